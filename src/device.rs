@@ -1,0 +1,118 @@
+//! The device: a thread pool of its own, the ISA chosen at run time with its table of kernels, the
+//! log and the memory accounts.
+
+use crate::error::{Error, Result, invalid_argument};
+use crate::memory::{MemoryFn, MemoryMonitor};
+use crate::simd::Isa;
+use crate::trace::Kernels;
+use std::sync::Arc;
+
+/// How much a log message matters.
+#[derive(Clone, Copy, Debug, PartialEq, Eq, PartialOrd, Ord)]
+#[repr(u32)]
+pub enum LogLevel {
+    Error = 0,
+    Warning = 1,
+    Info = 2,
+}
+
+/// Receives log messages, from any thread.
+pub type LogFn = dyn Fn(LogLevel, &str) + Send + Sync;
+
+/// The most threads a device accepts: a guard against garbage in the argument.
+pub const MAX_THREADS: usize = 4096;
+
+/// What to create a [`Device`] with.
+#[derive(Default)]
+pub struct DeviceOptions {
+    /// Worker threads; 0: one per logical core.
+    pub num_threads: usize,
+    /// `None`: the best that this machine has.
+    pub isa: Option<Isa>,
+    /// Receives log messages.
+    pub log: Option<Box<LogFn>>,
+    /// Asked before large allocations.
+    pub memory: Option<Box<MemoryFn>>,
+}
+
+/// Threads, kernels and accounts that scenes and bakes share.
+pub struct Device {
+    pool: rayon::ThreadPool,
+    kernels: &'static Kernels,
+    log: Option<Box<LogFn>>,
+    memory: Arc<MemoryMonitor>,
+}
+
+impl Device {
+    /// Starts a device. Fails if the machine lacks the ISA asked for or threads cannot be started.
+    pub fn new(options: DeviceOptions) -> Result<Arc<Device>> {
+        if options.num_threads > MAX_THREADS {
+            return invalid_argument!("num_threads is {}, more than {MAX_THREADS}", options.num_threads);
+        }
+        let isa = options.isa.unwrap_or_else(Isa::best);
+        if !isa.is_available() {
+            return Err(Error::Unsupported(format!("this machine cannot run {}", isa.name())));
+        }
+        let pool = rayon::ThreadPoolBuilder::new()
+            .num_threads(options.num_threads)
+            .thread_name(|i| format!("bakelite-{i}"))
+            .build()
+            .map_err(|e| Error::OutOfMemory(format!("the worker threads could not be started: {e}")))?;
+        Ok(Arc::new(Device {
+            pool,
+            kernels: Kernels::for_isa(isa),
+            log: options.log,
+            memory: Arc::new(MemoryMonitor::new(options.memory)),
+        }))
+    }
+
+    /// The ISA in use.
+    pub fn isa(&self) -> Isa {
+        self.kernels.isa
+    }
+
+    /// The number of worker threads.
+    pub fn num_threads(&self) -> usize {
+        self.pool.current_num_threads()
+    }
+
+    /// Runs `f` on the device's threads; rayon calls inside use them alone.
+    pub fn install<R: Send>(&self, f: impl FnOnce() -> R + Send) -> R {
+        self.pool.install(f)
+    }
+
+    /// Sends a message to the log callback.
+    pub fn log(&self, level: LogLevel, message: &str) {
+        if let Some(log) = &self.log {
+            log(level, message);
+        }
+    }
+
+    /// The memory accounts.
+    pub fn memory(&self) -> &Arc<MemoryMonitor> {
+        &self.memory
+    }
+
+    pub(crate) fn kernels(&self) -> &'static Kernels {
+        self.kernels
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn an_absurd_thread_count_is_refused_by_name() {
+        let e = Device::new(DeviceOptions { num_threads: 1 << 20, ..Default::default() }).err().unwrap();
+        assert!(e.to_string().contains("num_threads is 1048576"));
+    }
+
+    #[test]
+    fn every_available_isa_makes_a_device() {
+        for isa in Isa::available() {
+            let d = Device::new(DeviceOptions { isa: Some(isa), num_threads: 1, ..Default::default() }).unwrap();
+            assert_eq!(d.isa(), isa);
+        }
+    }
+}

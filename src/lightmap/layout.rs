@@ -1,0 +1,1 @@
+//! Layouts: where each chart lies in the pages of a map of a given resolution.

@@ -1,0 +1,110 @@
+//! Accounts of large allocations: a running total with its peak, an optional monitor that may
+//! refuse, and budgets for single calls.
+
+use crate::error::{Error, Result};
+use std::sync::Arc;
+use std::sync::atomic::{AtomicI64, Ordering::SeqCst};
+
+/// Asked before a large allocation with its size in bytes, told with a negative size after it is
+/// freed. `false` refuses (the answer to a negative size is ignored).
+pub type MemoryFn = dyn Fn(i64) -> bool + Send + Sync;
+
+/// The accounts of one device.
+#[derive(Default)]
+pub struct MemoryMonitor {
+    callback: Option<Box<MemoryFn>>,
+    current: AtomicI64,
+    peak: AtomicI64,
+}
+
+impl MemoryMonitor {
+    /// Accounts that ask `callback`, if there is one.
+    pub fn new(callback: Option<Box<MemoryFn>>) -> Self {
+        MemoryMonitor { callback, ..Default::default() }
+    }
+
+    /// Bytes held now.
+    pub fn current(&self) -> i64 {
+        self.current.load(SeqCst)
+    }
+
+    /// The most bytes held at once since the last [`reset_peak`](Self::reset_peak).
+    pub fn peak(&self) -> i64 {
+        self.peak.load(SeqCst)
+    }
+
+    /// Starts a new peak at what is held now.
+    pub fn reset_peak(&self) {
+        self.peak.store(self.current(), SeqCst);
+    }
+
+    /// Announces `bytes` for `what`; they are given back when the reservation is dropped. Hold it
+    /// beside the buffer that it stands for.
+    pub fn reserve(self: &Arc<Self>, bytes: usize, what: &str) -> Result<Reservation> {
+        let bytes = i64::try_from(bytes).map_err(|_| Error::OutOfMemory(format!("{what} would take {bytes} bytes")))?;
+        if let Some(callback) = &self.callback
+            && !callback(bytes)
+        {
+            return Err(Error::OutOfMemory(format!("the memory monitor refused {bytes} bytes for {what}")));
+        }
+        let now = self.current.fetch_add(bytes, SeqCst) + bytes;
+        self.peak.fetch_max(now, SeqCst);
+        Ok(Reservation { monitor: self.clone(), bytes })
+    }
+}
+
+/// Bytes announced to a [`MemoryMonitor`], given back on drop.
+pub struct Reservation {
+    monitor: Arc<MemoryMonitor>,
+    bytes: i64,
+}
+
+impl Reservation {
+    /// Size in bytes.
+    pub fn bytes(&self) -> usize {
+        self.bytes as usize
+    }
+}
+
+impl Drop for Reservation {
+    fn drop(&mut self) {
+        self.monitor.current.fetch_sub(self.bytes, SeqCst);
+        if let Some(callback) = &self.monitor.callback {
+            callback(-self.bytes);
+        }
+    }
+}
+
+/// A `Vec` of `len` default values; an allocation that fails is an error, not an abort.
+pub fn try_vec<T: Default + Clone>(len: usize, what: &str) -> Result<Vec<T>> {
+    let mut v = Vec::new();
+    v.try_reserve_exact(len)
+        .map_err(|_| Error::OutOfMemory(format!("{what} needs {} bytes", len as u128 * size_of::<T>() as u128)))?;
+    v.resize(len, T::default());
+    Ok(v)
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn reservations_add_up_and_go() {
+        let m = Arc::new(MemoryMonitor::new(None));
+        let a = m.reserve(10, "a").unwrap();
+        let b = m.reserve(5, "b").unwrap();
+        drop(a);
+        assert_eq!((m.current(), m.peak()), (5, 15));
+        drop(b);
+        assert_eq!(m.current(), 0);
+    }
+
+    #[test]
+    fn a_monitor_can_refuse() {
+        let m = Arc::new(MemoryMonitor::new(Some(Box::new(|bytes| bytes < 100))));
+        assert!(m.reserve(99, "small").is_ok());
+        let e = m.reserve(100, "the photon map").err().unwrap();
+        assert_eq!(e, Error::OutOfMemory("the memory monitor refused 100 bytes for the photon map".into()));
+        assert_eq!(m.current(), 0);
+    }
+}

@@ -1,0 +1,1 @@
+//! Independent f64 oracles.

@@ -1,0 +1,99 @@
+//! Lights without geometry. (Emissive triangles are lights too; see [`super::Emitter`].)
+
+use super::{check_energy, check_finite};
+use crate::error::{Result, invalid_argument};
+use glam::Vec3;
+
+/// A light. Directions need not be normalised; they are when the light is added to a scene.
+#[derive(Clone, Copy, Debug, PartialEq)]
+pub enum Light {
+    /// Radiates equally in all directions. `intensity` in W/sr.
+    Point { position: Vec3, intensity: [f32; 3] },
+    /// Radiates in a cone around `direction`: fully within `inner` radians of it, not at all beyond
+    /// `outer` (≤ π), smoothly in between (Hermite interpolation in the cosine). `intensity` in W/sr on the axis.
+    Spot { position: Vec3, direction: Vec3, inner: f32, outer: f32, intensity: [f32; 3] },
+    /// Parallel light that travels along `direction`. `irradiance` on a perpendicular plane in W/m².
+    Directional { direction: Vec3, irradiance: [f32; 3] },
+    /// The parallelogram with a corner at `position` and edges `edge_u` and `edge_v`. It radiates
+    /// from the side that `edge_u × edge_v` points to. `radiance` in W/(m²·sr). It casts light but
+    /// is not itself hit by rays.
+    Rect { position: Vec3, edge_u: Vec3, edge_v: Vec3, radiance: [f32; 3] },
+}
+
+impl Light {
+    /// The colour field, whatever its unit.
+    pub fn color(&self) -> [f32; 3] {
+        match *self {
+            Light::Point { intensity, .. } | Light::Spot { intensity, .. } => intensity,
+            Light::Directional { irradiance, .. } => irradiance,
+            Light::Rect { radiance, .. } => radiance,
+        }
+    }
+
+    /// Falloff of a spot light with the cosine of the angle to its axis, in [0, 1].
+    pub fn spot_falloff(cosine: f32, inner: f32, outer: f32) -> f32 {
+        let (ci, co) = (inner.cos(), outer.cos());
+        if cosine >= ci {
+            1.0
+        } else if cosine <= co {
+            0.0
+        } else {
+            let x = (cosine - co) / (ci - co);
+            x * x * (3.0 - 2.0 * x)
+        }
+    }
+
+    /// The same light with its direction normalised (in f64: extreme lengths do not overflow).
+    pub(crate) fn normalized(self) -> Light {
+        let unit = |d: Vec3| d.as_dvec3().normalize().as_vec3();
+        match self {
+            Light::Spot { position, direction, inner, outer, intensity } => {
+                Light::Spot { position, direction: unit(direction), inner, outer, intensity }
+            }
+            Light::Directional { direction, irradiance } => {
+                Light::Directional { direction: unit(direction), irradiance }
+            }
+            other => other,
+        }
+    }
+
+    /// Checks the ranges documented on the variants.
+    pub fn validate(&self) -> Result<()> {
+        check_energy("the light's color", &self.color())?;
+        match *self {
+            Light::Point { position, .. } => check_finite("the light's position", &position.to_array()),
+            Light::Spot { position, direction, inner, outer, .. } => {
+                check_finite("the light's position", &position.to_array())?;
+                check_direction(direction)?;
+                if !(inner >= 0.0 && inner <= outer && outer <= std::f32::consts::PI) {
+                    return invalid_argument!(
+                        "the cone angles are inner {inner} and outer {outer}, not 0 ≤ inner ≤ outer ≤ π"
+                    );
+                }
+                if outer == 0.0 {
+                    return invalid_argument!("the outer cone angle is 0");
+                }
+                Ok(())
+            }
+            Light::Directional { direction, .. } => check_direction(direction),
+            Light::Rect { position, edge_u, edge_v, .. } => {
+                check_finite("the light's position", &position.to_array())?;
+                check_finite("edge_u", &edge_u.to_array())?;
+                check_finite("edge_v", &edge_v.to_array())?;
+                let area = edge_u.as_dvec3().cross(edge_v.as_dvec3()).length();
+                if area == 0.0 {
+                    return invalid_argument!("the rect light has no area (edge_u {edge_u}, edge_v {edge_v})");
+                }
+                Ok(())
+            }
+        }
+    }
+}
+
+fn check_direction(d: Vec3) -> Result<()> {
+    check_finite("the light's direction", &d.to_array())?;
+    if d.as_dvec3().length() == 0.0 {
+        return invalid_argument!("the light's direction is zero");
+    }
+    Ok(())
+}

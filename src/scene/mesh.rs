@@ -1,0 +1,139 @@
+//! Triangle meshes as the caller describes them.
+
+use super::{MAX_COORDINATE, MAX_TRIANGLES};
+use crate::error::{Result, invalid_argument};
+use glam::{Vec2, Vec3};
+
+/// Which material each triangle has.
+#[derive(Clone, Debug, PartialEq)]
+pub enum MeshMaterials {
+    /// One material for the whole mesh.
+    One(u32),
+    /// One per triangle.
+    PerTriangle(Vec<u32>),
+}
+
+/// Light map coordinates that the caller brings.
+#[derive(Clone, Debug, PartialEq)]
+pub struct LightmapUvs {
+    /// One per vertex. Meant to be unique and in [0, 1]; what is not is counted and reported when
+    /// the light map is created, and repaired by unwrapping those triangles.
+    pub uvs: Vec<Vec2>,
+    /// Page per triangle; empty: all on page 0.
+    pub pages: Vec<u32>,
+}
+
+/// An indexed triangle mesh, counter-clockwise front faces.
+#[derive(Clone, Debug, PartialEq)]
+pub struct Mesh {
+    /// Vertex positions.
+    pub positions: Vec<Vec3>,
+    /// Three vertices per triangle.
+    pub indices: Vec<[u32; 3]>,
+    /// Shading normals, one per vertex, or empty: the geometric normal is used.
+    pub normals: Vec<Vec3>,
+    /// First texture coordinates, one per vertex, or empty. Kept for export.
+    pub uvs: Vec<Vec2>,
+    /// The caller's light map coordinates, if any.
+    pub lightmap: Option<LightmapUvs>,
+    /// Materials by number.
+    pub materials: MeshMaterials,
+    /// Refuse degenerate triangles and non-finite vertices, naming the first, rather than skip and
+    /// count them.
+    pub strict: bool,
+}
+
+impl Default for Mesh {
+    fn default() -> Self {
+        Mesh {
+            positions: Vec::new(),
+            indices: Vec::new(),
+            normals: Vec::new(),
+            uvs: Vec::new(),
+            lightmap: None,
+            materials: MeshMaterials::One(0),
+            strict: false,
+        }
+    }
+}
+
+impl Mesh {
+    /// The material of `triangle`.
+    #[inline]
+    pub fn material(&self, triangle: usize) -> u32 {
+        match &self.materials {
+            MeshMaterials::One(m) => *m,
+            MeshMaterials::PerTriangle(m) => m[triangle],
+        }
+    }
+
+    /// The corners of `triangle`.
+    #[inline]
+    pub fn corners(&self, triangle: usize) -> [Vec3; 3] {
+        self.indices[triangle].map(|i| self.positions[i as usize])
+    }
+
+    /// Checks sizes and index ranges, and the vertices if `strict`.
+    pub fn validate(&self, material_count: usize) -> Result<()> {
+        let vertices = self.positions.len();
+        if self.indices.len() > MAX_TRIANGLES {
+            return invalid_argument!("the mesh has {} triangles, more than {MAX_TRIANGLES}", self.indices.len());
+        }
+        for (t, tri) in self.indices.iter().enumerate() {
+            if let Some(i) = tri.iter().find(|&&i| i as usize >= vertices) {
+                return invalid_argument!("triangle {t} names vertex {i}, the mesh has {vertices}");
+            }
+        }
+        for (name, len) in [("normals", self.normals.len()), ("uvs", self.uvs.len())] {
+            if len != 0 && len != vertices {
+                return invalid_argument!("{name} has {len} entries for {vertices} vertices");
+            }
+        }
+        if let Some(l) = &self.lightmap {
+            if l.uvs.len() != vertices {
+                return invalid_argument!("lightmap_uvs has {} entries for {vertices} vertices", l.uvs.len());
+            }
+            if !l.pages.is_empty() && l.pages.len() != self.indices.len() {
+                return invalid_argument!(
+                    "lightmap_page has {} entries for {} triangles",
+                    l.pages.len(),
+                    self.indices.len()
+                );
+            }
+        }
+        match &self.materials {
+            MeshMaterials::One(m) if *m as usize >= material_count && !self.indices.is_empty() => {
+                return invalid_argument!("the mesh names material {m}, the scene has {material_count}");
+            }
+            MeshMaterials::One(_) => {}
+            MeshMaterials::PerTriangle(m) => {
+                if m.len() != self.indices.len() {
+                    return invalid_argument!(
+                        "triangle_materials has {} entries for {} triangles",
+                        m.len(),
+                        self.indices.len()
+                    );
+                }
+                if let Some((t, m)) = m.iter().enumerate().find(|(_, m)| **m as usize >= material_count) {
+                    return invalid_argument!("triangle {t} names material {m}, the scene has {material_count}");
+                }
+            }
+        }
+        if self.strict
+            && let Some(t) = (0..self.indices.len()).find(|&t| !is_valid_triangle(self.corners(t)))
+        {
+            let [a, b, c] = self.corners(t);
+            return invalid_argument!("triangle {t} is degenerate or not finite: {a}, {b}, {c}");
+        }
+        Ok(())
+    }
+}
+
+/// Whether a triangle has finite corners in the valid range and an area. Corners on a line count as
+/// no area only if the f64 cross product is exactly zero: slivers are kept.
+#[inline]
+pub fn is_valid_triangle(corners: [Vec3; 3]) -> bool {
+    let in_range = corners.iter().all(|c| c.abs().max_element() <= MAX_COORDINATE && !c.is_nan());
+    let [a, b, c] = corners.map(|c| c.as_dvec3());
+    in_range && (b - a).cross(c - a).length_squared() > 0.0
+}

@@ -1,0 +1,115 @@
+//! Scenes: what the caller describes ([`SceneData`]), checked as it comes in, and what the kernels
+//! work on ([`Scene`]), compact and immutable after commit.
+
+mod builtin;
+mod commit;
+mod light;
+mod material;
+mod mesh;
+
+pub use builtin::{BUILTIN_NAMES, Camera, builtin, builtin_camera};
+pub use commit::{Emitter, Scene, SceneStats};
+pub use light::Light;
+pub use material::{MAX_ALBEDO, Material};
+pub use mesh::{LightmapUvs, Mesh, MeshMaterials};
+
+use crate::error::{Error, Result, invalid_argument};
+
+/// "No triangle", "no chart", …: never a valid index.
+pub const NONE: u32 = u32::MAX;
+
+/// The most triangles in a scene: leaf references hold 28 bits.
+pub const MAX_TRIANGLES: usize = 1 << 28;
+
+/// Coordinates up to this magnitude are valid; squares and products of them stay finite in f32.
+pub const MAX_COORDINATE: f32 = 1e18;
+
+/// A scene being described. Everything added is checked; a refused addition changes nothing.
+#[derive(Clone, Debug, Default)]
+pub struct SceneData {
+    meshes: Vec<Mesh>,
+    materials: Vec<Material>,
+    lights: Vec<Light>,
+}
+
+impl SceneData {
+    /// An empty scene.
+    pub fn new() -> Self {
+        Self::default()
+    }
+
+    /// Adds a material and returns its number.
+    pub fn add_material(&mut self, material: Material) -> Result<u32> {
+        material.validate()?;
+        self.materials.push(material);
+        Ok(self.materials.len() as u32 - 1)
+    }
+
+    /// Adds a mesh and returns its number. Its materials must have been added before.
+    pub fn add_mesh(&mut self, mesh: Mesh) -> Result<u32> {
+        mesh.validate(self.materials.len())?;
+        let total = self.triangle_count() + mesh.indices.len();
+        if total > MAX_TRIANGLES {
+            return invalid_argument!("the scene would have {total} triangles, more than {MAX_TRIANGLES}");
+        }
+        self.meshes.push(mesh);
+        Ok(self.meshes.len() as u32 - 1)
+    }
+
+    /// Adds a light and returns its number.
+    pub fn add_light(&mut self, light: Light) -> Result<u32> {
+        light.validate()?;
+        self.lights.push(light.normalized());
+        Ok(self.lights.len() as u32 - 1)
+    }
+
+    /// Replaces light `id`.
+    pub fn set_light(&mut self, id: u32, light: Light) -> Result<()> {
+        light.validate()?;
+        let count = self.lights.len();
+        match self.lights.get_mut(id as usize) {
+            Some(l) => *l = light.normalized(),
+            None => return invalid_argument!("light {id} does not exist, the scene has {count}"),
+        }
+        Ok(())
+    }
+
+    /// The meshes, by number.
+    pub fn meshes(&self) -> &[Mesh] {
+        &self.meshes
+    }
+
+    /// The materials, by number.
+    pub fn materials(&self) -> &[Material] {
+        &self.materials
+    }
+
+    /// The lights, by number.
+    pub fn lights(&self) -> &[Light] {
+        &self.lights
+    }
+
+    /// Triangles in all meshes, degenerate ones included.
+    pub fn triangle_count(&self) -> usize {
+        self.meshes.iter().map(|m| m.indices.len()).sum()
+    }
+}
+
+/// Refuses NaN and infinities, and magnitudes beyond [`MAX_COORDINATE`].
+pub(crate) fn check_finite(what: &str, values: &[f32]) -> Result<()> {
+    match values.iter().find(|v| !(v.abs() <= MAX_COORDINATE)) {
+        Some(v) => {
+            Err(Error::InvalidArgument(format!("{what} contains {v}, not a number of magnitude ≤ {MAX_COORDINATE:e}")))
+        }
+        None => Ok(()),
+    }
+}
+
+/// Refuses NaN, infinities and negative values in a colour or power.
+pub(crate) fn check_energy(what: &str, values: &[f32; 3]) -> Result<()> {
+    check_finite(what, values)?;
+    match values.iter().find(|v| **v < 0.0) {
+        Some(v) => Err(Error::InvalidArgument(format!("{what} contains {v}, less than 0"))),
+        None => Ok(()),
+    }
+}

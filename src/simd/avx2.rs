@@ -1,0 +1,174 @@
+//! Lanes over AVX2 and FMA: 128-bit vectors of four, 256-bit vectors of eight.
+
+use super::{Halves, Lanes, Mask, Simd};
+use std::arch::x86_64::*;
+use std::ops::{Add, Mul, Sub};
+
+/// AVX2 with FMA.
+#[derive(Clone, Copy)]
+pub(crate) struct Avx2;
+
+impl Simd for Avx2 {
+    type F4 = A4;
+    type F8 = A8;
+    type Packet = A8;
+}
+
+#[derive(Clone, Copy)]
+pub(crate) struct A4(pub(super) __m128);
+
+#[derive(Clone, Copy)]
+pub(crate) struct A8(pub(super) __m256);
+
+macro_rules! lanes {
+    ($v:ident, $raw:ty, $width:expr, $splat:ident, $load:ident, $store:ident, $add:ident, $sub:ident, $mul:ident,
+     $div:ident, $min:ident, $max:ident, $fmadd:ident, $cmp:ident, $blend:ident, $movemask:ident, $and:ident, $or:ident) => {
+        // SAFETY of every intrinsic below: a value of this type exists only where the CPU has the
+        // ISA (see the module docs of `simd`).
+        impl Mask for $v {
+            #[inline(always)]
+            fn bits(self) -> u32 {
+                unsafe { $movemask(self.0) as u32 }
+            }
+            #[inline(always)]
+            fn and(self, o: Self) -> Self {
+                $v(unsafe { $and(self.0, o.0) })
+            }
+            #[inline(always)]
+            fn or(self, o: Self) -> Self {
+                $v(unsafe { $or(self.0, o.0) })
+            }
+        }
+        impl Add for $v {
+            type Output = $v;
+            #[inline(always)]
+            fn add(self, o: $v) -> $v {
+                $v(unsafe { $add(self.0, o.0) })
+            }
+        }
+        impl Sub for $v {
+            type Output = $v;
+            #[inline(always)]
+            fn sub(self, o: $v) -> $v {
+                $v(unsafe { $sub(self.0, o.0) })
+            }
+        }
+        impl Mul for $v {
+            type Output = $v;
+            #[inline(always)]
+            fn mul(self, o: $v) -> $v {
+                $v(unsafe { $mul(self.0, o.0) })
+            }
+        }
+        impl Lanes for $v {
+            const WIDTH: usize = $width;
+            // A comparison gives all-ones or all-zeros lanes of the same vector type.
+            type Mask = $v;
+            #[inline(always)]
+            unsafe fn splat(x: f32) -> Self {
+                $v(unsafe { $splat(x) })
+            }
+            #[inline(always)]
+            unsafe fn load(p: *const f32) -> Self {
+                $v(unsafe { $load(p) })
+            }
+            #[inline(always)]
+            unsafe fn store(self, p: *mut f32) {
+                unsafe { $store(p, self.0) }
+            }
+            #[inline(always)]
+            fn div(self, d: Self) -> Self {
+                $v(unsafe { $div(self.0, d.0) })
+            }
+            #[inline(always)]
+            fn min(self, o: Self) -> Self {
+                $v(unsafe { $min(self.0, o.0) })
+            }
+            #[inline(always)]
+            fn max(self, o: Self) -> Self {
+                $v(unsafe { $max(self.0, o.0) })
+            }
+            #[inline(always)]
+            fn mul_add(self, b: Self, c: Self) -> Self {
+                $v(unsafe { $fmadd(self.0, b.0, c.0) })
+            }
+            #[inline(always)]
+            fn lt(self, o: Self) -> $v {
+                $v(unsafe { $cmp::<_CMP_LT_OQ>(self.0, o.0) })
+            }
+            #[inline(always)]
+            fn le(self, o: Self) -> $v {
+                $v(unsafe { $cmp::<_CMP_LE_OQ>(self.0, o.0) })
+            }
+            #[inline(always)]
+            fn eq(self, o: Self) -> $v {
+                $v(unsafe { $cmp::<_CMP_EQ_OQ>(self.0, o.0) })
+            }
+            #[inline(always)]
+            fn select(m: $v, t: Self, f: Self) -> Self {
+                $v(unsafe { $blend(f.0, t.0, m.0) })
+            }
+        }
+    };
+}
+
+lanes!(
+    A4,
+    __m128,
+    4,
+    _mm_set1_ps,
+    _mm_loadu_ps,
+    _mm_storeu_ps,
+    _mm_add_ps,
+    _mm_sub_ps,
+    _mm_mul_ps,
+    _mm_div_ps,
+    _mm_min_ps,
+    _mm_max_ps,
+    _mm_fmadd_ps,
+    _mm_cmp_ps,
+    _mm_blendv_ps,
+    _mm_movemask_ps,
+    _mm_and_ps,
+    _mm_or_ps
+);
+lanes!(
+    A8,
+    __m256,
+    8,
+    _mm256_set1_ps,
+    _mm256_loadu_ps,
+    _mm256_storeu_ps,
+    _mm256_add_ps,
+    _mm256_sub_ps,
+    _mm256_mul_ps,
+    _mm256_div_ps,
+    _mm256_min_ps,
+    _mm256_max_ps,
+    _mm256_fmadd_ps,
+    _mm256_cmp_ps,
+    _mm256_blendv_ps,
+    _mm256_movemask_ps,
+    _mm256_and_ps,
+    _mm256_or_ps
+);
+
+impl Halves for A8 {
+    type Half = A4;
+    #[inline(always)]
+    unsafe fn load_halves(low: *const f32, high: *const f32) -> Self {
+        // SAFETY: the caller vouches for the ISA and both pointers. `loadu2` puts its first
+        // argument in the high half.
+        A8(unsafe { _mm256_loadu2_m128(high, low) })
+    }
+    #[inline(always)]
+    fn low(self) -> A4 {
+        // SAFETY: as above.
+        A4(unsafe { _mm256_castps256_ps128(self.0) })
+    }
+    #[inline(always)]
+    fn high(self) -> A4 {
+        // SAFETY: as above.
+        A4(unsafe { _mm256_extractf128_ps::<1>(self.0) })
+    }
+}

@@ -1,0 +1,111 @@
+//! Lanes over AVX-512: 512-bit vectors with mask registers for packets. Nodes and leaves keep the
+//! 128- and 256-bit vectors of AVX2, whose four-wide shape they have.
+
+use super::avx2::{A4, A8};
+use super::{Lanes, Mask, Simd};
+use std::arch::x86_64::*;
+use std::ops::{Add, Mul, Sub};
+
+/// AVX-512 F, VL, DQ and BW.
+#[derive(Clone, Copy)]
+pub(crate) struct Avx512;
+
+impl Simd for Avx512 {
+    type F4 = A4;
+    type F8 = A8;
+    type Packet = A16;
+}
+
+#[derive(Clone, Copy)]
+pub(crate) struct A16(__m512);
+
+#[derive(Clone, Copy)]
+pub(crate) struct M16(__mmask16);
+
+impl Mask for M16 {
+    #[inline(always)]
+    fn bits(self) -> u32 {
+        self.0 as u32
+    }
+    #[inline(always)]
+    fn and(self, o: Self) -> Self {
+        M16(self.0 & o.0)
+    }
+    #[inline(always)]
+    fn or(self, o: Self) -> Self {
+        M16(self.0 | o.0)
+    }
+}
+
+// SAFETY of every intrinsic below: a value of A16 exists only where the CPU has the ISA (see the
+// module docs of `simd`).
+impl Add for A16 {
+    type Output = A16;
+    #[inline(always)]
+    fn add(self, o: A16) -> A16 {
+        A16(unsafe { _mm512_add_ps(self.0, o.0) })
+    }
+}
+impl Sub for A16 {
+    type Output = A16;
+    #[inline(always)]
+    fn sub(self, o: A16) -> A16 {
+        A16(unsafe { _mm512_sub_ps(self.0, o.0) })
+    }
+}
+impl Mul for A16 {
+    type Output = A16;
+    #[inline(always)]
+    fn mul(self, o: A16) -> A16 {
+        A16(unsafe { _mm512_mul_ps(self.0, o.0) })
+    }
+}
+
+impl Lanes for A16 {
+    const WIDTH: usize = 16;
+    type Mask = M16;
+    #[inline(always)]
+    unsafe fn splat(x: f32) -> Self {
+        A16(unsafe { _mm512_set1_ps(x) })
+    }
+    #[inline(always)]
+    unsafe fn load(p: *const f32) -> Self {
+        A16(unsafe { _mm512_loadu_ps(p) })
+    }
+    #[inline(always)]
+    unsafe fn store(self, p: *mut f32) {
+        unsafe { _mm512_storeu_ps(p, self.0) }
+    }
+    #[inline(always)]
+    fn div(self, d: Self) -> Self {
+        A16(unsafe { _mm512_div_ps(self.0, d.0) })
+    }
+    #[inline(always)]
+    fn min(self, o: Self) -> Self {
+        A16(unsafe { _mm512_min_ps(self.0, o.0) })
+    }
+    #[inline(always)]
+    fn max(self, o: Self) -> Self {
+        A16(unsafe { _mm512_max_ps(self.0, o.0) })
+    }
+    #[inline(always)]
+    fn mul_add(self, b: Self, c: Self) -> Self {
+        A16(unsafe { _mm512_fmadd_ps(self.0, b.0, c.0) })
+    }
+    #[inline(always)]
+    fn lt(self, o: Self) -> M16 {
+        M16(unsafe { _mm512_cmp_ps_mask::<_CMP_LT_OQ>(self.0, o.0) })
+    }
+    #[inline(always)]
+    fn le(self, o: Self) -> M16 {
+        M16(unsafe { _mm512_cmp_ps_mask::<_CMP_LE_OQ>(self.0, o.0) })
+    }
+    #[inline(always)]
+    fn eq(self, o: Self) -> M16 {
+        M16(unsafe { _mm512_cmp_ps_mask::<_CMP_EQ_OQ>(self.0, o.0) })
+    }
+    #[inline(always)]
+    fn select(m: M16, t: Self, f: Self) -> Self {
+        A16(unsafe { _mm512_mask_blend_ps(m.0, f.0, t.0) })
+    }
+}

@@ -1,0 +1,171 @@
+//! Lanes: f32 vectors of a few widths over several instruction sets, and the choice between them at
+//! run time. Nothing in here knows about rays.
+//!
+//! A kernel is written once, `#[inline(always)] unsafe fn kernel<S: Simd>(…)`, over the vectors of
+//! [`Simd`]. Per ISA there is one entry point with `#[target_feature]` into which everything
+//! inlines, and a table of function pointers binds them when the device is created (the design of
+//! memchr's `arch` tree).
+//!
+//! # Safety
+//!
+//! The only ways to make a vector are [`Lanes::splat`] and the loads, which are unsafe: the caller
+//! promises that the CPU has the ISA. A value of the type is therefore proof that the ISA is there,
+//! and all arithmetic on it is safe. Entry points are unsafe for the same reason and are reached
+//! only through tables chosen by [`Isa::is_available`].
+
+use std::ops::{Add, Mul, Sub};
+
+#[cfg(target_arch = "x86_64")]
+mod avx2;
+#[cfg(target_arch = "x86_64")]
+mod avx512;
+mod portable;
+
+#[cfg(target_arch = "x86_64")]
+pub(crate) use avx2::Avx2;
+#[cfg(target_arch = "x86_64")]
+pub(crate) use avx512::Avx512;
+pub(crate) use portable::Portable;
+
+/// An instruction set that kernels are compiled for.
+#[derive(Clone, Copy, Debug, PartialEq, Eq, Hash)]
+#[repr(u32)]
+pub enum Isa {
+    /// The `wide` crate's vectors at the target's baseline: SSE2, NEON, simd128 or scalar.
+    Portable = 1,
+    /// AVX2 with FMA.
+    Avx2 = 2,
+    /// AVX-512 F, VL, DQ and BW, with AVX2 and FMA.
+    Avx512 = 3,
+}
+
+impl Isa {
+    /// All of them, best last.
+    pub const ALL: [Isa; 3] = [Isa::Portable, Isa::Avx2, Isa::Avx512];
+
+    /// Whether this machine can run it.
+    pub fn is_available(self) -> bool {
+        #[cfg(target_arch = "x86_64")]
+        {
+            let avx2 = std::arch::is_x86_feature_detected!("avx2") && std::arch::is_x86_feature_detected!("fma");
+            match self {
+                Isa::Portable => true,
+                Isa::Avx2 => avx2,
+                Isa::Avx512 => {
+                    avx2 && std::arch::is_x86_feature_detected!("avx512f")
+                        && std::arch::is_x86_feature_detected!("avx512vl")
+                        && std::arch::is_x86_feature_detected!("avx512dq")
+                        && std::arch::is_x86_feature_detected!("avx512bw")
+                }
+            }
+        }
+        #[cfg(not(target_arch = "x86_64"))]
+        {
+            self == Isa::Portable
+        }
+    }
+
+    /// Those that this machine can run, best last.
+    pub fn available() -> impl Iterator<Item = Isa> {
+        Self::ALL.into_iter().filter(|i| i.is_available())
+    }
+
+    /// The best that this machine can run.
+    pub fn best() -> Isa {
+        Self::available().last().unwrap_or(Isa::Portable)
+    }
+
+    /// Lower-case name, as the command line takes it.
+    pub fn name(self) -> &'static str {
+        match self {
+            Isa::Portable => "portable",
+            Isa::Avx2 => "avx2",
+            Isa::Avx512 => "avx512",
+        }
+    }
+}
+
+/// An ISA's vectors: four lanes for the children of a node or the triangles of a leaf, eight for the
+/// lower and upper planes of four boxes, and the width that suits packets of rays and photons.
+pub(crate) trait Simd: Copy {
+    type F4: Lanes;
+    type F8: Halves<Half = Self::F4>;
+    type Packet: Lanes;
+}
+
+/// Result of a comparison, one bit of truth per lane.
+pub(crate) trait Mask: Copy {
+    /// Bit i is lane i.
+    fn bits(self) -> u32;
+    fn and(self, other: Self) -> Self;
+    fn or(self, other: Self) -> Self;
+    #[inline(always)]
+    fn any(self) -> bool {
+        self.bits() != 0
+    }
+}
+
+/// A vector of f32. Arithmetic rounds like scalar f32; only [`mul_add`](Lanes::mul_add) depends on
+/// the ISA (fused where there is FMA).
+pub(crate) trait Lanes: Copy + Add<Output = Self> + Sub<Output = Self> + Mul<Output = Self> {
+    /// Number of lanes.
+    const WIDTH: usize;
+    type Mask: Mask;
+
+    /// All lanes `x`.
+    ///
+    /// # Safety
+    /// The CPU must have the ISA.
+    unsafe fn splat(x: f32) -> Self;
+    /// `WIDTH` floats from `p`, which need not be aligned.
+    ///
+    /// # Safety
+    /// The CPU must have the ISA, and `p` must be valid for reading `WIDTH` floats.
+    unsafe fn load(p: *const f32) -> Self;
+    /// `WIDTH` floats to `p`, which need not be aligned.
+    ///
+    /// # Safety
+    /// `p` must be valid for writing `WIDTH` floats.
+    unsafe fn store(self, p: *mut f32);
+
+    fn div(self, d: Self) -> Self;
+    /// The lesser; `other` where either is NaN.
+    fn min(self, other: Self) -> Self;
+    /// The greater; `other` where either is NaN.
+    fn max(self, other: Self) -> Self;
+    /// `self * b + c`, in one rounding where the ISA has FMA, else in two.
+    fn mul_add(self, b: Self, c: Self) -> Self;
+    /// Ordered `<`: false where either is NaN.
+    fn lt(self, other: Self) -> Self::Mask;
+    /// Ordered `≤`.
+    fn le(self, other: Self) -> Self::Mask;
+    /// Ordered `=`.
+    fn eq(self, other: Self) -> Self::Mask;
+    /// Lane by lane `if_true` or `if_false`.
+    fn select(mask: Self::Mask, if_true: Self, if_false: Self) -> Self;
+
+    /// The lanes as an array's first `WIDTH` entries (at most 16), for tests and cold paths.
+    #[inline(always)]
+    fn to_array(self) -> [f32; 16] {
+        let mut a = [0.0; 16];
+        const { assert!(Self::WIDTH <= 16) };
+        // SAFETY: the array has room for 16 ≥ WIDTH floats.
+        unsafe { self.store(a.as_mut_ptr()) };
+        a
+    }
+}
+
+/// Eight lanes made of two halves of four.
+pub(crate) trait Halves: Lanes {
+    type Half: Lanes;
+    /// Four floats from `low` and four from `high`.
+    ///
+    /// # Safety
+    /// The CPU must have the ISA, and both pointers must be valid for reading four floats.
+    unsafe fn load_halves(low: *const f32, high: *const f32) -> Self;
+    fn low(self) -> Self::Half;
+    fn high(self) -> Self::Half;
+}
+
+#[cfg(test)]
+mod tests;

@@ -1,0 +1,98 @@
+//! Every operation of every ISA that the machine has against plain f32.
+
+use super::*;
+
+const SPECIAL: [f32; 16] = [
+    0.0,
+    -0.0,
+    1.0,
+    -1.5,
+    f32::NAN,
+    f32::INFINITY,
+    f32::NEG_INFINITY,
+    1e-40,
+    f32::MIN_POSITIVE,
+    f32::MAX,
+    -2.0,
+    3.25,
+    1e18,
+    -1e-18,
+    7.0,
+    0.1,
+];
+
+/// Runs `check::<S>` for each ISA that the machine has.
+macro_rules! on_every_isa {
+    ($check:ident) => {
+        // SAFETY: each is run only where it is available.
+        for isa in Isa::available() {
+            match isa {
+                Isa::Portable => unsafe { $check::<Portable>() },
+                #[cfg(target_arch = "x86_64")]
+                Isa::Avx2 => unsafe { $check::<Avx2>() },
+                #[cfg(target_arch = "x86_64")]
+                Isa::Avx512 => unsafe { $check::<Avx512>() },
+                #[cfg(not(target_arch = "x86_64"))]
+                _ => unreachable!(),
+            }
+        }
+    };
+}
+
+fn same(a: f32, b: f32) -> bool {
+    a.to_bits() == b.to_bits() || (a.is_nan() && b.is_nan())
+}
+
+unsafe fn check_lanes<L: Lanes>() {
+    let get = |v: L, i: usize| v.to_array()[i];
+    let mut rotated = SPECIAL;
+    for _ in 0..16 {
+        rotated.rotate_left(1);
+        for base in (0..16).step_by(L::WIDTH) {
+            // SAFETY: base + WIDTH ≤ 16, and the caller vouches for the ISA.
+            let (a, b) = unsafe { (L::load(SPECIAL[base..].as_ptr()), L::load(rotated[base..].as_ptr())) };
+            for i in 0..L::WIDTH {
+                let (x, y) = (SPECIAL[base + i], rotated[base + i]);
+                assert!(same(get(a + b, i), x + y), "{x} + {y}");
+                assert!(same(get(a - b, i), x - y), "{x} - {y}");
+                assert!(same(get(a * b, i), x * y), "{x} * {y}");
+                assert!(same(get(a.div(b), i), x / y), "{x} / {y}");
+                let (min, max) = (if x < y { x } else { y }, if x > y { x } else { y });
+                assert!(same(get(a.min(b), i), min), "min({x}, {y}) = {}", get(a.min(b), i));
+                assert!(same(get(a.max(b), i), max), "max({x}, {y}) = {}", get(a.max(b), i));
+                let (fused, plain) = (x.mul_add(y, 0.75), x * y + 0.75);
+                // SAFETY: as above.
+                let r = get(a.mul_add(b, unsafe { L::splat(0.75) }), i);
+                assert!(same(r, fused) || same(r, plain), "{x} * {y} + 0.75 = {r}");
+                assert_eq!(a.lt(b).bits() >> i & 1 == 1, x < y);
+                assert_eq!(a.le(b).bits() >> i & 1 == 1, x <= y);
+                assert_eq!(a.eq(b).bits() >> i & 1 == 1, x == y);
+                assert_eq!(a.lt(b).or(a.eq(b)).bits() >> i & 1 == 1, x <= y);
+                assert_eq!(a.le(b).and(b.le(a)).bits() >> i & 1 == 1, x == y);
+                assert!(same(get(L::select(a.lt(b), a, b), i), min));
+            }
+            assert_eq!(a.eq(a).any(), SPECIAL[base..base + L::WIDTH].iter().any(|x| !x.is_nan()));
+        }
+    }
+}
+
+unsafe fn check_simd<S: Simd>() {
+    // SAFETY: the caller vouches for the ISA; `SPECIAL` has 16 floats.
+    unsafe {
+        check_lanes::<S::F4>();
+        check_lanes::<S::F8>();
+        check_lanes::<S::Packet>();
+        let v = S::F8::load_halves(SPECIAL[8..].as_ptr(), SPECIAL[2..].as_ptr());
+        for i in 0..4 {
+            assert!(same(v.low().to_array()[i], SPECIAL[8 + i]));
+            assert!(same(v.high().to_array()[i], SPECIAL[2 + i]));
+            assert!(same(v.to_array()[i], SPECIAL[8 + i]));
+            assert!(same(v.to_array()[4 + i], SPECIAL[2 + i]));
+        }
+    }
+}
+
+#[test]
+fn lanes_agree_with_scalars_on_every_isa() {
+    on_every_isa!(check_simd);
+}

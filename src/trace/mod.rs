@@ -1,0 +1,189 @@
+//! The ray kernels: rays, hits, and the table of kernels per ISA.
+//!
+//! A closest hit is the one with the least t in `tmin < t ≤ tmax`; among exactly equal t the
+//! triangle with the lowest global number wins, on every path, so that single rays, packets and
+//! every ISA agree on coincident triangles.
+
+mod kernels;
+
+pub(crate) use kernels::Kernels;
+
+use crate::error::{Result, invalid_argument};
+use crate::scene::{NONE, Scene};
+use bytemuck::{Pod, Zeroable};
+use glam::Vec3;
+use rayon::prelude::*;
+
+/// A ray: points `origin + t · direction` with `tmin < t ≤ tmax`. The direction need not be
+/// normalised. A ray with a NaN, an infinite origin or a zero direction hits nothing.
+#[derive(Clone, Copy, Debug, PartialEq, Pod, Zeroable)]
+#[repr(C)]
+pub struct Ray {
+    pub origin: [f32; 3],
+    pub tmin: f32,
+    pub direction: [f32; 3],
+    pub tmax: f32,
+}
+
+impl Ray {
+    /// The ray from `origin` along `direction` with `0 < t`.
+    pub fn new(origin: Vec3, direction: Vec3) -> Self {
+        Ray { origin: origin.to_array(), tmin: 0.0, direction: direction.to_array(), tmax: f32::INFINITY }
+    }
+
+    /// The same ray limited to `tmin < t ≤ tmax`.
+    pub fn within(self, tmin: f32, tmax: f32) -> Self {
+        Ray { tmin, tmax, ..self }
+    }
+}
+
+/// A hit by global triangle number, as kernels report it. A miss has `t = +inf`, triangle [`NONE`].
+#[derive(Clone, Copy, Debug, PartialEq)]
+pub struct RawHit {
+    pub t: f32,
+    /// Barycentric weight of vertex 1.
+    pub u: f32,
+    /// Barycentric weight of vertex 2.
+    pub v: f32,
+    /// Global triangle number.
+    pub triangle: u32,
+}
+
+impl RawHit {
+    /// No hit.
+    pub const MISS: RawHit = RawHit { t: f32::INFINITY, u: 0.0, v: 0.0, triangle: NONE };
+
+    /// Whether nothing was hit.
+    #[inline]
+    pub fn is_miss(&self) -> bool {
+        self.triangle == NONE
+    }
+}
+
+/// A hit by mesh and triangle, as callers see it.
+#[derive(Clone, Copy, Debug, PartialEq, Pod, Zeroable)]
+#[repr(C)]
+pub struct Hit {
+    pub t: f32,
+    pub u: f32,
+    pub v: f32,
+    pub triangle: u32,
+    pub mesh: u32,
+    pub instance: u32,
+}
+
+impl Hit {
+    /// No hit.
+    pub const MISS: Hit = Hit { t: f32::INFINITY, u: 0.0, v: 0.0, triangle: NONE, mesh: NONE, instance: NONE };
+}
+
+/// Rays in a gather packet.
+pub const PACKET_SIZE: usize = 32;
+
+/// Directions of up to [`PACKET_SIZE`] rays with one origin, component by component.
+#[derive(Clone, Copy, Debug)]
+#[repr(C, align(64))]
+pub struct Packet {
+    pub x: [f32; PACKET_SIZE],
+    pub y: [f32; PACKET_SIZE],
+    pub z: [f32; PACKET_SIZE],
+    /// How many of the directions count, from the first.
+    pub count: usize,
+}
+
+impl Default for Packet {
+    fn default() -> Self {
+        Packet { x: [0.0; PACKET_SIZE], y: [0.0; PACKET_SIZE], z: [0.0; PACKET_SIZE], count: 0 }
+    }
+}
+
+impl Packet {
+    /// Adds a direction. The packet must not be full.
+    #[inline]
+    pub fn push(&mut self, d: Vec3) {
+        (self.x[self.count], self.y[self.count], self.z[self.count]) = (d.x, d.y, d.z);
+        self.count += 1;
+    }
+}
+
+/// Work items are handed to threads in blocks of this many rays.
+const BLOCK: usize = 1024;
+
+impl Scene {
+    /// Closest hits of many rays, in order. `parallel`: spread over the device's threads.
+    pub fn intersect_many(&self, rays: &[Ray], parallel: bool, out: &mut [Hit]) -> Result<()> {
+        if rays.len() != out.len() {
+            return invalid_argument!("{} rays, but room for {} hits", rays.len(), out.len());
+        }
+        let block = |rays: &[Ray], out: &mut [Hit]| {
+            for (ray, hit) in rays.iter().zip(out) {
+                *hit = self.intersect(ray);
+            }
+        };
+        if parallel {
+            self.device()
+                .install(|| rays.par_chunks(BLOCK).zip(out.par_chunks_mut(BLOCK)).for_each(|(r, o)| block(r, o)));
+        } else {
+            block(rays, out);
+        }
+        Ok(())
+    }
+
+    /// Whether each of many rays hits anything, in order: 1 or 0.
+    pub fn occluded_many(&self, rays: &[Ray], parallel: bool, out: &mut [u8]) -> Result<()> {
+        if rays.len() != out.len() {
+            return invalid_argument!("{} rays, but room for {} answers", rays.len(), out.len());
+        }
+        let block = |rays: &[Ray], out: &mut [u8]| {
+            for (ray, o) in rays.iter().zip(out) {
+                *o = self.occluded(ray) as u8;
+            }
+        };
+        if parallel {
+            self.device()
+                .install(|| rays.par_chunks(BLOCK).zip(out.par_chunks_mut(BLOCK)).for_each(|(r, o)| block(r, o)));
+        } else {
+            block(rays, out);
+        }
+        Ok(())
+    }
+
+    /// Closest hits of rays that share an origin, `0 < t ≤ tmax`, in order. Faster than as many
+    /// single rays: the work that depends on the origin alone is done once per packet.
+    pub fn gather(
+        &self,
+        origin: Vec3,
+        directions: &[[f32; 3]],
+        tmax: f32,
+        parallel: bool,
+        out: &mut [Hit],
+    ) -> Result<()> {
+        if directions.len() != out.len() {
+            return invalid_argument!("{} directions, but room for {} hits", directions.len(), out.len());
+        }
+        let block = |directions: &[[f32; 3]], out: &mut [Hit]| {
+            let mut raw = [RawHit::MISS; PACKET_SIZE];
+            for (d, o) in directions.chunks(PACKET_SIZE).zip(out.chunks_mut(PACKET_SIZE)) {
+                let mut packet = Packet::default();
+                d.iter().for_each(|&d| packet.push(Vec3::from_array(d)));
+                self.gather_packet(origin, &packet, 0.0, tmax, &mut raw);
+                o.iter_mut().zip(&raw).for_each(|(o, &r)| *o = self.to_hit(r));
+            }
+        };
+        if parallel {
+            self.device().install(|| {
+                directions.par_chunks(BLOCK).zip(out.par_chunks_mut(BLOCK)).for_each(|(d, o)| block(d, o));
+            });
+        } else {
+            block(directions, out);
+        }
+        Ok(())
+    }
+
+    /// Closest hits of one packet, `tmin < t ≤ tmax`. Entries of `out` beyond the packet's count
+    /// are left alone.
+    #[inline]
+    pub fn gather_packet(&self, origin: Vec3, packet: &Packet, tmin: f32, tmax: f32, out: &mut [RawHit; PACKET_SIZE]) {
+        self.device().kernels().gather(self.mbvh(), origin, packet, tmin, tmax, out);
+    }
+}
