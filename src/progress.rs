@@ -127,7 +127,7 @@ mod tests {
     fn a_callback_that_says_no_cancels() {
         let p = Progress::new(|f, _| f < 0.5);
         let s = p.stage("work", 0.0, 1.0, 2);
-        assert_eq!(s.advance(1), Err(Error::Cancelled));
+        assert_eq!(s.advance(2), Err(Error::Cancelled));
         assert!(p.is_cancelled());
     }
 }
