@@ -110,7 +110,7 @@ impl Scene {
             );
         }
         let memory = device.memory().reserve(bvh::estimated_bytes(valid.len()), "the scene")?;
-        let (mbvh, sah_cost) = device.install(|| bvh::build(&corners, valid, options, progress))?;
+        let (mbvh, sah_cost) = device.install(|| bvh::build(&corners, &valid, options, progress))?;
         progress.check()?;
 
         let mut emitters = Vec::new();

@@ -11,7 +11,7 @@ pub use builtin::{BUILTIN_NAMES, Camera, builtin, builtin_camera};
 pub use commit::{Emitter, Scene, SceneStats};
 pub use light::Light;
 pub use material::{MAX_ALBEDO, Material};
-pub use mesh::{LightmapUvs, Mesh, MeshMaterials};
+pub use mesh::{LightmapUvs, Mesh, MeshMaterials, is_valid_triangle};
 
 use crate::error::{Error, Result, invalid_argument};
 
@@ -21,8 +21,9 @@ pub const NONE: u32 = u32::MAX;
 /// The most triangles in a scene: leaf references hold 28 bits.
 pub const MAX_TRIANGLES: usize = 1 << 28;
 
-/// Coordinates up to this magnitude are valid; squares and products of them stay finite in f32.
-pub const MAX_COORDINATE: f32 = 1e18;
+/// Coordinates up to this magnitude are valid: products of three of them stay finite in f32, as the
+/// triangle test needs.
+pub const MAX_COORDINATE: f32 = 1e12;
 
 /// A scene being described. Everything added is checked; a refused addition changes nothing.
 #[derive(Clone, Debug, Default)]

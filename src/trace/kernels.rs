@@ -1,56 +1,115 @@
 //! One table of kernel entry points per ISA.
+//!
+//! Each entry point carries the ISA's `#[target_feature]`s; the generic kernels are
+//! `#[inline(always)]` and so are compiled for them.
 
-use super::{PACKET_SIZE, Packet, RawHit, Ray};
+use super::{PACKET_SIZE, Packet, RawHit, Ray, gather, single};
 use crate::bvh::Mbvh;
-use crate::simd::Isa;
+use crate::simd::{self, Isa};
 use glam::Vec3;
 
+/// Kernels of one ISA. Tables exist for every ISA, but only [`Kernels::for_isa`] hands them out,
+/// and only those that the machine can run: that makes the methods safe.
 pub(crate) struct Kernels {
     pub(crate) isa: Isa,
+    intersect: unsafe fn(&Mbvh, &Ray) -> RawHit,
+    intersect_block: unsafe fn(&Mbvh, &[Ray], &mut [RawHit]),
+    occluded: unsafe fn(&Mbvh, &Ray) -> bool,
+    occluded_block: unsafe fn(&Mbvh, &[Ray], &mut [u8]),
+    gather: unsafe fn(&Mbvh, Vec3, &Packet, f32, f32, &mut [RawHit; PACKET_SIZE]),
 }
 
-impl Kernels {
-    pub(crate) fn for_isa(isa: Isa) -> &'static Kernels {
-        static T: [Kernels; 3] =
-            [Kernels { isa: Isa::Portable }, Kernels { isa: Isa::Avx2 }, Kernels { isa: Isa::Avx512 }];
-        &T[isa as usize - 1]
-    }
-    pub(crate) fn intersect(&self, bvh: &Mbvh, ray: &Ray) -> RawHit {
-        // PLACEHOLDER until the kernels land: brute force
-        let (o, d) = (Vec3::from_array(ray.origin), Vec3::from_array(ray.direction));
-        let mut best = RawHit { t: ray.tmax, ..RawHit::MISS };
-        for (id, [a, b, c]) in &bvh.tris {
-            let (e1, e2) = (*b - *a, *c - *a);
-            let p = d.cross(e2);
-            let det = e1.dot(p);
-            if det == 0.0 {
-                continue;
+macro_rules! table {
+    ($name:ident, $module:ident, $simd:ty, $isa:expr $(, $features:literal)?) => {
+        mod $module {
+            use super::*;
+            $(#[target_feature(enable = $features)])?
+            unsafe fn intersect(bvh: &Mbvh, ray: &Ray) -> RawHit {
+                // SAFETY (all): the caller vouches for the ISA.
+                unsafe { single::closest::<$simd>(bvh, ray) }
             }
-            let s = o - *a;
-            let u = s.dot(p) / det;
-            let q = s.cross(e1);
-            let v = d.dot(q) / det;
-            let t = e2.dot(q) / det;
-            if u >= 0.0 && v >= 0.0 && u + v <= 1.0 && t > ray.tmin && t <= best.t {
-                best = RawHit { t, u, v, triangle: *id };
+            $(#[target_feature(enable = $features)])?
+            unsafe fn intersect_block(bvh: &Mbvh, rays: &[Ray], out: &mut [RawHit]) {
+                for (ray, out) in rays.iter().zip(out) {
+                    *out = unsafe { single::closest::<$simd>(bvh, ray) };
+                }
             }
+            $(#[target_feature(enable = $features)])?
+            unsafe fn occluded(bvh: &Mbvh, ray: &Ray) -> bool {
+                unsafe { single::any::<$simd>(bvh, ray) }
+            }
+            $(#[target_feature(enable = $features)])?
+            unsafe fn occluded_block(bvh: &Mbvh, rays: &[Ray], out: &mut [u8]) {
+                for (ray, out) in rays.iter().zip(out) {
+                    *out = unsafe { single::any::<$simd>(bvh, ray) } as u8;
+                }
+            }
+            $(#[target_feature(enable = $features)])?
+            unsafe fn gather(bvh: &Mbvh, origin: Vec3, p: &Packet, tmin: f32, tmax: f32, out: &mut [RawHit; PACKET_SIZE]) {
+                unsafe { gather::gather::<$simd>(bvh, origin, p, tmin, tmax, out) }
+            }
+            pub(super) static TABLE: Kernels = Kernels { isa: $isa, intersect, intersect_block, occluded, occluded_block, gather };
         }
-        if best.is_miss() { RawHit::MISS } else { best }
+        use $module::TABLE as $name;
+    };
+}
+
+table!(PORTABLE, portable, simd::Portable, Isa::Portable);
+#[cfg(target_arch = "x86_64")]
+table!(AVX2, avx2, simd::Avx2, Isa::Avx2, "avx2,fma");
+#[cfg(target_arch = "x86_64")]
+table!(AVX512, avx512, simd::Avx512, Isa::Avx512, "avx2,fma,avx512f,avx512vl,avx512dq,avx512bw");
+
+impl Kernels {
+    /// The table of an ISA; of the portable one if the machine cannot run `isa`.
+    pub(crate) fn for_isa(isa: Isa) -> &'static Kernels {
+        match isa {
+            #[cfg(target_arch = "x86_64")]
+            Isa::Avx2 if isa.is_available() => &AVX2,
+            #[cfg(target_arch = "x86_64")]
+            Isa::Avx512 if isa.is_available() => &AVX512,
+            _ => &PORTABLE,
+        }
     }
+
+    /// Closest hit.
+    #[inline]
+    pub(crate) fn intersect(&self, bvh: &Mbvh, ray: &Ray) -> RawHit {
+        // SAFETY (this and below): `for_isa` checked that the machine has the ISA.
+        unsafe { (self.intersect)(bvh, ray) }
+    }
+
+    /// Closest hits of as many rays as both slices have.
+    pub(crate) fn intersect_block(&self, bvh: &Mbvh, rays: &[Ray], out: &mut [RawHit]) {
+        // SAFETY: see `intersect`.
+        unsafe { (self.intersect_block)(bvh, rays, out) }
+    }
+
+    /// Any hit.
+    #[inline]
     pub(crate) fn occluded(&self, bvh: &Mbvh, ray: &Ray) -> bool {
-        !self.intersect(bvh, ray).is_miss()
+        // SAFETY: see `intersect`.
+        unsafe { (self.occluded)(bvh, ray) }
     }
+
+    /// Any hit of as many rays as both slices have: 1 or 0.
+    pub(crate) fn occluded_block(&self, bvh: &Mbvh, rays: &[Ray], out: &mut [u8]) {
+        // SAFETY: see `intersect`.
+        unsafe { (self.occluded_block)(bvh, rays, out) }
+    }
+
+    /// Closest hits of a packet of rays from one origin.
+    #[inline]
     pub(crate) fn gather(
         &self,
         bvh: &Mbvh,
         origin: Vec3,
-        p: &Packet,
+        packet: &Packet,
         tmin: f32,
         tmax: f32,
         out: &mut [RawHit; PACKET_SIZE],
     ) {
-        for i in 0..p.count {
-            out[i] = self.intersect(bvh, &Ray::new(origin, Vec3::new(p.x[i], p.y[i], p.z[i])).within(tmin, tmax));
-        }
+        // SAFETY: see `intersect`.
+        unsafe { (self.gather)(bvh, origin, packet, tmin, tmax, out) }
     }
 }

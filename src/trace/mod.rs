@@ -4,7 +4,10 @@
 //! triangle with the lowest global number wins, on every path, so that single rays, packets and
 //! every ISA agree on coincident triangles.
 
+mod gather;
 mod kernels;
+mod single;
+mod triangle;
 
 pub(crate) use kernels::Kernels;
 
@@ -116,8 +119,10 @@ impl Scene {
             return invalid_argument!("{} rays, but room for {} hits", rays.len(), out.len());
         }
         let block = |rays: &[Ray], out: &mut [Hit]| {
-            for (ray, hit) in rays.iter().zip(out) {
-                *hit = self.intersect(ray);
+            let mut raw = [RawHit::MISS; 64];
+            for (rays, out) in rays.chunks(64).zip(out.chunks_mut(64)) {
+                self.device().kernels().intersect_block(self.mbvh(), rays, &mut raw);
+                out.iter_mut().zip(&raw).for_each(|(o, &r)| *o = self.to_hit(r));
             }
         };
         if parallel {
@@ -134,11 +139,7 @@ impl Scene {
         if rays.len() != out.len() {
             return invalid_argument!("{} rays, but room for {} answers", rays.len(), out.len());
         }
-        let block = |rays: &[Ray], out: &mut [u8]| {
-            for (ray, o) in rays.iter().zip(out) {
-                *o = self.occluded(ray) as u8;
-            }
-        };
+        let block = |rays: &[Ray], out: &mut [u8]| self.device().kernels().occluded_block(self.mbvh(), rays, out);
         if parallel {
             self.device()
                 .install(|| rays.par_chunks(BLOCK).zip(out.par_chunks_mut(BLOCK)).for_each(|(r, o)| block(r, o)));
@@ -187,3 +188,6 @@ impl Scene {
         self.device().kernels().gather(self.mbvh(), origin, packet, tmin, tmax, out);
     }
 }
+
+#[cfg(test)]
+mod tests;

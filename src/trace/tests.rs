@@ -1,0 +1,281 @@
+//! Every query on every ISA against an f64 brute-force oracle.
+
+use super::*;
+use crate::sampling::{orthonormal_basis, sobol_2d, uniform, uniform_sphere};
+use crate::{Device, DeviceOptions, Isa, Material, Mesh, Progress, SceneData};
+use glam::DVec3;
+use proptest::prelude::*;
+use std::sync::Arc;
+
+fn scene(isa: Isa, triangles: &[[Vec3; 3]], max_leaf: u32) -> Arc<Scene> {
+    let device = Device::new(DeviceOptions { isa: Some(isa), num_threads: 1, ..Default::default() }).unwrap();
+    let mut data = SceneData::new();
+    data.add_material(Material::default()).unwrap();
+    let positions: Vec<Vec3> = triangles.iter().flatten().copied().collect();
+    let indices = (0..triangles.len() as u32).map(|i| [3 * i, 3 * i + 1, 3 * i + 2]).collect();
+    data.add_mesh(Mesh { positions, indices, ..Default::default() }).unwrap();
+    let options = crate::bvh::BuildOptions { max_leaf, ..Default::default() };
+    Scene::commit(&device, data, &options, &Progress::none()).map_err(|e| e.1).unwrap()
+}
+
+/// t of the ray with a triangle's plane, and the least barycentric weight there.
+fn oracle(ray: &Ray, triangle: &[Vec3; 3]) -> Option<(f64, f64)> {
+    let [a, b, c] = triangle.map(|v| v.as_dvec3());
+    let (o, d) = (DVec3::from(ray.origin.map(f64::from)), DVec3::from(ray.direction.map(f64::from)));
+    let n = (b - a).cross(c - a);
+    let den = n.dot(d);
+    if den.abs() <= 1e-9 * n.length() * d.length() {
+        return None;
+    }
+    let t = n.dot(a - o) / den;
+    let p = o + t * d;
+    let weight = |v: DVec3, w: DVec3| (w - v).cross(p - v).dot(n) / n.length_squared();
+    Some((t, weight(b, c).min(weight(c, a)).min(weight(a, b))))
+}
+
+/// Checks a hit against all triangles; near edges either answer is right.
+fn check(ray: &Ray, triangles: &[[Vec3; 3]], hit: RawHit, what: &str) {
+    const EDGE: f64 = 1e-4;
+    let (tmin, tmax) = (ray.tmin as f64, ray.tmax as f64);
+    let near = |t: f64, e: f64| (t - e).abs() <= 2e-5 * e.abs().max(1.0);
+    for (i, triangle) in triangles.iter().enumerate() {
+        let Some((t, weight)) = oracle(ray, triangle) else { continue };
+        let certain = weight > EDGE && t > tmin && t < tmax && !near(t, tmin) && !near(t, tmax);
+        assert!(
+            !certain || hit.t as f64 <= t || near(hit.t as f64, t),
+            "{what}: {ray:?} misses {i} at {t}, has {hit:?}"
+        );
+    }
+    if !hit.is_miss() {
+        let (t, weight) = oracle(ray, &triangles[hit.triangle as usize]).expect("a ray in a plane has no hit");
+        assert!(weight > -EDGE && near(hit.t as f64, t), "{what}: {ray:?} {hit:?}, oracle t {t} weight {weight}");
+        assert!(hit.t > ray.tmin && hit.t <= ray.tmax);
+        let [a, b, c] = triangles[hit.triangle as usize];
+        let p = a + hit.u * (b - a) + hit.v * (c - a);
+        let q = Vec3::from(ray.origin) + hit.t * Vec3::from(ray.direction);
+        let scale = q.length().max(a.length()).max(1.0);
+        assert!((p - q).length() <= 1e-4 * scale, "{what}: {hit:?} barycentrics say {p}, t says {q}");
+    }
+}
+
+/// All queries of all ISAs on rays from one origin, against the oracle and each other.
+fn check_all(triangles: &[[Vec3; 3]], origin: Vec3, directions: &[[f32; 3]], tmax: f32) {
+    for isa in Isa::available() {
+        for max_leaf in [1, 3, 8] {
+            let scene = scene(isa, triangles, max_leaf);
+            let mut gathered = vec![Hit::MISS; directions.len()];
+            scene.gather(origin, directions, tmax, false, &mut gathered).unwrap();
+            let rays: Vec<Ray> = directions.iter().map(|&d| Ray::new(origin, d.into()).within(0.0, tmax)).collect();
+            let mut many = vec![Hit::MISS; rays.len()];
+            scene.intersect_many(&rays, false, &mut many).unwrap();
+            let mut occluded = vec![2; rays.len()];
+            scene.occluded_many(&rays, false, &mut occluded).unwrap();
+            for (i, ray) in rays.iter().enumerate() {
+                let hit = scene.intersect_raw(ray);
+                check(ray, triangles, hit, &format!("{isa:?} leaf {max_leaf} single"));
+                assert_eq!(scene.to_hit(hit), many[i]);
+                assert_eq!(scene.to_hit(hit), gathered[i], "{isa:?} leaf {max_leaf} gather {ray:?}");
+                assert_eq!(occluded[i] == 1, !hit.is_miss());
+                assert_eq!(scene.occluded(ray), !hit.is_miss());
+            }
+        }
+    }
+}
+
+fn soup(n: u32, size: f32, seed: u32) -> Vec<[Vec3; 3]> {
+    let p = |i, k| Vec3::new(uniform(i, k, seed), uniform(i, k + 1, seed), uniform(i, k + 2, seed)) * 2.0 - 1.0;
+    (0..n).map(|i| [p(i, 0), p(i, 0) + size * p(i, 3), p(i, 0) + size * p(i, 6)]).collect()
+}
+
+fn sphere_directions(n: u32, seed: u32) -> Vec<[f32; 3]> {
+    (0..n).map(|i| uniform_sphere(sobol_2d(i, seed)).to_array()).collect()
+}
+
+#[test]
+fn every_query_finds_the_closest_triangle_of_a_soup() {
+    for (n, size, seed) in [(1, 1.0, 1), (4, 1.0, 2), (50, 0.7, 3), (400, 0.2, 4), (3000, 0.05, 5)] {
+        let triangles = soup(n, size, seed);
+        for (k, origin) in [Vec3::ZERO, Vec3::new(0.3, -0.2, 0.5), Vec3::new(3.0, 0.1, 0.2)].into_iter().enumerate() {
+            check_all(&triangles, origin, &sphere_directions(100, k as u32), f32::INFINITY);
+            check_all(&triangles, origin, &sphere_directions(33, 7), 0.5);
+        }
+    }
+}
+
+/// Unit squares of an integer grid: the planes x, y, z = 0..n, two triangles each.
+fn grid(n: i32) -> Vec<[Vec3; 3]> {
+    let mut out = Vec::new();
+    for axis in 0..3 {
+        for k in [0, n] {
+            for i in 0..n {
+                for j in 0..n {
+                    let p = |i: i32, j: i32| {
+                        let mut v = [0.0; 3];
+                        (v[axis], v[(axis + 1) % 3], v[(axis + 2) % 3]) = (k as f32, i as f32, j as f32);
+                        Vec3::from(v)
+                    };
+                    out.push([p(i, j), p(i + 1, j), p(i + 1, j + 1)]);
+                    out.push([p(i, j), p(i + 1, j + 1), p(i, j + 1)]);
+                }
+            }
+        }
+    }
+    out
+}
+
+#[test]
+fn axis_parallel_rays_through_grid_corners_and_edges_hit_the_wall() {
+    // Rays along edges and through corners of a closed box of unit squares, with zeros of both signs.
+    let triangles = grid(4);
+    for isa in Isa::available() {
+        let scene = scene(isa, &triangles, 3);
+        for axis in 0..3 {
+            for sign in [1.0f32, -1.0] {
+                for zero in [0.0f32, -0.0] {
+                    for i in 1..=7 {
+                        for j in 1..=7 {
+                            let (mut o, mut d) = ([2.0f32; 3], [zero; 3]);
+                            d[axis] = sign;
+                            (o[(axis + 1) % 3], o[(axis + 2) % 3]) = (i as f32 / 2.0, j as f32 / 2.0);
+                            let ray = Ray { origin: o, tmin: 0.0, direction: d, tmax: f32::INFINITY };
+                            let hit = scene.intersect_raw(&ray);
+                            assert_eq!(hit.t, 2.0, "{isa:?} {ray:?} {hit:?}");
+                            assert!(scene.occluded(&ray));
+                            let mut out = [Hit::MISS; 9];
+                            scene.gather(o.into(), &[d; 9], f32::INFINITY, false, &mut out).unwrap();
+                            assert!(out.iter().all(|&h| h == scene.to_hit(hit)));
+                        }
+                    }
+                }
+            }
+        }
+    }
+}
+
+#[test]
+fn rays_in_the_plane_of_a_box_face_still_enter_the_box() {
+    // A wall across x with its border at y = 0, and rays that run exactly along y = 0.
+    let wall = [Vec3::new(5.0, 0.0, -1.0), Vec3::new(5.0, 0.0, 1.0), Vec3::new(5.0, 1.0, 0.0)];
+    for isa in Isa::available() {
+        for mirror in [1.0, -1.0] {
+            let scene = scene(isa, &[wall.map(|v| v * Vec3::new(1.0, mirror, 1.0))], 3);
+            for zero in [0.0f32, -0.0] {
+                for (ox, oz) in [(0.0, 0.25), (-1000.0, 0.0), (4.0, -0.75)] {
+                    let ray =
+                        Ray { origin: [ox, 0.0, oz], tmin: 0.0, direction: [1.0, zero, zero], tmax: f32::INFINITY };
+                    assert!(!scene.intersect_raw(&ray).is_miss(), "{isa:?} {ray:?}");
+                }
+            }
+        }
+    }
+}
+
+#[test]
+fn coincident_triangles_give_the_lowest_number_on_every_path() {
+    let triangles = [soup(40, 0.8, 8), soup(40, 0.8, 8), soup(40, 0.8, 8)].concat();
+    for isa in Isa::available() {
+        let scene = scene(isa, &triangles, 3);
+        for d in sphere_directions(500, 2) {
+            let hit = scene.intersect_raw(&Ray::new(Vec3::ZERO, d.into()));
+            assert!(hit.is_miss() || hit.triangle < 40, "{isa:?} {hit:?}");
+        }
+    }
+}
+
+#[test]
+fn unusable_rays_hit_nothing_and_extreme_lengths_do_not_matter() {
+    let triangles = grid(4);
+    let good = Ray::new(Vec3::splat(1.3), Vec3::new(0.3, -0.9, 0.2));
+    for isa in Isa::available() {
+        let scene = scene(isa, &triangles, 3);
+        let reference = scene.intersect_raw(&good);
+        for bad in [f32::NAN, f32::INFINITY, f32::NEG_INFINITY] {
+            for k in 0..3 {
+                let (mut o, mut d) = (good, good);
+                o.origin[k] = bad;
+                d.direction[k] = bad;
+                assert!(scene.intersect_raw(&o).is_miss() && !scene.occluded(&o));
+                assert!(scene.intersect_raw(&d).is_miss() && !scene.occluded(&d));
+            }
+        }
+        let zero = Ray { direction: [0.0; 3], ..good };
+        assert!(scene.intersect_raw(&zero).is_miss() && !scene.occluded(&zero));
+        for (tmin, tmax) in [(1.0, 0.5), (f32::NAN, 1.0), (0.0, f32::NAN), (0.0, -1.0), (f32::INFINITY, f32::INFINITY)]
+        {
+            assert!(scene.intersect_raw(&good.within(tmin, tmax)).is_miss(), "{tmin} {tmax}");
+        }
+        for exponent in [-100, -40, -20, -3, 3, 20, 40, 100] {
+            let s = 2f32.powi(exponent);
+            let ray = Ray { direction: good.direction.map(|d| d * s), ..good };
+            let hit = scene.intersect_raw(&ray);
+            assert_eq!((hit.triangle, hit.u, hit.v), (reference.triangle, reference.u, reference.v));
+            assert_eq!(hit.t, reference.t / s);
+            let mut out = [Hit::MISS; 2];
+            scene.gather(good.origin.into(), &[ray.direction, good.direction], f32::INFINITY, false, &mut out).unwrap();
+            assert_eq!(out, [scene.to_hit(hit), scene.to_hit(reference)]);
+        }
+        let limit = good.within(0.0, reference.t);
+        assert_eq!(scene.intersect_raw(&limit), reference, "tmax is inclusive");
+        assert_ne!(scene.intersect_raw(&good.within(reference.t, f32::INFINITY)), reference, "tmin is exclusive");
+    }
+}
+
+/// A sphere of 2 · rings · segments triangles, watertight by construction.
+fn sphere(centre: Vec3, segments: u32, rings: u32) -> Vec<[Vec3; 3]> {
+    let p = |i: u32, j: u32| {
+        let (theta, phi) = (
+            std::f64::consts::PI * j as f64 / rings as f64,
+            std::f64::consts::TAU * (i % segments) as f64 / segments as f64,
+        );
+        let r = if j == 0 || j == rings { 0.0 } else { theta.sin() };
+        centre + DVec3::new(r * phi.cos(), r * phi.sin(), theta.cos()).as_vec3()
+    };
+    let mut out = Vec::new();
+    for j in 0..rings {
+        for i in 0..segments {
+            out.push([p(i, j), p(i, j + 1), p(i + 1, j + 1)]);
+            out.push([p(i, j), p(i + 1, j + 1), p(i + 1, j)]);
+        }
+    }
+    out.retain(|t| crate::scene::is_valid_triangle(*t));
+    out
+}
+
+#[test]
+fn no_ray_leaks_between_the_triangles_of_an_edge_of_a_closed_sphere() {
+    let triangles = sphere(Vec3::ZERO, 40, 20);
+    for isa in Isa::available() {
+        let scene = scene(isa, &triangles, 3);
+        let mut leaks = 0;
+        for (i, t) in triangles.iter().enumerate() {
+            for k in 0..3 {
+                for s in 0..8 {
+                    let x = uniform(i as u32, 8 * k + s, 3);
+                    let target = t[k as usize].lerp(t[(k as usize + 1) % 3], x);
+                    let o = uniform_sphere(sobol_2d(i as u32, 11 + k)) * 0.5;
+                    leaks += scene.intersect_raw(&Ray::new(o, target - o)).is_miss() as u32;
+                }
+            }
+        }
+        assert_eq!(leaks, 0, "{isa:?}");
+    }
+}
+
+proptest! {
+    #![proptest_config(ProptestConfig { cases: 64, failure_persistence: None, ..ProptestConfig::default() })]
+
+    #[test]
+    fn queries_agree_on_random_scenes(n in 1u32..200, size in 0.01f32..2.0, seed: u32, ox in -1.5f32..1.5, oy in -1.5f32..1.5, count in 1usize..70) {
+        check_all(&soup(n, size, seed), Vec3::new(ox, oy, 0.1), &sphere_directions(count as u32, seed ^ 5), f32::INFINITY);
+    }
+
+    #[test]
+    fn narrow_packets_agree_with_single_rays(n in 50u32..500, seed: u32, width in 0.0f32..0.3) {
+        let axis = uniform_sphere(sobol_2d(seed, 1));
+        let (t, b) = orthonormal_basis(axis);
+        let directions: Vec<_> = (0..32)
+            .map(|i| { let [x, y] = sobol_2d(i, seed); (axis + width * (x - 0.5) * t + width * (y - 0.5) * b).to_array() })
+            .collect();
+        check_all(&soup(n, 0.3, seed), Vec3::ZERO, &directions, f32::INFINITY);
+    }
+}
