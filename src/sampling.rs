@@ -63,17 +63,22 @@ fn sobol_second(index: u32) -> u32 {
 
 /// [0, 1): 24 bits, so that the result is never rounded up to 1.
 #[inline]
-fn unit_float(x: u32) -> f32 {
+pub fn unit_float(x: u32) -> f32 {
     (x >> 8) as f32 * (1.0 / (1 << 24) as f32)
 }
 
 /// Point `index` of an Owen-scrambled Sobol (0,2)-sequence chosen by `seed`.
 #[inline]
 pub fn sobol_2d(index: u32, seed: u32) -> [f32; 2] {
+    sobol_2d_bits(index, seed).map(unit_float)
+}
+
+/// The same in fixed point: 32 binary digits behind the point. XOR with a constant per coordinate
+/// (a digital shift) gives another (0,2)-sequence with the same points in each elementary interval.
+#[inline]
+pub fn sobol_2d_bits(index: u32, seed: u32) -> [u32; 2] {
     let shuffled = owen_scramble(index, combine(seed, 0));
-    let x = owen_scramble(shuffled.reverse_bits(), combine(seed, 1));
-    let y = owen_scramble(sobol_second(shuffled), combine(seed, 2));
-    [unit_float(x), unit_float(y)]
+    [owen_scramble(shuffled.reverse_bits(), combine(seed, 1)), owen_scramble(sobol_second(shuffled), combine(seed, 2))]
 }
 
 /// A uniform pseudo-random number in [0, 1), independent in all arguments.

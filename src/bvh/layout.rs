@@ -1,5 +1,6 @@
 //! Memory layout of the 4-wide tree.
 
+use crate::simd::prefetch;
 use bytemuck::{Pod, Zeroable};
 use glam::Vec3;
 
@@ -143,6 +144,18 @@ impl Mbvh {
     /// Bytes of nodes and leaves.
     pub fn bytes(&self) -> usize {
         self.nodes.len() * size_of::<Node>() + self.leaves.len() * size_of::<f32>()
+    }
+
+    /// Asks for the memory of a child that will be visited soon.
+    #[inline(always)]
+    pub(crate) fn prefetch(&self, child: ChildRef) {
+        let p = if child.is_leaf() {
+            self.leaves.as_ptr().wrapping_add(LEAF_STRIDE * child.leaf_slot()).cast::<u8>()
+        } else {
+            self.nodes.as_ptr().wrapping_add(child.node_index()).cast::<u8>()
+        };
+        prefetch(p);
+        prefetch(p.wrapping_add(64));
     }
 
     /// Pointer to the first row of a leaf; [`LEAF_PAD`] floats behind the last leaf are readable.

@@ -8,7 +8,7 @@ mod material;
 mod mesh;
 
 pub use builtin::{BUILTIN_NAMES, Camera, builtin, builtin_camera};
-pub use commit::{Emitter, Scene, SceneStats};
+pub use commit::{Emitter, Scene, SceneStats, unit_normal};
 pub use light::Light;
 pub use material::{MAX_ALBEDO, Material};
 pub use mesh::{LightmapUvs, Mesh, MeshMaterials, is_valid_triangle};

@@ -385,7 +385,7 @@ pub(super) unsafe fn gather<S: Simd>(
             RawHit::MISS
         } else {
             let (u, v) = barycentrics(state.u[i], state.v[i], state.sum[i]);
-            RawHit { t: state.t[i], u, v, triangle }
+            RawHit { t: state.t[i], u, v, triangle, front: state.sum[i] < 0.0 }
         };
     }
 }

@@ -4,6 +4,7 @@
 //! triangle with the lowest global number wins, on every path, so that single rays, packets and
 //! every ISA agree on coincident triangles.
 
+pub mod baseline;
 mod gather;
 mod kernels;
 mod single;
@@ -50,11 +51,13 @@ pub struct RawHit {
     pub v: f32,
     /// Global triangle number.
     pub triangle: u32,
+    /// Whether the ray met the front, from which the corners go round counter-clockwise.
+    pub front: bool,
 }
 
 impl RawHit {
     /// No hit.
-    pub const MISS: RawHit = RawHit { t: f32::INFINITY, u: 0.0, v: 0.0, triangle: NONE };
+    pub const MISS: RawHit = RawHit { t: f32::INFINITY, u: 0.0, v: 0.0, triangle: NONE, front: false };
 
     /// Whether nothing was hit.
     #[inline]

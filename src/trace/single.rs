@@ -135,7 +135,7 @@ pub(super) struct Best {
     pub triangle: u32,
     pub u: f32,
     pub v: f32,
-    /// u + v + w.
+    /// u + v + w: twice normal · direction, so negative on the front.
     pub sum: f32,
 }
 
@@ -151,7 +151,7 @@ impl Best {
             return RawHit::MISS;
         }
         let (u, v) = barycentrics(self.u, self.v, self.sum);
-        RawHit { t: self.t, u, v, triangle: self.triangle }
+        RawHit { t: self.t, u, v, triangle: self.triangle, front: self.sum < 0.0 }
     }
 }
 
@@ -258,6 +258,7 @@ pub(super) unsafe fn traverse<S: Simd, const ANY: bool>(
                     current = node.children[first];
                     continue;
                 }
+                bvh.prefetch(node.children[first]);
                 // Insertion into the stack in order of falling distance: the nearest ends on top.
                 let base = top;
                 stack[top].write(Entry { child: node.children[first], near: near[first] });
@@ -266,6 +267,7 @@ pub(super) unsafe fn traverse<S: Simd, const ANY: bool>(
                     let i = mask.trailing_zeros() as usize;
                     mask &= mask - 1;
                     let e = Entry { child: node.children[i], near: near[i] };
+                    bvh.prefetch(e.child);
                     let mut j = top;
                     if !ANY {
                         while j > base {

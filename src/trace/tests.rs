@@ -50,6 +50,9 @@ fn check(ray: &Ray, triangles: &[[Vec3; 3]], hit: RawHit, what: &str) {
         let (t, weight) = oracle(ray, &triangles[hit.triangle as usize]).expect("a ray in a plane has no hit");
         assert!(weight > -EDGE && near(hit.t as f64, t), "{what}: {ray:?} {hit:?}, oracle t {t} weight {weight}");
         assert!(hit.t > ray.tmin && hit.t <= ray.tmax);
+        let normal = crate::scene::unit_normal(triangles[hit.triangle as usize]);
+        let facing = normal.dot(Vec3::from(ray.direction).normalize());
+        assert!(facing.abs() < 1e-5 || hit.front == (facing < 0.0), "{what}: {hit:?} {facing}");
         let [a, b, c] = triangles[hit.triangle as usize];
         let p = a + hit.u * (b - a) + hit.v * (c - a);
         let q = Vec3::from(ray.origin) + hit.t * Vec3::from(ray.direction);
@@ -99,6 +102,17 @@ fn every_query_finds_the_closest_triangle_of_a_soup() {
             check_all(&triangles, origin, &sphere_directions(100, k as u32), f32::INFINITY);
             check_all(&triangles, origin, &sphere_directions(33, 7), 0.5);
         }
+    }
+}
+
+#[test]
+fn the_baseline_finds_the_same_triangles() {
+    let triangles = soup(2000, 0.1, 4);
+    let ids: Vec<u32> = (0..2000).collect();
+    let binary = crate::bvh::BinaryBvh::build(&triangles, &ids, &Default::default(), &Progress::none()).unwrap();
+    for d in sphere_directions(2000, 3) {
+        let ray = Ray::new(Vec3::new(0.1, 0.2, 0.3), d.into());
+        check(&ray, &triangles, baseline::closest(&binary, &triangles, &ray), "baseline");
     }
 }
 
