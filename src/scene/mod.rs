@@ -64,6 +64,26 @@ impl SceneData {
         Ok(self.lights.len() as u32 - 1)
     }
 
+    /// Moves all of `other` behind what is here; its material numbers are shifted. A refusal changes
+    /// nothing here.
+    pub fn append(&mut self, mut other: SceneData) -> Result<()> {
+        let total = self.triangle_count() + other.triangle_count();
+        if total > MAX_TRIANGLES {
+            return invalid_argument!("the scene would have {total} triangles, more than {MAX_TRIANGLES}");
+        }
+        let shift = self.materials.len() as u32;
+        for mesh in &mut other.meshes {
+            match &mut mesh.materials {
+                MeshMaterials::One(m) => *m += shift,
+                MeshMaterials::PerTriangle(materials) => materials.iter_mut().for_each(|m| *m += shift),
+            }
+        }
+        self.meshes.append(&mut other.meshes);
+        self.materials.append(&mut other.materials);
+        self.lights.append(&mut other.lights);
+        Ok(())
+    }
+
     /// Replaces light `id`.
     pub fn set_light(&mut self, id: u32, light: Light) -> Result<()> {
         light.validate()?;

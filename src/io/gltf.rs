@@ -1,0 +1,491 @@
+//! glTF 2.0 and GLB: the triangles of the default scene with node transforms applied.
+//!
+//! - Albedo is `baseColorFactor` (textures are not read, metalness is ignored), emission is
+//!   `emissiveFactor` × `KHR_materials_emissive_strength`, sidedness is `doubleSided`.
+//! - `TEXCOORD_0` becomes [`Mesh::uvs`], `TEXCOORD_1` the light map coordinates. Their page is the
+//!   number of the material's texture that uses them, among all textures that are used so (as our
+//!   own export writes them), else 0. A mesh that several nodes show has no unique coordinates: none
+//!   are taken.
+//! - `KHR_lights_punctual`: candela is taken as W/sr and lux as W/m²; `range` is ignored.
+//! - Nodes that mirror flip the winding. Skins and morph targets stay in their rest pose.
+//! - Buffers: the binary chunk, data URIs, files beside the scene. Sparse accessors are read,
+//!   `KHR_mesh_quantization` too; compressed geometry is refused as unsupported.
+//!
+//! The crate `gltf` reads the JSON; accessors are read here, because the crate's readers trust sizes
+//! in the file.
+
+use super::{Import, is_valid_position};
+use crate::error::{Error, Result};
+use crate::scene::{Light, LightmapUvs, Mesh, MeshMaterials, NONE};
+use base64::Engine;
+use glam::{DMat3, DMat4, DVec3, Mat4, Vec2, Vec3};
+use gltf::accessor::{DataType, Dimensions};
+use gltf::json;
+use gltf::khr_lights_punctual::Kind;
+use gltf::mesh::{Mode, Semantic};
+use std::collections::{BTreeSet, HashMap};
+use std::path::Path;
+
+/// Required extensions that change nothing about shapes: they may be ignored.
+const HARMLESS_EXTENSIONS: [&str; 5] =
+    ["KHR_materials_", "KHR_texture_", "EXT_texture_", "KHR_mesh_quantization", "KHR_xmp"];
+
+pub(super) fn load(import: &mut Import) -> Result<()> {
+    let bytes = std::fs::read(&import.path).map_err(|e| import.error(e))?;
+    let (document, blob) = parse(import, &bytes)?;
+    drop(bytes);
+    let buffers = document
+        .buffers()
+        .map(|buffer| read_buffer(import, &buffer, blob.as_deref()))
+        .collect::<Result<Vec<Vec<u8>>>>()?;
+    let mut reader = Reader {
+        buffers,
+        materials: HashMap::new(),
+        pages: lightmap_pages(&document),
+        mesh_uses: vec![0; document.meshes().len()],
+        triangles: 0,
+        textured: BTreeSet::new(),
+        skipped_primitives: 0,
+        place: String::new(),
+        import,
+    };
+    let placed = place_nodes(reader.import, &document)?;
+    for mesh in placed.iter().filter_map(|(node, _)| node.mesh()) {
+        reader.mesh_uses[mesh.index()] += 1;
+    }
+    for (node, transform) in &placed {
+        if let Some(light) = node.light() {
+            reader.add_light(&light, transform)?;
+        }
+        for primitive in node.mesh().iter().flat_map(|mesh| mesh.primitives()) {
+            let mesh = node.mesh().map_or(0, |mesh| mesh.index());
+            reader.place = format!("mesh {mesh}, primitive {}", primitive.index());
+            reader.add_primitive(&primitive, transform, reader.mesh_uses[mesh] == 1)?;
+        }
+    }
+    reader.warn(&document);
+    if import.scene.triangle_count() == 0 {
+        return Err(import.error("there are no triangles in it"));
+    }
+    Ok(())
+}
+
+fn parse(import: &Import, bytes: &[u8]) -> Result<(gltf::Document, Option<Vec<u8>>)> {
+    // The crate subtracts the header's size from the length that the header states.
+    if bytes.starts_with(b"glTF") {
+        let stated = bytes.get(8..12).map_or(0, |b| u32::from_le_bytes([b[0], b[1], b[2], b[3]]));
+        if stated < 12 {
+            return Err(import.error("the GLB header is cut off"));
+        }
+    }
+    let parsed = gltf::Gltf::from_slice_without_validation(bytes).map_err(|e| explain(import, e))?;
+    let (blob, mut root) = (parsed.blob, parsed.document.into_json());
+    root.extensions_required.retain(|e| !HARMLESS_EXTENSIONS.iter().any(|harmless| e.starts_with(harmless)));
+    // The crate's validation looks at the positions' accessor before it has checked its number.
+    for (m, mesh) in root.meshes.iter().enumerate() {
+        for attributes in mesh.primitives.iter().map(|p| &p.attributes) {
+            if let Some(a) = attributes.get(&json::validation::Checked::Valid(Semantic::Positions))
+                && a.value() >= root.accessors.len()
+            {
+                let count = root.accessors.len();
+                return Err(import.error(format_args!("mesh {m} names accessor {a}, there are {count}")));
+            }
+        }
+    }
+    let document = gltf::Document::from_json(root).map_err(|e| explain(import, e))?;
+    Ok((document, blob))
+}
+
+fn explain(import: &Import, e: gltf::Error) -> Error {
+    match e {
+        gltf::Error::Validation(errors) => match errors.first() {
+            Some((path, json::validation::Error::Unsupported)) => {
+                Error::Unsupported(format!("{}: it requires {path}", import.path.display()))
+            }
+            Some((path, what)) => import.error(format_args!("{path}: {what}")),
+            None => import.error("it is not valid"),
+        },
+        gltf::Error::Binary(e) => import.error(format_args!("GLB: {e}")),
+        e => import.error(e),
+    }
+}
+
+/// The bytes of a buffer, at least as many as it says.
+fn read_buffer(import: &Import, buffer: &gltf::Buffer, blob: Option<&[u8]>) -> Result<Vec<u8>> {
+    let fail = |what: &dyn std::fmt::Display| import.error(format_args!("buffer {}: {what}", buffer.index()));
+    let bytes = match buffer.source() {
+        gltf::buffer::Source::Bin => blob.ok_or_else(|| fail(&"there is no binary chunk and no uri"))?.to_vec(),
+        gltf::buffer::Source::Uri(uri) => match uri.strip_prefix("data:") {
+            Some(data) => {
+                let (_, text) = data.split_once(";base64,").ok_or_else(|| fail(&"a data URI without base64"))?;
+                base64::prelude::BASE64_STANDARD.decode(text.trim_end()).map_err(|e| fail(&e))?
+            }
+            None => {
+                let name = percent_decoded(uri).ok_or_else(|| fail(&format_args!("the uri {uri:?}")))?;
+                if name.contains("://") {
+                    return Err(Error::Unsupported(format!(
+                        "{}: buffer {} is at {name:?}, not beside the scene",
+                        import.path.display(),
+                        buffer.index()
+                    )));
+                }
+                let path = import.path.parent().unwrap_or(Path::new("")).join(&name);
+                std::fs::read(&path).map_err(|e| fail(&format_args!("{}: {e}", path.display())))?
+            }
+        },
+    };
+    if bytes.len() < buffer.length() {
+        return Err(fail(&format_args!("it has {} bytes, not {}", bytes.len(), buffer.length())));
+    }
+    Ok(bytes)
+}
+
+/// `%20` and the like resolved; `None` if malformed.
+fn percent_decoded(uri: &str) -> Option<String> {
+    let mut bytes = Vec::with_capacity(uri.len());
+    let mut rest = uri.as_bytes();
+    while let [first, tail @ ..] = rest {
+        rest = tail;
+        if *first == b'%' {
+            let hex = std::str::from_utf8(tail.get(..2)?).ok()?;
+            bytes.push(u8::from_str_radix(hex, 16).ok()?);
+            rest = &tail[2..];
+        } else {
+            bytes.push(*first);
+        }
+    }
+    String::from_utf8(bytes).ok()
+}
+
+/// The nodes of the default scene (or the first, or all roots) with their transforms to the world,
+/// parents before children, in the order of the file.
+fn place_nodes<'a>(import: &Import, document: &'a gltf::Document) -> Result<Vec<(gltf::Node<'a>, DMat4)>> {
+    let roots: Vec<_> = match document.default_scene().or_else(|| document.scenes().next()) {
+        Some(scene) => scene.nodes().collect(),
+        None => {
+            let children: BTreeSet<_> = document.nodes().flat_map(|n| n.children()).map(|n| n.index()).collect();
+            document.nodes().filter(|n| !children.contains(&n.index())).collect()
+        }
+    };
+    let mut seen = vec![false; document.nodes().len()];
+    let mut placed = Vec::new();
+    let mut stack: Vec<_> = roots.into_iter().rev().map(|node| (node, DMat4::IDENTITY)).collect();
+    while let Some((node, parent)) = stack.pop() {
+        if std::mem::replace(&mut seen[node.index()], true) {
+            return Err(import.error(format_args!("node {} has several parents", node.index())));
+        }
+        let transform = parent * Mat4::from_cols_array_2d(&node.transform().matrix()).as_dmat4();
+        stack.extend(node.children().map(|child| (child, transform)).collect::<Vec<_>>().into_iter().rev());
+        placed.push((node, transform));
+    }
+    Ok(placed)
+}
+
+/// Texture that a material reads through `TEXCOORD_1`.
+fn lightmap_texture(material: &gltf::Material) -> Option<usize> {
+    let base = material.pbr_metallic_roughness().base_color_texture();
+    let textures = [
+        base.map(|t| (t.tex_coord(), t.texture().index())),
+        material.occlusion_texture().map(|t| (t.tex_coord(), t.texture().index())),
+        material.emissive_texture().map(|t| (t.tex_coord(), t.texture().index())),
+    ];
+    textures.into_iter().flatten().find(|(tex_coord, _)| *tex_coord == 1).map(|(_, texture)| texture)
+}
+
+/// The light map page of each texture that is used as one.
+fn lightmap_pages(document: &gltf::Document) -> HashMap<usize, u32> {
+    let textures: BTreeSet<_> = document.materials().filter_map(|m| lightmap_texture(&m)).collect();
+    textures.into_iter().zip(0..).collect()
+}
+
+struct Reader<'i> {
+    import: &'i mut Import,
+    buffers: Vec<Vec<u8>>,
+    /// Our material by theirs; `None` is glTF's default material.
+    materials: HashMap<Option<usize>, u32>,
+    pages: HashMap<usize, u32>,
+    /// How many nodes show each mesh.
+    mesh_uses: Vec<u32>,
+    triangles: usize,
+    /// Materials with a base colour texture.
+    textured: BTreeSet<usize>,
+    skipped_primitives: u32,
+    /// The primitive at hand, for errors.
+    place: String,
+}
+
+impl Reader<'_> {
+    fn malformed<T>(&self, what: impl std::fmt::Display) -> Result<T> {
+        Err(self.import.error(format_args!("{}: {what}", self.place)))
+    }
+
+    fn add_light(&mut self, light: &gltf::khr_lights_punctual::Light, transform: &DMat4) -> Result<()> {
+        let position = transform.w_axis.truncate().as_vec3();
+        // Lights shine along their node's -z axis. In f64, so that extreme scales keep a direction.
+        let direction = (-transform.z_axis.truncate()).normalize_or_zero().as_vec3();
+        let color = light.color().map(|c| c * light.intensity());
+        let light = match light.kind() {
+            Kind::Point => Light::Point { position, intensity: color },
+            Kind::Spot { inner_cone_angle: inner, outer_cone_angle: outer } => {
+                Light::Spot { position, direction, inner, outer, intensity: color }
+            }
+            Kind::Directional => Light::Directional { direction, irradiance: color },
+        };
+        let number = self.import.scene.lights().len();
+        match self.import.scene.add_light(light) {
+            Ok(_) => Ok(()),
+            Err(Error::InvalidArgument(what)) => Err(self.import.error(format_args!("light {number}: {what}"))),
+            Err(e) => Err(e),
+        }
+    }
+
+    fn material(&mut self, material: &gltf::Material) -> Result<u32> {
+        if let Some(id) = self.materials.get(&material.index()) {
+            return Ok(*id);
+        }
+        let pbr = material.pbr_metallic_roughness();
+        if let (Some(texture), Some(index)) = (pbr.base_color_texture(), material.index())
+            && texture.tex_coord() != 1
+        {
+            self.textured.insert(index);
+        }
+        let [r, g, b, _] = pbr.base_color_factor();
+        let strength = material.emissive_strength().unwrap_or(1.0);
+        let emission = material.emissive_factor().map(|e| e * strength);
+        if let Err(Error::InvalidArgument(what)) = crate::scene::check_energy("the emission", &emission) {
+            return self.malformed(what);
+        }
+        let id = self.import.add_material([r, g, b], emission, material.double_sided())?;
+        self.materials.insert(material.index(), id);
+        Ok(id)
+    }
+
+    /// Adds a primitive as a mesh. `unique`: no other node shows it.
+    fn add_primitive(&mut self, primitive: &gltf::Primitive, transform: &DMat4, unique: bool) -> Result<()> {
+        let mode = primitive.mode();
+        if !matches!(mode, Mode::Triangles | Mode::TriangleStrip | Mode::TriangleFan) {
+            self.skipped_primitives += 1;
+            return Ok(());
+        }
+        let Some(accessor) = primitive.get(&Semantic::Positions) else { return self.malformed("it has no positions") };
+        let positions = self.vectors::<3>(&accessor)?;
+        let corners = match primitive.indices() {
+            Some(indices) => self.indices(&indices, positions.len())?,
+            None => (0..positions.len() as u32).collect(),
+        };
+        let mut indices = match triangles_of(mode, &corners) {
+            Some(indices) => indices,
+            None => return self.malformed(format_args!("{} vertices do not make triangles", corners.len())),
+        };
+        self.triangles += indices.len();
+        self.import.check_triangle_count(self.triangles)?;
+        if transform.determinant() < 0.0 {
+            indices.iter_mut().for_each(|t| t.swap(1, 2));
+        }
+        let used = keep_used(&mut indices, positions.len());
+        let mut mesh = Mesh { indices, ..Default::default() };
+        for &v in &used {
+            let position = transform.transform_point3(Vec3::from(positions[v as usize]).as_dvec3()).as_vec3();
+            if !is_valid_position(position) {
+                return self.malformed(format_args!("vertex {v} is {position}, not finite or out of range"));
+            }
+            mesh.positions.push(position);
+        }
+        mesh.normals = self.normals(primitive, transform, &used, positions.len())?;
+        mesh.uvs = self.uvs(primitive, 0, &used, positions.len())?;
+        let material = primitive.material();
+        let lightmap_uvs = if unique { self.uvs(primitive, 1, &used, positions.len())? } else { Vec::new() };
+        if !lightmap_uvs.is_empty() {
+            let page = lightmap_texture(&material).and_then(|t| self.pages.get(&t)).copied().unwrap_or(0);
+            let pages = if page == 0 { Vec::new() } else { vec![page; mesh.indices.len()] };
+            mesh.lightmap = Some(LightmapUvs { uvs: lightmap_uvs, pages });
+        }
+        mesh.materials = MeshMaterials::One(self.material(&material)?);
+        match mesh.indices.is_empty() {
+            true => Ok(()),
+            false => self.import.add_mesh(mesh),
+        }
+    }
+
+    fn normals(
+        &self,
+        primitive: &gltf::Primitive,
+        transform: &DMat4,
+        used: &[u32],
+        vertices: usize,
+    ) -> Result<Vec<Vec3>> {
+        let Some(accessor) = primitive.get(&Semantic::Normals) else { return Ok(Vec::new()) };
+        let normals = self.vectors::<3>(&accessor)?;
+        if normals.len() != vertices {
+            return self.malformed(format_args!("it has {} normals for {vertices} vertices", normals.len()));
+        }
+        // The cofactor matrix: the inverse transpose without the division by the determinant. Its
+        // sign turns normals round where the winding is turned too.
+        let m = DMat3::from_mat4(*transform);
+        let flip = if m.determinant() < 0.0 { -1.0 } else { 1.0 };
+        let cofactors =
+            DMat3::from_cols(m.y_axis.cross(m.z_axis), m.z_axis.cross(m.x_axis), m.x_axis.cross(m.y_axis)) * flip;
+        let turn = |n: [f32; 3]| -> DVec3 { (cofactors * Vec3::from(n).as_dvec3()).normalize_or_zero() };
+        Ok(used.iter().map(|&v| turn(normals[v as usize]).as_vec3()).collect())
+    }
+
+    /// Texture coordinates of the used vertices; empty if there are none.
+    fn uvs(&self, primitive: &gltf::Primitive, set: u32, used: &[u32], vertices: usize) -> Result<Vec<Vec2>> {
+        let Some(accessor) = primitive.get(&Semantic::TexCoords(set)) else { return Ok(Vec::new()) };
+        let uvs = self.vectors::<2>(&accessor)?;
+        if uvs.len() != vertices {
+            return self.malformed(format_args!("TEXCOORD_{set} has {} entries for {vertices} vertices", uvs.len()));
+        }
+        if let Some(v) = used.iter().find(|v| !uvs[**v as usize].iter().all(|x| x.is_finite())) {
+            return self.malformed(format_args!("TEXCOORD_{set} of vertex {v} is not finite"));
+        }
+        Ok(used.iter().map(|&v| Vec2::from(uvs[v as usize])).collect())
+    }
+
+    /// The buffer view that holds an accessor's values. (Without one they would all be zeros, so many
+    /// as the file likes to say.)
+    fn base_view<'a>(&self, accessor: &gltf::Accessor<'a>) -> Result<gltf::buffer::View<'a>> {
+        match accessor.view() {
+            Some(view) => Ok(view),
+            None => self.malformed(format_args!("accessor {} has no buffer view", accessor.index())),
+        }
+    }
+
+    /// The `count` elements of `size` bytes in a buffer view, checked to lie in it.
+    fn elements(
+        &self,
+        view: gltf::buffer::View,
+        offset: usize,
+        count: usize,
+        size: usize,
+    ) -> Result<impl Iterator<Item = &[u8]> + use<'_>> {
+        let stride = view.stride().unwrap_or(size);
+        if stride < size || stride == 0 {
+            return self.malformed(format_args!("buffer view {} has stride {stride}, less than {size}", view.index()));
+        }
+        let buffer = &self.buffers[view.buffer().index()];
+        let bytes = view.offset().checked_add(view.length()).and_then(|end| buffer.get(view.offset()..end));
+        let wanted = match count {
+            0 => Some(0),
+            _ => stride.checked_mul(count - 1).and_then(|n| n.checked_add(size)),
+        };
+        let end = wanted.and_then(|n| n.checked_add(offset));
+        match bytes.and_then(|bytes| bytes.get(offset..end?)) {
+            Some(bytes) => Ok(bytes.chunks(stride).map(move |chunk| &chunk[..size])),
+            None => self.malformed(format_args!("{count} elements do not fit into buffer view {}", view.index())),
+        }
+    }
+
+    /// An accessor of `N` components each, integers converted to floats.
+    fn vectors<const N: usize>(&self, accessor: &gltf::Accessor) -> Result<Vec<[f32; N]>> {
+        if accessor.dimensions() != if N == 2 { Dimensions::Vec2 } else { Dimensions::Vec3 } {
+            return self.malformed(format_args!("accessor {} is not of {N}-vectors", accessor.index()));
+        }
+        let (data_type, normalized) = (accessor.data_type(), accessor.normalized());
+        let (part, size) = (data_type.size(), data_type.size() * N);
+        let decode = |bytes: &[u8]| std::array::from_fn(|k| component(&bytes[k * part..], data_type, normalized));
+        let view = self.base_view(accessor)?;
+        let mut vectors: Vec<[f32; N]> =
+            self.elements(view, accessor.offset(), accessor.count(), size)?.map(decode).collect();
+        if let Some(sparse) = accessor.sparse() {
+            let index_type = match sparse.indices().index_type() {
+                gltf::accessor::sparse::IndexType::U8 => DataType::U8,
+                gltf::accessor::sparse::IndexType::U16 => DataType::U16,
+                gltf::accessor::sparse::IndexType::U32 => DataType::U32,
+            };
+            let indices = sparse.indices();
+            let at = self.elements(indices.view(), indices.offset(), sparse.count(), index_type.size())?;
+            let values = self.elements(sparse.values().view(), sparse.values().offset(), sparse.count(), size)?;
+            for (i, value) in at.map(|bytes| unsigned(bytes, index_type)).zip(values) {
+                let count = vectors.len();
+                let Some(vector) = vectors.get_mut(i as usize) else {
+                    return self.malformed(format_args!("a sparse value is for element {i}, there are {count}"));
+                };
+                *vector = decode(value);
+            }
+        }
+        Ok(vectors)
+    }
+
+    /// Vertex numbers, checked to be less than `vertices`.
+    fn indices(&self, accessor: &gltf::Accessor, vertices: usize) -> Result<Vec<u32>> {
+        let data_type = accessor.data_type();
+        let unsigned_type = matches!(data_type, DataType::U8 | DataType::U16 | DataType::U32);
+        if accessor.dimensions() != Dimensions::Scalar || !unsigned_type || accessor.sparse().is_some() {
+            return self.malformed(format_args!("accessor {} is not of plain unsigned integers", accessor.index()));
+        }
+        let view = self.base_view(accessor)?;
+        let elements = self.elements(view, accessor.offset(), accessor.count(), data_type.size())?;
+        let indices: Vec<u32> = elements.map(|bytes| unsigned(bytes, data_type)).collect();
+        match indices.iter().find(|i| **i as usize >= vertices) {
+            Some(i) => self.malformed(format_args!("an index names vertex {i}, there are {vertices}")),
+            None => Ok(indices),
+        }
+    }
+
+    fn warn(&mut self, document: &gltf::Document) {
+        let uses =
+            self.mesh_uses.iter().zip(document.meshes()).filter(|(uses, mesh)| {
+                **uses > 1 && mesh.primitives().any(|p| p.get(&Semantic::TexCoords(1)).is_some())
+            });
+        let shared = uses.count();
+        for (count, what) in [
+            (self.textured.len(), "materials have a base colour texture, which is not read"),
+            (self.skipped_primitives as usize, "primitives are points or lines and were ignored"),
+            (document.skins().len(), "skins are left in their rest pose"),
+            (shared, "meshes appear several times, so their TEXCOORD_1 is not unique and was left out"),
+        ] {
+            if count > 0 {
+                self.import.warn(format!("{count} {what}"));
+            }
+        }
+    }
+}
+
+/// One component as a float; `normalized` integers map to [0, 1] or [-1, 1] (glTF 2.0, 3.6.2.2).
+fn component(bytes: &[u8], data_type: DataType, normalized: bool) -> f32 {
+    let (value, full) = match data_type {
+        DataType::I8 => (bytes[0] as i8 as f32, i8::MAX as f32),
+        DataType::U8 => (bytes[0] as f32, u8::MAX as f32),
+        DataType::I16 => (i16::from_le_bytes([bytes[0], bytes[1]]) as f32, i16::MAX as f32),
+        DataType::U16 => (u16::from_le_bytes([bytes[0], bytes[1]]) as f32, u16::MAX as f32),
+        DataType::U32 => (u32::from_le_bytes([bytes[0], bytes[1], bytes[2], bytes[3]]) as f32, u32::MAX as f32),
+        DataType::F32 => return f32::from_le_bytes([bytes[0], bytes[1], bytes[2], bytes[3]]),
+    };
+    if normalized { (value / full).max(-1.0) } else { value }
+}
+
+/// A little-endian unsigned integer of 1, 2 or 4 bytes.
+fn unsigned(bytes: &[u8], data_type: DataType) -> u32 {
+    match data_type {
+        DataType::U8 => bytes[0] as u32,
+        DataType::U16 => u16::from_le_bytes([bytes[0], bytes[1]]) as u32,
+        _ => u32::from_le_bytes([bytes[0], bytes[1], bytes[2], bytes[3]]),
+    }
+}
+
+/// The triangles that a list of vertices stands for (glTF 2.0, 3.7.2.1); `None` if it is too short.
+fn triangles_of(mode: Mode, corners: &[u32]) -> Option<Vec<[u32; 3]>> {
+    if corners.len() < 3 || (mode == Mode::Triangles && !corners.len().is_multiple_of(3)) {
+        return None;
+    }
+    Some(match mode {
+        Mode::TriangleStrip => {
+            let ordered = |(i, w): (usize, &[u32])| if i % 2 == 0 { [w[0], w[1], w[2]] } else { [w[0], w[2], w[1]] };
+            corners.windows(3).enumerate().map(ordered).collect()
+        }
+        Mode::TriangleFan => corners[1..].windows(2).map(|w| [corners[0], w[0], w[1]]).collect(),
+        _ => corners.as_chunks::<3>().0.to_vec(),
+    })
+}
+
+/// Renumbers vertices so that only used ones remain, in their order, and returns their old numbers.
+/// (Primitives often share one large vertex buffer.)
+fn keep_used(triangles: &mut [[u32; 3]], vertices: usize) -> Vec<u32> {
+    let mut number = vec![NONE; vertices];
+    triangles.iter().flatten().for_each(|&v| number[v as usize] = 0);
+    let used: Vec<u32> = (0..vertices as u32).filter(|&v| number[v as usize] == 0).collect();
+    used.iter().zip(0..).for_each(|(&v, new)| number[v as usize] = new);
+    triangles.iter_mut().flatten().for_each(|v| *v = number[*v as usize]);
+    used
+}

@@ -1,0 +1,194 @@
+//! Image files: OpenEXR for values, PNG for looking at, and the tone mapping between them.
+//!
+//! Rows are written in the order in which they are given, nothing is flipped: row 0 of a light map
+//! page is v = 0 and becomes the top row of the file, which is where glTF and Vulkan have v = 0.
+//! (OpenGL tools that expect v = 0 at the bottom show such files upside down.)
+
+use crate::error::{Error, Result, invalid_argument};
+use image::ExtendedColorType::{L8, Rgb8, Rgb32F};
+use image::ImageEncoder;
+use image::codecs::openexr::OpenExrEncoder;
+use image::codecs::png::{CompressionType, FilterType, PngEncoder};
+use std::io::Cursor;
+use std::path::Path;
+
+/// Writes linear RGB values as an OpenEXR file of 32-bit floats.
+pub fn write_exr(path: &Path, width: u32, height: u32, pixels: &[[f32; 3]]) -> Result<()> {
+    check_size(width, height, pixels.len())?;
+    let mut file = Cursor::new(Vec::new());
+    let bytes = bytemuck::cast_slice(pixels);
+    OpenExrEncoder::new(&mut file).write_image(bytes, width, height, Rgb32F).map_err(|e| fail(path, e))?;
+    write(path, file.get_ref())
+}
+
+/// Writes single values as an OpenEXR file of 32-bit floats, the same in R, G and B.
+pub fn write_exr_grey(path: &Path, width: u32, height: u32, pixels: &[f32]) -> Result<()> {
+    write_exr(path, width, height, &pixels.iter().map(|&v| [v; 3]).collect::<Vec<_>>())
+}
+
+/// Writes sRGB colours as a PNG file.
+pub fn write_png_rgb8(path: &Path, width: u32, height: u32, pixels: &[[u8; 3]]) -> Result<()> {
+    write(path, &encode_png_rgb8(width, height, pixels)?)
+}
+
+/// Writes grey values as a PNG file.
+pub fn write_png_grey8(path: &Path, width: u32, height: u32, pixels: &[u8]) -> Result<()> {
+    check_size(width, height, pixels.len())?;
+    write(path, &encode_png(width, height, pixels, L8).map_err(|e| fail(path, e))?)
+}
+
+/// The bytes of a PNG file of sRGB colours.
+pub fn encode_png_rgb8(width: u32, height: u32, pixels: &[[u8; 3]]) -> Result<Vec<u8>> {
+    check_size(width, height, pixels.len())?;
+    encode_png(width, height, pixels.as_flattened(), Rgb8).map_err(|e| Error::Io(format!("encoding a PNG: {e}")))
+}
+
+fn encode_png(width: u32, height: u32, bytes: &[u8], color: image::ExtendedColorType) -> image::ImageResult<Vec<u8>> {
+    let mut png = Vec::new();
+    PngEncoder::new_with_quality(&mut png, CompressionType::Default, FilterType::Adaptive)
+        .write_image(bytes, width, height, color)?;
+    Ok(png)
+}
+
+fn check_size(width: u32, height: u32, pixels: usize) -> Result<()> {
+    if pixels == 0 || width as u64 * height as u64 != pixels as u64 {
+        return invalid_argument!("an image of {width} × {height} pixels is given by {pixels} values");
+    }
+    Ok(())
+}
+
+fn write(path: &Path, bytes: &[u8]) -> Result<()> {
+    std::fs::write(path, bytes).map_err(|e| fail(path, e))
+}
+
+fn fail(path: &Path, e: impl std::fmt::Display) -> Error {
+    Error::Io(format!("{}: {e}", path.display()))
+}
+
+/// Where [`tone_map`] starts to bend, in units of white.
+const SHOULDER: f32 = 0.6;
+
+/// Linear radiance or irradiance to an sRGB colour: times `exposure`, then a curve that is linear up
+/// to [`SHOULDER`] and from there approaches 1 exponentially, without a kink, then the sRGB transfer
+/// function. The curve works on the largest channel and the others follow in proportion, so hue and
+/// saturation stay. Values that are negative or not numbers count as 0.
+pub fn tone_map(exposure: f32, rgb: [f32; 3]) -> [u8; 3] {
+    let exposed = rgb.map(|c| (c * exposure).clamp(0.0, 1e30)).map(|c| if c.is_nan() { 0.0 } else { c });
+    let largest = exposed.iter().fold(0.0f32, |a, &c| a.max(c));
+    let scale = if largest > SHOULDER {
+        let room = 1.0 - SHOULDER;
+        (SHOULDER + room * (1.0 - (-(largest - SHOULDER) / room).exp())) / largest
+    } else {
+        1.0
+    };
+    exposed.map(|c| (srgb_from_linear(c * scale) * 255.0).round() as u8)
+}
+
+/// The sRGB transfer function (IEC 61966-2-1), [0, 1] to [0, 1].
+pub fn srgb_from_linear(c: f32) -> f32 {
+    if c <= 0.003_130_8 { 12.92 * c } else { 1.055 * c.powf(1.0 / 2.4) - 0.055 }
+}
+
+/// Luminance of linear RGB (Rec. 709 primaries).
+pub fn luminance([r, g, b]: [f32; 3]) -> f32 {
+    0.2126 * r + 0.7152 * g + 0.0722 * b
+}
+
+/// The percentile of luminance that automatic exposure shows at [`SHOULDER`]: a tenth of what is
+/// lit, typically patches of sun, goes into the bend.
+const EXPOSURE_PERCENTILE: f64 = 0.9;
+
+/// An exposure for [`tone_map`]: it brings the 90th percentile of the luminance to 0.6 of white. Only
+/// pixels that `mask` includes by their number count, and of those only lit, finite ones; 1 if there
+/// are none.
+pub fn auto_exposure(pixels: &[[f32; 3]], mask: impl Fn(usize) -> bool) -> f32 {
+    let included = pixels.iter().enumerate().filter(|(i, _)| mask(*i));
+    let mut lit: Vec<f32> = included.map(|(_, p)| luminance(*p)).filter(|l| *l > 0.0 && l.is_finite()).collect();
+    if lit.is_empty() {
+        return 1.0;
+    }
+    let rank = ((lit.len() - 1) as f64 * EXPOSURE_PERCENTILE) as usize;
+    let (_, percentile, _) = lit.select_nth_unstable_by(rank, f32::total_cmp);
+    (SHOULDER / *percentile).clamp(f32::MIN_POSITIVE, f32::MAX)
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use crate::io::tests::Folder;
+
+    #[test]
+    fn exr_files_keep_every_bit_and_row_order() {
+        let folder = Folder::new();
+        let path = folder.path("a.exr");
+        let pixels = [[0.0, 1e-20, 1e20], [1.0, 2.5, -3.0], [0.1, 0.2, 0.3], [f32::MAX, 7.0, 8.0], [4.0; 3], [5.0; 3]];
+        write_exr(&path, 2, 3, &pixels).unwrap();
+        let back = image::open(&path).unwrap().into_rgb32f();
+        assert_eq!(back.dimensions(), (2, 3));
+        assert_eq!(back.as_raw()[..], *pixels.as_flattened());
+        write_exr_grey(&path, 3, 1, &[1.0, 0.5, 0.25]).unwrap();
+        assert_eq!(image::open(&path).unwrap().into_rgb32f().as_raw()[3..6], [0.5; 3]);
+    }
+
+    #[test]
+    fn png_files_keep_colors_and_row_order() {
+        let folder = Folder::new();
+        let path = folder.path("a.png");
+        let pixels = [[0, 1, 2], [255, 254, 253], [9, 8, 7], [100, 50, 25]];
+        write_png_rgb8(&path, 1, 4, &pixels).unwrap();
+        let back = image::open(&path).unwrap().into_rgb8();
+        assert_eq!(back.dimensions(), (1, 4));
+        assert_eq!(back.as_raw()[..], *pixels.as_flattened());
+        write_png_grey8(&path, 2, 1, &[3, 200]).unwrap();
+        assert_eq!(image::open(&path).unwrap().into_luma8().as_raw()[..], [3, 200]);
+    }
+
+    #[test]
+    fn wrong_sizes_and_places_are_errors() {
+        let folder = Folder::new();
+        let e = write_png_rgb8(&folder.path("a.png"), 2, 2, &[[0; 3]; 3]).unwrap_err();
+        assert_eq!(e, Error::InvalidArgument("an image of 2 × 2 pixels is given by 3 values".into()));
+        assert!(matches!(write_exr(&folder.path("a.exr"), 0, 5, &[]), Err(Error::InvalidArgument(_))));
+        let nowhere = folder.path("no/a.exr");
+        let Err(Error::Io(message)) = write_exr(&nowhere, 1, 1, &[[1.0; 3]]) else { panic!("written") };
+        assert!(message.contains("a.exr"), "{message}");
+    }
+
+    #[test]
+    fn the_curve_is_srgb_below_the_shoulder_and_monotonic_above() {
+        assert_eq!(tone_map(1.0, [0.0; 3]), [0; 3]);
+        // 0.2140 is mid grey in sRGB: 0.5.
+        assert_eq!(tone_map(2.0, [0.107, 0.107, 0.107]), [128, 128, 128]);
+        let levels: Vec<u8> = (0..1000).map(|i| tone_map(1.0, [i as f32 * 0.01; 3])[0]).collect();
+        assert!(levels.is_sorted());
+        assert_eq!(levels[999], 255);
+        assert!(levels[100] < 250, "white is reached only far above 1");
+        for odd in [f32::NAN, -1.0, f32::NEG_INFINITY] {
+            assert_eq!(tone_map(1.0, [odd; 3]), [0; 3]);
+        }
+        assert_eq!(tone_map(1.0, [f32::INFINITY; 3]), [255; 3]);
+    }
+
+    #[test]
+    fn the_shoulder_keeps_the_hue() {
+        let linear = |c: u8| {
+            let c = c as f64 / 255.0;
+            if c <= 0.04045 { c / 12.92 } else { ((c + 0.055) / 1.055).powf(2.4) }
+        };
+        let [r, g, b] = tone_map(1.0, [8.0, 4.0, 2.0]).map(linear);
+        assert!((g / r - 0.5).abs() < 0.01 && (b / r - 0.25).abs() < 0.01, "{r} {g} {b}");
+    }
+
+    #[test]
+    fn automatic_exposure_follows_the_light_and_the_mask() {
+        let mut pixels = vec![[2.0; 3]; 100];
+        pixels.extend([[f32::NAN; 3], [0.0; 3], [-1.0; 3], [f32::INFINITY; 3]]);
+        pixels.extend([[1000.0; 3]; 100]);
+        let exposure = auto_exposure(&pixels, |i| i < 104);
+        assert!((exposure - 0.3).abs() < 1e-6, "{exposure}");
+        assert!((auto_exposure(&pixels, |i| i >= 104) - 0.0006).abs() < 1e-9);
+        assert_eq!(auto_exposure(&pixels, |_| false), 1.0);
+        // A few bright pixels change nothing.
+        assert_eq!(auto_exposure(&pixels, |i| i < 109), exposure);
+    }
+}

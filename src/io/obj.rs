@@ -1,0 +1,419 @@
+//! Wavefront OBJ: polygons with materials and, by a convention of ours, light map coordinates.
+//!
+//! - Polygons are split into fans from their first corner, in file order.
+//! - `usemtl NAME|lmN`: the `vt` of the faces that follow are light map coordinates on page N, as
+//!   exported from game levels; a negative N means that they have none. The material is the exact
+//!   name if a library has it, else what stands before the `|`. Other `vt` become
+//!   [`Mesh::uvs`], unchanged.
+//! - Normals and coordinates belong to whole meshes here and to single faces in the file: a new mesh
+//!   starts wherever faces with begin or end. So triangles keep their global order.
+//! - Groups, smoothing and free forms are ignored, and points and lines too.
+//!
+//! Why not the crate `tobj` (which the tests compare with): it forgets the names of materials that no
+//! library describes, and with them the light map pages; makes triangles of lines and two-cornered
+//! faces; mixes up coordinates when only some faces have them; panics on `Kd 0.5` and, where
+//! overflow is checked, on out-of-range indices; and says no line. It takes about as long.
+
+use super::mtl::{self, Library, finite, split_keyword};
+use super::{DEFAULT_ALBEDO, Import, TWO_SIDED_UNLESS_SAID, is_valid_position};
+use crate::error::{Error, Result};
+use crate::scene::{LightmapUvs, Mesh, MeshMaterials, NONE};
+use glam::{Vec2, Vec3};
+use std::collections::HashMap;
+use std::fmt::Display;
+use std::fs::File;
+use std::io::{BufRead, BufReader};
+use std::ops::Range;
+
+/// Light map pages run below this: a page costs memory even if almost empty.
+const MAX_PAGES: i64 = 4096;
+
+pub(super) fn load(import: &mut Import) -> Result<()> {
+    let file = File::open(&import.path).map_err(|e| import.error(e))?;
+    let mut reader = Reader::new(import);
+    reader.read(&mut BufReader::with_capacity(1 << 20, file))?;
+    reader.finish()
+}
+
+/// A `usemtl` name.
+struct Name {
+    text: Vec<u8>,
+    /// What its `vt` are.
+    coordinates: Coordinates,
+    /// Faces that use it.
+    faces: u64,
+}
+
+#[derive(Clone, Copy, PartialEq)]
+enum Coordinates {
+    Texture,
+    Lightmap(u32),
+    Nothing,
+}
+
+/// What the faces of one mesh have in common.
+#[derive(Clone, Copy, Default, PartialEq)]
+struct Kind {
+    lightmap: bool,
+    uvs: bool,
+    normals: bool,
+}
+
+/// Position, texture coordinate and normal of a corner, from 0; [`NONE`] where there is none.
+type Corner = [u32; 3];
+
+struct Reader<'a> {
+    import: &'a mut Import,
+    line: usize,
+    positions: Vec<Vec3>,
+    uvs: Vec<Vec2>,
+    normals: Vec<Vec3>,
+    library: Library,
+    names: Vec<Name>,
+    name_ids: HashMap<Vec<u8>, u32>,
+    /// Number of the current name.
+    name: u32,
+    kind: Kind,
+    /// The mesh being filled; its materials are numbers of names.
+    mesh: Mesh,
+    triangle_names: Vec<u32>,
+    pages: Vec<u32>,
+    vertex_of: HashMap<Corner, u32>,
+    done: Vec<(Mesh, Vec<u32>)>,
+    triangles: usize,
+    /// Corners of the face being read.
+    corners: Vec<Corner>,
+    ignored_elements: u64,
+    faces_without_lightmap_uvs: u64,
+}
+
+impl<'a> Reader<'a> {
+    fn new(import: &'a mut Import) -> Self {
+        Reader {
+            import,
+            line: 0,
+            positions: Vec::new(),
+            uvs: Vec::new(),
+            normals: Vec::new(),
+            library: Library::new(),
+            names: vec![Name { text: Vec::new(), coordinates: Coordinates::Texture, faces: 0 }],
+            name_ids: HashMap::from([(Vec::new(), 0)]),
+            name: 0,
+            kind: Kind::default(),
+            mesh: Mesh::default(),
+            triangle_names: Vec::new(),
+            pages: Vec::new(),
+            vertex_of: HashMap::new(),
+            done: Vec::new(),
+            triangles: 0,
+            corners: Vec::new(),
+            ignored_elements: 0,
+            faces_without_lightmap_uvs: 0,
+        }
+    }
+
+    fn error(&self, what: impl Display) -> Error {
+        self.import.error(format_args!("line {}: {what}", self.line))
+    }
+
+    fn read(&mut self, source: &mut impl BufRead) -> Result<()> {
+        let mut text = Vec::new();
+        loop {
+            text.clear();
+            let mut lines = 0;
+            // A backslash at its end continues a line.
+            loop {
+                let read = source.read_until(b'\n', &mut text).map_err(|e| self.import.error(e))?;
+                lines += (read > 0) as usize;
+                let used = text.trim_ascii_end().len();
+                if read == 0 || text[..used].last() != Some(&b'\\') {
+                    break;
+                }
+                text.truncate(used - 1);
+                text.push(b' ');
+            }
+            if lines == 0 {
+                return Ok(());
+            }
+            self.line += 1;
+            self.statement(&text)?;
+            self.line += lines - 1;
+        }
+    }
+
+    fn statement(&mut self, text: &[u8]) -> Result<()> {
+        let (keyword, rest) = split_keyword(text);
+        match keyword {
+            b"v" => self.position(rest),
+            b"vt" => self.texture_coordinate(rest),
+            b"vn" => self.normal(rest),
+            b"f" | b"fo" => self.face(rest),
+            b"usemtl" => self.use_material(rest),
+            b"mtllib" => self.open_libraries(rest),
+            b"p" | b"l" | b"curv" | b"curv2" | b"surf" => {
+                self.ignored_elements += 1;
+                Ok(())
+            }
+            _ => Ok(()),
+        }
+    }
+
+    /// `N` numbers of which the first `required` must be there; the others are 0.
+    fn numbers<const N: usize>(&self, keyword: &str, text: &[u8], required: usize) -> Result<[f32; N]> {
+        let mut values = [0.0; N];
+        let mut words = words(text);
+        for (i, value) in values.iter_mut().enumerate() {
+            match words.next() {
+                Some(word) => *value = finite(word).map_err(|what| self.error(format_args!("{keyword} {what}")))?,
+                None if i < required => {
+                    return Err(self.error(format_args!("{keyword} has {i} numbers, not {required}")));
+                }
+                None => {}
+            }
+        }
+        Ok(values)
+    }
+
+    fn position(&mut self, text: &[u8]) -> Result<()> {
+        let p = Vec3::from(self.numbers("v", text, 3)?);
+        if !is_valid_position(p) {
+            return Err(self.error(format_args!("the vertex {p} is out of range")));
+        }
+        self.positions.push(p);
+        Ok(())
+    }
+
+    fn texture_coordinate(&mut self, text: &[u8]) -> Result<()> {
+        let uv = Vec2::from(self.numbers("vt", text, 1)?);
+        self.uvs.push(uv);
+        Ok(())
+    }
+
+    fn normal(&mut self, text: &[u8]) -> Result<()> {
+        let n = Vec3::from(self.numbers("vn", text, 3)?);
+        self.normals.push(n.as_dvec3().normalize_or_zero().as_vec3());
+        Ok(())
+    }
+
+    fn use_material(&mut self, name: &[u8]) -> Result<()> {
+        if let Some(&id) = self.name_ids.get(name) {
+            self.name = id;
+            return Ok(());
+        }
+        let coordinates = coordinates_of(name).map_err(|what| self.error(what))?;
+        self.name = self.names.len() as u32;
+        self.name_ids.insert(name.to_vec(), self.name);
+        self.names.push(Name { text: name.to_vec(), coordinates, faces: 0 });
+        Ok(())
+    }
+
+    /// `mtllib NAME…`: the rest of the line as one file name, or, as the format says, several names.
+    fn open_libraries(&mut self, names: &[u8]) -> Result<()> {
+        let folder = self.import.path.parent().unwrap_or(std::path::Path::new("")).to_owned();
+        let names = String::from_utf8_lossy(names).into_owned();
+        let files = if folder.join(&names).is_file() { vec![&names[..]] } else { names.split_whitespace().collect() };
+        for name in files {
+            let path = folder.join(name);
+            match File::open(&path) {
+                Ok(file) => mtl::read(&mut BufReader::new(file), &path, &mut self.library)?,
+                Err(e) => self.import.warn(format!("the material library {name:?} cannot be opened ({e})")),
+            }
+        }
+        Ok(())
+    }
+
+    fn face(&mut self, text: &[u8]) -> Result<()> {
+        let mut corners = std::mem::take(&mut self.corners);
+        corners.clear();
+        for word in words(text) {
+            corners.push(self.corner(word)?);
+        }
+        if corners.len() < 3 {
+            return Err(self.error(format_args!("a face has {} corners, fewer than 3", corners.len())));
+        }
+        self.triangles += corners.len() - 2;
+        self.import.check_triangle_count(self.triangles)?;
+        self.import.info.faces_triangulated += (corners.len() > 3) as u64;
+        self.add_face(&corners);
+        self.corners = corners;
+        Ok(())
+    }
+
+    /// `v`, `v/vt`, `v//vn` or `v/vt/vn`, from 1, or negative: back from the last.
+    fn corner(&self, word: &[u8]) -> Result<Corner> {
+        let mut corner = [NONE; 3];
+        let counts = [self.positions.len(), self.uvs.len(), self.normals.len()];
+        let mut parts = word.split(|&c| c == b'/');
+        for (k, what) in ["vertex", "texture coordinate", "normal"].into_iter().enumerate() {
+            let part = parts.next().unwrap_or_default();
+            if part.is_empty() && k > 0 {
+                continue;
+            }
+            let number = integer(part)
+                .ok_or_else(|| self.error(format_args!("a face has the corner {:?}", String::from_utf8_lossy(word))))?;
+            let count = counts[k] as i64;
+            let index = if number < 0 { count + number } else { number - 1 };
+            if !(0..count.min(NONE as i64)).contains(&index) {
+                return Err(self.error(format_args!("a face names {what} {number}, so far there are {count}")));
+            }
+            corner[k] = index as u32;
+        }
+        if parts.next().is_some() {
+            return Err(self.error(format_args!("a face has the corner {:?}", String::from_utf8_lossy(word))));
+        }
+        Ok(corner)
+    }
+
+    fn add_face(&mut self, corners: &[Corner]) {
+        let name = &mut self.names[self.name as usize];
+        name.faces += 1;
+        let has = |k: usize| corners.iter().all(|c| c[k] != NONE);
+        let mut kind = Kind { normals: has(2), ..Kind::default() };
+        match name.coordinates {
+            Coordinates::Texture => kind.uvs = has(1),
+            Coordinates::Lightmap(_) => {
+                kind.lightmap = has(1);
+                self.faces_without_lightmap_uvs += !kind.lightmap as u64;
+            }
+            Coordinates::Nothing => {}
+        }
+        let page = if let Coordinates::Lightmap(page) = name.coordinates { page } else { 0 };
+        if kind != self.kind {
+            self.finish_mesh();
+            self.kind = kind;
+        }
+        let mut fan = corners.iter().map(|&c| self.vertex(c)).collect::<Vec<_>>().into_iter();
+        let (Some(first), Some(mut previous)) = (fan.next(), fan.next()) else { return };
+        for next in fan {
+            self.mesh.indices.push([first, previous, next]);
+            self.triangle_names.push(self.name);
+            if kind.lightmap {
+                self.pages.push(page);
+            }
+            previous = next;
+        }
+    }
+
+    /// The vertex of the current mesh for a corner.
+    fn vertex(&mut self, [v, vt, vn]: Corner) -> u32 {
+        let Kind { lightmap, uvs, normals } = self.kind;
+        let key = [v, if uvs || lightmap { vt } else { NONE }, if normals { vn } else { NONE }];
+        *self.vertex_of.entry(key).or_insert_with(|| {
+            let mesh = &mut self.mesh;
+            mesh.positions.push(self.positions[v as usize]);
+            if uvs || lightmap {
+                mesh.uvs.push(self.uvs[vt as usize]);
+            }
+            if normals {
+                mesh.normals.push(self.normals[vn as usize]);
+            }
+            mesh.positions.len() as u32 - 1
+        })
+    }
+
+    fn finish_mesh(&mut self) {
+        self.vertex_of.clear();
+        let mut mesh = std::mem::take(&mut self.mesh);
+        let pages = std::mem::take(&mut self.pages);
+        let names = std::mem::take(&mut self.triangle_names);
+        if mesh.indices.is_empty() {
+            return;
+        }
+        if self.kind.lightmap {
+            mesh.lightmap = Some(LightmapUvs { uvs: std::mem::take(&mut mesh.uvs), pages });
+        }
+        self.done.push((mesh, names));
+    }
+
+    fn finish(mut self) -> Result<()> {
+        self.finish_mesh();
+        if self.done.is_empty() {
+            return Err(self.import.error("there are no faces in it"));
+        }
+        let materials = self.add_materials()?;
+        for (mut mesh, mut names) in std::mem::take(&mut self.done) {
+            names.iter_mut().for_each(|name| *name = materials[*name as usize]);
+            mesh.materials = match names.iter().all(|m| *m == names[0]) {
+                true => MeshMaterials::One(names[0]),
+                false => MeshMaterials::PerTriangle(names),
+            };
+            self.import.add_mesh(mesh)?;
+        }
+        self.warn();
+        Ok(())
+    }
+
+    /// Adds the materials that faces use, in the order of their names' first use, and returns the
+    /// material of each name. Names without a description share one grey material.
+    fn add_materials(&mut self) -> Result<Vec<u32>> {
+        let mut by_entry = HashMap::<Option<&[u8]>, u32>::new();
+        let mut materials = vec![NONE; self.names.len()];
+        let (mut unknown, mut textured) = (Vec::new(), 0);
+        for (name, material) in self.names.iter().zip(&mut materials).filter(|(name, _)| name.faces > 0) {
+            let base = base_name(&name.text);
+            let (key, entry) = match (self.library.get(&name.text), self.library.get(base)) {
+                (Some(entry), _) => (Some(&name.text[..]), *entry),
+                (None, Some(entry)) => (Some(base), *entry),
+                (None, None) => (None, mtl::Entry::default()),
+            };
+            if key.is_none() && !name.text.is_empty() {
+                unknown.push(String::from_utf8_lossy(base));
+            }
+            *material = match by_entry.get(&key) {
+                Some(id) => *id,
+                None => {
+                    textured += entry.textured as u32;
+                    let albedo = entry.albedo.unwrap_or([DEFAULT_ALBEDO; 3]);
+                    let id = self.import.add_material(albedo, entry.emission, TWO_SIDED_UNLESS_SAID)?;
+                    by_entry.insert(key, id);
+                    id
+                }
+            };
+        }
+        unknown.sort();
+        unknown.dedup();
+        if let [first, ..] = &unknown[..] {
+            let what = format!("{} materials have no description (first: {first:?}) and are grey", unknown.len());
+            self.import.warn(what);
+        }
+        if textured > 0 {
+            self.import.warn(format!("the textures (map_Kd) of {textured} materials are not read; Kd is used"));
+        }
+        Ok(materials)
+    }
+
+    fn warn(&mut self) {
+        if self.ignored_elements > 0 {
+            self.import.warn(format!("{} points, lines and free forms were ignored", self.ignored_elements));
+        }
+        if self.faces_without_lightmap_uvs > 0 {
+            let count = self.faces_without_lightmap_uvs;
+            self.import.warn(format!("{count} faces name a light map page but have no texture coordinates"));
+        }
+    }
+}
+
+/// The words of a line up to a comment.
+fn words(text: &[u8]) -> impl Iterator<Item = &[u8]> {
+    text.split(|c| c.is_ascii_whitespace()).filter(|w| !w.is_empty()).take_while(|w| w[0] != b'#')
+}
+
+fn integer(text: &[u8]) -> Option<i64> {
+    std::str::from_utf8(text).ok()?.parse().ok()
+}
+
+/// A material name without what stands behind the last `|`.
+fn base_name(name: &[u8]) -> &[u8] {
+    &name[..name.iter().rposition(|c| *c == b'|').unwrap_or(name.len())]
+}
+
+/// What the `vt` of a material's faces are: `…|lmN` says light map page N, a negative N nothing.
+fn coordinates_of(name: &[u8]) -> std::result::Result<Coordinates, String> {
+    let suffix: Range<usize> = (base_name(name).len() + 1).min(name.len())..name.len();
+    match name[suffix].strip_prefix(b"lm").and_then(integer) {
+        None => Ok(Coordinates::Texture),
+        Some(page) if page < 0 => Ok(Coordinates::Nothing),
+        Some(page) if page < MAX_PAGES => Ok(Coordinates::Lightmap(page as u32)),
+        Some(page) => Err(format!("light map page {page} is not below {MAX_PAGES}")),
+    }
+}
