@@ -6,6 +6,7 @@ mod commit;
 mod light;
 mod material;
 mod mesh;
+pub mod shapes;
 
 pub use builtin::{BUILTIN_NAMES, Camera, builtin, builtin_camera};
 pub use commit::{Emitter, Scene, SceneStats, unit_normal};
