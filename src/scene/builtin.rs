@@ -1,11 +1,12 @@
 //! Scenes made by code, for tests, examples and first steps.
 
-use super::{Light, Material, Mesh, MeshMaterials, SceneData};
+use super::shapes::MeshBuilder;
+use super::{Light, Material, SceneData};
 use crate::error::{Result, invalid_argument};
 use glam::Vec3;
 
 /// The names that [`builtin`] knows.
-pub const BUILTIN_NAMES: &[&str] = &["cornell", "furnace", "atrium"];
+pub const BUILTIN_NAMES: &[&str] = &["cornell", "furnace", "sealed"];
 
 /// A pinhole camera.
 #[derive(Clone, Copy, Debug, PartialEq)]
@@ -17,36 +18,186 @@ pub struct Camera {
     pub fov_y: f32,
 }
 
-/// A built-in scene by name, with its lights.
+/// A built-in scene by name, with its lights. Units are metres, y is up.
 ///
-/// - `cornell`: the Cornell box with the classic reflectances and its ceiling light as a rect light.
-/// - `furnace`: a closed unit cube seen from inside, emission 1, albedo 0.5.
-/// - `atrium`: two floors around a court, columns, arches, drapes; a rect light and a sun.
+/// - `cornell`: the Cornell box with its measured dimensions, open in front; white walls
+///   (0.725, 0.71, 0.68), red on the left, green on the right. Its ceiling light is a rect light of
+///   radiance (17, 12, 4) just below the ceiling. Mesh 0 is the room, 1 the short block, 2 the tall one.
+/// - `furnace`: a closed unit cube seen from inside, emission 1, albedo 0.5. Everywhere the
+///   irradiance is π · 1 / (1 − 0.5) = 2π.
+/// - `sealed`: a closed box that hangs in a lit room. Mesh 0 is the room, 1 the inside of the box,
+///   where the irradiance is exactly 0, 2 its outside, one centimetre away.
 pub fn builtin(name: &str) -> Result<SceneData> {
     match name {
-        "furnace" => furnace(0.5),
+        "cornell" => cornell(),
+        "furnace" => furnace(),
+        "sealed" => sealed(),
         _ => invalid_argument!("there is no built-in scene {name:?}; there are {}", BUILTIN_NAMES.join(", ")),
     }
 }
 
 /// The camera for the pictures of a built-in scene.
 pub fn builtin_camera(name: &str) -> Option<Camera> {
-    let _ = name;
-    None
+    let looking = |position, target, fov_y| Some(Camera { position, target, up: Vec3::Y, fov_y });
+    match name {
+        // The original's: 25 mm of film behind 35 mm of focal length.
+        "cornell" => looking(Vec3::new(2.78, 2.73, -8.0), Vec3::new(2.78, 2.73, 0.0), 2.0 * (12.5f32 / 35.0).atan()),
+        "furnace" => looking(Vec3::new(0.1, 0.5, 0.1), Vec3::new(0.6, 0.4, 0.6), 1.2),
+        "sealed" => looking(Vec3::new(0.3, 2.4, 0.3), Vec3::new(2.2, 1.2, 2.2), 1.2),
+        _ => None,
+    }
 }
 
-fn furnace(albedo: f32) -> Result<SceneData> {
+fn diffuse(albedo: [f32; 3]) -> Material {
+    Material { albedo, ..Default::default() }
+}
+
+/// Goral et al., *Modeling the Interaction of Light between Diffuse Surfaces* (1984), with the
+/// measurements that Cornell's graphics program published, in centimetres there.
+fn cornell() -> Result<SceneData> {
     let mut scene = SceneData::new();
-    let m = scene.add_material(Material { albedo: [albedo; 3], emission: [1.0; 3], two_sided: false })?;
-    let mut mesh = Mesh { materials: MeshMaterials::One(m), ..Default::default() };
-    let corner = |i: u32| Vec3::new((i & 1) as f32, (i >> 1 & 1) as f32, (i >> 2 & 1) as f32);
-    // Each face counter-clockwise seen from inside.
-    for [a, b, c, d] in [[0, 1, 3, 2], [4, 6, 7, 5], [0, 4, 5, 1], [2, 3, 7, 6], [0, 2, 6, 4], [1, 5, 7, 3]] {
-        let base = mesh.positions.len() as u32;
-        mesh.positions.extend([a, b, c, d].map(corner));
-        mesh.indices.extend([[base, base + 1, base + 2], [base, base + 2, base + 3]]);
+    let white = scene.add_material(diffuse([0.725, 0.71, 0.68]))?;
+    let red = scene.add_material(diffuse([0.63, 0.065, 0.05]))?;
+    let green = scene.add_material(diffuse([0.14, 0.45, 0.091]))?;
+    let p = |x: f32, y: f32, z: f32| Vec3::new(x, y, z) / 100.0;
+
+    let floor = [p(552.8, 0.0, 0.0), p(0.0, 0.0, 0.0), p(0.0, 0.0, 559.2), p(549.6, 0.0, 559.2)];
+    let ceiling = [p(556.0, 548.8, 0.0), p(556.0, 548.8, 559.2), p(0.0, 548.8, 559.2), p(0.0, 548.8, 0.0)];
+    let mut room = MeshBuilder::new();
+    let mut wall = |[a, b, c, d]: [Vec3; 4], material| room.quad(a, b, c, d, material);
+    wall(floor, white);
+    wall(ceiling, white);
+    wall([floor[3], floor[2], ceiling[2], ceiling[1]], white);
+    wall([floor[2], floor[1], ceiling[3], ceiling[2]], green);
+    wall([floor[0], floor[3], ceiling[1], ceiling[0]], red);
+    scene.add_mesh(room.finish())?;
+
+    let short = [[130.0, 65.0], [82.0, 225.0], [240.0, 272.0], [290.0, 114.0]];
+    let tall = [[423.0, 247.0], [265.0, 296.0], [314.0, 456.0], [472.0, 406.0]];
+    for (height, plan) in [(165.0, short), (330.0, tall)] {
+        // The plan is counter-clockwise from above; a hexahedron's corners 2 and 3 are the other way round.
+        let corner = |i: usize| {
+            let [x, z] = plan[[0, 1, 3, 2][i % 4]];
+            p(x, if i < 4 { 0.0 } else { height }, z)
+        };
+        let mut block = MeshBuilder::new();
+        block.hexahedron(std::array::from_fn(corner), false, white);
+        scene.add_mesh(block.finish())?;
     }
-    scene.add_mesh(mesh)?;
-    let _: Option<Light> = None;
+    scene.add_light(Light::Rect {
+        position: p(213.0, 548.7, 227.0),
+        edge_u: p(130.0, 0.0, 0.0),
+        edge_v: p(0.0, 0.0, 105.0),
+        radiance: [17.0, 12.0, 4.0],
+    })?;
     Ok(scene)
+}
+
+fn furnace() -> Result<SceneData> {
+    let mut scene = SceneData::new();
+    let walls = scene.add_material(Material { albedo: [0.5; 3], emission: [1.0; 3], two_sided: false })?;
+    let mut cube = MeshBuilder::new();
+    cube.box_(Vec3::ZERO, Vec3::ONE, true, walls);
+    scene.add_mesh(cube.finish())?;
+    Ok(scene)
+}
+
+fn sealed() -> Result<SceneData> {
+    let mut scene = SceneData::new();
+    let white = scene.add_material(diffuse([0.7; 3]))?;
+    let (lower, upper) = (Vec3::new(1.5, 0.8, 1.5), Vec3::new(2.5, 1.8, 2.5));
+    let wall = Vec3::splat(0.01);
+    for (lower, upper, inward) in
+        [(Vec3::ZERO, Vec3::new(4.0, 3.0, 4.0), true), (lower, upper, true), (lower - wall, upper + wall, false)]
+    {
+        let mut mesh = MeshBuilder::new();
+        mesh.box_(lower, upper, inward, white);
+        scene.add_mesh(mesh.finish())?;
+    }
+    scene.add_light(Light::Rect {
+        position: Vec3::new(1.5, 2.99, 1.5),
+        edge_u: Vec3::X,
+        edge_v: Vec3::Z,
+        radiance: [10.0; 3],
+    })?;
+    scene.add_light(Light::Point { position: Vec3::new(0.5, 1.3, 0.5), intensity: [3.0; 3] })?;
+    Ok(scene)
+}
+
+#[cfg(test)]
+mod tests {
+    use super::super::shapes::enclosed_volume;
+    use super::super::{Mesh, Scene};
+    use super::*;
+    use crate::bvh::BuildOptions;
+    use crate::{Device, DeviceOptions, Progress};
+    use std::sync::Arc;
+
+    fn commit(name: &str) -> Arc<Scene> {
+        let device = Device::new(DeviceOptions { num_threads: 1, ..Default::default() }).unwrap();
+        let data = builtin(name).unwrap();
+        Scene::commit(&device, data, &BuildOptions::default(), &Progress::none()).map_err(|(_, e)| e).unwrap()
+    }
+
+    fn assert_volume(mesh: &Mesh, expected: f64) {
+        let volume = enclosed_volume(mesh).expect("the mesh is not closed");
+        assert!((volume - expected).abs() < 1e-3 * expected.abs(), "{volume} m³ is not {expected} m³");
+    }
+
+    #[test]
+    fn every_built_in_scene_commits_without_degenerate_triangles_and_with_light() {
+        for name in BUILTIN_NAMES {
+            let scene = commit(name);
+            assert_eq!(scene.stats().skipped_degenerate, 0, "{name}");
+            assert!(!scene.lights().is_empty() || !scene.emitters().is_empty(), "{name}");
+            let camera = builtin_camera(name).unwrap();
+            assert!((camera.target - camera.position).cross(camera.up).length() > 0.1, "{name}");
+        }
+    }
+
+    #[test]
+    fn an_unknown_name_is_refused_with_those_there_are() {
+        let e = builtin("cornel").unwrap_err().to_string();
+        assert!(e.contains("\"cornel\"") && e.contains("cornell, furnace"), "{e}");
+        assert_eq!(builtin_camera("cornel"), None);
+    }
+
+    #[test]
+    fn closed_scenes_are_closed_and_look_where_they_should() {
+        assert_volume(&commit("furnace").meshes()[0], -1.0);
+        let sealed = commit("sealed");
+        assert_volume(&sealed.meshes()[0], -48.0);
+        assert_volume(&sealed.meshes()[1], -1.0);
+        assert_volume(&sealed.meshes()[2], 1.02f64.powi(3));
+    }
+
+    #[test]
+    fn the_cornell_box_looks_inward_and_its_blocks_outward() {
+        let scene = commit("cornell");
+        let [room, short, tall] = scene.meshes() else { panic!("three meshes") };
+        let center = Vec3::new(2.78, 2.74, 2.8);
+        for t in 0..room.indices.len() {
+            assert!(scene.normal(t as u32).dot(center - room.corners(t)[0]) > 2.0, "triangle {t}");
+        }
+        // Plan areas by the shoelace formula from the published corners.
+        assert_volume(short, 1.65 * 2.7769);
+        assert_volume(tall, 3.3 * 2.7409);
+        let (lower, upper) = scene.bounds();
+        assert_eq!(lower, Vec3::ZERO);
+        assert!((upper - Vec3::new(5.56, 5.488, 5.592)).abs().max_element() < 1e-5);
+    }
+
+    #[test]
+    fn lights_shine_into_their_rooms() {
+        for name in BUILTIN_NAMES {
+            let scene = commit(name);
+            let (lower, upper) = scene.bounds();
+            for light in scene.lights().iter() {
+                let Light::Rect { position, edge_u, edge_v, .. } = *light else { continue };
+                let corners = [position, position + edge_u, position + edge_v, position + edge_u + edge_v];
+                assert!(corners.iter().all(|c| c.cmpgt(lower).all() && c.cmplt(upper).all()), "{name}");
+                assert!(edge_u.cross(edge_v).dot((lower + upper) / 2.0 - position) > 0.0, "{name}");
+            }
+        }
+    }
 }
