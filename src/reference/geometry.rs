@@ -2,8 +2,8 @@
 //! area heuristic, Wald 2007; ordered traversal).
 //!
 //! The triangle test takes the signs of three edge functions d · (p × q) with p, q relative to the
-//! ray's origin. For the two triangles of an edge they are exact negatives of each other, and zero
-//! counts as inside, so that no ray passes between them.
+//! ray's origin. For the two triangles of an edge they are exact negatives of each other, and what
+//! may be zero counts as inside, so that no ray passes between them.
 
 use crate::scene::{MAX_COORDINATE, Mesh};
 use crate::trace::Ray;
@@ -47,6 +47,9 @@ pub struct Hit64 {
     pub triangle: u32,
 }
 
+/// Bound of the rounding error of d · (p × q) relative to |d| · |p| · |q|: ten operations deep at most.
+const ROUNDING: f64 = 10.0 * f64::EPSILON;
+
 /// A triangle and its global number.
 #[derive(Clone, Copy, Debug)]
 pub(super) struct Triangle {
@@ -73,19 +76,25 @@ impl Triangle {
     /// The hit with `tmin < t ≤ limit`.
     #[inline(always)]
     fn hit(&self, ray: &Ray64, limit: f64) -> Option<Hit64> {
-        let Edges { corners: [a, b, c], weights: [w0, w1, w2] } = self.edges(ray);
-        let inside = (w0 >= 0.0 && w1 >= 0.0 && w2 >= 0.0) || (w0 <= 0.0 && w1 <= 0.0 && w2 <= 0.0);
-        let sum = w0 + w1 + w2;
-        if !inside || sum == 0.0 {
-            return None;
-        }
+        let Edges { corners: [a, b, c], weights } = self.edges(ray);
         let normal = (b - a).cross(c - a);
-        let t = normal.dot(a) / normal.dot(ray.direction);
-        // A NaN or infinite t (the ray lies in the plane) fails the comparison or the limit.
-        (t > ray.tmin && t <= limit && t.is_finite()).then(|| Hit64 {
+        let slope = normal.dot(ray.direction);
+        let outside = weights.map(|w| w * -slope.signum()).into_iter().fold(0.0, f64::max);
+        if outside > 0.0 {
+            // Edge functions within their rounding error count as 0, or a ray through a vertex
+            // might find itself outside of all triangles around it.
+            let reach = a.length_squared().max(b.length_squared()).max(c.length_squared());
+            if outside * outside > ROUNDING * ROUNDING * ray.direction.length_squared() * reach * reach {
+                return None;
+            }
+        }
+        let t = normal.dot(a) / slope;
+        let sum = weights[0] + weights[1] + weights[2];
+        // A NaN or infinite t (the ray lies in the plane) fails.
+        (t > ray.tmin && t <= limit && t.is_finite() && sum != 0.0).then(|| Hit64 {
             t,
-            u: w1 / sum,
-            v: w2 / sum,
+            u: weights[1] / sum,
+            v: weights[2] / sum,
             triangle: self.number,
         })
     }
@@ -248,8 +257,10 @@ struct Slabs {
 
 impl Slabs {
     fn new(ray: &Ray64, margin: f64) -> Self {
-        // A direction component of 0 would make 0 · ∞ = NaN; this one is as good as 0 and does not.
+        // A direction component of 0 would make 0 · ∞ = NaN. With this one instead, and no box flat,
+        // a ray within a box's face is inside for all t that matter.
         let nonzero = |d: f64| if d.abs() < 1e-200 { 1e-200f64.copysign(d) } else { d };
+        let margin = margin.max(1e-100);
         let d = ray.direction;
         let inverse = DVec3::new(nonzero(d.x), nonzero(d.y), nonzero(d.z)).recip();
         Slabs { origin: ray.origin, inverse, margin: DVec3::splat(margin), tmin: ray.tmin }
@@ -259,8 +270,8 @@ impl Slabs {
     /// both ends move outward by more than the error of a subtraction and a product.
     #[inline(always)]
     fn enter(&self, node: &Node, limit: f64) -> Option<f64> {
-        let a = (node.lower.as_dvec3() - self.margin - self.origin) * self.inverse;
-        let b = (node.upper.as_dvec3() + self.margin - self.origin) * self.inverse;
+        let a = ((node.lower.as_dvec3() - self.origin) - self.margin) * self.inverse;
+        let b = ((node.upper.as_dvec3() - self.origin) + self.margin) * self.inverse;
         let (near, far) = (a.min(b), a.max(b));
         let grow = |t: f64, sign: f64| t + sign * 4.0 * f64::EPSILON * t.abs();
         let near = grow(near.x.max(near.y).max(near.z), -1.0).max(self.tmin);
@@ -413,7 +424,8 @@ mod tests {
             if let Some(hit) = expected {
                 let short = Ray64 { tmax: hit.t, ..ray };
                 prop_assert_eq!(geometry.closest(&short), expected);
-                prop_assert!(!geometry.occluded(&Ray64 { tmax: hit.t * (1.0 - 1e-12), ..ray }));
+                let shorter = Ray64 { tmax: hit.t * (1.0 - 1e-12), ..ray };
+                prop_assert!(!geometry.occluded(&shorter));
             }
         }
     }

@@ -180,8 +180,8 @@ mod tests {
             assert!(scene.normal(t as u32).dot(center - room.corners(t)[0]) > 2.0, "triangle {t}");
         }
         // Plan areas by the shoelace formula from the published corners.
-        assert_volume(short, 1.65 * 2.7769);
-        assert_volume(tall, 3.3 * 2.7409);
+        assert_volume(short, 1.65 * 2.76330);
+        assert_volume(tall, 3.3 * 2.76265);
         let (lower, upper) = scene.bounds();
         assert_eq!(lower, Vec3::ZERO);
         assert!((upper - Vec3::new(5.56, 5.488, 5.592)).abs().max_element() < 1e-5);
