@@ -1,8 +1,25 @@
 //! Charts: pieces of surface that are flat in the light map (thesis 3.2.3).
-use crate::error::Result;
+//!
+//! Charts come from the caller's UVs where those are usable, else from [`super::unwrap`]. They know
+//! nothing of texels: their coordinates are in scene units, and each map packs them at its own
+//! density ([`super::layout`]).
+
+use super::layout::{MAX_TEXELS, padded_extent};
+use super::unwrap;
+use crate::device::LogLevel;
+use crate::error::{Error, Result, invalid_argument};
 use crate::progress::Progress;
-use crate::scene::Scene;
+use crate::scene::{LightmapUvs, Material, Mesh, NONE, Scene};
+use glam::{DVec2, Vec2};
+use rayon::prelude::*;
+use std::collections::BTreeMap;
 use std::ops::Range;
+use std::time::Instant;
+
+/// Triangles whose UVs cover a page more than this many times over cannot have been meant to be
+/// unique (an engine's per-mesh UVs without page numbers, say): they are unwrapped instead. Below
+/// it overlaps are taken for the caller's affair and counted.
+const MAX_PAGE_COVER: f64 = 2.0;
 
 /// A piece of surface with continuous texture coordinates.
 #[derive(Clone, Debug, PartialEq)]
@@ -34,10 +51,12 @@ pub struct UvReport {
     pub given_charts: u32,
     /// Charts made by unwrapping.
     pub unwrapped_charts: u32,
-    /// With UVs outside [0, 1]; unwrapped instead.
+    /// With UVs outside [0, 1] or not finite; unwrapped instead.
     pub out_of_range: u64,
     /// Without area in UV space though not in space; unwrapped instead.
     pub degenerate: u64,
+    /// On pages that the given UVs cover more than twice over; unwrapped instead.
+    pub overlapping: u64,
     /// Texels whose centre several triangles of given UVs cover.
     pub overlapping_texels: u64,
     /// Charts reduced in density to fit a page.
@@ -45,11 +64,11 @@ pub struct UvReport {
     pub seconds: f64,
 }
 
-/// All charts of a scene.
+/// All charts of a scene. Those with given placement come first, ordered by page.
 #[derive(Clone, Debug, Default, PartialEq)]
 pub struct Charts {
     pub charts: Vec<Chart>,
-    /// Global triangle numbers, chart by chart.
+    /// Global triangle numbers, chart by chart, ascending in each.
     pub triangles: Vec<u32>,
     /// Chart of each global triangle, [`crate::scene::NONE`] for degenerate ones.
     pub chart_of: Vec<u32>,
@@ -57,10 +76,344 @@ pub struct Charts {
     pub corners: Vec<[[f32; 2]; 3]>,
 }
 
+/// A chart in the making. Local coordinates need not start at (0, 0).
+pub(super) struct Piece {
+    /// Global numbers, ascending.
+    pub triangles: Vec<u32>,
+    /// Local coordinates of the corners, per entry of `triangles`.
+    pub corners: Vec<[[f32; 2]; 3]>,
+    pub given: Option<Given>,
+}
+
 impl Charts {
     /// The charts of a scene: from the caller's UVs where there are usable ones, else by unwrapping.
-    pub fn of_scene(scene: &Scene, texels_per_unit: f32, progress: &Progress) -> Result<(Charts, UvReport)> {
-        let _ = (scene, texels_per_unit, progress);
-        Ok(Default::default())
+    ///
+    /// A triangle's UVs are usable if all are within half a texel of [0, 1] and enclose an area.
+    /// `texels_per_unit` (finite, > 0), `page_size` and `padding` (texels) are those of the finest
+    /// map: unwrapped charts that would not fit its pages are cut where there are triangle borders
+    /// to cut along. `OutOfMemory` if the surface would take more than [`MAX_TEXELS`] at this
+    /// density, `InvalidArgument` for a page number for which that is so.
+    ///
+    /// Reports as stage "unwrap" from 0 to 0.5 of the bar.
+    pub fn of_scene(
+        scene: &Scene,
+        texels_per_unit: f32,
+        page_size: u32,
+        padding: u32,
+        progress: &Progress,
+    ) -> Result<(Charts, UvReport)> {
+        let start = Instant::now();
+        let max_extent = padded_extent(page_size, padding)? as f64 / texels_per_unit as f64;
+        check_density(surface_area(scene), texels_per_unit)?;
+        let total = scene.triangle_count();
+        let stage = progress.stage("unwrap", 0.0, 0.5, total as u64 + 1);
+        // Pieces and charts side by side, and what the unwrapping of a part takes.
+        let _memory = scene.device().memory().reserve(total as usize * 2 * Self::BYTES_PER_TRIANGLE, "the charts")?;
+        let (charts, mut report) = scene.device().install(|| {
+            let mut report = UvReport::default();
+            let (mut pieces, rest) = given_pieces(scene, page_size, &mut report)?;
+            stage.advance(total as u64 - rest.len() as u64)?;
+            report.given_charts = pieces.len() as u32;
+            for piece in unwrap::unwrap(scene, &rest, &stage)? {
+                split_to_fit(piece, max_extent as f32, &mut pieces);
+            }
+            report.unwrapped_charts = pieces.len() as u32 - report.given_charts;
+            Ok((Charts::assemble(scene, pieces), report))
+        })?;
+        stage.advance(1)?;
+        report.seconds = start.elapsed().as_secs_f64();
+        log_report(scene, &report);
+        Ok((charts, report))
     }
+
+    /// What a triangle takes in a `Charts`, for memory accounts.
+    pub(crate) const BYTES_PER_TRIANGLE: usize = 24 + 4 + 4;
+
+    /// Bytes held.
+    pub fn bytes(&self) -> usize {
+        self.corners.len() * 24 + (self.triangles.len() + self.chart_of.len()) * 4 + size_of_val(&self.charts[..])
+    }
+
+    /// The global triangle numbers of a chart, ascending.
+    pub fn triangles_of(&self, chart: u32) -> &[u32] {
+        let Range { start, end } = self.charts[chart as usize].triangles;
+        &self.triangles[start as usize..end as usize]
+    }
+
+    /// Local coordinates of the point of a global triangle with weights `u` and `v` of its corners
+    /// 1 and 2.
+    #[inline]
+    pub fn local(&self, triangle: u32, u: f32, v: f32) -> [f32; 2] {
+        let [a, b, c] = self.corners[triangle as usize].map(Vec2::from_array);
+        (a * (1.0 - u - v) + b * u + c * v).to_array()
+    }
+
+    fn assemble(scene: &Scene, pieces: Vec<Piece>) -> Charts {
+        let total = scene.triangle_count() as usize;
+        let mut charts = Charts {
+            charts: Vec::with_capacity(pieces.len()),
+            triangles: Vec::with_capacity(pieces.iter().map(|p| p.triangles.len()).sum()),
+            chart_of: vec![NONE; total],
+            corners: vec![[[0.0; 2]; 3]; total],
+        };
+        for piece in pieces {
+            let (lower, upper) = bounds(&piece.corners);
+            let first = charts.triangles.len() as u32;
+            let mut area = 0.0;
+            for (&t, corners) in piece.triangles.iter().zip(&piece.corners) {
+                charts.chart_of[t as usize] = charts.charts.len() as u32;
+                charts.corners[t as usize] = corners.map(|c| (Vec2::from_array(c) - lower).to_array());
+                area += triangle_area(scene, t);
+            }
+            let two_sided = scene.material(piece.triangles[0]).two_sided;
+            charts.triangles.extend(&piece.triangles);
+            charts.charts.push(Chart {
+                triangles: first..charts.triangles.len() as u32,
+                size: (upper - lower).to_array(),
+                area: area as f32,
+                two_sided,
+                given: piece.given,
+            });
+        }
+        charts
+    }
+}
+
+/// The area of all valid triangles, in squared scene units.
+pub fn surface_area(scene: &Scene) -> f64 {
+    let areas = |m: usize, mesh: &Mesh| -> f64 {
+        let first = scene.first_triangle(m as u32);
+        (first..first + mesh.indices.len() as u32).filter(|&t| scene.is_valid(t)).map(|t| triangle_area(scene, t)).sum()
+    };
+    scene.meshes().iter().enumerate().map(|(m, mesh)| areas(m, mesh)).sum()
+}
+
+/// The density in texels per scene unit at which the scene's surface fills about `pages` pages,
+/// two thirds of each page's texels being covered.
+pub fn automatic_density(scene: &Scene, page_size: u32, pages: f64) -> f32 {
+    let texels = pages * (page_size as f64).powi(2) * 2.0 / 3.0;
+    ((texels / surface_area(scene)).sqrt() as f32).clamp(f32::MIN_POSITIVE, f32::MAX)
+}
+
+/// Area of a global triangle number, in squared scene units.
+pub(super) fn triangle_area(scene: &Scene, triangle: u32) -> f64 {
+    let [a, b, c] = scene.corners(triangle).map(|c| c.as_dvec3());
+    0.5 * (b - a).cross(c - a).length()
+}
+
+fn check_density(area: f64, texels_per_unit: f32) -> Result<()> {
+    if !(texels_per_unit > 0.0 && texels_per_unit.is_finite()) {
+        return invalid_argument!("texels_per_unit is {texels_per_unit}, not a finite number above 0");
+    }
+    let texels = area * (texels_per_unit as f64).powi(2);
+    if texels > MAX_TEXELS as f64 {
+        return Err(Error::OutOfMemory(format!(
+            "texels_per_unit {texels_per_unit} on a surface of {area:.3} squared units makes {texels:.3e} texels, \
+             more than {MAX_TEXELS}"
+        )));
+    }
+    Ok(())
+}
+
+fn log_report(scene: &Scene, report: &UvReport) {
+    let unusable = report.out_of_range + report.degenerate + report.overlapping;
+    if unusable > 0 {
+        scene.device().log(
+            LogLevel::Warning,
+            &format!(
+                "the light map UVs of {unusable} triangles are not usable and were replaced by unwrapping \
+                 ({} out of range, {} without area, {} on pages covered more than twice over)",
+                report.out_of_range, report.degenerate, report.overlapping
+            ),
+        );
+    }
+}
+
+/// Lower and upper corner of local coordinates.
+fn bounds(corners: &[[[f32; 2]; 3]]) -> (Vec2, Vec2) {
+    let points = corners.iter().flatten().map(|&p| Vec2::from_array(p));
+    points.fold((Vec2::INFINITY, Vec2::NEG_INFINITY), |(lo, hi), p| (lo.min(p), hi.max(p)))
+}
+
+/// Cuts a piece in halves, along triangle borders, until each is at most `max_extent` wide and high.
+/// Where that does not help (large triangles reach across the cut), the piece stays, to be reduced
+/// in density by the layout.
+fn split_to_fit(piece: Piece, max_extent: f32, out: &mut Vec<Piece>) {
+    let mut stack = vec![piece];
+    while let Some(piece) = stack.pop() {
+        let (lower, upper) = bounds(&piece.corners);
+        let axis = if upper.x - lower.x >= upper.y - lower.y { 0 } else { 1 };
+        let extent = (upper - lower)[axis];
+        if extent <= max_extent || piece.triangles.len() == 1 {
+            out.push(piece);
+            continue;
+        }
+        let middle = (0.5 * (lower + upper))[axis];
+        let is_low = |c: &[[f32; 2]; 3]| (c[0][axis] + c[1][axis] + c[2][axis]) / 3.0 < middle;
+        let half = |low: bool| {
+            let kept = || piece.triangles.iter().zip(&piece.corners).filter(|(_, c)| is_low(c) == low);
+            let triangles = kept().map(|(&t, _)| t).collect();
+            Piece { triangles, corners: kept().map(|(_, &c)| c).collect(), given: None }
+        };
+        let halves = [half(true), half(false)];
+        let shrinks = |p: &Piece| {
+            let (lower, upper) = bounds(&p.corners);
+            // A cut in two that leaves more than this on a side makes texels rather than room.
+            !p.triangles.is_empty() && (upper - lower)[axis] <= 0.8 * extent
+        };
+        if halves.iter().all(shrinks) {
+            let [low, high] = halves;
+            stack.extend([high, low]);
+        } else {
+            out.push(piece);
+        }
+    }
+}
+
+/// What must not meet in one chart: sides that are lit and sides that are not, and lamps and what
+/// they light (a texel of the radiance map belongs to one or the other).
+pub(super) fn surface_kind(material: &Material) -> u32 {
+    material.two_sided as u32 | (material.is_emissive() as u32) << 1
+}
+
+/// Pieces from the caller's UVs, ordered by page, and the valid triangles to unwrap, ascending.
+fn given_pieces(scene: &Scene, page_size: u32, report: &mut UvReport) -> Result<(Vec<Piece>, Vec<u32>)> {
+    let mut rest = Vec::new();
+    let mut usable = Vec::new();
+    let mut cover = BTreeMap::<u32, f64>::new();
+    for (m, mesh) in scene.meshes().iter().enumerate() {
+        let first = scene.first_triangle(m as u32);
+        for t in (0..mesh.indices.len()).filter(|&t| scene.is_valid(first + t as u32)) {
+            let Some(lightmap) = &mesh.lightmap else {
+                rest.push(first + t as u32);
+                continue;
+            };
+            let page = given_page(lightmap, m, t, page_size)?;
+            match uv_area(mesh, lightmap, t, page_size) {
+                Some(area) if area > 0.0 => {
+                    *cover.entry(page).or_default() += area;
+                    usable.push((first + t as u32, page));
+                    continue;
+                }
+                Some(_) => report.degenerate += 1,
+                None => report.out_of_range += 1,
+            }
+            rest.push(first + t as u32);
+        }
+    }
+    let (kept, overlapping): (Vec<_>, Vec<_>) = usable.into_iter().partition(|(_, page)| cover[page] <= MAX_PAGE_COVER);
+    report.overlapping = overlapping.len() as u64;
+    rest.extend(overlapping.iter().map(|(t, _)| t));
+    rest.sort_unstable();
+
+    let mut pieces = Vec::new();
+    for of_mesh in kept.chunk_by(|a, b| scene.locate(a.0).0 == scene.locate(b.0).0) {
+        pieces.extend(islands(scene, of_mesh));
+    }
+    pieces.sort_by_key(|p: &Piece| (p.given.map(|g| g.page), p.triangles[0]));
+    Ok((pieces, rest))
+}
+
+fn given_page(lightmap: &LightmapUvs, mesh: usize, triangle: usize, page_size: u32) -> Result<u32> {
+    let page = lightmap.pages.get(triangle).copied().unwrap_or(0);
+    let limit = MAX_TEXELS / (page_size as u64).pow(2);
+    if page as u64 >= limit {
+        return invalid_argument!(
+            "lightmap_page of triangle {triangle} of mesh {mesh} is {page}; with pages of {page_size}×{page_size} \
+             texels there can be {limit}"
+        );
+    }
+    Ok(page)
+}
+
+/// The area of a triangle in UV space, `None` if its UVs are not finite or more than half a texel
+/// outside [0, 1].
+fn uv_area(mesh: &Mesh, lightmap: &LightmapUvs, triangle: usize, page_size: u32) -> Option<f64> {
+    let tolerance = 0.5 / page_size as f32;
+    let uvs = mesh.indices[triangle].map(|i| lightmap.uvs[i as usize]);
+    let inside = |uv: &Vec2| uv.to_array().iter().all(|c| (-tolerance..=1.0 + tolerance).contains(c));
+    let [a, b, c] = uvs.map(|uv| uv.as_dvec2());
+    uvs.iter().all(inside).then(|| 0.5 * (b - a).perp_dot(c - a).abs())
+}
+
+/// Pieces of one mesh: triangles with usable UVs and their pages, connected through equal vertices.
+fn islands(scene: &Scene, triangles: &[(u32, u32)]) -> Vec<Piece> {
+    let mesh = &scene.meshes()[scene.locate(triangles[0].0).0 as usize];
+    let uvs = &mesh.lightmap.as_ref().expect("the mesh has UVs").uvs;
+    let corner = |t: u32, k: usize| mesh.indices[scene.locate(t).1 as usize][k] as usize;
+    let mut keys = Vec::with_capacity(triangles.len() * 3);
+    for (n, &(t, page)) in triangles.iter().enumerate() {
+        let kind = surface_kind(scene.material(t));
+        for k in 0..3 {
+            let i = corner(t, k);
+            let [u, v] = uvs[i].to_array().map(float_key);
+            keys.push(((page, kind, [u, v], mesh.positions[i].to_array().map(float_key)), n as u32));
+        }
+    }
+    groups(&connected(triangles.len(), keys))
+        .into_iter()
+        .map(|group| {
+            let page = triangles[group[0] as usize].1;
+            let numbers: Vec<u32> = group.iter().map(|&n| triangles[n as usize].0).collect();
+            let corners: Vec<_> = numbers.iter().map(|&t| [0, 1, 2].map(|k| uvs[corner(t, k)])).collect();
+            given_piece(scene, page, numbers, &corners)
+        })
+        .collect()
+}
+
+/// Local coordinates such that the piece keeps its area, and the placement that undoes them.
+fn given_piece(scene: &Scene, page: u32, triangles: Vec<u32>, uvs: &[[Vec2; 3]]) -> Piece {
+    let lower = uvs.iter().flatten().fold(Vec2::INFINITY, |m, &p| m.min(p));
+    let twice_area = |[a, b, c]: [DVec2; 3]| (b - a).perp_dot(c - a).abs();
+    let area_uv: f64 = uvs.iter().map(|t| 0.5 * twice_area(t.map(|uv| uv.as_dvec2()))).sum();
+    let area: f64 = triangles.iter().map(|&t| triangle_area(scene, t)).sum();
+    let scale = (area / area_uv).sqrt();
+    let local = |uv: Vec2| ((uv - lower).as_dvec2() * scale).as_vec2().to_array();
+    Piece {
+        triangles,
+        corners: uvs.iter().map(|t| t.map(local)).collect(),
+        given: Some(Given { page, offset: lower.to_array(), scale: [(1.0 / scale) as f32; 2] }),
+    }
+}
+
+/// A key that is equal for equal floats: +0 and −0 are one.
+pub(super) fn float_key(x: f32) -> u32 {
+    (x + 0.0).to_bits()
+}
+
+/// Which of `count` items are connected: each item's lowest connected item. `keys` are pairs of a
+/// key and an item; items with equal keys are connected.
+pub(super) fn connected<K: Ord + Send>(count: usize, mut keys: Vec<(K, u32)>) -> Vec<u32> {
+    keys.par_sort_unstable();
+    let mut parent: Vec<u32> = (0..count as u32).collect();
+    for pair in keys.windows(2).filter(|pair| pair[0].0 == pair[1].0) {
+        let (a, b) = (root(&mut parent, pair[0].1), root(&mut parent, pair[1].1));
+        // The lower one becomes the root, so that roots do not depend on the order of joins.
+        parent[a.max(b) as usize] = a.min(b);
+    }
+    (0..count as u32).map(|i| root(&mut parent, i)).collect()
+}
+
+fn root(parent: &mut [u32], mut i: u32) -> u32 {
+    while parent[i as usize] != i {
+        let next = parent[parent[i as usize] as usize];
+        parent[i as usize] = next;
+        i = next;
+    }
+    i
+}
+
+/// Items by root (as from [`connected`]), ordered by root, ascending in each group.
+pub(super) fn groups(roots: &[u32]) -> Vec<Vec<u32>> {
+    let mut group_of = vec![NONE; roots.len()];
+    let mut groups: Vec<Vec<u32>> = Vec::new();
+    for (i, &r) in roots.iter().enumerate() {
+        // A root is the lowest item of its group: it comes first.
+        if r as usize == i {
+            group_of[i] = groups.len() as u32;
+            groups.push(Vec::new());
+        }
+        groups[group_of[r as usize] as usize].push(i as u32);
+    }
+    groups
 }

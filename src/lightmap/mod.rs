@@ -1,12 +1,30 @@
-//! Light maps (thesis 3.2.3 to 3.2.6). PLACEHOLDER: signatures that the other modules use.
+//! Light maps (thesis 3.2.3 to 3.2.6): charts and texels of a scene, and the bake that fills them.
+//!
+//! A light map has three maps of independent resolution over the same charts: the light map itself,
+//! the gather map (indirect irradiance) and the radiance map (what gather rays see). A bake runs
+//! photons → radiance map → gather map → blur → direct light and composition.
 
+mod bake;
+pub mod blur;
 pub mod charts;
+pub mod direct;
+mod gather;
 pub mod layout;
+mod map;
+pub mod plan;
+mod polygon;
+mod radiance;
+mod read;
 pub mod texels;
+mod unwrap;
 
-use crate::error::Result;
-use crate::progress::Progress;
+use crate::error::{Result, invalid_argument};
+use crate::memory::Reservation;
 use crate::scene::Scene;
+use charts::Charts;
+use glam::Vec3;
+use map::ChartMap;
+use plan::Plan;
 use std::sync::Arc;
 
 /// How a light map is laid out.
@@ -51,7 +69,7 @@ pub struct LightmapInfo {
 #[derive(Clone, Copy, Debug, PartialEq)]
 pub struct BakeParams {
     pub photon_count: u64,
-    /// 0: Russian roulette alone.
+    /// Most reflections of light before it reaches a texel; 0: Russian roulette alone decides.
     pub max_bounces: u32,
     /// Rays per gather map texel; 0: no indirect light.
     pub gather_rays: u32,
@@ -59,7 +77,8 @@ pub struct BakeParams {
     pub radius: f32,
     /// Radius of the gather map's blur in its texels; 0: none.
     pub blur_radius: u32,
-    /// Shadow rays per light map texel and area light.
+    /// Shadow rays per light map texel and area light (of more than four area lights, four times
+    /// as many rays are shared out by their unoccluded light).
     pub direct_samples: u32,
     pub seed: u64,
     /// Bytes that the bake may take in addition; 0: no limit.
@@ -138,47 +157,88 @@ pub enum LayerData {
     Integer(Vec<u32>),
 }
 
+/// Light of the texels after a bake, by sample of the light map.
+struct Light {
+    direct: Vec<Vec3>,
+    indirect: Vec<Vec3>,
+    /// Whether each sample can be seen; the others were filled from their neighbours.
+    valid: Vec<bool>,
+    /// Reflected radiance, by sample of the radiance map. Empty if the bake left it out.
+    radiance: Vec<Vec3>,
+    _memory: Reservation,
+}
+
 /// Light maps of a scene: layout, texels and, after [`bake`](Lightmap::bake), light.
 pub struct Lightmap {
     scene: Arc<Scene>,
+    charts: Charts,
+    map: ChartMap,
+    gather: ChartMap,
+    radiance: ChartMap,
+    padding: u32,
+    info: LightmapInfo,
+    plan: Plan,
+    light: Option<Light>,
+    _memory: Reservation,
+}
+
+impl LightmapDesc {
+    /// Checks the ranges documented on the fields.
+    pub fn validate(&self) -> Result<()> {
+        if !(self.texels_per_unit >= 0.0 && self.texels_per_unit.is_finite()) {
+            return invalid_argument!("texels_per_unit is {}, not a finite number ≥ 0", self.texels_per_unit);
+        }
+        if !(16..=layout::MAX_PAGE_SIZE).contains(&self.page_size) {
+            return invalid_argument!("page_size is {}, outside 16 to {}", self.page_size, layout::MAX_PAGE_SIZE);
+        }
+        if !(1..=64).contains(&self.padding) || 4 * self.padding > self.page_size {
+            return invalid_argument!("padding is {}, outside 1 to 64 or over a quarter of a page", self.padding);
+        }
+        for (name, d) in [("gather_divisor", self.gather_divisor), ("radiance_divisor", self.radiance_divisor)] {
+            if !(1..=64).contains(&d) {
+                return invalid_argument!("{name} is {d}, outside 1 to 64");
+            }
+        }
+        Ok(())
+    }
+}
+
+impl BakeParams {
+    /// Checks the ranges documented on the fields.
+    pub fn validate(&self) -> Result<()> {
+        if !(self.radius >= 0.0) {
+            return invalid_argument!("radius is {}, not ≥ 0", self.radius);
+        }
+        if self.gather_rays > 1 << 16 {
+            return invalid_argument!("gather_rays is {}, more than 65536", self.gather_rays);
+        }
+        if self.blur_radius > blur::MAX_BLUR_RADIUS {
+            return invalid_argument!("blur_radius is {}, more than {}", self.blur_radius, blur::MAX_BLUR_RADIUS);
+        }
+        if !(1..=4096).contains(&self.direct_samples) {
+            return invalid_argument!("direct_samples is {}, outside 1 to 4096", self.direct_samples);
+        }
+        if self.texel_end != 0 && self.texel_end <= self.texel_begin {
+            return invalid_argument!("the texels {} to {} are none", self.texel_begin, self.texel_end);
+        }
+        Ok(())
+    }
 }
 
 impl Lightmap {
-    /// Unwraps what brings no UVs, lays out the pages and maps texels to triangles.
-    pub fn create(scene: &Arc<Scene>, desc: &LightmapDesc, progress: &Progress) -> Result<Lightmap> {
-        let _ = (desc, progress);
-        Ok(Lightmap { scene: scene.clone() })
-    }
+    /// The scene that is lit.
     pub fn scene(&self) -> &Arc<Scene> {
         &self.scene
     }
+
+    /// Numbers about layout and texels.
     pub fn info(&self) -> LightmapInfo {
-        LightmapInfo::default()
+        self.info
     }
-    /// Light map UV in [0, 1] of each corner, and the page of each triangle of `mesh` (page
-    /// [`crate::scene::NONE`] for triangles without texels).
-    pub fn mesh_uvs(&self, mesh: u32) -> Result<(Vec<[[f32; 2]; 3]>, Vec<u32>)> {
-        let _ = mesh;
-        Ok((vec![], vec![]))
-    }
-    /// Runs the pipeline. On an error or a cancel what was baked before is kept.
-    pub fn bake(&mut self, params: &BakeParams, progress: &Progress) -> Result<BakeStats> {
-        let _ = (params, progress);
-        Ok(BakeStats::default())
-    }
-    /// One layer of one page. Light layers need a bake (`InvalidState` before).
-    pub fn read(&self, page: u32, layer: Layer) -> Result<LayerData> {
-        let _ = (page, layer);
-        Ok(LayerData::Rgb(vec![]))
-    }
-    /// What a bake runs and what it leaves out and why, as text.
+
+    /// What the last bake ran (before the first: what a bake with default parameters would run) and
+    /// what it left out and why, one line each.
     pub fn plan_text(&self) -> String {
-        String::new()
-    }
-    /// Irradiance (direct + indirect) as a shader would see it: filtered light map at a point of a
-    /// global triangle (barycentric weights of vertices 1 and 2). Zero before a bake.
-    pub fn sample(&self, layer: Layer, triangle: u32, u: f32, v: f32) -> [f32; 3] {
-        let _ = (layer, triangle, u, v);
-        [0.0; 3]
+        self.plan.text()
     }
 }

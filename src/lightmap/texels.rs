@@ -1,1 +1,764 @@
 //! Texels: inverse mapping from texels to points on triangles (thesis 3.2.3).
+//!
+//! Every texel that a chart touches gets one sample: the texel's centre if it lies in the chart,
+//! else the point of the chart in the texel that is nearest to the centre. So borders are covered
+//! conservatively: any point of a chart lies in a texel that has a sample of this chart.
+//!
+//! Geometry is computed in f64 on texel coordinates relative to the rectangle at hand. Triangles
+//! that share an edge compute the same crossings with texel rows, so no centre falls between them.
+
+use super::charts::{Charts, triangle_area};
+use super::layout::Layout;
+use crate::error::Result;
+use crate::memory::{Reservation, try_vec};
+use crate::progress::Stage;
+use crate::scene::{NONE, Scene};
+use glam::{DVec2, Vec3};
+use rayon::prelude::*;
+use std::ops::Range;
+
+/// What a texel shows: a point on a triangle. 16 bytes.
+#[derive(Clone, Copy, Debug, Default, PartialEq, bytemuck::Pod, bytemuck::Zeroable)]
+#[repr(C)]
+pub struct TexelSample {
+    /// The texel in its page. (The page is that of the sample's placement.)
+    pub x: u16,
+    pub y: u16,
+    /// Global triangle number.
+    pub triangle: u32,
+    /// Weights of the triangle's corners 1 and 2; u, v ≥ 0, u + v ≤ 1 up to rounding.
+    pub u: f32,
+    pub v: f32,
+}
+
+impl TexelSample {
+    /// Position in the scene.
+    #[inline]
+    pub fn position(&self, scene: &Scene) -> Vec3 {
+        let [a, b, c] = scene.corners(self.triangle).map(|c| c.as_dvec3());
+        (a + (b - a) * self.u as f64 + (c - a) * self.v as f64).as_vec3()
+    }
+
+    /// Unit geometric normal, of the front side.
+    #[inline]
+    pub fn geometric_normal(&self, scene: &Scene) -> Vec3 {
+        scene.normal(self.triangle)
+    }
+
+    /// Unit shading normal of the front side: interpolated where the mesh has normals and they
+    /// point to the front, else the geometric normal.
+    pub fn shading_normal(&self, scene: &Scene) -> Vec3 {
+        let geometric = self.geometric_normal(scene);
+        let (mesh, triangle) = scene.locate(self.triangle);
+        let mesh = &scene.meshes()[mesh as usize];
+        if mesh.normals.is_empty() {
+            return geometric;
+        }
+        let [a, b, c] = mesh.indices[triangle as usize].map(|i| mesh.normals[i as usize].as_dvec3());
+        let (u, v) = (self.u as f64, self.v as f64);
+        let normal = (a * (1.0 - u - v) + b * u + c * v).normalize_or_zero().as_vec3();
+        if normal.dot(geometric) > 0.0 { normal } else { geometric }
+    }
+}
+
+/// Samples to interpolate between, with weights that sum to 1. Unused entries have weight 0 and
+/// repeat a used sample.
+#[derive(Clone, Copy, Debug, PartialEq)]
+pub struct Bilinear {
+    pub samples: [u32; 4],
+    pub weights: [f32; 4],
+}
+
+/// An uncovered texel near a chart, and the sample that it repeats.
+#[derive(Clone, Copy, Debug, PartialEq)]
+pub struct Dilated {
+    pub page: u32,
+    pub x: u16,
+    pub y: u16,
+    pub sample: u32,
+}
+
+/// The texels of all charts of a layout.
+pub struct TexelMap {
+    /// Ordered by placement, row, column.
+    pub samples: Vec<TexelSample>,
+    /// First sample of each placement, and the number of samples at the end.
+    pub chart_start: Vec<u32>,
+    /// Surface area in each texel in squared scene units, if it was asked for. Along an edge or in
+    /// a corner that charts share with nothing, only the chart's part of the texel counts.
+    pub areas: Vec<f32>,
+    /// Texels whose centre several triangles cover.
+    pub overlapping_texels: u64,
+    /// Where to look a placement's texels up.
+    windows: Vec<Window>,
+    /// Sample of each texel of each window, row-major, [`NONE`] where there is none.
+    index: Vec<u32>,
+    groups: Vec<Group>,
+    _memory: Vec<Reservation>,
+}
+
+/// A rectangle of texels and where its entries begin in the index.
+#[derive(Clone, Copy, Debug)]
+struct Window {
+    x: u16,
+    y: u16,
+    w: u16,
+    h: u16,
+    start: u32,
+}
+
+/// Placements that are mapped together: a packed chart alone, or all given charts of a page, since
+/// their rectangles may overlap.
+#[derive(Clone, Debug)]
+struct Group {
+    page: u32,
+    placements: Range<u32>,
+    window: Window,
+}
+
+impl Group {
+    fn texels(&self) -> usize {
+        self.window.w as usize * self.window.h as usize
+    }
+}
+
+impl TexelMap {
+    /// Maps the texels of `layout`, which must be of `charts`, which must be of `scene`. Runs on the
+    /// device's threads and advances `stage` by [`work`](Self::work) in all.
+    ///
+    /// Where given charts overlap, a texel goes to the first triangle that covers its centre, else
+    /// to the one nearest to it. `with_areas` asks for [`areas`](Self::areas).
+    pub fn build(scene: &Scene, charts: &Charts, layout: &Layout, with_areas: bool, stage: &Stage) -> Result<TexelMap> {
+        let (groups, windows, entries) = groups(layout);
+        let memory = scene.device().memory();
+        let mut map = TexelMap {
+            samples: Vec::new(),
+            chart_start: Vec::with_capacity(layout.placements.len() + 1),
+            areas: Vec::new(),
+            overlapping_texels: 0,
+            _memory: vec![memory.reserve(entries * 4 + windows.len() * 16, "the index of texels")?],
+            windows,
+            index: try_vec(entries, "the index of texels")?,
+            groups,
+        };
+        scene.device().install(|| {
+            let job = Job { scene, charts, layout, stage };
+            map.cover(&job)?;
+            let bytes = size_of::<TexelSample>() + if with_areas { 4 } else { 0 };
+            map._memory.push(memory.reserve(map.sample_count() * bytes, "the texel samples")?);
+            map.sample(&job)?;
+            if with_areas { map.measure(&job) } else { Ok(()) }
+        })?;
+        Ok(map)
+    }
+
+    /// What building a map of `layout` advances its stage by.
+    pub fn work(layout: &Layout) -> u64 {
+        2 * layout.placements.len() as u64
+    }
+
+    /// The placement of a sample: the chart's number, or that of its back side.
+    pub fn placement_of(&self, sample: u32) -> u32 {
+        self.chart_start.partition_point(|&first| first <= sample) as u32 - 1
+    }
+
+    /// The samples of a placement.
+    #[inline]
+    pub fn samples_of(&self, placement: u32) -> Range<u32> {
+        self.chart_start[placement as usize]..self.chart_start[placement as usize + 1]
+    }
+
+    /// The sample of a texel (x, y) of the page, [`NONE`] if it lies outside the placement's
+    /// rectangle or is not covered. Among given charts it may be the sample of another chart.
+    #[inline]
+    pub fn texel_index(&self, placement: u32, x: u32, y: u32) -> u32 {
+        let w = &self.windows[placement as usize];
+        let (x, y) = (x.wrapping_sub(w.x as u32), y.wrapping_sub(w.y as u32));
+        if x < w.w as u32 && y < w.h as u32 { self.index[w.at(x, y)] } else { NONE }
+    }
+
+    /// The sample nearest to a texel coordinate of the placement's page.
+    #[inline]
+    pub fn nearest(&self, placement: u32, coord: [f32; 2]) -> u32 {
+        let w = &self.windows[placement as usize];
+        let (x, y) = (w.column(coord[0].floor()), w.row(coord[1].floor()));
+        let sample = self.index[w.at(x, y)];
+        if sample != NONE { sample } else { self.search(w, x, y) }
+    }
+
+    /// Up to four samples around a texel coordinate of the placement's page. Texels without a
+    /// sample, and those outside the placement's rectangle, leave their weight to the others.
+    #[inline]
+    pub fn bilinear(&self, placement: u32, coord: [f32; 2]) -> Bilinear {
+        let w = &self.windows[placement as usize];
+        let (cx, cy) = (coord[0] - 0.5, coord[1] - 0.5);
+        let (x0, y0) = (cx.floor(), cy.floor());
+        let (fx, fy) = (cx - x0, cy - y0);
+        let (xs, ys) = ([w.column(x0), w.column(x0 + 1.0)], [w.row(y0), w.row(y0 + 1.0)]);
+        let at = |i: usize| self.index[w.at(xs[i & 1], ys[i >> 1])];
+        let mut samples = [at(0), at(1), at(2), at(3)];
+        let mut weights = [(1.0 - fx) * (1.0 - fy), fx * (1.0 - fy), (1.0 - fx) * fy, fx * fy];
+        let mut sum = 0.0;
+        for i in 0..4 {
+            if samples[i] == NONE {
+                weights[i] = 0.0;
+            }
+            sum += weights[i];
+        }
+        // The texel of a coordinate in the chart is covered and has a weight of at least 1/4. What
+        // rounding moved out of the chart finds the nearest sample.
+        if !(sum > 0.01) {
+            return Bilinear { samples: [self.nearest(placement, coord); 4], weights: [1.0, 0.0, 0.0, 0.0] };
+        }
+        let used = (0..4).find(|&i| weights[i] > 0.0).map_or(samples[0], |i| samples[i]);
+        for i in 0..4 {
+            samples[i] = if samples[i] == NONE { used } else { samples[i] };
+            weights[i] /= sum;
+        }
+        Bilinear { samples, weights }
+    }
+
+    /// The uncovered texels within `padding` of a covered one (a square of 2 · `padding` + 1
+    /// texels), each with the nearest sample, for filters that read beyond the charts' borders.
+    /// Ordered by page of given charts, then placement, row, column.
+    pub fn dilate(&self, padding: u32) -> Vec<Dilated> {
+        let of_groups: Vec<Vec<Dilated>> =
+            self.groups.par_iter().map(|g| dilate(g, self.entries(g), padding)).collect();
+        of_groups.concat()
+    }
+
+    /// Bytes held.
+    pub fn bytes(&self) -> usize {
+        size_of_val(&self.samples[..])
+            + (self.index.len() + self.chart_start.len() + self.areas.len()) * 4
+            + size_of_val(&self.windows[..])
+    }
+
+    fn sample_count(&self) -> usize {
+        *self.chart_start.last().unwrap_or(&0) as usize
+    }
+
+    fn entries(&self, group: &Group) -> &[u32] {
+        &self.index[group.window.start as usize..][..group.texels()]
+    }
+
+    #[cold]
+    fn search(&self, w: &Window, x: u32, y: u32) -> u32 {
+        let mut best = (u64::MAX, NONE);
+        for row in 0..w.h as u32 {
+            let dy = row.abs_diff(y) as u64;
+            if dy * dy >= best.0 {
+                continue;
+            }
+            for column in 0..w.w as u32 {
+                let dx = column.abs_diff(x) as u64;
+                let sample = self.index[w.at(column, row)];
+                if sample != NONE {
+                    best = best.min((dx * dx + dy * dy, sample));
+                }
+            }
+        }
+        best.1
+    }
+
+    /// First pass: which triangle each texel belongs to, and how many texels each placement has.
+    fn cover(&mut self, job: &Job) -> Result<()> {
+        let slices = split(&mut self.index, self.groups.iter().map(Group::texels));
+        let covered: Result<Vec<(Vec<u32>, u64)>> = self
+            .groups
+            .par_iter()
+            .zip(slices)
+            .map_init(Vec::new, |scratch, (group, owners)| {
+                let result = cover_group(job, group, owners, scratch)?;
+                job.stage.advance(group.placements.len() as u64)?;
+                Ok(result)
+            })
+            .collect();
+        let mut first = 0;
+        for (counts, overlapping) in covered? {
+            self.overlapping_texels += overlapping;
+            for count in counts {
+                self.chart_start.push(first);
+                first += count;
+            }
+        }
+        self.chart_start.push(first);
+        Ok(())
+    }
+
+    /// Second pass: the samples; the index then names them.
+    fn sample(&mut self, job: &Job) -> Result<()> {
+        self.samples = try_vec(self.sample_count(), "the texel samples")?;
+        let sizes = group_sizes(&self.groups, &self.chart_start);
+        let owners = split(&mut self.index, self.groups.iter().map(Group::texels));
+        let samples = split(&mut self.samples, sizes);
+        self.groups.par_iter().zip(owners).zip(samples).try_for_each(|((group, owners), samples)| {
+            sample_group(job, group, &self.chart_start, owners, samples);
+            job.stage.advance(group.placements.len() as u64)
+        })
+    }
+
+    /// Third pass: the surface area in each texel.
+    fn measure(&mut self, job: &Job) -> Result<()> {
+        self.areas = try_vec(self.samples.len(), "the texel areas")?;
+        let sizes = group_sizes(&self.groups, &self.chart_start);
+        let areas = split(&mut self.areas, sizes);
+        self.groups.par_iter().zip(areas).try_for_each(|(group, areas)| {
+            let entries = &self.index[group.window.start as usize..][..group.texels()];
+            measure_group(job, group, entries, self.chart_start[group.placements.start as usize], areas)
+        })
+    }
+}
+
+impl Window {
+    #[inline]
+    fn at(&self, x: u32, y: u32) -> usize {
+        self.start as usize + y as usize * self.w as usize + x as usize
+    }
+
+    /// Column in the window of a texel of the page, clamped. (NaN gives 0.)
+    #[inline]
+    fn column(&self, x: f32) -> u32 {
+        (x - self.x as f32).max(0.0).min(self.w as f32 - 1.0) as u32
+    }
+
+    #[inline]
+    fn row(&self, y: f32) -> u32 {
+        (y - self.y as f32).max(0.0).min(self.h as f32 - 1.0) as u32
+    }
+}
+
+/// What the passes read.
+struct Job<'a, 'p, 'c> {
+    scene: &'a Scene,
+    charts: &'a Charts,
+    layout: &'a Layout,
+    stage: &'a Stage<'p, 'c>,
+}
+
+impl Job<'_, '_, '_> {
+    /// Triangles of a group as slots of [`Charts::triangles`]. They are contiguous: a group is one
+    /// chart or some of the given charts, which come first.
+    fn slots(&self, group: &Group) -> Range<u32> {
+        let chart = |placement| &self.charts.charts[self.layout.chart_of(placement) as usize].triangles;
+        chart(group.placements.start).start..chart(group.placements.end - 1).end
+    }
+
+    /// Corners of a slot's triangle in texels of the group's window. `placement` only matters
+    /// for groups of a single one.
+    fn flat_triangle(&self, group: &Group, slot: u32) -> Flat {
+        let triangle = self.charts.triangles[slot as usize];
+        let placement =
+            if group.placements.len() == 1 { group.placements.start } else { self.charts.chart_of[triangle as usize] };
+        let p = &self.layout.placements[placement as usize];
+        let origin = DVec2::new(group.window.x as f64, group.window.y as f64);
+        let [offset, scale] = [p.offset, p.scale].map(|a| DVec2::new(a[0] as f64, a[1] as f64));
+        Flat(self.charts.corners[triangle as usize].map(|[s, t]| {
+            let local = if p.swap { DVec2::new(t as f64, s as f64) } else { DVec2::new(s as f64, t as f64) };
+            offset + scale * local - origin
+        }))
+    }
+}
+
+fn groups(layout: &Layout) -> (Vec<Group>, Vec<Window>, usize) {
+    let mut groups: Vec<Group> = Vec::new();
+    let mut start = 0;
+    let placements = &layout.placements[..];
+    let (given, packed) = placements.split_at(layout.given as usize);
+    let runs = given.chunk_by(|a, b| a.page == b.page).chain(packed.chunks(1));
+    for run in runs {
+        let first = groups.last().map_or(0, |g: &Group| g.placements.end);
+        let x = run.iter().map(|p| p.x).min().unwrap_or(0);
+        let y = run.iter().map(|p| p.y).min().unwrap_or(0);
+        let w = run.iter().map(|p| p.x + p.w).max().unwrap_or(0) - x;
+        let h = run.iter().map(|p| p.y + p.h).max().unwrap_or(0) - y;
+        let window = Window { x, y, w, h, start: start as u32 };
+        groups.push(Group { page: run[0].page, placements: first..first + run.len() as u32, window });
+        start += w as usize * h as usize;
+    }
+    let windows = groups.iter().flat_map(|g| g.placements.clone().map(|_| g.window)).collect();
+    (groups, windows, start)
+}
+
+fn group_sizes<'a>(groups: &'a [Group], chart_start: &'a [u32]) -> impl Iterator<Item = usize> + 'a {
+    let start = |placement: u32| chart_start[placement as usize] as usize;
+    groups.iter().map(move |g| start(g.placements.end) - start(g.placements.start))
+}
+
+/// Consecutive disjoint pieces of `all`.
+fn split<T>(mut all: &mut [T], sizes: impl Iterator<Item = usize>) -> Vec<&mut [T]> {
+    let mut pieces = Vec::new();
+    for size in sizes {
+        let (piece, rest) = all.split_at_mut(size);
+        pieces.push(piece);
+        all = rest;
+    }
+    pieces
+}
+
+/// Marks owners that touch a texel without covering its centre. (Slots have 28 bits.)
+const BORDER: u32 = 1 << 31;
+
+/// A cancel is looked for whenever so many texels have been visited.
+const TEXELS_PER_CHECK: u64 = 1 << 20;
+
+/// Writes the owner of each texel of a group (a slot, perhaps with [`BORDER`]; [`NONE`]); returns
+/// the number of texels of each placement and the number of centres covered more than once.
+fn cover_group(job: &Job, group: &Group, owners: &mut [u32], scratch: &mut Vec<f64>) -> Result<(Vec<u32>, u64)> {
+    owners.fill(NONE);
+    let size = [group.window.w as i64, group.window.h as i64];
+    let mut overlapping = 0;
+    let mut visited = 0;
+    let mut check = |texels: u64| {
+        visited += texels;
+        if visited < TEXELS_PER_CHECK {
+            return Ok(());
+        }
+        visited = 0;
+        job.stage.advance(0)
+    };
+    for slot in job.slots(group) {
+        overlapping += cover_centres(&job.flat_triangle(group, slot), slot, size, owners);
+        check(job.flat_triangle(group, slot).box_texels(size))?;
+    }
+    // Squared distance of the nearest triangle to the centre, for texels whose centre is in none.
+    scratch.clear();
+    scratch.resize(owners.len(), f64::INFINITY);
+    for slot in job.slots(group) {
+        let flat = job.flat_triangle(group, slot);
+        flat.for_each_touched(size, |x, y| {
+            let i = (y * size[0] + x) as usize;
+            if owners[i] == NONE || owners[i] & BORDER != 0 {
+                let distance = flat.nearest_in_texel(x, y).1;
+                // Rounding must not decide between triangles that share the nearest point.
+                if distance < scratch[i] - 1e-9 {
+                    scratch[i] = distance;
+                    owners[i] = slot | BORDER;
+                }
+            }
+        });
+        check(flat.box_texels(size))?;
+    }
+    let mut counts = vec![0; group.placements.len()];
+    for &owner in owners.iter().filter(|&&o| o != NONE) {
+        counts[placement_in_group(job, group, owner & !BORDER)] += 1;
+    }
+    Ok((counts, overlapping))
+}
+
+/// Which of the group's placements a slot belongs to.
+#[inline]
+fn placement_in_group(job: &Job, group: &Group, slot: u32) -> usize {
+    if group.placements.len() == 1 {
+        return 0;
+    }
+    let chart = job.charts.chart_of[job.charts.triangles[slot as usize] as usize];
+    (chart - group.placements.start) as usize
+}
+
+/// Claims the texels whose centre a triangle covers; returns how many it would have had to share.
+fn cover_centres(flat: &Flat, slot: u32, size: [i64; 2], owners: &mut [u32]) -> u64 {
+    // What overlaps by less than this may just touch.
+    const TOUCH: f64 = 1e-3;
+    let (lower, upper) = flat.bounds();
+    let mut overlapping = 0;
+    let last_row = ((upper.y - 0.5).floor() as i64).min(size[1] - 1);
+    for y in ((lower.y - 0.5).ceil() as i64).max(0)..=last_row {
+        let centre = y as f64 + 0.5;
+        let (left, right) = flat.slab(centre, centre);
+        let last = ((right - 0.5).floor() as i64).min(size[0] - 1);
+        let inner_row = centre - lower.y > TOUCH && upper.y - centre > TOUCH;
+        for x in ((left - 0.5).ceil() as i64).max(0)..=last {
+            let owner = &mut owners[(y * size[0] + x) as usize];
+            if *owner == NONE {
+                *owner = slot;
+            } else if inner_row && x as f64 + 0.5 - left > TOUCH && right - x as f64 - 0.5 > TOUCH {
+                overlapping += 1;
+            }
+        }
+    }
+    overlapping
+}
+
+/// Writes the samples of a group, and their numbers over the owners.
+fn sample_group(job: &Job, group: &Group, chart_start: &[u32], owners: &mut [u32], samples: &mut [TexelSample]) {
+    let first = chart_start[group.placements.start as usize];
+    let mut next = chart_start[group.placements.start as usize..group.placements.end as usize].to_vec();
+    // Neighbouring texels mostly show the same triangle.
+    let mut last = (NONE, Flat([DVec2::ZERO; 3]));
+    for (i, owner) in owners.iter_mut().enumerate() {
+        if *owner == NONE {
+            continue;
+        }
+        let (x, y) = (i as u32 % group.window.w as u32, i as u32 / group.window.w as u32);
+        let slot = *owner & !BORDER;
+        if slot != last.0 {
+            last = (slot, job.flat_triangle(group, slot));
+        }
+        let point = match *owner & BORDER {
+            0 => DVec2::new(x as f64 + 0.5, y as f64 + 0.5),
+            _ => last.1.nearest_in_texel(x as i64, y as i64).0,
+        };
+        let [u, v] = last.1.weights(point);
+        let number = &mut next[placement_in_group(job, group, slot)];
+        samples[(*number - first) as usize] = TexelSample {
+            x: group.window.x + x as u16,
+            y: group.window.y + y as u16,
+            triangle: job.charts.triangles[slot as usize],
+            u: u as f32,
+            v: v as f32,
+        };
+        *owner = *number;
+        *number += 1;
+    }
+}
+
+/// Adds up the surface area in each texel. `entries` name samples, which begin with `first`.
+fn measure_group(job: &Job, group: &Group, entries: &[u32], first: u32, areas: &mut [f32]) -> Result<()> {
+    let size = [group.window.w as i64, group.window.h as i64];
+    let mut sums = vec![0.0; areas.len()];
+    let mut visited = 0;
+    for slot in job.slots(group) {
+        let flat = job.flat_triangle(group, slot);
+        let area = triangle_area(job.scene, job.charts.triangles[slot as usize]);
+        let flat_area = flat.area();
+        let mut add = |x: i64, y: i64, share: f64| match entries[(y * size[0] + x) as usize] {
+            NONE => {}
+            sample => sums[(sample - first) as usize] += area * share,
+        };
+        if flat.altitude() > THIN {
+            flat.for_each_touched(size, |x, y| add(x, y, flat.clip(x, y).area() / flat_area));
+        } else {
+            // Without width in the map: all of it goes to one of the texels on its longest edge.
+            let mut touched = None;
+            flat.for_each_touched(size, |x, y| touched = touched.or(Some((x, y))));
+            touched.into_iter().for_each(|(x, y)| add(x, y, 1.0));
+        }
+        visited += flat.box_texels(size);
+        if visited >= TEXELS_PER_CHECK {
+            visited = 0;
+            job.stage.advance(0)?;
+        }
+    }
+    areas.iter_mut().zip(sums).for_each(|(a, s)| *a = s as f32);
+    Ok(())
+}
+
+/// Triangles less high than this many texels are taken for their longest edge where one would have
+/// to divide by their area.
+const THIN: f64 = 1e-9;
+
+/// A triangle in texel coordinates.
+#[derive(Clone, Copy, Debug)]
+struct Flat([DVec2; 3]);
+
+impl Flat {
+    fn bounds(&self) -> (DVec2, DVec2) {
+        let [a, b, c] = self.0;
+        (a.min(b).min(c), a.max(b).max(c))
+    }
+
+    /// Texels of the bounding box that lie in a window of `size`, at least 1.
+    fn box_texels(&self, size: [i64; 2]) -> u64 {
+        let (lower, upper) = self.bounds();
+        let extent = (upper - lower + 1.0).clamp(DVec2::ONE, DVec2::new(size[0] as f64, size[1] as f64));
+        (extent.x * extent.y) as u64
+    }
+
+    fn area(&self) -> f64 {
+        let [a, b, c] = self.0;
+        0.5 * (b - a).perp_dot(c - a).abs()
+    }
+
+    /// Ends of the longest edge, as numbers of corners.
+    fn longest_edge(&self) -> (usize, usize) {
+        let length = |(i, j): (usize, usize)| self.0[i].distance_squared(self.0[j]);
+        [(0, 1), (1, 2), (2, 0)].into_iter().fold((0, 1), |m, e| if length(e) > length(m) { e } else { m })
+    }
+
+    /// Height over the longest edge.
+    fn altitude(&self) -> f64 {
+        let (i, j) = self.longest_edge();
+        let length = self.0[i].distance(self.0[j]);
+        if length > 0.0 { 2.0 * self.area() / length } else { 0.0 }
+    }
+
+    /// Least and greatest x of the triangle's part with y in [y0, y1]. (+∞, −∞) where there is none.
+    fn slab(&self, y0: f64, y1: f64) -> (f64, f64) {
+        let (mut left, mut right) = (f64::INFINITY, f64::NEG_INFINITY);
+        let mut include = |x: f64| (left, right) = (left.min(x), right.max(x));
+        for k in 0..3 {
+            // In an order that both triangles of an edge agree on, so that crossings are equal.
+            let (p, q) = (self.0[k], self.0[(k + 1) % 3]);
+            let (p, q) = if (p.y, p.x) <= (q.y, q.x) { (p, q) } else { (q, p) };
+            for end in [p, q] {
+                if (y0..=y1).contains(&end.y) {
+                    include(end.x);
+                }
+            }
+            for y in [y0, y1] {
+                if p.y < y && y < q.y {
+                    let x = p.x + (y - p.y) / (q.y - p.y) * (q.x - p.x);
+                    include(x.clamp(p.x.min(q.x), p.x.max(q.x)));
+                }
+            }
+        }
+        (left, right)
+    }
+
+    /// Calls `f` with each texel of a window of `size` whose square the triangle overlaps, row by
+    /// row. A triangle without width in a direction lies in the texel above and to the right.
+    fn for_each_touched(&self, size: [i64; 2], mut f: impl FnMut(i64, i64)) {
+        let (lower, upper) = self.bounds();
+        let texels = |from: f64, to: f64, size: i64| {
+            let first = (from.floor() as i64).clamp(0, size - 1);
+            first..=((to.ceil() as i64) - 1).clamp(first, size - 1)
+        };
+        for y in texels(lower.y, upper.y, size[1]) {
+            let (left, right) = self.slab(y as f64, y as f64 + 1.0);
+            // Outside the window in y (rounding, or given UVs just beyond the page): nearest row.
+            let (left, right) = if left <= right { (left, right) } else { (lower.x, upper.x) };
+            for x in texels(left, right, size[0]) {
+                f(x, y);
+            }
+        }
+    }
+
+    /// The part in the square of texel (x, y).
+    fn clip(&self, x: i64, y: i64) -> Polygon {
+        let mut polygon = Polygon { points: [DVec2::ZERO; 8], count: 3 };
+        polygon.points[..3].copy_from_slice(&self.0);
+        let (x, y) = (x as f64, y as f64);
+        for (axis, bound, sign) in [(0, x, 1.0), (0, x + 1.0, -1.0), (1, y, 1.0), (1, y + 1.0, -1.0)] {
+            polygon = polygon.cut(axis, bound, sign);
+        }
+        polygon
+    }
+
+    /// The point in texel (x, y), which the triangle touches, that is nearest to the texel's centre,
+    /// and its squared distance.
+    fn nearest_in_texel(&self, x: i64, y: i64) -> (DVec2, f64) {
+        let corner = DVec2::new(x as f64, y as f64);
+        let centre = corner + 0.5;
+        let polygon = self.clip(x, y);
+        let mut best = (corner, f64::INFINITY);
+        let mut consider = |p: DVec2| {
+            let p = p.clamp(corner, corner + 1.0);
+            if p.distance_squared(centre) < best.1 {
+                best = (p, p.distance_squared(centre));
+            }
+        };
+        let points = &polygon.points[..polygon.count];
+        for (k, &p) in points.iter().enumerate() {
+            consider(nearest_on_segment(p, points[(k + 1) % points.len()], centre));
+        }
+        // Nothing left in rounding: the triangle's border, moved into the texel.
+        if points.is_empty() {
+            for k in 0..3 {
+                consider(nearest_on_segment(self.0[k], self.0[(k + 1) % 3], centre));
+            }
+        }
+        best
+    }
+
+    /// Weights of corners 1 and 2 for a point of the triangle; points just outside are moved in.
+    fn weights(&self, p: DVec2) -> [f64; 2] {
+        let [a, b, c] = self.0;
+        if self.altitude() <= THIN {
+            let (i, j) = self.longest_edge();
+            let mut weights = [0.0; 3];
+            let t = fraction_on_segment(self.0[i], self.0[j], p);
+            (weights[i], weights[j]) = (1.0 - t, t);
+            return [weights[1], weights[2]];
+        }
+        let det = (b - a).perp_dot(c - a);
+        let u = ((p - a).perp_dot(c - a) / det).max(0.0);
+        let v = ((b - a).perp_dot(p - a) / det).max(0.0);
+        let excess = (u + v).max(1.0);
+        [u / excess, v / excess]
+    }
+}
+
+/// A triangle clipped by up to four half-planes.
+struct Polygon {
+    points: [DVec2; 8],
+    count: usize,
+}
+
+impl Polygon {
+    /// The part where sign · coordinate ≥ sign · bound (Sutherland and Hodgman 1974).
+    fn cut(&self, axis: usize, bound: f64, sign: f64) -> Polygon {
+        let mut out = Polygon { points: [DVec2::ZERO; 8], count: 0 };
+        let mut push = |p: DVec2| {
+            // A convex polygon gains at most one corner per cut; rounding cannot exceed the array.
+            if out.count < 8 {
+                out.points[out.count] = p;
+                out.count += 1;
+            }
+        };
+        let points = &self.points[..self.count];
+        for (k, &p) in points.iter().enumerate() {
+            let q = points[(k + 1) % points.len()];
+            let (dp, dq) = (sign * (p[axis] - bound), sign * (q[axis] - bound));
+            if dp >= 0.0 {
+                push(p);
+            }
+            if (dp > 0.0 && dq < 0.0) || (dp < 0.0 && dq > 0.0) {
+                let mut crossing = p + (q - p) * (dp / (dp - dq));
+                crossing[axis] = bound;
+                push(crossing);
+            }
+        }
+        out
+    }
+
+    fn area(&self) -> f64 {
+        let points = &self.points[..self.count];
+        let Some(&origin) = points.first() else { return 0.0 };
+        0.5 * points.windows(2).map(|w| (w[0] - origin).perp_dot(w[1] - origin)).sum::<f64>().abs()
+    }
+}
+
+fn fraction_on_segment(a: DVec2, b: DVec2, p: DVec2) -> f64 {
+    let length = (b - a).length_squared();
+    if length > 0.0 { ((p - a).dot(b - a) / length).clamp(0.0, 1.0) } else { 0.0 }
+}
+
+fn nearest_on_segment(a: DVec2, b: DVec2, p: DVec2) -> DVec2 {
+    a + (b - a) * fraction_on_segment(a, b, p)
+}
+
+/// The uncovered texels of a group's window within `padding` of covered ones. Exact: first the
+/// nearest covered texel in each column, then the best of the columns around.
+fn dilate(group: &Group, entries: &[u32], padding: u32) -> Vec<Dilated> {
+    let (w, h) = (group.window.w as usize, group.window.h as usize);
+    let mut out = Vec::new();
+    // Row of the nearest covered texel of each column at or above the present row, and below it.
+    let mut above = vec![None; w];
+    let mut below = vec![None; w];
+    let reach = padding as usize;
+    for y in 0..h {
+        for x in 0..w {
+            if entries[y * w + x] != NONE {
+                above[x] = Some(y);
+            }
+            if below[x].is_none_or(|row| row < y) {
+                below[x] = (y..h.min(y + reach + 1)).find(|&row| entries[row * w + x] != NONE);
+            }
+        }
+        for x in (0..w).filter(|&x| entries[y * w + x] == NONE) {
+            let columns = x.saturating_sub(reach)..w.min(x + reach + 1);
+            let candidates = columns.flat_map(|column| [above[column], below[column]].map(|row| (column, row)));
+            let nearest = candidates
+                .filter_map(|(column, row)| Some((column, row?)))
+                .filter(|&(_, row)| row.abs_diff(y) <= reach)
+                .map(|(column, row)| (column.abs_diff(x).pow(2) + row.abs_diff(y).pow(2), entries[row * w + column]))
+                .min();
+            if let Some((_, sample)) = nearest {
+                let (x, y) = (group.window.x + x as u16, group.window.y + y as u16);
+                out.push(Dilated { page: group.page, x, y, sample });
+            }
+        }
+    }
+    out
+}

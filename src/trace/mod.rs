@@ -7,6 +7,7 @@
 pub mod baseline;
 mod gather;
 mod kernels;
+pub mod offset;
 mod single;
 mod triangle;
 

@@ -1,0 +1,366 @@
+//! The bake: stages in order, each with its share of progress, time and memory.
+
+use super::charts::{Charts, automatic_density};
+use super::direct::DirectLight;
+use super::gather::{Gathered, SampleSet, gather};
+use super::layout::Layout;
+use super::map::ChartMap;
+use super::plan::{Plan, left_out};
+use super::radiance::{self, RadianceInput, RadianceMap};
+use super::texels::TexelMap;
+use super::{BakeParams, BakeStats, Light, Lightmap, LightmapDesc, LightmapInfo, StageStats, blur};
+use crate::error::{Error, Result, invalid_argument};
+use crate::memory::try_vec;
+use crate::photon::{PhotonMap, PhotonParams};
+use crate::progress::Progress;
+use crate::sampling::{combine, purpose_seed};
+use crate::scene::Scene;
+use crate::trace::Ray;
+use glam::Vec3;
+use rayon::prelude::*;
+use std::ops::Range;
+use std::sync::Arc;
+use std::sync::atomic::{AtomicU64, Ordering::Relaxed};
+use std::time::Instant;
+
+/// Texels handed to a thread at a time.
+const BLOCK: usize = 256;
+
+/// Pages that a scene fills, about, if the caller leaves the density open.
+const AUTOMATIC_PAGES: f64 = 4.0;
+
+/// Coarse maps of small light maps have pages of this size at least.
+const MIN_PAGE_SIZE: u32 = 64;
+
+/// What the random numbers of a bake are for.
+mod purpose {
+    pub const RADIANCE: u32 = 1;
+    pub const GATHER_SET: u32 = 2;
+    pub const GATHER: u32 = 3;
+    pub const DIRECT: u32 = 4;
+}
+
+/// The radiance map, coarser than the light map, takes this part of the direct samples.
+const RADIANCE_SAMPLE_DIVISOR: u32 = 4;
+
+impl Lightmap {
+    /// Unwraps what brings no usable UVs, lays out the pages and maps texels to triangles.
+    pub fn create(scene: &Arc<Scene>, desc: &LightmapDesc, progress: &Progress) -> Result<Lightmap> {
+        desc.validate()?;
+        let start = Instant::now();
+        let density = match desc.texels_per_unit {
+            0.0 => automatic_density(scene, desc.page_size, AUTOMATIC_PAGES),
+            d => d,
+        };
+        let (charts, mut uvs) = Charts::of_scene(scene, density, desc.page_size, desc.padding, progress)?;
+        let unwrap_seconds = start.elapsed().as_secs_f64();
+        let two_sided = charts.charts.iter().any(|c| c.two_sided);
+        let pack = |divisor: u32, padding: u32, given: bool, back: bool| {
+            let page_size = (desc.page_size / divisor).max(MIN_PAGE_SIZE);
+            Layout::pack(&charts, density / divisor as f32, page_size, padding, given, back)
+        };
+        let layouts = [
+            pack(1, desc.padding, true, false)?,
+            pack(desc.gather_divisor, 0, false, false)?,
+            pack(desc.radiance_divisor, 0, false, two_sided)?,
+        ];
+        let stage = progress.stage("texels", 0.5, 1.0, layouts.iter().map(TexelMap::work).sum());
+        let [map, gather, radiance] = layouts.map(|l| ChartMap::new(scene, &charts, l, false, &stage));
+        let (map, gather, radiance) = (map?, gather?, radiance?);
+        uvs.overlapping_texels = map.texels.overlapping_texels;
+        uvs.reduced_charts = map.layout.reduced;
+        let bytes = charts.bytes() + map.bytes() + gather.bytes() + radiance.bytes();
+        let info = LightmapInfo {
+            page_count: map.layout.page_count,
+            width: desc.page_size,
+            height: desc.page_size,
+            charts: charts.charts.len() as u32,
+            texels: map.len() as u64,
+            gather_texels: gather.len() as u64,
+            radiance_texels: radiance.len() as u64,
+            bytes: bytes as u64,
+            unwrap_seconds,
+            texels_per_unit: density,
+            uvs,
+        };
+        let memory = scene.device().memory().reserve(charts.bytes(), "the charts")?;
+        let direct = DirectLight::new(scene);
+        let plan = Plan::new(scene, &direct, &BakeParams::default(), two_sided, uvs.unwrapped_charts > 0);
+        Ok(Lightmap {
+            scene: scene.clone(),
+            charts,
+            map,
+            gather,
+            radiance,
+            padding: desc.padding,
+            info,
+            plan,
+            light: None,
+            _memory: memory,
+        })
+    }
+
+    /// Runs the pipeline. On an error or a cancel what an earlier bake left stays as it was.
+    pub fn bake(&mut self, params: &BakeParams, progress: &Progress) -> Result<BakeStats> {
+        params.validate()?;
+        let total = self.map.len() as u64;
+        if params.texel_begin > total || params.texel_end > total {
+            return invalid_argument!(
+                "texel_begin {} or texel_end {} lies beyond the light map's {total} texels",
+                params.texel_begin,
+                params.texel_end
+            );
+        }
+        let end = if params.texel_end == 0 { total } else { params.texel_end };
+        let direct = DirectLight::new(&self.scene);
+        let two_sided = !self.radiance.layout.back_of.is_empty();
+        let plan = Plan::new(&self.scene, &direct, params, two_sided, self.info.uvs.unwrapped_charts > 0);
+        let device = self.scene.device().clone();
+        device.memory().reset_peak();
+        let bake = Bake {
+            lightmap: self,
+            params,
+            plan: &plan,
+            direct: &direct,
+            range: params.texel_begin as usize..end as usize,
+            progress,
+        };
+        let (light, mut stats) = bake.run()?;
+        stats.peak_bytes = device.memory().peak() as u64;
+        stats.left_out = plan.left_out;
+        self.plan = plan;
+        self.store(light, params.texel_begin as usize..end as usize);
+        Ok(stats)
+    }
+
+    /// Takes the light of a range of samples over.
+    fn store(&mut self, new: Light, range: Range<usize>) {
+        match &mut self.light {
+            Some(old) if range.len() < self.map.len() => {
+                old.direct[range.clone()].copy_from_slice(&new.direct[range.clone()]);
+                old.indirect[range.clone()].copy_from_slice(&new.indirect[range.clone()]);
+                old.valid[range.clone()].copy_from_slice(&new.valid[range]);
+                old.radiance = new.radiance;
+            }
+            light => *light = Some(new),
+        }
+    }
+}
+
+/// One bake under way.
+struct Bake<'a, 'p> {
+    lightmap: &'a Lightmap,
+    params: &'a BakeParams,
+    plan: &'a Plan,
+    direct: &'a DirectLight,
+    /// Samples of the light map to bake.
+    range: Range<usize>,
+    progress: &'a Progress<'p>,
+}
+
+/// The gather map after blur and filling.
+struct Indirect {
+    irradiance: Vec<Vec3>,
+    valid: Vec<bool>,
+}
+
+impl Bake<'_, '_> {
+    fn run(&self) -> Result<(Light, BakeStats)> {
+        let start = Instant::now();
+        let mut stats = BakeStats::default();
+        let memory = self.reserve()?;
+        let scene = &self.lightmap.scene;
+        let mut radiance = Vec::new();
+        let mut indirect = None;
+        if self.plan.runs(left_out::INDIRECT) {
+            let photons = if self.plan.runs(left_out::PHOTONS) { Some(self.photons(&mut stats)?) } else { None };
+            radiance = self.radiance(photons.as_ref(), &mut stats)?;
+            drop(photons);
+            indirect = Some(self.gather(&radiance, &mut stats)?);
+        }
+        let n = self.lightmap.map.len();
+        let mut light = Light {
+            direct: try_vec(n, "direct light")?,
+            indirect: try_vec(n, "indirect light")?,
+            valid: try_vec(n, "validity")?,
+            radiance,
+            _memory: memory,
+        };
+        self.compose(scene, indirect.as_ref(), &mut light, &mut stats)?;
+        stats.seconds = start.elapsed().as_secs_f64();
+        Ok((light, stats))
+    }
+
+    /// Announces the buffers of all stages but the photon map, which announces its own.
+    fn reserve(&self) -> Result<crate::memory::Reservation> {
+        let l = self.lightmap;
+        let mut bytes = l.map.len() * 25;
+        if self.plan.runs(left_out::INDIRECT) {
+            bytes += l.radiance.len() * 12 + l.gather.len() * 38;
+        }
+        if self.params.memory_budget != 0 && bytes as u64 > self.params.memory_budget {
+            return Err(Error::OutOfMemory(format!(
+                "the bake's buffers take {bytes} bytes, more than memory_budget {}",
+                self.params.memory_budget
+            )));
+        }
+        l.scene.device().memory().reserve(bytes, "the bake's buffers")
+    }
+
+    fn photons(&self, stats: &mut BakeStats) -> Result<PhotonMap> {
+        let start = Instant::now();
+        let params = PhotonParams {
+            photon_count: self.params.photon_count,
+            max_bounces: self.params.max_bounces,
+            radius: self.params.radius,
+            seed: self.params.seed,
+            memory_budget: self.params.memory_budget,
+            store_direct: false,
+            ..Default::default()
+        };
+        let map = PhotonMap::trace(&self.lightmap.scene, &params, self.progress)?;
+        let s = map.stats();
+        stats.photons = StageStats { seconds: start.elapsed().as_secs_f64(), rays: s.rays, bytes: map.bytes() as u64 };
+        (stats.photons_emitted, stats.photons_stored) = (s.emitted, s.stored);
+        Ok(map)
+    }
+
+    fn radiance(&self, photons: Option<&PhotonMap>, stats: &mut BakeStats) -> Result<Vec<Vec3>> {
+        let start = Instant::now();
+        let l = self.lightmap;
+        let stage = self.progress.stage("radiance", 0.2, 0.3, l.radiance.len() as u64);
+        let mut values = try_vec(l.radiance.len(), "the radiance map")?;
+        let input = RadianceInput {
+            scene: &l.scene,
+            map: &l.radiance,
+            direct: self.direct,
+            photons,
+            direct_samples: self.params.direct_samples.div_ceil(RADIANCE_SAMPLE_DIVISOR),
+            seed: purpose_seed(self.params.seed, purpose::RADIANCE),
+            back_start: l.radiance.back_start(),
+        };
+        let rays = radiance::bake(l.scene.device(), &input, &mut values, &stage)?;
+        let bytes = (values.len() * size_of::<Vec3>() + l.radiance.bytes()) as u64;
+        stats.radiance = StageStats { seconds: start.elapsed().as_secs_f64(), rays, bytes };
+        Ok(values)
+    }
+
+    /// Gathers, blurs and fills. Only charts that the range touches are gathered.
+    fn gather(&self, radiance: &[Vec3], stats: &mut BakeStats) -> Result<Indirect> {
+        let start = Instant::now();
+        let l = self.lightmap;
+        let device = l.scene.device();
+        let charts =
+            l.map.texels.placement_of(self.range.start as u32)..=l.map.texels.placement_of(self.range.end as u32 - 1);
+        let needed = l.gather.texels.chart_start[*charts.start() as usize] as usize
+            ..l.gather.texels.chart_start[*charts.end() as usize + 1] as usize;
+        let lookup = RadianceMap::new(&l.charts, &l.radiance, radiance);
+        let samples = SampleSet::new(self.params.gather_rays, purpose_seed(self.params.seed, purpose::GATHER_SET));
+        let seed = purpose_seed(self.params.seed, purpose::GATHER);
+        let stage = self.progress.stage("gather", 0.3, 0.6, needed.len() as u64);
+        let n = l.gather.len();
+        let mut irradiance: Vec<Vec3> = try_vec(n, "the gather map")?;
+        let mut normals: Vec<Vec3> = try_vec(n, "the gather map's normals")?;
+        let mut valid: Vec<bool> = try_vec(n, "the gather map's validity")?;
+        device.install(|| {
+            let values = irradiance[needed.clone()].par_chunks_mut(BLOCK);
+            let normals = normals[needed.clone()].par_chunks_mut(BLOCK);
+            let valid = valid[needed.clone()].par_chunks_mut(BLOCK);
+            values.zip(normals).zip(valid).enumerate().try_for_each(|(block, ((values, normals), valid))| {
+                for i in 0..values.len() {
+                    let sample = needed.start + block * BLOCK + i;
+                    let (_, receiver) = l.gather.receiver(&l.scene, sample, false);
+                    let Gathered { irradiance, valid: v } =
+                        gather(&l.scene, &lookup, &receiver, &samples, combine(seed, sample as u32));
+                    (values[i], normals[i], valid[i]) = (irradiance.into(), receiver.normal, v);
+                }
+                stage.advance(values.len() as u64)
+            })
+        })?;
+        blur::fill(&l.charts, &l.gather, &mut irradiance, &valid);
+        if self.plan.runs(left_out::BLUR) {
+            let stage = self.progress.stage("blur", 0.6, 0.65, n as u64);
+            let mut blurred = try_vec(n, "the blurred gather map")?;
+            let radius = self.params.blur_radius;
+            blur::blur(device, &l.charts, &l.gather, &irradiance, &valid, &normals, radius, &mut blurred, &stage)?;
+            irradiance = blurred;
+        }
+        let rays = needed.len() as u64 * samples.len() as u64;
+        let bytes = (n * 38 + l.gather.bytes()) as u64;
+        stats.gather = StageStats { seconds: start.elapsed().as_secs_f64(), rays, bytes };
+        Ok(Indirect { irradiance, valid })
+    }
+
+    /// Direct light and the interpolated indirect light of every texel of the range.
+    fn compose(
+        &self,
+        scene: &Arc<Scene>,
+        indirect: Option<&Indirect>,
+        light: &mut Light,
+        stats: &mut BakeStats,
+    ) -> Result<()> {
+        let start = Instant::now();
+        let l = self.lightmap;
+        let seed = purpose_seed(self.params.seed, purpose::DIRECT);
+        let stage = self.progress.stage("direct", 0.65, 1.0, self.range.len() as u64);
+        let rays = AtomicU64::new(0);
+        let range = self.range.clone();
+        scene.device().install(|| {
+            let direct = light.direct[range.clone()].par_chunks_mut(BLOCK);
+            let indirect_out = light.indirect[range.clone()].par_chunks_mut(BLOCK);
+            let valid = light.valid[range.clone()].par_chunks_mut(BLOCK);
+            direct.zip(indirect_out).zip(valid).enumerate().try_for_each(|(block, ((direct, ind), valid))| {
+                let mut traced = 0;
+                for i in 0..direct.len() {
+                    let sample = range.start + block * BLOCK + i;
+                    let (_, receiver) = l.map.receiver(scene, sample, false);
+                    valid[i] = true;
+                    if let Some(indirect) = indirect {
+                        let (value, clear) = self.interpolate(sample, indirect);
+                        ind[i] = value;
+                        if !clear {
+                            traced += 1;
+                            valid[i] = !inside_a_solid(scene, receiver.origin, receiver.geometric);
+                        }
+                    }
+                    if self.plan.runs(left_out::DIRECT) {
+                        let seed = combine(seed, sample as u32);
+                        direct[i] = self.direct.irradiance(&receiver, self.params.direct_samples, seed, &mut traced);
+                    }
+                }
+                rays.fetch_add(traced, Relaxed);
+                stage.advance(direct.len() as u64)
+            })
+        })?;
+        stats.direct = StageStats {
+            seconds: start.elapsed().as_secs_f64(),
+            rays: rays.into_inner(),
+            bytes: (l.map.len() * 25 + l.map.bytes()) as u64,
+        };
+        let start = Instant::now();
+        // A hidden texel beside a lit one would show as a dark rim under bilinear filtering.
+        blur::fill(&l.charts, &l.map, &mut light.direct, &light.valid);
+        stats.compose = StageStats { seconds: start.elapsed().as_secs_f64(), ..Default::default() };
+        Ok(())
+    }
+
+    /// Indirect light at a sample of the light map, and whether all gather texels that it comes
+    /// from can be seen.
+    fn interpolate(&self, sample: usize, indirect: &Indirect) -> (Vec3, bool) {
+        let l = self.lightmap;
+        let t = &l.map.texels.samples[sample];
+        let chart = l.charts.chart_of[t.triangle as usize];
+        let (mut sum, mut clear) = (Vec3::ZERO, true);
+        l.gather.bilinear(chart, l.charts.local(t.triangle, t.u, t.v), |s, w| {
+            sum += w * indirect.irradiance[s];
+            clear &= indirect.valid[s];
+        });
+        (sum, clear)
+    }
+}
+
+/// Whether what lies straight above a surface is the back of a one-sided one.
+fn inside_a_solid(scene: &Scene, origin: Vec3, normal: Vec3) -> bool {
+    let hit = scene.intersect_raw(&Ray::new(origin, normal));
+    !hit.is_miss() && !hit.front && !scene.material(hit.triangle).two_sided
+}

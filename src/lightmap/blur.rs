@@ -1,0 +1,156 @@
+//! Filters over the texels of a map: a blur of the gather map (thesis 3.2.5) that stays inside
+//! charts and does not reach through walls, and the filling of texels that cannot be seen.
+
+use super::charts::Charts;
+use super::map::ChartMap;
+use crate::device::Device;
+use crate::error::Result;
+use crate::progress::Stage;
+use crate::scene::NONE;
+use glam::Vec3;
+use rayon::prelude::*;
+
+/// Largest blur radius in texels.
+pub const MAX_BLUR_RADIUS: u32 = 16;
+
+/// Width of the largest window.
+const MAX_WINDOW: usize = 2 * MAX_BLUR_RADIUS as usize + 1;
+
+/// Texels handed to a thread at a time.
+const BLOCK: usize = 1024;
+
+/// Rounds of filling: a hidden region wider than twice this stays partly unfilled.
+const MAX_FILL_ROUNDS: usize = 64;
+
+/// Gaussian blur of the valid texels among `values` within a square of `radius`. A texel takes part
+/// only if a path of valid texels of the same chart, within the square, leads to it: light on one
+/// side of a wall that stands on the chart does not cross the hidden texels below the wall.
+pub(super) fn blur(
+    device: &Device,
+    charts: &Charts,
+    map: &ChartMap,
+    values: &[Vec3],
+    valid: &[bool],
+    normals: &[Vec3],
+    radius: u32,
+    out: &mut [Vec3],
+    stage: &Stage,
+) -> Result<()> {
+    let radius = radius.min(MAX_BLUR_RADIUS) as i32;
+    device.install(|| {
+        out.par_chunks_mut(BLOCK).enumerate().try_for_each(|(block, out)| {
+            let mut window = Window::new(radius);
+            for (i, out) in out.iter_mut().enumerate() {
+                let sample = block * BLOCK + i;
+                *out = if valid[sample] {
+                    window.blur(charts, map, sample, values, valid, normals)
+                } else {
+                    values[sample]
+                };
+            }
+            stage.advance(out.len() as u64)
+        })
+    })
+}
+
+/// Scratch space for one texel's neighbourhood.
+struct Window {
+    radius: i32,
+    /// Gaussian weight by squared distance.
+    weights: Vec<f32>,
+    seen: [u64; MAX_WINDOW],
+    queue: Vec<(i32, i32)>,
+}
+
+impl Window {
+    fn new(radius: i32) -> Window {
+        // The radius is two standard deviations.
+        let s = 2.0 / (radius as f32 * radius as f32).max(1.0);
+        let weights = (0..=2 * radius * radius).map(|d2| (-(d2 as f32) * s).exp()).collect();
+        Window { radius, weights, seen: [0; MAX_WINDOW], queue: Vec::new() }
+    }
+
+    fn blur(
+        &mut self,
+        charts: &Charts,
+        map: &ChartMap,
+        sample: usize,
+        values: &[Vec3],
+        valid: &[bool],
+        normals: &[Vec3],
+    ) -> Vec3 {
+        let (x, y) = map.position(sample);
+        let placement = charts.chart_of[map.texels.samples[sample].triangle as usize];
+        self.seen = [0; MAX_WINDOW];
+        self.queue.clear();
+        self.visit(0, 0);
+        let (mut sum, mut total) = (Vec3::ZERO, 0.0);
+        let mut next = 0;
+        while next < self.queue.len() {
+            let (dx, dy) = self.queue[next];
+            next += 1;
+            let s = map.at(placement, x + dx, y + dy);
+            if s == NONE || !valid[s as usize] {
+                continue;
+            }
+            // Charts may bend; light from another direction is another light.
+            let bend = normals[sample].dot(normals[s as usize]).max(0.0);
+            let w = self.weights[(dx * dx + dy * dy) as usize] * bend * bend * bend * bend;
+            sum += w * values[s as usize];
+            total += w;
+            for (nx, ny) in [(dx - 1, dy), (dx + 1, dy), (dx, dy - 1), (dx, dy + 1)] {
+                if nx.abs() <= self.radius && ny.abs() <= self.radius {
+                    self.visit(nx, ny);
+                }
+            }
+        }
+        sum / total
+    }
+
+    fn visit(&mut self, dx: i32, dy: i32) {
+        let (row, bit) = ((dy + self.radius) as usize, 1u64 << (dx + self.radius));
+        if self.seen[row] & bit == 0 {
+            self.seen[row] |= bit;
+            self.queue.push((dx, dy));
+        }
+    }
+}
+
+/// Gives each texel that is not valid the mean of its valid or already filled neighbours in the
+/// chart, ring by ring. Charts without a valid texel are left alone. Returns which were filled.
+pub(super) fn fill(charts: &Charts, map: &ChartMap, values: &mut [Vec3], valid: &[bool]) -> Vec<u32> {
+    let mut known = valid.to_vec();
+    let mut missing: Vec<u32> = (0..valid.len() as u32).filter(|&i| !valid[i as usize]).collect();
+    let mut filled = Vec::new();
+    for _ in 0..MAX_FILL_ROUNDS {
+        let ring: Vec<(u32, Vec3)> =
+            missing.iter().filter_map(|&i| Some((i, neighbours(charts, map, i, values, &known)?))).collect();
+        if ring.is_empty() {
+            break;
+        }
+        for &(i, v) in &ring {
+            values[i as usize] = v;
+            known[i as usize] = true;
+            filled.push(i);
+        }
+        missing.retain(|&i| !known[i as usize]);
+    }
+    filled
+}
+
+/// Mean of the known neighbours of a texel in its chart.
+fn neighbours(charts: &Charts, map: &ChartMap, sample: u32, values: &[Vec3], known: &[bool]) -> Option<Vec3> {
+    let (x, y) = map.position(sample as usize);
+    let placement = charts.chart_of[map.texels.samples[sample as usize].triangle as usize];
+    let (mut sum, mut n) = (Vec3::ZERO, 0.0);
+    for dy in -1..=1 {
+        for dx in -1..=1 {
+            let s = map.at(placement, x + dx, y + dy);
+            if s != NONE && known[s as usize] {
+                sum += values[s as usize];
+                n += 1.0;
+            }
+        }
+    }
+    (n > 0.0).then(|| sum / n)
+}

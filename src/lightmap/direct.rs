@@ -1,0 +1,282 @@
+//! Direct light at points of surfaces, by shadow rays (thesis 3.2.6).
+//!
+//! Point, spot and directional lights take one ray. For area lights (rect lights and emissive
+//! triangles) the unoccluded irradiance is computed exactly and multiplied by the fraction of it
+//! that rays find visible (the ratio estimator of Heitz, Hill and McGuire, *Combining Analytic
+//! Direct Illumination and Stochastic Shadows*, 2018): without occluders there is no noise. Of very
+//! many area lights each ray picks one at random, and the estimate is the plain unbiased one.
+
+use super::polygon;
+use crate::sampling::{combine, sobol_2d, uniform_triangle};
+use crate::scene::{Light, Scene};
+use crate::trace::Ray;
+use crate::trace::offset::{SurfacePoint, offset_ray_origin};
+use glam::Vec3;
+use std::sync::Arc;
+
+/// Up to this many area lights are evaluated exactly at every point.
+const MAX_ANALYTIC: usize = 64;
+
+/// Rays to area lights from one point, at most: this many times those for one light.
+const MAX_LIGHTS_SAMPLED: usize = 4;
+
+/// Shadow rays end this far before a light, as a fraction of the way.
+const LIGHT_MARGIN: f32 = 1e-4;
+
+/// A point that receives light.
+#[derive(Clone, Copy, Debug)]
+pub struct Receiver {
+    /// Where its rays start.
+    pub origin: Vec3,
+    /// Unit normal of the irradiance.
+    pub normal: Vec3,
+    /// Unit geometric normal on the same side.
+    pub geometric: Vec3,
+}
+
+impl Receiver {
+    /// The front (or back) of a point of a triangle. `shading` is the interpolated normal, if the
+    /// mesh has any; it is turned to the side.
+    pub fn new(scene: &Scene, point: &SurfacePoint, shading: Option<Vec3>, back: bool) -> Receiver {
+        let geometric = if back { -point.normal } else { point.normal };
+        let normal = match shading {
+            Some(n) if n.dot(geometric) < 0.0 => -n,
+            Some(n) => n,
+            None => geometric,
+        };
+        Receiver { origin: offset_ray_origin(point.interior, geometric, scene), normal, geometric }
+    }
+}
+
+/// A parallelogram or a triangle that emits.
+#[derive(Clone, Copy, Debug)]
+struct AreaLight {
+    corner: Vec3,
+    edge_u: Vec3,
+    edge_v: Vec3,
+    /// Unit normal of the emitting side.
+    normal: Vec3,
+    area: f32,
+    triangle: bool,
+    two_sided: bool,
+    radiance: Vec3,
+}
+
+impl AreaLight {
+    /// Unoccluded irradiance for radiance 1.
+    fn irradiance(&self, receiver: &Receiver) -> f64 {
+        let o = receiver.origin.as_dvec3();
+        let c = self.corner.as_dvec3() - o;
+        let (u, v) = (self.edge_u.as_dvec3(), self.edge_v.as_dvec3());
+        if !self.two_sided && c.dot(self.normal.as_dvec3()) >= 0.0 {
+            return 0.0;
+        }
+        let normal = receiver.normal.as_dvec3();
+        if self.triangle {
+            polygon::irradiance(&[c, c + u, c + v], normal)
+        } else {
+            polygon::irradiance(&[c, c + u, c + u + v, c + v], normal)
+        }
+    }
+
+    /// A point on the light, uniform in area.
+    fn sample(&self, u: [f32; 2]) -> Vec3 {
+        let [u, v] = if self.triangle { uniform_triangle(u) } else { u };
+        self.corner + u * self.edge_u + v * self.edge_v
+    }
+
+    /// cos cos'/d² between a point of the light and a receiver: irradiance per area for radiance 1.
+    fn geometry_term(&self, receiver: &Receiver, point: Vec3) -> f32 {
+        let way = point - receiver.origin;
+        let d2 = way.length_squared();
+        if d2 == 0.0 {
+            return 0.0;
+        }
+        let there = -way.dot(self.normal);
+        let there = if self.two_sided { there.abs() } else { there.max(0.0) };
+        way.dot(receiver.normal).max(0.0) * there / (d2 * d2)
+    }
+}
+
+/// The lights of a scene, ready to be sampled.
+pub struct DirectLight {
+    scene: Arc<Scene>,
+    lights: Arc<Vec<Light>>,
+    areas: Vec<AreaLight>,
+    /// Cumulative power of `areas`, normalised, for the many-light case.
+    power_cdf: Vec<f32>,
+}
+
+impl DirectLight {
+    /// A snapshot of a scene's lights.
+    pub fn new(scene: &Arc<Scene>) -> DirectLight {
+        let lights = scene.lights();
+        let mut areas = Vec::new();
+        for light in lights.iter() {
+            if let Light::Rect { position, edge_u, edge_v, radiance } = *light {
+                let cross = edge_u.as_dvec3().cross(edge_v.as_dvec3());
+                areas.push(AreaLight {
+                    corner: position,
+                    edge_u,
+                    edge_v,
+                    normal: cross.normalize().as_vec3(),
+                    area: cross.length() as f32,
+                    triangle: false,
+                    two_sided: false,
+                    radiance: Vec3::from(radiance),
+                });
+            }
+        }
+        areas.extend(scene.emitters().iter().map(|e| AreaLight {
+            corner: e.corner,
+            edge_u: e.edge_u,
+            edge_v: e.edge_v,
+            normal: e.normal,
+            area: e.area,
+            triangle: true,
+            two_sided: e.two_sided,
+            radiance: Vec3::from(e.radiance),
+        }));
+        areas.retain(|a| a.radiance.max_element() > 0.0 && a.area > 0.0);
+        let total: f64 = areas.iter().map(|a| (a.radiance.element_sum() * a.area) as f64).sum();
+        let mut below = 0.0;
+        let power_cdf = areas
+            .iter()
+            .map(|a| {
+                below += (a.radiance.element_sum() * a.area) as f64 / total;
+                below as f32
+            })
+            .collect();
+        DirectLight { scene: scene.clone(), lights, areas, power_cdf }
+    }
+
+    /// Rect lights and emissive triangles.
+    pub fn area_light_count(&self) -> usize {
+        self.areas.len()
+    }
+
+    /// Whether any light shines.
+    pub fn is_dark(&self) -> bool {
+        self.areas.is_empty() && self.lights.iter().all(|l| l.color().iter().all(|&c| c == 0.0))
+    }
+
+    /// Irradiance in W/m² at a receiver. `samples`: rays per area light. `seed`: of this point.
+    /// Adds the rays traced to `rays`.
+    pub fn irradiance(&self, receiver: &Receiver, samples: u32, seed: u32, rays: &mut u64) -> Vec3 {
+        let mut sum = Vec3::ZERO;
+        for light in self.lights.iter() {
+            sum += self.from_light(light, receiver, rays);
+        }
+        if self.areas.is_empty() || samples == 0 {
+            sum
+        } else if self.areas.len() <= MAX_ANALYTIC {
+            sum + self.from_few_areas(receiver, samples, seed, rays)
+        } else {
+            sum + self.from_many_areas(receiver, samples, seed, rays)
+        }
+    }
+
+    fn visible(&self, receiver: &Receiver, target: Vec3, rays: &mut u64) -> bool {
+        *rays += 1;
+        !self.scene.occluded(&Ray::new(receiver.origin, target - receiver.origin).within(0.0, 1.0 - LIGHT_MARGIN))
+    }
+
+    fn from_light(&self, light: &Light, receiver: &Receiver, rays: &mut u64) -> Vec3 {
+        match *light {
+            Light::Point { position, intensity } => self.from_point(position, Vec3::from(intensity), receiver, rays),
+            Light::Spot { position, direction, inner, outer, intensity } => {
+                let way = (receiver.origin - position).normalize_or_zero();
+                let falloff = Light::spot_falloff(way.dot(direction), inner, outer);
+                self.from_point(position, Vec3::from(intensity) * falloff, receiver, rays)
+            }
+            Light::Directional { direction, irradiance } => {
+                let cosine = -direction.dot(receiver.normal);
+                let irradiance = Vec3::from(irradiance) * cosine;
+                if cosine <= 0.0 || direction.dot(receiver.geometric) >= 0.0 || irradiance.max_element() <= 0.0 {
+                    return Vec3::ZERO;
+                }
+                *rays += 1;
+                if self.scene.occluded(&Ray::new(receiver.origin, -direction)) { Vec3::ZERO } else { irradiance }
+            }
+            Light::Rect { .. } => Vec3::ZERO,
+        }
+    }
+
+    fn from_point(&self, position: Vec3, intensity: Vec3, receiver: &Receiver, rays: &mut u64) -> Vec3 {
+        let way = position.as_dvec3() - receiver.origin.as_dvec3();
+        let d2 = way.length_squared();
+        let cosine = way.dot(receiver.normal.as_dvec3());
+        if cosine <= 0.0 || way.dot(receiver.geometric.as_dvec3()) <= 0.0 || intensity.max_element() <= 0.0 {
+            return Vec3::ZERO;
+        }
+        let factor = (cosine / (d2 * d2.sqrt())) as f32;
+        if self.visible(receiver, position, rays) { intensity * factor } else { Vec3::ZERO }
+    }
+
+    /// Exact unoccluded irradiance times the visible fraction of it.
+    fn from_few_areas(&self, receiver: &Receiver, samples: u32, seed: u32, rays: &mut u64) -> Vec3 {
+        let mut unoccluded = [0.0f32; MAX_ANALYTIC];
+        let (mut total, mut importance, mut shining) = (Vec3::ZERO, 0.0f32, 0);
+        for (e, area) in unoccluded.iter_mut().zip(&self.areas) {
+            *e = area.irradiance(receiver) as f32;
+            total += *e * area.radiance;
+            importance += *e * area.radiance.element_sum();
+            shining += (*e > 0.0) as usize;
+        }
+        if !(importance > 0.0) {
+            return Vec3::ZERO;
+        }
+        let n = samples as usize * shining.min(MAX_LIGHTS_SAMPLED);
+        let (mut weights, mut visible) = (Vec3::ZERO, Vec3::ZERO);
+        let offset = sobol_2d(0, combine(seed, 1))[0];
+        let (mut light, mut below) = (0, 0.0f32);
+        for k in 0..n {
+            // Systematic: the k-th ray goes to the light that the k-th stratum of the sum falls on.
+            let target = (k as f32 + offset) / n as f32 * importance;
+            let share = |i: usize| unoccluded[i] * self.areas[i].radiance.element_sum();
+            while light + 1 < self.areas.len() && below + share(light) <= target {
+                below += share(light);
+                light += 1;
+            }
+            let area = &self.areas[light];
+            let point = area.sample(sobol_2d(k as u32, combine(seed, 2)));
+            let weight = area.geometry_term(receiver, point) * area.area / share(light).max(f32::MIN_POSITIVE);
+            if !(weight > 0.0 && weight.is_finite()) {
+                continue;
+            }
+            weights += weight * area.radiance;
+            if self.visible(receiver, point, rays) {
+                visible += weight * area.radiance;
+            }
+        }
+        let fraction = |v: f32, w: f32| if w > 0.0 { v / w } else { 0.0 };
+        total
+            * Vec3::new(fraction(visible.x, weights.x), fraction(visible.y, weights.y), fraction(visible.z, weights.z))
+    }
+
+    /// Unbiased: lights picked by power.
+    fn from_many_areas(&self, receiver: &Receiver, samples: u32, seed: u32, rays: &mut u64) -> Vec3 {
+        let n = samples as usize * MAX_LIGHTS_SAMPLED;
+        let offset = sobol_2d(0, combine(seed, 1))[0];
+        let mut sum = Vec3::ZERO;
+        for k in 0..n {
+            let target = (k as f32 + offset) / n as f32;
+            let light = self.power_cdf.partition_point(|&c| c <= target).min(self.areas.len() - 1);
+            let area = &self.areas[light];
+            let below = if light == 0 { 0.0 } else { self.power_cdf[light - 1] };
+            let probability = self.power_cdf[light] - below;
+            let point = area.sample(sobol_2d(k as u32, combine(seed, 2)));
+            let weight = area.geometry_term(receiver, point) * area.area / (probability * n as f32);
+            if weight > 0.0 && weight.is_finite() && self.visible(receiver, point, rays) {
+                sum += weight * area.radiance;
+            }
+        }
+        sum
+    }
+
+    /// Emitted radiance of a front (or back) of a triangle.
+    pub fn emitted(scene: &Scene, triangle: u32, back: bool) -> Vec3 {
+        let material = scene.material(triangle);
+        if back && !material.two_sided { Vec3::ZERO } else { Vec3::from(material.emission) }
+    }
+}

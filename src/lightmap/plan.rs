@@ -1,0 +1,138 @@
+//! The plan of a bake: which stages and features a scene needs, and what is left out and why.
+
+use super::BakeParams;
+use super::direct::DirectLight;
+use crate::scene::{Light, Scene};
+
+/// Bits of [`super::BakeStats::left_out`].
+pub mod left_out {
+    /// No indirect light: no photons, radiance map and gather map.
+    pub const INDIRECT: u32 = 1 << 0;
+    /// No photons and no estimate: no light is reflected more than once.
+    pub const PHOTONS: u32 = 1 << 1;
+    /// No direct light: nothing shines.
+    pub const DIRECT: u32 = 1 << 2;
+    /// No sampling of area lights.
+    pub const AREA_LIGHTS: u32 = 1 << 3;
+    /// No radiance of back sides.
+    pub const BACK_SIDES: u32 = 1 << 4;
+    /// No blur of the gather map.
+    pub const BLUR: u32 = 1 << 5;
+    /// No unwrapping: all meshes bring usable UVs.
+    pub const UNWRAP: u32 = 1 << 6;
+    /// No interpolation of shading normals.
+    pub const SHADING_NORMALS: u32 = 1 << 7;
+}
+
+/// What a bake of a scene runs.
+#[derive(Clone, Debug, PartialEq)]
+pub struct Plan {
+    /// Bits of [`left_out`].
+    pub left_out: u32,
+    lines: Vec<String>,
+}
+
+impl Plan {
+    /// Derived from the scene, its lights and the parameters.
+    pub(super) fn new(
+        scene: &Scene,
+        direct: &DirectLight,
+        params: &BakeParams,
+        two_sided: bool,
+        unwrapped: bool,
+    ) -> Plan {
+        let mut plan = Plan { left_out: 0, lines: Vec::new() };
+        let lights = scene.lights();
+        let count = |f: fn(&Light) -> bool| lights.iter().filter(|l| f(l)).count();
+        plan.lines.push(format!(
+            "lights: {} point, {} spot, {} directional, {} rect, {} emissive triangles",
+            count(|l| matches!(l, Light::Point { .. })),
+            count(|l| matches!(l, Light::Spot { .. })),
+            count(|l| matches!(l, Light::Directional { .. })),
+            count(|l| matches!(l, Light::Rect { .. })),
+            scene.emitters().len(),
+        ));
+        let reflects = scene.materials().iter().any(|m| m.albedo.iter().any(|&a| a > 0.0));
+        let no_indirect = if direct.is_dark() {
+            Some("nothing shines")
+        } else if !reflects {
+            Some("nothing reflects")
+        } else if params.gather_rays == 0 {
+            Some("gather_rays is 0")
+        } else {
+            None
+        };
+        if direct.is_dark() {
+            plan.leave_out(left_out::DIRECT, "direct light", "nothing shines");
+        } else {
+            plan.run("direct light by shadow rays");
+        }
+        if direct.area_light_count() == 0 {
+            plan.leave_out(left_out::AREA_LIGHTS, "sampling of area lights", "there are none");
+        } else {
+            plan.run(&format!("sampling of area lights, {} rays each", params.direct_samples));
+        }
+        match no_indirect {
+            Some(why) => {
+                plan.leave_out(left_out::INDIRECT | left_out::PHOTONS, "photons, radiance map, gather map", why)
+            }
+            None => plan.indirect(params, two_sided),
+        }
+        if unwrapped {
+            plan.run("unwrapping of meshes without light map UVs");
+        } else {
+            plan.leave_out(left_out::UNWRAP, "unwrapping", "all meshes bring usable light map UVs");
+        }
+        if scene.meshes().iter().all(|m| m.normals.is_empty()) {
+            plan.leave_out(left_out::SHADING_NORMALS, "interpolation of normals", "no mesh brings any");
+        } else {
+            plan.run("interpolation of normals");
+        }
+        plan
+    }
+
+    fn indirect(&mut self, params: &BakeParams, two_sided: bool) {
+        let photons = if params.photon_count == 0 {
+            Some("photon_count is 0")
+        } else if params.max_bounces == 1 {
+            Some("max_bounces is 1")
+        } else {
+            None
+        };
+        match photons {
+            Some(why) => self.leave_out(left_out::PHOTONS, "photons for light reflected more than once", why),
+            None => self.run(&format!("{} photons for light reflected more than once", params.photon_count)),
+        }
+        self.run("radiance map");
+        self.run(&format!("gather map, {} rays per texel", params.gather_rays));
+        if two_sided {
+            self.run("radiance of back sides of two-sided materials");
+        } else {
+            self.leave_out(left_out::BACK_SIDES, "radiance of back sides", "no material is two-sided");
+        }
+        if params.blur_radius == 0 {
+            self.leave_out(left_out::BLUR, "blur of the gather map", "blur_radius is 0");
+        } else {
+            self.run(&format!("blur of the gather map, radius {} texels", params.blur_radius));
+        }
+    }
+
+    fn run(&mut self, what: &str) {
+        self.lines.push(format!("runs: {what}"));
+    }
+
+    fn leave_out(&mut self, bits: u32, what: &str, why: &str) {
+        self.left_out |= bits;
+        self.lines.push(format!("left out: {what} ({why})"));
+    }
+
+    /// Whether a part runs.
+    pub(super) fn runs(&self, bit: u32) -> bool {
+        self.left_out & bit == 0
+    }
+
+    /// One line per part, for people.
+    pub fn text(&self) -> String {
+        self.lines.join("\n") + "\n"
+    }
+}

@@ -1,0 +1,96 @@
+//! Radiance map (thesis 3.2.4): outgoing radiance of the surfaces, looked up where gather rays hit.
+//!
+//! Reflected radiance is albedo/π times irradiance: direct light by shadow rays plus, for light that
+//! was reflected before, the photon map's estimate. (Direct light by photons too, as in the thesis,
+//! blurs its shadows over the search radius and darkens every edge; by shadow rays it costs a
+//! percent or two of a bake.) Emission is not part of it: the emitters are sampled as lights
+//! wherever light is gathered, and would count twice.
+
+use super::charts::Charts;
+use super::direct::DirectLight;
+use super::map::ChartMap;
+use crate::device::Device;
+use crate::error::Result;
+use crate::photon::PhotonMap;
+use crate::progress::Stage;
+use crate::sampling::combine;
+use crate::scene::{NONE, Scene};
+use crate::trace::RawHit;
+use glam::Vec3;
+use rayon::prelude::*;
+use std::f32::consts::PI;
+use std::sync::Arc;
+use std::sync::atomic::{AtomicU64, Ordering::Relaxed};
+
+/// Texels handed to a thread at a time.
+const BLOCK: usize = 512;
+
+/// Reflected radiance per texel, with what a lookup needs.
+pub(super) struct RadianceMap<'a> {
+    charts: &'a Charts,
+    map: &'a ChartMap,
+    /// Per texel, front sides first; W/(m²·sr).
+    values: &'a [Vec3],
+}
+
+impl<'a> RadianceMap<'a> {
+    pub(super) fn new(charts: &'a Charts, map: &'a ChartMap, values: &'a [Vec3]) -> Self {
+        RadianceMap { charts, map, values }
+    }
+
+    /// Reflected radiance towards a ray that hit; `None` on the back of a one-sided surface.
+    #[inline]
+    pub(super) fn reflected(&self, hit: &RawHit) -> Option<Vec3> {
+        let chart = self.charts.chart_of[hit.triangle as usize];
+        if chart == NONE {
+            return Some(Vec3::ZERO);
+        }
+        let placement = if hit.front { chart } else { self.map.layout.back(chart)? };
+        let sample = self.map.nearest(placement, self.charts.local(hit.triangle, hit.u, hit.v))?;
+        Some(self.values[sample as usize])
+    }
+}
+
+/// What the stage needs.
+pub(super) struct RadianceInput<'a> {
+    pub scene: &'a Arc<Scene>,
+    pub map: &'a ChartMap,
+    pub direct: &'a DirectLight,
+    /// Photons that were reflected before; `None`: there is no such light.
+    pub photons: Option<&'a PhotonMap>,
+    pub direct_samples: u32,
+    pub seed: u32,
+    /// First sample that shows a back side.
+    pub back_start: usize,
+}
+
+/// Fills in `values`, one per texel of the map; returns the rays traced.
+pub(super) fn bake(device: &Device, input: &RadianceInput, values: &mut [Vec3], stage: &Stage) -> Result<u64> {
+    let rays = AtomicU64::new(0);
+    device.install(|| {
+        values.par_chunks_mut(BLOCK).enumerate().try_for_each(|(block, out)| {
+            let mut traced = 0;
+            for (i, value) in out.iter_mut().enumerate() {
+                *value = texel(input, block * BLOCK + i, &mut traced);
+            }
+            rays.fetch_add(traced, Relaxed);
+            stage.advance(out.len() as u64)
+        })
+    })?;
+    Ok(rays.into_inner())
+}
+
+fn texel(input: &RadianceInput, sample: usize, rays: &mut u64) -> Vec3 {
+    let texel = &input.map.texels.samples[sample];
+    let albedo = Vec3::from(input.scene.material(texel.triangle).albedo);
+    if albedo == Vec3::ZERO {
+        return Vec3::ZERO;
+    }
+    let back = sample >= input.back_start;
+    let (point, receiver) = input.map.receiver(input.scene, sample, back);
+    let mut e = input.direct.irradiance(&receiver, input.direct_samples, combine(input.seed, sample as u32), rays);
+    if let Some(photons) = input.photons {
+        e += Vec3::from(photons.estimate(point.position, receiver.geometric));
+    }
+    albedo * e / PI
+}

@@ -1,0 +1,138 @@
+//! Reading light maps out: pages layer by layer, UVs, and filtered lookups as a shader would do.
+
+use super::direct::DirectLight;
+use super::radiance::RadianceMap;
+use super::{Layer, LayerData, Light, Lightmap};
+use crate::error::{Error, Result, invalid_argument};
+use crate::memory::try_vec;
+use crate::scene::NONE;
+use crate::trace::RawHit;
+use glam::Vec3;
+
+/// Corner UVs of each triangle, and its page.
+pub type MeshUvs = (Vec<[[f32; 2]; 3]>, Vec<u32>);
+
+impl Lightmap {
+    /// Light map UV in [0, 1] of each corner, and the page of each triangle of `mesh`. Triangles
+    /// without texels (degenerate ones) have page [`NONE`] and UVs 0.
+    pub fn mesh_uvs(&self, mesh: u32) -> Result<MeshUvs> {
+        let Some(m) = self.scene.meshes().get(mesh as usize) else {
+            return invalid_argument!("mesh {mesh} does not exist, the scene has {}", self.scene.meshes().len());
+        };
+        let first = self.scene.first_triangle(mesh);
+        let mut uvs = Vec::with_capacity(m.indices.len());
+        let mut pages = Vec::with_capacity(m.indices.len());
+        let scale = 1.0 / self.map.layout.page_size as f32;
+        for t in first..first + m.indices.len() as u32 {
+            let chart = self.charts.chart_of[t as usize];
+            if chart == NONE {
+                uvs.push([[0.0; 2]; 3]);
+                pages.push(NONE);
+                continue;
+            }
+            let corners = self.charts.corners[t as usize];
+            uvs.push(corners.map(|c| self.map.layout.texel_coord(chart, c).map(|x| x * scale)));
+            pages.push(self.map.layout.placements[chart as usize].page);
+        }
+        Ok((uvs, pages))
+    }
+
+    fn light(&self) -> Result<&Light> {
+        self.light.as_ref().ok_or_else(|| Error::InvalidState("the light map has not been baked yet".into()))
+    }
+
+    /// One layer of one page, row-major from v = 0. Layers of light need a bake (`InvalidState`
+    /// before). Texels around charts repeat the nearest texel of the chart, up to the padding.
+    pub fn read(&self, page: u32, layer: Layer) -> Result<LayerData> {
+        if page >= self.info.page_count {
+            return invalid_argument!("page is {page}, the light map has {}", self.info.page_count);
+        }
+        Ok(match layer {
+            Layer::Combined => {
+                let light = self.light()?;
+                LayerData::Rgb(self.page(page, [0.0; 3], |s| (light.direct[s] + light.indirect[s]).to_array(), true)?)
+            }
+            Layer::Direct => {
+                let light = self.light()?;
+                LayerData::Rgb(self.page(page, [0.0; 3], |s| light.direct[s].to_array(), true)?)
+            }
+            Layer::Indirect => {
+                let light = self.light()?;
+                LayerData::Rgb(self.page(page, [0.0; 3], |s| light.indirect[s].to_array(), true)?)
+            }
+            Layer::Radiance => {
+                let light = self.light()?;
+                LayerData::Rgb(self.page(page, [0.0; 3], |s| self.radiance_at(light, s), true)?)
+            }
+            Layer::Validity => {
+                let light = self.light()?;
+                LayerData::Scalar(self.page(page, 0.0, |s| if light.valid[s] { 1.0 } else { 0.5 }, false)?)
+            }
+            Layer::Position => {
+                LayerData::Rgb(self.page(page, [0.0; 3], |s| self.map.surface(&self.scene, s).0.to_array(), false)?)
+            }
+            Layer::Normal => {
+                LayerData::Rgb(self.page(page, [0.0; 3], |s| self.map.surface(&self.scene, s).1.to_array(), false)?)
+            }
+            Layer::Triangle => {
+                LayerData::Integer(self.page(page, NONE, |s| self.map.texels.samples[s].triangle, false)?)
+            }
+        })
+    }
+
+    /// Outgoing radiance of a texel: reflected, from the radiance map, plus emitted.
+    fn radiance_at(&self, light: &Light, sample: usize) -> [f32; 3] {
+        let t = self.map.texels.samples[sample];
+        let mut l = DirectLight::emitted(&self.scene, t.triangle, false);
+        if light.radiance.is_empty() {
+            let e = light.direct[sample] + light.indirect[sample];
+            l += Vec3::from(self.scene.material(t.triangle).albedo) * e / std::f32::consts::PI;
+        } else {
+            let lookup = RadianceMap::new(&self.charts, &self.radiance, &light.radiance);
+            let hit = RawHit { t: 0.0, u: t.u, v: t.v, triangle: t.triangle, front: true };
+            l += lookup.reflected(&hit).unwrap_or_default();
+        }
+        l.to_array()
+    }
+
+    /// Scatters per-sample values to a page.
+    fn page<T: Copy + Default>(&self, page: u32, empty: T, value: impl Fn(usize) -> T, dilate: bool) -> Result<Vec<T>> {
+        let size = self.map.layout.page_size as usize;
+        let mut out = try_vec::<T>(size * size, "a page")?;
+        out.fill(empty);
+        for (chart, placement) in self.map.layout.placements.iter().enumerate() {
+            if placement.page != page {
+                continue;
+            }
+            for s in self.map.samples_of(chart as u32) {
+                let (x, y) = self.map.position(s);
+                out[y as usize * size + x as usize] = value(s);
+            }
+        }
+        if dilate {
+            self.map.dilate(page, self.padding, &mut out);
+        }
+        Ok(out)
+    }
+
+    /// What a shader sees on the front of a point of a global triangle (weights of vertices 1 and 2):
+    /// a light layer, bilinearly filtered within the chart. Zero before a bake and for the layers
+    /// that are not light.
+    pub fn sample(&self, layer: Layer, triangle: u32, u: f32, v: f32) -> [f32; 3] {
+        let Some(light) = &self.light else { return [0.0; 3] };
+        let chart = self.charts.chart_of[triangle as usize];
+        if chart == NONE {
+            return [0.0; 3];
+        }
+        let value = |s: usize| match layer {
+            Layer::Combined => light.direct[s] + light.indirect[s],
+            Layer::Direct => light.direct[s],
+            Layer::Indirect => light.indirect[s],
+            Layer::Radiance => self.radiance_at(light, s).into(),
+            _ => Vec3::ZERO,
+        };
+        let mut sum = Vec3::ZERO;
+        self.map.bilinear(chart, self.charts.local(triangle, u, v), |s, w| sum += w * value(s));
+        sum.to_array()
+    }
+}

@@ -1,0 +1,360 @@
+//! Unwrapping by parts, in parallel, for triangles without usable UVs (thesis 3.2.3).
+//!
+//! Triangles are grouped into parts of bounded size, each part is unwrapped on its own by the crate
+//! `uvunwrap` (region growing, LSCM refined as rigidly as possible), and only its charts are kept:
+//! packing is the layout's work. The parts depend on the mesh alone, so the charts do not depend on
+//! the number of threads.
+//!
+//! Without the feature `unwrap`, and for what it cannot chart, charts are single triangles and pairs
+//! of nearly coplanar triangles, projected on their plane: poor, but valid by construction.
+
+use super::charts::{Piece, connected, float_key, groups, surface_kind};
+use crate::error::Result;
+use crate::progress::Stage;
+use crate::scene::{NONE, Scene};
+use glam::{DVec2, DVec3};
+use rayon::prelude::*;
+
+/// Most triangles in a part, unless they are one flat region. Large enough that few charts are cut
+/// at part borders, small enough that parts keep many threads busy and a cancel is seen in time.
+const PART_TRIANGLES: usize = 30_000;
+
+/// Triangles are one flat region if their normals are within this of the first one's (the cosine
+/// of a quarter degree, as in `uvunwrap`). Parts never cut a flat region.
+const FLAT_COSINE: f64 = 1.0 - 1e-5;
+
+/// Pairs of triangles share a planar chart up to this angle between their normals (5 degrees).
+const PAIR_COSINE: f64 = 0.9962;
+
+/// Unwraps `triangles` (valid global numbers, ascending). Advances `stage` by one per triangle.
+pub(super) fn unwrap(scene: &Scene, triangles: &[u32], stage: &Stage) -> Result<Vec<Piece>> {
+    let of_meshes: Vec<&[u32]> = triangles.chunk_by(|&a, &b| scene.locate(a).0 == scene.locate(b).0).collect();
+    let parts: Vec<Vec<u32>> = of_meshes.par_iter().flat_map_iter(|t| parts(scene, t)).collect();
+    stage.advance(0)?;
+    let charted: Result<Vec<Vec<Piece>>> = parts
+        .into_par_iter()
+        .map(|part| {
+            let count = part.len() as u64;
+            let pieces = unwrap_part(&Geometry::of(scene, part), scene, stage)?;
+            stage.advance(count)?;
+            Ok(pieces)
+        })
+        .collect();
+    Ok(charted?.into_iter().flatten().collect())
+}
+
+/// Some triangles of one mesh with welded vertices.
+struct Geometry {
+    /// Global numbers, ascending.
+    triangles: Vec<u32>,
+    /// Vertices of each triangle; equal positions are one vertex.
+    indices: Vec<[u32; 3]>,
+    positions: Vec<DVec3>,
+    /// Unit normals of the triangles.
+    normals: Vec<DVec3>,
+    /// See [`surface_kind`].
+    kinds: Vec<u32>,
+}
+
+impl Geometry {
+    fn of(scene: &Scene, triangles: Vec<u32>) -> Geometry {
+        let corners: Vec<_> = triangles.iter().map(|&t| scene.corners(t)).collect();
+        let key = |corner: u32| corners[corner as usize / 3][corner as usize % 3].to_array().map(float_key);
+        let mut order: Vec<u32> = (0..3 * triangles.len() as u32).collect();
+        order.par_sort_unstable_by_key(|&c| (key(c), c));
+        let mut geometry = Geometry {
+            indices: vec![[0; 3]; triangles.len()],
+            positions: Vec::new(),
+            normals: corners
+                .iter()
+                .map(|c| {
+                    let [a, b, c] = c.map(|c| c.as_dvec3());
+                    (b - a).cross(c - a).normalize_or_zero()
+                })
+                .collect(),
+            kinds: triangles.iter().map(|&t| surface_kind(scene.material(t))).collect(),
+            triangles,
+        };
+        for same in order.chunk_by(|&a, &b| key(a) == key(b)) {
+            let (t, k) = (same[0] as usize / 3, same[0] as usize % 3);
+            for &c in same {
+                geometry.indices[c as usize / 3][c as usize % 3] = geometry.positions.len() as u32;
+            }
+            geometry.positions.push(corners[t][k].as_dvec3());
+        }
+        geometry
+    }
+
+    fn corners(&self, triangle: usize) -> [DVec3; 3] {
+        self.indices[triangle].map(|i| self.positions[i as usize])
+    }
+
+    /// The triangle across each edge (corners k and k + 1), [`NONE`] where there is none, where more
+    /// than two meet, where the winding differs and where materials must not share a chart.
+    fn neighbours(&self) -> Vec<[u32; 3]> {
+        let mut edges = Vec::with_capacity(3 * self.indices.len());
+        for (t, i) in self.indices.iter().enumerate() {
+            for k in 0..3 {
+                let (a, b) = (i[k], i[(k + 1) % 3]);
+                edges.push(((a.min(b), a.max(b)), t as u32, k as u8, a < b));
+            }
+        }
+        edges.par_sort_unstable();
+        let mut neighbours = vec![[NONE; 3]; self.indices.len()];
+        for same in edges.chunk_by(|a, b| a.0 == b.0) {
+            if let &[(_, t, k, forward), (_, t2, k2, forward2)] = same
+                && forward != forward2
+                && self.kinds[t as usize] == self.kinds[t2 as usize]
+            {
+                neighbours[t as usize][k as usize] = t2;
+                neighbours[t2 as usize][k2 as usize] = t;
+            }
+        }
+        neighbours
+    }
+}
+
+/// Triangles of one mesh in parts: connected components together, large ones cut in space.
+fn parts(scene: &Scene, triangles: &[u32]) -> Vec<Vec<u32>> {
+    if triangles.len() <= PART_TRIANGLES {
+        return vec![triangles.to_vec()];
+    }
+    let geometry = Geometry::of(scene, triangles.to_vec());
+    let keys = geometry.indices.iter().zip(0..).flat_map(|(i, t)| i.map(|i| (i, t))).collect();
+    let mut parts = Vec::new();
+    let mut open: Vec<u32> = Vec::new();
+    let mut neighbours = Vec::new();
+    for component in groups(&connected(triangles.len(), keys)) {
+        if component.len() > PART_TRIANGLES {
+            if neighbours.is_empty() {
+                neighbours = geometry.neighbours();
+            }
+            parts.extend(cut(flat_regions(&geometry, &neighbours, &component)));
+            continue;
+        }
+        if open.len() + component.len() > PART_TRIANGLES {
+            parts.push(std::mem::take(&mut open));
+        }
+        open.extend(component);
+    }
+    parts.push(open);
+    parts.retain(|p| !p.is_empty());
+    for part in &mut parts {
+        part.sort_unstable();
+        part.iter_mut().for_each(|t| *t = triangles[*t as usize]);
+    }
+    parts
+}
+
+/// A flat region and its middle.
+type Region = (DVec3, Vec<u32>);
+
+/// The flat regions of a component: connected triangles with nearly equal normals.
+fn flat_regions(geometry: &Geometry, neighbours: &[[u32; 3]], component: &[u32]) -> Vec<Region> {
+    let mut taken = vec![false; geometry.indices.len()];
+    let mut regions = Vec::new();
+    for &seed in component {
+        if std::mem::replace(&mut taken[seed as usize], true) {
+            continue;
+        }
+        let mut members = vec![seed];
+        let mut next = 0;
+        while let Some(&t) = members.get(next) {
+            next += 1;
+            for n in neighbours[t as usize] {
+                let flat = n != NONE && geometry.normals[n as usize].dot(geometry.normals[seed as usize]) > FLAT_COSINE;
+                if flat && !std::mem::replace(&mut taken[n as usize], true) {
+                    members.push(n);
+                }
+            }
+        }
+        let sum: DVec3 = members.iter().flat_map(|&t| geometry.corners(t as usize)).sum();
+        regions.push((sum / (3 * members.len()) as f64, members));
+    }
+    regions
+}
+
+/// Halves regions in space, along the longest side, until no part is too large.
+fn cut(regions: Vec<Region>) -> Vec<Vec<u32>> {
+    let mut parts = Vec::new();
+    let mut stack = vec![regions];
+    while let Some(mut regions) = stack.pop() {
+        let total: usize = regions.iter().map(|r| r.1.len()).sum();
+        if total <= PART_TRIANGLES || regions.len() == 1 {
+            parts.push(regions.into_iter().flat_map(|r| r.1).collect());
+            continue;
+        }
+        let lower = regions.iter().fold(DVec3::INFINITY, |m, r| m.min(r.0));
+        let upper = regions.iter().fold(DVec3::NEG_INFINITY, |m, r| m.max(r.0));
+        let axis = (upper - lower).max_position();
+        regions.sort_by(|a, b| a.0[axis].total_cmp(&b.0[axis]).then(a.1[0].cmp(&b.1[0])));
+        let mut seen = 0;
+        let half = regions.iter().position(|r| {
+            seen += r.1.len();
+            seen * 2 >= total
+        });
+        let upper_half = regions.split_off(half.unwrap_or(0).clamp(1, regions.len() - 1));
+        stack.extend([upper_half, regions]);
+    }
+    parts
+}
+
+#[cfg(not(feature = "unwrap"))]
+fn unwrap_part(geometry: &Geometry, _: &Scene, stage: &Stage) -> Result<Vec<Piece>> {
+    stage.advance(0)?;
+    Ok(planar_pieces(geometry, &vec![true; geometry.triangles.len()]))
+}
+
+#[cfg(feature = "unwrap")]
+fn unwrap_part(geometry: &Geometry, scene: &Scene, stage: &Stage) -> Result<Vec<Piece>> {
+    use crate::device::LogLevel;
+    use crate::error::Error;
+    let all = vec![true; geometry.triangles.len()];
+    match charts_of_part(geometry, stage) {
+        Ok((mut pieces, left)) => {
+            pieces.extend(planar_pieces(geometry, &left));
+            Ok(pieces)
+        }
+        Err(uvunwrap::Error::Cancelled) => Err(Error::Cancelled),
+        Err(e) => {
+            let (count, first) = (geometry.triangles.len(), geometry.triangles[0]);
+            scene.device().log(
+                LogLevel::Warning,
+                &format!(
+                    "{count} triangles from triangle {first} on get planar charts, they could not be unwrapped: {e}"
+                ),
+            );
+            Ok(planar_pieces(geometry, &all))
+        }
+    }
+}
+
+/// The charts that `uvunwrap` makes of a part, and which triangles it left without one (too thin
+/// for its single-precision UVs).
+#[cfg(feature = "unwrap")]
+fn charts_of_part(geometry: &Geometry, stage: &Stage) -> std::result::Result<(Vec<Piece>, Vec<bool>), uvunwrap::Error> {
+    // Normalised, so that huge, tiny and far-off parts lose no precision.
+    let lower = geometry.positions.iter().fold(DVec3::INFINITY, |m, &p| m.min(p));
+    let upper = geometry.positions.iter().fold(DVec3::NEG_INFINITY, |m, &p| m.max(p));
+    let (middle, size) = (0.5 * (lower + upper), (upper - lower).length());
+    let positions: Vec<[f32; 3]> =
+        geometry.positions.iter().map(|&p| ((p - middle) / size).as_vec3().to_array()).collect();
+    let area: f64 = (0..geometry.triangles.len())
+        .map(|t| {
+            let [a, b, c] = geometry.corners(t).map(|p| p / size);
+            0.5 * (b - a).cross(c - a).length()
+        })
+        .sum();
+    // Of its packing only the page's size matters, since UVs are relative to it.
+    let density = (PACKING_TEXELS / area).sqrt().min(MAX_PACKING_DENSITY) as f32;
+    let mesh = uvunwrap::MeshInput {
+        face_materials: Some(&geometry.kinds),
+        ..uvunwrap::MeshInput::new(&positions, geometry.indices.as_flattened())
+    };
+    let options = uvunwrap::Options {
+        max_chart_angle: MAX_CHART_ANGLE,
+        max_area_distortion: MAX_AREA_DISTORTION,
+        density: uvunwrap::Density::Fixed { texels_per_unit: density, page_size: None },
+        padding: 0,
+        allow_rotation: false,
+        packing: uvunwrap::Packing::Fast,
+        ..Default::default()
+    };
+    let atlas = uvunwrap::generate_with_progress(&[mesh], &options, |_| stage.advance(0).is_ok())?;
+    Ok(read_charts(geometry, &atlas, size / density as f64))
+}
+
+/// Texels of the page that `uvunwrap` packs a part into: few, since packing takes time.
+#[cfg(feature = "unwrap")]
+const PACKING_TEXELS: f64 = 512.0 * 512.0;
+/// Texels that a part's diagonal may take in that page, for parts with hardly any area.
+#[cfg(feature = "unwrap")]
+const MAX_PACKING_DENSITY: f64 = 65536.0;
+/// Largest angle between a triangle and its chart, in degrees.
+#[cfg(feature = "unwrap")]
+const MAX_CHART_ANGLE: f32 = 60.0;
+/// Largest ratio of a triangle's share of the chart's texels to its share of the surface.
+#[cfg(feature = "unwrap")]
+const MAX_AREA_DISTORTION: f32 = 2.0;
+
+/// The charts of an atlas whose texels are `texel` scene units wide.
+#[cfg(feature = "unwrap")]
+fn read_charts(geometry: &Geometry, atlas: &uvunwrap::Atlas, texel: f64) -> (Vec<Piece>, Vec<bool>) {
+    let unit = DVec2::new(atlas.width as f64, atlas.height as f64) * texel;
+    let empty = || Piece { triangles: Vec::new(), corners: Vec::new(), given: None };
+    let mut pieces: Vec<Piece> = (0..atlas.chart_count).map(|_| empty()).collect();
+    let mut left = vec![false; geometry.triangles.len()];
+    let mesh = &atlas.meshes[0];
+    for (t, corners) in mesh.indices.chunks_exact(3).enumerate() {
+        let corners = [0, 1, 2].map(|k| mesh.vertices[corners[k] as usize]);
+        let local = corners.map(|v| DVec2::from_array(v.uv.map(f64::from)) * unit);
+        let [a, b, c] = local;
+        // What has no chart of its own is folded into a point of some chart.
+        match corners[0].chart {
+            Some(chart) if (b - a).perp_dot(c - a) > 0.0 => {
+                pieces[chart as usize].triangles.push(geometry.triangles[t]);
+                pieces[chart as usize].corners.push(local.map(|p| p.as_vec2().to_array()));
+            }
+            _ => left[t] = true,
+        }
+    }
+    pieces.retain(|p| !p.triangles.is_empty());
+    (pieces, left)
+}
+
+/// Charts for the triangles marked in `which`: pairs of nearly coplanar triangles, longest shared
+/// edges first, and single triangles. The triangles of a pair lie on different sides of their edge,
+/// so they do not overlap in projection.
+fn planar_pieces(geometry: &Geometry, which: &[bool]) -> Vec<Piece> {
+    if !which.contains(&true) {
+        return Vec::new();
+    }
+    let neighbours = geometry.neighbours();
+    let mut candidates = Vec::new();
+    for t in (0..which.len()).filter(|&t| which[t]) {
+        for (k, &n) in neighbours[t].iter().enumerate() {
+            let open = n != NONE && which[n as usize] && n as usize > t;
+            if open && geometry.normals[t].dot(geometry.normals[n as usize]) > PAIR_COSINE {
+                let corners = geometry.corners(t);
+                candidates.push((corners[k].distance_squared(corners[(k + 1) % 3]), t, n as usize));
+            }
+        }
+    }
+    candidates.sort_by(|a, b| b.0.total_cmp(&a.0).then((a.1, a.2).cmp(&(b.1, b.2))));
+    let mut partner = vec![None; which.len()];
+    for (_, a, b) in candidates {
+        if partner[a].is_none() && partner[b].is_none() {
+            (partner[a], partner[b]) = (Some(b), Some(a));
+        }
+    }
+    (0..which.len())
+        .filter(|&t| which[t] && partner[t].is_none_or(|p| p > t))
+        .map(|t| planar_piece(geometry, t, partner[t]))
+        .collect()
+}
+
+/// A triangle and its partner, if any, projected on their plane, the longest outer edge along x.
+fn planar_piece(geometry: &Geometry, triangle: usize, partner: Option<usize>) -> Piece {
+    let members: Vec<usize> = [Some(triangle), partner].into_iter().flatten().collect();
+    let normal = members.iter().map(|&t| geometry.normals[t]).sum::<DVec3>().normalize_or(DVec3::Z);
+    let inner = |edge: [u32; 2]| {
+        let other = partner.map_or([NONE; 3], |p| geometry.indices[p]);
+        other.contains(&edge[0]) && other.contains(&edge[1])
+    };
+    let ends = geometry.indices[triangle];
+    let longest = (0..3)
+        .map(|k| [ends[k], ends[(k + 1) % 3]])
+        .filter(|&e| !inner(e))
+        .map(|e| geometry.positions[e[1] as usize] - geometry.positions[e[0] as usize])
+        .max_by(|a, b| a.length_squared().total_cmp(&b.length_squared()));
+    let x =
+        longest.map_or(DVec3::ZERO, |e| e.reject_from_normalized(normal)).normalize_or(normal.any_orthonormal_vector());
+    let y = normal.cross(x);
+    let origin = geometry.corners(triangle)[0];
+    let project = |p: DVec3| DVec2::new((p - origin).dot(x), (p - origin).dot(y)).as_vec2().to_array();
+    Piece {
+        triangles: members.iter().map(|&t| geometry.triangles[t]).collect(),
+        corners: members.iter().map(|&t| geometry.corners(t).map(project)).collect(),
+        given: None,
+    }
+}
