@@ -1,25 +1,55 @@
-//! The photon map (thesis 3.2.2). PLACEHOLDER: signatures that the other modules use.
-use crate::error::Result;
+//! The photon map (thesis 3.2.2; Jensen, *Realistic Image Synthesis Using Photon Mapping*, 2001).
+//!
+//! | file | what is in it |
+//! |---|---|
+//! | `emission.rs`, `spot.rs` | lights by power, stratified positions and directions |
+//! | `trace.rs` | paths with Russian roulette, blocks of photons in parallel |
+//! | `radius.rs` | the automatic search radius |
+//! | `grid.rs` | photons sorted into a uniform grid, one array per component |
+//! | `estimate.rs` | the irradiance estimate, over the lanes of each ISA |
+//!
+//! The same seed and ISA give the same map and the same estimates for any number of threads.
+
+mod emission;
+mod estimate;
+mod grid;
+mod radius;
+mod spot;
+mod trace;
+
+use crate::error::{Error, Result, invalid_argument};
+use crate::memory::Reservation;
 use crate::progress::Progress;
 use crate::scene::Scene;
+use crate::trace::Ray;
+use estimate::{Cylinder, EstimateFn};
 use glam::Vec3;
+use grid::Grid;
+use rayon::prelude::*;
 use std::sync::Arc;
+use std::time::Instant;
+
+/// The most photons that can be emitted: their numbers are 32-bit.
+pub const MAX_PHOTONS: u64 = 1 << 32;
 
 /// Parameters of a photon map.
 #[derive(Clone, Copy, Debug, PartialEq)]
 pub struct PhotonParams {
-    /// Photons emitted.
+    /// Photons emitted, 1 to [`MAX_PHOTONS`].
     pub photon_count: u64,
-    /// Most surface interactions per photon; 0: Russian roulette alone ends paths.
+    /// Most surface interactions per photon (1: direct light only); 0: Russian roulette alone ends
+    /// paths, and [`PATH_LIMIT`] as a safeguard.
     pub max_bounces: u32,
-    /// Search radius of the estimate in scene units; 0: chosen from the density of stored photons.
+    /// Search radius of the estimate in scene units; 0: chosen so that the average disc on the
+    /// surfaces that photons reached holds about [`PHOTONS_PER_DISC`].
     pub radius: f32,
-    /// Half the height of the search cylinder, as a fraction of the radius.
+    /// Half the height of the search cylinder, as a fraction of the radius; more than 0.
     pub half_height: f32,
     /// Jensen's cone filter constant, ≥ 1; infinity: no filter.
     pub cone_k: f32,
+    /// Chooses the random numbers.
     pub seed: u64,
-    /// Bytes that the map may take; 0: no limit.
+    /// Bytes that the map may take while it is made; 0: no limit.
     pub memory_budget: u64,
     /// Whether photons are stored at their first surface too (direct light).
     pub store_direct: bool,
@@ -40,54 +70,228 @@ impl Default for PhotonParams {
     }
 }
 
+impl PhotonParams {
+    /// Checks the ranges documented on the fields.
+    pub fn validate(&self) -> Result<()> {
+        if self.photon_count == 0 || self.photon_count > MAX_PHOTONS {
+            return invalid_argument!("photon_count is {}, not 1 to {MAX_PHOTONS}", self.photon_count);
+        }
+        if !(self.radius >= 0.0 && self.radius.is_finite()) {
+            return invalid_argument!("radius is {}, not a finite number ≥ 0 (0: automatic)", self.radius);
+        }
+        if self.radius > 0.0 && !self.radius.is_normal() {
+            return invalid_argument!("radius is {:e}, less than {:e}", self.radius, f32::MIN_POSITIVE);
+        }
+        if !(self.half_height > 0.0 && self.half_height.is_finite()) {
+            return invalid_argument!("half_height is {}, not a finite number > 0", self.half_height);
+        }
+        if self.cone_k.is_nan() || self.cone_k < 1.0 {
+            return invalid_argument!("cone_k is {}, not ≥ 1 (infinity: no filter)", self.cone_k);
+        }
+        Ok(())
+    }
+}
+
+/// Surface interactions after which a path ends even if `max_bounces` is 0. Light that survives
+/// 10,000 reflections carries less than 10⁻⁴ of its power at albedo 0.999.
+pub const PATH_LIMIT: u32 = 10_000;
+
+/// Photons in the average disc of the automatic radius. Jensen (2001, section 7.2) finds 50 to 500
+/// useful; the radiance map is seen through the final gather, which averages further, so resolution
+/// is worth more than smoothness.
+pub const PHOTONS_PER_DISC: f64 = 60.0;
+
 /// What tracing did.
-#[derive(Clone, Copy, Debug, Default)]
+///
+/// The light that hits surfaces is accounted by expectation at each interaction (reflectance times
+/// power), so `absorbed + escaped + truncated = emitted` holds up to the sampling error of Russian
+/// roulette.
+#[derive(Clone, Copy, Debug, Default, PartialEq)]
 pub struct PhotonStats {
+    /// Photons emitted: the count asked for, or 0 if no light has any power.
     pub emitted: u64,
+    /// Photons stored.
     pub stored: u64,
+    /// Rays traced.
     pub rays: u64,
-    /// Power of all lights, W per channel.
+    /// Power of all lights, W per channel. Of directional lights: what meets the bounding box.
     pub emitted_power: [f64; 3],
+    /// Absorbed by surfaces, including the back sides of one-sided ones.
     pub absorbed_power: [f64; 3],
+    /// Missed every surface, or was not aimed at the scene to begin with.
     pub escaped_power: [f64; 3],
+    /// Would have been reflected where `max_bounces` (or [`PATH_LIMIT`]) ended the path.
+    pub truncated_power: [f64; 3],
+    /// Wall time of emission and tracing.
     pub trace_seconds: f64,
+    /// Wall time of sorting into the grid and of choosing the radius.
     pub grid_seconds: f64,
 }
+
+/// The stored photons, one array per component, all of the same length, sorted by grid cell.
+#[derive(Clone, Copy, Debug)]
+pub struct PhotonView<'a> {
+    /// x, y and z of the positions, in scene units.
+    pub position: [&'a [f32]; 3],
+    /// x, y and z of the unit directions of travel.
+    pub direction: [&'a [f32]; 3],
+    /// Red, green and blue power in W.
+    pub power: [&'a [f32]; 3],
+    /// x, y and z of the unit geometric normal of the surface, on the side that was hit.
+    pub normal: [&'a [f32]; 3],
+}
+
+impl PhotonView<'_> {
+    /// Number of photons.
+    pub fn len(&self) -> usize {
+        self.position[0].len()
+    }
+
+    /// Whether there are none.
+    pub fn is_empty(&self) -> bool {
+        self.len() == 0
+    }
+}
+
+/// Estimates are handed to threads in blocks of this many points: some 50 µs of work.
+const BLOCK: usize = 128;
 
 /// Photons on the surfaces of a scene, in a uniform grid.
 pub struct PhotonMap {
     scene: Arc<Scene>,
+    stats: PhotonStats,
+    grid: Grid,
+    cylinder: Cylinder,
+    kernel: EstimateFn,
+    _memory: Reservation,
 }
 
 impl PhotonMap {
     /// Emits, traces and sorts photons.
+    ///
+    /// `InvalidArgument` for parameters out of range, `InvalidState` if the scene has no lights,
+    /// `OutOfMemory` if `memory_budget` or the memory monitor refuses. Lights without power make an
+    /// empty map.
     pub fn trace(scene: &Arc<Scene>, params: &PhotonParams, progress: &Progress) -> Result<PhotonMap> {
-        let _ = (params, progress);
-        Ok(PhotonMap { scene: scene.clone() })
+        Self::trace_within(scene, params, progress, 0.0, 1.0)
     }
+
+    /// The same as a part of a longer call: reports progress over `[from, to]` of the bar.
+    pub fn trace_within(
+        scene: &Arc<Scene>,
+        params: &PhotonParams,
+        progress: &Progress,
+        from: f32,
+        to: f32,
+    ) -> Result<PhotonMap> {
+        params.validate()?;
+        let lights = scene.lights();
+        if lights.is_empty() && scene.emitters().is_empty() {
+            return Err(Error::InvalidState("the scene has no lights: add a light or a material with emission".into()));
+        }
+        // Sorting is about a twentieth of the work.
+        let split = from + 0.95 * (to - from);
+        scene.device().install(|| {
+            let start = Instant::now();
+            let traced = trace::trace(scene, &lights, params, progress, (from, split))?;
+            let mut stats = traced.stats;
+            stats.trace_seconds = start.elapsed().as_secs_f64();
+            let start = Instant::now();
+            let radius = if params.radius > 0.0 {
+                params.radius
+            } else {
+                radius::automatic(&traced.blocks, scene.diagonal(), PHOTONS_PER_DISC)
+            };
+            let (grid, memory) = Grid::build(traced, radius, progress, (split, to))?;
+            stats.grid_seconds = start.elapsed().as_secs_f64();
+            Ok(PhotonMap {
+                scene: scene.clone(),
+                stats,
+                grid,
+                cylinder: Cylinder::new(radius, params.half_height, params.cone_k),
+                kernel: estimate::kernel(scene.device().isa()),
+                _memory: memory,
+            })
+        })
+    }
+
     /// The scene that it was made from.
     pub fn scene(&self) -> &Arc<Scene> {
         &self.scene
     }
+
     /// Numbers about the tracing.
     pub fn stats(&self) -> PhotonStats {
-        PhotonStats::default()
+        self.stats
     }
+
     /// Search radius in use.
     pub fn radius(&self) -> f32 {
-        0.0
+        self.cylinder.radius
     }
+
     /// Bytes held.
     pub fn bytes(&self) -> usize {
-        0
+        self.grid.bytes()
     }
-    /// Irradiance (W/m²) at `position` on the side that the unit vector `normal` points to.
+
+    /// Irradiance (W/m²) at `position` on the side that the unit vector `normal` points to: the
+    /// photons in a cylinder around the normal, whose surfaces face within 60° of it and whose
+    /// light comes from the front, weighted by Jensen's cone filter.
+    ///
+    /// The estimate assumes that the disc lies wholly on the surface: less than a radius from an
+    /// edge it falls, to half at the edge itself.
     pub fn estimate(&self, position: Vec3, normal: Vec3) -> [f32; 3] {
-        let _ = (position, normal);
-        [0.0; 3]
+        let mut out = [[0.0; 3]];
+        self.estimate_block(&[position.to_array()], &[normal.to_array()], &mut out);
+        out[0]
     }
-    /// Stored photons: positions, directions of travel (unit), powers.
-    pub fn photons(&self) -> (&[[f32; 3]], &[[f32; 3]], &[[f32; 3]]) {
-        (&[], &[], &[])
+
+    /// [`estimate`](Self::estimate) for many points, in order, on the device's threads.
+    /// `InvalidArgument` if the lengths differ; after a cancel, `out` is partly written.
+    pub fn estimate_many(
+        &self,
+        positions: &[[f32; 3]],
+        normals: &[[f32; 3]],
+        out: &mut [[f32; 3]],
+        progress: &Progress,
+    ) -> Result<()> {
+        if positions.len() != normals.len() || positions.len() != out.len() {
+            return invalid_argument!(
+                "{} positions, but {} normals and room for {} estimates",
+                positions.len(),
+                normals.len(),
+                out.len()
+            );
+        }
+        let stage = progress.stage("photon estimates", 0.0, 1.0, positions.len() as u64);
+        let blocks = positions.par_chunks(BLOCK).zip(normals.par_chunks(BLOCK)).zip(out.par_chunks_mut(BLOCK));
+        self.scene.device().install(|| {
+            blocks.try_for_each(|((positions, normals), out)| {
+                self.estimate_block(positions, normals, out);
+                stage.advance(positions.len() as u64)
+            })
+        })
+    }
+
+    /// [`estimate`](Self::estimate) for as many points as all three slices have, on this thread.
+    pub fn estimate_block(&self, positions: &[[f32; 3]], normals: &[[f32; 3]], out: &mut [[f32; 3]]) {
+        (self.kernel)(&self.grid, &self.cylinder, positions, normals, out);
+    }
+
+    /// The stored photons.
+    pub fn photons(&self) -> PhotonView<'_> {
+        self.grid.photons.view()
     }
 }
+
+/// The rays that [`PhotonMap::trace`] would trace, in the order of their photons: for measuring
+/// what tracing costs beyond the rays themselves. Nothing is stored.
+#[doc(hidden)]
+pub fn photon_rays(scene: &Arc<Scene>, params: &PhotonParams) -> Result<Vec<Ray>> {
+    params.validate()?;
+    trace::record_rays(scene, &scene.lights(), params)
+}
+
+#[cfg(test)]
+mod tests;

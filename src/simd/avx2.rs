@@ -22,7 +22,7 @@ pub(crate) struct A8(pub(super) __m256);
 
 macro_rules! lanes {
     ($v:ident, $raw:ty, $width:expr, $splat:ident, $load:ident, $store:ident, $add:ident, $sub:ident, $mul:ident,
-     $div:ident, $min:ident, $max:ident, $fmadd:ident, $cmp:ident, $blend:ident, $movemask:ident, $and:ident, $or:ident) => {
+     $div:ident, $sqrt:ident, $min:ident, $max:ident, $fmadd:ident, $cmp:ident, $blend:ident, $movemask:ident, $and:ident, $or:ident) => {
         // SAFETY of every intrinsic below: a value of this type exists only where the CPU has the
         // ISA (see the module docs of `simd`).
         impl Mask for $v {
@@ -81,6 +81,10 @@ macro_rules! lanes {
                 $v(unsafe { $div(self.0, d.0) })
             }
             #[inline(always)]
+            fn sqrt(self) -> Self {
+                $v(unsafe { $sqrt(self.0) })
+            }
+            #[inline(always)]
             fn min(self, o: Self) -> Self {
                 $v(unsafe { $min(self.0, o.0) })
             }
@@ -123,6 +127,7 @@ lanes!(
     _mm_sub_ps,
     _mm_mul_ps,
     _mm_div_ps,
+    _mm_sqrt_ps,
     _mm_min_ps,
     _mm_max_ps,
     _mm_fmadd_ps,
@@ -143,6 +148,7 @@ lanes!(
     _mm256_sub_ps,
     _mm256_mul_ps,
     _mm256_div_ps,
+    _mm256_sqrt_ps,
     _mm256_min_ps,
     _mm256_max_ps,
     _mm256_fmadd_ps,

@@ -81,6 +81,10 @@ impl Lanes for A16 {
         A16(unsafe { _mm512_div_ps(self.0, d.0) })
     }
     #[inline(always)]
+    fn sqrt(self) -> Self {
+        A16(unsafe { _mm512_sqrt_ps(self.0) })
+    }
+    #[inline(always)]
     fn min(self, o: Self) -> Self {
         A16(unsafe { _mm512_min_ps(self.0, o.0) })
     }

@@ -142,6 +142,8 @@ pub(crate) trait Lanes: Copy + Add<Output = Self> + Sub<Output = Self> + Mul<Out
     unsafe fn store(self, p: *mut f32);
 
     fn div(self, d: Self) -> Self;
+    /// Square root, correctly rounded; NaN where negative.
+    fn sqrt(self) -> Self;
     /// The lesser; `other` where either is NaN.
     fn min(self, other: Self) -> Self;
     /// The greater; `other` where either is NaN.

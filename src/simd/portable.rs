@@ -103,6 +103,10 @@ impl Lanes for P4 {
         P4(self.0 / d.0)
     }
     #[inline(always)]
+    fn sqrt(self) -> Self {
+        P4(self.0.sqrt())
+    }
+    #[inline(always)]
     fn min(self, o: Self) -> Self {
         // By comparison, not `fast_min`, whose answer for NaN and ±0 differs between targets.
         // On x86 it compiles to the same minps.
@@ -160,6 +164,10 @@ impl Lanes for P8 {
     #[inline(always)]
     fn div(self, d: Self) -> Self {
         P8(self.0.div(d.0), self.1.div(d.1))
+    }
+    #[inline(always)]
+    fn sqrt(self) -> Self {
+        P8(self.0.sqrt(), self.1.sqrt())
     }
     #[inline(always)]
     fn min(self, o: Self) -> Self {

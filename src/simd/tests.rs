@@ -57,6 +57,7 @@ unsafe fn check_lanes<L: Lanes>() {
                 assert!(same(get(a - b, i), x - y), "{x} - {y}");
                 assert!(same(get(a * b, i), x * y), "{x} * {y}");
                 assert!(same(get(a.div(b), i), x / y), "{x} / {y}");
+                assert!(same(get(a.sqrt(), i), x.sqrt()), "sqrt({x})");
                 let (min, max) = (if x < y { x } else { y }, if x > y { x } else { y });
                 assert!(same(get(a.min(b), i), min), "min({x}, {y}) = {}", get(a.min(b), i));
                 assert!(same(get(a.max(b), i), max), "max({x}, {y}) = {}", get(a.max(b), i));

@@ -28,15 +28,20 @@ pub fn offset_ray_origin(position: Vec3, normal: Vec3, scene: &Scene) -> Vec3 {
     position + normal * ray_epsilon(position, scene)
 }
 
+/// How far from the edges of its triangle a ray starts, in [`ray_epsilon`]s: with the offset along the
+/// normal that is inside of walls that meet at 8° or more.
+const EDGE_DISTANCE: f64 = 8.0;
+
 /// A point of a triangle with all that a path needs to go on from it.
 pub struct SurfacePoint {
     /// The hit point, rounded once.
     pub position: Vec3,
     /// Unit geometric normal of the front.
     pub normal: Vec3,
-    /// The hit point pulled inside the triangle: at least [`ray_epsilon`] from its edges, where the
-    /// triangle is large enough. Rays start here (offset along the normal), because a point rounded
-    /// at an edge may lie behind the wall that meets it there, and its rays would leak out.
+    /// The hit point pulled inside the triangle: at least eight [`ray_epsilon`]s from its edges,
+    /// where the triangle is large enough, else half-way to its centroid. Rays start here (offset
+    /// along the normal), because a point at an edge, rounded and offset, may lie behind the wall
+    /// that it shares the edge with, and its rays would leak out.
     pub interior: Vec3,
 }
 
@@ -52,7 +57,7 @@ impl SurfacePoint {
         // The centroid is 1/3 of a height from each edge, and no height is less than two inradii.
         let inradius = twice_area / (edge_u.length() + edge_v.length() + (edge_v - edge_u).length());
         let rounded = position.as_vec3();
-        let pull = (1.5 * ray_epsilon(rounded, scene) as f64 / inradius).min(0.5);
+        let pull = (1.5 * EDGE_DISTANCE * ray_epsilon(rounded, scene) as f64 / inradius).min(0.5);
         let centroid: DVec3 = (a + b + c) / 3.0;
         SurfacePoint {
             position: rounded,
@@ -123,7 +128,7 @@ mod tests {
                 let (a, b) = (corners[i].as_dvec3(), corners[(i + 1) % 3].as_dvec3());
                 let inward = p.normal.as_dvec3().cross(b - a).normalize();
                 let distance = (p.interior.as_dvec3() - a).dot(inward);
-                prop_assert!(distance > 0.9 * ray_epsilon(p.position, &scene) as f64, "{distance:e} from edge {i}");
+                prop_assert!(distance > 0.9 * EDGE_DISTANCE * ray_epsilon(p.position, &scene) as f64, "{distance:e} from edge {i}");
             }
         }
     }

@@ -1,0 +1,260 @@
+//! Emission: which light a photon comes from, where it starts, where it goes and what it carries.
+//!
+//! Lights get photons in proportion to their power (thesis 3.2.2) by systematic allotment: photon i
+//! stands at (i + offset)/N of the total power, so a light gets its share rounded down or up, and
+//! the photons of one light have consecutive numbers. A light that is due at least one photon
+//! divides its exact power among those it gets; fainter ones get one photon or none, which carries
+//! the power that makes the expectation right. Positions and directions are pairs of Owen-scrambled
+//! Sobol dimensions over the photon number: any run of consecutive numbers is stratified.
+//!
+//! Photons are aimed at the scene where that is exact and cheap. A directional light shines through
+//! the faces of the scene's bounding box that it meets, which is the whole of its light that can
+//! reach the scene. A point light outside the box's bounding sphere emits into the cone of that
+//! sphere; the rest of its power is counted as escaped without being traced.
+
+use super::spot::SpotProfile;
+use crate::sampling::{concentric_disc, cosine_hemisphere, orthonormal_basis, uniform_triangle};
+use crate::scene::{Emitter, Light, Scene};
+use crate::trace::offset::{offset_ray_origin, ray_epsilon};
+use glam::{DVec3, Vec3};
+use std::f64::consts::PI;
+
+/// A photon as it leaves its light.
+#[derive(Clone, Copy, Debug)]
+pub(super) struct Emitted {
+    pub(super) origin: Vec3,
+    /// Unit direction of travel.
+    pub(super) direction: Vec3,
+    /// W per channel.
+    pub(super) power: Vec3,
+}
+
+/// Where the photons of a light without geometry start, and where they go.
+#[derive(Clone, Copy, Debug)]
+enum Shape {
+    /// From a point into the cone around `axis`, uniformly; `height` is 1 − cos of its half-angle.
+    Cone {
+        position: Vec3,
+        axis: Vec3,
+        height: f64,
+    },
+    Spot {
+        position: Vec3,
+        axis: Vec3,
+        profile: SpotProfile,
+    },
+    /// From a parallelogram along `direction`.
+    Beam {
+        corner: Vec3,
+        edge_u: Vec3,
+        edge_v: Vec3,
+        direction: Vec3,
+    },
+    /// From a parallelogram, cosine-distributed around `normal`.
+    Rect {
+        corner: Vec3,
+        edge_u: Vec3,
+        edge_v: Vec3,
+        normal: Vec3,
+    },
+}
+
+#[derive(Clone, Copy, Debug)]
+struct Source {
+    shape: Shape,
+    /// W per channel.
+    power: DVec3,
+}
+
+/// The emitters of a scene with the allotment of photons to them.
+pub(super) struct Emission<'a> {
+    scene: &'a Scene,
+    sources: Vec<Source>,
+    /// First photon of each source, then of each emissive triangle, then the number of photons.
+    first: Vec<u64>,
+    /// Photons per watt (of the mean over the channels).
+    photons_per_watt: f64,
+    /// Power of all lights, W per channel.
+    pub(super) power: DVec3,
+    /// Of that, what is not aimed at the scene.
+    pub(super) unaimed: DVec3,
+}
+
+impl<'a> Emission<'a> {
+    /// Allots `count` photons to `lights` and to the scene's emissive triangles. `offset` in [0, 1)
+    /// places the first photon.
+    pub(super) fn new(scene: &'a Scene, lights: &[Light], count: u64, offset: f32) -> Self {
+        let mut sources = Vec::new();
+        let mut unaimed = DVec3::ZERO;
+        for light in lights {
+            unaimed += add_sources(scene, light, &mut sources);
+        }
+        let powers = || sources.iter().map(|s| s.power).chain(scene.emitters().iter().map(emitter_power));
+        let aimed: DVec3 = powers().sum();
+        let total = mean(aimed);
+        let photons_per_watt = if total > 0.0 { count as f64 / total } else { 0.0 };
+        let mut first = Vec::with_capacity(sources.len() + scene.emitters().len() + 1);
+        let mut below = 0.0;
+        for power in powers() {
+            first.push(((below * photons_per_watt - offset as f64).ceil().max(0.0) as u64).min(count));
+            below += mean(power);
+        }
+        first.push(if total > 0.0 { count } else { 0 });
+        Emission { scene, sources, first, photons_per_watt, power: aimed + unaimed, unaimed }
+    }
+
+    /// Photons to emit: the count asked for, or 0 if no light has any power.
+    pub(super) fn count(&self) -> u64 {
+        *self.first.last().expect("never empty")
+    }
+
+    /// The light of photon `index` (numbered as in `first`) and the power that each of its photons
+    /// carries.
+    fn light_of(&self, index: u64) -> (usize, DVec3) {
+        let light = self.first.partition_point(|&f| f <= index) - 1;
+        let power = match self.sources.get(light) {
+            Some(s) => s.power,
+            None => emitter_power(&self.scene.emitters()[light - self.sources.len()]),
+        };
+        let due = mean(power) * self.photons_per_watt;
+        let share = if due >= 1.0 { (self.first[light + 1] - self.first[light]) as f64 } else { due };
+        (light, power / share)
+    }
+
+    /// Photon `index`, its position on the light chosen by `p` and its direction by `d`, both
+    /// uniform in the unit square.
+    pub(super) fn emit(&self, index: u64, p: [f32; 2], d: [f32; 2]) -> Emitted {
+        let (light, power) = self.light_of(index);
+        let power = power.as_vec3();
+        let (origin, direction) = match self.sources.get(light) {
+            Some(source) => self.leave(&source.shape, p, d),
+            None => self.leave_triangle(&self.scene.emitters()[light - self.sources.len()], p, d),
+        };
+        Emitted { origin, direction, power }
+    }
+
+    fn leave(&self, shape: &Shape, p: [f32; 2], d: [f32; 2]) -> (Vec3, Vec3) {
+        match *shape {
+            Shape::Cone { position, axis, height } => {
+                (position, around(axis, concentric_disc(d), |r2| height * r2 as f64))
+            }
+            Shape::Spot { position, axis, profile } => {
+                (position, around(axis, concentric_disc(d), |r2| profile.height(r2 as f64)))
+            }
+            Shape::Beam { corner, edge_u, edge_v, direction } => (corner + edge_u * p[0] + edge_v * p[1], direction),
+            Shape::Rect { corner, edge_u, edge_v, normal } => {
+                let position = corner + edge_u * p[0] + edge_v * p[1];
+                (offset_ray_origin(position, normal, self.scene), cosine_around(normal, d))
+            }
+        }
+    }
+
+    fn leave_triangle(&self, e: &Emitter, p: [f32; 2], mut d: [f32; 2]) -> (Vec3, Vec3) {
+        let mut normal = e.normal;
+        if e.two_sided {
+            // The halves of one dimension are the sides: each stays stratified.
+            d[0] *= 2.0;
+            if d[0] >= 1.0 {
+                d[0] -= 1.0;
+                normal = -normal;
+            }
+        }
+        let [u, v] = uniform_triangle(p);
+        let position = e.corner + e.edge_u * u + e.edge_v * v;
+        (offset_ray_origin(position, normal, self.scene), cosine_around(normal, d))
+    }
+}
+
+/// Adds the sources that make up `light` and returns its power that is not aimed at the scene.
+fn add_sources(scene: &Scene, light: &Light, sources: &mut Vec<Source>) -> DVec3 {
+    let color = DVec3::from_array(light.color().map(f64::from));
+    let mut add = |shape, factor: f64| sources.push(Source { shape, power: color * factor });
+    match *light {
+        Light::Point { position, .. } => {
+            let (axis, height) = cone_of_scene(scene, position);
+            add(Shape::Cone { position, axis, height }, 2.0 * PI * height);
+            return color * (2.0 * PI * (2.0 - height));
+        }
+        Light::Spot { position, direction, inner, outer, .. } => {
+            let profile = SpotProfile::new(inner, outer);
+            add(Shape::Spot { position, axis: direction, profile }, profile.solid_angle());
+        }
+        Light::Directional { direction, .. } => {
+            for (corner, edge_u, edge_v) in lit_faces(scene, direction) {
+                let flux = edge_u.as_dvec3().cross(edge_v.as_dvec3()).dot(direction.as_dvec3()).abs();
+                add(Shape::Beam { corner, edge_u, edge_v, direction }, flux);
+            }
+        }
+        Light::Rect { position, edge_u, edge_v, .. } => {
+            let cross = edge_u.as_dvec3().cross(edge_v.as_dvec3());
+            let normal = cross.normalize().as_vec3();
+            add(Shape::Rect { corner: position, edge_u, edge_v, normal }, PI * cross.length());
+        }
+    }
+    DVec3::ZERO
+}
+
+/// Axis and 1 − cos(half-angle) of the cone in which the scene's bounding sphere appears from
+/// `position`; the whole sphere of directions from inside of it.
+fn cone_of_scene(scene: &Scene, position: Vec3) -> (Vec3, f64) {
+    let (lower, upper) = scene.bounds();
+    let (lower, upper) = (lower.as_dvec3(), upper.as_dvec3());
+    let to_centre = (lower + upper) * 0.5 - position.as_dvec3();
+    let distance = to_centre.length();
+    // A little more than the sphere, so that rounded directions cover its rim too.
+    let radius = 0.5005 * (upper - lower).length() + ray_epsilon(position, scene) as f64;
+    if distance <= radius {
+        return (Vec3::Z, 2.0);
+    }
+    let sin2 = (radius / distance).powi(2);
+    // 1 − cos without cancellation for distant lights.
+    ((to_centre / distance).as_vec3(), sin2 / (1.0 + (1.0 - sin2).sqrt()))
+}
+
+/// The up to three faces of the scene's bounding box that parallel light along `direction` enters
+/// through, as corner and edges, moved back against the light so that surfaces in a face are ahead.
+fn lit_faces(scene: &Scene, direction: Vec3) -> Vec<(Vec3, Vec3, Vec3)> {
+    let (lower, upper) = scene.bounds();
+    let size = upper - lower;
+    let back = (0.01 * scene.diagonal()).max(4.0 * ray_epsilon(lower.abs().max(upper.abs()), scene));
+    let edge = |axis: usize| Vec3::AXES[axis] * size[axis];
+    (0..3)
+        .filter(|&axis| direction[axis] != 0.0)
+        .map(|axis| {
+            let mut corner = lower;
+            if direction[axis] < 0.0 {
+                corner[axis] = upper[axis];
+            }
+            (corner - direction * back, edge((axis + 1) % 3), edge((axis + 2) % 3))
+        })
+        .collect()
+}
+
+fn emitter_power(e: &Emitter) -> DVec3 {
+    let sides = if e.two_sided { 2.0 } else { 1.0 };
+    DVec3::from_array(e.radiance.map(f64::from)) * (sides * PI * e.area as f64)
+}
+
+fn mean(power: DVec3) -> f64 {
+    power.element_sum() / 3.0
+}
+
+/// The direction around `axis` with the azimuth of a point of the unit disc and 1 − cos of its
+/// angle to the axis given by `height` of the point's squared radius (uniform in [0, 1]).
+#[inline]
+fn around(axis: Vec3, [x, y]: [f32; 2], height: impl Fn(f32) -> f64) -> Vec3 {
+    let r2 = (x * x + y * y).min(1.0);
+    let h = height(r2);
+    // sin θ / r; at the centre of the disc the direction is the axis.
+    let spread = if r2 > 0.0 { (h * (2.0 - h) / r2 as f64).max(0.0).sqrt() as f32 } else { 0.0 };
+    let (t, b) = orthonormal_basis(axis);
+    (t * (x * spread) + b * (y * spread) + axis * (1.0 - h) as f32).normalize()
+}
+
+/// A direction around `normal` with density cos θ / π.
+#[inline]
+pub(super) fn cosine_around(normal: Vec3, u: [f32; 2]) -> Vec3 {
+    let local = cosine_hemisphere(u);
+    let (t, b) = orthonormal_basis(normal);
+    (t * local.x + b * local.y + normal * local.z).normalize()
+}

@@ -1,0 +1,304 @@
+//! Photon tracing (thesis 3.2.2): diffuse paths ended by Russian roulette.
+//!
+//! Photons are traced in blocks of consecutive numbers. A block goes in waves: one ray for each
+//! path that is still alive, then all their hits, so that the kernel runs over an array of rays
+//! and the cache misses of shading overlap. Everything random is a function of the photon's number
+//! and its bounce, and blocks are kept in order, so threads make no difference.
+
+use super::emission::{Emission, cosine_around};
+use super::{PATH_LIMIT, PhotonParams, PhotonStats};
+use crate::error::{Error, Result};
+use crate::memory::{MemoryMonitor, Reservation};
+use crate::progress::{Progress, Stage};
+use crate::sampling::{combine, purpose_seed, sobol_2d, uniform};
+use crate::scene::{Light, Scene};
+use crate::trace::offset::{SurfacePoint, offset_ray_origin};
+use crate::trace::{RawHit, Ray};
+use glam::{DVec3, Vec3};
+use rayon::prelude::*;
+use std::sync::{Arc, Mutex};
+
+/// Photons per block: some 5 ms of work, so that cancelling is quick and threads stay busy.
+const BLOCK: u64 = 1024;
+
+/// Memory is announced in steps of this many bytes while photons are traced.
+const MEMORY_STEP: usize = 16 << 20;
+
+/// What photon random numbers are drawn for.
+const PURPOSE: u32 = u32::from_be_bytes(*b"phot");
+/// Dimensions: the start of a path, then two per bounce.
+const ALLOTMENT: u32 = 0;
+const EMIT_POSITION: u32 = 1;
+const EMIT_DIRECTION: u32 = 2;
+const BOUNCE: u32 = 3;
+
+/// A photon on a surface.
+#[derive(Clone, Copy, Debug, Default, PartialEq)]
+pub(super) struct StoredPhoton {
+    pub(super) position: Vec3,
+    /// Unit direction of travel.
+    pub(super) direction: Vec3,
+    /// W per channel.
+    pub(super) power: Vec3,
+    /// Unit geometric normal on the side that was hit. The estimate compares it with that of the
+    /// point asked for, to leave out photons of the other wall in a corner. Three floats rather
+    /// than a packed octahedral one: the lanes then compare it without unpacking.
+    pub(super) normal: Vec3,
+}
+
+/// Photons in order of blocks, within a block by bounce and number.
+pub(super) struct Traced {
+    pub(super) blocks: Vec<Vec<StoredPhoton>>,
+    pub(super) stats: PhotonStats,
+    pub(super) memory: Account,
+}
+
+/// Traces all photons, reporting over `[from, to]` of the bar. Runs on the current rayon pool.
+pub(super) fn trace(
+    scene: &Arc<Scene>,
+    lights: &[Light],
+    params: &PhotonParams,
+    progress: &Progress,
+    (from, to): (f32, f32),
+) -> Result<Traced> {
+    let tracer = Tracer::new(scene, lights, params);
+    let count = tracer.emission.count();
+    let stage = progress.stage("photons", from, to, count.div_ceil(BLOCK));
+    let memory = Account::new(scene.device().memory().clone(), params.memory_budget);
+    let results: Vec<(Vec<StoredPhoton>, Tally)> = (0..count.div_ceil(BLOCK))
+        .into_par_iter()
+        .map(|block| {
+            let result = tracer.block(block, Some(&stage), None)?;
+            memory.grow(result.0.len() * size_of::<StoredPhoton>())?;
+            stage.advance(1)?;
+            Ok(result)
+        })
+        .collect::<Result<_>>()?;
+
+    let mut tally = Tally::default();
+    let mut blocks = Vec::with_capacity(results.len());
+    for (block, t) in results {
+        tally.add(&t);
+        blocks.push(block);
+    }
+    let stats = PhotonStats {
+        emitted: count,
+        stored: blocks.iter().map(|b| b.len() as u64).sum(),
+        rays: tally.rays,
+        emitted_power: tracer.emission.power.to_array(),
+        absorbed_power: tally.absorbed.to_array(),
+        escaped_power: (tally.escaped + tracer.emission.unaimed).to_array(),
+        truncated_power: tally.truncated.to_array(),
+        ..Default::default()
+    };
+    Ok(Traced { blocks, stats, memory })
+}
+
+/// The rays of all paths.
+pub(super) fn record_rays(scene: &Arc<Scene>, lights: &[Light], params: &PhotonParams) -> Result<Vec<Ray>> {
+    let tracer = Tracer::new(scene, lights, params);
+    let mut rays = Vec::new();
+    for block in 0..tracer.emission.count().div_ceil(BLOCK) {
+        tracer.block(block, None, Some(&mut rays))?;
+    }
+    Ok(rays)
+}
+
+/// Sums over the paths of a block, powers in W per channel.
+#[derive(Clone, Copy, Default)]
+struct Tally {
+    rays: u64,
+    absorbed: DVec3,
+    escaped: DVec3,
+    truncated: DVec3,
+}
+
+impl Tally {
+    fn add(&mut self, other: &Tally) {
+        self.rays += other.rays;
+        self.absorbed += other.absorbed;
+        self.escaped += other.escaped;
+        self.truncated += other.truncated;
+    }
+}
+
+/// A path that is still alive.
+#[derive(Clone, Copy)]
+struct Path {
+    photon: u32,
+    power: Vec3,
+}
+
+struct Tracer<'a> {
+    scene: &'a Scene,
+    emission: Emission<'a>,
+    seed: u32,
+    /// Most surface interactions per path.
+    limit: u32,
+    store_direct: bool,
+}
+
+impl<'a> Tracer<'a> {
+    fn new(scene: &'a Scene, lights: &[Light], params: &PhotonParams) -> Self {
+        let seed = purpose_seed(params.seed, PURPOSE);
+        let emission = Emission::new(scene, lights, params.photon_count, uniform(0, ALLOTMENT, seed));
+        let limit = if params.max_bounces == 0 { PATH_LIMIT } else { params.max_bounces.min(PATH_LIMIT) };
+        Tracer { scene, emission, seed, limit, store_direct: params.store_direct }
+    }
+
+    /// Traces one block of photons; `record` gets the rays.
+    fn block(
+        &self,
+        block: u64,
+        stage: Option<&Stage>,
+        mut record: Option<&mut Vec<Ray>>,
+    ) -> Result<(Vec<StoredPhoton>, Tally)> {
+        let numbers = block * BLOCK..((block + 1) * BLOCK).min(self.emission.count());
+        let mut rays = Vec::with_capacity(BLOCK as usize);
+        let mut paths = Vec::with_capacity(BLOCK as usize);
+        for number in numbers {
+            let (ray, path) = self.emit(number as u32);
+            rays.push(ray);
+            paths.push(path);
+        }
+        let mut hits = vec![RawHit::MISS; rays.len()];
+        let mut stored = Vec::new();
+        let mut tally = Tally::default();
+        for bounce in 0..self.limit {
+            if rays.is_empty() {
+                break;
+            }
+            if stage.is_some_and(|s| s.is_cancelled()) {
+                return Err(Error::Cancelled);
+            }
+            if let Some(record) = record.as_deref_mut() {
+                record.extend_from_slice(&rays);
+            }
+            self.scene.device().kernels().intersect_block(self.scene.mbvh(), &rays, &mut hits);
+            tally.rays += rays.len() as u64;
+            stored.try_reserve(rays.len()).map_err(|e| Error::OutOfMemory(format!("the photons being traced: {e}")))?;
+            // Survivors move to the front.
+            let mut alive = 0;
+            for i in 0..rays.len() {
+                if let Some((ray, path)) = self.interact(&rays[i], paths[i], &hits[i], bounce, &mut stored, &mut tally)
+                {
+                    (rays[alive], paths[alive]) = (ray, path);
+                    alive += 1;
+                }
+            }
+            rays.truncate(alive);
+            paths.truncate(alive);
+        }
+        stored.shrink_to_fit();
+        Ok((stored, tally))
+    }
+
+    fn emit(&self, photon: u32) -> (Ray, Path) {
+        let at = |dimension| sobol_2d(photon, combine(self.seed, dimension));
+        let e = self.emission.emit(photon as u64, at(EMIT_POSITION), at(EMIT_DIRECTION));
+        (Ray::new(e.origin, e.direction), Path { photon, power: e.power })
+    }
+
+    /// What becomes of a path at the end of `ray`: the photon is stored, and goes on or not.
+    #[inline]
+    fn interact(
+        &self,
+        ray: &Ray,
+        path: Path,
+        hit: &RawHit,
+        bounce: u32,
+        stored: &mut Vec<StoredPhoton>,
+        tally: &mut Tally,
+    ) -> Option<(Ray, Path)> {
+        let power = path.power.as_dvec3();
+        if hit.is_miss() {
+            tally.escaped += power;
+            return None;
+        }
+        let (mesh, triangle) = self.scene.locate(hit.triangle);
+        let mesh = &self.scene.meshes()[mesh as usize];
+        let material = &self.scene.materials()[mesh.material(triangle as usize) as usize];
+        let point = SurfacePoint::new(mesh.corners(triangle as usize), hit.u, hit.v, self.scene);
+        let direction = Vec3::from_array(ray.direction);
+        let mut normal = point.normal;
+        if direction.dot(normal) > 0.0 {
+            if !material.two_sided {
+                tally.absorbed += power;
+                return None;
+            }
+            normal = -normal;
+        }
+        if bounce > 0 || self.store_direct {
+            stored.push(StoredPhoton { position: point.position, direction, power: path.power, normal });
+        }
+
+        let reflected = path.power * Vec3::from_array(material.albedo);
+        tally.absorbed += power - reflected.as_dvec3();
+        if bounce + 1 == self.limit {
+            tally.truncated += reflected.as_dvec3();
+            return None;
+        }
+        // The brightest channel keeps its power through all bounces: photons of similar power make
+        // the least noise (Jensen 2001, section 5.2).
+        let survival = reflected.max_element() / path.power.max_element();
+        let dimension = BOUNCE + 2 * bounce;
+        // A NaN, of photons too faint for f32, ends the path as well.
+        if !(uniform(path.photon, dimension, self.seed) < survival) {
+            return None;
+        }
+        let u = sobol_2d(path.photon, combine(self.seed, dimension + 1));
+        let origin = offset_ray_origin(point.interior, normal, self.scene);
+        Some((Ray::new(origin, cosine_around(normal, u)), Path { photon: path.photon, power: reflected / survival }))
+    }
+}
+
+/// Memory announced while it grows, against the budget of one call.
+pub(super) struct Account {
+    monitor: Arc<MemoryMonitor>,
+    budget: u64,
+    state: Mutex<AccountState>,
+}
+
+#[derive(Default)]
+struct AccountState {
+    used: usize,
+    reserved: usize,
+    reservations: Vec<Reservation>,
+}
+
+impl Account {
+    pub(super) fn new(monitor: Arc<MemoryMonitor>, budget: u64) -> Self {
+        Account { monitor, budget, state: Mutex::default() }
+    }
+
+    /// Counts `bytes` more, announcing them in large steps.
+    fn grow(&self, bytes: usize) -> Result<()> {
+        let mut state = self.state.lock().unwrap_or_else(|e| e.into_inner());
+        state.used += bytes;
+        self.check(state.used)?;
+        if state.used > state.reserved {
+            let step = MEMORY_STEP.max(state.used - state.reserved);
+            let reservation = self.monitor.reserve(step, "the photons being traced")?;
+            state.reserved += step;
+            state.reservations.push(reservation);
+        }
+        Ok(())
+    }
+
+    /// Announces `bytes` beside what is held already, for `what`.
+    pub(super) fn reserve(&self, bytes: usize, what: &str) -> Result<Reservation> {
+        let used = self.state.lock().unwrap_or_else(|e| e.into_inner()).used;
+        self.check(used + bytes)?;
+        self.monitor.reserve(bytes, what)
+    }
+
+    fn check(&self, bytes: usize) -> Result<()> {
+        if self.budget != 0 && bytes as u64 > self.budget {
+            return Err(Error::OutOfMemory(format!(
+                "the photon map needs at least {bytes} bytes, more than memory_budget, {}",
+                self.budget
+            )));
+        }
+        Ok(())
+    }
+}
