@@ -185,7 +185,7 @@ mod tests {
     }
 
     fn answer(t: f32, triangle: u32) -> RawHit {
-        RawHit { t, u: 0.0, v: 0.0, triangle }
+        RawHit { t, triangle, ..RawHit::MISS }
     }
 
     #[test]

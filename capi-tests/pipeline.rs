@@ -1,0 +1,301 @@
+//! The whole pipeline against the path tracer and against physics, and what it promises about
+//! threads, cancelling and shards. Each test prints its figures (`--nocapture` shows them).
+
+use bakelite::bvh::BuildOptions;
+use bakelite::lightmap::{BakeParams, Layer, LayerData, Lightmap, LightmapDesc};
+use bakelite::reference::{Irradiance, PathTracer, Random, SurfacePoint};
+use bakelite::scene::builtin;
+use bakelite::{Device, DeviceOptions, Error, Isa, Progress, Scene};
+use std::f64::consts::PI;
+use std::sync::Arc;
+use std::time::Instant;
+
+fn device(num_threads: usize, isa: Option<Isa>) -> Arc<Device> {
+    Device::new(DeviceOptions { num_threads, isa, ..Default::default() }).unwrap()
+}
+
+fn commit(name: &str, device: &Arc<Device>) -> Arc<Scene> {
+    let data = builtin(name).unwrap();
+    Scene::commit(device, data, &BuildOptions::default(), &Progress::none()).map_err(|(_, e)| e).unwrap()
+}
+
+/// A light map of a built-in scene with default settings, baked.
+fn baked(name: &str) -> Lightmap {
+    let scene = commit(name, &device(0, None));
+    let mut map = Lightmap::create(&scene, &LightmapDesc::default(), &Progress::none()).unwrap();
+    map.bake(&BakeParams::default(), &Progress::none()).unwrap();
+    map
+}
+
+/// A place on a surface: global triangle and weights of corners 1 and 2.
+#[derive(Clone, Copy)]
+struct Place {
+    triangle: u32,
+    u: f32,
+    v: f32,
+}
+
+impl Place {
+    /// Uniform over the area of `scene`.
+    fn random(scene: &Scene, random: &mut Random) -> Self {
+        let areas: Vec<f64> = (0..scene.triangle_count()).map(|t| area(scene, t)).collect();
+        let mut pick = random.uniform() * areas.iter().sum::<f64>();
+        let triangle = areas.iter().position(|a| {
+            pick -= a;
+            pick < 0.0
+        });
+        Self::random_on(triangle.unwrap_or(areas.len() - 1) as u32, random)
+    }
+
+    fn random_on(triangle: u32, random: &mut Random) -> Self {
+        let [a, b] = random.square();
+        let (u, v) = if a + b > 1.0 { (1.0 - a, 1.0 - b) } else { (a, b) };
+        Place { triangle, u: u as f32, v: v as f32 }
+    }
+
+    fn point(&self, scene: &Scene) -> SurfacePoint {
+        SurfacePoint::on_triangle(scene, self.triangle, self.u as f64, self.v as f64)
+    }
+
+    fn sample(&self, map: &Lightmap) -> [f64; 3] {
+        map.sample(Layer::Combined, self.triangle, self.u, self.v).map(f64::from)
+    }
+}
+
+fn area(scene: &Scene, triangle: u32) -> f64 {
+    let [a, b, c] = scene.corners(triangle).map(|c| c.as_dvec3());
+    0.5 * (b - a).cross(c - a).length()
+}
+
+/// Places in the Cornell box that light reaches, with their irradiance. (Below the blocks nothing
+/// is seen, and light maps repeat there what is around.)
+fn cornell_reference(scene: &Scene, count: usize, samples: u32) -> Vec<(Place, Irradiance)> {
+    let tracer = PathTracer::new(scene);
+    let mut random = Random::new(2024, 0);
+    let mut places = Vec::new();
+    while places.len() < count {
+        let place = Place::random(scene, &mut random);
+        if tracer.irradiance(&place.point(scene), 256, 0, 0).total()[0] > 0.0 {
+            places.push(place);
+        }
+    }
+    let points: Vec<SurfacePoint> = places.iter().map(|p| p.point(scene)).collect();
+    let values = tracer.irradiance_many(scene.device(), &points, samples, 1, &Progress::none()).unwrap();
+    places.into_iter().zip(values).collect()
+}
+
+/// The mean over values and channels.
+fn mean<'a>(values: impl IntoIterator<Item = &'a [f64; 3]>) -> f64 {
+    let (sum, count) = values.into_iter().fold((0.0, 0), |(s, n), v| (s + v.iter().sum::<f64>(), n + 3));
+    sum / count as f64
+}
+
+const CORNELL_POINTS: usize = 200;
+const CORNELL_SAMPLES: u32 = 16 * 32 * 32;
+
+#[test]
+fn the_reference_of_the_cornell_box_is_ten_times_as_exact_as_what_it_judges() {
+    let scene = commit("cornell", &device(0, None));
+    let start = Instant::now();
+    let reference = cornell_reference(&scene, CORNELL_POINTS, CORNELL_SAMPLES);
+    let seconds = start.elapsed().as_secs_f64();
+    let totals: Vec<[f64; 3]> = reference.iter().map(|(_, e)| e.total()).collect();
+    let variances: Vec<[f64; 3]> = reference.iter().map(|(_, e)| e.standard_error.map(|s| s * s)).collect();
+    let error = mean(&variances).sqrt() / mean(&totals);
+    println!("{CORNELL_POINTS} points, {CORNELL_SAMPLES} samples: standard error {error:.5}, {seconds:.2} s");
+    assert!(error < 0.003, "{error}");
+}
+
+#[test]
+fn the_cornell_box_agrees_with_the_path_tracer_to_three_percent_without_bias() {
+    let map = baked("cornell");
+    let scene = map.scene();
+    let reference = cornell_reference(scene, CORNELL_POINTS, CORNELL_SAMPLES);
+    let totals: Vec<[f64; 3]> = reference.iter().map(|(_, e)| e.total()).collect();
+    let errors: Vec<[f64; 3]> = reference
+        .iter()
+        .zip(&totals)
+        .map(|((place, _), total)| {
+            let baked = place.sample(&map);
+            std::array::from_fn(|c| baked[c] - total[c])
+        })
+        .collect();
+
+    // Triangles in the order of `cornell`: five quads of the room, then the blocks.
+    let class = |p: &Place| match p.triangle {
+        t @ 0..10 => ["floor", "ceiling", "back wall", "green wall", "red wall"][t as usize / 2],
+        10..22 => "short block",
+        _ => "tall block",
+    };
+    println!("{:12} {:>6} {:>8} {:>8} {:>8}", "surface", "points", "mean E", "bias", "RMSE");
+    for name in ["floor", "ceiling", "back wall", "green wall", "red wall", "short block", "tall block"] {
+        let of_class = |values: &[[f64; 3]]| -> Vec<[f64; 3]> {
+            values.iter().zip(&reference).filter(|(_, (p, _))| class(p) == name).map(|(v, _)| *v).collect()
+        };
+        let (e, t) = (of_class(&errors), of_class(&totals));
+        let (level, rmse) = (mean(&t), mean(&squares(&e)).sqrt());
+        let (bias, relative) = (100.0 * mean(&e) / level, 100.0 * rmse / level);
+        println!("{name:12} {:6} {level:8.3} {bias:7.2}% {relative:7.2}%", e.len());
+    }
+    let level = mean(&totals);
+    let (bias, rmse) = (mean(&errors) / level, mean(&squares(&errors)).sqrt() / level);
+    println!("all: bias {:.2} %, RMSE {:.2} %", 100.0 * bias, 100.0 * rmse);
+    assert!(rmse <= 0.03, "the relative RMSE is {rmse}");
+    // Three times what 200 points of 3 % error would scatter.
+    assert!(bias.abs() <= 0.0065, "the bias is {bias}");
+}
+
+fn squares(values: &[[f64; 3]]) -> Vec<[f64; 3]> {
+    values.iter().map(|v| v.map(|x| x * x)).collect()
+}
+
+#[test]
+fn a_furnace_glows_at_its_emission_over_one_minus_its_reflectance() {
+    let map = baked("furnace");
+    let scene = map.scene();
+    let expected = PI / (1.0 - 0.5);
+    let mut random = Random::new(3, 0);
+    let errors: Vec<[f64; 3]> = (0..scene.triangle_count())
+        .flat_map(|t| (0..50).map(move |_| t))
+        .map(|t| Place::random_on(t, &mut random).sample(&map).map(|e| e / expected - 1.0))
+        .collect();
+    let worst = errors.iter().flatten().fold(0.0, |w: f64, e| w.max(e.abs()));
+    let (bias, rmse) = (mean(&errors), mean(&squares(&errors)).sqrt());
+    println!("bias {:.2} %, RMSE {:.2} %, worst {:.2} %", 100.0 * bias, 100.0 * rmse, 100.0 * worst);
+    assert!(rmse <= 0.02, "the relative RMSE is {rmse}");
+    assert!(bias.abs() <= 0.01, "the bias is {bias}");
+}
+
+#[test]
+fn no_light_enters_a_sealed_box() {
+    let map = baked("sealed");
+    let scene = map.scene();
+    let inside = scene.first_triangle(1)..scene.first_triangle(2);
+    let mut lit = 0;
+    for page in 0..map.info().page_count {
+        let LayerData::Rgb(light) = map.read(page, Layer::Combined).unwrap() else { panic!("light is RGB") };
+        let LayerData::Integer(triangles) = map.read(page, Layer::Triangle).unwrap() else { panic!("numbers") };
+        for (light, triangle) in light.iter().zip(&triangles) {
+            if inside.contains(triangle) {
+                assert_eq!(*light, [0.0; 3], "on triangle {triangle}");
+            } else if light[0] > 0.0 {
+                lit += 1;
+            }
+        }
+    }
+    assert!(lit > 1000, "the room is lit, but only {lit} texels are");
+    let mut random = Random::new(4, 0);
+    for triangle in inside {
+        for _ in 0..100 {
+            assert_eq!(Place::random_on(triangle, &mut random).sample(&map), [0.0; 3]);
+        }
+    }
+}
+
+/// Settings that bake in a moment and still run every stage.
+fn small() -> (LightmapDesc, BakeParams) {
+    let desc = LightmapDesc { texels_per_unit: 8.0, page_size: 256, ..Default::default() };
+    (desc, BakeParams { photon_count: 20_000, gather_rays: 32, direct_samples: 4, ..Default::default() })
+}
+
+fn small_cornell(threads: usize, isa: Option<Isa>) -> Lightmap {
+    let scene = commit("cornell", &device(threads, isa));
+    Lightmap::create(&scene, &small().0, &Progress::none()).unwrap()
+}
+
+/// The bits of every layer of light on every page.
+fn bits(map: &Lightmap) -> Vec<u32> {
+    let layers = [Layer::Combined, Layer::Indirect, Layer::Direct, Layer::Radiance, Layer::Validity];
+    let mut all = Vec::new();
+    for page in 0..map.info().page_count {
+        for layer in layers {
+            match map.read(page, layer).unwrap() {
+                LayerData::Rgb(v) => all.extend(v.iter().flatten().map(|x| x.to_bits())),
+                LayerData::Scalar(v) => all.extend(v.iter().map(|x| x.to_bits())),
+                LayerData::Integer(v) => all.extend(v),
+            }
+        }
+    }
+    assert!(all.iter().any(|&b| b != 0), "all layers are empty");
+    all
+}
+
+/// Compares bits; says how many differ, not which million numbers they are.
+#[track_caller]
+fn assert_same_bits(a: &[u32], b: &[u32], what: &str) {
+    assert_eq!(a.len(), b.len(), "{what}");
+    let different = a.iter().zip(b).filter(|(a, b)| a != b).count();
+    assert!(different == 0, "{what}: {different} of {} numbers differ", a.len());
+}
+
+#[test]
+fn the_number_of_threads_changes_no_bit_on_any_isa() {
+    for isa in Isa::available() {
+        let bake = |threads| {
+            let mut map = small_cornell(threads, Some(isa));
+            map.bake(&small().1, &Progress::none()).unwrap();
+            bits(&map)
+        };
+        let one = bake(1);
+        for threads in [2, 7] {
+            assert_same_bits(&one, &bake(threads), &format!("{} with {threads} threads", isa.name()));
+        }
+    }
+}
+
+#[test]
+fn a_bake_cancelled_anywhere_can_be_repeated_and_gives_the_same_bits() {
+    let params = small().1;
+    let mut map = small_cornell(2, None);
+    let mut stages: Vec<String> = Vec::new();
+    let watch = Progress::new(|_, stage| {
+        if stages.last().is_none_or(|last| last != stage) {
+            stages.push(stage.to_string());
+        }
+        true
+    });
+    map.bake(&params, &watch).unwrap();
+    drop(watch);
+    let undisturbed = bits(&map);
+    println!("stages: {}", stages.join(", "));
+    assert!(stages.len() >= 4, "photons, radiance, gather and direct light at least: {stages:?}");
+
+    for name in &stages {
+        let mut map = small_cornell(2, None);
+        let cancel = Progress::new(|_, stage| stage != name);
+        assert_eq!(map.bake(&params, &cancel).err(), Some(Error::Cancelled), "in {name}");
+        map.bake(&params, &Progress::none()).unwrap();
+        assert_same_bits(&undisturbed, &bits(&map), &format!("after a cancel in {name}"));
+    }
+    // In the midst of stages, and on a light map whose earlier bake must survive.
+    for percent in (5..100).step_by(10) {
+        let cancel = Progress::new(|fraction, _| fraction * 100.0 < percent as f32);
+        assert_eq!(map.bake(&params, &cancel).err(), Some(Error::Cancelled), "at {percent} %");
+        assert_same_bits(&undisturbed, &bits(&map), &format!("kept after a cancel at {percent} %"));
+    }
+    map.bake(&params, &Progress::none()).unwrap();
+    assert_same_bits(&undisturbed, &bits(&map), "after all these cancels");
+}
+
+#[test]
+fn creating_a_light_map_can_be_cancelled() {
+    let scene = commit("cornell", &device(2, None));
+    let cancel = Progress::new(|_, _| false);
+    assert_eq!(Lightmap::create(&scene, &small().0, &cancel).err(), Some(Error::Cancelled));
+}
+
+#[test]
+fn shards_of_texels_combine_to_the_same_bits() {
+    let params = small().1;
+    let mut whole = small_cornell(2, None);
+    whole.bake(&params, &Progress::none()).unwrap();
+    let texels = whole.info().texels;
+    // Cuts that fall into the midst of charts; the last shard first.
+    let cuts = [0, texels / 7, texels / 2 + 3, texels];
+    let mut parts = small_cornell(2, None);
+    for range in cuts.windows(2).rev() {
+        let shard = BakeParams { texel_begin: range[0], texel_end: range[1], ..params };
+        parts.bake(&shard, &Progress::none()).unwrap();
+    }
+    assert_same_bits(&bits(&whole), &bits(&parts), "three shards");
+}
