@@ -23,6 +23,10 @@ const BATCHES: u32 = 16;
 /// coordinates: more than the rounding of points that were computed in f32.
 const OFFSET: f64 = 1e-7;
 
+/// Russian roulette lets a path go on with this times its throughput. Measured on the Cornell box,
+/// error² · time: 1.79 for 1, 1.33 for 2, 1.50 for 4.
+const ROULETTE: f64 = 2.0;
+
 /// Images are computed in square tiles of this many pixels a side: small, so that a cancel is
 /// noticed soon.
 const TILE: usize = 8;
@@ -209,8 +213,7 @@ impl PathTracer {
             }
             let square = random.square();
             result.indirect += throughput * self.direct(point.position, point.normal, square, random) / PI;
-            // Russian roulette: as many paths go on as energy does.
-            let survival = throughput.max_element().min(1.0);
+            let survival = (throughput.max_element() * ROULETTE).min(1.0);
             if random.uniform() >= survival {
                 break;
             }
