@@ -1,0 +1,963 @@
+/*
+ * Bakelite: SIMD light-baking kernels.
+ *
+ * Generated from src/capi by cbindgen; do not edit. To update it:
+ *     BAKELITE_UPDATE_HEADER=1 cargo test --test header
+ */
+#ifndef BAKELITE_H
+#define BAKELITE_H
+
+#include <stddef.h>
+#include <stdint.h>
+
+/* Programs that link the static library on Windows define BK_STATIC. */
+#ifndef BK_API
+#if defined(_WIN32) && !defined(BK_STATIC)
+#define BK_API __declspec(dllimport)
+#else
+#define BK_API
+#endif
+#endif
+
+#ifdef __cplusplus
+extern "C" {
+#endif
+
+/* ================================================================================================
+ * Results and version
+ *
+ * Functions that can fail return a `bk_result`: BK_OK, or a negative code. The sentence that names
+ * the argument and the value at fault is then in `bk_last_error()`. A call that fails changes
+ * nothing unless its description says so; every object can be used as before.
+ *
+ * Enums and flags travel as uint32_t constants. Values and flags that are not listed are refused.
+ *
+ * Every structure whose name ends in _desc, _params, _info, _stats or _view starts with
+ * `uint32_t struct_size`. Its `bk_..._init(&x)` function sets that size and fills in the defaults.
+ * Programs compiled against an older, shorter version of a structure keep working: the missing
+ * fields of an input get their defaults, and an output is written as far as it reaches. A size of
+ * 0, or larger than this library knows, is BK_ERROR_INVALID_ARGUMENT.
+ * ================================================================================================ */
+
+// Major version: programs must be recompiled when it changes.
+#define BK_VERSION_MAJOR 0
+
+// Minor version: functions and fields were added.
+#define BK_VERSION_MINOR 1
+
+// Patch version: only behaviour was mended.
+#define BK_VERSION_PATCH 0
+
+// The version of this header: major << 16 | minor << 8 | patch.
+#define BK_VERSION (((BK_VERSION_MAJOR << 16) | (BK_VERSION_MINOR << 8)) | BK_VERSION_PATCH)
+
+// "None" where an index is expected or reported.
+#define BK_NONE 0xffffffffu
+
+// What became of a call: BK_OK, or one of the negative BK_ERROR codes.
+typedef int32_t bk_result;
+
+// All went well.
+#define BK_OK 0
+
+// An argument is NULL or out of its documented range.
+#define BK_ERROR_INVALID_ARGUMENT (-1)
+
+// The call is not allowed in the object's present state, or while another thread changes it.
+#define BK_ERROR_INVALID_STATE (-2)
+
+// Memory ran out, or a memory budget or the memory callback refused.
+#define BK_ERROR_OUT_OF_MEMORY (-3)
+
+// The progress callback returned 0.
+#define BK_ERROR_CANCELLED (-4)
+
+// This build or this machine cannot do it.
+#define BK_ERROR_UNSUPPORTED (-5)
+
+// A file could not be read or written, or its content is malformed.
+#define BK_ERROR_IO (-6)
+
+// A bug in the library, caught before it reached the caller.
+#define BK_ERROR_INTERNAL (-7)
+
+// The version of the library in use, to compare with BK_VERSION.
+BK_API uint32_t bk_version(void);
+
+// The name of a result, as "BK_OK"; "unknown bk_result" for a value that is none. Never NULL; the
+// string is constant.
+BK_API const char *bk_result_string(bk_result result);
+
+// What went wrong in the last call of the calling thread that failed: one UTF-8 sentence that names
+// the argument and the value at fault; empty if none failed yet. Never NULL; valid until the
+// thread's next call into the library. Functions without a bk_result (as bk_intersect) leave their
+// failures here too; a call that succeeds leaves the text alone.
+BK_API const char *bk_last_error(void);
+
+/* ================================================================================================
+ * Devices and callbacks
+ *
+ * A device owns worker threads, the choice of instruction set, the log and the memory accounts.
+ *
+ * Handles (bk_device, bk_scene, bk_photon_map, bk_lightmap) are opaque and reference-counted: a
+ * create function hands out one reference, bk_..._retain adds one, bk_..._release gives one back,
+ * and NULL is ignored by both. What is made from an object keeps what it needs of it alive, so
+ * parents may be released first. Retaining and releasing is safe from any thread.
+ *
+ * Callbacks may run on any thread, must not throw or jump out, and may call the library, though
+ * not change (or release for good) the object whose call they are in: that is
+ * BK_ERROR_INVALID_STATE. Strings given to them are valid during the callback only.
+ * ================================================================================================ */
+
+// The best instruction set that the machine has.
+#define BK_ISA_AUTO 0
+
+// The baseline of the target: SSE2 on x86-64, NEON on AArch64.
+#define BK_ISA_PORTABLE 1
+
+// AVX2 with FMA.
+#define BK_ISA_AVX2 2
+
+// AVX-512 F, VL, DQ and BW.
+#define BK_ISA_AVX512 3
+
+// Log level: something failed that no result reports.
+#define BK_LOG_ERROR 0
+
+// Log level: something about the input or the run deserves attention, as skipped triangles.
+#define BK_LOG_WARNING 1
+
+// Log level: what is going on.
+#define BK_LOG_INFO 2
+
+// Worker threads, instruction set, log and memory accounts. All functions on a device are safe
+// from any thread.
+typedef struct bk_device bk_device;
+
+// Receives log messages (UTF-8) with one of the BK_LOG levels, from any thread, several at a time.
+typedef void (*bk_log_fn)(void *user, uint32_t level, const char *message);
+
+// Asked before a large allocation, with its size in bytes: return 0 to refuse, and the call that
+// wanted it ends with BK_ERROR_OUT_OF_MEMORY. Told after a free, with the size negative; the
+// answer is ignored then. From any thread, several at a time; for the last time when the last
+// object of the device is released.
+typedef int32_t (*bk_memory_fn)(void *user, int64_t bytes);
+
+// What to create a device with.
+typedef struct bk_device_desc {
+  // Size of this structure in bytes, set by bk_device_desc_init.
+  uint32_t struct_size;
+  // Worker threads; 0, the default: one per logical core. At most 4096. Results do not depend
+  // on it.
+  uint32_t num_threads;
+  // One of the BK_ISA values. Default: BK_ISA_AUTO.
+  uint32_t isa;
+  // None are defined yet: 0.
+  uint32_t flags;
+  // Receives log messages. Default: NULL.
+  bk_log_fn log;
+  // Asked before large allocations. Default: NULL.
+  bk_memory_fn memory;
+  // Handed to log and memory; must outlive the device and all that was made from it.
+  void *user;
+} bk_device_desc;
+
+// Told how far a call is: fraction in [0, 1], never falling, and the name of the stage, as
+// "gather". Called by one thread at a time, about every 10 ms and at least once per stage. Return
+// 0 to cancel: the call then ends soon with BK_ERROR_CANCELLED. NULL is allowed wherever one is
+// taken.
+typedef int32_t (*bk_progress_fn)(void *user, float fraction, const char *stage);
+
+// Fills in the defaults.
+BK_API void bk_device_desc_init(bk_device_desc *desc);
+
+// Starts a device.
+//
+// desc: NULL for the defaults. out: receives the device, NULL on failure.
+//
+// Fails with BK_ERROR_UNSUPPORTED if the machine lacks the instruction set asked for, with
+// BK_ERROR_OUT_OF_MEMORY if the threads cannot be started.
+BK_API bk_result bk_device_create(const bk_device_desc *desc, bk_device **out);
+
+// Counts one more reference. NULL is ignored.
+BK_API void bk_device_retain(bk_device *device);
+
+// Gives one reference back. When the last is given back, of the device and of all that was made
+// from it, its threads are joined. NULL is ignored.
+BK_API void bk_device_release(bk_device *device);
+
+// The instruction set in use: a BK_ISA value other than BK_ISA_AUTO; BK_ISA_AUTO if device is NULL.
+BK_API uint32_t bk_device_isa(const bk_device *device);
+
+// The number of worker threads; 0 if device is NULL.
+BK_API uint32_t bk_device_num_threads(const bk_device *device);
+
+/* ================================================================================================
+ * Scenes
+ *
+ * A scene is described (materials, meshes, lights, files), then committed: its acceleration
+ * structure is built, and from then on it can be queried and baked but only its lights change.
+ * Describing and committing want one thread at a time per scene; a call that meets another one
+ * fails with BK_ERROR_INVALID_STATE. Queries on a committed scene are safe from any threads.
+ *
+ * Right-handed coordinates, any up axis, any unit of length (W/m2 then means per square unit),
+ * counter-clockwise front faces, linear RGB, all surfaces diffuse. Coordinates are valid up to a
+ * magnitude of 1e12.
+ * ================================================================================================ */
+
+// A scene: being described, or committed.
+typedef struct bk_scene bk_scene;
+
+// What a file brought.
+typedef struct bk_load_info {
+  // Size of this structure in bytes, set by bk_load_info_init.
+  uint32_t struct_size;
+  // Meshes added, the first with number first_mesh.
+  uint32_t meshes;
+  // Number of the first mesh added.
+  uint32_t first_mesh;
+  // Materials added, the first with number first_material.
+  uint32_t materials;
+  // Number of the first material added.
+  uint32_t first_material;
+  // Channels of reflectances at or above 1 that were clamped to 0.98, or below 0 to 0.
+  uint32_t clamped_albedos;
+  // Triangles added, degenerate ones included.
+  uint64_t triangles;
+  // Time to read the file, in seconds.
+  double seconds;
+} bk_load_info;
+
+// How to build the acceleration structure.
+typedef struct bk_build_params {
+  // Size of this structure in bytes, set by bk_build_params_init.
+  uint32_t struct_size;
+  // Bins per axis of the surface area heuristic, 2 to 256. Default: 64.
+  uint32_t bins;
+  // Most triangles per leaf, 1 to 8. Default: 3.
+  uint32_t max_leaf;
+} bk_build_params;
+
+// Numbers about a committed scene.
+struct bk_scene_stats {
+  // Size of this structure in bytes, set by bk_scene_stats_init.
+  uint32_t struct_size;
+  // Surface area heuristic cost of the binary tree, traversal and intersection costing 1 each.
+  float sah_cost;
+  // Triangles in all meshes.
+  uint64_t triangles;
+  // Of those, skipped as degenerate or not finite.
+  uint64_t skipped_degenerate;
+  // 4-wide nodes of the acceleration structure.
+  uint64_t nodes;
+  // Bytes of the acceleration structure.
+  uint64_t bvh_bytes;
+  // Bytes of the whole committed scene.
+  uint64_t bytes;
+  // Time of the build, in seconds.
+  double build_seconds;
+};
+
+// Creates an empty scene.
+//
+// device: kept alive by the scene. out: receives the scene, NULL on failure.
+BK_API bk_result bk_scene_create(bk_device *device, bk_scene **out);
+
+// Counts one more reference. NULL is ignored.
+BK_API void bk_scene_retain(bk_scene *scene);
+
+// Gives one reference back. NULL is ignored.
+BK_API void bk_scene_release(bk_scene *scene);
+
+// Sets struct_size and clears the rest.
+BK_API void bk_load_info_init(bk_load_info *info);
+
+// Adds what a scene file describes: meshes and materials, emissive ones included.
+//
+// path: UTF-8, ending in .obj (with its .mtl), .ply, .gltf or .glb. out: what was added; NULL if
+// not wanted.
+//
+// Fails with BK_ERROR_IO, naming the file, if it cannot be read or is malformed, with
+// BK_ERROR_UNSUPPORTED if its kind is unknown or the library was built without files; the scene is
+// as before then.
+BK_API bk_result bk_scene_load_file(bk_scene *scene, const char *path, bk_load_info *out);
+
+// Adds a scene made by code, with its lights: "cornell" (the Cornell box), "furnace" (a closed,
+// glowing cube) or "atrium" (a two-floor court in the sun).
+BK_API bk_result bk_scene_load_builtin(bk_scene *scene, const char *name);
+
+// Fills in the defaults.
+BK_API void bk_build_params_init(bk_build_params *params);
+
+// Chooses how bk_scene_commit builds; without it the defaults hold.
+BK_API bk_result bk_scene_set_build(bk_scene *scene, const bk_build_params *params);
+
+// Ends the description: builds the acceleration structure on the device's threads. Afterwards the
+// scene can be queried and baked, and only bk_scene_set_light changes it.
+//
+// progress, user: told how far it is; NULL if not wanted.
+//
+// Fails with BK_ERROR_INVALID_STATE if the scene is committed already or holds no usable triangle.
+// A commit that fails or is cancelled leaves the description as it was.
+BK_API bk_result bk_scene_commit(bk_scene *scene, bk_progress_fn progress, void *user);
+
+// Sets struct_size and clears the rest.
+BK_API void bk_scene_stats_init(struct bk_scene_stats *stats);
+
+// Numbers about a committed scene. (The structure shares the function's name, so it is always
+// written with `struct`.)
+BK_API bk_result bk_scene_stats(const bk_scene *scene, struct bk_scene_stats *out);
+
+// The bounding box of all valid triangles of a committed scene.
+BK_API bk_result bk_scene_bounds(const bk_scene *scene, float lower[3], float upper[3]);
+
+/* ================================================================================================
+ * Materials and meshes
+ *
+ * Added to a scene before its commit. A refused addition changes nothing.
+ *
+ * Input arrays are read inside the call only. Strides are in bytes, 0 means packed; neither
+ * alignment nor bytes behind the last element are needed.
+ * ================================================================================================ */
+
+// Flag: the back side reflects and emits like the front. The back of a one-sided material absorbs
+// what meets it.
+#define BK_MATERIAL_TWO_SIDED 1
+
+// Flag: refuse degenerate triangles and vertices that are not finite, naming the first, rather
+// than skip and count them.
+#define BK_MESH_STRICT 1
+
+// A diffuse material.
+typedef struct bk_material_desc {
+  // Size of this structure in bytes, set by bk_material_desc_init.
+  uint32_t struct_size;
+  // BK_MATERIAL flags. Default: 0.
+  uint32_t flags;
+  // Diffuse reflectance per channel, in [0, 1). Default: 0.5.
+  float albedo[3];
+  // Emitted radiance per channel in W/(m2 sr), >= 0. Default: 0.
+  float emission[3];
+} bk_material_desc;
+
+// An indexed triangle mesh. The arrays are copied.
+typedef struct bk_mesh_desc {
+  // Size of this structure in bytes, set by bk_mesh_desc_init.
+  uint32_t struct_size;
+  // BK_MESH flags. Default: 0.
+  uint32_t flags;
+  // vertex_count positions of three floats.
+  const float *positions;
+  // Bytes from one position to the next, at least 12; 0: packed.
+  size_t position_stride;
+  // Number of vertices.
+  size_t vertex_count;
+  // Three vertex numbers per triangle, packed, each less than vertex_count.
+  const uint32_t *indices;
+  // Number of triangles; at most 2^28 in a scene.
+  size_t triangle_count;
+  // Optional: vertex_count shading normals of three floats.
+  const float *normals;
+  // Bytes from one normal to the next, at least 12; 0: packed.
+  size_t normal_stride;
+  // Optional: vertex_count texture coordinates of two floats. Kept for files that are saved.
+  const float *uvs;
+  // Bytes from one texture coordinate to the next, at least 8; 0: packed.
+  size_t uv_stride;
+  // Optional: vertex_count light map coordinates of two floats, in [0, 1] on a page, no two
+  // points of a page's triangles at the same place. Without them the mesh is unwrapped.
+  const float *lightmap_uvs;
+  // Bytes from one light map coordinate to the next, at least 8; 0: packed.
+  size_t lightmap_uv_stride;
+  // Optional, with lightmap_uvs only: light map page per triangle, packed. NULL: all on page 0.
+  const uint32_t *lightmap_page;
+  // Optional: material number per triangle, packed. NULL: all have `material`.
+  const uint32_t *triangle_materials;
+  // Material number of all triangles if triangle_materials is NULL. Default: 0.
+  uint32_t material;
+  // Not used yet: 0.
+  uint32_t reserved;
+} bk_mesh_desc;
+
+// The triangles of a mesh.
+typedef struct bk_mesh_view {
+  // Size of this structure in bytes, set by bk_mesh_view_init.
+  uint32_t struct_size;
+  // Not used yet.
+  uint32_t reserved;
+  // vertex_count positions of three floats, packed.
+  const float *positions;
+  // Number of vertices.
+  size_t vertex_count;
+  // Three vertex numbers per triangle, packed.
+  const uint32_t *indices;
+  // Number of triangles, degenerate ones included.
+  size_t triangle_count;
+} bk_mesh_view;
+
+// Fills in the defaults.
+BK_API void bk_material_desc_init(bk_material_desc *desc);
+
+// Adds a material.
+//
+// out_id: receives its number, for meshes; NULL if not wanted. Numbers count up from 0 in the
+// order of addition.
+BK_API
+bk_result bk_scene_add_material(bk_scene *scene,
+                                const bk_material_desc *desc,
+                                uint32_t *out_id);
+
+// Fills in the defaults.
+BK_API void bk_mesh_desc_init(bk_mesh_desc *desc);
+
+// Adds a mesh. The materials that it names must have been added before.
+//
+// out_id: receives its number, as hits report it; NULL if not wanted. Numbers count up from 0 in
+// the order of addition.
+//
+// Fails with BK_ERROR_INVALID_ARGUMENT, naming triangle and vertex, if an index or a material is
+// out of range or BK_MESH_STRICT finds something.
+BK_API bk_result bk_scene_add_mesh(bk_scene *scene, const bk_mesh_desc *desc, uint32_t *out_id);
+
+// The number of meshes, committed or not; 0 on failure.
+BK_API uint32_t bk_scene_mesh_count(const bk_scene *scene);
+
+// Sets struct_size and clears the rest.
+BK_API void bk_mesh_view_init(bk_mesh_view *view);
+
+// Shows the triangles of a mesh of a committed scene, without a copy.
+//
+// out: receives pointers that are valid while the scene lives.
+BK_API bk_result bk_scene_mesh_geometry(const bk_scene *scene, uint32_t mesh, bk_mesh_view *out);
+
+/* ================================================================================================
+ * Lights
+ *
+ * Added to a scene before its commit, changed at any time. Emissive materials make lights too.
+ * ================================================================================================ */
+
+// Radiates from a position equally in all directions. color: radiant intensity in W/sr.
+#define BK_LIGHT_POINT 1
+
+// Radiates from a position in a cone around direction: fully up to cone_inner radians from it, not
+// at all beyond cone_outer, smoothly in between. color: radiant intensity on the axis in W/sr.
+#define BK_LIGHT_SPOT 2
+
+// Parallel light that travels along direction. color: irradiance on a perpendicular plane in W/m2.
+#define BK_LIGHT_DIRECTIONAL 3
+
+// A parallelogram with a corner at position and the edges edge_u and edge_v, which radiates from
+// the side that edge_u x edge_v points to. color: radiance in W/(m2 sr). Rays do not hit it.
+#define BK_LIGHT_RECT 4
+
+// A light. Fields that its type does not use are ignored.
+typedef struct bk_light_desc {
+  // Size of this structure in bytes, set by bk_light_desc_init.
+  uint32_t struct_size;
+  // One of the BK_LIGHT values. Default: BK_LIGHT_POINT.
+  uint32_t type;
+  // Point, spot, and a corner of rect. Default: 0.
+  float position[3];
+  // Spot and directional: where the light travels, of any length but 0. Default: 0, to be set.
+  float direction[3];
+  // Rect: an edge. Default: 0, to be set.
+  float edge_u[3];
+  // Rect: the other edge, not parallel to edge_u. Default: 0, to be set.
+  float edge_v[3];
+  // Linear RGB, >= 0, in the unit of the type. Default: 1.
+  float color[3];
+  // Spot: half angle of the cone of full intensity, in radians, in [0, cone_outer]. Default: 0.
+  float cone_inner;
+  // Spot: half angle of the whole cone, in radians, in (0, pi]. Default: pi/4.
+  float cone_outer;
+} bk_light_desc;
+
+// Fills in the defaults.
+BK_API void bk_light_desc_init(bk_light_desc *desc);
+
+// Adds a light.
+//
+// out_id: receives its number; NULL if not wanted. Numbers count up from 0 in the order of
+// addition.
+BK_API bk_result bk_scene_add_light(bk_scene *scene, const bk_light_desc *desc, uint32_t *out_id);
+
+// Replaces light `id`, before or after the commit; its type may change. What is being baked keeps
+// the lights that it started with.
+BK_API bk_result bk_scene_set_light(bk_scene *scene, uint32_t id, const bk_light_desc *desc);
+
+// The number of lights (emissive materials not counted), committed or not; 0 on failure.
+BK_API uint32_t bk_scene_light_count(const bk_scene *scene);
+
+/* ================================================================================================
+ * Rays
+ *
+ * All functions take a committed scene and are safe from any threads. A closest hit is the one with
+ * the least t in tmin < t <= tmax; among equal t the triangle that was added first, whichever
+ * function is asked. Directions need not be normalised; t is in units of the direction's length.
+ * Both sides of a triangle are hit. A ray with a NaN, an infinite origin or a zero direction hits
+ * nothing.
+ * ================================================================================================ */
+
+// Flag: neighbouring rays are alike (a camera's, a tile's); they may be traced together. Results
+// do not depend on it.
+#define BK_RAYS_COHERENT 1
+
+// Flag: spread the rays over the device's threads. Without it the calling thread does the work.
+#define BK_RAYS_PARALLEL 2
+
+// The points origin + t direction with tmin < t <= tmax.
+typedef struct bk_ray {
+  float origin[3];
+  float tmin;
+  float direction[3];
+  float tmax;
+} bk_ray;
+
+// What a ray hits. A miss has t = +infinity, u = v = 0, and BK_NONE in the rest.
+typedef struct bk_hit {
+  // Distance in units of the direction's length.
+  float t;
+  // Barycentric weight of the triangle's vertex 1.
+  float u;
+  // Barycentric weight of the triangle's vertex 2.
+  float v;
+  // Number of the triangle in its mesh.
+  uint32_t triangle;
+  // Number of the mesh.
+  uint32_t mesh;
+  // Not used yet: BK_NONE.
+  uint32_t instance;
+} bk_hit;
+
+// The closest hit of one ray. On failure (a scene that is NULL or not committed, a NULL ray) out
+// receives a miss, and bk_last_error the reason.
+BK_API void bk_intersect(const bk_scene *scene, const bk_ray *ray, bk_hit *out);
+
+// Whether anything lies on the ray: 1 or 0. On failure 0, and bk_last_error has the reason.
+BK_API int32_t bk_occluded(const bk_scene *scene, const bk_ray *ray);
+
+// The closest hits of many rays.
+//
+// rays: count rays, aligned to 4 bytes. flags: BK_RAYS_COHERENT, BK_RAYS_PARALLEL. out: receives
+// count hits in the order of the rays; must not overlap them.
+BK_API
+bk_result bk_intersect_many(const bk_scene *scene,
+                            const bk_ray *rays,
+                            size_t count,
+                            uint32_t flags,
+                            bk_hit *out);
+
+// Whether anything lies on each of many rays.
+//
+// rays: count rays, aligned to 4 bytes. flags: BK_RAYS_COHERENT, BK_RAYS_PARALLEL. out: receives
+// count bytes, 1 or 0, in the order of the rays; must not overlap them.
+BK_API
+bk_result bk_occluded_many(const bk_scene *scene,
+                           const bk_ray *rays,
+                           size_t count,
+                           uint32_t flags,
+                           uint8_t *out);
+
+// The closest hits of rays that share an origin, with 0 < t <= tmax. Faster than as many single
+// rays, the more so the more directions there are (32 and up).
+//
+// directions: count directions of three floats, packed, aligned to 4 bytes. flags:
+// BK_RAYS_PARALLEL. out: receives count hits in the order of the directions; must not overlap them.
+BK_API
+bk_result bk_gather(const bk_scene *scene,
+                    const float origin[3],
+                    const float *directions,
+                    size_t count,
+                    float tmax,
+                    uint32_t flags,
+                    bk_hit *out);
+
+/* ================================================================================================
+ * Photon maps
+ *
+ * A photon map is light frozen on surfaces: photons emitted by the lights in proportion to their
+ * power, traced with Russian roulette, and kept where they meet diffuse surfaces. It gives the
+ * irradiance at any point. It is complete when created and never changes; all functions on it are
+ * safe from any threads.
+ * ================================================================================================ */
+
+// Flag: leave out photons that come straight from a light; the map then holds indirect light only.
+#define BK_PHOTONS_INDIRECT_ONLY 1
+
+// A photon map.
+typedef struct bk_photon_map bk_photon_map;
+
+// How to trace photons.
+typedef struct bk_photon_params {
+  // Size of this structure in bytes, set by bk_photon_params_init.
+  uint32_t struct_size;
+  // BK_PHOTONS flags. Default: 0.
+  uint32_t flags;
+  // Photons to emit, >= 1. Default: 1,000,000.
+  uint64_t photon_count;
+  // Most surfaces that a photon meets; 0, the default: Russian roulette alone ends its path.
+  uint32_t max_bounces;
+  // Search radius of the estimate in scene units; 0, the default: from the density of photons.
+  float radius;
+  // Half the height of the search cylinder, as a fraction of the radius. Default: 0.25.
+  float half_height;
+  // Constant of Jensen's cone filter, >= 1; +infinity: no filter. Default: 1.1.
+  float cone_k;
+  // Seed of all random numbers. The same seed gives the same bits on any number of threads.
+  // Default: 0.
+  uint64_t seed;
+  // Bytes that the map may take; 0, the default: no limit.
+  uint64_t memory_budget;
+} bk_photon_params;
+
+// The stored photons, array by array.
+typedef struct bk_photon_view {
+  // Size of this structure in bytes, set by bk_photon_view_init.
+  uint32_t struct_size;
+  // Search radius in use, in scene units.
+  float radius;
+  // Number of stored photons.
+  size_t count;
+  // count times three floats, packed: where it lies.
+  const float *position;
+  // count times three floats, packed: unit direction of travel.
+  const float *direction;
+  // count times three floats, packed: power in W.
+  const float *power;
+} bk_photon_view;
+
+// Fills in the defaults.
+BK_API void bk_photon_params_init(bk_photon_params *params);
+
+// Traces photons through a committed scene, on the device's threads.
+//
+// params: NULL for the defaults. progress, user: told how far it is; NULL if not wanted. out:
+// receives the map, NULL on failure.
+//
+// Fails with BK_ERROR_OUT_OF_MEMORY if the map would not fit into memory_budget.
+BK_API
+bk_result bk_photon_map_create(const bk_scene *scene,
+                               const bk_photon_params *params,
+                               bk_progress_fn progress,
+                               void *user,
+                               bk_photon_map **out);
+
+// Counts one more reference. NULL is ignored.
+BK_API void bk_photon_map_retain(bk_photon_map *map);
+
+// Gives one reference back. NULL is ignored.
+BK_API void bk_photon_map_release(bk_photon_map *map);
+
+// Irradiance (W/m2) at points of surfaces, on the side that the normal points to; the calling
+// thread does the work.
+//
+// positions, normals: count times three floats, packed, aligned to 4 bytes; normals of length 1.
+// out_irradiance_rgb: receives count times three floats, packed; must not overlap the inputs.
+BK_API
+bk_result bk_photon_map_estimate(const bk_photon_map *map,
+                                 const float *positions,
+                                 const float *normals,
+                                 size_t count,
+                                 float *out_irradiance_rgb);
+
+// Sets struct_size and clears the rest.
+BK_API void bk_photon_view_init(bk_photon_view *view);
+
+// Shows the stored photons, without a copy.
+//
+// out: receives pointers that are valid while the map lives. If no photon was stored, count is 0
+// and the pointers must not be read.
+BK_API bk_result bk_photon_map_photons(const bk_photon_map *map, bk_photon_view *out);
+
+/* ================================================================================================
+ * Light maps
+ *
+ * A light map lays the surfaces of a committed scene out on square pages and, once baked, holds
+ * irradiance E (W/m2) per texel: a shader shows albedo / pi * E. Texel (0, 0) is at uv (0, 0);
+ * rows follow v.
+ *
+ * One thread at a time may bake a light map; reads are safe from any threads. A read during a bake,
+ * or a second bake, fails with BK_ERROR_INVALID_STATE.
+ * ================================================================================================ */
+
+// A light map: a layout and, once baked, light.
+typedef struct bk_lightmap bk_lightmap;
+
+// How to lay out a light map.
+typedef struct bk_lightmap_desc {
+  // Size of this structure in bytes, set by bk_lightmap_desc_init.
+  uint32_t struct_size;
+  // Texels per scene unit of what is unwrapped; 0, the default: so that the scene fills about
+  // four pages.
+  float texels_per_unit;
+  // Width and height of a page in texels, 16 to 16384. Default: 1024.
+  uint32_t page_size;
+  // Texels around each chart that filtering may read, >= 1. Default: 2.
+  uint32_t padding;
+  // Light map texels per texel of the gather map (indirect light), along each axis, >= 1.
+  // Default: 4.
+  uint32_t gather_divisor;
+  // Light map texels per texel of the radiance map (what gather rays see), along each axis, >= 1.
+  // Default: 8.
+  uint32_t radiance_divisor;
+} bk_lightmap_desc;
+
+// Numbers about a light map's layout.
+struct bk_lightmap_info {
+  // Size of this structure in bytes, set by bk_lightmap_info_init.
+  uint32_t struct_size;
+  // Number of pages.
+  uint32_t page_count;
+  // Width of each page in texels.
+  uint32_t width;
+  // Height of each page in texels.
+  uint32_t height;
+  // Charts: pieces of surface that are flat in the light map.
+  uint32_t charts;
+  // Of those, taken from the caller's coordinates.
+  uint32_t given_charts;
+  // Of those, made by unwrapping.
+  uint32_t unwrapped_charts;
+  // Of those, reduced in density to fit a page.
+  uint32_t reduced_charts;
+  // Texels that a triangle covers: the range of texel_begin and texel_end of a bake.
+  uint64_t texels;
+  // Texels of the gather map.
+  uint64_t gather_texels;
+  // Texels of the radiance map.
+  uint64_t radiance_texels;
+  // Bytes held.
+  uint64_t bytes;
+  // Triangles whose given coordinates lie outside [0, 1]; they were unwrapped.
+  uint64_t uv_out_of_range;
+  // Triangles with an area in space whose given coordinates have none; they were unwrapped.
+  uint64_t uv_degenerate;
+  // Texels whose centre is covered by several triangles of given coordinates.
+  uint64_t uv_overlapping_texels;
+  // Time of unwrapping, in seconds.
+  double unwrap_seconds;
+  // Texels per scene unit in use.
+  float texels_per_unit;
+  // Not used yet.
+  uint32_t reserved;
+};
+
+// Fills in the defaults.
+BK_API void bk_lightmap_desc_init(bk_lightmap_desc *desc);
+
+// Lays out a light map of a committed scene: meshes with light map coordinates keep them, the
+// others are unwrapped, texels are mapped to triangles. Runs on the device's threads.
+//
+// scene: kept alive by the light map. desc: NULL for the defaults. progress, user: told how far it
+// is; NULL if not wanted. out: receives the light map, NULL on failure.
+//
+// Fails with BK_ERROR_OUT_OF_MEMORY if so many texels do not fit, or the memory callback refuses.
+BK_API
+bk_result bk_lightmap_create(const bk_scene *scene,
+                             const bk_lightmap_desc *desc,
+                             bk_progress_fn progress,
+                             void *user,
+                             bk_lightmap **out);
+
+// Counts one more reference. NULL is ignored.
+BK_API void bk_lightmap_retain(bk_lightmap *lightmap);
+
+// Gives one reference back. NULL is ignored.
+BK_API void bk_lightmap_release(bk_lightmap *lightmap);
+
+// Sets struct_size and clears the rest.
+BK_API void bk_lightmap_info_init(struct bk_lightmap_info *info);
+
+// Numbers about the layout. (The structure shares the function's name, so it is always written
+// with `struct`.)
+BK_API bk_result bk_lightmap_info(const bk_lightmap *lightmap, struct bk_lightmap_info *out);
+
+// Where the triangles of a mesh lie in the light map.
+//
+// out_corner_uvs: receives u and v in [0, 1] of each corner, 3 * triangles * 2 floats, aligned to 4
+// bytes; NULL if not wanted. out_page_per_triangle: receives triangles page numbers, BK_NONE for
+// triangles without texels; NULL if not wanted.
+BK_API
+bk_result bk_lightmap_mesh_uvs(const bk_lightmap *lightmap,
+                               uint32_t mesh,
+                               float *out_corner_uvs,
+                               uint32_t *out_page_per_triangle);
+
+/* ================================================================================================
+ * Baking
+ *
+ * A bake fills a light map with light: photons, radiance map, gather map (indirect light), direct
+ * light, composition. What the scene does not need is not run.
+ * ================================================================================================ */
+
+// How to bake.
+typedef struct bk_bake_params {
+  // Size of this structure in bytes, set by bk_bake_params_init.
+  uint32_t struct_size;
+  // Most surfaces that a photon meets; 0, the default: Russian roulette alone ends its path.
+  uint32_t max_bounces;
+  // Photons to emit. Default: 1,000,000.
+  uint64_t photon_count;
+  // Rays per texel of the gather map; 0: no indirect light. Default: 64.
+  uint32_t gather_rays;
+  // Photon search radius in scene units; 0, the default: from the density of photons.
+  float radius;
+  // Radius of the gather map's blur in its texels; 0: none. Default: 2.
+  uint32_t blur_radius;
+  // Shadow rays per light map texel and area light, >= 1. Default: 16.
+  uint32_t direct_samples;
+  // Seed of all random numbers. The same seed gives the same bits on any number of threads.
+  // Default: 0.
+  uint64_t seed;
+  // Bytes that the bake may take in addition to scene and light map; 0, the default: no limit.
+  uint64_t memory_budget;
+  // First covered texel to bake, for spreading a bake over several runs. Default: 0.
+  uint64_t texel_begin;
+  // One behind the last covered texel to bake; 0, the default: all.
+  uint64_t texel_end;
+} bk_bake_params;
+
+// What one stage of a bake took.
+typedef struct bk_stage_stats {
+  // Time, in seconds.
+  double seconds;
+  // Rays traced.
+  uint64_t rays;
+  // Bytes of its buffers.
+  uint64_t bytes;
+} bk_stage_stats;
+
+// What a bake did.
+typedef struct bk_bake_stats {
+  // Size of this structure in bytes, set by bk_bake_stats_init.
+  uint32_t struct_size;
+  // BK_LEFT_OUT bits: what the plan found unnecessary.
+  uint32_t left_out;
+  // Time of the whole bake, in seconds.
+  double seconds;
+  // The most bytes held at once on the device, scene and light map included.
+  uint64_t peak_bytes;
+  // Photons emitted.
+  uint64_t photons_emitted;
+  // Photons stored on surfaces.
+  uint64_t photons_stored;
+  // Tracing and sorting photons.
+  bk_stage_stats photons;
+  // The radiance map: outgoing radiance from the photons.
+  bk_stage_stats radiance;
+  // The gather map: indirect light.
+  bk_stage_stats gather;
+  // Direct light with shadow rays.
+  bk_stage_stats direct;
+  // Filtering and composition.
+  bk_stage_stats compose;
+} bk_bake_stats;
+
+// Fills in the defaults.
+BK_API void bk_bake_params_init(bk_bake_params *params);
+
+// Sets struct_size and clears the rest.
+BK_API void bk_bake_stats_init(bk_bake_stats *stats);
+
+// Computes the light of all texels, or of the given range, on the device's threads. May be called
+// again, with other lights or parameters.
+//
+// params: NULL for the defaults. progress, user: told how far it is; NULL if not wanted. out: what
+// was done; NULL if not wanted.
+//
+// Fails with BK_ERROR_OUT_OF_MEMORY if memory_budget is exceeded or the memory callback refuses. A
+// bake that fails or is cancelled keeps what was baked before, and can be repeated.
+BK_API
+bk_result bk_bake(bk_lightmap *lightmap,
+                  const bk_bake_params *params,
+                  bk_progress_fn progress,
+                  void *user,
+                  bk_bake_stats *out);
+
+// Describes in words what a bake of this light map runs, and what it leaves out and why.
+//
+// dst: receives as much of the text (UTF-8) as fits, with a NUL; may be NULL if capacity is 0.
+// capacity: bytes that dst has room for.
+//
+// Returns the length of the whole text without its NUL, whatever the capacity; 0 on failure.
+BK_API size_t bk_plan_describe(const bk_lightmap *lightmap, char *dst, size_t capacity);
+
+/* ================================================================================================
+ * Reading and saving light maps
+ * ================================================================================================ */
+
+// Irradiance, direct and indirect, in W/m2. RGB: BK_FORMAT_RGB32F or BK_FORMAT_RGBA16F.
+#define BK_LAYER_COMBINED 0
+
+// Irradiance by way of other surfaces, in W/m2. RGB.
+#define BK_LAYER_INDIRECT 1
+
+// Irradiance straight from lights, in W/m2. RGB.
+#define BK_LAYER_DIRECT 2
+
+// Outgoing radiance as gather rays see it, in W/(m2 sr). RGB.
+#define BK_LAYER_RADIANCE 3
+
+// 1 for a texel that a triangle covers, 0.5 for one filled from its neighbours, 0 for an empty one.
+// BK_FORMAT_R32F.
+#define BK_LAYER_VALIDITY 4
+
+// Position of the texel's sample in the scene. RGB.
+#define BK_LAYER_POSITION 5
+
+// Unit normal of the texel's sample. RGB.
+#define BK_LAYER_NORMAL 6
+
+// Number of the triangle that covers the texel, counted through all meshes in their order; BK_NONE
+// where there is none. BK_FORMAT_R32U.
+#define BK_LAYER_TRIANGLE 7
+
+// Three floats: 12 bytes per texel.
+#define BK_FORMAT_RGB32F 1
+
+// Four half floats: 8 bytes per texel. Alpha is 1; values beyond 65504 are clamped to it.
+#define BK_FORMAT_RGBA16F 2
+
+// One float: 4 bytes per texel.
+#define BK_FORMAT_R32F 3
+
+// One uint32_t: 4 bytes per texel.
+#define BK_FORMAT_R32U 4
+
+// Float images, one EXR file per page and layer.
+#define BK_FILE_EXR 1
+
+// Tone-mapped 8-bit images to look at, one PNG file per page and layer.
+#define BK_FILE_PNG 2
+
+// The scene with the light map as second texture, one GLB file for any viewer.
+#define BK_FILE_GLB 3
+
+// Copies one layer of one page.
+//
+// layer: one of the BK_LAYER values; those that hold light need a bake (BK_ERROR_INVALID_STATE
+// before). format: one of the BK_FORMAT values that suits the layer, as said there. dst: receives
+// height rows, row_stride bytes apart, of width texels; needs no alignment. row_stride: at least
+// the bytes of a row of texels; 0: just that many.
+BK_API
+bk_result bk_lightmap_read(const bk_lightmap *lightmap,
+                           uint32_t page,
+                           uint32_t layer,
+                           uint32_t format,
+                           void *dst,
+                           size_t row_stride);
+
+// Writes a baked light map to files.
+//
+// path_prefix: UTF-8; the names of the files are this followed by page, layer and extension.
+// file_format: one of the BK_FILE values.
+//
+// Fails with BK_ERROR_IO, naming the file, if it cannot be written, with BK_ERROR_INVALID_STATE
+// before a bake, with BK_ERROR_UNSUPPORTED if the library was built without files.
+BK_API bk_result bk_lightmap_save(const bk_lightmap *lightmap, const char *path_prefix, uint32_t file_format);
+
+#ifdef __cplusplus
+} /* extern "C" */
+#endif
+
+#endif /* BAKELITE_H */

@@ -1,0 +1,193 @@
+//! Baking
+//!
+//! A bake fills a light map with light: photons, radiance map, gather map (indirect light), direct
+//! light, composition. What the scene does not need is not run.
+
+use super::args::{OutStruct, SizedStruct, init, read_struct, sized_struct, slice_mut};
+use super::device::{bk_progress_fn, progress};
+use super::error::{bk_result, call, call_or};
+use super::handles::{hold, object};
+use super::lightmap::bk_lightmap;
+use crate::lightmap::{BakeParams, BakeStats, StageStats};
+use std::ffi::{c_char, c_void};
+
+/// How to bake.
+#[repr(C)]
+#[derive(Clone, Copy)]
+pub struct bk_bake_params {
+    /// Size of this structure in bytes, set by bk_bake_params_init.
+    pub struct_size: u32,
+    /// Most surfaces that a photon meets; 0, the default: Russian roulette alone ends its path.
+    pub max_bounces: u32,
+    /// Photons to emit. Default: 1,000,000.
+    pub photon_count: u64,
+    /// Rays per texel of the gather map; 0: no indirect light. Default: 64.
+    pub gather_rays: u32,
+    /// Photon search radius in scene units; 0, the default: from the density of photons.
+    pub radius: f32,
+    /// Radius of the gather map's blur in its texels; 0: none. Default: 2.
+    pub blur_radius: u32,
+    /// Shadow rays per light map texel and area light, >= 1. Default: 16.
+    pub direct_samples: u32,
+    /// Seed of all random numbers. The same seed gives the same bits on any number of threads.
+    /// Default: 0.
+    pub seed: u64,
+    /// Bytes that the bake may take in addition to scene and light map; 0, the default: no limit.
+    pub memory_budget: u64,
+    /// First covered texel to bake, for spreading a bake over several runs. Default: 0.
+    pub texel_begin: u64,
+    /// One behind the last covered texel to bake; 0, the default: all.
+    pub texel_end: u64,
+}
+
+sized_struct!(bk_bake_params, last: texel_end: u64, defaults: {
+    let p = BakeParams::default();
+    bk_bake_params {
+        struct_size: size_of::<bk_bake_params>() as u32,
+        max_bounces: p.max_bounces,
+        photon_count: p.photon_count,
+        gather_rays: p.gather_rays,
+        radius: p.radius,
+        blur_radius: p.blur_radius,
+        direct_samples: p.direct_samples,
+        seed: p.seed,
+        memory_budget: p.memory_budget,
+        texel_begin: p.texel_begin,
+        texel_end: p.texel_end,
+    }
+});
+
+/// Fills in the defaults.
+#[unsafe(no_mangle)]
+pub unsafe extern "C" fn bk_bake_params_init(params: *mut bk_bake_params) {
+    // SAFETY: the caller's structure, or NULL.
+    unsafe { init(params) }
+}
+
+/// What one stage of a bake took.
+#[repr(C)]
+#[derive(Clone, Copy)]
+pub struct bk_stage_stats {
+    /// Time, in seconds.
+    pub seconds: f64,
+    /// Rays traced.
+    pub rays: u64,
+    /// Bytes of its buffers.
+    pub bytes: u64,
+}
+
+/// What a bake did.
+#[repr(C)]
+#[derive(Clone, Copy)]
+pub struct bk_bake_stats {
+    /// Size of this structure in bytes, set by bk_bake_stats_init.
+    pub struct_size: u32,
+    /// BK_LEFT_OUT bits: what the plan found unnecessary.
+    pub left_out: u32,
+    /// Time of the whole bake, in seconds.
+    pub seconds: f64,
+    /// The most bytes held at once on the device, scene and light map included.
+    pub peak_bytes: u64,
+    /// Photons emitted.
+    pub photons_emitted: u64,
+    /// Photons stored on surfaces.
+    pub photons_stored: u64,
+    /// Tracing and sorting photons.
+    pub photons: bk_stage_stats,
+    /// The radiance map: outgoing radiance from the photons.
+    pub radiance: bk_stage_stats,
+    /// The gather map: indirect light.
+    pub gather: bk_stage_stats,
+    /// Direct light with shadow rays.
+    pub direct: bk_stage_stats,
+    /// Filtering and composition.
+    pub compose: bk_stage_stats,
+}
+
+sized_struct!(bk_bake_stats, last: compose: bk_stage_stats, defaults: stats(&Default::default()));
+
+fn stats(s: &BakeStats) -> bk_bake_stats {
+    let stage = |s: &StageStats| bk_stage_stats { seconds: s.seconds, rays: s.rays, bytes: s.bytes };
+    bk_bake_stats {
+        struct_size: size_of::<bk_bake_stats>() as u32,
+        left_out: s.left_out,
+        seconds: s.seconds,
+        peak_bytes: s.peak_bytes,
+        photons_emitted: s.photons_emitted,
+        photons_stored: s.photons_stored,
+        photons: stage(&s.photons),
+        radiance: stage(&s.radiance),
+        gather: stage(&s.gather),
+        direct: stage(&s.direct),
+        compose: stage(&s.compose),
+    }
+}
+
+/// Sets struct_size and clears the rest.
+#[unsafe(no_mangle)]
+pub unsafe extern "C" fn bk_bake_stats_init(stats: *mut bk_bake_stats) {
+    // SAFETY: the caller's structure, or NULL.
+    unsafe { init(stats) }
+}
+
+/// Computes the light of all texels, or of the given range, on the device's threads. May be called
+/// again, with other lights or parameters.
+///
+/// params: NULL for the defaults. progress, user: told how far it is; NULL if not wanted. out: what
+/// was done; NULL if not wanted.
+///
+/// Fails with BK_ERROR_OUT_OF_MEMORY if memory_budget is exceeded or the memory callback refuses. A
+/// bake that fails or is cancelled keeps what was baked before, and can be repeated.
+#[unsafe(no_mangle)]
+pub unsafe extern "C" fn bk_bake(
+    lightmap: *mut bk_lightmap,
+    params: *const bk_bake_params,
+    progress: bk_progress_fn,
+    user: *mut c_void,
+    out: *mut bk_bake_stats,
+) -> bk_result {
+    // SAFETY: params and out are the caller's, or NULL.
+    call(|| unsafe {
+        let lightmap = hold(lightmap, "lightmap")?;
+        let p: bk_bake_params = if params.is_null() { SizedStruct::defaults() } else { read_struct(params, "params")? };
+        let out = OutStruct::optional(out, "out")?;
+        let params = BakeParams {
+            photon_count: p.photon_count,
+            max_bounces: p.max_bounces,
+            gather_rays: p.gather_rays,
+            radius: p.radius,
+            blur_radius: p.blur_radius,
+            direct_samples: p.direct_samples,
+            seed: p.seed,
+            memory_budget: p.memory_budget,
+            texel_begin: p.texel_begin,
+            texel_end: p.texel_end,
+        };
+        let done = lightmap.change(|l| l.bake(&params, &self::progress(progress, user)))?;
+        if let Some(out) = out {
+            out.write(stats(&done));
+        }
+        Ok(())
+    })
+}
+
+/// Describes in words what a bake of this light map runs, and what it leaves out and why.
+///
+/// dst: receives as much of the text (UTF-8) as fits, with a NUL; may be NULL if capacity is 0.
+/// capacity: bytes that dst has room for.
+///
+/// Returns the length of the whole text without its NUL, whatever the capacity; 0 on failure.
+#[unsafe(no_mangle)]
+pub unsafe extern "C" fn bk_plan_describe(lightmap: *const bk_lightmap, dst: *mut c_char, capacity: usize) -> usize {
+    // SAFETY: dst is the caller's, or NULL.
+    call_or(0, || unsafe {
+        let plan = object!(lightmap).read(|l| Ok(l.plan_text()))?;
+        let dst = slice_mut(dst.cast::<u8>(), capacity, "dst", &[])?;
+        if let Some(room) = capacity.checked_sub(1) {
+            let fits = plan.floor_char_boundary(room);
+            dst[..fits].copy_from_slice(&plan.as_bytes()[..fits]);
+            dst[fits] = 0;
+        }
+        Ok(plan.len())
+    })
+}

@@ -1,0 +1,185 @@
+//! Devices and callbacks
+//!
+//! A device owns worker threads, the choice of instruction set, the log and the memory accounts.
+//!
+//! Handles (bk_device, bk_scene, bk_photon_map, bk_lightmap) are opaque and reference-counted: a
+//! create function hands out one reference, bk_..._retain adds one, bk_..._release gives one back,
+//! and NULL is ignored by both. What is made from an object keeps what it needs of it alive, so
+//! parents may be released first. Retaining and releasing is safe from any thread.
+//!
+//! Callbacks may run on any thread, must not throw or jump out, and may call the library, though
+//! not change (or release for good) the object whose call they are in: that is
+//! BK_ERROR_INVALID_STATE. Strings given to them are valid during the callback only.
+
+use super::args::{UserPointer, check_flags, init, read_struct, sized_struct, write};
+use super::error::{bk_result, c_string, call, call_or};
+use super::handles::{create, object, release, retain};
+use crate::device::{Device, DeviceOptions};
+use crate::error::{Result, invalid_argument};
+use crate::progress::Progress;
+use crate::simd::Isa;
+use std::ffi::{c_char, c_void};
+use std::sync::Arc;
+
+/// The best instruction set that the machine has.
+pub const BK_ISA_AUTO: u32 = 0;
+/// The baseline of the target: SSE2 on x86-64, NEON on AArch64.
+pub const BK_ISA_PORTABLE: u32 = 1;
+/// AVX2 with FMA.
+pub const BK_ISA_AVX2: u32 = 2;
+/// AVX-512 F, VL, DQ and BW.
+pub const BK_ISA_AVX512: u32 = 3;
+
+/// Log level: something failed that no result reports.
+pub const BK_LOG_ERROR: u32 = 0;
+/// Log level: something about the input or the run deserves attention, as skipped triangles.
+pub const BK_LOG_WARNING: u32 = 1;
+/// Log level: what is going on.
+pub const BK_LOG_INFO: u32 = 2;
+
+/// Told how far a call is: fraction in [0, 1], never falling, and the name of the stage, as
+/// "gather". Called by one thread at a time, about every 10 ms and at least once per stage. Return
+/// 0 to cancel: the call then ends soon with BK_ERROR_CANCELLED. NULL is allowed wherever one is
+/// taken.
+pub type bk_progress_fn = Option<unsafe extern "C" fn(user: *mut c_void, fraction: f32, stage: *const c_char) -> i32>;
+
+/// Receives log messages (UTF-8) with one of the BK_LOG levels, from any thread, several at a time.
+pub type bk_log_fn = Option<unsafe extern "C" fn(user: *mut c_void, level: u32, message: *const c_char)>;
+
+/// Asked before a large allocation, with its size in bytes: return 0 to refuse, and the call that
+/// wanted it ends with BK_ERROR_OUT_OF_MEMORY. Told after a free, with the size negative; the
+/// answer is ignored then. From any thread, several at a time; for the last time when the last
+/// object of the device is released.
+pub type bk_memory_fn = Option<unsafe extern "C" fn(user: *mut c_void, bytes: i64) -> i32>;
+
+/// Worker threads, instruction set, log and memory accounts. All functions on a device are safe
+/// from any thread.
+pub struct bk_device {
+    device: Arc<Device>,
+}
+
+impl bk_device {
+    pub(super) fn device(&self) -> &Arc<Device> {
+        &self.device
+    }
+}
+
+/// What to create a device with.
+#[repr(C)]
+#[derive(Clone, Copy)]
+pub struct bk_device_desc {
+    /// Size of this structure in bytes, set by bk_device_desc_init.
+    pub struct_size: u32,
+    /// Worker threads; 0, the default: one per logical core. At most 4096. Results do not depend
+    /// on it.
+    pub num_threads: u32,
+    /// One of the BK_ISA values. Default: BK_ISA_AUTO.
+    pub isa: u32,
+    /// None are defined yet: 0.
+    pub flags: u32,
+    /// Receives log messages. Default: NULL.
+    pub log: bk_log_fn,
+    /// Asked before large allocations. Default: NULL.
+    pub memory: bk_memory_fn,
+    /// Handed to log and memory; must outlive the device and all that was made from it.
+    pub user: *mut c_void,
+}
+
+sized_struct!(bk_device_desc, last: user: *mut c_void, defaults: bk_device_desc {
+    struct_size: size_of::<bk_device_desc>() as u32,
+    num_threads: 0,
+    isa: BK_ISA_AUTO,
+    flags: 0,
+    log: None,
+    memory: None,
+    user: std::ptr::null_mut(),
+});
+
+/// Fills in the defaults.
+#[unsafe(no_mangle)]
+pub unsafe extern "C" fn bk_device_desc_init(desc: *mut bk_device_desc) {
+    // SAFETY: the caller's structure, or NULL.
+    unsafe { init(desc) }
+}
+
+/// Starts a device.
+///
+/// desc: NULL for the defaults. out: receives the device, NULL on failure.
+///
+/// Fails with BK_ERROR_UNSUPPORTED if the machine lacks the instruction set asked for, with
+/// BK_ERROR_OUT_OF_MEMORY if the threads cannot be started.
+#[unsafe(no_mangle)]
+pub unsafe extern "C" fn bk_device_create(desc: *const bk_device_desc, out: *mut *mut bk_device) -> bk_result {
+    // SAFETY: desc and out are the caller's, or NULL.
+    call(|| unsafe {
+        write(out, std::ptr::null_mut(), "out")?;
+        let options = if desc.is_null() { DeviceOptions::default() } else { options(read_struct(desc, "desc")?)? };
+        write(out, create(bk_device { device: Device::new(options)? }), "out")
+    })
+}
+
+/// Counts one more reference. NULL is ignored.
+#[unsafe(no_mangle)]
+pub unsafe extern "C" fn bk_device_retain(device: *mut bk_device) {
+    // SAFETY: a handle or NULL.
+    unsafe { retain(device) }
+}
+
+/// Gives one reference back. When the last is given back, of the device and of all that was made
+/// from it, its threads are joined. NULL is ignored.
+#[unsafe(no_mangle)]
+pub unsafe extern "C" fn bk_device_release(device: *mut bk_device) {
+    // SAFETY: a handle whose reference the caller gives up, or NULL.
+    call_or((), || unsafe {
+        release(device);
+        Ok(())
+    })
+}
+
+/// The instruction set in use: a BK_ISA value other than BK_ISA_AUTO; BK_ISA_AUTO if device is NULL.
+#[unsafe(no_mangle)]
+pub unsafe extern "C" fn bk_device_isa(device: *const bk_device) -> u32 {
+    call_or(BK_ISA_AUTO, || Ok(object!(device).device.isa() as u32))
+}
+
+/// The number of worker threads; 0 if device is NULL.
+#[unsafe(no_mangle)]
+pub unsafe extern "C" fn bk_device_num_threads(device: *const bk_device) -> u32 {
+    call_or(0, || Ok(object!(device).device.num_threads() as u32))
+}
+
+fn options(desc: bk_device_desc) -> Result<DeviceOptions> {
+    check_flags(desc.flags, 0, "flags")?;
+    let isa = match desc.isa {
+        BK_ISA_AUTO => None,
+        BK_ISA_PORTABLE => Some(Isa::Portable),
+        BK_ISA_AVX2 => Some(Isa::Avx2),
+        BK_ISA_AVX512 => Some(Isa::Avx512),
+        other => return invalid_argument!("isa is {other}, not one of the BK_ISA values"),
+    };
+    let user = UserPointer::new(desc.user);
+    let mut options = DeviceOptions { num_threads: desc.num_threads as usize, isa, ..Default::default() };
+    if let Some(log) = desc.log {
+        options.log = Some(Box::new(move |level, message| {
+            // SAFETY: the caller's function, with its own pointer, as documented.
+            unsafe { log(user.get(), level as u32, c_string(message).as_ptr()) }
+        }));
+    }
+    if let Some(memory) = desc.memory {
+        // SAFETY: as above.
+        options.memory = Some(Box::new(move |bytes| unsafe { memory(user.get(), bytes) != 0 }));
+    }
+    Ok(options)
+}
+
+/// The progress of one call, reported to the caller's function.
+pub(super) fn progress<'a>(callback: bk_progress_fn, user: *mut c_void) -> Progress<'a> {
+    let user = UserPointer::new(user);
+    match callback {
+        None => Progress::none(),
+        Some(callback) => Progress::new(move |fraction, stage| {
+            // SAFETY: the caller's function, with its own pointer, as documented.
+            unsafe { callback(user.get(), fraction, c_string(stage).as_ptr()) != 0 }
+        }),
+    }
+}

@@ -1,0 +1,194 @@
+//! Results and version
+//!
+//! Functions that can fail return a `bk_result`: BK_OK, or a negative code. The sentence that names
+//! the argument and the value at fault is then in `bk_last_error()`. A call that fails changes
+//! nothing unless its description says so; every object can be used as before.
+//!
+//! Enums and flags travel as uint32_t constants. Values and flags that are not listed are refused.
+//!
+//! Every structure whose name ends in _desc, _params, _info, _stats or _view starts with
+//! `uint32_t struct_size`. Its `bk_..._init(&x)` function sets that size and fills in the defaults.
+//! Programs compiled against an older, shorter version of a structure keep working: the missing
+//! fields of an input get their defaults, and an output is written as far as it reaches. A size of
+//! 0, or larger than this library knows, is BK_ERROR_INVALID_ARGUMENT.
+
+use crate::error::{Error, Result};
+use std::any::Any;
+use std::cell::RefCell;
+use std::ffi::{CStr, CString, c_char};
+use std::panic::{AssertUnwindSafe, catch_unwind};
+
+/// Major version: programs must be recompiled when it changes.
+pub const BK_VERSION_MAJOR: u32 = 0;
+/// Minor version: functions and fields were added.
+pub const BK_VERSION_MINOR: u32 = 1;
+/// Patch version: only behaviour was mended.
+pub const BK_VERSION_PATCH: u32 = 0;
+/// The version of this header: major << 16 | minor << 8 | patch.
+pub const BK_VERSION: u32 = BK_VERSION_MAJOR << 16 | BK_VERSION_MINOR << 8 | BK_VERSION_PATCH;
+
+/// "None" where an index is expected or reported.
+pub const BK_NONE: u32 = 0xffff_ffff;
+
+/// What became of a call: BK_OK, or one of the negative BK_ERROR codes.
+pub type bk_result = i32;
+
+/// All went well.
+pub const BK_OK: bk_result = 0;
+/// An argument is NULL or out of its documented range.
+pub const BK_ERROR_INVALID_ARGUMENT: bk_result = -1;
+/// The call is not allowed in the object's present state, or while another thread changes it.
+pub const BK_ERROR_INVALID_STATE: bk_result = -2;
+/// Memory ran out, or a memory budget or the memory callback refused.
+pub const BK_ERROR_OUT_OF_MEMORY: bk_result = -3;
+/// The progress callback returned 0.
+pub const BK_ERROR_CANCELLED: bk_result = -4;
+/// This build or this machine cannot do it.
+pub const BK_ERROR_UNSUPPORTED: bk_result = -5;
+/// A file could not be read or written, or its content is malformed.
+pub const BK_ERROR_IO: bk_result = -6;
+/// A bug in the library, caught before it reached the caller.
+pub const BK_ERROR_INTERNAL: bk_result = -7;
+
+/// The version of the library in use, to compare with BK_VERSION.
+#[unsafe(no_mangle)]
+pub extern "C" fn bk_version() -> u32 {
+    BK_VERSION
+}
+
+/// The name of a result, as "BK_OK"; "unknown bk_result" for a value that is none. Never NULL; the
+/// string is constant.
+#[unsafe(no_mangle)]
+pub extern "C" fn bk_result_string(result: bk_result) -> *const c_char {
+    let name: &CStr = match result {
+        BK_OK => c"BK_OK",
+        BK_ERROR_INVALID_ARGUMENT => c"BK_ERROR_INVALID_ARGUMENT",
+        BK_ERROR_INVALID_STATE => c"BK_ERROR_INVALID_STATE",
+        BK_ERROR_OUT_OF_MEMORY => c"BK_ERROR_OUT_OF_MEMORY",
+        BK_ERROR_CANCELLED => c"BK_ERROR_CANCELLED",
+        BK_ERROR_UNSUPPORTED => c"BK_ERROR_UNSUPPORTED",
+        BK_ERROR_IO => c"BK_ERROR_IO",
+        BK_ERROR_INTERNAL => c"BK_ERROR_INTERNAL",
+        _ => c"unknown bk_result",
+    };
+    name.as_ptr()
+}
+
+/// What went wrong in the last call of the calling thread that failed: one UTF-8 sentence that names
+/// the argument and the value at fault; empty if none failed yet. Never NULL; valid until the
+/// thread's next call into the library. Functions without a bk_result (as bk_intersect) leave their
+/// failures here too; a call that succeeds leaves the text alone.
+#[unsafe(no_mangle)]
+pub extern "C" fn bk_last_error() -> *const c_char {
+    // During a thread's destruction the slot may be gone.
+    LAST_ERROR.try_with(|e| e.borrow().as_ptr()).unwrap_or(c"".as_ptr())
+}
+
+thread_local! {
+    static LAST_ERROR: RefCell<CString> = RefCell::default();
+}
+
+/// Runs the body of an entry point: what it panics with is caught, what it fails with is kept for
+/// `bk_last_error`.
+pub(super) fn call(body: impl FnOnce() -> Result<()>) -> bk_result {
+    match catch(body) {
+        Ok(()) => BK_OK,
+        Err(e) => {
+            let result = code(&e);
+            remember(&e);
+            result
+        }
+    }
+}
+
+/// As [`call`], for entry points that return a value: `fallback` on failure.
+#[inline]
+pub(super) fn call_or<T>(fallback: T, body: impl FnOnce() -> Result<T>) -> T {
+    match catch(body) {
+        Ok(value) => value,
+        Err(e) => {
+            remember(&e);
+            fallback
+        }
+    }
+}
+
+/// Nothing that a panic may leave half changed is reachable afterwards: the locks of handles are
+/// poisoned then, and refuse.
+#[inline]
+fn catch<T>(body: impl FnOnce() -> Result<T>) -> Result<T> {
+    catch_unwind(AssertUnwindSafe(body)).unwrap_or_else(|payload| Err(Error::Internal(panic_text(&*payload))))
+}
+
+fn panic_text(payload: &(dyn Any + Send)) -> String {
+    let text = payload.downcast_ref::<&str>().copied().or(payload.downcast_ref::<String>().map(String::as_str));
+    format!("a panic was caught: {}", text.unwrap_or("no message"))
+}
+
+#[cold]
+fn remember(e: &Error) {
+    let text = c_string(&e.to_string());
+    let _ = LAST_ERROR.try_with(|slot| *slot.borrow_mut() = text);
+}
+
+/// A C string; a NUL inside (a path from a file may hold anything) is shown as U+FFFD.
+pub(super) fn c_string(text: &str) -> CString {
+    CString::new(text.replace('\0', "\u{fffd}")).unwrap_or_default()
+}
+
+fn code(e: &Error) -> bk_result {
+    match e {
+        Error::InvalidArgument(_) => BK_ERROR_INVALID_ARGUMENT,
+        Error::InvalidState(_) => BK_ERROR_INVALID_STATE,
+        Error::OutOfMemory(_) => BK_ERROR_OUT_OF_MEMORY,
+        Error::Cancelled => BK_ERROR_CANCELLED,
+        Error::Unsupported(_) => BK_ERROR_UNSUPPORTED,
+        Error::Io(_) => BK_ERROR_IO,
+        Error::Internal(_) => BK_ERROR_INTERNAL,
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    fn last_error() -> String {
+        // SAFETY: the pointer is never NULL and read before this thread's next call.
+        unsafe { CStr::from_ptr(bk_last_error()) }.to_str().unwrap().to_string()
+    }
+
+    #[test]
+    fn the_header_carries_the_crate_version() {
+        assert_eq!(
+            format!("{BK_VERSION_MAJOR}.{BK_VERSION_MINOR}.{BK_VERSION_PATCH}"),
+            env!("CARGO_PKG_VERSION"),
+            "update the BK_VERSION constants"
+        );
+        assert_eq!(bk_version(), BK_VERSION);
+    }
+
+    #[test]
+    fn a_panic_becomes_an_internal_error_with_its_message() {
+        assert_eq!(call(|| panic!("node {} is missing", 7)), BK_ERROR_INTERNAL);
+        assert_eq!(last_error(), "internal error: a panic was caught: node 7 is missing");
+        assert_eq!(call_or(5, || panic!("plain")), 5);
+        assert!(last_error().ends_with("plain"));
+    }
+
+    #[test]
+    fn the_last_error_survives_success_and_stays_in_its_thread() {
+        assert_eq!(call(|| Err(Error::Io("no such file: a\0b".into()))), BK_ERROR_IO);
+        assert_eq!(call(|| Ok(())), BK_OK);
+        assert_eq!(last_error(), "input/output: no such file: a\u{fffd}b");
+        std::thread::spawn(|| assert_eq!(last_error(), "")).join().unwrap();
+    }
+
+    #[test]
+    fn every_code_has_its_name() {
+        for result in BK_ERROR_INTERNAL..=BK_OK {
+            // SAFETY: the pointer is never NULL and the string is constant.
+            let name = unsafe { CStr::from_ptr(bk_result_string(result)) };
+            assert!(name.to_str().unwrap().starts_with("BK_"), "{result}");
+        }
+    }
+}

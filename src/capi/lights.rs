@@ -1,0 +1,124 @@
+//! Lights
+//!
+//! Added to a scene before its commit, changed at any time. Emissive materials make lights too.
+
+use super::args::{init, read_struct, sized_struct, write_optional};
+use super::error::{bk_result, call, call_or};
+use super::handles::object;
+use super::scene::bk_scene;
+use crate::error::{Result, invalid_argument};
+use crate::scene::Light;
+use glam::Vec3;
+
+/// Radiates from a position equally in all directions. color: radiant intensity in W/sr.
+pub const BK_LIGHT_POINT: u32 = 1;
+/// Radiates from a position in a cone around direction: fully up to cone_inner radians from it, not
+/// at all beyond cone_outer, smoothly in between. color: radiant intensity on the axis in W/sr.
+pub const BK_LIGHT_SPOT: u32 = 2;
+/// Parallel light that travels along direction. color: irradiance on a perpendicular plane in W/m2.
+pub const BK_LIGHT_DIRECTIONAL: u32 = 3;
+/// A parallelogram with a corner at position and the edges edge_u and edge_v, which radiates from
+/// the side that edge_u x edge_v points to. color: radiance in W/(m2 sr). Rays do not hit it.
+pub const BK_LIGHT_RECT: u32 = 4;
+
+/// A light. Fields that its type does not use are ignored.
+#[repr(C)]
+#[derive(Clone, Copy)]
+pub struct bk_light_desc {
+    /// Size of this structure in bytes, set by bk_light_desc_init.
+    pub struct_size: u32,
+    /// One of the BK_LIGHT values. Default: BK_LIGHT_POINT.
+    pub r#type: u32,
+    /// Point, spot, and a corner of rect. Default: 0.
+    pub position: [f32; 3],
+    /// Spot and directional: where the light travels, of any length but 0. Default: 0, to be set.
+    pub direction: [f32; 3],
+    /// Rect: an edge. Default: 0, to be set.
+    pub edge_u: [f32; 3],
+    /// Rect: the other edge, not parallel to edge_u. Default: 0, to be set.
+    pub edge_v: [f32; 3],
+    /// Linear RGB, >= 0, in the unit of the type. Default: 1.
+    pub color: [f32; 3],
+    /// Spot: half angle of the cone of full intensity, in radians, in [0, cone_outer]. Default: 0.
+    pub cone_inner: f32,
+    /// Spot: half angle of the whole cone, in radians, in (0, pi]. Default: pi/4.
+    pub cone_outer: f32,
+}
+
+sized_struct!(bk_light_desc, last: cone_outer: f32, defaults: bk_light_desc {
+    struct_size: size_of::<bk_light_desc>() as u32,
+    r#type: BK_LIGHT_POINT,
+    position: [0.0; 3],
+    direction: [0.0; 3],
+    edge_u: [0.0; 3],
+    edge_v: [0.0; 3],
+    color: [1.0; 3],
+    cone_inner: 0.0,
+    cone_outer: std::f32::consts::FRAC_PI_4,
+});
+
+/// Fills in the defaults.
+#[unsafe(no_mangle)]
+pub unsafe extern "C" fn bk_light_desc_init(desc: *mut bk_light_desc) {
+    // SAFETY: the caller's structure, or NULL.
+    unsafe { init(desc) }
+}
+
+/// Adds a light.
+///
+/// out_id: receives its number; NULL if not wanted. Numbers count up from 0 in the order of
+/// addition.
+#[unsafe(no_mangle)]
+pub unsafe extern "C" fn bk_scene_add_light(
+    scene: *mut bk_scene,
+    desc: *const bk_light_desc,
+    out_id: *mut u32,
+) -> bk_result {
+    // SAFETY: desc and out_id are the caller's, or NULL.
+    call(|| unsafe {
+        let scene = object!(scene);
+        let light = light(&read_struct(desc, "desc")?)?;
+        let id = scene.describe("lights can be added", |d| d.data.add_light(light))?;
+        write_optional(out_id, id)
+    })
+}
+
+/// Replaces light `id`, before or after the commit; its type may change. What is being baked keeps
+/// the lights that it started with.
+#[unsafe(no_mangle)]
+pub unsafe extern "C" fn bk_scene_set_light(scene: *mut bk_scene, id: u32, desc: *const bk_light_desc) -> bk_result {
+    call(|| {
+        let scene = object!(scene);
+        // SAFETY: desc is the caller's, or NULL.
+        let light = light(&unsafe { read_struct(desc, "desc") }?)?;
+        match scene.committed.get() {
+            Some(committed) => committed.set_light(id, light),
+            None => scene.describe("the description can change", |d| d.data.set_light(id, light)),
+        }
+    })
+}
+
+fn light(d: &bk_light_desc) -> Result<Light> {
+    let position = Vec3::from_array(d.position);
+    let direction = Vec3::from_array(d.direction);
+    match d.r#type {
+        BK_LIGHT_POINT => Ok(Light::Point { position, intensity: d.color }),
+        BK_LIGHT_SPOT => {
+            Ok(Light::Spot { position, direction, inner: d.cone_inner, outer: d.cone_outer, intensity: d.color })
+        }
+        BK_LIGHT_DIRECTIONAL => Ok(Light::Directional { direction, irradiance: d.color }),
+        BK_LIGHT_RECT => Ok(Light::Rect {
+            position,
+            edge_u: Vec3::from_array(d.edge_u),
+            edge_v: Vec3::from_array(d.edge_v),
+            radiance: d.color,
+        }),
+        other => invalid_argument!("type is {other}, not one of the BK_LIGHT values"),
+    }
+}
+
+/// The number of lights (emissive materials not counted), committed or not; 0 on failure.
+#[unsafe(no_mangle)]
+pub unsafe extern "C" fn bk_scene_light_count(scene: *const bk_scene) -> u32 {
+    call_or(0, || object!(scene).count(|d| d.lights().len(), |s| s.lights().len()))
+}

@@ -1,0 +1,272 @@
+//! Materials and meshes
+//!
+//! Added to a scene before its commit. A refused addition changes nothing.
+//!
+//! Input arrays are read inside the call only. Strides are in bytes, 0 means packed; neither
+//! alignment nor bytes behind the last element are needed.
+
+use super::args::{
+    OutStruct, SizedStruct, check_flags, init, read_optional, read_strided, read_struct, sized_struct, write_optional,
+};
+use super::error::{bk_result, call, call_or};
+use super::handles::object;
+use super::scene::bk_scene;
+use crate::error::{Result, invalid_argument};
+use crate::scene::{LightmapUvs, Material, Mesh, MeshMaterials};
+use glam::{Vec2, Vec3};
+
+/// Flag: the back side reflects and emits like the front. The back of a one-sided material absorbs
+/// what meets it.
+pub const BK_MATERIAL_TWO_SIDED: u32 = 1;
+
+/// A diffuse material.
+#[repr(C)]
+#[derive(Clone, Copy)]
+pub struct bk_material_desc {
+    /// Size of this structure in bytes, set by bk_material_desc_init.
+    pub struct_size: u32,
+    /// BK_MATERIAL flags. Default: 0.
+    pub flags: u32,
+    /// Diffuse reflectance per channel, in [0, 1). Default: 0.5.
+    pub albedo: [f32; 3],
+    /// Emitted radiance per channel in W/(m2 sr), >= 0. Default: 0.
+    pub emission: [f32; 3],
+}
+
+sized_struct!(bk_material_desc, last: emission: [f32; 3], defaults: {
+    let m = Material::default();
+    bk_material_desc {
+        struct_size: size_of::<bk_material_desc>() as u32,
+        flags: if m.two_sided { BK_MATERIAL_TWO_SIDED } else { 0 },
+        albedo: m.albedo,
+        emission: m.emission,
+    }
+});
+
+/// Fills in the defaults.
+#[unsafe(no_mangle)]
+pub unsafe extern "C" fn bk_material_desc_init(desc: *mut bk_material_desc) {
+    // SAFETY: the caller's structure, or NULL.
+    unsafe { init(desc) }
+}
+
+/// Adds a material.
+///
+/// out_id: receives its number, for meshes; NULL if not wanted. Numbers count up from 0 in the
+/// order of addition.
+#[unsafe(no_mangle)]
+pub unsafe extern "C" fn bk_scene_add_material(
+    scene: *mut bk_scene,
+    desc: *const bk_material_desc,
+    out_id: *mut u32,
+) -> bk_result {
+    call(|| {
+        let scene = object!(scene);
+        // SAFETY: the caller's structure, or NULL.
+        let desc = unsafe { read_struct(desc, "desc") }?;
+        check_flags(desc.flags, BK_MATERIAL_TWO_SIDED, "flags")?;
+        let material = Material {
+            albedo: desc.albedo,
+            emission: desc.emission,
+            two_sided: desc.flags & BK_MATERIAL_TWO_SIDED != 0,
+        };
+        let id = scene.describe("materials can be added", |d| d.data.add_material(material))?;
+        // SAFETY: out_id is the caller's, or NULL.
+        unsafe { write_optional(out_id, id) }
+    })
+}
+
+/// Flag: refuse degenerate triangles and vertices that are not finite, naming the first, rather
+/// than skip and count them.
+pub const BK_MESH_STRICT: u32 = 1;
+
+/// An indexed triangle mesh. The arrays are copied.
+#[repr(C)]
+#[derive(Clone, Copy)]
+pub struct bk_mesh_desc {
+    /// Size of this structure in bytes, set by bk_mesh_desc_init.
+    pub struct_size: u32,
+    /// BK_MESH flags. Default: 0.
+    pub flags: u32,
+    /// vertex_count positions of three floats.
+    pub positions: *const f32,
+    /// Bytes from one position to the next, at least 12; 0: packed.
+    pub position_stride: usize,
+    /// Number of vertices.
+    pub vertex_count: usize,
+    /// Three vertex numbers per triangle, packed, each less than vertex_count.
+    pub indices: *const u32,
+    /// Number of triangles; at most 2^28 in a scene.
+    pub triangle_count: usize,
+    /// Optional: vertex_count shading normals of three floats.
+    pub normals: *const f32,
+    /// Bytes from one normal to the next, at least 12; 0: packed.
+    pub normal_stride: usize,
+    /// Optional: vertex_count texture coordinates of two floats. Kept for files that are saved.
+    pub uvs: *const f32,
+    /// Bytes from one texture coordinate to the next, at least 8; 0: packed.
+    pub uv_stride: usize,
+    /// Optional: vertex_count light map coordinates of two floats, in [0, 1] on a page, no two
+    /// points of a page's triangles at the same place. Without them the mesh is unwrapped.
+    pub lightmap_uvs: *const f32,
+    /// Bytes from one light map coordinate to the next, at least 8; 0: packed.
+    pub lightmap_uv_stride: usize,
+    /// Optional, with lightmap_uvs only: light map page per triangle, packed. NULL: all on page 0.
+    pub lightmap_page: *const u32,
+    /// Optional: material number per triangle, packed. NULL: all have `material`.
+    pub triangle_materials: *const u32,
+    /// Material number of all triangles if triangle_materials is NULL. Default: 0.
+    pub material: u32,
+    /// Not used yet: 0.
+    pub reserved: u32,
+}
+
+sized_struct!(bk_mesh_desc, last: reserved: u32, defaults: bk_mesh_desc {
+    struct_size: size_of::<bk_mesh_desc>() as u32,
+    flags: 0,
+    positions: std::ptr::null(),
+    position_stride: 0,
+    vertex_count: 0,
+    indices: std::ptr::null(),
+    triangle_count: 0,
+    normals: std::ptr::null(),
+    normal_stride: 0,
+    uvs: std::ptr::null(),
+    uv_stride: 0,
+    lightmap_uvs: std::ptr::null(),
+    lightmap_uv_stride: 0,
+    lightmap_page: std::ptr::null(),
+    triangle_materials: std::ptr::null(),
+    material: 0,
+    reserved: 0,
+});
+
+/// Fills in the defaults.
+#[unsafe(no_mangle)]
+pub unsafe extern "C" fn bk_mesh_desc_init(desc: *mut bk_mesh_desc) {
+    // SAFETY: the caller's structure, or NULL.
+    unsafe { init(desc) }
+}
+
+/// Adds a mesh. The materials that it names must have been added before.
+///
+/// out_id: receives its number, as hits report it; NULL if not wanted. Numbers count up from 0 in
+/// the order of addition.
+///
+/// Fails with BK_ERROR_INVALID_ARGUMENT, naming triangle and vertex, if an index or a material is
+/// out of range or BK_MESH_STRICT finds something.
+#[unsafe(no_mangle)]
+pub unsafe extern "C" fn bk_scene_add_mesh(
+    scene: *mut bk_scene,
+    desc: *const bk_mesh_desc,
+    out_id: *mut u32,
+) -> bk_result {
+    // SAFETY: desc, the arrays in it and out_id are the caller's, or NULL.
+    call(|| unsafe {
+        let scene = object!(scene);
+        let mesh = read_mesh(&read_struct(desc, "desc")?)?;
+        let id = scene.describe("meshes can be added", |d| d.data.add_mesh(mesh))?;
+        write_optional(out_id, id)
+    })
+}
+
+/// # Safety
+/// The arrays hold what the description says.
+unsafe fn read_mesh(d: &bk_mesh_desc) -> Result<Mesh> {
+    check_flags(d.flags, BK_MESH_STRICT, "flags")?;
+    check_flags(d.reserved, 0, "reserved")?;
+    let (vertices, triangles) = (d.vertex_count, d.triangle_count);
+    if d.lightmap_uvs.is_null() && !d.lightmap_page.is_null() {
+        return invalid_argument!("lightmap_page is given, but lightmap_uvs is NULL");
+    }
+    // SAFETY: by contract; optional arrays may be NULL.
+    unsafe {
+        Ok(Mesh {
+            positions: read_strided::<Vec3>(d.positions, d.position_stride, vertices, "positions")?,
+            indices: read_strided::<[u32; 3]>(d.indices, 0, triangles, "indices")?,
+            normals: read_optional::<Vec3>(d.normals, d.normal_stride, vertices, "normals")?,
+            uvs: read_optional::<Vec2>(d.uvs, d.uv_stride, vertices, "uvs")?,
+            lightmap: if d.lightmap_uvs.is_null() {
+                None
+            } else {
+                Some(LightmapUvs {
+                    uvs: read_strided::<Vec2>(d.lightmap_uvs, d.lightmap_uv_stride, vertices, "lightmap_uvs")?,
+                    pages: read_optional::<u32>(d.lightmap_page, 0, triangles, "lightmap_page")?,
+                })
+            },
+            materials: if d.triangle_materials.is_null() {
+                MeshMaterials::One(d.material)
+            } else {
+                MeshMaterials::PerTriangle(read_strided(d.triangle_materials, 0, triangles, "triangle_materials")?)
+            },
+            strict: d.flags & BK_MESH_STRICT != 0,
+        })
+    }
+}
+
+/// The number of meshes, committed or not; 0 on failure.
+#[unsafe(no_mangle)]
+pub unsafe extern "C" fn bk_scene_mesh_count(scene: *const bk_scene) -> u32 {
+    call_or(0, || object!(scene).count(|d| d.meshes().len(), |s| s.meshes().len()))
+}
+
+/// The triangles of a mesh.
+#[repr(C)]
+#[derive(Clone, Copy)]
+pub struct bk_mesh_view {
+    /// Size of this structure in bytes, set by bk_mesh_view_init.
+    pub struct_size: u32,
+    /// Not used yet.
+    pub reserved: u32,
+    /// vertex_count positions of three floats, packed.
+    pub positions: *const f32,
+    /// Number of vertices.
+    pub vertex_count: usize,
+    /// Three vertex numbers per triangle, packed.
+    pub indices: *const u32,
+    /// Number of triangles, degenerate ones included.
+    pub triangle_count: usize,
+}
+
+sized_struct!(bk_mesh_view, last: triangle_count: usize, defaults: bk_mesh_view {
+    struct_size: size_of::<bk_mesh_view>() as u32,
+    reserved: 0,
+    positions: std::ptr::null(),
+    vertex_count: 0,
+    indices: std::ptr::null(),
+    triangle_count: 0,
+});
+
+/// Sets struct_size and clears the rest.
+#[unsafe(no_mangle)]
+pub unsafe extern "C" fn bk_mesh_view_init(view: *mut bk_mesh_view) {
+    // SAFETY: the caller's structure, or NULL.
+    unsafe { init(view) }
+}
+
+/// Shows the triangles of a mesh of a committed scene, without a copy.
+///
+/// out: receives pointers that are valid while the scene lives.
+#[unsafe(no_mangle)]
+pub unsafe extern "C" fn bk_scene_mesh_geometry(
+    scene: *const bk_scene,
+    mesh: u32,
+    out: *mut bk_mesh_view,
+) -> bk_result {
+    call(|| {
+        let meshes = object!(scene).committed()?.meshes();
+        // SAFETY: out is the caller's, or NULL.
+        let out = unsafe { OutStruct::new(out, "out") }?;
+        let Some(m) = meshes.get(mesh as usize) else {
+            return invalid_argument!("mesh {mesh} does not exist, the scene has {}", meshes.len());
+        };
+        out.write(bk_mesh_view {
+            positions: m.positions.as_ptr().cast(),
+            vertex_count: m.positions.len(),
+            indices: m.indices.as_ptr().cast(),
+            triangle_count: m.indices.len(),
+            ..SizedStruct::defaults()
+        });
+        Ok(())
+    })
+}

@@ -1,0 +1,149 @@
+//! Rays
+//!
+//! All functions take a committed scene and are safe from any threads. A closest hit is the one with
+//! the least t in tmin < t <= tmax; among equal t the triangle that was added first, whichever
+//! function is asked. Directions need not be normalised; t is in units of the direction's length.
+//! Both sides of a triangle are hit. A ray with a NaN, an infinite origin or a zero direction hits
+//! nothing.
+
+use super::args::{check_flags, read_vec3, slice, slice_mut, write};
+use super::error::{BK_NONE, bk_result, call, call_or};
+use super::handles::object;
+use super::scene::bk_scene;
+use crate::trace::{Hit, Ray};
+use bytemuck::{Pod, Zeroable, cast_slice, cast_slice_mut};
+
+/// Flag: neighbouring rays are alike (a camera's, a tile's); they may be traced together. Results
+/// do not depend on it.
+pub const BK_RAYS_COHERENT: u32 = 1;
+/// Flag: spread the rays over the device's threads. Without it the calling thread does the work.
+pub const BK_RAYS_PARALLEL: u32 = 2;
+
+/// The points origin + t direction with tmin < t <= tmax.
+#[repr(C)]
+#[derive(Clone, Copy, Debug, Pod, Zeroable)]
+pub struct bk_ray {
+    pub origin: [f32; 3],
+    pub tmin: f32,
+    pub direction: [f32; 3],
+    pub tmax: f32,
+}
+
+/// What a ray hits. A miss has t = +infinity, u = v = 0, and BK_NONE in the rest.
+#[repr(C)]
+#[derive(Clone, Copy, Debug, Pod, Zeroable)]
+pub struct bk_hit {
+    /// Distance in units of the direction's length.
+    pub t: f32,
+    /// Barycentric weight of the triangle's vertex 1.
+    pub u: f32,
+    /// Barycentric weight of the triangle's vertex 2.
+    pub v: f32,
+    /// Number of the triangle in its mesh.
+    pub triangle: u32,
+    /// Number of the mesh.
+    pub mesh: u32,
+    /// Not used yet: BK_NONE.
+    pub instance: u32,
+}
+
+const _: () = assert!(size_of::<bk_ray>() == 32 && size_of::<bk_ray>() == size_of::<Ray>());
+const _: () = assert!(size_of::<bk_hit>() == 24 && size_of::<bk_hit>() == size_of::<Hit>());
+
+const MISS: bk_hit = bk_hit { t: f32::INFINITY, u: 0.0, v: 0.0, triangle: BK_NONE, mesh: BK_NONE, instance: BK_NONE };
+
+/// The closest hit of one ray. On failure (a scene that is NULL or not committed, a NULL ray) out
+/// receives a miss, and bk_last_error the reason.
+#[unsafe(no_mangle)]
+pub unsafe extern "C" fn bk_intersect(scene: *const bk_scene, ray: *const bk_ray, out: *mut bk_hit) {
+    // SAFETY: ray and out are the caller's, or NULL.
+    let hit = call_or(MISS, || unsafe {
+        let scene = object!(scene).committed()?;
+        let ray = &slice(ray, 1, "ray")?[0];
+        Ok(bytemuck::cast(scene.intersect(bytemuck::cast_ref(ray))))
+    });
+    // SAFETY: as above.
+    call_or((), || unsafe { write(out, hit, "out") });
+}
+
+/// Whether anything lies on the ray: 1 or 0. On failure 0, and bk_last_error has the reason.
+#[unsafe(no_mangle)]
+pub unsafe extern "C" fn bk_occluded(scene: *const bk_scene, ray: *const bk_ray) -> i32 {
+    // SAFETY: ray is the caller's, or NULL.
+    call_or(0, || unsafe {
+        let scene = object!(scene).committed()?;
+        let ray = &slice(ray, 1, "ray")?[0];
+        Ok(scene.occluded(bytemuck::cast_ref(ray)) as i32)
+    })
+}
+
+/// The closest hits of many rays.
+///
+/// rays: count rays, aligned to 4 bytes. flags: BK_RAYS_COHERENT, BK_RAYS_PARALLEL. out: receives
+/// count hits in the order of the rays; must not overlap them.
+#[unsafe(no_mangle)]
+pub unsafe extern "C" fn bk_intersect_many(
+    scene: *const bk_scene,
+    rays: *const bk_ray,
+    count: usize,
+    flags: u32,
+    out: *mut bk_hit,
+) -> bk_result {
+    // SAFETY: rays and out are the caller's, or NULL.
+    call(|| unsafe {
+        let scene = object!(scene).committed()?;
+        check_flags(flags, BK_RAYS_COHERENT | BK_RAYS_PARALLEL, "flags")?;
+        let rays = slice(rays, count, "rays")?;
+        let out = slice_mut(out, count, "out", &[(cast_slice(rays), "rays")])?;
+        scene.intersect_many(cast_slice(rays), flags & BK_RAYS_PARALLEL != 0, cast_slice_mut(out))
+    })
+}
+
+/// Whether anything lies on each of many rays.
+///
+/// rays: count rays, aligned to 4 bytes. flags: BK_RAYS_COHERENT, BK_RAYS_PARALLEL. out: receives
+/// count bytes, 1 or 0, in the order of the rays; must not overlap them.
+#[unsafe(no_mangle)]
+pub unsafe extern "C" fn bk_occluded_many(
+    scene: *const bk_scene,
+    rays: *const bk_ray,
+    count: usize,
+    flags: u32,
+    out: *mut u8,
+) -> bk_result {
+    // SAFETY: rays and out are the caller's, or NULL.
+    call(|| unsafe {
+        let scene = object!(scene).committed()?;
+        check_flags(flags, BK_RAYS_COHERENT | BK_RAYS_PARALLEL, "flags")?;
+        let rays = slice(rays, count, "rays")?;
+        let out = slice_mut(out, count, "out", &[(cast_slice(rays), "rays")])?;
+        scene.occluded_many(cast_slice(rays), flags & BK_RAYS_PARALLEL != 0, out)
+    })
+}
+
+/// cbindgen:ptrs-as-arrays=[[origin; 3]]
+/// The closest hits of rays that share an origin, with 0 < t <= tmax. Faster than as many single
+/// rays, the more so the more directions there are (32 and up).
+///
+/// directions: count directions of three floats, packed, aligned to 4 bytes. flags:
+/// BK_RAYS_PARALLEL. out: receives count hits in the order of the directions; must not overlap them.
+#[unsafe(no_mangle)]
+pub unsafe extern "C" fn bk_gather(
+    scene: *const bk_scene,
+    origin: *const f32,
+    directions: *const f32,
+    count: usize,
+    tmax: f32,
+    flags: u32,
+    out: *mut bk_hit,
+) -> bk_result {
+    // SAFETY: origin, directions and out are the caller's, or NULL.
+    call(|| unsafe {
+        let scene = object!(scene).committed()?;
+        check_flags(flags, BK_RAYS_PARALLEL, "flags")?;
+        let origin = read_vec3(origin, "origin")?;
+        let directions = slice(directions.cast::<[f32; 3]>(), count, "directions")?;
+        let out = slice_mut(out, count, "out", &[(cast_slice(directions), "directions")])?;
+        scene.gather(origin, directions, tmax, flags & BK_RAYS_PARALLEL != 0, cast_slice_mut(out))
+    })
+}

@@ -1,0 +1,222 @@
+//! Reading and saving light maps
+
+use super::args::text;
+use super::error::{bk_result, call};
+use super::handles::{is_null, object};
+use super::lightmap::bk_lightmap;
+use crate::error::{Error, Result, invalid_argument};
+use crate::lightmap::{Layer, LayerData, Lightmap};
+use std::ffi::{c_char, c_void};
+
+/// Irradiance, direct and indirect, in W/m2. RGB: BK_FORMAT_RGB32F or BK_FORMAT_RGBA16F.
+pub const BK_LAYER_COMBINED: u32 = 0;
+/// Irradiance by way of other surfaces, in W/m2. RGB.
+pub const BK_LAYER_INDIRECT: u32 = 1;
+/// Irradiance straight from lights, in W/m2. RGB.
+pub const BK_LAYER_DIRECT: u32 = 2;
+/// Outgoing radiance as gather rays see it, in W/(m2 sr). RGB.
+pub const BK_LAYER_RADIANCE: u32 = 3;
+/// 1 for a texel that a triangle covers, 0.5 for one filled from its neighbours, 0 for an empty one.
+/// BK_FORMAT_R32F.
+pub const BK_LAYER_VALIDITY: u32 = 4;
+/// Position of the texel's sample in the scene. RGB.
+pub const BK_LAYER_POSITION: u32 = 5;
+/// Unit normal of the texel's sample. RGB.
+pub const BK_LAYER_NORMAL: u32 = 6;
+/// Number of the triangle that covers the texel, counted through all meshes in their order; BK_NONE
+/// where there is none. BK_FORMAT_R32U.
+pub const BK_LAYER_TRIANGLE: u32 = 7;
+
+/// Three floats: 12 bytes per texel.
+pub const BK_FORMAT_RGB32F: u32 = 1;
+/// Four half floats: 8 bytes per texel. Alpha is 1; values beyond 65504 are clamped to it.
+pub const BK_FORMAT_RGBA16F: u32 = 2;
+/// One float: 4 bytes per texel.
+pub const BK_FORMAT_R32F: u32 = 3;
+/// One uint32_t: 4 bytes per texel.
+pub const BK_FORMAT_R32U: u32 = 4;
+
+/// Copies one layer of one page.
+///
+/// layer: one of the BK_LAYER values; those that hold light need a bake (BK_ERROR_INVALID_STATE
+/// before). format: one of the BK_FORMAT values that suits the layer, as said there. dst: receives
+/// height rows, row_stride bytes apart, of width texels; needs no alignment. row_stride: at least
+/// the bytes of a row of texels; 0: just that many.
+#[unsafe(no_mangle)]
+pub unsafe extern "C" fn bk_lightmap_read(
+    lightmap: *const bk_lightmap,
+    page: u32,
+    layer: u32,
+    format: u32,
+    dst: *mut c_void,
+    row_stride: usize,
+) -> bk_result {
+    call(|| {
+        let lightmap = object!(lightmap);
+        if dst.is_null() {
+            return Err(is_null("dst"));
+        }
+        let layer = core_layer(layer)?;
+        let texel = texel_bytes(format)?;
+        let (info, data) = lightmap.read(|l| {
+            let info = l.info();
+            if page >= info.page_count {
+                return invalid_argument!("page {page} does not exist, the light map has {}", info.page_count);
+            }
+            Ok((info, l.read(page, layer)?))
+        })?;
+        let packed = info.width as usize * texel;
+        let stride = if row_stride == 0 { packed } else { row_stride };
+        if stride < packed {
+            return invalid_argument!("row_stride is {row_stride}, less than the {packed} bytes of a row");
+        }
+        let bytes = encode(&data, format).ok_or_else(|| {
+            Error::InvalidArgument(format!("format is {format}, which does not suit the layer {layer:?}"))
+        })?;
+        for (row, from) in bytes.chunks_exact(packed).enumerate() {
+            // SAFETY: the caller has room for `height` rows `stride` bytes apart.
+            unsafe { std::ptr::copy_nonoverlapping(from.as_ptr(), dst.cast::<u8>().add(row * stride), packed) };
+        }
+        Ok(())
+    })
+}
+
+fn core_layer(layer: u32) -> Result<Layer> {
+    Ok(match layer {
+        BK_LAYER_COMBINED => Layer::Combined,
+        BK_LAYER_INDIRECT => Layer::Indirect,
+        BK_LAYER_DIRECT => Layer::Direct,
+        BK_LAYER_RADIANCE => Layer::Radiance,
+        BK_LAYER_VALIDITY => Layer::Validity,
+        BK_LAYER_POSITION => Layer::Position,
+        BK_LAYER_NORMAL => Layer::Normal,
+        BK_LAYER_TRIANGLE => Layer::Triangle,
+        other => return invalid_argument!("layer is {other}, not one of the BK_LAYER values"),
+    })
+}
+
+fn texel_bytes(format: u32) -> Result<usize> {
+    Ok(match format {
+        BK_FORMAT_RGB32F => 12,
+        BK_FORMAT_RGBA16F => 8,
+        BK_FORMAT_R32F | BK_FORMAT_R32U => 4,
+        other => return invalid_argument!("format is {other}, not one of the BK_FORMAT values"),
+    })
+}
+
+/// The texels of a layer in a format, or `None` if the format does not suit it.
+fn encode(data: &LayerData, format: u32) -> Option<std::borrow::Cow<'_, [u8]>> {
+    match (data, format) {
+        (LayerData::Rgb(rgb), BK_FORMAT_RGB32F) => Some(bytemuck::cast_slice(rgb).into()),
+        (LayerData::Rgb(rgb), BK_FORMAT_RGBA16F) => {
+            let half = |rgb: &[f32; 3]| [rgb[0], rgb[1], rgb[2], 1.0].map(half_bits);
+            Some(rgb.iter().flat_map(|t| bytemuck::cast::<[u16; 4], [u8; 8]>(half(t))).collect())
+        }
+        (LayerData::Scalar(v), BK_FORMAT_R32F) => Some(bytemuck::cast_slice(v).into()),
+        (LayerData::Integer(v), BK_FORMAT_R32U) => Some(bytemuck::cast_slice(v).into()),
+        _ => None,
+    }
+}
+
+/// IEEE 754 half precision, rounded to nearest even; magnitudes beyond the largest half are clamped
+/// to it, NaN stays NaN.
+fn half_bits(x: f32) -> u16 {
+    const LARGEST: f32 = 65504.0;
+    const SMALLEST_NORMAL: f32 = 6.103_515_6e-5;
+    let sign = (x.to_bits() >> 16) as u16 & 0x8000;
+    if x.is_nan() {
+        return sign | 0x7e00;
+    }
+    let magnitude = x.abs().min(LARGEST);
+    let half = if magnitude < SMALLEST_NORMAL {
+        // Adding 0.5 leaves the units of a subnormal half (2^-24) in the last bits, rounded by the FPU.
+        (magnitude + 0.5).to_bits() - 0.5f32.to_bits()
+    } else {
+        // Exponent bias 127 becomes 15; 13 bits of the fraction go, rounded to even by their top.
+        let bits = magnitude.to_bits() - ((127 - 15) << 23);
+        (bits + 0xfff + (bits >> 13 & 1)) >> 13
+    };
+    sign | half as u16
+}
+
+/// Float images, one EXR file per page and layer.
+pub const BK_FILE_EXR: u32 = 1;
+/// Tone-mapped 8-bit images to look at, one PNG file per page and layer.
+pub const BK_FILE_PNG: u32 = 2;
+/// The scene with the light map as second texture, one GLB file for any viewer.
+pub const BK_FILE_GLB: u32 = 3;
+
+/// Writes a baked light map to files.
+///
+/// path_prefix: UTF-8; the names of the files are this followed by page, layer and extension.
+/// file_format: one of the BK_FILE values.
+///
+/// Fails with BK_ERROR_IO, naming the file, if it cannot be written, with BK_ERROR_INVALID_STATE
+/// before a bake, with BK_ERROR_UNSUPPORTED if the library was built without files.
+#[unsafe(no_mangle)]
+pub unsafe extern "C" fn bk_lightmap_save(
+    lightmap: *const bk_lightmap,
+    path_prefix: *const c_char,
+    file_format: u32,
+) -> bk_result {
+    call(|| {
+        let lightmap = object!(lightmap);
+        // SAFETY: path_prefix is the caller's, or NULL.
+        let prefix = unsafe { text(path_prefix, "path_prefix") }?;
+        if !matches!(file_format, BK_FILE_EXR | BK_FILE_PNG | BK_FILE_GLB) {
+            return invalid_argument!("file_format is {file_format}, not one of the BK_FILE values");
+        }
+        lightmap.read(|l| save(l, prefix, file_format))
+    })
+}
+
+fn save(_: &Lightmap, prefix: &str, _: u32) -> Result<()> {
+    Err(Error::Unsupported(format!("this build of the library writes no files, and so not {prefix}")))
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    /// The value of a half, by its definition.
+    fn half_value(bits: u16) -> f64 {
+        let (exponent, fraction) = (i32::from(bits >> 10 & 31), f64::from(bits & 0x3ff));
+        let magnitude = match exponent {
+            0 => fraction * 2f64.powi(-24),
+            e => (1.0 + fraction / 1024.0) * 2f64.powi(e - 15),
+        };
+        if bits & 0x8000 != 0 { -magnitude } else { magnitude }
+    }
+
+    #[test]
+    fn every_finite_half_survives_the_way_through_f32() {
+        for bits in (0..=0x7bffu16).chain(0x8000..=0xfbff) {
+            assert_eq!(half_bits(half_value(bits) as f32), bits);
+        }
+    }
+
+    #[test]
+    fn between_two_halves_the_nearer_is_taken_and_in_the_middle_the_even_one() {
+        for bits in 0..0x7bffu16 {
+            let (low, high) = (half_value(bits), half_value(bits + 1));
+            let middle = ((low + high) / 2.0) as f32;
+            assert_eq!(half_bits(middle), bits + (bits & 1));
+            assert_eq!(half_bits(middle.next_down()), bits);
+            assert_eq!(half_bits(middle.next_up()), bits + 1);
+        }
+    }
+
+    #[test]
+    fn halves_are_clamped_and_nan_stays() {
+        assert_eq!([1e9, f32::INFINITY, -1e9].map(half_bits), [0x7bff, 0x7bff, 0xfbff]);
+        assert_eq!(half_bits(f32::NAN) & 0x7fff, 0x7e00);
+    }
+
+    #[test]
+    fn a_format_that_does_not_suit_the_layer_is_none() {
+        assert!(encode(&LayerData::Rgb(vec![[1.0; 3]]), BK_FORMAT_R32F).is_none());
+        assert!(encode(&LayerData::Integer(vec![1]), BK_FORMAT_R32F).is_none());
+        let half = encode(&LayerData::Rgb(vec![[1.0, 0.5, 0.0]]), BK_FORMAT_RGBA16F).unwrap();
+        assert_eq!(*half, *bytemuck::cast_slice::<u16, u8>(&[0x3c00, 0x3800, 0, 0x3c00]));
+    }
+}

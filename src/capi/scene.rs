@@ -1,0 +1,338 @@
+//! Scenes
+//!
+//! A scene is described (materials, meshes, lights, files), then committed: its acceleration
+//! structure is built, and from then on it can be queried and baked but only its lights change.
+//! Describing and committing want one thread at a time per scene; a call that meets another one
+//! fails with BK_ERROR_INVALID_STATE. Queries on a committed scene are safe from any threads.
+//!
+//! Right-handed coordinates, any up axis, any unit of length (W/m2 then means per square unit),
+//! counter-clockwise front faces, linear RGB, all surfaces diffuse. Coordinates are valid up to a
+//! magnitude of 1e12.
+
+use super::args::{OutStruct, init, read_struct, sized_struct, text, write};
+use super::device::{bk_device, bk_progress_fn, progress};
+use super::error::{bk_result, call, call_or};
+use super::handles::{create, hold, object, release, retain};
+use crate::bvh::BuildOptions;
+use crate::device::Device;
+use crate::error::{Error, Result};
+use crate::scene::{Scene, SceneData, builtin};
+use std::ffi::{c_char, c_void};
+use std::sync::{Arc, Mutex, OnceLock, TryLockError};
+
+/// A scene: being described, or committed.
+pub struct bk_scene {
+    device: Arc<Device>,
+    /// Set once by the commit; queries read it without a lock.
+    pub(super) committed: OnceLock<Arc<Scene>>,
+    /// The description; `None` once committed. Only ever tried, never waited for.
+    description: Mutex<Option<Description>>,
+}
+
+#[derive(Default)]
+pub(super) struct Description {
+    pub(super) data: SceneData,
+    build: BuildOptions,
+}
+
+impl bk_scene {
+    /// Changes the description. `what` completes "… after the commit".
+    pub(super) fn describe<R>(&self, what: &str, change: impl FnOnce(&mut Description) -> Result<R>) -> Result<R> {
+        self.with_description(|description| match description {
+            Some(d) => change(d),
+            None => Err(Error::InvalidState(format!("the scene is committed: {what} no more"))),
+        })
+    }
+
+    fn with_description<R>(&self, f: impl FnOnce(&mut Option<Description>) -> Result<R>) -> Result<R> {
+        match self.description.try_lock() {
+            Ok(mut description) => f(&mut description),
+            Err(TryLockError::WouldBlock) => {
+                Err(Error::InvalidState("another call is changing the scene at the same time".into()))
+            }
+            Err(TryLockError::Poisoned(_)) => {
+                Err(Error::InvalidState("an internal error has left the scene unusable".into()))
+            }
+        }
+    }
+
+    /// The committed scene.
+    #[inline]
+    pub(super) fn committed(&self) -> Result<&Arc<Scene>> {
+        self.committed.get().ok_or_else(|| Error::InvalidState("the scene is not committed".into()))
+    }
+
+    /// A number about the scene in either state.
+    pub(super) fn count(
+        &self,
+        described: impl Fn(&SceneData) -> usize,
+        committed: impl Fn(&Scene) -> usize,
+    ) -> Result<u32> {
+        match self.committed.get() {
+            Some(scene) => Ok(committed(scene) as u32),
+            None => self.with_description(|d| match d {
+                Some(d) => Ok(described(&d.data) as u32),
+                None => Ok(committed(self.committed()?) as u32),
+            }),
+        }
+    }
+}
+
+/// Creates an empty scene.
+///
+/// device: kept alive by the scene. out: receives the scene, NULL on failure.
+#[unsafe(no_mangle)]
+pub unsafe extern "C" fn bk_scene_create(device: *mut bk_device, out: *mut *mut bk_scene) -> bk_result {
+    // SAFETY: out is the caller's, or NULL.
+    call(|| unsafe {
+        write(out, std::ptr::null_mut(), "out")?;
+        let device = object!(device).device().clone();
+        let description = Mutex::new(Some(Description::default()));
+        write(out, create(bk_scene { device, committed: OnceLock::new(), description }), "out")
+    })
+}
+
+/// Counts one more reference. NULL is ignored.
+#[unsafe(no_mangle)]
+pub unsafe extern "C" fn bk_scene_retain(scene: *mut bk_scene) {
+    // SAFETY: a handle or NULL.
+    unsafe { retain(scene) }
+}
+
+/// Gives one reference back. NULL is ignored.
+#[unsafe(no_mangle)]
+pub unsafe extern "C" fn bk_scene_release(scene: *mut bk_scene) {
+    // SAFETY: a handle whose reference the caller gives up, or NULL.
+    call_or((), || unsafe {
+        release(scene);
+        Ok(())
+    })
+}
+
+/// What a file brought.
+#[repr(C)]
+#[derive(Clone, Copy)]
+pub struct bk_load_info {
+    /// Size of this structure in bytes, set by bk_load_info_init.
+    pub struct_size: u32,
+    /// Meshes added, the first with number first_mesh.
+    pub meshes: u32,
+    /// Number of the first mesh added.
+    pub first_mesh: u32,
+    /// Materials added, the first with number first_material.
+    pub materials: u32,
+    /// Number of the first material added.
+    pub first_material: u32,
+    /// Channels of reflectances at or above 1 that were clamped to 0.98, or below 0 to 0.
+    pub clamped_albedos: u32,
+    /// Triangles added, degenerate ones included.
+    pub triangles: u64,
+    /// Time to read the file, in seconds.
+    pub seconds: f64,
+}
+
+sized_struct!(bk_load_info, last: seconds: f64, defaults: bk_load_info {
+    struct_size: size_of::<bk_load_info>() as u32,
+    meshes: 0,
+    first_mesh: 0,
+    materials: 0,
+    first_material: 0,
+    clamped_albedos: 0,
+    triangles: 0,
+    seconds: 0.0,
+});
+
+/// Sets struct_size and clears the rest.
+#[unsafe(no_mangle)]
+pub unsafe extern "C" fn bk_load_info_init(info: *mut bk_load_info) {
+    // SAFETY: the caller's structure, or NULL.
+    unsafe { init(info) }
+}
+
+/// Adds what a scene file describes: meshes and materials, emissive ones included.
+///
+/// path: UTF-8, ending in .obj (with its .mtl), .ply, .gltf or .glb. out: what was added; NULL if
+/// not wanted.
+///
+/// Fails with BK_ERROR_IO, naming the file, if it cannot be read or is malformed, with
+/// BK_ERROR_UNSUPPORTED if its kind is unknown or the library was built without files; the scene is
+/// as before then.
+#[unsafe(no_mangle)]
+pub unsafe extern "C" fn bk_scene_load_file(
+    scene: *mut bk_scene,
+    path: *const c_char,
+    out: *mut bk_load_info,
+) -> bk_result {
+    // SAFETY: path and out are the caller's, or NULL.
+    call(|| unsafe {
+        let scene = object!(scene);
+        let path = text(path, "path")?;
+        let out = OutStruct::optional(out, "out")?;
+        let info = scene.describe("files can be loaded", |d| load_file(&mut d.data, path))?;
+        if let Some(out) = out {
+            out.write(info);
+        }
+        Ok(())
+    })
+}
+
+fn load_file(_: &mut SceneData, path: &str) -> Result<bk_load_info> {
+    Err(Error::Unsupported(format!("this build of the library reads no files, and so not {path}")))
+}
+
+/// Adds a scene made by code, with its lights: "cornell" (the Cornell box), "furnace" (a closed,
+/// glowing cube) or "atrium" (a two-floor court in the sun).
+#[unsafe(no_mangle)]
+pub unsafe extern "C" fn bk_scene_load_builtin(scene: *mut bk_scene, name: *const c_char) -> bk_result {
+    call(|| {
+        let scene = object!(scene);
+        // SAFETY: name is the caller's, or NULL.
+        let name = unsafe { text(name, "name") }?;
+        scene.describe("scenes can be loaded", |d| d.data.append(builtin(name)?))
+    })
+}
+
+/// How to build the acceleration structure.
+#[repr(C)]
+#[derive(Clone, Copy)]
+pub struct bk_build_params {
+    /// Size of this structure in bytes, set by bk_build_params_init.
+    pub struct_size: u32,
+    /// Bins per axis of the surface area heuristic, 2 to 256. Default: 64.
+    pub bins: u32,
+    /// Most triangles per leaf, 1 to 8. Default: 3.
+    pub max_leaf: u32,
+}
+
+sized_struct!(bk_build_params, last: max_leaf: u32, defaults: {
+    let b = BuildOptions::default();
+    bk_build_params { struct_size: size_of::<bk_build_params>() as u32, bins: b.bins, max_leaf: b.max_leaf }
+});
+
+/// Fills in the defaults.
+#[unsafe(no_mangle)]
+pub unsafe extern "C" fn bk_build_params_init(params: *mut bk_build_params) {
+    // SAFETY: the caller's structure, or NULL.
+    unsafe { init(params) }
+}
+
+/// Chooses how bk_scene_commit builds; without it the defaults hold.
+#[unsafe(no_mangle)]
+pub unsafe extern "C" fn bk_scene_set_build(scene: *mut bk_scene, params: *const bk_build_params) -> bk_result {
+    call(|| {
+        let scene = object!(scene);
+        // SAFETY: params is the caller's, or NULL.
+        let params = unsafe { read_struct(params, "params") }?;
+        let build = BuildOptions { bins: params.bins, max_leaf: params.max_leaf };
+        build.validate()?;
+        scene.describe("the build can be chosen", |d| {
+            d.build = build;
+            Ok(())
+        })
+    })
+}
+
+/// Ends the description: builds the acceleration structure on the device's threads. Afterwards the
+/// scene can be queried and baked, and only bk_scene_set_light changes it.
+///
+/// progress, user: told how far it is; NULL if not wanted.
+///
+/// Fails with BK_ERROR_INVALID_STATE if the scene is committed already or holds no usable triangle.
+/// A commit that fails or is cancelled leaves the description as it was.
+#[unsafe(no_mangle)]
+pub unsafe extern "C" fn bk_scene_commit(
+    scene: *mut bk_scene,
+    progress: bk_progress_fn,
+    user: *mut c_void,
+) -> bk_result {
+    call(|| {
+        // SAFETY: a handle or NULL.
+        let scene = unsafe { hold(scene, "scene") }?;
+        scene.with_description(|slot| {
+            let Some(Description { data, build }) = slot.take() else {
+                return Err(Error::InvalidState("the scene is committed already".into()));
+            };
+            match Scene::commit(&scene.device, data, &build, &self::progress(progress, user)) {
+                Ok(committed) => {
+                    // The description was there, so nothing was committed before.
+                    let _ = scene.committed.set(committed);
+                    Ok(())
+                }
+                Err((data, e)) => {
+                    *slot = Some(Description { data, build });
+                    Err(e)
+                }
+            }
+        })
+    })
+}
+
+/// Numbers about a committed scene.
+#[repr(C)]
+#[derive(Clone, Copy)]
+pub struct bk_scene_stats {
+    /// Size of this structure in bytes, set by bk_scene_stats_init.
+    pub struct_size: u32,
+    /// Surface area heuristic cost of the binary tree, traversal and intersection costing 1 each.
+    pub sah_cost: f32,
+    /// Triangles in all meshes.
+    pub triangles: u64,
+    /// Of those, skipped as degenerate or not finite.
+    pub skipped_degenerate: u64,
+    /// 4-wide nodes of the acceleration structure.
+    pub nodes: u64,
+    /// Bytes of the acceleration structure.
+    pub bvh_bytes: u64,
+    /// Bytes of the whole committed scene.
+    pub bytes: u64,
+    /// Time of the build, in seconds.
+    pub build_seconds: f64,
+}
+
+sized_struct!(bk_scene_stats, last: build_seconds: f64, defaults: stats(&Default::default()));
+
+fn stats(s: &crate::scene::SceneStats) -> bk_scene_stats {
+    bk_scene_stats {
+        struct_size: size_of::<bk_scene_stats>() as u32,
+        sah_cost: s.sah_cost,
+        triangles: s.triangles,
+        skipped_degenerate: s.skipped_degenerate,
+        nodes: s.nodes,
+        bvh_bytes: s.bvh_bytes,
+        bytes: s.bytes,
+        build_seconds: s.build_seconds,
+    }
+}
+
+/// Sets struct_size and clears the rest.
+#[unsafe(no_mangle)]
+pub unsafe extern "C" fn bk_scene_stats_init(stats: *mut bk_scene_stats) {
+    // SAFETY: the caller's structure, or NULL.
+    unsafe { init(stats) }
+}
+
+/// Numbers about a committed scene. (The structure shares the function's name, so it is always
+/// written with `struct`.)
+#[unsafe(no_mangle)]
+pub unsafe extern "C" fn bk_scene_stats(scene: *const bk_scene, out: *mut bk_scene_stats) -> bk_result {
+    call(|| {
+        let committed = object!(scene).committed()?;
+        // SAFETY: out is the caller's, or NULL.
+        unsafe { OutStruct::new(out, "out") }?.write(stats(committed.stats()));
+        Ok(())
+    })
+}
+
+/// cbindgen:ptrs-as-arrays=[[lower; 3], [upper; 3]]
+/// The bounding box of all valid triangles of a committed scene.
+#[unsafe(no_mangle)]
+pub unsafe extern "C" fn bk_scene_bounds(scene: *const bk_scene, lower: *mut f32, upper: *mut f32) -> bk_result {
+    call(|| {
+        let bounds = object!(scene).committed()?.bounds();
+        // SAFETY: lower and upper are the caller's, or NULL.
+        unsafe {
+            write(lower.cast::<[f32; 3]>(), bounds.0.to_array(), "lower")?;
+            write(upper.cast::<[f32; 3]>(), bounds.1.to_array(), "upper")
+        }
+    })
+}
