@@ -216,7 +216,8 @@ mod tests {
     fn a_format_that_does_not_suit_the_layer_is_none() {
         assert!(encode(&LayerData::Rgb(vec![[1.0; 3]]), BK_FORMAT_R32F).is_none());
         assert!(encode(&LayerData::Integer(vec![1]), BK_FORMAT_R32F).is_none());
-        let half = encode(&LayerData::Rgb(vec![[1.0, 0.5, 0.0]]), BK_FORMAT_RGBA16F).unwrap();
+        let rgb = LayerData::Rgb(vec![[1.0, 0.5, 0.0]]);
+        let half = encode(&rgb, BK_FORMAT_RGBA16F).unwrap();
         assert_eq!(*half, *bytemuck::cast_slice::<u16, u8>(&[0x3c00, 0x3800, 0, 0x3c00]));
     }
 }
