@@ -28,7 +28,12 @@ const PAIR_COSINE: f64 = 0.9962;
 
 /// Unwraps `triangles` (valid global numbers, ascending). Advances `stage` by one per triangle.
 pub(super) fn unwrap(scene: &Scene, triangles: &[u32], stage: &Stage) -> Result<Vec<Piece>> {
+<<<<<<< HEAD
     let of_meshes: Vec<&[u32]> = triangles.chunk_by(|&a, &b| scene.locate(a).0 == scene.locate(b).0).collect();
+=======
+    let of_meshes: Vec<&[u32]> =
+        triangles.chunk_by(|&a, &b| scene.locate(a).0 == scene.locate(b).0).collect();
+>>>>>>> 5d5d6d8 (wip)
     let parts: Vec<Vec<u32>> = of_meshes.par_iter().flat_map_iter(|t| parts(scene, t)).collect();
     stage.advance(0)?;
     let charted: Result<Vec<Vec<Piece>>> = parts
@@ -220,9 +225,13 @@ fn unwrap_part(geometry: &Geometry, scene: &Scene, stage: &Stage) -> Result<Vec<
             let (count, first) = (geometry.triangles.len(), geometry.triangles[0]);
             scene.device().log(
                 LogLevel::Warning,
+<<<<<<< HEAD
                 &format!(
                     "{count} triangles from triangle {first} on get planar charts, they could not be unwrapped: {e}"
                 ),
+=======
+                &format!("{count} triangles from triangle {first} on get planar charts, they could not be unwrapped: {e}"),
+>>>>>>> 5d5d6d8 (wip)
             );
             Ok(planar_pieces(geometry, &all))
         }
@@ -232,7 +241,14 @@ fn unwrap_part(geometry: &Geometry, scene: &Scene, stage: &Stage) -> Result<Vec<
 /// The charts that `uvunwrap` makes of a part, and which triangles it left without one (too thin
 /// for its single-precision UVs).
 #[cfg(feature = "unwrap")]
+<<<<<<< HEAD
 fn charts_of_part(geometry: &Geometry, stage: &Stage) -> std::result::Result<(Vec<Piece>, Vec<bool>), uvunwrap::Error> {
+=======
+fn charts_of_part(
+    geometry: &Geometry,
+    stage: &Stage,
+) -> std::result::Result<(Vec<Piece>, Vec<bool>), uvunwrap::Error> {
+>>>>>>> 5d5d6d8 (wip)
     // Normalised, so that huge, tiny and far-off parts lose no precision.
     let lower = geometry.positions.iter().fold(DVec3::INFINITY, |m, &p| m.min(p));
     let upper = geometry.positions.iter().fold(DVec3::NEG_INFINITY, |m, &p| m.max(p));
@@ -347,8 +363,12 @@ fn planar_piece(geometry: &Geometry, triangle: usize, partner: Option<usize>) ->
         .filter(|&e| !inner(e))
         .map(|e| geometry.positions[e[1] as usize] - geometry.positions[e[0] as usize])
         .max_by(|a, b| a.length_squared().total_cmp(&b.length_squared()));
+<<<<<<< HEAD
     let x =
         longest.map_or(DVec3::ZERO, |e| e.reject_from_normalized(normal)).normalize_or(normal.any_orthonormal_vector());
+=======
+    let x = longest.map_or(DVec3::ZERO, |e| e.reject_from_normalized(normal)).normalize_or(normal.any_orthonormal_vector());
+>>>>>>> 5d5d6d8 (wip)
     let y = normal.cross(x);
     let origin = geometry.corners(triangle)[0];
     let project = |p: DVec3| DVec2::new((p - origin).dot(x), (p - origin).dot(y)).as_vec2().to_array();

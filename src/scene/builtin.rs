@@ -1,5 +1,6 @@
 //! Scenes made by code, for tests, examples and first steps.
 
+use super::atrium::{atrium, atrium_camera};
 use super::shapes::MeshBuilder;
 use super::{Light, Material, SceneData};
 use crate::error::{Result, invalid_argument};
@@ -27,11 +28,13 @@ pub struct Camera {
 ///   irradiance is π · 1 / (1 − 0.5) = 2π.
 /// - `sealed`: a closed box that hangs in a lit room. Mesh 0 is the room, 1 the inside of the box,
 ///   where the irradiance is exactly 0, 2 its outside, one centimetre away.
+/// - `atrium`: two floors around a court, columns, arches, drapes; a rect light and a sun.
 pub fn builtin(name: &str) -> Result<SceneData> {
     match name {
         "cornell" => cornell(),
         "furnace" => furnace(),
         "sealed" => sealed(),
+        "atrium" => atrium(),
         _ => invalid_argument!("there is no built-in scene {name:?}; there are {}", BUILTIN_NAMES.join(", ")),
     }
 }
@@ -44,6 +47,7 @@ pub fn builtin_camera(name: &str) -> Option<Camera> {
         "cornell" => looking(Vec3::new(2.78, 2.73, -8.0), Vec3::new(2.78, 2.73, 0.0), 2.0 * (12.5f32 / 35.0).atan()),
         "furnace" => looking(Vec3::new(0.1, 0.5, 0.1), Vec3::new(0.6, 0.4, 0.6), 1.2),
         "sealed" => looking(Vec3::new(0.3, 2.4, 0.3), Vec3::new(2.2, 1.2, 2.2), 1.2),
+        "atrium" => Some(atrium_camera()),
         _ => None,
     }
 }

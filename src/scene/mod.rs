@@ -1,6 +1,7 @@
 //! Scenes: what the caller describes ([`SceneData`]), checked as it comes in, and what the kernels
 //! work on ([`Scene`]), compact and immutable after commit.
 
+mod atrium;
 mod builtin;
 mod commit;
 mod light;
