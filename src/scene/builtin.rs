@@ -7,7 +7,7 @@ use crate::error::{Result, invalid_argument};
 use glam::Vec3;
 
 /// The names that [`builtin`] knows.
-pub const BUILTIN_NAMES: &[&str] = &["cornell", "furnace", "sealed"];
+pub const BUILTIN_NAMES: &[&str] = &["cornell", "furnace", "sealed", "atrium"];
 
 /// A pinhole camera.
 #[derive(Clone, Copy, Debug, PartialEq)]
