@@ -26,8 +26,8 @@ use std::time::Instant;
 /// Texels handed to a thread at a time.
 const BLOCK: usize = 256;
 
-/// Pages that a scene fills, about, if the caller leaves the density open.
-const AUTOMATIC_PAGES: f64 = 4.0;
+/// Pages that a scene about fills if the caller leaves the density open.
+const AUTOMATIC_PAGES: f64 = 1.0;
 
 /// Coarse maps of small light maps have pages of this size at least.
 const MIN_PAGE_SIZE: u32 = 64;

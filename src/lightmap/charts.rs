@@ -183,14 +183,7 @@ impl Charts {
 pub fn surface_area(scene: &Scene) -> f64 {
     let areas = |m: usize, mesh: &Mesh| -> f64 {
         let first = scene.first_triangle(m as u32);
-<<<<<<< HEAD
         (first..first + mesh.indices.len() as u32).filter(|&t| scene.is_valid(t)).map(|t| triangle_area(scene, t)).sum()
-=======
-        (first..first + mesh.indices.len() as u32)
-            .filter(|&t| scene.is_valid(t))
-            .map(|t| triangle_area(scene, t))
-            .sum()
->>>>>>> 5d5d6d8 (wip)
     };
     scene.meshes().iter().enumerate().map(|(m, mesh)| areas(m, mesh)).sum()
 }
@@ -424,3 +417,6 @@ pub(super) fn groups(roots: &[u32]) -> Vec<Vec<u32>> {
     }
     groups
 }
+
+#[cfg(test)]
+pub(super) mod tests;

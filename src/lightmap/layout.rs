@@ -310,3 +310,119 @@ impl Skyline {
         self.lowest = self.steps.iter().map(|s| s[1]).min().unwrap_or(0);
     }
 }
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use proptest::prelude::*;
+
+    fn charts_of(sizes: &[[f32; 2]]) -> Charts {
+        let chart = |&size: &[f32; 2]| Chart { triangles: 0..0, size, area: 0.0, two_sided: true, given: None };
+        Charts { charts: sizes.iter().map(chart).collect(), ..Default::default() }
+    }
+
+    fn overlap(a: &Placement, b: &Placement) -> bool {
+        a.page == b.page && a.x < b.x + b.w && b.x < a.x + a.w && a.y < b.y + b.h && b.y < a.y + a.h
+    }
+
+    /// In their page, apart from each other, each containing its chart and the padding around it.
+    fn check(charts: &Charts, layout: &Layout, padding: u32) {
+        let size = layout.page_size;
+        for (n, p) in layout.placements.iter().enumerate() {
+            assert!(p.page < layout.page_count && (p.x + p.w) as u32 <= size && (p.y + p.h) as u32 <= size);
+            let chart = &charts.charts[layout.chart_of(n as u32) as usize];
+            let (lower, upper) = (p.texel_coord([0.0; 2]), p.texel_coord(chart.size));
+            for (axis, first, count) in [(0, p.x, p.w), (1, p.y, p.h)] {
+                assert!(lower[axis] >= first as f32 + padding as f32, "{p:?}");
+                assert!(upper[axis] <= (first + count) as f32 - padding as f32, "{p:?} {:?}", chart.size);
+            }
+        }
+        let mut order: Vec<&Placement> = layout.placements.iter().collect();
+        order.sort_by_key(|p| (p.page, p.x));
+        for (i, a) in order.iter().enumerate() {
+            let near = order[i + 1..].iter().take_while(|b| b.page == a.page && b.x < a.x + a.w);
+            near.for_each(|b| assert!(!overlap(a, b), "{a:?} and {b:?}"));
+        }
+    }
+
+    proptest! {
+        #[test]
+        fn placements_are_apart_and_contain_their_charts(
+            sizes in prop::collection::vec([0.0f32..60.0, 0.0f32..20.0], 0..60),
+            density in 0.05f32..4.0, padding in 0u32..4, page in 5u32..8, back in any::<bool>(),
+        ) {
+            let charts = charts_of(&sizes);
+            let layout = Layout::pack(&charts, density, 1 << page, padding, false, back).unwrap();
+            check(&charts, &layout, padding);
+            prop_assert_eq!(&layout, &Layout::pack(&charts, density, 1 << page, padding, false, back).unwrap());
+            prop_assert_eq!(layout.placements.len(), sizes.len() * if back { 2 } else { 1 });
+            for c in 0..sizes.len() as u32 {
+                prop_assert_eq!(layout.back(c).map(|p| (layout.chart_of(p), layout.is_back(p))), back.then_some((c, true)));
+            }
+        }
+    }
+
+    #[test]
+    fn many_charts_fill_their_pages() {
+        // As of a real scene: most charts are small, few are large.
+        let size = |i: u32, k: u32| {
+            let bits = (i * 2 + k).wrapping_mul(2_654_435_761) >> 8;
+            0.05 / (0.002 + bits as f32 / (1u32 << 24) as f32)
+        };
+        let charts = charts_of(&(0..20_000).map(|i| [size(i, 0), size(i, 1)]).collect::<Vec<_>>());
+        let layout = Layout::pack(&charts, 20.0, 1024, 2, false, false).unwrap();
+        check(&charts, &layout, 2);
+        assert!(layout.page_count >= 8, "{} pages are too few to say", layout.page_count);
+        assert!(layout.utilisation() > 0.85, "{}", layout.utilisation());
+    }
+
+    #[test]
+    fn a_chart_longer_than_a_page_is_reduced_along_that_axis_alone() {
+        let charts = charts_of(&[[1000.0, 3.0], [2.0, 2.0]]);
+        let layout = Layout::pack(&charts, 1.0, 64, 2, false, false).unwrap();
+        check(&charts, &layout, 2);
+        assert_eq!(layout.reduced, 1);
+        let p = &layout.placements[0];
+        assert!(p.scale[0] < 0.061 && p.scale[1] > 0.999 && p.w == 64 && p.h == 7, "{p:?}");
+    }
+
+    #[test]
+    fn gigantic_requests_are_refused_before_they_are_packed() {
+        let charts = charts_of(&vec![[1.0, 1.0]; 10_000]);
+        let e = Layout::pack(&charts, 1e4, 16384, 2, false, false).err().unwrap();
+        assert!(matches!(&e, Error::OutOfMemory(s) if s.contains("10000 charts at 10000 texels per unit")), "{e}");
+        let given = Given { page: 5000, offset: [0.0; 2], scale: [1.0; 2] };
+        let mut far = charts_of(&[[1.0, 1.0]]);
+        far.charts[0].given = Some(given);
+        let e = Layout::pack(&far, 1.0, 1024, 2, true, false).err().unwrap();
+        assert!(matches!(e, Error::OutOfMemory(_)), "{e}");
+    }
+
+    #[test]
+    fn impossible_arguments_are_refused_by_name() {
+        let charts = charts_of(&[[1.0, 1.0]]);
+        let error = |density, page_size, padding| {
+            Layout::pack(&charts, density, page_size, padding, false, false).err().unwrap().to_string()
+        };
+        assert!(error(0.0, 64, 2).contains("density is 0"));
+        assert!(error(f32::INFINITY, 64, 2).contains("density is inf"));
+        assert!(error(1.0, 0, 0).contains("page_size is 0"));
+        assert!(error(1.0, 20000, 0).contains("page_size is 20000"));
+        assert!(error(1.0, 64, 32).contains("padding 32"));
+        assert!(error(1.0, 64, u32::MAX).contains("padding 4294967295"));
+    }
+
+    #[test]
+    fn given_charts_stay_and_others_go_to_further_pages() {
+        let mut charts = charts_of(&[[4.0, 2.0], [1.0, 1.0]]);
+        charts.charts[0].given = Some(Given { page: 2, offset: [0.25, 0.5], scale: [0.125, 0.125] });
+        let layout = Layout::pack(&charts, 1.0, 64, 2, true, false).unwrap();
+        assert_eq!((layout.given, layout.page_count), (1, 4));
+        let p = layout.placements[0];
+        assert_eq!((p.page, p.x, p.y, p.w, p.h), (2, 16, 32, 33, 17));
+        assert_eq!(layout.texel_coord(0, [4.0, 2.0]), [48.0, 48.0]);
+        assert_eq!(layout.placements[1].page, 3);
+        let repacked = Layout::pack(&charts, 1.0, 64, 0, false, false).unwrap();
+        assert_eq!((repacked.given, repacked.page_count), (0, 1));
+    }
+}

@@ -90,7 +90,7 @@ impl ChartMap {
     /// Repeats the nearest sample around the charts of a page, up to `padding` texels away.
     pub(super) fn dilate<T: Copy>(&self, page: u32, padding: u32, out: &mut [T]) {
         let size = self.layout.page_size as usize;
-        for d in self.texels.dilate(padding).iter().filter(|d| d.page == page) {
+        for d in self.texels.dilate(page, padding) {
             let (x, y) = self.position(d.sample as usize);
             out[d.y as usize * size + d.x as usize] = out[y as usize * size + x as usize];
         }

@@ -30,7 +30,7 @@ use std::sync::Arc;
 /// How a light map is laid out.
 #[derive(Clone, Copy, Debug, PartialEq)]
 pub struct LightmapDesc {
-    /// Texels per scene unit; 0: chosen so that the scene fills about four pages.
+    /// Texels per scene unit; 0: chosen so that the scene about fills one page.
     pub texels_per_unit: f32,
     /// Width and height of a page in texels, 16 to 16384.
     pub page_size: u32,

@@ -72,7 +72,6 @@ pub struct Bilinear {
 /// An uncovered texel near a chart, and the sample that it repeats.
 #[derive(Clone, Copy, Debug, PartialEq)]
 pub struct Dilated {
-    pub page: u32,
     pub x: u16,
     pub y: u16,
     pub sample: u32,
@@ -218,13 +217,12 @@ impl TexelMap {
         Bilinear { samples, weights }
     }
 
-    /// The uncovered texels within `padding` of a covered one (a square of 2 · `padding` + 1
-    /// texels), each with the nearest sample, for filters that read beyond the charts' borders.
-    /// Ordered by page of given charts, then placement, row, column.
-    pub fn dilate(&self, padding: u32) -> Vec<Dilated> {
-        let of_groups: Vec<Vec<Dilated>> =
-            self.groups.par_iter().map(|g| dilate(g, self.entries(g), padding)).collect();
-        of_groups.concat()
+    /// The uncovered texels of a page within `padding` of a covered one (a square of 2 · `padding`
+    /// + 1 texels), each with the nearest sample, for filters that read beyond the charts' borders.
+    /// Ordered by placement, row, column; given charts of a page count as one.
+    pub fn dilate(&self, page: u32, padding: u32) -> Vec<Dilated> {
+        let on_page: Vec<&Group> = self.groups.iter().filter(|g| g.page == page).collect();
+        on_page.into_par_iter().flat_map_iter(|g| dilate(g, self.entries(g), padding)).collect()
     }
 
     /// Bytes held.
@@ -756,9 +754,12 @@ fn dilate(group: &Group, entries: &[u32], padding: u32) -> Vec<Dilated> {
                 .min();
             if let Some((_, sample)) = nearest {
                 let (x, y) = (group.window.x + x as u16, group.window.y + y as u16);
-                out.push(Dilated { page: group.page, x, y, sample });
+                out.push(Dilated { x, y, sample });
             }
         }
     }
     out
 }
+
+#[cfg(test)]
+mod tests;

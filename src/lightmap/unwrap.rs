@@ -28,12 +28,7 @@ const PAIR_COSINE: f64 = 0.9962;
 
 /// Unwraps `triangles` (valid global numbers, ascending). Advances `stage` by one per triangle.
 pub(super) fn unwrap(scene: &Scene, triangles: &[u32], stage: &Stage) -> Result<Vec<Piece>> {
-<<<<<<< HEAD
     let of_meshes: Vec<&[u32]> = triangles.chunk_by(|&a, &b| scene.locate(a).0 == scene.locate(b).0).collect();
-=======
-    let of_meshes: Vec<&[u32]> =
-        triangles.chunk_by(|&a, &b| scene.locate(a).0 == scene.locate(b).0).collect();
->>>>>>> 5d5d6d8 (wip)
     let parts: Vec<Vec<u32>> = of_meshes.par_iter().flat_map_iter(|t| parts(scene, t)).collect();
     stage.advance(0)?;
     let charted: Result<Vec<Vec<Piece>>> = parts
@@ -225,13 +220,9 @@ fn unwrap_part(geometry: &Geometry, scene: &Scene, stage: &Stage) -> Result<Vec<
             let (count, first) = (geometry.triangles.len(), geometry.triangles[0]);
             scene.device().log(
                 LogLevel::Warning,
-<<<<<<< HEAD
                 &format!(
                     "{count} triangles from triangle {first} on get planar charts, they could not be unwrapped: {e}"
                 ),
-=======
-                &format!("{count} triangles from triangle {first} on get planar charts, they could not be unwrapped: {e}"),
->>>>>>> 5d5d6d8 (wip)
             );
             Ok(planar_pieces(geometry, &all))
         }
@@ -241,14 +232,7 @@ fn unwrap_part(geometry: &Geometry, scene: &Scene, stage: &Stage) -> Result<Vec<
 /// The charts that `uvunwrap` makes of a part, and which triangles it left without one (too thin
 /// for its single-precision UVs).
 #[cfg(feature = "unwrap")]
-<<<<<<< HEAD
 fn charts_of_part(geometry: &Geometry, stage: &Stage) -> std::result::Result<(Vec<Piece>, Vec<bool>), uvunwrap::Error> {
-=======
-fn charts_of_part(
-    geometry: &Geometry,
-    stage: &Stage,
-) -> std::result::Result<(Vec<Piece>, Vec<bool>), uvunwrap::Error> {
->>>>>>> 5d5d6d8 (wip)
     // Normalised, so that huge, tiny and far-off parts lose no precision.
     let lower = geometry.positions.iter().fold(DVec3::INFINITY, |m, &p| m.min(p));
     let upper = geometry.positions.iter().fold(DVec3::NEG_INFINITY, |m, &p| m.max(p));
@@ -363,12 +347,8 @@ fn planar_piece(geometry: &Geometry, triangle: usize, partner: Option<usize>) ->
         .filter(|&e| !inner(e))
         .map(|e| geometry.positions[e[1] as usize] - geometry.positions[e[0] as usize])
         .max_by(|a, b| a.length_squared().total_cmp(&b.length_squared()));
-<<<<<<< HEAD
     let x =
         longest.map_or(DVec3::ZERO, |e| e.reject_from_normalized(normal)).normalize_or(normal.any_orthonormal_vector());
-=======
-    let x = longest.map_or(DVec3::ZERO, |e| e.reject_from_normalized(normal)).normalize_or(normal.any_orthonormal_vector());
->>>>>>> 5d5d6d8 (wip)
     let y = normal.cross(x);
     let origin = geometry.corners(triangle)[0];
     let project = |p: DVec3| DVec2::new((p - origin).dot(x), (p - origin).dot(y)).as_vec2().to_array();
@@ -376,5 +356,44 @@ fn planar_piece(geometry: &Geometry, triangle: usize, partner: Option<usize>) ->
         triangles: members.iter().map(|&t| geometry.triangles[t]).collect(),
         corners: members.iter().map(|&t| geometry.corners(t).map(project)).collect(),
         given: None,
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use crate::lightmap::charts::tests::{grid, scene_on};
+
+    #[test]
+    fn planar_charts_hold_each_triangle_once_in_true_shape() {
+        let scene = scene_on(1, grid(9, 7, |x, y| ((x * x + y) % 4) as f32 * 0.02));
+        let geometry = Geometry::of(&scene, (0..scene.triangle_count()).collect());
+        let pieces = planar_pieces(&geometry, &vec![true; geometry.triangles.len()]);
+        let mut triangles: Vec<u32> = pieces.iter().flat_map(|p| p.triangles.clone()).collect();
+        triangles.sort_unstable();
+        assert!(triangles.iter().copied().eq(0..scene.triangle_count()));
+        // Nearly all pair up across a diagonal.
+        assert!(pieces.len() < 80, "{} charts for 63 squares", pieces.len());
+        for p in &pieces {
+            for (t, c) in p.triangles.iter().zip(&p.corners) {
+                let corners = geometry.corners(*t as usize);
+                for k in 0..3 {
+                    let flat = DVec2::new((c[k][0] - c[(k + 1) % 3][0]) as f64, (c[k][1] - c[(k + 1) % 3][1]) as f64);
+                    let length = corners[k].distance(corners[(k + 1) % 3]);
+                    assert!((flat.length() / length - 1.0).abs() < 0.005);
+                }
+            }
+        }
+    }
+
+    #[test]
+    fn parts_are_bounded_and_hold_each_triangle_once() {
+        let scene = scene_on(2, grid(200, 170, |x, y| ((x * 31 + y * 17) % 11) as f32 * 0.1));
+        let triangles: Vec<u32> = (0..scene.triangle_count()).collect();
+        let parts = parts(&scene, &triangles);
+        assert!(parts.len() >= 3 && parts.iter().all(|p| p.len() <= PART_TRIANGLES && p.is_sorted()));
+        let mut all = parts.concat();
+        all.sort_unstable();
+        assert_eq!(all, triangles);
     }
 }
