@@ -17,7 +17,9 @@ pub fn closest(bvh: &BinaryBvh, corners: &[[Vec3; 3]], ray: &Ray) -> RawHit {
             continue;
         }
         let node = &bvh.nodes[index as usize];
-        for &triangle in &bvh.triangles[node.index as usize..][..node.count as usize] {
+        // The index of an inner node is a node number: there is nothing to slice.
+        let leaf = if node.count == 0 { &[] } else { &bvh.triangles[node.index as usize..][..node.count as usize] };
+        for &triangle in leaf {
             if let Some(hit) = intersect(&corners[triangle as usize], triangle, origin, direction)
                 && hit.t > ray.tmin
                 && (hit.t < best.t || (hit.t == best.t && triangle < best.triangle))
