@@ -267,3 +267,192 @@ fn container(mut json: Vec<u8>, binary: &[u8]) -> Result<Vec<u8>> {
     }
     Ok(file)
 }
+
+#[cfg(test)]
+pub(super) mod tests {
+    use super::super::image::encode_png_rgb8;
+    use super::*;
+    use crate::bvh::BuildOptions;
+    use crate::device::{Device, DeviceOptions};
+    use crate::io::tests::{albedos, corners, load_bytes};
+    use crate::progress::Progress;
+    use crate::scene::{Mesh, MeshMaterials, SceneData};
+    use std::sync::Arc;
+
+    const PAGE_COLORS: [[u8; 3]; 2] = [[200, 100, 50], [10, 20, 30]];
+
+    /// Two meshes on two pages: a quad with two materials, and a lamp, a degenerate triangle and one
+    /// without a chart.
+    fn scene_and_lightmap() -> (Arc<Scene>, GlbLightmap) {
+        let mut data = SceneData::new();
+        for (albedo, emission, two_sided) in
+            [([0.1, 0.2, 0.3], [0.0; 3], false), ([0.4; 3], [0.0; 3], true), ([0.5; 3], [10.0, 5.0, 0.0], false)]
+        {
+            data.add_material(Material { albedo, emission, two_sided }).unwrap();
+        }
+        let positions: Vec<Vec3> =
+            (0..4).map(|i| Vec3::new((i & 1) as f32 * 1.1, (i >> 1) as f32 * 0.7, -0.3)).collect();
+        data.add_mesh(Mesh {
+            uvs: positions.iter().map(|p| p.truncate() * 3.0).collect(),
+            positions: positions.clone(),
+            indices: vec![[0, 1, 2], [1, 3, 2], [1, 3, 2]],
+            materials: MeshMaterials::PerTriangle(vec![0, 0, 1]),
+            ..Default::default()
+        })
+        .unwrap();
+        data.add_mesh(Mesh {
+            positions: positions.iter().map(|p| *p + Vec3::Z).collect(),
+            indices: vec![[0, 1, 2], [1, 1, 2], [1, 3, 2]],
+            materials: MeshMaterials::PerTriangle(vec![2, 0, 0]),
+            ..Default::default()
+        })
+        .unwrap();
+        let device = Device::new(DeviceOptions { num_threads: 1, ..Default::default() }).unwrap();
+        let scene = Scene::commit(&device, data, &BuildOptions::default(), &Progress::none()).map_err(|e| e.1).unwrap();
+
+        let low = [[0.0, 0.0], [0.5, 0.0], [0.0, 0.5]];
+        let high = [[0.5, 0.0], [0.5, 0.5], [0.0, 0.5]];
+        let seam = [[0.9, 0.0], [0.5, 0.5], [0.0, 0.5]];
+        let pages = PAGE_COLORS.map(|color| encode_png_rgb8(2, 2, &[color; 4]).unwrap()).to_vec();
+        let meshes = vec![
+            GlbMesh { corner_uvs: vec![low, high, high], pages: vec![0, 0, 1] },
+            GlbMesh { corner_uvs: vec![low, low, seam], pages: vec![1, NONE, NONE] },
+        ];
+        (scene, GlbLightmap { meshes, pages })
+    }
+
+    pub fn sample() -> Vec<u8> {
+        let (scene, lightmap) = scene_and_lightmap();
+        encode_glb(&scene, &lightmap).unwrap()
+    }
+
+    fn floats<const N: usize>(binary: &[u8], accessor: &gltf::Accessor) -> Vec<[f32; N]> {
+        let view = accessor.view().unwrap();
+        let bytes = &binary[view.offset()..view.offset() + view.length()];
+        let values: Vec<f32> = bytes.chunks(4).map(|c| f32::from_le_bytes(c.try_into().unwrap())).collect();
+        assert_eq!(values.len(), accessor.count() * N);
+        values.as_chunks().0.to_vec()
+    }
+
+    #[test]
+    fn the_file_is_a_valid_container() {
+        let file = sample();
+        let word = |i: usize| u32::from_le_bytes(file[i..i + 4].try_into().unwrap()) as usize;
+        assert_eq!((word(8), file.len() % 4), (file.len(), 0));
+        let json_length = word(12);
+        assert_eq!((json_length % 4, word(20 + json_length) % 4), (0, 0));
+        assert_eq!(file.len(), 28 + json_length + word(20 + json_length));
+    }
+
+    #[test]
+    fn accessors_are_aligned_and_say_their_true_bounds() {
+        let parsed = gltf::Gltf::from_slice(&sample()).unwrap();
+        let binary = parsed.blob.as_deref().unwrap();
+        for accessor in parsed.accessors() {
+            let view = accessor.view().unwrap();
+            assert_eq!((view.offset() % 4, accessor.offset()), (0, 0));
+            assert_eq!(view.length(), accessor.count() * accessor.size());
+        }
+        for view in parsed.views() {
+            assert!(view.offset() + view.length() <= binary.len());
+        }
+        for primitive in parsed.meshes().flat_map(|m| m.primitives()) {
+            let accessor = primitive.get(&gltf::Semantic::Positions).unwrap();
+            let positions: Vec<Vec3> = floats::<3>(binary, &accessor).into_iter().map(Vec3::from).collect();
+            let lower = positions.iter().copied().reduce(Vec3::min).unwrap();
+            let upper = positions.iter().copied().reduce(Vec3::max).unwrap();
+            assert_eq!(accessor.min().unwrap(), json!(lower.to_array()));
+            assert_eq!(accessor.max().unwrap(), json!(upper.to_array()));
+            for set in [0, 1] {
+                let uvs = primitive.get(&gltf::Semantic::TexCoords(set)).unwrap();
+                assert_eq!(uvs.count(), positions.len());
+            }
+        }
+    }
+
+    #[test]
+    fn there_is_a_primitive_per_page_and_material() {
+        let parsed = gltf::Gltf::from_slice(&sample()).unwrap();
+        let primitives: Vec<_> = parsed.meshes().flat_map(|m| m.primitives()).collect();
+        let found: Vec<_> = primitives
+            .iter()
+            .map(|p| {
+                let pbr = p.material().pbr_metallic_roughness();
+                let texture = pbr.base_color_texture().map(|t| (t.texture().index(), t.tex_coord()));
+                let vertices = p.get(&gltf::Semantic::Positions).unwrap().count();
+                (texture, pbr.base_color_factor()[0], p.indices().unwrap().count(), vertices)
+            })
+            .collect();
+        // The quad's triangles share two vertices; the degenerate triangle is gone.
+        let expected =
+            [(Some((0, 1)), 0.1, 6, 4), (Some((1, 1)), 0.4, 3, 3), (Some((1, 1)), 0.5, 3, 3), (None, 0.1, 3, 3)];
+        assert_eq!(found, expected);
+        let materials: Vec<_> = primitives.iter().map(|p| p.material()).collect();
+        assert_eq!([0, 1, 2, 3].map(|i| materials[i].unlit()), [true, true, false, true]);
+        assert_eq!([0, 1, 2, 3].map(|i| materials[i].double_sided()), [false, true, false, false]);
+        assert_eq!((materials[2].emissive_factor(), materials[2].emissive_strength()), ([1.0, 0.5, 0.0], Some(10.0)));
+    }
+
+    #[test]
+    fn pages_are_embedded_as_png() {
+        let parsed = gltf::Gltf::from_slice(&sample()).unwrap();
+        let binary = parsed.blob.as_deref().unwrap();
+        for (texture, color) in parsed.textures().zip(PAGE_COLORS) {
+            let gltf::image::Source::View { view, mime_type } = texture.source().source() else { panic!() };
+            assert_eq!(mime_type, "image/png");
+            let png = &binary[view.offset()..view.offset() + view.length()];
+            let image = ::image::load_from_memory(png).unwrap().into_rgb8();
+            assert_eq!((image.dimensions(), image.get_pixel(1, 1).0), ((2, 2), color));
+        }
+        assert_eq!(parsed.textures().len(), 2);
+    }
+
+    #[test]
+    fn what_was_written_reads_back() {
+        let (scene, lightmap) = scene_and_lightmap();
+        let (back, info) = load_bytes("a.glb", encode_glb(&scene, &lightmap).unwrap()).unwrap();
+        let given = |m: usize, t: usize| scene.meshes()[m].corners(t);
+        assert_eq!(corners(&back), [given(0, 0), given(0, 1), given(0, 2), given(1, 0), given(1, 2)]);
+        assert_eq!(albedos(&back), [[0.1, 0.2, 0.3], [0.1, 0.2, 0.3], [0.4; 3], [0.5; 3], [0.1, 0.2, 0.3]]);
+        let mesh = &back.meshes()[0];
+        let lightmap_of = |mesh: &Mesh, t: usize| {
+            let l = mesh.lightmap.as_ref().unwrap();
+            mesh.indices[t].map(|v| l.uvs[v as usize].to_array())
+        };
+        assert_eq!(
+            [0, 1].map(|t| lightmap_of(mesh, t)),
+            [lightmap.meshes[0].corner_uvs[0], lightmap.meshes[0].corner_uvs[1]]
+        );
+        assert_eq!(mesh.uvs[mesh.indices[0][1] as usize], Vec2::new(1.1, 0.0) * 3.0);
+        let pages: Vec<_> = back.meshes().iter().map(|m| m.lightmap.as_ref().unwrap().pages.first().copied()).collect();
+        assert_eq!(pages, [None, Some(1), Some(1), None]);
+        assert!(info.warnings.is_empty());
+    }
+
+    #[test]
+    fn a_seam_in_the_light_map_splits_vertices() {
+        let (scene, mut lightmap) = scene_and_lightmap();
+        let count = |lightmap: &GlbLightmap| {
+            let file = encode_glb(&scene, lightmap).unwrap();
+            gltf::Gltf::from_slice(&file).unwrap().accessors().next().unwrap().count()
+        };
+        assert_eq!(count(&lightmap), 4);
+        lightmap.meshes[0].corner_uvs[1][0] = [0.6, 0.0];
+        assert_eq!(count(&lightmap), 5);
+    }
+
+    #[test]
+    fn light_maps_of_other_scenes_are_refused() {
+        let (scene, lightmap) = scene_and_lightmap();
+        let message = |change: fn(&mut GlbLightmap)| {
+            let mut lightmap = lightmap.clone();
+            change(&mut lightmap);
+            encode_glb(&scene, &lightmap).unwrap_err().to_string()
+        };
+        let pop = message(|l| drop(l.meshes.pop()));
+        assert_eq!(pop, "invalid argument: light map UVs of 1 meshes for 2");
+        assert!(message(|l| drop(l.meshes[1].pages.pop())).contains("mesh 1 has 3 triangles"));
+        assert!(message(|l| l.meshes[0].pages[2] = 2).contains("mesh 0 names page 2, there are 2"));
+        assert!(message(|l| l.meshes[0].corner_uvs[2][1][0] = f32::NAN).contains("NaN"));
+    }
+}

@@ -157,8 +157,8 @@ mod tests {
     #[test]
     fn the_curve_is_srgb_below_the_shoulder_and_monotonic_above() {
         assert_eq!(tone_map(1.0, [0.0; 3]), [0; 3]);
-        // 0.2140 is mid grey in sRGB: 0.5.
-        assert_eq!(tone_map(2.0, [0.107, 0.107, 0.107]), [128, 128, 128]);
+        // ((128/255 + 0.055) / 1.055)^2.4 = 0.21586.
+        assert_eq!(tone_map(2.0, [0.10793; 3]), [128; 3]);
         let levels: Vec<u8> = (0..1000).map(|i| tone_map(1.0, [i as f32 * 0.01; 3])[0]).collect();
         assert!(levels.is_sorted());
         assert_eq!(levels[999], 255);

@@ -281,3 +281,158 @@ impl PropertyAccess for Skipped {
         Skipped
     }
 }
+
+#[cfg(test)]
+pub(super) mod tests {
+    use super::*;
+    use crate::io::tests::{corners, load_bytes, refusal};
+    use crate::scene::SceneData;
+
+    const HEADER: &str = "comment a quad and a triangle
+element vertex 5
+property float x
+property float y
+property double z
+property uchar red
+property float nx
+property float ny
+property float nz
+property float s
+property float t
+element tag 1
+property list uchar short values
+element face 2
+property list uchar int vertex_indices
+property float quality
+end_header
+";
+
+    pub fn ascii_sample() -> Vec<u8> {
+        let body =
+            "0 0 0 255 0 0 2 0 0\n1 0 0 255 0 0 1 1 0\n1 1 0 255 0 0 1 1 1\n0 1 0 255 0 0 1 0 1\n0 0 1 255 0 0 1 0 0
+3 1 -2 3\n4 0 1 2 3 0.5\n3 0 1 4 0.5\n";
+        format!("ply\nformat ascii 1.0\n{HEADER}{body}").into()
+    }
+
+    pub fn binary_sample(little: bool) -> Vec<u8> {
+        let order = if little { "little" } else { "big" };
+        let mut bytes = format!("ply\nformat binary_{order}_endian 1.0\n{HEADER}").into_bytes();
+        let mut put = |big: &[u8]| match little {
+            true => bytes.extend(big.iter().rev()),
+            false => bytes.extend(big),
+        };
+        for (i, p) in
+            [[0f32, 0.0, 0.0], [1.0, 0.0, 0.0], [1.0, 1.0, 0.0], [0.0, 1.0, 0.0], [0.0, 0.0, 1.0]].iter().enumerate()
+        {
+            put(&p[0].to_be_bytes());
+            put(&p[1].to_be_bytes());
+            put(&f64::from(p[2]).to_be_bytes());
+            put(&[255]);
+            for x in [0.0, 0.0, if i == 0 { 2.0 } else { 1.0 }, p[0], p[1]] {
+                put(&f32::to_be_bytes(x));
+            }
+        }
+        put(&[3]);
+        [1i16, -2, 3].iter().for_each(|v| put(&v.to_be_bytes()));
+        for face in [&[0i32, 1, 2, 3][..], &[0, 1, 4]] {
+            put(&[face.len() as u8]);
+            face.iter().for_each(|v| put(&v.to_be_bytes()));
+            put(&0.5f32.to_be_bytes());
+        }
+        bytes
+    }
+
+    #[test]
+    fn all_encodings_read_the_same() {
+        let (scene, info) = load_bytes("a.ply", ascii_sample()).unwrap();
+        let mesh = &scene.meshes()[0];
+        assert_eq!(mesh.indices, [[0, 1, 2], [0, 2, 3], [0, 1, 4]]);
+        assert_eq!(corners(&scene)[2], [Vec3::ZERO, Vec3::X, Vec3::Z]);
+        assert_eq!(mesh.normals, [Vec3::Z; 5]);
+        assert_eq!(mesh.uvs[2], Vec2::ONE);
+        assert_eq!((info.faces_triangulated, info.materials, info.vertices), (1, 1, 5));
+        assert_eq!(scene.materials()[0].albedo, [DEFAULT_ALBEDO; 3]);
+        assert_eq!(scene.materials()[0].two_sided, TWO_SIDED_UNLESS_SAID);
+        for little in [true, false] {
+            let (binary, _) = load_bytes("a.ply", binary_sample(little)).unwrap();
+            assert_eq!(binary.meshes(), scene.meshes());
+        }
+    }
+
+    fn simple(vertices: &str, face_type: &str, faces: &str) -> String {
+        let (v, f) = (vertices.lines().count(), faces.lines().count());
+        format!(
+            "ply\nformat ascii 1.0\nelement vertex {v}\nproperty float x\nproperty float y\nproperty float z
+element face {f}\nproperty list {face_type} vertex_index\nend_header\n{vertices}{faces}"
+        )
+    }
+
+    const CORNERS: &str = "0 0 0\n1 0 0\n0 1 0\n";
+
+    #[test]
+    fn indices_may_have_any_integer_type() {
+        let indices = |t: &str| -> SceneData { load_bytes("a.ply", simple(CORNERS, t, "3 2 1 0\n")).unwrap().0 };
+        for t in ["uchar char", "int uchar", "uchar short", "uchar ushort", "uint int", "uchar uint32"] {
+            assert_eq!(indices(t).meshes()[0].indices, [[2, 1, 0]], "{t}");
+        }
+    }
+
+    #[test]
+    fn malformed_files_are_refused_with_the_place() {
+        let int = |faces: &str| refusal("a.ply", simple(CORNERS, "uchar int", faces));
+        assert_eq!(int("2 0 1\n"), "face 0 has 2 corners, fewer than 3");
+        assert_eq!(int("0\n"), "face 0 has 0 corners, fewer than 3");
+        assert_eq!(int("3 0 1 2\n3 0 1 -1\n"), "face 1 names vertex -1");
+        assert_eq!(int("3 0 1 3\n"), "a face names vertex 3, there are 3");
+        assert!(int("3 0 1\n").starts_with("line 13, face 0: "), "{}", int("3 0 1\n"));
+        assert!(int("3 0 1 x\n").starts_with("line 13, face 0: "));
+        assert_eq!(int(""), "there are no faces in it");
+        assert_eq!(
+            refusal("a.ply", simple("0 0 0\n1 nan 0\n0 1 0\n", "uchar int", "3 0 1 2\n")),
+            "vertex 1 is [1, NaN, 0], not finite or out of range"
+        );
+        assert_eq!(
+            refusal("a.ply", simple(CORNERS, "uchar int", "3 0 1 2\n").replace("face 1", "face 2")),
+            "line 14, face 1: the file ends here"
+        );
+        let float = refusal("a.ply", simple(CORNERS, "uchar float", "3 0 1 2\n"));
+        assert!(float.contains("vertex_index"), "{float}");
+    }
+
+    #[test]
+    fn impossible_headers_are_refused_before_memory_is_taken() {
+        let text = simple(CORNERS, "uchar int", "3 0 1 2\n");
+        let with = |from: &str, to: &str| refusal("a.ply", text.replace(from, to));
+        let bytes = text.len() + 12;
+        assert_eq!(
+            with("vertex 3", "vertex 3000000000000"),
+            format!("3000000000000 elements vertex do not fit into {bytes} bytes")
+        );
+        assert!(with("face 1", "face 18446744073709551615").contains("elements face do not fit"));
+        assert!(
+            with("face 1", "face 99999999999999999999").starts_with("Line 7: "),
+            "{}",
+            with("face 1", "face 99999999999999999999")
+        );
+        assert_eq!(with("property float y\n", ""), "the header has no vertex property y");
+        assert_eq!(with("element face", "element fact"), "the header has no element face");
+        assert_eq!(
+            with("list uchar int vertex_index", "int vertex_index"),
+            "the header has no face property list vertex_indices"
+        );
+        let empty = text.replace("end_header", "element nothing 99\nend_header");
+        assert_eq!(refusal("a.ply", empty), "the header's element nothing has no properties");
+        // A list that claims more than the file has.
+        let mut list = binary_sample(true);
+        let counts = String::from_utf8_lossy(&list).find("end_header\n").unwrap() + 11 + 5 * 37 + 1 + 6;
+        assert_eq!(list[counts], 4);
+        list[counts] = 255;
+        assert!(refusal("a.ply", &list).starts_with("face 0: "));
+    }
+
+    #[test]
+    fn an_empty_file_is_refused() {
+        assert!(refusal("a.ply", "").len() > 5);
+        assert!(refusal("a.ply", "ply\n").len() > 5);
+    }
+}
