@@ -57,8 +57,8 @@ impl Place {
         SurfacePoint::on_triangle(scene, self.triangle, self.u as f64, self.v as f64)
     }
 
-    fn sample(&self, map: &Lightmap) -> [f64; 3] {
-        map.sample(Layer::Combined, self.triangle, self.u, self.v).map(f64::from)
+    fn sample(&self, map: &Lightmap, layer: Layer) -> [f64; 3] {
+        map.sample(layer, self.triangle, self.u, self.v).map(f64::from)
     }
 }
 
@@ -115,14 +115,16 @@ fn the_cornell_box_agrees_with_the_path_tracer_to_three_percent_without_bias() {
     let map = baked("cornell");
     let reference = cornell_reference();
     let totals: Vec<[f64; 3]> = reference.iter().map(|(_, e)| e.total()).collect();
-    let errors: Vec<[f64; 3]> = reference
-        .iter()
-        .zip(&totals)
-        .map(|((place, _), total)| {
-            let baked = place.sample(&map);
-            std::array::from_fn(|c| baked[c] - total[c])
-        })
-        .collect();
+    let errors_of = |layer, expected: fn(&Irradiance) -> [f64; 3]| -> Vec<[f64; 3]> {
+        let error = |(place, e): &(Place, Irradiance)| {
+            let (baked, expected) = (place.sample(&map, layer), expected(e));
+            std::array::from_fn(|c| baked[c] - expected[c])
+        };
+        reference.iter().map(error).collect()
+    };
+    let errors = errors_of(Layer::Combined, Irradiance::total);
+    let direct = errors_of(Layer::Direct, |e| e.direct);
+    let indirect = errors_of(Layer::Indirect, |e| e.indirect);
 
     // Triangles in the order of `cornell`: five quads of the room, then the blocks.
     let class = |p: &Place| match p.triangle {
@@ -130,19 +132,23 @@ fn the_cornell_box_agrees_with_the_path_tracer_to_three_percent_without_bias() {
         10..22 => "short block",
         _ => "tall block",
     };
-    println!("{:12} {:>6} {:>8} {:>8} {:>8}", "surface", "points", "mean E", "bias", "RMSE");
-    for name in ["floor", "ceiling", "back wall", "green wall", "red wall", "short block", "tall block"] {
-        let of_class = |values: &[[f64; 3]]| -> Vec<[f64; 3]> {
-            values.iter().zip(reference).filter(|(_, (p, _))| class(p) == name).map(|(v, _)| *v).collect()
+    println!("Errors relative to the mean irradiance of the surface:");
+    println!("{:12} {:>6} {:>8} {:>8} {:>8} {:>8} {:>8}", "", "points", "mean E", "bias", "direct", "indirect", "RMSE");
+    let row = |name: &str, belongs: &dyn Fn(&Place) -> bool| -> (f64, f64) {
+        let select = |values: &[[f64; 3]]| -> Vec<[f64; 3]> {
+            values.iter().zip(reference).filter(|(_, (p, _))| belongs(p)).map(|(v, _)| *v).collect()
         };
-        let (e, t) = (of_class(&errors), of_class(&totals));
-        let (level, rmse) = (mean(&t), mean(&squares(&e)).sqrt());
-        let (bias, relative) = (100.0 * mean(&e) / level, 100.0 * rmse / level);
-        println!("{name:12} {:6} {level:8.3} {bias:7.2}% {relative:7.2}%", e.len());
+        let (e, level) = (select(&errors), mean(&select(&totals)));
+        let bias = |values: &[[f64; 3]]| mean(&select(values)) / level;
+        let rmse = mean(&squares(&e)).sqrt() / level;
+        let percent = [bias(&errors), bias(&direct), bias(&indirect), rmse].map(|x| format!("{:7.2}%", 100.0 * x));
+        println!("{name:12} {:6} {level:8.3} {}", e.len(), percent.join(" "));
+        (bias(&errors), rmse)
+    };
+    for name in ["floor", "ceiling", "back wall", "green wall", "red wall", "short block", "tall block"] {
+        row(name, &|p| class(p) == name);
     }
-    let level = mean(&totals);
-    let (bias, rmse) = (mean(&errors) / level, mean(&squares(&errors)).sqrt() / level);
-    println!("all: bias {:.2} %, RMSE {:.2} %", 100.0 * bias, 100.0 * rmse);
+    let (bias, rmse) = row("all", &|_| true);
     assert!(rmse <= 0.03, "the relative RMSE is {rmse}");
     // Three times what 200 points of 3 % error would scatter.
     assert!(bias.abs() <= 0.0065, "the bias is {bias}");
@@ -160,7 +166,7 @@ fn a_furnace_glows_at_its_emission_over_one_minus_its_reflectance() {
     let mut random = Random::new(3, 0);
     let errors: Vec<[f64; 3]> = (0..scene.triangle_count())
         .flat_map(|t| (0..50).map(move |_| t))
-        .map(|t| Place::random_on(t, &mut random).sample(&map).map(|e| e / expected - 1.0))
+        .map(|t| Place::random_on(t, &mut random).sample(&map, Layer::Combined).map(|e| e / expected - 1.0))
         .collect();
     let worst = errors.iter().flatten().fold(0.0, |w: f64, e| w.max(e.abs()));
     let (bias, rmse) = (mean(&errors), mean(&squares(&errors)).sqrt());
@@ -190,7 +196,7 @@ fn no_light_enters_a_sealed_box() {
     let mut random = Random::new(4, 0);
     for triangle in inside {
         for _ in 0..100 {
-            assert_eq!(Place::random_on(triangle, &mut random).sample(&map), [0.0; 3]);
+            assert_eq!(Place::random_on(triangle, &mut random).sample(&map, Layer::Combined), [0.0; 3]);
         }
     }
 }
