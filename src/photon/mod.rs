@@ -18,7 +18,7 @@ mod spot;
 mod trace;
 
 use crate::error::{Error, Result, invalid_argument};
-use crate::memory::Reservation;
+use crate::memory::{MemoryMonitor, Reservation, try_vec};
 use crate::progress::Progress;
 use crate::scene::Scene;
 use crate::trace::Ray;
@@ -26,7 +26,7 @@ use estimate::{Cylinder, EstimateFn};
 use glam::Vec3;
 use grid::Grid;
 use rayon::prelude::*;
-use std::sync::Arc;
+use std::sync::{Arc, OnceLock};
 use std::time::Instant;
 
 /// The most photons that can be emitted: their numbers are 32-bit.
@@ -141,6 +141,36 @@ pub struct PhotonView<'a> {
     pub normal: [&'a [f32]; 3],
 }
 
+/// The stored photons as packed triples.
+pub struct PackedPhotons {
+    /// In scene units.
+    pub position: Vec<[f32; 3]>,
+    /// Unit directions of travel.
+    pub direction: Vec<[f32; 3]>,
+    /// W per channel.
+    pub power: Vec<[f32; 3]>,
+    _memory: Reservation,
+}
+
+impl PackedPhotons {
+    fn new(view: PhotonView, monitor: &Arc<MemoryMonitor>) -> Result<Self> {
+        let memory = monitor.reserve(view.len() * 36, "packed photons")?;
+        let pack = |columns: [&[f32]; 3]| -> Result<Vec<[f32; 3]>> {
+            let mut packed = try_vec(view.len(), "packed photons")?;
+            for (i, p) in packed.iter_mut().enumerate() {
+                *p = columns.map(|c| c[i]);
+            }
+            Ok(packed)
+        };
+        Ok(PackedPhotons {
+            position: pack(view.position)?,
+            direction: pack(view.direction)?,
+            power: pack(view.power)?,
+            _memory: memory,
+        })
+    }
+}
+
 impl PhotonView<'_> {
     /// Number of photons.
     pub fn len(&self) -> usize {
@@ -163,6 +193,7 @@ pub struct PhotonMap {
     grid: Grid,
     cylinder: Cylinder,
     kernel: EstimateFn,
+    packed: OnceLock<PackedPhotons>,
     _memory: Reservation,
 }
 
@@ -210,6 +241,7 @@ impl PhotonMap {
                 grid,
                 cylinder: Cylinder::new(radius, params.half_height, params.cone_k),
                 kernel: estimate::kernel(scene.device().isa()),
+                packed: OnceLock::new(),
                 _memory: memory,
             })
         })
@@ -230,7 +262,7 @@ impl PhotonMap {
         self.cylinder.radius
     }
 
-    /// Bytes held.
+    /// Bytes held, without the copy that [`photons`](Self::photons) makes.
     pub fn bytes(&self) -> usize {
         self.grid.bytes()
     }
@@ -279,9 +311,20 @@ impl PhotonMap {
         (self.kernel)(&self.grid, &self.cylinder, positions, normals, out);
     }
 
-    /// The stored photons.
-    pub fn photons(&self) -> PhotonView<'_> {
+    /// The stored photons as the kernels see them, without a copy.
+    pub fn columns(&self) -> PhotonView<'_> {
         self.grid.photons.view()
+    }
+
+    /// The stored photons as packed triples, in the order of [`columns`](Self::columns). The first
+    /// call makes the copy, which the map then keeps; `OutOfMemory` if the monitor refuses it.
+    pub fn photons(&self) -> Result<&PackedPhotons> {
+        if let Some(packed) = self.packed.get() {
+            return Ok(packed);
+        }
+        let packed = PackedPhotons::new(self.columns(), self.scene.device().memory())?;
+        // Of two threads that come here at once, one keeps its copy.
+        Ok(self.packed.get_or_init(|| packed))
     }
 }
 

@@ -87,7 +87,7 @@ fn assert_close(found: f64, expected: f64, tolerance: f64) {
 }
 
 fn stored_power(map: &PhotonMap) -> [f64; 3] {
-    map.photons().power.map(|c| c.iter().map(|&x| x as f64).sum())
+    map.columns().power.map(|c| c.iter().map(|&x| x as f64).sum())
 }
 
 #[test]
@@ -200,7 +200,7 @@ fn two_sided_emitters_light_both_sides_with_double_power() {
     data.add_mesh(Mesh { positions, indices: vec![[0, 1, 2]], materials, ..Default::default() }).unwrap();
     let map = trace(&commit(data), PhotonParams { photon_count: 100_000, radius: 0.1, ..Default::default() });
     assert_close(map.stats().emitted_power[0], 2.0 * PI * 2.0 * 0.02, 1e-5);
-    let photons = map.photons();
+    let photons = map.columns();
     let above = photons.position[2].iter().filter(|&&z| z > 0.5).count() as f64;
     assert_close(above, 0.5 * photons.len() as f64, 0.001);
 }
@@ -263,7 +263,7 @@ fn the_same_seed_gives_the_same_bits_for_any_number_of_threads() {
         .map(|threads| {
             let scene = commit_on(&device(threads), cornell_like());
             let map = trace(&scene, PhotonParams { photon_count: 20_000, seed: 5, ..Default::default() });
-            let v = map.photons();
+            let v = map.columns();
             let columns = [v.position, v.direction, v.power, v.normal].map(|g| g.map(|c| c.to_vec()));
             let points: Vec<[f32; 3]> =
                 (0..2000).map(|i| [v.position[0][i], v.position[1][i], v.position[2][i]]).collect();
@@ -279,10 +279,23 @@ fn the_same_seed_gives_the_same_bits_for_any_number_of_threads() {
 }
 
 #[test]
+fn packed_photons_are_the_columns_row_by_row() {
+    let map = trace(&commit(cornell_like()), PhotonParams { photon_count: 100, ..Default::default() });
+    let (packed, columns) = (map.photons().unwrap(), map.columns());
+    assert_eq!(packed.position.len(), columns.len());
+    for i in 0..columns.len() {
+        assert_eq!(packed.position[i], columns.position.map(|c| c[i]));
+        assert_eq!(packed.direction[i], columns.direction.map(|c| c[i]));
+        assert_eq!(packed.power[i], columns.power.map(|c| c[i]));
+    }
+    assert!(std::ptr::eq(packed, map.photons().unwrap()), "copied once");
+}
+
+#[test]
 fn another_seed_gives_other_photons_and_the_same_light() {
     let scene = commit(cornell_like());
     let maps = [1, 2].map(|seed| trace(&scene, PhotonParams { photon_count: 100_000, seed, ..Default::default() }));
-    assert_ne!(maps[0].photons().position[0][..100], maps[1].photons().position[0][..100]);
+    assert_ne!(maps[0].columns().position[0][..100], maps[1].columns().position[0][..100]);
     for c in 0..3 {
         assert_close(stored_power(&maps[0])[c], stored_power(&maps[1])[c], 0.01);
     }
@@ -296,7 +309,7 @@ fn a_sealed_box_in_a_lit_room_is_exactly_dark_inside() {
     add_box(&mut data, both, lower, upper, false);
     let map = trace(&commit(data), PhotonParams { photon_count: 300_000, radius: 0.1, ..Default::default() });
     assert_eq!(map.stats().escaped_power, [0.0; 3]);
-    let v = map.photons();
+    let v = map.columns();
     let (mut outside, centre) = (0, (lower + upper) * 0.5);
     for i in 0..v.len() {
         let at = |v: [&[f32]; 3]| Vec3::new(v[0][i], v[1][i], v[2][i]);
@@ -363,7 +376,7 @@ fn direct_and_indirect_photons_add_up_to_all() {
 fn the_automatic_radius_finds_the_documented_number_of_photons() {
     for photon_count in [3_000, 200_000] {
         let map = trace(&commit(cornell_like()), PhotonParams { photon_count, ..Default::default() });
-        let (v, r) = (map.photons(), map.radius());
+        let (v, r) = (map.columns(), map.radius());
         // Where a random point of the floor, a wall or the block lies.
         let mut found = 0;
         let faces = [
@@ -421,7 +434,7 @@ fn a_scene_without_lights_is_an_error_and_dark_lights_make_an_empty_map() {
     data.add_light(Light::Point { position: Vec3::ONE, intensity: [0.0; 3] }).unwrap();
     let map = trace(&commit(data), params);
     assert_eq!((map.stats().emitted, map.stats().stored), (0, 0));
-    assert!(map.photons().is_empty());
+    assert!(map.columns().is_empty());
     assert_eq!(map.estimate(Vec3::ZERO, Vec3::Z), [0.0; 3]);
 }
 
@@ -448,6 +461,7 @@ fn all_memory_is_accounted_for_and_given_back() {
     let map = trace(&scene, PhotonParams { photon_count: 50_000, ..Default::default() });
     assert_eq!(device.memory().current() - before, map.bytes() as i64);
     assert!(map.bytes() > limit);
+    assert_eq!(map.photons().unwrap().power.len(), map.columns().len());
     drop(map);
     let refused = PhotonParams { photon_count: 1_000_000, max_bounces: 4, ..Default::default() };
     let error = PhotonMap::trace(&scene, &refused, &Progress::none()).err().unwrap();

@@ -221,7 +221,7 @@ impl<'a> Tracer<'a> {
         let point = SurfacePoint::new(mesh.corners(triangle as usize), hit.u, hit.v, self.scene);
         let direction = Vec3::from_array(ray.direction);
         let mut normal = point.normal;
-        if direction.dot(normal) > 0.0 {
+        if !hit.front {
             if !material.two_sided {
                 tally.absorbed += power;
                 return None;
