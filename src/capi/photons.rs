@@ -149,21 +149,21 @@ pub struct bk_photon_view {
     pub radius: f32,
     /// Number of stored photons.
     pub count: usize,
-    /// x, y and z of the positions, count floats each.
-    pub position: [*const f32; 3],
-    /// x, y and z of the unit directions of travel, count floats each.
-    pub direction: [*const f32; 3],
-    /// Red, green and blue power in W, count floats each.
-    pub power: [*const f32; 3],
+    /// count times three floats, packed: where it lies.
+    pub position: *const f32,
+    /// count times three floats, packed: unit direction of travel.
+    pub direction: *const f32,
+    /// count times three floats, packed: power in W.
+    pub power: *const f32,
 }
 
-sized_struct!(bk_photon_view, last: power: [*const f32; 3], defaults: bk_photon_view {
+sized_struct!(bk_photon_view, last: power: *const f32, defaults: bk_photon_view {
     struct_size: size_of::<bk_photon_view>() as u32,
     radius: 0.0,
     count: 0,
-    position: [std::ptr::null(); 3],
-    direction: [std::ptr::null(); 3],
-    power: [std::ptr::null(); 3],
+    position: std::ptr::null(),
+    direction: std::ptr::null(),
+    power: std::ptr::null(),
 });
 
 /// Sets struct_size and clears the rest.
@@ -181,15 +181,15 @@ pub unsafe extern "C" fn bk_photon_view_init(view: *mut bk_photon_view) {
 pub unsafe extern "C" fn bk_photon_map_photons(map: *const bk_photon_map, out: *mut bk_photon_view) -> bk_result {
     call(|| {
         let map = &object!(map).map;
-        let photons = map.photons();
+        let photons = map.photons()?;
         // SAFETY: out is the caller's, or NULL.
         unsafe { OutStruct::new(out, "out") }?.write(bk_photon_view {
             struct_size: 0,
             radius: map.radius(),
-            count: photons.len(),
-            position: photons.position.map(<[f32]>::as_ptr),
-            direction: photons.direction.map(<[f32]>::as_ptr),
-            power: photons.power.map(<[f32]>::as_ptr),
+            count: photons.position.len(),
+            position: photons.position.as_ptr().cast(),
+            direction: photons.direction.as_ptr().cast(),
+            power: photons.power.as_ptr().cast(),
         });
         Ok(())
     })
