@@ -6,6 +6,7 @@ use crate::memory::{MemoryFn, MemoryMonitor};
 use crate::simd::Isa;
 use crate::trace::Kernels;
 use std::sync::Arc;
+use std::thread::JoinHandle;
 
 /// How much a log message matters.
 #[derive(Clone, Copy, Debug, PartialEq, Eq, PartialOrd, Ord)]
@@ -36,8 +37,12 @@ pub struct DeviceOptions {
 }
 
 /// Threads, kernels and accounts that scenes and bakes share.
+///
+/// Dropping the device joins its threads.
 pub struct Device {
-    pool: rayon::ThreadPool,
+    /// `Some` until dropped.
+    pool: Option<rayon::ThreadPool>,
+    threads: Vec<JoinHandle<()>>,
     kernels: &'static Kernels,
     log: Option<Box<LogFn>>,
     memory: Arc<MemoryMonitor>,
@@ -53,13 +58,19 @@ impl Device {
         if !isa.is_available() {
             return Err(Error::Unsupported(format!("this machine cannot run {}", isa.name())));
         }
+        let mut threads = Vec::new();
         let pool = rayon::ThreadPoolBuilder::new()
             .num_threads(options.num_threads)
-            .thread_name(|i| format!("bakelite-{i}"))
+            .spawn_handler(|worker| {
+                let name = format!("bakelite-{}", worker.index());
+                threads.push(std::thread::Builder::new().name(name).spawn(|| worker.run())?);
+                Ok(())
+            })
             .build()
             .map_err(|e| Error::OutOfMemory(format!("the worker threads could not be started: {e}")))?;
         Ok(Arc::new(Device {
-            pool,
+            pool: Some(pool),
+            threads,
             kernels: Kernels::for_isa(isa),
             log: options.log,
             memory: Arc::new(MemoryMonitor::new(options.memory)),
@@ -73,12 +84,12 @@ impl Device {
 
     /// The number of worker threads.
     pub fn num_threads(&self) -> usize {
-        self.pool.current_num_threads()
+        self.threads.len()
     }
 
     /// Runs `f` on the device's threads; rayon calls inside use them alone.
     pub fn install<R: Send>(&self, f: impl FnOnce() -> R + Send) -> R {
-        self.pool.install(f)
+        self.pool.as_ref().expect("there until dropped").install(f)
     }
 
     /// Sends a message to the log callback.
@@ -98,9 +109,56 @@ impl Device {
     }
 }
 
+impl Drop for Device {
+    fn drop(&mut self) {
+        drop(self.pool.take());
+        // A callback may drop the last reference on one of the threads, which cannot join itself.
+        let this = std::thread::current().id();
+        for thread in self.threads.drain(..).filter(|t| t.thread().id() != this) {
+            let _ = thread.join();
+        }
+    }
+}
+
 #[cfg(test)]
 mod tests {
     use super::*;
+    use std::cell::RefCell;
+    use std::sync::atomic::{AtomicU32, Ordering::SeqCst};
+
+    #[test]
+    fn dropping_a_device_joins_its_threads() {
+        struct CountsOnDrop(Arc<AtomicU32>);
+        impl Drop for CountsOnDrop {
+            fn drop(&mut self) {
+                std::thread::sleep(std::time::Duration::from_millis(20));
+                self.0.fetch_add(1, SeqCst);
+            }
+        }
+        thread_local!(static AT_EXIT: RefCell<Option<CountsOnDrop>> = const { RefCell::new(None) });
+        let ended = Arc::new(AtomicU32::new(0));
+        let device = Device::new(DeviceOptions { num_threads: 3, ..Default::default() }).unwrap();
+        let pool = device.pool.as_ref().unwrap();
+        pool.broadcast(|_| AT_EXIT.with(|c| *c.borrow_mut() = Some(CountsOnDrop(ended.clone()))));
+        drop(device);
+        assert_eq!(ended.load(SeqCst), 3);
+    }
+
+    #[test]
+    fn a_device_can_be_dropped_on_one_of_its_threads() {
+        let device = Device::new(DeviceOptions { num_threads: 2, ..Default::default() }).unwrap();
+        let (sender, receiver) = std::sync::mpsc::channel();
+        let last = device.clone();
+        device.pool.as_ref().unwrap().spawn(move || {
+            while Arc::strong_count(&last) > 1 {
+                std::thread::yield_now();
+            }
+            drop(last);
+            sender.send(()).unwrap();
+        });
+        drop(device);
+        receiver.recv().unwrap();
+    }
 
     #[test]
     fn an_absurd_thread_count_is_refused_by_name() {

@@ -4,12 +4,42 @@
 //! light, composition. What the scene does not need is not run.
 
 use super::args::{OutStruct, SizedStruct, init, read_struct, sized_struct, slice_mut};
-use super::device::{bk_progress_fn, progress};
+use super::device::{bk_progress_fn, progress, refuse_in_callback};
 use super::error::{bk_result, call, call_or};
 use super::handles::{hold, object};
 use super::lightmap::bk_lightmap;
+use crate::lightmap::plan::left_out;
 use crate::lightmap::{BakeParams, BakeStats, StageStats};
 use std::ffi::{c_char, c_void};
+
+/// Bit of left_out. No indirect light: no photons, radiance map and gather map.
+pub const BK_LEFT_OUT_INDIRECT: u32 = 1;
+/// Bit of left_out. No photons and no estimate: no light is reflected more than once.
+pub const BK_LEFT_OUT_PHOTONS: u32 = 2;
+/// Bit of left_out. No direct light: nothing shines.
+pub const BK_LEFT_OUT_DIRECT: u32 = 4;
+/// Bit of left_out. No sampling of area lights.
+pub const BK_LEFT_OUT_AREA_LIGHTS: u32 = 8;
+/// Bit of left_out. No radiance of back sides.
+pub const BK_LEFT_OUT_BACK_SIDES: u32 = 16;
+/// Bit of left_out. No blur of the gather map.
+pub const BK_LEFT_OUT_BLUR: u32 = 32;
+/// Bit of left_out. No unwrapping: all meshes bring usable coordinates.
+pub const BK_LEFT_OUT_UNWRAP: u32 = 64;
+/// Bit of left_out. No interpolation of shading normals.
+pub const BK_LEFT_OUT_SHADING_NORMALS: u32 = 128;
+
+// The numbers are literal for the header's sake.
+const _: () = assert!(
+    BK_LEFT_OUT_INDIRECT == left_out::INDIRECT
+        && BK_LEFT_OUT_PHOTONS == left_out::PHOTONS
+        && BK_LEFT_OUT_DIRECT == left_out::DIRECT
+        && BK_LEFT_OUT_AREA_LIGHTS == left_out::AREA_LIGHTS
+        && BK_LEFT_OUT_BACK_SIDES == left_out::BACK_SIDES
+        && BK_LEFT_OUT_BLUR == left_out::BLUR
+        && BK_LEFT_OUT_UNWRAP == left_out::UNWRAP
+        && BK_LEFT_OUT_SHADING_NORMALS == left_out::SHADING_NORMALS
+);
 
 /// How to bake.
 #[repr(C)]
@@ -17,17 +47,19 @@ use std::ffi::{c_char, c_void};
 pub struct bk_bake_params {
     /// Size of this structure in bytes, set by bk_bake_params_init.
     pub struct_size: u32,
-    /// Most surfaces that a photon meets; 0, the default: Russian roulette alone ends its path.
+    /// Most reflections of light before it reaches a texel; 0, the default: Russian roulette alone
+    /// decides.
     pub max_bounces: u32,
     /// Photons to emit. Default: 1,000,000.
     pub photon_count: u64,
-    /// Rays per texel of the gather map; 0: no indirect light. Default: 64.
+    /// Rays per texel of the gather map, at most 65536; 0: no indirect light. Default: 64.
     pub gather_rays: u32,
     /// Photon search radius in scene units; 0, the default: from the density of photons.
     pub radius: f32,
     /// Radius of the gather map's blur in its texels; 0: none. Default: 2.
     pub blur_radius: u32,
-    /// Shadow rays per light map texel and area light, >= 1. Default: 16.
+    /// Shadow rays per light map texel and area light, 1 to 4096 (of more than four area lights,
+    /// four times as many rays are shared out). Default: 16.
     pub direct_samples: u32,
     /// Seed of all random numbers. The same seed gives the same bits on any number of threads.
     /// Default: 0.
@@ -148,6 +180,7 @@ pub unsafe extern "C" fn bk_bake(
 ) -> bk_result {
     // SAFETY: params and out are the caller's, or NULL.
     call(|| unsafe {
+        refuse_in_callback()?;
         let lightmap = hold(lightmap, "lightmap")?;
         let p: bk_bake_params = if params.is_null() { SizedStruct::defaults() } else { read_struct(params, "params")? };
         let out = OutStruct::optional(out, "out")?;
@@ -171,7 +204,8 @@ pub unsafe extern "C" fn bk_bake(
     })
 }
 
-/// Describes in words what a bake of this light map runs, and what it leaves out and why.
+/// Describes in words what the last bake ran (before the first: what a bake with default parameters
+/// would run), and what it left out and why, one line each.
 ///
 /// dst: receives as much of the text (UTF-8) as fits, with a NUL; may be NULL if capacity is 0.
 /// capacity: bytes that dst has room for.
@@ -184,7 +218,7 @@ pub unsafe extern "C" fn bk_plan_describe(lightmap: *const bk_lightmap, dst: *mu
         let plan = object!(lightmap).read(|l| Ok(l.plan_text()))?;
         let dst = slice_mut(dst.cast::<u8>(), capacity, "dst", &[])?;
         if let Some(room) = capacity.checked_sub(1) {
-            let fits = plan.floor_char_boundary(room);
+            let fits = (0..=room.min(plan.len())).rev().find(|&i| plan.is_char_boundary(i)).unwrap_or(0);
             dst[..fits].copy_from_slice(&plan.as_bytes()[..fits]);
             dst[fits] = 0;
         }

@@ -7,17 +7,19 @@
 //! and NULL is ignored by both. What is made from an object keeps what it needs of it alive, so
 //! parents may be released first. Retaining and releasing is safe from any thread.
 //!
-//! Callbacks may run on any thread, must not throw or jump out, and may call the library, though
-//! not change (or release for good) the object whose call they are in: that is
-//! BK_ERROR_INVALID_STATE. Strings given to them are valid during the callback only.
+//! Callbacks may run on any thread and must not throw or jump out. They may call functions that do
+//! not work on a device's threads; the others (commit, create, bake, save, BK_RAYS_PARALLEL), and
+//! changes to the object whose call they are in, fail with BK_ERROR_INVALID_STATE. Strings given to
+//! callbacks are valid during the callback only.
 
 use super::args::{UserPointer, check_flags, init, read_struct, sized_struct, write};
 use super::error::{bk_result, c_string, call, call_or};
 use super::handles::{create, object, release, retain};
 use crate::device::{Device, DeviceOptions};
-use crate::error::{Result, invalid_argument};
+use crate::error::{Error, Result, invalid_argument};
 use crate::progress::Progress;
 use crate::simd::Isa;
+use std::cell::Cell;
 use std::ffi::{c_char, c_void};
 use std::sync::Arc;
 
@@ -162,12 +164,12 @@ fn options(desc: bk_device_desc) -> Result<DeviceOptions> {
     if let Some(log) = desc.log {
         options.log = Some(Box::new(move |level, message| {
             // SAFETY: the caller's function, with its own pointer, as documented.
-            unsafe { log(user.get(), level as u32, c_string(message).as_ptr()) }
+            in_callback(|| unsafe { log(user.get(), level as u32, c_string(message).as_ptr()) })
         }));
     }
     if let Some(memory) = desc.memory {
         // SAFETY: as above.
-        options.memory = Some(Box::new(move |bytes| unsafe { memory(user.get(), bytes) != 0 }));
+        options.memory = Some(Box::new(move |bytes| in_callback(|| unsafe { memory(user.get(), bytes) != 0 })));
     }
     Ok(options)
 }
@@ -179,7 +181,30 @@ pub(super) fn progress<'a>(callback: bk_progress_fn, user: *mut c_void) -> Progr
         None => Progress::none(),
         Some(callback) => Progress::new(move |fraction, stage| {
             // SAFETY: the caller's function, with its own pointer, as documented.
-            unsafe { callback(user.get(), fraction, c_string(stage).as_ptr()) != 0 }
+            in_callback(|| unsafe { callback(user.get(), fraction, c_string(stage).as_ptr()) != 0 })
         }),
     }
+}
+
+thread_local! {
+    /// Callbacks that this thread is in.
+    static CALLBACK_DEPTH: Cell<u32> = const { Cell::new(0) };
+}
+
+/// Runs a callback of the caller's.
+fn in_callback<R>(callback: impl FnOnce() -> R) -> R {
+    CALLBACK_DEPTH.set(CALLBACK_DEPTH.get() + 1);
+    let result = callback();
+    CALLBACK_DEPTH.set(CALLBACK_DEPTH.get() - 1);
+    result
+}
+
+/// Refuses to start work on a device's threads from a callback: while it waits, the thread would
+/// take up other work of the call that it is in, and report its progress to a callback that has not
+/// returned yet.
+pub(super) fn refuse_in_callback() -> Result<()> {
+    if CALLBACK_DEPTH.get() == 0 {
+        return Ok(());
+    }
+    Err(Error::InvalidState("a callback must not start work on a device's threads".into()))
 }

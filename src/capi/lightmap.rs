@@ -8,11 +8,11 @@
 //! or a second bake, fails with BK_ERROR_INVALID_STATE.
 
 use super::args::{OutStruct, SizedStruct, init, read_struct, sized_struct, slice_mut, write};
-use super::device::{bk_progress_fn, progress};
+use super::device::{bk_progress_fn, progress, refuse_in_callback};
 use super::error::{bk_result, call, call_or};
 use super::handles::{create, hold, object, release, retain};
 use super::scene::bk_scene;
-use crate::error::{Error, Result, invalid_argument};
+use crate::error::{Error, Result};
 use crate::lightmap::{Lightmap, LightmapDesc, LightmapInfo};
 use std::ffi::c_void;
 use std::sync::{RwLock, TryLockError};
@@ -58,12 +58,12 @@ pub struct bk_lightmap_desc {
     pub texels_per_unit: f32,
     /// Width and height of a page in texels, 16 to 16384. Default: 1024.
     pub page_size: u32,
-    /// Texels around each chart that filtering may read, >= 1. Default: 2.
+    /// Texels around each chart that filtering may read, 1 to 64. Default: 2.
     pub padding: u32,
-    /// Light map texels per texel of the gather map (indirect light), along each axis, >= 1.
+    /// Light map texels per texel of the gather map (indirect light), along each axis, 1 to 64.
     /// Default: 4.
     pub gather_divisor: u32,
-    /// Light map texels per texel of the radiance map (what gather rays see), along each axis, >= 1.
+    /// Light map texels per texel of the radiance map (what gather rays see), along each axis, 1 to 64.
     /// Default: 8.
     pub radiance_divisor: u32,
 }
@@ -105,6 +105,7 @@ pub unsafe extern "C" fn bk_lightmap_create(
     // SAFETY: desc and out are the caller's, or NULL.
     call(|| unsafe {
         write(out, std::ptr::null_mut(), "out")?;
+        refuse_in_callback()?;
         let scene = hold(scene, "scene")?;
         let d: bk_lightmap_desc = if desc.is_null() { SizedStruct::defaults() } else { read_struct(desc, "desc")? };
         let desc = LightmapDesc {
@@ -237,13 +238,7 @@ pub unsafe extern "C" fn bk_lightmap_mesh_uvs(
 ) -> bk_result {
     // SAFETY: the arrays are the caller's, or NULL.
     call(|| unsafe {
-        let (uvs, pages) = object!(lightmap).read(|l| {
-            let meshes = l.scene().meshes().len();
-            if mesh as usize >= meshes {
-                return invalid_argument!("mesh {mesh} does not exist, the scene has {meshes}");
-            }
-            l.mesh_uvs(mesh)
-        })?;
+        let (uvs, pages) = object!(lightmap).read(|l| l.mesh_uvs(mesh))?;
         if !out_corner_uvs.is_null() {
             slice_mut(out_corner_uvs.cast(), uvs.len(), "out_corner_uvs", &[])?.copy_from_slice(&uvs);
         }

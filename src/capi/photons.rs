@@ -6,7 +6,7 @@
 //! safe from any threads.
 
 use super::args::{OutStruct, SizedStruct, check_flags, init, read_struct, sized_struct, slice, slice_mut, write};
-use super::device::{bk_progress_fn, progress};
+use super::device::{bk_progress_fn, progress, refuse_in_callback};
 use super::error::{bk_result, call, call_or};
 use super::handles::{create, hold, object, release, retain};
 use super::scene::bk_scene;
@@ -87,6 +87,7 @@ pub unsafe extern "C" fn bk_photon_map_create(
     // SAFETY: params and out are the caller's, or NULL.
     call(|| unsafe {
         write(out, std::ptr::null_mut(), "out")?;
+        refuse_in_callback()?;
         let scene = hold(scene, "scene")?;
         let params = if params.is_null() { SizedStruct::defaults() } else { read_struct(params, "params")? };
         let params = core_params(&params)?;

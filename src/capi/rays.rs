@@ -7,9 +7,11 @@
 //! nothing.
 
 use super::args::{check_flags, read_vec3, slice, slice_mut, write};
+use super::device::refuse_in_callback;
 use super::error::{BK_NONE, bk_result, call, call_or};
 use super::handles::object;
 use super::scene::bk_scene;
+use crate::error::Result;
 use crate::trace::{Hit, Ray};
 use bytemuck::{Pod, Zeroable, cast_slice, cast_slice_mut};
 
@@ -92,10 +94,10 @@ pub unsafe extern "C" fn bk_intersect_many(
     // SAFETY: rays and out are the caller's, or NULL.
     call(|| unsafe {
         let scene = object!(scene).committed()?;
-        check_flags(flags, BK_RAYS_COHERENT | BK_RAYS_PARALLEL, "flags")?;
+        let parallel = parallel(flags, BK_RAYS_COHERENT | BK_RAYS_PARALLEL)?;
         let rays = slice(rays, count, "rays")?;
         let out = slice_mut(out, count, "out", &[(cast_slice(rays), "rays")])?;
-        scene.intersect_many(cast_slice(rays), flags & BK_RAYS_PARALLEL != 0, cast_slice_mut(out))
+        scene.intersect_many(cast_slice(rays), parallel, cast_slice_mut(out))
     })
 }
 
@@ -114,10 +116,10 @@ pub unsafe extern "C" fn bk_occluded_many(
     // SAFETY: rays and out are the caller's, or NULL.
     call(|| unsafe {
         let scene = object!(scene).committed()?;
-        check_flags(flags, BK_RAYS_COHERENT | BK_RAYS_PARALLEL, "flags")?;
+        let parallel = parallel(flags, BK_RAYS_COHERENT | BK_RAYS_PARALLEL)?;
         let rays = slice(rays, count, "rays")?;
         let out = slice_mut(out, count, "out", &[(cast_slice(rays), "rays")])?;
-        scene.occluded_many(cast_slice(rays), flags & BK_RAYS_PARALLEL != 0, out)
+        scene.occluded_many(cast_slice(rays), parallel, out)
     })
 }
 
@@ -140,10 +142,20 @@ pub unsafe extern "C" fn bk_gather(
     // SAFETY: origin, directions and out are the caller's, or NULL.
     call(|| unsafe {
         let scene = object!(scene).committed()?;
-        check_flags(flags, BK_RAYS_PARALLEL, "flags")?;
+        let parallel = parallel(flags, BK_RAYS_PARALLEL)?;
         let origin = read_vec3(origin, "origin")?;
         let directions = slice(directions.cast::<[f32; 3]>(), count, "directions")?;
         let out = slice_mut(out, count, "out", &[(cast_slice(directions), "directions")])?;
-        scene.gather(origin, directions, tmax, flags & BK_RAYS_PARALLEL != 0, cast_slice_mut(out))
+        scene.gather(origin, directions, tmax, parallel, cast_slice_mut(out))
     })
+}
+
+/// Checks the flags; whether they ask for the device's threads.
+fn parallel(flags: u32, known: u32) -> Result<bool> {
+    check_flags(flags, known, "flags")?;
+    let parallel = flags & BK_RAYS_PARALLEL != 0;
+    if parallel {
+        refuse_in_callback()?;
+    }
+    Ok(parallel)
 }

@@ -1,6 +1,7 @@
 //! Reading and saving light maps
 
 use super::args::text;
+use super::device::refuse_in_callback;
 use super::error::{bk_result, call};
 use super::handles::{is_null, object};
 use super::lightmap::bk_lightmap;
@@ -58,13 +59,7 @@ pub unsafe extern "C" fn bk_lightmap_read(
         }
         let layer = core_layer(layer)?;
         let texel = texel_bytes(format)?;
-        let (info, data) = lightmap.read(|l| {
-            let info = l.info();
-            if page >= info.page_count {
-                return invalid_argument!("page {page} does not exist, the light map has {}", info.page_count);
-            }
-            Ok((info, l.read(page, layer)?))
-        })?;
+        let (info, data) = lightmap.read(|l| Ok((l.info(), l.read(page, layer)?)))?;
         let packed = info.width as usize * texel;
         let stride = if row_stride == 0 { packed } else { row_stride };
         if stride < packed {
@@ -139,17 +134,18 @@ fn half_bits(x: f32) -> u16 {
     sign | half as u16
 }
 
-/// Float images, one EXR file per page and layer.
+/// Float images of the light layers: PREFIXpageN-LAYER.exr, LAYER one of combined, indirect, direct,
+/// radiance.
 pub const BK_FILE_EXR: u32 = 1;
-/// Tone-mapped 8-bit images to look at, one PNG file per page and layer.
+/// Tone-mapped 8-bit images of the light layers, to look at: PREFIXpageN-LAYER.png.
 pub const BK_FILE_PNG: u32 = 2;
-/// The scene with the light map as second texture, one GLB file for any viewer.
+/// The scene with the light map as second texture, for any viewer: PREFIXscene.glb.
 pub const BK_FILE_GLB: u32 = 3;
 
 /// Writes a baked light map to files.
 ///
-/// path_prefix: UTF-8; the names of the files are this followed by page, layer and extension.
-/// file_format: one of the BK_FILE values.
+/// path_prefix: UTF-8, put before the file names that the BK_FILE values state, as "out/" for files
+/// in the folder out, which must exist. file_format: one of the BK_FILE values.
 ///
 /// Fails with BK_ERROR_IO, naming the file, if it cannot be written, with BK_ERROR_INVALID_STATE
 /// before a bake, with BK_ERROR_UNSUPPORTED if the library was built without files.
@@ -160,18 +156,35 @@ pub unsafe extern "C" fn bk_lightmap_save(
     file_format: u32,
 ) -> bk_result {
     call(|| {
+        refuse_in_callback()?;
         let lightmap = object!(lightmap);
         // SAFETY: path_prefix is the caller's, or NULL.
         let prefix = unsafe { text(path_prefix, "path_prefix") }?;
-        if !matches!(file_format, BK_FILE_EXR | BK_FILE_PNG | BK_FILE_GLB) {
-            return invalid_argument!("file_format is {file_format}, not one of the BK_FILE values");
-        }
         lightmap.read(|l| save(l, prefix, file_format))
     })
 }
 
+#[cfg(feature = "io")]
+fn save(lightmap: &Lightmap, prefix: &str, file_format: u32) -> Result<()> {
+    use crate::io::lightmaps;
+    use crate::progress::Progress;
+    match file_format {
+        BK_FILE_EXR => lightmaps::write_exr_pages(lightmap, prefix, &Progress::none()).map(drop),
+        BK_FILE_PNG => {
+            let exposure = lightmaps::exposure(lightmap)?;
+            lightmaps::write_png_pages(lightmap, prefix, exposure, &Progress::none()).map(drop)
+        }
+        BK_FILE_GLB => {
+            let path = format!("{prefix}scene.glb");
+            lightmaps::write_scene(lightmap, path.as_ref(), lightmaps::exposure(lightmap)?)
+        }
+        other => invalid_argument!("file_format is {other}, not one of the BK_FILE values"),
+    }
+}
+
+#[cfg(not(feature = "io"))]
 fn save(_: &Lightmap, prefix: &str, _: u32) -> Result<()> {
-    Err(Error::Unsupported(format!("this build of the library writes no files, and so not {prefix}")))
+    Err(Error::Unsupported(format!("the library was built without files and cannot write {prefix}")))
 }
 
 #[cfg(test)]

@@ -10,7 +10,7 @@
 //! magnitude of 1e12.
 
 use super::args::{OutStruct, init, read_struct, sized_struct, text, write};
-use super::device::{bk_device, bk_progress_fn, progress};
+use super::device::{bk_device, bk_progress_fn, progress, refuse_in_callback};
 use super::error::{bk_result, call, call_or};
 use super::handles::{create, hold, object, release, retain};
 use crate::bvh::BuildOptions;
@@ -123,7 +123,11 @@ pub struct bk_load_info {
     pub materials: u32,
     /// Number of the first material added.
     pub first_material: u32,
-    /// Channels of reflectances at or above 1 that were clamped to 0.98, or below 0 to 0.
+    /// Lights added (emissive materials not counted), the first with number first_light.
+    pub lights: u32,
+    /// Number of the first light added.
+    pub first_light: u32,
+    /// Materials of which a reflectance was outside [0, 0.98] and was clamped to that.
     pub clamped_albedos: u32,
     /// Triangles added, degenerate ones included.
     pub triangles: u64,
@@ -137,6 +141,8 @@ sized_struct!(bk_load_info, last: seconds: f64, defaults: bk_load_info {
     first_mesh: 0,
     materials: 0,
     first_material: 0,
+    lights: 0,
+    first_light: 0,
     clamped_albedos: 0,
     triangles: 0,
     seconds: 0.0,
@@ -149,7 +155,7 @@ pub unsafe extern "C" fn bk_load_info_init(info: *mut bk_load_info) {
     unsafe { init(info) }
 }
 
-/// Adds what a scene file describes: meshes and materials, emissive ones included.
+/// Adds what a scene file describes: meshes, materials (emissive ones included), lights.
 ///
 /// path: UTF-8, ending in .obj (with its .mtl), .ply, .gltf or .glb. out: what was added; NULL if
 /// not wanted.
@@ -168,7 +174,7 @@ pub unsafe extern "C" fn bk_scene_load_file(
         let scene = object!(scene);
         let path = text(path, "path")?;
         let out = OutStruct::optional(out, "out")?;
-        let info = scene.describe("files can be loaded", |d| load_file(&mut d.data, path))?;
+        let info = scene.describe("files can be loaded", |d| load_file(&scene.device, &mut d.data, path))?;
         if let Some(out) = out {
             out.write(info);
         }
@@ -176,8 +182,31 @@ pub unsafe extern "C" fn bk_scene_load_file(
     })
 }
 
-fn load_file(_: &mut SceneData, path: &str) -> Result<bk_load_info> {
-    Err(Error::Unsupported(format!("this build of the library reads no files, and so not {path}")))
+#[cfg(feature = "io")]
+fn load_file(device: &Device, data: &mut SceneData, path: &str) -> Result<bk_load_info> {
+    let (first_mesh, first_material) = (data.meshes().len() as u32, data.materials().len() as u32);
+    let first_light = data.lights().len() as u32;
+    let i = crate::io::load(path.as_ref(), data)?;
+    for warning in &i.warnings {
+        device.log(crate::device::LogLevel::Warning, warning);
+    }
+    Ok(bk_load_info {
+        meshes: i.meshes,
+        first_mesh,
+        materials: i.materials,
+        first_material,
+        lights: i.lights,
+        first_light,
+        clamped_albedos: i.albedos_clamped,
+        triangles: i.triangles,
+        seconds: i.seconds,
+        struct_size: 0,
+    })
+}
+
+#[cfg(not(feature = "io"))]
+fn load_file(_: &Device, _: &mut SceneData, path: &str) -> Result<bk_load_info> {
+    Err(Error::Unsupported(format!("the library was built without files and cannot read {path}")))
 }
 
 /// Adds a scene made by code, with its lights: "cornell" (the Cornell box), "furnace" (a closed,
@@ -246,6 +275,7 @@ pub unsafe extern "C" fn bk_scene_commit(
     user: *mut c_void,
 ) -> bk_result {
     call(|| {
+        refuse_in_callback()?;
         // SAFETY: a handle or NULL.
         let scene = unsafe { hold(scene, "scene") }?;
         scene.with_description(|slot| {

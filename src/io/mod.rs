@@ -7,6 +7,7 @@
 //! | `ply` | PLY, ASCII and binary |
 //! | `gltf` | glTF 2.0 and GLB: geometry, factors, punctual lights |
 //! | [`image`] | EXR and PNG files, tone mapping |
+//! | [`lightmaps`] | baked light maps: pages as EXR and PNG, the lit scene as GLB |
 //! | [`glb`] | a scene with its light maps as GLB, for any viewer |
 //!
 //! All surfaces become diffuse [`Material`]s. Textures are not read: a material is its colour factor.
@@ -16,6 +17,7 @@
 pub mod glb;
 mod gltf;
 pub mod image;
+pub mod lightmaps;
 mod mtl;
 mod obj;
 mod ply;
