@@ -112,6 +112,18 @@ impl<L: Lanes> V3<L> {
         }
     }
 
+    // Written out, here and below: closures do not inherit an entry point's target features, and
+    // where one is not inlined (in `array::map`) every operation on lanes becomes a call.
+    #[inline(always)]
+    fn minus(self, o: Self) -> Self {
+        V3([self.0[0] - o.0[0], self.0[1] - o.0[1], self.0[2] - o.0[2]])
+    }
+
+    #[inline(always)]
+    fn times(self, l: L) -> Self {
+        V3([self.0[0] * l, self.0[1] * l, self.0[2] * l])
+    }
+
     #[inline(always)]
     fn dot(self, o: Self) -> L {
         self.0[0].mul_add(o.0[0], self.0[1].mul_add(o.0[1], self.0[2] * o.0[2]))
@@ -149,7 +161,7 @@ unsafe fn estimate<S: Simd>(grid: &Grid, cylinder: &Cylinder, position: Vec3, no
                     // Lanes from `end` on belong to other rows.
                     let in_run = iota.lt(S::Packet::splat((end - i) as f32));
                     let p = V3::<S::Packet>::load(&columns, 0, i);
-                    let d = V3([0, 1, 2].map(|a| (p.0[a] - centre.0[a]) * inverse_radius));
+                    let d = p.minus(centre).times(inverse_radius);
                     let height = d.dot(n);
                     let radial2 = d.dot(d) - height * height;
                     let inside = in_run.and(radial2.le(one)).and(height.le(top)).and(bottom.le(height));
@@ -176,7 +188,8 @@ unsafe fn estimate<S: Simd>(grid: &Grid, cylinder: &Cylinder, position: Vec3, no
         if pending > 0 {
             flush(&mut sum, &mut total, zero);
         }
-        total.map(|t| (t * cylinder.scale) as f32)
+        let s = cylinder.scale;
+        [(total[0] * s) as f32, (total[1] * s) as f32, (total[2] * s) as f32]
     }
 }
 
@@ -184,7 +197,9 @@ unsafe fn estimate<S: Simd>(grid: &Grid, cylinder: &Cylinder, position: Vec3, no
 #[inline(always)]
 fn flush<L: Lanes>(sum: &mut [L; 3], total: &mut [f64; 3], zero: L) {
     for c in 0..3 {
-        total[c] += sum[c].to_array()[..L::WIDTH].iter().map(|&x| x as f64).sum::<f64>();
+        for &x in &sum[c].to_array()[..L::WIDTH] {
+            total[c] += x as f64;
+        }
         sum[c] = zero;
     }
 }

@@ -76,9 +76,13 @@ fn facing(n: Vec3) -> u64 {
     2 * axis as u64 + (n[axis] < 0.0) as u64
 }
 
-/// Bit i of x to bit 3i.
+/// Bit i of a 21-bit x to bit 3i: halves move apart, then quarters, …
 fn spread(x: u64) -> u64 {
-    (0..LEVELS).fold(0, |s, i| s | (x >> i & 1) << (3 * i))
+    let x = (x | x << 32) & 0x001f_0000_0000_ffff;
+    let x = (x | x << 16) & 0x001f_0000_ff00_00ff;
+    let x = (x | x << 8) & 0x100f_00f0_0f00_f00f;
+    let x = (x | x << 4) & 0x10c3_0c30_c30c_30c3;
+    (x | x << 2) & 0x1249_2492_4924_9249
 }
 
 #[cfg(test)]
@@ -108,6 +112,13 @@ mod tests {
                 let found = lit_area(&[photons], n as usize);
                 assert!((0.8..1.6).contains(&(found / exact)), "{n} {u} {v}: {found} for {exact}");
             }
+        }
+    }
+
+    #[test]
+    fn spreading_moves_bit_i_to_bit_3i() {
+        for x in [0, 1, 0xfffff, 0xa5a5a, 0x12345, 0x80001] {
+            assert_eq!(spread(x), (0..LEVELS).fold(0, |s, i| s | (x >> i & 1) << (3 * i)));
         }
     }
 

@@ -11,7 +11,7 @@ use crate::error::{Error, Result};
 use crate::memory::{MemoryMonitor, Reservation};
 use crate::progress::{Progress, Stage};
 use crate::sampling::{combine, purpose_seed, sobol_2d, uniform};
-use crate::scene::{Light, Scene};
+use crate::scene::{Light, NONE, Scene};
 use crate::trace::offset::{SurfacePoint, offset_ray_origin};
 use crate::trace::{RawHit, Ray};
 use glam::{DVec3, Vec3};
@@ -129,6 +129,21 @@ struct Path {
     power: Vec3,
 }
 
+/// What a path meets.
+#[derive(Clone, Copy)]
+struct Surface {
+    corners: [Vec3; 3],
+    /// Barycentric weights of vertices 1 and 2.
+    weights: [f32; 2],
+    front: bool,
+    /// [`NONE`] where nothing was hit.
+    material: u32,
+}
+
+impl Surface {
+    const NOTHING: Surface = Surface { corners: [Vec3::ZERO; 3], weights: [0.0; 2], front: false, material: NONE };
+}
+
 struct Tracer<'a> {
     scene: &'a Scene,
     emission: Emission<'a>,
@@ -162,6 +177,7 @@ impl<'a> Tracer<'a> {
             paths.push(path);
         }
         let mut hits = vec![RawHit::MISS; rays.len()];
+        let mut surfaces = vec![Surface::NOTHING; rays.len()];
         let mut stored = Vec::new();
         let mut tally = Tally::default();
         for bounce in 0..self.limit {
@@ -177,11 +193,16 @@ impl<'a> Tracer<'a> {
             self.scene.device().kernels().intersect_block(self.scene.mbvh(), &rays, &mut hits);
             tally.rays += rays.len() as u64;
             stored.try_reserve(rays.len()).map_err(|e| Error::OutOfMemory(format!("the photons being traced: {e}")))?;
+            // In a loop of its own, short enough for the processor to work on the cache misses of
+            // several hits at a time: within the next one, tracing Sponza took a tenth longer.
+            for (surface, hit) in surfaces.iter_mut().zip(&hits[..rays.len()]) {
+                *surface = self.surface(hit);
+            }
             // Survivors move to the front.
             let mut alive = 0;
             for i in 0..rays.len() {
-                if let Some((ray, path)) = self.interact(&rays[i], paths[i], &hits[i], bounce, &mut stored, &mut tally)
-                {
+                let next = self.interact(&rays[i], paths[i], &surfaces[i], bounce, &mut stored, &mut tally);
+                if let Some((ray, path)) = next {
                     (rays[alive], paths[alive]) = (ray, path);
                     alive += 1;
                 }
@@ -199,29 +220,43 @@ impl<'a> Tracer<'a> {
         (Ray::new(e.origin, e.direction), Path { photon, power: e.power })
     }
 
+    /// What the hit lies on.
+    #[inline]
+    fn surface(&self, hit: &RawHit) -> Surface {
+        if hit.is_miss() {
+            return Surface::NOTHING;
+        }
+        let (mesh, triangle) = self.scene.locate(hit.triangle);
+        let mesh = &self.scene.meshes()[mesh as usize];
+        Surface {
+            corners: mesh.corners(triangle as usize),
+            weights: [hit.u, hit.v],
+            front: hit.front,
+            material: mesh.material(triangle as usize),
+        }
+    }
+
     /// What becomes of a path at the end of `ray`: the photon is stored, and goes on or not.
     #[inline]
     fn interact(
         &self,
         ray: &Ray,
         path: Path,
-        hit: &RawHit,
+        surface: &Surface,
         bounce: u32,
         stored: &mut Vec<StoredPhoton>,
         tally: &mut Tally,
     ) -> Option<(Ray, Path)> {
         let power = path.power.as_dvec3();
-        if hit.is_miss() {
+        if surface.material == NONE {
             tally.escaped += power;
             return None;
         }
-        let (mesh, triangle) = self.scene.locate(hit.triangle);
-        let mesh = &self.scene.meshes()[mesh as usize];
-        let material = &self.scene.materials()[mesh.material(triangle as usize) as usize];
-        let point = SurfacePoint::new(mesh.corners(triangle as usize), hit.u, hit.v, self.scene);
+        let material = &self.scene.materials()[surface.material as usize];
+        let point = SurfacePoint::new(surface.corners, surface.weights[0], surface.weights[1], self.scene);
         let direction = Vec3::from_array(ray.direction);
         let mut normal = point.normal;
-        if !hit.front {
+        if !surface.front {
             if !material.two_sided {
                 tally.absorbed += power;
                 return None;
