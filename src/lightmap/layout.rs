@@ -370,7 +370,7 @@ mod tests {
             0.05 / (0.002 + bits as f32 / (1u32 << 24) as f32)
         };
         let charts = charts_of(&(0..20_000).map(|i| [size(i, 0), size(i, 1)]).collect::<Vec<_>>());
-        let layout = Layout::pack(&charts, 20.0, 1024, 2, false, false).unwrap();
+        let layout = Layout::pack(&charts, 60.0, 1024, 2, false, false).unwrap();
         check(&charts, &layout, 2);
         assert!(layout.page_count >= 8, "{} pages are too few to say", layout.page_count);
         assert!(layout.utilisation() > 0.85, "{}", layout.utilisation());
