@@ -1,1 +1,267 @@
-fn main() {}
+//! The command line: bakes a scene, writes its light maps and compares pictures of it.
+//!
+//! | file | what it does |
+//! |---|---|
+//! | `args` | flags, help, and what is wrong with them |
+//! | `bar` | progress on standard error |
+//! | `camera` | a view for scenes that come without one |
+//! | `pictures`, `font` | the three pictures that the thesis compares |
+//! | `output` | light map pages and the scene as files |
+//! | `table`, `report` | what a run took, for people and for programs |
+
+mod args;
+mod bar;
+mod camera;
+mod font;
+mod output;
+mod pictures;
+mod report;
+mod table;
+
+use args::{BakeArgs, Command};
+use bakelite::device::LogLevel;
+use bakelite::io::image::write_png_rgb8;
+use bakelite::lightmap::{BakeStats, Lightmap};
+use bakelite::scene::{BUILTIN_NAMES, Camera, builtin, builtin_camera};
+use bakelite::{Device, DeviceOptions, Error, Result, Scene, SceneData};
+use bar::Bars;
+use pictures::{NAMES, Pictures, View};
+use std::path::{Path, PathBuf};
+use std::process::ExitCode;
+use std::sync::Arc;
+use std::time::Instant;
+use table::Stage;
+
+/// Exit code for wrong arguments.
+const USAGE: u8 = 2;
+
+fn main() -> ExitCode {
+    match args::parse(std::env::args_os().skip(1)) {
+        Ok(Command::Help) => print!("{}", args::HELP),
+        Ok(Command::Version) => println!("bakelite {}", env!("CARGO_PKG_VERSION")),
+        Ok(Command::Bake(bake)) => {
+            if let Err(e) = Job::new(&bake).run() {
+                eprintln!("bakelite: {e}");
+                return ExitCode::from(if matches!(e, Error::InvalidArgument(_)) { USAGE } else { 1 });
+            }
+        }
+        Err(e) => {
+            eprintln!("bakelite: {e}\nTry bakelite --help");
+            return ExitCode::from(USAGE);
+        }
+    }
+    ExitCode::SUCCESS
+}
+
+/// One run of `bakelite bake`.
+struct Job<'a> {
+    args: &'a BakeArgs,
+    bars: Bars,
+    stages: Vec<Stage>,
+    warnings: Vec<String>,
+    files: Vec<PathBuf>,
+}
+
+impl<'a> Job<'a> {
+    fn new(args: &'a BakeArgs) -> Self {
+        let bars = Bars::new(args.quiet);
+        Job { args, bars, stages: Vec::new(), warnings: Vec::new(), files: Vec::new() }
+    }
+
+    fn run(mut self) -> Result<()> {
+        let start = Instant::now();
+        output::make_folder(&self.args.out)?;
+        let data = self.load()?;
+        let scene = self.commit(data)?;
+        let mut lightmap = self.layout(&scene)?;
+        let bake = self.bake(&mut lightmap)?;
+        self.write_maps(&lightmap)?;
+        let camera = self.camera(&scene);
+        let pictures = self.pictures(&lightmap, camera)?;
+        let seconds = start.elapsed().as_secs_f64();
+
+        let path = self.args.out.join("report.json");
+        self.files.push(path.clone());
+        let run = report::Run {
+            args: self.args,
+            lightmap: &lightmap,
+            bake: &bake,
+            stages: &self.stages,
+            pictures: pictures.as_ref(),
+            camera,
+            warnings: &self.warnings,
+            files: &self.files,
+            seconds,
+        };
+        let text = format!("{:#}\n", report::report(&run));
+        std::fs::write(&path, text).map_err(|e| Error::Io(format!("{}: {e}", path.display())))?;
+        if !self.args.quiet {
+            self.print(&lightmap, pictures.as_ref(), seconds);
+        }
+        Ok(())
+    }
+
+    /// Reads or makes the scene and adds the lights of the command line.
+    fn load(&mut self) -> Result<SceneData> {
+        let start = Instant::now();
+        let name = self.args.scene.as_str();
+        let mut data = if BUILTIN_NAMES.contains(&name) {
+            builtin(name)?
+        } else {
+            let mut data = SceneData::new();
+            let info = bakelite::io::load(Path::new(name), &mut data)?;
+            self.warnings = info.warnings;
+            data
+        };
+        for &light in &self.args.lights {
+            data.add_light(light)?;
+        }
+        for warning in &self.warnings {
+            self.bars.say(&format!("warning: {warning}"));
+        }
+        let shines = !data.lights().is_empty() || data.materials().iter().any(|m| m.is_emissive());
+        if !shines {
+            return Err(Error::InvalidArgument(format!("{name} has no lights; give some with --light (see --help)")));
+        }
+        self.stage("load", start);
+        Ok(data)
+    }
+
+    fn commit(&mut self, data: SceneData) -> Result<Arc<Scene>> {
+        let start = Instant::now();
+        let quiet = self.args.quiet;
+        let log = move |level: LogLevel, message: &str| {
+            if level == LogLevel::Error || !quiet {
+                eprintln!("{message}");
+            }
+        };
+        let device = Device::new(DeviceOptions {
+            num_threads: self.args.threads,
+            isa: self.args.isa,
+            log: Some(Box::new(log)),
+            memory: None,
+        })?;
+        let build = &self.args.build;
+        let scene = self.bars.show("scene", |p| Scene::commit(&device, data, build, p).map_err(|(_, e)| e))?;
+        self.stage("tree", start).bytes = scene.stats().bvh_bytes;
+        Ok(scene)
+    }
+
+    fn layout(&mut self, scene: &Arc<Scene>) -> Result<Lightmap> {
+        let start = Instant::now();
+        let lightmap = self.bars.show("charts", |p| Lightmap::create(scene, &self.args.desc, p))?;
+        self.stage("charts and texels", start).bytes = lightmap.info().bytes;
+        Ok(lightmap)
+    }
+
+    fn bake(&mut self, lightmap: &mut Lightmap) -> Result<BakeStats> {
+        let stats = self.bars.show("bake", |p| lightmap.bake(&self.args.params, p))?;
+        let parts = [
+            ("photons", stats.photons),
+            ("radiance map", stats.radiance),
+            ("gather map", stats.gather),
+            ("direct light", stats.direct),
+            ("composition", stats.compose),
+        ];
+        for (name, s) in parts {
+            let photons = if name == "photons" { stats.photons_emitted } else { 0 };
+            self.stages.push(Stage { name, seconds: s.seconds, rays: s.rays, photons, bytes: s.bytes });
+        }
+        Ok(stats)
+    }
+
+    fn write_maps(&mut self, lightmap: &Lightmap) -> Result<()> {
+        let start = Instant::now();
+        let exposure = output::page_exposure(lightmap)?;
+        let files = self.bars.show("files", |p| output::write_pages(&self.args.out, lightmap, exposure, p))?;
+        self.files.extend(files);
+        if self.args.glb {
+            self.files.push(output::write_scene(&self.args.out, lightmap, exposure)?);
+        }
+        let bytes = self.files.iter().filter_map(|f| std::fs::metadata(f).ok()).map(|m| m.len()).sum();
+        self.stage("files", start).bytes = bytes;
+        Ok(())
+    }
+
+    /// The camera that was given, the built-in scene's, or one that is looked for.
+    fn camera(&self, scene: &Scene) -> Camera {
+        match self.args.camera {
+            Some(camera) => Camera { up: self.args.up, ..camera },
+            None => builtin_camera(&self.args.scene).unwrap_or_else(|| camera::choose(scene, self.args.up)),
+        }
+    }
+
+    fn pictures(&mut self, lightmap: &Lightmap, camera: Camera) -> Result<Option<Pictures>> {
+        if self.args.reference_spp == 0 {
+            return Ok(None);
+        }
+        let view = View {
+            camera,
+            width: self.args.width,
+            height: self.args.height,
+            reference_spp: self.args.reference_spp,
+            seed: self.args.params.seed,
+            lightmap,
+        };
+        let pictures = self.bars.show("pictures", |p| view.render(p))?;
+        let names = ["picture: reference", "picture: shadow rays", "picture: light map"];
+        for (name, seconds) in names.into_iter().zip(pictures.seconds) {
+            self.stages.push(Stage { name, seconds, ..Default::default() });
+        }
+        for (i, name) in NAMES.into_iter().enumerate() {
+            self.write_picture(name, view.width, view.height, &pictures.tone_mapped(i))?;
+        }
+        let (width, height, pixels) = pictures.side_by_side();
+        self.write_picture("pictures", width, height, &pixels)?;
+        Ok(Some(pictures))
+    }
+
+    fn write_picture(&mut self, name: &str, width: usize, height: usize, pixels: &[[u8; 3]]) -> Result<()> {
+        let path = self.args.out.join(format!("{name}.png"));
+        write_png_rgb8(&path, width as u32, height as u32, pixels)?;
+        self.files.push(path);
+        Ok(())
+    }
+
+    /// Records a stage that began at `start`.
+    fn stage(&mut self, name: &'static str, start: Instant) -> &mut Stage {
+        let at = self.stages.len();
+        self.stages.push(Stage { name, seconds: start.elapsed().as_secs_f64(), ..Default::default() });
+        &mut self.stages[at]
+    }
+
+    fn print(&self, lightmap: &Lightmap, pictures: Option<&Pictures>, seconds: f64) {
+        let scene = lightmap.scene();
+        let info = lightmap.info();
+        println!(
+            "\n{}: {} triangles, {} charts, {} texels on {} pages of {} x {}, {} threads, {}\n",
+            self.args.scene,
+            scene.stats().triangles,
+            info.charts,
+            info.texels,
+            info.page_count,
+            info.width,
+            info.height,
+            scene.device().num_threads(),
+            scene.device().isa().name(),
+        );
+        println!("{}", table::text(&self.stages, seconds));
+        println!("{}", lightmap.plan_text());
+        if let Some(p) = pictures {
+            println!("RMSE against the path traced reference (whose own noise is {:.2} %):", 100.0 * p.noise);
+            for i in 1..3 {
+                println!("  {:<28}{:>7.2} %", pictures::TITLES[i], 100.0 * p.rmse[i]);
+            }
+            println!();
+        }
+        println!("Wrote to {}:", self.args.out.display());
+        println!("  pageN-combined, -indirect, -direct, -radiance: light map pages as .exr and .png");
+        if self.args.glb {
+            println!("  scene.glb: the scene with its light map, for any glTF viewer");
+        }
+        if pictures.is_some() {
+            println!("  pictures.png: reference, indirect map + shadow rays, light map; each also alone");
+        }
+        println!("  report.json: all of the above and more, for programs");
+    }
+}

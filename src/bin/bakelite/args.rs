@@ -1,0 +1,373 @@
+//! Arguments of the command line. Errors are sentences that name the flag and the value at fault.
+
+use bakelite::bvh::BuildOptions;
+use bakelite::lightmap::{BakeParams, LightmapDesc};
+use bakelite::scene::Camera;
+use bakelite::{Isa, Light};
+use glam::Vec3;
+use lexopt::Arg;
+use std::ffi::OsString;
+use std::path::PathBuf;
+use std::str::FromStr;
+
+/// What `--help` prints.
+pub const HELP: &str = "\
+Bakes light maps.
+
+Usage: bakelite [bake] [SCENE] [OPTIONS]
+
+SCENE is a file (.obj .ply .gltf .glb) or a built-in scene (atrium, cornell,
+furnace). Without it, the atrium is baked. Lengths are in scene units, colours
+are linear r,g,b.
+
+Lights, added to those of the scene; may be repeated:
+  --light point:X,Y,Z:R,G,B               intensity in W/sr
+  --light spot:X,Y,Z:DX,DY,DZ:INNER,OUTER:R,G,B
+                                          cone angles in degrees, intensity in W/sr
+  --light sun:DX,DY,DZ:R,G,B              direction of travel, irradiance in W/m2
+  --light rect:X,Y,Z:UX,UY,UZ:VX,VY,VZ:R,G,B
+                                          corner and edges, shines along u x v,
+                                          radiance in W/(m2 sr)
+Light map:
+  --texels-per-unit F    density; 0: about four pages [0]
+  --page-size N          width and height of a page in texels [1024]
+  --padding N            texels around each chart [2]
+  --gather-divisor N     light map texels per gather map texel and axis [4]
+  --radiance-divisor N   light map texels per radiance map texel and axis [8]
+Bake:
+  --photons N            photons emitted [1000000]
+  --bounces N            most reflections; 0: Russian roulette alone decides [0]
+  --gather-rays N        rays per gather map texel; 0: no indirect light [64]
+  --radius F             photon search radius; 0: automatic [0]
+  --blur N               blur radius in gather map texels [2]
+  --direct-samples N     shadow rays per texel and area light [16]
+  --seed N               the same seed gives the same bits [0]
+Machine:
+  --threads N            0: one per logical core [0]
+  --isa NAME             portable, avx2, avx512 or auto [auto]
+  --bins N               bins of the tree builder [64]
+  --leaf N               most triangles per leaf [3]
+Pictures (path traced reference; indirect map + shadow rays; light map alone):
+  --camera PX,PY,PZ:TX,TY,TZ[:FOV]        position, target, vertical degrees [60];
+                                          without it, a view is looked for
+  --up x|y|z             up axis of the scene, for the camera [y]
+  --width N --height N   size of each [480 x 270]
+  --reference-spp N      paths per pixel of the reference; 0: no pictures [64]
+Output:
+  --out DIR              where all files go [out]
+  --no-glb               do not write the scene with its light maps as GLB
+  --quiet                no progress, no table
+  --help, --version
+";
+
+/// What to do.
+#[derive(Debug)]
+pub enum Command {
+    Bake(Box<BakeArgs>),
+    Help,
+    Version,
+}
+
+/// Arguments of `bakelite bake`.
+#[derive(Clone, Debug)]
+pub struct BakeArgs {
+    /// A file or a built-in name.
+    pub scene: String,
+    pub lights: Vec<Light>,
+    pub desc: LightmapDesc,
+    pub params: BakeParams,
+    pub build: BuildOptions,
+    pub threads: usize,
+    pub isa: Option<Isa>,
+    /// Its `up` is not set: that is what [`up`](Self::up) is for.
+    pub camera: Option<Camera>,
+    pub up: Vec3,
+    pub width: usize,
+    pub height: usize,
+    /// 0: no pictures.
+    pub reference_spp: u32,
+    pub out: PathBuf,
+    pub glb: bool,
+    pub quiet: bool,
+}
+
+impl Default for BakeArgs {
+    fn default() -> Self {
+        BakeArgs {
+            scene: "atrium".into(),
+            lights: Vec::new(),
+            desc: LightmapDesc::default(),
+            params: BakeParams::default(),
+            build: BuildOptions::default(),
+            threads: 0,
+            isa: None,
+            camera: None,
+            up: Vec3::Y,
+            width: 480,
+            height: 270,
+            reference_spp: 64,
+            out: "out".into(),
+            glb: true,
+            quiet: false,
+        }
+    }
+}
+
+/// Images beyond this width or height are a slip of the finger.
+const MAX_PICTURE: usize = 16384;
+
+/// Parses the arguments after the program's name.
+pub fn parse(args: impl IntoIterator<Item = OsString>) -> Result<Command, String> {
+    let mut parser = lexopt::Parser::from_args(args);
+    let mut bake = BakeArgs::default();
+    let (mut first, mut scene) = (true, None);
+    while let Some(arg) = parser.next().map_err(|e| e.to_string())? {
+        match arg {
+            Arg::Short('h') | Arg::Long("help") => return Ok(Command::Help),
+            Arg::Short('V') | Arg::Long("version") => return Ok(Command::Version),
+            Arg::Value(v) if first && v == "bake" => {}
+            Arg::Value(v) if scene.is_none() => scene = Some(text("SCENE", v)?),
+            Arg::Value(v) => {
+                let first = scene.unwrap_or_default();
+                return Err(format!("there are two scenes, {first:?} and {:?}", v.to_string_lossy()));
+            }
+            Arg::Short(c) => return Err(format!("there is no flag -{c}")),
+            Arg::Long(name) => {
+                let name = name.to_owned();
+                option(&name, &mut parser, &mut bake)?;
+            }
+        }
+        first = false;
+    }
+    if let Some(scene) = scene {
+        bake.scene = scene;
+    }
+    Ok(Command::Bake(Box::new(bake)))
+}
+
+/// Takes one `--name` with its value.
+fn option(name: &str, parser: &mut lexopt::Parser, bake: &mut BakeArgs) -> Result<(), String> {
+    let flag = format!("--{name}");
+    let mut value = || match parser.value() {
+        Ok(v) => text(&flag, v),
+        Err(_) => Err(format!("{flag} needs a value")),
+    };
+    let (desc, params) = (&mut bake.desc, &mut bake.params);
+    match name {
+        "light" => bake.lights.push(light(&value()?)?),
+        "texels-per-unit" => desc.texels_per_unit = number(&flag, &value()?)?,
+        "page-size" => desc.page_size = number(&flag, &value()?)?,
+        "padding" => desc.padding = number(&flag, &value()?)?,
+        "gather-divisor" => desc.gather_divisor = number(&flag, &value()?)?,
+        "radiance-divisor" => desc.radiance_divisor = number(&flag, &value()?)?,
+        "photons" => params.photon_count = number(&flag, &value()?)?,
+        "bounces" => params.max_bounces = number(&flag, &value()?)?,
+        "gather-rays" => params.gather_rays = number(&flag, &value()?)?,
+        "radius" => params.radius = number(&flag, &value()?)?,
+        "blur" => params.blur_radius = number(&flag, &value()?)?,
+        "direct-samples" => params.direct_samples = number(&flag, &value()?)?,
+        "seed" => params.seed = number(&flag, &value()?)?,
+        "threads" => bake.threads = number(&flag, &value()?)?,
+        "isa" => bake.isa = isa(&value()?)?,
+        "bins" => bake.build.bins = number(&flag, &value()?)?,
+        "leaf" => bake.build.max_leaf = number(&flag, &value()?)?,
+        "camera" => bake.camera = Some(camera(&value()?)?),
+        "up" => bake.up = axis(&value()?)?,
+        "width" => bake.width = picture_size(&flag, &value()?)?,
+        "height" => bake.height = picture_size(&flag, &value()?)?,
+        "reference-spp" => bake.reference_spp = number(&flag, &value()?)?,
+        "out" => bake.out = value()?.into(),
+        "no-glb" => bake.glb = false,
+        "quiet" => bake.quiet = true,
+        _ => return Err(unknown(&flag)),
+    }
+    Ok(())
+}
+
+/// Names an unknown flag, and the known one that begins like it.
+fn unknown(flag: &str) -> String {
+    let known = HELP.split_whitespace().map(|w| w.trim_matches(|c| c == '[' || c == ']' || c == ','));
+    let alike = |known: &str| {
+        known.starts_with("--") && known.bytes().zip(flag.bytes()).take_while(|(a, b)| a == b).count() > 4
+    };
+    match known.filter(|k| alike(k)).max_by_key(|k| k.bytes().zip(flag.bytes()).take_while(|(a, b)| a == b).count()) {
+        Some(k) => format!("there is no flag {flag}; did you mean {k}?"),
+        None => format!("there is no flag {flag}"),
+    }
+}
+
+fn text(what: &str, value: OsString) -> Result<String, String> {
+    value.into_string().map_err(|v| format!("{what} is not valid UTF-8: {}", v.to_string_lossy()))
+}
+
+fn number<T: FromStr>(flag: &str, value: &str) -> Result<T, String> {
+    let kind = if "0.5".parse::<T>().is_ok() { "a number" } else { "a whole number in range" };
+    value.parse().map_err(|_| format!("{flag} is {value:?}, not {kind}"))
+}
+
+fn picture_size(flag: &str, value: &str) -> Result<usize, String> {
+    match number(flag, value)? {
+        n if (1..=MAX_PICTURE).contains(&n) => Ok(n),
+        n => Err(format!("{flag} is {n}, outside 1 to {MAX_PICTURE}")),
+    }
+}
+
+fn isa(value: &str) -> Result<Option<Isa>, String> {
+    if value == "auto" {
+        return Ok(None);
+    }
+    match Isa::ALL.into_iter().find(|i| i.name() == value) {
+        Some(isa) => Ok(Some(isa)),
+        None => Err(format!("--isa is {value:?}, not portable, avx2, avx512 or auto")),
+    }
+}
+
+fn axis(value: &str) -> Result<Vec3, String> {
+    match value {
+        "x" => Ok(Vec3::X),
+        "y" => Ok(Vec3::Y),
+        "z" => Ok(Vec3::Z),
+        _ => Err(format!("--up is {value:?}, not x, y or z")),
+    }
+}
+
+/// `N` numbers with commas between them.
+fn tuple<const N: usize>(flag: &str, what: &str, value: &str) -> Result<[f32; N], String> {
+    let numbers: Result<Vec<f32>, _> = value.split(',').map(|n| n.trim().parse::<f32>()).collect();
+    numbers.ok().and_then(|n| n.try_into().ok()).ok_or_else(|| {
+        let form = if N == 2 { "a,b" } else { "a,b,c" };
+        format!("{flag}: the {what} {value:?} is not {N} numbers {form}")
+    })
+}
+
+fn light(value: &str) -> Result<Light, String> {
+    let flag = format!("--light {value}");
+    let fields: Vec<&str> = value.split(':').collect();
+    let vector = |i: usize, what: &str| tuple::<3>(&flag, what, fields[i]).map(Vec3::from);
+    let color = |i: usize| tuple::<3>(&flag, "colour", fields[i]);
+    let light = match (fields[0], fields.len()) {
+        ("point", 3) => Light::Point { position: vector(1, "position")?, intensity: color(2)? },
+        ("sun", 3) => Light::Directional { direction: vector(1, "direction")?, irradiance: color(2)? },
+        ("spot", 5) => {
+            let [inner, outer] = tuple::<2>(&flag, "cone", fields[3])?.map(f32::to_radians);
+            let (position, direction) = (vector(1, "position")?, vector(2, "direction")?);
+            Light::Spot { position, direction, inner, outer, intensity: color(4)? }
+        }
+        ("rect", 5) => Light::Rect {
+            position: vector(1, "corner")?,
+            edge_u: vector(2, "edge u")?,
+            edge_v: vector(3, "edge v")?,
+            radiance: color(4)?,
+        },
+        (kind @ ("point" | "sun" | "spot" | "rect"), n) => {
+            let expected = if matches!(kind, "point" | "sun") { 3 } else { 5 };
+            return Err(format!("{flag} has {n} parts between colons, a {kind} has {expected} (see --help)"));
+        }
+        (kind, _) => return Err(format!("{flag}: the kind {kind:?} is not point, spot, sun or rect")),
+    };
+    light.validate().map_err(|e| format!("{flag}: {e}"))?;
+    Ok(light)
+}
+
+fn camera(value: &str) -> Result<Camera, String> {
+    let flag = format!("--camera {value}");
+    let fields: Vec<&str> = value.split(':').collect();
+    if !(2..=3).contains(&fields.len()) {
+        return Err(format!("{flag} is not position:target or position:target:fov"));
+    }
+    let position = Vec3::from(tuple::<3>(&flag, "position", fields[0])?);
+    let target = Vec3::from(tuple::<3>(&flag, "target", fields[1])?);
+    let degrees: f32 = fields.get(2).map_or(Ok(60.0), |f| number("--camera: the field of view", f))?;
+    if !position.is_finite() || !target.is_finite() || position == target {
+        return Err(format!("{flag}: position and target are not two finite points"));
+    }
+    if !(0.1..=170.0).contains(&degrees) {
+        return Err(format!("{flag}: the field of view is {degrees}, outside 0.1 to 170 degrees"));
+    }
+    Ok(Camera { position, target, up: Vec3::ZERO, fov_y: degrees.to_radians() })
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    fn bake(line: &str) -> Result<BakeArgs, String> {
+        match parse(line.split_whitespace().map(OsString::from))? {
+            Command::Bake(b) => Ok(*b),
+            other => panic!("{other:?}"),
+        }
+    }
+
+    #[test]
+    fn no_arguments_bake_the_atrium() {
+        let b = bake("").unwrap();
+        assert_eq!((b.scene.as_str(), b.out.to_str().unwrap(), b.glb), ("atrium", "out", true));
+        assert_eq!(bake("bake").unwrap().scene, "atrium");
+    }
+
+    #[test]
+    fn a_scene_may_be_called_bake_the_second_time() {
+        assert_eq!(bake("bake bake").unwrap().scene, "bake");
+        assert_eq!(bake("x.obj").unwrap().scene, "x.obj");
+        assert!(bake("bake a b").unwrap_err().contains("two scenes, \"a\" and \"b\""));
+    }
+
+    #[test]
+    fn every_flag_of_the_help_is_known_and_takes_hold() {
+        let b = bake(
+            "bake s.obj --light point:1,2,3:4,5,6 --light spot:0,0,0:0,-1,0:20,30:1,1,1 --light sun:0,-1,0:7,8,9 \
+             --light rect:0,0,0:1,0,0:0,0,1:2,2,2 --texels-per-unit 2.5 --page-size 256 --padding 3 --gather-divisor 2 \
+             --radiance-divisor 16 --photons 5 --bounces 6 --gather-rays 7 --radius 0.5 --blur 8 --direct-samples 9 \
+             --seed 10 --threads 2 --isa portable --bins 32 --leaf 4 --camera 0,1,2:3,4,5:40 --up z --width 64 \
+             --height 48 --reference-spp 3 --out o --no-glb --quiet",
+        )
+        .unwrap();
+        assert_eq!(b.lights.len(), 4);
+        assert_eq!(b.lights[0], Light::Point { position: Vec3::new(1.0, 2.0, 3.0), intensity: [4.0, 5.0, 6.0] });
+        assert_eq!((b.desc.texels_per_unit, b.desc.page_size, b.desc.padding), (2.5, 256, 3));
+        assert_eq!((b.desc.gather_divisor, b.desc.radiance_divisor), (2, 16));
+        let p = &b.params;
+        assert_eq!((p.photon_count, p.max_bounces, p.gather_rays, p.radius, p.blur_radius), (5, 6, 7, 0.5, 8));
+        assert_eq!((p.direct_samples, p.seed, b.threads, b.isa), (9, 10, 2, Some(Isa::Portable)));
+        assert_eq!((b.build.bins, b.build.max_leaf, b.up), (32, 4, Vec3::Z));
+        let camera = b.camera.unwrap();
+        assert_eq!((camera.position, camera.target), (Vec3::new(0.0, 1.0, 2.0), Vec3::new(3.0, 4.0, 5.0)));
+        assert!((camera.fov_y.to_degrees() - 40.0).abs() < 1e-4);
+        assert_eq!((b.width, b.height, b.reference_spp), (64, 48, 3));
+        assert_eq!((b.out.to_str().unwrap(), b.glb, b.quiet), ("o", false, true));
+        let flags = HELP.split(|c: char| c.is_whitespace() || c == ',').filter(|w| w.starts_with("--"));
+        for flag in flags.filter(|f| !matches!(*f, "--help" | "--version")) {
+            let found = bake(&format!("{flag} ?")).err();
+            assert!(!found.is_some_and(|e| e.contains("no flag")), "{flag} is in the help but unknown");
+        }
+    }
+
+    #[test]
+    fn errors_name_the_flag_and_the_value() {
+        for (line, part) in [
+            ("--photon 5", "no flag --photon; did you mean --photons?"),
+            ("--nonsense", "no flag --nonsense"),
+            ("-x", "no flag -x"),
+            ("--photons", "--photons needs a value"),
+            ("--photons many", "--photons is \"many\", not a whole number"),
+            ("--photons -3", "--photons is \"-3\", not a whole number"),
+            ("--texels-per-unit dense", "--texels-per-unit is \"dense\", not a number"),
+            ("--light point:1,2:3,4,5", "the position \"1,2\" is not 3 numbers"),
+            ("--light point:1,2,3:a,4,5", "the colour \"a,4,5\" is not 3 numbers"),
+            ("--light rect:1,2,3:1,1,1", "has 3 parts between colons, a rect has 5"),
+            ("--light lamp:1,2,3", "the kind \"lamp\" is not point"),
+            ("--light sun:0,0,0:1,1,1", "direction is zero"),
+            ("--light rect:0,0,0:1,0,0:1,0,0:1,1,1", "no area"),
+            ("--light point:0,0,0:-1,0,0", "less than 0"),
+            ("--isa sse9", "--isa is \"sse9\""),
+            ("--up w", "--up is \"w\""),
+            ("--camera 1,2,3", "is not position:target"),
+            ("--camera 1,2,3:1,2,3", "not two finite points"),
+            ("--camera 0,0,0:1,2,3:200", "field of view is 200"),
+            ("--width 0", "--width is 0, outside 1"),
+        ] {
+            let e = bake(line).unwrap_err();
+            assert!(e.contains(part), "{line}: {e}");
+        }
+    }
+}

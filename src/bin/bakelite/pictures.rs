@@ -1,0 +1,300 @@
+//! The three pictures that the thesis compares, from one camera: the path traced reference; the
+//! indirect light of the light map plus direct light by shadow rays at each pixel; the composite
+//! light map alone. All show outgoing radiance, albedo/π · E plus emission, at the same exposure.
+
+use crate::font;
+use bakelite::io::image::{auto_exposure, tone_map};
+use bakelite::lightmap::direct::{DirectLight, Receiver};
+use bakelite::lightmap::{Layer, Lightmap};
+use bakelite::reference::PathTracer;
+use bakelite::sampling::combine;
+use bakelite::scene::Camera;
+use bakelite::trace::offset::SurfacePoint;
+use bakelite::trace::{RawHit, Ray};
+use bakelite::{Progress, Result, Scene};
+use glam::Vec3;
+use rayon::prelude::*;
+use std::f32::consts::PI;
+use std::time::Instant;
+
+/// Captions, in the pictures' order.
+pub const TITLES: [&str; 3] = ["Path traced reference", "Indirect map + shadow rays", "Light map alone"];
+
+/// File names without extension, in the pictures' order.
+pub const NAMES: [&str; 3] = ["reference", "indirect-and-shadow-rays", "light-map"];
+
+/// Primary rays per pixel along each axis, for the pictures made from the light map.
+const GRID: usize = 3;
+
+/// Shadow rays per primary ray and area light.
+const SHADOW_RAYS: u32 = 4;
+
+/// What lies behind the scene, in units of white. Shown, but not part of any RMSE.
+const BACKGROUND: [f32; 3] = [0.55, 0.68, 0.85];
+
+/// What to render.
+pub struct View<'a> {
+    pub camera: Camera,
+    pub width: usize,
+    pub height: usize,
+    /// Paths per pixel of the reference, rendered as two halves.
+    pub reference_spp: u32,
+    pub seed: u64,
+    pub lightmap: &'a Lightmap,
+}
+
+/// The pictures: linear radiance, row by row from the top left, and what was measured.
+pub struct Pictures {
+    pub images: [Vec<[f32; 3]>; 3],
+    pub seconds: [f64; 3],
+    /// Root mean square difference to the reference over all channels of the pixels in which every
+    /// primary ray meets the scene, divided by the reference's mean over the same.
+    pub rmse: [f64; 3],
+    /// The reference's own noise in the same measure: half the difference of its two halves. It is
+    /// part of the RMSE of the other two.
+    pub noise: f64,
+    pub exposure: f32,
+    width: usize,
+    /// Part of each pixel that shows the background.
+    background: Vec<f32>,
+}
+
+impl View<'_> {
+    /// Renders all three.
+    pub fn render(&self, progress: &Progress) -> Result<Pictures> {
+        let scene = self.lightmap.scene();
+        let start = Instant::now();
+        let (reference, halves) = self.reference(progress)?;
+        let reference_seconds = start.elapsed().as_secs_f64();
+
+        let start = Instant::now();
+        let direct = DirectLight::new(scene);
+        let by_shadow_rays = self.image(progress, "shadow rays", |seen| {
+            let e = direct.irradiance(&receiver(scene, &seen.hit), SHADOW_RAYS, seen.seed, &mut 0);
+            e + Vec3::from(self.lightmap.sample(Layer::Indirect, seen.hit.triangle, seen.hit.u, seen.hit.v))
+        })?;
+        let shadow_seconds = start.elapsed().as_secs_f64();
+
+        let start = Instant::now();
+        let composite = self.image(progress, "light map", |seen| {
+            self.lightmap.sample(Layer::Combined, seen.hit.triangle, seen.hit.u, seen.hit.v).into()
+        })?;
+        let composite_seconds = start.elapsed().as_secs_f64();
+
+        let background = self.background();
+        let covered = |i: usize| background[i] == 0.0;
+        let exposure = auto_exposure(&reference, covered);
+        let rmse = [&reference, &by_shadow_rays, &composite].map(|image| relative_rmse(image, &reference, covered));
+        let noise = 0.5 * difference(&halves[0], &halves[1], covered) / mean(&reference, covered);
+        Ok(Pictures {
+            images: [reference, by_shadow_rays, composite],
+            seconds: [reference_seconds, shadow_seconds, composite_seconds],
+            rmse,
+            noise,
+            exposure,
+            width: self.width,
+            background,
+        })
+    }
+
+    /// The reference as the mean of two independent halves, and these.
+    fn reference(&self, progress: &Progress) -> Result<(Vec<[f32; 3]>, [Vec<[f32; 3]>; 2])> {
+        let scene = self.lightmap.scene();
+        let tracer = PathTracer::new(scene);
+        let half = |seed: u64| {
+            let spp = self.reference_spp.div_ceil(2);
+            tracer.render(scene.device(), &self.camera, self.width, self.height, spp, seed, progress)
+        };
+        let halves = [half(2 * self.seed)?, half(2 * self.seed + 1)?];
+        let mean = |(a, b): (&[f32; 3], &[f32; 3])| std::array::from_fn(|c| 0.5 * (a[c] + b[c]));
+        Ok((halves[0].iter().zip(&halves[1]).map(mean).collect(), halves))
+    }
+
+    /// An image of albedo/π · E + Le, with E from `irradiance`.
+    fn image(
+        &self,
+        progress: &Progress,
+        name: &str,
+        irradiance: impl Fn(&Seen) -> Vec3 + Sync,
+    ) -> Result<Vec<[f32; 3]>> {
+        let scene = self.lightmap.scene();
+        let rays = PrimaryRays::new(&self.camera, self.width, self.height);
+        let stage = progress.stage(name, 0.0, 1.0, self.height as u64);
+        let mut pixels = vec![[0.0; 3]; self.width * self.height];
+        let row = |(y, row): (usize, &mut [[f32; 3]])| {
+            for (x, pixel) in row.iter_mut().enumerate() {
+                let sum: Vec3 = rays
+                    .of_pixel(x, y)
+                    .enumerate()
+                    .map(|(k, ray)| {
+                        let seed = combine(combine(self.seed as u32, (y * self.width + x) as u32), k as u32);
+                        radiance(scene, &ray, seed, &irradiance)
+                    })
+                    .sum();
+                *pixel = (sum / (GRID * GRID) as f32).to_array();
+            }
+            stage.advance(1)
+        };
+        scene.device().install(|| pixels.par_chunks_mut(self.width).enumerate().try_for_each(row))?;
+        Ok(pixels)
+    }
+
+    /// Part of each pixel where nothing is.
+    fn background(&self) -> Vec<f32> {
+        let scene = self.lightmap.scene();
+        let rays = PrimaryRays::new(&self.camera, self.width, self.height);
+        let part = |i: usize| {
+            let misses = rays.of_pixel(i % self.width, i / self.width).filter(|r| scene.intersect_raw(r).is_miss());
+            misses.count() as f32 / (GRID * GRID) as f32
+        };
+        scene.device().install(|| (0..self.width * self.height).into_par_iter().map(part).collect())
+    }
+}
+
+/// A visible point.
+struct Seen {
+    hit: RawHit,
+    /// For the random numbers of this point.
+    seed: u32,
+}
+
+/// A hit as a point that receives light, on the side that was hit, with its interpolated normal.
+fn receiver(scene: &Scene, hit: &RawHit) -> Receiver {
+    let (mesh, triangle) = scene.locate(hit.triangle);
+    let mesh = &scene.meshes()[mesh as usize];
+    let normal = |corner: usize| mesh.normals[mesh.indices[triangle as usize][corner] as usize];
+    let interpolated = || (normal(0) * (1.0 - hit.u - hit.v) + normal(1) * hit.u + normal(2) * hit.v).try_normalize();
+    let shading = if mesh.normals.is_empty() { None } else { interpolated() };
+    let point = SurfacePoint::new(scene.corners(hit.triangle), hit.u, hit.v, scene);
+    Receiver::new(scene, &point, shading, !hit.front)
+}
+
+/// Radiance along a primary ray. The backs of one-sided materials are black.
+fn radiance(scene: &Scene, ray: &Ray, seed: u32, irradiance: impl Fn(&Seen) -> Vec3) -> Vec3 {
+    let hit = scene.intersect_raw(ray);
+    if hit.is_miss() {
+        return Vec3::ZERO;
+    }
+    let material = scene.material(hit.triangle);
+    if !hit.front && !material.two_sided {
+        return Vec3::ZERO;
+    }
+    let reflected = Vec3::from(material.albedo) / PI * irradiance(&Seen { hit, seed });
+    reflected + Vec3::from(material.emission)
+}
+
+/// The rays of a pinhole camera.
+struct PrimaryRays {
+    position: Vec3,
+    forward: Vec3,
+    /// To the right and down, from the middle of the image to its border.
+    right: Vec3,
+    down: Vec3,
+    width: usize,
+    height: usize,
+}
+
+impl PrimaryRays {
+    fn new(camera: &Camera, width: usize, height: usize) -> Self {
+        let forward = (camera.target - camera.position).normalize();
+        let right = forward.cross(camera.up).normalize();
+        let half = (0.5 * camera.fov_y).tan();
+        let down = forward.cross(right) * half;
+        let right = right * half * width as f32 / height as f32;
+        PrimaryRays { position: camera.position, forward, right, down, width, height }
+    }
+
+    /// Through the middles of a grid of cells of a pixel.
+    fn of_pixel(&self, x: usize, y: usize) -> impl Iterator<Item = Ray> {
+        (0..GRID * GRID).map(move |k| {
+            let at = |pixel: usize, cell: usize, size: usize| {
+                2.0 * (pixel as f32 + (cell as f32 + 0.5) / GRID as f32) / size as f32 - 1.0
+            };
+            let (u, v) = (at(x, k % GRID, self.width), at(y, k / GRID, self.height));
+            Ray::new(self.position, (self.forward + self.right * u + self.down * v).normalize())
+        })
+    }
+}
+
+/// Mean of all channels of the pixels that `mask` includes.
+fn mean(image: &[[f32; 3]], mask: impl Fn(usize) -> bool) -> f64 {
+    let included = image.iter().enumerate().filter(|(i, _)| mask(*i)).map(|(_, p)| p.iter().map(|&c| c as f64).sum());
+    let (sum, count) = included.fold((0.0, 0), |(s, n): (f64, usize), x: f64| (s + x, n + 3));
+    sum / count.max(1) as f64
+}
+
+/// Root mean square difference of all channels of the pixels that `mask` includes.
+fn difference(a: &[[f32; 3]], b: &[[f32; 3]], mask: impl Fn(usize) -> bool) -> f64 {
+    let squares = a.iter().zip(b).map(|(a, b)| std::array::from_fn(|c| (a[c] - b[c]).powi(2)));
+    mean(&squares.collect::<Vec<_>>(), mask).sqrt()
+}
+
+fn relative_rmse(image: &[[f32; 3]], reference: &[[f32; 3]], mask: impl Fn(usize) -> bool + Copy) -> f64 {
+    difference(image, reference, mask) / mean(reference, mask).max(f64::MIN_POSITIVE)
+}
+
+/// Pixels between the pictures and under the captions.
+const GAP: usize = 6;
+const TEXT_SCALE: usize = 2;
+const PAPER: [u8; 3] = [24, 24, 26];
+const INK: [u8; 3] = [225, 222, 214];
+
+impl Pictures {
+    /// One picture as sRGB.
+    pub fn tone_mapped(&self, picture: usize) -> Vec<[u8; 3]> {
+        let pixel = |(p, &part): (&[f32; 3], &f32)| {
+            let shown = std::array::from_fn(|c| p[c] + part * BACKGROUND[c] / self.exposure);
+            tone_map(self.exposure, shown)
+        };
+        self.images[picture].iter().zip(&self.background).map(pixel).collect()
+    }
+
+    /// The three side by side with their captions: width, height and pixels.
+    pub fn side_by_side(&self) -> (usize, usize, Vec<[u8; 3]>) {
+        let (w, h) = (self.width, self.images[0].len() / self.width);
+        let line = font::HEIGHT * TEXT_SCALE + GAP;
+        let (width, height) = (3 * w + 4 * GAP, h + 2 * GAP + 2 * line);
+        let mut pixels = vec![PAPER; width * height];
+        for i in 0..3 {
+            let left = GAP + i * (w + GAP);
+            for (y, row) in self.tone_mapped(i).chunks(w).enumerate() {
+                let start = (GAP + y) * width + left;
+                pixels[start..start + w].copy_from_slice(row);
+            }
+            let second = match i {
+                0 => format!("noise {:.2}%", 100.0 * self.noise),
+                _ => format!("RMSE {:.2}%", 100.0 * self.rmse[i]),
+            };
+            for (n, text) in [TITLES[i], &second].into_iter().enumerate() {
+                // Narrow pictures get small letters.
+                let scale = if font::width(text, TEXT_SCALE) <= w { TEXT_SCALE } else { 1 };
+                font::draw(&mut pixels, width, left, h + 2 * GAP + n * line, scale, INK, text);
+            }
+        }
+        (width, height, pixels)
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn rmse_is_relative_to_the_mean_of_the_reference_and_leaves_the_background_out() {
+        let reference = [[1.0, 2.0, 3.0], [100.0; 3]];
+        let image = [[1.5, 1.5, 3.5], [0.0; 3]];
+        assert!((relative_rmse(&image, &reference, |i| i == 0) - 0.25).abs() < 1e-6);
+    }
+
+    #[test]
+    fn primary_rays_cover_the_field_of_view() {
+        let camera = Camera { position: Vec3::ZERO, target: Vec3::X, up: Vec3::Y, fov_y: 90f32.to_radians() };
+        let rays = PrimaryRays::new(&camera, 200, 100);
+        let first = Vec3::from(rays.of_pixel(0, 0).next().unwrap().direction);
+        // Top left: up and, looking along +x with y up, towards −z.
+        let expected = Vec3::new(1.0, 1.0, -2.0).normalize();
+        assert!((first - expected).length() < 0.01, "{first}");
+        let middle: Vec3 = rays.of_pixel(100, 50).map(|r| Vec3::from(r.direction)).next().unwrap();
+        assert!(middle.x > 0.999);
+    }
+}
