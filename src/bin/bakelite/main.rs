@@ -248,7 +248,7 @@ impl<'a> Job<'a> {
         println!("{}", table::text(&self.stages, seconds));
         println!("{}", lightmap.plan_text());
         if let Some(p) = pictures {
-            println!("RMSE against the path traced reference (whose own noise is {:.2} %):", 100.0 * p.noise);
+            println!("RMSE against the path traced reference, without its own noise of {:.2} %:", 100.0 * p.noise);
             for i in 1..3 {
                 println!("  {:<28}{:>7.2} %", pictures::TITLES[i], 100.0 * p.rmse[i]);
             }

@@ -172,8 +172,9 @@ fn pictures(p: &Pictures, args: &BakeArgs) -> Value {
         "width": args.width,
         "height": args.height,
         "exposure": p.exposure,
-        "rmse_definition": "root mean square difference of linear radiance over all channels of the pixels that the \
-                            scene covers, divided by the reference's mean over the same",
+        "rmse_definition": "root mean square error of linear radiance over all channels of the pixels that the scene \
+                            covers, divided by the reference's mean over the same; the squared error of x is estimated \
+                            by (x - a)(x - b) from the reference's two halves a and b, so its noise is not part of it",
         "reference_noise": p.noise,
         "images": [image(0), image(1), image(2)],
     })
