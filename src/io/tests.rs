@@ -6,6 +6,7 @@ use crate::scene::{Light, Material, Mesh, MeshMaterials, SceneData};
 use glam::Vec3;
 use proptest::prelude::*;
 use std::path::{Path, PathBuf};
+use std::sync::LazyLock;
 use std::sync::atomic::{AtomicU32, Ordering::Relaxed};
 
 /// A folder for one test, removed at its end.
@@ -195,7 +196,7 @@ fn obj_files_read_as_by_tobj() {
 }
 
 /// A small valid file of each format, for damaging.
-fn samples() -> Vec<(&'static str, Vec<u8>)> {
+static SAMPLES: LazyLock<Vec<(&str, Vec<u8>)>> = LazyLock::new(|| {
     vec![
         ("a.obj", super::obj::tests::SAMPLE.into()),
         ("a.ply", super::ply::tests::ascii_sample()),
@@ -205,24 +206,24 @@ fn samples() -> Vec<(&'static str, Vec<u8>)> {
         ("a.glb", super::gltf::tests::sample().glb()),
         ("b.glb", super::glb::tests::sample()),
     ]
-}
+});
 
 #[test]
 fn the_samples_are_valid() {
-    for (name, bytes) in samples() {
+    for (name, bytes) in SAMPLES.iter() {
         load_bytes(name, bytes).unwrap_or_else(|e| panic!("{name}: {e}"));
     }
 }
 
 #[test]
 fn a_file_cut_anywhere_is_read_or_refused() {
-    for (name, bytes) in samples() {
+    for (name, bytes) in SAMPLES.iter() {
         let folder = Folder::new();
         for length in 0..bytes.len() {
             std::fs::write(folder.path(name), &bytes[..length]).unwrap();
             let result = load_path(&folder.path(name));
             // Text may still make sense, binary data does not.
-            if bytes.starts_with(b"glTF") || name == "b.ply" || name == "c.ply" || length == 0 {
+            if bytes.starts_with(b"glTF") || ["b.ply", "c.ply"].contains(name) || length == 0 {
                 assert!(matches!(result, Err(Error::Io(_))), "{name} cut at {length}: {result:?}");
             }
         }
@@ -246,7 +247,7 @@ fn replace_number(bytes: &[u8], n: usize, number: &str) -> Vec<u8> {
 }
 
 proptest! {
-    #![proptest_config(ProptestConfig { cases: 1000, failure_persistence: None, ..ProptestConfig::default() })]
+    #![proptest_config(ProptestConfig { failure_persistence: None, ..ProptestConfig::default() })]
 
     #[test]
     fn a_damaged_file_is_read_or_refused(
@@ -255,7 +256,7 @@ proptest! {
         numbers in prop::collection::vec((any::<usize>(), odd_number()), 0..3),
         cut in prop::option::weighted(0.2, any::<prop::sample::Index>()),
     ) {
-        let (name, mut bytes) = samples().swap_remove(which);
+        let (name, mut bytes) = SAMPLES[which].clone();
         for (n, number) in numbers {
             bytes = replace_number(&bytes, n, number);
         }
