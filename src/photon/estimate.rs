@@ -172,8 +172,8 @@ unsafe fn estimate<S: Simd>(grid: &Grid, cylinder: &Cylinder, position: Vec3, no
                         let filter = one - radial2.max(zero).sqrt() * inverse_k;
                         let weight = S::Packet::select(counts, filter, zero);
                         let power = V3::<S::Packet>::load(&columns, 6, i);
-                        for c in 0..3 {
-                            sum[c] = power.0[c].mul_add(weight, sum[c]);
+                        for (sum, power) in sum.iter_mut().zip(power.0) {
+                            *sum = power.mul_add(weight, *sum);
                         }
                         pending += 1;
                         if pending == FLUSH {

@@ -277,8 +277,9 @@ impl<'a> Tracer<'a> {
         // the least noise (Jensen 2001, section 5.2).
         let survival = reflected.max_element() / path.power.max_element();
         let dimension = BOUNCE + 2 * bounce;
-        // A NaN, of photons too faint for f32, ends the path as well.
-        if !(uniform(path.photon, dimension, self.seed) < survival) {
+        // Not so if it is NaN, of photons too faint for f32.
+        let survives = uniform(path.photon, dimension, self.seed) < survival;
+        if !survives {
             return None;
         }
         let u = sobol_2d(path.photon, combine(self.seed, dimension + 1));
