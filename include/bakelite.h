@@ -104,9 +104,10 @@ BK_API const char *bk_last_error(void);
  * and NULL is ignored by both. What is made from an object keeps what it needs of it alive, so
  * parents may be released first. Retaining and releasing is safe from any thread.
  *
- * Callbacks may run on any thread, must not throw or jump out, and may call the library, though
- * not change (or release for good) the object whose call they are in: that is
- * BK_ERROR_INVALID_STATE. Strings given to them are valid during the callback only.
+ * Callbacks may run on any thread and must not throw or jump out. They may call functions that do
+ * not work on a device's threads; the others (commit, create, bake, save, BK_RAYS_PARALLEL), and
+ * changes to the object whose call they are in, fail with BK_ERROR_INVALID_STATE. Strings given to
+ * callbacks are valid during the callback only.
  * ================================================================================================ */
 
 // The best instruction set that the machine has.
@@ -220,7 +221,11 @@ typedef struct bk_load_info {
   uint32_t materials;
   // Number of the first material added.
   uint32_t first_material;
-  // Channels of reflectances at or above 1 that were clamped to 0.98, or below 0 to 0.
+  // Lights added (emissive materials not counted), the first with number first_light.
+  uint32_t lights;
+  // Number of the first light added.
+  uint32_t first_light;
+  // Materials of which a reflectance was outside [0, 0.98] and was clamped to that.
   uint32_t clamped_albedos;
   // Triangles added, degenerate ones included.
   uint64_t triangles;
@@ -272,7 +277,7 @@ BK_API void bk_scene_release(bk_scene *scene);
 // Sets struct_size and clears the rest.
 BK_API void bk_load_info_init(bk_load_info *info);
 
-// Adds what a scene file describes: meshes and materials, emissive ones included.
+// Adds what a scene file describes: meshes, materials (emissive ones included), lights.
 //
 // path: UTF-8, ending in .obj (with its .mtl), .ply, .gltf or .glb. out: what was added; NULL if
 // not wanted.
@@ -692,12 +697,12 @@ typedef struct bk_lightmap_desc {
   float texels_per_unit;
   // Width and height of a page in texels, 16 to 16384. Default: 1024.
   uint32_t page_size;
-  // Texels around each chart that filtering may read, >= 1. Default: 2.
+  // Texels around each chart that filtering may read, 1 to 64. Default: 2.
   uint32_t padding;
-  // Light map texels per texel of the gather map (indirect light), along each axis, >= 1.
+  // Light map texels per texel of the gather map (indirect light), along each axis, 1 to 64.
   // Default: 4.
   uint32_t gather_divisor;
-  // Light map texels per texel of the radiance map (what gather rays see), along each axis, >= 1.
+  // Light map texels per texel of the radiance map (what gather rays see), along each axis, 1 to 64.
   // Default: 8.
   uint32_t radiance_divisor;
 } bk_lightmap_desc;
@@ -790,21 +795,47 @@ bk_result bk_lightmap_mesh_uvs(const bk_lightmap *lightmap,
  * light, composition. What the scene does not need is not run.
  * ================================================================================================ */
 
+// Bit of left_out. No indirect light: no photons, radiance map and gather map.
+#define BK_LEFT_OUT_INDIRECT 1
+
+// Bit of left_out. No photons and no estimate: no light is reflected more than once.
+#define BK_LEFT_OUT_PHOTONS 2
+
+// Bit of left_out. No direct light: nothing shines.
+#define BK_LEFT_OUT_DIRECT 4
+
+// Bit of left_out. No sampling of area lights.
+#define BK_LEFT_OUT_AREA_LIGHTS 8
+
+// Bit of left_out. No radiance of back sides.
+#define BK_LEFT_OUT_BACK_SIDES 16
+
+// Bit of left_out. No blur of the gather map.
+#define BK_LEFT_OUT_BLUR 32
+
+// Bit of left_out. No unwrapping: all meshes bring usable coordinates.
+#define BK_LEFT_OUT_UNWRAP 64
+
+// Bit of left_out. No interpolation of shading normals.
+#define BK_LEFT_OUT_SHADING_NORMALS 128
+
 // How to bake.
 typedef struct bk_bake_params {
   // Size of this structure in bytes, set by bk_bake_params_init.
   uint32_t struct_size;
-  // Most surfaces that a photon meets; 0, the default: Russian roulette alone ends its path.
+  // Most reflections of light before it reaches a texel; 0, the default: Russian roulette alone
+  // decides.
   uint32_t max_bounces;
   // Photons to emit. Default: 1,000,000.
   uint64_t photon_count;
-  // Rays per texel of the gather map; 0: no indirect light. Default: 64.
+  // Rays per texel of the gather map, at most 65536; 0: no indirect light. Default: 64.
   uint32_t gather_rays;
   // Photon search radius in scene units; 0, the default: from the density of photons.
   float radius;
   // Radius of the gather map's blur in its texels; 0: none. Default: 2.
   uint32_t blur_radius;
-  // Shadow rays per light map texel and area light, >= 1. Default: 16.
+  // Shadow rays per light map texel and area light, 1 to 4096 (of more than four area lights,
+  // four times as many rays are shared out). Default: 16.
   uint32_t direct_samples;
   // Seed of all random numbers. The same seed gives the same bits on any number of threads.
   // Default: 0.
@@ -874,7 +905,8 @@ bk_result bk_bake(bk_lightmap *lightmap,
                   void *user,
                   bk_bake_stats *out);
 
-// Describes in words what a bake of this light map runs, and what it leaves out and why.
+// Describes in words what the last bake ran (before the first: what a bake with default parameters
+// would run), and what it left out and why, one line each.
 //
 // dst: receives as much of the text (UTF-8) as fits, with a NUL; may be NULL if capacity is 0.
 // capacity: bytes that dst has room for.
@@ -924,13 +956,14 @@ BK_API size_t bk_plan_describe(const bk_lightmap *lightmap, char *dst, size_t ca
 // One uint32_t: 4 bytes per texel.
 #define BK_FORMAT_R32U 4
 
-// Float images, one EXR file per page and layer.
+// Float images of the light layers: PREFIXpageN-LAYER.exr, LAYER one of combined, indirect, direct,
+// radiance.
 #define BK_FILE_EXR 1
 
-// Tone-mapped 8-bit images to look at, one PNG file per page and layer.
+// Tone-mapped 8-bit images of the light layers, to look at: PREFIXpageN-LAYER.png.
 #define BK_FILE_PNG 2
 
-// The scene with the light map as second texture, one GLB file for any viewer.
+// The scene with the light map as second texture, for any viewer: PREFIXscene.glb.
 #define BK_FILE_GLB 3
 
 // Copies one layer of one page.
@@ -949,8 +982,8 @@ bk_result bk_lightmap_read(const bk_lightmap *lightmap,
 
 // Writes a baked light map to files.
 //
-// path_prefix: UTF-8; the names of the files are this followed by page, layer and extension.
-// file_format: one of the BK_FILE values.
+// path_prefix: UTF-8, put before the file names that the BK_FILE values state, as "out/" for files
+// in the folder out, which must exist. file_format: one of the BK_FILE values.
 //
 // Fails with BK_ERROR_IO, naming the file, if it cannot be written, with BK_ERROR_INVALID_STATE
 // before a bake, with BK_ERROR_UNSUPPORTED if the library was built without files.
