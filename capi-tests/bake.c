@@ -266,7 +266,10 @@ static void uvs(const bk_lightmap *lightmap) {
     int i, outside = 0;
 
     CHECK_OK(bk_lightmap_mesh_uvs(lightmap, 0, corner_uvs[0][0], pages));
-    for (i = 0; i < 60; i++) outside += !(corner_uvs[0][0][i] >= 0.0f && corner_uvs[0][0][i] <= 1.0f);
+    for (i = 0; i < 60; i++) {
+        float uv = corner_uvs[i / 6][i / 2 % 3][i % 2];
+        outside += !(uv >= 0.0f && uv <= 1.0f);
+    }
     for (i = 0; i < 10; i++) outside += pages[i] != 0;
     CHECK(outside == 0);
     CHECK_OK(bk_lightmap_mesh_uvs(lightmap, 0, NULL, pages));

@@ -1,46 +1,69 @@
-#!/bin/sh
-# Passes all tests: installs what is missing (Debian, Ubuntu), runs the Rust tests, builds the C and
-# C++ programs with CMake and runs them, the comparison with Embree included. Its exit code is the
-# verdict. Real scenes are used if they lie in ../shared/scenes or in $BAKELITE_SCENES.
-set -eu
+#!/usr/bin/env bash
+# All tests, on a fresh Debian or Ubuntu machine with a Rust toolchain: installs what is missing,
+# runs the Rust tests, builds the C and C++ programs with CMake and runs ctest. The exit code is the
+# verdict; the last line counts.
+#
+#     capi-tests/run.sh
+#
+# BAKELITE_SCENES: a folder of real scenes to compare with Embree on, beside the built-in ones
+# (default: ../shared/scenes, if there is such a folder).
+set -euo pipefail
 cd "$(dirname "$0")/.."
+root=$PWD
 
-missing=""
-need() { # command-or-file, package
-    if ! command -v "$1" >/dev/null 2>&1 && ! [ -e "$1" ]; then missing="$missing $2"; fi
+# ---- What is missing ----
+
+need=()
+command -v cmake >/dev/null || need+=(cmake)
+command -v make >/dev/null || need+=(make)
+command -v g++ >/dev/null || need+=(g++)
+command -v pkg-config >/dev/null || need+=(pkg-config)
+[ -e /usr/include/embree3/rtcore.h ] || need+=(libembree-dev)
+if [ ${#need[@]} -gt 0 ]; then
+    echo "== Installing with apt: ${need[*]}"
+    sudo=()
+    [ "$(id -u)" = 0 ] || sudo=(sudo)
+    "${sudo[@]}" apt-get update -qq
+    "${sudo[@]}" env DEBIAN_FRONTEND=noninteractive apt-get install -y -qq --no-install-recommends "${need[@]}" >/dev/null
+fi
+command -v cargo >/dev/null || {
+    echo 'There is no cargo: install Rust first, see https://rustup.rs' >&2
+    exit 1
 }
-need cmake cmake
-need make make
-need g++ g++
-need pkg-config pkg-config
-need /usr/include/embree3/rtcore.h libembree-dev
-if [ -n "$missing" ]; then
-    echo "installing:$missing"
-    as_root=""
-    [ "$(id -u)" = 0 ] || as_root=sudo
-    $as_root apt-get update -qq
-    # shellcheck disable=SC2086
-    $as_root env DEBIAN_FRONTEND=noninteractive apt-get install -y -qq --no-install-recommends $missing
-fi
-command -v cargo >/dev/null || { echo "a Rust toolchain is needed: https://rustup.rs" >&2; exit 1; }
-
-target=${CARGO_TARGET_DIR:-$PWD/target}
-if [ -d "${BAKELITE_SCENES:-../shared/scenes}" ]; then
-    BAKELITE_SCENES=$(cd "${BAKELITE_SCENES:-../shared/scenes}" && pwd)
-    export BAKELITE_SCENES
-    echo "scenes: $BAKELITE_SCENES"
-else
-    echo "scenes: the built-in ones only"
+embree=ON
+if [ ! -e /usr/include/embree3/rtcore.h ]; then
+    embree=OFF
+    echo '== The package libembree-dev of this system is not Embree 3: THE COMPARISON WITH EMBREE IS LEFT OUT'
 fi
 
-echo "== Rust tests"
-# Optimised: they trace millions of rays. The library and the programs below share the build.
-cargo test --release --locked
+# ---- The tests ----
+
+target=${CARGO_TARGET_DIR:-$root/target}
+build=$target/capi-tests
+log=$(mktemp)
+trap 'rm -f "$log"' EXIT
+verdict=0
+
+echo '== Rust, without features'
 cargo check --release --locked --no-default-features
 
-echo "== C and C++ programs"
-cmake -S capi-tests -B "$target/capi-tests" -DCMAKE_BUILD_TYPE=Release -DBAKELITE_CARGO_TARGET_DIR="$target" \
-    ${BAKELITE_SCENES:+-DBAKELITE_SCENES="$BAKELITE_SCENES"}
-cmake --build "$target/capi-tests"
-ctest --test-dir "$target/capi-tests" --output-on-failure
-echo "all tests passed"
+# Optimised: they trace millions of rays, and the programs below share the build.
+echo '== Rust, with all features'
+cargo test --release --locked --all-features --no-fail-fast 2>&1 | tee -a "$log" || verdict=1
+
+echo '== C and C++'
+scenes=${BAKELITE_SCENES:-$root/../shared/scenes}
+[ -d "$scenes" ] || echo "   (no folder $scenes: only the built-in scenes are compared with Embree)"
+cmake -S capi-tests -B "$build" -DBAKELITE_CARGO_TARGET_DIR="$target" -DBAKELITE_SCENES="$scenes" \
+    -DBAKELITE_TEST_EMBREE=$embree >/dev/null
+cmake --build "$build" || verdict=1
+ctest --test-dir "$build" --output-on-failure 2>&1 | tee -a "$log" || verdict=1
+
+# ---- The count: "test result: ok. 3 passed; 0 failed; ..." and "100% tests passed, 0 tests failed out of 12" ----
+
+awk '
+    /^test result:/ { passed += $4; failed += $6 }
+    /tests passed, .* tests failed out of/ { passed += $NF - $4; failed += $4 }
+    END { printf "%d passed, %d failed\n", passed, failed }
+' "$log"
+exit $verdict
