@@ -5,6 +5,7 @@
 
 #include "check.h"
 
+#include <cstring>
 #include <algorithm>
 #include <atomic>
 #include <cmath>

@@ -56,7 +56,7 @@ impl Lightmap {
         let unwrap_seconds = start.elapsed().as_secs_f64();
         let two_sided = charts.charts.iter().any(|c| c.two_sided);
         let pack = |divisor: u32, padding: u32, given: bool, back: bool| {
-            let page_size = (desc.page_size / divisor).max(MIN_PAGE_SIZE);
+            let page_size = if divisor == 1 { desc.page_size } else { (desc.page_size / divisor).max(MIN_PAGE_SIZE) };
             Layout::pack(&charts, density / divisor as f32, page_size, padding, given, back)
         };
         let layouts = [
@@ -72,8 +72,8 @@ impl Lightmap {
         let bytes = charts.bytes() + map.bytes() + gather.bytes() + radiance.bytes();
         let info = LightmapInfo {
             page_count: map.layout.page_count,
-            width: desc.page_size,
-            height: desc.page_size,
+            width: map.layout.page_size,
+            height: map.layout.page_size,
             charts: charts.charts.len() as u32,
             texels: map.len() as u64,
             gather_texels: gather.len() as u64,
