@@ -8,7 +8,7 @@ use super::map::ChartMap;
 use super::plan::{Plan, left_out};
 use super::radiance::{self, RadianceInput, RadianceMap};
 use super::texels::TexelMap;
-use super::{BakeParams, BakeStats, Light, Lightmap, LightmapDesc, LightmapInfo, StageStats, blur};
+use super::{BakeParams, BakeStats, Light, Lightmap, LightmapDesc, LightmapInfo, StageStats, TexelState, blur};
 use crate::error::{Error, Result, invalid_argument};
 use crate::memory::try_vec;
 use crate::photon::{PhotonMap, PhotonParams};
@@ -129,20 +129,32 @@ impl Lightmap {
         stats.peak_bytes = device.memory().peak() as u64;
         stats.left_out = plan.left_out;
         self.plan = plan;
+        let start = Instant::now();
         self.store(light, params.texel_begin as usize..end as usize);
+        stats.compose.seconds = start.elapsed().as_secs_f64();
+        stats.seconds += stats.compose.seconds;
         Ok(stats)
     }
 
-    /// Takes the light of a range of samples over.
+    /// Takes the light of a range of samples over. Hidden texels are filled here, from all that has
+    /// been baked so far: whatever the shards, the last one leaves the bits of a whole bake.
     fn store(&mut self, new: Light, range: Range<usize>) {
         match &mut self.light {
             Some(old) if range.len() < self.map.len() => {
                 old.direct[range.clone()].copy_from_slice(&new.direct[range.clone()]);
                 old.indirect[range.clone()].copy_from_slice(&new.indirect[range.clone()]);
-                old.valid[range.clone()].copy_from_slice(&new.valid[range]);
+                old.state[range.clone()].copy_from_slice(&new.state[range]);
                 old.radiance = new.radiance;
             }
             light => *light = Some(new),
+        }
+        let Some(light) = &mut self.light else { return };
+        let hidden: Vec<u32> =
+            (0..light.state.len() as u32).filter(|&i| light.state[i as usize] == TexelState::Hidden).collect();
+        // A hidden texel beside a lit one would show as a dark rim under bilinear filtering.
+        if !hidden.is_empty() {
+            let visible = light.state.iter().map(|&s| s == TexelState::Visible).collect();
+            blur::fill(&self.charts, &self.map, &mut light.direct, visible, hidden);
         }
     }
 }
@@ -182,7 +194,7 @@ impl Bake<'_, '_> {
         let mut light = Light {
             direct: try_vec(n, "direct light")?,
             indirect: try_vec(n, "indirect light")?,
-            valid: try_vec(n, "validity")?,
+            state: try_vec(n, "validity")?,
             radiance,
             _memory: memory,
         };
@@ -277,7 +289,8 @@ impl Bake<'_, '_> {
                 stage.advance(values.len() as u64)
             })
         })?;
-        blur::fill(&l.charts, &l.gather, &mut irradiance, &valid);
+        let hidden = needed.clone().filter(|&i| !valid[i]).map(|i| i as u32).collect();
+        blur::fill(&l.charts, &l.gather, &mut irradiance, valid.clone(), hidden);
         if self.plan.runs(left_out::BLUR) {
             let stage = self.progress.stage("blur", 0.6, 0.65, n as u64);
             let mut blurred = try_vec(n, "the blurred gather map")?;
@@ -308,19 +321,21 @@ impl Bake<'_, '_> {
         scene.device().install(|| {
             let direct = light.direct[range.clone()].par_chunks_mut(BLOCK);
             let indirect_out = light.indirect[range.clone()].par_chunks_mut(BLOCK);
-            let valid = light.valid[range.clone()].par_chunks_mut(BLOCK);
-            direct.zip(indirect_out).zip(valid).enumerate().try_for_each(|(block, ((direct, ind), valid))| {
+            let state = light.state[range.clone()].par_chunks_mut(BLOCK);
+            direct.zip(indirect_out).zip(state).enumerate().try_for_each(|(block, ((direct, ind), state))| {
                 let mut traced = 0;
                 for i in 0..direct.len() {
                     let sample = range.start + block * BLOCK + i;
                     let (_, receiver) = l.map.receiver(scene, sample, false);
-                    valid[i] = true;
+                    state[i] = TexelState::Visible;
                     if let Some(indirect) = indirect {
                         let (value, clear) = self.interpolate(sample, indirect);
                         ind[i] = value;
                         if !clear {
                             traced += 1;
-                            valid[i] = !inside_a_solid(scene, receiver.origin, receiver.geometric);
+                            if inside_a_solid(scene, receiver.origin, receiver.geometric) {
+                                state[i] = TexelState::Hidden;
+                            }
                         }
                     }
                     if self.plan.runs(left_out::DIRECT) {
@@ -337,10 +352,6 @@ impl Bake<'_, '_> {
             rays: rays.into_inner(),
             bytes: (l.map.len() * 25 + l.map.bytes()) as u64,
         };
-        let start = Instant::now();
-        // A hidden texel beside a lit one would show as a dark rim under bilinear filtering.
-        blur::fill(&l.charts, &l.map, &mut light.direct, &light.valid);
-        stats.compose = StageStats { seconds: start.elapsed().as_secs_f64(), ..Default::default() };
         Ok(())
     }
 

@@ -116,12 +116,10 @@ impl Window {
     }
 }
 
-/// Gives each texel that is not valid the mean of its valid or already filled neighbours in the
-/// chart, ring by ring. Charts without a valid texel are left alone. Returns which were filled.
-pub(super) fn fill(charts: &Charts, map: &ChartMap, values: &mut [Vec3], valid: &[bool]) -> Vec<u32> {
-    let mut known = valid.to_vec();
-    let mut missing: Vec<u32> = (0..valid.len() as u32).filter(|&i| !valid[i as usize]).collect();
-    let mut filled = Vec::new();
+/// Gives each of the texels `missing` the mean of its known or already filled neighbours in the
+/// chart, ring by ring. What charts without a known texel hold is left alone. Depends on the known
+/// texels alone, not on what the missing ones hold.
+pub(super) fn fill(charts: &Charts, map: &ChartMap, values: &mut [Vec3], mut known: Vec<bool>, mut missing: Vec<u32>) {
     for _ in 0..MAX_FILL_ROUNDS {
         let ring: Vec<(u32, Vec3)> =
             missing.iter().filter_map(|&i| Some((i, neighbours(charts, map, i, values, &known)?))).collect();
@@ -131,11 +129,9 @@ pub(super) fn fill(charts: &Charts, map: &ChartMap, values: &mut [Vec3], valid: 
         for &(i, v) in &ring {
             values[i as usize] = v;
             known[i as usize] = true;
-            filled.push(i);
         }
         missing.retain(|&i| !known[i as usize]);
     }
-    filled
 }
 
 /// Mean of the known neighbours of a texel in its chart.

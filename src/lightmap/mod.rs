@@ -157,12 +157,22 @@ pub enum LayerData {
     Integer(Vec<u32>),
 }
 
+/// What is known of a texel.
+#[derive(Clone, Copy, Debug, Default, PartialEq, Eq)]
+enum TexelState {
+    /// Not part of any bake yet.
+    #[default]
+    Unbaked,
+    /// Inside a solid; its light is filled in from its neighbours.
+    Hidden,
+    Visible,
+}
+
 /// Light of the texels after a bake, by sample of the light map.
 struct Light {
     direct: Vec<Vec3>,
     indirect: Vec<Vec3>,
-    /// Whether each sample can be seen; the others were filled from their neighbours.
-    valid: Vec<bool>,
+    state: Vec<TexelState>,
     /// Reflected radiance, by sample of the radiance map. Empty if the bake left it out.
     radiance: Vec<Vec3>,
     _memory: Reservation,

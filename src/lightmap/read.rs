@@ -2,7 +2,7 @@
 
 use super::direct::DirectLight;
 use super::radiance::RadianceMap;
-use super::{Layer, LayerData, Light, Lightmap};
+use super::{Layer, LayerData, Light, Lightmap, TexelState};
 use crate::error::{Error, Result, invalid_argument};
 use crate::memory::try_vec;
 use crate::scene::NONE;
@@ -66,7 +66,16 @@ impl Lightmap {
             }
             Layer::Validity => {
                 let light = self.light()?;
-                LayerData::Scalar(self.page(page, 0.0, |s| if light.valid[s] { 1.0 } else { 0.5 }, false)?)
+                LayerData::Scalar(self.page(
+                    page,
+                    0.0,
+                    |s| match light.state[s] {
+                        TexelState::Visible => 1.0,
+                        TexelState::Hidden => 0.5,
+                        TexelState::Unbaked => 0.0,
+                    },
+                    false,
+                )?)
             }
             Layer::Position => {
                 LayerData::Rgb(self.page(page, [0.0; 3], |s| self.map.surface(&self.scene, s).0.to_array(), false)?)
