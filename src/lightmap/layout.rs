@@ -5,7 +5,8 @@
 //! map keeps the caller's placement.
 //!
 //! Rectangles are packed along a skyline (bottom left), highest first, after Jylänki, *A Thousand
-//! Ways to Pack the Bin* (2010).
+//! Ways to Pack the Bin* (2010). Shelves (the crate `etagere`) took more pages for the same
+//! rectangles: 12 instead of 10 for Sponza's light map, 25 instead of 11 for its radiance map.
 
 use super::charts::{Chart, Charts, Given};
 use crate::error::{Error, Result, invalid_argument};
