@@ -12,7 +12,6 @@ use super::handles::{create, hold, object, release, retain};
 use super::scene::bk_scene;
 use crate::photon::{PhotonMap, PhotonParams};
 use bytemuck::cast_slice;
-use glam::Vec3;
 use std::ffi::c_void;
 
 /// Flag: leave out photons that come straight from a light; the map then holds indirect light only.
@@ -129,13 +128,11 @@ pub unsafe extern "C" fn bk_photon_map_estimate(
     // SAFETY: the arrays are the caller's, or NULL.
     call(|| unsafe {
         let map = object!(map);
-        let positions = slice(positions.cast::<Vec3>(), count, "positions")?;
-        let normals = slice(normals.cast::<Vec3>(), count, "normals")?;
+        let positions: &[[f32; 3]] = slice(positions.cast(), count, "positions")?;
+        let normals: &[[f32; 3]] = slice(normals.cast(), count, "normals")?;
         let inputs = [(cast_slice(positions), "positions"), (cast_slice(normals), "normals")];
-        let out = slice_mut(out_irradiance_rgb.cast::<[f32; 3]>(), count, "out_irradiance_rgb", &inputs)?;
-        for ((&position, &normal), e) in positions.iter().zip(normals).zip(out) {
-            *e = map.map.estimate(position, normal);
-        }
+        let out = slice_mut(out_irradiance_rgb.cast(), count, "out_irradiance_rgb", &inputs)?;
+        map.map.estimate_block(positions, normals, out);
         Ok(())
     })
 }
