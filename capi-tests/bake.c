@@ -261,19 +261,16 @@ static void read_layers(const bk_lightmap *lightmap, uint64_t texels) {
 }
 
 static void uvs(const bk_lightmap *lightmap) {
-    float corner_uvs[10][3][2];
+    float corner_uvs[10 * 3 * 2];
     uint32_t pages[10];
     int i, outside = 0;
 
-    CHECK_OK(bk_lightmap_mesh_uvs(lightmap, 0, corner_uvs[0][0], pages));
-    for (i = 0; i < 60; i++) {
-        float uv = corner_uvs[i / 6][i / 2 % 3][i % 2];
-        outside += !(uv >= 0.0f && uv <= 1.0f);
-    }
+    CHECK_OK(bk_lightmap_mesh_uvs(lightmap, 0, corner_uvs, pages));
+    for (i = 0; i < 60; i++) outside += !(corner_uvs[i] >= 0.0f && corner_uvs[i] <= 1.0f);
     for (i = 0; i < 10; i++) outside += pages[i] != 0;
     CHECK(outside == 0);
     CHECK_OK(bk_lightmap_mesh_uvs(lightmap, 0, NULL, pages));
-    CHECK_OK(bk_lightmap_mesh_uvs(lightmap, 0, corner_uvs[0][0], NULL));
+    CHECK_OK(bk_lightmap_mesh_uvs(lightmap, 0, corner_uvs, NULL));
 }
 
 static void plan(const bk_lightmap *lightmap) {

@@ -1,6 +1,8 @@
 # Runs cargo, asks rustc which libraries of the system a static link needs, and lays the results out.
 # Called by CMakeLists.txt at build time, with everything as -D definitions.
 
+cmake_minimum_required(VERSION 3.18)
+
 # RUSTFLAGS and cargo's configuration are the caller's: what this build needs is passed to rustc for
 # this crate alone.
 set(rustc_args --print native-static-libs -C strip=debuginfo)
@@ -47,7 +49,7 @@ if(SONAME)
   endforeach()
 endif()
 
-file(CONFIGURE OUTPUT "${LIB_DIR}/native.rsp" CONTENT "${native}\n")
+file(WRITE "${LIB_DIR}/native.rsp" "${native}\n")
 string(REPLACE " " ";" native_list "${native}")
-file(CONFIGURE OUTPUT "${NATIVE_LIBRARIES}" CONTENT "set(bakelite_NATIVE_LIBRARIES \"@native_list@\")\n" @ONLY)
+file(WRITE "${NATIVE_LIBRARIES}" "set(bakelite_NATIVE_LIBRARIES \"${native_list}\")\n")
 configure_file("${PC_IN}" "${PC_OUT}" @ONLY)
