@@ -45,10 +45,10 @@ trap 'rm -f "$log"' EXIT
 verdict=0
 
 echo '== Rust, without features'
-cargo check --locked --no-default-features
+cargo check --release --locked --no-default-features
 
 echo '== Rust, with all features'
-cargo test --locked --all-features --no-fail-fast 2>&1 | tee -a "$log" || verdict=1
+cargo test --release --locked --all-features --no-fail-fast 2>&1 | tee -a "$log" || verdict=1
 
 echo '== C and C++'
 scenes=${BAKELITE_SCENES:-$root/../shared/scenes}
