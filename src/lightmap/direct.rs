@@ -165,14 +165,14 @@ impl DirectLight {
     pub fn irradiance(&self, receiver: &Receiver, samples: u32, seed: u32, rays: &mut u64) -> Vec3 {
         let mut sum = Vec3::ZERO;
         for light in self.lights.iter() {
-            sum += self.from_light(light, receiver, rays);
+            sum += self.one_light(light, receiver, rays);
         }
         if self.areas.is_empty() || samples == 0 {
             sum
         } else if self.areas.len() <= MAX_ANALYTIC {
-            sum + self.from_few_areas(receiver, samples, seed, rays)
+            sum + self.few_area_lights(receiver, samples, seed, rays)
         } else {
-            sum + self.from_many_areas(receiver, samples, seed, rays)
+            sum + self.many_area_lights(receiver, samples, seed, rays)
         }
     }
 
@@ -181,13 +181,13 @@ impl DirectLight {
         !self.scene.occluded(&Ray::new(receiver.origin, target - receiver.origin).within(0.0, 1.0 - LIGHT_MARGIN))
     }
 
-    fn from_light(&self, light: &Light, receiver: &Receiver, rays: &mut u64) -> Vec3 {
+    fn one_light(&self, light: &Light, receiver: &Receiver, rays: &mut u64) -> Vec3 {
         match *light {
-            Light::Point { position, intensity } => self.from_point(position, Vec3::from(intensity), receiver, rays),
+            Light::Point { position, intensity } => self.point_light(position, Vec3::from(intensity), receiver, rays),
             Light::Spot { position, direction, inner, outer, intensity } => {
                 let way = (receiver.origin - position).normalize_or_zero();
                 let falloff = Light::spot_falloff(way.dot(direction), inner, outer);
-                self.from_point(position, Vec3::from(intensity) * falloff, receiver, rays)
+                self.point_light(position, Vec3::from(intensity) * falloff, receiver, rays)
             }
             Light::Directional { direction, irradiance } => {
                 let cosine = -direction.dot(receiver.normal);
@@ -202,7 +202,7 @@ impl DirectLight {
         }
     }
 
-    fn from_point(&self, position: Vec3, intensity: Vec3, receiver: &Receiver, rays: &mut u64) -> Vec3 {
+    fn point_light(&self, position: Vec3, intensity: Vec3, receiver: &Receiver, rays: &mut u64) -> Vec3 {
         let way = position.as_dvec3() - receiver.origin.as_dvec3();
         let d2 = way.length_squared();
         let cosine = way.dot(receiver.normal.as_dvec3());
@@ -214,7 +214,7 @@ impl DirectLight {
     }
 
     /// Exact unoccluded irradiance times the visible fraction of it.
-    fn from_few_areas(&self, receiver: &Receiver, samples: u32, seed: u32, rays: &mut u64) -> Vec3 {
+    fn few_area_lights(&self, receiver: &Receiver, samples: u32, seed: u32, rays: &mut u64) -> Vec3 {
         let mut unoccluded = [0.0f32; MAX_ANALYTIC];
         let (mut total, mut importance, mut shining) = (Vec3::ZERO, 0.0f32, 0);
         for (e, area) in unoccluded.iter_mut().zip(&self.areas) {
@@ -255,7 +255,7 @@ impl DirectLight {
     }
 
     /// Unbiased: lights picked by power.
-    fn from_many_areas(&self, receiver: &Receiver, samples: u32, seed: u32, rays: &mut u64) -> Vec3 {
+    fn many_area_lights(&self, receiver: &Receiver, samples: u32, seed: u32, rays: &mut u64) -> Vec3 {
         let n = samples as usize * MAX_LIGHTS_SAMPLED;
         let offset = sobol_2d(0, combine(seed, 1))[0];
         let mut sum = Vec3::ZERO;

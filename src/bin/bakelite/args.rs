@@ -52,7 +52,7 @@ Pictures (path traced reference; indirect map + shadow rays; light map alone):
                                           without it, a view is looked for
   --up x|y|z             up axis of the scene, for the camera [y]
   --width N --height N   size of each [480 x 270]
-  --reference-spp N      paths per pixel of the reference; 0: no pictures [64]
+  --reference-spp N      paths per pixel of the reference; 0: no pictures [16]
 Output:
   --out DIR              where all files go [out]
   --no-glb               do not write the scene with its light maps as GLB
@@ -105,7 +105,7 @@ impl Default for BakeArgs {
             up: Vec3::Y,
             width: 480,
             height: 270,
-            reference_spp: 64,
+            reference_spp: 16,
             out: "out".into(),
             glb: true,
             quiet: false,
