@@ -127,8 +127,8 @@ fn a_point_light_in_a_room_gives_intensity_times_cosine_over_squared_distance() 
         let found = map.estimate(point, normal);
         // Photons in the disc, and the noise of as many independent ones under the cone filter.
         let count = 1e6 / (4.0 * PI) * expected * PI * 0.03f64.powi(2);
-        for c in 0..3 {
-            assert_close(found[c] as f64, (c + 1) as f64 * expected, 3.0 / count.sqrt());
+        for (channel, &e) in found.iter().enumerate() {
+            assert_close(e as f64, (channel + 1) as f64 * expected, 3.0 / count.sqrt());
         }
     }
 }
