@@ -342,7 +342,7 @@ mod tests {
     #[test]
     fn strided_arrays_need_neither_alignment_nor_tail() {
         let values = [[1.0f32, 2.0, 3.0], [4.0, 5.0, 6.0]];
-        let mut bytes = vec![0u8; 1 + 17 + 12];
+        let mut bytes = [0u8; 1 + 17 + 12];
         for (i, v) in values.iter().enumerate() {
             bytes[1 + i * 17..][..12].copy_from_slice(bytemuck::bytes_of(v));
         }

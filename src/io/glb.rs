@@ -451,7 +451,7 @@ pub(super) mod tests {
         };
         let pop = message(|l| drop(l.meshes.pop()));
         assert_eq!(pop, "invalid argument: light map UVs of 1 meshes for 2");
-        assert!(message(|l| drop(l.meshes[1].pages.pop())).contains("mesh 1 has 3 triangles"));
+        assert!(message(|l| _ = l.meshes[1].pages.pop()).contains("mesh 1 has 3 triangles"));
         assert!(message(|l| l.meshes[0].pages[2] = 2).contains("mesh 0 names page 2, there are 2"));
         assert!(message(|l| l.meshes[0].corner_uvs[2][1][0] = f32::NAN).contains("NaN"));
     }

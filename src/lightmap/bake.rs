@@ -230,7 +230,7 @@ impl Bake<'_, '_> {
             store_direct: false,
             ..Default::default()
         };
-        let map = PhotonMap::trace(&self.lightmap.scene, &params, self.progress)?;
+        let map = PhotonMap::trace_within(&self.lightmap.scene, &params, self.progress, 0.0, 0.2)?;
         let s = map.stats();
         stats.photons = StageStats { seconds: start.elapsed().as_secs_f64(), rays: s.rays, bytes: map.bytes() as u64 };
         (stats.photons_emitted, stats.photons_stored) = (s.emitted, s.stored);

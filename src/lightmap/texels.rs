@@ -217,8 +217,8 @@ impl TexelMap {
         Bilinear { samples, weights }
     }
 
-    /// The uncovered texels of a page within `padding` of a covered one (a square of 2 · `padding`
-    /// + 1 texels), each with the nearest sample, for filters that read beyond the charts' borders.
+    /// The uncovered texels of a page within `padding` rows and columns of a covered one, each with
+    /// the nearest sample, for filters that read beyond the charts' borders.
     /// Ordered by placement, row, column; given charts of a page count as one.
     pub fn dilate(&self, page: u32, padding: u32) -> Vec<Dilated> {
         let on_page: Vec<&Group> = self.groups.iter().filter(|g| g.page == page).collect();

@@ -17,6 +17,9 @@ use rayon::prelude::*;
 use std::f32::consts::PI;
 use std::time::Instant;
 
+/// Linear RGB, row by row.
+type Pixels = Vec<[f32; 3]>;
+
 /// Captions, in the pictures' order.
 pub const TITLES: [&str; 3] = ["Path traced reference", "Indirect map + shadow rays", "Light map alone"];
 
@@ -100,7 +103,7 @@ impl View<'_> {
     }
 
     /// The reference as the mean of two independent halves, and these.
-    fn reference(&self, progress: &Progress) -> Result<(Vec<[f32; 3]>, [Vec<[f32; 3]>; 2])> {
+    fn reference(&self, progress: &Progress) -> Result<(Pixels, [Pixels; 2])> {
         let scene = self.lightmap.scene();
         let tracer = PathTracer::new(scene);
         let half = |seed: u64| {
