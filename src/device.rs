@@ -112,9 +112,13 @@ impl Device {
 impl Drop for Device {
     fn drop(&mut self) {
         drop(self.pool.take());
-        // A callback may drop the last reference on one of the threads, which cannot join itself.
+        // A callback may drop the last reference on one of the threads. It cannot join itself, nor
+        // the others, which end only after the job that it is in: they end on their own.
         let this = std::thread::current().id();
-        for thread in self.threads.drain(..).filter(|t| t.thread().id() != this) {
+        if self.threads.iter().any(|t| t.thread().id() == this) {
+            return;
+        }
+        for thread in self.threads.drain(..) {
             let _ = thread.join();
         }
     }
