@@ -747,7 +747,7 @@ pub(super) mod tests {
             with(|root| root["nodes"][2]["scale"] = json!([0, 0, 0])).starts_with("light 0: the light's direction")
         );
         assert!(with(|root| root["accessors"][0]["type"] = "VEC2".into()).ends_with("accessor 0 is not of 3-vectors"));
-        assert!(with(|root| root["bufferViews"][1]["byteStride"] = 2.into()).ends_with("less than 4"));
+        assert!(with(|root| root["bufferViews"][0]["byteStride"] = 4.into()).ends_with("stride 4, less than 12"));
         assert_eq!(refusal("a.glb", b"glTF\x02\0\0\0"), "the GLB header is cut off");
         for nothing in ["", "{}", "null", "[1", "{\"asset\":{\"version\":\"2.0\"}}"] {
             assert!(!refusal("a.gltf", nothing).is_empty());

@@ -387,10 +387,12 @@ element face {f}\nproperty list {face_type} vertex_index\nend_header\n{vertices}
         assert!(int("3 0 1\n").starts_with("line 13, face 0: "), "{}", int("3 0 1\n"));
         assert!(int("3 0 1 x\n").starts_with("line 13, face 0: "));
         assert_eq!(int(""), "there are no faces in it");
-        assert_eq!(
-            refusal("a.ply", simple("0 0 0\n1 nan 0\n0 1 0\n", "uchar int", "3 0 1 2\n")),
-            "vertex 1 is [1, NaN, 0], not finite or out of range"
-        );
+        let text = refusal("a.ply", simple("0 0 0\n1 nan 0\n0 1 0\n", "uchar int", "3 0 1 2\n"));
+        assert!(text.starts_with("line 11, vertex 1: "), "{text}");
+        let mut binary = binary_sample(true);
+        let y = String::from_utf8_lossy(&binary).find("end_header\n").unwrap() + 11 + 37 + 4;
+        binary[y..y + 4].copy_from_slice(&f32::NAN.to_le_bytes());
+        assert_eq!(refusal("a.ply", binary), "vertex 1 is [1, NaN, 0], not finite or out of range");
         assert_eq!(
             refusal("a.ply", simple(CORNERS, "uchar int", "3 0 1 2\n").replace("face 1", "face 2")),
             "line 14, face 1: the file ends here"
