@@ -5,7 +5,6 @@
 
 #include "check.h"
 
-#include <cstring>
 #include <algorithm>
 #include <atomic>
 #include <chrono>
