@@ -68,8 +68,12 @@ pub unsafe extern "C" fn bk_lightmap_read(
         let bytes = encode(&data, format).ok_or_else(|| {
             Error::InvalidArgument(format!("format is {format}, which does not suit the layer {layer:?}"))
         })?;
+        if bytes.len() != packed * info.height as usize {
+            return Err(Error::Internal(format!("page {page} has {} bytes in layer {layer:?}", bytes.len())));
+        }
         for (row, from) in bytes.chunks_exact(packed).enumerate() {
-            // SAFETY: the caller has room for `height` rows `stride` bytes apart.
+            // SAFETY: the caller has room for `height` rows `stride` bytes apart, and there are just
+            // that many.
             unsafe { std::ptr::copy_nonoverlapping(from.as_ptr(), dst.cast::<u8>().add(row * stride), packed) };
         }
         Ok(())
