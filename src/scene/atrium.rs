@@ -63,22 +63,22 @@ pub fn atrium() -> Result<SceneData> {
         position: Vec3::new(-x, PARAPET + 0.7, -z),
         edge_u: Vec3::new(2.0 * x, 0.0, 0.0),
         edge_v: Vec3::new(0.0, 0.0, 2.0 * z),
-        radiance: [2.6, 3.3, 4.4],
+        radiance: [3.2, 4.0, 5.2],
     })?;
-    scene.add_light(Light::Directional { direction: SUN, irradiance: [46.0, 39.0, 29.0] })?;
+    scene.add_light(Light::Directional { direction: SUN, irradiance: [44.0, 37.5, 28.0] })?;
     Ok(scene)
 }
 
 /// The way that sunlight travels.
 const SUN: Vec3 = Vec3::new(0.45, -1.0, 0.36);
 
-/// A view along the court from under the arcade at one end.
+/// A view from the upper floor at one end, along the court and down into it.
 pub fn atrium_camera() -> Camera {
     Camera {
-        position: Vec3::new(-8.6, 1.9, -1.9),
-        target: Vec3::new(2.0, 3.5, 1.2),
+        position: Vec3::new(-6.45, 6.0, -1.4),
+        target: Vec3::new(1.5, 3.7, 0.8),
         up: Vec3::Y,
-        fov_y: 58f32.to_radians(),
+        fov_y: 62f32.to_radians(),
     }
 }
 

@@ -32,16 +32,21 @@ pub fn offset_ray_origin(position: Vec3, normal: Vec3, scene: &Scene) -> Vec3 {
 /// normal that is inside of walls that meet at 8° or more.
 const EDGE_DISTANCE: f64 = 8.0;
 
+/// How far a point moves at most to get away from edges, in [`ray_epsilon`]s: enough for corners of
+/// 30° and more.
+const MAX_MOVE: f64 = 4.0 * EDGE_DISTANCE;
+
 /// A point of a triangle with all that a path needs to go on from it.
 pub struct SurfacePoint {
     /// The hit point, rounded once.
     pub position: Vec3,
     /// Unit geometric normal of the front.
     pub normal: Vec3,
-    /// The hit point pulled inside the triangle: at least eight [`ray_epsilon`]s from its edges,
-    /// where the triangle is large enough, else half-way to its centroid. Rays start here (offset
-    /// along the normal), because a point at an edge, rounded and offset, may lie behind the wall
-    /// that it shares the edge with, and its rays would leak out.
+    /// The hit point, or, where that is nearer than eight [`ray_epsilon`]s to an edge, the nearest
+    /// point that is not (of a narrow triangle: nearer than half its inradius). Rays start here
+    /// (offset along the normal), because a point at an edge, rounded and offset, may lie behind the
+    /// wall that it shares the edge with, and its rays would leak out. It is never further than 32
+    /// [`ray_epsilon`]s from the hit point, so that no shadow is seen to move with it.
     pub interior: Vec3,
 }
 
@@ -49,22 +54,44 @@ impl SurfacePoint {
     /// The point with barycentric weights `u` and `v` of vertices 1 and 2.
     #[inline]
     pub fn new(corners: [Vec3; 3], u: f32, v: f32, scene: &Scene) -> SurfacePoint {
-        let [a, b, c] = corners.map(|c| c.as_dvec3());
+        let corners = corners.map(|c| c.as_dvec3());
+        let [a, b, c] = corners;
         let (edge_u, edge_v) = (b - a, c - a);
         let cross = edge_u.cross(edge_v);
         let twice_area = cross.length();
-        let position = a + edge_u * u as f64 + edge_v * v as f64;
-        // The centroid is 1/3 of a height from each edge, and no height is less than two inradii.
-        let inradius = twice_area / (edge_u.length() + edge_v.length() + (edge_v - edge_u).length());
+        let (u, v) = (u as f64, v as f64);
+        let position = a + edge_u * u + edge_v * v;
+        let lengths = [(c - b).length(), edge_v.length(), edge_u.length()];
+        let inradius = twice_area / (lengths[0] + lengths[1] + lengths[2]);
         let rounded = position.as_vec3();
-        let pull = (1.5 * EDGE_DISTANCE * ray_epsilon(rounded, scene) as f64 / inradius).min(0.5);
-        let centroid: DVec3 = (a + b + c) / 3.0;
-        SurfacePoint {
-            position: rounded,
-            normal: (cross / twice_area).as_vec3(),
-            interior: (position + (centroid - position) * pull).as_vec3(),
-        }
+        let epsilon = ray_epsilon(rounded, scene) as f64;
+        let distance = (EDGE_DISTANCE * epsilon).min(0.5 * inradius);
+        let weights = [1.0 - u - v, u, v];
+        let interior = if (0..3).all(|i| weights[i] * twice_area >= distance * lengths[i]) {
+            rounded
+        } else {
+            let target = nearest_on_inner_triangle(corners, lengths, distance / inradius, position);
+            (position + (target - position).clamp_length_max(MAX_MOVE * epsilon)).as_vec3()
+        };
+        SurfacePoint { position: rounded, normal: (cross / twice_area).as_vec3(), interior }
     }
+}
+
+/// The point nearest to `p`, which lies outside of it, of a triangle shrunk towards its incentre by a
+/// fraction of its inradius. `lengths`: of the edges opposite to the corners.
+#[cold]
+fn nearest_on_inner_triangle(corners: [DVec3; 3], lengths: [f64; 3], fraction: f64, p: DVec3) -> DVec3 {
+    let [a, b, c] = corners;
+    let incentre = (a * lengths[0] + b * lengths[1] + c * lengths[2]) / (lengths[0] + lengths[1] + lengths[2]);
+    let inner = corners.map(|c| c + (incentre - c) * fraction);
+    let on_edge = |i: usize| {
+        let (from, edge) = (inner[i], inner[(i + 1) % 3] - inner[i]);
+        let t = (p - from).dot(edge) / edge.length_squared();
+        // Not a number for an edge of no length.
+        from + edge * if t > 0.0 { t.min(1.0) } else { 0.0 }
+    };
+    let points = [on_edge(0), on_edge(1), on_edge(2)];
+    points.into_iter().min_by(|x, y| x.distance_squared(p).total_cmp(&y.distance_squared(p))).unwrap_or(p)
 }
 
 #[cfg(test)]
@@ -129,6 +156,27 @@ mod tests {
                 let inward = p.normal.as_dvec3().cross(b - a).normalize();
                 let distance = (p.interior.as_dvec3() - a).dot(inward);
                 prop_assert!(distance > 0.9 * EDGE_DISTANCE * ray_epsilon(p.position, &scene) as f64, "{distance:e} from edge {i}");
+            }
+        }
+
+        /// Of slivers too: their shadows once moved by a third of their length.
+        #[test]
+        fn the_interior_point_is_in_the_triangle_and_near_the_point(
+            (u, v) in (0.0f32..=1.0, 0.0f32..=1.0),
+            width in -6.0f32..0.0,
+            lean in -1.0f32..2.0,
+        ) {
+            let corners = [Vec3::ZERO, Vec3::new(10.0, 0.0, 0.0), Vec3::new(10.0 * lean, 10f32.powf(width), 0.0)];
+            let scene = one_triangle(corners);
+            let (u, v) = if u + v > 1.0 { (1.0 - u, 1.0 - v) } else { (u, v) };
+            let p = SurfacePoint::new(corners, u, v, &scene);
+            let epsilon = ray_epsilon(p.position, &scene);
+            prop_assert!(p.interior.distance(p.position) <= 1.01 * MAX_MOVE as f32 * epsilon);
+            for i in 0..3 {
+                let (a, b) = (corners[i].as_dvec3(), corners[(i + 1) % 3].as_dvec3());
+                let inward = p.normal.as_dvec3().cross(b - a).normalize();
+                let distance = (p.interior.as_dvec3() - a).dot(inward);
+                prop_assert!(distance > -0.1 * epsilon as f64, "{distance:e} beyond edge {i}");
             }
         }
     }

@@ -29,7 +29,7 @@ Lights, added to those of the scene; may be repeated:
                                           corner and edges, shines along u x v,
                                           radiance in W/(m2 sr)
 Light map:
-  --texels-per-unit F    density; 0: about four pages [0]
+  --texels-per-unit F    density; 0: about one page [0; the atrium: 30]
   --page-size N          width and height of a page in texels [1024]
   --padding N            texels around each chart [2]
   --gather-divisor N     light map texels per gather map texel and axis [4]
@@ -52,7 +52,7 @@ Pictures (path traced reference; indirect map + shadow rays; light map alone):
                                           without it, a view is looked for
   --up x|y|z             up axis of the scene, for the camera [y]
   --width N --height N   size of each [480 x 270]
-  --reference-spp N      paths per pixel of the reference; 0: no pictures [16]
+  --reference-spp N      paths per pixel of the reference; 0: no pictures [32]
 Output:
   --out DIR              where all files go [out]
   --no-glb               do not write the scene with its light maps as GLB
@@ -105,13 +105,17 @@ impl Default for BakeArgs {
             up: Vec3::Y,
             width: 480,
             height: 270,
-            reference_spp: 16,
+            reference_spp: 32,
             out: "out".into(),
             glb: true,
             quiet: false,
         }
     }
 }
+
+/// Light map texels per metre of the atrium unless a density is given: it takes so many to show the
+/// shadows of its balusters.
+const ATRIUM_DENSITY: f32 = 30.0;
 
 /// Images beyond this width or height are a slip of the finger.
 const MAX_PICTURE: usize = 16384;
@@ -120,7 +124,7 @@ const MAX_PICTURE: usize = 16384;
 pub fn parse(args: impl IntoIterator<Item = OsString>) -> Result<Command, String> {
     let mut parser = lexopt::Parser::from_args(args);
     let mut bake = BakeArgs::default();
-    let (mut first, mut scene) = (true, None);
+    let (mut first, mut scene, mut density) = (true, None, None);
     while let Some(arg) = parser.next().map_err(|e| e.to_string())? {
         match arg {
             Arg::Short('h') | Arg::Long("help") => return Ok(Command::Help),
@@ -132,6 +136,9 @@ pub fn parse(args: impl IntoIterator<Item = OsString>) -> Result<Command, String
                 return Err(format!("there are two scenes, {first:?} and {:?}", v.to_string_lossy()));
             }
             Arg::Short(c) => return Err(format!("there is no flag -{c}")),
+            Arg::Long("texels-per-unit") => {
+                density = Some(number("--texels-per-unit", &value("--texels-per-unit", &mut parser)?)?);
+            }
             Arg::Long(name) => {
                 let name = name.to_owned();
                 option(&name, &mut parser, &mut bake)?;
@@ -142,20 +149,17 @@ pub fn parse(args: impl IntoIterator<Item = OsString>) -> Result<Command, String
     if let Some(scene) = scene {
         bake.scene = scene;
     }
+    bake.desc.texels_per_unit = density.unwrap_or(if bake.scene == "atrium" { ATRIUM_DENSITY } else { 0.0 });
     Ok(Command::Bake(Box::new(bake)))
 }
 
 /// Takes one `--name` with its value.
 fn option(name: &str, parser: &mut lexopt::Parser, bake: &mut BakeArgs) -> Result<(), String> {
     let flag = format!("--{name}");
-    let mut value = || match parser.value() {
-        Ok(v) => text(&flag, v),
-        Err(_) => Err(format!("{flag} needs a value")),
-    };
+    let mut value = || value(&flag, parser);
     let (desc, params) = (&mut bake.desc, &mut bake.params);
     match name {
         "light" => bake.lights.push(light(&value()?)?),
-        "texels-per-unit" => desc.texels_per_unit = number(&flag, &value()?)?,
         "page-size" => desc.page_size = number(&flag, &value()?)?,
         "padding" => desc.padding = number(&flag, &value()?)?,
         "gather-divisor" => desc.gather_divisor = number(&flag, &value()?)?,
@@ -182,6 +186,14 @@ fn option(name: &str, parser: &mut lexopt::Parser, bake: &mut BakeArgs) -> Resul
         _ => return Err(unknown(&flag)),
     }
     Ok(())
+}
+
+/// The value of the flag that was just taken.
+fn value(flag: &str, parser: &mut lexopt::Parser) -> Result<String, String> {
+    match parser.value() {
+        Ok(v) => text(flag, v),
+        Err(_) => Err(format!("{flag} needs a value")),
+    }
 }
 
 /// Names an unknown flag, and the known one that begins like it.
@@ -303,6 +315,8 @@ mod tests {
         let b = bake("").unwrap();
         assert_eq!((b.scene.as_str(), b.out.to_str().unwrap(), b.glb), ("atrium", "out", true));
         assert_eq!(bake("bake").unwrap().scene, "atrium");
+        let density = |line: &str| bake(line).unwrap().desc.texels_per_unit;
+        assert_eq!((density(""), density("--texels-per-unit 0"), density("x.obj")), (ATRIUM_DENSITY, 0.0, 0.0));
     }
 
     #[test]
