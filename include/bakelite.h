@@ -882,6 +882,9 @@ typedef struct bk_bake_stats {
   bk_stage_stats direct;
   // Filtering and composition.
   bk_stage_stats compose;
+  // Two-sided charts whose light map shows the back, because the front gets less than a tenth of
+  // its light.
+  uint64_t back_charts;
 } bk_bake_stats;
 
 // Fills in the defaults.
@@ -937,7 +940,7 @@ BK_API size_t bk_plan_describe(const bk_lightmap *lightmap, char *dst, size_t ca
 // Position of the texel's sample in the scene. RGB.
 #define BK_LAYER_POSITION 5
 
-// Unit normal of the texel's sample. RGB.
+// Unit normal of the texel's sample, on the side whose light it holds. RGB.
 #define BK_LAYER_NORMAL 6
 
 // Number of the triangle that covers the texel, counted through all meshes in their order; BK_NONE

@@ -134,9 +134,12 @@ pub struct bk_bake_stats {
     pub direct: bk_stage_stats,
     /// Filtering and composition.
     pub compose: bk_stage_stats,
+    /// Two-sided charts whose light map shows the back, because the front gets less than a tenth of
+    /// its light.
+    pub back_charts: u64,
 }
 
-sized_struct!(bk_bake_stats, last: compose: bk_stage_stats, defaults: stats(&Default::default()));
+sized_struct!(bk_bake_stats, last: back_charts: u64, defaults: stats(&Default::default()));
 
 fn stats(s: &BakeStats) -> bk_bake_stats {
     let stage = |s: &StageStats| bk_stage_stats { seconds: s.seconds, rays: s.rays, bytes: s.bytes };
@@ -152,6 +155,7 @@ fn stats(s: &BakeStats) -> bk_bake_stats {
         gather: stage(&s.gather),
         direct: stage(&s.direct),
         compose: stage(&s.compose),
+        back_charts: s.back_charts,
     }
 }
 

@@ -22,7 +22,7 @@ pub const BK_LAYER_RADIANCE: u32 = 3;
 pub const BK_LAYER_VALIDITY: u32 = 4;
 /// Position of the texel's sample in the scene. RGB.
 pub const BK_LAYER_POSITION: u32 = 5;
-/// Unit normal of the texel's sample. RGB.
+/// Unit normal of the texel's sample, on the side whose light it holds. RGB.
 pub const BK_LAYER_NORMAL: u32 = 6;
 /// Number of the triangle that covers the texel, counted through all meshes in their order; BK_NONE
 /// where there is none. BK_FORMAT_R32U.

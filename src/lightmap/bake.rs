@@ -7,6 +7,7 @@ use super::layout::Layout;
 use super::map::ChartMap;
 use super::plan::{Plan, left_out};
 use super::radiance::{self, RadianceInput, RadianceMap};
+use super::sides;
 use super::texels::TexelMap;
 use super::{BakeParams, BakeStats, Light, Lightmap, LightmapDesc, LightmapInfo, StageStats, TexelState, blur};
 use crate::error::{Error, Result, invalid_argument};
@@ -114,7 +115,7 @@ impl Lightmap {
         let end = if params.texel_end == 0 { total } else { params.texel_end };
         let direct = DirectLight::new(&self.scene);
         let two_sided = !self.radiance.layout.back_of.is_empty();
-        let plan = Plan::new(&self.scene, &direct, params, two_sided, self.info.uvs.unwrapped_charts > 0);
+        let mut plan = Plan::new(&self.scene, &direct, params, two_sided, self.info.uvs.unwrapped_charts > 0);
         let device = self.scene.device().clone();
         device.memory().reset_peak();
         let bake = Bake {
@@ -128,6 +129,8 @@ impl Lightmap {
         let (light, mut stats) = bake.run()?;
         stats.peak_bytes = device.memory().peak() as u64;
         stats.left_out = plan.left_out;
+        stats.back_charts = light.backs.iter().filter(|&&b| b).count() as u64;
+        plan.note_back_charts(stats.back_charts);
         self.plan = plan;
         let start = Instant::now();
         self.store(light, params.texel_begin as usize..end as usize);
@@ -145,6 +148,7 @@ impl Lightmap {
                 old.indirect[range.clone()].copy_from_slice(&new.indirect[range.clone()]);
                 old.state[range.clone()].copy_from_slice(&new.state[range]);
                 old.radiance = new.radiance;
+                old.backs = new.backs;
             }
             light => *light = Some(new),
         }
@@ -188,7 +192,10 @@ impl Bake<'_, '_> {
             let photons = if self.plan.runs(left_out::PHOTONS) { Some(self.photons(&mut stats)?) } else { None };
             radiance = self.radiance(photons.as_ref(), &mut stats)?;
             drop(photons);
-            indirect = Some(self.gather(&radiance, &mut stats)?);
+        }
+        let backs = self.backs(&radiance);
+        if self.plan.runs(left_out::INDIRECT) {
+            indirect = Some(self.gather(&radiance, &backs, &mut stats)?);
         }
         let n = self.lightmap.map.len();
         let mut light = Light {
@@ -196,6 +203,7 @@ impl Bake<'_, '_> {
             indirect: try_vec(n, "indirect light")?,
             state: try_vec(n, "validity")?,
             radiance,
+            backs,
             _memory: memory,
         };
         self.compose(scene, indirect.as_ref(), &mut light, &mut stats)?;
@@ -257,8 +265,22 @@ impl Bake<'_, '_> {
         Ok(values)
     }
 
+    /// Per chart, whether its back is baked.
+    fn backs(&self, radiance: &[Vec3]) -> Vec<bool> {
+        let l = self.lightmap;
+        if !radiance.is_empty() {
+            return sides::backs(&l.charts, &l.radiance, |s| radiance[s].element_sum());
+        }
+        // Without indirect light there is no radiance map: direct light decides.
+        let back_start = l.radiance.back_start();
+        sides::backs(&l.charts, &l.radiance, |s| {
+            let (_, receiver) = l.radiance.receiver(&l.scene, s, s >= back_start);
+            self.direct.irradiance(&receiver, 1, combine(self.params.seed as u32, s as u32), &mut 0).element_sum()
+        })
+    }
+
     /// Gathers, blurs and fills. Only charts that the range touches are gathered.
-    fn gather(&self, radiance: &[Vec3], stats: &mut BakeStats) -> Result<Indirect> {
+    fn gather(&self, radiance: &[Vec3], backs: &[bool], stats: &mut BakeStats) -> Result<Indirect> {
         let start = Instant::now();
         let l = self.lightmap;
         let device = l.scene.device();
@@ -281,7 +303,9 @@ impl Bake<'_, '_> {
             values.zip(normals).zip(valid).enumerate().try_for_each(|(block, ((values, normals), valid))| {
                 for i in 0..values.len() {
                     let sample = needed.start + block * BLOCK + i;
-                    let (_, receiver) = l.gather.receiver(&l.scene, sample, false);
+                    let chart = l.charts.chart_of[l.gather.texels.samples[sample].triangle as usize];
+                    let back = backs.get(chart as usize).is_some_and(|&b| b);
+                    let (_, receiver) = l.gather.receiver(&l.scene, sample, back);
                     let Gathered { irradiance, valid: v } =
                         gather(&l.scene, &lookup, &receiver, &samples, combine(seed, sample as u32));
                     (values[i], normals[i], valid[i]) = (irradiance.into(), receiver.normal, v);
@@ -318,6 +342,7 @@ impl Bake<'_, '_> {
         let stage = self.progress.stage("direct", 0.65, 1.0, self.range.len() as u64);
         let rays = AtomicU64::new(0);
         let range = self.range.clone();
+        let backs = &light.backs[..];
         scene.device().install(|| {
             let direct = light.direct[range.clone()].par_chunks_mut(BLOCK);
             let indirect_out = light.indirect[range.clone()].par_chunks_mut(BLOCK);
@@ -326,7 +351,9 @@ impl Bake<'_, '_> {
                 let mut traced = 0;
                 for i in 0..direct.len() {
                     let sample = range.start + block * BLOCK + i;
-                    let (_, receiver) = l.map.receiver(scene, sample, false);
+                    let chart = l.charts.chart_of[l.map.texels.samples[sample].triangle as usize];
+                    let back = backs.get(chart as usize).is_some_and(|&b| b);
+                    let (_, receiver) = l.map.receiver(scene, sample, back);
                     state[i] = TexelState::Visible;
                     if let Some(indirect) = indirect {
                         let (value, clear) = self.interpolate(sample, indirect);

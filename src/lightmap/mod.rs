@@ -15,6 +15,7 @@ pub mod plan;
 mod polygon;
 mod radiance;
 mod read;
+mod sides;
 pub mod texels;
 mod unwrap;
 
@@ -123,6 +124,8 @@ pub struct BakeStats {
     pub gather: StageStats,
     pub direct: StageStats,
     pub compose: StageStats,
+    /// Two-sided charts whose back was baked because their front is dark by comparison.
+    pub back_charts: u64,
     pub seconds: f64,
     pub peak_bytes: u64,
     /// Bits of [`left_out`].
@@ -175,6 +178,8 @@ struct Light {
     state: Vec<TexelState>,
     /// Reflected radiance, by sample of the radiance map. Empty if the bake left it out.
     radiance: Vec<Vec3>,
+    /// Whether a chart shows its back, by chart. Empty if none is two-sided.
+    backs: Vec<bool>,
     _memory: Reservation,
 }
 
@@ -232,6 +237,13 @@ impl BakeParams {
             return invalid_argument!("the texels {} to {} are none", self.texel_begin, self.texel_end);
         }
         Ok(())
+    }
+}
+
+impl Light {
+    /// Whether a chart shows its back.
+    fn is_back(&self, chart: u32) -> bool {
+        self.backs.get(chart as usize).is_some_and(|&b| b)
     }
 }
 

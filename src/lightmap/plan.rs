@@ -117,6 +117,13 @@ impl Plan {
         }
     }
 
+    /// Tells of two-sided charts of which the back was baked.
+    pub(super) fn note_back_charts(&mut self, count: u64) {
+        if count > 0 {
+            self.run(&format!("the backs of {count} two-sided charts, whose fronts are dark"));
+        }
+    }
+
     fn run(&mut self, what: &str) {
         self.lines.push(format!("runs: {what}"));
     }

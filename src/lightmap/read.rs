@@ -81,7 +81,11 @@ impl Lightmap {
                 LayerData::Rgb(self.page(page, [0.0; 3], |s| self.map.surface(&self.scene, s).0.to_array(), false)?)
             }
             Layer::Normal => {
-                LayerData::Rgb(self.page(page, [0.0; 3], |s| self.map.surface(&self.scene, s).1.to_array(), false)?)
+                let normal = |s: usize| {
+                    let n = self.map.surface(&self.scene, s).1;
+                    if self.shows_back(self.map.texels.samples[s].triangle) { -n } else { n }
+                };
+                LayerData::Rgb(self.page(page, [0.0; 3], |s| normal(s).to_array(), false)?)
             }
             Layer::Triangle => {
                 LayerData::Integer(self.page(page, NONE, |s| self.map.texels.samples[s].triangle, false)?)
@@ -92,13 +96,14 @@ impl Lightmap {
     /// Outgoing radiance of a texel: reflected, from the radiance map, plus emitted.
     fn radiance_at(&self, light: &Light, sample: usize) -> [f32; 3] {
         let t = self.map.texels.samples[sample];
-        let mut l = DirectLight::emitted(&self.scene, t.triangle, false);
+        let back = light.is_back(self.charts.chart_of[t.triangle as usize]);
+        let mut l = DirectLight::emitted(&self.scene, t.triangle, back);
         if light.radiance.is_empty() {
             let e = light.direct[sample] + light.indirect[sample];
             l += Vec3::from(self.scene.material(t.triangle).albedo) * e / std::f32::consts::PI;
         } else {
             let lookup = RadianceMap::new(&self.charts, &self.radiance, &light.radiance);
-            let hit = RawHit { t: 0.0, u: t.u, v: t.v, triangle: t.triangle, front: true };
+            let hit = RawHit { t: 0.0, u: t.u, v: t.v, triangle: t.triangle, front: !back };
             l += lookup.reflected(&hit).unwrap_or_default();
         }
         l.to_array()
@@ -124,7 +129,12 @@ impl Lightmap {
         Ok(out)
     }
 
-    /// What a shader sees on the front of a point of a global triangle (weights of vertices 1 and 2):
+    /// Whether the light map holds the light of the back of a global triangle. Fronts before a bake.
+    pub fn shows_back(&self, triangle: u32) -> bool {
+        self.light.as_ref().is_some_and(|l| l.is_back(self.charts.chart_of[triangle as usize]))
+    }
+
+    /// What a shader sees at a point of a global triangle (weights of vertices 1 and 2):
     /// a light layer, bilinearly filtered within the chart. Zero before a bake and for the layers
     /// that are not light.
     pub fn sample(&self, layer: Layer, triangle: u32, u: f32, v: f32) -> [f32; 3] {

@@ -2,11 +2,13 @@
 //!
 //! Candidate eyes are spread over the scene's bounds, at heights where people stand. An eye is
 //! inside if most rays from it meet something, on the front where materials are one-sided. From each
-//! inside eye the level directions with the longest free views are scored by the mean length of a
-//! bundle of rays as wide as the picture; the best view with some air round the eye wins. If no eye
-//! is inside, the scene is an object: it is looked at from outside.
+//! inside eye the level directions with the longest free views over lit surfaces are scored by the
+//! mean of length times light in a bundle of rays as wide as the picture; the best view with some
+//! air round the eye wins. If no inside eye sees light, the scene is an object: it is looked at from
+//! outside, from where most of it is lit.
 
 use bakelite::Scene;
+use bakelite::lightmap::{Layer, Lightmap};
 use bakelite::sampling::{sobol_2d, uniform, uniform_sphere};
 use bakelite::scene::Camera;
 use bakelite::trace::Ray;
@@ -19,25 +21,69 @@ const EYES: u32 = 512;
 const PROBES: u32 = 64;
 /// Directions tried from an eye.
 const DIRECTIONS: u32 = 24;
+/// Directions from which an object is tried.
+const SIDES: u32 = 16;
 /// An inside eye sees at least this part of the probes end on something.
 const ENCLOSED: f32 = 0.6;
+/// A view shows at least this much light, where 1 is all surfaces far brighter than the usual.
+const LIT: f32 = 0.25;
 /// Vertical field of view.
 const FOV: f32 = 60.0;
 
-/// A view of `scene`, whose up axis is the unit vector `up`. Depends on the scene alone.
-pub fn choose(scene: &Scene, up: Vec3) -> Camera {
-    let best = (0..EYES).filter_map(|i| {
-        let eye = candidate(scene, up, i);
-        let air = clearance(scene, eye)?;
-        let (direction, length) = longest_view(scene, up, eye);
+/// A view of a baked scene, whose up axis is the unit vector `up`. Depends on scene and light alone.
+pub fn choose(lightmap: &Lightmap, up: Vec3) -> Camera {
+    let scene = &**lightmap.scene();
+    let eyes: Vec<(Vec3, f32)> = (0..EYES)
+        .map(|i| candidate(scene, up, i))
+        .filter_map(|eye| clearance(scene, eye).map(|air| (eye, air)))
+        .collect();
+    let light = Brightness::new(lightmap, eyes.iter().map(|&(eye, _)| eye));
+    let views = eyes.iter().map(|&(eye, air)| {
+        let (direction, score, lit) = best_view(scene, up, eye, &light);
         // Air counts up to 5 % of the diagonal: enough not to stare at a pillar.
         let air = (air / (0.05 * scene.diagonal())).min(1.0);
-        Some((length * air, eye, direction))
+        (score * air, lit, eye, direction)
     });
-    let best = best.max_by(|a, b| a.0.total_cmp(&b.0));
-    match best {
-        Some((_, eye, direction)) => Camera { position: eye, target: eye + direction, up, fov_y: FOV.to_radians() },
-        None => outside(scene, up),
+    match views.filter(|v| v.1 >= LIT).max_by(|a, b| a.0.total_cmp(&b.0)) {
+        Some((_, _, eye, direction)) => Camera { position: eye, target: eye + direction, up, fov_y: FOV.to_radians() },
+        None => outside(scene, up, &light),
+    }
+}
+
+/// How bright surfaces are, relative to what is usual in the scene.
+struct Brightness<'a> {
+    lightmap: &'a Lightmap,
+    /// The median irradiance of the lit surfaces that the eyes see.
+    usual: f32,
+}
+
+impl<'a> Brightness<'a> {
+    fn new(lightmap: &'a Lightmap, eyes: impl Iterator<Item = Vec3>) -> Self {
+        let mut all = Brightness { lightmap, usual: 0.0 };
+        let probes = eyes.flat_map(|eye| (0..PROBES).map(move |i| Ray::new(eye, uniform_sphere(sobol_2d(i, 1)))));
+        let mut seen: Vec<f32> =
+            probes.filter_map(|ray| all.irradiance(&ray).map(|s| s.0)).filter(|&e| e > 0.0).collect();
+        seen.sort_unstable_by(f32::total_cmp);
+        all.usual = seen.get(seen.len() / 2).copied().unwrap_or(0.0);
+        all
+    }
+
+    /// Irradiance where a ray ends, and how far that is. The side whose light is not known is dark.
+    fn irradiance(&self, ray: &Ray) -> Option<(f32, f32)> {
+        let hit = self.lightmap.scene().intersect_raw(ray);
+        if hit.is_miss() {
+            return None;
+        }
+        if hit.front == self.lightmap.shows_back(hit.triangle) {
+            return Some((0.0, hit.t));
+        }
+        let e = self.lightmap.sample(Layer::Combined, hit.triangle, hit.u, hit.v);
+        Some((e.iter().sum::<f32>() / 3.0, hit.t))
+    }
+
+    /// 0 for a dark surface, 1/2 for a usual one, up to 1 for a bright one; and how far it is.
+    fn lit(&self, ray: &Ray) -> Option<(f32, f32)> {
+        self.irradiance(ray).map(|(e, t)| (if e > 0.0 { e / (e + self.usual) } else { 0.0 }, t))
     }
 }
 
@@ -69,68 +115,89 @@ fn clearance(scene: &Scene, eye: Vec3) -> Option<f32> {
     (inside && nearest > 0.01 * scene.diagonal()).then_some(nearest)
 }
 
-/// The level direction in which a bundle of rays gets farthest on average, and how far.
-fn longest_view(scene: &Scene, up: Vec3, eye: Vec3) -> (Vec3, f32) {
+/// The level direction in which a bundle of rays gets farthest over lit surfaces: the direction, the
+/// mean of length times light, and the mean light.
+fn best_view(scene: &Scene, up: Vec3, eye: Vec3, light: &Brightness) -> (Vec3, f32, f32) {
     let level = up.any_orthonormal_vector();
     let far = scene.diagonal();
-    let score = |azimuth: f32| -> f32 {
-        let rays = (0..15).map(|i| {
-            let turned = Quat::from_axis_angle(up, azimuth + ((i % 5) as f32 - 2.0) * 0.2) * level;
+    let score = |azimuth: f32| -> (Vec3, f32, f32) {
+        let forward = Quat::from_axis_angle(up, azimuth) * level;
+        let (mut score, mut lit) = (0.0, 0.0);
+        for i in 0..15 {
+            let turned = Quat::from_axis_angle(up, ((i % 5) as f32 - 2.0) * 0.2) * forward;
             let direction = (turned + up * ((i / 5) as f32 - 1.0) * 0.2).normalize();
-            let hit = scene.intersect_raw(&Ray::new(eye, direction));
             // Into the open is nothing to look at.
-            if hit.is_miss() { 0.1 * far } else { hit.t.min(far) }
-        });
-        rays.sum::<f32>() / 15.0
+            let (l, t) = light.lit(&Ray::new(eye, direction)).unwrap_or((LIT, 0.1 * far));
+            score += l * t.min(far) / 15.0;
+            lit += l / 15.0;
+        }
+        (forward, score, lit)
     };
-    let azimuths = (0..DIRECTIONS).map(|i| TAU * i as f32 / DIRECTIONS as f32);
-    let (azimuth, length) = azimuths.map(|a| (a, score(a))).max_by(|a, b| a.1.total_cmp(&b.1)).unwrap_or_default();
-    (Quat::from_axis_angle(up, azimuth) * level, length)
+    let views = (0..DIRECTIONS).map(|i| score(TAU * i as f32 / DIRECTIONS as f32));
+    views.max_by(|a, b| a.1.total_cmp(&b.1)).unwrap_or((level, 0.0, 0.0))
 }
 
 /// From outside, a little from above, so that the bounds' sphere fills the picture.
-fn outside(scene: &Scene, up: Vec3) -> Camera {
+fn outside(scene: &Scene, up: Vec3, light: &Brightness) -> Camera {
     let (lower, upper) = scene.bounds();
     let middle = 0.5 * (lower + upper);
-    let level = up.any_orthonormal_vector();
-    let direction = (level + 0.6 * up.cross(level) + 0.4 * up).normalize();
     let distance = 0.5 * scene.diagonal() / (0.5 * FOV.to_radians()).sin();
-    Camera { position: middle + direction * distance, target: middle, up, fov_y: FOV.to_radians() }
+    let view = |i: u32| {
+        let level = Quat::from_axis_angle(up, TAU * (i as f32 + 0.5) / SIDES as f32) * up.any_orthonormal_vector();
+        let position = middle + (level + 0.4 * up).normalize() * distance;
+        let rays = (0..PROBES).map(|k| {
+            let target = middle + 0.25 * scene.diagonal() * uniform_sphere(sobol_2d(k, 1));
+            light.lit(&Ray::new(position, target - position)).map_or(0.0, |l| l.0)
+        });
+        (position, rays.sum::<f32>())
+    };
+    let best = (0..SIDES).map(view).max_by(|a, b| a.1.total_cmp(&b.1));
+    let position = best.map_or(middle + up * distance, |b| b.0);
+    Camera { position, target: middle, up, fov_y: FOV.to_radians() }
 }
 
 #[cfg(test)]
 mod tests {
     use super::*;
     use bakelite::bvh::BuildOptions;
-    use bakelite::scene::{MeshMaterials, builtin};
+    use bakelite::lightmap::{BakeParams, LightmapDesc};
+    use bakelite::scene::{Light, MeshMaterials, builtin};
     use bakelite::{Device, Material, Mesh, Progress, SceneData};
-    use std::sync::Arc;
 
-    fn commit(data: SceneData) -> Arc<Scene> {
+    fn baked(data: SceneData, texels_per_unit: f32) -> Lightmap {
         let device = Device::new(Default::default()).unwrap();
-        Scene::commit(&device, data, &BuildOptions::default(), &Progress::none()).map_err(|e| e.1).unwrap()
+        let none = Progress::none();
+        let scene = Scene::commit(&device, data, &BuildOptions::default(), &none).map_err(|e| e.1).unwrap();
+        let desc = LightmapDesc { texels_per_unit, page_size: 256, ..Default::default() };
+        let mut lightmap = Lightmap::create(&scene, &desc, &none).unwrap();
+        lightmap.bake(&BakeParams { photon_count: 10_000, gather_rays: 16, ..Default::default() }, &none).unwrap();
+        lightmap
     }
 
     #[test]
-    fn the_view_of_a_room_is_inside_it() {
-        let scene = commit(builtin("atrium").unwrap());
-        let camera = choose(&scene, Vec3::Y);
+    fn the_view_of_a_room_is_inside_it_and_shows_light() {
+        let lightmap = baked(builtin("atrium").unwrap(), 4.0);
+        let scene = lightmap.scene();
+        let camera = choose(&lightmap, Vec3::Y);
         assert!(camera.position.x.abs() < 10.0 && camera.position.z.abs() < 5.8, "{camera:?}");
-        assert!(clearance(&scene, camera.position).is_some());
+        assert!(clearance(scene, camera.position).is_some());
         let ray = Ray::new(camera.position, (camera.target - camera.position).normalize());
         assert!(scene.intersect_raw(&ray).t > 4.0);
+        let light = Brightness::new(&lightmap, [camera.position].into_iter());
+        assert!(best_view(scene, Vec3::Y, camera.position, &light).2 >= LIT);
     }
 
+    /// A two-sided tetrahedron, which rays from within find closed, but dark.
     #[test]
-    fn an_object_is_looked_at_from_outside() {
+    fn an_object_is_looked_at_from_outside_and_from_the_lit_side() {
         let mut data = SceneData::new();
-        let material = data.add_material(Material::default()).unwrap();
+        let material = data.add_material(Material { two_sided: true, ..Default::default() }).unwrap();
         let positions = vec![Vec3::ZERO, Vec3::X, Vec3::Y, Vec3::Z];
         let indices = vec![[0, 2, 1], [0, 1, 3], [0, 3, 2], [1, 2, 3]];
         data.add_mesh(Mesh { positions, indices, materials: MeshMaterials::One(material), ..Default::default() })
             .unwrap();
-        let scene = commit(data);
-        let camera = choose(&scene, Vec3::Z);
-        assert!(camera.position.z > 1.0 && camera.target == Vec3::splat(0.5));
+        data.add_light(Light::Directional { direction: Vec3::new(-1.0, -0.1, -0.2), irradiance: [1.0; 3] }).unwrap();
+        let camera = choose(&baked(data, 16.0), Vec3::Z);
+        assert!(camera.position.z > 1.0 && camera.position.x > 1.0 && camera.target == Vec3::splat(0.5), "{camera:?}");
     }
 }

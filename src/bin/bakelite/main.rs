@@ -76,7 +76,7 @@ impl<'a> Job<'a> {
         let mut lightmap = self.layout(&scene)?;
         let bake = self.bake(&mut lightmap)?;
         self.write_maps(&lightmap)?;
-        let camera = self.camera(&scene);
+        let camera = self.camera(&lightmap);
         let pictures = self.pictures(&lightmap, camera)?;
         let seconds = start.elapsed().as_secs_f64();
 
@@ -184,10 +184,10 @@ impl<'a> Job<'a> {
     }
 
     /// The camera that was given, the built-in scene's, or one that is looked for.
-    fn camera(&self, scene: &Scene) -> Camera {
+    fn camera(&self, lightmap: &Lightmap) -> Camera {
         match self.args.camera {
             Some(camera) => Camera { up: self.args.up, ..camera },
-            None => builtin_camera(&self.args.scene).unwrap_or_else(|| camera::choose(scene, self.args.up)),
+            None => builtin_camera(&self.args.scene).unwrap_or_else(|| camera::choose(lightmap, self.args.up)),
         }
     }
 
@@ -248,9 +248,12 @@ impl<'a> Job<'a> {
         println!("{}", table::text(&self.stages, seconds));
         println!("{}", lightmap.plan_text());
         if let Some(p) = pictures {
-            println!("RMSE against the path traced reference, without its own noise of {:.2} %:", 100.0 * p.noise);
+            println!(
+                "RMSE against the path traced reference, without its own noise of {}:",
+                pictures::percent(p.noise)
+            );
             for i in 1..3 {
-                println!("  {:<28}{:>7.2} %", pictures::TITLES[i], 100.0 * p.rmse[i]);
+                println!("  {:<28}{:>16}", pictures::TITLES[i], pictures::percent(p.rmse[i]));
             }
             println!();
         }

@@ -54,7 +54,7 @@ pub struct Pictures {
     /// Root mean square error over all channels of the pixels in which every primary ray meets the
     /// scene, divided by the reference's mean over the same. The squared error of x is estimated by
     /// (x − a)(x − b), where a and b are the reference's halves: as their noise is independent, the
-    /// noise of the reference is not part of it.
+    /// noise of the reference is not part of it. Not a number where the noise hides the error.
     pub rmse: [f64; 3],
     /// The reference's own noise in the same measure: half the difference of its two halves.
     pub noise: f64,
@@ -239,8 +239,13 @@ fn relative_rmse(image: &[[f32; 3]], [a, b]: &[Vec<[f32; 3]>; 2], mask: impl Fn(
     let product = |i: usize| std::array::from_fn(|c| (image[i][c] - a[i][c]) * (image[i][c] - b[i][c]));
     let squares: Vec<[f32; 3]> = (0..image.len()).map(product).collect();
     let reference = 0.5 * (mean(a, mask) + mean(b, mask));
-    // By chance the estimate of a tiny error can be below 0.
-    mean(&squares, mask).max(0.0).sqrt() / reference.max(f64::MIN_POSITIVE)
+    // By chance the estimate of a small error can be below 0, and its root is not a number.
+    mean(&squares, mask).sqrt() / reference
+}
+
+/// For people.
+pub fn percent(part: f64) -> String {
+    if part.is_finite() { format!("{:.2}%", 100.0 * part) } else { "lost in noise".into() }
 }
 
 /// Pixels between the pictures and under the captions.
@@ -272,8 +277,8 @@ impl Pictures {
                 pixels[start..start + w].copy_from_slice(row);
             }
             let second = match i {
-                0 => format!("noise {:.2}%", 100.0 * self.noise),
-                _ => format!("RMSE {:.2}%", 100.0 * self.rmse[i]),
+                0 => format!("noise {}", percent(self.noise)),
+                _ => format!("RMSE {}", percent(self.rmse[i])),
             };
             for (n, text) in [TITLES[i], &second].into_iter().enumerate() {
                 // Narrow pictures get small letters.

@@ -42,6 +42,7 @@ pub fn report(run: &Run) -> Value {
             "photons_stored": run.bake.photons_stored,
             "peak_bytes": run.bake.peak_bytes,
             "left_out": run.bake.left_out,
+            "back_charts": run.bake.back_charts,
         },
         "camera": {
             "position": run.camera.position.to_array(),
