@@ -9,7 +9,7 @@ use super::plan::{Plan, left_out};
 use super::radiance::{self, RadianceInput, RadianceMap};
 use super::sides;
 use super::texels::TexelMap;
-use super::{BakeParams, BakeStats, Light, Lightmap, LightmapDesc, LightmapInfo, StageStats, TexelState, blur};
+use super::{Atlas, BakeParams, BakeStats, Light, Lightmap, LightmapDesc, LightmapInfo, StageStats, TexelState, blur};
 use crate::error::{Error, Result, invalid_argument};
 use crate::memory::try_vec;
 use crate::photon::{PhotonMap, PhotonParams};
@@ -87,24 +87,15 @@ impl Lightmap {
         let memory = scene.device().memory().reserve(charts.bytes(), "the charts")?;
         let direct = DirectLight::new(scene);
         let plan = Plan::new(scene, &direct, &BakeParams::default(), two_sided, uvs.unwrapped_charts > 0);
-        Ok(Lightmap {
-            scene: scene.clone(),
-            charts,
-            map,
-            gather,
-            radiance,
-            padding: desc.padding,
-            info,
-            plan,
-            light: None,
-            _memory: memory,
-        })
+        let scene = scene.clone();
+        let atlas = Atlas { scene, charts, map, gather, radiance, padding: desc.padding, info, _memory: memory };
+        Ok(Lightmap { atlas: Arc::new(atlas), plan, light: None })
     }
 
     /// Runs the pipeline. On an error or a cancel what an earlier bake left stays as it was.
     pub fn bake(&mut self, params: &BakeParams, progress: &Progress) -> Result<BakeStats> {
         params.validate()?;
-        let total = self.map.len() as u64;
+        let total = self.atlas.map.len() as u64;
         if params.texel_begin > total || params.texel_end > total {
             return invalid_argument!(
                 "texel_begin {} or texel_end {} lies beyond the light map's {total} texels",
@@ -113,13 +104,14 @@ impl Lightmap {
             );
         }
         let end = if params.texel_end == 0 { total } else { params.texel_end };
-        let direct = DirectLight::new(&self.scene);
-        let two_sided = !self.radiance.layout.back_of.is_empty();
-        let mut plan = Plan::new(&self.scene, &direct, params, two_sided, self.info.uvs.unwrapped_charts > 0);
-        let device = self.scene.device().clone();
+        let direct = DirectLight::new(&self.atlas.scene);
+        let two_sided = !self.atlas.radiance.layout.back_of.is_empty();
+        let mut plan =
+            Plan::new(&self.atlas.scene, &direct, params, two_sided, self.atlas.info.uvs.unwrapped_charts > 0);
+        let device = self.atlas.scene.device().clone();
         device.memory().reset_peak();
         let bake = Bake {
-            lightmap: self,
+            atlas: &self.atlas,
             params,
             plan: &plan,
             direct: &direct,
@@ -143,7 +135,7 @@ impl Lightmap {
     /// been baked so far: whatever the shards, the last one leaves the bits of a whole bake.
     fn store(&mut self, new: Light, range: Range<usize>) {
         match &mut self.light {
-            Some(old) if range.len() < self.map.len() => {
+            Some(old) if range.len() < self.atlas.map.len() => {
                 old.direct[range.clone()].copy_from_slice(&new.direct[range.clone()]);
                 old.indirect[range.clone()].copy_from_slice(&new.indirect[range.clone()]);
                 old.state[range.clone()].copy_from_slice(&new.state[range]);
@@ -158,14 +150,14 @@ impl Lightmap {
         // A hidden texel beside a lit one would show as a dark rim under bilinear filtering.
         if !hidden.is_empty() {
             let visible = light.state.iter().map(|&s| s == TexelState::Visible).collect();
-            blur::fill(&self.charts, &self.map, &mut light.direct, visible, hidden);
+            blur::fill(&self.atlas.charts, &self.atlas.map, &mut light.direct, visible, hidden);
         }
     }
 }
 
 /// One bake under way.
 struct Bake<'a, 'p> {
-    lightmap: &'a Lightmap,
+    atlas: &'a Atlas,
     params: &'a BakeParams,
     plan: &'a Plan,
     direct: &'a DirectLight,
@@ -185,7 +177,7 @@ impl Bake<'_, '_> {
         let start = Instant::now();
         let mut stats = BakeStats::default();
         let memory = self.reserve()?;
-        let scene = &self.lightmap.scene;
+        let scene = &self.atlas.scene;
         let mut radiance = Vec::new();
         let mut indirect = None;
         if self.plan.runs(left_out::INDIRECT) {
@@ -197,7 +189,7 @@ impl Bake<'_, '_> {
         if self.plan.runs(left_out::INDIRECT) {
             indirect = Some(self.gather(&radiance, &backs, &mut stats)?);
         }
-        let n = self.lightmap.map.len();
+        let n = self.atlas.map.len();
         let mut light = Light {
             direct: try_vec(n, "direct light")?,
             indirect: try_vec(n, "indirect light")?,
@@ -213,7 +205,7 @@ impl Bake<'_, '_> {
 
     /// Announces the buffers of all stages but the photon map, which announces its own.
     fn reserve(&self) -> Result<crate::memory::Reservation> {
-        let l = self.lightmap;
+        let l = self.atlas;
         let mut bytes = l.map.len() * 25;
         if self.plan.runs(left_out::INDIRECT) {
             bytes += l.radiance.len() * 12 + l.gather.len() * 38;
@@ -238,7 +230,7 @@ impl Bake<'_, '_> {
             store_direct: false,
             ..Default::default()
         };
-        let map = PhotonMap::trace_within(&self.lightmap.scene, &params, self.progress, 0.0, 0.2)?;
+        let map = PhotonMap::trace_within(&self.atlas.scene, &params, self.progress, 0.0, 0.2)?;
         let s = map.stats();
         stats.photons = StageStats { seconds: start.elapsed().as_secs_f64(), rays: s.rays, bytes: map.bytes() as u64 };
         (stats.photons_emitted, stats.photons_stored) = (s.emitted, s.stored);
@@ -247,7 +239,7 @@ impl Bake<'_, '_> {
 
     fn radiance(&self, photons: Option<&PhotonMap>, stats: &mut BakeStats) -> Result<Vec<Vec3>> {
         let start = Instant::now();
-        let l = self.lightmap;
+        let l = self.atlas;
         let stage = self.progress.stage("radiance", 0.2, 0.3, l.radiance.len() as u64);
         let mut values = try_vec(l.radiance.len(), "the radiance map")?;
         let input = RadianceInput {
@@ -267,7 +259,7 @@ impl Bake<'_, '_> {
 
     /// Per chart, whether its back is baked.
     fn backs(&self, radiance: &[Vec3]) -> Vec<bool> {
-        let l = self.lightmap;
+        let l = self.atlas;
         if !radiance.is_empty() {
             return sides::backs(&l.charts, &l.radiance, |s| radiance[s].element_sum());
         }
@@ -282,7 +274,7 @@ impl Bake<'_, '_> {
     /// Gathers, blurs and fills. Only charts that the range touches are gathered.
     fn gather(&self, radiance: &[Vec3], backs: &[bool], stats: &mut BakeStats) -> Result<Indirect> {
         let start = Instant::now();
-        let l = self.lightmap;
+        let l = self.atlas;
         let device = l.scene.device();
         let charts =
             l.map.texels.placement_of(self.range.start as u32)..=l.map.texels.placement_of(self.range.end as u32 - 1);
@@ -337,7 +329,7 @@ impl Bake<'_, '_> {
         stats: &mut BakeStats,
     ) -> Result<()> {
         let start = Instant::now();
-        let l = self.lightmap;
+        let l = self.atlas;
         let seed = purpose_seed(self.params.seed, purpose::DIRECT);
         let stage = self.progress.stage("direct", 0.65, 1.0, self.range.len() as u64);
         let rays = AtomicU64::new(0);
@@ -385,7 +377,7 @@ impl Bake<'_, '_> {
     /// Indirect light at a sample of the light map, and whether all gather texels that it comes
     /// from can be seen.
     fn interpolate(&self, sample: usize, indirect: &Indirect) -> (Vec3, bool) {
-        let l = self.lightmap;
+        let l = self.atlas;
         let t = &l.map.texels.samples[sample];
         let chart = l.charts.chart_of[t.triangle as usize];
         let (mut sum, mut clear) = (Vec3::ZERO, true);

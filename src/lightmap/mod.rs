@@ -183,18 +183,24 @@ struct Light {
     _memory: Reservation,
 }
 
+/// Charts and texels of a scene: all of a light map but its light. Does not change once made, and is
+/// shared with live updates.
+pub(crate) struct Atlas {
+    pub scene: Arc<Scene>,
+    pub charts: Charts,
+    pub map: ChartMap,
+    pub gather: ChartMap,
+    pub radiance: ChartMap,
+    pub padding: u32,
+    pub info: LightmapInfo,
+    _memory: Reservation,
+}
+
 /// Light maps of a scene: layout, texels and, after [`bake`](Lightmap::bake), light.
 pub struct Lightmap {
-    scene: Arc<Scene>,
-    charts: Charts,
-    map: ChartMap,
-    gather: ChartMap,
-    radiance: ChartMap,
-    padding: u32,
-    info: LightmapInfo,
+    atlas: Arc<Atlas>,
     plan: Plan,
     light: Option<Light>,
-    _memory: Reservation,
 }
 
 impl LightmapDesc {
@@ -250,12 +256,17 @@ impl Light {
 impl Lightmap {
     /// The scene that is lit.
     pub fn scene(&self) -> &Arc<Scene> {
-        &self.scene
+        &self.atlas.scene
+    }
+
+    /// Charts and texels.
+    pub(crate) fn atlas(&self) -> &Arc<Atlas> {
+        &self.atlas
     }
 
     /// Numbers about layout and texels.
     pub fn info(&self) -> LightmapInfo {
-        self.info
+        self.atlas.info
     }
 
     /// What the last bake ran (before the first: what a bake with default parameters would run) and

@@ -16,23 +16,23 @@ impl Lightmap {
     /// Light map UV in [0, 1] of each corner, and the page of each triangle of `mesh`. Triangles
     /// without texels (degenerate ones) have page [`NONE`] and UVs 0.
     pub fn mesh_uvs(&self, mesh: u32) -> Result<MeshUvs> {
-        let Some(m) = self.scene.meshes().get(mesh as usize) else {
-            return invalid_argument!("mesh {mesh} does not exist, the scene has {}", self.scene.meshes().len());
+        let Some(m) = self.atlas.scene.meshes().get(mesh as usize) else {
+            return invalid_argument!("mesh {mesh} does not exist, the scene has {}", self.atlas.scene.meshes().len());
         };
-        let first = self.scene.first_triangle(mesh);
+        let first = self.atlas.scene.first_triangle(mesh);
         let mut uvs = Vec::with_capacity(m.indices.len());
         let mut pages = Vec::with_capacity(m.indices.len());
-        let scale = 1.0 / self.map.layout.page_size as f32;
+        let scale = 1.0 / self.atlas.map.layout.page_size as f32;
         for t in first..first + m.indices.len() as u32 {
-            let chart = self.charts.chart_of[t as usize];
+            let chart = self.atlas.charts.chart_of[t as usize];
             if chart == NONE {
                 uvs.push([[0.0; 2]; 3]);
                 pages.push(NONE);
                 continue;
             }
-            let corners = self.charts.corners[t as usize];
-            uvs.push(corners.map(|c| self.map.layout.texel_coord(chart, c).map(|x| x * scale)));
-            pages.push(self.map.layout.placements[chart as usize].page);
+            let corners = self.atlas.charts.corners[t as usize];
+            uvs.push(corners.map(|c| self.atlas.map.layout.texel_coord(chart, c).map(|x| x * scale)));
+            pages.push(self.atlas.map.layout.placements[chart as usize].page);
         }
         Ok((uvs, pages))
     }
@@ -44,8 +44,8 @@ impl Lightmap {
     /// One layer of one page, row-major from v = 0. Layers of light need a bake (`InvalidState`
     /// before). Texels around charts repeat the nearest texel of the chart, up to the padding.
     pub fn read(&self, page: u32, layer: Layer) -> Result<LayerData> {
-        if page >= self.info.page_count {
-            return invalid_argument!("page is {page}, the light map has {}", self.info.page_count);
+        if page >= self.atlas.info.page_count {
+            return invalid_argument!("page is {page}, the light map has {}", self.atlas.info.page_count);
         }
         Ok(match layer {
             Layer::Combined => {
@@ -77,32 +77,35 @@ impl Lightmap {
                     false,
                 )?)
             }
-            Layer::Position => {
-                LayerData::Rgb(self.page(page, [0.0; 3], |s| self.map.surface(&self.scene, s).0.to_array(), false)?)
-            }
+            Layer::Position => LayerData::Rgb(self.page(
+                page,
+                [0.0; 3],
+                |s| self.atlas.map.surface(&self.atlas.scene, s).0.to_array(),
+                false,
+            )?),
             Layer::Normal => {
                 let normal = |s: usize| {
-                    let n = self.map.surface(&self.scene, s).1;
-                    if self.shows_back(self.map.texels.samples[s].triangle) { -n } else { n }
+                    let n = self.atlas.map.surface(&self.atlas.scene, s).1;
+                    if self.shows_back(self.atlas.map.texels.samples[s].triangle) { -n } else { n }
                 };
                 LayerData::Rgb(self.page(page, [0.0; 3], |s| normal(s).to_array(), false)?)
             }
             Layer::Triangle => {
-                LayerData::Integer(self.page(page, NONE, |s| self.map.texels.samples[s].triangle, false)?)
+                LayerData::Integer(self.page(page, NONE, |s| self.atlas.map.texels.samples[s].triangle, false)?)
             }
         })
     }
 
     /// Outgoing radiance of a texel: reflected, from the radiance map, plus emitted.
     fn radiance_at(&self, light: &Light, sample: usize) -> [f32; 3] {
-        let t = self.map.texels.samples[sample];
-        let back = light.is_back(self.charts.chart_of[t.triangle as usize]);
-        let mut l = DirectLight::emitted(&self.scene, t.triangle, back);
+        let t = self.atlas.map.texels.samples[sample];
+        let back = light.is_back(self.atlas.charts.chart_of[t.triangle as usize]);
+        let mut l = DirectLight::emitted(&self.atlas.scene, t.triangle, back);
         if light.radiance.is_empty() {
             let e = light.direct[sample] + light.indirect[sample];
-            l += Vec3::from(self.scene.material(t.triangle).albedo) * e / std::f32::consts::PI;
+            l += Vec3::from(self.atlas.scene.material(t.triangle).albedo) * e / std::f32::consts::PI;
         } else {
-            let lookup = RadianceMap::new(&self.charts, &self.radiance, &light.radiance);
+            let lookup = RadianceMap::new(&self.atlas.charts, &self.atlas.radiance, &light.radiance);
             let hit = RawHit { t: 0.0, u: t.u, v: t.v, triangle: t.triangle, front: !back };
             l += lookup.reflected(&hit).unwrap_or_default();
         }
@@ -111,27 +114,27 @@ impl Lightmap {
 
     /// Scatters per-sample values to a page.
     fn page<T: Copy + Default>(&self, page: u32, empty: T, value: impl Fn(usize) -> T, dilate: bool) -> Result<Vec<T>> {
-        let size = self.map.layout.page_size as usize;
+        let size = self.atlas.map.layout.page_size as usize;
         let mut out = try_vec::<T>(size * size, "a page")?;
         out.fill(empty);
-        for (chart, placement) in self.map.layout.placements.iter().enumerate() {
+        for (chart, placement) in self.atlas.map.layout.placements.iter().enumerate() {
             if placement.page != page {
                 continue;
             }
-            for s in self.map.samples_of(chart as u32) {
-                let (x, y) = self.map.position(s);
+            for s in self.atlas.map.samples_of(chart as u32) {
+                let (x, y) = self.atlas.map.position(s);
                 out[y as usize * size + x as usize] = value(s);
             }
         }
         if dilate {
-            self.map.dilate(page, self.padding, &mut out);
+            self.atlas.map.dilate(page, self.atlas.padding, &mut out);
         }
         Ok(out)
     }
 
     /// Whether the light map holds the light of the back of a global triangle. Fronts before a bake.
     pub fn shows_back(&self, triangle: u32) -> bool {
-        self.light.as_ref().is_some_and(|l| l.is_back(self.charts.chart_of[triangle as usize]))
+        self.light.as_ref().is_some_and(|l| l.is_back(self.atlas.charts.chart_of[triangle as usize]))
     }
 
     /// What a shader sees at a point of a global triangle (weights of vertices 1 and 2):
@@ -139,7 +142,7 @@ impl Lightmap {
     /// that are not light.
     pub fn sample(&self, layer: Layer, triangle: u32, u: f32, v: f32) -> [f32; 3] {
         let Some(light) = &self.light else { return [0.0; 3] };
-        let chart = self.charts.chart_of[triangle as usize];
+        let chart = self.atlas.charts.chart_of[triangle as usize];
         if chart == NONE {
             return [0.0; 3];
         }
@@ -151,7 +154,7 @@ impl Lightmap {
             _ => Vec3::ZERO,
         };
         let mut sum = Vec3::ZERO;
-        self.map.bilinear(chart, self.charts.local(triangle, u, v), |s, w| sum += w * value(s));
+        self.atlas.map.bilinear(chart, self.atlas.charts.local(triangle, u, v), |s, w| sum += w * value(s));
         sum.to_array()
     }
 }
