@@ -2,7 +2,7 @@
 
 use super::charts::{Charts, automatic_density};
 use super::direct::DirectLight;
-use super::gather::{Gathered, SampleSet, gather};
+use super::gather::{Gathered, SampleSet};
 use super::layout::Layout;
 use super::map::ChartMap;
 use super::plan::{Plan, left_out};
@@ -34,7 +34,7 @@ const AUTOMATIC_PAGES: f64 = 1.0;
 const MIN_PAGE_SIZE: u32 = 64;
 
 /// What the random numbers of a bake are for.
-mod purpose {
+pub(crate) mod purpose {
     pub const RADIANCE: u32 = 1;
     pub const GATHER_SET: u32 = 2;
     pub const GATHER: u32 = 3;
@@ -156,14 +156,14 @@ impl Lightmap {
 }
 
 /// One bake under way.
-struct Bake<'a, 'p> {
-    atlas: &'a Atlas,
-    params: &'a BakeParams,
-    plan: &'a Plan,
-    direct: &'a DirectLight,
+pub(crate) struct Bake<'a, 'p> {
+    pub atlas: &'a Atlas,
+    pub params: &'a BakeParams,
+    pub plan: &'a Plan,
+    pub direct: &'a DirectLight,
     /// Samples of the light map to bake.
-    range: Range<usize>,
-    progress: &'a Progress<'p>,
+    pub range: Range<usize>,
+    pub progress: &'a Progress<'p>,
 }
 
 /// The gather map after blur and filling.
@@ -178,14 +178,8 @@ impl Bake<'_, '_> {
         let mut stats = BakeStats::default();
         let memory = self.reserve()?;
         let scene = &self.atlas.scene;
-        let mut radiance = Vec::new();
         let mut indirect = None;
-        if self.plan.runs(left_out::INDIRECT) {
-            let photons = if self.plan.runs(left_out::PHOTONS) { Some(self.photons(&mut stats)?) } else { None };
-            radiance = self.radiance(photons.as_ref(), &mut stats)?;
-            drop(photons);
-        }
-        let backs = self.backs(&radiance);
+        let (radiance, backs) = self.illuminate(&mut stats)?;
         if self.plan.runs(left_out::INDIRECT) {
             indirect = Some(self.gather(&radiance, &backs, &mut stats)?);
         }
@@ -201,6 +195,18 @@ impl Bake<'_, '_> {
         self.compose(scene, indirect.as_ref(), &mut light, &mut stats)?;
         stats.seconds = start.elapsed().as_secs_f64();
         Ok((light, stats))
+    }
+
+    /// The radiance map (empty if the plan leaves indirect light out) and, per chart, whether its
+    /// back is baked: all that texels need to be lit.
+    pub(crate) fn illuminate(&self, stats: &mut BakeStats) -> Result<(Vec<Vec3>, Vec<bool>)> {
+        let mut radiance = Vec::new();
+        if self.plan.runs(left_out::INDIRECT) {
+            let photons = if self.plan.runs(left_out::PHOTONS) { Some(self.photons(stats)?) } else { None };
+            radiance = self.radiance(photons.as_ref(), stats)?;
+        }
+        let backs = self.backs(&radiance);
+        Ok((radiance, backs))
     }
 
     /// Announces the buffers of all stages but the photon map, which announces its own.
@@ -295,12 +301,12 @@ impl Bake<'_, '_> {
             values.zip(normals).zip(valid).enumerate().try_for_each(|(block, ((values, normals), valid))| {
                 for i in 0..values.len() {
                     let sample = needed.start + block * BLOCK + i;
-                    let chart = l.charts.chart_of[l.gather.texels.samples[sample].triangle as usize];
-                    let back = backs.get(chart as usize).is_some_and(|&b| b);
-                    let (_, receiver) = l.gather.receiver(&l.scene, sample, back);
-                    let Gathered { irradiance, valid: v } =
-                        gather(&l.scene, &lookup, &receiver, &samples, combine(seed, sample as u32));
-                    (values[i], normals[i], valid[i]) = (irradiance.into(), receiver.normal, v);
+                    let receiver = l.receiver(&l.gather, backs, sample);
+                    let mut gathered = Gathered::default();
+                    for round in 0..samples.rounds() {
+                        gathered.add_round(&l.scene, &lookup, &receiver, &samples, round, combine(seed, sample as u32));
+                    }
+                    (values[i], normals[i], valid[i]) = (gathered.irradiance(), receiver.normal, gathered.is_visible());
                 }
                 stage.advance(values.len() as u64)
             })
@@ -343,9 +349,7 @@ impl Bake<'_, '_> {
                 let mut traced = 0;
                 for i in 0..direct.len() {
                     let sample = range.start + block * BLOCK + i;
-                    let chart = l.charts.chart_of[l.map.texels.samples[sample].triangle as usize];
-                    let back = backs.get(chart as usize).is_some_and(|&b| b);
-                    let (_, receiver) = l.map.receiver(scene, sample, back);
+                    let receiver = l.receiver(&l.map, backs, sample);
                     state[i] = TexelState::Visible;
                     if let Some(indirect) = indirect {
                         let (value, clear) = self.interpolate(sample, indirect);
@@ -390,7 +394,7 @@ impl Bake<'_, '_> {
 }
 
 /// Whether what lies straight above a surface is the back of a one-sided one.
-fn inside_a_solid(scene: &Scene, origin: Vec3, normal: Vec3) -> bool {
+pub(crate) fn inside_a_solid(scene: &Scene, origin: Vec3, normal: Vec3) -> bool {
     let hit = scene.intersect_raw(&Ray::new(origin, normal));
     !hit.is_miss() && !hit.front && !scene.material(hit.triangle).two_sided
 }

@@ -25,7 +25,7 @@ const MAX_FILL_ROUNDS: usize = 64;
 /// Gaussian blur of the valid texels among `values` within a square of `radius`. A texel takes part
 /// only if a path of valid texels of the same chart, within the square, leads to it: light on one
 /// side of a wall that stands on the chart does not cross the hidden texels below the wall.
-pub(super) fn blur(
+pub(crate) fn blur(
     device: &Device,
     charts: &Charts,
     map: &ChartMap,
@@ -54,7 +54,7 @@ pub(super) fn blur(
 }
 
 /// Scratch space for one texel's neighbourhood.
-struct Window {
+pub(crate) struct Window {
     radius: i32,
     /// Gaussian weight by squared distance.
     weights: Vec<f32>,
@@ -63,14 +63,15 @@ struct Window {
 }
 
 impl Window {
-    fn new(radius: i32) -> Window {
+    pub(crate) fn new(radius: i32) -> Window {
         // The radius is two standard deviations.
         let s = 2.0 / (radius as f32 * radius as f32).max(1.0);
         let weights = (0..=2 * radius * radius).map(|d2| (-(d2 as f32) * s).exp()).collect();
         Window { radius, weights, seen: [0; MAX_WINDOW], queue: Vec::new() }
     }
 
-    fn blur(
+    /// The blurred value of one valid texel.
+    pub(crate) fn blur(
         &mut self,
         charts: &Charts,
         map: &ChartMap,
@@ -119,7 +120,7 @@ impl Window {
 /// Gives each of the texels `missing` the mean of its known or already filled neighbours in the
 /// chart, ring by ring. What charts without a known texel hold is left alone. Depends on the known
 /// texels alone, not on what the missing ones hold.
-pub(super) fn fill(charts: &Charts, map: &ChartMap, values: &mut [Vec3], mut known: Vec<bool>, mut missing: Vec<u32>) {
+pub(crate) fn fill(charts: &Charts, map: &ChartMap, values: &mut [Vec3], mut known: Vec<bool>, mut missing: Vec<u32>) {
     for _ in 0..MAX_FILL_ROUNDS {
         let ring: Vec<(u32, Vec3)> =
             missing.iter().filter_map(|&i| Some((i, neighbours(charts, map, i, values, &known)?))).collect();

@@ -1,9 +1,11 @@
 //! Gather map (thesis 3.2.5): indirect irradiance by final gathering. From each texel a packet of
 //! cosine-distributed rays is traced; a hit looks the outgoing radiance up in the radiance map.
 //!
-//! The sample set is made once: Sobol points, sorted along a Morton curve so that each packet of 32
-//! is a narrow bundle. Each texel shifts it digitally (XOR), which keeps both the stratification
-//! and the bundles.
+//! Rays come in rounds of 64, so that a texel can be refined at any time: its sum over k rounds has
+//! the same bits however they were spread over bakes and live updates. The sample set is made once:
+//! the Sobol sequence, in each round sorted along a Morton curve so that each packet of 32 is a
+//! narrower bundle. Each texel shifts it digitally (XOR), which keeps both the stratification and
+//! the bundles. (One set of 256 rays sorted as a whole traces 0 to 15 % faster than four rounds.)
 
 use super::direct::Receiver;
 use super::radiance::RadianceMap;
@@ -17,19 +19,29 @@ use std::f32::consts::PI;
 /// solid.
 const MAX_BACK_FACES: f32 = 0.5;
 
+/// Rays of a round.
+pub(crate) const ROUND: usize = 64;
+
 /// Points of the unit square, in fixed point, that every texel uses in its own shift.
-pub(super) struct SampleSet {
+pub(crate) struct SampleSet {
     points: Vec<[u32; 2]>,
 }
 
 impl SampleSet {
-    pub(super) fn new(count: u32, seed: u32) -> SampleSet {
+    pub(crate) fn new(count: u32, seed: u32) -> SampleSet {
         let mut points: Vec<[u32; 2]> = (0..count).map(|i| sobol_2d_bits(i, seed)).collect();
-        points.sort_unstable_by_key(|&[x, y]| morton(x >> 16, y >> 16));
+        for round in points.chunks_mut(ROUND) {
+            round.sort_unstable_by_key(|&[x, y]| morton(x >> 16, y >> 16));
+        }
         SampleSet { points }
     }
 
-    pub(super) fn len(&self) -> usize {
+    /// Rounds, the last of which may be shorter.
+    pub(crate) fn rounds(&self) -> usize {
+        self.points.len().div_ceil(ROUND)
+    }
+
+    pub(crate) fn len(&self) -> usize {
         self.points.len()
     }
 }
@@ -45,52 +57,69 @@ fn morton(x: u32, y: u32) -> u32 {
     spread(x) | spread(y) << 1
 }
 
-/// What a texel gathered.
+/// What a texel has gathered so far.
 #[derive(Clone, Copy, Debug, Default, PartialEq)]
-pub(super) struct Gathered {
-    /// Indirect irradiance, W/m².
-    pub irradiance: [f32; 3],
-    /// Whether the texel can be seen at all.
-    pub valid: bool,
+pub(crate) struct Gathered {
+    /// Sum of the radiance that rays met, W/(m²·sr).
+    pub sum: Vec3,
+    /// Rays traced.
+    pub rays: u32,
+    /// Of these, how many met the back of a one-sided surface.
+    pub backs: u32,
 }
 
-/// Gathers at a receiver; `seed` is the texel's own.
-pub(super) fn gather(
-    scene: &Scene,
-    radiance: &RadianceMap,
-    receiver: &Receiver,
-    samples: &SampleSet,
-    seed: u32,
-) -> Gathered {
-    let shift = [combine(seed, 1), combine(seed, 2)];
-    let (tangent, bitangent) = orthonormal_basis(receiver.normal);
-    let mut hits = [RawHit::MISS; PACKET_SIZE];
-    let (mut sum, mut backs) = (Vec3::ZERO, 0u32);
-    for bundle in samples.points.chunks(PACKET_SIZE) {
-        let mut packet = Packet::default();
-        for p in bundle {
-            let [x, y] = concentric_disc([unit_float(p[0] ^ shift[0]), unit_float(p[1] ^ shift[1])]);
-            let z = (1.0 - x * x - y * y).max(0.0).sqrt();
-            packet.push(x * tangent + y * bitangent + z * receiver.normal);
-        }
-        scene.gather_packet(receiver.origin, &packet, 0.0, f32::INFINITY, &mut hits);
-        for (i, hit) in hits[..packet.count].iter().enumerate() {
-            if hit.is_miss() {
-                continue;
-            }
-            // Under the true surface where the shading normal leans away from it: no light.
-            let d = Vec3::new(packet.x[i], packet.y[i], packet.z[i]);
-            if d.dot(receiver.geometric) <= 0.0 {
-                continue;
-            }
-            match radiance.reflected(hit) {
-                Some(l) => sum += l,
-                None => backs += 1,
-            }
-        }
+impl Gathered {
+    /// Indirect irradiance, W/m².
+    pub(crate) fn irradiance(&self) -> Vec3 {
+        self.sum * (PI / self.rays as f32)
     }
-    let n = samples.points.len() as f32;
-    Gathered { irradiance: (sum * (PI / n)).to_array(), valid: backs as f32 <= MAX_BACK_FACES * n }
+
+    /// Whether the texel can be seen at all.
+    pub(crate) fn is_visible(&self) -> bool {
+        self.backs as f32 <= MAX_BACK_FACES * self.rays as f32
+    }
+
+    /// Adds one round of rays from a receiver; `seed` is the texel's own.
+    pub(crate) fn add_round(
+        &mut self,
+        scene: &Scene,
+        radiance: &RadianceMap,
+        receiver: &Receiver,
+        samples: &SampleSet,
+        round: usize,
+        seed: u32,
+    ) {
+        let points = &samples.points[round * ROUND..samples.points.len().min((round + 1) * ROUND)];
+        let shift = [combine(seed, 1), combine(seed, 2)];
+        let (tangent, bitangent) = orthonormal_basis(receiver.normal);
+        let mut hits = [RawHit::MISS; PACKET_SIZE];
+        let mut sum = Vec3::ZERO;
+        for bundle in points.chunks(PACKET_SIZE) {
+            let mut packet = Packet::default();
+            for p in bundle {
+                let [x, y] = concentric_disc([unit_float(p[0] ^ shift[0]), unit_float(p[1] ^ shift[1])]);
+                let z = (1.0 - x * x - y * y).max(0.0).sqrt();
+                packet.push(x * tangent + y * bitangent + z * receiver.normal);
+            }
+            scene.gather_packet(receiver.origin, &packet, 0.0, f32::INFINITY, &mut hits);
+            for (i, hit) in hits[..packet.count].iter().enumerate() {
+                if hit.is_miss() {
+                    continue;
+                }
+                // Under the true surface where the shading normal leans away from it: no light.
+                let d = Vec3::new(packet.x[i], packet.y[i], packet.z[i]);
+                if d.dot(receiver.geometric) <= 0.0 {
+                    continue;
+                }
+                match radiance.reflected(hit) {
+                    Some(l) => sum += l,
+                    None => self.backs += 1,
+                }
+            }
+        }
+        self.sum += sum;
+        self.rays += points.len() as u32;
+    }
 }
 
 #[cfg(test)]
@@ -98,7 +127,7 @@ mod tests {
     use super::*;
 
     #[test]
-    fn every_packet_of_a_set_is_a_narrow_bundle() {
+    fn every_packet_is_a_narrower_bundle_than_its_round() {
         let set = SampleSet::new(1024, 5);
         for shift in [[0, 0], [0x1234_5678, 0x9abc_def0]] {
             for bundle in set.points.chunks(PACKET_SIZE) {
@@ -106,8 +135,8 @@ mod tests {
                     let values = bundle.iter().map(|p| unit_float(p[k] ^ shift[k]));
                     values.clone().fold(0.0, f32::max) - values.fold(1.0, f32::min)
                 };
-                // 32 bundles: 4 × 8 or 8 × 4 cells of the unit square.
-                assert!(extent(0) <= 0.25 && extent(1) <= 0.25, "{} {}", extent(0), extent(1));
+                // Two bundles a round: halves of the unit square.
+                assert!(extent(0).min(extent(1)) <= 0.5, "{} {}", extent(0), extent(1));
             }
         }
     }

@@ -12,49 +12,49 @@ use glam::Vec3;
 use std::ops::Range;
 
 /// Layout and texels of the light map, the gather map or the radiance map.
-pub(super) struct ChartMap {
+pub(crate) struct ChartMap {
     pub layout: Layout,
     pub texels: TexelMap,
 }
 
 impl ChartMap {
-    pub(super) fn new(scene: &Scene, charts: &Charts, layout: Layout, with_areas: bool, stage: &Stage) -> Result<Self> {
+    pub(crate) fn new(scene: &Scene, charts: &Charts, layout: Layout, with_areas: bool, stage: &Stage) -> Result<Self> {
         let texels = TexelMap::build(scene, charts, &layout, with_areas, stage)?;
         Ok(ChartMap { layout, texels })
     }
 
     /// Number of texels that show a surface.
-    pub(super) fn len(&self) -> usize {
+    pub(crate) fn len(&self) -> usize {
         self.texels.samples.len()
     }
 
-    pub(super) fn bytes(&self) -> usize {
+    pub(crate) fn bytes(&self) -> usize {
         self.texels.bytes() + size_of_val(&self.layout.placements[..])
     }
 
     /// Column and row of a sample in its page.
     #[inline]
-    pub(super) fn position(&self, sample: usize) -> (i32, i32) {
+    pub(crate) fn position(&self, sample: usize) -> (i32, i32) {
         let t = &self.texels.samples[sample];
         (t.x as i32, t.y as i32)
     }
 
     /// The samples of a placement.
-    pub(super) fn samples_of(&self, placement: u32) -> Range<usize> {
+    pub(crate) fn samples_of(&self, placement: u32) -> Range<usize> {
         let r = self.texels.samples_of(placement);
         r.start as usize..r.end as usize
     }
 
     /// The sample of a placement at a column and row, [`NONE`] if there is none.
     #[inline]
-    pub(super) fn at(&self, placement: u32, x: i32, y: i32) -> u32 {
+    pub(crate) fn at(&self, placement: u32, x: i32, y: i32) -> u32 {
         if x < 0 || y < 0 { NONE } else { self.texels.texel_index(placement, x as u32, y as u32) }
     }
 
     /// The sample nearest to a point of a placed chart; `None` if the placement has no texel (given
     /// charts that others cover).
     #[inline]
-    pub(super) fn nearest(&self, placement: u32, local: [f32; 2]) -> Option<u32> {
+    pub(crate) fn nearest(&self, placement: u32, local: [f32; 2]) -> Option<u32> {
         let sample = self.texels.nearest(placement, self.layout.texel_coord(placement, local));
         (sample != NONE).then_some(sample)
     }
@@ -62,7 +62,7 @@ impl ChartMap {
     /// Calls `visit` with the samples to interpolate between and their weights, which sum to 1; not
     /// at all if the placement has no texel.
     #[inline]
-    pub(super) fn bilinear(&self, placement: u32, local: [f32; 2], mut visit: impl FnMut(usize, f32)) {
+    pub(crate) fn bilinear(&self, placement: u32, local: [f32; 2], mut visit: impl FnMut(usize, f32)) {
         let b = self.texels.bilinear(placement, self.layout.texel_coord(placement, local));
         for (s, w) in b.samples.into_iter().zip(b.weights) {
             if w > 0.0 && s != NONE {
@@ -72,7 +72,7 @@ impl ChartMap {
     }
 
     /// The point of a sample and its side as a receiver.
-    pub(super) fn receiver(&self, scene: &Scene, sample: usize, back: bool) -> (SurfacePoint, Receiver) {
+    pub(crate) fn receiver(&self, scene: &Scene, sample: usize, back: bool) -> (SurfacePoint, Receiver) {
         let t = &self.texels.samples[sample];
         let point = SurfacePoint::new(scene.corners(t.triangle), t.u, t.v, scene);
         let (mesh, _) = scene.locate(t.triangle);
@@ -82,13 +82,13 @@ impl ChartMap {
     }
 
     /// The first sample that shows a back side.
-    pub(super) fn back_start(&self) -> usize {
+    pub(crate) fn back_start(&self) -> usize {
         let fronts = self.layout.placements.len() - self.layout.back_of.len();
         self.texels.chart_start[fronts] as usize
     }
 
     /// Repeats the nearest sample around the charts of a page, up to `padding` texels away.
-    pub(super) fn dilate<T: Copy>(&self, page: u32, padding: u32, out: &mut [T]) {
+    pub(crate) fn dilate<T: Copy>(&self, page: u32, padding: u32, out: &mut [T]) {
         let size = self.layout.page_size as usize;
         for d in self.texels.dilate(page, padding) {
             let (x, y) = self.position(d.sample as usize);
@@ -97,7 +97,7 @@ impl ChartMap {
     }
 
     /// Position and normal of a sample.
-    pub(super) fn surface(&self, scene: &Scene, sample: usize) -> (Vec3, Vec3) {
+    pub(crate) fn surface(&self, scene: &Scene, sample: usize) -> (Vec3, Vec3) {
         let t = &self.texels.samples[sample];
         (t.position(scene), t.shading_normal(scene))
     }

@@ -4,16 +4,16 @@
 //! the gather map (indirect irradiance) and the radiance map (what gather rays see). A bake runs
 //! photons → radiance map → gather map → blur → direct light and composition.
 
-mod bake;
+pub(crate) mod bake;
 pub mod blur;
 pub mod charts;
 pub mod direct;
-mod gather;
+pub(crate) mod gather;
 pub mod layout;
-mod map;
+pub(crate) mod map;
 pub mod plan;
 mod polygon;
-mod radiance;
+pub(crate) mod radiance;
 mod read;
 mod sides;
 pub mod texels;
@@ -194,6 +194,16 @@ pub(crate) struct Atlas {
     pub padding: u32,
     pub info: LightmapInfo,
     _memory: Reservation,
+}
+
+impl Atlas {
+    /// A sample of the light map or the gather map as a receiver, on the side that `backs` (per
+    /// chart; empty: fronts) tells.
+    pub(crate) fn receiver(&self, map: &ChartMap, backs: &[bool], sample: usize) -> direct::Receiver {
+        let chart = self.charts.chart_of[map.texels.samples[sample].triangle as usize];
+        let back = backs.get(chart as usize).is_some_and(|&b| b);
+        map.receiver(&self.scene, sample, back).1
+    }
 }
 
 /// Light maps of a scene: layout, texels and, after [`bake`](Lightmap::bake), light.

@@ -26,7 +26,7 @@ use std::sync::atomic::{AtomicU64, Ordering::Relaxed};
 const BLOCK: usize = 512;
 
 /// Reflected radiance per texel, with what a lookup needs.
-pub(super) struct RadianceMap<'a> {
+pub(crate) struct RadianceMap<'a> {
     charts: &'a Charts,
     map: &'a ChartMap,
     /// Per texel, front sides first; W/(m²·sr).
@@ -34,13 +34,13 @@ pub(super) struct RadianceMap<'a> {
 }
 
 impl<'a> RadianceMap<'a> {
-    pub(super) fn new(charts: &'a Charts, map: &'a ChartMap, values: &'a [Vec3]) -> Self {
+    pub(crate) fn new(charts: &'a Charts, map: &'a ChartMap, values: &'a [Vec3]) -> Self {
         RadianceMap { charts, map, values }
     }
 
     /// Reflected radiance towards a ray that hit; `None` on the back of a one-sided surface.
     #[inline]
-    pub(super) fn reflected(&self, hit: &RawHit) -> Option<Vec3> {
+    pub(crate) fn reflected(&self, hit: &RawHit) -> Option<Vec3> {
         let chart = self.charts.chart_of[hit.triangle as usize];
         if chart == NONE {
             return Some(Vec3::ZERO);
@@ -52,7 +52,7 @@ impl<'a> RadianceMap<'a> {
 }
 
 /// What the stage needs.
-pub(super) struct RadianceInput<'a> {
+pub(crate) struct RadianceInput<'a> {
     pub scene: &'a Arc<Scene>,
     pub map: &'a ChartMap,
     pub direct: &'a DirectLight,
@@ -65,7 +65,7 @@ pub(super) struct RadianceInput<'a> {
 }
 
 /// Fills in `values`, one per texel of the map; returns the rays traced.
-pub(super) fn bake(device: &Device, input: &RadianceInput, values: &mut [Vec3], stage: &Stage) -> Result<u64> {
+pub(crate) fn bake(device: &Device, input: &RadianceInput, values: &mut [Vec3], stage: &Stage) -> Result<u64> {
     let rays = AtomicU64::new(0);
     device.install(|| {
         values.par_chunks_mut(BLOCK).enumerate().try_for_each(|(block, out)| {

@@ -14,7 +14,7 @@ const DARK_FRONT: f64 = 10.0;
 
 /// Per chart, whether its back is baked; empty if no chart has a back. `light` tells how much light a
 /// sample of the radiance map gets (any unit).
-pub(super) fn backs(charts: &Charts, radiance: &ChartMap, mut light: impl FnMut(usize) -> f32) -> Vec<bool> {
+pub(crate) fn backs(charts: &Charts, radiance: &ChartMap, mut light: impl FnMut(usize) -> f32) -> Vec<bool> {
     if radiance.layout.back_of.is_empty() {
         return Vec::new();
     }
