@@ -5,6 +5,7 @@ use crate::error::{Error, Result, invalid_argument};
 use crate::memory::{MemoryFn, MemoryMonitor};
 use crate::simd::Isa;
 use crate::trace::Kernels;
+use std::cell::Cell;
 use std::sync::Arc;
 use std::thread::JoinHandle;
 
@@ -19,6 +20,11 @@ pub enum LogLevel {
 
 /// Receives log messages, from any thread.
 pub type LogFn = dyn Fn(LogLevel, &str) + Send + Sync;
+
+thread_local! {
+    /// Set while a thread runs what was given to [`Device::spawn`].
+    static APART: Cell<bool> = const { Cell::new(false) };
+}
 
 /// The most threads a device accepts: a guard against garbage in the argument.
 pub const MAX_THREADS: usize = 4096;
@@ -89,7 +95,22 @@ impl Device {
 
     /// Runs `f` on the device's threads; rayon calls inside use them alone.
     pub fn install<R: Send>(&self, f: impl FnOnce() -> R + Send) -> R {
+        if APART.get() {
+            return f();
+        }
         self.pool.as_ref().expect("there until dropped").install(f)
+    }
+
+    /// Runs `f` on one of the device's threads and returns at once. What it would
+    /// [`install`](Self::install) in any device runs on this one's threads too: long work in the
+    /// background that must not keep the threads of another device from short work. `f` must not
+    /// panic.
+    pub(crate) fn spawn(&self, f: impl FnOnce() + Send + 'static) {
+        self.pool.as_ref().expect("there until dropped").spawn(|| {
+            APART.set(true);
+            f();
+            APART.set(false);
+        });
     }
 
     /// Sends a message to the log callback.

@@ -34,6 +34,7 @@ pub mod error;
 #[cfg(feature = "io")]
 pub mod io;
 pub mod lightmap;
+pub mod live;
 pub mod memory;
 pub mod photon;
 pub mod progress;

@@ -34,7 +34,7 @@ pub struct Plan {
 
 impl Plan {
     /// Derived from the scene, its lights and the parameters.
-    pub(super) fn new(
+    pub(crate) fn new(
         scene: &Scene,
         direct: &DirectLight,
         params: &BakeParams,
@@ -118,7 +118,7 @@ impl Plan {
     }
 
     /// Tells of two-sided charts of which the back was baked.
-    pub(super) fn note_back_charts(&mut self, count: u64) {
+    pub(crate) fn note_back_charts(&mut self, count: u64) {
         if count > 0 {
             self.run(&format!("the backs of {count} two-sided charts, whose fronts are dark"));
         }
@@ -134,7 +134,7 @@ impl Plan {
     }
 
     /// Whether a part runs.
-    pub(super) fn runs(&self, bit: u32) -> bool {
+    pub(crate) fn runs(&self, bit: u32) -> bool {
         self.left_out & bit == 0
     }
 

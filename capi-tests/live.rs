@@ -1,0 +1,235 @@
+//! Live updates against bakes: whatever the order of the updates, the light that they end with has
+//! the bits of a bake with as many rays; and what an application may rely on in between.
+
+use bakelite::bvh::BuildOptions;
+use bakelite::lightmap::{Layer, LayerData, Lightmap, LightmapDesc};
+use bakelite::live::{Budget, Live, LiveCamera, LiveParams, LiveStats, Mode, PageRect};
+use bakelite::scene::{Light, builtin};
+use bakelite::{Device, DeviceOptions, Error, Progress, Scene};
+use glam::Vec3;
+use std::f32::consts::PI;
+
+const RAYS: Budget = Budget { milliseconds: 0.0, rays: 200_000 };
+
+/// A light map of a built-in scene, not baked.
+fn unbaked(name: &str, threads: usize, texels_per_unit: f32) -> Lightmap {
+    let device = Device::new(DeviceOptions { num_threads: threads, ..Default::default() }).unwrap();
+    let data = builtin(name).unwrap();
+    let scene = Scene::commit(&device, data, &BuildOptions::default(), &Progress::none()).map_err(|e| e.1).unwrap();
+    let desc = LightmapDesc { texels_per_unit, page_size: 256, ..Default::default() };
+    Lightmap::create(&scene, &desc, &Progress::none()).unwrap()
+}
+
+fn params(mode: Mode) -> LiveParams {
+    LiveParams { mode, max_rounds: 3, photon_count: 20_000, direct_samples: 4, seed: 5, ..Default::default() }
+}
+
+/// Looks around the Cornell box, and at its outside too.
+fn camera(i: u32) -> LiveCamera {
+    let angle = i as f32 * 0.7;
+    LiveCamera {
+        position: Vec3::new(0.278, 0.35, 0.28),
+        forward: Vec3::new(angle.cos(), 0.9 * (0.37 * angle).sin(), angle.sin()),
+        up: Vec3::Y,
+        fov_y: 1.5,
+        width: 320,
+        height: 200,
+    }
+}
+
+fn pages(live: &Live, lightmap: &Lightmap) -> Vec<[f32; 3]> {
+    let info = lightmap.info();
+    let page = |page| live.read(&PageRect { page, x: 0, y: 0, width: info.width, height: info.height }, true).unwrap();
+    (0..info.page_count).flat_map(page).collect()
+}
+
+/// Updates until nothing is left to do. The camera sees all that can be seen sooner or later; for
+/// what it never does, position-based updates see to the rest.
+fn finish(live: &mut Live) -> LiveStats {
+    let mut stats = LiveStats::default();
+    for i in 0..20_000 {
+        stats = live.update(&camera(i), &RAYS).unwrap();
+        if stats.finished == 1.0 {
+            break;
+        }
+    }
+    live.update(&camera(0), &Budget { milliseconds: 1000.0, rays: 0 }).unwrap();
+    stats
+}
+
+/// Compares the texels that can be seen; others are filled from what is around them.
+fn assert_same_as_bake(live: &Live, lightmap: &mut Lightmap, what: &str) {
+    lightmap.bake(&live.params().bake(), &Progress::none()).unwrap();
+    let shown = pages(live, lightmap);
+    let read = |layer| (0..lightmap.info().page_count).map(move |p| (p, layer));
+    let baked: Vec<[f32; 3]> = read(Layer::Combined)
+        .flat_map(|(p, l)| match lightmap.read(p, l).unwrap() {
+            LayerData::Rgb(v) => v,
+            _ => unreachable!(),
+        })
+        .collect();
+    let valid: Vec<f32> = read(Layer::Validity)
+        .flat_map(|(p, l)| match lightmap.read(p, l).unwrap() {
+            LayerData::Scalar(v) => v,
+            _ => unreachable!(),
+        })
+        .collect();
+    let compared = (0..baked.len()).filter(|&i| valid[i] == 1.0).count();
+    let different: Vec<usize> = (0..baked.len())
+        .filter(|&i| valid[i] == 1.0 && shown[i].map(f32::to_bits) != baked[i].map(f32::to_bits))
+        .collect();
+    assert!(compared > 1000, "{what}: only {compared} texels to compare");
+    if let Some(&i) = different.first() {
+        panic!(
+            "{what}: {} of {compared} texels differ, first {i}: {:?} is not {:?}",
+            different.len(),
+            shown[i],
+            baked[i]
+        );
+    }
+}
+
+#[test]
+fn position_based_and_uniform_updates_end_with_the_bits_of_a_bake() {
+    for (mode, threads) in [(Mode::Position, 1), (Mode::Position, 2), (Mode::Uniform, 2)] {
+        let mut lightmap = unbaked("cornell", threads, 60.0);
+        let mut live = Live::new(&lightmap, &params(mode), &Progress::none()).unwrap();
+        let stats = finish(&mut live);
+        assert_eq!(stats.finished, 1.0, "{mode:?}");
+        assert!(live.sums().iter().all(|s| s.1 == 3 * 64));
+        assert_same_as_bake(&live, &mut lightmap, &format!("{mode:?}, {threads} threads"));
+    }
+}
+
+#[test]
+fn view_based_updates_finish_what_the_camera_sees() {
+    let lightmap = unbaked("cornell", 2, 60.0);
+    let mut live = Live::new(&lightmap, &params(Mode::View), &Progress::none()).unwrap();
+    let mut stats = LiveStats::default();
+    for _ in 0..3000 {
+        stats = live.update(&camera(0), &RAYS).unwrap();
+    }
+    assert_eq!(stats.visible_finished, 1.0);
+    assert!(stats.finished < 1.0, "what is behind the camera has no turn");
+    assert!(stats.visible_error < 0.2, "{stats:?}");
+    // A texel's sums depend on its rounds alone.
+    let mut other = Live::new(&lightmap, &params(Mode::Position), &Progress::none()).unwrap();
+    finish(&mut other);
+    let (some, all) = (live.sums(), other.sums());
+    let same = some.iter().zip(&all).filter(|(a, _)| a.1 == 3 * 64).map(|(a, b)| assert_eq!(a, b)).count();
+    assert!(same > some.len() / 20, "{same}");
+}
+
+#[test]
+fn after_a_light_has_changed_the_updates_end_with_the_bits_of_a_bake_under_it() {
+    let mut lightmap = unbaked("cornell", 2, 60.0);
+    let mut live = Live::new(&lightmap, &params(Mode::Position), &Progress::none()).unwrap();
+    finish(&mut live);
+    let before = pages(&live, &lightmap);
+    let scene = lightmap.scene().clone();
+    let changed = match scene.lights()[0] {
+        Light::Rect { position, edge_u, edge_v, radiance } => {
+            Light::Rect { position, edge_u, edge_v, radiance: [radiance[2], radiance[1] * 0.1, radiance[0]] }
+        }
+        other => panic!("{other:?}"),
+    };
+    scene.set_light(0, changed).unwrap();
+    live.light_changed(0).unwrap();
+    // While light is recomputed nothing is black that was not, nor anything wilder than before or after.
+    let brightest = before.iter().flatten().fold(0.0, |a: f32, &b| a.max(b));
+    for i in 0..50 {
+        live.update(&camera(i), &RAYS).unwrap();
+        for (now, before) in pages(&live, &lightmap).iter().zip(&before) {
+            assert!(now.iter().all(|c| c.is_finite() && *c >= 0.0 && *c < 6.0 * brightest), "{now:?}");
+            assert!(before[1] == 0.0 || now[1] > 0.0, "{before:?} turned {now:?}");
+        }
+    }
+    live.finish_relighting().unwrap();
+    assert_eq!(finish(&mut live).finished, 1.0);
+    assert_same_as_bake(&live, &mut lightmap, "new light");
+    let e = live.light_changed(7).unwrap_err().to_string();
+    assert!(e.ends_with("light 7 does not exist, the scene has 1"), "{e}");
+}
+
+#[test]
+fn what_changes_is_covered_by_dirty_rectangles_and_is_never_negative() {
+    for mode in [Mode::View, Mode::Position, Mode::Uniform] {
+        let lightmap = unbaked("cornell", 2, 60.0);
+        let mut live = Live::new(&lightmap, &params(mode), &Progress::none()).unwrap();
+        let size = lightmap.info().width;
+        let whole = PageRect { page: 0, x: 0, y: 0, width: size, height: size };
+        assert_eq!(live.take_dirty(1), [whole]);
+        let mut copy = pages(&live, &lightmap);
+        live.take_dirty(usize::MAX);
+        for i in 0..40 {
+            live.update(&camera(i), &Budget { milliseconds: 0.0, rays: 30_000 }).unwrap();
+            while let Some(r) = live.take_dirty(1).pop() {
+                let values = live.read(&r, true).unwrap();
+                for (k, v) in values.into_iter().enumerate() {
+                    let (x, y) = (r.x + k as u32 % r.width, r.y + k as u32 / r.width);
+                    copy[(r.page * size * size + y * size + x) as usize] = v;
+                }
+            }
+            let now = pages(&live, &lightmap);
+            assert!(now.iter().flatten().all(|c| c.is_finite() && *c >= 0.0));
+            let stale = (0..now.len()).filter(|&i| now[i] != copy[i]).count();
+            assert_eq!(stale, 0, "{mode:?}: texels that changed outside of all rectangles");
+        }
+    }
+}
+
+#[test]
+fn cells_are_promoted_near_the_camera_first() {
+    let lightmap = unbaked("cornell", 2, 60.0);
+    let mut live = Live::new(&lightmap, &params(Mode::Position), &Progress::none()).unwrap();
+    let (info, lods) = live.cell_lods();
+    assert_eq!(info.dimensions.iter().product::<u32>() as usize, lods.len());
+    assert!(lods.iter().all(|&l| l == 0 || l == bakelite::live::NO_LOD));
+    let (mut promoted, mut last) = (0, lods);
+    while promoted < 20 {
+        promoted += live.update(&camera(0), &Budget { milliseconds: 0.0, rays: 20_000 }).unwrap().cells_promoted;
+        let (_, lods) = live.cell_lods();
+        assert!(lods.iter().zip(&last).all(|(now, before)| now >= before), "no cell falls back");
+        last = lods;
+    }
+    assert!(last.contains(&0), "and not all at once");
+    assert_eq!(live.lod_at(Vec3::splat(1e6)), None);
+    assert_eq!(live.lod_at(Vec3::NAN), None);
+}
+
+#[test]
+fn bad_cameras_and_budgets_are_refused_and_change_nothing() {
+    let lightmap = unbaked("cornell", 1, 60.0);
+    let mut live = Live::new(&lightmap, &params(Mode::View), &Progress::none()).unwrap();
+    live.take_dirty(usize::MAX);
+    let before = (live.sums(), pages(&live, &lightmap));
+    let good = camera(0);
+    let bad = [
+        LiveCamera { position: Vec3::new(0.0, f32::NAN, 0.0), ..good },
+        LiveCamera { forward: Vec3::ZERO, ..good },
+        LiveCamera { up: good.forward * 2.0, ..good },
+        LiveCamera { fov_y: 0.0, ..good },
+        LiveCamera { fov_y: PI, ..good },
+        LiveCamera { width: 0, ..good },
+    ];
+    for camera in bad {
+        let e = live.update(&camera, &RAYS).unwrap_err();
+        assert!(matches!(&e, Error::InvalidArgument(m) if m.contains("camera")), "{e}");
+    }
+    for milliseconds in [-1.0, f32::NAN, f32::INFINITY] {
+        let e = live.update(&good, &Budget { milliseconds, rays: 0 }).unwrap_err();
+        assert!(e.to_string().contains("milliseconds"), "{e}");
+    }
+    let stats = live.update(&good, &Budget { milliseconds: 0.0, rays: 0 }).unwrap();
+    assert_eq!((stats.rays, stats.blocks_changed), (0, 0));
+    assert_eq!((live.sums(), pages(&live, &lightmap)), before);
+    assert!(live.take_dirty(8).is_empty());
+    // From inside a wall, outside the scene and very far away: nothing to see, and no harm.
+    for position in [Vec3::new(0.0, -0.001, 0.0), Vec3::splat(100.0), Vec3::splat(1e18)] {
+        live.update(&LiveCamera { position, ..good }, &RAYS).unwrap();
+    }
+    for wrong in [LiveParams { lod_count: 0, ..params(Mode::View) }, LiveParams { max_rounds: 0, ..params(Mode::View) }]
+    {
+        assert!(Live::new(&lightmap, &wrong, &Progress::none()).is_err());
+    }
+}

@@ -1,0 +1,250 @@
+//! Blocks: tiles of 8 × 8 gather texels of one chart, the unit in which live light is computed,
+//! shown and uploaded, and the order of their texels by level of detail (LOD).
+//!
+//! LOD l computes every 2^(top − l)-th texel along each axis (thesis 3.3.2: each LOD doubles the
+//! resolution); the texels of a lower LOD are among those of the next, so that no ray is lost when
+//! the detail grows, and what two LODs share at the border of two blocks has one value.
+
+use crate::lightmap::Atlas;
+use crate::lightmap::gather::Gathered;
+use crate::scene::NONE;
+use glam::Vec3;
+
+/// Gather texels along a side of a block.
+pub(super) const TILE: i32 = 8;
+
+/// The most LODs: the lowest then computes one texel of a block.
+pub const MAX_LODS: usize = 4;
+
+/// A rectangle of texels, from (x0, y0) up to, without, (x1, y1).
+#[derive(Clone, Copy, Debug, Default, PartialEq, Eq)]
+pub(super) struct Rect {
+    pub x0: i32,
+    pub y0: i32,
+    pub x1: i32,
+    pub y1: i32,
+}
+
+impl Rect {
+    pub fn width(&self) -> usize {
+        (self.x1 - self.x0).max(0) as usize
+    }
+
+    pub fn height(&self) -> usize {
+        (self.y1 - self.y0).max(0) as usize
+    }
+
+    pub fn area(&self) -> usize {
+        self.width() * self.height()
+    }
+
+    pub fn grown(&self, by: i32) -> Rect {
+        Rect { x0: self.x0 - by, y0: self.y0 - by, x1: self.x1 + by, y1: self.y1 + by }
+    }
+
+    pub fn clipped(&self, to: &Rect) -> Rect {
+        Rect { x0: self.x0.max(to.x0), y0: self.y0.max(to.y0), x1: self.x1.min(to.x1), y1: self.y1.min(to.y1) }
+    }
+
+    pub fn union(&self, other: &Rect) -> Rect {
+        Rect {
+            x0: self.x0.min(other.x0),
+            y0: self.y0.min(other.y0),
+            x1: self.x1.max(other.x1),
+            y1: self.y1.max(other.y1),
+        }
+    }
+
+    /// All texels, row by row.
+    pub fn texels(self) -> impl Iterator<Item = (i32, i32)> {
+        (self.y0..self.y1).flat_map(move |y| (self.x0..self.x1).map(move |x| (x, y)))
+    }
+}
+
+/// Direct light of the light map texels around a block, at full resolution.
+#[derive(Clone, Debug)]
+pub(super) struct DirectTile {
+    pub rect: Rect,
+    /// Row by row; only those of the block's own texels mean anything.
+    pub values: Box<[Vec3]>,
+}
+
+/// One block.
+#[derive(Debug, Default)]
+pub(super) struct Block {
+    pub chart: u32,
+    /// Where it lies in the gather map.
+    pub rect: Rect,
+    /// Its gather texels, by LOD.
+    pub texels: Box<[u32]>,
+    /// The texels of LOD l are the first `lod_end[l]`.
+    pub lod_end: [u16; MAX_LODS],
+    pub centre: Vec3,
+    pub cell: u32,
+    /// What the texels gathered, as far as they have been worked on.
+    pub gathered: Vec<Gathered>,
+    /// Light of an earlier epoch, by texel, that fades out while new rays come in; may be empty.
+    pub prior: Box<[Vec3]>,
+    /// The LOD whose texels have all been gathered, and how many rounds they have.
+    pub lod: u8,
+    pub rounds: u16,
+    /// The next texel of the step under way.
+    pub cursor: u16,
+    /// The LOD in use for display: `lod`, or less until the block's cell is promoted.
+    pub shown_lod: u8,
+    /// Of the radiance that `gathered` saw; of the lights that `direct` saw.
+    pub indirect_epoch: u32,
+    pub direct_epoch: u32,
+    /// Direct light at full resolution, once the block was worked on.
+    pub direct: Option<DirectTile>,
+    /// Direct light under way, and its next texel.
+    pub direct_work: Option<(DirectTile, u32)>,
+    /// Squared deviations of the rounds from the mean so far, by luminance, and how many.
+    pub deviations: f32,
+    pub deviation_count: u32,
+    /// Estimated relative error of indirect light.
+    pub error: f32,
+}
+
+impl Block {
+    /// Bytes held beside the structure itself.
+    pub fn bytes(&self) -> usize {
+        let tile = |t: &DirectTile| t.values.len() * size_of::<Vec3>();
+        self.texels.len() * 4
+            + self.gathered.capacity() * size_of::<Gathered>()
+            + self.prior.len() * size_of::<Vec3>()
+            + self.direct.as_ref().map_or(0, tile)
+            + self.direct_work.as_ref().map_or(0, |w| tile(&w.0))
+    }
+}
+
+/// Blocks by chart.
+pub(super) struct BlockIndex {
+    /// First block of each chart.
+    first: Vec<u32>,
+    /// Corner and number of columns of each chart's tiles, in texels of the gather map.
+    origin: Vec<(i32, i32, i32)>,
+    /// Lowest LOD that each gather texel belongs to.
+    pub lod_of: Vec<u8>,
+    top: u8,
+}
+
+impl BlockIndex {
+    /// Cuts the charts of an atlas into blocks. `lods`: 1 to [`MAX_LODS`].
+    pub fn new(atlas: &Atlas, lods: u32) -> (BlockIndex, Vec<Block>) {
+        let top = (lods - 1) as u8;
+        let mut index = BlockIndex {
+            first: Vec::with_capacity(atlas.charts.charts.len() + 1),
+            origin: Vec::with_capacity(atlas.charts.charts.len()),
+            lod_of: vec![top; atlas.gather.len()],
+            top,
+        };
+        let mut blocks = Vec::new();
+        for chart in 0..atlas.charts.charts.len() as u32 {
+            index.first.push(blocks.len() as u32);
+            let p = &atlas.gather.layout.placements[chart as usize];
+            let (x, y, w, h) = (p.x as i32, p.y as i32, p.w as i32, p.h as i32);
+            let (columns, rows) = ((w + TILE - 1) / TILE, (h + TILE - 1) / TILE);
+            index.origin.push((x, y, columns));
+            for (i, j) in (0..rows).flat_map(|j| (0..columns).map(move |i| (i, j))) {
+                let (x0, y0) = (x + i * TILE, y + j * TILE);
+                let rect = Rect { x0, y0, x1: (x0 + TILE).min(x + w), y1: (y0 + TILE).min(y + h) };
+                blocks.push(index.block(atlas, chart, rect));
+            }
+        }
+        index.first.push(blocks.len() as u32);
+        (index, blocks)
+    }
+
+    fn block(&mut self, atlas: &Atlas, chart: u32, rect: Rect) -> Block {
+        let mut texels: Vec<(u8, u32)> = rect
+            .texels()
+            .filter_map(|(x, y)| {
+                let sample = atlas.gather.at(chart, x, y);
+                (sample != NONE).then(|| (self.lod_at(chart, x, y), sample))
+            })
+            .collect();
+        texels.sort_by_key(|t| t.0);
+        // A block must not be without light: its first texel, if none falls on the lowest LOD's grid.
+        if let Some(t) = texels.first_mut() {
+            t.0 = 0;
+        }
+        let mut block = Block { chart, rect, ..Default::default() };
+        for (l, end) in block.lod_end.iter_mut().enumerate() {
+            *end = texels.iter().filter(|t| t.0 as usize <= l).count() as u16;
+        }
+        let mut centre = glam::DVec3::ZERO;
+        for &(lod, sample) in &texels {
+            self.lod_of[sample as usize] = lod;
+            centre += atlas.gather.texels.samples[sample as usize].position(&atlas.scene).as_dvec3();
+        }
+        block.centre = (centre / texels.len().max(1) as f64).as_vec3();
+        block.texels = texels.into_iter().map(|t| t.1).collect();
+        block
+    }
+
+    /// The LOD on whose grid a texel of the gather map lies.
+    fn lod_at(&self, chart: u32, x: i32, y: i32) -> u8 {
+        let (ox, oy, _) = self.origin[chart as usize];
+        let zeros = ((x - ox) | (y - oy)).trailing_zeros();
+        self.top - zeros.min(self.top as u32) as u8
+    }
+
+    /// The highest LOD.
+    pub fn top(&self) -> u8 {
+        self.top
+    }
+
+    /// Corner of a chart's grid of texels.
+    pub fn origin(&self, chart: u32) -> (i32, i32) {
+        let (x, y, _) = self.origin[chart as usize];
+        (x, y)
+    }
+
+    /// The block of a texel of the gather map, which must be one of the chart's rectangle; others
+    /// are clamped to it.
+    pub fn block_at(&self, chart: u32, x: i32, y: i32) -> u32 {
+        let (ox, oy, columns) = self.origin[chart as usize];
+        let (first, end) = (self.first[chart as usize], self.first[chart as usize + 1]);
+        let rows = (end - first) as i32 / columns.max(1);
+        let (i, j) = (((x - ox) / TILE).clamp(0, columns - 1), ((y - oy) / TILE).clamp(0, rows - 1));
+        first + (j * columns + i) as u32
+    }
+
+    /// The blocks of a chart.
+    pub fn of_chart(&self, chart: u32) -> std::ops::Range<u32> {
+        self.first[chart as usize]..self.first[chart as usize + 1]
+    }
+
+    /// Bytes held.
+    pub fn bytes(&self) -> usize {
+        self.first.len() * 4 + self.origin.len() * 12 + self.lod_of.len()
+    }
+}
+
+/// Where the light map shows the texels of a block: the smallest rectangle with all of them, within
+/// the chart's own.
+pub(super) fn rect_in_light_map(atlas: &Atlas, chart: u32, rect: &Rect) -> Rect {
+    let gather = &atlas.gather.layout.placements[chart as usize];
+    let map = &atlas.map.layout.placements[chart as usize];
+    let corner = |x: i32, y: i32| {
+        let at = [x as f32, y as f32];
+        let mut local: [f32; 2] = std::array::from_fn(|k| (at[k] - gather.offset[k]) / gather.scale[k]);
+        if gather.swap {
+            local.swap(0, 1);
+        }
+        map.texel_coord(local)
+    };
+    let corners =
+        [corner(rect.x0, rect.y0), corner(rect.x1, rect.y0), corner(rect.x0, rect.y1), corner(rect.x1, rect.y1)];
+    let bound = |k: usize, f: fn(f32, f32) -> f32| corners[1..].iter().fold(corners[0][k], |b, c| f(b, c[k]));
+    let own =
+        Rect { x0: map.x as i32, y0: map.y as i32, x1: map.x as i32 + map.w as i32, y1: map.y as i32 + map.h as i32 };
+    Rect {
+        x0: bound(0, f32::min).floor() as i32 - 1,
+        y0: bound(1, f32::min).floor() as i32 - 1,
+        x1: bound(0, f32::max).ceil() as i32 + 1,
+        y1: bound(1, f32::max).ceil() as i32 + 1,
+    }
+    .clipped(&own)
+}

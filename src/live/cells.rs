@@ -1,0 +1,92 @@
+//! The light map grid (thesis 3.3.2): a uniform grid over the scene, to whose cells blocks of texels
+//! of all LODs belong. A cell shows its next LOD when all its blocks have it.
+
+use super::blocks::Block;
+use crate::error::{Result, invalid_argument};
+use glam::{UVec3, Vec3};
+
+/// Cells along the longest side unless the size is given.
+const AUTOMATIC_CELLS: f32 = 16.0;
+
+/// More would make a 3D texture that nobody wants.
+const MAX_CELLS: u64 = 1 << 24;
+
+/// LOD of cells without surfaces.
+pub const NO_LOD: u8 = 255;
+
+/// Where the cells lie.
+#[derive(Clone, Copy, Debug, PartialEq)]
+pub struct CellInfo {
+    pub origin: Vec3,
+    pub cell_size: f32,
+    pub dimensions: [u32; 3],
+}
+
+/// The grid.
+pub(super) struct Grid {
+    pub info: CellInfo,
+    /// Blocks of each cell.
+    blocks: Vec<Vec<u32>>,
+    /// Cells with blocks.
+    pub occupied: Vec<u32>,
+}
+
+impl CellInfo {
+    /// Cell of a position; those outside are clamped.
+    pub(super) fn cell(&self, position: Vec3) -> u32 {
+        let at = ((position - self.origin) / self.cell_size).floor().max(Vec3::ZERO).as_uvec3();
+        let at = at.min(UVec3::from(self.dimensions) - 1);
+        at.x + self.dimensions[0] * (at.y + self.dimensions[1] * at.z)
+    }
+
+    pub(super) fn contains(&self, position: Vec3) -> bool {
+        let at = (position - self.origin) / self.cell_size;
+        let size = UVec3::from(self.dimensions).as_vec3();
+        // A position on the upper face belongs to the last cell.
+        position.is_finite() && at.cmpge(Vec3::ZERO).all() && at.cmple(size).all()
+    }
+
+    /// Distance from a position to a cell.
+    pub(super) fn distance(&self, cell: u32, position: Vec3) -> f32 {
+        let [nx, ny, _] = self.dimensions;
+        let at = UVec3::new(cell % nx, cell / nx % ny, cell / nx / ny).as_vec3();
+        let lower = self.origin + at * self.cell_size;
+        position.distance(position.clamp(lower, lower + self.cell_size))
+    }
+}
+
+impl Grid {
+    /// Assigns blocks to the cells of their centres. `size` 0: automatic.
+    pub fn new(lower: Vec3, upper: Vec3, size: f32, blocks: &mut [Block]) -> Result<Grid> {
+        if !(size >= 0.0 && size.is_finite()) {
+            return invalid_argument!("cell_size is {size}, not a finite number ≥ 0");
+        }
+        let extent = upper - lower;
+        let cell_size = if size > 0.0 { size } else { (extent.max_element() / AUTOMATIC_CELLS).max(f32::MIN_POSITIVE) };
+        let cells = (extent / cell_size).ceil().max(Vec3::ONE);
+        if cells.x as f64 * cells.y as f64 * cells.z as f64 > MAX_CELLS as f64 {
+            return invalid_argument!("cell_size {cell_size} makes {cells} cells, more than {MAX_CELLS}");
+        }
+        let info = CellInfo { origin: lower, cell_size, dimensions: cells.as_uvec3().to_array() };
+        let mut grid = Grid { info, blocks: vec![Vec::new(); cells.element_product() as usize], occupied: Vec::new() };
+        for (b, block) in blocks.iter_mut().enumerate().filter(|(_, b)| !b.texels.is_empty()) {
+            block.cell = info.cell(block.centre);
+            grid.blocks[block.cell as usize].push(b as u32);
+        }
+        grid.occupied = (0..grid.blocks.len() as u32).filter(|&c| !grid.blocks_of(c).is_empty()).collect();
+        Ok(grid)
+    }
+
+    pub fn blocks_of(&self, cell: u32) -> &[u32] {
+        &self.blocks[cell as usize]
+    }
+
+    /// The lowest LOD that the blocks of a cell show.
+    pub fn lod(&self, cell: u32, blocks: &[Block]) -> u8 {
+        self.blocks_of(cell).iter().map(|&b| blocks[b as usize].shown_lod).min().unwrap_or(NO_LOD)
+    }
+
+    pub fn bytes(&self) -> usize {
+        self.blocks.len() * size_of::<Vec<u32>>() + self.blocks.iter().map(|b| b.capacity() * 4).sum::<usize>()
+    }
+}

@@ -1,0 +1,125 @@
+//! What the camera looks at (thesis 3.3.1): primary rays, denser in the middle of the picture, mark
+//! the blocks that they hit. Marks fade over some updates, so that few rays per update suffice.
+
+use super::LiveCamera;
+use super::blocks::BlockIndex;
+use crate::lightmap::Atlas;
+use crate::sampling::sobol_2d;
+use crate::scene::NONE;
+use crate::trace::{PACKET_SIZE, Packet, RawHit};
+use glam::Vec3;
+
+/// Packets of primary rays per update. A packet is one column of the picture.
+const PACKETS: usize = 16;
+
+/// What is left of a mark after an update.
+const FADING: f32 = 0.93;
+
+/// Below this a mark is dropped: after some sixty updates.
+const FORGOTTEN: f32 = 0.01;
+
+/// Marks of what is visible.
+#[derive(Default)]
+pub(super) struct Visibility {
+    /// By block.
+    marks: Vec<f32>,
+    /// Blocks with a mark.
+    pub seen: Vec<u32>,
+    updates: u32,
+}
+
+impl Visibility {
+    pub fn new(blocks: usize) -> Visibility {
+        Visibility { marks: vec![0.0; blocks], ..Default::default() }
+    }
+
+    pub fn mark(&self, block: u32) -> f32 {
+        self.marks[block as usize]
+    }
+
+    pub fn bytes(&self) -> usize {
+        (self.marks.len() + self.seen.capacity()) * 4
+    }
+
+    /// Traces the primary rays of one update; returns how many.
+    pub fn look(&mut self, atlas: &Atlas, index: &BlockIndex, camera: &LiveCamera) -> u64 {
+        let marks = &mut self.marks;
+        self.seen.retain(|&b| {
+            let mark = &mut marks[b as usize];
+            *mark *= FADING;
+            if *mark < FORGOTTEN {
+                *mark = 0.0;
+            }
+            *mark > 0.0
+        });
+        let forward = camera.forward.normalize();
+        let right = forward.cross(camera.up).normalize();
+        let half = (0.5 * camera.fov_y).tan();
+        let down = forward.cross(right) * half;
+        let right = right * half * camera.width as f32 / camera.height as f32;
+        let mut hits = [RawHit::MISS; PACKET_SIZE];
+        for p in 0..PACKETS {
+            let mut packet = Packet::default();
+            for _ in 0..PACKET_SIZE {
+                let i =
+                    self.updates.wrapping_mul((PACKETS * PACKET_SIZE) as u32) + (p * PACKET_SIZE + packet.count) as u32;
+                let [a, b] = sobol_2d(i & 0xffff, 0x5eed);
+                // The packet's column of the picture, in coordinates from −1 to 1.
+                let u = denser_in_the_middle(((p as f32 + a) / PACKETS as f32) * 2.0 - 1.0);
+                let v = denser_in_the_middle(b * 2.0 - 1.0);
+                packet.push((forward + right * u + down * v).normalize());
+            }
+            atlas.scene.gather_packet(camera.position, &packet, 0.0, f32::INFINITY, &mut hits);
+            for hit in &hits[..packet.count] {
+                let Some(block) = block_of(atlas, index, hit) else { continue };
+                let mark = &mut self.marks[block as usize];
+                if *mark == 0.0 {
+                    self.seen.push(block);
+                }
+                *mark += 1.0;
+            }
+        }
+        self.updates = self.updates.wrapping_add(1);
+        (PACKETS * PACKET_SIZE) as u64
+    }
+}
+
+/// Maps [−1, 1] to itself with twice the density in the middle.
+fn denser_in_the_middle(x: f32) -> f32 {
+    x * (0.5 + 0.5 * x * x)
+}
+
+/// The block that a ray hit.
+pub(super) fn block_of(atlas: &Atlas, index: &BlockIndex, hit: &RawHit) -> Option<u32> {
+    if hit.is_miss() {
+        return None;
+    }
+    let chart = atlas.charts.chart_of[hit.triangle as usize];
+    if chart == NONE || index.of_chart(chart).is_empty() {
+        return None;
+    }
+    let at = atlas.gather.layout.texel_coord(chart, atlas.charts.local(hit.triangle, hit.u, hit.v));
+    Some(index.block_at(chart, at[0].floor() as i32, at[1].floor() as i32))
+}
+
+impl LiveCamera {
+    /// Whether numbers make sense: finite, with an extent, an aspect and a field of view.
+    pub fn validate(&self) -> crate::Result<()> {
+        use crate::error::invalid_argument;
+        let finite = |v: Vec3| v.is_finite();
+        if !(finite(self.position) && finite(self.forward) && finite(self.up)) {
+            return invalid_argument!("the camera has a coordinate that is not finite: {self:?}");
+        }
+        if !(self.fov_y > 0.0 && self.fov_y < std::f32::consts::PI) {
+            return invalid_argument!("the camera's fov_y is {}, not in (0, π)", self.fov_y);
+        }
+        if self.width == 0 || self.height == 0 {
+            return invalid_argument!("the camera's picture is {} × {} pixels", self.width, self.height);
+        }
+        let across = self.forward.normalize_or_zero().cross(self.up.normalize_or_zero());
+        if !(across.length() > 1e-4) {
+            return invalid_argument!("the camera's forward {} and up {} are zero or parallel", self.forward, self.up);
+        }
+        Ok(())
+    }
+}

@@ -1,0 +1,287 @@
+//! Work on one block: direct light at full resolution, then rounds of gather rays for the texels of
+//! the next LOD, then more rounds for all. It can stop after any texel and go on later; the sums of
+//! a texel depend on its number of rounds alone, so they have the bits of a bake with as many rays.
+
+use super::blocks::{Block, DirectTile, rect_in_light_map};
+use super::relight::Illumination;
+use crate::lightmap::Atlas;
+use crate::lightmap::bake::inside_a_solid;
+use crate::lightmap::gather::{Gathered, ROUND, SampleSet};
+use crate::lightmap::radiance::RadianceMap;
+use crate::sampling::combine;
+use crate::scene::NONE;
+use glam::Vec3;
+use std::sync::atomic::{AtomicU64, Ordering::Relaxed};
+use std::time::Instant;
+
+/// What all work on blocks reads.
+pub(super) struct Context<'a> {
+    pub atlas: &'a Atlas,
+    pub light: &'a Illumination,
+    pub samples: &'a SampleSet,
+    pub gather_seed: u32,
+    pub direct_seed: u32,
+    pub direct_samples: u32,
+    pub top: u8,
+    pub promote_threshold: u32,
+    pub max_rounds: u32,
+}
+
+/// What ends the work of an update.
+pub(super) struct Limit {
+    pub deadline: Option<Instant>,
+    /// Rays that may be traced; `u64::MAX`: any number.
+    pub rays: u64,
+    pub traced: AtomicU64,
+}
+
+impl Limit {
+    /// Whether there is room for more; asked before every texel.
+    pub fn reached(&self) -> bool {
+        self.traced.load(Relaxed) >= self.rays || self.deadline.is_some_and(|d| Instant::now() >= d)
+    }
+}
+
+/// What became of a block.
+#[derive(Clone, Copy, Debug, Default, PartialEq, Eq)]
+pub(super) struct Done {
+    /// Its direct light is new.
+    pub direct: bool,
+    /// A step of its indirect light was completed.
+    pub indirect: bool,
+}
+
+impl Block {
+    /// LOD and rounds that the next step works towards; `None` if nothing is left to do.
+    fn target(&self, c: &Context) -> Option<(u8, u32)> {
+        if !c.light.has_indirect {
+            None
+        } else if self.indirect_epoch != c.light.indirect_epoch || self.gathered.is_empty() {
+            // New light: what is shown first.
+            Some((self.lod, c.promote_threshold))
+        } else if self.lod < c.top {
+            Some((self.lod + 1, c.promote_threshold))
+        } else if (self.rounds as u32) < c.max_rounds {
+            Some((c.top, self.rounds as u32 + 1))
+        } else {
+            None
+        }
+    }
+
+    /// Whether all rays have been traced under the light of now.
+    pub fn is_finished(&self, c: &Context) -> bool {
+        self.has_direct(c) && self.target(c).is_none()
+    }
+
+    /// Whether direct light is known at full resolution under the light of now.
+    pub fn has_direct(&self, c: &Context) -> bool {
+        // The old tile stays on display while the new one is under way.
+        self.direct.is_some() && self.direct_work.is_none() && self.direct_epoch == c.light.direct_epoch
+    }
+
+    /// Works until a step is completed or the limit is reached.
+    pub fn work(&mut self, c: &Context, limit: &Limit) -> Done {
+        let mut done = Done::default();
+        if !self.has_direct(c) {
+            done.direct = self.work_on_direct(c, limit);
+            if !done.direct {
+                return done;
+            }
+        }
+        done.indirect = self.work_on_indirect(c, limit);
+        done
+    }
+
+    /// One step of indirect light; tells whether it was completed.
+    pub fn work_on_indirect(&mut self, c: &Context, limit: &Limit) -> bool {
+        if self.texels.is_empty() {
+            return false;
+        }
+        let Some((lod, rounds)) = self.target(c) else { return false };
+        if self.indirect_epoch != c.light.indirect_epoch {
+            self.begin_epoch(c.light.indirect_epoch);
+        }
+        let lookup = RadianceMap::new(&c.atlas.charts, &c.atlas.radiance, &c.light.radiance);
+        let end = self.lod_end[lod as usize];
+        while self.cursor < end {
+            let i = self.cursor as usize;
+            let sample = self.texels[i];
+            if self.gathered.len() <= i {
+                self.gathered.push(Gathered::default());
+            }
+            let receiver = c.atlas.receiver(&c.atlas.gather, &c.light.backs, sample as usize);
+            while self.gathered[i].rays < rounds * ROUND as u32 {
+                if limit.reached() {
+                    return false;
+                }
+                let before = self.gathered[i];
+                let round = (before.rays as usize) / ROUND;
+                let seed = combine(c.gather_seed, sample);
+                self.gathered[i].add_round(&c.atlas.scene, &lookup, &receiver, c.samples, round, seed);
+                self.note_deviation(&before, i);
+                limit.traced.fetch_add(ROUND as u64, Relaxed);
+            }
+            self.cursor += 1;
+        }
+        self.cursor = 0;
+        self.lod = lod;
+        self.rounds = rounds as u16;
+        self.error = self.estimate_error(c.top);
+        true
+    }
+
+    /// Keeps the light of now as a prior and starts over.
+    fn begin_epoch(&mut self, epoch: u32) {
+        if !self.gathered.is_empty() {
+            self.prior = self.texels.iter().enumerate().map(|(i, _)| self.estimate(i).unwrap_or(Vec3::NAN)).collect();
+        }
+        self.gathered.clear();
+        self.indirect_epoch = epoch;
+        self.rounds = 0;
+        self.cursor = 0;
+        (self.deviations, self.deviation_count) = (0.0, 0);
+    }
+
+    /// What is known of texel `i`: its own rays, with the prior's light fading while they are few.
+    pub fn estimate(&self, i: usize) -> Option<Vec3> {
+        let prior = self.prior.get(i).copied().filter(|p| p.is_finite());
+        let Some(g) = self.gathered.get(i).filter(|g| g.rays > 0) else { return prior };
+        let Some(prior) = prior else { return Some(g.irradiance()) };
+        // The prior weighs as much as two rounds and loses that within as many.
+        let n = g.rays as f32 / ROUND as f32;
+        let weight = (2.0 - n).max(0.0);
+        Some((prior * weight + g.irradiance() * n) / (weight + n))
+    }
+
+    /// Whether texel `i` can be seen, as far as is known.
+    pub fn is_visible(&self, i: usize) -> bool {
+        self.gathered.get(i).is_none_or(|g| g.is_visible())
+    }
+
+    /// Drops the prior once it has no weight.
+    pub fn drop_faded_prior(&mut self) {
+        if self.rounds >= 2 {
+            self.prior = Box::default();
+        }
+    }
+
+    /// Takes note of how far a round lies from the rounds before it (Welford 1962).
+    fn note_deviation(&mut self, before: &Gathered, i: usize) {
+        let (n, after) = (before.rays as f32 / ROUND as f32, &self.gathered[i]);
+        if n > 0.0 {
+            let mean = before.irradiance().element_sum();
+            let round = after.irradiance().element_sum() * (n + 1.0) - mean * n;
+            self.deviations += (round - mean).powi(2) * n / (n + 1.0);
+            self.deviation_count += 1;
+        }
+    }
+
+    /// Relative error of the block's indirect light: the spread of its rounds, where there is more
+    /// than one, and, where texels are interpolated, half the spread of those that are not.
+    fn estimate_error(&self, top: u8) -> f32 {
+        let values = || self.gathered.iter().filter(|g| g.rays > 0).map(|g| g.irradiance().element_sum());
+        let n = values().count().max(1) as f32;
+        let mean = values().sum::<f32>() / n;
+        if !(mean > 0.0) {
+            return 0.0;
+        }
+        let spread = (values().map(|v| (v - mean).powi(2)).sum::<f32>() / n).sqrt() / mean;
+        let noise = if self.deviation_count > 0 {
+            (self.deviations / self.deviation_count as f32 / self.rounds.max(1) as f32).sqrt() / mean
+        } else {
+            // One round alone tells nothing of its noise; neighbours differ by it at least.
+            spread.min(1.0) / (self.rounds.max(1) as f32).sqrt()
+        };
+        if self.lod < top { noise + 0.5 * spread.min(1.0) + 0.02 } else { noise }
+    }
+
+    /// Direct light of the block's light map texels; tells whether it was completed.
+    fn work_on_direct(&mut self, c: &Context, limit: &Limit) -> bool {
+        let (mut tile, mut next) = match self.direct_work.take() {
+            Some((tile, next)) if self.direct_epoch == c.light.direct_epoch => (tile, next),
+            _ => {
+                let rect = rect_in_light_map(c.atlas, self.chart, &self.rect);
+                self.direct_epoch = c.light.direct_epoch;
+                (DirectTile { rect, values: vec![Vec3::NAN; rect.area()].into() }, 0)
+            }
+        };
+        let width = tile.rect.width().max(1);
+        while (next as usize) < tile.values.len() {
+            if limit.reached() {
+                self.direct_work = Some((tile, next));
+                return false;
+            }
+            let (x, y) = (tile.rect.x0 + (next as usize % width) as i32, tile.rect.y0 + (next as usize / width) as i32);
+            let mut rays = 0;
+            if let Some(value) = self.direct_texel(c, x, y, &mut rays) {
+                tile.values[next as usize] = value;
+            }
+            limit.traced.fetch_add(rays, Relaxed);
+            next += 1;
+        }
+        fill_hidden(&mut tile);
+        self.direct = Some(tile);
+        true
+    }
+
+    /// Direct light of a texel of the light map; `None` if it is none of the block's; infinite if
+    /// it is inside a solid.
+    fn direct_texel(&self, c: &Context, x: i32, y: i32, rays: &mut u64) -> Option<Vec3> {
+        let a = c.atlas;
+        let sample = a.map.at(self.chart, x, y);
+        if sample == NONE {
+            return None;
+        }
+        let t = &a.map.texels.samples[sample as usize];
+        if a.charts.chart_of[t.triangle as usize] != self.chart {
+            return None;
+        }
+        let at = a.gather.layout.texel_coord(self.chart, a.charts.local(t.triangle, t.u, t.v));
+        // One texel more than the block's own, so that rounding leaves no gaps between blocks.
+        let own = self.rect.grown(1);
+        let (gx, gy) = (at[0].floor() as i32, at[1].floor() as i32);
+        if gx < own.x0 || gx >= own.x1 || gy < own.y0 || gy >= own.y1 {
+            return None;
+        }
+        let receiver = a.receiver(&a.map, &c.light.backs, sample as usize);
+        *rays += 1;
+        if inside_a_solid(&a.scene, receiver.origin, receiver.geometric) {
+            return Some(Vec3::INFINITY);
+        }
+        Some(c.light.direct.irradiance(&receiver, c.direct_samples, combine(c.direct_seed, sample), rays))
+    }
+}
+
+/// Gives texels inside solids (marked infinite) the mean of their neighbours, ring by ring; without
+/// any visible one in the tile, black.
+fn fill_hidden(tile: &mut DirectTile) {
+    let width = tile.rect.width();
+    let mut hidden: Vec<usize> = (0..tile.values.len()).filter(|&i| tile.values[i].x == f32::INFINITY).collect();
+    while !hidden.is_empty() {
+        let ring: Vec<(usize, Vec3)> = hidden
+            .iter()
+            .filter_map(|&i| {
+                let (x, y) = ((i % width) as i32, (i / width) as i32);
+                let (mut sum, mut n) = (Vec3::ZERO, 0.0);
+                for (nx, ny) in (-1..=1).flat_map(|dy| (-1..=1).map(move |dx| (x + dx, y + dy))) {
+                    if nx >= 0 && ny >= 0 && (nx as usize) < width && (ny as usize) < tile.rect.height() {
+                        let v = tile.values[ny as usize * width + nx as usize];
+                        if v.is_finite() {
+                            sum += v;
+                            n += 1.0;
+                        }
+                    }
+                }
+                (n > 0.0).then(|| (i, sum / n))
+            })
+            .collect();
+        if ring.is_empty() {
+            hidden.iter().for_each(|&i| tile.values[i] = Vec3::ZERO);
+            return;
+        }
+        for &(i, v) in &ring {
+            tile.values[i] = v;
+        }
+        hidden.retain(|&i| !tile.values[i].is_finite());
+    }
+}
