@@ -992,6 +992,251 @@ bk_result bk_lightmap_read(const bk_lightmap *lightmap,
 // before a bake, with BK_ERROR_UNSUPPORTED if the library was built without files.
 BK_API bk_result bk_lightmap_save(const bk_lightmap *lightmap, const char *path_prefix, uint32_t file_format);
 
+/* ================================================================================================
+ * Live updates
+ *
+ * A live object lights a scene at once, coarsely, and refines it while somebody walks through: call
+ * bk_live_update once per frame with the camera and a time budget, fetch the rectangles of texels
+ * that changed, and read and upload those. All levels of detail (LODs) are shown in pages of the
+ * light map's size and layout; a lower LOD is interpolated.
+ *
+ * One call at a time may use a live object, from any thread: a second one that comes while it runs
+ * fails with BK_ERROR_INVALID_STATE and changes nothing. Reads (bk_live_read, bk_live_cell_lods,
+ * bk_live_lod_at) exclude updates only, not each other. Source: Schouls 2017, section 3.3.
+ * ================================================================================================ */
+
+// Work on what the camera sees, most where estimated error times visibility is largest.
+#define BK_LIVE_VIEW 0
+
+// Work on the grid cells near the camera, visible ones first. A cell shows its next LOD when all its
+// texels have it.
+#define BK_LIVE_POSITION 1
+
+// Work anywhere, at random: to compare with.
+#define BK_LIVE_UNIFORM 2
+
+// Added to the format of bk_live_read: leave direct light out, for applications that shade it
+// themselves.
+#define BK_FORMAT_INDIRECT_ONLY 256
+
+// A scene's light under refinement.
+typedef struct bk_live bk_live;
+
+// How to update.
+typedef struct bk_live_params {
+  // Size of this structure in bytes, set by bk_live_params_init.
+  uint32_t struct_size;
+  // One of the BK_LIVE modes. Default: BK_LIVE_VIEW.
+  uint32_t mode;
+  // Levels of detail, 1 to 4: the lowest computes every 2^(lod_count - 1)-th texel of the gather map
+  // along each axis, the highest all. Default: 3.
+  uint32_t lod_count;
+  // Rounds of 64 rays that each texel of a cell needs before the cell shows its next LOD, 1 to
+  // max_rounds. Default: 1.
+  uint32_t promote_threshold;
+  // Rounds of 64 rays after which a texel is finished, 1 to 1024. Default: 16.
+  uint32_t max_rounds;
+  // The most rays that an update traces, whatever its budget; 0, the default: no such limit.
+  uint32_t rays_per_update;
+  // Radius in texels of the gather map of a blur for display, 0 to 16; what is accumulated is not
+  // blurred. Default: 2.
+  uint32_t blur;
+  // Edge of a grid cell in scene units; 0, the default: a sixteenth of the scene's longest side.
+  float cell_size;
+  // Seed of all random numbers, as in bk_bake_params. Default: 0.
+  uint64_t seed;
+  // Photons to emit. Default: 1,000,000.
+  uint64_t photon_count;
+  // Most reflections, as in bk_bake_params. Default: 0.
+  uint32_t max_bounces;
+  // Shadow rays per light map texel and area light, as in bk_bake_params. Default: 16.
+  uint32_t direct_samples;
+  // Photon search radius, as in bk_bake_params. Default: 0.
+  float radius;
+  // 1: the device's threads go on working between updates, on what the last one saw. Default: 0.
+  uint32_t background;
+} bk_live_params;
+
+// Where somebody looks from.
+typedef struct bk_camera {
+  // Size of this structure in bytes, set by bk_camera_init.
+  uint32_t struct_size;
+  // Width of the picture in pixels, >= 1: only the aspect matters. Default: 1920.
+  uint32_t width;
+  // Height of the picture in pixels, >= 1. Default: 1080.
+  uint32_t height;
+  // Position in the scene. Default: the origin.
+  float position[3];
+  // Direction of view, of any length > 0. Default: -z.
+  float forward[3];
+  // Upwards, of any length > 0, not parallel to forward. Default: +y.
+  float up[3];
+  // Vertical field of view in radians, in (0, pi). Default: 1.
+  float fov_y;
+} bk_camera;
+
+// What an update may take. Both limits 0: nothing is traced.
+typedef struct bk_budget {
+  // Size of this structure in bytes, set by bk_budget_init.
+  uint32_t struct_size;
+  // Time in milliseconds, finite and >= 0; 0: no limit by time. Default: 4.
+  float milliseconds;
+  // Rays; 0, the default: no limit by rays. A round of 64 that was begun is finished.
+  uint64_t rays;
+} bk_budget;
+
+// What an update did, and how things stand.
+typedef struct bk_live_stats {
+  // Size of this structure in bytes, set by bk_live_stats_init.
+  uint32_t struct_size;
+  // 1 while indirect light is being recomputed because a light has changed, else 0.
+  uint32_t light_pending;
+  // Time that the update took.
+  float milliseconds;
+  // Estimated relative error of indirect light where the camera looks.
+  float visible_error;
+  // Part of the light map that is finished, 0 to 1.
+  float finished;
+  // Part of what the camera sees that is finished, 0 to 1.
+  float visible_finished;
+  // Rays traced by the update, and in the background since the one before.
+  uint64_t rays;
+  // Rays traced since the beginning.
+  uint64_t total_rays;
+  // Cells that went to a higher LOD (BK_LIVE_POSITION).
+  uint32_t cells_promoted;
+  // Blocks of 8 x 8 texels of the gather map whose shown light changed.
+  uint32_t blocks_changed;
+  // Bytes that the live object holds.
+  uint64_t bytes;
+  // Bytes that it would hold with all LODs worked on everywhere.
+  uint64_t bytes_full;
+} bk_live_stats;
+
+// Where the cells of the light map grid lie.
+typedef struct bk_cell_info {
+  // Size of this structure in bytes, set by bk_cell_info_init.
+  uint32_t struct_size;
+  // Cells along x, y and z.
+  uint32_t dimensions[3];
+  // Lower corner of the first cell, in the scene.
+  float origin[3];
+  // Edge of a cell in scene units.
+  float cell_size;
+} bk_cell_info;
+
+// A rectangle of texels of a page.
+typedef struct bk_rect {
+  // Number of the page.
+  uint32_t page;
+  // LOD of what is to be read; of dirty rectangles always the highest: lod_count - 1.
+  uint32_t lod;
+  // First column.
+  uint32_t x;
+  // First row.
+  uint32_t y;
+  // Columns.
+  uint32_t width;
+  // Rows.
+  uint32_t height;
+} bk_rect;
+
+// Fills in the defaults.
+BK_API void bk_live_params_init(bk_live_params *params);
+
+// Fills in the defaults.
+BK_API void bk_camera_init(bk_camera *camera);
+
+// Fills in the defaults.
+BK_API void bk_budget_init(bk_budget *budget);
+
+// Sets struct_size and clears the rest.
+BK_API void bk_live_stats_init(bk_live_stats *stats);
+
+// Sets struct_size and clears the rest.
+BK_API void bk_cell_info_init(bk_cell_info *info);
+
+// Computes photons and the lowest LOD under the lights of now, on the device's threads: a second or
+// two for a large scene. All pages are dirty afterwards.
+//
+// lightmap: its layout is used; it need not be baked, is not changed, and may be released. params:
+// NULL for the defaults. out: receives the live object, NULL on failure.
+BK_API
+bk_result bk_live_create(bk_lightmap *lightmap,
+                         const bk_live_params *params,
+                         bk_live **out);
+
+// Counts one more reference. NULL is ignored.
+BK_API void bk_live_retain(bk_live *live);
+
+// Gives one reference back. NULL is ignored.
+BK_API void bk_live_release(bk_live *live);
+
+// Refines the light for as long as the budget allows, on the device's threads.
+//
+// camera: where somebody looks from; it may be inside walls or outside the scene. budget: NULL for
+// 4 ms. out: what was done; NULL if not wanted.
+//
+// A camera with coordinates that are not finite, with no extent or field of view, or whose forward
+// and up are parallel, and a budget that is negative or not finite are refused
+// (BK_ERROR_INVALID_ARGUMENT). BK_ERROR_OUT_OF_MEMORY if the memory callback refuses a higher LOD; what
+// has been computed stays.
+BK_API
+bk_result bk_live_update(bk_live *live,
+                         const bk_camera *camera,
+                         const bk_budget *budget,
+                         bk_live_stats *out);
+
+// Fetches rectangles of texels whose shown light has changed since they were last fetched, merged
+// where that adds little. Texels around charts (padding) are included.
+//
+// out: receives at most capacity rectangles; NULL if capacity is 0. count: receives how many. What
+// does not fit is kept for the next call: fetch until count < capacity.
+BK_API
+bk_result bk_live_dirty_rects(bk_live *live,
+                              bk_rect *out,
+                              size_t capacity,
+                              size_t *count);
+
+// Copies irradiance as shown, in W/m2, for a rectangle of a page.
+//
+// lod: lod_count - 1 for what is shown; less: what would be shown if no texel were above that LOD
+// (slow: for comparison). format: BK_FORMAT_RGB32F or BK_FORMAT_RGBA16F, with BK_FORMAT_INDIRECT_ONLY
+// added or not. rect: x, y, width and height count, page and lod do not; NULL: the whole page. dst:
+// receives the rectangle's rows, row_stride bytes apart; needs no alignment. row_stride: at least
+// the bytes of a row; 0: just that many.
+BK_API
+bk_result bk_live_read(const bk_live *live,
+                       uint32_t page,
+                       uint32_t lod,
+                       uint32_t format,
+                       const bk_rect *rect,
+                       void *dst,
+                       size_t row_stride);
+
+// The light map grid and the LOD that each of its cells shows, to be put into a 3D texture.
+//
+// info: receives where the cells lie. out: receives one LOD per cell, x fastest, 255 in cells without
+// surfaces; NULL if capacity is 0 and only info is wanted. capacity: bytes that out has room for, at
+// least the number of cells unless 0.
+BK_API
+bk_result bk_live_cell_lods(const bk_live *live,
+                            bk_cell_info *info,
+                            uint8_t *out,
+                            size_t capacity);
+
+// The LOD that is shown at a position: three floats. BK_NONE outside the grid, in cells without
+// surfaces, and on failure.
+BK_API uint32_t bk_live_lod_at(const bk_live *live, const float *position);
+
+// To be called after bk_scene_set_light: direct light follows in the next
+// updates, first where the camera looks; photons are traced again on a thread of their own, and
+// indirect light follows as they come, the old fading out. Several changes may be followed by one
+// call.
+//
+// light: number of a light that changed.
+BK_API bk_result bk_live_light_changed(bk_live *live, uint32_t light);
+
 #ifdef __cplusplus
 } /* extern "C" */
 #endif

@@ -1,10 +1,10 @@
 //! The C ABI behind `include/bakelite.h`: handles, checks, errors and callbacks, and no algorithms.
 //!
 //! One file per section of the header, in its order: [`error`], [`device`], [`scene`], [`meshes`],
-//! [`lights`], [`rays`], [`photons`], [`lightmap`], [`bake`], [`read`]. cbindgen makes the header from exactly these files
-//! (`capi-tests/header.rs`); their `//!` heads become the sections' heads and every public item's
-//! documentation becomes the manual, so both are written for the C reader. `handles` and `args`
-//! hold what the sections share.
+//! [`lights`], [`rays`], [`photons`], [`lightmap`], [`bake`], [`read`], [`live`]. cbindgen makes the
+//! header from exactly these files (`capi-tests/header.rs`); their `//!` heads become the sections'
+//! heads and every public item's documentation becomes the manual, so both are written for the C
+//! reader. `handles` and `args` hold what the sections share.
 //!
 //! # Safety
 //!
@@ -24,6 +24,7 @@ pub mod device;
 pub mod error;
 pub mod lightmap;
 pub mod lights;
+pub mod live;
 pub mod meshes;
 pub mod photons;
 pub mod rays;

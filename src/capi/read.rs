@@ -71,13 +71,43 @@ pub unsafe extern "C" fn bk_lightmap_read(
         if bytes.len() != packed * info.height as usize {
             return Err(Error::Internal(format!("page {page} has {} bytes in layer {layer:?}", bytes.len())));
         }
-        for (row, from) in bytes.chunks_exact(packed).enumerate() {
-            // SAFETY: the caller has room for `height` rows `stride` bytes apart, and there are just
-            // that many.
-            unsafe { std::ptr::copy_nonoverlapping(from.as_ptr(), dst.cast::<u8>().add(row * stride), packed) };
-        }
+        // SAFETY: the caller has room for `height` rows `stride` bytes apart, and there are just that
+        // many.
+        unsafe { copy_rows(&bytes, packed, dst, stride) };
         Ok(())
     })
+}
+
+/// Copies rows of `packed` bytes to rows `stride` bytes apart.
+///
+/// # Safety
+/// `dst` has room for all rows of `bytes`.
+unsafe fn copy_rows(bytes: &[u8], packed: usize, dst: *mut c_void, stride: usize) {
+    for (row, from) in bytes.chunks_exact(packed).enumerate() {
+        // SAFETY: by contract.
+        unsafe { std::ptr::copy_nonoverlapping(from.as_ptr(), dst.cast::<u8>().add(row * stride), packed) };
+    }
+}
+
+/// Copies RGB texels, `width` per row, in a format of theirs.
+///
+/// # Safety
+/// `dst` has room for all rows of texels, `stride` bytes apart.
+pub(super) unsafe fn copy_rgb(
+    texels: Vec<[f32; 3]>,
+    format: u32,
+    width: usize,
+    dst: *mut c_void,
+    stride: usize,
+) -> Result<()> {
+    let bytes = LayerData::Rgb(texels);
+    let bytes = encode(&bytes, format)
+        .ok_or_else(|| Error::InvalidArgument(format!("format is {format}, not one of the formats of light")))?;
+    if width > 0 {
+        // SAFETY: by contract.
+        unsafe { copy_rows(&bytes, width * texel_bytes(format)?, dst, stride) };
+    }
+    Ok(())
 }
 
 fn core_layer(layer: u32) -> Result<Layer> {
@@ -94,7 +124,7 @@ fn core_layer(layer: u32) -> Result<Layer> {
     })
 }
 
-fn texel_bytes(format: u32) -> Result<usize> {
+pub(super) fn texel_bytes(format: u32) -> Result<usize> {
     Ok(match format {
         BK_FORMAT_RGB32F => 12,
         BK_FORMAT_RGBA16F => 8,

@@ -15,7 +15,7 @@ const MAX_CELLS: u64 = 1 << 24;
 pub const NO_LOD: u8 = 255;
 
 /// Where the cells lie.
-#[derive(Clone, Copy, Debug, PartialEq)]
+#[derive(Clone, Copy, Debug, Default, PartialEq)]
 pub struct CellInfo {
     pub origin: Vec3,
     pub cell_size: f32,

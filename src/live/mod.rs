@@ -78,6 +78,8 @@ pub struct LiveParams {
     pub max_bounces: u32,
     pub direct_samples: u32,
     pub radius: f32,
+    /// The device's threads go on working between updates.
+    pub background: bool,
 }
 
 impl Default for LiveParams {
@@ -96,6 +98,7 @@ impl Default for LiveParams {
             max_bounces: bake.max_bounces,
             direct_samples: bake.direct_samples,
             radius: bake.radius,
+            background: false,
         }
     }
 }
@@ -639,6 +642,11 @@ impl Live {
             }
         }
         Ok(out)
+    }
+
+    /// Width and height of the pages, as those of the light map.
+    pub fn page_size(&self) -> u32 {
+        self.atlas.map.layout.page_size
     }
 
     /// The light map grid, and the LOD that each of its cells shows ([`NO_LOD`]: no surfaces), x
