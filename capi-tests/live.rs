@@ -39,8 +39,9 @@ fn camera(i: u32) -> LiveCamera {
 
 fn pages(live: &Live, lightmap: &Lightmap) -> Vec<[f32; 3]> {
     let info = lightmap.info();
-    let page = |page| live.read(&PageRect { page, x: 0, y: 0, width: info.width, height: info.height }, true).unwrap();
-    (0..info.page_count).flat_map(page).collect()
+    let lod = live.params().lod_count - 1;
+    let rect = |page| PageRect { page, x: 0, y: 0, width: info.width, height: info.height };
+    (0..info.page_count).flat_map(|page| live.read(&rect(page), lod, true).unwrap()).collect()
 }
 
 /// Updates until nothing is left to do. The camera sees all that can be seen sooner or later; for
@@ -96,7 +97,7 @@ fn position_based_and_uniform_updates_end_with_the_bits_of_a_bake() {
         let mut live = Live::new(&lightmap, &params(mode), &Progress::none()).unwrap();
         let stats = finish(&mut live);
         assert_eq!(stats.finished, 1.0, "{mode:?}");
-        assert!(live.sums().iter().all(|s| s.1 == 3 * 64));
+        assert!(live.sums().unwrap().iter().all(|s| s.1 == 3 * 64));
         assert_same_as_bake(&live, &mut lightmap, &format!("{mode:?}, {threads} threads"));
     }
 }
@@ -115,7 +116,7 @@ fn view_based_updates_finish_what_the_camera_sees() {
     // A texel's sums depend on its rounds alone.
     let mut other = Live::new(&lightmap, &params(Mode::Position), &Progress::none()).unwrap();
     finish(&mut other);
-    let (some, all) = (live.sums(), other.sums());
+    let (some, all) = (live.sums().unwrap(), other.sums().unwrap());
     let same = some.iter().zip(&all).filter(|(a, _)| a.1 == 3 * 64).map(|(a, b)| assert_eq!(a, b)).count();
     assert!(same > some.len() / 20, "{same}");
 }
@@ -164,7 +165,7 @@ fn what_changes_is_covered_by_dirty_rectangles_and_is_never_negative() {
         for i in 0..40 {
             live.update(&camera(i), &Budget { milliseconds: 0.0, rays: 30_000 }).unwrap();
             while let Some(r) = live.take_dirty(1).pop() {
-                let values = live.read(&r, true).unwrap();
+                let values = live.read(&r, live.params().lod_count - 1, true).unwrap();
                 for (k, v) in values.into_iter().enumerate() {
                     let (x, y) = (r.x + k as u32 % r.width, r.y + k as u32 / r.width);
                     copy[(r.page * size * size + y * size + x) as usize] = v;
@@ -198,11 +199,120 @@ fn cells_are_promoted_near_the_camera_first() {
 }
 
 #[test]
+fn work_between_updates_ends_with_the_bits_of_a_bake_and_can_be_paused() {
+    let mut lightmap = unbaked("cornell", 2, 60.0);
+    let params = LiveParams { background: true, ..params(Mode::Position) };
+    let mut live = Live::new(&lightmap, &params, &Progress::none()).unwrap();
+    let little = Budget { milliseconds: 0.0, rays: 64 };
+    let mut behind_the_back = 0;
+    for i in 0..100_000 {
+        let stats = live.update(&camera(i), &little).unwrap();
+        behind_the_back += stats.rays.saturating_sub(2048);
+        if i == 10 {
+            live.pause(true).unwrap();
+            let before = live.sums().unwrap();
+            std::thread::sleep(std::time::Duration::from_millis(20));
+            assert_eq!(live.sums().unwrap(), before);
+            live.pause(false).unwrap();
+        }
+        if stats.finished == 1.0 {
+            break;
+        }
+        std::thread::sleep(std::time::Duration::from_micros(500));
+    }
+    assert!(behind_the_back > 100_000, "{behind_the_back}");
+    live.update(&camera(0), &Budget { milliseconds: 1000.0, rays: 0 }).unwrap();
+    assert_same_as_bake(&live, &mut lightmap, "in the background");
+}
+
+#[test]
+fn a_saved_state_goes_on_where_it_was() {
+    let mut lightmap = unbaked("cornell", 2, 60.0);
+    let mut live = Live::new(&lightmap, &params(Mode::Position), &Progress::none()).unwrap();
+    for i in 0..15 {
+        live.update(&camera(i), &RAYS).unwrap();
+    }
+    let path = std::env::temp_dir().join(format!("bakelite-live-{}", std::process::id()));
+    live.save(&path).unwrap();
+    let mut other = Live::new(&lightmap, &params(Mode::Position), &Progress::none()).unwrap();
+    other.restore(&path).unwrap();
+    assert_eq!(other.sums().unwrap(), live.sums().unwrap());
+    assert_eq!(other.cell_lods(), live.cell_lods());
+
+    // What is damaged, cut off, of something else or missing is refused and changes nothing.
+    let whole = std::fs::read(&path).unwrap();
+    let mut refuse = |bytes: &[u8], part: &str| {
+        std::fs::write(&path, bytes).unwrap();
+        let e = other.restore(&path).unwrap_err().to_string();
+        assert!(e.contains(part), "{e}");
+        assert_eq!(other.sums().unwrap(), live.sums().unwrap());
+    };
+    refuse(&whole[..whole.len() / 2], "checksum");
+    refuse(&[], "is not a saved");
+    for at in (0..whole.len()).step_by(whole.len() / 50) {
+        let mut damaged = whole.clone();
+        damaged[at] ^= 0x40;
+        refuse(&damaged, "is");
+    }
+    std::fs::write(&path, &whole).unwrap();
+    let different = LiveParams { seed: 6, ..params(Mode::Position) };
+    let mut different = Live::new(&lightmap, &different, &Progress::none()).unwrap();
+    assert!(matches!(different.restore(&path), Err(Error::InvalidArgument(_))));
+    std::fs::remove_file(&path).unwrap();
+    assert!(matches!(other.restore(&path), Err(Error::Io(_))));
+
+    assert_eq!(finish(&mut other).finished, 1.0);
+    assert_same_as_bake(&other, &mut lightmap, "restored");
+}
+
+#[test]
+fn a_lower_lod_can_be_read_beside_what_is_shown() {
+    let lightmap = unbaked("cornell", 2, 60.0);
+    let mut live = Live::new(&lightmap, &params(Mode::Position), &Progress::none()).unwrap();
+    let size = lightmap.info().width;
+    let whole = PageRect { page: 0, x: 0, y: 0, width: size, height: size };
+    let first = live.read(&whole, 2, false).unwrap();
+    finish(&mut live);
+    let error = |lod| {
+        let (now, top) = (live.read(&whole, lod, false).unwrap(), live.read(&whole, 2, false).unwrap());
+        now.iter().zip(&top).map(|(a, b)| (Vec3::from(*a) - Vec3::from(*b)).length_squared()).sum::<f32>()
+    };
+    assert!(error(0) > error(1) && error(1) > 0.0, "{} {}", error(0), error(1));
+    assert_ne!(first, live.read(&whole, 0, false).unwrap(), "more rays came in");
+    assert!(live.read(&whole, 3, true).unwrap_err().to_string().contains("lod is 3"));
+}
+
+#[test]
+fn a_monitor_that_refuses_growth_stops_the_work_and_nothing_else() {
+    let limit = std::sync::Arc::new(std::sync::atomic::AtomicI64::new(i64::MAX));
+    let ask = limit.clone();
+    let device = Device::new(DeviceOptions {
+        num_threads: 2,
+        memory: Some(Box::new(move |bytes| bytes <= ask.load(std::sync::atomic::Ordering::SeqCst))),
+        ..Default::default()
+    })
+    .unwrap();
+    let data = builtin("cornell").unwrap();
+    let scene = Scene::commit(&device, data, &BuildOptions::default(), &Progress::none()).map_err(|e| e.1).unwrap();
+    let desc = LightmapDesc { texels_per_unit: 120.0, page_size: 256, ..Default::default() };
+    let mut lightmap = Lightmap::create(&scene, &desc, &Progress::none()).unwrap();
+    let mut live = Live::new(&lightmap, &params(Mode::Position), &Progress::none()).unwrap();
+    limit.store(0, std::sync::atomic::Ordering::SeqCst);
+    let refused = (0..200).find_map(|i| live.update(&camera(i), &RAYS).err()).unwrap();
+    assert!(matches!(&refused, Error::OutOfMemory(m) if m.contains("live light")), "{refused}");
+    limit.store(i64::MAX, std::sync::atomic::Ordering::SeqCst);
+    assert_eq!(finish(&mut live).finished, 1.0);
+    assert_same_as_bake(&live, &mut lightmap, "after a refusal");
+    drop((live, lightmap, scene));
+    assert_eq!(device.memory().current(), 0);
+}
+
+#[test]
 fn bad_cameras_and_budgets_are_refused_and_change_nothing() {
     let lightmap = unbaked("cornell", 1, 60.0);
     let mut live = Live::new(&lightmap, &params(Mode::View), &Progress::none()).unwrap();
     live.take_dirty(usize::MAX);
-    let before = (live.sums(), pages(&live, &lightmap));
+    let before = (live.sums().unwrap(), pages(&live, &lightmap));
     let good = camera(0);
     let bad = [
         LiveCamera { position: Vec3::new(0.0, f32::NAN, 0.0), ..good },
@@ -222,7 +332,7 @@ fn bad_cameras_and_budgets_are_refused_and_change_nothing() {
     }
     let stats = live.update(&good, &Budget { milliseconds: 0.0, rays: 0 }).unwrap();
     assert_eq!((stats.rays, stats.blocks_changed), (0, 0));
-    assert_eq!((live.sums(), pages(&live, &lightmap)), before);
+    assert_eq!((live.sums().unwrap(), pages(&live, &lightmap)), before);
     assert!(live.take_dirty(8).is_empty());
     // From inside a wall, outside the scene and very far away: nothing to see, and no harm.
     for position in [Vec3::new(0.0, -0.001, 0.0), Vec3::splat(100.0), Vec3::splat(1e18)] {

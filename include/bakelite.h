@@ -1237,6 +1237,30 @@ BK_API uint32_t bk_live_lod_at(const bk_live *live, const float *position);
 // light: number of a light that changed.
 BK_API bk_result bk_live_light_changed(bk_live *live, uint32_t light);
 
+// Stops work between updates (background), and the recomputation of indirect light, or lets both go
+// on with the next update. Updates still do what their budget allows.
+//
+// paused: 1 or 0.
+BK_API bk_result bk_live_pause(bk_live *live, uint32_t paused);
+
+// Writes what has been accumulated to a file, to go on from another time; an existing file is
+// replaced once the new one is whole. Light that is older than the last change of a light is left
+// out.
+//
+// path: UTF-8.
+//
+// Fails with BK_ERROR_IO if the file cannot be written.
+BK_API bk_result bk_live_save(bk_live *live, const char *path);
+
+// Goes on from a file that was saved of the same scene, light map, lights and parameters (mode, cell
+// size, promotion, blur and limits may differ). All pages are dirty afterwards.
+//
+// path: UTF-8.
+//
+// Fails with BK_ERROR_IO if the file cannot be read or is damaged, and with
+// BK_ERROR_INVALID_ARGUMENT if it is of something else; nothing is changed then.
+BK_API bk_result bk_live_restore(bk_live *live, const char *path);
+
 #ifdef __cplusplus
 } /* extern "C" */
 #endif

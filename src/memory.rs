@@ -64,10 +64,20 @@ impl Reservation {
     pub fn bytes(&self) -> usize {
         self.bytes as usize
     }
+
+    /// Announces more, so that `bytes` are held in all; a refusal changes nothing.
+    pub fn grow(&mut self, bytes: usize, what: &str) -> Result<()> {
+        let mut more = self.monitor.reserve(bytes.saturating_sub(self.bytes()), what)?;
+        self.bytes += std::mem::take(&mut more.bytes);
+        Ok(())
+    }
 }
 
 impl Drop for Reservation {
     fn drop(&mut self) {
+        if self.bytes == 0 {
+            return;
+        }
         self.monitor.current.fetch_sub(self.bytes, SeqCst);
         if let Some(callback) = &self.monitor.callback {
             callback(-self.bytes);
@@ -96,6 +106,17 @@ mod tests {
         drop(a);
         assert_eq!((m.current(), m.peak()), (5, 15));
         drop(b);
+        assert_eq!(m.current(), 0);
+    }
+
+    #[test]
+    fn a_reservation_grows_and_goes_as_a_whole() {
+        let m = Arc::new(MemoryMonitor::new(Some(Box::new(|bytes| bytes < 100))));
+        let mut a = m.reserve(10, "a").unwrap();
+        a.grow(90, "a").unwrap();
+        assert!(a.grow(300, "a").is_err());
+        assert_eq!((a.bytes(), m.current()), (90, 90));
+        drop(a);
         assert_eq!(m.current(), 0);
     }
 

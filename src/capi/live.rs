@@ -9,7 +9,7 @@
 //! fails with BK_ERROR_INVALID_STATE and changes nothing. Reads (bk_live_read, bk_live_cell_lods,
 //! bk_live_lod_at) exclude updates only, not each other. Source: Schouls 2017, section 3.3.
 
-use super::args::{OutStruct, SizedStruct, init, read_struct, read_vec3, sized_struct, slice_mut, write};
+use super::args::{OutStruct, SizedStruct, init, read_struct, read_vec3, sized_struct, slice_mut, text, write};
 use super::device::refuse_in_callback;
 use super::error::{BK_NONE, bk_result, call, call_or};
 use super::handles::{create, hold, is_null, object, release, retain};
@@ -19,7 +19,8 @@ use crate::error::{Error, Result, invalid_argument};
 use crate::live::{Budget, CellInfo, Live, LiveCamera, LiveParams, LiveStats, Mode, PageRect};
 use crate::progress::Progress;
 use glam::Vec3;
-use std::ffi::c_void;
+use std::ffi::{c_char, c_void};
+use std::path::Path;
 use std::sync::{RwLock, TryLockError};
 
 /// Work on what the camera sees, most where estimated error times visibility is largest.
@@ -465,10 +466,6 @@ pub unsafe extern "C" fn bk_live_read(
         // SAFETY: the caller's rectangle, or NULL.
         let rect = unsafe { rect.as_ref() };
         live.read(|l| {
-            let lods = l.params().lod_count;
-            if lod >= lods {
-                return invalid_argument!("lod is {lod}, the live object has {lods}");
-            }
             let size = l.page_size();
             let rect = rect.map_or(PageRect { page, x: 0, y: 0, width: size, height: size }, |r| PageRect {
                 page,
@@ -482,7 +479,7 @@ pub unsafe extern "C" fn bk_live_read(
             if stride < packed {
                 return invalid_argument!("row_stride is {row_stride}, less than the {packed} bytes of a row");
             }
-            let texels = l.read(&rect, with_direct)?;
+            let texels = l.read(&rect, lod, with_direct)?;
             // SAFETY: the caller has room for the rectangle's rows, `stride` bytes apart.
             unsafe { copy_rgb(texels, format, rect.width as usize, dst, stride) }
         })
@@ -538,4 +535,55 @@ pub unsafe extern "C" fn bk_live_lod_at(live: *const bk_live, position: *const f
 #[unsafe(no_mangle)]
 pub unsafe extern "C" fn bk_live_light_changed(live: *mut bk_live, light: u32) -> bk_result {
     call(|| object!(live).change(|l| l.light_changed(light)))
+}
+
+/// Stops work between updates (background), and the recomputation of indirect light, or lets both go
+/// on with the next update. Updates still do what their budget allows.
+///
+/// paused: 1 or 0.
+#[unsafe(no_mangle)]
+pub unsafe extern "C" fn bk_live_pause(live: *mut bk_live, paused: u32) -> bk_result {
+    call(|| {
+        let live = object!(live);
+        if paused > 1 {
+            return invalid_argument!("paused is {paused}, not 0 or 1");
+        }
+        live.change(|l| l.pause(paused == 1))
+    })
+}
+
+/// Writes what has been accumulated to a file, to go on from another time; an existing file is
+/// replaced once the new one is whole. Light that is older than the last change of a light is left
+/// out.
+///
+/// path: UTF-8.
+///
+/// Fails with BK_ERROR_IO if the file cannot be written.
+#[unsafe(no_mangle)]
+pub unsafe extern "C" fn bk_live_save(live: *mut bk_live, path: *const c_char) -> bk_result {
+    call(|| {
+        refuse_in_callback()?;
+        let live = object!(live);
+        // SAFETY: path is the caller's, or NULL.
+        let path = unsafe { text(path, "path") }?;
+        live.change(|l| l.save(Path::new(path)))
+    })
+}
+
+/// Goes on from a file that was saved of the same scene, light map, lights and parameters (mode, cell
+/// size, promotion, blur and limits may differ). All pages are dirty afterwards.
+///
+/// path: UTF-8.
+///
+/// Fails with BK_ERROR_IO if the file cannot be read or is damaged, and with
+/// BK_ERROR_INVALID_ARGUMENT if it is of something else; nothing is changed then.
+#[unsafe(no_mangle)]
+pub unsafe extern "C" fn bk_live_restore(live: *mut bk_live, path: *const c_char) -> bk_result {
+    call(|| {
+        refuse_in_callback()?;
+        let live = object!(live);
+        // SAFETY: path is the caller's, or NULL.
+        let path = unsafe { text(path, "path") }?;
+        live.change(|l| l.restore(Path::new(path)))
+    })
 }

@@ -9,6 +9,7 @@ use crate::lightmap::Atlas;
 use crate::lightmap::gather::Gathered;
 use crate::scene::NONE;
 use glam::Vec3;
+use std::sync::Arc;
 
 /// Gather texels along a side of a block.
 pub(super) const TILE: i32 = 8;
@@ -69,9 +70,9 @@ pub(super) struct DirectTile {
     pub values: Box<[Vec3]>,
 }
 
-/// One block.
-#[derive(Debug, Default)]
-pub(super) struct Block {
+/// What of a block never changes.
+#[derive(Debug)]
+pub(super) struct Tile {
     pub chart: u32,
     /// Where it lies in the gather map.
     pub rect: Rect,
@@ -80,7 +81,13 @@ pub(super) struct Block {
     /// The texels of LOD l are the first `lod_end[l]`.
     pub lod_end: [u16; MAX_LODS],
     pub centre: Vec3,
+    /// Cell of the light map grid.
     pub cell: u32,
+}
+
+/// The state of the work on a block; what is shown of it is the display's.
+#[derive(Debug, Default)]
+pub(super) struct Block {
     /// What the texels gathered, as far as they have been worked on.
     pub gathered: Vec<Gathered>,
     /// Light of an earlier epoch, by texel, that fades out while new rays come in; may be empty.
@@ -90,15 +97,17 @@ pub(super) struct Block {
     pub rounds: u16,
     /// The next texel of the step under way.
     pub cursor: u16,
-    /// The LOD in use for display: `lod`, or less until the block's cell is promoted.
-    pub shown_lod: u8,
-    /// Of the radiance that `gathered` saw; of the lights that `direct` saw.
+    /// Of the radiance that `gathered` saw.
     pub indirect_epoch: u32,
+    /// Of the lights that the coarse direct light saw, and the direct light at full resolution.
+    pub coarse_epoch: u32,
     pub direct_epoch: u32,
-    /// Direct light at full resolution, once the block was worked on.
-    pub direct: Option<DirectTile>,
     /// Direct light under way, and its next texel.
     pub direct_work: Option<(DirectTile, u32)>,
+    /// Finished light on its way to the display: coarse direct light of the lowest LOD's texels, and
+    /// direct light at full resolution.
+    pub new_coarse: Box<[Vec3]>,
+    pub new_direct: Option<DirectTile>,
     /// Squared deviations of the rounds from the mean so far, by luminance, and how many.
     pub deviations: f32,
     pub deviation_count: u32,
@@ -106,20 +115,32 @@ pub(super) struct Block {
     pub error: f32,
 }
 
-impl Block {
-    /// Bytes held beside the structure itself.
+impl DirectTile {
     pub fn bytes(&self) -> usize {
-        let tile = |t: &DirectTile| t.values.len() * size_of::<Vec3>();
-        self.texels.len() * 4
-            + self.gathered.capacity() * size_of::<Gathered>()
-            + self.prior.len() * size_of::<Vec3>()
-            + self.direct.as_ref().map_or(0, tile)
-            + self.direct_work.as_ref().map_or(0, |w| tile(&w.0))
+        self.values.len() * size_of::<Vec3>()
     }
 }
 
-/// Blocks by chart.
-pub(super) struct BlockIndex {
+impl Tile {
+    /// Bytes held, with those of an idle block.
+    pub fn bytes(&self) -> usize {
+        size_of::<Tile>() + size_of::<Block>() + self.texels.len() * 4
+    }
+}
+
+impl Block {
+    /// Bytes held beside the structure itself.
+    pub fn bytes(&self) -> usize {
+        self.gathered.capacity() * size_of::<Gathered>()
+            + self.prior.len() * size_of::<Vec3>()
+            + self.direct_work.as_ref().map_or(0, |w| w.0.bytes())
+    }
+}
+
+/// All blocks of an atlas, and where they are.
+pub(super) struct BlockMap {
+    pub atlas: Arc<Atlas>,
+    pub tiles: Vec<Tile>,
     /// First block of each chart.
     first: Vec<u32>,
     /// Corner and number of columns of each chart's tiles, in texels of the gather map.
@@ -129,34 +150,36 @@ pub(super) struct BlockIndex {
     top: u8,
 }
 
-impl BlockIndex {
+impl BlockMap {
     /// Cuts the charts of an atlas into blocks. `lods`: 1 to [`MAX_LODS`].
-    pub fn new(atlas: &Atlas, lods: u32) -> (BlockIndex, Vec<Block>) {
+    pub fn new(atlas: &Arc<Atlas>, lods: u32) -> BlockMap {
         let top = (lods - 1) as u8;
-        let mut index = BlockIndex {
+        let mut map = BlockMap {
+            atlas: atlas.clone(),
+            tiles: Vec::new(),
             first: Vec::with_capacity(atlas.charts.charts.len() + 1),
             origin: Vec::with_capacity(atlas.charts.charts.len()),
             lod_of: vec![top; atlas.gather.len()],
             top,
         };
-        let mut blocks = Vec::new();
         for chart in 0..atlas.charts.charts.len() as u32 {
-            index.first.push(blocks.len() as u32);
+            map.first.push(map.tiles.len() as u32);
             let p = &atlas.gather.layout.placements[chart as usize];
             let (x, y, w, h) = (p.x as i32, p.y as i32, p.w as i32, p.h as i32);
             let (columns, rows) = ((w + TILE - 1) / TILE, (h + TILE - 1) / TILE);
-            index.origin.push((x, y, columns));
+            map.origin.push((x, y, columns));
             for (i, j) in (0..rows).flat_map(|j| (0..columns).map(move |i| (i, j))) {
                 let (x0, y0) = (x + i * TILE, y + j * TILE);
                 let rect = Rect { x0, y0, x1: (x0 + TILE).min(x + w), y1: (y0 + TILE).min(y + h) };
-                blocks.push(index.block(atlas, chart, rect));
+                let tile = map.tile(atlas, chart, rect);
+                map.tiles.push(tile);
             }
         }
-        index.first.push(blocks.len() as u32);
-        (index, blocks)
+        map.first.push(map.tiles.len() as u32);
+        map
     }
 
-    fn block(&mut self, atlas: &Atlas, chart: u32, rect: Rect) -> Block {
+    fn tile(&mut self, atlas: &Atlas, chart: u32, rect: Rect) -> Tile {
         let mut texels: Vec<(u8, u32)> = rect
             .texels()
             .filter_map(|(x, y)| {
@@ -169,18 +192,14 @@ impl BlockIndex {
         if let Some(t) = texels.first_mut() {
             t.0 = 0;
         }
-        let mut block = Block { chart, rect, ..Default::default() };
-        for (l, end) in block.lod_end.iter_mut().enumerate() {
-            *end = texels.iter().filter(|t| t.0 as usize <= l).count() as u16;
-        }
+        let lod_end = std::array::from_fn(|l| texels.iter().filter(|t| t.0 as usize <= l).count() as u16);
         let mut centre = glam::DVec3::ZERO;
         for &(lod, sample) in &texels {
             self.lod_of[sample as usize] = lod;
             centre += atlas.gather.texels.samples[sample as usize].position(&atlas.scene).as_dvec3();
         }
-        block.centre = (centre / texels.len().max(1) as f64).as_vec3();
-        block.texels = texels.into_iter().map(|t| t.1).collect();
-        block
+        let centre = (centre / texels.len().max(1) as f64).as_vec3();
+        Tile { chart, rect, texels: texels.into_iter().map(|t| t.1).collect(), lod_end, centre, cell: 0 }
     }
 
     /// The LOD on whose grid a texel of the gather map lies.
@@ -216,15 +235,35 @@ impl BlockIndex {
         self.first[chart as usize]..self.first[chart as usize + 1]
     }
 
-    /// Bytes held.
+    /// The up to eight blocks around a block in its chart.
+    pub fn neighbours(&self, b: u32) -> impl Iterator<Item = u32> + '_ {
+        let tile = &self.tiles[b as usize];
+        let (_, _, columns) = self.origin[tile.chart as usize];
+        let range = self.of_chart(tile.chart);
+        let rows = (range.end - range.start) as i32 / columns.max(1);
+        let at = (b - range.start) as i32;
+        let (i, j) = (at % columns, at / columns);
+        let around = (-1..=1).flat_map(|dj| (-1..=1).map(move |di| (di, dj))).filter(|&d| d != (0, 0));
+        around
+            .map(move |(di, dj)| (i + di, j + dj))
+            .filter(move |&(i, j)| i >= 0 && i < columns && j >= 0 && j < rows)
+            .map(move |(i, j)| range.start + (j * columns + i) as u32)
+    }
+
+    /// Where the light map shows a rectangle of a chart's gather texels: the smallest one with all of
+    /// them, within the chart's own.
+    pub fn rect_in_light_map(&self, chart: u32, rect: &Rect) -> Rect {
+        rect_in_light_map(&self.atlas, chart, rect)
+    }
+
+    /// Bytes held, with those of idle blocks.
     pub fn bytes(&self) -> usize {
-        self.first.len() * 4 + self.origin.len() * 12 + self.lod_of.len()
+        let tiles: usize = self.tiles.iter().map(Tile::bytes).sum();
+        self.first.len() * 4 + self.origin.len() * 12 + self.lod_of.len() + tiles
     }
 }
 
-/// Where the light map shows the texels of a block: the smallest rectangle with all of them, within
-/// the chart's own.
-pub(super) fn rect_in_light_map(atlas: &Atlas, chart: u32, rect: &Rect) -> Rect {
+fn rect_in_light_map(atlas: &Atlas, chart: u32, rect: &Rect) -> Rect {
     let gather = &atlas.gather.layout.placements[chart as usize];
     let map = &atlas.map.layout.placements[chart as usize];
     let corner = |x: i32, y: i32| {

@@ -1,7 +1,7 @@
 //! The light map grid (thesis 3.3.2): a uniform grid over the scene, to whose cells blocks of texels
 //! of all LODs belong. A cell shows its next LOD when all its blocks have it.
 
-use super::blocks::Block;
+use super::blocks::{Block, MAX_LODS, Tile};
 use crate::error::{Result, invalid_argument};
 use glam::{UVec3, Vec3};
 
@@ -57,7 +57,7 @@ impl CellInfo {
 
 impl Grid {
     /// Assigns blocks to the cells of their centres. `size` 0: automatic.
-    pub fn new(lower: Vec3, upper: Vec3, size: f32, blocks: &mut [Block]) -> Result<Grid> {
+    pub fn new(lower: Vec3, upper: Vec3, size: f32, tiles: &mut [Tile]) -> Result<Grid> {
         if !(size >= 0.0 && size.is_finite()) {
             return invalid_argument!("cell_size is {size}, not a finite number ≥ 0");
         }
@@ -69,9 +69,9 @@ impl Grid {
         }
         let info = CellInfo { origin: lower, cell_size, dimensions: cells.as_uvec3().to_array() };
         let mut grid = Grid { info, blocks: vec![Vec::new(); cells.element_product() as usize], occupied: Vec::new() };
-        for (b, block) in blocks.iter_mut().enumerate().filter(|(_, b)| !b.texels.is_empty()) {
-            block.cell = info.cell(block.centre);
-            grid.blocks[block.cell as usize].push(b as u32);
+        for (b, tile) in tiles.iter_mut().enumerate().filter(|(_, t)| !t.texels.is_empty()) {
+            tile.cell = info.cell(tile.centre);
+            grid.blocks[tile.cell as usize].push(b as u32);
         }
         grid.occupied = (0..grid.blocks.len() as u32).filter(|&c| !grid.blocks_of(c).is_empty()).collect();
         Ok(grid)
@@ -81,12 +81,65 @@ impl Grid {
         &self.blocks[cell as usize]
     }
 
-    /// The lowest LOD that the blocks of a cell show.
-    pub fn lod(&self, cell: u32, blocks: &[Block]) -> u8 {
-        self.blocks_of(cell).iter().map(|&b| blocks[b as usize].shown_lod).min().unwrap_or(NO_LOD)
+    /// The lowest of the LODs that the blocks of a cell show.
+    pub fn lod(&self, cell: u32, shown: &[u8]) -> u8 {
+        self.blocks_of(cell).iter().map(|&b| shown[b as usize]).min().unwrap_or(NO_LOD)
     }
 
     pub fn bytes(&self) -> usize {
         self.blocks.len() * size_of::<Vec<u32>>() + self.blocks.iter().map(|b| b.capacity() * 4).sum::<usize>()
     }
+}
+
+/// Finds out when all blocks of a cell have a LOD.
+pub(super) struct Promotion {
+    /// LOD of the work, by block.
+    lods: Vec<u8>,
+    /// Blocks of each LOD, by cell.
+    counts: Vec<[u32; MAX_LODS]>,
+    /// LOD that all blocks of a cell have.
+    common: Vec<u8>,
+}
+
+impl Promotion {
+    pub fn new(tiles: &[Tile], grid: &Grid) -> Promotion {
+        Promotion {
+            lods: vec![0; tiles.len()],
+            counts: vec![[0; MAX_LODS]; grid.blocks.len()],
+            common: vec![0; grid.blocks.len()],
+        }
+    }
+
+    pub fn bytes(&self) -> usize {
+        self.lods.len() + self.counts.len() * (size_of::<[u32; MAX_LODS]>() + 1)
+    }
+
+    /// Begins anew.
+    pub fn count(&mut self, tiles: &[Tile], blocks: &[Block]) {
+        self.counts.fill([0; MAX_LODS]);
+        for ((tile, block), lod) in tiles.iter().zip(blocks).zip(&mut self.lods) {
+            *lod = block.lod;
+            if !tile.texels.is_empty() {
+                self.counts[tile.cell as usize][block.lod as usize] += 1;
+            }
+        }
+        for (common, counts) in self.common.iter_mut().zip(&self.counts) {
+            *common = lowest(counts);
+        }
+    }
+
+    /// Takes note of the LOD of a block; returns that of its whole cell if it has risen.
+    pub fn note(&mut self, b: u32, cell: u32, lod: u8) -> Option<u8> {
+        let old = std::mem::replace(&mut self.lods[b as usize], lod);
+        let counts = &mut self.counts[cell as usize];
+        counts[old as usize] -= 1;
+        counts[lod as usize] += 1;
+        let now = lowest(counts);
+        (std::mem::replace(&mut self.common[cell as usize], now) < now).then_some(now)
+    }
+}
+
+/// The lowest LOD that any block has.
+fn lowest(counts: &[u32; MAX_LODS]) -> u8 {
+    counts.iter().position(|&n| n > 0).unwrap_or(0) as u8
 }

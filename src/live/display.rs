@@ -2,32 +2,42 @@
 //! of a lower LOD, filled where it cannot be seen, blurred; and its composition with direct light
 //! when a page is read. The sums of the texels are left alone.
 
-use super::blocks::{Block, BlockIndex, Rect, TILE};
-use crate::device::Device;
-use crate::lightmap::Atlas;
+use super::blocks::{Block, BlockMap, DirectTile, Rect, TILE};
 use crate::lightmap::blur::Window;
 use crate::memory::try_vec;
 use crate::scene::NONE;
 use glam::Vec3;
 use rayon::prelude::*;
-use std::collections::{BTreeMap, HashMap};
+use std::collections::HashMap;
 
-/// Rings of unseen texels that are filled around those that are seen.
-const MAX_FILL_ROUNDS: usize = 64;
+/// Unseen texels are filled from those that are seen within this distance.
+const FILLED: i32 = TILE;
 
-/// Per gather texel.
+/// What is shown.
+#[derive(Clone)]
 pub(super) struct Display {
-    /// Indirect irradiance, not blurred.
+    /// Indirect irradiance per gather texel, not blurred.
     plain: Vec<Vec3>,
     /// What is shown of it.
     shown: Vec<Vec3>,
-    /// Direct irradiance of the lowest LOD, interpolated: shown until a block has more.
-    pub coarse_direct: Vec<Vec3>,
+    /// Direct irradiance of the lowest LOD per gather texel, interpolated: shown until a block has
+    /// more.
+    coarse: Vec<Vec3>,
+    /// What `coarse` was when a block's direct tile was made. The difference corrects tiles that were
+    /// made under other lights, which keeps the shadows of the lights that did not change. Empty
+    /// until a light changes.
+    coarse_of_tile: Vec<Vec3>,
     normals: Vec<Vec3>,
-    /// Whether a texel can be seen, as far as is known.
+    /// Whether a gather texel can be seen, as far as is known.
     visible: Vec<bool>,
-    /// Texels that cannot, by chart.
+    /// Gather texels that cannot, by block.
     unseen: HashMap<u32, Vec<u32>>,
+    /// The LOD in use, by block: that of the work, or less until the block's cell is promoted.
+    pub lods: Vec<u8>,
+    /// Direct light at full resolution, by block.
+    tiles: Vec<Option<DirectTile>>,
+    /// Whether the tile was made under the lights of now.
+    is_current: Vec<bool>,
     blur: i32,
 }
 
@@ -39,7 +49,8 @@ pub(super) struct Changed {
 }
 
 impl Display {
-    pub fn new(atlas: &Atlas, blur: u32) -> crate::Result<Display> {
+    pub fn new(map: &BlockMap, blur: u32) -> crate::Result<Display> {
+        let atlas = &map.atlas;
         let n = atlas.gather.len();
         let mut normals = try_vec(n, "the gather map's normals")?;
         atlas.scene.device().install(|| {
@@ -52,134 +63,127 @@ impl Display {
         Ok(Display {
             plain: try_vec(n, "live indirect light")?,
             shown: try_vec(n, "shown indirect light")?,
-            coarse_direct: try_vec(n, "live direct light")?,
+            coarse: try_vec(n, "live direct light")?,
+            coarse_of_tile: Vec::new(),
             normals,
             visible,
             unseen: HashMap::new(),
+            lods: vec![0; map.tiles.len()],
+            tiles: vec![None; map.tiles.len()],
+            is_current: vec![false; map.tiles.len()],
             blur: blur as i32,
         })
     }
 
-    /// Bytes held.
+    /// Bytes held, without the tiles.
     pub fn bytes(&self) -> usize {
-        self.plain.len() * (4 * size_of::<Vec3>() + 1)
+        let per_texel = 4 * size_of::<Vec3>() + 1;
+        let per_block = size_of::<Option<DirectTile>>() + 2;
+        self.plain.len() * per_texel + self.coarse_of_tile.len() * size_of::<Vec3>() + self.lods.len() * per_block
     }
 
     /// Shows what `changed` blocks know now; returns where that changes the light map.
-    pub fn refresh(
-        &mut self,
-        device: &Device,
-        atlas: &Atlas,
-        index: &BlockIndex,
-        blocks: &[Block],
-        changed: &[u32],
-    ) -> Vec<Changed> {
-        let top = index.top();
-        // Neighbours that interpolate do so between texels of these blocks too.
-        let mut all: Vec<u32> = changed.to_vec();
+    pub fn refresh(&mut self, map: &BlockMap, blocks: &[Block], changed: &[u32]) -> Vec<Changed> {
         for &b in changed {
-            all.extend(index.neighbours(blocks, b).filter(|&n| blocks[n as usize].shown_lod < top));
+            let (tile, block) = (&map.tiles[b as usize], &blocks[b as usize]);
+            for i in 0..tile.lod_end[self.lods[b as usize] as usize] as usize {
+                if let Some(value) = block.estimate(i) {
+                    self.plain[tile.texels[i] as usize] = value;
+                }
+                self.note_visible(b, tile.texels[i], block.is_visible(i));
+            }
+        }
+        self.spread(map, changed)
+    }
+
+    /// Interpolates, fills and blurs what depends on texels of the `changed` blocks; returns where that
+    /// changes the light map.
+    fn spread(&mut self, map: &BlockMap, changed: &[u32]) -> Vec<Changed> {
+        let top = map.top();
+        // Neighbours that interpolate do so between texels of these blocks too.
+        let mut all = changed.to_vec();
+        for &b in changed {
+            all.extend(map.neighbours(b).filter(|&n| self.lods[n as usize] < top));
         }
         all.sort_unstable();
         all.dedup();
-
-        // What has rays of its own first: the others need it.
-        let own: Vec<(u32, Option<Vec3>, bool)> = changed
-            .iter()
-            .flat_map(|&b| {
-                let block = &blocks[b as usize];
-                (0..block.lod_end[block.shown_lod as usize] as usize)
-                    .map(|i| (block.texels[i], block.estimate(i), block.is_visible(i)))
-            })
-            .collect();
-        for (sample, value, visible) in own {
-            if let Some(value) = value {
-                self.plain[sample as usize] = value;
-            }
-            self.note_visible(atlas, sample, visible);
-        }
         let interpolate = |&b: &u32| -> Vec<(u32, Vec3)> {
-            let block = &blocks[b as usize];
-            let known =
-                |s: u32, x, y| index.lod_of[s as usize] <= blocks[index.block_at(block.chart, x, y) as usize].shown_lod;
-            let lod = block.shown_lod;
-            let value = |s: u32| self.interpolate(atlas, index, block, lod, s, &self.plain, known);
-            block.texels[block.lod_end[lod as usize] as usize..].iter().map(|&s| (s, value(s))).collect()
+            let (tile, lod) = (&map.tiles[b as usize], self.lods[b as usize]);
+            let known = |s: u32, x, y| map.lod_of[s as usize] <= self.lods[map.block_at(tile.chart, x, y) as usize];
+            let value = |s: u32| self.interpolate(map, b, lod, s, &self.plain, known);
+            tile.texels[tile.lod_end[lod as usize] as usize..].iter().map(|&s| (s, value(s))).collect()
         };
-        let interpolated: Vec<(u32, Vec3)> = device.install(|| all.par_iter().flat_map_iter(interpolate).collect());
+        let interpolated: Vec<(u32, Vec3)> = all.par_iter().flat_map_iter(interpolate).collect();
         for (sample, value) in interpolated {
             self.plain[sample as usize] = value;
         }
-        let mut charts: BTreeMap<u32, Vec<u32>> = BTreeMap::new();
-        for &b in &all {
-            charts.entry(blocks[b as usize].chart).or_default().push(b);
+
+        let mut to_fill = Vec::new();
+        if !self.unseen.is_empty() {
+            to_fill.extend(changed.iter().flat_map(|&b| map.neighbours(b).chain([b])));
+            to_fill.retain(|b| self.unseen.contains_key(b));
+            to_fill.sort_unstable();
+            to_fill.dedup();
         }
-        let mut touched = Vec::new();
-        for (&chart, of_chart) in &charts {
-            let filled = self.fill(atlas, chart);
-            let own = self.own_rect(atlas, chart);
-            for &b in of_chart {
-                touched.push((chart, blocks[b as usize].rect.grown(self.blur).clipped(&own)));
-            }
-            touched.extend(filled.map(|rect| (chart, rect.clipped(&own))));
+        let filled: Vec<(u32, Vec3)> = to_fill.par_iter().flat_map_iter(|&b| self.fill(map, b)).collect();
+        for (sample, value) in filled {
+            self.plain[sample as usize] = value;
         }
 
-        let shown: Vec<(u32, Vec3)> = device.install(|| {
-            touched
-                .par_iter()
-                .flat_map_iter(|&(chart, rect)| {
-                    let mut window = Window::new(self.blur);
-                    rect.texels()
-                        .filter_map(|(x, y)| {
-                            let s = atlas.gather.at(chart, x, y);
-                            (s != NONE).then(|| (s, self.blurred(atlas, &mut window, s as usize)))
-                        })
-                        .collect::<Vec<_>>()
-                })
-                .collect()
-        });
+        let grown = |b: u32| {
+            let tile = &map.tiles[b as usize];
+            (tile.chart, tile.rect.grown(self.blur).clipped(&own_rect(map, tile.chart)))
+        };
+        all.extend(to_fill);
+        all.sort_unstable();
+        all.dedup();
+        let touched: Vec<(u32, Rect)> = all.into_iter().map(grown).collect();
+        let shown: Vec<(u32, Vec3)> = touched
+            .par_iter()
+            .flat_map_iter(|&(chart, rect)| {
+                let mut window = Window::new(self.blur);
+                let at = |(x, y)| map.atlas.gather.at(chart, x, y);
+                let samples = rect.texels().map(at).filter(|&s| s != NONE);
+                samples.map(|s| (s, self.blurred(map, &mut window, s as usize))).collect::<Vec<_>>()
+            })
+            .collect();
         for (sample, value) in shown {
             self.shown[sample as usize] = value;
         }
-        let changed = |&(chart, rect): &(u32, Rect)| {
-            // A texel of the light map interpolates between four of the gather map.
-            let rect = super::blocks::rect_in_light_map(atlas, chart, &rect.grown(1));
-            Changed { page: atlas.map.layout.placements[chart as usize].page, rect }
-        };
-        touched.iter().map(changed).collect()
+        // A texel of the light map interpolates between four of the gather map.
+        touched.iter().map(|(chart, rect)| in_light_map(map, *chart, &rect.grown(1))).collect()
     }
 
-    /// The rectangle of the light map that shows the direct light of a block.
-    pub fn direct_rect(atlas: &Atlas, block: &Block) -> Changed {
-        let rect = super::blocks::rect_in_light_map(atlas, block.chart, &block.rect.grown(1));
-        Changed { page: atlas.map.layout.placements[block.chart as usize].page, rect }
+    /// What would be shown if no block were above a LOD.
+    pub fn lowered(&self, map: &BlockMap, lod: u8) -> Display {
+        let mut lower = self.clone();
+        lower.lods.iter_mut().for_each(|l| *l = lod.min(*l));
+        let all: Vec<u32> = (0..map.tiles.len() as u32).collect();
+        map.atlas.scene.device().install(|| lower.spread(map, &all));
+        lower
     }
 
-    fn own_rect(&self, atlas: &Atlas, chart: u32) -> Rect {
-        let p = &atlas.gather.layout.placements[chart as usize];
-        let (x0, y0) = (p.x as i32, p.y as i32);
-        Rect { x0, y0, x1: x0 + p.w as i32, y1: y0 + p.h as i32 }
-    }
-
-    fn blurred(&self, atlas: &Atlas, window: &mut Window, sample: usize) -> Vec3 {
+    fn blurred(&self, map: &BlockMap, window: &mut Window, sample: usize) -> Vec3 {
         if self.blur == 0 || !self.visible[sample] {
             return self.plain[sample];
         }
+        let atlas = &map.atlas;
         window.blur(&atlas.charts, &atlas.gather, sample, &self.plain, &self.visible, &self.normals)
     }
 
-    fn note_visible(&mut self, atlas: &Atlas, sample: u32, visible: bool) {
+    fn note_visible(&mut self, b: u32, sample: u32, visible: bool) {
         if self.visible[sample as usize] == visible {
             return;
         }
         self.visible[sample as usize] = visible;
-        let chart = atlas.charts.chart_of[atlas.gather.texels.samples[sample as usize].triangle as usize];
-        let list = self.unseen.entry(chart).or_default();
+        let list = self.unseen.entry(b).or_default();
         if visible {
             list.retain(|&s| s != sample);
+            if list.is_empty() {
+                self.unseen.remove(&b);
+            }
         } else {
             list.push(sample);
-            list.sort_unstable();
         }
     }
 
@@ -187,17 +191,17 @@ impl Display {
     /// LOD's grid that are `known`; else the mean of the block's own by inverse square distance.
     fn interpolate(
         &self,
-        atlas: &Atlas,
-        index: &BlockIndex,
-        block: &Block,
+        map: &BlockMap,
+        b: u32,
         lod: u8,
         sample: u32,
         values: &[Vec3],
         known: impl Fn(u32, i32, i32) -> bool,
     ) -> Vec3 {
-        let (x, y) = atlas.gather.position(sample as usize);
-        let (ox, oy) = index.origin(block.chart);
-        let step = 1 << (index.top() - lod);
+        let (tile, gather) = (&map.tiles[b as usize], &map.atlas.gather);
+        let (x, y) = gather.position(sample as usize);
+        let (ox, oy) = map.origin(tile.chart);
+        let step = 1 << (map.top() - lod);
         let (x0, y0) = (x - (x - ox) % step, y - (y - oy) % step);
         let (fx, fy) = ((x - x0) as f32 / step as f32, (y - y0) as f32 / step as f32);
         let (mut sum, mut total) = (Vec3::ZERO, 0.0);
@@ -207,7 +211,7 @@ impl Display {
             (x0, y0 + step, (1.0 - fx) * fy),
             (x0 + step, y0 + step, fx * fy),
         ] {
-            let s = atlas.gather.at(block.chart, cx, cy);
+            let s = gather.at(tile.chart, cx, cy);
             if w > 0.0 && s != NONE && self.visible[s as usize] && known(s, cx, cy) {
                 sum += w * values[s as usize];
                 total += w;
@@ -216,8 +220,8 @@ impl Display {
         if total > 0.2 {
             return sum / total;
         }
-        for &s in &block.texels[..block.lod_end[lod as usize] as usize] {
-            let (sx, sy) = atlas.gather.position(s as usize);
+        for &s in &tile.texels[..tile.lod_end[lod as usize] as usize] {
+            let (sx, sy) = gather.position(s as usize);
             let weight = if self.visible[s as usize] { 1.0 } else { 1e-3 };
             let w = weight / ((sx - x).pow(2) + (sy - y).pow(2)).max(1) as f32;
             sum += w * values[s as usize];
@@ -226,43 +230,80 @@ impl Display {
         if total > 0.0 { sum / total } else { Vec3::ZERO }
     }
 
-    /// Takes over the direct light of the lowest LOD's texels, and interpolates it to all others.
-    pub fn spread_direct(
-        &mut self,
-        device: &Device,
-        atlas: &Atlas,
-        index: &BlockIndex,
-        blocks: &[Block],
-        known: &[(u32, Vec3)],
-    ) {
-        for &(sample, value) in known {
-            self.coarse_direct[sample as usize] = value;
+    /// Has tiles that were made under other lights than those of now corrected by coarse light.
+    pub fn begin_direct_epoch(&mut self) {
+        if self.coarse_of_tile.is_empty() {
+            self.coarse_of_tile = self.coarse.clone();
         }
-        let others = |block: &Block| -> Vec<(u32, Vec3)> {
-            let lowest = |s: u32, _, _| index.lod_of[s as usize] == 0;
-            let value = |s: u32| self.interpolate(atlas, index, block, 0, s, &self.coarse_direct, lowest);
-            block.texels[block.lod_end[0] as usize..].iter().map(|&s| (s, value(s))).collect()
-        };
-        let others: Vec<(u32, Vec3)> = device.install(|| blocks.par_iter().flat_map_iter(others).collect());
-        for (sample, value) in others {
-            self.coarse_direct[sample as usize] = value;
-        }
+        self.is_current.fill(false);
     }
 
-    /// Gives the unseen texels of a chart the mean of their neighbours, ring by ring, as a bake does;
-    /// returns the rectangle around them.
-    fn fill(&mut self, atlas: &Atlas, chart: u32) -> Option<Rect> {
-        let unseen = self.unseen.get(&chart).filter(|u| !u.is_empty())?;
-        let mut missing = unseen.clone();
+    /// Takes over the direct light of the lowest LOD's texels of `changed` blocks, and interpolates it
+    /// to the others; returns where that changes the light map.
+    pub fn take_coarse(&mut self, map: &BlockMap, blocks: &mut [Block], changed: &[u32]) -> Vec<Changed> {
+        for &b in changed {
+            let values = std::mem::take(&mut blocks[b as usize].new_coarse);
+            for (&sample, value) in map.tiles[b as usize].texels.iter().zip(values) {
+                self.coarse[sample as usize] = value;
+            }
+        }
+        let mut all: Vec<u32> = changed.iter().flat_map(|&b| map.neighbours(b).chain([b])).collect();
+        all.sort_unstable();
+        all.dedup();
+        let others = |&b: &u32| -> Vec<(u32, Vec3)> {
+            let tile = &map.tiles[b as usize];
+            let lowest = |s: u32, _, _| map.lod_of[s as usize] == 0;
+            let value = |s: u32| self.interpolate(map, b, 0, s, &self.coarse, lowest);
+            tile.texels[tile.lod_end[0] as usize..].iter().map(|&s| (s, value(s))).collect()
+        };
+        let others: Vec<(u32, Vec3)> = all.par_iter().flat_map_iter(others).collect();
+        for (sample, value) in others {
+            self.coarse[sample as usize] = value;
+        }
+        all.iter().map(|&b| self.block_rect(map, b)).collect()
+    }
+
+    /// Takes over the direct light of a block at full resolution; returns where that changes the light
+    /// map, and by how many bytes the display has grown.
+    pub fn take_direct(&mut self, map: &BlockMap, b: u32, tile: DirectTile) -> (Changed, isize) {
+        if !self.coarse_of_tile.is_empty() {
+            for &s in &map.tiles[b as usize].texels {
+                self.coarse_of_tile[s as usize] = self.coarse[s as usize];
+            }
+        }
+        self.is_current[b as usize] = true;
+        let grown = tile.bytes() as isize;
+        let old = self.tiles[b as usize].replace(tile);
+        (self.block_rect(map, b), grown - old.map_or(0, |t| t.bytes() as isize))
+    }
+
+    /// Direct light of a block at full resolution, and whether it is that of the lights of now.
+    pub fn direct_tile(&self, b: u32) -> Option<(&DirectTile, bool)> {
+        self.tiles[b as usize].as_ref().map(|t| (t, self.is_current[b as usize]))
+    }
+
+    /// The part of the light map that shows a block.
+    fn block_rect(&self, map: &BlockMap, b: u32) -> Changed {
+        let tile = &map.tiles[b as usize];
+        in_light_map(map, tile.chart, &tile.rect.grown(1))
+    }
+
+    /// The unseen texels of a block with the mean of their neighbours, ring by ring from those that are
+    /// seen. (A bake fills across whole charts: here work on a block must stay short.)
+    fn fill(&self, map: &BlockMap, b: u32) -> Vec<(u32, Vec3)> {
+        let tile = &map.tiles[b as usize];
+        let around = |b: u32| self.unseen.get(&b).into_iter().flatten().copied();
+        let mut missing: Vec<u32> = map.neighbours(b).chain([b]).flat_map(around).collect();
+        missing.sort_unstable();
         let mut filled: HashMap<u32, Vec3> = HashMap::new();
-        for _ in 0..MAX_FILL_ROUNDS {
+        for _ in 0..FILLED {
             let ring: Vec<(u32, Vec3)> = missing
                 .iter()
                 .filter_map(|&s| {
-                    let (x, y) = atlas.gather.position(s as usize);
+                    let (x, y) = map.atlas.gather.position(s as usize);
                     let (mut sum, mut n) = (Vec3::ZERO, 0.0);
                     for (nx, ny) in (-1..=1).flat_map(|dy| (-1..=1).map(move |dx| (x + dx, y + dy))) {
-                        let t = atlas.gather.at(chart, nx, ny);
+                        let t = map.atlas.gather.at(tile.chart, nx, ny);
                         if t == NONE {
                             continue;
                         }
@@ -285,55 +326,50 @@ impl Display {
             filled.extend(ring);
             missing.retain(|s| !filled.contains_key(s));
         }
-        let mut around: Option<Rect> = None;
-        for (s, value) in filled {
-            self.plain[s as usize] = value;
-            let (x, y) = atlas.gather.position(s as usize);
-            let texel = Rect { x0: x, y0: y, x1: x + 1, y1: y + 1 };
-            around = Some(around.map_or(texel, |r| r.union(&texel)));
-        }
-        around
+        let own = self.unseen.get(&b).into_iter().flatten();
+        own.filter_map(|s| filled.get(s).map(|&value| (*s, value))).collect()
     }
 
     /// Irradiance shown at a sample of the light map; `with_direct` false: indirect light alone.
-    pub fn irradiance(
-        &self,
-        atlas: &Atlas,
-        index: &BlockIndex,
-        blocks: &[Block],
-        sample: u32,
-        with_direct: bool,
-    ) -> Vec3 {
+    pub fn irradiance(&self, map: &BlockMap, sample: u32, with_direct: bool) -> Vec3 {
+        let atlas = &map.atlas;
         let t = &atlas.map.texels.samples[sample as usize];
         let chart = atlas.charts.chart_of[t.triangle as usize];
         let local = atlas.charts.local(t.triangle, t.u, t.v);
-        let (mut sum, mut coarse) = (Vec3::ZERO, Vec3::ZERO);
-        atlas.gather.bilinear(chart, local, |s, w| {
-            sum += w * self.shown[s];
-            coarse += w * self.coarse_direct[s];
-        });
+        let mix = |values: &[Vec3]| {
+            let mut sum = Vec3::ZERO;
+            atlas.gather.bilinear(chart, local, |s, w| sum += w * values[s]);
+            sum
+        };
+        let indirect = mix(&self.shown);
         if !with_direct {
-            return sum;
+            return indirect;
         }
         let at = atlas.gather.layout.texel_coord(chart, local);
-        let block = &blocks[index.block_at(chart, at[0].floor() as i32, at[1].floor() as i32) as usize];
-        let fine = block.direct.as_ref().and_then(|tile| {
+        let b = map.block_at(chart, at[0].floor() as i32, at[1].floor() as i32) as usize;
+        let fine = self.tiles[b].as_ref().and_then(|tile| {
             let (x, y) = atlas.map.position(sample as usize);
             let r = &tile.rect;
             let inside = x >= r.x0 && x < r.x1 && y >= r.y0 && y < r.y1;
             inside.then(|| tile.values[(y - r.y0) as usize * r.width() + (x - r.x0) as usize]).filter(|v| v.is_finite())
         });
-        sum + fine.unwrap_or(coarse)
+        indirect
+            + match fine {
+                Some(fine) if self.is_current[b] || self.coarse_of_tile.is_empty() => fine,
+                Some(old) => (old + mix(&self.coarse) - mix(&self.coarse_of_tile)).max(Vec3::ZERO),
+                None => mix(&self.coarse),
+            }
     }
 }
 
-impl BlockIndex {
-    /// The up to eight blocks around a block in its chart.
-    fn neighbours<'a>(&'a self, blocks: &'a [Block], b: u32) -> impl Iterator<Item = u32> + 'a {
-        let block = &blocks[b as usize];
-        let range = self.of_chart(block.chart);
-        let offsets = (-1..=1).flat_map(|dy| (-1..=1).map(move |dx| (dx * TILE, dy * TILE)));
-        let at = offsets.map(move |(dx, dy)| self.block_at(block.chart, block.rect.x0 + dx, block.rect.y0 + dy));
-        at.filter(move |&n| n != b && range.contains(&n))
-    }
+fn own_rect(map: &BlockMap, chart: u32) -> Rect {
+    let p = &map.atlas.gather.layout.placements[chart as usize];
+    let (x0, y0) = (p.x as i32, p.y as i32);
+    Rect { x0, y0, x1: x0 + p.w as i32, y1: y0 + p.h as i32 }
+}
+
+/// Where the light map shows a rectangle of a chart's gather texels.
+fn in_light_map(map: &BlockMap, chart: u32, rect: &Rect) -> Changed {
+    let rect = map.rect_in_light_map(chart, rect);
+    Changed { page: map.atlas.map.layout.placements[chart as usize].page, rect }
 }

@@ -11,39 +11,46 @@
 //! A texel's sums depend on its number of rounds alone. When all texels have k rounds they have the
 //! bits of a bake with 64 · k gather rays, whatever the order of the updates.
 
+mod batch;
 mod blocks;
 mod cells;
+mod choose;
 mod dirty;
 mod display;
+mod read;
 mod relight;
+mod save;
 mod visibility;
 mod work;
 
 pub use blocks::MAX_LODS;
 pub use cells::{CellInfo, NO_LOD};
 
+use crate::device::Device;
 use crate::error::{Result, invalid_argument};
 use crate::lightmap::bake::purpose;
-use crate::lightmap::gather::{ROUND, SampleSet};
-use crate::lightmap::{Atlas, BakeParams, Lightmap, blur::MAX_BLUR_RADIUS};
+use crate::lightmap::direct::DirectLight;
+use crate::lightmap::gather::{Gathered, ROUND, SampleSet};
+use crate::lightmap::{BakeParams, Lightmap, blur::MAX_BLUR_RADIUS};
 use crate::memory::Reservation;
 use crate::progress::Progress;
-use crate::sampling::{combine, mix, purpose_seed};
-use crate::scene::{NONE, Scene};
-use blocks::{Block, BlockIndex, Rect};
-use cells::Grid;
+use crate::sampling::purpose_seed;
+use crate::scene::{Light, Scene};
+use batch::{Batch, Item};
+use blocks::{Block, BlockMap, Rect};
+use cells::{Grid, Promotion};
+use choose::{Choice, Chooser};
 use dirty::Dirty;
-use display::Display;
+use display::{Changed, Display};
 use glam::Vec3;
 use rayon::prelude::*;
+use read::ChartBins;
 use relight::{Illumination, Relight};
 use std::collections::VecDeque;
 use std::sync::Arc;
-use std::sync::Mutex;
-use std::sync::atomic::{AtomicU64, AtomicUsize, Ordering::Relaxed};
 use std::time::{Duration, Instant};
 use visibility::Visibility;
-use work::{Context, Done, Limit};
+use work::{Context, Limit, Step};
 
 /// Which blocks updates work on.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
@@ -163,32 +170,48 @@ pub struct PageRect {
 /// threads without work at the end of a pass.
 const PASS: usize = 32;
 
+/// Blocks that are worked on between two updates, at most.
+const BACKGROUND: usize = 256;
+
 /// Part of the time budget that is left to showing what was computed and to leaving.
 const SPARE: f64 = 0.15;
 
+/// Memory is announced to the monitor in steps of so many bytes.
+const MEMORY_STEP: usize = 1 << 20;
+
 /// A scene's light under refinement.
 pub struct Live {
-    atlas: Arc<Atlas>,
     params: LiveParams,
     bake: BakeParams,
-    light: Illumination,
+    /// Blocks with their lights, as work on them sees them.
+    context: Context,
+    /// The lights that direct light is of.
+    lights: Arc<Vec<Light>>,
     relight: Relight,
-    samples: SampleSet,
-    index: BlockIndex,
     blocks: Vec<Block>,
     grid: Grid,
+    promotion: Promotion,
     display: Display,
+    bins: ChartBins,
     visibility: Visibility,
+    chooser: Chooser,
     dirty: Dirty,
     /// Blocks to show anew.
     waiting: VecDeque<u32>,
     is_waiting: Vec<bool>,
-    /// Seconds that showing a block took lately.
+    /// Work that goes on between updates, on blocks that are then missing from `blocks`.
+    background: Option<Arc<Batch>>,
+    paused: bool,
+    /// Seconds that showing a block took lately: its indirect light; coarse direct light.
     refresh_seconds: f64,
+    coarse_seconds: f64,
     updates: u32,
     total_rays: u64,
+    /// Bytes of what never grows, and of what blocks and display have allocated since.
+    fixed: usize,
+    held: isize,
     bytes_full: u64,
-    _memory: Reservation,
+    memory: Reservation,
 }
 
 impl LiveParams {
@@ -226,6 +249,10 @@ impl LiveParams {
 }
 
 impl Budget {
+    fn is_nothing(&self) -> bool {
+        self.milliseconds == 0.0 && self.rays == 0
+    }
+
     fn validate(&self) -> Result<()> {
         if !(self.milliseconds >= 0.0 && self.milliseconds.is_finite()) {
             return invalid_argument!("the budget is {} milliseconds, not a finite number ≥ 0", self.milliseconds);
@@ -239,38 +266,64 @@ impl Live {
     /// baked and is not changed.
     pub fn new(lightmap: &Lightmap, params: &LiveParams, progress: &Progress) -> Result<Live> {
         params.validate()?;
-        let atlas = lightmap.atlas().clone();
+        let atlas = lightmap.atlas();
         let bake = params.bake();
-        let (index, mut blocks) = BlockIndex::new(&atlas, params.lod_count);
+        let mut map = BlockMap::new(atlas, params.lod_count);
         let (lower, upper) = atlas.scene.bounds();
-        let grid = Grid::new(lower, upper, params.cell_size, &mut blocks)?;
-        let light = Illumination::new(&atlas, &bake, progress)?;
-        let display = Display::new(&atlas, params.blur)?;
-        let seed = purpose_seed(params.seed, purpose::GATHER_SET);
-        let block_bytes: usize = blocks.iter().map(Block::bytes).sum();
-        let fixed = display.bytes() + index.bytes() + grid.bytes() + block_bytes + blocks.len() * size_of::<Block>();
+        let grid = Grid::new(lower, upper, params.cell_size, &mut map.tiles)?;
+        let lights = atlas.scene.lights();
+        let light = Illumination::new(atlas, &bake, progress)?;
+        let display = Display::new(&map, params.blur)?;
+        let bins = ChartBins::new(&map);
+        let chooser = Chooser::new(&map, &grid);
+        let promotion = Promotion::new(&map.tiles, &grid);
+        let fixed = map.bytes()
+            + display.bytes()
+            + grid.bytes()
+            + promotion.bytes()
+            + bins.bytes()
+            + chooser.bytes()
+            + light.radiance.len() * size_of::<Vec3>()
+            // Marks, and the queue of what is to be shown.
+            + map.tiles.len() * 9;
         let memory = atlas.scene.device().memory().reserve(fixed, "the live state")?;
-        let full = atlas.gather.len() * size_of::<crate::lightmap::gather::Gathered>() + atlas.map.len() * 12;
+        let full = atlas.gather.len() * size_of::<Gathered>() + atlas.map.len() * size_of::<Vec3>();
+        let blocks: Vec<Block> = map.tiles.iter().map(|_| Block::default()).collect();
         let mut live = Live {
             visibility: Visibility::new(blocks.len()),
             dirty: Dirty::all(atlas.info.page_count, atlas.map.layout.page_size),
             is_waiting: vec![false; blocks.len()],
             waiting: VecDeque::new(),
-            samples: SampleSet::new(bake.gather_rays, seed),
             bytes_full: (fixed + full) as u64,
             params: *params,
             relight: Relight::default(),
+            background: None,
+            paused: false,
             refresh_seconds: 1e-4,
+            coarse_seconds: 1e-4,
             updates: 0,
             total_rays: 0,
-            _memory: memory,
-            atlas,
+            fixed,
+            held: 0,
+            memory,
+            context: Context {
+                map: Arc::new(map),
+                light: Arc::new(light),
+                samples: Arc::new(SampleSet::new(bake.gather_rays, purpose_seed(params.seed, purpose::GATHER_SET))),
+                gather_seed: purpose_seed(params.seed, purpose::GATHER),
+                direct_seed: purpose_seed(params.seed, purpose::DIRECT),
+                direct_samples: params.direct_samples,
+                promote_threshold: params.promote_threshold,
+                max_rounds: params.max_rounds,
+            },
+            lights,
             bake,
-            light,
-            index,
             blocks,
             grid,
+            promotion,
             display,
+            bins,
+            chooser,
         };
         live.start(progress)?;
         Ok(live)
@@ -278,57 +331,51 @@ impl Live {
 
     /// The lowest LOD everywhere.
     fn start(&mut self, progress: &Progress) -> Result<()> {
-        self.light_coarsely();
         let stage = progress.stage("lowest LOD", 0.5, 1.0, self.blocks.len() as u64);
-        let limit = Limit { deadline: None, rays: u64::MAX, traced: AtomicU64::new(0) };
-        let mut blocks = std::mem::take(&mut self.blocks);
-        let context = self.context();
-        let result = self.atlas.scene.device().install(|| {
-            blocks.par_iter_mut().try_for_each(|block| {
-                block.work_on_indirect(&context, &limit);
+        let limit = Limit::new(None, u64::MAX);
+        let context = self.context.clone();
+        let device = self.device();
+        let blocks = &mut self.blocks;
+        device.install(|| {
+            (blocks, &context.map.tiles).into_par_iter().try_for_each(|(block, tile)| {
+                if !tile.texels.is_empty() {
+                    block.work_on_coarse(&context, tile, &limit);
+                    block.work_on_indirect(&context, tile, &limit);
+                }
                 stage.advance(1)
             })
-        });
-        self.blocks = blocks;
-        result?;
+        })?;
         self.total_rays += limit.traced.into_inner();
+        self.held = self.blocks.iter().map(|b| b.bytes() as isize).sum();
         let all: Vec<u32> = (0..self.blocks.len() as u32).collect();
-        let device = self.atlas.scene.device();
-        self.display.refresh(device, &self.atlas, &self.index, &self.blocks, &all);
+        let (display, blocks) = (&mut self.display, &mut self.blocks);
+        device.install(|| display.take_coarse(&context.map, blocks, &all));
+        self.reserve_for(&[])?;
+        self.show_all();
         Ok(())
     }
 
-    /// Direct light of the lowest LOD's texels, for all blocks that have no better.
-    fn light_coarsely(&mut self) {
-        let context = self.context();
-        let samples = self.params.direct_samples.min(4);
-        let texel = |&s: &u32| {
-            let receiver = self.atlas.receiver(&self.atlas.gather, &self.light.backs, s as usize);
-            (s, self.light.direct.irradiance(&receiver, samples, combine(context.direct_seed, s), &mut 0))
-        };
-        let of_block = |b: &Block| b.texels[..b.lod_end[0] as usize].iter().map(texel).collect::<Vec<_>>();
-        let device = self.atlas.scene.device();
-        let known: Vec<(u32, Vec3)> = device.install(|| self.blocks.par_iter().flat_map_iter(of_block).collect());
-        self.display.spread_direct(device, &self.atlas, &self.index, &self.blocks, &known);
+    /// Shows all blocks as they are, and takes note of how far they are.
+    fn show_all(&mut self) {
+        let all: Vec<u32> = (0..self.blocks.len() as u32).collect();
+        let device = self.device();
+        let (display, blocks, map) = (&mut self.display, &self.blocks, &self.context.map);
+        device.install(|| display.refresh(map, blocks, &all));
+        let atlas = &self.context.map.atlas;
+        self.dirty = Dirty::all(atlas.info.page_count, atlas.map.layout.page_size);
+        self.waiting.clear();
+        self.is_waiting.fill(false);
+        self.promotion.count(&self.context.map.tiles, &self.blocks);
+        self.chooser.note_all(&self.context, &self.blocks);
     }
 
-    fn context(&self) -> Context<'_> {
-        Context {
-            atlas: &self.atlas,
-            light: &self.light,
-            samples: &self.samples,
-            gather_seed: purpose_seed(self.params.seed, purpose::GATHER),
-            direct_seed: purpose_seed(self.params.seed, purpose::DIRECT),
-            direct_samples: self.params.direct_samples,
-            top: self.index.top(),
-            promote_threshold: self.params.promote_threshold,
-            max_rounds: self.params.max_rounds,
-        }
+    fn device(&self) -> Arc<Device> {
+        self.context.map.atlas.scene.device().clone()
     }
 
     /// The scene that is lit.
     pub fn scene(&self) -> &Arc<Scene> {
-        &self.atlas.scene
+        &self.context.map.atlas.scene
     }
 
     /// How it was made.
@@ -341,165 +388,123 @@ impl Live {
         let start = Instant::now();
         camera.validate()?;
         budget.validate()?;
-        if let Some(new) = self.relight.poll(&self.atlas, &self.bake)? {
-            self.light.renew(new);
-        }
-        let rays = match (budget.rays, self.params.rays_per_update as u64) {
-            (0, 0) if budget.milliseconds > 0.0 => u64::MAX,
-            (0, 0) => 0,
-            (0, r) | (r, 0) => r,
-            (a, b) => a.min(b),
-        };
-        let idle = budget.milliseconds == 0.0 && budget.rays == 0;
-        let end =
-            (budget.milliseconds > 0.0).then(|| start + Duration::from_secs_f64(budget.milliseconds as f64 * 1e-3));
         let mut stats = LiveStats::default();
-        let mut limit = Limit { deadline: end, rays: if idle { 0 } else { rays }, traced: AtomicU64::new(0) };
-        if !idle {
-            let looked = self.visibility.look(&self.atlas, &self.index, camera);
-            *limit.traced.get_mut() += looked;
+        let device = self.device();
+        // Work that was done meanwhile, then new light, then the budget: on the pool as a whole, since
+        // going there and back takes as long as a hundred rays.
+        let items = self.stop_background(&mut stats)?;
+        let renewed = self.take_new_light()?;
+        if !items.is_empty() || renewed || !budget.is_nothing() {
+            device.install(|| {
+                self.take_over(items, &mut stats);
+                self.spend(start, camera, budget, &mut stats)
+            })?;
         }
-        while !idle && !limit.reached() {
-            // What is waiting to be shown comes first, then the next blocks.
-            self.show_waiting(end, &mut stats);
-            let chosen = self.choose(camera);
-            if chosen.is_empty() || limit.reached() {
-                break;
-            }
-            let spare = Duration::from_secs_f64(budget.milliseconds as f64 * 1e-3 * SPARE);
-            limit.deadline = end.map(|e| e.checked_sub(spare).unwrap_or(e));
-            self.work_on(&chosen, &limit, &mut stats);
-            limit.deadline = end;
-        }
-        self.show_waiting(end, &mut stats);
+        self.start_background(camera)?;
         self.updates = self.updates.wrapping_add(1);
-        stats.rays = limit.traced.into_inner();
         self.total_rays += stats.rays;
         self.describe(&mut stats);
         stats.milliseconds = start.elapsed().as_secs_f32() * 1e3;
         Ok(stats)
     }
 
-    /// The next blocks to work on, the most urgent first.
-    fn choose(&self, camera: &LiveCamera) -> Vec<u32> {
-        let context = self.context();
-        let open =
-            |b: &u32| !self.blocks[*b as usize].texels.is_empty() && !self.blocks[*b as usize].is_finished(&context);
-        let urgency = |b: u32| {
-            let block = &self.blocks[b as usize];
-            // Wrong direct light is what is seen first, then missing detail.
-            let error = if block.has_direct(&context) { block.error.max(1e-4) } else { 100.0 };
-            self.visibility.mark(b) * error
-        };
-        let mut keyed: Vec<(f32, u32)> = match self.params.mode {
-            Mode::View => self.visibility.seen.iter().copied().filter(open).map(|b| (urgency(b), b)).collect(),
-            Mode::Uniform => {
-                let n = self.blocks.len() as u32;
-                let random = |i: u32| mix(combine(self.updates, i)) % n.max(1);
-                (0..PASS as u32).map(random).filter(open).map(|b| (1.0, b)).collect()
+    fn spend(&mut self, start: Instant, camera: &LiveCamera, budget: &Budget, stats: &mut LiveStats) -> Result<()> {
+        if budget.is_nothing() {
+            return Ok(());
+        }
+        let seconds = budget.milliseconds as f64 * 1e-3;
+        let end = (seconds > 0.0).then(|| start + Duration::from_secs_f64(seconds));
+        let most_rays = [budget.rays, self.params.rays_per_update as u64].into_iter().filter(|&r| r > 0).min();
+        let most_rays = most_rays.unwrap_or(u64::MAX);
+        stats.rays += self.visibility.look(&self.context.map, camera);
+        self.chooser.look(&self.context.map, &self.visibility);
+        let mut traced = 0;
+        let over = |traced: u64| traced >= most_rays || end.is_some_and(|e| Instant::now() >= e);
+        while !over(traced) {
+            // What is waiting to be shown comes first, then wrong light, then the next blocks.
+            self.show_waiting(end, stats);
+            let from =
+                Choice { context: &self.context, blocks: &self.blocks, grid: &self.grid, visibility: &self.visibility };
+            let left = end.map_or(f64::INFINITY, |e| e.saturating_duration_since(Instant::now()).as_secs_f64());
+            let mut step = Step::Coarse;
+            let mut chosen = self.chooser.wrong(&from, ((left / self.coarse_seconds) as usize).clamp(1, PASS));
+            if chosen.is_empty() {
+                step = Step::Next;
+                chosen = self.chooser.next(&from, self.params.mode, camera, self.updates, PASS);
             }
-            Mode::Position => return self.choose_by_cell(camera, &open),
-        };
-        if keyed.len() > PASS {
-            keyed.select_nth_unstable_by(PASS, |a, b| b.0.total_cmp(&a.0).then(a.1.cmp(&b.1)));
-            keyed.truncate(PASS);
-        }
-        keyed.sort_unstable_by(|a, b| b.0.total_cmp(&a.0).then(a.1.cmp(&b.1)));
-        keyed.dedup_by_key(|k| k.1);
-        keyed.into_iter().map(|k| k.1).collect()
-    }
-
-    /// Blocks of the cell that is next: visible cells before hidden ones, near before far, where each
-    /// LOD that a cell has makes it twice as far.
-    fn choose_by_cell(&self, camera: &LiveCamera, open: &impl Fn(&u32) -> bool) -> Vec<u32> {
-        let mut seen = vec![false; self.blocks.len()];
-        let mut visible = std::collections::HashSet::new();
-        for &b in &self.visibility.seen {
-            seen[b as usize] = true;
-            visible.insert(self.blocks[b as usize].cell);
-        }
-        let top = self.index.top() as u32;
-        let progress = |b: &u32| {
-            let block = &self.blocks[*b as usize];
-            block.lod as u32 + if block.lod as u32 == top { block.rounds as u32 } else { 0 }
-        };
-        let mut cells: Vec<(bool, f32, u32)> = self
-            .grid
-            .occupied
-            .iter()
-            .filter_map(|&cell| {
-                let least = self.grid.blocks_of(cell).iter().filter(|b| open(b)).map(progress).min()?;
-                let away = self.grid.info.distance(cell, camera.position) + self.grid.info.cell_size;
-                Some((!visible.contains(&cell), away * (1u64 << least.min(40)) as f32, cell))
-            })
-            .collect();
-        cells.sort_unstable_by(|a, b| a.0.cmp(&b.0).then(a.1.total_cmp(&b.1)).then(a.2.cmp(&b.2)));
-        let mut chosen = Vec::new();
-        for &(_, _, cell) in &cells {
-            // The least advanced of the cell first: it is promoted as a whole.
-            let mut of_cell: Vec<u32> = self.grid.blocks_of(cell).iter().copied().filter(open).collect();
-            of_cell.sort_by_key(|b| (progress(b), !seen[*b as usize]));
-            chosen.extend(of_cell);
-            if chosen.len() >= PASS {
+            if chosen.is_empty() || over(traced) {
                 break;
             }
+            let spare = Duration::from_secs_f64(seconds * SPARE);
+            let deadline = end.map(|e| e.checked_sub(spare).unwrap_or(e));
+            traced += self.work_on(&chosen, step, Limit::new(deadline, most_rays - traced), stats)?;
         }
-        chosen.truncate(PASS);
-        chosen
+        stats.rays += traced;
+        self.show_waiting(end, stats);
+        Ok(())
     }
 
-    /// Works on blocks in order, each on one thread.
-    fn work_on(&mut self, chosen: &[u32], limit: &Limit, stats: &mut LiveStats) {
-        let items: Vec<Mutex<(Block, Done)>> = chosen
-            .iter()
-            .map(|&b| Mutex::new((std::mem::take(&mut self.blocks[b as usize]), Done::default())))
-            .collect();
-        let next = AtomicUsize::new(0);
-        let context = self.context();
-        // Showing what is completed takes time too, which is kept free.
-        let completed = AtomicUsize::new(0);
-        let reserve = self.refresh_seconds;
-        self.atlas.scene.device().install(|| {
-            rayon::broadcast(|_| {
-                while let Some(item) = items.get(next.fetch_add(1, Relaxed)) {
-                    let soon = Duration::from_secs_f64(reserve * completed.load(Relaxed) as f64);
-                    if limit.reached() || limit.deadline.is_some_and(|d| Instant::now() + soon >= d) {
-                        break;
-                    }
-                    let mut item = item.lock().unwrap_or_else(|e| e.into_inner());
-                    let done = item.0.work(&context, limit);
-                    item.1 = done;
-                    completed.fetch_add((done.direct || done.indirect) as usize, Relaxed);
-                }
-            })
-        });
-        for (&b, item) in chosen.iter().zip(items) {
-            let (block, done) = item.into_inner().unwrap_or_else(|e| e.into_inner());
-            self.blocks[b as usize] = block;
-            if done.direct {
-                self.dirty.add(Display::direct_rect(&self.atlas, &self.blocks[b as usize]));
+    /// Works on blocks in order, each on one thread, and takes over what became of them; returns the
+    /// rays traced.
+    fn work_on(&mut self, chosen: &[u32], step: Step, limit: Limit, stats: &mut LiveStats) -> Result<u64> {
+        self.reserve_for(chosen)?;
+        let start = Instant::now();
+        // Showing what is completed takes time too.
+        let seconds = if step == Step::Coarse { self.coarse_seconds } else { self.refresh_seconds };
+        let blocks = &mut self.blocks;
+        let taken = chosen.iter().map(|&b| (b, std::mem::take(&mut blocks[b as usize])));
+        let batch = Batch::new(self.context.clone(), taken, step, limit, Duration::from_secs_f64(seconds));
+        batch.run();
+        let (items, traced, result) = batch.take();
+        self.take_over(items, stats);
+        if step == Step::Coarse {
+            let seconds = start.elapsed().as_secs_f64() / chosen.len() as f64;
+            self.coarse_seconds += 0.2 * (seconds - self.coarse_seconds);
+        }
+        result.map(|()| traced)
+    }
+
+    /// Puts blocks back and shows, or has shown, what became of them. To be called in the pool.
+    fn take_over(&mut self, items: Vec<Item>, stats: &mut LiveStats) {
+        let map = self.context.map.clone();
+        let done: Vec<_> = items.iter().map(|i| (i.number, i.done)).collect();
+        for item in items {
+            self.held += item.block.bytes() as isize - item.bytes as isize;
+            self.blocks[item.number as usize] = item.block;
+        }
+        let coarse: Vec<u32> = done.iter().filter(|d| d.1.coarse).map(|d| d.0).collect();
+        if !coarse.is_empty() {
+            let changed = self.display.take_coarse(&map, &mut self.blocks, &coarse);
+            changed.into_iter().for_each(|c| self.dirty.add(c));
+            stats.blocks_changed += coarse.len() as u32;
+        }
+        for (b, done) in done {
+            if let Some(tile) = self.blocks[b as usize].new_direct.take() {
+                let (changed, grown) = self.display.take_direct(&map, b, tile);
+                self.dirty.add(changed);
+                self.held += grown;
                 stats.blocks_changed += 1;
             }
             if done.indirect {
                 self.promote(b, stats);
             }
+            self.chooser.note(&self.context, b, &self.blocks[b as usize]);
         }
     }
 
     /// Has a block that completed a step shown: at once, or, in position-based mode, with its cell.
     fn promote(&mut self, b: u32, stats: &mut LiveStats) {
-        let (cell, lod) = (self.blocks[b as usize].cell, self.blocks[b as usize].lod);
-        if self.params.mode != Mode::Position || lod == self.blocks[b as usize].shown_lod {
-            self.blocks[b as usize].shown_lod = lod;
+        let cell = self.context.map.tiles[b as usize].cell;
+        let lod = self.blocks[b as usize].lod;
+        let common = self.promotion.note(b, cell, lod);
+        if self.params.mode != Mode::Position || lod == self.display.lods[b as usize] {
+            self.display.lods[b as usize] = lod;
             self.wait(b);
-            return;
-        }
-        let of_cell = self.grid.blocks_of(cell).to_vec();
-        let common = of_cell.iter().map(|&b| self.blocks[b as usize].lod).min().unwrap_or(0);
-        if of_cell.iter().any(|&b| self.blocks[b as usize].shown_lod < common) {
+        } else if let Some(common) = common {
             stats.cells_promoted += 1;
-            for b in of_cell {
-                self.blocks[b as usize].shown_lod = common;
+            for i in 0..self.grid.blocks_of(cell).len() {
+                let b = self.grid.blocks_of(cell)[i];
+                self.display.lods[b as usize] = common;
                 self.wait(b);
             }
         }
@@ -521,12 +526,14 @@ impl Live {
                 return;
             }
             let batch: Vec<u32> = self.waiting.drain(..fit.min(PASS).min(self.waiting.len())).collect();
-            let device = self.atlas.scene.device();
-            let changed = self.display.refresh(device, &self.atlas, &self.index, &self.blocks, &batch);
+            let changed: Vec<Changed> = self.display.refresh(&self.context.map, &self.blocks, &batch);
             changed.into_iter().for_each(|c| self.dirty.add(c));
             for &b in &batch {
                 self.is_waiting[b as usize] = false;
-                self.blocks[b as usize].drop_faded_prior();
+                let block = &mut self.blocks[b as usize];
+                self.held -= block.bytes() as isize;
+                block.drop_faded_prior();
+                self.held += block.bytes() as isize;
             }
             stats.blocks_changed += batch.len() as u32;
             let seconds = start.elapsed().as_secs_f64() / batch.len() as f64;
@@ -534,14 +541,95 @@ impl Live {
         }
     }
 
+    /// Announces what work on blocks may allocate, in steps, so that the monitor is rarely asked.
+    fn reserve_for(&mut self, chosen: &[u32]) -> Result<()> {
+        let map = &self.context.map;
+        let growth = |&b: &u32| {
+            let tile = &map.tiles[b as usize];
+            let direct = map.rect_in_light_map(tile.chart, &tile.rect).area() * size_of::<Vec3>();
+            tile.texels.len() * (size_of::<Gathered>() + size_of::<Vec3>()) + 2 * direct
+        };
+        let needed = self.fixed + self.held.max(0) as usize + chosen.iter().map(growth).sum::<usize>();
+        if needed > self.memory.bytes() {
+            self.memory.grow(needed.next_multiple_of(MEMORY_STEP), "live light")?;
+        }
+        Ok(())
+    }
+
+    /// Takes new indirect light over, if there is any.
+    fn take_new_light(&mut self) -> Result<bool> {
+        if self.paused {
+            return Ok(false);
+        }
+        let Some(new) = self.relight.poll(&self.context.map.atlas, &self.bake)? else { return Ok(false) };
+        self.context.light = Arc::new(self.context.light.renewed(new));
+        self.chooser.note_all(&self.context, &self.blocks);
+        Ok(true)
+    }
+
+    /// Has the pool go on with what was seen last.
+    fn start_background(&mut self, camera: &LiveCamera) -> Result<()> {
+        if !self.params.background || self.paused {
+            return Ok(());
+        }
+        let from =
+            Choice { context: &self.context, blocks: &self.blocks, grid: &self.grid, visibility: &self.visibility };
+        let mut chosen = self.chooser.next(&from, self.params.mode, camera, !self.updates, BACKGROUND);
+        // What waits to be shown must be there for it.
+        chosen.retain(|&b| !self.is_waiting[b as usize]);
+        if chosen.is_empty() {
+            return Ok(());
+        }
+        self.reserve_for(&chosen)?;
+        let most_rays = Some(self.params.rays_per_update as u64).filter(|&r| r > 0).unwrap_or(u64::MAX);
+        let blocks = &mut self.blocks;
+        let taken = chosen.iter().map(|&b| (b, std::mem::take(&mut blocks[b as usize])));
+        let limit = Limit::new(None, most_rays);
+        let batch = Arc::new(Batch::new(self.context.clone(), taken, Step::Next, limit, Duration::ZERO));
+        batch.start(&self.device());
+        self.background = Some(batch);
+        Ok(())
+    }
+
+    /// Ends work in the background and returns its blocks.
+    fn stop_background(&mut self, stats: &mut LiveStats) -> Result<Vec<Item>> {
+        let Some(batch) = self.background.take() else { return Ok(Vec::new()) };
+        let (items, traced, result) = batch.take();
+        stats.rays += traced;
+        if let Err(e) = result {
+            let device = self.device();
+            device.install(|| self.take_over(items, stats));
+            return Err(e);
+        }
+        Ok(items)
+    }
+
+    /// Ends work in the background and takes it over.
+    fn collect(&mut self) -> Result<()> {
+        let mut stats = LiveStats::default();
+        let items = self.stop_background(&mut stats)?;
+        if !items.is_empty() {
+            let device = self.device();
+            device.install(|| self.take_over(items, &mut stats));
+        }
+        self.total_rays += stats.rays;
+        Ok(())
+    }
+
+    /// Stops work in the background, or lets it go on with the next update: refinement between
+    /// updates, and the recomputation of indirect light.
+    pub fn pause(&mut self, paused: bool) -> Result<()> {
+        self.paused = paused;
+        self.relight.hold(paused, &self.context.map.atlas, &self.bake)?;
+        self.collect()
+    }
+
     fn describe(&self, stats: &mut LiveStats) {
-        let context = self.context();
-        let finished = |b: &Block| (b.texels.is_empty() || b.is_finished(&context)) as u32 as f32;
         let (mut error, mut marks, mut done) = (0.0, 0.0, 0.0);
         for &b in &self.visibility.seen {
-            let (mark, block) = (self.visibility.mark(b), &self.blocks[b as usize]);
-            error += mark * block.error.powi(2);
-            done += mark * finished(block);
+            let mark = self.visibility.mark(b);
+            error += mark * self.blocks[b as usize].error.powi(2);
+            done += if self.chooser.is_open(b) { 0.0 } else { mark };
             marks += mark;
         }
         stats.light_pending = self.relight.is_pending();
@@ -549,34 +637,42 @@ impl Live {
             stats.visible_error = (error / marks).sqrt();
             stats.visible_finished = done / marks;
         }
-        stats.finished = self.blocks.iter().map(finished).sum::<f32>() / self.blocks.len().max(1) as f32;
+        stats.finished = self.chooser.finished();
         stats.total_rays = self.total_rays;
-        let blocks: usize = self.blocks.iter().map(Block::bytes).sum();
-        let structures = self.blocks.len() * size_of::<Block>() + self.visibility.bytes();
-        let fixed = self.display.bytes() + self.index.bytes() + self.grid.bytes();
-        stats.bytes = (blocks + structures + fixed) as u64;
+        stats.bytes = (self.fixed as isize + self.held).max(0) as u64;
         stats.bytes_full = self.bytes_full;
     }
 
     /// Takes a change of light `id` of the scene into account: direct light in the next updates,
     /// indirect light as it is recomputed in the background.
     pub fn light_changed(&mut self, id: u32) -> Result<()> {
-        let count = self.atlas.scene.lights().len();
+        let lights = self.scene().lights();
+        let count = lights.len();
         if id as usize >= count {
             return invalid_argument!("light {id} does not exist, the scene has {count}");
         }
-        self.relight.start(&self.atlas, &self.bake)?;
-        self.light.direct = crate::lightmap::direct::DirectLight::new(&self.atlas.scene);
-        self.light.direct_epoch += 1;
+        self.collect()?;
+        let bytes = self.display.bytes();
+        self.display.begin_direct_epoch();
+        let grown = self.display.bytes() - bytes;
+        (self.fixed, self.bytes_full) = (self.fixed + grown, self.bytes_full + grown as u64);
+        self.relight.start(&self.context.map.atlas, &self.bake)?;
+        self.lights = lights;
+        self.context.light = Arc::new(Illumination {
+            direct: Arc::new(DirectLight::new(self.scene())),
+            direct_epoch: self.context.light.direct_epoch + 1,
+            ..(*self.context.light).clone()
+        });
+        self.chooser.note_all(&self.context, &self.blocks);
         Ok(())
     }
 
     /// Removes and returns up to `capacity` rectangles whose shown light has changed since they were
     /// last taken. At first all pages are.
     pub fn take_dirty(&mut self, capacity: usize) -> Vec<PageRect> {
-        let size = self.atlas.map.layout.page_size as i32;
+        let size = self.page_size() as i32;
         let page = Rect { x0: 0, y0: 0, x1: size, y1: size };
-        let padding = self.atlas.padding as i32;
+        let padding = self.context.map.atlas.padding as i32;
         let rect = |(number, rect): (u32, Rect)| {
             let r = rect.grown(padding).clipped(&page);
             let (width, height) = (r.width() as u32, r.height() as u32);
@@ -585,103 +681,54 @@ impl Live {
         self.dirty.take(capacity).into_iter().map(rect).collect()
     }
 
-    /// Irradiance shown in a rectangle of a page, row by row; `with_direct` false: indirect light
-    /// alone. Texels around charts repeat the nearest of the chart, up to the padding.
-    pub fn read(&self, rect: &PageRect, with_direct: bool) -> Result<Vec<[f32; 3]>> {
-        let size = self.atlas.map.layout.page_size;
-        let (right, bottom) = (rect.x as u64 + rect.width as u64, rect.y as u64 + rect.height as u64);
-        if rect.page >= self.atlas.info.page_count || right > size as u64 || bottom > size as u64 {
-            let pages = self.atlas.info.page_count;
-            return invalid_argument!("{rect:?} is not within the {pages} pages of {size} × {size} texels");
-        }
-        let mut out = crate::memory::try_vec::<[f32; 3]>(rect.width as usize * rect.height as usize, "a page")?;
-        let r = Rect { x0: rect.x as i32, y0: rect.y as i32, x1: right as i32, y1: bottom as i32 };
-        let padding = self.atlas.padding as i32;
-        let shown: Vec<(u32, Rect)> = (0..self.atlas.charts.charts.len() as u32)
-            .filter_map(|chart| {
-                let p = &self.atlas.map.layout.placements[chart as usize];
-                let (x0, y0) = (p.x as i32, p.y as i32);
-                let own = Rect { x0, y0, x1: x0 + p.w as i32, y1: y0 + p.h as i32 }.grown(padding).clipped(&r);
-                (p.page == rect.page && own.width() * own.height() > 0).then_some((chart, own))
-            })
-            .collect();
-        let (atlas, index, blocks, display) = (&self.atlas, &self.index, &self.blocks, &self.display);
-        let value = |chart: u32, x: i32, y: i32| -> Option<(u32, bool)> {
-            let own = |x: i32, y: i32| {
-                let s = atlas.map.at(chart, x, y);
-                let is_own =
-                    |s: u32| atlas.charts.chart_of[atlas.map.texels.samples[s as usize].triangle as usize] == chart;
-                (s != NONE && is_own(s)).then_some(s)
-            };
-            if let Some(s) = own(x, y) {
-                return Some((s, true));
-            }
-            // Around the chart: the nearest texel within the padding.
-            let around = Rect { x0: x, y0: y, x1: x + 1, y1: y + 1 }.grown(padding);
-            let near = around.texels().filter_map(|(i, j)| own(i, j).map(|s| ((i - x).pow(2) + (j - y).pow(2), s)));
-            near.min().map(|(_, s)| (s, false))
-        };
-        let lit: Vec<Vec<(usize, Vec3, bool)>> = atlas.scene.device().install(|| {
-            shown
-                .par_iter()
-                .map(|&(chart, own)| {
-                    let texel = |(x, y): (i32, i32)| {
-                        let (s, is_own) = value(chart, x, y)?;
-                        let at = (y - r.y0) as usize * r.width() + (x - r.x0) as usize;
-                        Some((at, display.irradiance(atlas, index, blocks, s, with_direct), is_own))
-                    };
-                    own.texels().filter_map(texel).collect()
-                })
-                .collect()
-        });
-        let mut is_set = vec![false; out.len()];
-        for (at, value, is_own) in lit.into_iter().flatten() {
-            if is_own || !is_set[at] {
-                out[at] = value.to_array();
-                is_set[at] |= is_own;
-            }
-        }
-        Ok(out)
-    }
-
     /// Width and height of the pages, as those of the light map.
     pub fn page_size(&self) -> u32 {
-        self.atlas.map.layout.page_size
+        self.context.map.atlas.map.layout.page_size
     }
 
     /// The light map grid, and the LOD that each of its cells shows ([`NO_LOD`]: no surfaces), x
     /// fastest.
     pub fn cell_lods(&self) -> (CellInfo, Vec<u8>) {
         let cells = self.grid.info.dimensions.iter().product::<u32>();
-        (self.grid.info, (0..cells).map(|c| self.grid.lod(c, &self.blocks)).collect())
+        (self.grid.info, (0..cells).map(|c| self.grid.lod(c, &self.display.lods)).collect())
     }
 
     /// The LOD shown at a position; `None` outside the grid and in cells without surfaces.
     pub fn lod_at(&self, position: Vec3) -> Option<u8> {
-        let lod = self.grid.info.contains(position).then(|| self.grid.lod(self.grid.info.cell(position), &self.blocks));
+        let info = &self.grid.info;
+        let lod = info.contains(position).then(|| self.grid.lod(info.cell(position), &self.display.lods));
         lod.filter(|&l| l != NO_LOD)
     }
 
     /// Sums and rays of every gather texel, by sample: the part of the state that bakes share. For
     /// tests.
-    pub fn sums(&self) -> Vec<([f32; 3], u32)> {
-        let mut sums = vec![([0.0; 3], 0); self.atlas.gather.len()];
-        for block in &self.blocks {
-            for (&s, g) in block.texels.iter().zip(&block.gathered) {
+    pub fn sums(&mut self) -> Result<Vec<([f32; 3], u32)>> {
+        self.collect()?;
+        let mut sums = vec![([0.0; 3], 0); self.context.map.atlas.gather.len()];
+        for (tile, block) in self.context.map.tiles.iter().zip(&self.blocks) {
+            for (&s, g) in tile.texels.iter().zip(&block.gathered) {
                 sums[s as usize] = (g.sum.to_array(), g.rays);
             }
         }
-        sums
+        Ok(sums)
     }
 
     /// Waits for indirect light that is being recomputed and takes it over.
     pub fn finish_relighting(&mut self) -> Result<()> {
-        while self.relight.is_pending() {
-            if let Some(new) = self.relight.poll(&self.atlas, &self.bake)? {
-                self.light.renew(new);
-            }
+        self.collect()?;
+        while self.relight.is_pending() && !self.paused {
+            self.take_new_light()?;
             std::thread::sleep(Duration::from_millis(1));
         }
         Ok(())
+    }
+}
+
+impl Drop for Live {
+    fn drop(&mut self) {
+        if let Some(batch) = self.background.take() {
+            // Threads at work hold what they work on; nothing is lost if this is the end of it.
+            let _ = batch.take();
+        }
     }
 }

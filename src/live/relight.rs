@@ -14,21 +14,22 @@ use crate::lightmap::{Atlas, BakeParams, BakeStats};
 use crate::progress::Progress;
 use glam::Vec3;
 use std::panic::{AssertUnwindSafe, catch_unwind};
-use std::sync::Arc;
 use std::sync::atomic::{AtomicBool, Ordering::Relaxed};
 use std::sync::mpsc::{Receiver, TryRecvError, channel};
+use std::sync::{Arc, Mutex};
 
 /// The first renewal takes this part of the photons.
 const QUICK_PART: u64 = 16;
 
 /// Light as texels see it.
+#[derive(Clone)]
 pub(super) struct Illumination {
-    pub direct: DirectLight,
+    pub direct: Arc<DirectLight>,
     /// By sample of the radiance map.
-    pub radiance: Vec<Vec3>,
+    pub radiance: Arc<Vec<Vec3>>,
     /// Per chart, whether its back is shown.
-    pub backs: Vec<bool>,
-    /// Whether there is any indirect light.
+    pub backs: Arc<Vec<bool>>,
+    /// Whether there is, or ever was, any indirect light.
     pub has_indirect: bool,
     /// Numbers that change with the parts.
     pub direct_epoch: u32,
@@ -43,12 +44,7 @@ pub(super) struct Indirect {
 }
 
 /// Computes radiance map and sides under the scene's lights of now.
-pub(super) fn illuminate(
-    atlas: &Atlas,
-    params: &BakeParams,
-    direct: &DirectLight,
-    progress: &Progress,
-) -> Result<Indirect> {
+fn illuminate(atlas: &Atlas, params: &BakeParams, direct: &DirectLight, progress: &Progress) -> Result<Indirect> {
     let two_sided = !atlas.radiance.layout.back_of.is_empty();
     let plan = Plan::new(&atlas.scene, direct, params, two_sided, false);
     let bake = Bake { atlas, params, plan: &plan, direct, range: 0..atlas.map.len(), progress };
@@ -62,23 +58,31 @@ impl Illumination {
         let direct = DirectLight::new(&atlas.scene);
         let i = illuminate(atlas, params, &direct, progress)?;
         Ok(Illumination {
-            direct,
-            radiance: i.radiance,
-            backs: i.backs,
+            direct: Arc::new(direct),
+            radiance: Arc::new(i.radiance),
+            backs: Arc::new(i.backs),
             has_indirect: i.has_indirect,
             direct_epoch: 1,
             indirect_epoch: 1,
         })
     }
 
-    /// Takes new indirect light over.
-    pub fn renew(&mut self, new: Indirect) {
-        if self.backs != new.backs {
-            // Other sides are shown: their direct light is another one too.
-            self.direct_epoch += 1;
+    /// With new indirect light.
+    pub fn renewed(&self, new: Indirect) -> Illumination {
+        let mut light = Illumination { indirect_epoch: self.indirect_epoch + 1, ..self.clone() };
+        if new.has_indirect {
+            light.radiance = Arc::new(new.radiance);
+            if *light.backs != new.backs {
+                // Other sides are shown: their direct light is another one too.
+                light.direct_epoch += 1;
+                light.backs = Arc::new(new.backs);
+            }
+            light.has_indirect = true;
+        } else {
+            // All went dark: what is there fades to black, on the sides that are shown.
+            light.radiance = Arc::new(vec![Vec3::ZERO; self.radiance.len()]);
         }
-        (self.radiance, self.backs, self.has_indirect) = (new.radiance, new.backs, new.has_indirect);
-        self.indirect_epoch += 1;
+        light
     }
 }
 
@@ -88,13 +92,14 @@ pub(super) struct Relight {
     /// One thread, from the first renewal on.
     device: Option<Arc<Device>>,
     running: Option<Running>,
-    /// The lights changed while a renewal under older ones was under way.
+    /// The lights changed while a renewal under older ones was under way, or while on hold.
     again: bool,
+    on_hold: bool,
 }
 
 struct Running {
     /// Closed when the renewal has ended.
-    results: Receiver<Result<Indirect>>,
+    results: Mutex<Receiver<Result<Indirect>>>,
     cancel: Arc<AtomicBool>,
 }
 
@@ -104,6 +109,8 @@ impl Relight {
     pub fn start(&mut self, atlas: &Arc<Atlas>, params: &BakeParams) -> Result<()> {
         if let Some(running) = &self.running {
             running.cancel.store(true, Relaxed);
+        }
+        if self.running.is_some() || self.on_hold {
             self.again = true;
             return Ok(());
         }
@@ -131,21 +138,38 @@ impl Relight {
             send(&params, &Progress::new(|_, _| !cancelled.load(Relaxed)));
         });
         self.device = Some(device);
-        self.running = Some(Running { results, cancel });
+        self.running = Some(Running { results: Mutex::new(results), cancel });
         Ok(())
     }
 
     /// Whether results are still to come.
     pub fn is_pending(&self) -> bool {
-        self.running.is_some()
+        self.running.is_some() || self.again
+    }
+
+    /// Breaks a renewal off, to be begun again when it is no longer on hold.
+    pub fn hold(&mut self, on_hold: bool, atlas: &Arc<Atlas>, params: &BakeParams) -> Result<()> {
+        self.on_hold = on_hold;
+        if on_hold {
+            if let Some(running) = &self.running {
+                running.cancel.store(true, Relaxed);
+                self.again = true;
+            }
+            return Ok(());
+        }
+        if self.running.is_none() && std::mem::take(&mut self.again) {
+            self.start(atlas, params)?;
+        }
+        Ok(())
     }
 
     /// The newest finished result. Does not wait.
     pub fn poll(&mut self, atlas: &Arc<Atlas>, params: &BakeParams) -> Result<Option<Indirect>> {
-        let Some(running) = &self.running else { return Ok(None) };
+        let Some(running) = &mut self.running else { return Ok(None) };
+        let results = running.results.get_mut().unwrap_or_else(|e| e.into_inner());
         let mut newest = None;
         loop {
-            match running.results.try_recv() {
+            match results.try_recv() {
                 Ok(Ok(indirect)) => newest = Some(indirect),
                 // Because of yet another change.
                 Ok(Err(Error::Cancelled)) => {}
@@ -156,7 +180,7 @@ impl Relight {
                 Err(TryRecvError::Empty) => break,
                 Err(TryRecvError::Disconnected) => {
                     self.running = None;
-                    if std::mem::take(&mut self.again) {
+                    if !self.on_hold && std::mem::take(&mut self.again) {
                         self.start(atlas, params)?;
                     }
                     break;

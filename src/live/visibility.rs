@@ -2,8 +2,7 @@
 //! the blocks that they hit. Marks fade over some updates, so that few rays per update suffice.
 
 use super::LiveCamera;
-use super::blocks::BlockIndex;
-use crate::lightmap::Atlas;
+use super::blocks::BlockMap;
 use crate::sampling::sobol_2d;
 use crate::scene::NONE;
 use crate::trace::{PACKET_SIZE, Packet, RawHit};
@@ -37,12 +36,8 @@ impl Visibility {
         self.marks[block as usize]
     }
 
-    pub fn bytes(&self) -> usize {
-        (self.marks.len() + self.seen.capacity()) * 4
-    }
-
     /// Traces the primary rays of one update; returns how many.
-    pub fn look(&mut self, atlas: &Atlas, index: &BlockIndex, camera: &LiveCamera) -> u64 {
+    pub fn look(&mut self, map: &BlockMap, camera: &LiveCamera) -> u64 {
         let marks = &mut self.marks;
         self.seen.retain(|&b| {
             let mark = &mut marks[b as usize];
@@ -69,9 +64,9 @@ impl Visibility {
                 let v = denser_in_the_middle(b * 2.0 - 1.0);
                 packet.push((forward + right * u + down * v).normalize());
             }
-            atlas.scene.gather_packet(camera.position, &packet, 0.0, f32::INFINITY, &mut hits);
+            map.atlas.scene.gather_packet(camera.position, &packet, 0.0, f32::INFINITY, &mut hits);
             for hit in &hits[..packet.count] {
-                let Some(block) = block_of(atlas, index, hit) else { continue };
+                let Some(block) = block_of(map, hit) else { continue };
                 let mark = &mut self.marks[block as usize];
                 if *mark == 0.0 {
                     self.seen.push(block);
@@ -90,16 +85,17 @@ fn denser_in_the_middle(x: f32) -> f32 {
 }
 
 /// The block that a ray hit.
-pub(super) fn block_of(atlas: &Atlas, index: &BlockIndex, hit: &RawHit) -> Option<u32> {
+fn block_of(map: &BlockMap, hit: &RawHit) -> Option<u32> {
     if hit.is_miss() {
         return None;
     }
+    let atlas = &map.atlas;
     let chart = atlas.charts.chart_of[hit.triangle as usize];
-    if chart == NONE || index.of_chart(chart).is_empty() {
+    if chart == NONE || map.of_chart(chart).is_empty() {
         return None;
     }
     let at = atlas.gather.layout.texel_coord(chart, atlas.charts.local(hit.triangle, hit.u, hit.v));
-    Some(index.block_at(chart, at[0].floor() as i32, at[1].floor() as i32))
+    Some(map.block_at(chart, at[0].floor() as i32, at[1].floor() as i32))
 }
 
 impl LiveCamera {

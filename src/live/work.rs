@@ -2,27 +2,30 @@
 //! the next LOD, then more rounds for all. It can stop after any texel and go on later; the sums of
 //! a texel depend on its number of rounds alone, so they have the bits of a bake with as many rays.
 
-use super::blocks::{Block, DirectTile, rect_in_light_map};
+use super::blocks::{Block, BlockMap, DirectTile, Tile};
 use super::relight::Illumination;
-use crate::lightmap::Atlas;
 use crate::lightmap::bake::inside_a_solid;
 use crate::lightmap::gather::{Gathered, ROUND, SampleSet};
 use crate::lightmap::radiance::RadianceMap;
 use crate::sampling::combine;
 use crate::scene::NONE;
 use glam::Vec3;
-use std::sync::atomic::{AtomicU64, Ordering::Relaxed};
+use std::sync::Arc;
+use std::sync::atomic::{AtomicBool, AtomicU64, Ordering::Relaxed};
 use std::time::Instant;
 
+/// Shadow rays per area light for coarse direct light, at most.
+const COARSE_SAMPLES: u32 = 4;
+
 /// What all work on blocks reads.
-pub(super) struct Context<'a> {
-    pub atlas: &'a Atlas,
-    pub light: &'a Illumination,
-    pub samples: &'a SampleSet,
+#[derive(Clone)]
+pub(super) struct Context {
+    pub map: Arc<BlockMap>,
+    pub light: Arc<Illumination>,
+    pub samples: Arc<SampleSet>,
     pub gather_seed: u32,
     pub direct_seed: u32,
     pub direct_samples: u32,
-    pub top: u8,
     pub promote_threshold: u32,
     pub max_rounds: u32,
 }
@@ -33,36 +36,63 @@ pub(super) struct Limit {
     /// Rays that may be traced; `u64::MAX`: any number.
     pub rays: u64,
     pub traced: AtomicU64,
+    /// Set by whoever wants the work back.
+    pub stopped: AtomicBool,
 }
 
 impl Limit {
-    /// Whether there is room for more; asked before every texel.
-    pub fn reached(&self) -> bool {
-        self.traced.load(Relaxed) >= self.rays || self.deadline.is_some_and(|d| Instant::now() >= d)
+    pub fn new(deadline: Option<Instant>, rays: u64) -> Limit {
+        Limit { deadline, rays, traced: AtomicU64::new(0), stopped: AtomicBool::new(false) }
     }
+
+    /// Whether there is no room for more; asked before every texel.
+    pub fn reached(&self) -> bool {
+        self.stopped.load(Relaxed)
+            || self.traced.load(Relaxed) >= self.rays
+            || self.deadline.is_some_and(|d| Instant::now() >= d)
+    }
+}
+
+/// How much of a block is to be worked on.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub(super) enum Step {
+    /// The coarse direct light alone.
+    Coarse,
+    /// What is missing of direct light, then a step of indirect light.
+    Next,
 }
 
 /// What became of a block.
 #[derive(Clone, Copy, Debug, Default, PartialEq, Eq)]
 pub(super) struct Done {
-    /// Its direct light is new.
+    /// Its coarse direct light is new.
+    pub coarse: bool,
+    /// Its direct light at full resolution is new.
     pub direct: bool,
     /// A step of its indirect light was completed.
     pub indirect: bool,
 }
 
+impl Done {
+    /// Whether there is anything to show.
+    pub fn any(&self) -> bool {
+        self.coarse || self.direct || self.indirect
+    }
+}
+
 impl Block {
     /// LOD and rounds that the next step works towards; `None` if nothing is left to do.
     fn target(&self, c: &Context) -> Option<(u8, u32)> {
+        let top = c.map.top();
         if !c.light.has_indirect {
             None
         } else if self.indirect_epoch != c.light.indirect_epoch || self.gathered.is_empty() {
             // New light: what is shown first.
             Some((self.lod, c.promote_threshold))
-        } else if self.lod < c.top {
+        } else if self.lod < top {
             Some((self.lod + 1, c.promote_threshold))
         } else if (self.rounds as u32) < c.max_rounds {
-            Some((c.top, self.rounds as u32 + 1))
+            Some((top, self.rounds as u32 + 1))
         } else {
             None
         }
@@ -75,41 +105,53 @@ impl Block {
 
     /// Whether direct light is known at full resolution under the light of now.
     pub fn has_direct(&self, c: &Context) -> bool {
-        // The old tile stays on display while the new one is under way.
-        self.direct.is_some() && self.direct_work.is_none() && self.direct_epoch == c.light.direct_epoch
+        self.direct_epoch == c.light.direct_epoch && self.direct_work.is_none()
+    }
+
+    /// Changes of the lights since the coarse direct light was computed.
+    pub fn changes_behind(&self, c: &Context) -> u32 {
+        c.light.direct_epoch - self.coarse_epoch
     }
 
     /// Works until a step is completed or the limit is reached.
-    pub fn work(&mut self, c: &Context, limit: &Limit) -> Done {
+    pub fn work(&mut self, c: &Context, tile: &Tile, step: Step, limit: &Limit) -> Done {
         let mut done = Done::default();
+        if tile.texels.is_empty() {
+            return done;
+        }
+        if self.changes_behind(c) > 0 {
+            self.work_on_coarse(c, tile, limit);
+            done.coarse = true;
+        }
+        if step == Step::Coarse {
+            return done;
+        }
         if !self.has_direct(c) {
-            done.direct = self.work_on_direct(c, limit);
+            done.direct = self.work_on_direct(c, tile, limit);
             if !done.direct {
                 return done;
             }
         }
-        done.indirect = self.work_on_indirect(c, limit);
+        done.indirect = self.work_on_indirect(c, tile, limit);
         done
     }
 
     /// One step of indirect light; tells whether it was completed.
-    pub fn work_on_indirect(&mut self, c: &Context, limit: &Limit) -> bool {
-        if self.texels.is_empty() {
-            return false;
-        }
+    pub fn work_on_indirect(&mut self, c: &Context, tile: &Tile, limit: &Limit) -> bool {
         let Some((lod, rounds)) = self.target(c) else { return false };
         if self.indirect_epoch != c.light.indirect_epoch {
-            self.begin_epoch(c.light.indirect_epoch);
+            self.begin_epoch(tile, c.light.indirect_epoch);
         }
-        let lookup = RadianceMap::new(&c.atlas.charts, &c.atlas.radiance, &c.light.radiance);
-        let end = self.lod_end[lod as usize];
+        let atlas = &c.map.atlas;
+        let lookup = RadianceMap::new(&atlas.charts, &atlas.radiance, &c.light.radiance);
+        let end = tile.lod_end[lod as usize];
         while self.cursor < end {
             let i = self.cursor as usize;
-            let sample = self.texels[i];
+            let sample = tile.texels[i];
             if self.gathered.len() <= i {
                 self.gathered.push(Gathered::default());
             }
-            let receiver = c.atlas.receiver(&c.atlas.gather, &c.light.backs, sample as usize);
+            let receiver = atlas.receiver(&atlas.gather, &c.light.backs, sample as usize);
             while self.gathered[i].rays < rounds * ROUND as u32 {
                 if limit.reached() {
                     return false;
@@ -117,7 +159,7 @@ impl Block {
                 let before = self.gathered[i];
                 let round = (before.rays as usize) / ROUND;
                 let seed = combine(c.gather_seed, sample);
-                self.gathered[i].add_round(&c.atlas.scene, &lookup, &receiver, c.samples, round, seed);
+                self.gathered[i].add_round(&atlas.scene, &lookup, &receiver, &c.samples, round, seed);
                 self.note_deviation(&before, i);
                 limit.traced.fetch_add(ROUND as u64, Relaxed);
             }
@@ -126,14 +168,14 @@ impl Block {
         self.cursor = 0;
         self.lod = lod;
         self.rounds = rounds as u16;
-        self.error = self.estimate_error(c.top);
+        self.error = self.estimate_error(c.map.top());
         true
     }
 
     /// Keeps the light of now as a prior and starts over.
-    fn begin_epoch(&mut self, epoch: u32) {
+    fn begin_epoch(&mut self, tile: &Tile, epoch: u32) {
         if !self.gathered.is_empty() {
-            self.prior = self.texels.iter().enumerate().map(|(i, _)| self.estimate(i).unwrap_or(Vec3::NAN)).collect();
+            self.prior = (0..tile.texels.len()).map(|i| self.estimate(i).unwrap_or(Vec3::NAN)).collect();
         }
         self.gathered.clear();
         self.indirect_epoch = epoch;
@@ -178,7 +220,7 @@ impl Block {
 
     /// Relative error of the block's indirect light: the spread of its rounds, where there is more
     /// than one, and, where texels are interpolated, half the spread of those that are not.
-    fn estimate_error(&self, top: u8) -> f32 {
+    pub fn estimate_error(&self, top: u8) -> f32 {
         let values = || self.gathered.iter().filter(|g| g.rays > 0).map(|g| g.irradiance().element_sum());
         let n = values().count().max(1) as f32;
         let mean = values().sum::<f32>() / n;
@@ -195,12 +237,25 @@ impl Block {
         if self.lod < top { noise + 0.5 * spread.min(1.0) + 0.02 } else { noise }
     }
 
+    /// Direct light of the lowest LOD's texels.
+    pub fn work_on_coarse(&mut self, c: &Context, tile: &Tile, limit: &Limit) {
+        let (atlas, mut rays) = (&c.map.atlas, 0);
+        let samples = c.direct_samples.min(COARSE_SAMPLES);
+        let value = |&s: &u32| {
+            let receiver = atlas.receiver(&atlas.gather, &c.light.backs, s as usize);
+            c.light.direct.irradiance(&receiver, samples, combine(c.direct_seed, s), &mut rays)
+        };
+        self.new_coarse = tile.texels[..tile.lod_end[0] as usize].iter().map(value).collect();
+        self.coarse_epoch = c.light.direct_epoch;
+        limit.traced.fetch_add(rays, Relaxed);
+    }
+
     /// Direct light of the block's light map texels; tells whether it was completed.
-    fn work_on_direct(&mut self, c: &Context, limit: &Limit) -> bool {
+    fn work_on_direct(&mut self, c: &Context, of: &Tile, limit: &Limit) -> bool {
         let (mut tile, mut next) = match self.direct_work.take() {
             Some((tile, next)) if self.direct_epoch == c.light.direct_epoch => (tile, next),
             _ => {
-                let rect = rect_in_light_map(c.atlas, self.chart, &self.rect);
+                let rect = c.map.rect_in_light_map(of.chart, &of.rect);
                 self.direct_epoch = c.light.direct_epoch;
                 (DirectTile { rect, values: vec![Vec3::NAN; rect.area()].into() }, 0)
             }
@@ -213,43 +268,43 @@ impl Block {
             }
             let (x, y) = (tile.rect.x0 + (next as usize % width) as i32, tile.rect.y0 + (next as usize / width) as i32);
             let mut rays = 0;
-            if let Some(value) = self.direct_texel(c, x, y, &mut rays) {
+            if let Some(value) = direct_texel(c, of, x, y, &mut rays) {
                 tile.values[next as usize] = value;
             }
             limit.traced.fetch_add(rays, Relaxed);
             next += 1;
         }
         fill_hidden(&mut tile);
-        self.direct = Some(tile);
+        self.new_direct = Some(tile);
         true
     }
+}
 
-    /// Direct light of a texel of the light map; `None` if it is none of the block's; infinite if
-    /// it is inside a solid.
-    fn direct_texel(&self, c: &Context, x: i32, y: i32, rays: &mut u64) -> Option<Vec3> {
-        let a = c.atlas;
-        let sample = a.map.at(self.chart, x, y);
-        if sample == NONE {
-            return None;
-        }
-        let t = &a.map.texels.samples[sample as usize];
-        if a.charts.chart_of[t.triangle as usize] != self.chart {
-            return None;
-        }
-        let at = a.gather.layout.texel_coord(self.chart, a.charts.local(t.triangle, t.u, t.v));
-        // One texel more than the block's own, so that rounding leaves no gaps between blocks.
-        let own = self.rect.grown(1);
-        let (gx, gy) = (at[0].floor() as i32, at[1].floor() as i32);
-        if gx < own.x0 || gx >= own.x1 || gy < own.y0 || gy >= own.y1 {
-            return None;
-        }
-        let receiver = a.receiver(&a.map, &c.light.backs, sample as usize);
-        *rays += 1;
-        if inside_a_solid(&a.scene, receiver.origin, receiver.geometric) {
-            return Some(Vec3::INFINITY);
-        }
-        Some(c.light.direct.irradiance(&receiver, c.direct_samples, combine(c.direct_seed, sample), rays))
+/// Direct light of a texel of the light map; `None` if it is none of the block's; infinite if
+/// it is inside a solid.
+fn direct_texel(c: &Context, tile: &Tile, x: i32, y: i32, rays: &mut u64) -> Option<Vec3> {
+    let a = &c.map.atlas;
+    let sample = a.map.at(tile.chart, x, y);
+    if sample == NONE {
+        return None;
     }
+    let t = &a.map.texels.samples[sample as usize];
+    if a.charts.chart_of[t.triangle as usize] != tile.chart {
+        return None;
+    }
+    let at = a.gather.layout.texel_coord(tile.chart, a.charts.local(t.triangle, t.u, t.v));
+    // One texel more than the block's own, so that rounding leaves no gaps between blocks.
+    let own = tile.rect.grown(1);
+    let (gx, gy) = (at[0].floor() as i32, at[1].floor() as i32);
+    if gx < own.x0 || gx >= own.x1 || gy < own.y0 || gy >= own.y1 {
+        return None;
+    }
+    let receiver = a.receiver(&a.map, &c.light.backs, sample as usize);
+    *rays += 1;
+    if inside_a_solid(&a.scene, receiver.origin, receiver.geometric) {
+        return Some(Vec3::INFINITY);
+    }
+    Some(c.light.direct.irradiance(&receiver, c.direct_samples, combine(c.direct_seed, sample), rays))
 }
 
 /// Gives texels inside solids (marked infinite) the mean of their neighbours, ring by ring; without

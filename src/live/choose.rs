@@ -1,0 +1,181 @@
+//! Which blocks are worked on next.
+
+use super::blocks::{Block, BlockMap};
+use super::cells::Grid;
+use super::visibility::Visibility;
+use super::work::Context;
+use super::{LiveCamera, Mode};
+use crate::sampling::{combine, mix};
+use std::cmp::Ordering;
+
+/// Urgency of wrong direct light, which is what is seen first; that of missing detail is about 1.
+const WRONG_DIRECT: f32 = 100.0;
+
+/// What choosing needs to remember.
+pub(super) struct Chooser {
+    /// Per block, whether something is left to do.
+    open: Vec<bool>,
+    open_count: usize,
+    /// Per cell, the least progress of its open blocks; `None`: all are finished.
+    least: Vec<Option<u32>>,
+    /// Cells whose `least` is to be found anew.
+    stale: Vec<bool>,
+    /// Cells with marked blocks, in the update under way.
+    visible: Vec<u32>,
+    is_visible: Vec<bool>,
+}
+
+/// What there is to choose from.
+pub(super) struct Choice<'a> {
+    pub context: &'a Context,
+    pub blocks: &'a [Block],
+    pub grid: &'a Grid,
+    pub visibility: &'a Visibility,
+}
+
+impl Chooser {
+    pub fn new(map: &BlockMap, grid: &Grid) -> Chooser {
+        let cells = grid.info.dimensions.iter().product::<u32>() as usize;
+        let open: Vec<bool> = map.tiles.iter().map(|t| !t.texels.is_empty()).collect();
+        Chooser {
+            open_count: open.iter().filter(|&&o| o).count(),
+            open,
+            least: vec![None; cells],
+            stale: vec![true; cells],
+            visible: Vec::new(),
+            is_visible: vec![false; cells],
+        }
+    }
+
+    pub fn bytes(&self) -> usize {
+        self.open.len() + self.least.len() * (size_of::<Option<u32>>() + 2)
+    }
+
+    /// Part of the blocks on which nothing is left to do.
+    pub fn finished(&self) -> f32 {
+        1.0 - self.open_count as f32 / self.open.len().max(1) as f32
+    }
+
+    pub fn is_open(&self, b: u32) -> bool {
+        self.open[b as usize]
+    }
+
+    /// Takes note that a block was worked on.
+    pub fn note(&mut self, context: &Context, b: u32, block: &Block) {
+        let tile = &context.map.tiles[b as usize];
+        let open = !tile.texels.is_empty() && !block.is_finished(context);
+        if self.open[b as usize] != open {
+            self.open[b as usize] = open;
+            self.open_count = if open { self.open_count + 1 } else { self.open_count - 1 };
+        }
+        if !tile.texels.is_empty() {
+            self.stale[tile.cell as usize] = true;
+        }
+    }
+
+    /// Takes note that the light has changed.
+    pub fn note_all(&mut self, context: &Context, blocks: &[Block]) {
+        (0..).zip(blocks).for_each(|(b, block)| self.note(context, b, block));
+    }
+
+    /// Takes note of what is seen in this update.
+    pub fn look(&mut self, map: &BlockMap, visibility: &Visibility) {
+        self.visible.drain(..).for_each(|cell| self.is_visible[cell as usize] = false);
+        for &b in &visibility.seen {
+            let cell = map.tiles[b as usize].cell;
+            if !std::mem::replace(&mut self.is_visible[cell as usize], true) {
+                self.visible.push(cell);
+            }
+        }
+    }
+
+    /// Seen blocks whose coarse direct light is of other lights than those of now: those that most is
+    /// seen of first, and those first that have waited for long.
+    pub fn wrong(&self, from: &Choice, count: usize) -> Vec<u32> {
+        let wrong = |&b: &u32| {
+            let behind = from.blocks[b as usize].changes_behind(from.context);
+            (behind > 0).then(|| (from.visibility.mark(b) * behind as f32, b))
+        };
+        greatest(from.visibility.seen.iter().filter_map(wrong).collect(), count)
+    }
+
+    /// The next blocks to work on, the most urgent first.
+    pub fn next(&mut self, from: &Choice, mode: Mode, camera: &LiveCamera, update: u32, count: usize) -> Vec<u32> {
+        match mode {
+            Mode::View => {
+                let urgency = |b: u32| {
+                    let block = &from.blocks[b as usize];
+                    let error = if block.has_direct(from.context) { block.error.max(1e-4) } else { WRONG_DIRECT };
+                    from.visibility.mark(b) * error
+                };
+                let open = from.visibility.seen.iter().filter(|&&b| self.is_open(b));
+                greatest(open.map(|&b| (urgency(b), b)).collect(), count)
+            }
+            Mode::Uniform => {
+                let n = self.open.len() as u32;
+                let random = |i: u32| mix(combine(update, i)) % n.max(1);
+                let mut chosen: Vec<u32> = (0..count as u32).map(random).filter(|&b| self.is_open(b)).collect();
+                chosen.sort_unstable();
+                chosen.dedup();
+                chosen
+            }
+            Mode::Position => self.next_of_cells(from, camera, count),
+        }
+    }
+
+    /// Blocks of the cells that are next: visible cells before hidden ones, near before far, where each
+    /// LOD that a cell has makes it twice as far.
+    fn next_of_cells(&mut self, from: &Choice, camera: &LiveCamera, count: usize) -> Vec<u32> {
+        let top = from.context.map.top() as u32;
+        let progress = |b: u32| {
+            let block = &from.blocks[b as usize];
+            block.lod as u32 + if block.lod as u32 == top { block.rounds as u32 } else { 0 }
+        };
+        let info = &from.grid.info;
+        let mut cells = Vec::new();
+        for &cell in &from.grid.occupied {
+            let c = cell as usize;
+            if std::mem::replace(&mut self.stale[c], false) {
+                let open = from.grid.blocks_of(cell).iter().filter(|&&b| self.is_open(b));
+                self.least[c] = open.map(|&b| progress(b)).min();
+            }
+            if let Some(least) = self.least[c] {
+                let away = info.distance(cell, camera.position) + info.cell_size;
+                cells.push((!self.is_visible[c], away * (1u64 << least.min(40)) as f32, cell));
+            }
+        }
+        let order = |a: &(bool, f32, u32), b: &(bool, f32, u32)| -> Ordering {
+            a.0.cmp(&b.0).then(a.1.total_cmp(&b.1)).then(a.2.cmp(&b.2))
+        };
+        // Each of these has at least one open block.
+        if cells.len() > count {
+            cells.select_nth_unstable_by(count, order);
+            cells.truncate(count);
+        }
+        cells.sort_unstable_by(order);
+        let mut chosen = Vec::new();
+        for &(_, _, cell) in &cells {
+            // The least advanced of the cell first: it is promoted as a whole.
+            let mut of_cell: Vec<u32> =
+                from.grid.blocks_of(cell).iter().copied().filter(|&b| self.is_open(b)).collect();
+            of_cell.sort_by_key(|&b| (progress(b), from.visibility.mark(b) == 0.0));
+            chosen.extend(of_cell);
+            if chosen.len() >= count {
+                break;
+            }
+        }
+        chosen.truncate(count);
+        chosen
+    }
+}
+
+/// The `count` greatest, in falling order.
+fn greatest(mut keyed: Vec<(f32, u32)>, count: usize) -> Vec<u32> {
+    let order = |a: &(f32, u32), b: &(f32, u32)| b.0.total_cmp(&a.0).then(a.1.cmp(&b.1));
+    if keyed.len() > count {
+        keyed.select_nth_unstable_by(count, order);
+        keyed.truncate(count);
+    }
+    keyed.sort_unstable_by(order);
+    keyed.into_iter().map(|k| k.1).collect()
+}

@@ -1,0 +1,140 @@
+//! Reading rectangles of the shown light: which charts lie in a rectangle, and their composition with
+//! the padding around them.
+
+use super::blocks::{BlockMap, Rect};
+use super::display::Display;
+use super::{Live, PageRect};
+use crate::error::{Result, invalid_argument};
+use crate::scene::NONE;
+use glam::Vec3;
+use rayon::prelude::*;
+
+/// Side of a bin in texels.
+const BIN: i32 = 64;
+
+/// Rows that a thread composes at a time.
+const ROWS: usize = 16;
+
+/// Rectangles of fewer texels are composed by the calling thread: waking others takes longer.
+const SMALL: usize = 4096;
+
+/// Charts by where they lie: bins of 64 × 64 texels of the pages.
+pub(super) struct ChartBins {
+    /// Bins along a side of a page.
+    side: i32,
+    bins: Vec<Vec<u32>>,
+}
+
+impl ChartBins {
+    pub fn new(map: &BlockMap) -> ChartBins {
+        let layout = &map.atlas.map.layout;
+        let side = (layout.page_size as i32 + BIN - 1) / BIN;
+        let pages = map.atlas.info.page_count as i32;
+        let mut bins = ChartBins { side, bins: vec![Vec::new(); (side * side * pages) as usize] };
+        for chart in 0..map.atlas.charts.charts.len() as u32 {
+            let (page, rect) = padded(map, chart);
+            for i in bins.overlapping(page, &rect) {
+                bins.bins[i].push(chart);
+            }
+        }
+        bins
+    }
+
+    fn overlapping(&self, page: u32, rect: &Rect) -> impl Iterator<Item = usize> + use<> {
+        let side = self.side;
+        let clamp = |v: i32| v.clamp(0, side - 1);
+        let columns = clamp(rect.x0 / BIN)..clamp((rect.x1 - 1) / BIN) + 1;
+        let rows = clamp(rect.y0 / BIN)..clamp((rect.y1 - 1) / BIN) + 1;
+        rows.flat_map(move |j| columns.clone().map(move |i| (i, j)))
+            .map(move |(i, j)| ((page as i32 * side + j) * side + i) as usize)
+    }
+
+    /// Charts that a rectangle of a page may show, with their padding, in order.
+    fn charts(&self, page: u32, rect: &Rect) -> Vec<u32> {
+        let mut charts: Vec<u32> = self.overlapping(page, rect).flat_map(|i| self.bins[i].iter().copied()).collect();
+        charts.sort_unstable();
+        charts.dedup();
+        charts
+    }
+
+    pub fn bytes(&self) -> usize {
+        self.bins.iter().map(|b| size_of::<Vec<u32>>() + b.capacity() * 4).sum()
+    }
+}
+
+/// A chart's page and rectangle, with padding.
+fn padded(map: &BlockMap, chart: u32) -> (u32, Rect) {
+    let p = &map.atlas.map.layout.placements[chart as usize];
+    let (x0, y0) = (p.x as i32, p.y as i32);
+    (p.page, Rect { x0, y0, x1: x0 + p.w as i32, y1: y0 + p.h as i32 }.grown(map.atlas.padding as i32))
+}
+
+impl Live {
+    /// Irradiance shown in a rectangle of a page, row by row; `with_direct` false: indirect light
+    /// alone. Texels around charts repeat the nearest of the chart, up to the padding. `lod` below the
+    /// highest: what would be shown if no block were above it (slow).
+    pub fn read(&self, rect: &PageRect, lod: u32, with_direct: bool) -> Result<Vec<[f32; 3]>> {
+        let atlas = &self.context.map.atlas;
+        let size = self.page_size();
+        let (right, bottom) = (rect.x as u64 + rect.width as u64, rect.y as u64 + rect.height as u64);
+        if rect.page >= atlas.info.page_count || right > size as u64 || bottom > size as u64 {
+            let pages = atlas.info.page_count;
+            return invalid_argument!("{rect:?} is not within the {pages} pages of {size} × {size} texels");
+        }
+        if lod >= self.params.lod_count {
+            return invalid_argument!("lod is {lod}, the live object has {}", self.params.lod_count);
+        }
+        let mut out = crate::memory::try_vec::<[f32; 3]>(rect.width as usize * rect.height as usize, "a page")?;
+        let r = Rect { x0: rect.x as i32, y0: rect.y as i32, x1: right as i32, y1: bottom as i32 };
+        if r.area() == 0 {
+            return Ok(out);
+        }
+        let lower = (lod + 1 < self.params.lod_count).then(|| self.display.lowered(&self.context.map, lod as u8));
+        let display = lower.as_ref().unwrap_or(&self.display);
+        let compose = |(i, out): (usize, &mut [[f32; 3]])| {
+            let y0 = r.y0 + (i * ROWS) as i32;
+            let rows = Rect { y0, y1: (y0 + ROWS as i32).min(r.y1), ..r };
+            self.compose(display, rect.page, &rows, with_direct, out);
+        };
+        if r.area() < SMALL {
+            out.chunks_mut(r.width() * ROWS).enumerate().for_each(compose);
+        } else {
+            let device = atlas.scene.device();
+            device.install(|| out.par_chunks_mut(r.width() * ROWS).enumerate().for_each(compose));
+        }
+        Ok(out)
+    }
+
+    fn compose(&self, display: &Display, page: u32, rows: &Rect, with_direct: bool, out: &mut [[f32; 3]]) {
+        let map = &self.context.map;
+        let atlas = &map.atlas;
+        let padding = atlas.padding as i32;
+        let mut is_own = vec![false; out.len()];
+        for chart in self.bins.charts(page, rows) {
+            let own = |x: i32, y: i32| {
+                let s = atlas.map.at(chart, x, y);
+                let of_chart =
+                    |s: u32| atlas.charts.chart_of[atlas.map.texels.samples[s as usize].triangle as usize] == chart;
+                (s != NONE && of_chart(s)).then_some(s)
+            };
+            for (x, y) in padded(map, chart).1.clipped(rows).texels() {
+                let at = (y - rows.y0) as usize * rows.width() + (x - rows.x0) as usize;
+                if is_own[at] {
+                    continue;
+                }
+                let mut sample = own(x, y);
+                is_own[at] = sample.is_some();
+                if sample.is_none() {
+                    // Around the chart: the nearest texel within the padding.
+                    let around = Rect { x0: x, y0: y, x1: x + 1, y1: y + 1 }.grown(padding);
+                    let near =
+                        around.texels().filter_map(|(i, j)| own(i, j).map(|s| ((i - x).pow(2) + (j - y).pow(2), s)));
+                    sample = near.min().map(|n| n.1);
+                }
+                if let Some(s) = sample {
+                    out[at] = Vec3::to_array(&display.irradiance(map, s, with_direct));
+                }
+            }
+        }
+    }
+}
