@@ -23,6 +23,8 @@ pub(super) struct Chooser {
     /// Cells with marked blocks, in the update under way.
     visible: Vec<u32>,
     is_visible: Vec<bool>,
+    /// Of random choices.
+    turn: u32,
 }
 
 /// What there is to choose from.
@@ -44,6 +46,7 @@ impl Chooser {
             stale: vec![true; cells],
             visible: Vec::new(),
             is_visible: vec![false; cells],
+            turn: 0,
         }
     }
 
@@ -100,7 +103,7 @@ impl Chooser {
     }
 
     /// The next blocks to work on, the most urgent first.
-    pub fn next(&mut self, from: &Choice, mode: Mode, camera: &LiveCamera, update: u32, count: usize) -> Vec<u32> {
+    pub fn next(&mut self, from: &Choice, mode: Mode, camera: &LiveCamera, count: usize) -> Vec<u32> {
         match mode {
             Mode::View => {
                 let urgency = |b: u32| {
@@ -113,8 +116,17 @@ impl Chooser {
             }
             Mode::Uniform => {
                 let n = self.open.len() as u32;
-                let random = |i: u32| mix(combine(update, i)) % n.max(1);
-                let mut chosen: Vec<u32> = (0..count as u32).map(random).filter(|&b| self.is_open(b)).collect();
+                let turn = self.turn;
+                self.turn = turn.wrapping_add(1);
+                let random = |i: u32| mix(combine(turn, i)) % n.max(1);
+                if self.open_count < self.open.len() / 16 {
+                    // Few are left: the next ones from somewhere on.
+                    let from = random(0);
+                    let around = (from..n).chain(0..from);
+                    return around.filter(|&b| self.is_open(b)).take(count).collect();
+                }
+                let mut chosen: Vec<u32> =
+                    (0..16 * count as u32).map(random).filter(|&b| self.is_open(b)).take(count).collect();
                 chosen.sort_unstable();
                 chosen.dedup();
                 chosen

@@ -205,7 +205,6 @@ pub struct Live {
     /// Seconds that showing a block took lately: its indirect light; coarse direct light.
     refresh_seconds: f64,
     coarse_seconds: f64,
-    updates: u32,
     total_rays: u64,
     /// Bytes of what never grows, and of what blocks and display have allocated since.
     fixed: usize,
@@ -301,7 +300,6 @@ impl Live {
             paused: false,
             refresh_seconds: 1e-4,
             coarse_seconds: 1e-4,
-            updates: 0,
             total_rays: 0,
             fixed,
             held: 0,
@@ -401,7 +399,6 @@ impl Live {
             })?;
         }
         self.start_background(camera)?;
-        self.updates = self.updates.wrapping_add(1);
         self.total_rays += stats.rays;
         self.describe(&mut stats);
         stats.milliseconds = start.elapsed().as_secs_f32() * 1e3;
@@ -430,7 +427,7 @@ impl Live {
             let mut chosen = self.chooser.wrong(&from, ((left / self.coarse_seconds) as usize).clamp(1, PASS));
             if chosen.is_empty() {
                 step = Step::Next;
-                chosen = self.chooser.next(&from, self.params.mode, camera, self.updates, PASS);
+                chosen = self.chooser.next(&from, self.params.mode, camera, PASS);
             }
             if chosen.is_empty() || over(traced) {
                 break;
@@ -574,7 +571,7 @@ impl Live {
         }
         let from =
             Choice { context: &self.context, blocks: &self.blocks, grid: &self.grid, visibility: &self.visibility };
-        let mut chosen = self.chooser.next(&from, self.params.mode, camera, !self.updates, BACKGROUND);
+        let mut chosen = self.chooser.next(&from, self.params.mode, camera, BACKGROUND);
         // What waits to be shown must be there for it.
         chosen.retain(|&b| !self.is_waiting[b as usize]);
         if chosen.is_empty() {
