@@ -15,10 +15,12 @@ pub const HELP: &str = "\
 Bakes light maps.
 
 Usage: bakelite [bake] [SCENE] [OPTIONS]
+       bakelite report live [SCENE] [OPTIONS]
 
-SCENE is a file (.obj .ply .gltf .glb) or a built-in scene (atrium, cornell,
+SCENE, or --scene SCENE, is a file (.obj .ply .gltf .glb) or a built-in scene (atrium, cornell,
 furnace). Without it, the atrium is baked. Lengths are in scene units, colours
-are linear r,g,b.
+are linear r,g,b. `report live` measures live updates instead: error against
+time and rays, budgets, traffic and memory.
 
 Lights, added to those of the scene; may be repeated:
   --light point:X,Y,Z:R,G,B               intensity in W/sr
@@ -53,6 +55,9 @@ Pictures (path traced reference; indirect map + shadow rays; light map alone):
   --up x|y|z             up axis of the scene, for the camera [y]
   --width N --height N   size of each [480 x 270]
   --reference-spp N      paths per pixel of the reference; 0: no pictures [32]
+Report live (live.md with its tables and plots):
+  --seconds F            most time per curve of errors [20]
+  --updates N            updates per time budget, of 1, 2, 4 and 8 ms [10000]
 Output:
   --out DIR              where all files go [out]
   --no-glb               do not write the scene with its light maps as GLB
@@ -64,6 +69,7 @@ Output:
 #[derive(Debug)]
 pub enum Command {
     Bake(Box<BakeArgs>),
+    ReportLive(Box<ReportArgs>),
     Help,
     Version,
 }
@@ -113,6 +119,23 @@ impl Default for BakeArgs {
     }
 }
 
+/// Arguments of `bakelite report live`.
+#[derive(Clone, Debug)]
+pub struct ReportArgs {
+    /// Scene, lights, light map and machine. How many gather rays is for the report to vary.
+    pub bake: BakeArgs,
+    /// Most time per curve of errors.
+    pub seconds: f64,
+    /// Updates per time budget; 0: budgets are not measured.
+    pub updates: u32,
+}
+
+impl Default for ReportArgs {
+    fn default() -> Self {
+        ReportArgs { bake: BakeArgs::default(), seconds: 20.0, updates: 10_000 }
+    }
+}
+
 /// Light map texels per metre of the atrium unless a density is given: it takes so many to show the
 /// shadows of its balusters.
 const ATRIUM_DENSITY: f32 = 30.0;
@@ -123,34 +146,62 @@ const MAX_PICTURE: usize = 16384;
 /// Parses the arguments after the program's name.
 pub fn parse(args: impl IntoIterator<Item = OsString>) -> Result<Command, String> {
     let mut parser = lexopt::Parser::from_args(args);
-    let mut bake = BakeArgs::default();
-    let (mut first, mut scene, mut density) = (true, None, None);
+    let mut report = ReportArgs::default();
+    let (mut first, mut is_report, mut scene, mut density) = (true, false, None, None);
+    // The first flag that only a report has.
+    let mut of_report = None;
     while let Some(arg) = parser.next().map_err(|e| e.to_string())? {
         match arg {
             Arg::Short('h') | Arg::Long("help") => return Ok(Command::Help),
             Arg::Short('V') | Arg::Long("version") => return Ok(Command::Version),
             Arg::Value(v) if first && v == "bake" => {}
-            Arg::Value(v) if scene.is_none() => scene = Some(text("SCENE", v)?),
-            Arg::Value(v) => {
-                let first = scene.unwrap_or_default();
-                return Err(format!("there are two scenes, {first:?} and {:?}", v.to_string_lossy()));
+            Arg::Value(v) if first && v == "report" => {
+                is_report = true;
+                match parser.value().ok() {
+                    Some(kind) if kind == "live" => {}
+                    Some(kind) => return Err(format!("there is no report {kind:?}; there is: live")),
+                    None => return Err("report needs what to report; there is: live".into()),
+                }
             }
+            Arg::Value(v) => name_scene(&mut scene, text("SCENE", v)?)?,
+            Arg::Long("scene") => name_scene(&mut scene, value("--scene", &mut parser)?)?,
             Arg::Short(c) => return Err(format!("there is no flag -{c}")),
             Arg::Long("texels-per-unit") => {
                 density = Some(number("--texels-per-unit", &value("--texels-per-unit", &mut parser)?)?);
             }
+            Arg::Long("seconds") => {
+                of_report.get_or_insert("--seconds");
+                report.seconds = seconds(&value("--seconds", &mut parser)?)?;
+            }
+            Arg::Long("updates") => {
+                of_report.get_or_insert("--updates");
+                report.updates = number("--updates", &value("--updates", &mut parser)?)?;
+            }
             Arg::Long(name) => {
                 let name = name.to_owned();
-                option(&name, &mut parser, &mut bake)?;
+                option(&name, &mut parser, &mut report.bake)?;
             }
         }
         first = false;
     }
+    let bake = &mut report.bake;
     if let Some(scene) = scene {
         bake.scene = scene;
     }
     bake.desc.texels_per_unit = density.unwrap_or(if bake.scene == "atrium" { ATRIUM_DENSITY } else { 0.0 });
-    Ok(Command::Bake(Box::new(bake)))
+    match of_report {
+        _ if is_report => Ok(Command::ReportLive(Box::new(report))),
+        Some(flag) => Err(format!("{flag} is for `report live` alone")),
+        None => Ok(Command::Bake(Box::new(report.bake))),
+    }
+}
+
+/// Takes the scene's name, which may be given once.
+fn name_scene(scene: &mut Option<String>, name: String) -> Result<(), String> {
+    match scene.replace(name) {
+        Some(first) => Err(format!("there are two scenes, {first:?} and {:?}", scene.as_deref().unwrap_or_default())),
+        None => Ok(()),
+    }
 }
 
 /// Takes one `--name` with its value.
@@ -215,6 +266,13 @@ fn text(what: &str, value: OsString) -> Result<String, String> {
 fn number<T: FromStr>(flag: &str, value: &str) -> Result<T, String> {
     let kind = if "0.5".parse::<T>().is_ok() { "a number" } else { "a whole number in range" };
     value.parse().map_err(|_| format!("{flag} is {value:?}, not {kind}"))
+}
+
+fn seconds(value: &str) -> Result<f64, String> {
+    match number("--seconds", value)? {
+        s if s > 0.0 && f64::is_finite(s) => Ok(s),
+        s => Err(format!("--seconds is {s}, not a finite number greater than 0")),
+    }
 }
 
 fn picture_size(flag: &str, value: &str) -> Result<usize, String> {
@@ -327,6 +385,20 @@ mod tests {
     }
 
     #[test]
+    fn a_report_takes_the_flags_of_a_bake_and_its_own() {
+        let report = |line: &str| match parse(line.split_whitespace().map(OsString::from)) {
+            Ok(Command::ReportLive(r)) => *r,
+            other => panic!("{line}: {other:?}"),
+        };
+        let r = report("report live --scene s.obj --photons 5 --seconds 2.5 --updates 7");
+        assert_eq!((r.bake.scene.as_str(), r.bake.params.photon_count), ("s.obj", 5));
+        assert_eq!((r.seconds, r.updates), (2.5, 7));
+        let r = report("report live");
+        assert_eq!((r.bake.scene.as_str(), r.bake.desc.texels_per_unit), ("atrium", ATRIUM_DENSITY));
+        assert_eq!(bake("report.obj").unwrap().scene, "report.obj");
+    }
+
+    #[test]
     fn every_flag_of_the_help_is_known_and_takes_hold() {
         let b = bake(
             "bake s.obj --light point:1,2,3:4,5,6 --light spot:0,0,0:0,-1,0:20,30:1,1,1 --light sun:0,-1,0:7,8,9 \
@@ -349,6 +421,7 @@ mod tests {
         assert!((camera.fov_y.to_degrees() - 40.0).abs() < 1e-4);
         assert_eq!((b.width, b.height, b.reference_spp), (64, 48, 3));
         assert_eq!((b.out.to_str().unwrap(), b.glb, b.quiet), ("o", false, true));
+        assert_eq!(bake("--scene s.obj").unwrap().scene, "s.obj");
         let flags = HELP.split(|c: char| c.is_whitespace() || c == ',').filter(|w| w.starts_with("--"));
         for flag in flags.filter(|f| !matches!(*f, "--help" | "--version")) {
             let found = bake(&format!("{flag} ?")).err();
@@ -379,6 +452,13 @@ mod tests {
             ("--camera 1,2,3:1,2,3", "not two finite points"),
             ("--camera 0,0,0:1,2,3:200", "field of view is 200"),
             ("--width 0", "--width is 0, outside 1"),
+            ("a --scene b", "two scenes, \"a\" and \"b\""),
+            ("report", "report needs what to report; there is: live"),
+            ("report dead", "there is no report \"dead\"; there is: live"),
+            ("report live --seconds 0", "--seconds is 0, not a finite number greater than 0"),
+            ("report live --seconds inf", "--seconds is inf"),
+            ("report live --updates 1.5", "--updates is \"1.5\", not a whole number"),
+            ("--updates 5", "--updates is for `report live` alone"),
         ] {
             let e = bake(line).unwrap_err();
             assert!(e.contains(part), "{line}: {e}");

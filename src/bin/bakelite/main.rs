@@ -1,4 +1,5 @@
-//! The command line: bakes a scene, writes its light maps and compares pictures of it.
+//! The command line: bakes a scene, writes its light maps and compares pictures of it; measures
+//! live updates.
 //!
 //! | file | what it does |
 //! |---|---|
@@ -8,13 +9,17 @@
 //! | `pictures`, `font` | the three pictures that the thesis compares |
 //! | `output` | light map pages and the scene as files |
 //! | `table`, `report` | what a run took, for people and for programs |
+//! | `live_measure`, `live_report`, `plot` | live updates: measurements, tables, plots |
 
 mod args;
 mod bar;
 mod camera;
 mod font;
+mod live_measure;
+mod live_report;
 mod output;
 mod pictures;
+mod plot;
 mod report;
 mod table;
 
@@ -36,24 +41,30 @@ use table::Stage;
 const USAGE: u8 = 2;
 
 fn main() -> ExitCode {
-    match args::parse(std::env::args_os().skip(1)) {
-        Ok(Command::Help) => print!("{}", args::HELP),
-        Ok(Command::Version) => println!("bakelite {}", env!("CARGO_PKG_VERSION")),
-        Ok(Command::Bake(bake)) => {
-            if let Err(e) = Job::new(&bake).run() {
-                eprintln!("bakelite: {e}");
-                return ExitCode::from(if matches!(e, Error::InvalidArgument(_)) { USAGE } else { 1 });
-            }
+    let result = match args::parse(std::env::args_os().skip(1)) {
+        Ok(Command::Help) => {
+            print!("{}", args::HELP);
+            Ok(())
         }
+        Ok(Command::Version) => {
+            println!("bakelite {}", env!("CARGO_PKG_VERSION"));
+            Ok(())
+        }
+        Ok(Command::Bake(bake)) => Job::new(&bake).run(),
+        Ok(Command::ReportLive(report)) => live_report::run(&report),
         Err(e) => {
             eprintln!("bakelite: {e}\nTry bakelite --help");
             return ExitCode::from(USAGE);
         }
+    };
+    if let Err(e) = result {
+        eprintln!("bakelite: {e}");
+        return ExitCode::from(if matches!(e, Error::InvalidArgument(_)) { USAGE } else { 1 });
     }
     ExitCode::SUCCESS
 }
 
-/// One run of `bakelite bake`.
+/// One run of `bakelite bake`, whose first steps are those of other commands too.
 struct Job<'a> {
     args: &'a BakeArgs,
     bars: Bars,
@@ -71,9 +82,7 @@ impl<'a> Job<'a> {
     fn run(mut self) -> Result<()> {
         let start = Instant::now();
         output::make_folder(&self.args.out)?;
-        let data = self.load()?;
-        let scene = self.commit(data)?;
-        let mut lightmap = self.layout(&scene)?;
+        let mut lightmap = self.unbaked()?;
         let bake = self.bake(&mut lightmap)?;
         self.write_maps(&lightmap)?;
         let camera = self.camera(&lightmap);
@@ -99,6 +108,13 @@ impl<'a> Job<'a> {
             self.print(&lightmap, pictures.as_ref(), seconds);
         }
         Ok(())
+    }
+
+    /// The light map of the scene, without light.
+    fn unbaked(&mut self) -> Result<Lightmap> {
+        let data = self.load()?;
+        let scene = self.commit(data)?;
+        self.layout(&scene)
     }
 
     /// Reads or makes the scene and adds the lights of the command line.

@@ -189,7 +189,7 @@ fn radiance(scene: &Scene, ray: &Ray, seed: u32, irradiance: impl Fn(&Seen) -> V
 }
 
 /// The rays of a pinhole camera.
-struct PrimaryRays {
+pub struct PrimaryRays {
     position: Vec3,
     forward: Vec3,
     /// To the right and down, from the middle of the image to its border.
@@ -200,7 +200,7 @@ struct PrimaryRays {
 }
 
 impl PrimaryRays {
-    fn new(camera: &Camera, width: usize, height: usize) -> Self {
+    pub fn new(camera: &Camera, width: usize, height: usize) -> Self {
         let forward = (camera.target - camera.position).normalize();
         let right = forward.cross(camera.up).normalize();
         let half = (0.5 * camera.fov_y).tan();
@@ -210,7 +210,7 @@ impl PrimaryRays {
     }
 
     /// Spread evenly over a pixel.
-    fn of_pixel(&self, x: usize, y: usize) -> impl Iterator<Item = Ray> {
+    pub fn of_pixel(&self, x: usize, y: usize) -> impl Iterator<Item = Ray> {
         let seed = combine(y as u32, x as u32);
         (0..PRIMARY_RAYS).map(move |k| {
             let [dx, dy] = sobol_2d(k, seed);

@@ -1,0 +1,392 @@
+//! `bakelite report live`: measures live updates of a scene and writes tables, plots and figures.
+
+use crate::Job;
+use crate::args::{BakeArgs, ReportArgs};
+use crate::live_measure::{CHANGE_INTERVAL, Curve, FOLLOW_MS, Frame, MODES, ModeRun, Point, Seen, Walk, Watch};
+use crate::live_measure::{bake, live_camera, moved_light, ray_count, walk};
+use crate::output;
+use crate::pictures::percent;
+use crate::plot::{Plot, Series};
+use bakelite::lightmap::{BakeParams, Lightmap};
+use bakelite::live::LiveParams;
+use bakelite::scene::Camera;
+use bakelite::{Error, Light, Result};
+use std::fmt::Write;
+
+/// Gather rays of the bakes that updates are compared with.
+const BAKE_RAYS: [u32; 5] = [64, 128, 256, 512, 1024];
+
+/// Gather rays of the references.
+const REFERENCE_RAYS: u32 = 4096;
+
+/// Rounds of live updates whose errors are followed: they end with as many rays as the last bake.
+const ROUNDS: u32 = 16;
+
+/// Rounds on walks, so many that work remains.
+const WALK_ROUNDS: u32 = 1024;
+
+const BUDGETS_MS: [f32; 4] = [1.0, 2.0, 4.0, 8.0];
+
+const THREADS: [usize; 2] = [1, 2];
+
+/// Errors that people ask for.
+const GOALS: [f64; 2] = [0.1, 0.01];
+
+/// Of a texel that is uploaded as RGBA of half floats.
+const TEXEL_BYTES: u64 = 8;
+
+/// The errors under one light.
+struct Phase {
+    /// In file names and in `live-errors.csv`.
+    name: &'static str,
+    title: String,
+    curves: Vec<Curve>,
+}
+
+/// All that is measured.
+struct Measured {
+    phases: Vec<Phase>,
+    runs: Vec<ModeRun>,
+    walks: Vec<Walk>,
+    /// What was done to light 0.
+    change: Option<String>,
+    seen: usize,
+}
+
+/// Runs the report.
+pub fn run(args: &ReportArgs) -> Result<()> {
+    output::make_folder(&args.bake.out)?;
+    let mut job = Job::new(&args.bake);
+    let mut lightmap = job.unbaked()?;
+    let (mut measured, camera) = errors(&job, args, &mut lightmap)?;
+    if args.updates > 0 {
+        measured.walks = walks(&job, args, &camera)?;
+    }
+    let mut names = Vec::new();
+    let mut save = |name: String, text: &str| -> Result<()> {
+        let path = args.bake.out.join(&name);
+        names.push(name);
+        std::fs::write(&path, text).map_err(|e| Error::Io(format!("{}: {e}", path.display())))
+    };
+    save("live.md".into(), &markdown(args, &lightmap, &camera, &measured))?;
+    save("live-errors.csv".into(), &errors_csv(&measured.phases))?;
+    if args.updates > 0 {
+        save("live-updates.csv".into(), &updates_csv(&measured.walks))?;
+    }
+    for phase in &measured.phases {
+        for axis in [TIME, RAYS] {
+            save(plot_name(phase, &axis), &plot(phase, &axis))?;
+        }
+    }
+    if !args.bake.quiet {
+        println!("Wrote to {}: {}", args.bake.out.display(), names.join(", "));
+    }
+    Ok(())
+}
+
+fn live_params(params: &BakeParams) -> LiveParams {
+    LiveParams {
+        max_rounds: ROUNDS,
+        blur: params.blur_radius,
+        seed: params.seed,
+        photon_count: params.photon_count,
+        max_bounces: params.max_bounces,
+        direct_samples: params.direct_samples,
+        radius: params.radius,
+        ..Default::default()
+    }
+}
+
+fn aspect(args: &BakeArgs) -> f32 {
+    args.width as f32 / args.height as f32
+}
+
+/// Follows the error of visible texels, from nothing and after light 0 has moved.
+fn errors(job: &Job, args: &ReportArgs, lightmap: &mut Lightmap) -> Result<(Measured, Camera)> {
+    let params = args.bake.params;
+    let reference_params = BakeParams { gather_rays: REFERENCE_RAYS, ..params };
+    job.bars.show("reference", |p| lightmap.bake(&reference_params, p))?;
+    let camera = job.camera(lightmap);
+    let seen = Seen::new(lightmap, &camera, aspect(&args.bake))?;
+    let reference = seen.of_bake(lightmap)?;
+    if reference.iter().flatten().all(|&c| c == 0.0) {
+        return Err(Error::InvalidArgument("the camera sees nothing that is lit; give another with --camera".into()));
+    }
+    let bakes = |lightmap: &mut Lightmap, reference: &[[f32; 3]]| -> Result<Curve> {
+        let one = |gather_rays| bake(lightmap, &BakeParams { gather_rays, ..params }, &seen, reference);
+        Ok(Curve { name: "bakes", points: BAKE_RAYS.into_iter().map(one).collect::<Result<_>>()? })
+    };
+    job.bars.say("bakes to compare with");
+    let mut phases =
+        vec![Phase { name: "start", title: "From nothing".into(), curves: vec![bakes(lightmap, &reference)?] }];
+
+    let (moved, change) = moved_light(lightmap.scene(), args.bake.up).unzip();
+    let mut moved_reference: Option<(Light, Vec<[f32; 3]>)> = None;
+    if let Some(moved) = moved {
+        let original = lightmap.scene().lights()[0];
+        lightmap.scene().set_light(0, moved)?;
+        job.bars.show("reference", |p| lightmap.bake(&reference_params, p))?;
+        let reference = seen.of_bake(lightmap)?;
+        job.bars.say("bakes to compare with");
+        let curves = vec![bakes(lightmap, &reference)?];
+        lightmap.scene().set_light(0, original)?;
+        phases.push(Phase { name: "moved", title: "After a light has moved".into(), curves });
+        moved_reference = Some((moved, reference));
+    }
+
+    let watch = Watch { seen: &seen, camera: live_camera(&camera, aspect(&args.bake)), seconds: args.seconds };
+    let mut runs = Vec::new();
+    for (mode, name) in MODES {
+        job.bars.say(&format!("{name} updates"));
+        let params = LiveParams { mode, ..live_params(&params) };
+        let after = moved_reference.as_ref().map(|(light, reference)| (*light, &reference[..]));
+        let mut run = watch.run(lightmap, &params, &reference, after)?;
+        phases[0].curves.push(Curve { name, points: std::mem::take(&mut run.from_nothing) });
+        if let Some(points) = run.after_move.take() {
+            phases[1].curves.push(Curve { name, points });
+        }
+        runs.push(run);
+    }
+    Ok((Measured { phases, runs, walks: Vec::new(), change, seen: seen.count() }, camera))
+}
+
+/// Walks with all budgets, in fresh states, on one thread and on two.
+fn walks(job: &Job, args: &ReportArgs, camera: &Camera) -> Result<Vec<Walk>> {
+    let mut walks = Vec::new();
+    for threads in THREADS {
+        // Threads belong to the device, and so does the scene.
+        let again = BakeArgs { threads, quiet: true, ..args.bake.clone() };
+        let lightmap = Job::new(&again).unbaked()?;
+        let params = LiveParams { max_rounds: WALK_ROUNDS, ..live_params(&args.bake.params) };
+        for budget in BUDGETS_MS {
+            job.bars.say(&format!("{} updates of {budget} ms, threads: {threads}", args.updates));
+            walks.push(walk(&lightmap, &params, &live_camera(camera, aspect(&args.bake)), budget, args.updates)?);
+        }
+    }
+    Ok(walks)
+}
+
+/// What errors are plotted against.
+struct Horizontal {
+    name: &'static str,
+    label: &'static str,
+    value: fn(&Point) -> f64,
+}
+
+const TIME: Horizontal = Horizontal { name: "time", label: "seconds", value: |p| p.seconds };
+const RAYS: Horizontal =
+    Horizontal { name: "rays", label: "gather, shadow and primary rays", value: |p| p.rays as f64 };
+
+fn plot_name(phase: &Phase, axis: &Horizontal) -> String {
+    format!("live-{}-{}.svg", phase.name, axis.name)
+}
+
+fn plot(phase: &Phase, axis: &Horizontal) -> String {
+    let points = |c: &Curve| c.points.iter().map(|p| [(axis.value)(p), p.error]).collect();
+    let series = phase.curves.iter().map(|c| Series { name: c.name, points: points(c) }).collect();
+    Plot { title: &phase.title, x_label: axis.label, y_label: "relative error of visible texels", series }.svg()
+}
+
+fn errors_csv(phases: &[Phase]) -> String {
+    let mut out = String::from("phase,series,seconds,rays,error\n");
+    for phase in phases {
+        for curve in &phase.curves {
+            for p in &curve.points {
+                let (phase, curve) = (phase.name, curve.name);
+                let _ = writeln!(out, "{phase},{curve},{:.6},{},{:.6}", p.seconds, p.rays, p.error);
+            }
+        }
+    }
+    out
+}
+
+fn updates_csv(walks: &[Walk]) -> String {
+    let mut out =
+        String::from("threads,budget_ms,update,used_ms,relighting,work_left,dirty_rects,dirty_bytes,read_ms\n");
+    for walk in walks {
+        for (i, f) in walk.frames.iter().enumerate() {
+            let (threads, budget, bytes) = (walk.threads, walk.budget_ms, f.texels * TEXEL_BYTES);
+            let (relighting, work) = (f.relighting as u8, f.has_work as u8);
+            let (used, rects, read) = (f.used_ms, f.rects, f.read_ms);
+            let _ = writeln!(out, "{threads},{budget},{i},{used:.4},{relighting},{work},{rects},{bytes},{read:.4}");
+        }
+    }
+    out
+}
+
+/// Median, 99th percentile and maximum (nearest rank), as cells of a table.
+fn spread(values: impl Iterator<Item = f64>, digits: usize) -> String {
+    let mut sorted: Vec<f64> = values.collect();
+    sorted.sort_unstable_by(f64::total_cmp);
+    let Some(&max) = sorted.last() else { return "– | – | –".into() };
+    let rank = |part: f64| sorted[((part * sorted.len() as f64).ceil() as usize).max(1) - 1];
+    format!("{:.digits$} | {:.digits$} | {max:.digits$}", rank(0.5), rank(0.99))
+}
+
+fn markdown(args: &ReportArgs, lightmap: &Lightmap, camera: &Camera, measured: &Measured) -> String {
+    let mut out = introduction(args, lightmap, camera, measured);
+    for phase in &measured.phases {
+        let _ = writeln!(out, "## {}\n", phase.title);
+        if let (true, Some(change)) = (phase.name == "moved", &measured.change) {
+            let _ = writeln!(
+                out,
+                "Light 0 {change}. Time and rays count from `light_changed`; bakes are those of the whole light map \
+                 under the new light. While indirect light is being recomputed in the background, measuring errors \
+                 counts as time.\n"
+            );
+        }
+        errors_table(&mut out, phase);
+    }
+    if measured.change.is_none() {
+        out.push_str("## After a light has moved\n\nNot measured: the scene has no lights but emissive materials.\n\n");
+    }
+    if !measured.walks.is_empty() {
+        walk_tables(&mut out, args, &measured.walks);
+    }
+    memory_table(&mut out, &measured.runs);
+    out
+}
+
+fn introduction(args: &ReportArgs, lightmap: &Lightmap, camera: &Camera, measured: &Measured) -> String {
+    let (scene, info, params) = (lightmap.scene(), lightmap.info(), &args.bake.params);
+    // The folders of a scene say more about the machine than about the scene.
+    let path = std::path::Path::new(&args.bake.scene);
+    let name = path.file_name().map_or(args.bake.scene.clone(), |n| n.to_string_lossy().into_owned());
+    let device = scene.device();
+    let (position, target) = (camera.position, camera.target);
+    format!(
+        "# Live updates: {name}\n\n\
+         {triangles} triangles, {texels} texels ({gather} of them gather) on {pages} pages of {width} × {height}; \
+         {lights} lights, {emitters} emissive triangles; {photons} photons, {samples} shadow rays per area light, \
+         blur {blur}, seed {seed}; threads: {threads}, {isa}. Camera at {position}, looking at {target}.\n\n\
+         Errors are those of irradiance as shown, direct and indirect: the root of the sum of squared differences over \
+         the sum of the reference's squares, at the texels that {seen} of {rays} primary rays hit. The \
+         reference is a bake with {REFERENCE_RAYS} gather rays and otherwise the same parameters, blur and photons \
+         included: what is left is the noise of gathering. As its first rays are those of the others, errors are \
+         slightly too small, by about an eighth with {last} rays. Rays are those for gathering, for direct light \
+         and, in live updates, for what the camera sees; those of photons and radiance map are left out. Live updates \
+         are of {FOLLOW_MS} ms, with at most {ROUNDS} rounds of 64 rays per texel; their time includes that of \
+         creating the live state but not that of measuring errors. They end when all that is seen is finished, or \
+         after {seconds} s.\n\n",
+        triangles = scene.stats().triangles,
+        texels = info.texels,
+        gather = info.gather_texels,
+        pages = info.page_count,
+        width = info.width,
+        height = info.height,
+        lights = scene.lights().len(),
+        emitters = scene.emitters().len(),
+        photons = params.photon_count,
+        samples = params.direct_samples,
+        blur = params.blur_radius,
+        seed = params.seed,
+        threads = device.num_threads(),
+        isa = device.isa().name(),
+        seen = measured.seen,
+        last = ROUNDS * 64,
+        seconds = args.seconds,
+        rays = ray_count(aspect(&args.bake)),
+    )
+}
+
+fn errors_table(out: &mut String, phase: &Phase) {
+    let goals = GOALS.map(|g| format!("to {:.0}%", 100.0 * g));
+    let _ = writeln!(out, "| | {} | {} | first error | last error |", goals[0], goals[1]);
+    out.push_str("|---|---|---|---|---|\n");
+    let work = |p: &Point| format!("{:.3} s, {:.2} Mrays", p.seconds, p.rays as f64 * 1e-6);
+    for curve in &phase.curves {
+        let cells = GOALS.map(|goal| match curve.first_within(goal) {
+            Some(p) => work(p),
+            None => format!("not reached: best {}", percent(curve.best())),
+        });
+        let end = |p: Option<&Point>| p.map_or("–".into(), |p| format!("{} at {}", percent(p.error), work(p)));
+        let (first, last) = (end(curve.points.first()), end(curve.points.last()));
+        let _ = writeln!(out, "| {} | {} | {} | {first} | {last} |", curve.name, cells[0], cells[1]);
+    }
+    for axis in [TIME, RAYS] {
+        let _ = write!(out, "\n![error against {}]({})\n", axis.name, plot_name(phase, &axis));
+    }
+    out.push('\n');
+}
+
+fn walk_tables(out: &mut String, args: &ReportArgs, walks: &[Walk]) {
+    let change = walks.iter().map(|w| w.change_ms).fold(0.0, f64::max);
+    let _ = writeln!(
+        out,
+        "## Keeping to the budget\n\n\
+         {} view-based updates per budget, with a camera that walks a small circle and looks to and fro. {} Overshoot \
+         is the wall time of a call less its budget, in ms; *in need* are the updates that took longer than their \
+         budget while something seen was left to do; *calm* are those without indirect light being recomputed beside \
+         them, on one more thread.\n",
+        args.updates,
+        if change > 0.0 {
+            format!("Every {CHANGE_INTERVAL} updates a light is said to have changed, which took up to {change:.2} ms.")
+        } else {
+            "No light changes.".into()
+        },
+    );
+    out.push_str("| threads | budget | p50 | p99 | max | in need | p50 | p99 | max | calm | p50 | p99 | max |\n");
+    out.push_str("|---|---|---|---|---|---|---|---|---|---|---|---|---|\n");
+    for walk in walks {
+        let over = |f: &Frame| f.used_ms - walk.budget_ms as f64;
+        let cells = |of: &dyn Fn(&&Frame) -> bool| {
+            let chosen: Vec<&Frame> = walk.frames.iter().filter(of).collect();
+            let part = chosen.len() as f64 / walk.frames.len() as f64;
+            format!("{} | {}", percent(part), spread(chosen.into_iter().map(over), 3))
+        };
+        let all = spread(walk.frames.iter().map(over), 3);
+        let (need, calm) = (cells(&|f| f.has_work && over(f) > 0.0), cells(&|f| !f.relighting));
+        let _ = writeln!(out, "| {} | {} ms | {all} | {need} | {calm} |", walk.threads, walk.budget_ms);
+    }
+    let _ = writeln!(
+        out,
+        "\n## What changes per update\n\n\
+         Dirty rectangles after each of these updates, the bytes of their texels as RGBA of half floats, and the time \
+         that `read` takes for all of them.\n"
+    );
+    out.push_str("| threads | budget | rectangles p50 | p99 | max | KB p50 | p99 | max | read ms p50 | p99 | max |\n");
+    out.push_str("|---|---|---|---|---|---|---|---|---|---|---|\n");
+    for walk in walks {
+        let frames = || walk.frames.iter();
+        let rects = spread(frames().map(|f| f.rects as f64), 0);
+        let bytes = spread(frames().map(|f| (f.texels * TEXEL_BYTES) as f64 * 1e-3), 1);
+        let read = spread(frames().map(|f| f.read_ms), 3);
+        let _ = writeln!(out, "| {} | {} ms | {rects} | {bytes} | {read} |", walk.threads, walk.budget_ms);
+    }
+    out.push('\n');
+}
+
+fn memory_table(out: &mut String, runs: &[ModeRun]) {
+    out.push_str(
+        "## Memory\n\nOf the live state, in MB: when it has been created, after the updates above, and with all LODs \
+         allocated everywhere.\n\n| | at first | in the end | all |\n|---|---|---|---|\n",
+    );
+    let mb = |bytes: u64| bytes as f64 * 1e-6;
+    for ((_, name), run) in MODES.iter().zip(runs) {
+        let [first, last] = &run.stats;
+        let _ =
+            writeln!(out, "| {name} | {:.2} | {:.2} | {:.2} |", mb(first.bytes), mb(last.bytes), mb(last.bytes_full));
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn percentiles_are_by_nearest_rank() {
+        assert_eq!(spread((1..=100).rev().map(f64::from), 0), "50 | 99 | 100");
+        assert_eq!(spread([2.5].into_iter(), 1), "2.5 | 2.5 | 2.5");
+        assert_eq!(spread([].into_iter(), 1), "– | – | –");
+    }
+
+    #[test]
+    fn a_goal_is_reached_at_the_first_point_within_it() {
+        let point = |seconds, error| Point { seconds, rays: 1_500_000, error };
+        let points = vec![point(0.5, 0.2), point(1.0, 0.1), point(2.0, 0.05)];
+        let phase = Phase { name: "start", title: String::new(), curves: vec![Curve { name: "a", points }] };
+        let mut out = String::new();
+        errors_table(&mut out, &phase);
+        assert!(out.contains("| a | 1.000 s, 1.50 Mrays | not reached: best 5.00% | 20.00% at 0.500 s"), "{out}");
+    }
+}
