@@ -92,8 +92,11 @@ pub(super) struct Block {
     pub gathered: Vec<Gathered>,
     /// Light of an earlier epoch, by texel, that fades out while new rays come in; may be empty.
     pub prior: Box<[Vec3]>,
-    /// The LOD whose texels have all been gathered, and how many rounds they have.
+    /// The highest LOD whose texels have all been gathered, under whatever light.
     pub lod: u8,
+    /// The LOD whose texels have all been gathered under the light of now, at most `lod`, and how many
+    /// rounds they have.
+    pub fresh_lod: u8,
     pub rounds: u16,
     /// The next texel of the step under way.
     pub cursor: u16,

@@ -8,7 +8,9 @@ use super::{LiveCamera, Mode};
 use crate::sampling::{combine, mix};
 use std::cmp::Ordering;
 
-/// Urgency of wrong direct light, which is what is seen first; that of missing detail is about 1.
+/// Urgency of indirect light of another time, which a few rays mend, and of missing direct light;
+/// that of missing detail is about 1.
+const OLD_LIGHT: f32 = 1000.0;
 const WRONG_DIRECT: f32 = 100.0;
 
 /// What choosing needs to remember.
@@ -108,7 +110,11 @@ impl Chooser {
             Mode::View => {
                 let urgency = |b: u32| {
                     let block = &from.blocks[b as usize];
-                    let error = if block.has_direct(from.context) { block.error.max(1e-4) } else { WRONG_DIRECT };
+                    let error = match () {
+                        _ if block.has_old_light(from.context) => OLD_LIGHT,
+                        _ if !block.has_direct(from.context) => WRONG_DIRECT,
+                        _ => block.error.max(1e-4),
+                    };
                     from.visibility.mark(b) * error
                 };
                 let open = from.visibility.seen.iter().filter(|&&b| self.is_open(b));
@@ -141,7 +147,9 @@ impl Chooser {
         let top = from.context.map.top() as u32;
         let progress = |b: u32| {
             let block = &from.blocks[b as usize];
-            block.lod as u32 + if block.lod as u32 == top { block.rounds as u32 } else { 0 }
+            let is_new = !block.has_old_light(from.context) as u32;
+            let rounds = if block.fresh_lod as u32 == top { block.rounds as u32 } else { 0 };
+            is_new * (1 + block.fresh_lod as u32 + rounds)
         };
         let info = &from.grid.info;
         let mut cells = Vec::new();

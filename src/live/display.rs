@@ -34,6 +34,11 @@ pub(super) struct Display {
     unseen: HashMap<u32, Vec<u32>>,
     /// The LOD in use, by block: that of the work, or less until the block's cell is promoted.
     pub lods: Vec<u8>,
+    /// The LOD whose texels have light of now, by block, at most that in use.
+    fresh: Vec<u8>,
+    /// Indirect irradiance before the last change of light. What the fresh texels differ from it by is
+    /// interpolated and added to it, which keeps its detail. Empty until light changes.
+    old: Vec<Vec3>,
     /// Direct light at full resolution, by block.
     tiles: Vec<Option<DirectTile>>,
     /// Whether the tile was made under the lights of now.
@@ -69,6 +74,8 @@ impl Display {
             visible,
             unseen: HashMap::new(),
             lods: vec![0; map.tiles.len()],
+            fresh: vec![0; map.tiles.len()],
+            old: Vec::new(),
             tiles: vec![None; map.tiles.len()],
             is_current: vec![false; map.tiles.len()],
             blur: blur as i32,
@@ -78,7 +85,7 @@ impl Display {
     /// Bytes held, without the tiles.
     pub fn bytes(&self) -> usize {
         let per_texel = 4 * size_of::<Vec3>() + 1;
-        let per_block = size_of::<Option<DirectTile>>() + 2;
+        let per_block = size_of::<Option<DirectTile>>() + 3;
         self.plain.len() * per_texel + self.coarse_of_tile.len() * size_of::<Vec3>() + self.lods.len() * per_block
     }
 
@@ -86,7 +93,9 @@ impl Display {
     pub fn refresh(&mut self, map: &BlockMap, blocks: &[Block], changed: &[u32]) -> Vec<Changed> {
         for &b in changed {
             let (tile, block) = (&map.tiles[b as usize], &blocks[b as usize]);
-            for i in 0..tile.lod_end[self.lods[b as usize] as usize] as usize {
+            let fresh = block.fresh_lod.min(self.lods[b as usize]);
+            self.fresh[b as usize] = fresh;
+            for i in 0..tile.lod_end[fresh as usize] as usize {
                 if let Some(value) = block.estimate(i) {
                     self.plain[tile.texels[i] as usize] = value;
                 }
@@ -103,14 +112,20 @@ impl Display {
         // Neighbours that interpolate do so between texels of these blocks too.
         let mut all = changed.to_vec();
         for &b in changed {
-            all.extend(map.neighbours(b).filter(|&n| self.lods[n as usize] < top));
+            all.extend(map.neighbours(b).filter(|&n| self.fresh[n as usize] < top));
         }
         all.sort_unstable();
         all.dedup();
         let interpolate = |&b: &u32| -> Vec<(u32, Vec3)> {
-            let (tile, lod) = (&map.tiles[b as usize], self.lods[b as usize]);
-            let known = |s: u32, x, y| map.lod_of[s as usize] <= self.lods[map.block_at(tile.chart, x, y) as usize];
-            let value = |s: u32| self.interpolate(map, b, lod, s, &self.plain, known);
+            let (tile, lod) = (&map.tiles[b as usize], self.fresh[b as usize]);
+            let known = |s: u32, x, y| map.lod_of[s as usize] <= self.fresh[map.block_at(tile.chart, x, y) as usize];
+            let value = |s: u32| {
+                if self.old.is_empty() {
+                    return self.interpolate(map, b, lod, s, known, |s| self.plain[s]);
+                }
+                let change = self.interpolate(map, b, lod, s, known, |s| self.plain[s] - self.old[s]);
+                (self.old[s as usize] + change).max(Vec3::ZERO)
+            };
             tile.texels[tile.lod_end[lod as usize] as usize..].iter().map(|&s| (s, value(s))).collect()
         };
         let interpolated: Vec<(u32, Vec3)> = all.par_iter().flat_map_iter(interpolate).collect();
@@ -158,6 +173,8 @@ impl Display {
     pub fn lowered(&self, map: &BlockMap, lod: u8) -> Display {
         let mut lower = self.clone();
         lower.lods.iter_mut().for_each(|l| *l = lod.min(*l));
+        lower.fresh.iter_mut().for_each(|l| *l = lod.min(*l));
+        lower.old = Vec::new();
         let all: Vec<u32> = (0..map.tiles.len() as u32).collect();
         map.atlas.scene.device().install(|| lower.spread(map, &all));
         lower
@@ -195,8 +212,8 @@ impl Display {
         b: u32,
         lod: u8,
         sample: u32,
-        values: &[Vec3],
         known: impl Fn(u32, i32, i32) -> bool,
+        values: impl Fn(usize) -> Vec3,
     ) -> Vec3 {
         let (tile, gather) = (&map.tiles[b as usize], &map.atlas.gather);
         let (x, y) = gather.position(sample as usize);
@@ -213,7 +230,7 @@ impl Display {
         ] {
             let s = gather.at(tile.chart, cx, cy);
             if w > 0.0 && s != NONE && self.visible[s as usize] && known(s, cx, cy) {
-                sum += w * values[s as usize];
+                sum += w * values(s as usize);
                 total += w;
             }
         }
@@ -224,10 +241,15 @@ impl Display {
             let (sx, sy) = gather.position(s as usize);
             let weight = if self.visible[s as usize] { 1.0 } else { 1e-3 };
             let w = weight / ((sx - x).pow(2) + (sy - y).pow(2)).max(1) as f32;
-            sum += w * values[s as usize];
+            sum += w * values(s as usize);
             total += w;
         }
         if total > 0.0 { sum / total } else { Vec3::ZERO }
+    }
+
+    /// Keeps what is shown as the light of before a change.
+    pub fn begin_indirect_epoch(&mut self) {
+        self.old.clone_from(&self.plain);
     }
 
     /// Has tiles that were made under other lights than those of now corrected by coarse light.
@@ -253,7 +275,7 @@ impl Display {
         let others = |&b: &u32| -> Vec<(u32, Vec3)> {
             let tile = &map.tiles[b as usize];
             let lowest = |s: u32, _, _| map.lod_of[s as usize] == 0;
-            let value = |s: u32| self.interpolate(map, b, 0, s, &self.coarse, lowest);
+            let value = |s: u32| self.interpolate(map, b, 0, s, lowest, |s| self.coarse[s]);
             tile.texels[tile.lod_end[0] as usize..].iter().map(|&s| (s, value(s))).collect()
         };
         let others: Vec<(u32, Vec3)> = all.par_iter().flat_map_iter(others).collect();

@@ -494,7 +494,7 @@ impl Live {
         let cell = self.context.map.tiles[b as usize].cell;
         let lod = self.blocks[b as usize].lod;
         let common = self.promotion.note(b, cell, lod);
-        if self.params.mode != Mode::Position || lod == self.display.lods[b as usize] {
+        if self.params.mode != Mode::Position {
             self.display.lods[b as usize] = lod;
             self.wait(b);
         } else if let Some(common) = common {
@@ -504,6 +504,8 @@ impl Live {
                 self.display.lods[b as usize] = common;
                 self.wait(b);
             }
+        } else if self.blocks[b as usize].fresh_lod <= self.display.lods[b as usize] {
+            self.wait(b);
         }
     }
 
@@ -553,6 +555,11 @@ impl Live {
         Ok(())
     }
 
+    fn grow_fixed(&mut self, bytes: usize) {
+        self.fixed += bytes;
+        self.bytes_full += bytes as u64;
+    }
+
     /// Takes new indirect light over, if there is any.
     fn take_new_light(&mut self) -> Result<bool> {
         if self.paused {
@@ -560,6 +567,9 @@ impl Live {
         }
         let Some(new) = self.relight.poll(&self.context.map.atlas, &self.bake)? else { return Ok(false) };
         self.context.light = Arc::new(self.context.light.renewed(new));
+        let bytes = self.display.bytes();
+        self.display.begin_indirect_epoch();
+        self.grow_fixed(self.display.bytes() - bytes);
         self.chooser.note_all(&self.context, &self.blocks);
         Ok(true)
     }
@@ -651,8 +661,7 @@ impl Live {
         self.collect()?;
         let bytes = self.display.bytes();
         self.display.begin_direct_epoch();
-        let grown = self.display.bytes() - bytes;
-        (self.fixed, self.bytes_full) = (self.fixed + grown, self.bytes_full + grown as u64);
+        self.grow_fixed(self.display.bytes() - bytes);
         self.relight.start(&self.context.map.atlas, &self.bake)?;
         self.lights = lights;
         self.context.light = Arc::new(Illumination {

@@ -116,8 +116,8 @@ impl Live {
         let fresh = Block::default();
         let block = &self.blocks[b as usize];
         // What was gathered under an earlier light is left out.
-        let block = if block.indirect_epoch == self.context.light.indirect_epoch { block } else { &fresh };
-        out.extend([block.lod, self.display.lods[b as usize].min(block.lod)]);
+        let block = if block.has_old_light(&self.context) { &fresh } else { block };
+        out.extend([block.fresh_lod, self.display.lods[b as usize].min(block.fresh_lod)]);
         for n in [block.rounds, block.cursor, block.gathered.len() as u16] {
             out.extend(n.to_le_bytes());
         }
@@ -186,7 +186,16 @@ impl Live {
         }
         let direct = (0..values).map(|_| from.vec3()).collect::<Option<Box<[Vec3]>>>()?;
         Some(Saved {
-            block: Block { lod, rounds, cursor, gathered, deviations, deviation_count, ..Default::default() },
+            block: Block {
+                lod,
+                fresh_lod: lod,
+                rounds,
+                cursor,
+                gathered,
+                deviations,
+                deviation_count,
+                ..Default::default()
+            },
             shown,
             direct: (values > 0).then_some(direct),
         })

@@ -17,6 +17,10 @@ use std::time::Instant;
 /// Shadow rays per area light for coarse direct light, at most.
 const COARSE_SAMPLES: u32 = 4;
 
+/// Weight of old light beside the first round of rays under new light. More would hide the noise of
+/// that round, but old light is mostly further from the truth.
+const PRIOR_WEIGHT: f32 = 0.25;
+
 /// What all work on blocks reads.
 #[derive(Clone)]
 pub(super) struct Context {
@@ -87,10 +91,10 @@ impl Block {
         if !c.light.has_indirect {
             None
         } else if self.indirect_epoch != c.light.indirect_epoch || self.gathered.is_empty() {
-            // New light: what is shown first.
-            Some((self.lod, c.promote_threshold))
-        } else if self.lod < top {
-            Some((self.lod + 1, c.promote_threshold))
+            // New light: a little of it everywhere first.
+            Some((0, c.promote_threshold))
+        } else if self.fresh_lod < top {
+            Some((self.fresh_lod + 1, c.promote_threshold))
         } else if (self.rounds as u32) < c.max_rounds {
             Some((top, self.rounds as u32 + 1))
         } else {
@@ -106,6 +110,11 @@ impl Block {
     /// Whether direct light is known at full resolution under the light of now.
     pub fn has_direct(&self, c: &Context) -> bool {
         self.direct_epoch == c.light.direct_epoch && self.direct_work.is_none()
+    }
+
+    /// Whether its indirect light is of an earlier epoch altogether.
+    pub fn has_old_light(&self, c: &Context) -> bool {
+        c.light.has_indirect && self.indirect_epoch != c.light.indirect_epoch
     }
 
     /// Changes of the lights since the coarse direct light was computed.
@@ -124,6 +133,11 @@ impl Block {
             done.coarse = true;
         }
         if step == Step::Coarse {
+            return done;
+        }
+        if self.has_old_light(c) {
+            // The first few rays change more, for less, than direct light at full resolution does.
+            done.indirect = self.work_on_indirect(c, tile, limit);
             return done;
         }
         if !self.has_direct(c) {
@@ -166,7 +180,8 @@ impl Block {
             self.cursor += 1;
         }
         self.cursor = 0;
-        self.lod = lod;
+        self.fresh_lod = lod;
+        self.lod = self.lod.max(lod);
         self.rounds = rounds as u16;
         self.error = self.estimate_error(c.map.top());
         true
@@ -179,6 +194,7 @@ impl Block {
         }
         self.gathered.clear();
         self.indirect_epoch = epoch;
+        self.fresh_lod = 0;
         self.rounds = 0;
         self.cursor = 0;
         (self.deviations, self.deviation_count) = (0.0, 0);
@@ -189,9 +205,9 @@ impl Block {
         let prior = self.prior.get(i).copied().filter(|p| p.is_finite());
         let Some(g) = self.gathered.get(i).filter(|g| g.rays > 0) else { return prior };
         let Some(prior) = prior else { return Some(g.irradiance()) };
-        // The prior weighs as much as two rounds and loses that within as many.
+        // The prior loses its weight within two rounds.
         let n = g.rays as f32 / ROUND as f32;
-        let weight = (2.0 - n).max(0.0);
+        let weight = PRIOR_WEIGHT * (2.0 - n).max(0.0);
         Some((prior * weight + g.irradiance() * n) / (weight + n))
     }
 
@@ -202,7 +218,7 @@ impl Block {
 
     /// Drops the prior once it has no weight.
     pub fn drop_faded_prior(&mut self) {
-        if self.rounds >= 2 {
+        if self.rounds >= 2 && self.cursor == 0 {
             self.prior = Box::default();
         }
     }
@@ -234,7 +250,7 @@ impl Block {
             // One round alone tells nothing of its noise; neighbours differ by it at least.
             spread.min(1.0) / (self.rounds.max(1) as f32).sqrt()
         };
-        if self.lod < top { noise + 0.5 * spread.min(1.0) + 0.02 } else { noise }
+        if self.fresh_lod < top { noise + 0.5 * spread.min(1.0) + 0.02 } else { noise }
     }
 
     /// Direct light of the lowest LOD's texels.
