@@ -333,12 +333,14 @@ impl Live {
         let limit = Limit::new(None, u64::MAX);
         let context = self.context.clone();
         let device = self.device();
-        let blocks = &mut self.blocks;
+        let (blocks, top) = (&mut self.blocks, context.map.top());
         device.install(|| {
             (blocks, &context.map.tiles).into_par_iter().try_for_each(|(block, tile)| {
                 if !tile.texels.is_empty() {
                     block.work_on_coarse(&context, tile, &limit);
                     block.work_on_indirect(&context, tile, &limit);
+                    // Texels that lie hidden inside something tell nothing of the others.
+                    while block.lod < top && !block.sees_anything() && block.work_on_indirect(&context, tile, &limit) {}
                 }
                 stage.advance(1)
             })
@@ -348,6 +350,7 @@ impl Live {
         let all: Vec<u32> = (0..self.blocks.len() as u32).collect();
         let (display, blocks) = (&mut self.display, &mut self.blocks);
         device.install(|| display.take_coarse(&context.map, blocks, &all));
+        self.display.lods = self.blocks.iter().map(|b| b.lod).collect();
         self.reserve_for(&[])?;
         self.show_all();
         Ok(())
@@ -522,6 +525,8 @@ impl Live {
             let left = end.map_or(f64::INFINITY, |e| e.saturating_duration_since(start).as_secs_f64());
             let fit = (left / self.refresh_seconds) as usize;
             if fit == 0 {
+                // One slow moment must not keep light from being shown for ever.
+                self.refresh_seconds *= 0.9;
                 return;
             }
             let batch: Vec<u32> = self.waiting.drain(..fit.min(PASS).min(self.waiting.len())).collect();

@@ -176,7 +176,8 @@ impl Live {
         let most = self.params.max_rounds * ROUND as u32;
         let gathered = |from: &mut Reader| {
             let g = Gathered { sum: from.vec3()?, rays: from.u32()?, backs: from.u32()? };
-            (g.sum.is_finite() && g.rays <= most && g.rays % ROUND as u32 == 0 && g.backs <= g.rays).then_some(g)
+            (g.sum.is_finite() && g.rays <= most && g.rays.is_multiple_of(ROUND as u32) && g.backs <= g.rays)
+                .then_some(g)
         };
         let gathered = (0..count).map(|_| gathered(from)).collect::<Option<Vec<_>>>()?;
         let values = from.u32()? as usize;

@@ -216,6 +216,11 @@ impl Block {
         self.gathered.get(i).is_none_or(|g| g.is_visible())
     }
 
+    /// Whether any texel gathered so far can be seen.
+    pub fn sees_anything(&self) -> bool {
+        self.gathered.iter().any(Gathered::is_visible)
+    }
+
     /// Drops the prior once it has no weight.
     pub fn drop_faded_prior(&mut self) {
         if self.rounds >= 2 && self.cursor == 0 {
@@ -241,7 +246,8 @@ impl Block {
         let n = values().count().max(1) as f32;
         let mean = values().sum::<f32>() / n;
         if !(mean > 0.0) {
-            return 0.0;
+            // Dark, or the texels so far lie hidden inside something and those of the next LOD do not.
+            return if self.fresh_lod < top { 1.0 } else { 0.0 };
         }
         let spread = (values().map(|v| (v - mean).powi(2)).sum::<f32>() / n).sqrt() / mean;
         let noise = if self.deviation_count > 0 {
