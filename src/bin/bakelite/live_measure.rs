@@ -7,16 +7,11 @@ use bakelite::live::{Budget, Live, LiveCamera, LiveParams, LiveStats, Mode, Page
 use bakelite::scene::{Camera, NONE};
 use bakelite::{Error, Light, Progress, Result, Scene};
 use glam::{Quat, Vec3};
-use std::collections::BTreeMap;
 use std::f32::consts::TAU;
 use std::time::{Duration, Instant};
 
 /// Primary rays whose texels are compared: this many columns, rows by the picture's aspect.
 const COLUMNS: usize = 160;
-
-/// Edge of the squares of texels in which visible texels are read: whole pages would take longer,
-/// texel by texel too.
-const TILE: u32 = 64;
 
 /// Milliseconds per update while errors are followed.
 pub const FOLLOW_MS: f32 = 4.0;
@@ -41,8 +36,8 @@ pub const MODES: [(Mode, &str); 3] =
 /// The texels of the light map that primary rays hit. One that n rays hit counts n times: errors are
 /// those of the picture.
 pub struct Seen {
-    /// Rectangles to read, and where in them the texels are.
-    tiles: Vec<(PageRect, Vec<usize>)>,
+    /// Page, row and column, in order.
+    texels: Vec<[u32; 3]>,
     page_size: u32,
 }
 
@@ -55,7 +50,7 @@ impl Seen {
         let rays = PrimaryRays::new(camera, COLUMNS, rows);
         let uvs = (0..scene.meshes().len() as u32).map(|m| lightmap.mesh_uvs(m)).collect::<Result<Vec<_>>>()?;
         let size = lightmap.info().width;
-        let mut tiles: BTreeMap<[u32; 3], Vec<usize>> = BTreeMap::new();
+        let mut texels = Vec::new();
         for ray in (0..COLUMNS * rows).filter_map(|i| rays.of_pixel(i % COLUMNS, i / COLUMNS).next()) {
             let hit = scene.intersect_raw(&ray);
             if hit.is_miss() || hit.front == lightmap.shows_back(hit.triangle) {
@@ -70,48 +65,41 @@ impl Seen {
                 let [a, b, c] = corners.map(|uv| uv[axis]);
                 (((a * (1.0 - hit.u - hit.v) + b * hit.u + c * hit.v) * size as f32) as u32).min(size - 1)
             };
-            let (x, y) = (texel(0), texel(1));
-            // Tiles at the right border are narrower.
-            let width = TILE.min(size - x / TILE * TILE);
-            tiles.entry([page, y / TILE, x / TILE]).or_default().push((y % TILE * width + x % TILE) as usize);
+            texels.push([page, texel(1), texel(0)]);
         }
-        let rect = |[page, ty, tx]: [u32; 3]| {
-            let (x, y) = (tx * TILE, ty * TILE);
-            PageRect { page, x, y, width: TILE.min(size - x), height: TILE.min(size - y) }
-        };
-        Ok(Seen { tiles: tiles.into_iter().map(|(tile, at)| (rect(tile), at)).collect(), page_size: size })
+        texels.sort_unstable();
+        Ok(Seen { texels, page_size: size })
     }
 
     /// Rays that hit a texel.
     pub fn count(&self) -> usize {
-        self.tiles.iter().map(|t| t.1.len()).sum()
+        self.texels.len()
     }
 
     /// Light of the visible texels in a bake.
     pub fn of_bake(&self, lightmap: &Lightmap) -> Result<Vec<[f32; 3]>> {
         let mut values = Vec::new();
         let mut page: (u32, Vec<[f32; 3]>) = (NONE, Vec::new());
-        for (rect, at) in &self.tiles {
-            if page.0 != rect.page {
-                let LayerData::Rgb(pixels) = lightmap.read(rect.page, Layer::Combined)? else {
+        for &[number, y, x] in &self.texels {
+            if page.0 != number {
+                let LayerData::Rgb(pixels) = lightmap.read(number, Layer::Combined)? else {
                     return Err(Error::Internal("combined light is not RGB".into()));
                 };
-                page = (rect.page, pixels);
+                page = (number, pixels);
             }
-            let (x, y, width) = (rect.x as usize, rect.y as usize, rect.width as usize);
-            values.extend(at.iter().map(|i| page.1[(y + i / width) * self.page_size as usize + x + i % width]));
+            values.push(page.1[y as usize * self.page_size as usize + x as usize]);
         }
         Ok(values)
     }
 
     /// Light of the visible texels as it is shown now.
     fn of_live(&self, live: &Live) -> Result<Vec<[f32; 3]>> {
-        let mut values = Vec::new();
-        for (rect, at) in &self.tiles {
-            let tile = live.read(rect, live.params().lod_count - 1, true)?;
-            values.extend(at.iter().map(|&i| tile[i]));
-        }
-        Ok(values)
+        let lod = live.params().lod_count - 1;
+        let texel = |&[page, y, x]: &[u32; 3]| {
+            let texel = live.read(&PageRect { page, x, y, width: 1, height: 1 }, lod, true)?;
+            Ok(texel[0])
+        };
+        self.texels.iter().map(texel).collect()
     }
 }
 
@@ -246,7 +234,7 @@ impl Watch<'_> {
                 if stats.light_pending {
                     // Indirect light goes on being recomputed meanwhile, so the clock must go on too;
                     // then measuring may not take more than a small part of the time.
-                    next = next.max(seconds + 11.0 * taken.as_secs_f64());
+                    next = next.max(seconds + 9.0 * taken.as_secs_f64());
                 } else {
                     measuring += taken;
                 }
