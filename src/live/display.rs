@@ -41,8 +41,9 @@ pub(super) struct Display {
     old: Vec<Vec3>,
     /// Direct light at full resolution, by block.
     tiles: Vec<Option<DirectTile>>,
-    /// Whether the tile was made under the lights of now.
-    is_current: Vec<bool>,
+    /// Changes of the lights before the tile was made, and so far.
+    tile_epochs: Vec<u32>,
+    epoch: u32,
     blur: i32,
 }
 
@@ -77,7 +78,8 @@ impl Display {
             fresh: vec![0; map.tiles.len()],
             old: Vec::new(),
             tiles: vec![None; map.tiles.len()],
-            is_current: vec![false; map.tiles.len()],
+            tile_epochs: vec![0; map.tiles.len()],
+            epoch: 0,
             blur: blur as i32,
         })
     }
@@ -85,7 +87,7 @@ impl Display {
     /// Bytes held, without the tiles.
     pub fn bytes(&self) -> usize {
         let per_texel = 4 * size_of::<Vec3>() + 1;
-        let per_block = size_of::<Option<DirectTile>>() + 3;
+        let per_block = size_of::<Option<DirectTile>>() + size_of::<u32>() + 2;
         self.plain.len() * per_texel + self.coarse_of_tile.len() * size_of::<Vec3>() + self.lods.len() * per_block
     }
 
@@ -257,7 +259,7 @@ impl Display {
         if self.coarse_of_tile.is_empty() {
             self.coarse_of_tile = self.coarse.clone();
         }
-        self.is_current.fill(false);
+        self.epoch += 1;
     }
 
     /// Takes over the direct light of the lowest LOD's texels of `changed` blocks, and interpolates it
@@ -293,7 +295,7 @@ impl Display {
                 self.coarse_of_tile[s as usize] = self.coarse[s as usize];
             }
         }
-        self.is_current[b as usize] = true;
+        self.tile_epochs[b as usize] = self.epoch;
         let grown = tile.bytes() as isize;
         let old = self.tiles[b as usize].replace(tile);
         (self.block_rect(map, b), grown - old.map_or(0, |t| t.bytes() as isize))
@@ -301,7 +303,7 @@ impl Display {
 
     /// Direct light of a block at full resolution, and whether it is that of the lights of now.
     pub fn direct_tile(&self, b: u32) -> Option<(&DirectTile, bool)> {
-        self.tiles[b as usize].as_ref().map(|t| (t, self.is_current[b as usize]))
+        self.tiles[b as usize].as_ref().map(|t| (t, self.tile_epochs[b as usize] == self.epoch))
     }
 
     /// The part of the light map that shows a block.
@@ -377,10 +379,26 @@ impl Display {
         });
         indirect
             + match fine {
-                Some(fine) if self.is_current[b] || self.coarse_of_tile.is_empty() => fine,
-                Some(old) => (old + mix(&self.coarse) - mix(&self.coarse_of_tile)).max(Vec3::ZERO),
+                Some(fine) if self.tile_epochs[b] == self.epoch => fine,
+                Some(old) => (old + self.change_of_direct(map, chart, local, b)).max(Vec3::ZERO),
                 None => mix(&self.coarse),
             }
+    }
+
+    /// What the coarse direct light around a point has changed by since the tile of its block was made.
+    /// Neighbours whose tiles are of other times say nothing of that.
+    fn change_of_direct(&self, map: &BlockMap, chart: u32, local: [f32; 2], b: usize) -> Vec3 {
+        let gather = &map.atlas.gather;
+        let (mut sum, mut total) = (Vec3::ZERO, 0.0);
+        gather.bilinear(chart, local, |s, w| {
+            let (x, y) = gather.position(s);
+            let of = map.block_at(chart, x, y) as usize;
+            if of == b || (self.tiles[of].is_some() && self.tile_epochs[of] == self.tile_epochs[b]) {
+                sum += w * (self.coarse[s] - self.coarse_of_tile[s]);
+                total += w;
+            }
+        });
+        if total > 0.0 { sum / total } else { Vec3::ZERO }
     }
 }
 

@@ -571,9 +571,13 @@ impl Live {
             return Ok(false);
         }
         let Some(new) = self.relight.poll(&self.context.map.atlas, &self.bake)? else { return Ok(false) };
+        let direct_epoch = self.context.light.direct_epoch;
         self.context.light = Arc::new(self.context.light.renewed(new));
         let bytes = self.display.bytes();
         self.display.begin_indirect_epoch();
+        if self.context.light.direct_epoch != direct_epoch {
+            self.display.begin_direct_epoch();
+        }
         self.grow_fixed(self.display.bytes() - bytes);
         self.chooser.note_all(&self.context, &self.blocks);
         Ok(true)
