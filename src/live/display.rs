@@ -13,6 +13,10 @@ use std::collections::HashMap;
 /// Unseen texels are filled from those that are seen within this distance.
 const FILLED: i32 = TILE;
 
+/// Updates over which a block whose cell was promoted goes from what was shown to what is known: cells
+/// are large, and would be seen to jump.
+const FADE: u8 = 6;
+
 /// What is shown.
 #[derive(Clone)]
 pub(super) struct Display {
@@ -44,6 +48,8 @@ pub(super) struct Display {
     /// Changes of the lights before the tile was made, and so far.
     tile_epochs: Vec<u32>,
     epoch: u32,
+    /// Updates left of the fade, by block.
+    fades: Vec<u8>,
     blur: i32,
 }
 
@@ -80,6 +86,7 @@ impl Display {
             tiles: vec![None; map.tiles.len()],
             tile_epochs: vec![0; map.tiles.len()],
             epoch: 0,
+            fades: vec![0; map.tiles.len()],
             blur: blur as i32,
         })
     }
@@ -87,7 +94,7 @@ impl Display {
     /// Bytes held, without the tiles.
     pub fn bytes(&self) -> usize {
         let per_texel = 4 * size_of::<Vec3>() + 1;
-        let per_block = size_of::<Option<DirectTile>>() + size_of::<u32>() + 2;
+        let per_block = size_of::<Option<DirectTile>>() + size_of::<u32>() + 3;
         self.plain.len() * per_texel + self.coarse_of_tile.len() * size_of::<Vec3>() + self.lods.len() * per_block
     }
 
@@ -159,8 +166,10 @@ impl Display {
             .par_iter()
             .flat_map_iter(|&(chart, rect)| {
                 let mut window = Window::new(self.blur);
+                // Blocks that fade get there by themselves.
+                let is_still = |&(x, y): &(i32, i32)| self.fades[map.block_at(chart, x, y) as usize] == 0;
                 let at = |(x, y)| map.atlas.gather.at(chart, x, y);
-                let samples = rect.texels().map(at).filter(|&s| s != NONE);
+                let samples = rect.texels().filter(is_still).map(at).filter(|&s| s != NONE);
                 samples.map(|s| (s, self.blurred(map, &mut window, s as usize))).collect::<Vec<_>>()
             })
             .collect();
@@ -177,9 +186,45 @@ impl Display {
         lower.lods.iter_mut().for_each(|l| *l = lod.min(*l));
         lower.fresh.iter_mut().for_each(|l| *l = lod.min(*l));
         lower.old = Vec::new();
+        lower.fades.fill(0);
         let all: Vec<u32> = (0..map.tiles.len() as u32).collect();
         map.atlas.scene.device().install(|| lower.spread(map, &all));
         lower
+    }
+
+    /// Has a block reach what is known in steps of [`fade`](Self::fade). Tells whether it did not already.
+    pub fn begin_fade(&mut self, b: u32) -> bool {
+        std::mem::replace(&mut self.fades[b as usize], FADE) == 0
+    }
+
+    /// Whatever fades is there with the next refresh.
+    pub fn end_fades(&mut self) {
+        self.fades.fill(0);
+    }
+
+    /// Whether a block is still to fade.
+    pub fn is_fading(&self, b: u32) -> bool {
+        self.fades[b as usize] > 0
+    }
+
+    /// One step of blocks that fade; returns where that changes the light map.
+    pub fn fade(&mut self, map: &BlockMap, blocks: &[u32]) -> Vec<Changed> {
+        let step = |&b: &u32| -> Vec<(u32, Vec3)> {
+            let mut window = Window::new(self.blur);
+            let part = 1.0 / self.fades[b as usize] as f32;
+            let mut value = |s: u32| {
+                let (shown, goal) = (self.shown[s as usize], self.blurred(map, &mut window, s as usize));
+                // The last step must leave no rounding error.
+                if part == 1.0 { goal } else { shown + (goal - shown) * part }
+            };
+            map.tiles[b as usize].texels.iter().map(|&s| (s, value(s))).collect()
+        };
+        let values: Vec<(u32, Vec3)> = blocks.par_iter().flat_map_iter(step).collect();
+        for (sample, value) in values {
+            self.shown[sample as usize] = value;
+        }
+        blocks.iter().for_each(|&b| self.fades[b as usize] -= 1);
+        blocks.iter().map(|&b| self.block_rect(map, b)).collect()
     }
 
     fn blurred(&self, map: &BlockMap, window: &mut Window, sample: usize) -> Vec3 {

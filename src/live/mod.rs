@@ -199,6 +199,8 @@ pub struct Live {
     /// Blocks to show anew.
     waiting: VecDeque<u32>,
     is_waiting: Vec<bool>,
+    /// Blocks that fade to what is known.
+    fading: Vec<u32>,
     /// Work that goes on between updates, on blocks that are then missing from `blocks`.
     background: Option<Arc<Batch>>,
     paused: bool,
@@ -293,6 +295,7 @@ impl Live {
             dirty: Dirty::all(atlas.info.page_count, atlas.map.layout.page_size),
             is_waiting: vec![false; blocks.len()],
             waiting: VecDeque::new(),
+            fading: Vec::new(),
             bytes_full: (fixed + full) as u64,
             params: *params,
             relight: Relight::default(),
@@ -361,11 +364,13 @@ impl Live {
         let all: Vec<u32> = (0..self.blocks.len() as u32).collect();
         let device = self.device();
         let (display, blocks, map) = (&mut self.display, &self.blocks, &self.context.map);
+        display.end_fades();
         device.install(|| display.refresh(map, blocks, &all));
         let atlas = &self.context.map.atlas;
         self.dirty = Dirty::all(atlas.info.page_count, atlas.map.layout.page_size);
         self.waiting.clear();
         self.is_waiting.fill(false);
+        self.fading.clear();
         self.promotion.count(&self.context.map.tiles, &self.blocks);
         self.chooser.note_all(&self.context, &self.blocks);
     }
@@ -418,6 +423,7 @@ impl Live {
         let most_rays = most_rays.unwrap_or(u64::MAX);
         stats.rays += self.visibility.look(&self.context.map, camera);
         self.chooser.look(&self.context.map, &self.visibility);
+        self.show_fading(end, stats);
         let mut traced = 0;
         let over = |traced: u64| traced >= most_rays || end.is_some_and(|e| Instant::now() >= e);
         while !over(traced) {
@@ -505,6 +511,9 @@ impl Live {
             for i in 0..self.grid.blocks_of(cell).len() {
                 let b = self.grid.blocks_of(cell)[i];
                 self.display.lods[b as usize] = common;
+                if self.display.begin_fade(b) {
+                    self.fading.push(b);
+                }
                 self.wait(b);
             }
         } else if self.blocks[b as usize].fresh_lod <= self.display.lods[b as usize] {
@@ -543,6 +552,31 @@ impl Live {
             let seconds = start.elapsed().as_secs_f64() / batch.len() as f64;
             self.refresh_seconds += 0.2 * (seconds - self.refresh_seconds);
         }
+    }
+
+    /// One step of the blocks that fade, as far as there is time; those left come first next time.
+    fn show_fading(&mut self, end: Option<Instant>, stats: &mut LiveStats) {
+        let mut todo: Vec<u32> = Vec::new();
+        let mut rest: Vec<u32> = Vec::new();
+        for b in std::mem::take(&mut self.fading) {
+            // What waits is not known to the display yet.
+            if self.is_waiting[b as usize] { rest.push(b) } else { todo.push(b) }
+        }
+        let mut todo = todo.into_iter();
+        while todo.len() > 0 {
+            let left = end.map_or(f64::INFINITY, |e| e.saturating_duration_since(Instant::now()).as_secs_f64());
+            // A fade must not take the time of all work.
+            let fit = (0.5 * left / self.refresh_seconds) as usize;
+            if fit == 0 {
+                break;
+            }
+            let batch: Vec<u32> = todo.by_ref().take(fit.min(PASS)).collect();
+            let changed = self.display.fade(&self.context.map, &batch);
+            changed.into_iter().for_each(|c| self.dirty.add(c));
+            stats.blocks_changed += batch.len() as u32;
+            rest.extend(batch.into_iter().filter(|&b| self.display.is_fading(b)));
+        }
+        self.fading = todo.chain(rest).collect();
     }
 
     /// Announces what work on blocks may allocate, in steps, so that the monitor is rarely asked.

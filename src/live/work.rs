@@ -253,8 +253,9 @@ impl Block {
         let noise = if self.deviation_count > 0 {
             (self.deviations / self.deviation_count as f32 / self.rounds.max(1) as f32).sqrt() / mean
         } else {
-            // One round alone tells nothing of its noise; neighbours differ by it at least.
-            spread.min(1.0) / (self.rounds.max(1) as f32).sqrt()
+            // One round alone tells nothing of its noise; neighbours differ by it at least. Few texels
+            // do not tell even that.
+            spread.max(1.0 / n).min(1.0) / (self.rounds.max(1) as f32).sqrt()
         };
         if self.fresh_lod < top { noise + 0.5 * spread.min(1.0) + 0.02 } else { noise }
     }
