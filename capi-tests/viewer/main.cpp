@@ -192,7 +192,8 @@ public:
 
     void run() {
         const Clock::time_point start = Clock::now();
-        for (long frame = 0; !glfwWindowShouldClose(window) && (options.frames == 0 || frame < options.frames); frame++) {
+        for (long frame = 0; options.frames == 0 || frame < options.frames; frame++) {
+            if (glfwWindowShouldClose(window)) break;
             const bool by_clock = !options.headless || options.realtime;
             const double now = by_clock ? seconds_since(start) : double(frame) / 30;
             frame_seconds = now - time;
@@ -203,13 +204,13 @@ public:
             else if (!options.headless) walker.walk(window, float(frame_seconds));
             if (!options.headless) fit_window();
             draw(frame);
+            if (options.screenshot_every > 0 && frame % options.screenshot_every == 0) write_screenshot(frame);
             glfwSwapBuffers(window);
             if (frame == 0) {
                 gl::Finish();
                 std::printf("first lit frame after %.2f s\n", seconds_since(program_start));
                 std::fflush(stdout);
             }
-            if (options.screenshot_every > 0 && frame % options.screenshot_every == 0) write_screenshot(frame);
         }
     }
 
@@ -281,19 +282,20 @@ private:
             overlay.draw(width, height);
         }
         if (csv) {
-            std::fprintf(csv, "%ld,%.4f,%.3f,%.3f,%llu,%.6g,%.6g,%.6g,%zu,%zu,%u,%llu,%u,%.3f\n", frame, time, update_ms,
-                         mode == Mode::off ? 0.0 : double(options.budget_ms), static_cast<unsigned long long>(stats.rays),
-                         double(stats.visible_error), double(stats.visible_finished), double(stats.finished), rects, texels,
-                         stats.cells_promoted, static_cast<unsigned long long>(stats.bytes), stats.light_pending, upload_ms);
+            const double budget = mode == Mode::off ? 0 : double(options.budget_ms);
+            std::fprintf(csv, "%ld,%.4f,%.3f,%.3f,", frame, time, update_ms, budget);
+            std::fprintf(csv, "%llu,%.6g,", (unsigned long long)stats.rays, double(stats.visible_error));
+            std::fprintf(csv, "%.6g,%.6g,", double(stats.visible_finished), double(stats.finished));
+            std::fprintf(csv, "%zu,%zu,%u,", rects, texels, stats.cells_promoted);
+            std::fprintf(csv, "%llu,%u,%.3f\n", (unsigned long long)stats.bytes, stats.light_pending, upload_ms);
         }
     }
 
     void open_csv() {
         csv = std::fopen(options.csv.c_str(), "w");
         if (!csv) throw std::runtime_error(options.csv + " cannot be written");
-        std::fputs("frame,time,update_ms,budget_ms,rays,visible_error,visible_finished,finished,dirty_rects,dirty_texels,"
-                   "cells_promoted,bytes,light_pending,upload_ms\n",
-                   csv);
+        std::fputs("frame,time,update_ms,budget_ms,rays,visible_error,visible_finished,finished,", csv);
+        std::fputs("dirty_rects,dirty_texels,cells_promoted,bytes,light_pending,upload_ms\n", csv);
     }
 
     void print(const bk_live_stats &stats, double update_ms, double upload_ms) {

@@ -86,7 +86,8 @@ void main()
 } // namespace
 
 Renderer::Renderer(const LiveLight &light, int width, int height, float exposure)
-    : light(light), scene(SCENE_VERTEX, (std::string(SCENE_FRAGMENT_BEGIN) + Shadows::SHADER + SCENE_FRAGMENT_END).c_str()),
+    : light(light),
+      scene(SCENE_VERTEX, (std::string(SCENE_FRAGMENT_BEGIN) + Shadows::SHADER + SCENE_FRAGMENT_END).c_str()),
       tone(TONE_VERTEX, TONE_FRAGMENT), exposure(exposure) {
     load_triangles();
     gl::GenVertexArrays(1, &nothing);
@@ -94,8 +95,9 @@ Renderer::Renderer(const LiveLight &light, int width, int height, float exposure
     GLint most_pages;
     gl::GetIntegerv(GL_MAX_ARRAY_TEXTURE_LAYERS, &most_pages);
     if (light.pages.page_count > uint32_t(most_pages)) {
-        throw std::runtime_error("The light map has " + std::to_string(light.pages.page_count) + " pages and OpenGL room for " +
-                                 std::to_string(most_pages) + "; give a larger --page-size");
+        throw std::runtime_error("the light map has " + std::to_string(light.pages.page_count) +
+                                 " pages and OpenGL room for " + std::to_string(most_pages) +
+                                 "; give a larger --page-size");
     }
     // Filtering reads one texel beyond a chart, which its padding has; mip maps would want more.
     pages = gl::make_texture(GL_TEXTURE_2D_ARRAY, GL_LINEAR);

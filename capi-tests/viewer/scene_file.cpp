@@ -16,7 +16,9 @@
 
 namespace {
 
-[[noreturn]] void fail(const std::string &path, const std::string &what) { throw std::runtime_error(path + ": " + what); }
+[[noreturn]] void fail(const std::string &path, const std::string &what) {
+    throw std::runtime_error(path + ": " + what);
+}
 
 bool ends_with(const std::string &text, const std::string &end) {
     return text.size() >= end.size() && text.compare(text.size() - end.size(), end.size(), end) == 0;
@@ -133,8 +135,9 @@ private:
         for (const char *at = text.c_str(); *at;) {
             char *end;
             Corner corner{index(std::strtol(at, &end, 10), positions.size()), 0};
-            if (end[0] == '/' && end[1] != '/' && has_page) corner.uv = index(std::strtol(end + 1, &end, 10), uvs.size());
-            else mapped = false;
+            const bool has_uv = end[0] == '/' && end[1] != '/';
+            mapped &= has_uv;
+            if (mapped) corner.uv = index(std::strtol(end + 1, &end, 10), uvs.size());
             corners.push_back(corner);
             at = end + std::strcspn(end, " \t");
             at += std::strspn(at, " \t");
@@ -212,7 +215,9 @@ SceneFile load_ply(const std::string &path) {
         uint32_t corner[255];
         take(&corners, 1);
         take(corner, 4 * size_t(corners));
-        for (int i = 2; i < corners; i++) mesh.indices.insert(mesh.indices.end(), {corner[0], corner[i - 1], corner[i]});
+        for (int i = 2; i < corners; i++) {
+            mesh.indices.insert(mesh.indices.end(), {corner[0], corner[i - 1], corner[i]});
+        }
     }
     mesh.materials.resize(mesh.indices.size() / 3);
     return scene;

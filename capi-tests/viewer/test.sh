@@ -58,7 +58,8 @@ fail() {
 
 # mean PNG: the mean byte of its pixels, which the viewer writes uncompressed behind 50 bytes of headers.
 mean() {
-    tail -c +51 "$1" | od -An -v -tu1 | awk '{ for (i = 1; i <= NF; i++) sum += $i; n += NF } END { print int(sum / n) }'
+    tail -c +51 "$1" | od -An -v -tu1 |
+        awk '{ for (i = 1; i <= NF; i++) sum += $i; n += NF } END { print int(sum / n) }'
 }
 
 # look NAME OPTIONS: 31 frames with pictures of the first and the last.
