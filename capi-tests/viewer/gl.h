@@ -8,14 +8,15 @@
 // Those that the viewer calls, without their prefix.
 #define GL_FUNCTIONS(X) \
     X(ActiveTexture) X(AttachShader) X(BindBuffer) X(BindFramebuffer) X(BindTexture) X(BindVertexArray) X(BlendFunc) \
-    X(BufferData) X(CheckFramebufferStatus) X(Clear) X(ClearColor) X(CompileShader) X(CreateProgram) X(CreateShader) \
-    X(DeleteShader) X(DepthMask) X(Disable) X(DrawArrays) X(DrawBuffer) X(Enable) X(EnableVertexAttribArray) \
-    X(Finish) X(FramebufferTexture2D) X(FramebufferTextureLayer) X(GenBuffers) X(GenFramebuffers) X(GenTextures) \
-    X(GenVertexArrays) X(GetIntegerv) X(GetProgramInfoLog) X(GetProgramiv) X(GetShaderInfoLog) X(GetShaderiv) \
-    X(GetUniformLocation) X(LinkProgram) X(PixelStorei) X(PolygonOffset) X(ReadBuffer) X(ReadPixels) X(ShaderSource) \
-    X(TexImage2D) X(TexImage3D) X(TexParameteri) X(TexSubImage3D) X(Uniform1f) X(Uniform1i) X(Uniform2f) \
-    X(Uniform2iv) X(Uniform3fv) X(Uniform4fv) X(UniformMatrix4fv) X(UseProgram) X(VertexAttribIPointer) \
-    X(VertexAttribPointer) X(Viewport)
+    X(BufferData) X(CheckFramebufferStatus) X(Clear) X(ClearColor) X(CompileShader) X(CreateProgram) \
+    X(CreateShader) X(DeleteShader) X(DepthMask) X(Disable) X(DrawArrays) X(DrawBuffer) X(Enable) \
+    X(EnableVertexAttribArray) X(Finish) X(FramebufferTexture2D) X(FramebufferTextureLayer) X(GenBuffers) \
+    X(GenFramebuffers) X(GenTextures) X(GenVertexArrays) X(GetIntegerv) X(GetProgramInfoLog) X(GetProgramiv) \
+    X(GetShaderInfoLog) X(GetShaderiv) X(GetTexImage) X(GetUniformLocation) X(LinkProgram) X(PixelStorei) \
+    X(PolygonOffset) X(ReadBuffer) X(ReadPixels) X(ShaderSource) X(TexImage2D) X(TexImage3D) \
+    X(TexParameteri) X(TexSubImage3D) X(Uniform1f) X(Uniform1i) X(Uniform2f) X(Uniform2iv) X(Uniform3fv) \
+    X(Uniform4fv) X(UniformMatrix4fv) X(UseProgram) X(VertexAttribIPointer) X(VertexAttribPointer) \
+    X(Viewport)
 
 namespace gl {
 

@@ -11,6 +11,9 @@
 // Told how far loading is, on any thread; false cancels.
 using Progress = std::function<bool(float fraction, const char *stage)>;
 
+// Of a texel as the viewer reads it: four half floats.
+constexpr size_t TEXEL_BYTES = 8;
+
 class LiveLight {
 public:
     // Loads the scene and gives it light; takes seconds. Throws bakelite's sentence if something fails.

@@ -195,26 +195,38 @@ public:
         for (long frame = 0; options.frames == 0 || frame < options.frames; frame++) {
             if (glfwWindowShouldClose(window)) break;
             const bool by_clock = !options.headless || options.realtime;
+            const Clock::time_point frame_start = Clock::now();
             const double now = by_clock ? seconds_since(start) : double(frame) / 30;
-            frame_seconds = now - time;
+            const double step = now - time;
             time = now;
             glfwPollEvents();
             if (frame == options.switch_light_at) light.switch_light();
             if (path) walker.look(with_fov(path->at(time)));
-            else if (!options.headless) walker.walk(window, float(frame_seconds));
+            else if (!options.headless) walker.walk(window, float(step));
             if (!options.headless) fit_window();
-            draw(frame);
-            if (options.screenshot_every > 0 && frame % options.screenshot_every == 0) write_screenshot(frame);
+            const Work work = draw();
             glfwSwapBuffers(window);
+            // OpenGL in software works on the cores that the next update needs.
+            if (options.headless || frame == 0) gl::Finish();
+            frame_ms = 1000 * seconds_since(frame_start);
             if (frame == 0) {
-                gl::Finish();
                 std::printf("first lit frame after %.2f s\n", seconds_since(program_start));
                 std::fflush(stdout);
             }
+            if (csv) write_row(frame, work);
+            write_screenshots(frame);
         }
+        if (options.check) check_textures();
     }
 
 private:
+    // What a frame's light took.
+    struct Work {
+        bk_live_stats stats;
+        double update_ms = 0, upload_ms = 0;
+        size_t rects = 0, texels = 0;
+    };
+
     void press(int key) {
         if (key == GLFW_KEY_ESCAPE) glfwSetWindowShouldClose(window, GLFW_TRUE);
         if (key == GLFW_KEY_1) set_mode(Mode::view);
@@ -258,52 +270,58 @@ private:
     }
 
     // One frame: what a program with live light maps does.
-    void draw(long frame) {
+    Work draw() {
+        Work work;
         const bk_camera camera = walker.camera(width, height);
         const Clock::time_point update_start = Clock::now();
-        const bk_live_stats stats = light.update(camera, options.budget_ms);
-        const double update_ms = 1000 * seconds_since(update_start);
+        work.stats = light.update(camera, options.budget_ms);
+        work.update_ms = 1000 * seconds_since(update_start);
 
-        size_t rects = 0, texels = 0;
         const Clock::time_point upload_start = Clock::now();
         const auto upload = [&](const bk_rect &rect, const void *data) {
             renderer.upload(rect, data);
-            rects++;
-            texels += size_t(rect.width) * rect.height;
+            work.rects++;
+            work.texels += size_t(rect.width) * rect.height;
         };
         light.changes(!look.direct_from_shadow_maps, upload);
         if (all_is_new) light.everything(!look.direct_from_shadow_maps, upload);
         all_is_new = false;
-        const double upload_ms = 1000 * seconds_since(upload_start);
+        work.upload_ms = 1000 * seconds_since(upload_start);
 
         renderer.draw(camera, look, target);
         if (overlay_shown) {
-            print(stats, update_ms, upload_ms);
+            print(work);
             overlay.draw(width, height);
         }
-        if (csv) {
-            const double budget = mode == Mode::off ? 0 : double(options.budget_ms);
-            std::fprintf(csv, "%ld,%.4f,%.3f,%.3f,", frame, time, update_ms, budget);
-            std::fprintf(csv, "%llu,%.6g,", (unsigned long long)stats.rays, double(stats.visible_error));
-            std::fprintf(csv, "%.6g,%.6g,", double(stats.visible_finished), double(stats.finished));
-            std::fprintf(csv, "%zu,%zu,%u,", rects, texels, stats.cells_promoted);
-            std::fprintf(csv, "%llu,%u,%.3f\n", (unsigned long long)stats.bytes, stats.light_pending, upload_ms);
-        }
+        return work;
     }
 
     void open_csv() {
         csv = std::fopen(options.csv.c_str(), "w");
         if (!csv) throw std::runtime_error(options.csv + " cannot be written");
-        std::fputs("frame,time,update_ms,budget_ms,rays,visible_error,visible_finished,finished,", csv);
-        std::fputs("dirty_rects,dirty_texels,cells_promoted,bytes,light_pending,upload_ms\n", csv);
+        // `seconds` since the program began, `time` since the first lit frame as the path counts it.
+        std::fputs("frame,seconds,time,frame_ms,update_ms,upload_ms,budget_ms,rays,visible_error,", csv);
+        std::fputs("visible_finished,finished,dirty_rects,dirty_bytes,cells_promoted,bytes,light_pending\n", csv);
     }
 
-    void print(const bk_live_stats &stats, double update_ms, double upload_ms) {
+    void write_row(long frame, const Work &work) const {
+        const bk_live_stats &s = work.stats;
+        const double budget = mode == Mode::off ? 0 : double(options.budget_ms);
+        std::fprintf(csv, "%ld,%.3f,%.4f,%.3f,", frame, seconds_since(program_start), time, frame_ms);
+        std::fprintf(csv, "%.3f,%.3f,%.3f,", work.update_ms, work.upload_ms, budget);
+        std::fprintf(csv, "%llu,%.6g,", (unsigned long long)s.rays, double(s.visible_error));
+        std::fprintf(csv, "%.6g,%.6g,", double(s.visible_finished), double(s.finished));
+        std::fprintf(csv, "%zu,%zu,%u,", work.rects, work.texels * TEXEL_BYTES, s.cells_promoted);
+        std::fprintf(csv, "%llu,%u\n", (unsigned long long)s.bytes, s.light_pending);
+    }
+
+    void print(const Work &work) {
+        const bk_live_stats &stats = work.stats;
         static const char *const modes[] = {"view-based", "position-based", "off"};
         overlay.print(text("%s, direct light %s%s", modes[int(mode)],
                            look.direct_from_shadow_maps ? "by shadow maps" : "baked",
                            light.is_switched_off() ? ", first light off" : ""));
-        overlay.print(text("frame %.1f ms: update %.1f, upload %.1f", 1000 * frame_seconds, update_ms, upload_ms));
+        overlay.print(text("frame %.1f ms; update %.1f, upload %.1f", frame_ms, work.update_ms, work.upload_ms));
         overlay.print(text("%.1fk rays, %.1fM in all", double(stats.rays) / 1e3, double(stats.total_rays) / 1e6));
         overlay.print(text("error %.1f %% of what is seen%s", 100.0 * double(stats.visible_error),
                            stats.light_pending ? ", light pending" : ""));
@@ -315,11 +333,34 @@ private:
         for (uint32_t lod = 0; lod <= light.highest_lod(); lod++) overlay.print(text("LOD %u", lod), colors[lod]);
     }
 
-    void write_screenshot(long frame) const {
+    void write_screenshots(long frame) {
+        if (options.screenshot_every > 0 && frame % options.screenshot_every == 0) {
+            write_screenshot(text("/frame%05ld.png", frame));
+        }
+        while (screenshots_at < options.screenshot_at.size() && time >= options.screenshot_at[screenshots_at]) {
+            write_screenshot(text("/at%g.png", options.screenshot_at[screenshots_at++]));
+        }
+    }
+
+    void write_screenshot(const std::string &name) const {
         std::vector<uint8_t> rgb(size_t(width) * height * 3);
         gl::BindFramebuffer(GL_FRAMEBUFFER, target);
         gl::ReadPixels(0, 0, width, height, GL_RGB, GL_UNSIGNED_BYTE, rgb.data());
-        write_png(options.out + text("/frame%05ld.png", frame), width, height, rgb);
+        write_png(options.out + name, width, height, rgb);
+    }
+
+    // Dirty rectangles must have brought every texel that the light map has.
+    void check_textures() const {
+        const std::vector<uint16_t> uploaded = renderer.uploaded();
+        std::vector<uint16_t> whole;
+        light.everything(!look.direct_from_shadow_maps, [&](const bk_rect &rect, const void *texels) {
+            const auto *halves = static_cast<const uint16_t *>(texels);
+            whole.insert(whole.end(), halves, halves + size_t(rect.width) * rect.height * 4);
+        });
+        size_t wrong = 0;
+        for (size_t i = 0; i < whole.size(); i++) wrong += whole[i] != uploaded[i];
+        if (wrong == 0) return;
+        throw std::runtime_error(text("%zu of %zu numbers of the light map are not in the textures", wrong, whole.size()));
     }
 
     const Options &options;
@@ -334,7 +375,8 @@ private:
     Mode mode;
     Look look;
     bool overlay_shown, all_is_new = false;
-    double time = 0, frame_seconds = 0;
+    double time = 0, frame_ms = 0; // frame_ms: of the frame before
+    size_t screenshots_at = 0;
     std::FILE *csv = nullptr;
 };
 

@@ -37,8 +37,10 @@ Without a person:
   --frames N                     ends after so many frames; 0: does not [0]
   --realtime                     by the clock; without it headless frames are 1/30 s apart
   --screenshot-every N           writes frameNNNNN.png
+  --screenshot-at S,S,...        writes atS.png so many seconds after the first lit frame
   --csv FILE                     one line of figures per frame
   --out DIR                      folder of the screenshots, which must exist [.]
+  --check                        fails at the end unless the textures hold the light map
 
 Keys: WASD, E, Q and the mouse move (shift: faster); 1 view-based, 2 position-based, 0 off;
 L light, B direct light baked or by shadow maps, H heat map, O overlay, Esc.
@@ -70,6 +72,13 @@ Vec3 vector(const std::string &flag, const std::string &text) {
     Vec3 v;
     for (int i = 0; i < 3; i++) v[i] = float(number(flag, parts[i], -1e12, 1e12));
     return v;
+}
+
+std::vector<double> seconds(const std::string &flag, const std::string &text) {
+    std::vector<double> times;
+    for (const std::string &part : split(text, ',')) times.push_back(number(flag, part, 0, 1e9));
+    std::sort(times.begin(), times.end());
+    return times;
 }
 
 PlacedLight light(const std::string &text) {
@@ -130,6 +139,8 @@ Options parse_options(int argc, char **argv) {
         else if (flag == "--frames") o.frames = long(in(0, 1e9));
         else if (flag == "--realtime") o.realtime = true;
         else if (flag == "--screenshot-every") o.screenshot_every = long(in(0, 1e9));
+        else if (flag == "--screenshot-at") o.screenshot_at = seconds(flag, value());
+        else if (flag == "--check") o.check = true;
         else if (flag == "--csv") o.csv = value();
         else if (flag == "--out") o.out = value();
         else if (flag[0] == '-' || !o.scene.empty()) fail("\"" + flag + "\" is not understood; see --help");

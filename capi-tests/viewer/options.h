@@ -35,9 +35,10 @@ struct Options {
     int width = 960, height = 540;
     float exposure = 0; // 0: from the first frame
     bool shadow_maps = false, heat_map = false, overlay = true;
-    bool headless = false, realtime = false;
+    bool headless = false, realtime = false, check = false;
     long frames = 0; // 0: until the window is closed
     long screenshot_every = 0, switch_light_at = -1;
+    std::vector<double> screenshot_at; // rising seconds
     std::string path, csv, out = ".";
 };
 

@@ -174,6 +174,13 @@ void Renderer::upload(const bk_rect &rect, const void *texels) {
                       GLsizei(rect.height), 1, GL_RGBA, GL_HALF_FLOAT, texels);
 }
 
+std::vector<uint16_t> Renderer::uploaded() const {
+    std::vector<uint16_t> halves(size_t(light.pages.width) * light.pages.height * light.pages.page_count * 4);
+    gl::bind_texture(PAGES, GL_TEXTURE_2D_ARRAY, pages);
+    gl::GetTexImage(GL_TEXTURE_2D_ARRAY, 0, GL_RGBA, GL_HALF_FLOAT, halves.data());
+    return halves;
+}
+
 void Renderer::draw_triangles() const {
     gl::BindVertexArray(vertices);
     gl::Enable(GL_DEPTH_TEST);

@@ -18,6 +18,8 @@ public:
 
     // New texels of the light map, four half floats each.
     void upload(const bk_rect &rect, const void *texels);
+    // All pages as they were uploaded, one after the other.
+    std::vector<uint16_t> uploaded() const;
     // Into the framebuffer, which may be 0, the window's.
     void draw(const bk_camera &camera, const Look &look, GLuint framebuffer);
     void resize(int width, int height);

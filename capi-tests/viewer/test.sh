@@ -67,7 +67,7 @@ look() {
     mkdir "$1"
     xvfb-run -a -s '-screen 0 640x480x24' "$viewer" room.obj --light point:1,2.5,1:10,10,10 --texels-per-unit 16 \
         --page-size 256 --width 160 --height 120 --no-overlay --headless --frames 31 --path path --screenshot-every 30 \
-        --csv "$1/frames.csv" --out "$1" --budget-ms 20 "${@:2}" || fail "$1: exit code $?"
+        --csv "$1/frames.csv" --out "$1" --budget-ms 20 --check "${@:2}" || fail "$1: exit code $?"
     [ "$(wc -l <"$1/frames.csv")" = 32 ] || fail "$1: the CSV has $(wc -l <"$1/frames.csv") lines"
     [ "$(mean "$1/frame00000.png")" -ge 40 ] || fail "$1: the first picture is dark: $(mean "$1/frame00000.png")"
 }
@@ -77,7 +77,7 @@ look position --mode position --heat-map
 look shadow-maps --mode off --shadow-maps
 look dark --switch-light-at 5
 
-rays() { awk -F, 'NR > 1 { rays += $5 } END { print rays + 0 }' "$1/frames.csv"; }
+rays() { awk -F, 'NR > 1 { rays += $8 } END { print rays + 0 }' "$1/frames.csv"; }
 [ "$(rays view)" -gt 0 ] || fail 'the view-based updates traced nothing'
 [ "$(rays position)" -gt 0 ] || fail 'the position-based updates traced nothing'
 [ "$(rays shadow-maps)" -eq 0 ] || fail "off traced $(rays shadow-maps) rays"
