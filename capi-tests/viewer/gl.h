@@ -8,8 +8,8 @@
 // Those that the viewer calls, without their prefix.
 #define GL_FUNCTIONS(X) \
     X(ActiveTexture) X(AttachShader) X(BindBuffer) X(BindFramebuffer) X(BindTexture) X(BindVertexArray) X(BlendFunc) \
-    X(BufferData) X(CheckFramebufferStatus) X(Clear) X(ClearColor) X(CompileShader) X(CreateProgram) \
-    X(CreateShader) X(DeleteShader) X(DepthMask) X(Disable) X(DrawArrays) X(DrawBuffer) X(Enable) \
+    X(BufferData) X(CheckFramebufferStatus) X(Clear) X(ClearColor) X(ClearDepth) X(CompileShader) X(CreateProgram) \
+    X(CreateShader) X(DeleteShader) X(DepthFunc) X(Disable) X(DrawArrays) X(DrawBuffer) X(Enable) \
     X(EnableVertexAttribArray) X(Finish) X(FramebufferTexture2D) X(FramebufferTextureLayer) X(GenBuffers) \
     X(GenFramebuffers) X(GenTextures) X(GenVertexArrays) X(GetIntegerv) X(GetProgramInfoLog) X(GetProgramiv) \
     X(GetShaderInfoLog) X(GetShaderiv) X(GetTexImage) X(GetUniformLocation) X(LinkProgram) X(PixelStorei) \

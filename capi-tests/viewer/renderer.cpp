@@ -42,6 +42,7 @@ uniform sampler2DArray pages;
 uniform sampler2D materials;
 uniform usampler3D cells;
 uniform bool shade_direct, heat;
+uniform float near;
 uniform vec3 cell_origin;
 uniform float cell_size;
 )";
@@ -57,6 +58,8 @@ void main()
     vec3 albedo = texelFetch(materials, ivec2(0, material), 0).rgb;
     color.rgb = albedo / 3.14159265 * irradiance + texelFetch(materials, ivec2(1, material), 0).rgb;
     color.a = 0;
+    // The inverse of the distance, which floats hold best where surfaces lie a hair apart far away.
+    gl_FragDepth = near * gl_FragCoord.w;
     if (heat) {
         ivec3 cell = clamp(ivec3((world - cell_origin) / cell_size), ivec3(0), textureSize(cells, 0) - 1);
         uint lod = texelFetch(cells, cell, 0).r;
@@ -157,7 +160,7 @@ void Renderer::load_triangles() {
 void Renderer::resize(int new_width, int new_height) {
     width = new_width, height = new_height;
     gl::bind_texture(LINEAR, GL_TEXTURE_2D, depth);
-    gl::allocate(GL_TEXTURE_2D, GL_DEPTH_COMPONENT24, width, height, 0, GL_DEPTH_COMPONENT, GL_UNSIGNED_INT, nullptr);
+    gl::allocate(GL_TEXTURE_2D, GL_DEPTH_COMPONENT32F, width, height, 0, GL_DEPTH_COMPONENT, GL_FLOAT, nullptr);
     gl::bind_texture(LINEAR, GL_TEXTURE_2D, linear);
     gl::allocate(GL_TEXTURE_2D, GL_RGBA16F, width, height, 0, GL_RGBA, GL_FLOAT, nullptr);
     gl::BindFramebuffer(GL_FRAMEBUFFER, framebuffer);
@@ -219,14 +222,18 @@ void Renderer::draw(const bk_camera &camera, const Look &look, GLuint target) {
     const Vec3 eye{camera.position[0], camera.position[1], camera.position[2]};
     const float size = length(light.upper - light.lower);
     const float far = size + length(eye - 0.5f * (light.lower + light.upper));
-    const Mat4 matrix = perspective(camera.fov_y, float(width) / float(height), 5e-4f * size, far) *
+    const float near = 5e-4f * size;
+    const Mat4 matrix = perspective(camera.fov_y, float(width) / float(height), near, far) *
                         look_at(eye, {camera.forward[0], camera.forward[1], camera.forward[2]},
                                 {camera.up[0], camera.up[1], camera.up[2]});
     gl::BindFramebuffer(GL_FRAMEBUFFER, framebuffer);
     gl::Viewport(0, 0, width, height);
     gl::ClearColor(0, 0, 0, 0);
+    gl::ClearDepth(0); // infinitely far
+    gl::DepthFunc(GL_GREATER);
     gl::Clear(GL_COLOR_BUFFER_BIT | GL_DEPTH_BUFFER_BIT);
     scene.use();
+    gl::Uniform1f(scene["near"], near);
     gl::UniformMatrix4fv(scene["camera"], 1, GL_FALSE, matrix.data());
     gl::Uniform1i(scene["shade_direct"], look.direct_from_shadow_maps);
     gl::Uniform1i(scene["heat"], look.heat_map);

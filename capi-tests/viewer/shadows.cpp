@@ -57,6 +57,8 @@ Shadows::Shadows(const LiveLight &light, const std::function<void()> &draw) {
     gl::DrawBuffer(GL_NONE);
     gl::ReadBuffer(GL_NONE);
     gl::Viewport(0, 0, SIZE, SIZE);
+    gl::ClearDepth(1);
+    gl::DepthFunc(GL_LESS);
     gl::Enable(GL_POLYGON_OFFSET_FILL);
     gl::PolygonOffset(2, 4);
     const gl::Program program("#version 330 core\n"
