@@ -19,6 +19,11 @@ command -v make >/dev/null || need+=(make)
 command -v g++ >/dev/null || need+=(g++)
 command -v pkg-config >/dev/null || need+=(pkg-config)
 [ -e /usr/include/embree3/rtcore.h ] || need+=(libembree-dev)
+# The viewer, and a screen and OpenGL in software to test it with.
+[ -e /usr/include/GLFW/glfw3.h ] || need+=(libglfw3-dev)
+[ -e /usr/include/GL/glcorearb.h ] || need+=(libgl-dev)
+command -v xvfb-run >/dev/null || need+=(xvfb xauth)
+ls /usr/lib/*/dri/swrast_dri.so >/dev/null 2>&1 || need+=(libgl1-mesa-dri)
 if [ ${#need[@]} -gt 0 ]; then
     echo "== Installing with apt: ${need[*]}"
     sudo=()
@@ -35,6 +40,12 @@ if [ ! -e /usr/include/embree3/rtcore.h ]; then
     embree=OFF
     echo '== The package libembree-dev of this system is not Embree 3: THE COMPARISON WITH EMBREE IS LEFT OUT'
 fi
+viewer=ON
+if [ ! -e /usr/include/GLFW/glfw3.h ]; then
+    viewer=OFF
+    echo '== There is no GLFW: THE VIEWER IS LEFT OUT'
+fi
+command -v xvfb-run >/dev/null || echo '== There is no xvfb-run: THE VIEWER IS NOT TESTED'
 
 # ---- The tests ----
 
@@ -54,7 +65,7 @@ echo '== C and C++'
 scenes=${BAKELITE_SCENES:-$root/../shared/scenes}
 [ -d "$scenes" ] || echo "   (no folder $scenes: only the built-in scenes are compared with Embree)"
 cmake -S capi-tests -B "$build" -DBAKELITE_CARGO_TARGET_DIR="$target" -DBAKELITE_SCENES="$scenes" \
-    -DBAKELITE_TEST_EMBREE=$embree >/dev/null
+    -DBAKELITE_TEST_EMBREE=$embree -DBAKELITE_TEST_VIEWER=$viewer >/dev/null
 cmake --build "$build" || verdict=1
 ctest --test-dir "$build" --output-on-failure 2>&1 | tee -a "$log" || verdict=1
 
