@@ -155,6 +155,12 @@ impl DirectLight {
         self.areas.len()
     }
 
+    /// Rays that [`irradiance`](Self::irradiance) traces where all lights shine.
+    pub fn rays_per_point(&self, samples: u32) -> f32 {
+        let others = self.lights.iter().filter(|l| !matches!(l, Light::Rect { .. })).count();
+        (others + samples as usize * self.areas.len().min(MAX_LIGHTS_SAMPLED)) as f32
+    }
+
     /// Whether any light shines.
     pub fn is_dark(&self) -> bool {
         self.areas.is_empty() && self.lights.iter().all(|l| l.color().iter().all(|&c| c == 0.0))

@@ -81,6 +81,8 @@ pub(super) struct Tile {
     /// The texels of LOD l are the first `lod_end[l]`.
     pub lod_end: [u16; MAX_LODS],
     pub centre: Vec3,
+    /// Texels of the light map around it, roughly.
+    pub map_texels: u32,
     /// Cell of the light map grid.
     pub cell: u32,
 }
@@ -114,8 +116,11 @@ pub(super) struct Block {
     /// Squared deviations of the rounds from the mean so far, by luminance, and how many.
     pub deviations: f32,
     pub deviation_count: u32,
-    /// Estimated relative error of indirect light.
+    /// Estimated relative error of indirect light; the mean of that light, and of coarse direct light, by
+    /// the sum of the channels.
     pub error: f32,
+    pub mean: f32,
+    pub direct_mean: f32,
 }
 
 impl DirectTile {
@@ -202,7 +207,9 @@ impl BlockMap {
             centre += atlas.gather.texels.samples[sample as usize].position(&atlas.scene).as_dvec3();
         }
         let centre = (centre / texels.len().max(1) as f64).as_vec3();
-        Tile { chart, rect, texels: texels.into_iter().map(|t| t.1).collect(), lod_end, centre, cell: 0 }
+        let map_texels = rect_in_light_map(atlas, chart, &rect).area() as u32;
+        let texels = texels.into_iter().map(|t| t.1).collect();
+        Tile { chart, rect, texels, lod_end, centre, map_texels, cell: 0 }
     }
 
     /// The LOD on whose grid a texel of the gather map lies.

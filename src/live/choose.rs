@@ -8,11 +8,6 @@ use super::{LiveCamera, Mode};
 use crate::sampling::{combine, mix};
 use std::cmp::Ordering;
 
-/// Urgency of indirect light of another time, which a few rays mend, and of missing direct light;
-/// that of missing detail is about 1.
-const OLD_LIGHT: f32 = 1000.0;
-const WRONG_DIRECT: f32 = 100.0;
-
 /// What choosing needs to remember.
 pub(super) struct Chooser {
     /// Per block, whether something is left to do.
@@ -109,13 +104,8 @@ impl Chooser {
         match mode {
             Mode::View => {
                 let urgency = |b: u32| {
-                    let block = &from.blocks[b as usize];
-                    let error = match () {
-                        _ if block.has_old_light(from.context) => OLD_LIGHT,
-                        _ if !block.has_direct(from.context) => WRONG_DIRECT,
-                        _ => block.error.max(1e-4),
-                    };
-                    from.visibility.mark(b) * error
+                    let gain = from.blocks[b as usize].next(from.context, &from.context.map.tiles[b as usize]);
+                    from.visibility.mark(b) * gain.map_or(0.0, |g| g.1)
                 };
                 let open = from.visibility.seen.iter().filter(|&&b| self.is_open(b));
                 greatest(open.map(|&b| (urgency(b), b)).collect(), count)

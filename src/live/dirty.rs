@@ -8,7 +8,7 @@ use super::display::Changed;
 const SLACK: f64 = 1.3;
 
 /// More rectangles than this on one page become one.
-const MAX_RECTS: usize = 256;
+const MAX_RECTS: usize = 1024;
 
 /// Changed rectangles, by page.
 pub(super) struct Dirty {

@@ -140,7 +140,7 @@ pub struct LiveStats {
     pub light_pending: bool,
     /// That the update took.
     pub milliseconds: f32,
-    /// Estimated relative error of indirect light where the camera looks.
+    /// Estimated relative error (RMS) of indirect light where the camera looks.
     pub visible_error: f32,
     /// Part of the blocks that are finished, of all and of those that the camera sees.
     pub finished: f32,
@@ -175,6 +175,9 @@ const BACKGROUND: usize = 256;
 
 /// Part of the time budget that is left to showing what was computed and to leaving.
 const SPARE: f64 = 0.15;
+
+/// Light below this part of the scene's mean counts as dark.
+const DIM: f32 = 0.02;
 
 /// Memory is announced to the monitor in steps of so many bytes.
 const MEMORY_STEP: usize = 1 << 20;
@@ -309,13 +312,15 @@ impl Live {
             memory,
             context: Context {
                 map: Arc::new(map),
-                light: Arc::new(light),
                 samples: Arc::new(SampleSet::new(bake.gather_rays, purpose_seed(params.seed, purpose::GATHER_SET))),
                 gather_seed: purpose_seed(params.seed, purpose::GATHER),
                 direct_seed: purpose_seed(params.seed, purpose::DIRECT),
                 direct_samples: params.direct_samples,
+                direct_rays: light.direct.rays_per_point(params.direct_samples),
+                dim: 0.0,
                 promote_threshold: params.promote_threshold,
                 max_rounds: params.max_rounds,
+                light: Arc::new(light),
             },
             lights,
             bake,
@@ -342,13 +347,20 @@ impl Live {
                 if !tile.texels.is_empty() {
                     block.work_on_coarse(&context, tile, &limit);
                     block.work_on_indirect(&context, tile, &limit);
-                    // Texels that lie hidden inside something tell nothing of the others.
-                    while block.lod < top && !block.sees_anything() && block.work_on_indirect(&context, tile, &limit) {}
+                    // One or two texels that lie hidden inside something, or against it, tell nothing of
+                    // the others.
+                    while block.lod < top
+                        && tile.lod_end[block.lod as usize] <= 2
+                        && !block.sees_light()
+                        && block.work_on_indirect(&context, tile, &limit)
+                    {}
                 }
                 stage.advance(1)
             })
         })?;
         self.total_rays += limit.traced.into_inner();
+        let mean = self.blocks.iter().map(|b| (b.mean + b.direct_mean) as f64).sum::<f64>() / self.blocks.len() as f64;
+        self.context.dim = DIM * mean as f32;
         self.held = self.blocks.iter().map(|b| b.bytes() as isize).sum();
         let all: Vec<u32> = (0..self.blocks.len() as u32).collect();
         let (display, blocks) = (&mut self.display, &mut self.blocks);
@@ -675,16 +687,18 @@ impl Live {
     }
 
     fn describe(&self, stats: &mut LiveStats) {
-        let (mut error, mut marks, mut done) = (0.0, 0.0, 0.0);
+        let (mut error, mut light, mut marks, mut done) = (0.0, 0.0, 0.0, 0.0);
         for &b in &self.visibility.seen {
             let mark = self.visibility.mark(b);
-            error += mark * self.blocks[b as usize].error.powi(2);
+            let block = &self.blocks[b as usize];
+            error += mark * (block.error * block.mean).powi(2);
+            light += mark * block.mean.powi(2);
             done += if self.chooser.is_open(b) { 0.0 } else { mark };
             marks += mark;
         }
         stats.light_pending = self.relight.is_pending();
         if marks > 0.0 {
-            stats.visible_error = (error / marks).sqrt();
+            stats.visible_error = if light > 0.0 { (error / light).sqrt() } else { 0.0 };
             stats.visible_finished = done / marks;
         }
         stats.finished = self.chooser.finished();

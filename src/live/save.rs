@@ -67,7 +67,7 @@ impl Live {
                 self.blocks[b as usize] = old;
                 continue;
             }
-            let mut block = Block { coarse_epoch: old.coarse_epoch, ..saved.block };
+            let mut block = Block { coarse_epoch: old.coarse_epoch, direct_mean: old.direct_mean, ..saved.block };
             block.indirect_epoch = self.context.light.indirect_epoch;
             self.held += block.bytes() as isize - old.bytes() as isize;
             if let Some(values) = saved.direct
@@ -78,7 +78,7 @@ impl Live {
                 let rect = self.context.map.rect_in_light_map(tile.chart, &tile.rect);
                 self.held += self.display.take_direct(&self.context.map, b, DirectTile { rect, values }).1;
             }
-            block.error = block.estimate_error(self.context.map.top());
+            block.note_error(self.context.map.top());
             self.display.lods[b as usize] = saved.shown;
             self.blocks[b as usize] = block;
         }

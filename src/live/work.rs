@@ -17,6 +17,13 @@ use std::time::Instant;
 /// Shadow rays per area light for coarse direct light, at most.
 const COARSE_SAMPLES: u32 = 4;
 
+/// Gain of rays under new light.
+const OLD_LIGHT: f32 = 1e30;
+
+/// Error of coarse direct light, by its mean: shadows are missing or blurred over whole blocks, which is
+/// seen first.
+const DIRECT_ERROR: f32 = 2.0;
+
 /// Weight of old light beside the first round of rays under new light. More would hide the noise of
 /// that round, but old light is mostly further from the truth.
 const PRIOR_WEIGHT: f32 = 0.25;
@@ -30,8 +37,19 @@ pub(super) struct Context {
     pub gather_seed: u32,
     pub direct_seed: u32,
     pub direct_samples: u32,
+    /// About so many rays take direct light at a point.
+    pub direct_rays: f32,
+    /// Light below which places count as dark: a small part of the scene's mean.
+    pub dim: f32,
     pub promote_threshold: u32,
     pub max_rounds: u32,
+}
+
+/// What a block can do next.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub(super) enum Kind {
+    Direct,
+    Indirect,
 }
 
 /// What ends the work of an update.
@@ -62,7 +80,7 @@ impl Limit {
 pub(super) enum Step {
     /// The coarse direct light alone.
     Coarse,
-    /// What is missing of direct light, then a step of indirect light.
+    /// That, if it is of other lights, then whichever of direct and indirect light gains more.
     Next,
 }
 
@@ -135,19 +153,36 @@ impl Block {
         if step == Step::Coarse {
             return done;
         }
-        if self.has_old_light(c) {
-            // The first few rays change more, for less, than direct light at full resolution does.
-            done.indirect = self.work_on_indirect(c, tile, limit);
-            return done;
+        match self.next(c, tile) {
+            Some((Kind::Direct, _)) => done.direct = self.work_on_direct(c, tile, limit),
+            Some((Kind::Indirect, _)) => done.indirect = self.work_on_indirect(c, tile, limit),
+            None => {}
         }
-        if !self.has_direct(c) {
-            done.direct = self.work_on_direct(c, tile, limit);
-            if !done.direct {
-                return done;
-            }
-        }
-        done.indirect = self.work_on_indirect(c, tile, limit);
         done
+    }
+
+    /// What gains most next, and how much: error mended per ray.
+    pub fn next(&self, c: &Context, tile: &Tile) -> Option<(Kind, f32)> {
+        if self.has_old_light(c) {
+            // Few rays change much; before all else.
+            return Some((Kind::Indirect, OLD_LIGHT));
+        }
+        // Errors of dark places are seen better than their size tells, less than their ratio does.
+        let scale = 1.0 / (self.mean + self.direct_mean + c.dim).max(f32::MIN_POSITIVE).sqrt();
+        let direct = (!self.has_direct(c)).then(|| {
+            let rays = tile.map_texels as f32 * c.direct_rays;
+            (Kind::Direct, scale * DIRECT_ERROR * (self.direct_mean + 0.1 * self.mean + c.dim) / rays.max(1.0))
+        });
+        let indirect = self.target(c).map(|(lod, rounds)| {
+            let known = if lod > 0 && rounds == c.promote_threshold { tile.lod_end[lod as usize - 1] } else { 0 };
+            let rays = (tile.lod_end[lod as usize] - known) as f32 * ROUND as f32;
+            // A finished block of no error still has its turn.
+            (Kind::Indirect, scale * self.error.max(1e-4) * (self.mean + c.dim) / rays.max(1.0))
+        });
+        match (direct, indirect) {
+            (Some(d), Some(i)) => Some(if i.1 > d.1 { i } else { d }),
+            (one, other) => one.or(other),
+        }
     }
 
     /// One step of indirect light; tells whether it was completed.
@@ -183,7 +218,7 @@ impl Block {
         self.fresh_lod = lod;
         self.lod = self.lod.max(lod);
         self.rounds = rounds as u16;
-        self.error = self.estimate_error(c.map.top());
+        self.note_error(c.map.top());
         true
     }
 
@@ -216,9 +251,9 @@ impl Block {
         self.gathered.get(i).is_none_or(|g| g.is_visible())
     }
 
-    /// Whether any texel gathered so far can be seen.
-    pub fn sees_anything(&self) -> bool {
-        self.gathered.iter().any(Gathered::is_visible)
+    /// Whether any texel gathered so far can be seen and sees light.
+    pub fn sees_light(&self) -> bool {
+        self.gathered.iter().any(|g| g.is_visible() && g.sum != Vec3::ZERO)
     }
 
     /// Drops the prior once it has no weight.
@@ -241,23 +276,25 @@ impl Block {
 
     /// Relative error of the block's indirect light: the spread of its rounds, where there is more
     /// than one, and, where texels are interpolated, half the spread of those that are not.
-    pub fn estimate_error(&self, top: u8) -> f32 {
+    pub fn note_error(&mut self, top: u8) {
         let values = || self.gathered.iter().filter(|g| g.rays > 0).map(|g| g.irradiance().element_sum());
         let n = values().count().max(1) as f32;
         let mean = values().sum::<f32>() / n;
-        if !(mean > 0.0) {
-            // Dark, or the texels so far lie hidden inside something and those of the next LOD do not.
-            return if self.fresh_lod < top { 1.0 } else { 0.0 };
-        }
-        let spread = (values().map(|v| (v - mean).powi(2)).sum::<f32>() / n).sqrt() / mean;
-        let noise = if self.deviation_count > 0 {
-            (self.deviations / self.deviation_count as f32 / self.rounds.max(1) as f32).sqrt() / mean
+        self.mean = mean;
+        self.error = if mean > 0.0 {
+            let spread = (values().map(|v| (v - mean).powi(2)).sum::<f32>() / n).sqrt() / mean;
+            let noise = if self.deviation_count > 0 {
+                (self.deviations / self.deviation_count as f32 / self.rounds.max(1) as f32).sqrt() / mean
+            } else {
+                // One round alone tells nothing of its noise; neighbours differ by it at least. Few
+                // texels do not tell even that.
+                spread.max(1.0 / n).min(1.0) / (self.rounds.max(1) as f32).sqrt()
+            };
+            if self.fresh_lod < top { noise + 0.5 * spread.min(1.0) + 0.02 } else { noise }
         } else {
-            // One round alone tells nothing of its noise; neighbours differ by it at least. Few texels
-            // do not tell even that.
-            spread.max(1.0 / n).min(1.0) / (self.rounds.max(1) as f32).sqrt()
+            // Dark, or the texels so far lie hidden inside something and those of the next LOD do not.
+            (self.fresh_lod < top) as u8 as f32
         };
-        if self.fresh_lod < top { noise + 0.5 * spread.min(1.0) + 0.02 } else { noise }
     }
 
     /// Direct light of the lowest LOD's texels.
@@ -269,6 +306,8 @@ impl Block {
             c.light.direct.irradiance(&receiver, samples, combine(c.direct_seed, s), &mut rays)
         };
         self.new_coarse = tile.texels[..tile.lod_end[0] as usize].iter().map(value).collect();
+        let sum: f32 = self.new_coarse.iter().map(|v| v.element_sum()).sum();
+        self.direct_mean = sum / self.new_coarse.len().max(1) as f32;
         self.coarse_epoch = c.light.direct_epoch;
         limit.traced.fetch_add(rays, Relaxed);
     }
