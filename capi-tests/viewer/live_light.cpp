@@ -1,6 +1,7 @@
 #include "live_light.h"
 
 #include <algorithm>
+#include <chrono>
 #include <cstdio>
 #include <stdexcept>
 
@@ -179,13 +180,15 @@ void LiveLight::read(const bk_rect &rect, bool direct, const Use &use) {
     use(rect, texels.data());
 }
 
-void LiveLight::changes(bool direct, const Use &use) {
-    bk_rect rects[256];
+void LiveLight::changes(bool direct, double milliseconds, const Use &use) {
+    using Clock = std::chrono::steady_clock;
+    const auto end = Clock::now() + std::chrono::duration<double, std::milli>(milliseconds);
+    bk_rect rect;
     size_t count;
     do {
-        check(bk_live_dirty_rects(live.get(), rects, std::size(rects), &count));
-        for (size_t i = 0; i < count; i++) read(rects[i], direct, use);
-    } while (count == std::size(rects));
+        check(bk_live_dirty_rects(live.get(), &rect, 1, &count));
+        if (count) read(rect, direct, use);
+    } while (count && Clock::now() < end);
 }
 
 void LiveLight::everything(bool direct, const Use &use) {

@@ -44,9 +44,10 @@ public:
     // Makes the light map better, where this camera makes worthwhile, for about so long.
     bk_live_stats update(const bk_camera &camera, float milliseconds);
     // What of the light map is another than at the last call: use() gets rectangles and their texels,
-    // four half floats each. Without `direct`, only light that came by way of other surfaces.
+    // four half floats each. Without `direct`, only light that came by way of other surfaces. After about
+    // so many milliseconds the rest is left to the next call.
     using Use = std::function<void(const bk_rect &, const void *texels)>;
-    void changes(bool direct, const Use &use);
+    void changes(bool direct, double milliseconds, const Use &use);
     // The same for all pages, changed or not.
     void everything(bool direct, const Use &use);
     uint32_t highest_lod() const { return top_lod; }

@@ -25,6 +25,9 @@
 
 namespace {
 
+// Time per frame to fetch and upload what has changed. What is left comes in the next frames.
+constexpr double UPLOAD_MS = 3, WHATEVER_IT_TAKES = 1e6;
+
 using Clock = std::chrono::steady_clock;
 const Clock::time_point program_start = Clock::now();
 
@@ -216,7 +219,11 @@ public:
             if (csv) write_row(frame, work);
             write_screenshots(frame);
         }
-        if (options.check) check_textures();
+        if (options.check) {
+            light.changes(!look.direct_from_shadow_maps, WHATEVER_IT_TAKES,
+                          [&](const bk_rect &rect, const void *data) { renderer.upload(rect, data); });
+            check_textures();
+        }
     }
 
 private:
@@ -244,6 +251,7 @@ private:
     void set_mode(Mode m) {
         mode = m;
         light.set_mode(m);
+        is_starting = true;
     }
 
     // A path has no field of view of its own.
@@ -283,9 +291,9 @@ private:
             work.rects++;
             work.texels += size_t(rect.width) * rect.height;
         };
-        light.changes(!look.direct_from_shadow_maps, upload);
+        light.changes(!look.direct_from_shadow_maps, is_starting ? WHATEVER_IT_TAKES : UPLOAD_MS, upload);
         if (all_is_new) light.everything(!look.direct_from_shadow_maps, upload);
-        all_is_new = false;
+        all_is_new = is_starting = false;
         work.upload_ms = 1000 * seconds_since(upload_start);
 
         renderer.draw(camera, look, target);
@@ -374,7 +382,7 @@ private:
     int width, height;
     Mode mode;
     Look look;
-    bool overlay_shown, all_is_new = false;
+    bool overlay_shown, all_is_new = false, is_starting = true;
     double time = 0, frame_ms = 0; // frame_ms: of the frame before
     size_t screenshots_at = 0;
     std::FILE *csv = nullptr;
