@@ -83,8 +83,9 @@ pub unsafe extern "C" fn bk_scene_add_light(
     })
 }
 
-/// Replaces light `id`, before or after the commit; its type may change. What is being baked keeps
-/// the lights that it started with.
+/// Replaces light `id`, before or after the commit; its type may change. A light is taken away by
+/// giving it no colour. What is being baked keeps the lights that it started with; a live object is
+/// told by bk_live_light_changed.
 #[unsafe(no_mangle)]
 pub unsafe extern "C" fn bk_scene_set_light(scene: *mut bk_scene, id: u32, desc: *const bk_light_desc) -> bk_result {
     call(|| {

@@ -180,7 +180,7 @@ impl TexelMap {
     #[inline]
     pub fn nearest(&self, placement: u32, coord: [f32; 2]) -> u32 {
         let w = &self.windows[placement as usize];
-        let (x, y) = (w.column(coord[0].floor()), w.row(coord[1].floor()));
+        let (x, y) = (w.column(coord[0]), w.row(coord[1]));
         let sample = self.index[w.at(x, y)];
         if sample != NONE { sample } else { self.search(w, x, y) }
     }
@@ -191,7 +191,7 @@ impl TexelMap {
     pub fn bilinear(&self, placement: u32, coord: [f32; 2]) -> Bilinear {
         let w = &self.windows[placement as usize];
         let (cx, cy) = (coord[0] - 0.5, coord[1] - 0.5);
-        let (x0, y0) = (cx.floor(), cy.floor());
+        let (x0, y0) = (floor(cx), floor(cy));
         let (fx, fy) = (cx - x0, cy - y0);
         let (xs, ys) = ([w.column(x0), w.column(x0 + 1.0)], [w.row(y0), w.row(y0 + 1.0)]);
         let at = |i: usize| self.index[w.at(xs[i & 1], ys[i >> 1])];
@@ -315,6 +315,7 @@ impl Window {
     }
 
     /// Column in the window of a texel of the page, clamped. (NaN gives 0.)
+    /// The column of a coordinate, rounded down, or the nearest that there is.
     #[inline]
     fn column(&self, x: f32) -> u32 {
         (x - self.x as f32).max(0.0).min(self.w as f32 - 1.0) as u32
@@ -324,6 +325,14 @@ impl Window {
     fn row(&self, y: f32) -> u32 {
         (y - self.y as f32).max(0.0).min(self.h as f32 - 1.0) as u32
     }
+}
+
+/// Rounds a coordinate down. (`f32::floor` is a call into the C library unless SSE4.1 is taken for
+/// granted. With it, reading live light took 92 instead of 80 ns per texel.)
+#[inline]
+fn floor(x: f32) -> f32 {
+    let towards_zero = x as i32 as f32;
+    if towards_zero > x { towards_zero - 1.0 } else { towards_zero }
 }
 
 /// What the passes read.

@@ -414,8 +414,9 @@ impl Display {
         if !with_direct {
             return indirect;
         }
+        // Coordinates are not negative, so that truncation rounds down.
         let at = atlas.gather.layout.texel_coord(chart, local);
-        let b = map.block_at(chart, at[0].floor() as i32, at[1].floor() as i32) as usize;
+        let b = map.block_at(chart, at[0] as i32, at[1] as i32) as usize;
         let fine = self.tiles[b].as_ref().and_then(|tile| {
             let (x, y) = atlas.map.position(sample as usize);
             let r = &tile.rect;
