@@ -486,8 +486,9 @@ BK_API void bk_light_desc_init(bk_light_desc *desc);
 // addition.
 BK_API bk_result bk_scene_add_light(bk_scene *scene, const bk_light_desc *desc, uint32_t *out_id);
 
-// Replaces light `id`, before or after the commit; its type may change. What is being baked keeps
-// the lights that it started with.
+// Replaces light `id`, before or after the commit; its type may change. A light is taken away by
+// giving it no colour. What is being baked keeps the lights that it started with; a live object is
+// told by bk_live_light_changed.
 BK_API bk_result bk_scene_set_light(bk_scene *scene, uint32_t id, const bk_light_desc *desc);
 
 // The number of lights (emissive materials not counted), committed or not; 0 on failure.
