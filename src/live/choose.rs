@@ -3,7 +3,7 @@
 use super::blocks::{Block, BlockMap};
 use super::cells::Grid;
 use super::visibility::Visibility;
-use super::work::Context;
+use super::work::{Context, Step};
 use super::{LiveCamera, Mode};
 use crate::sampling::{combine, mix};
 use std::cmp::Ordering;
@@ -20,7 +20,7 @@ pub(super) struct Chooser {
     /// Cells with marked blocks, in the update under way.
     visible: Vec<u32>,
     is_visible: Vec<bool>,
-    /// Of random choices.
+    /// Number of choices so far.
     turn: u32,
 }
 
@@ -99,8 +99,25 @@ impl Chooser {
         greatest(from.visibility.seen.iter().filter_map(wrong).collect(), count)
     }
 
-    /// The next blocks to work on, the most urgent first.
-    pub fn next(&mut self, from: &Choice, mode: Mode, camera: &LiveCamera, count: usize) -> Vec<u32> {
+    /// The next blocks to work on, the most urgent first, and what is to be done to them.
+    pub fn next(&mut self, from: &Choice, mode: Mode, camera: &LiveCamera, count: usize) -> (Step, Vec<u32>) {
+        self.turn = self.turn.wrapping_add(1);
+        if mode == Mode::Position && self.turn % 2 == 0 {
+            // In turn with cells, direct light of what is seen: shadows that end at the border of a cell
+            // are seen more than any other.
+            let missing = |&b: &u32| {
+                let is_missing = self.is_open(b) && !from.blocks[b as usize].has_direct(from.context);
+                is_missing.then(|| (from.visibility.mark(b), b))
+            };
+            let missing = greatest(from.visibility.seen.iter().filter_map(missing).collect(), count);
+            if !missing.is_empty() {
+                return (Step::Direct, missing);
+            }
+        }
+        (Step::Next, self.next_by_mode(from, mode, camera, count))
+    }
+
+    fn next_by_mode(&mut self, from: &Choice, mode: Mode, camera: &LiveCamera, count: usize) -> Vec<u32> {
         match mode {
             Mode::View => {
                 let urgency = |b: u32| {
@@ -112,9 +129,7 @@ impl Chooser {
             }
             Mode::Uniform => {
                 let n = self.open.len() as u32;
-                let turn = self.turn;
-                self.turn = turn.wrapping_add(1);
-                let random = |i: u32| mix(combine(turn, i)) % n.max(1);
+                let random = |i: u32| mix(combine(self.turn, i)) % n.max(1);
                 if self.open_count < self.open.len() / 16 {
                     // Few are left: the next ones from somewhere on.
                     let from = random(0);

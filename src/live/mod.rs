@@ -447,8 +447,7 @@ impl Live {
             let mut step = Step::Coarse;
             let mut chosen = self.chooser.wrong(&from, ((left / self.coarse_seconds) as usize).clamp(1, PASS));
             if chosen.is_empty() {
-                step = Step::Next;
-                chosen = self.chooser.next(&from, self.params.mode, camera, PASS);
+                (step, chosen) = self.chooser.next(&from, self.params.mode, camera, PASS);
             }
             if chosen.is_empty() || over(traced) {
                 break;
@@ -636,7 +635,7 @@ impl Live {
         }
         let from =
             Choice { context: &self.context, blocks: &self.blocks, grid: &self.grid, visibility: &self.visibility };
-        let mut chosen = self.chooser.next(&from, self.params.mode, camera, BACKGROUND);
+        let (step, mut chosen) = self.chooser.next(&from, self.params.mode, camera, BACKGROUND);
         // What waits to be shown must be there for it.
         chosen.retain(|&b| !self.is_waiting[b as usize]);
         if chosen.is_empty() {
@@ -647,7 +646,7 @@ impl Live {
         let blocks = &mut self.blocks;
         let taken = chosen.iter().map(|&b| (b, std::mem::take(&mut blocks[b as usize])));
         let limit = Limit::new(None, most_rays);
-        let batch = Arc::new(Batch::new(self.context.clone(), taken, Step::Next, limit, Duration::ZERO));
+        let batch = Arc::new(Batch::new(self.context.clone(), taken, step, limit, Duration::ZERO));
         batch.start(&self.device());
         self.background = Some(batch);
         Ok(())

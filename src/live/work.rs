@@ -80,6 +80,8 @@ impl Limit {
 pub(super) enum Step {
     /// The coarse direct light alone.
     Coarse,
+    /// Direct light alone.
+    Direct,
     /// That, if it is of other lights, then whichever of direct and indirect light gains more.
     Next,
 }
@@ -153,7 +155,9 @@ impl Block {
         if step == Step::Coarse {
             return done;
         }
-        match self.next(c, tile) {
+        let next = if step == Step::Direct { Some((Kind::Direct, 0.0)) } else { self.next(c, tile) };
+        match next {
+            Some((Kind::Direct, _)) if self.has_direct(c) => {}
             Some((Kind::Direct, _)) => done.direct = self.work_on_direct(c, tile, limit),
             Some((Kind::Indirect, _)) => done.indirect = self.work_on_indirect(c, tile, limit),
             None => {}
