@@ -37,7 +37,7 @@ use crate::progress::Progress;
 use crate::sampling::purpose_seed;
 use crate::scene::{Light, Scene};
 use batch::{Batch, Item};
-use blocks::{Block, BlockMap, Rect};
+use blocks::{Block, BlockMap, Rect, Tile};
 use cells::{Grid, Promotion};
 use choose::{Choice, Chooser};
 use dirty::Dirty;
@@ -291,7 +291,8 @@ impl Live {
             // Marks, and the queue of what is to be shown.
             + map.tiles.len() * 9;
         let memory = atlas.scene.device().memory().reserve(fixed, "the live state")?;
-        let full = atlas.gather.len() * size_of::<Gathered>() + atlas.map.len() * size_of::<Vec3>();
+        let all_of = |t: &Tile| t.texels.len() * size_of::<Gathered>() + t.map_texels as usize * size_of::<Vec3>();
+        let full: usize = map.tiles.iter().map(all_of).sum();
         let blocks: Vec<Block> = map.tiles.iter().map(|_| Block::default()).collect();
         let mut live = Live {
             visibility: Visibility::new(blocks.len()),

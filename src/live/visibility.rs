@@ -3,7 +3,7 @@
 
 use super::LiveCamera;
 use super::blocks::BlockMap;
-use crate::sampling::sobol_2d;
+use crate::sampling::{combine, sobol_2d};
 use crate::scene::NONE;
 use crate::trace::{PACKET_SIZE, Packet, RawHit};
 use glam::Vec3;
@@ -56,9 +56,9 @@ impl Visibility {
         for p in 0..PACKETS {
             let mut packet = Packet::default();
             for _ in 0..PACKET_SIZE {
-                let i =
-                    self.updates.wrapping_mul((PACKETS * PACKET_SIZE) as u32) + (p * PACKET_SIZE + packet.count) as u32;
-                let [a, b] = sobol_2d(i & 0xffff, 0x5eed);
+                // A sequence of its own per column: every 16th part of one sequence would leave gaps.
+                let i = self.updates.wrapping_mul(PACKET_SIZE as u32) + packet.count as u32;
+                let [a, b] = sobol_2d(i & 0xffff, combine(0x5eed, p as u32));
                 // The packet's column of the picture, in coordinates from −1 to 1.
                 let u = denser_in_the_middle(((p as f32 + a) / PACKETS as f32) * 2.0 - 1.0);
                 let v = denser_in_the_middle(b * 2.0 - 1.0);

@@ -198,6 +198,7 @@ impl Block {
         let atlas = &c.map.atlas;
         let lookup = RadianceMap::new(&atlas.charts, &atlas.radiance, &c.light.radiance);
         let end = tile.lod_end[lod as usize];
+        self.gathered.reserve_exact((end as usize).saturating_sub(self.gathered.len()));
         while self.cursor < end {
             let i = self.cursor as usize;
             let sample = tile.texels[i];
