@@ -9,7 +9,7 @@ use crate::scene::NONE;
 use glam::Vec3;
 use rayon::prelude::*;
 
-/// Side of a bin in texels.
+/// Side of a bin in texels. (16 is no faster: time goes to the search of the nearest texel in the padding.)
 const BIN: i32 = 64;
 
 /// Rows that a thread composes at a time.
