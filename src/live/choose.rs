@@ -102,7 +102,7 @@ impl Chooser {
     /// The next blocks to work on, the most urgent first, and what is to be done to them.
     pub fn next(&mut self, from: &Choice, mode: Mode, camera: &LiveCamera, count: usize) -> (Step, Vec<u32>) {
         self.turn = self.turn.wrapping_add(1);
-        if mode == Mode::Position && self.turn % 2 == 0 {
+        if mode == Mode::Position && self.turn.is_multiple_of(2) {
             // In turn with cells, direct light of what is seen: shadows that end at the border of a cell
             // are seen more than any other.
             let missing = |&b: &u32| {
