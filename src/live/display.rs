@@ -307,6 +307,13 @@ impl Display {
         self.epoch += 1;
     }
 
+    /// A tile that was current before the last change is so still.
+    pub fn keep_tile(&mut self, b: u32) {
+        if self.tile_epochs[b as usize] + 1 == self.epoch {
+            self.tile_epochs[b as usize] = self.epoch;
+        }
+    }
+
     /// Takes over the direct light of the lowest LOD's texels of `changed` blocks, and interpolates it
     /// to the others; returns where that changes the light map.
     pub fn take_coarse(&mut self, map: &BlockMap, blocks: &mut [Block], changed: &[u32]) -> Vec<Changed> {

@@ -617,16 +617,34 @@ impl Live {
             return Ok(false);
         }
         let Some(new) = self.relight.poll(&self.context.map.atlas, &self.bake)? else { return Ok(false) };
-        let direct_epoch = self.context.light.direct_epoch;
-        self.context.light = Arc::new(self.context.light.renewed(new));
+        let before = self.context.light.clone();
+        self.context.light = Arc::new(before.renewed(new));
         let bytes = self.display.bytes();
         self.display.begin_indirect_epoch();
-        if self.context.light.direct_epoch != direct_epoch {
+        if self.context.light.direct_epoch != before.direct_epoch {
             self.display.begin_direct_epoch();
+            self.keep_direct_of_same_sides(&before);
         }
         self.grow_fixed(self.display.bytes() - bytes);
         self.chooser.note_all(&self.context, &self.blocks);
         Ok(true)
+    }
+
+    /// New indirect light may turn charts over; the direct light of all others stays good.
+    fn keep_direct_of_same_sides(&mut self, before: &Illumination) {
+        let light = self.context.light.clone();
+        for (b, (block, tile)) in (0u32..).zip(self.blocks.iter_mut().zip(&self.context.map.tiles)) {
+            if before.backs.get(tile.chart as usize) != light.backs.get(tile.chart as usize) {
+                continue;
+            }
+            if block.coarse_epoch == before.direct_epoch {
+                block.coarse_epoch = light.direct_epoch;
+                if block.direct_epoch == before.direct_epoch {
+                    block.direct_epoch = light.direct_epoch;
+                    self.display.keep_tile(b);
+                }
+            }
+        }
     }
 
     /// Has the pool go on with what was seen last.
