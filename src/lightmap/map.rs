@@ -61,7 +61,7 @@ impl ChartMap {
 
     /// Calls `visit` with the samples to interpolate between and their weights, which sum to 1; not
     /// at all if the placement has no texel.
-    #[inline(always)] // so that sums stay in registers: reading live light took 80 instead of 69 ns per texel
+    #[inline(always)] // sums stay in registers: reading live light takes 69 ns per texel, otherwise 80
     pub(crate) fn bilinear(&self, placement: u32, local: [f32; 2], mut visit: impl FnMut(usize, f32)) {
         let b = self.texels.bilinear(placement, self.layout.texel_coord(placement, local));
         for (s, w) in b.samples.into_iter().zip(b.weights) {

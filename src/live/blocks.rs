@@ -113,7 +113,7 @@ pub(super) struct Block {
     /// direct light at full resolution.
     pub new_coarse: Box<[Vec3]>,
     pub new_direct: Option<DirectTile>,
-    /// Squared deviations of the rounds from the mean so far, by luminance, and how many.
+    /// Squared deviations of the rounds from the mean so far, by the sum of the channels, and how many.
     pub deviations: f32,
     pub deviation_count: u32,
     /// Estimated relative error of indirect light; the mean of that light, and of coarse direct light, by

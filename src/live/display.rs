@@ -95,7 +95,9 @@ impl Display {
     pub fn bytes(&self) -> usize {
         let per_texel = 4 * size_of::<Vec3>() + 1;
         let per_block = size_of::<Option<DirectTile>>() + size_of::<u32>() + 3;
-        self.plain.len() * per_texel + self.coarse_of_tile.len() * size_of::<Vec3>() + self.lods.len() * per_block
+        self.plain.len() * per_texel
+            + (self.coarse_of_tile.len() + self.old.len()) * size_of::<Vec3>()
+            + self.lods.len() * per_block
     }
 
     /// Shows what `changed` blocks know now; returns where that changes the light map.

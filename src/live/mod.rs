@@ -367,7 +367,7 @@ impl Live {
         let (display, blocks) = (&mut self.display, &mut self.blocks);
         device.install(|| display.take_coarse(&context.map, blocks, &all));
         self.display.lods = self.blocks.iter().map(|b| b.lod).collect();
-        self.reserve_for(&[])?;
+        self.reserve(0)?;
         self.show_all();
         Ok(())
     }
@@ -409,15 +409,11 @@ impl Live {
         budget.validate()?;
         let mut stats = LiveStats::default();
         let device = self.device();
-        // Work that was done meanwhile, then new light, then the budget: on the pool as a whole, since
-        // going there and back takes as long as a hundred rays.
-        let items = self.stop_background(&mut stats)?;
-        let renewed = self.take_new_light()?;
-        if !items.is_empty() || renewed || !budget.is_nothing() {
-            device.install(|| {
-                self.take_over(items, &mut stats);
-                self.spend(start, camera, budget, &mut stats)
-            })?;
+        self.collect(&mut stats)?;
+        self.take_new_light()?;
+        if !budget.is_nothing() {
+            // On the pool as a whole: going there and back takes as long as a hundred rays.
+            device.install(|| self.spend(start, camera, budget, &mut stats))?;
         }
         self.start_background(camera)?;
         self.total_rays += stats.rays;
@@ -426,10 +422,8 @@ impl Live {
         Ok(stats)
     }
 
+    /// Works until the budget is used up. To be called in the pool.
     fn spend(&mut self, start: Instant, camera: &LiveCamera, budget: &Budget, stats: &mut LiveStats) -> Result<()> {
-        if budget.is_nothing() {
-            return Ok(());
-        }
         let seconds = budget.milliseconds as f64 * 1e-3;
         let end = (seconds > 0.0).then(|| start + Duration::from_secs_f64(seconds));
         let most_rays = [budget.rays, self.params.rays_per_update as u64].into_iter().filter(|&r| r > 0).min();
@@ -591,15 +585,20 @@ impl Live {
         self.fading = todo.chain(rest).collect();
     }
 
-    /// Announces what work on blocks may allocate, in steps, so that the monitor is rarely asked.
+    /// Announces what work on blocks may allocate.
     fn reserve_for(&mut self, chosen: &[u32]) -> Result<()> {
-        let map = &self.context.map;
         let growth = |&b: &u32| {
-            let tile = &map.tiles[b as usize];
-            let direct = map.rect_in_light_map(tile.chart, &tile.rect).area() * size_of::<Vec3>();
-            tile.texels.len() * (size_of::<Gathered>() + size_of::<Vec3>()) + 2 * direct
+            let tile = &self.context.map.tiles[b as usize];
+            // Direct light under way is held beside that which is shown.
+            tile.texels.len() * (size_of::<Gathered>() + size_of::<Vec3>())
+                + 2 * tile.map_texels as usize * size_of::<Vec3>()
         };
-        let needed = self.fixed + self.held.max(0) as usize + chosen.iter().map(growth).sum::<usize>();
+        self.reserve(chosen.iter().map(growth).sum())
+    }
+
+    /// Announces more bytes than are held, in steps, so that the monitor is rarely asked.
+    fn reserve(&mut self, more: usize) -> Result<()> {
+        let needed = self.fixed + self.held.max(0) as usize + more;
         if needed > self.memory.bytes() {
             self.memory.grow(needed.next_multiple_of(MEMORY_STEP), "live light")?;
         }
@@ -612,11 +611,11 @@ impl Live {
     }
 
     /// Takes new indirect light over, if there is any.
-    fn take_new_light(&mut self) -> Result<bool> {
+    fn take_new_light(&mut self) -> Result<()> {
         if self.paused {
-            return Ok(false);
+            return Ok(());
         }
-        let Some(new) = self.relight.poll(&self.context.map.atlas, &self.bake)? else { return Ok(false) };
+        let Some(new) = self.relight.poll(&self.context.map.atlas, &self.bake)? else { return Ok(()) };
         let before = self.context.light.clone();
         self.context.light = Arc::new(before.renewed(new));
         let bytes = self.display.bytes();
@@ -627,7 +626,7 @@ impl Live {
         }
         self.grow_fixed(self.display.bytes() - bytes);
         self.chooser.note_all(&self.context, &self.blocks);
-        Ok(true)
+        Ok(())
     }
 
     /// New indirect light may turn charts over; the direct light of all others stays good.
@@ -671,29 +670,22 @@ impl Live {
         Ok(())
     }
 
-    /// Ends work in the background and returns its blocks.
-    fn stop_background(&mut self, stats: &mut LiveStats) -> Result<Vec<Item>> {
-        let Some(batch) = self.background.take() else { return Ok(Vec::new()) };
+    /// Ends work in the background and takes it over, whatever became of it.
+    fn collect(&mut self, stats: &mut LiveStats) -> Result<()> {
+        let Some(batch) = self.background.take() else { return Ok(()) };
         let (items, traced, result) = batch.take();
         stats.rays += traced;
-        if let Err(e) = result {
-            let device = self.device();
-            device.install(|| self.take_over(items, stats));
-            return Err(e);
-        }
-        Ok(items)
+        let device = self.device();
+        device.install(|| self.take_over(items, stats));
+        result
     }
 
-    /// Ends work in the background and takes it over.
-    fn collect(&mut self) -> Result<()> {
+    /// [`collect`](Self::collect) outside of updates.
+    fn collect_now(&mut self) -> Result<()> {
         let mut stats = LiveStats::default();
-        let items = self.stop_background(&mut stats)?;
-        if !items.is_empty() {
-            let device = self.device();
-            device.install(|| self.take_over(items, &mut stats));
-        }
+        let result = self.collect(&mut stats);
         self.total_rays += stats.rays;
-        Ok(())
+        result
     }
 
     /// Stops work in the background, or lets it go on with the next update: refinement between
@@ -701,7 +693,7 @@ impl Live {
     pub fn pause(&mut self, paused: bool) -> Result<()> {
         self.paused = paused;
         self.relight.hold(paused, &self.context.map.atlas, &self.bake)?;
-        self.collect()
+        self.collect_now()
     }
 
     fn describe(&self, stats: &mut LiveStats) {
@@ -733,7 +725,7 @@ impl Live {
         if id as usize >= count {
             return invalid_argument!("light {id} does not exist, the scene has {count}");
         }
-        self.collect()?;
+        self.collect_now()?;
         let bytes = self.display.bytes();
         self.display.begin_direct_epoch();
         self.grow_fixed(self.display.bytes() - bytes);
@@ -784,7 +776,7 @@ impl Live {
     /// Sums and rays of every gather texel, by sample: the part of the state that bakes share. For
     /// tests.
     pub fn sums(&mut self) -> Result<Vec<([f32; 3], u32)>> {
-        self.collect()?;
+        self.collect_now()?;
         let mut sums = vec![([0.0; 3], 0); self.context.map.atlas.gather.len()];
         for (tile, block) in self.context.map.tiles.iter().zip(&self.blocks) {
             for (&s, g) in tile.texels.iter().zip(&block.gathered) {
@@ -796,7 +788,7 @@ impl Live {
 
     /// Waits for indirect light that is being recomputed and takes it over.
     pub fn finish_relighting(&mut self) -> Result<()> {
-        self.collect()?;
+        self.collect_now()?;
         while self.relight.is_pending() && !self.paused {
             self.take_new_light()?;
             std::thread::sleep(Duration::from_millis(1));

@@ -37,7 +37,7 @@ struct Saved {
 impl Live {
     /// Writes the accumulated state to a file, which is replaced as a whole.
     pub fn save(&mut self, path: &Path) -> Result<()> {
-        self.collect()?;
+        self.collect_now()?;
         let mut out = MAGIC.to_vec();
         out.extend(self.fingerprint().to_le_bytes());
         out.extend((self.blocks.len() as u64).to_le_bytes());
@@ -59,7 +59,9 @@ impl Live {
     pub fn restore(&mut self, path: &Path) -> Result<()> {
         let bytes = std::fs::read(path).map_err(|e| Error::Io(format!("cannot read {}: {e}", path.display())))?;
         let saved = self.parse(&bytes, path)?;
-        self.collect()?;
+        self.collect_now()?;
+        let direct = |s: &Saved| s.direct.as_ref().map_or(0, |d| size_of_val(&d[..]));
+        self.reserve(saved.iter().map(|s| s.block.bytes() + direct(s)).sum())?;
         for (b, saved) in (0u32..).zip(saved) {
             let old = std::mem::take(&mut self.blocks[b as usize]);
             if saved.block.gathered.is_empty() {

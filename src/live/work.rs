@@ -1,6 +1,8 @@
-//! Work on one block: direct light at full resolution, then rounds of gather rays for the texels of
-//! the next LOD, then more rounds for all. It can stop after any texel and go on later; the sums of
-//! a texel depend on its number of rounds alone, so they have the bits of a bake with as many rays.
+//! Work on one block, in steps: coarse direct light, a few rays of indirect light where that is of an
+//! earlier time, then whichever mends more per ray: direct light at full resolution, the texels of
+//! the next LOD, or another round of 64 rays for all. Work can stop after any texel and go on later;
+//! the sums of a texel depend on its number of rounds alone, so they have the bits of a bake with as
+//! many rays.
 
 use super::blocks::{Block, BlockMap, DirectTile, Tile};
 use super::relight::Illumination;
@@ -78,11 +80,11 @@ impl Limit {
 /// How much of a block is to be worked on.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub(super) enum Step {
-    /// The coarse direct light alone.
+    /// Coarse direct light, if it is of other lights than those of now. The other steps begin so too.
     Coarse,
-    /// Direct light alone.
+    /// Direct light at full resolution.
     Direct,
-    /// That, if it is of other lights, then whichever of direct and indirect light gains more.
+    /// Whichever of direct and indirect light gains more.
     Next,
 }
 
@@ -152,14 +154,14 @@ impl Block {
             self.work_on_coarse(c, tile, limit);
             done.coarse = true;
         }
-        if step == Step::Coarse {
-            return done;
-        }
-        let next = if step == Step::Direct { Some((Kind::Direct, 0.0)) } else { self.next(c, tile) };
-        match next {
-            Some((Kind::Direct, _)) if self.has_direct(c) => {}
-            Some((Kind::Direct, _)) => done.direct = self.work_on_direct(c, tile, limit),
-            Some((Kind::Indirect, _)) => done.indirect = self.work_on_indirect(c, tile, limit),
+        let kind = match step {
+            Step::Coarse => None,
+            Step::Direct => (!self.has_direct(c)).then_some(Kind::Direct),
+            Step::Next => self.next(c, tile).map(|n| n.0),
+        };
+        match kind {
+            Some(Kind::Direct) => done.direct = self.work_on_direct(c, tile, limit),
+            Some(Kind::Indirect) => done.indirect = self.work_on_indirect(c, tile, limit),
             None => {}
         }
         done
@@ -279,7 +281,7 @@ impl Block {
         }
     }
 
-    /// Relative error of the block's indirect light: the spread of its rounds, where there is more
+    /// Estimates mean and relative error of the block's indirect light: the spread of its rounds, where there is more
     /// than one, and, where texels are interpolated, half the spread of those that are not.
     pub fn note_error(&mut self, top: u8) {
         let values = || self.gathered.iter().filter(|g| g.rays > 0).map(|g| g.irradiance().element_sum());
