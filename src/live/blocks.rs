@@ -7,6 +7,7 @@
 
 use crate::lightmap::Atlas;
 use crate::lightmap::gather::Gathered;
+use crate::lightmap::layout::Placement;
 use crate::scene::NONE;
 use glam::Vec3;
 use std::sync::Arc;
@@ -27,6 +28,11 @@ pub(super) struct Rect {
 }
 
 impl Rect {
+    pub fn of(p: &Placement) -> Rect {
+        let (x0, y0) = (p.x as i32, p.y as i32);
+        Rect { x0, y0, x1: x0 + p.w as i32, y1: y0 + p.h as i32 }
+    }
+
     pub fn width(&self) -> usize {
         (self.x1 - self.x0).max(0) as usize
     }
@@ -287,13 +293,11 @@ fn rect_in_light_map(atlas: &Atlas, chart: u32, rect: &Rect) -> Rect {
     let corners =
         [corner(rect.x0, rect.y0), corner(rect.x1, rect.y0), corner(rect.x0, rect.y1), corner(rect.x1, rect.y1)];
     let bound = |k: usize, f: fn(f32, f32) -> f32| corners[1..].iter().fold(corners[0][k], |b, c| f(b, c[k]));
-    let own =
-        Rect { x0: map.x as i32, y0: map.y as i32, x1: map.x as i32 + map.w as i32, y1: map.y as i32 + map.h as i32 };
     Rect {
         x0: bound(0, f32::min).floor() as i32 - 1,
         y0: bound(1, f32::min).floor() as i32 - 1,
         x1: bound(0, f32::max).ceil() as i32 + 1,
         y1: bound(1, f32::max).ceil() as i32 + 1,
     }
-    .clipped(&own)
+    .clipped(&Rect::of(map))
 }

@@ -458,9 +458,7 @@ impl Display {
 }
 
 fn own_rect(map: &BlockMap, chart: u32) -> Rect {
-    let p = &map.atlas.gather.layout.placements[chart as usize];
-    let (x0, y0) = (p.x as i32, p.y as i32);
-    Rect { x0, y0, x1: x0 + p.w as i32, y1: y0 + p.h as i32 }
+    Rect::of(&map.atlas.gather.layout.placements[chart as usize])
 }
 
 /// Where the light map shows a rectangle of a chart's gather texels.

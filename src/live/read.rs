@@ -6,7 +6,6 @@ use super::display::Display;
 use super::{Live, PageRect};
 use crate::error::{Result, invalid_argument};
 use crate::scene::NONE;
-use glam::Vec3;
 use rayon::prelude::*;
 
 /// Side of a bin in texels. (16 is no faster: time goes to the search of the nearest texel in the padding.)
@@ -62,11 +61,16 @@ impl ChartBins {
     }
 }
 
-/// A chart's page and rectangle, with padding.
-fn padded(map: &BlockMap, chart: u32) -> (u32, Rect) {
+/// A chart's page and rectangle.
+fn placed(map: &BlockMap, chart: u32) -> (u32, Rect) {
     let p = &map.atlas.map.layout.placements[chart as usize];
-    let (x0, y0) = (p.x as i32, p.y as i32);
-    (p.page, Rect { x0, y0, x1: x0 + p.w as i32, y1: y0 + p.h as i32 }.grown(map.atlas.padding as i32))
+    (p.page, Rect::of(p))
+}
+
+/// A chart's page and rectangle, with padding. (That of given charts lies outside their own.)
+fn padded(map: &BlockMap, chart: u32) -> (u32, Rect) {
+    let (page, rect) = placed(map, chart);
+    (page, if chart < map.atlas.map.layout.given { rect.grown(map.atlas.padding as i32) } else { rect })
 }
 
 impl Live {
@@ -110,29 +114,41 @@ impl Live {
         let atlas = &map.atlas;
         let padding = atlas.padding as i32;
         let mut is_own = vec![false; out.len()];
+        // Each sample is looked up and its light put together once, though up to a dozen texels of the
+        // padding repeat it.
+        let (mut samples, mut values) = (Vec::new(), Vec::new());
         for chart in self.bins.charts(page, rows) {
-            let own = |x: i32, y: i32| {
+            let shown = padded(map, chart).1.clipped(rows);
+            let from = placed(map, chart).1.clipped(&shown.grown(padding));
+            samples.clear();
+            samples.extend(from.texels().map(|(x, y)| {
                 let s = atlas.map.at(chart, x, y);
                 let of_chart =
-                    |s: u32| atlas.charts.chart_of[atlas.map.texels.samples[s as usize].triangle as usize] == chart;
-                (s != NONE && of_chart(s)).then_some(s)
-            };
-            for (x, y) in padded(map, chart).1.clipped(rows).texels() {
+                    s != NONE && atlas.charts.chart_of[atlas.map.texels.samples[s as usize].triangle as usize] == chart;
+                if of_chart { s } else { NONE }
+            }));
+            values.clear();
+            values.resize(samples.len(), None);
+            let index = |x: i32, y: i32| (y - from.y0) as usize * from.width() + (x - from.x0) as usize;
+            for (x, y) in shown.texels() {
                 let at = (y - rows.y0) as usize * rows.width() + (x - rows.x0) as usize;
                 if is_own[at] {
                     continue;
                 }
-                let mut sample = own(x, y);
-                is_own[at] = sample.is_some();
-                if sample.is_none() {
-                    // Around the chart: the nearest texel within the padding.
-                    let around = Rect { x0: x, y0: y, x1: x + 1, y1: y + 1 }.grown(padding);
+                // Around the chart: the nearest texel within the padding.
+                let here = Rect { x0: x, y0: y, x1: x + 1, y1: y + 1 };
+                let own = here.clipped(&from).texels().map(|(i, j)| index(i, j)).find(|&i| samples[i] != NONE);
+                is_own[at] = own.is_some();
+                let nearest = own.or_else(|| {
+                    let around = here.grown(padding).clipped(&from);
+                    let distance = |(i, j): (i32, i32)| ((i - x).pow(2) + (j - y).pow(2), samples[index(i, j)]);
                     let near =
-                        around.texels().filter_map(|(i, j)| own(i, j).map(|s| ((i - x).pow(2) + (j - y).pow(2), s)));
-                    sample = near.min().map(|n| n.1);
-                }
-                if let Some(s) = sample {
-                    out[at] = Vec3::to_array(&display.irradiance(map, s, with_direct));
+                        around.texels().filter(|&(i, j)| samples[index(i, j)] != NONE).min_by_key(|&t| distance(t));
+                    near.map(|(i, j)| index(i, j))
+                });
+                if let Some(i) = nearest {
+                    let value = values[i].get_or_insert_with(|| display.irradiance(map, samples[i], with_direct));
+                    out[at] = value.to_array();
                 }
             }
         }
