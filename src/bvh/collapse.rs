@@ -1,17 +1,21 @@
-//! Collapse of the binary tree to four-wide nodes (Dammertz, Hanika and Keller, *Shallow Bounding
+//! Collapse of the binary tree to eight-wide nodes (Dammertz, Hanika and Keller, *Shallow Bounding
 //! Volume Hierarchies for Fast SIMD Ray Tracing of Incoherent Rays*, 2008): the child of largest
 //! area is opened first.
 
 use super::binned::BinaryBvh;
-use super::layout::{ChildRef, LEAF_PAD, LEAF_STRIDE, Mbvh, Node};
+use super::layout::{ChildRef, LEAF_PAD, LEAF_STRIDE, Mbvh, Node, WIDTH};
 use glam::Vec3;
 
-/// The 4-wide tree of a binary one, nodes in depth-first order.
+/// Boxes grow by this part of their coordinates, which pays for the rounding of planes in the box test of
+/// the kernels.
+const OUTWARDS: f32 = 2.0 * f32::EPSILON;
+
+/// The 8-wide tree of a binary one, nodes in depth-first order.
 pub(super) fn collapse(binary: &BinaryBvh, corners: &[[Vec3; 3]]) -> Mbvh {
     let n = binary.triangles.len();
     let root = &binary.nodes[0];
     let mut tree = Mbvh {
-        nodes: Vec::with_capacity(n / 3 + 1),
+        nodes: Vec::with_capacity(n / 8 + 1),
         leaves: Vec::with_capacity(n * LEAF_STRIDE + LEAF_PAD),
         bounds: (root.lower, root.upper),
     };
@@ -19,14 +23,14 @@ pub(super) fn collapse(binary: &BinaryBvh, corners: &[[Vec3; 3]]) -> Mbvh {
     // (node to fill, its binary root); depth-first, first child next.
     let mut work = vec![(0usize, 0u32)];
     while let Some((target, source)) = work.pop() {
-        let mut children = [0u32; 4];
+        let mut children = [0u32; WIDTH];
         let count = open(binary, source, &mut children);
         let mut node = Node::EMPTY;
         for (i, &child) in children[..count].iter().enumerate() {
             let b = &binary.nodes[child as usize];
             for axis in 0..3 {
-                node.bounds[axis][i] = b.lower[axis];
-                node.bounds[axis][4 + i] = b.upper[axis];
+                node.lower[axis][i] = b.lower[axis] - OUTWARDS * b.lower[axis].abs();
+                node.upper[axis][i] = b.upper[axis] + OUTWARDS * b.upper[axis].abs();
             }
             node.children[i] = if b.count > 0 {
                 let triangles = &binary.triangles[b.index as usize..][..b.count as usize];
@@ -36,6 +40,7 @@ pub(super) fn collapse(binary: &BinaryBvh, corners: &[[Vec3; 3]]) -> Mbvh {
                 ChildRef::node(tree.nodes.len() - 1)
             };
         }
+        node.sort_children();
         tree.nodes[target] = node;
         for (i, &child) in children[..count].iter().enumerate().rev() {
             if !node.children[i].is_leaf() {
@@ -48,11 +53,11 @@ pub(super) fn collapse(binary: &BinaryBvh, corners: &[[Vec3; 3]]) -> Mbvh {
     tree
 }
 
-/// Fills in up to four descendants of `source` that cover it, and says how many.
-fn open(binary: &BinaryBvh, source: u32, children: &mut [u32; 4]) -> usize {
+/// Fills in up to eight descendants of `source` that cover it, and says how many.
+fn open(binary: &BinaryBvh, source: u32, children: &mut [u32; WIDTH]) -> usize {
     children[0] = source;
     let mut count = 1;
-    while count < 4 {
+    while count < WIDTH {
         let inner = (0..count).filter(|&i| binary.nodes[children[i] as usize].count == 0);
         let largest =
             inner.reduce(|a, b| if binary.half_area(children[b]) > binary.half_area(children[a]) { b } else { a });
@@ -107,7 +112,7 @@ mod tests {
                         for row in 0..9 {
                             let x = rows[row * c + k];
                             assert_eq!(x, corners[id][row / 3][row % 3]);
-                            assert!(node.bounds[row % 3][i] <= x && x <= node.bounds[row % 3][4 + i]);
+                            assert!(node.lower[row % 3][i] <= x && x <= node.upper[row % 3][i]);
                         }
                     }
                 }

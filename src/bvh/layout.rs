@@ -1,4 +1,4 @@
-//! Memory layout of the 4-wide tree.
+//! Memory layout of the 8-wide tree.
 
 use crate::simd::prefetch;
 use bytemuck::{Pod, Zeroable};
@@ -14,9 +14,13 @@ pub(crate) const MAX_DEPTH: usize = SAH_DEPTH + 28;
 /// Levels on which the builder may follow the SAH freely.
 pub(crate) const SAH_DEPTH: usize = 48;
 
-/// Entries that a traversal stack can need: each level of the 4-wide tree leaves at most three
-/// siblings behind, and a 4-wide level is at least one binary level.
-pub(crate) const STACK_SIZE: usize = 3 * MAX_DEPTH + 1;
+/// Children of a node.
+pub(crate) const WIDTH: usize = 8;
+
+/// Entries that a traversal stack can need: each level of the 8-wide tree leaves at most seven
+/// siblings behind, and an 8-wide level is at least one binary level. Children are pushed eight at a
+/// time, whatever their number.
+pub(crate) const STACK_SIZE: usize = (WIDTH - 1) * MAX_DEPTH + 1 + WIDTH;
 
 /// A reference to a child: another node, a leaf, or nothing.
 ///
@@ -68,41 +72,49 @@ impl ChildRef {
     }
 }
 
-/// A 4-wide node, 128 bytes, two cache lines.
+/// An 8-wide node, 256 bytes, four cache lines.
 ///
 /// ```text
-/// byte   0  x: four minima (f32), four maxima
-///       32  y: four minima, four maxima
-///       64  z: four minima, four maxima
-///       96  four child references (u32)
-///      112  unused
+/// byte   0  minima of x (eight f32), of y, of z
+///       96  maxima of x, of y, of z
+///      192  eight child references (u32)
+///      224  eight u32: bits 3·o to 3·o + 2 of the i-th name the child that comes i-th, from far to
+///           near, for directions of octant o (bit a of o: component a is negative)
 /// ```
 ///
-/// The minima and maxima of an axis lie side by side, so that one 256-bit operation tests the near
-/// and far planes of four boxes. Missing children have minima +inf, maxima −inf: no ray hits them.
+/// Missing children have minima +inf, maxima −inf: no ray hits them.
 #[derive(Clone, Copy, Debug, Pod, Zeroable)]
 #[repr(C, align(64))]
 pub struct Node {
-    pub bounds: [[f32; 8]; 3],
-    pub children: [ChildRef; 4],
-    pub unused: [u32; 4],
+    pub lower: [[f32; WIDTH]; 3],
+    pub upper: [[f32; WIDTH]; 3],
+    pub children: [ChildRef; WIDTH],
+    pub order: [u32; WIDTH],
 }
 
 impl Node {
     pub(crate) const EMPTY: Node = Node {
-        bounds: [[
-            f32::INFINITY,
-            f32::INFINITY,
-            f32::INFINITY,
-            f32::INFINITY,
-            f32::NEG_INFINITY,
-            f32::NEG_INFINITY,
-            f32::NEG_INFINITY,
-            f32::NEG_INFINITY,
-        ]; 3],
-        children: [ChildRef::EMPTY; 4],
-        unused: [0; 4],
+        lower: [[f32::INFINITY; WIDTH]; 3],
+        upper: [[f32::NEG_INFINITY; WIDTH]; 3],
+        children: [ChildRef::EMPTY; WIDTH],
+        order: [0; WIDTH],
     };
+
+    /// Fills in `order` from the boxes.
+    pub(crate) fn sort_children(&mut self) {
+        self.order = [0; WIDTH];
+        for octant in 0..8u32 {
+            // How far along the octant's diagonal a child begins. (Sorting by centres is no better.)
+            let begin = |i: usize| -> f32 {
+                (0..3).map(|a| if octant >> a & 1 == 1 { -self.upper[a][i] } else { self.lower[a][i] }).sum()
+            };
+            let mut far_to_near: [usize; WIDTH] = std::array::from_fn(|i| i);
+            far_to_near.sort_by(|&i, &j| begin(j).total_cmp(&begin(i)));
+            for (entry, child) in self.order.iter_mut().zip(far_to_near) {
+                *entry |= (child as u32) << (3 * octant);
+            }
+        }
+    }
 }
 
 /// Floats that leaf loads may read beyond a leaf's end.
@@ -111,7 +123,7 @@ pub(crate) const LEAF_PAD: usize = 16;
 /// Floats per triangle in a leaf: nine coordinates and the number.
 pub(crate) const LEAF_STRIDE: usize = 10;
 
-/// The 4-wide tree that the kernels traverse. Node 0 is the root.
+/// The 8-wide tree that the kernels traverse. Node 0 is the root.
 ///
 /// Triangles lie leaf by leaf. A leaf of c triangles that starts at slot s occupies floats 10·s to
 /// 10·(s + c): ten rows of c values each:
@@ -136,7 +148,7 @@ impl Mbvh {
         self.bounds
     }
 
-    /// Number of 4-wide nodes.
+    /// Number of 8-wide nodes.
     pub fn node_count(&self) -> usize {
         self.nodes.len()
     }
@@ -154,8 +166,8 @@ impl Mbvh {
         } else {
             self.nodes.as_ptr().wrapping_add(child.node_index()).cast::<u8>()
         };
+        // One line: the others follow by themselves. (Two and four lines are no faster.)
         prefetch(p);
-        prefetch(p.wrapping_add(64));
     }
 
     /// Pointer to the first row of a leaf; [`LEAF_PAD`] floats behind the last leaf are readable.

@@ -1,6 +1,6 @@
 //! Lanes over AVX2 and FMA: 128-bit vectors of four, 256-bit vectors of eight.
 
-use super::{Halves, Lanes, Mask, Simd};
+use super::{Eight, Lanes, Mask, Simd};
 use std::arch::x86_64::*;
 use std::ops::{Add, Mul, Sub};
 
@@ -159,22 +159,46 @@ lanes!(
     _mm256_or_ps
 );
 
-impl Halves for A8 {
-    type Half = A4;
-    #[inline(always)]
-    unsafe fn load_halves(low: *const f32, high: *const f32) -> Self {
-        // SAFETY: the caller vouches for the ISA and both pointers. `loadu2` puts its first
-        // argument in the high half.
-        A8(unsafe { _mm256_loadu2_m128(high, low) })
+/// For each set of lanes, the lanes of the set in ascending order.
+static LANES_OF: [[u8; 8]; 256] = {
+    let mut table = [[0; 8]; 256];
+    let mut set = 0;
+    while set < 256 {
+        let (mut lane, mut n) = (0, 0);
+        while lane < 8 {
+            if set >> lane & 1 == 1 {
+                table[set][n] = lane as u8;
+                n += 1;
+            }
+            lane += 1;
+        }
+        set += 1;
     }
+    table
+};
+
+impl Eight for A8 {
     #[inline(always)]
-    fn low(self) -> A4 {
-        // SAFETY: as above.
-        A4(unsafe { _mm256_castps256_ps128(self.0) })
-    }
-    #[inline(always)]
-    fn high(self) -> A4 {
-        // SAFETY: as above.
-        A4(unsafe { _mm256_extractf128_ps::<1>(self.0) })
+    unsafe fn compress(
+        self,
+        names: *const u32,
+        order: *const u32,
+        shift: u32,
+        mask: A8,
+        values: *mut f32,
+        out_names: *mut u32,
+    ) -> usize {
+        // SAFETY: the caller vouches for eight values at each pointer. Permutations use the lowest
+        // three bits of each index alone.
+        unsafe {
+            let order = _mm256_srl_epi32(_mm256_loadu_si256(order.cast()), _mm_cvtsi32_si128(shift as i32));
+            let set = _mm256_movemask_ps(_mm256_permutevar8x32_ps(mask.0, order)) as usize;
+            let kept = _mm256_cvtepu8_epi32(_mm_loadl_epi64(LANES_OF[set].as_ptr().cast()));
+            let from = _mm256_permutevar8x32_epi32(order, kept);
+            _mm256_storeu_ps(values, _mm256_permutevar8x32_ps(self.0, from));
+            let names = _mm256_permutevar8x32_epi32(_mm256_loadu_si256(names.cast()), from);
+            _mm256_storeu_si256(out_names.cast(), names);
+            set.count_ones() as usize
+        }
     }
 }

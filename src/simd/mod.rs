@@ -47,7 +47,13 @@ impl Isa {
     pub fn is_available(self) -> bool {
         #[cfg(target_arch = "x86_64")]
         {
-            let avx2 = std::arch::is_x86_feature_detected!("avx2") && std::arch::is_x86_feature_detected!("fma");
+            // Bit counts came to every CPU no later than AVX2.
+            let avx2 = std::arch::is_x86_feature_detected!("avx2")
+                && std::arch::is_x86_feature_detected!("fma")
+                && std::arch::is_x86_feature_detected!("popcnt")
+                && std::arch::is_x86_feature_detected!("lzcnt")
+                && std::arch::is_x86_feature_detected!("bmi1")
+                && std::arch::is_x86_feature_detected!("bmi2");
             match self {
                 Isa::Portable => true,
                 Isa::Avx2 => avx2,
@@ -85,11 +91,11 @@ impl Isa {
     }
 }
 
-/// An ISA's vectors: four lanes for the children of a node or the triangles of a leaf, eight for the
-/// lower and upper planes of four boxes, and the width that suits packets of rays and photons.
+/// An ISA's vectors: four lanes for the triangles of a leaf, eight for the children of a node, and the
+/// width that suits packets of rays and photons.
 pub(crate) trait Simd: Copy {
     type F4: Lanes;
-    type F8: Halves<Half = Self::F4>;
+    type F8: Eight;
     type Packet: Lanes;
 }
 
@@ -170,16 +176,23 @@ pub(crate) trait Lanes: Copy + Add<Output = Self> + Sub<Output = Self> + Mul<Out
     }
 }
 
-/// Eight lanes made of two halves of four.
-pub(crate) trait Halves: Lanes {
-    type Half: Lanes;
-    /// Four floats from `low` and four from `high`.
+/// Eight lanes, one per child of a node.
+pub(crate) trait Eight: Lanes {
+    /// Writes the lanes of `mask` to `values`, and the same lanes of `names` to `out_names`, in the
+    /// order that bits `shift` to `shift + 2` of each of `order` tell; returns how many. All eight
+    /// entries behind both outputs may be overwritten.
     ///
     /// # Safety
-    /// The CPU must have the ISA, and both pointers must be valid for reading four floats.
-    unsafe fn load_halves(low: *const f32, high: *const f32) -> Self;
-    fn low(self) -> Self::Half;
-    fn high(self) -> Self::Half;
+    /// All pointers must be valid for eight values.
+    unsafe fn compress(
+        self,
+        names: *const u32,
+        order: *const u32,
+        shift: u32,
+        mask: Self::Mask,
+        values: *mut f32,
+        out_names: *mut u32,
+    ) -> usize;
 }
 
 #[cfg(test)]

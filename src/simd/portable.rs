@@ -1,7 +1,7 @@
 //! Lanes over the `wide` crate: SSE2, NEON, simd128 or plain scalars, whatever the target's baseline
 //! has.
 
-use super::{Halves, Lanes, Mask, Simd};
+use super::{Eight, Lanes, Mask, Simd};
 use std::ops::{Add, Mul, Sub};
 use wide::f32x4;
 
@@ -199,19 +199,28 @@ impl Lanes for P8 {
     }
 }
 
-impl Halves for P8 {
-    type Half = P4;
+impl Eight for P8 {
     #[inline(always)]
-    unsafe fn load_halves(low: *const f32, high: *const f32) -> Self {
-        // SAFETY: forwarded.
-        unsafe { P8(P4::load(low), P4::load(high)) }
-    }
-    #[inline(always)]
-    fn low(self) -> P4 {
-        self.0
-    }
-    #[inline(always)]
-    fn high(self) -> P4 {
-        self.1
+    unsafe fn compress(
+        self,
+        names: *const u32,
+        order: *const u32,
+        shift: u32,
+        mask: M8,
+        values: *mut f32,
+        out_names: *mut u32,
+    ) -> usize {
+        let (own, mask) = (self.to_array(), mask.bits());
+        let mut n = 0;
+        for i in 0..8 {
+            // SAFETY: the caller vouches for eight values at each pointer; n ≤ i and `lane` are below 8.
+            unsafe {
+                let lane = (order.add(i).read() >> shift & 7) as usize;
+                values.add(n).write(own[lane]);
+                out_names.add(n).write(names.add(lane).read());
+                n += (mask >> lane & 1) as usize;
+            }
+        }
+        n
     }
 }

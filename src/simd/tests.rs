@@ -77,19 +77,38 @@ unsafe fn check_lanes<L: Lanes>() {
     }
 }
 
+unsafe fn check_compress<E: Eight>() {
+    let names: [u32; 8] = std::array::from_fn(|i| 100 + i as u32);
+    let values: [f32; 8] = std::array::from_fn(|i| i as f32);
+    // Two orders in one word, at different shifts.
+    let orders: [[u32; 8]; 2] = [[0, 1, 2, 3, 4, 5, 6, 7], [6, 2, 7, 0, 5, 1, 3, 4]];
+    let order: [u32; 8] = std::array::from_fn(|i| orders[0][i] | orders[1][i] << 21);
+    for set in 0..256u32 {
+        let chosen: [f32; 8] = std::array::from_fn(|i| (set >> i & 1) as f32);
+        for (k, shift) in [0, 21].into_iter().enumerate() {
+            let (mut out, mut out_names) = ([0.0; 8], [0; 8]);
+            // SAFETY: arrays of eight, and the caller vouches for the ISA.
+            let n = unsafe {
+                let mask = E::splat(0.5).lt(E::load(chosen.as_ptr()));
+                let v = E::load(values.as_ptr());
+                v.compress(names.as_ptr(), order.as_ptr(), shift, mask, out.as_mut_ptr(), out_names.as_mut_ptr())
+            };
+            let expected: Vec<u32> = orders[k].into_iter().filter(|&lane| set >> lane & 1 == 1).collect();
+            assert_eq!(n, expected.len());
+            for (i, lane) in expected.into_iter().enumerate() {
+                assert_eq!((out[i], out_names[i]), (lane as f32, 100 + lane));
+            }
+        }
+    }
+}
+
 unsafe fn check_simd<S: Simd>() {
     // SAFETY: the caller vouches for the ISA; `SPECIAL` has 16 floats.
     unsafe {
         check_lanes::<S::F4>();
         check_lanes::<S::F8>();
         check_lanes::<S::Packet>();
-        let v = S::F8::load_halves(SPECIAL[8..].as_ptr(), SPECIAL[2..].as_ptr());
-        for i in 0..4 {
-            assert!(same(v.low().to_array()[i], SPECIAL[8 + i]));
-            assert!(same(v.high().to_array()[i], SPECIAL[2 + i]));
-            assert!(same(v.to_array()[i], SPECIAL[8 + i]));
-            assert!(same(v.to_array()[4 + i], SPECIAL[2 + i]));
-        }
+        check_compress::<S::F8>();
     }
 }
 

@@ -26,23 +26,21 @@ macro_rules! table {
             $(#[target_feature(enable = $features)])?
             unsafe fn intersect(bvh: &Mbvh, ray: &Ray) -> RawHit {
                 // SAFETY (all): the caller vouches for the ISA.
-                unsafe { single::closest::<$simd>(bvh, ray) }
+                unsafe { single::one::<$simd, false>(bvh, ray) }
             }
             $(#[target_feature(enable = $features)])?
             unsafe fn intersect_block(bvh: &Mbvh, rays: &[Ray], out: &mut [RawHit]) {
-                for (ray, out) in rays.iter().zip(out) {
-                    *out = unsafe { single::closest::<$simd>(bvh, ray) };
-                }
+                let n = rays.len().min(out.len());
+                unsafe { single::many::<$simd, false>(bvh, n, |i| rays[i], |i, hit| out[i] = hit) }
             }
             $(#[target_feature(enable = $features)])?
             unsafe fn occluded(bvh: &Mbvh, ray: &Ray) -> bool {
-                unsafe { single::any::<$simd>(bvh, ray) }
+                !unsafe { single::one::<$simd, true>(bvh, ray) }.is_miss()
             }
             $(#[target_feature(enable = $features)])?
             unsafe fn occluded_block(bvh: &Mbvh, rays: &[Ray], out: &mut [u8]) {
-                for (ray, out) in rays.iter().zip(out) {
-                    *out = unsafe { single::any::<$simd>(bvh, ray) } as u8;
-                }
+                let n = rays.len().min(out.len());
+                unsafe { single::many::<$simd, true>(bvh, n, |i| rays[i], |i, hit| out[i] = !hit.is_miss() as u8) }
             }
             $(#[target_feature(enable = $features)])?
             unsafe fn gather(bvh: &Mbvh, origin: Vec3, p: &Packet, tmin: f32, tmax: f32, out: &mut [RawHit; PACKET_SIZE]) {
@@ -56,9 +54,9 @@ macro_rules! table {
 
 table!(PORTABLE, portable, simd::Portable, Isa::Portable);
 #[cfg(target_arch = "x86_64")]
-table!(AVX2, avx2, simd::Avx2, Isa::Avx2, "avx2,fma");
+table!(AVX2, avx2, simd::Avx2, Isa::Avx2, "avx2,fma,popcnt,lzcnt,bmi1,bmi2");
 #[cfg(target_arch = "x86_64")]
-table!(AVX512, avx512, simd::Avx512, Isa::Avx512, "avx2,fma,avx512f,avx512vl,avx512dq,avx512bw");
+table!(AVX512, avx512, simd::Avx512, Isa::Avx512, "avx2,fma,popcnt,lzcnt,bmi1,bmi2,avx512f,avx512vl,avx512dq,avx512bw");
 
 impl Kernels {
     /// The table of an ISA; of the portable one if the machine cannot run `isa`.

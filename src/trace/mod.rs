@@ -123,8 +123,8 @@ impl Scene {
             return invalid_argument!("{} rays, but room for {} hits", rays.len(), out.len());
         }
         let block = |rays: &[Ray], out: &mut [Hit]| {
-            let mut raw = [RawHit::MISS; 64];
-            for (rays, out) in rays.chunks(64).zip(out.chunks_mut(64)) {
+            let mut raw = [RawHit::MISS; 256];
+            for (rays, out) in rays.chunks(256).zip(out.chunks_mut(256)) {
                 self.device().kernels().intersect_block(self.mbvh(), rays, &mut raw);
                 out.iter_mut().zip(&raw).for_each(|(o, &r)| *o = self.to_hit(r));
             }
