@@ -25,6 +25,19 @@ const EDGE_ULPS: f64 = 3.0;
 const PLANE_ULPS: f64 = 9.0;
 const RELATIVE_T: f64 = 1e-5;
 
+/// What can be wrong with an answer.
+#[derive(Clone, Copy, Debug, PartialEq, Eq, PartialOrd, Ord)]
+pub enum Fault {
+    /// Another triangle or a miss, other barycentrics, an end of the interval passed over.
+    Wrong,
+    /// The right triangle at a t that is not accurate.
+    InaccurateT,
+    /// A hit of a triangle in whose plane the ray lies, at a point off the triangle.
+    OffTriangle,
+    /// Not the lowest number among exact copies of a triangle.
+    NotLowest,
+}
+
 /// A triangle that the ray hits or may be held to hit.
 #[derive(Clone, Copy, Debug)]
 struct Candidate {
@@ -38,7 +51,9 @@ struct Candidate {
     grazed: [bool; 3],
     /// The ray lies in the triangle's plane as far as f32 can tell.
     edge_on: bool,
-    /// Not near an end of the ray's interval.
+    /// In the ray's interval up to the error of t.
+    within: bool,
+    /// Not near an end of it.
     well_within: bool,
 }
 
@@ -98,13 +113,10 @@ fn candidate(ray: &Ray, number: usize, corners: &Triangle) -> Option<Candidate> 
     let t = normal.dot(relative[0]) / slope;
     let t_error = (PLANE_ULPS * EPSILON * farthest * normal.length() / slope.abs() + EPSILON * t.abs())
         .max(RELATIVE_T * t.abs())
-        // Results below f32's smallest normal number are rounded in absolute terms.
-        .max(f32::MIN_POSITIVE as f64);
-    let edge_on = !(t_error * d.length() < longest.max(2.0 * RELATIVE_T * farthest));
+        // Denormal results are rounded in absolute terms.
+        .max(f32::from_bits(1) as f64);
+    let edge_on = !(slope != 0.0 && t_error * d.length() < longest.max(2.0 * RELATIVE_T * farthest));
     let (tmin, tmax) = (ray.tmin as f64, ray.tmax as f64);
-    if !edge_on && !(t + t_error > tmin && t - t_error <= tmax) {
-        return None;
-    }
     let total: f64 = tolerances.iter().sum();
     let error = |k: usize| (tolerances[k] + total * (w[k] / sum).abs()) / sum.abs() + 2.0 * EPSILON;
     Some(Candidate {
@@ -115,6 +127,7 @@ fn candidate(ray: &Ray, number: usize, corners: &Triangle) -> Option<Candidate> 
         uv_error: [error(1), error(2)],
         grazed: std::array::from_fn(|k| w[k].abs() <= tolerances[k]),
         edge_on,
+        within: edge_on || (t + t_error > tmin && t - t_error <= tmax),
         well_within: t - t_error > tmin && t + t_error < tmax,
     })
 }
@@ -159,51 +172,57 @@ impl<'a> Truth<'a> {
     }
 
     /// What is wrong with a closest hit, if anything.
-    pub fn judge(&self, hit: &Hit) -> Result<(), String> {
+    pub fn judge(&self, hit: &Hit) -> Result<(), (Fault, String)> {
+        let wrong = |what: String| Err((Fault::Wrong, what));
         if hit.triangle == NONE {
             return match self.limit {
-                _ if *hit != Hit::MISS => Err(format!("a miss that is not Hit::MISS: {hit:?}")),
-                Some((t, triangle)) => Err(format!("misses {} with t ≤ {t:e}", self.describe(triangle))),
+                _ if *hit != Hit::MISS => wrong(format!("a miss that is not Hit::MISS: {hit:?}")),
+                Some((t, triangle)) => wrong(format!("misses {} with t ≤ {t:e}", self.describe(triangle))),
                 None => Ok(()),
             };
         }
         let number = hit.triangle as usize;
         let Some(c) = self.candidates.iter().find(|c| c.triangle == number) else {
-            return Err(format!("{hit:?}, but the ray does not meet {}", self.describe(number)));
+            return wrong(format!("{hit:?}, but the ray does not meet {}", self.describe(number)));
         };
-        if !(hit.t > self.ray.tmin && hit.t <= self.ray.tmax) {
-            return Err(format!("{hit:?} outside the interval"));
-        }
-        let t = hit.t as f64;
-        if c.edge_on {
-            self.judge_edge_on(hit)?;
-        } else {
-            let rounded = hit.t == c.t as f32;
-            if !((t - c.t).abs() <= c.t_error || rounded) {
-                return Err(format!("{hit:?}, but t is {:e} ± {:e} on {}", c.t, c.t_error, self.describe(number)));
-            }
-            for (got, k) in [(hit.u, 0), (hit.v, 1)] {
-                if !((got as f64 - c.uv[k]).abs() <= c.uv_error[k]) {
-                    let (uv, error) = (c.uv, c.uv_error);
-                    return Err(format!("{hit:?}, but u, v are {uv:?} ± {error:?} on {}", self.describe(number)));
-                }
-            }
+        if !(hit.t > self.ray.tmin && hit.t <= self.ray.tmax) || (hit.mesh, hit.instance) != (0, NONE) {
+            return wrong(format!("{hit:?} outside the interval or of no mesh"));
         }
         let weights = [hit.u, hit.v, 1.0 - hit.u - hit.v];
         if !weights.iter().all(|&w| (-2.0 * f32::EPSILON..=1.0).contains(&w)) {
-            return Err(format!("{hit:?}: barycentrics outside the triangle"));
+            return wrong(format!("{hit:?}: barycentrics outside the triangle"));
         }
-        match self.limit {
-            Some((limit, nearer)) if t - c.t_error.min(RELATIVE_T * t.abs()) > limit => {
-                Err(format!("{hit:?} lies behind {} with t ≤ {limit:e}", self.describe(nearer)))
+        if !c.within {
+            let what = format!("{hit:?}, but t is {:e} ± {:e}: outside the interval", c.t, c.t_error);
+            return Err((if (hit.t as f64 - c.t).abs() > c.t_error { Fault::InaccurateT } else { Fault::Wrong }, what));
+        }
+        let t = if c.edge_on { hit.t as f64 } else { c.t };
+        if let Some((limit, nearer)) = self.limit
+            && t - RELATIVE_T * t.abs() > limit
+        {
+            return wrong(format!("{hit:?} lies behind {} with t ≤ {limit:e}", self.describe(nearer)));
+        }
+        if c.edge_on {
+            return self.judge_edge_on(hit);
+        }
+        for (got, k) in [(hit.u, 0), (hit.v, 1)] {
+            if !((got as f64 - c.uv[k]).abs() <= c.uv_error[k]) {
+                let (uv, error) = (c.uv, c.uv_error);
+                return wrong(format!("{hit:?}, but u, v are {uv:?} ± {error:?} on {}", self.describe(number)));
             }
-            _ => Ok(()),
+        }
+        // The second: where f32 overflows.
+        if (hit.t as f64 - c.t).abs() <= c.t_error || hit.t == c.t as f32 {
+            Ok(())
+        } else {
+            let what = format!("{hit:?}, but t is {:e} ± {:e} on {}", c.t, c.t_error, self.describe(number));
+            Err((Fault::InaccurateT, what))
         }
     }
 
     /// A hit of a ray in the triangle's plane: its t is poorly determined, but the point must lie in
     /// the triangle's box up to the displacement that is allowed.
-    fn judge_edge_on(&self, hit: &Hit) -> Result<(), String> {
+    fn judge_edge_on(&self, hit: &Hit) -> Result<(), (Fault, String)> {
         let corners = self.triangles[hit.triangle as usize].map(|c| c.as_dvec3());
         let origin = Vec3::from(self.ray.origin).as_dvec3();
         let point = origin + hit.t as f64 * Vec3::from(self.ray.direction).as_dvec3();
@@ -214,7 +233,7 @@ impl<'a> Truth<'a> {
             Ok(())
         } else {
             let triangle = self.describe(hit.triangle as usize);
-            Err(format!("{hit:?}: edge-on, but {point} is not on {triangle}"))
+            Err((Fault::OffTriangle, format!("{hit:?}: {point} is not on {triangle}")))
         }
     }
 
