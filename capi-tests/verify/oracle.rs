@@ -117,8 +117,10 @@ fn candidate(ray: &Ray, number: usize, corners: &Triangle) -> Option<Candidate> 
         .max(f32::from_bits(1) as f64);
     let edge_on = !(slope != 0.0 && t_error * d.length() < longest.max(2.0 * RELATIVE_T * farthest));
     let (tmin, tmax) = (ray.tmin as f64, ray.tmax as f64);
+    // Where the sum is lost in the errors of its terms, so are the weights.
     let total: f64 = tolerances.iter().sum();
-    let error = |k: usize| (tolerances[k] + total * (w[k] / sum).abs()) / sum.abs() + 2.0 * EPSILON;
+    let certain_sum = (sum.abs() - total).max(0.0);
+    let error = |k: usize| (tolerances[k] + total * (w[k] / sum).abs()) / certain_sum + 2.0 * EPSILON;
     Some(Candidate {
         triangle: number,
         t,
@@ -206,7 +208,7 @@ impl<'a> Truth<'a> {
             return self.judge_edge_on(hit);
         }
         for (got, k) in [(hit.u, 0), (hit.v, 1)] {
-            if !((got as f64 - c.uv[k]).abs() <= c.uv_error[k]) {
+            if (got as f64 - c.uv[k]).abs() > c.uv_error[k] {
                 let (uv, error) = (c.uv, c.uv_error);
                 return wrong(format!("{hit:?}, but u, v are {uv:?} ± {error:?} on {}", self.describe(number)));
             }
