@@ -225,14 +225,14 @@ pub fn directions(triangles: &[Triangle], origin: Vec3, n: u32, seed: u32) -> Ve
         let d = match below(8, i, 40, seed) {
             0..=2 => direction(i, seed),
             3 => {
-                let mut axis = [if i % 2 == 0 { 0.0 } else { -0.0 }; 3];
+                let mut axis = [if i.is_multiple_of(2) { 0.0 } else { -0.0 }; 3];
                 axis[below(3, i, 41, seed)] = if i % 4 < 2 { 1.0 } else { -1.0 };
                 axis.into()
             }
             _ => target(&triangles[below(triangles.len(), i, 42, seed)], combine(i, 43), seed) - origin,
         };
         // Whole packets of plain lengths and packets with odd ones in them.
-        let odd = (i / 32) % 3 == 2 && i % 8 == 0;
+        let odd = (i / 32) % 3 == 2 && i.is_multiple_of(8);
         let d = if odd { d * 2f32.powi(below(120, i, 44, seed) as i32 - 60) } else { d };
         d.to_array()
     };
