@@ -717,6 +717,28 @@ fn no_ray_leaves_a_tetrahedron_through_a_vertex() {
 }
 
 #[test]
+#[ignore = "known: a triangle with its corners on a line is skipped, and with it the seam that it closed"]
+fn no_ray_leaves_between_triangles_joined_by_one_without_area() {
+    // An edge a–b on one side, a–m–b on the other, and (b, a, m) between them, exactly on a line.
+    let mut leaks = BTreeMap::new();
+    for i in 0..2000 {
+        let exact = |k| (point(i, k, 3) * 256.0).round() / 256.0;
+        let (a, b, c) = (exact(0), exact(1), exact(2));
+        let (m, d) = ((a + b) * 0.5, (a + b) - c);
+        let origin = m + (b - a).cross(c - a).normalize() + 0.5 * point(i, 4, 3);
+        let at = |k: u32| a.lerp(b, 0.05 + 0.9 * uniform(i, k, 8));
+        let rays: Vec<Ray> = (0..50).map(|k| Ray::new(origin, at(k) - origin)).collect();
+        for device in DEVICES.iter() {
+            let scene = commit(device, &[[a, b, c], [b, a, m], [a, m, d], [m, b, d]], &BuildOptions::default());
+            for (ray, _) in rays.iter().zip(closest(&scene, &rays)).filter(|(_, h)| h.triangle == NONE) {
+                leaks.entry(device.isa().name()).or_insert((0, format!("{:?} {ray:?}", [a, b, c, m, d]))).0 += 1;
+            }
+        }
+    }
+    assert!(leaks.is_empty(), "leaks of 100000 rays: {leaks:#?}");
+}
+
+#[test]
 fn axis_parallel_rays_on_lines_and_planes_of_a_grid_do_not_leak() {
     // A closed box of unit squares, and a lattice with walls at every integer.
     for (n, planes, shift) in [(6, vec![0, 6], 0.0), (4, vec![0, 1, 2, 3, 4], 0.0), (6, vec![0, 6], 4096.0)] {
@@ -922,13 +944,13 @@ fn assert_scale_free(exponents: &[i32]) {
 
 #[test]
 fn hits_do_not_depend_on_the_scale_of_the_scene() {
-    assert_scale_free(&[-36, -32, -24, -16, -8, 8, 16, 24, 32, 38]);
+    assert_scale_free(&[-38, -32, -24, -16, -8, 8, 16, 24, 32, 38]);
 }
 
 #[test]
-#[ignore = "known: normal · corner, a volume, is denormal or 0 where triangle and distance are below 1e-11"]
+#[ignore = "known: normal · corner, a volume, is denormal or 0 where triangle and distance are below 1e-12"]
 fn hits_do_not_depend_on_the_scale_of_tiny_scenes() {
-    assert_scale_free(&[-60, -50, -40, -38]);
+    assert_scale_free(&[-60, -50, -40]);
 }
 
 // Scenes made to hurt: random rays against the oracle.
