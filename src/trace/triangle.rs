@@ -7,10 +7,11 @@
 //! exact difference or is 0; both triangles of an edge, and all of a corner, accept 0: no ray passes
 //! between them. (Formed without contraction: fused, the sign would depend on the order of corners.)
 //!
-//! The distance comes from the plane, which is accurate for large triangles along the axes, and is
-//! kept within the corners' range, which nothing guarantees where the ray grazes the plane.
+//! The distance comes from the plane, which is accurate for large triangles along the axes; in f64 where
+//! f32 cannot tell it. It is kept within the corners' range: no hit lies off its triangle.
 
 use crate::simd::{Lanes, Mask};
+use glam::DVec3;
 
 /// Three f32 vectors.
 #[derive(Clone, Copy)]
@@ -24,6 +25,11 @@ impl<L: Lanes> V3<L> {
     #[inline(always)]
     fn sub(self, o: Self) -> Self {
         V3 { x: self.x - o.x, y: self.y - o.y, z: self.z - o.z }
+    }
+
+    #[inline(always)]
+    fn map(self, f: impl Fn(L) -> L) -> Self {
+        V3 { x: f(self.x), y: f(self.y), z: f(self.z) }
     }
 
     #[inline(always)]
@@ -57,6 +63,8 @@ pub(super) struct Shear {
     back: [f32; 3],
     /// −x/z, −y/z and −1/z of the direction.
     shear: [f32; 3],
+    /// [`GRAZING`] times the direction's length, at least.
+    grazing: f32,
 }
 
 impl Shear {
@@ -72,6 +80,7 @@ impl Shear {
             origin: [origin[i], origin[j], origin[k]],
             back: [-d[i], -d[j], -d[k]],
             shear: [d[i] * inverse, d[j] * inverse, inverse],
+            grazing: GRAZING * (x + y + z),
         }
     }
 }
@@ -120,23 +129,76 @@ impl<L: Lanes> Projected<L> {
         zero.le(u.min(v).min(w)).or(u.max(v).max(w).le(zero))
     }
 
-    /// Distances, and where they lie in `tmin < t ≤ tmax` and exist at all.
+    /// Distances by the plane, where these are accurate, and where they exist at all. They are inaccurate
+    /// on thin triangles, whose normal is rounded, where the ray grazes the plane, and where squares of
+    /// areas are too small for f32: see [`accurate_distance`].
     ///
     /// # Safety
     /// The CPU must have the ISA.
     #[inline(always)]
-    pub(super) unsafe fn distances(&self, ray: &Shear, tmin: f32, tmax: f32) -> (L, L::Mask) {
+    pub(super) unsafe fn distances(&self, ray: &Shear) -> (L, L::Mask, L::Mask) {
         let [a, b, c] = self.corners;
-        let normal = c.sub(a).cross(b.sub(a));
+        let (e0, e1) = (c.sub(a), b.sub(a));
+        let normal = e0.cross(e1);
         // SAFETY (all): the caller vouches for the ISA.
-        let (back, inverse, zero) = unsafe { (V3::splat(ray.back), L::splat(ray.shear[2]), L::splat(0.0)) };
-        let t = normal.dot(a).div(normal.dot(back));
+        let splat = |x: f32| unsafe { L::splat(x) };
+        let (back, inverse, zero) = (unsafe { V3::splat(ray.back) }, splat(ray.shear[2]), splat(0.0));
+        let slope = normal.dot(back);
+        // Divided before the product with a corner, which may be too small for f32.
+        let reciprocal = splat(1.0).div(slope);
+        let t = normal.map(|n| n * reciprocal).dot(a);
         let (ta, tb, tc) = (a.z * inverse, b.z * inverse, c.z * inverse);
         let t = t.max(ta.min(tb).min(tc)).min(ta.max(tb).max(tc));
-        let (tmin, tmax) = unsafe { (L::splat(tmin), L::splat(tmax)) };
+        let abs = |x: L| x.max(zero - x);
+        let area = abs(normal.x).max(abs(normal.y)).max(abs(normal.z));
+        let is_fat = (splat(THIN) * e0.dot(e0).max(e1.dot(e1))).lt(area);
+        let is_steep = (splat(ray.grazing) * area).lt(abs(slope));
         // In the plane of a triangle all three vanish.
         let sum = self.u + self.v + self.w;
-        let exists = sum.lt(zero).or(zero.lt(sum));
-        (t, tmin.lt(t).and(t.le(tmax)).and(exists))
+        (t, is_fat.and(is_steep), sum.lt(zero).or(zero.lt(sum)))
     }
+}
+
+/// Double area of a triangle over its longest edge's square below which it is thin. Below, t would lose more
+/// than some 1e-6.
+const THIN: f32 = 0.05;
+
+/// Sine of the angle to a plane below which a ray grazes it, likewise.
+const GRAZING: f32 = 0.03;
+
+/// The distance to a triangle's plane in f64 from the corners themselves, kept between the edges that the
+/// ray passes: all that is left to tell where it lies in the plane.
+///
+/// # Safety
+/// As for [`Projected::load`]; `i` must be below `count`.
+#[cold]
+pub(super) unsafe fn accurate_distance(leaf: *const f32, count: usize, i: usize, ray: &Shear) -> f32 {
+    // SAFETY: rows are `count` apart.
+    let at = |corner: usize, a: usize| unsafe {
+        leaf.add(i + (3 * corner + ray.axes[a] as usize) * count).read() as f64 - ray.origin[a] as f64
+    };
+    let corners = [0, 1, 2].map(|k| DVec3::new(at(k, 0), at(k, 1), at(k, 2)));
+    let [a, b, c] = corners;
+    let d = -DVec3::from(ray.back.map(f64::from));
+    let normal = (b - a).cross(c - a);
+    let slope = normal.dot(d);
+    // Corners across the ray, along the axis on which they lie farther apart.
+    let across = |k: usize| corners.map(|v| v[k] - v.z * (d[k] / d.z));
+    let spread = |s: [f64; 3]| s[0].max(s[1]).max(s[2]) - s[0].min(s[1]).min(s[2]);
+    let (x, y) = (across(0), across(1));
+    let s = if spread(x) > spread(y) { x } else { y };
+    let crossing = |i: usize, j: usize| {
+        let part = (-s[i] / (s[j] - s[i])).clamp(0.0, 1.0);
+        (s[i] * s[j] <= 0.0 && !part.is_nan()).then(|| (corners[i].z + part * (corners[j].z - corners[i].z)) / d.z)
+    };
+    let crossings = [crossing(0, 1), crossing(1, 2), crossing(2, 0)].into_iter().flatten();
+    let range =
+        crossings.fold(None, |r: Option<[f64; 2]>, t| r.map_or(Some([t; 2]), |[a, b]| Some([a.min(t), b.max(t)])));
+    // Beside the triangle by less than f32 can tell: the corner next to the ray.
+    let nearest = || {
+        let k = (0..3).min_by(|&i, &j| s[i].abs().total_cmp(&s[j].abs())).unwrap_or(0);
+        [corners[k].z / d.z; 2]
+    };
+    let [least, most] = range.unwrap_or_else(nearest);
+    (normal.dot(a) / slope).max(least).min(most) as f32
 }
