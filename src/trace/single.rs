@@ -210,15 +210,17 @@ unsafe fn leaf<S: Simd, const ANY: bool>(bvh: &Mbvh, leaf: ChildRef, ray: &RaySe
         let mut candidates = unsafe { projected.inside() }.bits() & lanes;
         if candidates != 0 {
             // SAFETY: as above.
-            let (t, is_accurate, exists) = unsafe { projected.distances(&ray.shear) };
-            candidates &= exists.bits();
+            let (t, is_accurate) = unsafe { projected.distances(&ray.shear) };
             let mut t = t.to_array();
             let mut inaccurate = candidates & !is_accurate.bits();
             while inaccurate != 0 {
                 let i = inaccurate.trailing_zeros() as usize;
                 inaccurate &= inaccurate - 1;
-                // SAFETY: `candidates` has no lane beyond the count.
-                t[i] = unsafe { accurate_distance(rows, count, first + i, &ray.shear) };
+                let weights = [projected.u, projected.v, projected.w].map(|l| l.to_array()[i]);
+                // Where all vanish, the ray lies in the plane. SAFETY: `candidates` has no lane beyond the count.
+                let is_seen = weights[0] + weights[1] + weights[2] != 0.0;
+                t[i] =
+                    if is_seen { unsafe { accurate_distance(rows, count, first + i, &ray.shear) } } else { f32::NAN };
             }
             let (u, v, w) = (projected.u.to_array(), projected.v.to_array(), projected.w.to_array());
             while candidates != 0 {
@@ -360,7 +362,7 @@ impl Walk {
     /// # Safety
     /// The CPU must have the ISA; the walk must have been begun in `bvh`, and `current` be a node.
     #[inline(always)]
-    unsafe fn visit_node<S: Simd>(&mut self, bvh: &Mbvh) {
+    unsafe fn visit_node<S: Simd>(&mut self, bvh: &Mbvh) -> ChildRef {
         debug_assert!(self.current.node_index() < bvh.nodes.len());
         // SAFETY: inner references of the tree are in range; the caller vouches for the ISA.
         unsafe {
@@ -368,28 +370,30 @@ impl Walk {
             let (near, mask) = self.ray.node::<S>(node, self.limit);
             self.stack.push::<S>(node, self.ray.shift, near, mask);
             self.current = self.stack.pop();
+            self.current
         }
     }
 
-    /// Visits the current leaf and goes on to the next child; says whether the walk has ended: it met
-    /// something and `ANY`.
+    /// Visits the current leaf and goes on to the next child, which is [`ChildRef::EMPTY`] when there is none,
+    /// or when the walk has met something and `ANY`.
     ///
     /// # Safety
     /// The CPU must have the ISA; the walk must have been begun in `bvh`, and `current` be a leaf.
     #[inline(always)]
-    unsafe fn visit_leaf<S: Simd, const ANY: bool>(&mut self, bvh: &Mbvh) -> bool {
+    unsafe fn visit_leaf<S: Simd, const ANY: bool>(&mut self, bvh: &Mbvh) -> ChildRef {
         // SAFETY: forwarded.
         unsafe {
             if leaf::<S, ANY>(bvh, self.current, &self.ray, &mut self.best) {
                 if ANY {
-                    return true;
+                    self.stack.count = 1;
+                } else {
+                    self.limit = beyond(self.best.t);
+                    self.stack.cut::<S>(self.limit);
                 }
-                self.limit = beyond(self.best.t);
-                self.stack.cut::<S>(self.limit);
             }
             self.current = self.stack.pop();
         }
-        false
+        self.current
     }
 
     #[inline(always)]
@@ -415,10 +419,10 @@ pub(super) unsafe fn one<S: Simd, const ANY: bool>(bvh: &Mbvh, ray: &Ray) -> Raw
     while walk.current != ChildRef::EMPTY {
         // SAFETY: forwarded.
         unsafe {
-            if !walk.current.is_leaf() {
+            if walk.current.is_leaf() {
+                walk.visit_leaf::<S, ANY>(bvh);
+            } else {
                 walk.visit_node::<S>(bvh);
-            } else if walk.visit_leaf::<S, ANY>(bvh) {
-                break;
             }
         }
     }
@@ -429,26 +433,8 @@ pub(super) unsafe fn one<S: Simd, const ANY: bool>(bvh: &Mbvh, ray: &Ray) -> Raw
 /// Mrays/s.)
 const FLIGHT: usize = 16;
 
-/// Walks that wait for the same kind of visit.
-struct Queue {
-    walks: [*mut Walk; FLIGHT],
-    count: usize,
-}
-
-impl Queue {
-    const EMPTY: Queue = Queue { walks: [std::ptr::null_mut(); FLIGHT], count: 0 };
-
-    /// # Safety
-    /// The queue must not be full.
-    #[inline(always)]
-    unsafe fn push_if(&mut self, is: bool, walk: *mut Walk) {
-        debug_assert!(self.count < FLIGHT || !is);
-        // Written in any case, so that there is no branch. SAFETY: at most FLIGHT walks are in all queues
-        // together, this one not yet, so that the place exists.
-        unsafe { *self.walks.get_unchecked_mut(self.count) = walk };
-        self.count += is as usize;
-    }
-}
+/// Walks that wait for the same kind of visit. One more than there can be, for a branch-free push.
+type Queue = [*mut Walk; FLIGHT + 1];
 
 /// Traces many rays, [`FLIGHT`] of them at a time: `ray` gives the rays from 0 to `count`, `done` takes
 /// their hits, in any order.
@@ -466,52 +452,60 @@ pub(super) unsafe fn many<S: Simd, const ANY: bool>(
     mut done: impl FnMut(usize, RawHit),
 ) {
     let mut places = [const { MaybeUninit::<Walk>::uninit() }; FLIGHT];
-    let first = places.as_mut_ptr();
-    let mut idle = Queue::EMPTY;
-    // SAFETY: FLIGHT places, and as much room in the queue.
-    (0..FLIGHT).for_each(|i| unsafe { idle.push_if(true, first.add(i).cast()) });
+    let first = places.as_mut_ptr().cast::<Walk>();
+    let mut idle: Queue = std::array::from_fn(|i| first.wrapping_add(i));
+    let (mut at_nodes, mut at_leaves): (Queue, Queue) = ([std::ptr::null_mut(); _], [std::ptr::null_mut(); _]);
+    let (idle, at_nodes, at_leaves) = (idle.as_mut_ptr(), at_nodes.as_mut_ptr(), at_leaves.as_mut_ptr());
+    let (mut idle_count, mut node_count, mut leaf_count) = (FLIGHT, 0, 0);
     let mut next = 0;
-    let (mut at_nodes, mut at_leaves) = (Queue::EMPTY, Queue::EMPTY);
+    // SAFETY (all below): every walk is in one queue, so that no queue holds more than FLIGHT; those at
+    // nodes and leaves have begun. The caller vouches for the ISA.
     loop {
-        while idle.count > 0 && next < count {
-            let walk = idle.walks[idle.count - 1];
-            // SAFETY: the place is no other walk's.
+        while idle_count > 0 && next < count {
+            let walk = unsafe { *idle.add(idle_count - 1) };
             if Walk::begin(unsafe { &mut *walk.cast() }, &ray(next), next) {
-                idle.count -= 1;
-                // SAFETY: the walk has left the idle ones.
-                unsafe { at_nodes.push_if(true, walk) };
+                idle_count -= 1;
+                unsafe { *at_nodes.add(node_count) = walk };
+                node_count += 1;
             } else {
                 done(next, RawHit::MISS);
             }
             next += 1;
         }
-        if idle.count == FLIGHT {
+        if idle_count == FLIGHT {
             return;
         }
-        // Walks put back are written at or before the place that is read next.
-        for k in 0..std::mem::take(&mut at_nodes.count) {
-            // SAFETY: walks in a queue have begun and are in no other; the caller vouches for the ISA.
-            unsafe {
-                let walk = &mut *at_nodes.walks[k];
-                walk.visit_node::<S>(bvh);
-                bvh.prefetch(walk.current);
-                at_leaves.push_if(walk.current.is_leaf(), walk);
-                at_nodes.push_if(!walk.current.is_leaf(), walk);
-            }
+        // Puts a walk where its next visit will be: into both queues, but counted in one. It is written
+        // at or before the place that is read next.
+        let enqueue = |walk: *mut Walk, child: ChildRef, nodes: &mut usize, leaves: &mut usize| unsafe {
+            bvh.prefetch(child);
+            *at_nodes.add(*nodes) = walk;
+            *at_leaves.add(*leaves) = walk;
+            *leaves += child.is_leaf() as usize;
+            *nodes += !child.is_leaf() as usize;
+        };
+        let visits = std::mem::take(&mut node_count);
+        for k in 0..visits {
+            let walk = unsafe { *at_nodes.add(k) };
+            let child = unsafe { (*walk).visit_node::<S>(bvh) };
+            enqueue(walk, child, &mut node_count, &mut leaf_count);
         }
-        for k in 0..std::mem::take(&mut at_leaves.count) {
-            // SAFETY: as above.
-            unsafe {
-                let walk = &mut *at_leaves.walks[k];
-                if walk.current == ChildRef::EMPTY || walk.visit_leaf::<S, ANY>(bvh) {
-                    done(walk.number, walk.hit());
-                    idle.push_if(true, walk);
-                    continue;
-                }
-                bvh.prefetch(walk.current);
-                at_leaves.push_if(walk.current.is_leaf(), walk);
-                at_nodes.push_if(!walk.current.is_leaf(), walk);
+        let visits = std::mem::take(&mut leaf_count);
+        for k in 0..visits {
+            let walk = unsafe { *at_leaves.add(k) };
+            let mut child = unsafe { (*walk).current };
+            if child != ChildRef::EMPTY {
+                child = unsafe { (*walk).visit_leaf::<S, ANY>(bvh) };
             }
+            if child != ChildRef::EMPTY {
+                enqueue(walk, child, &mut node_count, &mut leaf_count);
+                continue;
+            }
+            unsafe {
+                done((*walk).number, (*walk).hit());
+                *idle.add(idle_count) = walk;
+            }
+            idle_count += 1;
         }
     }
 }

@@ -61,8 +61,8 @@ pub(super) struct Shear {
     origin: [f32; 3],
     /// Where the ray comes from: the direction negated, in the frame's order.
     back: [f32; 3],
-    /// −x/z, −y/z and −1/z of the direction.
-    shear: [f32; 3],
+    /// −x/z and −y/z of the direction.
+    shear: [f32; 2],
     /// [`GRAZING`] times the direction's length, at least.
     grazing: f32,
 }
@@ -79,7 +79,7 @@ impl Shear {
             axes: [i as u32, j as u32, k as u32],
             origin: [origin[i], origin[j], origin[k]],
             back: [-d[i], -d[j], -d[k]],
-            shear: [d[i] * inverse, d[j] * inverse, inverse],
+            shear: [d[i] * inverse, d[j] * inverse],
             grazing: GRAZING * (x + y + z),
         }
     }
@@ -129,33 +129,29 @@ impl<L: Lanes> Projected<L> {
         zero.le(u.min(v).min(w)).or(u.max(v).max(w).le(zero))
     }
 
-    /// Distances by the plane, where these are accurate, and where they exist at all. They are inaccurate
+    /// Distances by the plane, and where these are accurate. They are not
     /// on thin triangles, whose normal is rounded, where the ray grazes the plane, and where squares of
     /// areas are too small for f32: see [`accurate_distance`].
     ///
     /// # Safety
     /// The CPU must have the ISA.
     #[inline(always)]
-    pub(super) unsafe fn distances(&self, ray: &Shear) -> (L, L::Mask, L::Mask) {
+    pub(super) unsafe fn distances(&self, ray: &Shear) -> (L, L::Mask) {
         let [a, b, c] = self.corners;
         let (e0, e1) = (c.sub(a), b.sub(a));
         let normal = e0.cross(e1);
         // SAFETY (all): the caller vouches for the ISA.
         let splat = |x: f32| unsafe { L::splat(x) };
-        let (back, inverse, zero) = (unsafe { V3::splat(ray.back) }, splat(ray.shear[2]), splat(0.0));
+        let (back, zero) = (unsafe { V3::splat(ray.back) }, splat(0.0));
         let slope = normal.dot(back);
         // Divided before the product with a corner, which may be too small for f32.
         let reciprocal = splat(1.0).div(slope);
         let t = normal.map(|n| n * reciprocal).dot(a);
-        let (ta, tb, tc) = (a.z * inverse, b.z * inverse, c.z * inverse);
-        let t = t.max(ta.min(tb).min(tc)).min(ta.max(tb).max(tc));
         let abs = |x: L| x.max(zero - x);
         let area = abs(normal.x).max(abs(normal.y)).max(abs(normal.z));
         let is_fat = (splat(THIN) * e0.dot(e0).max(e1.dot(e1))).lt(area);
         let is_steep = (splat(ray.grazing) * area).lt(abs(slope));
-        // In the plane of a triangle all three vanish.
-        let sum = self.u + self.v + self.w;
-        (t, is_fat.and(is_steep), sum.lt(zero).or(zero.lt(sum)))
+        (t, is_fat.and(is_steep))
     }
 }
 
