@@ -14,7 +14,7 @@ use glam::{Mat4, Vec3, Vec4, Vec4Swizzles};
 use rayon::prelude::*;
 
 /// Subtrees of more triangles than this are built as separate tasks.
-const PARALLEL_SUBTREE: usize = 4096;
+pub(super) const PARALLEL_SUBTREE: usize = 4096;
 
 /// Ranges of more triangles than this are binned and partitioned by several threads.
 const PARALLEL_RANGE: usize = 1 << 15;
@@ -69,7 +69,27 @@ impl Box4 {
         Box4 { neg_lower: self.neg_lower.max(o.neg_lower), upper: self.upper.max(o.upper) }
     }
 
-    /// Extent, 0 where empty.
+    #[inline(always)]
+    pub(super) fn add(&mut self, p: Vec4) {
+        *self = self.join(Box4 { neg_lower: -p, upper: p });
+    }
+
+    /// The part that both cover, which may be empty.
+    pub(super) fn meet(self, o: Box4) -> Box4 {
+        Box4 { neg_lower: self.neg_lower.min(o.neg_lower), upper: self.upper.min(o.upper) }
+    }
+
+    pub(super) fn is_empty(&self) -> bool {
+        (self.upper + self.neg_lower).truncate().min_element() < 0.0
+    }
+
+    /// Half the surface area, 0 if empty.
+    pub(super) fn half_area(&self) -> f64 {
+        let (lower, upper) = self.corners();
+        if self.is_empty() { 0.0 } else { half_area(lower, upper) }
+    }
+
+    /// Extent, 0 on axes where there is nothing.
     #[inline(always)]
     pub(super) fn extent(&self) -> Vec4 {
         (self.upper + self.neg_lower).max(Vec4::ZERO)
@@ -145,7 +165,7 @@ fn half_area(lower: Vec3, upper: Vec3) -> f64 {
 
 /// Half the surface areas of boxes of extents `d`, in lanes.
 #[inline(always)]
-fn half_areas(d: [Vec4; 4]) -> Vec4 {
+pub(super) fn half_areas(d: [Vec4; 4]) -> Vec4 {
     let [a, b, c, d] = d.map(|d| d * d.yzxw());
     let sums = Mat4::from_cols(a, b, c, d).transpose();
     sums.x_axis + sums.y_axis + sums.z_axis
@@ -154,7 +174,7 @@ fn half_areas(d: [Vec4; 4]) -> Vec4 {
 /// A power of two near 1 / greatest extent, so that f32 areas of boxes inside neither over- nor
 /// underflow, and scaling is exact.
 #[inline(always)]
-fn area_scale(b: &Box4) -> f32 {
+pub(super) fn area_scale(b: &Box4) -> f32 {
     let exponent = b.extent().truncate().max_element().to_bits() & 0x7f80_0000;
     f32::from_bits((0x7f00_0000 - exponent.min(0x7e80_0000)).max(1 << 23))
 }
@@ -184,7 +204,7 @@ impl Extent {
 }
 
 /// Whether to share the work on a range among threads. The results are the same.
-fn in_parallel(n: usize) -> bool {
+pub(super) fn in_parallel(n: usize) -> bool {
     n > PARALLEL_RANGE && rayon::current_num_threads() > 1
 }
 
@@ -214,7 +234,7 @@ impl BinMap {
         b.max(Vec4::ZERO).min(self.last) + Vec4::splat(8_388_608.0)
     }
 
-    fn side(&self, split: &Split) -> Side {
+    pub(super) fn side(&self, split: &Split) -> Side {
         let axis = split.axis;
         let first_right = split.bin as f32 + 8_388_608.0;
         Side { axis, origin: self.origin[axis], scale: self.scale[axis], first_right }
@@ -229,7 +249,7 @@ impl BinMap {
 }
 
 /// Tells the sides of a split by the same arithmetic as [`BinMap::bin`].
-struct Side {
+pub(super) struct Side {
     axis: usize,
     origin: f32,
     scale: f32,
@@ -244,7 +264,7 @@ impl Side {
     }
 
     #[inline(always)]
-    fn is_left(&self, r: &Reference) -> bool {
+    pub(super) fn is_left(&self, r: &Reference) -> bool {
         self.bin(r) < self.first_right
     }
 }
@@ -281,9 +301,9 @@ impl Bin {
 }
 
 /// A split between two bins.
-struct Split {
+pub(super) struct Split {
     /// Σ scaled half area · triangles.
-    cost: f32,
+    pub(super) cost: f32,
     axis: usize,
     /// First bin on the right.
     bin: usize,
@@ -300,7 +320,7 @@ impl Bins {
         Box::new(Bins { bins: [Bin::EMPTY; MAX_BINS], right: [Vec4::ZERO; MAX_BINS] })
     }
 
-    fn fill(&mut self, refs: &[Reference], map: &BinMap) {
+    pub(super) fn fill(&mut self, refs: &[Reference], map: &BinMap) {
         self.bins[..map.bins].fill(Bin::EMPTY);
         if !in_parallel(refs.len()) {
             return self.add(refs, map);
@@ -356,7 +376,7 @@ impl Bins {
 
     /// The best split with triangles on both sides. `scale` keeps f32 areas from over- and
     /// underflow.
-    fn best_split(&mut self, map: &BinMap, scale: f32) -> Option<Split> {
+    pub(super) fn best_split(&mut self, map: &BinMap, scale: f32) -> Option<Split> {
         let scale = Vec4::splat(scale);
         let mut sum = Bin::EMPTY;
         for i in (1..map.bins).rev() {
@@ -377,7 +397,7 @@ impl Bins {
     }
 
     /// Triangles left of a split, and the boxes of both sides.
-    fn sides(&self, map: &BinMap, split: &Split) -> (usize, [Box4; 2]) {
+    pub(super) fn sides(&self, map: &BinMap, split: &Split) -> (usize, [Box4; 2]) {
         let join = |bins: &[Bin]| bins.iter().fold(Box4::EMPTY, |b, bin| b.join(bin.boxes[split.axis]));
         let (left, right) = self.bins[..map.bins].split_at(split.bin);
         let n: i32 = left.iter().map(|b| b.counts[split.axis]).sum();
@@ -506,12 +526,11 @@ impl Builder<'_, '_> {
             return self.few(refs, other, slots, extent, depth, bins);
         }
         if depth < SAH_DEPTH {
-            let d = extent.boxes.extent();
             let scale = area_scale(&extent.boxes);
             let map = BinMap::new(&extent.centres, bin_count(self.options.bins as usize, n));
             bins.fill(refs, &map);
             if let Some(split) = bins.best_split(&map, scale) {
-                if may_be_leaf && half_areas([d * scale; 4]).x * (n as f32 - 1.0) <= split.cost {
+                if may_be_leaf && leaf_cost(&extent.boxes, scale, n) <= split.cost {
                     return slots.leaf(refs, &extent.boxes);
                 }
                 let (middle, boxes) = bins.sides(&map, &split);
@@ -523,14 +542,10 @@ impl Builder<'_, '_> {
         if may_be_leaf {
             return slots.leaf(refs, &extent.boxes);
         }
-        // All centres equal, or too deep: halve along the widest axis.
-        let d = extent.centres.upper - extent.centres.lower;
-        let axis = if d.x >= d.y && d.x >= d.z { 0 } else { 1 + usize::from(d.z > d.y) };
-        refs.select_nth_unstable_by(n / 2, |a, b| {
-            a.centre()[axis].total_cmp(&b.centre()[axis]).then(a.id().cmp(&b.id()))
-        });
-        let extents = [Extent::of(&refs[..n / 2]), Extent::of(&refs[n / 2..])];
-        self.children(refs, other, slots, extent, extents, n / 2, depth, bins);
+        // All centres equal, or too deep.
+        let middle = halve(refs, &extent);
+        let extents = [Extent::of(&refs[..middle]), Extent::of(&refs[middle..])];
+        self.children(refs, other, slots, extent, extents, middle, depth, bins);
     }
 
     /// Builds the subtree over two to four triangles by trying every way to part them.
@@ -543,51 +558,17 @@ impl Builder<'_, '_> {
         depth: usize,
         bins: &mut Bins,
     ) {
-        let n = refs.len();
-        let boxes: [Box4; 4] = std::array::from_fn(|i| if i < n { refs[i].0 } else { Box4::EMPTY });
-        let pair = |i: usize, j: usize| boxes[i].join(boxes[j]);
-        let (p01, p23) = (pair(0, 1), pair(2, 3));
         let scale = area_scale(&extent.boxes);
-        let areas = |b: [Box4; 4]| half_areas(b.map(|b| b.extent() * scale));
-        let m = n as f32;
-        // One against the others; two against two.
-        let ones = areas(boxes);
-        let others =
-            areas([p23.join(boxes[1]), p23.join(boxes[0]), p01.join(boxes[3]), p01.join(boxes[2])]) * (m - 1.0);
-        let mut costs = [f32::INFINITY; 7];
-        costs[..n].copy_from_slice(&(ones + others).to_array()[..n]);
-        if n == 4 {
-            let left = areas([p01, pair(0, 2), pair(0, 3), p01]);
-            let right = areas([p23, pair(1, 3), pair(1, 2), p23]);
-            let pairs = (2.0 * (left + right)).to_array();
-            costs[4..7].copy_from_slice(&pairs[..3]);
+        let (cost, parting) = best_parting(refs, scale);
+        if refs.len() <= self.options.max_leaf as usize && leaf_cost(&extent.boxes, scale, refs.len()) <= cost {
+            return slots.leaf(refs, &extent.boxes);
         }
-        let mut best = 0;
-        for i in 1..7 {
-            if costs[i] < costs[best] {
-                best = i;
-            }
-        }
-        if n <= self.options.max_leaf as usize {
-            let area = areas([extent.boxes; 4]).x;
-            if area * (m - 1.0) <= costs[best] {
-                return slots.leaf(refs, &extent.boxes);
-            }
-        }
-        let middle = if best < 4 {
-            refs.swap(0, best);
-            1
-        } else {
-            refs.swap(1, best - 3);
-            2
-        };
-        let (l, r) = refs.split_at(middle);
-        let join = |refs: &[Reference]| {
+        let middle = part_few(refs, parting);
+        // Nothing looks at the centres of so few, unless too deep.
+        let extents = [&refs[..middle], &refs[middle..]].map(|refs| {
             let boxes = refs.iter().fold(Box4::EMPTY, |b, r| b.join(r.0));
-            // Nothing looks at the centres of so few, unless too deep.
             Extent { boxes, centres: extent.centres }
-        };
-        let extents = [join(l), join(r)];
+        });
         self.children(refs, other, slots, extent, extents, middle, depth, bins);
     }
 
@@ -621,8 +602,66 @@ impl Builder<'_, '_> {
     }
 }
 
+/// Cost of a leaf less that of a traversal step, in the units of [`Bins::best_split`].
+pub(super) fn leaf_cost(bounds: &Box4, scale: f32, n: usize) -> f32 {
+    half_areas([bounds.extent() * scale; 4]).x * (n as f32 - 1.0)
+}
+
+/// A way to part two to four references: 0 to 3: that one from the others; 4 to 6: the first and one
+/// more from the other two.
+#[derive(Clone, Copy)]
+pub(super) struct Parting(usize);
+
+/// The best way to part two to four references, with its cost.
+pub(super) fn best_parting(refs: &[Reference], scale: f32) -> (f32, Parting) {
+    let n = refs.len();
+    let boxes: [Box4; 4] = std::array::from_fn(|i| if i < n { refs[i].0 } else { Box4::EMPTY });
+    let pair = |i: usize, j: usize| boxes[i].join(boxes[j]);
+    let (p01, p23) = (pair(0, 1), pair(2, 3));
+    let areas = |b: [Box4; 4]| half_areas(b.map(|b| b.extent() * scale));
+    let others = [p23.join(boxes[1]), p23.join(boxes[0]), p01.join(boxes[3]), p01.join(boxes[2])];
+    let ones = (areas(boxes) + areas(others) * (n as f32 - 1.0)).to_array();
+    let mut best = (f32::INFINITY, 0);
+    for i in 0..n {
+        if ones[i] < best.0 {
+            best = (ones[i], i);
+        }
+    }
+    if n == 4 {
+        let left = areas([p01, pair(0, 2), pair(0, 3), p01]);
+        let right = areas([p23, pair(1, 3), pair(1, 2), p23]);
+        let pairs = (2.0 * (left + right)).to_array();
+        for i in 0..3 {
+            if pairs[i] < best.0 {
+                best = (pairs[i], 4 + i);
+            }
+        }
+    }
+    (best.0, Parting(best.1))
+}
+
+/// Brings references into the order of a parting and says how many are on the left.
+pub(super) fn part_few(refs: &mut [Reference], Parting(i): Parting) -> usize {
+    if i < 4 {
+        refs.swap(0, i);
+        1
+    } else {
+        refs.swap(1, i - 3);
+        2
+    }
+}
+
+/// Halves references along the widest axis of their centres; ties are broken by number.
+pub(super) fn halve(refs: &mut [Reference], extent: &Extent) -> usize {
+    let d = extent.centres.upper - extent.centres.lower;
+    let axis = if d.x >= d.y && d.x >= d.z { 0 } else { 1 + usize::from(d.z > d.y) };
+    let middle = refs.len() / 2;
+    refs.select_nth_unstable_by(middle, |a, b| a.centre()[axis].total_cmp(&b.centre()[axis]).then(a.id().cmp(&b.id())));
+    middle
+}
+
 /// Few triangles do not fill many bins; fewer bins find the same splits sooner.
-fn bin_count(most: usize, n: usize) -> usize {
+pub(super) fn bin_count(most: usize, n: usize) -> usize {
     most.min(n / 4 + 6)
 }
 
@@ -733,7 +772,7 @@ mod tests {
         for (bins, max_leaf) in [(2, 1), (16, 3), (64, 3), (256, 8)] {
             for n in [1, 2, 3, 9, 1000, 70_000] {
                 let corners = soup(n, 5, 0.1);
-                check(&build(&corners, BuildOptions { bins, max_leaf }), &corners, max_leaf);
+                check(&build(&corners, BuildOptions { bins, max_leaf, ..Default::default() }), &corners, max_leaf);
             }
         }
     }
@@ -753,7 +792,8 @@ mod tests {
             })
             .collect();
         for corners in [equal, chain] {
-            let depth = check(&build(&corners, BuildOptions { bins: 2, max_leaf: 1 }), &corners, 1);
+            let depth =
+                check(&build(&corners, BuildOptions { bins: 2, max_leaf: 1, ..Default::default() }), &corners, 1);
             assert!(depth <= crate::bvh::layout::MAX_DEPTH, "{depth}");
         }
     }
@@ -766,7 +806,12 @@ mod tests {
             .map(|n| {
                 let pool = rayon::ThreadPoolBuilder::new().num_threads(n).build().unwrap();
                 let b = pool.install(|| build(&corners, BuildOptions::default()));
-                (b.triangles.clone(), b.sah_cost().to_bits())
+                let bits: Vec<_> = b
+                    .nodes
+                    .iter()
+                    .map(|n| (n.lower.to_array().map(f32::to_bits), n.upper.to_array().map(f32::to_bits), n.index))
+                    .collect();
+                (b.triangles, bits)
             })
             .collect();
         assert!(trees.iter().all(|t| *t == trees[0]));
