@@ -356,7 +356,8 @@ impl Bins {
         }
     }
 
-    /// The same with boxes in one register each.
+    /// The same with boxes in one register each. (Even and odd references into two sets of bins, so
+    /// that they do not wait for each other's stores: 0 to 3 %, not kept.)
     #[cfg(target_arch = "x86_64")]
     #[target_feature(enable = "avx")]
     fn add_avx(&mut self, refs: &[Reference], map: &BinMap) {
@@ -660,7 +661,9 @@ pub(super) fn halve(refs: &mut [Reference], extent: &Extent) -> usize {
     middle
 }
 
-/// Few triangles do not fill many bins; fewer bins find the same splits sooner.
+/// Few triangles do not fill many bins; fewer bins find the same splits sooner. (2n bins: longer for
+/// the same cost; n / 20 + 4: a tenth faster, cost up to 0.6 % higher. How many bins there are at
+/// most hardly matters then: 16 to 64 take the same time within 5 %.)
 pub(super) fn bin_count(most: usize, n: usize) -> usize {
     most.min(n / 4 + 6)
 }

@@ -34,7 +34,7 @@ pub struct BuildOptions {
     /// Whether triangles may be cut by spatial splits.
     pub quality: BuildQuality,
     /// With [`BuildQuality::High`]: most references that cuts may add, in parts of the number of
-    /// triangles, 0 to 4. Memory of the tree grows by at most as much. Default: 0.5.
+    /// triangles, 0 to 4. Memory of the tree grows by at most as much. Default: 0.25.
     pub split_budget: f32,
 }
 
@@ -53,7 +53,7 @@ impl BuildQuality {
 
 impl Default for BuildOptions {
     fn default() -> Self {
-        BuildOptions { bins: 64, max_leaf: 3, quality: BuildQuality::Default, split_budget: 0.5 }
+        BuildOptions { bins: 64, max_leaf: 3, quality: BuildQuality::Default, split_budget: 0.25 }
     }
 }
 

@@ -24,7 +24,8 @@ use crate::progress::Progress;
 use glam::{DVec3, Vec3, Vec4};
 use rayon::prelude::*;
 
-/// Planes are tried at the borders of at most this many slabs per axis.
+/// Planes are tried at the borders of at most this many slabs per axis. (16: up to a fifth faster; cost
+/// within 1 % on four scenes, 4 % higher on San Miguel.)
 const SLABS: usize = 32;
 
 /// Planes are tried only where the halves of the best split between triangles overlap by more than
