@@ -434,6 +434,12 @@ static void descriptions(bk_device *device) {
     build.max_leaf = 100;
     CHECK_ERROR(bk_scene_set_build(scene, &build), ARGUMENT, "max_leaf is 100");
     build.max_leaf = 4;
+    build.quality = 2;
+    CHECK_ERROR(bk_scene_set_build(scene, &build), ARGUMENT, "quality is 2");
+    build.quality = BK_BUILD_QUALITY_HIGH;
+    build.split_budget = 5;
+    CHECK_ERROR(bk_scene_set_build(scene, &build), ARGUMENT, "split_budget is 5");
+    build.split_budget = 1;
     CHECK_OK(bk_scene_set_build(scene, &build));
     CHECK_ERROR(bk_scene_load_builtin(scene, "teapot"), ARGUMENT, "teapot");
     CHECK(bk_scene_mesh_count(scene) == 1 && bk_scene_light_count(scene) == 1);

@@ -206,6 +206,13 @@ BK_API uint32_t bk_device_num_threads(const bk_device *device);
  * magnitude of 1e12.
  * ================================================================================================ */
 
+// Binned SAH.
+#define BK_BUILD_QUALITY_DEFAULT 0
+
+// Binned SAH with spatial splits: triangles may be cut. The build takes several times as long; rays
+// are faster where large or slanted triangles overlap others, as in most buildings.
+#define BK_BUILD_QUALITY_HIGH 1
+
 // A scene: being described, or committed.
 typedef struct bk_scene bk_scene;
 
@@ -241,6 +248,11 @@ typedef struct bk_build_params {
   uint32_t bins;
   // Most triangles per leaf, 1 to 8. Default: 3.
   uint32_t max_leaf;
+  // One of BK_BUILD_QUALITY_*. Default: BK_BUILD_QUALITY_DEFAULT.
+  uint32_t quality;
+  // With BK_BUILD_QUALITY_HIGH: most references that cuts may add, in parts of the number of
+  // triangles, 0 to 4; memory grows by at most as much. Default: 0.25.
+  float split_budget;
 } bk_build_params;
 
 // Numbers about a committed scene.

@@ -1,9 +1,10 @@
-//! Acceleration structures: a binary tree built by binned SAH, collapsed to the 4-wide MBVH that the
+//! Acceleration structures: a binary tree built by binned SAH, with spatial splits if asked, collapsed to the 4-wide MBVH that the
 //! kernels traverse.
 
 mod binned;
 mod collapse;
 pub(crate) mod layout;
+mod spatial;
 
 pub use binned::{BinaryBvh, BinaryNode};
 pub use layout::{ChildRef, Mbvh, Node};
@@ -12,6 +13,17 @@ use crate::error::{Result, invalid_argument};
 use crate::progress::Progress;
 use glam::Vec3;
 
+/// How much effort the build takes.
+#[derive(Clone, Copy, Debug, Default, PartialEq, Eq)]
+#[repr(u32)]
+pub enum BuildQuality {
+    /// Binned SAH (Wald 2007).
+    #[default]
+    Default = 0,
+    /// Binned SAH with spatial splits (Stich, Friedrich and Dietrich 2009).
+    High = 1,
+}
+
 /// Parameters of the builder.
 #[derive(Clone, Copy, Debug, PartialEq)]
 pub struct BuildOptions {
@@ -19,11 +31,29 @@ pub struct BuildOptions {
     pub bins: u32,
     /// Most triangles per leaf, 1 to 8. Thesis: 3.
     pub max_leaf: u32,
+    /// Whether triangles may be cut by spatial splits.
+    pub quality: BuildQuality,
+    /// With [`BuildQuality::High`]: most references that cuts may add, in parts of the number of
+    /// triangles, 0 to 4. Memory of the tree grows by at most as much. Default: 0.25.
+    pub split_budget: f32,
+}
+
+impl BuildQuality {
+    /// Both, by rising effort.
+    pub const ALL: [BuildQuality; 2] = [BuildQuality::Default, BuildQuality::High];
+
+    /// Its name on the command line and in reports: "default" or "high".
+    pub fn name(self) -> &'static str {
+        match self {
+            BuildQuality::Default => "default",
+            BuildQuality::High => "high",
+        }
+    }
 }
 
 impl Default for BuildOptions {
     fn default() -> Self {
-        BuildOptions { bins: 64, max_leaf: 3 }
+        BuildOptions { bins: 64, max_leaf: 3, quality: BuildQuality::Default, split_budget: 0.25 }
     }
 }
 
@@ -36,23 +66,55 @@ impl BuildOptions {
         if !(1..=layout::MAX_LEAF as u32).contains(&self.max_leaf) {
             return invalid_argument!("max_leaf is {}, outside 1 to {}", self.max_leaf, layout::MAX_LEAF);
         }
+        if !(0.0..=4.0).contains(&self.split_budget) {
+            return invalid_argument!("split_budget is {}, outside 0 to 4", self.split_budget);
+        }
         Ok(())
     }
 }
 
 /// Upper bound of an [`Mbvh`]'s size with the builder's working memory, for the memory monitor.
-pub fn estimated_bytes(triangles: usize) -> usize {
-    // Per triangle: 40 in leaves, up to 128/3 of nodes, and while building 32 of references, 64 of
-    // binary nodes and 36 of corners.
-    triangles * 216
+pub fn estimated_bytes(triangles: usize, options: &BuildOptions) -> usize {
+    match options.quality {
+        // Per triangle: 40 in leaves, up to 128/3 of nodes, and while building 64 of references, 64
+        // of binary nodes, 4 of numbers and 36 of corners.
+        BuildQuality::Default => triangles * 252,
+        // Per reference twice the binary nodes and numbers, because subtrees are joined at the end.
+        BuildQuality::High => {
+            let references = triangles as f64 * (1.0 + f64::from(options.split_budget));
+            triangles * 36 + (references * 284.0) as usize
+        }
+    }
 }
 
 /// Builds the MBVH over the triangles `valid` (global numbers, ascending) and gives its SAH cost:
 /// that of the binary tree with traversal and intersection costing 1 each.
 pub fn build(corners: &[[Vec3; 3]], valid: &[u32], options: &BuildOptions, progress: &Progress) -> Result<(Mbvh, f32)> {
     options.validate()?;
-    let binary = BinaryBvh::build(corners, valid, options, progress)?;
+    let binary = match options.quality {
+        BuildQuality::Default => BinaryBvh::build(corners, valid, options, progress)?,
+        BuildQuality::High => BinaryBvh::build_spatial(corners, valid, options, progress)?,
+    };
     progress.check()?;
     let cost = binary.sah_cost();
     Ok((collapse::collapse(&binary, corners), cost))
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn options_out_of_range_are_refused_by_name() {
+        let ok = BuildOptions { quality: BuildQuality::High, ..Default::default() };
+        assert_eq!(ok.validate(), Ok(()));
+        for (options, name) in [
+            (BuildOptions { bins: 257, ..ok }, "bins is 257"),
+            (BuildOptions { max_leaf: 0, ..ok }, "max_leaf is 0"),
+            (BuildOptions { split_budget: -0.1, ..ok }, "split_budget is -0.1"),
+            (BuildOptions { split_budget: f32::NAN, ..ok }, "split_budget is NaN"),
+        ] {
+            assert!(options.validate().unwrap_err().to_string().contains(name));
+        }
+    }
 }

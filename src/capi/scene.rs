@@ -13,9 +13,9 @@ use super::args::{OutStruct, init, read_struct, sized_struct, text, write};
 use super::device::{bk_device, bk_progress_fn, progress, refuse_in_callback};
 use super::error::{bk_result, call, call_or};
 use super::handles::{create, hold, object, release, retain};
-use crate::bvh::BuildOptions;
+use crate::bvh::{BuildOptions, BuildQuality};
 use crate::device::Device;
-use crate::error::{Error, Result};
+use crate::error::{Error, Result, invalid_argument};
 use crate::scene::{Scene, SceneData, builtin};
 use std::ffi::{c_char, c_void};
 use std::sync::{Arc, Mutex, OnceLock, TryLockError};
@@ -231,11 +231,29 @@ pub struct bk_build_params {
     pub bins: u32,
     /// Most triangles per leaf, 1 to 8. Default: 3.
     pub max_leaf: u32,
+    /// One of BK_BUILD_QUALITY_*. Default: BK_BUILD_QUALITY_DEFAULT.
+    pub quality: u32,
+    /// With BK_BUILD_QUALITY_HIGH: most references that cuts may add, in parts of the number of
+    /// triangles, 0 to 4; memory grows by at most as much. Default: 0.25.
+    pub split_budget: f32,
 }
+
+/// Binned SAH.
+pub const BK_BUILD_QUALITY_DEFAULT: u32 = 0;
+
+/// Binned SAH with spatial splits: triangles may be cut. The build takes several times as long; rays
+/// are faster where large or slanted triangles overlap others, as in most buildings.
+pub const BK_BUILD_QUALITY_HIGH: u32 = 1;
 
 sized_struct!(bk_build_params, last: max_leaf: u32, defaults: {
     let b = BuildOptions::default();
-    bk_build_params { struct_size: size_of::<bk_build_params>() as u32, bins: b.bins, max_leaf: b.max_leaf }
+    bk_build_params {
+        struct_size: size_of::<bk_build_params>() as u32,
+        bins: b.bins,
+        max_leaf: b.max_leaf,
+        quality: b.quality as u32,
+        split_budget: b.split_budget,
+    }
 });
 
 /// Fills in the defaults.
@@ -252,7 +270,13 @@ pub unsafe extern "C" fn bk_scene_set_build(scene: *mut bk_scene, params: *const
         let scene = object!(scene);
         // SAFETY: params is the caller's, or NULL.
         let params = unsafe { read_struct(params, "params") }?;
-        let build = BuildOptions { bins: params.bins, max_leaf: params.max_leaf };
+        let quality = match params.quality {
+            BK_BUILD_QUALITY_DEFAULT => BuildQuality::Default,
+            BK_BUILD_QUALITY_HIGH => BuildQuality::High,
+            q => return invalid_argument!("quality is {q}, not one of BK_BUILD_QUALITY_*"),
+        };
+        let build =
+            BuildOptions { bins: params.bins, max_leaf: params.max_leaf, quality, split_budget: params.split_budget };
         build.validate()?;
         scene.describe("the build can be chosen", |d| {
             d.build = build;

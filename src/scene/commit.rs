@@ -1,7 +1,7 @@
 //! The committed scene: acceleration structure, emitters, bounds and numbers.
 
 use super::mesh::is_valid_triangle;
-use super::{Light, Material, Mesh, NONE, SceneData};
+use super::{Light, Material, Mesh, MeshMaterials, NONE, SceneData};
 use crate::bvh::{self, BuildOptions, Mbvh};
 use crate::device::{Device, LogLevel};
 use crate::error::{Error, Result};
@@ -9,8 +9,12 @@ use crate::memory::Reservation;
 use crate::progress::Progress;
 use crate::trace::{Hit, RawHit, Ray};
 use glam::Vec3;
+use rayon::prelude::*;
 use std::sync::{Arc, RwLock};
 use std::time::Instant;
+
+/// Triangles that a thread takes at a time.
+const CHUNK: usize = 1 << 12;
 
 /// An emissive triangle, as a light.
 #[derive(Clone, Copy, Debug)]
@@ -85,18 +89,19 @@ impl Scene {
         let stage = progress.stage("bvh", 0.0, 1.0, 1);
         let mut first_triangle = Vec::with_capacity(data.meshes.len() + 1);
         let mut corners = crate::memory::try_vec::<[Vec3; 3]>(total, "the triangles to build from")?;
-        let mut next = 0;
-        for mesh in &data.meshes {
-            first_triangle.push(next as u32);
-            for t in 0..mesh.indices.len() {
-                corners[next + t] = mesh.corners(t);
+        let valid: Vec<u32> = device.install(|| {
+            let mut next = 0;
+            for mesh in &data.meshes {
+                first_triangle.push(next as u32);
+                let corners = &mut corners[next..next + mesh.indices.len()];
+                corners.par_iter_mut().with_min_len(CHUNK).enumerate().for_each(|(t, c)| *c = mesh.corners(t));
+                next += mesh.indices.len();
             }
-            next += mesh.indices.len();
-        }
-        first_triangle.push(next as u32);
+            first_triangle.push(next as u32);
+            let triangles = (0..total as u32).into_par_iter().with_min_len(CHUNK);
+            triangles.filter(|&t| is_valid_triangle(corners[t as usize])).collect()
+        });
         progress.check()?;
-
-        let valid: Vec<u32> = (0..total as u32).filter(|&t| is_valid_triangle(corners[t as usize])).collect();
         let skipped = total - valid.len();
         if valid.is_empty() {
             return Err(Error::InvalidState(format!(
@@ -109,12 +114,17 @@ impl Scene {
                 &format!("{skipped} of {total} triangles are degenerate or not finite and were skipped"),
             );
         }
-        let memory = device.memory().reserve(bvh::estimated_bytes(valid.len()), "the scene")?;
+        let memory = device.memory().reserve(bvh::estimated_bytes(valid.len(), options), "the scene")?;
         let (mbvh, sah_cost) = device.install(|| bvh::build(&corners, &valid, options, progress))?;
         progress.check()?;
 
         let mut emitters = Vec::new();
         for (m, mesh) in data.meshes.iter().enumerate() {
+            if let MeshMaterials::One(material) = mesh.materials
+                && !data.materials[material as usize].is_emissive()
+            {
+                continue;
+            }
             for t in 0..mesh.indices.len() {
                 let material = &data.materials[mesh.material(t) as usize];
                 if material.is_emissive() && is_valid_triangle(mesh.corners(t)) {
@@ -321,7 +331,7 @@ fn mesh_bytes(meshes: &[Mesh]) -> usize {
                 + m.normals.len() * 12
                 + m.uvs.len() * 8
                 + m.lightmap.as_ref().map_or(0, |l| l.uvs.len() * 8 + l.pages.len() * 4)
-                + if let super::MeshMaterials::PerTriangle(v) = &m.materials { v.len() * 4 } else { 0 }
+                + if let MeshMaterials::PerTriangle(v) = &m.materials { v.len() * 4 } else { 0 }
         })
         .sum()
 }

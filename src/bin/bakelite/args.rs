@@ -1,6 +1,6 @@
 //! Arguments of the command line. Errors are sentences that name the flag and the value at fault.
 
-use bakelite::bvh::BuildOptions;
+use bakelite::bvh::{BuildOptions, BuildQuality};
 use bakelite::lightmap::{BakeParams, LightmapDesc};
 use bakelite::scene::Camera;
 use bakelite::{Isa, Light};
@@ -49,6 +49,7 @@ Machine:
   --isa NAME             portable, avx2, avx512 or auto [auto]
   --bins N               bins of the tree builder [64]
   --leaf N               most triangles per leaf [3]
+  --build NAME           default, or high: with spatial splits, for faster rays [default]
 Pictures (path traced reference; indirect map + shadow rays; light map alone):
   --camera PX,PY,PZ:TX,TY,TZ[:FOV]        position, target, vertical degrees [60];
                                           without it, a view is looked for
@@ -226,6 +227,7 @@ fn option(name: &str, parser: &mut lexopt::Parser, bake: &mut BakeArgs) -> Resul
         "isa" => bake.isa = isa(&value()?)?,
         "bins" => bake.build.bins = number(&flag, &value()?)?,
         "leaf" => bake.build.max_leaf = number(&flag, &value()?)?,
+        "build" => bake.build.quality = build_quality(&value()?)?,
         "camera" => bake.camera = Some(camera(&value()?)?),
         "up" => bake.up = axis(&value()?)?,
         "width" => bake.width = picture_size(&flag, &value()?)?,
@@ -280,6 +282,13 @@ fn picture_size(flag: &str, value: &str) -> Result<usize, String> {
         n if (1..=MAX_PICTURE).contains(&n) => Ok(n),
         n => Err(format!("{flag} is {n}, outside 1 to {MAX_PICTURE}")),
     }
+}
+
+fn build_quality(value: &str) -> Result<BuildQuality, String> {
+    BuildQuality::ALL
+        .into_iter()
+        .find(|q| q.name() == value)
+        .ok_or_else(|| format!("--build is {value:?}, neither default nor high"))
 }
 
 fn isa(value: &str) -> Result<Option<Isa>, String> {
@@ -404,7 +413,7 @@ mod tests {
             "bake s.obj --light point:1,2,3:4,5,6 --light spot:0,0,0:0,-1,0:20,30:1,1,1 --light sun:0,-1,0:7,8,9 \
              --light rect:0,0,0:1,0,0:0,0,1:2,2,2 --texels-per-unit 2.5 --page-size 256 --padding 3 --gather-divisor 2 \
              --radiance-divisor 16 --photons 5 --bounces 6 --gather-rays 7 --radius 0.5 --blur 8 --direct-samples 9 \
-             --seed 10 --threads 2 --isa portable --bins 32 --leaf 4 --camera 0,1,2:3,4,5:40 --up z --width 64 \
+             --seed 10 --threads 2 --isa portable --bins 32 --leaf 4 --build high --camera 0,1,2:3,4,5:40 --up z --width 64 \
              --height 48 --reference-spp 3 --out o --no-glb --quiet",
         )
         .unwrap();
@@ -415,7 +424,7 @@ mod tests {
         let p = &b.params;
         assert_eq!((p.photon_count, p.max_bounces, p.gather_rays, p.radius, p.blur_radius), (5, 6, 7, 0.5, 8));
         assert_eq!((p.direct_samples, p.seed, b.threads, b.isa), (9, 10, 2, Some(Isa::Portable)));
-        assert_eq!((b.build.bins, b.build.max_leaf, b.up), (32, 4, Vec3::Z));
+        assert_eq!((b.build.bins, b.build.max_leaf, b.build.quality, b.up), (32, 4, BuildQuality::High, Vec3::Z));
         let camera = b.camera.unwrap();
         assert_eq!((camera.position, camera.target), (Vec3::new(0.0, 1.0, 2.0), Vec3::new(3.0, 4.0, 5.0)));
         assert!((camera.fov_y.to_degrees() - 40.0).abs() < 1e-4);

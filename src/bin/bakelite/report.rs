@@ -77,6 +77,7 @@ fn parameters(args: &BakeArgs) -> Value {
         "isa": args.isa.map_or("auto", |i| i.name()),
         "bins": args.build.bins,
         "leaf": args.build.max_leaf,
+        "build": args.build.quality.name(),
         "width": args.width,
         "height": args.height,
         "reference_spp": args.reference_spp,

@@ -1,0 +1,786 @@
+//! Binary BVH with spatial splits: M. Stich, H. Friedrich and A. Dietrich, *Spatial Splits in
+//! Bounding Volume Hierarchies*, 2009.
+//!
+//! A node is split between triangles, as in [`binned`](super::binned), or by a plane that cuts
+//! triangles: both sides then refer to a cut triangle, each with the box of its part. That pays
+//! where large triangles overlap small ones. Subtrees are built in parallel; each has its own share
+//! of the references that may be added, so that the tree does not depend on the number of threads.
+//!
+//! A reference's box holds its part of the triangle with a margin. The kernels decide hits on
+//! corners that the subtraction of the ray's origin has rounded, by up to 2^-24 of the distance
+//! between them. Around a whole triangle, the box test's own margin covers that; at a cut it need
+//! not, because the corners can be much farther away than the box. So parts are padded by a little
+//! more than this rounding over the triangle's extent, and no ray slips past a cut.
+
+use super::BuildOptions;
+use super::binned::{BinMap, BinaryBvh, BinaryNode, Bins, Box4, Extent, PARALLEL_SUBTREE, Reference};
+use super::binned::{
+    area_scale, best_parting, bin_count, half_areas, halve, in_parallel, leaf_cost, part_few, references,
+};
+use super::layout::SAH_DEPTH;
+use crate::error::Result;
+use crate::memory::try_vec;
+use crate::progress::Progress;
+use glam::{DVec3, Vec3, Vec4};
+use rayon::prelude::*;
+
+/// Planes are tried at the borders of at most this many slabs per axis. (16: up to a fifth faster; cost
+/// within 1 % on four scenes, 4 % higher on San Miguel.)
+const SLABS: usize = 32;
+
+/// Planes are tried only where the halves of the best split between triangles overlap by more than
+/// this part of the root's area (the paper's α, there 1e-5; this takes a tenth longer, but a ground
+/// plane that makes the root huge does not at once forbid all cuts).
+const ALPHA: f32 = 1e-6;
+
+/// … and by more than this part of the node's own area. Without that (the paper has only α) the
+/// build takes twice as long, for trees of 1 % less cost.
+const OVERLAP: f64 = 0.2;
+
+/// Levels on which the surface area decides. One less than elsewhere, because cut triangles can
+/// double the references that are halved below it.
+const FREE_DEPTH: usize = SAH_DEPTH - 1;
+
+/// Slots that leaf references can number.
+const MAX_SLOTS: usize = (1 << 28) - 2;
+
+/// Padding of parts in extents of the triangle: four times what rounding moves its corners by.
+const PADDING: f64 = 1.0 / (1 << 22) as f64;
+
+/// Bound of the rounding of a cut's f64 coordinates, by the greatest coordinate.
+const ROUNDING: f64 = 1.0 / (1u64 << 48) as f64;
+
+/// The parts of a triangle below and above `position` on `axis`, within `bounds`; an empty box where
+/// there is none.
+fn cut(corners: &[Vec3; 3], bounds: Box4, axis: usize, position: f32) -> [Box4; 2] {
+    let v = corners.map(|c| c.as_dvec3());
+    let plane = f64::from(position);
+    let mut parts = [(DVec3::INFINITY, DVec3::NEG_INFINITY); 2];
+    let mut grow = |side: usize, p: DVec3| parts[side] = (parts[side].0.min(p), parts[side].1.max(p));
+    for i in 0..3 {
+        let (a, b) = (v[i], v[(i + 1) % 3]);
+        if a[axis] <= plane {
+            grow(0, a);
+        }
+        if a[axis] >= plane {
+            grow(1, a);
+        }
+        if (a[axis] < plane && plane < b[axis]) || (b[axis] < plane && plane < a[axis]) {
+            let p = a + (b - a) * ((plane - a[axis]) / (b[axis] - a[axis]));
+            grow(0, p);
+            grow(1, p);
+        }
+    }
+    let lower = v[0].min(v[1]).min(v[2]);
+    let upper = v[0].max(v[1]).max(v[2]);
+    let pad = PADDING * (upper - lower).max_element() + ROUNDING * lower.abs().max(upper.abs()).max_element();
+    parts[0].1[axis] = parts[0].1[axis].min(plane);
+    parts[1].0[axis] = parts[1].0[axis].max(plane);
+    parts.map(|(lower, upper)| {
+        let lower = (lower - pad).to_array().map(round_down);
+        let upper = (upper + pad).to_array().map(|x| -round_down(-x));
+        Box4::new(lower.into(), upper.into()).meet(bounds)
+    })
+}
+
+/// The greatest f32 that is not above `x`.
+fn round_down(x: f64) -> f32 {
+    let y = x as f32;
+    if f64::from(y) > x { y.next_down() } else { y }
+}
+
+/// What lies in one slab of each axis.
+#[derive(Clone, Copy)]
+struct Slab {
+    boxes: [Box4; 3],
+    /// References whose first and last slab it is. The fourth is unused.
+    first: [i32; 4],
+    last: [i32; 4],
+}
+
+impl Slab {
+    const EMPTY: Slab = Slab { boxes: [Box4::EMPTY; 3], first: [0; 4], last: [0; 4] };
+
+    fn add(&mut self, o: &Slab) {
+        for axis in 0..3 {
+            self.boxes[axis] = self.boxes[axis].join(o.boxes[axis]);
+        }
+        for axis in 0..4 {
+            self.first[axis] += o.first[axis];
+            self.last[axis] += o.last[axis];
+        }
+    }
+}
+
+/// Slabs of equal width in a box.
+struct Grid {
+    slabs: usize,
+    lower: Vec3,
+    width: Vec3,
+    scale: Vec3,
+}
+
+impl Grid {
+    fn new(bounds: &Box4, n: usize) -> Grid {
+        let slabs = slab_count(n);
+        let (lower, upper) = bounds.corners();
+        let width = (upper - lower) / slabs as f32;
+        let scale = Vec3::select(width.cmpgt(Vec3::splat(f32::MIN_POSITIVE)), width.recip(), Vec3::ZERO);
+        Grid { slabs, lower, width, scale }
+    }
+
+    fn slab(&self, axis: usize, x: f32) -> usize {
+        (((x - self.lower[axis]) * self.scale[axis]) as usize).min(self.slabs - 1)
+    }
+
+    /// The border below slab `i`.
+    fn plane(&self, axis: usize, i: usize) -> f32 {
+        self.lower[axis] + i as f32 * self.width[axis]
+    }
+}
+
+/// A plane, and what it would leave on either side.
+struct Plane {
+    cost: f32,
+    axis: usize,
+    position: f32,
+    boxes: [Box4; 2],
+    counts: [i32; 2],
+}
+
+/// The boxes of a triangle's parts in slabs `first` to `last` of an axis. Only an estimate, in f32.
+#[inline(always)]
+fn chop(corners: &[Vec4; 3], axis: usize, first: usize, last: usize, grid: &Grid, parts: &mut [Box4; SLABS]) {
+    parts[first..=last].fill(Box4::EMPTY);
+    let slab = corners.map(|c| ((c[axis] - grid.lower[axis]) * grid.scale[axis]) as i32);
+    let (first, last) = (first as i32, last as i32);
+    for i in 0..3 {
+        let (mut a, mut b) = (i, (i + 1) % 3);
+        if (first..=last).contains(&slab[a]) {
+            parts[slab[a] as usize].add(corners[a]);
+        }
+        if corners[a][axis] > corners[b][axis] {
+            (a, b) = (b, a);
+        }
+        let (origin, edge) = (corners[a], corners[b] - corners[a]);
+        let inverse = 1.0 / edge[axis];
+        for plane in (slab[a] + 1).max(first)..=slab[b].min(last + 1) {
+            let t = (grid.plane(axis, plane as usize) - origin[axis]) * inverse;
+            let p = origin + edge * t.clamp(0.0, 1.0);
+            if plane > first {
+                parts[plane as usize - 1].add(p);
+            }
+            if plane <= last {
+                parts[plane as usize].add(p);
+            }
+        }
+    }
+}
+
+/// Slabs of a node, and room for what lies right of each.
+struct Slabs {
+    slabs: [Slab; SLABS],
+    right: [Slab; SLABS],
+}
+
+impl Slabs {
+    fn new() -> Box<Slabs> {
+        Box::new(Slabs { slabs: [Slab::EMPTY; SLABS], right: [Slab::EMPTY; SLABS] })
+    }
+
+    fn fill(&mut self, refs: &[Reference], corners: &[[Vec3; 3]], grid: &Grid) {
+        self.slabs[..grid.slabs].fill(Slab::EMPTY);
+        if !in_parallel(refs.len()) {
+            return self.add(refs, corners, grid);
+        }
+        let parts: Vec<Box<Slabs>> = refs
+            .par_chunks(1 << 13)
+            .map(|refs| {
+                let mut slabs = Slabs::new();
+                slabs.add(refs, corners, grid);
+                slabs
+            })
+            .collect();
+        for part in &parts {
+            self.slabs.iter_mut().zip(&part.slabs).for_each(|(s, p)| s.add(p));
+        }
+    }
+
+    fn add(&mut self, refs: &[Reference], corners: &[[Vec3; 3]], grid: &Grid) {
+        let mut parts = [Box4::EMPTY; SLABS];
+        for r in refs {
+            let corners = corners[r.id() as usize].map(|c| c.extend(0.0));
+            self.add_to_axis::<0>(r, &corners, grid, &mut parts);
+            self.add_to_axis::<1>(r, &corners, grid, &mut parts);
+            self.add_to_axis::<2>(r, &corners, grid, &mut parts);
+        }
+    }
+
+    #[inline(always)]
+    fn add_to_axis<const AXIS: usize>(
+        &mut self,
+        r: &Reference,
+        corners: &[Vec4; 3],
+        grid: &Grid,
+        parts: &mut [Box4; SLABS],
+    ) {
+        let (lower, upper) = r.bounds().corners();
+        let (first, last) = (grid.slab(AXIS, lower[AXIS]), grid.slab(AXIS, upper[AXIS]));
+        self.slabs[first].first[AXIS] += 1;
+        self.slabs[last].last[AXIS] += 1;
+        if first == last {
+            let b = &mut self.slabs[first].boxes[AXIS];
+            *b = b.join(r.bounds());
+            return;
+        }
+        chop(corners, AXIS, first, last, grid, parts);
+        for (slab, part) in self.slabs[first..=last].iter_mut().zip(&parts[first..=last]) {
+            let part = part.meet(r.bounds());
+            if !part.is_empty() {
+                slab.boxes[AXIS] = slab.boxes[AXIS].join(part);
+            }
+        }
+    }
+
+    /// The best plane that adds at most `extra` references.
+    fn best_plane(&mut self, grid: &Grid, scale: f32, n: usize, extra: usize) -> Option<Plane> {
+        let cost = |s: &Slab, counts: &[i32; 4]| {
+            let areas = half_areas([s.boxes[0], s.boxes[1], s.boxes[2], Box4::EMPTY].map(|b| b.extent() * scale));
+            areas * Vec4::from_array(counts.map(|n| n as f32))
+        };
+        let mut sum = Slab::EMPTY;
+        for i in (1..grid.slabs).rev() {
+            sum.add(&self.slabs[i]);
+            self.right[i] = sum;
+        }
+        let mut left = Slab::EMPTY;
+        let mut best: Option<Plane> = None;
+        for i in 1..grid.slabs {
+            left.add(&self.slabs[i - 1]);
+            let right = &self.right[i];
+            let costs = cost(&left, &left.first) + cost(right, &right.last);
+            for axis in 0..3 {
+                let counts = [left.first[axis], right.last[axis]];
+                let allowed = counts[0] > 0 && counts[1] > 0 && (counts[0] + counts[1]) as usize <= n + extra;
+                if allowed && grid.scale[axis] > 0.0 && costs[axis] < best.as_ref().map_or(f32::INFINITY, |b| b.cost) {
+                    let boxes = [left.boxes[axis], right.boxes[axis]];
+                    best = Some(Plane { cost: costs[axis], axis, position: grid.plane(axis, i), boxes, counts });
+                }
+            }
+        }
+        best
+    }
+}
+
+/// Few triangles need few planes.
+fn slab_count(n: usize) -> usize {
+    SLABS.min(n / 16 + 8)
+}
+
+/// Buffers of a task.
+struct Work {
+    bins: Box<Bins>,
+    slabs: Box<Slabs>,
+    left: Vec<Reference>,
+    right: Vec<Reference>,
+}
+
+impl Work {
+    fn new() -> Work {
+        Work { bins: Bins::new(), slabs: Slabs::new(), left: Vec::new(), right: Vec::new() }
+    }
+}
+
+/// A subtree: numbers in it count from its own first node and triangle.
+#[derive(Default)]
+struct Flat {
+    nodes: Vec<BinaryNode>,
+    triangles: Vec<u32>,
+}
+
+impl Flat {
+    fn leaf(&mut self, refs: &[Reference], bounds: &Box4) {
+        let (lower, upper) = bounds.corners();
+        self.nodes.push(BinaryNode { lower, upper, index: self.triangles.len() as u32, count: refs.len() as u32 });
+        self.triangles.extend(refs.iter().map(Reference::id));
+    }
+}
+
+/// A tree of subtrees, as the tasks made them.
+enum Piece {
+    Flat(Flat),
+    Inner(Box4, Box<[Piece; 2]>),
+}
+
+impl Piece {
+    fn size(&self) -> (usize, usize) {
+        match self {
+            Piece::Flat(f) => (f.nodes.len(), f.triangles.len()),
+            Piece::Inner(_, children) => {
+                let [a, b] = [children[0].size(), children[1].size()];
+                (a.0 + b.0 + 1, a.1 + b.1)
+            }
+        }
+    }
+
+    fn append_to(self, nodes: &mut Vec<BinaryNode>, triangles: &mut Vec<u32>) {
+        match self {
+            Piece::Flat(f) => {
+                let (first_node, first_triangle) = (nodes.len() as u32, triangles.len() as u32);
+                nodes.extend(f.nodes.iter().map(|n| BinaryNode {
+                    index: n.index + if n.count > 0 { first_triangle } else { first_node },
+                    ..*n
+                }));
+                triangles.extend(f.triangles);
+            }
+            Piece::Inner(bounds, children) => {
+                let (lower, upper) = bounds.corners();
+                let i = nodes.len();
+                nodes.push(BinaryNode { lower, upper, index: 0, count: 0 });
+                let [left, right] = *children;
+                left.append_to(nodes, triangles);
+                nodes[i].index = nodes.len() as u32;
+                right.append_to(nodes, triangles);
+            }
+        }
+    }
+}
+
+struct Builder<'a, 'p> {
+    corners: &'a [[Vec3; 3]],
+    options: &'a BuildOptions,
+    progress: &'a Progress<'p>,
+    /// Root's half area in f64, times α.
+    least_overlap: f64,
+}
+
+/// The two sides of a split, whose references are in [`Work`].
+struct Sides {
+    extents: [Extent; 2],
+    /// How many references may be added in each.
+    extra: [usize; 2],
+}
+
+impl Builder<'_, '_> {
+    /// Builds over `refs`, adding at most `extra` to them.
+    fn build(&self, refs: Vec<Reference>, extent: Extent, extra: usize, depth: usize) -> Piece {
+        let mut refs = refs;
+        let mut work = Work::new();
+        let mut flat = Flat::default();
+        if self.progress.is_cancelled() {
+            return Piece::Flat(flat);
+        }
+        let n = refs.len();
+        if n <= PARALLEL_SUBTREE {
+            self.build_flat(&mut refs, n, extent, extra, depth, &mut work, &mut flat);
+            return Piece::Flat(flat);
+        }
+        let sides = self.split(&mut refs, &extent, extra, depth, &mut work).expect("too many for a leaf");
+        drop(refs);
+        let Work { left, right, .. } = work;
+        let (a, b) = rayon::join(
+            || self.build(left, sides.extents[0], sides.extra[0], depth + 1),
+            || self.build(right, sides.extents[1], sides.extra[1], depth + 1),
+        );
+        Piece::Inner(extent.boxes, Box::new([a, b]))
+    }
+
+    /// Builds over the last `n` of `stack` and removes them.
+    fn build_flat(
+        &self,
+        stack: &mut Vec<Reference>,
+        n: usize,
+        extent: Extent,
+        extra: usize,
+        depth: usize,
+        work: &mut Work,
+        out: &mut Flat,
+    ) {
+        let start = stack.len() - n;
+        let Some(sides) = self.split(&mut stack[start..], &extent, extra, depth, work) else {
+            out.leaf(&stack[start..], &extent.boxes);
+            return stack.truncate(start);
+        };
+        stack.truncate(start);
+        // The left side on top, because it is built first.
+        stack.extend_from_slice(&work.right);
+        stack.extend_from_slice(&work.left);
+        let (nl, nr) = (work.left.len(), work.right.len());
+        let i = out.nodes.len();
+        let (lower, upper) = extent.boxes.corners();
+        out.nodes.push(BinaryNode { lower, upper, index: 0, count: 0 });
+        self.build_flat(stack, nl, sides.extents[0], sides.extra[0], depth + 1, work, out);
+        out.nodes[i].index = out.nodes.len() as u32;
+        self.build_flat(stack, nr, sides.extents[1], sides.extra[1], depth + 1, work, out);
+    }
+
+    /// Writes the two sides of the best split to `work`; `None`: make a leaf.
+    fn split(
+        &self,
+        refs: &mut [Reference],
+        extent: &Extent,
+        extra: usize,
+        depth: usize,
+        work: &mut Work,
+    ) -> Option<Sides> {
+        let n = refs.len();
+        if n == 1 {
+            return None;
+        }
+        let may_be_leaf = n <= self.options.max_leaf as usize;
+        work.left.clear();
+        work.right.clear();
+        if depth >= FREE_DEPTH {
+            return (!may_be_leaf).then(|| self.halve(refs, extent, extra, work));
+        }
+        let scale = area_scale(&extent.boxes);
+        // Between triangles.
+        let few = (n <= 4).then(|| {
+            let (cost, parting) = best_parting(refs, scale);
+            (cost, part_few(refs, parting))
+        });
+        let map = BinMap::new(&extent.centres, bin_count(self.options.bins as usize, n));
+        let object = if few.is_some() {
+            None
+        } else {
+            work.bins.fill(refs, &map);
+            work.bins.best_split(&map, scale).map(|split| (work.bins.sides(&map, &split), split))
+        };
+        let (mut cost, overlap) = match (&few, &object) {
+            (Some((cost, middle)), _) => {
+                let [a, b] = [&refs[..*middle], &refs[*middle..]]
+                    .map(|refs| refs.iter().fold(Box4::EMPTY, |b, r| b.join(r.bounds())));
+                (*cost, a.meet(b).half_area())
+            }
+            (_, Some(((_, [a, b]), split))) => (split.cost, a.meet(*b).half_area()),
+            _ => (f32::INFINITY, f64::INFINITY),
+        };
+        // By a plane.
+        let mut plane = None;
+        if extra > 0 && overlap > self.least_overlap.max(OVERLAP * extent.boxes.half_area()) {
+            let grid = Grid::new(&extent.boxes, n);
+            work.slabs.fill(refs, self.corners, &grid);
+            plane = work.slabs.best_plane(&grid, scale, n, extra).filter(|p| p.cost < cost);
+            cost = plane.as_ref().map_or(cost, |p| p.cost);
+        }
+        if may_be_leaf && leaf_cost(&extent.boxes, scale, n) <= cost {
+            return None;
+        }
+        if let Some(plane) = plane
+            && self.cut_all(refs, &plane, scale, extra, work)
+        {
+            return Some(self.sides(n, extra, work));
+        }
+        if let Some((_, middle)) = few {
+            let (left, right) = refs.split_at(middle);
+            work.left.extend_from_slice(left);
+            work.right.extend_from_slice(right);
+            return Some(self.sides(n, extra, work));
+        }
+        match object {
+            Some(((middle, _), split)) => {
+                let side = map.side(&split);
+                work.left.reserve(middle);
+                work.right.reserve(n - middle);
+                for r in refs.iter() {
+                    if side.is_left(r) { work.left.push(*r) } else { work.right.push(*r) }
+                }
+                Some(self.sides(n, extra, work))
+            }
+            None => (!may_be_leaf).then(|| self.halve(refs, extent, extra, work)),
+        }
+    }
+
+    /// Halves along the widest axis of the centres.
+    fn halve(&self, refs: &mut [Reference], extent: &Extent, extra: usize, work: &mut Work) -> Sides {
+        let n = refs.len();
+        let middle = halve(refs, extent);
+        let (left, right) = refs.split_at(middle);
+        work.left.extend_from_slice(left);
+        work.right.extend_from_slice(right);
+        self.sides(n, extra, work)
+    }
+
+    /// Cuts by a plane what it crosses, unless a reference is better left whole on one side (the
+    /// paper's reference unsplitting, with the sizes that were estimated for the sides, so that the
+    /// order of references does not matter). Whether anything is on both sides.
+    fn cut_all(&self, refs: &[Reference], plane: &Plane, scale: f32, extra: usize, work: &mut Work) -> bool {
+        let area = |b: Box4| half_areas([b.extent() * scale; 4]).x;
+        let [left, right] = plane.boxes;
+        let [nl, nr] = plane.counts.map(|n| n as f32);
+        let (al, ar) = (area(left), area(right));
+        let mut added = 0;
+        for r in refs {
+            let (lower, upper) = r.bounds().corners();
+            if upper[plane.axis] <= plane.position {
+                work.left.push(*r);
+                continue;
+            }
+            if lower[plane.axis] >= plane.position {
+                work.right.push(*r);
+                continue;
+            }
+            let [below, above] = cut(&self.corners[r.id() as usize], r.bounds(), plane.axis, plane.position);
+            match (below.is_empty(), above.is_empty()) {
+                (false, true) => work.left.push(Reference::of_box(r.id(), below)),
+                (true, false) => work.right.push(Reference::of_box(r.id(), above)),
+                (empty, _) => {
+                    let both = al * nl + ar * nr;
+                    let whole_left = area(left.join(r.bounds())) * nl + ar * (nr - 1.0);
+                    let whole_right = al * (nl - 1.0) + area(right.join(r.bounds())) * nr;
+                    if !empty && added < extra && both <= whole_left.min(whole_right) {
+                        added += 1;
+                        work.left.push(Reference::of_box(r.id(), below));
+                        work.right.push(Reference::of_box(r.id(), above));
+                    } else if whole_left <= whole_right {
+                        work.left.push(*r);
+                    } else {
+                        work.right.push(*r);
+                    }
+                }
+            }
+        }
+        let ok = !work.left.is_empty() && !work.right.is_empty();
+        if !ok {
+            work.left.clear();
+            work.right.clear();
+        }
+        ok
+    }
+
+    /// The extents of both sides, and their shares of what remains to be added: by their areas
+    /// times references, which is where more cuts can save most.
+    fn sides(&self, n: usize, extra: usize, work: &Work) -> Sides {
+        let extents = [Extent::of(&work.left), Extent::of(&work.right)];
+        let remaining = extra - (work.left.len() + work.right.len() - n);
+        let [a, b] = [(&work.left, &extents[0]), (&work.right, &extents[1])]
+            .map(|(refs, e)| share_weight(refs.len(), e.boxes.half_area()));
+        let share = if a + b > 0.0 { ((a / (a + b) * remaining as f64) as usize).min(remaining) } else { 0 };
+        Sides { extents, extra: [share, remaining - share] }
+    }
+}
+
+fn share_weight(n: usize, area: f64) -> f64 {
+    n as f64 * area
+}
+
+impl BinaryBvh {
+    /// Builds the tree over the triangles `valid` of `corners` with spatial splits, which add at most
+    /// `options.split_budget` times as many references. On the current rayon pool.
+    pub fn build_spatial(
+        corners: &[[Vec3; 3]],
+        valid: &[u32],
+        options: &BuildOptions,
+        progress: &Progress,
+    ) -> Result<BinaryBvh> {
+        let n = valid.len();
+        let (refs, extent) = references(corners, valid)?;
+        let extra = ((n as f64 * f64::from(options.split_budget)) as usize).min(MAX_SLOTS - n.min(MAX_SLOTS));
+        let least_overlap = extent.boxes.half_area() * f64::from(ALPHA);
+        let piece = Builder { corners, options, progress, least_overlap }.build(refs, extent, extra, 0);
+        progress.check()?;
+        let (node_count, triangle_count) = piece.size();
+        let mut nodes = try_vec::<BinaryNode>(node_count, "the binary tree")?;
+        let mut triangles = try_vec::<u32>(triangle_count, "the binary tree")?;
+        nodes.clear();
+        triangles.clear();
+        piece.append_to(&mut nodes, &mut triangles);
+        Ok(BinaryBvh { nodes, triangles })
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use crate::bvh::BuildQuality;
+    use crate::bvh::layout::MAX_DEPTH;
+    use crate::sampling::uniform;
+
+    type Triangles = Vec<[Vec3; 3]>;
+
+    fn point(i: usize, k: u32, seed: u32) -> Vec3 {
+        Vec3::new(uniform(i as u32, k, seed), uniform(i as u32, k + 1, seed), uniform(i as u32, k + 2, seed))
+    }
+
+    /// Long thin triangles in all directions among small ones: what spatial splits are for.
+    fn needles(n: usize) -> Triangles {
+        (0..n)
+            .map(|i| {
+                let (a, b) = (point(i, 0, 3), point(i, 3, 3));
+                let size = if i % 3 == 0 { 1.0 } else { 0.02 };
+                [a, a + size * (b - a), a + size * (b - a) + 0.01 * point(i, 6, 3)]
+            })
+            .collect()
+    }
+
+    fn options(split_budget: f32) -> BuildOptions {
+        BuildOptions { quality: BuildQuality::High, split_budget, ..Default::default() }
+    }
+
+    fn build(corners: &Triangles, options: &BuildOptions) -> BinaryBvh {
+        let ids: Vec<u32> = (0..corners.len() as u32).collect();
+        BinaryBvh::build_spatial(corners, &ids, options, &Progress::none()).unwrap()
+    }
+
+    /// Checks nesting, leaf sizes, and slots that are used once; gives the boxes of the leaves that
+    /// name each triangle, and the depth.
+    fn leaves(bvh: &BinaryBvh, triangles: usize, max_leaf: u32) -> (Vec<Vec<(Vec3, Vec3)>>, usize) {
+        let mut boxes = vec![Vec::new(); triangles];
+        let (mut slots, mut nodes, mut deepest) = (0, 0, 0);
+        let mut stack = vec![(0u32, 0usize, Vec3::NEG_INFINITY, Vec3::INFINITY)];
+        while let Some((i, depth, lo, hi)) = stack.pop() {
+            let node = bvh.nodes[i as usize];
+            nodes += 1;
+            deepest = deepest.max(depth);
+            assert!(node.lower.cmpge(lo).all() && node.upper.cmple(hi).all());
+            if node.count == 0 {
+                stack.push((i + 1, depth + 1, node.lower, node.upper));
+                stack.push((node.index, depth + 1, node.lower, node.upper));
+                continue;
+            }
+            assert!(node.count <= max_leaf);
+            let named = &bvh.triangles[node.index as usize..][..node.count as usize];
+            slots += named.len();
+            for (k, &t) in named.iter().enumerate() {
+                assert!(!named[..k].contains(&t), "twice in a leaf");
+                boxes[t as usize].push((node.lower, node.upper));
+            }
+        }
+        assert_eq!((slots, nodes), (bvh.triangles.len(), bvh.nodes.len()));
+        (boxes, deepest)
+    }
+
+    /// Points of each triangle, moved by as much as rounding can move its corners, lie in leaves.
+    fn covers(bvh: &BinaryBvh, corners: &Triangles, max_leaf: u32) {
+        let (boxes, depth) = leaves(bvh, corners.len(), max_leaf);
+        assert!(depth <= MAX_DEPTH);
+        for (t, (tri, boxes)) in corners.iter().zip(&boxes).enumerate() {
+            let v = tri.map(|c| c.as_dvec3());
+            let (lower, upper) = (v[0].min(v[1]).min(v[2]), v[0].max(v[1]).max(v[2]));
+            let rounding = (upper - lower).max_element() / (1 << 24) as f64;
+            let inside =
+                |p: DVec3| boxes.iter().any(|b| p.cmpge(b.0.as_dvec3()).all() && p.cmple(b.1.as_dvec3()).all());
+            for s in 0..64u32 {
+                let [a, b] = [0, 1].map(|k| f64::from(uniform(s, k, t as u32)));
+                // On edges and at corners too.
+                let (a, b) = match s % 8 {
+                    0 => (a, 0.0),
+                    1 => (0.0, b),
+                    2 => (a, 1.0 - a),
+                    3 => ([0.0, 1.0, 0.0][s as usize % 3], [0.0, 0.0, 1.0][s as usize % 3]),
+                    _ if a + b > 1.0 => (1.0 - a, 1.0 - b),
+                    _ => (a, b),
+                };
+                let p = v[0] + a * (v[1] - v[0]) + b * (v[2] - v[0]);
+                for axis in 0..3 {
+                    for sign in [-1.0, 0.0, 1.0] {
+                        let moved = p + sign * rounding * DVec3::AXES[axis];
+                        assert!(inside(moved.clamp(lower, upper)), "triangle {t}, sample {s}: {moved}");
+                    }
+                }
+            }
+        }
+    }
+
+    #[test]
+    fn every_point_of_a_triangle_lies_in_a_leaf_that_names_it() {
+        for (scale, offset) in [
+            (1.0, Vec3::ZERO),
+            (1e-18, Vec3::ZERO),
+            (1e12, Vec3::ZERO),
+            (1.0, Vec3::new(148376.0, 1234.0, -223423.0)),
+            (1e3, Vec3::new(1e9, 1e9, -1e9)),
+        ] {
+            let corners: Triangles = needles(1500).into_iter().map(|t| t.map(|c| (c - 0.5) * scale + offset)).collect();
+            let bvh = build(&corners, &options(1.0));
+            assert!(offset.x > 1e6 || bvh.triangles.len() > corners.len() + 200, "no splits at {scale}, {offset}");
+            covers(&bvh, &corners, 3);
+        }
+    }
+
+    #[test]
+    fn hard_triangles_are_covered_too() {
+        // Axis-parallel grids, a fan of slivers, one huge triangle over all, two scales far apart.
+        let mut corners = Triangles::new();
+        for i in 0..20 {
+            for j in 0..20 {
+                let p = Vec3::new(i as f32, j as f32, (i * j % 3) as f32);
+                corners.push([p, p + Vec3::X, p + Vec3::Y]);
+                corners.push([p, p + 7.0 * Vec3::Z, p + 9.0 * Vec3::Y]);
+            }
+        }
+        corners.push([Vec3::new(-300.0, -300.0, 0.5), Vec3::new(300.0, -300.0, 0.7), Vec3::new(0.0, 400.0, 0.9)]);
+        for i in 0..200 {
+            let a = i as f32 * 0.01;
+            let p = |a: f32| Vec3::new(30.0 * a.cos(), 30.0 * a.sin(), a);
+            corners.push([Vec3::ZERO, p(a), p(a + 1e-5)]);
+            corners.push([1e-6 * p(a), 1e-6 * p(a + 0.01), 1e-6 * p(a + 2.0)]);
+        }
+        for max_leaf in [1, 8] {
+            let o = BuildOptions { max_leaf, ..options(2.0) };
+            let bvh = build(&corners, &o);
+            assert!(bvh.triangles.len() > corners.len());
+            covers(&bvh, &corners, max_leaf);
+        }
+    }
+
+    #[test]
+    fn both_parts_of_a_cut_meet_at_the_plane_and_stay_in_the_box() {
+        let t = [Vec3::ZERO, Vec3::new(4.0, 0.0, 0.0), Vec3::new(4.0, 2.0, 0.0)];
+        let whole = Box4::new(Vec3::ZERO, Vec3::new(4.0, 2.0, 0.0));
+        let [a, b] = cut(&t, whole, 0, 1.0).map(|b| b.corners());
+        assert!(a.1.x >= 1.0 && a.1.x < 1.0001 && a.1.y >= 0.5 && a.1.y < 0.5001);
+        assert!(b.0.x <= 1.0 && b.0.x > 0.9999 && b.0.y == 0.0 && b.1 == Vec3::new(4.0, 2.0, 0.0));
+        assert!(cut(&t, whole, 0, -1.0)[0].is_empty());
+        assert!(cut(&t, whole, 1, 3.0)[1].is_empty());
+    }
+
+    #[test]
+    fn the_budget_holds_and_the_cost_falls() {
+        let corners = needles(20_000);
+        let costs: Vec<f32> = [0.0, 0.1, 0.5, 2.0]
+            .into_iter()
+            .map(|budget| {
+                let bvh = build(&corners, &options(budget));
+                assert!(bvh.triangles.len() as f32 <= corners.len() as f32 * (1.0 + budget));
+                bvh.sah_cost()
+            })
+            .collect();
+        assert!(costs.windows(2).all(|c| c[1] < c[0]), "{costs:?}");
+        assert!(costs[2] < 0.9 * costs[0], "{costs:?}");
+    }
+
+    #[test]
+    fn the_tree_does_not_depend_on_the_number_of_threads() {
+        let corners = needles(60_000);
+        let trees: Vec<_> = [1, 2, 7]
+            .into_iter()
+            .map(|n| {
+                let pool = rayon::ThreadPoolBuilder::new().num_threads(n).build().unwrap();
+                let b = pool.install(|| build(&corners, &options(0.5)));
+                let bits: Vec<_> = b
+                    .nodes
+                    .iter()
+                    .map(|n| (n.lower.to_array().map(f32::to_bits), n.upper.to_array().map(f32::to_bits), n.index))
+                    .collect();
+                (b.triangles, bits)
+            })
+            .collect();
+        assert!(trees.iter().all(|t| *t == trees[0]));
+    }
+
+    #[test]
+    fn equal_triangles_and_chains_stay_shallow() {
+        let equal: Triangles = vec![[Vec3::ZERO, Vec3::X, Vec3::Y]; 3000];
+        let chain: Triangles = (0..120)
+            .map(|i| {
+                let s = 2f32.powi(i - 90);
+                [Vec3::new(s, 0.0, 0.0), Vec3::new(s, s, 0.0), Vec3::new(s, 0.0, s)]
+            })
+            .collect();
+        for corners in [equal, chain] {
+            let o = BuildOptions { bins: 2, max_leaf: 1, ..options(1.0) };
+            covers(&build(&corners, &o), &corners, 1);
+        }
+    }
+}
