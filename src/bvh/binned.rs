@@ -603,9 +603,15 @@ impl Builder<'_, '_> {
     }
 }
 
+/// Cost of testing n triangles, of which four are tested at a time, in traversal steps. (With n alone,
+/// random rays take 3 to 4 % more instructions; with 3 + n / 2 as many.)
+pub(super) fn leaf_weight(n: usize) -> f32 {
+    if n <= 4 { 1.0 + 0.5 * n as f32 } else { n as f32 }
+}
+
 /// Cost of a leaf less that of a traversal step, in the units of [`Bins::best_split`].
 pub(super) fn leaf_cost(bounds: &Box4, scale: f32, n: usize) -> f32 {
-    half_areas([bounds.extent() * scale; 4]).x * (n as f32 - 1.0)
+    half_areas([bounds.extent() * scale; 4]).x * (leaf_weight(n) - 1.0)
 }
 
 /// A way to part two to four references: 0 to 3: that one from the others; 4 to 6: the first and one
@@ -621,7 +627,7 @@ pub(super) fn best_parting(refs: &[Reference], scale: f32) -> (f32, Parting) {
     let (p01, p23) = (pair(0, 1), pair(2, 3));
     let areas = |b: [Box4; 4]| half_areas(b.map(|b| b.extent() * scale));
     let others = [p23.join(boxes[1]), p23.join(boxes[0]), p01.join(boxes[3]), p01.join(boxes[2])];
-    let ones = (areas(boxes) + areas(others) * (n as f32 - 1.0)).to_array();
+    let ones = (areas(boxes) * leaf_weight(1) + areas(others) * leaf_weight(n - 1)).to_array();
     let mut best = (f32::INFINITY, 0);
     for i in 0..n {
         if ones[i] < best.0 {
@@ -631,7 +637,7 @@ pub(super) fn best_parting(refs: &[Reference], scale: f32) -> (f32, Parting) {
     if n == 4 {
         let left = areas([p01, pair(0, 2), pair(0, 3), p01]);
         let right = areas([p23, pair(1, 3), pair(1, 2), p23]);
-        let pairs = (2.0 * (left + right)).to_array();
+        let pairs = (leaf_weight(2) * (left + right)).to_array();
         for i in 0..3 {
             if pairs[i] < best.0 {
                 best = (pairs[i], 4 + i);

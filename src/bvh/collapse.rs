@@ -5,81 +5,125 @@
 use super::binned::BinaryBvh;
 use super::layout::{ChildRef, LEAF_PAD, LEAF_STRIDE, Mbvh, Node, WIDTH};
 use glam::Vec3;
+use rayon::prelude::*;
 
 /// Boxes grow by this part of their coordinates, which pays for the rounding of planes in the box test of
 /// the kernels.
 const OUTWARDS: f32 = 2.0 * f32::EPSILON;
 
-/// The 8-wide tree of a binary one, nodes in depth-first order.
+/// The binary nodes that an 8-wide node has as children.
+#[derive(Clone, Copy)]
+struct Plan {
+    children: [u32; WIDTH],
+    count: u32,
+    /// Number of the node of the first inner child; those of the others follow.
+    first: u32,
+}
+
+/// The 8-wide tree of a binary one; nodes follow their parents.
 pub(super) fn collapse(binary: &BinaryBvh, corners: &[[Vec3; 3]]) -> Mbvh {
     let n = binary.triangles.len();
     let root = &binary.nodes[0];
-    let mut tree = Mbvh {
-        nodes: Vec::with_capacity(n / 8 + 1),
-        leaves: Vec::with_capacity(n * LEAF_STRIDE + LEAF_PAD),
-        bounds: (root.lower, root.upper),
-    };
-    tree.nodes.push(Node::EMPTY);
-    // (node to fill, its binary root); depth-first, first child next.
+    // Which binary nodes become children is quickly told; to fill in nodes and leaves takes the time.
+    let mut plans = Vec::with_capacity(n / 6 + 1);
+    plans.push(Plan { children: [0; WIDTH], count: 0, first: 0 });
     let mut work = vec![(0usize, 0u32)];
     while let Some((target, source)) = work.pop() {
-        let mut children = [0u32; WIDTH];
-        let count = open(binary, source, &mut children);
-        let mut node = Node::EMPTY;
-        for (i, &child) in children[..count].iter().enumerate() {
-            let b = &binary.nodes[child as usize];
-            for axis in 0..3 {
-                node.lower[axis][i] = b.lower[axis] - OUTWARDS * b.lower[axis].abs();
-                node.upper[axis][i] = b.upper[axis] + OUTWARDS * b.upper[axis].abs();
-            }
-            node.children[i] = if b.count > 0 {
-                let triangles = &binary.triangles[b.index as usize..][..b.count as usize];
-                push_leaf(&mut tree.leaves, triangles, corners)
-            } else {
-                tree.nodes.push(Node::EMPTY);
-                ChildRef::node(tree.nodes.len() - 1)
-            };
-        }
-        node.sort_children();
-        tree.nodes[target] = node;
-        for (i, &child) in children[..count].iter().enumerate().rev() {
-            if !node.children[i].is_leaf() {
-                work.push((node.children[i].node_index(), child));
+        let (children, count) = open(binary, source);
+        let first = plans.len();
+        plans[target] = Plan { children, count: count as u32, first: first as u32 };
+        for &child in &children[..count] {
+            if binary.nodes[child as usize].count == 0 {
+                work.push((plans.len(), child));
+                plans.push(Plan { children: [0; WIDTH], count: 0, first: 0 });
             }
         }
+        // The first child's subtree comes next.
+        let inner = plans.len() - first;
+        let end = work.len();
+        work[end - inner..].reverse();
     }
-    tree.leaves.extend([0.0; LEAF_PAD]);
-    tree.nodes.shrink_to_fit();
-    tree
+    let nodes = plans.par_iter().with_min_len(1024).map(|plan| node(binary, plan)).collect();
+    let mut leaves = vec![0.0; n * LEAF_STRIDE + LEAF_PAD];
+    fill_leaves(&mut leaves[..n * LEAF_STRIDE], binary, corners);
+    Mbvh { nodes, leaves, bounds: (root.lower, root.upper) }
 }
 
-/// Fills in up to eight descendants of `source` that cover it, and says how many.
-fn open(binary: &BinaryBvh, source: u32, children: &mut [u32; WIDTH]) -> usize {
-    children[0] = source;
+fn node(binary: &BinaryBvh, plan: &Plan) -> Node {
+    let mut node = Node::EMPTY;
+    let mut next = plan.first as usize;
+    for (i, &child) in plan.children[..plan.count as usize].iter().enumerate() {
+        let b = &binary.nodes[child as usize];
+        for axis in 0..3 {
+            node.lower[axis][i] = b.lower[axis] - OUTWARDS * b.lower[axis].abs();
+            node.upper[axis][i] = b.upper[axis] + OUTWARDS * b.upper[axis].abs();
+        }
+        node.children[i] = if b.count > 0 {
+            ChildRef::leaf(b.index as usize, b.count as usize)
+        } else {
+            next += 1;
+            ChildRef::node(next - 1)
+        };
+    }
+    node.sort_children();
+    node
+}
+
+/// Descendants of `source` that cover it, up to eight, and how many.
+fn open(binary: &BinaryBvh, source: u32) -> ([u32; WIDTH], usize) {
+    // A leaf is never opened. Its area counts as negative.
+    let area = |node: u32| if binary.nodes[node as usize].count == 0 { binary.half_area(node) } else { -1.0 };
+    let mut children = [source; WIDTH];
+    let mut areas = [area(source); WIDTH];
     let mut count = 1;
     while count < WIDTH {
-        let inner = (0..count).filter(|&i| binary.nodes[children[i] as usize].count == 0);
-        let largest =
-            inner.reduce(|a, b| if binary.half_area(children[b]) > binary.half_area(children[a]) { b } else { a });
-        let Some(i) = largest else { break };
-        let parent = children[i];
-        children[i] = parent + 1;
-        children[count] = binary.nodes[parent as usize].index;
+        let largest = (1..count).fold(0, |a, b| if areas[b] > areas[a] { b } else { a });
+        if areas[largest] < 0.0 {
+            break;
+        }
+        let parent = children[largest];
+        for (place, child) in [(largest, parent + 1), (count, binary.nodes[parent as usize].index)] {
+            (children[place], areas[place]) = (child, area(child));
+        }
         count += 1;
     }
-    count
+    (children, count)
 }
 
-fn push_leaf(leaves: &mut Vec<f32>, triangles: &[u32], corners: &[[Vec3; 3]]) -> ChildRef {
-    let slot = leaves.len() / LEAF_STRIDE;
-    for corner in 0..3 {
-        for axis in 0..3 {
-            leaves.extend(triangles.iter().map(|&t| corners[t as usize][corner][axis]));
-        }
+/// Rows of all leaves, each where its triangles are in the binary tree's order.
+fn fill_leaves(leaves: &mut [f32], binary: &BinaryBvh, corners: &[[Vec3; 3]]) {
+    // In the order of the nodes, leaves follow each other in `triangles` too.
+    let counts: Vec<u32> = binary.nodes.iter().map(|b| b.count).filter(|&c| c > 0).collect();
+    debug_assert!(binary.nodes.iter().filter(|b| b.count > 0).is_sorted_by_key(|b| b.index));
+    let mut rest = leaves;
+    let mut first = 0;
+    let mut jobs = Vec::with_capacity(counts.len() / LEAVES_PER_JOB + 1);
+    for counts in counts.chunks(LEAVES_PER_JOB) {
+        let triangles = counts.iter().sum::<u32>() as usize;
+        let (rows, others) = rest.split_at_mut(triangles * LEAF_STRIDE);
+        jobs.push((rows, counts, &binary.triangles[first..first + triangles]));
+        (rest, first) = (others, first + triangles);
     }
-    leaves.extend(triangles.iter().map(|&t| f32::from_bits(t)));
-    ChildRef::leaf(slot, triangles.len())
+    jobs.into_par_iter().for_each(|(mut rows, counts, mut triangles)| {
+        for &count in counts {
+            let count = count as usize;
+            let (leaf, others) = std::mem::take(&mut rows).split_at_mut(count * LEAF_STRIDE);
+            let (own, next) = triangles.split_at(count);
+            for (i, &t) in own.iter().enumerate() {
+                for (corner, v) in corners[t as usize].iter().enumerate() {
+                    for axis in 0..3 {
+                        leaf[(3 * corner + axis) * count + i] = v[axis];
+                    }
+                }
+                leaf[9 * count + i] = f32::from_bits(t);
+            }
+            (rows, triangles) = (others, next);
+        }
+    });
 }
+
+/// Leaves that a thread fills at a time.
+const LEAVES_PER_JOB: usize = 1024;
 
 #[cfg(test)]
 mod tests {
@@ -96,28 +140,36 @@ mod tests {
                 .collect();
             let ids: Vec<u32> = (0..n as u32).collect();
             let options = BuildOptions { max_leaf, ..Default::default() };
-            let binary = BinaryBvh::build(&corners, &ids, &options, &Progress::none()).unwrap();
-            let tree = collapse(&binary, &corners);
-            let mut seen = vec![false; n];
-            for node in &tree.nodes {
-                for (i, child) in node.children.iter().enumerate() {
-                    if *child == ChildRef::EMPTY || !child.is_leaf() {
-                        continue;
-                    }
-                    let c = child.leaf_count();
-                    let rows = &tree.leaves[child.leaf_slot() * LEAF_STRIDE..][..LEAF_STRIDE * c];
-                    for k in 0..c {
-                        let id = rows[9 * c + k].to_bits() as usize;
-                        assert!(!std::mem::replace(&mut seen[id], true));
-                        for row in 0..9 {
-                            let x = rows[row * c + k];
-                            assert_eq!(x, corners[id][row / 3][row % 3]);
-                            assert!(node.lower[row % 3][i] <= x && x <= node.upper[row % 3][i]);
+            for binary in [
+                BinaryBvh::build(&corners, &ids, &options, &Progress::none()).unwrap(),
+                BinaryBvh::build_spatial(&corners, &ids, &options, &Progress::none()).unwrap(),
+            ] {
+                let tree = collapse(&binary, &corners);
+                let mut seen = vec![0; n];
+                for node in &tree.nodes {
+                    for (i, child) in node.children.iter().enumerate() {
+                        if *child == ChildRef::EMPTY || !child.is_leaf() {
+                            continue;
+                        }
+                        let c = child.leaf_count();
+                        let rows = &tree.leaves[child.leaf_slot() * LEAF_STRIDE..][..LEAF_STRIDE * c];
+                        for k in 0..c {
+                            let id = rows[9 * c + k].to_bits() as usize;
+                            seen[id] += 1;
+                            for row in 0..9 {
+                                let x = rows[row * c + k];
+                                assert_eq!(x, corners[id][row / 3][row % 3]);
+                                // A cut triangle is larger than its box.
+                                assert!(
+                                    binary.triangles.len() > n
+                                        || node.lower[row % 3][i] <= x && x <= node.upper[row % 3][i]
+                                );
+                            }
                         }
                     }
                 }
+                assert!(seen.iter().all(|&s| s > 0) && seen.iter().sum::<usize>() == binary.triangles.len());
             }
-            assert!(seen.iter().all(|&s| s));
         }
     }
 }

@@ -100,18 +100,32 @@ impl Node {
         order: [0; WIDTH],
     };
 
-    /// Fills in `order` from the boxes.
+    /// Fills in `order` from the boxes: by their centres along the octant's diagonal. (By where boxes begin
+    /// costs random rays 3 % more instructions.)
     pub(crate) fn sort_children(&mut self) {
         self.order = [0; WIDTH];
-        for octant in 0..8u32 {
-            // How far along the octant's diagonal a child begins. (Sorting by centres is no better.)
-            let begin = |i: usize| -> f32 {
-                (0..3).map(|a| if octant >> a & 1 == 1 { -self.upper[a][i] } else { self.lower[a][i] }).sum()
-            };
-            let mut far_to_near: [usize; WIDTH] = std::array::from_fn(|i| i);
-            far_to_near.sort_by(|&i, &j| begin(j).total_cmp(&begin(i)));
-            for (entry, child) in self.order.iter_mut().zip(far_to_near) {
-                *entry |= (child as u32) << (3 * octant);
+        for octant in 0..4u32 {
+            let key: [f32; WIDTH] = std::array::from_fn(|i| {
+                let along = |a: usize| {
+                    let centre = self.lower[a][i] + self.upper[a][i];
+                    if octant >> a & 1 == 1 { -centre } else { centre }
+                };
+                // Nobody asks for the place of a missing child.
+                if self.children[i] == ChildRef::EMPTY { f32::INFINITY } else { along(0) + along(1) + along(2) }
+            });
+            let mut far_to_near = [0usize; WIDTH];
+            for i in 1..WIDTH {
+                let mut place = i;
+                while place > 0 && key[far_to_near[place - 1]] < key[i] {
+                    far_to_near[place] = far_to_near[place - 1];
+                    place -= 1;
+                }
+                far_to_near[place] = i;
+            }
+            for (place, &child) in far_to_near.iter().enumerate() {
+                self.order[place] |= (child as u32) << (3 * octant);
+                // The opposite octant.
+                self.order[WIDTH - 1 - place] |= (child as u32) << (3 * (7 - octant));
             }
         }
     }

@@ -15,7 +15,7 @@
 use super::BuildOptions;
 use super::binned::{BinMap, BinaryBvh, BinaryNode, Bins, Box4, Extent, PARALLEL_SUBTREE, Reference};
 use super::binned::{
-    area_scale, best_parting, bin_count, half_areas, halve, in_parallel, leaf_cost, part_few, references,
+    area_scale, best_parting, bin_count, half_areas, halve, in_parallel, leaf_cost, leaf_weight, part_few, references,
 };
 use super::layout::SAH_DEPTH;
 use crate::error::Result;
@@ -246,7 +246,8 @@ impl Slabs {
     fn best_plane(&mut self, grid: &Grid, scale: f32, n: usize, extra: usize) -> Option<Plane> {
         let cost = |s: &Slab, counts: &[i32; 4]| {
             let areas = half_areas([s.boxes[0], s.boxes[1], s.boxes[2], Box4::EMPTY].map(|b| b.extent() * scale));
-            areas * Vec4::from_array(counts.map(|n| n as f32))
+            areas
+                * Vec4::from_array(counts.map(|count| if n <= 4 { leaf_weight(count as usize) } else { count as f32 }))
         };
         let mut sum = Slab::EMPTY;
         for i in (1..grid.slabs).rev() {
@@ -694,7 +695,7 @@ mod tests {
             let corners: Triangles = needles(1500).into_iter().map(|t| t.map(|c| (c - 0.5) * scale + offset)).collect();
             let bvh = build(&corners, &options(1.0));
             assert!(offset.x > 1e6 || bvh.triangles.len() > corners.len() + 200, "no splits at {scale}, {offset}");
-            covers(&bvh, &corners, 3);
+            covers(&bvh, &corners, BuildOptions::default().max_leaf);
         }
     }
 
