@@ -8,7 +8,7 @@ mod oracle;
 #[path = "verify/scenes.rs"]
 mod scenes;
 
-use bakelite::bvh::BuildOptions;
+use bakelite::bvh::{BuildOptions, BuildQuality};
 use bakelite::sampling::uniform;
 use bakelite::scene::{MAX_COORDINATE, NONE};
 use bakelite::trace::{Hit, Ray};
@@ -20,13 +20,6 @@ use std::collections::{BTreeMap, HashMap};
 use std::sync::{Arc, LazyLock};
 
 const INFINITY: f32 = f32::INFINITY;
-
-/// Faults that random rays at any scene meet now and then, known and tested for by
-/// `a_ray_in_the_plane_of_a_triangle_hits_it_where_it_is`.
-const IN_PLANE: &[Fault] = &[Fault::OffTriangle];
-
-/// The same, and those of thin triangles, tested for by `t_is_accurate_on_thin_triangles`.
-const THIN: &[Fault] = &[Fault::OffTriangle, Fault::InaccurateT];
 
 static DEVICES: LazyLock<Vec<Arc<Device>>> = LazyLock::new(|| {
     let device = |isa| Device::new(DeviceOptions { isa: Some(isa), num_threads: 2, ..Default::default() }).unwrap();
@@ -189,21 +182,16 @@ impl Case {
         }
     }
 
-    /// Fails if there was any fault but the `excused`, which are known defects with tests of their own.
-    fn finish(self, excused: &[Fault]) {
+    /// Fails if there was any fault.
+    fn finish(self) {
         let Case { name, rays, certain_hits, disagreements, scenes, .. } = &self;
         let isas = scenes.len();
         println!("{name}: {rays} rays, {certain_hits} surely hit, {isas} ISAs, gather differs: {disagreements}");
         assert!(self.rays > 0, "{}: nothing was traced", self.name);
         let mut report = String::new();
         for ((fault, query), (count, examples)) in &self.failures {
-            let line =
-                format!("{fault:?} {query}: {count} of {} rays, such as\n    {}", self.rays, examples.join("\n    "));
-            if excused.contains(fault) {
-                println!("known: {line}");
-            } else {
-                report += &format!("\n{line}");
-            }
+            let examples = examples.join("\n    ");
+            report += &format!("\n{fault:?} {query}: {count} of {} rays, such as\n    {examples}", self.rays);
         }
         assert!(report.is_empty(), "scene '{}'{report}", self.name);
     }
@@ -260,11 +248,16 @@ fn an_empty_mesh_does_not_shift_the_others() {
 fn many_small_scenes_are_built_and_traced() {
     for i in 0..400 {
         let n = 1 + below(60, i, 0, 9) as u32;
-        let options = BuildOptions { bins: [2, 8, 64, 256][i as usize % 4], max_leaf: 1 + i % 8 };
+        let options = BuildOptions {
+            bins: [2, 8, 64, 256][i as usize % 4],
+            max_leaf: 1 + i % 8,
+            quality: BuildQuality::ALL[i as usize / 4 % 2],
+            ..Default::default()
+        };
         let triangles = soup(n, [0.01, 0.3, 2.0][i as usize % 3], i);
         let mut case = Case::with_options(&format!("soup({n}, …, {i}), {options:?}"), triangles, &options);
         case.random(200, i);
-        case.finish(IN_PLANE);
+        case.finish();
     }
 }
 
@@ -292,7 +285,7 @@ fn the_same_hits_come_from_any_leaf_size() {
         let options = BuildOptions { max_leaf, ..Default::default() };
         let mut case = Case::with_options(&format!("leaf {max_leaf}"), triangles.clone(), &options);
         case.random(10_000, 8);
-        case.finish(IN_PLANE);
+        case.finish();
     }
 }
 
@@ -317,7 +310,7 @@ fn t_and_barycentrics_of_a_known_triangle_are_exact() {
             }
         }
     }
-    case.finish(&[]);
+    case.finish();
 }
 
 #[test]
@@ -334,7 +327,7 @@ fn of_coincident_triangles_the_lowest_number_is_hit() {
             for hits in case.shared(Vec3::new(0.1, 0.2, 3.0), &directions, INFINITY) {
                 assert!(hits.iter().all(|h| h.triangle == lowest), "{copies} copies from {lowest}: {hits:?}");
             }
-            case.finish(&[]);
+            case.finish();
         }
     }
 }
@@ -350,7 +343,7 @@ fn of_coincident_soups_the_lowest_number_is_hit() {
             assert!(hits.iter().all(|h| h.triangle == NONE || h.triangle < 50), "{o} {hits:?}");
         }
     }
-    case.finish(IN_PLANE);
+    case.finish();
 }
 
 // Intervals.
@@ -390,7 +383,7 @@ fn rays_with_an_empty_interval_hit_nothing() {
             assert!(hits.iter().all(|&h| h == Hit::MISS), "{tmax} {hits:?}");
         }
     }
-    case.finish(&[]);
+    case.finish();
 }
 
 #[test]
@@ -416,7 +409,7 @@ fn the_near_end_is_exclusive_and_the_far_end_inclusive() {
             assert!(hits.iter().all(|h| (h.t == 2.0) == expected), "{tmax} {hits:?}");
         }
     }
-    case.finish(&[]);
+    case.finish();
 }
 
 #[test]
@@ -469,7 +462,7 @@ fn assert_hits_behind_the_origin(name: &str, wall: Triangle, intervals: &[(f32, 
         }
     }
     assert!(wrong.is_empty(), "{name}: {ray:?} within (tmin, tmax) has t: {wrong:?}");
-    case.finish(&[]);
+    case.finish();
 }
 
 const TILTED: Triangle = [Vec3::new(-1.0, -1.0, -3.0), Vec3::new(1.0, -1.0, -2.0), Vec3::new(0.0, 1.0, -1.5)];
@@ -487,11 +480,10 @@ fn hits_behind_the_origin_count_where_the_interval_says_so() {
             assert!(hits.iter().all(|h| (h.t == 0.0) == expected), "{tmin} {tmax} {hits:?}");
         }
     }
-    case.finish(&[]);
+    case.finish();
 }
 
 #[test]
-#[ignore = "known: box distances are scaled up for safety, which is the wrong way for negative t"]
 fn hits_behind_the_origin_count_in_flat_boxes_and_at_the_far_end() {
     let flat = [Vec3::new(-1.0, -1.0, -2.0), Vec3::new(3.0, -1.0, -2.0), Vec3::new(-1.0, 3.0, -2.0)];
     assert_hits_behind_the_origin("flat wall", flat, &[(-3.0, 0.0, true), (-INFINITY, INFINITY, true)]);
@@ -508,7 +500,7 @@ fn random_intervals_are_respected_on_both_sides_of_the_origin() {
         })
         .collect();
     case.single(&rays);
-    case.finish(&[]);
+    case.finish();
 }
 
 // Directions and memory.
@@ -533,16 +525,15 @@ fn the_length_of_the_direction_only_scales_t() {
     for length in [1e-20, 3e-7, 1e-6, 9.99e5, 1e6, 1e20] {
         case.shared(o, &unit.iter().map(|d| d.map(|x| x * length)).collect::<Vec<_>>(), INFINITY);
     }
-    case.finish(&[]);
+    case.finish();
 }
 
 #[test]
-#[ignore = "known: the sum that looks for NaN overflows from 1.2e38 on, and the ray is refused"]
 fn directions_near_the_largest_float_are_directions() {
     let mut case = Case::new("soup(100, 0.8, 41)", soup(100, 0.8, 41));
     let d: Vec<[f32; 3]> = (0..500).map(|i| (direction(i, 2) * 3.4e38).to_array()).collect();
     case.shared(Vec3::new(0.1, -0.2, 0.3), &d, INFINITY);
-    case.finish(&[]);
+    case.finish();
 }
 
 #[test]
@@ -567,7 +558,7 @@ fn zero_and_denormal_components_are_as_good_as_others() {
             assert!(!inside || hits.iter().all(|h| h.triangle != NONE), "leak from {o}");
         }
     }
-    case.finish(&[]);
+    case.finish();
 }
 
 #[test]
@@ -684,19 +675,16 @@ fn no_ray_leaves_spheres_of_extreme_size() {
 }
 
 #[test]
-#[ignore = "known: all edge functions at a vertex may round to one sign, so that every triangle around it is missed"]
 fn no_ray_leaves_a_sphere_through_a_vertex() {
     assert_closed("sphere(0, 2, 40, 20)", sphere(Vec3::ZERO, 2.0, 40, 20), Vec3::ZERO, 0.9, 60, &[Aim::Vertex]);
 }
 
 #[test]
-#[ignore = "known: all edge functions at a vertex may round to one sign, so that every triangle around it is missed"]
 fn no_ray_leaves_a_far_sphere_through_a_vertex() {
     assert_closed("sphere(FAR, 2, 24, 12)", sphere(FAR, 2.0, 24, 12), FAR, 0.9, 200, &[Aim::Vertex]);
 }
 
 #[test]
-#[ignore = "known: all edge functions at a vertex may round to one sign, so that every triangle around it is missed"]
 fn no_ray_leaves_a_tetrahedron_through_a_vertex() {
     let mut leaks = BTreeMap::new();
     for i in 0..3000 {
@@ -717,7 +705,7 @@ fn no_ray_leaves_a_tetrahedron_through_a_vertex() {
 }
 
 #[test]
-#[ignore = "known: a triangle with its corners on a line is skipped, and with it the seam that it closed"]
+#[ignore = "known: a triangle with its corners on a line is skipped, and with it the seam that it closed: 1 % of rays at it leak"]
 fn no_ray_leaves_between_triangles_joined_by_one_without_area() {
     // An edge a–b on one side, a–m–b on the other, and (b, a, m) between them, exactly on a line.
     let mut leaks = BTreeMap::new();
@@ -808,7 +796,7 @@ fn rays_that_are_not_finite_hit_nothing() {
         (directions[0], directions[17], directions[39]) = (ray.direction, ray.direction, ray.direction);
         case.shared(ray.origin.into(), &directions, ray.tmax);
     }
-    case.finish(&[]);
+    case.finish();
 }
 
 #[test]
@@ -823,7 +811,7 @@ fn triangles_that_are_not_finite_are_skipped_and_keep_their_numbers() {
         assert!((lower, upper) == bounds_of_valid(&case.triangles), "{lower} {upper}");
     }
     case.random(100_000, 5);
-    case.finish(IN_PLANE);
+    case.finish();
 }
 
 fn bounds_of_valid(triangles: &[Triangle]) -> (Vec3, Vec3) {
@@ -857,14 +845,14 @@ fn triangles_at_the_end_of_the_valid_range_are_hit_and_those_beyond_are_skipped(
     let large: Vec<Triangle> = soup(100, 0.5, 71).iter().map(|t| t.map(|v| v * 0.66 * MAX_COORDINATE)).collect();
     let mut case = Case::new("soup(100, 0.5, 71) · 0.66e12", large);
     case.random(60_000, 6);
-    case.finish(IN_PLANE);
+    case.finish();
     let beyond = soup(100, 0.5, 72).iter().map(|t| t.map(|v| v * 1e18)).collect::<Vec<_>>();
     let mut case = Case::new("soup and one of extent 1e18", [beyond, soup(50, 0.5, 73)].concat());
     for scene in &case.scenes {
         assert_eq!(scene.stats().skipped_degenerate, 100);
     }
     case.random(10_000, 6);
-    case.finish(IN_PLANE);
+    case.finish();
 }
 
 /// Least barycentric weight of the point where a line along `axis` through `p` meets a triangle.
@@ -948,72 +936,71 @@ fn hits_do_not_depend_on_the_scale_of_the_scene() {
 }
 
 #[test]
-#[ignore = "known: normal · corner, a volume, is denormal or 0 where triangle and distance are below 1e-12"]
 fn hits_do_not_depend_on_the_scale_of_tiny_scenes() {
     assert_scale_free(&[-50, -40]);
 }
 
 // Scenes made to hurt: random rays against the oracle.
 
-fn random_rays(name: &str, triangles: Vec<Triangle>, rays: u32, excused: &[Fault]) {
+fn random_rays(name: &str, triangles: Vec<Triangle>, rays: u32) {
     let mut case = Case::new(name, triangles);
     case.random(rays, 17);
-    case.finish(excused);
+    case.finish();
 }
 
 #[test]
 fn random_rays_at_soups() {
-    random_rays("soup(60, 1, 101)", soup(60, 1.0, 101), 200_000, IN_PLANE);
-    random_rays("soup(120, 0.2, 102)", soup(120, 0.2, 102), 100_000, IN_PLANE);
+    random_rays("soup(60, 1, 101)", soup(60, 1.0, 101), 200_000);
+    random_rays("soup(120, 0.2, 102)", soup(120, 0.2, 102), 100_000);
 }
 
 #[test]
 fn random_rays_at_an_integer_grid() {
-    random_rays("grid(3, [0, 3])", grid(3, &[0, 3]), 150_000, IN_PLANE);
-    random_rays("grid(2, [0, 1, 2])", grid(2, &[0, 1, 2]), 100_000, IN_PLANE);
+    random_rays("grid(3, [0, 3])", grid(3, &[0, 3]), 150_000);
+    random_rays("grid(2, [0, 1, 2])", grid(2, &[0, 1, 2]), 100_000);
 }
 
 #[test]
 fn random_rays_at_a_sphere() {
-    random_rays("sphere(0, 1, 12, 8)", sphere(Vec3::ZERO, 1.0, 12, 8), 100_000, IN_PLANE);
+    random_rays("sphere(0, 1, 12, 8)", sphere(Vec3::ZERO, 1.0, 12, 8), 100_000);
     let centre = Vec3::new(148376.0, 1234.0, -223423.0);
-    random_rays("sphere(far, 2, 12, 8)", sphere(centre, 2.0, 12, 8), 50_000, IN_PLANE);
+    random_rays("sphere(far, 2, 12, 8)", sphere(centre, 2.0, 12, 8), 50_000);
 }
 
 #[test]
 fn random_rays_at_a_fan() {
-    random_rays("fan(97)", fan(97), 150_000, IN_PLANE);
+    random_rays("fan(97)", fan(97), 150_000);
 }
 
 #[test]
 fn random_rays_at_needles() {
-    random_rays("needles(80, 1e-3, 7)", needles(80, 1e-3, 7), 100_000, THIN);
-    random_rays("needles(80, 1e-6, 7)", needles(80, 1e-6, 7), 50_000, THIN);
+    random_rays("needles(80, 1e-3, 7)", needles(80, 1e-3, 7), 100_000);
+    random_rays("needles(80, 1e-6, 7)", needles(80, 1e-6, 7), 50_000);
 }
 
 #[test]
 fn random_rays_at_slivers() {
-    random_rays("slivers(80, 7)", slivers(80, 7), 100_000, THIN);
+    random_rays("slivers(80, 7)", slivers(80, 7), 100_000);
 }
 
 #[test]
 fn random_rays_at_a_coplanar_stack() {
-    random_rays("coplanar_stack(60)", coplanar_stack(60), 100_000, &[Fault::OffTriangle, Fault::NotLowest]);
+    random_rays("coplanar_stack(60)", coplanar_stack(60), 100_000);
 }
 
 #[test]
 fn random_rays_at_two_scales() {
-    random_rays("two_scales(50, 7)", two_scales(50, 7), 150_000, THIN);
+    random_rays("two_scales(50, 7)", two_scales(50, 7), 150_000);
 }
 
 #[test]
 fn random_rays_at_one_huge_triangle_over_many_small_ones() {
-    random_rays("giant_over_small(100, 7)", giant_over_small(100, 7), 150_000, THIN);
+    random_rays("giant_over_small(100, 7)", giant_over_small(100, 7), 150_000);
 }
 
 #[test]
 fn random_rays_at_equal_centroids() {
-    random_rays("equal_centroids(100, 7)", equal_centroids(100, 7), 100_000, IN_PLANE);
+    random_rays("equal_centroids(100, 7)", equal_centroids(100, 7), 100_000);
 }
 
 #[test]
@@ -1021,18 +1008,10 @@ fn random_rays_at_coincident_soups() {
     let once = soup(30, 0.8, 111);
     let rotated: Vec<Triangle> = once.iter().map(|&[a, b, c]| [c, a, b]).collect();
     let turned: Vec<Triangle> = once.iter().map(|&[a, b, c]| [b, a, c]).collect();
-    random_rays("soup(30, 0.8, 111), rotated, turned", [once, rotated, turned].concat(), 100_000, IN_PLANE);
-}
-
-/// Rays at every kind of scene with all that the tests above let pass.
-fn thin_or_in_plane(excused: &[Fault]) {
-    random_rays("fan(97)", fan(97), 50_000, excused);
-    random_rays("soup(60, 1, 101)", soup(60, 1.0, 101), 100_000, excused);
-    random_rays("sphere(0, 1, 12, 8)", sphere(Vec3::ZERO, 1.0, 12, 8), 50_000, excused);
+    random_rays("soup(30, 0.8, 111), rotated, turned", [once, rotated, turned].concat(), 100_000);
 }
 
 #[test]
-#[ignore = "known: t of a grazing ray is not held within the triangle's extent along the ray"]
 fn a_ray_in_the_plane_of_a_triangle_hits_it_where_it_is() {
     // The ray starts on the triangle and leaves it through a corner, at t = 1.
     let triangle = [
@@ -1046,12 +1025,10 @@ fn a_ray_in_the_plane_of_a_triangle_hits_it_where_it_is() {
         &[[-0.032037154, 0.25425756, -0.12613022]; 9],
         INFINITY,
     );
-    case.finish(&[]);
-    thin_or_in_plane(&[]);
+    case.finish();
 }
 
 #[test]
-#[ignore = "known: rounding in the normal of a thin triangle moves t by the inverse of its aspect"]
 fn t_is_accurate_on_thin_triangles() {
     // 1e-3 wide, and a few ulps wide; the rays are aimed at t = 1.
     let needle = [
@@ -1067,16 +1044,7 @@ fn t_is_accurate_on_thin_triangles() {
     let mut case = Case::new("a needle and a sliver", vec![needle, sliver]);
     case.shared(Vec3::new(0.6932027, -0.56247705, -1.3453095), &[[-1.7338862, -0.85571426, 2.0219245]], INFINITY);
     case.shared(Vec3::new(0.386845, -0.308618, -0.8444522), &[[-0.0554927, 0.59886855, 0.5649444]], INFINITY);
-    case.finish(&[]);
-    random_rays("needles(80, 1e-3, 7)", needles(80, 1e-3, 7), 50_000, IN_PLANE);
-    random_rays("needles(80, 1e-6, 7)", needles(80, 1e-6, 7), 50_000, IN_PLANE);
-    random_rays("slivers(80, 7)", slivers(80, 7), 50_000, IN_PLANE);
-}
-
-#[test]
-#[ignore = "known: a grazing t may be off by more than the slack with which boxes are culled"]
-fn of_coincident_triangles_the_lowest_number_is_hit_at_grazing_angles() {
-    random_rays("coplanar_stack(60)", coplanar_stack(60), 50_000, IN_PLANE);
+    case.finish();
 }
 
 // Trees.
@@ -1097,7 +1065,7 @@ fn the_worst_trees_do_not_overflow_the_stack() {
     ];
     for (name, triangles) in chains {
         for (bins, max_leaf) in [(2, 1), (64, 1), (256, 3)] {
-            let options = BuildOptions { bins, max_leaf };
+            let options = BuildOptions { bins, max_leaf, ..Default::default() };
             let mut case = Case::with_options(&format!("{name} {options:?}"), triangles.clone(), &options);
             // From the small end through all boxes, and in general.
             let d: Vec<[f32; 3]> = (0..500).map(|i| target(&triangles[0], i, 5).to_array()).collect();
@@ -1108,7 +1076,7 @@ fn the_worst_trees_do_not_overflow_the_stack() {
                 (0..500).map(|i| (target(&triangles[i as usize % triangles.len()], i, 6) - above).to_array()).collect();
             case.shared(above, &down, INFINITY);
             case.random(4000, 19);
-            case.finish(IN_PLANE);
+            case.finish();
         }
     }
 }
@@ -1130,8 +1098,8 @@ fn deep_trees_of_many_triangles_do_not_overflow_the_stack() {
         })
         .collect();
     for device in DEVICES.iter() {
-        let deep = commit(device, &triangles, &BuildOptions { bins: 2, max_leaf: 1 });
-        let shallow = commit(device, &triangles, &BuildOptions { bins: 256, max_leaf: 8 });
+        let deep = commit(device, &triangles, &BuildOptions { bins: 2, max_leaf: 1, ..Default::default() });
+        let shallow = commit(device, &triangles, &BuildOptions { bins: 256, max_leaf: 8, ..Default::default() });
         let (a, b) = (closest(&deep, &rays), closest(&shallow, &rays));
         let differing = (0..rays.len()).find(|&i| !same_bits(&[a[i]], &[b[i]]));
         if let Some(i) = differing {
@@ -1156,7 +1124,7 @@ fn gather_takes_any_number_of_directions() {
         case.shared(o, &d, INFINITY);
         case.shared(o, &d, 0.7);
     }
-    case.finish(&[]);
+    case.finish();
 }
 
 #[test]
@@ -1168,7 +1136,7 @@ fn narrow_and_wide_packets_find_the_same_as_single_rays() {
         let d: Vec<[f32; 3]> = (0..32).map(|k| (axis + width * point(k, 1, i)).to_array()).collect();
         case.shared(o, &d, INFINITY);
     }
-    case.finish(&[]);
+    case.finish();
 }
 
 #[test]

@@ -105,10 +105,6 @@ macro_rules! lanes {
                 $v(unsafe { $cmp::<_CMP_LE_OQ>(self.0, o.0) })
             }
             #[inline(always)]
-            fn eq(self, o: Self) -> $v {
-                $v(unsafe { $cmp::<_CMP_EQ_OQ>(self.0, o.0) })
-            }
-            #[inline(always)]
             fn select(m: $v, t: Self, f: Self) -> Self {
                 $v(unsafe { $blend(f.0, t.0, m.0) })
             }

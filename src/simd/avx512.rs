@@ -105,10 +105,6 @@ impl Lanes for A16 {
         M16(unsafe { _mm512_cmp_ps_mask::<_CMP_LE_OQ>(self.0, o.0) })
     }
     #[inline(always)]
-    fn eq(self, o: Self) -> M16 {
-        M16(unsafe { _mm512_cmp_ps_mask::<_CMP_EQ_OQ>(self.0, o.0) })
-    }
-    #[inline(always)]
     fn select(m: M16, t: Self, f: Self) -> Self {
         A16(unsafe { _mm512_mask_blend_ps(m.0, f.0, t.0) })
     }

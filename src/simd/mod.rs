@@ -160,8 +160,6 @@ pub(crate) trait Lanes: Copy + Add<Output = Self> + Sub<Output = Self> + Mul<Out
     fn lt(self, other: Self) -> Self::Mask;
     /// Ordered `≤`.
     fn le(self, other: Self) -> Self::Mask;
-    /// Ordered `=`.
-    fn eq(self, other: Self) -> Self::Mask;
     /// Lane by lane `if_true` or `if_false`.
     fn select(mask: Self::Mask, if_true: Self, if_false: Self) -> Self;
 

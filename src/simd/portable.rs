@@ -131,10 +131,6 @@ impl Lanes for P4 {
         M4(self.0.simd_le(o.0))
     }
     #[inline(always)]
-    fn eq(self, o: Self) -> M4 {
-        M4(self.0.simd_eq(o.0))
-    }
-    #[inline(always)]
     fn select(m: M4, t: Self, f: Self) -> Self {
         P4(m.0.bitselect(t.0, f.0))
     }
@@ -188,10 +184,6 @@ impl Lanes for P8 {
     #[inline(always)]
     fn le(self, o: Self) -> M8 {
         M8(self.0.le(o.0), self.1.le(o.1))
-    }
-    #[inline(always)]
-    fn eq(self, o: Self) -> M8 {
-        M8(self.0.eq(o.0), self.1.eq(o.1))
     }
     #[inline(always)]
     fn select(m: M8, t: Self, f: Self) -> Self {
