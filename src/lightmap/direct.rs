@@ -98,6 +98,56 @@ impl AreaLight {
     }
 }
 
+fn shadow_ray(receiver: &Receiver, target: Vec3) -> Ray {
+    Ray::new(receiver.origin, target - receiver.origin).within(0.0, 1.0 - LIGHT_MARGIN)
+}
+
+/// Shadow rays that are traced together, which is faster than one by one.
+const TOGETHER: usize = 32;
+
+/// Shadow rays and the light that comes along them if nothing is in the way.
+struct ShadowRays<'a> {
+    scene: &'a Scene,
+    rays: [Ray; TOGETHER],
+    light: [Vec3; TOGETHER],
+    count: usize,
+    traced: u64,
+    visible: Vec3,
+}
+
+impl<'a> ShadowRays<'a> {
+    fn new(scene: &'a Scene) -> Self {
+        let rays = [Ray::new(Vec3::ZERO, Vec3::ZERO); TOGETHER];
+        ShadowRays { scene, rays, light: [Vec3::ZERO; TOGETHER], count: 0, traced: 0, visible: Vec3::ZERO }
+    }
+
+    fn push(&mut self, ray: Ray, light: Vec3) {
+        if self.count == TOGETHER {
+            self.trace();
+        }
+        (self.rays[self.count], self.light[self.count]) = (ray, light);
+        self.count += 1;
+    }
+
+    fn trace(&mut self) {
+        let mut occluded = [0; TOGETHER];
+        let scene = self.scene;
+        scene.device().kernels().occluded_block(scene.mbvh(), &self.rays[..self.count], &mut occluded);
+        for (light, _) in self.light[..self.count].iter().zip(occluded).filter(|(_, occluded)| *occluded == 0) {
+            self.visible += *light;
+        }
+        self.traced += self.count as u64;
+        self.count = 0;
+    }
+
+    /// The light that arrives; adds the rays traced to `rays`.
+    fn finish(mut self, rays: &mut u64) -> Vec3 {
+        self.trace();
+        *rays += self.traced;
+        self.visible
+    }
+}
+
 /// The lights of a scene, ready to be sampled.
 pub struct DirectLight {
     scene: Arc<Scene>,
@@ -184,7 +234,7 @@ impl DirectLight {
 
     fn visible(&self, receiver: &Receiver, target: Vec3, rays: &mut u64) -> bool {
         *rays += 1;
-        !self.scene.occluded(&Ray::new(receiver.origin, target - receiver.origin).within(0.0, 1.0 - LIGHT_MARGIN))
+        !self.scene.occluded(&shadow_ray(receiver, target))
     }
 
     fn one_light(&self, light: &Light, receiver: &Receiver, rays: &mut u64) -> Vec3 {
@@ -233,7 +283,7 @@ impl DirectLight {
             return Vec3::ZERO;
         }
         let n = samples as usize * shining.min(MAX_LIGHTS_SAMPLED);
-        let (mut weights, mut visible) = (Vec3::ZERO, Vec3::ZERO);
+        let (mut weights, mut shadow) = (Vec3::ZERO, ShadowRays::new(&self.scene));
         let offset = sobol_2d(0, combine(seed, 1))[0];
         let (mut light, mut below) = (0, 0.0f32);
         for k in 0..n {
@@ -251,10 +301,9 @@ impl DirectLight {
                 continue;
             }
             weights += weight * area.radiance;
-            if self.visible(receiver, point, rays) {
-                visible += weight * area.radiance;
-            }
+            shadow.push(shadow_ray(receiver, point), weight * area.radiance);
         }
+        let visible = shadow.finish(rays);
         let fraction = |v: f32, w: f32| if w > 0.0 { v / w } else { 0.0 };
         total
             * Vec3::new(fraction(visible.x, weights.x), fraction(visible.y, weights.y), fraction(visible.z, weights.z))
@@ -264,7 +313,7 @@ impl DirectLight {
     fn many_area_lights(&self, receiver: &Receiver, samples: u32, seed: u32, rays: &mut u64) -> Vec3 {
         let n = samples as usize * MAX_LIGHTS_SAMPLED;
         let offset = sobol_2d(0, combine(seed, 1))[0];
-        let mut sum = Vec3::ZERO;
+        let mut shadow = ShadowRays::new(&self.scene);
         for k in 0..n {
             let target = (k as f32 + offset) / n as f32;
             let light = self.power_cdf.partition_point(|&c| c <= target).min(self.areas.len() - 1);
@@ -273,11 +322,11 @@ impl DirectLight {
             let probability = self.power_cdf[light] - below;
             let point = area.sample(sobol_2d(k as u32, combine(seed, 2)));
             let weight = area.geometry_term(receiver, point) * area.area / (probability * n as f32);
-            if weight > 0.0 && weight.is_finite() && self.visible(receiver, point, rays) {
-                sum += weight * area.radiance;
+            if weight > 0.0 && weight.is_finite() {
+                shadow.push(shadow_ray(receiver, point), weight * area.radiance);
             }
         }
-        sum
+        shadow.finish(rays)
     }
 
     /// Emitted radiance of a front (or back) of a triangle.
