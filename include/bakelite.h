@@ -265,7 +265,7 @@ struct bk_scene_stats {
   uint64_t triangles;
   // Of those, skipped as degenerate or not finite.
   uint64_t skipped_degenerate;
-  // 4-wide nodes of the acceleration structure.
+  // 8-wide nodes of the acceleration structure.
   uint64_t nodes;
   // Bytes of the acceleration structure.
   uint64_t bvh_bytes;

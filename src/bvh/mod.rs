@@ -1,4 +1,4 @@
-//! Acceleration structures: a binary tree built by binned SAH, with spatial splits if asked, collapsed to the 4-wide MBVH that the
+//! Acceleration structures: a binary tree built by binned SAH, with spatial splits if asked, collapsed to the 8-wide MBVH that the
 //! kernels traverse.
 
 mod binned;

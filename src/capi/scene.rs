@@ -229,7 +229,7 @@ pub struct bk_build_params {
     pub struct_size: u32,
     /// Bins per axis of the surface area heuristic, 2 to 256. Default: 64.
     pub bins: u32,
-    /// Most triangles per leaf, 1 to 8. Default: 3.
+    /// Most triangles per leaf, 1 to 8. Default: 4, as many as are tested at a time.
     pub max_leaf: u32,
     /// One of BK_BUILD_QUALITY_*. Default: BK_BUILD_QUALITY_DEFAULT.
     pub quality: u32,
@@ -333,7 +333,7 @@ pub struct bk_scene_stats {
     pub triangles: u64,
     /// Of those, skipped as degenerate or not finite.
     pub skipped_degenerate: u64,
-    /// 4-wide nodes of the acceleration structure.
+    /// 8-wide nodes of the acceleration structure.
     pub nodes: u64,
     /// Bytes of the acceleration structure.
     pub bvh_bytes: u64,

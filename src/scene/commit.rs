@@ -40,7 +40,7 @@ pub struct SceneStats {
     pub triangles: u64,
     /// Of those, skipped as degenerate or not finite.
     pub skipped_degenerate: u64,
-    /// 4-wide nodes.
+    /// 8-wide nodes.
     pub nodes: u64,
     /// Bytes of the acceleration structure.
     pub bvh_bytes: u64,

@@ -1,5 +1,5 @@
 //! Lanes over AVX-512: 512-bit vectors with mask registers for packets. Nodes and leaves keep the
-//! 128- and 256-bit vectors of AVX2, whose four-wide shape they have.
+//! 128- and 256-bit vectors of AVX2, whose shape they have: four triangles, eight children.
 
 use super::avx2::{A4, A8};
 use super::{Lanes, Mask, Simd};

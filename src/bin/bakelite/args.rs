@@ -48,7 +48,7 @@ Machine:
   --threads N            0: one per logical core [0]
   --isa NAME             portable, avx2, avx512 or auto [auto]
   --bins N               bins of the tree builder [64]
-  --leaf N               most triangles per leaf [3]
+  --leaf N               most triangles per leaf [4]
   --build NAME           default, or high: with spatial splits, for faster rays [default]
 Pictures (path traced reference; indirect map + shadow rays; light map alone):
   --camera PX,PY,PZ:TX,TY,TZ[:FOV]        position, target, vertical degrees [60];
