@@ -209,8 +209,10 @@ BK_API uint32_t bk_device_num_threads(const bk_device *device);
 // Binned SAH.
 #define BK_BUILD_QUALITY_DEFAULT 0
 
-// Binned SAH with spatial splits: triangles may be cut. The build takes several times as long; rays
-// are faster where large or slanted triangles overlap others, as in most buildings.
+// Binned SAH with spatial splits: triangles may be cut. The build takes several times as long and the
+// tree up to a sixth more memory. Closest hits are found with 10 to 20 % less work where large or slanted
+// triangles overlap others, as in most buildings; occlusion rays may take a tenth more, since large
+// triangles are met later.
 #define BK_BUILD_QUALITY_HIGH 1
 
 // A scene: being described, or committed.
@@ -246,7 +248,7 @@ typedef struct bk_build_params {
   uint32_t struct_size;
   // Bins per axis of the surface area heuristic, 2 to 256. Default: 64.
   uint32_t bins;
-  // Most triangles per leaf, 1 to 8. Default: 3.
+  // Most triangles per leaf, 1 to 8. Default: 4, as many as are tested at a time.
   uint32_t max_leaf;
   // One of BK_BUILD_QUALITY_*. Default: BK_BUILD_QUALITY_DEFAULT.
   uint32_t quality;

@@ -241,8 +241,10 @@ pub struct bk_build_params {
 /// Binned SAH.
 pub const BK_BUILD_QUALITY_DEFAULT: u32 = 0;
 
-/// Binned SAH with spatial splits: triangles may be cut. The build takes several times as long; rays
-/// are faster where large or slanted triangles overlap others, as in most buildings.
+/// Binned SAH with spatial splits: triangles may be cut. The build takes several times as long and the
+/// tree up to a sixth more memory. Closest hits are found with 10 to 20 % less work where large or slanted
+/// triangles overlap others, as in most buildings; occlusion rays may take a tenth more, since large
+/// triangles are met later.
 pub const BK_BUILD_QUALITY_HIGH: u32 = 1;
 
 sized_struct!(bk_build_params, last: max_leaf: u32, defaults: {
