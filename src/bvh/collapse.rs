@@ -2,7 +2,7 @@
 //! Volume Hierarchies for Fast SIMD Ray Tracing of Incoherent Rays*, 2008): the child of largest
 //! area is opened first.
 
-use super::binned::BinaryBvh;
+use super::binned::{BinaryBvh, Box4};
 use super::layout::{ChildRef, LEAF_PAD, LEAF_STRIDE, Mbvh, Node, WIDTH};
 use glam::Vec3;
 
@@ -10,7 +10,25 @@ use glam::Vec3;
 /// the kernels.
 const OUTWARDS: f32 = 2.0 * f32::EPSILON;
 
-/// The 8-wide tree of a binary one, nodes in depth-first order.
+/// Sets the box of child `i`, moved outwards; an empty one is hit by no ray.
+pub(super) fn set_box(node: &mut Node, i: usize, b: &Box4) {
+    // From infinities it would make NaN.
+    if b.is_empty() {
+        for axis in 0..3 {
+            (node.lower[axis][i], node.upper[axis][i]) = (f32::INFINITY, f32::NEG_INFINITY);
+        }
+        return;
+    }
+    let (lower, upper) = b.corners();
+    for axis in 0..3 {
+        node.lower[axis][i] = lower[axis] - OUTWARDS * lower[axis].abs();
+        node.upper[axis][i] = upper[axis] + OUTWARDS * upper[axis].abs();
+    }
+}
+
+/// The 8-wide tree of a binary one, nodes in depth-first order: the inner children of a node follow each
+/// other, then comes what lies below the first, below the second, and so on; leaves likewise (`refit`
+/// relies on it).
 pub(super) fn collapse(binary: &BinaryBvh, corners: &[[Vec3; 3]]) -> Mbvh {
     let n = binary.triangles.len();
     let root = &binary.nodes[0];
@@ -28,10 +46,7 @@ pub(super) fn collapse(binary: &BinaryBvh, corners: &[[Vec3; 3]]) -> Mbvh {
         let mut node = Node::EMPTY;
         for (i, &child) in children[..count].iter().enumerate() {
             let b = &binary.nodes[child as usize];
-            for axis in 0..3 {
-                node.lower[axis][i] = b.lower[axis] - OUTWARDS * b.lower[axis].abs();
-                node.upper[axis][i] = b.upper[axis] + OUTWARDS * b.upper[axis].abs();
-            }
+            set_box(&mut node, i, &Box4::new(b.lower, b.upper));
             node.children[i] = if b.count > 0 {
                 let triangles = &binary.triangles[b.index as usize..][..b.count as usize];
                 push_leaf(&mut tree.leaves, triangles, corners)
