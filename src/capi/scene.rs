@@ -365,9 +365,9 @@ pub unsafe extern "C" fn bk_scene_commit(
 ///
 /// The acceleration structure keeps its shape and gets new boxes, on the device's threads, in a
 /// fraction of the time of a commit. It serves well while neighbours stay neighbours; where
-/// bk_scene_stats.wide_sah_cost has grown much since the commit, rays have become as much slower,
-/// and a new scene would be better. After BK_BUILD_QUALITY_HIGH the first refit costs some of what
-/// the cuts had gained, however little moved.
+/// bk_scene_stats.wide_sah_cost has grown much since the commit, rays are slower,
+/// and a new scene would be better. After BK_BUILD_QUALITY_HIGH the first refit loses more than the
+/// cuts had gained, however little moved: scenes to be refitted want BK_BUILD_QUALITY_DEFAULT.
 ///
 /// Triangles that become degenerate or not finite are not hit while they are; those that were so at
 /// the commit stay out for good. Light maps, photon maps and live objects that were made before keep
