@@ -197,9 +197,11 @@ BK_API uint32_t bk_device_num_threads(const bk_device *device);
  * Scenes
  *
  * A scene is described (materials, meshes, lights, files), then committed: its acceleration
- * structure is built, and from then on it can be queried and baked but only its lights change.
- * Describing and committing want one thread at a time per scene; a call that meets another one
- * fails with BK_ERROR_INVALID_STATE. Queries on a committed scene are safe from any threads.
+ * structure is built, and from then on it can be queried and baked but only its lights change, and
+ * its vertices by bk_mesh_set_positions and bk_scene_refit. Describing, committing and moving want
+ * one thread at a time per scene; a call that meets another one fails with BK_ERROR_INVALID_STATE.
+ * Queries on a committed scene are safe from any threads, except during bk_scene_refit: then
+ * whichever comes second fails with BK_ERROR_INVALID_STATE.
  *
  * Right-handed coordinates, any up axis, any unit of length (W/m2 then means per square unit),
  * counter-clockwise front faces, linear RGB, all surfaces diffuse. Coordinates are valid up to a
@@ -261,11 +263,12 @@ typedef struct bk_build_params {
 struct bk_scene_stats {
   // Size of this structure in bytes, set by bk_scene_stats_init.
   uint32_t struct_size;
-  // Surface area heuristic cost of the binary tree, traversal and intersection costing 1 each.
+  // Surface area heuristic cost of the binary tree, traversal and intersection costing 1 each, at
+  // the commit.
   float sah_cost;
   // Triangles in all meshes.
   uint64_t triangles;
-  // Of those, skipped as degenerate or not finite.
+  // Of those, degenerate or not finite at the commit, or since bk_scene_refit.
   uint64_t skipped_degenerate;
   // 8-wide nodes of the acceleration structure.
   uint64_t nodes;
@@ -275,6 +278,13 @@ struct bk_scene_stats {
   uint64_t bytes;
   // Time of the build, in seconds.
   double build_seconds;
+  // Surface area heuristic cost of the 8-wide tree as it is now, 1 for each node and each triangle
+  // that a ray is expected to meet. Compare it with its value after the commit.
+  float wide_sah_cost;
+  // Times that bk_scene_refit moved something.
+  uint32_t refits;
+  // Time of the last of these, in seconds; 0 if there was none.
+  double refit_seconds;
 };
 
 // Creates an empty scene.
@@ -312,13 +322,34 @@ BK_API void bk_build_params_init(bk_build_params *params);
 BK_API bk_result bk_scene_set_build(bk_scene *scene, const bk_build_params *params);
 
 // Ends the description: builds the acceleration structure on the device's threads. Afterwards the
-// scene can be queried and baked, and only bk_scene_set_light changes it.
+// scene can be queried and baked, and only bk_scene_set_light, bk_mesh_set_positions and
+// bk_scene_refit change it.
 //
 // progress, user: told how far it is; NULL if not wanted.
 //
 // Fails with BK_ERROR_INVALID_STATE if the scene is committed already or holds no usable triangle.
 // A commit that fails or is cancelled leaves the description as it was.
 BK_API bk_result bk_scene_commit(bk_scene *scene, bk_progress_fn progress, void *user);
+
+// Gives the meshes of a committed scene the positions set by bk_mesh_set_positions since the last
+// refit; without any it does nothing. Queries then meet the moved triangles, and what follows from
+// positions (geometric normals, light of emissive triangles, bounds, statistics) follows.
+//
+// The acceleration structure keeps its shape and gets new boxes, on the device's threads, in a
+// fraction of the time of a commit. It serves well while neighbours stay neighbours; where
+// bk_scene_stats.wide_sah_cost has grown much since the commit, rays are slower,
+// and a new scene would be better. After BK_BUILD_QUALITY_HIGH the first refit loses more than the
+// cuts had gained, however little moved: scenes to be refitted want BK_BUILD_QUALITY_DEFAULT.
+//
+// Triangles that become degenerate or not finite are not hit while they are; those that were so at
+// the commit stay out for good. Light maps, photon maps and live objects that were made before keep
+// the geometry that they were made of (the scene is copied then, else changed in place) and go on
+// following the scene's lights. Pointers from bk_scene_mesh_geometry become invalid.
+//
+// Fails with BK_ERROR_INVALID_STATE if the scene is not committed, if no triangle would be left that
+// can be hit, or if another thread queries or changes the scene; with BK_ERROR_OUT_OF_MEMORY if the
+// copy is refused. The scene is as before then, and the positions wait for the next refit.
+BK_API bk_result bk_scene_refit(bk_scene *scene);
 
 // Sets struct_size and clears the rest.
 BK_API void bk_scene_stats_init(struct bk_scene_stats *stats);
@@ -333,7 +364,8 @@ BK_API bk_result bk_scene_bounds(const bk_scene *scene, float lower[3], float up
 /* ================================================================================================
  * Materials and meshes
  *
- * Added to a scene before its commit. A refused addition changes nothing.
+ * Added to a scene before its commit; vertices can move after it. A refused addition changes
+ * nothing.
  *
  * Input arrays are read inside the call only. Strides are in bytes, 0 means packed; neither
  * alignment nor bytes behind the last element are needed.
@@ -438,6 +470,24 @@ BK_API void bk_mesh_desc_init(bk_mesh_desc *desc);
 // out of range or BK_MESH_STRICT finds something.
 BK_API bk_result bk_scene_add_mesh(bk_scene *scene, const bk_mesh_desc *desc, uint32_t *out_id);
 
+// Sets new positions for all vertices of a mesh of a committed scene, to be put in force by
+// bk_scene_refit; until then nothing changes. What was set for the mesh since the last refit is
+// replaced.
+//
+// mesh: number of the mesh. positions: vertex_count positions of three floats, copied. vertex_count:
+// as when the mesh was added. stride: bytes from one position to the next, at least 12; 0: packed.
+// Shading normals, texture and light map coordinates stay as they were given.
+//
+// Positions that are not finite are taken, and their triangles are not hit after the refit, unless the
+// mesh has BK_MESH_STRICT. Fails with BK_ERROR_INVALID_STATE if the scene is not committed or another
+// thread is changing it.
+BK_API
+bk_result bk_mesh_set_positions(bk_scene *scene,
+                                uint32_t mesh,
+                                const float *positions,
+                                size_t vertex_count,
+                                size_t stride);
+
 // The number of meshes, committed or not; 0 on failure.
 BK_API uint32_t bk_scene_mesh_count(const bk_scene *scene);
 
@@ -446,7 +496,7 @@ BK_API void bk_mesh_view_init(bk_mesh_view *view);
 
 // Shows the triangles of a mesh of a committed scene, without a copy.
 //
-// out: receives pointers that are valid while the scene lives.
+// out: receives pointers that are valid while the scene lives, until the next bk_scene_refit.
 BK_API bk_result bk_scene_mesh_geometry(const bk_scene *scene, uint32_t mesh, bk_mesh_view *out);
 
 /* ================================================================================================

@@ -96,6 +96,12 @@ impl Box4 {
     }
 }
 
+/// The box of a triangle.
+#[inline(always)]
+pub(super) fn triangle_box([a, b, c]: [Vec3; 3]) -> Box4 {
+    Box4::new(a.min(b).min(c), a.max(b).max(c))
+}
+
 /// Bounds of centres.
 #[derive(Clone, Copy)]
 pub(super) struct Range4 {
@@ -132,8 +138,8 @@ impl Default for Reference {
 impl Reference {
     const NORMAL: u32 = 0x4000_0000;
 
-    fn new(id: u32, [a, b, c]: [Vec3; 3]) -> Self {
-        Reference::of_box(id, Box4::new(a.min(b).min(c), a.max(b).max(c)))
+    fn new(id: u32, corners: [Vec3; 3]) -> Self {
+        Reference::of_box(id, triangle_box(corners))
     }
 
     pub(super) fn of_box(id: u32, mut b: Box4) -> Self {
@@ -158,7 +164,7 @@ impl Reference {
 }
 
 /// In f64: sums over huge scenes neither overflow nor cancel.
-fn half_area(lower: Vec3, upper: Vec3) -> f64 {
+pub(super) fn half_area(lower: Vec3, upper: Vec3) -> f64 {
     let d = (upper - lower).max(Vec3::ZERO).as_dvec3();
     d.x * d.y + d.y * d.z + d.z * d.x
 }

@@ -2,7 +2,7 @@
 //! Volume Hierarchies for Fast SIMD Ray Tracing of Incoherent Rays*, 2008): the child of largest
 //! area is opened first.
 
-use super::binned::BinaryBvh;
+use super::binned::{BinaryBvh, BinaryNode, Box4};
 use super::layout::{ChildRef, LEAF_PAD, LEAF_STRIDE, Mbvh, Node, WIDTH};
 use glam::Vec3;
 use rayon::prelude::*;
@@ -11,59 +11,110 @@ use rayon::prelude::*;
 /// the kernels.
 const OUTWARDS: f32 = 2.0 * f32::EPSILON;
 
+/// Sets the box of child `i`, moved outwards; an empty one is hit by no ray.
+pub(super) fn set_box(node: &mut Node, i: usize, b: &Box4) {
+    // From infinities it would make NaN.
+    if b.is_empty() {
+        for axis in 0..3 {
+            (node.lower[axis][i], node.upper[axis][i]) = (f32::INFINITY, f32::NEG_INFINITY);
+        }
+        return;
+    }
+    let (lower, upper) = b.corners();
+    for axis in 0..3 {
+        node.lower[axis][i] = lower[axis] - OUTWARDS * lower[axis].abs();
+        node.upper[axis][i] = upper[axis] + OUTWARDS * upper[axis].abs();
+    }
+}
+
 /// The binary nodes that an 8-wide node has as children.
 #[derive(Clone, Copy)]
 struct Plan {
     children: [u32; WIDTH],
     count: u32,
-    /// Number of the node of the first inner child; those of the others follow.
-    first: u32,
+    /// Number of the node of the first inner child, and slot of the first triangle of the first leaf;
+    /// those of the others follow.
+    first_node: u32,
+    first_slot: u32,
 }
 
-/// The 8-wide tree of a binary one; nodes follow their parents.
+/// The 8-wide tree of a binary one, nodes in depth-first order: the inner children of a node follow each
+/// other, then comes what lies below the first, below the second, and so on; leaves likewise (`refit`
+/// relies on it).
 pub(super) fn collapse(binary: &BinaryBvh, corners: &[[Vec3; 3]]) -> Mbvh {
     let n = binary.triangles.len();
     let root = &binary.nodes[0];
     // Which binary nodes become children is quickly told; to fill in nodes and leaves takes the time.
+    let idle = Plan { children: [0; WIDTH], count: 0, first_node: 0, first_slot: 0 };
     let mut plans = Vec::with_capacity(n / 6 + 1);
-    plans.push(Plan { children: [0; WIDTH], count: 0, first: 0 });
+    plans.push(idle);
+    // Numbers of nodes in the order of their leaves.
+    let mut order = Vec::with_capacity(n / 6 + 1);
+    let mut slot = 0;
     let mut work = vec![(0usize, 0u32)];
     while let Some((target, source)) = work.pop() {
         let (children, count) = open(binary, source);
         let first = plans.len();
-        plans[target] = Plan { children, count: count as u32, first: first as u32 };
+        plans[target] = Plan { children, count: count as u32, first_node: first as u32, first_slot: slot };
+        order.push(target as u32);
         for &child in &children[..count] {
-            if binary.nodes[child as usize].count == 0 {
-                work.push((plans.len(), child));
-                plans.push(Plan { children: [0; WIDTH], count: 0, first: 0 });
+            match binary.nodes[child as usize].count {
+                0 => {
+                    work.push((plans.len(), child));
+                    plans.push(idle);
+                }
+                triangles => slot += triangles,
             }
         }
         // The first child's subtree comes next.
-        let inner = plans.len() - first;
         let end = work.len();
-        work[end - inner..].reverse();
+        work[end - (plans.len() - first)..].reverse();
     }
     let nodes = plans.par_iter().with_min_len(1024).map(|plan| node(binary, plan)).collect();
     let mut leaves = vec![0.0; n * LEAF_STRIDE + LEAF_PAD];
-    fill_leaves(&mut leaves[..n * LEAF_STRIDE], binary, corners);
+    let mut rest = &mut leaves[..n * LEAF_STRIDE];
+    let mut jobs = Vec::with_capacity(order.len() / NODES_PER_JOB + 1);
+    for (i, part) in order.chunks(NODES_PER_JOB).enumerate() {
+        let end = order.get((i + 1) * NODES_PER_JOB).map_or(n, |&next| plans[next as usize].first_slot as usize);
+        let triangles = end - plans[part[0] as usize].first_slot as usize;
+        let (rows, others) = std::mem::take(&mut rest).split_at_mut(triangles * LEAF_STRIDE);
+        jobs.push((part, rows));
+        rest = others;
+    }
+    jobs.into_par_iter().for_each(|(part, mut rows)| {
+        for &i in part {
+            for b in plans[i as usize].leaves(binary) {
+                let (leaf, others) = rows.split_at_mut(b.count as usize * LEAF_STRIDE);
+                fill_leaf(leaf, &binary.triangles[b.index as usize..][..b.count as usize], corners);
+                rows = others;
+            }
+        }
+    });
     Mbvh { nodes, leaves, bounds: (root.lower, root.upper) }
+}
+
+/// Nodes whose leaves a thread fills at a time.
+const NODES_PER_JOB: usize = 1024;
+
+impl Plan {
+    fn leaves<'a>(&'a self, binary: &'a BinaryBvh) -> impl Iterator<Item = &'a BinaryNode> {
+        self.children[..self.count as usize].iter().map(|&c| &binary.nodes[c as usize]).filter(|b| b.count > 0)
+    }
 }
 
 fn node(binary: &BinaryBvh, plan: &Plan) -> Node {
     let mut node = Node::EMPTY;
-    let mut next = plan.first as usize;
+    let (mut next_node, mut next_slot) = (plan.first_node as usize, plan.first_slot as usize);
     for (i, &child) in plan.children[..plan.count as usize].iter().enumerate() {
         let b = &binary.nodes[child as usize];
-        for axis in 0..3 {
-            node.lower[axis][i] = b.lower[axis] - OUTWARDS * b.lower[axis].abs();
-            node.upper[axis][i] = b.upper[axis] + OUTWARDS * b.upper[axis].abs();
-        }
-        node.children[i] = if b.count > 0 {
-            ChildRef::leaf(b.index as usize, b.count as usize)
+        set_box(&mut node, i, &Box4::new(b.lower, b.upper));
+        if b.count > 0 {
+            node.children[i] = ChildRef::leaf(next_slot, b.count as usize);
+            next_slot += b.count as usize;
         } else {
-            next += 1;
-            ChildRef::node(next - 1)
-        };
+            node.children[i] = ChildRef::node(next_node);
+            next_node += 1;
+        }
     }
     node.sort_children();
     node
@@ -90,40 +141,17 @@ fn open(binary: &BinaryBvh, source: u32) -> ([u32; WIDTH], usize) {
     (children, count)
 }
 
-/// Rows of all leaves, each where its triangles are in the binary tree's order.
-fn fill_leaves(leaves: &mut [f32], binary: &BinaryBvh, corners: &[[Vec3; 3]]) {
-    // In the order of the nodes, leaves follow each other in `triangles` too.
-    let counts: Vec<u32> = binary.nodes.iter().map(|b| b.count).filter(|&c| c > 0).collect();
-    debug_assert!(binary.nodes.iter().filter(|b| b.count > 0).is_sorted_by_key(|b| b.index));
-    let mut rest = leaves;
-    let mut first = 0;
-    let mut jobs = Vec::with_capacity(counts.len() / LEAVES_PER_JOB + 1);
-    for counts in counts.chunks(LEAVES_PER_JOB) {
-        let triangles = counts.iter().sum::<u32>() as usize;
-        let (rows, others) = rest.split_at_mut(triangles * LEAF_STRIDE);
-        jobs.push((rows, counts, &binary.triangles[first..first + triangles]));
-        (rest, first) = (others, first + triangles);
-    }
-    jobs.into_par_iter().for_each(|(mut rows, counts, mut triangles)| {
-        for &count in counts {
-            let count = count as usize;
-            let (leaf, others) = std::mem::take(&mut rows).split_at_mut(count * LEAF_STRIDE);
-            let (own, next) = triangles.split_at(count);
-            for (i, &t) in own.iter().enumerate() {
-                for (corner, v) in corners[t as usize].iter().enumerate() {
-                    for axis in 0..3 {
-                        leaf[(3 * corner + axis) * count + i] = v[axis];
-                    }
-                }
-                leaf[9 * count + i] = f32::from_bits(t);
+fn fill_leaf(leaf: &mut [f32], triangles: &[u32], corners: &[[Vec3; 3]]) {
+    let count = triangles.len();
+    for (i, &t) in triangles.iter().enumerate() {
+        for (corner, v) in corners[t as usize].iter().enumerate() {
+            for axis in 0..3 {
+                leaf[(3 * corner + axis) * count + i] = v[axis];
             }
-            (rows, triangles) = (others, next);
         }
-    });
+        leaf[9 * count + i] = f32::from_bits(t);
+    }
 }
-
-/// Leaves that a thread fills at a time.
-const LEAVES_PER_JOB: usize = 1024;
 
 #[cfg(test)]
 mod tests {

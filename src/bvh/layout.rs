@@ -1,8 +1,10 @@
 //! Memory layout of the 8-wide tree.
 
+use super::binned::half_area;
 use crate::simd::prefetch;
 use bytemuck::{Pod, Zeroable};
 use glam::Vec3;
+use rayon::prelude::*;
 
 /// Most triangles that a leaf reference can name.
 pub(crate) const MAX_LEAF: usize = 8;
@@ -100,6 +102,20 @@ impl Node {
         order: [0; WIDTH],
     };
 
+    /// What the children add to the tree's cost, times half the area of its bounds.
+    fn sah_cost(&self) -> f64 {
+        let child = |i: usize| {
+            let c = self.children[i];
+            // Nothing, or a leaf whose triangles cannot be hit.
+            if self.lower[0][i] > self.upper[0][i] {
+                return 0.0;
+            }
+            let [lower, upper] = [&self.lower, &self.upper].map(|b| Vec3::new(b[0][i], b[1][i], b[2][i]));
+            half_area(lower, upper) * if c.is_leaf() { c.leaf_count() as f64 } else { 1.0 }
+        };
+        (0..WIDTH).map(child).sum()
+    }
+
     /// Fills in `order` from the boxes: by their centres along the octant's diagonal. (By where boxes begin
     /// costs random rays 3 % more instructions.)
     pub(crate) fn sort_children(&mut self) {
@@ -150,6 +166,7 @@ pub(crate) const LEAF_STRIDE: usize = 10;
 /// Rows are loaded four at a time whatever c is; lanes beyond c hold the next row's values and are
 /// masked. That keeps leaves at 40 bytes per triangle with no transposition (padding every leaf to
 /// four triangles would take about twice that).
+#[derive(Clone)]
 pub struct Mbvh {
     pub(crate) nodes: Vec<Node>,
     pub(crate) leaves: Vec<f32>,
@@ -170,6 +187,16 @@ impl Mbvh {
     /// Bytes of nodes and leaves.
     pub fn bytes(&self) -> usize {
         self.nodes.len() * size_of::<Node>() + self.leaves.len() * size_of::<f32>()
+    }
+
+    /// Surface area heuristic cost: how many nodes plus triangles a ray through the bounds is expected to
+    /// meet. From the boxes as they are now, so a refit changes it.
+    pub fn sah_cost(&self) -> f32 {
+        let root_area = half_area(self.bounds.0, self.bounds.1);
+        // By chunks, whose sums do not depend on the number of threads.
+        let chunks: Vec<f64> =
+            self.nodes.par_chunks(1 << 10).map(|nodes| nodes.iter().map(Node::sah_cost).sum()).collect();
+        (1.0 + chunks.iter().sum::<f64>() / root_area) as f32
     }
 
     /// Asks for the memory of a child that will be visited soon.

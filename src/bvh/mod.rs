@@ -4,10 +4,12 @@
 mod binned;
 mod collapse;
 pub(crate) mod layout;
+mod refit;
 mod spatial;
 
 pub use binned::{BinaryBvh, BinaryNode};
 pub use layout::{ChildRef, Mbvh, Node};
+pub(crate) use refit::refit;
 
 use crate::error::{Result, invalid_argument};
 use crate::progress::Progress;

@@ -15,7 +15,7 @@ use super::scene::bk_scene;
 use crate::error::{Error, Result};
 use crate::lightmap::{Lightmap, LightmapDesc, LightmapInfo};
 use std::ffi::c_void;
-use std::sync::{RwLock, TryLockError};
+use std::sync::{Arc, RwLock, TryLockError};
 
 /// A light map: a layout and, once baked, light.
 pub struct bk_lightmap {
@@ -106,7 +106,8 @@ pub unsafe extern "C" fn bk_lightmap_create(
     call(|| unsafe {
         write(out, std::ptr::null_mut(), "out")?;
         refuse_in_callback()?;
-        let scene = hold(scene, "scene")?;
+        // Its geometry as of now: it may be refitted meanwhile.
+        let scene = Arc::clone(&*hold(scene, "scene")?.committed()?);
         let d: bk_lightmap_desc = if desc.is_null() { SizedStruct::defaults() } else { read_struct(desc, "desc")? };
         let desc = LightmapDesc {
             texels_per_unit: d.texels_per_unit,
@@ -115,7 +116,7 @@ pub unsafe extern "C" fn bk_lightmap_create(
             gather_divisor: d.gather_divisor,
             radiance_divisor: d.radiance_divisor,
         };
-        let lightmap = Lightmap::create(scene.committed()?, &desc, &self::progress(progress, user))?;
+        let lightmap = Lightmap::create(&scene, &desc, &self::progress(progress, user))?;
         write(out, create(bk_lightmap { lightmap: RwLock::new(lightmap) }), "out")
     })
 }

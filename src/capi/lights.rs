@@ -92,10 +92,10 @@ pub unsafe extern "C" fn bk_scene_set_light(scene: *mut bk_scene, id: u32, desc:
         let scene = object!(scene);
         // SAFETY: desc is the caller's, or NULL.
         let light = light(&unsafe { read_struct(desc, "desc") }?)?;
-        match scene.committed.get() {
-            Some(committed) => committed.set_light(id, light),
-            None => scene.describe("the description can change", |d| d.data.set_light(id, light)),
+        if scene.is_committed() {
+            return scene.committed()?.set_light(id, light);
         }
+        scene.describe("the description can change", |d| d.data.set_light(id, light))
     })
 }
 

@@ -1,6 +1,7 @@
 //! Materials and meshes
 //!
-//! Added to a scene before its commit. A refused addition changes nothing.
+//! Added to a scene before its commit; vertices can move after it. A refused addition changes
+//! nothing.
 //!
 //! Input arrays are read inside the call only. Strides are in bytes, 0 means packed; neither
 //! alignment nor bytes behind the last element are needed.
@@ -204,6 +205,44 @@ unsafe fn read_mesh(d: &bk_mesh_desc) -> Result<Mesh> {
     }
 }
 
+/// Sets new positions for all vertices of a mesh of a committed scene, to be put in force by
+/// bk_scene_refit; until then nothing changes. What was set for the mesh since the last refit is
+/// replaced.
+///
+/// mesh: number of the mesh. positions: vertex_count positions of three floats, copied. vertex_count:
+/// as when the mesh was added. stride: bytes from one position to the next, at least 12; 0: packed.
+/// Shading normals, texture and light map coordinates stay as they were given.
+///
+/// Positions that are not finite are taken, and their triangles are not hit after the refit, unless the
+/// mesh has BK_MESH_STRICT. Fails with BK_ERROR_INVALID_STATE if the scene is not committed or another
+/// thread is changing it.
+#[unsafe(no_mangle)]
+pub unsafe extern "C" fn bk_mesh_set_positions(
+    scene: *mut bk_scene,
+    mesh: u32,
+    positions: *const f32,
+    vertex_count: usize,
+    stride: usize,
+) -> bk_result {
+    call(|| {
+        let scene = object!(scene);
+        // The number before the array: a wrong one must not be read by.
+        let (count, meshes) = {
+            let committed = scene.committed()?;
+            (committed.meshes().get(mesh as usize).map(|m| m.positions.len()), committed.meshes().len())
+        };
+        match count {
+            None => return invalid_argument!("mesh {mesh} does not exist, the scene has {meshes}"),
+            Some(count) if count != vertex_count => {
+                return invalid_argument!("vertex_count is {vertex_count}, the mesh has {count} vertices");
+            }
+            Some(_) => {}
+        }
+        // SAFETY: positions are the caller's, or NULL.
+        scene.set_positions(mesh, || unsafe { read_strided(positions, stride, vertex_count, "positions") })
+    })
+}
+
 /// The number of meshes, committed or not; 0 on failure.
 #[unsafe(no_mangle)]
 pub unsafe extern "C" fn bk_scene_mesh_count(scene: *const bk_scene) -> u32 {
@@ -246,7 +285,7 @@ pub unsafe extern "C" fn bk_mesh_view_init(view: *mut bk_mesh_view) {
 
 /// Shows the triangles of a mesh of a committed scene, without a copy.
 ///
-/// out: receives pointers that are valid while the scene lives.
+/// out: receives pointers that are valid while the scene lives, until the next bk_scene_refit.
 #[unsafe(no_mangle)]
 pub unsafe extern "C" fn bk_scene_mesh_geometry(
     scene: *const bk_scene,
@@ -254,7 +293,8 @@ pub unsafe extern "C" fn bk_scene_mesh_geometry(
     out: *mut bk_mesh_view,
 ) -> bk_result {
     call(|| {
-        let meshes = object!(scene).committed()?.meshes();
+        let committed = object!(scene).committed()?;
+        let meshes = committed.meshes();
         // SAFETY: out is the caller's, or NULL.
         let out = unsafe { OutStruct::new(out, "out") }?;
         let Some(m) = meshes.get(mesh as usize) else {

@@ -4,7 +4,8 @@
 //! [`lights`], [`rays`], [`photons`], [`lightmap`], [`bake`], [`read`], [`live`]. cbindgen makes the
 //! header from exactly these files (`capi-tests/header.rs`); their `//!` heads become the sections'
 //! heads and every public item's documentation becomes the manual, so both are written for the C
-//! reader. `handles` and `args` hold what the sections share.
+//! reader. `handles`, `shared` and `args` hold what the
+//! sections share.
 //!
 //! # Safety
 //!
@@ -18,6 +19,7 @@
 
 mod args;
 mod handles;
+mod shared;
 
 pub mod bake;
 pub mod device;

@@ -13,6 +13,7 @@ use super::scene::bk_scene;
 use crate::photon::{PhotonMap, PhotonParams};
 use bytemuck::cast_slice;
 use std::ffi::c_void;
+use std::sync::Arc;
 
 /// Flag: leave out photons that come straight from a light; the map then holds indirect light only.
 pub const BK_PHOTONS_INDIRECT_ONLY: u32 = 1;
@@ -87,10 +88,11 @@ pub unsafe extern "C" fn bk_photon_map_create(
     call(|| unsafe {
         write(out, std::ptr::null_mut(), "out")?;
         refuse_in_callback()?;
-        let scene = hold(scene, "scene")?;
+        // Its geometry as of now: it may be refitted meanwhile.
+        let scene = Arc::clone(&*hold(scene, "scene")?.committed()?);
         let params = if params.is_null() { SizedStruct::defaults() } else { read_struct(params, "params")? };
         let params = core_params(&params)?;
-        let map = PhotonMap::trace(scene.committed()?, &params, &self::progress(progress, user))?;
+        let map = PhotonMap::trace(&scene, &params, &self::progress(progress, user))?;
         write(out, create(bk_photon_map { map }), "out")
     })
 }

@@ -1,9 +1,11 @@
 //! Scenes
 //!
 //! A scene is described (materials, meshes, lights, files), then committed: its acceleration
-//! structure is built, and from then on it can be queried and baked but only its lights change.
-//! Describing and committing want one thread at a time per scene; a call that meets another one
-//! fails with BK_ERROR_INVALID_STATE. Queries on a committed scene are safe from any threads.
+//! structure is built, and from then on it can be queried and baked but only its lights change, and
+//! its vertices by bk_mesh_set_positions and bk_scene_refit. Describing, committing and moving want
+//! one thread at a time per scene; a call that meets another one fails with BK_ERROR_INVALID_STATE.
+//! Queries on a committed scene are safe from any threads, except during bk_scene_refit: then
+//! whichever comes second fails with BK_ERROR_INVALID_STATE.
 //!
 //! Right-handed coordinates, any up axis, any unit of length (W/m2 then means per square unit),
 //! counter-clockwise front faces, linear RGB, all surfaces diffuse. Coordinates are valid up to a
@@ -13,20 +15,29 @@ use super::args::{OutStruct, init, read_struct, sized_struct, text, write};
 use super::device::{bk_device, bk_progress_fn, progress, refuse_in_callback};
 use super::error::{bk_result, call, call_or};
 use super::handles::{create, hold, object, release, retain};
+use super::shared::{Reading, Shared};
 use crate::bvh::{BuildOptions, BuildQuality};
 use crate::device::Device;
 use crate::error::{Error, Result, invalid_argument};
 use crate::scene::{Scene, SceneData, builtin};
+use glam::Vec3;
 use std::ffi::{c_char, c_void};
 use std::sync::{Arc, Mutex, OnceLock, TryLockError};
 
 /// A scene: being described, or committed.
 pub struct bk_scene {
     device: Arc<Device>,
-    /// Set once by the commit; queries read it without a lock.
-    pub(super) committed: OnceLock<Arc<Scene>>,
-    /// The description; `None` once committed. Only ever tried, never waited for.
-    description: Mutex<Option<Description>>,
+    /// Set once by the commit.
+    committed: OnceLock<Shared<Arc<Scene>>>,
+    /// What changes the scene. Only ever tried, never waited for.
+    changes: Mutex<Changes>,
+}
+
+struct Changes {
+    /// `None` once committed.
+    description: Option<Description>,
+    /// Meshes with the positions that the next refit gives them, each at most once.
+    moved: Vec<(u32, Vec<Vec3>)>,
 }
 
 #[derive(Default)]
@@ -45,8 +56,12 @@ impl bk_scene {
     }
 
     fn with_description<R>(&self, f: impl FnOnce(&mut Option<Description>) -> Result<R>) -> Result<R> {
-        match self.description.try_lock() {
-            Ok(mut description) => f(&mut description),
+        self.with_changes(|c| f(&mut c.description))
+    }
+
+    fn with_changes<R>(&self, f: impl FnOnce(&mut Changes) -> Result<R>) -> Result<R> {
+        match self.changes.try_lock() {
+            Ok(mut changes) => f(&mut changes),
             Err(TryLockError::WouldBlock) => {
                 Err(Error::InvalidState("another call is changing the scene at the same time".into()))
             }
@@ -56,10 +71,32 @@ impl bk_scene {
         }
     }
 
-    /// The committed scene.
+    pub(super) fn is_committed(&self) -> bool {
+        self.committed.get().is_some()
+    }
+
+    /// The committed scene, kept from refits meanwhile.
     #[inline]
-    pub(super) fn committed(&self) -> Result<&Arc<Scene>> {
+    pub(super) fn committed(&self) -> Result<Reading<'_, Arc<Scene>>> {
+        self.shared()?.read()
+    }
+
+    #[inline]
+    fn shared(&self) -> Result<&Shared<Arc<Scene>>> {
         self.committed.get().ok_or_else(|| Error::InvalidState("the scene is not committed".into()))
+    }
+
+    /// Keeps positions for the next refit.
+    pub(super) fn set_positions(&self, mesh: u32, positions: impl FnOnce() -> Result<Vec<Vec3>>) -> Result<()> {
+        self.with_changes(|changes| {
+            let positions = positions()?;
+            self.committed()?.check_positions(mesh, &positions)?;
+            match changes.moved.iter_mut().find(|(m, _)| *m == mesh) {
+                Some((_, old)) => *old = positions,
+                None => changes.moved.push((mesh, positions)),
+            }
+            Ok(())
+        })
     }
 
     /// A number about the scene in either state.
@@ -68,13 +105,13 @@ impl bk_scene {
         described: impl Fn(&SceneData) -> usize,
         committed: impl Fn(&Scene) -> usize,
     ) -> Result<u32> {
-        match self.committed.get() {
-            Some(scene) => Ok(committed(scene) as u32),
-            None => self.with_description(|d| match d {
-                Some(d) => Ok(described(&d.data) as u32),
-                None => Ok(committed(self.committed()?) as u32),
-            }),
+        if self.is_committed() {
+            return Ok(committed(&**self.committed()?) as u32);
         }
+        self.with_description(|d| match d {
+            Some(d) => Ok(described(&d.data) as u32),
+            None => Ok(committed(&**self.committed()?) as u32),
+        })
     }
 }
 
@@ -87,8 +124,8 @@ pub unsafe extern "C" fn bk_scene_create(device: *mut bk_device, out: *mut *mut 
     call(|| unsafe {
         write(out, std::ptr::null_mut(), "out")?;
         let device = object!(device).device().clone();
-        let description = Mutex::new(Some(Description::default()));
-        write(out, create(bk_scene { device, committed: OnceLock::new(), description }), "out")
+        let changes = Changes { description: Some(Description::default()), moved: Vec::new() };
+        write(out, create(bk_scene { device, committed: OnceLock::new(), changes: Mutex::new(changes) }), "out")
     })
 }
 
@@ -288,7 +325,8 @@ pub unsafe extern "C" fn bk_scene_set_build(scene: *mut bk_scene, params: *const
 }
 
 /// Ends the description: builds the acceleration structure on the device's threads. Afterwards the
-/// scene can be queried and baked, and only bk_scene_set_light changes it.
+/// scene can be queried and baked, and only bk_scene_set_light, bk_mesh_set_positions and
+/// bk_scene_refit change it.
 ///
 /// progress, user: told how far it is; NULL if not wanted.
 ///
@@ -311,7 +349,7 @@ pub unsafe extern "C" fn bk_scene_commit(
             match Scene::commit(&scene.device, data, &build, &self::progress(progress, user)) {
                 Ok(committed) => {
                     // The description was there, so nothing was committed before.
-                    let _ = scene.committed.set(committed);
+                    let _ = scene.committed.set(Shared::new(committed));
                     Ok(())
                 }
                 Err((data, e)) => {
@@ -323,17 +361,55 @@ pub unsafe extern "C" fn bk_scene_commit(
     })
 }
 
+/// Gives the meshes of a committed scene the positions set by bk_mesh_set_positions since the last
+/// refit; without any it does nothing. Queries then meet the moved triangles, and what follows from
+/// positions (geometric normals, light of emissive triangles, bounds, statistics) follows.
+///
+/// The acceleration structure keeps its shape and gets new boxes, on the device's threads, in a
+/// fraction of the time of a commit. It serves well while neighbours stay neighbours; where
+/// bk_scene_stats.wide_sah_cost has grown much since the commit, rays are slower,
+/// and a new scene would be better. After BK_BUILD_QUALITY_HIGH the first refit loses more than the
+/// cuts had gained, however little moved: scenes to be refitted want BK_BUILD_QUALITY_DEFAULT.
+///
+/// Triangles that become degenerate or not finite are not hit while they are; those that were so at
+/// the commit stay out for good. Light maps, photon maps and live objects that were made before keep
+/// the geometry that they were made of (the scene is copied then, else changed in place) and go on
+/// following the scene's lights. Pointers from bk_scene_mesh_geometry become invalid.
+///
+/// Fails with BK_ERROR_INVALID_STATE if the scene is not committed, if no triangle would be left that
+/// can be hit, or if another thread queries or changes the scene; with BK_ERROR_OUT_OF_MEMORY if the
+/// copy is refused. The scene is as before then, and the positions wait for the next refit.
+#[unsafe(no_mangle)]
+pub unsafe extern "C" fn bk_scene_refit(scene: *mut bk_scene) -> bk_result {
+    call(|| {
+        refuse_in_callback()?;
+        // SAFETY: a handle or NULL.
+        let scene = unsafe { hold(scene, "scene") }?;
+        let shared = scene.shared()?;
+        scene.with_changes(|changes| {
+            if changes.moved.is_empty() {
+                return Ok(());
+            }
+            let moved: Vec<(u32, &[Vec3])> = changes.moved.iter().map(|(mesh, p)| (*mesh, &p[..])).collect();
+            shared.write(|scene| Scene::refit(scene, &moved))??;
+            changes.moved = Vec::new();
+            Ok(())
+        })
+    })
+}
+
 /// Numbers about a committed scene.
 #[repr(C)]
 #[derive(Clone, Copy)]
 pub struct bk_scene_stats {
     /// Size of this structure in bytes, set by bk_scene_stats_init.
     pub struct_size: u32,
-    /// Surface area heuristic cost of the binary tree, traversal and intersection costing 1 each.
+    /// Surface area heuristic cost of the binary tree, traversal and intersection costing 1 each, at
+    /// the commit.
     pub sah_cost: f32,
     /// Triangles in all meshes.
     pub triangles: u64,
-    /// Of those, skipped as degenerate or not finite.
+    /// Of those, degenerate or not finite at the commit, or since bk_scene_refit.
     pub skipped_degenerate: u64,
     /// 8-wide nodes of the acceleration structure.
     pub nodes: u64,
@@ -343,6 +419,13 @@ pub struct bk_scene_stats {
     pub bytes: u64,
     /// Time of the build, in seconds.
     pub build_seconds: f64,
+    /// Surface area heuristic cost of the 8-wide tree as it is now, 1 for each node and each triangle
+    /// that a ray is expected to meet. Compare it with its value after the commit.
+    pub wide_sah_cost: f32,
+    /// Times that bk_scene_refit moved something.
+    pub refits: u32,
+    /// Time of the last of these, in seconds; 0 if there was none.
+    pub refit_seconds: f64,
 }
 
 sized_struct!(bk_scene_stats, last: build_seconds: f64, defaults: stats(&Default::default()));
@@ -357,6 +440,9 @@ fn stats(s: &crate::scene::SceneStats) -> bk_scene_stats {
         bvh_bytes: s.bvh_bytes,
         bytes: s.bytes,
         build_seconds: s.build_seconds,
+        wide_sah_cost: s.wide_sah_cost,
+        refits: s.refits,
+        refit_seconds: s.refit_seconds,
     }
 }
 

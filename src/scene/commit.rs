@@ -4,7 +4,7 @@ use super::mesh::is_valid_triangle;
 use super::{Light, Material, Mesh, MeshMaterials, NONE, SceneData};
 use crate::bvh::{self, BuildOptions, Mbvh};
 use crate::device::{Device, LogLevel};
-use crate::error::{Error, Result};
+use crate::error::{Error, Result, invalid_argument};
 use crate::memory::Reservation;
 use crate::progress::Progress;
 use crate::trace::{Hit, RawHit, Ray};
@@ -38,7 +38,8 @@ pub struct Emitter {
 pub struct SceneStats {
     /// Triangles in all meshes.
     pub triangles: u64,
-    /// Of those, skipped as degenerate or not finite.
+    /// Of those, degenerate or not finite at the commit, or since a refit: not in the tree, or in it and
+    /// never hit.
     pub skipped_degenerate: u64,
     /// 8-wide nodes.
     pub nodes: u64,
@@ -46,22 +47,33 @@ pub struct SceneStats {
     pub bvh_bytes: u64,
     /// Bytes of the whole committed scene.
     pub bytes: u64,
-    /// Surface area heuristic cost of the binary tree, traversal and intersection costing 1 each.
+    /// Surface area heuristic cost of the binary tree, traversal and intersection costing 1 each. A refit
+    /// leaves it as it was.
     pub sah_cost: f32,
     /// Wall time of the build.
     pub build_seconds: f64,
+    /// Surface area heuristic cost of the 8-wide tree as it is now, per node and per triangle 1: compared with
+    /// its value after the commit, it tells how much a refitted tree has lost.
+    pub wide_sah_cost: f32,
+    /// Refits since the commit.
+    pub refits: u32,
+    /// Wall time of the last refit, 0 if there was none.
+    pub refit_seconds: f64,
 }
 
 /// A committed scene. Queries are safe from any number of threads.
 pub struct Scene {
     device: Arc<Device>,
     data: SceneData,
-    lights: RwLock<Arc<Vec<Light>>>,
+    /// One for a scene and all copies that refits make of it: light maps go on following the lights.
+    lights: Arc<RwLock<Arc<Vec<Light>>>>,
     emitters: Vec<Emitter>,
     /// First global triangle number per mesh, and the total at the end.
     first_triangle: Vec<u32>,
     bounds: (Vec3, Vec3),
     mbvh: Mbvh,
+    /// Triangles that are not in the tree, ascending.
+    skipped: Vec<u32>,
     stats: SceneStats,
     _memory: Reservation,
 }
@@ -78,6 +90,102 @@ impl Scene {
             Ok(parts) => Ok(Arc::new(parts.into_scene(device.clone(), data))),
             Err(e) => Err((data, e)),
         }
+    }
+
+    /// Moves vertices: `moved` names meshes and the new positions of all their vertices. (Of a mesh that is
+    /// named twice the last holds.) The tree keeps its shape and gets new boxes, which takes a fraction of a
+    /// commit; so it serves well as long as neighbours stay neighbours, and
+    /// [`wide_sah_cost`](SceneStats::wide_sah_cost) tells when a new commit would be better. Emitters, bounds
+    /// and numbers are renewed; shading normals, texture and light map coordinates stay as they were given.
+    ///
+    /// If `scene` is the only reference, it is changed in place; otherwise it is replaced by a copy, and who
+    /// holds the other references (light maps, live objects) keeps the old geometry and shares the lights.
+    ///
+    /// Triangles that become degenerate or not finite are not hit while they are; those that were so at the
+    /// commit are not in the tree and stay out whatever becomes of them. After a build with spatial splits,
+    /// boxes become those of whole triangles: right, but larger than before.
+    ///
+    /// Fails, and leaves `scene` as it was, if a mesh does not exist, has another number of vertices or is
+    /// strict and gets a degenerate triangle or a vertex that is not finite; if no triangle would be left that
+    /// a ray can hit; or if memory is refused.
+    pub fn refit(scene: &mut Arc<Scene>, moved: &[(u32, &[Vec3])]) -> Result<()> {
+        let start = Instant::now();
+        for &(mesh, positions) in moved {
+            scene.check_positions(mesh, positions)?;
+        }
+        if !scene.any_left(moved) {
+            return Err(Error::InvalidState("all triangles of the scene would be degenerate or not finite".into()));
+        }
+        if Arc::get_mut(scene).is_none() {
+            *scene = Arc::new(scene.copy()?);
+        }
+        let device = scene.device.clone();
+        let scene = Arc::get_mut(scene).expect("a new Arc, or the only one");
+        for &(mesh, positions) in moved {
+            scene.data.meshes[mesh as usize].positions.copy_from_slice(positions);
+        }
+        device.install(|| scene.follow_positions());
+        scene.stats.refits += 1;
+        scene.stats.refit_seconds = start.elapsed().as_secs_f64();
+        Ok(())
+    }
+
+    /// Whether [`refit`](Self::refit) takes these positions for a mesh.
+    pub fn check_positions(&self, mesh: u32, positions: &[Vec3]) -> Result<()> {
+        let meshes = self.meshes();
+        match meshes.get(mesh as usize) {
+            None => invalid_argument!("mesh {mesh} does not exist, the scene has {}", meshes.len()),
+            Some(m) => m.check_positions(positions),
+        }
+    }
+
+    /// Whether a triangle of the tree could be hit with vertices moved.
+    fn any_left(&self, moved: &[(u32, &[Vec3])]) -> bool {
+        self.meshes().iter().enumerate().any(|(m, mesh)| {
+            let new = moved.iter().rev().find(|(id, _)| *id as usize == m);
+            let positions = new.map_or(&mesh.positions[..], |(_, positions)| positions);
+            let first = self.first_triangle[m];
+            (first..).zip(&mesh.indices).any(|(t, i)| {
+                is_valid_triangle(i.map(|i| positions[i as usize])) && self.skipped.binary_search(&t).is_err()
+            })
+        })
+    }
+
+    /// Brings up to date what follows from the positions.
+    fn follow_positions(&mut self) {
+        let (first, meshes) = (&self.first_triangle, &self.data.meshes);
+        let corners = |t: u32| {
+            let m = first.partition_point(|&first| first <= t) - 1;
+            meshes[m].corners((t - first[m]) as usize)
+        };
+        let out = bvh::refit(&mut self.mbvh, &corners);
+        if !out.is_empty() {
+            let total = self.stats.triangles;
+            let message = format!("{} of {total} triangles are degenerate or not finite after the refit", out.len());
+            self.device.log(LogLevel::Warning, &message);
+        }
+        self.bounds = self.mbvh.bounds();
+        self.emitters = emitters(&self.data, &self.first_triangle, &self.skipped);
+        self.stats.skipped_degenerate = (self.skipped.len() + out.len()) as u64;
+        self.stats.wide_sah_cost = self.mbvh.sah_cost();
+    }
+
+    /// A scene of its own that is equal, lights shared.
+    fn copy(&self) -> Result<Scene> {
+        let bytes = self.mbvh.bytes() + mesh_bytes(&self.data.meshes);
+        let memory = self.device.memory().reserve(bytes, "a copy of the scene to refit")?;
+        Ok(Scene {
+            device: self.device.clone(),
+            data: self.data.clone(),
+            lights: self.lights.clone(),
+            emitters: Vec::new(),
+            first_triangle: self.first_triangle.clone(),
+            bounds: self.bounds,
+            mbvh: self.mbvh.clone(),
+            skipped: self.skipped.clone(),
+            stats: self.stats,
+            _memory: memory,
+        })
     }
 
     fn build(device: &Arc<Device>, data: &SceneData, options: &BuildOptions, progress: &Progress) -> Result<Parts> {
@@ -102,48 +210,43 @@ impl Scene {
             triangles.filter(|&t| is_valid_triangle(corners[t as usize])).collect()
         });
         progress.check()?;
-        let skipped = total - valid.len();
         if valid.is_empty() {
             return Err(Error::InvalidState(format!(
                 "all {total} triangles of the scene are degenerate or not finite"
             )));
         }
-        if skipped > 0 {
+        let skipped: Vec<u32> = if valid.len() == total {
+            Vec::new()
+        } else {
+            (0..total as u32).filter(|&t| !is_valid_triangle(corners[t as usize])).collect()
+        };
+        if !skipped.is_empty() {
             device.log(
                 LogLevel::Warning,
-                &format!("{skipped} of {total} triangles are degenerate or not finite and were skipped"),
+                &format!("{} of {total} triangles are degenerate or not finite and were skipped", skipped.len()),
             );
         }
         let memory = device.memory().reserve(bvh::estimated_bytes(valid.len(), options), "the scene")?;
         let (mbvh, sah_cost) = device.install(|| bvh::build(&corners, &valid, options, progress))?;
         progress.check()?;
 
-        let mut emitters = Vec::new();
-        for (m, mesh) in data.meshes.iter().enumerate() {
-            if let MeshMaterials::One(material) = mesh.materials
-                && !data.materials[material as usize].is_emissive()
-            {
-                continue;
-            }
-            for t in 0..mesh.indices.len() {
-                let material = &data.materials[mesh.material(t) as usize];
-                if material.is_emissive() && is_valid_triangle(mesh.corners(t)) {
-                    emitters.push(emitter(first_triangle[m] + t as u32, mesh.corners(t), material));
-                }
-            }
-        }
+        let emitters = emitters(data, &first_triangle, &skipped);
         stage.advance(1)?;
         let bounds = mbvh.bounds();
+        let wide_sah_cost = device.install(|| mbvh.sah_cost());
         let stats = SceneStats {
             triangles: total as u64,
-            skipped_degenerate: skipped as u64,
+            skipped_degenerate: skipped.len() as u64,
             nodes: mbvh.node_count() as u64,
             bvh_bytes: mbvh.bytes() as u64,
             bytes: (mbvh.bytes() + mesh_bytes(&data.meshes)) as u64,
             sah_cost,
             build_seconds: start.elapsed().as_secs_f64(),
+            wide_sah_cost,
+            refits: 0,
+            refit_seconds: 0.0,
         };
-        Ok(Parts { emitters, first_triangle, bounds, mbvh, stats, memory })
+        Ok(Parts { emitters, first_triangle, bounds, mbvh, skipped, stats, memory })
     }
 
     /// The device that the scene lives on.
@@ -225,9 +328,10 @@ impl Scene {
         self.data.meshes[m as usize].corners(t as usize)
     }
 
-    /// Whether a global triangle number is a valid triangle (not skipped by the build).
+    /// Whether a global triangle number is a valid triangle (not skipped by the build, and not made degenerate
+    /// by a refit).
     pub fn is_valid(&self, triangle: u32) -> bool {
-        is_valid_triangle(self.corners(triangle))
+        is_valid_triangle(self.corners(triangle)) && self.skipped.binary_search(&triangle).is_err()
     }
 
     /// The material of a global triangle number.
@@ -295,16 +399,36 @@ struct Parts {
     first_triangle: Vec<u32>,
     bounds: (Vec3, Vec3),
     mbvh: Mbvh,
+    skipped: Vec<u32>,
     stats: SceneStats,
     memory: Reservation,
 }
 
 impl Parts {
     fn into_scene(self, device: Arc<Device>, data: SceneData) -> Scene {
-        let Parts { emitters, first_triangle, bounds, mbvh, stats, memory } = self;
-        let lights = RwLock::new(Arc::new(data.lights.clone()));
-        Scene { device, data, lights, emitters, first_triangle, bounds, mbvh, stats, _memory: memory }
+        let Parts { emitters, first_triangle, bounds, mbvh, skipped, stats, memory } = self;
+        let lights = Arc::new(RwLock::new(Arc::new(data.lights.clone())));
+        Scene { device, data, lights, emitters, first_triangle, bounds, mbvh, skipped, stats, _memory: memory }
     }
+}
+
+/// The emissive triangles that are valid and not `skipped`.
+fn emitters(data: &SceneData, first_triangle: &[u32], skipped: &[u32]) -> Vec<Emitter> {
+    let mut emitters = Vec::new();
+    for (m, mesh) in data.meshes.iter().enumerate() {
+        if let MeshMaterials::One(material) = mesh.materials
+            && !data.materials[material as usize].is_emissive()
+        {
+            continue;
+        }
+        for t in 0..mesh.indices.len() {
+            let (material, id) = (&data.materials[mesh.material(t) as usize], first_triangle[m] + t as u32);
+            if material.is_emissive() && is_valid_triangle(mesh.corners(t)) && skipped.binary_search(&id).is_err() {
+                emitters.push(emitter(id, mesh.corners(t), material));
+            }
+        }
+    }
+    emitters
 }
 
 fn emitter(triangle: u32, corners: [Vec3; 3], material: &Material) -> Emitter {
@@ -334,4 +458,97 @@ fn mesh_bytes(meshes: &[Mesh]) -> usize {
                 + if let MeshMaterials::PerTriangle(v) = &m.materials { v.len() * 4 } else { 0 }
         })
         .sum()
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use crate::device::DeviceOptions;
+
+    /// A floor (mesh 0), a lamp over it (mesh 1, emissive), and a triangle that is none (mesh 2).
+    fn scene() -> Arc<Scene> {
+        let device = Device::new(DeviceOptions { num_threads: 2, ..Default::default() }).unwrap();
+        let mut data = SceneData::new();
+        data.add_material(Material::default()).unwrap();
+        data.add_material(Material { emission: [2.0; 3], ..Default::default() }).unwrap();
+        let light = Light::Point { position: Vec3::Z, intensity: [1.0; 3] };
+        data.add_light(light).unwrap();
+        let mesh = |positions: Vec<Vec3>, material| Mesh {
+            indices: (0..positions.len() as u32 / 3).map(|i| [3 * i, 3 * i + 1, 3 * i + 2]).collect(),
+            positions,
+            materials: MeshMaterials::One(material),
+            ..Default::default()
+        };
+        data.add_mesh(mesh([FLOOR, FLOOR.map(|c| c + 2.0 * Vec3::Y)].concat(), 0)).unwrap();
+        data.add_mesh(mesh(FLOOR.map(|c| c + 3.0 * Vec3::Z).to_vec(), 1)).unwrap();
+        data.add_mesh(mesh(vec![Vec3::ZERO; 3], 1)).unwrap();
+        Scene::commit(&device, data, &BuildOptions::default(), &Progress::none()).map_err(|e| e.1).unwrap()
+    }
+
+    const FLOOR: [Vec3; 3] = [Vec3::ZERO, Vec3::X, Vec3::Y];
+
+    fn up(scene: &Scene) -> Hit {
+        scene.intersect(&Ray { origin: [0.2, 0.2, 0.5], tmin: 0.0, direction: [0.0, 0.0, 1.0], tmax: f32::INFINITY })
+    }
+
+    #[test]
+    fn all_that_follows_from_positions_follows_a_refit() {
+        let mut s = scene();
+        let (address, before) = (Arc::as_ptr(&s), *s.stats());
+        assert_eq!((up(&s).t, up(&s).mesh, s.emitters()[0].area, before.skipped_degenerate), (2.5, 1, 0.5, 1));
+        let lamp = FLOOR.map(|c| 2.0 * c + 5.0 * Vec3::Z);
+        Scene::refit(&mut s, &[(1, &lamp)]).unwrap();
+        assert_eq!(Arc::as_ptr(&s), address, "nobody else holds it");
+        assert_eq!((up(&s).t, up(&s).mesh), (4.5, 1));
+        let e = s.emitters();
+        assert_eq!((e.len(), e[0].area, e[0].corner, e[0].triangle), (1, 2.0, 5.0 * Vec3::Z, 2));
+        assert_eq!(s.bounds(), (Vec3::ZERO, Vec3::new(2.0, 3.0, 5.0)));
+        assert_eq!(s.corners(2), lamp);
+        let after = s.stats();
+        assert_eq!((after.refits, after.sah_cost, after.skipped_degenerate), (1, before.sah_cost, 1));
+        assert!(after.wide_sah_cost > 0.0 && after.refit_seconds > 0.0);
+    }
+
+    #[test]
+    fn who_holds_the_scene_keeps_its_geometry_and_shares_its_lights() {
+        let mut s = scene();
+        let old = s.clone();
+        Scene::refit(&mut s, &[(1, &FLOOR.map(|c| c + 4.0 * Vec3::Z))]).unwrap();
+        assert_eq!((up(&old).t, up(&s).t), (2.5, 3.5));
+        assert_eq!((old.emitters()[0].corner.z, s.emitters()[0].corner.z), (3.0, 4.0));
+        let light = Light::Point { position: Vec3::X, intensity: [3.0; 3] };
+        s.set_light(0, light).unwrap();
+        assert_eq!(old.lights()[0], s.lights()[0]);
+        let held = s.device().memory().current();
+        drop(old);
+        assert!(s.device().memory().current() < held);
+    }
+
+    #[test]
+    fn triangles_go_and_come_back_but_those_that_never_were_stay_out() {
+        let mut s = scene();
+        Scene::refit(&mut s, &[(1, &[Vec3::NAN; 3]), (2, &FLOOR.map(|c| c + Vec3::Z))]).unwrap();
+        assert!(up(&s).triangle == NONE && s.emitters().is_empty() && !s.is_valid(2) && !s.is_valid(3));
+        assert_eq!(s.stats().skipped_degenerate, 2);
+        Scene::refit(&mut s, &[(1, &FLOOR.map(|c| c + 3.0 * Vec3::Z))]).unwrap();
+        assert!(up(&s).t == 2.5 && s.emitters().len() == 1 && s.is_valid(2) && !s.is_valid(3));
+        assert_eq!(s.stats().skipped_degenerate, 1);
+    }
+
+    #[test]
+    fn a_refused_refit_changes_nothing() {
+        let mut s = scene();
+        let fine = FLOOR.map(|c| c + 9.0 * Vec3::Z);
+        let nothing = [Vec3::ZERO; 6];
+        let refused: [(&[(u32, &[Vec3])], &str); 3] = [
+            (&[(1, &fine), (7, &fine)], "mesh 7 does not exist"),
+            (&[(1, &fine), (0, &fine)], "positions has 3 entries for 6 vertices"),
+            (&[(0, &nothing), (1, &nothing[..3])], "all triangles"),
+        ];
+        for (moved, culprit) in refused {
+            let e = Scene::refit(&mut s, moved).unwrap_err().to_string();
+            assert!(e.contains(culprit), "{e}");
+            assert_eq!((up(&s).t, s.stats().refits, s.corners(2)[0].z), (2.5, 0, 3.0));
+        }
+    }
 }

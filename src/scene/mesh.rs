@@ -119,10 +119,21 @@ impl Mesh {
                 }
             }
         }
+        self.check_positions(&self.positions)
+    }
+
+    /// Checks positions that might take the place of the mesh's own: their number, and themselves if
+    /// `strict`.
+    pub(super) fn check_positions(&self, positions: &[Vec3]) -> Result<()> {
+        if positions.len() != self.positions.len() {
+            let (new, old) = (positions.len(), self.positions.len());
+            return invalid_argument!("positions has {new} entries for {old} vertices");
+        }
+        let corners = |t: usize| self.indices[t].map(|i| positions[i as usize]);
         if self.strict
-            && let Some(t) = (0..self.indices.len()).find(|&t| !is_valid_triangle(self.corners(t)))
+            && let Some(t) = (0..self.indices.len()).find(|&t| !is_valid_triangle(corners(t)))
         {
-            let [a, b, c] = self.corners(t);
+            let [a, b, c] = corners(t);
             return invalid_argument!("triangle {t} is degenerate or not finite: {a}, {b}, {c}");
         }
         Ok(())

@@ -1,0 +1,232 @@
+/*
+ * Moved vertices: what follows a refit, who does not, and what is refused.
+ *
+ *     refit
+ */
+#include "check.h"
+
+#include <math.h>
+
+#define ARGUMENT BK_ERROR_INVALID_ARGUMENT
+#define STATE BK_ERROR_INVALID_STATE
+
+/* Mesh 0 is a floor at z = 0, mesh 1 a glowing ceiling at z = 1. */
+static const float SQUARE[4][3] = {{0, 0, 0}, {1, 0, 0}, {1, 1, 0}, {0, 1, 0}};
+static const uint32_t UP[2][3] = {{0, 1, 2}, {0, 2, 3}}, DOWN[2][3] = {{0, 2, 1}, {0, 3, 2}};
+
+static void square_at(float z, float out[4][3]) {
+    int i;
+    memcpy(out, SQUARE, sizeof SQUARE);
+    for (i = 0; i < 4; i++) {
+        out[i][2] = z;
+    }
+}
+
+static bk_scene *described_scene(bk_device *device, uint32_t ceiling_flags) {
+    bk_scene *scene = NULL;
+    bk_material_desc material;
+    bk_mesh_desc mesh;
+    float ceiling[4][3];
+    CHECK_OK(bk_scene_create(device, &scene));
+    bk_material_desc_init(&material);
+    CHECK_OK(bk_scene_add_material(scene, &material, NULL));
+    material.emission[0] = material.emission[1] = material.emission[2] = 1.0f;
+    CHECK_OK(bk_scene_add_material(scene, &material, NULL));
+    bk_mesh_desc_init(&mesh);
+    mesh.positions = SQUARE[0];
+    mesh.vertex_count = 4;
+    mesh.indices = UP[0];
+    mesh.triangle_count = 2;
+    CHECK_OK(bk_scene_add_mesh(scene, &mesh, NULL));
+    square_at(1.0f, ceiling);
+    mesh.positions = ceiling[0];
+    mesh.indices = DOWN[0];
+    mesh.material = 1;
+    mesh.flags = ceiling_flags;
+    CHECK_OK(bk_scene_add_mesh(scene, &mesh, NULL));
+    return scene;
+}
+
+static bk_scene *committed_scene(bk_device *device, uint32_t ceiling_flags) {
+    bk_scene *scene = described_scene(device, ceiling_flags);
+    CHECK_OK(bk_scene_commit(scene, NULL, NULL));
+    return scene;
+}
+
+/* How far it is up to the ceiling from z = 0.1, by all queries alike. */
+static float height(const bk_scene *scene) {
+    bk_ray ray = {{0.3f, 0.4f, 0.125f}, 0.0f, {0, 0, 1}, INFINITY};
+    bk_hit hit, many, gathered;
+    uint8_t occluded = 2;
+    bk_intersect(scene, &ray, &hit);
+    CHECK(bk_occluded(scene, &ray) == (hit.triangle != BK_NONE));
+    CHECK_OK(bk_intersect_many(scene, &ray, 1, BK_RAYS_PARALLEL, &many));
+    CHECK_OK(bk_occluded_many(scene, &ray, 1, 0, &occluded));
+    CHECK_OK(bk_gather(scene, ray.origin, ray.direction, 1, INFINITY, 0, &gathered));
+    CHECK(many.t == hit.t && gathered.t == hit.t && occluded == (hit.triangle != BK_NONE));
+    return hit.t;
+}
+
+static struct bk_scene_stats stats_of(const bk_scene *scene) {
+    struct bk_scene_stats stats;
+    bk_scene_stats_init(&stats);
+    CHECK_OK(bk_scene_stats(scene, &stats));
+    return stats;
+}
+
+static void test_use(bk_device *device) {
+    bk_scene *scene = committed_scene(device, 0);
+    struct bk_scene_stats before = stats_of(scene), after;
+    struct { float position[3], other[2]; } vertices[4];
+    float ceiling[4][3], lower[3], upper[3];
+    bk_mesh_view view;
+    int i;
+
+    /* Nothing to do is fine. */
+    CHECK_OK(bk_scene_refit(scene));
+    CHECK(stats_of(scene).refits == 0 && stats_of(scene).refit_seconds == 0.0);
+
+    /* Positions are staged, the last ones hold. */
+    square_at(7.0f, ceiling);
+    CHECK_OK(bk_mesh_set_positions(scene, 1, ceiling[0], 4, 0));
+    square_at(3.125f, ceiling);
+    for (i = 0; i < 4; i++) {
+        memcpy(vertices[i].position, ceiling[i], sizeof ceiling[i]);
+    }
+    CHECK_OK(bk_mesh_set_positions(scene, 1, vertices[0].position, 4, sizeof vertices[0]));
+    memset(vertices, 0xff, sizeof vertices);
+    CHECK(height(scene) == 0.875f);
+    CHECK_OK(bk_scene_refit(scene));
+    CHECK(height(scene) == 3.0f);
+    CHECK_OK(bk_scene_bounds(scene, lower, upper));
+    CHECK(lower[2] == 0.0f && upper[2] == 3.125f);
+    bk_mesh_view_init(&view);
+    CHECK_OK(bk_scene_mesh_geometry(scene, 1, &view));
+    CHECK(view.vertex_count == 4 && view.positions[2] == 3.125f);
+    after = stats_of(scene);
+    CHECK(after.refits == 1 && after.sah_cost == before.sah_cost && after.refit_seconds > 0.0);
+    CHECK(before.wide_sah_cost > 0.0f && after.wide_sah_cost > 0.0f);
+
+    /* What becomes no triangle is not hit, and comes back. */
+    ceiling[0][1] = NAN;
+    CHECK_OK(bk_mesh_set_positions(scene, 1, ceiling[0], 4, 0));
+    CHECK_OK(bk_scene_refit(scene));
+    CHECK(height(scene) == INFINITY && stats_of(scene).skipped_degenerate == 2);
+    square_at(2.125f, ceiling);
+    CHECK_OK(bk_mesh_set_positions(scene, 1, ceiling[0], 4, 0));
+    CHECK_OK(bk_scene_refit(scene));
+    CHECK(height(scene) == 2.0f && stats_of(scene).skipped_degenerate == 0);
+    bk_scene_release(scene);
+}
+
+/* The mean brightness of the light map's first page. */
+static double brightness(bk_lightmap *lightmap) {
+    static float pixels[64 * 64 * 3];
+    bk_bake_params params;
+    double sum = 0.0;
+    int i;
+    bk_bake_params_init(&params);
+    params.photon_count = 20000;
+    params.gather_rays = 16;
+    CHECK_OK(bk_bake(lightmap, &params, NULL, NULL, NULL));
+    CHECK_OK(bk_lightmap_read(lightmap, 0, BK_LAYER_COMBINED, BK_FORMAT_RGB32F, pixels, 0));
+    for (i = 0; i < 64 * 64 * 3; i++) {
+        sum += pixels[i];
+    }
+    return sum / (64 * 64 * 3);
+}
+
+static bk_lightmap *lightmap_of(const bk_scene *scene) {
+    bk_lightmap *lightmap = NULL;
+    bk_lightmap_desc desc;
+    bk_lightmap_desc_init(&desc);
+    desc.page_size = 64;
+    desc.texels_per_unit = 16.0f;
+    desc.gather_divisor = desc.radiance_divisor = 2;
+    CHECK_OK(bk_lightmap_create(scene, &desc, NULL, NULL, &lightmap));
+    return lightmap;
+}
+
+static void test_old_lightmaps(bk_device *device) {
+    bk_scene *scene = committed_scene(device, 0);
+    bk_lightmap *old = lightmap_of(scene), *moved;
+    double first = brightness(old);
+    float ceiling[4][3];
+    square_at(4.0f, ceiling);
+    CHECK_OK(bk_mesh_set_positions(scene, 1, ceiling[0], 4, 0));
+    CHECK_OK(bk_scene_refit(scene));
+    moved = lightmap_of(scene);
+    CHECK(brightness(old) == first);
+    CHECK(brightness(moved) < 0.8 * first);
+    bk_lightmap_release(moved);
+    bk_scene_release(scene);
+    CHECK(brightness(old) == first);
+    bk_lightmap_release(old);
+}
+
+static int32_t refit_in_callback(void *user, float fraction, const char *stage) {
+    (void)fraction;
+    (void)stage;
+    CHECK_ERROR(bk_scene_refit((bk_scene *)user), STATE, "callback");
+    return 1;
+}
+
+static void test_bad_input(bk_device *device) {
+    bk_scene *scene = described_scene(device, BK_MESH_STRICT);
+    bk_photon_map *map = NULL;
+    bk_photon_params photons;
+    float p[4][3];
+    square_at(2.125f, p);
+    CHECK_ERROR(bk_mesh_set_positions(NULL, 1, p[0], 4, 0), ARGUMENT, "scene is NULL");
+    CHECK_ERROR(bk_scene_refit(NULL), ARGUMENT, "scene is NULL");
+    CHECK_ERROR(bk_mesh_set_positions(scene, 1, p[0], 4, 0), STATE, "not committed");
+    CHECK_ERROR(bk_scene_refit(scene), STATE, "not committed");
+    CHECK_OK(bk_scene_commit(scene, NULL, NULL));
+
+    /* A refused call loses nothing of what an earlier one set. */
+    CHECK_OK(bk_mesh_set_positions(scene, 1, p[0], 4, 0));
+    CHECK_ERROR(bk_mesh_set_positions(scene, 2, p[0], 4, 0), ARGUMENT, "mesh 2 does not exist");
+    CHECK_ERROR(bk_mesh_set_positions(scene, BK_NONE, p[0], 4, 0), ARGUMENT, "does not exist");
+    CHECK_ERROR(bk_mesh_set_positions(scene, 1, p[0], 3, 0), ARGUMENT, "vertex_count is 3");
+    CHECK_ERROR(bk_mesh_set_positions(scene, 1, p[0], SIZE_MAX, 0), ARGUMENT, "vertex_count is");
+    CHECK_ERROR(bk_mesh_set_positions(scene, 1, NULL, 4, 0), ARGUMENT, "positions is NULL");
+    CHECK_ERROR(bk_mesh_set_positions(scene, 1, p[0], 4, 8), ARGUMENT, "stride of positions is 8");
+    CHECK_ERROR(bk_mesh_set_positions(scene, 1, p[0], 4, SIZE_MAX / 2), ARGUMENT, "larger than memory");
+    p[2][0] = NAN;
+    CHECK_ERROR(bk_mesh_set_positions(scene, 1, p[0], 4, 0), ARGUMENT, "triangle 0");
+    CHECK_OK(bk_mesh_set_positions(scene, 0, p[0], 4, 0));
+    bk_photon_params_init(&photons);
+    photons.photon_count = 1000;
+    CHECK_OK(bk_photon_map_create(scene, &photons, refit_in_callback, scene, &map));
+    bk_photon_map_release(map);
+    CHECK(height(scene) == 0.875f);
+    CHECK_OK(bk_scene_refit(scene));
+    CHECK(height(scene) == 2.0f);
+    bk_scene_release(scene);
+
+    /* A refit that leaves nothing is refused, and what was set waits for more. */
+    scene = committed_scene(device, 0);
+    memset(p, 0, sizeof p);
+    CHECK_OK(bk_mesh_set_positions(scene, 0, p[0], 4, 0));
+    CHECK_OK(bk_mesh_set_positions(scene, 1, p[0], 4, 0));
+    CHECK_ERROR(bk_scene_refit(scene), STATE, "all triangles");
+    CHECK(height(scene) == 0.875f);
+    square_at(5.125f, p);
+    CHECK_OK(bk_mesh_set_positions(scene, 1, p[0], 4, 0));
+    CHECK_OK(bk_scene_refit(scene));
+    CHECK(height(scene) == 5.0f && stats_of(scene).skipped_degenerate == 2);
+    bk_scene_release(scene);
+}
+
+int main(void) {
+    bk_device *device = NULL;
+    bk_device_desc desc;
+    bk_device_desc_init(&desc);
+    desc.num_threads = 2;
+    CHECK_OK(bk_device_create(&desc, &device));
+    test_use(device);
+    test_old_lightmaps(device);
+    test_bad_input(device);
+    bk_device_release(device);
+    return check_report("refit");
+}
