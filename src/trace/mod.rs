@@ -8,6 +8,7 @@ pub mod baseline;
 mod gather;
 mod kernels;
 pub mod offset;
+mod packet;
 mod single;
 mod triangle;
 
