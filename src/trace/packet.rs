@@ -180,20 +180,32 @@ impl Pyramid {
     /// The CPU must have the ISA.
     #[inline(always)]
     unsafe fn node<S: Simd>(&self, node: &Node, negative: [bool; 3]) -> (S::F8, <S::F8 as Lanes>::Mask) {
-        // SAFETY: the caller vouches for the ISA; rows have eight floats.
-        let splat = |x: f32| unsafe { S::F8::splat(x) };
-        let axis = |a: usize| {
-            let (near, far) = planes(node, a, negative);
-            let (near, far) = unsafe { (S::F8::load(near.as_ptr()), S::F8::load(far.as_ptr())) };
-            let near = near.mul_add(splat(self.sign[a]), splat(self.near[a]));
-            let far = far.mul_add(splat(self.sign[a]), splat(self.far[a]));
-            let (least, most) = (splat(self.least[a]), splat(self.most[a]));
-            ((near * least).min(near * most), (far * least).max(far * most))
+        // SAFETY: forwarded.
+        let [(nx, fx), (ny, fy), (nz, fz)] = unsafe {
+            [self.axis::<S>(node, 0, negative), self.axis::<S>(node, 1, negative), self.axis::<S>(node, 2, negative)]
         };
-        let ((nx, fx), (ny, fy), (nz, fz)) = (axis(0), axis(1), axis(2));
-        let near = nx.max(ny).max(nz.max(splat(self.begin)));
-        let far = fx.min(fy).min(fz.min(splat(self.end)));
+        // SAFETY: the caller vouches for the ISA.
+        let (begin, end) = unsafe { (S::F8::splat(self.begin), S::F8::splat(self.end)) };
+        let near = nx.max(ny).max(nz.max(begin));
+        let far = fx.min(fy).min(fz.min(end));
         (near, near.le(far))
+    }
+
+    /// Distances of a node's near and far planes. (A function: as a closure it was not inlined.)
+    ///
+    /// # Safety
+    /// The CPU must have the ISA.
+    #[inline(always)]
+    unsafe fn axis<S: Simd>(&self, node: &Node, a: usize, negative: [bool; 3]) -> (S::F8, S::F8) {
+        let (near, far) = planes(node, a, negative);
+        // SAFETY: the caller vouches for the ISA; rows have eight floats.
+        unsafe {
+            let sign = S::F8::splat(self.sign[a]);
+            let near = S::F8::load(near.as_ptr()).mul_add(sign, S::F8::splat(self.near[a]));
+            let far = S::F8::load(far.as_ptr()).mul_add(sign, S::F8::splat(self.far[a]));
+            let (least, most) = (S::F8::splat(self.least[a]), S::F8::splat(self.most[a]));
+            ((near * least).min(near * most), (far * least).max(far * most))
+        }
     }
 }
 
