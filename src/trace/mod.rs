@@ -119,6 +119,9 @@ const BLOCK: usize = 1024;
 
 impl Scene {
     /// Closest hits of many rays, in order. `parallel`: spread over the device's threads.
+    ///
+    /// Consecutive rays of a pinhole camera, with one origin and range, pass the tree together and are some
+    /// times as fast as others: best in small square tiles of pixels. Hits are the same, bit for bit.
     pub fn intersect_many(&self, rays: &[Ray], parallel: bool, out: &mut [Hit]) -> Result<()> {
         if rays.len() != out.len() {
             return invalid_argument!("{} rays, but room for {} hits", rays.len(), out.len());

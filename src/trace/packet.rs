@@ -82,37 +82,35 @@ fn longest_axis(d: [f32; 3]) -> Option<usize> {
 #[inline(always)]
 fn bundle(rays: &[Ray]) -> usize {
     let first = &rays[0];
-    let bits = |r: &Ray| [r.origin[0], r.origin[1], r.origin[2], r.tmin, r.tmax].map(f32::to_bits);
-    let same = |r: &Ray| bits(r) == bits(first);
+    // By bits, and all at once, without branches.
+    let differ = |a: f32, b: f32| a.to_bits() ^ b.to_bits();
+    let same = |r: &Ray| {
+        let origin = (0..3).fold(0, |sum, a| sum | differ(r.origin[a], first.origin[a]));
+        origin | differ(r.tmin, first.tmin) | differ(r.tmax, first.tmax) == 0
+    };
     // At once for most rays that are in no bundle.
     if rays.len() < LEAST || !same(&rays[1]) || !(first.tmax > first.tmin) {
         return 0;
     }
     let (Some(k), true) = (longest_axis(first.direction), first.origin.iter().all(|o| o.is_finite())) else { return 0 };
     let (i, j) = ((k + 1) % 3, (k + 2) % 3);
-    let slopes = |d: [f32; 3]| {
-        let inverse = 1.0 / d[k].abs();
-        [d[i] * inverse, d[j] * inverse]
-    };
-    let s = slopes(first.direction);
-    let (mut least, mut most) = (s, s);
-    let mut n = 1;
-    for r in &rays[1..rays.len().min(SIZE)] {
-        let d = r.direction;
-        let is_alike = (0..3).all(|a| (d[a] < 0.0) == (first.direction[a] < 0.0));
-        if !same(r) || !is_alike || longest_axis(d) != Some(k) {
-            break;
+    let sign = first.direction.map(|d| 1f32.copysign(d));
+    let (mut least, mut most) = ([f32::INFINITY; 2], [0f32; 2]);
+    for (n, r) in rays.iter().take(SIZE).enumerate() {
+        let [x, y, z] = [r.direction[i] * sign[i], r.direction[j] * sign[j], r.direction[k] * sign[k]];
+        // What `longest_axis` asks, without branches, which took a tenth of the time; and the octant.
+        let is_alike = (x < z) & (y < z) & (x > STEEP * z) & (y > STEEP * z) & (z >= 1e-6) & (z <= 1e6);
+        let inverse = 1.0 / z;
+        for (a, s) in [x * inverse, y * inverse].into_iter().enumerate() {
+            least[a] = if s < least[a] { s } else { least[a] };
+            most[a] = if s > most[a] { s } else { most[a] };
         }
-        let s = slopes(d);
-        for a in 0..2 {
-            (least[a], most[a]) = (least[a].min(s[a]), most[a].max(s[a]));
+        let is_narrow = (most[0] - least[0] <= SPREAD) & (most[1] - least[1] <= SPREAD);
+        if !(same(r) & is_alike & is_narrow) {
+            return n;
         }
-        if (most[0] - least[0]).max(most[1] - least[1]) > SPREAD {
-            break;
-        }
-        n += 1;
     }
-    n
+    rays.len().min(SIZE)
 }
 
 /// A value per ray.
@@ -301,7 +299,11 @@ unsafe fn trace<S: Simd>(bvh: &Mbvh, rays: &[Ray], out: &mut [RawHit]) {
                 first = *firsts.add(count) as usize;
                 let (node, lane) = (bvh.nodes.get_unchecked(name / WIDTH), name % WIDTH);
                 let child = node.children[lane];
-                bvh.prefetch(child);
+                // The one that comes next, most likely.
+                if count > 0 {
+                    let next = *children.add(count - 1) as usize;
+                    bvh.prefetch(bvh.nodes.get_unchecked(next / WIDTH).children[next % WIDTH]);
+                }
                 let plane = |a: usize| {
                     let (near, far) = planes(node, a, shared.negative);
                     [S::Packet::splat(near[lane]), S::Packet::splat(far[lane])]
@@ -356,7 +358,7 @@ unsafe fn begin<S: Simd>(rays: &[Ray], place: &mut MaybeUninit<Bundle>) -> (Shar
         let [i, j, k] = axes;
         let (mut least, mut most) = ([splat(f32::INFINITY); 3], [zero; 3]);
         for g in 0..shared.groups {
-            let d = [0, 1, 2].map(|a| lanes::<S::Packet>(&b.direction[a], g));
+            let d: [S::Packet; 3] = [lanes(&b.direction[0], g), lanes(&b.direction[1], g), lanes(&b.direction[2], g)];
             let length = abs(d[k]);
             for a in 0..3 {
                 let r = splat(1.0).div(d[a]);
@@ -382,8 +384,8 @@ unsafe fn begin<S: Simd>(rays: &[Ray], place: &mut MaybeUninit<Bundle>) -> (Shar
         let lengths = &b.length[..rays.len()];
         let (shortest, longest) = lengths.iter().fold((f32::INFINITY, 0f32), |(a, b), &l| (a.min(l), b.max(l)));
         let begin = tmin * if tmin < 0.0 { longest } else { shortest };
-        let least = least.map(|l| l.to_array()[..width].iter().copied().fold(f32::INFINITY, f32::min));
-        let most = most.map(|l| l.to_array()[..width].iter().copied().fold(0.0, f32::max));
+        let least = [least[0].to_array(), least[1].to_array(), least[2].to_array()];
+        let most = [most[0].to_array(), most[1].to_array(), most[2].to_array()];
         let sign = negative.map(|n| if n { -1.0 } else { 1.0 });
         // More than what rays alone take off for rounding, which all of them do.
         let margin = origin.map(|o| 16.0 * EPSILON * o.abs());
@@ -391,8 +393,8 @@ unsafe fn begin<S: Simd>(rays: &[Ray], place: &mut MaybeUninit<Bundle>) -> (Shar
             sign,
             near: [0, 1, 2].map(|a| -origin[a] * sign[a] - margin[a]),
             far: [0, 1, 2].map(|a| -origin[a] * sign[a] + margin[a]),
-            least: least.map(|r| r * (1.0 - SLACK)),
-            most: most.map(|r| r * (1.0 + SLACK)),
+            least: least.map(|r| r[..width].iter().fold(f32::INFINITY, |a, &b| a.min(b)) * (1.0 - SLACK)),
+            most: most.map(|r| r[..width].iter().fold(0f32, |a, &b| a.max(b)) * (1.0 + SLACK)),
             begin: begin - SLACK * begin.abs(),
             end: b.end::<S::Packet>(shared.groups),
         };
@@ -515,9 +517,13 @@ impl Bundle {
         // SAFETY (all below): the caller vouches for the ISA, the group and the leaf.
         unsafe {
             let zero = L::splat(0.0);
-            let back = shared.axes.map(|a| zero - lanes::<L>(&self.direction[a], g));
-            let (mut t, is_accurate) =
-                seen.distances_along(V3 { x: back[0], y: back[1], z: back[2] }, lanes(&self.grazing, g));
+            let [i0, i1, i2] = shared.axes;
+            let back = V3 {
+                x: zero - lanes(&self.direction[i0], g),
+                y: zero - lanes(&self.direction[i1], g),
+                z: zero - lanes(&self.direction[i2], g),
+            };
+            let (mut t, is_accurate) = seen.distances_along(back, lanes(&self.grazing, g));
             let sum = seen.u + seen.v + seen.w;
             let inaccurate = candidates.bits() & !is_accurate.bits();
             if inaccurate != 0 {
