@@ -130,7 +130,7 @@ impl Scene {
             let mut raw = [RawHit::MISS; 256];
             for (rays, out) in rays.chunks(256).zip(out.chunks_mut(256)) {
                 self.device().kernels().intersect_block(self.mbvh(), rays, &mut raw);
-                out.iter_mut().zip(&raw).for_each(|(o, &r)| *o = self.to_hit(r));
+                self.to_hits(&raw, out);
             }
         };
         if parallel {

@@ -11,7 +11,7 @@
 //! through more boxes, but a triangle counts only for rays that meet the box of its leaf, and since
 //! rounding is monotonic these meet all boxes around it.
 
-use super::single::{self, Best, EPSILON, STEEP, beyond};
+use super::single::{self, EPSILON, STEEP, barycentrics, beyond};
 use super::triangle::{GRAZING, Projected, Shear, V3, accurate_distance};
 use super::{RawHit, Ray};
 use crate::bvh::layout::{ChildRef, MAX_LEAF, Mbvh, Node, STACK_SIZE, WIDTH};
@@ -116,7 +116,7 @@ fn bundle(rays: &[Ray]) -> usize {
 /// A value per ray.
 type Column = [f32; SIZE];
 
-/// The rays of a bundle, and the best hits so far as in [`Best`].
+/// The rays of a bundle, and the best hits so far as in [`single::Best`].
 #[repr(C, align(64))]
 struct Bundle {
     direction: [Column; 3],
@@ -145,6 +145,8 @@ struct Shared {
     tmin: f32,
     /// Of the scene's axes in the rays' frames, as in [`Shear`].
     axes: [usize; 3],
+    /// The origin in the order of `axes`.
+    frame_origin: [f32; 3],
     negative: [bool; 3],
     /// Of the octant in [`Node::order`].
     shift: u32,
@@ -338,7 +340,8 @@ unsafe fn begin<S: Simd>(rays: &[Ray], place: &mut MaybeUninit<Bundle>) -> (Shar
     let axes = Shear::new(origin, direction).axes.map(|a| a as usize);
     let negative = direction.map(|d| d < 0.0);
     let shift = 3 * (negative[0] as u32 | (negative[1] as u32) << 1 | (negative[2] as u32) << 2);
-    let shared = Shared { origin, tmin, axes, negative, shift, groups: rays.len().div_ceil(width) };
+    let frame_origin = axes.map(|a| origin[a]);
+    let shared = Shared { origin, tmin, axes, frame_origin, negative, shift, groups: rays.len().div_ceil(width) };
     // SAFETY: zeros are f32s.
     let b = unsafe {
         place.as_mut_ptr().write_bytes(0, 1);
@@ -405,9 +408,15 @@ unsafe fn begin<S: Simd>(rays: &[Ray], place: &mut MaybeUninit<Bundle>) -> (Shar
 /// Hits from the best ones.
 #[inline(always)]
 fn finish(rays: &Bundle, out: &mut [RawHit]) {
+    // Like this the divisions become vectors'.
+    let (mut u, mut v): (Column, Column) = ([0.0; SIZE], [0.0; SIZE]);
+    for i in 0..SIZE {
+        (u[i], v[i]) = barycentrics(rays.u[i], rays.v[i], rays.sum[i]);
+    }
     for (i, out) in out.iter_mut().enumerate() {
-        let triangle = rays.triangle[i].to_bits();
-        *out = Best { t: rays.t[i], triangle, u: rays.u[i], v: rays.v[i], sum: rays.sum[i] }.hit();
+        let hit =
+            RawHit { t: rays.t[i], u: u[i], v: v[i], triangle: rays.triangle[i].to_bits(), front: rays.sum[i] > 0.0 };
+        *out = if hit.is_miss() { RawHit::MISS } else { hit };
     }
 }
 
@@ -470,11 +479,14 @@ impl Bundle {
         // SAFETY (all below): rows are `count` apart, and the pad behind the last leaf covers reads beyond
         // it; `corners` have room for twice four. The caller vouches for the ISA.
         for i in (0..count).step_by(4) {
-            for (k, corner) in corners.iter_mut().enumerate() {
-                let a = shared.axes[k % 3];
+            for a in 0..3 {
                 unsafe {
-                    let row = S::F4::load(rows.add(i + (k / 3 * 3 + a) * count));
-                    (S::F4::splat(shared.origin[a]) - row).store(corner.as_mut_ptr().add(i));
+                    let origin = S::F4::splat(shared.frame_origin[a]);
+                    let row = rows.add(i + shared.axes[a] * count);
+                    for corner in 0..3 {
+                        let relative = origin - S::F4::load(row.add(3 * corner * count));
+                        relative.store(corners[3 * corner + a].as_mut_ptr().add(i));
+                    }
                 }
             }
         }
