@@ -120,7 +120,7 @@ const BLOCK: usize = 1024;
 impl Scene {
     /// Closest hits of many rays, in order. `parallel`: spread over the device's threads.
     ///
-    /// Consecutive rays of a pinhole camera, with one origin and range, pass the tree together and are some
+    /// Consecutive rays of a pinhole camera, with one origin and range, pass the tree together and are several
     /// times as fast as others: best in small square tiles of pixels. Hits are the same, bit for bit.
     pub fn intersect_many(&self, rays: &[Ray], parallel: bool, out: &mut [Hit]) -> Result<()> {
         if rays.len() != out.len() {

@@ -19,7 +19,7 @@ use crate::scene::NONE;
 use crate::simd::{Eight, Lanes, Mask, Simd};
 use std::mem::MaybeUninit;
 
-/// Most rays in a bundle.
+/// Most rays in a bundle. (In tiles of 4 × 4 pixels, 128 were no faster.)
 const SIZE: usize = 64;
 
 /// Fewer rays go alone.
