@@ -606,7 +606,9 @@ BK_API void bk_intersect(const bk_scene *scene, const bk_ray *ray, bk_hit *out);
 // Whether anything lies on the ray: 1 or 0. On failure 0, and bk_last_error has the reason.
 BK_API int32_t bk_occluded(const bk_scene *scene, const bk_ray *ray);
 
-// The closest hits of many rays.
+// The closest hits of many rays. Fastest where consecutive rays share origin, tmin and tmax and go
+// nearly the same way, as those of a pinhole camera do in small square tiles of pixels; the hits are
+// the same, bit for bit, in any order of rays.
 //
 // rays: count rays, aligned to 4 bytes. flags: BK_RAYS_COHERENT, BK_RAYS_PARALLEL. out: receives
 // count hits in the order of the rays; must not overlap them.

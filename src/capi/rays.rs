@@ -79,7 +79,9 @@ pub unsafe extern "C" fn bk_occluded(scene: *const bk_scene, ray: *const bk_ray)
     })
 }
 
-/// The closest hits of many rays.
+/// The closest hits of many rays. Fastest where consecutive rays share origin, tmin and tmax and go
+/// nearly the same way, as those of a pinhole camera do in small square tiles of pixels; the hits are
+/// the same, bit for bit, in any order of rays.
 ///
 /// rays: count rays, aligned to 4 bytes. flags: BK_RAYS_COHERENT, BK_RAYS_PARALLEL. out: receives
 /// count hits in the order of the rays; must not overlap them.

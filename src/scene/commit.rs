@@ -385,6 +385,23 @@ impl Scene {
         let (mesh, triangle) = self.locate(hit.triangle);
         Hit { t: hit.t, u: hit.u, v: hit.v, triangle, mesh, instance: NONE }
     }
+
+    /// The same of many. Neighbours mostly hit the same mesh, which is then looked up once.
+    pub(crate) fn to_hits(&self, hits: &[RawHit], out: &mut [Hit]) {
+        let (mut mesh, mut begin, mut end) = (0, 0, 0);
+        for (out, hit) in out.iter_mut().zip(hits) {
+            if hit.triangle == NONE {
+                *out = Hit::MISS;
+                continue;
+            }
+            if !(begin..end).contains(&hit.triangle) {
+                mesh = self.locate(hit.triangle).0;
+                begin = self.first_triangle[mesh as usize];
+                end = self.first_triangle.get(mesh as usize + 1).copied().unwrap_or(u32::MAX);
+            }
+            *out = Hit { t: hit.t, u: hit.u, v: hit.v, triangle: hit.triangle - begin, mesh, instance: NONE };
+        }
+    }
 }
 
 /// Unit normal of a valid triangle, computed in f64.

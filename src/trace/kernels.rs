@@ -3,7 +3,7 @@
 //! Each entry point carries the ISA's `#[target_feature]`s; the generic kernels are
 //! `#[inline(always)]` and so are compiled for them.
 
-use super::{PACKET_SIZE, Packet, RawHit, Ray, gather, single};
+use super::{PACKET_SIZE, Packet, RawHit, Ray, gather, packet, single};
 use crate::bvh::Mbvh;
 use crate::simd::{self, Isa};
 use glam::Vec3;
@@ -30,8 +30,7 @@ macro_rules! table {
             }
             $(#[target_feature(enable = $features)])?
             unsafe fn intersect_block(bvh: &Mbvh, rays: &[Ray], out: &mut [RawHit]) {
-                let n = rays.len().min(out.len());
-                unsafe { single::many::<$simd, false>(bvh, n, |i| rays[i], |i, hit| out[i] = hit) }
+                unsafe { packet::block::<$simd>(bvh, rays, out) }
             }
             $(#[target_feature(enable = $features)])?
             unsafe fn occluded(bvh: &Mbvh, ray: &Ray) -> bool {

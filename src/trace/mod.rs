@@ -8,6 +8,7 @@ pub mod baseline;
 mod gather;
 mod kernels;
 pub mod offset;
+mod packet;
 mod single;
 mod triangle;
 
@@ -118,6 +119,9 @@ const BLOCK: usize = 1024;
 
 impl Scene {
     /// Closest hits of many rays, in order. `parallel`: spread over the device's threads.
+    ///
+    /// Consecutive rays of a pinhole camera, with one origin and range, pass the tree together and are several
+    /// times as fast as others: best in small square tiles of pixels. Hits are the same, bit for bit.
     pub fn intersect_many(&self, rays: &[Ray], parallel: bool, out: &mut [Hit]) -> Result<()> {
         if rays.len() != out.len() {
             return invalid_argument!("{} rays, but room for {} hits", rays.len(), out.len());
@@ -126,7 +130,7 @@ impl Scene {
             let mut raw = [RawHit::MISS; 256];
             for (rays, out) in rays.chunks(256).zip(out.chunks_mut(256)) {
                 self.device().kernels().intersect_block(self.mbvh(), rays, &mut raw);
-                out.iter_mut().zip(&raw).for_each(|(o, &r)| *o = self.to_hit(r));
+                self.to_hits(&raw, out);
             }
         };
         if parallel {

@@ -55,10 +55,10 @@ pub(super) fn direction_scale(ray: &Ray) -> Option<f32> {
 }
 
 /// A ray whose direction has a component below this fraction of the largest takes the slower box test.
-const STEEP: f32 = 1e-10;
+pub(super) const STEEP: f32 = 1e-10;
 
 /// Rounding of one operation.
-const EPSILON: f32 = f32::EPSILON / 2.0;
+pub(super) const EPSILON: f32 = f32::EPSILON / 2.0;
 
 /// What a ray is for the tests.
 #[derive(Clone, Copy)]

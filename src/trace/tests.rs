@@ -293,3 +293,88 @@ proptest! {
         check_all(&soup(n, 0.3, seed), Vec3::ZERO, &directions, f32::INFINITY);
     }
 }
+
+/// Rays of a pinhole camera with a square picture, in tiles of 4 x 4 pixels.
+fn camera(eye: Vec3, toward: Vec3, width: f32, side: usize) -> Vec<Ray> {
+    let z = toward.normalize();
+    let (x, y) = orthonormal_basis(z);
+    let pixel = |i: usize| {
+        let (tile, p) = (i / 16, i % 16);
+        let (px, py) = (tile % (side / 4) * 4 + p % 4, tile / (side / 4) * 4 + p / 4);
+        let at = |p: usize| width * (2.0 * (p as f32 + 0.5) / side as f32 - 1.0);
+        Ray::new(eye, z + at(px) * x + at(py) * y)
+    };
+    (0..side * side).map(pixel).collect()
+}
+
+/// Checks that rays together hit what each hits alone, bit for bit.
+fn check_together(triangles: &[[Vec3; 3]], rays: &[Ray], what: &str) {
+    for isa in Isa::available() {
+        for max_leaf in [1, 8] {
+            let scene = scene(isa, triangles, max_leaf);
+            let mut many = vec![Hit::MISS; rays.len()];
+            scene.intersect_many(rays, false, &mut many).unwrap();
+            for (i, ray) in rays.iter().enumerate() {
+                let alone = scene.to_hit(scene.intersect_raw(ray));
+                let bits = |h: Hit| bytemuck::cast::<Hit, [u32; 6]>(h);
+                assert_eq!(bits(alone), bits(many[i]), "{what} {isa:?} {ray:?} {alone:?} {:?}", many[i]);
+            }
+        }
+    }
+}
+
+#[test]
+fn a_camera_sees_what_its_rays_hit_alone() {
+    let grid: Vec<[Vec3; 3]> = grid(4).iter().map(|t| t.map(|v| v * 0.5 - 1.0)).collect();
+    let twice: Vec<[Vec3; 3]> = soup(300, 0.3, 9).into_iter().flat_map(|t| [t, t]).collect();
+    let slivers: Vec<[Vec3; 3]> = soup(500, 0.8, 3).into_iter().map(|[a, b, c]| [a, b, b + 1e-3 * (c - b)]).collect();
+    let scenes = [
+        ("soup", soup(3000, 0.1, 2)),
+        ("large", soup(60, 1.0, 5)),
+        ("grid", grid),
+        ("twice", twice),
+        ("thin", slivers),
+    ];
+    for (name, triangles) in scenes {
+        for octant in 0..8 {
+            let sign = |a: usize| if octant >> a & 1 == 1 { -1.0 } else { 1.0 };
+            let toward = Vec3::new(sign(0) * 0.9, sign(1) * 0.55, sign(2) * 0.3);
+            for toward in [toward, Vec3::new(toward.z, toward.x, toward.y), Vec3::new(toward.y, toward.z, toward.x)] {
+                check_together(&triangles, &camera(-1.5 * toward, toward, 0.2, 16), name);
+                check_together(&triangles, &camera(Vec3::new(0.1, -0.2, 0.05), toward, 0.1, 16), name);
+            }
+        }
+        // Straddling axes and diagonals; from the planes of triangles.
+        for toward in [Vec3::X, Vec3::NEG_Y, Vec3::Z, Vec3::ONE, Vec3::new(1.0, -1.0, 0.0)] {
+            check_together(&triangles, &camera(-2.0 * toward, toward, 1.0, 48), name);
+            check_together(&triangles, &camera(Vec3::ZERO, toward, 0.3, 32), name);
+        }
+    }
+}
+
+#[test]
+fn bundles_of_any_length_and_range_hit_what_rays_hit_alone() {
+    let triangles = soup(2000, 0.1, 8);
+    let rays = camera(Vec3::new(-2.0, -1.0, -0.7), Vec3::new(2.0, 1.0, 0.7), 0.25, 16);
+    for n in (1..=80).chain([127, 128, 129, 255]) {
+        check_together(&triangles, &rays[..n], "tail");
+    }
+    for (tmin, tmax) in [(0.5, 1.0), (-1.0, 0.7), (0.0, 1e-3), (1.0, 0.5), (f32::NAN, 1.0), (0.8, f32::INFINITY)] {
+        let some: Vec<Ray> = rays.iter().map(|r| r.within(tmin, tmax)).collect();
+        check_together(&triangles, &some, "range");
+    }
+    // Among others; with directions that can hit nothing, and of any length.
+    let mut mixed = rays.clone();
+    for (i, r) in mixed.iter_mut().enumerate() {
+        match i % 97 {
+            90 => r.direction[i % 3] = f32::NAN,
+            91 => r.direction = [0.0; 3],
+            92 => r.origin[i % 3] = f32::INFINITY,
+            93 => r.direction[i % 3] = -0.0,
+            94 => r.direction = r.direction.map(|d| d * 1e20),
+            95 => r.origin[0] += 0.1,
+            _ => r.direction = r.direction.map(|d| d * (1.0 + i as f32)),
+        }
+    }
+    check_together(&triangles, &mixed, "mixed");
+}

@@ -56,15 +56,15 @@ impl<L: Lanes> V3<L> {
 pub(super) struct Shear {
     /// Of the scene's axes, which are x, y, and z of the frame. Right-handed if the direction's z is
     /// positive in it, left-handed if not: the winding of corners stays what it is seen from the origin.
-    axes: [u32; 3],
+    pub axes: [u32; 3],
     /// In the frame's order.
-    origin: [f32; 3],
+    pub origin: [f32; 3],
     /// Where the ray comes from: the direction negated, in the frame's order.
-    back: [f32; 3],
+    pub back: [f32; 3],
     /// −x/z and −y/z of the direction.
-    shear: [f32; 2],
+    pub shear: [f32; 2],
     /// [`GRAZING`] times the direction's length, at least.
-    grazing: f32,
+    pub grazing: f32,
 }
 
 impl Shear {
@@ -112,7 +112,13 @@ impl<L: Lanes> Projected<L> {
         };
         let ([ax, bx, cx], [ay, by, cy], [az, bz, cz]) = (axis(0), axis(1), axis(2));
         let corners = [V3 { x: ax, y: ay, z: az }, V3 { x: bx, y: by, z: bz }, V3 { x: cx, y: cy, z: cz }];
-        let (sx, sy) = unsafe { (L::splat(ray.shear[0]), L::splat(ray.shear[1])) };
+        Self::new(corners, unsafe { [L::splat(ray.shear[0]), L::splat(ray.shear[1])] })
+    }
+
+    /// From `corners` to the origin, in the ray's frame. Lanes are triangles of one ray, or rays of one
+    /// triangle.
+    #[inline(always)]
+    pub(super) fn new(corners: [V3<L>; 3], [sx, sy]: [L; 2]) -> Self {
         let [(ax, ay), (bx, by), (cx, cy)] = corners.map(|c| (sx.mul_add(c.z, c.x), sy.mul_add(c.z, c.y)));
         Projected { corners, u: ax * cy - ay * cx, v: bx * ay - by * ax, w: cx * by - cy * bx }
     }
@@ -137,12 +143,22 @@ impl<L: Lanes> Projected<L> {
     /// The CPU must have the ISA.
     #[inline(always)]
     pub(super) unsafe fn distances(&self, ray: &Shear) -> (L, L::Mask) {
+        // SAFETY: forwarded.
+        unsafe { self.distances_along(V3::splat(ray.back), L::splat(ray.grazing)) }
+    }
+
+    /// The same of rays by [`Shear::back`] and [`Shear::grazing`].
+    ///
+    /// # Safety
+    /// The CPU must have the ISA.
+    #[inline(always)]
+    pub(super) unsafe fn distances_along(&self, back: V3<L>, grazing: L) -> (L, L::Mask) {
         let [a, b, c] = self.corners;
         let (e0, e1) = (c.sub(a), b.sub(a));
         let normal = e0.cross(e1);
         // SAFETY (all): the caller vouches for the ISA.
         let splat = |x: f32| unsafe { L::splat(x) };
-        let (back, zero) = (unsafe { V3::splat(ray.back) }, splat(0.0));
+        let zero = splat(0.0);
         let slope = normal.dot(back);
         // Divided before the product with a corner, which may be too small for f32.
         let reciprocal = splat(1.0).div(slope);
@@ -150,7 +166,7 @@ impl<L: Lanes> Projected<L> {
         let abs = |x: L| x.max(zero - x);
         let area = abs(normal.x).max(abs(normal.y)).max(abs(normal.z));
         let is_fat = (splat(THIN) * e0.dot(e0).max(e1.dot(e1))).lt(area);
-        let is_steep = (splat(ray.grazing) * area).lt(abs(slope));
+        let is_steep = (grazing * area).lt(abs(slope));
         (t, is_fat.and(is_steep))
     }
 }
@@ -160,7 +176,7 @@ impl<L: Lanes> Projected<L> {
 const THIN: f32 = 0.05;
 
 /// Sine of the angle to a plane below which a ray grazes it, likewise.
-const GRAZING: f32 = 0.03;
+pub(super) const GRAZING: f32 = 0.03;
 
 /// The distance to a triangle's plane in f64 from the corners themselves, kept between the edges that the
 /// ray passes: all that is left to tell where it lies in the plane.

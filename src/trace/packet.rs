@@ -1,0 +1,608 @@
+//! Bundles of rays from a pinhole: consecutive rays with one origin that go nearly the same way pass
+//! the 8-wide tree together (Overbeck, Ramamoorthi and Mark, *Large Ray Packets for Real-time Whitted
+//! Ray Tracing*, 2008; Wald et al., *Interactive Rendering with Coherent Ray Tracing*, 2001).
+//!
+//! Of a node, the pyramid around the rays is tested against all eight children at once. What it meets is
+//! later tested against groups of rays, one ray per lane, from the first group that met the parent on; a
+//! node is entered at the first group that meets it, so that coherent rays cost one test or two per node.
+//! Leaves are tested group by group.
+//!
+//! Hits are those of [`single`], bit for bit: groups do its arithmetic, lane by lane. The pyramid may let
+//! through more boxes, but a triangle counts only for rays that meet the box of its leaf, and since
+//! rounding is monotonic these meet all boxes around it.
+
+use super::single::{self, EPSILON, STEEP, barycentrics, beyond};
+use super::triangle::{GRAZING, Projected, Shear, V3, accurate_distance};
+use super::{RawHit, Ray};
+use crate::bvh::layout::{ChildRef, MAX_LEAF, Mbvh, Node, STACK_SIZE, WIDTH};
+use crate::scene::NONE;
+use crate::simd::{Eight, Lanes, Mask, Simd};
+use std::mem::MaybeUninit;
+
+/// Most rays in a bundle. (In tiles of 4 × 4 pixels, 128 were no faster.)
+const SIZE: usize = 64;
+
+/// Fewer rays go alone.
+const LEAST: usize = 12;
+
+/// How far slopes against the longest axis may differ in a bundle.
+const SPREAD: f32 = 0.4;
+
+/// Closest hits of as many rays as both slices have: bundles together, others alone.
+///
+/// # Safety
+/// The CPU must have the ISA.
+#[inline(always)]
+pub(super) unsafe fn block<S: Simd>(bvh: &Mbvh, rays: &[Ray], out: &mut [RawHit]) {
+    let n = rays.len().min(out.len());
+    let (rays, out) = (&rays[..n], &mut out[..n]);
+    let mut start = 0;
+    while start < n {
+        let (mut end, mut length) = (start, 0);
+        while end < n {
+            length = bundle(&rays[end..]);
+            if length >= LEAST {
+                break;
+            }
+            end += length.max(1);
+            length = 0;
+        }
+        // SAFETY (both): forwarded; `bundle` has said that these are one.
+        if start < end {
+            let (rays, out) = (&rays[start..end], &mut out[start..end]);
+            unsafe { single::many::<S, false>(bvh, rays.len(), |i| rays[i], |i, hit| out[i] = hit) }
+        }
+        if length > 0 {
+            unsafe { trace::<S>(bvh, &rays[end..end + length], &mut out[end..end + length]) }
+        }
+        start = end + length;
+    }
+}
+
+/// The axis of the largest component, which must be the only one, of a direction which no test has to
+/// treat specially.
+#[inline(always)]
+fn longest_axis(d: [f32; 3]) -> Option<usize> {
+    let [x, y, z] = d.map(f32::abs);
+    let (k, least) = if x > y && x > z {
+        (0, y.min(z))
+    } else if y > z && y > x {
+        (1, x.min(z))
+    } else if z > x && z > y {
+        (2, x.min(y))
+    } else {
+        return None;
+    };
+    let largest = d[k].abs();
+    ((1e-6..=1e6).contains(&largest) && least > STEEP * largest).then_some(k)
+}
+
+/// How many rays, from the first, make a bundle: they share origin and range, and their directions octant
+/// and longest axis, and nearly their slopes. 0 or 1 if there is none.
+#[inline(always)]
+fn bundle(rays: &[Ray]) -> usize {
+    let first = &rays[0];
+    // By bits, and all at once, without branches.
+    let differ = |a: f32, b: f32| a.to_bits() ^ b.to_bits();
+    let same = |r: &Ray| {
+        let origin = (0..3).fold(0, |sum, a| sum | differ(r.origin[a], first.origin[a]));
+        origin | differ(r.tmin, first.tmin) | differ(r.tmax, first.tmax) == 0
+    };
+    // At once for most rays that are in no bundle.
+    if rays.len() < LEAST || !same(&rays[1]) || !(first.tmax > first.tmin) {
+        return 0;
+    }
+    let (Some(k), true) = (longest_axis(first.direction), first.origin.iter().all(|o| o.is_finite())) else { return 0 };
+    let (i, j) = ((k + 1) % 3, (k + 2) % 3);
+    let sign = first.direction.map(|d| 1f32.copysign(d));
+    let (mut least, mut most) = ([f32::INFINITY; 2], [0f32; 2]);
+    for (n, r) in rays.iter().take(SIZE).enumerate() {
+        let [x, y, z] = [r.direction[i] * sign[i], r.direction[j] * sign[j], r.direction[k] * sign[k]];
+        // What `longest_axis` asks, without branches, which took a tenth of the time; and the octant.
+        let is_alike = (x < z) & (y < z) & (x > STEEP * z) & (y > STEEP * z) & (z >= 1e-6) & (z <= 1e6);
+        let inverse = 1.0 / z;
+        for (a, s) in [x * inverse, y * inverse].into_iter().enumerate() {
+            least[a] = if s < least[a] { s } else { least[a] };
+            most[a] = if s > most[a] { s } else { most[a] };
+        }
+        let is_narrow = (most[0] - least[0] <= SPREAD) & (most[1] - least[1] <= SPREAD);
+        if !(same(r) & is_alike & is_narrow) {
+            return n;
+        }
+    }
+    rays.len().min(SIZE)
+}
+
+/// A value per ray.
+type Column = [f32; SIZE];
+
+/// The rays of a bundle, and the best hits so far as in [`single::Best`].
+#[repr(C, align(64))]
+struct Bundle {
+    direction: [Column; 3],
+    /// As in `RaySetup`.
+    reciprocal: [Column; 3],
+    near_offset: [Column; 3],
+    far_offset: [Column; 3],
+    /// As in [`Shear`].
+    shear: [Column; 2],
+    grazing: Column,
+    /// The largest component: from t to the distance along its axis.
+    length: Column,
+    /// Boxes that begin behind this are not entered. −inf behind the last ray.
+    limit: Column,
+    t: Column,
+    u: Column,
+    v: Column,
+    sum: Column,
+    /// Numbers as bits.
+    triangle: Column,
+}
+
+/// What the rays of a bundle share.
+struct Shared {
+    origin: [f32; 3],
+    tmin: f32,
+    /// Of the scene's axes in the rays' frames, as in [`Shear`].
+    axes: [usize; 3],
+    /// The origin in the order of `axes`.
+    frame_origin: [f32; 3],
+    negative: [bool; 3],
+    /// Of the octant in [`Node::order`].
+    shift: u32,
+    /// Groups of lanes that have rays.
+    groups: usize,
+}
+
+/// The pyramid around the rays. Distances are along the longest axis; they differ from t by a factor per ray.
+/// So the three intervals of a box are independent, and the test is exact but for rounding: a common
+/// distance exists if and only if one exists for any two of them.
+struct Pyramid {
+    /// 1 or −1: planes × `sign` + `near` or `far` are distances from the origin along the axis.
+    sign: [f32; 3],
+    near: [f32; 3],
+    far: [f32; 3],
+    /// Least and greatest reciprocal slopes.
+    least: [f32; 3],
+    most: [f32; 3],
+    /// Range of distances.
+    begin: f32,
+    end: f32,
+}
+
+/// More than what rounding may cost in the pyramid's tests.
+const SLACK: f32 = 2e-6;
+
+impl Pyramid {
+    /// Near distances of a node's boxes, and which of them the pyramid meets.
+    ///
+    /// # Safety
+    /// The CPU must have the ISA.
+    #[inline(always)]
+    unsafe fn node<S: Simd>(&self, node: &Node, negative: [bool; 3]) -> (S::F8, <S::F8 as Lanes>::Mask) {
+        // SAFETY: forwarded.
+        let [(nx, fx), (ny, fy), (nz, fz)] = unsafe {
+            [self.axis::<S>(node, 0, negative), self.axis::<S>(node, 1, negative), self.axis::<S>(node, 2, negative)]
+        };
+        // SAFETY: the caller vouches for the ISA.
+        let (begin, end) = unsafe { (S::F8::splat(self.begin), S::F8::splat(self.end)) };
+        let near = nx.max(ny).max(nz.max(begin));
+        let far = fx.min(fy).min(fz.min(end));
+        (near, near.le(far))
+    }
+
+    /// Distances of a node's near and far planes. (A function: as a closure it was not inlined.)
+    ///
+    /// # Safety
+    /// The CPU must have the ISA.
+    #[inline(always)]
+    unsafe fn axis<S: Simd>(&self, node: &Node, a: usize, negative: [bool; 3]) -> (S::F8, S::F8) {
+        let (near, far) = planes(node, a, negative);
+        // SAFETY: the caller vouches for the ISA; rows have eight floats.
+        unsafe {
+            let sign = S::F8::splat(self.sign[a]);
+            let near = S::F8::load(near.as_ptr()).mul_add(sign, S::F8::splat(self.near[a]));
+            let far = S::F8::load(far.as_ptr()).mul_add(sign, S::F8::splat(self.far[a]));
+            let (least, most) = (S::F8::splat(self.least[a]), S::F8::splat(self.most[a]));
+            ((near * least).min(near * most), (far * least).max(far * most))
+        }
+    }
+}
+
+/// Near and far planes of a node's children.
+#[inline(always)]
+fn planes(node: &Node, a: usize, negative: [bool; 3]) -> (&[f32; WIDTH], &[f32; WIDTH]) {
+    if negative[a] { (&node.upper[a], &node.lower[a]) } else { (&node.lower[a], &node.upper[a]) }
+}
+
+/// Children still to be visited, nearest on top.
+struct Stack {
+    near: [MaybeUninit<f32>; STACK_SIZE],
+    /// 8 · the parent's number + which child. (There are fewer nodes than triangle slots, of 2^28.)
+    child: [MaybeUninit<u32>; STACK_SIZE],
+    /// Groups that may meet it begin here.
+    first: [MaybeUninit<u8>; STACK_SIZE],
+}
+
+/// Lanes of group `g`.
+///
+/// # Safety
+/// The CPU must have the ISA; the group must lie in the column.
+#[inline(always)]
+unsafe fn lanes<L: Lanes>(column: &Column, g: usize) -> L {
+    debug_assert!((g + 1) * L::WIDTH <= SIZE);
+    // SAFETY: forwarded.
+    unsafe { L::load(column.as_ptr().add(g * L::WIDTH)) }
+}
+
+/// # Safety
+/// The group must lie in the column.
+#[inline(always)]
+unsafe fn store<L: Lanes>(column: &mut Column, g: usize, x: L) {
+    debug_assert!((g + 1) * L::WIDTH <= SIZE);
+    // SAFETY: forwarded.
+    unsafe { x.store(column.as_mut_ptr().add(g * L::WIDTH)) }
+}
+
+/// # Safety
+/// The CPU must have the ISA; the group must lie in the column.
+#[inline(always)]
+unsafe fn replace<L: Lanes>(column: &mut Column, g: usize, mask: L::Mask, x: L) {
+    // SAFETY: forwarded.
+    unsafe { store(column, g, L::select(mask, x, lanes(column, g))) }
+}
+
+/// Closest hits of a bundle.
+///
+/// # Safety
+/// The CPU must have the ISA; [`bundle`] must have said that all `rays` are one.
+#[inline(always)]
+unsafe fn trace<S: Simd>(bvh: &Mbvh, rays: &[Ray], out: &mut [RawHit]) {
+    let mut place = MaybeUninit::uninit();
+    // SAFETY (all below): the caller vouches for the ISA. Groups are below `shared.groups`, all of whose lanes
+    // `begin` writes. Children on the stack are of the tree, and the builder bounds its depth so that there
+    // is room (see `STACK_SIZE`).
+    let (shared, mut pyramid) = unsafe { begin::<S>(rays, &mut place) };
+    let rays = unsafe { place.assume_init_mut() };
+    let mut stack = MaybeUninit::<Stack>::uninit();
+    let stack = stack.as_mut_ptr();
+    let (nears, children, firsts) = unsafe {
+        (
+            (&raw mut (*stack).near).cast::<f32>(),
+            (&raw mut (*stack).child).cast::<u32>(),
+            (&raw mut (*stack).first).cast::<u8>(),
+        )
+    };
+    const IOTA: [u32; WIDTH] = [0, 1, 2, 3, 4, 5, 6, 7];
+    let (mut count, mut number, mut first) = (0, 0, 0);
+    loop {
+        unsafe {
+            let node = bvh.nodes.get_unchecked(number);
+            let (near, mask) = pyramid.node::<S>(node, shared.negative);
+            let children = children.add(count);
+            let n = near.compress(IOTA.as_ptr(), node.order.as_ptr(), shared.shift, mask, nears.add(count), children);
+            for i in 0..WIDTH {
+                *children.add(i) += (number * WIDTH) as u32;
+            }
+            firsts.add(count).cast::<[u8; WIDTH]>().write([first as u8; WIDTH]);
+            count += n;
+        }
+        loop {
+            if count == 0 {
+                finish(rays, out);
+                return;
+            }
+            count -= 1;
+            unsafe {
+                if *nears.add(count) > pyramid.end {
+                    continue;
+                }
+                let name = *children.add(count) as usize;
+                first = *firsts.add(count) as usize;
+                let (node, lane) = (bvh.nodes.get_unchecked(name / WIDTH), name % WIDTH);
+                let child = node.children[lane];
+                // The one that comes next, most likely.
+                if count > 0 {
+                    let next = *children.add(count - 1) as usize;
+                    bvh.prefetch(bvh.nodes.get_unchecked(next / WIDTH).children[next % WIDTH]);
+                }
+                let plane = |a: usize| {
+                    let (near, far) = planes(node, a, shared.negative);
+                    [S::Packet::splat(near[lane]), S::Packet::splat(far[lane])]
+                };
+                let planes = [plane(0), plane(1), plane(2)];
+                while first < shared.groups && !rays.meet::<S::Packet>(&planes, shared.tmin, first).any() {
+                    first += 1;
+                }
+                if first == shared.groups {
+                    continue;
+                }
+                if !child.is_leaf() {
+                    number = child.node_index();
+                    break;
+                }
+                if rays.leaf::<S>(bvh, child, &shared, &planes, first) {
+                    pyramid.end = rays.end::<S::Packet>(shared.groups);
+                }
+            }
+        }
+    }
+}
+
+/// Sets up a bundle in `place`.
+///
+/// # Safety
+/// As for [`trace`].
+#[inline(always)]
+unsafe fn begin<S: Simd>(rays: &[Ray], place: &mut MaybeUninit<Bundle>) -> (Shared, Pyramid) {
+    let width = S::Packet::WIDTH;
+    let Ray { origin, direction, tmin, tmax } = rays[0];
+    let axes = Shear::new(origin, direction).axes.map(|a| a as usize);
+    let negative = direction.map(|d| d < 0.0);
+    let shift = 3 * (negative[0] as u32 | (negative[1] as u32) << 1 | (negative[2] as u32) << 2);
+    let frame_origin = axes.map(|a| origin[a]);
+    let shared = Shared { origin, tmin, axes, frame_origin, negative, shift, groups: rays.len().div_ceil(width) };
+    // SAFETY: zeros are f32s.
+    let b = unsafe {
+        place.as_mut_ptr().write_bytes(0, 1);
+        place.assume_init_mut()
+    };
+    for i in 0..shared.groups * width {
+        let (d, limit) =
+            if i < rays.len() { (rays[i].direction, beyond(tmax)) } else { (direction, f32::NEG_INFINITY) };
+        (b.direction[0][i], b.direction[1][i], b.direction[2][i]) = (d[0], d[1], d[2]);
+        b.limit[i] = limit;
+    }
+    // SAFETY (all below): the caller vouches for the ISA; groups are of the bundle.
+    unsafe {
+        let splat = |x: f32| S::Packet::splat(x);
+        let zero = splat(0.0);
+        let abs = |x: S::Packet| x.max(zero - x);
+        let [i, j, k] = axes;
+        let (mut least, mut most) = ([splat(f32::INFINITY); 3], [zero; 3]);
+        for g in 0..shared.groups {
+            let d: [S::Packet; 3] = [lanes(&b.direction[0], g), lanes(&b.direction[1], g), lanes(&b.direction[2], g)];
+            let length = abs(d[k]);
+            for a in 0..3 {
+                let r = splat(1.0).div(d[a]);
+                let offset = splat(-origin[a]) * r;
+                let error = splat(6.0 * EPSILON) * abs(offset);
+                store(&mut b.reciprocal[a], g, r);
+                store(&mut b.near_offset[a], g, offset - error);
+                store(&mut b.far_offset[a], g, offset + error);
+                let r = abs(r) * length;
+                (least[a], most[a]) = (least[a].min(r), most[a].max(r));
+            }
+            let inverse = splat(-1.0).div(d[k]);
+            store(&mut b.shear[0], g, d[i] * inverse);
+            store(&mut b.shear[1], g, d[j] * inverse);
+            store(&mut b.grazing, g, splat(GRAZING) * (abs(d[0]) + abs(d[1]) + abs(d[2])));
+            store(&mut b.length, g, length);
+            store(&mut b.t, g, splat(tmax));
+            store(&mut b.u, g, zero);
+            store(&mut b.v, g, zero);
+            store(&mut b.sum, g, splat(1.0));
+            store(&mut b.triangle, g, splat(f32::from_bits(NONE)));
+        }
+        let lengths = &b.length[..rays.len()];
+        let (shortest, longest) = lengths.iter().fold((f32::INFINITY, 0f32), |(a, b), &l| (a.min(l), b.max(l)));
+        let begin = tmin * if tmin < 0.0 { longest } else { shortest };
+        let least = [least[0].to_array(), least[1].to_array(), least[2].to_array()];
+        let most = [most[0].to_array(), most[1].to_array(), most[2].to_array()];
+        let sign = negative.map(|n| if n { -1.0 } else { 1.0 });
+        // More than what rays alone take off for rounding, which all of them do.
+        let margin = origin.map(|o| 16.0 * EPSILON * o.abs());
+        let pyramid = Pyramid {
+            sign,
+            near: [0, 1, 2].map(|a| -origin[a] * sign[a] - margin[a]),
+            far: [0, 1, 2].map(|a| -origin[a] * sign[a] + margin[a]),
+            least: least.map(|r| r[..width].iter().fold(f32::INFINITY, |a, &b| a.min(b)) * (1.0 - SLACK)),
+            most: most.map(|r| r[..width].iter().fold(0f32, |a, &b| a.max(b)) * (1.0 + SLACK)),
+            begin: begin - SLACK * begin.abs(),
+            end: b.end::<S::Packet>(shared.groups),
+        };
+        (shared, pyramid)
+    }
+}
+
+/// Hits from the best ones.
+#[inline(always)]
+fn finish(rays: &Bundle, out: &mut [RawHit]) {
+    // Like this the divisions become vectors'.
+    let (mut u, mut v): (Column, Column) = ([0.0; SIZE], [0.0; SIZE]);
+    for i in 0..SIZE {
+        (u[i], v[i]) = barycentrics(rays.u[i], rays.v[i], rays.sum[i]);
+    }
+    for (i, out) in out.iter_mut().enumerate() {
+        let hit =
+            RawHit { t: rays.t[i], u: u[i], v: v[i], triangle: rays.triangle[i].to_bits(), front: rays.sum[i] > 0.0 };
+        *out = if hit.is_miss() { RawHit::MISS } else { hit };
+    }
+}
+
+impl Bundle {
+    /// Which rays of a group meet a box, by its near and far planes per axis: what `RaySetup::node` does.
+    ///
+    /// # Safety
+    /// The CPU must have the ISA; the group must be of the bundle.
+    #[inline(always)]
+    unsafe fn meet<L: Lanes>(&self, planes: &[[L; 2]; 3], tmin: f32, g: usize) -> L::Mask {
+        // SAFETY: forwarded.
+        unsafe {
+            let axis = |a: usize| {
+                let r = lanes::<L>(&self.reciprocal[a], g);
+                (
+                    planes[a][0].mul_add(r, lanes(&self.near_offset[a], g)),
+                    planes[a][1].mul_add(r, lanes(&self.far_offset[a], g)),
+                )
+            };
+            let ((nx, fx), (ny, fy), (nz, fz)) = (axis(0), axis(1), axis(2));
+            let near = nx.max(ny).max(nz.max(L::splat(tmin)));
+            near.le(fx.min(fy).min(fz.min(lanes(&self.limit, g))))
+        }
+    }
+
+    /// Greatest distance, along the longest axis, at which any ray may still find something.
+    ///
+    /// # Safety
+    /// The CPU must have the ISA; there must be as many groups.
+    #[inline(always)]
+    unsafe fn end<L: Lanes>(&self, groups: usize) -> f32 {
+        // SAFETY: forwarded.
+        let end = unsafe {
+            let mut end = L::splat(f32::NEG_INFINITY);
+            for g in 0..groups {
+                end = end.max(lanes::<L>(&self.limit, g) * lanes(&self.length, g));
+            }
+            end.to_array()[..L::WIDTH].iter().copied().fold(f32::NEG_INFINITY, f32::max)
+        };
+        end + SLACK * end.abs()
+    }
+
+    /// Improves hits by the triangles of a leaf in the box of `planes`, from group `first` on; says whether
+    /// it did.
+    ///
+    /// # Safety
+    /// The CPU must have the ISA; `leaf` must be a leaf of `bvh`.
+    #[inline(always)]
+    unsafe fn leaf<S: Simd>(
+        &mut self,
+        bvh: &Mbvh,
+        leaf: ChildRef,
+        shared: &Shared,
+        planes: &[[S::Packet; 2]; 3],
+        first: usize,
+    ) -> bool {
+        let (rows, count) = (bvh.leaf(leaf), leaf.leaf_count());
+        // From corners to the origin, in the frame that all rays share.
+        let mut corners = [[0.0f32; MAX_LEAF]; 9];
+        // SAFETY (all below): rows are `count` apart, and the pad behind the last leaf covers reads beyond
+        // it; `corners` have room for twice four. The caller vouches for the ISA.
+        for i in (0..count).step_by(4) {
+            for a in 0..3 {
+                unsafe {
+                    let origin = S::F4::splat(shared.frame_origin[a]);
+                    let row = rows.add(i + shared.axes[a] * count);
+                    for corner in 0..3 {
+                        let relative = origin - S::F4::load(row.add(3 * corner * count));
+                        relative.store(corners[3 * corner + a].as_mut_ptr().add(i));
+                    }
+                }
+            }
+        }
+        let mut improved = false;
+        for g in first..shared.groups {
+            let meets = unsafe { self.meet::<S::Packet>(planes, shared.tmin, g) };
+            if !meets.any() {
+                continue;
+            }
+            let shear = unsafe { [lanes(&self.shear[0], g), lanes(&self.shear[1], g)] };
+            for i in 0..count {
+                let corner = |k: usize| unsafe {
+                    V3::<S::Packet>::splat([corners[3 * k][i], corners[3 * k + 1][i], corners[3 * k + 2][i]])
+                };
+                let seen = Projected::new([corner(0), corner(1), corner(2)], shear);
+                let candidates = unsafe { seen.inside() }.and(meets);
+                if candidates.any() {
+                    improved |= unsafe { self.improve(rows, count, i, shared, g, &seen, candidates) };
+                }
+            }
+        }
+        improved
+    }
+
+    /// Improves the hits of `candidates` of group `g` by triangle `i` of a leaf; says whether it did.
+    ///
+    /// # Safety
+    /// The CPU must have the ISA; `rows` must be a leaf of `count` triangles, more than `i`.
+    #[inline(always)]
+    unsafe fn improve<L: Lanes>(
+        &mut self,
+        rows: *const f32,
+        count: usize,
+        i: usize,
+        shared: &Shared,
+        g: usize,
+        seen: &Projected<L>,
+        candidates: L::Mask,
+    ) -> bool {
+        // SAFETY (all below): the caller vouches for the ISA, the group and the leaf.
+        unsafe {
+            let zero = L::splat(0.0);
+            let [i0, i1, i2] = shared.axes;
+            let back = V3 {
+                x: zero - lanes(&self.direction[i0], g),
+                y: zero - lanes(&self.direction[i1], g),
+                z: zero - lanes(&self.direction[i2], g),
+            };
+            let (mut t, is_accurate) = seen.distances_along(back, lanes(&self.grazing, g));
+            let sum = seen.u + seen.v + seen.w;
+            let inaccurate = candidates.bits() & !is_accurate.bits();
+            if inaccurate != 0 {
+                let mut array = t.to_array();
+                self.accurate(rows, count, i, shared, g * L::WIDTH, &sum.to_array(), inaccurate, &mut array);
+                t = L::load(array.as_ptr());
+            }
+            let best = lanes::<L>(&self.t, g);
+            let in_range = candidates.and(L::splat(shared.tmin).lt(t));
+            // Among equal t, the lowest number.
+            let number = rows.add(9 * count + i).read();
+            let mut equal = in_range.and(t.eq(best)).bits();
+            let nearer = in_range.and(t.lt(best));
+            let mut improved = nearer.any();
+            if improved {
+                replace(&mut self.t, g, nearer, t);
+                replace(&mut self.u, g, nearer, seen.u);
+                replace(&mut self.v, g, nearer, seen.v);
+                replace(&mut self.sum, g, nearer, sum);
+                replace(&mut self.triangle, g, nearer, L::splat(number));
+                // As `beyond`.
+                replace(&mut self.limit, g, nearer, t + L::splat(4e-6) * t.max(zero - t));
+            }
+            if equal != 0 {
+                let (t, u, v, sum) = (t.to_array(), seen.u.to_array(), seen.v.to_array(), sum.to_array());
+                while equal != 0 {
+                    let lane = equal.trailing_zeros() as usize;
+                    equal &= equal - 1;
+                    let ray = g * L::WIDTH + lane;
+                    if number.to_bits() < self.triangle[ray].to_bits() {
+                        (self.t[ray], self.u[ray], self.v[ray], self.sum[ray]) = (t[lane], u[lane], v[lane], sum[lane]);
+                        (self.triangle[ray], self.limit[ray]) = (number, beyond(t[lane]));
+                        improved = true;
+                    }
+                }
+            }
+            improved
+        }
+    }
+
+    /// Puts the distances of `inaccurate` rays of those from `first` on right, as for rays alone.
+    ///
+    /// # Safety
+    /// `rows` must be a leaf of `count` triangles, more than `i`.
+    #[cold]
+    unsafe fn accurate(
+        &self,
+        rows: *const f32,
+        count: usize,
+        i: usize,
+        shared: &Shared,
+        first: usize,
+        sums: &[f32; 16],
+        mut inaccurate: u32,
+        t: &mut [f32; 16],
+    ) {
+        while inaccurate != 0 {
+            let lane = inaccurate.trailing_zeros() as usize;
+            inaccurate &= inaccurate - 1;
+            let direction = [0, 1, 2].map(|a| self.direction[a][first + lane]);
+            // Where all edge functions vanish, the ray lies in the plane.
+            t[lane] = if sums[lane] != 0.0 {
+                // SAFETY: forwarded.
+                unsafe { accurate_distance(rows, count, i, &Shear::new(shared.origin, direction)) }
+            } else {
+                f32::NAN
+            };
+        }
+    }
+}
