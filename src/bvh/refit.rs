@@ -17,6 +17,7 @@ const PARALLEL_SUBTREE: usize = 256;
 /// What lies below a node in memory, because the collapse works depth-first: the node's inner children,
 /// one after the other, then all that lies below the first of them, below the second, and so on; and the
 /// rows of the node's leaves, then of those below the first inner child, and so on.
+#[derive(Default)]
 struct Part<'a> {
     nodes: &'a mut [Node],
     /// Number of `nodes[0]`.
@@ -102,12 +103,6 @@ fn refit_node(node: &mut Node, part: Part, corners: &(impl Fn(u32) -> [Vec3; 3] 
     }
     node.sort_children();
     Below { bounds: boxes.into_iter().fold(Box4::EMPTY, Box4::join), out }
-}
-
-impl Default for Part<'_> {
-    fn default() -> Self {
-        Part { nodes: &mut [], first_node: 0, rows: &mut [], first_slot: 0 }
-    }
 }
 
 fn leaves(node: &Node) -> impl Iterator<Item = (usize, ChildRef)> + use<> {

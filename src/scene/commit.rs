@@ -557,7 +557,8 @@ mod tests {
         let mut s = scene();
         let fine = FLOOR.map(|c| c + 9.0 * Vec3::Z);
         let nothing = [Vec3::ZERO; 6];
-        let refused: [(&[(u32, &[Vec3])], &str); 3] = [
+        type Moves<'a> = &'a [(u32, &'a [Vec3])];
+        let refused: [(Moves, &str); 3] = [
             (&[(1, &fine), (7, &fine)], "mesh 7 does not exist"),
             (&[(1, &fine), (0, &fine)], "positions has 3 entries for 6 vertices"),
             (&[(0, &nothing), (1, &nothing[..3])], "all triangles"),

@@ -42,7 +42,7 @@ pub(super) fn direction_scale(ray: &Ray) -> Option<f32> {
     let ([x, y, z], [ox, oy, oz]) = (ray.direction, ray.origin);
     let largest = x.abs().max(y.abs()).max(z.abs());
     // Any NaN or infinity makes this NaN; `max` alone would lose a NaN.
-    let zero = (x - x) + (y - y) + (z - z) + ((ox - ox) + (oy - oy) + (oz - oz));
+    let zero = (0.0 * x + 0.0 * y + 0.0 * z) + (0.0 * ox + 0.0 * oy + 0.0 * oz);
     if zero != 0.0 || largest == 0.0 {
         return None;
     }
