@@ -126,8 +126,8 @@ pub unsafe extern "C" fn bk_occluded_many(
 }
 
 /// cbindgen:ptrs-as-arrays=[[origin; 3]]
-/// The closest hits of rays that share an origin, with 0 < t <= tmax. Faster than as many single
-/// rays, the more so the more directions there are (32 and up).
+/// The closest hits of rays that share an origin, with 0 < t <= tmax: those of bk_intersect_many.
+/// Faster than as many single rays; use 32 directions and more.
 ///
 /// directions: count directions of three floats, packed, aligned to 4 bytes. flags:
 /// BK_RAYS_PARALLEL. out: receives count hits in the order of the directions; must not overlap them.
