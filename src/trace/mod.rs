@@ -171,12 +171,13 @@ impl Scene {
             return invalid_argument!("{} directions, but room for {} hits", directions.len(), out.len());
         }
         let block = |directions: &[[f32; 3]], out: &mut [Hit]| {
-            let mut rays = [Ray::new(origin, Vec3::ZERO).within(0.0, tmax); 128];
-            let mut raw = [RawHit::MISS; 128];
-            for (directions, out) in directions.chunks(128).zip(out.chunks_mut(128)) {
-                rays.iter_mut().zip(directions).for_each(|(ray, &d)| ray.direction = d);
-                self.device().kernels().intersect_block(self.mbvh(), &rays[..directions.len()], &mut raw);
-                self.to_hits(&raw, out);
+            // (Blocks of 128 through `intersect_block` are a fifth slower: it looks for bundles.)
+            let mut raw = [RawHit::MISS; PACKET_SIZE];
+            for (d, o) in directions.chunks(PACKET_SIZE).zip(out.chunks_mut(PACKET_SIZE)) {
+                let mut packet = Packet::default();
+                d.iter().for_each(|&d| packet.push(Vec3::from_array(d)));
+                self.gather_packet(origin, &packet, 0.0, tmax, &mut raw);
+                o.iter_mut().zip(&raw).for_each(|(o, &r)| *o = self.to_hit(r));
             }
         };
         if parallel {
