@@ -7,6 +7,9 @@
 #
 # BAKELITE_SCENES: a folder of real scenes to compare with Embree on, beside the built-in ones
 # (default: ../shared/scenes, if there is such a folder).
+# PROPTEST_RNG_SEED, PROPTEST_CASES: where property tests start (the same place each time, so that a
+# failure is the change's) and how many cases they try. To look for what no run has met yet:
+#     PROPTEST_CASES=10000 cargo test --release --locked --all-features
 set -euo pipefail
 cd "$(dirname "$0")/.."
 root=$PWD
@@ -59,6 +62,7 @@ echo '== Rust, without features'
 cargo check --release --locked --no-default-features
 
 echo '== Rust, with all features'
+export PROPTEST_RNG_SEED=${PROPTEST_RNG_SEED:-1}
 cargo test --release --locked --all-features --no-fail-fast 2>&1 | tee -a "$log" || verdict=1
 
 echo '== C and C++'

@@ -669,20 +669,25 @@ impl Flat {
     }
 
     /// Weights of corners 1 and 2 for a point of the triangle; points just outside are moved in.
+    ///
+    /// First how far along the longest edge, which every triangle tells well, then how far across,
+    /// which in a sliver is a quotient of rounding errors and gives way: so the weights' point is
+    /// never farther from `p` than the triangle is high.
     fn weights(&self, p: DVec2) -> [f64; 2] {
-        let [a, b, c] = self.0;
-        if self.altitude() <= THIN {
-            let (i, j) = self.longest_edge();
-            let mut weights = [0.0; 3];
-            let t = fraction_on_segment(self.0[i], self.0[j], p);
-            (weights[i], weights[j]) = (1.0 - t, t);
-            return [weights[1], weights[2]];
-        }
-        let det = (b - a).perp_dot(c - a);
-        let u = ((p - a).perp_dot(c - a) / det).max(0.0);
-        let v = ((b - a).perp_dot(p - a) / det).max(0.0);
-        let excess = (u + v).max(1.0);
-        [u / excess, v / excess]
+        let (i, j) = self.longest_edge();
+        let k = 3 - i - j;
+        let [origin, edge, apex] = [self.0[i], self.0[j] - self.0[i], self.0[k] - self.0[i]];
+        let along = fraction_on_segment(origin, self.0[j], p);
+        let apex_along = fraction_on_segment(origin, self.0[j], self.0[k]);
+        let height = edge.perp_dot(apex);
+        let across = if height != 0.0 { edge.perp_dot(p - origin) / height } else { 0.0 };
+        let most_of = |along: f64, apex_along: f64| if apex_along > 0.0 { along / apex_along } else { f64::INFINITY };
+        let most = most_of(along, apex_along).min(most_of(1.0 - along, 1.0 - apex_along));
+        let mut weights = [0.0; 3];
+        weights[k] = across.max(0.0).min(most);
+        weights[j] = (along - weights[k] * apex_along).max(0.0);
+        weights[i] = 1.0 - weights[j] - weights[k];
+        [weights[1].max(0.0), weights[2].max(0.0)]
     }
 }
 

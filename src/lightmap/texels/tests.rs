@@ -19,8 +19,8 @@ fn triangles() -> impl Strategy<Value = Flat> {
     let point = || (0.0..16.0, 0.0..12.0);
     let any = [point(), point(), point()].prop_map(flat);
     let sliver =
-        (point(), point(), 0.0..1.0, -1e-6..1e-6).prop_map(|(a, b, t, d): ((f64, f64), (f64, f64), f64, f64)| {
-            let c = (a.0 + t * (b.0 - a.0), (a.1 + t * (b.1 - a.1) + d).clamp(0.0, 12.0));
+        (point(), point(), 0.0..1.0, -14.0..-4.0).prop_map(|(a, b, t, d): ((f64, f64), (f64, f64), f64, f64)| {
+            let c = (a.0 + t * (b.0 - a.0), (a.1 + t * (b.1 - a.1) + 10f64.powf(d)).clamp(0.0, 12.0));
             flat([a, b, c])
         });
     let small = (0.0..15.0, 0.0..11.0, [(0.0..1.0, 0.0..1.0), (0.0..1.0, 0.0..1.0), (0.0..1.0, 0.0..1.0)])
