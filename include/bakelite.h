@@ -255,7 +255,7 @@ typedef struct bk_build_params {
   // One of BK_BUILD_QUALITY_*. Default: BK_BUILD_QUALITY_DEFAULT.
   uint32_t quality;
   // With BK_BUILD_QUALITY_HIGH: most references that cuts may add, in parts of the number of
-  // triangles, 0 to 4; memory grows by at most as much. Default: 0.25.
+  // triangles, 0 to 4; leaves grow by at most as much. Default: 0.25.
   float split_budget;
 } bk_build_params;
 

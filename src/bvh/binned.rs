@@ -741,7 +741,7 @@ impl BinaryBvh {
 }
 
 #[cfg(test)]
-mod tests {
+pub(super) mod tests {
     use super::*;
     use crate::sampling::uniform;
 
@@ -814,23 +814,24 @@ mod tests {
         }
     }
 
-    #[test]
-    fn the_tree_does_not_depend_on_the_number_of_threads() {
-        let corners = soup(100_000, 9, 0.01);
+    /// Builds with 1, 2 and 7 threads, which must give the same bits.
+    pub(in crate::bvh) fn assert_no_matter_how_many_threads(build: impl Fn() -> BinaryBvh + Sync) {
         let trees: Vec<_> = [1, 2, 7]
             .into_iter()
             .map(|n| {
-                let pool = rayon::ThreadPoolBuilder::new().num_threads(n).build().unwrap();
-                let b = pool.install(|| build(&corners, BuildOptions::default()));
-                let bits: Vec<_> = b
-                    .nodes
-                    .iter()
-                    .map(|n| (n.lower.to_array().map(f32::to_bits), n.upper.to_array().map(f32::to_bits), n.index))
-                    .collect();
-                (b.triangles, bits)
+                let b = rayon::ThreadPoolBuilder::new().num_threads(n).build().unwrap().install(&build);
+                let bits = |v: Vec3| v.to_array().map(f32::to_bits);
+                let nodes: Vec<_> = b.nodes.iter().map(|n| (bits(n.lower), bits(n.upper), n.index, n.count)).collect();
+                (b.triangles, nodes)
             })
             .collect();
         assert!(trees.iter().all(|t| *t == trees[0]));
+    }
+
+    #[test]
+    fn the_tree_does_not_depend_on_the_number_of_threads() {
+        let corners = soup(100_000, 9, 0.01);
+        assert_no_matter_how_many_threads(|| build(&corners, BuildOptions::default()));
     }
 
     #[test]

@@ -1,5 +1,5 @@
-//! Acceleration structures: a binary tree built by binned SAH, with spatial splits if asked, collapsed to the 8-wide MBVH that the
-//! kernels traverse.
+//! Acceleration structures: a binary tree built by binned SAH, with spatial splits if asked, collapsed to
+//! the 8-wide MBVH that the kernels traverse.
 
 mod binned;
 mod collapse;
@@ -36,7 +36,7 @@ pub struct BuildOptions {
     /// Whether triangles may be cut by spatial splits.
     pub quality: BuildQuality,
     /// With [`BuildQuality::High`]: most references that cuts may add, in parts of the number of
-    /// triangles, 0 to 4. Memory of the tree grows by at most as much. Default: 0.25.
+    /// triangles, 0 to 4. Leaves grow by at most as much. Default: 0.25.
     pub split_budget: f32,
 }
 

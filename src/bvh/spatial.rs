@@ -594,6 +594,7 @@ impl BinaryBvh {
 mod tests {
     use super::*;
     use crate::bvh::BuildQuality;
+    use crate::bvh::binned::tests::assert_no_matter_how_many_threads;
     use crate::bvh::layout::MAX_DEPTH;
     use crate::sampling::uniform;
 
@@ -754,20 +755,7 @@ mod tests {
     #[test]
     fn the_tree_does_not_depend_on_the_number_of_threads() {
         let corners = needles(60_000);
-        let trees: Vec<_> = [1, 2, 7]
-            .into_iter()
-            .map(|n| {
-                let pool = rayon::ThreadPoolBuilder::new().num_threads(n).build().unwrap();
-                let b = pool.install(|| build(&corners, &options(0.5)));
-                let bits: Vec<_> = b
-                    .nodes
-                    .iter()
-                    .map(|n| (n.lower.to_array().map(f32::to_bits), n.upper.to_array().map(f32::to_bits), n.index))
-                    .collect();
-                (b.triangles, bits)
-            })
-            .collect();
-        assert!(trees.iter().all(|t| *t == trees[0]));
+        assert_no_matter_how_many_threads(|| build(&corners, &options(0.5)));
     }
 
     #[test]

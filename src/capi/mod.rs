@@ -4,8 +4,8 @@
 //! [`lights`], [`rays`], [`photons`], [`lightmap`], [`bake`], [`read`], [`live`]. cbindgen makes the
 //! header from exactly these files (`capi-tests/header.rs`); their `//!` heads become the sections'
 //! heads and every public item's documentation becomes the manual, so both are written for the C
-//! reader. `handles`, `shared` and `args` hold what the
-//! sections share.
+//! reader. `handles`, `shared` and `args` hold what the sections
+//! share.
 //!
 //! # Safety
 //!

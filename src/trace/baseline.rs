@@ -48,7 +48,7 @@ fn slab(node: &BinaryNode, origin: Vec3, reciprocal: Vec3, tmin: f32, tmax: f32)
     if near <= far.min(super::single::beyond(tmax)) { near } else { f32::INFINITY }
 }
 
-/// Edge functions as in [`super::triangle`].
+/// Edge functions in 3D (Kensler and Shirley 2006): other arithmetic than that of the kernels.
 fn intersect(corners: &[Vec3; 3], triangle: u32, origin: Vec3, direction: Vec3) -> Option<RawHit> {
     let [v0, v1, v2] = corners.map(|c| c - origin);
     let u = (v2 - v0).cross(v2 + v0).dot(direction);

@@ -11,7 +11,7 @@
 //! through more boxes, but a triangle counts only for rays that meet the box of its leaf, and since
 //! rounding is monotonic these meet all boxes around it.
 
-use super::single::{self, EPSILON, STEEP, barycentrics, beyond};
+use super::single::{self, BEYOND, EPSILON, OFFSET_ERROR, STEEP, barycentrics, beyond};
 use super::triangle::{GRAZING, Projected, Shear, V3, accurate_distance};
 use super::{RawHit, Ray};
 use crate::bvh::layout::{ChildRef, MAX_LEAF, Mbvh, Node, STACK_SIZE, WIDTH};
@@ -273,17 +273,14 @@ unsafe fn trace<S: Simd>(bvh: &Mbvh, rays: &[Ray], out: &mut [RawHit]) {
             (&raw mut (*stack).first).cast::<u8>(),
         )
     };
-    const IOTA: [u32; WIDTH] = [0, 1, 2, 3, 4, 5, 6, 7];
     let (mut count, mut number, mut first) = (0, 0, 0);
     loop {
         unsafe {
             let node = bvh.nodes.get_unchecked(number);
             let (near, mask) = pyramid.node::<S>(node, shared.negative);
-            let children = children.add(count);
-            let n = near.compress(IOTA.as_ptr(), node.order.as_ptr(), shared.shift, mask, nears.add(count), children);
-            for i in 0..WIDTH {
-                *children.add(i) += (number * WIDTH) as u32;
-            }
+            let names: [u32; WIDTH] = std::array::from_fn(|i| (number * WIDTH + i) as u32);
+            let (nears, children) = (nears.add(count), children.add(count));
+            let n = near.compress(names.as_ptr(), node.order.as_ptr(), shared.shift, mask, nears, children);
             firsts.add(count).cast::<[u8; WIDTH]>().write([first as u8; WIDTH]);
             count += n;
         }
@@ -366,7 +363,7 @@ unsafe fn begin<S: Simd>(rays: &[Ray], place: &mut MaybeUninit<Bundle>) -> (Shar
             for a in 0..3 {
                 let r = splat(1.0).div(d[a]);
                 let offset = splat(-origin[a]) * r;
-                let error = splat(6.0 * EPSILON) * abs(offset);
+                let error = splat(OFFSET_ERROR) * abs(offset);
                 store(&mut b.reciprocal[a], g, r);
                 store(&mut b.near_offset[a], g, offset - error);
                 store(&mut b.far_offset[a], g, offset + error);
@@ -557,7 +554,7 @@ impl Bundle {
                 replace(&mut self.sum, g, nearer, sum);
                 replace(&mut self.triangle, g, nearer, L::splat(number));
                 // As `beyond`.
-                replace(&mut self.limit, g, nearer, t + L::splat(4e-6) * t.max(zero - t));
+                replace(&mut self.limit, g, nearer, t + L::splat(BEYOND) * t.max(zero - t));
             }
             if equal != 0 {
                 let (t, u, v, sum) = (t.to_array(), seen.u.to_array(), seen.v.to_array(), sum.to_array());

@@ -1,8 +1,8 @@
 //! Single rays through the 8-wide tree: ordered closest hit and any hit (thesis 3.1.2; Wald,
 //! Benthin and Boulos, *Getting Rid of Packets*, 2008; Dammertz et al. 2008).
 //!
-//! The box test is conservative (Ize, *Robust BVH Ray Traversal*, 2013): far distances are scaled
-//! up by more than the rounding of three operations.
+//! The box test is conservative (Ize, *Robust BVH Ray Traversal*, 2013): the builder moves planes, and
+//! a ray its origin, by more than rounding can.
 
 use super::triangle::{Projected, Shear, accurate_distance};
 use super::{RawHit, Ray};
@@ -11,15 +11,18 @@ use crate::scene::NONE;
 use crate::simd::{Eight, Lanes, Mask, Simd};
 use std::mem::MaybeUninit;
 
-/// Ize's 1 + 2γ₃ for the box test, rounded up.
+/// Ize's 1 + 2γ₃ for box tests that subtract the origin from planes, rounded up.
 pub(super) const FAR_SCALE: f32 = 1.0 + 4e-7;
 
 /// A box is entered up to this distance: a triangle's t has a larger rounding error than its box's, and
 /// of triangles at equal t all must be seen.
 #[inline(always)]
 pub(super) fn beyond(t: f32) -> f32 {
-    t + 4e-6 * t.abs()
+    t + BEYOND * t.abs()
 }
+
+/// See [`beyond`].
+pub(super) const BEYOND: f32 = 4e-6;
 
 /// A direction component below this fraction of the largest counts as zero in box tests.
 pub(super) const PARALLEL: f32 = 1e-18;
@@ -34,9 +37,8 @@ pub(super) fn nudge(origin: f32) -> f32 {
     (origin.abs() * 2.4e-7).max(1e-20)
 }
 
-/// Powers of two that bring any direction's largest component into a range where the reciprocals
-/// and products of the tests neither overflow nor vanish: (scale, largest component), or `None` for
-/// a ray that can hit nothing.
+/// The power of two that brings a direction's largest component into a range where the reciprocals and
+/// products of the tests neither overflow nor vanish; `None` for a ray that can hit nothing.
 #[inline(always)]
 pub(super) fn direction_scale(ray: &Ray) -> Option<f32> {
     let ([x, y, z], [ox, oy, oz]) = (ray.direction, ray.origin);
@@ -59,6 +61,11 @@ pub(super) const STEEP: f32 = 1e-10;
 
 /// Rounding of one operation.
 pub(super) const EPSILON: f32 = f32::EPSILON / 2.0;
+
+/// Bound, as a part of the product of origin and reciprocal, of its rounding, of the reciprocal's, of the
+/// box test's fused sum and of the sum with this, and some to spare. (The builder has moved planes outwards
+/// by their own share.)
+pub(super) const OFFSET_ERROR: f32 = 6.0 * EPSILON;
 
 /// What a ray is for the tests.
 #[derive(Clone, Copy)]
@@ -89,9 +96,7 @@ impl RaySetup {
         let negative: [u32; 3] = std::array::from_fn(|a| (direction[a] < 0.0) as u32);
         let reciprocal = direction.map(|d| 1.0 / d);
         let offset: [f32; 3] = std::array::from_fn(|a| -origin[a] * reciprocal[a]);
-        // Of the product above, of the reciprocal, of the test's fused sum, of the sum below, and some to
-        // spare. (The builder has moved planes outwards by their own share.)
-        let error: [f32; 3] = std::array::from_fn(|a| 6.0 * EPSILON * offset[a].abs());
+        let error: [f32; 3] = std::array::from_fn(|a| OFFSET_ERROR * offset[a].abs());
         let near = std::array::from_fn(|a| ROW * (a as u32 + 3 * negative[a]));
         let mut ray = RaySetup {
             reciprocal,
@@ -168,7 +173,7 @@ pub(super) struct Best {
     pub triangle: u32,
     pub u: f32,
     pub v: f32,
-    /// u + v + w: -2 normal · direction up to a factor: positive on the front.
+    /// u + v + w: positive where the ray meets the front.
     pub sum: f32,
 }
 
@@ -288,25 +293,13 @@ impl Stack {
     }
 
     /// Drops what begins behind `tmax`.
-    ///
-    /// # Safety
-    /// The CPU must have the ISA.
     #[inline(always)]
-    unsafe fn cut<S: Simd>(&mut self, tmax: f32) {
-        const IDENTITY: [u32; WIDTH] = [0, 1, 2, 3, 4, 5, 6, 7];
-        let (near, child) = (self.near.as_mut_ptr().cast::<f32>(), self.child.as_mut_ptr().cast::<u32>());
-        let (end, mut kept) = (self.count, 0);
-        for i in (0..end).step_by(WIDTH) {
-            // SAFETY: eight entries from `i` lie in the arrays, which end `WIDTH` entries behind what
-            // is ever on the stack. Those at `end` and beyond are not counted, whatever they are. `kept` ≤ i,
-            // and in place is allowed.
-            unsafe {
-                let n = S::F8::load(near.add(i));
-                let keep = n.le(S::F8::splat(tmax));
-                let all = n.compress(child.add(i), IDENTITY.as_ptr(), 0, keep, near.add(kept), child.add(kept));
-                let beyond = keep.bits() >> (end - i).min(WIDTH);
-                kept += all - beyond.count_ones() as usize;
-            }
+    fn cut(&mut self, tmax: f32) {
+        let mut kept = 0;
+        for i in 0..self.count {
+            (self.near[kept], self.child[kept]) = (self.near[i], self.child[i]);
+            // SAFETY: entries below `count` have been written.
+            kept += (unsafe { self.near[i].assume_init() } <= tmax) as usize;
         }
         self.count = kept;
     }
@@ -389,7 +382,7 @@ impl Walk {
                     self.stack.count = 1;
                 } else {
                     self.limit = beyond(self.best.t);
-                    self.stack.cut::<S>(self.limit);
+                    self.stack.cut(self.limit);
                 }
             }
             self.current = self.stack.pop();

@@ -7,8 +7,8 @@
 //! exact difference or is 0; both triangles of an edge, and all of a corner, accept 0: no ray passes
 //! between them. (Formed without contraction: fused, the sign would depend on the order of corners.)
 //!
-//! The distance comes from the plane, which is accurate for large triangles along the axes; in f64 where
-//! f32 cannot tell it. It is kept within the corners' range: no hit lies off its triangle.
+//! The distance comes from the plane, which is accurate for large triangles along the axes. Where f32 cannot
+//! tell it, it comes in f64, and is kept between the edges that the ray passes: no hit lies off its triangle.
 
 use crate::simd::{Lanes, Mask};
 use glam::DVec3;
@@ -135,9 +135,9 @@ impl<L: Lanes> Projected<L> {
         zero.le(u.min(v).min(w)).or(u.max(v).max(w).le(zero))
     }
 
-    /// Distances by the plane, and where these are accurate. They are not
-    /// on thin triangles, whose normal is rounded, where the ray grazes the plane, and where squares of
-    /// areas are too small for f32: see [`accurate_distance`].
+    /// Distances by the plane, and where these are accurate. They are not on thin triangles, whose normal is
+    /// rounded, where the ray grazes the plane, and where areas are too small for f32: see
+    /// [`accurate_distance`].
     ///
     /// # Safety
     /// The CPU must have the ISA.
