@@ -181,7 +181,8 @@ pub(crate) trait Eight: Lanes {
     /// entries behind both outputs may be overwritten.
     ///
     /// # Safety
-    /// All pointers must be valid for eight values.
+    /// All pointers must be valid for eight values. `out_names` may overlap `names` if `order` tells the
+    /// lanes' own and it does not lie behind.
     unsafe fn compress(
         self,
         names: *const u32,
