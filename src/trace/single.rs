@@ -9,6 +9,7 @@ use super::{RawHit, Ray};
 use crate::bvh::layout::{ChildRef, Mbvh, Node, STACK_SIZE, WIDTH};
 use crate::scene::NONE;
 use crate::simd::{Eight, Lanes, Mask, Simd};
+use std::hint::select_unpredictable;
 use std::mem::MaybeUninit;
 
 /// Ize's 1 + 2γ₃ for box tests that subtract the origin from planes, rounded up.
@@ -37,13 +38,25 @@ pub(super) fn nudge(origin: f32) -> f32 {
     (origin.abs() * 2.4e-7).max(1e-20)
 }
 
+/// One instruction, where `f32::max` takes four to treat NaN.
+#[inline(always)]
+fn greater(a: f32, b: f32) -> f32 {
+    if a > b { a } else { b }
+}
+
+/// Likewise.
+#[inline(always)]
+fn lesser(a: f32, b: f32) -> f32 {
+    if a < b { a } else { b }
+}
+
 /// The power of two that brings a direction's largest component into a range where the reciprocals and
 /// products of the tests neither overflow nor vanish; `None` for a ray that can hit nothing.
 #[inline(always)]
 pub(super) fn direction_scale(ray: &Ray) -> Option<f32> {
     let ([x, y, z], [ox, oy, oz]) = (ray.direction, ray.origin);
-    let largest = x.abs().max(y.abs()).max(z.abs());
-    // Any NaN or infinity makes this NaN; `max` alone would lose a NaN.
+    let largest = greater(greater(x.abs(), y.abs()), z.abs());
+    // Any NaN or infinity makes this NaN; a maximum alone would lose a NaN.
     let zero = (0.0 * x + 0.0 * y + 0.0 * z) + (0.0 * ox + 0.0 * oy + 0.0 * oz);
     if zero != 0.0 || largest == 0.0 {
         return None;
@@ -89,31 +102,34 @@ pub(super) struct RaySetup {
 const ROW: u32 = 4 * WIDTH as u32;
 
 impl RaySetup {
-    /// (All axes in one vector by hand take no fewer instructions.)
+    /// If [`must_be_slow`](Self::must_be_slow), then [`make_slow`](Self::make_slow). (All axes in one vector by hand take no fewer
+    /// instructions.)
     #[inline(always)]
-    pub(super) fn new(origin: [f32; 3], direction: [f32; 3], tmin: f32) -> Self {
+    fn new(origin: [f32; 3], direction: [f32; 3], tmin: f32) -> Self {
         let shear = Shear::new(origin, direction);
-        let negative: [u32; 3] = std::array::from_fn(|a| (direction[a] < 0.0) as u32);
+        let is_negative = direction.map(|d| d < 0.0);
         let reciprocal = direction.map(|d| 1.0 / d);
         let offset: [f32; 3] = std::array::from_fn(|a| -origin[a] * reciprocal[a]);
         let error: [f32; 3] = std::array::from_fn(|a| OFFSET_ERROR * offset[a].abs());
-        let near = std::array::from_fn(|a| ROW * (a as u32 + 3 * negative[a]));
-        let mut ray = RaySetup {
+        // (Half of the branches that this became were mispredicted.)
+        let near = std::array::from_fn(|a| select_unpredictable(is_negative[a], ROW * (a as u32 + 3), ROW * a as u32));
+        RaySetup {
             reciprocal,
             near_offset: std::array::from_fn(|a| offset[a] - error[a]),
             far_offset: std::array::from_fn(|a| offset[a] + error[a]),
             near,
             far: std::array::from_fn(|a| ROW * (2 * a as u32 + 3) - near[a]),
-            shift: 3 * (negative[0] | negative[1] << 1 | negative[2] << 2),
+            shift: 3 * (is_negative[0] as u32 | (is_negative[1] as u32) << 1 | (is_negative[2] as u32) << 2),
             is_slow: false,
             tmin,
             shear,
-        };
-        let [x, y, z] = direction.map(f32::abs);
-        if x.min(y).min(z) <= STEEP * x.max(y).max(z) {
-            ray.make_slow(origin, direction);
         }
-        ray
+    }
+
+    #[inline(always)]
+    fn must_be_slow(direction: [f32; 3]) -> bool {
+        let [x, y, z] = direction.map(f32::abs);
+        lesser(lesser(x, y), z) <= STEEP * greater(greater(x, y), z)
     }
 
     /// Where a reciprocal is infinite or too large for [`Self::node`].
@@ -341,8 +357,10 @@ impl Walk {
     #[inline(always)]
     fn begin(place: &mut MaybeUninit<Walk>, ray: &Ray, number: usize) -> bool {
         let Some(scale) = direction_scale(ray) else { return false };
-        let (d, inverse) = (ray.direction.map(|d| d * scale), 1.0 / scale);
-        let (tmin, tmax) = (ray.tmin * inverse, ray.tmax * inverse);
+        let (mut d, mut tmin, mut tmax) = (ray.direction, ray.tmin, ray.tmax);
+        if scale != 1.0 {
+            (d, tmin, tmax) = (d.map(|d| d * scale), tmin / scale, tmax / scale);
+        }
         // False for NaN.
         if !(tmax > tmin) {
             return false;
@@ -361,6 +379,11 @@ impl Walk {
             // Never behind a hit, so that they stay.
             (&raw mut (*p).stack.near).cast::<[f32; BOTTOM]>().write([f32::NEG_INFINITY; BOTTOM]);
             (&raw mut (*p).stack.child).cast::<[ChildRef; BOTTOM]>().write([ChildRef::EMPTY; BOTTOM]);
+            // In place: a call that may change a ray keeps it from being built where it will be, and in between
+            // it went through memory twice.
+            if RaySetup::must_be_slow(d) {
+                (*p).ray.make_slow(ray.origin, d);
+            }
         }
         true
     }

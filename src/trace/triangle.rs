@@ -12,6 +12,7 @@
 
 use crate::simd::{Lanes, Mask};
 use glam::DVec3;
+use std::hint::select_unpredictable;
 
 /// Three f32 vectors.
 #[derive(Clone, Copy)]
@@ -51,6 +52,9 @@ impl<L: Lanes> V3<L> {
     }
 }
 
+/// [`Shear::axes`] by the axis of the largest component, three for positive and three for negative ones.
+const AXES: [[u32; 3]; 6] = [[1, 2, 0], [2, 0, 1], [0, 1, 2], [2, 1, 0], [0, 2, 1], [1, 0, 2]];
+
 /// A ray in its own frame: z along the axis of the direction's largest component.
 #[derive(Clone, Copy)]
 pub(super) struct Shear {
@@ -72,14 +76,17 @@ impl Shear {
     pub(super) fn new(origin: [f32; 3], d: [f32; 3]) -> Shear {
         let [x, y, z] = d.map(f32::abs);
         let k = if x > y && x > z { 0 } else { 2 - usize::from(y > z) };
-        let (next, last) = ([1, 2, 0][k], [2, 0, 1][k]);
-        let (i, j) = if d[k] < 0.0 { (last, next) } else { (next, last) };
-        let inverse = -1.0 / d[k];
+        // (Half of the branches that this became were mispredicted.)
+        let axes = &AXES[select_unpredictable(d[k] < 0.0, k + 3, k)];
+        // (Four of each, so that no index is checked.)
+        let [d4, origin4] = [d, origin].map(|v| [v[0], v[1], v[2], 0.0]);
+        let of = |v: &[f32; 4], a: usize| v[axes[a] as usize & 3];
+        let inverse = -1.0 / of(&d4, 2);
         Shear {
-            axes: [i as u32, j as u32, k as u32],
-            origin: [origin[i], origin[j], origin[k]],
-            back: [-d[i], -d[j], -d[k]],
-            shear: [d[i] * inverse, d[j] * inverse],
+            axes: *axes,
+            origin: [of(&origin4, 0), of(&origin4, 1), of(&origin4, 2)],
+            back: [-of(&d4, 0), -of(&d4, 1), -of(&d4, 2)],
+            shear: [of(&d4, 0) * inverse, of(&d4, 1) * inverse],
             grazing: GRAZING * (x + y + z),
         }
     }
