@@ -32,7 +32,7 @@ Bytes embree_bytes(const Scene &s, const Setup &setup, Mode mode);
 //
 // Embree does not show the tree of a scene. This is the cost of the tree that rtcBuildBVH makes with the parameters of
 // the scene's builder: of default quality the same tree (what Embree prints of a scene with verbose=2 has the same sums
-// of areas, to the last digit), of high quality one whose cost differs by less than 1 %. Embree tests
-// leaves by blocks of four and builds for that: by blocks, Sponza's 46.4 would be 23.0. Our tree's cost by blocks is
-// not to be had from the API, so this measure is a little in our favour.
+// of areas, to the last digit), of high quality one whose cost differs by less than 1 %. Embree tests leaves by blocks
+// of four and builds for that: by blocks, Sponza's 46.4 would be 23.0. Our tree's cost by blocks is not to be had from
+// the API, so this measure is a little in our favour.
 double embree_sah(const Scene &s, const Setup &setup, Mode mode);

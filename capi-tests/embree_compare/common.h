@@ -5,7 +5,6 @@
 #include <bakelite.h>
 
 #include <algorithm>
-#include <chrono>
 #include <cmath>
 #include <cstddef>
 #include <cstdint>
@@ -21,10 +20,11 @@ void check(bk_result result);
 // Denormals to zero on the calling thread, as Embree recommends; for both sides.
 void flush_denormals();
 
-using Clock = std::chrono::steady_clock;
-inline double seconds_since(Clock::time_point start) {
-    return std::chrono::duration<double>(Clock::now() - start).count();
-}
+// Seconds, from any beginning: by the clock on the wall, and what the calling thread and all threads together have run.
+// The latter leave out what a thread waits while others have its core.
+double wall_seconds();
+double thread_seconds();
+double process_seconds();
 
 inline double median(std::vector<double> v) {
     std::sort(v.begin(), v.end());

@@ -193,6 +193,15 @@ void random_incoherent(Kind &k, const Scene &s, size_t count, Random &random) {
     k.ways = {intersect1(k.rays), intersect16(k.rays, false), intersect_stream(k.rays, STREAM, false)};
 }
 
+// The same, by one call per ray: for programs that know one ray at a time.
+void one_by_one(Kind &k, const Scene &s, size_t count, Random &random) {
+    random_incoherent(k, s, count, random);
+    k.ours = [&k, &s](size_t begin, size_t end) {
+        for (size_t i = begin; i < end; i++) bk_intersect(s.scene, &k.rays.rays[i], &k.hits[i]);
+    };
+    k.ways = {intersect1(k.rays)};
+}
+
 // Texel-like origins, just off the surface; one set of cosine-distributed directions, turned for each.
 void gather(Kind &k, const Scene &s, size_t count, Random &random) {
     std::vector<Vec3d> set;
@@ -307,13 +316,14 @@ const struct {
     bool occlusion;
     void (*make)(Kind &, const Scene &, size_t count, Random &);
 } HOW[KINDS] = {
-    {STREAM, false, random_incoherent}, {32, false, gather},           {256, false, gather},
-    {STREAM, false, primary},           {STREAM, false, axis_aligned}, {16, true, occlusion},
+    {STREAM, false, random_incoherent}, {32, false, gather},   {256, false, gather},        {STREAM, false, primary},
+    {STREAM, false, axis_aligned},      {16, true, occlusion}, {STREAM, false, one_by_one},
 };
 
 } // namespace
 
-const char *const KIND_NAMES[KINDS] = {"random", "gather 32", "gather 256", "primary", "axis-aligned", "occluded"};
+const char *const KIND_NAMES[KINDS] = {"random",       "gather 32", "gather 256", "primary",
+                                       "axis-aligned", "occluded",  "one by one"};
 
 void make_kind(Kind &k, size_t number, const Scene &s, size_t count, uint64_t seed) {
     k.name = KIND_NAMES[number];

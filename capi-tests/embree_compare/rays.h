@@ -77,7 +77,7 @@ struct Kind {
     std::vector<Way> ways;
 };
 
-const size_t KINDS = 6;
+const size_t KINDS = 7;
 extern const char *const KIND_NAMES[KINDS];
 
 // Makes rays of the kind with that number: the same for the same seed and scene, whatever traces them. count: a

@@ -16,6 +16,7 @@ struct Row {
     std::string way; // a function of Embree
     Mode mode = DEFAULT;
     double embree = 0, ratio = 0; // ours to Embree's
+    double fastest = 0;           // Embree's rate in its fastest run
     Counts counts;                // of rays
 };
 

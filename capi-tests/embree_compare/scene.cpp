@@ -1,8 +1,10 @@
 #include "scene.h"
 
+#include <chrono>
 #include <cstdio>
 #include <cstdlib>
 #include <cstring>
+#include <ctime>
 #if defined(__x86_64__) || defined(_M_X64)
 #include <pmmintrin.h>
 #include <xmmintrin.h>
@@ -16,6 +18,23 @@ void fail(const std::string &what) {
 void check(bk_result result) {
     if (result != BK_OK) fail(std::string(bk_result_string(result)) + ": " + bk_last_error());
 }
+
+double wall_seconds() {
+    return std::chrono::duration<double>(std::chrono::steady_clock::now().time_since_epoch()).count();
+}
+
+#ifdef _WIN32
+double thread_seconds() { return wall_seconds(); }
+double process_seconds() { return wall_seconds(); }
+#else
+static double seconds_of(clockid_t clock) {
+    timespec t{};
+    clock_gettime(clock, &t);
+    return double(t.tv_sec) + 1e-9 * double(t.tv_nsec);
+}
+double thread_seconds() { return seconds_of(CLOCK_THREAD_CPUTIME_ID); }
+double process_seconds() { return seconds_of(CLOCK_PROCESS_CPUTIME_ID); }
+#endif
 
 void flush_denormals() {
 #if defined(__x86_64__) || defined(_M_X64)
