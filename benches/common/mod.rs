@@ -1,0 +1,97 @@
+//! Scenes and rays that several benches share.
+//!
+//! The scene is the built-in atrium, or the file that `BAKELITE_BENCH_SCENE` names.
+
+// No bench uses all of it.
+#![allow(dead_code)]
+
+use bakelite::bvh::{BuildOptions, BuildQuality};
+use bakelite::sampling::{cosine_hemisphere, orthonormal_basis, sobol_2d, uniform, uniform_triangle};
+use bakelite::scene::builtin;
+use bakelite::trace::{Hit, Ray};
+use bakelite::{Device, DeviceOptions, Isa, Progress, Scene, SceneData};
+use glam::Vec3;
+use std::env;
+use std::f32::consts::TAU;
+use std::sync::Arc;
+
+pub fn data() -> SceneData {
+    let Ok(path) = env::var("BAKELITE_BENCH_SCENE") else { return builtin("atrium").expect("scene") };
+    let mut data = SceneData::new();
+    #[cfg(feature = "io")]
+    bakelite::io::load(path.as_ref(), &mut data).expect("scene file");
+    assert!(data.triangle_count() > 0, "{path} has no triangles, or this was built without the feature `io`");
+    data
+}
+
+/// Committed on one thread.
+pub fn commit(isa: Isa, quality: BuildQuality) -> Arc<Scene> {
+    let device = Device::new(DeviceOptions { isa: Some(isa), num_threads: 1, ..Default::default() }).expect("device");
+    let options = BuildOptions { quality, ..Default::default() };
+    Scene::commit(&device, data(), &options, &Progress::none()).map_err(|e| e.1).expect("commit")
+}
+
+/// Points a little above random triangles, with unit normals. (Of triangles with an area: thesis 4.1.2.)
+pub fn origins(scene: &Scene, count: u32) -> Vec<(Vec3, Vec3)> {
+    let valid: Vec<u32> = (0..scene.triangle_count()).filter(|&t| scene.is_valid(t)).collect();
+    (0..count)
+        .map(|i| {
+            let triangle = valid[(uniform(i, 0, 1) * valid.len() as f32) as usize];
+            let [a, b, c] = scene.corners(triangle);
+            let [u, v] = uniform_triangle(sobol_2d(i, 2));
+            let n = scene.normal(triangle);
+            (a + u * (b - a) + v * (c - a) + 1e-4 * scene.diagonal() * n, n)
+        })
+        .collect()
+}
+
+/// Cosine-distributed, as a gather's.
+pub fn directions(normal: Vec3, seed: u32, count: u32) -> impl Iterator<Item = [f32; 3]> {
+    let (t, b) = orthonormal_basis(normal);
+    (0..count).map(move |i| {
+        let d = cosine_hemisphere(sobol_2d(i, seed));
+        (d.x * t + d.y * b + d.z * normal).to_array()
+    })
+}
+
+/// From random points into the hemisphere, uniformly: thesis 4.1.2.
+pub fn incoherent(scene: &Scene, count: u32) -> Vec<Ray> {
+    let into_hemisphere = |(i, (origin, n)): (usize, (Vec3, Vec3))| {
+        let [z, turn] = sobol_2d(i as u32, 3);
+        let (t, b) = orthonormal_basis(n);
+        let (sin, cos) = (TAU * turn).sin_cos();
+        Ray::new(origin, (1.0 - z * z).sqrt() * (cos * t + sin * b) + z * n)
+    };
+    origins(scene, count).into_iter().enumerate().map(into_hemisphere).collect()
+}
+
+/// Between random points.
+pub fn segments(scene: &Scene, count: u32) -> Vec<Ray> {
+    let points = origins(scene, 2 * count);
+    points.chunks_exact(2).map(|p| Ray::new(p[0].0, p[1].0 - p[0].0).within(0.0, 1.0 - 1e-4)).collect()
+}
+
+/// A pinhole camera's, 90 degrees, in tiles of 4 x 4 pixels; from the one of some points that sees the most, toward the
+/// middle. side: pixels, a multiple of 4.
+pub fn camera(scene: &Scene, side: u32) -> Vec<Ray> {
+    let (lower, upper) = scene.bounds();
+    let from = |eye: Vec3, side: u32| {
+        let z = ((lower + upper) * 0.5 - eye).normalize();
+        let (x, y) = orthonormal_basis(z);
+        let tile_side = side / 4;
+        (0..side * side).map(move |i| {
+            let (tile, p) = (i / 16, i % 16);
+            let pixel = |tile: u32, p: u32| 2.0 * ((4 * tile + p) as f32 + 0.5) / side as f32 - 1.0;
+            Ray::new(eye, z + pixel(tile % tile_side, p % 4) * x + pixel(tile / tile_side, p / 4) * y)
+        })
+    };
+    let seen = |eye: Vec3| {
+        let rays: Vec<Ray> = from(eye, 16).collect();
+        let mut hits = vec![Hit::MISS; rays.len()];
+        scene.intersect_many(&rays, false, &mut hits).expect("rays");
+        hits.iter().filter(|h| h.t.is_finite()).map(|h| (h.t / (0.1 * scene.diagonal())).min(1.0)).sum::<f32>()
+    };
+    let eyes = origins(scene, 64).into_iter().map(|(p, n)| p + 0.02 * scene.diagonal() * n);
+    let eye = eyes.max_by(|&a, &b| seen(a).total_cmp(&seen(b))).expect("a point");
+    from(eye, side).collect()
+}

@@ -1,0 +1,160 @@
+#include "scene.h"
+
+#include <chrono>
+#include <cstdio>
+#include <cstdlib>
+#include <cstring>
+#include <ctime>
+#if defined(__x86_64__) || defined(_M_X64)
+#include <pmmintrin.h>
+#include <xmmintrin.h>
+#endif
+
+void fail(const std::string &what) {
+    std::fprintf(stderr, "embree_compare: %s\n", what.c_str());
+    std::exit(2);
+}
+
+void check(bk_result result) {
+    if (result != BK_OK) fail(std::string(bk_result_string(result)) + ": " + bk_last_error());
+}
+
+double wall_seconds() {
+    return std::chrono::duration<double>(std::chrono::steady_clock::now().time_since_epoch()).count();
+}
+
+#ifdef _WIN32
+double thread_seconds() { return wall_seconds(); }
+double process_seconds() { return wall_seconds(); }
+#else
+static double seconds_of(clockid_t clock) {
+    timespec t{};
+    clock_gettime(clock, &t);
+    return double(t.tv_sec) + 1e-9 * double(t.tv_nsec);
+}
+double thread_seconds() { return seconds_of(CLOCK_THREAD_CPUTIME_ID); }
+double process_seconds() { return seconds_of(CLOCK_PROCESS_CPUTIME_ID); }
+#endif
+
+void flush_denormals() {
+#if defined(__x86_64__) || defined(_M_X64)
+    _MM_SET_FLUSH_ZERO_MODE(_MM_FLUSH_ZERO_ON);
+    _MM_SET_DENORMALS_ZERO_MODE(_MM_DENORMALS_ZERO_ON);
+#endif
+}
+
+bk_device *our_device(const Setup &setup, unsigned threads) {
+    bk_device_desc desc;
+    bk_device_desc_init(&desc);
+    desc.isa = setup.isa;
+    desc.num_threads = threads;
+    bk_device *device = nullptr;
+    const bk_result result = bk_device_create(&desc, &device);
+    if (result != BK_ERROR_UNSUPPORTED) check(result);
+    return device;
+}
+
+RTCDevice embree_device(const Setup &setup, unsigned threads) {
+    std::string config = "threads=" + std::to_string(threads);
+    if (!setup.embree_isa.empty()) config += ",isa=" + setup.embree_isa;
+    return rtcNewDevice(config.c_str());
+}
+
+bk_scene *our_scene(bk_device *device, const Scene &s, uint32_t quality) {
+    bk_scene *scene;
+    check(bk_scene_create(device, &scene));
+    bk_build_params params;
+    bk_build_params_init(&params);
+    params.quality = quality;
+    check(bk_scene_set_build(scene, &params));
+    bk_material_desc material;
+    bk_material_desc_init(&material);
+    check(bk_scene_add_material(scene, &material, nullptr));
+    for (const bk_mesh_view &view : s.meshes) {
+        bk_mesh_desc mesh;
+        bk_mesh_desc_init(&mesh);
+        mesh.positions = view.positions;
+        mesh.vertex_count = view.vertex_count;
+        mesh.indices = view.indices;
+        mesh.triangle_count = view.triangle_count;
+        check(bk_scene_add_mesh(scene, &mesh, nullptr));
+    }
+    return scene;
+}
+
+RTCScene embree_scene(RTCDevice device, const Scene &s, Mode mode) {
+    RTCScene scene = rtcNewScene(device);
+    rtcSetSceneBuildQuality(scene, mode == HIGH ? RTC_BUILD_QUALITY_HIGH : RTC_BUILD_QUALITY_MEDIUM);
+    rtcSetSceneFlags(scene, mode == ROBUST ? RTC_SCENE_FLAG_ROBUST : RTC_SCENE_FLAG_NONE);
+    for (size_t m = 0; m < s.meshes.size(); m++) {
+        const bk_mesh_view &mesh = s.meshes[m];
+        if (mesh.triangle_count == 0) continue;
+        RTCGeometry geometry = rtcNewGeometry(device, RTC_GEOMETRY_TYPE_TRIANGLE);
+        void *vertices =
+            rtcSetNewGeometryBuffer(geometry, RTC_BUFFER_TYPE_VERTEX, 0, RTC_FORMAT_FLOAT3, 12, mesh.vertex_count);
+        void *indices =
+            rtcSetNewGeometryBuffer(geometry, RTC_BUFFER_TYPE_INDEX, 0, RTC_FORMAT_UINT3, 12, mesh.triangle_count);
+        if (!vertices || !indices) fail("Embree has no memory for mesh " + std::to_string(m));
+        std::memcpy(vertices, mesh.positions, mesh.vertex_count * 12);
+        std::memcpy(indices, mesh.indices, mesh.triangle_count * 12);
+        rtcCommitGeometry(geometry);
+        rtcAttachGeometryByID(scene, geometry, unsigned(m));
+        rtcReleaseGeometry(geometry);
+    }
+    return scene;
+}
+
+Scene::Scene(const std::string &name, const Setup &setup) {
+    // All rays are traced by threads of this program's own.
+    device = our_device(setup, 1);
+    if (!device) fail(std::string("this machine has no ") + ISA_NAMES[setup.isa]);
+    check(bk_scene_create(device, &scene));
+    const bool file = name.find('.') != std::string::npos;
+    check(file ? bk_scene_load_file(scene, name.c_str(), nullptr) : bk_scene_load_builtin(scene, name.c_str()));
+    bk_build_params params;
+    bk_build_params_init(&params);
+    params.quality = setup.quality;
+    check(bk_scene_set_build(scene, &params));
+    check(bk_scene_commit(scene, nullptr, nullptr));
+    bk_scene_stats_init(&stats);
+    check(bk_scene_stats(scene, &stats));
+
+    float lower[3], upper[3];
+    check(bk_scene_bounds(scene, lower, upper));
+    center = (load(lower) + load(upper)) * 0.5;
+    diagonal = length(load(upper) - load(lower));
+    double sum = 0;
+    for (uint32_t m = 0; m < bk_scene_mesh_count(scene); m++) {
+        bk_mesh_view view;
+        bk_mesh_view_init(&view);
+        check(bk_scene_mesh_geometry(scene, m, &view));
+        meshes.push_back(view);
+        for (uint32_t t = 0; t < view.triangle_count; t++) {
+            const Vec3d a = load(vertex(m, t, 0)), b = load(vertex(m, t, 1)), c = load(vertex(m, t, 2));
+            const double area = 0.5 * length(cross(b - a, c - a));
+            if (!(area > 0) || !std::isfinite(area)) continue;
+            sum += area;
+            triangles.emplace_back(m, t);
+            area_sums.push_back(sum);
+        }
+    }
+}
+
+Scene::~Scene() {
+    bk_scene_release(scene);
+    bk_device_release(device);
+}
+
+EmbreeScenes::EmbreeScenes(const Scene &s, const Setup &setup) : device(embree_device(setup, 1)) {
+    if (!device) fail("Embree starts no device with ISA " + setup.embree_isa);
+    for (int mode = 0; mode < MODES; mode++) {
+        of[mode] = embree_scene(device, s, Mode(mode));
+        rtcCommitScene(of[mode]);
+    }
+    if (rtcGetDeviceError(device) != RTC_ERROR_NONE) fail("Embree cannot build the scene");
+}
+
+EmbreeScenes::~EmbreeScenes() {
+    for (RTCScene scene : of) rtcReleaseScene(scene);
+    rtcReleaseDevice(device);
+}
