@@ -226,12 +226,15 @@ impl Scene {
                 &format!("{} of {total} triangles are degenerate or not finite and were skipped", skipped.len()),
             );
         }
-        let memory = device.memory().reserve(bvh::estimated_bytes(valid.len(), options), "the scene")?;
+        let meshes = mesh_bytes(&data.meshes);
+        let mut memory = device.memory().reserve(meshes + bvh::estimated_bytes(valid.len(), options), "the scene")?;
         let (mbvh, sah_cost) = device.install(|| bvh::build(&corners, &valid, options, progress))?;
         progress.check()?;
 
         let emitters = emitters(data, &first_triangle, &skipped);
         stage.advance(1)?;
+        let bytes = mbvh.bytes() + meshes;
+        memory.shrink(bytes);
         let bounds = mbvh.bounds();
         let wide_sah_cost = device.install(|| mbvh.sah_cost());
         let stats = SceneStats {
@@ -239,7 +242,7 @@ impl Scene {
             skipped_degenerate: skipped.len() as u64,
             nodes: mbvh.node_count() as u64,
             bvh_bytes: mbvh.bytes() as u64,
-            bytes: (mbvh.bytes() + mesh_bytes(&data.meshes)) as u64,
+            bytes: bytes as u64,
             sah_cost,
             build_seconds: start.elapsed().as_secs_f64(),
             wide_sah_cost,
@@ -464,17 +467,7 @@ fn emitter(triangle: u32, corners: [Vec3; 3], material: &Material) -> Emitter {
 }
 
 fn mesh_bytes(meshes: &[Mesh]) -> usize {
-    meshes
-        .iter()
-        .map(|m| {
-            m.positions.len() * 12
-                + m.indices.len() * 12
-                + m.normals.len() * 12
-                + m.uvs.len() * 8
-                + m.lightmap.as_ref().map_or(0, |l| l.uvs.len() * 8 + l.pages.len() * 4)
-                + if let MeshMaterials::PerTriangle(v) = &m.materials { v.len() * 4 } else { 0 }
-        })
-        .sum()
+    meshes.iter().map(Mesh::bytes).sum()
 }
 
 #[cfg(test)]
@@ -524,6 +517,16 @@ mod tests {
         let after = s.stats();
         assert_eq!((after.refits, after.sah_cost, after.skipped_degenerate), (1, before.sah_cost, 1));
         assert!(after.wide_sah_cost > 0.0 && after.refit_seconds > 0.0);
+    }
+
+    #[test]
+    fn the_accounts_hold_what_the_scene_takes() {
+        let s = scene();
+        let memory = s.device().memory();
+        // Positions and indices, and what the tree says of itself.
+        assert_eq!(s.stats().bytes - s.stats().bvh_bytes, 12 * (6 + 3 + 3) + 12 * (2 + 1 + 1));
+        assert_eq!(memory.current() as u64, s.stats().bytes);
+        assert!(memory.peak() > memory.current(), "the build takes more");
     }
 
     #[test]
