@@ -262,6 +262,9 @@ static void struct_sizes(bk_device *device) {
     CHECK_ERROR(bk_scene_add_light(scene, &light, NULL), ARGUMENT, "bk_light_desc.struct_size is 4");
     build.struct_size = 0;
     CHECK_ERROR(bk_scene_set_build(scene, &build), ARGUMENT, "bk_build_params.struct_size is 0");
+    bk_build_params_init(&build);
+    build.compact = 2;
+    CHECK_ERROR(bk_scene_set_build(scene, &build), ARGUMENT, "compact is 2, not 0 or 1");
     bk_load_info_init(&load);
     load.struct_size = 1;
     CHECK_ERROR(bk_scene_load_file(scene, "a.obj", &load), ARGUMENT, "bk_load_info.struct_size is 1");

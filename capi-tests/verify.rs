@@ -80,6 +80,8 @@ struct Case {
     /// Per triangle the lowest number among its exact copies.
     lowest: Vec<u32>,
     scenes: Vec<Arc<Scene>>,
+    /// The same with compact trees, which have the same hits.
+    compact: Vec<Arc<Scene>>,
     rays: usize,
     certain_hits: usize,
     /// Rays for which gather and the single ray have different triangles, both right.
@@ -95,11 +97,14 @@ impl Case {
 
     fn with_options(name: &str, triangles: Vec<Triangle>, options: &BuildOptions) -> Case {
         let scenes = DEVICES.iter().map(|d| commit(d, &triangles, options)).collect();
+        let compact = BuildOptions { compact: true, ..*options };
+        let compact = DEVICES.iter().map(|d| commit(d, &triangles, &compact)).collect();
         let mut first = HashMap::new();
         let bits = |t: &Triangle| t.map(|v| v.to_array().map(f32::to_bits));
         let lowest = triangles.iter().zip(0..).map(|(t, i)| *first.entry(bits(t)).or_insert(i)).collect();
         let failures = BTreeMap::new();
-        Case { name: name.into(), triangles, lowest, scenes, rays: 0, certain_hits: 0, disagreements: 0, failures }
+        let name = name.into();
+        Case { name, triangles, lowest, scenes, compact, rays: 0, certain_hits: 0, disagreements: 0, failures }
     }
 
     fn fail(&mut self, fault: Fault, scene: &Scene, query: &str, ray: &Ray, what: &str) {
@@ -131,8 +136,18 @@ impl Case {
         self.rays += rays.len();
         self.certain_hits += truths.iter().filter(|t| t.surely_hits()).count();
         let mut all = Vec::new();
-        for scene in self.scenes.clone() {
+        for (scene, compact) in self.scenes.clone().into_iter().zip(self.compact.clone()) {
             let (hits, shadows) = (closest(&scene, rays), occluded(&scene, rays));
+            let (same_hits, same_shadows) = (closest(&compact, rays), occluded(&compact, rays));
+            for i in 0..rays.len() {
+                if !same_bits(&[hits[i]], &[same_hits[i]]) || shadows[i] != same_shadows[i] {
+                    let what = format!(
+                        "{:?} and occluded {} in the compact tree, {:?} and {} else",
+                        same_hits[i], same_shadows[i], hits[i], shadows[i]
+                    );
+                    self.fail(Fault::Wrong, &scene, "compact", &rays[i], &what);
+                }
+            }
             for (((ray, truth), hit), shadow) in rays.iter().zip(&truths).zip(&hits).zip(shadows) {
                 self.judge(&scene, "closest hit", ray, truth, hit);
                 if shadow != (hit.triangle != NONE) as u8 {

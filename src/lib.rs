@@ -12,7 +12,7 @@
 //! | [`sampling`] | counter-based low-discrepancy samples and the maps from the square |
 //! | `simd` | lanes over `wide` and over `core::arch`; ISA detection |
 //! | [`scene`] | meshes, materials, lights; validation; the built-in scenes; commit |
-//! | [`bvh`] | binned SAH builder, collapse to the 8-wide MBVH |
+//! | [`bvh`] | binned SAH builder, collapse to the 8-wide MBVH, whole or compact |
 //! | [`trace`] | the ray kernels: single rays, shared-origin gather, occlusion |
 //! | [`photon`] | emission, photon tracing, uniform grid, radiance estimate |
 //! | [`lightmap`] | charts, texels, radiance map, gather map, direct light, composition |

@@ -71,6 +71,13 @@ impl Reservation {
         self.bytes += std::mem::take(&mut more.bytes);
         Ok(())
     }
+
+    /// Gives back all but `bytes`, if there are more.
+    pub fn shrink(&mut self, bytes: usize) {
+        let more = self.bytes - self.bytes.min(bytes as i64);
+        self.bytes -= more;
+        drop(Reservation { monitor: self.monitor.clone(), bytes: more });
+    }
 }
 
 impl Drop for Reservation {
@@ -118,6 +125,24 @@ mod tests {
         assert_eq!((a.bytes(), m.current()), (90, 90));
         drop(a);
         assert_eq!(m.current(), 0);
+    }
+
+    #[test]
+    fn a_reservation_shrinks_but_not_to_more() {
+        let given_back = Arc::new(AtomicI64::new(0));
+        let seen = given_back.clone();
+        let callback = move |bytes: i64| {
+            seen.fetch_sub(bytes.min(0), SeqCst);
+            true
+        };
+        let m = Arc::new(MemoryMonitor::new(Some(Box::new(callback))));
+        let mut a = m.reserve(100, "a").unwrap();
+        a.shrink(200);
+        assert_eq!((a.bytes(), given_back.load(SeqCst)), (100, 0));
+        a.shrink(30);
+        assert_eq!((a.bytes(), m.current(), m.peak(), given_back.load(SeqCst)), (30, 30, 100, 70));
+        drop(a);
+        assert_eq!((m.current(), given_back.load(SeqCst)), (0, 100));
     }
 
     #[test]

@@ -3,6 +3,7 @@
 //! area is opened first.
 
 use super::binned::{BinaryBvh, BinaryNode, Box4};
+use super::compact::{self, Compact, CompactNode};
 use super::layout::{ChildRef, LEAF_PAD, LEAF_STRIDE, Mbvh, Node, WIDTH};
 use glam::Vec3;
 use rayon::prelude::*;
@@ -10,6 +11,12 @@ use rayon::prelude::*;
 /// Boxes grow by this part of their coordinates, which pays for the rounding of planes in the box test of
 /// the kernels.
 const OUTWARDS: f32 = 2.0 * f32::EPSILON;
+
+/// The box of a child, from that around its triangles.
+#[inline(always)]
+pub(crate) fn outwards(lower: Vec3, upper: Vec3) -> (Vec3, Vec3) {
+    (lower - OUTWARDS * lower.abs(), upper + OUTWARDS * upper.abs())
+}
 
 /// Sets the box of child `i`, moved outwards; an empty one is hit by no ray.
 pub(super) fn set_box(node: &mut Node, i: usize, b: &Box4) {
@@ -21,9 +28,9 @@ pub(super) fn set_box(node: &mut Node, i: usize, b: &Box4) {
         return;
     }
     let (lower, upper) = b.corners();
+    let (lower, upper) = outwards(lower, upper);
     for axis in 0..3 {
-        node.lower[axis][i] = lower[axis] - OUTWARDS * lower[axis].abs();
-        node.upper[axis][i] = upper[axis] + OUTWARDS * upper[axis].abs();
+        (node.lower[axis][i], node.upper[axis][i]) = (lower[axis], upper[axis]);
     }
 }
 
@@ -38,17 +45,15 @@ struct Plan {
     first_slot: u32,
 }
 
-/// The 8-wide tree of a binary one, nodes in depth-first order: the inner children of a node follow each
-/// other, then comes what lies below the first, below the second, and so on; leaves likewise (`refit`
-/// relies on it).
-pub(super) fn collapse(binary: &BinaryBvh, corners: &[[Vec3; 3]]) -> Mbvh {
+/// The plans of all 8-wide nodes, and their numbers in the order of their leaves.
+///
+/// Nodes are in depth-first order: the inner children of a node follow each other, then comes what lies below
+/// the first, below the second, and so on; leaves likewise (`refit` relies on it).
+fn plans(binary: &BinaryBvh) -> (Vec<Plan>, Vec<u32>) {
     let n = binary.triangles.len();
-    let root = &binary.nodes[0];
-    // Which binary nodes become children is quickly told; to fill in nodes and leaves takes the time.
     let idle = Plan { children: [0; WIDTH], count: 0, first_node: 0, first_slot: 0 };
     let mut plans = Vec::with_capacity(n / 6 + 1);
     plans.push(idle);
-    // Numbers of nodes in the order of their leaves.
     let mut order = Vec::with_capacity(n / 6 + 1);
     let mut slot = 0;
     let mut work = vec![(0usize, 0u32)];
@@ -70,6 +75,32 @@ pub(super) fn collapse(binary: &BinaryBvh, corners: &[[Vec3; 3]]) -> Mbvh {
         let end = work.len();
         work[end - (plans.len() - first)..].reverse();
     }
+    (plans, order)
+}
+
+/// The same tree with compact nodes and leaves; `meshes` as in [`Compact::new`].
+pub(super) fn collapse_compact(binary: &BinaryBvh, meshes: &[u32]) -> Compact {
+    let root = &binary.nodes[0];
+    let (plans, order) = plans(binary);
+    let compact = |plan: &Plan| CompactNode::new(&node(binary, plan), plan.first_node, plan.first_slot);
+    let nodes = plans.par_iter().with_min_len(1024).map(compact).collect();
+    let mut triangles = Vec::with_capacity(binary.triangles.len() + compact::PAD);
+    for &i in &order {
+        for b in plans[i as usize].leaves(binary) {
+            triangles.extend_from_slice(&binary.triangles[b.index as usize..][..b.count as usize]);
+            *triangles.last_mut().expect("a leaf has triangles") |= compact::LAST;
+        }
+    }
+    triangles.extend([compact::LAST | compact::GONE; compact::PAD]);
+    Compact::new(nodes, triangles, (root.lower, root.upper), meshes)
+}
+
+/// The 8-wide tree of a binary one.
+pub(super) fn collapse(binary: &BinaryBvh, corners: &[[Vec3; 3]]) -> Mbvh {
+    let n = binary.triangles.len();
+    let root = &binary.nodes[0];
+    // Which binary nodes become children is quickly told; to fill in nodes and leaves takes the time.
+    let (plans, order) = plans(binary);
     let nodes = plans.par_iter().with_min_len(1024).map(|plan| node(binary, plan)).collect();
     let mut leaves = vec![0.0; n * LEAF_STRIDE + LEAF_PAD];
     let mut rest = &mut leaves[..n * LEAF_STRIDE];

@@ -50,6 +50,14 @@ impl ChildRef {
         ChildRef(1 << 31 | (count as u32 - 1) << 28 | first_slot as u32)
     }
 
+    pub(crate) fn bits(self) -> u32 {
+        self.0
+    }
+
+    pub(crate) fn from_bits(bits: u32) -> Self {
+        ChildRef(bits)
+    }
+
     /// Whether it names a leaf (or nothing).
     #[inline(always)]
     pub(crate) fn is_leaf(self) -> bool {

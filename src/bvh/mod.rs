@@ -1,15 +1,18 @@
 //! Acceleration structures: a binary tree built by binned SAH, with spatial splits if asked, collapsed to
-//! the 8-wide MBVH that the kernels traverse.
+//! the 8-wide MBVH that the kernels traverse, or to the compact one.
 
 mod binned;
 mod collapse;
+pub(crate) mod compact;
+mod compact_refit;
 pub(crate) mod layout;
 mod refit;
 mod spatial;
 
 pub use binned::{BinaryBvh, BinaryNode};
+pub(crate) use collapse::outwards;
+pub(crate) use compact::Compact;
 pub use layout::{ChildRef, Mbvh, Node};
-pub(crate) use refit::refit;
 
 use crate::error::{Result, invalid_argument};
 use crate::progress::Progress;
@@ -38,6 +41,10 @@ pub struct BuildOptions {
     /// With [`BuildQuality::High`]: most references that cuts may add, in parts of the number of
     /// triangles, 0 to 4. Leaves grow by at most as much. Default: 0.25.
     pub split_budget: f32,
+    /// Whether the tree is to take little memory: a fifth of what it takes else, for rays that take longer. Hits
+    /// are the same, bit for bit, except that after spatial splits a ray that grazes an edge within rounding may
+    /// meet the triangle in one tree and pass it in the other. Default: false.
+    pub compact: bool,
 }
 
 impl BuildQuality {
@@ -55,7 +62,7 @@ impl BuildQuality {
 
 impl Default for BuildOptions {
     fn default() -> Self {
-        BuildOptions { bins: 64, max_leaf: 4, quality: BuildQuality::Default, split_budget: 0.25 }
+        BuildOptions { bins: 64, max_leaf: 4, quality: BuildQuality::Default, split_budget: 0.25, compact: false }
     }
 }
 
@@ -77,29 +84,107 @@ impl BuildOptions {
 
 /// Upper bound of an [`Mbvh`]'s size with the builder's working memory, for the memory monitor.
 pub fn estimated_bytes(triangles: usize, options: &BuildOptions) -> usize {
+    // Per triangle: 40 in leaves and up to 256/7 of nodes, or 4 and up to 80/7; with 40/7 of their plan.
+    let tree = if options.compact { 22 } else { 84 };
     match options.quality {
-        // Per triangle: 40 in leaves, up to 256/7 of nodes, with 40/7 of their plan, and while building 64 of
-        // references, 64 of binary nodes, 4 of numbers and 36 of corners.
-        BuildQuality::Default => triangles * 252,
+        // While building 64 of references, 64 of binary nodes, 4 of numbers and 36 of corners.
+        BuildQuality::Default => triangles * (tree + 168),
         // Per reference twice the binary nodes and numbers, because subtrees are joined at the end.
         BuildQuality::High => {
             let references = triangles as f64 * (1.0 + f64::from(options.split_budget));
-            triangles * 36 + (references * 284.0) as usize
+            triangles * 36 + (references * (tree as f64 + 200.0)) as usize
         }
     }
 }
 
-/// Builds the MBVH over the triangles `valid` (global numbers, ascending) and gives its SAH cost:
+/// A scene's acceleration structure.
+#[derive(Clone)]
+pub(crate) enum Tree {
+    Whole(Mbvh),
+    Compact(Compact),
+}
+
+impl Tree {
+    /// Lower and upper corner of the box around all triangles.
+    pub(crate) fn bounds(&self) -> (Vec3, Vec3) {
+        match self {
+            Tree::Whole(t) => t.bounds(),
+            Tree::Compact(t) => t.bounds(),
+        }
+    }
+
+    pub(crate) fn node_count(&self) -> usize {
+        match self {
+            Tree::Whole(t) => t.node_count(),
+            Tree::Compact(t) => t.node_count(),
+        }
+    }
+
+    pub(crate) fn node_bytes(&self) -> usize {
+        match self {
+            Tree::Whole(t) => size_of_val(&t.nodes[..]),
+            Tree::Compact(t) => t.node_bytes(),
+        }
+    }
+
+    pub(crate) fn bytes(&self) -> usize {
+        match self {
+            Tree::Whole(t) => t.bytes(),
+            Tree::Compact(t) => t.bytes(),
+        }
+    }
+
+    /// See [`Mbvh::sah_cost`].
+    pub(crate) fn sah_cost(&self) -> f32 {
+        match self {
+            Tree::Whole(t) => t.sah_cost(),
+            Tree::Compact(t) => t.sah_cost(),
+        }
+    }
+
+    /// See [`refit::refit`].
+    pub(crate) fn refit(&mut self, corners: &(impl Fn(u32) -> [Vec3; 3] + Sync)) -> Vec<u32> {
+        match self {
+            Tree::Whole(t) => refit::refit(t, corners),
+            Tree::Compact(t) => compact_refit::refit(t, corners),
+        }
+    }
+}
+
+/// Builds the tree over the triangles `valid` (global numbers, ascending) and gives its SAH cost:
 /// that of the binary tree with traversal and intersection costing 1 each.
-pub fn build(corners: &[[Vec3; 3]], valid: &[u32], options: &BuildOptions, progress: &Progress) -> Result<(Mbvh, f32)> {
+///
+/// `meshes`: the first triangle of each mesh, and the number of all triangles at the end.
+pub(crate) fn build(
+    corners: &[[Vec3; 3]],
+    valid: &[u32],
+    meshes: &[u32],
+    options: &BuildOptions,
+    progress: &Progress,
+) -> Result<(Tree, f32)> {
+    let binary = build_binary(corners, valid, options, progress)?;
+    let cost = binary.sah_cost();
+    let tree = if options.compact {
+        Tree::Compact(collapse::collapse_compact(&binary, meshes))
+    } else {
+        Tree::Whole(collapse::collapse(&binary, corners))
+    };
+    Ok((tree, cost))
+}
+
+fn build_binary(
+    corners: &[[Vec3; 3]],
+    valid: &[u32],
+    options: &BuildOptions,
+    progress: &Progress,
+) -> Result<BinaryBvh> {
     options.validate()?;
     let binary = match options.quality {
         BuildQuality::Default => BinaryBvh::build(corners, valid, options, progress)?,
         BuildQuality::High => BinaryBvh::build_spatial(corners, valid, options, progress)?,
     };
     progress.check()?;
-    let cost = binary.sah_cost();
-    Ok((collapse::collapse(&binary, corners), cost))
+    Ok(binary)
 }
 
 #[cfg(test)]

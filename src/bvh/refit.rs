@@ -1,5 +1,6 @@
 //! Refit: new corners in an old tree. Leaf rows are rewritten, boxes and orders of children computed anew
-//! from the leaves up; which triangles share a leaf, and which leaves a node, stays.
+//! from the leaves up; which triangles share a leaf, and which leaves a node, stays. (Compact trees:
+//! `compact_refit`.)
 //!
 //! The tree is walked as it lies in memory (see [`Part`]): threads share neither nodes nor rows, each
 //! finds its own next to each other, and the result does not depend on their number.
@@ -147,7 +148,8 @@ fn refit_leaf(rows: &mut [f32], corners: &impl Fn(u32) -> [Vec3; 3], out: &mut V
 
 #[cfg(test)]
 mod tests {
-    use super::super::{BuildOptions, BuildQuality, build};
+    use super::super::collapse::collapse;
+    use super::super::{BuildOptions, BuildQuality, build_binary};
     use super::*;
     use crate::progress::Progress;
     use crate::sampling::{uniform, uniform_sphere};
@@ -176,7 +178,7 @@ mod tests {
 
     fn tree(corners: &Triangles, options: &BuildOptions) -> Mbvh {
         let valid: Vec<u32> = (0..corners.len() as u32).filter(|&t| is_valid_triangle(corners[t as usize])).collect();
-        build(corners, &valid, options, &Progress::none()).unwrap().0
+        collapse(&build_binary(corners, &valid, options, &Progress::none()).unwrap(), corners)
     }
 
     fn moved(mut tree: Mbvh, corners: &Triangles) -> (Mbvh, Vec<u32>) {

@@ -132,7 +132,7 @@ impl<'a> ShadowRays<'a> {
     fn trace(&mut self) {
         let mut occluded = [0; TOGETHER];
         let scene = self.scene;
-        scene.device().kernels().occluded_block(scene.mbvh(), &self.rays[..self.count], &mut occluded);
+        scene.occluded_block(&self.rays[..self.count], &mut occluded);
         for (light, _) in self.light[..self.count].iter().zip(occluded).filter(|(_, occluded)| *occluded == 0) {
             self.visible += *light;
         }

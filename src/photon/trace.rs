@@ -190,7 +190,7 @@ impl<'a> Tracer<'a> {
             if let Some(record) = record.as_deref_mut() {
                 record.extend_from_slice(&rays);
             }
-            self.scene.device().kernels().intersect_block(self.scene.mbvh(), &rays, &mut hits);
+            self.scene.intersect_block(&rays, &mut hits);
             tally.rays += rays.len() as u64;
             stored.try_reserve(rays.len()).map_err(|e| Error::OutOfMemory(format!("the photons being traced: {e}")))?;
             // In a loop of its own, short enough for the processor to work on the cache misses of

@@ -2,12 +2,12 @@
 
 use super::mesh::is_valid_triangle;
 use super::{Light, Material, Mesh, MeshMaterials, NONE, SceneData};
-use crate::bvh::{self, BuildOptions, Mbvh};
+use crate::bvh::{self, BuildOptions, Tree};
 use crate::device::{Device, LogLevel};
 use crate::error::{Error, Result, invalid_argument};
 use crate::memory::Reservation;
 use crate::progress::Progress;
-use crate::trace::{Hit, RawHit, Ray};
+use crate::trace::{Hit, RawHit, Ray, TreeView, View};
 use glam::Vec3;
 use rayon::prelude::*;
 use std::sync::{Arc, RwLock};
@@ -45,6 +45,8 @@ pub struct SceneStats {
     pub nodes: u64,
     /// Bytes of the acceleration structure.
     pub bvh_bytes: u64,
+    /// Of these, of its nodes.
+    pub node_bytes: u64,
     /// Bytes of the whole committed scene.
     pub bytes: u64,
     /// Surface area heuristic cost of the binary tree, traversal and intersection costing 1 each. A refit
@@ -71,7 +73,7 @@ pub struct Scene {
     /// First global triangle number per mesh, and the total at the end.
     first_triangle: Vec<u32>,
     bounds: (Vec3, Vec3),
-    mbvh: Mbvh,
+    tree: Tree,
     /// Triangles that are not in the tree, ascending.
     skipped: Vec<u32>,
     stats: SceneStats,
@@ -158,21 +160,21 @@ impl Scene {
             let m = first.partition_point(|&first| first <= t) - 1;
             meshes[m].corners((t - first[m]) as usize)
         };
-        let out = bvh::refit(&mut self.mbvh, &corners);
+        let out = self.tree.refit(&corners);
         if !out.is_empty() {
             let total = self.stats.triangles;
             let message = format!("{} of {total} triangles are degenerate or not finite after the refit", out.len());
             self.device.log(LogLevel::Warning, &message);
         }
-        self.bounds = self.mbvh.bounds();
+        self.bounds = self.tree.bounds();
         self.emitters = emitters(&self.data, &self.first_triangle, &self.skipped);
         self.stats.skipped_degenerate = (self.skipped.len() + out.len()) as u64;
-        self.stats.wide_sah_cost = self.mbvh.sah_cost();
+        self.stats.wide_sah_cost = self.tree.sah_cost();
     }
 
     /// A scene of its own that is equal, lights shared.
     fn copy(&self) -> Result<Scene> {
-        let bytes = self.mbvh.bytes() + mesh_bytes(&self.data.meshes);
+        let bytes = self.tree.bytes() + mesh_bytes(&self.data.meshes);
         let memory = self.device.memory().reserve(bytes, "a copy of the scene to refit")?;
         Ok(Scene {
             device: self.device.clone(),
@@ -181,7 +183,7 @@ impl Scene {
             emitters: Vec::new(),
             first_triangle: self.first_triangle.clone(),
             bounds: self.bounds,
-            mbvh: self.mbvh.clone(),
+            tree: self.tree.clone(),
             skipped: self.skipped.clone(),
             stats: self.stats,
             _memory: memory,
@@ -226,27 +228,31 @@ impl Scene {
                 &format!("{} of {total} triangles are degenerate or not finite and were skipped", skipped.len()),
             );
         }
-        let memory = device.memory().reserve(bvh::estimated_bytes(valid.len(), options), "the scene")?;
-        let (mbvh, sah_cost) = device.install(|| bvh::build(&corners, &valid, options, progress))?;
+        let meshes = mesh_bytes(&data.meshes);
+        let mut memory = device.memory().reserve(meshes + bvh::estimated_bytes(valid.len(), options), "the scene")?;
+        let (tree, sah_cost) = device.install(|| bvh::build(&corners, &valid, &first_triangle, options, progress))?;
         progress.check()?;
 
         let emitters = emitters(data, &first_triangle, &skipped);
         stage.advance(1)?;
-        let bounds = mbvh.bounds();
-        let wide_sah_cost = device.install(|| mbvh.sah_cost());
+        let bytes = tree.bytes() + meshes;
+        memory.shrink(bytes);
+        let bounds = tree.bounds();
+        let wide_sah_cost = device.install(|| tree.sah_cost());
         let stats = SceneStats {
             triangles: total as u64,
             skipped_degenerate: skipped.len() as u64,
-            nodes: mbvh.node_count() as u64,
-            bvh_bytes: mbvh.bytes() as u64,
-            bytes: (mbvh.bytes() + mesh_bytes(&data.meshes)) as u64,
+            nodes: tree.node_count() as u64,
+            bvh_bytes: tree.bytes() as u64,
+            node_bytes: tree.node_bytes() as u64,
+            bytes: bytes as u64,
             sah_cost,
             build_seconds: start.elapsed().as_secs_f64(),
             wide_sah_cost,
             refits: 0,
             refit_seconds: 0.0,
         };
-        Ok(Parts { emitters, first_triangle, bounds, mbvh, skipped, stats, memory })
+        Ok(Parts { emitters, first_triangle, bounds, tree, skipped, stats, memory })
     }
 
     /// The device that the scene lives on.
@@ -355,25 +361,20 @@ impl Scene {
 
     /// The acceleration structure, for kernels.
     #[inline]
-    pub fn mbvh(&self) -> &Mbvh {
-        &self.mbvh
-    }
-
-    /// Closest hit with `tmin < t ≤ tmax`, by global triangle number.
-    #[inline]
-    pub fn intersect_raw(&self, ray: &Ray) -> RawHit {
-        self.device.kernels().intersect(&self.mbvh, ray)
+    pub(crate) fn tree(&self) -> TreeView<'_> {
+        match &self.tree {
+            Tree::Whole(tree) => TreeView::Whole(tree),
+            // SAFETY: the tree was built of these meshes, which `SceneData` has validated; refits change
+            // positions alone.
+            Tree::Compact(tree) => {
+                TreeView::Compact(unsafe { View::new(tree, &self.data.meshes, &self.first_triangle) })
+            }
+        }
     }
 
     /// Closest hit with `tmin < t ≤ tmax`.
     pub fn intersect(&self, ray: &Ray) -> Hit {
         self.to_hit(self.intersect_raw(ray))
-    }
-
-    /// Whether anything lies on the ray with `tmin < t ≤ tmax`.
-    #[inline]
-    pub fn occluded(&self, ray: &Ray) -> bool {
-        self.device.kernels().occluded(&self.mbvh, ray)
     }
 
     /// From global to (mesh, triangle) numbers.
@@ -415,7 +416,7 @@ struct Parts {
     emitters: Vec<Emitter>,
     first_triangle: Vec<u32>,
     bounds: (Vec3, Vec3),
-    mbvh: Mbvh,
+    tree: Tree,
     skipped: Vec<u32>,
     stats: SceneStats,
     memory: Reservation,
@@ -423,9 +424,9 @@ struct Parts {
 
 impl Parts {
     fn into_scene(self, device: Arc<Device>, data: SceneData) -> Scene {
-        let Parts { emitters, first_triangle, bounds, mbvh, skipped, stats, memory } = self;
+        let Parts { emitters, first_triangle, bounds, tree, skipped, stats, memory } = self;
         let lights = Arc::new(RwLock::new(Arc::new(data.lights.clone())));
-        Scene { device, data, lights, emitters, first_triangle, bounds, mbvh, skipped, stats, _memory: memory }
+        Scene { device, data, lights, emitters, first_triangle, bounds, tree, skipped, stats, _memory: memory }
     }
 }
 
@@ -464,17 +465,7 @@ fn emitter(triangle: u32, corners: [Vec3; 3], material: &Material) -> Emitter {
 }
 
 fn mesh_bytes(meshes: &[Mesh]) -> usize {
-    meshes
-        .iter()
-        .map(|m| {
-            m.positions.len() * 12
-                + m.indices.len() * 12
-                + m.normals.len() * 12
-                + m.uvs.len() * 8
-                + m.lightmap.as_ref().map_or(0, |l| l.uvs.len() * 8 + l.pages.len() * 4)
-                + if let MeshMaterials::PerTriangle(v) = &m.materials { v.len() * 4 } else { 0 }
-        })
-        .sum()
+    meshes.iter().map(Mesh::bytes).sum()
 }
 
 #[cfg(test)]
@@ -524,6 +515,16 @@ mod tests {
         let after = s.stats();
         assert_eq!((after.refits, after.sah_cost, after.skipped_degenerate), (1, before.sah_cost, 1));
         assert!(after.wide_sah_cost > 0.0 && after.refit_seconds > 0.0);
+    }
+
+    #[test]
+    fn the_accounts_hold_what_the_scene_takes() {
+        let s = scene();
+        let memory = s.device().memory();
+        // Positions and indices, and what the tree says of itself.
+        assert_eq!(s.stats().bytes - s.stats().bvh_bytes, 12 * (6 + 3 + 3) + 12 * (2 + 1 + 1));
+        assert_eq!(memory.current() as u64, s.stats().bytes);
+        assert!(memory.peak() > memory.current(), "the build takes more");
     }
 
     #[test]

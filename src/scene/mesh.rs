@@ -67,6 +67,33 @@ impl Mesh {
         }
     }
 
+    /// Bytes of its arrays.
+    pub(super) fn bytes(&self) -> usize {
+        let per_triangle = if let MeshMaterials::PerTriangle(m) = &self.materials { size_of_val(&m[..]) } else { 0 };
+        let lightmap = self.lightmap.as_ref().map_or(0, |l| size_of_val(&l.uvs[..]) + size_of_val(&l.pages[..]));
+        size_of_val(&self.positions[..])
+            + size_of_val(&self.indices[..])
+            + size_of_val(&self.normals[..])
+            + size_of_val(&self.uvs[..])
+            + lightmap
+            + per_triangle
+    }
+
+    /// Frees what arrays have room for beyond their length: as much again in the worst case, after files are read.
+    pub(super) fn shrink_to_fit(&mut self) {
+        self.positions.shrink_to_fit();
+        self.indices.shrink_to_fit();
+        self.normals.shrink_to_fit();
+        self.uvs.shrink_to_fit();
+        if let Some(l) = &mut self.lightmap {
+            l.uvs.shrink_to_fit();
+            l.pages.shrink_to_fit();
+        }
+        if let MeshMaterials::PerTriangle(m) = &mut self.materials {
+            m.shrink_to_fit();
+        }
+    }
+
     /// The corners of `triangle`.
     #[inline]
     pub fn corners(&self, triangle: usize) -> [Vec3; 3] {

@@ -49,8 +49,9 @@ impl SceneData {
     }
 
     /// Adds a mesh and returns its number. Its materials must have been added before.
-    pub fn add_mesh(&mut self, mesh: Mesh) -> Result<u32> {
+    pub fn add_mesh(&mut self, mut mesh: Mesh) -> Result<u32> {
         mesh.validate(self.materials.len())?;
+        mesh.shrink_to_fit();
         let total = self.triangle_count() + mesh.indices.len();
         if total > MAX_TRIANGLES {
             return invalid_argument!("the scene would have {total} triangles, more than {MAX_TRIANGLES}");

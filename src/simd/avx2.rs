@@ -1,6 +1,6 @@
 //! Lanes over AVX2 and FMA: 128-bit vectors of four, 256-bit vectors of eight.
 
-use super::{Eight, Lanes, Mask, Simd};
+use super::{Eight, Four, Lanes, Mask, Simd};
 use std::arch::x86_64::*;
 use std::ops::{Add, Mul, Sub};
 
@@ -173,7 +173,28 @@ static LANES_OF: [[u8; 8]; 256] = {
     table
 };
 
+impl Four for A4 {
+    #[inline(always)]
+    unsafe fn gather([a, b, c, d]: [*const f32; 4]) -> Self {
+        // SAFETY: the caller vouches for the pointers. (One load and three inserts; the gather instruction is
+        // slower.)
+        A4(unsafe { _mm_setr_ps(a.read(), b.read(), c.read(), d.read()) })
+    }
+}
+
 impl Eight for A8 {
+    #[inline(always)]
+    unsafe fn from_bytes(p: *const u8) -> Self {
+        // SAFETY: the caller vouches for eight bytes.
+        A8(unsafe { _mm256_cvtepi32_ps(_mm256_cvtepu8_epi32(_mm_loadl_epi64(p.cast()))) })
+    }
+
+    #[inline(always)]
+    unsafe fn highest_bits(p: *const u32) -> u32 {
+        // SAFETY: the caller vouches for eight numbers.
+        unsafe { _mm256_movemask_ps(_mm256_loadu_ps(p.cast())) as u32 }
+    }
+
     #[inline(always)]
     unsafe fn compress(
         self,

@@ -94,7 +94,7 @@ impl Isa {
 /// An ISA's vectors: four lanes for the triangles of a leaf, eight for the children of a node, and the
 /// width that suits packets of rays and photons.
 pub(crate) trait Simd: Copy {
-    type F4: Lanes;
+    type F4: Four;
     type F8: Eight;
     type Packet: Lanes;
 }
@@ -174,8 +174,29 @@ pub(crate) trait Lanes: Copy + Add<Output = Self> + Sub<Output = Self> + Mul<Out
     }
 }
 
+/// Four lanes, one per triangle of a leaf.
+pub(crate) trait Four: Lanes {
+    /// Lane i from where `from[i]` points.
+    ///
+    /// # Safety
+    /// The CPU must have the ISA, and all pointers must be valid for reading.
+    unsafe fn gather(from: [*const f32; 4]) -> Self;
+}
+
 /// Eight lanes, one per child of a node.
 pub(crate) trait Eight: Lanes {
+    /// Eight bytes as numbers 0 to 255.
+    ///
+    /// # Safety
+    /// The CPU must have the ISA, and `p` must be valid for reading eight bytes.
+    unsafe fn from_bytes(p: *const u8) -> Self;
+
+    /// The highest bits of eight numbers: bit i is that of the i-th.
+    ///
+    /// # Safety
+    /// The CPU must have the ISA, and `p` must be valid for reading eight numbers, which need not be aligned.
+    unsafe fn highest_bits(p: *const u32) -> u32;
+
     /// Writes the lanes of `mask` to `values`, and the same lanes of `names` to `out_names`, in the
     /// order that bits `shift` to `shift + 2` of each of `order` tell; returns how many. All eight
     /// entries behind both outputs may be overwritten.

@@ -1,7 +1,7 @@
 //! Lanes over the `wide` crate: SSE2, NEON, simd128 or plain scalars, whatever the target's baseline
 //! has.
 
-use super::{Eight, Lanes, Mask, Simd};
+use super::{Eight, Four, Lanes, Mask, Simd};
 use std::ops::{Add, Mul, Sub};
 use wide::f32x4;
 
@@ -191,7 +191,28 @@ impl Lanes for P8 {
     }
 }
 
+impl Four for P4 {
+    #[inline(always)]
+    unsafe fn gather(from: [*const f32; 4]) -> Self {
+        // SAFETY: the caller vouches for the pointers.
+        P4(f32x4::new(from.map(|p| unsafe { p.read() })))
+    }
+}
+
 impl Eight for P8 {
+    #[inline(always)]
+    unsafe fn from_bytes(p: *const u8) -> Self {
+        // SAFETY: the caller vouches for eight bytes.
+        let four = |i: usize| P4(f32x4::new([0, 1, 2, 3].map(|k| unsafe { p.add(i + k).read() } as f32)));
+        P8(four(0), four(4))
+    }
+
+    #[inline(always)]
+    unsafe fn highest_bits(p: *const u32) -> u32 {
+        // SAFETY: the caller vouches for eight numbers.
+        (0..8).fold(0, |bits, i| bits | unsafe { p.add(i).read_unaligned() } >> 31 << i)
+    }
+
     #[inline(always)]
     unsafe fn compress(
         self,

@@ -101,9 +101,31 @@ unsafe fn check_compress<E: Eight>() {
     }
 }
 
+unsafe fn check_gather<F: Four>() {
+    let values = SPECIAL;
+    for from in [[0, 1, 2, 3], [15, 4, 4, 9], [7, 7, 7, 7]] {
+        // SAFETY: pointers into `values`, and the caller vouches for the ISA.
+        let lanes = unsafe { F::gather(from.map(|i| &raw const values[i])) }.to_array();
+        assert!((0..4).all(|i| same(lanes[i], SPECIAL[from[i]])));
+    }
+}
+
+unsafe fn check_bytes<E: Eight>() {
+    for first in 0..=248u8 {
+        let bytes: [u8; 8] = std::array::from_fn(|i| first + i as u8);
+        let numbers: [u32; 8] = std::array::from_fn(|i| ((first >> i) as u32) << 31 | 0x4123_4567);
+        // SAFETY: arrays of eight, and the caller vouches for the ISA.
+        let (lanes, bits) = unsafe { (E::from_bytes(bytes.as_ptr()).to_array(), E::highest_bits(numbers.as_ptr())) };
+        assert!((0..8).all(|i| lanes[i] == bytes[i] as f32));
+        assert_eq!(bits, first as u32);
+    }
+}
+
 unsafe fn check_simd<S: Simd>() {
     // SAFETY: the caller vouches for the ISA; `SPECIAL` has 16 floats.
     unsafe {
+        check_gather::<S::F4>();
+        check_bytes::<S::F8>();
         check_lanes::<S::F4>();
         check_lanes::<S::F8>();
         check_lanes::<S::Packet>();

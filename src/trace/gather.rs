@@ -26,5 +26,5 @@ pub(super) unsafe fn gather<S: Simd>(
     let count = packet.count.min(PACKET_SIZE);
     let ray = |i: usize| Ray::new(origin, Vec3::new(packet.x[i], packet.y[i], packet.z[i])).within(tmin, tmax);
     // SAFETY: forwarded.
-    unsafe { many::<S, false>(bvh, count, ray, |i, hit| out[i] = hit) }
+    unsafe { many::<S, _, false>(bvh, count, ray, |i, hit| out[i] = hit) }
 }

@@ -3,6 +3,7 @@
 //! Each entry point carries the ISA's `#[target_feature]`s; the generic kernels are
 //! `#[inline(always)]` and so are compiled for them.
 
+use super::compact::View;
 use super::{PACKET_SIZE, Packet, RawHit, Ray, gather, packet, single};
 use crate::bvh::Mbvh;
 use crate::simd::{self, Isa};
@@ -17,6 +18,8 @@ pub(crate) struct Kernels {
     occluded: unsafe fn(&Mbvh, &Ray) -> bool,
     occluded_block: unsafe fn(&Mbvh, &[Ray], &mut [u8]),
     gather: unsafe fn(&Mbvh, Vec3, &Packet, f32, f32, &mut [RawHit; PACKET_SIZE]),
+    compact_intersect: unsafe fn(&View, &[Ray], &mut [RawHit]),
+    compact_occluded: unsafe fn(&View, &[Ray], &mut [u8]),
 }
 
 macro_rules! table {
@@ -26,7 +29,7 @@ macro_rules! table {
             $(#[target_feature(enable = $features)])?
             unsafe fn intersect(bvh: &Mbvh, ray: &Ray) -> RawHit {
                 // SAFETY (all): the caller vouches for the ISA.
-                unsafe { single::one::<$simd, false>(bvh, ray) }
+                unsafe { single::one::<$simd, _, false>(bvh, ray) }
             }
             $(#[target_feature(enable = $features)])?
             unsafe fn intersect_block(bvh: &Mbvh, rays: &[Ray], out: &mut [RawHit]) {
@@ -34,18 +37,45 @@ macro_rules! table {
             }
             $(#[target_feature(enable = $features)])?
             unsafe fn occluded(bvh: &Mbvh, ray: &Ray) -> bool {
-                !unsafe { single::one::<$simd, true>(bvh, ray) }.is_miss()
+                !unsafe { single::one::<$simd, _, true>(bvh, ray) }.is_miss()
             }
             $(#[target_feature(enable = $features)])?
             unsafe fn occluded_block(bvh: &Mbvh, rays: &[Ray], out: &mut [u8]) {
                 let n = rays.len().min(out.len());
-                unsafe { single::many::<$simd, true>(bvh, n, |i| rays[i], |i, hit| out[i] = !hit.is_miss() as u8) }
+                unsafe { single::many::<$simd, _, true>(bvh, n, |i| rays[i], |i, hit| out[i] = !hit.is_miss() as u8) }
             }
             $(#[target_feature(enable = $features)])?
             unsafe fn gather(bvh: &Mbvh, origin: Vec3, p: &Packet, tmin: f32, tmax: f32, out: &mut [RawHit; PACKET_SIZE]) {
                 unsafe { gather::gather::<$simd>(bvh, origin, p, tmin, tmax, out) }
             }
-            pub(super) static TABLE: Kernels = Kernels { isa: $isa, intersect, intersect_block, occluded, occluded_block, gather };
+            $(#[target_feature(enable = $features)])?
+            unsafe fn compact_intersect(tree: &View, rays: &[Ray], out: &mut [RawHit]) {
+                let n = rays.len().min(out.len());
+                match rays {
+                    [ray] if n == 1 => out[0] = unsafe { single::one::<$simd, _, false>(tree, ray) },
+                    _ => unsafe { single::many::<$simd, _, false>(tree, n, |i| rays[i], |i, hit| out[i] = hit) },
+                }
+            }
+            $(#[target_feature(enable = $features)])?
+            unsafe fn compact_occluded(tree: &View, rays: &[Ray], out: &mut [u8]) {
+                let n = rays.len().min(out.len());
+                match rays {
+                    [ray] if n == 1 => out[0] = !unsafe { single::one::<$simd, _, true>(tree, ray) }.is_miss() as u8,
+                    _ => unsafe {
+                        single::many::<$simd, _, true>(tree, n, |i| rays[i], |i, hit| out[i] = !hit.is_miss() as u8)
+                    },
+                }
+            }
+            pub(super) static TABLE: Kernels = Kernels {
+                isa: $isa,
+                intersect,
+                intersect_block,
+                occluded,
+                occluded_block,
+                gather,
+                compact_intersect,
+                compact_occluded,
+            };
         }
         use $module::TABLE as $name;
     };
@@ -108,5 +138,17 @@ impl Kernels {
     ) {
         // SAFETY: see `intersect`.
         unsafe { (self.gather)(bvh, origin, packet, tmin, tmax, out) }
+    }
+
+    /// Closest hits of as many rays as both slices have, in a compact tree.
+    pub(crate) fn compact_intersect(&self, tree: &View, rays: &[Ray], out: &mut [RawHit]) {
+        // SAFETY: see `intersect`.
+        unsafe { (self.compact_intersect)(tree, rays, out) }
+    }
+
+    /// Any hit of as many rays as both slices have, in a compact tree: 1 or 0.
+    pub(crate) fn compact_occluded(&self, tree: &View, rays: &[Ray], out: &mut [u8]) {
+        // SAFETY: see `intersect`.
+        unsafe { (self.compact_occluded)(tree, rays, out) }
     }
 }

@@ -5,15 +5,19 @@
 //! every ISA agree on coincident triangles.
 
 pub mod baseline;
+mod compact;
 mod gather;
 mod kernels;
 pub mod offset;
 mod packet;
 mod single;
+mod tree;
 mod triangle;
 
+pub(crate) use compact::View;
 pub(crate) use kernels::Kernels;
 
+use crate::bvh::Mbvh;
 use crate::error::{Result, invalid_argument};
 use crate::scene::{NONE, Scene};
 use bytemuck::{Pod, Zeroable};
@@ -114,6 +118,13 @@ impl Packet {
     }
 }
 
+/// The tree of a scene, for kernels.
+#[derive(Clone, Copy)]
+pub(crate) enum TreeView<'a> {
+    Whole(&'a Mbvh),
+    Compact(View<'a>),
+}
+
 /// Work items are handed to threads in blocks of this many rays.
 const BLOCK: usize = 1024;
 
@@ -129,7 +140,7 @@ impl Scene {
         let block = |rays: &[Ray], out: &mut [Hit]| {
             let mut raw = [RawHit::MISS; 256];
             for (rays, out) in rays.chunks(256).zip(out.chunks_mut(256)) {
-                self.device().kernels().intersect_block(self.mbvh(), rays, &mut raw);
+                self.intersect_block(rays, &mut raw);
                 self.to_hits(&raw, out);
             }
         };
@@ -147,7 +158,7 @@ impl Scene {
         if rays.len() != out.len() {
             return invalid_argument!("{} rays, but room for {} answers", rays.len(), out.len());
         }
-        let block = |rays: &[Ray], out: &mut [u8]| self.device().kernels().occluded_block(self.mbvh(), rays, out);
+        let block = |rays: &[Ray], out: &mut [u8]| self.occluded_block(rays, out);
         if parallel {
             self.device()
                 .install(|| rays.par_chunks(BLOCK).zip(out.par_chunks_mut(BLOCK)).for_each(|(r, o)| block(r, o)));
@@ -194,7 +205,58 @@ impl Scene {
     /// are left alone.
     #[inline]
     pub fn gather_packet(&self, origin: Vec3, packet: &Packet, tmin: f32, tmax: f32, out: &mut [RawHit; PACKET_SIZE]) {
-        self.device().kernels().gather(self.mbvh(), origin, packet, tmin, tmax, out);
+        match self.tree() {
+            TreeView::Whole(tree) => self.device().kernels().gather(tree, origin, packet, tmin, tmax, out),
+            TreeView::Compact(tree) => {
+                let count = packet.count.min(PACKET_SIZE);
+                let rays: [Ray; PACKET_SIZE] = std::array::from_fn(|i| {
+                    Ray::new(origin, Vec3::new(packet.x[i], packet.y[i], packet.z[i])).within(tmin, tmax)
+                });
+                self.device().kernels().compact_intersect(&tree, &rays[..count], out);
+            }
+        }
+    }
+
+    /// Closest hit with `tmin < t ≤ tmax`, by global triangle number.
+    #[inline]
+    pub fn intersect_raw(&self, ray: &Ray) -> RawHit {
+        match self.tree() {
+            TreeView::Whole(tree) => self.device().kernels().intersect(tree, ray),
+            TreeView::Compact(tree) => {
+                let mut hit = [RawHit::MISS];
+                self.device().kernels().compact_intersect(&tree, std::slice::from_ref(ray), &mut hit);
+                hit[0]
+            }
+        }
+    }
+
+    /// Whether anything lies on the ray with `tmin < t ≤ tmax`.
+    #[inline]
+    pub fn occluded(&self, ray: &Ray) -> bool {
+        match self.tree() {
+            TreeView::Whole(tree) => self.device().kernels().occluded(tree, ray),
+            TreeView::Compact(tree) => {
+                let mut occluded = [0];
+                self.device().kernels().compact_occluded(&tree, std::slice::from_ref(ray), &mut occluded);
+                occluded[0] != 0
+            }
+        }
+    }
+
+    /// Closest hits of as many rays as both slices have.
+    pub(crate) fn intersect_block(&self, rays: &[Ray], out: &mut [RawHit]) {
+        match self.tree() {
+            TreeView::Whole(tree) => self.device().kernels().intersect_block(tree, rays, out),
+            TreeView::Compact(tree) => self.device().kernels().compact_intersect(&tree, rays, out),
+        }
+    }
+
+    /// Any hit of as many rays as both slices have: 1 or 0.
+    pub(crate) fn occluded_block(&self, rays: &[Ray], out: &mut [u8]) {
+        match self.tree() {
+            TreeView::Whole(tree) => self.device().kernels().occluded_block(tree, rays, out),
+            TreeView::Compact(tree) => self.device().kernels().compact_occluded(&tree, rays, out),
+        }
     }
 }
 

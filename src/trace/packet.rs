@@ -50,7 +50,7 @@ pub(super) unsafe fn block<S: Simd>(bvh: &Mbvh, rays: &[Ray], out: &mut [RawHit]
         // SAFETY (both): forwarded; `bundle` has said that these are one.
         if start < end {
             let (rays, out) = (&rays[start..end], &mut out[start..end]);
-            unsafe { single::many::<S, false>(bvh, rays.len(), |i| rays[i], |i, hit| out[i] = hit) }
+            unsafe { single::many::<S, _, false>(bvh, rays.len(), |i| rays[i], |i, hit| out[i] = hit) }
         }
         if length > 0 {
             unsafe { trace::<S>(bvh, &rays[end..end + length], &mut out[end..end + length]) }

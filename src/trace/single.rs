@@ -4,12 +4,15 @@
 //! The box test is conservative (Ize, *Robust BVH Ray Traversal*, 2013): the builder moves planes, and
 //! a ray its origin, by more than rounding can.
 
-use super::triangle::{Projected, Shear, accurate_distance};
+use super::tree::{Leaf, Tree};
+use super::triangle::Shear;
 use super::{RawHit, Ray};
-use crate::bvh::layout::{ChildRef, Mbvh, Node, STACK_SIZE, WIDTH};
+use crate::bvh::layout::{ChildRef, STACK_SIZE, WIDTH};
 use crate::scene::NONE;
 use crate::simd::{Eight, Lanes, Mask, Simd};
+use glam::Vec3;
 use std::hint::select_unpredictable;
+use std::marker::PhantomData;
 use std::mem::MaybeUninit;
 
 /// Ize's 1 + 2γ₃ for box tests that subtract the origin from planes, rounded up.
@@ -88,37 +91,35 @@ pub(super) struct RaySetup {
     reciprocal: [f32; 3],
     near_offset: [f32; 3],
     far_offset: [f32; 3],
-    /// Bytes from the start of a node to the near and far planes, per axis.
+    /// Bytes from the first row of a node's planes to the near and far ones, per axis.
     near: [u32; 3],
     far: [u32; 3],
-    /// Of the direction's octant in [`Node::order`].
+    /// Of the direction's octant in [`Tree::order`].
     shift: u32,
     is_slow: bool,
     tmin: f32,
     shear: Shear,
 }
 
-/// Bytes of a row of planes.
-const ROW: u32 = 4 * WIDTH as u32;
-
 impl RaySetup {
     /// If [`must_be_slow`](Self::must_be_slow), then [`make_slow`](Self::make_slow). (All axes in one vector by hand take no fewer
     /// instructions.)
     #[inline(always)]
-    fn new(origin: [f32; 3], direction: [f32; 3], tmin: f32) -> Self {
+    fn new<T: Tree>(origin: [f32; 3], direction: [f32; 3], tmin: f32) -> Self {
         let shear = Shear::new(origin, direction);
         let is_negative = direction.map(|d| d < 0.0);
         let reciprocal = direction.map(|d| 1.0 / d);
         let offset: [f32; 3] = std::array::from_fn(|a| -origin[a] * reciprocal[a]);
         let error: [f32; 3] = std::array::from_fn(|a| OFFSET_ERROR * offset[a].abs());
         // (Half of the branches that this became were mispredicted.)
-        let near = std::array::from_fn(|a| select_unpredictable(is_negative[a], ROW * (a as u32 + 3), ROW * a as u32));
+        let near =
+            std::array::from_fn(|a| select_unpredictable(is_negative[a], T::ROW * (a as u32 + 3), T::ROW * a as u32));
         RaySetup {
             reciprocal,
             near_offset: std::array::from_fn(|a| offset[a] - error[a]),
             far_offset: std::array::from_fn(|a| offset[a] + error[a]),
             near,
-            far: std::array::from_fn(|a| ROW * (2 * a as u32 + 3) - near[a]),
+            far: std::array::from_fn(|a| T::ROW * (2 * a as u32 + 3) - near[a]),
             shift: 3 * (is_negative[0] as u32 | (is_negative[1] as u32) << 1 | (is_negative[2] as u32) << 2),
             is_slow: false,
             tmin,
@@ -134,7 +135,7 @@ impl RaySetup {
 
     /// Where a reciprocal is infinite or too large for [`Self::node`].
     #[cold]
-    fn make_slow(&mut self, origin: [f32; 3], direction: [f32; 3]) {
+    fn make_slow<T: Tree>(&mut self, origin: [f32; 3], direction: [f32; 3]) {
         let [x, y, z] = direction.map(f32::abs);
         let parallel = PARALLEL * x.max(y).max(z);
         self.is_slow = true;
@@ -145,40 +146,109 @@ impl RaySetup {
                 self.near_offset[a] += nudge(origin[a]);
                 self.far_offset[a] -= nudge(origin[a]);
                 // The sign of a direction that is not quite 0 must not matter.
-                self.near[a] = ROW * a as u32;
-                self.far[a] = ROW * (a as u32 + 3);
+                self.near[a] = T::ROW * a as u32;
+                self.far[a] = T::ROW * (a as u32 + 3);
             }
         }
     }
 
-    /// Near distances of a node's boxes, and which of them the ray meets up to `tmax`.
+    /// Near distances of boxes, and which of them the ray meets up to `tmax`.
     ///
     /// # Safety
     /// The CPU must have the ISA.
     #[inline(always)]
-    unsafe fn node<S: Simd>(&self, node: &Node, tmax: f32) -> (S::F8, <S::F8 as Lanes>::Mask) {
-        let bytes = std::ptr::from_ref(node).cast::<u8>();
-        // SAFETY (all): offsets are those of rows of eight in the node; the caller vouches for the ISA.
-        let planes = |offset: u32| unsafe { S::F8::load(bytes.add(offset as usize).cast()) };
-        let splat = |x: f32| unsafe { S::F8::splat(x) };
-        let axis = |a: usize| {
-            let r = splat(self.reciprocal[a]);
-            let near = planes(self.near[a]).mul_add(r, splat(self.near_offset[a]));
-            let far = planes(self.far[a]).mul_add(r, splat(self.far_offset[a]));
-            (near, far)
+    unsafe fn boxes<L: Lanes>(&self, boxes: &impl Boxes<L>, tmax: f32) -> (L, L::Mask) {
+        // SAFETY (all): the caller vouches for the ISA; axes are.
+        let ((nx, fx), (ny, fy), (nz, fz)) = unsafe {
+            if self.is_slow {
+                (self.slow_axis(boxes, 0), self.slow_axis(boxes, 1), self.slow_axis(boxes, 2))
+            } else {
+                (self.axis(boxes, 0), self.axis(boxes, 1), self.axis(boxes, 2))
+            }
         };
-        let slow_axis = |a: usize| {
-            let r = splat(self.reciprocal[a]);
-            let near = (planes(self.near[a]) - splat(self.near_offset[a])) * r;
-            let far = (planes(self.far[a]) - splat(self.far_offset[a])) * r;
-            // Away from the near planes, on either side of the origin.
-            (near, (far * splat(FAR_SCALE)).max(far * splat(2.0 - FAR_SCALE)))
-        };
-        let ((nx, fx), (ny, fy), (nz, fz)) =
-            if self.is_slow { (slow_axis(0), slow_axis(1), slow_axis(2)) } else { (axis(0), axis(1), axis(2)) };
-        let near = nx.max(ny).max(nz.max(splat(self.tmin)));
-        let far = fx.min(fy).min(fz.min(splat(tmax)));
+        let (tmin, tmax) = unsafe { (L::splat(self.tmin), L::splat(tmax)) };
+        let near = nx.max(ny).max(nz.max(tmin));
+        let far = fx.min(fy).min(fz.min(tmax));
         (near, near.le(far))
+    }
+
+    /// Distances of near and far planes across an axis. (A function: as a closure it was not inlined.)
+    ///
+    /// # Safety
+    /// The CPU must have the ISA; the axis must be 0 to 2.
+    #[inline(always)]
+    unsafe fn axis<L: Lanes>(&self, boxes: &impl Boxes<L>, a: usize) -> (L, L) {
+        // SAFETY: forwarded; rows are those of the axis.
+        unsafe {
+            let r = L::splat(self.reciprocal[a]);
+            let near = boxes.planes(a, self.near[a]).mul_add(r, L::splat(self.near_offset[a]));
+            let far = boxes.planes(a, self.far[a]).mul_add(r, L::splat(self.far_offset[a]));
+            (near, far)
+        }
+    }
+
+    /// The same of rays that are slow.
+    ///
+    /// # Safety
+    /// As for [`Self::axis`].
+    #[inline(always)]
+    unsafe fn slow_axis<L: Lanes>(&self, boxes: &impl Boxes<L>, a: usize) -> (L, L) {
+        // SAFETY: forwarded; rows are those of the axis.
+        unsafe {
+            let r = L::splat(self.reciprocal[a]);
+            let near = (boxes.planes(a, self.near[a]) - L::splat(self.near_offset[a])) * r;
+            let far = (boxes.planes(a, self.far[a]) - L::splat(self.far_offset[a])) * r;
+            // Away from the near planes, on either side of the origin.
+            (near, (far * L::splat(FAR_SCALE)).max(far * L::splat(2.0 - FAR_SCALE)))
+        }
+    }
+
+    /// Whether the ray, set up for `T`, meets a box up to `tmax`, by the arithmetic that nodes meet.
+    ///
+    /// # Safety
+    /// The CPU must have the ISA.
+    #[inline(always)]
+    pub(super) unsafe fn meets<S: Simd, T: Tree>(&self, lower: Vec3, upper: Vec3, tmax: f32) -> bool {
+        let one = OneBox::<T> { planes: [lower, upper], tree: PhantomData };
+        // SAFETY: forwarded.
+        unsafe { self.boxes::<S::F4>(&one, tmax) }.1.any()
+    }
+}
+
+/// Boxes that rays are tested against.
+trait Boxes<L> {
+    /// Planes across `axis`, of the row that begins at `row` as in [`Tree::planes`].
+    ///
+    /// # Safety
+    /// As for [`Tree::planes`].
+    unsafe fn planes(&self, axis: usize, row: u32) -> L;
+}
+
+/// The children of a node.
+struct Children<'a, S, T: Tree> {
+    node: &'a T::Node,
+    isa: PhantomData<S>,
+}
+
+impl<S: Simd, T: Tree> Boxes<S::F8> for Children<'_, S, T> {
+    #[inline(always)]
+    unsafe fn planes(&self, axis: usize, row: u32) -> S::F8 {
+        // SAFETY: forwarded.
+        unsafe { T::planes::<S>(self.node, axis, row) }
+    }
+}
+
+/// One box, in all lanes.
+struct OneBox<T> {
+    planes: [Vec3; 2],
+    tree: PhantomData<T>,
+}
+
+impl<L: Lanes, T: Tree> Boxes<L> for OneBox<T> {
+    #[inline(always)]
+    unsafe fn planes(&self, axis: usize, row: u32) -> L {
+        // SAFETY: forwarded.
+        unsafe { L::splat(self.planes[(row >= 3 * T::ROW) as usize][axis]) }
     }
 }
 
@@ -218,15 +288,23 @@ pub(super) fn barycentrics(u: f32, v: f32, sum: f32) -> (f32, f32) {
 /// Improves `best` by the triangles of a leaf; `ANY`: stops at the first. Says whether it did.
 ///
 /// # Safety
-/// The CPU must have the ISA; `leaf` must be a leaf of `bvh`.
+/// The CPU must have the ISA; `leaf` must be a leaf of `tree`.
 #[inline(always)]
-unsafe fn leaf<S: Simd, const ANY: bool>(bvh: &Mbvh, leaf: ChildRef, ray: &RaySetup, best: &mut Best) -> bool {
-    let (rows, count) = (bvh.leaf(leaf), leaf.leaf_count());
+unsafe fn leaf<S: Simd, T: Tree, const ANY: bool>(
+    tree: &T,
+    leaf: ChildRef,
+    ray: &RaySetup,
+    limit: f32,
+    best: &mut Best,
+) -> bool {
+    // SAFETY: forwarded.
+    let leaf = unsafe { tree.leaf::<S>(leaf) };
+    let count = leaf.count();
     let mut improved = false;
     let mut first = 0;
     while first < count {
-        // SAFETY: `rows` is a leaf of `count`, and `first < count`; the caller vouches for the ISA.
-        let projected = unsafe { Projected::<S::F4>::load(rows, count, first, &ray.shear) };
+        // SAFETY: `first < count`; the caller vouches for the ISA.
+        let projected = unsafe { leaf.project::<S::F4>(first, &ray.shear) };
         let lanes = if count - first >= 4 { 0xf } else { (1u32 << (count - first)) - 1 };
         // SAFETY: as above.
         let mut candidates = unsafe { projected.inside() }.bits() & lanes;
@@ -241,8 +319,7 @@ unsafe fn leaf<S: Simd, const ANY: bool>(bvh: &Mbvh, leaf: ChildRef, ray: &RaySe
                 let weights = [projected.u, projected.v, projected.w].map(|l| l.to_array()[i]);
                 // Where all vanish, the ray lies in the plane. SAFETY: `candidates` has no lane beyond the count.
                 let is_seen = weights[0] + weights[1] + weights[2] != 0.0;
-                t[i] =
-                    if is_seen { unsafe { accurate_distance(rows, count, first + i, &ray.shear) } } else { f32::NAN };
+                t[i] = if is_seen { unsafe { leaf.accurate_distance(first + i, &ray.shear) } } else { f32::NAN };
             }
             let (u, v, w) = (projected.u.to_array(), projected.v.to_array(), projected.w.to_array());
             while candidates != 0 {
@@ -251,13 +328,17 @@ unsafe fn leaf<S: Simd, const ANY: bool>(bvh: &Mbvh, leaf: ChildRef, ray: &RaySe
                 if !(ray.tmin < t[i] && t[i] <= best.t) {
                     continue;
                 }
+                // SAFETY: first + i < count.
+                if !unsafe { leaf.counts::<S>(first + i, ray, limit) } {
+                    continue;
+                }
                 if ANY {
                     // Any number tells that there is one.
                     best.triangle = 0;
                     return true;
                 }
-                // SAFETY: row 9 of the leaf holds `count` numbers, and first + i < count.
-                let id = unsafe { rows.add(9 * count + first + i).read().to_bits() };
+                // SAFETY: as above.
+                let id = unsafe { leaf.number(first + i) };
                 if t[i] < best.t || id < best.triangle {
                     *best = Best { t: t[i], triangle: id, u: u[i], v: v[i], sum: u[i] + v[i] + w[i] };
                     improved = true;
@@ -287,12 +368,13 @@ impl Stack {
     /// # Safety
     /// The CPU must have the ISA; `node` must be a node of the tree that the stack is used for.
     #[inline(always)]
-    unsafe fn push<S: Simd>(&mut self, node: &Node, shift: u32, near: S::F8, mask: <S::F8 as Lanes>::Mask) {
+    unsafe fn push<S: Simd, T: Tree>(&mut self, node: &T::Node, shift: u32, near: S::F8, mask: <S::F8 as Lanes>::Mask) {
+        let mut room = MaybeUninit::uninit();
         // SAFETY: the builder bounds the tree's depth so that there is room (see `STACK_SIZE`).
         self.count += unsafe {
             near.compress(
-                node.children.as_ptr().cast(),
-                node.order.as_ptr(),
+                T::names(node, &mut room),
+                T::order(node),
                 shift,
                 mask,
                 self.near.as_mut_ptr().add(self.count).cast(),
@@ -312,7 +394,7 @@ impl Stack {
         unsafe { self.child.get_unchecked(self.count).assume_init() }
     }
 
-    /// Drops what begins behind `tmax`. (Entry by entry, without branches, Sponza's random rays took XXX longer.)
+    /// Drops what begins behind `tmax`. (Entry by entry, without branches, random rays in Sponza took some 10 % longer.)
     ///
     /// # Safety
     /// The CPU must have the ISA; there must be at least [`BOTTOM`] entries.
@@ -355,7 +437,7 @@ impl Walk {
     /// Begins the walk of a ray in `place`; says whether there is anything to be walked: some rays cannot
     /// hit anything.
     #[inline(always)]
-    fn begin(place: &mut MaybeUninit<Walk>, ray: &Ray, number: usize) -> bool {
+    fn begin<T: Tree>(place: &mut MaybeUninit<Walk>, ray: &Ray, number: usize) -> bool {
         let Some(scale) = direction_scale(ray) else { return false };
         let (mut d, mut tmin, mut tmax) = (ray.direction, ray.tmin, ray.tmax);
         if scale != 1.0 {
@@ -369,7 +451,7 @@ impl Walk {
         // SAFETY: the pointers lead into `place`. Everything but entries of the stack is written, and
         // those are `MaybeUninit` themselves.
         unsafe {
-            (&raw mut (*p).ray).write(RaySetup::new(ray.origin, d, tmin));
+            (&raw mut (*p).ray).write(RaySetup::new::<T>(ray.origin, d, tmin));
             (&raw mut (*p).best).write(Best::none(tmax));
             (&raw mut (*p).limit).write(beyond(tmax));
             (&raw mut (*p).current).write(ChildRef::node(0));
@@ -382,7 +464,7 @@ impl Walk {
             // In place: a call that may change a ray keeps it from being built where it will be, and in between
             // it went through memory twice.
             if RaySetup::must_be_slow(d) {
-                (*p).ray.make_slow(ray.origin, d);
+                (*p).ray.make_slow::<T>(ray.origin, d);
             }
         }
         true
@@ -391,15 +473,15 @@ impl Walk {
     /// Visits the current node and goes on to the next child.
     ///
     /// # Safety
-    /// The CPU must have the ISA; the walk must have been begun in `bvh`, and `current` be a node.
+    /// The CPU must have the ISA; the walk must have been begun in `tree`, and `current` be a node.
     #[inline(always)]
-    unsafe fn visit_node<S: Simd>(&mut self, bvh: &Mbvh) -> ChildRef {
-        debug_assert!(self.current.node_index() < bvh.nodes.len());
-        // SAFETY: inner references of the tree are in range; the caller vouches for the ISA.
+    unsafe fn visit_node<S: Simd, T: Tree>(&mut self, tree: &T) -> ChildRef {
+        // SAFETY: forwarded.
         unsafe {
-            let node = bvh.nodes.get_unchecked(self.current.node_index());
-            let (near, mask) = self.ray.node::<S>(node, self.limit);
-            self.stack.push::<S>(node, self.ray.shift, near, mask);
+            let node = tree.node(self.current);
+            let boxes = Children::<S, T> { node, isa: PhantomData };
+            let (near, mask) = self.ray.boxes::<S::F8>(&boxes, self.limit);
+            self.stack.push::<S, T>(node, self.ray.shift, near, mask);
             self.current = self.stack.pop();
             self.current
         }
@@ -409,12 +491,12 @@ impl Walk {
     /// or when the walk has met something and `ANY`.
     ///
     /// # Safety
-    /// The CPU must have the ISA; the walk must have been begun in `bvh`, and `current` be a leaf.
+    /// The CPU must have the ISA; the walk must have been begun in `tree`, and `current` be a leaf.
     #[inline(always)]
-    unsafe fn visit_leaf<S: Simd, const ANY: bool>(&mut self, bvh: &Mbvh) -> ChildRef {
+    unsafe fn visit_leaf<S: Simd, T: Tree, const ANY: bool>(&mut self, tree: &T) -> ChildRef {
         // SAFETY: forwarded.
         unsafe {
-            if leaf::<S, ANY>(bvh, self.current, &self.ray, &mut self.best) {
+            if leaf::<S, T, ANY>(tree, self.current, &self.ray, self.limit, &mut self.best) {
                 if ANY {
                     self.stack.count = BOTTOM;
                 } else {
@@ -440,9 +522,9 @@ impl Walk {
 /// # Safety
 /// The CPU must have the ISA.
 #[inline(always)]
-pub(super) unsafe fn one<S: Simd, const ANY: bool>(bvh: &Mbvh, ray: &Ray) -> RawHit {
+pub(super) unsafe fn one<S: Simd, T: Tree, const ANY: bool>(tree: &T, ray: &Ray) -> RawHit {
     let mut place = MaybeUninit::uninit();
-    if !Walk::begin(&mut place, ray, 0) {
+    if !Walk::begin::<T>(&mut place, ray, 0) {
         return RawHit::MISS;
     }
     // SAFETY: it has begun.
@@ -451,9 +533,9 @@ pub(super) unsafe fn one<S: Simd, const ANY: bool>(bvh: &Mbvh, ray: &Ray) -> Raw
         // SAFETY: forwarded.
         unsafe {
             if walk.current.is_leaf() {
-                walk.visit_leaf::<S, ANY>(bvh);
+                walk.visit_leaf::<S, T, ANY>(tree);
             } else {
-                walk.visit_node::<S>(bvh);
+                walk.visit_node::<S, T>(tree);
             }
         }
     }
@@ -476,8 +558,8 @@ type Queue = [*mut Walk; FLIGHT + 1];
 /// # Safety
 /// The CPU must have the ISA.
 #[inline(always)]
-pub(super) unsafe fn many<S: Simd, const ANY: bool>(
-    bvh: &Mbvh,
+pub(super) unsafe fn many<S: Simd, T: Tree, const ANY: bool>(
+    tree: &T,
     count: usize,
     ray: impl Fn(usize) -> Ray,
     mut done: impl FnMut(usize, RawHit),
@@ -494,7 +576,7 @@ pub(super) unsafe fn many<S: Simd, const ANY: bool>(
     loop {
         while idle_count > 0 && next < count {
             let walk = unsafe { *idle.add(idle_count - 1) };
-            if Walk::begin(unsafe { &mut *walk.cast() }, &ray(next), next) {
+            if Walk::begin::<T>(unsafe { &mut *walk.cast() }, &ray(next), next) {
                 idle_count -= 1;
                 unsafe { *at_nodes.add(node_count) = walk };
                 node_count += 1;
@@ -509,7 +591,7 @@ pub(super) unsafe fn many<S: Simd, const ANY: bool>(
         // Puts a walk where its next visit will be: into both queues, but counted in one. It is written
         // at or before the place that is read next.
         let enqueue = |walk: *mut Walk, child: ChildRef, nodes: &mut usize, leaves: &mut usize| unsafe {
-            bvh.prefetch(child);
+            tree.prefetch(child);
             *at_nodes.add(*nodes) = walk;
             *at_leaves.add(*leaves) = walk;
             *leaves += child.is_leaf() as usize;
@@ -518,7 +600,7 @@ pub(super) unsafe fn many<S: Simd, const ANY: bool>(
         let visits = std::mem::take(&mut node_count);
         for k in 0..visits {
             let walk = unsafe { *at_nodes.add(k) };
-            let child = unsafe { (*walk).visit_node::<S>(bvh) };
+            let child = unsafe { (*walk).visit_node::<S, T>(tree) };
             enqueue(walk, child, &mut node_count, &mut leaf_count);
         }
         let visits = std::mem::take(&mut leaf_count);
@@ -526,7 +608,7 @@ pub(super) unsafe fn many<S: Simd, const ANY: bool>(
             let walk = unsafe { *at_leaves.add(k) };
             let mut child = unsafe { (*walk).current };
             if child != ChildRef::EMPTY {
-                child = unsafe { (*walk).visit_leaf::<S, ANY>(bvh) };
+                child = unsafe { (*walk).visit_leaf::<S, T, ANY>(tree) };
             }
             if child != ChildRef::EMPTY {
                 enqueue(walk, child, &mut node_count, &mut leaf_count);

@@ -126,7 +126,11 @@ impl<L: Lanes> Projected<L> {
     /// triangle.
     #[inline(always)]
     pub(super) fn new(corners: [V3<L>; 3], [sx, sy]: [L; 2]) -> Self {
-        let [(ax, ay), (bx, by), (cx, cy)] = corners.map(|c| (sx.mul_add(c.z, c.x), sy.mul_add(c.z, c.y)));
+        // (`map` was not inlined everywhere.)
+        let [a, b, c] = corners;
+        let (ax, ay) = (sx.mul_add(a.z, a.x), sy.mul_add(a.z, a.y));
+        let (bx, by) = (sx.mul_add(b.z, b.x), sy.mul_add(b.z, b.y));
+        let (cx, cy) = (sx.mul_add(c.z, c.x), sy.mul_add(c.z, c.y));
         Projected { corners, u: ax * cy - ay * cx, v: bx * ay - by * ax, w: cx * by - cy * bx }
     }
 

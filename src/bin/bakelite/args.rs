@@ -16,11 +16,13 @@ Bakes light maps.
 
 Usage: bakelite [bake] [SCENE] [OPTIONS]
        bakelite report live [SCENE] [OPTIONS]
+       bakelite report memory [SCENE] [OPTIONS]
 
 SCENE, or --scene SCENE, is a file (.obj .ply .gltf .glb) or a built-in scene (atrium, cornell,
 furnace). Without it, the atrium is baked. Lengths are in scene units, colours
 are linear r,g,b. `report live` measures live updates instead: error against
-time and rays, budgets, traffic and memory.
+time and rays, budgets, traffic and memory; `report memory` the scene's memory,
+default and compact, and what that costs rays.
 
 Lights, added to those of the scene; may be repeated:
   --light point:X,Y,Z:R,G,B               intensity in W/sr
@@ -50,6 +52,7 @@ Machine:
   --bins N               bins of the tree builder [64]
   --leaf N               most triangles per leaf [4]
   --build NAME           default, or high: with spatial splits, for faster rays [default]
+  --compact              the tree in a fifth of the memory, for slower rays
 Pictures (path traced reference; indirect map + shadow rays; light map alone):
   --camera PX,PY,PZ:TX,TY,TZ[:FOV]        position, target, vertical degrees [60];
                                           without it, a view is looked for
@@ -71,6 +74,7 @@ Output:
 pub enum Command {
     Bake(Box<BakeArgs>),
     ReportLive(Box<ReportArgs>),
+    ReportMemory(Box<BakeArgs>),
     Help,
     Version,
 }
@@ -148,7 +152,7 @@ const MAX_PICTURE: usize = 16384;
 pub fn parse(args: impl IntoIterator<Item = OsString>) -> Result<Command, String> {
     let mut parser = lexopt::Parser::from_args(args);
     let mut report = ReportArgs::default();
-    let (mut first, mut is_report, mut scene, mut density) = (true, false, None, None);
+    let (mut first, mut reported, mut scene, mut density) = (true, String::new(), None, None);
     // The first flag that only a report has.
     let mut of_report = None;
     while let Some(arg) = parser.next().map_err(|e| e.to_string())? {
@@ -157,11 +161,10 @@ pub fn parse(args: impl IntoIterator<Item = OsString>) -> Result<Command, String
             Arg::Short('V') | Arg::Long("version") => return Ok(Command::Version),
             Arg::Value(v) if first && v == "bake" => {}
             Arg::Value(v) if first && v == "report" => {
-                is_report = true;
-                match parser.value().ok() {
-                    Some(kind) if kind == "live" => {}
-                    Some(kind) => return Err(format!("there is no report {kind:?}; there is: live")),
-                    None => return Err("report needs what to report; there is: live".into()),
+                reported = match parser.value().ok() {
+                    Some(kind) if kind == "live" || kind == "memory" => text("report", kind)?,
+                    Some(kind) => return Err(format!("there is no report {kind:?}; there are: live, memory")),
+                    None => return Err("report needs what to report; there are: live, memory".into()),
                 }
             }
             Arg::Value(v) => name_scene(&mut scene, text("SCENE", v)?)?,
@@ -191,8 +194,9 @@ pub fn parse(args: impl IntoIterator<Item = OsString>) -> Result<Command, String
     }
     bake.desc.texels_per_unit = density.unwrap_or(if bake.scene == "atrium" { ATRIUM_DENSITY } else { 0.0 });
     match of_report {
-        _ if is_report => Ok(Command::ReportLive(Box::new(report))),
+        _ if reported == "live" => Ok(Command::ReportLive(Box::new(report))),
         Some(flag) => Err(format!("{flag} is for `report live` alone")),
+        None if reported == "memory" => Ok(Command::ReportMemory(Box::new(report.bake))),
         None => Ok(Command::Bake(Box::new(report.bake))),
     }
 }
@@ -228,6 +232,7 @@ fn option(name: &str, parser: &mut lexopt::Parser, bake: &mut BakeArgs) -> Resul
         "bins" => bake.build.bins = number(&flag, &value()?)?,
         "leaf" => bake.build.max_leaf = number(&flag, &value()?)?,
         "build" => bake.build.quality = build_quality(&value()?)?,
+        "compact" => bake.build.compact = true,
         "camera" => bake.camera = Some(camera(&value()?)?),
         "up" => bake.up = axis(&value()?)?,
         "width" => bake.width = picture_size(&flag, &value()?)?,
@@ -413,7 +418,7 @@ mod tests {
             "bake s.obj --light point:1,2,3:4,5,6 --light spot:0,0,0:0,-1,0:20,30:1,1,1 --light sun:0,-1,0:7,8,9 \
              --light rect:0,0,0:1,0,0:0,0,1:2,2,2 --texels-per-unit 2.5 --page-size 256 --padding 3 --gather-divisor 2 \
              --radiance-divisor 16 --photons 5 --bounces 6 --gather-rays 7 --radius 0.5 --blur 8 --direct-samples 9 \
-             --seed 10 --threads 2 --isa portable --bins 32 --leaf 4 --build high --camera 0,1,2:3,4,5:40 --up z --width 64 \
+             --seed 10 --threads 2 --isa portable --bins 32 --leaf 4 --build high --compact --camera 0,1,2:3,4,5:40 --up z --width 64 \
              --height 48 --reference-spp 3 --out o --no-glb --quiet",
         )
         .unwrap();
@@ -425,6 +430,7 @@ mod tests {
         assert_eq!((p.photon_count, p.max_bounces, p.gather_rays, p.radius, p.blur_radius), (5, 6, 7, 0.5, 8));
         assert_eq!((p.direct_samples, p.seed, b.threads, b.isa), (9, 10, 2, Some(Isa::Portable)));
         assert_eq!((b.build.bins, b.build.max_leaf, b.build.quality, b.up), (32, 4, BuildQuality::High, Vec3::Z));
+        assert!(b.build.compact);
         let camera = b.camera.unwrap();
         assert_eq!((camera.position, camera.target), (Vec3::new(0.0, 1.0, 2.0), Vec3::new(3.0, 4.0, 5.0)));
         assert!((camera.fov_y.to_degrees() - 40.0).abs() < 1e-4);
@@ -462,11 +468,12 @@ mod tests {
             ("--camera 0,0,0:1,2,3:200", "field of view is 200"),
             ("--width 0", "--width is 0, outside 1"),
             ("a --scene b", "two scenes, \"a\" and \"b\""),
-            ("report", "report needs what to report; there is: live"),
-            ("report dead", "there is no report \"dead\"; there is: live"),
+            ("report", "report needs what to report; there are: live, memory"),
+            ("report dead", "there is no report \"dead\"; there are: live, memory"),
             ("report live --seconds 0", "--seconds is 0, not a finite number greater than 0"),
             ("report live --seconds inf", "--seconds is inf"),
             ("report live --updates 1.5", "--updates is \"1.5\", not a whole number"),
+            ("report memory --updates 5", "--updates is for `report live` alone"),
             ("--updates 5", "--updates is for `report live` alone"),
         ] {
             let e = bake(line).unwrap_err();

@@ -10,6 +10,7 @@
 //! | `output` | light map pages and the scene as files |
 //! | `table`, `report` | what a run took, for people and for programs |
 //! | `live_measure`, `live_report`, `plot` | live updates: measurements, tables, plots |
+//! | `memory_report` | a scene's memory by part, and what little of it costs rays |
 
 mod args;
 mod bar;
@@ -17,6 +18,7 @@ mod camera;
 mod font;
 mod live_measure;
 mod live_report;
+mod memory_report;
 mod output;
 mod pictures;
 mod plot;
@@ -24,6 +26,7 @@ mod report;
 mod table;
 
 use args::{BakeArgs, Command};
+use bakelite::bvh::BuildOptions;
 use bakelite::device::LogLevel;
 use bakelite::io::image::write_png_rgb8;
 use bakelite::lightmap::{BakeStats, Lightmap};
@@ -52,6 +55,7 @@ fn main() -> ExitCode {
         }
         Ok(Command::Bake(bake)) => Job::new(&bake).run(),
         Ok(Command::ReportLive(report)) => live_report::run(&report),
+        Ok(Command::ReportMemory(args)) => memory_report::run(&args),
         Err(e) => {
             eprintln!("bakelite: {e}\nTry bakelite --help");
             return ExitCode::from(USAGE);
@@ -119,6 +123,17 @@ impl<'a> Job<'a> {
 
     /// Reads or makes the scene and adds the lights of the command line.
     fn load(&mut self) -> Result<SceneData> {
+        let data = self.load_dark()?;
+        let shines = !data.lights().is_empty() || data.materials().iter().any(|m| m.is_emissive());
+        if !shines {
+            let name = &self.args.scene;
+            return Err(Error::InvalidArgument(format!("{name} has no lights; give some with --light (see --help)")));
+        }
+        Ok(data)
+    }
+
+    /// The same for what needs no light.
+    fn load_dark(&mut self) -> Result<SceneData> {
         let start = Instant::now();
         let name = self.args.scene.as_str();
         let mut data = if BUILTIN_NAMES.contains(&name) {
@@ -135,32 +150,35 @@ impl<'a> Job<'a> {
         for warning in &self.warnings {
             self.bars.say(&format!("warning: {warning}"));
         }
-        let shines = !data.lights().is_empty() || data.materials().iter().any(|m| m.is_emissive());
-        if !shines {
-            return Err(Error::InvalidArgument(format!("{name} has no lights; give some with --light (see --help)")));
-        }
         self.stage("load", start);
         Ok(data)
     }
 
     fn commit(&mut self, data: SceneData) -> Result<Arc<Scene>> {
+        let device = self.device()?;
+        self.commit_on(&device, data, &self.args.build)
+    }
+
+    fn commit_on(&mut self, device: &Arc<Device>, data: SceneData, build: &BuildOptions) -> Result<Arc<Scene>> {
         let start = Instant::now();
+        let scene = self.bars.show("scene", |p| Scene::commit(device, data, build, p).map_err(|(_, e)| e))?;
+        self.stage("tree", start).bytes = scene.stats().bvh_bytes;
+        Ok(scene)
+    }
+
+    fn device(&self) -> Result<Arc<Device>> {
         let quiet = self.args.quiet;
         let log = move |level: LogLevel, message: &str| {
             if level == LogLevel::Error || !quiet {
                 eprintln!("{message}");
             }
         };
-        let device = Device::new(DeviceOptions {
+        Device::new(DeviceOptions {
             num_threads: self.args.threads,
             isa: self.args.isa,
             log: Some(Box::new(log)),
             memory: None,
-        })?;
-        let build = &self.args.build;
-        let scene = self.bars.show("scene", |p| Scene::commit(&device, data, build, p).map_err(|(_, e)| e))?;
-        self.stage("tree", start).bytes = scene.stats().bvh_bytes;
-        Ok(scene)
+        })
     }
 
     fn layout(&mut self, scene: &Arc<Scene>) -> Result<Lightmap> {

@@ -78,6 +78,7 @@ fn parameters(args: &BakeArgs) -> Value {
         "bins": args.build.bins,
         "leaf": args.build.max_leaf,
         "build": args.build.quality.name(),
+        "compact": args.build.compact,
         "width": args.width,
         "height": args.height,
         "reference_spp": args.reference_spp,
