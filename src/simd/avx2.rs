@@ -204,7 +204,7 @@ impl Eight for A8 {
         mask: A8,
         values: *mut f32,
         out_names: *mut u32,
-    ) -> usize {
+    ) -> u32 {
         // SAFETY: the caller vouches for eight values at each pointer. Permutations use the lowest
         // three bits of each index alone.
         unsafe {
@@ -215,7 +215,7 @@ impl Eight for A8 {
             _mm256_storeu_ps(values, _mm256_permutevar8x32_ps(self.0, from));
             let names = _mm256_permutevar8x32_epi32(_mm256_loadu_si256(names.cast()), from);
             _mm256_storeu_si256(out_names.cast(), names);
-            set.count_ones() as usize
+            set as u32
         }
     }
 }

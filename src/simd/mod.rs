@@ -198,8 +198,8 @@ pub(crate) trait Eight: Lanes {
     unsafe fn highest_bits(p: *const u32) -> u32;
 
     /// Writes the lanes of `mask` to `values`, and the same lanes of `names` to `out_names`, in the
-    /// order that bits `shift` to `shift + 2` of each of `order` tell; returns how many. All eight
-    /// entries behind both outputs may be overwritten.
+    /// order that bits `shift` to `shift + 2` of each of `order` tell; returns, as bits, which places in that
+    /// order were taken. All eight entries behind both outputs may be overwritten.
     ///
     /// # Safety
     /// All pointers must be valid for eight values. `out_names` may overlap `names` if `order` tells the
@@ -212,7 +212,7 @@ pub(crate) trait Eight: Lanes {
         mask: Self::Mask,
         values: *mut f32,
         out_names: *mut u32,
-    ) -> usize;
+    ) -> u32;
 }
 
 #[cfg(test)]

@@ -222,9 +222,9 @@ impl Eight for P8 {
         mask: M8,
         values: *mut f32,
         out_names: *mut u32,
-    ) -> usize {
+    ) -> u32 {
         let (own, mask) = (self.to_array(), mask.bits());
-        let mut n = 0;
+        let (mut n, mut set) = (0, 0);
         for i in 0..8 {
             // SAFETY: the caller vouches for eight values at each pointer; n ≤ i and `lane` are below 8.
             unsafe {
@@ -232,8 +232,9 @@ impl Eight for P8 {
                 values.add(n).write(own[lane]);
                 out_names.add(n).write(names.add(lane).read());
                 n += (mask >> lane & 1) as usize;
+                set |= (mask >> lane & 1) << i;
             }
         }
-        n
+        set
     }
 }

@@ -87,13 +87,14 @@ unsafe fn check_compress<E: Eight>() {
         for (k, shift) in [0, 21].into_iter().enumerate() {
             let (mut out, mut out_names) = ([0.0; 8], [0; 8]);
             // SAFETY: arrays of eight, and the caller vouches for the ISA.
-            let n = unsafe {
+            let places = unsafe {
                 let mask = E::splat(0.5).lt(E::load(chosen.as_ptr()));
                 let v = E::load(values.as_ptr());
                 v.compress(names.as_ptr(), order.as_ptr(), shift, mask, out.as_mut_ptr(), out_names.as_mut_ptr())
             };
             let expected: Vec<u32> = orders[k].into_iter().filter(|&lane| set >> lane & 1 == 1).collect();
-            assert_eq!(n, expected.len());
+            let taken = (0..8).filter(|&i| set >> orders[k][i] & 1 == 1);
+            assert_eq!(places, taken.map(|i| 1u32 << i).sum::<u32>());
             for (i, lane) in expected.into_iter().enumerate() {
                 assert_eq!((out[i], out_names[i]), (lane as f32, 100 + lane));
             }

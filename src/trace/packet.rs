@@ -280,9 +280,9 @@ unsafe fn trace<S: Simd>(bvh: &Mbvh, rays: &[Ray], out: &mut [RawHit]) {
             let (near, mask) = pyramid.node::<S>(node, shared.negative);
             let names: [u32; WIDTH] = std::array::from_fn(|i| (number * WIDTH + i) as u32);
             let (nears, children) = (nears.add(count), children.add(count));
-            let n = near.compress(names.as_ptr(), node.order.as_ptr(), shared.shift, mask, nears, children);
+            let set = near.compress(names.as_ptr(), node.order.as_ptr(), shared.shift, mask, nears, children);
             firsts.add(count).cast::<[u8; WIDTH]>().write([first as u8; WIDTH]);
-            count += n;
+            count += set.count_ones() as usize;
         }
         loop {
             if count == 0 {
