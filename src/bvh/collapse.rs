@@ -1,6 +1,7 @@
 //! Collapse of the binary tree to eight-wide nodes (Dammertz, Hanika and Keller, *Shallow Bounding
 //! Volume Hierarchies for Fast SIMD Ray Tracing of Incoherent Rays*, 2008): the child of largest
-//! area is opened first.
+//! area is opened first. (The best choice, by dynamic programming as in Ylitie, Karras and Laine 2017, makes
+//! rays visit 1 to 3 % fewer nodes and takes a sixth of the whole build's time.)
 
 use super::binned::{BinaryBvh, BinaryNode, Box4};
 use super::compact::{self, Compact, CompactNode};

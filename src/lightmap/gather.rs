@@ -5,7 +5,8 @@
 //! the same bits however they were spread over bakes and live updates. The sample set is made once:
 //! the Sobol sequence, in each round sorted along a Morton curve so that each packet of 32 is a
 //! narrower bundle. Each texel shifts it digitally (XOR), which keeps both the stratification and
-//! the bundles. (One set of 256 rays sorted as a whole traces 0 to 15 % faster than four rounds.)
+//! the bundles. (One set of 256 rays sorted as a whole traces 0 to 15 % faster than four rounds;
+//! the rays of 64 neighbouring texels stratum by stratum 3 to 8 % faster than texel by texel.)
 
 use super::direct::Receiver;
 use super::radiance::RadianceMap;
