@@ -61,17 +61,6 @@ static bk_scene *committed_scene(bk_device *device) {
     return scene;
 }
 
-static bk_lightmap *small_lightmap(const bk_scene *scene) {
-    bk_lightmap *lightmap = NULL;
-    bk_lightmap_desc desc;
-    bk_lightmap_desc_init(&desc);
-    desc.page_size = 32;
-    desc.texels_per_unit = 16.0f;
-    desc.gather_divisor = desc.radiance_divisor = 2;
-    CHECK_OK(bk_lightmap_create(scene, &desc, NULL, NULL, &lightmap));
-    return lightmap;
-}
-
 static bk_bake_params quick_bake(void) {
     bk_bake_params params;
     bk_bake_params_init(&params);
@@ -84,7 +73,7 @@ static bk_bake_params quick_bake(void) {
 static void check_works(const bk_scene *scene) {
     const bk_ray down = {{0.5f, 0.25f, 0.5f}, 0.0f, {0, 0, -1}, INFINITY};
     bk_hit hit;
-    bk_lightmap *lightmap = small_lightmap(scene);
+    bk_lightmap *lightmap = small_lightmap(scene, 32);
     bk_bake_params params = quick_bake();
     bk_intersect(scene, &down, &hit);
     CHECK(hit.t == 0.5f);
@@ -125,7 +114,7 @@ static void devices(void) {
 
 static void nulls(bk_device *device) {
     bk_scene *scene = committed_scene(device), *none = NULL;
-    bk_lightmap *lightmap = small_lightmap(scene), *no_lightmap = NULL;
+    bk_lightmap *lightmap = small_lightmap(scene, 32), *no_lightmap = NULL;
     bk_photon_map *map = NULL;
     bk_material_desc material;
     bk_mesh_desc mesh = floor_desc();
@@ -293,7 +282,7 @@ static void struct_sizes(bk_device *device) {
     lightmap_desc.struct_size = 0;
     CHECK_ERROR(bk_lightmap_create(scene, &lightmap_desc, NULL, NULL, &lightmap), ARGUMENT,
                 "bk_lightmap_desc.struct_size is 0");
-    lightmap = small_lightmap(scene);
+    lightmap = small_lightmap(scene, 32);
     bk_lightmap_info_init(&info);
     info.struct_size = 0;
     CHECK_ERROR(bk_lightmap_info(lightmap, &info), ARGUMENT, "bk_lightmap_info.struct_size is 0");
@@ -643,7 +632,7 @@ static void bad_uvs(bk_device *device) {
         CHECK_OK(bk_scene_add_mesh(scene, &mesh, NULL));
         if (overlapping) CHECK_OK(bk_scene_add_mesh(scene, &mesh, NULL));
         CHECK_OK(bk_scene_commit(scene, NULL, NULL));
-        lightmap = small_lightmap(scene);
+        lightmap = small_lightmap(scene, 32);
         bk_lightmap_info_init(&info);
         CHECK_OK(bk_lightmap_info(lightmap, &info));
         if (overlapping) {
@@ -697,7 +686,7 @@ static void memory(void) {
     CHECK_ERROR(bk_photon_map_create(scene, &photons, NULL, NULL, &map), BK_ERROR_OUT_OF_MEMORY, "budget");
     CHECK(map == NULL);
 
-    lightmap = small_lightmap(scene);
+    lightmap = small_lightmap(scene, 32);
     bake.memory_budget = 100;
     CHECK_ERROR(bk_bake(lightmap, &bake, NULL, NULL, NULL), BK_ERROR_OUT_OF_MEMORY, "budget");
     bake.memory_budget = 0;
@@ -715,7 +704,7 @@ static void memory(void) {
 
 static void bakes(bk_device *device) {
     bk_scene *scene = committed_scene(device);
-    bk_lightmap *lightmap = small_lightmap(scene);
+    bk_lightmap *lightmap = small_lightmap(scene, 32);
     bk_photon_map *map = NULL;
     bk_photon_params photons;
     bk_bake_params bake;
@@ -775,7 +764,7 @@ static void no_lights(bk_device *device) {
 
     add_floor(scene);
     CHECK_OK(bk_scene_commit(scene, NULL, NULL));
-    lightmap = small_lightmap(scene);
+    lightmap = small_lightmap(scene, 32);
     bk_bake_stats_init(&stats);
     CHECK_OK(bk_bake(lightmap, &params, NULL, NULL, &stats));
     CHECK((stats.left_out & BK_LEFT_OUT_DIRECT) && (stats.left_out & BK_LEFT_OUT_INDIRECT));

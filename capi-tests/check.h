@@ -44,6 +44,18 @@ static inline void check_error_at(bk_result result, bk_result expected, const ch
 #define CHECK_OK(call) check_ok_at((call), #call, __FILE__, __LINE__)
 #define CHECK_ERROR(call, code, culprit) check_error_at((call), (code), (culprit), #call, __FILE__, __LINE__)
 
+/* An empty light map of a scene of about one unit, small enough for a test. */
+static inline bk_lightmap *small_lightmap(const bk_scene *scene, uint32_t page_size) {
+    bk_lightmap *lightmap = NULL;
+    bk_lightmap_desc desc;
+    bk_lightmap_desc_init(&desc);
+    desc.page_size = page_size;
+    desc.texels_per_unit = 16.0f;
+    desc.gather_divisor = desc.radiance_divisor = 2;
+    CHECK_OK(bk_lightmap_create(scene, &desc, NULL, NULL, &lightmap));
+    return lightmap;
+}
+
 static inline int check_report(const char *program) {
     printf("%s: %d checks, %d failed\n", program, checks_done, checks_failed);
     return checks_failed == 0 ? 0 : 1;

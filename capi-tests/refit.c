@@ -136,26 +136,15 @@ static double brightness(bk_lightmap *lightmap) {
     return sum / (64 * 64 * 3);
 }
 
-static bk_lightmap *lightmap_of(const bk_scene *scene) {
-    bk_lightmap *lightmap = NULL;
-    bk_lightmap_desc desc;
-    bk_lightmap_desc_init(&desc);
-    desc.page_size = 64;
-    desc.texels_per_unit = 16.0f;
-    desc.gather_divisor = desc.radiance_divisor = 2;
-    CHECK_OK(bk_lightmap_create(scene, &desc, NULL, NULL, &lightmap));
-    return lightmap;
-}
-
 static void test_old_lightmaps(bk_device *device) {
     bk_scene *scene = committed_scene(device, 0);
-    bk_lightmap *old = lightmap_of(scene), *moved;
+    bk_lightmap *old = small_lightmap(scene, 64), *moved;
     double first = brightness(old);
     float ceiling[4][3];
     square_at(4.0f, ceiling);
     CHECK_OK(bk_mesh_set_positions(scene, 1, ceiling[0], 4, 0));
     CHECK_OK(bk_scene_refit(scene));
-    moved = lightmap_of(scene);
+    moved = small_lightmap(scene, 64);
     CHECK(brightness(old) == first);
     CHECK(brightness(moved) < 0.8 * first);
     bk_lightmap_release(moved);

@@ -6,7 +6,7 @@
 use super::binned::{BinaryBvh, BinaryNode, Box4};
 use super::compact::{self, Compact, CompactNode};
 use super::layout::{ChildRef, LEAF_PAD, LEAF_STRIDE, Mbvh, Node, WIDTH};
-use crate::memory::prefer_large_pages;
+use crate::memory::{large_vec, prefer_large_pages};
 use glam::Vec3;
 use rayon::prelude::*;
 
@@ -85,11 +85,9 @@ pub(super) fn collapse_compact(binary: &BinaryBvh, meshes: &[u32]) -> Compact {
     let root = &binary.nodes[0];
     let (plans, order) = plans(binary);
     let compact = |plan: &Plan| CompactNode::new(&node(binary, plan), plan.first_node, plan.first_slot);
-    let mut nodes = Vec::with_capacity(plans.len());
-    prefer_large_pages(nodes.spare_capacity_mut());
+    let mut nodes = large_vec(plans.len());
     plans.par_iter().with_min_len(1024).map(compact).collect_into_vec(&mut nodes);
-    let mut triangles = Vec::with_capacity(binary.triangles.len() + compact::PAD);
-    prefer_large_pages(triangles.spare_capacity_mut());
+    let mut triangles = large_vec(binary.triangles.len() + compact::PAD);
     for &i in &order {
         for b in plans[i as usize].leaves(binary) {
             triangles.extend_from_slice(&binary.triangles[b.index as usize..][..b.count as usize]);
@@ -106,8 +104,7 @@ pub(super) fn collapse(binary: &BinaryBvh, corners: &[[Vec3; 3]]) -> Mbvh {
     let root = &binary.nodes[0];
     // Which binary nodes become children is quickly told; to fill in nodes and leaves takes the time.
     let (plans, order) = plans(binary);
-    let mut nodes = Vec::with_capacity(plans.len());
-    prefer_large_pages(nodes.spare_capacity_mut());
+    let mut nodes = large_vec(plans.len());
     plans.par_iter().with_min_len(1024).map(|plan| node(binary, plan)).collect_into_vec(&mut nodes);
     // (Zeros that nobody has written take no memory yet.)
     let mut leaves = vec![0.0; n * LEAF_STRIDE + LEAF_PAD];

@@ -102,8 +102,8 @@ pub(super) struct RaySetup {
 }
 
 impl RaySetup {
-    /// If [`must_be_slow`](Self::must_be_slow), then [`make_slow`](Self::make_slow). (All axes in one vector by hand take no fewer
-    /// instructions.)
+    /// If [`must_be_slow`](Self::must_be_slow), then [`make_slow`](Self::make_slow). (All axes in one vector by
+    /// hand take no fewer instructions.)
     #[inline(always)]
     fn new<T: Tree>(origin: [f32; 3], direction: [f32; 3], tmin: f32) -> Self {
         let shear = Shear::new(origin, direction);
@@ -403,7 +403,8 @@ impl Stack {
         unsafe { self.child.get_unchecked(self.count).assume_init() }
     }
 
-    /// Drops what begins behind `tmax`. (Entry by entry, without branches, random rays in Sponza took some 10 % longer.)
+    /// Drops what begins behind `tmax`. (Entry by entry, without branches, random rays in Sponza took some 10 %
+    /// longer.)
     ///
     /// # Safety
     /// The CPU must have the ISA; there must be at least [`BOTTOM`] entries.
@@ -481,7 +482,8 @@ impl Walk {
     }
 
     /// Visits the current node and goes on to the next child. `ALONE`: takes the nearest child from the node
-    /// itself, which is sooner there than on the stack, but as another branch. (Rays one by one take 4 to 7 % less time, many rays more.)
+    /// itself, which is sooner there than on the stack, but as another branch. (Rays one by one take 4 to 7 %
+    /// less time.)
     ///
     /// # Safety
     /// The CPU must have the ISA; the walk must have been begun in `tree`, and `current` be a node.
