@@ -15,14 +15,18 @@ pub const HELP: &str = "\
 Bakes light maps.
 
 Usage: bakelite [bake] [SCENE] [OPTIONS]
-       bakelite report live [SCENE] [OPTIONS]
-       bakelite report memory [SCENE] [OPTIONS]
+       bakelite report live|memory|pipeline|quality [SCENE] [OPTIONS]
 
 SCENE, or --scene SCENE, is a file (.obj .ply .gltf .glb) or a built-in scene (atrium, cornell,
 furnace). Without it, the atrium is baked. Lengths are in scene units, colours
-are linear r,g,b. `report live` measures live updates instead: error against
-time and rays, budgets, traffic and memory; `report memory` the scene's memory,
-default and compact, and what that costs rays.
+are linear r,g,b.
+
+Reports measure instead, and write tables, plots and CSV:
+  live      live updates: error against time and rays, budgets, traffic, memory
+  memory    the scene's memory, default and compact, and what that costs rays
+  pipeline  what each stage of a bake takes, and what bounds it
+  quality   error of the light against run time, for every knob of a bake, path
+            tracing and photons alone
 
 Lights, added to those of the scene; may be repeated:
   --light point:X,Y,Z:R,G,B               intensity in W/sr
@@ -62,6 +66,13 @@ Pictures (path traced reference; indirect map + shadow rays; light map alone):
 Report live (live.md with its tables and plots):
   --seconds F            most time per curve of errors [20]
   --updates N            updates per time budget, of 1, 2, 4 and 8 ms [10000]
+Report quality (quality.md):
+  --points N             points at which light is compared [400]
+  --seeds N              bakes per setting, to tell noise from bias [4]
+  --paths N              paths per point of the path traced reference [4096]
+  --knobs A,B,..         what to vary, of gather-rays, photons, radius, blur,
+                         direct-samples, gather-divisor, radiance-divisor,
+                         path-tracing, photons-alone [all of these]
 Output:
   --out DIR              where all files go [out]
   --no-glb               do not write the scene with its light maps as GLB
@@ -75,6 +86,8 @@ pub enum Command {
     Bake(Box<BakeArgs>),
     ReportLive(Box<ReportArgs>),
     ReportMemory(Box<BakeArgs>),
+    ReportPipeline(Box<BakeArgs>),
+    ReportQuality(Box<ReportArgs>),
     Help,
     Version,
 }
@@ -124,22 +137,54 @@ impl Default for BakeArgs {
     }
 }
 
-/// Arguments of `bakelite report live`.
+/// Arguments of the reports that have their own.
 #[derive(Clone, Debug)]
 pub struct ReportArgs {
-    /// Scene, lights, light map and machine. How many gather rays is for the report to vary.
+    /// Scene, lights, light map and machine. What a report varies is for it to choose.
     pub bake: BakeArgs,
-    /// Most time per curve of errors.
+    /// Live: most time per curve of errors.
     pub seconds: f64,
-    /// Updates per time budget; 0: budgets are not measured.
+    /// Live: updates per time budget; 0: budgets are not measured.
     pub updates: u32,
+    /// Quality: points at which light is compared.
+    pub points: usize,
+    /// Quality: bakes per setting.
+    pub seeds: u64,
+    /// Quality: paths per point of the reference.
+    pub paths: u32,
+    /// Quality: what to vary, of [`KNOBS`].
+    pub knobs: Vec<String>,
 }
 
 impl Default for ReportArgs {
     fn default() -> Self {
-        ReportArgs { bake: BakeArgs::default(), seconds: 20.0, updates: 10_000 }
+        ReportArgs {
+            bake: BakeArgs::default(),
+            seconds: 20.0,
+            updates: 10_000,
+            points: 400,
+            seeds: 4,
+            paths: 4096,
+            knobs: KNOBS.map(String::from).to_vec(),
+        }
     }
 }
+
+/// What there is to report.
+const REPORTS: [&str; 4] = ["live", "memory", "pipeline", "quality"];
+
+/// What a report of quality varies.
+const KNOBS: [&str; 9] = [
+    "gather-rays",
+    "photons",
+    "radius",
+    "blur",
+    "direct-samples",
+    "gather-divisor",
+    "radiance-divisor",
+    "path-tracing",
+    "photons-alone",
+];
 
 /// Light map texels per metre of the atrium unless a density is given: it takes so many to show the
 /// shadows of its balusters.
@@ -153,18 +198,19 @@ pub fn parse(args: impl IntoIterator<Item = OsString>) -> Result<Command, String
     let mut parser = lexopt::Parser::from_args(args);
     let mut report = ReportArgs::default();
     let (mut first, mut reported, mut scene, mut density) = (true, String::new(), None, None);
-    // The first flag that only a report has.
-    let mut of_report = None;
+    // Flags that only one report has.
+    let mut of_report: Vec<(&str, &str)> = Vec::new();
     while let Some(arg) = parser.next().map_err(|e| e.to_string())? {
         match arg {
             Arg::Short('h') | Arg::Long("help") => return Ok(Command::Help),
             Arg::Short('V') | Arg::Long("version") => return Ok(Command::Version),
             Arg::Value(v) if first && v == "bake" => {}
             Arg::Value(v) if first && v == "report" => {
+                let there_are = REPORTS.join(", ");
                 reported = match parser.value().ok() {
-                    Some(kind) if kind == "live" || kind == "memory" => text("report", kind)?,
-                    Some(kind) => return Err(format!("there is no report {kind:?}; there are: live, memory")),
-                    None => return Err("report needs what to report; there are: live, memory".into()),
+                    Some(kind) if REPORTS.iter().any(|r| kind == *r) => text("report", kind)?,
+                    Some(kind) => return Err(format!("there is no report {kind:?}; there are: {there_are}")),
+                    None => return Err(format!("report needs what to report; there are: {there_are}")),
                 }
             }
             Arg::Value(v) => name_scene(&mut scene, text("SCENE", v)?)?,
@@ -174,12 +220,28 @@ pub fn parse(args: impl IntoIterator<Item = OsString>) -> Result<Command, String
                 density = Some(number("--texels-per-unit", &value("--texels-per-unit", &mut parser)?)?);
             }
             Arg::Long("seconds") => {
-                of_report.get_or_insert("--seconds");
+                of_report.push(("--seconds", "live"));
                 report.seconds = seconds(&value("--seconds", &mut parser)?)?;
             }
             Arg::Long("updates") => {
-                of_report.get_or_insert("--updates");
+                of_report.push(("--updates", "live"));
                 report.updates = number("--updates", &value("--updates", &mut parser)?)?;
+            }
+            Arg::Long("points") => {
+                of_report.push(("--points", "quality"));
+                report.points = at_least_one("--points", &value("--points", &mut parser)?)? as usize;
+            }
+            Arg::Long("seeds") => {
+                of_report.push(("--seeds", "quality"));
+                report.seeds = at_least_one("--seeds", &value("--seeds", &mut parser)?)?;
+            }
+            Arg::Long("paths") => {
+                of_report.push(("--paths", "quality"));
+                report.paths = at_least_one("--paths", &value("--paths", &mut parser)?)?.min(u32::MAX.into()) as u32;
+            }
+            Arg::Long("knobs") => {
+                of_report.push(("--knobs", "quality"));
+                report.knobs = knobs(&value("--knobs", &mut parser)?)?;
             }
             Arg::Long(name) => {
                 let name = name.to_owned();
@@ -193,12 +255,16 @@ pub fn parse(args: impl IntoIterator<Item = OsString>) -> Result<Command, String
         bake.scene = scene;
     }
     bake.desc.texels_per_unit = density.unwrap_or(if bake.scene == "atrium" { ATRIUM_DENSITY } else { 0.0 });
-    match of_report {
-        _ if reported == "live" => Ok(Command::ReportLive(Box::new(report))),
-        Some(flag) => Err(format!("{flag} is for `report live` alone")),
-        None if reported == "memory" => Ok(Command::ReportMemory(Box::new(report.bake))),
-        None => Ok(Command::Bake(Box::new(report.bake))),
+    if let Some((flag, kind)) = of_report.iter().find(|(_, kind)| *kind != reported) {
+        return Err(format!("{flag} is for `report {kind}` alone"));
     }
+    Ok(match reported.as_str() {
+        "live" => Command::ReportLive(Box::new(report)),
+        "memory" => Command::ReportMemory(Box::new(report.bake)),
+        "pipeline" => Command::ReportPipeline(Box::new(report.bake)),
+        "quality" => Command::ReportQuality(Box::new(report)),
+        _ => Command::Bake(Box::new(report.bake)),
+    })
 }
 
 /// Takes the scene's name, which may be given once.
@@ -279,6 +345,21 @@ fn seconds(value: &str) -> Result<f64, String> {
     match number("--seconds", value)? {
         s if s > 0.0 && f64::is_finite(s) => Ok(s),
         s => Err(format!("--seconds is {s}, not a finite number greater than 0")),
+    }
+}
+
+fn knobs(value: &str) -> Result<Vec<String>, String> {
+    let known = |name: &str| match KNOBS.contains(&name) {
+        true => Ok(name.to_owned()),
+        false => Err(format!("--knobs: there is no {name:?}; there are: {}", KNOBS.join(", "))),
+    };
+    value.split(',').map(known).collect()
+}
+
+fn at_least_one(flag: &str, value: &str) -> Result<u64, String> {
+    match number(flag, value)? {
+        0 => Err(format!("{flag} is 0, not 1 or more")),
+        n => Ok(n),
     }
 }
 
@@ -468,13 +549,16 @@ mod tests {
             ("--camera 0,0,0:1,2,3:200", "field of view is 200"),
             ("--width 0", "--width is 0, outside 1"),
             ("a --scene b", "two scenes, \"a\" and \"b\""),
-            ("report", "report needs what to report; there are: live, memory"),
-            ("report dead", "there is no report \"dead\"; there are: live, memory"),
+            ("report", "report needs what to report; there are: live, memory, pipeline, quality"),
+            ("report dead", "there is no report \"dead\"; there are: live, memory, pipeline, quality"),
             ("report live --seconds 0", "--seconds is 0, not a finite number greater than 0"),
             ("report live --seconds inf", "--seconds is inf"),
             ("report live --updates 1.5", "--updates is \"1.5\", not a whole number"),
             ("report memory --updates 5", "--updates is for `report live` alone"),
             ("--updates 5", "--updates is for `report live` alone"),
+            ("report live --seeds 5", "--seeds is for `report quality` alone"),
+            ("report quality --knobs photon", "there is no \"photon\"; there are: gather-rays, photons,"),
+            ("report quality --points 0", "--points is 0, not 1 or more"),
         ] {
             let e = bake(line).unwrap_err();
             assert!(e.contains(part), "{line}: {e}");

@@ -11,6 +11,9 @@
 //! | `table`, `report` | what a run took, for people and for programs |
 //! | `live_measure`, `live_report`, `plot` | live updates: measurements, tables, plots |
 //! | `memory_report` | a scene's memory by part, and what little of it costs rays |
+//! | `pipeline_report` | the stages of a bake, and what bounds each |
+//! | `quality_measure`, `quality_report` | error of the light against run time |
+//! | `texel_paths` | path tracing every texel, which a bake is compared with |
 
 mod args;
 mod bar;
@@ -21,9 +24,13 @@ mod live_report;
 mod memory_report;
 mod output;
 mod pictures;
+mod pipeline_report;
 mod plot;
+mod quality_measure;
+mod quality_report;
 mod report;
 mod table;
+mod texel_paths;
 
 use args::{BakeArgs, Command};
 use bakelite::bvh::BuildOptions;
@@ -56,6 +63,8 @@ fn main() -> ExitCode {
         Ok(Command::Bake(bake)) => Job::new(&bake).run(),
         Ok(Command::ReportLive(report)) => live_report::run(&report),
         Ok(Command::ReportMemory(args)) => memory_report::run(&args),
+        Ok(Command::ReportPipeline(args)) => pipeline_report::run(&args),
+        Ok(Command::ReportQuality(report)) => quality_report::run(&report),
         Err(e) => {
             eprintln!("bakelite: {e}\nTry bakelite --help");
             return ExitCode::from(USAGE);

@@ -1,0 +1,422 @@
+//! `bakelite report quality`: error of the light against run time, for every knob of a bake, for path
+//! tracing each texel with the same kernels, and for the photon map alone.
+
+use crate::Job;
+use crate::args::ReportArgs;
+use crate::output;
+use crate::plot::{Plot, Series};
+use crate::quality_measure::{Errors, Points, Values};
+use crate::texel_paths::TexelPaths;
+use bakelite::lightmap::direct::{DirectLight, Receiver};
+use bakelite::lightmap::{BakeParams, Layer, Lightmap, LightmapDesc};
+use bakelite::photon::{PhotonMap, PhotonParams};
+use bakelite::trace::PACKET_SIZE;
+use bakelite::trace::offset::SurfacePoint;
+use bakelite::{Error, Progress, Result};
+use std::fmt::Write;
+use std::time::Instant;
+
+const GATHER_RAYS: [u32; 7] = [16, 32, 64, 128, 256, 512, 1024];
+const PHOTONS: [u64; 4] = [10_000, 100_000, 1_000_000, 4_000_000];
+/// In units of the automatic one.
+const RADII: [f32; 4] = [0.5, 1.0, 2.0, 4.0];
+const BLURS: [u32; 4] = [0, 1, 2, 4];
+const GATHER_DIVISORS: [u32; 4] = [1, 2, 4, 8];
+const RADIANCE_DIVISORS: [u32; 4] = [2, 4, 8, 16];
+const DIRECT_SAMPLES: [u32; 3] = [4, 16, 64];
+/// Rounds of [`PACKET_SIZE`] paths per texel.
+const PATH_ROUNDS: [u32; 5] = [1, 2, 4, 8, 16];
+const PHOTONS_ALONE: [u64; 4] = [100_000, 1_000_000, 4_000_000, 16_000_000];
+
+/// Root mean square errors that people ask for.
+const GOALS: [f64; 3] = [0.1, 0.05, 0.01];
+
+/// One setting of one way to compute light.
+struct Row {
+    /// The knob that is turned, or another way to compute light.
+    series: &'static str,
+    value: String,
+    /// For the light of all texels.
+    seconds: f64,
+    indirect: Errors,
+    /// Direct light too, where it is part of what was computed.
+    all: Option<Errors>,
+}
+
+/// Runs the report.
+pub fn run(args: &ReportArgs) -> Result<()> {
+    output::make_folder(&args.bake.out)?;
+    let mut job = Job::new(&args.bake);
+    let mut lightmap = job.unbaked()?;
+    let params = args.bake.params;
+    job.bars.show("bake", |p| lightmap.bake(&params, p))?;
+    let start = Instant::now();
+    let points = job.bars.show("reference", |p| Points::new(&lightmap, args.points, args.paths, p))?;
+    let reference_seconds = start.elapsed().as_secs_f64();
+    if points.all[0].iter().flatten().all(|&c| c == 0.0) {
+        return Err(Error::InvalidArgument("no light arrives at any of the points compared".into()));
+    }
+    let at_points = points_csv(&points, &points.of_bake(&lightmap, Layer::Indirect));
+    let mut measure = Measure { args, points: &points, rows: Vec::new() };
+    measure.bakes(&job, &mut lightmap)?;
+    if measure.varies("path-tracing") {
+        measure.paths(&job, &lightmap)?;
+    }
+    if measure.varies("photons-alone") {
+        measure.photons_alone(&job, &lightmap)?;
+    }
+    let rows = measure.rows;
+
+    let save = |name: &str, text: &str| {
+        let path = args.bake.out.join(name);
+        std::fs::write(&path, text).map_err(|e| Error::Io(format!("{}: {e}", path.display())))
+    };
+    save("quality.csv", &csv(&rows))?;
+    save("quality-points.csv", &at_points)?;
+    save("quality.svg", &plot(&rows))?;
+    let text = markdown(args, &lightmap, &points, reference_seconds, &rows);
+    save("quality.md", &text)?;
+    if !args.bake.quiet {
+        println!(
+            "{text}\nWrote to {}: quality.md, quality.csv, quality-points.csv, quality.svg",
+            args.bake.out.display()
+        );
+    }
+    Ok(())
+}
+
+struct Measure<'a> {
+    args: &'a ReportArgs,
+    points: &'a Points,
+    rows: Vec<Row>,
+}
+
+impl Measure<'_> {
+    /// Bakes with one knob turned at a time.
+    fn bakes(&mut self, job: &Job, lightmap: &mut Lightmap) -> Result<()> {
+        let (desc, params) = (self.args.bake.desc, self.args.bake.params);
+        self.bake(job, lightmap, "as given", String::new(), &params)?;
+        if self.varies("gather-rays") {
+            for gather_rays in GATHER_RAYS {
+                let params = BakeParams { gather_rays, ..params };
+                self.bake(job, lightmap, "gather rays", gather_rays.to_string(), &params)?;
+            }
+        }
+        if self.varies("photons") {
+            for photon_count in PHOTONS {
+                let params = BakeParams { photon_count, ..params };
+                self.bake(job, lightmap, "photons", photon_count.to_string(), &params)?;
+            }
+        }
+        if self.varies("radius") {
+            let photons = PhotonParams { photon_count: params.photon_count, store_direct: false, ..Default::default() };
+            let automatic = PhotonMap::trace(lightmap.scene(), &photons, &Progress::none())?.radius();
+            for factor in RADII {
+                let radius = factor * automatic;
+                self.bake(job, lightmap, "radius", format!("{radius:.4}"), &BakeParams { radius, ..params })?;
+            }
+        }
+        if self.varies("blur") {
+            for blur_radius in BLURS {
+                self.bake(job, lightmap, "blur", blur_radius.to_string(), &BakeParams { blur_radius, ..params })?;
+            }
+        }
+        if self.varies("direct-samples") && DirectLight::new(lightmap.scene()).area_light_count() > 0 {
+            for direct_samples in DIRECT_SAMPLES {
+                let params = BakeParams { direct_samples, ..params };
+                self.bake(job, lightmap, "direct samples", direct_samples.to_string(), &params)?;
+            }
+        }
+        if self.varies("gather-divisor") {
+            for gather_divisor in GATHER_DIVISORS {
+                let desc = LightmapDesc { gather_divisor, ..desc };
+                let mut other = Lightmap::create(lightmap.scene(), &desc, &Progress::none())?;
+                self.bake(job, &mut other, "gather divisor", gather_divisor.to_string(), &params)?;
+            }
+        }
+        if self.varies("radiance-divisor") {
+            for radiance_divisor in RADIANCE_DIVISORS {
+                let desc = LightmapDesc { radiance_divisor, ..desc };
+                let mut other = Lightmap::create(lightmap.scene(), &desc, &Progress::none())?;
+                self.bake(job, &mut other, "radiance divisor", radiance_divisor.to_string(), &params)?;
+            }
+        }
+        Ok(())
+    }
+
+    fn varies(&self, knob: &str) -> bool {
+        self.args.knobs.iter().any(|k| k == knob)
+    }
+
+    /// One setting with all seeds.
+    fn bake(
+        &mut self,
+        job: &Job,
+        lightmap: &mut Lightmap,
+        series: &'static str,
+        value: String,
+        params: &BakeParams,
+    ) -> Result<()> {
+        job.bars.say(&format!("{series} {value}"));
+        let (mut indirect, mut all, mut seconds) = (Vec::new(), Vec::new(), Vec::new());
+        for seed in 0..self.args.seeds {
+            let params = BakeParams { seed: params.seed + seed, ..*params };
+            seconds.push(lightmap.bake(&params, &Progress::none())?.seconds);
+            indirect.push(self.points.of_bake(lightmap, Layer::Indirect));
+            all.push(self.points.of_bake(lightmap, Layer::Combined));
+        }
+        self.rows.push(Row {
+            series,
+            value,
+            seconds: median(seconds),
+            indirect: self.points.errors(&indirect, &self.points.indirect),
+            all: Some(self.points.errors(&all, &self.points.all)),
+        });
+        Ok(())
+    }
+
+    /// Paths from every texel.
+    fn paths(&mut self, job: &Job, lightmap: &Lightmap) -> Result<()> {
+        let scene = lightmap.scene();
+        let receivers: Vec<Receiver> = (0..self.points.len())
+            .map(|i| {
+                let (triangle, u, v) = self.points.on[i];
+                let point = SurfacePoint::new(scene.corners(triangle), u, v, scene);
+                Receiver::new(scene, &point, Some(self.points.normals[i]), lightmap.shows_back(triangle))
+            })
+            .collect();
+        let paths = TexelPaths::new(scene);
+        let all_texels = lightmap.info().texels as f64 / receivers.len() as f64;
+        for rounds in PATH_ROUNDS {
+            job.bars.say(&format!("{} paths per texel", rounds * PACKET_SIZE as u32));
+            let start = Instant::now();
+            let runs: Vec<Values> = (0..self.args.seeds)
+                .map(|seed| paths.indirect(&receivers, rounds, seed as u32 + 1))
+                .collect::<Result<_>>()?;
+            self.rows.push(Row {
+                series: "path tracing",
+                value: (rounds * PACKET_SIZE as u32).to_string(),
+                seconds: start.elapsed().as_secs_f64() / self.args.seeds as f64 * all_texels,
+                indirect: self.points.errors(&runs, &self.points.indirect),
+                all: None,
+            });
+        }
+        Ok(())
+    }
+
+    /// The photon map's estimate at every texel.
+    fn photons_alone(&mut self, job: &Job, lightmap: &Lightmap) -> Result<()> {
+        let positions: Vec<[f32; 3]> = self.points.positions.iter().map(|p| p.to_array()).collect();
+        let normals: Vec<[f32; 3]> = self.points.normals.iter().map(|n| n.to_array()).collect();
+        let all_texels = lightmap.info().texels as f64 / positions.len() as f64;
+        for photon_count in PHOTONS_ALONE {
+            job.bars.say(&format!("{photon_count} photons alone"));
+            let (mut runs, mut seconds) = (Vec::new(), Vec::new());
+            for seed in 0..self.args.seeds {
+                let params = PhotonParams { photon_count, seed, store_direct: false, ..Default::default() };
+                let map = PhotonMap::trace(lightmap.scene(), &params, &Progress::none())?;
+                let start = Instant::now();
+                let mut out = vec![[0.0; 3]; positions.len()];
+                map.estimate_many(&positions, &normals, &mut out, &Progress::none())?;
+                let stats = map.stats();
+                let estimates = start.elapsed().as_secs_f64() * all_texels;
+                seconds.push(stats.trace_seconds + stats.grid_seconds + estimates);
+                runs.push(out.iter().map(|e| e.map(f64::from)).collect());
+            }
+            self.rows.push(Row {
+                series: "photons alone",
+                value: photon_count.to_string(),
+                seconds: median(seconds),
+                indirect: self.points.errors(&runs, &self.points.indirect),
+                all: None,
+            });
+        }
+        Ok(())
+    }
+}
+
+fn median(mut values: Vec<f64>) -> f64 {
+    values.sort_unstable_by(f64::total_cmp);
+    values[values.len() / 2]
+}
+
+/// The rows of each series, in order.
+fn series(rows: &[Row]) -> Vec<&[Row]> {
+    rows.chunk_by(|a, b| a.series == b.series).collect()
+}
+
+/// Slope of error against time in log-log axes, by least squares; 0.5 is that of plain Monte Carlo.
+fn slope(rows: &[Row]) -> Option<f64> {
+    let points: Vec<[f64; 2]> = rows
+        .iter()
+        .filter(|r| r.seconds > 0.0 && r.indirect.mse > 0.0)
+        .map(|r| [r.seconds.ln(), 0.5 * r.indirect.mse.ln()])
+        .collect();
+    let n = points.len() as f64;
+    let [x, y] = [0, 1].map(|c| points.iter().map(|p| p[c]).sum::<f64>() / n);
+    let xx: f64 = points.iter().map(|p| (p[0] - x).powi(2)).sum();
+    let xy: f64 = points.iter().map(|p| (p[0] - x) * (p[1] - y)).sum();
+    (points.len() > 1 && xx > 0.0).then(|| xy / xx)
+}
+
+/// Time at which a series reaches a root mean square error: between two settings along the line in
+/// log-log axes, beyond the last one along the slope of pure noise if there is no bias to speak of.
+fn time_to(rows: &[Row], goal: f64) -> String {
+    let error = |r: &Row| r.indirect.mse.max(0.0).sqrt();
+    let mut sorted: Vec<&Row> = rows.iter().collect();
+    sorted.sort_by(|a, b| a.seconds.total_cmp(&b.seconds));
+    let Some(at) = sorted.iter().position(|r| error(r) <= goal) else {
+        let best = sorted.iter().map(|r| error(r)).fold(f64::INFINITY, f64::min);
+        let last = sorted[sorted.len() - 1];
+        let unbiased = last.indirect.bias2 < 0.1 * last.indirect.mse;
+        return if unbiased {
+            format!("about {}", seconds(last.seconds * (error(last) / goal).powi(2)))
+        } else {
+            format!("not reached: {:.1} %", 100.0 * best)
+        };
+    };
+    if at == 0 {
+        return format!("< {}", seconds(sorted[0].seconds));
+    }
+    let (a, b) = (sorted[at - 1], sorted[at]);
+    let part = (error(a) / goal).ln() / (error(a) / error(b)).ln();
+    seconds(a.seconds * (b.seconds / a.seconds).powf(part))
+}
+
+fn seconds(s: f64) -> String {
+    if s < 10.0 { format!("{s:.2} s") } else { format!("{s:.0} s") }
+}
+
+fn csv(rows: &[Row]) -> String {
+    let mut out = String::from(
+        "series,value,seconds,indirect_mse,variance,bias2,mean,uncertainty,indirect_mse_to_mean,all_mse,all_mse_to_mean\n",
+    );
+    for r in rows {
+        let e = &r.indirect;
+        let all = r.all.map_or(",".into(), |a| format!("{:.6e},{:.6e}", a.mse, a.to_mean));
+        let _ = writeln!(
+            out,
+            "{},{},{:.4},{:.6e},{:.6e},{:.6e},{:.6},{:.6e},{:.6e},{all}",
+            r.series, r.value, r.seconds, e.mse, e.variance, e.bias2, e.mean, e.uncertainty, e.to_mean
+        );
+    }
+    out
+}
+
+/// Where the error is: indirect light at each of the points, of a bake and of the reference.
+fn points_csv(points: &Points, bake: &Values) -> String {
+    let mut out = String::from("triangle,x,y,z,nx,ny,nz,bake_r,bake_g,bake_b,reference_r,reference_g,reference_b\n");
+    for i in 0..points.len() {
+        let ([x, y, z], [nx, ny, nz]) = (points.positions[i].to_array(), points.normals[i].to_array());
+        let (halves, [r, g, b]) = (&points.indirect, bake[i]);
+        let [a, c, d] = [0, 1, 2].map(|k| 0.5 * (halves[0][i][k] + halves[1][i][k]));
+        let triangle = points.on[i].0;
+        let _ = writeln!(out, "{triangle},{x},{y},{z},{nx},{ny},{nz},{r:e},{g:e},{b:e},{a:e},{c:e},{d:e}");
+    }
+    out
+}
+
+fn plot(rows: &[Row]) -> String {
+    let shown = ["gather rays", "photons", "gather divisor", "radiance divisor", "path tracing", "photons alone"];
+    let points = |rows: &[Row]| rows.iter().map(|r| [r.seconds, r.indirect.mse.max(0.0).sqrt()]).collect();
+    let series = series(rows)
+        .into_iter()
+        .filter(|s| shown.contains(&s[0].series))
+        .map(|s| Series { name: s[0].series, points: points(s) })
+        .collect();
+    let title = "Indirect light: error against run time";
+    Plot {
+        title,
+        x_label: "seconds for all texels",
+        y_label: "relative root mean square error of indirect light",
+        series,
+    }
+    .svg()
+}
+
+fn markdown(args: &ReportArgs, lightmap: &Lightmap, points: &Points, reference_seconds: f64, rows: &[Row]) -> String {
+    let (scene, info, params) = (lightmap.scene(), lightmap.info(), &args.bake.params);
+    let path = std::path::Path::new(&args.bake.scene);
+    let name = path.file_name().map_or(args.bake.scene.clone(), |n| n.to_string_lossy().into_owned());
+    let mut out = format!(
+        "# Quality: {name}\n\n\
+         {triangles} triangles; {texels} texels at {density:.2} per unit, {gather} gather and {radiance} radiance \
+         texels; {photons} photons, {rays} gather rays, blur {blur} unless another value is named; threads: {threads}, \
+         {isa}.\n\n\
+         Errors are of irradiance at {count} points that are seen from places in the scene, against {paths} paths per point of an independent path tracer in \
+         f64 ({reference_seconds:.0} s). Relative MSE is the mean of the squared error by the square of the reference \
+         (what is darker than a tenth of its mean counts as so bright), RMS its root; to mean, the mean of the squared \
+         error by the square of the reference's mean. The reference's own noise is not part of them: they are products \
+         of the differences from its two halves. Noise is what differs between {seeds} seeds, bias what does not; \
+         MSE = noise² + bias². ± is one standard error of the MSE, from the points chosen. Seconds are those of the \
+         bake, without charts; of path tracing and photons alone those at the points compared, scaled to all.\n\n",
+        triangles = scene.stats().triangles,
+        texels = info.texels,
+        density = info.texels_per_unit,
+        gather = info.gather_texels,
+        radiance = info.radiance_texels,
+        photons = params.photon_count,
+        rays = params.gather_rays,
+        blur = params.blur_radius,
+        threads = scene.device().num_threads(),
+        isa = scene.device().isa().name(),
+        count = points.len(),
+        paths = args.paths,
+        seeds = args.seeds,
+    );
+    out.push_str("## Time to an error of indirect light\n\n| | 10 % | 5 % | 1 % | slope |\n|---|---|---|---|---|\n");
+    for s in
+        series(rows).into_iter().filter(|s| ["gather rays", "path tracing", "photons alone"].contains(&s[0].series))
+    {
+        let [a, b, c] = GOALS.map(|g| time_to(s, g));
+        let slope = slope(s).map_or("–".into(), |s| format!("{s:.2}"));
+        let name = if s[0].series == "gather rays" { "this bake, by gather rays" } else { s[0].series };
+        let _ = writeln!(out, "| {name} | {a} | {b} | {c} | {slope} |");
+    }
+    out.push_str(
+        "\n![error against time](quality.svg)\n\n## All settings\n\n\
+         | | | seconds | RMS | relative MSE | ± | noise² | bias² | brighter by | to mean | all light: MSE | to mean |\n\
+         |---|---|---|---|---|---|---|---|---|---|---|---|\n",
+    );
+    for r in rows {
+        let e = &r.indirect;
+        let all = r.all.map_or("– | –".into(), |a| format!("{:.1e} | {:.1e}", a.mse, a.to_mean));
+        let _ = writeln!(
+            out,
+            "| {} | {} | {:.2} | {:.2} % | {:.1e} | {:.0e} | {:.1e} | {:.1e} | {:+.2} % | {:.1e} | {all} |",
+            r.series,
+            r.value,
+            r.seconds,
+            100.0 * e.mse.max(0.0).sqrt(),
+            e.mse,
+            e.uncertainty,
+            e.variance,
+            e.bias2,
+            100.0 * e.mean,
+            e.to_mean
+        );
+    }
+    out
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    fn row(seconds: f64, mse: f64, bias2: f64) -> Row {
+        let indirect = Errors { mse, bias2, variance: mse - bias2, ..Default::default() };
+        Row { series: "s", value: String::new(), seconds, indirect, all: None }
+    }
+
+    #[test]
+    fn times_are_found_between_settings_and_beyond_unbiased_ones() {
+        let rows = [row(1.0, 0.04, 0.0), row(4.0, 0.01, 0.0), row(16.0, 0.0025, 0.0)];
+        assert_eq!(time_to(&rows, 0.1), "4.00 s");
+        assert_eq!(time_to(&rows, 0.05), "16 s");
+        assert_eq!(time_to(&rows, 0.01), "about 400 s");
+        assert_eq!(time_to(&rows, 0.3), "< 1.00 s");
+        assert!((slope(&rows).unwrap() + 0.5).abs() < 1e-9);
+        let biased = [row(1.0, 0.04, 0.03), row(4.0, 0.0325, 0.03)];
+        assert_eq!(time_to(&biased, 0.05), "not reached: 18.0 %");
+    }
+}
