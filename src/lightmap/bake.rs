@@ -30,6 +30,9 @@ const BLOCK: usize = 256;
 /// Pages that a scene about fills if the caller leaves the density open.
 const AUTOMATIC_PAGES: f64 = 1.0;
 
+/// Bytes per gather texel while a bake runs: light, blurred light, normal, variance, whether it is valid.
+const GATHER_BYTES: usize = 3 * size_of::<Vec3>() + size_of::<f32>() + size_of::<bool>();
+
 /// Coarse maps of small light maps have pages of this size at least.
 const MIN_PAGE_SIZE: u32 = 64;
 
@@ -66,8 +69,10 @@ impl Lightmap {
             pack(desc.radiance_divisor, 0, false, two_sided)?,
         ];
         let stage = progress.stage("texels", 0.5, 1.0, layouts.iter().map(TexelMap::work).sum());
-        let [map, gather, radiance] = layouts.map(|l| ChartMap::new(scene, &charts, l, false, &stage));
-        let (map, gather, radiance) = (map?, gather?, radiance?);
+        let [map, gather, radiance] = layouts;
+        let map = ChartMap::new(scene, &charts, map, false, &stage)?;
+        let gather = ChartMap::new(scene, &charts, gather, false, &stage)?;
+        let radiance = ChartMap::new(scene, &charts, radiance, true, &stage)?;
         uvs.overlapping_texels = map.texels.overlapping_texels;
         uvs.reduced_charts = map.layout.reduced;
         let bytes = charts.bytes() + map.bytes() + gather.bytes() + radiance.bytes();
@@ -214,7 +219,7 @@ impl Bake<'_, '_> {
         let l = self.atlas;
         let mut bytes = l.map.len() * 25;
         if self.plan.runs(left_out::INDIRECT) {
-            bytes += l.radiance.len() * 12 + l.gather.len() * 38;
+            bytes += l.radiance.len() * 12 + l.gather.len() * GATHER_BYTES;
         }
         if self.params.memory_budget != 0 && bytes as u64 > self.params.memory_budget {
             return Err(Error::OutOfMemory(format!(
@@ -293,12 +298,15 @@ impl Bake<'_, '_> {
         let n = l.gather.len();
         let mut irradiance: Vec<Vec3> = try_vec(n, "the gather map")?;
         let mut normals: Vec<Vec3> = try_vec(n, "the gather map's normals")?;
+        let mut variances: Vec<f32> = try_vec(n, "the gather map's variance")?;
         let mut valid: Vec<bool> = try_vec(n, "the gather map's validity")?;
         device.install(|| {
             let values = irradiance[needed.clone()].par_chunks_mut(BLOCK);
             let normals = normals[needed.clone()].par_chunks_mut(BLOCK);
+            let variances = variances[needed.clone()].par_chunks_mut(BLOCK);
             let valid = valid[needed.clone()].par_chunks_mut(BLOCK);
-            values.zip(normals).zip(valid).enumerate().try_for_each(|(block, ((values, normals), valid))| {
+            let blocks = values.zip(normals).zip(variances).zip(valid).enumerate();
+            blocks.try_for_each(|(block, (((values, normals), variances), valid))| {
                 for i in 0..values.len() {
                     let sample = needed.start + block * BLOCK + i;
                     let receiver = l.receiver(&l.gather, backs, sample);
@@ -306,7 +314,8 @@ impl Bake<'_, '_> {
                     for round in 0..samples.rounds() {
                         gathered.add_round(&l.scene, &lookup, &receiver, &samples, round, combine(seed, sample as u32));
                     }
-                    (values[i], normals[i], valid[i]) = (gathered.irradiance(), receiver.normal, gathered.is_visible());
+                    (values[i], normals[i]) = (gathered.irradiance(), receiver.normal);
+                    (variances[i], valid[i]) = (gathered.variance(), gathered.is_visible());
                 }
                 stage.advance(values.len() as u64)
             })
@@ -317,11 +326,12 @@ impl Bake<'_, '_> {
             let stage = self.progress.stage("blur", 0.6, 0.65, n as u64);
             let mut blurred = try_vec(n, "the blurred gather map")?;
             let radius = self.params.blur_radius;
-            blur::blur(device, &l.charts, &l.gather, &irradiance, &valid, &normals, radius, &mut blurred, &stage)?;
+            let texels = blur::Texels { values: &irradiance, variances: &variances, valid: &valid, normals: &normals };
+            blur::blur(device, &l.charts, &l.gather, texels, radius, &mut blurred, &stage)?;
             irradiance = blurred;
         }
         let rays = needed.len() as u64 * samples.len() as u64;
-        let bytes = (n * 38 + l.gather.bytes()) as u64;
+        let bytes = (n * GATHER_BYTES + l.gather.bytes()) as u64;
         stats.gather = StageStats { seconds: start.elapsed().as_secs_f64(), rays, bytes };
         Ok(Indirect { irradiance, valid })
     }

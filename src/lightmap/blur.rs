@@ -22,16 +22,31 @@ const BLOCK: usize = 1024;
 /// Rounds of filling: a hidden region wider than twice this stays partly unfilled.
 const MAX_FILL_ROUNDS: usize = 64;
 
-/// Gaussian blur of the valid texels among `values` within a square of `radius`. A texel takes part
-/// only if a path of valid texels of the same chart, within the square, leads to it: light on one
+/// How many standard deviations of their noise two texels may differ by and still be taken for equally lit.
+const LIKE: f32 = 2.0;
+
+/// What a blur reads, by sample of the map.
+#[derive(Clone, Copy)]
+pub(crate) struct Texels<'a> {
+    pub values: &'a [Vec3],
+    /// Variance of the values' sums over the channels; infinite where nothing is known of it.
+    pub variances: &'a [f32],
+    pub valid: &'a [bool],
+    pub normals: &'a [Vec3],
+}
+
+/// Blur of the valid texels within a square of `radius`, by a Gaussian that leaves out what differs by more
+/// than noise: the weight falls with the difference of two texels by the standard deviation of that difference
+/// (the range filter of Tomasi and Manduchi, *Bilateral filtering*, 1998, its width from the samples' variance
+/// as in Rousselle, Knaus and Zwicker, *Adaptive rendering with non-local means filtering*, 2012). So shadows
+/// of indirect light stay sharp where they are known, and the blur's bias goes with the noise. A texel takes
+/// part only if a path of valid texels of the same chart, within the square, leads to it: light on one
 /// side of a wall that stands on the chart does not cross the hidden texels below the wall.
 pub(crate) fn blur(
     device: &Device,
     charts: &Charts,
     map: &ChartMap,
-    values: &[Vec3],
-    valid: &[bool],
-    normals: &[Vec3],
+    texels: Texels,
     radius: u32,
     out: &mut [Vec3],
     stage: &Stage,
@@ -42,11 +57,8 @@ pub(crate) fn blur(
             let mut window = Window::new(radius);
             for (i, out) in out.iter_mut().enumerate() {
                 let sample = block * BLOCK + i;
-                *out = if valid[sample] {
-                    window.blur(charts, map, sample, values, valid, normals)
-                } else {
-                    values[sample]
-                };
+                *out =
+                    if texels.valid[sample] { window.blur(charts, map, sample, texels) } else { texels.values[sample] };
             }
             stage.advance(out.len() as u64)
         })
@@ -71,15 +83,9 @@ impl Window {
     }
 
     /// The blurred value of one valid texel.
-    pub(crate) fn blur(
-        &mut self,
-        charts: &Charts,
-        map: &ChartMap,
-        sample: usize,
-        values: &[Vec3],
-        valid: &[bool],
-        normals: &[Vec3],
-    ) -> Vec3 {
+    pub(crate) fn blur(&mut self, charts: &Charts, map: &ChartMap, sample: usize, texels: Texels) -> Vec3 {
+        let Texels { values, variances, valid, normals } = texels;
+        let (brightness, variance) = (values[sample].element_sum(), variances[sample]);
         let (x, y) = map.position(sample);
         let placement = charts.chart_of[map.texels.samples[sample].triangle as usize];
         self.seen = [0; MAX_WINDOW];
@@ -96,8 +102,14 @@ impl Window {
             }
             // Charts may bend; light from another direction is another light.
             let bend = normals[sample].dot(normals[s as usize]).max(0.0);
-            let w = self.weights[(dx * dx + dy * dy) as usize] * bend * bend * bend * bend;
-            sum += w * values[s as usize];
+            let bend = bend * bend * bend * bend;
+            let s = s as usize;
+            let deviation = (variance + variances[s]).sqrt() + f32::MIN_POSITIVE;
+            let difference = (values[s].element_sum() - brightness) / (LIKE * deviation);
+            // Not a number where light overflows.
+            let like = if s == sample { 1.0 } else { (-0.5 * difference * difference).exp().max(0.0) };
+            let w = self.weights[(dx * dx + dy * dy) as usize] * bend * like;
+            sum += w * values[s];
             total += w;
             for (nx, ny) in [(dx - 1, dy), (dx + 1, dy), (dx, dy - 1), (dx, dy + 1)] {
                 if nx.abs() <= self.radius && ny.abs() <= self.radius {

@@ -67,12 +67,23 @@ pub(crate) struct Gathered {
     pub rays: u32,
     /// Of these, how many met the back of a one-sided surface.
     pub backs: u32,
+    /// Sum of the squares of the rays' radiance, summed over the channels.
+    pub squares: f32,
 }
 
 impl Gathered {
     /// Indirect irradiance, W/m².
     pub(crate) fn irradiance(&self) -> Vec3 {
         self.sum * (PI / self.rays as f32)
+    }
+
+    /// Variance of the [`irradiance`](Self::irradiance)'s sum over the channels, from the spread of the rays
+    /// (those of a stratified set vary less; what decides by it knows).
+    pub(crate) fn variance(&self) -> f32 {
+        let n = self.rays as f32;
+        let mean = self.sum.element_sum() / n;
+        let spread = (self.squares / n - mean * mean).max(0.0);
+        PI * PI * spread / (n - 1.0).max(1.0)
     }
 
     /// Whether the texel can be seen at all.
@@ -94,7 +105,7 @@ impl Gathered {
         let shift = [combine(seed, 1), combine(seed, 2)];
         let (tangent, bitangent) = orthonormal_basis(receiver.normal);
         let mut hits = [RawHit::MISS; PACKET_SIZE];
-        let mut sum = Vec3::ZERO;
+        let (mut sum, mut squares) = (Vec3::ZERO, 0.0);
         for bundle in points.chunks(PACKET_SIZE) {
             let mut packet = Packet::default();
             for p in bundle {
@@ -113,12 +124,16 @@ impl Gathered {
                     continue;
                 }
                 match radiance.reflected(hit) {
-                    Some(l) => sum += l,
+                    Some(l) => {
+                        sum += l;
+                        squares += l.element_sum() * l.element_sum();
+                    }
                     None => self.backs += 1,
                 }
             }
         }
         self.sum += sum;
+        self.squares += squares;
         self.rays += points.len() as u32;
     }
 }

@@ -6,12 +6,14 @@
 //! percent or two of a bake.) Emission is not part of it: the emitters are sampled as lights
 //! wherever light is gathered, and would count twice.
 
+use super::bake::inside_a_solid;
 use super::charts::Charts;
 use super::direct::DirectLight;
 use super::map::ChartMap;
 use crate::device::Device;
 use crate::error::Result;
 use crate::photon::PhotonMap;
+use crate::photon::coverage::{Coverage, Piece};
 use crate::progress::Stage;
 use crate::sampling::combine;
 use crate::scene::{NONE, Scene};
@@ -67,11 +69,15 @@ pub(crate) struct RadianceInput<'a> {
 /// Fills in `values`, one per texel of the map; returns the rays traced.
 pub(crate) fn bake(device: &Device, input: &RadianceInput, values: &mut [Vec3], stage: &Stage) -> Result<u64> {
     let rays = AtomicU64::new(0);
+    let coverage = match input.photons {
+        Some(photons) => Some(device.install(|| coverage(input, photons, &rays))?),
+        None => None,
+    };
     device.install(|| {
         values.par_chunks_mut(BLOCK).enumerate().try_for_each(|(block, out)| {
             let mut traced = 0;
             for (i, value) in out.iter_mut().enumerate() {
-                *value = texel(input, block * BLOCK + i, &mut traced);
+                *value = texel(input, coverage.as_ref(), block * BLOCK + i, &mut traced);
             }
             rays.fetch_add(traced, Relaxed);
             stage.advance(out.len() as u64)
@@ -80,7 +86,7 @@ pub(crate) fn bake(device: &Device, input: &RadianceInput, values: &mut [Vec3], 
     Ok(rays.into_inner())
 }
 
-fn texel(input: &RadianceInput, sample: usize, rays: &mut u64) -> Vec3 {
+fn texel(input: &RadianceInput, coverage: Option<&Coverage>, sample: usize, rays: &mut u64) -> Vec3 {
     let texel = &input.map.texels.samples[sample];
     let albedo = Vec3::from(input.scene.material(texel.triangle).albedo);
     if albedo == Vec3::ZERO {
@@ -89,8 +95,30 @@ fn texel(input: &RadianceInput, sample: usize, rays: &mut u64) -> Vec3 {
     let back = sample >= input.back_start;
     let (point, receiver) = input.map.receiver(input.scene, sample, back);
     let mut e = input.direct.irradiance(&receiver, input.direct_samples, combine(input.seed, sample as u32), rays);
-    if let Some(photons) = input.photons {
-        e += Vec3::from(photons.estimate(point.position, receiver.geometric));
+    if let (Some(photons), Some(coverage)) = (input.photons, coverage) {
+        let estimate = Vec3::from(photons.estimate(point.position, receiver.geometric));
+        e += estimate / coverage.at(photons, point.position, receiver.geometric);
     }
     albedo * e / PI
+}
+
+/// The surfaces that photons could lie on: what the texels show, but for those inside solids (a floor that
+/// goes on below a wall).
+fn coverage(input: &RadianceInput, photons: &PhotonMap, rays: &AtomicU64) -> Result<Coverage> {
+    let samples = 0..input.map.len();
+    rays.fetch_add(samples.len() as u64, Relaxed);
+    let pieces: Vec<Option<Piece>> = samples
+        .into_par_iter()
+        .with_min_len(BLOCK)
+        .map(|sample| {
+            let (point, receiver) = input.map.receiver(input.scene, sample, sample >= input.back_start);
+            let area = input.map.texels.areas[sample];
+            (!inside_a_solid(input.scene, receiver.origin, receiver.geometric)).then_some(Piece {
+                position: point.position,
+                normal: receiver.geometric,
+                area,
+            })
+        })
+        .collect();
+    Coverage::new(photons, pieces.into_iter().flatten())
 }

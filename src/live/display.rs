@@ -3,7 +3,7 @@
 //! when a page is read. The sums of the texels are left alone.
 
 use super::blocks::{Block, BlockMap, DirectTile, Rect, TILE};
-use crate::lightmap::blur::Window;
+use crate::lightmap::blur::{Texels, Window};
 use crate::memory::try_vec;
 use crate::scene::NONE;
 use glam::Vec3;
@@ -32,6 +32,8 @@ pub(super) struct Display {
     /// until a light changes.
     coarse_of_tile: Vec<Vec3>,
     normals: Vec<Vec3>,
+    /// Of `plain`; infinite where it is interpolated.
+    variances: Vec<f32>,
     /// Whether a gather texel can be seen, as far as is known.
     visible: Vec<bool>,
     /// Gather texels that cannot, by block.
@@ -70,6 +72,8 @@ impl Display {
                 *normal = atlas.receiver(&atlas.gather, &[], i).normal;
             });
         });
+        let mut variances = try_vec(n, "the gather map's variance")?;
+        variances.fill(f32::INFINITY);
         let mut visible = try_vec(n, "the gather map's validity")?;
         visible.fill(true);
         Ok(Display {
@@ -78,6 +82,7 @@ impl Display {
             coarse: try_vec(n, "live direct light")?,
             coarse_of_tile: Vec::new(),
             normals,
+            variances,
             visible,
             unseen: HashMap::new(),
             lods: vec![0; map.tiles.len()],
@@ -93,7 +98,7 @@ impl Display {
 
     /// Bytes held, without the tiles.
     pub fn bytes(&self) -> usize {
-        let per_texel = 4 * size_of::<Vec3>() + 1;
+        let per_texel = 4 * size_of::<Vec3>() + size_of::<f32>() + 1;
         let per_block = size_of::<Option<DirectTile>>() + size_of::<u32>() + 3;
         self.plain.len() * per_texel
             + (self.coarse_of_tile.len() + self.old.len()) * size_of::<Vec3>()
@@ -109,6 +114,7 @@ impl Display {
             for i in 0..tile.lod_end[fresh as usize] as usize {
                 if let Some(value) = block.estimate(i) {
                     self.plain[tile.texels[i] as usize] = value;
+                    self.variances[tile.texels[i] as usize] = block.variance(i);
                 }
                 self.note_visible(b, tile.texels[i], block.is_visible(i));
             }
@@ -142,6 +148,7 @@ impl Display {
         let interpolated: Vec<(u32, Vec3)> = all.par_iter().flat_map_iter(interpolate).collect();
         for (sample, value) in interpolated {
             self.plain[sample as usize] = value;
+            self.variances[sample as usize] = f32::INFINITY;
         }
 
         let mut to_fill = Vec::new();
@@ -234,7 +241,9 @@ impl Display {
             return self.plain[sample];
         }
         let atlas = &map.atlas;
-        window.blur(&atlas.charts, &atlas.gather, sample, &self.plain, &self.visible, &self.normals)
+        let texels =
+            Texels { values: &self.plain, variances: &self.variances, valid: &self.visible, normals: &self.normals };
+        window.blur(&atlas.charts, &atlas.gather, sample, texels)
     }
 
     fn note_visible(&mut self, b: u32, sample: u32, visible: bool) {

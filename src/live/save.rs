@@ -10,7 +10,7 @@ use crate::lightmap::gather::{Gathered, ROUND};
 use glam::Vec3;
 use std::path::Path;
 
-const MAGIC: [u8; 8] = *b"BKLIVE1\0";
+const MAGIC: [u8; 8] = *b"BKLIVE2\0";
 
 /// FNV-1a, 64 bits.
 struct Hash(u64);
@@ -129,6 +129,7 @@ impl Live {
             g.sum.to_array().iter().for_each(|c| out.extend(c.to_le_bytes()));
             out.extend(g.rays.to_le_bytes());
             out.extend(g.backs.to_le_bytes());
+            out.extend(g.squares.to_le_bytes());
         }
         let tile = self.display.direct_tile(b).filter(|t| t.1).map(|t| t.0);
         out.extend(tile.map_or(0, |t| t.values.len() as u32).to_le_bytes());
@@ -177,8 +178,12 @@ impl Live {
         }
         let most = self.params.max_rounds * ROUND as u32;
         let gathered = |from: &mut Reader| {
-            let g = Gathered { sum: from.vec3()?, rays: from.u32()?, backs: from.u32()? };
-            (g.sum.is_finite() && g.rays <= most && g.rays.is_multiple_of(ROUND as u32) && g.backs <= g.rays)
+            let g = Gathered { sum: from.vec3()?, rays: from.u32()?, backs: from.u32()?, squares: from.f32()? };
+            (g.sum.is_finite()
+                && g.squares >= 0.0
+                && g.rays <= most
+                && g.rays.is_multiple_of(ROUND as u32)
+                && g.backs <= g.rays)
                 .then_some(g)
         };
         let gathered = (0..count).map(|_| gathered(from)).collect::<Option<Vec<_>>>()?;

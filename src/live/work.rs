@@ -253,6 +253,11 @@ impl Block {
         Some((prior * weight + g.irradiance() * n) / (weight + n))
     }
 
+    /// Variance of what texel `i` has gathered, infinite before it has gathered anything.
+    pub fn variance(&self, i: usize) -> f32 {
+        self.gathered.get(i).filter(|g| g.rays > 0).map_or(f32::INFINITY, |g| g.variance())
+    }
+
     /// Whether texel `i` can be seen, as far as is known.
     pub fn is_visible(&self, i: usize) -> bool {
         self.gathered.get(i).is_none_or(|g| g.is_visible())

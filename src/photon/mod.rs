@@ -7,9 +7,11 @@
 //! | `radius.rs` | the automatic search radius |
 //! | `grid.rs` | photons sorted into a uniform grid, one array per component |
 //! | `estimate.rs` | the irradiance estimate, over the lanes of each ISA |
+//! | `coverage.rs` | how much surface there is in its disc |
 //!
 //! The same seed and ISA give the same map and the same estimates for any number of threads.
 
+pub(crate) mod coverage;
 mod emission;
 mod estimate;
 mod grid;

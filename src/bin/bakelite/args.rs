@@ -41,7 +41,7 @@ Light map:
   --page-size N          width and height of a page in texels [1024]
   --padding N            texels around each chart [2]
   --gather-divisor N     light map texels per gather map texel and axis [4]
-  --radiance-divisor N   light map texels per radiance map texel and axis [8]
+  --radiance-divisor N   light map texels per radiance map texel and axis [2]
 Bake:
   --photons N            photons emitted [1000000]
   --bounces N            most reflections; 0: Russian roulette alone decides [0]
@@ -72,7 +72,7 @@ Report quality (quality.md):
   --paths N              paths per point of the path traced reference [4096]
   --knobs A,B,..         what to vary, of gather-rays, photons, radius, blur,
                          direct-samples, gather-divisor, radiance-divisor,
-                         path-tracing, photons-alone [all of these]
+                         path-tracing, photons-alone, or none [all of these]
 Output:
   --out DIR              where all files go [out]
   --no-glb               do not write the scene with its light maps as GLB
@@ -353,6 +353,9 @@ fn knobs(value: &str) -> Result<Vec<String>, String> {
         true => Ok(name.to_owned()),
         false => Err(format!("--knobs: there is no {name:?}; there are: {}", KNOBS.join(", "))),
     };
+    if value == "none" {
+        return Ok(Vec::new());
+    }
     value.split(',').map(known).collect()
 }
 

@@ -1,9 +1,251 @@
-//! `bakelite report pipeline`: what each stage of a bake takes, and what bounds it.
+//! `bakelite report pipeline`: what each stage of a bake takes (thesis 4.2), and what bounds it: rays per second
+//! beside those of the bare kernels on rays of the same distribution, bytes per second beside what the memory
+//! gives.
 
+use crate::Job;
 use crate::args::BakeArgs;
-use bakelite::Result;
+use crate::output;
+use bakelite::lightmap::{BakeStats, Layer, LayerData, Lightmap, StageStats};
+use bakelite::photon::{PhotonParams, photon_rays};
+use bakelite::sampling::{cosine_hemisphere, mix, orthonormal_basis, sobol_2d};
+use bakelite::trace::offset::offset_ray_origin;
+use bakelite::trace::{Hit, PACKET_SIZE, Packet, RawHit, Ray};
+use bakelite::{Error, Light, Result, Scene};
+use glam::Vec3;
+use rayon::prelude::*;
+use std::fmt::Write;
+use std::sync::Arc;
+use std::time::Instant;
+
+/// Bakes, and runs of each bare kernel; medians are reported.
+const RUNS: usize = 5;
+
+/// Photons whose rays are traced by the bare kernel.
+const PHOTONS: u64 = 200_000;
+
+/// Places that bare gather rays and shadow rays start from.
+const PLACES: usize = 4096;
+
+/// Packets per place.
+const PACKETS: usize = 2;
+
+/// Bytes that are copied to measure memory.
+const COPIED: usize = 256 << 20;
+
+/// One line of the table.
+struct Row {
+    stage: &'static str,
+    seconds: f64,
+    rays: u64,
+    bytes: u64,
+    /// Rays per second of the bare kernel, where the stage traces any.
+    bare: Option<f64>,
+}
 
 /// Runs the report.
-pub fn run(_args: &BakeArgs) -> Result<()> {
-    todo!()
+pub fn run(args: &BakeArgs) -> Result<()> {
+    output::make_folder(&args.out)?;
+    let mut job = Job::new(args);
+    let mut lightmap = job.unbaked()?;
+    let mut bakes: Vec<BakeStats> = Vec::new();
+    for _ in 0..RUNS {
+        bakes.push(job.bars.show("bake", |p| lightmap.bake(&args.params, p))?);
+    }
+    let scene = lightmap.scene().clone();
+    let places = places(&lightmap)?;
+    let photons = median((0..RUNS).map(|_| photons_rate(&scene)).collect::<Result<_>>()?);
+    let gather = median((0..RUNS).map(|_| gather_rate(&scene, &places)).collect());
+    let shadow = median((0..RUNS).map(|_| shadow_rate(&scene, &places)).collect::<Result<_>>()?);
+    let memory = median((0..RUNS).map(|_| copy_rate(&scene)).collect());
+
+    let before = |name: &str| {
+        let stage = job.stages.iter().find(|s| s.name == name);
+        stage.map_or((0.0, 0), |s| (s.seconds, s.bytes))
+    };
+    let of = |stage: fn(&BakeStats) -> StageStats| {
+        let s = stage(&bakes[0]);
+        StageStats { seconds: median(bakes.iter().map(|b| stage(b).seconds).collect()), ..s }
+    };
+    let row = |stage, s: StageStats, bare| Row { stage, seconds: s.seconds, rays: s.rays, bytes: s.bytes, bare };
+    let unwrap = lightmap.info().unwrap_seconds;
+    let (tree, texels) = (before("tree"), before("charts and texels"));
+    let build = |stage, (seconds, bytes): (f64, u64)| Row { stage, seconds, rays: 0, bytes, bare: None };
+    let rows = [
+        build("acceleration structure", tree),
+        build("unwrapping", (unwrap, 0)),
+        build("packing and texels", (texels.0 - unwrap, texels.1)),
+        row("photons", of(|b| b.photons), Some(photons)),
+        row("radiance map", of(|b| b.radiance), Some(shadow)),
+        row("gather map", of(|b| b.gather), Some(gather)),
+        row("direct light", of(|b| b.direct), Some(shadow)),
+        row("composition", of(|b| b.compose), None),
+    ];
+    let save = |name: &str, text: &str| {
+        let path = args.out.join(name);
+        std::fs::write(&path, text).map_err(|e| Error::Io(format!("{}: {e}", path.display())))
+    };
+    let text = markdown(args, &lightmap, &rows, memory);
+    save("pipeline.csv", &csv(&rows))?;
+    save("pipeline.md", &text)?;
+    if !args.quiet {
+        println!("{text}\nWrote to {}: pipeline.md, pipeline.csv", args.out.display());
+    }
+    Ok(())
+}
+
+fn median(mut values: Vec<f64>) -> f64 {
+    values.sort_unstable_by(f64::total_cmp);
+    values[values.len() / 2]
+}
+
+/// Where rays start, just above texels chosen at random, and the normals there.
+fn places(lightmap: &Lightmap) -> Result<Vec<[Vec3; 2]>> {
+    let mut texels = Vec::new();
+    for page in 0..lightmap.info().page_count {
+        let layers = [Layer::Validity, Layer::Position, Layer::Normal].map(|l| lightmap.read(page, l));
+        let [Ok(LayerData::Scalar(valid)), Ok(LayerData::Rgb(positions)), Ok(LayerData::Rgb(normals))] = layers else {
+            return Err(Error::Internal("a layer is of another type".into()));
+        };
+        let all = valid.into_iter().zip(positions.into_iter().zip(normals)).filter(|(v, _)| *v == 1.0);
+        texels.extend(all.map(|(_, (p, n))| [Vec3::from(p), Vec3::from(n)]));
+    }
+    if texels.is_empty() {
+        return Err(Error::InvalidArgument("no texel of the scene can be seen".into()));
+    }
+    let scene = lightmap.scene();
+    let at = |i: u32| texels[((mix(i) as u64 * texels.len() as u64) >> 32) as usize];
+    Ok((0..PLACES as u32).map(at).map(|[p, n]| [offset_ray_origin(p, n, scene), n]).collect())
+}
+
+/// Rays per second of `rays`, on all threads.
+fn rate(scene: &Scene, rays: u64, work: impl FnOnce() + Send) -> f64 {
+    let start = Instant::now();
+    scene.device().install(work);
+    rays as f64 / start.elapsed().as_secs_f64()
+}
+
+/// The rays of photons, in their order, without what photons are.
+fn photons_rate(scene: &Arc<Scene>) -> Result<f64> {
+    let params = PhotonParams { photon_count: PHOTONS, ..Default::default() };
+    let rays = photon_rays(scene, &params)?;
+    let mut hits = vec![Hit::MISS; rays.len()];
+    let start = Instant::now();
+    scene.intersect_many(&rays, true, &mut hits)?;
+    Ok(rays.len() as f64 / start.elapsed().as_secs_f64())
+}
+
+/// Packets as the gather map traces them, without looking anything up.
+fn gather_rate(scene: &Scene, places: &[[Vec3; 2]]) -> f64 {
+    let rays = (places.len() * PACKETS * PACKET_SIZE) as u64;
+    rate(scene, rays, || {
+        places.par_iter().enumerate().for_each(|(i, &[origin, normal])| {
+            let (x, y) = orthonormal_basis(normal);
+            let mut hits = [RawHit::MISS; PACKET_SIZE];
+            let mut points: Vec<[f32; 2]> =
+                (0..(PACKETS * PACKET_SIZE) as u32).map(|k| sobol_2d(k, mix(i as u32))).collect();
+            points.sort_unstable_by(|a, b| a[0].total_cmp(&b[0]));
+            for bundle in points.chunks(PACKET_SIZE) {
+                let mut packet = Packet::default();
+                for &p in bundle {
+                    let d = cosine_hemisphere(p);
+                    packet.push(d.x * x + d.y * y + d.z * normal);
+                }
+                scene.gather_packet(origin, &packet, 0.0, f32::INFINITY, &mut hits);
+                std::hint::black_box(&hits);
+            }
+        });
+    })
+}
+
+/// Shadow rays from the places to the lights.
+fn shadow_rate(scene: &Scene, places: &[[Vec3; 2]]) -> Result<f64> {
+    let centre = |l: &Light| match *l {
+        Light::Point { position, .. } | Light::Spot { position, .. } => position,
+        Light::Directional { direction, .. } => -direction * 4.0 * scene.diagonal(),
+        Light::Rect { position, edge_u, edge_v, .. } => position + 0.5 * (edge_u + edge_v),
+    };
+    let emitters = scene.emitters().iter().map(|e| e.corner + (e.edge_u + e.edge_v) / 3.0);
+    let lights: Vec<Vec3> = scene.lights().iter().map(centre).chain(emitters).collect();
+    let ray = |(i, [p, _]): (usize, &[Vec3; 2])| {
+        let light = lights[mix(i as u32) as usize % lights.len()];
+        Ray::new(*p, light - *p).within(0.0, 0.9999)
+    };
+    let rays: Vec<Ray> = (0..16).flat_map(|_| places.iter().enumerate().map(ray)).collect();
+    let mut occluded = vec![0; rays.len()];
+    let start = Instant::now();
+    scene.occluded_many(&rays, true, &mut occluded)?;
+    Ok(rays.len() as f64 / start.elapsed().as_secs_f64())
+}
+
+/// Bytes per second read and written by copying, on all threads.
+fn copy_rate(scene: &Scene) -> f64 {
+    let (from, mut to) = (vec![1u8; COPIED], vec![0u8; COPIED]);
+    let part = COPIED / scene.device().num_threads().max(1) + 1;
+    let start = Instant::now();
+    scene.device().install(|| {
+        to.par_chunks_mut(part).zip(from.par_chunks(part)).for_each(|(to, from)| to.copy_from_slice(from));
+    });
+    std::hint::black_box(&to);
+    2.0 * COPIED as f64 / start.elapsed().as_secs_f64()
+}
+
+fn csv(rows: &[Row]) -> String {
+    let mut out = String::from("stage,seconds,rays,bytes,bare_rays_per_second\n");
+    for r in rows {
+        let bare = r.bare.map_or(String::new(), |b| format!("{b:.0}"));
+        let _ = writeln!(out, "{},{:.5},{},{},{bare}", r.stage, r.seconds, r.rays, r.bytes);
+    }
+    out
+}
+
+fn markdown(args: &BakeArgs, lightmap: &Lightmap, rows: &[Row], memory: f64) -> String {
+    let (scene, info) = (lightmap.scene(), lightmap.info());
+    let path = std::path::Path::new(&args.scene);
+    let name = path.file_name().map_or(args.scene.clone(), |n| n.to_string_lossy().into_owned());
+    let total: f64 = rows.iter().map(|r| r.seconds).sum();
+    let unwrapping = rows.iter().filter(|r| r.stage == "unwrapping").map(|r| r.seconds).sum::<f64>();
+    let mut out = format!(
+        "# Pipeline: {name}\n\n\
+         {} triangles; {} texels at {:.2} per unit, {} gather and {} radiance texels, {} charts; {} photons, {} gather \
+         rays; threads: {}, {}. Medians of {RUNS} bakes. The bare kernel's rays have the same distribution as the \
+         stage's: photon paths in their order, shared-origin packets from texels, shadow rays from texels. Copying \
+         memory moves {:.1} GB/s.\n\n\
+         | stage | seconds | share | rays | Mrays/s | of the bare kernel's | MB | GB/s |\n|---|---|---|---|---|---|---|---|\n",
+        scene.stats().triangles,
+        info.texels,
+        info.texels_per_unit,
+        info.gather_texels,
+        info.radiance_texels,
+        info.charts,
+        args.params.photon_count,
+        args.params.gather_rays,
+        scene.device().num_threads(),
+        scene.device().isa().name(),
+        memory * 1e-9,
+    );
+    for r in rows {
+        let rate = r.rays as f64 / r.seconds;
+        let (rays, mrays) = if r.rays > 0 {
+            (format!("{:.2} M", r.rays as f64 * 1e-6), format!("{:.2}", rate * 1e-6))
+        } else {
+            ("–".into(), "–".into())
+        };
+        let bare = match r.bare {
+            Some(b) if r.rays > 0 => format!("{:.0} % of {:.2}", 100.0 * rate / b, b * 1e-6),
+            _ => "–".into(),
+        };
+        let (mb, gb) = (r.bytes as f64 * 1e-6, r.bytes as f64 / r.seconds * 1e-9);
+        let bytes = if r.bytes > 0 { format!("{mb:.1} | {gb:.2}") } else { "– | –".into() };
+        let (stage, seconds, share) = (r.stage, r.seconds, 100.0 * r.seconds / total);
+        let _ = writeln!(out, "| {stage} | {seconds:.3} | {share:.1} % | {rays} | {mrays} | {bare} | {bytes} |");
+    }
+    let _ = writeln!(
+        out,
+        "| sum | {total:.3} | | | | | | |\n| sum without unwrapping | {:.3} | | | | | | |\n\n## Plan\n",
+        total - unwrapping
+    );
+    for line in lightmap.plan_text().lines() {
+        let _ = writeln!(out, "- {line}");
+    }
+    out
 }
