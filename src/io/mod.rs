@@ -109,7 +109,7 @@ impl Import {
     fn add_material(&mut self, albedo: [f32; 3], emission: [f32; 3], two_sided: bool) -> Result<u32> {
         let clamped = albedo.map(|a| a.clamp(0.0, MAX_ALBEDO));
         self.info.albedos_clamped += (clamped != albedo) as u32;
-        let material = Material { albedo: clamped, emission, two_sided };
+        let material = Material { albedo: clamped, emission, two_sided, ..Default::default() };
         self.scene.add_material(material).map_err(|e| self.rename(e))
     }
 

@@ -184,7 +184,7 @@ fn radiance(scene: &Scene, ray: &Ray, seed: u32, irradiance: impl Fn(&Seen) -> V
     if !hit.front && !material.two_sided {
         return Vec3::ZERO;
     }
-    let reflected = Vec3::from(material.albedo) / PI * irradiance(&Seen { hit, seed });
+    let reflected = scene.albedo(hit.triangle, hit.u, hit.v) / PI * irradiance(&Seen { hit, seed });
     reflected + Vec3::from(material.emission)
 }
 
