@@ -121,6 +121,8 @@ impl Uses {
 
 impl Scene {
     /// Builds the acceleration structure. On an error, `data` comes back unharmed.
+    // It goes in by value and comes back so.
+    #[allow(clippy::result_large_err)]
     pub fn commit(
         device: &Arc<Device>,
         data: SceneData,
