@@ -319,6 +319,68 @@ static void materials(bk_scene *scene) {
     bk_material_desc_init(&material);
     material.flags = 0x100;
     CHECK_ERROR(bk_scene_add_material(scene, &material, NULL), ARGUMENT, "0x100");
+    bk_material_desc_init(&material);
+    material.transmission[2] = 0.75f;
+    CHECK_ERROR(bk_scene_add_material(scene, &material, NULL), ARGUMENT, "transmission[2] 0.75 are more than 1");
+    material.transmission[2] = NAN;
+    CHECK_ERROR(bk_scene_add_material(scene, &material, NULL), ARGUMENT, "transmission[2] is NaN");
+    bk_material_desc_init(&material);
+    material.alpha_cutoff = 0.5f;
+    CHECK_ERROR(bk_scene_add_material(scene, &material, NULL), ARGUMENT, "there is no albedo_texture");
+    material.albedo_texture = 0;
+    CHECK_ERROR(bk_scene_add_material(scene, &material, NULL), ARGUMENT, "albedo_texture 0 does not exist");
+}
+
+static void textures(bk_scene *scene) {
+    static const uint8_t texels[4][4] = {{1, 2, 3, 4}, {5, 6, 7, 8}, {9, 10, 11, 12}, {13, 14, 15, 16}};
+    bk_texture_desc texture;
+    bk_material_desc material;
+    uint32_t id = 77;
+    bk_texture_init(NULL);
+    bk_texture_init(&texture);
+    CHECK_ERROR(bk_scene_add_texture(NULL, &texture, &id), ARGUMENT, "scene is NULL");
+    CHECK_ERROR(bk_scene_add_texture(scene, NULL, &id), ARGUMENT, "desc is NULL");
+    CHECK_ERROR(bk_scene_add_texture(scene, &texture, &id), ARGUMENT, "width is 0");
+    texture.width = 2;
+    CHECK_ERROR(bk_scene_add_texture(scene, &texture, &id), ARGUMENT, "height is 0");
+    texture.height = 2;
+    CHECK_ERROR(bk_scene_add_texture(scene, &texture, &id), ARGUMENT, "data is NULL");
+    texture.data = texels;
+    texture.width = 0xffffffffu;
+    CHECK_ERROR(bk_scene_add_texture(scene, &texture, &id), ARGUMENT, "width is 4294967295");
+    texture.width = 2;
+    texture.height = 16385;
+    CHECK_ERROR(bk_scene_add_texture(scene, &texture, &id), ARGUMENT, "height is 16385");
+    texture.height = 2;
+    texture.row_stride = 7;
+    CHECK_ERROR(bk_scene_add_texture(scene, &texture, &id), ARGUMENT, "row_stride is 7");
+    texture.row_stride = SIZE_MAX - 3;
+    CHECK_ERROR(bk_scene_add_texture(scene, &texture, &id), ARGUMENT, "row_stride is ");
+    texture.row_stride = 0;
+    texture.format = 99;
+    CHECK_ERROR(bk_scene_add_texture(scene, &texture, &id), ARGUMENT, "format is 99");
+    texture.format = BK_TEXTURE_RGBA8_SRGB;
+    texture.struct_size = 8;
+    CHECK_ERROR(bk_scene_add_texture(scene, &texture, &id), ARGUMENT, "bk_texture_desc.struct_size is 8");
+    texture.struct_size = sizeof texture;
+    CHECK(id == 77);
+    CHECK_OK(bk_scene_add_texture(scene, &texture, &id));
+    CHECK(id == 0);
+    CHECK_OK(bk_scene_add_texture(scene, &texture, NULL));
+
+    bk_material_desc_init(&material);
+    material.albedo_texture = 2;
+    CHECK_ERROR(bk_scene_add_material(scene, &material, NULL), ARGUMENT,
+                "albedo_texture 2 does not exist, the scene has 2 textures");
+    material.albedo_texture = 1;
+    material.albedo[0] = 1.01f;
+    CHECK_ERROR(bk_scene_add_material(scene, &material, NULL), ARGUMENT, "albedo[0] is 1.01");
+    material.albedo[0] = 1.0f;
+    material.alpha_cutoff = 1.5f;
+    CHECK_ERROR(bk_scene_add_material(scene, &material, NULL), ARGUMENT, "alpha_cutoff is 1.5");
+    material.alpha_cutoff = 1.0f;
+    material.emission[0] = 1.0f;
+    CHECK_ERROR(bk_scene_add_material(scene, &material, NULL), ARGUMENT, "cannot have holes");
 }
 
 static void meshes(bk_scene *scene) {
@@ -410,13 +472,19 @@ static void descriptions(bk_device *device) {
     bk_build_params build;
     bk_light_desc light = lamp_desc();
     bk_material_desc material;
+    bk_texture_desc texture;
     bk_mesh_desc mesh = floor_desc();
+    const uint32_t texel = 0;
 
+    bk_texture_init(&texture);
+    texture.width = texture.height = 1;
+    texture.data = &texel;
     bk_material_desc_init(&material);
     CHECK_ERROR(bk_scene_add_mesh(scene, &mesh, NULL), ARGUMENT, "material 0");
     CHECK_ERROR(bk_scene_commit(scene, NULL, NULL), STATE, "no triangles");
     add_floor(scene);
     materials(scene);
+    textures(scene);
     meshes(scene);
     lights(scene);
     bk_build_params_init(&build);
@@ -439,6 +507,7 @@ static void descriptions(bk_device *device) {
 
     CHECK_ERROR(bk_scene_commit(scene, NULL, NULL), STATE, "committed already");
     CHECK_ERROR(bk_scene_add_material(scene, &material, NULL), STATE, "committed");
+    CHECK_ERROR(bk_scene_add_texture(scene, &texture, NULL), STATE, "committed");
     CHECK_ERROR(bk_scene_add_mesh(scene, &mesh, NULL), STATE, "committed");
     CHECK_ERROR(bk_scene_add_light(scene, &light, NULL), STATE, "committed");
     CHECK_ERROR(bk_scene_load_builtin(scene, "cornell"), STATE, "committed");

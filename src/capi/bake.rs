@@ -28,6 +28,12 @@ pub const BK_LEFT_OUT_BLUR: u32 = 32;
 pub const BK_LEFT_OUT_UNWRAP: u32 = 64;
 /// Bit of left_out. No interpolation of shading normals.
 pub const BK_LEFT_OUT_SHADING_NORMALS: u32 = 128;
+/// Bit of left_out. No look-ups of albedo textures.
+pub const BK_LEFT_OUT_TEXTURES: u32 = 256;
+/// Bit of left_out. No tests for holes that textures cut out.
+pub const BK_LEFT_OUT_CUTOUTS: u32 = 512;
+/// Bit of left_out. No light through surfaces.
+pub const BK_LEFT_OUT_TRANSMISSION: u32 = 1024;
 
 // The numbers are literal for the header's sake.
 const _: () = assert!(
@@ -39,6 +45,9 @@ const _: () = assert!(
         && BK_LEFT_OUT_BLUR == left_out::BLUR
         && BK_LEFT_OUT_UNWRAP == left_out::UNWRAP
         && BK_LEFT_OUT_SHADING_NORMALS == left_out::SHADING_NORMALS
+        && BK_LEFT_OUT_TEXTURES == left_out::TEXTURES
+        && BK_LEFT_OUT_CUTOUTS == left_out::CUTOUTS
+        && BK_LEFT_OUT_TRANSMISSION == left_out::TRANSMISSION
 );
 
 /// How to bake.

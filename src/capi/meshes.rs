@@ -9,15 +9,17 @@
 use super::args::{
     OutStruct, SizedStruct, check_flags, init, read_optional, read_strided, read_struct, sized_struct, write_optional,
 };
-use super::error::{bk_result, call, call_or};
+use super::error::{BK_NONE, bk_result, call, call_or};
 use super::handles::object;
 use super::scene::bk_scene;
 use crate::error::{Result, invalid_argument};
-use crate::scene::{LightmapUvs, Material, Mesh, MeshMaterials};
+use crate::scene::{LightmapUvs, Material, Mesh, MeshMaterials, NONE};
 use glam::{Vec2, Vec3};
 
+const _: () = assert!(BK_NONE == NONE);
+
 /// Flag: the back side reflects and emits like the front. The back of a one-sided material absorbs
-/// what meets it.
+/// what meets it and is not transmitted.
 pub const BK_MATERIAL_TWO_SIDED: u32 = 1;
 
 /// A diffuse material.
@@ -28,10 +30,21 @@ pub struct bk_material_desc {
     pub struct_size: u32,
     /// BK_MATERIAL flags. Default: 0.
     pub flags: u32,
-    /// Diffuse reflectance per channel, in [0, 1). Default: 0.5.
+    /// Diffuse reflectance per channel, in [0, 1); with albedo_texture: its factor, in [0, 1]. Default: 0.5.
     pub albedo: [f32; 3],
     /// Emitted radiance per channel in W/(m2 sr), >= 0. Default: 0.
     pub emission: [f32; 3],
+    /// Number of the texture that is multiplied with albedo, the product being limited to 0.98; BK_NONE: none.
+    /// Where a mesh has no uvs, albedo alone counts. Default: BK_NONE.
+    pub albedo_texture: u32,
+    /// Points where the texture's alpha, interpolated and from 0 to 1, is less than this are holes, which rays and
+    /// photons do not meet, from whichever side. In [0, 1]; not for materials that emit. Holes cost rays that
+    /// meet them a second search. Default: 0, no holes.
+    pub alpha_cutoff: f32,
+    /// Fraction of light per channel that passes straight through, from either side, as through a pane of
+    /// stained glass; at most 1 together with albedo. It is not textured. Light of lamps that comes through
+    /// is direct light. bk_intersect, bk_occluded and their like meet the surface all the same. Default: 0.
+    pub transmission: [f32; 3],
 }
 
 sized_struct!(bk_material_desc, last: emission: [f32; 3], defaults: {
@@ -41,6 +54,9 @@ sized_struct!(bk_material_desc, last: emission: [f32; 3], defaults: {
         flags: if m.two_sided { BK_MATERIAL_TWO_SIDED } else { 0 },
         albedo: m.albedo,
         emission: m.emission,
+        albedo_texture: m.albedo_texture,
+        alpha_cutoff: m.alpha_cutoff,
+        transmission: m.transmission,
     }
 });
 
@@ -51,7 +67,7 @@ pub unsafe extern "C" fn bk_material_desc_init(desc: *mut bk_material_desc) {
     unsafe { init(desc) }
 }
 
-/// Adds a material.
+/// Adds a material. The texture that it names must have been added before.
 ///
 /// out_id: receives its number, for meshes; NULL if not wanted. Numbers count up from 0 in the
 /// order of addition.
@@ -70,6 +86,9 @@ pub unsafe extern "C" fn bk_scene_add_material(
             albedo: desc.albedo,
             emission: desc.emission,
             two_sided: desc.flags & BK_MATERIAL_TWO_SIDED != 0,
+            albedo_texture: desc.albedo_texture,
+            alpha_cutoff: desc.alpha_cutoff,
+            transmission: desc.transmission,
         };
         let id = scene.describe("materials can be added", |d| d.data.add_material(material))?;
         // SAFETY: out_id is the caller's, or NULL.
@@ -103,7 +122,7 @@ pub struct bk_mesh_desc {
     pub normals: *const f32,
     /// Bytes from one normal to the next, at least 12; 0: packed.
     pub normal_stride: usize,
-    /// Optional: vertex_count texture coordinates of two floats. Kept for files that are saved.
+    /// Optional: vertex_count texture coordinates of two floats, which place the textures of materials.
     pub uvs: *const f32,
     /// Bytes from one texture coordinate to the next, at least 8; 0: packed.
     pub uv_stride: usize,

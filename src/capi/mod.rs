@@ -1,6 +1,6 @@
 //! The C ABI behind `include/bakelite.h`: handles, checks, errors and callbacks, and no algorithms.
 //!
-//! One file per section of the header, in its order: [`error`], [`device`], [`scene`], [`meshes`],
+//! One file per section of the header, in its order: [`error`], [`device`], [`scene`], [`textures`], [`meshes`],
 //! [`lights`], [`rays`], [`photons`], [`lightmap`], [`bake`], [`read`], [`live`]. cbindgen makes the
 //! header from exactly these files (`capi-tests/header.rs`); their `//!` heads become the sections'
 //! heads and every public item's documentation becomes the manual, so both are written for the C
@@ -32,3 +32,4 @@ pub mod photons;
 pub mod rays;
 pub mod read;
 pub mod scene;
+pub mod textures;

@@ -170,6 +170,11 @@ pub struct bk_load_info {
     pub triangles: u64,
     /// Time to read the file, in seconds.
     pub seconds: f64,
+    /// Textures added, the first with number first_texture. An image that cannot be read is told to the device's
+    /// log as a warning, and its materials do without.
+    pub textures: u32,
+    /// Number of the first texture added.
+    pub first_texture: u32,
 }
 
 sized_struct!(bk_load_info, last: seconds: f64, defaults: bk_load_info {
@@ -183,6 +188,8 @@ sized_struct!(bk_load_info, last: seconds: f64, defaults: bk_load_info {
     clamped_albedos: 0,
     triangles: 0,
     seconds: 0.0,
+    textures: 0,
+    first_texture: 0,
 });
 
 /// Sets struct_size and clears the rest.
@@ -192,7 +199,8 @@ pub unsafe extern "C" fn bk_load_info_init(info: *mut bk_load_info) {
     unsafe { init(info) }
 }
 
-/// Adds what a scene file describes: meshes, materials (emissive ones included), lights.
+/// Adds what a scene file describes: meshes, materials (emissive ones included) with their textures (PNG and
+/// JPEG), lights.
 ///
 /// path: UTF-8, ending in .obj (with its .mtl), .ply, .gltf or .glb. out: what was added; NULL if
 /// not wanted.
@@ -222,7 +230,7 @@ pub unsafe extern "C" fn bk_scene_load_file(
 #[cfg(feature = "io")]
 fn load_file(device: &Device, data: &mut SceneData, path: &str) -> Result<bk_load_info> {
     let (first_mesh, first_material) = (data.meshes().len() as u32, data.materials().len() as u32);
-    let first_light = data.lights().len() as u32;
+    let (first_light, first_texture) = (data.lights().len() as u32, data.textures().len() as u32);
     let i = crate::io::load(path.as_ref(), data)?;
     for warning in &i.warnings {
         device.log(crate::device::LogLevel::Warning, warning);
@@ -237,6 +245,8 @@ fn load_file(device: &Device, data: &mut SceneData, path: &str) -> Result<bk_loa
         clamped_albedos: i.albedos_clamped,
         triangles: i.triangles,
         seconds: i.seconds,
+        textures: i.textures,
+        first_texture,
         struct_size: 0,
     })
 }

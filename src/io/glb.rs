@@ -288,7 +288,7 @@ pub(super) mod tests {
         for (albedo, emission, two_sided) in
             [([0.1, 0.2, 0.3], [0.0; 3], false), ([0.4; 3], [0.0; 3], true), ([0.5; 3], [10.0, 5.0, 0.0], false)]
         {
-            data.add_material(Material { albedo, emission, two_sided }).unwrap();
+            data.add_material(Material { albedo, emission, two_sided, ..Default::default() }).unwrap();
         }
         let positions: Vec<Vec3> =
             (0..4).map(|i| Vec3::new((i & 1) as f32 * 1.1, (i >> 1) as f32 * 0.7, -0.3)).collect();

@@ -1,7 +1,12 @@
 //! glTF 2.0 and GLB: the triangles of the default scene with node transforms applied.
 //!
-//! - Albedo is `baseColorFactor` (textures are not read, metalness is ignored), emission is
-//!   `emissiveFactor` × `KHR_materials_emissive_strength`, sidedness is `doubleSided`.
+//! - Albedo is `baseColorFactor` × `baseColorTexture` (metalness is ignored), emission is `emissiveFactor` ×
+//!   `KHR_materials_emissive_strength` without its texture, sidedness is `doubleSided`.
+//! - `alphaMode` `MASK` cuts holes, except into surfaces that emit; `BLEND` counts as opaque.
+//!   `KHR_materials_transmission`: its factor of `baseColorFactor` passes straight through, as through a thin
+//!   sheet; textures do not change that.
+//! - Images (PNG, JPEG) come from buffer views, data URIs and files beside the scene. All repeat, whatever their
+//!   sampler says, and `KHR_texture_transform` is ignored.
 //! - `TEXCOORD_0` becomes [`Mesh::uvs`], `TEXCOORD_1` the light map coordinates. Their page is the
 //!   number of the material's texture that uses them, among all textures that are used so (as our
 //!   own export writes them), else 0. A mesh that several nodes show has no unique coordinates: none
@@ -14,14 +19,15 @@
 //! The crate `gltf` reads the JSON; accessors are read here, because the crate's readers trust sizes
 //! in the file.
 
-use super::{Import, is_valid_position};
+use super::{Import, is_valid_position, texture};
 use crate::error::{Error, Result};
-use crate::scene::{Light, LightmapUvs, Mesh, MeshMaterials, NONE};
+use crate::scene::{Light, LightmapUvs, Material, Mesh, MeshMaterials, NONE, Texture};
 use base64::Engine;
 use glam::{DMat3, DMat4, DVec3, Mat4, Vec2, Vec3};
 use gltf::accessor::{DataType, Dimensions};
 use gltf::json;
 use gltf::khr_lights_punctual::Kind;
+use gltf::material::AlphaMode;
 use gltf::mesh::{Mode, Semantic};
 use std::collections::{BTreeSet, HashMap};
 use std::path::Path;
@@ -40,12 +46,16 @@ pub(super) fn load(import: &mut Import) -> Result<()> {
         .collect::<Result<Vec<Vec<u8>>>>()?;
     let mut reader = Reader {
         buffers,
+        document: &document,
         materials: HashMap::new(),
+        images: HashMap::new(),
         pages: lightmap_pages(&document),
         mesh_uses: vec![0; document.meshes().len()],
         triangles: 0,
         textured: BTreeSet::new(),
+        blended: BTreeSet::new(),
         skipped_primitives: 0,
+        invisible_primitives: 0,
         place: String::new(),
         import,
     };
@@ -63,7 +73,7 @@ pub(super) fn load(import: &mut Import) -> Result<()> {
             reader.add_primitive(&primitive, transform, reader.mesh_uses[mesh] == 1)?;
         }
     }
-    reader.warn(&document);
+    reader.warn();
     if import.scene.triangle_count() == 0 {
         return Err(import.error("there are no triangles in it"));
     }
@@ -201,15 +211,22 @@ fn lightmap_pages(document: &gltf::Document) -> HashMap<usize, u32> {
 struct Reader<'i> {
     import: &'i mut Import,
     buffers: Vec<Vec<u8>>,
-    /// Our material by theirs; `None` is glTF's default material.
+    document: &'i gltf::Document,
+    /// Our material by theirs; `None` is glTF's default material. [`NONE`]: nothing can be seen of it.
     materials: HashMap<Option<usize>, u32>,
+    /// Our texture by their image; [`NONE`] if it cannot be read.
+    images: HashMap<usize, u32>,
     pages: HashMap<usize, u32>,
     /// How many nodes show each mesh.
     mesh_uses: Vec<u32>,
     triangles: usize,
-    /// Materials with a base colour texture.
+    /// Materials with a base colour texture by other than the first coordinates.
     textured: BTreeSet<usize>,
+    /// Materials that are blended.
+    blended: BTreeSet<usize>,
     skipped_primitives: u32,
+    /// Primitives that are holes all over.
+    invisible_primitives: u32,
     /// The primitive at hand, for errors.
     place: String,
 }
@@ -244,20 +261,78 @@ impl Reader<'_> {
             return Ok(*id);
         }
         let pbr = material.pbr_metallic_roughness();
-        if let (Some(texture), Some(index)) = (pbr.base_color_texture(), material.index())
-            && texture.tex_coord() != 1
-        {
-            self.textured.insert(index);
+        let mut albedo_texture = NONE;
+        match (pbr.base_color_texture(), material.index()) {
+            (Some(info), _) if info.tex_coord() == 0 => {
+                albedo_texture = self.texture(info.texture().source().index())?;
+            }
+            (Some(info), Some(index)) if info.tex_coord() > 1 => drop(self.textured.insert(index)),
+            _ => {}
         }
-        let [r, g, b, _] = pbr.base_color_factor();
+        let [r, g, b, alpha] = pbr.base_color_factor();
         let strength = material.emissive_strength().unwrap_or(1.0);
         let emission = material.emissive_factor().map(|e| e * strength);
         if let Err(Error::InvalidArgument(what)) = crate::scene::check_energy("the emission", &emission) {
             return self.malformed(what);
         }
-        let id = self.import.add_material([r, g, b], emission, material.double_sided())?;
+        let emits = emission.iter().any(|&e| e > 0.0);
+        // Of the texture's alpha alone. What is less opaque than that everywhere cannot be seen.
+        let mut alpha_cutoff = 0.0;
+        match material.alpha_mode() {
+            AlphaMode::Mask if !emits => alpha_cutoff = material.alpha_cutoff().unwrap_or(0.5).max(0.0) / alpha,
+            AlphaMode::Blend => self.blended.extend(material.index()),
+            _ => {}
+        }
+        let passes = material.transmission().map_or(0.0, |t| t.transmission_factor().clamp(0.0, 1.0));
+        let id = if alpha_cutoff > 1.0 {
+            NONE
+        } else {
+            self.import.add_material(Material {
+                albedo: [r, g, b].map(|c| c * (1.0 - passes)),
+                emission,
+                two_sided: material.double_sided(),
+                albedo_texture,
+                // 0 / 0: no matter what.
+                alpha_cutoff: if albedo_texture == NONE || alpha_cutoff.is_nan() { 0.0 } else { alpha_cutoff },
+                transmission: [r, g, b].map(|c| c * passes),
+            })?
+        };
         self.materials.insert(material.index(), id);
         Ok(id)
+    }
+
+    /// Our texture for an image, read when first wanted.
+    fn texture(&mut self, image: usize) -> Result<u32> {
+        if let Some(id) = self.images.get(&image) {
+            return Ok(*id);
+        }
+        let read = self.image(image);
+        let id = self.import.add_texture(&image.to_string(), read)?.unwrap_or(NONE);
+        self.images.insert(image, id);
+        Ok(id)
+    }
+
+    /// (From the JSON: the crate's view of images panics at those that are neither here nor there.)
+    fn image(&self, image: usize) -> std::result::Result<Texture, String> {
+        let json = self.document.as_json().images.get(image).ok_or("there is none of this number")?;
+        if let Some(view) = &json.buffer_view {
+            let view = self.document.views().nth(view.value()).ok_or("its buffer view is missing")?;
+            let buffer = &self.buffers[view.buffer().index()];
+            let bytes = view.offset().checked_add(view.length()).and_then(|end| buffer.get(view.offset()..end));
+            return texture::decode(bytes.ok_or("its buffer view does not fit its buffer")?);
+        }
+        let uri = json.uri.as_deref().ok_or("it has neither a buffer view nor a uri")?;
+        if let Some(data) = uri.strip_prefix("data:") {
+            let (_, text) = data.split_once(";base64,").ok_or("a data URI without base64")?;
+            let bytes = base64::prelude::BASE64_STANDARD.decode(text.trim_end()).map_err(|e| e.to_string())?;
+            return texture::decode(&bytes);
+        }
+        let name = percent_decoded(uri).ok_or_else(|| format!("the uri {uri:?}"))?;
+        if name.contains("://") {
+            return Err(format!("it is at {name:?}, not beside the scene"));
+        }
+        let path = self.import.path.parent().unwrap_or(Path::new("")).join(&name);
+        texture::read(&path).map_err(|what| format!("{}: {what}", path.display()))
     }
 
     /// Adds a primitive as a mesh. `unique`: no other node shows it.
@@ -300,7 +375,12 @@ impl Reader<'_> {
             let pages = if page == 0 { Vec::new() } else { vec![page; mesh.indices.len()] };
             mesh.lightmap = Some(LightmapUvs { uvs: lightmap_uvs, pages });
         }
-        mesh.materials = MeshMaterials::One(self.material(&material)?);
+        let material = self.material(&material)?;
+        if material == NONE {
+            self.invisible_primitives += 1;
+            return Ok(());
+        }
+        mesh.materials = MeshMaterials::One(material);
         match mesh.indices.is_empty() {
             true => Ok(()),
             false => self.import.add_mesh(mesh),
@@ -423,15 +503,18 @@ impl Reader<'_> {
         }
     }
 
-    fn warn(&mut self, document: &gltf::Document) {
+    fn warn(&mut self) {
+        let document = self.document;
         let uses =
             self.mesh_uses.iter().zip(document.meshes()).filter(|(uses, mesh)| {
                 **uses > 1 && mesh.primitives().any(|p| p.get(&Semantic::TexCoords(1)).is_some())
             });
         let shared = uses.count();
         for (count, what) in [
-            (self.textured.len(), "materials have a base colour texture, which is not read"),
+            (self.textured.len(), "materials have a base colour texture by other than TEXCOORD_0, which is not read"),
+            (self.blended.len(), "materials are blended (alphaMode BLEND) and count as opaque"),
             (self.skipped_primitives as usize, "primitives are points or lines and were ignored"),
+            (self.invisible_primitives as usize, "primitives are masked all over and were left out"),
             (document.skins().len(), "skins are left in their rest pose"),
             (shared, "meshes appear several times, so their TEXCOORD_1 is not unique and was left out"),
         ] {
@@ -610,6 +693,89 @@ pub(super) mod tests {
         let (scene, _) = load_bytes("a.glb", bare).unwrap();
         assert_eq!(albedos(&scene)[0], [0.98; 3]);
         assert!(!scene.materials()[0].two_sided);
+    }
+
+    #[test]
+    fn base_color_textures_come_from_views_data_and_files() {
+        use crate::io::texture::tests::png;
+        let image = png(2, 1, &[[10, 20, 30, 0], [40, 50, 60, 255]]);
+        let textured = |source: Value, material: Value| {
+            let mut sample = sample();
+            let offset = sample.binary.len();
+            sample.binary.extend(&image);
+            sample.root["buffers"][0]["byteLength"] = sample.binary.len().into();
+            let views = sample.root["bufferViews"].as_array_mut().unwrap();
+            views.push(json!({ "buffer": 0, "byteOffset": offset, "byteLength": image.len() }));
+            sample.root["images"] = json!([source]);
+            sample.root["textures"] = json!([{ "source": 0 }]);
+            let mut base = json!({ "pbrMetallicRoughness": {
+                "baseColorFactor": [1, 0.5, 0.25, 0.8], "baseColorTexture": { "index": 0 } } });
+            base.as_object_mut().unwrap().extend(material.as_object().unwrap().clone());
+            sample.root["materials"][0] = base;
+            let folder = Folder::new();
+            std::fs::write(folder.path("an image.png"), &image).unwrap();
+            std::fs::write(folder.path("a.glb"), sample.glb()).unwrap();
+            load_path(&folder.path("a.glb")).unwrap()
+        };
+        let mask = json!({ "alphaMode": "MASK", "alphaCutoff": 0.4, "doubleSided": true });
+        let data = format!("data:image/png;base64,{}", base64::prelude::BASE64_STANDARD.encode(&image));
+        for source in [
+            json!({ "bufferView": 3, "mimeType": "image/png" }),
+            json!({ "bufferView": 3 }),
+            json!({ "uri": data }),
+            json!({ "uri": "an%20image.png" }),
+        ] {
+            let (scene, info) = textured(source, mask.clone());
+            assert_eq!((info.textures, &info.warnings[..]), (1, &[][..]));
+            assert_eq!(scene.textures()[0].rgba8, [[10, 20, 30, 0], [40, 50, 60, 255]]);
+            let m = scene.materials()[0];
+            assert_eq!((m.albedo, m.albedo_texture, m.two_sided), ([1.0, 0.5, 0.25], 0, true));
+            // Of the texture's alpha: the factor has 0.8.
+            assert_eq!(m.alpha_cutoff, 0.5);
+            assert_eq!(info.albedos_clamped, 0);
+        }
+        let inside = || json!({ "bufferView": 3 });
+        assert_eq!(textured(inside(), json!({ "alphaMode": "MASK" })).0.materials()[0].alpha_cutoff, 0.5 / 0.8);
+        assert_eq!(textured(inside(), json!({})).0.materials()[0].alpha_cutoff, 0.0);
+        let (scene, info) = textured(inside(), json!({ "alphaMode": "BLEND" }));
+        assert_eq!(scene.materials()[0].alpha_cutoff, 0.0);
+        assert_eq!(info.warnings, ["1 materials are blended (alphaMode BLEND) and count as opaque"]);
+        let emits = json!({ "alphaMode": "MASK", "emissiveFactor": [1, 1, 1] });
+        assert_eq!(textured(inside(), emits).0.materials()[0].alpha_cutoff, 0.0);
+        // Images that are not there, or not images.
+        for source in
+            [json!({}), json!({ "uri": "no.png" }), json!({ "uri": "http://x/y.png" }), json!({ "uri": "a.glb" })]
+        {
+            let (scene, info) = textured(source, mask.clone());
+            let m = scene.materials()[0];
+            assert_eq!((m.albedo, m.albedo_texture, m.alpha_cutoff), ([0.98, 0.5, 0.25], NONE, 0.0));
+            let [warning] = &info.warnings[..] else { panic!("{:?}", info.warnings) };
+            assert!(warning.starts_with("the image 0 cannot be read ("), "{warning}");
+        }
+    }
+
+    #[test]
+    fn masked_factors_hide_and_transmission_lets_through() {
+        let with = |alpha: f32| {
+            changed(|root| {
+                root["materials"][0] =
+                    json!({ "pbrMetallicRoughness": { "baseColorFactor": [1, 1, 1, alpha] }, "alphaMode": "MASK" });
+                root["nodes"][2]["mesh"] = 0.into();
+            })
+        };
+        assert_eq!(load_bytes("a.glb", with(0.6)).unwrap().0.materials()[0].alpha_cutoff, 0.0);
+        for alpha in [0.4, 0.0] {
+            assert!(refusal("a.glb", with(alpha)).ends_with("there are no triangles in it"));
+        }
+        let glass = changed(|root| {
+            root["materials"][0] = json!({
+                "pbrMetallicRoughness": { "baseColorFactor": [0.8, 0.4, 0.1, 1] },
+                "extensions": { "KHR_materials_transmission": { "transmissionFactor": 0.75 } },
+            });
+        });
+        let m = load_bytes("a.glb", glass).unwrap().0.materials()[0];
+        assert_eq!(m.transmission, [0.8f32, 0.4, 0.1].map(|c| c * 0.75));
+        assert_eq!(m.albedo, [0.8f32, 0.4, 0.1].map(|c| c * 0.25));
     }
 
     #[test]

@@ -5,12 +5,14 @@
 //! | [`load`] | chooses a reader by the file name's extension |
 //! | `obj`, `mtl` | Wavefront OBJ with material libraries |
 //! | `ply` | PLY, ASCII and binary |
-//! | `gltf` | glTF 2.0 and GLB: geometry, factors, punctual lights |
+//! | `gltf` | glTF 2.0 and GLB: geometry, materials, punctual lights |
+//! | `texture` | PNG and JPEG images of materials |
 //! | [`image`] | EXR and PNG files, tone mapping |
 //! | [`lightmaps`] | baked light maps: pages as EXR and PNG, the lit scene as GLB |
 //! | [`glb`] | a scene with its light maps as GLB, for any viewer |
 //!
-//! All surfaces become diffuse [`Material`]s. Textures are not read: a material is its colour factor.
+//! All surfaces become diffuse [`Material`]s with their colour textures, holes and transmission. Images that
+//! cannot be read are warnings.
 //! Malformed files are refused with an [`Error::Io`] that names the file and the place; degenerate
 //! triangles are kept (commit skips and counts them); vertices that are not finite are malformed.
 
@@ -23,9 +25,10 @@ mod obj;
 mod ply;
 #[cfg(test)]
 mod tests;
+mod texture;
 
 use crate::error::{Error, Result};
-use crate::scene::{MAX_ALBEDO, MAX_COORDINATE, MAX_TRIANGLES, Material, Mesh, SceneData};
+use crate::scene::{MAX_ALBEDO, MAX_COORDINATE, MAX_TRIANGLES, Material, Mesh, NONE, SceneData, Texture};
 use glam::Vec3;
 use std::path::{Path, PathBuf};
 use std::time::Instant;
@@ -45,6 +48,7 @@ pub struct LoadInfo {
     pub triangles: u64,
     pub vertices: u64,
     pub materials: u32,
+    pub textures: u32,
     pub lights: u32,
     /// Materials of which a reflectance was outside [0, [`MAX_ALBEDO`]] and was clamped.
     pub albedos_clamped: u32,
@@ -105,12 +109,25 @@ impl Import {
         self.info.warnings.push(what.into());
     }
 
-    /// Adds a material, its reflectance clamped and counted.
-    fn add_material(&mut self, albedo: [f32; 3], emission: [f32; 3], two_sided: bool) -> Result<u32> {
-        let clamped = albedo.map(|a| a.clamp(0.0, MAX_ALBEDO));
-        self.info.albedos_clamped += (clamped != albedo) as u32;
-        let material = Material { albedo: clamped, emission, two_sided };
+    /// Adds a material, its reflectance clamped and counted, and limited to what does not pass through.
+    fn add_material(&mut self, mut material: Material) -> Result<u32> {
+        let limit = if material.albedo_texture == NONE { MAX_ALBEDO } else { 1.0 };
+        let clamped = material.albedo.map(|a| a.clamp(0.0, limit));
+        self.info.albedos_clamped += (clamped != material.albedo) as u32;
+        material.transmission = material.transmission.map(|t| t.clamp(0.0, 1.0));
+        material.albedo = std::array::from_fn(|c| clamped[c].min(1.0 - material.transmission[c]));
         self.scene.add_material(material).map_err(|e| self.rename(e))
+    }
+
+    /// Adds a texture, or warns of an image that cannot be read; `image`: its name.
+    fn add_texture(&mut self, image: &str, texture: std::result::Result<Texture, String>) -> Result<Option<u32>> {
+        match texture {
+            Ok(texture) => self.scene.add_texture(texture).map(Some).map_err(|e| self.rename(e)),
+            Err(what) => {
+                self.warn(format!("the image {image} cannot be read ({what}); its materials do without"));
+                Ok(None)
+            }
+        }
     }
 
     fn add_mesh(&mut self, mesh: Mesh) -> Result<()> {
@@ -140,6 +157,7 @@ impl Import {
         info.triangles = scene.triangle_count() as u64;
         info.vertices = scene.meshes().iter().map(|m| m.positions.len() as u64).sum();
         info.materials = scene.materials().len() as u32;
+        info.textures = scene.textures().len() as u32;
         info.lights = scene.lights().len() as u32;
         info.has_lightmap_uvs = scene.meshes().iter().any(|m| m.lightmap.is_some());
         data.append(scene)?;

@@ -1,20 +1,33 @@
-//! Material libraries of OBJ files: of each `newmtl`, `Kd` (diffuse reflectance, linear) and `Ke`
-//! (here: emitted radiance in W/(m²·sr)). Everything else is skipped; textures are counted.
+//! Material libraries of OBJ files: of each `newmtl`, `Kd` (diffuse reflectance, linear) with `map_Kd`, `Ke`
+//! (here: emitted radiance in W/(m²·sr)), `map_d` (where there are holes), and `Tf` (what passes through) if
+//! `illum` is one of the models with transparency, 4, 6, 7 and 9. Options of maps and everything else are
+//! skipped.
 
 use crate::error::{Error, Result};
 use std::collections::HashMap;
 use std::fmt::Display;
 use std::io::BufRead;
-use std::path::Path;
+use std::path::{Path, PathBuf};
 
 /// What a library says about a material.
-#[derive(Clone, Copy, Debug, Default, PartialEq)]
+#[derive(Clone, Debug, Default, PartialEq)]
 pub(super) struct Entry {
     /// `None` where there is no `Kd`, or one in a form that is not RGB.
     pub albedo: Option<[f32; 3]>,
     pub emission: [f32; 3],
-    /// Whether a `map_Kd` was ignored.
-    pub textured: bool,
+    /// `Tf` and `illum`.
+    filter: [f32; 3],
+    model: i32,
+    /// Files of `map_Kd` and `map_d`.
+    pub color_map: Option<PathBuf>,
+    pub alpha_map: Option<PathBuf>,
+}
+
+impl Entry {
+    /// What passes straight through.
+    pub fn transmission(&self) -> [f32; 3] {
+        if matches!(self.model, 4 | 6 | 7 | 9) { self.filter } else { [0.0; 3] }
+    }
 }
 
 /// Materials by name. Of several of one name the last is kept.
@@ -48,7 +61,15 @@ pub(super) fn read(source: &mut impl BufRead, path: &Path, library: &mut Library
                     return Err(fail(line, &format_args!("Ke contains {e}, less than 0")));
                 }
             }
-            b"map_Kd" => entry.textured = true,
+            b"Tf" => {
+                entry.filter = color(rest).map_err(|what| fail(line, &format_args!("Tf {what}")))?.unwrap_or_default();
+            }
+            b"illum" => {
+                let model = finite(rest).map_err(|what| fail(line, &format_args!("illum {what}")))?;
+                entry.model = model as i32;
+            }
+            b"map_Kd" => entry.color_map = map_file(rest, path),
+            b"map_d" => entry.alpha_map = map_file(rest, path),
             _ => {}
         }
     }
@@ -78,6 +99,29 @@ fn color(text: &[u8]) -> std::result::Result<Option<[f32; 3]>, String> {
     }
 }
 
+/// The file that a map names behind its options, beside the library at `path`.
+fn map_file(mut text: &[u8], path: &Path) -> Option<PathBuf> {
+    while text.starts_with(b"-") {
+        let (option, rest) = split_keyword(text);
+        let numbers = match option {
+            b"-o" | b"-s" | b"-t" => 3,
+            b"-mm" => 2,
+            _ => 1,
+        };
+        text = rest;
+        for i in 0..numbers {
+            let (word, rest) = split_keyword(text);
+            // Of three numbers the last two may be left out.
+            if i > 0 && finite(word).is_err() {
+                break;
+            }
+            text = rest;
+        }
+    }
+    let name = String::from_utf8_lossy(text).replace('\\', "/");
+    (!name.is_empty()).then(|| path.parent().unwrap_or(Path::new("")).join(name))
+}
+
 /// A finite number.
 pub(super) fn finite(word: &[u8]) -> std::result::Result<f32, String> {
     match std::str::from_utf8(word).ok().and_then(|s| s.parse::<f32>().ok()) {
@@ -100,9 +144,36 @@ mod tests {
     fn colors_are_read_by_material() {
         let l = parse("Kd 9 9 9\nnewmtl a b\r\nKd 0.1 .2 3e-1 # red\nmap_Kd x.png\nnewmtl c\n Ke 5\n").unwrap();
         assert_eq!(l.len(), 2);
-        assert_eq!(l[&b"a b"[..]], Entry { albedo: Some([0.1, 0.2, 0.3]), emission: [0.0; 3], textured: true });
-        assert_eq!(l[&b"c"[..]], Entry { albedo: None, emission: [5.0; 3], textured: false });
+        let color_map = Some("x.png".into());
+        assert_eq!(l[&b"a b"[..]], Entry { albedo: Some([0.1, 0.2, 0.3]), color_map, ..Default::default() });
+        assert_eq!(l[&b"c"[..]], Entry { emission: [5.0; 3], ..Default::default() });
         assert_eq!(parse("newmtl a\nKd spectral x.rfl\n").unwrap()[&b"a"[..]].albedo, None);
+    }
+
+    #[test]
+    fn maps_are_files_beside_the_library_whatever_their_options() {
+        for (map, expected) in [
+            ("map_Kd a b.png", Some("lib/a b.png")),
+            ("map_Kd -s 2 2 -o 0.5 -clamp on -bm 1 sub\\c.jpg", Some("lib/sub/c.jpg")),
+            ("map_Kd -s 1 1 1 7.png", Some("lib/7.png")),
+            ("map_Kd -mm 0 1 x", Some("lib/x")),
+            ("map_Kd", None),
+            ("map_Kd -s 1", None),
+        ] {
+            let mut library = Library::new();
+            read(&mut format!("newmtl a\n{map}\n").as_bytes(), Path::new("lib/a.mtl"), &mut library).unwrap();
+            assert_eq!(library[&b"a"[..]].color_map, expected.map(PathBuf::from), "{map}");
+        }
+    }
+
+    #[test]
+    fn only_transparent_models_transmit() {
+        for (model, transmits) in [(0, false), (1, false), (2, false), (4, true), (6, true), (7, true), (9, true)] {
+            let l = parse(&format!("newmtl a\nTf 0.8 0.1 0.2\nillum {model}\n")).unwrap();
+            let expected = if transmits { [0.8, 0.1, 0.2] } else { [0.0; 3] };
+            assert_eq!(l[&b"a"[..]].transmission(), expected, "{model}");
+        }
+        assert_eq!(parse("newmtl a\nTf 1\n").unwrap()[&b"a"[..]].transmission(), [0.0; 3]);
     }
 
     #[test]

@@ -7,6 +7,8 @@
 //!   [`Mesh::uvs`], unchanged.
 //! - Normals and coordinates belong to whole meshes here and to single faces in the file: a new mesh
 //!   starts wherever faces with begin or end. So triangles keep their global order.
+//! - Images have v = 0 at their bottom and are turned over, for here it is row 0. Where one has alpha (that of
+//!   `map_d`, else that of `map_Kd`) below one half are holes, except in surfaces that emit.
 //! - Groups, smoothing and free forms are ignored, and points and lines too.
 //!
 //! Why not the crate `tobj` (which the tests compare with): it forgets the names of materials that no
@@ -15,15 +17,16 @@
 //! overflow is checked, on out-of-range indices; and says no line. It takes about as long.
 
 use super::mtl::{self, Library, finite, split_keyword};
-use super::{DEFAULT_ALBEDO, Import, TWO_SIDED_UNLESS_SAID, is_valid_position};
+use super::{DEFAULT_ALBEDO, Import, TWO_SIDED_UNLESS_SAID, is_valid_position, texture};
 use crate::error::{Error, Result};
-use crate::scene::{LightmapUvs, Mesh, MeshMaterials, NONE};
+use crate::scene::{LightmapUvs, Material, Mesh, MeshMaterials, NONE, Texture};
 use glam::{Vec2, Vec3};
 use std::collections::HashMap;
 use std::fmt::Display;
 use std::fs::File;
 use std::io::{BufRead, BufReader};
 use std::ops::Range;
+use std::path::PathBuf;
 
 /// Light map pages run below this: a page costs memory even if almost empty.
 const MAX_PAGES: i64 = 4096;
@@ -348,12 +351,12 @@ impl<'a> Reader<'a> {
     fn add_materials(&mut self) -> Result<Vec<u32>> {
         let mut by_entry = HashMap::<Option<&[u8]>, u32>::new();
         let mut materials = vec![NONE; self.names.len()];
-        let (mut unknown, mut textured) = (Vec::new(), 0);
+        let (mut unknown, mut images) = (Vec::new(), Images::new());
         for (name, material) in self.names.iter().zip(&mut materials).filter(|(name, _)| name.faces > 0) {
             let base = base_name(&name.text);
             let (key, entry) = match (self.library.get(&name.text), self.library.get(base)) {
-                (Some(entry), _) => (Some(&name.text[..]), *entry),
-                (None, Some(entry)) => (Some(base), *entry),
+                (Some(entry), _) => (Some(&name.text[..]), entry.clone()),
+                (None, Some(entry)) => (Some(base), entry.clone()),
                 (None, None) => (None, mtl::Entry::default()),
             };
             if key.is_none() && !name.text.is_empty() {
@@ -362,9 +365,8 @@ impl<'a> Reader<'a> {
             *material = match by_entry.get(&key) {
                 Some(id) => *id,
                 None => {
-                    textured += entry.textured as u32;
-                    let albedo = entry.albedo.unwrap_or([DEFAULT_ALBEDO; 3]);
-                    let id = self.import.add_material(albedo, entry.emission, TWO_SIDED_UNLESS_SAID)?;
+                    let material = described(self.import, &mut images, &entry)?;
+                    let id = self.import.add_material(material)?;
                     by_entry.insert(key, id);
                     id
                 }
@@ -375,9 +377,6 @@ impl<'a> Reader<'a> {
         if let [first, ..] = &unknown[..] {
             let what = format!("{} materials have no description (first: {first:?}) and are grey", unknown.len());
             self.import.warn(what);
-        }
-        if textured > 0 {
-            self.import.warn(format!("the textures (map_Kd) of {textured} materials are not read; Kd is used"));
         }
         Ok(materials)
     }
@@ -391,6 +390,53 @@ impl<'a> Reader<'a> {
             self.import.warn(format!("{count} faces name a light map page but have no texture coordinates"));
         }
     }
+}
+
+/// Texture and alpha cutoff by the files of `map_Kd` and `map_d`.
+type Images = HashMap<(Option<PathBuf>, Option<PathBuf>), (u32, f32)>;
+
+/// The material of a library's entry.
+fn described(import: &mut Import, images: &mut Images, entry: &mtl::Entry) -> Result<Material> {
+    let maps = (entry.color_map.clone(), entry.alpha_map.clone());
+    let (albedo_texture, alpha_cutoff) = match images.get(&maps) {
+        Some(known) => *known,
+        None => {
+            let image = add_image(import, &maps.0, &maps.1)?;
+            *images.entry(maps).or_insert(image)
+        }
+    };
+    // Where a map gives the colour, the factor is white unless said.
+    let grey = if entry.color_map.is_some() && albedo_texture != NONE { 1.0 } else { DEFAULT_ALBEDO };
+    let emits = entry.emission.iter().any(|&e| e > 0.0);
+    Ok(Material {
+        albedo: entry.albedo.unwrap_or([grey; 3]),
+        emission: entry.emission,
+        two_sided: TWO_SIDED_UNLESS_SAID,
+        albedo_texture,
+        alpha_cutoff: if emits { 0.0 } else { alpha_cutoff },
+        transmission: entry.transmission(),
+    })
+}
+
+/// Reads the images of a material into one; [`NONE`] without any.
+fn add_image(import: &mut Import, color: &Option<PathBuf>, alpha: &Option<PathBuf>) -> Result<(u32, f32)> {
+    let mut read = |path: &PathBuf| -> Option<Texture> {
+        let image = texture::read(path);
+        if let Err(what) = &image {
+            import.warn(format!("the image {} cannot be read ({what}); its materials do without", path.display()));
+        }
+        image.ok()
+    };
+    let colors = color.as_ref().and_then(&mut read);
+    let alphas = if alpha == color { None } else { alpha.as_ref().and_then(&mut read) };
+    let image = match (colors, alphas) {
+        (colors, Some(alpha)) => texture::with_alpha(colors, &alpha),
+        (Some(colors), None) => colors,
+        (None, None) => return Ok((NONE, 0.0)),
+    };
+    let cutoff = if texture::is_opaque(&image) { 0.0 } else { texture::CUTOFF };
+    let id = import.scene.add_texture(texture::flipped(image)).map_err(|e| import.rename(e))?;
+    Ok((id, cutoff))
 }
 
 /// The words of a line up to a comment.
@@ -520,9 +566,43 @@ usemtl a\nf 1 2 3\nusemtl a|x\nf 1 2 3\nusemtl unused\nusemtl b\nf 1 2 3\n";
         let a = [0.98, 0.0, 0.5];
         assert_eq!(albedos(&scene), [a, [0.1; 3], a, a, [DEFAULT_ALBEDO; 3]]);
         assert_eq!((info.materials, info.albedos_clamped), (3, 1));
-        assert_eq!(info.warnings, ["the textures (map_Kd) of 1 materials are not read; Kd is used"]);
+        let [warning] = &info.warnings[..] else { panic!("{:?}", info.warnings) };
+        assert!(warning.starts_with("the image ") && warning.contains("x.png cannot be read ("), "{warning}");
         assert_eq!(scene.materials()[2].emission, [1.0, 2.0, 3.0]);
         assert!(scene.materials().iter().all(|m| m.two_sided == TWO_SIDED_UNLESS_SAID));
+    }
+
+    #[test]
+    fn images_color_surfaces_and_cut_holes() {
+        use crate::io::texture::tests::png;
+        let folder = Folder::new();
+        let (top, bottom) = ([255, 0, 0, 0], [0, 255, 0, 255]);
+        std::fs::write(folder.path("leaf.png"), png(1, 2, &[top, bottom])).unwrap();
+        std::fs::write(folder.path("mask.png"), png(2, 1, &[[0, 0, 0, 255], [255; 4]])).unwrap();
+        std::fs::write(folder.path("solid.png"), png(1, 1, &[[255; 4]])).unwrap();
+        let mtl = "newmtl leaf\nmap_Kd leaf.png\nmap_d leaf.png\nnewmtl bright\nKd 0.9\nKe 1\nmap_Kd leaf.png\n\
+                   newmtl masked\nmap_d mask.png\nnewmtl solid\nKd 1 1 1\nmap_Kd solid.png\n\
+                   newmtl glass\nKd 0.5\nTf 0.8 0.1 0.1\nillum 4\nnewmtl lost\nKd 0.3\nmap_Kd no.png\nmap_d no2.png\n";
+        let mut obj = String::from("mtllib a.mtl\nv 0 0 0\nv 1 0 0\nv 0 1 0\nvt 0 0.25\n");
+        for name in ["leaf", "bright", "masked", "solid", "glass", "lost"] {
+            obj += &format!("usemtl {name}\nf 1/1 2/1 3/1\n");
+        }
+        std::fs::write(folder.path("a.mtl"), mtl).unwrap();
+        std::fs::write(folder.path("a.obj"), obj).unwrap();
+        let (scene, info) = load_path(&folder.path("a.obj")).unwrap();
+        let m = scene.materials();
+        assert_eq!((m[0].albedo, m[0].albedo_texture, m[0].alpha_cutoff), ([1.0; 3], 0, 0.5));
+        // v = 0.25 is in the bottom row.
+        assert_eq!(scene.textures()[0].alpha(scene.meshes()[0].uvs[0]), 1.0);
+        assert_eq!(scene.textures()[0].rgba8, [bottom, top]);
+        // Emits: no holes.
+        assert_eq!((m[1].alpha_cutoff, m[1].albedo), (0.0, [0.9; 3]));
+        assert_eq!((m[2].albedo, m[2].alpha_cutoff), ([DEFAULT_ALBEDO; 3], 0.5));
+        assert_eq!(scene.textures()[m[2].albedo_texture as usize].rgba8, [[255, 255, 255, 0], [255; 4]]);
+        assert_eq!((m[3].albedo, m[3].alpha_cutoff), ([1.0; 3], 0.0));
+        assert_eq!((m[4].transmission, m[4].albedo), ([0.8, 0.1, 0.1], [0.2f32.min(1.0 - 0.8), 0.5, 0.5]));
+        assert_eq!((m[5].albedo, m[5].albedo_texture, m[5].alpha_cutoff), ([0.3; 3], NONE, 0.0));
+        assert_eq!((info.textures, info.albedos_clamped, info.warnings.len()), (4, 0, 2), "{:?}", info.warnings);
     }
 
     #[test]

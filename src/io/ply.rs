@@ -5,7 +5,7 @@
 
 use super::{DEFAULT_ALBEDO, Import, TWO_SIDED_UNLESS_SAID, is_valid_position};
 use crate::error::Result;
-use crate::scene::{Mesh, MeshMaterials};
+use crate::scene::{Material, Mesh, MeshMaterials};
 use glam::{Vec2, Vec3};
 use ply_rs_bw::parser::{Parser, Reader};
 use ply_rs_bw::ply::{
@@ -25,7 +25,11 @@ pub(super) fn load(import: &mut Import) -> Result<()> {
     check_header(import, &header, bytes)?;
     let mut body = Body { line: reader.line(), encoding: header.encoding, text: String::new() };
 
-    let material = import.add_material([DEFAULT_ALBEDO; 3], [0.0; 3], TWO_SIDED_UNLESS_SAID)?;
+    let material = import.add_material(Material {
+        albedo: [DEFAULT_ALBEDO; 3],
+        two_sided: TWO_SIDED_UNLESS_SAID,
+        ..Default::default()
+    })?;
     let mut mesh = Mesh { materials: MeshMaterials::One(material), ..Default::default() };
     for (name, element) in &header.elements {
         match name.as_str() {

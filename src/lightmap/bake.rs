@@ -255,6 +255,7 @@ impl Bake<'_, '_> {
         let mut values = try_vec(l.radiance.len(), "the radiance map")?;
         let input = RadianceInput {
             scene: &l.scene,
+            charts: &l.charts,
             map: &l.radiance,
             direct: self.direct,
             photons,
@@ -406,5 +407,9 @@ impl Bake<'_, '_> {
 /// Whether what lies straight above a surface is the back of a one-sided one.
 pub(crate) fn inside_a_solid(scene: &Scene, origin: Vec3, normal: Vec3) -> bool {
     let hit = scene.intersect_raw(&Ray::new(origin, normal));
-    !hit.is_miss() && !hit.front && !scene.material(hit.triangle).two_sided
+    if hit.is_miss() || hit.front {
+        return false;
+    }
+    let material = scene.material(hit.triangle);
+    !material.two_sided && !material.transmits()
 }

@@ -5,6 +5,8 @@
 //! that rays find visible (the ratio estimator of Heitz, Hill and McGuire, *Combining Analytic
 //! Direct Illumination and Stochastic Shadows*, 2018): without occluders there is no noise. Of very
 //! many area lights each ray picks one at random, and the estimate is the plain unbiased one.
+//!
+//! Where surfaces transmit light, what comes along a ray is multiplied with what they let through.
 
 use super::polygon;
 use crate::sampling::{combine, sobol_2d, uniform_triangle};
@@ -132,6 +134,14 @@ impl<'a> ShadowRays<'a> {
     fn trace(&mut self) {
         let mut occluded = [0; TOGETHER];
         let scene = self.scene;
+        if scene.uses().transmission {
+            for (ray, light) in self.rays[..self.count].iter().zip(&self.light) {
+                self.visible += *light * scene.transmittance(ray);
+            }
+            self.traced += self.count as u64;
+            self.count = 0;
+            return;
+        }
         scene.occluded_block(&self.rays[..self.count], &mut occluded);
         for (light, _) in self.light[..self.count].iter().zip(occluded).filter(|(_, occluded)| *occluded == 0) {
             self.visible += *light;
@@ -232,9 +242,16 @@ impl DirectLight {
         }
     }
 
-    fn visible(&self, receiver: &Receiver, target: Vec3, rays: &mut u64) -> bool {
+    /// `light`, as much of it as gets along a ray.
+    fn along(&self, ray: &Ray, light: Vec3, rays: &mut u64) -> Vec3 {
         *rays += 1;
-        !self.scene.occluded(&shadow_ray(receiver, target))
+        if self.scene.uses().transmission {
+            light * self.scene.transmittance(ray)
+        } else if self.scene.occluded(ray) {
+            Vec3::ZERO
+        } else {
+            light
+        }
     }
 
     fn one_light(&self, light: &Light, receiver: &Receiver, rays: &mut u64) -> Vec3 {
@@ -251,8 +268,7 @@ impl DirectLight {
                 if cosine <= 0.0 || direction.dot(receiver.geometric) >= 0.0 || irradiance.max_element() <= 0.0 {
                     return Vec3::ZERO;
                 }
-                *rays += 1;
-                if self.scene.occluded(&Ray::new(receiver.origin, -direction)) { Vec3::ZERO } else { irradiance }
+                self.along(&Ray::new(receiver.origin, -direction), irradiance, rays)
             }
             Light::Rect { .. } => Vec3::ZERO,
         }
@@ -266,7 +282,7 @@ impl DirectLight {
             return Vec3::ZERO;
         }
         let factor = (cosine / (d2 * d2.sqrt())) as f32;
-        if self.visible(receiver, position, rays) { intensity * factor } else { Vec3::ZERO }
+        self.along(&shadow_ray(receiver, position), intensity * factor, rays)
     }
 
     /// Exact unoccluded irradiance times the visible fraction of it.

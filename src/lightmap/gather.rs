@@ -12,7 +12,8 @@ use super::direct::Receiver;
 use super::radiance::RadianceMap;
 use crate::sampling::{combine, concentric_disc, orthonormal_basis, sobol_2d_bits, unit_float};
 use crate::scene::Scene;
-use crate::trace::{PACKET_SIZE, Packet, RawHit};
+use crate::trace::filter::Crossing;
+use crate::trace::{PACKET_SIZE, Packet, RawHit, Ray};
 use glam::Vec3;
 use std::f32::consts::PI;
 
@@ -106,6 +107,7 @@ impl Gathered {
         let (tangent, bitangent) = orthonormal_basis(receiver.normal);
         let mut hits = [RawHit::MISS; PACKET_SIZE];
         let (mut sum, mut squares) = (Vec3::ZERO, 0.0);
+        let (transmits, mut crossings) = (scene.uses().transmission, Vec::new());
         for bundle in points.chunks(PACKET_SIZE) {
             let mut packet = Packet::default();
             for p in bundle {
@@ -123,7 +125,11 @@ impl Gathered {
                 if d.dot(receiver.geometric) <= 0.0 {
                     continue;
                 }
-                match radiance.reflected(hit) {
+                let mut seen = radiance.reflected(hit);
+                if transmits && scene.material(hit.triangle).transmits() {
+                    seen = Some(through(scene, radiance, &Ray::new(receiver.origin, d), &mut crossings));
+                }
+                match seen {
                     Some(l) => {
                         sum += l;
                         squares += l.element_sum() * l.element_sum();
@@ -136,6 +142,18 @@ impl Gathered {
         self.squares += squares;
         self.rays += points.len() as u32;
     }
+}
+
+/// Reflected radiance that comes along a ray from sheets that transmit and from what lies behind them.
+#[cold]
+fn through(scene: &Scene, radiance: &RadianceMap, ray: &Ray, crossings: &mut Vec<Crossing>) -> Vec3 {
+    let behind = scene.intersect_through(ray, crossings);
+    let (mut sum, mut part) = (Vec3::ZERO, Vec3::ONE);
+    for c in crossings.iter() {
+        sum += part * radiance.reflected(&c.hit).unwrap_or_default();
+        part *= Vec3::from(scene.material(c.hit.triangle).transmission);
+    }
+    if behind.is_miss() { sum } else { sum + part * radiance.reflected(&behind).unwrap_or_default() }
 }
 
 #[cfg(test)]

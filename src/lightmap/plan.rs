@@ -22,6 +22,12 @@ pub mod left_out {
     pub const UNWRAP: u32 = 1 << 6;
     /// No interpolation of shading normals.
     pub const SHADING_NORMALS: u32 = 1 << 7;
+    /// No look-ups of albedo textures.
+    pub const TEXTURES: u32 = 1 << 8;
+    /// No tests for holes that textures cut out.
+    pub const CUTOUTS: u32 = 1 << 9;
+    /// No light through surfaces.
+    pub const TRANSMISSION: u32 = 1 << 10;
 }
 
 /// What a bake of a scene runs.
@@ -88,7 +94,29 @@ impl Plan {
         } else {
             plan.run("interpolation of normals");
         }
+        plan.materials(scene);
         plan
+    }
+
+    /// What materials ask for.
+    fn materials(&mut self, scene: &Scene) {
+        let uses = scene.uses();
+        if uses.textures {
+            let bytes: usize = scene.textures().iter().map(|t| t.bytes()).sum();
+            self.run(&format!("albedo textures, {} of {bytes} bytes", scene.textures().len()));
+        } else {
+            self.leave_out(left_out::TEXTURES, "albedo textures", "no surface has one");
+        }
+        if uses.holes.is_empty() {
+            self.leave_out(left_out::CUTOUTS, "holes cut out by alpha", "no surface has any");
+        } else {
+            self.run(&format!("holes cut out by alpha, in {} materials", uses.holes.iter().filter(|&&h| h).count()));
+        }
+        if uses.transmission {
+            self.run("light through surfaces that transmit");
+        } else {
+            self.leave_out(left_out::TRANSMISSION, "light through surfaces", "none transmits");
+        }
     }
 
     fn indirect(&mut self, params: &BakeParams, two_sided: bool) {

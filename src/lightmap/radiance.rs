@@ -5,6 +5,10 @@
 //! blurs its shadows over the search radius and darkens every edge; by shadow rays it costs a
 //! percent or two of a bake.) Emission is not part of it: the emitters are sampled as lights
 //! wherever light is gathered, and would count twice.
+//!
+//! The albedo of a texel is that of its point or, where a texture varies, the average of look-ups spread over
+//! what the texel shows of its triangle. (Rather than from a mip chain, which would be kept for this alone:
+//! a texel's shadow rays take longer.)
 
 use super::bake::inside_a_solid;
 use super::charts::Charts;
@@ -15,10 +19,10 @@ use crate::error::Result;
 use crate::photon::PhotonMap;
 use crate::photon::coverage::{Coverage, Piece};
 use crate::progress::Stage;
-use crate::sampling::combine;
+use crate::sampling::{combine, sobol_2d};
 use crate::scene::{NONE, Scene};
 use crate::trace::RawHit;
-use glam::Vec3;
+use glam::{Mat2, Vec2, Vec3};
 use rayon::prelude::*;
 use std::f32::consts::PI;
 use std::sync::Arc;
@@ -56,6 +60,7 @@ impl<'a> RadianceMap<'a> {
 /// What the stage needs.
 pub(crate) struct RadianceInput<'a> {
     pub scene: &'a Arc<Scene>,
+    pub charts: &'a Charts,
     pub map: &'a ChartMap,
     pub direct: &'a DirectLight,
     /// Photons that were reflected before; `None`: there is no such light.
@@ -87,8 +92,7 @@ pub(crate) fn bake(device: &Device, input: &RadianceInput, values: &mut [Vec3], 
 }
 
 fn texel(input: &RadianceInput, coverage: Option<&Coverage>, sample: usize, rays: &mut u64) -> Vec3 {
-    let texel = &input.map.texels.samples[sample];
-    let albedo = Vec3::from(input.scene.material(texel.triangle).albedo);
+    let albedo = albedo(input.scene, input.charts, input.map, sample);
     if albedo == Vec3::ZERO {
         return Vec3::ZERO;
     }
@@ -121,4 +125,43 @@ fn coverage(input: &RadianceInput, photons: &PhotonMap, rays: &AtomicU64) -> Res
         })
         .collect();
     Coverage::new(photons, pieces.into_iter().flatten())
+}
+
+/// Look-ups of a texture in one texel, at most.
+const MAX_LOOKUPS: u32 = 256;
+
+/// The albedo that a texel of a map shows.
+pub(crate) fn albedo(scene: &Scene, charts: &Charts, map: &ChartMap, sample: usize) -> Vec3 {
+    let texel = &map.texels.samples[sample];
+    let point = || scene.albedo(texel.triangle, texel.u, texel.v);
+    let material = scene.material(texel.triangle);
+    if !scene.uses().textures || material.albedo_texture == NONE {
+        return Vec3::from(material.albedo);
+    }
+    let (mesh, triangle) = scene.locate(texel.triangle);
+    let mesh = &scene.meshes()[mesh as usize];
+    let uv = |w: Vec2| mesh.texture_coordinates(triangle as usize, w.x, w.y).unwrap_or_default();
+    // Weights of corners 1 and 2 as a function of places in the map, in texels.
+    let placement = map.texels.placement_of(sample as u32);
+    let place = |u, v| Vec2::from(map.layout.texel_coord(placement, charts.local(texel.triangle, u, v)));
+    let origin = place(0.0, 0.0);
+    let weights = Mat2::from_cols(place(1.0, 0.0) - origin, place(0.0, 1.0) - origin).inverse();
+    let Some(texture) = scene.textures().get(material.albedo_texture as usize) else { return point() };
+    let (x, y) = map.position(sample);
+    let corner = weights * (Vec2::new(x as f32, y as f32) - origin);
+    let size = |edge: Vec2| ((uv(edge) - uv(Vec2::ZERO)) * texture.size()).length();
+    let texels = size(weights.x_axis).max(1.0) * size(weights.y_axis).max(1.0);
+    if mesh.uvs.is_empty() || !texels.is_finite() {
+        return point();
+    }
+    let count = (4.0 * texels).min(MAX_LOOKUPS as f32) as u32;
+    let (mut sum, mut seen) = (Vec3::ZERO, 0);
+    for i in 0..count {
+        let w = corner + weights * Vec2::from(sobol_2d(i, sample as u32));
+        if w.min_element() >= 0.0 && w.x + w.y <= 1.0 && !scene.is_hole(texel.triangle, w.x, w.y) {
+            sum += scene.albedo_at(material, || Some(uv(w)));
+            seen += 1;
+        }
+    }
+    if seen > 0 { sum / seen as f32 } else { point() }
 }

@@ -1,7 +1,7 @@
 //! Reading light maps out: pages layer by layer, UVs, and filtered lookups as a shader would do.
 
 use super::direct::DirectLight;
-use super::radiance::RadianceMap;
+use super::radiance::{self, RadianceMap};
 use super::{Layer, LayerData, Light, Lightmap, TexelState};
 use crate::error::{Error, Result, invalid_argument};
 use crate::memory::try_vec;
@@ -103,7 +103,8 @@ impl Lightmap {
         let mut l = DirectLight::emitted(&self.atlas.scene, t.triangle, back);
         if light.radiance.is_empty() {
             let e = light.direct[sample] + light.indirect[sample];
-            l += Vec3::from(self.atlas.scene.material(t.triangle).albedo) * e / std::f32::consts::PI;
+            let a = &self.atlas;
+            l += radiance::albedo(&a.scene, &a.charts, &a.map, sample) * e / std::f32::consts::PI;
         } else {
             let lookup = RadianceMap::new(&self.atlas.charts, &self.atlas.radiance, &light.radiance);
             let hit = RawHit { t: 0.0, u: t.u, v: t.v, triangle: t.triangle, front: !back };

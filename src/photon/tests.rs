@@ -192,7 +192,7 @@ fn a_spot_gives_the_irradiance_of_its_falloff() {
 fn two_sided_emitters_light_both_sides_with_double_power() {
     let mut data = SceneData::new();
     data.add_material(grey(0.0)).unwrap();
-    let lamp = Material { albedo: [0.0; 3], emission: [2.0; 3], two_sided: true };
+    let lamp = Material { albedo: [0.0; 3], emission: [2.0; 3], two_sided: true, ..Default::default() };
     let lamp = data.add_material(lamp).unwrap();
     add_box(&mut data, 0, Vec3::ZERO, Vec3::ONE, true);
     let positions = [(0.4, 0.4), (0.6, 0.4), (0.4, 0.6)].map(|(x, y)| Vec3::new(x, y, 0.5)).to_vec();

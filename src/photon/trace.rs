@@ -1,4 +1,5 @@
-//! Photon tracing (thesis 3.2.2): diffuse paths ended by Russian roulette.
+//! Photon tracing (thesis 3.2.2): diffuse paths ended by Russian roulette. At a thin sheet that transmits, the
+//! roulette also decides which way a path goes on.
 //!
 //! Photons are traced in blocks of consecutive numbers. A block goes in waves: one ray for each
 //! path that is still alive, then all their hits, so that the kernel runs over an array of rays
@@ -26,7 +27,7 @@ const MEMORY_STEP: usize = 16 << 20;
 
 /// What photon random numbers are drawn for.
 const PURPOSE: u32 = u32::from_be_bytes(*b"phot");
-/// Dimensions: the start of a path, then two per bounce.
+/// Dimensions: the start of a path, then two per surface met.
 const ALLOTMENT: u32 = 0;
 const EMIT_POSITION: u32 = 1;
 const EMIT_DIRECTION: u32 = 2;
@@ -127,6 +128,8 @@ impl Tally {
 struct Path {
     photon: u32,
     power: Vec3,
+    /// How often it was reflected.
+    bounces: u32,
 }
 
 /// What a path meets.
@@ -138,17 +141,19 @@ struct Surface {
     front: bool,
     /// [`NONE`] where nothing was hit.
     material: u32,
+    albedo: Vec3,
 }
 
 impl Surface {
-    const NOTHING: Surface = Surface { corners: [Vec3::ZERO; 3], weights: [0.0; 2], front: false, material: NONE };
+    const NOTHING: Surface =
+        Surface { corners: [Vec3::ZERO; 3], weights: [0.0; 2], front: false, material: NONE, albedo: Vec3::ZERO };
 }
 
 struct Tracer<'a> {
     scene: &'a Scene,
     emission: Emission<'a>,
     seed: u32,
-    /// Most surface interactions per path.
+    /// Most surface interactions per path, passages through sheets not counted.
     limit: u32,
     store_direct: bool,
 }
@@ -180,7 +185,7 @@ impl<'a> Tracer<'a> {
         let mut surfaces = vec![Surface::NOTHING; rays.len()];
         let mut stored = Vec::new();
         let mut tally = Tally::default();
-        for bounce in 0..self.limit {
+        for step in 0..PATH_LIMIT {
             if rays.is_empty() {
                 break;
             }
@@ -201,7 +206,7 @@ impl<'a> Tracer<'a> {
             // Survivors move to the front.
             let mut alive = 0;
             for i in 0..rays.len() {
-                let next = self.interact(&rays[i], paths[i], &surfaces[i], bounce, &mut stored, &mut tally);
+                let next = self.interact(&rays[i], paths[i], &surfaces[i], step, &mut stored, &mut tally);
                 if let Some((ray, path)) = next {
                     (rays[alive], paths[alive]) = (ray, path);
                     alive += 1;
@@ -217,7 +222,7 @@ impl<'a> Tracer<'a> {
     fn emit(&self, photon: u32) -> (Ray, Path) {
         let at = |dimension| sobol_2d(photon, combine(self.seed, dimension));
         let e = self.emission.emit(photon as u64, at(EMIT_POSITION), at(EMIT_DIRECTION));
-        (Ray::new(e.origin, e.direction), Path { photon, power: e.power })
+        (Ray::new(e.origin, e.direction), Path { photon, power: e.power, bounces: 0 })
     }
 
     /// What the hit lies on.
@@ -228,22 +233,25 @@ impl<'a> Tracer<'a> {
         }
         let (mesh, triangle) = self.scene.locate(hit.triangle);
         let mesh = &self.scene.meshes()[mesh as usize];
+        let material = mesh.material(triangle as usize);
+        let uv = || mesh.texture_coordinates(triangle as usize, hit.u, hit.v);
         Surface {
             corners: mesh.corners(triangle as usize),
             weights: [hit.u, hit.v],
             front: hit.front,
-            material: mesh.material(triangle as usize),
+            material,
+            albedo: self.scene.albedo_at(&self.scene.materials()[material as usize], uv),
         }
     }
 
-    /// What becomes of a path at the end of `ray`: the photon is stored, and goes on or not.
+    /// What becomes of a path at the end of `ray`, the `step`-th: the photon is stored, and goes on or not.
     #[inline]
     fn interact(
         &self,
         ray: &Ray,
         path: Path,
         surface: &Surface,
-        bounce: u32,
+        step: u32,
         stored: &mut Vec<StoredPhoton>,
         tally: &mut Tally,
     ) -> Option<(Ray, Path)> {
@@ -253,38 +261,50 @@ impl<'a> Tracer<'a> {
             return None;
         }
         let material = &self.scene.materials()[surface.material as usize];
+        let is_black = !surface.front && !material.two_sided;
+        if is_black && !material.transmits() {
+            tally.absorbed += power;
+            return None;
+        }
         let point = SurfacePoint::new(surface.corners, surface.weights[0], surface.weights[1], self.scene);
         let direction = Vec3::from_array(ray.direction);
-        let mut normal = point.normal;
-        if !surface.front {
-            if !material.two_sided {
-                tally.absorbed += power;
-                return None;
-            }
-            normal = -normal;
-        }
-        if bounce > 0 || self.store_direct {
+        let normal = if surface.front { point.normal } else { -point.normal };
+        if !is_black && (path.bounces > 0 || self.store_direct) {
             stored.push(StoredPhoton { position: point.position, direction, power: path.power, normal });
         }
 
-        let reflected = path.power * Vec3::from_array(material.albedo);
-        tally.absorbed += power - reflected.as_dvec3();
-        if bounce + 1 == self.limit {
+        let mut reflected = if is_black { Vec3::ZERO } else { path.power * surface.albedo };
+        let passed = path.power * Vec3::from_array(material.transmission);
+        tally.absorbed += power - reflected.as_dvec3() - passed.as_dvec3();
+        if path.bounces + 1 == self.limit {
             tally.truncated += reflected.as_dvec3();
+            reflected = Vec3::ZERO;
+        }
+        if step + 1 == PATH_LIMIT {
+            tally.truncated += reflected.as_dvec3() + passed.as_dvec3();
             return None;
         }
         // The brightest channel keeps its power through all bounces: photons of similar power make
         // the least noise (Jensen 2001, section 5.2).
-        let survival = reflected.max_element() / path.power.max_element();
-        let dimension = BOUNCE + 2 * bounce;
-        // Not so if it is NaN, of photons too faint for f32.
-        let survives = uniform(path.photon, dimension, self.seed) < survival;
-        if !survives {
-            return None;
+        let brightest = path.power.max_element();
+        let (reflects, passes) = (reflected.max_element() / brightest, passed.max_element() / brightest);
+        // More than 1 together where other channels are reflected than pass.
+        let all = (reflects + passes).max(1.0);
+        let (reflects, passes) = (reflects / all, passes / all);
+        let dimension = BOUNCE + 2 * step;
+        // Below neither if they are NaN, of photons too faint for f32.
+        let choice = uniform(path.photon, dimension, self.seed);
+        if choice < reflects {
+            let u = sobol_2d(path.photon, combine(self.seed, dimension + 1));
+            let origin = offset_ray_origin(point.interior, normal, self.scene);
+            let path = Path { power: reflected / reflects, bounces: path.bounces + 1, ..path };
+            Some((Ray::new(origin, cosine_around(normal, u)), path))
+        } else if choice < reflects + passes {
+            let origin = offset_ray_origin(point.interior, -normal, self.scene);
+            Some((Ray::new(origin, direction), Path { power: passed / passes, ..path }))
+        } else {
+            None
         }
-        let u = sobol_2d(path.photon, combine(self.seed, dimension + 1));
-        let origin = offset_ray_origin(point.interior, normal, self.scene);
-        Some((Ray::new(origin, cosine_around(normal, u)), Path { photon: path.photon, power: reflected / survival }))
     }
 }
 

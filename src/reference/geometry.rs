@@ -169,9 +169,17 @@ impl Geometry {
 
     /// Closest hit; of several at equal t that with the lowest number.
     pub fn closest(&self, ray: &Ray64) -> Option<Hit64> {
+        self.closest_of(ray, |_| true)
+    }
+
+    /// The same among the hits that `accept` accepts. It is asked about every hit that is nearer than what it has
+    /// accepted so far, once.
+    pub(super) fn closest_of(&self, ray: &Ray64, mut accept: impl FnMut(&Hit64) -> bool) -> Option<Hit64> {
         let mut best: Option<Hit64> = None;
         self.traverse(ray, 0.0, |triangle, limit| {
-            if let Some(hit) = triangle.hit(ray, limit) {
+            if let Some(hit) = triangle.hit(ray, limit)
+                && accept(&hit)
+            {
                 keep_nearer(&mut best, hit);
             }
             best.map_or(ray.tmax, |b| b.t)

@@ -152,10 +152,10 @@ impl Lights {
         chosen.map(|p| Proposal { irradiance: p.irradiance * (total / brightness(p.irradiance)), ..p })
     }
 
-    /// Radiance that a ray sampled by cosine meets in rect lights before `limit`, weighted against
+    /// Radiance that a ray sampled by cosine meets in rect lights between two distances, weighted against
     /// area sampling. (Rect lights stop no rays, so there may be several.)
-    pub fn rects_along(&self, origin: DVec3, direction: DVec3, limit: f64, by_direction: f64) -> DVec3 {
-        self.rects.iter().fold(DVec3::ZERO, |sum, rect| sum + rect_along(rect, origin, direction, limit, by_direction))
+    pub fn rects_along(&self, origin: DVec3, direction: DVec3, range: [f64; 2], by_direction: f64) -> DVec3 {
+        self.rects.iter().fold(DVec3::ZERO, |sum, rect| sum + rect_along(rect, origin, direction, range, by_direction))
     }
 
     /// Weight of a triangle's emission that a ray sampled by cosine has found at `distance`, under
@@ -172,10 +172,10 @@ fn brightness_of(material: &Material) -> f64 {
     brightness(rgb(material.emission)) * if material.two_sided { 2.0 } else { 1.0 }
 }
 
-fn rect_along(rect: &Area, origin: DVec3, direction: DVec3, limit: f64, by_direction: f64) -> DVec3 {
+fn rect_along(rect: &Area, origin: DVec3, direction: DVec3, [from, to]: [f64; 2], by_direction: f64) -> DVec3 {
     let cosine = -rect.normal.dot(direction);
     let distance = -rect.normal.dot(rect.corner - origin) / cosine;
-    if !(cosine > 0.0 && distance > 0.0 && distance < limit) {
+    if !(cosine > 0.0 && distance > from && distance < to) {
         return DVec3::ZERO;
     }
     let p = origin + direction * distance - rect.corner;

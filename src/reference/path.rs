@@ -3,18 +3,21 @@
 //!
 //! What it computes is what the library means: one-sided surfaces seen or hit from behind are black
 //! and absorb, two-sided ones reflect and emit on both sides, rect lights emit from one side and are
-//! not hit by rays, the background is black.
+//! not hit by rays, the background is black. Textures colour surfaces and cut holes into them; sheets that
+//! transmit are passed straight or reflect, by chance.
 
 use super::geometry::{Geometry, Hit64, Ray64};
 use super::lights::{Lights, rgb};
 use super::random::{Random, cosine_direction};
+use super::surfaces::Surfaces;
 use crate::device::Device;
 use crate::error::{Result, invalid_argument};
 use crate::progress::Progress;
-use crate::scene::{Camera, Light, Material, Mesh, Scene, SceneData};
+use crate::scene::{Camera, Light, Material, Mesh, Scene, SceneData, Texture};
 use glam::{DVec3, Vec3};
 use rayon::prelude::*;
 use std::f64::consts::PI;
+use std::sync::Arc;
 
 /// Independent estimates from whose spread the standard error is taken.
 const BATCHES: u32 = 16;
@@ -75,9 +78,7 @@ struct Split {
 /// A scene prepared for path tracing.
 pub struct PathTracer {
     geometry: Geometry,
-    /// Material by global triangle number.
-    material_of: Vec<u32>,
-    materials: Vec<Material>,
+    surfaces: Surfaces,
     /// Corners by global triangle number.
     corners: Vec<[Vec3; 3]>,
     lights: Lights,
@@ -88,23 +89,22 @@ pub struct PathTracer {
 impl PathTracer {
     /// Of a committed scene, with its lights of now.
     pub fn new(scene: &Scene) -> Self {
-        Self::from_parts(scene.meshes(), scene.materials(), &scene.lights())
+        Self::from_parts(scene.meshes(), scene.materials(), scene.textures(), &scene.lights())
     }
 
     /// Of a scene that has not been committed.
     pub fn from_data(data: &SceneData) -> Self {
-        Self::from_parts(data.meshes(), data.materials(), data.lights())
+        Self::from_parts(data.meshes(), data.materials(), data.textures(), data.lights())
     }
 
-    fn from_parts(meshes: &[Mesh], materials: &[Material], lights: &[Light]) -> Self {
+    fn from_parts(meshes: &[Mesh], materials: &[Material], textures: &[Arc<Texture>], lights: &[Light]) -> Self {
         let geometry = Geometry::new(meshes);
         let all = || meshes.iter().flat_map(|m| (0..m.indices.len()).map(move |t| (m, t)));
         let (lower, upper) = geometry.bounds();
         let largest = lower.abs().max(upper.abs()).max_element();
         PathTracer {
-            material_of: all().map(|(m, t)| m.material(t)).collect(),
+            surfaces: Surfaces::new(meshes, materials, textures),
             corners: all().map(|(m, t)| m.corners(t)).collect(),
-            materials: materials.to_vec(),
             lights: Lights::new(meshes, materials, lights),
             offset: OFFSET * (largest + (upper - lower).length()),
             geometry,
@@ -187,7 +187,7 @@ impl PathTracer {
     fn direct(&self, point: DVec3, normal: DVec3, square: [f64; 2], random: &mut Random) -> DVec3 {
         let Some(light) = self.lights.propose(point, normal, square, random) else { return DVec3::ZERO };
         let shadow = Ray64 { tmax: light.distance - self.offset, ..Ray64::new(point, light.direction) };
-        if self.geometry.occluded(&shadow) { DVec3::ZERO } else { light.irradiance }
+        light.irradiance * self.surfaces.transmittance(&self.geometry, &shadow)
     }
 
     /// Radiance along a ray, split in emitted and reflected. `density` is that of the direction, if
@@ -197,17 +197,33 @@ impl PathTracer {
         let mut result = Split::default();
         let mut throughput = DVec3::ONE;
         let (mut ray, mut density) = (Ray64::new(origin, direction), density);
-        for bounce in 0.. {
-            let hit = self.geometry.closest(&ray);
-            let emitted = throughput * self.emitted(&ray, hit.as_ref(), density);
+        // Where the ray was last reflected, and how far it has come since, through sheets.
+        let (mut start, mut passed) = (origin, 0.0);
+        let mut bounce = 0;
+        loop {
+            let hit = self.surfaces.closest(&self.geometry, &ray);
+            let emitted = throughput * self.emitted(&ray, hit.as_ref(), density, start, passed);
             if bounce == 0 {
                 result.direct += emitted;
             } else {
                 result.indirect += emitted;
             }
             let Some(hit) = hit else { break };
-            let Some((material, point)) = self.surface(&ray, &hit) else { break };
-            throughput *= rgb(material.albedo);
+            let (material, point, is_lit) = self.surface(&ray, &hit);
+            let reflected = if is_lit { self.surfaces.albedo(&hit) } else { DVec3::ZERO };
+            let transmitted = rgb(material.transmission);
+            let (r, t) = (reflected.max_element(), transmitted.max_element());
+            let mut chance = 1.0;
+            if t > 0.0 {
+                if random.uniform() * (r + t) < t {
+                    throughput *= transmitted * ((r + t) / t);
+                    passed += hit.t;
+                    ray = Ray64::new(point.position - point.normal * (2.0 * self.offset), ray.direction);
+                    continue;
+                }
+                chance = r / (r + t);
+            }
+            throughput *= reflected / chance;
             if bounce >= self.max_bounces || throughput == DVec3::ZERO {
                 break;
             }
@@ -221,43 +237,41 @@ impl PathTracer {
             let (direction, cosine) = cosine_direction(point.normal, random.square());
             ray = Ray64::new(point.position, direction);
             density = Some(cosine / PI);
+            (start, passed) = (point.position, 0.0);
+            bounce += 1;
         }
         result
     }
 
-    /// Emission along a ray up to its hit, weighted.
-    fn emitted(&self, ray: &Ray64, hit: Option<&Hit64>, density: Option<f64>) -> DVec3 {
+    /// Emission along a ray up to its hit, weighted. It comes from `start`, `passed` before its origin.
+    fn emitted(&self, ray: &Ray64, hit: Option<&Hit64>, density: Option<f64>, start: DVec3, passed: f64) -> DVec3 {
         let mut sum = DVec3::ZERO;
         if let Some(density) = density {
-            let limit = hit.map_or(f64::INFINITY, |h| h.t);
-            sum += self.lights.rects_along(ray.origin, ray.direction, limit, density);
+            let limit = hit.map_or(f64::INFINITY, |h| passed + h.t);
+            sum += self.lights.rects_along(start, ray.direction, [passed, limit], density);
         }
         let Some(hit) = hit else { return sum };
-        let material = &self.materials[self.material_of[hit.triangle as usize] as usize];
-        if material.is_emissive()
-            && let Some((_, point)) = self.surface(ray, hit)
-        {
+        let (material, point, is_lit) = self.surface(ray, hit);
+        if material.is_emissive() && is_lit {
             let cosine = point.normal.dot(ray.direction);
-            let weight = density.map_or(1.0, |d| self.lights.emission_weight(material, cosine, hit.t, d));
+            let weight = density.map_or(1.0, |d| self.lights.emission_weight(material, cosine, passed + hit.t, d));
             sum += rgb(material.emission) * weight;
         }
         sum
     }
 
-    /// Material and point of a hit, on the side that the ray comes from and already off the surface;
-    /// `None` on the back of a one-sided surface.
-    fn surface(&self, ray: &Ray64, hit: &Hit64) -> Option<(&Material, SurfacePoint)> {
-        let material = &self.materials[self.material_of[hit.triangle as usize] as usize];
+    /// Material and point of a hit, on the side that the ray comes from and already off the surface, and whether
+    /// that side reflects and emits: the back of a one-sided surface does not.
+    fn surface(&self, ray: &Ray64, hit: &Hit64) -> (&Material, SurfacePoint, bool) {
+        let material = self.surfaces.material(hit.triangle);
         let [a, b, c] = self.corners[hit.triangle as usize].map(|c| c.as_dvec3());
         let front = (b - a).cross(c - a).normalize_or_zero();
         let from_behind = front.dot(ray.direction) > 0.0;
-        if from_behind && !material.two_sided {
-            return None;
-        }
         let normal = if from_behind { -front } else { front };
         // From the corners rather than along the ray: on the plane whatever the distance.
         let on_plane = a + (b - a) * hit.u + (c - a) * hit.v;
-        Some((material, SurfacePoint { position: on_plane + normal * self.offset, normal }))
+        let point = SurfacePoint { position: on_plane + normal * self.offset, normal };
+        (material, point, !from_behind || material.two_sided)
     }
 
     /// An image: linear radiance per pixel, row by row from the top left, `samples` paths per pixel
@@ -347,7 +361,7 @@ mod tests {
     const UP: SurfacePoint = SurfacePoint { position: DVec3::ZERO, normal: DVec3::Z };
 
     fn material(albedo: f32, emission: f32, two_sided: bool) -> Material {
-        Material { albedo: [albedo; 3], emission: [emission; 3], two_sided }
+        Material { albedo: [albedo; 3], emission: [emission; 3], two_sided, ..Default::default() }
     }
 
     fn square(half: f32, z: f32, material: u32) -> Mesh {

@@ -108,7 +108,7 @@ struct Palette {
 impl Palette {
     fn new(scene: &mut SceneData) -> Result<Palette> {
         let mut add =
-            |r, g, b, two_sided| scene.add_material(Material { albedo: [r, g, b], emission: [0.0; 3], two_sided });
+            |r, g, b, two_sided| scene.add_material(Material { albedo: [r, g, b], two_sided, ..Default::default() });
         Ok(Palette {
             plaster: add(0.74, 0.66, 0.53, false)?,
             ochre: add(0.70, 0.52, 0.34, false)?,

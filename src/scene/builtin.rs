@@ -99,7 +99,7 @@ fn cornell() -> Result<SceneData> {
 
 fn furnace() -> Result<SceneData> {
     let mut scene = SceneData::new();
-    let walls = scene.add_material(Material { albedo: [0.5; 3], emission: [1.0; 3], two_sided: false })?;
+    let walls = scene.add_material(Material { emission: [1.0; 3], ..Default::default() })?;
     let mut cube = MeshBuilder::new();
     cube.box_(Vec3::ZERO, Vec3::ONE, true, walls);
     scene.add_mesh(cube.finish())?;

@@ -1,14 +1,14 @@
 //! The committed scene: acceleration structure, emitters, bounds and numbers.
 
 use super::mesh::is_valid_triangle;
-use super::{Light, Material, Mesh, MeshMaterials, NONE, SceneData};
+use super::{Light, MAX_ALBEDO, Material, Mesh, MeshMaterials, NONE, SceneData, Texture, texture};
 use crate::bvh::{self, BuildOptions, Tree};
 use crate::device::{Device, LogLevel};
 use crate::error::{Error, Result, invalid_argument};
 use crate::memory::Reservation;
 use crate::progress::Progress;
 use crate::trace::{Hit, RawHit, Ray, TreeView, View};
-use glam::Vec3;
+use glam::{Vec2, Vec3};
 use rayon::prelude::*;
 use std::sync::{Arc, RwLock};
 use std::time::Instant;
@@ -76,12 +76,53 @@ pub struct Scene {
     tree: Tree,
     /// Triangles that are not in the tree, ascending.
     skipped: Vec<u32>,
+    uses: Uses,
     stats: SceneStats,
     _memory: Reservation,
 }
 
+/// What a scene uses of what materials can do.
+#[derive(Clone, Debug, Default, PartialEq)]
+pub(crate) struct Uses {
+    /// Whether a texture colours a surface.
+    pub textures: bool,
+    /// By material, whether it has holes; empty if none that a surface has does.
+    pub holes: Vec<bool>,
+    /// Whether light passes through a surface.
+    pub transmission: bool,
+}
+
+impl Uses {
+    fn of(data: &SceneData) -> Uses {
+        // Holes need texels that are less opaque than the cutoff.
+        let has_holes = |m: &Material| {
+            m.alpha_cutoff > 0.0
+                && texture::of(&data.textures, m.albedo_texture).is_some_and(|t| t.least_alpha() < m.alpha_cutoff)
+        };
+        let could: Vec<bool> = data.materials.iter().map(has_holes).collect();
+        let (mut uses, mut holes) = (Uses::default(), false);
+        for mesh in data.meshes.iter().filter(|m| !m.indices.is_empty()) {
+            let mut note = |id: u32| {
+                let material = &data.materials[id as usize];
+                let has_uvs = !mesh.uvs.is_empty();
+                uses.textures |= has_uvs && material.albedo_texture != NONE;
+                holes |= has_uvs && could[id as usize];
+                uses.transmission |= material.transmits();
+            };
+            match &mesh.materials {
+                MeshMaterials::One(id) => note(*id),
+                MeshMaterials::PerTriangle(ids) => ids.iter().for_each(|id| note(*id)),
+            }
+        }
+        uses.holes = if holes { could } else { Vec::new() };
+        uses
+    }
+}
+
 impl Scene {
     /// Builds the acceleration structure. On an error, `data` comes back unharmed.
+    // It goes in by value and comes back so.
+    #[allow(clippy::result_large_err)]
     pub fn commit(
         device: &Arc<Device>,
         data: SceneData,
@@ -185,6 +226,7 @@ impl Scene {
             bounds: self.bounds,
             tree: self.tree.clone(),
             skipped: self.skipped.clone(),
+            uses: self.uses.clone(),
             stats: self.stats,
             _memory: memory,
         })
@@ -228,7 +270,7 @@ impl Scene {
                 &format!("{} of {total} triangles are degenerate or not finite and were skipped", skipped.len()),
             );
         }
-        let meshes = mesh_bytes(&data.meshes);
+        let meshes = mesh_bytes(&data.meshes) + data.textures.iter().map(|t| t.bytes()).sum::<usize>();
         let mut memory = device.memory().reserve(meshes + bvh::estimated_bytes(valid.len(), options), "the scene")?;
         let (tree, sah_cost) = device.install(|| bvh::build(&corners, &valid, &first_triangle, options, progress))?;
         progress.check()?;
@@ -252,7 +294,7 @@ impl Scene {
             refits: 0,
             refit_seconds: 0.0,
         };
-        Ok(Parts { emitters, first_triangle, bounds, tree, skipped, stats, memory })
+        Ok(Parts { emitters, first_triangle, bounds, tree, skipped, uses: Uses::of(data), stats, memory })
     }
 
     /// The device that the scene lives on.
@@ -268,6 +310,17 @@ impl Scene {
     /// The materials, by number.
     pub fn materials(&self) -> &[Material] {
         &self.data.materials
+    }
+
+    /// The textures, by number.
+    pub fn textures(&self) -> &[Arc<Texture>] {
+        &self.data.textures
+    }
+
+    /// What it uses of what materials can do.
+    #[inline]
+    pub(crate) fn uses(&self) -> &Uses {
+        &self.uses
     }
 
     /// A snapshot of the lights, by number.
@@ -353,6 +406,44 @@ impl Scene {
         self.data.meshes[m as usize].material(t as usize)
     }
 
+    /// Diffuse reflectance at a point of a global triangle number, with weights `u` and `v` of its corners 1
+    /// and 2: the material's, multiplied with its texture.
+    #[inline]
+    pub fn albedo(&self, triangle: u32, u: f32, v: f32) -> Vec3 {
+        let (m, t) = self.locate(triangle);
+        let mesh = &self.data.meshes[m as usize];
+        let material = &self.data.materials[mesh.material(t as usize) as usize];
+        self.albedo_at(material, || mesh.texture_coordinates(t as usize, u, v))
+    }
+
+    /// The same of a material at the texture coordinates that `uv` tells, which textured ones ask for.
+    #[inline]
+    pub(crate) fn albedo_at(&self, material: &Material, uv: impl FnOnce() -> Option<Vec2>) -> Vec3 {
+        let factor = Vec3::from(material.albedo);
+        match texture::of(&self.data.textures, material.albedo_texture) {
+            None => factor,
+            Some(texture) => uv().map_or(factor, |uv| factor * texture.color(uv)).min(Vec3::splat(MAX_ALBEDO)),
+        }
+    }
+
+    /// Whether a point of a global triangle number, with weights `u` and `v` of its corners 1 and 2, is a hole.
+    pub fn is_hole(&self, triangle: u32, u: f32, v: f32) -> bool {
+        if self.uses.holes.is_empty() {
+            return false;
+        }
+        let (m, t) = self.locate(triangle);
+        let mesh = &self.data.meshes[m as usize];
+        let id = mesh.material(t as usize) as usize;
+        if !self.uses.holes[id] {
+            return false;
+        }
+        let material = &self.data.materials[id];
+        match (texture::of(&self.data.textures, material.albedo_texture), mesh.texture_coordinates(t as usize, u, v)) {
+            (Some(texture), Some(uv)) => texture.alpha(uv) < material.alpha_cutoff,
+            _ => false,
+        }
+    }
+
     /// Unit geometric normal of a global triangle number (f64 inside: right for slivers too).
     #[inline]
     pub fn normal(&self, triangle: u32) -> Vec3 {
@@ -418,15 +509,16 @@ struct Parts {
     bounds: (Vec3, Vec3),
     tree: Tree,
     skipped: Vec<u32>,
+    uses: Uses,
     stats: SceneStats,
     memory: Reservation,
 }
 
 impl Parts {
     fn into_scene(self, device: Arc<Device>, data: SceneData) -> Scene {
-        let Parts { emitters, first_triangle, bounds, tree, skipped, stats, memory } = self;
+        let Parts { emitters, first_triangle, bounds, tree, skipped, uses, stats, memory } = self;
         let lights = Arc::new(RwLock::new(Arc::new(data.lights.clone())));
-        Scene { device, data, lights, emitters, first_triangle, bounds, tree, skipped, stats, _memory: memory }
+        Scene { device, data, lights, emitters, first_triangle, bounds, tree, skipped, uses, stats, _memory: memory }
     }
 }
 

@@ -32,7 +32,7 @@ pub struct Mesh {
     pub indices: Vec<[u32; 3]>,
     /// Shading normals, one per vertex, or empty: the geometric normal is used.
     pub normals: Vec<Vec3>,
-    /// First texture coordinates, one per vertex, or empty. Kept for export.
+    /// First texture coordinates, one per vertex, or empty: where textures lie on the surface.
     pub uvs: Vec<Vec2>,
     /// The caller's light map coordinates, if any.
     pub lightmap: Option<LightmapUvs>,
@@ -65,6 +65,16 @@ impl Mesh {
             MeshMaterials::One(m) => *m,
             MeshMaterials::PerTriangle(m) => m[triangle],
         }
+    }
+
+    /// The texture coordinates of a point of `triangle` with weights `u` and `v` of its corners 1 and 2.
+    #[inline]
+    pub fn texture_coordinates(&self, triangle: usize, u: f32, v: f32) -> Option<Vec2> {
+        if self.uvs.is_empty() {
+            return None;
+        }
+        let [a, b, c] = self.indices[triangle].map(|i| self.uvs[i as usize]);
+        Some(a + (b - a) * u + (c - a) * v)
     }
 
     /// Bytes of its arrays.

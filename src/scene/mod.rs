@@ -8,14 +8,17 @@ mod light;
 mod material;
 mod mesh;
 pub mod shapes;
+mod texture;
 
 pub use builtin::{BUILTIN_NAMES, Camera, builtin, builtin_camera};
 pub use commit::{Emitter, Scene, SceneStats, unit_normal};
 pub use light::Light;
 pub use material::{MAX_ALBEDO, Material};
 pub use mesh::{LightmapUvs, Mesh, MeshMaterials, is_valid_triangle};
+pub use texture::{MAX_TEXTURE_SIZE, Texture};
 
 use crate::error::{Error, Result, invalid_argument};
+use std::sync::Arc;
 
 /// "No triangle", "no chart", …: never a valid index.
 pub const NONE: u32 = u32::MAX;
@@ -33,6 +36,8 @@ pub struct SceneData {
     meshes: Vec<Mesh>,
     materials: Vec<Material>,
     lights: Vec<Light>,
+    /// Shared by the copies that refits make.
+    textures: Vec<Arc<Texture>>,
 }
 
 impl SceneData {
@@ -41,9 +46,17 @@ impl SceneData {
         Self::default()
     }
 
-    /// Adds a material and returns its number.
+    /// Adds a texture and returns its number, for materials.
+    pub fn add_texture(&mut self, mut texture: Texture) -> Result<u32> {
+        texture.validate()?;
+        texture.rgba8.shrink_to_fit();
+        self.textures.push(Arc::new(texture));
+        Ok(self.textures.len() as u32 - 1)
+    }
+
+    /// Adds a material and returns its number. Its texture must have been added before.
     pub fn add_material(&mut self, material: Material) -> Result<u32> {
-        material.validate()?;
+        material.validate(self.textures.len())?;
         self.materials.push(material);
         Ok(self.materials.len() as u32 - 1)
     }
@@ -67,8 +80,8 @@ impl SceneData {
         Ok(self.lights.len() as u32 - 1)
     }
 
-    /// Moves all of `other` behind what is here; its material numbers are shifted. A refusal changes
-    /// nothing here.
+    /// Moves all of `other` behind what is here; its material and texture numbers are shifted. A refusal
+    /// changes nothing here.
     pub fn append(&mut self, mut other: SceneData) -> Result<()> {
         let total = self.triangle_count() + other.triangle_count();
         if total > MAX_TRIANGLES {
@@ -81,6 +94,11 @@ impl SceneData {
                 MeshMaterials::PerTriangle(materials) => materials.iter_mut().for_each(|m| *m += shift),
             }
         }
+        let shift = self.textures.len() as u32;
+        for material in other.materials.iter_mut().filter(|m| m.albedo_texture != NONE) {
+            material.albedo_texture += shift;
+        }
+        self.textures.append(&mut other.textures);
         self.meshes.append(&mut other.meshes);
         self.materials.append(&mut other.materials);
         self.lights.append(&mut other.lights);
@@ -106,6 +124,11 @@ impl SceneData {
     /// The materials, by number.
     pub fn materials(&self) -> &[Material] {
         &self.materials
+    }
+
+    /// The textures, by number.
+    pub fn textures(&self) -> &[Arc<Texture>] {
+        &self.textures
     }
 
     /// The lights, by number.

@@ -4,6 +4,7 @@
 //! `#[inline(always)]` and so are compiled for them.
 
 use super::compact::View;
+use super::filter::Filter;
 use super::{PACKET_SIZE, Packet, RawHit, Ray, gather, packet, single};
 use crate::bvh::Mbvh;
 use crate::simd::{self, Isa};
@@ -20,6 +21,10 @@ pub(crate) struct Kernels {
     gather: unsafe fn(&Mbvh, Vec3, &Packet, f32, f32, &mut [RawHit; PACKET_SIZE]),
     compact_intersect: unsafe fn(&View, &[Ray], &mut [RawHit]),
     compact_occluded: unsafe fn(&View, &[Ray], &mut [u8]),
+    filtered: unsafe fn(&Mbvh, &Ray, &mut Filter) -> RawHit,
+    filtered_any: unsafe fn(&Mbvh, &Ray, &mut Filter) -> RawHit,
+    compact_filtered: unsafe fn(&View, &Ray, &mut Filter) -> RawHit,
+    compact_filtered_any: unsafe fn(&View, &Ray, &mut Filter) -> RawHit,
 }
 
 macro_rules! table {
@@ -66,6 +71,22 @@ macro_rules! table {
                     },
                 }
             }
+            $(#[target_feature(enable = $features)])?
+            unsafe fn filtered(tree: &Mbvh, ray: &Ray, filter: &mut Filter) -> RawHit {
+                unsafe { single::one_of::<$simd, _, _, false>(tree, ray, filter) }
+            }
+            $(#[target_feature(enable = $features)])?
+            unsafe fn filtered_any(tree: &Mbvh, ray: &Ray, filter: &mut Filter) -> RawHit {
+                unsafe { single::one_of::<$simd, _, _, true>(tree, ray, filter) }
+            }
+            $(#[target_feature(enable = $features)])?
+            unsafe fn compact_filtered(tree: &View, ray: &Ray, filter: &mut Filter) -> RawHit {
+                unsafe { single::one_of::<$simd, _, _, false>(tree, ray, filter) }
+            }
+            $(#[target_feature(enable = $features)])?
+            unsafe fn compact_filtered_any(tree: &View, ray: &Ray, filter: &mut Filter) -> RawHit {
+                unsafe { single::one_of::<$simd, _, _, true>(tree, ray, filter) }
+            }
             pub(super) static TABLE: Kernels = Kernels {
                 isa: $isa,
                 intersect,
@@ -75,6 +96,10 @@ macro_rules! table {
                 gather,
                 compact_intersect,
                 compact_occluded,
+                filtered,
+                filtered_any,
+                compact_filtered,
+                compact_filtered_any,
             };
         }
         use $module::TABLE as $name;
@@ -150,5 +175,28 @@ impl Kernels {
     pub(crate) fn compact_occluded(&self, tree: &View, rays: &[Ray], out: &mut [u8]) {
         // SAFETY: see `intersect`.
         unsafe { (self.compact_occluded)(tree, rays, out) }
+    }
+    /// Closest of the hits that a filter accepts.
+    pub(crate) fn filtered(&self, tree: &Mbvh, ray: &Ray, filter: &mut Filter) -> RawHit {
+        // SAFETY: see `intersect`.
+        unsafe { (self.filtered)(tree, ray, filter) }
+    }
+
+    /// Any of the hits that a filter accepts.
+    pub(crate) fn filtered_any(&self, tree: &Mbvh, ray: &Ray, filter: &mut Filter) -> RawHit {
+        // SAFETY: see `intersect`.
+        unsafe { (self.filtered_any)(tree, ray, filter) }
+    }
+
+    /// Closest of the hits that a filter accepts, in a compact tree.
+    pub(crate) fn compact_filtered(&self, tree: &View, ray: &Ray, filter: &mut Filter) -> RawHit {
+        // SAFETY: see `intersect`.
+        unsafe { (self.compact_filtered)(tree, ray, filter) }
+    }
+
+    /// Any of the hits that a filter accepts, in a compact tree.
+    pub(crate) fn compact_filtered_any(&self, tree: &View, ray: &Ray, filter: &mut Filter) -> RawHit {
+        // SAFETY: see `intersect`.
+        unsafe { (self.compact_filtered_any)(tree, ray, filter) }
     }
 }

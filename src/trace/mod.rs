@@ -3,9 +3,13 @@
 //! A closest hit is the one with the least t in `tmin < t ≤ tmax`; among exactly equal t the
 //! triangle with the lowest global number wins, on every path, so that single rays, packets and
 //! every ISA agree on coincident triangles.
+//!
+//! Points that a texture cuts out are no hits. In scenes that have some, hits and occlusion are
+//! [checked](filter) after the kernels, which are those of all scenes.
 
 pub mod baseline;
 mod compact;
+pub(crate) mod filter;
 mod gather;
 mod kernels;
 pub mod offset;
@@ -215,24 +219,41 @@ impl Scene {
                 self.device().kernels().compact_intersect(&tree, &rays[..count], out);
             }
         }
+        if self.has_holes() {
+            self.leave_holes_of_packet(origin, packet, tmin, tmax, out);
+        }
     }
 
     /// Closest hit with `tmin < t ≤ tmax`, by global triangle number.
     #[inline]
     pub fn intersect_raw(&self, ray: &Ray) -> RawHit {
-        match self.tree() {
+        let mut hit = [match self.tree() {
             TreeView::Whole(tree) => self.device().kernels().intersect(tree, ray),
             TreeView::Compact(tree) => {
                 let mut hit = [RawHit::MISS];
                 self.device().kernels().compact_intersect(&tree, std::slice::from_ref(ray), &mut hit);
                 hit[0]
             }
+        }];
+        if self.has_holes() {
+            self.leave_holes(std::slice::from_ref(ray), &mut hit);
         }
+        hit[0]
     }
 
     /// Whether anything lies on the ray with `tmin < t ≤ tmax`.
     #[inline]
     pub fn occluded(&self, ray: &Ray) -> bool {
+        let mut occluded = [self.anything_on(ray) as u8];
+        if self.has_holes() {
+            self.look_through_holes(std::slice::from_ref(ray), &mut occluded);
+        }
+        occluded[0] != 0
+    }
+
+    /// Whether anything lies on the ray, holes included.
+    #[inline]
+    fn anything_on(&self, ray: &Ray) -> bool {
         match self.tree() {
             TreeView::Whole(tree) => self.device().kernels().occluded(tree, ray),
             TreeView::Compact(tree) => {
@@ -249,6 +270,9 @@ impl Scene {
             TreeView::Whole(tree) => self.device().kernels().intersect_block(tree, rays, out),
             TreeView::Compact(tree) => self.device().kernels().compact_intersect(&tree, rays, out),
         }
+        if self.has_holes() {
+            self.leave_holes(rays, out);
+        }
     }
 
     /// Any hit of as many rays as both slices have: 1 or 0.
@@ -257,6 +281,15 @@ impl Scene {
             TreeView::Whole(tree) => self.device().kernels().occluded_block(tree, rays, out),
             TreeView::Compact(tree) => self.device().kernels().compact_occluded(&tree, rays, out),
         }
+        if self.has_holes() {
+            self.look_through_holes(rays, out);
+        }
+    }
+
+    /// Whether hits may be holes.
+    #[inline]
+    fn has_holes(&self) -> bool {
+        !self.uses().holes.is_empty()
     }
 }
 

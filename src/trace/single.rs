@@ -4,6 +4,7 @@
 //! The box test is conservative (Ize, *Robust BVH Ray Traversal*, 2013): the builder moves planes, and
 //! a ray its origin, by more than rounding can.
 
+use super::filter::{Accept, All};
 use super::tree::{Leaf, Tree};
 use super::triangle::Shear;
 use super::{RawHit, Ray};
@@ -290,12 +291,13 @@ pub(super) fn barycentrics(u: f32, v: f32, sum: f32) -> (f32, f32) {
 /// # Safety
 /// The CPU must have the ISA; `leaf` must be a leaf of `tree`.
 #[inline(always)]
-unsafe fn leaf<S: Simd, T: Tree, const ANY: bool>(
+unsafe fn leaf<S: Simd, T: Tree, A: Accept, const ANY: bool>(
     tree: &T,
     leaf: ChildRef,
     ray: &RaySetup,
     limit: f32,
     best: &mut Best,
+    accept: &mut A,
 ) -> bool {
     // SAFETY: forwarded.
     let leaf = unsafe { tree.leaf::<S>(leaf) };
@@ -330,6 +332,10 @@ unsafe fn leaf<S: Simd, T: Tree, const ANY: bool>(
                 }
                 // SAFETY: first + i < count.
                 if !unsafe { leaf.counts::<S>(first + i, ray, limit) } {
+                    continue;
+                }
+                // SAFETY: as above.
+                if A::FILTERS && !accept.accepts(unsafe { leaf.number(first + i) }, t[i], [u[i], v[i], w[i]]) {
                     continue;
                 }
                 if ANY {
@@ -513,10 +519,14 @@ impl Walk {
     /// # Safety
     /// The CPU must have the ISA; the walk must have been begun in `tree`, and `current` be a leaf.
     #[inline(always)]
-    unsafe fn visit_leaf<S: Simd, T: Tree, const ANY: bool>(&mut self, tree: &T) -> ChildRef {
+    unsafe fn visit_leaf<S: Simd, T: Tree, A: Accept, const ANY: bool>(
+        &mut self,
+        tree: &T,
+        accept: &mut A,
+    ) -> ChildRef {
         // SAFETY: forwarded.
         unsafe {
-            if leaf::<S, T, ANY>(tree, self.current, &self.ray, self.limit, &mut self.best) {
+            if leaf::<S, T, A, ANY>(tree, self.current, &self.ray, self.limit, &mut self.best, accept) {
                 if ANY {
                     self.stack.count = BOTTOM;
                 } else {
@@ -543,6 +553,20 @@ impl Walk {
 /// The CPU must have the ISA.
 #[inline(always)]
 pub(super) unsafe fn one<S: Simd, T: Tree, const ANY: bool>(tree: &T, ray: &Ray) -> RawHit {
+    // SAFETY: forwarded.
+    unsafe { one_of::<S, T, All, ANY>(tree, ray, &mut All) }
+}
+
+/// The same among the hits that `accept` accepts.
+///
+/// # Safety
+/// The CPU must have the ISA.
+#[inline(always)]
+pub(super) unsafe fn one_of<S: Simd, T: Tree, A: Accept, const ANY: bool>(
+    tree: &T,
+    ray: &Ray,
+    accept: &mut A,
+) -> RawHit {
     let mut place = MaybeUninit::uninit();
     if !Walk::begin::<T>(&mut place, ray, 0) {
         return RawHit::MISS;
@@ -553,7 +577,7 @@ pub(super) unsafe fn one<S: Simd, T: Tree, const ANY: bool>(tree: &T, ray: &Ray)
         // SAFETY: forwarded.
         unsafe {
             if walk.current.is_leaf() {
-                walk.visit_leaf::<S, T, ANY>(tree);
+                walk.visit_leaf::<S, T, A, ANY>(tree, accept);
             } else {
                 walk.visit_node::<S, T, true>(tree);
                 // What comes after. (5 to 8 % of the time.)
@@ -630,7 +654,7 @@ pub(super) unsafe fn many<S: Simd, T: Tree, const ANY: bool>(
             let walk = unsafe { *at_leaves.add(k) };
             let mut child = unsafe { (*walk).current };
             if child != ChildRef::EMPTY {
-                child = unsafe { (*walk).visit_leaf::<S, T, ANY>(tree) };
+                child = unsafe { (*walk).visit_leaf::<S, T, All, ANY>(tree, &mut All) };
             }
             if child != ChildRef::EMPTY {
                 enqueue(walk, child, &mut node_count, &mut leaf_count);

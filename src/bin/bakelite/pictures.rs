@@ -9,7 +9,7 @@ use bakelite::lightmap::{Layer, Lightmap};
 use bakelite::reference::PathTracer;
 use bakelite::sampling::{combine, sobol_2d};
 use bakelite::scene::Camera;
-use bakelite::trace::offset::SurfacePoint;
+use bakelite::trace::offset::{SurfacePoint, offset_ray_origin};
 use bakelite::trace::{RawHit, Ray};
 use bakelite::{Progress, Result, Scene};
 use glam::Vec3;
@@ -175,17 +175,24 @@ fn receiver(scene: &Scene, hit: &RawHit) -> Receiver {
 }
 
 /// Radiance along a primary ray. The backs of one-sided materials are black.
-fn radiance(scene: &Scene, ray: &Ray, seed: u32, irradiance: impl Fn(&Seen) -> Vec3) -> Vec3 {
+fn radiance(scene: &Scene, ray: &Ray, seed: u32, irradiance: &impl Fn(&Seen) -> Vec3) -> Vec3 {
     let hit = scene.intersect_raw(ray);
     if hit.is_miss() {
         return Vec3::ZERO;
     }
     let material = scene.material(hit.triangle);
-    if !hit.front && !material.two_sided {
-        return Vec3::ZERO;
+    let mut through = Vec3::ZERO;
+    if material.transmits() {
+        let point = SurfacePoint::new(scene.corners(hit.triangle), hit.u, hit.v, scene);
+        let onwards = if hit.front { -point.normal } else { point.normal };
+        let behind = Ray::new(offset_ray_origin(point.interior, onwards, scene), ray.direction.into());
+        through = Vec3::from(material.transmission) * radiance(scene, &behind, seed, irradiance);
     }
-    let reflected = Vec3::from(material.albedo) / PI * irradiance(&Seen { hit, seed });
-    reflected + Vec3::from(material.emission)
+    if !hit.front && !material.two_sided {
+        return through;
+    }
+    let reflected = scene.albedo(hit.triangle, hit.u, hit.v) / PI * irradiance(&Seen { hit, seed });
+    through + reflected + Vec3::from(material.emission)
 }
 
 /// The rays of a pinhole camera.

@@ -112,7 +112,7 @@ impl TexelPaths {
             return None;
         }
         let receiver = Receiver::new(&self.scene, &point, None, back);
-        let throughput = path.throughput * Vec3::from(material.albedo);
+        let throughput = path.throughput * self.scene.albedo(triangle, hit.u, hit.v);
         let e = self.direct.irradiance(&receiver, 1, combine(path.seed, 1), &mut 0);
         sums[path.receiver] += (throughput * e / PI).as_dvec3();
         let survival = throughput.max_element().min(1.0);

@@ -1,0 +1,342 @@
+//! Bakes of textured surfaces, grates and stained glass against the f64 path tracer, which looks textures up
+//! by itself, and against closed forms.
+
+use bakelite::bvh::BuildOptions;
+use bakelite::lightmap::plan::left_out;
+use bakelite::lightmap::{BakeParams, BakeStats, Layer, Lightmap, LightmapDesc};
+use bakelite::photon::{PhotonMap, PhotonParams};
+use bakelite::reference::{PathTracer, Random, SurfacePoint};
+use bakelite::scene::{MeshMaterials, NONE, Texture};
+use bakelite::{Device, DeviceOptions, Light, Material, Mesh, Progress, Scene, SceneData};
+use glam::{Vec2, Vec3};
+use std::sync::Arc;
+
+fn commit(data: SceneData, compact: bool) -> Arc<Scene> {
+    let device = Device::new(DeviceOptions::default()).unwrap();
+    let build = BuildOptions { compact, ..Default::default() };
+    Scene::commit(&device, data, &build, &Progress::none()).map_err(|(_, e)| e).unwrap()
+}
+
+fn bake(scene: &Arc<Scene>, texels_per_unit: f32, params: &BakeParams) -> (Lightmap, BakeStats) {
+    let desc = LightmapDesc { texels_per_unit, gather_divisor: 2, radiance_divisor: 4, ..Default::default() };
+    let mut map = Lightmap::create(scene, &desc, &Progress::none()).unwrap();
+    let stats = map.bake(params, &Progress::none()).unwrap();
+    (map, stats)
+}
+
+/// A parallelogram that faces edge_u × edge_v; texture coordinates from 0 to `repeats`.
+fn sheet(corner: Vec3, edge_u: Vec3, edge_v: Vec3, repeats: f32, material: u32) -> Mesh {
+    let places = [[0.0, 0.0], [1.0, 0.0], [1.0, 1.0], [0.0, 1.0]].map(Vec2::from);
+    Mesh {
+        positions: places.iter().map(|p| corner + edge_u * p.x + edge_v * p.y).collect(),
+        uvs: places.iter().map(|p| *p * repeats).collect(),
+        indices: vec![[0, 1, 2], [0, 2, 3]],
+        materials: MeshMaterials::One(material),
+        ..Default::default()
+    }
+}
+
+/// The inside of a box: floor, ceiling, and the walls at x = 0, x = size, y = 0 and y = size, as meshes 0 to 5.
+fn room(data: &mut SceneData, size: Vec3, floor: u32, walls: u32) {
+    let (x, y, z) = (Vec3::X * size.x, Vec3::Y * size.y, Vec3::Z * size.z);
+    for (corner, u, v, material) in [
+        (Vec3::ZERO, x, y, floor),
+        (z, y, x, walls),
+        (Vec3::ZERO, y, z, walls),
+        (x, z, y, walls),
+        (Vec3::ZERO, z, x, walls),
+        (y, x, z, walls),
+    ] {
+        data.add_mesh(sheet(corner, u, v, 4.0, material)).unwrap();
+    }
+}
+
+/// Red and pale green squares of 4 × 4 texels.
+fn chequer() -> Texture {
+    let (red, green) = ([230, 20, 20, 255], [150, 250, 150, 255]);
+    let color = |(x, y): (u32, u32)| if (x / 4 + y / 4) % 2 == 0 { red } else { green };
+    Texture { width: 8, height: 8, rgba8: (0..64).map(|i| color((i % 8, i / 8))).collect() }
+}
+
+/// Bars along v: half of the surface.
+fn bars() -> Texture {
+    Texture { width: 2, height: 1, rgba8: vec![[255, 255, 255, 0], [255; 4]] }
+}
+
+/// Baked and true irradiance at random places of a mesh: relative difference of the means with its standard
+/// error, and RMS difference, for the channels together.
+struct Comparison {
+    bias: f64,
+    bias_error: f64,
+    rms: f64,
+}
+
+fn compare(map: &Lightmap, scene: &Arc<Scene>, mesh: u32, layer: Layer, places: u32) -> Comparison {
+    let tracer = PathTracer::new(scene);
+    let mut random = Random::new(11, mesh as u64);
+    let first = scene.first_triangle(mesh);
+    let places: Vec<(u32, f64, f64)> = (0..places)
+        .map(|i| {
+            let [a, b] = random.square();
+            let (u, v) = if a + b > 1.0 { (1.0 - a, 1.0 - b) } else { (a, b) };
+            (first + i % 2, u, v)
+        })
+        .collect();
+    let points: Vec<_> = places.iter().map(|&(t, u, v)| SurfacePoint::on_triangle(scene, t, u, v)).collect();
+    let truth = tracer.irradiance_many(scene.device(), &points, 16 * 24 * 24, 5, &Progress::none()).unwrap();
+    let (mut sum, mut expected, mut squares, mut variance) = (0.0, 0.0, 0.0, 0.0);
+    for (&(t, u, v), truth) in places.iter().zip(&truth) {
+        let baked = map.sample(layer, t, u as f32, v as f32);
+        let exact = match layer {
+            Layer::Indirect => truth.indirect,
+            Layer::Direct => truth.direct,
+            _ => truth.total(),
+        };
+        for c in 0..3 {
+            sum += baked[c] as f64;
+            expected += exact[c];
+            squares += (baked[c] as f64 - exact[c]).powi(2);
+            variance += truth.standard_error[c].powi(2);
+        }
+    }
+    let n = 3.0 * places.len() as f64;
+    Comparison {
+        bias: sum / expected - 1.0,
+        bias_error: variance.sqrt() / expected,
+        rms: (squares / n).sqrt() / (expected / n),
+    }
+}
+
+#[track_caller]
+fn assert_close(what: &str, c: Comparison, bias: f64, rms: f64) {
+    println!("{what}: bias {:.4} ± {:.4}, RMS {:.4}", c.bias, c.bias_error, c.rms);
+    assert!(c.bias_error < 0.01 && c.bias.abs() < bias, "{what}: bias {} ± {}", c.bias, c.bias_error);
+    assert!(c.rms < rms, "{what}: RMS {}", c.rms);
+}
+
+fn production() -> BakeParams {
+    BakeParams { photon_count: 400_000, gather_rays: 256, ..Default::default() }
+}
+
+fn lamp(data: &mut SceneData, position: Vec3) {
+    data.add_light(Light::Point { position, intensity: [10.0; 3] }).unwrap();
+}
+
+#[test]
+fn a_chequered_floor_colors_the_walls_as_in_the_path_tracer() {
+    for repeats_texture in [true, false] {
+        let mut data = SceneData::new();
+        let albedo_texture = data.add_texture(chequer()).unwrap();
+        let tiles = Material { albedo: [0.9; 3], albedo_texture, ..Default::default() };
+        let floor = data.add_material(tiles).unwrap();
+        // Without texture coordinates the factor counts alone: the same floor, but white.
+        let walls = data.add_material(Material { albedo: [0.6; 3], ..Default::default() }).unwrap();
+        room(&mut data, Vec3::new(2.0, 2.0, 1.5), floor, walls);
+        lamp(&mut data, Vec3::new(0.8, 1.1, 1.1));
+        if !repeats_texture {
+            let mut other = SceneData::new();
+            other.add_texture(chequer()).unwrap();
+            for m in data.materials() {
+                other.add_material(*m).unwrap();
+            }
+            for mesh in data.meshes() {
+                other.add_mesh(Mesh { uvs: Vec::new(), ..mesh.clone() }).unwrap();
+            }
+            lamp(&mut other, Vec3::new(0.8, 1.1, 1.1));
+            data = other;
+        }
+        let scene = commit(data, false);
+        let (map, stats) = bake(&scene, 24.0, &production());
+        assert_eq!(stats.left_out & left_out::TEXTURES == 0, repeats_texture);
+        for mesh in [2, 5] {
+            let what = format!("wall {mesh}, textured {repeats_texture}");
+            assert_close(&what, compare(&map, &scene, mesh, Layer::Indirect, 60), 0.02, 0.04);
+        }
+        // Red light: the floor's mean albedo is (0.53, 0.43, 0.15) with the texture.
+        let wall = map.sample(Layer::Indirect, scene.first_triangle(2), 0.3, 0.3);
+        assert_eq!(wall[0] > 1.3 * wall[2], repeats_texture, "{wall:?}");
+        // Outgoing radiance shows the tiles.
+        let texel = |u: f32, v: f32| map.sample(Layer::Radiance, scene.first_triangle(0), u, v);
+        let tile = texel(0.5 + 1.0 / 32.0, 1.0 / 32.0);
+        assert_eq!(tile[0] > 3.0 * tile[1], repeats_texture, "{tile:?}");
+    }
+}
+
+/// A room with a sheet half-way up, above a black floor or not, and a lamp above the sheet.
+fn divided_room(sheet_material: impl FnOnce(&mut SceneData) -> Material, faces_up: bool) -> SceneData {
+    let mut data = SceneData::new();
+    let grey = data.add_material(Material { albedo: [0.7, 0.6, 0.5], ..Default::default() }).unwrap();
+    let material = sheet_material(&mut data);
+    let divider = data.add_material(material).unwrap();
+    room(&mut data, Vec3::new(2.0, 2.0, 2.0), grey, grey);
+    let (u, v) = if faces_up { (Vec3::X, Vec3::Y) } else { (Vec3::Y, Vec3::X) };
+    data.add_mesh(sheet(Vec3::new(0.0, 0.0, 1.0), 2.0 * u, 2.0 * v, 4.0, divider)).unwrap();
+    lamp(&mut data, Vec3::new(1.1, 0.9, 1.7));
+    data
+}
+
+fn grate(data: &mut SceneData) -> Material {
+    let albedo_texture = data.add_texture(bars()).unwrap();
+    Material { albedo: [0.8; 3], albedo_texture, alpha_cutoff: 0.5, ..Default::default() }
+}
+
+#[test]
+fn a_grate_casts_its_shadow_and_lets_photons_through() {
+    // Two-sided; one-sided facing the lamp; one-sided facing away: from below it is lit or black.
+    for (two_sided, faces_up) in [(true, true), (false, true), (false, false)] {
+        let data = divided_room(|d| Material { two_sided, ..grate(d) }, faces_up);
+        let scene = commit(data, !two_sided);
+        let (map, stats) = bake(&scene, 48.0, &production());
+        assert_eq!(stats.left_out & left_out::CUTOUTS, 0);
+        // The shadow: straight lines from the lamp to the floor, holes where the fraction of u, twice the
+        // distance along the sheet's first edge, is less than 1/2.
+        let lamp = Vec3::new(1.1, 0.9, 1.7);
+        let (mut lit, mut dark) = (0, 0);
+        let mut random = Random::new(3, 0);
+        while lit < 100 || dark < 100 {
+            let [a, b] = random.square().map(|x| x as f32);
+            let (u, v) = if a + b > 1.0 { (1.0 - a, 1.0 - b) } else { (a, b) };
+            let point = SurfacePoint::on_triangle(&scene, 0, u as f64, v as f64).position.as_vec3();
+            let at = lamp + (point - lamp) * (0.7 / 1.7);
+            let along = if faces_up { at.x } else { at.y } * 2.0;
+            if (2.0 * along - (2.0 * along).round()).abs() < 0.12 {
+                continue;
+            }
+            let way = lamp - point;
+            let expected = 10.0 * way.z / way.length().powi(3);
+            let e = map.sample(Layer::Direct, 0, u, v)[1];
+            if along - along.floor() < 0.5 {
+                assert!((e - expected).abs() < 0.02 * expected, "{point}: {e} is not {expected}");
+                lit += 1;
+            } else {
+                assert_eq!(e, 0.0, "{point}");
+                dark += 1;
+            }
+        }
+        let what = format!("two-sided {two_sided}, up {faces_up}");
+        assert_close(&format!("floor, {what}"), compare(&map, &scene, 0, Layer::Indirect, 60), 0.025, 0.06);
+        assert_close(&format!("ceiling, {what}"), compare(&map, &scene, 1, Layer::Indirect, 60), 0.025, 0.06);
+        assert_energy(&scene);
+    }
+}
+
+/// Power absorbed, escaped and cut off is the power emitted.
+fn assert_energy(scene: &Arc<Scene>) {
+    let params = PhotonParams { photon_count: 200_000, ..Default::default() };
+    let map = PhotonMap::trace(scene, &params, &Progress::none()).unwrap();
+    let s = map.stats();
+    for c in 0..3 {
+        let out = s.absorbed_power[c] + s.escaped_power[c] + s.truncated_power[c];
+        assert!((out / s.emitted_power[c] - 1.0).abs() < 0.01, "{out} W of {} W", s.emitted_power[c]);
+    }
+}
+
+const GLASS: [f32; 3] = [0.8, 0.1, 0.1];
+
+#[test]
+fn direct_light_is_multiplied_with_what_each_pane_transmits() {
+    // Several lights, of all kinds, above panes that cover the whole sky.
+    let scene = |panes: &[f32]| {
+        let mut data = SceneData::new();
+        let grey = data.add_material(Material::default()).unwrap();
+        let glass = Material { albedo: [0.1; 3], transmission: GLASS, two_sided: true, ..Default::default() };
+        let glass = data.add_material(glass).unwrap();
+        data.add_mesh(sheet(Vec3::ZERO, Vec3::X, Vec3::Y, 1.0, grey)).unwrap();
+        // Far from all light, so that all scenes are of one size and rays start as far from the floor.
+        for corner in [Vec3::splat(-40.0), Vec3::splat(40.0)] {
+            data.add_mesh(sheet(corner, Vec3::X, Vec3::Y, 1.0, grey)).unwrap();
+        }
+        for &z in panes {
+            data.add_mesh(sheet(Vec3::new(-9.0, -9.0, z), 20.0 * Vec3::X, 20.0 * Vec3::Y, 1.0, glass)).unwrap();
+        }
+        let position = Vec3::new(0.3, 0.4, 4.0);
+        let direction = Vec3::new(0.2, 0.1, -1.0);
+        lamp(&mut data, position);
+        data.add_light(Light::Directional { direction, irradiance: [1.0, 2.0, 3.0] }).unwrap();
+        data.add_light(Light::Spot { position, direction, inner: 0.3, outer: 1.0, intensity: [5.0; 3] }).unwrap();
+        let (edge_u, edge_v) = (Vec3::Y, Vec3::X);
+        data.add_light(Light::Rect { position, edge_u, edge_v, radiance: [3.0; 3] }).unwrap();
+        commit(data, false)
+    };
+    let params = BakeParams { gather_rays: 0, ..Default::default() };
+    let bare = scene(&[]);
+    let (bare_map, stats) = bake(&bare, 32.0, &params);
+    assert_ne!(stats.left_out & left_out::TRANSMISSION, 0);
+    // The last two at one place.
+    for panes in [&[1.0][..], &[1.0, 2.0], &[1.5, 1.5]] {
+        let (map, stats) = bake(&scene(panes), 32.0, &params);
+        assert_eq!(stats.left_out & left_out::TRANSMISSION, 0);
+        for i in 0..200 {
+            let (u, v) = (i as f32 / 400.0, (i * 37 % 200) as f32 / 400.0);
+            let (e, full) = (map.sample(Layer::Direct, i % 2, u, v), bare_map.sample(Layer::Direct, i % 2, u, v));
+            for c in 0..3 {
+                let expected = full[c] * GLASS[c].powi(panes.len() as i32);
+                assert!((e[c] - expected).abs() <= 2e-6 * expected, "{panes:?} {c}: {} is not {expected}", e[c]);
+            }
+        }
+    }
+}
+
+#[test]
+fn light_below_stained_glass_is_that_of_the_path_tracer() {
+    for (two_sided, faces_up) in [(true, true), (false, true), (false, false)] {
+        let glass = |_: &mut SceneData| Material {
+            albedo: [0.15, 0.6, 0.3],
+            transmission: GLASS.map(|t| t / 2.0),
+            two_sided,
+            ..Default::default()
+        };
+        let scene = commit(divided_room(glass, faces_up), two_sided);
+        let (map, _) = bake(&scene, 16.0, &production());
+        let what = format!("two-sided {two_sided}, up {faces_up}");
+        for (name, mesh) in [("floor", 0), ("ceiling", 1)] {
+            let c = compare(&map, &scene, mesh, Layer::Combined, 60);
+            assert_close(&format!("{name}, {what}"), c, 0.02, 0.04);
+            let c = compare(&map, &scene, mesh, Layer::Indirect, 60);
+            assert_close(&format!("{name}, indirect, {what}"), c, 0.02, 0.04);
+        }
+        assert_energy(&scene);
+    }
+}
+
+#[test]
+fn a_lamp_behind_glass_is_direct_light_whether_it_is_met_or_sampled() {
+    // The reference finds the emissive lamp both by shadow rays and by chance; the bake by shadow rays alone.
+    let mut data = divided_room(
+        |_| Material { albedo: [0.1; 3], transmission: [0.7, 0.5, 0.3], two_sided: true, ..Default::default() },
+        true,
+    );
+    let glow = data.add_material(Material { albedo: [0.0; 3], emission: [5.0; 3], ..Default::default() }).unwrap();
+    data.add_mesh(sheet(Vec3::new(0.6, 0.6, 1.6), 0.8 * Vec3::Y, 0.8 * Vec3::X, 1.0, glow)).unwrap();
+    let scene = commit(data, false);
+    let (map, _) = bake(&scene, 16.0, &BakeParams { direct_samples: 64, ..production() });
+    assert_close("direct", compare(&map, &scene, 0, Layer::Direct, 60), 0.02, 0.03);
+    assert_close("combined", compare(&map, &scene, 0, Layer::Combined, 60), 0.02, 0.03);
+}
+
+#[test]
+fn a_scene_that_uses_none_of_it_keeps_and_runs_none_of_it() {
+    let plain = |extra: bool| {
+        let mut data = SceneData::new();
+        let texture = if extra { data.add_texture(bars()).unwrap() } else { NONE };
+        // Opaque all over: no holes.
+        let white = data.add_texture(Texture { width: 1, height: 1, rgba8: vec![[255; 4]] }).unwrap();
+        let grey = data.add_material(Material::default()).unwrap();
+        // Materials that no surface has, and a cutoff that nothing reaches.
+        let unused = Material { albedo_texture: texture, transmission: [0.5; 3], ..Default::default() };
+        data.add_material(unused).unwrap();
+        let opaque = Material { albedo_texture: white, alpha_cutoff: 0.5, ..Default::default() };
+        let opaque = data.add_material(opaque).unwrap();
+        room(&mut data, Vec3::ONE, if extra { opaque } else { grey }, grey);
+        lamp(&mut data, Vec3::splat(0.5));
+        commit(data, false)
+    };
+    let bits = left_out::TEXTURES | left_out::CUTOUTS | left_out::TRANSMISSION;
+    let params = BakeParams { photon_count: 1000, gather_rays: 16, ..Default::default() };
+    let (map, stats) = bake(&plain(false), 8.0, &params);
+    assert_eq!(stats.left_out & bits, bits);
+    assert!(map.plan_text().contains("left out: holes cut out by alpha (no surface has any)"), "{}", map.plan_text());
+    let (map, stats) = bake(&plain(true), 8.0, &params);
+    assert_eq!(stats.left_out & bits, left_out::CUTOUTS | left_out::TRANSMISSION);
+    assert!(map.plan_text().contains("runs: albedo textures"), "{}", map.plan_text());
+}
