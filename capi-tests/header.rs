@@ -10,8 +10,8 @@ use cbindgen::{
 use std::path::Path;
 
 /// The sections of the header, in order.
-const SECTIONS: [&str; 11] =
-    ["error", "device", "scene", "meshes", "lights", "rays", "photons", "lightmap", "bake", "read", "live"];
+const SECTIONS: [&str; 12] =
+    ["error", "device", "scene", "textures", "meshes", "lights", "rays", "photons", "lightmap", "bake", "read", "live"];
 
 /// Structures that share their name with a function, so that C allows no typedef for them.
 const TAG_ONLY: [&str; 2] = ["bk_scene_stats", "bk_lightmap_info"];

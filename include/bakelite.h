@@ -366,6 +366,55 @@ BK_API bk_result bk_scene_stats(const bk_scene *scene, struct bk_scene_stats *ou
 BK_API bk_result bk_scene_bounds(const bk_scene *scene, float lower[3], float upper[3]);
 
 /* ================================================================================================
+ * Textures
+ *
+ * Images that a scene uses. Added before its commit, and before what names them. Environments are the
+ * images of skies: the whole sphere of directions by longitude and latitude. Row 0 is at the zenith, the
+ * last row at the nadir; the middle of a row is the sky's front, and texels follow one another to the right
+ * as seen from inside. Each texel is an area of uniform radiance, without interpolation. A scene without
+ * images spends neither memory nor time on them.
+ * ================================================================================================ */
+
+// Format: four bytes per texel, sRGB red, green and blue and linear alpha (255: opaque).
+#define BK_TEXTURE_RGBA8_SRGB 0
+
+// Format: three floats per texel, linear red, green and blue, finite and >= 0.
+#define BK_TEXTURE_RGB32F 1
+
+// An image. The texels are copied.
+typedef struct bk_texture_desc {
+  // Size of this structure in bytes, set by bk_texture_init.
+  uint32_t struct_size;
+  // One of BK_TEXTURE. Default: BK_TEXTURE_RGBA8_SRGB.
+  uint32_t format;
+  // Texels along u, 1 to 16384.
+  uint32_t width;
+  // Texels along v, 1 to 16384.
+  uint32_t height;
+  // height rows of width texels. Row 0 lies at v = 0 and the first texel of a row at u = 0, as in glTF.
+  const void *data;
+  // Bytes from one row to the next, at least those of a row; 0: packed.
+  size_t row_stride;
+} bk_texture_desc;
+
+// Fills in the defaults.
+BK_API void bk_texture_init(bk_texture_desc *desc);
+
+// Adds an environment, for lights of type BK_LIGHT_SKY. Its format must be BK_TEXTURE_RGB32F. It takes 16
+// bytes per texel.
+//
+// out_id: receives its number; NULL if not wanted. Numbers count up from 0 in the order of addition, apart
+// from those of other images.
+//
+// Fails with BK_ERROR_INVALID_ARGUMENT if a size or the stride is out of range, the format is another, data
+// is NULL or a texel is not finite or less than 0; with BK_ERROR_OUT_OF_MEMORY if there is no memory for a
+// copy; with BK_ERROR_INVALID_STATE after the commit.
+BK_API
+bk_result bk_scene_add_environment(bk_scene *scene,
+                                   const bk_texture_desc *desc,
+                                   uint32_t *out_id);
+
+/* ================================================================================================
  * Materials and meshes
  *
  * Added to a scene before its commit; vertices can move after it. A refused addition changes
@@ -516,12 +565,19 @@ BK_API bk_result bk_scene_mesh_geometry(const bk_scene *scene, uint32_t mesh, bk
 // at all beyond cone_outer, smoothly in between. color: radiant intensity on the axis in W/sr.
 #define BK_LIGHT_SPOT 2
 
-// Parallel light that travels along direction. color: irradiance on a perpendicular plane in W/m2.
+// Light from infinitely far away that travels along direction: parallel or, with an angular_radius,
+// from a disc of uniform radiance (the sun). color: irradiance on a plane that faces the middle of the
+// disc, with all of it above its horizon, in W/m2. A disc takes direct_samples shadow rays per point.
 #define BK_LIGHT_DIRECTIONAL 3
 
 // A parallelogram with a corner at position and the edges edge_u and edge_v, which radiates from
 // the side that edge_u x edge_v points to. color: radiance in W/(m2 sr). Rays do not hit it.
 #define BK_LIGHT_RECT 4
+
+// Light from all directions, infinitely far away: color is its radiance in W/(m2 sr) or, with an
+// environment, the factor of the image. Takes 4 direct_samples shadow rays per point. Gather rays that
+// leave the scene bring nothing: the sky is part of the direct light, as all lights are.
+#define BK_LIGHT_SKY 5
 
 // A light. Fields that its type does not use are ignored.
 typedef struct bk_light_desc {
@@ -543,6 +599,18 @@ typedef struct bk_light_desc {
   float cone_inner;
   // Spot: half angle of the whole cone, in radians, in (0, pi]. Default: pi/4.
   float cone_outer;
+  // Directional: radius of the disc in radians, in [0, pi/2]; less than 1e-5: parallel. The sun's is
+  // 0.00465. Default: 0.
+  float angular_radius;
+  // Sky: number of its image, see bk_scene_add_environment; BK_NONE: none, the same radiance from all
+  // directions. Default: BK_NONE.
+  uint32_t environment;
+  // Sky: where the zenith of the image is, of any length but 0. The front of the image then looks along
+  // -z, or along +y if up is less than 45 degrees from the z axis, made perpendicular to up. Default:
+  // (0, 1, 0).
+  float up[3];
+  // Sky: turns the image about up, counter-clockwise as seen from its tip, in radians. Default: 0.
+  float rotation;
 } bk_light_desc;
 
 // Fills in the defaults.
@@ -890,6 +958,17 @@ bk_result bk_lightmap_mesh_uvs(const bk_lightmap *lightmap,
 // Bit of left_out. No interpolation of shading normals.
 #define BK_LEFT_OUT_SHADING_NORMALS 128
 
+// Bit of left_out. No light from a sky.
+#define BK_LEFT_OUT_SKY 4096
+
+// Bit of left_out. No directional light with an angular_radius.
+#define BK_LEFT_OUT_SUN_DISC 8192
+
+// Bit of left_out. No choice among many lights: at most 64 point and spot lights, each of which gets a
+// shadow ray, and at most 64 rect lights and emissive triangles. More of either are sampled, with up to 4
+// direct_samples shadow rays for all.
+#define BK_LEFT_OUT_MANY_LIGHTS 16384
+
 // How to bake.
 typedef struct bk_bake_params {
   // Size of this structure in bytes, set by bk_bake_params_init.
@@ -905,8 +984,9 @@ typedef struct bk_bake_params {
   float radius;
   // Radius of the gather map's blur in its texels; 0: none. Default: 2.
   uint32_t blur_radius;
-  // Shadow rays per light map texel and area light, 1 to 4096 (of more than four area lights,
-  // four times as many rays are shared out). Default: 16.
+  // Shadow rays per light map texel and area light or disc of a directional light, 1 to 4096 (of
+  // more than four area lights, four times as many rays are shared out); four times as many per sky,
+  // and for all of many lights (BK_LEFT_OUT_MANY_LIGHTS). Default: 16.
   uint32_t direct_samples;
   // Seed of all random numbers. The same seed gives the same bits on any number of threads.
   // Default: 0.

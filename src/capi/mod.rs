@@ -32,3 +32,4 @@ pub mod photons;
 pub mod rays;
 pub mod read;
 pub mod scene;
+pub mod textures;

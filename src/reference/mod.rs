@@ -12,6 +12,7 @@ mod lights;
 mod oracle;
 mod path;
 mod random;
+mod sky;
 
 pub use geometry::{Geometry, Hit64, Ray64};
 pub use oracle::{Agreement, Candidate, Verdict};

@@ -3,7 +3,7 @@
 //!
 //! What it computes is what the library means: one-sided surfaces seen or hit from behind are black
 //! and absorb, two-sided ones reflect and emit on both sides, rect lights emit from one side and are
-//! not hit by rays, the background is black.
+//! not hit by rays, the background is black but for skies.
 
 use super::geometry::{Geometry, Hit64, Ray64};
 use super::lights::{Lights, rgb};
@@ -11,10 +11,11 @@ use super::random::{Random, cosine_direction};
 use crate::device::Device;
 use crate::error::{Result, invalid_argument};
 use crate::progress::Progress;
-use crate::scene::{Camera, Light, Material, Mesh, Scene, SceneData};
+use crate::scene::{Camera, Environment, Light, Material, Mesh, Scene, SceneData};
 use glam::{DVec3, Vec3};
 use rayon::prelude::*;
 use std::f64::consts::PI;
+use std::sync::Arc;
 
 /// Independent estimates from whose spread the standard error is taken.
 const BATCHES: u32 = 16;
@@ -88,15 +89,20 @@ pub struct PathTracer {
 impl PathTracer {
     /// Of a committed scene, with its lights of now.
     pub fn new(scene: &Scene) -> Self {
-        Self::from_parts(scene.meshes(), scene.materials(), &scene.lights())
+        Self::from_parts(scene.meshes(), scene.materials(), scene.environments(), &scene.lights())
     }
 
     /// Of a scene that has not been committed.
     pub fn from_data(data: &SceneData) -> Self {
-        Self::from_parts(data.meshes(), data.materials(), data.lights())
+        Self::from_parts(data.meshes(), data.materials(), data.environments(), data.lights())
     }
 
-    fn from_parts(meshes: &[Mesh], materials: &[Material], lights: &[Light]) -> Self {
+    fn from_parts(
+        meshes: &[Mesh],
+        materials: &[Material],
+        environments: &[Arc<Environment>],
+        lights: &[Light],
+    ) -> Self {
         let geometry = Geometry::new(meshes);
         let all = || meshes.iter().flat_map(|m| (0..m.indices.len()).map(move |t| (m, t)));
         let (lower, upper) = geometry.bounds();
@@ -105,7 +111,7 @@ impl PathTracer {
             material_of: all().map(|(m, t)| m.material(t)).collect(),
             corners: all().map(|(m, t)| m.corners(t)).collect(),
             materials: materials.to_vec(),
-            lights: Lights::new(meshes, materials, lights),
+            lights: Lights::new(meshes, materials, environments, lights),
             offset: OFFSET * (largest + (upper - lower).length()),
             geometry,
             max_bounces: u32::MAX,
@@ -232,7 +238,7 @@ impl PathTracer {
             let limit = hit.map_or(f64::INFINITY, |h| h.t);
             sum += self.lights.rects_along(ray.origin, ray.direction, limit, density);
         }
-        let Some(hit) = hit else { return sum };
+        let Some(hit) = hit else { return sum + self.lights.skies_along(ray.direction, density) };
         let material = &self.materials[self.material_of[hit.triangle as usize] as usize];
         if material.is_emissive()
             && let Some((_, point)) = self.surface(ray, hit)
@@ -415,8 +421,12 @@ mod tests {
 
     #[test]
     fn the_sun_gives_its_irradiance_times_cosine() {
-        let e = floor_under(Light::Directional { direction: Vec3::new(-3.0, 0.0, -4.0), irradiance: [2.0; 3] })
-            .irradiance(&UP, 16, 0, 0);
+        let e = floor_under(Light::Directional {
+            direction: Vec3::new(-3.0, 0.0, -4.0),
+            irradiance: [2.0; 3],
+            angular_radius: 0.0,
+        })
+        .irradiance(&UP, 16, 0, 0);
         assert!((e.direct[0] - 1.6).abs() < 1e-6);
         assert_eq!(e.indirect, [0.0; 3]);
     }
@@ -485,7 +495,8 @@ mod tests {
             data.add_light(Light::Point { position: Vec3::new(x, 0.0, 4.0), intensity: [25.0; 3] }).unwrap();
         }
         let sun = Vec3::new(0.0, -5.0, -1.0);
-        data.add_light(Light::Directional { direction: sun, irradiance: [26f32.sqrt(); 3] }).unwrap();
+        data.add_light(Light::Directional { direction: sun, irradiance: [26f32.sqrt(); 3], angular_radius: 0.0 })
+            .unwrap();
         // The square above the point hides the middle light; the sun comes in below it.
         let e = PathTracer::from_data(&data).irradiance(&UP, 1 << 14, 0, 0);
         assert_irradiance(&e, 2.0 * 25.0 * 0.8 / 25.0 + 1.0, 0.01);

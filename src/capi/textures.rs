@@ -1,0 +1,109 @@
+//! Textures
+//!
+//! Images that a scene uses. Added before its commit, and before what names them. Environments are the
+//! images of skies: the whole sphere of directions by longitude and latitude. Row 0 is at the zenith, the
+//! last row at the nadir; the middle of a row is the sky's front, and texels follow one another to the right
+//! as seen from inside. Each texel is an area of uniform radiance, without interpolation. A scene without
+//! images spends neither memory nor time on them.
+
+use super::args::{init, read_struct, sized_struct, write_optional};
+use super::error::{bk_result, call};
+use super::handles::{is_null, object};
+use super::scene::bk_scene;
+use crate::error::{Result, invalid_argument};
+use crate::scene::{Environment, MAX_ENVIRONMENT_SIZE};
+use std::ffi::c_void;
+
+/// Format: four bytes per texel, sRGB red, green and blue and linear alpha (255: opaque).
+pub const BK_TEXTURE_RGBA8_SRGB: u32 = 0;
+/// Format: three floats per texel, linear red, green and blue, finite and >= 0.
+pub const BK_TEXTURE_RGB32F: u32 = 1;
+
+/// An image. The texels are copied.
+#[repr(C)]
+#[derive(Clone, Copy)]
+pub struct bk_texture_desc {
+    /// Size of this structure in bytes, set by bk_texture_init.
+    pub struct_size: u32,
+    /// One of BK_TEXTURE. Default: BK_TEXTURE_RGBA8_SRGB.
+    pub format: u32,
+    /// Texels along u, 1 to 16384.
+    pub width: u32,
+    /// Texels along v, 1 to 16384.
+    pub height: u32,
+    /// height rows of width texels. Row 0 lies at v = 0 and the first texel of a row at u = 0, as in glTF.
+    pub data: *const c_void,
+    /// Bytes from one row to the next, at least those of a row; 0: packed.
+    pub row_stride: usize,
+}
+
+sized_struct!(bk_texture_desc, last: row_stride: usize, defaults: bk_texture_desc {
+    struct_size: size_of::<bk_texture_desc>() as u32,
+    format: BK_TEXTURE_RGBA8_SRGB,
+    width: 0,
+    height: 0,
+    data: std::ptr::null(),
+    row_stride: 0,
+});
+
+/// Fills in the defaults.
+#[unsafe(no_mangle)]
+pub unsafe extern "C" fn bk_texture_init(desc: *mut bk_texture_desc) {
+    // SAFETY: the caller's structure, or NULL.
+    unsafe { init(desc) }
+}
+
+/// Adds an environment, for lights of type BK_LIGHT_SKY. Its format must be BK_TEXTURE_RGB32F. It takes 16
+/// bytes per texel.
+///
+/// out_id: receives its number; NULL if not wanted. Numbers count up from 0 in the order of addition, apart
+/// from those of other images.
+///
+/// Fails with BK_ERROR_INVALID_ARGUMENT if a size or the stride is out of range, the format is another, data
+/// is NULL or a texel is not finite or less than 0; with BK_ERROR_OUT_OF_MEMORY if there is no memory for a
+/// copy; with BK_ERROR_INVALID_STATE after the commit.
+#[unsafe(no_mangle)]
+pub unsafe extern "C" fn bk_scene_add_environment(
+    scene: *mut bk_scene,
+    desc: *const bk_texture_desc,
+    out_id: *mut u32,
+) -> bk_result {
+    // SAFETY: desc, the texels and out_id are the caller's, or NULL.
+    call(|| unsafe {
+        let scene = object!(scene);
+        let environment = read_environment(&read_struct(desc, "desc")?)?;
+        let id = scene.describe("environments can be added", |d| Ok(d.data.add_environment(environment)))?;
+        write_optional(out_id, id)
+    })
+}
+
+/// # Safety
+/// `data` holds what the description says.
+unsafe fn read_environment(d: &bk_texture_desc) -> Result<Environment> {
+    if d.format != BK_TEXTURE_RGB32F {
+        return invalid_argument!("format is {}, not BK_TEXTURE_RGB32F, as environments need", d.format);
+    }
+    // Sizes before the texels: wrong ones must not be read by.
+    for (name, size) in [("width", d.width), ("height", d.height)] {
+        if !(1..=MAX_ENVIRONMENT_SIZE).contains(&size) {
+            return invalid_argument!("{name} is {size}, outside 1 to {MAX_ENVIRONMENT_SIZE}");
+        }
+    }
+    let (width, height) = (d.width as usize, d.height as usize);
+    let row = size_of::<[f32; 3]>() * width;
+    let stride = if d.row_stride == 0 { row } else { d.row_stride };
+    if stride < row || stride.checked_mul(height).is_none_or(|bytes| bytes > isize::MAX as usize) {
+        return invalid_argument!("row_stride is {stride}, less than the {row} bytes of a row or too large");
+    }
+    if d.data.is_null() {
+        return Err(is_null("data"));
+    }
+    let mut rgb = crate::memory::try_vec::<[f32; 3]>(width * height, "the environment")?;
+    for (y, texels) in rgb.chunks_exact_mut(width).enumerate() {
+        // SAFETY: by contract the row is there; as bytes it needs no alignment.
+        unsafe {
+            std::ptr::copy_nonoverlapping(d.data.cast::<u8>().add(y * stride), texels.as_mut_ptr().cast::<u8>(), row);
+        }
+    }
+    Environment::new(d.width, d.height, rgb)
+}
