@@ -460,11 +460,142 @@ static void lights(bk_scene *scene) {
     CHECK_ERROR(bk_scene_add_light(scene, &light, NULL), ARGUMENT, "inner 1");
     light.cone_outer = 4.0f;
     CHECK_ERROR(bk_scene_add_light(scene, &light, NULL), ARGUMENT, "outer 4");
+    light.type = BK_LIGHT_DIRECTIONAL;
+    light.angular_radius = 1.6f;
+    CHECK_ERROR(bk_scene_add_light(scene, &light, NULL), ARGUMENT, "angular radius is 1.6");
+    light.angular_radius = NAN;
+    CHECK_ERROR(bk_scene_add_light(scene, &light, NULL), ARGUMENT, "angular radius is NaN");
+    light.angular_radius = -0.1f;
+    CHECK_ERROR(bk_scene_add_light(scene, &light, NULL), ARGUMENT, "angular radius is -0.1");
+    light = lamp_desc();
+    light.type = BK_LIGHT_SKY;
+    light.environment = 0;
+    CHECK_ERROR(bk_scene_add_light(scene, &light, NULL), ARGUMENT, "environment 0 does not exist");
+    light.environment = BK_NONE;
+    light.rotation = INFINITY;
+    CHECK_ERROR(bk_scene_add_light(scene, &light, NULL), ARGUMENT, "rotation contains inf");
+    light.rotation = 0.0f;
+    light.up[1] = 0.0f;
+    CHECK_ERROR(bk_scene_add_light(scene, &light, NULL), ARGUMENT, "up is zero");
+    light.up[0] = NAN;
+    CHECK_ERROR(bk_scene_add_light(scene, &light, NULL), ARGUMENT, "up contains NaN");
+    light.type = 6;
+    CHECK_ERROR(bk_scene_add_light(scene, &light, NULL), ARGUMENT, "type is 6");
 
     light = lamp_desc();
     CHECK_ERROR(bk_scene_set_light(scene, 0, &light), ARGUMENT, "light 0");
     CHECK_OK(bk_scene_add_light(scene, &light, &lamp));
+    /* A program that was compiled before directional lights had discs. */
+    light.type = BK_LIGHT_DIRECTIONAL;
+    light.direction[2] = -1.0f;
+    light.angular_radius = NAN;
+    light.struct_size = (uint32_t)offsetof(bk_light_desc, angular_radius);
     CHECK_OK(bk_scene_set_light(scene, lamp, &light));
+    light = lamp_desc();
+    CHECK_OK(bk_scene_set_light(scene, lamp, &light));
+}
+
+/* Images of skies. */
+static void environments(bk_scene *scene) {
+    float texels[2][8][3];
+    bk_texture_desc image;
+    bk_light_desc sky = lamp_desc();
+    uint32_t id = BK_NONE;
+    int i;
+
+    for (i = 0; i < 2 * 8; i++) texels[i / 8][i % 8][0] = texels[i / 8][i % 8][1] = texels[i / 8][i % 8][2] = 1.0f;
+    bk_texture_init(&image);
+    CHECK_ERROR(bk_scene_add_environment(NULL, &image, NULL), ARGUMENT, "scene is NULL");
+    CHECK_ERROR(bk_scene_add_environment(scene, NULL, NULL), ARGUMENT, "desc is NULL");
+    CHECK_ERROR(bk_scene_add_environment(scene, &image, NULL), ARGUMENT, "format is 0");
+    image.format = 77;
+    CHECK_ERROR(bk_scene_add_environment(scene, &image, NULL), ARGUMENT, "format is 77");
+    image.format = BK_TEXTURE_RGB32F;
+    CHECK_ERROR(bk_scene_add_environment(scene, &image, NULL), ARGUMENT, "width is 0");
+    image.width = 4;
+    image.height = 20000;
+    CHECK_ERROR(bk_scene_add_environment(scene, &image, NULL), ARGUMENT, "height is 20000");
+    image.height = 2;
+    CHECK_ERROR(bk_scene_add_environment(scene, &image, NULL), ARGUMENT, "data is NULL");
+    image.data = texels;
+    image.row_stride = 47;
+    CHECK_ERROR(bk_scene_add_environment(scene, &image, NULL), ARGUMENT, "row_stride is 47");
+    image.row_stride = (size_t)-1;
+    CHECK_ERROR(bk_scene_add_environment(scene, &image, NULL), ARGUMENT, "row_stride is");
+    image.row_stride = sizeof texels[0];
+    texels[1][2][1] = NAN;
+    CHECK_ERROR(bk_scene_add_environment(scene, &image, NULL), ARGUMENT, "pixel (2, 1)");
+    texels[1][2][1] = -1.0f;
+    CHECK_ERROR(bk_scene_add_environment(scene, &image, NULL), ARGUMENT, "pixel (2, 1)");
+    texels[1][2][1] = 1.0f;
+    texels[1][4][0] = NAN; /* Beyond the row's four texels. */
+    image.struct_size = 8;
+    CHECK_ERROR(bk_scene_add_environment(scene, &image, NULL), ARGUMENT, "bk_texture_desc.struct_size is 8");
+    image.struct_size = sizeof image;
+    CHECK_OK(bk_scene_add_environment(scene, &image, &id));
+    CHECK(id == 0);
+    sky.type = BK_LIGHT_SKY;
+    sky.environment = 1;
+    CHECK_ERROR(bk_scene_add_light(scene, &sky, NULL), ARGUMENT, "environment 1 does not exist, the scene has 1");
+    sky.environment = id;
+    CHECK_OK(bk_scene_set_light(scene, 0, &sky));
+    sky = lamp_desc();
+    CHECK_OK(bk_scene_set_light(scene, 0, &sky));
+}
+
+/* An open floor under a sky gets pi times its radiance; the plan says what the scene needs. */
+static void sky(bk_device *device) {
+    const uint32_t distant = BK_LEFT_OUT_SKY | BK_LEFT_OUT_SUN_DISC | BK_LEFT_OUT_MANY_LIGHTS;
+    float white[2][3] = {{0.5f, 0.5f, 0.5f}, {0.5f, 0.5f, 0.5f}};
+    float pixels[32 * 32][3];
+    int with_image, i;
+
+    for (with_image = 0; with_image < 2; with_image++) {
+        bk_scene *scene = empty_scene(device);
+        bk_light_desc light = lamp_desc();
+        bk_texture_desc image;
+        bk_lightmap *lightmap;
+        bk_bake_params params = quick_bake();
+        bk_bake_stats stats;
+        float brightest = 0.0f;
+
+        bk_texture_init(&image);
+        image.format = BK_TEXTURE_RGB32F;
+        image.width = 1;
+        image.height = 2;
+        image.data = white;
+        add_floor(scene);
+        light.type = BK_LIGHT_SKY;
+        light.color[0] = light.color[1] = light.color[2] = with_image ? 2.0f : 1.0f;
+        if (with_image) CHECK_OK(bk_scene_add_environment(scene, &image, &light.environment));
+        CHECK_OK(bk_scene_add_light(scene, &light, NULL));
+        light.type = BK_LIGHT_DIRECTIONAL;
+        light.direction[2] = -1.0f;
+        light.angular_radius = 0.01f;
+        CHECK_OK(bk_scene_add_light(scene, &light, NULL));
+        CHECK_OK(bk_scene_commit(scene, NULL, NULL));
+        CHECK_ERROR(bk_scene_add_environment(scene, &image, NULL), STATE, "environments can be added");
+        lightmap = small_lightmap(scene, 32);
+        bk_bake_stats_init(&stats);
+        CHECK_OK(bk_bake(lightmap, &params, NULL, NULL, &stats));
+        CHECK((stats.left_out & distant) == BK_LEFT_OUT_MANY_LIGHTS);
+        CHECK_OK(bk_lightmap_read(lightmap, 0, BK_LAYER_DIRECT, BK_FORMAT_RGB32F, pixels, 0));
+        for (i = 0; i < 32 * 32; i++) brightest = pixels[i][0] > brightest ? pixels[i][0] : brightest;
+        if (with_image) {
+            CHECK(brightest > 4.5f && brightest < 6.5f);
+        } else {
+            CHECK(fabsf(brightest - 3.14159265f - 1.0f) < 1e-4f);
+        }
+        /* Away with both: the plan of the next bake leaves them out. */
+        light.type = BK_LIGHT_POINT;
+        light.position[2] = 1.0f;
+        CHECK_OK(bk_scene_set_light(scene, 0, &light));
+        CHECK_OK(bk_scene_set_light(scene, 1, &light));
+        CHECK_OK(bk_bake(lightmap, &params, NULL, NULL, &stats));
+        CHECK((stats.left_out & distant) == distant);
+        bk_lightmap_release(lightmap);
+        bk_scene_release(scene);
+    }
 }
 
 static void descriptions(bk_device *device) {
@@ -487,6 +618,7 @@ static void descriptions(bk_device *device) {
     textures(scene);
     meshes(scene);
     lights(scene);
+    environments(scene);
     bk_build_params_init(&build);
     build.bins = 1;
     CHECK_ERROR(bk_scene_set_build(scene, &build), ARGUMENT, "bins is 1");
@@ -862,6 +994,7 @@ int main(int argc, char **argv) {
     memory();
     bakes(device);
     no_lights(device);
+    sky(device);
     bk_device_release(device);
     return check_report("bad_input");
 }

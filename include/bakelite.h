@@ -242,11 +242,6 @@ typedef struct bk_load_info {
   uint64_t triangles;
   // Time to read the file, in seconds.
   double seconds;
-  // Textures added, the first with number first_texture. An image that cannot be read is told to the device's
-  // log as a warning, and its materials do without.
-  uint32_t textures;
-  // Number of the first texture added.
-  uint32_t first_texture;
 } bk_load_info;
 
 // How to build the acceleration structure.
@@ -310,8 +305,7 @@ BK_API void bk_scene_release(bk_scene *scene);
 // Sets struct_size and clears the rest.
 BK_API void bk_load_info_init(bk_load_info *info);
 
-// Adds what a scene file describes: meshes, materials (emissive ones included) with their textures (PNG and
-// JPEG), lights.
+// Adds what a scene file describes: meshes, materials (emissive ones included), lights.
 //
 // path: UTF-8, ending in .obj (with its .mtl), .ply, .gltf or .glb. out: what was added; NULL if
 // not wanted.
@@ -374,14 +368,18 @@ BK_API bk_result bk_scene_bounds(const bk_scene *scene, float lower[3], float up
 /* ================================================================================================
  * Textures
  *
- * Images that materials name: they colour surfaces and cut holes into them. Added to a scene before its
- * commit, and before the materials that name them. They are addressed by the first texture coordinates of
- * meshes (bk_mesh_desc.uvs), repeat beyond [0, 1], and are interpolated between the centres of texels. A
- * scene without textures spends neither memory nor time on them.
+ * Images that a scene uses. Added before its commit, and before what names them. Environments are the
+ * images of skies: the whole sphere of directions by longitude and latitude. Row 0 is at the zenith, the
+ * last row at the nadir; the middle of a row is the sky's front, and texels follow one another to the right
+ * as seen from inside. Each texel is an area of uniform radiance, without interpolation. A scene without
+ * images spends neither memory nor time on them.
  * ================================================================================================ */
 
 // Format: four bytes per texel, sRGB red, green and blue and linear alpha (255: opaque).
 #define BK_TEXTURE_RGBA8_SRGB 0
+
+// Format: three floats per texel, linear red, green and blue, finite and >= 0.
+#define BK_TEXTURE_RGB32F 1
 
 // An image. The texels are copied.
 typedef struct bk_texture_desc {
@@ -402,14 +400,19 @@ typedef struct bk_texture_desc {
 // Fills in the defaults.
 BK_API void bk_texture_init(bk_texture_desc *desc);
 
-// Adds a texture.
+// Adds an environment, for lights of type BK_LIGHT_SKY. Its format must be BK_TEXTURE_RGB32F. It takes 16
+// bytes per texel.
 //
-// out_id: receives its number, for materials; NULL if not wanted. Numbers count up from 0 in the order of
-// addition.
+// out_id: receives its number; NULL if not wanted. Numbers count up from 0 in the order of addition, apart
+// from those of other images.
 //
-// Fails with BK_ERROR_INVALID_ARGUMENT if a size or the stride is out of range, the format is unknown or data
-// is NULL, with BK_ERROR_OUT_OF_MEMORY if there is no memory for a copy.
-BK_API bk_result bk_scene_add_texture(bk_scene *scene, const bk_texture_desc *desc, uint32_t *out_id);
+// Fails with BK_ERROR_INVALID_ARGUMENT if a size or the stride is out of range, the format is another, data
+// is NULL or a texel is not finite or less than 0; with BK_ERROR_OUT_OF_MEMORY if there is no memory for a
+// copy; with BK_ERROR_INVALID_STATE after the commit.
+BK_API
+bk_result bk_scene_add_environment(bk_scene *scene,
+                                   const bk_texture_desc *desc,
+                                   uint32_t *out_id);
 
 /* ================================================================================================
  * Materials and meshes
@@ -422,7 +425,7 @@ BK_API bk_result bk_scene_add_texture(bk_scene *scene, const bk_texture_desc *de
  * ================================================================================================ */
 
 // Flag: the back side reflects and emits like the front. The back of a one-sided material absorbs
-// what meets it and is not transmitted.
+// what meets it.
 #define BK_MATERIAL_TWO_SIDED 1
 
 // Flag: refuse degenerate triangles and vertices that are not finite, naming the first, rather
@@ -435,21 +438,10 @@ typedef struct bk_material_desc {
   uint32_t struct_size;
   // BK_MATERIAL flags. Default: 0.
   uint32_t flags;
-  // Diffuse reflectance per channel, in [0, 1); with albedo_texture: its factor, in [0, 1]. Default: 0.5.
+  // Diffuse reflectance per channel, in [0, 1). Default: 0.5.
   float albedo[3];
   // Emitted radiance per channel in W/(m2 sr), >= 0. Default: 0.
   float emission[3];
-  // Number of the texture that is multiplied with albedo, the product being limited to 0.98; BK_NONE: none.
-  // Where a mesh has no uvs, albedo alone counts. Default: BK_NONE.
-  uint32_t albedo_texture;
-  // Points where the texture's alpha, interpolated and from 0 to 1, is less than this are holes, which rays and
-  // photons do not meet, from whichever side. In [0, 1]; not for materials that emit. Holes cost rays that
-  // meet them a second search. Default: 0, no holes.
-  float alpha_cutoff;
-  // Fraction of light per channel that passes straight through, from either side, as through a pane of
-  // stained glass; at most 1 together with albedo. It is not textured. Light of lamps that comes through
-  // is direct light. bk_intersect, bk_occluded and their like meet the surface all the same. Default: 0.
-  float transmission[3];
 } bk_material_desc;
 
 // An indexed triangle mesh. The arrays are copied.
@@ -472,7 +464,7 @@ typedef struct bk_mesh_desc {
   const float *normals;
   // Bytes from one normal to the next, at least 12; 0: packed.
   size_t normal_stride;
-  // Optional: vertex_count texture coordinates of two floats, which place the textures of materials.
+  // Optional: vertex_count texture coordinates of two floats. Kept for files that are saved.
   const float *uvs;
   // Bytes from one texture coordinate to the next, at least 8; 0: packed.
   size_t uv_stride;
@@ -510,7 +502,7 @@ typedef struct bk_mesh_view {
 // Fills in the defaults.
 BK_API void bk_material_desc_init(bk_material_desc *desc);
 
-// Adds a material. The texture that it names must have been added before.
+// Adds a material.
 //
 // out_id: receives its number, for meshes; NULL if not wanted. Numbers count up from 0 in the
 // order of addition.
@@ -573,12 +565,19 @@ BK_API bk_result bk_scene_mesh_geometry(const bk_scene *scene, uint32_t mesh, bk
 // at all beyond cone_outer, smoothly in between. color: radiant intensity on the axis in W/sr.
 #define BK_LIGHT_SPOT 2
 
-// Parallel light that travels along direction. color: irradiance on a perpendicular plane in W/m2.
+// Light from infinitely far away that travels along direction: parallel or, with an angular_radius,
+// from a disc of uniform radiance (the sun). color: irradiance on a plane that faces the middle of the
+// disc, with all of it above its horizon, in W/m2. A disc takes direct_samples shadow rays per point.
 #define BK_LIGHT_DIRECTIONAL 3
 
 // A parallelogram with a corner at position and the edges edge_u and edge_v, which radiates from
 // the side that edge_u x edge_v points to. color: radiance in W/(m2 sr). Rays do not hit it.
 #define BK_LIGHT_RECT 4
+
+// Light from all directions, infinitely far away: color is its radiance in W/(m2 sr) or, with an
+// environment, the factor of the image. Takes 4 direct_samples shadow rays per point. Gather rays that
+// leave the scene bring nothing: the sky is part of the direct light, as all lights are.
+#define BK_LIGHT_SKY 5
 
 // A light. Fields that its type does not use are ignored.
 typedef struct bk_light_desc {
@@ -600,6 +599,18 @@ typedef struct bk_light_desc {
   float cone_inner;
   // Spot: half angle of the whole cone, in radians, in (0, pi]. Default: pi/4.
   float cone_outer;
+  // Directional: radius of the disc in radians, in [0, pi/2]; less than 1e-5: parallel. The sun's is
+  // 0.00465. Default: 0.
+  float angular_radius;
+  // Sky: number of its image, see bk_scene_add_environment; BK_NONE: none, the same radiance from all
+  // directions. Default: BK_NONE.
+  uint32_t environment;
+  // Sky: where the zenith of the image is, of any length but 0. The front of the image then looks along
+  // -z, or along +y if up is less than 45 degrees from the z axis, made perpendicular to up. Default:
+  // (0, 1, 0).
+  float up[3];
+  // Sky: turns the image about up, counter-clockwise as seen from its tip, in radians. Default: 0.
+  float rotation;
 } bk_light_desc;
 
 // Fills in the defaults.
@@ -947,14 +958,16 @@ bk_result bk_lightmap_mesh_uvs(const bk_lightmap *lightmap,
 // Bit of left_out. No interpolation of shading normals.
 #define BK_LEFT_OUT_SHADING_NORMALS 128
 
-// Bit of left_out. No look-ups of albedo textures.
-#define BK_LEFT_OUT_TEXTURES 256
+// Bit of left_out. No light from a sky.
+#define BK_LEFT_OUT_SKY 4096
 
-// Bit of left_out. No tests for holes that textures cut out.
-#define BK_LEFT_OUT_CUTOUTS 512
+// Bit of left_out. No directional light with an angular_radius.
+#define BK_LEFT_OUT_SUN_DISC 8192
 
-// Bit of left_out. No light through surfaces.
-#define BK_LEFT_OUT_TRANSMISSION 1024
+// Bit of left_out. No choice among many lights: at most 64 point and spot lights, each of which gets a
+// shadow ray, and at most 64 rect lights and emissive triangles. More of either are sampled, with up to 4
+// direct_samples shadow rays for all.
+#define BK_LEFT_OUT_MANY_LIGHTS 16384
 
 // How to bake.
 typedef struct bk_bake_params {
@@ -971,8 +984,9 @@ typedef struct bk_bake_params {
   float radius;
   // Radius of the gather map's blur in its texels; 0: none. Default: 2.
   uint32_t blur_radius;
-  // Shadow rays per light map texel and area light, 1 to 4096 (of more than four area lights,
-  // four times as many rays are shared out). Default: 16.
+  // Shadow rays per light map texel and area light or disc of a directional light, 1 to 4096 (of
+  // more than four area lights, four times as many rays are shared out); four times as many per sky,
+  // and for all of many lights (BK_LEFT_OUT_MANY_LIGHTS). Default: 16.
   uint32_t direct_samples;
   // Seed of all random numbers. The same seed gives the same bits on any number of threads.
   // Default: 0.

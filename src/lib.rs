@@ -24,7 +24,7 @@
 //!
 //! Right-handed coordinates, any up axis, counter-clockwise front faces, linear RGB. Point and
 //! spot lights are given by radiant intensity (W/sr), directional lights by irradiance on a
-//! perpendicular plane (W/m²), area lights and emissive materials by radiance (W/(m²·sr)). Light
+//! perpendicular plane (W/m²), area lights, skies and emissive materials by radiance (W/(m²·sr)). Light
 //! maps hold irradiance E (W/m²): a shader shows albedo/π · E. All surfaces are diffuse.
 
 pub mod bvh;

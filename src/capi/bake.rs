@@ -34,6 +34,14 @@ pub const BK_LEFT_OUT_TEXTURES: u32 = 256;
 pub const BK_LEFT_OUT_CUTOUTS: u32 = 512;
 /// Bit of left_out. No light through surfaces.
 pub const BK_LEFT_OUT_TRANSMISSION: u32 = 1024;
+/// Bit of left_out. No light from a sky.
+pub const BK_LEFT_OUT_SKY: u32 = 4096;
+/// Bit of left_out. No directional light with an angular_radius.
+pub const BK_LEFT_OUT_SUN_DISC: u32 = 8192;
+/// Bit of left_out. No choice among many lights: at most 64 point and spot lights, each of which gets a
+/// shadow ray, and at most 64 rect lights and emissive triangles. More of either are sampled, with up to 4
+/// direct_samples shadow rays for all.
+pub const BK_LEFT_OUT_MANY_LIGHTS: u32 = 16384;
 
 // The numbers are literal for the header's sake.
 const _: () = assert!(
@@ -48,6 +56,9 @@ const _: () = assert!(
         && BK_LEFT_OUT_TEXTURES == left_out::TEXTURES
         && BK_LEFT_OUT_CUTOUTS == left_out::CUTOUTS
         && BK_LEFT_OUT_TRANSMISSION == left_out::TRANSMISSION
+        && BK_LEFT_OUT_SKY == left_out::SKY
+        && BK_LEFT_OUT_SUN_DISC == left_out::SUN_DISC
+        && BK_LEFT_OUT_MANY_LIGHTS == left_out::MANY_LIGHTS
 );
 
 /// How to bake.
@@ -67,8 +78,9 @@ pub struct bk_bake_params {
     pub radius: f32,
     /// Radius of the gather map's blur in its texels; 0: none. Default: 2.
     pub blur_radius: u32,
-    /// Shadow rays per light map texel and area light, 1 to 4096 (of more than four area lights,
-    /// four times as many rays are shared out). Default: 16.
+    /// Shadow rays per light map texel and area light or disc of a directional light, 1 to 4096 (of
+    /// more than four area lights, four times as many rays are shared out); four times as many per sky,
+    /// and for all of many lights (BK_LEFT_OUT_MANY_LIGHTS). Default: 16.
     pub direct_samples: u32,
     /// Seed of all random numbers. The same seed gives the same bits on any number of threads.
     /// Default: 0.

@@ -3,7 +3,7 @@
 //! Added to a scene before its commit, changed at any time. Emissive materials make lights too.
 
 use super::args::{init, read_struct, sized_struct, write_optional};
-use super::error::{bk_result, call, call_or};
+use super::error::{BK_NONE, bk_result, call, call_or};
 use super::handles::object;
 use super::scene::bk_scene;
 use crate::error::{Result, invalid_argument};
@@ -15,11 +15,17 @@ pub const BK_LIGHT_POINT: u32 = 1;
 /// Radiates from a position in a cone around direction: fully up to cone_inner radians from it, not
 /// at all beyond cone_outer, smoothly in between. color: radiant intensity on the axis in W/sr.
 pub const BK_LIGHT_SPOT: u32 = 2;
-/// Parallel light that travels along direction. color: irradiance on a perpendicular plane in W/m2.
+/// Light from infinitely far away that travels along direction: parallel or, with an angular_radius,
+/// from a disc of uniform radiance (the sun). color: irradiance on a plane that faces the middle of the
+/// disc, with all of it above its horizon, in W/m2. A disc takes direct_samples shadow rays per point.
 pub const BK_LIGHT_DIRECTIONAL: u32 = 3;
 /// A parallelogram with a corner at position and the edges edge_u and edge_v, which radiates from
 /// the side that edge_u x edge_v points to. color: radiance in W/(m2 sr). Rays do not hit it.
 pub const BK_LIGHT_RECT: u32 = 4;
+/// Light from all directions, infinitely far away: color is its radiance in W/(m2 sr) or, with an
+/// environment, the factor of the image. Takes 4 direct_samples shadow rays per point. Gather rays that
+/// leave the scene bring nothing: the sky is part of the direct light, as all lights are.
+pub const BK_LIGHT_SKY: u32 = 5;
 
 /// A light. Fields that its type does not use are ignored.
 #[repr(C)]
@@ -43,6 +49,18 @@ pub struct bk_light_desc {
     pub cone_inner: f32,
     /// Spot: half angle of the whole cone, in radians, in (0, pi]. Default: pi/4.
     pub cone_outer: f32,
+    /// Directional: radius of the disc in radians, in [0, pi/2]; less than 1e-5: parallel. The sun's is
+    /// 0.00465. Default: 0.
+    pub angular_radius: f32,
+    /// Sky: number of its image, see bk_scene_add_environment; BK_NONE: none, the same radiance from all
+    /// directions. Default: BK_NONE.
+    pub environment: u32,
+    /// Sky: where the zenith of the image is, of any length but 0. The front of the image then looks along
+    /// -z, or along +y if up is less than 45 degrees from the z axis, made perpendicular to up. Default:
+    /// (0, 1, 0).
+    pub up: [f32; 3],
+    /// Sky: turns the image about up, counter-clockwise as seen from its tip, in radians. Default: 0.
+    pub rotation: f32,
 }
 
 sized_struct!(bk_light_desc, last: cone_outer: f32, defaults: bk_light_desc {
@@ -55,6 +73,10 @@ sized_struct!(bk_light_desc, last: cone_outer: f32, defaults: bk_light_desc {
     color: [1.0; 3],
     cone_inner: 0.0,
     cone_outer: std::f32::consts::FRAC_PI_4,
+    angular_radius: 0.0,
+    environment: BK_NONE,
+    up: [0.0, 1.0, 0.0],
+    rotation: 0.0,
 });
 
 /// Fills in the defaults.
@@ -107,12 +129,20 @@ fn light(d: &bk_light_desc) -> Result<Light> {
         BK_LIGHT_SPOT => {
             Ok(Light::Spot { position, direction, inner: d.cone_inner, outer: d.cone_outer, intensity: d.color })
         }
-        BK_LIGHT_DIRECTIONAL => Ok(Light::Directional { direction, irradiance: d.color }),
+        BK_LIGHT_DIRECTIONAL => {
+            Ok(Light::Directional { direction, irradiance: d.color, angular_radius: d.angular_radius })
+        }
         BK_LIGHT_RECT => Ok(Light::Rect {
             position,
             edge_u: Vec3::from_array(d.edge_u),
             edge_v: Vec3::from_array(d.edge_v),
             radiance: d.color,
+        }),
+        BK_LIGHT_SKY => Ok(Light::Sky {
+            radiance: d.color,
+            environment: d.environment,
+            up: Vec3::from_array(d.up),
+            rotation: d.rotation,
         }),
         other => invalid_argument!("type is {other}, not one of the BK_LIGHT values"),
     }

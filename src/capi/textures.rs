@@ -1,20 +1,29 @@
 //! Textures
 //!
-//! Images that materials name: they colour surfaces and cut holes into them. Added to a scene before its
-//! commit, and before the materials that name them. They are addressed by the first texture coordinates of
-//! meshes (bk_mesh_desc.uvs), repeat beyond [0, 1], and are interpolated between the centres of texels. A
-//! scene without textures spends neither memory nor time on them.
+//! Images that a scene uses. Added before its commit, and before what names them.
+//!
+//! Textures colour surfaces and cut holes into them. They are addressed by the first texture coordinates of
+//! meshes (bk_mesh_desc.uvs), repeat beyond [0, 1], and are interpolated between the centres of texels.
+//!
+//! Environments are the images of skies: the whole sphere of directions by longitude and latitude. Row 0 is at
+//! the zenith, the last row at the nadir; the middle of a row is the sky's front, and texels follow one another
+//! to the right as seen from inside. Each texel is an area of uniform radiance, without interpolation.
+//!
+//! A scene without images spends neither memory nor time on them.
 
 use super::args::{init, read_struct, sized_struct, write_optional};
 use super::error::{bk_result, call};
 use super::handles::{is_null, object};
 use super::scene::bk_scene;
 use crate::error::{Result, invalid_argument};
-use crate::scene::{MAX_TEXTURE_SIZE, Texture};
+use crate::scene::{Environment, MAX_ENVIRONMENT_SIZE, MAX_TEXTURE_SIZE, Texture};
+use bytemuck::Pod;
 use std::ffi::c_void;
 
 /// Format: four bytes per texel, sRGB red, green and blue and linear alpha (255: opaque).
 pub const BK_TEXTURE_RGBA8_SRGB: u32 = 0;
+/// Format: three floats per texel, linear red, green and blue, finite and >= 0.
+pub const BK_TEXTURE_RGB32F: u32 = 1;
 
 /// An image. The texels are copied.
 #[repr(C)]
@@ -78,14 +87,58 @@ unsafe fn read_texture(d: &bk_texture_desc) -> Result<Texture> {
     if d.format != BK_TEXTURE_RGBA8_SRGB {
         return invalid_argument!("format is {}, not one of BK_TEXTURE_*", d.format);
     }
+    // SAFETY: forwarded.
+    let rgba8 = unsafe { texels(d, MAX_TEXTURE_SIZE, "the texture")? };
+    Ok(Texture { width: d.width, height: d.height, rgba8 })
+}
+
+/// Adds an environment, for lights of type BK_LIGHT_SKY. Its format must be BK_TEXTURE_RGB32F. It takes 16
+/// bytes per texel.
+///
+/// out_id: receives its number; NULL if not wanted. Numbers count up from 0 in the order of addition, apart
+/// from those of other images.
+///
+/// Fails with BK_ERROR_INVALID_ARGUMENT if a size or the stride is out of range, the format is another, data
+/// is NULL or a texel is not finite or less than 0; with BK_ERROR_OUT_OF_MEMORY if there is no memory for a
+/// copy; with BK_ERROR_INVALID_STATE after the commit.
+#[unsafe(no_mangle)]
+pub unsafe extern "C" fn bk_scene_add_environment(
+    scene: *mut bk_scene,
+    desc: *const bk_texture_desc,
+    out_id: *mut u32,
+) -> bk_result {
+    // SAFETY: desc, the texels and out_id are the caller's, or NULL.
+    call(|| unsafe {
+        let scene = object!(scene);
+        let environment = read_environment(&read_struct(desc, "desc")?)?;
+        let id = scene.describe("environments can be added", |d| Ok(d.data.add_environment(environment)))?;
+        write_optional(out_id, id)
+    })
+}
+
+/// # Safety
+/// `data` holds what the description says.
+unsafe fn read_environment(d: &bk_texture_desc) -> Result<Environment> {
+    if d.format != BK_TEXTURE_RGB32F {
+        return invalid_argument!("format is {}, not BK_TEXTURE_RGB32F, as environments need", d.format);
+    }
+    // SAFETY: forwarded.
+    Environment::new(d.width, d.height, unsafe { texels(d, MAX_ENVIRONMENT_SIZE, "the environment")? })
+}
+
+/// A copy of an image's texels.
+///
+/// # Safety
+/// `data` holds what the description says, in texels of type `T`.
+unsafe fn texels<T: Pod + Default>(d: &bk_texture_desc, most: u32, what: &str) -> Result<Vec<T>> {
     // Sizes before the texels: wrong ones must not be read by.
     for (name, size) in [("width", d.width), ("height", d.height)] {
-        if !(1..=MAX_TEXTURE_SIZE).contains(&size) {
-            return invalid_argument!("{name} is {size}, outside 1 to {MAX_TEXTURE_SIZE}");
+        if !(1..=most).contains(&size) {
+            return invalid_argument!("{name} is {size}, outside 1 to {most}");
         }
     }
     let (width, height) = (d.width as usize, d.height as usize);
-    let row = 4 * width;
+    let row = size_of::<T>() * width;
     let stride = if d.row_stride == 0 { row } else { d.row_stride };
     if stride < row || stride.checked_mul(height).is_none_or(|bytes| bytes > isize::MAX as usize) {
         return invalid_argument!("row_stride is {stride}, less than the {row} bytes of a row or too large");
@@ -93,12 +146,12 @@ unsafe fn read_texture(d: &bk_texture_desc) -> Result<Texture> {
     if d.data.is_null() {
         return Err(is_null("data"));
     }
-    let mut rgba8 = crate::memory::try_vec::<[u8; 4]>(width * height, "the texture")?;
-    for (y, texels) in rgba8.chunks_exact_mut(width).enumerate() {
-        // SAFETY: by contract the row is there; bytes need no alignment.
+    let mut out = crate::memory::try_vec::<T>(width * height, what)?;
+    for (y, texels) in out.chunks_exact_mut(width).enumerate() {
+        // SAFETY: by contract the row is there; as bytes it needs no alignment.
         unsafe {
             std::ptr::copy_nonoverlapping(d.data.cast::<u8>().add(y * stride), texels.as_mut_ptr().cast::<u8>(), row);
         }
     }
-    Ok(Texture { width: d.width, height: d.height, rgba8 })
+    Ok(out)
 }

@@ -246,7 +246,7 @@ impl Reader<'_> {
             Kind::Spot { inner_cone_angle: inner, outer_cone_angle: outer } => {
                 Light::Spot { position, direction, inner, outer, intensity: color }
             }
-            Kind::Directional => Light::Directional { direction, irradiance: color },
+            Kind::Directional => Light::Directional { direction, irradiance: color, angular_radius: 0.0 },
         };
         let number = self.import.scene.lights().len();
         match self.import.scene.add_light(light) {
@@ -793,7 +793,7 @@ pub(super) mod tests {
         assert_eq!(intensity, [10.0, 5.0, 0.0]);
         let point = lamp(json!({ "type": "point" }));
         assert_eq!(point, Light::Point { position: Vec3::new(10.0, 5.0, 0.0), intensity: [1.0; 3] });
-        let Light::Directional { direction, irradiance } = lamp(json!({ "type": "directional", "intensity": 3 }))
+        let Light::Directional { direction, irradiance, .. } = lamp(json!({ "type": "directional", "intensity": 3 }))
         else {
             panic!()
         };

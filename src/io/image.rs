@@ -1,14 +1,16 @@
-//! Image files: OpenEXR for values, PNG for looking at, and the tone mapping between them.
+//! Image files: OpenEXR for values, PNG for looking at, and the tone mapping between them; skies from
+//! OpenEXR and Radiance HDR files.
 //!
 //! Rows are written in the order in which they are given, nothing is flipped: row 0 of a light map
 //! page is v = 0 and becomes the top row of the file, which is where glTF and Vulkan have v = 0.
 //! (OpenGL tools that expect v = 0 at the bottom show such files upside down.)
 
 use crate::error::{Error, Result, invalid_argument};
+use crate::scene::{Environment, MAX_COORDINATE};
 use image::ExtendedColorType::{L8, Rgb8, Rgb32F};
-use image::ImageEncoder;
 use image::codecs::openexr::OpenExrEncoder;
 use image::codecs::png::{CompressionType, FilterType, PngEncoder};
+use image::{ImageEncoder, ImageFormat};
 use std::io::Cursor;
 use std::path::Path;
 
@@ -19,6 +21,21 @@ pub fn write_exr(path: &Path, width: u32, height: u32, pixels: &[[f32; 3]]) -> R
     let bytes = bytemuck::cast_slice(pixels);
     OpenExrEncoder::new(&mut file).write_image(bytes, width, height, Rgb32F).map_err(|e| fail(path, e))?;
     write(path, file.get_ref())
+}
+
+/// Reads the image of a sky from an OpenEXR or Radiance HDR file, in linear RGB. Negative values and those
+/// that are not numbers, which cameras and filters leave in such files, become 0; too large ones the largest.
+pub fn read_environment(path: &Path) -> Result<Environment> {
+    let reader = image::ImageReader::open(path).and_then(|r| r.with_guessed_format()).map_err(|e| fail(path, e))?;
+    match reader.format() {
+        Some(ImageFormat::Hdr | ImageFormat::OpenExr) => {}
+        _ => return Err(fail(path, "neither an OpenEXR nor a Radiance HDR file")),
+    }
+    let image = reader.decode().map_err(|e| fail(path, e))?.into_rgb32f();
+    let (width, height) = image.dimensions();
+    let value = |c: f32| if c > 0.0 { c.min(MAX_COORDINATE) } else { 0.0 };
+    let rgb = image.pixels().map(|p| p.0.map(value)).collect();
+    Environment::new(width, height, rgb).map_err(|e| fail(path, e))
 }
 
 /// Writes single values as an OpenEXR file of 32-bit floats, the same in R, G and B.
@@ -128,6 +145,26 @@ mod tests {
         assert_eq!(back.as_raw()[..], *pixels.as_flattened());
         write_exr_grey(&path, 3, 1, &[1.0, 0.5, 0.25]).unwrap();
         assert_eq!(image::open(&path).unwrap().into_rgb32f().as_raw()[3..6], [0.5; 3]);
+    }
+
+    #[test]
+    fn skies_are_read_from_exr_and_hdr_files_and_from_nothing_else() {
+        let folder = Folder::new();
+        let exr = folder.path("sky.exr");
+        write_exr(&exr, 2, 1, &[[1.5, -2.0, f32::NAN], [3.0, f32::INFINITY, 0.25]]).unwrap();
+        let sky = read_environment(&exr).unwrap();
+        assert_eq!((sky.size(), sky.rgb()), ((2, 1), &[[1.5, 0.0, 0.0], [3.0, MAX_COORDINATE, 0.25]][..]));
+        let hdr = folder.path("sky.hdr");
+        let file = b"#?RADIANCE\nFORMAT=32-bit_rle_rgbe\n\n-Y 1 +X 2\n\x80\x40\x00\x81\x00\x00\x00\x00";
+        std::fs::write(&hdr, file).unwrap();
+        assert_eq!(read_environment(&hdr).unwrap().rgb(), [[1.0, 0.5, 0.0], [0.0; 3]]);
+        let png = folder.path("sky.png");
+        write_png_rgb8(&png, 1, 1, &[[9; 3]]).unwrap();
+        for path in [png, folder.path("no.exr")] {
+            assert!(
+                matches!(read_environment(&path), Err(Error::Io(m)) if m.contains("sky.png") || m.contains("no.exr"))
+            );
+        }
     }
 
     #[test]

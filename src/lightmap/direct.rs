@@ -8,18 +8,22 @@
 //!
 //! Where surfaces transmit light, what comes along a ray is multiplied with what they let through.
 
-use super::polygon;
-use crate::sampling::{combine, sobol_2d, uniform_triangle};
-use crate::scene::{Light, Scene};
+use super::area::AreaLight;
+use super::distant::{Disc, push_sky};
+use super::many::ManyLights;
+use crate::sampling::{combine, sobol_2d};
+use crate::scene::{Light, Scene, Sky};
 use crate::trace::Ray;
 use crate::trace::offset::{SurfacePoint, offset_ray_origin};
 use glam::Vec3;
 use std::sync::Arc;
 
-/// Up to this many area lights are evaluated exactly at every point.
-const MAX_ANALYTIC: usize = 64;
+/// Up to this many area lights are evaluated exactly at every point, and up to this many point and
+/// spot lights get a ray each: no noise, and no more rays than sampling takes.
+const MAX_EXACT: usize = 64;
 
-/// Rays to area lights from one point, at most: this many times those for one light.
+/// Rays to area lights from one point, at most, and to all of many lights: this many times those for
+/// one light.
 const MAX_LIGHTS_SAMPLED: usize = 4;
 
 /// Shadow rays end this far before a light, as a fraction of the way.
@@ -50,57 +54,7 @@ impl Receiver {
     }
 }
 
-/// A parallelogram or a triangle that emits.
-#[derive(Clone, Copy, Debug)]
-struct AreaLight {
-    corner: Vec3,
-    edge_u: Vec3,
-    edge_v: Vec3,
-    /// Unit normal of the emitting side.
-    normal: Vec3,
-    area: f32,
-    triangle: bool,
-    two_sided: bool,
-    radiance: Vec3,
-}
-
-impl AreaLight {
-    /// Unoccluded irradiance for radiance 1.
-    fn irradiance(&self, receiver: &Receiver) -> f64 {
-        let o = receiver.origin.as_dvec3();
-        let c = self.corner.as_dvec3() - o;
-        let (u, v) = (self.edge_u.as_dvec3(), self.edge_v.as_dvec3());
-        if !self.two_sided && c.dot(self.normal.as_dvec3()) >= 0.0 {
-            return 0.0;
-        }
-        let normal = receiver.normal.as_dvec3();
-        if self.triangle {
-            polygon::irradiance(&[c, c + u, c + v], normal)
-        } else {
-            polygon::irradiance(&[c, c + u, c + u + v, c + v], normal)
-        }
-    }
-
-    /// A point on the light, uniform in area.
-    fn sample(&self, u: [f32; 2]) -> Vec3 {
-        let [u, v] = if self.triangle { uniform_triangle(u) } else { u };
-        self.corner + u * self.edge_u + v * self.edge_v
-    }
-
-    /// cos cos'/d² between a point of the light and a receiver: irradiance per area for radiance 1.
-    fn geometry_term(&self, receiver: &Receiver, point: Vec3) -> f32 {
-        let way = point - receiver.origin;
-        let d2 = way.length_squared();
-        if d2 == 0.0 {
-            return 0.0;
-        }
-        let there = -way.dot(self.normal);
-        let there = if self.two_sided { there.abs() } else { there.max(0.0) };
-        way.dot(receiver.normal).max(0.0) * there / (d2 * d2)
-    }
-}
-
-fn shadow_ray(receiver: &Receiver, target: Vec3) -> Ray {
+pub(super) fn shadow_ray(receiver: &Receiver, target: Vec3) -> Ray {
     Ray::new(receiver.origin, target - receiver.origin).within(0.0, 1.0 - LIGHT_MARGIN)
 }
 
@@ -108,7 +62,7 @@ fn shadow_ray(receiver: &Receiver, target: Vec3) -> Ray {
 const TOGETHER: usize = 32;
 
 /// Shadow rays and the light that comes along them if nothing is in the way.
-struct ShadowRays<'a> {
+pub(super) struct ShadowRays<'a> {
     scene: &'a Scene,
     rays: [Ray; TOGETHER],
     light: [Vec3; TOGETHER],
@@ -118,12 +72,12 @@ struct ShadowRays<'a> {
 }
 
 impl<'a> ShadowRays<'a> {
-    fn new(scene: &'a Scene) -> Self {
+    pub(super) fn new(scene: &'a Scene) -> Self {
         let rays = [Ray::new(Vec3::ZERO, Vec3::ZERO); TOGETHER];
         ShadowRays { scene, rays, light: [Vec3::ZERO; TOGETHER], count: 0, traced: 0, visible: Vec3::ZERO }
     }
 
-    fn push(&mut self, ray: Ray, light: Vec3) {
+    pub(super) fn push(&mut self, ray: Ray, light: Vec3) {
         if self.count == TOGETHER {
             self.trace();
         }
@@ -151,7 +105,7 @@ impl<'a> ShadowRays<'a> {
     }
 
     /// The light that arrives; adds the rays traced to `rays`.
-    fn finish(mut self, rays: &mut u64) -> Vec3 {
+    pub(super) fn finish(mut self, rays: &mut u64) -> Vec3 {
         self.trace();
         *rays += self.traced;
         self.visible
@@ -161,133 +115,122 @@ impl<'a> ShadowRays<'a> {
 /// The lights of a scene, ready to be sampled.
 pub struct DirectLight {
     scene: Arc<Scene>,
-    lights: Arc<Vec<Light>>,
+    /// Lights that each get a ray from every point: parallel ones, and few point and spot lights.
+    each: Vec<Light>,
+    /// Few area lights.
     areas: Vec<AreaLight>,
-    /// Cumulative power of `areas`, normalised, for the many-light case.
-    power_cdf: Vec<f32>,
+    area_count: usize,
+    discs: Vec<Disc>,
+    skies: Vec<Sky>,
+    /// Many point and spot lights, many area lights.
+    many: Option<ManyLights>,
 }
 
 impl DirectLight {
     /// A snapshot of a scene's lights.
     pub fn new(scene: &Arc<Scene>) -> DirectLight {
         let lights = scene.lights();
-        let mut areas = Vec::new();
-        for light in lights.iter() {
-            if let Light::Rect { position, edge_u, edge_v, radiance } = *light {
-                let cross = edge_u.as_dvec3().cross(edge_v.as_dvec3());
-                areas.push(AreaLight {
-                    corner: position,
-                    edge_u,
-                    edge_v,
-                    normal: cross.normalize().as_vec3(),
-                    area: cross.length() as f32,
-                    triangle: false,
-                    two_sided: false,
-                    radiance: Vec3::from(radiance),
-                });
-            }
-        }
-        areas.extend(scene.emitters().iter().map(|e| AreaLight {
-            corner: e.corner,
-            edge_u: e.edge_u,
-            edge_v: e.edge_v,
-            normal: e.normal,
-            area: e.area,
-            triangle: true,
-            two_sided: e.two_sided,
-            radiance: Vec3::from(e.radiance),
-        }));
+        let mut areas: Vec<AreaLight> = lights.iter().filter_map(AreaLight::rect).collect();
+        areas.extend(scene.emitters().iter().map(AreaLight::emitter));
         areas.retain(|a| a.radiance.max_element() > 0.0 && a.area > 0.0);
-        let total: f64 = areas.iter().map(|a| (a.radiance.element_sum() * a.area) as f64).sum();
-        let mut below = 0.0;
-        let power_cdf = areas
+        let shines = |l: &&Light| l.color().iter().any(|&c| c > 0.0);
+        let (points, mut each): (Vec<Light>, Vec<Light>) = lights
             .iter()
-            .map(|a| {
-                below += (a.radiance.element_sum() * a.area) as f64 / total;
-                below as f32
-            })
-            .collect();
-        DirectLight { scene: scene.clone(), lights, areas, power_cdf }
+            .filter(|l| !matches!(l, Light::Rect { .. } | Light::Sky { .. }))
+            .filter(|l| !matches!(l, Light::Directional { angular_radius, .. } if *angular_radius > 0.0))
+            .filter(shines)
+            .partition(|l| matches!(l, Light::Point { .. } | Light::Spot { .. }));
+        let discs = lights.iter().filter(shines).filter_map(|l| match *l {
+            Light::Directional { direction, irradiance, angular_radius } if angular_radius > 0.0 => {
+                Some(Disc { to_light: -direction, irradiance: Vec3::from(irradiance), angular_radius })
+            }
+            _ => None,
+        });
+        let skies = lights.iter().filter_map(|l| scene.sky(l)).filter(|s| !s.is_dark());
+        let area_count = areas.len();
+        let few_points = points.len() <= MAX_EXACT;
+        let few_areas = area_count <= MAX_EXACT;
+        let many = ManyLights::new(if few_points { &[] } else { &points }, if few_areas { &[] } else { &areas });
+        if few_points {
+            each.extend(points);
+        }
+        if !few_areas {
+            areas = Vec::new();
+        }
+        DirectLight {
+            scene: scene.clone(),
+            each,
+            areas,
+            area_count,
+            discs: discs.collect(),
+            skies: skies.collect(),
+            many: (many.len() > 0).then_some(many),
+        }
     }
 
     /// Rect lights and emissive triangles.
     pub fn area_light_count(&self) -> usize {
-        self.areas.len()
+        self.area_count
+    }
+
+    /// Lights that are sampled because they are many.
+    pub fn many_light_count(&self) -> usize {
+        self.many.as_ref().map_or(0, ManyLights::len)
+    }
+
+    /// Directional lights with a disc.
+    pub fn disc_count(&self) -> usize {
+        self.discs.len()
+    }
+
+    /// Skies that shine.
+    pub fn sky_count(&self) -> usize {
+        self.skies.len()
     }
 
     /// Rays that [`irradiance`](Self::irradiance) traces where all lights shine.
     pub fn rays_per_point(&self, samples: u32) -> f32 {
-        let others = self.lights.iter().filter(|l| !matches!(l, Light::Rect { .. })).count();
-        (others + samples as usize * self.areas.len().min(MAX_LIGHTS_SAMPLED)) as f32
+        let four = self.skies.len() + self.many.is_some() as usize;
+        let sampled = self.areas.len().min(MAX_LIGHTS_SAMPLED) + self.discs.len() + four * MAX_LIGHTS_SAMPLED;
+        (self.each.len() + samples as usize * sampled) as f32
     }
 
     /// Whether any light shines.
     pub fn is_dark(&self) -> bool {
-        self.areas.is_empty() && self.lights.iter().all(|l| l.color().iter().all(|&c| c == 0.0))
+        self.area_count == 0
+            && self.each.is_empty()
+            && self.many.is_none()
+            && self.discs.is_empty()
+            && self.skies.is_empty()
     }
 
-    /// Irradiance in W/m² at a receiver. `samples`: rays per area light. `seed`: of this point.
-    /// Adds the rays traced to `rays`.
+    /// Irradiance in W/m² at a receiver. `samples`: rays per area light or disc, and a quarter of those
+    /// per sky and for all of many lights. `seed`: of this point. Adds the rays traced to `rays`.
     pub fn irradiance(&self, receiver: &Receiver, samples: u32, seed: u32, rays: &mut u64) -> Vec3 {
-        let mut sum = Vec3::ZERO;
-        for light in self.lights.iter() {
-            sum += self.one_light(light, receiver, rays);
+        let mut shadow = ShadowRays::new(&self.scene);
+        for light in &self.each {
+            push_one(light, receiver, &mut shadow);
         }
-        if self.areas.is_empty() || samples == 0 {
-            sum
-        } else if self.areas.len() <= MAX_ANALYTIC {
-            sum + self.few_area_lights(receiver, samples, seed, rays)
-        } else {
-            sum + self.many_area_lights(receiver, samples, seed, rays)
+        if let Some(many) = self.many.as_ref().filter(|_| samples > 0) {
+            many.push(receiver, samples * MAX_LIGHTS_SAMPLED as u32, seed, &mut shadow);
         }
-    }
-
-    /// `light`, as much of it as gets along a ray.
-    fn along(&self, ray: &Ray, light: Vec3, rays: &mut u64) -> Vec3 {
-        *rays += 1;
-        if self.scene.uses().transmission {
-            light * self.scene.transmittance(ray)
-        } else if self.scene.occluded(ray) {
-            Vec3::ZERO
-        } else {
-            light
+        // Sequences of skies and discs differ by their number.
+        for (i, sky) in (0..).zip(&self.skies).filter(|_| samples > 0) {
+            push_sky(sky, receiver, samples * MAX_LIGHTS_SAMPLED as u32, combine(seed, 16 + i), &mut shadow);
         }
-    }
-
-    fn one_light(&self, light: &Light, receiver: &Receiver, rays: &mut u64) -> Vec3 {
-        match *light {
-            Light::Point { position, intensity } => self.point_light(position, Vec3::from(intensity), receiver, rays),
-            Light::Spot { position, direction, inner, outer, intensity } => {
-                let way = (receiver.origin - position).normalize_or_zero();
-                let falloff = Light::spot_falloff(way.dot(direction), inner, outer);
-                self.point_light(position, Vec3::from(intensity) * falloff, receiver, rays)
-            }
-            Light::Directional { direction, irradiance } => {
-                let cosine = -direction.dot(receiver.normal);
-                let irradiance = Vec3::from(irradiance) * cosine;
-                if cosine <= 0.0 || direction.dot(receiver.geometric) >= 0.0 || irradiance.max_element() <= 0.0 {
-                    return Vec3::ZERO;
-                }
-                self.along(&Ray::new(receiver.origin, -direction), irradiance, rays)
-            }
-            Light::Rect { .. } => Vec3::ZERO,
+        let mut sum = shadow.finish(rays);
+        for (i, disc) in (0..).zip(&self.discs) {
+            sum += disc.light(&self.scene, receiver, samples, combine(seed, 16 + i), rays);
         }
-    }
-
-    fn point_light(&self, position: Vec3, intensity: Vec3, receiver: &Receiver, rays: &mut u64) -> Vec3 {
-        let way = position.as_dvec3() - receiver.origin.as_dvec3();
-        let d2 = way.length_squared();
-        let cosine = way.dot(receiver.normal.as_dvec3());
-        if cosine <= 0.0 || way.dot(receiver.geometric.as_dvec3()) <= 0.0 || intensity.max_element() <= 0.0 {
-            return Vec3::ZERO;
+        if !self.areas.is_empty() && samples > 0 {
+            sum += self.few_area_lights(receiver, samples, seed, rays);
         }
-        let factor = (cosine / (d2 * d2.sqrt())) as f32;
-        self.along(&shadow_ray(receiver, position), intensity * factor, rays)
+        sum
     }
 
     /// Exact unoccluded irradiance times the visible fraction of it.
     fn few_area_lights(&self, receiver: &Receiver, samples: u32, seed: u32, rays: &mut u64) -> Vec3 {
-        let mut unoccluded = [0.0f32; MAX_ANALYTIC];
+        let mut unoccluded = [0.0f32; MAX_EXACT];
         let (mut total, mut importance, mut shining) = (Vec3::ZERO, 0.0f32, 0);
         for (e, area) in unoccluded.iter_mut().zip(&self.areas) {
             *e = area.irradiance(receiver) as f32;
@@ -302,6 +245,7 @@ impl DirectLight {
         let (mut weights, mut shadow) = (Vec3::ZERO, ShadowRays::new(&self.scene));
         let offset = sobol_2d(0, combine(seed, 1))[0];
         let (mut light, mut below) = (0, 0.0f32);
+        let mut prepared = None;
         for k in 0..n {
             // Systematic: the k-th ray goes to the light that the k-th stratum of the sum falls on.
             let target = (k as f32 + offset) / n as f32 * importance;
@@ -309,10 +253,12 @@ impl DirectLight {
             while light + 1 < self.areas.len() && below + share(light) <= target {
                 below += share(light);
                 light += 1;
+                prepared = None;
             }
             let area = &self.areas[light];
-            let point = area.sample(sobol_2d(k as u32, combine(seed, 2)));
-            let weight = area.geometry_term(receiver, point) * area.area / share(light).max(f32::MIN_POSITIVE);
+            let Some(sampler) = prepared.get_or_insert_with(|| area.sampler(receiver)) else { continue };
+            let (point, weight) = area.sample(sampler, receiver, sobol_2d(k as u32, combine(seed, 2)));
+            let weight = weight / share(light).max(f32::MIN_POSITIVE);
             if !(weight > 0.0 && weight.is_finite()) {
                 continue;
             }
@@ -325,29 +271,344 @@ impl DirectLight {
             * Vec3::new(fraction(visible.x, weights.x), fraction(visible.y, weights.y), fraction(visible.z, weights.z))
     }
 
-    /// Unbiased: lights picked by power.
-    fn many_area_lights(&self, receiver: &Receiver, samples: u32, seed: u32, rays: &mut u64) -> Vec3 {
-        let n = samples as usize * MAX_LIGHTS_SAMPLED;
-        let offset = sobol_2d(0, combine(seed, 1))[0];
-        let mut shadow = ShadowRays::new(&self.scene);
-        for k in 0..n {
-            let target = (k as f32 + offset) / n as f32;
-            let light = self.power_cdf.partition_point(|&c| c <= target).min(self.areas.len() - 1);
-            let area = &self.areas[light];
-            let below = if light == 0 { 0.0 } else { self.power_cdf[light - 1] };
-            let probability = self.power_cdf[light] - below;
-            let point = area.sample(sobol_2d(k as u32, combine(seed, 2)));
-            let weight = area.geometry_term(receiver, point) * area.area / (probability * n as f32);
-            if weight > 0.0 && weight.is_finite() {
-                shadow.push(shadow_ray(receiver, point), weight * area.radiance);
-            }
-        }
-        shadow.finish(rays)
-    }
-
     /// Emitted radiance of a front (or back) of a triangle.
     pub fn emitted(scene: &Scene, triangle: u32, back: bool) -> Vec3 {
         let material = scene.material(triangle);
         if back && !material.two_sided { Vec3::ZERO } else { Vec3::from(material.emission) }
+    }
+}
+
+/// The ray to a light of which every point gets one.
+fn push_one(light: &Light, receiver: &Receiver, shadow: &mut ShadowRays) {
+    if let Light::Directional { direction, irradiance, .. } = *light {
+        let cosine = -direction.dot(receiver.normal);
+        let irradiance = Vec3::from(irradiance) * cosine;
+        if cosine > 0.0 && direction.dot(receiver.geometric) < 0.0 && irradiance.max_element() > 0.0 {
+            shadow.push(Ray::new(receiver.origin, -direction), irradiance);
+        }
+    } else if let Some((target, light)) = point_light(light, receiver) {
+        shadow.push(shadow_ray(receiver, target), light);
+    }
+}
+
+/// Where a point or spot light is, and its unoccluded irradiance; `None` if it cannot shine there.
+pub(super) fn point_light(light: &Light, receiver: &Receiver) -> Option<(Vec3, Vec3)> {
+    let (position, intensity) = match *light {
+        Light::Point { position, intensity } => (position, Vec3::from(intensity)),
+        Light::Spot { position, direction, inner, outer, intensity } => {
+            let way = (receiver.origin - position).normalize_or_zero();
+            (position, Vec3::from(intensity) * Light::spot_falloff(way.dot(direction), inner, outer))
+        }
+        _ => return None,
+    };
+    let way = position.as_dvec3() - receiver.origin.as_dvec3();
+    let d2 = way.length_squared();
+    let cosine = way.dot(receiver.normal.as_dvec3());
+    if cosine <= 0.0 || way.dot(receiver.geometric.as_dvec3()) <= 0.0 || intensity.max_element() <= 0.0 {
+        return None;
+    }
+    Some((position, intensity * (cosine / (d2 * d2.sqrt())) as f32))
+}
+
+#[cfg(test)]
+mod tests {
+    use super::super::polygon;
+    use super::*;
+    use crate::bvh::BuildOptions;
+    use crate::progress::Progress;
+    use crate::sampling::{uniform, uniform_sphere};
+    use crate::scene::shapes::MeshBuilder;
+    use crate::scene::{Material, SceneData, builtin};
+    use crate::{Device, DeviceOptions};
+    use glam::DVec3;
+    use std::f32::consts::PI;
+
+    fn commit(data: SceneData) -> Arc<Scene> {
+        let device = Device::new(DeviceOptions { num_threads: 1, ..Default::default() }).unwrap();
+        Scene::commit(&device, data, &BuildOptions::default(), &Progress::none()).map_err(|e| e.1).unwrap()
+    }
+
+    fn receiver(scene: &Scene, position: Vec3, normal: Vec3) -> Receiver {
+        Receiver { origin: offset_ray_origin(position, normal, scene), normal, geometric: normal }
+    }
+
+    /// A floor at z = 0, and what `add` builds.
+    fn floor(add: impl FnOnce(&mut SceneData, &mut MeshBuilder)) -> Arc<Scene> {
+        let mut data = SceneData::new();
+        data.add_material(Material { albedo: [0.5; 3], two_sided: true, ..Default::default() }).unwrap();
+        let mut builder = MeshBuilder::new();
+        let p = |x: f32, y: f32| Vec3::new(x, y, 0.0);
+        builder.quad(p(-20.0, -20.0), p(20.0, -20.0), p(20.0, 20.0), p(-20.0, 20.0), 0);
+        add(&mut data, &mut builder);
+        data.add_mesh(builder.finish()).unwrap();
+        commit(data)
+    }
+
+    fn lambert(origin: Vec3, quad: [Vec3; 4]) -> f64 {
+        polygon::irradiance(&quad.map(|p| (p - origin).as_dvec3()), DVec3::Z)
+    }
+
+    fn wall(x: f32, half: f32, height: f32) -> [Vec3; 4] {
+        [(-half, 0.0), (half, 0.0), (half, height), (-half, height)].map(|(y, z)| Vec3::new(x, y, z))
+    }
+
+    #[test]
+    fn a_light_that_stands_on_the_floor_behind_a_board_has_small_errors_up_to_its_foot() {
+        for emissive in [false, true] {
+            let [a, b, c, d] = wall(0.0, 1.0, 1.0);
+            let board = wall(0.004, 0.1, 0.1);
+            let scene = floor(|data, builder| {
+                if emissive {
+                    let m = data.add_material(Material { emission: [1.0; 3], ..Default::default() }).unwrap();
+                    builder.quad(a, b, c, d, m);
+                } else {
+                    let (edge_u, edge_v) = (b - a, d - a);
+                    data.add_light(Light::Rect { position: a, edge_u, edge_v, radiance: [1.0; 3] }).unwrap();
+                }
+                builder.quad(board[0], board[1], board[2], board[3], 0);
+            });
+            let direct = DirectLight::new(&scene);
+            let (points, seeds) = (100, 8);
+            let (mut mse, mut bias) = (0.0, 0.0);
+            for i in 0..points {
+                let x = 0.01 * (50f32).powf((i as f32 + 0.5) / points as f32);
+                let r = receiver(&scene, Vec3::new(x, 0.0, 0.0), Vec3::Z);
+                // The board, as seen from here, covers a part of the light and nothing else.
+                let all = lambert(r.origin, [a, b, c, d]);
+                let expected = all - lambert(r.origin, board);
+                for seed in 0..seeds {
+                    let e = direct.irradiance(&r, 16, combine(i, seed), &mut 0).x as f64;
+                    let off = (e - expected) / all;
+                    mse += off * off / (points * seeds) as f64;
+                    bias += off / (points * seeds) as f64;
+                }
+            }
+            eprintln!("emissive {emissive}: MSE {mse:.2e}, bias {bias:.2e} of the unoccluded light");
+            assert!(mse < 4e-3 && bias.abs() < 4e-3, "emissive {emissive}: MSE {mse}, bias {bias}");
+        }
+    }
+
+    #[test]
+    fn a_light_just_above_the_surface_and_one_that_lies_on_it() {
+        for (height, expected) in [(1e-3, PI), (1e-2, PI), (0.0, 0.0)] {
+            let p = Vec3::new(-5.0, -5.0, height);
+            let scene = floor(|data, _| {
+                // Its u × v points down.
+                let (edge_u, edge_v) = (Vec3::Y * 10.0, Vec3::X * 10.0);
+                data.add_light(Light::Rect { position: p, edge_u, edge_v, radiance: [1.0; 3] }).unwrap();
+            });
+            let direct = DirectLight::new(&scene);
+            for i in 0..50 {
+                let place = Vec3::new(uniform(i, 0, 1) - 0.5, uniform(i, 1, 1) - 0.5, 0.0) * 9.8;
+                let e = direct.irradiance(&receiver(&scene, place, Vec3::Z), 4, i, &mut 0).x;
+                assert!((e - expected).abs() < 1e-3 * PI, "{e} instead of {expected}, {height} above");
+            }
+        }
+    }
+
+    /// The atrium with 300 lights, half points and spots, half triangles, in place of its own.
+    fn many() -> Arc<Scene> {
+        let mut data = builtin("atrium").unwrap();
+        for i in 0..data.lights().len() as u32 {
+            data.set_light(i, Light::Point { position: Vec3::ZERO, intensity: [0.0; 3] }).unwrap();
+        }
+        let positions: Vec<Vec3> = data.meshes().iter().flat_map(|m| m.positions.iter().copied()).collect();
+        let lower = positions.iter().fold(Vec3::INFINITY, |a, &b| a.min(b));
+        let upper = positions.iter().fold(Vec3::NEG_INFINITY, |a, &b| a.max(b));
+        for i in 0..300 {
+            let r = |d| uniform(i, d, 5);
+            let position = lower + (upper - lower) * Vec3::new(r(0), r(1), r(2));
+            let intensity = [0.1 + 10.0 * r(3), 5.0 * r(4), 1.0];
+            match i % 4 {
+                0 => data.add_light(Light::Point { position, intensity }),
+                1 => {
+                    let direction = uniform_sphere([r(5), r(6)]);
+                    data.add_light(Light::Spot { position, direction, inner: 0.3, outer: 0.3 + r(7), intensity })
+                }
+                _ => {
+                    let (edge_u, edge_v) = (uniform_sphere([r(5), r(6)]) * 0.5, uniform_sphere([r(7), r(8)]) * 0.5);
+                    data.add_light(Light::Rect { position, edge_u, edge_v, radiance: intensity })
+                }
+            }
+            .unwrap();
+        }
+        commit(data)
+    }
+
+    #[test]
+    fn many_lights_are_sampled_without_bias() {
+        let scene = many();
+        let direct = DirectLight::new(&scene);
+        assert_eq!((direct.many_light_count(), direct.area_light_count()), (300, 150));
+        let lights = scene.lights();
+        let mut checked = 0;
+        for i in 0..60 {
+            let triangle = (uniform(i, 0, 9) * scene.triangle_count() as f32) as u32;
+            if !scene.is_valid(triangle) {
+                continue;
+            }
+            let [a, b, c] = scene.corners(triangle);
+            let r = receiver(&scene, (a + b + c) / 3.0, scene.normal(triangle));
+            // The sum over all lights, one at a time.
+            let mut expected = Vec3::ZERO;
+            for light in lights.iter() {
+                if let Some(area) = AreaLight::rect(light) {
+                    let (n, Some(sampler)) = (256, area.sampler(&r)) else { continue };
+                    for k in 0..n {
+                        let (point, weight) = area.sample(&sampler, &r, sobol_2d(k, combine(i, 77)));
+                        if weight > 0.0 && !scene.occluded(&shadow_ray(&r, point)) {
+                            expected += area.radiance * (weight / n as f32);
+                        }
+                    }
+                } else if let Some((target, light)) = point_light(light, &r)
+                    && !scene.occluded(&shadow_ray(&r, target))
+                {
+                    expected += light;
+                }
+            }
+            let (mut mean, mut square, seeds) = (Vec3::ZERO, Vec3::ZERO, 400);
+            for seed in 0..seeds {
+                let e = direct.irradiance(&r, 2, combine(seed, 1000 + i), &mut 0);
+                mean += e / seeds as f32;
+                square += e * e / seeds as f32;
+            }
+            let error = ((square - mean * mean).max(Vec3::ZERO) / seeds as f32).sqrt();
+            let off = (mean - expected).abs();
+            assert!(off.cmple(5.0 * error + 0.01 * expected + 1e-5).all(), "{mean} ± {error} is not {expected}");
+            checked += (expected.max_element() > 0.0) as u32;
+        }
+        assert!(checked > 20, "{checked} of the points were lit");
+    }
+
+    #[test]
+    fn a_thousand_rays_are_not_needed_for_a_thousand_lights() {
+        let scene = many();
+        let direct = DirectLight::new(&scene);
+        let r = receiver(&scene, scene.corners(0)[0], scene.normal(0));
+        let mut rays = 0;
+        direct.irradiance(&r, 8, 1, &mut rays);
+        assert!(rays <= 33, "{rays} rays, not 4 · 8 or one more");
+        assert_eq!(direct.rays_per_point(8), 32.0);
+    }
+
+    fn sun(direction: Vec3, angular_radius: f32) -> Light {
+        Light::Directional { direction, irradiance: [10.0; 3], angular_radius }
+    }
+
+    fn sky(radiance: f32) -> Light {
+        Light::Sky { radiance: [radiance; 3], environment: crate::scene::NONE, up: Vec3::Z, rotation: 0.0 }
+    }
+
+    /// Mean over seeds at a point of the floor.
+    fn mean(direct: &DirectLight, position: Vec3, samples: u32, seeds: u32) -> f32 {
+        let r = receiver(&direct.scene, position, Vec3::Z);
+        (0..seeds).map(|s| direct.irradiance(&r, samples, combine(s, 3), &mut 0).x).sum::<f32>() / seeds as f32
+    }
+
+    #[test]
+    fn a_sun_with_a_disc_has_the_irradiance_of_a_point_and_a_penumbra_as_wide_as_it_looks() {
+        // A half plane at height 1 over x > 0 (as far as it matters), under a disc at the zenith.
+        let radius = 0.1f32;
+        let scene = floor(|data, builder| {
+            let p = |x: f32, y: f32| Vec3::new(x, y, 1.0);
+            builder.quad(p(0.0, -15.0), p(15.0, -15.0), p(15.0, 15.0), p(0.0, 15.0), 0);
+            data.add_light(sun(Vec3::NEG_Z, radius)).unwrap();
+        });
+        let direct = DirectLight::new(&scene);
+        assert_eq!((direct.disc_count(), direct.rays_per_point(16)), (1, 16.0));
+        let e = direct.irradiance(&receiver(&scene, Vec3::new(-3.0, 0.0, 0.0), Vec3::Z), 4, 1, &mut 0);
+        assert!((e - 10.0).abs().max_element() < 1e-5, "no noise in the open: {e}");
+        let reach = radius.tan();
+        assert_eq!(mean(&direct, Vec3::X * (1.01 * reach), 64, 16), 0.0);
+        assert!((mean(&direct, Vec3::X * (-1.01 * reach), 64, 1) - 10.0).abs() < 1e-5);
+        for part in [-0.8f32, -0.5, 0.0, 0.5, 0.8] {
+            // Projected on the floor, the disc is a disc in which every area counts the same; the edge
+            // cuts it along a great circle, an ellipse's axis wide x/√(1 + x²) from its middle.
+            let x = part * reach;
+            let cut = (x / (1.0 + x * x).sqrt() / radius.sin()) as f64;
+            let segment = (cut.acos() - cut * (1.0 - cut * cut).sqrt()) / std::f64::consts::PI;
+            let e = mean(&direct, Vec3::X * x, 256, 64) as f64 / 10.0;
+            assert!((e - segment).abs() < 5e-3, "{part}: {e}, not {segment}");
+        }
+    }
+
+    #[test]
+    fn the_horizon_cuts_a_disc_without_noise_and_parallel_light_is_its_limit() {
+        let light = |elevation: f32, radius: f32| {
+            let direction = -Vec3::new(elevation.cos(), 0.0, elevation.sin());
+            let scene = floor(|data, _| assert!(data.add_light(sun(direction, radius)).is_ok()));
+            mean(&DirectLight::new(&scene), Vec3::ZERO, 16, 4)
+        };
+        assert!((light(0.5, 1e-3) / light(0.5, 0.0) - 1.0).abs() < 1e-5);
+        assert_eq!(light(0.5, 1e-6), light(0.5, 0.0));
+        // The middle on the horizon: half a disc; what cosines sum to in the small limit is 2/(3π) · radius.
+        let (e, limit) = (light(1e-7, 0.01), 10.0 * 2.0 / (3.0 * PI) * 0.01);
+        assert!((e / limit - 1.0).abs() < 1e-3, "{e} {limit}");
+        // A disc of half the sphere at the zenith is a sky.
+        assert!((light(PI / 2.0, PI / 2.0) - 10.0).abs() < 1e-4);
+    }
+
+    #[test]
+    fn an_open_floor_under_a_constant_sky_gets_pi_times_its_radiance_without_noise() {
+        let scene = floor(|data, _| assert!(data.add_light(sky(2.0)).is_ok()));
+        let direct = DirectLight::new(&scene);
+        for seed in 0..20 {
+            let e = direct.irradiance(&receiver(&scene, Vec3::ZERO, Vec3::Z), 4, seed, &mut 0);
+            assert!((e / (2.0 * PI) - 1.0).abs().max_element() < 1e-6, "{e}");
+        }
+    }
+
+    #[test]
+    fn a_valley_under_the_sky_gets_what_its_walls_leave() {
+        // On the middle line of a trench with walls that lean outwards (half-width 1, up to height h),
+        // the sky is seen between two great circles: E = π L · cos of the angle from the zenith.
+        let (width, height) = (1.0f32, 0.75f32);
+        let scene = floor(|data, builder| {
+            for x in [-width, width] {
+                let p = |y: f32, z: f32| Vec3::new(x, y, z);
+                builder.quad(p(-200.0, 0.0), p(200.0, 0.0), p(200.0, height), p(-200.0, height), 0);
+            }
+            data.add_light(sky(1.0)).unwrap();
+        });
+        let expected = PI * (width / (width * width + height * height).sqrt());
+        let e = mean(&DirectLight::new(&scene), Vec3::ZERO, 64, 1024);
+        assert!((e / expected - 1.0).abs() < 2e-3, "{e}, not {expected}");
+    }
+
+    fn under_image(image: crate::scene::Environment, up: Vec3, rotation: f32) -> DirectLight {
+        let scene = floor(|data, _| {
+            let environment = data.add_environment(image);
+            data.add_light(Light::Sky { radiance: [3.0; 3], environment, up, rotation }).unwrap();
+        });
+        DirectLight::new(&scene)
+    }
+
+    #[test]
+    fn half_an_image_that_is_bright_gives_half_the_light() {
+        use crate::scene::Environment;
+        let half = Environment::new(8, 1, [[[1.0; 3]; 4], [[0.0; 3]; 4]].concat()).unwrap();
+        let e = mean(&under_image(half, Vec3::Z, 0.7), Vec3::ZERO, 64, 32);
+        assert!((e / (1.5 * PI) - 1.0).abs() < 5e-3, "{e}");
+        // Bright above the horizon only, upside down: nothing.
+        let above = Environment::new(1, 2, vec![[1.0; 3], [0.0; 3]]).unwrap();
+        let e = mean(&under_image(above.clone(), Vec3::Z, 0.0), Vec3::ZERO, 64, 8);
+        assert!((e / (3.0 * PI) - 1.0).abs() < 2e-3, "{e}");
+        assert_eq!(mean(&under_image(above, Vec3::NEG_Z, 0.0), Vec3::ZERO, 64, 8), 0.0);
+    }
+
+    #[test]
+    fn an_image_with_one_bright_pixel_is_a_sun() {
+        use crate::scene::Environment;
+        let (width, height) = (512usize, 256usize);
+        let (x, y) = (300usize, 60usize);
+        let mut rgb = vec![[0.0; 3]; width * height];
+        rgb[y * width + x] = [1e4; 3];
+        let direct = under_image(Environment::new(width as u32, height as u32, rgb).unwrap(), Vec3::Z, 0.0);
+        let theta = |y: f32| PI * y / height as f32;
+        let y = y as f32;
+        let solid_angle = 2.0 * PI / width as f32 * (theta(y).cos() - theta(y + 1.0).cos());
+        let expected = 3.0 * 1e4 * solid_angle * theta(y + 0.5).cos();
+        let e = mean(&direct, Vec3::ZERO, 16, 16);
+        assert!((e / expected - 1.0).abs() < 1e-3, "{e}, not {expected}");
     }
 }

@@ -4,18 +4,23 @@
 //! the gather map (indirect irradiance) and the radiance map (what gather rays see). A bake runs
 //! photons → radiance map → gather map → blur → direct light and composition.
 
+mod area;
 pub(crate) mod bake;
 pub mod blur;
 pub mod charts;
 pub mod direct;
+mod distant;
 pub(crate) mod gather;
 pub mod layout;
+mod light_tree;
+mod many;
 pub(crate) mod map;
 pub mod plan;
 mod polygon;
 pub(crate) mod radiance;
 mod read;
 mod sides;
+mod spherical;
 pub mod texels;
 mod unwrap;
 
@@ -78,8 +83,9 @@ pub struct BakeParams {
     pub radius: f32,
     /// Radius of the gather map's blur in its texels; 0: none.
     pub blur_radius: u32,
-    /// Shadow rays per light map texel and area light (of more than four area lights, four times
-    /// as many rays are shared out by their unoccluded light).
+    /// Shadow rays per light map texel and area light or disc of a directional light (of more than
+    /// four area lights, four times as many rays are shared out by their unoccluded light); four
+    /// times as many per sky, and for all of many lights.
     pub direct_samples: u32,
     pub seed: u64,
     /// Bytes that the bake may take in addition; 0: no limit.

@@ -28,6 +28,12 @@ pub mod left_out {
     pub const CUTOUTS: u32 = 1 << 9;
     /// No light through surfaces.
     pub const TRANSMISSION: u32 = 1 << 10;
+    /// No light from a sky.
+    pub const SKY: u32 = 1 << 12;
+    /// No directional light with a disc.
+    pub const SUN_DISC: u32 = 1 << 13;
+    /// No choice among many lights: all are few enough to be evaluated one by one.
+    pub const MANY_LIGHTS: u32 = 1 << 14;
 }
 
 /// What a bake of a scene runs.
@@ -51,11 +57,12 @@ impl Plan {
         let lights = scene.lights();
         let count = |f: fn(&Light) -> bool| lights.iter().filter(|l| f(l)).count();
         plan.lines.push(format!(
-            "lights: {} point, {} spot, {} directional, {} rect, {} emissive triangles",
+            "lights: {} point, {} spot, {} directional, {} rect, {} sky, {} emissive triangles",
             count(|l| matches!(l, Light::Point { .. })),
             count(|l| matches!(l, Light::Spot { .. })),
             count(|l| matches!(l, Light::Directional { .. })),
             count(|l| matches!(l, Light::Rect { .. })),
+            count(|l| matches!(l, Light::Sky { .. })),
             scene.emitters().len(),
         ));
         let reflects = scene.materials().iter().any(|m| m.albedo.iter().any(|&a| a > 0.0));
@@ -78,6 +85,7 @@ impl Plan {
         } else {
             plan.run(&format!("sampling of area lights, {} rays each", params.direct_samples));
         }
+        plan.distant_and_many(direct, params.direct_samples);
         match no_indirect {
             Some(why) => {
                 plan.leave_out(left_out::INDIRECT | left_out::PHOTONS, "photons, radiance map, gather map", why)
@@ -116,6 +124,21 @@ impl Plan {
             self.run("light through surfaces that transmit");
         } else {
             self.leave_out(left_out::TRANSMISSION, "light through surfaces", "none transmits");
+        }
+    }
+
+    fn distant_and_many(&mut self, direct: &DirectLight, samples: u32) {
+        match direct.many_light_count() {
+            0 => self.leave_out(left_out::MANY_LIGHTS, "choice among many lights", "they are few"),
+            n => self.run(&format!("choice among {n} lights by a light tree, {} rays for all", 4 * samples)),
+        }
+        match direct.disc_count() {
+            0 => self.leave_out(left_out::SUN_DISC, "discs of directional lights", "none has an angular radius"),
+            n => self.run(&format!("discs of {n} directional lights, {samples} rays each")),
+        }
+        match direct.sky_count() {
+            0 => self.leave_out(left_out::SKY, "light from the sky", "there is none"),
+            n => self.run(&format!("light from {n} sky, {} rays", 4 * samples * n as u32)),
         }
     }
 

@@ -7,14 +7,15 @@
 //! the power that makes the expectation right. Positions and directions are pairs of Owen-scrambled
 //! Sobol dimensions over the photon number: any run of consecutive numbers is stratified.
 //!
-//! Photons are aimed at the scene where that is exact and cheap. A directional light shines through
+//! Photons are aimed at the scene where that is exact and cheap. A parallel light shines through
 //! the faces of the scene's bounding box that it meets, which is the whole of its light that can
-//! reach the scene. A point light outside the box's bounding sphere emits into the cone of that
+//! reach the scene. Discs and skies shine through discs around the scene's bounding sphere, each
+//! perpendicular to its photon. A point light outside the box's bounding sphere emits into the cone of that
 //! sphere; the rest of its power is counted as escaped without being traced.
 
 use super::spot::SpotProfile;
 use crate::sampling::{concentric_disc, cosine_hemisphere, orthonormal_basis, uniform_triangle};
-use crate::scene::{Emitter, Light, Scene};
+use crate::scene::{Emitter, Light, Scene, Sky};
 use crate::trace::offset::{offset_ray_origin, ray_epsilon};
 use glam::{DVec3, Vec3};
 use std::f64::consts::PI;
@@ -50,6 +51,13 @@ enum Shape {
         edge_v: Vec3,
         direction: Vec3,
     },
+    /// From all around, in the cone around `axis`, uniformly; `height` as above.
+    Disc {
+        axis: Vec3,
+        height: f64,
+    },
+    /// From all around, in proportion to the radiance of a sky (by number).
+    Sky(usize),
     /// From a parallelogram, cosine-distributed around `normal`.
     Rect {
         corner: Vec3,
@@ -70,6 +78,10 @@ struct Source {
 pub(super) struct Emission<'a> {
     scene: &'a Scene,
     sources: Vec<Source>,
+    skies: Vec<Sky>,
+    /// Sphere around the scene.
+    centre: Vec3,
+    radius: f32,
     /// First photon of each source, then of each emissive triangle, then the number of photons.
     first: Vec<u64>,
     /// Photons per watt (of the mean over the channels).
@@ -84,10 +96,10 @@ impl<'a> Emission<'a> {
     /// Allots `count` photons to `lights` and to the scene's emissive triangles. `offset` in [0, 1)
     /// places the first photon.
     pub(super) fn new(scene: &'a Scene, lights: &[Light], count: u64, offset: f32) -> Self {
-        let mut sources = Vec::new();
+        let (mut sources, mut skies) = (Vec::new(), Vec::new());
         let mut unaimed = DVec3::ZERO;
         for light in lights {
-            unaimed += add_sources(scene, light, &mut sources);
+            unaimed += add_sources(scene, light, &mut sources, &mut skies);
         }
         let powers = || sources.iter().map(|s| s.power).chain(scene.emitters().iter().map(emitter_power));
         let aimed: DVec3 = powers().sum();
@@ -100,7 +112,9 @@ impl<'a> Emission<'a> {
             below += mean(power);
         }
         first.push(if total > 0.0 { count } else { 0 });
-        Emission { scene, sources, first, photons_per_watt, power: aimed + unaimed, unaimed }
+        let (centre, radius) = sphere_of_scene(scene);
+        let power = aimed + unaimed;
+        Emission { scene, sources, skies, centre, radius, first, photons_per_watt, power, unaimed }
     }
 
     /// Photons to emit: the count asked for, or 0 if no light has any power.
@@ -125,8 +139,13 @@ impl<'a> Emission<'a> {
     /// uniform in the unit square.
     pub(super) fn emit(&self, index: u64, p: [f32; 2], d: [f32; 2]) -> Emitted {
         let (light, power) = self.light_of(index);
-        let power = power.as_vec3();
+        let mut power = power.as_vec3();
         let (origin, direction) = match self.sources.get(light) {
+            Some(Source { shape: Shape::Sky(sky), .. }) => {
+                let (from, tint) = self.sky_direction(&self.skies[*sky], d);
+                power *= tint;
+                (self.all_around(-from, p), -from)
+            }
             Some(source) => self.leave(&source.shape, p, d),
             None => self.leave_triangle(&self.scene.emitters()[light - self.sources.len()], p, d),
         };
@@ -141,12 +160,33 @@ impl<'a> Emission<'a> {
             Shape::Spot { position, axis, profile } => {
                 (position, around(axis, concentric_disc(d), |r2| profile.height(r2 as f64)))
             }
+            Shape::Disc { axis, height } => {
+                let direction = around(axis, concentric_disc(d), |r2| height * r2 as f64);
+                (self.all_around(direction, p), direction)
+            }
+            Shape::Sky(_) => unreachable!("skies colour their photons: see emit"),
             Shape::Beam { corner, edge_u, edge_v, direction } => (corner + edge_u * p[0] + edge_v * p[1], direction),
             Shape::Rect { corner, edge_u, edge_v, normal } => {
                 let position = corner + edge_u * p[0] + edge_v * p[1];
                 (offset_ray_origin(position, normal, self.scene), cosine_around(normal, d))
             }
         }
+    }
+
+    /// A point of the disc through which light along `direction` enters the scene's sphere.
+    fn all_around(&self, direction: Vec3, p: [f32; 2]) -> Vec3 {
+        let (t, b) = orthonormal_basis(direction);
+        let [x, y] = concentric_disc(p);
+        // A little before the sphere, so that rounding leaves all surfaces ahead.
+        self.centre + (t * x + b * y - direction * 1.01) * self.radius
+    }
+
+    /// A direction that a sky shines from, and its colour there beside the mean of all photons.
+    fn sky_direction(&self, sky: &Sky, d: [f32; 2]) -> (Vec3, Vec3) {
+        let (from, radiance, density) = sky.sample(d);
+        let mean = sky.integral().as_vec3();
+        let part = |c: usize| if mean[c] > 0.0 { radiance[c] / density / mean[c] } else { 0.0 };
+        (from, Vec3::new(part(0), part(1), part(2)))
     }
 
     fn leave_triangle(&self, e: &Emitter, p: [f32; 2], mut d: [f32; 2]) -> (Vec3, Vec3) {
@@ -166,7 +206,7 @@ impl<'a> Emission<'a> {
 }
 
 /// Adds the sources that make up `light` and returns its power that is not aimed at the scene.
-fn add_sources(scene: &Scene, light: &Light, sources: &mut Vec<Source>) -> DVec3 {
+fn add_sources(scene: &Scene, light: &Light, sources: &mut Vec<Source>, skies: &mut Vec<Sky>) -> DVec3 {
     let color = DVec3::from_array(light.color().map(f64::from));
     let mut add = |shape, factor: f64| sources.push(Source { shape, power: color * factor });
     match *light {
@@ -178,6 +218,20 @@ fn add_sources(scene: &Scene, light: &Light, sources: &mut Vec<Source>) -> DVec3
         Light::Spot { position, direction, inner, outer, .. } => {
             let profile = SpotProfile::new(inner, outer);
             add(Shape::Spot { position, axis: direction, profile }, profile.solid_angle());
+        }
+        Light::Directional { direction, angular_radius, .. } if angular_radius > 0.0 => {
+            // 1 − cos of the radius; radiance times solid angle times the cross-section of the sphere.
+            let height = 2.0 * (0.5 * angular_radius as f64).sin().powi(2);
+            let (radius, sine) = (sphere_of_scene(scene).1 as f64, (angular_radius as f64).sin());
+            let solid_angles = 2.0 * height / (sine * sine);
+            add(Shape::Disc { axis: direction, height }, solid_angles * PI * radius * radius);
+        }
+        Light::Sky { .. } => {
+            let Some(sky) = scene.sky(light).filter(|s| !s.is_dark()) else { return DVec3::ZERO };
+            let radius = sphere_of_scene(scene).1 as f64;
+            let power = sky.integral() * (PI * radius * radius);
+            sources.push(Source { shape: Shape::Sky(skies.len()), power });
+            skies.push(sky);
         }
         Light::Directional { direction, .. } => {
             for (corner, edge_u, edge_v) in lit_faces(scene, direction) {
@@ -192,6 +246,15 @@ fn add_sources(scene: &Scene, light: &Light, sources: &mut Vec<Source>) -> DVec3
         }
     }
     DVec3::ZERO
+}
+
+/// Middle and radius of the sphere around the scene's bounding box.
+fn sphere_of_scene(scene: &Scene) -> (Vec3, f32) {
+    let (lower, upper) = scene.bounds();
+    let (l, u) = (lower.as_dvec3(), upper.as_dvec3());
+    // A little more, so that what rounding puts outside is covered too.
+    let radius = 0.5005 * (u - l).length() + ray_epsilon(lower.abs().max(upper.abs()), scene) as f64;
+    (((l + u) * 0.5).as_vec3(), radius as f32)
 }
 
 /// Axis and 1 − cos(half-angle) of the cone in which the scene's bounding sphere appears from

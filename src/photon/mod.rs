@@ -116,7 +116,8 @@ pub struct PhotonStats {
     pub stored: u64,
     /// Rays traced.
     pub rays: u64,
-    /// Power of all lights, W per channel. Of directional lights: what meets the bounding box.
+    /// Power of all lights, W per channel. Of directional lights: what meets the bounding box; of those
+    /// with a disc and of skies: what meets the bounding sphere.
     pub emitted_power: [f64; 3],
     /// Absorbed by surfaces, including the back sides of one-sided ones.
     pub absorbed_power: [f64; 3],

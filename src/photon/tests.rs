@@ -140,7 +140,7 @@ fn the_sun_gives_a_plane_its_irradiance() {
     let positions = vec![Vec3::ZERO, Vec3::X, Vec3::X + Vec3::Y, Vec3::Y];
     data.add_mesh(Mesh { positions, indices: vec![[0, 1, 2], [0, 2, 3]], ..Default::default() }).unwrap();
     let direction = Vec3::new(0.3, 0.5, -0.8);
-    data.add_light(Light::Directional { direction, irradiance: [1.0, 5.0, 0.0] }).unwrap();
+    data.add_light(Light::Directional { direction, irradiance: [1.0, 5.0, 0.0], angular_radius: 0.0 }).unwrap();
     let map = trace(&commit(data), PhotonParams { photon_count: 200_000, radius: 0.04, ..Default::default() });
     let cosine = 0.8 / direction.length() as f64;
     let mean = mean_estimate(&map, &points_on(Vec3::ZERO, Vec3::X, Vec3::Y, 0.05, 400), Vec3::Z);
@@ -150,6 +150,71 @@ fn the_sun_gives_a_plane_its_irradiance() {
     assert_eq!(map.estimate(Vec3::new(0.5, 0.5, 0.0), -Vec3::Z), [0.0; 3], "the back is dark");
     // The box's faces lie edge to edge as seen by the sun: nothing is wasted but at the very rim.
     assert!(map.stats().stored as f64 > 0.999 * 200_000.0, "{}", map.stats().stored);
+}
+
+fn white_sky(radiance: f32) -> Light {
+    Light::Sky { radiance: [radiance; 3], environment: crate::scene::NONE, up: Vec3::Y, rotation: 0.0 }
+}
+
+/// A unit square at z = 0 that looks up, of reflectance 0.3.
+fn square_under(add: impl FnOnce(&mut SceneData) -> Light) -> Arc<Scene> {
+    let mut data = SceneData::new();
+    data.add_material(grey(0.3)).unwrap();
+    let positions = vec![Vec3::ZERO, Vec3::X, Vec3::X + Vec3::Y, Vec3::Y];
+    data.add_mesh(Mesh { positions, indices: vec![[0, 1, 2], [0, 2, 3]], ..Default::default() }).unwrap();
+    let light = add(&mut data);
+    data.add_light(light).unwrap();
+    commit(data)
+}
+
+#[test]
+fn discs_and_skies_send_photons_of_their_irradiance() {
+    let direction = Vec3::new(0.3, 0.5, -0.8);
+    let disc = Light::Directional { direction, irradiance: [1.0, 5.0, 0.0], angular_radius: 0.3 };
+    let cosine = 0.8 / direction.length() as f64;
+    let image = |data: &mut SceneData| {
+        // Red from above x > 0, blue from x < 0: a front that looks along +y, right of it is +x.
+        let rgb = vec![[0.0, 0.0, 2.0], [1.0, 0.0, 0.0]];
+        let environment = data.add_environment(crate::scene::Environment::new(2, 1, rgb).unwrap());
+        Light::Sky { radiance: [3.0; 3], environment, up: Vec3::Z, rotation: 0.0 }
+    };
+    let cases: [(Arc<Scene>, [f64; 3]); 3] = [
+        (square_under(|_| disc), [cosine, 5.0 * cosine, 0.0]),
+        (square_under(|_| white_sky(2.0)), [2.0 * PI; 3]),
+        (square_under(image), [1.5 * PI, 0.0, 3.0 * PI]),
+    ];
+    for (scene, expected) in cases {
+        let map = trace(&scene, PhotonParams { photon_count: 1_000_000, radius: 0.05, ..Default::default() });
+        let mean = mean_estimate(&map, &points_on(Vec3::ZERO, Vec3::X, Vec3::Y, 0.06, 400), Vec3::Z);
+        for c in 0..3 {
+            assert!((mean[c] - expected[c]).abs() <= 0.01 * expected[c], "{mean:?}, not {expected:?}");
+        }
+        let s = map.stats();
+        for c in 0..3 {
+            let sum = s.absorbed_power[c] + s.escaped_power[c] + s.truncated_power[c];
+            assert!((sum - s.emitted_power[c]).abs() <= 5e-3 * s.emitted_power[c], "{s:?}");
+        }
+    }
+}
+
+#[test]
+fn a_ball_under_a_white_sky_absorbs_what_its_surface_gets() {
+    // It is convex: nothing is reflected onto it, and every point gets π times the radiance.
+    let mut data = SceneData::new();
+    data.add_material(grey(0.6)).unwrap();
+    let mut builder = crate::scene::shapes::MeshBuilder::new();
+    builder.sphere(Vec3::splat(3.0), 1.0, 4, 0);
+    let mesh = builder.finish();
+    let area: f64 = (0..mesh.indices.len())
+        .map(|t| {
+            let [a, b, c] = mesh.corners(t).map(|c| c.as_dvec3());
+            0.5 * (b - a).cross(c - a).length()
+        })
+        .sum();
+    data.add_mesh(mesh).unwrap();
+    data.add_light(white_sky(2.0)).unwrap();
+    let map = trace(&commit(data), PhotonParams { photon_count: 300_000, ..Default::default() });
+    assert_close(map.stats().absorbed_power[0], 0.4 * 2.0 * PI * area, 0.005);
 }
 
 #[test]
@@ -229,9 +294,11 @@ fn the_photons_of_all_lights_carry_exactly_their_power() {
     let direction = Vec3::new(0.1, -1.0, 0.2);
     data.add_light(Light::Point { position, intensity }).unwrap();
     data.add_light(Light::Spot { position, direction, inner: 0.2, outer: 0.4, intensity: [100.0; 3] }).unwrap();
-    data.add_light(Light::Directional { direction, irradiance: [2.0, 1.0, 0.5] }).unwrap();
+    data.add_light(Light::Directional { direction, irradiance: [2.0, 1.0, 0.5], angular_radius: 0.0 }).unwrap();
+    data.add_light(Light::Directional { direction, irradiance: [9.0, 1.0, 0.5], angular_radius: 0.2 }).unwrap();
+    data.add_light(white_sky(0.3)).unwrap();
     let scene = commit(data);
-    for count in [100, 9_999] {
+    for count in [1_000, 9_999] {
         let emission = emission::Emission::new(&scene, &scene.lights(), count, 0.37);
         let sum: glam::DVec3 = (0..count).map(|i| emission.emit(i, [0.5; 2], [0.5; 2]).power.as_dvec3()).sum();
         for c in 0..3 {

@@ -7,9 +7,11 @@
 //! 9.2.2), which keeps surfaces close to them free of fireflies.
 
 use super::random::{Random, triangle_point};
-use crate::scene::{Light, Material, Mesh};
+use super::sky::Sky;
+use crate::scene::{Environment, Light, Material, Mesh};
 use glam::{DVec3, Vec3};
-use std::f64::consts::PI;
+use std::f64::consts::{PI, TAU};
+use std::sync::Arc;
 
 /// What a light would do to a surface element if nothing is in the way.
 #[derive(Clone, Copy, Debug)]
@@ -40,6 +42,7 @@ struct Area {
 pub struct Lights {
     /// Point, spot and directional lights.
     simple: Vec<Light>,
+    skies: Vec<Sky>,
     rects: Vec<Area>,
     emitters: Vec<Area>,
     /// Running sums of the emitters' power (in luminance-like units), the total last.
@@ -85,14 +88,15 @@ impl Area {
 
 /// Share of a sample that was found by following a direction of density `by_direction`, when area
 /// sampling would have found it with density `by_area`.
-fn balance(by_direction: f64, by_area: f64) -> f64 {
+pub fn balance(by_direction: f64, by_area: f64) -> f64 {
     by_direction / (by_direction + by_area)
 }
 
 impl Lights {
     /// The lights of a scene, emissive triangles included.
-    pub fn new(meshes: &[Mesh], materials: &[Material], lights: &[Light]) -> Self {
+    pub fn new(meshes: &[Mesh], materials: &[Material], environments: &[Arc<Environment>], lights: &[Light]) -> Self {
         let mut simple = Vec::new();
+        let mut skies = Vec::new();
         let mut rects = Vec::new();
         for light in lights {
             match *light {
@@ -101,6 +105,7 @@ impl Lights {
                     let density = 1.0 / u.cross(v).length();
                     rects.push(Area { density, ..Area::new(corner, u, v, radiance, false) });
                 }
+                Light::Sky { .. } => skies.extend(Sky::new(light, environments)),
                 other => simple.push(other),
             }
         }
@@ -122,7 +127,7 @@ impl Lights {
         for e in &mut emitters {
             e.density = brightness(e.radiance) * if e.two_sided { 2.0 } else { 1.0 } / total;
         }
-        Lights { simple, rects, emitters, power }
+        Lights { simple, skies, rects, emitters, power }
     }
 
     /// Chooses a light and a point on it for the surface element at `point`. `square` places the
@@ -139,7 +144,10 @@ impl Lights {
             }
         };
         for light in &self.simple {
-            offer(propose_simple(light, point, normal), random);
+            offer(propose_simple(light, point, normal, square), random);
+        }
+        for sky in &self.skies {
+            offer(sky.propose(normal, random), random);
         }
         for rect in &self.rects {
             offer(rect.propose(point, normal, square), random);
@@ -156,6 +164,12 @@ impl Lights {
     /// area sampling. (Rect lights stop no rays, so there may be several.)
     pub fn rects_along(&self, origin: DVec3, direction: DVec3, range: [f64; 2], by_direction: f64) -> DVec3 {
         self.rects.iter().fold(DVec3::ZERO, |sum, rect| sum + rect_along(rect, origin, direction, range, by_direction))
+    }
+
+    /// Radiance of the skies along a ray that hits nothing, weighted against their own sampling if its
+    /// direction was sampled by cosine.
+    pub fn skies_along(&self, direction: DVec3, by_direction: Option<f64>) -> DVec3 {
+        self.skies.iter().map(|s| s.along(direction, by_direction)).sum()
     }
 
     /// Weight of a triangle's emission that a ray sampled by cosine has found at `distance`, under
@@ -190,8 +204,8 @@ fn rect_along(rect: &Area, origin: DVec3, direction: DVec3, [from, to]: [f64; 2]
     rect.radiance * balance(by_direction, by_area)
 }
 
-/// Point, spot and directional lights.
-fn propose_simple(light: &Light, point: DVec3, normal: DVec3) -> Option<Proposal> {
+/// Point, spot and directional lights; `square` places the sample on a disc.
+fn propose_simple(light: &Light, point: DVec3, normal: DVec3, square: [f64; 2]) -> Option<Proposal> {
     let towards = |position: Vec3| {
         let to_light = position.as_dvec3() - point;
         let distance = to_light.length();
@@ -208,10 +222,17 @@ fn propose_simple(light: &Light, point: DVec3, normal: DVec3) -> Option<Proposal
             let falloff = Light::spot_falloff(cosine as f32, inner, outer) as f64;
             (direction, distance, rgb(intensity) * (falloff / (distance * distance)))
         }
-        Light::Directional { direction, irradiance } => {
-            (-direction.as_dvec3().normalize(), f64::INFINITY, rgb(irradiance))
+        Light::Directional { direction, irradiance, angular_radius } => {
+            let axis = -direction.as_dvec3().normalize();
+            let (x, y) = axis.any_orthonormal_pair();
+            // A disc in the plane across the axis projects to the cap: radiance L, density cos/(π sin² α),
+            // so what a sample stands for is L π sin² α / cos = irradiance / cos.
+            let sine = (angular_radius as f64).sin() * square[0].sqrt();
+            let cosine = (1.0 - sine * sine).sqrt();
+            let (sin, cos) = (TAU * square[1]).sin_cos();
+            (axis * cosine + (x * cos + y * sin) * sine, f64::INFINITY, rgb(irradiance) / cosine.max(1e-9))
         }
-        Light::Rect { .. } => return None,
+        Light::Rect { .. } | Light::Sky { .. } => return None,
     };
     let cosine = normal.dot(direction);
     (cosine > 0.0).then(|| Proposal { irradiance: irradiance * cosine, direction, distance })

@@ -12,6 +12,7 @@ mod lights;
 mod oracle;
 mod path;
 mod random;
+mod sky;
 mod surfaces;
 
 pub use geometry::{Geometry, Hit64, Ray64};

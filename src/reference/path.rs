@@ -3,7 +3,7 @@
 //!
 //! What it computes is what the library means: one-sided surfaces seen or hit from behind are black
 //! and absorb, two-sided ones reflect and emit on both sides, rect lights emit from one side and are
-//! not hit by rays, the background is black. Textures colour surfaces and cut holes into them; sheets that
+//! not hit by rays, the background is black but for skies. Textures colour surfaces and cut holes into them; sheets that
 //! transmit are passed straight or reflect, by chance.
 
 use super::geometry::{Geometry, Hit64, Ray64};
@@ -13,7 +13,7 @@ use super::surfaces::Surfaces;
 use crate::device::Device;
 use crate::error::{Result, invalid_argument};
 use crate::progress::Progress;
-use crate::scene::{Camera, Light, Material, Mesh, Scene, SceneData, Texture};
+use crate::scene::{Camera, Environment, Light, Material, Mesh, Scene, SceneData, Texture};
 use glam::{DVec3, Vec3};
 use rayon::prelude::*;
 use std::f64::consts::PI;
@@ -89,15 +89,21 @@ pub struct PathTracer {
 impl PathTracer {
     /// Of a committed scene, with its lights of now.
     pub fn new(scene: &Scene) -> Self {
-        Self::from_parts(scene.meshes(), scene.materials(), scene.textures(), &scene.lights())
+        Self::from_parts(scene.meshes(), scene.materials(), scene.textures(), scene.environments(), &scene.lights())
     }
 
     /// Of a scene that has not been committed.
     pub fn from_data(data: &SceneData) -> Self {
-        Self::from_parts(data.meshes(), data.materials(), data.textures(), data.lights())
+        Self::from_parts(data.meshes(), data.materials(), data.textures(), data.environments(), data.lights())
     }
 
-    fn from_parts(meshes: &[Mesh], materials: &[Material], textures: &[Arc<Texture>], lights: &[Light]) -> Self {
+    fn from_parts(
+        meshes: &[Mesh],
+        materials: &[Material],
+        textures: &[Arc<Texture>],
+        environments: &[Arc<Environment>],
+        lights: &[Light],
+    ) -> Self {
         let geometry = Geometry::new(meshes);
         let all = || meshes.iter().flat_map(|m| (0..m.indices.len()).map(move |t| (m, t)));
         let (lower, upper) = geometry.bounds();
@@ -105,7 +111,7 @@ impl PathTracer {
         PathTracer {
             surfaces: Surfaces::new(meshes, materials, textures),
             corners: all().map(|(m, t)| m.corners(t)).collect(),
-            lights: Lights::new(meshes, materials, lights),
+            lights: Lights::new(meshes, materials, environments, lights),
             offset: OFFSET * (largest + (upper - lower).length()),
             geometry,
             max_bounces: u32::MAX,
@@ -250,7 +256,7 @@ impl PathTracer {
             let limit = hit.map_or(f64::INFINITY, |h| passed + h.t);
             sum += self.lights.rects_along(start, ray.direction, [passed, limit], density);
         }
-        let Some(hit) = hit else { return sum };
+        let Some(hit) = hit else { return sum + self.lights.skies_along(ray.direction, density) };
         let (material, point, is_lit) = self.surface(ray, hit);
         if material.is_emissive() && is_lit {
             let cosine = point.normal.dot(ray.direction);
@@ -429,8 +435,12 @@ mod tests {
 
     #[test]
     fn the_sun_gives_its_irradiance_times_cosine() {
-        let e = floor_under(Light::Directional { direction: Vec3::new(-3.0, 0.0, -4.0), irradiance: [2.0; 3] })
-            .irradiance(&UP, 16, 0, 0);
+        let e = floor_under(Light::Directional {
+            direction: Vec3::new(-3.0, 0.0, -4.0),
+            irradiance: [2.0; 3],
+            angular_radius: 0.0,
+        })
+        .irradiance(&UP, 16, 0, 0);
         assert!((e.direct[0] - 1.6).abs() < 1e-6);
         assert_eq!(e.indirect, [0.0; 3]);
     }
@@ -499,7 +509,8 @@ mod tests {
             data.add_light(Light::Point { position: Vec3::new(x, 0.0, 4.0), intensity: [25.0; 3] }).unwrap();
         }
         let sun = Vec3::new(0.0, -5.0, -1.0);
-        data.add_light(Light::Directional { direction: sun, irradiance: [26f32.sqrt(); 3] }).unwrap();
+        data.add_light(Light::Directional { direction: sun, irradiance: [26f32.sqrt(); 3], angular_radius: 0.0 })
+            .unwrap();
         // The square above the point hides the middle light; the sun comes in below it.
         let e = PathTracer::from_data(&data).irradiance(&UP, 1 << 14, 0, 0);
         assert_irradiance(&e, 2.0 * 25.0 * 0.8 / 25.0 + 1.0, 0.01);

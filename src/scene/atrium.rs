@@ -65,7 +65,7 @@ pub fn atrium() -> Result<SceneData> {
         edge_v: Vec3::new(0.0, 0.0, 2.0 * z),
         radiance: [3.2, 4.0, 5.2],
     })?;
-    scene.add_light(Light::Directional { direction: SUN, irradiance: [44.0, 37.5, 28.0] })?;
+    scene.add_light(Light::Directional { direction: SUN, irradiance: [44.0, 37.5, 28.0], angular_radius: 0.0 })?;
     Ok(scene)
 }
 

@@ -1,7 +1,7 @@
 //! The committed scene: acceleration structure, emitters, bounds and numbers.
 
 use super::mesh::is_valid_triangle;
-use super::{Light, MAX_ALBEDO, Material, Mesh, MeshMaterials, NONE, SceneData, Texture, texture};
+use super::{Environment, Light, MAX_ALBEDO, Material, Mesh, MeshMaterials, NONE, SceneData, Sky, Texture, texture};
 use crate::bvh::{self, BuildOptions, Tree};
 use crate::device::{Device, LogLevel};
 use crate::error::{Error, Result, invalid_argument};
@@ -121,7 +121,7 @@ impl Uses {
 
 impl Scene {
     /// Builds the acceleration structure. On an error, `data` comes back unharmed.
-    // It goes in by value and comes back so.
+    // Once per scene: what is handed back may be large.
     #[allow(clippy::result_large_err)]
     pub fn commit(
         device: &Arc<Device>,
@@ -270,7 +270,9 @@ impl Scene {
                 &format!("{} of {total} triangles are degenerate or not finite and were skipped", skipped.len()),
             );
         }
-        let meshes = mesh_bytes(&data.meshes) + data.textures.iter().map(|t| t.bytes()).sum::<usize>();
+        let textures: usize = data.textures.iter().map(|t| t.bytes()).sum();
+        let environments: usize = data.environments.iter().map(|e| e.bytes()).sum();
+        let meshes = mesh_bytes(&data.meshes) + textures + environments;
         let mut memory = device.memory().reserve(meshes + bvh::estimated_bytes(valid.len(), options), "the scene")?;
         let (tree, sah_cost) = device.install(|| bvh::build(&corners, &valid, &first_triangle, options, progress))?;
         progress.check()?;
@@ -323,14 +325,26 @@ impl Scene {
         &self.uses
     }
 
+    /// The images of skies, by number.
+    pub fn environments(&self) -> &[Arc<Environment>] {
+        &self.data.environments
+    }
+
     /// A snapshot of the lights, by number.
     pub fn lights(&self) -> Arc<Vec<Light>> {
         self.lights.read().unwrap_or_else(|e| e.into_inner()).clone()
     }
 
+    /// A sky light as it is sampled; `None` for other lights.
+    pub fn sky(&self, light: &Light) -> Option<Sky> {
+        let Light::Sky { radiance, environment, up, rotation } = *light else { return None };
+        Some(Sky::new(radiance, environment, up, rotation, self.environments()))
+    }
+
     /// Replaces light `id`. Bakes that are running keep the lights that they started with.
     pub fn set_light(&self, id: u32, light: Light) -> Result<()> {
         light.validate()?;
+        light.check_environment(self.environments().len())?;
         let mut lights = self.lights.write().unwrap_or_else(|e| e.into_inner());
         let mut new = (**lights).clone();
         match new.get_mut(id as usize) {

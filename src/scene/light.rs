@@ -1,6 +1,6 @@
 //! Lights without geometry. (Emissive triangles are lights too; see [`super::Emitter`].)
 
-use super::{check_energy, check_finite};
+use super::{NONE, check_energy, check_finite};
 use crate::error::{Result, invalid_argument};
 use glam::Vec3;
 
@@ -12,13 +12,25 @@ pub enum Light {
     /// Radiates in a cone around `direction`: fully within `inner` radians of it, not at all beyond
     /// `outer` (≤ π), smoothly in between (Hermite interpolation in the cosine). `intensity` in W/sr on the axis.
     Spot { position: Vec3, direction: Vec3, inner: f32, outer: f32, intensity: [f32; 3] },
-    /// Parallel light that travels along `direction`. `irradiance` on a perpendicular plane in W/m².
-    Directional { direction: Vec3, irradiance: [f32; 3] },
+    /// Light from infinitely far away that travels along `direction`, parallel or, with an
+    /// `angular_radius` (radians, in [0, π/2]; less than 1e-5 counts as 0), from a disc of uniform
+    /// radiance around it; the sun's is 0.00465. `irradiance` in W/m² on a plane that faces the middle
+    /// of the disc with all of it above its horizon.
+    Directional { direction: Vec3, irradiance: [f32; 3], angular_radius: f32 },
     /// The parallelogram with a corner at `position` and edges `edge_u` and `edge_v`. It radiates
     /// from the side that `edge_u × edge_v` points to. `radiance` in W/(m²·sr). It casts light but
     /// is not itself hit by rays.
     Rect { position: Vec3, edge_u: Vec3, edge_v: Vec3, radiance: [f32; 3] },
+    /// Light from all directions, infinitely far away: of `radiance` in W/(m²·sr), or `radiance` times
+    /// the scene's [`Environment`](super::Environment) of number `environment` ([`NONE`]: none). The
+    /// image's zenith is at `up`; its front, the middle, looks along −z, or along +y if `up` is less than
+    /// 45° from the z axis, made perpendicular to `up` and turned by `rotation` radians about it,
+    /// counter-clockwise as seen from its tip.
+    Sky { radiance: [f32; 3], environment: u32, up: Vec3, rotation: f32 },
 }
+
+/// Discs of less than this radius are points.
+const MIN_ANGULAR_RADIUS: f32 = 1e-5;
 
 impl Light {
     /// The colour field, whatever its unit.
@@ -26,7 +38,7 @@ impl Light {
         match *self {
             Light::Point { intensity, .. } | Light::Spot { intensity, .. } => intensity,
             Light::Directional { irradiance, .. } => irradiance,
-            Light::Rect { radiance, .. } => radiance,
+            Light::Rect { radiance, .. } | Light::Sky { radiance, .. } => radiance,
         }
     }
 
@@ -50,10 +62,24 @@ impl Light {
             Light::Spot { position, direction, inner, outer, intensity } => {
                 Light::Spot { position, direction: unit(direction), inner, outer, intensity }
             }
-            Light::Directional { direction, irradiance } => {
-                Light::Directional { direction: unit(direction), irradiance }
+            Light::Directional { direction, irradiance, angular_radius } => {
+                let angular_radius = if angular_radius < MIN_ANGULAR_RADIUS { 0.0 } else { angular_radius };
+                Light::Directional { direction: unit(direction), irradiance, angular_radius }
+            }
+            Light::Sky { radiance, environment, up, rotation } => {
+                Light::Sky { radiance, environment, up: unit(up), rotation }
             }
             other => other,
+        }
+    }
+
+    /// Checks that the scene's environment exists, if it is a sky with one.
+    pub(crate) fn check_environment(&self, count: usize) -> Result<()> {
+        match *self {
+            Light::Sky { environment, .. } if environment != NONE && environment as usize >= count => {
+                invalid_argument!("environment {environment} does not exist, the scene has {count}")
+            }
+            _ => Ok(()),
         }
     }
 
@@ -75,7 +101,20 @@ impl Light {
                 }
                 Ok(())
             }
-            Light::Directional { direction, .. } => check_direction(direction),
+            Light::Directional { direction, angular_radius, .. } => {
+                if !(0.0..=std::f32::consts::FRAC_PI_2).contains(&angular_radius) {
+                    return invalid_argument!("the angular radius is {angular_radius}, outside 0 to π/2");
+                }
+                check_direction(direction)
+            }
+            Light::Sky { up, rotation, .. } => {
+                check_finite("the sky's rotation", &[rotation])?;
+                check_finite("the sky's up", &up.to_array())?;
+                if up.as_dvec3().length() == 0.0 {
+                    return invalid_argument!("the sky's up is zero");
+                }
+                Ok(())
+            }
             Light::Rect { position, edge_u, edge_v, .. } => {
                 check_finite("the light's position", &position.to_array())?;
                 check_finite("edge_u", &edge_u.to_array())?;

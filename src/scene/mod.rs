@@ -4,6 +4,7 @@
 mod atrium;
 mod builtin;
 mod commit;
+mod environment;
 mod light;
 mod material;
 mod mesh;
@@ -12,6 +13,7 @@ mod texture;
 
 pub use builtin::{BUILTIN_NAMES, Camera, builtin, builtin_camera};
 pub use commit::{Emitter, Scene, SceneStats, unit_normal};
+pub use environment::{Environment, MAX_ENVIRONMENT_SIZE, Sky};
 pub use light::Light;
 pub use material::{MAX_ALBEDO, Material};
 pub use mesh::{LightmapUvs, Mesh, MeshMaterials, is_valid_triangle};
@@ -38,6 +40,7 @@ pub struct SceneData {
     lights: Vec<Light>,
     /// Shared by the copies that refits make.
     textures: Vec<Arc<Texture>>,
+    environments: Vec<Arc<Environment>>,
 }
 
 impl SceneData {
@@ -76,12 +79,19 @@ impl SceneData {
     /// Adds a light and returns its number.
     pub fn add_light(&mut self, light: Light) -> Result<u32> {
         light.validate()?;
+        light.check_environment(self.environments.len())?;
         self.lights.push(light.normalized());
         Ok(self.lights.len() as u32 - 1)
     }
 
-    /// Moves all of `other` behind what is here; its material and texture numbers are shifted. A refusal
-    /// changes nothing here.
+    /// Adds an image for skies and returns its number.
+    pub fn add_environment(&mut self, environment: Environment) -> u32 {
+        self.environments.push(Arc::new(environment));
+        self.environments.len() as u32 - 1
+    }
+
+    /// Moves all of `other` behind what is here; its material, texture and environment
+    /// numbers are shifted. A refusal changes nothing here.
     pub fn append(&mut self, mut other: SceneData) -> Result<()> {
         let total = self.triangle_count() + other.triangle_count();
         if total > MAX_TRIANGLES {
@@ -99,6 +109,14 @@ impl SceneData {
             material.albedo_texture += shift;
         }
         self.textures.append(&mut other.textures);
+        for light in &mut other.lights {
+            if let Light::Sky { environment, .. } = light
+                && *environment != NONE
+            {
+                *environment += self.environments.len() as u32;
+            }
+        }
+        self.environments.append(&mut other.environments);
         self.meshes.append(&mut other.meshes);
         self.materials.append(&mut other.materials);
         self.lights.append(&mut other.lights);
@@ -108,6 +126,7 @@ impl SceneData {
     /// Replaces light `id`.
     pub fn set_light(&mut self, id: u32, light: Light) -> Result<()> {
         light.validate()?;
+        light.check_environment(self.environments.len())?;
         let count = self.lights.len();
         match self.lights.get_mut(id as usize) {
             Some(l) => *l = light.normalized(),
@@ -134,6 +153,11 @@ impl SceneData {
     /// The lights, by number.
     pub fn lights(&self) -> &[Light] {
         &self.lights
+    }
+
+    /// The images of skies, by number.
+    pub fn environments(&self) -> &[Arc<Environment>] {
+        &self.environments
     }
 
     /// Triangles in all meshes, degenerate ones included.

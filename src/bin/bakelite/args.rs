@@ -2,7 +2,7 @@
 
 use bakelite::bvh::{BuildOptions, BuildQuality};
 use bakelite::lightmap::{BakeParams, LightmapDesc};
-use bakelite::scene::Camera;
+use bakelite::scene::{Camera, NONE};
 use bakelite::{Isa, Light};
 use glam::Vec3;
 use lexopt::Arg;
@@ -32,7 +32,11 @@ Lights, added to those of the scene; may be repeated:
   --light point:X,Y,Z:R,G,B               intensity in W/sr
   --light spot:X,Y,Z:DX,DY,DZ:INNER,OUTER:R,G,B
                                           cone angles in degrees, intensity in W/sr
-  --light sun:DX,DY,DZ:R,G,B              direction of travel, irradiance in W/m2
+  --light sun:DX,DY,DZ:R,G,B[:DEGREES]    direction of travel, irradiance in W/m2,
+                                          radius of its disc [0; the sun's: 0.27]
+  --light sky:R,G,B                       the same radiance from all directions
+  --light sky:FILE.hdr|.exr[:SCALE]       an image by longitude and latitude, its
+                                          zenith along --up, times SCALE
   --light rect:X,Y,Z:UX,UY,UZ:VX,VY,VZ:R,G,B
                                           corner and edges, shines along u x v,
                                           radiance in W/(m2 sr)
@@ -92,12 +96,21 @@ pub enum Command {
     Version,
 }
 
+/// A light of the command line.
+#[derive(Clone, Debug)]
+pub struct GivenLight {
+    /// Of a sky, up is still to be set.
+    pub light: Light,
+    /// Of a sky.
+    pub image: Option<PathBuf>,
+}
+
 /// Arguments of `bakelite bake`.
 #[derive(Clone, Debug)]
 pub struct BakeArgs {
     /// A file or a built-in name.
     pub scene: String,
-    pub lights: Vec<Light>,
+    pub lights: Vec<GivenLight>,
     pub desc: LightmapDesc,
     pub params: BakeParams,
     pub build: BuildOptions,
@@ -408,14 +421,19 @@ fn tuple<const N: usize>(flag: &str, what: &str, value: &str) -> Result<[f32; N]
     })
 }
 
-fn light(value: &str) -> Result<Light, String> {
+fn light(value: &str) -> Result<GivenLight, String> {
     let flag = format!("--light {value}");
     let fields: Vec<&str> = value.split(':').collect();
     let vector = |i: usize, what: &str| tuple::<3>(&flag, what, fields[i]).map(Vec3::from);
     let color = |i: usize| tuple::<3>(&flag, "colour", fields[i]);
     let light = match (fields[0], fields.len()) {
         ("point", 3) => Light::Point { position: vector(1, "position")?, intensity: color(2)? },
-        ("sun", 3) => Light::Directional { direction: vector(1, "direction")?, irradiance: color(2)? },
+        ("sun", 3 | 4) => {
+            let degrees = if fields.len() == 4 { number::<f32>(&flag, fields[3])? } else { 0.0 };
+            let (direction, irradiance) = (vector(1, "direction")?, color(2)?);
+            Light::Directional { direction, irradiance, angular_radius: degrees.to_radians() }
+        }
+        ("sky", 2 | 3) => return sky(&flag, &fields),
         ("spot", 5) => {
             let [inner, outer] = tuple::<2>(&flag, "cone", fields[3])?.map(f32::to_radians);
             let (position, direction) = (vector(1, "position")?, vector(2, "direction")?);
@@ -427,14 +445,35 @@ fn light(value: &str) -> Result<Light, String> {
             edge_v: vector(3, "edge v")?,
             radiance: color(4)?,
         },
-        (kind @ ("point" | "sun" | "spot" | "rect"), n) => {
-            let expected = if matches!(kind, "point" | "sun") { 3 } else { 5 };
+        (kind @ ("point" | "sun" | "spot" | "rect" | "sky"), n) => {
+            let expected = match kind {
+                "point" => "3",
+                "sun" => "3 or 4",
+                "sky" => "2 or 3",
+                _ => "5",
+            };
             return Err(format!("{flag} has {n} parts between colons, a {kind} has {expected} (see --help)"));
         }
-        (kind, _) => return Err(format!("{flag}: the kind {kind:?} is not point, spot, sun or rect")),
+        (kind, _) => return Err(format!("{flag}: the kind {kind:?} is not point, spot, sun, sky or rect")),
     };
     light.validate().map_err(|e| format!("{flag}: {e}"))?;
-    Ok(light)
+    Ok(GivenLight { light, image: None })
+}
+
+/// A colour for all directions, or an image.
+fn sky(flag: &str, fields: &[&str]) -> Result<GivenLight, String> {
+    let sky = |radiance| Light::Sky { radiance, environment: NONE, up: Vec3::Y, rotation: 0.0 };
+    let is_image = [".hdr", ".exr"].iter().any(|e| fields[1].to_lowercase().ends_with(e));
+    let given = if is_image {
+        let scale = if fields.len() == 3 { number(flag, fields[2])? } else { 1.0 };
+        GivenLight { light: sky([scale; 3]), image: Some(fields[1].into()) }
+    } else if fields.len() == 3 {
+        return Err(format!("{flag}: {:?} is not a .hdr or .exr file, and a colour has no scale", fields[1]));
+    } else {
+        GivenLight { light: sky(tuple::<3>(flag, "colour", fields[1])?), image: None }
+    };
+    given.light.validate().map_err(|e| format!("{flag}: {e}"))?;
+    Ok(given)
 }
 
 fn camera(value: &str) -> Result<Camera, String> {
@@ -500,14 +539,22 @@ mod tests {
     fn every_flag_of_the_help_is_known_and_takes_hold() {
         let b = bake(
             "bake s.obj --light point:1,2,3:4,5,6 --light spot:0,0,0:0,-1,0:20,30:1,1,1 --light sun:0,-1,0:7,8,9 \
+             --light sun:0,-1,0:7,8,9:90 --light sky:1,2,3 --light sky:a.HDR:2.5 \
              --light rect:0,0,0:1,0,0:0,0,1:2,2,2 --texels-per-unit 2.5 --page-size 256 --padding 3 --gather-divisor 2 \
              --radiance-divisor 16 --photons 5 --bounces 6 --gather-rays 7 --radius 0.5 --blur 8 --direct-samples 9 \
              --seed 10 --threads 2 --isa portable --bins 32 --leaf 4 --build high --compact --camera 0,1,2:3,4,5:40 --up z --width 64 \
              --height 48 --reference-spp 3 --out o --no-glb --quiet",
         )
         .unwrap();
-        assert_eq!(b.lights.len(), 4);
-        assert_eq!(b.lights[0], Light::Point { position: Vec3::new(1.0, 2.0, 3.0), intensity: [4.0, 5.0, 6.0] });
+        assert_eq!(b.lights.len(), 7);
+        assert_eq!(b.lights[0].light, Light::Point { position: Vec3::new(1.0, 2.0, 3.0), intensity: [4.0, 5.0, 6.0] });
+        let Light::Directional { angular_radius, .. } = b.lights[3].light else { panic!() };
+        assert!((angular_radius - std::f32::consts::FRAC_PI_2).abs() < 1e-6);
+        assert_eq!((b.lights[4].light.color(), &b.lights[4].image), ([1.0, 2.0, 3.0], &None));
+        assert_eq!((b.lights[5].light.color(), b.lights[5].image.as_deref()), ([2.5; 3], Some("a.HDR".as_ref())));
+        for bad in ["sky", "sky:a.png", "sky:1,2,3:4", "sky:-1,0,0", "sun:0,-1,0:7,8,9:91"] {
+            assert!(bake(&format!("bake s.obj --light {bad}")).is_err(), "{bad}");
+        }
         assert_eq!((b.desc.texels_per_unit, b.desc.page_size, b.desc.padding), (2.5, 256, 3));
         assert_eq!((b.desc.gather_divisor, b.desc.radiance_divisor), (2, 16));
         let p = &b.params;

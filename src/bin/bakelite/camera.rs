@@ -196,7 +196,12 @@ mod tests {
         let indices = vec![[0, 2, 1], [0, 1, 3], [0, 3, 2], [1, 2, 3]];
         data.add_mesh(Mesh { positions, indices, materials: MeshMaterials::One(material), ..Default::default() })
             .unwrap();
-        data.add_light(Light::Directional { direction: Vec3::new(-1.0, -0.1, -0.2), irradiance: [1.0; 3] }).unwrap();
+        data.add_light(Light::Directional {
+            direction: Vec3::new(-1.0, -0.1, -0.2),
+            irradiance: [1.0; 3],
+            angular_radius: 0.0,
+        })
+        .unwrap();
         let camera = choose(&baked(data, 16.0), Vec3::Z);
         assert!(camera.position.z > 1.0 && camera.position.x > 1.0 && camera.target == Vec3::splat(0.5), "{camera:?}");
     }

@@ -266,6 +266,10 @@ pub fn moved_light(scene: &Scene, up: Vec3) -> Option<(Light, String)> {
             *direction = direction.normalize() + MOVE * across;
             format!("turns by {:.1} degrees, as it has no place to move from", MOVE.to_degrees())
         }
+        Light::Sky { rotation, .. } => {
+            *rotation += MOVE;
+            format!("turns by {:.1} degrees", MOVE.to_degrees())
+        }
     };
     Some((light, words))
 }

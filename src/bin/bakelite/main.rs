@@ -38,7 +38,7 @@ use bakelite::device::LogLevel;
 use bakelite::io::image::write_png_rgb8;
 use bakelite::lightmap::{BakeStats, Lightmap};
 use bakelite::scene::{BUILTIN_NAMES, Camera, builtin, builtin_camera};
-use bakelite::{Device, DeviceOptions, Error, Result, Scene, SceneData};
+use bakelite::{Device, DeviceOptions, Error, Light, Result, Scene, SceneData};
 use bar::Bars;
 use pictures::{NAMES, Pictures, View};
 use std::path::{Path, PathBuf};
@@ -153,7 +153,14 @@ impl<'a> Job<'a> {
             self.warnings = info.warnings;
             data
         };
-        for &light in &self.args.lights {
+        for given in &self.args.lights {
+            let mut light = given.light;
+            if let Light::Sky { environment, up, .. } = &mut light {
+                *up = self.args.up;
+                if let Some(path) = &given.image {
+                    *environment = data.add_environment(bakelite::io::image::read_environment(path)?);
+                }
+            }
             data.add_light(light)?;
         }
         for warning in &self.warnings {

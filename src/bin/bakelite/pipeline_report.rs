@@ -162,6 +162,7 @@ fn shadow_rate(scene: &Scene, places: &[[Vec3; 2]]) -> Result<f64> {
     let centre = |l: &Light| match *l {
         Light::Point { position, .. } | Light::Spot { position, .. } => position,
         Light::Directional { direction, .. } => -direction * 4.0 * scene.diagonal(),
+        Light::Sky { up, .. } => up * 4.0 * scene.diagonal(),
         Light::Rect { position, edge_u, edge_v, .. } => position + 0.5 * (edge_u + edge_v),
     };
     let emitters = scene.emitters().iter().map(|e| e.corner + (e.edge_u + e.edge_v) / 3.0);

@@ -4,6 +4,7 @@ use crate::args::BakeArgs;
 use crate::pictures::{NAMES, Pictures};
 use crate::table::Stage;
 use bakelite::lightmap::{BakeStats, Lightmap};
+use bakelite::scene::NONE;
 use bakelite::{Light, Scene};
 use glam::Vec3;
 use serde_json::{Value, json};
@@ -117,9 +118,14 @@ fn light(light: &Light) -> Value {
             "kind": "spot", "position": v(position), "direction": v(direction),
             "inner_degrees": inner.to_degrees(), "outer_degrees": outer.to_degrees(), "intensity": intensity,
         }),
-        Light::Directional { direction, irradiance } => {
-            json!({"kind": "sun", "direction": v(direction), "irradiance": irradiance})
-        }
+        Light::Directional { direction, irradiance, angular_radius } => json!({
+            "kind": "sun", "direction": v(direction), "irradiance": irradiance,
+            "radius_degrees": angular_radius.to_degrees(),
+        }),
+        Light::Sky { radiance, environment, up, rotation } => json!({
+            "kind": "sky", "radiance": radiance, "environment": (environment != NONE).then_some(environment),
+            "up": v(up), "rotation_degrees": rotation.to_degrees(),
+        }),
         Light::Rect { position, edge_u, edge_v, radiance } => json!({
             "kind": "rect", "corner": v(position), "edge_u": v(edge_u), "edge_v": v(edge_v), "radiance": radiance,
         }),
