@@ -221,6 +221,20 @@ fn all_power_emitted_is_absorbed_or_escapes_or_is_cut_off() {
     }
 }
 
+/// Lengths of paths are stratified over the photons: with independent numbers for every bounce, the standard
+/// deviation of 1,000 photons at albedo 0.999 would be 3 %.
+#[test]
+fn few_photons_of_long_paths_lose_no_power() {
+    for albedo in [0.5, 0.9, 0.999] {
+        let scene = commit(room(albedo, Vec3::ONE, Vec3::new(0.4, 0.5, 0.6)));
+        let s = trace(&scene, PhotonParams { photon_count: 1_000, ..Default::default() }).stats();
+        for c in 0..3 {
+            let sum = s.absorbed_power[c] + s.escaped_power[c] + s.truncated_power[c];
+            assert_close(sum, s.emitted_power[c], 0.005);
+        }
+    }
+}
+
 #[test]
 fn the_photons_of_all_lights_carry_exactly_their_power() {
     let mut data = cornell_like();

@@ -10,7 +10,7 @@ use super::{PATH_LIMIT, PhotonParams, PhotonStats};
 use crate::error::{Error, Result};
 use crate::memory::{MemoryMonitor, Reservation};
 use crate::progress::{Progress, Stage};
-use crate::sampling::{combine, purpose_seed, sobol_2d, uniform};
+use crate::sampling::{combine, purpose_seed, sobol_2d, sobol_2d_bits, uniform};
 use crate::scene::{Light, NONE, Scene};
 use crate::trace::offset::{SurfacePoint, offset_ray_origin};
 use crate::trace::{RawHit, Ray};
@@ -26,11 +26,12 @@ const MEMORY_STEP: usize = 16 << 20;
 
 /// What photon random numbers are drawn for.
 const PURPOSE: u32 = u32::from_be_bytes(*b"phot");
-/// Dimensions: the start of a path, then two per bounce.
+/// Dimensions: the start of a path, its length, then one per bounce.
 const ALLOTMENT: u32 = 0;
 const EMIT_POSITION: u32 = 1;
 const EMIT_DIRECTION: u32 = 2;
-const BOUNCE: u32 = 3;
+const ROULETTE: u32 = 3;
+const BOUNCE: u32 = 4;
 
 /// A photon on a surface.
 #[derive(Clone, Copy, Debug, Default, PartialEq)]
@@ -126,6 +127,8 @@ impl Tally {
 #[derive(Clone, Copy)]
 struct Path {
     photon: u32,
+    /// What Russian roulette is played with: uniform in (0, 1), given that the path is still alive.
+    luck: f32,
     power: Vec3,
 }
 
@@ -217,7 +220,10 @@ impl<'a> Tracer<'a> {
     fn emit(&self, photon: u32) -> (Ray, Path) {
         let at = |dimension| sobol_2d(photon, combine(self.seed, dimension));
         let e = self.emission.emit(photon as u64, at(EMIT_POSITION), at(EMIT_DIRECTION));
-        (Ray::new(e.origin, e.direction), Path { photon, power: e.power })
+        // All 32 bits: of paths with 10⁷ others, the longest are decided by the last.
+        let [luck, _] = sobol_2d_bits(photon, combine(self.seed, ROULETTE));
+        let luck = ((luck as f64 + 0.5) / (1u64 << 32) as f64) as f32;
+        (Ray::new(e.origin, e.direction), Path { photon, luck, power: e.power })
     }
 
     /// What the hit lies on.
@@ -276,15 +282,19 @@ impl<'a> Tracer<'a> {
         // The brightest channel keeps its power through all bounces: photons of similar power make
         // the least noise (Jensen 2001, section 5.2).
         let survival = reflected.max_element() / path.power.max_element();
-        let dimension = BOUNCE + 2 * bounce;
         // Not so if it is NaN, of photons too faint for f32.
-        let survives = uniform(path.photon, dimension, self.seed) < survival;
+        let survives = path.luck < survival;
         if !survives {
             return None;
         }
-        let u = sobol_2d(path.photon, combine(self.seed, dimension + 1));
+        // One number decides a whole path: what is below the probability is uniform again when divided by
+        // it. The numbers of all photons being stratified, so are the lengths of their paths, and the power
+        // that reaches surfaces is almost free of noise (albedo 0.999, 2,000 photons: with independent
+        // numbers it was off by 2 %).
+        let luck = path.luck / survival;
+        let u = sobol_2d(path.photon, combine(self.seed, BOUNCE + bounce));
         let origin = offset_ray_origin(point.interior, normal, self.scene);
-        Some((Ray::new(origin, cosine_around(normal, u)), Path { photon: path.photon, power: reflected / survival }))
+        Some((Ray::new(origin, cosine_around(normal, u)), Path { luck, power: reflected / survival, ..path }))
     }
 }
 
