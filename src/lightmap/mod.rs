@@ -16,6 +16,7 @@ mod polygon;
 pub(crate) mod radiance;
 mod read;
 mod sides;
+mod terminator;
 pub mod texels;
 mod unwrap;
 
@@ -237,8 +238,11 @@ impl LightmapDesc {
 impl BakeParams {
     /// Checks the ranges documented on the fields.
     pub fn validate(&self) -> Result<()> {
-        if !(self.radius >= 0.0) {
-            return invalid_argument!("radius is {}, not ≥ 0", self.radius);
+        if !(self.radius >= 0.0 && self.radius.is_finite()) {
+            return invalid_argument!("radius is {}, not a finite number ≥ 0 (0: automatic)", self.radius);
+        }
+        if self.radius > 0.0 && !self.radius.is_normal() {
+            return invalid_argument!("radius is {:e}, less than {:e}", self.radius, f32::MIN_POSITIVE);
         }
         if self.gather_rays > 1 << 16 {
             return invalid_argument!("gather_rays is {}, more than 65536", self.gather_rays);
