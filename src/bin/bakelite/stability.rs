@@ -160,9 +160,11 @@ impl<'a> Lab<'a> {
         std::mem::take(&mut self.warnings.lock().unwrap_or_else(|e| e.into_inner()))
     }
 
-    /// All parameters, or of those for a quick look only every third.
+    /// All parameters, or for a quick look every third, the last (most extreme) among them.
     pub fn some<T: Copy>(&self, all: &[T]) -> Vec<T> {
-        all.iter().copied().step_by(if self.quick { 3 } else { 1 }).collect()
+        let mut some: Vec<T> = all.iter().rev().copied().step_by(if self.quick { 3 } else { 1 }).collect();
+        some.reverse();
+        some
     }
 }
 
