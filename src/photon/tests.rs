@@ -465,6 +465,26 @@ fn the_memory_budget_is_kept_and_named() {
     assert!(PhotonMap::trace(&scene, &enough, &Progress::none()).is_ok());
 }
 
+/// Not only between them: one block of photons between white walls stores hundreds of megabytes.
+#[test]
+fn the_memory_budget_is_kept_within_a_block() {
+    let scene = commit(room(1.0 - f32::EPSILON, Vec3::ONE, Vec3::splat(0.5)));
+    let params = PhotonParams { photon_count: 1_000, memory_budget: 4 << 20, ..Default::default() };
+    let refused = PhotonMap::trace(&scene, &params, &Progress::none()).err();
+    assert!(matches!(refused, Some(Error::OutOfMemory(_))), "{refused:?}");
+    let seen = Arc::new(std::sync::atomic::AtomicI64::new(0));
+    let memory = {
+        let seen = seen.clone();
+        move |bytes: i64| seen.fetch_add(bytes, std::sync::atomic::Ordering::SeqCst) + bytes < 64 << 20
+    };
+    let device =
+        Device::new(DeviceOptions { num_threads: 1, memory: Some(Box::new(memory)), ..Default::default() }).unwrap();
+    let scene = commit_on(&device, room(1.0 - f32::EPSILON, Vec3::ONE, Vec3::splat(0.5)));
+    let params = PhotonParams { photon_count: 1_000, ..Default::default() };
+    let refused = PhotonMap::trace(&scene, &params, &Progress::none()).err();
+    assert!(matches!(refused, Some(Error::OutOfMemory(_))), "{refused:?}");
+}
+
 #[test]
 fn all_memory_is_accounted_for_and_given_back() {
     let limit = 4 << 20;

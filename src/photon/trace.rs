@@ -24,6 +24,9 @@ const BLOCK: u64 = 1024;
 /// Memory is announced in steps of this many bytes while photons are traced.
 const MEMORY_STEP: usize = 16 << 20;
 
+/// The same within a block, as its photons are stored.
+const BLOCK_STEP: usize = 1 << 20;
+
 /// What photon random numbers are drawn for.
 const PURPOSE: u32 = u32::from_be_bytes(*b"phot");
 /// Dimensions: the start of a path, its length, then one per bounce.
@@ -69,8 +72,7 @@ pub(super) fn trace(
     let results: Vec<(Vec<StoredPhoton>, Tally)> = (0..count.div_ceil(BLOCK))
         .into_par_iter()
         .map(|block| {
-            let result = tracer.block(block, Some(&stage), None)?;
-            memory.grow(result.0.len() * size_of::<StoredPhoton>())?;
+            let result = tracer.block(block, Some((&stage, &memory)), None)?;
             stage.advance(1)?;
             Ok(result)
         })
@@ -164,11 +166,11 @@ impl<'a> Tracer<'a> {
         Tracer { scene, emission, seed, limit, store_direct: params.store_direct }
     }
 
-    /// Traces one block of photons; `record` gets the rays.
+    /// Traces one block of photons; `watch` may cancel and counts the memory; `record` gets the rays.
     fn block(
         &self,
         block: u64,
-        stage: Option<&Stage>,
+        watch: Option<(&Stage, &Account)>,
         mut record: Option<&mut Vec<Ray>>,
     ) -> Result<(Vec<StoredPhoton>, Tally)> {
         let numbers = block * BLOCK..((block + 1) * BLOCK).min(self.emission.count());
@@ -181,14 +183,22 @@ impl<'a> Tracer<'a> {
         }
         let mut hits = vec![RawHit::MISS; rays.len()];
         let mut surfaces = vec![Surface::NOTHING; rays.len()];
-        let mut stored = Vec::new();
+        let (mut stored, mut announced) = (Vec::new(), 0);
         let mut tally = Tally::default();
         for bounce in 0..self.limit {
             if rays.is_empty() {
                 break;
             }
-            if stage.is_some_and(|s| s.is_cancelled()) {
-                return Err(Error::Cancelled);
+            if let Some((stage, memory)) = watch {
+                if stage.is_cancelled() {
+                    return Err(Error::Cancelled);
+                }
+                // Between white walls, a block may store ten million photons.
+                let bytes = stored.len() * size_of::<StoredPhoton>();
+                if bytes - announced >= BLOCK_STEP {
+                    memory.grow(bytes - announced)?;
+                    announced = bytes;
+                }
             }
             if let Some(record) = record.as_deref_mut() {
                 record.extend_from_slice(&rays);
@@ -214,6 +224,9 @@ impl<'a> Tracer<'a> {
             paths.truncate(alive);
         }
         stored.shrink_to_fit();
+        if let Some((_, memory)) = watch {
+            memory.grow(stored.len() * size_of::<StoredPhoton>() - announced)?;
+        }
         Ok((stored, tally))
     }
 
