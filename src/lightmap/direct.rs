@@ -8,7 +8,7 @@
 
 use super::{polygon, terminator};
 use crate::sampling::{combine, sobol_2d, uniform_triangle};
-use crate::scene::{Light, Scene};
+use crate::scene::{BRIGHTEST, Light, Scene};
 use crate::trace::Ray;
 use crate::trace::offset::{SurfacePoint, offset_ray_origin, ray_epsilon};
 use glam::Vec3;
@@ -292,8 +292,9 @@ impl DirectLight {
         if cosine <= 0.0 || !receiver.faces(way.as_vec3()) || intensity.max_element() <= 0.0 {
             return Vec3::ZERO;
         }
-        let factor = (cosine / (d2 * d2.sqrt())) as f32;
-        if self.visible(receiver, position, rays) { intensity * factor } else { Vec3::ZERO }
+        let factor = (cosine / (d2 * d2.sqrt())).min(BRIGHTEST as f64) as f32;
+        let light = (intensity * factor).min(Vec3::splat(BRIGHTEST));
+        if self.visible(receiver, position, rays) { light } else { Vec3::ZERO }
     }
 
     /// Exact unoccluded irradiance times the visible fraction of it.
