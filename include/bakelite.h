@@ -331,6 +331,10 @@ BK_API bk_result bk_scene_set_build(bk_scene *scene, const bk_build_params *para
 //
 // progress, user: told how far it is; NULL if not wanted.
 //
+// Logs a warning if triangles are skipped, or if the scene lies so far from the origin that its f32
+// coordinates have too few digits for its size: rays start 32 rounding steps above surfaces, and from
+// about a thousand times the scene's size from the origin on that spoils light.
+//
 // Fails with BK_ERROR_INVALID_STATE if the scene is committed already or holds no usable triangle.
 // A commit that fails or is cancelled leaves the description as it was.
 BK_API bk_result bk_scene_commit(bk_scene *scene, bk_progress_fn progress, void *user);
@@ -737,20 +741,24 @@ typedef struct bk_photon_params {
   uint32_t struct_size;
   // BK_PHOTONS flags. Default: 0.
   uint32_t flags;
-  // Photons to emit, >= 1. Default: 1,000,000.
+  // Photons to emit, 1 to 2^32. They meet 1 / (1 - albedo) surfaces each, and take 96 bytes for each
+  // while the map is made, half of them later. Default: 1,000,000.
   uint64_t photon_count;
-  // Most surfaces that a photon meets; 0, the default: Russian roulette alone ends its path.
+  // Most surfaces that a photon meets; 0, the default: Russian roulette alone ends its path. At most
+  // 10,000 in any case.
   uint32_t max_bounces;
-  // Search radius of the estimate in scene units; 0, the default: from the density of photons.
+  // Search radius of the estimate in scene units, finite and at least 1.2e-38; 0, the default: from
+  // the density of photons.
   float radius;
-  // Half the height of the search cylinder, as a fraction of the radius. Default: 0.25.
+  // Half the height of the search cylinder, as a fraction of the radius, finite and > 0.
+  // Default: 0.25.
   float half_height;
   // Constant of Jensen's cone filter, >= 1; +infinity: no filter. Default: 1.1.
   float cone_k;
   // Seed of all random numbers. The same seed gives the same bits on any number of threads.
   // Default: 0.
   uint64_t seed;
-  // Bytes that the map may take; 0, the default: no limit.
+  // Bytes that the map may take while it is made; 0, the default: no limit.
   uint64_t memory_budget;
 } bk_photon_params;
 
@@ -778,7 +786,10 @@ BK_API void bk_photon_params_init(bk_photon_params *params);
 // params: NULL for the defaults. progress, user: told how far it is; NULL if not wanted. out:
 // receives the map, NULL on failure.
 //
-// Fails with BK_ERROR_OUT_OF_MEMORY if the map would not fit into memory_budget.
+// Fails with BK_ERROR_INVALID_ARGUMENT if a field of params is out of its range,
+// BK_ERROR_INVALID_STATE if the scene is not committed or has no lights, BK_ERROR_OUT_OF_MEMORY if
+// the map would not fit into memory_budget or the memory callback refuses, BK_ERROR_CANCELLED if
+// progress says so. Lights without power make an empty map.
 BK_API
 bk_result bk_photon_map_create(const bk_scene *scene,
                                const bk_photon_params *params,
@@ -796,7 +807,12 @@ BK_API void bk_photon_map_release(bk_photon_map *map);
 // thread does the work.
 //
 // positions, normals: count times three floats, packed, aligned to 4 bytes; normals of length 1.
-// out_irradiance_rgb: receives count times three floats, packed; must not overlap the inputs.
+// out_irradiance_rgb: receives count times three floats, packed, finite and >= 0, at most 1e30; must
+// not overlap the inputs.
+//
+// The estimate takes the search disc to lie wholly on the surface: less than a radius from an edge it
+// falls, to half at the edge, and photons behind a wall that crosses the disc count. Positions and
+// normals that are not finite give 0.
 BK_API
 bk_result bk_photon_map_estimate(const bk_photon_map *map,
                                  const float *positions,
@@ -807,10 +823,13 @@ bk_result bk_photon_map_estimate(const bk_photon_map *map,
 // Sets struct_size and clears the rest.
 BK_API void bk_photon_view_init(bk_photon_view *view);
 
-// Shows the stored photons, without a copy.
+// Shows the stored photons. The first call packs them, 36 bytes each, for as long as the map lives.
 //
 // out: receives pointers that are valid while the map lives. If no photon was stored, count is 0
 // and the pointers must not be read.
+//
+// Fails with BK_ERROR_OUT_OF_MEMORY if the memory callback refuses the packed copy that the first
+// call makes.
 BK_API bk_result bk_photon_map_photons(const bk_photon_map *map, bk_photon_view *out);
 
 /* ================================================================================================
@@ -831,12 +850,13 @@ typedef struct bk_lightmap bk_lightmap;
 typedef struct bk_lightmap_desc {
   // Size of this structure in bytes, set by bk_lightmap_desc_init.
   uint32_t struct_size;
-  // Texels per scene unit of what is unwrapped; 0, the default: so that the scene fills about
-  // four pages.
+  // Texels per scene unit of what is unwrapped, finite and >= 0; 0, the default: so that the scene
+  // fills about one page. All pages of a map together hold at most 2^29 texels.
   float texels_per_unit;
   // Width and height of a page in texels, 16 to 16384. Default: 1024.
   uint32_t page_size;
-  // Texels around each chart that filtering may read, 1 to 64. Default: 2.
+  // Texels around each chart that filtering may read, 1 to 64, at most a quarter of page_size.
+  // Default: 2.
   uint32_t padding;
   // Light map texels per texel of the gather map (indirect light), along each axis, 1 to 64.
   // Default: 4.
@@ -895,7 +915,13 @@ BK_API void bk_lightmap_desc_init(bk_lightmap_desc *desc);
 // scene: kept alive by the light map. desc: NULL for the defaults. progress, user: told how far it
 // is; NULL if not wanted. out: receives the light map, NULL on failure.
 //
-// Fails with BK_ERROR_OUT_OF_MEMORY if so many texels do not fit, or the memory callback refuses.
+// Logs a warning if the scene lies so far from the origin that rays start more than a quarter of a
+// texel above surfaces: 32 rounding steps of its coordinates.
+//
+// Fails with BK_ERROR_INVALID_ARGUMENT if a field of desc is out of its range or a mesh names a page
+// beyond 2^29 texels, BK_ERROR_INVALID_STATE if the scene is not committed, BK_ERROR_OUT_OF_MEMORY
+// if there would be more than 2^29 texels, they do not fit, or the memory callback refuses,
+// BK_ERROR_CANCELLED if progress says so.
 BK_API
 bk_result bk_lightmap_create(const bk_scene *scene,
                              const bk_lightmap_desc *desc,
@@ -921,6 +947,9 @@ BK_API bk_result bk_lightmap_info(const bk_lightmap *lightmap, struct bk_lightma
 // out_corner_uvs: receives u and v in [0, 1] of each corner, 3 * triangles * 2 floats, aligned to 4
 // bytes; NULL if not wanted. out_page_per_triangle: receives triangles page numbers, BK_NONE for
 // triangles without texels; NULL if not wanted.
+//
+// Fails with BK_ERROR_INVALID_ARGUMENT if there is no such mesh, with BK_ERROR_INVALID_STATE while
+// the light map is being baked.
 BK_API
 bk_result bk_lightmap_mesh_uvs(const bk_lightmap *lightmap,
                                uint32_t mesh,
@@ -976,13 +1005,15 @@ typedef struct bk_bake_params {
   // Most reflections of light before it reaches a texel; 0, the default: Russian roulette alone
   // decides.
   uint32_t max_bounces;
-  // Photons to emit. Default: 1,000,000.
+  // Photons to emit, at most 2^32; 0: no light that is reflected more than once. Default: 1,000,000.
   uint64_t photon_count;
   // Rays per texel of the gather map, at most 65536; 0: no indirect light. Default: 64.
   uint32_t gather_rays;
-  // Photon search radius in scene units; 0, the default: from the density of photons.
+  // Photon search radius in scene units, finite and at least 1.2e-38; 0, the default: from the
+  // density of photons. Photons on one plane count through walls that stand on it: a radius well
+  // above the automatic one lets light through them.
   float radius;
-  // Radius of the gather map's blur in its texels; 0: none. Default: 2.
+  // Radius of the gather map's blur in its texels, at most 16; 0: none. Default: 2.
   uint32_t blur_radius;
   // Shadow rays per light map texel and area light or disc of a directional light, 1 to 4096 (of
   // more than four area lights, four times as many rays are shared out); four times as many per sky,
@@ -993,9 +1024,11 @@ typedef struct bk_bake_params {
   uint64_t seed;
   // Bytes that the bake may take in addition to scene and light map; 0, the default: no limit.
   uint64_t memory_budget;
-  // First covered texel to bake, for spreading a bake over several runs. Default: 0.
+  // First covered texel to bake, for spreading a bake over several runs, at most the number of
+  // texels that bk_lightmap_info tells. Default: 0.
   uint64_t texel_begin;
-  // One behind the last covered texel to bake; 0, the default: all.
+  // One behind the last covered texel to bake, above texel_begin and at most the number of texels;
+  // 0, the default: all.
   uint64_t texel_end;
 } bk_bake_params;
 
@@ -1050,7 +1083,11 @@ BK_API void bk_bake_stats_init(bk_bake_stats *stats);
 // params: NULL for the defaults. progress, user: told how far it is; NULL if not wanted. out: what
 // was done; NULL if not wanted.
 //
-// Fails with BK_ERROR_OUT_OF_MEMORY if memory_budget is exceeded or the memory callback refuses. A
+// All light is finite and >= 0: irradiance is cut off at 1e30 W/m2 per light.
+//
+// Fails with BK_ERROR_INVALID_ARGUMENT if a field of params is out of its range,
+// BK_ERROR_INVALID_STATE if another call is using the light map, BK_ERROR_OUT_OF_MEMORY if
+// memory_budget is exceeded or the memory callback refuses, BK_ERROR_CANCELLED if progress says so. A
 // bake that fails or is cancelled keeps what was baked before, and can be repeated.
 BK_API
 bk_result bk_bake(bk_lightmap *lightmap,
@@ -1126,6 +1163,9 @@ BK_API size_t bk_plan_describe(const bk_lightmap *lightmap, char *dst, size_t ca
 // before). format: one of the BK_FORMAT values that suits the layer, as said there. dst: receives
 // height rows, row_stride bytes apart, of width texels; needs no alignment. row_stride: at least
 // the bytes of a row of texels; 0: just that many.
+//
+// Fails with BK_ERROR_INVALID_ARGUMENT if page, layer or format is none or row_stride is too small,
+// BK_ERROR_INVALID_STATE before or during a bake, BK_ERROR_OUT_OF_MEMORY if a page does not fit.
 BK_API
 bk_result bk_lightmap_read(const bk_lightmap *lightmap,
                            uint32_t page,
@@ -1192,11 +1232,12 @@ typedef struct bk_live_params {
   // Radius in texels of the gather map of a blur for display, 0 to 16; what is accumulated is not
   // blurred. Default: 2.
   uint32_t blur;
-  // Edge of a grid cell in scene units; 0, the default: a sixteenth of the scene's longest side.
+  // Edge of a grid cell in scene units, finite and >= 0; 0, the default: a sixteenth of the scene's
+  // longest side. A grid of more than 2^24 cells is refused.
   float cell_size;
   // Seed of all random numbers, as in bk_bake_params. Default: 0.
   uint64_t seed;
-  // Photons to emit. Default: 1,000,000.
+  // Photons to emit, as in bk_bake_params. Default: 1,000,000.
   uint64_t photon_count;
   // Most reflections, as in bk_bake_params. Default: 0.
   uint32_t max_bounces;

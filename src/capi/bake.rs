@@ -70,13 +70,15 @@ pub struct bk_bake_params {
     /// Most reflections of light before it reaches a texel; 0, the default: Russian roulette alone
     /// decides.
     pub max_bounces: u32,
-    /// Photons to emit. Default: 1,000,000.
+    /// Photons to emit, at most 2^32; 0: no light that is reflected more than once. Default: 1,000,000.
     pub photon_count: u64,
     /// Rays per texel of the gather map, at most 65536; 0: no indirect light. Default: 64.
     pub gather_rays: u32,
-    /// Photon search radius in scene units; 0, the default: from the density of photons.
+    /// Photon search radius in scene units, finite and at least 1.2e-38; 0, the default: from the
+    /// density of photons. Photons on one plane count through walls that stand on it: a radius well
+    /// above the automatic one lets light through them.
     pub radius: f32,
-    /// Radius of the gather map's blur in its texels; 0: none. Default: 2.
+    /// Radius of the gather map's blur in its texels, at most 16; 0: none. Default: 2.
     pub blur_radius: u32,
     /// Shadow rays per light map texel and area light or disc of a directional light, 1 to 4096 (of
     /// more than four area lights, four times as many rays are shared out); four times as many per sky,
@@ -87,9 +89,11 @@ pub struct bk_bake_params {
     pub seed: u64,
     /// Bytes that the bake may take in addition to scene and light map; 0, the default: no limit.
     pub memory_budget: u64,
-    /// First covered texel to bake, for spreading a bake over several runs. Default: 0.
+    /// First covered texel to bake, for spreading a bake over several runs, at most the number of
+    /// texels that bk_lightmap_info tells. Default: 0.
     pub texel_begin: u64,
-    /// One behind the last covered texel to bake; 0, the default: all.
+    /// One behind the last covered texel to bake, above texel_begin and at most the number of texels;
+    /// 0, the default: all.
     pub texel_end: u64,
 }
 
@@ -193,7 +197,11 @@ pub unsafe extern "C" fn bk_bake_stats_init(stats: *mut bk_bake_stats) {
 /// params: NULL for the defaults. progress, user: told how far it is; NULL if not wanted. out: what
 /// was done; NULL if not wanted.
 ///
-/// Fails with BK_ERROR_OUT_OF_MEMORY if memory_budget is exceeded or the memory callback refuses. A
+/// All light is finite and >= 0: irradiance is cut off at 1e30 W/m2 per light.
+///
+/// Fails with BK_ERROR_INVALID_ARGUMENT if a field of params is out of its range,
+/// BK_ERROR_INVALID_STATE if another call is using the light map, BK_ERROR_OUT_OF_MEMORY if
+/// memory_budget is exceeded or the memory callback refuses, BK_ERROR_CANCELLED if progress says so. A
 /// bake that fails or is cancelled keeps what was baked before, and can be repeated.
 #[unsafe(no_mangle)]
 pub unsafe extern "C" fn bk_bake(

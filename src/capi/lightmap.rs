@@ -53,12 +53,13 @@ fn unusable() -> Error {
 pub struct bk_lightmap_desc {
     /// Size of this structure in bytes, set by bk_lightmap_desc_init.
     pub struct_size: u32,
-    /// Texels per scene unit of what is unwrapped; 0, the default: so that the scene fills about
-    /// four pages.
+    /// Texels per scene unit of what is unwrapped, finite and >= 0; 0, the default: so that the scene
+    /// fills about one page. All pages of a map together hold at most 2^29 texels.
     pub texels_per_unit: f32,
     /// Width and height of a page in texels, 16 to 16384. Default: 1024.
     pub page_size: u32,
-    /// Texels around each chart that filtering may read, 1 to 64. Default: 2.
+    /// Texels around each chart that filtering may read, 1 to 64, at most a quarter of page_size.
+    /// Default: 2.
     pub padding: u32,
     /// Light map texels per texel of the gather map (indirect light), along each axis, 1 to 64.
     /// Default: 4.
@@ -93,7 +94,13 @@ pub unsafe extern "C" fn bk_lightmap_desc_init(desc: *mut bk_lightmap_desc) {
 /// scene: kept alive by the light map. desc: NULL for the defaults. progress, user: told how far it
 /// is; NULL if not wanted. out: receives the light map, NULL on failure.
 ///
-/// Fails with BK_ERROR_OUT_OF_MEMORY if so many texels do not fit, or the memory callback refuses.
+/// Logs a warning if the scene lies so far from the origin that rays start more than a quarter of a
+/// texel above surfaces: 32 rounding steps of its coordinates.
+///
+/// Fails with BK_ERROR_INVALID_ARGUMENT if a field of desc is out of its range or a mesh names a page
+/// beyond 2^29 texels, BK_ERROR_INVALID_STATE if the scene is not committed, BK_ERROR_OUT_OF_MEMORY
+/// if there would be more than 2^29 texels, they do not fit, or the memory callback refuses,
+/// BK_ERROR_CANCELLED if progress says so.
 #[unsafe(no_mangle)]
 pub unsafe extern "C" fn bk_lightmap_create(
     scene: *const bk_scene,
@@ -230,6 +237,9 @@ pub unsafe extern "C" fn bk_lightmap_info(lightmap: *const bk_lightmap, out: *mu
 /// out_corner_uvs: receives u and v in [0, 1] of each corner, 3 * triangles * 2 floats, aligned to 4
 /// bytes; NULL if not wanted. out_page_per_triangle: receives triangles page numbers, BK_NONE for
 /// triangles without texels; NULL if not wanted.
+///
+/// Fails with BK_ERROR_INVALID_ARGUMENT if there is no such mesh, with BK_ERROR_INVALID_STATE while
+/// the light map is being baked.
 #[unsafe(no_mangle)]
 pub unsafe extern "C" fn bk_lightmap_mesh_uvs(
     lightmap: *const bk_lightmap,

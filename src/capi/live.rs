@@ -88,11 +88,12 @@ pub struct bk_live_params {
     /// Radius in texels of the gather map of a blur for display, 0 to 16; what is accumulated is not
     /// blurred. Default: 2.
     pub blur: u32,
-    /// Edge of a grid cell in scene units; 0, the default: a sixteenth of the scene's longest side.
+    /// Edge of a grid cell in scene units, finite and >= 0; 0, the default: a sixteenth of the scene's
+    /// longest side. A grid of more than 2^24 cells is refused.
     pub cell_size: f32,
     /// Seed of all random numbers, as in bk_bake_params. Default: 0.
     pub seed: u64,
-    /// Photons to emit. Default: 1,000,000.
+    /// Photons to emit, as in bk_bake_params. Default: 1,000,000.
     pub photon_count: u64,
     /// Most reflections, as in bk_bake_params. Default: 0.
     pub max_bounces: u32,

@@ -31,20 +31,24 @@ pub struct bk_photon_params {
     pub struct_size: u32,
     /// BK_PHOTONS flags. Default: 0.
     pub flags: u32,
-    /// Photons to emit, >= 1. Default: 1,000,000.
+    /// Photons to emit, 1 to 2^32. They meet 1 / (1 - albedo) surfaces each, and take 96 bytes for each
+    /// while the map is made, half of them later. Default: 1,000,000.
     pub photon_count: u64,
-    /// Most surfaces that a photon meets; 0, the default: Russian roulette alone ends its path.
+    /// Most surfaces that a photon meets; 0, the default: Russian roulette alone ends its path. At most
+    /// 10,000 in any case.
     pub max_bounces: u32,
-    /// Search radius of the estimate in scene units; 0, the default: from the density of photons.
+    /// Search radius of the estimate in scene units, finite and at least 1.2e-38; 0, the default: from
+    /// the density of photons.
     pub radius: f32,
-    /// Half the height of the search cylinder, as a fraction of the radius. Default: 0.25.
+    /// Half the height of the search cylinder, as a fraction of the radius, finite and > 0.
+    /// Default: 0.25.
     pub half_height: f32,
     /// Constant of Jensen's cone filter, >= 1; +infinity: no filter. Default: 1.1.
     pub cone_k: f32,
     /// Seed of all random numbers. The same seed gives the same bits on any number of threads.
     /// Default: 0.
     pub seed: u64,
-    /// Bytes that the map may take; 0, the default: no limit.
+    /// Bytes that the map may take while it is made; 0, the default: no limit.
     pub memory_budget: u64,
 }
 
@@ -75,7 +79,10 @@ pub unsafe extern "C" fn bk_photon_params_init(params: *mut bk_photon_params) {
 /// params: NULL for the defaults. progress, user: told how far it is; NULL if not wanted. out:
 /// receives the map, NULL on failure.
 ///
-/// Fails with BK_ERROR_OUT_OF_MEMORY if the map would not fit into memory_budget.
+/// Fails with BK_ERROR_INVALID_ARGUMENT if a field of params is out of its range,
+/// BK_ERROR_INVALID_STATE if the scene is not committed or has no lights, BK_ERROR_OUT_OF_MEMORY if
+/// the map would not fit into memory_budget or the memory callback refuses, BK_ERROR_CANCELLED if
+/// progress says so. Lights without power make an empty map.
 #[unsafe(no_mangle)]
 pub unsafe extern "C" fn bk_photon_map_create(
     scene: *const bk_scene,
@@ -118,7 +125,12 @@ pub unsafe extern "C" fn bk_photon_map_release(map: *mut bk_photon_map) {
 /// thread does the work.
 ///
 /// positions, normals: count times three floats, packed, aligned to 4 bytes; normals of length 1.
-/// out_irradiance_rgb: receives count times three floats, packed; must not overlap the inputs.
+/// out_irradiance_rgb: receives count times three floats, packed, finite and >= 0, at most 1e30; must
+/// not overlap the inputs.
+///
+/// The estimate takes the search disc to lie wholly on the surface: less than a radius from an edge it
+/// falls, to half at the edge, and photons behind a wall that crosses the disc count. Positions and
+/// normals that are not finite give 0.
 #[unsafe(no_mangle)]
 pub unsafe extern "C" fn bk_photon_map_estimate(
     map: *const bk_photon_map,
@@ -173,10 +185,13 @@ pub unsafe extern "C" fn bk_photon_view_init(view: *mut bk_photon_view) {
     unsafe { init(view) }
 }
 
-/// Shows the stored photons, without a copy.
+/// Shows the stored photons. The first call packs them, 36 bytes each, for as long as the map lives.
 ///
 /// out: receives pointers that are valid while the map lives. If no photon was stored, count is 0
 /// and the pointers must not be read.
+///
+/// Fails with BK_ERROR_OUT_OF_MEMORY if the memory callback refuses the packed copy that the first
+/// call makes.
 #[unsafe(no_mangle)]
 pub unsafe extern "C" fn bk_photon_map_photons(map: *const bk_photon_map, out: *mut bk_photon_view) -> bk_result {
     call(|| {

@@ -43,6 +43,9 @@ pub const BK_FORMAT_R32U: u32 = 4;
 /// before). format: one of the BK_FORMAT values that suits the layer, as said there. dst: receives
 /// height rows, row_stride bytes apart, of width texels; needs no alignment. row_stride: at least
 /// the bytes of a row of texels; 0: just that many.
+///
+/// Fails with BK_ERROR_INVALID_ARGUMENT if page, layer or format is none or row_stride is too small,
+/// BK_ERROR_INVALID_STATE before or during a bake, BK_ERROR_OUT_OF_MEMORY if a page does not fit.
 #[unsafe(no_mangle)]
 pub unsafe extern "C" fn bk_lightmap_read(
     lightmap: *const bk_lightmap,

@@ -353,6 +353,10 @@ pub unsafe extern "C" fn bk_scene_set_build(scene: *mut bk_scene, params: *const
 ///
 /// progress, user: told how far it is; NULL if not wanted.
 ///
+/// Logs a warning if triangles are skipped, or if the scene lies so far from the origin that its f32
+/// coordinates have too few digits for its size: rays start 32 rounding steps above surfaces, and from
+/// about a thousand times the scene's size from the origin on that spoils light.
+///
 /// Fails with BK_ERROR_INVALID_STATE if the scene is committed already or holds no usable triangle.
 /// A commit that fails or is cancelled leaves the description as it was.
 #[unsafe(no_mangle)]

@@ -10,6 +10,7 @@ use super::radiance::{self, RadianceInput, RadianceMap};
 use super::sides;
 use super::texels::TexelMap;
 use super::{Atlas, BakeParams, BakeStats, Light, Lightmap, LightmapDesc, LightmapInfo, StageStats, TexelState, blur};
+use crate::device::LogLevel;
 use crate::error::{Error, Result, invalid_argument};
 use crate::memory::try_vec;
 use crate::photon::{PhotonMap, PhotonParams};
@@ -17,6 +18,7 @@ use crate::progress::Progress;
 use crate::sampling::{combine, purpose_seed};
 use crate::scene::Scene;
 use crate::trace::Ray;
+use crate::trace::offset::too_few_digits;
 use glam::Vec3;
 use rayon::prelude::*;
 use std::ops::Range;
@@ -32,6 +34,9 @@ const AUTOMATIC_PAGES: f64 = 1.0;
 
 /// Bytes per gather texel while a bake runs: light, blurred light, normal, variance, whether it is valid.
 const GATHER_BYTES: usize = 3 * size_of::<Vec3>() + size_of::<f32>() + size_of::<bool>();
+
+/// The offset of rays from surfaces from which on a warning is due, as a part of a texel.
+const OFFSET_PART: f32 = 0.25;
 
 /// Coarse maps of small light maps have pages of this size at least.
 const MIN_PAGE_SIZE: u32 = 64;
@@ -90,6 +95,9 @@ impl Lightmap {
             uvs,
         };
         let memory = scene.device().memory().reserve(charts.bytes(), "the charts")?;
+        if let Some(message) = too_few_digits(scene, "texels", 1.0 / density, OFFSET_PART) {
+            scene.device().log(LogLevel::Warning, &message);
+        }
         let direct = DirectLight::new(scene);
         let plan = Plan::new(scene, &direct, &BakeParams::default(), two_sided, uvs.unwrapped_charts > 0);
         let scene = scene.clone();

@@ -65,8 +65,8 @@ impl Disc {
             let weight = direction.dot(receiver.normal);
             if weight > 0.0 {
                 weights += weight;
-                if direction.dot(receiver.geometric) > 0.0 {
-                    shadow.push(Ray::new(receiver.origin, direction), Vec3::splat(weight));
+                if receiver.faces(direction) {
+                    shadow.push(Ray::new(receiver.shadow_origin, direction), Vec3::splat(weight));
                 }
             }
         }
@@ -83,8 +83,8 @@ pub(super) fn push_sky(sky: &Sky, receiver: &Receiver, n: u32, seed: u32, shadow
         t * d.x + b * d.y + receiver.normal * d.z
     };
     let mut push = |direction: Vec3, light: Vec3| {
-        if direction.dot(receiver.geometric) > 0.0 && light.max_element() > 0.0 {
-            shadow.push(Ray::new(receiver.origin, direction), light);
+        if receiver.faces(direction) && light.max_element() > 0.0 {
+            shadow.push(Ray::new(receiver.shadow_origin, direction), light);
         }
     };
     if sky.is_constant() {

@@ -75,9 +75,15 @@ impl ChartMap {
     pub(crate) fn receiver(&self, scene: &Scene, sample: usize, back: bool) -> (SurfacePoint, Receiver) {
         let t = &self.texels.samples[sample];
         let point = SurfacePoint::new(scene.corners(t.triangle), t.u, t.v, scene);
-        let (mesh, _) = scene.locate(t.triangle);
-        let shading = (!scene.meshes()[mesh as usize].normals.is_empty()).then(|| t.shading_normal(scene));
-        let receiver = Receiver::new(scene, &point, shading, back);
+        let (mesh, triangle) = scene.locate(t.triangle);
+        let mesh = &scene.meshes()[mesh as usize];
+        if mesh.normals.is_empty() {
+            let receiver = Receiver::new(scene, &point, None, back);
+            return (point, receiver);
+        }
+        let receiver = Receiver::new(scene, &point, Some(t.shading_normal(scene)), back);
+        let normals = mesh.indices[triangle as usize].map(|i| mesh.normals[i as usize]);
+        let receiver = receiver.smooth(scene, mesh.corners(triangle as usize), normals, [t.u, t.v]);
         (point, receiver)
     }
 

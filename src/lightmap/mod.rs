@@ -21,11 +21,13 @@ pub(crate) mod radiance;
 mod read;
 mod sides;
 mod spherical;
+mod terminator;
 pub mod texels;
 mod unwrap;
 
 use crate::error::{Result, invalid_argument};
 use crate::memory::Reservation;
+use crate::photon::MAX_PHOTONS;
 use crate::scene::Scene;
 use charts::Charts;
 use glam::Vec3;
@@ -74,12 +76,13 @@ pub struct LightmapInfo {
 /// How to bake.
 #[derive(Clone, Copy, Debug, PartialEq)]
 pub struct BakeParams {
+    /// At most [`MAX_PHOTONS`]; 0: no light that is reflected more than once.
     pub photon_count: u64,
     /// Most reflections of light before it reaches a texel; 0: Russian roulette alone decides.
     pub max_bounces: u32,
     /// Rays per gather map texel; 0: no indirect light.
     pub gather_rays: u32,
-    /// Photon search radius; 0: automatic.
+    /// Photon search radius, finite; 0: automatic.
     pub radius: f32,
     /// Radius of the gather map's blur in its texels; 0: none.
     pub blur_radius: u32,
@@ -243,8 +246,14 @@ impl LightmapDesc {
 impl BakeParams {
     /// Checks the ranges documented on the fields.
     pub fn validate(&self) -> Result<()> {
-        if !(self.radius >= 0.0) {
-            return invalid_argument!("radius is {}, not ≥ 0", self.radius);
+        if !(self.radius >= 0.0 && self.radius.is_finite()) {
+            return invalid_argument!("radius is {}, not a finite number ≥ 0 (0: automatic)", self.radius);
+        }
+        if self.radius > 0.0 && !self.radius.is_normal() {
+            return invalid_argument!("radius is {:e}, less than {:e}", self.radius, f32::MIN_POSITIVE);
+        }
+        if self.photon_count > MAX_PHOTONS {
+            return invalid_argument!("photon_count is {}, more than {MAX_PHOTONS}", self.photon_count);
         }
         if self.gather_rays > 1 << 16 {
             return invalid_argument!("gather_rays is {}, more than 65536", self.gather_rays);

@@ -140,8 +140,12 @@ impl Display {
                 if self.old.is_empty() {
                     return self.interpolate(map, b, lod, s, known, |s| self.plain[s]);
                 }
-                let change = self.interpolate(map, b, lod, s, known, |s| self.plain[s] - self.old[s]);
-                (self.old[s as usize] + change).max(Vec3::ZERO)
+                // What is around has changed by so much; but where that is more than there was here, by such a
+                // part: nothing goes black because its surroundings lost more than it had.
+                let around = |of: &[Vec3]| self.interpolate(map, b, lod, s, known, |s| of[s]);
+                let (old, before, now) = (self.old[s as usize], around(&self.old), around(&self.plain));
+                let sum = old + (now - before);
+                Vec3::select(sum.cmpge(Vec3::ZERO), sum, old * now / before.max(Vec3::splat(f32::MIN_POSITIVE)))
             };
             tile.texels[tile.lod_end[lod as usize] as usize..].iter().map(|&s| (s, value(s))).collect()
         };

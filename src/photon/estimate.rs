@@ -189,7 +189,9 @@ unsafe fn estimate<S: Simd>(grid: &Grid, cylinder: &Cylinder, position: Vec3, no
             flush(&mut sum, &mut total, zero);
         }
         let s = cylinder.scale;
-        [(total[0] * s) as f32, (total[1] * s) as f32, (total[2] * s) as f32]
+        // A photon in the middle of a disc of 1e-30 units: still a number that others can be added to.
+        let finite = |x: f64| x.min(crate::scene::BRIGHTEST as f64) as f32;
+        [finite(total[0] * s), finite(total[1] * s), finite(total[2] * s)]
     }
 }
 

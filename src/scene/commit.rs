@@ -7,6 +7,7 @@ use crate::device::{Device, LogLevel};
 use crate::error::{Error, Result, invalid_argument};
 use crate::memory::Reservation;
 use crate::progress::Progress;
+use crate::trace::offset::too_few_digits;
 use crate::trace::{Hit, RawHit, Ray, TreeView, View};
 use glam::{Vec2, Vec3};
 use rayon::prelude::*;
@@ -15,6 +16,10 @@ use std::time::Instant;
 
 /// Triangles that a thread takes at a time.
 const CHUNK: usize = 1 << 12;
+
+/// The offset of rays from surfaces from which on a warning is due, as a part of the scene's diagonal. (The
+/// Cornell box at 1,000 times its size from the origin: 1/900, irradiance wrong by 0.7 %; at 10,000: 14 %.)
+const OFFSET_PART: f32 = 1.0 / 256.0;
 
 /// An emissive triangle, as a light.
 #[derive(Clone, Copy, Debug)]
@@ -130,7 +135,11 @@ impl Scene {
         progress: &Progress,
     ) -> std::result::Result<Arc<Scene>, (SceneData, Error)> {
         match Self::build(device, &data, options, progress) {
-            Ok(parts) => Ok(Arc::new(parts.into_scene(device.clone(), data))),
+            Ok(parts) => {
+                let scene = Arc::new(parts.into_scene(device.clone(), data));
+                scene.warn_of_few_digits();
+                Ok(scene)
+            }
             Err(e) => Err((data, e)),
         }
     }
@@ -194,6 +203,13 @@ impl Scene {
         })
     }
 
+    /// Logs a warning if the scene lies so far from the origin, for its size, that light is wrong.
+    fn warn_of_few_digits(&self) {
+        if let Some(message) = too_few_digits(self, "a scene with a diagonal", self.diagonal(), OFFSET_PART) {
+            self.device.log(LogLevel::Warning, &message);
+        }
+    }
+
     /// Brings up to date what follows from the positions.
     fn follow_positions(&mut self) {
         let (first, meshes) = (&self.first_triangle, &self.data.meshes);
@@ -211,6 +227,7 @@ impl Scene {
         self.emitters = emitters(&self.data, &self.first_triangle, &self.skipped);
         self.stats.skipped_degenerate = (self.skipped.len() + out.len()) as u64;
         self.stats.wide_sah_cost = self.tree.sah_cost();
+        self.warn_of_few_digits();
     }
 
     /// A scene of its own that is equal, lights shared.
@@ -600,6 +617,28 @@ mod tests {
     }
 
     const FLOOR: [Vec3; 3] = [Vec3::ZERO, Vec3::X, Vec3::Y];
+
+    #[test]
+    fn a_scene_far_from_the_origin_for_its_size_is_warned_of() {
+        let warnings = |offset: f32| {
+            let messages = Arc::new(std::sync::Mutex::new(Vec::<String>::new()));
+            let log = {
+                let messages = messages.clone();
+                move |_: LogLevel, message: &str| messages.lock().unwrap().push(message.to_owned())
+            };
+            let options = DeviceOptions { num_threads: 1, log: Some(Box::new(log)), ..Default::default() };
+            let device = Device::new(options).unwrap();
+            let mut data = SceneData::new();
+            data.add_material(Material::default()).unwrap();
+            let positions = FLOOR.map(|c| c + Vec3::splat(offset)).to_vec();
+            data.add_mesh(Mesh { positions, indices: vec![[0, 1, 2]], ..Default::default() }).unwrap();
+            Scene::commit(&device, data, &BuildOptions::default(), &Progress::none()).map_err(|e| e.1).unwrap();
+            messages.lock().unwrap().clone()
+        };
+        assert!(warnings(0.0).is_empty() && warnings(1e3).is_empty());
+        let far = warnings(1e4);
+        assert!(far.len() == 1 && far[0].contains("too few digits"), "{far:?}");
+    }
 
     fn up(scene: &Scene) -> Hit {
         scene.intersect(&Ray { origin: [0.2, 0.2, 0.5], tmin: 0.0, direction: [0.0, 0.0, 1.0], tmax: f32::INFINITY })

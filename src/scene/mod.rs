@@ -32,6 +32,10 @@ pub const MAX_TRIANGLES: usize = 1 << 28;
 /// triangle test needs.
 pub const MAX_COORDINATE: f32 = 1e12;
 
+/// Irradiance beyond this is cut off, W/m²: what a light of 10¹² gives at a distance of 10⁻⁹. Sums of
+/// thousands of such values are still finite.
+pub const BRIGHTEST: f32 = 1e30;
+
 /// A scene being described. Everything added is checked; a refused addition changes nothing.
 #[derive(Clone, Debug, Default)]
 pub struct SceneData {

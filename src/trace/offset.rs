@@ -28,6 +28,21 @@ pub fn offset_ray_origin(position: Vec3, normal: Vec3, scene: &Scene) -> Vec3 {
     position + normal * ray_epsilon(position, scene)
 }
 
+/// A sentence if rays start further above the scene's surfaces than a `part` of `size`, a length that the
+/// caller knows as `what`: too few digits of the f32 coordinates are left for it so far from the origin.
+pub(crate) fn too_few_digits(scene: &Scene, what: &str, size: f32, part: f32) -> Option<String> {
+    let (lower, upper) = scene.bounds();
+    let farthest = lower.abs().max(upper.abs());
+    let offset = ray_epsilon(farthest, scene);
+    (offset > part * size).then(|| {
+        format!(
+            "coordinates of magnitude {:.2e} have too few digits for {what} of {size:.2e}: rays start {offset:.2e} \
+             above surfaces; move the scene nearer to the origin",
+            farthest.max_element()
+        )
+    })
+}
+
 /// How far from the edges of its triangle a ray starts, in [`ray_epsilon`]s: with the offset along the
 /// normal that is inside of walls that meet at 8° or more.
 const EDGE_DISTANCE: f64 = 8.0;

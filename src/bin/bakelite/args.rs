@@ -15,7 +15,7 @@ pub const HELP: &str = "\
 Bakes light maps.
 
 Usage: bakelite [bake] [SCENE] [OPTIONS]
-       bakelite report live|memory|pipeline|quality [SCENE] [OPTIONS]
+       bakelite report live|memory|pipeline|quality|stability [SCENE] [OPTIONS]
 
 SCENE, or --scene SCENE, is a file (.obj .ply .gltf .glb) or a built-in scene (atrium, cornell,
 furnace). Without it, the atrium is baked. Lengths are in scene units, colours
@@ -27,6 +27,8 @@ Reports measure instead, and write tables, plots and CSV:
   pipeline  what each stage of a bake takes, and what bounds it
   quality   error of the light against run time, for every knob of a bake, path
             tracing and photons alone
+  stability stiff and extreme cases, each against what is known of it (SCENE:
+            its energy balance too)
 
 Lights, added to those of the scene; may be repeated:
   --light point:X,Y,Z:R,G,B               intensity in W/sr
@@ -92,6 +94,7 @@ pub enum Command {
     ReportMemory(Box<BakeArgs>),
     ReportPipeline(Box<BakeArgs>),
     ReportQuality(Box<ReportArgs>),
+    ReportStability(Box<BakeArgs>),
     Help,
     Version,
 }
@@ -184,7 +187,7 @@ impl Default for ReportArgs {
 }
 
 /// What there is to report.
-const REPORTS: [&str; 4] = ["live", "memory", "pipeline", "quality"];
+const REPORTS: [&str; 5] = ["live", "memory", "pipeline", "quality", "stability"];
 
 /// What a report of quality varies.
 const KNOBS: [&str; 9] = [
@@ -276,6 +279,7 @@ pub fn parse(args: impl IntoIterator<Item = OsString>) -> Result<Command, String
         "memory" => Command::ReportMemory(Box::new(report.bake)),
         "pipeline" => Command::ReportPipeline(Box::new(report.bake)),
         "quality" => Command::ReportQuality(Box::new(report)),
+        "stability" => Command::ReportStability(Box::new(report.bake)),
         _ => Command::Bake(Box::new(report.bake)),
     })
 }
@@ -599,8 +603,8 @@ mod tests {
             ("--camera 0,0,0:1,2,3:200", "field of view is 200"),
             ("--width 0", "--width is 0, outside 1"),
             ("a --scene b", "two scenes, \"a\" and \"b\""),
-            ("report", "report needs what to report; there are: live, memory, pipeline, quality"),
-            ("report dead", "there is no report \"dead\"; there are: live, memory, pipeline, quality"),
+            ("report", "report needs what to report; there are: live, memory, pipeline, quality, stability"),
+            ("report dead", "there is no report \"dead\"; there are: live, memory, pipeline, quality, stability"),
             ("report live --seconds 0", "--seconds is 0, not a finite number greater than 0"),
             ("report live --seconds inf", "--seconds is inf"),
             ("report live --updates 1.5", "--updates is \"1.5\", not a whole number"),

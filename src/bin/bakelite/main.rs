@@ -13,6 +13,7 @@
 //! | `memory_report` | a scene's memory by part, and what little of it costs rays |
 //! | `pipeline_report` | the stages of a bake, and what bounds each |
 //! | `quality_measure`, `quality_report` | error of the light against run time |
+//! | `stability`, `stability_*` | stiff and extreme cases against what is known of them |
 //! | `texel_paths` | path tracing every texel, which a bake is compared with |
 
 mod args;
@@ -29,6 +30,10 @@ mod plot;
 mod quality_measure;
 mod quality_report;
 mod report;
+mod stability;
+mod stability_light;
+mod stability_limits;
+mod stability_space;
 mod table;
 mod texel_paths;
 
@@ -65,6 +70,7 @@ fn main() -> ExitCode {
         Ok(Command::ReportMemory(args)) => memory_report::run(&args),
         Ok(Command::ReportPipeline(args)) => pipeline_report::run(&args),
         Ok(Command::ReportQuality(report)) => quality_report::run(&report),
+        Ok(Command::ReportStability(args)) => stability::run(&args),
         Err(e) => {
             eprintln!("bakelite: {e}\nTry bakelite --help");
             return ExitCode::from(USAGE);
