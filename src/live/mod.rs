@@ -247,6 +247,8 @@ impl LiveParams {
             blur_radius: self.blur,
             direct_samples: self.direct_samples,
             seed: self.seed,
+            // What is shown changes block by block, and each block is shown as it is.
+            stitch: false,
             ..Default::default()
         }
     }
