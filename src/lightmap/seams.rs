@@ -17,7 +17,7 @@ use super::texels::TexelSample;
 use super::{Atlas, BakeParams, BakeStats, Light, Lightmap, TexelState};
 use crate::error::{Error, Result};
 use crate::memory::{Reservation, try_vec};
-use crate::progress::Progress;
+use crate::progress::{Progress, Stage};
 use crate::scene::NONE;
 use glam::{DVec3, Vec2, Vec3, Vec3A};
 use rayon::prelude::*;
@@ -87,7 +87,7 @@ impl Lightmap {
             "texels are still to be baked"
         } else {
             let stage = progress.stage("seams", 1.0, 1.0, 1);
-            let job = Job { atlas: &self.atlas, backs: &new.backs, budget: params.memory_budget, progress };
+            let job = Job { atlas: &self.atlas, backs: &new.backs, budget: params.memory_budget, stage: &stage };
             let stitch = self.atlas.scene.device().install(|| job.run(&view, plan, stats))?;
             stage.advance(1)?;
             stats.seam_seconds = start.elapsed().as_secs_f64();
@@ -168,19 +168,19 @@ struct Point {
     length: f32,
 }
 
-struct Job<'a, 'p> {
+struct Job<'a, 'p, 'c> {
     atlas: &'a Atlas,
     /// Per chart, whether its back is shown; empty: fronts.
     backs: &'a [bool],
     budget: u64,
-    progress: &'a Progress<'p>,
+    stage: &'a Stage<'p, 'c>,
 }
 
-impl Job<'_, '_> {
+impl Job<'_, '_, '_> {
     /// The stitched light and the number of edges. `None` if there are none.
     fn run(&self, view: &View, plan: &Plan, stats: &mut BakeStats) -> Result<Option<(Stitch, u64)>> {
         let edges = self.edges()?;
-        self.progress.check()?;
+        self.stage.advance(0)?;
         let count: usize = edges.iter().map(|e| self.point_count(e)).sum();
         let uses = 8 * size_of::<(u32, f32)>();
         let bytes = count * (size_of::<Point>() + uses + size_of::<Vec3A>()) + self.atlas.map.len() * 4;
@@ -195,7 +195,7 @@ impl Job<'_, '_> {
         if points.is_empty() {
             return Ok(None);
         }
-        self.progress.check()?;
+        self.stage.advance(0)?;
         let texels = number(&mut points, self.atlas.map.len())?;
         let n = texels.len();
         let memory = self.reserve(n * 2 * size_of::<Vec3>(), "the light of the seams' texels")?;
@@ -206,7 +206,7 @@ impl Job<'_, '_> {
         let mut after = before.clone();
         for (layer, bit) in [left_out::DIRECT, left_out::INDIRECT].into_iter().enumerate() {
             if plan.runs(bit) {
-                system.solve(&before[layer], &mut after[layer], self.progress)?;
+                system.solve(&before[layer], &mut after[layer], self.stage)?;
             }
         }
         stats.seam_points = system.points.len() as u64;
@@ -239,9 +239,9 @@ impl Job<'_, '_> {
                 *side = (hash(s.ends(corners)), s);
             }
         });
-        self.progress.check()?;
+        self.stage.advance(0)?;
         sides.par_sort_unstable();
-        self.progress.check()?;
+        self.stage.advance(0)?;
         // Where three or more meet, something stands on the surface, and light need not go on below
         // it. (So does the rare hash that two edges share.)
         let mut edges: Vec<[Side; 2]> = sides
@@ -418,7 +418,7 @@ impl System {
     }
 
     /// Conjugate gradients from `before` on, each channel on its own. Light stays ≥ 0.
-    fn solve(&self, before: &[Vec3A], x: &mut [Vec3A], progress: &Progress) -> Result<()> {
+    fn solve(&self, before: &[Vec3A], x: &mut [Vec3A], stage: &Stage) -> Result<()> {
         let mut differences = vec![Vec3A::ZERO; self.points.len()];
         let mut q = vec![Vec3A::ZERO; before.len()];
         self.differences(before, &mut differences);
@@ -429,7 +429,7 @@ impl System {
         let mut rr = dot(&r, &r);
         let enough = rr * TOLERANCE * TOLERANCE;
         for _ in 0..MAX_ITERATIONS {
-            progress.check()?;
+            stage.advance(0)?;
             if rr.cmple(enough).all() {
                 break;
             }

@@ -178,7 +178,8 @@ fn three_sheets_at_an_edge_and_sheets_that_face_away_stay() {
     let edges = |meshes: Vec<Mesh>| {
         let map = lightmap(&scene(2, meshes, LAMP));
         let progress = Progress::none();
-        let job = Job { atlas: &map.atlas, backs: &[], budget: 0, progress: &progress };
+        let stage = progress.stage("seams", 0.0, 1.0, 1);
+        let job = Job { atlas: &map.atlas, backs: &[], budget: 0, stage: &stage };
         job.edges().unwrap().len()
     };
     assert_eq!(edges(floor()), 1);
@@ -197,6 +198,11 @@ fn three_sheets_at_an_edge_and_sheets_that_face_away_stay() {
     assert_eq!(edges(walled), 0);
 }
 
+fn solve(system: &System, before: &[Vec3A], x: &mut [Vec3A]) {
+    let progress = Progress::none();
+    system.solve(before, x, &progress.stage("seams", 0.0, 1.0, 1)).unwrap();
+}
+
 /// On the edge of a spotlight's cone, where least squares alone would go below zero.
 #[test]
 fn light_stays_at_least_zero() {
@@ -206,7 +212,7 @@ fn light_stays_at_least_zero() {
         Point { texels: [0, 1, 0, 0, 2, 2, 2, 2], weights: [0.5, 0.5, 0.0, 0.0, -1.0, 0.0, 0.0, 0.0], length: 1.0 };
     let before = [Vec3A::ZERO, Vec3A::ONE, Vec3A::ZERO];
     let mut x = before;
-    System::new(vec![point], 3).solve(&before, &mut x, &Progress::none()).unwrap();
+    solve(&System::new(vec![point], 3), &before, &mut x);
     let step = 0.5 / (1.5 + STIFFNESS);
     for (x, expected) in x.iter().zip([0.0, 1.0 - 0.5 * step, step]) {
         assert!((*x - Vec3A::splat(expected)).abs().max_element() < 1e-5, "{x} {expected}");
@@ -270,7 +276,7 @@ fn the_light_found_is_the_least_squares_solution() {
         }
     }
     let mut x = before.clone();
-    System::new(points, n as usize).solve(&before, &mut x, &Progress::none()).unwrap();
+    solve(&System::new(points, n as usize), &before, &mut x);
     for i in 0..n as usize {
         let expected = rows[i].1 / rows[i].0[i];
         let moved = (before[i].as_dvec3() - expected).abs().max_element();
