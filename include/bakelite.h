@@ -960,7 +960,7 @@ bk_result bk_lightmap_mesh_uvs(const bk_lightmap *lightmap,
  * Baking
  *
  * A bake fills a light map with light: photons, radiance map, gather map (indirect light), direct
- * light, composition. What the scene does not need is not run.
+ * light, composition, stitching of seams. What the scene does not need is not run.
  * ================================================================================================ */
 
 // Bit of left_out. No indirect light: no photons, radiance map and gather map.
@@ -998,6 +998,9 @@ bk_result bk_lightmap_mesh_uvs(const bk_lightmap *lightmap,
 // direct_samples shadow rays for all.
 #define BK_LEFT_OUT_MANY_LIGHTS 16384
 
+// Bit of left_out. No stitching of seams.
+#define BK_LEFT_OUT_SEAMS 65536
+
 // How to bake.
 typedef struct bk_bake_params {
   // Size of this structure in bytes, set by bk_bake_params_init.
@@ -1030,6 +1033,11 @@ typedef struct bk_bake_params {
   // One behind the last covered texel to bake, above texel_begin and at most the number of texels;
   // 0, the default: all.
   uint64_t texel_end;
+  // Whether seams are stitched: where a smooth surface is cut open in the light map, both sides of
+  // the edge are made to show the same under bilinear filtering, by moving the texels that the edge
+  // shows and no others. Done when all texels are baked. 0: no, any other value: yes. Live updates
+  // do not stitch: their finished texels have the bits of a bake with 0. Default: 1.
+  uint32_t stitch;
 } bk_bake_params;
 
 // What one stage of a bake took.
@@ -1069,6 +1077,15 @@ typedef struct bk_bake_stats {
   // Two-sided charts whose light map shows the back, because the front gets less than a tenth of
   // its light.
   uint64_t back_charts;
+  // Points, half a texel apart at most, along the edges that were stitched.
+  uint64_t seam_points;
+  // How much the two sides of these edges showed different light under bilinear filtering: root mean
+  // square over the edges' lengths, relative to the mean irradiance there. 0 without seams.
+  double seam_rms_before;
+  // The same after the stitching.
+  double seam_rms_after;
+  // Finding and stitching seams, in seconds.
+  double seam_seconds;
 } bk_bake_stats;
 
 // Fills in the defaults.

@@ -1,7 +1,7 @@
 //! Baking
 //!
 //! A bake fills a light map with light: photons, radiance map, gather map (indirect light), direct
-//! light, composition. What the scene does not need is not run.
+//! light, composition, stitching of seams. What the scene does not need is not run.
 
 use super::args::{OutStruct, SizedStruct, init, read_struct, sized_struct, slice_mut};
 use super::device::{bk_progress_fn, progress, refuse_in_callback};
@@ -42,6 +42,8 @@ pub const BK_LEFT_OUT_SUN_DISC: u32 = 8192;
 /// shadow ray, and at most 64 rect lights and emissive triangles. More of either are sampled, with up to 4
 /// direct_samples shadow rays for all.
 pub const BK_LEFT_OUT_MANY_LIGHTS: u32 = 16384;
+/// Bit of left_out. No stitching of seams.
+pub const BK_LEFT_OUT_SEAMS: u32 = 65536;
 
 // The numbers are literal for the header's sake.
 const _: () = assert!(
@@ -59,6 +61,7 @@ const _: () = assert!(
         && BK_LEFT_OUT_SKY == left_out::SKY
         && BK_LEFT_OUT_SUN_DISC == left_out::SUN_DISC
         && BK_LEFT_OUT_MANY_LIGHTS == left_out::MANY_LIGHTS
+        && BK_LEFT_OUT_SEAMS == left_out::SEAMS
 );
 
 /// How to bake.
@@ -95,6 +98,11 @@ pub struct bk_bake_params {
     /// One behind the last covered texel to bake, above texel_begin and at most the number of texels;
     /// 0, the default: all.
     pub texel_end: u64,
+    /// Whether seams are stitched: where a smooth surface is cut open in the light map, both sides of
+    /// the edge are made to show the same under bilinear filtering, by moving the texels that the edge
+    /// shows and no others. Done when all texels are baked. 0: no, any other value: yes. Live updates
+    /// do not stitch: their finished texels have the bits of a bake with 0. Default: 1.
+    pub stitch: u32,
 }
 
 sized_struct!(bk_bake_params, last: texel_end: u64, defaults: {
@@ -111,6 +119,7 @@ sized_struct!(bk_bake_params, last: texel_end: u64, defaults: {
         memory_budget: p.memory_budget,
         texel_begin: p.texel_begin,
         texel_end: p.texel_end,
+        stitch: p.stitch as u32,
     }
 });
 
@@ -162,6 +171,15 @@ pub struct bk_bake_stats {
     /// Two-sided charts whose light map shows the back, because the front gets less than a tenth of
     /// its light.
     pub back_charts: u64,
+    /// Points, half a texel apart at most, along the edges that were stitched.
+    pub seam_points: u64,
+    /// How much the two sides of these edges showed different light under bilinear filtering: root mean
+    /// square over the edges' lengths, relative to the mean irradiance there. 0 without seams.
+    pub seam_rms_before: f64,
+    /// The same after the stitching.
+    pub seam_rms_after: f64,
+    /// Finding and stitching seams, in seconds.
+    pub seam_seconds: f64,
 }
 
 sized_struct!(bk_bake_stats, last: back_charts: u64, defaults: stats(&Default::default()));
@@ -181,6 +199,10 @@ fn stats(s: &BakeStats) -> bk_bake_stats {
         direct: stage(&s.direct),
         compose: stage(&s.compose),
         back_charts: s.back_charts,
+        seam_points: s.seam_points,
+        seam_rms_before: s.seam_rms_before,
+        seam_rms_after: s.seam_rms_after,
+        seam_seconds: s.seam_seconds,
     }
 }
 
@@ -228,6 +250,7 @@ pub unsafe extern "C" fn bk_bake(
             memory_budget: p.memory_budget,
             texel_begin: p.texel_begin,
             texel_end: p.texel_end,
+            stitch: p.stitch != 0,
         };
         let done = lightmap.change(|l| l.bake(&params, &self::progress(progress, user)))?;
         if let Some(out) = out {

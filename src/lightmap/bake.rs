@@ -7,6 +7,7 @@ use super::layout::Layout;
 use super::map::ChartMap;
 use super::plan::{Plan, left_out};
 use super::radiance::{self, RadianceInput, RadianceMap};
+use super::seams::Stitch;
 use super::sides;
 use super::texels::TexelMap;
 use super::{Atlas, BakeParams, BakeStats, Light, Lightmap, LightmapDesc, LightmapInfo, StageStats, TexelState, blur};
@@ -132,23 +133,29 @@ impl Lightmap {
             progress,
         };
         let (light, mut stats) = bake.run()?;
-        stats.peak_bytes = device.memory().peak() as u64;
-        stats.left_out = plan.left_out;
         stats.back_charts = light.backs.iter().filter(|&&b| b).count() as u64;
         plan.note_back_charts(stats.back_charts);
+        let range = params.texel_begin as usize..end as usize;
+        let stitch = self.stitch(&light, &range, params, &mut plan, &mut stats, progress)?;
+        stats.left_out = plan.left_out;
+        stats.peak_bytes = device.memory().peak() as u64;
         self.plan = plan;
         let start = Instant::now();
-        self.store(light, params.texel_begin as usize..end as usize);
+        self.store(light, range, stitch);
         stats.compose.seconds = start.elapsed().as_secs_f64();
         stats.seconds += stats.compose.seconds;
         Ok(stats)
     }
 
     /// Takes the light of a range of samples over. Hidden texels are filled here, from all that has
-    /// been baked so far: whatever the shards, the last one leaves the bits of a whole bake.
-    fn store(&mut self, new: Light, range: Range<usize>) {
+    /// been baked so far, and seams are stitched anew: whatever the shards, the last one leaves the
+    /// bits of a whole bake.
+    fn store(&mut self, new: Light, range: Range<usize>, stitch: Option<Stitch>) {
         match &mut self.light {
             Some(old) if range.len() < self.atlas.map.len() => {
+                if let Some(mut before) = old.stitch.take() {
+                    before.swap(old);
+                }
                 old.direct[range.clone()].copy_from_slice(&new.direct[range.clone()]);
                 old.indirect[range.clone()].copy_from_slice(&new.indirect[range.clone()]);
                 old.state[range.clone()].copy_from_slice(&new.state[range]);
@@ -164,6 +171,10 @@ impl Lightmap {
         if !hidden.is_empty() {
             let visible = light.state.iter().map(|&s| s == TexelState::Visible).collect();
             blur::fill(&self.atlas.charts, &self.atlas.map, &mut light.direct, visible, hidden);
+        }
+        if let Some(mut stitch) = stitch {
+            stitch.swap(light);
+            light.stitch = Some(stitch);
         }
     }
 }
@@ -203,6 +214,7 @@ impl Bake<'_, '_> {
             state: try_vec(n, "validity")?,
             radiance,
             backs,
+            stitch: None,
             _memory: memory,
         };
         self.compose(scene, indirect.as_ref(), &mut light, &mut stats)?;

@@ -2,7 +2,7 @@
 //!
 //! A light map has three maps of independent resolution over the same charts: the light map itself,
 //! the gather map (indirect irradiance) and the radiance map (what gather rays see). A bake runs
-//! photons → radiance map → gather map → blur → direct light and composition.
+//! photons → radiance map → gather map → blur → direct light and composition → stitching of seams.
 
 mod area;
 pub(crate) mod bake;
@@ -19,6 +19,7 @@ pub mod plan;
 mod polygon;
 pub(crate) mod radiance;
 mod read;
+mod seams;
 mod sides;
 mod spherical;
 mod terminator;
@@ -96,6 +97,11 @@ pub struct BakeParams {
     /// Only these of the light map's covered texels, in chart order; `texel_end` 0: all.
     pub texel_begin: u64,
     pub texel_end: u64,
+    /// Whether both sides of edges at which smooth surfaces are cut open in the light map are made to
+    /// agree under bilinear filtering. Moves only the texels that such edges show, once all texels
+    /// are baked. Live updates do not stitch: [`LiveParams::bake`](crate::live::LiveParams::bake)
+    /// says `false`.
+    pub stitch: bool,
 }
 
 impl Default for BakeParams {
@@ -111,6 +117,7 @@ impl Default for BakeParams {
             memory_budget: 0,
             texel_begin: 0,
             texel_end: 0,
+            stitch: true,
         }
     }
 }
@@ -139,6 +146,14 @@ pub struct BakeStats {
     pub peak_bytes: u64,
     /// Bits of [`left_out`].
     pub left_out: u32,
+    /// Points along edges that were stitched, half a texel apart at most.
+    pub seam_points: u64,
+    /// Root mean square of what the two sides of stitched edges show differently, relative to the mean
+    /// irradiance there: before, and after.
+    pub seam_rms_before: f64,
+    pub seam_rms_after: f64,
+    /// Finding and stitching seams.
+    pub seam_seconds: f64,
 }
 
 /// What a bake can read out.
@@ -189,6 +204,8 @@ struct Light {
     radiance: Vec<Vec3>,
     /// Whether a chart shows its back, by chart. Empty if none is two-sided.
     backs: Vec<bool>,
+    /// What was stitched, as it was before: stitching starts anew with every bake of some texels.
+    stitch: Option<seams::Stitch>,
     _memory: Reservation,
 }
 

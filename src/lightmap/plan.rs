@@ -34,6 +34,8 @@ pub mod left_out {
     pub const SUN_DISC: u32 = 1 << 13;
     /// No choice among many lights: all are few enough to be evaluated one by one.
     pub const MANY_LIGHTS: u32 = 1 << 14;
+    /// No stitching of seams.
+    pub const SEAMS: u32 = 1 << 16;
 }
 
 /// What a bake of a scene runs.
@@ -173,6 +175,16 @@ impl Plan {
         if count > 0 {
             self.run(&format!("the backs of {count} two-sided charts, whose fronts are dark"));
         }
+    }
+
+    /// Tells of stitched edges.
+    pub(crate) fn run_seams(&mut self, edges: u64) {
+        self.run(&format!("stitching of {edges} edges at which smooth surfaces are cut open"));
+    }
+
+    /// Tells why nothing was stitched.
+    pub(crate) fn leave_out_seams(&mut self, why: &str) {
+        self.leave_out(left_out::SEAMS, "stitching of seams", why);
     }
 
     fn run(&mut self, what: &str) {

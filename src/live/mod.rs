@@ -9,7 +9,7 @@
 //! of a LOD are among those of the next and what lies between is interpolated across cells.
 //!
 //! A texel's sums depend on its number of rounds alone. When all texels have k rounds they have the
-//! bits of a bake with 64 · k gather rays, whatever the order of the updates.
+//! bits of a bake with 64 · k gather rays and without stitching, whatever the order of the updates.
 
 mod batch;
 mod blocks;
@@ -247,6 +247,8 @@ impl LiveParams {
             blur_radius: self.blur,
             direct_samples: self.direct_samples,
             seed: self.seed,
+            // What is shown changes block by block, and each block is shown as it is.
+            stitch: false,
             ..Default::default()
         }
     }

@@ -56,6 +56,7 @@ Bake:
   --blur N               blur radius in gather map texels [2]
   --direct-samples N     shadow rays per texel and area light [16]
   --seed N               the same seed gives the same bits [0]
+  --no-stitch            leave the seams between charts as they are
 Machine:
   --threads N            0: one per logical core [0]
   --isa NAME             portable, avx2, avx512 or auto [auto]
@@ -310,6 +311,7 @@ fn option(name: &str, parser: &mut lexopt::Parser, bake: &mut BakeArgs) -> Resul
         "blur" => params.blur_radius = number(&flag, &value()?)?,
         "direct-samples" => params.direct_samples = number(&flag, &value()?)?,
         "seed" => params.seed = number(&flag, &value()?)?,
+        "no-stitch" => params.stitch = false,
         "threads" => bake.threads = number(&flag, &value()?)?,
         "isa" => bake.isa = isa(&value()?)?,
         "bins" => bake.build.bins = number(&flag, &value()?)?,

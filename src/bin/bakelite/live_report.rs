@@ -103,7 +103,8 @@ fn aspect(args: &BakeArgs) -> f32 {
 
 /// Follows the error of visible texels, from nothing and after light 0 has moved.
 fn errors(job: &Job, args: &ReportArgs, lightmap: &mut Lightmap) -> Result<(Measured, Camera)> {
-    let params = args.bake.params;
+    // Live light is not stitched.
+    let params = BakeParams { stitch: false, ..args.bake.params };
     let reference_params = BakeParams { gather_rays: REFERENCE_RAYS, ..params };
     job.bars.show("reference", |p| lightmap.bake(&reference_params, p))?;
     let camera = job.camera(lightmap);

@@ -124,7 +124,7 @@ impl<'a> Job<'a> {
         let text = format!("{:#}\n", report::report(&run));
         std::fs::write(&path, text).map_err(|e| Error::Io(format!("{}: {e}", path.display())))?;
         if !self.args.quiet {
-            self.print(&lightmap, pictures.as_ref(), seconds);
+            self.print(&lightmap, &bake, pictures.as_ref(), seconds);
         }
         Ok(())
     }
@@ -223,6 +223,9 @@ impl<'a> Job<'a> {
             let photons = if name == "photons" { stats.photons_emitted } else { 0 };
             self.stages.push(Stage { name, seconds: s.seconds, rays: s.rays, photons, bytes: s.bytes });
         }
+        if stats.seam_points > 0 {
+            self.stages.push(Stage { name: "seams", seconds: stats.seam_seconds, ..Default::default() });
+        }
         Ok(stats)
     }
 
@@ -286,7 +289,7 @@ impl<'a> Job<'a> {
         &mut self.stages[at]
     }
 
-    fn print(&self, lightmap: &Lightmap, pictures: Option<&Pictures>, seconds: f64) {
+    fn print(&self, lightmap: &Lightmap, bake: &BakeStats, pictures: Option<&Pictures>, seconds: f64) {
         let scene = lightmap.scene();
         let info = lightmap.info();
         println!(
@@ -303,6 +306,13 @@ impl<'a> Job<'a> {
         );
         println!("{}", table::text(&self.stages, seconds));
         println!("{}", lightmap.plan_text());
+        if bake.seam_points > 0 {
+            println!(
+                "Both sides of stitched edges differ by {} of the light there (RMS), before by {}.\n",
+                pictures::percent(bake.seam_rms_after),
+                pictures::percent(bake.seam_rms_before),
+            );
+        }
         if let Some(p) = pictures {
             println!(
                 "RMSE against the path traced reference, without its own noise of {}:",

@@ -44,6 +44,12 @@ pub fn report(run: &Run) -> Value {
             "peak_bytes": run.bake.peak_bytes,
             "left_out": run.bake.left_out,
             "back_charts": run.bake.back_charts,
+            "seams": {
+                "points": run.bake.seam_points,
+                "rms_before": run.bake.seam_rms_before,
+                "rms_after": run.bake.seam_rms_after,
+                "seconds": run.bake.seam_seconds,
+            },
         },
         "camera": {
             "position": run.camera.position.to_array(),
@@ -74,6 +80,7 @@ fn parameters(args: &BakeArgs) -> Value {
         "blur": p.blur_radius,
         "direct_samples": p.direct_samples,
         "seed": p.seed,
+        "stitch": p.stitch,
         "threads": args.threads,
         "isa": args.isa.map_or("auto", |i| i.name()),
         "bins": args.build.bins,

@@ -1,0 +1,486 @@
+//! Seams: edges at which the light map is cut open, so that the texels of either side are filtered
+//! apart and show different light along what should look like one surface.
+//!
+//! After Iwanicki, *Lighting Technology of "The Last of Us"* (SIGGRAPH talks 2013): points along the
+//! edges tell as weights of texels what the two sides A and B show there, and the texels x are moved
+//! from x₀, as little as possible, so that both agree: least Σ l (A − B)² + λ Σ (x − x₀)², l being
+//! the length in texels that a point stands for. (Ray et al., *Invisible Seams*, EGSR 2010, make
+//! both sides agree exactly, for which the texel grids must meet.) The normal equations are solved
+//! by conjugate gradients (Hestenes and Stiefel 1952), one set of texels for each layer of light.
+//!
+//! Edges are compared by the positions of their ends: vertices on the middle of another triangle's
+//! edge are not found.
+
+use super::charts::float_key;
+use super::plan::{Plan, left_out};
+use super::texels::TexelSample;
+use super::{Atlas, BakeParams, BakeStats, Light, Lightmap, TexelState};
+use crate::error::{Error, Result};
+use crate::memory::{Reservation, try_vec};
+use crate::progress::{Progress, Stage};
+use crate::scene::NONE;
+use glam::{DVec3, Vec2, Vec3, Vec3A};
+use rayon::prelude::*;
+use std::ops::Range;
+use std::time::Instant;
+
+/// Surfaces that meet at more than this angle (30 degrees) have an edge of their own.
+const SMOOTH_COSINE: f32 = 0.866;
+
+/// Texels between the points of an edge: both sides are linear between texels, each in its own grid.
+const SPACING: f32 = 0.5;
+
+/// What moving a texel costs, λ. Much less than the weight of a texel in the points around it (about
+/// 1/2), so that both sides agree, and enough to hold what a point hardly shows.
+const STIFFNESS: f32 = 0.01;
+
+/// Ends the iteration: the gradient's length by its length at the start.
+const TOLERANCE: f64 = 1e-4;
+
+/// Far more iterations than it takes.
+const MAX_ITERATIONS: usize = 200;
+
+/// Elements that a thread takes at a time.
+const CHUNK: usize = 1 << 12;
+
+/// Moved texels and their light: before the stitching or after it, whichever the light map does not
+/// hold.
+pub(crate) struct Stitch {
+    /// Ascending.
+    texels: Vec<u32>,
+    direct: Vec<Vec3>,
+    indirect: Vec<Vec3>,
+    _memory: Reservation,
+}
+
+impl Stitch {
+    /// Exchanges what the light map holds and what is held here.
+    pub(super) fn swap(&mut self, light: &mut Light) {
+        for (i, &texel) in self.texels.iter().enumerate() {
+            std::mem::swap(&mut self.direct[i], &mut light.direct[texel as usize]);
+            std::mem::swap(&mut self.indirect[i], &mut light.indirect[texel as usize]);
+        }
+    }
+}
+
+impl Lightmap {
+    /// Stitches what [`store`](Lightmap::store) will make of `new` light of a range of samples.
+    /// `None` if there is nothing to stitch, or texels are still to be baked: then the shard that
+    /// comes last does it. Changes nothing yet, so that it can be cancelled.
+    pub(super) fn stitch(
+        &self,
+        new: &Light,
+        range: &Range<usize>,
+        params: &BakeParams,
+        plan: &mut Plan,
+        stats: &mut BakeStats,
+        progress: &Progress,
+    ) -> Result<Option<Stitch>> {
+        let start = Instant::now();
+        let view = View { new, range, old: self.light.as_ref() };
+        let dark = !plan.runs(left_out::DIRECT) && !plan.runs(left_out::INDIRECT);
+        let why = if !params.stitch {
+            "it is switched off"
+        } else if dark {
+            "nothing shines"
+        } else if view.has_unbaked(self.atlas.map.len()) {
+            "texels are still to be baked"
+        } else {
+            let stage = progress.stage("seams", 1.0, 1.0, 1);
+            let job = Job { atlas: &self.atlas, backs: &new.backs, budget: params.memory_budget, stage: &stage };
+            let stitch = self.atlas.scene.device().install(|| job.run(&view, plan, stats))?;
+            stage.advance(1)?;
+            stats.seam_seconds = start.elapsed().as_secs_f64();
+            stats.seconds += stats.seam_seconds;
+            if let Some((stitch, edges)) = stitch {
+                plan.run_seams(edges);
+                return Ok(Some(stitch));
+            }
+            "no edge of a smooth surface is cut open"
+        };
+        plan.leave_out_seams(why);
+        Ok(None)
+    }
+}
+
+/// The light as it is going to be, not yet stitched.
+struct View<'a> {
+    new: &'a Light,
+    range: &'a Range<usize>,
+    old: Option<&'a Light>,
+}
+
+impl View<'_> {
+    /// Whose light of a sample it is.
+    fn source(&self, sample: usize) -> &Light {
+        self.old.filter(|_| !self.range.contains(&sample)).unwrap_or(self.new)
+    }
+
+    fn has_unbaked(&self, samples: usize) -> bool {
+        let unbaked = |i| self.source(i).state[i] == TexelState::Unbaked;
+        (0..self.range.start).chain(self.range.end..samples).any(unbaked)
+    }
+
+    /// Direct and indirect light.
+    fn light(&self, sample: usize) -> [Vec3; 2] {
+        let source = self.source(sample);
+        let stitched = source.stitch.as_ref();
+        match stitched.and_then(|s| Some((s, s.texels.binary_search(&(sample as u32)).ok()?))) {
+            Some((before, i)) => [before.direct[i], before.indirect[i]],
+            None => [source.direct[sample], source.indirect[sample]],
+        }
+    }
+
+    /// Whether a sample may be moved: hidden ones repeat what is around them, and what has overflown
+    /// must not spread.
+    fn is_valid(&self, sample: usize) -> bool {
+        let source = self.source(sample);
+        let finite = source.direct[sample].is_finite() && source.indirect[sample].is_finite();
+        source.state[sample] == TexelState::Visible && finite
+    }
+}
+
+/// An edge of a triangle: three times the triangle's global number, plus that of the corner that the
+/// edge starts at. (Triangle numbers have 28 bits.)
+#[derive(Clone, Copy, Debug, Default, PartialEq, Eq, PartialOrd, Ord)]
+struct Side(u32);
+
+impl Side {
+    fn triangle(self) -> u32 {
+        self.0 / 3
+    }
+
+    /// Start and end among the triangle's corners.
+    fn ends<T: Copy>(self, corners: [T; 3]) -> [T; 2] {
+        let k = (self.0 % 3) as usize;
+        [corners[k], corners[(k + 1) % 3]]
+    }
+}
+
+/// What the two sides of an edge show at a point of it.
+#[derive(Clone, Copy, Debug, Default)]
+struct Point {
+    /// Texels of the one side, then of the other.
+    texels: [u32; 8],
+    /// Sum to 1 on the one side, to −1 on the other.
+    weights: [f32; 8],
+    /// The length that it stands for, in texels.
+    length: f32,
+}
+
+struct Job<'a, 'p, 'c> {
+    atlas: &'a Atlas,
+    /// Per chart, whether its back is shown; empty: fronts.
+    backs: &'a [bool],
+    budget: u64,
+    stage: &'a Stage<'p, 'c>,
+}
+
+impl Job<'_, '_, '_> {
+    /// The stitched light and the number of edges. `None` if there are none.
+    fn run(&self, view: &View, plan: &Plan, stats: &mut BakeStats) -> Result<Option<(Stitch, u64)>> {
+        let edges = self.edges()?;
+        self.stage.advance(0)?;
+        let count: usize = edges.iter().map(|e| self.point_count(e)).sum();
+        let uses = 8 * size_of::<(u32, f32)>();
+        let bytes = count * (size_of::<Point>() + uses + size_of::<Vec3A>()) + self.atlas.map.len() * 4;
+        let _memory = self.reserve(bytes, "the seams' points")?;
+        let mut points: Vec<Point> = edges
+            .par_iter()
+            .with_min_len(64)
+            .flat_map_iter(|e| {
+                self.points(e).filter(|p| is_cut(p) && p.texels.iter().all(|&t| view.is_valid(t as usize)))
+            })
+            .collect();
+        if points.is_empty() {
+            return Ok(None);
+        }
+        self.stage.advance(0)?;
+        let texels = number(&mut points, self.atlas.map.len())?;
+        let n = texels.len();
+        let memory = self.reserve(n * 2 * size_of::<Vec3>(), "the light of the seams' texels")?;
+        let _vectors = self.reserve(n * 8 * size_of::<Vec3A>(), "the seams' vectors")?;
+        let system = System::new(points, n);
+        let light: Vec<[Vec3; 2]> = texels.iter().map(|&t| view.light(t as usize)).collect();
+        let mut before = [0, 1].map(|layer| light.iter().map(|l| Vec3A::from(l[layer])).collect::<Vec<_>>());
+        let mut after = before.clone();
+        for (layer, bit) in [left_out::DIRECT, left_out::INDIRECT].into_iter().enumerate() {
+            if plan.runs(bit) {
+                system.solve(&before[layer], &mut after[layer], self.stage)?;
+            }
+        }
+        stats.seam_points = system.points.len() as u64;
+        stats.seam_rms_before = system.relative_rms(&combine(&mut before));
+        let [direct, indirect] = [0, 1].map(|i: usize| after[i].iter().map(|&v| Vec3::from(v)).collect());
+        stats.seam_rms_after = system.relative_rms(&combine(&mut after));
+        Ok(Some((Stitch { texels, direct, indirect, _memory: memory }, edges.len() as u64)))
+    }
+
+    fn reserve(&self, bytes: usize, what: &str) -> Result<Reservation> {
+        if self.budget != 0 && bytes as u64 > self.budget {
+            return Err(Error::OutOfMemory(format!(
+                "{what} take {bytes} bytes, more than memory_budget {}",
+                self.budget
+            )));
+        }
+        self.atlas.scene.device().memory().reserve(bytes, what)
+    }
+
+    /// The edges that are cut open, each with its two sides.
+    fn edges(&self) -> Result<Vec<[Side; 2]>> {
+        let (scene, triangles) = (&self.atlas.scene, &self.atlas.charts.triangles[..]);
+        let n = 3 * triangles.len();
+        let _memory = self.reserve(n * size_of::<(u64, Side)>(), "the edges of the charts")?;
+        let mut sides: Vec<(u64, Side)> = try_vec(n, "the edges of the charts")?;
+        sides.par_chunks_mut(3).zip(triangles).with_min_len(CHUNK).for_each(|(sides, &t)| {
+            let corners = scene.corners(t);
+            for (side, k) in sides.iter_mut().zip(0..) {
+                let s = Side(3 * t + k);
+                *side = (hash(s.ends(corners)), s);
+            }
+        });
+        self.stage.advance(0)?;
+        sides.par_sort_unstable();
+        self.stage.advance(0)?;
+        // Where three or more meet, something stands on the surface, and light need not go on below
+        // it. (So does the rare hash that two edges share.)
+        let mut edges: Vec<[Side; 2]> = sides
+            .par_chunk_by(|a, b| a.0 == b.0)
+            .filter_map(|same| match same {
+                [(_, a), (_, b)] if self.is_seam([*a, *b]) => Some([*a, *b]),
+                _ => None,
+            })
+            .collect();
+        // Neighbours in the scene use the same texels.
+        edges.par_sort_unstable();
+        Ok(edges)
+    }
+
+    fn chart(&self, side: Side) -> u32 {
+        self.atlas.charts.chart_of[side.triangle() as usize]
+    }
+
+    fn is_back(&self, side: Side) -> bool {
+        self.backs.get(self.chart(side) as usize).is_some_and(|&b| b)
+    }
+
+    /// Whether the second side runs from the first one's end to its start, as in a mesh it should.
+    fn runs_back(&self, [a, b]: [Side; 2]) -> bool {
+        let [start, _] = a.ends(self.atlas.scene.corners(a.triangle()));
+        let [_, end] = b.ends(self.atlas.scene.corners(b.triangle()));
+        start == end
+    }
+
+    /// Whether the shown sides of the surface go on smoothly over an edge, but the light map does not.
+    fn is_seam(&self, edge: [Side; 2]) -> bool {
+        let [a, b] = edge;
+        let ends = edge.map(|s| s.ends(self.atlas.scene.corners(s.triangle())));
+        let runs_back = self.runs_back(edge);
+        let other = if runs_back { [ends[1][1], ends[1][0]] } else { ends[1] };
+        if ends[0] != other || runs_back == (self.is_back(a) != self.is_back(b)) {
+            return false;
+        }
+        let [at_a, at_b] = self.in_charts(edge);
+        let apart = |i: usize| (self.texel(a, at_a[i]) - self.texel(b, at_b[i])).length() > 1e-3;
+        if self.chart(a) == self.chart(b) && !apart(0) && !apart(1) {
+            return false;
+        }
+        let normal = |side: Side, s: f32| {
+            // Weights of the corners 1 and 2.
+            let [u, v] = [[s, 0.0], [1.0 - s, s], [0.0, 1.0 - s]][(side.0 % 3) as usize];
+            let n = TexelSample { triangle: side.triangle(), u, v, x: 0, y: 0 }.shading_normal(&self.atlas.scene);
+            if self.is_back(side) { -n } else { n }
+        };
+        [0.0, 1.0].into_iter().all(|s| {
+            let along_b = if runs_back { 1.0 - s } else { s };
+            normal(a, s).dot(normal(b, along_b)) > SMOOTH_COSINE
+        })
+    }
+
+    /// Start and end of an edge in the charts of both sides.
+    fn in_charts(&self, edge: [Side; 2]) -> [[Vec2; 2]; 2] {
+        let corners = |s: Side| s.ends(self.atlas.charts.corners[s.triangle() as usize].map(Vec2::from_array));
+        let [a, [start, end]] = edge.map(corners);
+        [a, if self.runs_back(edge) { [end, start] } else { [start, end] }]
+    }
+
+    /// The texel coordinate of a point of a side's chart.
+    fn texel(&self, side: Side, local: Vec2) -> Vec2 {
+        self.atlas.map.layout.texel_coord(self.chart(side), local.to_array()).into()
+    }
+
+    /// The length of an edge in texels, on the side where it takes more of them.
+    fn length(&self, edge: &[Side; 2]) -> f32 {
+        let locals = self.in_charts(*edge);
+        let length = |i: usize| (self.texel(edge[i], locals[i][0]) - self.texel(edge[i], locals[i][1])).length();
+        length(0).max(length(1))
+    }
+
+    fn point_count(&self, edge: &[Side; 2]) -> usize {
+        ((self.length(edge) / SPACING).ceil() as usize).max(1)
+    }
+
+    fn points(&self, edge: &[Side; 2]) -> impl Iterator<Item = Point> {
+        let (edge, locals, n) = (*edge, self.in_charts(*edge), self.point_count(edge));
+        let length = self.length(&edge) / n as f32;
+        (0..n).map(move |i| {
+            let s = (i as f32 + 0.5) / n as f32;
+            let mut point = Point { length, ..Default::default() };
+            for (side, sign) in [(0, 1.0), (1, -1.0)] {
+                let local = locals[side][0].lerp(locals[side][1], s);
+                let mut at = 4 * side;
+                self.atlas.map.bilinear(self.chart(edge[side]), local.to_array(), |texel, weight| {
+                    (point.texels[at], point.weights[at]) = (texel as u32, sign * weight);
+                    at += 1;
+                });
+                // What is not used repeats a used one, with weight 0.
+                let used = point.texels[4 * side];
+                point.texels[at..4 * side + 4].fill(used);
+            }
+            point
+        })
+    }
+}
+
+/// The same for both directions of an edge.
+fn hash(ends: [Vec3; 2]) -> u64 {
+    let [a, b] = ends.map(|p| p.to_array().map(float_key));
+    let (low, high) = if a < b { (a, b) } else { (b, a) };
+    low.into_iter().chain(high).fold(0, |h: u64, x| {
+        let h = (h ^ x as u64).wrapping_mul(0x9e37_79b9_7f4a_7c15);
+        h ^ h >> 29
+    })
+}
+
+/// Whether the sides of a point show different texels, or the same ones in different parts. (Charts
+/// that the caller placed side by side share texels. A placement without texels has weights 0.)
+fn is_cut(p: &Point) -> bool {
+    let sum: f32 = p.weights.iter().map(|w| w.abs()).sum();
+    let part = |t: u32| p.texels.iter().zip(&p.weights).filter(|(u, _)| **u == t).map(|(_, w)| w).sum::<f32>();
+    sum > 1.5 && p.texels.iter().any(|&t| part(t).abs() > 1e-3)
+}
+
+/// Replaces texels by their numbers among the texels that points use. Those texels, ascending.
+fn number(points: &mut [Point], texels: usize) -> Result<Vec<u32>> {
+    let mut number_of: Vec<u32> = try_vec(texels, "the numbers of the seams' texels")?;
+    number_of.fill(NONE);
+    points.iter().flat_map(|p| p.texels).for_each(|t| number_of[t as usize] = 0);
+    let used: Vec<u32> = (0..texels as u32).filter(|&t| number_of[t as usize] != NONE).collect();
+    (0..).zip(&used).for_each(|(i, &t)| number_of[t as usize] = i);
+    points.par_iter_mut().for_each(|p| p.texels = p.texels.map(|t| number_of[t as usize]));
+    Ok(used)
+}
+
+/// Adds the second layer to the first.
+fn combine(layers: &mut [Vec<Vec3A>; 2]) -> Vec<Vec3A> {
+    let [first, second] = layers;
+    first.iter_mut().zip(second).for_each(|(a, b)| *a += *b);
+    std::mem::take(first)
+}
+
+/// The least squares problem: J is what points show, its rows times the roots of their lengths.
+struct System {
+    points: Vec<Point>,
+    /// Where the uses of each texel begin, and the number of uses at the end.
+    first_use: Vec<usize>,
+    /// Points that show a texel, with its weight there times their length.
+    uses: Vec<(u32, f32)>,
+}
+
+impl System {
+    fn new(points: Vec<Point>, texels: usize) -> System {
+        let used =
+            || (0..).zip(&points).flat_map(|(i, p)| (0..8).map(move |k| (i, p.texels[k], p.weights[k] * p.length)));
+        let mut first_use = vec![0; texels + 1];
+        used().filter(|u| u.2 != 0.0).for_each(|(_, t, _)| first_use[t as usize + 1] += 1);
+        (0..texels).for_each(|t| first_use[t + 1] += first_use[t]);
+        let mut uses = vec![(0, 0.0); first_use[texels]];
+        let mut next = first_use.clone();
+        for (i, t, w) in used().filter(|u| u.2 != 0.0) {
+            uses[next[t as usize]] = (i, w);
+            next[t as usize] += 1;
+        }
+        System { points, first_use, uses }
+    }
+
+    /// A − B at every point.
+    fn differences(&self, x: &[Vec3A], out: &mut [Vec3A]) {
+        let show = |p: &Point| (0..8).fold(Vec3A::ZERO, |sum, k| sum + p.weights[k] * x[p.texels[k] as usize]);
+        out.par_iter_mut().zip(&self.points).with_min_len(CHUNK).for_each(|(d, p)| *d = show(p));
+    }
+
+    /// JᵀJ of what the differences are of. (Sums in the order of points, whatever the threads.)
+    fn pull(&self, differences: &[Vec3A], out: &mut [Vec3A]) {
+        out.par_iter_mut().enumerate().with_min_len(CHUNK).for_each(|(t, out)| {
+            let uses = &self.uses[self.first_use[t]..self.first_use[t + 1]];
+            *out = uses.iter().fold(Vec3A::ZERO, |sum, &(p, w)| sum + w * differences[p as usize]);
+        });
+    }
+
+    /// Conjugate gradients from `before` on, each channel on its own. Light stays ≥ 0.
+    fn solve(&self, before: &[Vec3A], x: &mut [Vec3A], stage: &Stage) -> Result<()> {
+        let mut differences = vec![Vec3A::ZERO; self.points.len()];
+        let mut q = vec![Vec3A::ZERO; before.len()];
+        self.differences(before, &mut differences);
+        self.pull(&differences, &mut q);
+        let mut r: Vec<Vec3A> = q.iter().map(|&v| -v).collect();
+        let mut p = r.clone();
+        x.copy_from_slice(before);
+        let mut rr = dot(&r, &r);
+        let enough = rr * TOLERANCE * TOLERANCE;
+        for _ in 0..MAX_ITERATIONS {
+            stage.advance(0)?;
+            if rr.cmple(enough).all() {
+                break;
+            }
+            self.differences(&p, &mut differences);
+            self.pull(&differences, &mut q);
+            q.par_iter_mut().zip(&p).with_min_len(CHUNK).for_each(|(q, &p)| *q += STIFFNESS * p);
+            let step = ratio(rr, dot(&p, &q));
+            x.par_iter_mut().zip(&p).with_min_len(CHUNK).for_each(|(x, &p)| *x += step * p);
+            r.par_iter_mut().zip(&q).with_min_len(CHUNK).for_each(|(r, &q)| *r -= step * q);
+            let next = dot(&r, &r);
+            let keep = ratio(next, rr);
+            p.par_iter_mut().zip(&r).with_min_len(CHUNK).for_each(|(p, &r)| *p = r + keep * *p);
+            rr = next;
+        }
+        for (x, &before) in x.iter_mut().zip(before) {
+            *x = if x.is_finite() { x.max(Vec3A::ZERO) } else { before };
+        }
+        Ok(())
+    }
+
+    /// Root mean square of A − B over lengths and channels, relative to the mean light; 0 in the dark.
+    fn relative_rms(&self, x: &[Vec3A]) -> f64 {
+        let (mut squares, mut sum, mut total) = (DVec3::ZERO, DVec3::ZERO, 0.0);
+        for p in &self.points {
+            let length = p.length as f64;
+            let [a, b] = [0..4, 4..8].map(|side: Range<usize>| {
+                side.fold(DVec3::ZERO, |s, k| s + (p.weights[k].abs() * x[p.texels[k] as usize]).as_dvec3())
+            });
+            squares += length * (a - b) * (a - b);
+            sum += length * 0.5 * (a + b);
+            total += length;
+        }
+        let mean = sum.element_sum() / 3.0 / total;
+        if mean > 0.0 { (squares.element_sum() / 3.0 / total).sqrt() / mean } else { 0.0 }
+    }
+}
+
+/// Per channel, in f64 and in a fixed order.
+fn dot(a: &[Vec3A], b: &[Vec3A]) -> DVec3 {
+    let part = |(a, b): (&[Vec3A], &[Vec3A])| {
+        a.iter().zip(b).fold(DVec3::ZERO, |sum, (a, b)| sum + a.as_dvec3() * b.as_dvec3())
+    };
+    let parts: Vec<DVec3> = a.par_chunks(CHUNK).zip(b.par_chunks(CHUNK)).map(part).collect();
+    parts.into_iter().sum()
+}
+
+/// Per channel; 0 for a channel that is done.
+fn ratio(a: DVec3, b: DVec3) -> Vec3A {
+    let q = a / b;
+    DVec3::select(b.cmpgt(DVec3::ZERO), q, DVec3::ZERO).as_vec3a()
+}
+
+#[cfg(test)]
+mod tests;
