@@ -242,6 +242,11 @@ typedef struct bk_load_info {
   uint64_t triangles;
   // Time to read the file, in seconds.
   double seconds;
+  // Textures added, the first with number first_texture. An image that cannot be read is told to the device's
+  // log as a warning, and its materials do without.
+  uint32_t textures;
+  // Number of the first texture added.
+  uint32_t first_texture;
 } bk_load_info;
 
 // How to build the acceleration structure.
@@ -305,7 +310,8 @@ BK_API void bk_scene_release(bk_scene *scene);
 // Sets struct_size and clears the rest.
 BK_API void bk_load_info_init(bk_load_info *info);
 
-// Adds what a scene file describes: meshes, materials (emissive ones included), lights.
+// Adds what a scene file describes: meshes, materials (emissive ones included) with their textures (PNG and
+// JPEG), lights.
 //
 // path: UTF-8, ending in .obj (with its .mtl), .ply, .gltf or .glb. out: what was added; NULL if
 // not wanted.
@@ -372,11 +378,16 @@ BK_API bk_result bk_scene_bounds(const bk_scene *scene, float lower[3], float up
 /* ================================================================================================
  * Textures
  *
- * Images that a scene uses. Added before its commit, and before what names them. Environments are the
- * images of skies: the whole sphere of directions by longitude and latitude. Row 0 is at the zenith, the
- * last row at the nadir; the middle of a row is the sky's front, and texels follow one another to the right
- * as seen from inside. Each texel is an area of uniform radiance, without interpolation. A scene without
- * images spends neither memory nor time on them.
+ * Images that a scene uses. Added before its commit, and before what names them.
+ *
+ * Textures colour surfaces and cut holes into them. They are addressed by the first texture coordinates of
+ * meshes (bk_mesh_desc.uvs), repeat beyond [0, 1], and are interpolated between the centres of texels.
+ *
+ * Environments are the images of skies: the whole sphere of directions by longitude and latitude. Row 0 is at
+ * the zenith, the last row at the nadir; the middle of a row is the sky's front, and texels follow one another
+ * to the right as seen from inside. Each texel is an area of uniform radiance, without interpolation.
+ *
+ * A scene without images spends neither memory nor time on them.
  * ================================================================================================ */
 
 // Format: four bytes per texel, sRGB red, green and blue and linear alpha (255: opaque).
@@ -404,6 +415,15 @@ typedef struct bk_texture_desc {
 // Fills in the defaults.
 BK_API void bk_texture_init(bk_texture_desc *desc);
 
+// Adds a texture.
+//
+// out_id: receives its number, for materials; NULL if not wanted. Numbers count up from 0 in the order of
+// addition.
+//
+// Fails with BK_ERROR_INVALID_ARGUMENT if a size or the stride is out of range, the format is unknown or data
+// is NULL, with BK_ERROR_OUT_OF_MEMORY if there is no memory for a copy.
+BK_API bk_result bk_scene_add_texture(bk_scene *scene, const bk_texture_desc *desc, uint32_t *out_id);
+
 // Adds an environment, for lights of type BK_LIGHT_SKY. Its format must be BK_TEXTURE_RGB32F. It takes 16
 // bytes per texel.
 //
@@ -429,7 +449,7 @@ bk_result bk_scene_add_environment(bk_scene *scene,
  * ================================================================================================ */
 
 // Flag: the back side reflects and emits like the front. The back of a one-sided material absorbs
-// what meets it.
+// what meets it and is not transmitted.
 #define BK_MATERIAL_TWO_SIDED 1
 
 // Flag: refuse degenerate triangles and vertices that are not finite, naming the first, rather
@@ -442,10 +462,21 @@ typedef struct bk_material_desc {
   uint32_t struct_size;
   // BK_MATERIAL flags. Default: 0.
   uint32_t flags;
-  // Diffuse reflectance per channel, in [0, 1). Default: 0.5.
+  // Diffuse reflectance per channel, in [0, 1); with albedo_texture: its factor, in [0, 1]. Default: 0.5.
   float albedo[3];
   // Emitted radiance per channel in W/(m2 sr), >= 0. Default: 0.
   float emission[3];
+  // Number of the texture that is multiplied with albedo, the product being limited to 0.98; BK_NONE: none.
+  // Where a mesh has no uvs, albedo alone counts. Default: BK_NONE.
+  uint32_t albedo_texture;
+  // Points where the texture's alpha, interpolated and from 0 to 1, is less than this are holes, which rays and
+  // photons do not meet, from whichever side. In [0, 1]; not for materials that emit. Holes cost rays that
+  // meet them a second search. Default: 0, no holes.
+  float alpha_cutoff;
+  // Fraction of light per channel that passes straight through, from either side, as through a pane of
+  // stained glass; at most 1 together with albedo. It is not textured. Light of lamps that comes through
+  // is direct light. bk_intersect, bk_occluded and their like meet the surface all the same. Default: 0.
+  float transmission[3];
 } bk_material_desc;
 
 // An indexed triangle mesh. The arrays are copied.
@@ -468,7 +499,7 @@ typedef struct bk_mesh_desc {
   const float *normals;
   // Bytes from one normal to the next, at least 12; 0: packed.
   size_t normal_stride;
-  // Optional: vertex_count texture coordinates of two floats. Kept for files that are saved.
+  // Optional: vertex_count texture coordinates of two floats, which place the textures of materials.
   const float *uvs;
   // Bytes from one texture coordinate to the next, at least 8; 0: packed.
   size_t uv_stride;
@@ -506,7 +537,7 @@ typedef struct bk_mesh_view {
 // Fills in the defaults.
 BK_API void bk_material_desc_init(bk_material_desc *desc);
 
-// Adds a material.
+// Adds a material. The texture that it names must have been added before.
 //
 // out_id: receives its number, for meshes; NULL if not wanted. Numbers count up from 0 in the
 // order of addition.
@@ -986,6 +1017,15 @@ bk_result bk_lightmap_mesh_uvs(const bk_lightmap *lightmap,
 
 // Bit of left_out. No interpolation of shading normals.
 #define BK_LEFT_OUT_SHADING_NORMALS 128
+
+// Bit of left_out. No look-ups of albedo textures.
+#define BK_LEFT_OUT_TEXTURES 256
+
+// Bit of left_out. No tests for holes that textures cut out.
+#define BK_LEFT_OUT_CUTOUTS 512
+
+// Bit of left_out. No light through surfaces.
+#define BK_LEFT_OUT_TRANSMISSION 1024
 
 // Bit of left_out. No light from a sky.
 #define BK_LEFT_OUT_SKY 4096
