@@ -71,14 +71,18 @@ impl Draw {
     fn light(&mut self, size: f32) -> Light {
         let position = if self.one_in(4) { Vec3::ZERO } else { self.point(size) };
         let direction = self.point(1.0);
-        match self.below(4) {
+        match self.below(5) {
             0 => Light::Point { position, intensity: self.color() },
             1 => {
                 let outer = self.pick(&[1e-7, 1e-3, 0.5, 3.1415925]);
                 let inner = outer * self.pick(&[0.0, 0.5, 1.0]);
                 Light::Spot { position, direction, inner, outer, intensity: self.color() }
             }
-            2 => Light::Directional { direction, irradiance: self.color() },
+            2 => {
+                let angular_radius = self.pick(&[0.0, 1e-5, 5e-3, 0.5, 1.57]);
+                Light::Directional { direction, irradiance: self.color(), angular_radius }
+            }
+            3 => Light::Sky { radiance: self.color(), environment: NONE, up: direction, rotation: self.log(-3.0, 3.0) },
             _ => {
                 let flat = self.pick(&[1.0, 1e-6]);
                 let (edge_u, edge_v) = (self.point(size), self.point(size * flat));
@@ -90,7 +94,9 @@ impl Draw {
     fn material(&mut self) -> Material {
         let albedo = std::array::from_fn(|_| self.pick(&[0.0, 0.3, 0.9, 0.99]));
         let emission = if self.one_in(3) { self.color() } else { [0.0; 3] };
-        Material { albedo, emission, two_sided: self.one_in(2) }
+        // Where albedo is as high as may be, light passes through nothing.
+        let transmission = albedo.map(|a: f32| if self.one_in(4) { 0.5 * (1.0 - a) } else { 0.0 });
+        Material { albedo, emission, two_sided: self.one_in(2), transmission, ..Default::default() }
     }
 
     fn scene(&mut self) -> Result<SceneData> {

@@ -252,7 +252,7 @@ fn direct_light_is_multiplied_with_what_each_pane_transmits() {
         let position = Vec3::new(0.3, 0.4, 4.0);
         let direction = Vec3::new(0.2, 0.1, -1.0);
         lamp(&mut data, position);
-        data.add_light(Light::Directional { direction, irradiance: [1.0, 2.0, 3.0] }).unwrap();
+        data.add_light(Light::Directional { direction, irradiance: [1.0, 2.0, 3.0], angular_radius: 0.0 }).unwrap();
         data.add_light(Light::Spot { position, direction, inner: 0.3, outer: 1.0, intensity: [5.0; 3] }).unwrap();
         let (edge_u, edge_v) = (Vec3::Y, Vec3::X);
         data.add_light(Light::Rect { position, edge_u, edge_v, radiance: [3.0; 3] }).unwrap();

@@ -80,7 +80,7 @@ mod tests {
         let p = |x: f32, y: f32| Vec3::new(x, y, 0.0);
         builder.quad(p(0.0, 0.0), p(1.0, 0.0), p(1.0, 1.0), p(0.0, 1.0), m);
         data.add_mesh(builder.finish()).unwrap();
-        data.add_light(Light::Directional { direction: -Vec3::Z, irradiance: [2.0; 3] }).unwrap();
+        data.add_light(Light::Directional { direction: -Vec3::Z, irradiance: [2.0; 3], angular_radius: 0.0 }).unwrap();
         let scene = Scene::commit(&device, data, &BuildOptions::default(), &Progress::none()).map_err(|e| e.1).unwrap();
         let params = PhotonParams { photon_count: 1 << 18, radius: 0.1, ..Default::default() };
         let map = PhotonMap::trace(&scene, &params, &Progress::none()).unwrap();
