@@ -122,7 +122,10 @@ impl ByPower {
 fn report(name: &str, scene: &Arc<Scene>) {
     let receivers: Vec<Receiver> = common::origins(scene, POINTS)
         .into_iter()
-        .map(|(p, n)| Receiver { origin: offset_ray_origin(p, n, scene), normal: n, geometric: n })
+        .map(|(position, n)| {
+            let origin = offset_ray_origin(position, n, scene);
+            Receiver { origin, normal: n, geometric: n, position, shadow_origin: origin, raised: false }
+        })
         .collect();
     let (direct, by_power) = (DirectLight::new(scene), ByPower::new(scene));
     let exact = |r: &Receiver, rays: &mut u64| -> f32 {

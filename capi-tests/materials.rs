@@ -18,7 +18,7 @@ fn commit(data: SceneData, compact: bool) -> Arc<Scene> {
 }
 
 fn bake(scene: &Arc<Scene>, texels_per_unit: f32, params: &BakeParams) -> (Lightmap, BakeStats) {
-    let desc = LightmapDesc { texels_per_unit, gather_divisor: 2, radiance_divisor: 4, ..Default::default() };
+    let desc = LightmapDesc { texels_per_unit, gather_divisor: 1, radiance_divisor: 2, ..Default::default() };
     let mut map = Lightmap::create(scene, &desc, &Progress::none()).unwrap();
     let stats = map.bake(params, &Progress::none()).unwrap();
     (map, stats)

@@ -19,7 +19,7 @@ use crate::error::Result;
 use crate::photon::PhotonMap;
 use crate::photon::coverage::{Coverage, Piece};
 use crate::progress::Stage;
-use crate::sampling::{combine, sobol_2d};
+use crate::sampling::{combine, orthonormal_basis, sobol_2d};
 use crate::scene::{NONE, Scene};
 use crate::trace::RawHit;
 use glam::{Mat2, Vec2, Vec3};
@@ -117,7 +117,7 @@ fn coverage(input: &RadianceInput, photons: &PhotonMap, rays: &AtomicU64) -> Res
         .map(|sample| {
             let (point, receiver) = input.map.receiver(input.scene, sample, sample >= input.back_start);
             let area = input.map.texels.areas[sample];
-            (!inside_a_solid(input.scene, receiver.origin, receiver.geometric)).then_some(Piece {
+            (!is_buried(input.scene, receiver.origin, receiver.geometric)).then_some(Piece {
                 position: point.position,
                 normal: receiver.geometric,
                 area,
@@ -125,6 +125,14 @@ fn coverage(input: &RadianceInput, photons: &PhotonMap, rays: &AtomicU64) -> Res
         })
         .collect();
     Coverage::new(photons, pieces.into_iter().flatten())
+}
+
+/// Whether a surface lies inside a solid: straight above it and to all sides are backs. (Straight above alone may
+/// be that of a single sheet, such as a grate, below which there is light.)
+fn is_buried(scene: &Scene, origin: Vec3, normal: Vec3) -> bool {
+    let (x, y) = orthonormal_basis(normal);
+    let aside = [x, -x, y, -y].into_iter().map(|side| normal + side);
+    inside_a_solid(scene, origin, normal) && aside.into_iter().all(|d| inside_a_solid(scene, origin, d))
 }
 
 /// Look-ups of a texture in one texel, at most.
