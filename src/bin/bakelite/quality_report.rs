@@ -259,20 +259,23 @@ fn slope(rows: &[Row]) -> Option<f64> {
     (points.len() > 1 && xx > 0.0).then(|| xy / xx)
 }
 
+/// Whether the error of the last setting but one falls to that of the last as noise does, by its slope.
+fn still_noise(a: &Row, b: &Row) -> bool {
+    let slope = 0.5 * (b.indirect.mse / a.indirect.mse).ln() / (b.seconds / a.seconds).ln();
+    slope < -0.35
+}
+
 /// Time at which a series reaches a root mean square error: between two settings along the line in
-/// log-log axes, beyond the last one along the slope of pure noise if there is no bias to speak of.
+/// log-log axes, beyond the last one along the slope of pure noise if the error still falls so.
 fn time_to(rows: &[Row], goal: f64) -> String {
     let error = |r: &Row| r.indirect.mse.max(0.0).sqrt();
     let mut sorted: Vec<&Row> = rows.iter().collect();
     sorted.sort_by(|a, b| a.seconds.total_cmp(&b.seconds));
     let Some(at) = sorted.iter().position(|r| error(r) <= goal) else {
         let best = sorted.iter().map(|r| error(r)).fold(f64::INFINITY, f64::min);
-        let last = sorted[sorted.len() - 1];
-        let unbiased = last.indirect.bias2 < 0.1 * last.indirect.mse;
-        return if unbiased {
-            format!("about {}", seconds(last.seconds * (error(last) / goal).powi(2)))
-        } else {
-            format!("not reached: {:.1} %", 100.0 * best)
+        return match sorted[..] {
+            [.., a, b] if still_noise(a, b) => format!("about {}", seconds(b.seconds * (error(b) / goal).powi(2))),
+            _ => format!("not reached: {:.1} %", 100.0 * best),
         };
     };
     if at == 0 {
