@@ -28,6 +28,9 @@ use std::f32::consts::PI;
 use std::sync::Arc;
 use std::sync::atomic::{AtomicU64, Ordering::Relaxed};
 
+/// Estimates are divided by the surface in their disc if that is known at so many texels per radius.
+const TEXELS_PER_RADIUS: f32 = 1.0;
+
 /// Texels handed to a thread at a time.
 const BLOCK: usize = 512;
 
@@ -74,7 +77,10 @@ pub(crate) struct RadianceInput<'a> {
 /// Fills in `values`, one per texel of the map; returns the rays traced.
 pub(crate) fn bake(device: &Device, input: &RadianceInput, values: &mut [Vec3], stage: &Stage) -> Result<u64> {
     let rays = AtomicU64::new(0);
-    let coverage = match input.photons {
+    // Of pieces larger than this it would count too few or too many (closed furnace, radiance divisor 4: 2 % too
+    // bright).
+    let is_fine = |p: &PhotonMap| p.radius() * input.map.layout.density >= TEXELS_PER_RADIUS;
+    let coverage = match input.photons.filter(|p| is_fine(p)) {
         Some(photons) => Some(device.install(|| coverage(input, photons, &rays))?),
         None => None,
     };
@@ -99,9 +105,9 @@ fn texel(input: &RadianceInput, coverage: Option<&Coverage>, sample: usize, rays
     let back = sample >= input.back_start;
     let (point, receiver) = input.map.receiver(input.scene, sample, back);
     let mut e = input.direct.irradiance(&receiver, input.direct_samples, combine(input.seed, sample as u32), rays);
-    if let (Some(photons), Some(coverage)) = (input.photons, coverage) {
-        let estimate = Vec3::from(photons.estimate(point.position, receiver.geometric));
-        e += estimate / coverage.at(photons, point.position, receiver.geometric);
+    if let Some(photons) = input.photons {
+        let part = coverage.map_or(1.0, |c| c.at(photons, point.position, receiver.geometric));
+        e += Vec3::from(photons.estimate(point.position, receiver.geometric)) / part;
     }
     albedo * e / PI
 }
