@@ -5,11 +5,17 @@ use bakelite::bvh::BuildOptions;
 use bakelite::lightmap::plan::left_out;
 use bakelite::lightmap::{BakeParams, BakeStats, Layer, Lightmap, LightmapDesc};
 use bakelite::photon::{PhotonMap, PhotonParams};
-use bakelite::reference::{PathTracer, Random, SurfacePoint};
+use bakelite::reference::{Irradiance, PathTracer, Random, SurfacePoint};
 use bakelite::scene::{MeshMaterials, NONE, Texture};
 use bakelite::{Device, DeviceOptions, Light, Material, Mesh, Progress, Scene, SceneData};
 use glam::{Vec2, Vec3};
 use std::sync::Arc;
+
+/// At which light is compared.
+const PLACES: u32 = 60;
+
+/// Paths per place and half of the truth.
+const SAMPLES: u32 = 16 * 12 * 12;
 
 fn commit(data: SceneData, compact: bool) -> Arc<Scene> {
     let device = Device::new(DeviceOptions::default()).unwrap();
@@ -17,8 +23,11 @@ fn commit(data: SceneData, compact: bool) -> Arc<Scene> {
     Scene::commit(&device, data, &build, &Progress::none()).map_err(|(_, e)| e).unwrap()
 }
 
-fn bake(scene: &Arc<Scene>, texels_per_unit: f32, params: &BakeParams) -> (Lightmap, BakeStats) {
-    let desc = LightmapDesc { texels_per_unit, gather_divisor: 1, radiance_divisor: 2, ..Default::default() };
+/// `density`: texels per unit, and gather texels, of which the former are a multiple.
+fn bake(scene: &Arc<Scene>, density: [u32; 2], params: &BakeParams) -> (Lightmap, BakeStats) {
+    let [texels, gather] = density;
+    let (texels_per_unit, gather_divisor) = (texels as f32, texels / gather);
+    let desc = LightmapDesc { texels_per_unit, gather_divisor, radiance_divisor: 2, ..Default::default() };
     let mut map = Lightmap::create(scene, &desc, &Progress::none()).unwrap();
     let stats = map.bake(params, &Progress::none()).unwrap();
     (map, stats)
@@ -63,55 +72,56 @@ fn bars() -> Texture {
     Texture { width: 2, height: 1, rgba8: vec![[255, 255, 255, 0], [255; 4]] }
 }
 
-/// Baked and true irradiance at random places of a mesh: relative difference of the means with its standard
-/// error, and RMS difference, for the channels together.
-struct Comparison {
-    bias: f64,
-    bias_error: f64,
-    rms: f64,
+/// True light at random places of a mesh: two independent halves, which tell its noise.
+struct Truth {
+    places: Vec<(u32, f64, f64)>,
+    halves: [Vec<Irradiance>; 2],
 }
 
-fn compare(map: &Lightmap, scene: &Arc<Scene>, mesh: u32, layer: Layer, places: u32) -> Comparison {
-    let tracer = PathTracer::new(scene);
-    let mut random = Random::new(11, mesh as u64);
-    let first = scene.first_triangle(mesh);
-    let places: Vec<(u32, f64, f64)> = (0..places)
-        .map(|i| {
-            let [a, b] = random.square();
-            let (u, v) = if a + b > 1.0 { (1.0 - a, 1.0 - b) } else { (a, b) };
-            (first + i % 2, u, v)
-        })
-        .collect();
-    let points: Vec<_> = places.iter().map(|&(t, u, v)| SurfacePoint::on_triangle(scene, t, u, v)).collect();
-    let truth = tracer.irradiance_many(scene.device(), &points, 16 * 24 * 24, 5, &Progress::none()).unwrap();
-    let (mut sum, mut expected, mut squares, mut variance) = (0.0, 0.0, 0.0, 0.0);
-    for (&(t, u, v), truth) in places.iter().zip(&truth) {
-        let baked = map.sample(layer, t, u as f32, v as f32);
-        let exact = match layer {
-            Layer::Indirect => truth.indirect,
-            Layer::Direct => truth.direct,
-            _ => truth.total(),
-        };
-        for c in 0..3 {
-            sum += baked[c] as f64;
-            expected += exact[c];
-            squares += (baked[c] as f64 - exact[c]).powi(2);
-            variance += truth.standard_error[c].powi(2);
+impl Truth {
+    fn new(scene: &Arc<Scene>, mesh: u32) -> Truth {
+        let tracer = PathTracer::new(scene);
+        let mut random = Random::new(11, mesh as u64);
+        let first = scene.first_triangle(mesh);
+        let places: Vec<(u32, f64, f64)> = (0..PLACES)
+            .map(|i| {
+                let [a, b] = random.square();
+                let (u, v) = if a + b > 1.0 { (1.0 - a, 1.0 - b) } else { (a, b) };
+                (first + i % 2, u, v)
+            })
+            .collect();
+        let points: Vec<_> = places.iter().map(|&(t, u, v)| SurfacePoint::on_triangle(scene, t, u, v)).collect();
+        let half = |seed| tracer.irradiance_many(scene.device(), &points, SAMPLES, seed, &Progress::none()).unwrap();
+        Truth { places, halves: [half(5), half(6)] }
+    }
+
+    /// Relative difference of a bake's mean, which must be less than `bias`, and the root of the mean square
+    /// of the differences by the mean, less than `rms`. The noise of the truth is not part of the latter.
+    #[track_caller]
+    fn assert_close(&self, what: &str, map: &Lightmap, layer: Layer, bias: f64, rms: f64) {
+        let (mut baked, mut truth, mut squares, mut noise) = (0.0, 0.0, 0.0, 0.0);
+        for (i, &(t, u, v)) in self.places.iter().enumerate() {
+            let x = map.sample(layer, t, u as f32, v as f32);
+            let [a, b] = [0, 1].map(|half| match layer {
+                Layer::Indirect => self.halves[half][i].indirect,
+                Layer::Direct => self.halves[half][i].direct,
+                _ => self.halves[half][i].total(),
+            });
+            for c in 0..3 {
+                let x = x[c] as f64;
+                baked += x;
+                truth += 0.5 * (a[c] + b[c]);
+                squares += (x - a[c]) * (x - b[c]);
+                noise += 0.25 * (a[c] - b[c]).powi(2);
+            }
         }
+        let n = 3.0 * self.places.len() as f64;
+        let (got, noise) = (baked / truth - 1.0, noise.sqrt() / truth);
+        let got_rms = (squares / n).max(0.0).sqrt() / (truth / n);
+        println!("{what}: bias {got:.4} ± {noise:.4}, RMS {got_rms:.4}");
+        assert!(noise < 0.2 * bias && got.abs() < bias, "{what}: bias {got} ± {noise}");
+        assert!(got_rms < rms, "{what}: RMS {got_rms}");
     }
-    let n = 3.0 * places.len() as f64;
-    Comparison {
-        bias: sum / expected - 1.0,
-        bias_error: variance.sqrt() / expected,
-        rms: (squares / n).sqrt() / (expected / n),
-    }
-}
-
-#[track_caller]
-fn assert_close(what: &str, c: Comparison, bias: f64, rms: f64) {
-    println!("{what}: bias {:.4} ± {:.4}, RMS {:.4}", c.bias, c.bias_error, c.rms);
-    assert!(c.bias_error < 0.01 && c.bias.abs() < bias, "{what}: bias {} ± {}", c.bias, c.bias_error);
-    assert!(c.rms < rms, "{what}: RMS {}", c.rms);
 }
 
 fn production() -> BakeParams {
@@ -124,7 +134,7 @@ fn lamp(data: &mut SceneData, position: Vec3) {
 
 #[test]
 fn a_chequered_floor_colors_the_walls_as_in_the_path_tracer() {
-    for repeats_texture in [true, false] {
+    for textured in [true, false] {
         let mut data = SceneData::new();
         let albedo_texture = data.add_texture(chequer()).unwrap();
         let tiles = Material { albedo: [0.9; 3], albedo_texture, ..Default::default() };
@@ -133,7 +143,7 @@ fn a_chequered_floor_colors_the_walls_as_in_the_path_tracer() {
         let walls = data.add_material(Material { albedo: [0.6; 3], ..Default::default() }).unwrap();
         room(&mut data, Vec3::new(2.0, 2.0, 1.5), floor, walls);
         lamp(&mut data, Vec3::new(0.8, 1.1, 1.1));
-        if !repeats_texture {
+        if !textured {
             let mut other = SceneData::new();
             other.add_texture(chequer()).unwrap();
             for m in data.materials() {
@@ -146,19 +156,19 @@ fn a_chequered_floor_colors_the_walls_as_in_the_path_tracer() {
             data = other;
         }
         let scene = commit(data, false);
-        let (map, stats) = bake(&scene, 24.0, &production());
-        assert_eq!(stats.left_out & left_out::TEXTURES == 0, repeats_texture);
+        let (map, stats) = bake(&scene, [24, 24], &production());
+        assert_eq!(stats.left_out & left_out::TEXTURES == 0, textured);
         for mesh in [2, 5] {
-            let what = format!("wall {mesh}, textured {repeats_texture}");
-            assert_close(&what, compare(&map, &scene, mesh, Layer::Indirect, 60), 0.02, 0.04);
+            let what = format!("wall {mesh}, textured {textured}");
+            Truth::new(&scene, mesh).assert_close(&what, &map, Layer::Indirect, 0.004, 0.02);
         }
         // Red light: the floor's mean albedo is (0.53, 0.43, 0.15) with the texture.
         let wall = map.sample(Layer::Indirect, scene.first_triangle(2), 0.3, 0.3);
-        assert_eq!(wall[0] > 1.3 * wall[2], repeats_texture, "{wall:?}");
+        assert_eq!(wall[0] > 1.3 * wall[2], textured, "{wall:?}");
         // Outgoing radiance shows the tiles.
         let texel = |u: f32, v: f32| map.sample(Layer::Radiance, scene.first_triangle(0), u, v);
         let tile = texel(0.5 + 1.0 / 32.0, 1.0 / 32.0);
-        assert_eq!(tile[0] > 3.0 * tile[1], repeats_texture, "{tile:?}");
+        assert_eq!(tile[0] > 3.0 * tile[1], textured, "{tile:?}");
     }
 }
 
@@ -186,7 +196,7 @@ fn a_grate_casts_its_shadow_and_lets_photons_through() {
     for (two_sided, faces_up) in [(true, true), (false, true), (false, false)] {
         let data = divided_room(|d| Material { two_sided, ..grate(d) }, faces_up);
         let scene = commit(data, !two_sided);
-        let (map, stats) = bake(&scene, 48.0, &production());
+        let (map, stats) = bake(&scene, [48, 24], &production());
         assert_eq!(stats.left_out & left_out::CUTOUTS, 0);
         // The shadow: straight lines from the lamp to the floor, holes where the fraction of u, twice the
         // distance along the sheet's first edge, is less than 1/2.
@@ -214,8 +224,10 @@ fn a_grate_casts_its_shadow_and_lets_photons_through() {
             }
         }
         let what = format!("two-sided {two_sided}, up {faces_up}");
-        assert_close(&format!("floor, {what}"), compare(&map, &scene, 0, Layer::Indirect, 60), 0.025, 0.06);
-        assert_close(&format!("ceiling, {what}"), compare(&map, &scene, 1, Layer::Indirect, 60), 0.025, 0.06);
+        for (name, mesh) in [("floor", 0), ("ceiling", 1)] {
+            let truth = Truth::new(&scene, mesh);
+            truth.assert_close(&format!("{name}, {what}"), &map, Layer::Indirect, 0.01, 0.04);
+        }
         assert_energy(&scene);
     }
 }
@@ -235,7 +247,7 @@ const GLASS: [f32; 3] = [0.8, 0.1, 0.1];
 
 #[test]
 fn direct_light_is_multiplied_with_what_each_pane_transmits() {
-    // Several lights, of all kinds, above panes that cover the whole sky.
+    // Lights of all kinds that have no noise, above panes that all their rays pass.
     let scene = |panes: &[f32]| {
         let mut data = SceneData::new();
         let grey = data.add_material(Material::default()).unwrap();
@@ -247,7 +259,7 @@ fn direct_light_is_multiplied_with_what_each_pane_transmits() {
             data.add_mesh(sheet(corner, Vec3::X, Vec3::Y, 1.0, grey)).unwrap();
         }
         for &z in panes {
-            data.add_mesh(sheet(Vec3::new(-9.0, -9.0, z), 20.0 * Vec3::X, 20.0 * Vec3::Y, 1.0, glass)).unwrap();
+            data.add_mesh(sheet(Vec3::new(-1.0, -1.0, z), 3.0 * Vec3::X, 3.0 * Vec3::Y, 1.0, glass)).unwrap();
         }
         let position = Vec3::new(0.3, 0.4, 4.0);
         let direction = Vec3::new(0.2, 0.1, -1.0);
@@ -260,11 +272,11 @@ fn direct_light_is_multiplied_with_what_each_pane_transmits() {
     };
     let params = BakeParams { gather_rays: 0, ..Default::default() };
     let bare = scene(&[]);
-    let (bare_map, stats) = bake(&bare, 32.0, &params);
+    let (bare_map, stats) = bake(&bare, [32, 32], &params);
     assert_ne!(stats.left_out & left_out::TRANSMISSION, 0);
     // The last two at one place.
     for panes in [&[1.0][..], &[1.0, 2.0], &[1.5, 1.5]] {
-        let (map, stats) = bake(&scene(panes), 32.0, &params);
+        let (map, stats) = bake(&scene(panes), [32, 32], &params);
         assert_eq!(stats.left_out & left_out::TRANSMISSION, 0);
         for i in 0..200 {
             let (u, v) = (i as f32 / 400.0, (i * 37 % 200) as f32 / 400.0);
@@ -287,13 +299,12 @@ fn light_below_stained_glass_is_that_of_the_path_tracer() {
             ..Default::default()
         };
         let scene = commit(divided_room(glass, faces_up), two_sided);
-        let (map, _) = bake(&scene, 16.0, &production());
+        let (map, _) = bake(&scene, [16, 16], &production());
         let what = format!("two-sided {two_sided}, up {faces_up}");
         for (name, mesh) in [("floor", 0), ("ceiling", 1)] {
-            let c = compare(&map, &scene, mesh, Layer::Combined, 60);
-            assert_close(&format!("{name}, {what}"), c, 0.02, 0.04);
-            let c = compare(&map, &scene, mesh, Layer::Indirect, 60);
-            assert_close(&format!("{name}, indirect, {what}"), c, 0.02, 0.04);
+            let truth = Truth::new(&scene, mesh);
+            truth.assert_close(&format!("{name}, {what}"), &map, Layer::Combined, 0.02, 0.04);
+            truth.assert_close(&format!("{name}, indirect, {what}"), &map, Layer::Indirect, 0.02, 0.04);
         }
         assert_energy(&scene);
     }
@@ -309,9 +320,10 @@ fn a_lamp_behind_glass_is_direct_light_whether_it_is_met_or_sampled() {
     let glow = data.add_material(Material { albedo: [0.0; 3], emission: [5.0; 3], ..Default::default() }).unwrap();
     data.add_mesh(sheet(Vec3::new(0.6, 0.6, 1.6), 0.8 * Vec3::Y, 0.8 * Vec3::X, 1.0, glow)).unwrap();
     let scene = commit(data, false);
-    let (map, _) = bake(&scene, 16.0, &BakeParams { direct_samples: 64, ..production() });
-    assert_close("direct", compare(&map, &scene, 0, Layer::Direct, 60), 0.02, 0.03);
-    assert_close("combined", compare(&map, &scene, 0, Layer::Combined, 60), 0.02, 0.03);
+    let (map, _) = bake(&scene, [16, 16], &BakeParams { direct_samples: 64, ..production() });
+    let truth = Truth::new(&scene, 0);
+    truth.assert_close("direct", &map, Layer::Direct, 0.01, 0.02);
+    truth.assert_close("combined", &map, Layer::Combined, 0.01, 0.02);
 }
 
 #[test]
@@ -333,10 +345,10 @@ fn a_scene_that_uses_none_of_it_keeps_and_runs_none_of_it() {
     };
     let bits = left_out::TEXTURES | left_out::CUTOUTS | left_out::TRANSMISSION;
     let params = BakeParams { photon_count: 1000, gather_rays: 16, ..Default::default() };
-    let (map, stats) = bake(&plain(false), 8.0, &params);
+    let (map, stats) = bake(&plain(false), [8, 8], &params);
     assert_eq!(stats.left_out & bits, bits);
     assert!(map.plan_text().contains("left out: holes cut out by alpha (no surface has any)"), "{}", map.plan_text());
-    let (map, stats) = bake(&plain(true), 8.0, &params);
+    let (map, stats) = bake(&plain(true), [8, 8], &params);
     assert_eq!(stats.left_out & bits, left_out::CUTOUTS | left_out::TRANSMISSION);
     assert!(map.plan_text().contains("runs: albedo textures"), "{}", map.plan_text());
 }
