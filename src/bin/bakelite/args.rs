@@ -7,7 +7,7 @@ use bakelite::{Isa, Light};
 use glam::Vec3;
 use lexopt::Arg;
 use std::ffi::OsString;
-use std::path::PathBuf;
+use std::path::{Path, PathBuf};
 use std::str::FromStr;
 
 /// What `--help` prints.
@@ -130,6 +130,14 @@ pub struct BakeArgs {
     pub out: PathBuf,
     pub glb: bool,
     pub quiet: bool,
+}
+
+impl BakeArgs {
+    /// The scene's name for titles: its folders say more about the machine than about the scene.
+    pub fn title(&self) -> String {
+        let name = Path::new(&self.scene).file_name();
+        name.map_or_else(|| self.scene.clone(), |n| n.to_string_lossy().into_owned())
+    }
 }
 
 impl Default for BakeArgs {

@@ -63,10 +63,10 @@ pub fn run(args: &ReportArgs) -> Result<()> {
         measured.walks = walks(&job, args, &camera)?;
     }
     let mut names = Vec::new();
-    let mut save = |name: String, text: &str| -> Result<()> {
+    let mut save = |name: String, text: &str| {
         let path = args.bake.out.join(&name);
         names.push(name);
-        std::fs::write(&path, text).map_err(|e| Error::Io(format!("{}: {e}", path.display())))
+        output::write_text(&path, text)
     };
     save("live.md".into(), &markdown(args, &lightmap, &camera, &measured))?;
     save("live-errors.csv".into(), &errors_csv(&measured.phases))?;
@@ -250,13 +250,10 @@ fn markdown(args: &ReportArgs, lightmap: &Lightmap, camera: &Camera, measured: &
 
 fn introduction(args: &ReportArgs, lightmap: &Lightmap, camera: &Camera, measured: &Measured) -> String {
     let (scene, info, params) = (lightmap.scene(), lightmap.info(), &args.bake.params);
-    // The folders of a scene say more about the machine than about the scene.
-    let path = std::path::Path::new(&args.bake.scene);
-    let name = path.file_name().map_or(args.bake.scene.clone(), |n| n.to_string_lossy().into_owned());
     let device = scene.device();
     let (position, target) = (camera.position, camera.target);
     format!(
-        "# Live updates: {name}\n\n\
+        "# Live updates: {}\n\n\
          {triangles} triangles, {texels} texels ({gather} of them gather) on {pages} pages of {width} × {height}; \
          {lights} lights, {emitters} emissive triangles; {photons} photons, {samples} shadow rays per area light, \
          blur {blur}, seed {seed}; threads: {threads}, {isa}. Camera at {position}, looking at {target}.\n\n\
@@ -269,6 +266,7 @@ fn introduction(args: &ReportArgs, lightmap: &Lightmap, camera: &Camera, measure
          are of {FOLLOW_MS} ms, with at most {ROUNDS} rounds of 64 rays per texel; their time includes that of \
          creating the live state but not that of measuring errors. They end when all that is seen is finished, or \
          after {seconds} s.\n\n",
+        args.bake.title(),
         triangles = scene.stats().triangles,
         texels = info.texels,
         gather = info.gather_texels,

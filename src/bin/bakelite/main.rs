@@ -7,9 +7,10 @@
 //! | `bar` | progress on standard error |
 //! | `camera` | a view for scenes that come without one |
 //! | `pictures`, `font` | the three pictures that the thesis compares |
-//! | `output` | light map pages and the scene as files |
+//! | `output` | light map pages, the scene and texts as files |
 //! | `table`, `report` | what a run took, for people and for programs |
 //! | `live_measure`, `live_report`, `plot` | live updates: measurements, tables, plots |
+//! | `measure` | what measurements share |
 //! | `memory_report` | a scene's memory by part, and what little of it costs rays |
 //! | `pipeline_report` | the stages of a bake, and what bounds each |
 //! | `quality_measure`, `quality_report` | error of the light against run time |
@@ -22,6 +23,7 @@ mod camera;
 mod font;
 mod live_measure;
 mod live_report;
+mod measure;
 mod memory_report;
 mod output;
 mod pictures;
@@ -122,7 +124,7 @@ impl<'a> Job<'a> {
             seconds,
         };
         let text = format!("{:#}\n", report::report(&run));
-        std::fs::write(&path, text).map_err(|e| Error::Io(format!("{}: {e}", path.display())))?;
+        output::write_text(&path, &text)?;
         if !self.args.quiet {
             self.print(&lightmap, &bake, pictures.as_ref(), seconds);
         }

@@ -3,6 +3,7 @@
 
 use crate::Job;
 use crate::args::BakeArgs;
+use crate::measure::median;
 use bakelite::bvh::BuildOptions;
 use bakelite::sampling::{cosine_hemisphere, mix, orthonormal_basis, uniform, uniform_triangle};
 use bakelite::trace::{Hit, Ray};
@@ -90,8 +91,5 @@ fn rates(scenes: &[std::sync::Arc<Scene>; 2], rays: &[Ray]) -> Result<[f64; 2]> 
     if differing > 0 {
         eprintln!("{differing} of {} rays have other hits in the compact tree", rays.len());
     }
-    Ok(ratios.map(|mut r| {
-        r.sort_by(f64::total_cmp);
-        r[PAIRS / 2]
-    }))
+    Ok(ratios.map(median))
 }

@@ -1,4 +1,4 @@
-//! The files of a bake: pages layer by layer, and the scene with its light map.
+//! The files of a bake: pages layer by layer, and the scene with its light map; texts of reports.
 
 use bakelite::io::glb::{GlbLightmap, GlbMesh, write_glb};
 use bakelite::io::image::{auto_exposure, encode_png_rgb8, tone_map, write_exr, write_png_rgb8};
@@ -19,6 +19,11 @@ const LAYERS: [(Layer, &str); 4] = [
 /// Makes the folder that all files go to.
 pub fn make_folder(folder: &Path) -> Result<()> {
     std::fs::create_dir_all(folder).map_err(|e| Error::Io(format!("{}: {e}", folder.display())))
+}
+
+/// Writes a text file.
+pub fn write_text(path: &Path, text: &str) -> Result<()> {
+    std::fs::write(path, text).map_err(|e| Error::Io(format!("{}: {e}", path.display())))
 }
 
 /// A light layer of a page.

@@ -4,13 +4,14 @@
 
 use crate::Job;
 use crate::args::BakeArgs;
+use crate::measure::{median, pick, visible_texels};
 use crate::output;
-use bakelite::lightmap::{BakeStats, Layer, LayerData, Lightmap, StageStats};
+use bakelite::lightmap::{BakeStats, Lightmap, StageStats};
 use bakelite::photon::{PhotonParams, photon_rays};
 use bakelite::sampling::{cosine_hemisphere, mix, orthonormal_basis, sobol_2d};
 use bakelite::trace::offset::offset_ray_origin;
 use bakelite::trace::{Hit, PACKET_SIZE, Packet, RawHit, Ray};
-use bakelite::{Error, Light, Result, Scene};
+use bakelite::{Light, Result, Scene};
 use glam::Vec3;
 use rayon::prelude::*;
 use std::fmt::Write;
@@ -80,41 +81,20 @@ pub fn run(args: &BakeArgs) -> Result<()> {
         row("direct light", of(|b| b.direct), Some(shadow)),
         row("composition", of(|b| b.compose), None),
     ];
-    let save = |name: &str, text: &str| {
-        let path = args.out.join(name);
-        std::fs::write(&path, text).map_err(|e| Error::Io(format!("{}: {e}", path.display())))
-    };
     let text = markdown(args, &lightmap, &rows, memory);
-    save("pipeline.csv", &csv(&rows))?;
-    save("pipeline.md", &text)?;
+    for (name, content) in [("pipeline.csv", &csv(&rows)), ("pipeline.md", &text)] {
+        output::write_text(&args.out.join(name), content)?;
+    }
     if !args.quiet {
         println!("{text}\nWrote to {}: pipeline.md, pipeline.csv", args.out.display());
     }
     Ok(())
 }
 
-fn median(mut values: Vec<f64>) -> f64 {
-    values.sort_unstable_by(f64::total_cmp);
-    values[values.len() / 2]
-}
-
 /// Where rays start, just above texels chosen at random, and the normals there.
 fn places(lightmap: &Lightmap) -> Result<Vec<[Vec3; 2]>> {
-    let mut texels = Vec::new();
-    for page in 0..lightmap.info().page_count {
-        let layers = [Layer::Validity, Layer::Position, Layer::Normal].map(|l| lightmap.read(page, l));
-        let [Ok(LayerData::Scalar(valid)), Ok(LayerData::Rgb(positions)), Ok(LayerData::Rgb(normals))] = layers else {
-            return Err(Error::Internal("a layer is of another type".into()));
-        };
-        let all = valid.into_iter().zip(positions.into_iter().zip(normals)).filter(|(v, _)| *v == 1.0);
-        texels.extend(all.map(|(_, (p, n))| [Vec3::from(p), Vec3::from(n)]));
-    }
-    if texels.is_empty() {
-        return Err(Error::InvalidArgument("no texel of the scene can be seen".into()));
-    }
-    let scene = lightmap.scene();
-    let at = |i: u32| texels[((mix(i) as u64 * texels.len() as u64) >> 32) as usize];
-    Ok((0..PLACES as u32).map(at).map(|[p, n]| [offset_ray_origin(p, n, scene), n]).collect())
+    let (scene, texels) = (lightmap.scene(), visible_texels(lightmap)?);
+    Ok((0..PLACES as u32).map(|i| pick(&texels, i)).map(|[p, n]| [offset_ray_origin(p, n, scene), n]).collect())
 }
 
 /// Rays per second of `rays`, on all threads.
@@ -201,17 +181,16 @@ fn csv(rows: &[Row]) -> String {
 
 fn markdown(args: &BakeArgs, lightmap: &Lightmap, rows: &[Row], memory: f64) -> String {
     let (scene, info) = (lightmap.scene(), lightmap.info());
-    let path = std::path::Path::new(&args.scene);
-    let name = path.file_name().map_or(args.scene.clone(), |n| n.to_string_lossy().into_owned());
     let total: f64 = rows.iter().map(|r| r.seconds).sum();
     let unwrapping = rows.iter().filter(|r| r.stage == "unwrapping").map(|r| r.seconds).sum::<f64>();
     let mut out = format!(
-        "# Pipeline: {name}\n\n\
+        "# Pipeline: {}\n\n\
          {} triangles; {} texels at {:.2} per unit, {} gather and {} radiance texels, {} charts; {} photons, {} gather \
          rays; threads: {}, {}. Medians of {RUNS} bakes. The bare kernel's rays have the same distribution as the \
          stage's: photon paths in their order, shared-origin packets from texels, shadow rays from texels. Copying \
          memory moves {:.1} GB/s.\n\n\
          | stage | seconds | share | rays | Mrays/s | of the bare kernel's | MB | GB/s |\n|---|---|---|---|---|---|---|---|\n",
+        args.title(),
         scene.stats().triangles,
         info.texels,
         info.texels_per_unit,

@@ -1,10 +1,11 @@
 //! Measurements of the error of light: the points compared, their reference, and the error of several
 //! runs with different seeds, bias and variance apart.
 
+use crate::measure::{pick, visible_texels};
 use bakelite::lightmap::texels::TexelSample;
-use bakelite::lightmap::{Layer, LayerData, Lightmap};
+use bakelite::lightmap::{Layer, Lightmap};
 use bakelite::reference::{PathTracer, SurfacePoint};
-use bakelite::sampling::{cosine_hemisphere, mix, orthonormal_basis, uniform, uniform_sphere};
+use bakelite::sampling::{cosine_hemisphere, orthonormal_basis, uniform, uniform_sphere};
 use bakelite::trace::Ray;
 use bakelite::trace::offset::offset_ray_origin;
 use bakelite::{Error, Progress, Result};
@@ -26,7 +27,7 @@ pub struct Points {
     /// Unit normals of the sides that the light map holds.
     pub normals: Vec<Vec3>,
     pub positions: Vec<Vec3>,
-    /// Indirect and all irradiance as two halves with independent noise, and the noise of their mean.
+    /// Irradiance of the reference, indirect and all, as two halves with independent noise.
     pub indirect: [Values; 2],
     pub all: [Values; 2],
 }
@@ -84,13 +85,13 @@ impl Points {
     /// random directions.
     fn choose(&mut self, lightmap: &Lightmap, count: usize) -> Result<()> {
         let scene = lightmap.scene();
-        let texels = texels(lightmap)?;
+        let texels = visible_texels(lightmap)?;
         let room = MIN_ROOM * scene.diagonal();
         for i in 0..count as u32 * TRIES {
             if self.len() == count {
                 return Ok(());
             }
-            let [position, normal] = texels[((mix(i) as u64 * texels.len() as u64) >> 32) as usize];
+            let [position, normal] = pick(&texels, i);
             let d = cosine_hemisphere([uniform(i, 0, 0), uniform(i, 1, 0)]);
             let (x, y) = orthonormal_basis(normal);
             let direction = d.x * x + d.y * y + d.z * normal;
@@ -123,34 +124,12 @@ impl Points {
     pub fn of_bake(&self, lightmap: &Lightmap, layer: Layer) -> Values {
         self.on.iter().map(|&(t, u, v)| lightmap.sample(layer, t, u, v).map(f64::from)).collect()
     }
-
-    /// Errors of several runs against the two halves of a reference.
-    pub fn errors(&self, runs: &[Values], reference: &[Values; 2]) -> Errors {
-        errors(runs, reference)
-    }
 }
 
-/// Positions and normals of all texels that are not inside solids.
-fn texels(lightmap: &Lightmap) -> Result<Vec<[Vec3; 2]>> {
-    let mut texels = Vec::new();
-    for page in 0..lightmap.info().page_count {
-        let read = |layer| lightmap.read(page, layer);
-        let layers = (read(Layer::Validity)?, read(Layer::Position)?, read(Layer::Normal)?);
-        let (LayerData::Scalar(validity), LayerData::Rgb(positions), LayerData::Rgb(normals)) = layers else {
-            return Err(Error::Internal("a layer is of another type".into()));
-        };
-        let all = validity.into_iter().zip(positions.into_iter().zip(normals));
-        texels.extend(all.filter(|(v, _)| *v == 1.0).map(|(_, (p, n))| [Vec3::from(p), Vec3::from(n)]));
-    }
-    match texels.len() {
-        0 => Err(Error::InvalidArgument("no texel of the scene can be seen".into())),
-        _ => Ok(texels),
-    }
-}
-
-/// The squared error of x is estimated by (x − a)(x − b) from the reference's halves a and b: as their
-/// noise is independent, the noise of the reference is not part of it.
-fn errors(runs: &[Values], [a, b]: &[Values; 2]) -> Errors {
+/// Errors of several runs against the two halves of a reference. The squared error of x is estimated by
+/// (x − a)(x − b) from the halves a and b: as their noise is independent, the noise of the reference is not
+/// part of it.
+pub fn errors(runs: &[Values], [a, b]: &[Values; 2]) -> Errors {
     let (points, k) = (a.len() as f64, runs.len() as f64);
     let mean_of = |v: &Values| v.iter().flatten().sum::<f64>() / (3.0 * points);
     let mean = 0.5 * (mean_of(a) + mean_of(b));
@@ -185,6 +164,7 @@ fn errors(runs: &[Values], [a, b]: &[Values; 2]) -> Errors {
 #[cfg(test)]
 mod tests {
     use super::*;
+    use bakelite::sampling::mix;
 
     #[test]
     fn bias_variance_and_the_noise_of_the_reference_come_apart() {

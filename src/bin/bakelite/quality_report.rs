@@ -3,9 +3,10 @@
 
 use crate::Job;
 use crate::args::ReportArgs;
+use crate::measure::median;
 use crate::output;
 use crate::plot::{Plot, Series};
-use crate::quality_measure::{Errors, Points, Values};
+use crate::quality_measure::{Errors, Points, Values, errors};
 use crate::texel_paths::TexelPaths;
 use bakelite::lightmap::direct::{DirectLight, Receiver};
 use bakelite::lightmap::{BakeParams, Layer, Lightmap, LightmapDesc};
@@ -13,7 +14,7 @@ use bakelite::photon::{PhotonMap, PhotonParams};
 use bakelite::trace::PACKET_SIZE;
 use bakelite::trace::offset::SurfacePoint;
 use bakelite::{Error, Progress, Result};
-use std::fmt::Write;
+use std::fmt::{Display, Write};
 use std::time::Instant;
 
 const GATHER_RAYS: [u32; 7] = [16, 32, 64, 128, 256, 512, 1024];
@@ -34,7 +35,7 @@ const GOALS: [f64; 3] = [0.1, 0.05, 0.01];
 /// One setting of one way to compute light.
 struct Row {
     /// The knob that is turned, or another way to compute light.
-    series: &'static str,
+    series: String,
     value: String,
     /// For the light of all texels.
     seconds: f64,
@@ -67,15 +68,15 @@ pub fn run(args: &ReportArgs) -> Result<()> {
     }
     let rows = measure.rows;
 
-    let save = |name: &str, text: &str| {
-        let path = args.bake.out.join(name);
-        std::fs::write(&path, text).map_err(|e| Error::Io(format!("{}: {e}", path.display())))
-    };
-    save("quality.csv", &csv(&rows))?;
-    save("quality-points.csv", &at_points)?;
-    save("quality.svg", &plot(&rows))?;
     let text = markdown(args, &lightmap, &points, reference_seconds, &rows);
-    save("quality.md", &text)?;
+    for (name, content) in [
+        ("quality.md", &text),
+        ("quality.csv", &csv(&rows)),
+        ("quality-points.csv", &at_points),
+        ("quality.svg", &plot(&rows)),
+    ] {
+        output::write_text(&args.bake.out.join(name), content)?;
+    }
     if !args.bake.quiet {
         println!(
             "{text}\nWrote to {}: quality.md, quality.csv, quality-points.csv, quality.svg",
@@ -94,51 +95,47 @@ struct Measure<'a> {
 impl Measure<'_> {
     /// Bakes with one knob turned at a time.
     fn bakes(&mut self, job: &Job, lightmap: &mut Lightmap) -> Result<()> {
-        let (desc, params) = (self.args.bake.desc, self.args.bake.params);
-        self.bake(job, lightmap, "as given", String::new(), &params)?;
-        if self.varies("gather-rays") {
-            for gather_rays in GATHER_RAYS {
-                let params = BakeParams { gather_rays, ..params };
-                self.bake(job, lightmap, "gather rays", gather_rays.to_string(), &params)?;
-            }
-        }
-        if self.varies("photons") {
-            for photon_count in PHOTONS {
-                let params = BakeParams { photon_count, ..params };
-                self.bake(job, lightmap, "photons", photon_count.to_string(), &params)?;
-            }
-        }
+        let args = &self.args.bake;
+        self.bake(job, lightmap, "as given", String::new(), &args.params)?;
+        self.sweep(job, lightmap, "gather-rays", GATHER_RAYS, |_, p, n| p.gather_rays = n)?;
+        self.sweep(job, lightmap, "photons", PHOTONS, |_, p, n| p.photon_count = n)?;
         if self.varies("radius") {
-            let photons = PhotonParams { photon_count: params.photon_count, store_direct: false, ..Default::default() };
+            let photon_count = args.params.photon_count;
+            let photons = PhotonParams { photon_count, store_direct: false, ..Default::default() };
             let automatic = PhotonMap::trace(lightmap.scene(), &photons, &Progress::none())?.radius();
-            for factor in RADII {
-                let radius = factor * automatic;
-                self.bake(job, lightmap, "radius", format!("{radius:.4}"), &BakeParams { radius, ..params })?;
-            }
+            self.sweep(job, lightmap, "radius", RADII.map(|f| f * automatic), |_, p, r| p.radius = r)?;
         }
-        if self.varies("blur") {
-            for blur_radius in BLURS {
-                self.bake(job, lightmap, "blur", blur_radius.to_string(), &BakeParams { blur_radius, ..params })?;
-            }
+        self.sweep(job, lightmap, "blur", BLURS, |_, p, n| p.blur_radius = n)?;
+        if DirectLight::new(lightmap.scene()).area_light_count() > 0 {
+            self.sweep(job, lightmap, "direct-samples", DIRECT_SAMPLES, |_, p, n| p.direct_samples = n)?;
         }
-        if self.varies("direct-samples") && DirectLight::new(lightmap.scene()).area_light_count() > 0 {
-            for direct_samples in DIRECT_SAMPLES {
-                let params = BakeParams { direct_samples, ..params };
-                self.bake(job, lightmap, "direct samples", direct_samples.to_string(), &params)?;
-            }
+        self.sweep(job, lightmap, "gather-divisor", GATHER_DIVISORS, |d, _, n| d.gather_divisor = n)?;
+        self.sweep(job, lightmap, "radiance-divisor", RADIANCE_DIVISORS, |d, _, n| d.radiance_divisor = n)
+    }
+
+    /// Bakes with all values of a knob, which `set` turns, if it is to be varied.
+    fn sweep<V: Copy + Display>(
+        &mut self,
+        job: &Job,
+        lightmap: &mut Lightmap,
+        knob: &str,
+        values: impl IntoIterator<Item = V>,
+        set: fn(&mut LightmapDesc, &mut BakeParams, V),
+    ) -> Result<()> {
+        if !self.varies(knob) {
+            return Ok(());
         }
-        if self.varies("gather-divisor") {
-            for gather_divisor in GATHER_DIVISORS {
-                let desc = LightmapDesc { gather_divisor, ..desc };
+        let given = self.args.bake.desc;
+        for value in values {
+            let (mut desc, mut params) = (given, self.args.bake.params);
+            set(&mut desc, &mut params, value);
+            // (Of whole numbers all digits are shown.)
+            let (series, value) = (knob.replace('-', " "), format!("{value:.4}"));
+            if desc == given {
+                self.bake(job, lightmap, &series, value, &params)?;
+            } else {
                 let mut other = Lightmap::create(lightmap.scene(), &desc, &Progress::none())?;
-                self.bake(job, &mut other, "gather divisor", gather_divisor.to_string(), &params)?;
-            }
-        }
-        if self.varies("radiance-divisor") {
-            for radiance_divisor in RADIANCE_DIVISORS {
-                let desc = LightmapDesc { radiance_divisor, ..desc };
-                let mut other = Lightmap::create(lightmap.scene(), &desc, &Progress::none())?;
-                self.bake(job, &mut other, "radiance divisor", radiance_divisor.to_string(), &params)?;
+                self.bake(job, &mut other, &series, value, &params)?;
             }
         }
         Ok(())
@@ -153,7 +150,7 @@ impl Measure<'_> {
         &mut self,
         job: &Job,
         lightmap: &mut Lightmap,
-        series: &'static str,
+        series: &str,
         value: String,
         params: &BakeParams,
     ) -> Result<()> {
@@ -166,11 +163,11 @@ impl Measure<'_> {
             all.push(self.points.of_bake(lightmap, Layer::Combined));
         }
         self.rows.push(Row {
-            series,
+            series: series.to_owned(),
             value,
             seconds: median(seconds),
-            indirect: self.points.errors(&indirect, &self.points.indirect),
-            all: Some(self.points.errors(&all, &self.points.all)),
+            indirect: errors(&indirect, &self.points.indirect),
+            all: Some(errors(&all, &self.points.all)),
         });
         Ok(())
     }
@@ -194,10 +191,10 @@ impl Measure<'_> {
                 .map(|seed| paths.indirect(&receivers, rounds, seed as u32 + 1))
                 .collect::<Result<_>>()?;
             self.rows.push(Row {
-                series: "path tracing",
+                series: "path tracing".into(),
                 value: (rounds * PACKET_SIZE as u32).to_string(),
                 seconds: start.elapsed().as_secs_f64() / self.args.seeds as f64 * all_texels,
-                indirect: self.points.errors(&runs, &self.points.indirect),
+                indirect: errors(&runs, &self.points.indirect),
                 all: None,
             });
         }
@@ -224,20 +221,15 @@ impl Measure<'_> {
                 runs.push(out.iter().map(|e| e.map(f64::from)).collect());
             }
             self.rows.push(Row {
-                series: "photons alone",
+                series: "photons alone".into(),
                 value: photon_count.to_string(),
                 seconds: median(seconds),
-                indirect: self.points.errors(&runs, &self.points.indirect),
+                indirect: errors(&runs, &self.points.indirect),
                 all: None,
             });
         }
         Ok(())
     }
-}
-
-fn median(mut values: Vec<f64>) -> f64 {
-    values.sort_unstable_by(f64::total_cmp);
-    values[values.len() / 2]
 }
 
 /// The rows of each series, in order.
@@ -324,8 +316,8 @@ fn plot(rows: &[Row]) -> String {
     let points = |rows: &[Row]| rows.iter().map(|r| [r.seconds, r.indirect.mse.max(0.0).sqrt()]).collect();
     let series = series(rows)
         .into_iter()
-        .filter(|s| shown.contains(&s[0].series))
-        .map(|s| Series { name: s[0].series, points: points(s) })
+        .filter(|s| shown.contains(&s[0].series.as_str()))
+        .map(|s| Series { name: &s[0].series, points: points(s) })
         .collect();
     let title = "Indirect light: error against run time";
     Plot {
@@ -339,10 +331,8 @@ fn plot(rows: &[Row]) -> String {
 
 fn markdown(args: &ReportArgs, lightmap: &Lightmap, points: &Points, reference_seconds: f64, rows: &[Row]) -> String {
     let (scene, info, params) = (lightmap.scene(), lightmap.info(), &args.bake.params);
-    let path = std::path::Path::new(&args.bake.scene);
-    let name = path.file_name().map_or(args.bake.scene.clone(), |n| n.to_string_lossy().into_owned());
     let mut out = format!(
-        "# Quality: {name}\n\n\
+        "# Quality: {}\n\n\
          {triangles} triangles; {texels} texels at {density:.2} per unit, {gather} gather and {radiance} radiance \
          texels; {photons} photons, {rays} gather rays, blur {blur} unless another value is named; threads: {threads}, \
          {isa}.\n\n\
@@ -353,6 +343,7 @@ fn markdown(args: &ReportArgs, lightmap: &Lightmap, points: &Points, reference_s
          of the differences from its two halves. Noise is what differs between {seeds} seeds, bias what does not; \
          MSE = noise² + bias². ± is one standard error of the MSE, from the points chosen. Seconds are those of the \
          bake, without charts; of path tracing and photons alone those at the points compared, scaled to all.\n\n",
+        args.bake.title(),
         triangles = scene.stats().triangles,
         texels = info.texels,
         density = info.texels_per_unit,
@@ -368,12 +359,13 @@ fn markdown(args: &ReportArgs, lightmap: &Lightmap, points: &Points, reference_s
         seeds = args.seeds,
     );
     out.push_str("## Time to an error of indirect light\n\n| | 10 % | 5 % | 1 % | slope |\n|---|---|---|---|---|\n");
-    for s in
-        series(rows).into_iter().filter(|s| ["gather rays", "path tracing", "photons alone"].contains(&s[0].series))
+    for s in series(rows)
+        .into_iter()
+        .filter(|s| ["gather rays", "path tracing", "photons alone"].contains(&s[0].series.as_str()))
     {
         let [a, b, c] = GOALS.map(|g| time_to(s, g));
         let slope = slope(s).map_or("–".into(), |s| format!("{s:.2}"));
-        let name = if s[0].series == "gather rays" { "this bake, by gather rays" } else { s[0].series };
+        let name = if s[0].series == "gather rays" { "this bake, by gather rays" } else { &s[0].series };
         let _ = writeln!(out, "| {name} | {a} | {b} | {c} | {slope} |");
     }
     out.push_str(
@@ -408,7 +400,7 @@ mod tests {
 
     fn row(seconds: f64, mse: f64, bias2: f64) -> Row {
         let indirect = Errors { mse, bias2, variance: mse - bias2, ..Default::default() };
-        Row { series: "s", value: String::new(), seconds, indirect, all: None }
+        Row { series: "s".into(), value: String::new(), seconds, indirect, all: None }
     }
 
     #[test]

@@ -11,10 +11,9 @@ use bakelite::bvh::BuildOptions;
 use bakelite::device::LogLevel;
 use bakelite::lightmap::{BakeParams, Layer, LayerData, Lightmap, LightmapDesc};
 use bakelite::scene::{BUILTIN_NAMES, NONE, builtin};
-use bakelite::{Device, DeviceOptions, Error, Progress, Result, Scene, SceneData};
+use bakelite::{Device, DeviceOptions, Error, Material, Progress, Result, Scene, SceneData};
 use glam::Vec3;
 use std::fmt::Write;
-use std::path::Path;
 use std::sync::{Arc, Mutex};
 use std::time::Instant;
 
@@ -168,6 +167,11 @@ impl<'a> Lab<'a> {
     }
 }
 
+/// A grey material.
+pub fn diffuse(albedo: f32) -> Material {
+    Material { albedo: [albedo; 3], ..Default::default() }
+}
+
 /// A small light map: a second or less.
 pub fn small_desc() -> LightmapDesc {
     LightmapDesc { page_size: 128, gather_divisor: 2, radiance_divisor: 4, ..Default::default() }
@@ -221,7 +225,7 @@ pub fn deviation(texels: &[Texel], expected: impl Fn(&Texel) -> f64) -> f64 {
 }
 
 /// A case: adds its rows.
-type Case = fn(&Lab, &mut Vec<Row>) -> Result<()>;
+pub type Case = fn(&Lab, &mut Vec<Row>) -> Result<()>;
 
 /// By name, in the order of the report.
 fn cases() -> Vec<(&'static str, Case)> {
@@ -249,13 +253,9 @@ pub fn run(args: &BakeArgs) -> Result<()> {
     let text = markdown(&rows, &seconds, start.elapsed().as_secs_f64());
     println!("\n{text}");
     for (name, content) in [("stability.csv", csv(&rows)), ("stability.svg", plot(&rows)), ("stability.md", text)] {
-        write_file(&args.out.join(name), &content)?;
+        output::write_text(&args.out.join(name), &content)?;
     }
     Ok(())
-}
-
-fn write_file(path: &Path, content: &str) -> Result<()> {
-    std::fs::write(path, content).map_err(|e| Error::Io(format!("{}: {e}", path.display())))
 }
 
 /// The built-in scenes, and the one asked for if it is another.

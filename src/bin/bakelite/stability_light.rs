@@ -1,6 +1,8 @@
 //! Cases of `bakelite report stability` about light: how much there is, and where lights are.
 
-use crate::stability::{Lab, Row, deviation, largest, mean, scenes, small_bake, small_desc, texels};
+use crate::stability::{
+    Case, Lab, Row, Texel, deviation, diffuse, largest, mean, scenes, small_bake, small_desc, texels,
+};
 use bakelite::lightmap::{BakeParams, Layer, LightmapDesc};
 use bakelite::photon::{PhotonMap, PhotonParams};
 use bakelite::reference::{PathTracer, SurfacePoint};
@@ -10,8 +12,6 @@ use bakelite::{Light, Material, Progress, Result, SceneData};
 use glam::{DVec3, Vec3};
 use std::f64::consts::PI;
 use std::time::Instant;
-
-type Case = fn(&Lab, &mut Vec<Row>) -> Result<()>;
 
 pub const CASES: [(&str, Case); 8] = [
     ("furnace", furnace),
@@ -23,10 +23,6 @@ pub const CASES: [(&str, Case); 8] = [
     ("point light in a solid", light_in_solid),
     ("half floats", half_floats),
 ];
-
-fn diffuse(albedo: f32) -> Material {
-    Material { albedo: [albedo; 3], ..Default::default() }
-}
 
 /// Photons that surfaces of the furnace meet, at most: Russian roulette lets a photon meet 1/(1 − albedo).
 const FURNACE_HITS: f64 = 2e6;
@@ -229,7 +225,7 @@ fn emissive_in_wall(lab: &Lab, rows: &mut Vec<Row>) -> Result<()> {
 }
 
 /// Mean irradiance of points on the floor from the lamp of [`emissive_in_wall`], by the midpoint rule.
-fn form_factor_mean(floor: &[crate::stability::Texel]) -> f64 {
+fn form_factor_mean(floor: &[Texel]) -> f64 {
     const N: usize = 40;
     let one = |p: DVec3| {
         let cells = (0..N * N).map(|i| {

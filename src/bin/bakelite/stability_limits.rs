@@ -1,13 +1,11 @@
 //! Cases of `bakelite report stability` about limits: settings and scenes at and beyond the ends of their ranges.
 
-use crate::stability::{Lab, Row, mean, small_bake, small_desc, texels};
+use crate::stability::{Case, Lab, Row, mean, small_bake, small_desc, texels};
 use bakelite::lightmap::{BakeParams, Layer, Lightmap, LightmapDesc};
 use bakelite::photon::{MAX_PHOTONS, PhotonMap, PhotonParams};
 use bakelite::scene::builtin;
 use bakelite::{Light, Material, Mesh, Progress, Result, SceneData};
 use glam::Vec3;
-
-type Case = fn(&Lab, &mut Vec<Row>) -> Result<()>;
 
 pub const CASES: [(&str, Case); 4] =
     [("texels", texel_requests), ("tiny scenes", tiny_scenes), ("photon counts", photon_counts), ("radius", radii)];

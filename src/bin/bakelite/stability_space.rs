@@ -1,13 +1,13 @@
 //! Cases of `bakelite report stability` about shapes: how large, where, how thin.
 
-use crate::stability::{Lab, Row, Texel, deviation, largest, mean, small_bake, small_desc, texels};
+use crate::stability::{
+    Case, Lab, Row, Texel, Verdict, deviation, diffuse, largest, mean, small_bake, small_desc, texels,
+};
 use bakelite::lightmap::{BakeParams, Layer, LightmapDesc};
 use bakelite::scene::builtin;
 use bakelite::scene::shapes::MeshBuilder;
 use bakelite::{Light, Material, Mesh, Result, SceneData};
 use glam::{DQuat, DVec3, Vec3};
-
-type Case = fn(&Lab, &mut Vec<Row>) -> Result<()>;
 
 pub const CASES: [(&str, Case); 10] = [
     ("scale", scale),
@@ -21,10 +21,6 @@ pub const CASES: [(&str, Case); 10] = [
     ("shadow terminator", terminator),
     ("closed corners", closed_corners),
 ];
-
-fn diffuse(albedo: f32) -> Material {
-    Material { albedo: [albedo; 3], ..Default::default() }
-}
 
 /// The scene turned, scaled and moved. Intensities of point lights follow the square of the scale, so that
 /// irradiance stays as it was.
@@ -346,7 +342,7 @@ fn terminator(lab: &Lab, rows: &mut Vec<Row>) -> Result<()> {
         // A texel on the flat triangle is not where the sphere is: of 80 triangles, up to a tenth of the radius.
         let tolerance = [f64::NAN, 0.06, 0.03, 0.015, 0.01][subdivisions as usize];
         let row = row.within(tolerance).note(format!("{black} of {} texels are black and should not be", all.len()));
-        rows.push(if black > 0 { Row { verdict: crate::stability::Verdict::Fails, ..row } } else { row });
+        rows.push(if black > 0 { Row { verdict: Verdict::Fails, ..row } } else { row });
     }
     Ok(())
 }

@@ -1,0 +1,35 @@
+//! What the measurements of several reports share.
+
+use bakelite::lightmap::{Layer, LayerData, Lightmap};
+use bakelite::sampling::mix;
+use bakelite::{Error, Result};
+use glam::Vec3;
+
+/// The middle one of some values; of an even number the upper one.
+pub fn median(mut values: Vec<f64>) -> f64 {
+    values.sort_unstable_by(f64::total_cmp);
+    values[values.len() / 2]
+}
+
+/// One of `all` by a number whose neighbours choose others.
+pub fn pick<T: Copy>(all: &[T], number: u32) -> T {
+    all[((mix(number) as u64 * all.len() as u64) >> 32) as usize]
+}
+
+/// Positions and normals of all texels that are not inside solids: at least one.
+pub fn visible_texels(lightmap: &Lightmap) -> Result<Vec<[Vec3; 2]>> {
+    let mut texels = Vec::new();
+    for page in 0..lightmap.info().page_count {
+        let read = |layer| lightmap.read(page, layer);
+        let layers = (read(Layer::Validity)?, read(Layer::Position)?, read(Layer::Normal)?);
+        let (LayerData::Scalar(validity), LayerData::Rgb(positions), LayerData::Rgb(normals)) = layers else {
+            return Err(Error::Internal("a layer is of another type".into()));
+        };
+        let all = validity.into_iter().zip(positions.into_iter().zip(normals));
+        texels.extend(all.filter(|(v, _)| *v == 1.0).map(|(_, (p, n))| [Vec3::from(p), Vec3::from(n)]));
+    }
+    match texels.len() {
+        0 => Err(Error::InvalidArgument("no texel of the scene can be seen".into())),
+        _ => Ok(texels),
+    }
+}
