@@ -133,11 +133,9 @@ impl Scene {
     #[cold]
     fn filtered<const ANY: bool>(&self, ray: &Ray, crossings: Option<&mut Vec<Crossing>>) -> RawHit {
         let (kernels, mut filter) = (self.device().kernels(), Filter { scene: self, crossings });
-        match (self.tree(), ANY) {
-            (TreeView::Whole(tree), false) => kernels.filtered(tree, ray, &mut filter),
-            (TreeView::Whole(tree), true) => kernels.filtered_any(tree, ray, &mut filter),
-            (TreeView::Compact(tree), false) => kernels.compact_filtered(&tree, ray, &mut filter),
-            (TreeView::Compact(tree), true) => kernels.compact_filtered_any(&tree, ray, &mut filter),
+        match self.tree() {
+            TreeView::Whole(tree) => kernels.filtered::<ANY>(tree, ray, &mut filter),
+            TreeView::Compact(tree) => kernels.compact_filtered::<ANY>(&tree, ray, &mut filter),
         }
     }
 

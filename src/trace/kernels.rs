@@ -21,10 +21,9 @@ pub(crate) struct Kernels {
     gather: unsafe fn(&Mbvh, Vec3, &Packet, f32, f32, &mut [RawHit; PACKET_SIZE]),
     compact_intersect: unsafe fn(&View, &[Ray], &mut [RawHit]),
     compact_occluded: unsafe fn(&View, &[Ray], &mut [u8]),
-    filtered: unsafe fn(&Mbvh, &Ray, &mut Filter) -> RawHit,
-    filtered_any: unsafe fn(&Mbvh, &Ray, &mut Filter) -> RawHit,
-    compact_filtered: unsafe fn(&View, &Ray, &mut Filter) -> RawHit,
-    compact_filtered_any: unsafe fn(&View, &Ray, &mut Filter) -> RawHit,
+    /// The closest hit, and any.
+    filtered: [unsafe fn(&Mbvh, &Ray, &mut Filter) -> RawHit; 2],
+    compact_filtered: [unsafe fn(&View, &Ray, &mut Filter) -> RawHit; 2],
 }
 
 macro_rules! table {
@@ -72,20 +71,12 @@ macro_rules! table {
                 }
             }
             $(#[target_feature(enable = $features)])?
-            unsafe fn filtered(tree: &Mbvh, ray: &Ray, filter: &mut Filter) -> RawHit {
-                unsafe { single::one_of::<$simd, _, _, false>(tree, ray, filter) }
+            unsafe fn filtered<const ANY: bool>(tree: &Mbvh, ray: &Ray, filter: &mut Filter) -> RawHit {
+                unsafe { single::one_of::<$simd, _, _, ANY>(tree, ray, filter) }
             }
             $(#[target_feature(enable = $features)])?
-            unsafe fn filtered_any(tree: &Mbvh, ray: &Ray, filter: &mut Filter) -> RawHit {
-                unsafe { single::one_of::<$simd, _, _, true>(tree, ray, filter) }
-            }
-            $(#[target_feature(enable = $features)])?
-            unsafe fn compact_filtered(tree: &View, ray: &Ray, filter: &mut Filter) -> RawHit {
-                unsafe { single::one_of::<$simd, _, _, false>(tree, ray, filter) }
-            }
-            $(#[target_feature(enable = $features)])?
-            unsafe fn compact_filtered_any(tree: &View, ray: &Ray, filter: &mut Filter) -> RawHit {
-                unsafe { single::one_of::<$simd, _, _, true>(tree, ray, filter) }
+            unsafe fn compact_filtered<const ANY: bool>(tree: &View, ray: &Ray, filter: &mut Filter) -> RawHit {
+                unsafe { single::one_of::<$simd, _, _, ANY>(tree, ray, filter) }
             }
             pub(super) static TABLE: Kernels = Kernels {
                 isa: $isa,
@@ -96,10 +87,8 @@ macro_rules! table {
                 gather,
                 compact_intersect,
                 compact_occluded,
-                filtered,
-                filtered_any,
-                compact_filtered,
-                compact_filtered_any,
+                filtered: [filtered::<false>, filtered::<true>],
+                compact_filtered: [compact_filtered::<false>, compact_filtered::<true>],
             };
         }
         use $module::TABLE as $name;
@@ -176,27 +165,16 @@ impl Kernels {
         // SAFETY: see `intersect`.
         unsafe { (self.compact_occluded)(tree, rays, out) }
     }
-    /// Closest of the hits that a filter accepts.
-    pub(crate) fn filtered(&self, tree: &Mbvh, ray: &Ray, filter: &mut Filter) -> RawHit {
+
+    /// Closest (or any) of the hits that a filter accepts.
+    pub(crate) fn filtered<const ANY: bool>(&self, tree: &Mbvh, ray: &Ray, filter: &mut Filter) -> RawHit {
         // SAFETY: see `intersect`.
-        unsafe { (self.filtered)(tree, ray, filter) }
+        unsafe { (self.filtered[ANY as usize])(tree, ray, filter) }
     }
 
-    /// Any of the hits that a filter accepts.
-    pub(crate) fn filtered_any(&self, tree: &Mbvh, ray: &Ray, filter: &mut Filter) -> RawHit {
+    /// The same in a compact tree.
+    pub(crate) fn compact_filtered<const ANY: bool>(&self, tree: &View, ray: &Ray, filter: &mut Filter) -> RawHit {
         // SAFETY: see `intersect`.
-        unsafe { (self.filtered_any)(tree, ray, filter) }
-    }
-
-    /// Closest of the hits that a filter accepts, in a compact tree.
-    pub(crate) fn compact_filtered(&self, tree: &View, ray: &Ray, filter: &mut Filter) -> RawHit {
-        // SAFETY: see `intersect`.
-        unsafe { (self.compact_filtered)(tree, ray, filter) }
-    }
-
-    /// Any of the hits that a filter accepts, in a compact tree.
-    pub(crate) fn compact_filtered_any(&self, tree: &View, ray: &Ray, filter: &mut Filter) -> RawHit {
-        // SAFETY: see `intersect`.
-        unsafe { (self.compact_filtered_any)(tree, ray, filter) }
+        unsafe { (self.compact_filtered[ANY as usize])(tree, ray, filter) }
     }
 }
