@@ -307,7 +307,10 @@ impl Reader<'_> {
             return Ok(*id);
         }
         let read = self.image(image);
-        let id = self.import.add_texture(&image.to_string(), read)?.unwrap_or(NONE);
+        let id = match self.import.image(image, read) {
+            Some(texture) => self.import.add_texture(texture)?,
+            None => NONE,
+        };
         self.images.insert(image, id);
         Ok(id)
     }

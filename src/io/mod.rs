@@ -30,6 +30,7 @@ mod texture;
 use crate::error::{Error, Result};
 use crate::scene::{MAX_ALBEDO, MAX_COORDINATE, MAX_TRIANGLES, Material, Mesh, NONE, SceneData, Texture};
 use glam::Vec3;
+use std::fmt::Display;
 use std::path::{Path, PathBuf};
 use std::time::Instant;
 
@@ -119,15 +120,16 @@ impl Import {
         self.scene.add_material(material).map_err(|e| self.rename(e))
     }
 
-    /// Adds a texture, or warns of an image that cannot be read; `image`: its name.
-    fn add_texture(&mut self, image: &str, texture: std::result::Result<Texture, String>) -> Result<Option<u32>> {
-        match texture {
-            Ok(texture) => self.scene.add_texture(texture).map(Some).map_err(|e| self.rename(e)),
-            Err(what) => {
-                self.warn(format!("the image {image} cannot be read ({what}); its materials do without"));
-                Ok(None)
-            }
+    /// The image of some materials, or a warning that it cannot be read; `name`: the image's.
+    fn image(&mut self, name: impl Display, image: std::result::Result<Texture, String>) -> Option<Texture> {
+        if let Err(what) = &image {
+            self.warn(format!("the image {name} cannot be read ({what}); its materials do without"));
         }
+        image.ok()
+    }
+
+    fn add_texture(&mut self, texture: Texture) -> Result<u32> {
+        self.scene.add_texture(texture).map_err(|e| self.rename(e))
     }
 
     fn add_mesh(&mut self, mesh: Mesh) -> Result<()> {

@@ -19,7 +19,7 @@
 use super::mtl::{self, Library, finite, split_keyword};
 use super::{DEFAULT_ALBEDO, Import, TWO_SIDED_UNLESS_SAID, is_valid_position, texture};
 use crate::error::{Error, Result};
-use crate::scene::{LightmapUvs, Material, Mesh, MeshMaterials, NONE, Texture};
+use crate::scene::{LightmapUvs, Material, Mesh, MeshMaterials, NONE};
 use glam::{Vec2, Vec3};
 use std::collections::HashMap;
 use std::fmt::Display;
@@ -420,13 +420,7 @@ fn described(import: &mut Import, images: &mut Images, entry: &mtl::Entry) -> Re
 
 /// Reads the images of a material into one; [`NONE`] without any.
 fn add_image(import: &mut Import, color: &Option<PathBuf>, alpha: &Option<PathBuf>) -> Result<(u32, f32)> {
-    let mut read = |path: &PathBuf| -> Option<Texture> {
-        let image = texture::read(path);
-        if let Err(what) = &image {
-            import.warn(format!("the image {} cannot be read ({what}); its materials do without", path.display()));
-        }
-        image.ok()
-    };
+    let mut read = |path: &PathBuf| import.image(path.display(), texture::read(path));
     let colors = color.as_ref().and_then(&mut read);
     let alphas = if alpha == color { None } else { alpha.as_ref().and_then(&mut read) };
     let image = match (colors, alphas) {
@@ -435,8 +429,7 @@ fn add_image(import: &mut Import, color: &Option<PathBuf>, alpha: &Option<PathBu
         (None, None) => return Ok((NONE, 0.0)),
     };
     let cutoff = if texture::is_opaque(&image) { 0.0 } else { texture::CUTOFF };
-    let id = import.scene.add_texture(texture::flipped(image)).map_err(|e| import.rename(e))?;
-    Ok((id, cutoff))
+    Ok((import.add_texture(texture::flipped(image))?, cutoff))
 }
 
 /// The words of a line up to a comment.
