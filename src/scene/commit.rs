@@ -1,7 +1,7 @@
 //! The committed scene: acceleration structure, emitters, bounds and numbers.
 
 use super::mesh::is_valid_triangle;
-use super::{Environment, Light, MAX_ALBEDO, Material, Mesh, MeshMaterials, NONE, SceneData, Sky, Texture, texture};
+use super::{Environment, Light, MAX_ALBEDO, Material, Mesh, MeshMaterials, NONE, SceneData, Sky, Texture};
 use crate::bvh::{self, BuildOptions, Tree};
 use crate::device::{Device, LogLevel};
 use crate::error::{Error, Result, invalid_argument};
@@ -102,7 +102,7 @@ impl Uses {
         // Holes need texels that are less opaque than the cutoff.
         let has_holes = |m: &Material| {
             m.alpha_cutoff > 0.0
-                && texture::of(&data.textures, m.albedo_texture).is_some_and(|t| t.least_alpha() < m.alpha_cutoff)
+                && data.textures.get(m.albedo_texture as usize).is_some_and(|t| t.least_alpha() < m.alpha_cutoff)
         };
         let could: Vec<bool> = data.materials.iter().map(has_holes).collect();
         let (mut uses, mut holes) = (Uses::default(), false);
@@ -451,7 +451,7 @@ impl Scene {
     #[inline]
     pub(crate) fn albedo_at(&self, material: &Material, uv: impl FnOnce() -> Option<Vec2>) -> Vec3 {
         let factor = Vec3::from(material.albedo);
-        match texture::of(&self.data.textures, material.albedo_texture) {
+        match self.data.textures.get(material.albedo_texture as usize) {
             None => factor,
             Some(texture) => uv().map_or(factor, |uv| factor * texture.color(uv)).min(Vec3::splat(MAX_ALBEDO)),
         }
@@ -469,7 +469,8 @@ impl Scene {
             return false;
         }
         let material = &self.data.materials[id];
-        match (texture::of(&self.data.textures, material.albedo_texture), mesh.texture_coordinates(t as usize, u, v)) {
+        let texture = self.data.textures.get(material.albedo_texture as usize);
+        match (texture, mesh.texture_coordinates(t as usize, u, v)) {
             (Some(texture), Some(uv)) => texture.alpha(uv) < material.alpha_cutoff,
             _ => false,
         }

@@ -4,7 +4,6 @@
 //! centres of four texels is interpolated (colours in linear light). Nothing is stored beside the
 //! image; what sees areas of a surface averages look-ups.
 
-use super::NONE;
 use crate::error::{Result, invalid_argument};
 use glam::{Vec2, Vec3};
 use std::sync::LazyLock;
@@ -108,12 +107,6 @@ impl Texture {
         let texel = |x: usize, y: usize| self.rgba8[y * self.width as usize + x];
         Around { texels: [texel(x0, y0), texel(x1, y0), texel(x0, y1), texel(x1, y1)], x, y }
     }
-}
-
-/// The texture of a number, if there is one.
-#[inline]
-pub(super) fn of<T>(textures: &[T], id: u32) -> Option<&T> {
-    if id == NONE { None } else { textures.get(id as usize) }
 }
 
 #[cfg(test)]
