@@ -1,10 +1,11 @@
 //! Direct light at points of surfaces, by shadow rays (thesis 3.2.6).
 //!
-//! Point, spot and directional lights take one ray. For area lights (rect lights and emissive
+//! Point, spot and parallel lights take one ray. For area lights (rect lights and emissive
 //! triangles) the unoccluded irradiance is computed exactly and multiplied by the fraction of it
 //! that rays find visible (the ratio estimator of Heitz, Hill and McGuire, *Combining Analytic
 //! Direct Illumination and Stochastic Shadows*, 2018): without occluders there is no noise. Of very
-//! many area lights each ray picks one at random, and the estimate is the plain unbiased one.
+//! many lights a [tree](super::light_tree) tells which to try, and the estimate is the plain unbiased
+//! one. Discs and skies have [a file of their own](super::distant).
 //!
 //! Where surfaces transmit light, what comes along a ray is multiplied with what they let through.
 
@@ -361,10 +362,8 @@ mod tests {
     }
 
     fn receiver(scene: &Scene, position: Vec3, normal: Vec3) -> Receiver {
-        {
-            let origin = offset_ray_origin(position, normal, scene);
-            Receiver { origin, normal, geometric: normal, position, shadow_origin: origin, raised: false }
-        }
+        let origin = offset_ray_origin(position, normal, scene);
+        Receiver { origin, normal, geometric: normal, position, shadow_origin: origin, raised: false }
     }
 
     /// A floor at z = 0, and what `add` builds.
@@ -436,7 +435,7 @@ mod tests {
             for i in 0..50 {
                 let place = Vec3::new(uniform(i, 0, 1) - 0.5, uniform(i, 1, 1) - 0.5, 0.0) * 9.8;
                 let e = direct.irradiance(&receiver(&scene, place, Vec3::Z), 4, i, &mut 0).x;
-                assert!((e - expected).abs() < 1e-3 * PI, "{e} instead of {expected}, {height} above");
+                assert!((e - expected).abs() < 5e-4 * PI, "{e} instead of {expected}, {height} above");
             }
         }
     }
@@ -563,7 +562,7 @@ mod tests {
             let cut = (x / (1.0 + x * x).sqrt() / radius.sin()) as f64;
             let segment = (cut.acos() - cut * (1.0 - cut * cut).sqrt()) / std::f64::consts::PI;
             let e = mean(&direct, Vec3::X * x, 256, 64) as f64 / 10.0;
-            assert!((e - segment).abs() < 5e-3, "{part}: {e}, not {segment}");
+            assert!((e - segment).abs() < 4e-3, "{part}: {e}, not {segment}");
         }
     }
 
@@ -578,7 +577,7 @@ mod tests {
         assert_eq!(light(0.5, 1e-6), light(0.5, 0.0));
         // The middle on the horizon: half a disc; what cosines sum to in the small limit is 2/(3π) · radius.
         let (e, limit) = (light(1e-7, 0.01), 10.0 * 2.0 / (3.0 * PI) * 0.01);
-        assert!((e / limit - 1.0).abs() < 1e-3, "{e} {limit}");
+        assert!((e / limit - 1.0).abs() < 1e-4, "{e} {limit}");
         // A disc of half the sphere at the zenith is a sky.
         assert!((light(PI / 2.0, PI / 2.0) - 10.0).abs() < 1e-4);
     }
@@ -607,7 +606,7 @@ mod tests {
         });
         let expected = PI * (width / (width * width + height * height).sqrt());
         let e = mean(&DirectLight::new(&scene), Vec3::ZERO, 64, 1024);
-        assert!((e / expected - 1.0).abs() < 2e-3, "{e}, not {expected}");
+        assert!((e / expected - 1.0).abs() < 1.5e-3, "{e}, not {expected}");
     }
 
     fn under_image(image: crate::scene::Environment, up: Vec3, rotation: f32) -> DirectLight {
@@ -623,11 +622,11 @@ mod tests {
         use crate::scene::Environment;
         let half = Environment::new(8, 1, [[[1.0; 3]; 4], [[0.0; 3]; 4]].concat()).unwrap();
         let e = mean(&under_image(half, Vec3::Z, 0.7), Vec3::ZERO, 64, 32);
-        assert!((e / (1.5 * PI) - 1.0).abs() < 5e-3, "{e}");
+        assert!((e / (1.5 * PI) - 1.0).abs() < 1e-3, "{e}");
         // Bright above the horizon only, upside down: nothing.
         let above = Environment::new(1, 2, vec![[1.0; 3], [0.0; 3]]).unwrap();
         let e = mean(&under_image(above.clone(), Vec3::Z, 0.0), Vec3::ZERO, 64, 8);
-        assert!((e / (3.0 * PI) - 1.0).abs() < 2e-3, "{e}");
+        assert!((e / (3.0 * PI) - 1.0).abs() < 2e-4, "{e}");
         assert_eq!(mean(&under_image(above, Vec3::NEG_Z, 0.0), Vec3::ZERO, 64, 8), 0.0);
     }
 
@@ -644,6 +643,6 @@ mod tests {
         let solid_angle = 2.0 * PI / width as f32 * (theta(y).cos() - theta(y + 1.0).cos());
         let expected = 3.0 * 1e4 * solid_angle * theta(y + 0.5).cos();
         let e = mean(&direct, Vec3::ZERO, 16, 16);
-        assert!((e / expected - 1.0).abs() < 1e-3, "{e}, not {expected}");
+        assert!((e / expected - 1.0).abs() < 1e-4, "{e}, not {expected}");
     }
 }

@@ -305,8 +305,9 @@ mod tests {
             let total: f32 = due.iter().sum();
             assert!(total < n as f32 * 1.0001);
             for (light, b) in lights.iter().enumerate() {
-                assert!((sampled[light] - due[light]).abs() < 2e-3, "{} {}", sampled[light], due[light]);
-                if Node::new(b, 0).importance(position, normal) > 0.02 * b.power {
+                assert!((sampled[light] - due[light]).abs() < 1e-3, "{} {}", sampled[light], due[light]);
+                // (What is due less often than once in all rounds may not be seen.)
+                if Node::new(b, 0).importance(position, normal) > 3e-4 * b.power {
                     assert!(due[light] > 0.0, "light {light} at {i}");
                 }
             }

@@ -101,12 +101,12 @@ mod tests {
                     for e in 0..3 {
                         let plane = corners[e].cross(corners[(e + 1) % 3]).normalize();
                         let outside = plane.dot(d) * plane.dot(corners[(e + 2) % 3]).signum();
-                        assert!(outside > -1e-7, "{corners:?}: {d} is {outside} outside");
+                        assert!(outside > -1e-9, "{corners:?}: {d} is {outside} outside");
                     }
                     inside += (side.dot(d) * side.dot(corners[1]) > 0.0) as u32;
                 }
                 let (got, expected) = (inside as f64 / n as f64, part / t.solid_angle());
-                assert!((got - expected).abs() < 3e-3, "{corners:?}: {got}, not {expected}");
+                assert!((got - expected).abs() < 1e-3, "{corners:?}: {got}, not {expected}");
             }
         }
     }

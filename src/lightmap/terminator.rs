@@ -92,8 +92,10 @@ mod tests {
     fn convex_surfaces_are_raised_between_corners_and_others_are_not() {
         let scene = scene(None);
         let middle = height(&scene, 0.5, MIDDLE).unwrap();
-        // A sphere whose normals turn by 0.5 per unit has a radius of 2: at 0.5 from the corners, 0.06 higher.
-        assert!((0.03..0.2).contains(&middle), "{middle}");
+        // Above it the planes on the corners' normals are d²/2 / (1 + d²/4) high, d² = 2/9, 5/9 and 5/9 being the
+        // squared distances of the corners.
+        let expected = (2.0 / 19.0 + 2.0 * 10.0 / 41.0) / 3.0;
+        assert!((middle - expected).abs() < 2e-5, "{middle}");
         assert_eq!(height(&scene, 0.5, [0.0, 0.0]), None);
         assert_eq!(height(&scene, 0.0, MIDDLE), None);
         assert_eq!(height(&scene, -0.5, MIDDLE), None);

@@ -187,12 +187,12 @@ fn discs_and_skies_send_photons_of_their_irradiance() {
         let map = trace(&scene, PhotonParams { photon_count: 1_000_000, radius: 0.05, ..Default::default() });
         let mean = mean_estimate(&map, &points_on(Vec3::ZERO, Vec3::X, Vec3::Y, 0.06, 400), Vec3::Z);
         for c in 0..3 {
-            assert!((mean[c] - expected[c]).abs() <= 0.01 * expected[c], "{mean:?}, not {expected:?}");
+            assert!((mean[c] - expected[c]).abs() <= 0.004 * expected[c], "{mean:?}, not {expected:?}");
         }
         let s = map.stats();
         for c in 0..3 {
             let sum = s.absorbed_power[c] + s.escaped_power[c] + s.truncated_power[c];
-            assert!((sum - s.emitted_power[c]).abs() <= 5e-3 * s.emitted_power[c], "{s:?}");
+            assert!((sum - s.emitted_power[c]).abs() <= 7e-4 * s.emitted_power[c], "{s:?}");
         }
     }
 }
@@ -214,7 +214,7 @@ fn a_ball_under_a_white_sky_absorbs_what_its_surface_gets() {
     data.add_mesh(mesh).unwrap();
     data.add_light(white_sky(2.0)).unwrap();
     let map = trace(&commit(data), PhotonParams { photon_count: 300_000, ..Default::default() });
-    assert_close(map.stats().absorbed_power[0], 0.4 * 2.0 * PI * area, 0.005);
+    assert_close(map.stats().absorbed_power[0], 0.4 * 2.0 * PI * area, 0.001);
 }
 
 #[test]
@@ -295,7 +295,7 @@ fn few_photons_of_long_paths_lose_no_power() {
         let s = trace(&scene, PhotonParams { photon_count: 1_000, ..Default::default() }).stats();
         for c in 0..3 {
             let sum = s.absorbed_power[c] + s.escaped_power[c] + s.truncated_power[c];
-            assert_close(sum, s.emitted_power[c], 0.005);
+            assert_close(sum, s.emitted_power[c], 0.0025);
         }
     }
 }

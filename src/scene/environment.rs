@@ -2,7 +2,7 @@
 //! choice of directions by importance (Pharr, Jakob and Humphreys, *Physically Based Rendering*,
 //! section 12.5, with the exact solid angle of each pixel instead of its sine).
 
-use super::{NONE, check_energy};
+use super::check_energy;
 use crate::error::{Result, invalid_argument};
 use glam::{DVec3, Vec3};
 use std::f32::consts::{FRAC_PI_4, PI, TAU};
@@ -146,7 +146,8 @@ impl Sky {
         rotation: f32,
         environments: &[Arc<Environment>],
     ) -> Sky {
-        let image = if environment == NONE { None } else { environments.get(environment as usize).cloned() };
+        // (No image has the number NONE.)
+        let image = environments.get(environment as usize).cloned();
         // What is the front before the sky is turned.
         let ahead = if up.z.abs() > FRAC_PI_4.cos() { Vec3::Y } else { Vec3::NEG_Z };
         let ahead = ahead.reject_from_normalized(up).normalize_or(up.any_orthonormal_vector());
@@ -228,10 +229,10 @@ mod tests {
                 let d = uniform_sphere(sobol_2d(i, 2));
                 uniform_mean += sky.at(d).0.as_dvec3() * (4.0 * f64::consts::PI) / n as f64;
             }
-            assert!(off < n / 500, "{off} of {n}");
+            assert!(off < n / 5000, "{off} of {n}");
             let exact = sky.integral();
-            assert!((mean / exact - 1.0).abs().max_element() < 0.01, "{mean} {exact}");
-            assert!((uniform_mean / exact - 1.0).abs().max_element() < 0.02, "{uniform_mean} {exact}");
+            assert!((mean / exact - 1.0).abs().max_element() < 3e-3, "{mean} {exact}");
+            assert!((uniform_mean / exact - 1.0).abs().max_element() < 0.01, "{uniform_mean} {exact}");
         }
     }
 
