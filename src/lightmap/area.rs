@@ -164,3 +164,45 @@ impl AreaLight {
         way.dot(receiver.normal).max(0.0) / d2 * (there / d2)
     }
 }
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use crate::sampling::{sobol_2d, uniform, uniform_sphere};
+
+    fn receiver(position: Vec3, normal: Vec3) -> Receiver {
+        let origin = position;
+        Receiver { origin, normal, geometric: normal, position, shadow_origin: origin, raised: false }
+    }
+
+    #[test]
+    fn the_mean_of_samples_is_the_unoccluded_irradiance_however_they_are_chosen() {
+        let (edge_u, edge_v) = (Vec3::new(1.0, 0.2, 0.0), Vec3::new(-0.3, 0.8, 0.1));
+        let parallelogram = Light::Rect { position: Vec3::ZERO, edge_u, edge_v, radiance: [1.0; 3] };
+        let parallelogram = AreaLight::rect(&parallelogram).unwrap();
+        let triangle = AreaLight { triangle: true, area: 0.5 * parallelogram.area, ..parallelogram };
+        let two_sided = AreaLight { two_sided: true, ..triangle };
+        let (mut by_area, mut by_solid_angle) = (0, 0);
+        for light in [parallelogram, triangle, two_sided] {
+            for i in 0..60 {
+                let distance = 10f32.powf(1.5 * uniform(i, 0, 1) - 0.5);
+                let place = distance * uniform_sphere([uniform(i, 1, 1), uniform(i, 2, 1)]);
+                // Wholly above the horizon, as weights below it are 0.
+                let r = receiver(place, (Vec3::new(0.3, 0.3, 0.0) - place).normalize());
+                let Some(sampler) = light.sampler(&r) else {
+                    assert_eq!(light.irradiance(&r), 0.0);
+                    continue;
+                };
+                let n = 1 << 12;
+                let mean = (0..n).map(|k| light.sample(&sampler, &r, sobol_2d(k, i)).1 as f64).sum::<f64>() / n as f64;
+                let expected = light.irradiance(&r);
+                assert!((mean / expected - 1.0).abs() < 1e-3, "{i}, {distance} away: {mean}, not {expected}");
+                match sampler {
+                    AreaSampler::Area => by_area += 1,
+                    AreaSampler::SolidAngle { .. } => by_solid_angle += 1,
+                }
+            }
+        }
+        assert!(by_area > 20 && by_solid_angle > 20, "{by_area} {by_solid_angle}");
+    }
+}

@@ -620,6 +620,23 @@ mod tests {
     const FLOOR: [Vec3; 3] = [Vec3::ZERO, Vec3::X, Vec3::Y];
 
     #[test]
+    fn a_texture_is_multiplied_with_the_albedo_which_stays_below_one() {
+        let device = Device::new(DeviceOptions { num_threads: 1, ..Default::default() }).unwrap();
+        let mut data = SceneData::new();
+        let texture = Texture { width: 1, height: 1, rgba8: vec![[255, 128, 128, 255]] };
+        let albedo_texture = data.add_texture(texture).unwrap();
+        data.add_material(Material { albedo: [1.0, 1.0, 0.5], albedo_texture, ..Default::default() }).unwrap();
+        let plain = Mesh { positions: FLOOR.to_vec(), indices: vec![[0, 1, 2]], ..Default::default() };
+        data.add_mesh(Mesh { uvs: vec![Vec2::ZERO; 3], ..plain.clone() }).unwrap();
+        data.add_mesh(plain).unwrap();
+        let scene = Scene::commit(&device, data, &BuildOptions::default(), &Progress::none()).map_err(|e| e.1).unwrap();
+        // ((128/255 + 0.055) / 1.055)^2.4.
+        let expected = Vec3::new(MAX_ALBEDO, 0.215_861, 0.5 * 0.215_861);
+        assert!((scene.albedo(0, 0.2, 0.3) - expected).abs().max_element() < 1e-6);
+        assert_eq!(scene.albedo(1, 0.2, 0.3), Vec3::new(MAX_ALBEDO, MAX_ALBEDO, 0.5));
+    }
+
+    #[test]
     fn a_scene_far_from_the_origin_for_its_size_is_warned_of() {
         let warnings = |offset: f32| {
             let messages = Arc::new(std::sync::Mutex::new(Vec::<String>::new()));

@@ -345,6 +345,22 @@ mod tests {
         }
     }
 
+    /// Spatial splits put a triangle into several leaves, which a ray passes one after the other.
+    #[test]
+    fn sheets_count_once_however_a_tree_cuts_them() {
+        let mut data = SceneData::new();
+        let glass = Material { albedo: [0.1; 3], transmission: [0.9, 0.8, 0.7], ..Default::default() };
+        let glass = data.add_material(glass).unwrap();
+        data.add_mesh(soup(150, 2, glass)).unwrap();
+        let scenes = scenes(&data);
+        let passed = |scene: &Scene| rays(1).iter().map(|r| scene.transmittance(r)).collect::<Vec<_>>();
+        let expected = passed(&scenes[0]);
+        assert!(expected.iter().filter(|t| t.x < 0.8).count() > 100);
+        for scene in &scenes {
+            assert_eq!(passed(scene), expected);
+        }
+    }
+
     #[test]
     fn sheets_multiply_and_what_is_opaque_ends_it() {
         let (a, b) = (Vec3::new(0.8, 0.1, 0.5), Vec3::new(0.3, 0.6, 0.0));

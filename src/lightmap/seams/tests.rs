@@ -122,9 +122,10 @@ fn shards_and_threads_leave_the_bits_of_a_whole_bake() {
         let stats = bake(parts, &BakeParams { texel_begin: range[0], texel_end: range[1], ..params(stitch) });
         stats.left_out & left_out::SEAMS == 0
     };
-    assert!(!shard(&mut parts, [n / 3, n / 2], true), "stitched too soon");
     assert!(!shard(&mut parts, [n / 2, n], true), "stitched too soon");
-    assert!(shard(&mut parts, [0, n / 3], true));
+    // But for one texel, which no seam shows.
+    assert!(!shard(&mut parts, [1, n / 2], true), "stitched too soon");
+    assert!(shard(&mut parts, [0, 1], true));
     assert!(bits(&whole) == bits(&parts));
     // A part again: what was stitched is stitched anew, not twice.
     assert!(shard(&mut parts, [n / 5, n / 4], true));
@@ -192,6 +193,9 @@ fn three_sheets_at_an_edge_and_sheets_that_face_away_stay() {
         folded[1].positions[i].z = z;
     }
     assert_eq!(edges(folded), 0);
+    let mut stacked = floor();
+    stacked[1].positions = stacked[0].positions.clone();
+    assert_eq!(edges(stacked), 0);
     let wall = [[0.0, 0.0], [1.0, 0.0], [1.0, 1.0], [0.0, 1.0]].map(|[z, y]| Vec3::new(1.0, y, z));
     let mut walled = floor();
     walled.push(quad(wall, Vec2::new(0.75, 0.75), 0.0));
