@@ -11,7 +11,7 @@ use bakelite::photon::{PhotonParams, photon_rays};
 use bakelite::sampling::{cosine_hemisphere, mix, orthonormal_basis, sobol_2d};
 use bakelite::trace::offset::offset_ray_origin;
 use bakelite::trace::{Hit, PACKET_SIZE, Packet, RawHit, Ray};
-use bakelite::{Light, Result, Scene};
+use bakelite::{Error, Light, Result, Scene};
 use glam::Vec3;
 use rayon::prelude::*;
 use std::fmt::Write;
@@ -70,16 +70,17 @@ pub fn run(args: &BakeArgs) -> Result<()> {
     let row = |stage, s: StageStats, bare| Row { stage, seconds: s.seconds, rays: s.rays, bytes: s.bytes, bare };
     let unwrap = lightmap.info().unwrap_seconds;
     let (tree, texels) = (before("tree"), before("charts and texels"));
-    let build = |stage, (seconds, bytes): (f64, u64)| Row { stage, seconds, rays: 0, bytes, bare: None };
+    let rayless = |stage, (seconds, bytes): (f64, u64)| Row { stage, seconds, rays: 0, bytes, bare: None };
     let rows = [
-        build("acceleration structure", tree),
-        build("unwrapping", (unwrap, 0)),
-        build("packing and texels", (texels.0 - unwrap, texels.1)),
+        rayless("acceleration structure", tree),
+        rayless("unwrapping", (unwrap, 0)),
+        rayless("packing and texels", (texels.0 - unwrap, texels.1)),
         row("photons", of(|b| b.photons), Some(photons)),
         row("radiance map", of(|b| b.radiance), Some(shadow)),
         row("gather map", of(|b| b.gather), Some(gather)),
         row("direct light", of(|b| b.direct), Some(shadow)),
         row("composition", of(|b| b.compose), None),
+        rayless("seams", (median(bakes.iter().map(|b| b.seam_seconds).collect()), 0)),
     ];
     let text = markdown(args, &lightmap, &rows, memory);
     for (name, content) in [("pipeline.csv", &csv(&rows)), ("pipeline.md", &text)] {
@@ -147,6 +148,9 @@ fn shadow_rate(scene: &Scene, places: &[[Vec3; 2]]) -> Result<f64> {
     };
     let emitters = scene.emitters().iter().map(|e| e.corner + (e.edge_u + e.edge_v) / 3.0);
     let lights: Vec<Vec3> = scene.lights().iter().map(centre).chain(emitters).collect();
+    if lights.is_empty() {
+        return Err(Error::InvalidArgument("the scene has a material that emits, but no surface of it".into()));
+    }
     let ray = |(i, [p, _]): (usize, &[Vec3; 2])| {
         let light = lights[mix(i as u32) as usize % lights.len()];
         Ray::new(*p, light - *p).within(0.0, 0.9999)

@@ -336,8 +336,8 @@ fn markdown(args: &ReportArgs, lightmap: &Lightmap, points: &Points, reference_s
          {triangles} triangles; {texels} texels at {density:.2} per unit, {gather} gather and {radiance} radiance \
          texels; {photons} photons, {rays} gather rays, blur {blur} unless another value is named; threads: {threads}, \
          {isa}.\n\n\
-         Errors are of irradiance at {count} points that are seen from places in the scene, against {paths} paths per point of an independent path tracer in \
-         f64 ({reference_seconds:.0} s). Relative MSE is the mean of the squared error by the square of the reference \
+         Errors are of irradiance at {count} points that are seen from places in the scene, against {paths} paths per \
+         point of an independent path tracer in f64 ({reference_seconds:.0} s). Relative MSE is the mean of the squared error by the square of the reference \
          (what is darker than a tenth of its mean counts as so bright), RMS its root; to mean, the mean of the squared \
          error by the square of the reference's mean. The reference's own noise is not part of them: they are products \
          of the differences from its two halves. Noise is what differs between {seeds} seeds, bias what does not; \
