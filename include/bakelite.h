@@ -893,7 +893,7 @@ typedef struct bk_lightmap_desc {
   // Default: 4.
   uint32_t gather_divisor;
   // Light map texels per texel of the radiance map (what gather rays see), along each axis, 1 to 64.
-  // Default: 8.
+  // Default: 4.
   uint32_t radiance_divisor;
 } bk_lightmap_desc;
 

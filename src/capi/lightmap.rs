@@ -65,7 +65,7 @@ pub struct bk_lightmap_desc {
     /// Default: 4.
     pub gather_divisor: u32,
     /// Light map texels per texel of the radiance map (what gather rays see), along each axis, 1 to 64.
-    /// Default: 8.
+    /// Default: 4.
     pub radiance_divisor: u32,
 }
 

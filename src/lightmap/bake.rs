@@ -76,9 +76,9 @@ impl Lightmap {
         ];
         let stage = progress.stage("texels", 0.5, 1.0, layouts.iter().map(TexelMap::work).sum());
         let [map, gather, radiance] = layouts;
-        let map = ChartMap::new(scene, &charts, map, false, &stage)?;
-        let gather = ChartMap::new(scene, &charts, gather, false, &stage)?;
-        let radiance = ChartMap::new(scene, &charts, radiance, true, &stage)?;
+        let map = ChartMap::new(scene, &charts, map, &stage)?;
+        let gather = ChartMap::new(scene, &charts, gather, &stage)?;
+        let radiance = ChartMap::new(scene, &charts, radiance, &stage)?;
         uvs.overlapping_texels = map.texels.overlapping_texels;
         uvs.reduced_charts = map.layout.reduced;
         let bytes = charts.bytes() + map.bytes() + gather.bytes() + radiance.bytes();

@@ -18,8 +18,8 @@ pub(crate) struct ChartMap {
 }
 
 impl ChartMap {
-    pub(crate) fn new(scene: &Scene, charts: &Charts, layout: Layout, with_areas: bool, stage: &Stage) -> Result<Self> {
-        let texels = TexelMap::build(scene, charts, &layout, with_areas, stage)?;
+    pub(crate) fn new(scene: &Scene, charts: &Charts, layout: Layout, stage: &Stage) -> Result<Self> {
+        let texels = TexelMap::build(scene, charts, &layout, stage)?;
         Ok(ChartMap { layout, texels })
     }
 

@@ -53,7 +53,7 @@ pub struct LightmapDesc {
 
 impl Default for LightmapDesc {
     fn default() -> Self {
-        LightmapDesc { texels_per_unit: 0.0, page_size: 1024, padding: 2, gather_divisor: 4, radiance_divisor: 2 }
+        LightmapDesc { texels_per_unit: 0.0, page_size: 1024, padding: 2, gather_divisor: 4, radiance_divisor: 4 }
     }
 }
 

@@ -17,7 +17,7 @@ use super::map::ChartMap;
 use crate::device::Device;
 use crate::error::Result;
 use crate::photon::PhotonMap;
-use crate::photon::coverage::{Coverage, Piece};
+use crate::photon::coverage::coverage;
 use crate::progress::Stage;
 use crate::sampling::{combine, orthonormal_basis, sobol_2d};
 use crate::scene::{NONE, Scene};
@@ -27,9 +27,6 @@ use rayon::prelude::*;
 use std::f32::consts::PI;
 use std::sync::Arc;
 use std::sync::atomic::{AtomicU64, Ordering::Relaxed};
-
-/// Estimates are divided by the surface in their disc if that is known at so many texels per radius.
-const TEXELS_PER_RADIUS: f32 = 1.0;
 
 /// Texels handed to a thread at a time.
 const BLOCK: usize = 512;
@@ -77,18 +74,11 @@ pub(crate) struct RadianceInput<'a> {
 /// Fills in `values`, one per texel of the map; returns the rays traced.
 pub(crate) fn bake(device: &Device, input: &RadianceInput, values: &mut [Vec3], stage: &Stage) -> Result<u64> {
     let rays = AtomicU64::new(0);
-    // Of pieces larger than this it would count too few or too many (closed furnace, radiance divisor 4: 2 % too
-    // bright).
-    let is_fine = |p: &PhotonMap| p.radius() * input.map.layout.density >= TEXELS_PER_RADIUS;
-    let coverage = match input.photons.filter(|p| is_fine(p)) {
-        Some(photons) => Some(device.install(|| coverage(input, photons, &rays))?),
-        None => None,
-    };
     device.install(|| {
         values.par_chunks_mut(BLOCK).enumerate().try_for_each(|(block, out)| {
             let mut traced = 0;
             for (i, value) in out.iter_mut().enumerate() {
-                *value = texel(input, coverage.as_ref(), block * BLOCK + i, &mut traced);
+                *value = texel(input, block * BLOCK + i, &mut traced);
             }
             rays.fetch_add(traced, Relaxed);
             stage.advance(out.len() as u64)
@@ -97,40 +87,23 @@ pub(crate) fn bake(device: &Device, input: &RadianceInput, values: &mut [Vec3], 
     Ok(rays.into_inner())
 }
 
-fn texel(input: &RadianceInput, coverage: Option<&Coverage>, sample: usize, rays: &mut u64) -> Vec3 {
+fn texel(input: &RadianceInput, sample: usize, rays: &mut u64) -> Vec3 {
     let albedo = albedo(input.scene, input.charts, input.map, sample);
     if albedo == Vec3::ZERO {
         return Vec3::ZERO;
     }
     let back = sample >= input.back_start;
     let (point, receiver) = input.map.receiver(input.scene, sample, back);
-    let mut e = input.direct.irradiance(&receiver, input.direct_samples, combine(input.seed, sample as u32), rays);
+    let seed = combine(input.seed, sample as u32);
+    let mut e = input.direct.irradiance(&receiver, input.direct_samples, seed, rays);
     if let Some(photons) = input.photons {
-        let part = coverage.map_or(1.0, |c| c.at(photons, point.position, receiver.geometric));
-        e += Vec3::from(photons.estimate(point.position, receiver.geometric)) / part;
+        let by_photons = Vec3::from(photons.estimate(point.position, receiver.geometric));
+        if by_photons != Vec3::ZERO {
+            let is_buried = |origin, normal| is_buried(input.scene, origin, normal);
+            e += by_photons / coverage(photons, point.position, receiver.geometric, seed, is_buried, rays);
+        }
     }
     albedo * e / PI
-}
-
-/// The surfaces that photons could lie on: what the texels show, but for those inside solids (a floor that
-/// goes on below a wall).
-fn coverage(input: &RadianceInput, photons: &PhotonMap, rays: &AtomicU64) -> Result<Coverage> {
-    let samples = 0..input.map.len();
-    rays.fetch_add(samples.len() as u64, Relaxed);
-    let pieces: Vec<Option<Piece>> = samples
-        .into_par_iter()
-        .with_min_len(BLOCK)
-        .map(|sample| {
-            let (point, receiver) = input.map.receiver(input.scene, sample, sample >= input.back_start);
-            let area = input.map.texels.areas[sample];
-            (!is_buried(input.scene, receiver.origin, receiver.geometric)).then_some(Piece {
-                position: point.position,
-                normal: receiver.geometric,
-                area,
-            })
-        })
-        .collect();
-    Coverage::new(photons, pieces.into_iter().flatten())
 }
 
 /// Whether a surface lies inside a solid: straight above it and to all sides are backs. (Straight above alone may
@@ -138,7 +111,9 @@ fn coverage(input: &RadianceInput, photons: &PhotonMap, rays: &AtomicU64) -> Res
 fn is_buried(scene: &Scene, origin: Vec3, normal: Vec3) -> bool {
     let (x, y) = orthonormal_basis(normal);
     let aside = [x, -x, y, -y].into_iter().map(|side| normal + side);
-    inside_a_solid(scene, origin, normal) && aside.into_iter().all(|d| inside_a_solid(scene, origin, d))
+    scene.uses().solids
+        && inside_a_solid(scene, origin, normal)
+        && aside.into_iter().all(|d| inside_a_solid(scene, origin, d))
 }
 
 /// Look-ups of a texture in one texel, at most.

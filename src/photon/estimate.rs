@@ -17,7 +17,7 @@ use glam::Vec3;
 
 /// The least cosine between a photon's surface normal and the estimate's: 60°, coarse tessellations
 /// of columns and vaults included.
-const SAME_SURFACE: f32 = 0.5;
+pub(super) const SAME_SURFACE: f32 = 0.5;
 
 /// Vectors summed in f32 before their sums go to f64: bounds the rounding error to 2⁻¹⁹ while most
 /// estimates go to f64 once.
@@ -41,6 +41,11 @@ impl Cylinder {
         let inverse_k = 1.0 / cone_k as f64;
         let area = (1.0 - inverse_k * 2.0 / 3.0) * std::f64::consts::PI * r * r;
         Cylinder { radius, half_height, inverse_k: inverse_k as f32, scale: 1.0 / area }
+    }
+
+    /// Weight of a photon at a distance from the axis, in radii.
+    pub(super) fn filter(&self, distance: f32) -> f32 {
+        1.0 - distance * self.inverse_k
     }
 }
 

@@ -95,6 +95,8 @@ pub(crate) struct Uses {
     pub holes: Vec<bool>,
     /// Whether light passes through a surface.
     pub transmission: bool,
+    /// Whether a surface is opaque and shows one side only, as those of solids: light does not get behind it.
+    pub solids: bool,
 }
 
 impl Uses {
@@ -113,6 +115,7 @@ impl Uses {
                 uses.textures |= has_uvs && material.albedo_texture != NONE;
                 holes |= has_uvs && could[id as usize];
                 uses.transmission |= material.transmits();
+                uses.solids |= !material.two_sided && !material.transmits();
             };
             match &mesh.materials {
                 MeshMaterials::One(id) => note(*id),

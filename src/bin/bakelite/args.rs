@@ -47,7 +47,7 @@ Light map:
   --page-size N          width and height of a page in texels [1024]
   --padding N            texels around each chart [2]
   --gather-divisor N     light map texels per gather map texel and axis [4]
-  --radiance-divisor N   light map texels per radiance map texel and axis [2]
+  --radiance-divisor N   light map texels per radiance map texel and axis [4]
 Bake:
   --photons N            photons emitted [1000000]
   --bounces N            most reflections; 0: Russian roulette alone decides [0]

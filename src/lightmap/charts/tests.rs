@@ -23,10 +23,10 @@ pub(in crate::lightmap) fn scene_of(mesh: Mesh) -> Arc<Scene> {
     scene_on(2, mesh)
 }
 
-pub(in crate::lightmap) fn map_of(scene: &Scene, charts: &Charts, layout: &Layout, with_areas: bool) -> TexelMap {
+pub(in crate::lightmap) fn map_of(scene: &Scene, charts: &Charts, layout: &Layout) -> TexelMap {
     let progress = Progress::none();
     let stage = progress.stage("texels", 0.0, 1.0, TexelMap::work(layout));
-    TexelMap::build(scene, charts, layout, with_areas, &stage).unwrap()
+    TexelMap::build(scene, charts, layout, &stage).unwrap()
 }
 
 /// The unit square in two triangles.
@@ -90,7 +90,7 @@ fn check(scene: &Scene, charts: &Charts) {
     }
     let density = automatic_density(scene, 256, 1.0);
     let layout = Layout::pack(charts, density, 256, 1, false, false).unwrap();
-    assert_eq!(map_of(scene, charts, &layout, false).overlapping_texels, 0);
+    assert_eq!(map_of(scene, charts, &layout).overlapping_texels, 0);
 }
 
 /// Area in the chart over area in space, of a triangle.
@@ -322,7 +322,7 @@ fn a_real_level_keeps_its_own_pages() {
     let layout = Layout::pack(&charts, 0.5, 1024, 2, true, false).unwrap();
     let pages = layout.placements[..layout.given as usize].iter().map(|p| p.page).max();
     assert_eq!(pages, Some(5));
-    let map = map_of(&scene, &charts, &layout, false);
+    let map = map_of(&scene, &charts, &layout);
     assert!((0..charts.charts.len() as u32).all(|c| c >= layout.given || layout.placements[c as usize].page <= 5));
     assert!(map.samples.len() > 1_000_000);
 }
