@@ -47,7 +47,15 @@ impl Disc {
         (part / consts::PI).max(0.0)
     }
 
-    pub(super) fn light(&self, scene: &Scene, receiver: &Receiver, samples: u32, seed: u32, rays: &mut u64) -> Vec3 {
+    pub(super) fn light(
+        &self,
+        scene: &Scene,
+        receiver: &Receiver,
+        samples: u32,
+        seed: u32,
+        rays: &mut u64,
+        by_ratio: bool,
+    ) -> Vec3 {
         let cosine = self.to_light.as_dvec3().dot(receiver.normal.as_dvec3());
         let total = self.unoccluded(cosine) as f32;
         if total <= 0.0 {
@@ -71,6 +79,11 @@ impl Disc {
             }
         }
         let visible = shadow.finish(rays).x;
+        if !by_ratio {
+            // Radiance times solid angle: irradiance / (π sin²) · 2π (1 − cos).
+            let sine = self.angular_radius.sin();
+            return self.irradiance * (2.0 * height / (sine * sine) * visible / samples as f32);
+        }
         if weights > 0.0 { self.irradiance * (total * (visible / weights)) } else { Vec3::ZERO }
     }
 }

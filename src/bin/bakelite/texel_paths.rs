@@ -1,13 +1,14 @@
 //! Path tracing every texel with the library's own kernels: what a bake has to beat.
 //!
 //! As good as it gets without anything shared between texels: the first bounce goes in packets with a
-//! shared origin, further ones in blocks, direct light is sampled at each vertex as in a bake, paths
-//! end by Russian roulette, and the first direction of each texel is an Owen-scrambled Sobol sequence.
+//! shared origin, further ones in blocks, direct light is sampled at each vertex, paths end by Russian
+//! roulette, which also decides whether they pass a sheet that transmits, and the first direction of
+//! each texel is an Owen-scrambled Sobol sequence.
 
 use bakelite::lightmap::direct::{DirectLight, Receiver};
 use bakelite::sampling::{combine, cosine_hemisphere, orthonormal_basis, sobol_2d, uniform};
 use bakelite::scene::NONE;
-use bakelite::trace::offset::SurfacePoint;
+use bakelite::trace::offset::{SurfacePoint, offset_ray_origin};
 use bakelite::trace::{Hit, PACKET_SIZE, Packet, RawHit, Ray};
 use bakelite::{Result, Scene};
 use glam::{DVec3, Vec3};
@@ -108,21 +109,79 @@ impl TexelPaths {
         let material = self.scene.material(triangle);
         let point = SurfacePoint::new(self.scene.corners(triangle), hit.u, hit.v, &self.scene);
         let back = path.direction.dot(point.normal) > 0.0;
-        if back && !material.two_sided {
-            return None;
-        }
         let receiver = Receiver::new(&self.scene, &point, None, back);
-        let throughput = path.throughput * self.scene.albedo(triangle, hit.u, hit.v);
-        let e = self.direct.irradiance(&receiver, 1, combine(path.seed, 1), &mut 0);
-        sums[path.receiver] += (throughput * e / PI).as_dvec3();
-        let survival = throughput.max_element().min(1.0);
-        if !(uniform(0, 0, path.seed) < survival) {
-            return None;
+        let mut reflected = Vec3::ZERO;
+        if !back || material.two_sided {
+            reflected = path.throughput * self.scene.albedo(triangle, hit.u, hit.v);
+            let e = self.direct.unbiased(&receiver, 1, combine(path.seed, 1), &mut 0);
+            sums[path.receiver] += (reflected * e / PI).as_dvec3();
         }
-        let d = cosine_hemisphere([uniform(0, 1, path.seed), uniform(0, 2, path.seed)]);
-        let (tangent, bitangent) = orthonormal_basis(receiver.normal);
-        let direction = d.x * tangent + d.y * bitangent + d.z * receiver.normal;
-        let next = Path { throughput: throughput / survival, seed: combine(path.seed, 2), direction, ..path };
-        Some((next, Ray::new(receiver.origin, direction)))
+        let passed = path.throughput * Vec3::from(material.transmission);
+        let (reflects, passes) = (reflected.max_element(), passed.max_element());
+        // More than 1 together where other channels are reflected than pass.
+        let all = (reflects + passes).max(1.0);
+        let (luck, seed) = (uniform(0, 0, path.seed) * all, combine(path.seed, 2));
+        if luck < reflects {
+            let d = cosine_hemisphere([uniform(0, 1, path.seed), uniform(0, 2, path.seed)]);
+            let (tangent, bitangent) = orthonormal_basis(receiver.normal);
+            let direction = d.x * tangent + d.y * bitangent + d.z * receiver.normal;
+            let next = Path { throughput: reflected * (all / reflects), seed, direction, ..path };
+            Some((next, Ray::new(receiver.origin, direction)))
+        } else if luck < reflects + passes {
+            let origin = offset_ray_origin(point.interior, -receiver.geometric, &self.scene);
+            let next = Path { throughput: passed * (all / passes), seed, ..path };
+            Some((next, Ray::new(origin, path.direction)))
+        } else {
+            None
+        }
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use bakelite::bvh::BuildOptions;
+    use bakelite::reference::{self, PathTracer};
+    use bakelite::scene::shapes::MeshBuilder;
+    use bakelite::scene::{Light, Material, SceneData};
+    use bakelite::{Device, Progress};
+
+    /// A room with a lamp of some size, divided by a pane of glass, and a point of its floor.
+    #[test]
+    fn indirect_light_is_that_of_the_path_tracer_in_f64() {
+        let mut data = SceneData::new();
+        let walls = data.add_material(Material { albedo: [0.7, 0.5, 0.3], ..Default::default() }).unwrap();
+        let glass = Material { albedo: [0.1, 0.4, 0.2], transmission: [0.8, 0.3, 0.1], ..Default::default() };
+        let glass = data.add_material(Material { two_sided: true, ..glass }).unwrap();
+        let mut room = MeshBuilder::new();
+        room.box_(Vec3::ZERO, Vec3::ONE, true, walls);
+        let at = |x: f32, z: f32| Vec3::new(x, 0.5, z);
+        room.quad(at(0.0, 0.0), at(0.0, 1.0), at(1.0, 1.0), at(1.0, 0.0), glass);
+        // Hides a part of the lamp.
+        room.box_(Vec3::new(0.4, 0.6, 0.2), Vec3::new(0.5, 0.9, 0.8), false, walls);
+        data.add_mesh(room.finish()).unwrap();
+        let (edge_u, edge_v) = (Vec3::X * 0.8, Vec3::Z * 0.8);
+        data.add_light(Light::Rect { position: Vec3::new(0.1, 0.99, 0.1), edge_u, edge_v, radiance: [5.0; 3] })
+            .unwrap();
+        let device = Device::new(Default::default()).unwrap();
+        let scene = Scene::commit(&device, data, &BuildOptions::default(), &Progress::none()).map_err(|e| e.1).unwrap();
+        for place in [Vec3::new(0.7, 0.0, 0.4), Vec3::new(0.2, 1.0, 0.9), Vec3::new(0.0, 0.3, 0.5)] {
+            let start = Vec3::new(0.55, place.y.clamp(0.1, 0.95), 0.1);
+            let hit = scene.intersect_raw(&Ray::new(start, place - start));
+            let point = SurfacePoint::new(scene.corners(hit.triangle), hit.u, hit.v, &scene);
+            let receiver = Receiver::new(&scene, &point, None, false);
+            let n = 64;
+            let runs = TexelPaths::new(&scene).indirect(&vec![receiver; n], 64, 1).unwrap();
+            let surface = reference::SurfacePoint::on_triangle(&scene, hit.triangle, hit.u as f64, hit.v as f64);
+            let truth = PathTracer::new(&scene).irradiance(&surface, 16 * 100 * 100, 1, 0);
+            for c in 0..3 {
+                let mean = runs.iter().map(|e| e[c]).sum::<f64>() / n as f64;
+                let variance = runs.iter().map(|e| (e[c] - mean).powi(2)).sum::<f64>() / (n * (n - 1)) as f64;
+                let error = (variance + truth.standard_error[c].powi(2)).sqrt();
+                let off = mean - truth.indirect[c];
+                println!("{place} {c}: {mean} ± {error}, {}", truth.indirect[c]);
+                assert!(error < 6e-3 * mean && off.abs() < 3.0 * error, "{place} {c}: {mean} ± {error}, {truth:?}");
+            }
+        }
     }
 }
