@@ -12,13 +12,14 @@
 //! | `live_measure`, `live_report`, `plot` | live updates: measurements, tables, plots |
 //! | `measure` | what measurements share |
 //! | `memory_report` | a scene's memory by part, and what little of it costs rays |
-//! | `pipeline_report` | the stages of a bake, and what bounds each |
+//! | `pipeline_report`, `bar_chart` | the stages of a bake, and what bounds each |
 //! | `quality_measure`, `quality_report` | error of the light against run time |
 //! | `stability`, `stability_*` | stiff and extreme cases against what is known of them |
 //! | `texel_paths` | path tracing every texel, which a bake is compared with |
 
 mod args;
 mod bar;
+mod bar_chart;
 mod camera;
 mod font;
 mod live_measure;

@@ -4,6 +4,7 @@
 
 use crate::Job;
 use crate::args::BakeArgs;
+use crate::bar_chart::{self, Bar};
 use crate::measure::{median, pick, visible_texels};
 use crate::output;
 use bakelite::lightmap::{BakeStats, Lightmap, StageStats};
@@ -32,6 +33,8 @@ const PACKETS: usize = 2;
 
 /// Bytes that are copied to measure memory.
 const COPIED: usize = 256 << 20;
+
+const UNWRAPPING: &str = "unwrapping";
 
 /// One line of the table.
 struct Row {
@@ -73,7 +76,7 @@ pub fn run(args: &BakeArgs) -> Result<()> {
     let rayless = |stage, (seconds, bytes): (f64, u64)| Row { stage, seconds, rays: 0, bytes, bare: None };
     let rows = [
         rayless("acceleration structure", tree),
-        rayless("unwrapping", (unwrap, 0)),
+        rayless(UNWRAPPING, (unwrap, 0)),
         rayless("packing and texels", (texels.0 - unwrap, texels.1)),
         row("photons", of(|b| b.photons), Some(photons)),
         row("radiance map", of(|b| b.radiance), Some(shadow)),
@@ -83,11 +86,11 @@ pub fn run(args: &BakeArgs) -> Result<()> {
         rayless("seams", (median(bakes.iter().map(|b| b.seam_seconds).collect()), 0)),
     ];
     let text = markdown(args, &lightmap, &rows, memory);
-    for (name, content) in [("pipeline.csv", &csv(&rows)), ("pipeline.md", &text)] {
+    for (name, content) in [("pipeline.csv", &csv(&rows)), ("pipeline.svg", &chart(&rows)), ("pipeline.md", &text)] {
         output::write_text(&args.out.join(name), content)?;
     }
     if !args.quiet {
-        println!("{text}\nWrote to {}: pipeline.md, pipeline.csv", args.out.display());
+        println!("{text}\nWrote to {}: pipeline.md, pipeline.csv, pipeline.svg", args.out.display());
     }
     Ok(())
 }
@@ -183,10 +186,37 @@ fn csv(rows: &[Row]) -> String {
     out
 }
 
+/// Seconds of all stages, and without unwrapping.
+fn seconds(rows: &[Row]) -> [f64; 2] {
+    let sum = |unwrapping: bool| {
+        let counted = rows.iter().filter(|r| unwrapping || r.stage != UNWRAPPING);
+        counted.map(|r| r.seconds).sum()
+    };
+    [sum(true), sum(false)]
+}
+
+/// Seconds of each stage, and its share of all with and without unwrapping.
+fn chart(rows: &[Row]) -> String {
+    let [all, others] = seconds(rows);
+    let bar = |r: &Row| {
+        let apart = r.stage == UNWRAPPING;
+        let mut note = format!("{:.3} s, {:.1} %", r.seconds, 100.0 * r.seconds / all);
+        if !apart {
+            let _ = write!(note, " ({:.1} %)", 100.0 * r.seconds / others);
+        }
+        Bar { name: r.stage, value: r.seconds, note, apart }
+    };
+    let title = format!("Stages of a bake: {all:.2} s, {others:.2} s without unwrapping");
+    bar_chart::svg(
+        &title,
+        "seconds (share of all, and of all but unwrapping)",
+        &rows.iter().map(bar).collect::<Vec<_>>(),
+    )
+}
+
 fn markdown(args: &BakeArgs, lightmap: &Lightmap, rows: &[Row], memory: f64) -> String {
     let (scene, info) = (lightmap.scene(), lightmap.info());
-    let total: f64 = rows.iter().map(|r| r.seconds).sum();
-    let unwrapping = rows.iter().filter(|r| r.stage == "unwrapping").map(|r| r.seconds).sum::<f64>();
+    let [total, without_unwrapping] = seconds(rows);
     let mut out = format!(
         "# Pipeline: {}\n\n\
          {} triangles; {} texels at {:.2} per unit, {} gather and {} radiance texels, {} charts; {} photons, {} gather \
@@ -225,8 +255,8 @@ fn markdown(args: &BakeArgs, lightmap: &Lightmap, rows: &[Row], memory: f64) -> 
     }
     let _ = writeln!(
         out,
-        "| sum | {total:.3} | | | | | | |\n| sum without unwrapping | {:.3} | | | | | | |\n\n## Plan\n",
-        total - unwrapping
+        "| sum | {total:.3} | | | | | | |\n| sum without unwrapping | {without_unwrapping:.3} | | | | | | |\n\n\
+         ![seconds of each stage](pipeline.svg)\n\n## Plan\n",
     );
     for line in lightmap.plan_text().lines() {
         let _ = writeln!(out, "- {line}");

@@ -24,7 +24,7 @@ const HEIGHT: f64 = 420.0;
 const MARGIN: [f64; 4] = [72.0, 130.0, 40.0, 52.0];
 
 /// Told apart by the colour-blind too (Okabe and Ito 2008).
-const COLORS: [&str; 6] = ["#0072b2", "#d55e00", "#009e73", "#cc79a7", "#e69f00", "#000000"];
+pub const COLORS: [&str; 6] = ["#0072b2", "#d55e00", "#009e73", "#cc79a7", "#e69f00", "#000000"];
 
 /// A logarithmic axis over whole decades, from `from` to `to` in the picture.
 struct Axis {
@@ -124,7 +124,8 @@ fn curve(out: &mut String, color: &str, points: impl Iterator<Item = [f64; 2]> +
     }
 }
 
-fn text(out: &mut String, [x, y]: [f64; 2], anchor: &str, more: &str, text: &str) {
+/// Adds a text; `more`: further attributes.
+pub fn text(out: &mut String, [x, y]: [f64; 2], anchor: &str, more: &str, text: &str) {
     let escaped = text.replace('&', "&amp;").replace('<', "&lt;");
     let _ = writeln!(out, "<text x=\"{x:.1}\" y=\"{y:.1}\" text-anchor=\"{anchor}\" {more}>{escaped}</text>");
 }
