@@ -25,8 +25,8 @@ Reports measure instead, and write tables, plots and CSV:
   live      live updates: error against time and rays, budgets, traffic, memory
   memory    the scene's memory, default and compact, and what that costs rays
   pipeline  what each stage of a bake takes, and what bounds it
-  quality   error of the light against run time, for every knob of a bake, path
-            tracing and photons alone
+  quality   error of the light and likeness of a view against run time, for every
+            knob of a bake, path tracing and photons alone
   stability stiff and extreme cases, each against what is known of it (SCENE:
             its energy balance too)
 
@@ -76,7 +76,8 @@ Report live (live.md with its tables and plots):
 Report quality (quality.md):
   --points N             points at which light is compared [400]
   --seeds N              bakes per setting, to tell noise from bias [4]
-  --paths N              paths per point of the path traced reference [4096]
+  --paths N              paths per point of the path traced reference, and per pixel of
+                         a path traced view [4096]
   --knobs A,B,..         what to vary, of gather-rays, photons, radius, blur,
                          direct-samples, gather-divisor, radiance-divisor,
                          path-tracing, photons-alone, or none [all of these]

@@ -18,7 +18,7 @@ use std::f32::consts::PI;
 use std::time::Instant;
 
 /// Linear RGB, row by row.
-type Pixels = Vec<[f32; 3]>;
+pub type Pixels = Vec<[f32; 3]>;
 
 /// Captions, in the pictures' order.
 pub const TITLES: [&str; 3] = ["Path traced reference", "Indirect map + shadow rays", "Light map alone"];
@@ -28,7 +28,7 @@ pub const NAMES: [&str; 3] = ["reference", "indirect-and-shadow-rays", "light-ma
 
 /// Primary rays per pixel of the pictures made from the light map: a (0,2)-net, so that edges along
 /// rows and columns, of which buildings are full, get sixteen levels.
-const PRIMARY_RAYS: u32 = 16;
+pub const PRIMARY_RAYS: u32 = 16;
 
 /// Shadow rays per primary ray and area light.
 const SHADOW_RAYS: u32 = 2;
@@ -73,20 +73,21 @@ impl View<'_> {
         let reference_seconds = start.elapsed().as_secs_f64();
 
         let start = Instant::now();
+        let (size, seed) = ([self.width, self.height], self.seed as u32);
         let direct = DirectLight::new(scene);
-        let by_shadow_rays = self.image(progress, "shadow rays", |seen| {
+        let by_shadow_rays = render(scene, &self.camera, size, seed, progress, "shadow rays", |seen| {
             let e = direct.irradiance(&receiver(scene, &seen.hit), SHADOW_RAYS, seen.seed, &mut 0);
-            e + Vec3::from(self.lightmap.sample(Layer::Indirect, seen.hit.triangle, seen.hit.u, seen.hit.v))
+            Ok(e + Vec3::from(self.lightmap.sample(Layer::Indirect, seen.hit.triangle, seen.hit.u, seen.hit.v)))
         })?;
         let shadow_seconds = start.elapsed().as_secs_f64();
 
         let start = Instant::now();
-        let composite = self.image(progress, "light map", |seen| {
-            self.lightmap.sample(Layer::Combined, seen.hit.triangle, seen.hit.u, seen.hit.v).into()
+        let composite = render(scene, &self.camera, size, seed, progress, "light map", |seen| {
+            Ok(self.lightmap.sample(Layer::Combined, seen.hit.triangle, seen.hit.u, seen.hit.v).into())
         })?;
         let composite_seconds = start.elapsed().as_secs_f64();
 
-        let background = self.background();
+        let background = background(scene, &self.camera, size);
         let covered = |i: usize| background[i] == 0.0;
         let exposure = auto_exposure(&reference, covered);
         let rmse = [&reference, &by_shadow_rays, &composite].map(|image| relative_rmse(image, &halves, covered));
@@ -114,57 +115,64 @@ impl View<'_> {
         let mean = |(a, b): (&[f32; 3], &[f32; 3])| std::array::from_fn(|c| 0.5 * (a[c] + b[c]));
         Ok((halves[0].iter().zip(&halves[1]).map(mean).collect(), halves))
     }
+}
 
-    /// An image of albedo/π · E + Le, with E from `irradiance`.
-    fn image(
-        &self,
-        progress: &Progress,
-        name: &str,
-        irradiance: impl Fn(&Seen) -> Vec3 + Sync,
-    ) -> Result<Vec<[f32; 3]>> {
-        let scene = self.lightmap.scene();
-        let rays = PrimaryRays::new(&self.camera, self.width, self.height);
-        let stage = progress.stage(name, 0.0, 1.0, self.height as u64);
-        let mut pixels = vec![[0.0; 3]; self.width * self.height];
-        let row = |(y, row): (usize, &mut [[f32; 3]])| {
-            for (x, pixel) in row.iter_mut().enumerate() {
-                let sum: Vec3 = rays
-                    .of_pixel(x, y)
-                    .enumerate()
-                    .map(|(k, ray)| {
-                        let seed = combine(combine(self.seed as u32, (y * self.width + x) as u32), k as u32);
-                        radiance(scene, &ray, seed, &irradiance)
-                    })
-                    .sum();
-                *pixel = (sum / PRIMARY_RAYS as f32).to_array();
+/// A picture of albedo/π · E + Le, with E from `irradiance`.
+pub fn render(
+    scene: &Scene,
+    camera: &Camera,
+    [width, height]: [usize; 2],
+    seed: u32,
+    progress: &Progress,
+    name: &str,
+    irradiance: impl Fn(&Seen) -> Result<Vec3> + Sync,
+) -> Result<Pixels> {
+    let rays = PrimaryRays::new(camera, width, height);
+    let stage = progress.stage(name, 0.0, 1.0, height as u64);
+    let mut pixels = vec![[0.0; 3]; width * height];
+    let row = |(y, row): (usize, &mut [[f32; 3]])| {
+        for (x, pixel) in row.iter_mut().enumerate() {
+            let mut sum = Vec3::ZERO;
+            for (k, ray) in rays.of_pixel(x, y).enumerate() {
+                let seed = combine(combine(seed, (y * width + x) as u32), k as u32);
+                sum += radiance(scene, &ray, seed, &irradiance)?;
             }
-            stage.advance(1)
-        };
-        scene.device().install(|| pixels.par_chunks_mut(self.width).enumerate().try_for_each(row))?;
-        Ok(pixels)
-    }
+            *pixel = (sum / PRIMARY_RAYS as f32).to_array();
+        }
+        stage.advance(1)
+    };
+    scene.device().install(|| pixels.par_chunks_mut(width).enumerate().try_for_each(row))?;
+    Ok(pixels)
+}
 
-    /// Part of each pixel where nothing is.
-    fn background(&self) -> Vec<f32> {
-        let scene = self.lightmap.scene();
-        let rays = PrimaryRays::new(&self.camera, self.width, self.height);
-        let part = |i: usize| {
-            let misses = rays.of_pixel(i % self.width, i / self.width).filter(|r| scene.intersect_raw(r).is_miss());
-            misses.count() as f32 / PRIMARY_RAYS as f32
-        };
-        scene.device().install(|| (0..self.width * self.height).into_par_iter().map(part).collect())
-    }
+/// Part of each pixel where nothing is.
+pub fn background(scene: &Scene, camera: &Camera, [width, height]: [usize; 2]) -> Vec<f32> {
+    let rays = PrimaryRays::new(camera, width, height);
+    let part = |i: usize| {
+        let misses = rays.of_pixel(i % width, i / width).filter(|r| scene.intersect_raw(r).is_miss());
+        misses.count() as f32 / PRIMARY_RAYS as f32
+    };
+    scene.device().install(|| (0..width * height).into_par_iter().map(part).collect())
+}
+
+/// Linear radiance as sRGB, with the background where nothing is.
+pub fn tone_mapped(pixels: &[[f32; 3]], background: &[f32], exposure: f32) -> Vec<[u8; 3]> {
+    let pixel = |(p, &part): (&[f32; 3], &f32)| {
+        let shown = std::array::from_fn(|c| p[c] + part * BACKGROUND[c] / exposure);
+        tone_map(exposure, shown)
+    };
+    pixels.iter().zip(background).map(pixel).collect()
 }
 
 /// A visible point.
-struct Seen {
-    hit: RawHit,
+pub struct Seen {
+    pub hit: RawHit,
     /// For the random numbers of this point.
-    seed: u32,
+    pub seed: u32,
 }
 
 /// A hit as a point that receives light, on the side that was hit, with its interpolated normal.
-fn receiver(scene: &Scene, hit: &RawHit) -> Receiver {
+pub fn receiver(scene: &Scene, hit: &RawHit) -> Receiver {
     let (mesh, triangle) = scene.locate(hit.triangle);
     let mesh = &scene.meshes()[mesh as usize];
     let normal = |corner: usize| mesh.normals[mesh.indices[triangle as usize][corner] as usize];
@@ -175,10 +183,10 @@ fn receiver(scene: &Scene, hit: &RawHit) -> Receiver {
 }
 
 /// Radiance along a primary ray. The backs of one-sided materials are black.
-fn radiance(scene: &Scene, ray: &Ray, seed: u32, irradiance: &impl Fn(&Seen) -> Vec3) -> Vec3 {
+fn radiance(scene: &Scene, ray: &Ray, seed: u32, irradiance: &impl Fn(&Seen) -> Result<Vec3>) -> Result<Vec3> {
     let hit = scene.intersect_raw(ray);
     if hit.is_miss() {
-        return Vec3::ZERO;
+        return Ok(Vec3::ZERO);
     }
     let material = scene.material(hit.triangle);
     let mut through = Vec3::ZERO;
@@ -186,13 +194,13 @@ fn radiance(scene: &Scene, ray: &Ray, seed: u32, irradiance: &impl Fn(&Seen) -> 
         let point = SurfacePoint::new(scene.corners(hit.triangle), hit.u, hit.v, scene);
         let onwards = if hit.front { -point.normal } else { point.normal };
         let behind = Ray::new(offset_ray_origin(point.interior, onwards, scene), ray.direction.into());
-        through = Vec3::from(material.transmission) * radiance(scene, &behind, seed, irradiance);
+        through = Vec3::from(material.transmission) * radiance(scene, &behind, seed, irradiance)?;
     }
     if !hit.front && !material.two_sided {
-        return through;
+        return Ok(through);
     }
-    let reflected = scene.albedo(hit.triangle, hit.u, hit.v) / PI * irradiance(&Seen { hit, seed });
-    through + reflected + Vec3::from(material.emission)
+    let reflected = scene.albedo(hit.triangle, hit.u, hit.v) / PI * irradiance(&Seen { hit, seed })?;
+    Ok(through + reflected + Vec3::from(material.emission))
 }
 
 /// The rays of a pinhole camera.
@@ -264,11 +272,7 @@ const INK: [u8; 3] = [225, 222, 214];
 impl Pictures {
     /// One picture as sRGB.
     pub fn tone_mapped(&self, picture: usize) -> Vec<[u8; 3]> {
-        let pixel = |(p, &part): (&[f32; 3], &f32)| {
-            let shown = std::array::from_fn(|c| p[c] + part * BACKGROUND[c] / self.exposure);
-            tone_map(self.exposure, shown)
-        };
-        self.images[picture].iter().zip(&self.background).map(pixel).collect()
+        tone_mapped(&self.images[picture], &self.background, self.exposure)
     }
 
     /// The three side by side with their captions: width, height and pixels.

@@ -7,6 +7,7 @@ use crate::measure::median;
 use crate::output;
 use crate::plot::{Plot, Series};
 use crate::quality_measure::{Errors, Points, Values, errors};
+use crate::quality_view::ViewReference;
 use crate::texel_paths::TexelPaths;
 use bakelite::lightmap::direct::{DirectLight, Receiver};
 use bakelite::lightmap::{BakeParams, Layer, Lightmap, LightmapDesc};
@@ -27,6 +28,8 @@ const RADIANCE_DIVISORS: [u32; 4] = [2, 4, 8, 16];
 const DIRECT_SAMPLES: [u32; 3] = [4, 16, 64];
 /// Rounds of [`PACKET_SIZE`] paths per texel.
 const PATH_ROUNDS: [u32; 5] = [1, 2, 4, 8, 16];
+/// Pixels across the view that is compared.
+const VIEW_WIDTH: usize = 160;
 const PHOTONS_ALONE: [u64; 4] = [100_000, 1_000_000, 4_000_000, 16_000_000];
 
 /// Root mean square errors that people ask for.
@@ -42,6 +45,8 @@ struct Row {
     indirect: Errors,
     /// Direct light too, where it is part of what was computed.
     all: Option<Errors>,
+    /// Structural similarity of a view with the path traced one, where the view can be rendered.
+    ssim: Option<f64>,
 }
 
 /// Runs the report.
@@ -57,8 +62,12 @@ pub fn run(args: &ReportArgs) -> Result<()> {
     if points.all[0].iter().flatten().all(|&c| c == 0.0) {
         return Err(Error::InvalidArgument("no light arrives at any of the points compared".into()));
     }
+    let (width, height) = (args.bake.width, args.bake.height);
+    let size = [VIEW_WIDTH, (VIEW_WIDTH * height / width).max(1)];
+    let camera = job.camera(&lightmap);
+    let view = job.bars.show("view", |p| ViewReference::new(&lightmap, camera, size, args.paths, p))?;
     let at_points = points_csv(&points, &points.of_bake(&lightmap, Layer::Indirect));
-    let mut measure = Measure { args, points: &points, rows: Vec::new() };
+    let mut measure = Measure { args, points: &points, view: &view, rows: Vec::new() };
     measure.bakes(&job, &mut lightmap)?;
     if measure.varies("path-tracing") {
         measure.paths(&job, &lightmap)?;
@@ -68,7 +77,7 @@ pub fn run(args: &ReportArgs) -> Result<()> {
     }
     let rows = measure.rows;
 
-    let text = markdown(args, &lightmap, &points, reference_seconds, &rows);
+    let text = markdown(args, &lightmap, &points, reference_seconds, &view, &rows);
     for (name, content) in [
         ("quality.md", &text),
         ("quality.csv", &csv(&rows)),
@@ -89,6 +98,7 @@ pub fn run(args: &ReportArgs) -> Result<()> {
 struct Measure<'a> {
     args: &'a ReportArgs,
     points: &'a Points,
+    view: &'a ViewReference,
     rows: Vec<Row>,
 }
 
@@ -155,12 +165,13 @@ impl Measure<'_> {
         params: &BakeParams,
     ) -> Result<()> {
         job.bars.say(&format!("{series} {value}"));
-        let (mut indirect, mut all, mut seconds) = (Vec::new(), Vec::new(), Vec::new());
+        let (mut indirect, mut all, mut seconds, mut ssim) = (Vec::new(), Vec::new(), Vec::new(), Some(0.0));
         for seed in 0..self.args.seeds {
             let params = BakeParams { seed: params.seed + seed, ..*params };
             seconds.push(lightmap.bake(&params, &Progress::none())?.seconds);
             indirect.push(self.points.of_bake(lightmap, Layer::Indirect));
             all.push(self.points.of_bake(lightmap, Layer::Combined));
+            ssim = ssim.zip(self.view.of_bake(lightmap)?).map(|(sum, one)| sum + one / self.args.seeds as f64);
         }
         self.rows.push(Row {
             series: series.to_owned(),
@@ -168,6 +179,7 @@ impl Measure<'_> {
             seconds: median(seconds),
             indirect: errors(&indirect, &self.points.indirect),
             all: Some(errors(&all, &self.points.all)),
+            ssim,
         });
         Ok(())
     }
@@ -196,6 +208,7 @@ impl Measure<'_> {
                 seconds: start.elapsed().as_secs_f64() / self.args.seeds as f64 * all_texels,
                 indirect: errors(&runs, &self.points.indirect),
                 all: None,
+                ssim: None,
             });
         }
         Ok(())
@@ -226,6 +239,7 @@ impl Measure<'_> {
                 seconds: median(seconds),
                 indirect: errors(&runs, &self.points.indirect),
                 all: None,
+                ssim: None,
             });
         }
         Ok(())
@@ -284,14 +298,15 @@ fn seconds(s: f64) -> String {
 
 fn csv(rows: &[Row]) -> String {
     let mut out = String::from(
-        "series,value,seconds,indirect_mse,variance,bias2,mean,uncertainty,indirect_mse_to_mean,all_mse,all_mse_to_mean\n",
+        "series,value,seconds,indirect_mse,variance,bias2,mean,uncertainty,indirect_mse_to_mean,all_mse,all_mse_to_mean,ssim\n",
     );
     for r in rows {
         let e = &r.indirect;
         let all = r.all.map_or(",".into(), |a| format!("{:.6e},{:.6e}", a.mse, a.to_mean));
+        let ssim = r.ssim.map_or(String::new(), |s| format!("{s:.6}"));
         let _ = writeln!(
             out,
-            "{},{},{:.4},{:.6e},{:.6e},{:.6e},{:.6},{:.6e},{:.6e},{all}",
+            "{},{},{:.4},{:.6e},{:.6e},{:.6e},{:.6},{:.6e},{:.6e},{all},{ssim}",
             r.series, r.value, r.seconds, e.mse, e.variance, e.bias2, e.mean, e.uncertainty, e.to_mean
         );
     }
@@ -329,7 +344,14 @@ fn plot(rows: &[Row]) -> String {
     .svg()
 }
 
-fn markdown(args: &ReportArgs, lightmap: &Lightmap, points: &Points, reference_seconds: f64, rows: &[Row]) -> String {
+fn markdown(
+    args: &ReportArgs,
+    lightmap: &Lightmap,
+    points: &Points,
+    reference_seconds: f64,
+    view: &ViewReference,
+    rows: &[Row],
+) -> String {
     let (scene, info, params) = (lightmap.scene(), lightmap.info(), &args.bake.params);
     let mut out = format!(
         "# Quality: {}\n\n\
@@ -342,7 +364,11 @@ fn markdown(args: &ReportArgs, lightmap: &Lightmap, points: &Points, reference_s
          error by the square of the reference's mean. The reference's own noise is not part of them: they are products \
          of the differences from its two halves. Noise is what differs between {seeds} seeds, bias what does not; \
          MSE = noise² + bias². ± is one standard error of the MSE, from the points chosen. Seconds are those of the \
-         bake, without charts; of path tracing and photons alone those at the points compared, scaled to all.\n\n",
+         bake, without charts; of path tracing and photons alone those at the points compared, scaled to all.\n\n\
+         SSIM (Wang 2004) compares the light map alone, as the camera shows it in {width} × {height} pixels, with the \
+         same view path traced by the bake's kernels with {view_paths} paths per pixel ({view_seconds:.0} s), both tone \
+         mapped alike. Two halves of the reference, with half the paths each, have an SSIM of {of_halves}: an exact \
+         bake would have more than that, but not 1.\n\n",
         args.bake.title(),
         triangles = scene.stats().triangles,
         texels = info.texels,
@@ -357,6 +383,11 @@ fn markdown(args: &ReportArgs, lightmap: &Lightmap, points: &Points, reference_s
         count = points.len(),
         paths = args.paths,
         seeds = args.seeds,
+        width = view.size[0],
+        height = view.size[1],
+        view_paths = view.paths,
+        view_seconds = view.seconds,
+        of_halves = likeness(view.of_halves),
     );
     out.push_str("## Time to an error of indirect light\n\n| | 10 % | 5 % | 1 % | slope |\n|---|---|---|---|---|\n");
     for s in series(rows)
@@ -370,15 +401,15 @@ fn markdown(args: &ReportArgs, lightmap: &Lightmap, points: &Points, reference_s
     }
     out.push_str(
         "\n![error against time](quality.svg)\n\n## All settings\n\n\
-         | | | seconds | RMS | relative MSE | ± | noise² | bias² | brighter by | to mean | all light: MSE | to mean |\n\
-         |---|---|---|---|---|---|---|---|---|---|---|---|\n",
+         | | | seconds | RMS | relative MSE | ± | noise² | bias² | brighter by | to mean | all light: MSE | to mean | SSIM |\n\
+         |---|---|---|---|---|---|---|---|---|---|---|---|---|\n",
     );
     for r in rows {
         let e = &r.indirect;
         let all = r.all.map_or("– | –".into(), |a| format!("{:.1e} | {:.1e}", a.mse, a.to_mean));
         let _ = writeln!(
             out,
-            "| {} | {} | {:.2} | {:.2} % | {:.1e} | {:.0e} | {:.1e} | {:.1e} | {:+.2} % | {:.1e} | {all} |",
+            "| {} | {} | {:.2} | {:.2} % | {:.1e} | {:.0e} | {:.1e} | {:.1e} | {:+.2} % | {:.1e} | {all} | {} |",
             r.series,
             r.value,
             r.seconds,
@@ -388,10 +419,16 @@ fn markdown(args: &ReportArgs, lightmap: &Lightmap, points: &Points, reference_s
             e.variance,
             e.bias2,
             100.0 * e.mean,
-            e.to_mean
+            e.to_mean,
+            likeness(r.ssim),
         );
     }
     out
+}
+
+/// A similarity for people.
+fn likeness(ssim: Option<f64>) -> String {
+    ssim.map_or("–".into(), |s| format!("{s:.4}"))
 }
 
 #[cfg(test)]
@@ -400,7 +437,7 @@ mod tests {
 
     fn row(seconds: f64, mse: f64, bias2: f64) -> Row {
         let indirect = Errors { mse, bias2, variance: mse - bias2, ..Default::default() };
-        Row { series: "s".into(), value: String::new(), seconds, indirect, all: None }
+        Row { series: "s".into(), value: String::new(), seconds, indirect, all: None, ssim: None }
     }
 
     #[test]

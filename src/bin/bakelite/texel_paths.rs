@@ -47,6 +47,12 @@ impl TexelPaths {
         Ok(results.concat())
     }
 
+    /// The same at one receiver, on the caller's thread.
+    pub fn indirect_at(&self, receiver: &Receiver, rounds: u32, seed: u32) -> Result<Vec3> {
+        let e = self.block(std::slice::from_ref(receiver), rounds, seed)?;
+        Ok(DVec3::from(e[0]).as_vec3())
+    }
+
     fn block(&self, receivers: &[Receiver], rounds: u32, seed: u32) -> Result<Vec<[f64; 3]>> {
         let mut sums = vec![DVec3::ZERO; receivers.len()];
         for round in 0..rounds {
