@@ -1,6 +1,6 @@
 //! `bakelite report pipeline`: what each stage of a bake takes (thesis 4.2), and what bounds it: rays per second
 //! beside those of the bare kernels on rays of the same distribution, bytes per second beside what the memory
-//! gives.
+//! gives. And where the power of the lights goes, at several photon counts.
 
 use crate::Job;
 use crate::args::BakeArgs;
@@ -8,11 +8,11 @@ use crate::bar_chart::{self, Bar};
 use crate::measure::{median, pick, visible_texels};
 use crate::output;
 use bakelite::lightmap::{BakeStats, Lightmap, StageStats};
-use bakelite::photon::{PhotonParams, photon_rays};
+use bakelite::photon::{PhotonMap, PhotonParams, PhotonStats, photon_rays};
 use bakelite::sampling::{cosine_hemisphere, mix, orthonormal_basis, sobol_2d};
 use bakelite::trace::offset::offset_ray_origin;
 use bakelite::trace::{Hit, PACKET_SIZE, Packet, RawHit, Ray};
-use bakelite::{Error, Light, Result, Scene};
+use bakelite::{Error, Light, Progress, Result, Scene};
 use glam::Vec3;
 use rayon::prelude::*;
 use std::fmt::Write;
@@ -24,6 +24,9 @@ const RUNS: usize = 5;
 
 /// Photons whose rays are traced by the bare kernel.
 const PHOTONS: u64 = 200_000;
+
+/// Photon counts for which power is accounted.
+const ENERGY_PHOTONS: [u64; 4] = [1_000, 10_000, 100_000, 1_000_000];
 
 /// Places that bare gather rays and shadow rays start from.
 const PLACES: usize = 4096;
@@ -85,7 +88,8 @@ pub fn run(args: &BakeArgs) -> Result<()> {
         row("composition", of(|b| b.compose), None),
         rayless("seams", (median(bakes.iter().map(|b| b.seam_seconds).collect()), 0)),
     ];
-    let text = markdown(args, &lightmap, &rows, memory);
+    let energy = ENERGY_PHOTONS.into_iter().map(|n| energy(&scene, n)).collect::<Result<Vec<_>>>()?;
+    let text = markdown(args, &lightmap, &rows, memory) + &energy_table(&energy);
     for (name, content) in [("pipeline.csv", &csv(&rows)), ("pipeline.svg", &chart(&rows)), ("pipeline.md", &text)] {
         output::write_text(&args.out.join(name), content)?;
     }
@@ -116,6 +120,33 @@ fn photons_rate(scene: &Arc<Scene>) -> Result<f64> {
     let start = Instant::now();
     scene.intersect_many(&rays, true, &mut hits)?;
     Ok(rays.len() as f64 / start.elapsed().as_secs_f64())
+}
+
+/// Where power went when so many photons were traced.
+fn energy(scene: &Arc<Scene>, photon_count: u64) -> Result<PhotonStats> {
+    let params = PhotonParams { photon_count, ..Default::default() };
+    Ok(PhotonMap::trace(scene, &params, &Progress::none())?.stats())
+}
+
+fn energy_table(all: &[PhotonStats]) -> String {
+    let mut out = String::from(
+        "\n## Power\n\nMean of the channels. The rest is the sampling error of Russian roulette.\n\n\
+         | photons | emitted, W | absorbed | escaped | cut off | rest |\n|---|---|---|---|---|---|\n",
+    );
+    for s in all {
+        let mean = |power: [f64; 3]| power.iter().sum::<f64>() / 3.0;
+        let emitted = mean(s.emitted_power);
+        let part = |power| 100.0 * mean(power) / emitted;
+        let parts = [part(s.absorbed_power), part(s.escaped_power), part(s.truncated_power)];
+        let [absorbed, escaped, cut] = parts;
+        let rest = 100.0 - parts.iter().sum::<f64>();
+        let _ = writeln!(
+            out,
+            "| {} | {emitted:.5e} | {absorbed:.3} % | {escaped:.3} % | {cut:.3} % | {rest:+.3} % |",
+            s.emitted
+        );
+    }
+    out
 }
 
 /// Packets as the gather map traces them, without looking anything up.
