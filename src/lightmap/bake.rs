@@ -18,8 +18,8 @@ use crate::photon::{PhotonMap, PhotonParams};
 use crate::progress::Progress;
 use crate::sampling::{combine, purpose_seed};
 use crate::scene::Scene;
-use crate::trace::Ray;
 use crate::trace::offset::too_few_digits;
+use crate::trace::solids::sees_a_back;
 use glam::Vec3;
 use rayon::prelude::*;
 use std::ops::Range;
@@ -385,11 +385,8 @@ impl Bake<'_, '_> {
                     if let Some(indirect) = indirect {
                         let (value, clear) = self.interpolate(sample, indirect);
                         ind[i] = value;
-                        if !clear {
-                            traced += 1;
-                            if inside_a_solid(scene, receiver.origin, receiver.geometric) {
-                                state[i] = TexelState::Hidden;
-                            }
+                        if !clear && sees_a_back(scene, receiver.origin, receiver.geometric, &mut traced) {
+                            state[i] = TexelState::Hidden;
                         }
                     }
                     if self.plan.runs(left_out::DIRECT) {
@@ -422,14 +419,4 @@ impl Bake<'_, '_> {
         });
         (sum, clear)
     }
-}
-
-/// Whether what lies straight above a surface is the back of a one-sided one.
-pub(crate) fn inside_a_solid(scene: &Scene, origin: Vec3, normal: Vec3) -> bool {
-    let hit = scene.intersect_raw(&Ray::new(origin, normal));
-    if hit.is_miss() || hit.front {
-        return false;
-    }
-    let material = scene.material(hit.triangle);
-    !material.two_sided && !material.transmits()
 }

@@ -10,7 +10,6 @@
 //! what the texel shows of its triangle. (Rather than from a mip chain, which would be kept for this alone:
 //! a texel's shadow rays take longer.)
 
-use super::bake::inside_a_solid;
 use super::charts::Charts;
 use super::direct::DirectLight;
 use super::map::ChartMap;
@@ -19,7 +18,7 @@ use crate::error::Result;
 use crate::photon::PhotonMap;
 use crate::photon::coverage::coverage;
 use crate::progress::Stage;
-use crate::sampling::{combine, orthonormal_basis, sobol_2d};
+use crate::sampling::{combine, sobol_2d};
 use crate::scene::{NONE, Scene};
 use crate::trace::RawHit;
 use glam::{Mat2, Vec2, Vec3};
@@ -99,21 +98,10 @@ fn texel(input: &RadianceInput, sample: usize, rays: &mut u64) -> Vec3 {
     if let Some(photons) = input.photons {
         let by_photons = Vec3::from(photons.estimate(point.position, receiver.geometric));
         if by_photons != Vec3::ZERO {
-            let is_buried = |origin, normal| is_buried(input.scene, origin, normal);
-            e += by_photons / coverage(photons, point.position, receiver.geometric, seed, is_buried, rays);
+            e += by_photons / coverage(photons, point.position, receiver.geometric, seed, rays);
         }
     }
     albedo * e / PI
-}
-
-/// Whether a surface lies inside a solid: straight above it and to all sides are backs. (Straight above alone may
-/// be that of a single sheet, such as a grate, below which there is light.)
-fn is_buried(scene: &Scene, origin: Vec3, normal: Vec3) -> bool {
-    let (x, y) = orthonormal_basis(normal);
-    let aside = [x, -x, y, -y].into_iter().map(|side| normal + side);
-    scene.uses().solids
-        && inside_a_solid(scene, origin, normal)
-        && aside.into_iter().all(|d| inside_a_solid(scene, origin, d))
 }
 
 /// Look-ups of a texture in one texel, at most.

@@ -16,7 +16,8 @@ use crate::sampling::{concentric_disc, orthonormal_basis, sobol_2d};
 use crate::scene::Scene;
 use crate::trace::Ray;
 use crate::trace::offset::offset_ray_origin;
-use glam::Vec3;
+use crate::trace::solids::is_buried;
+use glam::{Vec2, Vec3};
 
 /// Estimates are raised by a factor of four at most, as the corner of a box needs: on scraps of surface that
 /// hardly any photon hits, more would make single photons shine.
@@ -28,16 +29,8 @@ const PROBES: u32 = 32;
 /// If these of them all meet surface, so do the others, it is supposed: at most points there is no edge nearby.
 const FIRST: u32 = 8;
 
-/// What the estimate of `map` at a point is to be divided by, in [1/4, 1]. `is_buried` tells of a point that rays
-/// may start from, and its normal, that no light gets there. Counts the probes in `rays`, not what that takes.
-pub(crate) fn coverage(
-    map: &PhotonMap,
-    position: Vec3,
-    normal: Vec3,
-    seed: u32,
-    is_buried: impl Fn(Vec3, Vec3) -> bool,
-    rays: &mut u64,
-) -> f32 {
+/// What the estimate of `map` at a point is to be divided by, in [1/4, 1]. Counts the rays that takes.
+pub(crate) fn coverage(map: &PhotonMap, position: Vec3, normal: Vec3, seed: u32, rays: &mut u64) -> f32 {
     let scene = map.scene();
     let (radius, height) = (map.cylinder.radius, map.cylinder.radius * map.cylinder.half_height);
     let (x, y) = orthonormal_basis(normal);
@@ -46,12 +39,13 @@ pub(crate) fn coverage(
         if i == FIRST && covered == all {
             return 1.0;
         }
-        let d = glam::Vec2::from(concentric_disc(sobol_2d(i, seed)));
+        let d = Vec2::from(concentric_disc(sobol_2d(i, seed)));
         let weight = map.cylinder.filter(d.length());
         all += weight;
         *rays += 1;
         let surface = probe(scene, position + radius * (d.x * x + d.y * y), normal, height);
-        if surface.is_some_and(|(point, facing)| !is_buried(offset_ray_origin(point, facing, scene), facing)) {
+        let gets_light = |(point, facing)| !is_buried(scene, offset_ray_origin(point, facing, scene), facing, rays);
+        if surface.is_some_and(gets_light) {
             covered += weight;
         }
     }
@@ -72,37 +66,62 @@ fn probe(scene: &Scene, position: Vec3, normal: Vec3, height: f32) -> Option<(Ve
 #[cfg(test)]
 mod tests {
     use super::*;
-    use crate::bvh::BuildOptions;
-    use crate::device::{Device, DeviceOptions};
     use crate::photon::PhotonParams;
+    use crate::photon::tests::commit;
     use crate::progress::Progress;
     use crate::scene::shapes::MeshBuilder;
-    use crate::scene::{Light, Material, Scene, SceneData};
+    use crate::scene::{Light, Material, SceneData};
+
+    /// Photons with a search radius of 0.1 on a square below a light that gives it 2 W/m², and on what `add` puts there.
+    fn square(add: impl Fn(&mut MeshBuilder, u32)) -> PhotonMap {
+        let mut data = SceneData::new();
+        let m = data.add_material(Material { albedo: [0.0; 3], ..Default::default() }).unwrap();
+        let mut builder = MeshBuilder::new();
+        builder.quad(at(0.0, 0.0), at(1.0, 0.0), at(1.0, 1.0), at(0.0, 1.0), m);
+        add(&mut builder, m);
+        data.add_mesh(builder.finish()).unwrap();
+        data.add_light(Light::Directional { direction: -Vec3::Z, irradiance: [2.0; 3], angular_radius: 0.0 }).unwrap();
+        let params = PhotonParams { photon_count: 1 << 20, radius: 0.1, ..Default::default() };
+        PhotonMap::trace(&commit(data), &params, &Progress::none()).unwrap()
+    }
+
+    fn at(x: f32, y: f32) -> Vec3 {
+        Vec3::new(x, y, 0.0)
+    }
+
+    /// The mean over many seeds.
+    fn mean_coverage(map: &PhotonMap, position: Vec3, normal: Vec3) -> f32 {
+        let seeds = 64;
+        (0..seeds).map(|s| coverage(map, position, normal, s, &mut 0)).sum::<f32>() / seeds as f32
+    }
 
     #[test]
     fn edges_and_corners_of_a_square_get_their_light_back() {
-        let device = Device::new(DeviceOptions { num_threads: 1, ..Default::default() }).unwrap();
-        let mut data = SceneData::new();
-        let m = data.add_material(Material::default()).unwrap();
-        let mut builder = MeshBuilder::new();
-        let p = |x: f32, y: f32| Vec3::new(x, y, 0.0);
-        builder.quad(p(0.0, 0.0), p(1.0, 0.0), p(1.0, 1.0), p(0.0, 1.0), m);
-        data.add_mesh(builder.finish()).unwrap();
-        data.add_light(Light::Directional { direction: -Vec3::Z, irradiance: [2.0; 3], angular_radius: 0.0 }).unwrap();
-        let scene = Scene::commit(&device, data, &BuildOptions::default(), &Progress::none()).map_err(|e| e.1).unwrap();
-        let params = PhotonParams { photon_count: 1 << 18, radius: 0.1, ..Default::default() };
-        let map = PhotonMap::trace(&scene, &params, &Progress::none()).unwrap();
-        let of = |position, normal, seed| coverage(&map, position, normal, seed, |_, _| false, &mut 0);
-        for (x, y, part) in [(0.5, 0.5, 1.0), (0.0, 0.4, 0.5), (1.0, 0.0, 0.25)] {
-            let seeds = 64;
-            let found = (0..seeds).map(|s| of(p(x, y), Vec3::Z, s)).sum::<f32>() / seeds as f32;
-            let e = map.estimate(p(x, y), Vec3::Z)[0];
-            assert!((found / part - 1.0).abs() < 0.05, "{x} {y}: {found}");
-            assert!((e / found / 2.0 - 1.0).abs() < 0.05, "{x} {y}: {e} by {found}");
+        let map = square(|_, _| ());
+        assert_eq!(mean_coverage(&map, at(0.5, 0.5), Vec3::Z), 1.0);
+        // In the corner, what is found less than a quarter by chance counts as a quarter: 2.5% too much.
+        for (x, y, part, tolerance) in [(0.5, 0.5, 1.0, 1e-3), (0.0, 0.4, 0.5, 1e-3), (1.0, 0.0, 0.25, 0.05)] {
+            let found = mean_coverage(&map, at(x, y), Vec3::Z);
+            let e = map.estimate(at(x, y), Vec3::Z)[0] / found / 2.0;
+            assert!((found / part - 1.0).abs() < tolerance, "{x} {y}: {found}");
+            assert!((e - 1.0).abs() < tolerance, "{x} {y}: {e}");
         }
-        // Surfaces that face elsewhere do not count, nor do those that no light gets to.
-        assert_eq!(of(p(0.5, 0.5), Vec3::X, 0), LEAST);
-        assert_eq!(of(p(0.5, 0.5), -Vec3::Z, 0), LEAST);
-        assert_eq!(coverage(&map, p(0.5, 0.5), Vec3::Z, 0, |_, _| true, &mut 0), LEAST);
+        // Surfaces that face elsewhere do not count.
+        assert_eq!(mean_coverage(&map, at(0.5, 0.5), Vec3::X), LEAST);
+        assert_eq!(mean_coverage(&map, at(0.5, 0.5), -Vec3::Z), LEAST);
+    }
+
+    #[test]
+    fn what_lies_below_a_box_gets_no_light_and_does_not_count() {
+        let map = square(|b, m| b.box_(Vec3::new(0.5, -0.1, -0.1), Vec3::new(1.1, 1.1, 0.1), false, m));
+        let (beside, mut rays) = (at(0.5, 0.5), 0);
+        let found = mean_coverage(&map, beside, Vec3::Z);
+        let e = map.estimate(beside, Vec3::Z)[0] / found / 2.0;
+        assert!((found / 0.5 - 1.0).abs() < 1e-3, "{found}");
+        assert!((e - 1.0).abs() < 1e-3, "{e}");
+        assert_eq!(mean_coverage(&map, at(0.8, 0.5), Vec3::Z), LEAST);
+        // Each probe that meets the square costs a ray, and each below the box five.
+        coverage(&map, at(0.8, 0.5), Vec3::Z, 0, &mut rays);
+        assert_eq!(rays, 6 * u64::from(PROBES));
     }
 }

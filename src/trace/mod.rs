@@ -15,6 +15,7 @@ mod kernels;
 pub mod offset;
 mod packet;
 mod single;
+pub(crate) mod solids;
 mod tree;
 mod triangle;
 
