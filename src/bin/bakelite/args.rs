@@ -76,8 +76,8 @@ Report live (live.md with its tables and plots):
 Report quality (quality.md):
   --points N             points at which light is compared [400]
   --seeds N              bakes per setting, to tell noise from bias [4]
-  --paths N              paths per point of the path traced reference, and per pixel of
-                         a path traced view [4096]
+  --paths N              paths per point of the path traced reference [4096]
+  --view-paths N         paths per pixel of a path traced view, 1,024 or times that [1024]
   --knobs A,B,..         what to vary, of gather-rays, photons, radius, blur,
                          direct-samples, gather-divisor, radiance-divisor,
                          path-tracing, photons-alone, or none [all of these]
@@ -178,6 +178,8 @@ pub struct ReportArgs {
     pub seeds: u64,
     /// Quality: paths per point of the reference.
     pub paths: u32,
+    /// Quality: paths per pixel of the reference's view.
+    pub view_paths: u32,
     /// Quality: what to vary, of [`KNOBS`].
     pub knobs: Vec<String>,
 }
@@ -191,6 +193,7 @@ impl Default for ReportArgs {
             points: 400,
             seeds: 4,
             paths: 4096,
+            view_paths: 1024,
             knobs: KNOBS.map(String::from).to_vec(),
         }
     }
@@ -264,6 +267,11 @@ pub fn parse(args: impl IntoIterator<Item = OsString>) -> Result<Command, String
             Arg::Long("paths") => {
                 of_report.push(("--paths", "quality"));
                 report.paths = at_least_one("--paths", &value("--paths", &mut parser)?)?.min(u32::MAX.into()) as u32;
+            }
+            Arg::Long("view-paths") => {
+                of_report.push(("--view-paths", "quality"));
+                let paths = at_least_one("--view-paths", &value("--view-paths", &mut parser)?)?;
+                report.view_paths = paths.min(u32::MAX.into()) as u32;
             }
             Arg::Long("knobs") => {
                 of_report.push(("--knobs", "quality"));

@@ -65,7 +65,7 @@ pub fn run(args: &ReportArgs) -> Result<()> {
     let (width, height) = (args.bake.width, args.bake.height);
     let size = [VIEW_WIDTH, (VIEW_WIDTH * height / width).max(1)];
     let camera = job.camera(&lightmap);
-    let view = job.bars.show("view", |p| ViewReference::new(&lightmap, camera, size, args.paths, p))?;
+    let view = job.bars.show("view", |p| ViewReference::new(&lightmap, camera, size, args.view_paths, p))?;
     let at_points = points_csv(&points, &points.of_bake(&lightmap, Layer::Indirect));
     let mut measure = Measure { args, points: &points, view: &view, rows: Vec::new() };
     measure.bakes(&job, &mut lightmap)?;
@@ -359,9 +359,9 @@ fn markdown(
          texels; {photons} photons, {rays} gather rays, blur {blur} unless another value is named; threads: {threads}, \
          {isa}.\n\n\
          Errors are of irradiance at {count} points that are seen from places in the scene, against {paths} paths per \
-         point of an independent path tracer in f64 ({reference_seconds:.0} s). Relative MSE is the mean of the squared error by the square of the reference \
-         (what is darker than a tenth of its mean counts as so bright), RMS its root; to mean, the mean of the squared \
-         error by the square of the reference's mean. The reference's own noise is not part of them: they are products \
+         point of an independent path tracer in f64 ({reference_seconds:.0} s). Relative MSE is the mean of the squared \
+         error by the square of the reference (what is darker than a tenth of its mean counts as so bright), RMS its \
+         root; to mean, the mean of the squared error by the square of the reference's mean. The reference's own noise is not part of them: they are products \
          of the differences from its two halves. Noise is what differs between {seeds} seeds, bias what does not; \
          MSE = noise² + bias². ± is one standard error of the MSE, from the points chosen. Seconds are those of the \
          bake, without charts; of path tracing and photons alone those at the points compared, scaled to all.\n\n\

@@ -185,7 +185,6 @@ mod tests {
                 let variance = runs.iter().map(|e| (e[c] - mean).powi(2)).sum::<f64>() / (n * (n - 1)) as f64;
                 let error = (variance + truth.standard_error[c].powi(2)).sqrt();
                 let off = mean - truth.indirect[c];
-                println!("{place} {c}: {mean} ± {error}, {}", truth.indirect[c]);
                 assert!(error < 6e-3 * mean && off.abs() < 3.0 * error, "{place} {c}: {mean} ± {error}, {truth:?}");
             }
         }
