@@ -432,7 +432,6 @@ mod tests {
                     bias += off / (points * seeds) as f64;
                 }
             }
-            eprintln!("emissive {emissive}: MSE {mse:.2e}, bias {bias:.2e} of the unoccluded light");
             assert!(mse < 4e-3 && bias.abs() < 4e-3, "emissive {emissive}: MSE {mse}, bias {bias}");
         }
     }
@@ -465,7 +464,6 @@ mod tests {
                 mean_of(&|seed| direct.unbiased(&r, 1, seed, &mut 0)),
                 mean_of(&|seed| direct.irradiance(&r, 1, seed, &mut 0)),
             );
-            println!("{side} {radius}: {unbiased}, by ratio {by_ratio}");
             assert!(unbiased.abs() < 0.005, "{side} {radius}: {unbiased}");
             worst = by_ratio.abs().max(worst);
         }
