@@ -4,8 +4,8 @@
 use bakelite::bvh::BuildOptions;
 use bakelite::lightmap::{Layer, LayerData, Lightmap, LightmapDesc};
 use bakelite::live::{Budget, Live, LiveCamera, LiveParams, LiveStats, Mode, PageRect};
-use bakelite::scene::{Light, builtin};
-use bakelite::{Device, DeviceOptions, Error, Progress, Scene};
+use bakelite::scene::{Light, MeshMaterials, builtin};
+use bakelite::{Device, DeviceOptions, Error, Material, Mesh, Progress, Scene, SceneData};
 use glam::Vec3;
 use std::f32::consts::PI;
 
@@ -13,8 +13,11 @@ const RAYS: Budget = Budget { milliseconds: 0.0, rays: 200_000 };
 
 /// A light map of a built-in scene, not baked.
 fn unbaked(name: &str, threads: usize, texels_per_unit: f32) -> Lightmap {
+    unbaked_of(builtin(name).unwrap(), threads, texels_per_unit)
+}
+
+fn unbaked_of(data: SceneData, threads: usize, texels_per_unit: f32) -> Lightmap {
     let device = Device::new(DeviceOptions { num_threads: threads, ..Default::default() }).unwrap();
-    let data = builtin(name).unwrap();
     let scene = Scene::commit(&device, data, &BuildOptions::default(), &Progress::none()).map_err(|e| e.1).unwrap();
     let desc = LightmapDesc { texels_per_unit, page_size: 256, ..Default::default() };
     Lightmap::create(&scene, &desc, &Progress::none()).unwrap()
@@ -101,6 +104,20 @@ fn position_based_and_uniform_updates_end_with_the_bits_of_a_bake() {
         assert!(live.sums().unwrap().iter().all(|s| s.1 == 3 * 64));
         assert_same_as_bake(&live, &mut lightmap, &format!("{mode:?}, {threads} threads"));
     }
+}
+
+/// Interpolation keeps the gap apart from what lies beside the carpet.
+#[test]
+fn a_carpet_in_the_cornell_box_ends_with_the_bits_of_a_bake() {
+    let mut data = builtin("cornell").unwrap();
+    let material = data.add_material(Material { two_sided: true, ..Default::default() }).unwrap();
+    let corners = [[0.1, 0.1], [0.1, 0.3], [0.4, 0.3], [0.4, 0.1]].map(|[x, z]| Vec3::new(x, 0.004, z));
+    let (indices, materials) = (vec![[0, 1, 2], [0, 2, 3]], MeshMaterials::One(material));
+    data.add_mesh(Mesh { positions: corners.into(), indices, materials, ..Default::default() }).unwrap();
+    let mut lightmap = unbaked_of(data, 2, 60.0);
+    let mut live = Live::new(&lightmap, &params(Mode::Uniform), &Progress::none()).unwrap();
+    assert_eq!(finish(&mut live).finished, 1.0);
+    assert_same_as_bake(&live, &mut lightmap, "carpet");
 }
 
 #[test]

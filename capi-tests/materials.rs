@@ -352,3 +352,31 @@ fn a_scene_that_uses_none_of_it_keeps_and_runs_none_of_it() {
     assert_eq!(stats.left_out & bits, left_out::CUTOUTS | left_out::TRANSMISSION);
     assert!(map.plan_text().contains("runs: albedo textures"), "{}", map.plan_text());
 }
+
+/// Gather texels as wide as the gap below a carpet is deep: they must neither darken the floor beside the carpet nor
+/// light the floor below it.
+#[test]
+fn a_carpet_has_no_dark_rim_and_its_gap_stays_dark() {
+    let mut data = SceneData::new();
+    let grey = data.add_material(Material { albedo: [0.5; 3], two_sided: true, ..Default::default() }).unwrap();
+    room(&mut data, Vec3::new(4.0, 4.0, 3.0), grey, grey);
+    data.add_mesh(sheet(Vec3::Z * 0.01, Vec3::X * 1.97, Vec3::Y * 4.0, 1.0, grey)).unwrap();
+    data.add_light(Light::Point { position: Vec3::new(2.0, 2.0, 2.5), intensity: [10.0; 3] }).unwrap();
+    let scene = commit(data, false);
+    let params = BakeParams { gather_rays: 256, photon_count: 200_000, stitch: false, ..Default::default() };
+    let (fine, coarse) = (bake(&scene, [20, 20], &params).0, bake(&scene, [20, 5], &params).0);
+    // The mean along the carpet, of the floor at some distance from the wall at x = 0.
+    let mean = |map: &Lightmap, x: f32| {
+        let light = |y: f32| {
+            let (triangle, u, v) = if y <= x { (0, (x - y) / 4.0, y / 4.0) } else { (1, x / 4.0, (y - x) / 4.0) };
+            map.sample(Layer::Indirect, triangle, u, v)[0]
+        };
+        (0..30).map(|j| light(0.5 + 0.1 * j as f32)).sum::<f32>() / 30.0
+    };
+    for x in (0..20).map(|i| 0.02 * i as f32) {
+        let (beside, below) =
+            (mean(&coarse, 2.0 + x) / mean(&fine, 2.1 + x), mean(&coarse, 1.84 - x) / mean(&fine, 2.1));
+        assert!((beside - 1.0).abs() < 0.02, "{x} beside the carpet: {beside}");
+        assert!(below < 0.03, "{x} below the carpet: {below}");
+    }
+}

@@ -2,6 +2,7 @@
 
 use super::charts::{Charts, automatic_density};
 use super::direct::DirectLight;
+use super::gaps::Gaps;
 use super::gather::{Gathered, SampleSet};
 use super::layout::Layout;
 use super::map::ChartMap;
@@ -194,6 +195,7 @@ pub(crate) struct Bake<'a, 'p> {
 struct Indirect {
     irradiance: Vec<Vec3>,
     valid: Vec<bool>,
+    gaps: Gaps,
 }
 
 impl Bake<'_, '_> {
@@ -312,10 +314,11 @@ impl Bake<'_, '_> {
             l.map.texels.placement_of(self.range.start as u32)..=l.map.texels.placement_of(self.range.end as u32 - 1);
         let needed = l.gather.texels.chart_start[*charts.start() as usize] as usize
             ..l.gather.texels.chart_start[*charts.end() as usize + 1] as usize;
+        let gaps = self.gaps(backs, *charts.start()..charts.end() + 1)?;
         let lookup = RadianceMap::new(&l.charts, &l.radiance, radiance);
         let samples = SampleSet::new(self.params.gather_rays, purpose_seed(self.params.seed, purpose::GATHER_SET));
         let seed = purpose_seed(self.params.seed, purpose::GATHER);
-        let stage = self.progress.stage("gather", 0.3, 0.6, needed.len() as u64);
+        let stage = self.progress.stage("gather", 0.32, 0.6, needed.len() as u64);
         let n = l.gather.len();
         let mut irradiance: Vec<Vec3> = try_vec(n, "the gather map")?;
         let mut normals: Vec<Vec3> = try_vec(n, "the gather map's normals")?;
@@ -351,10 +354,16 @@ impl Bake<'_, '_> {
             blur::blur(device, &l.charts, &l.gather, texels, radius, &mut blurred, &stage)?;
             irradiance = blurred;
         }
-        let rays = needed.len() as u64 * samples.len() as u64;
+        let rays = needed.len() as u64 * samples.len() as u64 + gaps.rays;
         let bytes = (n * GATHER_BYTES + l.gather.bytes()) as u64;
         stats.gather = StageStats { seconds: start.elapsed().as_secs_f64(), rays, bytes };
-        Ok(Indirect { irradiance, valid })
+        Ok(Indirect { irradiance, valid, gaps })
+    }
+
+    /// Which texels of some charts lie in gaps.
+    pub(crate) fn gaps(&self, backs: &[bool], charts: Range<u32>) -> Result<Gaps> {
+        let stage = self.progress.stage("gaps", 0.3, 0.32, charts.len() as u64);
+        Gaps::find(self.atlas, charts, backs, &stage)
     }
 
     /// Direct light and the interpolated indirect light of every texel of the range.
@@ -383,8 +392,9 @@ impl Bake<'_, '_> {
                     let receiver = l.receiver(&l.map, backs, sample);
                     state[i] = TexelState::Visible;
                     if let Some(indirect) = indirect {
-                        let (value, clear) = self.interpolate(sample, indirect);
-                        ind[i] = value;
+                        let mut clear = true;
+                        ind[i] =
+                            l.interpolate(&indirect.irradiance, &indirect.gaps, sample, |s| clear &= indirect.valid[s]);
                         if !clear && sees_a_back(scene, receiver.origin, receiver.geometric, &mut traced) {
                             state[i] = TexelState::Hidden;
                         }
@@ -404,19 +414,5 @@ impl Bake<'_, '_> {
             bytes: (l.map.len() * 25 + l.map.bytes()) as u64,
         };
         Ok(())
-    }
-
-    /// Indirect light at a sample of the light map, and whether all gather texels that it comes
-    /// from can be seen.
-    fn interpolate(&self, sample: usize, indirect: &Indirect) -> (Vec3, bool) {
-        let l = self.atlas;
-        let t = &l.map.texels.samples[sample];
-        let chart = l.charts.chart_of[t.triangle as usize];
-        let (mut sum, mut clear) = (Vec3::ZERO, true);
-        l.gather.bilinear(chart, l.charts.local(t.triangle, t.u, t.v), |s, w| {
-            sum += w * indirect.irradiance[s];
-            clear &= indirect.valid[s];
-        });
-        (sum, clear)
     }
 }

@@ -10,6 +10,7 @@ pub mod blur;
 pub mod charts;
 pub mod direct;
 mod distant;
+pub(crate) mod gaps;
 pub(crate) mod gather;
 pub mod layout;
 mod light_tree;
@@ -31,6 +32,7 @@ use crate::memory::Reservation;
 use crate::photon::MAX_PHOTONS;
 use crate::scene::Scene;
 use charts::Charts;
+use gaps::Gaps;
 use glam::Vec3;
 use map::ChartMap;
 use plan::Plan;
@@ -229,6 +231,31 @@ impl Atlas {
         let chart = self.charts.chart_of[map.texels.samples[sample].triangle as usize];
         let back = backs.get(chart as usize).is_some_and(|&b| b);
         map.receiver(&self.scene, sample, back).1
+    }
+
+    /// A gather map's `values` interpolated at a sample of the light map: between those texels around that lie in a
+    /// gap as it does, or do not as it does not. `visit` is told all around.
+    #[inline]
+    pub(crate) fn interpolate(
+        &self,
+        values: &[Vec3],
+        gaps: &Gaps,
+        sample: usize,
+        mut visit: impl FnMut(usize),
+    ) -> Vec3 {
+        let t = &self.map.texels.samples[sample];
+        let chart = self.charts.chart_of[t.triangle as usize];
+        let local = self.charts.local(t.triangle, t.u, t.v);
+        let (mut all, mut alike, mut part) = (Vec3::ZERO, Vec3::ZERO, 0.0);
+        self.gather.bilinear(chart, local, |s, w| {
+            visit(s);
+            all += w * values[s];
+            if !gaps.is_empty() && gaps.are_alike(sample, s) {
+                alike += w * values[s];
+                part += w;
+            }
+        });
+        if part > 0.0 && part < 1.0 { alike / part } else { all }
     }
 }
 

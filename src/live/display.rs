@@ -4,6 +4,7 @@
 
 use super::blocks::{Block, BlockMap, DirectTile, Rect, TILE};
 use crate::lightmap::blur::{Texels, Window};
+use crate::lightmap::gaps::Gaps;
 use crate::memory::try_vec;
 use crate::scene::NONE;
 use glam::Vec3;
@@ -422,20 +423,15 @@ impl Display {
     }
 
     /// Irradiance shown at a sample of the light map; `with_direct` false: indirect light alone.
-    pub fn irradiance(&self, map: &BlockMap, sample: u32, with_direct: bool) -> Vec3 {
+    pub fn irradiance(&self, map: &BlockMap, gaps: &Gaps, sample: u32, with_direct: bool) -> Vec3 {
         let atlas = &map.atlas;
-        let t = &atlas.map.texels.samples[sample as usize];
-        let chart = atlas.charts.chart_of[t.triangle as usize];
-        let local = atlas.charts.local(t.triangle, t.u, t.v);
-        let mix = |values: &[Vec3]| {
-            let mut sum = Vec3::ZERO;
-            atlas.gather.bilinear(chart, local, |s, w| sum += w * values[s]);
-            sum
-        };
-        let indirect = mix(&self.shown);
+        let indirect = atlas.interpolate(&self.shown, gaps, sample as usize, |_| ());
         if !with_direct {
             return indirect;
         }
+        let t = &atlas.map.texels.samples[sample as usize];
+        let chart = atlas.charts.chart_of[t.triangle as usize];
+        let local = atlas.charts.local(t.triangle, t.u, t.v);
         // Coordinates are not negative, so that truncation rounds down.
         let at = atlas.gather.layout.texel_coord(chart, local);
         let b = map.block_at(chart, at[0] as i32, at[1] as i32) as usize;
@@ -449,7 +445,11 @@ impl Display {
             + match fine {
                 Some(fine) if self.tile_epochs[b] == self.epoch => fine,
                 Some(old) => (old + self.change_of_direct(map, chart, local, b)).max(Vec3::ZERO),
-                None => mix(&self.coarse),
+                None => {
+                    let mut coarse = Vec3::ZERO;
+                    atlas.gather.bilinear(chart, local, |s, w| coarse += w * self.coarse[s]);
+                    coarse
+                }
             }
     }
 

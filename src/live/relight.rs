@@ -10,6 +10,7 @@ use crate::device::{Device, DeviceOptions};
 use crate::error::{Error, Result};
 use crate::lightmap::bake::Bake;
 use crate::lightmap::direct::DirectLight;
+use crate::lightmap::gaps::Gaps;
 use crate::lightmap::plan::{Plan, left_out};
 use crate::lightmap::{Atlas, BakeParams, BakeStats};
 use crate::progress::Progress;
@@ -30,6 +31,8 @@ pub(super) struct Illumination {
     pub radiance: Arc<Vec<Vec3>>,
     /// Per chart, whether its back is shown.
     pub backs: Arc<Vec<bool>>,
+    /// On the sides that are shown; none without indirect light.
+    pub gaps: Arc<Gaps>,
     /// Whether there is, or ever was, any indirect light.
     pub has_indirect: bool,
     /// Numbers that change with the parts.
@@ -40,29 +43,46 @@ pub(super) struct Illumination {
 /// Radiance map and sides.
 pub(super) struct Indirect {
     radiance: Vec<Vec3>,
-    /// Empty: as they were.
-    backs: Vec<bool>,
+    /// Which backs are shown, and the gaps there; `None`: as they were.
+    sides: Option<(Vec<bool>, Gaps)>,
     has_indirect: bool,
 }
 
-/// Computes radiance map and sides under the scene's lights of now.
-fn illuminate(atlas: &Atlas, params: &BakeParams, direct: &DirectLight, progress: &Progress) -> Result<Indirect> {
+/// Computes radiance map and, `with_sides`, sides under the scene's lights of now.
+fn illuminate(
+    atlas: &Atlas,
+    params: &BakeParams,
+    direct: &DirectLight,
+    with_sides: bool,
+    progress: &Progress,
+) -> Result<Indirect> {
     let two_sided = !atlas.radiance.layout.back_of.is_empty();
     let plan = Plan::new(&atlas.scene, direct, params, two_sided, false);
     let bake = Bake { atlas, params, plan: &plan, direct, range: 0..atlas.map.len(), progress };
     let (radiance, backs) = bake.illuminate(&mut BakeStats::default())?;
-    Ok(Indirect { radiance, backs, has_indirect: plan.runs(left_out::INDIRECT) })
+    let has_indirect = plan.runs(left_out::INDIRECT);
+    let sides = match with_sides {
+        true if has_indirect => {
+            let gaps = bake.gaps(&backs, 0..atlas.charts.charts.len() as u32)?;
+            Some((backs, gaps))
+        }
+        true => Some((backs, Gaps::default())),
+        false => None,
+    };
+    Ok(Indirect { radiance, sides, has_indirect })
 }
 
 impl Illumination {
     /// Of the scene's lights of now, with all photons.
     pub fn new(atlas: &Atlas, params: &BakeParams, progress: &Progress) -> Result<Illumination> {
         let direct = DirectLight::new(&atlas.scene);
-        let i = illuminate(atlas, params, &direct, progress)?;
+        let i = illuminate(atlas, params, &direct, true, progress)?;
+        let (backs, gaps) = i.sides.unwrap_or_default();
         Ok(Illumination {
             direct: Arc::new(direct),
             radiance: Arc::new(i.radiance),
-            backs: Arc::new(i.backs),
+            backs: Arc::new(backs),
+            gaps: Arc::new(gaps),
             has_indirect: i.has_indirect,
             direct_epoch: 1,
             indirect_epoch: 1,
@@ -74,10 +94,13 @@ impl Illumination {
         let mut light = Illumination { indirect_epoch: self.indirect_epoch + 1, ..self.clone() };
         if new.has_indirect {
             light.radiance = Arc::new(new.radiance);
-            if !new.backs.is_empty() && *light.backs != new.backs {
-                // Other sides are shown: their direct light is another one too.
-                light.direct_epoch += 1;
-                light.backs = Arc::new(new.backs);
+            if let Some((backs, gaps)) = new.sides {
+                light.gaps = Arc::new(gaps);
+                if *light.backs != backs {
+                    // Other sides are shown: their direct light is another one too.
+                    light.direct_epoch += 1;
+                    light.backs = Arc::new(backs);
+                }
             }
             light.has_indirect = true;
         } else {
@@ -128,17 +151,16 @@ impl Relight {
         let (sender, results) = channel();
         let cancel = Arc::new(AtomicBool::new(false));
         let cancelled = cancel.clone();
-        let compute = move |params: &BakeParams, progress: &Progress| {
+        let compute = move |params: &BakeParams, with_sides: bool, progress: &Progress| {
             let direct = DirectLight::new(&atlas.scene);
-            let result = catch_unwind(AssertUnwindSafe(|| illuminate(&atlas, params, &direct, progress)));
+            let result = catch_unwind(AssertUnwindSafe(|| illuminate(&atlas, params, &direct, with_sides, progress)));
             result.unwrap_or_else(|_| Err(Error::Internal("relighting panicked".into())))
         };
         device.spawn(move || {
             let quick = BakeParams { photon_count: params.photon_count.div_ceil(QUICK_PART), ..params };
-            let first = compute(&quick, &Progress::none());
             // Nobody listens any more when the live object is gone.
-            let _ = sender.send(first.map(|i| Indirect { backs: Vec::new(), ..i }));
-            let _ = sender.send(compute(&params, &Progress::new(|_, _| !cancelled.load(Relaxed))));
+            let _ = sender.send(compute(&quick, false, &Progress::none()));
+            let _ = sender.send(compute(&params, true, &Progress::new(|_, _| !cancelled.load(Relaxed))));
         });
         self.device = Some(device);
         self.running = Some(Running { results: Mutex::new(results), cancel });
@@ -218,15 +240,16 @@ mod tests {
             direct: Arc::new(DirectLight::new(&scene)),
             radiance: Arc::new(vec![Vec3::ZERO; 3]),
             backs: Arc::new(vec![false, true]),
+            gaps: Arc::default(),
             has_indirect: true,
             direct_epoch: 1,
             indirect_epoch: 1,
         };
-        let new = |backs| Indirect { radiance: vec![Vec3::ONE; 3], backs, has_indirect: true };
-        let quick = before.renewed(new(Vec::new()));
+        let new = |sides| Indirect { radiance: vec![Vec3::ONE; 3], sides, has_indirect: true };
+        let quick = before.renewed(new(None));
         assert_eq!((quick.direct_epoch, quick.indirect_epoch, quick.radiance[0]), (1, 2, Vec3::ONE));
         assert_eq!(quick.backs, before.backs);
-        let full = quick.renewed(new(vec![true, true]));
+        let full = quick.renewed(new(Some((vec![true, true], Gaps::default()))));
         assert_eq!((full.direct_epoch, full.indirect_epoch), (2, 3));
         assert_eq!(*full.backs, [true, true]);
     }

@@ -1,0 +1,244 @@
+//! Texels in gaps narrower than themselves.
+//!
+//! The light behind a picture frame, below a skirting board or between a carpet and the floor is not that of the
+//! wall and the floor beside it, and a gather texel there may be as wide as the gap is deep. Interpolated as they
+//! come, dark rims lie around what stands on or hangs before a surface, and gaps shine. So a texel of the light map
+//! interpolates between those gather texels that lie in a gap as it does itself, or do not as it does not. (This is
+//! the joint bilateral upsampling of Kopf, Cohen, Lischinski and Uyttendaele, 2007; its guide is who lies in a gap.)
+//!
+//! Living room, 20 texels/m and gather_divisor 4: mean squared relative error of all but the worst hundredth of the
+//! points 8.5e-3 instead of 16e-3, and none of the other scenes measured more than before. What brought less: the mean
+//! of open neighbours for gather texels in gaps (10e-3, but gaps shine: 0.27 instead of 0.11 with the worst), moving
+//! their samples to places in the open (11e-3, and 0.27 instead of 0.09 in Sponza), a blur that keeps them apart
+//! (no difference), gaps of half the width (12e-3) or twice that (13e-3).
+
+use super::Atlas;
+use super::map::ChartMap;
+use crate::error::Result;
+use crate::memory::{Reservation, try_vec};
+use crate::progress::Stage;
+use crate::sampling::{cosine_hemisphere, orthonormal_basis, sobol_2d};
+use crate::trace::Ray;
+use rayon::prelude::*;
+use std::ops::Range;
+use std::sync::atomic::{AtomicU64, Ordering::Relaxed};
+
+/// Rays that tell whether a texel is in a gap, at most.
+const PROBES: u32 = 16;
+
+/// Outside of gaps at least so many of them get further than a texel.
+const AWAY: u32 = 2;
+
+/// Which gather texels lie in gaps, and which texels of the light map do that interpolate between some that do and
+/// some that do not.
+#[derive(Default)]
+pub(crate) struct Gaps {
+    gather: Bits,
+    map: Bits,
+    /// Rays that it took.
+    pub rays: u64,
+    _memory: Option<Reservation>,
+}
+
+impl Gaps {
+    /// Of some `charts` of an atlas, on the sides that `backs` tells. Advances `stage` by one per chart.
+    pub(crate) fn find(atlas: &Atlas, charts: Range<u32>, backs: &[bool], stage: &Stage) -> Result<Gaps> {
+        let search = Search { atlas, backs, rays: AtomicU64::new(0) };
+        let of_chart = |chart: u32| {
+            stage.advance(1)?;
+            Ok(search.chart(chart))
+        };
+        let device = atlas.scene.device();
+        let found: Vec<InGaps> = device.install(|| charts.into_par_iter().map(of_chart).collect::<Result<_>>())?;
+        let gather = Bits::new(found.iter().flat_map(|f| &f.gather), atlas.gather.len())?;
+        let map = Bits::new(found.iter().flat_map(|f| &f.map), atlas.map.len())?;
+        let memory = device.memory().reserve(gather.bytes() + map.bytes(), "the texels in gaps")?;
+        Ok(Gaps { gather, map, rays: search.rays.into_inner(), _memory: Some(memory) })
+    }
+
+    /// Whether a texel of the light map and one of the gather map both lie in gaps, or neither.
+    #[inline]
+    pub(crate) fn are_alike(&self, map: usize, gather: usize) -> bool {
+        self.map.has(map) == self.gather.has(gather)
+    }
+
+    /// Whether there are none.
+    #[inline]
+    pub(crate) fn is_empty(&self) -> bool {
+        self.gather.words.is_empty()
+    }
+}
+
+/// Samples in gaps of one chart.
+#[derive(Default)]
+struct InGaps {
+    gather: Vec<u32>,
+    map: Vec<u32>,
+}
+
+struct Search<'a> {
+    atlas: &'a Atlas,
+    backs: &'a [bool],
+    rays: AtomicU64,
+}
+
+impl Search<'_> {
+    fn chart(&self, chart: u32) -> InGaps {
+        let (gather, map, charts) = (&self.atlas.gather, &self.atlas.map, &self.atlas.charts);
+        let scale = gather.layout.placements[chart as usize].scale;
+        let texel = 1.0 / scale[0].min(scale[1]);
+        let mut rays = 0;
+        let of_chart = gather.samples_of(chart);
+        let is_in_gap: Vec<bool> = of_chart.clone().map(|s| self.is_in_gap(gather, s, texel, &mut rays)).collect();
+        let mut found = InGaps::default();
+        found.gather.extend(of_chart.clone().filter(|s| is_in_gap[s - of_chart.start]).map(|s| s as u32));
+        if !found.gather.is_empty() {
+            let is_between = |sample: &usize| {
+                let t = &map.texels.samples[*sample];
+                let (mut some, mut all) = (false, true);
+                gather.bilinear(chart, charts.local(t.triangle, t.u, t.v), |s, _| {
+                    some |= is_in_gap[s - of_chart.start];
+                    all &= is_in_gap[s - of_chart.start];
+                });
+                some && !all
+            };
+            let candidates = map.samples_of(chart).filter(is_between);
+            found.map = candidates.filter(|&s| self.is_in_gap(map, s, texel, &mut rays)).map(|s| s as u32).collect();
+        }
+        self.rays.fetch_add(rays, Relaxed);
+        found
+    }
+
+    /// Whether all but a few rays from a sample meet something within the width of a gather texel.
+    fn is_in_gap(&self, map: &ChartMap, sample: usize, texel: f32, rays: &mut u64) -> bool {
+        let receiver = self.atlas.receiver(map, self.backs, sample);
+        let (tangent, bitangent) = orthonormal_basis(receiver.normal);
+        let mut away = 0;
+        for i in 0..PROBES {
+            let d = cosine_hemisphere(sobol_2d(i, sample as u32));
+            let d = d.x * tangent + d.y * bitangent + d.z * receiver.normal;
+            *rays += 1;
+            away += u32::from(!self.atlas.scene.occluded(&Ray::new(receiver.origin, d).within(0.0, texel)));
+            if away == AWAY {
+                return false;
+            }
+        }
+        true
+    }
+}
+
+/// A bit per sample; none at all if all are 0.
+#[derive(Default)]
+struct Bits {
+    words: Vec<u64>,
+}
+
+impl Bits {
+    fn new<'a>(ones: impl Iterator<Item = &'a u32>, n: usize) -> Result<Bits> {
+        let mut words = Vec::new();
+        for &i in ones {
+            if words.is_empty() {
+                words = try_vec(n.div_ceil(64), "the texels in gaps")?;
+            }
+            words[i as usize / 64] |= 1 << (i % 64);
+        }
+        Ok(Bits { words })
+    }
+
+    #[inline]
+    fn has(&self, i: usize) -> bool {
+        self.words.get(i / 64).is_some_and(|word| word >> (i % 64) & 1 != 0)
+    }
+
+    fn bytes(&self) -> usize {
+        size_of_val(&self.words[..])
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use crate::bvh::BuildOptions;
+    use crate::device::{Device, DeviceOptions};
+    use crate::lightmap::{Lightmap, LightmapDesc};
+    use crate::progress::Progress;
+    use crate::scene::shapes::MeshBuilder;
+    use crate::scene::{Light, Material, Scene, SceneData};
+    use glam::Vec3;
+
+    /// A floor from −2 to 2 m, and a sheet 5 mm above it where x < 0.
+    fn carpet() -> Lightmap {
+        let device = Device::new(DeviceOptions { num_threads: 2, ..Default::default() }).unwrap();
+        let mut data = SceneData::new();
+        let m = data.add_material(Material { two_sided: true, ..Default::default() }).unwrap();
+        for (right, z) in [(2.0, 0.0), (0.0, 0.005)] {
+            let p = |x: f32, y: f32| Vec3::new(x, y, z);
+            let mut builder = MeshBuilder::new();
+            builder.quad(p(-2.0, -2.0), p(right, -2.0), p(right, 2.0), p(-2.0, 2.0), m);
+            data.add_mesh(builder.finish()).unwrap();
+        }
+        data.add_light(Light::Directional { direction: -Vec3::Z, irradiance: [1.0; 3], angular_radius: 0.0 }).unwrap();
+        let scene = Scene::commit(&device, data, &BuildOptions::default(), &Progress::none()).map_err(|e| e.1).unwrap();
+        let desc = LightmapDesc { texels_per_unit: 20.0, gather_divisor: 4, ..Default::default() };
+        Lightmap::create(&scene, &desc, &Progress::none()).unwrap()
+    }
+
+    #[test]
+    fn what_lies_below_a_sheet_is_in_a_gap_and_what_lies_beside_it_is_not() {
+        let lightmap = carpet();
+        let atlas = lightmap.atlas();
+        let progress = Progress::none();
+        let (floor, sheet) = (atlas.charts.chart_of[0], atlas.charts.chart_of[2]);
+        let find = |backs: &[bool]| Gaps::find(atlas, 0..2, backs, &progress.stage("gaps", 0.0, 1.0, 2)).unwrap();
+        let gaps = find(&[]);
+        for s in atlas.gather.samples_of(floor) {
+            let x = atlas.gather.surface(&atlas.scene, s).0.x;
+            assert!(gaps.gather.has(s) == (x < 0.0) || x.abs() < 0.05, "gather texel at {x}");
+        }
+        // Near the edge of the sheet a ray more or less gets out.
+        let x = |s: usize| atlas.map.surface(&atlas.scene, s).0.x;
+        let below: Vec<usize> = atlas.map.samples_of(floor).filter(|&s| x(s) > -0.1 && x(s) < -0.05).collect();
+        let found = below.iter().filter(|s| gaps.map.has(**s)).count();
+        assert!(below.len() >= 80 && found > below.len() / 2, "{found} of {}", below.len());
+        assert_eq!(atlas.map.samples_of(floor).filter(|&s| x(s) > 0.0 && gaps.map.has(s)).count(), 0);
+        assert!(atlas.gather.samples_of(sheet).all(|s| !gaps.gather.has(s)));
+        assert_eq!(atlas.map.samples_of(sheet).filter(|&s| gaps.map.has(s)).count(), 0);
+
+        let mut backs = [false; 2];
+        backs[sheet as usize] = true;
+        let below = find(&backs);
+        let is_inner = |s: &usize| {
+            let p = atlas.gather.surface(&atlas.scene, *s).0;
+            p.x > -1.8 && p.x < -0.2 && p.y.abs() < 1.8
+        };
+        assert!(atlas.gather.samples_of(sheet).filter(is_inner).all(|s| below.gather.has(s)));
+        assert!(atlas.gather.samples_of(floor).all(|s| below.gather.has(s) == gaps.gather.has(s)));
+    }
+
+    #[test]
+    fn light_is_interpolated_within_gaps_and_outside_of_them() {
+        let lightmap = carpet();
+        let atlas = lightmap.atlas();
+        let progress = Progress::none();
+        let gaps = Gaps::find(atlas, 0..2, &[], &progress.stage("gaps", 0.0, 1.0, 2)).unwrap();
+        let light = |s: usize| if gaps.gather.has(s) { Vec3::ZERO } else { Vec3::ONE };
+        let values: Vec<Vec3> = (0..atlas.gather.len()).map(light).collect();
+        let mut mixed = 0;
+        for s in 0..atlas.map.len() {
+            let (mut around, mut alike) = (0, 0);
+            let shown = atlas.interpolate(&values, &gaps, s, |g| {
+                around += 1;
+                alike += u32::from(gaps.are_alike(s, g));
+            });
+            let plain = atlas.interpolate(&values, &Gaps::default(), s, |_| ());
+            let expected =
+                if alike > 0 && alike < around { Vec3::splat(!gaps.map.has(s) as u32 as f32) } else { plain };
+            assert!(shown.abs_diff_eq(expected, 1e-6), "{shown} is not {expected}");
+            mixed += u32::from(!shown.abs_diff_eq(plain, 1e-6));
+        }
+        assert!(mixed > 100, "{mixed} texels between light and dark");
+        // Without gaps nothing is held.
+        let none = Gaps::find(atlas, 1..1, &[], &progress.stage("gaps", 0.0, 1.0, 0)).unwrap();
+        assert!(none.is_empty() && none.gather.bytes() + none.map.bytes() == 0);
+    }
+}
