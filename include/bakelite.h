@@ -1114,8 +1114,8 @@ typedef struct bk_bake_stats {
   bk_stage_stats direct;
   // Filtering and composition.
   bk_stage_stats compose;
-  // Two-sided charts whose light map shows the back, because the front gets less than a tenth of
-  // its light.
+  // Two-sided charts whose light map shows the back, because the distance that one sees from it
+  // times the cube root of its light is more than twice that of the front.
   uint64_t back_charts;
   // Points, half a texel apart at most, along the edges that were stitched.
   uint64_t seam_points;

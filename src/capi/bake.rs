@@ -168,8 +168,8 @@ pub struct bk_bake_stats {
     pub direct: bk_stage_stats,
     /// Filtering and composition.
     pub compose: bk_stage_stats,
-    /// Two-sided charts whose light map shows the back, because the front gets less than a tenth of
-    /// its light.
+    /// Two-sided charts whose light map shows the back, because the distance that one sees from it
+    /// times the cube root of its light is more than twice that of the front.
     pub back_charts: u64,
     /// Points, half a texel apart at most, along the edges that were stitched.
     pub seam_points: u64,

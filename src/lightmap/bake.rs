@@ -294,15 +294,16 @@ impl Bake<'_, '_> {
     /// Per chart, whether its back is baked.
     fn backs(&self, radiance: &[Vec3]) -> Vec<bool> {
         let l = self.atlas;
-        if !radiance.is_empty() {
-            return sides::backs(&l.charts, &l.radiance, |s| radiance[s].element_sum());
-        }
         // Without indirect light there is no radiance map: direct light decides.
         let back_start = l.radiance.back_start();
-        sides::backs(&l.charts, &l.radiance, |s| {
-            let (_, receiver) = l.radiance.receiver(&l.scene, s, s >= back_start);
-            self.direct.irradiance(&receiver, 1, combine(self.params.seed as u32, s as u32), &mut 0).element_sum()
-        })
+        let light = |s: usize| match radiance.get(s) {
+            Some(radiance) => radiance.element_sum(),
+            None => {
+                let (_, receiver) = l.radiance.receiver(&l.scene, s, s >= back_start);
+                self.direct.irradiance(&receiver, 1, combine(self.params.seed as u32, s as u32), &mut 0).element_sum()
+            }
+        };
+        l.scene.device().install(|| sides::backs(&l.scene, &l.charts, &l.radiance, light))
     }
 
     /// Gathers, blurs and fills. Only charts that the range touches are gathered.

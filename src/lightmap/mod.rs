@@ -142,7 +142,8 @@ pub struct BakeStats {
     pub gather: StageStats,
     pub direct: StageStats,
     pub compose: StageStats,
-    /// Two-sided charts whose back was baked because their front is dark by comparison.
+    /// Two-sided charts whose back was baked because one sees further from it, or more light falls on it, than from and on
+    /// the front.
     pub back_charts: u64,
     pub seconds: f64,
     pub peak_bytes: u64,

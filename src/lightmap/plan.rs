@@ -173,7 +173,9 @@ impl Plan {
     /// Tells of two-sided charts of which the back was baked.
     pub(crate) fn note_back_charts(&mut self, count: u64) {
         if count > 0 {
-            self.run(&format!("the backs of {count} two-sided charts, whose fronts are dark"));
+            self.run(&format!(
+                "the backs of {count} two-sided charts, from whose fronts one sees less far, or less light"
+            ));
         }
     }
 

@@ -1,29 +1,150 @@
 //! Which side of two-sided charts the light map shows.
 //!
-//! A texel holds the light of one side. In modelled scenes many two-sided surfaces have their fronts
-//! where nobody looks and no light arrives: ceilings that face the roof, sofas turned inside out. So
-//! the light of the whole chart on both its sides decides.
+//! A texel holds the light of one side. In modelled scenes many two-sided surfaces have their fronts where nobody
+//! looks: ceilings that face the roof, sofas turned inside out. So of each chart that side is shown from which one
+//! sees far before one sees another surface, as from inside a room rather than from inside its furniture or from the
+//! void around, and which is lit.
+//!
+//! Measured as the part of the surfaces seen from random places inside that show their other side: living room 1.8 %,
+//! Sponza in the sun 11.3 %, by two lamps 11.6 % (cloths and vaults seen from both sides, for the most part). By light
+//! alone, a back that gets ten times the front's, these were 2.9, 15.1 and 12.5 %: the sun shines on roofs, and some
+//! light leaks into sofas. By distance alone 1.6, 11.1 and 11.1 %, but the side of a block in the Cornell box that
+//! faces its open front lost to its dark inside; the square root of light, or the fourth, or a factor of 1.2 or 1.5
+//! instead of 2 change half a percent.
 
 use super::charts::Charts;
 use super::map::ChartMap;
+use crate::sampling::{cosine_hemisphere, orthonormal_basis, sobol_2d};
+use crate::scene::Scene;
+use crate::trace::Ray;
+use rayon::prelude::*;
 
-/// The back is shown if it gets more than this many times the light of the front. Between sides that
-/// are both lit the front is preferred: it is what users expect, and it does not change when a light
-/// moves a little.
-const DARK_FRONT: f64 = 10.0;
+/// The back is shown if the distance seen from it times the cube root of its light is more than this many times that
+/// of the front: twice as far, or eight times as bright. Between sides that are alike the front is preferred: it is what
+/// users expect, and it does not change when a light moves a little.
+const BETTER: f64 = 2.0;
+
+/// Everything beyond this part of the scene's diagonal is as far as that.
+const FAR: f32 = 0.3;
+
+/// Where nothing is seen, this part of it.
+const VOID: f32 = 0.05;
+
+/// Places that are looked from, per side of a chart, and rays from each.
+const PLACES: usize = 64;
+const RAYS: u32 = 4;
 
 /// Per chart, whether its back is baked; empty if no chart has a back. `light` tells how much light a
-/// sample of the radiance map gets (any unit).
-pub(crate) fn backs(charts: &Charts, radiance: &ChartMap, mut light: impl FnMut(usize) -> f32) -> Vec<bool> {
+/// sample of the radiance map gets (any unit). To be called on the device's threads.
+pub(crate) fn backs(
+    scene: &Scene,
+    charts: &Charts,
+    radiance: &ChartMap,
+    light: impl Fn(usize) -> f32 + Sync,
+) -> Vec<bool> {
     if radiance.layout.back_of.is_empty() {
         return Vec::new();
     }
-    let mut mean = |placement: u32| {
+    let lit = |placement: u32| {
         let samples = radiance.samples_of(placement);
         let n = samples.len().max(1) as f64;
         samples.map(|s| light(s) as f64).sum::<f64>() / n
     };
-    (0..charts.charts.len() as u32)
-        .map(|chart| radiance.layout.back(chart).is_some_and(|back| mean(back) > DARK_FRONT * mean(chart)))
-        .collect()
+    let is_back = |chart: u32| {
+        let Some(back) = radiance.layout.back(chart) else { return false };
+        let worth = |placement: u32| view(scene, radiance, placement) * lit(placement).cbrt();
+        worth(back) > BETTER * worth(chart)
+    };
+    (0..charts.charts.len() as u32).into_par_iter().map(is_back).collect()
+}
+
+/// The mean distance of what is seen from a side.
+fn view(scene: &Scene, radiance: &ChartMap, placement: u32) -> f64 {
+    let far = FAR * scene.diagonal();
+    let samples = radiance.samples_of(placement);
+    let places = samples.clone().step_by(samples.len().div_ceil(PLACES).max(1));
+    let n = places.len().max(1) as f64;
+    let from = |sample: usize| {
+        let (_, receiver) = radiance.receiver(scene, sample, sample >= radiance.back_start());
+        let (x, y) = orthonormal_basis(receiver.geometric);
+        let distance = |i: u32| {
+            let d = cosine_hemisphere(sobol_2d(i, sample as u32));
+            let d = d.x * x + d.y * y + d.z * receiver.geometric;
+            let hit = scene.intersect_raw(&Ray::new(receiver.origin, d));
+            f64::from(if hit.is_miss() { VOID * far } else { hit.t.min(far) })
+        };
+        (0..RAYS).map(distance).sum::<f64>() / f64::from(RAYS)
+    };
+    places.map(from).sum::<f64>() / n
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use crate::bvh::BuildOptions;
+    use crate::device::{Device, DeviceOptions};
+    use crate::lightmap::{Lightmap, LightmapDesc};
+    use crate::progress::Progress;
+    use crate::scene::shapes::MeshBuilder;
+    use crate::scene::{Light, Material, SceneData};
+    use glam::Vec3;
+
+    /// Sides of a room that faces inwards or outwards and of a box in it that faces outwards or inwards, each a mesh.
+    /// `lights` is said to fall on outer and inner sides.
+    fn backs_of(room_inward: bool, box_inward: bool, lights: [f32; 2]) -> Vec<bool> {
+        let device = Device::new(DeviceOptions { num_threads: 2, ..Default::default() }).unwrap();
+        let mut data = SceneData::new();
+        let m = data.add_material(Material { two_sided: true, ..Default::default() }).unwrap();
+        for (size, inward) in [(2.0, room_inward), (0.4, box_inward)] {
+            let mut builder = MeshBuilder::new();
+            builder.box_(Vec3::splat(-size), Vec3::splat(size), inward, m);
+            data.add_mesh(builder.finish()).unwrap();
+        }
+        data.add_light(Light::Point { position: Vec3::splat(1.0), intensity: [1.0; 3] }).unwrap();
+        let scene = Scene::commit(&device, data, &BuildOptions::default(), &Progress::none()).map_err(|e| e.1).unwrap();
+        let desc = LightmapDesc { texels_per_unit: 8.0, ..Default::default() };
+        let lightmap = Lightmap::create(&scene, &desc, &Progress::none()).unwrap();
+        let atlas = lightmap.atlas();
+        let light = |s: usize| {
+            let (point, receiver) = atlas.radiance.receiver(&scene, s, s >= atlas.radiance.back_start());
+            let inwards = receiver.geometric.dot(point.position) < 0.0;
+            lights[usize::from(inwards)]
+        };
+        let of_chart = backs(&scene, &atlas.charts, &atlas.radiance, light);
+        // The first triangles of the room and of the box.
+        [0, 12].map(|t| of_chart[atlas.charts.chart_of[t] as usize]).to_vec()
+    }
+
+    #[test]
+    fn rooms_show_their_inside_and_boxes_their_outside() {
+        for lights in [[1.0, 1.0], [1.0, 0.5], [0.5, 1.0]] {
+            assert_eq!(backs_of(true, false, lights), [false, false], "{lights:?}");
+            assert_eq!(backs_of(false, false, lights), [true, false], "{lights:?}");
+            assert_eq!(backs_of(true, true, lights), [false, true], "{lights:?}");
+        }
+    }
+
+    #[test]
+    fn of_two_like_rooms_the_one_that_is_lit_is_shown() {
+        let device = Device::new(DeviceOptions { num_threads: 2, ..Default::default() }).unwrap();
+        let mut data = SceneData::new();
+        let m = data.add_material(Material { two_sided: true, ..Default::default() }).unwrap();
+        let p = |x: f32, y: f32| Vec3::new(x, y, 0.0);
+        let mut builder = MeshBuilder::new();
+        // The wall between them, whose front faces +z.
+        builder.quad(p(-1.0, -1.0), p(1.0, -1.0), p(1.0, 1.0), p(-1.0, 1.0), m);
+        builder.box_(Vec3::new(-1.0, -1.0, -2.0), Vec3::new(1.0, 1.0, 2.0), true, m);
+        data.add_mesh(builder.finish()).unwrap();
+        data.add_light(Light::Point { position: Vec3::Z, intensity: [1.0; 3] }).unwrap();
+        let scene = Scene::commit(&device, data, &BuildOptions::default(), &Progress::none()).map_err(|e| e.1).unwrap();
+        let desc = LightmapDesc { texels_per_unit: 8.0, ..Default::default() };
+        let lightmap = Lightmap::create(&scene, &desc, &Progress::none()).unwrap();
+        let atlas = lightmap.atlas();
+        let wall = atlas.charts.chart_of[0];
+        let shown = |front: f32, back: f32| {
+            let light = |s: usize| if s >= atlas.radiance.back_start() { back } else { front };
+            backs(&scene, &atlas.charts, &atlas.radiance, light)[wall as usize]
+        };
+        assert_eq!([shown(1.0, 0.0), shown(1.0, 1.0), shown(1.0, 7.0), shown(1.0, 9.0)], [false, false, false, true]);
+    }
 }
