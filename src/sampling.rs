@@ -138,6 +138,14 @@ pub fn orthonormal_basis(n: Vec3) -> (Vec3, Vec3) {
     (Vec3::new(1.0 + sign * n.x * n.x * a, sign * b, -sign * n.x), Vec3::new(b, sign + n.y * n.y * a, -n.y))
 }
 
+/// A direction around the unit vector `normal` with density cos θ / π.
+#[inline]
+pub fn cosine_around(normal: Vec3, u: [f32; 2]) -> Vec3 {
+    let local = cosine_hemisphere(u);
+    let (t, b) = orthonormal_basis(normal);
+    (t * local.x + b * local.y + normal * local.z).normalize()
+}
+
 #[cfg(test)]
 mod tests {
     use super::*;

@@ -6,7 +6,7 @@
 #![allow(dead_code)]
 
 use bakelite::bvh::{BuildOptions, BuildQuality};
-use bakelite::sampling::{cosine_hemisphere, orthonormal_basis, sobol_2d, uniform, uniform_triangle};
+use bakelite::sampling::{cosine_around, orthonormal_basis, sobol_2d, uniform, uniform_triangle};
 use bakelite::scene::builtin;
 use bakelite::trace::{Hit, Ray};
 use bakelite::{Device, DeviceOptions, Isa, Progress, Scene, SceneData};
@@ -47,11 +47,7 @@ pub fn origins(scene: &Scene, count: u32) -> Vec<(Vec3, Vec3)> {
 
 /// Cosine-distributed, as a gather's.
 pub fn directions(normal: Vec3, seed: u32, count: u32) -> impl Iterator<Item = [f32; 3]> {
-    let (t, b) = orthonormal_basis(normal);
-    (0..count).map(move |i| {
-        let d = cosine_hemisphere(sobol_2d(i, seed));
-        (d.x * t + d.y * b + d.z * normal).to_array()
-    })
+    (0..count).map(move |i| cosine_around(normal, sobol_2d(i, seed)).to_array())
 }
 
 /// From random points into the hemisphere, uniformly: thesis 4.1.2.

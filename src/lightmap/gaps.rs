@@ -17,7 +17,7 @@ use super::map::ChartMap;
 use crate::error::Result;
 use crate::memory::{Reservation, try_vec};
 use crate::progress::Stage;
-use crate::sampling::{cosine_hemisphere, orthonormal_basis, sobol_2d};
+use crate::sampling::{cosine_around, sobol_2d};
 use crate::trace::Ray;
 use rayon::prelude::*;
 use std::ops::Range;
@@ -112,11 +112,9 @@ impl Search<'_> {
     /// Whether all but a few rays from a sample meet something within the width of a gather texel.
     fn is_in_gap(&self, map: &ChartMap, sample: usize, texel: f32, rays: &mut u64) -> bool {
         let receiver = self.atlas.receiver(map, self.backs, sample);
-        let (tangent, bitangent) = orthonormal_basis(receiver.normal);
         let mut away = 0;
         for i in 0..PROBES {
-            let d = cosine_hemisphere(sobol_2d(i, sample as u32));
-            let d = d.x * tangent + d.y * bitangent + d.z * receiver.normal;
+            let d = cosine_around(receiver.normal, sobol_2d(i, sample as u32));
             *rays += 1;
             away += u32::from(!self.atlas.scene.occluded(&Ray::new(receiver.origin, d).within(0.0, texel)));
             if away == AWAY {

@@ -14,7 +14,7 @@
 
 use super::charts::Charts;
 use super::map::ChartMap;
-use crate::sampling::{cosine_hemisphere, orthonormal_basis, sobol_2d};
+use crate::sampling::{cosine_around, sobol_2d};
 use crate::scene::Scene;
 use crate::trace::Ray;
 use rayon::prelude::*;
@@ -66,10 +66,8 @@ fn view(scene: &Scene, radiance: &ChartMap, placement: u32) -> f64 {
     let n = places.len().max(1) as f64;
     let from = |sample: usize| {
         let (_, receiver) = radiance.receiver(scene, sample, sample >= radiance.back_start());
-        let (x, y) = orthonormal_basis(receiver.geometric);
         let distance = |i: u32| {
-            let d = cosine_hemisphere(sobol_2d(i, sample as u32));
-            let d = d.x * x + d.y * y + d.z * receiver.geometric;
+            let d = cosine_around(receiver.geometric, sobol_2d(i, sample as u32));
             let hit = scene.intersect_raw(&Ray::new(receiver.origin, d));
             f64::from(if hit.is_miss() { VOID * far } else { hit.t.min(far) })
         };

@@ -14,7 +14,7 @@
 //! sphere; the rest of its power is counted as escaped without being traced.
 
 use super::spot::SpotProfile;
-use crate::sampling::{concentric_disc, cosine_hemisphere, orthonormal_basis, uniform_triangle};
+use crate::sampling::{concentric_disc, cosine_around, orthonormal_basis, uniform_triangle};
 use crate::scene::{Emitter, Light, Scene, Sky};
 use crate::trace::offset::{offset_ray_origin, ray_epsilon};
 use glam::{DVec3, Vec3};
@@ -312,12 +312,4 @@ fn around(axis: Vec3, [x, y]: [f32; 2], height: impl Fn(f32) -> f64) -> Vec3 {
     let spread = if r2 > 0.0 { (h * (2.0 - h) / r2 as f64).max(0.0).sqrt() as f32 } else { 0.0 };
     let (t, b) = orthonormal_basis(axis);
     (t * (x * spread) + b * (y * spread) + axis * (1.0 - h) as f32).normalize()
-}
-
-/// A direction around `normal` with density cos θ / π.
-#[inline]
-pub(super) fn cosine_around(normal: Vec3, u: [f32; 2]) -> Vec3 {
-    let local = cosine_hemisphere(u);
-    let (t, b) = orthonormal_basis(normal);
-    (t * local.x + b * local.y + normal * local.z).normalize()
 }

@@ -6,12 +6,12 @@
 //! and the cache misses of shading overlap. Everything random is a function of the photon's number
 //! and its bounce, and blocks are kept in order, so threads make no difference.
 
-use super::emission::{Emission, cosine_around};
+use super::emission::Emission;
 use super::{PATH_LIMIT, PhotonParams, PhotonStats};
 use crate::error::{Error, Result};
 use crate::memory::{MemoryMonitor, Reservation};
 use crate::progress::{Progress, Stage};
-use crate::sampling::{combine, purpose_seed, sobol_2d, sobol_2d_bits, uniform};
+use crate::sampling::{combine, cosine_around, purpose_seed, sobol_2d, sobol_2d_bits, uniform};
 use crate::scene::{Light, NONE, Scene};
 use crate::trace::offset::{SurfacePoint, offset_ray_origin};
 use crate::trace::{RawHit, Ray};

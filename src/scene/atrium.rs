@@ -948,7 +948,7 @@ mod tests {
     use crate::bvh::BuildOptions;
     use crate::device::Device;
     use crate::progress::Progress;
-    use crate::sampling::{cosine_hemisphere, orthonormal_basis, sobol_2d};
+    use crate::sampling::{cosine_around, sobol_2d};
     use crate::scene::Scene;
     use crate::scene::mesh::is_valid_triangle;
     use crate::trace::Ray;
@@ -998,9 +998,7 @@ mod tests {
         let (mut position, mut normal) = (start, Vec3::Y);
         let (mut hits, mut escapes) = (0, 0);
         for i in 0..200_000u32 {
-            let local = cosine_hemisphere(sobol_2d(i, 5));
-            let (t, b) = orthonormal_basis(normal);
-            let direction = t * local.x + b * local.y + normal * local.z;
+            let direction = cosine_around(normal, sobol_2d(i, 5));
             let (origin, ray) = (position, Ray::new(position, direction));
             let hit = scene.intersect_raw(&ray);
             if hit.is_miss() {

@@ -5,7 +5,7 @@ use crate::Job;
 use crate::args::BakeArgs;
 use crate::measure::median;
 use bakelite::bvh::BuildOptions;
-use bakelite::sampling::{cosine_hemisphere, mix, orthonormal_basis, uniform, uniform_triangle};
+use bakelite::sampling::{cosine_around, mix, uniform, uniform_triangle};
 use bakelite::trace::{Hit, Ray};
 use bakelite::{Result, Scene};
 use std::time::Instant;
@@ -62,9 +62,8 @@ fn rays(scene: &Scene) -> Vec<Ray> {
         let corners = scene.corners(t);
         let [u, v] = uniform_triangle([uniform(i, 0, 1), uniform(i, 1, 1)]);
         let (normal, [a, b, c]) = (scene.normal(t), corners);
-        let d = cosine_hemisphere([uniform(i, 2, 1), uniform(i, 3, 1)]);
-        let (x, y) = orthonormal_basis(normal);
-        Ray::new(a + u * (b - a) + v * (c - a), d.x * x + d.y * y + d.z * normal)
+        let d = cosine_around(normal, [uniform(i, 2, 1), uniform(i, 3, 1)]);
+        Ray::new(a + u * (b - a) + v * (c - a), d)
     };
     valid.map(ray).collect()
 }

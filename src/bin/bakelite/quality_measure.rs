@@ -5,7 +5,7 @@ use crate::measure::{pick, visible_texels};
 use bakelite::lightmap::texels::TexelSample;
 use bakelite::lightmap::{Layer, Lightmap};
 use bakelite::reference::{PathTracer, SurfacePoint};
-use bakelite::sampling::{cosine_hemisphere, orthonormal_basis, uniform, uniform_sphere};
+use bakelite::sampling::{cosine_around, uniform, uniform_sphere};
 use bakelite::trace::Ray;
 use bakelite::trace::offset::offset_ray_origin;
 use bakelite::{Error, Progress, Result};
@@ -30,6 +30,8 @@ pub struct Points {
     /// Irradiance of the reference, indirect and all, as two halves with independent noise.
     pub indirect: [Values; 2],
     pub all: [Values; 2],
+    /// How many more were seen, on sides that the light map does not hold.
+    pub of_other_sides: usize,
 }
 
 /// Texels darker than this part of the mean are judged as if they were so bright: a picture exposed for
@@ -63,6 +65,7 @@ impl Points {
             positions: Vec::new(),
             indirect: Default::default(),
             all: Default::default(),
+            of_other_sides: 0,
         };
         points.choose(lightmap, count)?;
         let scene = lightmap.scene();
@@ -92,9 +95,7 @@ impl Points {
                 return Ok(());
             }
             let [position, normal] = pick(&texels, i);
-            let d = cosine_hemisphere([uniform(i, 0, 0), uniform(i, 1, 0)]);
-            let (x, y) = orthonormal_basis(normal);
-            let direction = d.x * x + d.y * y + d.z * normal;
+            let direction = cosine_around(normal, [uniform(i, 0, 0), uniform(i, 1, 0)]);
             let origin = offset_ray_origin(position, normal, scene);
             let t = scene.intersect_raw(&Ray::new(origin, direction)).t;
             if !(t.is_finite() && t > room) {
@@ -102,13 +103,18 @@ impl Points {
             }
             let look = uniform_sphere([uniform(i, 2, 0), uniform(i, 3, 0)]);
             let hit = scene.intersect_raw(&Ray::new(origin + 0.5 * t * direction, look));
-            if !hit.is_miss() && hit.front != lightmap.shows_back(hit.triangle) {
-                let side = if hit.front { 1.0 } else { -1.0 };
-                let sample = TexelSample { triangle: hit.triangle, u: hit.u, v: hit.v, ..Default::default() };
-                self.on.push((hit.triangle, hit.u, hit.v));
-                self.positions.push(sample.position(scene));
-                self.normals.push(side * sample.shading_normal(scene));
+            if hit.is_miss() {
+                continue;
             }
+            if hit.front == lightmap.shows_back(hit.triangle) {
+                self.of_other_sides += 1;
+                continue;
+            }
+            let side = if hit.front { 1.0 } else { -1.0 };
+            let sample = TexelSample { triangle: hit.triangle, u: hit.u, v: hit.v, ..Default::default() };
+            self.on.push((hit.triangle, hit.u, hit.v));
+            self.positions.push(sample.position(scene));
+            self.normals.push(side * sample.shading_normal(scene));
         }
         match self.len() {
             0 => Err(Error::InvalidArgument("no surface of the scene is seen from another".into())),

@@ -361,8 +361,9 @@ fn markdown(
          Errors are of irradiance at {count} points that are seen from places in the scene, against {paths} paths per \
          point of an independent path tracer in f64 ({reference_seconds:.0} s). Relative MSE is the mean of the squared \
          error by the square of the reference (what is darker than a tenth of its mean counts as so bright), RMS its \
-         root; to mean, the mean of the squared error by the square of the reference's mean. The reference's own noise is not part of them: they are products \
-         of the differences from its two halves. Noise is what differs between {seeds} seeds, bias what does not; \
+         root; to mean, the mean of the squared error by the square of the reference's mean. The reference's own noise \
+         is not part of them: they are products of the differences from its two halves. {others} more points, {part:.1} % \
+         of all that were seen, lie on sides that the light map does not show, and are left out. Noise is what differs between {seeds} seeds, bias what does not; \
          MSE = noise² + bias². ± is one standard error of the MSE, from the points chosen. Seconds are those of the \
          bake, without charts; of path tracing and photons alone those at the points compared, scaled to all.\n\n\
          SSIM (Wang 2004) compares the light map alone, as the camera shows it in {width} × {height} pixels, with the \
@@ -381,6 +382,8 @@ fn markdown(
         threads = scene.device().num_threads(),
         isa = scene.device().isa().name(),
         count = points.len(),
+        others = points.of_other_sides,
+        part = 100.0 * points.of_other_sides as f64 / (points.of_other_sides + points.len()) as f64,
         paths = args.paths,
         seeds = args.seeds,
         width = view.size[0],

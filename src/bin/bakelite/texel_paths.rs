@@ -6,7 +6,7 @@
 //! each texel is an Owen-scrambled Sobol sequence.
 
 use bakelite::lightmap::direct::{DirectLight, Receiver};
-use bakelite::sampling::{combine, cosine_hemisphere, orthonormal_basis, sobol_2d, uniform};
+use bakelite::sampling::{combine, cosine_around, cosine_hemisphere, orthonormal_basis, sobol_2d, uniform};
 use bakelite::scene::NONE;
 use bakelite::trace::offset::{SurfacePoint, offset_ray_origin};
 use bakelite::trace::{Hit, PACKET_SIZE, Packet, RawHit, Ray};
@@ -128,9 +128,7 @@ impl TexelPaths {
         let all = (reflects + passes).max(1.0);
         let (luck, seed) = (uniform(0, 0, path.seed) * all, combine(path.seed, 2));
         if luck < reflects {
-            let d = cosine_hemisphere([uniform(0, 1, path.seed), uniform(0, 2, path.seed)]);
-            let (tangent, bitangent) = orthonormal_basis(receiver.normal);
-            let direction = d.x * tangent + d.y * bitangent + d.z * receiver.normal;
+            let direction = cosine_around(receiver.normal, [uniform(0, 1, path.seed), uniform(0, 2, path.seed)]);
             let next = Path { throughput: reflected * (all / reflects), seed, direction, ..path };
             Some((next, Ray::new(receiver.origin, direction)))
         } else if luck < reflects + passes {
