@@ -205,7 +205,8 @@ impl Bake<'_, '_> {
         let memory = self.reserve()?;
         let scene = &self.atlas.scene;
         let mut indirect = None;
-        let (radiance, backs) = self.illuminate(&mut stats)?;
+        let radiance = self.illuminate(&mut stats)?;
+        let backs = self.backs(&radiance);
         if self.plan.runs(left_out::INDIRECT) {
             indirect = Some(self.gather(&radiance, &backs, &mut stats)?);
         }
@@ -224,16 +225,13 @@ impl Bake<'_, '_> {
         Ok((light, stats))
     }
 
-    /// The radiance map (empty if the plan leaves indirect light out) and, per chart, whether its
-    /// back is baked: all that texels need to be lit.
-    pub(crate) fn illuminate(&self, stats: &mut BakeStats) -> Result<(Vec<Vec3>, Vec<bool>)> {
-        let mut radiance = Vec::new();
-        if self.plan.runs(left_out::INDIRECT) {
-            let photons = if self.plan.runs(left_out::PHOTONS) { Some(self.photons(stats)?) } else { None };
-            radiance = self.radiance(photons.as_ref(), stats)?;
+    /// The radiance map; empty if the plan leaves indirect light out.
+    pub(crate) fn illuminate(&self, stats: &mut BakeStats) -> Result<Vec<Vec3>> {
+        if !self.plan.runs(left_out::INDIRECT) {
+            return Ok(Vec::new());
         }
-        let backs = self.backs(&radiance);
-        Ok((radiance, backs))
+        let photons = if self.plan.runs(left_out::PHOTONS) { Some(self.photons(stats)?) } else { None };
+        self.radiance(photons.as_ref(), stats)
     }
 
     /// Announces the buffers of all stages but the photon map, which announces its own.
@@ -291,8 +289,8 @@ impl Bake<'_, '_> {
         Ok(values)
     }
 
-    /// Per chart, whether its back is baked.
-    fn backs(&self, radiance: &[Vec3]) -> Vec<bool> {
+    /// Per chart, whether its back is baked. With [`illuminate`](Self::illuminate)'s map all that texels need to be lit.
+    pub(crate) fn backs(&self, radiance: &[Vec3]) -> Vec<bool> {
         let l = self.atlas;
         // Without indirect light there is no radiance map: direct light decides.
         let back_start = l.radiance.back_start();

@@ -59,15 +59,15 @@ fn illuminate(
     let two_sided = !atlas.radiance.layout.back_of.is_empty();
     let plan = Plan::new(&atlas.scene, direct, params, two_sided, false);
     let bake = Bake { atlas, params, plan: &plan, direct, range: 0..atlas.map.len(), progress };
-    let (radiance, backs) = bake.illuminate(&mut BakeStats::default())?;
+    let radiance = bake.illuminate(&mut BakeStats::default())?;
     let has_indirect = plan.runs(left_out::INDIRECT);
-    let sides = match with_sides {
-        true if has_indirect => {
-            let gaps = bake.gaps(&backs, 0..atlas.charts.charts.len() as u32)?;
-            Some((backs, gaps))
-        }
-        true => Some((backs, Gaps::default())),
-        false => None,
+    let sides = if with_sides {
+        let backs = bake.backs(&radiance);
+        let charts = if has_indirect { atlas.charts.charts.len() as u32 } else { 0 };
+        let gaps = bake.gaps(&backs, 0..charts)?;
+        Some((backs, gaps))
+    } else {
+        None
     };
     Ok(Indirect { radiance, sides, has_indirect })
 }
