@@ -373,10 +373,11 @@ fn a_carpet_has_no_dark_rim_and_its_gap_stays_dark() {
         };
         (0..30).map(|j| light(0.5 + 0.1 * j as f32)).sum::<f32>() / 30.0
     };
+    // The floor's own light changes by less than 0.6 % in 10 cm; so far from the carpet the fine map has no rim either.
     for x in (0..20).map(|i| 0.02 * i as f32) {
         let (beside, below) =
             (mean(&coarse, 2.0 + x) / mean(&fine, 2.1 + x), mean(&coarse, 1.84 - x) / mean(&fine, 2.1));
-        assert!((beside - 1.0).abs() < 0.02, "{x} beside the carpet: {beside}");
+        assert!((beside - 1.0).abs() < 0.01, "{x} beside the carpet: {beside}");
         assert!(below < 0.03, "{x} below the carpet: {below}");
     }
 }

@@ -174,7 +174,7 @@ impl Plan {
     pub(crate) fn note_back_charts(&mut self, count: u64) {
         if count > 0 {
             self.run(&format!(
-                "the backs of {count} two-sided charts, from whose fronts one sees less far, or less light"
+                "the backs of {count} two-sided charts, which see further or get more light than their fronts"
             ));
         }
     }
