@@ -77,7 +77,10 @@ Report quality (quality.md):
   --points N             points at which light is compared [400]
   --seeds N              bakes per setting, to tell noise from bias [4]
   --paths N              paths per point of the path traced reference [4096]
-  --view-paths N         paths per pixel of a path traced view, 1,024 or times that [1024]
+  --reference FILE       points and reference of an earlier report of the same scene and
+                         lights: its quality-points.csv
+  --view-paths N         paths per pixel of a path traced view, 1,024 or times that;
+                         0: no view [1024]
   --knobs A,B,..         what to vary, of gather-rays, photons, radius, blur,
                          direct-samples, gather-divisor, radiance-divisor,
                          path-tracing, photons-alone, or none [all of these]
@@ -178,7 +181,9 @@ pub struct ReportArgs {
     pub seeds: u64,
     /// Quality: paths per point of the reference.
     pub paths: u32,
-    /// Quality: paths per pixel of the reference's view.
+    /// Quality: the points of an earlier report.
+    pub reference: Option<PathBuf>,
+    /// Quality: paths per pixel of the reference's view; 0: no view.
     pub view_paths: u32,
     /// Quality: what to vary, of [`KNOBS`].
     pub knobs: Vec<String>,
@@ -193,6 +198,7 @@ impl Default for ReportArgs {
             points: 400,
             seeds: 4,
             paths: 4096,
+            reference: None,
             view_paths: 1024,
             knobs: KNOBS.map(String::from).to_vec(),
         }
@@ -270,8 +276,11 @@ pub fn parse(args: impl IntoIterator<Item = OsString>) -> Result<Command, String
             }
             Arg::Long("view-paths") => {
                 of_report.push(("--view-paths", "quality"));
-                let paths = at_least_one("--view-paths", &value("--view-paths", &mut parser)?)?;
-                report.view_paths = paths.min(u32::MAX.into()) as u32;
+                report.view_paths = number("--view-paths", &value("--view-paths", &mut parser)?)?;
+            }
+            Arg::Long("reference") => {
+                of_report.push(("--reference", "quality"));
+                report.reference = Some(PathBuf::from(value("--reference", &mut parser)?));
             }
             Arg::Long("knobs") => {
                 of_report.push(("--knobs", "quality"));

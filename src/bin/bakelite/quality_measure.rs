@@ -9,7 +9,9 @@ use bakelite::sampling::{cosine_around, uniform, uniform_sphere};
 use bakelite::trace::Ray;
 use bakelite::trace::offset::offset_ray_origin;
 use bakelite::{Error, Progress, Result};
-use glam::Vec3;
+use glam::{DVec3, Vec3};
+use std::fmt::Write;
+use std::path::Path;
 
 /// Attempts per point, most of which fail where little is enclosed.
 const TRIES: u32 = 100;
@@ -21,6 +23,7 @@ const MIN_ROOM: f32 = 0.02;
 pub type Values = Vec<[f64; 3]>;
 
 /// Points of surfaces, as often as they are seen from places in the scene.
+#[derive(Default)]
 pub struct Points {
     /// Global triangle and weights of its corners 1 and 2.
     pub on: Vec<(u32, f32, f32)>,
@@ -33,6 +36,11 @@ pub struct Points {
     /// How many more were seen, on sides that the light map does not hold.
     pub of_other_sides: usize,
 }
+
+/// What a file of points has of each: where it is, the light of a bake, to look at, and the reference.
+const COLUMNS: &str = "triangle,u,v,x,y,z,nx,ny,nz,bake_r,bake_g,bake_b,\
+                       indirect_a_r,indirect_a_g,indirect_a_b,indirect_b_r,indirect_b_g,indirect_b_b,\
+                       all_a_r,all_a_g,all_a_b,all_b_r,all_b_g,all_b_b";
 
 /// Texels darker than this part of the mean are judged as if they were so bright: a picture exposed for
 /// the mean shows no more.
@@ -59,14 +67,7 @@ impl Points {
     /// Chooses `count` points of the surfaces of a baked light map and path traces the reference there, with `paths` in
     /// f64 per point.
     pub fn new(lightmap: &Lightmap, count: usize, paths: u32, progress: &Progress) -> Result<Points> {
-        let mut points = Points {
-            on: Vec::new(),
-            normals: Vec::new(),
-            positions: Vec::new(),
-            indirect: Default::default(),
-            all: Default::default(),
-            of_other_sides: 0,
-        };
+        let mut points = Points::default();
         points.choose(lightmap, count)?;
         let scene = lightmap.scene();
         let tracer = PathTracer::new(scene);
@@ -82,6 +83,68 @@ impl Points {
             points.all[half] = e.iter().map(|e| e.total()).collect();
         }
         Ok(points)
+    }
+
+    /// The points and the reference of an earlier report of the same scene, as [`csv`](Self::csv) writes them, less those
+    /// on sides that the light map does not show now.
+    pub fn read(path: &Path, lightmap: &Lightmap) -> Result<Points> {
+        let scene = lightmap.scene();
+        let invalid = |what: String| Error::InvalidArgument(format!("{}: {what}", path.display()));
+        let text = std::fs::read_to_string(path).map_err(|e| Error::Io(format!("{}: {e}", path.display())))?;
+        let mut lines = text.lines();
+        if lines.next() != Some(COLUMNS) {
+            return Err(invalid("not the quality-points.csv of a report".into()));
+        }
+        let mut points = Points::default();
+        for line in lines {
+            let numbers: Vec<f64> = line.split(',').map_while(|n| n.parse().ok()).collect();
+            let &[triangle, u, v, x, y, z, nx, ny, nz, _, _, _, ref halves @ ..] = &numbers[..] else {
+                return Err(invalid(format!("no point: {line}")));
+            };
+            let &[ir, ig, ib, jr, jg, jb, ar, ag, ab, br, bg, bb] = halves else {
+                return Err(invalid(format!("no point: {line}")));
+            };
+            let (triangle, u, v) = (triangle as u32, u as f32, v as f32);
+            let (position, normal) = (DVec3::new(x, y, z).as_vec3(), DVec3::new(nx, ny, nz).as_vec3());
+            let sample = TexelSample { triangle, u, v, ..Default::default() };
+            if triangle as usize >= scene.stats().triangles as usize
+                || sample.position(scene).distance(position) > 1e-3 * scene.diagonal()
+            {
+                return Err(invalid(format!("of another scene: {line}")));
+            }
+            if (normal.dot(scene.normal(triangle)) < 0.0) != lightmap.shows_back(triangle) {
+                points.of_other_sides += 1;
+                continue;
+            }
+            points.on.push((triangle, u, v));
+            points.positions.push(position);
+            points.normals.push(normal);
+            for (values, value) in points.indirect.iter_mut().zip([[ir, ig, ib], [jr, jg, jb]]) {
+                values.push(value);
+            }
+            for (values, value) in points.all.iter_mut().zip([[ar, ag, ab], [br, bg, bb]]) {
+                values.push(value);
+            }
+        }
+        if points.len() == 0 {
+            return Err(invalid("no points on the sides that the light map shows".into()));
+        }
+        Ok(points)
+    }
+
+    /// The points and the reference, with the light of a `bake` beside it.
+    pub fn csv(&self, bake: &Values) -> String {
+        let mut out = format!("{COLUMNS}\n");
+        for i in 0..self.len() {
+            let (t, u, v) = self.on[i];
+            let (p, n) = (self.positions[i], self.normals[i]);
+            let _ = write!(out, "{t},{u:e},{v:e},{},{},{},{},{},{}", p.x, p.y, p.z, n.x, n.y, n.z);
+            for [r, g, b] in [bake, &self.indirect[0], &self.indirect[1], &self.all[0], &self.all[1]].map(|v| v[i]) {
+                let _ = write!(out, ",{r:e},{g:e},{b:e}");
+            }
+            out.push('\n');
+        }
+        out
     }
 
     /// Points that are seen from places in the air: halfway between a random texel and what it sees, in
@@ -170,6 +233,9 @@ pub fn errors(runs: &[Values], [a, b]: &[Values; 2]) -> Errors {
 #[cfg(test)]
 mod tests {
     use super::*;
+    use crate::Job;
+    use crate::args::BakeArgs;
+    use bakelite::lightmap::BakeParams;
     use bakelite::sampling::mix;
 
     #[test]
@@ -188,5 +254,27 @@ mod tests {
         assert!((e.mse * dark - 0.0325).abs() < 8e-4, "{e:?}");
         assert!((e.to_mean - 0.0325).abs() < 8e-4, "{e:?}");
         assert!((e.mean - 0.1).abs() < 2e-3, "{e:?}");
+    }
+
+    #[test]
+    fn points_are_the_same_when_read_again_and_none_of_another_scene() {
+        let lightmap = |scene: &str| {
+            let args = BakeArgs { scene: scene.into(), threads: 1, quiet: true, ..Default::default() };
+            let mut lightmap = Job::new(&args).unbaked().unwrap();
+            let params = BakeParams { photon_count: 1000, ..Default::default() };
+            lightmap.bake(&params, &Progress::none()).unwrap();
+            lightmap
+        };
+        let cornell = lightmap("cornell");
+        let points = Points::new(&cornell, 20, 4, &Progress::none()).unwrap();
+        let file = std::env::temp_dir().join(format!("bakelite-points-{}.csv", std::process::id()));
+        std::fs::write(&file, points.csv(&points.of_bake(&cornell, Layer::Indirect))).unwrap();
+        let again = Points::read(&file, &cornell);
+        let elsewhere = Points::read(&file, &lightmap("furnace"));
+        std::fs::remove_file(&file).unwrap();
+        let again = again.unwrap();
+        assert_eq!((&points.on, &points.positions), (&again.on, &again.positions));
+        assert_eq!((&points.normals, &points.indirect, &points.all), (&again.normals, &again.indirect, &again.all));
+        assert!(matches!(elsewhere, Err(Error::InvalidArgument(_))));
     }
 }

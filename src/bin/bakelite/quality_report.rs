@@ -57,17 +57,23 @@ pub fn run(args: &ReportArgs) -> Result<()> {
     let params = args.bake.params;
     job.bars.show("bake", |p| lightmap.bake(&params, p))?;
     let start = Instant::now();
-    let points = job.bars.show("reference", |p| Points::new(&lightmap, args.points, args.paths, p))?;
+    let points = match &args.reference {
+        Some(file) => Points::read(file, &lightmap)?,
+        None => job.bars.show("reference", |p| Points::new(&lightmap, args.points, args.paths, p))?,
+    };
     let reference_seconds = start.elapsed().as_secs_f64();
     if points.all[0].iter().flatten().all(|&c| c == 0.0) {
         return Err(Error::InvalidArgument("no light arrives at any of the points compared".into()));
     }
     let (width, height) = (args.bake.width, args.bake.height);
     let size = [VIEW_WIDTH, (VIEW_WIDTH * height / width).max(1)];
-    let camera = job.camera(&lightmap);
-    let view = job.bars.show("view", |p| ViewReference::new(&lightmap, camera, size, args.view_paths, p))?;
-    let at_points = points_csv(&points, &points.of_bake(&lightmap, Layer::Indirect));
-    let mut measure = Measure { args, points: &points, view: &view, rows: Vec::new() };
+    let mut view = None;
+    if args.view_paths > 0 {
+        let camera = job.camera(&lightmap);
+        view = Some(job.bars.show("view", |p| ViewReference::new(&lightmap, camera, size, args.view_paths, p))?);
+    }
+    let at_points = points.csv(&points.of_bake(&lightmap, Layer::Indirect));
+    let mut measure = Measure { args, points: &points, view: view.as_ref(), rows: Vec::new() };
     measure.bakes(&job, &mut lightmap)?;
     if measure.varies("path-tracing") {
         measure.paths(&job, &lightmap)?;
@@ -77,7 +83,7 @@ pub fn run(args: &ReportArgs) -> Result<()> {
     }
     let rows = measure.rows;
 
-    let text = markdown(args, &lightmap, &points, reference_seconds, &view, &rows);
+    let text = markdown(args, &lightmap, &points, reference_seconds, view.as_ref(), &rows);
     for (name, content) in [
         ("quality.md", &text),
         ("quality.csv", &csv(&rows)),
@@ -98,7 +104,7 @@ pub fn run(args: &ReportArgs) -> Result<()> {
 struct Measure<'a> {
     args: &'a ReportArgs,
     points: &'a Points,
-    view: &'a ViewReference,
+    view: Option<&'a ViewReference>,
     rows: Vec<Row>,
 }
 
@@ -171,7 +177,8 @@ impl Measure<'_> {
             seconds.push(lightmap.bake(&params, &Progress::none())?.seconds);
             indirect.push(self.points.of_bake(lightmap, Layer::Indirect));
             all.push(self.points.of_bake(lightmap, Layer::Combined));
-            ssim = ssim.zip(self.view.of_bake(lightmap)?).map(|(sum, one)| sum + one / self.args.seeds as f64);
+            let one = self.view.map(|view| view.of_bake(lightmap)).transpose()?.flatten();
+            ssim = ssim.zip(one).map(|(sum, one)| sum + one / self.args.seeds as f64);
         }
         self.rows.push(Row {
             series: series.to_owned(),
@@ -313,19 +320,6 @@ fn csv(rows: &[Row]) -> String {
     out
 }
 
-/// Where the error is: indirect light at each of the points, of a bake and of the reference.
-fn points_csv(points: &Points, bake: &Values) -> String {
-    let mut out = String::from("triangle,x,y,z,nx,ny,nz,bake_r,bake_g,bake_b,reference_r,reference_g,reference_b\n");
-    for i in 0..points.len() {
-        let ([x, y, z], [nx, ny, nz]) = (points.positions[i].to_array(), points.normals[i].to_array());
-        let (halves, [r, g, b]) = (&points.indirect, bake[i]);
-        let [a, c, d] = [0, 1, 2].map(|k| 0.5 * (halves[0][i][k] + halves[1][i][k]));
-        let triangle = points.on[i].0;
-        let _ = writeln!(out, "{triangle},{x},{y},{z},{nx},{ny},{nz},{r:e},{g:e},{b:e},{a:e},{c:e},{d:e}");
-    }
-    out
-}
-
 fn plot(rows: &[Row]) -> String {
     let shown = ["gather rays", "photons", "gather divisor", "radiance divisor", "path tracing", "photons alone"];
     let points = |rows: &[Row]| rows.iter().map(|r| [r.seconds, r.indirect.mse.max(0.0).sqrt()]).collect();
@@ -349,27 +343,28 @@ fn markdown(
     lightmap: &Lightmap,
     points: &Points,
     reference_seconds: f64,
-    view: &ViewReference,
+    view: Option<&ViewReference>,
     rows: &[Row],
 ) -> String {
     let (scene, info, params) = (lightmap.scene(), lightmap.info(), &args.bake.params);
+    let reference = match &args.reference {
+        Some(file) => format!("those in {}", file.display()),
+        None => format!("{} paths per point ({reference_seconds:.0} s)", args.paths),
+    };
     let mut out = format!(
         "# Quality: {}\n\n\
          {triangles} triangles; {texels} texels at {density:.2} per unit, {gather} gather and {radiance} radiance \
          texels; {photons} photons, {rays} gather rays, blur {blur} unless another value is named; threads: {threads}, \
          {isa}.\n\n\
-         Errors are of irradiance at {count} points that are seen from places in the scene, against {paths} paths per \
-         point of an independent path tracer in f64 ({reference_seconds:.0} s). Relative MSE is the mean of the squared \
-         error by the square of the reference (what is darker than a tenth of its mean counts as so bright), RMS its \
-         root; to mean, the mean of the squared error by the square of the reference's mean. The reference's own noise \
-         is not part of them: they are products of the differences from its two halves. {others} more points, {part:.1} % \
-         of all that were seen, lie on sides that the light map does not show, and are left out. Noise is what differs between {seeds} seeds, bias what does not; \
-         MSE = noise² + bias². ± is one standard error of the MSE, from the points chosen. Seconds are those of the \
-         bake, without charts; of path tracing and photons alone those at the points compared, scaled to all.\n\n\
-         SSIM (Wang 2004) compares the light map alone, as the camera shows it in {width} × {height} pixels, with the \
-         same view path traced by the bake's kernels with {view_paths} paths per pixel ({view_seconds:.0} s), both tone \
-         mapped alike. Two halves of the reference, with half the paths each, have an SSIM of {of_halves}: an exact \
-         bake would have more than that, but not 1.\n\n",
+         Errors are of irradiance at {count} points that are seen from places in the scene, against {reference} of an \
+         independent path tracer in f64. Relative MSE is the mean of the squared error by the square of the reference \
+         (what is darker than a tenth of its mean counts as so bright), RMS its root; to mean, the mean of the squared \
+         error by the square of the reference's mean. The reference's own noise is not part of them: they are products \
+         of the differences from its two halves. {others} more points, {part:.1} % of all that were seen, lie on sides \
+         that the light map does not show, and are left out. Noise is what differs between {seeds} seeds, bias what \
+         does not; MSE = noise² + bias². ± is one standard error of the MSE, from the points chosen. Seconds are those \
+         of the bake, without charts; of path tracing and photons alone those at the points compared, scaled to \
+         all.\n\n",
         args.bake.title(),
         triangles = scene.stats().triangles,
         texels = info.texels,
@@ -384,14 +379,22 @@ fn markdown(
         count = points.len(),
         others = points.of_other_sides,
         part = 100.0 * points.of_other_sides as f64 / (points.of_other_sides + points.len()) as f64,
-        paths = args.paths,
         seeds = args.seeds,
-        width = view.size[0],
-        height = view.size[1],
-        view_paths = view.paths,
-        view_seconds = view.seconds,
-        of_halves = likeness(view.of_halves),
     );
+    if let Some(view) = view {
+        let _ = write!(
+            out,
+            "SSIM (Wang 2004) compares the light map alone, as the camera shows it in {} × {} pixels, with the same view \
+             path traced by the bake's kernels with {} paths per pixel ({:.0} s), both tone mapped alike. Two halves of \
+             the reference, with half the paths each, have an SSIM of {}: an exact bake would have more than that, but \
+             not 1.\n\n",
+            view.size[0],
+            view.size[1],
+            view.paths,
+            view.seconds,
+            likeness(view.of_halves),
+        );
+    }
     out.push_str("## Time to an error of indirect light\n\n| | 10 % | 5 % | 1 % | slope |\n|---|---|---|---|---|\n");
     for s in series(rows)
         .into_iter()
