@@ -1053,8 +1053,8 @@ typedef struct bk_bake_params {
   // Rays per texel of the gather map, at most 65536; 0: no indirect light. Default: 64.
   uint32_t gather_rays;
   // Photon search radius in scene units, finite and at least 1.2e-38; 0, the default: from the
-  // density of photons. Photons on one plane count through walls that stand on it: a radius well
-  // above the automatic one lets light through them.
+  // density of photons. Photons that are not seen from the middle of their disc, as those behind a
+  // wall, do not count, and neither does the surface there.
   float radius;
   // Radius of the gather map's blur in its texels, at most 16; 0: none. Default: 2.
   uint32_t blur_radius;

@@ -16,7 +16,7 @@ use super::map::ChartMap;
 use crate::device::Device;
 use crate::error::Result;
 use crate::photon::PhotonMap;
-use crate::photon::coverage::coverage;
+use crate::photon::coverage;
 use crate::progress::Stage;
 use crate::sampling::{combine, sobol_2d};
 use crate::scene::{NONE, Scene};
@@ -96,10 +96,7 @@ fn texel(input: &RadianceInput, sample: usize, rays: &mut u64) -> Vec3 {
     let seed = combine(input.seed, sample as u32);
     let mut e = input.direct.irradiance(&receiver, input.direct_samples, seed, rays);
     if let Some(photons) = input.photons {
-        let by_photons = Vec3::from(photons.estimate(point.position, receiver.geometric));
-        if by_photons != Vec3::ZERO {
-            e += by_photons / coverage(photons, point.position, receiver.geometric, seed, rays);
-        }
+        e += coverage::irradiance(photons, point.position, receiver.geometric, seed, rays);
     }
     albedo * e / PI
 }

@@ -11,6 +11,7 @@
 //! fixed by the grid and the width of the lanes; lanes of f32 are emptied into f64 often enough
 //! that a disc may hold millions.
 
+use super::PhotonView;
 use super::grid::Grid;
 use crate::simd::{self, Isa, Lanes, Mask, Simd};
 use glam::Vec3;
@@ -46,6 +47,18 @@ impl Cylinder {
     /// Weight of a photon at a distance from the axis, in radii.
     pub(super) fn filter(&self, distance: f32) -> f32 {
         1.0 - distance * self.inverse_k
+    }
+
+    /// Weight of photon `i` in the estimate at a point; `None` if it does not count.
+    pub(super) fn weight(&self, photons: &PhotonView, i: usize, position: Vec3, normal: Vec3) -> Option<f32> {
+        let dot = |columns: &[&[f32]; 3]| Vec3::new(columns[0][i], columns[1][i], columns[2][i]).dot(normal);
+        let [x, y, z] = photons.position.map(|column| column[i]);
+        let d = (Vec3::new(x, y, z) - position) / self.radius;
+        let height = d.dot(normal);
+        let radial2 = d.length_squared() - height * height;
+        let inside = radial2 <= 1.0 && height.abs() <= self.half_height;
+        let counts = inside && dot(&photons.direction) < 0.0 && dot(&photons.normal) >= SAME_SURFACE;
+        counts.then(|| self.filter(radial2.max(0.0).sqrt()))
     }
 }
 
@@ -302,6 +315,25 @@ mod tests {
             (place(Vec3::new(at(0), at(1), at(2))), n)
         };
         (0..count).map(query).collect()
+    }
+
+    #[test]
+    fn weights_one_by_one_add_up_to_the_estimate() {
+        let photon = |i| StoredPhoton {
+            position: Vec3::new(uniform(i, 0, 1), uniform(i, 1, 1), 0.3 * uniform(i, 2, 1)),
+            direction: uniform_sphere([uniform(i, 3, 1), uniform(i, 4, 1)]),
+            power: Vec3::splat(uniform(i, 5, 1)),
+            normal: uniform_sphere([uniform(i, 6, 1), uniform(i, 7, 1)]),
+        };
+        let photons: Vec<StoredPhoton> = (0..2000).map(photon).collect();
+        let (position, normal) = (Vec3::new(0.5, 0.4, 0.1), Vec3::new(0.1, 0.2, 1.0).normalize());
+        let (grid, cylinder) = (grid_of(&photons, 0.3), Cylinder::new(0.3, 0.25, 1.1));
+        let mut e = [[0.0; 3]];
+        kernel(Isa::Portable)(&grid, &cylinder, &[position.to_array()], &[normal.to_array()], &mut e);
+        let view = grid.photons.view();
+        let weight = |i| cylinder.weight(&view, i, position, normal).unwrap_or(0.0);
+        let sum: f64 = (0..photons.len()).map(|i| f64::from(weight(i) * view.power[0][i])).sum();
+        assert!(e[0][0] > 1.0 && (sum * cylinder.scale / f64::from(e[0][0]) - 1.0).abs() < 1e-5, "{sum} {e:?}");
     }
 
     #[test]

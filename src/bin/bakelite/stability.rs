@@ -370,10 +370,9 @@ mod tests {
         assert!(plot(&rows).contains("scene scale"));
     }
 
-    /// What the library promises about stiff and extreme cases. One thing it does not keep yet: photons of a wide
-    /// search disc count through walls (photon/estimate.rs looks at places and normals only).
+    /// What the library promises about stiff and extreme cases.
     #[test]
-    fn all_cases_hold_but_photons_behind_walls() {
+    fn all_cases_hold() {
         let args = BakeArgs { params: BakeParams { photon_count: 10_000, ..Default::default() }, ..Default::default() };
         let lab = Lab::new(&args, true).unwrap();
         let mut rows = Vec::new();
@@ -381,9 +380,8 @@ mod tests {
             lab.take_warnings();
             case(&lab, &mut rows).unwrap_or_else(|e| panic!("{name}: {e}"));
         }
-        let leaks = |r: &Row| r.case == "thin wall" && r.parameter.ends_with("search radius 0.3, indirect");
         for r in &rows {
-            assert_eq!(r.verdict == Verdict::Fails, leaks(r), "{r:?}");
+            assert!(r.verdict != Verdict::Fails, "{r:?}");
         }
         assert!(rows.len() > 50, "{}", rows.len());
     }

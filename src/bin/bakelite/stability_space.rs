@@ -151,8 +151,10 @@ fn thin_wall(lab: &Lab, rows: &mut Vec<Row>) -> Result<()> {
     }
     // Discs of the photon map's estimate that reach across the wall.
     for radius in lab.some(&[0.1, 0.3]) {
-        let parameter = format!("1e-3, search radius {radius}");
-        push_dark(lab, rows, "thin wall", parameter, radius, two_rooms(1e-3, DQuat::IDENTITY)?)?;
+        for gap in [1e-3, 0.0] {
+            let parameter = format!("{gap:e}, search radius {radius}");
+            push_dark(lab, rows, "thin wall", parameter, radius, two_rooms(gap, DQuat::IDENTITY)?)?;
+        }
     }
     Ok(())
 }
