@@ -180,8 +180,12 @@ impl Plan {
     }
 
     /// Tells of stitched edges.
-    pub(crate) fn run_seams(&mut self, edges: u64) {
-        self.run(&format!("stitching of {edges} edges at which smooth surfaces are cut open"));
+    pub(crate) fn run_seams(&mut self, edges: u64, unlike: u64) {
+        let but = match unlike {
+            0 => String::new(),
+            n => format!(", but for {n} points of them whose sides have very different indirect light"),
+        };
+        self.run(&format!("stitching of {edges} edges at which smooth surfaces are cut open{but}"));
     }
 
     /// Tells why nothing was stitched.

@@ -8,6 +8,9 @@
 //! both sides agree exactly, for which the texel grids must meet.) The normal equations are solved
 //! by conjugate gradients (Hestenes and Stiefel 1952), one set of texels for each layer of light.
 //!
+//! Where the two sides show very different indirect light, one of them is not what is seen there: it shows its other
+//! face, or lies in a gap. Stitched, it would shine into the other, so such points are left as they are.
+//!
 //! Edges are compared by the positions of their ends: vertices on the middle of another triangle's
 //! edge are not found.
 
@@ -22,10 +25,16 @@ use crate::scene::NONE;
 use glam::{DVec3, Vec2, Vec3, Vec3A};
 use rayon::prelude::*;
 use std::ops::Range;
+use std::sync::atomic::{AtomicU64, Ordering::Relaxed};
 use std::time::Instant;
 
 /// Surfaces that meet at more than this angle (30 degrees) have an edge of their own.
 const SMOOTH_COSINE: f32 = 0.866;
+
+/// Points whose sides differ by more than this factor in indirect light are not stitched. In the living room that took
+/// a shade beside a lamp from 9.9 to 4.4 (5.5 is right) and the mean squared relative error of all but the worst hundredth
+/// of the points from 1.36e-2 to 1.15e-2; 2 is no better and 8 as without. No difference in Sponza, whatever the factor.
+const CONTRAST: f32 = 4.0;
 
 /// Texels between the points of an edge: both sides are linear between texels, each in its own grid.
 const SPACING: f32 = 0.5;
@@ -92,11 +101,11 @@ impl Lightmap {
             stage.advance(1)?;
             stats.seam_seconds = start.elapsed().as_secs_f64();
             stats.seconds += stats.seam_seconds;
-            if let Some((stitch, edges)) = stitch {
-                plan.run_seams(edges);
+            if let Some((stitch, [edges, unlike])) = stitch {
+                plan.run_seams(edges, unlike);
                 return Ok(Some(stitch));
             }
-            "no edge of a smooth surface is cut open"
+            "no edge of a smooth surface is cut open where both sides show alike light"
         };
         plan.leave_out_seams(why);
         Ok(None)
@@ -129,6 +138,15 @@ impl View<'_> {
             Some((before, i)) => [before.direct[i], before.indirect[i]],
             None => [source.direct[sample], source.indirect[sample]],
         }
+    }
+
+    /// Whether the indirect light of both sides of a point is of the same order.
+    fn are_alike(&self, p: &Point) -> bool {
+        let shown = |side: Range<usize>| -> f32 {
+            side.map(|k| p.weights[k].abs() * self.light(p.texels[k] as usize)[1].element_sum()).sum()
+        };
+        let (a, b) = (shown(0..4), shown(4..8));
+        a.max(b) <= CONTRAST * a.min(b)
     }
 
     /// Whether a sample may be moved: hidden ones repeat what is around them, and what has overflown
@@ -177,21 +195,25 @@ struct Job<'a, 'p, 'c> {
 }
 
 impl Job<'_, '_, '_> {
-    /// The stitched light and the number of edges. `None` if there are none.
-    fn run(&self, view: &View, plan: &Plan, stats: &mut BakeStats) -> Result<Option<(Stitch, u64)>> {
+    /// The stitched light, the number of edges, and that of points whose sides differ too much. `None` if there are none.
+    fn run(&self, view: &View, plan: &Plan, stats: &mut BakeStats) -> Result<Option<(Stitch, [u64; 2])>> {
         let edges = self.edges()?;
         self.stage.advance(0)?;
         let count: usize = edges.iter().map(|e| self.point_count(e)).sum();
         let uses = 8 * size_of::<(u32, f32)>();
         let bytes = count * (size_of::<Point>() + uses + size_of::<Vec3A>()) + self.atlas.map.len() * 4;
         let _memory = self.reserve(bytes, "the seams' points")?;
-        let mut points: Vec<Point> = edges
-            .par_iter()
-            .with_min_len(64)
-            .flat_map_iter(|e| {
-                self.points(e).filter(|p| is_cut(p) && p.texels.iter().all(|&t| view.is_valid(t as usize)))
-            })
-            .collect();
+        let unlike = AtomicU64::new(0);
+        let is_stitched = |p: &Point| {
+            if !is_cut(p) || !p.texels.iter().all(|&t| view.is_valid(t as usize)) {
+                return false;
+            }
+            let alike = view.are_alike(p);
+            unlike.fetch_add(u64::from(!alike), Relaxed);
+            alike
+        };
+        let mut points: Vec<Point> =
+            edges.par_iter().with_min_len(64).flat_map_iter(|e| self.points(e).filter(&is_stitched)).collect();
         if points.is_empty() {
             return Ok(None);
         }
@@ -213,7 +235,7 @@ impl Job<'_, '_, '_> {
         stats.seam_rms_before = system.relative_rms(&combine(&mut before));
         let [direct, indirect] = [0, 1].map(|i: usize| after[i].iter().map(|&v| Vec3::from(v)).collect());
         stats.seam_rms_after = system.relative_rms(&combine(&mut after));
-        Ok(Some((Stitch { texels, direct, indirect, _memory: memory }, edges.len() as u64)))
+        Ok(Some((Stitch { texels, direct, indirect, _memory: memory }, [edges.len() as u64, unlike.into_inner()])))
     }
 
     fn reserve(&self, bytes: usize, what: &str) -> Result<Reservation> {

@@ -113,6 +113,31 @@ fn both_sides_of_a_seam_agree_and_nothing_else_changes() {
 }
 
 #[test]
+fn what_lies_in_a_gap_is_not_stitched_to_what_does_not() {
+    // Half of the second square is covered, and a curtain hangs down from the cover where the squares meet.
+    let mut meshes = floor();
+    let cover = [[1.000_01, 0.0], [2.0, 0.0], [2.0, 0.5], [1.000_01, 0.5]].map(|[x, z]| Vec3::new(x, 0.02, z));
+    let curtain = [[0.02, 0.0], [0.02, 0.5], [1e-4, 0.5], [1e-4, 0.0]].map(|[y, z]| Vec3::new(1.000_01, y, z));
+    meshes.push(quad(cover, Vec2::new(0.75, 0.75), 0.0));
+    meshes.push(quad(curtain, Vec2::new(0.75, 0.75), 0.0));
+    let mut map = lightmap(&scene(2, meshes, LAMP));
+    bake(&mut map, &params(false));
+    let plain = bits(&map);
+    bake(&mut map, &params(true));
+    let text = map.plan_text();
+    let stitched = bits(&map);
+    let n = map.atlas.map.len();
+    let (mut open, mut covered) = (0, 0);
+    for i in (0..2 * n).filter(|&i| stitched[i] != plain[i]) {
+        let z = map.atlas.map.texels.samples[i % n].position(&map.atlas.scene).z;
+        (open, covered) = (open + (z > 0.5) as u32, covered + (z < 0.45) as u32);
+    }
+    // But for some texels (34 of 138) whose samples lie before the curtain.
+    assert!(open > 50 && 3 * covered < open, "{open} {covered}");
+    assert!(text.contains("cut open, but for "), "{text}");
+}
+
+#[test]
 fn shards_and_threads_leave_the_bits_of_a_whole_bake() {
     let mut whole = lightmap(&scene(1, floor(), LAMP));
     bake(&mut whole, &params(true));
