@@ -41,15 +41,17 @@ pub(crate) struct Gaps {
 }
 
 impl Gaps {
-    /// Of some `charts` of an atlas, on the sides that `backs` tells. Advances `stage` by one per chart.
-    pub(crate) fn find(atlas: &Atlas, charts: Range<u32>, backs: &[bool], stage: &Stage) -> Result<Gaps> {
+    /// Of some `placements` of an atlas, on the sides that `backs` tells of charts with one place. Advances `stage` by
+    /// one per placement.
+    pub(crate) fn find(atlas: &Atlas, placements: Range<u32>, backs: &[bool], stage: &Stage) -> Result<Gaps> {
         let search = Search { atlas, backs, rays: AtomicU64::new(0) };
-        let of_chart = |chart: u32| {
+        let of_placement = |placement: u32| {
             stage.advance(1)?;
-            Ok(search.chart(chart))
+            Ok(search.placement(placement))
         };
         let device = atlas.scene.device();
-        let found: Vec<InGaps> = device.install(|| charts.into_par_iter().map(of_chart).collect::<Result<_>>())?;
+        let found: Vec<InGaps> =
+            device.install(|| placements.into_par_iter().map(of_placement).collect::<Result<_>>())?;
         let gather = Bits::new(found.iter().flat_map(|f| &f.gather), atlas.gather.len())?;
         let map = Bits::new(found.iter().flat_map(|f| &f.map), atlas.map.len())?;
         let memory = device.memory().reserve(gather.bytes() + map.bytes(), "the texels in gaps")?;
@@ -69,7 +71,7 @@ impl Gaps {
     }
 }
 
-/// Samples in gaps of one chart.
+/// Samples in gaps of one placement.
 #[derive(Default)]
 struct InGaps {
     gather: Vec<u32>,
@@ -83,26 +85,26 @@ struct Search<'a> {
 }
 
 impl Search<'_> {
-    fn chart(&self, chart: u32) -> InGaps {
+    fn placement(&self, placement: u32) -> InGaps {
         let (gather, map, charts) = (&self.atlas.gather, &self.atlas.map, &self.atlas.charts);
-        let scale = gather.layout.placements[chart as usize].scale;
+        let scale = gather.layout.placements[placement as usize].scale;
         let texel = 1.0 / scale[0].min(scale[1]);
         let mut rays = 0;
-        let of_chart = gather.samples_of(chart);
-        let is_in_gap: Vec<bool> = of_chart.clone().map(|s| self.is_in_gap(gather, s, texel, &mut rays)).collect();
+        let own = gather.samples_of(placement);
+        let is_in_gap: Vec<bool> = own.clone().map(|s| self.is_in_gap(gather, s, texel, &mut rays)).collect();
         let mut found = InGaps::default();
-        found.gather.extend(of_chart.clone().filter(|s| is_in_gap[s - of_chart.start]).map(|s| s as u32));
+        found.gather.extend(own.clone().filter(|s| is_in_gap[s - own.start]).map(|s| s as u32));
         if !found.gather.is_empty() {
             let is_between = |sample: &usize| {
                 let t = &map.texels.samples[*sample];
                 let (mut some, mut all) = (false, true);
-                gather.bilinear(chart, charts.local(t.triangle, t.u, t.v), |s, _| {
-                    some |= is_in_gap[s - of_chart.start];
-                    all &= is_in_gap[s - of_chart.start];
+                gather.bilinear(placement, charts.local(t.triangle, t.u, t.v), |s, _| {
+                    some |= is_in_gap[s - own.start];
+                    all &= is_in_gap[s - own.start];
                 });
                 some && !all
             };
-            let candidates = map.samples_of(chart).filter(is_between);
+            let candidates = map.samples_of(placement).filter(is_between);
             found.map = candidates.filter(|&s| self.is_in_gap(map, s, texel, &mut rays)).map(|s| s as u32).collect();
         }
         self.rays.fetch_add(rays, Relaxed);

@@ -22,8 +22,8 @@ pub type Values = Vec<[f64; 3]>;
 
 /// Points of surfaces, as often as they are seen from places in the scene.
 pub struct Points {
-    /// Global triangle and weights of its corners 1 and 2.
-    pub on: Vec<(u32, f32, f32)>,
+    /// Global triangle, whether it is its front, and weights of its corners 1 and 2.
+    pub on: Vec<(u32, bool, f32, f32)>,
     /// Unit normals of the sides that the light map holds.
     pub normals: Vec<Vec3>,
     pub positions: Vec<Vec3>,
@@ -106,13 +106,13 @@ impl Points {
             if hit.is_miss() {
                 continue;
             }
-            if hit.front == lightmap.shows_back(hit.triangle) {
+            if !lightmap.shows(hit.triangle, hit.front) {
                 self.of_other_sides += 1;
                 continue;
             }
             let side = if hit.front { 1.0 } else { -1.0 };
             let sample = TexelSample { triangle: hit.triangle, u: hit.u, v: hit.v, ..Default::default() };
-            self.on.push((hit.triangle, hit.u, hit.v));
+            self.on.push((hit.triangle, hit.front, hit.u, hit.v));
             self.positions.push(sample.position(scene));
             self.normals.push(side * sample.shading_normal(scene));
         }
@@ -128,7 +128,7 @@ impl Points {
 
     /// Light that a light map of the same scene has at the points.
     pub fn of_bake(&self, lightmap: &Lightmap, layer: Layer) -> Values {
-        self.on.iter().map(|&(t, u, v)| lightmap.sample(layer, t, u, v).map(f64::from)).collect()
+        self.on.iter().map(|&(t, front, u, v)| lightmap.sample(layer, t, front, u, v).map(f64::from)).collect()
     }
 }
 
