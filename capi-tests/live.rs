@@ -120,13 +120,15 @@ fn a_carpet_in_the_cornell_box_ends_with_the_bits_of_a_bake() {
     assert_same_as_bake(&live, &mut lightmap, "carpet");
 }
 
-/// The Cornell box with a two-sided shelf below its lamp.
+/// The Cornell box with a two-sided shelf below its lamp, its back above, and a mat 4 mm over that.
 fn with_shelf(threads: usize, both_sides: bool) -> Lightmap {
     let mut data = builtin("cornell").unwrap();
     let material = data.add_material(Material { two_sided: true, ..Default::default() }).unwrap();
-    let corners = [[0.1, 0.1], [0.1, 0.4], [0.45, 0.4], [0.45, 0.1]].map(|[x, z]| Vec3::new(x, 0.45, z));
-    let (indices, materials) = (vec![[0, 1, 2], [0, 2, 3]], MeshMaterials::One(material));
-    data.add_mesh(Mesh { positions: corners.into(), indices, materials, ..Default::default() }).unwrap();
+    for (right, y) in [(0.45, 0.45), (0.25, 0.454)] {
+        let corners = [[0.1, 0.1], [right, 0.1], [right, 0.4], [0.1, 0.4]].map(|[x, z]| Vec3::new(x, y, z));
+        let (indices, materials) = (vec![[0, 1, 2], [0, 2, 3]], MeshMaterials::One(material));
+        data.add_mesh(Mesh { positions: corners.into(), indices, materials, ..Default::default() }).unwrap();
+    }
     let device = Device::new(DeviceOptions { num_threads: threads, ..Default::default() }).unwrap();
     let scene = Scene::commit(&device, data, &BuildOptions::default(), &Progress::none()).map_err(|e| e.1).unwrap();
     let desc = LightmapDesc { texels_per_unit: 60.0, page_size: 256, both_sides, ..Default::default() };

@@ -250,6 +250,14 @@ fn both_sides_of_a_sheet_have_their_own_light() {
         let level = mean(&totals);
         let (bias, rmse) = (mean(&errors) / level, mean(&squares(&errors)).sqrt() / level);
         println!("front {front}: mean {level:.3}, bias {:.2} %, RMSE {:.2} %", 100.0 * bias, 100.0 * rmse);
+        // Reflected is albedo/π of it, in texels of another size.
+        let sum = |layer, c: usize| {
+            places.iter().map(|p| map.sample(layer, p.triangle, front, p.u, p.v)[c] as f64).sum::<f64>()
+        };
+        let reflected = [0, 1, 2].map(|c| PI * sum(Layer::Radiance, c) / sum(Layer::Combined, c));
+        println!("reflected {reflected:.3?}");
+        let off = (0..3).map(|c| (reflected[c] / [0.7, 0.5, 0.3][c] - 1.0).abs()).fold(0.0, f64::max);
+        assert!(off <= 0.08, "front {front}: {reflected:?} of the light is reflected");
         assert!(rmse <= most_rmse && bias.abs() <= most_bias, "front {front}: RMSE {rmse}, bias {bias}");
     }
 }

@@ -241,4 +241,37 @@ mod tests {
         let none = Gaps::find(atlas, 1..1, &[], &progress.stage("gaps", 0.0, 1.0, 0)).unwrap();
         assert!(none.is_empty() && none.gather.bytes() + none.map.bytes() == 0);
     }
+
+    /// A wall between two rooms, and a poster 5 mm behind a part of it.
+    #[test]
+    fn a_back_with_a_place_of_its_own_has_gaps_of_its_own() {
+        let device = Device::new(DeviceOptions { num_threads: 2, ..Default::default() }).unwrap();
+        let mut data = SceneData::new();
+        let m = data.add_material(Material { two_sided: true, ..Default::default() }).unwrap();
+        let quad = |size: f32, z: f32| {
+            let p = |x: f32, y: f32| Vec3::new(x, y, z);
+            let mut builder = MeshBuilder::new();
+            builder.quad(p(-size, -size), p(size, -size), p(size, size), p(-size, size), m);
+            builder.finish()
+        };
+        data.add_mesh(quad(2.0, 0.0)).unwrap();
+        data.add_mesh(quad(0.8, -0.005)).unwrap();
+        let mut room = MeshBuilder::new();
+        room.box_(Vec3::splat(-2.0), Vec3::splat(2.0), true, m);
+        data.add_mesh(room.finish()).unwrap();
+        let scene = Scene::commit(&device, data, &BuildOptions::default(), &Progress::none()).map_err(|e| e.1).unwrap();
+        let desc = LightmapDesc { texels_per_unit: 20.0, both_sides: true, ..Default::default() };
+        let lightmap = Lightmap::create(&scene, &desc, &Progress::none()).unwrap();
+        let atlas = lightmap.atlas();
+        let wall = atlas.charts.chart_of[0];
+        let back = atlas.map.layout.back(wall).unwrap();
+        let progress = Progress::none();
+        let all = atlas.map.layout.placements.len() as u32;
+        let gaps = Gaps::find(atlas, 0..all, &[], &progress.stage("gaps", 0.0, 1.0, all.into())).unwrap();
+        let behind = |s: &usize| atlas.gather.surface(&atlas.scene, *s).0.abs().max_element() < 0.6;
+        assert!(atlas.gather.samples_of(back).filter(behind).all(|s| gaps.gather.has(s)));
+        assert!(atlas.gather.samples_of(wall).filter(behind).all(|s| !gaps.gather.has(s)));
+        assert!(atlas.map.samples_of(back).any(|s| gaps.map.has(s)));
+        assert!(!atlas.map.samples_of(wall).any(|s| gaps.map.has(s)));
+    }
 }

@@ -164,7 +164,7 @@ mod tests {
         assert_eq!([shown(1.0, 0.0), shown(1.0, 1.0), shown(1.0, 7.0), shown(1.0, 9.0)], [false, false, false, true]);
     }
 
-    /// Two rooms, a wall between them, and in one of them a small box and a one-sided screen.
+    /// Two rooms, a wall between them, and in them two small boxes and a one-sided screen.
     #[test]
     fn what_one_sees_something_from_both_sides_of_gets_two_places() {
         let device = Device::new(DeviceOptions { num_threads: 2, ..Default::default() }).unwrap();
@@ -175,7 +175,9 @@ mod tests {
         let mut builder = MeshBuilder::new();
         builder.quad(p(-1.0, -1.0, 0.0), p(1.0, -1.0, 0.0), p(1.0, 1.0, 0.0), p(-1.0, 1.0, 0.0), m);
         builder.box_(Vec3::new(-1.0, -1.0, -2.0), Vec3::new(1.0, 1.0, 2.0), true, m);
+        // Their fronts outside, and inside.
         builder.box_(Vec3::splat(0.05), Vec3::splat(0.15), false, m);
+        builder.box_(Vec3::splat(0.45), Vec3::splat(0.55), true, m);
         let screen = [p(-0.5, -0.5, -1.0), p(0.5, -0.5, -1.0), p(0.5, 0.5, -1.0), p(-0.5, 0.5, -1.0)];
         builder.quad(screen[0], screen[1], screen[2], screen[3], one_sided);
         data.add_mesh(builder.finish()).unwrap();
@@ -185,7 +187,7 @@ mod tests {
         let atlas = lightmap.atlas();
         let wall = atlas.charts.chart_of[0];
         for map in [&atlas.map, &atlas.gather] {
-            assert_eq!(map.layout.back_of, [wall], "the inside of the box and the outside of the room see nothing");
+            assert_eq!(map.layout.back_of, [wall], "the insides of the boxes and the outside of the room see nothing");
         }
         let back = atlas.map.layout.back(wall).unwrap();
         assert_eq!(atlas.map.samples_of(back), atlas.map.back_start..atlas.map.len());

@@ -108,7 +108,6 @@ impl Live {
         for v in self.context.light.radiance.iter() {
             v.to_array().iter().for_each(|c| h.bytes(&c.to_bits().to_le_bytes()));
         }
-        atlas.map.layout.back_of.iter().for_each(|chart| h.bytes(&chart.to_le_bytes()));
         for tile in &self.context.map.tiles {
             tile.texels.iter().for_each(|t| h.bytes(&t.to_le_bytes()));
         }
