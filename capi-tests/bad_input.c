@@ -199,6 +199,8 @@ static void nulls(bk_device *device) {
     CHECK_ERROR(bk_lightmap_info(lightmap, NULL), ARGUMENT, "out is NULL");
     CHECK_ERROR(bk_lightmap_mesh_uvs(NULL, 0, vector, NULL), ARGUMENT, "lightmap is NULL");
     CHECK_ERROR(bk_lightmap_mesh_uvs(lightmap, 3, NULL, NULL), ARGUMENT, "mesh 3");
+    CHECK_ERROR(bk_lightmap_mesh_back_uvs(NULL, 0, vector, NULL, NULL), ARGUMENT, "lightmap is NULL");
+    CHECK_ERROR(bk_lightmap_mesh_back_uvs(lightmap, 3, NULL, NULL, NULL), ARGUMENT, "mesh 3");
     CHECK_ERROR(bk_bake(NULL, NULL, NULL, NULL, NULL), ARGUMENT, "lightmap is NULL");
     CHECK_ERROR(bk_lightmap_read(NULL, 0, 0, BK_FORMAT_RGB32F, vector, 0), ARGUMENT, "lightmap is NULL");
     CHECK_ERROR(bk_lightmap_read(lightmap, 0, BK_LAYER_NORMAL, BK_FORMAT_RGB32F, NULL, 0), ARGUMENT, "dst is NULL");

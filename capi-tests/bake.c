@@ -355,6 +355,95 @@ static void bake(const bk_scene *scene, const char *prefix) {
     bk_lightmap_release(lightmap);
 }
 
+/* ---- Both sides of a two-sided shelf in the box, across it at half its height ---- */
+
+static const float SHELF[4][3] = {{-0.8f, -0.8f, 1}, {0.8f, -0.8f, 1}, {0.8f, 0.8f, 1}, {-0.8f, 0.8f, 1}};
+static const uint32_t SHELF_TRIANGLES[2][3] = {{0, 1, 2}, {0, 2, 3}};
+
+static bk_lightmap *both_sides_of(const bk_scene *scene, uint32_t struct_size, struct bk_lightmap_info *info) {
+    bk_lightmap *lightmap = NULL;
+    bk_lightmap_desc desc;
+    bk_lightmap_desc_init(&desc);
+    CHECK(desc.both_sides == 0);
+    desc.struct_size = struct_size;
+    desc.page_size = PAGE;
+    desc.texels_per_unit = 8.0f;
+    desc.gather_divisor = desc.radiance_divisor = 2;
+    desc.both_sides = 1;
+    CHECK_OK(bk_lightmap_create(scene, &desc, NULL, NULL, &lightmap));
+    bk_lightmap_info_init(info);
+    CHECK_OK(bk_lightmap_info(lightmap, info));
+    return lightmap;
+}
+
+/* The texel in the middle of a triangle. */
+static const float *middle(const float *pixels, const float corner_uvs[6]) {
+    int x = (int)((corner_uvs[0] + corner_uvs[2] + corner_uvs[4]) / 3.0f * PAGE);
+    int y = (int)((corner_uvs[1] + corner_uvs[3] + corner_uvs[5]) / 3.0f * PAGE);
+    return pixels + 3 * (y * PAGE + x);
+}
+
+static void both_sides(bk_device *device) {
+    bk_scene *scene = make_scene(device);
+    bk_material_desc material;
+    bk_mesh_desc mesh;
+    bk_lightmap *lightmap;
+    struct bk_lightmap_info info, old_info;
+    bk_bake_params params;
+    uint32_t two_sided, id, pages[10], back_pages[10];
+    uint8_t own[10];
+    float front[60], back[60], *normal, *combined;
+
+    bk_material_desc_init(&material);
+    material.flags = BK_MATERIAL_TWO_SIDED;
+    CHECK_OK(bk_scene_add_material(scene, &material, &two_sided));
+    bk_mesh_desc_init(&mesh);
+    mesh.positions = SHELF[0];
+    mesh.vertex_count = 4;
+    mesh.indices = SHELF_TRIANGLES[0];
+    mesh.triangle_count = 2;
+    mesh.material = two_sided;
+    CHECK_OK(bk_scene_add_mesh(scene, &mesh, &id));
+    CHECK_OK(bk_scene_commit(scene, NULL, NULL));
+
+    /* Callers whose structures end before the field get what they got before. */
+    lightmap = both_sides_of(scene, (uint32_t)offsetof(bk_lightmap_desc, both_sides), &info);
+    CHECK(info.both_sided_charts == 0 && info.back_texels == 0);
+    CHECK_OK(bk_lightmap_mesh_uvs(lightmap, id, front, pages));
+    CHECK_OK(bk_lightmap_mesh_back_uvs(lightmap, id, back, back_pages, own));
+    CHECK(memcmp(front, back, 12 * sizeof(float)) == 0 && pages[1] == back_pages[1] && own[0] == 0 && own[1] == 0);
+    bk_lightmap_release(lightmap);
+
+    lightmap = both_sides_of(scene, sizeof(bk_lightmap_desc), &info);
+    CHECK(info.both_sided_charts == 1 && info.back_texels >= 12 * 12 && info.page_count == 1);
+    memset(&old_info, 0xab, sizeof old_info);
+    old_info.struct_size = (uint32_t)offsetof(struct bk_lightmap_info, both_sided_charts);
+    CHECK_OK(bk_lightmap_info(lightmap, &old_info));
+    CHECK(old_info.texels == info.texels && old_info.both_sided_charts != info.both_sided_charts);
+
+    CHECK_OK(bk_lightmap_mesh_uvs(lightmap, id, front, pages));
+    CHECK_OK(bk_lightmap_mesh_back_uvs(lightmap, id, back, back_pages, own));
+    CHECK(own[0] == 1 && own[1] == 1 && memcmp(front, back, 12 * sizeof(float)) != 0 && back_pages[0] == 0);
+    bk_bake_params_init(&params);
+    params.photon_count = 50000;
+    CHECK_OK(bk_bake(lightmap, &params, NULL, NULL, NULL));
+    normal = read_rgb(lightmap, BK_LAYER_NORMAL);
+    combined = read_rgb(lightmap, BK_LAYER_COMBINED);
+    CHECK(middle(normal, front)[2] == 1.0f && middle(normal, back)[2] == -1.0f);
+    /* The lamp hangs above. */
+    CHECK(middle(combined, front)[0] > 3.0f * middle(combined, back)[0] && middle(combined, back)[0] > 0.0f);
+    free(normal);
+    free(combined);
+
+    /* The walls of the box are one-sided. */
+    CHECK_OK(bk_lightmap_mesh_uvs(lightmap, 0, front, pages));
+    CHECK_OK(bk_lightmap_mesh_back_uvs(lightmap, 0, back, back_pages, own));
+    CHECK(memcmp(front, back, sizeof back) == 0 && memcmp(pages, back_pages, sizeof pages) == 0 && own[9] == 0);
+    CHECK_OK(bk_lightmap_mesh_back_uvs(lightmap, 0, NULL, NULL, NULL));
+    bk_lightmap_release(lightmap);
+    bk_scene_release(scene);
+}
+
 int main(int argc, char **argv) {
     const char *prefix = argc > 1 ? argv[1] : "";
     bk_device *device = NULL;
@@ -370,6 +459,7 @@ int main(int argc, char **argv) {
     CHECK_OK(bk_device_create(&desc, &device));
     CHECK(bk_device_isa(device) != BK_ISA_AUTO && bk_device_num_threads(device) == 2);
 
+    both_sides(device);
     scene = make_scene(device);
     bk_device_release(device); /* the scene keeps it alive */
     commit(scene);

@@ -158,6 +158,7 @@ impl Draw {
             padding: self.pick(&[1, 1, 2, 4]),
             gather_divisor: self.pick(&[1, 2, 3, 64]),
             radiance_divisor: self.pick(&[1, 2, 5, 64]),
+            both_sides: self.one_in(2),
         };
         match self.below(20) {
             0 => desc.page_size = self.pick(&[0, 15, 20_000, u32::MAX]),
@@ -256,7 +257,7 @@ fn check_light(map: &Lightmap) {
         assert!(triangles.iter().all(|&t| t == NONE || t < map.scene().triangle_count()));
     }
     for t in 0..map.scene().triangle_count() {
-        assert!(is_sound(&[map.sample(Layer::Combined, t, 0.3, 0.3)]));
+        assert!(is_sound(&[map.sample(Layer::Combined, t, true, 0.3, 0.3)]));
     }
 }
 

@@ -120,6 +120,48 @@ fn a_carpet_in_the_cornell_box_ends_with_the_bits_of_a_bake() {
     assert_same_as_bake(&live, &mut lightmap, "carpet");
 }
 
+/// The Cornell box with a two-sided shelf below its lamp, its back above, and a mat 4 mm over that.
+fn with_shelf(threads: usize, both_sides: bool) -> Lightmap {
+    let mut data = builtin("cornell").unwrap();
+    let material = data.add_material(Material { two_sided: true, ..Default::default() }).unwrap();
+    for (right, y) in [(0.45, 0.45), (0.25, 0.454)] {
+        let corners = [[0.1, 0.1], [right, 0.1], [right, 0.4], [0.1, 0.4]].map(|[x, z]| Vec3::new(x, y, z));
+        let (indices, materials) = (vec![[0, 1, 2], [0, 2, 3]], MeshMaterials::One(material));
+        data.add_mesh(Mesh { positions: corners.into(), indices, materials, ..Default::default() }).unwrap();
+    }
+    let device = Device::new(DeviceOptions { num_threads: threads, ..Default::default() }).unwrap();
+    let scene = Scene::commit(&device, data, &BuildOptions::default(), &Progress::none()).map_err(|e| e.1).unwrap();
+    let desc = LightmapDesc { texels_per_unit: 60.0, page_size: 256, both_sides, ..Default::default() };
+    Lightmap::create(&scene, &desc, &Progress::none()).unwrap()
+}
+
+#[test]
+fn with_both_sides_updates_end_with_the_bits_of_a_bake_before_and_after_a_change_of_light() {
+    let mut lightmap = with_shelf(2, true);
+    assert!(lightmap.info().both_sided_charts == 1 && lightmap.info().back_texels > 300);
+    let mut live = Live::new(&lightmap, &params(Mode::Position), &Progress::none()).unwrap();
+    for i in 0..10 {
+        live.update(&camera(i), &RAYS).unwrap();
+    }
+    let path = std::env::temp_dir().join(format!("bakelite-both-sides-{}", std::process::id()));
+    live.save(&path).unwrap();
+    let mut other = Live::new(&lightmap, &params(Mode::Position), &Progress::none()).unwrap();
+    other.restore(&path).unwrap();
+    assert_eq!(other.sums().unwrap(), live.sums().unwrap());
+    let mut one_sided = Live::new(&with_shelf(2, false), &params(Mode::Position), &Progress::none()).unwrap();
+    assert!(matches!(one_sided.restore(&path), Err(Error::InvalidArgument(_))));
+    std::fs::remove_file(&path).unwrap();
+    assert_eq!(finish(&mut other).finished, 1.0);
+    assert_same_as_bake(&other, &mut lightmap, "both sides");
+    let Light::Rect { position, edge_u, edge_v, radiance } = lightmap.scene().lights()[0] else { panic!() };
+    let radiance = [radiance[2], 0.1 * radiance[1], radiance[0]];
+    lightmap.scene().set_light(0, Light::Rect { position, edge_u, edge_v, radiance }).unwrap();
+    other.light_changed(0).unwrap();
+    other.finish_relighting().unwrap();
+    assert_eq!(finish(&mut other).finished, 1.0);
+    assert_same_as_bake(&other, &mut lightmap, "both sides under another light");
+}
+
 #[test]
 fn view_based_updates_finish_what_the_camera_sees() {
     let lightmap = unbaked("cornell", 2, 60.0);

@@ -101,7 +101,7 @@ impl Truth {
     fn assert_close(&self, what: &str, map: &Lightmap, layer: Layer, bias: f64, rms: f64) {
         let (mut baked, mut truth, mut squares, mut noise) = (0.0, 0.0, 0.0, 0.0);
         for (i, &(t, u, v)) in self.places.iter().enumerate() {
-            let x = map.sample(layer, t, u as f32, v as f32);
+            let x = map.sample(layer, t, true, u as f32, v as f32);
             let [a, b] = [0, 1].map(|half| match layer {
                 Layer::Indirect => self.halves[half][i].indirect,
                 Layer::Direct => self.halves[half][i].direct,
@@ -163,10 +163,10 @@ fn a_chequered_floor_colors_the_walls_as_in_the_path_tracer() {
             Truth::new(&scene, mesh).assert_close(&what, &map, Layer::Indirect, 0.004, 0.02);
         }
         // Red light: the floor's mean albedo is (0.53, 0.43, 0.15) with the texture.
-        let wall = map.sample(Layer::Indirect, scene.first_triangle(2), 0.3, 0.3);
+        let wall = map.sample(Layer::Indirect, scene.first_triangle(2), true, 0.3, 0.3);
         assert_eq!(wall[0] > 1.3 * wall[2], textured, "{wall:?}");
         // Outgoing radiance shows the tiles.
-        let texel = |u: f32, v: f32| map.sample(Layer::Radiance, scene.first_triangle(0), u, v);
+        let texel = |u: f32, v: f32| map.sample(Layer::Radiance, scene.first_triangle(0), true, u, v);
         let tile = texel(0.5 + 1.0 / 32.0, 1.0 / 32.0);
         assert_eq!(tile[0] > 3.0 * tile[1], textured, "{tile:?}");
     }
@@ -214,7 +214,7 @@ fn a_grate_casts_its_shadow_and_lets_photons_through() {
             }
             let way = lamp - point;
             let expected = 10.0 * way.z / way.length().powi(3);
-            let e = map.sample(Layer::Direct, 0, u, v)[1];
+            let e = map.sample(Layer::Direct, 0, true, u, v)[1];
             if along - along.floor() < 0.5 {
                 assert!((e - expected).abs() < 0.02 * expected, "{point}: {e} is not {expected}");
                 lit += 1;
@@ -280,7 +280,8 @@ fn direct_light_is_multiplied_with_what_each_pane_transmits() {
         assert_eq!(stats.left_out & left_out::TRANSMISSION, 0);
         for i in 0..200 {
             let (u, v) = (i as f32 / 400.0, (i * 37 % 200) as f32 / 400.0);
-            let (e, full) = (map.sample(Layer::Direct, i % 2, u, v), bare_map.sample(Layer::Direct, i % 2, u, v));
+            let (e, full) =
+                (map.sample(Layer::Direct, i % 2, true, u, v), bare_map.sample(Layer::Direct, i % 2, true, u, v));
             for c in 0..3 {
                 let expected = full[c] * GLASS[c].powi(panes.len() as i32);
                 assert!((e[c] - expected).abs() <= 2e-6 * expected, "{panes:?} {c}: {} is not {expected}", e[c]);
@@ -369,7 +370,7 @@ fn a_carpet_has_no_dark_rim_and_its_gap_stays_dark() {
     let mean = |map: &Lightmap, x: f32| {
         let light = |y: f32| {
             let (triangle, u, v) = if y <= x { (0, (x - y) / 4.0, y / 4.0) } else { (1, x / 4.0, (y - x) / 4.0) };
-            map.sample(Layer::Indirect, triangle, u, v)[0]
+            map.sample(Layer::Indirect, triangle, true, u, v)[0]
         };
         (0..30).map(|j| light(0.5 + 0.1 * j as f32)).sum::<f32>() / 30.0
     };

@@ -5,6 +5,7 @@ use bakelite::bvh::BuildOptions;
 use bakelite::lightmap::plan::left_out;
 use bakelite::lightmap::{BakeParams, Layer, LayerData, Lightmap, LightmapDesc};
 use bakelite::reference::{Irradiance, PathTracer, Random, SurfacePoint};
+use bakelite::scene::shapes::MeshBuilder;
 use bakelite::scene::{Environment, builtin};
 use bakelite::trace::Ray;
 use bakelite::{Device, DeviceOptions, Error, Isa, Light, Material, Progress, Scene, SceneData};
@@ -61,7 +62,7 @@ impl Place {
     }
 
     fn sample(&self, map: &Lightmap, layer: Layer) -> [f64; 3] {
-        map.sample(layer, self.triangle, self.u, self.v).map(f64::from)
+        map.sample(layer, self.triangle, true, self.u, self.v).map(f64::from)
     }
 }
 
@@ -193,6 +194,103 @@ fn a_two_sided_room_turned_inside_out_has_the_same_light() {
     println!("bias {:.2} %, RMSE {:.2} %", 100.0 * bias, 100.0 * rmse);
     assert!(rmse <= 0.03, "the relative RMSE is {rmse}");
     assert!(bias.abs() <= 0.0065, "the bias is {bias}");
+}
+
+/// A room with a lamp in either half and a two-sided sheet between them: mesh 0, which does not reach the ceiling.
+fn divided_room(threads: usize) -> Arc<Scene> {
+    let mut data = SceneData::new();
+    let cloth = Material { albedo: [0.7, 0.5, 0.3], two_sided: true, ..Default::default() };
+    let cloth = data.add_material(cloth).unwrap();
+    let walls = data.add_material(Material { albedo: [0.6; 3], ..Default::default() }).unwrap();
+    let p = |x: f32, y: f32| Vec3::new(x, y, 0.0);
+    let mut sheet = MeshBuilder::new();
+    sheet.quad(p(-1.0, -1.0), p(1.0, -1.0), p(1.0, 0.5), p(-1.0, 0.5), cloth);
+    data.add_mesh(sheet.finish()).unwrap();
+    let mut room = MeshBuilder::new();
+    room.box_(Vec3::new(-1.0, -1.0, -1.5), Vec3::new(1.0, 1.0, 1.5), true, walls);
+    data.add_mesh(room.finish()).unwrap();
+    for (position, intensity) in [([0.0, 0.2, 1.0], [3.0, 2.0, 1.0]), ([0.3, -0.2, -0.8], [0.2, 0.4, 0.6])] {
+        data.add_light(Light::Point { position: position.into(), intensity }).unwrap();
+    }
+    let device = device(threads, None);
+    Scene::commit(&device, data, &BuildOptions::default(), &Progress::none()).map_err(|e| e.1).unwrap()
+}
+
+fn divided(threads: usize, both_sides: bool) -> Lightmap {
+    let desc = LightmapDesc { texels_per_unit: 16.0, page_size: 256, gather_divisor: 2, ..Default::default() };
+    let desc = LightmapDesc { radiance_divisor: 2, both_sides, ..desc };
+    Lightmap::create(&divided_room(threads), &desc, &Progress::none()).unwrap()
+}
+
+#[test]
+fn both_sides_of_a_sheet_have_their_own_light() {
+    let mut map = divided(0, true);
+    map.bake(&BakeParams::default(), &Progress::none()).unwrap();
+    let info = map.info();
+    assert_eq!(info.both_sided_charts, 1);
+    let line = format!("both sides of 1 two-sided charts; their backs take {} of", info.back_texels);
+    assert!(map.plan_text().contains(&line), "{}", map.plan_text());
+    let scene = map.scene().clone();
+    let tracer = PathTracer::new(&scene);
+    let mut random = Random::new(7, 0);
+    let places: Vec<Place> = (0..100).map(|i| Place::random_on(i % 2, &mut random)).collect();
+    for (front, most_rmse, most_bias) in [(true, 0.03, 0.007), (false, 0.04, 0.02)] {
+        let side = |p: &Place| {
+            let point = p.point(&scene);
+            SurfacePoint { normal: if front { point.normal } else { -point.normal }, ..point }
+        };
+        let points: Vec<SurfacePoint> = places.iter().map(side).collect();
+        let reference = tracer.irradiance_many(scene.device(), &points, 16 * 16 * 16, 1, &Progress::none()).unwrap();
+        let totals: Vec<[f64; 3]> = reference.iter().map(|e| e.total()).collect();
+        let error = |(p, e): (&Place, &[f64; 3])| -> [f64; 3] {
+            let x = map.sample(Layer::Combined, p.triangle, front, p.u, p.v).map(f64::from);
+            std::array::from_fn(|c| x[c] - e[c])
+        };
+        let errors: Vec<[f64; 3]> = places.iter().zip(&totals).map(error).collect();
+        let level = mean(&totals);
+        let (bias, rmse) = (mean(&errors) / level, mean(&squares(&errors)).sqrt() / level);
+        println!("front {front}: mean {level:.3}, bias {:.2} %, RMSE {:.2} %", 100.0 * bias, 100.0 * rmse);
+        // Reflected is albedo/π of it, in texels of another size.
+        let sum = |layer, c: usize| {
+            places.iter().map(|p| map.sample(layer, p.triangle, front, p.u, p.v)[c] as f64).sum::<f64>()
+        };
+        let reflected = [0, 1, 2].map(|c| PI * sum(Layer::Radiance, c) / sum(Layer::Combined, c));
+        println!("reflected {reflected:.3?}");
+        let off = (0..3).map(|c| (reflected[c] / [0.7, 0.5, 0.3][c] - 1.0).abs()).fold(0.0, f64::max);
+        assert!(off <= 0.08, "front {front}: {reflected:?} of the light is reflected");
+        assert!(rmse <= most_rmse && bias.abs() <= most_bias, "front {front}: RMSE {rmse}, bias {bias}");
+    }
+}
+
+/// The UVs of fronts and backs lead to texels of the same places that look the other way.
+#[test]
+fn backs_have_uvs_positions_and_normals_of_their_own() {
+    let map = divided(2, true);
+    let size = map.info().width as usize;
+    let ((fronts, pages), (backs, back_pages)) = (map.mesh_uvs(0).unwrap(), map.mesh_back_uvs(0).unwrap().0);
+    for t in 0..2 {
+        let texel = |corners: [[f32; 2]; 3], page: u32| -> [[f32; 3]; 2] {
+            let [x, y] = [0, 1].map(|k| (corners.iter().map(|c| c[k]).sum::<f32>() / 3.0 * size as f32) as usize);
+            [Layer::Position, Layer::Normal].map(|layer| match map.read(page, layer).unwrap() {
+                LayerData::Rgb(v) => v[y * size + x],
+                _ => unreachable!(),
+            })
+        };
+        let [front, back] = [texel(fronts[t], pages[t]), texel(backs[t], back_pages[t])];
+        assert!((Vec3::from(front[0]) - Vec3::from(back[0])).length() < 1.5 / 16.0, "{front:?} {back:?}");
+        assert_eq!((front[1][2], back[1][2]), (1.0, -1.0));
+        assert!(map.shows(t as u32, true) && map.shows(t as u32, false));
+    }
+    assert_eq!(map.mesh_back_uvs(0).unwrap().1, [true; 2]);
+    // The walls are one-sided, and without the option so is the place of the sheet.
+    assert_eq!(map.mesh_back_uvs(1).unwrap(), (map.mesh_uvs(1).unwrap(), vec![false; 12]));
+    assert!(map.shows(2, true) && !map.shows(2, false));
+    let mut one = divided(2, false);
+    assert_eq!(one.mesh_back_uvs(0).unwrap(), (one.mesh_uvs(0).unwrap(), vec![false; 2]));
+    one.bake(&small().1, &Progress::none()).unwrap();
+    assert_ne!(one.shows(0, true), one.shows(0, false));
+    assert_eq!(one.sample(Layer::Combined, 0, true, 0.3, 0.3), one.sample(Layer::Combined, 0, false, 0.3, 0.3));
+    assert_eq!(one.info().texels + map.info().back_texels, map.info().texels);
 }
 
 /// The Cornell box, whose front is open, in the light of a sky with an image and of a low sun with a disc.
@@ -410,4 +508,25 @@ fn shards_of_texels_combine_to_the_same_bits() {
         parts.bake(&shard, &Progress::none()).unwrap();
     }
     assert_same_bits(&bits(&whole), &bits(&parts), "three shards");
+}
+
+#[test]
+fn with_both_sides_neither_threads_nor_shards_change_a_bit() {
+    let params = small().1;
+    let bake = |threads| {
+        let mut map = divided(threads, true);
+        map.bake(&params, &Progress::none()).unwrap();
+        bits(&map)
+    };
+    let one = bake(1);
+    assert_same_bits(&one, &bake(7), "7 threads");
+    let mut parts = divided(2, true);
+    let (texels, backs) = (parts.info().texels, parts.info().back_texels);
+    // One shard has backs alone.
+    let cuts = [0, texels / 3, texels - backs - 5, texels - backs / 2, texels];
+    for range in cuts.windows(2).rev() {
+        let shard = BakeParams { texel_begin: range[0], texel_end: range[1], ..params };
+        parts.bake(&shard, &Progress::none()).unwrap();
+    }
+    assert_same_bits(&one, &bits(&parts), "four shards");
 }

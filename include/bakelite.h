@@ -895,6 +895,10 @@ typedef struct bk_lightmap_desc {
   // Light map texels per texel of the radiance map (what gather rays see), along each axis, 1 to 64.
   // Default: 4.
   uint32_t radiance_divisor;
+  // Whether two-sided charts from both sides of which one sees something get a second place for their
+  // backs, which bk_lightmap_mesh_back_uvs tells of. Without one, a chart shows the side that the bake
+  // chooses. 0: no, any other value: yes. Default: 0.
+  uint32_t both_sides;
 } bk_lightmap_desc;
 
 // Numbers about a light map's layout.
@@ -935,6 +939,10 @@ struct bk_lightmap_info {
   float texels_per_unit;
   // Not used yet.
   uint32_t reserved;
+  // Of charts, those with a second place for their backs; see both_sides of bk_lightmap_desc.
+  uint64_t both_sided_charts;
+  // Of texels, those of the second places: the last so many.
+  uint64_t back_texels;
 };
 
 // Fills in the defaults.
@@ -986,6 +994,21 @@ bk_result bk_lightmap_mesh_uvs(const bk_lightmap *lightmap,
                                uint32_t mesh,
                                float *out_corner_uvs,
                                uint32_t *out_page_per_triangle);
+
+// Where the backs of the triangles of a mesh lie in the light map. A shader that reads
+// gl_FrontFacing ? uv : back_uv, and the page accordingly, shows the right light on both sides.
+//
+// out_corner_uvs, out_page_per_triangle: as of bk_lightmap_mesh_uvs; of triangles whose back has no
+// place of its own, the same as there. out_own_place_per_triangle: receives triangles bytes, 1 where
+// the back has a place of its own (see both_sides of bk_lightmap_desc), else 0; NULL if not wanted.
+//
+// Fails as bk_lightmap_mesh_uvs does.
+BK_API
+bk_result bk_lightmap_mesh_back_uvs(const bk_lightmap *lightmap,
+                                    uint32_t mesh,
+                                    float *out_corner_uvs,
+                                    uint32_t *out_page_per_triangle,
+                                    uint8_t *out_own_place_per_triangle);
 
 /* ================================================================================================
  * Baking

@@ -13,7 +13,7 @@ use super::error::{bk_result, call, call_or};
 use super::handles::{create, hold, object, release, retain};
 use super::scene::bk_scene;
 use crate::error::{Error, Result};
-use crate::lightmap::{Lightmap, LightmapDesc, LightmapInfo};
+use crate::lightmap::{Lightmap, LightmapDesc, LightmapInfo, MeshUvs};
 use std::ffi::c_void;
 use std::sync::{Arc, RwLock, TryLockError};
 
@@ -67,6 +67,10 @@ pub struct bk_lightmap_desc {
     /// Light map texels per texel of the radiance map (what gather rays see), along each axis, 1 to 64.
     /// Default: 4.
     pub radiance_divisor: u32,
+    /// Whether two-sided charts from both sides of which one sees something get a second place for their
+    /// backs, which bk_lightmap_mesh_back_uvs tells of. Without one, a chart shows the side that the bake
+    /// chooses. 0: no, any other value: yes. Default: 0.
+    pub both_sides: u32,
 }
 
 sized_struct!(bk_lightmap_desc, last: radiance_divisor: u32, defaults: {
@@ -78,6 +82,7 @@ sized_struct!(bk_lightmap_desc, last: radiance_divisor: u32, defaults: {
         padding: d.padding,
         gather_divisor: d.gather_divisor,
         radiance_divisor: d.radiance_divisor,
+        both_sides: d.both_sides as u32,
     }
 });
 
@@ -122,6 +127,7 @@ pub unsafe extern "C" fn bk_lightmap_create(
             padding: d.padding,
             gather_divisor: d.gather_divisor,
             radiance_divisor: d.radiance_divisor,
+            both_sides: d.both_sides != 0,
         };
         let lightmap = Lightmap::create(&scene, &desc, &self::progress(progress, user))?;
         write(out, create(bk_lightmap { lightmap: RwLock::new(lightmap) }), "out")
@@ -185,6 +191,10 @@ pub struct bk_lightmap_info {
     pub texels_per_unit: f32,
     /// Not used yet.
     pub reserved: u32,
+    /// Of charts, those with a second place for their backs; see both_sides of bk_lightmap_desc.
+    pub both_sided_charts: u64,
+    /// Of texels, those of the second places: the last so many.
+    pub back_texels: u64,
 }
 
 sized_struct!(bk_lightmap_info, last: reserved: u32, defaults: info(&Default::default()));
@@ -209,6 +219,8 @@ fn info(i: &LightmapInfo) -> bk_lightmap_info {
         unwrap_seconds: i.unwrap_seconds,
         texels_per_unit: i.texels_per_unit,
         reserved: 0,
+        both_sided_charts: i.both_sided_charts.into(),
+        back_texels: i.back_texels,
     }
 }
 
@@ -249,13 +261,52 @@ pub unsafe extern "C" fn bk_lightmap_mesh_uvs(
 ) -> bk_result {
     // SAFETY: the arrays are the caller's, or NULL.
     call(|| unsafe {
-        let (uvs, pages) = object!(lightmap).read(|l| l.mesh_uvs(mesh))?;
-        if !out_corner_uvs.is_null() {
-            slice_mut(out_corner_uvs.cast(), uvs.len(), "out_corner_uvs", &[])?.copy_from_slice(&uvs);
-        }
-        if !out_page_per_triangle.is_null() {
-            slice_mut(out_page_per_triangle, pages.len(), "out_page_per_triangle", &[])?.copy_from_slice(&pages);
+        let uvs = object!(lightmap).read(|l| l.mesh_uvs(mesh))?;
+        copy_uvs(&uvs, out_corner_uvs, out_page_per_triangle)
+    })
+}
+
+/// Where the backs of the triangles of a mesh lie in the light map. A shader that reads
+/// gl_FrontFacing ? uv : back_uv, and the page accordingly, shows the right light on both sides.
+///
+/// out_corner_uvs, out_page_per_triangle: as of bk_lightmap_mesh_uvs; of triangles whose back has no
+/// place of its own, the same as there. out_own_place_per_triangle: receives triangles bytes, 1 where
+/// the back has a place of its own (see both_sides of bk_lightmap_desc), else 0; NULL if not wanted.
+///
+/// Fails as bk_lightmap_mesh_uvs does.
+#[unsafe(no_mangle)]
+pub unsafe extern "C" fn bk_lightmap_mesh_back_uvs(
+    lightmap: *const bk_lightmap,
+    mesh: u32,
+    out_corner_uvs: *mut f32,
+    out_page_per_triangle: *mut u32,
+    out_own_place_per_triangle: *mut u8,
+) -> bk_result {
+    // SAFETY: the arrays are the caller's, or NULL.
+    call(|| unsafe {
+        let (uvs, own) = object!(lightmap).read(|l| l.mesh_back_uvs(mesh))?;
+        copy_uvs(&uvs, out_corner_uvs, out_page_per_triangle)?;
+        if !out_own_place_per_triangle.is_null() {
+            let out = slice_mut(out_own_place_per_triangle, own.len(), "out_own_place_per_triangle", &[])?;
+            out.iter_mut().zip(own).for_each(|(out, own)| *out = own.into());
         }
         Ok(())
     })
+}
+
+/// Copies corner UVs and pages where they are wanted.
+///
+/// # Safety
+/// Each array is NULL or valid for writing as many elements.
+unsafe fn copy_uvs((uvs, pages): &MeshUvs, out_corner_uvs: *mut f32, out_pages: *mut u32) -> Result<()> {
+    // SAFETY: by contract.
+    unsafe {
+        if !out_corner_uvs.is_null() {
+            slice_mut(out_corner_uvs.cast(), uvs.len(), "out_corner_uvs", &[])?.copy_from_slice(uvs);
+        }
+        if !out_pages.is_null() {
+            slice_mut(out_pages, pages.len(), "out_page_per_triangle", &[])?.copy_from_slice(pages);
+        }
+    }
+    Ok(())
 }

@@ -6,13 +6,15 @@
 //! E it shows albedo × E × exposure, bent by the shoulder of [`super::image::tone_map`]: what an eye
 //! at the surface sees, albedo/π · E, up to a constant, as nothing but diffuse light is baked.
 //! Emissive materials are not unlit, since unlit ones do not glow: they carry `emissiveFactor` and
-//! `KHR_materials_emissive_strength`. Triangles without a chart show their albedo alone.
+//! `KHR_materials_emissive_strength`. Triangles without a chart show their albedo alone. Triangles both sides of which
+//! have places in the light map are written twice, the second time turned round, with one-sided materials.
 //!
 //! Pages are embedded as PNG files, row 0 at v = 0, without a flip (see [`super::image`]).
 //! `TEXCOORD_0` holds the mesh's first texture coordinates, or zeros. Normals are left out. Triangles
 //! that the scene skips (degenerate or not finite) are left out too.
 
 use crate::error::{Error, Result, invalid_argument};
+use crate::lightmap::Lightmap;
 use crate::scene::{Material, NONE, Scene};
 use glam::{Vec2, Vec3};
 use serde_json::{Value, json};
@@ -26,6 +28,29 @@ pub struct GlbMesh {
     pub corner_uvs: Vec<[[f32; 2]; 3]>,
     /// Page of each triangle; [`NONE`]: it has no chart.
     pub pages: Vec<u32>,
+    /// Triangles whose backs have places of their own.
+    pub backs: Vec<GlbBack>,
+}
+
+/// Where the back of a triangle lies in the light map.
+#[derive(Clone, Copy, Debug, PartialEq)]
+pub struct GlbBack {
+    /// Its number in the mesh.
+    pub triangle: u32,
+    /// Of its corners, in the order of the front, in [0, 1].
+    pub corner_uvs: [[f32; 2]; 3],
+    pub page: u32,
+}
+
+impl GlbMesh {
+    /// Of a mesh of a light map.
+    pub fn of(lightmap: &Lightmap, mesh: u32) -> Result<GlbMesh> {
+        let (corner_uvs, pages) = lightmap.mesh_uvs(mesh)?;
+        let ((back_uvs, back_pages), own) = lightmap.mesh_back_uvs(mesh)?;
+        let back = |t: usize| GlbBack { triangle: t as u32, corner_uvs: back_uvs[t], page: back_pages[t] };
+        let backs = (0..own.len()).filter(|&t| own[t]).map(back).collect();
+        Ok(GlbMesh { corner_uvs, pages, backs })
+    }
 }
 
 /// The light maps of a scene.
@@ -46,9 +71,11 @@ pub fn write_glb(path: &Path, scene: &Scene, lightmap: &GlbLightmap) -> Result<(
 pub fn encode_glb(scene: &Scene, lightmap: &GlbLightmap) -> Result<Vec<u8>> {
     check(scene, lightmap)?;
     let mut file = File::default();
-    for ((page, material), triangles) in group(scene, lightmap) {
-        let primitive = Primitive::new(scene, lightmap, &triangles);
-        file.add_primitive(&primitive, page, &scene.materials()[material as usize]);
+    for ((page, material, one_sided), triangles) in group(scene, lightmap) {
+        let primitive = Primitive::new(scene, &triangles);
+        let material = scene.materials()[material as usize];
+        let material = Material { two_sided: material.two_sided && !one_sided, ..material };
+        file.add_primitive(&primitive, page, &material);
     }
     file.add_pages(&lightmap.pages);
     file.finish()
@@ -66,26 +93,46 @@ fn check(scene: &Scene, lightmap: &GlbLightmap) -> Result<()> {
             let (corners, pages) = (uvs.corner_uvs.len(), uvs.pages.len());
             return invalid_argument!("mesh {m} has {triangles} triangles, {corners} light map UVs, {pages} pages");
         }
-        if let Some(page) = uvs.pages.iter().find(|p| **p != NONE && **p as usize >= page_count) {
+        if let Some(back) = uvs.backs.iter().find(|b| b.triangle as usize >= triangles) {
+            return invalid_argument!("mesh {m} has {triangles} triangles, and a back of number {}", back.triangle);
+        }
+        let pages = || uvs.pages.iter().filter(|p| **p != NONE).chain(uvs.backs.iter().map(|b| &b.page));
+        if let Some(page) = pages().find(|p| **p as usize >= page_count) {
             return invalid_argument!("mesh {m} names page {page}, there are {page_count}");
         }
-        if let Some(uv) = uvs.corner_uvs.iter().flatten().flatten().find(|uv| !uv.is_finite()) {
+        let all = || uvs.corner_uvs.iter().chain(uvs.backs.iter().map(|b| &b.corner_uvs)).flatten().flatten();
+        if let Some(uv) = all().find(|uv| !uv.is_finite()) {
             return invalid_argument!("mesh {m} has the light map coordinate {uv}");
         }
     }
     Ok(())
 }
 
-/// A triangle by mesh and number in it.
-type Triangle = (u32, u32);
+/// A side of a triangle to write.
+struct Triangle {
+    mesh: u32,
+    /// Vertices and light map coordinates of its corners, in the order in which the side is a front.
+    vertices: [u32; 3],
+    corner_uvs: [[f32; 2]; 3],
+}
 
-/// The valid triangles of each (page, material).
-fn group(scene: &Scene, lightmap: &GlbLightmap) -> BTreeMap<(u32, u32), Vec<Triangle>> {
+/// The valid triangles of each (page, material, whether this side alone is to be shown).
+fn group(scene: &Scene, lightmap: &GlbLightmap) -> BTreeMap<(u32, u32, bool), Vec<Triangle>> {
     let mut groups = BTreeMap::<_, Vec<_>>::new();
-    for (m, (mesh, uvs)) in scene.meshes().iter().zip(&lightmap.meshes).enumerate() {
-        let first = scene.first_triangle(m as u32);
+    for (m, (mesh, uvs)) in (0..).zip(scene.meshes().iter().zip(&lightmap.meshes)) {
+        let first = scene.first_triangle(m);
+        let backs: HashMap<usize, &GlbBack> = uvs.backs.iter().map(|b| (b.triangle as usize, b)).collect();
         for t in (0..mesh.indices.len()).filter(|t| scene.is_valid(first + *t as u32)) {
-            groups.entry((uvs.pages[t], mesh.material(t))).or_default().push((m as u32, t as u32));
+            let (vertices, back) = (mesh.indices[t], backs.get(&t));
+            let mut add = |page: u32, vertices, corner_uvs| {
+                let key = (page, mesh.material(t), back.is_some());
+                groups.entry(key).or_default().push(Triangle { mesh: m, vertices, corner_uvs });
+            };
+            add(uvs.pages[t], vertices, uvs.corner_uvs[t]);
+            if let Some(back) = back {
+                let turn = [0, 2, 1];
+                add(back.page, turn.map(|i| vertices[i]), turn.map(|i| back.corner_uvs[i]));
+            }
         }
     }
     groups
@@ -101,14 +148,13 @@ struct Primitive {
 }
 
 impl Primitive {
-    fn new(scene: &Scene, lightmap: &GlbLightmap, triangles: &[Triangle]) -> Self {
+    fn new(scene: &Scene, triangles: &[Triangle]) -> Self {
         let mut result = Primitive::default();
         let mut vertex_of = HashMap::<(u32, u32, [u32; 2]), u32>::new();
-        for &(m, t) in triangles {
-            let mesh = &scene.meshes()[m as usize];
-            let corner_uvs = &lightmap.meshes[m as usize].corner_uvs[t as usize];
-            for (&v, &lightmap_uv) in mesh.indices[t as usize].iter().zip(corner_uvs) {
-                let vertex = *vertex_of.entry((m, v, lightmap_uv.map(f32::to_bits))).or_insert_with(|| {
+        for t in triangles {
+            let mesh = &scene.meshes()[t.mesh as usize];
+            for (&v, &lightmap_uv) in t.vertices.iter().zip(&t.corner_uvs) {
+                let vertex = *vertex_of.entry((t.mesh, v, lightmap_uv.map(f32::to_bits))).or_insert_with(|| {
                     let uv = mesh.uvs.get(v as usize).copied().filter(|uv| uv.is_finite());
                     result.positions.push(mesh.positions[v as usize]);
                     result.uvs.push(uv.unwrap_or_default());
@@ -315,8 +361,8 @@ pub(super) mod tests {
         let seam = [[0.9, 0.0], [0.5, 0.5], [0.0, 0.5]];
         let pages = PAGE_COLORS.map(|color| encode_png_rgb8(2, 2, &[color; 4]).unwrap()).to_vec();
         let meshes = vec![
-            GlbMesh { corner_uvs: vec![low, high, high], pages: vec![0, 0, 1] },
-            GlbMesh { corner_uvs: vec![low, low, seam], pages: vec![1, NONE, NONE] },
+            GlbMesh { corner_uvs: vec![low, high, high], pages: vec![0, 0, 1], backs: Vec::new() },
+            GlbMesh { corner_uvs: vec![low, low, seam], pages: vec![1, NONE, NONE], backs: Vec::new() },
         ];
         (scene, GlbLightmap { meshes, pages })
     }
@@ -394,6 +440,29 @@ pub(super) mod tests {
     }
 
     #[test]
+    fn a_triangle_with_a_place_for_its_back_is_written_twice_and_one_sided() {
+        let (scene, mut lightmap) = scene_and_lightmap();
+        // The only two-sided triangle.
+        let (triangle, corner_uvs) = (2, [[0.5, 0.25], [0.75, 0.25], [0.75, 0.5]]);
+        lightmap.meshes[0].backs = vec![GlbBack { triangle, corner_uvs, page: 0 }];
+        let file = encode_glb(&scene, &lightmap).unwrap();
+        let parsed = gltf::Gltf::from_slice(&file).unwrap();
+        let materials: Vec<_> = parsed
+            .meshes()
+            .flat_map(|m| m.primitives())
+            .map(|p| (p.material().double_sided(), p.material().pbr_metallic_roughness().base_color_factor()[0]))
+            .collect();
+        assert_eq!(materials, [(false, 0.1), (false, 0.4), (false, 0.4), (false, 0.5), (false, 0.1)]);
+        let (back, _) = load_bytes("a.glb", file).unwrap();
+        let [a, b, c] = scene.meshes()[0].corners(2);
+        assert_eq!([corners(&back)[2], corners(&back)[3]], [[a, c, b], [a, b, c]]);
+        let mesh = &back.meshes()[1];
+        let light = mesh.lightmap.as_ref().unwrap();
+        let [a, b, c] = corner_uvs;
+        assert_eq!(mesh.indices[0].map(|v| light.uvs[v as usize].to_array()), [a, c, b]);
+    }
+
+    #[test]
     fn pages_are_embedded_as_png() {
         let parsed = gltf::Gltf::from_slice(&sample()).unwrap();
         let binary = parsed.blob.as_deref().unwrap();
@@ -453,6 +522,12 @@ pub(super) mod tests {
         assert_eq!(pop, "invalid argument: light map UVs of 1 meshes for 2");
         assert!(message(|l| _ = l.meshes[1].pages.pop()).contains("mesh 1 has 3 triangles"));
         assert!(message(|l| l.meshes[0].pages[2] = 2).contains("mesh 0 names page 2, there are 2"));
+        fn back(triangle: u32, page: u32, u: f32) -> Vec<GlbBack> {
+            vec![GlbBack { triangle, corner_uvs: [[u; 2]; 3], page }]
+        }
+        assert!(message(|l| l.meshes[0].backs = back(2, 7, 0.0)).contains("mesh 0 names page 7, there are 2"));
+        assert!(message(|l| l.meshes[0].backs = back(3, 0, 0.0)).contains("a back of number 3"));
+        assert!(message(|l| l.meshes[0].backs = back(2, 0, f32::INFINITY)).contains("inf"));
         assert!(message(|l| l.meshes[0].corner_uvs[2][1][0] = f32::NAN).contains("NaN"));
     }
 }

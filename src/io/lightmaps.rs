@@ -51,9 +51,8 @@ pub fn write_png_pages(lightmap: &Lightmap, prefix: &str, exposure: f32, progres
 /// Writes the scene with its light map to the GLB file `path`.
 pub fn write_scene(lightmap: &Lightmap, path: &Path, exposure: f32) -> Result<()> {
     let info = lightmap.info();
-    let meshes = (0..lightmap.scene().meshes().len() as u32)
-        .map(|mesh| lightmap.mesh_uvs(mesh).map(|(corner_uvs, pages)| GlbMesh { corner_uvs, pages }))
-        .collect::<Result<_>>()?;
+    let meshes =
+        (0..lightmap.scene().meshes().len() as u32).map(|mesh| GlbMesh::of(lightmap, mesh)).collect::<Result<_>>()?;
     let page =
         |page| encode_png_rgb8(info.width, info.height, &tone_mapped(lightmap, page, Layer::Combined, exposure)?);
     let pages = (0..info.page_count).map(page).collect::<Result<_>>()?;

@@ -65,21 +65,25 @@ impl Lightmap {
         };
         let (charts, mut uvs) = Charts::of_scene(scene, density, desc.page_size, desc.padding, progress)?;
         let unwrap_seconds = start.elapsed().as_secs_f64();
-        let two_sided = charts.charts.iter().any(|c| c.two_sided);
-        let pack = |divisor: u32, padding: u32, given: bool, back: bool| {
+        let two_sided: Vec<u32> = (0..).zip(&charts.charts).filter(|(_, c)| c.two_sided).map(|(c, _)| c).collect();
+        let pack = |divisor: u32, padding: u32, given: bool, with_backs: &[u32]| {
             let page_size = if divisor == 1 { desc.page_size } else { (desc.page_size / divisor).max(MIN_PAGE_SIZE) };
-            Layout::pack(&charts, density / divisor as f32, page_size, padding, given, back)
+            Layout::pack(&charts, density / divisor as f32, page_size, padding, given, with_backs)
         };
-        let layouts = [
-            pack(1, desc.padding, true, false)?,
-            pack(desc.gather_divisor, 0, false, false)?,
-            pack(desc.radiance_divisor, 0, false, two_sided)?,
-        ];
-        let stage = progress.stage("texels", 0.5, 1.0, layouts.iter().map(TexelMap::work).sum());
-        let [map, gather, radiance] = layouts;
+        let radiance = pack(desc.radiance_divisor, 0, false, &two_sided)?;
+        let stage = progress.stage("texels", 0.5, 0.6, TexelMap::work(&radiance));
+        let radiance = ChartMap::new(scene, &charts, radiance, &stage)?;
+        let with_backs = if desc.both_sides {
+            let stage = progress.stage("sides", 0.6, 0.65, two_sided.len() as u64);
+            sides::seen_from_both(scene, &radiance, &two_sided, &stage)?
+        } else {
+            Vec::new()
+        };
+        let map = pack(1, desc.padding, true, &with_backs)?;
+        let gather = pack(desc.gather_divisor, 0, false, &with_backs)?;
+        let stage = progress.stage("texels", 0.65, 1.0, TexelMap::work(&map) + TexelMap::work(&gather));
         let map = ChartMap::new(scene, &charts, map, &stage)?;
         let gather = ChartMap::new(scene, &charts, gather, &stage)?;
-        let radiance = ChartMap::new(scene, &charts, radiance, &stage)?;
         uvs.overlapping_texels = map.texels.overlapping_texels;
         uvs.reduced_charts = map.layout.reduced;
         let bytes = charts.bytes() + map.bytes() + gather.bytes() + radiance.bytes();
@@ -95,13 +99,17 @@ impl Lightmap {
             unwrap_seconds,
             texels_per_unit: density,
             uvs,
+            both_sided_charts: with_backs.len() as u32,
+            back_texels: (map.len() - map.back_start) as u64,
         };
         let memory = scene.device().memory().reserve(charts.bytes(), "the charts")?;
         if let Some(message) = too_few_digits(scene, "texels", 1.0 / density, OFFSET_PART) {
             scene.device().log(LogLevel::Warning, &message);
         }
         let direct = DirectLight::new(scene);
-        let plan = Plan::new(scene, &direct, &BakeParams::default(), two_sided, uvs.unwrapped_charts > 0);
+        let mut plan =
+            Plan::new(scene, &direct, &BakeParams::default(), !two_sided.is_empty(), uvs.unwrapped_charts > 0);
+        plan.note_both_sides(&info);
         let scene = scene.clone();
         let atlas = Atlas { scene, charts, map, gather, radiance, padding: desc.padding, info, _memory: memory };
         Ok(Lightmap { atlas: Arc::new(atlas), plan, light: None })
@@ -123,6 +131,7 @@ impl Lightmap {
         let two_sided = !self.atlas.radiance.layout.back_of.is_empty();
         let mut plan =
             Plan::new(&self.atlas.scene, &direct, params, two_sided, self.atlas.info.uvs.unwrapped_charts > 0);
+        plan.note_both_sides(&self.atlas.info);
         let device = self.atlas.scene.device().clone();
         device.memory().reset_peak();
         let bake = Bake {
@@ -281,7 +290,6 @@ impl Bake<'_, '_> {
             photons,
             direct_samples: self.params.direct_samples.div_ceil(RADIANCE_SAMPLE_DIVISOR),
             seed: purpose_seed(self.params.seed, purpose::RADIANCE),
-            back_start: l.radiance.back_start(),
         };
         let rays = radiance::bake(l.scene.device(), &input, &mut values, &stage)?;
         let bytes = (values.len() * size_of::<Vec3>() + l.radiance.bytes()) as u64;
@@ -289,31 +297,31 @@ impl Bake<'_, '_> {
         Ok(values)
     }
 
-    /// Per chart, whether its back is baked. With [`illuminate`](Self::illuminate)'s map all that texels need to be lit.
+    /// Per chart with one place, whether its back is baked. With [`illuminate`](Self::illuminate)'s map all that
+    /// texels need to be lit.
     pub(crate) fn backs(&self, radiance: &[Vec3]) -> Vec<bool> {
         let l = self.atlas;
         // Without indirect light there is no radiance map: direct light decides.
-        let back_start = l.radiance.back_start();
         let light = |s: usize| match radiance.get(s) {
             Some(radiance) => radiance.element_sum(),
             None => {
-                let (_, receiver) = l.radiance.receiver(&l.scene, s, s >= back_start);
+                let (_, receiver) = l.radiance.receiver(&l.scene, s, l.radiance.is_back(s));
                 self.direct.irradiance(&receiver, 1, combine(self.params.seed as u32, s as u32), &mut 0).element_sum()
             }
         };
-        l.scene.device().install(|| sides::backs(&l.scene, &l.charts, &l.radiance, light))
+        l.scene.device().install(|| sides::backs(l, light))
     }
 
-    /// Gathers, blurs and fills. Only charts that the range touches are gathered.
+    /// Gathers, blurs and fills. Only placements that the range touches are gathered.
     fn gather(&self, radiance: &[Vec3], backs: &[bool], stats: &mut BakeStats) -> Result<Indirect> {
         let start = Instant::now();
         let l = self.atlas;
         let device = l.scene.device();
-        let charts =
-            l.map.texels.placement_of(self.range.start as u32)..=l.map.texels.placement_of(self.range.end as u32 - 1);
-        let needed = l.gather.texels.chart_start[*charts.start() as usize] as usize
-            ..l.gather.texels.chart_start[*charts.end() as usize + 1] as usize;
-        let gaps = self.gaps(backs, *charts.start()..charts.end() + 1)?;
+        let placements = l.map.texels.placement_of(self.range.start as u32)
+            ..l.map.texels.placement_of(self.range.end as u32 - 1) + 1;
+        let needed = l.gather.texels.chart_start[placements.start as usize] as usize
+            ..l.gather.texels.chart_start[placements.end as usize] as usize;
+        let gaps = self.gaps(backs, placements)?;
         let lookup = RadianceMap::new(&l.charts, &l.radiance, radiance);
         let samples = SampleSet::new(self.params.gather_rays, purpose_seed(self.params.seed, purpose::GATHER_SET));
         let seed = purpose_seed(self.params.seed, purpose::GATHER);
@@ -359,10 +367,10 @@ impl Bake<'_, '_> {
         Ok(Indirect { irradiance, valid, gaps })
     }
 
-    /// Which texels of some charts lie in gaps.
-    pub(crate) fn gaps(&self, backs: &[bool], charts: Range<u32>) -> Result<Gaps> {
-        let stage = self.progress.stage("gaps", 0.3, 0.32, charts.len() as u64);
-        Gaps::find(self.atlas, charts, backs, &stage)
+    /// Which texels of some placements lie in gaps.
+    pub(crate) fn gaps(&self, backs: &[bool], placements: Range<u32>) -> Result<Gaps> {
+        let stage = self.progress.stage("gaps", 0.3, 0.32, placements.len() as u64);
+        Gaps::find(self.atlas, placements, backs, &stage)
     }
 
     /// Direct light and the interpolated indirect light of every texel of the range.

@@ -87,7 +87,7 @@ impl Window {
         let Texels { values, variances, valid, normals } = texels;
         let (brightness, variance) = (values[sample].element_sum(), variances[sample]);
         let (x, y) = map.position(sample);
-        let placement = charts.chart_of[map.texels.samples[sample].triangle as usize];
+        let placement = map.placement_of(charts, sample);
         self.seen = [0; MAX_WINDOW];
         self.queue.clear();
         self.visit(0, 0);
@@ -150,7 +150,7 @@ pub(crate) fn fill(charts: &Charts, map: &ChartMap, values: &mut [Vec3], mut kno
 /// Mean of the known neighbours of a texel in its chart.
 fn neighbours(charts: &Charts, map: &ChartMap, sample: u32, values: &[Vec3], known: &[bool]) -> Option<Vec3> {
     let (x, y) = map.position(sample as usize);
-    let placement = charts.chart_of[map.texels.samples[sample as usize].triangle as usize];
+    let placement = map.placement_of(charts, sample as usize);
     let (mut sum, mut n) = (Vec3::ZERO, 0.0);
     for dy in -1..=1 {
         for dx in -1..=1 {

@@ -41,15 +41,17 @@ pub(crate) struct Gaps {
 }
 
 impl Gaps {
-    /// Of some `charts` of an atlas, on the sides that `backs` tells. Advances `stage` by one per chart.
-    pub(crate) fn find(atlas: &Atlas, charts: Range<u32>, backs: &[bool], stage: &Stage) -> Result<Gaps> {
+    /// Of some `placements` of an atlas, on the sides that `backs` tells of charts with one place. Advances `stage` by
+    /// one per placement.
+    pub(crate) fn find(atlas: &Atlas, placements: Range<u32>, backs: &[bool], stage: &Stage) -> Result<Gaps> {
         let search = Search { atlas, backs, rays: AtomicU64::new(0) };
-        let of_chart = |chart: u32| {
+        let of_placement = |placement: u32| {
             stage.advance(1)?;
-            Ok(search.chart(chart))
+            Ok(search.placement(placement))
         };
         let device = atlas.scene.device();
-        let found: Vec<InGaps> = device.install(|| charts.into_par_iter().map(of_chart).collect::<Result<_>>())?;
+        let found: Vec<InGaps> =
+            device.install(|| placements.into_par_iter().map(of_placement).collect::<Result<_>>())?;
         let gather = Bits::new(found.iter().flat_map(|f| &f.gather), atlas.gather.len())?;
         let map = Bits::new(found.iter().flat_map(|f| &f.map), atlas.map.len())?;
         let memory = device.memory().reserve(gather.bytes() + map.bytes(), "the texels in gaps")?;
@@ -69,7 +71,7 @@ impl Gaps {
     }
 }
 
-/// Samples in gaps of one chart.
+/// Samples in gaps of one placement.
 #[derive(Default)]
 struct InGaps {
     gather: Vec<u32>,
@@ -83,26 +85,26 @@ struct Search<'a> {
 }
 
 impl Search<'_> {
-    fn chart(&self, chart: u32) -> InGaps {
+    fn placement(&self, placement: u32) -> InGaps {
         let (gather, map, charts) = (&self.atlas.gather, &self.atlas.map, &self.atlas.charts);
-        let scale = gather.layout.placements[chart as usize].scale;
+        let scale = gather.layout.placements[placement as usize].scale;
         let texel = 1.0 / scale[0].min(scale[1]);
         let mut rays = 0;
-        let of_chart = gather.samples_of(chart);
-        let is_in_gap: Vec<bool> = of_chart.clone().map(|s| self.is_in_gap(gather, s, texel, &mut rays)).collect();
+        let own = gather.samples_of(placement);
+        let is_in_gap: Vec<bool> = own.clone().map(|s| self.is_in_gap(gather, s, texel, &mut rays)).collect();
         let mut found = InGaps::default();
-        found.gather.extend(of_chart.clone().filter(|s| is_in_gap[s - of_chart.start]).map(|s| s as u32));
+        found.gather.extend(own.clone().filter(|s| is_in_gap[s - own.start]).map(|s| s as u32));
         if !found.gather.is_empty() {
             let is_between = |sample: &usize| {
                 let t = &map.texels.samples[*sample];
                 let (mut some, mut all) = (false, true);
-                gather.bilinear(chart, charts.local(t.triangle, t.u, t.v), |s, _| {
-                    some |= is_in_gap[s - of_chart.start];
-                    all &= is_in_gap[s - of_chart.start];
+                gather.bilinear(placement, charts.local(t.triangle, t.u, t.v), |s, _| {
+                    some |= is_in_gap[s - own.start];
+                    all &= is_in_gap[s - own.start];
                 });
                 some && !all
             };
-            let candidates = map.samples_of(chart).filter(is_between);
+            let candidates = map.samples_of(placement).filter(is_between);
             found.map = candidates.filter(|&s| self.is_in_gap(map, s, texel, &mut rays)).map(|s| s as u32).collect();
         }
         self.rays.fetch_add(rays, Relaxed);
@@ -238,5 +240,38 @@ mod tests {
         // Without gaps nothing is held.
         let none = Gaps::find(atlas, 1..1, &[], &progress.stage("gaps", 0.0, 1.0, 0)).unwrap();
         assert!(none.is_empty() && none.gather.bytes() + none.map.bytes() == 0);
+    }
+
+    /// A wall between two rooms, and a poster 5 mm behind a part of it.
+    #[test]
+    fn a_back_with_a_place_of_its_own_has_gaps_of_its_own() {
+        let device = Device::new(DeviceOptions { num_threads: 2, ..Default::default() }).unwrap();
+        let mut data = SceneData::new();
+        let m = data.add_material(Material { two_sided: true, ..Default::default() }).unwrap();
+        let quad = |size: f32, z: f32| {
+            let p = |x: f32, y: f32| Vec3::new(x, y, z);
+            let mut builder = MeshBuilder::new();
+            builder.quad(p(-size, -size), p(size, -size), p(size, size), p(-size, size), m);
+            builder.finish()
+        };
+        data.add_mesh(quad(2.0, 0.0)).unwrap();
+        data.add_mesh(quad(0.8, -0.005)).unwrap();
+        let mut room = MeshBuilder::new();
+        room.box_(Vec3::splat(-2.0), Vec3::splat(2.0), true, m);
+        data.add_mesh(room.finish()).unwrap();
+        let scene = Scene::commit(&device, data, &BuildOptions::default(), &Progress::none()).map_err(|e| e.1).unwrap();
+        let desc = LightmapDesc { texels_per_unit: 20.0, both_sides: true, ..Default::default() };
+        let lightmap = Lightmap::create(&scene, &desc, &Progress::none()).unwrap();
+        let atlas = lightmap.atlas();
+        let wall = atlas.charts.chart_of[0];
+        let back = atlas.map.layout.back(wall).unwrap();
+        let progress = Progress::none();
+        let all = atlas.map.layout.placements.len() as u32;
+        let gaps = Gaps::find(atlas, 0..all, &[], &progress.stage("gaps", 0.0, 1.0, all.into())).unwrap();
+        let behind = |s: &usize| atlas.gather.surface(&atlas.scene, *s).0.abs().max_element() < 0.6;
+        assert!(atlas.gather.samples_of(back).filter(behind).all(|s| gaps.gather.has(s)));
+        assert!(atlas.gather.samples_of(wall).filter(behind).all(|s| !gaps.gather.has(s)));
+        assert!(atlas.map.samples_of(back).any(|s| gaps.map.has(s)));
+        assert!(!atlas.map.samples_of(wall).any(|s| gaps.map.has(s)));
     }
 }

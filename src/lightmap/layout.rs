@@ -69,7 +69,7 @@ impl Layout {
     /// `page_size` (1 to [`MAX_PAGE_SIZE`]) as they need, with `padding` texels around each.
     ///
     /// With `honour_given` the charts that the caller placed stay where they are, and the others
-    /// go to further pages. With `back_sides` the charts of two-sided materials get a second place.
+    /// go to further pages. The charts of `with_backs`, ascending, get a second place for their backs.
     /// A chart too long for a page is shown at a lower density along that axis. `OutOfMemory` if
     /// the pages would hold more than [`MAX_TEXELS`].
     pub fn pack(
@@ -78,7 +78,7 @@ impl Layout {
         page_size: u32,
         padding: u32,
         honour_given: bool,
-        back_sides: bool,
+        with_backs: &[u32],
     ) -> Result<Layout> {
         let max_extent = padded_extent(page_size, padding)?;
         if !(density > 0.0 && density.is_finite()) {
@@ -101,12 +101,12 @@ impl Layout {
         for chart in &charts[given..] {
             layout.push(chart, max_extent, padding);
         }
-        if back_sides {
+        if !with_backs.is_empty() {
             layout.backs = vec![NONE; charts.len()];
-            for (c, chart) in charts.iter().enumerate().filter(|(_, c)| c.two_sided) {
-                layout.backs[c] = layout.placements.len() as u32;
-                layout.back_of.push(c as u32);
-                layout.push(chart, max_extent, padding);
+            for &c in with_backs {
+                layout.backs[c as usize] = layout.placements.len() as u32;
+                layout.back_of.push(c);
+                layout.push(&charts[c as usize], max_extent, padding);
             }
         }
         layout.check_size(first_page)?;
@@ -133,6 +133,12 @@ impl Layout {
     #[inline]
     pub fn back(&self, chart: u32) -> Option<u32> {
         self.backs.get(chart as usize).copied().filter(|&p| p != NONE)
+    }
+
+    /// The placement that shows a side of a chart: a back without a place of its own shares the front's.
+    #[inline]
+    pub fn place_of(&self, chart: u32, front: bool) -> u32 {
+        if front { chart } else { self.back(chart).unwrap_or(chart) }
     }
 
     /// The texel coordinate of a point of a placed chart.
@@ -350,15 +356,18 @@ mod tests {
         #[test]
         fn placements_are_apart_and_contain_their_charts(
             sizes in prop::collection::vec([0.0f32..60.0, 0.0f32..20.0], 0..60),
-            density in 0.05f32..4.0, padding in 0u32..4, page in 5u32..8, back in any::<bool>(),
+            density in 0.05f32..4.0, padding in 0u32..4, page in 5u32..8, back in any::<bool>(), all in any::<bool>(),
         ) {
             let charts = charts_of(&sizes);
-            let layout = Layout::pack(&charts, density, 1 << page, padding, false, back).unwrap();
+            // All of them, or every third.
+            let backs: Vec<u32> = (0..sizes.len() as u32).step_by(if all { 1 } else { 3 }).filter(|_| back).collect();
+            let layout = Layout::pack(&charts, density, 1 << page, padding, false, &backs).unwrap();
             check(&charts, &layout, padding);
-            prop_assert_eq!(&layout, &Layout::pack(&charts, density, 1 << page, padding, false, back).unwrap());
-            prop_assert_eq!(layout.placements.len(), sizes.len() * if back { 2 } else { 1 });
+            prop_assert_eq!(&layout, &Layout::pack(&charts, density, 1 << page, padding, false, &backs).unwrap());
+            prop_assert_eq!(layout.placements.len(), sizes.len() + backs.len());
             for c in 0..sizes.len() as u32 {
-                prop_assert_eq!(layout.back(c).map(|p| (layout.chart_of(p), layout.is_back(p))), back.then_some((c, true)));
+                let back = backs.contains(&c).then_some((c, true));
+                prop_assert_eq!(layout.back(c).map(|p| (layout.chart_of(p), layout.is_back(p))), back);
             }
         }
     }
@@ -371,7 +380,7 @@ mod tests {
             0.05 / (0.002 + bits as f32 / (1u32 << 24) as f32)
         };
         let charts = charts_of(&(0..20_000).map(|i| [size(i, 0), size(i, 1)]).collect::<Vec<_>>());
-        let layout = Layout::pack(&charts, 60.0, 1024, 2, false, false).unwrap();
+        let layout = Layout::pack(&charts, 60.0, 1024, 2, false, &[]).unwrap();
         check(&charts, &layout, 2);
         assert!(layout.page_count >= 8, "{} pages are too few to say", layout.page_count);
         assert!(layout.utilisation() > 0.85, "{}", layout.utilisation());
@@ -380,7 +389,7 @@ mod tests {
     #[test]
     fn a_chart_longer_than_a_page_is_reduced_along_that_axis_alone() {
         let charts = charts_of(&[[1000.0, 3.0], [2.0, 2.0]]);
-        let layout = Layout::pack(&charts, 1.0, 64, 2, false, false).unwrap();
+        let layout = Layout::pack(&charts, 1.0, 64, 2, false, &[]).unwrap();
         check(&charts, &layout, 2);
         assert_eq!(layout.reduced, 1);
         let p = &layout.placements[0];
@@ -390,12 +399,12 @@ mod tests {
     #[test]
     fn gigantic_requests_are_refused_before_they_are_packed() {
         let charts = charts_of(&vec![[1.0, 1.0]; 10_000]);
-        let e = Layout::pack(&charts, 1e4, 16384, 2, false, false).err().unwrap();
+        let e = Layout::pack(&charts, 1e4, 16384, 2, false, &[]).err().unwrap();
         assert!(matches!(&e, Error::OutOfMemory(s) if s.contains("10000 charts at 10000 texels per unit")), "{e}");
         let given = Given { page: 5000, offset: [0.0; 2], scale: [1.0; 2] };
         let mut far = charts_of(&[[1.0, 1.0]]);
         far.charts[0].given = Some(given);
-        let e = Layout::pack(&far, 1.0, 1024, 2, true, false).err().unwrap();
+        let e = Layout::pack(&far, 1.0, 1024, 2, true, &[]).err().unwrap();
         assert!(matches!(e, Error::OutOfMemory(_)), "{e}");
     }
 
@@ -403,7 +412,7 @@ mod tests {
     fn impossible_arguments_are_refused_by_name() {
         let charts = charts_of(&[[1.0, 1.0]]);
         let error = |density, page_size, padding| {
-            Layout::pack(&charts, density, page_size, padding, false, false).err().unwrap().to_string()
+            Layout::pack(&charts, density, page_size, padding, false, &[]).err().unwrap().to_string()
         };
         assert!(error(0.0, 64, 2).contains("density is 0"));
         assert!(error(f32::INFINITY, 64, 2).contains("density is inf"));
@@ -417,13 +426,13 @@ mod tests {
     fn given_charts_stay_and_others_go_to_further_pages() {
         let mut charts = charts_of(&[[4.0, 2.0], [1.0, 1.0]]);
         charts.charts[0].given = Some(Given { page: 2, offset: [0.25, 0.5], scale: [0.125, 0.125] });
-        let layout = Layout::pack(&charts, 1.0, 64, 2, true, false).unwrap();
+        let layout = Layout::pack(&charts, 1.0, 64, 2, true, &[]).unwrap();
         assert_eq!((layout.given, layout.page_count), (1, 4));
         let p = layout.placements[0];
         assert_eq!((p.page, p.x, p.y, p.w, p.h), (2, 16, 32, 33, 17));
         assert_eq!(layout.texel_coord(0, [4.0, 2.0]), [48.0, 48.0]);
         assert_eq!(layout.placements[1].page, 3);
-        let repacked = Layout::pack(&charts, 1.0, 64, 0, false, false).unwrap();
+        let repacked = Layout::pack(&charts, 1.0, 64, 0, false, &[]).unwrap();
         assert_eq!((repacked.given, repacked.page_count), (0, 1));
     }
 }

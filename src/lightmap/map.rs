@@ -15,12 +15,16 @@ use std::ops::Range;
 pub(crate) struct ChartMap {
     pub layout: Layout,
     pub texels: TexelMap,
+    /// The first sample that shows a back in a place of its own.
+    pub back_start: usize,
 }
 
 impl ChartMap {
     pub(crate) fn new(scene: &Scene, charts: &Charts, layout: Layout, stage: &Stage) -> Result<Self> {
         let texels = TexelMap::build(scene, charts, &layout, stage)?;
-        Ok(ChartMap { layout, texels })
+        let fronts = layout.placements.len() - layout.back_of.len();
+        let back_start = texels.chart_start[fronts] as usize;
+        Ok(ChartMap { layout, texels, back_start })
     }
 
     /// Number of texels that show a surface.
@@ -87,10 +91,17 @@ impl ChartMap {
         (point, receiver)
     }
 
-    /// The first sample that shows a back side.
-    pub(crate) fn back_start(&self) -> usize {
-        let fronts = self.layout.placements.len() - self.layout.back_of.len();
-        self.texels.chart_start[fronts] as usize
+    /// Whether a sample shows a back in a place of its own.
+    #[inline]
+    pub(crate) fn is_back(&self, sample: usize) -> bool {
+        sample >= self.back_start
+    }
+
+    /// The placement of a sample.
+    #[inline]
+    pub(crate) fn placement_of(&self, charts: &Charts, sample: usize) -> u32 {
+        let chart = charts.chart_of[self.texels.samples[sample].triangle as usize];
+        if self.is_back(sample) { self.layout.place_of(chart, false) } else { chart }
     }
 
     /// Repeats the nearest sample around the charts of a page, up to `padding` texels away.

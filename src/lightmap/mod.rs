@@ -36,6 +36,7 @@ use gaps::Gaps;
 use glam::Vec3;
 use map::ChartMap;
 use plan::Plan;
+pub use read::MeshUvs;
 use std::sync::Arc;
 
 /// How a light map is laid out.
@@ -51,11 +52,21 @@ pub struct LightmapDesc {
     pub gather_divisor: u32,
     /// Light map texels per radiance map texel, along each axis.
     pub radiance_divisor: u32,
+    /// Whether two-sided charts from both sides of which one sees something get a second place for their backs
+    /// ([`Lightmap::mesh_back_uvs`]). Without one, a chart shows the side that the bake chooses.
+    pub both_sides: bool,
 }
 
 impl Default for LightmapDesc {
     fn default() -> Self {
-        LightmapDesc { texels_per_unit: 0.0, page_size: 1024, padding: 2, gather_divisor: 4, radiance_divisor: 4 }
+        LightmapDesc {
+            texels_per_unit: 0.0,
+            page_size: 1024,
+            padding: 2,
+            gather_divisor: 4,
+            radiance_divisor: 4,
+            both_sides: false,
+        }
     }
 }
 
@@ -74,6 +85,10 @@ pub struct LightmapInfo {
     pub unwrap_seconds: f64,
     pub texels_per_unit: f32,
     pub uvs: charts::UvReport,
+    /// Charts with a second place for their backs.
+    pub both_sided_charts: u32,
+    /// Of `texels`, those of the second places.
+    pub back_texels: u64,
 }
 
 /// How to bake.
@@ -96,7 +111,8 @@ pub struct BakeParams {
     pub seed: u64,
     /// Bytes that the bake may take in addition; 0: no limit.
     pub memory_budget: u64,
-    /// Only these of the light map's covered texels, in chart order; `texel_end` 0: all.
+    /// Only these of the light map's covered texels, in chart order, backs with places of their own
+    /// last; `texel_end` 0: all.
     pub texel_begin: u64,
     pub texel_end: u64,
     /// Whether both sides of edges at which smooth surfaces are cut open in the light map are made to
@@ -205,7 +221,7 @@ struct Light {
     state: Vec<TexelState>,
     /// Reflected radiance, by sample of the radiance map. Empty if the bake left it out.
     radiance: Vec<Vec3>,
-    /// Whether a chart shows its back, by chart. Empty if none is two-sided.
+    /// Whether a chart with one place shows its back, by chart. Empty if none is two-sided.
     backs: Vec<bool>,
     /// What was stitched, as it was before: stitching starts anew with every bake of some texels.
     stitch: Option<seams::Stitch>,
@@ -226,12 +242,16 @@ pub(crate) struct Atlas {
 }
 
 impl Atlas {
-    /// A sample of the light map or the gather map as a receiver, on the side that `backs` (per
-    /// chart; empty: fronts) tells.
-    pub(crate) fn receiver(&self, map: &ChartMap, backs: &[bool], sample: usize) -> direct::Receiver {
+    /// Whether a sample of the light map or the gather map shows the back: in a place of its own, or since
+    /// `backs` (per chart; empty: fronts) says so.
+    pub(crate) fn is_back(&self, map: &ChartMap, backs: &[bool], sample: usize) -> bool {
         let chart = self.charts.chart_of[map.texels.samples[sample].triangle as usize];
-        let back = backs.get(chart as usize).is_some_and(|&b| b);
-        map.receiver(&self.scene, sample, back).1
+        map.is_back(sample) || backs.get(chart as usize).is_some_and(|&b| b)
+    }
+
+    /// A sample of the light map or the gather map as a receiver, on the side that it shows.
+    pub(crate) fn receiver(&self, map: &ChartMap, backs: &[bool], sample: usize) -> direct::Receiver {
+        map.receiver(&self.scene, sample, self.is_back(map, backs, sample)).1
     }
 
     /// A gather map's `values` interpolated at a sample of the light map: between those texels around that lie in a
@@ -245,10 +265,11 @@ impl Atlas {
         mut visit: impl FnMut(usize),
     ) -> Vec3 {
         let t = &self.map.texels.samples[sample];
-        let chart = self.charts.chart_of[t.triangle as usize];
+        // The gather map has the light map's placements.
+        let placement = self.map.placement_of(&self.charts, sample);
         let local = self.charts.local(t.triangle, t.u, t.v);
         let (mut all, mut alike, mut part) = (Vec3::ZERO, Vec3::ZERO, 0.0);
-        self.gather.bilinear(chart, local, |s, w| {
+        self.gather.bilinear(placement, local, |s, w| {
             visit(s);
             all += w * values[s];
             if !gaps.is_empty() && gaps.are_alike(sample, s) {
@@ -313,13 +334,6 @@ impl BakeParams {
             return invalid_argument!("the texels {} to {} are none", self.texel_begin, self.texel_end);
         }
         Ok(())
-    }
-}
-
-impl Light {
-    /// Whether a chart shows its back.
-    fn is_back(&self, chart: u32) -> bool {
-        self.backs.get(chart as usize).is_some_and(|&b| b)
     }
 }
 

@@ -1,7 +1,7 @@
 //! The plan of a bake: which stages and features a scene needs, and what is left out and why.
 
-use super::BakeParams;
 use super::direct::DirectLight;
+use super::{BakeParams, LightmapInfo};
 use crate::scene::{Light, Scene};
 
 /// Bits of [`super::BakeStats::left_out`].
@@ -167,6 +167,16 @@ impl Plan {
             self.leave_out(left_out::BLUR, "blur of the gather map", "blur_radius is 0");
         } else {
             self.run(&format!("blur of the gather map, radius {} texels", params.blur_radius));
+        }
+    }
+
+    /// Tells of charts with a second place for their backs.
+    pub(crate) fn note_both_sides(&mut self, info: &LightmapInfo) {
+        if info.both_sided_charts > 0 {
+            self.run(&format!(
+                "both sides of {} two-sided charts; their backs take {} of {} texels",
+                info.both_sided_charts, info.back_texels, info.texels
+            ));
         }
     }
 

@@ -66,8 +66,6 @@ pub(crate) struct RadianceInput<'a> {
     pub photons: Option<&'a PhotonMap>,
     pub direct_samples: u32,
     pub seed: u32,
-    /// First sample that shows a back side.
-    pub back_start: usize,
 }
 
 /// Fills in `values`, one per texel of the map; returns the rays traced.
@@ -91,8 +89,7 @@ fn texel(input: &RadianceInput, sample: usize, rays: &mut u64) -> Vec3 {
     if albedo == Vec3::ZERO {
         return Vec3::ZERO;
     }
-    let back = sample >= input.back_start;
-    let (point, receiver) = input.map.receiver(input.scene, sample, back);
+    let (point, receiver) = input.map.receiver(input.scene, sample, input.map.is_back(sample));
     let seed = combine(input.seed, sample as u32);
     let mut e = input.direct.irradiance(&receiver, input.direct_samples, seed, rays);
     if let Some(photons) = input.photons {

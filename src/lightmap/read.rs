@@ -16,6 +16,19 @@ impl Lightmap {
     /// Light map UV in [0, 1] of each corner, and the page of each triangle of `mesh`. Triangles
     /// without texels (degenerate ones) have page [`NONE`] and UVs 0.
     pub fn mesh_uvs(&self, mesh: u32) -> Result<MeshUvs> {
+        self.uvs_of(mesh, true)
+    }
+
+    /// The same for the backs of `mesh`'s triangles, and whether each has a place of its own. Those that have none
+    /// share the front's.
+    pub fn mesh_back_uvs(&self, mesh: u32) -> Result<(MeshUvs, Vec<bool>)> {
+        let uvs = self.uvs_of(mesh, false)?;
+        let first = self.atlas.scene.first_triangle(mesh);
+        let own = (first..first + uvs.1.len() as u32).map(|t| self.has_both_sides(t)).collect();
+        Ok((uvs, own))
+    }
+
+    fn uvs_of(&self, mesh: u32, front: bool) -> Result<MeshUvs> {
         let Some(m) = self.atlas.scene.meshes().get(mesh as usize) else {
             return invalid_argument!("mesh {mesh} does not exist, the scene has {}", self.atlas.scene.meshes().len());
         };
@@ -30,9 +43,10 @@ impl Lightmap {
                 pages.push(NONE);
                 continue;
             }
+            let placement = self.atlas.map.layout.place_of(chart, front);
             let corners = self.atlas.charts.corners[t as usize];
-            uvs.push(corners.map(|c| self.atlas.map.layout.texel_coord(chart, c).map(|x| x * scale)));
-            pages.push(self.atlas.map.layout.placements[chart as usize].page);
+            uvs.push(corners.map(|c| self.atlas.map.layout.texel_coord(placement, c).map(|x| x * scale)));
+            pages.push(self.atlas.map.layout.placements[placement as usize].page);
         }
         Ok((uvs, pages))
     }
@@ -86,7 +100,8 @@ impl Lightmap {
             Layer::Normal => {
                 let normal = |s: usize| {
                     let n = self.atlas.map.surface(&self.atlas.scene, s).1;
-                    if self.shows_back(self.atlas.map.texels.samples[s].triangle) { -n } else { n }
+                    let backs = self.light.as_ref().map_or(&[][..], |l| &l.backs);
+                    if self.atlas.is_back(&self.atlas.map, backs, s) { -n } else { n }
                 };
                 LayerData::Rgb(self.page(page, [0.0; 3], |s| normal(s).to_array(), false)?)
             }
@@ -99,7 +114,7 @@ impl Lightmap {
     /// Outgoing radiance of a texel: reflected, from the radiance map, plus emitted.
     fn radiance_at(&self, light: &Light, sample: usize) -> [f32; 3] {
         let t = self.atlas.map.texels.samples[sample];
-        let back = light.is_back(self.atlas.charts.chart_of[t.triangle as usize]);
+        let back = self.atlas.is_back(&self.atlas.map, &light.backs, sample);
         let mut l = DirectLight::emitted(&self.atlas.scene, t.triangle, back);
         if light.radiance.is_empty() {
             let e = light.direct[sample] + light.indirect[sample];
@@ -118,11 +133,11 @@ impl Lightmap {
         let size = self.atlas.map.layout.page_size as usize;
         let mut out = try_vec::<T>(size * size, "a page")?;
         out.fill(empty);
-        for (chart, placement) in self.atlas.map.layout.placements.iter().enumerate() {
+        for (number, placement) in self.atlas.map.layout.placements.iter().enumerate() {
             if placement.page != page {
                 continue;
             }
-            for s in self.atlas.map.samples_of(chart as u32) {
+            for s in self.atlas.map.samples_of(number as u32) {
                 let (x, y) = self.atlas.map.position(s);
                 out[y as usize * size + x as usize] = value(s);
             }
@@ -133,15 +148,23 @@ impl Lightmap {
         Ok(out)
     }
 
-    /// Whether the light map holds the light of the back of a global triangle. Fronts before a bake.
-    pub fn shows_back(&self, triangle: u32) -> bool {
-        self.light.as_ref().is_some_and(|l| l.is_back(self.atlas.charts.chart_of[triangle as usize]))
+    /// Whether the back of a global triangle has a place of its own.
+    fn has_both_sides(&self, triangle: u32) -> bool {
+        self.atlas.map.layout.back(self.atlas.charts.chart_of[triangle as usize]).is_some()
     }
 
-    /// What a shader sees at a point of a global triangle (weights of vertices 1 and 2):
-    /// a light layer, bilinearly filtered within the chart. Zero before a bake and for the layers
-    /// that are not light.
-    pub fn sample(&self, layer: Layer, triangle: u32, u: f32, v: f32) -> [f32; 3] {
+    /// Whether the light map holds the light of a side of a global triangle. Before a bake, of two sides in one place
+    /// that is the front.
+    pub fn shows(&self, triangle: u32, front: bool) -> bool {
+        let backs = self.light.as_ref().map_or(&[][..], |l| &l.backs);
+        let back = backs.get(self.atlas.charts.chart_of[triangle as usize] as usize).is_some_and(|&b| b);
+        front != back || self.has_both_sides(triangle)
+    }
+
+    /// What a shader sees at a point of a side of a global triangle (weights of vertices 1 and 2):
+    /// a light layer, bilinearly filtered within the chart; of two sides in one place the one that
+    /// is [shown](Self::shows). Zero before a bake and for the layers that are not light.
+    pub fn sample(&self, layer: Layer, triangle: u32, front: bool, u: f32, v: f32) -> [f32; 3] {
         let Some(light) = &self.light else { return [0.0; 3] };
         let chart = self.atlas.charts.chart_of[triangle as usize];
         if chart == NONE {
@@ -155,7 +178,8 @@ impl Lightmap {
             _ => Vec3::ZERO,
         };
         let mut sum = Vec3::ZERO;
-        self.atlas.map.bilinear(chart, self.atlas.charts.local(triangle, u, v), |s, w| sum += w * value(s));
+        let placement = self.atlas.map.layout.place_of(chart, front);
+        self.atlas.map.bilinear(placement, self.atlas.charts.local(triangle, u, v), |s, w| sum += w * value(s));
         sum.to_array()
     }
 }

@@ -158,19 +158,30 @@ impl View<'_> {
     }
 }
 
-/// An edge of a triangle: three times the triangle's global number, plus that of the corner that the
-/// edge starts at. (Triangle numbers have 28 bits.)
+/// An edge of a triangle in one of its places: three times the triangle's global number, plus that of the corner that
+/// the edge starts at (triangle numbers have 28 bits), plus [`SECOND`] in the place of a back.
 #[derive(Clone, Copy, Debug, Default, PartialEq, Eq, PartialOrd, Ord)]
 struct Side(u32);
 
+const SECOND: u32 = 1 << 31;
+
 impl Side {
     fn triangle(self) -> u32 {
-        self.0 / 3
+        (self.0 & !SECOND) / 3
+    }
+
+    /// Which of the triangle's corners it starts at.
+    fn corner(self) -> usize {
+        ((self.0 & !SECOND) % 3) as usize
+    }
+
+    fn is_second(self) -> bool {
+        self.0 & SECOND != 0
     }
 
     /// Start and end among the triangle's corners.
     fn ends<T: Copy>(self, corners: [T; 3]) -> [T; 2] {
-        let k = (self.0 % 3) as usize;
+        let k = self.corner();
         [corners[k], corners[(k + 1) % 3]]
     }
 }
@@ -188,7 +199,7 @@ struct Point {
 
 struct Job<'a, 'p, 'c> {
     atlas: &'a Atlas,
-    /// Per chart, whether its back is shown; empty: fronts.
+    /// Per chart with one place, whether its back is shown; empty: fronts.
     backs: &'a [bool],
     budget: u64,
     stage: &'a Stage<'p, 'c>,
@@ -268,9 +279,9 @@ impl Job<'_, '_, '_> {
         // it. (So does the rare hash that two edges share.)
         let mut edges: Vec<[Side; 2]> = sides
             .par_chunk_by(|a, b| a.0 == b.0)
-            .filter_map(|same| match same {
-                [(_, a), (_, b)] if self.is_seam([*a, *b]) => Some([*a, *b]),
-                _ => None,
+            .flat_map_iter(|same| {
+                let two = if let [(_, a), (_, b)] = same { Some([*a, *b]) } else { None };
+                two.into_iter().flat_map(|edge| self.in_places(edge)).filter(|&edge| self.is_seam(edge))
             })
             .collect();
         // Neighbours in the scene use the same texels.
@@ -282,8 +293,21 @@ impl Job<'_, '_, '_> {
         self.atlas.charts.chart_of[side.triangle() as usize]
     }
 
+    /// An edge between all places of its two triangles.
+    fn in_places(&self, edge: [Side; 2]) -> impl Iterator<Item = [Side; 2]> + use<> {
+        let [a, b] = edge.map(|side| {
+            let second = self.atlas.map.layout.back(self.chart(side)).map(|_| Side(side.0 | SECOND));
+            [Some(side), second].into_iter().flatten()
+        });
+        a.flat_map(move |a| b.clone().map(move |b| [a, b]))
+    }
+
+    fn placement(&self, side: Side) -> u32 {
+        self.atlas.map.layout.place_of(self.chart(side), !side.is_second())
+    }
+
     fn is_back(&self, side: Side) -> bool {
-        self.backs.get(self.chart(side) as usize).is_some_and(|&b| b)
+        side.is_second() || self.backs.get(self.chart(side) as usize).is_some_and(|&b| b)
     }
 
     /// Whether the second side runs from the first one's end to its start, as in a mesh it should.
@@ -304,12 +328,12 @@ impl Job<'_, '_, '_> {
         }
         let [at_a, at_b] = self.in_charts(edge);
         let apart = |i: usize| (self.texel(a, at_a[i]) - self.texel(b, at_b[i])).length() > 1e-3;
-        if self.chart(a) == self.chart(b) && !apart(0) && !apart(1) {
+        if self.placement(a) == self.placement(b) && !apart(0) && !apart(1) {
             return false;
         }
         let normal = |side: Side, s: f32| {
             // Weights of the corners 1 and 2.
-            let [u, v] = [[s, 0.0], [1.0 - s, s], [0.0, 1.0 - s]][(side.0 % 3) as usize];
+            let [u, v] = [[s, 0.0], [1.0 - s, s], [0.0, 1.0 - s]][side.corner()];
             let n = TexelSample { triangle: side.triangle(), u, v, x: 0, y: 0 }.shading_normal(&self.atlas.scene);
             if self.is_back(side) { -n } else { n }
         };
@@ -328,7 +352,7 @@ impl Job<'_, '_, '_> {
 
     /// The texel coordinate of a point of a side's chart.
     fn texel(&self, side: Side, local: Vec2) -> Vec2 {
-        self.atlas.map.layout.texel_coord(self.chart(side), local.to_array()).into()
+        self.atlas.map.layout.texel_coord(self.placement(side), local.to_array()).into()
     }
 
     /// The length of an edge in texels, on the side where it takes more of them.
@@ -351,7 +375,7 @@ impl Job<'_, '_, '_> {
             for (side, sign) in [(0, 1.0), (1, -1.0)] {
                 let local = locals[side][0].lerp(locals[side][1], s);
                 let mut at = 4 * side;
-                self.atlas.map.bilinear(self.chart(edge[side]), local.to_array(), |texel, weight| {
+                self.atlas.map.bilinear(self.placement(edge[side]), local.to_array(), |texel, weight| {
                     (point.texels[at], point.weights[at]) = (texel as u32, sign * weight);
                     at += 1;
                 });

@@ -1,4 +1,4 @@
-//! Blocks: tiles of 8 × 8 gather texels of one chart, the unit in which live light is computed,
+//! Blocks: tiles of 8 × 8 gather texels of one placement of a chart, the unit in which live light is computed,
 //! shown and uploaded, and the order of their texels by level of detail (LOD).
 //!
 //! LOD l computes every 2^(top − l)-th texel along each axis (thesis 3.3.2: each LOD doubles the
@@ -79,7 +79,7 @@ pub(super) struct DirectTile {
 /// What of a block never changes.
 #[derive(Debug)]
 pub(super) struct Tile {
-    pub chart: u32,
+    pub placement: u32,
     /// Where it lies in the gather map.
     pub rect: Rect,
     /// Its gather texels, by LOD.
@@ -155,9 +155,9 @@ impl Block {
 pub(super) struct BlockMap {
     pub atlas: Arc<Atlas>,
     pub tiles: Vec<Tile>,
-    /// First block of each chart.
+    /// First block of each placement.
     first: Vec<u32>,
-    /// Corner and number of columns of each chart's tiles, in texels of the gather map.
+    /// Corner and number of columns of each placement's tiles, in texels of the gather map.
     origin: Vec<(i32, i32, i32)>,
     /// Lowest LOD that each gather texel belongs to.
     pub lod_of: Vec<u8>,
@@ -168,24 +168,25 @@ impl BlockMap {
     /// Cuts the charts of an atlas into blocks. `lods`: 1 to [`MAX_LODS`].
     pub fn new(atlas: &Arc<Atlas>, lods: u32) -> BlockMap {
         let top = (lods - 1) as u8;
+        // The light map has as many, of the same sides of the same charts.
+        let placements = &atlas.gather.layout.placements;
         let mut map = BlockMap {
             atlas: atlas.clone(),
             tiles: Vec::new(),
-            first: Vec::with_capacity(atlas.charts.charts.len() + 1),
-            origin: Vec::with_capacity(atlas.charts.charts.len()),
+            first: Vec::with_capacity(placements.len() + 1),
+            origin: Vec::with_capacity(placements.len()),
             lod_of: vec![top; atlas.gather.len()],
             top,
         };
-        for chart in 0..atlas.charts.charts.len() as u32 {
+        for (number, p) in (0..).zip(placements) {
             map.first.push(map.tiles.len() as u32);
-            let p = &atlas.gather.layout.placements[chart as usize];
             let (x, y, w, h) = (p.x as i32, p.y as i32, p.w as i32, p.h as i32);
             let (columns, rows) = ((w + TILE - 1) / TILE, (h + TILE - 1) / TILE);
             map.origin.push((x, y, columns));
             for (i, j) in (0..rows).flat_map(|j| (0..columns).map(move |i| (i, j))) {
                 let (x0, y0) = (x + i * TILE, y + j * TILE);
                 let rect = Rect { x0, y0, x1: (x0 + TILE).min(x + w), y1: (y0 + TILE).min(y + h) };
-                let tile = map.tile(atlas, chart, rect);
+                let tile = map.tile(atlas, number, rect);
                 map.tiles.push(tile);
             }
         }
@@ -193,12 +194,12 @@ impl BlockMap {
         map
     }
 
-    fn tile(&mut self, atlas: &Atlas, chart: u32, rect: Rect) -> Tile {
+    fn tile(&mut self, atlas: &Atlas, placement: u32, rect: Rect) -> Tile {
         let mut texels: Vec<(u8, u32)> = rect
             .texels()
             .filter_map(|(x, y)| {
-                let sample = atlas.gather.at(chart, x, y);
-                (sample != NONE).then(|| (self.lod_at(chart, x, y), sample))
+                let sample = atlas.gather.at(placement, x, y);
+                (sample != NONE).then(|| (self.lod_at(placement, x, y), sample))
             })
             .collect();
         texels.sort_by_key(|t| t.0);
@@ -213,14 +214,14 @@ impl BlockMap {
             centre += atlas.gather.texels.samples[sample as usize].position(&atlas.scene).as_dvec3();
         }
         let centre = (centre / texels.len().max(1) as f64).as_vec3();
-        let map_texels = rect_in_light_map(atlas, chart, &rect).area() as u32;
+        let map_texels = rect_in_light_map(atlas, placement, &rect).area() as u32;
         let texels = texels.into_iter().map(|t| t.1).collect();
-        Tile { chart, rect, texels, lod_end, centre, map_texels, cell: 0 }
+        Tile { placement, rect, texels, lod_end, centre, map_texels, cell: 0 }
     }
 
     /// The LOD on whose grid a texel of the gather map lies.
-    fn lod_at(&self, chart: u32, x: i32, y: i32) -> u8 {
-        let (ox, oy, _) = self.origin[chart as usize];
+    fn lod_at(&self, placement: u32, x: i32, y: i32) -> u8 {
+        let (ox, oy, _) = self.origin[placement as usize];
         let zeros = ((x - ox) | (y - oy)).trailing_zeros();
         self.top - zeros.min(self.top as u32) as u8
     }
@@ -230,32 +231,32 @@ impl BlockMap {
         self.top
     }
 
-    /// Corner of a chart's grid of texels.
-    pub fn origin(&self, chart: u32) -> (i32, i32) {
-        let (x, y, _) = self.origin[chart as usize];
+    /// Corner of a placement's grid of texels.
+    pub fn origin(&self, placement: u32) -> (i32, i32) {
+        let (x, y, _) = self.origin[placement as usize];
         (x, y)
     }
 
-    /// The block of a texel of the gather map, which must be one of the chart's rectangle; others
+    /// The block of a texel of the gather map, which must be one of the placement's rectangle; others
     /// are clamped to it.
-    pub fn block_at(&self, chart: u32, x: i32, y: i32) -> u32 {
-        let (ox, oy, columns) = self.origin[chart as usize];
-        let (first, end) = (self.first[chart as usize], self.first[chart as usize + 1]);
+    pub fn block_at(&self, placement: u32, x: i32, y: i32) -> u32 {
+        let (ox, oy, columns) = self.origin[placement as usize];
+        let (first, end) = (self.first[placement as usize], self.first[placement as usize + 1]);
         let rows = (end - first) as i32 / columns.max(1);
         let (i, j) = (((x - ox) / TILE).clamp(0, columns - 1), ((y - oy) / TILE).clamp(0, rows - 1));
         first + (j * columns + i) as u32
     }
 
-    /// The blocks of a chart.
-    pub fn of_chart(&self, chart: u32) -> std::ops::Range<u32> {
-        self.first[chart as usize]..self.first[chart as usize + 1]
+    /// The blocks of a placement.
+    pub fn of_placement(&self, placement: u32) -> std::ops::Range<u32> {
+        self.first[placement as usize]..self.first[placement as usize + 1]
     }
 
-    /// The up to eight blocks around a block in its chart.
+    /// The up to eight blocks around a block in its placement.
     pub fn neighbours(&self, b: u32) -> impl Iterator<Item = u32> + '_ {
         let tile = &self.tiles[b as usize];
-        let (_, _, columns) = self.origin[tile.chart as usize];
-        let range = self.of_chart(tile.chart);
+        let (_, _, columns) = self.origin[tile.placement as usize];
+        let range = self.of_placement(tile.placement);
         let rows = (range.end - range.start) as i32 / columns.max(1);
         let at = (b - range.start) as i32;
         let (i, j) = (at % columns, at / columns);
@@ -266,10 +267,10 @@ impl BlockMap {
             .map(move |(i, j)| range.start + (j * columns + i) as u32)
     }
 
-    /// Where the light map shows a rectangle of a chart's gather texels: the smallest one with all of
-    /// them, within the chart's own.
-    pub fn rect_in_light_map(&self, chart: u32, rect: &Rect) -> Rect {
-        rect_in_light_map(&self.atlas, chart, rect)
+    /// Where the light map shows a rectangle of a placement's gather texels: the smallest one with all of
+    /// them, within the placement's own.
+    pub fn rect_in_light_map(&self, placement: u32, rect: &Rect) -> Rect {
+        rect_in_light_map(&self.atlas, placement, rect)
     }
 
     /// Bytes held, with those of idle blocks.
@@ -279,9 +280,9 @@ impl BlockMap {
     }
 }
 
-fn rect_in_light_map(atlas: &Atlas, chart: u32, rect: &Rect) -> Rect {
-    let gather = &atlas.gather.layout.placements[chart as usize];
-    let map = &atlas.map.layout.placements[chart as usize];
+fn rect_in_light_map(atlas: &Atlas, placement: u32, rect: &Rect) -> Rect {
+    let gather = &atlas.gather.layout.placements[placement as usize];
+    let map = &atlas.map.layout.placements[placement as usize];
     let corner = |x: i32, y: i32| {
         let at = [x as f32, y as f32];
         let mut local: [f32; 2] = std::array::from_fn(|k| (at[k] - gather.offset[k]) / gather.scale[k]);

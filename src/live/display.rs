@@ -136,7 +136,8 @@ impl Display {
         all.dedup();
         let interpolate = |&b: &u32| -> Vec<(u32, Vec3)> {
             let (tile, lod) = (&map.tiles[b as usize], self.fresh[b as usize]);
-            let known = |s: u32, x, y| map.lod_of[s as usize] <= self.fresh[map.block_at(tile.chart, x, y) as usize];
+            let known =
+                |s: u32, x, y| map.lod_of[s as usize] <= self.fresh[map.block_at(tile.placement, x, y) as usize];
             let value = |s: u32| {
                 if self.old.is_empty() {
                     return self.interpolate(map, b, lod, s, known, |s| self.plain[s]);
@@ -170,7 +171,7 @@ impl Display {
 
         let grown = |b: u32| {
             let tile = &map.tiles[b as usize];
-            (tile.chart, tile.rect.grown(self.blur).clipped(&own_rect(map, tile.chart)))
+            (tile.placement, tile.rect.grown(self.blur).clipped(&own_rect(map, tile.placement)))
         };
         all.extend(to_fill);
         all.sort_unstable();
@@ -178,11 +179,11 @@ impl Display {
         let touched: Vec<(u32, Rect)> = all.into_iter().map(grown).collect();
         let shown: Vec<(u32, Vec3)> = touched
             .par_iter()
-            .flat_map_iter(|&(chart, rect)| {
+            .flat_map_iter(|&(placement, rect)| {
                 let mut window = Window::new(self.blur);
                 // Blocks that fade get there by themselves.
-                let is_still = |&(x, y): &(i32, i32)| self.fades[map.block_at(chart, x, y) as usize] == 0;
-                let at = |(x, y)| map.atlas.gather.at(chart, x, y);
+                let is_still = |&(x, y): &(i32, i32)| self.fades[map.block_at(placement, x, y) as usize] == 0;
+                let at = |(x, y)| map.atlas.gather.at(placement, x, y);
                 let samples = rect.texels().filter(is_still).map(at).filter(|&s| s != NONE);
                 samples.map(|s| (s, self.blurred(map, &mut window, s as usize))).collect::<Vec<_>>()
             })
@@ -191,7 +192,7 @@ impl Display {
             self.shown[sample as usize] = value;
         }
         // A texel of the light map interpolates between four of the gather map.
-        touched.iter().map(|(chart, rect)| in_light_map(map, *chart, &rect.grown(1))).collect()
+        touched.iter().map(|(placement, rect)| in_light_map(map, *placement, &rect.grown(1))).collect()
     }
 
     /// What would be shown if no block were above a LOD.
@@ -280,7 +281,7 @@ impl Display {
     ) -> Vec3 {
         let (tile, gather) = (&map.tiles[b as usize], &map.atlas.gather);
         let (x, y) = gather.position(sample as usize);
-        let (ox, oy) = map.origin(tile.chart);
+        let (ox, oy) = map.origin(tile.placement);
         let step = 1 << (map.top() - lod);
         let (x0, y0) = (x - (x - ox) % step, y - (y - oy) % step);
         let (fx, fy) = ((x - x0) as f32 / step as f32, (y - y0) as f32 / step as f32);
@@ -291,7 +292,7 @@ impl Display {
             (x0, y0 + step, (1.0 - fx) * fy),
             (x0 + step, y0 + step, fx * fy),
         ] {
-            let s = gather.at(tile.chart, cx, cy);
+            let s = gather.at(tile.placement, cx, cy);
             if w > 0.0 && s != NONE && self.visible[s as usize] && known(s, cx, cy) {
                 sum += w * values(s as usize);
                 total += w;
@@ -377,7 +378,7 @@ impl Display {
     /// The part of the light map that shows a block.
     fn block_rect(&self, map: &BlockMap, b: u32) -> Changed {
         let tile = &map.tiles[b as usize];
-        in_light_map(map, tile.chart, &tile.rect.grown(1))
+        in_light_map(map, tile.placement, &tile.rect.grown(1))
     }
 
     /// The unseen texels of a block with the mean of their neighbours, ring by ring from those that are
@@ -395,7 +396,7 @@ impl Display {
                     let (x, y) = map.atlas.gather.position(s as usize);
                     let (mut sum, mut n) = (Vec3::ZERO, 0.0);
                     for (nx, ny) in (-1..=1).flat_map(|dy| (-1..=1).map(move |dx| (x + dx, y + dy))) {
-                        let t = map.atlas.gather.at(tile.chart, nx, ny);
+                        let t = map.atlas.gather.at(tile.placement, nx, ny);
                         if t == NONE {
                             continue;
                         }
@@ -430,11 +431,11 @@ impl Display {
             return indirect;
         }
         let t = &atlas.map.texels.samples[sample as usize];
-        let chart = atlas.charts.chart_of[t.triangle as usize];
+        let placement = atlas.map.placement_of(&atlas.charts, sample as usize);
         let local = atlas.charts.local(t.triangle, t.u, t.v);
         // Coordinates are not negative, so that truncation rounds down.
-        let at = atlas.gather.layout.texel_coord(chart, local);
-        let b = map.block_at(chart, at[0] as i32, at[1] as i32) as usize;
+        let at = atlas.gather.layout.texel_coord(placement, local);
+        let b = map.block_at(placement, at[0] as i32, at[1] as i32) as usize;
         let fine = self.tiles[b].as_ref().and_then(|tile| {
             let (x, y) = atlas.map.position(sample as usize);
             let r = &tile.rect;
@@ -444,10 +445,10 @@ impl Display {
         indirect
             + match fine {
                 Some(fine) if self.tile_epochs[b] == self.epoch => fine,
-                Some(old) => (old + self.change_of_direct(map, chart, local, b)).max(Vec3::ZERO),
+                Some(old) => (old + self.change_of_direct(map, placement, local, b)).max(Vec3::ZERO),
                 None => {
                     let mut coarse = Vec3::ZERO;
-                    atlas.gather.bilinear(chart, local, |s, w| coarse += w * self.coarse[s]);
+                    atlas.gather.bilinear(placement, local, |s, w| coarse += w * self.coarse[s]);
                     coarse
                 }
             }
@@ -455,12 +456,12 @@ impl Display {
 
     /// What the coarse direct light around a point has changed by since the tile of its block was made.
     /// Neighbours whose tiles are of other times say nothing of that.
-    fn change_of_direct(&self, map: &BlockMap, chart: u32, local: [f32; 2], b: usize) -> Vec3 {
+    fn change_of_direct(&self, map: &BlockMap, placement: u32, local: [f32; 2], b: usize) -> Vec3 {
         let gather = &map.atlas.gather;
         let (mut sum, mut total) = (Vec3::ZERO, 0.0);
-        gather.bilinear(chart, local, |s, w| {
+        gather.bilinear(placement, local, |s, w| {
             let (x, y) = gather.position(s);
-            let of = map.block_at(chart, x, y) as usize;
+            let of = map.block_at(placement, x, y) as usize;
             if of == b || (self.tiles[of].is_some() && self.tile_epochs[of] == self.tile_epochs[b]) {
                 sum += w * (self.coarse[s] - self.coarse_of_tile[s]);
                 total += w;
@@ -470,12 +471,12 @@ impl Display {
     }
 }
 
-fn own_rect(map: &BlockMap, chart: u32) -> Rect {
-    Rect::of(&map.atlas.gather.layout.placements[chart as usize])
+fn own_rect(map: &BlockMap, placement: u32) -> Rect {
+    Rect::of(&map.atlas.gather.layout.placements[placement as usize])
 }
 
-/// Where the light map shows a rectangle of a chart's gather texels.
-fn in_light_map(map: &BlockMap, chart: u32, rect: &Rect) -> Changed {
-    let rect = map.rect_in_light_map(chart, rect);
-    Changed { page: map.atlas.map.layout.placements[chart as usize].page, rect }
+/// Where the light map shows a rectangle of a placement's gather texels.
+fn in_light_map(map: &BlockMap, placement: u32, rect: &Rect) -> Changed {
+    let rect = map.rect_in_light_map(placement, rect);
+    Changed { page: map.atlas.map.layout.placements[placement as usize].page, rect }
 }

@@ -635,7 +635,8 @@ impl Live {
     fn keep_direct_of_same_sides(&mut self, before: &Illumination) {
         let light = self.context.light.clone();
         for (b, (block, tile)) in (0u32..).zip(self.blocks.iter_mut().zip(&self.context.map.tiles)) {
-            if before.backs.get(tile.chart as usize) != light.backs.get(tile.chart as usize) {
+            let chart = self.context.map.atlas.gather.layout.chart_of(tile.placement) as usize;
+            if before.backs.get(chart) != light.backs.get(chart) {
                 continue;
             }
             if block.coarse_epoch == before.direct_epoch {

@@ -1,4 +1,4 @@
-//! Reading rectangles of the shown light: which charts lie in a rectangle, and their composition with
+//! Reading rectangles of the shown light: which placements of charts lie in a rectangle, and their composition with
 //! the padding around them.
 
 use super::blocks::{BlockMap, Rect};
@@ -17,7 +17,7 @@ const ROWS: usize = 16;
 /// Rectangles of fewer texels are composed by the calling thread: waking others takes longer.
 const SMALL: usize = 4096;
 
-/// Charts by where they lie: bins of 64 × 64 texels of the pages.
+/// Placements by where they lie: bins of 64 × 64 texels of the pages.
 pub(super) struct ChartBins {
     /// Bins along a side of a page.
     side: i32,
@@ -30,10 +30,10 @@ impl ChartBins {
         let side = (layout.page_size as i32 + BIN - 1) / BIN;
         let pages = map.atlas.info.page_count as i32;
         let mut bins = ChartBins { side, bins: vec![Vec::new(); (side * side * pages) as usize] };
-        for chart in 0..map.atlas.charts.charts.len() as u32 {
-            let (page, rect) = padded(map, chart);
+        for placement in 0..layout.placements.len() as u32 {
+            let (page, rect) = padded(map, placement);
             for i in bins.overlapping(page, &rect) {
-                bins.bins[i].push(chart);
+                bins.bins[i].push(placement);
             }
         }
         bins
@@ -48,12 +48,12 @@ impl ChartBins {
             .map(move |(i, j)| ((page as i32 * side + j) * side + i) as usize)
     }
 
-    /// Charts that a rectangle of a page may show, with their padding, in order.
-    fn charts(&self, page: u32, rect: &Rect) -> Vec<u32> {
-        let mut charts: Vec<u32> = self.overlapping(page, rect).flat_map(|i| self.bins[i].iter().copied()).collect();
-        charts.sort_unstable();
-        charts.dedup();
-        charts
+    /// Placements that a rectangle of a page may show, with their padding, in order.
+    fn placements(&self, page: u32, rect: &Rect) -> Vec<u32> {
+        let mut all: Vec<u32> = self.overlapping(page, rect).flat_map(|i| self.bins[i].iter().copied()).collect();
+        all.sort_unstable();
+        all.dedup();
+        all
     }
 
     pub fn bytes(&self) -> usize {
@@ -61,16 +61,16 @@ impl ChartBins {
     }
 }
 
-/// A chart's page and rectangle.
-fn placed(map: &BlockMap, chart: u32) -> (u32, Rect) {
-    let p = &map.atlas.map.layout.placements[chart as usize];
+/// A placement's page and rectangle.
+fn placed(map: &BlockMap, placement: u32) -> (u32, Rect) {
+    let p = &map.atlas.map.layout.placements[placement as usize];
     (p.page, Rect::of(p))
 }
 
-/// A chart's page and rectangle, with padding. (That of given charts lies outside their own.)
-fn padded(map: &BlockMap, chart: u32) -> (u32, Rect) {
-    let (page, rect) = placed(map, chart);
-    (page, if chart < map.atlas.map.layout.given { rect.grown(map.atlas.padding as i32) } else { rect })
+/// A placement's page and rectangle, with padding. (That of given charts lies outside their own.)
+fn padded(map: &BlockMap, placement: u32) -> (u32, Rect) {
+    let (page, rect) = placed(map, placement);
+    (page, if placement < map.atlas.map.layout.given { rect.grown(map.atlas.padding as i32) } else { rect })
 }
 
 impl Live {
@@ -117,15 +117,14 @@ impl Live {
         // Each sample is looked up and its light put together once, though up to a dozen texels of the
         // padding repeat it.
         let (mut samples, mut values) = (Vec::new(), Vec::new());
-        for chart in self.bins.charts(page, rows) {
-            let shown = padded(map, chart).1.clipped(rows);
-            let from = placed(map, chart).1.clipped(&shown.grown(padding));
+        for placement in self.bins.placements(page, rows) {
+            let shown = padded(map, placement).1.clipped(rows);
+            let from = placed(map, placement).1.clipped(&shown.grown(padding));
             samples.clear();
             samples.extend(from.texels().map(|(x, y)| {
-                let s = atlas.map.at(chart, x, y);
-                let of_chart =
-                    s != NONE && atlas.charts.chart_of[atlas.map.texels.samples[s as usize].triangle as usize] == chart;
-                if of_chart { s } else { NONE }
+                let s = atlas.map.at(placement, x, y);
+                let is_own = s != NONE && atlas.map.placement_of(&atlas.charts, s as usize) == placement;
+                if is_own { s } else { NONE }
             }));
             values.clear();
             values.resize(samples.len(), None);

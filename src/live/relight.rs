@@ -29,7 +29,7 @@ pub(super) struct Illumination {
     pub direct: Arc<DirectLight>,
     /// By sample of the radiance map.
     pub radiance: Arc<Vec<Vec3>>,
-    /// Per chart, whether its back is shown.
+    /// Per chart with one place, whether its back is shown.
     pub backs: Arc<Vec<bool>>,
     /// On the sides that are shown; none without indirect light.
     pub gaps: Arc<Gaps>,
@@ -63,8 +63,8 @@ fn illuminate(
     let has_indirect = plan.runs(left_out::INDIRECT);
     let sides = if with_sides {
         let backs = bake.backs(&radiance);
-        let charts = if has_indirect { atlas.charts.charts.len() as u32 } else { 0 };
-        let gaps = bake.gaps(&backs, 0..charts)?;
+        let placements = if has_indirect { atlas.map.layout.placements.len() as u32 } else { 0 };
+        let gaps = bake.gaps(&backs, 0..placements)?;
         Some((backs, gaps))
     } else {
         None

@@ -77,7 +77,7 @@ impl Live {
             {
                 block.direct_epoch = self.context.light.direct_epoch;
                 let tile = &self.context.map.tiles[b as usize];
-                let rect = self.context.map.rect_in_light_map(tile.chart, &tile.rect);
+                let rect = self.context.map.rect_in_light_map(tile.placement, &tile.rect);
                 self.held += self.display.take_direct(&self.context.map, b, DirectTile { rect, values }).1;
             }
             block.note_error(self.context.map.top());
@@ -188,7 +188,7 @@ impl Live {
         };
         let gathered = (0..count).map(|_| gathered(from)).collect::<Option<Vec<_>>>()?;
         let values = from.u32()? as usize;
-        let rect = self.context.map.rect_in_light_map(tile.chart, &tile.rect);
+        let rect = self.context.map.rect_in_light_map(tile.placement, &tile.rect);
         if values != 0 && values != rect.area() {
             return None;
         }

@@ -91,11 +91,15 @@ fn block_of(map: &BlockMap, hit: &RawHit) -> Option<u32> {
     }
     let atlas = &map.atlas;
     let chart = atlas.charts.chart_of[hit.triangle as usize];
-    if chart == NONE || map.of_chart(chart).is_empty() {
+    if chart == NONE {
         return None;
     }
-    let at = atlas.gather.layout.texel_coord(chart, atlas.charts.local(hit.triangle, hit.u, hit.v));
-    Some(map.block_at(chart, at[0].floor() as i32, at[1].floor() as i32))
+    let placement = atlas.gather.layout.place_of(chart, hit.front);
+    if map.of_placement(placement).is_empty() {
+        return None;
+    }
+    let at = atlas.gather.layout.texel_coord(placement, atlas.charts.local(hit.triangle, hit.u, hit.v));
+    Some(map.block_at(placement, at[0].floor() as i32, at[1].floor() as i32))
 }
 
 impl LiveCamera {
@@ -117,5 +121,46 @@ impl LiveCamera {
             return invalid_argument!("the camera's forward {} and up {} are zero or parallel", self.forward, self.up);
         }
         Ok(())
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use crate::bvh::BuildOptions;
+    use crate::device::{Device, DeviceOptions};
+    use crate::lightmap::{Lightmap, LightmapDesc};
+    use crate::progress::Progress;
+    use crate::scene::shapes::MeshBuilder;
+    use crate::scene::{Material, Scene, SceneData};
+    use crate::trace::Ray;
+
+    #[test]
+    fn a_hit_marks_a_block_of_the_side_that_is_seen() {
+        let device = Device::new(DeviceOptions { num_threads: 1, ..Default::default() }).unwrap();
+        let mut data = SceneData::new();
+        let m = data.add_material(Material { two_sided: true, ..Default::default() }).unwrap();
+        let p = |x: f32, y: f32| Vec3::new(x, y, 0.0);
+        let mut builder = MeshBuilder::new();
+        builder.quad(p(-1.0, -1.0), p(1.0, -1.0), p(1.0, 1.0), p(-1.0, 1.0), m);
+        builder.box_(Vec3::splat(-2.0), Vec3::splat(2.0), true, m);
+        data.add_mesh(builder.finish()).unwrap();
+        let scene = Scene::commit(&device, data, &BuildOptions::default(), &Progress::none()).map_err(|e| e.1).unwrap();
+        for both_sides in [true, false] {
+            let desc = LightmapDesc { texels_per_unit: 16.0, both_sides, ..Default::default() };
+            let lightmap = Lightmap::create(&scene, &desc, &Progress::none()).unwrap();
+            let map = BlockMap::new(lightmap.atlas(), 3);
+            let chart = lightmap.atlas().charts.chart_of[0];
+            let [above, below] = [1.0, -1.0].map(|z| {
+                let hit = scene.intersect_raw(&Ray::new(Vec3::new(0.3, 0.4, z), Vec3::Z * -z));
+                let tile = &map.tiles[block_of(&map, &hit).unwrap() as usize];
+                let near = (tile.centre - Vec3::new(0.3, 0.4, 0.0)).length();
+                assert!(near < 1.5, "a block is 2 m wide, and {near} m away");
+                tile.placement
+            });
+            assert_eq!(above, chart);
+            assert_eq!(Some(below).filter(|&b| b != chart), map.atlas.gather.layout.back(chart));
+            assert_eq!(above != below, both_sides);
+        }
     }
 }

@@ -329,7 +329,7 @@ impl Block {
         let (mut tile, mut next) = match self.direct_work.take() {
             Some((tile, next)) if self.direct_epoch == c.light.direct_epoch => (tile, next),
             _ => {
-                let rect = c.map.rect_in_light_map(of.chart, &of.rect);
+                let rect = c.map.rect_in_light_map(of.placement, &of.rect);
                 self.direct_epoch = c.light.direct_epoch;
                 (DirectTile { rect, values: vec![Vec3::NAN; rect.area()].into() }, 0)
             }
@@ -358,15 +358,15 @@ impl Block {
 /// it is inside a solid.
 fn direct_texel(c: &Context, tile: &Tile, x: i32, y: i32, rays: &mut u64) -> Option<Vec3> {
     let a = &c.map.atlas;
-    let sample = a.map.at(tile.chart, x, y);
+    let sample = a.map.at(tile.placement, x, y);
     if sample == NONE {
         return None;
     }
     let t = &a.map.texels.samples[sample as usize];
-    if a.charts.chart_of[t.triangle as usize] != tile.chart {
+    if a.map.placement_of(&a.charts, sample as usize) != tile.placement {
         return None;
     }
-    let at = a.gather.layout.texel_coord(tile.chart, a.charts.local(t.triangle, t.u, t.v));
+    let at = a.gather.layout.texel_coord(tile.placement, a.charts.local(t.triangle, t.u, t.v));
     // One texel more than the block's own, so that rounding leaves no gaps between blocks.
     let own = tile.rect.grown(1);
     let (gx, gy) = (at[0].floor() as i32, at[1].floor() as i32);

@@ -74,10 +74,10 @@ impl<'a> Brightness<'a> {
         if hit.is_miss() {
             return None;
         }
-        if hit.front == self.lightmap.shows_back(hit.triangle) {
+        if !self.lightmap.shows(hit.triangle, hit.front) {
             return Some((0.0, hit.t));
         }
-        let e = self.lightmap.sample(Layer::Combined, hit.triangle, hit.u, hit.v);
+        let e = self.lightmap.sample(Layer::Combined, hit.triangle, hit.front, hit.u, hit.v);
         Some((e.iter().sum::<f32>() / 3.0, hit.t))
     }
 

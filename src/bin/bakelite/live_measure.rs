@@ -48,16 +48,19 @@ impl Seen {
         let scene = lightmap.scene();
         let rows = ray_count(aspect) / COLUMNS;
         let rays = PrimaryRays::new(camera, COLUMNS, rows);
-        let uvs = (0..scene.meshes().len() as u32).map(|m| lightmap.mesh_uvs(m)).collect::<Result<Vec<_>>>()?;
+        let uvs = (0..scene.meshes().len() as u32)
+            .map(|m| Ok([lightmap.mesh_back_uvs(m)?.0, lightmap.mesh_uvs(m)?]))
+            .collect::<Result<Vec<_>>>()?;
         let size = lightmap.info().width;
         let mut texels = Vec::new();
         for ray in (0..COLUMNS * rows).filter_map(|i| rays.of_pixel(i % COLUMNS, i / COLUMNS).next()) {
             let hit = scene.intersect_raw(&ray);
-            if hit.is_miss() || hit.front == lightmap.shows_back(hit.triangle) {
+            if hit.is_miss() || !lightmap.shows(hit.triangle, hit.front) {
                 continue;
             }
             let (mesh, triangle) = scene.locate(hit.triangle);
-            let (corners, page) = (&uvs[mesh as usize].0[triangle as usize], uvs[mesh as usize].1[triangle as usize]);
+            let (corners, pages) = &uvs[mesh as usize][usize::from(hit.front)];
+            let (corners, page) = (&corners[triangle as usize], pages[triangle as usize]);
             if page == NONE {
                 continue;
             }

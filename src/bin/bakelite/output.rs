@@ -67,9 +67,8 @@ pub fn write_pages(folder: &Path, lightmap: &Lightmap, exposure: f32, progress: 
 /// Writes the scene with its light map as `scene.glb` and returns its path.
 pub fn write_scene(folder: &Path, lightmap: &Lightmap, exposure: f32) -> Result<PathBuf> {
     let info = lightmap.info();
-    let meshes = (0..lightmap.scene().meshes().len() as u32)
-        .map(|mesh| lightmap.mesh_uvs(mesh).map(|(corner_uvs, pages)| GlbMesh { corner_uvs, pages }))
-        .collect::<Result<_>>()?;
+    let meshes =
+        (0..lightmap.scene().meshes().len() as u32).map(|mesh| GlbMesh::of(lightmap, mesh)).collect::<Result<_>>()?;
     let page = |page: u32| -> Result<Vec<u8>> {
         let mapped: Vec<[u8; 3]> =
             rgb(lightmap, page, Layer::Combined)?.iter().map(|&p| tone_map(exposure, p)).collect();

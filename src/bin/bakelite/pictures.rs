@@ -77,13 +77,19 @@ impl View<'_> {
         let direct = DirectLight::new(scene);
         let by_shadow_rays = render(scene, &self.camera, size, seed, progress, "shadow rays", |seen| {
             let e = direct.irradiance(&receiver(scene, &seen.hit), SHADOW_RAYS, seen.seed, &mut 0);
-            Ok(e + Vec3::from(self.lightmap.sample(Layer::Indirect, seen.hit.triangle, seen.hit.u, seen.hit.v)))
+            Ok(e + Vec3::from(self.lightmap.sample(
+                Layer::Indirect,
+                seen.hit.triangle,
+                seen.hit.front,
+                seen.hit.u,
+                seen.hit.v,
+            )))
         })?;
         let shadow_seconds = start.elapsed().as_secs_f64();
 
         let start = Instant::now();
         let composite = render(scene, &self.camera, size, seed, progress, "light map", |seen| {
-            Ok(self.lightmap.sample(Layer::Combined, seen.hit.triangle, seen.hit.u, seen.hit.v).into())
+            Ok(self.lightmap.sample(Layer::Combined, seen.hit.triangle, seen.hit.front, seen.hit.u, seen.hit.v).into())
         })?;
         let composite_seconds = start.elapsed().as_secs_f64();
 

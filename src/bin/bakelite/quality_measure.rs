@@ -25,8 +25,8 @@ pub type Values = Vec<[f64; 3]>;
 /// Points of surfaces, as often as they are seen from places in the scene.
 #[derive(Default)]
 pub struct Points {
-    /// Global triangle and weights of its corners 1 and 2.
-    pub on: Vec<(u32, f32, f32)>,
+    /// Global triangle, whether it is its front, and weights of its corners 1 and 2.
+    pub on: Vec<(u32, bool, f32, f32)>,
     /// Unit normals of the sides that the light map holds.
     pub normals: Vec<Vec3>,
     pub positions: Vec<Vec3>,
@@ -112,11 +112,12 @@ impl Points {
             {
                 return Err(invalid(format!("of another scene: {line}")));
             }
-            if (normal.dot(scene.normal(triangle)) < 0.0) != lightmap.shows_back(triangle) {
+            let front = normal.dot(scene.normal(triangle)) > 0.0;
+            if !lightmap.shows(triangle, front) {
                 points.of_other_sides += 1;
                 continue;
             }
-            points.on.push((triangle, u, v));
+            points.on.push((triangle, front, u, v));
             points.positions.push(position);
             points.normals.push(normal);
             for (values, value) in points.indirect.iter_mut().zip([[ir, ig, ib], [jr, jg, jb]]) {
@@ -136,7 +137,7 @@ impl Points {
     pub fn csv(&self, bake: &Values) -> String {
         let mut out = format!("{COLUMNS}\n");
         for i in 0..self.len() {
-            let (t, u, v) = self.on[i];
+            let (t, _, u, v) = self.on[i];
             let (p, n) = (self.positions[i], self.normals[i]);
             let _ = write!(out, "{t},{u:e},{v:e},{},{},{},{},{},{}", p.x, p.y, p.z, n.x, n.y, n.z);
             for [r, g, b] in [bake, &self.indirect[0], &self.indirect[1], &self.all[0], &self.all[1]].map(|v| v[i]) {
@@ -169,13 +170,13 @@ impl Points {
             if hit.is_miss() {
                 continue;
             }
-            if hit.front == lightmap.shows_back(hit.triangle) {
+            if !lightmap.shows(hit.triangle, hit.front) {
                 self.of_other_sides += 1;
                 continue;
             }
             let side = if hit.front { 1.0 } else { -1.0 };
             let sample = TexelSample { triangle: hit.triangle, u: hit.u, v: hit.v, ..Default::default() };
-            self.on.push((hit.triangle, hit.u, hit.v));
+            self.on.push((hit.triangle, hit.front, hit.u, hit.v));
             self.positions.push(sample.position(scene));
             self.normals.push(side * sample.shading_normal(scene));
         }
@@ -191,7 +192,7 @@ impl Points {
 
     /// Light that a light map of the same scene has at the points.
     pub fn of_bake(&self, lightmap: &Lightmap, layer: Layer) -> Values {
-        self.on.iter().map(|&(t, u, v)| lightmap.sample(layer, t, u, v).map(f64::from)).collect()
+        self.on.iter().map(|&(t, front, u, v)| lightmap.sample(layer, t, front, u, v).map(f64::from)).collect()
     }
 }
 

@@ -196,9 +196,9 @@ impl Measure<'_> {
         let scene = lightmap.scene();
         let receivers: Vec<Receiver> = (0..self.points.len())
             .map(|i| {
-                let (triangle, u, v) = self.points.on[i];
+                let (triangle, front, u, v) = self.points.on[i];
                 let point = SurfacePoint::new(scene.corners(triangle), u, v, scene);
-                Receiver::new(scene, &point, Some(self.points.normals[i]), lightmap.shows_back(triangle))
+                Receiver::new(scene, &point, Some(self.points.normals[i]), !front)
             })
             .collect();
         let paths = TexelPaths::new(scene);

@@ -73,7 +73,7 @@ impl ViewReference {
     /// Similarity of a view of the light map alone.
     pub fn of_bake(&self, lightmap: &Lightmap) -> Result<Option<f64>> {
         let image = render(lightmap.scene(), &self.camera, self.size, 0, &Progress::none(), "view", |seen| {
-            Ok(lightmap.sample(Layer::Combined, seen.hit.triangle, seen.hit.u, seen.hit.v).into())
+            Ok(lightmap.sample(Layer::Combined, seen.hit.triangle, seen.hit.front, seen.hit.u, seen.hit.v).into())
         })?;
         Ok(ssim(&tone_mapped(&image, &self.background, self.exposure), &self.shown, self.size[0]))
     }

@@ -2,7 +2,7 @@ use super::*;
 use crate::device::{Device, DeviceOptions};
 use crate::lightmap::{Layer, LightmapDesc};
 use crate::scene::shapes::MeshBuilder;
-use crate::scene::{LightmapUvs, Material, Mesh, Scene, SceneData};
+use crate::scene::{LightmapUvs, Material, Mesh, MeshMaterials, Scene, SceneData};
 use std::f32::consts::FRAC_PI_6;
 use std::sync::Arc;
 
@@ -13,6 +13,7 @@ fn scene(threads: usize, meshes: Vec<Mesh>, light: crate::scene::Light) -> Arc<S
     let device = Device::new(DeviceOptions { num_threads: threads, ..Default::default() }).unwrap();
     let mut data = SceneData::new();
     data.add_material(Material { albedo: [0.7; 3], ..Default::default() }).unwrap();
+    data.add_material(Material { albedo: [0.7; 3], two_sided: true, ..Default::default() }).unwrap();
     for mesh in meshes {
         data.add_mesh(mesh).unwrap();
     }
@@ -67,14 +68,14 @@ fn bits(map: &Lightmap) -> Vec<[u32; 3]> {
 
 /// What the two squares of floor show differently where they meet, as a shader would, relative to
 /// what they show: root mean square over places that have nothing to do with the points.
-fn rms_at_the_seam(map: &Lightmap, layer: Layer) -> f64 {
+fn rms_at_the_seam(map: &Lightmap, layer: Layer, front: bool) -> f64 {
     let (mut squares, mut sum, n) = (0.0, 0.0, 1009);
     for i in 0..n {
         let z = (i as f32 + 0.5) / n as f32;
         // Triangle 1 has corners 0, 2, 3 of its square: x = 1 from its corner 1 to 2. Triangle 2 has
         // corners 0, 1, 2 of the other: from its corner 0 to 1.
-        let a = Vec3::from(map.sample(layer, 1, z, 1.0 - z));
-        let b = Vec3::from(map.sample(layer, 2, z, 0.0));
+        let a = Vec3::from(map.sample(layer, 1, front, z, 1.0 - z));
+        let b = Vec3::from(map.sample(layer, 2, front, z, 0.0));
         squares += (a - b).length_squared() as f64;
         sum += (a + b).element_sum() as f64 / 2.0;
     }
@@ -86,10 +87,10 @@ fn both_sides_of_a_seam_agree_and_nothing_else_changes() {
     let mut map = lightmap(&scene(2, floor(), LAMP));
     let off = bake(&mut map, &params(false));
     assert!(off.left_out & left_out::SEAMS != 0 && off.seam_points == 0);
-    let before = [Layer::Direct, Layer::Indirect].map(|l| rms_at_the_seam(&map, l));
+    let before = [Layer::Direct, Layer::Indirect].map(|l| rms_at_the_seam(&map, l, true));
     let plain = bits(&map);
     let stats = bake(&mut map, &params(true));
-    let after = [Layer::Direct, Layer::Indirect].map(|l| rms_at_the_seam(&map, l));
+    let after = [Layer::Direct, Layer::Indirect].map(|l| rms_at_the_seam(&map, l, true));
     println!("{before:?} {after:?} {} {}", stats.seam_rms_before, stats.seam_rms_after);
     assert!(map.plan_text().contains("stitching of 1 edges"), "{}", map.plan_text());
     for (before, after) in before.into_iter().zip(after) {
@@ -225,6 +226,47 @@ fn three_sheets_at_an_edge_and_sheets_that_face_away_stay() {
     let mut walled = floor();
     walled.push(quad(wall, Vec2::new(0.75, 0.75), 0.0));
     assert_eq!(edges(walled), 0);
+}
+
+/// The floor with both its sides over a cellar.
+#[test]
+fn backs_are_stitched_to_the_sides_that_go_on_in_them() {
+    let house = |sides: [u32; 2], turned: bool| {
+        let mut meshes = floor();
+        let cellar = [[-1.0, -1.0], [-1.0, 2.0], [3.0, 2.0], [3.0, -1.0]].map(|[x, z]| Vec3::new(x, -1.5, z));
+        meshes.push(quad(cellar, Vec2::new(0.75, 0.75), 0.0));
+        for (mesh, material) in meshes.iter_mut().zip(sides) {
+            mesh.materials = MeshMaterials::One(material);
+        }
+        if turned {
+            meshes[1].indices.iter_mut().for_each(|t| t.swap(1, 2));
+        }
+        let light = crate::scene::Light::Point { position: Vec3::new(0.9, -0.4, 0.45), intensity: [4.0, 2.0, 1.0] };
+        let scene = scene(2, meshes, light);
+        let desc = LightmapDesc { texels_per_unit: 40.0, page_size: 128, gather_divisor: 2, ..Default::default() };
+        Lightmap::create(&scene, &LightmapDesc { both_sides: true, ..desc }, &Progress::none()).unwrap()
+    };
+    // Pairs of sides by material and winding; backs are true.
+    let pairs = |map: &Lightmap| -> Vec<[bool; 2]> {
+        let progress = Progress::none();
+        let stage = progress.stage("seams", 0.0, 1.0, 1);
+        let job = Job { atlas: &map.atlas, backs: &[], budget: 0, stage: &stage };
+        job.edges().unwrap().iter().map(|e| e.map(|side| job.is_back(side))).collect()
+    };
+    assert_eq!(pairs(&house([1, 1], false)), [[false, false], [true, true]]);
+    assert_eq!(pairs(&house([1, 1], true)), [[false, true], [true, false]]);
+    assert_eq!(pairs(&house([1, 0], false)), [[false, false]]);
+    assert_eq!(pairs(&house([1, 0], true)), [[true, false]]);
+
+    let mut map = house([1, 1], false);
+    bake(&mut map, &params(false));
+    let before = [Layer::Direct, Layer::Indirect].map(|l| rms_at_the_seam(&map, l, false));
+    bake(&mut map, &params(true));
+    let after = [Layer::Direct, Layer::Indirect].map(|l| rms_at_the_seam(&map, l, false));
+    println!("{before:?} {after:?}");
+    for (before, after) in before.into_iter().zip(after) {
+        assert!(before > 0.002 && after < before / 5.0, "{before} {after}");
+    }
 }
 
 fn solve(system: &System, before: &[Vec3A], x: &mut [Vec3A]) {
