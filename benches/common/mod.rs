@@ -9,7 +9,7 @@ use bakelite::bvh::{BuildOptions, BuildQuality};
 use bakelite::sampling::{cosine_around, orthonormal_basis, sobol_2d, uniform, uniform_triangle};
 use bakelite::scene::builtin;
 use bakelite::trace::{Hit, Ray};
-use bakelite::{Device, DeviceOptions, Isa, Progress, Scene, SceneData};
+use bakelite::{Device, DeviceOptions, Isa, Light, Progress, Scene, SceneData};
 use glam::Vec3;
 use std::env;
 use std::f32::consts::TAU;
@@ -26,9 +26,26 @@ pub fn data() -> SceneData {
 
 /// Committed on one thread.
 pub fn commit(isa: Isa, quality: BuildQuality) -> Arc<Scene> {
+    commit_data(data(), isa, quality)
+}
+
+/// The same with a point light in the middle if it has no light.
+pub fn commit_lit(isa: Isa, quality: BuildQuality) -> Arc<Scene> {
+    let mut data = data();
+    if data.lights().is_empty() {
+        let positions = || data.meshes().iter().flat_map(|m| &m.positions);
+        let lower = positions().fold(Vec3::INFINITY, |a, &b| a.min(b));
+        let upper = positions().fold(Vec3::NEG_INFINITY, |a, &b| a.max(b));
+        let light = Light::Point { position: (lower + upper) * 0.5, intensity: [1.0; 3] };
+        data.add_light(light).expect("light");
+    }
+    commit_data(data, isa, quality)
+}
+
+fn commit_data(data: SceneData, isa: Isa, quality: BuildQuality) -> Arc<Scene> {
     let device = Device::new(DeviceOptions { isa: Some(isa), num_threads: 1, ..Default::default() }).expect("device");
     let options = BuildOptions { quality, ..Default::default() };
-    Scene::commit(&device, data(), &options, &Progress::none()).map_err(|e| e.1).expect("commit")
+    Scene::commit(&device, data, &options, &Progress::none()).map_err(|e| e.1).expect("commit")
 }
 
 /// Points a little above random triangles, with unit normals. (Of triangles with an area: thesis 4.1.2.)
