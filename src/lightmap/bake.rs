@@ -20,7 +20,7 @@ use crate::progress::Progress;
 use crate::sampling::{combine, purpose_seed};
 use crate::scene::Scene;
 use crate::trace::offset::too_few_digits;
-use crate::trace::solids::sees_a_back;
+use crate::trace::solids::is_buried;
 use glam::Vec3;
 use rayon::prelude::*;
 use std::ops::Range;
@@ -203,7 +203,6 @@ pub(crate) struct Bake<'a, 'p> {
 /// The gather map after blur and filling.
 struct Indirect {
     irradiance: Vec<Vec3>,
-    valid: Vec<bool>,
     gaps: Gaps,
 }
 
@@ -364,7 +363,7 @@ impl Bake<'_, '_> {
         let rays = needed.len() as u64 * samples.len() as u64 + gaps.rays;
         let bytes = (n * GATHER_BYTES + l.gather.bytes()) as u64;
         stats.gather = StageStats { seconds: start.elapsed().as_secs_f64(), rays, bytes };
-        Ok(Indirect { irradiance, valid, gaps })
+        Ok(Indirect { irradiance, gaps })
     }
 
     /// Which texels of some placements lie in gaps.
@@ -399,12 +398,10 @@ impl Bake<'_, '_> {
                     let receiver = l.receiver(&l.map, backs, sample);
                     state[i] = TexelState::Visible;
                     if let Some(indirect) = indirect {
-                        let mut clear = true;
-                        ind[i] =
-                            l.interpolate(&indirect.irradiance, &indirect.gaps, sample, |s| clear &= indirect.valid[s]);
-                        if !clear && sees_a_back(scene, receiver.origin, receiver.geometric, &mut traced) {
-                            state[i] = TexelState::Hidden;
-                        }
+                        ind[i] = l.interpolate(&indirect.irradiance, &indirect.gaps, sample);
+                    }
+                    if is_buried(scene, receiver.origin, receiver.geometric, &mut traced) {
+                        state[i] = TexelState::Hidden;
                     }
                     if self.plan.runs(left_out::DIRECT) {
                         let seed = combine(seed, sample as u32);

@@ -226,11 +226,13 @@ mod tests {
         let mut mixed = 0;
         for s in 0..atlas.map.len() {
             let (mut around, mut alike) = (0, 0);
-            let shown = atlas.interpolate(&values, &gaps, s, |g| {
+            let (t, placement) = (&atlas.map.texels.samples[s], atlas.map.placement_of(&atlas.charts, s));
+            atlas.gather.bilinear(placement, atlas.charts.local(t.triangle, t.u, t.v), |g, _| {
                 around += 1;
                 alike += u32::from(gaps.are_alike(s, g));
             });
-            let plain = atlas.interpolate(&values, &Gaps::default(), s, |_| ());
+            let shown = atlas.interpolate(&values, &gaps, s);
+            let plain = atlas.interpolate(&values, &Gaps::default(), s);
             let expected =
                 if alike > 0 && alike < around { Vec3::splat(!gaps.map.has(s) as u32 as f32) } else { plain };
             assert!(shown.abs_diff_eq(expected, 1e-6), "{shown} is not {expected}");

@@ -255,22 +255,15 @@ impl Atlas {
     }
 
     /// A gather map's `values` interpolated at a sample of the light map: between those texels around that lie in a
-    /// gap as it does, or do not as it does not. `visit` is told all around.
+    /// gap as it does, or do not as it does not.
     #[inline]
-    pub(crate) fn interpolate(
-        &self,
-        values: &[Vec3],
-        gaps: &Gaps,
-        sample: usize,
-        mut visit: impl FnMut(usize),
-    ) -> Vec3 {
+    pub(crate) fn interpolate(&self, values: &[Vec3], gaps: &Gaps, sample: usize) -> Vec3 {
         let t = &self.map.texels.samples[sample];
         // The gather map has the light map's placements.
         let placement = self.map.placement_of(&self.charts, sample);
         let local = self.charts.local(t.triangle, t.u, t.v);
         let (mut all, mut alike, mut part) = (Vec3::ZERO, Vec3::ZERO, 0.0);
         self.gather.bilinear(placement, local, |s, w| {
-            visit(s);
             all += w * values[s];
             if !gaps.is_empty() && gaps.are_alike(sample, s) {
                 alike += w * values[s];

@@ -426,7 +426,7 @@ impl Display {
     /// Irradiance shown at a sample of the light map; `with_direct` false: indirect light alone.
     pub fn irradiance(&self, map: &BlockMap, gaps: &Gaps, sample: u32, with_direct: bool) -> Vec3 {
         let atlas = &map.atlas;
-        let indirect = atlas.interpolate(&self.shown, gaps, sample as usize, |_| ());
+        let indirect = atlas.interpolate(&self.shown, gaps, sample as usize);
         if !with_direct {
             return indirect;
         }

@@ -10,7 +10,7 @@ use crate::lightmap::gather::{Gathered, ROUND, SampleSet};
 use crate::lightmap::radiance::RadianceMap;
 use crate::sampling::combine;
 use crate::scene::NONE;
-use crate::trace::solids::sees_a_back;
+use crate::trace::solids::is_buried;
 use glam::Vec3;
 use std::sync::Arc;
 use std::sync::atomic::{AtomicBool, AtomicU64, Ordering::Relaxed};
@@ -374,7 +374,7 @@ fn direct_texel(c: &Context, tile: &Tile, x: i32, y: i32, rays: &mut u64) -> Opt
         return None;
     }
     let receiver = a.receiver(&a.map, &c.light.backs, sample as usize);
-    if sees_a_back(&a.scene, receiver.origin, receiver.geometric, rays) {
+    if is_buried(&a.scene, receiver.origin, receiver.geometric, rays) {
         return Some(Vec3::INFINITY);
     }
     Some(c.light.direct.irradiance(&receiver, c.direct_samples, combine(c.direct_seed, sample), rays))
