@@ -120,6 +120,21 @@ fn a_carpet_in_the_cornell_box_ends_with_the_bits_of_a_bake() {
     assert_same_as_bake(&live, &mut lightmap, "carpet");
 }
 
+/// Below a table top of one side one sees its back, but that is no solid: its shadow stays.
+#[test]
+fn below_a_one_sided_sheet_updates_end_with_the_bits_of_a_bake() {
+    let mut data = builtin("cornell").unwrap();
+    let material = data.add_material(Material::default()).unwrap();
+    // Its front faces up.
+    let positions = [[0.1, 0.1], [0.1, 0.25], [0.4, 0.25], [0.4, 0.1]].map(|[x, z]| Vec3::new(x, 0.4, z));
+    let (indices, materials) = (vec![[0, 1, 2], [0, 2, 3]], MeshMaterials::One(material));
+    data.add_mesh(Mesh { positions: positions.into(), indices, materials, ..Default::default() }).unwrap();
+    let mut lightmap = unbaked_of(data, 2, 60.0);
+    let mut live = Live::new(&lightmap, &params(Mode::Position), &Progress::none()).unwrap();
+    assert_eq!(finish(&mut live).finished, 1.0);
+    assert_same_as_bake(&live, &mut lightmap, "one-sided sheet");
+}
+
 /// The Cornell box with a two-sided shelf below its lamp, its back above, and a mat 4 mm over that.
 fn with_shelf(threads: usize, both_sides: bool) -> Lightmap {
     let mut data = builtin("cornell").unwrap();
