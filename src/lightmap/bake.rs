@@ -387,6 +387,7 @@ impl Bake<'_, '_> {
         let rays = AtomicU64::new(0);
         let range = self.range.clone();
         let backs = &light.backs[..];
+        let is_lit = indirect.is_some() || self.plan.runs(left_out::DIRECT);
         scene.device().install(|| {
             let direct = light.direct[range.clone()].par_chunks_mut(BLOCK);
             let indirect_out = light.indirect[range.clone()].par_chunks_mut(BLOCK);
@@ -400,7 +401,7 @@ impl Bake<'_, '_> {
                     if let Some(indirect) = indirect {
                         ind[i] = l.interpolate(&indirect.irradiance, &indirect.gaps, sample);
                     }
-                    if is_buried(scene, receiver.origin, receiver.geometric, &mut traced) {
+                    if is_lit && is_buried(scene, receiver.origin, receiver.geometric, &mut traced) {
                         state[i] = TexelState::Hidden;
                     }
                     if self.plan.runs(left_out::DIRECT) {
