@@ -51,7 +51,8 @@ const PLACES: usize = 64;
 const RAYS: u32 = 4;
 
 /// Per chart with one place, whether its back is baked; empty if no chart has a back. `light` tells how much light a
-/// sample of the radiance map gets (any unit). To be called on the device's threads.
+/// sample of the radiance map gets (any unit). To be called on the device's threads. Its time is in the bake's as a whole,
+/// its rays in no stage.
 pub(crate) fn backs(atlas: &Atlas, light: impl Fn(usize) -> f32 + Sync) -> Vec<bool> {
     let (scene, radiance) = (&atlas.scene, &atlas.radiance);
     if radiance.layout.back_of.is_empty() {
