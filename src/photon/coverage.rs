@@ -84,18 +84,21 @@ impl<'a> Disc<'a> {
 
     /// The part of the photons' light that comes from photons that are seen, by channel.
     fn light(&self, seed: u32, rays: &mut u64) -> Vec3 {
-        let (mut seen, mut all, mut hidden) = (Vec3::ZERO, Vec3::ZERO, 0);
-        let photons = self.map.columns();
+        let (mut seen, mut all, mut looked_at, mut hidden) = (Vec3::ZERO, Vec3::ZERO, 0, 0);
+        let (photons, cylinder) = (self.map.columns(), &self.map.cylinder);
         let vector = |columns: &[&[f32]; 3], i: usize| Vec3::new(columns[0][i], columns[1][i], columns[2][i]);
-        self.map.spread_photons(self.position, self.normal, seed, |n, i, weight| {
+        let grid = &self.map.grid;
+        grid.spread(&grid.search(self.position, self.normal, cylinder), seed, |i| {
+            let Some(weight) = cylinder.weight(&photons, i, self.position, self.normal) else { return true };
             let power = weight * vector(&photons.power, i);
             all += power;
+            looked_at += 1;
             if self.sees(vector(&photons.position, i), vector(&photons.normal, i), rays) {
                 seen += power;
             } else {
                 hidden += 1;
             }
-            n + 1 < if hidden == 0 { FIRST } else { PROBES }
+            looked_at < if hidden == 0 { FIRST } else { PROBES }
         });
         if hidden == 0 { Vec3::ONE } else { seen / all.max(Vec3::splat(f32::MIN_POSITIVE)) }
     }

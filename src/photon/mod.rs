@@ -314,37 +314,6 @@ impl PhotonMap {
         (self.kernel)(&self.grid, &self.cylinder, positions, normals, out);
     }
 
-    /// Calls `visit` with photons of the estimate at a point, spread evenly over those that it looks at, until it returns
-    /// false or has seen all: how many came before, its number, and its weight.
-    fn spread_photons(&self, position: Vec3, normal: Vec3, seed: u32, mut visit: impl FnMut(u32, usize, f32) -> bool) {
-        let search = self.grid.search(position, normal, &self.cylinder);
-        let rows = (search.z.0..search.z.1).flat_map(|z| (search.y.0..search.y.1).map(move |y| (y, z)));
-        let runs: Vec<(usize, usize)> = rows.map(|(y, z)| self.grid.row(&search, y, z)).filter(|r| r.0 < r.1).collect();
-        let total: usize = runs.iter().map(|r| r.1 - r.0).sum();
-        let stride = spreading_stride(total);
-        let mut visited = 0;
-        let mut place = seed as usize % total.max(1);
-        for _ in 0..total {
-            let mut i = place;
-            let run = runs.iter().find(|r| {
-                let inside = i < r.1 - r.0;
-                if !inside {
-                    i -= r.1 - r.0;
-                }
-                inside
-            });
-            place = (place + stride) % total;
-            let Some(run) = run else { continue };
-            let photon = run.0 + i;
-            if let Some(weight) = self.cylinder.weight(&self.columns(), photon, position, normal) {
-                if !visit(visited, photon, weight) {
-                    return;
-                }
-                visited += 1;
-            }
-        }
-    }
-
     /// The stored photons as the kernels see them, without a copy.
     pub fn columns(&self) -> PhotonView<'_> {
         self.grid.photons.view()
@@ -360,18 +329,6 @@ impl PhotonMap {
         // Of two threads that come here at once, one keeps its copy.
         Ok(self.packed.get_or_init(|| packed))
     }
-}
-
-/// A step that visits all of `total` places, wherever it starts, each far from the ones before: near the golden section.
-fn spreading_stride(total: usize) -> usize {
-    let gcd = |mut a: usize, mut b: usize| {
-        while b > 0 {
-            (a, b) = (b, a % b);
-        }
-        a
-    };
-    let golden = (0.618_034 * total as f64) as usize;
-    (golden.max(1)..).find(|&s| gcd(s, total) == 1).unwrap_or(1)
 }
 
 /// The rays that [`PhotonMap::trace`] would trace, in the order of their photons: for measuring
