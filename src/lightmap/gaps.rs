@@ -271,8 +271,11 @@ mod tests {
         let all = atlas.map.layout.placements.len() as u32;
         let gaps = Gaps::find(atlas, 0..all, &[], &progress.stage("gaps", 0.0, 1.0, all.into())).unwrap();
         let behind = |s: &usize| atlas.gather.surface(&atlas.scene, *s).0.abs().max_element() < 0.6;
-        assert!(atlas.gather.samples_of(back).filter(behind).all(|s| gaps.gather.has(s)));
-        assert!(atlas.gather.samples_of(wall).filter(behind).all(|s| !gaps.gather.has(s)));
+        let in_gaps = |placement: u32| {
+            atlas.gather.samples_of(placement).filter(behind).map(|s| gaps.gather.has(s)).collect::<Vec<bool>>()
+        };
+        assert!(in_gaps(back).len() > 10 && in_gaps(back).iter().all(|&gap| gap));
+        assert!(in_gaps(wall).len() > 10 && !in_gaps(wall).contains(&true));
         assert!(atlas.map.samples_of(back).any(|s| gaps.map.has(s)));
         assert!(!atlas.map.samples_of(wall).any(|s| gaps.map.has(s)));
     }
