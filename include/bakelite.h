@@ -896,7 +896,8 @@ typedef struct bk_lightmap_desc {
   // Default: 4.
   uint32_t radiance_divisor;
   // Whether two-sided charts from both sides of which one sees something get a second place for their
-  // backs, which bk_lightmap_mesh_back_uvs tells of. Without one, a chart shows the side that the bake
+  // backs, which bk_lightmap_mesh_back_uvs tells of; the open is something to see where the sun or a
+  // sky shines as the light map is created. Without one, a chart shows the side that the bake
   // chooses. 0: no, any other value: yes. Default: 0.
   uint32_t both_sides;
 } bk_lightmap_desc;

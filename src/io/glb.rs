@@ -318,10 +318,9 @@ fn container(mut json: Vec<u8>, binary: &[u8]) -> Result<Vec<u8>> {
 pub(super) mod tests {
     use super::super::image::encode_png_rgb8;
     use super::*;
-    use crate::bvh::BuildOptions;
-    use crate::device::{Device, DeviceOptions};
+
     use crate::io::tests::{albedos, corners, load_bytes};
-    use crate::progress::Progress;
+
     use crate::scene::{Mesh, MeshMaterials, SceneData};
     use std::sync::Arc;
 
@@ -353,8 +352,7 @@ pub(super) mod tests {
             ..Default::default()
         })
         .unwrap();
-        let device = Device::new(DeviceOptions { num_threads: 1, ..Default::default() }).unwrap();
-        let scene = Scene::commit(&device, data, &BuildOptions::default(), &Progress::none()).map_err(|e| e.1).unwrap();
+        let scene = data.committed();
 
         let low = [[0.0, 0.0], [0.5, 0.0], [0.0, 0.5]];
         let high = [[0.5, 0.0], [0.5, 0.5], [0.0, 0.5]];

@@ -362,19 +362,13 @@ pub(super) fn point_light(light: &Light, receiver: &Receiver) -> Option<(Vec3, V
 mod tests {
     use super::super::polygon;
     use super::*;
-    use crate::bvh::BuildOptions;
-    use crate::progress::Progress;
+
     use crate::sampling::{uniform, uniform_sphere};
     use crate::scene::shapes::MeshBuilder;
     use crate::scene::{Material, SceneData, builtin};
-    use crate::{Device, DeviceOptions};
+
     use glam::DVec3;
     use std::f32::consts::PI;
-
-    fn commit(data: SceneData) -> Arc<Scene> {
-        let device = Device::new(DeviceOptions { num_threads: 1, ..Default::default() }).unwrap();
-        Scene::commit(&device, data, &BuildOptions::default(), &Progress::none()).map_err(|e| e.1).unwrap()
-    }
 
     fn receiver(scene: &Scene, position: Vec3, normal: Vec3) -> Receiver {
         let origin = offset_ray_origin(position, normal, scene);
@@ -390,7 +384,7 @@ mod tests {
         builder.quad(p(-20.0, -20.0), p(20.0, -20.0), p(20.0, 20.0), p(-20.0, 20.0), 0);
         add(&mut data, &mut builder);
         data.add_mesh(builder.finish()).unwrap();
-        commit(data)
+        data.committed()
     }
 
     fn lambert(origin: Vec3, quad: [Vec3; 4]) -> f64 {
@@ -514,7 +508,7 @@ mod tests {
             }
             .unwrap();
         }
-        commit(data)
+        data.committed()
     }
 
     #[test]

@@ -158,17 +158,15 @@ impl Bits {
 #[cfg(test)]
 mod tests {
     use super::*;
-    use crate::bvh::BuildOptions;
-    use crate::device::{Device, DeviceOptions};
+
     use crate::lightmap::{Lightmap, LightmapDesc};
     use crate::progress::Progress;
     use crate::scene::shapes::MeshBuilder;
-    use crate::scene::{Light, Material, Scene, SceneData};
+    use crate::scene::{Light, Material, SceneData};
     use glam::Vec3;
 
     /// A floor from −2 to 2 m, and a sheet 5 mm above it where x < 0.
     fn carpet() -> Lightmap {
-        let device = Device::new(DeviceOptions { num_threads: 2, ..Default::default() }).unwrap();
         let mut data = SceneData::new();
         let m = data.add_material(Material { two_sided: true, ..Default::default() }).unwrap();
         for (right, z) in [(2.0, 0.0), (0.0, 0.005)] {
@@ -178,7 +176,7 @@ mod tests {
             data.add_mesh(builder.finish()).unwrap();
         }
         data.add_light(Light::Directional { direction: -Vec3::Z, irradiance: [1.0; 3], angular_radius: 0.0 }).unwrap();
-        let scene = Scene::commit(&device, data, &BuildOptions::default(), &Progress::none()).map_err(|e| e.1).unwrap();
+        let scene = data.committed();
         let desc = LightmapDesc { texels_per_unit: 20.0, gather_divisor: 4, ..Default::default() };
         Lightmap::create(&scene, &desc, &Progress::none()).unwrap()
     }
@@ -247,7 +245,6 @@ mod tests {
     /// A wall between two rooms, and a poster 5 mm behind a part of it.
     #[test]
     fn a_back_with_a_place_of_its_own_has_gaps_of_its_own() {
-        let device = Device::new(DeviceOptions { num_threads: 2, ..Default::default() }).unwrap();
         let mut data = SceneData::new();
         let m = data.add_material(Material { two_sided: true, ..Default::default() }).unwrap();
         let quad = |size: f32, z: f32| {
@@ -261,7 +258,7 @@ mod tests {
         let mut room = MeshBuilder::new();
         room.box_(Vec3::splat(-2.0), Vec3::splat(2.0), true, m);
         data.add_mesh(room.finish()).unwrap();
-        let scene = Scene::commit(&device, data, &BuildOptions::default(), &Progress::none()).map_err(|e| e.1).unwrap();
+        let scene = data.committed();
         let desc = LightmapDesc { texels_per_unit: 20.0, both_sides: true, ..Default::default() };
         let lightmap = Lightmap::create(&scene, &desc, &Progress::none()).unwrap();
         let atlas = lightmap.atlas();

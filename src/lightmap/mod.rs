@@ -53,7 +53,8 @@ pub struct LightmapDesc {
     /// Light map texels per radiance map texel, along each axis.
     pub radiance_divisor: u32,
     /// Whether two-sided charts from both sides of which one sees something get a second place for their backs
-    /// ([`Lightmap::mesh_back_uvs`]). Without one, a chart shows the side that the bake chooses.
+    /// ([`Lightmap::mesh_back_uvs`]); the open is something to see where the sun or a sky shines as the light map is
+    /// created. Without one, a chart shows the side that the bake chooses.
     pub both_sides: bool,
 }
 

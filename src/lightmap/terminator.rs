@@ -52,16 +52,13 @@ pub(super) fn raised(
 #[cfg(test)]
 mod tests {
     use super::*;
-    use crate::bvh::BuildOptions;
-    use crate::device::{Device, DeviceOptions};
-    use crate::progress::Progress;
+
     use crate::scene::shapes::MeshBuilder;
     use crate::scene::{Material, Mesh, SceneData};
     use std::sync::Arc;
 
     /// A triangle in the plane y = 0, and perhaps another over it.
     fn scene(roof: Option<f32>) -> Arc<Scene> {
-        let device = Device::new(DeviceOptions { num_threads: 1, ..Default::default() }).unwrap();
         let mut data = SceneData::new();
         data.add_material(Material::default()).unwrap();
         data.add_mesh(Mesh { positions: CORNERS.to_vec(), indices: vec![[0, 1, 2]], ..Default::default() }).unwrap();
@@ -71,7 +68,7 @@ mod tests {
             mesh.triangle(a, b, c, 0);
             data.add_mesh(mesh.finish()).unwrap();
         }
-        Scene::commit(&device, data, &BuildOptions::default(), &Progress::none()).map_err(|(_, e)| e).unwrap()
+        data.committed()
     }
 
     const CORNERS: [Vec3; 3] = [Vec3::ZERO, Vec3::Z, Vec3::X];

@@ -227,15 +227,12 @@ impl Drop for Relight {
 #[cfg(test)]
 mod tests {
     use super::*;
-    use crate::bvh::BuildOptions;
-    use crate::scene::{Scene, builtin};
+
+    use crate::scene::builtin;
 
     #[test]
     fn few_photons_turn_no_sides_over() {
-        let device = Device::new(DeviceOptions::default()).unwrap();
-        let source = builtin("cornell").unwrap();
-        let scene =
-            Scene::commit(&device, source, &BuildOptions::default(), &Progress::none()).map_err(|e| e.1).unwrap();
+        let scene = builtin("cornell").unwrap().committed();
         let before = Illumination {
             direct: Arc::new(DirectLight::new(&scene)),
             radiance: Arc::new(vec![Vec3::ZERO; 3]),

@@ -127,17 +127,15 @@ impl LiveCamera {
 #[cfg(test)]
 mod tests {
     use super::*;
-    use crate::bvh::BuildOptions;
-    use crate::device::{Device, DeviceOptions};
+
     use crate::lightmap::{Lightmap, LightmapDesc};
     use crate::progress::Progress;
     use crate::scene::shapes::MeshBuilder;
-    use crate::scene::{Material, Scene, SceneData};
+    use crate::scene::{Material, SceneData};
     use crate::trace::Ray;
 
     #[test]
     fn a_hit_marks_a_block_of_the_side_that_is_seen() {
-        let device = Device::new(DeviceOptions { num_threads: 1, ..Default::default() }).unwrap();
         let mut data = SceneData::new();
         let m = data.add_material(Material { two_sided: true, ..Default::default() }).unwrap();
         let p = |x: f32, y: f32| Vec3::new(x, y, 0.0);
@@ -145,7 +143,7 @@ mod tests {
         builder.quad(p(-1.0, -1.0), p(1.0, -1.0), p(1.0, 1.0), p(-1.0, 1.0), m);
         builder.box_(Vec3::splat(-2.0), Vec3::splat(2.0), true, m);
         data.add_mesh(builder.finish()).unwrap();
-        let scene = Scene::commit(&device, data, &BuildOptions::default(), &Progress::none()).map_err(|e| e.1).unwrap();
+        let scene = data.committed();
         for both_sides in [true, false] {
             let desc = LightmapDesc { texels_per_unit: 16.0, both_sides, ..Default::default() };
             let lightmap = Lightmap::create(&scene, &desc, &Progress::none()).unwrap();

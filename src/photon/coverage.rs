@@ -127,7 +127,6 @@ impl<'a> Disc<'a> {
 mod tests {
     use super::*;
     use crate::photon::PhotonParams;
-    use crate::photon::tests::commit;
     use crate::progress::Progress;
     use crate::scene::shapes::MeshBuilder;
     use crate::scene::{Light, Material, SceneData};
@@ -146,7 +145,7 @@ mod tests {
         data.add_mesh(builder.finish()).unwrap();
         data.add_light(Light::Directional { direction: -Vec3::Z, irradiance: [2.0; 3], angular_radius: 0.0 }).unwrap();
         let params = PhotonParams { photon_count, radius: 0.1, ..Default::default() };
-        PhotonMap::trace(&commit(data), &params, &Progress::none()).unwrap()
+        PhotonMap::trace(&data.committed(), &params, &Progress::none()).unwrap()
     }
 
     fn at(x: f32, y: f32) -> Vec3 {

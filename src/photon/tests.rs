@@ -12,12 +12,8 @@ fn device(num_threads: usize) -> Arc<Device> {
     Device::new(DeviceOptions { num_threads, ..Default::default() }).unwrap()
 }
 
-pub(super) fn commit_on(device: &Arc<Device>, data: SceneData) -> Arc<Scene> {
+fn commit_on(device: &Arc<Device>, data: SceneData) -> Arc<Scene> {
     Scene::commit(device, data, &BuildOptions::default(), &Progress::none()).map_err(|e| e.1).unwrap()
-}
-
-pub(super) fn commit(data: SceneData) -> Arc<Scene> {
-    commit_on(&device(2), data)
 }
 
 fn trace(scene: &Arc<Scene>, params: PhotonParams) -> PhotonMap {
@@ -92,7 +88,7 @@ fn stored_power(map: &PhotonMap) -> [f64; 3] {
 
 #[test]
 fn a_closed_glowing_box_has_the_irradiance_of_a_furnace() {
-    let scene = commit(builtin("furnace").unwrap());
+    let scene = builtin("furnace").unwrap().committed();
     let map = trace(&scene, PhotonParams { photon_count: 300_000, radius: 0.05, ..Default::default() });
     let faces = [
         (Vec3::ZERO, Vec3::X, Vec3::Y, Vec3::Z),
@@ -116,7 +112,7 @@ fn a_closed_glowing_box_has_the_irradiance_of_a_furnace() {
 #[test]
 fn a_point_light_in_a_room_gives_intensity_times_cosine_over_squared_distance() {
     let light = Vec3::new(0.5, 0.4, 0.45);
-    let scene = commit(room(0.6, Vec3::ONE, light));
+    let scene = room(0.6, Vec3::ONE, light).committed();
     let params = PhotonParams { photon_count: 1_000_000, max_bounces: 1, radius: 0.03, ..Default::default() };
     let map = trace(&scene, params);
     for point in [Vec3::new(0.5, 0.5, 0.0), Vec3::new(0.3, 0.0, 0.6), Vec3::new(1.0, 0.7, 0.3)] {
@@ -141,7 +137,7 @@ fn the_sun_gives_a_plane_its_irradiance() {
     data.add_mesh(Mesh { positions, indices: vec![[0, 1, 2], [0, 2, 3]], ..Default::default() }).unwrap();
     let direction = Vec3::new(0.3, 0.5, -0.8);
     data.add_light(Light::Directional { direction, irradiance: [1.0, 5.0, 0.0], angular_radius: 0.0 }).unwrap();
-    let map = trace(&commit(data), PhotonParams { photon_count: 200_000, radius: 0.04, ..Default::default() });
+    let map = trace(&data.committed(), PhotonParams { photon_count: 200_000, radius: 0.04, ..Default::default() });
     let cosine = 0.8 / direction.length() as f64;
     let mean = mean_estimate(&map, &points_on(Vec3::ZERO, Vec3::X, Vec3::Y, 0.05, 400), Vec3::Z);
     assert_close(mean[0], cosine, 0.005);
@@ -164,7 +160,7 @@ fn square_under(add: impl FnOnce(&mut SceneData) -> Light) -> Arc<Scene> {
     data.add_mesh(Mesh { positions, indices: vec![[0, 1, 2], [0, 2, 3]], ..Default::default() }).unwrap();
     let light = add(&mut data);
     data.add_light(light).unwrap();
-    commit(data)
+    data.committed()
 }
 
 #[test]
@@ -213,7 +209,7 @@ fn a_ball_under_a_white_sky_absorbs_what_its_surface_gets() {
         .sum();
     data.add_mesh(mesh).unwrap();
     data.add_light(white_sky(2.0)).unwrap();
-    let map = trace(&commit(data), PhotonParams { photon_count: 300_000, ..Default::default() });
+    let map = trace(&data.committed(), PhotonParams { photon_count: 300_000, ..Default::default() });
     assert_close(map.stats().absorbed_power[0], 0.4 * 2.0 * PI * area, 0.001);
 }
 
@@ -223,7 +219,7 @@ fn a_far_point_light_is_aimed_at_the_scene_and_keeps_its_irradiance() {
     data.add_material(grey(0.0)).unwrap();
     add_box(&mut data, 0, Vec3::ZERO, Vec3::ONE, false);
     data.add_light(Light::Point { position: Vec3::new(0.5, 0.5, 41.0), intensity: [1600.0; 3] }).unwrap();
-    let map = trace(&commit(data), PhotonParams { photon_count: 100_000, radius: 0.06, ..Default::default() });
+    let map = trace(&data.committed(), PhotonParams { photon_count: 100_000, radius: 0.06, ..Default::default() });
     let stats = map.stats();
     assert!(stats.stored > 35_000, "only {} photons of 100,000 reach the box", stats.stored);
     assert_close(stats.emitted_power[0], 4.0 * PI * 1600.0, 1e-9);
@@ -240,7 +236,7 @@ fn a_spot_gives_the_irradiance_of_its_falloff() {
     let (inner, outer) = (0.3, 0.7);
     let (position, direction) = (Vec3::Z * 4.0, -Vec3::Z);
     data.add_light(Light::Spot { position, direction, inner, outer, intensity: [1.0; 3] }).unwrap();
-    let map = trace(&commit(data), PhotonParams { photon_count: 1_000_000, radius: 0.1, ..Default::default() });
+    let map = trace(&data.committed(), PhotonParams { photon_count: 1_000_000, radius: 0.1, ..Default::default() });
     for x in [0.0f32, 1.0, 1.9, 2.4] {
         let cosine = 4.0 / x.hypot(4.0);
         let expected = (Light::spot_falloff(cosine, inner, outer) * cosine.powi(3) / 16.0) as f64;
@@ -263,7 +259,7 @@ fn two_sided_emitters_light_both_sides_with_double_power() {
     let positions = [(0.4, 0.4), (0.6, 0.4), (0.4, 0.6)].map(|(x, y)| Vec3::new(x, y, 0.5)).to_vec();
     let materials = MeshMaterials::One(lamp);
     data.add_mesh(Mesh { positions, indices: vec![[0, 1, 2]], materials, ..Default::default() }).unwrap();
-    let map = trace(&commit(data), PhotonParams { photon_count: 100_000, radius: 0.1, ..Default::default() });
+    let map = trace(&data.committed(), PhotonParams { photon_count: 100_000, radius: 0.1, ..Default::default() });
     assert_close(map.stats().emitted_power[0], 2.0 * PI * 2.0 * 0.02, 1e-5);
     let photons = map.columns();
     let above = photons.position[2].iter().filter(|&&z| z > 0.5).count() as f64;
@@ -275,7 +271,7 @@ fn all_power_emitted_is_absorbed_or_escapes_or_is_cut_off() {
     let mut data = cornell_like();
     // An opening, and a second light of another colour and kind.
     data.add_light(Light::Point { position: Vec3::new(2.0, 3.0, 9.0), intensity: [0.1, 9.0, 2.0] }).unwrap();
-    let scene = commit(data);
+    let scene = data.committed();
     for max_bounces in [0, 1, 3] {
         let params = PhotonParams { photon_count: 200_000, max_bounces, ..Default::default() };
         let s = trace(&scene, params).stats();
@@ -291,7 +287,7 @@ fn all_power_emitted_is_absorbed_or_escapes_or_is_cut_off() {
 #[test]
 fn few_photons_of_long_paths_lose_no_power() {
     for albedo in [0.5, 0.9, 0.999] {
-        let scene = commit(room(albedo, Vec3::ONE, Vec3::new(0.4, 0.5, 0.6)));
+        let scene = room(albedo, Vec3::ONE, Vec3::new(0.4, 0.5, 0.6)).committed();
         let s = trace(&scene, PhotonParams { photon_count: 1_000, ..Default::default() }).stats();
         for c in 0..3 {
             let sum = s.absorbed_power[c] + s.escaped_power[c] + s.truncated_power[c];
@@ -311,7 +307,7 @@ fn the_photons_of_all_lights_carry_exactly_their_power() {
     data.add_light(Light::Directional { direction, irradiance: [2.0, 1.0, 0.5], angular_radius: 0.0 }).unwrap();
     data.add_light(Light::Directional { direction, irradiance: [9.0, 1.0, 0.5], angular_radius: 0.2 }).unwrap();
     data.add_light(white_sky(0.3)).unwrap();
-    let scene = commit(data);
+    let scene = data.committed();
     for count in [1_000, 9_999] {
         let emission = emission::Emission::new(&scene, &scene.lights(), count, 0.37);
         let sum: glam::DVec3 = (0..count).map(|i| emission.emit(i, [0.5; 2], [0.5; 2]).power.as_dvec3()).sum();
@@ -326,7 +322,7 @@ fn a_light_too_faint_for_a_photon_keeps_its_power_in_expectation() {
     let mut data = cornell_like();
     let (position, intensity) = (Vec3::ONE, [0.0, 0.0, 3.0]);
     data.add_light(Light::Point { position, intensity }).unwrap();
-    let scene = commit(data);
+    let scene = data.committed();
     let offsets = 1000;
     let mut blue = 0.0;
     for i in 0..offsets {
@@ -361,7 +357,7 @@ fn the_same_seed_gives_the_same_bits_for_any_number_of_threads() {
 
 #[test]
 fn packed_photons_are_the_columns_row_by_row() {
-    let map = trace(&commit(cornell_like()), PhotonParams { photon_count: 100, ..Default::default() });
+    let map = trace(&cornell_like().committed(), PhotonParams { photon_count: 100, ..Default::default() });
     let (packed, columns) = (map.photons().unwrap(), map.columns());
     assert_eq!(packed.position.len(), columns.len());
     for i in 0..columns.len() {
@@ -374,7 +370,7 @@ fn packed_photons_are_the_columns_row_by_row() {
 
 #[test]
 fn another_seed_gives_other_photons_and_the_same_light() {
-    let scene = commit(cornell_like());
+    let scene = cornell_like().committed();
     let maps = [1, 2].map(|seed| trace(&scene, PhotonParams { photon_count: 100_000, seed, ..Default::default() }));
     assert_ne!(maps[0].columns().position[0][..100], maps[1].columns().position[0][..100]);
     for c in 0..3 {
@@ -388,7 +384,7 @@ fn a_sealed_box_in_a_lit_room_is_exactly_dark_inside() {
     let both = data.add_material(Material { two_sided: true, ..grey(0.9) }).unwrap();
     let (lower, upper) = (Vec3::new(1.1, 1.2, 0.9), Vec3::new(1.9, 1.7, 1.8));
     add_box(&mut data, both, lower, upper, false);
-    let map = trace(&commit(data), PhotonParams { photon_count: 300_000, radius: 0.1, ..Default::default() });
+    let map = trace(&data.committed(), PhotonParams { photon_count: 300_000, radius: 0.1, ..Default::default() });
     assert_eq!(map.stats().escaped_power, [0.0; 3]);
     let v = map.columns();
     let (mut outside, centre) = (0, (lower + upper) * 0.5);
@@ -416,7 +412,7 @@ fn no_light_leaves_a_closed_room_with_sharp_corners() {
     let inside = positions.iter().sum::<Vec3>() / 4.0;
     data.add_mesh(Mesh { positions, indices, ..Default::default() }).unwrap();
     data.add_light(Light::Point { position: inside, intensity: [1.0; 3] }).unwrap();
-    let stats = trace(&commit(data), PhotonParams { photon_count: 100_000, ..Default::default() }).stats();
+    let stats = trace(&data.committed(), PhotonParams { photon_count: 100_000, ..Default::default() }).stats();
     assert!(stats.rays > 1_500_000);
     assert_eq!(stats.escaped_power, [0.0; 3]);
 }
@@ -428,14 +424,14 @@ fn backs_of_one_sided_surfaces_swallow_photons() {
     // Front faces look outwards, the light is inside.
     add_box(&mut data, 0, Vec3::ZERO, Vec3::ONE, false);
     data.add_light(Light::Point { position: Vec3::splat(0.5), intensity: [1.0; 3] }).unwrap();
-    let stats = trace(&commit(data), PhotonParams { photon_count: 1000, ..Default::default() }).stats();
+    let stats = trace(&data.committed(), PhotonParams { photon_count: 1000, ..Default::default() }).stats();
     assert_eq!((stats.stored, stats.rays), (0, 1000));
     assert_close(stats.absorbed_power[0], 4.0 * PI, 1e-6);
 }
 
 #[test]
 fn direct_and_indirect_photons_add_up_to_all() {
-    let scene = commit(cornell_like());
+    let scene = cornell_like().committed();
     let params = PhotonParams { photon_count: 20_000, ..Default::default() };
     let all = trace(&scene, params);
     let direct = trace(&scene, PhotonParams { max_bounces: 1, ..params });
@@ -456,7 +452,7 @@ fn direct_and_indirect_photons_add_up_to_all() {
 #[test]
 fn the_automatic_radius_finds_the_documented_number_of_photons() {
     for photon_count in [3_000, 200_000] {
-        let map = trace(&commit(cornell_like()), PhotonParams { photon_count, ..Default::default() });
+        let map = trace(&cornell_like().committed(), PhotonParams { photon_count, ..Default::default() });
         let (v, r) = (map.columns(), map.radius());
         // Where a random point of the floor, a wall or the block lies.
         let mut found = 0;
@@ -483,7 +479,7 @@ fn the_automatic_radius_finds_the_documented_number_of_photons() {
 
 #[test]
 fn parameters_out_of_range_are_refused_by_name() {
-    let scene = commit(cornell_like());
+    let scene = cornell_like().committed();
     let good = PhotonParams::default();
     for (params, name) in [
         (PhotonParams { photon_count: 0, ..good }, "photon_count is 0"),
@@ -510,10 +506,10 @@ fn a_scene_without_lights_is_an_error_and_dark_lights_make_an_empty_map() {
     data.add_material(grey(0.5)).unwrap();
     add_box(&mut data, 0, Vec3::ZERO, Vec3::ONE, true);
     let params = PhotonParams::default();
-    let error = PhotonMap::trace(&commit(data.clone()), &params, &Progress::none()).err().unwrap();
+    let error = PhotonMap::trace(&data.clone().committed(), &params, &Progress::none()).err().unwrap();
     assert!(matches!(&error, Error::InvalidState(s) if s.contains("the scene has no lights")), "{error}");
     data.add_light(Light::Point { position: Vec3::ONE, intensity: [0.0; 3] }).unwrap();
-    let map = trace(&commit(data), params);
+    let map = trace(&data.committed(), params);
     assert_eq!((map.stats().emitted, map.stats().stored), (0, 0));
     assert!(map.columns().is_empty());
     assert_eq!(map.estimate(Vec3::ZERO, Vec3::Z), [0.0; 3]);
@@ -521,7 +517,7 @@ fn a_scene_without_lights_is_an_error_and_dark_lights_make_an_empty_map() {
 
 #[test]
 fn the_memory_budget_is_kept_and_named() {
-    let scene = commit(cornell_like());
+    let scene = cornell_like().committed();
     let map = trace(&scene, PhotonParams { photon_count: 5_000, ..Default::default() });
     let tight = PhotonParams { photon_count: 5_000, memory_budget: map.bytes() as u64, ..Default::default() };
     let error = PhotonMap::trace(&scene, &tight, &Progress::none()).err().unwrap();
@@ -535,7 +531,7 @@ fn the_memory_budget_is_kept_and_named() {
 /// Not only between them: one block of photons between white walls stores hundreds of megabytes.
 #[test]
 fn the_memory_budget_is_kept_within_a_block() {
-    let scene = commit(room(1.0 - f32::EPSILON, Vec3::ONE, Vec3::splat(0.5)));
+    let scene = room(1.0 - f32::EPSILON, Vec3::ONE, Vec3::splat(0.5)).committed();
     let params = PhotonParams { photon_count: 1_000, memory_budget: 4 << 20, ..Default::default() };
     let refused = PhotonMap::trace(&scene, &params, &Progress::none()).err();
     assert!(matches!(refused, Some(Error::OutOfMemory(_))), "{refused:?}");
@@ -572,7 +568,7 @@ fn all_memory_is_accounted_for_and_given_back() {
 
 #[test]
 fn cancelling_stops_every_stage_and_gives_all_memory_back() {
-    let scene = commit(cornell_like());
+    let scene = cornell_like().committed();
     let before = scene.device().memory().current();
     let params = PhotonParams { photon_count: 20_000, ..Default::default() };
     for stage in ["photons", "photon grid"] {

@@ -133,14 +133,11 @@ mod tests {
     use super::super::shapes::enclosed_volume;
     use super::super::{Mesh, Scene};
     use super::*;
-    use crate::bvh::BuildOptions;
-    use crate::{Device, DeviceOptions, Progress};
+
     use std::sync::Arc;
 
     fn commit(name: &str) -> Arc<Scene> {
-        let device = Device::new(DeviceOptions { num_threads: 1, ..Default::default() }).unwrap();
-        let data = builtin(name).unwrap();
-        Scene::commit(&device, data, &BuildOptions::default(), &Progress::none()).map_err(|(_, e)| e).unwrap()
+        builtin(name).unwrap().committed()
     }
 
     fn assert_volume(mesh: &Mesh, expected: f64) {

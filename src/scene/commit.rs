@@ -596,13 +596,21 @@ fn mesh_bytes(meshes: &[Mesh]) -> usize {
 }
 
 #[cfg(test)]
+impl SceneData {
+    /// The scene on a device of two threads, for tests; it has no error.
+    pub(crate) fn committed(self) -> Arc<Scene> {
+        let device = Device::new(crate::device::DeviceOptions { num_threads: 2, ..Default::default() }).unwrap();
+        Scene::commit(&device, self, &BuildOptions::default(), &Progress::none()).map_err(|e| e.1).unwrap()
+    }
+}
+
+#[cfg(test)]
 mod tests {
     use super::*;
     use crate::device::DeviceOptions;
 
     /// A floor (mesh 0), a lamp over it (mesh 1, emissive), and a triangle that is none (mesh 2).
     fn scene() -> Arc<Scene> {
-        let device = Device::new(DeviceOptions { num_threads: 2, ..Default::default() }).unwrap();
         let mut data = SceneData::new();
         data.add_material(Material::default()).unwrap();
         data.add_material(Material { emission: [2.0; 3], ..Default::default() }).unwrap();
@@ -617,14 +625,13 @@ mod tests {
         data.add_mesh(mesh([FLOOR, FLOOR.map(|c| c + 2.0 * Vec3::Y)].concat(), 0)).unwrap();
         data.add_mesh(mesh(FLOOR.map(|c| c + 3.0 * Vec3::Z).to_vec(), 1)).unwrap();
         data.add_mesh(mesh(vec![Vec3::ZERO; 3], 1)).unwrap();
-        Scene::commit(&device, data, &BuildOptions::default(), &Progress::none()).map_err(|e| e.1).unwrap()
+        data.committed()
     }
 
     const FLOOR: [Vec3; 3] = [Vec3::ZERO, Vec3::X, Vec3::Y];
 
     #[test]
     fn a_texture_is_multiplied_with_the_albedo_which_stays_below_one() {
-        let device = Device::new(DeviceOptions { num_threads: 1, ..Default::default() }).unwrap();
         let mut data = SceneData::new();
         let texture = Texture { width: 1, height: 1, rgba8: vec![[255, 128, 128, 255]] };
         let albedo_texture = data.add_texture(texture).unwrap();
@@ -632,7 +639,7 @@ mod tests {
         let plain = Mesh { positions: FLOOR.to_vec(), indices: vec![[0, 1, 2]], ..Default::default() };
         data.add_mesh(Mesh { uvs: vec![Vec2::ZERO; 3], ..plain.clone() }).unwrap();
         data.add_mesh(plain).unwrap();
-        let scene = Scene::commit(&device, data, &BuildOptions::default(), &Progress::none()).map_err(|e| e.1).unwrap();
+        let scene = data.committed();
         // ((128/255 + 0.055) / 1.055)^2.4.
         let expected = Vec3::new(MAX_ALBEDO, 0.215_861, 0.5 * 0.215_861);
         assert!((scene.albedo(0, 0.2, 0.3) - expected).abs().max_element() < 1e-6);

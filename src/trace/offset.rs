@@ -112,20 +112,17 @@ fn nearest_on_inner_triangle(corners: [DVec3; 3], lengths: [f64; 3], fraction: f
 #[cfg(test)]
 mod tests {
     use super::*;
-    use crate::bvh::BuildOptions;
-    use crate::device::{Device, DeviceOptions};
-    use crate::progress::Progress;
+
     use crate::scene::{Material, Mesh, SceneData};
     use crate::trace::Ray;
     use proptest::prelude::*;
     use std::sync::Arc;
 
     fn one_triangle(corners: [Vec3; 3]) -> Arc<Scene> {
-        let device = Device::new(DeviceOptions { num_threads: 1, ..Default::default() }).unwrap();
         let mut data = SceneData::new();
         data.add_material(Material::default()).unwrap();
         data.add_mesh(Mesh { positions: corners.to_vec(), indices: vec![[0, 1, 2]], ..Default::default() }).unwrap();
-        Scene::commit(&device, data, &BuildOptions::default(), &Progress::none()).map_err(|e| e.1).unwrap()
+        data.committed()
     }
 
     proptest! {

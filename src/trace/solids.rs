@@ -30,16 +30,13 @@ fn sees_a_back(scene: &Scene, origin: Vec3, direction: Vec3, rays: &mut u64) -> 
 #[cfg(test)]
 mod tests {
     use super::*;
-    use crate::bvh::BuildOptions;
-    use crate::device::{Device, DeviceOptions};
-    use crate::progress::Progress;
+
     use crate::scene::shapes::MeshBuilder;
     use crate::scene::{Material, SceneData};
     use std::sync::Arc;
 
     /// A floor at z = 0 and what `add` puts on it, of a material with one side or two.
     fn scene(two_sided: bool, add: impl Fn(&mut MeshBuilder, u32)) -> Arc<Scene> {
-        let device = Device::new(DeviceOptions { num_threads: 1, ..Default::default() }).unwrap();
         let mut data = SceneData::new();
         let m = data.add_material(Material { two_sided, ..Default::default() }).unwrap();
         let mut builder = MeshBuilder::new();
@@ -47,7 +44,7 @@ mod tests {
         builder.quad(p(-9.0, -9.0), p(9.0, -9.0), p(9.0, 9.0), p(-9.0, 9.0), m);
         add(&mut builder, m);
         data.add_mesh(builder.finish()).unwrap();
-        Scene::commit(&device, data, &BuildOptions::default(), &Progress::none()).map_err(|e| e.1).unwrap()
+        data.committed()
     }
 
     fn asked(scene: &Scene, x: f32) -> (bool, u64) {

@@ -8,7 +8,7 @@ use bakelite::lightmap::direct::{DirectLight, Receiver};
 use bakelite::lightmap::{Layer, Lightmap};
 use bakelite::reference::PathTracer;
 use bakelite::sampling::{combine, sobol_2d};
-use bakelite::scene::Camera;
+use bakelite::scene::{Camera, Sky};
 use bakelite::trace::offset::{SurfacePoint, offset_ray_origin};
 use bakelite::trace::{RawHit, Ray};
 use bakelite::{Progress, Result, Scene};
@@ -93,8 +93,8 @@ impl View<'_> {
         })?;
         let composite_seconds = start.elapsed().as_secs_f64();
 
-        let background = background(scene, &self.camera, size);
-        let covered = |i: usize| background[i] == 0.0;
+        let missed = missed(scene, &self.camera, size);
+        let covered = |i: usize| missed[i] == 0.0;
         let exposure = auto_exposure(&reference, covered);
         let rmse = [&reference, &by_shadow_rays, &composite].map(|image| relative_rmse(image, &halves, covered));
         let noise = 0.5 * difference(&halves[0], &halves[1], covered) / mean(&reference, covered);
@@ -105,7 +105,7 @@ impl View<'_> {
             noise,
             exposure,
             width: self.width,
-            background,
+            background: background(scene, missed),
         })
     }
 
@@ -134,6 +134,7 @@ pub fn render(
     irradiance: impl Fn(&Seen) -> Result<Vec3> + Sync,
 ) -> Result<Pixels> {
     let rays = PrimaryRays::new(camera, width, height);
+    let skies = skies(scene);
     let stage = progress.stage(name, 0.0, 1.0, height as u64);
     let mut pixels = vec![[0.0; 3]; width * height];
     let row = |(y, row): (usize, &mut [[f32; 3]])| {
@@ -141,7 +142,7 @@ pub fn render(
             let mut sum = Vec3::ZERO;
             for (k, ray) in rays.of_pixel(x, y).enumerate() {
                 let seed = combine(combine(seed, (y * width + x) as u32), k as u32);
-                sum += radiance(scene, &ray, seed, &irradiance)?;
+                sum += radiance(scene, &skies, &ray, seed, &irradiance)?;
             }
             *pixel = (sum / PRIMARY_RAYS as f32).to_array();
         }
@@ -152,13 +153,24 @@ pub fn render(
 }
 
 /// Part of each pixel where nothing is.
-pub fn background(scene: &Scene, camera: &Camera, [width, height]: [usize; 2]) -> Vec<f32> {
+pub fn missed(scene: &Scene, camera: &Camera, [width, height]: [usize; 2]) -> Vec<f32> {
     let rays = PrimaryRays::new(camera, width, height);
     let part = |i: usize| {
         let misses = rays.of_pixel(i % width, i / width).filter(|r| scene.intersect_raw(r).is_miss());
         misses.count() as f32 / PRIMARY_RAYS as f32
     };
     scene.device().install(|| (0..width * height).into_par_iter().map(part).collect())
+}
+
+/// The skies that shine.
+fn skies(scene: &Scene) -> Vec<Sky> {
+    let skies = scene.lights().iter().filter_map(|light| scene.sky(light)).collect::<Vec<_>>();
+    skies.into_iter().filter(|sky| !sky.is_dark()).collect()
+}
+
+/// Part of each pixel that shows the background, of that where nothing is: none of it where a sky is seen.
+pub fn background(scene: &Scene, missed: Vec<f32>) -> Vec<f32> {
+    if skies(scene).is_empty() { missed } else { vec![0.0; missed.len()] }
 }
 
 /// Linear radiance as sRGB, with the background where nothing is.
@@ -189,10 +201,16 @@ pub fn receiver(scene: &Scene, hit: &RawHit) -> Receiver {
 }
 
 /// Radiance along a primary ray. The backs of one-sided materials are black.
-fn radiance(scene: &Scene, ray: &Ray, seed: u32, irradiance: &impl Fn(&Seen) -> Result<Vec3>) -> Result<Vec3> {
+fn radiance(
+    scene: &Scene,
+    skies: &[Sky],
+    ray: &Ray,
+    seed: u32,
+    irradiance: &impl Fn(&Seen) -> Result<Vec3>,
+) -> Result<Vec3> {
     let hit = scene.intersect_raw(ray);
     if hit.is_miss() {
-        return Ok(Vec3::ZERO);
+        return Ok(skies.iter().map(|sky| sky.at(ray.direction.into()).0).sum());
     }
     let material = scene.material(hit.triangle);
     let mut through = Vec3::ZERO;
@@ -200,7 +218,7 @@ fn radiance(scene: &Scene, ray: &Ray, seed: u32, irradiance: &impl Fn(&Seen) -> 
         let point = SurfacePoint::new(scene.corners(hit.triangle), hit.u, hit.v, scene);
         let onwards = if hit.front { -point.normal } else { point.normal };
         let behind = Ray::new(offset_ray_origin(point.interior, onwards, scene), ray.direction.into());
-        through = Vec3::from(material.transmission) * radiance(scene, &behind, seed, irradiance)?;
+        through = Vec3::from(material.transmission) * radiance(scene, skies, &behind, seed, irradiance)?;
     }
     if !hit.front && !material.two_sided {
         return Ok(through);

@@ -1,7 +1,7 @@
 //! What a camera sees of the light: views of bakes against one that is path traced with the library's
 //! kernels, by structural similarity.
 
-use crate::pictures::{PRIMARY_RAYS, background, receiver, render, tone_mapped};
+use crate::pictures::{PRIMARY_RAYS, background, missed, receiver, render, tone_mapped};
 use crate::ssim::ssim;
 use crate::texel_paths::TexelPaths;
 use bakelite::io::image::auto_exposure;
@@ -55,8 +55,9 @@ impl ViewReference {
         let halves = [half(1)?, half(2)?];
         let mean = |(a, b): (&[f32; 3], &[f32; 3])| std::array::from_fn(|c| 0.5 * (a[c] + b[c]));
         let whole: Vec<[f32; 3]> = halves[0].iter().zip(&halves[1]).map(mean).collect();
-        let background = background(scene, &camera, size);
-        let exposure = auto_exposure(&whole, |i| background[i] == 0.0);
+        let missed = missed(scene, &camera, size);
+        let exposure = auto_exposure(&whole, |i| missed[i] == 0.0);
+        let background = background(scene, missed);
         let [a, b] = halves.map(|half| tone_mapped(&half, &background, exposure));
         Ok(ViewReference {
             camera,
