@@ -44,6 +44,8 @@ pub const BK_LEFT_OUT_SUN_DISC: u32 = 8192;
 pub const BK_LEFT_OUT_MANY_LIGHTS: u32 = 16384;
 /// Bit of left_out. No stitching of seams.
 pub const BK_LEFT_OUT_SEAMS: u32 = 65536;
+/// Bit of left_out. No bright patches of surfaces as lights: gather rays find all that is bright.
+pub const BK_LEFT_OUT_BRIGHT_PATCHES: u32 = 131072;
 
 // The numbers are literal for the header's sake.
 const _: () = assert!(
@@ -62,6 +64,7 @@ const _: () = assert!(
         && BK_LEFT_OUT_SUN_DISC == left_out::SUN_DISC
         && BK_LEFT_OUT_MANY_LIGHTS == left_out::MANY_LIGHTS
         && BK_LEFT_OUT_SEAMS == left_out::SEAMS
+        && BK_LEFT_OUT_BRIGHT_PATCHES == left_out::BRIGHT_PATCHES
 );
 
 /// How to bake.

@@ -1,5 +1,6 @@
 //! The bake: stages in order, each with its share of progress, time and memory.
 
+use super::bright::Bright;
 use super::charts::{Charts, automatic_density};
 use super::direct::DirectLight;
 use super::gaps::Gaps;
@@ -7,7 +8,7 @@ use super::gather::{Gathered, SampleSet};
 use super::layout::Layout;
 use super::map::ChartMap;
 use super::plan::{Plan, left_out};
-use super::radiance::{self, RadianceInput, RadianceMap};
+use super::radiance::{self, Radiance, RadianceInput, RadianceMap};
 use super::seams::Stitch;
 use super::sides;
 use super::texels::TexelMap;
@@ -145,6 +146,7 @@ impl Lightmap {
         let (light, mut stats) = bake.run()?;
         stats.back_charts = light.backs.iter().filter(|&&b| b).count() as u64;
         plan.note_back_charts(stats.back_charts);
+        plan.note_bright(&light.radiance.bright);
         let range = params.texel_begin as usize..end as usize;
         let stitch = self.stitch(&light, &range, params, &mut plan, &mut stats, progress)?;
         stats.left_out = plan.left_out;
@@ -214,7 +216,7 @@ impl Bake<'_, '_> {
         let scene = &self.atlas.scene;
         let mut indirect = None;
         let radiance = self.illuminate(&mut stats)?;
-        let backs = self.backs(&radiance);
+        let backs = self.backs(&radiance.values);
         if self.plan.runs(left_out::INDIRECT) {
             indirect = Some(self.gather(&radiance, &backs, &mut stats)?);
         }
@@ -234,9 +236,9 @@ impl Bake<'_, '_> {
     }
 
     /// The radiance map; empty if the plan leaves indirect light out.
-    pub(crate) fn illuminate(&self, stats: &mut BakeStats) -> Result<Vec<Vec3>> {
+    pub(crate) fn illuminate(&self, stats: &mut BakeStats) -> Result<Radiance> {
         if !self.plan.runs(left_out::INDIRECT) {
-            return Ok(Vec::new());
+            return Ok(Radiance::default());
         }
         let photons = if self.plan.runs(left_out::PHOTONS) { Some(self.photons(stats)?) } else { None };
         self.radiance(photons.as_ref(), stats)
@@ -276,7 +278,7 @@ impl Bake<'_, '_> {
         Ok(map)
     }
 
-    fn radiance(&self, photons: Option<&PhotonMap>, stats: &mut BakeStats) -> Result<Vec<Vec3>> {
+    fn radiance(&self, photons: Option<&PhotonMap>, stats: &mut BakeStats) -> Result<Radiance> {
         let start = Instant::now();
         let l = self.atlas;
         let stage = self.progress.stage("radiance", 0.2, 0.3, l.radiance.len() as u64);
@@ -290,10 +292,11 @@ impl Bake<'_, '_> {
             direct_samples: self.params.direct_samples.div_ceil(RADIANCE_SAMPLE_DIVISOR),
             seed: purpose_seed(self.params.seed, purpose::RADIANCE),
         };
-        let rays = radiance::bake(l.scene.device(), &input, &mut values, &stage)?;
+        let mut rays = radiance::bake(l.scene.device(), &input, &mut values, &stage)?;
+        let bright = l.scene.device().install(|| Bright::new(l, &values, &mut rays))?;
         let bytes = (values.len() * size_of::<Vec3>() + l.radiance.bytes()) as u64;
         stats.radiance = StageStats { seconds: start.elapsed().as_secs_f64(), rays, bytes };
-        Ok(values)
+        Ok(Radiance { values, bright })
     }
 
     /// Per chart with one place, whether its back is baked. With [`illuminate`](Self::illuminate)'s map all that
@@ -312,7 +315,7 @@ impl Bake<'_, '_> {
     }
 
     /// Gathers, blurs and fills. Only placements that the range touches are gathered.
-    fn gather(&self, radiance: &[Vec3], backs: &[bool], stats: &mut BakeStats) -> Result<Indirect> {
+    fn gather(&self, radiance: &Radiance, backs: &[bool], stats: &mut BakeStats) -> Result<Indirect> {
         let start = Instant::now();
         let l = self.atlas;
         let device = l.scene.device();
@@ -330,6 +333,7 @@ impl Bake<'_, '_> {
         let mut normals: Vec<Vec3> = try_vec(n, "the gather map's normals")?;
         let mut variances: Vec<f32> = try_vec(n, "the gather map's variance")?;
         let mut valid: Vec<bool> = try_vec(n, "the gather map's validity")?;
+        let rays = AtomicU64::new(gaps.rays);
         device.install(|| {
             let values = irradiance[needed.clone()].par_chunks_mut(BLOCK);
             let normals = normals[needed.clone()].par_chunks_mut(BLOCK);
@@ -337,16 +341,19 @@ impl Bake<'_, '_> {
             let valid = valid[needed.clone()].par_chunks_mut(BLOCK);
             let blocks = values.zip(normals).zip(variances).zip(valid).enumerate();
             blocks.try_for_each(|(block, (((values, normals), variances), valid))| {
+                let mut traced = 0;
                 for i in 0..values.len() {
                     let sample = needed.start + block * BLOCK + i;
                     let receiver = l.receiver(&l.gather, backs, sample);
                     let mut gathered = Gathered::default();
                     for round in 0..samples.rounds() {
-                        gathered.add_round(&l.scene, &lookup, &receiver, &samples, round, combine(seed, sample as u32));
+                        let seed = combine(seed, sample as u32);
+                        traced += gathered.add_round(&l.scene, &lookup, &receiver, &samples, round, seed);
                     }
                     (values[i], normals[i]) = (gathered.irradiance(), receiver.normal);
                     (variances[i], valid[i]) = (gathered.variance(), gathered.is_visible());
                 }
+                rays.fetch_add(traced, Relaxed);
                 stage.advance(values.len() as u64)
             })
         })?;
@@ -360,9 +367,8 @@ impl Bake<'_, '_> {
             blur::blur(device, &l.charts, &l.gather, texels, radius, &mut blurred, &stage)?;
             irradiance = blurred;
         }
-        let rays = needed.len() as u64 * samples.len() as u64 + gaps.rays;
         let bytes = (n * GATHER_BYTES + l.gather.bytes()) as u64;
-        stats.gather = StageStats { seconds: start.elapsed().as_secs_f64(), rays, bytes };
+        stats.gather = StageStats { seconds: start.elapsed().as_secs_f64(), rays: rays.into_inner(), bytes };
         Ok(Indirect { irradiance, gaps })
     }
 

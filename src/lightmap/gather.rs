@@ -42,10 +42,6 @@ impl SampleSet {
     pub(crate) fn rounds(&self) -> usize {
         self.points.len().div_ceil(ROUND)
     }
-
-    pub(crate) fn len(&self) -> usize {
-        self.points.len()
-    }
 }
 
 /// Bits of two 16-bit numbers interleaved.
@@ -64,7 +60,7 @@ fn morton(x: u32, y: u32) -> u32 {
 pub(crate) struct Gathered {
     /// Sum of the radiance that rays met, W/(m²·sr).
     pub sum: Vec3,
-    /// Rays traced.
+    /// Gather rays traced.
     pub rays: u32,
     /// Of these, how many met the back of a one-sided surface.
     pub backs: u32,
@@ -92,7 +88,7 @@ impl Gathered {
         self.backs as f32 <= MAX_BACK_FACES * self.rays as f32
     }
 
-    /// Adds one round of rays from a receiver; `seed` is the texel's own.
+    /// Adds one round of rays from a receiver; `seed` is the texel's own. Returns the rays traced.
     pub(crate) fn add_round(
         &mut self,
         scene: &Scene,
@@ -101,7 +97,7 @@ impl Gathered {
         samples: &SampleSet,
         round: usize,
         seed: u32,
-    ) {
+    ) -> u64 {
         let points = &samples.points[round * ROUND..samples.points.len().min((round + 1) * ROUND)];
         let shift = [combine(seed, 1), combine(seed, 2)];
         let (tangent, bitangent) = orthonormal_basis(receiver.normal);
@@ -125,7 +121,7 @@ impl Gathered {
                 if d.dot(receiver.geometric) <= 0.0 {
                     continue;
                 }
-                let mut seen = radiance.reflected(hit);
+                let mut seen = radiance.seen(hit);
                 if transmits && scene.material(hit.triangle).transmits() {
                     seen = Some(through(scene, radiance, &Ray::new(receiver.origin, d), &mut crossings));
                 }
@@ -138,9 +134,18 @@ impl Gathered {
                 }
             }
         }
+        let mut rays = points.len() as u64;
+        if radiance.bright().len() > 0 {
+            let seed = combine(seed, 16 + round as u32);
+            let (e, variance) = radiance.bright().irradiance(scene, receiver, seed, &mut rays);
+            let scale = points.len() as f32 / PI;
+            sum += e * scale;
+            squares += variance * scale * scale;
+        }
         self.sum += sum;
         self.squares += squares;
         self.rays += points.len() as u32;
+        rays
     }
 }
 
@@ -150,10 +155,10 @@ fn through(scene: &Scene, radiance: &RadianceMap, ray: &Ray, crossings: &mut Vec
     let behind = scene.intersect_through(ray, crossings);
     let (mut sum, mut part) = (Vec3::ZERO, Vec3::ONE);
     for c in crossings.iter() {
-        sum += part * radiance.reflected(&c.hit).unwrap_or_default();
+        sum += part * radiance.seen(&c.hit).unwrap_or_default();
         part *= Vec3::from(scene.material(c.hit.triangle).transmission);
     }
-    if behind.is_miss() { sum } else { sum + part * radiance.reflected(&behind).unwrap_or_default() }
+    if behind.is_miss() { sum } else { sum + part * radiance.seen(&behind).unwrap_or_default() }
 }
 
 #[cfg(test)]

@@ -135,6 +135,12 @@ impl Layout {
         self.backs.get(chart as usize).copied().filter(|&p| p != NONE)
     }
 
+    /// The placement that shows this very side of a chart, if the layout has one.
+    #[inline]
+    pub fn side(&self, chart: u32, front: bool) -> Option<u32> {
+        if front { Some(chart) } else { self.back(chart) }
+    }
+
     /// The placement that shows a side of a chart: a back without a place of its own shares the front's.
     #[inline]
     pub fn place_of(&self, chart: u32, front: bool) -> u32 {

@@ -145,11 +145,18 @@ impl LightTree {
     /// Over lights whose power is greater than 0.
     pub(super) fn new(lights: &[Bounds]) -> LightTree {
         let mut tree = LightTree { nodes: Vec::with_capacity((2 * lights.len()).saturating_sub(1)) };
-        let mut numbered: Vec<(u32, Bounds)> = (0..).zip(lights.iter().copied()).collect();
+        // Powers as parts of the whole: times squared lengths, those of large scenes would overflow.
+        let whole = lights.iter().map(|l| f64::from(l.power)).sum::<f64>();
+        let part = |l: &Bounds| Bounds { power: (f64::from(l.power) / whole) as f32, ..*l };
+        let mut numbered: Vec<(u32, Bounds)> = (0..).zip(lights.iter().map(part)).collect();
         if !lights.is_empty() {
             tree.build(&mut numbered, 0);
         }
         tree
+    }
+
+    pub(super) fn bytes(&self) -> usize {
+        size_of_val(&self.nodes[..])
     }
 
     fn build(&mut self, lights: &mut [(u32, Bounds)], depth: u32) -> Bounds {

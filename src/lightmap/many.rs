@@ -27,6 +27,32 @@ enum Source {
     /// A point or spot light.
     Point(Light),
     Area(AreaLight),
+    Patch(Patch),
+}
+
+/// A small part of a surface, as a light.
+#[derive(Clone, Copy)]
+pub(super) struct Patch {
+    /// Off the surface.
+    pub position: Vec3,
+    /// On the side that shines.
+    pub normal: Vec3,
+    /// Radiance times area.
+    pub flux: Vec3,
+    /// It only shines on what is further away than this, squared.
+    pub near2: f32,
+}
+
+impl Patch {
+    /// Unoccluded irradiance.
+    fn light(&self, receiver: &Receiver) -> Option<Vec3> {
+        let way = self.position - receiver.origin;
+        let d2 = way.length_squared();
+        // (The square of d2 would overflow in scenes of 1e9 units.)
+        let direction = way / d2.sqrt();
+        let (here, there) = (direction.dot(receiver.normal), -direction.dot(self.normal));
+        (d2 > self.near2 && here > 0.0 && there > 0.0 && receiver.faces(way)).then(|| self.flux * (here * there / d2))
+    }
 }
 
 /// Lights that are sampled.
@@ -51,16 +77,28 @@ impl ManyLights {
         ManyLights { tree: LightTree::new(&bounds), sources }
     }
 
+    /// Of parts of surfaces.
+    pub(super) fn of_patches(patches: Vec<Patch>) -> ManyLights {
+        let sources: Vec<Source> = patches.into_iter().map(Source::Patch).collect();
+        let bounds: Vec<Bounds> = sources.iter().map(bounds).collect();
+        ManyLights { tree: LightTree::new(&bounds), sources }
+    }
+
+    pub(super) fn bytes(&self) -> usize {
+        size_of_val(&self.sources[..]) + self.tree.bytes()
+    }
+
     pub(super) fn len(&self) -> usize {
         self.sources.len()
     }
 
-    /// Pushes up to `n` shadow rays, whose sum is the irradiance without bias.
-    pub(super) fn push(&self, receiver: &Receiver, n: u32, seed: u32, shadow: &mut ShadowRays) {
+    /// Pushes up to `n` shadow rays, whose sum is the irradiance without bias. Returns what it would be with
+    /// nothing in the way, summed over the channels.
+    pub(super) fn push(&self, receiver: &Receiver, n: u32, seed: u32, shadow: &mut ShadowRays) -> f32 {
         let candidates = self.candidates(receiver, n * CANDIDATES, seed);
         let total: f32 = candidates.iter().map(|c| c.light.element_sum()).sum();
         if !(total > 0.0 && total.is_finite()) {
-            return;
+            return 0.0;
         }
         let mut at = sobol_2d(0, combine(seed, 3))[0] - 1.0;
         for c in &candidates {
@@ -75,6 +113,7 @@ impl ManyLights {
                 at -= 1.0;
             }
         }
+        total
     }
 
     fn candidates(&self, receiver: &Receiver, n: u32, seed: u32) -> Vec<Candidate> {
@@ -88,6 +127,11 @@ impl ManyLights {
                 Source::Point(light) => {
                     if let Some((target, light)) = point_light(light, receiver) {
                         candidates.push(Candidate { target, light: light * (share * count as f32) });
+                    }
+                }
+                Source::Patch(patch) => {
+                    if let Some(light) = patch.light(receiver) {
+                        candidates.push(Candidate { target: patch.position, light: light * (share * count as f32) });
                     }
                 }
                 Source::Area(area) => {
@@ -120,6 +164,13 @@ fn bounds(source: &Source) -> Bounds {
             Bounds { power: Vec3::from(intensity).element_sum(), ..everywhere(position) }
         }
         Source::Point(_) => unreachable!("only point and spot lights are made points"),
+        Source::Patch(p) => Bounds {
+            axis: p.normal,
+            spread: 0.0,
+            reach: FRAC_PI_2,
+            power: p.flux.element_sum(),
+            ..everywhere(p.position)
+        },
         Source::Area(a) => {
             let (lower, upper) = a.bounds();
             let spread = if a.two_sided { PI } else { 0.0 };

@@ -7,6 +7,7 @@
 mod area;
 pub(crate) mod bake;
 pub mod blur;
+pub(crate) mod bright;
 pub mod charts;
 pub mod direct;
 mod distant;
@@ -36,6 +37,7 @@ use gaps::Gaps;
 use glam::Vec3;
 use map::ChartMap;
 use plan::Plan;
+use radiance::Radiance;
 pub use read::MeshUvs;
 use std::sync::Arc;
 
@@ -221,7 +223,7 @@ struct Light {
     indirect: Vec<Vec3>,
     state: Vec<TexelState>,
     /// Reflected radiance, by sample of the radiance map. Empty if the bake left it out.
-    radiance: Vec<Vec3>,
+    radiance: Radiance,
     /// Whether a chart with one place shows its back, by chart. Empty if none is two-sided.
     backs: Vec<bool>,
     /// What was stitched, as it was before: stitching starts anew with every bake of some texels.

@@ -1,6 +1,8 @@
 //! The plan of a bake: which stages and features a scene needs, and what is left out and why.
 
+use super::bright::Bright;
 use super::direct::DirectLight;
+use super::gather::ROUND;
 use super::{BakeParams, LightmapInfo};
 use crate::scene::{Light, Scene};
 
@@ -36,6 +38,8 @@ pub mod left_out {
     pub const MANY_LIGHTS: u32 = 1 << 14;
     /// No stitching of seams.
     pub const SEAMS: u32 = 1 << 16;
+    /// No bright patches as lights: gather rays find all that is bright.
+    pub const BRIGHT_PATCHES: u32 = 1 << 17;
 }
 
 /// What a bake of a scene runs.
@@ -186,6 +190,21 @@ impl Plan {
             self.run(&format!(
                 "the backs of {count} two-sided charts, which see further or get more light than their fronts"
             ));
+        }
+    }
+
+    /// Tells of bright patches of surfaces.
+    pub(crate) fn note_bright(&mut self, bright: &Bright) {
+        match bright.len() {
+            0 if !self.runs(left_out::INDIRECT) => self.left_out |= left_out::BRIGHT_PATCHES,
+            0 => {
+                let why = "gather rays find all that is bright";
+                self.leave_out(left_out::BRIGHT_PATCHES, "bright patches as lights", why);
+            }
+            n => {
+                let rays = bright.shadow_rays();
+                self.run(&format!("{n} bright patches as lights, {rays} shadow rays with each {ROUND} gather rays"));
+            }
         }
     }
 

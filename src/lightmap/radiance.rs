@@ -15,6 +15,7 @@
 //! chart (less noise, and light that crosses edges of charts); 4.3e-4, 0.138, 4.2e-2 and 0.22 with radii for 60 photons
 //! each, between a quarter and twice the automatic one.
 
+use super::bright::Bright;
 use super::charts::Charts;
 use super::direct::DirectLight;
 use super::map::ChartMap;
@@ -39,25 +40,48 @@ const BLOCK: usize = 512;
 pub(crate) struct RadianceMap<'a> {
     charts: &'a Charts,
     map: &'a ChartMap,
-    /// Per texel, front sides first; W/(m²·sr).
-    values: &'a [Vec3],
+    radiance: &'a Radiance,
+}
+
+/// Reflected radiance per texel, front sides first; W/(m²·sr).
+#[derive(Default)]
+pub(crate) struct Radiance {
+    pub values: Vec<Vec3>,
+    pub bright: Bright,
 }
 
 impl<'a> RadianceMap<'a> {
-    pub(crate) fn new(charts: &'a Charts, map: &'a ChartMap, values: &'a [Vec3]) -> Self {
-        RadianceMap { charts, map, values }
+    pub(crate) fn new(charts: &'a Charts, map: &'a ChartMap, radiance: &'a Radiance) -> Self {
+        RadianceMap { charts, map, radiance }
     }
 
     /// Reflected radiance towards a ray that hit; `None` on the back of a one-sided surface.
-    #[inline]
     pub(crate) fn reflected(&self, hit: &RawHit) -> Option<Vec3> {
+        self.met(hit).map(|(_, radiance)| radiance)
+    }
+
+    /// What of it a gather ray sees; the rest is that of [`bright`](Self::bright).
+    #[inline]
+    pub(crate) fn seen(&self, hit: &RawHit) -> Option<Vec3> {
+        let (placement, radiance) = self.met(hit)?;
+        Some(self.radiance.bright.seen(radiance, self.map, placement, hit.t))
+    }
+
+    /// Bright patches, of which gather rays do not see all.
+    pub(crate) fn bright(&self) -> &Bright {
+        &self.radiance.bright
+    }
+
+    /// Placement and radiance where a ray hit.
+    #[inline]
+    fn met(&self, hit: &RawHit) -> Option<(u32, Vec3)> {
         let chart = self.charts.chart_of[hit.triangle as usize];
         if chart == NONE {
-            return Some(Vec3::ZERO);
+            return Some((NONE, Vec3::ZERO));
         }
-        let placement = if hit.front { chart } else { self.map.layout.back(chart)? };
+        let placement = self.map.layout.side(chart, hit.front)?;
         let sample = self.map.nearest(placement, self.charts.local(hit.triangle, hit.u, hit.v))?;
-        Some(self.values[sample as usize])
+        Some((placement, self.radiance.values[sample as usize]))
     }
 }
 

@@ -116,7 +116,7 @@ impl Lightmap {
         let t = self.atlas.map.texels.samples[sample];
         let back = self.atlas.is_back(&self.atlas.map, &light.backs, sample);
         let mut l = DirectLight::emitted(&self.atlas.scene, t.triangle, back);
-        if light.radiance.is_empty() {
+        if light.radiance.values.is_empty() {
             let e = light.direct[sample] + light.indirect[sample];
             let a = &self.atlas;
             l += radiance::albedo(&a.scene, &a.charts, &a.map, sample) * e / std::f32::consts::PI;

@@ -289,7 +289,7 @@ impl Live {
             + promotion.bytes()
             + bins.bytes()
             + chooser.bytes()
-            + light.radiance.len() * size_of::<Vec3>()
+            + light.radiance.values.len() * size_of::<Vec3>()
             // Marks, and the queue of what is to be shown.
             + map.tiles.len() * 9;
         let memory = atlas.scene.device().memory().reserve(fixed, "the live state")?;

@@ -12,6 +12,7 @@ use crate::lightmap::bake::Bake;
 use crate::lightmap::direct::DirectLight;
 use crate::lightmap::gaps::Gaps;
 use crate::lightmap::plan::{Plan, left_out};
+use crate::lightmap::radiance::Radiance;
 use crate::lightmap::{Atlas, BakeParams, BakeStats};
 use crate::progress::Progress;
 use glam::Vec3;
@@ -28,7 +29,7 @@ const QUICK_PART: u64 = 16;
 pub(super) struct Illumination {
     pub direct: Arc<DirectLight>,
     /// By sample of the radiance map.
-    pub radiance: Arc<Vec<Vec3>>,
+    pub radiance: Arc<Radiance>,
     /// Per chart with one place, whether its back is shown.
     pub backs: Arc<Vec<bool>>,
     /// On the sides that are shown; none without indirect light.
@@ -42,7 +43,7 @@ pub(super) struct Illumination {
 
 /// Radiance map and sides.
 pub(super) struct Indirect {
-    radiance: Vec<Vec3>,
+    radiance: Radiance,
     /// Which backs are shown, and the gaps there; `None`: as they were.
     sides: Option<(Vec<bool>, Gaps)>,
     has_indirect: bool,
@@ -62,7 +63,7 @@ fn illuminate(
     let radiance = bake.illuminate(&mut BakeStats::default())?;
     let has_indirect = plan.runs(left_out::INDIRECT);
     let sides = if with_sides {
-        let backs = bake.backs(&radiance);
+        let backs = bake.backs(&radiance.values);
         let placements = if has_indirect { atlas.map.layout.placements.len() as u32 } else { 0 };
         let gaps = bake.gaps(&backs, 0..placements)?;
         Some((backs, gaps))
@@ -105,7 +106,8 @@ impl Illumination {
             light.has_indirect = true;
         } else {
             // All went dark: what is there fades to black, on the sides that are shown.
-            light.radiance = Arc::new(vec![Vec3::ZERO; self.radiance.len()]);
+            light.radiance =
+                Arc::new(Radiance { values: vec![Vec3::ZERO; self.radiance.values.len()], ..Default::default() });
         }
         light
     }
@@ -233,18 +235,19 @@ mod tests {
     #[test]
     fn few_photons_turn_no_sides_over() {
         let scene = builtin("cornell").unwrap().committed();
+        let plain = |value: Vec3| Radiance { values: vec![value; 3], ..Default::default() };
         let before = Illumination {
             direct: Arc::new(DirectLight::new(&scene)),
-            radiance: Arc::new(vec![Vec3::ZERO; 3]),
+            radiance: Arc::new(plain(Vec3::ZERO)),
             backs: Arc::new(vec![false, true]),
             gaps: Arc::default(),
             has_indirect: true,
             direct_epoch: 1,
             indirect_epoch: 1,
         };
-        let new = |sides| Indirect { radiance: vec![Vec3::ONE; 3], sides, has_indirect: true };
+        let new = |sides| Indirect { radiance: plain(Vec3::ONE), sides, has_indirect: true };
         let quick = before.renewed(new(None));
-        assert_eq!((quick.direct_epoch, quick.indirect_epoch, quick.radiance[0]), (1, 2, Vec3::ONE));
+        assert_eq!((quick.direct_epoch, quick.indirect_epoch, quick.radiance.values[0]), (1, 2, Vec3::ONE));
         assert_eq!(quick.backs, before.backs);
         let full = quick.renewed(new(Some((vec![true, true], Gaps::default()))));
         assert_eq!((full.direct_epoch, full.indirect_epoch), (2, 3));

@@ -105,7 +105,7 @@ impl Live {
             h.bytes(&n.to_le_bytes());
         }
         h.bytes(format!("{:?}", self.lights).as_bytes());
-        for v in self.context.light.radiance.iter() {
+        for v in self.context.light.radiance.values.iter() {
             v.to_array().iter().for_each(|c| h.bytes(&c.to_bits().to_le_bytes()));
         }
         for tile in &self.context.map.tiles {

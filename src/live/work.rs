@@ -215,9 +215,9 @@ impl Block {
                 let before = self.gathered[i];
                 let round = (before.rays as usize) / ROUND;
                 let seed = combine(c.gather_seed, sample);
-                self.gathered[i].add_round(&atlas.scene, &lookup, &receiver, &c.samples, round, seed);
+                let rays = self.gathered[i].add_round(&atlas.scene, &lookup, &receiver, &c.samples, round, seed);
                 self.note_deviation(&before, i);
-                limit.traced.fetch_add(ROUND as u64, Relaxed);
+                limit.traced.fetch_add(rays, Relaxed);
             }
             self.cursor += 1;
         }
