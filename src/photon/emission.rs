@@ -11,8 +11,10 @@
 //! the faces of the scene's bounding box that it meets, which is the whole of its light that can
 //! reach the scene. Discs and skies shine through discs around the scene's bounding sphere, each
 //! perpendicular to its photon. A point light outside the box's bounding sphere emits into the cone of that
-//! sphere; the rest of its power is counted as escaped without being traced.
+//! sphere; the rest of its power is counted as escaped without being traced. Where in all that photons do more
+//! good, [guides](super::guide) tell.
 
+use super::guide::{Guide, PilotPhoton};
 use super::spot::SpotProfile;
 use crate::sampling::{concentric_disc, cosine_around, orthonormal_basis, uniform_triangle};
 use crate::scene::{Emitter, Light, Scene, Sky};
@@ -84,6 +86,8 @@ pub(super) struct Emission<'a> {
     radius: f32,
     /// First photon of each source, then of each emissive triangle, then the number of photons.
     first: Vec<u64>,
+    /// Of each source.
+    guides: Vec<Option<Guide>>,
     /// Photons per watt (of the mean over the channels).
     photons_per_watt: f64,
     /// Power of all lights, W per channel.
@@ -114,7 +118,8 @@ impl<'a> Emission<'a> {
         first.push(if total > 0.0 { count } else { 0 });
         let (centre, radius) = sphere_of_scene(scene);
         let power = aimed + unaimed;
-        Emission { scene, sources, skies, centre, radius, first, photons_per_watt, power, unaimed }
+        let guides = vec![None; sources.len()];
+        Emission { scene, sources, skies, centre, radius, first, guides, photons_per_watt, power, unaimed }
     }
 
     /// Photons to emit: the count asked for, or 0 if no light has any power.
@@ -135,11 +140,45 @@ impl<'a> Emission<'a> {
         (light, power / share)
     }
 
+    /// The source that a pilot photon comes from, and its place in the square that a guide divides; `None` for lights
+    /// with an area.
+    pub(super) fn guidable(&self, index: u64, p: [f32; 2], d: [f32; 2]) -> Option<(usize, [f32; 2])> {
+        let (light, _) = self.light_of(index);
+        match self.sources.get(light)?.shape {
+            Shape::Cone { .. } | Shape::Spot { .. } => Some((light, d)),
+            Shape::Beam { .. } | Shape::Disc { .. } | Shape::Sky(_) => Some((light, p)),
+            Shape::Rect { .. } => None,
+        }
+    }
+
+    /// Whether any light could have a guide.
+    pub(super) fn can_be_guided(&self) -> bool {
+        self.sources.iter().any(|s| !matches!(s.shape, Shape::Rect { .. }))
+    }
+
+    /// From now on guided by pilot photons, each with its source.
+    pub(super) fn guide(&mut self, pilot: impl Iterator<Item = (usize, PilotPhoton)>) {
+        let mut of_source = vec![Vec::new(); self.sources.len()];
+        pilot.for_each(|(source, photon)| of_source[source].push(photon));
+        self.guides = of_source.iter().map(|photons| Guide::new(photons)).collect();
+    }
+
     /// Photon `index`, its position on the light chosen by `p` and its direction by `d`, both
     /// uniform in the unit square.
     pub(super) fn emit(&self, index: u64, p: [f32; 2], d: [f32; 2]) -> Emitted {
         let (light, power) = self.light_of(index);
         let mut power = power.as_vec3();
+        let (mut p, mut d) = (p, d);
+        if let Some(guide) = self.guides.get(light).and_then(Option::as_ref) {
+            let square = if matches!(self.sources[light].shape, Shape::Cone { .. } | Shape::Spot { .. }) {
+                &mut d
+            } else {
+                &mut p
+            };
+            let (place, density) = guide.place(*square);
+            *square = place;
+            power /= density;
+        }
         let (origin, direction) = match self.sources.get(light) {
             Some(Source { shape: Shape::Sky(sky), .. }) => {
                 let (from, tint) = self.sky_direction(&self.skies[*sky], d);

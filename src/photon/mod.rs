@@ -15,6 +15,7 @@ pub(crate) mod coverage;
 mod emission;
 mod estimate;
 mod grid;
+mod guide;
 mod radius;
 mod spot;
 mod trace;

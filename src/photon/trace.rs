@@ -7,6 +7,7 @@
 //! and its bounce, and blocks are kept in order, so threads make no difference.
 
 use super::emission::Emission;
+use super::guide::PilotPhoton;
 use super::{PATH_LIMIT, PhotonParams, PhotonStats};
 use crate::error::{Error, Result};
 use crate::memory::{MemoryMonitor, Reservation};
@@ -27,6 +28,18 @@ const MEMORY_STEP: usize = 16 << 20;
 
 /// The same within a block, as its photons are stored.
 const BLOCK_STEP: usize = 1 << 20;
+
+/// A pilot of one photon in so many tells where to send the others.
+const PILOT_PART: u64 = 16;
+
+/// They have other random numbers.
+const PILOT: u64 = u64::from_be_bytes(*b"phopilot");
+
+/// Pilot photons, at most.
+const MAX_PILOT: u64 = 1 << 16;
+
+/// A pilot photon and its source.
+type Guidable = (usize, PilotPhoton);
 
 /// What photon random numbers are drawn for.
 const PURPOSE: u32 = u32::from_be_bytes(*b"phot");
@@ -66,14 +79,14 @@ pub(super) fn trace(
     progress: &Progress,
     (from, to): (f32, f32),
 ) -> Result<Traced> {
-    let tracer = Tracer::new(scene, lights, params);
+    let tracer = Tracer::guided(scene, lights, params)?;
     let count = tracer.emission.count();
     let stage = progress.stage("photons", from, to, count.div_ceil(BLOCK));
     let memory = Account::new(scene.device().memory().clone(), params.memory_budget);
     let results: Vec<(Vec<StoredPhoton>, Tally)> = (0..count.div_ceil(BLOCK))
         .into_par_iter()
         .map(|block| {
-            let result = tracer.block(block, Some((&stage, &memory)), None)?;
+            let result = tracer.block(block, Some((&stage, &memory)), |_, _, _| ())?;
             stage.advance(1)?;
             Ok(result)
         })
@@ -88,7 +101,7 @@ pub(super) fn trace(
     let stats = PhotonStats {
         emitted: count,
         stored: blocks.iter().map(|b| b.len() as u64).sum(),
-        rays: tally.rays,
+        rays: tally.rays + tracer.pilot_rays,
         emitted_power: tracer.emission.power.to_array(),
         absorbed_power: tally.absorbed.to_array(),
         escaped_power: (tally.escaped + tracer.emission.unaimed).to_array(),
@@ -100,10 +113,10 @@ pub(super) fn trace(
 
 /// The rays of all paths.
 pub(super) fn record_rays(scene: &Arc<Scene>, lights: &[Light], params: &PhotonParams) -> Result<Vec<Ray>> {
-    let tracer = Tracer::new(scene, lights, params);
+    let tracer = Tracer::guided(scene, lights, params)?;
     let mut rays = Vec::new();
     for block in 0..tracer.emission.count().div_ceil(BLOCK) {
-        tracer.block(block, None, Some(&mut rays))?;
+        tracer.block(block, None, |_, traced, _| rays.extend_from_slice(traced))?;
     }
     Ok(rays)
 }
@@ -161,6 +174,8 @@ struct Tracer<'a> {
     /// Most surface interactions per path, passages through sheets not counted.
     limit: u32,
     store_direct: bool,
+    /// Rays that it took to find guides.
+    pilot_rays: u64,
 }
 
 impl<'a> Tracer<'a> {
@@ -168,15 +183,52 @@ impl<'a> Tracer<'a> {
         let seed = purpose_seed(params.seed, PURPOSE);
         let emission = Emission::new(scene, lights, params.photon_count, uniform(0, ALLOTMENT, seed));
         let limit = if params.max_bounces == 0 { PATH_LIMIT } else { params.max_bounces.min(PATH_LIMIT) };
-        Tracer { scene, emission, seed, limit, store_direct: params.store_direct }
+        Tracer { scene, emission, seed, limit, store_direct: params.store_direct, pilot_rays: 0 }
     }
 
-    /// Traces one block of photons; `watch` may cancel and counts the memory; `record` gets the rays.
+    /// The same with guides, if there are photons enough to find any.
+    fn guided(scene: &'a Scene, lights: &[Light], params: &PhotonParams) -> Result<Self> {
+        let count = (params.photon_count / PILOT_PART).min(MAX_PILOT);
+        let mut tracer = Tracer::new(scene, lights, params);
+        if count < BLOCK || !tracer.emission.can_be_guided() {
+            return Ok(tracer);
+        }
+        let params = PhotonParams { photon_count: count, seed: params.seed ^ PILOT, ..*params };
+        let pilot = Tracer::new(scene, lights, &params);
+        let blocks =
+            (0..pilot.emission.count().div_ceil(BLOCK)).into_par_iter().map(|block| pilot.left_by_block(block));
+        let blocks: Vec<(Vec<Guidable>, u64)> = blocks.collect::<Result<_>>()?;
+        tracer.pilot_rays = blocks.iter().map(|b| b.1).sum();
+        tracer.emission.guide(blocks.into_iter().flat_map(|b| b.0));
+        Ok(tracer)
+    }
+
+    /// The photons of a block that can be guided, with how many they left on surfaces but where they ended; and the rays
+    /// traced.
+    fn left_by_block(&self, block: u64) -> Result<(Vec<Guidable>, u64)> {
+        let mut left = [0; BLOCK as usize];
+        let (_, tally) = self.block(block, None, |step, _, paths| {
+            // What goes on from a surface after the first was left on it.
+            if step >= 2 {
+                paths.iter().for_each(|p| left[(u64::from(p.photon) - block * BLOCK) as usize] += 1);
+            }
+        })?;
+        let photons = (block * BLOCK..self.emission.count()).zip(left);
+        let guidable = photons.filter_map(|(photon, left)| {
+            let at = |dimension| sobol_2d(photon as u32, combine(self.seed, dimension));
+            let (source, place) = self.emission.guidable(photon, at(EMIT_POSITION), at(EMIT_DIRECTION))?;
+            Some((source, PilotPhoton { place, left }))
+        });
+        Ok((guidable.collect(), tally.rays))
+    }
+
+    /// Traces one block of photons; `watch` may cancel and counts the memory; `see` gets the number, the rays and the
+    /// paths of each wave.
     fn block(
         &self,
         block: u64,
         watch: Option<(&Stage, &Account)>,
-        mut record: Option<&mut Vec<Ray>>,
+        mut see: impl FnMut(u32, &[Ray], &[Path]),
     ) -> Result<(Vec<StoredPhoton>, Tally)> {
         let numbers = block * BLOCK..((block + 1) * BLOCK).min(self.emission.count());
         let mut rays = Vec::with_capacity(BLOCK as usize);
@@ -205,9 +257,7 @@ impl<'a> Tracer<'a> {
                     announced = bytes;
                 }
             }
-            if let Some(record) = record.as_deref_mut() {
-                record.extend_from_slice(&rays);
-            }
+            see(step, &rays, &paths);
             self.scene.intersect_block(&rays, &mut hits);
             tally.rays += rays.len() as u64;
             stored.try_reserve(rays.len()).map_err(|e| Error::OutOfMemory(format!("the photons being traced: {e}")))?;
@@ -377,5 +427,75 @@ impl Account {
             )));
         }
         Ok(())
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use crate::scene::shapes::MeshBuilder;
+    use crate::scene::{Material, SceneData};
+
+    /// A hall on a field, with a hole in its roof, under `light`.
+    fn hall(light: Light) -> Arc<Scene> {
+        let mut data = SceneData::new();
+        let m = data.add_material(Material { albedo: [0.7; 3], two_sided: true, ..Default::default() }).unwrap();
+        let mut builder = MeshBuilder::new();
+        let p = Vec3::new;
+        builder.quad(p(-10.0, 0.0, -10.0), p(-10.0, 0.0, 10.0), p(10.0, 0.0, 10.0), p(10.0, 0.0, -10.0), m);
+        let corners = [p(-4.0, 0.0, -4.0), p(4.0, 0.0, -4.0), p(4.0, 0.0, 4.0), p(-4.0, 0.0, 4.0)];
+        for (i, &a) in corners.iter().enumerate() {
+            let b = corners[(i + 1) % 4];
+            builder.quad(a, b, b + Vec3::Y * 3.0, a + Vec3::Y * 3.0, m);
+        }
+        for [x0, z0, x1, z1] in
+            [[-4.0, -4.0, 4.0, 0.0], [-4.0, 1.0, 4.0, 4.0], [-4.0, 0.0, 0.0, 1.0], [1.0, 0.0, 4.0, 1.0]]
+        {
+            builder.quad(p(x0, 3.0, z0), p(x0, 3.0, z1), p(x1, 3.0, z1), p(x1, 3.0, z0), m);
+        }
+        data.add_mesh(builder.finish()).unwrap();
+        data.add_light(light).unwrap();
+        data.committed()
+    }
+
+    #[test]
+    fn guided_photons_bring_the_same_light_to_the_same_places_in_larger_number() {
+        let position = Vec3::new(3.0, 60.0, 2.0);
+        let direction = Vec3::new(-0.1, -1.0, 0.05).normalize();
+        let (color, up) = ([3.0, 2.0, 1.0], Vec3::Y);
+        let lights = [
+            Light::Point { position, intensity: color },
+            Light::Spot { position, direction: -Vec3::Y, inner: 0.1, outer: 0.3, intensity: color },
+            Light::Directional { direction, irradiance: color, angular_radius: 0.0 },
+            Light::Directional { direction, irradiance: color, angular_radius: 0.05 },
+            Light::Sky { radiance: color, environment: NONE, up, rotation: 0.0 },
+        ];
+        for light in lights {
+            let scene = hall(light);
+            let params = PhotonParams { photon_count: 1 << 19, ..Default::default() };
+            // Photons in the hall; red power there, and on all.
+            let sums = |tracer: Tracer| {
+                let (mut inside, mut red, mut all, mut emitted) = (0, 0.0, 0.0, 0.0);
+                for block in 0..tracer.emission.count().div_ceil(BLOCK) {
+                    let (stored, tally) = tracer.block(block, None, |_, _, _| ()).unwrap();
+                    emitted += (tally.absorbed + tally.escaped + tally.truncated).x;
+                    for p in stored {
+                        all += f64::from(p.power.x);
+                        // On the floor: walls and roof have an outside.
+                        if p.position.y < 0.1 && p.position.x.abs().max(p.position.z.abs()) < 3.9 {
+                            inside += 1;
+                            red += f64::from(p.power.x);
+                        }
+                    }
+                }
+                (inside, red, all, emitted)
+            };
+            let plain = sums(Tracer::new(&scene, &[light], &params));
+            let guided = sums(Tracer::guided(&scene, &[light], &params).unwrap());
+            assert!(guided.0 > 2 * plain.0, "{light:?}: {} {}", guided.0, plain.0);
+            assert!((guided.1 / plain.1 - 1.0).abs() < 0.03, "{light:?}: {} {}", guided.1, plain.1);
+            assert!((guided.2 / plain.2 - 1.0).abs() < 0.02, "{light:?}: {} {}", guided.2, plain.2);
+            assert!((guided.3 / plain.3 - 1.0).abs() < 1e-3, "{light:?}: {} {}", guided.3, plain.3);
+        }
     }
 }
