@@ -10,8 +10,8 @@
 //!
 //! Of 10⁶ photons of a lamp 60 units above Sponza and San Miguel, 102,000 are stored instead of 14,600 and 14,100. Relative
 //! MSE of indirect light in Sponza without the worst hundredth of 300 points 4.5e-2 -> 3.1e-2, without three hundredths
-//! 2.9e-2 -> 1.8e-2 (4 seeds); of Sponza by two lamps, without a hundredth, 2.7e-3 -> 2.0e-3. The photons take 0.13 to 0.34 s
-//! in San Miguel, the radiance map 2.1 to 1.4 s.
+//! 2.9e-2 -> 1.8e-2 (4 seeds; with [`LEAST`] 0.2 instead of 0.5 3.3e-2 and 2.0e-2). The photons take 0.13 -> 0.34 s in San
+//! Miguel, the radiance map 2.1 -> 1.4 s.
 
 /// Pilot photons per cell, at least.
 const PER_CELL: usize = 32;

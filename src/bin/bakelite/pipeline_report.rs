@@ -130,7 +130,7 @@ fn energy(scene: &Arc<Scene>, photon_count: u64) -> Result<PhotonStats> {
 
 fn energy_table(all: &[PhotonStats]) -> String {
     let mut out = String::from(
-        "\n## Power\n\nMean of the channels. The rest is the sampling error of Russian roulette.\n\n\
+        "\n## Power\n\nMean of the channels. The rest is the sampling error of Russian roulette and of guides.\n\n\
          | photons | emitted, W | absorbed | escaped | cut off | rest |\n|---|---|---|---|---|---|\n",
     );
     for s in all {
