@@ -1,4 +1,4 @@
-//! Texels in gaps narrower than themselves.
+//! Texels in gaps narrower than themselves, and what else interpolation of the gather map heeds.
 //!
 //! The light behind a picture frame, below a skirting board or between a carpet and the floor is not that of the
 //! wall and the floor beside it, and a gather texel there may be as wide as the gap is deep. Interpolated as they
@@ -14,6 +14,7 @@
 
 use super::Atlas;
 use super::map::ChartMap;
+use super::walls;
 use crate::error::Result;
 use crate::memory::{Reservation, try_vec};
 use crate::progress::Stage;
@@ -30,11 +31,15 @@ const PROBES: u32 = 16;
 const AWAY: u32 = 2;
 
 /// Which gather texels lie in gaps, and which texels of the light map do that interpolate between some that do and
-/// some that do not.
+/// some that do not; and which lie behind [walls](super::walls).
 #[derive(Default)]
 pub(crate) struct Gaps {
     gather: Bits,
     map: Bits,
+    /// Texels of the light map of which `walls` tells.
+    walled: Bits,
+    /// A texel of the light map and one of the gather map that it does not see, in ascending order.
+    walls: Vec<(u32, u32)>,
     /// Rays that it took.
     pub rays: u64,
     _memory: Option<Reservation>,
@@ -54,8 +59,11 @@ impl Gaps {
             device.install(|| placements.into_par_iter().map(of_placement).collect::<Result<_>>())?;
         let gather = Bits::new(found.iter().flat_map(|f| &f.gather), atlas.gather.len())?;
         let map = Bits::new(found.iter().flat_map(|f| &f.map), atlas.map.len())?;
-        let memory = device.memory().reserve(gather.bytes() + map.bytes(), "the texels in gaps")?;
-        Ok(Gaps { gather, map, rays: search.rays.into_inner(), _memory: Some(memory) })
+        let walls: Vec<(u32, u32)> = found.iter().flat_map(|f| &f.walls).copied().collect();
+        let walled = Bits::new(walls.iter().map(|(sample, _)| sample), atlas.map.len())?;
+        let bytes = gather.bytes() + map.bytes() + walled.bytes() + size_of_val(&walls[..]);
+        let memory = device.memory().reserve(bytes, "the texels in gaps")?;
+        Ok(Gaps { gather, map, walled, walls, rays: search.rays.into_inner(), _memory: Some(memory) })
     }
 
     /// Whether a texel of the light map and one of the gather map both lie in gaps, or neither.
@@ -64,10 +72,16 @@ impl Gaps {
         self.map.has(map) == self.gather.has(gather)
     }
 
-    /// Whether there are none.
+    /// Whether a wall stands between a texel of the light map and one of the gather map, if it sees any other.
+    #[inline]
+    pub(crate) fn are_apart(&self, map: usize, gather: usize) -> bool {
+        self.walled.has(map) && self.walls.binary_search(&(map as u32, gather as u32)).is_ok()
+    }
+
+    /// Whether there are none, nor walls.
     #[inline]
     pub(crate) fn is_empty(&self) -> bool {
-        self.gather.words.is_empty()
+        self.gather.words.is_empty() && self.walls.is_empty()
     }
 }
 
@@ -76,6 +90,7 @@ impl Gaps {
 struct InGaps {
     gather: Vec<u32>,
     map: Vec<u32>,
+    walls: Vec<(u32, u32)>,
 }
 
 struct Search<'a> {
@@ -107,6 +122,7 @@ impl Search<'_> {
             let candidates = map.samples_of(placement).filter(is_between);
             found.map = candidates.filter(|&s| self.is_in_gap(map, s, texel, &mut rays)).map(|s| s as u32).collect();
         }
+        found.walls = walls::between(self.atlas, placement, self.backs, &mut rays);
         self.rays.fetch_add(rays, Relaxed);
         found
     }
@@ -239,7 +255,7 @@ mod tests {
         assert!(mixed > 100, "{mixed} texels between light and dark");
         // Without gaps nothing is held.
         let none = Gaps::find(atlas, 1..1, &[], &progress.stage("gaps", 0.0, 1.0, 0)).unwrap();
-        assert!(none.is_empty() && none.gather.bytes() + none.map.bytes() == 0);
+        assert!(none.is_empty() && none.gather.bytes() + none.map.bytes() + none.walled.bytes() == 0);
     }
 
     /// A wall between two rooms, and a poster 5 mm behind a part of it.

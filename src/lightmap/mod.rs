@@ -27,6 +27,7 @@ mod spherical;
 mod terminator;
 pub mod texels;
 mod unwrap;
+mod walls;
 
 use crate::error::{Result, invalid_argument};
 use crate::memory::Reservation;
@@ -258,22 +259,30 @@ impl Atlas {
     }
 
     /// A gather map's `values` interpolated at a sample of the light map: between those texels around that lie in a
-    /// gap as it does, or do not as it does not.
+    /// gap as it does, or do not as it does not, and behind no wall.
     #[inline]
     pub(crate) fn interpolate(&self, values: &[Vec3], gaps: &Gaps, sample: usize) -> Vec3 {
         let t = &self.map.texels.samples[sample];
         // The gather map has the light map's placements.
         let placement = self.map.placement_of(&self.charts, sample);
         let local = self.charts.local(t.triangle, t.u, t.v);
-        let (mut all, mut alike, mut part) = (Vec3::ZERO, Vec3::ZERO, 0.0);
+        let mut all = Vec3::ZERO;
+        if gaps.is_empty() {
+            self.gather.bilinear(placement, local, |s, w| all += w * values[s]);
+            return all;
+        }
+        let (mut seen, mut alike) = ((Vec3::ZERO, 0.0), (Vec3::ZERO, 0.0));
         self.gather.bilinear(placement, local, |s, w| {
             all += w * values[s];
-            if !gaps.is_empty() && gaps.are_alike(sample, s) {
-                alike += w * values[s];
-                part += w;
+            if !gaps.are_apart(sample, s) {
+                seen = (seen.0 + w * values[s], seen.1 + w);
+                if gaps.are_alike(sample, s) {
+                    alike = (alike.0 + w * values[s], alike.1 + w);
+                }
             }
         });
-        if part > 0.0 && part < 1.0 { alike / part } else { all }
+        let (sum, part) = if alike.1 > 0.0 { alike } else { seen };
+        if part > 0.0 && part < 1.0 { sum / part } else { all }
     }
 }
 

@@ -1,0 +1,119 @@
+//! Texels of the gather map behind walls.
+//!
+//! Where a wall stands on a floor, a texel of the light map may lie on one side of it and some of the gather texels that
+//! it interpolates between on the other. Those that it does not see from a little above the surface are left out, as long
+//! as it sees any. (As probes behind walls are left out in Majercik, Guertin, Nowrouzezahrai and McGuire, *Dynamic Diffuse
+//! Global Illumination with Ray-Traced Irradiance Fields*, 2019.)
+//!
+//! Living room, 20 texels/m: mean squared relative error of all but the worst hundredth of 300 points 4.0e-3 instead of
+//! 1.1e-2, of all but three hundredths 2.1e-3 instead of 4.1e-3. Seen from a quarter of a texel above, not an eighth, the
+//! same, from half a texel 6.3e-3, from 0.03 texels 6.6e-3. A texel that sees none would need gather rays of its own.
+
+use super::Atlas;
+use crate::scene::NONE;
+use crate::trace::Ray;
+use glam::Vec3;
+use std::collections::HashMap;
+
+/// Texels look at one another from so many texels of the gather map above the surface.
+const ABOVE: f32 = 0.125;
+
+/// The pairs of texels of a placement in the light map and in the gather map that interpolation would join through a
+/// wall, on the side that `backs` tells of, in ascending order. Adds the rays traced to `rays`.
+pub(super) fn between(atlas: &Atlas, placement: u32, backs: &[bool], rays: &mut u64) -> Vec<(u32, u32)> {
+    let (gather, map, charts) = (&atlas.gather, &atlas.map, &atlas.charts);
+    let scale = gather.layout.placements[placement as usize].scale;
+    let above = ABOVE / scale[0].min(scale[1]);
+    let eye = |map, sample: usize| -> Vec3 {
+        let receiver = atlas.receiver(map, backs, sample);
+        receiver.origin + receiver.geometric * above
+    };
+    let own = gather.samples_of(placement);
+    let eyes: Vec<Vec3> = own.clone().map(|s| eye(gather, s)).collect();
+    let eye_of = |s: u32| {
+        let s = s as usize;
+        if own.contains(&s) { eyes[s - own.start] } else { eye(gather, s) }
+    };
+    let mut blocked = |from: Vec3, to: Vec3| {
+        *rays += 1;
+        atlas.scene.occluded(&Ray::new(from, to - from).within(0.0, 1.0))
+    };
+    let mut split: HashMap<[u32; 4], bool> = HashMap::new();
+    let mut found = Vec::new();
+    for sample in map.samples_of(placement) {
+        let t = &map.texels.samples[sample];
+        let (mut around, mut n) = ([NONE; 4], 0);
+        gather.bilinear(placement, charts.local(t.triangle, t.u, t.v), |s, _| {
+            around[n] = s as u32;
+            n += 1;
+        });
+        around[..n].sort_unstable();
+        // Most are around many texels, and see one another.
+        let is_split = *split.entry(around).or_insert_with(|| {
+            let pairs = (1..n).flat_map(|i| (0..i).map(move |j| (i, j)));
+            pairs.into_iter().any(|(i, j)| blocked(eye_of(around[i]), eye_of(around[j])))
+        });
+        if !is_split {
+            continue;
+        }
+        let from = eye(map, sample);
+        let start = found.len();
+        for &s in &around[..n] {
+            if blocked(from, eye_of(s)) {
+                found.push((sample as u32, s));
+            }
+        }
+        if found.len() - start == n {
+            found.truncate(start);
+        }
+    }
+    found
+}
+
+#[cfg(test)]
+mod tests {
+    use crate::lightmap::gaps::Gaps;
+    use crate::lightmap::{Lightmap, LightmapDesc};
+    use crate::progress::Progress;
+    use crate::scene::shapes::MeshBuilder;
+    use crate::scene::{Material, SceneData};
+    use glam::Vec3;
+
+    /// A floor of 4 × 4 with a thin wall on it at x = 0.03, or none.
+    fn light_map(wall: bool) -> Lightmap {
+        let mut data = SceneData::new();
+        let m = data.add_material(Material { two_sided: true, ..Default::default() }).unwrap();
+        let p = Vec3::new;
+        let mut builder = MeshBuilder::new();
+        builder.quad(p(-2.0, -2.0, 0.0), p(2.0, -2.0, 0.0), p(2.0, 2.0, 0.0), p(-2.0, 2.0, 0.0), m);
+        if wall {
+            builder.box_(p(0.03, -3.0, -0.01), p(0.04, 3.0, 1.0), false, m);
+        }
+        data.add_mesh(builder.finish()).unwrap();
+        let desc = LightmapDesc { texels_per_unit: 20.0, gather_divisor: 4, ..Default::default() };
+        Lightmap::create(&data.committed(), &desc, &Progress::none()).unwrap()
+    }
+
+    #[test]
+    fn light_does_not_go_through_walls_by_interpolation() {
+        for wall in [true, false] {
+            let lightmap = light_map(wall);
+            let atlas = lightmap.atlas();
+            let progress = Progress::none();
+            let gaps = Gaps::find(atlas, 0..1, &[], &progress.stage("gaps", 0.0, 1.0, 1)).unwrap();
+            let x = |map: &crate::lightmap::map::ChartMap, s: usize| map.surface(&atlas.scene, s).0.x;
+            let light = |s: usize| Vec3::splat(f32::from(u8::from(x(&atlas.gather, s) < 0.035)));
+            let values: Vec<Vec3> = (0..atlas.gather.len()).map(light).collect();
+            let mut mixed = 0;
+            for s in atlas.map.samples_of(atlas.charts.chart_of[0]) {
+                let (x, shown) = (x(&atlas.map, s), atlas.interpolate(&values, &gaps, s).x);
+                // Below the wall nothing is seen.
+                if !(0.02..0.05).contains(&x) && shown > 0.01 && shown < 0.99 {
+                    mixed += 1;
+                }
+            }
+            assert_eq!(mixed > 0, !wall, "{mixed}");
+            assert_eq!(gaps.is_empty(), !wall);
+        }
+    }
+}
