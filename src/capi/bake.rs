@@ -76,9 +76,12 @@ pub struct bk_bake_params {
     /// Most reflections of light before it reaches a texel; 0, the default: Russian roulette alone
     /// decides.
     pub max_bounces: u32,
-    /// Photons to emit, at most 2^32; 0: no light that is reflected more than once. Default: 1,000,000.
+    /// Photons to emit, at most 2^32; 0: no light that is reflected more than once. A sixteenth as many, at
+    /// most 65,536, are traced before to find out where to send them. Default: 1,000,000.
     pub photon_count: u64,
-    /// Rays per texel of the gather map, at most 65536; 0: no indirect light. Default: 64.
+    /// Rays per texel of the gather map, at most 65536; 0: no indirect light. With every 64 go up to 16
+    /// shadow rays to bright patches of surfaces, where there are any (BK_LEFT_OUT_BRIGHT_PATCHES).
+    /// Default: 64.
     pub gather_rays: u32,
     /// Photon search radius in scene units, finite and at least 1.2e-38; 0, the default: from the
     /// density of photons. Photons that are not seen from the middle of their disc, as those behind a

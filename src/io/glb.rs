@@ -318,7 +318,6 @@ fn container(mut json: Vec<u8>, binary: &[u8]) -> Result<Vec<u8>> {
 pub(super) mod tests {
     use super::super::image::encode_png_rgb8;
     use super::*;
-
     use crate::io::tests::{albedos, corners, load_bytes};
 
     use crate::scene::{Mesh, MeshMaterials, SceneData};

@@ -293,10 +293,11 @@ impl Bake<'_, '_> {
             seed: purpose_seed(self.params.seed, purpose::RADIANCE),
         };
         let mut rays = radiance::bake(l.scene.device(), &input, &mut values, &stage)?;
-        let bright = l.scene.device().install(|| Bright::new(l, &values, &mut rays))?;
-        let bytes = (values.len() * size_of::<Vec3>() + l.radiance.bytes()) as u64;
+        let mut radiance = Radiance { values, bright: Bright::default() };
+        radiance.bright = l.scene.device().install(|| Bright::new(l, &radiance, &mut rays))?;
+        let bytes = (radiance.values.len() * size_of::<Vec3>() + l.radiance.bytes()) as u64;
         stats.radiance = StageStats { seconds: start.elapsed().as_secs_f64(), rays, bytes };
-        Ok(Radiance { values, bright })
+        Ok(radiance)
     }
 
     /// Per chart with one place, whether its back is baked. With [`illuminate`](Self::illuminate)'s map all that

@@ -21,6 +21,7 @@ use super::Atlas;
 use super::direct::{Receiver, ShadowRays};
 use super::many::{ManyLights, Patch};
 use super::map::ChartMap;
+use super::radiance::{Radiance, RadianceMap};
 use crate::error::Result;
 use crate::memory::Reservation;
 use crate::sampling::{cosine_around, sobol_2d, uniform};
@@ -66,8 +67,8 @@ pub(crate) struct Bright {
 
 impl Bright {
     /// Of the radiance map of an atlas, to be called on the device's threads. Adds the rays traced to `rays`.
-    pub(crate) fn new(atlas: &Atlas, values: &[Vec3], rays: &mut u64) -> Result<Bright> {
-        let seen = seen(atlas, values, rays);
+    pub(crate) fn new(atlas: &Atlas, radiance: &Radiance, rays: &mut u64) -> Result<Bright> {
+        let seen = seen_by_gather_rays(atlas, radiance, rays);
         let mean = seen.iter().sum::<f32>() / seen.len().max(1) as f32;
         let limit = LIMIT * mean;
         let square = |l: f32| seen.iter().map(|s| s.min(l).powi(2)).sum::<f32>();
@@ -78,7 +79,7 @@ impl Bright {
         }
         let beyond: f32 = seen.iter().map(|s| (s - limit).max(0.0)).sum();
         let share = beyond / (mean * seen.len() as f32);
-        let patches = patches(atlas, values, limit, MAX_PATCHES, rays);
+        let patches = patches(atlas, &radiance.values, limit, MAX_PATCHES, rays);
         if patches.is_empty() {
             return Ok(Bright::default());
         }
@@ -131,23 +132,22 @@ fn near2(map: &ChartMap, placement: u32) -> f32 {
 }
 
 /// What gather rays see from places all over the lit surfaces, sums over the channels, where it is more than nothing.
-fn seen(atlas: &Atlas, values: &[Vec3], rays: &mut u64) -> Vec<f32> {
-    let (scene, map) = (&atlas.scene, &atlas.radiance);
+fn seen_by_gather_rays(atlas: &Atlas, radiance: &Radiance, rays: &mut u64) -> Vec<f32> {
+    let (scene, map, values) = (&atlas.scene, &atlas.radiance, &radiance.values);
+    let lookup = RadianceMap::new(&atlas.charts, map, radiance);
     let step = (values.len() / VIEWS).max(1);
     let lit: Vec<usize> = (step / 2..values.len()).step_by(step).filter(|&s| values[s] != Vec3::ZERO).collect();
     *rays += lit.len() as u64 * u64::from(RAYS);
     let from = |&sample: &usize| {
         let (_, receiver) = map.receiver(scene, sample, map.is_back(sample));
+        let lookup = &lookup;
         let along = move |i: u32| {
             let d = cosine_around(receiver.geometric, sobol_2d(i, sample as u32));
             let hit = scene.intersect_raw(&Ray::new(receiver.origin, d));
             if hit.is_miss() {
                 return None;
             }
-            let chart = Some(atlas.charts.chart_of[hit.triangle as usize]).filter(|&c| c != NONE)?;
-            let placement = map.layout.side(chart, hit.front)?;
-            let met = map.nearest(placement, atlas.charts.local(hit.triangle, hit.u, hit.v))?;
-            Some(values[met as usize].element_sum()).filter(|&s| s > 0.0)
+            lookup.reflected(&hit).map(|l| l.element_sum()).filter(|&s| s > 0.0)
         };
         (0..RAYS).filter_map(along).collect::<Vec<f32>>()
     };
@@ -257,7 +257,6 @@ mod tests {
     use super::*;
     use crate::lightmap::gather::{Gathered, SampleSet};
     use crate::lightmap::plan::left_out;
-    use crate::lightmap::radiance::{Radiance, RadianceMap};
     use crate::lightmap::{BakeParams, Light as Baked, Lightmap, LightmapDesc};
     use crate::progress::Progress;
     use crate::sampling::uniform_triangle;

@@ -362,11 +362,9 @@ pub(super) fn point_light(light: &Light, receiver: &Receiver) -> Option<(Vec3, V
 mod tests {
     use super::super::polygon;
     use super::*;
-
     use crate::sampling::{uniform, uniform_sphere};
     use crate::scene::shapes::MeshBuilder;
     use crate::scene::{Material, SceneData, builtin};
-
     use glam::DVec3;
     use std::f32::consts::PI;
 

@@ -174,7 +174,6 @@ impl Bits {
 #[cfg(test)]
 mod tests {
     use super::*;
-
     use crate::lightmap::{Lightmap, LightmapDesc};
     use crate::progress::Progress;
     use crate::scene::shapes::MeshBuilder;

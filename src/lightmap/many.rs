@@ -1,4 +1,4 @@
-//! Direct light of many lights: candidates from the light tree, of which a few get shadow rays.
+//! Light of many lights, or of [bright patches](super::bright): candidates from the light tree, of which a few get shadow rays.
 //!
 //! Resampled importance sampling (Talbot, Cline and Egbert, *Importance Resampling for Global
 //! Illumination*, 2005), with systematic sampling in both steps: a light that is due at least one
@@ -73,13 +73,15 @@ impl ManyLights {
     pub(super) fn new(points: &[Light], areas: &[AreaLight]) -> ManyLights {
         let sources: Vec<Source> =
             points.iter().map(|&p| Source::Point(p)).chain(areas.iter().map(|&a| Source::Area(a))).collect();
-        let bounds: Vec<Bounds> = sources.iter().map(bounds).collect();
-        ManyLights { tree: LightTree::new(&bounds), sources }
+        ManyLights::of(sources)
     }
 
     /// Of parts of surfaces.
     pub(super) fn of_patches(patches: Vec<Patch>) -> ManyLights {
-        let sources: Vec<Source> = patches.into_iter().map(Source::Patch).collect();
+        ManyLights::of(patches.into_iter().map(Source::Patch).collect())
+    }
+
+    fn of(sources: Vec<Source>) -> ManyLights {
         let bounds: Vec<Bounds> = sources.iter().map(bounds).collect();
         ManyLights { tree: LightTree::new(&bounds), sources }
     }

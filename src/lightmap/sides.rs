@@ -153,7 +153,6 @@ fn view(scene: &Scene, radiance: &ChartMap, placement: u32) -> View {
 #[cfg(test)]
 mod tests {
     use super::*;
-
     use crate::lightmap::{Lightmap, LightmapDesc};
     use crate::progress::Progress;
     use crate::scene::shapes::MeshBuilder;

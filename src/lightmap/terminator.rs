@@ -52,7 +52,6 @@ pub(super) fn raised(
 #[cfg(test)]
 mod tests {
     use super::*;
-
     use crate::scene::shapes::MeshBuilder;
     use crate::scene::{Material, Mesh, SceneData};
     use std::sync::Arc;

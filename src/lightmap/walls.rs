@@ -50,8 +50,8 @@ pub(super) fn between(atlas: &Atlas, placement: u32, backs: &[bool], rays: &mut 
         around[..n].sort_unstable();
         // Most are around many texels, and see one another.
         let is_split = *split.entry(around).or_insert_with(|| {
-            let pairs = (1..n).flat_map(|i| (0..i).map(move |j| (i, j)));
-            pairs.into_iter().any(|(i, j)| blocked(eye_of(around[i]), eye_of(around[j])))
+            let mut pairs = (1..n).flat_map(|i| (0..i).map(move |j| (i, j)));
+            pairs.any(|(i, j)| blocked(eye_of(around[i]), eye_of(around[j])))
         });
         if !is_split {
             continue;

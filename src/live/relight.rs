@@ -229,7 +229,6 @@ impl Drop for Relight {
 #[cfg(test)]
 mod tests {
     use super::*;
-
     use crate::scene::builtin;
 
     #[test]

@@ -127,7 +127,6 @@ impl LiveCamera {
 #[cfg(test)]
 mod tests {
     use super::*;
-
     use crate::lightmap::{Lightmap, LightmapDesc};
     use crate::progress::Progress;
     use crate::scene::shapes::MeshBuilder;

@@ -69,6 +69,24 @@ enum Shape {
     },
 }
 
+/// The pair of random numbers that a guide changes.
+#[derive(Clone, Copy, PartialEq)]
+enum Square {
+    Position,
+    Direction,
+}
+
+impl Shape {
+    /// The one in which photons that leave something differ most from those that do not; `None`: no guide.
+    fn square(&self) -> Option<Square> {
+        match self {
+            Shape::Cone { .. } | Shape::Spot { .. } => Some(Square::Direction),
+            Shape::Beam { .. } | Shape::Disc { .. } | Shape::Sky(_) => Some(Square::Position),
+            Shape::Rect { .. } => None,
+        }
+    }
+}
+
 #[derive(Clone, Copy, Debug)]
 struct Source {
     shape: Shape,
@@ -144,16 +162,13 @@ impl<'a> Emission<'a> {
     /// with an area.
     pub(super) fn guidable(&self, index: u64, p: [f32; 2], d: [f32; 2]) -> Option<(usize, [f32; 2])> {
         let (light, _) = self.light_of(index);
-        match self.sources.get(light)?.shape {
-            Shape::Cone { .. } | Shape::Spot { .. } => Some((light, d)),
-            Shape::Beam { .. } | Shape::Disc { .. } | Shape::Sky(_) => Some((light, p)),
-            Shape::Rect { .. } => None,
-        }
+        let square = self.sources.get(light)?.shape.square()?;
+        Some((light, if square == Square::Direction { d } else { p }))
     }
 
     /// Whether any light could have a guide.
     pub(super) fn can_be_guided(&self) -> bool {
-        self.sources.iter().any(|s| !matches!(s.shape, Shape::Rect { .. }))
+        self.sources.iter().any(|s| s.shape.square().is_some())
     }
 
     /// From now on guided by pilot photons, each with its source.
@@ -170,11 +185,8 @@ impl<'a> Emission<'a> {
         let mut power = power.as_vec3();
         let (mut p, mut d) = (p, d);
         if let Some(guide) = self.guides.get(light).and_then(Option::as_ref) {
-            let square = if matches!(self.sources[light].shape, Shape::Cone { .. } | Shape::Spot { .. }) {
-                &mut d
-            } else {
-                &mut p
-            };
+            let is_direction = self.sources[light].shape.square() == Some(Square::Direction);
+            let square = if is_direction { &mut d } else { &mut p };
             let (place, density) = guide.place(*square);
             *square = place;
             power /= density;

@@ -1,8 +1,8 @@
 //! Emission guided by a pilot: more photons go where they lead to surfaces that light reaches only by reflection.
 //!
 //! Most photons of a sun meet roofs and are gone; what lights the rooms comes through few windows. So a part of the
-//! photons is traced first, and the square of random numbers by which a light outside of the scene, or in it, chooses
-//! where its photons go is divided in cells. A cell gets photons in proportion to the root mean square of how many its
+//! photons is traced first, and the square of random numbers by which a light chooses where its photons go, or where they
+//! come in, is divided in cells. A cell gets photons in proportion to the root mean square of how many its
 //! pilot photons left on surfaces after a reflection (the allocation of Neyman, *On the Two Different Aspects of the
 //! Representative Method*, 1934), each with as much less power. (Dutré and Willems, *Potential-Driven Monte Carlo
 //! Particle Tracing for Diffuse Environments with Adaptive Probability Density Functions*, 1995, guide all reflections

@@ -38,7 +38,8 @@ pub const MAX_PHOTONS: u64 = 1 << 32;
 /// Parameters of a photon map.
 #[derive(Clone, Copy, Debug, PartialEq)]
 pub struct PhotonParams {
-    /// Photons emitted, 1 to [`MAX_PHOTONS`].
+    /// Photons emitted, 1 to [`MAX_PHOTONS`]. A sixteenth as many, at most 65,536, are traced before to find out where
+    /// to send them.
     pub photon_count: u64,
     /// Most surface interactions per photon (1: direct light only); 0: Russian roulette alone ends
     /// paths, and [`PATH_LIMIT`] as a safeguard.

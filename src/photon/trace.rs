@@ -32,11 +32,11 @@ const BLOCK_STEP: usize = 1 << 20;
 /// A pilot of one photon in so many tells where to send the others.
 const PILOT_PART: u64 = 16;
 
-/// They have other random numbers.
-const PILOT: u64 = u64::from_be_bytes(*b"phopilot");
-
 /// Pilot photons, at most.
 const MAX_PILOT: u64 = 1 << 16;
+
+/// What makes their random numbers others.
+const PILOT_SEED: u64 = u64::from_be_bytes(*b"phopilot");
 
 /// A pilot photon and its source.
 type Guidable = (usize, PilotPhoton);
@@ -193,7 +193,7 @@ impl<'a> Tracer<'a> {
         if count < BLOCK || !tracer.emission.can_be_guided() {
             return Ok(tracer);
         }
-        let params = PhotonParams { photon_count: count, seed: params.seed ^ PILOT, ..*params };
+        let params = PhotonParams { photon_count: count, seed: params.seed ^ PILOT_SEED, ..*params };
         let pilot = Tracer::new(scene, lights, &params);
         let blocks =
             (0..pilot.emission.count().div_ceil(BLOCK)).into_par_iter().map(|block| pilot.left_by_block(block));

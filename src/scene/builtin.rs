@@ -133,7 +133,6 @@ mod tests {
     use super::super::shapes::enclosed_volume;
     use super::super::{Mesh, Scene};
     use super::*;
-
     use std::sync::Arc;
 
     fn commit(name: &str) -> Arc<Scene> {

@@ -112,7 +112,6 @@ fn nearest_on_inner_triangle(corners: [DVec3; 3], lengths: [f64; 3], fraction: f
 #[cfg(test)]
 mod tests {
     use super::*;
-
     use crate::scene::{Material, Mesh, SceneData};
     use crate::trace::Ray;
     use proptest::prelude::*;

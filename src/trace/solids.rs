@@ -30,7 +30,6 @@ fn sees_a_back(scene: &Scene, origin: Vec3, direction: Vec3, rays: &mut u64) -> 
 #[cfg(test)]
 mod tests {
     use super::*;
-
     use crate::scene::shapes::MeshBuilder;
     use crate::scene::{Material, SceneData};
     use std::sync::Arc;
