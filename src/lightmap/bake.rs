@@ -294,7 +294,7 @@ impl Bake<'_, '_> {
         };
         let mut rays = radiance::bake(l.scene.device(), &input, &mut values, &stage)?;
         let mut radiance = Radiance { values, bright: Bright::default() };
-        radiance.bright = l.scene.device().install(|| Bright::new(l, &radiance, &mut rays))?;
+        l.scene.device().install(|| Bright::find(l, &mut radiance, &mut rays))?;
         let bytes = (radiance.values.len() * size_of::<Vec3>() + l.radiance.bytes()) as u64;
         stats.radiance = StageStats { seconds: start.elapsed().as_secs_f64(), rays, bytes };
         Ok(radiance)

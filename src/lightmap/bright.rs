@@ -13,18 +13,21 @@
 //! and twice the shadow rays, noise in the sun 4.4e-2 and 0.9e-2 for 11 and 16 s; by lamps no difference. With a limit of
 //! twice or eight times what is seen on average instead of four, 1.2 and 1.3 times the noise (lamps).
 //!
-//! It does not pay where much is in the sun, which stratified rays find well: the built-in atrium has 34,935 patches, and
-//! 9.8e-3 -> 8.7e-3 at default settings takes 7.6 -> 10.5 s, with as much noise as before (5.5e-3 -> 6.1e-3). A test that
-//! weighs the shadow rays' own noise and time against the gain is still to be found.
+//! It brings little where much is in the sun, which stratified rays find well: in the built-in atrium with its 35,000 patches
+//! 9.6e-3 -> 7.5e-3 takes 9.8 -> 11.3 s. So rounds of gather rays from some places are traced with and without them. The variance
+//! of rounds with them is 0.2 (Sponza by lamps), 0.5 (in the sun), 0.6 (Cornell box), 0.7 (atrium) and 0.9 (living room)
+//! of that without, and its product with the time of rounds 0.2, 1.1, 0.7, 1.9 and 1.1. Half or a quarter of the candidates
+//! per shadow ray or a sixteenth of the patches did not make the product smaller by more than a fifth in any of them.
 
 use super::Atlas;
 use super::direct::{Receiver, ShadowRays};
+use super::gather::{Gathered, ROUND, SampleSet};
 use super::many::{ManyLights, Patch};
 use super::map::ChartMap;
 use super::radiance::{Radiance, RadianceMap};
 use crate::error::Result;
 use crate::memory::Reservation;
-use crate::sampling::{cosine_around, sobol_2d, uniform};
+use crate::sampling::{combine, cosine_around, sobol_2d, uniform};
 use crate::scene::{NONE, Scene};
 use crate::trace::Ray;
 use crate::trace::offset::{SurfacePoint, offset_ray_origin};
@@ -38,9 +41,20 @@ const LIMIT: f32 = 4.0;
 /// If the mean square of what they see is more than this part of what it is without the limit, nothing is done.
 const GAIN: f32 = 0.8;
 
+/// Nor is it if the variance of gathered light is more than this part of what it is without. (Rounds take up to two and
+/// a half times as long with them, but a bake is not gather rays alone.)
+const PAYS: f32 = 0.65;
+
 /// Lit texels of the radiance map from which rays tell what gather rays see, and rays from each.
 const VIEWS: usize = 2048;
 const RAYS: u32 = 16;
+
+/// Lit texels from which rounds of gather rays tell that variance, and rounds from each.
+const TRIALS: usize = 4096;
+const ROUNDS: u32 = 2;
+
+/// Light weaker than this part of the mean need not be right in proportion.
+const LEAST: f32 = 0.1;
 
 /// A round of gather rays comes with this many shadow rays, times the part of the light that the patches make.
 const SHADOW_RAYS: f32 = 16.0;
@@ -66,27 +80,33 @@ pub(crate) struct Bright {
 }
 
 impl Bright {
-    /// Of the radiance map of an atlas, to be called on the device's threads. Adds the rays traced to `rays`.
-    pub(crate) fn new(atlas: &Atlas, radiance: &Radiance, rays: &mut u64) -> Result<Bright> {
+    /// Bright patches of the radiance map of an atlas, which has none yet, become lights if that pays. To be called on
+    /// the device's threads. Adds the rays traced to `rays`.
+    pub(crate) fn find(atlas: &Atlas, radiance: &mut Radiance, rays: &mut u64) -> Result<()> {
         let seen = seen_by_gather_rays(atlas, radiance, rays);
         let mean = seen.iter().sum::<f32>() / seen.len().max(1) as f32;
         let limit = LIMIT * mean;
         let square = |l: f32| seen.iter().map(|s| s.min(l).powi(2)).sum::<f32>();
         let (square, limited) = (square(f32::INFINITY), square(limit));
-        let pays = limited < GAIN * square && limit > 0.0 && square.is_finite();
-        if !pays {
-            return Ok(Bright::default());
+        let may_pay = limited < GAIN * square && limit > 0.0 && square.is_finite();
+        if !may_pay {
+            return Ok(());
         }
         let beyond: f32 = seen.iter().map(|s| (s - limit).max(0.0)).sum();
         let share = beyond / (mean * seen.len() as f32);
         let patches = patches(atlas, &radiance.values, limit, MAX_PATCHES, rays);
         if patches.is_empty() {
-            return Ok(Bright::default());
+            return Ok(());
         }
         let patches = ManyLights::of_patches(patches);
         let memory = atlas.scene.device().memory().reserve(patches.bytes(), "bright patches")?;
         let shadow_rays = (SHADOW_RAYS * share).ceil() as u32;
-        Ok(Bright { limit, patches: Some(patches), shadow_rays, _memory: Some(memory) })
+        let without = trials(atlas, radiance, rays);
+        radiance.bright = Bright { limit, patches: Some(patches), shadow_rays, _memory: Some(memory) };
+        if !pays(&trials(atlas, radiance, rays), &without) {
+            radiance.bright = Bright::default();
+        }
+        Ok(())
     }
 
     /// Number of lights.
@@ -131,12 +151,50 @@ fn near2(map: &ChartMap, placement: u32) -> f32 {
     NEAR / (x * y)
 }
 
+/// Every so manyth of the lit texels of a radiance map, about `count`.
+fn lit_texels(values: &[Vec3], count: usize) -> Vec<usize> {
+    let lit: Vec<usize> = (0..values.len()).filter(|&s| values[s] != Vec3::ZERO).collect();
+    let step = (lit.len() / count).max(1);
+    lit.into_iter().skip(step / 2).step_by(step).collect()
+}
+
+/// Mean and variance of rounds of gather rays from places all over the lit surfaces, sums over the channels.
+fn trials(atlas: &Atlas, radiance: &Radiance, rays: &mut u64) -> Vec<(f32, f32)> {
+    let lookup = RadianceMap::new(&atlas.charts, &atlas.radiance, radiance);
+    let samples = SampleSet::new(ROUND as u32, 0);
+    let at = |&sample: &usize| {
+        let (_, receiver) = atlas.radiance.receiver(&atlas.scene, sample, atlas.radiance.is_back(sample));
+        let mut traced = 0;
+        let round = |i: u32| {
+            let (mut gathered, seed) = (Gathered::default(), combine(sample as u32, i));
+            traced += gathered.add_round(&atlas.scene, &lookup, &receiver, &samples, 0, seed);
+            gathered.irradiance().element_sum()
+        };
+        let light: Vec<f32> = (0..ROUNDS).map(round).collect();
+        let mean = light.iter().sum::<f32>() / ROUNDS as f32;
+        let squares: f32 = light.iter().map(|e| (e - mean).powi(2)).sum();
+        (mean, squares / (ROUNDS - 1) as f32, traced)
+    };
+    let found: Vec<(f32, f32, u64)> = lit_texels(&radiance.values, TRIALS).par_iter().map(at).collect();
+    *rays += found.iter().map(|f| f.2).sum::<u64>();
+    found.into_iter().map(|(mean, variance, _)| (mean, variance)).collect()
+}
+
+/// Whether trials vary that much less, in proportion to the light.
+fn pays(with: &[(f32, f32)], without: &[(f32, f32)]) -> bool {
+    let light: Vec<f32> = with.iter().zip(without).map(|(a, b)| 0.5 * (a.0 + b.0)).collect();
+    let least = LEAST * light.iter().sum::<f32>() / light.len().max(1) as f32;
+    let relative = |of: &[(f32, f32)]| -> f32 {
+        of.iter().zip(&light).map(|((_, variance), light)| variance / (light * light + least * least)).sum()
+    };
+    relative(with) < PAYS * relative(without)
+}
+
 /// What gather rays see from places all over the lit surfaces, sums over the channels, where it is more than nothing.
 fn seen_by_gather_rays(atlas: &Atlas, radiance: &Radiance, rays: &mut u64) -> Vec<f32> {
     let (scene, map, values) = (&atlas.scene, &atlas.radiance, &radiance.values);
     let lookup = RadianceMap::new(&atlas.charts, map, radiance);
-    let step = (values.len() / VIEWS).max(1);
-    let lit: Vec<usize> = (step / 2..values.len()).step_by(step).filter(|&s| values[s] != Vec3::ZERO).collect();
+    let lit = lit_texels(values, VIEWS);
     *rays += lit.len() as u64 * u64::from(RAYS);
     let from = |&sample: &usize| {
         let (_, receiver) = map.receiver(scene, sample, map.is_back(sample));
@@ -377,6 +435,15 @@ mod tests {
         let halves =
             [[square(0., 0.), square(8., 0.), square(8., 8.)], [square(0., 0.), square(8., 8.), square(0., 8.)]];
         assert_eq!(halves.map(|t| grid_points(t, Vec2::ZERO).count()).iter().sum::<usize>(), 64);
+    }
+
+    #[test]
+    fn lights_pay_if_they_take_away_much_of_the_noise_in_proportion_to_the_light() {
+        let noise = |dark: f32, light: f32| [vec![(0.5, 0.25 * dark); 50], vec![(2.0, 4.0 * light); 50]].concat();
+        assert!(pays(&noise(0.6, 0.6), &noise(1.0, 1.0)) && !pays(&noise(0.7, 0.7), &noise(1.0, 1.0)));
+        // What is dark counts as much as what is light.
+        assert!(pays(&noise(0.2, 1.0), &noise(1.0, 1.0)) && pays(&noise(1.0, 0.2), &noise(1.0, 1.0)));
+        assert!(!pays(&noise(0.0, 0.0), &noise(0.0, 0.0)) && !pays(&[], &[]));
     }
 
     #[test]

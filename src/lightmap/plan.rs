@@ -198,7 +198,7 @@ impl Plan {
         match bright.len() {
             0 if !self.runs(left_out::INDIRECT) => self.left_out |= left_out::BRIGHT_PATCHES,
             0 => {
-                let why = "gather rays find all that is bright";
+                let why = "gather rays find most of what is bright";
                 self.leave_out(left_out::BRIGHT_PATCHES, "bright patches as lights", why);
             }
             n => {

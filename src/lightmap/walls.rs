@@ -7,7 +7,11 @@
 //!
 //! Living room, 20 texels/m: mean squared relative error of all but the worst hundredth of 300 points 4.0e-3 instead of
 //! 1.1e-2, of all but three hundredths 2.1e-3 instead of 4.1e-3. Seen from a quarter of a texel above, not an eighth, the
-//! same, from half a texel 6.3e-3, from 0.03 texels 6.6e-3. A texel that sees none would need gather rays of its own.
+//! same, from half a texel 6.3e-3, from 0.03 texels 6.6e-3.
+//!
+//! Tried: gather rays of their own for texels that see none, or lie outside of a gap in which all around them lie (1.2 % of
+//! the living room's, 0.5 % of Sponza's): all points 0.130 -> 0.124, a picture of 960 x 540 12.5 -> 11.9 %. For texels in gaps,
+//! too: 0.130 -> 0.020, but the dark of what lies behind a moulding shows as a rim around it.
 
 use super::Atlas;
 use crate::scene::NONE;
