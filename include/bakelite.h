@@ -1065,7 +1065,7 @@ bk_result bk_lightmap_mesh_back_uvs(const bk_lightmap *lightmap,
 // Bit of left_out. No stitching of seams.
 #define BK_LEFT_OUT_SEAMS 65536
 
-// Bit of left_out. No bright patches of surfaces as lights: gather rays find all that is bright.
+// Bit of left_out. No bright patches of surfaces as lights: gather rays find most of what is bright.
 #define BK_LEFT_OUT_BRIGHT_PATCHES 131072
 
 // How to bake.

@@ -44,7 +44,7 @@ pub const BK_LEFT_OUT_SUN_DISC: u32 = 8192;
 pub const BK_LEFT_OUT_MANY_LIGHTS: u32 = 16384;
 /// Bit of left_out. No stitching of seams.
 pub const BK_LEFT_OUT_SEAMS: u32 = 65536;
-/// Bit of left_out. No bright patches of surfaces as lights: gather rays find all that is bright.
+/// Bit of left_out. No bright patches of surfaces as lights: gather rays find most of what is bright.
 pub const BK_LEFT_OUT_BRIGHT_PATCHES: u32 = 131072;
 
 // The numbers are literal for the header's sake.

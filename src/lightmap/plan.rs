@@ -38,7 +38,7 @@ pub mod left_out {
     pub const MANY_LIGHTS: u32 = 1 << 14;
     /// No stitching of seams.
     pub const SEAMS: u32 = 1 << 16;
-    /// No bright patches as lights: gather rays find all that is bright.
+    /// No bright patches as lights: gather rays find most of what is bright.
     pub const BRIGHT_PATCHES: u32 = 1 << 17;
 }
 
