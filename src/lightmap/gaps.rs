@@ -31,14 +31,14 @@ const PROBES: u32 = 16;
 const AWAY: u32 = 2;
 
 /// Which gather texels lie in gaps, and which texels of the light map do that interpolate between some that do and
-/// some that do not; and which lie behind [walls](super::walls).
+/// some that do not; and which lie behind [walls](super::walls) or across creases.
 #[derive(Default)]
 pub(crate) struct Gaps {
     gather: Bits,
     map: Bits,
     /// Texels of the light map of which `walls` tells.
     walled: Bits,
-    /// A texel of the light map and one of the gather map that it does not see, in ascending order.
+    /// A texel of the light map and one of the gather map behind a wall or a crease, in ascending order.
     walls: Vec<(u32, u32)>,
     /// Rays that it took.
     pub rays: u64,
@@ -72,7 +72,7 @@ impl Gaps {
         self.map.has(map) == self.gather.has(gather)
     }
 
-    /// Whether a wall stands between a texel of the light map and one of the gather map, if it sees any other.
+    /// Whether a wall or a crease is between a texel of the light map and one of the gather map, but not all of them.
     #[inline]
     pub(crate) fn are_apart(&self, map: usize, gather: usize) -> bool {
         self.walled.has(map) && self.walls.binary_search(&(map as u32, gather as u32)).is_ok()
