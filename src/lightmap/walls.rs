@@ -1,9 +1,10 @@
 //! Texels of the gather map behind walls and across creases.
 //!
 //! Where a wall stands on a floor, a texel of the light map may lie on one side of it and some of the gather texels that
-//! it interpolates between on the other. Those that it does not see from a little above the surface are left out, as are those
-//! whose normals differ much from its own, as on either side of a fold; but not all of them. (As probes behind walls are left out in Majercik, Guertin, Nowrouzezahrai and McGuire, *Dynamic Diffuse
-//! Global Illumination with Ray-Traced Irradiance Fields*, 2019.)
+//! it interpolates between on the other. Those that it does not see from a little above the surface are left out, and those whose
+//! normals differ much from its own, as on either side of a fold; but not all of them. (As probes behind walls are left
+//! out in Majercik, Guertin, Nowrouzezahrai and McGuire, *Dynamic Diffuse Global Illumination with Ray-Traced Irradiance
+//! Fields*, 2019.)
 //!
 //! Living room, 20 texels/m: mean squared relative error of all but the worst hundredth of 300 points 4.0e-3 instead of
 //! 1.1e-2, of all but three hundredths 2.1e-3 instead of 4.1e-3. Seen from a quarter of a texel above, not an eighth, the
