@@ -7,6 +7,11 @@
 //! narrower bundle. Each texel shifts it digitally (XOR), which keeps both the stratification and
 //! the bundles. (One set of 256 rays sorted as a whole traces 0 to 15 % faster than four rounds;
 //! the rays of 64 neighbouring texels stratum by stratum 3 to 8 % faster than texel by texel.)
+//!
+//! Tried: more rays where their relative variance is largest. At 128 rays on average, 64 everywhere and 192 more in a third
+//! of the texels (or 640 more in a tenth), noise is 4.6e-4 (6.0e-4) instead of 3.6e-4 in the Cornell box, 8.5e-4 (8.7e-4)
+//! instead of 7.8e-4 in the living room, 2.2e-3 (2.8e-3) as before in Sponza by two lamps; and as texels that found little
+//! light get no more, it is 1 % too dark.
 
 use super::direct::Receiver;
 use super::radiance::RadianceMap;
