@@ -272,18 +272,22 @@ impl Atlas {
             self.gather.bilinear(placement, local, |s, w| all += w * values[s]);
             return all;
         }
-        let (mut seen, mut alike) = ((Vec3::ZERO, 0.0), (Vec3::ZERO, 0.0));
+        // Alike and seen; of texels in the open those alike; seen.
+        let is_open = !gaps.is_in_gap(sample);
+        let mut sums = [(Vec3::ZERO, 0.0); 3];
         self.gather.bilinear(placement, local, |s, w| {
             all += w * values[s];
-            if !gaps.are_apart(sample, s) {
-                seen = (seen.0 + w * values[s], seen.1 + w);
-                if gaps.are_alike(sample, s) {
-                    alike = (alike.0 + w * values[s], alike.1 + w);
+            let (alike, seen) = (gaps.are_alike(sample, s), !gaps.are_apart(sample, s));
+            for ((sum, part), counts) in sums.iter_mut().zip([alike && seen, alike && is_open, seen]) {
+                if counts {
+                    (*sum, *part) = (*sum + w * values[s], *part + w);
                 }
             }
         });
-        let (sum, part) = if alike.1 > 0.0 { alike } else { seen };
-        if part > 0.0 && part < 1.0 { sum / part } else { all }
+        match sums.into_iter().find(|(_, part)| *part > 0.0) {
+            Some((sum, part)) if part < 1.0 => sum / part,
+            _ => all,
+        }
     }
 }
 
