@@ -70,7 +70,8 @@ impl Gaps {
         Ok(Gaps { gather, map, walled, walls, rays: search.rays.into_inner(), _memory: Some(memory) })
     }
 
-    /// Whether a texel of the light map lies in a gap, around which some texels of the gather map do and some do not.
+    /// Whether a texel of the light map lies in a gap. Only known where some of the gather texels around it do and some
+    /// do not; `false` elsewhere.
     #[inline]
     pub(crate) fn is_in_gap(&self, map: usize) -> bool {
         self.map.has(map)
@@ -82,7 +83,8 @@ impl Gaps {
         self.map.has(map) == self.gather.has(gather)
     }
 
-    /// Whether a wall or a crease is between a texel of the light map and one of the gather map, but not all of them.
+    /// Whether a wall or a crease is between a texel of the light map and one of the gather map; never between it and all
+    /// around it.
     #[inline]
     pub(crate) fn are_apart(&self, map: usize, gather: usize) -> bool {
         self.walled.has(map) && self.walls.binary_search(&(map as u32, gather as u32)).is_ok()

@@ -260,7 +260,8 @@ impl Atlas {
     }
 
     /// A gather map's `values` interpolated at a sample of the light map: between those texels around that lie in a
-    /// gap as it does, or do not as it does not, and behind no wall.
+    /// gap as it does, or do not as it does not, and behind no wall or crease. Of what is left if none is both, see
+    /// [`gaps`].
     #[inline]
     pub(crate) fn interpolate(&self, values: &[Vec3], gaps: &Gaps, sample: usize) -> Vec3 {
         let t = &self.map.texels.samples[sample];
@@ -272,13 +273,13 @@ impl Atlas {
             self.gather.bilinear(placement, local, |s, w| all += w * values[s]);
             return all;
         }
-        // Alike and seen; of texels in the open those alike; seen.
+        // The first that is not empty is shown: of what is alike and not apart; alike (to a texel in the open); not apart.
         let is_open = !gaps.is_in_gap(sample);
         let mut sums = [(Vec3::ZERO, 0.0); 3];
         self.gather.bilinear(placement, local, |s, w| {
             all += w * values[s];
-            let (alike, seen) = (gaps.are_alike(sample, s), !gaps.are_apart(sample, s));
-            for ((sum, part), counts) in sums.iter_mut().zip([alike && seen, alike && is_open, seen]) {
+            let (alike, joined) = (gaps.are_alike(sample, s), !gaps.are_apart(sample, s));
+            for ((sum, part), counts) in sums.iter_mut().zip([alike && joined, alike && is_open, joined]) {
                 if counts {
                     (*sum, *part) = (*sum + w * values[s], *part + w);
                 }

@@ -1,19 +1,19 @@
 //! Texels of the gather map behind walls and across creases.
 //!
 //! Where a wall stands on a floor, a texel of the light map may lie on one side of it and some of the gather texels that
-//! it interpolates between on the other. Those that it does not see from a little above the surface are left out, and those whose
-//! normals differ much from its own, as on either side of a fold; but not all of them. (As probes behind walls are left
-//! out in Majercik, Guertin, Nowrouzezahrai and McGuire, *Dynamic Diffuse Global Illumination with Ray-Traced Irradiance
-//! Fields*, 2019.)
+//! it interpolates between on the other. Those that it does not see from a little above the surface are left out, and
+//! those whose normals differ much from its own, as on either side of a fold; but not all of them. (As probes behind walls
+//! are left out in Majercik, Guertin, Nowrouzezahrai and McGuire, *Dynamic Diffuse Global Illumination with Ray-Traced
+//! Irradiance Fields*, 2019.)
 //!
 //! Living room, 20 texels/m: mean squared relative error of all but the worst hundredth of 300 points 4.0e-3 instead of
 //! 1.1e-2, of all but three hundredths 2.1e-3 instead of 4.1e-3. Seen from a quarter of a texel above, not an eighth, the
 //! same, from half a texel 6.3e-3, from 0.03 texels 6.6e-3. Creases: all points of Sponza in the sun 0.141 -> 0.050, by lamps
 //! 1.35e-2 as before; with cosines of 0.97, 0.9 and 0.5 instead, 0.050, 0.042 and 0.141 in the sun, no difference by lamps.
 //!
-//! Tried: gather rays of their own for texels that see none, or lie outside of a gap in which all around them lie (1.2 % of
-//! the living room's, 0.5 % of Sponza's): all points 0.130 -> 0.124, a picture of 960 x 540 12.5 -> 11.9 %. For texels in gaps,
-//! too: 0.130 -> 0.020, but the dark of what lies behind a moulding shows as a rim around it.
+//! Tried: gather rays of their own for texels that see none, or lie outside of a gap in which all around them lie (1.2 %
+//! of the living room's, 0.5 % of Sponza's): all points 0.130 -> 0.124, a picture of 960 x 540 12.5 -> 11.9 %. For texels
+//! in gaps, too: 0.130 -> 0.020, but the dark of what lies behind a moulding shows as a rim around it.
 
 use super::Atlas;
 use crate::scene::NONE;
