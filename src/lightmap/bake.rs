@@ -3,7 +3,6 @@
 use super::bright::Bright;
 use super::charts::{Charts, automatic_density};
 use super::direct::DirectLight;
-use super::gaps::Gaps;
 use super::gather::{Gathered, SampleSet};
 use super::layout::Layout;
 use super::map::ChartMap;
@@ -12,6 +11,7 @@ use super::radiance::{self, Radiance, RadianceInput, RadianceMap};
 use super::seams::Stitch;
 use super::sides;
 use super::texels::TexelMap;
+use super::upsample::{OWN_RAYS, OwnRays, Upsampling};
 use super::{Atlas, BakeParams, BakeStats, Light, Lightmap, LightmapDesc, LightmapInfo, StageStats, TexelState, blur};
 use crate::device::LogLevel;
 use crate::error::{Error, Result, invalid_argument};
@@ -50,6 +50,7 @@ pub(crate) mod purpose {
     pub const GATHER_SET: u32 = 2;
     pub const GATHER: u32 = 3;
     pub const DIRECT: u32 = 4;
+    pub const OWN: u32 = 5;
 }
 
 /// The radiance map, coarser than the light map, takes this part of the direct samples.
@@ -205,7 +206,7 @@ pub(crate) struct Bake<'a, 'p> {
 /// The gather map after blur and filling.
 struct Indirect {
     irradiance: Vec<Vec3>,
-    gaps: Gaps,
+    upsampling: Upsampling,
 }
 
 impl Bake<'_, '_> {
@@ -324,7 +325,7 @@ impl Bake<'_, '_> {
             ..l.map.texels.placement_of(self.range.end as u32 - 1) + 1;
         let needed = l.gather.texels.chart_start[placements.start as usize] as usize
             ..l.gather.texels.chart_start[placements.end as usize] as usize;
-        let gaps = self.gaps(backs, placements)?;
+        let upsampling = self.upsampling(radiance, backs, placements)?;
         let lookup = RadianceMap::new(&l.charts, &l.radiance, radiance);
         let samples = SampleSet::new(self.params.gather_rays, purpose_seed(self.params.seed, purpose::GATHER_SET));
         let seed = purpose_seed(self.params.seed, purpose::GATHER);
@@ -334,7 +335,7 @@ impl Bake<'_, '_> {
         let mut normals: Vec<Vec3> = try_vec(n, "the gather map's normals")?;
         let mut variances: Vec<f32> = try_vec(n, "the gather map's variance")?;
         let mut valid: Vec<bool> = try_vec(n, "the gather map's validity")?;
-        let rays = AtomicU64::new(gaps.rays);
+        let rays = AtomicU64::new(upsampling.rays);
         device.install(|| {
             let values = irradiance[needed.clone()].par_chunks_mut(BLOCK);
             let normals = normals[needed.clone()].par_chunks_mut(BLOCK);
@@ -370,13 +371,22 @@ impl Bake<'_, '_> {
         }
         let bytes = (n * GATHER_BYTES + l.gather.bytes()) as u64;
         stats.gather = StageStats { seconds: start.elapsed().as_secs_f64(), rays: rays.into_inner(), bytes };
-        Ok(Indirect { irradiance, gaps })
+        Ok(Indirect { irradiance, upsampling })
     }
 
-    /// Which texels of some placements lie in gaps.
-    pub(crate) fn gaps(&self, backs: &[bool], placements: Range<u32>) -> Result<Gaps> {
-        let stage = self.progress.stage("gaps", 0.3, 0.32, placements.len() as u64);
-        Gaps::find(self.atlas, placements, backs, &stage)
+    /// How the light map shows some placements of the gather map.
+    pub(crate) fn upsampling(&self, radiance: &Radiance, backs: &[bool], placements: Range<u32>) -> Result<Upsampling> {
+        let l = self.atlas;
+        let own = OwnRays {
+            radiance: RadianceMap::new(&l.charts, &l.radiance, radiance),
+            samples: &SampleSet::new(
+                self.params.gather_rays.min(OWN_RAYS),
+                purpose_seed(self.params.seed, purpose::GATHER_SET),
+            ),
+            seed: purpose_seed(self.params.seed, purpose::OWN),
+        };
+        let stage = self.progress.stage("upsampling", 0.3, 0.32, placements.len() as u64);
+        Upsampling::find(l, placements, backs, &own, &stage)
     }
 
     /// Direct light and the interpolated indirect light of every texel of the range.
@@ -406,7 +416,7 @@ impl Bake<'_, '_> {
                     let receiver = l.receiver(&l.map, backs, sample);
                     state[i] = TexelState::Visible;
                     if let Some(indirect) = indirect {
-                        ind[i] = l.interpolate(&indirect.irradiance, &indirect.gaps, sample);
+                        ind[i] = indirect.upsampling.at(l, &indirect.irradiance, sample);
                     }
                     if is_lit && is_buried(scene, receiver.origin, receiver.geometric, &mut traced) {
                         state[i] = TexelState::Hidden;

@@ -130,18 +130,26 @@ impl Bright {
         radiance * (self.limit / sum)
     }
 
-    /// Irradiance by what gather rays do not see, and the variance of its sum over the channels. Adds the rays traced to
-    /// `rays`.
-    pub(crate) fn irradiance(&self, scene: &Scene, receiver: &Receiver, seed: u32, rays: &mut u64) -> (Vec3, f32) {
+    /// Irradiance by what a round of `gather_rays` does not see, and the variance of its sum over the channels. Adds the
+    /// rays traced to `rays`.
+    pub(crate) fn irradiance(
+        &self,
+        scene: &Scene,
+        receiver: &Receiver,
+        gather_rays: usize,
+        seed: u32,
+        rays: &mut u64,
+    ) -> (Vec3, f32) {
         let Some(patches) = &self.patches else { return (Vec3::ZERO, 0.0) };
         // As gather rays start.
         let receiver = Receiver { shadow_origin: receiver.origin, raised: false, ..*receiver };
         let mut shadow = ShadowRays::new(scene);
-        let unoccluded = patches.push(&receiver, self.shadow_rays, seed, &mut shadow);
+        let shadow_rays = (self.shadow_rays * gather_rays as u32).div_ceil(ROUND as u32);
+        let unoccluded = patches.push(&receiver, shadow_rays, seed, &mut shadow);
         let e = shadow.finish(rays);
         // Each ray brings about as much, or nothing.
         let sum = e.element_sum();
-        (e, sum * (unoccluded - sum).max(0.0) / self.shadow_rays as f32)
+        (e, sum * (unoccluded - sum).max(0.0) / shadow_rays as f32)
     }
 }
 

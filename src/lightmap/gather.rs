@@ -142,7 +142,7 @@ impl Gathered {
         let mut rays = points.len() as u64;
         if radiance.bright().len() > 0 {
             let seed = combine(seed, 16 + round as u32);
-            let (e, variance) = radiance.bright().irradiance(scene, receiver, seed, &mut rays);
+            let (e, variance) = radiance.bright().irradiance(scene, receiver, points.len(), seed, &mut rays);
             let scale = points.len() as f32 / PI;
             sum += e * scale;
             squares += variance * scale * scale;

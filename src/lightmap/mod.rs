@@ -11,7 +11,7 @@ pub(crate) mod bright;
 pub mod charts;
 pub mod direct;
 mod distant;
-pub(crate) mod gaps;
+mod gaps;
 pub(crate) mod gather;
 pub mod layout;
 mod light_tree;
@@ -27,6 +27,7 @@ mod spherical;
 mod terminator;
 pub mod texels;
 mod unwrap;
+pub(crate) mod upsample;
 mod walls;
 
 use crate::error::{Result, invalid_argument};
@@ -34,7 +35,6 @@ use crate::memory::Reservation;
 use crate::photon::MAX_PHOTONS;
 use crate::scene::Scene;
 use charts::Charts;
-use gaps::Gaps;
 use glam::Vec3;
 use map::ChartMap;
 use plan::Plan;
@@ -257,38 +257,6 @@ impl Atlas {
     /// A sample of the light map or the gather map as a receiver, on the side that it shows.
     pub(crate) fn receiver(&self, map: &ChartMap, backs: &[bool], sample: usize) -> direct::Receiver {
         map.receiver(&self.scene, sample, self.is_back(map, backs, sample)).1
-    }
-
-    /// A gather map's `values` interpolated at a sample of the light map: between those texels around that lie in a
-    /// gap as it does, or do not as it does not, and behind no wall or crease. Of what is left if none is both, see
-    /// [`gaps`].
-    #[inline]
-    pub(crate) fn interpolate(&self, values: &[Vec3], gaps: &Gaps, sample: usize) -> Vec3 {
-        let t = &self.map.texels.samples[sample];
-        // The gather map has the light map's placements.
-        let placement = self.map.placement_of(&self.charts, sample);
-        let local = self.charts.local(t.triangle, t.u, t.v);
-        let mut all = Vec3::ZERO;
-        if gaps.is_empty() {
-            self.gather.bilinear(placement, local, |s, w| all += w * values[s]);
-            return all;
-        }
-        // The first that is not empty is shown: of what is alike and not apart; alike (to a texel in the open); not apart.
-        let is_open = !gaps.is_in_gap(sample);
-        let mut sums = [(Vec3::ZERO, 0.0); 3];
-        self.gather.bilinear(placement, local, |s, w| {
-            all += w * values[s];
-            let (alike, joined) = (gaps.are_alike(sample, s), !gaps.are_apart(sample, s));
-            for ((sum, part), counts) in sums.iter_mut().zip([alike && joined, alike && is_open, joined]) {
-                if counts {
-                    (*sum, *part) = (*sum + w * values[s], *part + w);
-                }
-            }
-        });
-        match sums.into_iter().find(|(_, part)| *part > 0.0) {
-            Some((sum, part)) if part < 1.0 => sum / part,
-            _ => all,
-        }
     }
 }
 

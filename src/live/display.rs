@@ -4,7 +4,7 @@
 
 use super::blocks::{Block, BlockMap, DirectTile, Rect, TILE};
 use crate::lightmap::blur::{Texels, Window};
-use crate::lightmap::gaps::Gaps;
+use crate::lightmap::upsample::Upsampling;
 use crate::memory::try_vec;
 use crate::scene::NONE;
 use glam::Vec3;
@@ -424,9 +424,9 @@ impl Display {
     }
 
     /// Irradiance shown at a sample of the light map; `with_direct` false: indirect light alone.
-    pub fn irradiance(&self, map: &BlockMap, gaps: &Gaps, sample: u32, with_direct: bool) -> Vec3 {
+    pub fn irradiance(&self, map: &BlockMap, upsampling: &Upsampling, sample: u32, with_direct: bool) -> Vec3 {
         let atlas = &map.atlas;
-        let indirect = atlas.interpolate(&self.shown, gaps, sample as usize);
+        let indirect = upsampling.at(atlas, &self.shown, sample as usize);
         if !with_direct {
             return indirect;
         }

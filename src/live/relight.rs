@@ -10,9 +10,9 @@ use crate::device::{Device, DeviceOptions};
 use crate::error::{Error, Result};
 use crate::lightmap::bake::Bake;
 use crate::lightmap::direct::DirectLight;
-use crate::lightmap::gaps::Gaps;
 use crate::lightmap::plan::{Plan, left_out};
 use crate::lightmap::radiance::Radiance;
+use crate::lightmap::upsample::Upsampling;
 use crate::lightmap::{Atlas, BakeParams, BakeStats};
 use crate::progress::Progress;
 use glam::Vec3;
@@ -32,8 +32,8 @@ pub(super) struct Illumination {
     pub radiance: Arc<Radiance>,
     /// Per chart with one place, whether its back is shown.
     pub backs: Arc<Vec<bool>>,
-    /// On the sides that are shown; none without indirect light.
-    pub gaps: Arc<Gaps>,
+    /// What the light map shows of the gather map on these sides; all as it comes without indirect light.
+    pub upsampling: Arc<Upsampling>,
     /// Whether there is, or ever was, any indirect light.
     pub has_indirect: bool,
     /// Numbers that change with the parts.
@@ -44,8 +44,8 @@ pub(super) struct Illumination {
 /// Radiance map and sides.
 pub(super) struct Indirect {
     radiance: Radiance,
-    /// Which backs are shown, and the gaps there; `None`: as they were.
-    sides: Option<(Vec<bool>, Gaps)>,
+    /// Which backs are shown, and upsampling there; `None`: as they were.
+    sides: Option<(Vec<bool>, Upsampling)>,
     has_indirect: bool,
 }
 
@@ -65,8 +65,8 @@ fn illuminate(
     let sides = if with_sides {
         let backs = bake.backs(&radiance.values);
         let placements = if has_indirect { atlas.map.layout.placements.len() as u32 } else { 0 };
-        let gaps = bake.gaps(&backs, 0..placements)?;
-        Some((backs, gaps))
+        let upsampling = bake.upsampling(&radiance, &backs, 0..placements)?;
+        Some((backs, upsampling))
     } else {
         None
     };
@@ -78,12 +78,12 @@ impl Illumination {
     pub fn new(atlas: &Atlas, params: &BakeParams, progress: &Progress) -> Result<Illumination> {
         let direct = DirectLight::new(&atlas.scene);
         let i = illuminate(atlas, params, &direct, true, progress)?;
-        let (backs, gaps) = i.sides.unwrap_or_default();
+        let (backs, upsampling) = i.sides.unwrap_or_default();
         Ok(Illumination {
             direct: Arc::new(direct),
             radiance: Arc::new(i.radiance),
             backs: Arc::new(backs),
-            gaps: Arc::new(gaps),
+            upsampling: Arc::new(upsampling),
             has_indirect: i.has_indirect,
             direct_epoch: 1,
             indirect_epoch: 1,
@@ -95,8 +95,8 @@ impl Illumination {
         let mut light = Illumination { indirect_epoch: self.indirect_epoch + 1, ..self.clone() };
         if new.has_indirect {
             light.radiance = Arc::new(new.radiance);
-            if let Some((backs, gaps)) = new.sides {
-                light.gaps = Arc::new(gaps);
+            if let Some((backs, upsampling)) = new.sides {
+                light.upsampling = Arc::new(upsampling);
                 if *light.backs != backs {
                     // Other sides are shown: their direct light is another one too.
                     light.direct_epoch += 1;
@@ -106,6 +106,7 @@ impl Illumination {
             light.has_indirect = true;
         } else {
             // All went dark: what is there fades to black, on the sides that are shown.
+            light.upsampling = Arc::default();
             light.radiance =
                 Arc::new(Radiance { values: vec![Vec3::ZERO; self.radiance.values.len()], ..Default::default() });
         }
@@ -239,7 +240,7 @@ mod tests {
             direct: Arc::new(DirectLight::new(&scene)),
             radiance: Arc::new(plain(Vec3::ZERO)),
             backs: Arc::new(vec![false, true]),
-            gaps: Arc::default(),
+            upsampling: Arc::default(),
             has_indirect: true,
             direct_epoch: 1,
             indirect_epoch: 1,
@@ -248,8 +249,11 @@ mod tests {
         let quick = before.renewed(new(None));
         assert_eq!((quick.direct_epoch, quick.indirect_epoch, quick.radiance.values[0]), (1, 2, Vec3::ONE));
         assert_eq!(quick.backs, before.backs);
-        let full = quick.renewed(new(Some((vec![true, true], Gaps::default()))));
+        let full = quick.renewed(new(Some((vec![true, true], Upsampling::default()))));
         assert_eq!((full.direct_epoch, full.indirect_epoch), (2, 3));
         assert_eq!(*full.backs, [true, true]);
+        // Texels that gather for themselves must not go on shining.
+        let dark = full.renewed(Indirect { has_indirect: false, ..new(None) });
+        assert!(!Arc::ptr_eq(&dark.upsampling, &full.upsampling));
     }
 }
