@@ -23,6 +23,8 @@ use glam::{Vec2, Vec3};
 const LEAST: f32 = 0.25;
 
 /// Probes of a disc, and photons looked at, at most. Where there are no more photons, what is seen of them is exact.
+/// (16 or 64, or twice [`FIRST`]: the living room 0.125 to 0.126, Sponza by two lamps 9.4e-3 to 1.1e-2, in the sun 5.2e-2 to
+/// 5.9e-2 with four seeds, in no order.)
 const PROBES: u32 = 32;
 
 /// If these of them are all seen, so are the others, it is supposed: at most points there is no edge nearby. Of a part p
