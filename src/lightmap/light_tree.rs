@@ -199,7 +199,7 @@ impl LightTree {
         offset: f64,
         visit: &mut impl FnMut(usize, f32, u32),
     ) {
-        let samples = |from: f64, to: f64| (to - offset).ceil() - (from - offset).ceil();
+        let samples = |from: f64, to: f64| ceil(to - offset) - ceil(from - offset);
         let right = self.nodes[node as usize].right;
         if right > i32::MAX as u32 {
             return visit(!right as usize, (to - from) as f32, samples(from, to) as u32);
@@ -267,6 +267,13 @@ fn split(lights: &mut [(u32, Bounds)], depth: u32) -> usize {
     lights.sort_by_key(|(_, b)| bin(b, axis) > last);
     let middle = lights.partition_point(|(_, b)| bin(b, axis) <= last);
     if middle == 0 || middle == lights.len() { half } else { middle }
+}
+
+/// Rounds up. (`f64::ceil` is a call into the C library, as SSE4.1 is not taken for granted.)
+#[inline]
+fn ceil(x: f64) -> f64 {
+    let towards_zero = x as i64 as f64;
+    if towards_zero < x { towards_zero + 1.0 } else { towards_zero }
 }
 
 #[cfg(test)]

@@ -87,8 +87,12 @@ impl Upsampling {
         let walls: Vec<(u32, u32)> = found.iter().flat_map(|f| &f.walls).copied().collect();
         let walled = Bits::new(walls.iter().map(|(sample, _)| sample), atlas.map.len())?;
         let alone: Vec<u32> = found.iter().flat_map(|f| &f.alone).copied().collect();
-        let gather_block = |block| gather_for(atlas, backs, own, block);
-        let gathered: Vec<_> = device.install(|| alone.par_chunks(BLOCK).map(gather_block).collect());
+        let gather_block = |block| {
+            stage.advance(0)?;
+            Ok(gather_for(atlas, backs, own, block))
+        };
+        let gathered: Vec<(Vec<Own>, u64)> =
+            device.install(|| alone.par_chunks(BLOCK).map(gather_block).collect::<Result<_>>())?;
         let own: Vec<Own> = gathered.iter().flat_map(|(own, _)| own).copied().collect();
         let own = device.install(|| blurred(atlas, &own))?;
         let gathers = Bits::new(own.iter().map(|(sample, _)| sample), atlas.map.len())?;
@@ -184,10 +188,12 @@ fn blurred(atlas: &Atlas, own: &[Own]) -> Result<Vec<(u32, Vec3)>> {
     let blur = |this: &Own| {
         let (x, y) = atlas.map.position(this.sample as usize);
         let placement = atlas.map.placement_of(&atlas.charts, this.sample as usize);
+        let of_placement = atlas.map.samples_of(placement);
         let (mut sum, mut total) = (Vec3::ZERO, 0.0);
         for (dx, dy) in (-RADIUS..=RADIUS).flat_map(|dy| (-RADIUS..=RADIUS).map(move |dx| (dx, dy))) {
             let s = atlas.map.at(placement, x + dx, y + dy);
-            if s == NONE || !gathers.has(s as usize) {
+            // Among given charts there may be another one, which other shards bake.
+            if s == NONE || !of_placement.contains(&(s as usize)) || !gathers.has(s as usize) {
                 continue;
             }
             if let Ok(i) = own.binary_search_by_key(&s, |own| own.sample) {
@@ -309,7 +315,13 @@ pub(super) mod tests {
 
     /// Upsampling where all surfaces send out `radiance`.
     pub(crate) fn lit(atlas: &Atlas, placements: Range<u32>, backs: &[bool], radiance: f32) -> Upsampling {
-        let radiance = Radiance { values: vec![Vec3::splat(radiance); atlas.radiance.len()], ..Default::default() };
+        lit_by(atlas, placements, backs, |_| radiance)
+    }
+
+    /// Upsampling where each texel of the radiance map sends out its own radiance.
+    fn lit_by(atlas: &Atlas, placements: Range<u32>, backs: &[bool], radiance: impl Fn(usize) -> f32) -> Upsampling {
+        let values = (0..atlas.radiance.len()).map(|s| Vec3::splat(radiance(s))).collect();
+        let radiance = Radiance { values, ..Default::default() };
         let own = OwnRays {
             radiance: RadianceMap::new(&atlas.charts, &atlas.radiance, &radiance),
             samples: &SampleSet::new(OWN_RAYS, 0),
@@ -412,37 +424,44 @@ pub(super) mod tests {
         assert_eq!(shown(&[], others, &[0.5]), 0.5);
     }
 
-    /// A sheet of 4 × 4 with a face 60 mm high across it, in one chart in a closed room: no gather texel is on that face,
-    /// or hardly one.
-    #[test]
-    fn narrow_faces_gather_for_themselves() {
-        const STEP: f32 = 0.06;
+    /// Folded sheets 4 m long in a closed room, each along a profile of (x, z) that it is unfolded from, side by side in one
+    /// page without a gap.
+    fn folded(profiles: &[&[[f32; 2]]]) -> Lightmap {
         let mut data = SceneData::new();
         let m = data.add_material(Material { two_sided: true, ..Default::default() }).unwrap();
-        let mut builder = MeshBuilder::new();
-        // Along the sheet, across the fold: 0 to 1, up by STEP, on to 3.
-        let profile = [(-2.0, 0.0), (0.013, 0.0), (0.013, STEP), (2.0, STEP)];
-        builder.sheet(3, 1, m, |u, v| {
-            let (x, z) = profile[(u * 3.0).round() as usize];
-            Vec3::new(x, 4.0 * v - 2.0, z)
-        });
-        let mut mesh = builder.finish();
-        let unfolded = |p: &Vec3| Vec2::new(p.x + p.z, p.y) * 0.2 + 0.5;
-        mesh.lightmap = Some(LightmapUvs { uvs: mesh.positions.iter().map(unfolded).collect(), pages: Vec::new() });
-        data.add_mesh(mesh).unwrap();
+        let mut start = 0.0;
+        for profile in profiles {
+            let mut builder = MeshBuilder::new();
+            let parts = profile.len() as u32 - 1;
+            builder.sheet(parts, 1, m, |u, v| {
+                let [x, z] = profile[(u * parts as f32).round() as usize];
+                Vec3::new(x, 4.0 * v - 2.0, z)
+            });
+            let mut mesh = builder.finish();
+            let along = |p: &Vec3| (p.x - profile[0][0]).abs() + (p.z - profile[0][1]).abs();
+            let unfolded = |p: &Vec3| Vec2::new(start + 0.2 * along(p), 0.2 * p.y + 0.5);
+            mesh.lightmap = Some(LightmapUvs { uvs: mesh.positions.iter().map(unfolded).collect(), pages: Vec::new() });
+            start = mesh.positions.iter().map(|p| unfolded(p).x).fold(0.0, f32::max);
+            data.add_mesh(mesh).unwrap();
+        }
         let mut room = MeshBuilder::new();
-        room.box_(Vec3::splat(-3.0), Vec3::splat(3.0), true, m);
+        room.box_(Vec3::splat(-5.0), Vec3::splat(5.0), true, m);
         data.add_mesh(room.finish()).unwrap();
         let desc = LightmapDesc { texels_per_unit: 50.0, gather_divisor: 8, ..Default::default() };
-        let lightmap = Lightmap::create(&data.committed(), &desc, &Progress::none()).unwrap();
+        Lightmap::create(&data.committed(), &desc, &Progress::none()).unwrap()
+    }
+
+    /// A face 60 mm high across a sheet: no gather texel is on it.
+    #[test]
+    fn narrow_faces_gather_for_themselves() {
+        let lightmap = folded(&[&[[-2.0, 0.0], [0.013, 0.0], [0.013, 0.06], [2.0, 0.06]]]);
         let atlas = lightmap.atlas();
-        let chart = atlas.charts.chart_of[0];
         let is_on_face = |map: &ChartMap, s: &usize| map.surface(&atlas.scene, *s).1.x.abs() > 0.5;
-        assert_eq!(atlas.gather.samples_of(chart).filter(|s| is_on_face(&atlas.gather, s)).count(), 0);
-        let upsampling = lit(atlas, chart..chart + 1, &[], 1.0);
+        assert_eq!(atlas.gather.samples_of(0).filter(|s| is_on_face(&atlas.gather, s)).count(), 0);
+        let upsampling = lit(atlas, 0..1, &[], 1.0);
         let dark = vec![Vec3::ZERO; atlas.gather.len()];
         let (mut on_face, mut elsewhere) = (0, 0);
-        for s in atlas.map.samples_of(chart) {
+        for s in atlas.map.samples_of(0) {
             let shown = upsampling.at(atlas, &dark, s).x;
             if is_on_face(&atlas.map, &s) {
                 assert!((shown - std::f32::consts::PI).abs() < 1e-5, "{shown} on the face");
@@ -451,9 +470,26 @@ pub(super) mod tests {
                 elsewhere += u32::from(shown != 0.0);
             }
         }
-        // Below and above the face some lie in its corner, behind the fold of all gather texels around.
         assert!(on_face >= 400 && elsewhere <= on_face / 4, "{on_face} and {elsewhere}");
-        assert!(upsampling.rays > on_face as u64 * OWN_RAYS as u64);
+        assert!(upsampling.rays > u64::from(on_face * OWN_RAYS));
+    }
+
+    /// Faces of two charts beside each other in the page: shards bake one without the other.
+    #[test]
+    fn what_texels_gather_is_blurred_within_their_chart() {
+        let face = [[0.0, 0.0], [0.0, 0.06], [2.0, 0.06]];
+        let lightmap = folded(&[&[[-2.0, -0.06], [-0.3, -0.06], [-0.3, 0.0]], &face]);
+        let atlas = lightmap.atlas();
+        assert_eq!(atlas.map.layout.given, 2);
+        let at = |s: u32| (atlas.map.position(s as usize), atlas.map.placement_of(&atlas.charts, s as usize));
+        let both = lit(atlas, 0..2, &[], 1.0).own;
+        let beside = |&((x, y), placement): &((i32, i32), u32)| {
+            placement == 0 && both.iter().any(|&(s, _)| at(s) == ((x + 1, y), 1))
+        };
+        assert!(both.iter().map(|(s, _)| at(*s)).filter(beside).count() > 50);
+        // Unequal rays, so that what is blurred shows whom with.
+        let own = |placements: Range<u32>| lit_by(atlas, placements, &[], |s| (s % 7) as f32).own;
+        assert_eq!(own(0..2), [own(0..1), own(1..2)].concat());
     }
 
     /// A wall between two rooms, and a poster 5 mm behind a part of it.
