@@ -11,7 +11,7 @@ use super::radiance::{self, Radiance, RadianceInput, RadianceMap};
 use super::seams::Stitch;
 use super::sides;
 use super::texels::TexelMap;
-use super::upsample::{OWN_RAYS, OwnRays, Upsampling};
+use super::upsample::{OWN_RAYS, OwnLight, OwnRays, Upsampling};
 use super::{Atlas, BakeParams, BakeStats, Light, Lightmap, LightmapDesc, LightmapInfo, StageStats, TexelState, blur};
 use crate::device::LogLevel;
 use crate::error::{Error, Result, invalid_argument};
@@ -207,6 +207,7 @@ pub(crate) struct Bake<'a, 'p> {
 struct Indirect {
     irradiance: Vec<Vec3>,
     upsampling: Upsampling,
+    own: OwnLight,
 }
 
 impl Bake<'_, '_> {
@@ -325,7 +326,8 @@ impl Bake<'_, '_> {
             ..l.map.texels.placement_of(self.range.end as u32 - 1) + 1;
         let needed = l.gather.texels.chart_start[placements.start as usize] as usize
             ..l.gather.texels.chart_start[placements.end as usize] as usize;
-        let upsampling = self.upsampling(radiance, backs, placements)?;
+        let upsampling = self.upsampling(backs, placements)?;
+        let (own, own_rays) = self.own_light(radiance, backs, &upsampling)?;
         let lookup = RadianceMap::new(&l.charts, &l.radiance, radiance);
         let samples = SampleSet::new(self.params.gather_rays, purpose_seed(self.params.seed, purpose::GATHER_SET));
         let seed = purpose_seed(self.params.seed, purpose::GATHER);
@@ -335,7 +337,7 @@ impl Bake<'_, '_> {
         let mut normals: Vec<Vec3> = try_vec(n, "the gather map's normals")?;
         let mut variances: Vec<f32> = try_vec(n, "the gather map's variance")?;
         let mut valid: Vec<bool> = try_vec(n, "the gather map's validity")?;
-        let rays = AtomicU64::new(upsampling.rays);
+        let rays = AtomicU64::new(upsampling.rays + own_rays);
         device.install(|| {
             let values = irradiance[needed.clone()].par_chunks_mut(BLOCK);
             let normals = normals[needed.clone()].par_chunks_mut(BLOCK);
@@ -371,22 +373,31 @@ impl Bake<'_, '_> {
         }
         let bytes = (n * GATHER_BYTES + l.gather.bytes()) as u64;
         stats.gather = StageStats { seconds: start.elapsed().as_secs_f64(), rays: rays.into_inner(), bytes };
-        Ok(Indirect { irradiance, upsampling })
+        Ok(Indirect { irradiance, upsampling, own })
     }
 
     /// How the light map shows some placements of the gather map.
-    pub(crate) fn upsampling(&self, radiance: &Radiance, backs: &[bool], placements: Range<u32>) -> Result<Upsampling> {
+    pub(crate) fn upsampling(&self, backs: &[bool], placements: Range<u32>) -> Result<Upsampling> {
+        let stage = self.progress.stage("upsampling", 0.3, 0.315, placements.len() as u64);
+        Upsampling::find(self.atlas, placements, backs, &stage)
+    }
+
+    /// Light of the texels that no gather texel stands for, and the rays that it takes.
+    pub(crate) fn own_light(
+        &self,
+        radiance: &Radiance,
+        backs: &[bool],
+        upsampling: &Upsampling,
+    ) -> Result<(OwnLight, u64)> {
         let l = self.atlas;
-        let own = OwnRays {
+        let count = self.params.gather_rays.min(OWN_RAYS);
+        let rays = OwnRays {
             radiance: RadianceMap::new(&l.charts, &l.radiance, radiance),
-            samples: &SampleSet::new(
-                self.params.gather_rays.min(OWN_RAYS),
-                purpose_seed(self.params.seed, purpose::GATHER_SET),
-            ),
+            samples: &SampleSet::new(count, purpose_seed(self.params.seed, purpose::GATHER_SET)),
             seed: purpose_seed(self.params.seed, purpose::OWN),
         };
-        let stage = self.progress.stage("upsampling", 0.3, 0.32, placements.len() as u64);
-        Upsampling::find(l, placements, backs, &own, &stage)
+        let stage = self.progress.stage("own light", 0.315, 0.32, upsampling.own_work());
+        upsampling.own_light(l, backs, &rays, &stage)
     }
 
     /// Direct light and the interpolated indirect light of every texel of the range.
@@ -416,7 +427,7 @@ impl Bake<'_, '_> {
                     let receiver = l.receiver(&l.map, backs, sample);
                     state[i] = TexelState::Visible;
                     if let Some(indirect) = indirect {
-                        ind[i] = indirect.upsampling.at(l, &indirect.irradiance, sample);
+                        ind[i] = indirect.upsampling.at(l, &indirect.irradiance, &indirect.own, sample);
                     }
                     if is_lit && is_buried(scene, receiver.origin, receiver.geometric, &mut traced) {
                         state[i] = TexelState::Hidden;

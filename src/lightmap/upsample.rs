@@ -2,8 +2,8 @@
 //! Uyttendaele, 2007).
 //!
 //! A texel of the light map interpolates between those gather texels around it that lie in a [gap](super::gaps) as it does
-//! itself, or do not as it does not, and are behind no [wall or crease](super::walls). What is in the open and finds none,
-//! as a narrow face of a moulding, gathers for itself: a few rays, blurred among its like.
+//! itself, or do not as it does not, and are behind no [wall or crease](super::walls). What lies in no gap that is known of
+//! and finds none in the open, as a narrow face of a moulding, is on its own: it gathers a few rays, blurred among its like.
 //!
 //! Rays of their own, 20 texels/m, 1.8 % of the texels of Sponza and 3 % of the living room's: all points of Sponza by two
 //! lamps 1.36e-2 -> 0.95e-2, in the sun 5.0e-2 -> 5.4e-2, the living room without the worst hundredth 4.2e-3 -> 4.1e-3; its
@@ -27,35 +27,40 @@ use glam::Vec3;
 use rayon::prelude::*;
 use std::ops::Range;
 
-/// Texels with rays of their own that a thread takes at a time.
+/// Texels on their own that a thread takes at a time.
 const BLOCK: usize = 64;
 
-/// Rays of their own per texel, at most.
+/// A cancel is looked for whenever so many texels of a placement have been looked at.
+pub(super) const TEXELS_PER_CHECK: usize = 256;
+
+/// Rays of a texel on its own, at most.
 pub(super) const OWN_RAYS: u32 = 16;
 
 /// What they bring is blurred over so many texels of the light map to each side.
 const RADIUS: i32 = 2;
 
-/// What texels of the light map show of the gather map.
+/// What texels of the light map show of the gather map. Depends on the scene and the sides that are shown, not on light.
 #[derive(Default)]
 pub(crate) struct Upsampling {
     /// Gather texels in gaps.
-    gather: Bits,
-    /// Texels of the light map in gaps, of those around which some gather texel is.
-    map: Bits,
+    gather_gaps: Bits,
+    /// Texels of the light map in gaps, of those around which some gather texel is in one.
+    map_gaps: Bits,
     /// Texels of the light map of which `walls` tells.
     walled: Bits,
     /// A texel of the light map and one of the gather map behind a wall or a crease, in ascending order; never all around
     /// a texel.
     walls: Vec<(u32, u32)>,
-    /// Texels of the light map of which `own` tells.
-    gathers: Bits,
-    /// Texels of the light map and the indirect irradiance that they gathered themselves, in ascending order.
-    own: Vec<(u32, Vec3)>,
+    is_alone: Bits,
+    /// Texels of the light map on their own, in ascending order.
+    alone: Vec<u32>,
     /// Rays that it took.
     pub rays: u64,
     _memory: Option<Reservation>,
 }
+
+/// Indirect irradiance of the texels that an [`Upsampling`] finds alone, in its order; `None` inside of solids.
+pub(crate) type OwnLight = Vec<Option<Vec3>>;
 
 /// How texels gather for themselves.
 pub(crate) struct OwnRays<'a> {
@@ -68,57 +73,79 @@ pub(crate) struct OwnRays<'a> {
 impl Upsampling {
     /// Of some `placements` of an atlas, on the sides that `backs` tells of charts with one place. Advances `stage` by
     /// one per placement.
-    pub(crate) fn find(
-        atlas: &Atlas,
-        placements: Range<u32>,
-        backs: &[bool],
-        own: &OwnRays,
-        stage: &Stage,
-    ) -> Result<Upsampling> {
+    pub(crate) fn find(atlas: &Atlas, placements: Range<u32>, backs: &[bool], stage: &Stage) -> Result<Upsampling> {
         let of_placement = |placement: u32| {
+            let found = Found::in_placement(atlas, backs, placement, stage)?;
             stage.advance(1)?;
-            Ok(Found::in_placement(atlas, backs, placement))
+            Ok(found)
         };
         let device = atlas.scene.device();
         let found: Vec<Found> =
             device.install(|| placements.into_par_iter().map(of_placement).collect::<Result<_>>())?;
-        let gather = Bits::new(found.iter().flat_map(|f| &f.gather), atlas.gather.len())?;
-        let map = Bits::new(found.iter().flat_map(|f| &f.map), atlas.map.len())?;
+        let gather_gaps = Bits::new(found.iter().flat_map(|f| &f.gather_gaps), atlas.gather.len())?;
+        let map_gaps = Bits::new(found.iter().flat_map(|f| &f.map_gaps), atlas.map.len())?;
         let walls: Vec<(u32, u32)> = found.iter().flat_map(|f| &f.walls).copied().collect();
         let walled = Bits::new(walls.iter().map(|(sample, _)| sample), atlas.map.len())?;
         let alone: Vec<u32> = found.iter().flat_map(|f| &f.alone).copied().collect();
-        let gather_block = |block| {
-            stage.advance(0)?;
-            Ok(gather_for(atlas, backs, own, block))
-        };
-        let gathered: Vec<(Vec<Own>, u64)> =
-            device.install(|| alone.par_chunks(BLOCK).map(gather_block).collect::<Result<_>>())?;
-        let own: Vec<Own> = gathered.iter().flat_map(|(own, _)| own).copied().collect();
-        let own = device.install(|| blurred(atlas, &own))?;
-        let gathers = Bits::new(own.iter().map(|(sample, _)| sample), atlas.map.len())?;
-        let rays = found.iter().map(|f| f.rays).chain(gathered.iter().map(|(_, rays)| *rays)).sum();
-        let bits: usize = [&gather, &map, &walled, &gathers].into_iter().map(Bits::bytes).sum();
-        let bytes = bits + size_of_val(&walls[..]) + size_of_val(&own[..]);
+        let is_alone = Bits::new(alone.iter(), atlas.map.len())?;
+        let rays = found.iter().map(|f| f.rays).sum();
+        let bits: usize = [&gather_gaps, &map_gaps, &walled, &is_alone].into_iter().map(Bits::bytes).sum();
+        let own = alone.len() * size_of::<Option<Vec3>>();
+        let bytes = bits + size_of_val(&walls[..]) + size_of_val(&alone[..]) + own;
         let memory = device.memory().reserve(bytes, "what the light map shows of the gather map")?;
-        Ok(Upsampling { gather, map, walled, walls, gathers, own, rays, _memory: Some(memory) })
+        Ok(Upsampling { gather_gaps, map_gaps, walled, walls, is_alone, alone, rays, _memory: Some(memory) })
+    }
+
+    /// What the texels on their own gather, and the rays that it takes. Advances `stage` by
+    /// [`own_work`](Self::own_work).
+    pub(crate) fn own_light(
+        &self,
+        atlas: &Atlas,
+        backs: &[bool],
+        rays: &OwnRays,
+        stage: &Stage,
+    ) -> Result<(OwnLight, u64)> {
+        let gather_block = |texels: &[u32]| {
+            let gathered = gather_for(atlas, backs, rays, texels);
+            stage.advance(texels.len() as u64)?;
+            Ok(gathered)
+        };
+        atlas.scene.device().install(|| {
+            let blocks: Vec<(Vec<Own>, u64)> = self.alone.par_chunks(BLOCK).map(gather_block).collect::<Result<_>>()?;
+            let own: Vec<Own> = blocks.iter().flat_map(|(own, _)| own).copied().collect();
+            let blur_block = |begin: usize| {
+                let end = own.len().min(begin + BLOCK);
+                stage.advance((end - begin) as u64)?;
+                Ok((begin..end).map(|i| self.blurred(atlas, &own, i)).collect::<Vec<_>>())
+            };
+            let starts = (0..own.len()).into_par_iter().step_by(BLOCK);
+            let light: Vec<OwnLight> = starts.map(blur_block).collect::<Result<_>>()?;
+            Ok((light.concat(), blocks.iter().map(|(_, rays)| rays).sum()))
+        })
+    }
+
+    /// Steps of [`own_light`](Self::own_light).
+    pub(crate) fn own_work(&self) -> u64 {
+        2 * self.alone.len() as u64
     }
 
     /// A gather map's `values` as a sample of the light map shows them.
     #[inline]
-    pub(crate) fn at(&self, atlas: &Atlas, values: &[Vec3], sample: usize) -> Vec3 {
-        if self.gathers.has(sample)
-            && let Ok(i) = self.own.binary_search_by_key(&(sample as u32), |(s, _)| *s)
+    pub(crate) fn at(&self, atlas: &Atlas, values: &[Vec3], own: &OwnLight, sample: usize) -> Vec3 {
+        if self.is_alone.has(sample)
+            && let Ok(i) = self.alone.binary_search(&(sample as u32))
+            && let Some(irradiance) = own[i]
         {
-            return self.own[i].1;
+            return irradiance;
         }
         let mut all = Vec3::ZERO;
         if self.is_plain() {
-            around(atlas, sample, |s, w| all += w * values[s]);
+            atlas.gather_around(sample, |s, w| all += w * values[s]);
             return all;
         }
         // What is both, or where none is, what is joined.
         let mut sums = [(Vec3::ZERO, 0.0); 2];
-        around(atlas, sample, |s, w| {
+        atlas.gather_around(sample, |s, w| {
             all += w * values[s];
             let is_joined = !self.are_apart(sample, s);
             for ((sum, part), counts) in sums.iter_mut().zip([is_joined && self.are_alike(sample, s), is_joined]) {
@@ -136,7 +163,7 @@ impl Upsampling {
     /// Whether a texel of the light map and one of the gather map both lie in gaps, or neither.
     #[inline]
     fn are_alike(&self, map: usize, gather: usize) -> bool {
-        self.map.has(map) == self.gather.has(gather)
+        self.map_gaps.has(map) == self.gather_gaps.has(gather)
     }
 
     #[inline]
@@ -144,118 +171,112 @@ impl Upsampling {
         self.walled.has(map) && self.walls.binary_search(&(map as u32, gather as u32)).is_ok()
     }
 
-    /// Whether all is interpolated as it comes, but for texels that gather for themselves.
+    /// Whether all is interpolated as it comes, but for texels on their own.
     #[inline]
     pub(super) fn is_plain(&self) -> bool {
-        self.gather.words.is_empty() && self.walls.is_empty()
+        self.gather_gaps.words.is_empty() && self.walls.is_empty()
+    }
+
+    /// The mean of what texels on their own within [`RADIUS`] in the same chart gathered that face the same way as number
+    /// `i`. (Whether a wall thinner than that is between them is not asked.)
+    fn blurred(&self, atlas: &Atlas, own: &[Own], i: usize) -> Option<Vec3> {
+        let (sample, normal) = (self.alone[i] as usize, own[i].normal);
+        own[i].irradiance?;
+        let (x, y) = atlas.map.position(sample);
+        let placement = atlas.map.placement_of(&atlas.charts, sample);
+        let of_placement = atlas.map.samples_of(placement);
+        let (mut sum, mut total) = (Vec3::ZERO, 0.0);
+        for (dx, dy) in (-RADIUS..=RADIUS).flat_map(|dy| (-RADIUS..=RADIUS).map(move |dx| (dx, dy))) {
+            let s = atlas.map.at(placement, x + dx, y + dy);
+            // Among given charts there may be another one, which other shards bake.
+            if s == NONE || !of_placement.contains(&(s as usize)) || !self.is_alone.has(s as usize) {
+                continue;
+            }
+            if let Ok(k) = self.alone.binary_search(&s)
+                && let Some(irradiance) = own[k].irradiance
+            {
+                let weight = normal.dot(own[k].normal).max(0.0).powi(4);
+                (sum, total) = (sum + weight * irradiance, total + weight);
+            }
+        }
+        if total > 0.0 { Some(sum / total) } else { own[i].irradiance }
     }
 }
 
-/// The gather texels around a sample of the light map, with their bilinear weights.
-#[inline]
-pub(super) fn around(atlas: &Atlas, sample: usize, visit: impl FnMut(usize, f32)) {
-    let t = &atlas.map.texels.samples[sample];
-    // The gather map has the light map's placements.
-    let placement = atlas.map.placement_of(&atlas.charts, sample);
-    atlas.gather.bilinear(placement, atlas.charts.local(t.triangle, t.u, t.v), visit);
-}
-
-/// What a texel of the light map gathered.
+/// What a texel on its own gathered.
 #[derive(Clone, Copy)]
 struct Own {
-    sample: u32,
-    irradiance: Vec3,
+    /// `None` inside of a solid.
+    irradiance: Option<Vec3>,
     normal: Vec3,
 }
 
-/// What texels of the light map gather that do not lie inside of a solid, and the rays that it took.
-fn gather_for(atlas: &Atlas, backs: &[bool], own: &OwnRays, samples: &[u32]) -> (Vec<Own>, u64) {
+/// What some texels of the light map gather, and the rays that it took.
+fn gather_for(atlas: &Atlas, backs: &[bool], own: &OwnRays, texels: &[u32]) -> (Vec<Own>, u64) {
     let mut rays = 0;
     let gather = |&sample: &u32| {
         let receiver = atlas.receiver(&atlas.map, backs, sample as usize);
         let mut gathered = Gathered::default();
         let seed = combine(own.seed, sample);
         rays += gathered.add_round(&atlas.scene, &own.radiance, &receiver, own.samples, 0, seed);
-        gathered.is_visible().then(|| Own { sample, irradiance: gathered.irradiance(), normal: receiver.normal })
+        Own { irradiance: gathered.is_visible().then(|| gathered.irradiance()), normal: receiver.normal }
     };
-    let values = samples.iter().filter_map(gather).collect();
-    (values, rays)
-}
-
-/// The mean of what texels within [`RADIUS`] in the same chart gathered that face the same way.
-fn blurred(atlas: &Atlas, own: &[Own]) -> Result<Vec<(u32, Vec3)>> {
-    let gathers = Bits::new(own.iter().map(|own| &own.sample), atlas.map.len())?;
-    let blur = |this: &Own| {
-        let (x, y) = atlas.map.position(this.sample as usize);
-        let placement = atlas.map.placement_of(&atlas.charts, this.sample as usize);
-        let of_placement = atlas.map.samples_of(placement);
-        let (mut sum, mut total) = (Vec3::ZERO, 0.0);
-        for (dx, dy) in (-RADIUS..=RADIUS).flat_map(|dy| (-RADIUS..=RADIUS).map(move |dx| (dx, dy))) {
-            let s = atlas.map.at(placement, x + dx, y + dy);
-            // Among given charts there may be another one, which other shards bake.
-            if s == NONE || !of_placement.contains(&(s as usize)) || !gathers.has(s as usize) {
-                continue;
-            }
-            if let Ok(i) = own.binary_search_by_key(&s, |own| own.sample) {
-                let weight = this.normal.dot(own[i].normal).max(0.0).powi(4);
-                (sum, total) = (sum + weight * own[i].irradiance, total + weight);
-            }
-        }
-        (this.sample, if total > 0.0 { sum / total } else { this.irradiance })
-    };
-    Ok(own.par_iter().map(blur).collect())
+    let gathered = texels.iter().map(gather).collect();
+    (gathered, rays)
 }
 
 /// What there is to heed in a placement.
 #[derive(Default)]
 struct Found {
-    gather: Vec<u32>,
-    map: Vec<u32>,
+    gather_gaps: Vec<u32>,
+    map_gaps: Vec<u32>,
     walls: Vec<(u32, u32)>,
-    /// Texels of the light map in the open that see no gather texel in the open around them.
     alone: Vec<u32>,
     rays: u64,
 }
 
 impl Found {
-    fn in_placement(atlas: &Atlas, backs: &[bool], placement: u32) -> Found {
+    fn in_placement(atlas: &Atlas, backs: &[bool], placement: u32, stage: &Stage) -> Result<Found> {
         let (gather, map) = (&atlas.gather, &atlas.map);
         let mut found = Found::default();
-        let apart = walls::between(atlas, placement, backs, &mut found.rays);
+        let apart = walls::between(atlas, placement, backs, stage, &mut found.rays)?;
         let scale = gather.layout.placements[placement as usize].scale;
         let texel = 1.0 / scale[0].min(scale[1]);
         let mut is_in_gap = |map: &ChartMap, sample: usize| {
             let receiver = atlas.receiver(map, backs, sample);
             is_in_gap(&atlas.scene, &receiver, texel, sample as u32, &mut found.rays)
         };
-        let own = gather.samples_of(placement);
-        let gaps: Vec<bool> = own.clone().map(|s| is_in_gap(gather, s)).collect();
-        found.gather.extend(own.clone().filter(|s| gaps[s - own.start]).map(|s| s as u32));
+        let of_gather = gather.samples_of(placement);
+        let gaps: Vec<bool> = of_gather.clone().map(|s| is_in_gap(gather, s)).collect();
+        found.gather_gaps.extend(of_gather.clone().filter(|s| gaps[s - of_gather.start]).map(|s| s as u32));
         let mut end = 0;
-        for sample in map.samples_of(placement) {
+        for (i, sample) in map.samples_of(placement).enumerate() {
+            if i % TEXELS_PER_CHECK == 0 {
+                stage.advance(0)?;
+            }
             let (begin, this) = (end, sample as u32);
             end += apart[begin..].iter().take_while(|(s, _)| *s == this).count();
             let apart = &apart[begin..end];
-            if apart.is_empty() && found.gather.is_empty() {
+            if apart.is_empty() && found.gather_gaps.is_empty() {
                 continue;
             }
             let (mut n, mut has_gap, mut sees_open) = (0, false, false);
-            around(atlas, sample, |s, _| {
-                let is_gap = gaps[s - own.start];
+            atlas.gather_around(sample, |s, _| {
+                let is_gap = gaps[s - of_gather.start];
                 n += 1;
                 has_gap |= is_gap;
                 sees_open |= !is_gap && !apart.contains(&(this, s as u32));
             });
             if has_gap && is_in_gap(map, sample) {
-                found.map.push(this);
-            } else if !sees_open {
+                found.map_gaps.push(this);
+            } else if !sees_open && n > 0 {
                 found.alone.push(this);
             }
             if apart.len() < n {
                 found.walls.extend(apart);
             }
         }
-        found
+        Ok(found)
     }
 }
 
@@ -270,7 +291,7 @@ impl Bits {
         let mut words = Vec::new();
         for &i in ones {
             if words.is_empty() {
-                words = try_vec(n.div_ceil(64), "the texels in gaps")?;
+                words = try_vec(n.div_ceil(64), "what the light map shows of the gather map")?;
             }
             words[i as usize / 64] |= 1 << (i % 64);
         }
@@ -313,23 +334,30 @@ pub(super) mod tests {
         Lightmap::create(&scene, &desc, &Progress::none()).unwrap()
     }
 
-    /// Upsampling where all surfaces send out `radiance`.
-    pub(crate) fn lit(atlas: &Atlas, placements: Range<u32>, backs: &[bool], radiance: f32) -> Upsampling {
-        lit_by(atlas, placements, backs, |_| radiance)
+    /// Upsampling of some placements.
+    pub(crate) fn find(atlas: &Atlas, placements: Range<u32>, backs: &[bool]) -> Upsampling {
+        let progress = Progress::none();
+        let stage = progress.stage("upsampling", 0.0, 1.0, placements.len() as u64);
+        Upsampling::find(atlas, placements, backs, &stage).unwrap()
     }
 
-    /// Upsampling where each texel of the radiance map sends out its own radiance.
-    fn lit_by(atlas: &Atlas, placements: Range<u32>, backs: &[bool], radiance: impl Fn(usize) -> f32) -> Upsampling {
+    /// What texels gather for themselves where each texel of the radiance map sends out its own radiance; and the rays.
+    fn own_light(atlas: &Atlas, upsampling: &Upsampling, radiance: impl Fn(usize) -> f32) -> (OwnLight, u64) {
         let values = (0..atlas.radiance.len()).map(|s| Vec3::splat(radiance(s))).collect();
         let radiance = Radiance { values, ..Default::default() };
-        let own = OwnRays {
+        let rays = OwnRays {
             radiance: RadianceMap::new(&atlas.charts, &atlas.radiance, &radiance),
             samples: &SampleSet::new(OWN_RAYS, 0),
             seed: 0,
         };
         let progress = Progress::none();
-        let stage = progress.stage("upsampling", 0.0, 1.0, placements.len() as u64);
-        Upsampling::find(atlas, placements, backs, &own, &stage).unwrap()
+        let stage = progress.stage("own light", 0.0, 1.0, upsampling.own_work());
+        upsampling.own_light(atlas, &[], &rays, &stage).unwrap()
+    }
+
+    /// No light of their own.
+    pub(crate) fn dark(upsampling: &Upsampling) -> OwnLight {
+        vec![Some(Vec3::ZERO); upsampling.alone.len()]
     }
 
     #[test]
@@ -337,20 +365,20 @@ pub(super) mod tests {
         let lightmap = carpet();
         let atlas = lightmap.atlas();
         let (floor, sheet) = (atlas.charts.chart_of[0], atlas.charts.chart_of[2]);
-        let find = |backs: &[bool]| lit(atlas, 0..2, backs, 0.0);
+        let find = |backs: &[bool]| find(atlas, 0..2, backs);
         let gaps = find(&[]);
         for s in atlas.gather.samples_of(floor) {
             let x = atlas.gather.surface(&atlas.scene, s).0.x;
-            assert!(gaps.gather.has(s) == (x < 0.0) || x.abs() < 0.05, "gather texel at {x}");
+            assert!(gaps.gather_gaps.has(s) == (x < 0.0) || x.abs() < 0.05, "gather texel at {x}");
         }
         // Near the edge of the sheet a ray more or less gets out.
         let x = |s: usize| atlas.map.surface(&atlas.scene, s).0.x;
         let below: Vec<usize> = atlas.map.samples_of(floor).filter(|&s| x(s) > -0.1 && x(s) < -0.05).collect();
-        let found = below.iter().filter(|s| gaps.map.has(**s)).count();
+        let found = below.iter().filter(|s| gaps.map_gaps.has(**s)).count();
         assert!(below.len() >= 80 && found > below.len() / 2, "{found} of {}", below.len());
-        assert_eq!(atlas.map.samples_of(floor).filter(|&s| x(s) > 0.0 && gaps.map.has(s)).count(), 0);
-        assert!(atlas.gather.samples_of(sheet).all(|s| !gaps.gather.has(s)));
-        assert_eq!(atlas.map.samples_of(sheet).filter(|&s| gaps.map.has(s)).count(), 0);
+        assert_eq!(atlas.map.samples_of(floor).filter(|&s| x(s) > 0.0 && gaps.map_gaps.has(s)).count(), 0);
+        assert!(atlas.gather.samples_of(sheet).all(|s| !gaps.gather_gaps.has(s)));
+        assert_eq!(atlas.map.samples_of(sheet).filter(|&s| gaps.map_gaps.has(s)).count(), 0);
 
         let mut backs = [false; 2];
         backs[sheet as usize] = true;
@@ -359,38 +387,38 @@ pub(super) mod tests {
             let p = atlas.gather.surface(&atlas.scene, *s).0;
             p.x > -1.8 && p.x < -0.2 && p.y.abs() < 1.8
         };
-        assert!(atlas.gather.samples_of(sheet).filter(is_inner).all(|s| below.gather.has(s)));
-        assert!(atlas.gather.samples_of(floor).all(|s| below.gather.has(s) == gaps.gather.has(s)));
+        assert!(atlas.gather.samples_of(sheet).filter(is_inner).all(|s| below.gather_gaps.has(s)));
+        assert!(atlas.gather.samples_of(floor).all(|s| below.gather_gaps.has(s) == gaps.gather_gaps.has(s)));
     }
 
     #[test]
     fn light_is_interpolated_within_gaps_and_outside_of_them() {
         let lightmap = carpet();
         let atlas = lightmap.atlas();
-        let gaps = lit(atlas, 0..2, &[], 0.0);
-        let light = |s: usize| if gaps.gather.has(s) { Vec3::ZERO } else { Vec3::ONE };
+        let gaps = find(atlas, 0..2, &[]);
+        let light = |s: usize| if gaps.gather_gaps.has(s) { Vec3::ZERO } else { Vec3::ONE };
         let values: Vec<Vec3> = (0..atlas.gather.len()).map(light).collect();
         let mut mixed = 0;
         for s in 0..atlas.map.len() {
             let (mut around, mut alike) = (0, 0);
-            super::around(atlas, s, |g, _| {
+            atlas.gather_around(s, |g, _| {
                 around += 1;
                 alike += u32::from(gaps.are_alike(s, g));
             });
-            let shown = gaps.at(atlas, &values, s);
-            let plain = Upsampling::default().at(atlas, &values, s);
+            let shown = gaps.at(atlas, &values, &dark(&gaps), s);
+            let plain = Upsampling::default().at(atlas, &values, &Vec::new(), s);
             let expected =
-                if alike > 0 && alike < around { Vec3::splat(!gaps.map.has(s) as u32 as f32) } else { plain };
+                if alike > 0 && alike < around { Vec3::splat(!gaps.map_gaps.has(s) as u32 as f32) } else { plain };
             // Beside the sheet, with gather texels below it alone.
-            let expected = if gaps.gathers.has(s) { Vec3::ZERO } else { expected };
+            let expected = if gaps.is_alone.has(s) { Vec3::ZERO } else { expected };
             assert!(shown.abs_diff_eq(expected, 1e-6), "{shown} is not {expected}");
             mixed += u32::from(!shown.abs_diff_eq(plain, 1e-6));
         }
         assert!(mixed > 100, "{mixed} texels between light and dark");
         // Without gaps nothing is held.
-        let none = lit(atlas, 1..1, &[], 0.0);
-        let bytes = |u: &Upsampling| [&u.gather, &u.map, &u.walled, &u.gathers].map(Bits::bytes);
-        assert!(none.is_plain() && none.own.is_empty() && bytes(&none) == [0; 4]);
+        let none = find(atlas, 1..1, &[]);
+        let bytes = |u: &Upsampling| [&u.gather_gaps, &u.map_gaps, &u.walled, &u.is_alone].map(Bits::bytes);
+        assert!(none.is_plain() && none.alone.is_empty() && bytes(&none) == [0; 4]);
     }
 
     /// Of gather texels around a texel, one lies in a gap and all others are behind walls, or the other way around.
@@ -400,28 +428,30 @@ pub(super) mod tests {
         let atlas = lightmap.atlas();
         let sample = atlas.map.samples_of(atlas.charts.chart_of[0]).nth(1234).unwrap();
         let mut around = Vec::new();
-        super::around(atlas, sample, |s, _| around.push(s as u32));
+        atlas.gather_around(sample, |s, _| around.push(s as u32));
         around.sort_unstable();
         assert_eq!(around.len(), 4);
         let (one, others) = (&around[..1], &around[1..]);
         let light = |s: usize| if one.contains(&(s as u32)) { Vec3::ZERO } else { Vec3::ONE };
         let values: Vec<Vec3> = (0..atlas.gather.len()).map(light).collect();
         let this = sample as u32;
-        let shown = |in_gap: &[u32], behind_walls: &[u32], own: &[f32]| {
+        let shown = |in_gap: &[u32], behind_walls: &[u32], own: &[Option<Vec3>]| {
             let upsampling = Upsampling {
-                gather: Bits::new(one.iter(), atlas.gather.len()).unwrap(),
-                map: Bits::new(in_gap.iter(), atlas.map.len()).unwrap(),
+                gather_gaps: Bits::new(one.iter(), atlas.gather.len()).unwrap(),
+                map_gaps: Bits::new(in_gap.iter(), atlas.map.len()).unwrap(),
                 walled: Bits::new([this].iter(), atlas.map.len()).unwrap(),
                 walls: behind_walls.iter().map(|&s| (this, s)).collect(),
-                gathers: Bits::new(own.iter().map(|_| &this), atlas.map.len()).unwrap(),
-                own: own.iter().map(|&own| (this, Vec3::splat(own))).collect(),
+                is_alone: Bits::new(own.iter().map(|_| &this), atlas.map.len()).unwrap(),
+                alone: own.iter().map(|_| this).collect(),
                 ..Default::default()
             };
-            upsampling.at(atlas, &values, sample).x
+            upsampling.at(atlas, &values, &own.to_vec(), sample).x
         };
         assert_eq!((shown(&[this], others, &[]), shown(&[], others, &[])), (0.0, 0.0));
         assert!((shown(&[this], one, &[]) - 1.0).abs() < 1e-6 && (shown(&[], one, &[]) - 1.0).abs() < 1e-6);
-        assert_eq!(shown(&[], others, &[0.5]), 0.5);
+        assert_eq!(shown(&[], others, &[Some(Vec3::splat(0.5))]), 0.5);
+        // Inside of a solid.
+        assert!((shown(&[], one, &[None]) - 1.0).abs() < 1e-6);
     }
 
     /// Folded sheets 4 m long in a closed room, each along a profile of (x, z) that it is unfolded from, side by side in one
@@ -458,11 +488,12 @@ pub(super) mod tests {
         let atlas = lightmap.atlas();
         let is_on_face = |map: &ChartMap, s: &usize| map.surface(&atlas.scene, *s).1.x.abs() > 0.5;
         assert_eq!(atlas.gather.samples_of(0).filter(|s| is_on_face(&atlas.gather, s)).count(), 0);
-        let upsampling = lit(atlas, 0..1, &[], 1.0);
+        let upsampling = find(atlas, 0..1, &[]);
+        let (own, rays) = own_light(atlas, &upsampling, |_| 1.0);
         let dark = vec![Vec3::ZERO; atlas.gather.len()];
         let (mut on_face, mut elsewhere) = (0, 0);
         for s in atlas.map.samples_of(0) {
-            let shown = upsampling.at(atlas, &dark, s).x;
+            let shown = upsampling.at(atlas, &dark, &own, s).x;
             if is_on_face(&atlas.map, &s) {
                 assert!((shown - std::f32::consts::PI).abs() < 1e-5, "{shown} on the face");
                 on_face += 1;
@@ -471,7 +502,7 @@ pub(super) mod tests {
             }
         }
         assert!(on_face >= 400 && elsewhere <= on_face / 4, "{on_face} and {elsewhere}");
-        assert!(upsampling.rays > u64::from(on_face * OWN_RAYS));
+        assert_eq!(rays, u64::from(OWN_RAYS) * own.len() as u64);
     }
 
     /// Faces of two charts beside each other in the page: shards bake one without the other.
@@ -482,13 +513,12 @@ pub(super) mod tests {
         let atlas = lightmap.atlas();
         assert_eq!(atlas.map.layout.given, 2);
         let at = |s: u32| (atlas.map.position(s as usize), atlas.map.placement_of(&atlas.charts, s as usize));
-        let both = lit(atlas, 0..2, &[], 1.0).own;
-        let beside = |&((x, y), placement): &((i32, i32), u32)| {
-            placement == 0 && both.iter().any(|&(s, _)| at(s) == ((x + 1, y), 1))
-        };
-        assert!(both.iter().map(|(s, _)| at(*s)).filter(beside).count() > 50);
+        let both = find(atlas, 0..2, &[]).alone;
+        let beside =
+            |&((x, y), placement): &((i32, i32), u32)| placement == 0 && both.iter().any(|&s| at(s) == ((x + 1, y), 1));
+        assert!(both.iter().map(|&s| at(s)).filter(beside).count() > 50);
         // Unequal rays, so that what is blurred shows whom with.
-        let own = |placements: Range<u32>| lit_by(atlas, placements, &[], |s| (s % 7) as f32).own;
+        let own = |placements: Range<u32>| own_light(atlas, &find(atlas, placements, &[]), |s| (s % 7) as f32).0;
         assert_eq!(own(0..2), [own(0..1), own(1..2)].concat());
     }
 
@@ -515,14 +545,14 @@ pub(super) mod tests {
         let wall = atlas.charts.chart_of[0];
         let back = atlas.map.layout.back(wall).unwrap();
         let all = atlas.map.layout.placements.len() as u32;
-        let gaps = lit(atlas, 0..all, &[], 0.0);
+        let gaps = find(atlas, 0..all, &[]);
         let behind = |s: &usize| atlas.gather.surface(&atlas.scene, *s).0.abs().max_element() < 0.6;
         let in_gaps = |placement: u32| {
-            atlas.gather.samples_of(placement).filter(behind).map(|s| gaps.gather.has(s)).collect::<Vec<bool>>()
+            atlas.gather.samples_of(placement).filter(behind).map(|s| gaps.gather_gaps.has(s)).collect::<Vec<bool>>()
         };
         assert!(in_gaps(back).len() > 10 && in_gaps(back).iter().all(|&gap| gap));
         assert!(in_gaps(wall).len() > 10 && !in_gaps(wall).contains(&true));
-        assert!(atlas.map.samples_of(back).any(|s| gaps.map.has(s)));
-        assert!(!atlas.map.samples_of(wall).any(|s| gaps.map.has(s)));
+        assert!(atlas.map.samples_of(back).any(|s| gaps.map_gaps.has(s)));
+        assert!(!atlas.map.samples_of(wall).any(|s| gaps.map_gaps.has(s)));
     }
 }

@@ -11,7 +11,10 @@
 //! same, from half a texel 6.3e-3, from 0.03 texels 6.6e-3. Creases: all points of Sponza in the sun 0.141 -> 0.050, by lamps
 //! 1.35e-2 as before; with cosines of 0.97, 0.9 and 0.5 instead, 0.050, 0.042 and 0.141 in the sun, no difference by lamps.
 
-use super::{Atlas, upsample};
+use super::Atlas;
+use super::upsample::TEXELS_PER_CHECK;
+use crate::error::Result;
+use crate::progress::Stage;
 use crate::scene::NONE;
 use crate::trace::Ray;
 use glam::Vec3;
@@ -31,8 +34,15 @@ struct Eye {
 }
 
 /// The pairs of texels of a placement in the light map and in the gather map that interpolation would join through a
-/// wall or across a crease, on the side that `backs` tells of, in ascending order. Adds the rays traced to `rays`.
-pub(super) fn between(atlas: &Atlas, placement: u32, backs: &[bool], rays: &mut u64) -> Vec<(u32, u32)> {
+/// wall or across a crease, on the side that `backs` tells of, in ascending order. Adds the rays traced to `rays`;
+/// `stage` may cancel.
+pub(super) fn between(
+    atlas: &Atlas,
+    placement: u32,
+    backs: &[bool],
+    stage: &Stage,
+    rays: &mut u64,
+) -> Result<Vec<(u32, u32)>> {
     let (gather, map) = (&atlas.gather, &atlas.map);
     let scale = gather.layout.placements[placement as usize].scale;
     let above = ABOVE / scale[0].min(scale[1]);
@@ -52,12 +62,18 @@ pub(super) fn between(atlas: &Atlas, placement: u32, backs: &[bool], rays: &mut 
     };
     let mut split: HashMap<[u32; 4], bool> = HashMap::new();
     let mut found = Vec::new();
-    for sample in map.samples_of(placement) {
+    for (i, sample) in map.samples_of(placement).enumerate() {
+        if i % TEXELS_PER_CHECK == 0 {
+            stage.advance(0)?;
+        }
         let (mut around, mut n) = ([NONE; 4], 0);
-        upsample::around(atlas, sample, |s, _| {
+        atlas.gather_around(sample, |s, _| {
             around[n] = s as u32;
             n += 1;
         });
+        if n == 0 {
+            continue;
+        }
         around[..n].sort_unstable();
         let from = eye(map, sample);
         // Most are around many texels, and all alike.
@@ -72,13 +88,13 @@ pub(super) fn between(atlas: &Atlas, placement: u32, backs: &[bool], rays: &mut 
             found.extend(around[..n].iter().map(|&s| (sample as u32, s)));
         }
     }
-    found
+    Ok(found)
 }
 
 #[cfg(test)]
 mod tests {
     use crate::lightmap::map::ChartMap;
-    use crate::lightmap::upsample::tests::lit;
+    use crate::lightmap::upsample::tests::{dark, find};
     use crate::lightmap::{Lightmap, LightmapDesc};
     use crate::progress::Progress;
     use crate::scene::shapes::MeshBuilder;
@@ -104,12 +120,12 @@ mod tests {
     /// and whether interpolation has anything to heed.
     fn mixed(lightmap: &Lightmap, edge: f32, skip: impl Fn(f32) -> bool) -> (usize, bool) {
         let atlas = lightmap.atlas();
-        let upsampling = lit(atlas, 0..1, &[], 0.0);
+        let upsampling = find(atlas, 0..1, &[]);
         let x = |map: &ChartMap, s: usize| map.surface(&atlas.scene, s).0.x;
         let light = |s: usize| Vec3::splat(f32::from(u8::from(x(&atlas.gather, s) < edge)));
         let values: Vec<Vec3> = (0..atlas.gather.len()).map(light).collect();
         let is_mixed = |s: &usize| {
-            let shown = upsampling.at(atlas, &values, *s).x;
+            let shown = upsampling.at(atlas, &values, &dark(&upsampling), *s).x;
             !skip(x(&atlas.map, *s)) && shown > 0.01 && shown < 0.99
         };
         (atlas.map.samples_of(atlas.charts.chart_of[0]).filter(is_mixed).count(), !upsampling.is_plain())

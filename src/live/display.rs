@@ -3,8 +3,8 @@
 //! when a page is read. The sums of the texels are left alone.
 
 use super::blocks::{Block, BlockMap, DirectTile, Rect, TILE};
+use super::relight::Illumination;
 use crate::lightmap::blur::{Texels, Window};
-use crate::lightmap::upsample::Upsampling;
 use crate::memory::try_vec;
 use crate::scene::NONE;
 use glam::Vec3;
@@ -424,9 +424,9 @@ impl Display {
     }
 
     /// Irradiance shown at a sample of the light map; `with_direct` false: indirect light alone.
-    pub fn irradiance(&self, map: &BlockMap, upsampling: &Upsampling, sample: u32, with_direct: bool) -> Vec3 {
+    pub fn irradiance(&self, map: &BlockMap, light: &Illumination, sample: u32, with_direct: bool) -> Vec3 {
         let atlas = &map.atlas;
-        let indirect = upsampling.at(atlas, &self.shown, sample as usize);
+        let indirect = light.sides.upsampling.at(atlas, &self.shown, &light.own, sample as usize);
         if !with_direct {
             return indirect;
         }

@@ -617,7 +617,9 @@ impl Live {
         if self.paused {
             return Ok(());
         }
-        let Some(new) = self.relight.poll(&self.context.map.atlas, &self.bake)? else { return Ok(()) };
+        let Some(new) = self.relight.poll(&self.context.map.atlas, &self.bake, &self.context.light.sides)? else {
+            return Ok(());
+        };
         let before = self.context.light.clone();
         self.context.light = Arc::new(before.renewed(new));
         let bytes = self.display.bytes();
@@ -636,7 +638,7 @@ impl Live {
         let light = self.context.light.clone();
         for (b, (block, tile)) in (0u32..).zip(self.blocks.iter_mut().zip(&self.context.map.tiles)) {
             let chart = self.context.map.atlas.gather.layout.chart_of(tile.placement) as usize;
-            if before.backs.get(chart) != light.backs.get(chart) {
+            if before.sides.backs.get(chart) != light.sides.backs.get(chart) {
                 continue;
             }
             if block.coarse_epoch == before.direct_epoch {
@@ -695,7 +697,7 @@ impl Live {
     /// updates, and the recomputation of indirect light.
     pub fn pause(&mut self, paused: bool) -> Result<()> {
         self.paused = paused;
-        self.relight.hold(paused, &self.context.map.atlas, &self.bake)?;
+        self.relight.hold(paused, &self.context.map.atlas, &self.bake, &self.context.light.sides)?;
         self.collect_now()
     }
 
@@ -732,7 +734,7 @@ impl Live {
         let bytes = self.display.bytes();
         self.display.begin_direct_epoch();
         self.grow_fixed(self.display.bytes() - bytes);
-        self.relight.start(&self.context.map.atlas, &self.bake)?;
+        self.relight.start(&self.context.map.atlas, &self.bake, &self.context.light.sides)?;
         self.lights = lights;
         self.context.light = Arc::new(Illumination {
             direct: Arc::new(DirectLight::new(self.scene())),

@@ -110,7 +110,7 @@ impl Live {
     }
 
     fn compose(&self, display: &Display, page: u32, rows: &Rect, with_direct: bool, out: &mut [[f32; 3]]) {
-        let (map, upsampling) = (&self.context.map, &self.context.light.upsampling);
+        let (map, light) = (&self.context.map, &*self.context.light);
         let atlas = &map.atlas;
         let padding = atlas.padding as i32;
         let mut is_own = vec![false; out.len()];
@@ -147,7 +147,7 @@ impl Live {
                 });
                 if let Some(i) = nearest {
                     let value =
-                        values[i].get_or_insert_with(|| display.irradiance(map, upsampling, samples[i], with_direct));
+                        values[i].get_or_insert_with(|| display.irradiance(map, light, samples[i], with_direct));
                     out[at] = value.to_array();
                 }
             }

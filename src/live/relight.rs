@@ -12,7 +12,7 @@ use crate::lightmap::bake::Bake;
 use crate::lightmap::direct::DirectLight;
 use crate::lightmap::plan::{Plan, left_out};
 use crate::lightmap::radiance::Radiance;
-use crate::lightmap::upsample::Upsampling;
+use crate::lightmap::upsample::{OwnLight, Upsampling};
 use crate::lightmap::{Atlas, BakeParams, BakeStats};
 use crate::progress::Progress;
 use glam::Vec3;
@@ -24,16 +24,24 @@ use std::sync::{Arc, Mutex};
 /// The first renewal takes this part of the photons.
 const QUICK_PART: u64 = 16;
 
+/// The sides that are shown.
+#[derive(Default)]
+pub(super) struct Sides {
+    /// Per chart with one place, whether its back is shown.
+    pub backs: Vec<bool>,
+    /// What the light map shows of the gather map there; all as it comes without indirect light.
+    pub upsampling: Upsampling,
+}
+
 /// Light as texels see it.
 #[derive(Clone)]
 pub(super) struct Illumination {
     pub direct: Arc<DirectLight>,
     /// By sample of the radiance map.
     pub radiance: Arc<Radiance>,
-    /// Per chart with one place, whether its back is shown.
-    pub backs: Arc<Vec<bool>>,
-    /// What the light map shows of the gather map on these sides; all as it comes without indirect light.
-    pub upsampling: Arc<Upsampling>,
+    pub sides: Arc<Sides>,
+    /// Of the texels that no gather texel stands for.
+    pub own: Arc<OwnLight>,
     /// Whether there is, or ever was, any indirect light.
     pub has_indirect: bool,
     /// Numbers that change with the parts.
@@ -41,20 +49,20 @@ pub(super) struct Illumination {
     pub indirect_epoch: u32,
 }
 
-/// Radiance map and sides.
+/// Radiance map and sides, which may be those that were shown before.
 pub(super) struct Indirect {
     radiance: Radiance,
-    /// Which backs are shown, and upsampling there; `None`: as they were.
-    sides: Option<(Vec<bool>, Upsampling)>,
+    sides: Arc<Sides>,
+    own: OwnLight,
     has_indirect: bool,
 }
 
-/// Computes radiance map and, `with_sides`, sides under the scene's lights of now.
+/// Computes radiance map and sides under the scene's lights of now, or keeps `sides`.
 fn illuminate(
     atlas: &Atlas,
     params: &BakeParams,
     direct: &DirectLight,
-    with_sides: bool,
+    sides: Option<Arc<Sides>>,
     progress: &Progress,
 ) -> Result<Indirect> {
     let two_sided = !atlas.radiance.layout.back_of.is_empty();
@@ -62,28 +70,29 @@ fn illuminate(
     let bake = Bake { atlas, params, plan: &plan, direct, range: 0..atlas.map.len(), progress };
     let radiance = bake.illuminate(&mut BakeStats::default())?;
     let has_indirect = plan.runs(left_out::INDIRECT);
-    let sides = if with_sides {
-        let backs = bake.backs(&radiance.values);
-        let placements = if has_indirect { atlas.map.layout.placements.len() as u32 } else { 0 };
-        let upsampling = bake.upsampling(&radiance, &backs, 0..placements)?;
-        Some((backs, upsampling))
-    } else {
-        None
+    let sides = match sides {
+        Some(sides) => sides,
+        None => {
+            let backs = bake.backs(&radiance.values);
+            let placements = if has_indirect { atlas.map.layout.placements.len() as u32 } else { 0 };
+            let upsampling = bake.upsampling(&backs, 0..placements)?;
+            Arc::new(Sides { backs, upsampling })
+        }
     };
-    Ok(Indirect { radiance, sides, has_indirect })
+    let (own, _) = bake.own_light(&radiance, &sides.backs, &sides.upsampling)?;
+    Ok(Indirect { radiance, sides, own, has_indirect })
 }
 
 impl Illumination {
     /// Of the scene's lights of now, with all photons.
     pub fn new(atlas: &Atlas, params: &BakeParams, progress: &Progress) -> Result<Illumination> {
         let direct = DirectLight::new(&atlas.scene);
-        let i = illuminate(atlas, params, &direct, true, progress)?;
-        let (backs, upsampling) = i.sides.unwrap_or_default();
+        let i = illuminate(atlas, params, &direct, None, progress)?;
         Ok(Illumination {
             direct: Arc::new(direct),
             radiance: Arc::new(i.radiance),
-            backs: Arc::new(backs),
-            upsampling: Arc::new(upsampling),
+            sides: i.sides,
+            own: Arc::new(i.own),
             has_indirect: i.has_indirect,
             direct_epoch: 1,
             indirect_epoch: 1,
@@ -95,20 +104,17 @@ impl Illumination {
         let mut light = Illumination { indirect_epoch: self.indirect_epoch + 1, ..self.clone() };
         if new.has_indirect {
             light.radiance = Arc::new(new.radiance);
-            if let Some((backs, upsampling)) = new.sides {
-                light.upsampling = Arc::new(upsampling);
-                if *light.backs != backs {
-                    // Other sides are shown: their direct light is another one too.
-                    light.direct_epoch += 1;
-                    light.backs = Arc::new(backs);
-                }
+            if light.sides.backs != new.sides.backs {
+                // Other sides are shown: their direct light is another one too.
+                light.direct_epoch += 1;
             }
+            (light.sides, light.own) = (new.sides, Arc::new(new.own));
             light.has_indirect = true;
         } else {
             // All went dark: what is there fades to black, on the sides that are shown.
-            light.upsampling = Arc::default();
             light.radiance =
                 Arc::new(Radiance { values: vec![Vec3::ZERO; self.radiance.values.len()], ..Default::default() });
+            light.own = Arc::new(self.own.iter().map(|own| own.map(|_| Vec3::ZERO)).collect());
         }
         light
     }
@@ -133,8 +139,8 @@ struct Running {
 
 impl Relight {
     /// Begins a renewal, or has the one under way followed by another. The quick part of that one is
-    /// always finished: lights that move all the time are followed in steps.
-    pub fn start(&mut self, atlas: &Arc<Atlas>, params: &BakeParams) -> Result<()> {
+    /// always finished: lights that move all the time are followed in steps. It keeps the `sides` that are shown.
+    pub fn start(&mut self, atlas: &Arc<Atlas>, params: &BakeParams, sides: &Arc<Sides>) -> Result<()> {
         if let Some(running) = &self.running {
             running.cancel.store(true, Relaxed);
         }
@@ -150,20 +156,20 @@ impl Relight {
                 ..Default::default()
             })?,
         };
-        let (atlas, params) = (atlas.clone(), *params);
+        let (atlas, params, shown) = (atlas.clone(), *params, sides.clone());
         let (sender, results) = channel();
         let cancel = Arc::new(AtomicBool::new(false));
         let cancelled = cancel.clone();
-        let compute = move |params: &BakeParams, with_sides: bool, progress: &Progress| {
+        let compute = move |params: &BakeParams, sides: Option<Arc<Sides>>, progress: &Progress| {
             let direct = DirectLight::new(&atlas.scene);
-            let result = catch_unwind(AssertUnwindSafe(|| illuminate(&atlas, params, &direct, with_sides, progress)));
+            let result = catch_unwind(AssertUnwindSafe(|| illuminate(&atlas, params, &direct, sides, progress)));
             result.unwrap_or_else(|_| Err(Error::Internal("relighting panicked".into())))
         };
         device.spawn(move || {
             let quick = BakeParams { photon_count: params.photon_count.div_ceil(QUICK_PART), ..params };
             // Nobody listens any more when the live object is gone.
-            let _ = sender.send(compute(&quick, false, &Progress::none()));
-            let _ = sender.send(compute(&params, true, &Progress::new(|_, _| !cancelled.load(Relaxed))));
+            let _ = sender.send(compute(&quick, Some(shown), &Progress::none()));
+            let _ = sender.send(compute(&params, None, &Progress::new(|_, _| !cancelled.load(Relaxed))));
         });
         self.device = Some(device);
         self.running = Some(Running { results: Mutex::new(results), cancel });
@@ -176,7 +182,7 @@ impl Relight {
     }
 
     /// Breaks a renewal off, to be begun again when it is no longer on hold.
-    pub fn hold(&mut self, on_hold: bool, atlas: &Arc<Atlas>, params: &BakeParams) -> Result<()> {
+    pub fn hold(&mut self, on_hold: bool, atlas: &Arc<Atlas>, params: &BakeParams, sides: &Arc<Sides>) -> Result<()> {
         self.on_hold = on_hold;
         if on_hold {
             if let Some(running) = &self.running {
@@ -186,16 +192,16 @@ impl Relight {
             return Ok(());
         }
         if self.running.is_none() && std::mem::take(&mut self.again) {
-            self.start(atlas, params)?;
+            self.start(atlas, params, sides)?;
         }
         Ok(())
     }
 
     /// The newest finished result. Does not wait.
-    pub fn poll(&mut self, atlas: &Arc<Atlas>, params: &BakeParams) -> Result<Option<Indirect>> {
+    pub fn poll(&mut self, atlas: &Arc<Atlas>, params: &BakeParams, sides: &Arc<Sides>) -> Result<Option<Indirect>> {
         let Some(running) = &mut self.running else { return Ok(None) };
         let results = running.results.get_mut().unwrap_or_else(|e| e.into_inner());
-        let mut newest = None;
+        let mut newest: Option<Indirect> = None;
         loop {
             match results.try_recv() {
                 Ok(Ok(indirect)) => newest = Some(indirect),
@@ -209,7 +215,9 @@ impl Relight {
                 Err(TryRecvError::Disconnected) => {
                     self.running = None;
                     if !self.on_hold && std::mem::take(&mut self.again) {
-                        self.start(atlas, params)?;
+                        // Those that the caller will show.
+                        let newer = newest.as_ref().filter(|new| new.has_indirect).map(|new| &new.sides);
+                        self.start(atlas, params, newer.unwrap_or(sides))?;
                     }
                     break;
                 }
@@ -230,30 +238,60 @@ impl Drop for Relight {
 #[cfg(test)]
 mod tests {
     use super::*;
+    use crate::lightmap::{Lightmap, LightmapDesc};
     use crate::scene::builtin;
 
     #[test]
     fn few_photons_turn_no_sides_over() {
         let scene = builtin("cornell").unwrap().committed();
         let plain = |value: Vec3| Radiance { values: vec![value; 3], ..Default::default() };
+        let sides = |backs: [bool; 2]| Arc::new(Sides { backs: backs.to_vec(), ..Default::default() });
+        let shown = sides([false, true]);
         let before = Illumination {
             direct: Arc::new(DirectLight::new(&scene)),
             radiance: Arc::new(plain(Vec3::ZERO)),
-            backs: Arc::new(vec![false, true]),
-            upsampling: Arc::default(),
+            sides: shown.clone(),
+            own: Arc::new(vec![Some(Vec3::X), None]),
             has_indirect: true,
             direct_epoch: 1,
             indirect_epoch: 1,
         };
-        let new = |sides| Indirect { radiance: plain(Vec3::ONE), sides, has_indirect: true };
-        let quick = before.renewed(new(None));
+        let new = |sides: &Arc<Sides>, own: OwnLight| Indirect {
+            radiance: plain(Vec3::ONE),
+            sides: sides.clone(),
+            own,
+            has_indirect: true,
+        };
+        let quick = before.renewed(new(&shown, vec![Some(Vec3::Y), None]));
         assert_eq!((quick.direct_epoch, quick.indirect_epoch, quick.radiance.values[0]), (1, 2, Vec3::ONE));
-        assert_eq!(quick.backs, before.backs);
-        let full = quick.renewed(new(Some((vec![true, true], Upsampling::default()))));
+        assert_eq!((&quick.sides.backs, quick.own[0]), (&before.sides.backs, Some(Vec3::Y)));
+        let full = quick.renewed(new(&sides([true, true]), vec![Some(Vec3::Z)]));
         assert_eq!((full.direct_epoch, full.indirect_epoch), (2, 3));
-        assert_eq!(*full.backs, [true, true]);
+        assert_eq!((&full.sides.backs[..], &full.own[..]), (&[true, true][..], &[Some(Vec3::Z)][..]));
         // Texels that gather for themselves must not go on shining.
-        let dark = full.renewed(Indirect { has_indirect: false, ..new(None) });
-        assert!(!Arc::ptr_eq(&dark.upsampling, &full.upsampling));
+        let dark = quick.renewed(Indirect { has_indirect: false, ..new(&sides([true, true]), Vec::new()) });
+        assert_eq!((&dark.sides.backs, &dark.own[..]), (&shown.backs, &[Some(Vec3::ZERO), None][..]));
+    }
+
+    /// What few photons bring fits what is shown, whatever sides are found later.
+    #[test]
+    fn a_quick_renewal_keeps_the_sides_and_renews_what_texels_gather_for_themselves() {
+        let scene = builtin("atrium").unwrap().committed();
+        let desc = LightmapDesc { texels_per_unit: 3.0, ..Default::default() };
+        let lightmap = Lightmap::create(&scene, &desc, &Progress::none()).unwrap();
+        let (atlas, params) = (lightmap.atlas(), BakeParams { photon_count: 20_000, ..Default::default() });
+        let light = Illumination::new(atlas, &params, &Progress::none()).unwrap();
+        assert!(!light.own.is_empty());
+        let mut relight = Relight::default();
+        relight.start(atlas, &params, &light.sides).unwrap();
+        let mut results = Vec::new();
+        while relight.is_pending() {
+            results.extend(relight.poll(atlas, &params, &light.sides).unwrap());
+        }
+        let last = results.pop().unwrap();
+        assert!(!Arc::ptr_eq(&last.sides, &light.sides) && last.own == *light.own);
+        if let Some(quick) = results.first() {
+            assert!(Arc::ptr_eq(&quick.sides, &light.sides) && quick.own != *light.own);
+        }
     }
 }

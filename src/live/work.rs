@@ -207,7 +207,7 @@ impl Block {
             if self.gathered.len() <= i {
                 self.gathered.push(Gathered::default());
             }
-            let receiver = atlas.receiver(&atlas.gather, &c.light.backs, sample as usize);
+            let receiver = atlas.receiver(&atlas.gather, &c.light.sides.backs, sample as usize);
             while self.gathered[i].rays < rounds * ROUND as u32 {
                 if limit.reached() {
                     return false;
@@ -314,7 +314,7 @@ impl Block {
         let (atlas, mut rays) = (&c.map.atlas, 0);
         let samples = c.direct_samples.min(COARSE_SAMPLES);
         let value = |&s: &u32| {
-            let receiver = atlas.receiver(&atlas.gather, &c.light.backs, s as usize);
+            let receiver = atlas.receiver(&atlas.gather, &c.light.sides.backs, s as usize);
             c.light.direct.irradiance(&receiver, samples, combine(c.direct_seed, s), &mut rays)
         };
         self.new_coarse = tile.texels[..tile.lod_end[0] as usize].iter().map(value).collect();
@@ -373,7 +373,7 @@ fn direct_texel(c: &Context, tile: &Tile, x: i32, y: i32, rays: &mut u64) -> Opt
     if gx < own.x0 || gx >= own.x1 || gy < own.y0 || gy >= own.y1 {
         return None;
     }
-    let receiver = a.receiver(&a.map, &c.light.backs, sample as usize);
+    let receiver = a.receiver(&a.map, &c.light.sides.backs, sample as usize);
     if is_buried(&a.scene, receiver.origin, receiver.geometric, rays) {
         return Some(Vec3::INFINITY);
     }
