@@ -79,7 +79,9 @@ fn illuminate(
             Arc::new(Sides { backs, upsampling })
         }
     };
-    let (own, _) = bake.own_light(&radiance, &sides.backs, &sides.upsampling)?;
+    // In the dark there is no radiance map to look at.
+    let own =
+        if has_indirect { bake.own_light(&radiance, &sides.backs, &sides.upsampling)?.0 } else { OwnLight::new() };
     Ok(Indirect { radiance, sides, own, has_indirect })
 }
 
@@ -239,7 +241,7 @@ impl Drop for Relight {
 mod tests {
     use super::*;
     use crate::lightmap::{Lightmap, LightmapDesc};
-    use crate::scene::builtin;
+    use crate::scene::{Light, builtin};
 
     #[test]
     fn few_photons_turn_no_sides_over() {
@@ -281,17 +283,31 @@ mod tests {
         let lightmap = Lightmap::create(&scene, &desc, &Progress::none()).unwrap();
         let (atlas, params) = (lightmap.atlas(), BakeParams { photon_count: 20_000, ..Default::default() });
         let light = Illumination::new(atlas, &params, &Progress::none()).unwrap();
-        assert!(!light.own.is_empty());
-        let mut relight = Relight::default();
-        relight.start(atlas, &params, &light.sides).unwrap();
-        let mut results = Vec::new();
-        while relight.is_pending() {
-            results.extend(relight.poll(atlas, &params, &light.sides).unwrap());
-        }
+        assert!(light.own.iter().any(|own| own.is_some_and(|e| e != Vec3::ZERO)));
+        let renewals = || {
+            let (mut relight, mut results) = (Relight::default(), Vec::new());
+            relight.start(atlas, &params, &light.sides).unwrap();
+            while relight.is_pending() {
+                results.extend(relight.poll(atlas, &params, &light.sides).unwrap());
+                std::thread::sleep(std::time::Duration::from_millis(1));
+            }
+            results
+        };
+        let mut results = renewals();
         let last = results.pop().unwrap();
         assert!(!Arc::ptr_eq(&last.sides, &light.sides) && last.own == *light.own);
         if let Some(quick) = results.first() {
             assert!(Arc::ptr_eq(&quick.sides, &light.sides) && quick.own != *light.own);
+        }
+        // All lights go out.
+        for id in 0..scene.lights().len() as u32 {
+            let off = Light::Point { position: Vec3::ZERO, intensity: [0.0; 3] };
+            scene.set_light(id, off).unwrap();
+        }
+        for new in renewals() {
+            assert!(!new.has_indirect);
+            let dark = light.renewed(new);
+            assert!(dark.own.len() == light.own.len() && dark.own.iter().flatten().all(|&e| e == Vec3::ZERO));
         }
     }
 }
