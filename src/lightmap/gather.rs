@@ -18,8 +18,8 @@
 //! 2.5e-3 instead of 3.1e-3 in the Cornell box, 2.7e-2 instead of 4.2e-2 in Sponza by two lamps and 7.2e-2 instead of 0.119 in
 //! the sun; with them, which bring more, by 2.2e-3 instead of 2.7e-3, 8.3e-3 instead of 9.5e-3 and 4.9e-2 instead of 5.4e-2, in
 //! the living room by 3.8e-3 instead of 4.1e-3 without the worst hundredth, in the same time. (Four fifths of the rays, or
-//! photons from twice as far: no better.) Not worth what live updates would
-//! have to keep for it, 48 bytes per photon or a distribution per texel.
+//! photons from twice as far: no better.) Not worth what live updates would have to keep for it, 48 bytes per photon or a
+//! distribution per texel.
 
 use super::direct::Receiver;
 use super::radiance::RadianceMap;

@@ -269,7 +269,8 @@ fn split(lights: &mut [(u32, Bounds)], depth: u32) -> usize {
     if middle == 0 || middle == lights.len() { half } else { middle }
 }
 
-/// Rounds up. (`f64::ceil` is a call into the C library, as SSE4.1 is not taken for granted.)
+/// Rounds up. (`f64::ceil` is a call into the C library, as SSE4.1 is not taken for granted: gathering in Sponza with
+/// 45,000 bright patches takes 4 % longer with it.)
 #[inline]
 fn ceil(x: f64) -> f64 {
     let towards_zero = x as i64 as f64;

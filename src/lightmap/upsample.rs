@@ -129,9 +129,9 @@ impl Upsampling {
         2 * self.alone.len() as u64
     }
 
-    /// A gather map's `values` as a sample of the light map shows them.
+    /// A gather map's `values`, and the light of texels on their own ([`OwnLight`]), as a sample of the light map shows them.
     #[inline]
-    pub(crate) fn at(&self, atlas: &Atlas, values: &[Vec3], own: &OwnLight, sample: usize) -> Vec3 {
+    pub(crate) fn at(&self, atlas: &Atlas, values: &[Vec3], own: &[Option<Vec3>], sample: usize) -> Vec3 {
         if self.is_alone.has(sample)
             && let Ok(i) = self.alone.binary_search(&(sample as u32))
             && let Some(irradiance) = own[i]
@@ -406,7 +406,7 @@ pub(super) mod tests {
                 alike += u32::from(gaps.are_alike(s, g));
             });
             let shown = gaps.at(atlas, &values, &dark(&gaps), s);
-            let plain = Upsampling::default().at(atlas, &values, &Vec::new(), s);
+            let plain = Upsampling::default().at(atlas, &values, &[], s);
             let expected =
                 if alike > 0 && alike < around { Vec3::splat(!gaps.map_gaps.has(s) as u32 as f32) } else { plain };
             // Beside the sheet, with gather texels below it alone.
@@ -445,7 +445,7 @@ pub(super) mod tests {
                 alone: own.iter().map(|_| this).collect(),
                 ..Default::default()
             };
-            upsampling.at(atlas, &values, &own.to_vec(), sample).x
+            upsampling.at(atlas, &values, own, sample).x
         };
         assert_eq!((shown(&[this], others, &[]), shown(&[], others, &[])), (0.0, 0.0));
         assert!((shown(&[this], one, &[]) - 1.0).abs() < 1e-6 && (shown(&[], one, &[]) - 1.0).abs() < 1e-6);

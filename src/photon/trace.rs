@@ -436,7 +436,7 @@ mod tests {
     use crate::scene::shapes::MeshBuilder;
     use crate::scene::{Material, SceneData};
 
-    /// A hall on a field, with a hole in its roof, under `light`.
+    /// A hall on a field, with a hole in its roof, under `lights`.
     fn hall(lights: &[Light]) -> Arc<Scene> {
         let mut data = SceneData::new();
         let m = data.add_material(Material { albedo: [0.7; 3], two_sided: true, ..Default::default() }).unwrap();
