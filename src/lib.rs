@@ -9,6 +9,7 @@
 //! | module | what is in it |
 //! |---|---|
 //! | [`error`], [`progress`], [`memory`], [`device`] | manners: errors, cancelling, memory accounts, threads and ISA |
+//! | [`files`] | files that are read only if regular, and replaced as a whole |
 //! | [`sampling`] | counter-based low-discrepancy samples and the maps from the square |
 //! | `simd` | lanes over `wide` and over `core::arch`; ISA detection |
 //! | [`scene`] | meshes, materials, lights; validation; the built-in scenes; commit |
@@ -31,6 +32,7 @@ pub mod bvh;
 pub mod capi;
 pub mod device;
 pub mod error;
+pub mod files;
 #[cfg(feature = "io")]
 pub mod io;
 pub mod lightmap;

@@ -14,6 +14,7 @@
 //! that the scene skips (degenerate or not finite) are left out too.
 
 use crate::error::{Error, Result, invalid_argument};
+use crate::files;
 use crate::lightmap::Lightmap;
 use crate::scene::{Material, NONE, Scene};
 use glam::{Vec2, Vec3};
@@ -64,7 +65,7 @@ pub struct GlbLightmap {
 
 /// Writes `scene` and its light maps to the file `path`.
 pub fn write_glb(path: &Path, scene: &Scene, lightmap: &GlbLightmap) -> Result<()> {
-    std::fs::write(path, encode_glb(scene, lightmap)?).map_err(|e| Error::Io(format!("{}: {e}", path.display())))
+    files::replace_with(path, &encode_glb(scene, lightmap)?)
 }
 
 /// The bytes of the file that [`write_glb`] writes.

@@ -6,6 +6,7 @@
 //! (OpenGL tools that expect v = 0 at the bottom show such files upside down.)
 
 use crate::error::{Error, Result, invalid_argument};
+use crate::files;
 use crate::scene::{Environment, MAX_COORDINATE};
 use image::ExtendedColorType::{L8, Rgb8, Rgb32F};
 use image::codecs::openexr::OpenExrEncoder;
@@ -20,7 +21,7 @@ pub fn write_exr(path: &Path, width: u32, height: u32, pixels: &[[f32; 3]]) -> R
     let mut file = Cursor::new(Vec::new());
     let bytes = bytemuck::cast_slice(pixels);
     OpenExrEncoder::new(&mut file).write_image(bytes, width, height, Rgb32F).map_err(|e| fail(path, e))?;
-    write(path, file.get_ref())
+    files::replace_with(path, file.get_ref())
 }
 
 /// Reads the image of a sky from an OpenEXR or Radiance HDR file, in linear RGB. Negative values and those
@@ -45,13 +46,13 @@ pub fn write_exr_grey(path: &Path, width: u32, height: u32, pixels: &[f32]) -> R
 
 /// Writes sRGB colours as a PNG file.
 pub fn write_png_rgb8(path: &Path, width: u32, height: u32, pixels: &[[u8; 3]]) -> Result<()> {
-    write(path, &encode_png_rgb8(width, height, pixels)?)
+    files::replace_with(path, &encode_png_rgb8(width, height, pixels)?)
 }
 
 /// Writes grey values as a PNG file.
 pub fn write_png_grey8(path: &Path, width: u32, height: u32, pixels: &[u8]) -> Result<()> {
     check_size(width, height, pixels.len())?;
-    write(path, &encode_png(width, height, pixels, L8).map_err(|e| fail(path, e))?)
+    files::replace_with(path, &encode_png(width, height, pixels, L8).map_err(|e| fail(path, e))?)
 }
 
 /// The bytes of a PNG file of sRGB colours.
@@ -72,10 +73,6 @@ fn check_size(width: u32, height: u32, pixels: usize) -> Result<()> {
         return invalid_argument!("an image of {width} × {height} pixels is given by {pixels} values");
     }
     Ok(())
-}
-
-fn write(path: &Path, bytes: &[u8]) -> Result<()> {
-    std::fs::write(path, bytes).map_err(|e| fail(path, e))
 }
 
 fn fail(path: &Path, e: impl std::fmt::Display) -> Error {

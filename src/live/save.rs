@@ -6,6 +6,7 @@
 use super::Live;
 use super::blocks::{Block, DirectTile};
 use crate::error::{Error, Result, invalid_argument};
+use crate::files;
 use crate::lightmap::gather::{Gathered, ROUND};
 use glam::Vec3;
 use std::path::Path;
@@ -47,17 +48,13 @@ impl Live {
         let mut sum = Hash::new();
         sum.bytes(&out);
         out.extend(sum.0.to_le_bytes());
-        let failed = |e: std::io::Error| Error::Io(format!("cannot write {}: {e}", path.display()));
-        let mut beside = path.as_os_str().to_owned();
-        beside.push(".part");
-        std::fs::write(&beside, out).map_err(failed)?;
-        std::fs::rename(&beside, path).map_err(failed)
+        files::replace_with(path, &out)
     }
 
     /// Goes on from a state that was saved of the same scene, light map, lights and parameters. A file
     /// that is refused changes nothing.
     pub fn restore(&mut self, path: &Path) -> Result<()> {
-        let bytes = std::fs::read(path).map_err(|e| Error::Io(format!("cannot read {}: {e}", path.display())))?;
+        let bytes = files::read(path, u64::MAX - 1)?;
         let saved = self.parse(&bytes, path)?;
         self.collect_now()?;
         let direct = |s: &Saved| s.direct.as_ref().map_or(0, |d| size_of_val(&d[..]));

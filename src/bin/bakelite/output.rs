@@ -23,7 +23,7 @@ pub fn make_folder(folder: &Path) -> Result<()> {
 
 /// Writes a text file.
 pub fn write_text(path: &Path, text: &str) -> Result<()> {
-    std::fs::write(path, text).map_err(|e| Error::Io(format!("{}: {e}", path.display())))
+    bakelite::files::replace_with(path, text.as_bytes())
 }
 
 /// A light layer of a page.
