@@ -57,7 +57,7 @@ impl MemoryMonitor {
 /// written. (Most systems give them only on demand. Random rays take 8 % less time in Sponza's tree of 18 MB,
 /// 17 % in San Miguel's.) A wish: nothing happens where there are none, or to a small buffer.
 pub(crate) fn prefer_large_pages<T>(buffer: &[T]) {
-    #[cfg(target_os = "linux")]
+    #[cfg(all(target_os = "linux", not(miri)))]
     {
         let page = LARGE_PAGE;
         let range = buffer.as_ptr_range();
@@ -68,12 +68,12 @@ pub(crate) fn prefer_large_pages<T>(buffer: &[T]) {
             unsafe { libc::madvise(start as *mut libc::c_void, end - start, libc::MADV_HUGEPAGE) };
         }
     }
-    #[cfg(not(target_os = "linux"))]
+    #[cfg(any(not(target_os = "linux"), miri))]
     let _ = buffer;
 }
 
 /// Of x86-64, and of AArch64 with small pages of 4 KB.
-#[cfg(target_os = "linux")]
+#[cfg(all(target_os = "linux", not(miri)))]
 const LARGE_PAGE: usize = 2 << 20;
 
 /// An empty vector with room for `capacity`, in [large pages](prefer_large_pages) if there are any.

@@ -10,6 +10,8 @@ use super::layout::SAH_DEPTH;
 use crate::error::Result;
 use crate::memory::try_vec;
 use crate::progress::Progress;
+#[cfg(target_arch = "x86_64")]
+use crate::simd::Isa;
 use glam::{Mat4, Vec3, Vec4, Vec4Swizzles};
 use rayon::prelude::*;
 
@@ -320,11 +322,19 @@ pub(super) struct Split {
 pub(super) struct Bins {
     bins: [Bin; MAX_BINS],
     right: [Vec4; MAX_BINS],
+    /// Only minima and maxima depend on it, which are the same bits either way.
+    #[cfg(target_arch = "x86_64")]
+    has_avx: bool,
 }
 
 impl Bins {
     pub(super) fn new() -> Box<Bins> {
-        Box::new(Bins { bins: [Bin::EMPTY; MAX_BINS], right: [Vec4::ZERO; MAX_BINS] })
+        Box::new(Bins {
+            bins: [Bin::EMPTY; MAX_BINS],
+            right: [Vec4::ZERO; MAX_BINS],
+            #[cfg(target_arch = "x86_64")]
+            has_avx: Isa::Avx2.is_available(),
+        })
     }
 
     pub(super) fn fill(&mut self, refs: &[Reference], map: &BinMap) {
@@ -350,8 +360,8 @@ impl Bins {
 
     fn add(&mut self, refs: &[Reference], map: &BinMap) {
         #[cfg(target_arch = "x86_64")]
-        if std::arch::is_x86_feature_detected!("avx") {
-            // SAFETY: the CPU has AVX.
+        if self.has_avx {
+            // SAFETY: the CPU has AVX2, and with it AVX.
             return unsafe { self.add_avx(refs, map) };
         }
         for r in refs {

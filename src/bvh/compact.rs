@@ -258,12 +258,15 @@ impl Compact {
     }
 
     /// First and last mesh that a triangle may be of.
+    ///
+    /// # Safety
+    /// The triangle must be one of the scene.
     #[inline(always)]
-    pub(crate) fn mesh_range(&self, triangle: u32) -> (u32, u32) {
+    pub(crate) unsafe fn mesh_range(&self, triangle: u32) -> (u32, u32) {
         let block = (triangle / BLOCK) as usize;
         debug_assert!(block + 1 < self.blocks.len());
-        // SAFETY: there is an entry for the block of every triangle and one more, and only triangles of the
-        // scene are asked for.
+        // SAFETY: there is an entry for the block of every triangle and one more; the caller vouches for the
+        // triangle.
         unsafe { (*self.blocks.get_unchecked(block), *self.blocks.get_unchecked(block + 1)) }
     }
 
@@ -279,16 +282,21 @@ impl Compact {
     }
 
     /// Pointer to the numbers of a leaf; [`MAX_LEAF`](super::layout::MAX_LEAF) of them are readable.
+    ///
+    /// # Safety
+    /// `leaf` must be a leaf of this tree.
     #[inline(always)]
-    pub(crate) fn leaf(&self, leaf: ChildRef) -> *const u32 {
-        self.triangles.as_ptr().wrapping_add(leaf.leaf_slot())
+    pub(crate) unsafe fn leaf(&self, leaf: ChildRef) -> *const u32 {
+        debug_assert!(leaf.leaf_slot() < self.triangles.len());
+        // SAFETY: the caller vouches for the reference; the builder made the numbers that it names.
+        unsafe { self.triangles.as_ptr().add(leaf.leaf_slot()) }
     }
 
     /// Address of what a reference names.
     #[inline(always)]
     pub(crate) fn address(&self, child: ChildRef) -> *const u8 {
         if child.is_leaf() {
-            self.leaf(child).cast()
+            self.triangles.as_ptr().wrapping_add(child.leaf_slot()).cast()
         } else {
             self.nodes.as_ptr().wrapping_add(child.node_index()).cast()
         }
@@ -413,7 +421,8 @@ mod tests {
         let tree = Compact::new(Vec::new(), Vec::new(), (Vec3::ZERO, Vec3::ZERO), &firsts);
         for t in 0..2305 {
             let mesh = firsts.partition_point(|&first| first <= t) as u32 - 1;
-            let (first, last) = tree.mesh_range(t);
+            // SAFETY: a triangle of the meshes that the tree was built of.
+            let (first, last) = unsafe { tree.mesh_range(t) };
             assert!((first..=last).contains(&mesh), "{t}: {mesh}, {first} to {last}");
         }
     }

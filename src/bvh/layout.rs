@@ -220,10 +220,13 @@ impl Mbvh {
     }
 
     /// Pointer to the first row of a leaf; [`LEAF_PAD`] floats behind the last leaf are readable.
+    ///
+    /// # Safety
+    /// `leaf` must be a leaf of this tree.
     #[inline(always)]
-    pub(crate) fn leaf(&self, leaf: ChildRef) -> *const f32 {
+    pub(crate) unsafe fn leaf(&self, leaf: ChildRef) -> *const f32 {
         debug_assert!(LEAF_STRIDE * (leaf.leaf_slot() + leaf.leaf_count()) + LEAF_PAD <= self.leaves.len());
-        // SAFETY: leaf references come from the builder, which made the rows they name.
+        // SAFETY: the caller vouches for the reference; the builder made the rows that it names.
         unsafe { self.leaves.as_ptr().add(LEAF_STRIDE * leaf.leaf_slot()) }
     }
 }

@@ -68,8 +68,8 @@ pub(super) fn is_null(name: &str) -> Error {
 /// "scene is NULL". The caller's contract (capi's head) makes the pointer valid.
 macro_rules! object {
     ($handle:ident) => {{
-        // SAFETY: C promises that a handle that is not NULL is alive during the call.
         #[allow(unused_unsafe)] // some callers are in an unsafe block already
+        // SAFETY: C promises that a handle that is not NULL is alive during the call.
         let object = unsafe { $crate::capi::handles::borrow($handle, stringify!($handle)) }?;
         object
     }};

@@ -13,7 +13,7 @@
 
 use super::PhotonView;
 use super::grid::Grid;
-use crate::simd::{self, Isa, Lanes, Mask, Simd};
+use crate::simd::{self, Isa, Lanes, Mask, Simd, entry_point, isa_features};
 use glam::Vec3;
 
 /// The least cosine between a photon's surface normal and the estimate's: 60°, coarse tessellations
@@ -76,18 +76,18 @@ pub(super) fn kernel(isa: Isa) -> EstimateFn {
     }
 }
 
-macro_rules! entry_points {
-    ($module:ident, $simd:ty $(, $features:literal)?) => {
+macro_rules! kernel {
+    ($module:ident, $isa:ident) => {
         mod $module {
             use super::*;
 
-            $(#[target_feature(enable = $features)])?
-            unsafe fn many(g: &Grid, c: &Cylinder, p: &[[f32; 3]], n: &[[f32; 3]], out: &mut [[f32; 3]]) {
-                for ((p, n), out) in p.iter().zip(n).zip(out) {
-                    // SAFETY: the caller vouches for the ISA.
-                    *out = unsafe { estimate::<$simd>(g, c, Vec3::from_array(*p), Vec3::from_array(*n)) };
+            isa_features! { $isa => entry_point! {
+                fn many(g: &Grid, c: &Cylinder, p: &[[f32; 3]], n: &[[f32; 3]], out: &mut [[f32; 3]]) {
+                    for ((p, n), out) in p.iter().zip(n).zip(out) {
+                        *out = estimate::<simd::$isa>(g, c, Vec3::from_array(*p), Vec3::from_array(*n));
+                    }
                 }
-            }
+            } }
 
             /// Reached only through [`kernel`], which has checked that the machine has the ISA.
             pub(super) fn checked(g: &Grid, c: &Cylinder, p: &[[f32; 3]], n: &[[f32; 3]], out: &mut [[f32; 3]]) {
@@ -98,11 +98,11 @@ macro_rules! entry_points {
     };
 }
 
-entry_points!(portable, simd::Portable);
+kernel!(portable, Portable);
 #[cfg(target_arch = "x86_64")]
-entry_points!(avx2, simd::Avx2, "avx2,fma");
+kernel!(avx2, Avx2);
 #[cfg(target_arch = "x86_64")]
-entry_points!(avx512, simd::Avx512, "avx2,fma,avx512f,avx512vl,avx512dq,avx512bw");
+kernel!(avx512, Avx512);
 
 /// Lane numbers.
 static IOTA: [f32; 16] = [0.0, 1.0, 2.0, 3.0, 4.0, 5.0, 6.0, 7.0, 8.0, 9.0, 10.0, 11.0, 12.0, 13.0, 14.0, 15.0];
@@ -154,7 +154,7 @@ impl<L: Lanes> V3<L> {
 /// The CPU must have the ISA.
 #[inline(always)]
 unsafe fn estimate<S: Simd>(grid: &Grid, cylinder: &Cylinder, position: Vec3, normal: Vec3) -> [f32; 3] {
-    // SAFETY (of the whole function): the caller vouches for the ISA. Rows are runs of photons, and
+    // SAFETY: the caller vouches for the ISA. Rows are runs of photons, and
     // from each photon's place a full vector can be read in every column.
     unsafe {
         let columns = grid.photons.pointers();

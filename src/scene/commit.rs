@@ -490,9 +490,9 @@ impl Scene {
     pub(crate) fn tree(&self) -> TreeView<'_> {
         match &self.tree {
             Tree::Whole(tree) => TreeView::Whole(tree),
-            // SAFETY: the tree was built of these meshes, which `SceneData` has validated; refits change
-            // positions alone.
             Tree::Compact(tree) => {
+                // SAFETY: the tree was built of these meshes, which `SceneData` has validated; refits change
+                // positions alone.
                 TreeView::Compact(unsafe { View::new(tree, &self.data.meshes, &self.first_triangle) })
             }
         }

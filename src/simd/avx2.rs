@@ -20,44 +20,51 @@ pub(crate) struct A4(pub(super) __m128);
 #[derive(Clone, Copy)]
 pub(crate) struct A8(pub(super) __m256);
 
+/// Applies an intrinsic of AVX2 or FMA to values.
+macro_rules! on_values {
+    ($intrinsic:expr, $($value:expr),*) => {
+        // SAFETY: the intrinsic touches no memory, and a vector among the values exists only where the CPU
+        // has the ISA (see the module docs of `simd`).
+        unsafe { $intrinsic($($value),*) }
+    };
+}
+
 macro_rules! lanes {
     ($v:ident, $raw:ty, $width:expr, $splat:ident, $load:ident, $store:ident, $add:ident, $sub:ident, $mul:ident,
      $div:ident, $sqrt:ident, $min:ident, $max:ident, $fmadd:ident, $cmp:ident, $blend:ident, $movemask:ident, $and:ident, $or:ident) => {
-        // SAFETY of every intrinsic below: a value of this type exists only where the CPU has the
-        // ISA (see the module docs of `simd`).
         impl Mask for $v {
             #[inline(always)]
             fn bits(self) -> u32 {
-                unsafe { $movemask(self.0) as u32 }
+                on_values!($movemask, self.0) as u32
             }
             #[inline(always)]
             fn and(self, o: Self) -> Self {
-                $v(unsafe { $and(self.0, o.0) })
+                $v(on_values!($and, self.0, o.0))
             }
             #[inline(always)]
             fn or(self, o: Self) -> Self {
-                $v(unsafe { $or(self.0, o.0) })
+                $v(on_values!($or, self.0, o.0))
             }
         }
         impl Add for $v {
             type Output = $v;
             #[inline(always)]
             fn add(self, o: $v) -> $v {
-                $v(unsafe { $add(self.0, o.0) })
+                $v(on_values!($add, self.0, o.0))
             }
         }
         impl Sub for $v {
             type Output = $v;
             #[inline(always)]
             fn sub(self, o: $v) -> $v {
-                $v(unsafe { $sub(self.0, o.0) })
+                $v(on_values!($sub, self.0, o.0))
             }
         }
         impl Mul for $v {
             type Output = $v;
             #[inline(always)]
             fn mul(self, o: $v) -> $v {
-                $v(unsafe { $mul(self.0, o.0) })
+                $v(on_values!($mul, self.0, o.0))
             }
         }
         impl Lanes for $v {
@@ -66,47 +73,50 @@ macro_rules! lanes {
             type Mask = $v;
             #[inline(always)]
             unsafe fn splat(x: f32) -> Self {
+                // SAFETY: the caller vouches for the ISA.
                 $v(unsafe { $splat(x) })
             }
             #[inline(always)]
             unsafe fn load(p: *const f32) -> Self {
+                // SAFETY: the caller vouches for the ISA and the floats; an unaligned load.
                 $v(unsafe { $load(p) })
             }
             #[inline(always)]
             unsafe fn store(self, p: *mut f32) {
+                // SAFETY: the caller vouches for the floats; an unaligned store.
                 unsafe { $store(p, self.0) }
             }
             #[inline(always)]
             fn div(self, d: Self) -> Self {
-                $v(unsafe { $div(self.0, d.0) })
+                $v(on_values!($div, self.0, d.0))
             }
             #[inline(always)]
             fn sqrt(self) -> Self {
-                $v(unsafe { $sqrt(self.0) })
+                $v(on_values!($sqrt, self.0))
             }
             #[inline(always)]
             fn min(self, o: Self) -> Self {
-                $v(unsafe { $min(self.0, o.0) })
+                $v(on_values!($min, self.0, o.0))
             }
             #[inline(always)]
             fn max(self, o: Self) -> Self {
-                $v(unsafe { $max(self.0, o.0) })
+                $v(on_values!($max, self.0, o.0))
             }
             #[inline(always)]
             fn mul_add(self, b: Self, c: Self) -> Self {
-                $v(unsafe { $fmadd(self.0, b.0, c.0) })
+                $v(on_values!($fmadd, self.0, b.0, c.0))
             }
             #[inline(always)]
             fn lt(self, o: Self) -> $v {
-                $v(unsafe { $cmp::<_CMP_LT_OQ>(self.0, o.0) })
+                $v(on_values!($cmp::<_CMP_LT_OQ>, self.0, o.0))
             }
             #[inline(always)]
             fn le(self, o: Self) -> $v {
-                $v(unsafe { $cmp::<_CMP_LE_OQ>(self.0, o.0) })
+                $v(on_values!($cmp::<_CMP_LE_OQ>, self.0, o.0))
             }
             #[inline(always)]
             fn select(m: $v, t: Self, f: Self) -> Self {
-                $v(unsafe { $blend(f.0, t.0, m.0) })
+                $v(on_values!($blend, f.0, t.0, m.0))
             }
         }
     };

@@ -37,27 +37,34 @@ impl Mask for M16 {
     }
 }
 
-// SAFETY of every intrinsic below: a value of A16 exists only where the CPU has the ISA (see the
-// module docs of `simd`).
+/// Applies an intrinsic of AVX-512 F to values.
+macro_rules! on_values {
+    ($intrinsic:expr, $($value:expr),*) => {
+        // SAFETY: the intrinsic touches no memory, and an `A16` among the values exists only where the CPU
+        // has the ISA (see the module docs of `simd`).
+        unsafe { $intrinsic($($value),*) }
+    };
+}
+
 impl Add for A16 {
     type Output = A16;
     #[inline(always)]
     fn add(self, o: A16) -> A16 {
-        A16(unsafe { _mm512_add_ps(self.0, o.0) })
+        A16(on_values!(_mm512_add_ps, self.0, o.0))
     }
 }
 impl Sub for A16 {
     type Output = A16;
     #[inline(always)]
     fn sub(self, o: A16) -> A16 {
-        A16(unsafe { _mm512_sub_ps(self.0, o.0) })
+        A16(on_values!(_mm512_sub_ps, self.0, o.0))
     }
 }
 impl Mul for A16 {
     type Output = A16;
     #[inline(always)]
     fn mul(self, o: A16) -> A16 {
-        A16(unsafe { _mm512_mul_ps(self.0, o.0) })
+        A16(on_values!(_mm512_mul_ps, self.0, o.0))
     }
 }
 
@@ -66,46 +73,49 @@ impl Lanes for A16 {
     type Mask = M16;
     #[inline(always)]
     unsafe fn splat(x: f32) -> Self {
+        // SAFETY: the caller vouches for the ISA.
         A16(unsafe { _mm512_set1_ps(x) })
     }
     #[inline(always)]
     unsafe fn load(p: *const f32) -> Self {
+        // SAFETY: the caller vouches for the ISA and the floats; an unaligned load.
         A16(unsafe { _mm512_loadu_ps(p) })
     }
     #[inline(always)]
     unsafe fn store(self, p: *mut f32) {
+        // SAFETY: the caller vouches for the floats; an unaligned store.
         unsafe { _mm512_storeu_ps(p, self.0) }
     }
     #[inline(always)]
     fn div(self, d: Self) -> Self {
-        A16(unsafe { _mm512_div_ps(self.0, d.0) })
+        A16(on_values!(_mm512_div_ps, self.0, d.0))
     }
     #[inline(always)]
     fn sqrt(self) -> Self {
-        A16(unsafe { _mm512_sqrt_ps(self.0) })
+        A16(on_values!(_mm512_sqrt_ps, self.0))
     }
     #[inline(always)]
     fn min(self, o: Self) -> Self {
-        A16(unsafe { _mm512_min_ps(self.0, o.0) })
+        A16(on_values!(_mm512_min_ps, self.0, o.0))
     }
     #[inline(always)]
     fn max(self, o: Self) -> Self {
-        A16(unsafe { _mm512_max_ps(self.0, o.0) })
+        A16(on_values!(_mm512_max_ps, self.0, o.0))
     }
     #[inline(always)]
     fn mul_add(self, b: Self, c: Self) -> Self {
-        A16(unsafe { _mm512_fmadd_ps(self.0, b.0, c.0) })
+        A16(on_values!(_mm512_fmadd_ps, self.0, b.0, c.0))
     }
     #[inline(always)]
     fn lt(self, o: Self) -> M16 {
-        M16(unsafe { _mm512_cmp_ps_mask::<_CMP_LT_OQ>(self.0, o.0) })
+        M16(on_values!(_mm512_cmp_ps_mask::<_CMP_LT_OQ>, self.0, o.0))
     }
     #[inline(always)]
     fn le(self, o: Self) -> M16 {
-        M16(unsafe { _mm512_cmp_ps_mask::<_CMP_LE_OQ>(self.0, o.0) })
+        M16(on_values!(_mm512_cmp_ps_mask::<_CMP_LE_OQ>, self.0, o.0))
     }
     #[inline(always)]
     fn select(m: M16, t: Self, f: Self) -> Self {
-        A16(unsafe { _mm512_mask_blend_ps(m.0, f.0, t.0) })
+        A16(on_values!(_mm512_mask_blend_ps, m.0, f.0, t.0))
     }
 }

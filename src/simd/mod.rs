@@ -10,8 +10,9 @@
 //!
 //! The only ways to make a vector are [`Lanes::splat`] and the loads, which are unsafe: the caller
 //! promises that the CPU has the ISA. A value of the type is therefore proof that the ISA is there,
-//! and all arithmetic on it is safe. Entry points are unsafe for the same reason and are reached
-//! only through tables chosen by [`Isa::is_available`].
+//! and all arithmetic on it is safe. Entry points, which [`entry_point`] makes, are unsafe for the same
+//! reason and are reached only through tables chosen by [`Isa::is_available`]. Both take the ISA's CPU
+//! features from [`isa_features`], so that no entry point can use a feature which the check leaves out.
 
 use std::ops::{Add, Mul, Sub};
 
@@ -26,6 +27,45 @@ pub(crate) use avx2::Avx2;
 #[cfg(target_arch = "x86_64")]
 pub(crate) use avx512::Avx512;
 pub(crate) use portable::Portable;
+
+/// Calls the macro `$then` with the CPU features of an ISA in brackets, followed by `$args`.
+macro_rules! isa_features {
+    (Portable => $then:ident! { $($args:tt)* }) => { $then! { [] $($args)* } };
+    // Bit counts came to every CPU no later than AVX2.
+    (Avx2 => $then:ident! { $($args:tt)* }) => {
+        $then! { ["avx2" "fma" "popcnt" "lzcnt" "bmi1" "bmi2"] $($args)* }
+    };
+    (Avx512 => $then:ident! { $($args:tt)* }) => {
+        $then! {
+            ["avx2" "fma" "popcnt" "lzcnt" "bmi1" "bmi2" "avx512f" "avx512vl" "avx512dq" "avx512bw"] $($args)*
+        }
+    };
+}
+pub(crate) use isa_features;
+
+/// Defines the entry point of a kernel, compiled for the features of an ISA:
+/// `isa_features! { Avx2 => entry_point! { fn name(arguments) -> result { body } } }`.
+///
+/// The body may call whatever needs nothing but the ISA. The function is unsafe: its caller promises that
+/// the CPU has the ISA.
+macro_rules! entry_point {
+    ([$($feature:literal)*] fn $name:ident $([const $flag:ident: bool])? ($($arg:ident: $type:ty),*) $(-> $result:ty)?
+        $body:block
+    ) => {
+        $(#[target_feature(enable = $feature)])*
+        unsafe fn $name $(<const $flag: bool>)? ($($arg: $type),*) $(-> $result)? {
+            // SAFETY: the body needs the ISA alone, for which the caller of an entry point vouches.
+            unsafe { $body }
+        }
+    };
+}
+pub(crate) use entry_point;
+
+/// Whether the CPU has all of the features.
+#[cfg(all(target_arch = "x86_64", not(miri)))]
+macro_rules! cpu_has {
+    ([$($feature:tt)*]) => { true $(&& std::arch::is_x86_feature_detected!($feature))* };
+}
 
 /// An instruction set that kernels are compiled for.
 #[derive(Clone, Copy, Debug, PartialEq, Eq, Hash)]
@@ -45,27 +85,14 @@ impl Isa {
 
     /// Whether this machine can run it.
     pub fn is_available(self) -> bool {
-        #[cfg(target_arch = "x86_64")]
-        {
-            // Bit counts came to every CPU no later than AVX2.
-            let avx2 = std::arch::is_x86_feature_detected!("avx2")
-                && std::arch::is_x86_feature_detected!("fma")
-                && std::arch::is_x86_feature_detected!("popcnt")
-                && std::arch::is_x86_feature_detected!("lzcnt")
-                && std::arch::is_x86_feature_detected!("bmi1")
-                && std::arch::is_x86_feature_detected!("bmi2");
-            match self {
-                Isa::Portable => true,
-                Isa::Avx2 => avx2,
-                Isa::Avx512 => {
-                    avx2 && std::arch::is_x86_feature_detected!("avx512f")
-                        && std::arch::is_x86_feature_detected!("avx512vl")
-                        && std::arch::is_x86_feature_detected!("avx512dq")
-                        && std::arch::is_x86_feature_detected!("avx512bw")
-                }
-            }
+        // Miri interprets no intrinsics of wide vectors.
+        #[cfg(all(target_arch = "x86_64", not(miri)))]
+        match self {
+            Isa::Portable => true,
+            Isa::Avx2 => isa_features! { Avx2 => cpu_has! {} },
+            Isa::Avx512 => isa_features! { Avx512 => cpu_has! {} },
         }
-        #[cfg(not(target_arch = "x86_64"))]
+        #[cfg(any(not(target_arch = "x86_64"), miri))]
         {
             self == Isa::Portable
         }
@@ -102,13 +129,13 @@ pub(crate) trait Simd: Copy {
 /// Asks for the cache line at `p`, which need not be valid.
 #[inline(always)]
 pub(crate) fn prefetch<T>(p: *const T) {
-    #[cfg(target_arch = "x86_64")]
+    #[cfg(all(target_arch = "x86_64", not(miri)))]
     // SAFETY: a prefetch is a hint; it reads nothing and never faults. SSE is part of x86-64.
     unsafe {
         use std::arch::x86_64::{_MM_HINT_T0, _mm_prefetch};
         _mm_prefetch::<_MM_HINT_T0>(p.cast());
     }
-    #[cfg(not(target_arch = "x86_64"))]
+    #[cfg(any(not(target_arch = "x86_64"), miri))]
     let _ = p;
 }
 

@@ -24,17 +24,18 @@ const SPECIAL: [f32; 16] = [
 /// Runs `check::<S>` for each ISA that the machine has.
 macro_rules! on_every_isa {
     ($check:ident) => {
-        // SAFETY: each is run only where it is available.
         for isa in Isa::available() {
-            match isa {
-                Isa::Portable => unsafe { $check::<Portable>() },
+            let check: unsafe fn() = match isa {
+                Isa::Portable => $check::<Portable>,
                 #[cfg(target_arch = "x86_64")]
-                Isa::Avx2 => unsafe { $check::<Avx2>() },
+                Isa::Avx2 => $check::<Avx2>,
                 #[cfg(target_arch = "x86_64")]
-                Isa::Avx512 => unsafe { $check::<Avx512>() },
+                Isa::Avx512 => $check::<Avx512>,
                 #[cfg(not(target_arch = "x86_64"))]
                 _ => unreachable!(),
-            }
+            };
+            // SAFETY: the ISA is available.
+            unsafe { check() };
         }
     };
 }

@@ -40,7 +40,8 @@ impl<'a> View<'a> {
     /// The triangle must be one of the scene.
     #[inline(always)]
     unsafe fn corners(&self, triangle: u32) -> [*const f32; 3] {
-        let (mut mesh, last) = self.tree.mesh_range(triangle);
+        // SAFETY: forwarded.
+        let (mut mesh, last) = unsafe { self.tree.mesh_range(triangle) };
         if mesh != last {
             let firsts = &self.first_triangle[mesh as usize + 1..=last as usize];
             mesh += firsts.partition_point(|&first| first <= triangle) as u32;
@@ -101,7 +102,8 @@ impl Tree for View<'_> {
 
     #[inline(always)]
     unsafe fn leaf<S: Simd>(&self, leaf: ChildRef) -> CompactLeaf<'_> {
-        let triangles = self.tree.leaf(leaf);
+        // SAFETY: forwarded.
+        let triangles = unsafe { self.tree.leaf(leaf) };
         // SAFETY: eight numbers are readable from every leaf; the caller vouches for the ISA. No leaf holds
         // more, but here nothing shall depend on it.
         let ends = unsafe { S::F8::highest_bits(triangles) } | 1 << (MAX_LEAF - 1);

@@ -1,13 +1,13 @@
 //! One table of kernel entry points per ISA.
 //!
-//! Each entry point carries the ISA's `#[target_feature]`s; the generic kernels are
+//! Each [entry point](entry_point) carries the ISA's `#[target_feature]`s; the generic kernels are
 //! `#[inline(always)]` and so are compiled for them.
 
 use super::compact::View;
 use super::filter::Filter;
 use super::{PACKET_SIZE, Packet, RawHit, Ray, gather, packet, single};
 use crate::bvh::Mbvh;
-use crate::simd::{self, Isa};
+use crate::simd::{self, Isa, entry_point, isa_features};
 use glam::Vec3;
 
 /// Kernels of one ISA. Tables exist for every ISA, but only [`Kernels::for_isa`] hands them out,
@@ -27,59 +27,64 @@ pub(crate) struct Kernels {
 }
 
 macro_rules! table {
-    ($name:ident, $module:ident, $simd:ty, $isa:expr $(, $features:literal)?) => {
+    ($name:ident, $module:ident, $isa:ident) => {
         mod $module {
             use super::*;
-            $(#[target_feature(enable = $features)])?
-            unsafe fn intersect(bvh: &Mbvh, ray: &Ray) -> RawHit {
-                // SAFETY (all): the caller vouches for the ISA.
-                unsafe { single::one::<$simd, _, false>(bvh, ray) }
-            }
-            $(#[target_feature(enable = $features)])?
-            unsafe fn intersect_block(bvh: &Mbvh, rays: &[Ray], out: &mut [RawHit]) {
-                unsafe { packet::block::<$simd>(bvh, rays, out) }
-            }
-            $(#[target_feature(enable = $features)])?
-            unsafe fn occluded(bvh: &Mbvh, ray: &Ray) -> bool {
-                !unsafe { single::one::<$simd, _, true>(bvh, ray) }.is_miss()
-            }
-            $(#[target_feature(enable = $features)])?
-            unsafe fn occluded_block(bvh: &Mbvh, rays: &[Ray], out: &mut [u8]) {
-                let n = rays.len().min(out.len());
-                unsafe { single::many::<$simd, _, true>(bvh, n, |i| rays[i], |i, hit| out[i] = !hit.is_miss() as u8) }
-            }
-            $(#[target_feature(enable = $features)])?
-            unsafe fn gather(bvh: &Mbvh, origin: Vec3, p: &Packet, tmin: f32, tmax: f32, out: &mut [RawHit; PACKET_SIZE]) {
-                unsafe { gather::gather::<$simd>(bvh, origin, p, tmin, tmax, out) }
-            }
-            $(#[target_feature(enable = $features)])?
-            unsafe fn compact_intersect(tree: &View, rays: &[Ray], out: &mut [RawHit]) {
-                let n = rays.len().min(out.len());
-                match rays {
-                    [ray] if n == 1 => out[0] = unsafe { single::one::<$simd, _, false>(tree, ray) },
-                    _ => unsafe { single::many::<$simd, _, false>(tree, n, |i| rays[i], |i, hit| out[i] = hit) },
+            use simd::$isa as S;
+
+            isa_features! { $isa => entry_point! {
+                fn intersect(bvh: &Mbvh, ray: &Ray) -> RawHit { single::one::<S, _, false>(bvh, ray) }
+            } }
+            isa_features! { $isa => entry_point! {
+                fn intersect_block(bvh: &Mbvh, rays: &[Ray], out: &mut [RawHit]) { packet::block::<S>(bvh, rays, out) }
+            } }
+            isa_features! { $isa => entry_point! {
+                fn occluded(bvh: &Mbvh, ray: &Ray) -> bool { !single::one::<S, _, true>(bvh, ray).is_miss() }
+            } }
+            isa_features! { $isa => entry_point! {
+                fn occluded_block(bvh: &Mbvh, rays: &[Ray], out: &mut [u8]) {
+                    let n = rays.len().min(out.len());
+                    single::many::<S, _, true>(bvh, n, |i| rays[i], |i, hit| out[i] = !hit.is_miss() as u8)
                 }
-            }
-            $(#[target_feature(enable = $features)])?
-            unsafe fn compact_occluded(tree: &View, rays: &[Ray], out: &mut [u8]) {
-                let n = rays.len().min(out.len());
-                match rays {
-                    [ray] if n == 1 => out[0] = !unsafe { single::one::<$simd, _, true>(tree, ray) }.is_miss() as u8,
-                    _ => unsafe {
-                        single::many::<$simd, _, true>(tree, n, |i| rays[i], |i, hit| out[i] = !hit.is_miss() as u8)
-                    },
+            } }
+            isa_features! { $isa => entry_point! {
+                fn gather(
+                    bvh: &Mbvh, origin: Vec3, packet: &Packet, tmin: f32, tmax: f32, out: &mut [RawHit; PACKET_SIZE]
+                ) {
+                    gather::gather::<S>(bvh, origin, packet, tmin, tmax, out)
                 }
-            }
-            $(#[target_feature(enable = $features)])?
-            unsafe fn filtered<const ANY: bool>(tree: &Mbvh, ray: &Ray, filter: &mut Filter) -> RawHit {
-                unsafe { single::one_of::<$simd, _, _, ANY>(tree, ray, filter) }
-            }
-            $(#[target_feature(enable = $features)])?
-            unsafe fn compact_filtered<const ANY: bool>(tree: &View, ray: &Ray, filter: &mut Filter) -> RawHit {
-                unsafe { single::one_of::<$simd, _, _, ANY>(tree, ray, filter) }
-            }
+            } }
+            isa_features! { $isa => entry_point! {
+                fn compact_intersect(tree: &View, rays: &[Ray], out: &mut [RawHit]) {
+                    let n = rays.len().min(out.len());
+                    match rays {
+                        [ray] if n == 1 => out[0] = single::one::<S, _, false>(tree, ray),
+                        _ => single::many::<S, _, false>(tree, n, |i| rays[i], |i, hit| out[i] = hit),
+                    }
+                }
+            } }
+            isa_features! { $isa => entry_point! {
+                fn compact_occluded(tree: &View, rays: &[Ray], out: &mut [u8]) {
+                    let n = rays.len().min(out.len());
+                    match rays {
+                        [ray] if n == 1 => out[0] = !single::one::<S, _, true>(tree, ray).is_miss() as u8,
+                        _ => single::many::<S, _, true>(tree, n, |i| rays[i], |i, hit| out[i] = !hit.is_miss() as u8),
+                    }
+                }
+            } }
+            isa_features! { $isa => entry_point! {
+                fn filtered[const ANY: bool](tree: &Mbvh, ray: &Ray, filter: &mut Filter) -> RawHit {
+                    single::one_of::<S, _, _, ANY>(tree, ray, filter)
+                }
+            } }
+            isa_features! { $isa => entry_point! {
+                fn compact_filtered[const ANY: bool](tree: &View, ray: &Ray, filter: &mut Filter) -> RawHit {
+                    single::one_of::<S, _, _, ANY>(tree, ray, filter)
+                }
+            } }
+
             pub(super) static TABLE: Kernels = Kernels {
-                isa: $isa,
+                isa: Isa::$isa,
                 intersect,
                 intersect_block,
                 occluded,
@@ -95,11 +100,11 @@ macro_rules! table {
     };
 }
 
-table!(PORTABLE, portable, simd::Portable, Isa::Portable);
+table!(PORTABLE, portable, Portable);
 #[cfg(target_arch = "x86_64")]
-table!(AVX2, avx2, simd::Avx2, Isa::Avx2, "avx2,fma,popcnt,lzcnt,bmi1,bmi2");
+table!(AVX2, avx2, Avx2);
 #[cfg(target_arch = "x86_64")]
-table!(AVX512, avx512, simd::Avx512, Isa::Avx512, "avx2,fma,popcnt,lzcnt,bmi1,bmi2,avx512f,avx512vl,avx512dq,avx512bw");
+table!(AVX512, avx512, Avx512);
 
 impl Kernels {
     /// The table of an ISA; of the portable one if the machine cannot run `isa`.
@@ -116,7 +121,7 @@ impl Kernels {
     /// Closest hit.
     #[inline]
     pub(crate) fn intersect(&self, bvh: &Mbvh, ray: &Ray) -> RawHit {
-        // SAFETY (this and below): `for_isa` checked that the machine has the ISA.
+        // SAFETY: `for_isa` checked that the machine has the ISA.
         unsafe { (self.intersect)(bvh, ray) }
     }
 

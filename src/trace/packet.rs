@@ -52,12 +52,13 @@ pub(super) unsafe fn block<S: Simd>(bvh: &Mbvh, rays: &[Ray], out: &mut [RawHit]
             end += length.max(1);
             length = 0;
         }
-        // SAFETY (both): forwarded; `bundle` has said that these are one.
         if start < end {
             let (rays, out) = (&rays[start..end], &mut out[start..end]);
+            // SAFETY: forwarded.
             unsafe { single::many::<S, _, false>(bvh, rays.len(), |i| rays[i], |i, hit| out[i] = hit) }
         }
         if length > 0 {
+            // SAFETY: forwarded; `bundle` has said that these are one.
             unsafe { trace::<S>(bvh, &rays[end..end + length], &mut out[end..end + length]) }
         }
         start = end + length;
@@ -264,13 +265,11 @@ unsafe fn replace<L: Lanes>(column: &mut Column, g: usize, mask: L::Mask, x: L) 
 #[inline(always)]
 unsafe fn trace<S: Simd>(bvh: &Mbvh, rays: &[Ray], out: &mut [RawHit]) {
     let mut place = MaybeUninit::uninit();
-    // SAFETY (all below): the caller vouches for the ISA. Groups are below `shared.groups`, all of whose lanes
-    // `begin` writes. Children on the stack are of the tree, and the builder bounds its depth so that there
-    // is room (see `STACK_SIZE`).
-    let (shared, mut pyramid) = unsafe { begin::<S>(rays, &mut place) };
-    let rays = unsafe { place.assume_init_mut() };
+    // SAFETY: forwarded.
+    let (rays, shared, mut pyramid) = unsafe { begin::<S>(rays, &mut place) };
     let mut stack = MaybeUninit::<Stack>::uninit();
     let stack = stack.as_mut_ptr();
+    // SAFETY: addresses within the stack; nothing is read.
     let (nears, children, firsts) = unsafe {
         (
             (&raw mut (*stack).near).cast::<f32>(),
@@ -280,6 +279,8 @@ unsafe fn trace<S: Simd>(bvh: &Mbvh, rays: &[Ray], out: &mut [RawHit]) {
     };
     let (mut count, mut number, mut first) = (0, 0, 0);
     loop {
+        // SAFETY: `number` is the root's or comes from a node of this tree. The builder bounds the tree's depth so
+        // that there is room for eight more children (see `STACK_SIZE`). The caller vouches for the ISA.
         unsafe {
             let node = bvh.nodes.get_unchecked(number);
             let (near, mask) = pyramid.node::<S>(node, shared.negative);
@@ -295,6 +296,8 @@ unsafe fn trace<S: Simd>(bvh: &Mbvh, rays: &[Ray], out: &mut [RawHit]) {
                 return;
             }
             count -= 1;
+            // SAFETY: entries below the count have been written, and name children of this tree's nodes. Groups
+            // are below `shared.groups`. The caller vouches for the ISA.
             unsafe {
                 if *nears.add(count) > pyramid.end {
                     continue;
@@ -331,12 +334,12 @@ unsafe fn trace<S: Simd>(bvh: &Mbvh, rays: &[Ray], out: &mut [RawHit]) {
     }
 }
 
-/// Sets up a bundle in `place`.
+/// Sets up a bundle in `place`, with all lanes of its groups.
 ///
 /// # Safety
 /// As for [`trace`].
 #[inline(always)]
-unsafe fn begin<S: Simd>(rays: &[Ray], place: &mut MaybeUninit<Bundle>) -> (Shared, Pyramid) {
+unsafe fn begin<'a, S: Simd>(rays: &[Ray], place: &'a mut MaybeUninit<Bundle>) -> (&'a mut Bundle, Shared, Pyramid) {
     let width = S::Packet::WIDTH;
     let Ray { origin, direction, tmin, tmax } = rays[0];
     let axes = Shear::new(origin, direction).axes.map(|a| a as usize);
@@ -355,7 +358,7 @@ unsafe fn begin<S: Simd>(rays: &[Ray], place: &mut MaybeUninit<Bundle>) -> (Shar
         (b.direction[0][i], b.direction[1][i], b.direction[2][i]) = (d[0], d[1], d[2]);
         b.limit[i] = limit;
     }
-    // SAFETY (all below): the caller vouches for the ISA; groups are of the bundle.
+    // SAFETY: the caller vouches for the ISA; groups are of the bundle.
     unsafe {
         let splat = |x: f32| S::Packet::splat(x);
         let zero = splat(0.0);
@@ -403,7 +406,7 @@ unsafe fn begin<S: Simd>(rays: &[Ray], place: &mut MaybeUninit<Bundle>) -> (Shar
             begin: begin - SLACK * begin.abs(),
             end: b.end::<S::Packet>(shared.groups),
         };
-        (shared, pyramid)
+        (b, shared, pyramid)
     }
 }
 
@@ -475,13 +478,14 @@ impl Bundle {
         planes: &[[S::Packet; 2]; 3],
         first: usize,
     ) -> bool {
-        let (rows, count) = (bvh.leaf(leaf), leaf.leaf_count());
+        // SAFETY: forwarded.
+        let (rows, count) = (unsafe { bvh.leaf(leaf) }, leaf.leaf_count());
         // From corners to the origin, in the frame that all rays share.
         let mut corners = [[0.0f32; MAX_LEAF]; 9];
-        // SAFETY (all below): rows are `count` apart, and the pad behind the last leaf covers reads beyond
-        // it; `corners` have room for twice four. The caller vouches for the ISA.
         for i in (0..count).step_by(4) {
             for a in 0..3 {
+                // SAFETY: rows are `count` apart, and the pad behind the last leaf covers reads beyond it;
+                // `corners` have room for twice four. The caller vouches for the ISA.
                 unsafe {
                     let origin = S::F4::splat(shared.frame_origin[a]);
                     let row = rows.add(i + shared.axes[a] * count);
@@ -494,18 +498,23 @@ impl Bundle {
         }
         let mut improved = false;
         for g in first..shared.groups {
+            // SAFETY: one of the bundle's groups. The caller vouches for the ISA.
             let meets = unsafe { self.meet::<S::Packet>(planes, shared.tmin, g) };
             if !meets.any() {
                 continue;
             }
+            // SAFETY: as above.
             let shear = unsafe { [lanes(&self.shear[0], g), lanes(&self.shear[1], g)] };
             for i in 0..count {
+                // SAFETY: the caller vouches for the ISA.
                 let corner = |k: usize| unsafe {
                     V3::<S::Packet>::splat([corners[3 * k][i], corners[3 * k + 1][i], corners[3 * k + 2][i]])
                 };
                 let seen = Projected::new([corner(0), corner(1), corner(2)], shear);
+                // SAFETY: as above.
                 let candidates = unsafe { seen.inside() }.and(meets);
                 if candidates.any() {
+                    // SAFETY: `rows` are the leaf's, and `i` is below its count. The caller vouches for the ISA.
                     improved |= unsafe { self.improve(rows, count, i, shared, g, &seen, candidates) };
                 }
             }
@@ -528,7 +537,7 @@ impl Bundle {
         seen: &Projected<L>,
         candidates: L::Mask,
     ) -> bool {
-        // SAFETY (all below): the caller vouches for the ISA, the group and the leaf.
+        // SAFETY: the caller vouches for the ISA, the group and the leaf.
         unsafe {
             let zero = L::splat(0.0);
             let [i0, i1, i2] = shared.axes;

@@ -159,7 +159,7 @@ impl RaySetup {
     /// The CPU must have the ISA.
     #[inline(always)]
     unsafe fn boxes<L: Lanes>(&self, boxes: &impl Boxes<L>, tmax: f32) -> (L, L::Mask) {
-        // SAFETY (all): the caller vouches for the ISA; axes are.
+        // SAFETY: the caller vouches for the ISA; 0, 1 and 2 are axes.
         let ((nx, fx), (ny, fy), (nz, fz)) = unsafe {
             if self.is_slow {
                 (self.slow_axis(boxes, 0), self.slow_axis(boxes, 1), self.slow_axis(boxes, 2))
@@ -167,6 +167,7 @@ impl RaySetup {
                 (self.axis(boxes, 0), self.axis(boxes, 1), self.axis(boxes, 2))
             }
         };
+        // SAFETY: the caller vouches for the ISA.
         let (tmin, tmax) = unsafe { (L::splat(self.tmin), L::splat(tmax)) };
         let near = nx.max(ny).max(nz.max(tmin));
         let far = fx.min(fy).min(fz.min(tmax));
@@ -319,8 +320,9 @@ unsafe fn leaf<S: Simd, T: Tree, A: Accept, const ANY: bool>(
                 let i = inaccurate.trailing_zeros() as usize;
                 inaccurate &= inaccurate - 1;
                 let weights = [projected.u, projected.v, projected.w].map(|l| l.to_array()[i]);
-                // Where all vanish, the ray lies in the plane. SAFETY: `candidates` has no lane beyond the count.
+                // Where all vanish, the ray lies in the plane.
                 let is_seen = weights[0] + weights[1] + weights[2] != 0.0;
+                // SAFETY: `candidates` has no lane beyond the count.
                 t[i] = if is_seen { unsafe { leaf.accurate_distance(first + i, &ray.shear) } } else { f32::NAN };
             }
             let (u, v, w) = (projected.u.to_array(), projected.v.to_array(), projected.w.to_array());
@@ -617,14 +619,15 @@ pub(super) unsafe fn many<S: Simd, T: Tree, const ANY: bool>(
     let (idle, at_nodes, at_leaves) = (idle.as_mut_ptr(), at_nodes.as_mut_ptr(), at_leaves.as_mut_ptr());
     let (mut idle_count, mut node_count, mut leaf_count) = (FLIGHT, 0, 0);
     let mut next = 0;
-    // SAFETY (all below): every walk is in one queue, so that no queue holds more than FLIGHT; those at
-    // nodes and leaves have begun. The caller vouches for the ISA.
+    // Every walk is in one queue, so that none holds more than FLIGHT: what the blocks below rely on.
     loop {
         while idle_count > 0 && next < count {
-            let walk = unsafe { *idle.add(idle_count - 1) };
-            if Walk::begin::<T>(unsafe { &mut *walk.cast() }, &ray(next), next) {
+            // SAFETY: the queue's last entry, which names one of the places; nothing else refers to an idle one.
+            let place = unsafe { &mut *(*idle.add(idle_count - 1)).cast() };
+            if Walk::begin::<T>(place, &ray(next), next) {
                 idle_count -= 1;
-                unsafe { *at_nodes.add(node_count) = walk };
+                // SAFETY: the walk was idle, so that there is room among those at nodes.
+                unsafe { *at_nodes.add(node_count) = place.as_mut_ptr() };
                 node_count += 1;
             } else {
                 done(next, RawHit::MISS);
@@ -636,34 +639,42 @@ pub(super) unsafe fn many<S: Simd, T: Tree, const ANY: bool>(
         }
         // Puts a walk where its next visit will be: into both queues, but counted in one. It is written
         // at or before the place that is read next.
-        let enqueue = |walk: *mut Walk, child: ChildRef, nodes: &mut usize, leaves: &mut usize| unsafe {
+        let enqueue = |walk: *mut Walk, child: ChildRef, nodes: &mut usize, leaves: &mut usize| {
             tree.prefetch(child);
-            *at_nodes.add(*nodes) = walk;
-            *at_leaves.add(*leaves) = walk;
+            // SAFETY: at most FLIGHT walks are counted in a queue, and each has room for one more.
+            unsafe {
+                *at_nodes.add(*nodes) = walk;
+                *at_leaves.add(*leaves) = walk;
+            }
             *leaves += child.is_leaf() as usize;
             *nodes += !child.is_leaf() as usize;
         };
         let visits = std::mem::take(&mut node_count);
         for k in 0..visits {
-            let walk = unsafe { *at_nodes.add(k) };
-            let child = unsafe { (*walk).visit_node::<S, T, false>(tree) };
+            // SAFETY: one of the queue's walks, which have begun in this tree and are at a node. The caller
+            // vouches for the ISA.
+            let (walk, child) = unsafe {
+                let walk = *at_nodes.add(k);
+                (walk, (*walk).visit_node::<S, T, false>(tree))
+            };
             enqueue(walk, child, &mut node_count, &mut leaf_count);
         }
         let visits = std::mem::take(&mut leaf_count);
         for k in 0..visits {
-            let walk = unsafe { *at_leaves.add(k) };
-            let mut child = unsafe { (*walk).current };
+            // SAFETY: one of the queue's walks, which have begun; nothing else refers to it now.
+            let walk = unsafe { &mut **at_leaves.add(k) };
+            let mut child = walk.current;
             if child != ChildRef::EMPTY {
-                child = unsafe { (*walk).visit_leaf::<S, T, All, ANY>(tree, &mut All) };
+                // SAFETY: it has begun in this tree, and is at a leaf. The caller vouches for the ISA.
+                child = unsafe { walk.visit_leaf::<S, T, All, ANY>(tree, &mut All) };
             }
             if child != ChildRef::EMPTY {
                 enqueue(walk, child, &mut node_count, &mut leaf_count);
                 continue;
             }
-            unsafe {
-                done((*walk).number, (*walk).hit());
-                *idle.add(idle_count) = walk;
-            }
+            done(walk.number, walk.hit());
+            // SAFETY: the walk was in another queue, so that there is room among the idle ones.
+            unsafe { *idle.add(idle_count) = walk };
             idle_count += 1;
         }
     }

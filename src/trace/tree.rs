@@ -109,7 +109,8 @@ impl Tree for Mbvh {
 
     #[inline(always)]
     unsafe fn leaf<S: Simd>(&self, leaf: ChildRef) -> Rows {
-        Rows { rows: self.leaf(leaf), count: leaf.leaf_count() }
+        // SAFETY: forwarded.
+        Rows { rows: unsafe { self.leaf(leaf) }, count: leaf.leaf_count() }
     }
 }
 

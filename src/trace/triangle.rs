@@ -111,14 +111,15 @@ impl<L: Lanes> Projected<L> {
     /// [`crate::bvh::Mbvh`], and `first < count`.
     #[inline(always)]
     pub(super) unsafe fn load(leaf: *const f32, count: usize, first: usize, ray: &Shear) -> Self {
-        // SAFETY (all): rows are `count` apart; the pad behind the last leaf covers reads beyond it. The
-        // caller vouches for the ISA.
+        // SAFETY: rows are `count` apart; the pad behind the last leaf covers reads beyond it. The caller
+        // vouches for the ISA.
         let axis = |a: usize| unsafe {
             let (row, origin) = (leaf.add(first + ray.axes[a] as usize * count), L::splat(ray.origin[a]));
             [0, 3 * count, 6 * count].map(|corner| origin - L::load(row.add(corner)))
         };
         let ([ax, bx, cx], [ay, by, cy], [az, bz, cz]) = (axis(0), axis(1), axis(2));
         let corners = [V3 { x: ax, y: ay, z: az }, V3 { x: bx, y: by, z: bz }, V3 { x: cx, y: cy, z: cz }];
+        // SAFETY: the caller vouches for the ISA.
         Self::new(corners, unsafe { [L::splat(ray.shear[0]), L::splat(ray.shear[1])] })
     }
 
@@ -167,7 +168,7 @@ impl<L: Lanes> Projected<L> {
         let [a, b, c] = self.corners;
         let (e0, e1) = (c.sub(a), b.sub(a));
         let normal = e0.cross(e1);
-        // SAFETY (all): the caller vouches for the ISA.
+        // SAFETY: the caller vouches for the ISA.
         let splat = |x: f32| unsafe { L::splat(x) };
         let zero = splat(0.0);
         let slope = normal.dot(back);
