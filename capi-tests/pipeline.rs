@@ -4,6 +4,7 @@
 use bakelite::bvh::BuildOptions;
 use bakelite::lightmap::plan::left_out;
 use bakelite::lightmap::{BakeParams, Layer, LayerData, Lightmap, LightmapDesc};
+use bakelite::photon::{PhotonMap, PhotonParams};
 use bakelite::reference::{Irradiance, PathTracer, Random, SurfacePoint};
 use bakelite::scene::shapes::MeshBuilder;
 use bakelite::scene::{Environment, builtin};
@@ -492,6 +493,38 @@ fn creating_a_light_map_can_be_cancelled() {
     let scene = commit("cornell", &device(2, None));
     let cancel = Progress::new(|_, _| false);
     assert_eq!(Lightmap::create(&scene, &small().0, &cancel).err(), Some(Error::Cancelled));
+}
+
+#[test]
+fn reports_are_made_on_the_calling_thread_alone() {
+    let this = std::thread::current().id();
+    let same_thread = |_: f32, _: &str| std::thread::current().id() == this;
+    let device = device(2, None);
+    let data = builtin("cornell").unwrap();
+    let scene = Scene::commit(&device, data, &BuildOptions::default(), &Progress::new(same_thread)).map_err(|e| e.1);
+    let scene = scene.unwrap();
+    let mut map = Lightmap::create(&scene, &small().0, &Progress::new(same_thread)).unwrap();
+    map.bake(&small().1, &Progress::new(same_thread)).unwrap();
+    PhotonMap::trace(&scene, &PhotonParams::default(), &Progress::new(same_thread)).unwrap();
+}
+
+#[test]
+fn a_callback_may_wait_for_the_threads_of_the_call_that_it_is_in() {
+    let scene = commit("cornell", &device(1, None));
+    let mut map = Lightmap::create(&scene, &small().0, &Progress::none()).unwrap();
+    let device = scene.device().clone();
+    let mut waited = 0;
+    map.bake(
+        &small().1,
+        &Progress::new(|_, _| {
+            device.install(|| {
+                waited += 1;
+                true
+            })
+        }),
+    )
+    .unwrap();
+    assert!(waited > 4);
 }
 
 #[test]

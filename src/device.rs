@@ -3,6 +3,7 @@
 
 use crate::error::{Error, Result, invalid_argument};
 use crate::memory::{MemoryFn, MemoryMonitor};
+use crate::progress::Progress;
 use crate::simd::Isa;
 use crate::trace::Kernels;
 use std::cell::Cell;
@@ -99,6 +100,26 @@ impl Device {
             return f();
         }
         self.pool.as_ref().expect("there until dropped").install(f)
+    }
+
+    /// Runs `f` on the device's threads, as [`install`](Self::install) does, while the calling thread makes the
+    /// reports of `progress`. On a thread of the device, which has to work, reports are made when work is counted.
+    pub fn run<R: Send>(&self, progress: &Progress, f: impl FnOnce() -> R + Send) -> R {
+        let pool = self.pool.as_ref().expect("there until dropped");
+        if APART.get() || pool.current_thread_index().is_some() || !progress.wants_attendance() {
+            return self.install(f);
+        }
+        let mut result = None;
+        let out = &mut result;
+        pool.in_place_scope(|scope| {
+            progress.attend(|attended| {
+                scope.spawn(move |_| {
+                    let _attended = attended;
+                    *out = Some(f());
+                });
+            });
+        });
+        result.expect("the scope waits for what it spawned, and passes its panic on")
     }
 
     /// Runs `f` on one of the device's threads and returns at once. What it would

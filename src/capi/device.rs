@@ -40,9 +40,11 @@ pub const BK_LOG_WARNING: u32 = 1;
 pub const BK_LOG_INFO: u32 = 2;
 
 /// Told how far a call is: fraction in [0, 1], never falling, and the name of the stage, as
-/// "gather". Called by one thread at a time, about every 10 ms and at least once per stage. Return
-/// 0 to cancel: the call then ends soon with BK_ERROR_CANCELLED. NULL is allowed wherever one is
-/// taken.
+/// "gather". Called on the thread that made the call, and only until that call returns: when a stage
+/// starts and about every 15 ms, at most 100 times in any second. (A stage that starts when 20 others
+/// just have is reported with the next call.) The library's own threads go on working meanwhile.
+/// Return 0 to cancel: the call then ends with BK_ERROR_CANCELLED, as a rule within 50 ms. NULL is
+/// allowed wherever one is taken.
 pub type bk_progress_fn = Option<unsafe extern "C" fn(user: *mut c_void, fraction: f32, stage: *const c_char) -> i32>;
 
 /// Receives log messages (UTF-8) with one of the BK_LOG levels, from any thread, several at a time.

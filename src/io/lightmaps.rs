@@ -68,7 +68,7 @@ fn each_page(
     let jobs: Vec<(u32, Layer, &str)> =
         (0..lightmap.info().page_count).flat_map(|page| LAYERS.map(|(layer, name)| (page, layer, name))).collect();
     let stage: Stage = progress.stage("pages", 0.0, 1.0, jobs.len() as u64);
-    lightmap.scene().device().install(|| {
+    lightmap.scene().device().run(progress, || {
         let written = jobs.par_iter().map(|&(page, layer, name)| {
             let path = write(page, layer, name)?;
             stage.advance(1)?;

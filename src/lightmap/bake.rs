@@ -60,6 +60,12 @@ impl Lightmap {
     /// Unwraps what brings no usable UVs, lays out the pages and maps texels to triangles.
     pub fn create(scene: &Arc<Scene>, desc: &LightmapDesc, progress: &Progress) -> Result<Lightmap> {
         desc.validate()?;
+        let lightmap = scene.device().run(progress, || Self::lay_out(scene, desc, progress))?;
+        progress.check()?;
+        Ok(lightmap)
+    }
+
+    fn lay_out(scene: &Arc<Scene>, desc: &LightmapDesc, progress: &Progress) -> Result<Lightmap> {
         let start = Instant::now();
         let density = match desc.texels_per_unit {
             0.0 => automatic_density(scene, desc.page_size, AUTOMATIC_PAGES),
@@ -136,25 +142,24 @@ impl Lightmap {
         plan.note_both_sides(&self.atlas.info);
         let device = self.atlas.scene.device().clone();
         device.memory().reset_peak();
-        let bake = Bake {
-            atlas: &self.atlas,
-            params,
-            plan: &plan,
-            direct: &direct,
-            range: params.texel_begin as usize..end as usize,
-            progress,
-        };
-        let (light, mut stats) = bake.run()?;
-        stats.back_charts = light.backs.iter().filter(|&&b| b).count() as u64;
-        plan.note_back_charts(stats.back_charts);
-        plan.note_bright(&light.radiance.bright);
         let range = params.texel_begin as usize..end as usize;
-        let stitch = self.stitch(&light, &range, params, &mut plan, &mut stats, progress)?;
+        let (light, mut stats, stitch) = device.run(progress, || {
+            let (atlas, direct, range) = (&self.atlas, &direct, range.clone());
+            let (light, mut stats) =
+                Bake { atlas, params, plan: &plan, direct, range: range.clone(), progress }.run()?;
+            stats.back_charts = light.backs.iter().filter(|&&b| b).count() as u64;
+            plan.note_back_charts(stats.back_charts);
+            plan.note_bright(&light.radiance.bright);
+            let stitch = self.stitch(&light, &range, params, &mut plan, &mut stats, progress)?;
+            Ok((light, stats, stitch))
+        })?;
+        // The last moment at which nothing has changed.
+        progress.check()?;
         stats.left_out = plan.left_out;
         stats.peak_bytes = device.memory().peak() as u64;
         self.plan = plan;
         let start = Instant::now();
-        self.store(light, range, stitch);
+        device.install(|| self.store(light, range, stitch));
         stats.compose.seconds = start.elapsed().as_secs_f64();
         stats.seconds += stats.compose.seconds;
         Ok(stats)

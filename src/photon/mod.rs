@@ -209,7 +209,9 @@ impl PhotonMap {
     /// `OutOfMemory` if `memory_budget` or the memory monitor refuses. Lights without power make an
     /// empty map.
     pub fn trace(scene: &Arc<Scene>, params: &PhotonParams, progress: &Progress) -> Result<PhotonMap> {
-        Self::trace_within(scene, params, progress, 0.0, 1.0)
+        let map = scene.device().run(progress, || Self::trace_within(scene, params, progress, 0.0, 1.0))?;
+        progress.check()?;
+        Ok(map)
     }
 
     /// The same as a part of a longer call: reports progress over `[from, to]` of the bar.
@@ -303,7 +305,7 @@ impl PhotonMap {
         }
         let stage = progress.stage("photon estimates", 0.0, 1.0, positions.len() as u64);
         let blocks = positions.par_chunks(BLOCK).zip(normals.par_chunks(BLOCK)).zip(out.par_chunks_mut(BLOCK));
-        self.scene.device().install(|| {
+        self.scene.device().run(progress, || {
             blocks.try_for_each(|((positions, normals), out)| {
                 self.estimate_block(positions, normals, out);
                 stage.advance(positions.len() as u64)

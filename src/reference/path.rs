@@ -162,7 +162,7 @@ impl PathTracer {
             let result = self.irradiance(point, samples, seed, i as u64);
             stage.advance(1).map(|()| result)
         };
-        device.install(|| points.par_iter().enumerate().map(one).collect())
+        device.run(progress, || points.par_iter().enumerate().map(one).collect())
     }
 
     /// One estimate of irradiance from `k` × `k` samples.
@@ -320,7 +320,7 @@ impl PathTracer {
             stage.advance(1).map(|()| out)
         };
         let tiles: Vec<_> =
-            device.install(|| (0..columns * rows).into_par_iter().map(render_tile).collect::<Result<_>>())?;
+            device.run(progress, || (0..columns * rows).into_par_iter().map(render_tile).collect::<Result<_>>())?;
         let mut image = vec![[0.0; 3]; width * height];
         for (tile, colors) in tiles.into_iter().enumerate() {
             for ((x, y), color) in pixels(tile).zip(colors) {

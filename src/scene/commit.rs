@@ -137,7 +137,8 @@ impl Scene {
         options: &BuildOptions,
         progress: &Progress,
     ) -> std::result::Result<Arc<Scene>, (SceneData, Error)> {
-        match Self::build(device, &data, options, progress) {
+        let built = device.run(progress, || Self::build(device, &data, options, progress));
+        match built.and_then(|parts| progress.check().map(|()| parts)) {
             Ok(parts) => {
                 let scene = Arc::new(parts.into_scene(device.clone(), data));
                 scene.warn_of_few_digits();

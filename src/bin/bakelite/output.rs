@@ -60,7 +60,7 @@ pub fn write_pages(folder: &Path, lightmap: &Lightmap, exposure: f32, progress: 
         stage.advance(1)?;
         Ok([exr, png])
     };
-    let files: Result<Vec<_>> = lightmap.scene().device().install(|| jobs.par_iter().map(write).collect());
+    let files: Result<Vec<_>> = lightmap.scene().device().run(progress, || jobs.par_iter().map(write).collect());
     Ok(files?.into_iter().flatten().collect())
 }
 

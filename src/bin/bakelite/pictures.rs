@@ -130,7 +130,7 @@ pub fn render(
     [width, height]: [usize; 2],
     seed: u32,
     progress: &Progress,
-    name: &str,
+    name: &'static str,
     irradiance: impl Fn(&Seen) -> Result<Vec3> + Sync,
 ) -> Result<Pixels> {
     let rays = PrimaryRays::new(camera, width, height);
@@ -148,7 +148,7 @@ pub fn render(
         }
         stage.advance(1)
     };
-    scene.device().install(|| pixels.par_chunks_mut(width).enumerate().try_for_each(row))?;
+    scene.device().run(progress, || pixels.par_chunks_mut(width).enumerate().try_for_each(row))?;
     Ok(pixels)
 }
 
