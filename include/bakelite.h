@@ -164,9 +164,11 @@ typedef struct bk_device_desc {
 } bk_device_desc;
 
 // Told how far a call is: fraction in [0, 1], never falling, and the name of the stage, as
-// "gather". Called by one thread at a time, about every 10 ms and at least once per stage. Return
-// 0 to cancel: the call then ends soon with BK_ERROR_CANCELLED. NULL is allowed wherever one is
-// taken.
+// "gather". Called on the thread that made the call, and only until that call returns: when a stage
+// starts and about every 15 ms, at most 100 times in any second. (A stage that starts when 20 others
+// just have is reported with the next call.) The library's own threads go on working meanwhile.
+// Return 0 to cancel: the call then ends with BK_ERROR_CANCELLED, as a rule within 50 ms. NULL is
+// allowed wherever one is taken.
 typedef int32_t (*bk_progress_fn)(void *user, float fraction, const char *stage);
 
 // Fills in the defaults.

@@ -15,13 +15,14 @@ pub const HELP: &str = "\
 Bakes light maps.
 
 Usage: bakelite [bake] [SCENE] [OPTIONS]
-       bakelite report live|memory|pipeline|quality|stability [SCENE] [OPTIONS]
+       bakelite report cancel|live|memory|pipeline|quality|stability [SCENE] [OPTIONS]
 
 SCENE, or --scene SCENE, is a file (.obj .ply .gltf .glb) or a built-in scene (atrium, cornell,
 furnace). Without it, the atrium is baked. Lengths are in scene units, colours
 are linear r,g,b.
 
 Reports measure instead, and write tables, plots and CSV:
+  cancel    how long each call is silent, and how soon it ends when it is cancelled
   live      live updates: error against time and rays, budgets, traffic, memory
   memory    the scene's memory, default and compact, and what that costs rays
   pipeline  what each stage of a bake takes, and what bounds it
@@ -96,6 +97,7 @@ Output:
 #[derive(Debug)]
 pub enum Command {
     Bake(Box<BakeArgs>),
+    ReportCancel(Box<BakeArgs>),
     ReportLive(Box<ReportArgs>),
     ReportMemory(Box<BakeArgs>),
     ReportPipeline(Box<BakeArgs>),
@@ -207,7 +209,7 @@ impl Default for ReportArgs {
 }
 
 /// What there is to report.
-const REPORTS: [&str; 5] = ["live", "memory", "pipeline", "quality", "stability"];
+const REPORTS: [&str; 6] = ["cancel", "live", "memory", "pipeline", "quality", "stability"];
 
 /// What a report of quality varies.
 const KNOBS: [&str; 9] = [
@@ -303,6 +305,7 @@ pub fn parse(args: impl IntoIterator<Item = OsString>) -> Result<Command, String
         return Err(format!("{flag} is for `report {kind}` alone"));
     }
     Ok(match reported.as_str() {
+        "cancel" => Command::ReportCancel(Box::new(report.bake)),
         "live" => Command::ReportLive(Box::new(report)),
         "memory" => Command::ReportMemory(Box::new(report.bake)),
         "pipeline" => Command::ReportPipeline(Box::new(report.bake)),
@@ -633,8 +636,11 @@ mod tests {
             ("--camera 0,0,0:1,2,3:200", "field of view is 200"),
             ("--width 0", "--width is 0, outside 1"),
             ("a --scene b", "two scenes, \"a\" and \"b\""),
-            ("report", "report needs what to report; there are: live, memory, pipeline, quality, stability"),
-            ("report dead", "there is no report \"dead\"; there are: live, memory, pipeline, quality, stability"),
+            ("report", "report needs what to report; there are: cancel, live, memory, pipeline, quality, stability"),
+            (
+                "report dead",
+                "there is no report \"dead\"; there are: cancel, live, memory, pipeline, quality, stability",
+            ),
             ("report live --seconds 0", "--seconds is 0, not a finite number greater than 0"),
             ("report live --seconds inf", "--seconds is inf"),
             ("report live --updates 1.5", "--updates is \"1.5\", not a whole number"),

@@ -5,6 +5,7 @@
 //! |---|---|
 //! | `args` | flags, help, and what is wrong with them |
 //! | `bar` | progress on standard error |
+//! | `cancel_report` | how long calls are silent, and how soon they end when cancelled |
 //! | `camera` | a view for scenes that come without one |
 //! | `pictures`, `font` | the three pictures that the thesis compares |
 //! | `output` | light map pages, the scene and texts as files |
@@ -22,6 +23,7 @@ mod args;
 mod bar;
 mod bar_chart;
 mod camera;
+mod cancel_report;
 mod font;
 mod live_measure;
 mod live_report;
@@ -72,6 +74,7 @@ fn main() -> ExitCode {
             Ok(())
         }
         Ok(Command::Bake(bake)) => Job::new(&bake).run(),
+        Ok(Command::ReportCancel(args)) => cancel_report::run(&args),
         Ok(Command::ReportLive(report)) => live_report::run(&report),
         Ok(Command::ReportMemory(args)) => memory_report::run(&args),
         Ok(Command::ReportPipeline(args)) => pipeline_report::run(&args),
