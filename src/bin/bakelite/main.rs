@@ -15,6 +15,7 @@
 //! | `memory_report` | a scene's memory by part, and what little of it costs rays |
 //! | `pipeline_report`, `bar_chart` | the stages of a bake, and what bounds each |
 //! | `quality_measure`, `quality_report` | error of the light against run time |
+//! | `quality_places` | where somebody can stand, who looks at it |
 //! | `quality_view`, `ssim` | likeness of views of it |
 //! | `stability`, `stability_*` | stiff and extreme cases against what is known of them |
 //! | `texel_paths` | path tracing every texel, which a bake is compared with |
@@ -34,6 +35,7 @@ mod pictures;
 mod pipeline_report;
 mod plot;
 mod quality_measure;
+mod quality_places;
 mod quality_report;
 mod quality_view;
 mod report;

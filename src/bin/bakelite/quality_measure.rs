@@ -1,40 +1,39 @@
 //! Measurements of the error of light: the points compared, their reference, and the error of several
 //! runs with different seeds, bias and variance apart.
 
-use crate::measure::{pick, visible_texels};
+use crate::quality_places;
 use bakelite::lightmap::texels::TexelSample;
-use bakelite::lightmap::{Layer, Lightmap};
+use bakelite::lightmap::{Layer, LayerData, Lightmap, MeshUvs};
 use bakelite::reference::{PathTracer, SurfacePoint};
-use bakelite::sampling::{cosine_around, uniform, uniform_sphere};
+use bakelite::sampling::{uniform, uniform_sphere};
+use bakelite::scene::{Camera, Light, NONE};
 use bakelite::trace::Ray;
-use bakelite::trace::offset::offset_ray_origin;
 use bakelite::{Error, Progress, Result};
-use glam::{DVec3, Vec3};
+use glam::{DVec3, Vec2, Vec3};
+use std::collections::BTreeMap;
 use std::fmt::Write;
 use std::path::Path;
 
 /// Attempts per point, most of which fail where little is enclosed.
 const TRIES: u32 = 100;
 
-/// Gaps narrower than this part of the scene's diagonal are not where anybody looks from.
-const MIN_ROOM: f32 = 0.02;
+/// The part of the points that is left out with the worst.
+const WORST: f64 = 0.01;
 
 /// Irradiance at each point.
 pub type Values = Vec<[f64; 3]>;
 
-/// Points of surfaces, as often as they are seen from places in the scene.
-#[derive(Default)]
+/// Points of surfaces, as often as they are seen from places in the scene where somebody can stand.
+#[derive(Clone, Default)]
 pub struct Points {
     /// Global triangle, whether it is its front, and weights of its corners 1 and 2.
     pub on: Vec<(u32, bool, f32, f32)>,
-    /// Unit normals of the sides that the light map holds.
+    /// Unit normals of the sides that are seen.
     pub normals: Vec<Vec3>,
     pub positions: Vec<Vec3>,
     /// Irradiance of the reference, indirect and all, as two halves with independent noise.
     pub indirect: [Values; 2],
     pub all: [Values; 2],
-    /// How many more were seen, on sides that the light map does not hold.
-    pub of_other_sides: usize,
 }
 
 /// What a file of points has of each: where it is, the light of a bake, to look at, and the reference.
@@ -59,16 +58,18 @@ pub struct Errors {
     pub to_mean: f64,
     /// Mean of the error by the mean of the reference: how much too bright.
     pub mean: f64,
+    /// `mse` without the worst hundredth of the points.
+    pub trimmed: f64,
     /// Standard error of `mse` over the points.
     pub uncertainty: f64,
 }
 
 impl Points {
-    /// Chooses `count` points of the surfaces of a baked light map and path traces the reference there, with `paths` in
-    /// f64 per point.
-    pub fn new(lightmap: &Lightmap, count: usize, paths: u32, progress: &Progress) -> Result<Points> {
+    /// Chooses `count` points of surfaces that are seen from places that can be reached from `camera` and from the lamps,
+    /// on whatever side, and path traces the reference there, with `paths` in f64 per point.
+    pub fn new(lightmap: &Lightmap, camera: &Camera, count: usize, paths: u32, progress: &Progress) -> Result<Points> {
         let mut points = Points::default();
-        points.choose(lightmap, count)?;
+        points.choose(lightmap, camera, count)?;
         let scene = lightmap.scene();
         let tracer = PathTracer::new(scene);
         let surface: Vec<SurfacePoint> = (0..points.on.len())
@@ -85,8 +86,7 @@ impl Points {
         Ok(points)
     }
 
-    /// The points and the reference of an earlier report of the same scene, as [`csv`](Self::csv) writes them, less those
-    /// on sides that the light map does not show now.
+    /// The points and the reference of an earlier report of the same scene, as [`csv`](Self::csv) writes them.
     pub fn read(path: &Path, lightmap: &Lightmap) -> Result<Points> {
         let scene = lightmap.scene();
         let invalid = |what: String| Error::InvalidArgument(format!("{}: {what}", path.display()));
@@ -113,10 +113,6 @@ impl Points {
                 return Err(invalid(format!("of another scene: {line}")));
             }
             let front = normal.dot(scene.normal(triangle)) > 0.0;
-            if !lightmap.shows(triangle, front) {
-                points.of_other_sides += 1;
-                continue;
-            }
             points.on.push((triangle, front, u, v));
             points.positions.push(position);
             points.normals.push(normal);
@@ -128,9 +124,25 @@ impl Points {
             }
         }
         if points.len() == 0 {
-            return Err(invalid("no points on the sides that the light map shows".into()));
+            return Err(invalid("no points".into()));
         }
         Ok(points)
+    }
+
+    /// The points on sides that a light map shows.
+    pub fn shown_by(&self, lightmap: &Lightmap) -> Result<Points> {
+        let shown: Vec<usize> = (0..self.len()).filter(|&i| lightmap.shows(self.on[i].0, self.on[i].1)).collect();
+        if shown.is_empty() {
+            return Err(Error::InvalidArgument("no point is on a side that the light map shows".into()));
+        }
+        let values = |all: &[Values; 2]| all.each_ref().map(|v| shown.iter().map(|&i| v[i]).collect());
+        Ok(Points {
+            on: shown.iter().map(|&i| self.on[i]).collect(),
+            normals: shown.iter().map(|&i| self.normals[i]).collect(),
+            positions: shown.iter().map(|&i| self.positions[i]).collect(),
+            indirect: values(&self.indirect),
+            all: values(&self.all),
+        })
     }
 
     /// The points and the reference, with the light of a `bake` beside it.
@@ -148,30 +160,18 @@ impl Points {
         out
     }
 
-    /// Points that are seen from places in the air: halfway between a random texel and what it sees, in
-    /// random directions.
-    fn choose(&mut self, lightmap: &Lightmap, count: usize) -> Result<()> {
+    /// Hits of random rays from places in turn.
+    fn choose(&mut self, lightmap: &Lightmap, camera: &Camera, count: usize) -> Result<()> {
         let scene = lightmap.scene();
-        let texels = visible_texels(lightmap)?;
-        let room = MIN_ROOM * scene.diagonal();
+        let places = quality_places::find(scene, &known_places(lightmap, camera), camera.up.normalize());
         for i in 0..count as u32 * TRIES {
-            if self.len() == count {
-                return Ok(());
+            if places.is_empty() || self.len() == count {
+                break;
             }
-            let [position, normal] = pick(&texels, i);
-            let direction = cosine_around(normal, [uniform(i, 0, 0), uniform(i, 1, 0)]);
-            let origin = offset_ray_origin(position, normal, scene);
-            let t = scene.intersect_raw(&Ray::new(origin, direction)).t;
-            if !(t.is_finite() && t > room) {
-                continue;
-            }
+            let place = places[i as usize % places.len()];
             let look = uniform_sphere([uniform(i, 2, 0), uniform(i, 3, 0)]);
-            let hit = scene.intersect_raw(&Ray::new(origin + 0.5 * t * direction, look));
-            if hit.is_miss() {
-                continue;
-            }
-            if !lightmap.shows(hit.triangle, hit.front) {
-                self.of_other_sides += 1;
+            let hit = scene.intersect_raw(&Ray::new(place, look));
+            if hit.is_miss() || !hit.front && !scene.material(hit.triangle).two_sided {
                 continue;
             }
             let side = if hit.front { 1.0 } else { -1.0 };
@@ -181,7 +181,7 @@ impl Points {
             self.normals.push(side * sample.shading_normal(scene));
         }
         match self.len() {
-            0 => Err(Error::InvalidArgument("no surface of the scene is seen from another".into())),
+            0 => Err(Error::InvalidArgument("no surface is seen from around the camera or the lamps".into())),
             _ => Ok(()),
         }
     }
@@ -190,10 +190,60 @@ impl Points {
         self.on.len()
     }
 
-    /// Light that a light map of the same scene has at the points.
-    pub fn of_bake(&self, lightmap: &Lightmap, layer: Layer) -> Values {
-        self.on.iter().map(|&(t, front, u, v)| lightmap.sample(layer, t, front, u, v).map(f64::from)).collect()
+    /// Light that a light map of the same scene has at the points, read from its pages as a shader does: bilinearly, at
+    /// the UVs of the side that is seen.
+    pub fn of_bake(&self, lightmap: &Lightmap, layer: Layer) -> Result<Values> {
+        let (scene, size) = (lightmap.scene(), lightmap.info().width as usize);
+        let mut uvs: BTreeMap<u32, [MeshUvs; 2]> = BTreeMap::new();
+        let mut at: Vec<Option<(u32, [f32; 2])>> = Vec::new();
+        for &(t, front, u, v) in &self.on {
+            let (mesh, triangle) = scene.locate(t);
+            if !uvs.contains_key(&mesh) {
+                uvs.insert(mesh, [lightmap.mesh_back_uvs(mesh)?.0, lightmap.mesh_uvs(mesh)?]);
+            }
+            let (corners, pages) = &uvs[&mesh][usize::from(front)];
+            let [a, b, c] = corners[triangle as usize].map(Vec2::from);
+            let page = pages[triangle as usize];
+            at.push((page != NONE).then(|| (page, ((a + (b - a) * u + (c - a) * v) * size as f32 - 0.5).to_array())));
+        }
+        let mut values = vec![[0.0; 3]; self.len()];
+        for page in 0..lightmap.info().page_count {
+            let LayerData::Rgb(texels) = lightmap.read(page, layer)? else {
+                return Err(Error::Internal("a layer of light has other values".into()));
+            };
+            for (value, at) in values.iter_mut().zip(&at) {
+                if let Some((_, at)) = at.filter(|(on, _)| *on == page) {
+                    *value = bilinear(&texels, size, at);
+                }
+            }
+        }
+        Ok(values)
     }
+}
+
+/// Positions that are likely to be in the rooms: the camera's and some before it, and those of lamps.
+fn known_places(lightmap: &Lightmap, camera: &Camera) -> Vec<Vec3> {
+    let scene = lightmap.scene();
+    let direction = (camera.target - camera.position).normalize();
+    let free = scene.intersect_raw(&Ray::new(camera.position, direction)).t.min(scene.diagonal());
+    let ahead = [0.25, 0.5, 0.75].map(|part| camera.position + part * free * direction);
+    let lamps = scene.lights();
+    let lamps = lamps.iter().filter_map(|light| match *light {
+        Light::Point { position, .. } | Light::Spot { position, .. } => Some(position),
+        _ => None,
+    });
+    [camera.position].into_iter().chain(ahead).chain(lamps).collect()
+}
+
+/// A page of `size` × `size` texels at texel coordinates of which (0, 0) is the first texel's centre.
+fn bilinear(texels: &[[f32; 3]], size: usize, at: [f32; 2]) -> [f64; 3] {
+    let [(x, fx), (y, fy)] = at.map(|a| (a.floor(), f64::from(a - a.floor())));
+    let texel = |x: f32, y: f32| {
+        let [x, y] = [x, y].map(|a| a.clamp(0.0, size as f32 - 1.0) as usize);
+        texels[y * size + x].map(f64::from)
+    };
+    let [a, b, c, d] = [texel(x, y), texel(x + 1.0, y), texel(x, y + 1.0), texel(x + 1.0, y + 1.0)];
+    std::array::from_fn(|k| (a[k] * (1.0 - fx) + b[k] * fx) * (1.0 - fy) + (c[k] * (1.0 - fx) + d[k] * fx) * fy)
 }
 
 /// Errors of several runs against the two halves of a reference. The squared error of x is estimated by
@@ -204,7 +254,8 @@ pub fn errors(runs: &[Values], [a, b]: &[Values; 2]) -> Errors {
     let mean_of = |v: &Values| v.iter().flatten().sum::<f64>() / (3.0 * points);
     let mean = 0.5 * (mean_of(a) + mean_of(b));
     let least = (DARK * mean).powi(2);
-    let (mut mse, mut variance, mut squares, mut to_mean) = (0.0, 0.0, 0.0, 0.0);
+    let (mut variance, mut squares, mut to_mean) = (0.0, 0.0, 0.0);
+    let mut of_points = Vec::with_capacity(a.len());
     for i in 0..a.len() {
         let mut of_point = 0.0;
         for c in 0..3 {
@@ -217,16 +268,20 @@ pub fn errors(runs: &[Values], [a, b]: &[Values; 2]) -> Errors {
                 variance += weight * runs.iter().map(|x| (x[i][c] - mean).powi(2)).sum::<f64>() / (k - 1.0);
             }
         }
-        mse += of_point / points;
+        of_points.push(of_point);
         squares += of_point * of_point / points;
     }
     variance /= points;
+    let mse = of_points.iter().sum::<f64>() / points;
+    of_points.sort_unstable_by(f64::total_cmp);
+    let but_worst = of_points.len() - (WORST * points).ceil() as usize;
     Errors {
         mse,
         variance,
         bias2: mse - variance,
         to_mean,
         mean: runs.iter().map(mean_of).sum::<f64>() / k / mean - 1.0,
+        trimmed: of_points[..but_worst].iter().sum::<f64>() / (but_worst as f64).max(1.0),
         uncertainty: ((squares - mse * mse).max(0.0) / points).sqrt(),
     }
 }
@@ -238,6 +293,7 @@ mod tests {
     use crate::args::BakeArgs;
     use bakelite::lightmap::BakeParams;
     use bakelite::sampling::mix;
+    use bakelite::scene::builtin_camera;
 
     #[test]
     fn bias_variance_and_the_noise_of_the_reference_come_apart() {
@@ -267,9 +323,10 @@ mod tests {
             lightmap
         };
         let cornell = lightmap("cornell");
-        let points = Points::new(&cornell, 20, 4, &Progress::none()).unwrap();
+        let camera = builtin_camera("cornell").unwrap();
+        let points = Points::new(&cornell, &camera, 20, 4, &Progress::none()).unwrap();
         let file = std::env::temp_dir().join(format!("bakelite-points-{}.csv", std::process::id()));
-        std::fs::write(&file, points.csv(&points.of_bake(&cornell, Layer::Indirect))).unwrap();
+        std::fs::write(&file, points.csv(&points.of_bake(&cornell, Layer::Indirect).unwrap())).unwrap();
         let again = Points::read(&file, &cornell);
         let elsewhere = Points::read(&file, &lightmap("furnace"));
         std::fs::remove_file(&file).unwrap();

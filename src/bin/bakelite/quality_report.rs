@@ -56,11 +56,14 @@ pub fn run(args: &ReportArgs) -> Result<()> {
     let mut lightmap = job.unbaked()?;
     let params = args.bake.params;
     job.bars.show("bake", |p| lightmap.bake(&params, p))?;
+    let camera = job.camera(&lightmap);
     let start = Instant::now();
-    let points = match &args.reference {
+    let seen = match &args.reference {
         Some(file) => Points::read(file, &lightmap)?,
-        None => job.bars.show("reference", |p| Points::new(&lightmap, args.points, args.paths, p))?,
+        None => job.bars.show("reference", |p| Points::new(&lightmap, &camera, args.points, args.paths, p))?,
     };
+    let at_points = seen.csv(&seen.of_bake(&lightmap, Layer::Indirect)?);
+    let points = seen.shown_by(&lightmap)?;
     let reference_seconds = start.elapsed().as_secs_f64();
     if points.all[0].iter().flatten().all(|&c| c == 0.0) {
         return Err(Error::InvalidArgument("no light arrives at any of the points compared".into()));
@@ -69,10 +72,8 @@ pub fn run(args: &ReportArgs) -> Result<()> {
     let size = [VIEW_WIDTH, (VIEW_WIDTH * height / width).max(1)];
     let mut view = None;
     if args.view_paths > 0 {
-        let camera = job.camera(&lightmap);
         view = Some(job.bars.show("view", |p| ViewReference::new(&lightmap, camera, size, args.view_paths, p))?);
     }
-    let at_points = points.csv(&points.of_bake(&lightmap, Layer::Indirect));
     let mut measure = Measure { args, points: &points, view: view.as_ref(), rows: Vec::new() };
     measure.bakes(&job, &mut lightmap)?;
     if measure.varies("path-tracing") {
@@ -83,7 +84,7 @@ pub fn run(args: &ReportArgs) -> Result<()> {
     }
     let rows = measure.rows;
 
-    let text = markdown(args, &lightmap, &points, reference_seconds, view.as_ref(), &rows);
+    let text = markdown(args, &lightmap, [&seen, &points], reference_seconds, view.as_ref(), &rows);
     for (name, content) in [
         ("quality.md", &text),
         ("quality.csv", &csv(&rows)),
@@ -175,8 +176,8 @@ impl Measure<'_> {
         for seed in 0..self.args.seeds {
             let params = BakeParams { seed: params.seed + seed, ..*params };
             seconds.push(lightmap.bake(&params, &Progress::none())?.seconds);
-            indirect.push(self.points.of_bake(lightmap, Layer::Indirect));
-            all.push(self.points.of_bake(lightmap, Layer::Combined));
+            indirect.push(self.points.of_bake(lightmap, Layer::Indirect)?);
+            all.push(self.points.of_bake(lightmap, Layer::Combined)?);
             let one = self.view.map(|view| view.of_bake(lightmap)).transpose()?.flatten();
             ssim = ssim.zip(one).map(|(sum, one)| sum + one / self.args.seeds as f64);
         }
@@ -341,7 +342,7 @@ fn plot(rows: &[Row]) -> String {
 fn markdown(
     args: &ReportArgs,
     lightmap: &Lightmap,
-    points: &Points,
+    [seen, points]: [&Points; 2],
     reference_seconds: f64,
     view: Option<&ViewReference>,
     rows: &[Row],
@@ -356,12 +357,14 @@ fn markdown(
          {triangles} triangles; {texels} texels at {density:.2} per unit, {gather} gather and {radiance} radiance \
          texels; {photons} photons, {rays} gather rays, blur {blur} unless another value is named; threads: {threads}, \
          {isa}.\n\n\
-         Errors are of irradiance at {count} points that are seen from places in the scene, against {reference} of an \
+         Errors are of irradiance at {count} points that are seen from places where somebody can stand, reached from the \
+         camera and from lamps, as a shader reads it there, against {reference} of an \
          independent path tracer in f64. Relative MSE is the mean of the squared error by the square of the reference \
          (what is darker than a tenth of its mean counts as so bright), RMS its root; to mean, the mean of the squared \
          error by the square of the reference's mean. The reference's own noise is not part of them: they are products \
          of the differences from its two halves. {others} more points, {part:.1} % of all that were seen, lie on sides \
-         that the light map does not show, and are left out. Noise is what differs between {seeds} seeds, bias what \
+         that the light map does not show, and are left out. But worst is the relative MSE without the worst hundredth of \
+         the points; Σ the sum of the light baked by that of the reference. Noise is what differs between {seeds} seeds, bias what \
          does not; MSE = noise² + bias². ± is one standard error of the MSE, from the points chosen. Seconds are those \
          of the bake, without charts; of path tracing and photons alone those at the points compared, scaled to \
          all.\n\n",
@@ -377,8 +380,8 @@ fn markdown(
         threads = scene.device().num_threads(),
         isa = scene.device().isa().name(),
         count = points.len(),
-        others = points.of_other_sides,
-        part = 100.0 * points.of_other_sides as f64 / (points.of_other_sides + points.len()) as f64,
+        others = seen.len() - points.len(),
+        part = 100.0 * (1.0 - points.len() as f64 / seen.len() as f64),
         seeds = args.seeds,
     );
     if let Some(view) = view {
@@ -407,24 +410,27 @@ fn markdown(
     }
     out.push_str(
         "\n![error against time](quality.svg)\n\n## All settings\n\n\
-         | | | seconds | RMS | relative MSE | ± | noise² | bias² | brighter by | to mean | all light: MSE | to mean | SSIM |\n\
-         |---|---|---|---|---|---|---|---|---|---|---|---|---|\n",
+         | | | seconds | RMS | relative MSE | ± | but worst | noise² | bias² | Σ | to mean | all light: MSE | but worst | Σ | SSIM |\n\
+         |---|---|---|---|---|---|---|---|---|---|---|---|---|---|---|\n",
     );
     for r in rows {
         let e = &r.indirect;
-        let all = r.all.map_or("– | –".into(), |a| format!("{:.1e} | {:.1e}", a.mse, a.to_mean));
+        let all = r
+            .all
+            .map_or("– | – | –".into(), |a| format!("{:.1e} | {:.1e} | {:.3}", a.mse, a.trimmed, 1.0 + a.mean));
         let _ = writeln!(
             out,
-            "| {} | {} | {:.2} | {:.2} % | {:.1e} | {:.0e} | {:.1e} | {:.1e} | {:+.2} % | {:.1e} | {all} | {} |",
+            "| {} | {} | {:.2} | {:.2} % | {:.1e} | {:.0e} | {:.1e} | {:.1e} | {:.1e} | {:.3} | {:.1e} | {all} | {} |",
             r.series,
             r.value,
             r.seconds,
             100.0 * e.mse.max(0.0).sqrt(),
             e.mse,
             e.uncertainty,
+            e.trimmed,
             e.variance,
             e.bias2,
-            100.0 * e.mean,
+            1.0 + e.mean,
             e.to_mean,
             likeness(r.ssim),
         );
