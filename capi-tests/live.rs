@@ -303,6 +303,32 @@ fn work_between_updates_ends_with_the_bits_of_a_bake_and_can_be_paused() {
     assert_same_as_bake(&live, &mut lightmap, "in the background");
 }
 
+/// With one thread, updates limited by rays do the same work every time.
+#[test]
+fn errors_of_blocks_that_are_worked_on_between_updates_count() {
+    let lightmap = unbaked("cornell", 1, 60.0);
+    let create = |background| {
+        let params = LiveParams { background, max_rounds: 64, ..params(Mode::View) };
+        Live::new(&lightmap, &params, &Progress::none()).unwrap()
+    };
+    let (mut alone, mut live) = (create(false), create(true));
+    let little = Budget { milliseconds: 0.0, rays: 64 };
+    let nothing = Budget { milliseconds: 0.0, rays: 0 };
+    // The first update leaves all blocks alike; the pool then takes the most urgent ones away.
+    let (at_home, away) = (alone.update(&camera(0), &little).unwrap(), live.update(&camera(0), &little).unwrap());
+    assert!(at_home.visible_error > 0.2, "{at_home:?}");
+    assert_eq!(away.visible_error, at_home.visible_error);
+    assert_eq!((away.finished, away.visible_finished), (at_home.finished, at_home.visible_finished));
+    for _ in 0..20 {
+        let before = live.update(&camera(0), &little).unwrap().visible_error;
+        live.pause(true).unwrap();
+        let after = live.update(&camera(0), &nothing).unwrap().visible_error;
+        live.pause(false).unwrap();
+        // Work in the background lowers the error, or finds that it was more than one round could tell.
+        assert!(before > 0.7 * after, "{before} while blocks are away, {after} when they are back");
+    }
+}
+
 #[test]
 fn a_saved_state_goes_on_where_it_was() {
     let mut lightmap = unbaked("cornell", 2, 60.0);

@@ -1452,7 +1452,14 @@ bk_result bk_live_create(bk_lightmap *lightmap,
 BK_API void bk_live_retain(bk_live *live);
 
 // Gives one reference back. NULL is ignored.
-BK_API void bk_live_release(bk_live *live);
+//
+// The last release stops work between updates and the recomputation of indirect light, and waits until both have
+// ended: no callback comes from them afterwards. It may be made in a callback, on any thread; only when it is made
+// in a memory callback that the recomputation of indirect light calls, that work ends just after the callback has
+// returned, and may call the memory callback once more for what it gives back. A thread that makes the last
+// release must not hold a lock that a callback takes.
+BK_API
+void bk_live_release(bk_live *live);
 
 // Refines the light for as long as the budget allows, on the device's threads.
 //

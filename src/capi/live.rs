@@ -363,6 +363,12 @@ pub unsafe extern "C" fn bk_live_retain(live: *mut bk_live) {
 }
 
 /// Gives one reference back. NULL is ignored.
+///
+/// The last release stops work between updates and the recomputation of indirect light, and waits until both have
+/// ended: no callback comes from them afterwards. It may be made in a callback, on any thread; only when it is made
+/// in a memory callback that the recomputation of indirect light calls, that work ends just after the callback has
+/// returned, and may call the memory callback once more for what it gives back. A thread that makes the last
+/// release must not hold a lock that a callback takes.
 #[unsafe(no_mangle)]
 pub unsafe extern "C" fn bk_live_release(live: *mut bk_live) {
     // SAFETY: a handle whose reference the caller gives up, or NULL.
@@ -535,7 +541,8 @@ pub unsafe extern "C" fn bk_live_lod_at(live: *const bk_live, position: *const f
 /// light: number of a light that changed.
 #[unsafe(no_mangle)]
 pub unsafe extern "C" fn bk_live_light_changed(live: *mut bk_live, light: u32) -> bk_result {
-    call(|| object!(live).change(|l| l.light_changed(light)))
+    // SAFETY: a handle, or NULL.
+    call(|| unsafe { hold(live, "live") }?.change(|l| l.light_changed(light)))
 }
 
 /// Stops work between updates (background), and the recomputation of indirect light, or lets both go
@@ -545,7 +552,8 @@ pub unsafe extern "C" fn bk_live_light_changed(live: *mut bk_live, light: u32) -
 #[unsafe(no_mangle)]
 pub unsafe extern "C" fn bk_live_pause(live: *mut bk_live, paused: u32) -> bk_result {
     call(|| {
-        let live = object!(live);
+        // SAFETY: a handle, or NULL.
+        let live = unsafe { hold(live, "live") }?;
         if paused > 1 {
             return invalid_argument!("paused is {paused}, not 0 or 1");
         }
@@ -564,7 +572,8 @@ pub unsafe extern "C" fn bk_live_pause(live: *mut bk_live, paused: u32) -> bk_re
 pub unsafe extern "C" fn bk_live_save(live: *mut bk_live, path: *const c_char) -> bk_result {
     call(|| {
         refuse_in_callback()?;
-        let live = object!(live);
+        // SAFETY: a handle, or NULL.
+        let live = unsafe { hold(live, "live") }?;
         // SAFETY: path is the caller's, or NULL.
         let path = unsafe { text(path, "path") }?;
         live.change(|l| l.save(Path::new(path)))
@@ -582,7 +591,8 @@ pub unsafe extern "C" fn bk_live_save(live: *mut bk_live, path: *const c_char) -
 pub unsafe extern "C" fn bk_live_restore(live: *mut bk_live, path: *const c_char) -> bk_result {
     call(|| {
         refuse_in_callback()?;
-        let live = object!(live);
+        // SAFETY: a handle, or NULL.
+        let live = unsafe { hold(live, "live") }?;
         // SAFETY: path is the caller's, or NULL.
         let path = unsafe { text(path, "path") }?;
         live.change(|l| l.restore(Path::new(path)))

@@ -14,12 +14,12 @@ use std::time::{Duration, Instant};
 pub(super) struct Item {
     pub number: u32,
     pub block: Block,
-    /// That the block held before.
+    /// Bytes that the block held before.
     pub bytes: usize,
     pub done: Done,
 }
 
-/// Blocks, the most urgent first, and the threads at work on them.
+/// Blocks, the most urgent first, and what to do with them.
 pub(super) struct Batch {
     context: Context,
     items: Vec<Mutex<Item>>,
@@ -30,10 +30,10 @@ pub(super) struct Batch {
     next: AtomicUsize,
     completed: AtomicUsize,
     panicked: AtomicBool,
-    /// Threads at work in the background.
-    active: Mutex<usize>,
-    idle: Condvar,
 }
+
+/// The result of a batch: its blocks, the rays traced, and an error if a thread panicked.
+pub(super) type Outcome = (Vec<Item>, u64, Result<()>);
 
 impl Batch {
     pub fn new(
@@ -44,7 +44,7 @@ impl Batch {
         showing: Duration,
     ) -> Batch {
         let item = |(number, block): (u32, Block)| {
-            Mutex::new(Item { number, bytes: block.bytes(), block, done: Done::default() })
+            Mutex::new(Item { number, bytes: block.work.bytes(), block, done: Done::default() })
         };
         Batch {
             context,
@@ -55,8 +55,6 @@ impl Batch {
             next: AtomicUsize::new(0),
             completed: AtomicUsize::new(0),
             panicked: AtomicBool::new(false),
-            active: Mutex::new(0),
-            idle: Condvar::new(),
         }
     }
 
@@ -64,55 +62,14 @@ impl Batch {
     /// (`rayon::broadcast` waits for all. While light is recomputed on a third thread of a machine with two
     /// cores that cost p90 of the overshoot 2 to 4 ms, a scheduler's time slice, instead of 0.4; p99 is a
     /// time slice still. Did not help: one thread fewer meanwhile; a lower priority of that third thread.)
-    pub fn run(&self) {
+    pub fn run(self) -> Outcome {
         rayon::scope(|scope| {
             for _ in 1..rayon::current_num_threads() {
                 scope.spawn(|_| self.work());
             }
             self.work();
         });
-    }
-
-    /// Works on the device's threads and returns at once.
-    pub fn start(self: &Arc<Self>, device: &Device) {
-        for _ in 0..device.num_threads() {
-            let batch = self.clone();
-            device.spawn(move || {
-                // Whoever stopped the batch does not wait for threads that come later.
-                let mut active = batch.active();
-                if batch.limit.stopped.load(Relaxed) {
-                    return;
-                }
-                *active += 1;
-                drop(active);
-                batch.work();
-                *batch.active() -= 1;
-                batch.idle.notify_all();
-            });
-        }
-    }
-
-    /// Stops the work and takes the blocks back, with the rays traced. Waits for threads that are at
-    /// work, each of which ends with the texel it is at.
-    pub fn take(&self) -> (Vec<Item>, u64, Result<()>) {
-        let mut active = self.active();
-        self.limit.stopped.store(true, Relaxed);
-        while *active > 0 {
-            active = self.idle.wait(active).unwrap_or_else(|e| e.into_inner());
-        }
-        let take = |item: &Mutex<Item>| {
-            let mut item = item.lock().unwrap_or_else(|e| e.into_inner());
-            Item { block: std::mem::take(&mut item.block), ..*item }
-        };
-        let result = match self.panicked.load(Relaxed) {
-            true => Err(Error::Internal("work on a block of texels panicked".into())),
-            false => Ok(()),
-        };
-        (self.items.iter().map(take).collect(), self.limit.traced.load(Relaxed), result)
-    }
-
-    fn active(&self) -> MutexGuard<'_, usize> {
-        self.active.lock().unwrap_or_else(|e| e.into_inner())
+        self.outcome()
     }
 
     fn work(&self) {
@@ -132,5 +89,87 @@ impl Batch {
         if result.is_err() {
             self.panicked.store(true, Relaxed);
         }
+    }
+
+    fn outcome(self) -> Outcome {
+        let result = match self.panicked.into_inner() {
+            true => Err(Error::Internal("work on a block of texels panicked".into())),
+            false => Ok(()),
+        };
+        let items = self.items.into_iter().map(|i| i.into_inner().unwrap_or_else(|e| e.into_inner()));
+        (items.collect(), self.limit.traced.into_inner(), result)
+    }
+}
+
+/// A batch on which a device's threads work while the caller does something else.
+///
+/// Jobs that a busy pool starts late, when the batch has been taken back, find the door closed: they hold nothing
+/// of the batch, hence nothing of the scene, whose last reference must not end on such a thread.
+pub(super) struct Background {
+    door: Arc<Door>,
+}
+
+#[derive(Default)]
+struct Door {
+    state: Mutex<Inside>,
+    idle: Condvar,
+}
+
+#[derive(Default)]
+struct Inside {
+    /// `None`: closed.
+    batch: Option<Arc<Batch>>,
+    /// Threads at work.
+    active: usize,
+}
+
+impl Background {
+    /// Works on the device's threads and returns at once.
+    pub fn start(batch: Batch, device: &Device) -> Background {
+        let inside = Inside { batch: Some(Arc::new(batch)), active: 0 };
+        let door = Arc::new(Door { state: Mutex::new(inside), ..Default::default() });
+        for _ in 0..device.num_threads() {
+            let door = door.clone();
+            device.spawn(move || {
+                let Some(batch) = door.enter() else { return };
+                batch.work();
+                door.leave(batch);
+            });
+        }
+        Background { door }
+    }
+
+    /// Stops the work and takes the blocks back. Waits for threads that are at work, each of which ends with the
+    /// texel it is at, and calls no callback meanwhile; afterwards no thread holds anything of the batch.
+    pub fn finish(self) -> Outcome {
+        let mut inside = self.door.inside();
+        let Some(batch) = inside.batch.take() else { return (Vec::new(), 0, Ok(())) };
+        batch.limit.stopped.store(true, Relaxed);
+        while inside.active > 0 {
+            inside = self.door.idle.wait(inside).unwrap_or_else(|e| e.into_inner());
+        }
+        match Arc::try_unwrap(batch) {
+            Ok(batch) => batch.outcome(),
+            Err(_) => unreachable!("threads drop their references before they count themselves out"),
+        }
+    }
+}
+
+impl Door {
+    fn inside(&self) -> MutexGuard<'_, Inside> {
+        self.state.lock().unwrap_or_else(|e| e.into_inner())
+    }
+
+    fn enter(&self) -> Option<Arc<Batch>> {
+        let mut inside = self.inside();
+        let batch = inside.batch.clone()?;
+        inside.active += 1;
+        Some(batch)
+    }
+
+    fn leave(&self, batch: Arc<Batch>) {
+        drop(batch);
+        self.inside().active -= 1;
+        self.idle.notify_all();
     }
 }

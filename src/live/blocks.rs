@@ -34,11 +34,11 @@ impl Rect {
     }
 
     pub fn width(&self) -> usize {
-        (self.x1 - self.x0).max(0) as usize
+        self.x1.saturating_sub(self.x0).max(0) as usize
     }
 
     pub fn height(&self) -> usize {
-        (self.y1 - self.y0).max(0) as usize
+        self.y1.saturating_sub(self.y0).max(0) as usize
     }
 
     pub fn area(&self) -> usize {
@@ -93,28 +93,48 @@ pub(super) struct Tile {
     pub cell: u32,
 }
 
-/// The state of the work on a block; what is shown of it is the display's.
+/// How far a block is. It may be read at any time, also while a thread works on the block: it then says how far
+/// the block was when the work began.
+#[derive(Clone, Copy, Debug, Default)]
+pub(super) struct BlockStatus {
+    /// The highest LOD whose texels have all been gathered, under whatever light.
+    pub lod: u8,
+    /// The LOD whose texels have all been gathered under the light of now, at most `lod`, and how many
+    /// rounds they have; 0 rounds: no step has been completed under that light.
+    pub fresh_lod: u8,
+    pub rounds: u16,
+    /// Epoch of the radiance that was gathered.
+    pub indirect_epoch: u32,
+    /// Epochs of the lights that the coarse direct light saw, and the direct light at full resolution.
+    pub coarse_epoch: u32,
+    pub direct_epoch: u32,
+    /// Estimated relative error of indirect light; the mean of that light, and of coarse direct light, by
+    /// the sum of the channels.
+    pub error: f32,
+    pub mean: f32,
+    pub direct_mean: f32,
+}
+
+/// Direct light at full resolution that is being computed.
+#[derive(Debug)]
+pub(super) struct DirectWork {
+    pub tile: DirectTile,
+    /// The next texel of the tile.
+    pub next: u32,
+    /// Epoch of the lights.
+    pub epoch: u32,
+}
+
+/// What a block has accumulated. It moves to the thread that works on it; what is shown of it is the display's.
 #[derive(Debug, Default)]
-pub(super) struct Block {
+pub(super) struct BlockWork {
     /// What the texels gathered, as far as they have been worked on.
     pub gathered: Vec<Gathered>,
     /// Light of an earlier epoch, by texel, that fades out while new rays come in; may be empty.
     pub prior: Box<[Vec3]>,
-    /// The highest LOD whose texels have all been gathered, under whatever light.
-    pub lod: u8,
-    /// The LOD whose texels have all been gathered under the light of now, at most `lod`, and how many
-    /// rounds they have.
-    pub fresh_lod: u8,
-    pub rounds: u16,
     /// The next texel of the step under way.
     pub cursor: u16,
-    /// Of the radiance that `gathered` saw.
-    pub indirect_epoch: u32,
-    /// Of the lights that the coarse direct light saw, and the direct light at full resolution.
-    pub coarse_epoch: u32,
-    pub direct_epoch: u32,
-    /// Direct light under way, and its next texel.
-    pub direct_work: Option<(DirectTile, u32)>,
+    pub direct: Option<DirectWork>,
     /// Finished light on its way to the display: coarse direct light of the lowest LOD's texels, and
     /// direct light at full resolution.
     pub new_coarse: Box<[Vec3]>,
@@ -122,11 +142,66 @@ pub(super) struct Block {
     /// Squared deviations of the rounds from the mean so far, by the sum of the channels, and how many.
     pub deviations: f32,
     pub deviation_count: u32,
-    /// Estimated relative error of indirect light; the mean of that light, and of coarse direct light, by
-    /// the sum of the channels.
-    pub error: f32,
-    pub mean: f32,
-    pub direct_mean: f32,
+}
+
+/// A block on which one thread works.
+#[derive(Debug, Default)]
+pub(super) struct Block {
+    pub status: BlockStatus,
+    pub work: Box<BlockWork>,
+}
+
+/// All blocks. The work of some may be away, in a [`Batch`](super::batch::Batch); their status never is.
+pub(super) struct Blocks {
+    status: Vec<BlockStatus>,
+    /// `None`: away.
+    work: Vec<Option<Box<BlockWork>>>,
+}
+
+impl Blocks {
+    pub fn new(blocks: Vec<Block>) -> Blocks {
+        let (status, work) = blocks.into_iter().map(|b| (b.status, Some(b.work))).unzip();
+        Blocks { status, work }
+    }
+
+    pub fn len(&self) -> usize {
+        self.status.len()
+    }
+
+    /// How far the blocks are, by number.
+    pub fn status(&self) -> &[BlockStatus] {
+        &self.status
+    }
+
+    pub fn status_mut(&mut self) -> &mut [BlockStatus] {
+        &mut self.status
+    }
+
+    /// What a block has accumulated; `None` while it is away.
+    pub fn work(&self, b: u32) -> Option<&BlockWork> {
+        self.work[b as usize].as_deref()
+    }
+
+    pub fn work_mut(&mut self, b: u32) -> Option<&mut BlockWork> {
+        self.work[b as usize].as_deref_mut()
+    }
+
+    /// Hands a block out to be worked on; `None` if it is away already.
+    pub fn take(&mut self, b: u32) -> Option<Block> {
+        let work = self.work[b as usize].take()?;
+        Some(Block { status: self.status[b as usize], work })
+    }
+
+    /// Takes a block back.
+    pub fn put(&mut self, b: u32, block: Block) {
+        self.status[b as usize] = block.status;
+        self.work[b as usize] = Some(block.work);
+    }
+
+    /// Bytes that the blocks at home hold beside the structures themselves.
+    pub fn bytes(&self) -> usize {
+        self.work.iter().flatten().map(|w| w.bytes()).sum()
+    }
 }
 
 impl DirectTile {
@@ -138,16 +213,17 @@ impl DirectTile {
 impl Tile {
     /// Bytes held, with those of an idle block.
     pub fn bytes(&self) -> usize {
-        size_of::<Tile>() + size_of::<Block>() + self.texels.len() * 4
+        let block = size_of::<BlockStatus>() + size_of::<Option<Box<BlockWork>>>() + size_of::<BlockWork>();
+        size_of::<Tile>() + block + self.texels.len() * 4
     }
 }
 
-impl Block {
+impl BlockWork {
     /// Bytes held beside the structure itself.
     pub fn bytes(&self) -> usize {
         self.gathered.capacity() * size_of::<Gathered>()
             + self.prior.len() * size_of::<Vec3>()
-            + self.direct_work.as_ref().map_or(0, |w| w.0.bytes())
+            + self.direct.as_ref().map_or(0, |w| w.tile.bytes())
     }
 }
 
@@ -293,12 +369,49 @@ fn rect_in_light_map(atlas: &Atlas, placement: u32, rect: &Rect) -> Rect {
     };
     let corners =
         [corner(rect.x0, rect.y0), corner(rect.x1, rect.y0), corner(rect.x0, rect.y1), corner(rect.x1, rect.y1)];
-    let bound = |k: usize, f: fn(f32, f32) -> f32| corners[1..].iter().fold(corners[0][k], |b, c| f(b, c[k]));
-    Rect {
-        x0: bound(0, f32::min).floor() as i32 - 1,
-        y0: bound(1, f32::min).floor() as i32 - 1,
-        x1: bound(0, f32::max).ceil() as i32 + 1,
-        y1: bound(1, f32::max).ceil() as i32 + 1,
+    // Vertices may be as far away as floats go: clipped while they are floats, that no integer overflows.
+    let whole = Rect::of(map);
+    let ends = [(whole.x0, whole.x1), (whole.y0, whole.y1)];
+    let [(x0, x1), (y0, y1)] = std::array::from_fn(|k| {
+        let (first, end) = ends[k];
+        let bound = |f: fn(f32, f32) -> f32| corners[1..].iter().fold(corners[0][k], |b, c| f(b, c[k]));
+        let inside = |v: f32| v.clamp(first as f32, end as f32) as i32;
+        let (low, high) = (inside(bound(f32::min).floor() - 1.0), inside(bound(f32::max).ceil() + 1.0));
+        // Where digits have run out, it can be anywhere in the placement.
+        let is_known = corners.iter().all(|c| c[k].is_finite()) && low < high;
+        if is_known { (low, high) } else { (first, end) }
+    });
+    Rect { x0, y0, x1, y1 }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use crate::lightmap::{Lightmap, LightmapDesc};
+    use crate::progress::Progress;
+    use crate::scene::{Material, Mesh, MeshMaterials, SceneData};
+
+    /// A sheet with one vertex far away: its texels are so large that coordinates of neighbours round to one another.
+    #[test]
+    fn rectangles_of_blocks_lie_on_their_placement_however_far_a_vertex_is() {
+        for far in [1.0, 1e6, 1e12, -1e12, 1e18] {
+            let mut data = SceneData::new();
+            let material = data.add_material(Material { two_sided: true, ..Default::default() }).unwrap();
+            let positions = vec![Vec3::ZERO, Vec3::new(far, 0.3, 0.0), Vec3::new(0.1, 1.0, 0.2), Vec3::ONE];
+            let (indices, materials) = (vec![[0, 1, 2], [1, 3, 2]], MeshMaterials::One(material));
+            data.add_mesh(Mesh { positions, indices, materials, ..Default::default() }).unwrap();
+            let scene = data.committed();
+            let desc = LightmapDesc { page_size: 64, ..Default::default() };
+            let lightmap = Lightmap::create(&scene, &desc, &Progress::none()).unwrap();
+            let map = BlockMap::new(lightmap.atlas(), 3);
+            assert!(!map.tiles.is_empty());
+            for tile in &map.tiles {
+                let whole = Rect::of(&map.atlas.map.layout.placements[tile.placement as usize]);
+                for grown in [0, 1, 20, 1 << 20] {
+                    let r = map.rect_in_light_map(tile.placement, &tile.rect.grown(grown));
+                    assert!(r.area() > 0 && r.clipped(&whole) == r, "{far}: {r:?} is not within {whole:?}");
+                }
+            }
+        }
     }
-    .clipped(&Rect::of(map))
 }

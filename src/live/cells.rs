@@ -1,7 +1,7 @@
 //! The light map grid (thesis 3.3.2): a uniform grid over the scene, to whose cells blocks of texels
 //! of all LODs belong. A cell shows its next LOD when all its blocks have it.
 
-use super::blocks::{Block, MAX_LODS, Tile};
+use super::blocks::{BlockStatus, MAX_LODS, Tile};
 use crate::error::{Result, invalid_argument};
 use glam::{UVec3, Vec3};
 
@@ -115,7 +115,7 @@ impl Promotion {
     }
 
     /// Begins anew.
-    pub fn count(&mut self, tiles: &[Tile], blocks: &[Block]) {
+    pub fn count(&mut self, tiles: &[Tile], blocks: &[BlockStatus]) {
         self.counts.fill([0; MAX_LODS]);
         for ((tile, block), lod) in tiles.iter().zip(blocks).zip(&mut self.lods) {
             *lod = block.lod;

@@ -1,6 +1,6 @@
 //! Which blocks are worked on next.
 
-use super::blocks::{Block, BlockMap};
+use super::blocks::{BlockMap, BlockStatus};
 use super::cells::Grid;
 use super::visibility::Visibility;
 use super::work::{Context, Step};
@@ -27,7 +27,7 @@ pub(super) struct Chooser {
 /// What there is to choose from.
 pub(super) struct Choice<'a> {
     pub context: &'a Context,
-    pub blocks: &'a [Block],
+    pub blocks: &'a [BlockStatus],
     pub grid: &'a Grid,
     pub visibility: &'a Visibility,
 }
@@ -61,7 +61,7 @@ impl Chooser {
     }
 
     /// Takes note that a block was worked on.
-    pub fn note(&mut self, context: &Context, b: u32, block: &Block) {
+    pub fn note(&mut self, context: &Context, b: u32, block: &BlockStatus) {
         let tile = &context.map.tiles[b as usize];
         let open = !tile.texels.is_empty() && !block.is_finished(context);
         if self.open[b as usize] != open {
@@ -74,7 +74,7 @@ impl Chooser {
     }
 
     /// Takes note that the light has changed.
-    pub fn note_all(&mut self, context: &Context, blocks: &[Block]) {
+    pub fn note_all(&mut self, context: &Context, blocks: &[BlockStatus]) {
         (0..).zip(blocks).for_each(|(b, block)| self.note(context, b, block));
     }
 

@@ -2,7 +2,7 @@
 //! of a lower LOD, filled where it cannot be seen, blurred; and its composition with direct light
 //! when a page is read. The sums of the texels are left alone.
 
-use super::blocks::{Block, BlockMap, DirectTile, Rect, TILE};
+use super::blocks::{BlockMap, Blocks, DirectTile, Rect, TILE};
 use super::relight::Illumination;
 use crate::lightmap::blur::{Texels, Window};
 use crate::memory::try_vec;
@@ -106,11 +106,13 @@ impl Display {
             + self.lods.len() * per_block
     }
 
-    /// Shows what `changed` blocks know now; returns where that changes the light map.
-    pub fn refresh(&mut self, map: &BlockMap, blocks: &[Block], changed: &[u32]) -> Vec<Changed> {
+    /// Shows what `changed` blocks know now; returns where that changes the light map. A block that is away keeps
+    /// what it shows until it is back.
+    pub fn refresh(&mut self, map: &BlockMap, blocks: &Blocks, changed: &[u32]) -> Vec<Changed> {
         for &b in changed {
-            let (tile, block) = (&map.tiles[b as usize], &blocks[b as usize]);
-            let fresh = block.fresh_lod.min(self.lods[b as usize]);
+            let Some(block) = blocks.work(b) else { continue };
+            let tile = &map.tiles[b as usize];
+            let fresh = blocks.status()[b as usize].fresh_lod.min(self.lods[b as usize]);
             self.fresh[b as usize] = fresh;
             for i in 0..tile.lod_end[fresh as usize] as usize {
                 if let Some(value) = block.estimate(i) {
@@ -333,9 +335,9 @@ impl Display {
 
     /// Takes over the direct light of the lowest LOD's texels of `changed` blocks, and interpolates it
     /// to the others; returns where that changes the light map.
-    pub fn take_coarse(&mut self, map: &BlockMap, blocks: &mut [Block], changed: &[u32]) -> Vec<Changed> {
+    pub fn take_coarse(&mut self, map: &BlockMap, blocks: &mut Blocks, changed: &[u32]) -> Vec<Changed> {
         for &b in changed {
-            let values = std::mem::take(&mut blocks[b as usize].new_coarse);
+            let values = blocks.work_mut(b).map(|w| std::mem::take(&mut w.new_coarse)).unwrap_or_default();
             for (&sample, value) in map.tiles[b as usize].texels.iter().zip(values) {
                 self.coarse[sample as usize] = value;
             }

@@ -36,8 +36,8 @@ use crate::memory::Reservation;
 use crate::progress::Progress;
 use crate::sampling::purpose_seed;
 use crate::scene::{Light, Scene};
-use batch::{Batch, Item};
-use blocks::{Block, BlockMap, Rect, Tile};
+use batch::{Background, Batch, Item};
+use blocks::{Block, BlockMap, BlockStatus, Blocks, Rect, Tile};
 use cells::{Grid, Promotion};
 use choose::{Choice, Chooser};
 use dirty::Dirty;
@@ -171,7 +171,7 @@ pub struct PageRect {
 const PASS: usize = 32;
 
 /// Blocks that are worked on between two updates, at most.
-const BACKGROUND: usize = 256;
+const BACKGROUND_BLOCKS: usize = 256;
 
 /// Part of the time budget that is left to showing what was computed and to leaving.
 const SPARE: f64 = 0.15;
@@ -191,7 +191,7 @@ pub struct Live {
     /// The lights that direct light is of.
     lights: Arc<Vec<Light>>,
     relight: Relight,
-    blocks: Vec<Block>,
+    blocks: Blocks,
     grid: Grid,
     promotion: Promotion,
     display: Display,
@@ -204,8 +204,8 @@ pub struct Live {
     is_waiting: Vec<bool>,
     /// Blocks that fade to what is known.
     fading: Vec<u32>,
-    /// Work that goes on between updates, on blocks that are then missing from `blocks`.
-    background: Option<Arc<Batch>>,
+    /// Work that goes on between updates, on blocks that are then away from `blocks`.
+    background: Option<Background>,
     paused: bool,
     /// Seconds that showing a block took lately: its indirect light; coarse direct light.
     refresh_seconds: f64,
@@ -295,7 +295,7 @@ impl Live {
         let memory = atlas.scene.device().memory().reserve(fixed, "the live state")?;
         let all_of = |t: &Tile| t.texels.len() * size_of::<Gathered>() + t.map_texels as usize * size_of::<Vec3>();
         let full: usize = map.tiles.iter().map(all_of).sum();
-        let blocks: Vec<Block> = map.tiles.iter().map(|_| Block::default()).collect();
+        let blocks = Blocks::new(map.tiles.iter().map(|_| Block::default()).collect());
         let mut live = Live {
             visibility: Visibility::new(blocks.len()),
             dirty: Dirty::all(atlas.info.page_count, atlas.map.layout.page_size),
@@ -344,31 +344,33 @@ impl Live {
         let limit = Limit::new(None, u64::MAX);
         let context = self.context.clone();
         let device = self.device();
-        let (blocks, top) = (&mut self.blocks, context.map.top());
+        let top = context.map.top();
+        let mut blocks: Vec<Block> = context.map.tiles.iter().map(|_| Block::default()).collect();
         device.install(|| {
-            (blocks, &context.map.tiles).into_par_iter().try_for_each(|(block, tile)| {
+            (&mut blocks, &context.map.tiles).into_par_iter().try_for_each(|(block, tile)| {
                 if !tile.texels.is_empty() {
                     block.work_on_coarse(&context, tile, &limit);
                     block.work_on_indirect(&context, tile, &limit);
                     // One or two texels that lie hidden inside something, or against it, tell nothing of
                     // the others.
-                    while block.lod < top
-                        && tile.lod_end[block.lod as usize] <= 2
-                        && !block.sees_light()
+                    while block.status.lod < top
+                        && tile.lod_end[block.status.lod as usize] <= 2
+                        && !block.work.sees_light()
                         && block.work_on_indirect(&context, tile, &limit)
                     {}
                 }
                 stage.advance(1)
             })
         })?;
+        self.blocks = Blocks::new(blocks);
         self.total_rays += limit.traced.into_inner();
-        let mean = self.blocks.iter().map(|b| (b.mean + b.direct_mean) as f64).sum::<f64>() / self.blocks.len() as f64;
-        self.context.dim = DIM * mean as f32;
-        self.held = self.blocks.iter().map(|b| b.bytes() as isize).sum();
+        let sum: f64 = self.blocks.status().iter().map(|b| (b.mean + b.direct_mean) as f64).sum();
+        self.context.dim = DIM * (sum / self.blocks.len() as f64) as f32;
+        self.held = self.blocks.bytes() as isize;
         let all: Vec<u32> = (0..self.blocks.len() as u32).collect();
         let (display, blocks) = (&mut self.display, &mut self.blocks);
         device.install(|| display.take_coarse(&context.map, blocks, &all));
-        self.display.lods = self.blocks.iter().map(|b| b.lod).collect();
+        self.display.lods = self.blocks.status().iter().map(|b| b.lod).collect();
         self.reserve(0)?;
         self.show_all();
         Ok(())
@@ -386,8 +388,12 @@ impl Live {
         self.waiting.clear();
         self.is_waiting.fill(false);
         self.fading.clear();
-        self.promotion.count(&self.context.map.tiles, &self.blocks);
-        self.chooser.note_all(&self.context, &self.blocks);
+        self.promotion.count(&self.context.map.tiles, self.blocks.status());
+        self.chooser.note_all(&self.context, self.blocks.status());
+    }
+
+    fn status(&self, b: u32) -> &BlockStatus {
+        &self.blocks.status()[b as usize]
     }
 
     fn device(&self) -> Arc<Device> {
@@ -438,10 +444,14 @@ impl Live {
         while !over(traced) {
             // What is waiting to be shown comes first, then wrong light, then the next blocks.
             self.show_waiting(end, stats);
-            let from =
-                Choice { context: &self.context, blocks: &self.blocks, grid: &self.grid, visibility: &self.visibility };
             let left = end.map_or(f64::INFINITY, |e| e.saturating_duration_since(Instant::now()).as_secs_f64());
             let mut step = Step::Coarse;
+            let from = Choice {
+                context: &self.context,
+                blocks: self.blocks.status(),
+                grid: &self.grid,
+                visibility: &self.visibility,
+            };
             let mut chosen = self.chooser.wrong(&from, ((left / self.coarse_seconds) as usize).clamp(1, PASS));
             if chosen.is_empty() {
                 (step, chosen) = self.chooser.next(&from, self.params.mode, camera, PASS);
@@ -466,10 +476,9 @@ impl Live {
         // Showing what is completed takes time too.
         let seconds = if step == Step::Coarse { self.coarse_seconds } else { self.refresh_seconds };
         let blocks = &mut self.blocks;
-        let taken = chosen.iter().map(|&b| (b, std::mem::take(&mut blocks[b as usize])));
+        let taken = chosen.iter().filter_map(|&b| Some((b, blocks.take(b)?)));
         let batch = Batch::new(self.context.clone(), taken, step, limit, Duration::from_secs_f64(seconds));
-        batch.run();
-        let (items, traced, result) = batch.take();
+        let (items, traced, result) = batch.run();
         self.take_over(items, stats);
         if step == Step::Coarse {
             let seconds = start.elapsed().as_secs_f64() / chosen.len() as f64;
@@ -483,8 +492,8 @@ impl Live {
         let map = self.context.map.clone();
         let done: Vec<_> = items.iter().map(|i| (i.number, i.done)).collect();
         for item in items {
-            self.held += item.block.bytes() as isize - item.bytes as isize;
-            self.blocks[item.number as usize] = item.block;
+            self.held += item.block.work.bytes() as isize - item.bytes as isize;
+            self.blocks.put(item.number, item.block);
         }
         let coarse: Vec<u32> = done.iter().filter(|d| d.1.coarse).map(|d| d.0).collect();
         if !coarse.is_empty() {
@@ -493,7 +502,7 @@ impl Live {
             stats.blocks_changed += coarse.len() as u32;
         }
         for (b, done) in done {
-            if let Some(tile) = self.blocks[b as usize].new_direct.take() {
+            if let Some(tile) = self.blocks.work_mut(b).and_then(|w| w.new_direct.take()) {
                 let (changed, grown) = self.display.take_direct(&map, b, tile);
                 self.dirty.add(changed);
                 self.held += grown;
@@ -502,14 +511,14 @@ impl Live {
             if done.indirect {
                 self.promote(b, stats);
             }
-            self.chooser.note(&self.context, b, &self.blocks[b as usize]);
+            self.chooser.note(&self.context, b, &self.blocks.status()[b as usize]);
         }
     }
 
     /// Has a block that completed a step shown: at once, or, in position-based mode, with its cell.
     fn promote(&mut self, b: u32, stats: &mut LiveStats) {
         let cell = self.context.map.tiles[b as usize].cell;
-        let lod = self.blocks[b as usize].lod;
+        let lod = self.status(b).lod;
         let common = self.promotion.note(b, cell, lod);
         if self.params.mode != Mode::Position {
             self.display.lods[b as usize] = lod;
@@ -524,7 +533,7 @@ impl Live {
                 }
                 self.wait(b);
             }
-        } else if self.blocks[b as usize].fresh_lod <= self.display.lods[b as usize] {
+        } else if self.status(b).fresh_lod <= self.display.lods[b as usize] {
             self.wait(b);
         }
     }
@@ -551,9 +560,10 @@ impl Live {
             changed.into_iter().for_each(|c| self.dirty.add(c));
             for &b in &batch {
                 self.is_waiting[b as usize] = false;
-                let block = &mut self.blocks[b as usize];
+                let status = *self.status(b);
+                let Some(block) = self.blocks.work_mut(b) else { continue };
                 self.held -= block.bytes() as isize;
-                block.drop_faded_prior();
+                block.drop_faded_prior(&status);
                 self.held += block.bytes() as isize;
             }
             stats.blocks_changed += batch.len() as u32;
@@ -629,23 +639,30 @@ impl Live {
             self.keep_direct_of_same_sides(&before);
         }
         self.grow_fixed(self.display.bytes() - bytes);
-        self.chooser.note_all(&self.context, &self.blocks);
+        self.chooser.note_all(&self.context, self.blocks.status());
         Ok(())
     }
 
     /// New indirect light may turn charts over; the direct light of all others stays good.
     fn keep_direct_of_same_sides(&mut self, before: &Illumination) {
         let light = self.context.light.clone();
-        for (b, (block, tile)) in (0u32..).zip(self.blocks.iter_mut().zip(&self.context.map.tiles)) {
+        for (b, tile) in (0u32..).zip(&self.context.map.tiles) {
             let chart = self.context.map.atlas.gather.layout.chart_of(tile.placement) as usize;
             if before.sides.backs.get(chart) != light.sides.backs.get(chart) {
                 continue;
             }
-            if block.coarse_epoch == before.direct_epoch {
-                block.coarse_epoch = light.direct_epoch;
-                if block.direct_epoch == before.direct_epoch {
-                    block.direct_epoch = light.direct_epoch;
+            let renew = |epoch: &mut u32| {
+                let is_good = *epoch == before.direct_epoch;
+                *epoch = if is_good { light.direct_epoch } else { *epoch };
+                is_good
+            };
+            let status = &mut self.blocks.status_mut()[b as usize];
+            if renew(&mut status.coarse_epoch) {
+                if renew(&mut status.direct_epoch) {
                     self.display.keep_tile(b);
+                }
+                if let Some(work) = self.blocks.work_mut(b).and_then(|w| w.direct.as_mut()) {
+                    renew(&mut work.epoch);
                 }
             }
         }
@@ -656,9 +673,13 @@ impl Live {
         if !self.params.background || self.paused {
             return Ok(());
         }
-        let from =
-            Choice { context: &self.context, blocks: &self.blocks, grid: &self.grid, visibility: &self.visibility };
-        let (step, mut chosen) = self.chooser.next(&from, self.params.mode, camera, BACKGROUND);
+        let from = Choice {
+            context: &self.context,
+            blocks: self.blocks.status(),
+            grid: &self.grid,
+            visibility: &self.visibility,
+        };
+        let (step, mut chosen) = self.chooser.next(&from, self.params.mode, camera, BACKGROUND_BLOCKS);
         // What waits to be shown must be there for it.
         chosen.retain(|&b| !self.is_waiting[b as usize]);
         if chosen.is_empty() {
@@ -667,18 +688,17 @@ impl Live {
         self.reserve_for(&chosen)?;
         let most_rays = Some(self.params.rays_per_update as u64).filter(|&r| r > 0).unwrap_or(u64::MAX);
         let blocks = &mut self.blocks;
-        let taken = chosen.iter().map(|&b| (b, std::mem::take(&mut blocks[b as usize])));
+        let taken = chosen.iter().filter_map(|&b| Some((b, blocks.take(b)?)));
         let limit = Limit::new(None, most_rays);
-        let batch = Arc::new(Batch::new(self.context.clone(), taken, step, limit, Duration::ZERO));
-        batch.start(&self.device());
-        self.background = Some(batch);
+        let batch = Batch::new(self.context.clone(), taken, step, limit, Duration::ZERO);
+        self.background = Some(Background::start(batch, &self.device()));
         Ok(())
     }
 
     /// Ends work in the background and takes it over, whatever became of it.
     fn collect(&mut self, stats: &mut LiveStats) -> Result<()> {
-        let Some(batch) = self.background.take() else { return Ok(()) };
-        let (items, traced, result) = batch.take();
+        let Some(background) = self.background.take() else { return Ok(()) };
+        let (items, traced, result) = background.finish();
         stats.rays += traced;
         let device = self.device();
         device.install(|| self.take_over(items, stats));
@@ -705,7 +725,7 @@ impl Live {
         let (mut error, mut light, mut marks, mut done) = (0.0, 0.0, 0.0, 0.0);
         for &b in &self.visibility.seen {
             let mark = self.visibility.mark(b);
-            let block = &self.blocks[b as usize];
+            let block = self.status(b);
             error += mark * (block.error * block.mean).powi(2);
             light += mark * block.mean.powi(2);
             done += if self.chooser.is_open(b) { 0.0 } else { mark };
@@ -741,7 +761,7 @@ impl Live {
             direct_epoch: self.context.light.direct_epoch + 1,
             ..(*self.context.light).clone()
         });
-        self.chooser.note_all(&self.context, &self.blocks);
+        self.chooser.note_all(&self.context, self.blocks.status());
         Ok(())
     }
 
@@ -783,8 +803,9 @@ impl Live {
     pub fn sums(&mut self) -> Result<Vec<([f32; 3], u32)>> {
         self.collect_now()?;
         let mut sums = vec![([0.0; 3], 0); self.context.map.atlas.gather.len()];
-        for (tile, block) in self.context.map.tiles.iter().zip(&self.blocks) {
-            for (&s, g) in tile.texels.iter().zip(&block.gathered) {
+        for (b, tile) in (0..).zip(&self.context.map.tiles) {
+            let gathered = self.blocks.work(b).map_or(&[][..], |w| &w.gathered);
+            for (&s, g) in tile.texels.iter().zip(gathered) {
                 sums[s as usize] = (g.sum.to_array(), g.rays);
             }
         }
@@ -804,9 +825,11 @@ impl Live {
 
 impl Drop for Live {
     fn drop(&mut self) {
-        if let Some(batch) = self.background.take() {
-            // Threads at work hold what they work on; nothing is lost if this is the end of it.
-            let _ = batch.take();
+        if let Some(background) = self.background.take() {
+            // Nothing is lost if this is the end of it.
+            let _ = background.finish();
         }
+        // Before the scene is let go: its last reference then ends here, not on the thread that relights.
+        drop(std::mem::take(&mut self.relight));
     }
 }

@@ -136,7 +136,10 @@ pub(super) struct Relight {
 struct Running {
     /// Closed when the renewal has ended.
     results: Mutex<Receiver<Result<Indirect>>>,
+    /// Ends the part with all photons; a change of light does.
     cancel: Arc<AtomicBool>,
+    /// Ends the quick part too; the end of the live object does.
+    abandon: Arc<AtomicBool>,
 }
 
 impl Relight {
@@ -161,7 +164,8 @@ impl Relight {
         let (atlas, params, shown) = (atlas.clone(), *params, sides.clone());
         let (sender, results) = channel();
         let cancel = Arc::new(AtomicBool::new(false));
-        let cancelled = cancel.clone();
+        let abandon = Arc::new(AtomicBool::new(false));
+        let (cancelled, abandoned) = (cancel.clone(), abandon.clone());
         let compute = move |params: &BakeParams, sides: Option<Arc<Sides>>, progress: &Progress| {
             let direct = DirectLight::new(&atlas.scene);
             let result = catch_unwind(AssertUnwindSafe(|| illuminate(&atlas, params, &direct, sides, progress)));
@@ -170,11 +174,11 @@ impl Relight {
         device.spawn(move || {
             let quick = BakeParams { photon_count: params.photon_count.div_ceil(QUICK_PART), ..params };
             // Nobody listens any more when the live object is gone.
-            let _ = sender.send(compute(&quick, Some(shown), &Progress::none()));
+            let _ = sender.send(compute(&quick, Some(shown), &Progress::new(|_, _| !abandoned.load(Relaxed))));
             let _ = sender.send(compute(&params, None, &Progress::new(|_, _| !cancelled.load(Relaxed))));
         });
         self.device = Some(device);
-        self.running = Some(Running { results: Mutex::new(results), cancel });
+        self.running = Some(Running { results: Mutex::new(results), cancel, abandon });
         Ok(())
     }
 
@@ -230,10 +234,15 @@ impl Relight {
 }
 
 impl Drop for Relight {
+    /// Breaks a renewal off and waits for its thread, unless this is that thread (the last reference was given back
+    /// in a callback that it called): the renewal then ends after the callback has returned.
     fn drop(&mut self) {
         if let Some(running) = &self.running {
             running.cancel.store(true, Relaxed);
+            running.abandon.store(true, Relaxed);
         }
+        // Nobody else holds the device, so that its thread is joined here.
+        self.device = None;
     }
 }
 

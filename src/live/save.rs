@@ -4,7 +4,7 @@
 //! blocks, the blocks, and a checksum. Light of earlier epochs is not saved.
 
 use super::Live;
-use super::blocks::{Block, DirectTile};
+use super::blocks::{Block, BlockStatus, BlockWork, DirectTile};
 use crate::error::{Error, Result, invalid_argument};
 use crate::files;
 use crate::lightmap::gather::{Gathered, ROUND};
@@ -58,28 +58,29 @@ impl Live {
         let saved = self.parse(&bytes, path)?;
         self.collect_now()?;
         let direct = |s: &Saved| s.direct.as_ref().map_or(0, |d| size_of_val(&d[..]));
-        self.reserve(saved.iter().map(|s| s.block.bytes() + direct(s)).sum())?;
+        self.reserve(saved.iter().map(|s| s.block.work.bytes() + direct(s)).sum())?;
         for (b, saved) in (0u32..).zip(saved) {
-            let old = std::mem::take(&mut self.blocks[b as usize]);
-            if saved.block.gathered.is_empty() {
+            if saved.block.work.gathered.is_empty() {
                 // Nothing was known; what this object began with is more.
-                self.blocks[b as usize] = old;
                 continue;
             }
-            let mut block = Block { coarse_epoch: old.coarse_epoch, direct_mean: old.direct_mean, ..saved.block };
-            block.indirect_epoch = self.context.light.indirect_epoch;
-            self.held += block.bytes() as isize - old.bytes() as isize;
+            let Some(old) = self.blocks.take(b) else { continue };
+            let mut block = saved.block;
+            block.status.coarse_epoch = old.status.coarse_epoch;
+            block.status.direct_mean = old.status.direct_mean;
+            block.status.indirect_epoch = self.context.light.indirect_epoch;
+            self.held += block.work.bytes() as isize - old.work.bytes() as isize;
             if let Some(values) = saved.direct
-                && block.changes_behind(&self.context) == 0
+                && block.status.changes_behind(&self.context) == 0
             {
-                block.direct_epoch = self.context.light.direct_epoch;
+                block.status.direct_epoch = self.context.light.direct_epoch;
                 let tile = &self.context.map.tiles[b as usize];
                 let rect = self.context.map.rect_in_light_map(tile.placement, &tile.rect);
                 self.held += self.display.take_direct(&self.context.map, b, DirectTile { rect, values }).1;
             }
             block.note_error(self.context.map.top());
             self.display.lods[b as usize] = saved.shown;
-            self.blocks[b as usize] = block;
+            self.blocks.put(b, block);
         }
         self.show_all();
         Ok(())
@@ -112,12 +113,14 @@ impl Live {
     }
 
     fn write_block(&self, b: u32, out: &mut Vec<u8>) {
-        let fresh = Block::default();
-        let block = &self.blocks[b as usize];
+        let fresh = BlockWork::default();
+        let (mut status, mut block) = (*self.status(b), self.blocks.work(b).unwrap_or(&fresh));
         // What was gathered under an earlier light is left out.
-        let block = if block.has_old_light(&self.context) { &fresh } else { block };
-        out.extend([block.fresh_lod, self.display.lods[b as usize].min(block.fresh_lod)]);
-        for n in [block.rounds, block.cursor, block.gathered.len() as u16] {
+        if status.has_old_light(&self.context) {
+            (status, block) = (BlockStatus::default(), &fresh);
+        }
+        out.extend([status.fresh_lod, self.display.lods[b as usize].min(status.fresh_lod)]);
+        for n in [status.rounds, block.cursor, block.gathered.len() as u16] {
             out.extend(n.to_le_bytes());
         }
         out.extend(block.deviations.to_le_bytes());
@@ -192,14 +195,8 @@ impl Live {
         let direct = (0..values).map(|_| from.vec3()).collect::<Option<Box<[Vec3]>>>()?;
         Some(Saved {
             block: Block {
-                lod,
-                fresh_lod: lod,
-                rounds,
-                cursor,
-                gathered,
-                deviations,
-                deviation_count,
-                ..Default::default()
+                status: BlockStatus { lod, fresh_lod: lod, rounds, ..Default::default() },
+                work: Box::new(BlockWork { cursor, gathered, deviations, deviation_count, ..Default::default() }),
             },
             shown,
             direct: (values > 0).then_some(direct),

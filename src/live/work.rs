@@ -4,7 +4,7 @@
 //! the sums of a texel depend on its number of rounds alone, so they have the bits of a bake with as
 //! many rays.
 
-use super::blocks::{Block, BlockMap, DirectTile, Tile};
+use super::blocks::{Block, BlockMap, BlockStatus, BlockWork, DirectTile, DirectWork, Tile};
 use super::relight::Illumination;
 use crate::lightmap::gather::{Gathered, ROUND, SampleSet};
 use crate::lightmap::radiance::RadianceMap;
@@ -106,13 +106,13 @@ impl Done {
     }
 }
 
-impl Block {
+impl BlockStatus {
     /// LOD and rounds that the next step works towards; `None` if nothing is left to do.
     fn target(&self, c: &Context) -> Option<(u8, u32)> {
         let top = c.map.top();
         if !c.light.has_indirect {
             None
-        } else if self.indirect_epoch != c.light.indirect_epoch || self.gathered.is_empty() {
+        } else if self.indirect_epoch != c.light.indirect_epoch || self.rounds == 0 {
             // New light: a little of it everywhere first.
             Some((0, c.promote_threshold))
         } else if self.fresh_lod < top {
@@ -131,7 +131,7 @@ impl Block {
 
     /// Whether direct light is known at full resolution under the light of now.
     pub fn has_direct(&self, c: &Context) -> bool {
-        self.direct_epoch == c.light.direct_epoch && self.direct_work.is_none()
+        self.direct_epoch == c.light.direct_epoch
     }
 
     /// Whether its indirect light is of an earlier epoch altogether.
@@ -142,29 +142,6 @@ impl Block {
     /// Changes of the lights since the coarse direct light was computed.
     pub fn changes_behind(&self, c: &Context) -> u32 {
         c.light.direct_epoch - self.coarse_epoch
-    }
-
-    /// Works until a step is completed or the limit is reached.
-    pub fn work(&mut self, c: &Context, tile: &Tile, step: Step, limit: &Limit) -> Done {
-        let mut done = Done::default();
-        if tile.texels.is_empty() {
-            return done;
-        }
-        if self.changes_behind(c) > 0 {
-            self.work_on_coarse(c, tile, limit);
-            done.coarse = true;
-        }
-        let kind = match step {
-            Step::Coarse => None,
-            Step::Direct => (!self.has_direct(c)).then_some(Kind::Direct),
-            Step::Next => self.next(c, tile).map(|n| n.0),
-        };
-        match kind {
-            Some(Kind::Direct) => done.direct = self.work_on_direct(c, tile, limit),
-            Some(Kind::Indirect) => done.indirect = self.work_on_indirect(c, tile, limit),
-            None => {}
-        }
-        done
     }
 
     /// What gains most next, and how much: error mended per ray.
@@ -190,58 +167,155 @@ impl Block {
             (one, other) => one.or(other),
         }
     }
+}
+
+impl Block {
+    /// Works until a step is completed or the limit is reached.
+    pub fn work(&mut self, c: &Context, tile: &Tile, step: Step, limit: &Limit) -> Done {
+        let mut done = Done::default();
+        if tile.texels.is_empty() {
+            return done;
+        }
+        if self.status.changes_behind(c) > 0 {
+            self.work_on_coarse(c, tile, limit);
+            done.coarse = true;
+        }
+        let kind = match step {
+            Step::Coarse => None,
+            Step::Direct => (!self.status.has_direct(c)).then_some(Kind::Direct),
+            Step::Next => self.status.next(c, tile).map(|n| n.0),
+        };
+        match kind {
+            Some(Kind::Direct) => done.direct = self.work_on_direct(c, tile, limit),
+            Some(Kind::Indirect) => done.indirect = self.work_on_indirect(c, tile, limit),
+            None => {}
+        }
+        done
+    }
 
     /// One step of indirect light; tells whether it was completed.
     pub fn work_on_indirect(&mut self, c: &Context, tile: &Tile, limit: &Limit) -> bool {
-        let Some((lod, rounds)) = self.target(c) else { return false };
-        if self.indirect_epoch != c.light.indirect_epoch {
+        let Some((lod, rounds)) = self.status.target(c) else { return false };
+        if self.status.indirect_epoch != c.light.indirect_epoch {
             self.begin_epoch(tile, c.light.indirect_epoch);
         }
         let atlas = &c.map.atlas;
         let lookup = RadianceMap::new(&atlas.charts, &atlas.radiance, &c.light.radiance);
         let end = tile.lod_end[lod as usize];
-        self.gathered.reserve_exact((end as usize).saturating_sub(self.gathered.len()));
-        while self.cursor < end {
-            let i = self.cursor as usize;
+        let work = &mut *self.work;
+        work.gathered.reserve_exact((end as usize).saturating_sub(work.gathered.len()));
+        while work.cursor < end {
+            let i = work.cursor as usize;
             let sample = tile.texels[i];
-            if self.gathered.len() <= i {
-                self.gathered.push(Gathered::default());
+            if work.gathered.len() <= i {
+                work.gathered.push(Gathered::default());
             }
             let receiver = atlas.receiver(&atlas.gather, &c.light.sides.backs, sample as usize);
-            while self.gathered[i].rays < rounds * ROUND as u32 {
+            while work.gathered[i].rays < rounds * ROUND as u32 {
                 if limit.reached() {
                     return false;
                 }
-                let before = self.gathered[i];
+                let before = work.gathered[i];
                 let round = (before.rays as usize) / ROUND;
                 let seed = combine(c.gather_seed, sample);
-                let rays = self.gathered[i].add_round(&atlas.scene, &lookup, &receiver, &c.samples, round, seed);
-                self.note_deviation(&before, i);
+                let rays = work.gathered[i].add_round(&atlas.scene, &lookup, &receiver, &c.samples, round, seed);
+                work.note_deviation(&before, i);
                 limit.traced.fetch_add(rays, Relaxed);
             }
-            self.cursor += 1;
+            work.cursor += 1;
         }
-        self.cursor = 0;
-        self.fresh_lod = lod;
-        self.lod = self.lod.max(lod);
-        self.rounds = rounds as u16;
+        work.cursor = 0;
+        self.status.fresh_lod = lod;
+        self.status.lod = self.status.lod.max(lod);
+        self.status.rounds = rounds as u16;
         self.note_error(c.map.top());
         true
     }
 
     /// Keeps the light of now as a prior and starts over.
     fn begin_epoch(&mut self, tile: &Tile, epoch: u32) {
-        if !self.gathered.is_empty() {
-            self.prior = (0..tile.texels.len()).map(|i| self.estimate(i).unwrap_or(Vec3::NAN)).collect();
+        let work = &mut *self.work;
+        if !work.gathered.is_empty() {
+            work.prior = (0..tile.texels.len()).map(|i| work.estimate(i).unwrap_or(Vec3::NAN)).collect();
         }
-        self.gathered.clear();
-        self.indirect_epoch = epoch;
-        self.fresh_lod = 0;
-        self.rounds = 0;
-        self.cursor = 0;
-        (self.deviations, self.deviation_count) = (0.0, 0);
+        work.gathered.clear();
+        work.cursor = 0;
+        (work.deviations, work.deviation_count) = (0.0, 0);
+        let status = &mut self.status;
+        (status.indirect_epoch, status.fresh_lod, status.rounds) = (epoch, 0, 0);
     }
 
+    /// Estimates mean and relative error of the block's indirect light: the spread of its rounds, where there is more
+    /// than one, and, where texels are interpolated, half the spread of those that are not.
+    pub fn note_error(&mut self, top: u8) {
+        let values = || self.work.gathered.iter().filter(|g| g.rays > 0).map(|g| g.irradiance().element_sum());
+        let n = values().count().max(1) as f32;
+        let mean = values().sum::<f32>() / n;
+        self.status.mean = mean;
+        self.status.error = if mean > 0.0 {
+            let spread = (values().map(|v| (v - mean).powi(2)).sum::<f32>() / n).sqrt() / mean;
+            let noise = if self.work.deviation_count > 0 {
+                (self.work.deviations / self.work.deviation_count as f32 / self.status.rounds.max(1) as f32).sqrt()
+                    / mean
+            } else {
+                // One round alone tells nothing of its noise; neighbours differ by it at least. Few
+                // texels do not tell even that.
+                spread.max(1.0 / n).min(1.0) / (self.status.rounds.max(1) as f32).sqrt()
+            };
+            if self.status.fresh_lod < top { noise + 0.5 * spread.min(1.0) + 0.02 } else { noise }
+        } else {
+            // Dark, or the texels so far lie hidden inside something and those of the next LOD do not.
+            (self.status.fresh_lod < top) as u8 as f32
+        };
+    }
+
+    /// Direct light of the lowest LOD's texels.
+    pub fn work_on_coarse(&mut self, c: &Context, tile: &Tile, limit: &Limit) {
+        let (atlas, mut rays) = (&c.map.atlas, 0);
+        let samples = c.direct_samples.min(COARSE_SAMPLES);
+        let value = |&s: &u32| {
+            let receiver = atlas.receiver(&atlas.gather, &c.light.sides.backs, s as usize);
+            c.light.direct.irradiance(&receiver, samples, combine(c.direct_seed, s), &mut rays)
+        };
+        let values: Box<[Vec3]> = tile.texels[..tile.lod_end[0] as usize].iter().map(value).collect();
+        let sum: f32 = values.iter().map(|v| v.element_sum()).sum();
+        self.status.direct_mean = sum / values.len().max(1) as f32;
+        self.status.coarse_epoch = c.light.direct_epoch;
+        self.work.new_coarse = values;
+        limit.traced.fetch_add(rays, Relaxed);
+    }
+
+    /// Direct light of the block's light map texels; tells whether it was completed.
+    fn work_on_direct(&mut self, c: &Context, of: &Tile, limit: &Limit) -> bool {
+        let under_way = self.work.direct.take().filter(|w| w.epoch == c.light.direct_epoch);
+        let mut direct = under_way.unwrap_or_else(|| {
+            let rect = c.map.rect_in_light_map(of.placement, &of.rect);
+            let tile = DirectTile { rect, values: vec![Vec3::NAN; rect.area()].into() };
+            DirectWork { tile, next: 0, epoch: c.light.direct_epoch }
+        });
+        let (width, corner) = (direct.tile.rect.width().max(1), (direct.tile.rect.x0, direct.tile.rect.y0));
+        while (direct.next as usize) < direct.tile.values.len() {
+            if limit.reached() {
+                self.work.direct = Some(direct);
+                return false;
+            }
+            let at = direct.next as usize;
+            let (x, y) = (corner.0 + (at % width) as i32, corner.1 + (at / width) as i32);
+            let mut rays = 0;
+            if let Some(value) = direct_texel(c, of, x, y, &mut rays) {
+                direct.tile.values[at] = value;
+            }
+            limit.traced.fetch_add(rays, Relaxed);
+            direct.next += 1;
+        }
+        fill_hidden(&mut direct.tile);
+        self.status.direct_epoch = direct.epoch;
+        self.work.new_direct = Some(direct.tile);
+        true
+    }
+}
+
+impl BlockWork {
     /// What is known of texel `i`: its own rays, with the prior's light fading while they are few.
     pub fn estimate(&self, i: usize) -> Option<Vec3> {
         let prior = self.prior.get(i).copied().filter(|p| p.is_finite());
@@ -268,9 +342,9 @@ impl Block {
         self.gathered.iter().any(|g| g.is_visible() && g.sum != Vec3::ZERO)
     }
 
-    /// Drops the prior once it has no weight.
-    pub fn drop_faded_prior(&mut self) {
-        if self.rounds >= 2 && self.cursor == 0 {
+    /// Drops the prior once it has no weight: when a step of the second round has been completed.
+    pub fn drop_faded_prior(&mut self, status: &BlockStatus) {
+        if status.rounds >= 2 && self.cursor == 0 {
             self.prior = Box::default();
         }
     }
@@ -284,73 +358,6 @@ impl Block {
             self.deviations += (round - mean).powi(2) * n / (n + 1.0);
             self.deviation_count += 1;
         }
-    }
-
-    /// Estimates mean and relative error of the block's indirect light: the spread of its rounds, where there is more
-    /// than one, and, where texels are interpolated, half the spread of those that are not.
-    pub fn note_error(&mut self, top: u8) {
-        let values = || self.gathered.iter().filter(|g| g.rays > 0).map(|g| g.irradiance().element_sum());
-        let n = values().count().max(1) as f32;
-        let mean = values().sum::<f32>() / n;
-        self.mean = mean;
-        self.error = if mean > 0.0 {
-            let spread = (values().map(|v| (v - mean).powi(2)).sum::<f32>() / n).sqrt() / mean;
-            let noise = if self.deviation_count > 0 {
-                (self.deviations / self.deviation_count as f32 / self.rounds.max(1) as f32).sqrt() / mean
-            } else {
-                // One round alone tells nothing of its noise; neighbours differ by it at least. Few
-                // texels do not tell even that.
-                spread.max(1.0 / n).min(1.0) / (self.rounds.max(1) as f32).sqrt()
-            };
-            if self.fresh_lod < top { noise + 0.5 * spread.min(1.0) + 0.02 } else { noise }
-        } else {
-            // Dark, or the texels so far lie hidden inside something and those of the next LOD do not.
-            (self.fresh_lod < top) as u8 as f32
-        };
-    }
-
-    /// Direct light of the lowest LOD's texels.
-    pub fn work_on_coarse(&mut self, c: &Context, tile: &Tile, limit: &Limit) {
-        let (atlas, mut rays) = (&c.map.atlas, 0);
-        let samples = c.direct_samples.min(COARSE_SAMPLES);
-        let value = |&s: &u32| {
-            let receiver = atlas.receiver(&atlas.gather, &c.light.sides.backs, s as usize);
-            c.light.direct.irradiance(&receiver, samples, combine(c.direct_seed, s), &mut rays)
-        };
-        self.new_coarse = tile.texels[..tile.lod_end[0] as usize].iter().map(value).collect();
-        let sum: f32 = self.new_coarse.iter().map(|v| v.element_sum()).sum();
-        self.direct_mean = sum / self.new_coarse.len().max(1) as f32;
-        self.coarse_epoch = c.light.direct_epoch;
-        limit.traced.fetch_add(rays, Relaxed);
-    }
-
-    /// Direct light of the block's light map texels; tells whether it was completed.
-    fn work_on_direct(&mut self, c: &Context, of: &Tile, limit: &Limit) -> bool {
-        let (mut tile, mut next) = match self.direct_work.take() {
-            Some((tile, next)) if self.direct_epoch == c.light.direct_epoch => (tile, next),
-            _ => {
-                let rect = c.map.rect_in_light_map(of.placement, &of.rect);
-                self.direct_epoch = c.light.direct_epoch;
-                (DirectTile { rect, values: vec![Vec3::NAN; rect.area()].into() }, 0)
-            }
-        };
-        let width = tile.rect.width().max(1);
-        while (next as usize) < tile.values.len() {
-            if limit.reached() {
-                self.direct_work = Some((tile, next));
-                return false;
-            }
-            let (x, y) = (tile.rect.x0 + (next as usize % width) as i32, tile.rect.y0 + (next as usize / width) as i32);
-            let mut rays = 0;
-            if let Some(value) = direct_texel(c, of, x, y, &mut rays) {
-                tile.values[next as usize] = value;
-            }
-            limit.traced.fetch_add(rays, Relaxed);
-            next += 1;
-        }
-        fill_hidden(&mut tile);
-        self.new_direct = Some(tile);
-        true
     }
 }
 
