@@ -4,9 +4,9 @@
 use bakelite::bvh::BuildOptions;
 use bakelite::lightmap::{Layer, LayerData, Lightmap, LightmapDesc};
 use bakelite::live::{Budget, Live, LiveCamera, LiveParams, LiveStats, Mode, PageRect};
-use bakelite::scene::{Light, MeshMaterials, builtin};
+use bakelite::scene::{Light, LightmapUvs, MeshMaterials, builtin};
 use bakelite::{Device, DeviceOptions, Error, Material, Mesh, Progress, Scene, SceneData};
-use glam::Vec3;
+use glam::{Vec2, Vec3};
 use std::f32::consts::PI;
 
 const RAYS: Budget = Budget { milliseconds: 0.0, rays: 200_000 };
@@ -91,6 +91,89 @@ fn assert_same_as_bake(live: &Live, lightmap: &mut Lightmap, what: &str) {
             shown[i],
             baked[i]
         );
+    }
+}
+
+/// A room of 4 × 3 × 5 whose six faces have light map UVs of their own, in two rows of three cells with gaps of `gap`
+/// around each.
+fn room_with_uvs(gap: f32) -> SceneData {
+    let corner = |i: usize| Vec3::new((i & 1) as f32 * 4.0, (i >> 1 & 1) as f32 * 3.0, (i >> 2) as f32 * 5.0);
+    let faces = [[0, 4, 5, 1], [2, 3, 7, 6], [0, 1, 3, 2], [4, 6, 7, 5], [0, 2, 6, 4], [1, 5, 7, 3]];
+    let mut mesh = Mesh::default();
+    let mut uvs = Vec::new();
+    for (cell, face) in faces.into_iter().enumerate() {
+        let first = mesh.positions.len() as u32;
+        mesh.positions.extend(face.map(corner));
+        mesh.indices.extend([[first, first + 1, first + 2], [first, first + 2, first + 3]]);
+        let (u, v) = ((cell % 3) as f32 / 3.0, (cell / 3) as f32 / 2.0);
+        let (u0, u1, v0, v1) = (u + gap, u + 1.0 / 3.0 - gap, v + gap, v + 0.5 - gap);
+        uvs.extend([[u0, v0], [u1, v0], [u1, v1], [u0, v1]].map(Vec2::from));
+    }
+    mesh.lightmap = Some(LightmapUvs { uvs, pages: Vec::new() });
+    let position = Vec3::new(1.5, 2.99, 2.0);
+    let light = Light::Rect { position, edge_u: Vec3::X, edge_v: Vec3::Z, radiance: [10.0; 3] };
+    let mut data = SceneData::new();
+    data.add_material(Material { albedo: [0.75; 3], ..Default::default() }).unwrap();
+    data.add_mesh(mesh).unwrap();
+    data.add_light(light).unwrap();
+    data
+}
+
+/// A layer of light of all pages.
+fn rgb(lightmap: &Lightmap, layer: Layer) -> Vec<[f32; 3]> {
+    let page = |page| match lightmap.read(page, layer).unwrap() {
+        LayerData::Rgb(v) => v,
+        _ => unreachable!(),
+    };
+    (0..lightmap.info().page_count).flat_map(page).collect()
+}
+
+#[test]
+fn around_given_charts_bakes_and_live_light_are_padded_alike() {
+    let mut lightmap = unbaked_of(room_with_uvs(0.02), 2, 20.0);
+    let mut live = Live::new(&lightmap, &params(Mode::Uniform), &Progress::none()).unwrap();
+    finish(&mut live);
+    lightmap.bake(&live.params().bake(), &Progress::none()).unwrap();
+    let (width, padding) = (lightmap.info().width as usize, 2);
+    let shown = pages(&live, &lightmap);
+    let layers = [Layer::Combined, Layer::Direct, Layer::Indirect, Layer::Radiance].map(|l| rgb(&lightmap, l));
+    assert!(shown == layers[0], "a bake and live light differ in the padding");
+    let LayerData::Scalar(validity) = lightmap.read(0, Layer::Validity).unwrap() else { unreachable!() };
+    let mut filled = 0;
+    for (i, v) in validity.iter().enumerate() {
+        let (x, y) = (i % width, i / width);
+        let near = |reach: usize, value: f32| {
+            let range = |c: usize| c.saturating_sub(reach)..(c + reach + 1).min(width);
+            range(y).any(|y| range(x).any(|x| validity[y * width + x] == value))
+        };
+        let expected = if *v == 1.0 { 1.0 } else { 0.5 * f32::from(near(padding, 1.0)) };
+        assert_eq!(*v, expected, "validity at ({x}, {y})");
+        filled += usize::from(*v == 0.5);
+        // The ceiling gets no direct light.
+        let lit = [0, 2, 3].iter().all(|&l: &usize| layers[l][i][0] > 0.0);
+        assert_eq!(lit, *v > 0.0, "({x}, {y}) has validity {v}");
+    }
+    assert!(filled > 6 * 4 * 60, "{filled} texels of padding");
+}
+
+#[test]
+fn around_given_charts_whatever_changes_is_dirty() {
+    let lightmap = unbaked_of(room_with_uvs(0.04), 2, 20.0);
+    let mut live = Live::new(&lightmap, &params(Mode::Uniform), &Progress::none()).unwrap();
+    live.take_dirty(usize::MAX);
+    let mut before = pages(&live, &lightmap);
+    let width = lightmap.info().width;
+    for i in 0..6 {
+        live.update(&camera(i), &RAYS).unwrap();
+        let mut uploaded = before.clone();
+        let after = pages(&live, &lightmap);
+        for r in live.take_dirty(usize::MAX) {
+            for (y, x) in (r.y..r.y + r.height).flat_map(|y| (r.x..r.x + r.width).map(move |x| (y, x))) {
+                uploaded[(y * width + x) as usize] = after[(y * width + x) as usize];
+            }
+        }
+        assert!(uploaded == after, "update {i} changed texels outside of the dirty rectangles");
+        before = after;
     }
 }
 

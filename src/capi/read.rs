@@ -17,12 +17,15 @@ pub const BK_LAYER_INDIRECT: u32 = 1;
 pub const BK_LAYER_DIRECT: u32 = 2;
 /// Outgoing radiance as gather rays see it, in W/(m2 sr). RGB.
 pub const BK_LAYER_RADIANCE: u32 = 3;
-/// 1 for a texel that a triangle covers, 0.5 for one filled from its neighbours, 0 for an empty one.
-/// BK_FORMAT_R32F.
+/// 1 for a texel that a triangle covers; 0.5 for one whose light is filled in from its neighbours, because
+/// it lies in the padding around a chart or inside a solid; 0 for an empty one. After a bake of some
+/// texels, those that are not baked yet, and the padding that repeats them, are 0 too; before the first
+/// bake covered texels are 1. BK_FORMAT_R32F.
 pub const BK_LAYER_VALIDITY: u32 = 4;
-/// Position of the texel's sample in the scene. RGB.
+/// Position of the texel's sample in the scene; 0 where no triangle covers the texel. RGB.
 pub const BK_LAYER_POSITION: u32 = 5;
-/// Unit normal of the texel's sample, on the side whose light it holds. RGB.
+/// Unit normal of the texel's sample, on the side whose light it holds (before a bake the front, but for
+/// backs with texels of their own); 0 where no triangle covers the texel. RGB.
 pub const BK_LAYER_NORMAL: u32 = 6;
 /// Number of the triangle that covers the texel, counted through all meshes in their order; BK_NONE
 /// where there is none. BK_FORMAT_R32U.
@@ -39,13 +42,15 @@ pub const BK_FORMAT_R32U: u32 = 4;
 
 /// Copies one layer of one page.
 ///
-/// layer: one of the BK_LAYER values; those that hold light need a bake (BK_ERROR_INVALID_STATE
-/// before). format: one of the BK_FORMAT values that suits the layer, as said there. dst: receives
-/// height rows, row_stride bytes apart, of width texels; needs no alignment. row_stride: at least
-/// the bytes of a row of texels; 0: just that many.
+/// layer: one of the BK_LAYER values. BK_LAYER_COMBINED, INDIRECT, DIRECT and RADIANCE hold light and need
+/// a bake; VALIDITY, POSITION, NORMAL and TRIANGLE can be read at any time but during one. In the layers
+/// of light each texel of the padding repeats the nearest covered texel. format: one of the BK_FORMAT
+/// values that suits the layer, as stated there. dst: receives height rows, row_stride bytes apart, of
+/// width texels; needs no alignment. row_stride: at least the bytes of a row of texels; 0: just that many.
 ///
-/// Fails with BK_ERROR_INVALID_ARGUMENT if page, layer or format is none or row_stride is too small,
-/// BK_ERROR_INVALID_STATE before or during a bake, BK_ERROR_OUT_OF_MEMORY if a page does not fit.
+/// Fails with BK_ERROR_INVALID_ARGUMENT if page, layer or format does not exist or row_stride is too
+/// small, BK_ERROR_INVALID_STATE if the layer holds light and there was no bake, or during a bake,
+/// BK_ERROR_OUT_OF_MEMORY if a page does not fit.
 #[unsafe(no_mangle)]
 pub unsafe extern "C" fn bk_lightmap_read(
     lightmap: *const bk_lightmap,

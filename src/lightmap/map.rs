@@ -104,15 +104,6 @@ impl ChartMap {
         if self.is_back(sample) { self.layout.place_of(chart, false) } else { chart }
     }
 
-    /// Repeats the nearest sample around the charts of a page, up to `padding` texels away.
-    pub(crate) fn dilate<T: Copy>(&self, page: u32, padding: u32, out: &mut [T]) {
-        let size = self.layout.page_size as usize;
-        for d in self.texels.dilate(page, padding) {
-            let (x, y) = self.position(d.sample as usize);
-            out[d.y as usize * size + d.x as usize] = out[y as usize * size + x as usize];
-        }
-    }
-
     /// Position and normal of a sample.
     pub(crate) fn surface(&self, scene: &Scene, sample: usize) -> (Vec3, Vec3) {
         let t = &self.texels.samples[sample];

@@ -191,11 +191,13 @@ pub enum Layer {
     Direct = 2,
     /// Outgoing radiance (RGB, W/(m²·sr)).
     Radiance = 3,
-    /// 1 where a valid texel, 0.5 where filled from neighbours, 0 elsewhere.
+    /// 1 for a covered texel, 0.5 for one filled from its neighbours (the padding, and what lies inside solids), 0 for
+    /// an empty one. After a bake of some texels those that are not baked yet are 0; before the first bake covered
+    /// texels are 1.
     Validity = 4,
-    /// World position of the texel's sample (RGB).
+    /// Position of the texel's sample in the scene (RGB); 0 for texels that no triangle covers.
     Position = 5,
-    /// Unit normal of the texel's sample (RGB).
+    /// Unit normal of the texel's sample (RGB); 0 for texels that no triangle covers.
     Normal = 6,
     /// Global triangle number (u32), [`crate::scene::NONE`] where there is none.
     Triangle = 7,

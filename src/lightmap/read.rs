@@ -2,12 +2,16 @@
 
 use super::direct::DirectLight;
 use super::radiance::{self, RadianceMap};
+use super::texels::PageArea;
 use super::{Layer, LayerData, Light, Lightmap, TexelState};
 use crate::error::{Error, Result, invalid_argument};
 use crate::memory::try_vec;
 use crate::scene::NONE;
 use crate::trace::RawHit;
 use glam::Vec3;
+
+/// What the validity layer says of a texel filled from its neighbours.
+const FILLED: f32 = 0.5;
 
 /// Corner UVs of each triangle, and its page.
 pub type MeshUvs = (Vec<[[f32; 2]; 3]>, Vec<u32>);
@@ -55,60 +59,63 @@ impl Lightmap {
         self.light.as_ref().ok_or_else(|| Error::InvalidState("the light map has not been baked yet".into()))
     }
 
-    /// One layer of one page, row-major from v = 0. Layers of light need a bake (`InvalidState`
-    /// before). Texels around charts repeat the nearest texel of the chart, up to the padding.
+    /// Returns one layer of one page, row-major from v = 0. The layers of light (combined, indirect, direct, radiance)
+    /// need a bake (`InvalidState` before); the others can be read at any time. In the layers of light, texels around charts
+    /// repeat the nearest covered texel, up to the padding.
     pub fn read(&self, page: u32, layer: Layer) -> Result<LayerData> {
         if page >= self.atlas.info.page_count {
             return invalid_argument!("page is {page}, the light map has {}", self.atlas.info.page_count);
         }
-        Ok(match layer {
+        let map = &self.atlas.map;
+        match layer {
             Layer::Combined => {
                 let light = self.light()?;
-                LayerData::Rgb(self.page(page, [0.0; 3], |s| (light.direct[s] + light.indirect[s]).to_array(), true)?)
+                self.page_of_light(page, |s| (light.direct[s] + light.indirect[s]).to_array())
             }
             Layer::Direct => {
                 let light = self.light()?;
-                LayerData::Rgb(self.page(page, [0.0; 3], |s| light.direct[s].to_array(), true)?)
+                self.page_of_light(page, |s| light.direct[s].to_array())
             }
             Layer::Indirect => {
                 let light = self.light()?;
-                LayerData::Rgb(self.page(page, [0.0; 3], |s| light.indirect[s].to_array(), true)?)
+                self.page_of_light(page, |s| light.indirect[s].to_array())
             }
             Layer::Radiance => {
                 let light = self.light()?;
-                LayerData::Rgb(self.page(page, [0.0; 3], |s| self.radiance_at(light, s), true)?)
+                self.page_of_light(page, |s| self.radiance_at(light, s))
             }
             Layer::Validity => {
-                let light = self.light()?;
-                LayerData::Scalar(self.page(
-                    page,
-                    0.0,
-                    |s| match light.state[s] {
-                        TexelState::Visible => 1.0,
-                        TexelState::Hidden => 0.5,
-                        TexelState::Unbaked => 0.0,
-                    },
-                    false,
-                )?)
+                let padding = self.atlas.padding;
+                Ok(LayerData::Scalar(self.page(page, 0.0, padding, |s| self.validity(s), |v| FILLED.min(v))?))
             }
-            Layer::Position => LayerData::Rgb(self.page(
-                page,
-                [0.0; 3],
-                |s| self.atlas.map.surface(&self.atlas.scene, s).0.to_array(),
-                false,
-            )?),
+            Layer::Position => {
+                let position = |s| map.surface(&self.atlas.scene, s).0.to_array();
+                Ok(LayerData::Rgb(self.page_of_samples(page, [0.0; 3], position)?))
+            }
             Layer::Normal => {
+                let backs = self.light.as_ref().map_or(&[][..], |l| &l.backs);
                 let normal = |s: usize| {
-                    let n = self.atlas.map.surface(&self.atlas.scene, s).1;
-                    let backs = self.light.as_ref().map_or(&[][..], |l| &l.backs);
-                    if self.atlas.is_back(&self.atlas.map, backs, s) { -n } else { n }
+                    let n = map.surface(&self.atlas.scene, s).1;
+                    if self.atlas.is_back(map, backs, s) { -n } else { n }.to_array()
                 };
-                LayerData::Rgb(self.page(page, [0.0; 3], |s| normal(s).to_array(), false)?)
+                Ok(LayerData::Rgb(self.page_of_samples(page, [0.0; 3], normal)?))
             }
             Layer::Triangle => {
-                LayerData::Integer(self.page(page, NONE, |s| self.atlas.map.texels.samples[s].triangle, false)?)
+                let triangle = |s: usize| map.texels.samples[s].triangle;
+                Ok(LayerData::Integer(self.page_of_samples(page, NONE, triangle)?))
             }
-        })
+        }
+    }
+
+    /// What the validity layer says of a sample.
+    fn validity(&self, sample: usize) -> f32 {
+        // Before a bake: what a bake will cover.
+        let Some(light) = &self.light else { return 1.0 };
+        match light.state[sample] {
+            TexelState::Visible => 1.0,
+            TexelState::Hidden => FILLED,
+            TexelState::Unbaked => 0.0,
+        }
     }
 
     /// Outgoing radiance of a texel: reflected, from the radiance map, plus emitted.
@@ -128,24 +135,33 @@ impl Lightmap {
         l.to_array()
     }
 
-    /// Scatters per-sample values to a page.
-    fn page<T: Copy + Default>(&self, page: u32, empty: T, value: impl Fn(usize) -> T, dilate: bool) -> Result<Vec<T>> {
-        let size = self.atlas.map.layout.page_size as usize;
-        let mut out = try_vec::<T>(size * size, "a page")?;
+    /// A page of values by sample; `fill` gives what a texel within `padding` of a chart shows by the value of the
+    /// nearest sample.
+    fn page<T: Copy + Default>(
+        &self,
+        page: u32,
+        empty: T,
+        padding: u32,
+        value: impl Fn(usize) -> T,
+        fill: impl Fn(T) -> T,
+    ) -> Result<Vec<T>> {
+        let size = self.atlas.map.layout.page_size;
+        let mut out = try_vec::<T>(size as usize * size as usize, "a page")?;
         out.fill(empty);
-        for (number, placement) in self.atlas.map.layout.placements.iter().enumerate() {
-            if placement.page != page {
-                continue;
-            }
-            for s in self.atlas.map.samples_of(number as u32) {
-                let (x, y) = self.atlas.map.position(s);
-                out[y as usize * size + x as usize] = value(s);
-            }
-        }
-        if dilate {
-            self.atlas.map.dilate(page, self.atlas.padding, &mut out);
-        }
+        let texels = &self.atlas.map.texels;
+        let groups = texels.groups_of_page(page);
+        texels.compose(groups, &PageArea::page(size), padding, &mut out, |s| value(s as usize), fill);
         Ok(out)
+    }
+
+    /// A page of light: the padding repeats the nearest sample.
+    fn page_of_light(&self, page: u32, value: impl Fn(usize) -> [f32; 3]) -> Result<LayerData> {
+        Ok(LayerData::Rgb(self.page(page, [0.0; 3], self.atlas.padding, value, |v| v)?))
+    }
+
+    /// A page of what covered texels alone have.
+    fn page_of_samples<T: Copy + Default>(&self, page: u32, empty: T, value: impl Fn(usize) -> T) -> Result<Vec<T>> {
+        self.page(page, empty, 0, value, |v| v)
     }
 
     /// Whether the back of a global triangle has a place of its own.

@@ -10,6 +10,8 @@
 //! Geometry is computed in f64 on texel coordinates relative to the rectangle at hand. Triangles
 //! that share an edge compute the same crossings with texel rows, so no centre falls between them.
 
+mod padding;
+
 use super::charts::Charts;
 use super::layout::Layout;
 use crate::error::Result;
@@ -17,6 +19,7 @@ use crate::memory::{Reservation, try_vec};
 use crate::progress::Stage;
 use crate::scene::{NONE, Scene};
 use glam::{DVec2, Vec3};
+pub(crate) use padding::PageArea;
 use rayon::prelude::*;
 use std::ops::Range;
 
@@ -72,14 +75,6 @@ pub struct Bilinear {
     pub weights: [f32; 4],
 }
 
-/// An uncovered texel near a chart, and the sample that it repeats.
-#[derive(Clone, Copy, Debug, PartialEq)]
-pub struct Dilated {
-    pub x: u16,
-    pub y: u16,
-    pub sample: u32,
-}
-
 /// The texels of all charts of a layout.
 pub struct TexelMap {
     /// Ordered by placement, row, column.
@@ -111,6 +106,8 @@ struct Window {
 #[derive(Clone, Debug)]
 struct Group {
     page: u32,
+    /// Whether the placements are the caller's, whose rectangles have no padding inside.
+    given: bool,
     placements: Range<u32>,
     window: Window,
 }
@@ -213,14 +210,6 @@ impl TexelMap {
             weights[i] /= sum;
         }
         Bilinear { samples, weights }
-    }
-
-    /// The uncovered texels of a page within `padding` rows and columns of a covered one, each with
-    /// the nearest sample, for filters that read beyond the charts' borders.
-    /// Ordered by placement, row, column; given charts of a page count as one.
-    pub fn dilate(&self, page: u32, padding: u32) -> Vec<Dilated> {
-        let on_page: Vec<&Group> = self.groups.iter().filter(|g| g.page == page).collect();
-        on_page.into_par_iter().flat_map_iter(|g| dilate(g, self.entries(g), padding)).collect()
     }
 
     /// Bytes held.
@@ -366,7 +355,8 @@ fn groups(layout: &Layout) -> (Vec<Group>, Vec<Window>, usize) {
         let w = run.iter().map(|p| p.x + p.w).max().unwrap_or(0) - x;
         let h = run.iter().map(|p| p.y + p.h).max().unwrap_or(0) - y;
         let window = Window { x, y, w, h, start: start as u32 };
-        groups.push(Group { page: run[0].page, placements: first..first + run.len() as u32, window });
+        let (page, is_given) = (run[0].page, first < layout.given);
+        groups.push(Group { page, given: is_given, placements: first..first + run.len() as u32, window });
         start += w as usize * h as usize;
     }
     let windows = groups.iter().flat_map(|g| g.placements.clone().map(|_| g.window)).collect();
@@ -696,41 +686,6 @@ fn fraction_on_segment(a: DVec2, b: DVec2, p: DVec2) -> f64 {
 
 fn nearest_on_segment(a: DVec2, b: DVec2, p: DVec2) -> DVec2 {
     a + (b - a) * fraction_on_segment(a, b, p)
-}
-
-/// The uncovered texels of a group's window within `padding` of covered ones. Exact: first the
-/// nearest covered texel in each column, then the best of the columns around.
-fn dilate(group: &Group, entries: &[u32], padding: u32) -> Vec<Dilated> {
-    let (w, h) = (group.window.w as usize, group.window.h as usize);
-    let mut out = Vec::new();
-    // Row of the nearest covered texel of each column at or above the present row, and below it.
-    let mut above = vec![None; w];
-    let mut below = vec![None; w];
-    let reach = padding as usize;
-    for y in 0..h {
-        for x in 0..w {
-            if entries[y * w + x] != NONE {
-                above[x] = Some(y);
-            }
-            if below[x].is_none_or(|row| row < y) {
-                below[x] = (y..h.min(y + reach + 1)).find(|&row| entries[row * w + x] != NONE);
-            }
-        }
-        for x in (0..w).filter(|&x| entries[y * w + x] == NONE) {
-            let columns = x.saturating_sub(reach)..w.min(x + reach + 1);
-            let candidates = columns.flat_map(|column| [above[column], below[column]].map(|row| (column, row)));
-            let nearest = candidates
-                .filter_map(|(column, row)| Some((column, row?)))
-                .filter(|&(_, row)| row.abs_diff(y) <= reach)
-                .map(|(column, row)| (column.abs_diff(x).pow(2) + row.abs_diff(y).pow(2), entries[row * w + column]))
-                .min();
-            if let Some((_, sample)) = nearest {
-                let (x, y) = (group.window.x + x as u16, group.window.y + y as u16);
-                out.push(Dilated { x, y, sample });
-            }
-        }
-    }
-    out
 }
 
 #[cfg(test)]

@@ -477,8 +477,15 @@ fn own_rect(map: &BlockMap, placement: u32) -> Rect {
     Rect::of(&map.atlas.gather.layout.placements[placement as usize])
 }
 
-/// Where the light map shows a rectangle of a placement's gather texels.
+/// Where the light map shows a rectangle of a placement's gather texels, the padding that repeats it included.
 fn in_light_map(map: &BlockMap, placement: u32, rect: &Rect) -> Changed {
-    let rect = map.rect_in_light_map(placement, rect);
-    Changed { page: map.atlas.map.layout.placements[placement as usize].page, rect }
+    let layout = &map.atlas.map.layout;
+    let padding = map.atlas.padding as i32;
+    let place = &layout.placements[placement as usize];
+    // The padding of packed charts lies in their rectangles, that of given charts around them.
+    let shown = if placement < layout.given { Rect::of(place).grown(padding) } else { Rect::of(place) };
+    let size = layout.page_size as i32;
+    let page = Rect { x0: 0, y0: 0, x1: size, y1: size };
+    let rect = map.rect_in_light_map(placement, rect).grown(padding).clipped(&shown).clipped(&page);
+    Changed { page: place.page, rect }
 }

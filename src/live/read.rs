@@ -1,11 +1,10 @@
-//! Reading rectangles of the shown light: which placements of charts lie in a rectangle, and their composition with
-//! the padding around them.
+//! Reading rectangles of the shown light: which groups of charts lie in a rectangle, and their composition.
 
 use super::blocks::{BlockMap, Rect};
 use super::display::Display;
 use super::{Live, PageRect};
 use crate::error::{Result, invalid_argument};
-use crate::scene::NONE;
+use crate::lightmap::texels::PageArea;
 use rayon::prelude::*;
 
 /// Side of a bin in texels. (16 is no faster: time goes to the search of the nearest texel in the padding.)
@@ -17,7 +16,8 @@ const ROWS: usize = 16;
 /// Rectangles of fewer texels are composed by the calling thread: waking others takes longer.
 const SMALL: usize = 4096;
 
-/// Placements by where they lie: bins of 64 × 64 texels of the pages.
+/// Groups of charts (see [`TexelMap::group_count`](crate::lightmap::texels::TexelMap)) by where they lie: bins of
+/// 64 × 64 texels of the pages.
 pub(super) struct ChartBins {
     /// Bins along a side of a page.
     side: i32,
@@ -26,31 +26,31 @@ pub(super) struct ChartBins {
 
 impl ChartBins {
     pub fn new(map: &BlockMap) -> ChartBins {
-        let layout = &map.atlas.map.layout;
-        let side = (layout.page_size as i32 + BIN - 1) / BIN;
-        let pages = map.atlas.info.page_count as i32;
+        let atlas = &map.atlas;
+        let side = (atlas.map.layout.page_size as i32 + BIN - 1) / BIN;
+        let pages = atlas.info.page_count as i32;
         let mut bins = ChartBins { side, bins: vec![Vec::new(); (side * side * pages) as usize] };
-        for placement in 0..layout.placements.len() as u32 {
-            let (page, rect) = padded(map, placement);
-            for i in bins.overlapping(page, &rect) {
-                bins.bins[i].push(placement);
+        for group in 0..atlas.map.texels.group_count() {
+            let (page, area) = atlas.map.texels.group_area(group, atlas.padding);
+            for i in bins.overlapping(page, &area) {
+                bins.bins[i].push(group as u32);
             }
         }
         bins
     }
 
-    fn overlapping(&self, page: u32, rect: &Rect) -> impl Iterator<Item = usize> + use<> {
+    fn overlapping(&self, page: u32, area: &PageArea) -> impl Iterator<Item = usize> + use<> {
         let side = self.side;
         let clamp = |v: i32| v.clamp(0, side - 1);
-        let columns = clamp(rect.x0 / BIN)..clamp((rect.x1 - 1) / BIN) + 1;
-        let rows = clamp(rect.y0 / BIN)..clamp((rect.y1 - 1) / BIN) + 1;
+        let columns = clamp(area.columns.start / BIN)..clamp((area.columns.end - 1) / BIN) + 1;
+        let rows = clamp(area.rows.start / BIN)..clamp((area.rows.end - 1) / BIN) + 1;
         rows.flat_map(move |j| columns.clone().map(move |i| (i, j)))
             .map(move |(i, j)| ((page as i32 * side + j) * side + i) as usize)
     }
 
-    /// Placements that a rectangle of a page may show, with their padding, in order.
-    fn placements(&self, page: u32, rect: &Rect) -> Vec<u32> {
-        let mut all: Vec<u32> = self.overlapping(page, rect).flat_map(|i| self.bins[i].iter().copied()).collect();
+    /// Groups that a rectangle of a page may show, with their padding, in order.
+    fn groups(&self, page: u32, area: &PageArea) -> Vec<u32> {
+        let mut all: Vec<u32> = self.overlapping(page, area).flat_map(|i| self.bins[i].iter().copied()).collect();
         all.sort_unstable();
         all.dedup();
         all
@@ -59,18 +59,6 @@ impl ChartBins {
     pub fn bytes(&self) -> usize {
         self.bins.iter().map(|b| size_of::<Vec<u32>>() + b.capacity() * 4).sum()
     }
-}
-
-/// A placement's page and rectangle.
-fn placed(map: &BlockMap, placement: u32) -> (u32, Rect) {
-    let p = &map.atlas.map.layout.placements[placement as usize];
-    (p.page, Rect::of(p))
-}
-
-/// A placement's page and rectangle, with padding. (That of given charts lies outside their own.)
-fn padded(map: &BlockMap, placement: u32) -> (u32, Rect) {
-    let (page, rect) = placed(map, placement);
-    (page, if placement < map.atlas.map.layout.given { rect.grown(map.atlas.padding as i32) } else { rect })
 }
 
 impl Live {
@@ -112,45 +100,9 @@ impl Live {
     fn compose(&self, display: &Display, page: u32, rows: &Rect, with_direct: bool, out: &mut [[f32; 3]]) {
         let (map, light) = (&self.context.map, &*self.context.light);
         let atlas = &map.atlas;
-        let padding = atlas.padding as i32;
-        let mut is_own = vec![false; out.len()];
-        // Each sample is looked up and its light put together once, though up to a dozen texels of the
-        // padding repeat it.
-        let (mut samples, mut values) = (Vec::new(), Vec::new());
-        for placement in self.bins.placements(page, rows) {
-            let shown = padded(map, placement).1.clipped(rows);
-            let from = placed(map, placement).1.clipped(&shown.grown(padding));
-            samples.clear();
-            samples.extend(from.texels().map(|(x, y)| {
-                let s = atlas.map.at(placement, x, y);
-                let is_own = s != NONE && atlas.map.placement_of(&atlas.charts, s as usize) == placement;
-                if is_own { s } else { NONE }
-            }));
-            values.clear();
-            values.resize(samples.len(), None);
-            let index = |x: i32, y: i32| (y - from.y0) as usize * from.width() + (x - from.x0) as usize;
-            for (x, y) in shown.texels() {
-                let at = (y - rows.y0) as usize * rows.width() + (x - rows.x0) as usize;
-                if is_own[at] {
-                    continue;
-                }
-                // Around the chart: the nearest texel within the padding.
-                let here = Rect { x0: x, y0: y, x1: x + 1, y1: y + 1 };
-                let own = here.clipped(&from).texels().map(|(i, j)| index(i, j)).find(|&i| samples[i] != NONE);
-                is_own[at] = own.is_some();
-                let nearest = own.or_else(|| {
-                    let around = here.grown(padding).clipped(&from);
-                    let distance = |(i, j): (i32, i32)| ((i - x).pow(2) + (j - y).pow(2), samples[index(i, j)]);
-                    let near =
-                        around.texels().filter(|&(i, j)| samples[index(i, j)] != NONE).min_by_key(|&t| distance(t));
-                    near.map(|(i, j)| index(i, j))
-                });
-                if let Some(i) = nearest {
-                    let value =
-                        values[i].get_or_insert_with(|| display.irradiance(map, light, samples[i], with_direct));
-                    out[at] = value.to_array();
-                }
-            }
-        }
+        let area = PageArea { columns: rows.x0..rows.x1, rows: rows.y0..rows.y1 };
+        let groups = self.bins.groups(page, &area).into_iter().map(|g| g as usize);
+        let value = |sample: u32| display.irradiance(map, light, sample, with_direct).to_array();
+        atlas.map.texels.compose(groups, &area, atlas.padding, out, value, |v| v);
     }
 }

@@ -145,32 +145,70 @@ proptest! {
     }
 
     #[test]
-    fn dilation_finds_the_nearest_covered_texel(seed in any::<u64>(), padding in 1u32..5) {
+    fn the_padding_shows_the_nearest_covered_texel(
+        seed in any::<u64>(), padding in 1u32..5, x0 in 0i32..64, y0 in 0i32..64, w in 1i32..64, h in 1i32..64
+    ) {
         let (scene, charts) = crumpled(seed);
-        let layout = Layout::pack(&charts, 2.0, 64, 3, false, &[]).unwrap();
+        let layout = Layout::pack(&charts, 2.0, 64, 4, false, &[]).unwrap();
         let map = map_of(&scene, &charts, &layout);
-        let dilated: Vec<_> = (0..layout.page_count).flat_map(|page| map.dilate(page, padding).into_iter().map(move |d| (page, d))).collect();
-        let mut expected = 0;
-        for (n, p) in layout.placements.iter().enumerate() {
-            for y in p.y as u32..(p.y + p.h) as u32 {
-                for x in p.x as u32..(p.x + p.w) as u32 {
-                    if map.texel_index(n as u32, x, y) != NONE {
-                        continue;
-                    }
-                    let offset = |s: u32| {
-                        let t = map.samples[s as usize];
-                        (x.abs_diff(t.x as u32), y.abs_diff(t.y as u32))
-                    };
-                    let near = map.samples_of(n as u32).filter(|&s| offset(s).0.max(offset(s).1) <= padding);
-                    let Some(best) = near.min_by_key(|&s| (offset(s).0.pow(2) + offset(s).1.pow(2), s)) else { continue };
-                    expected += 1;
-                    let found = Dilated { x: x as u16, y: y as u16, sample: best };
-                    prop_assert!(dilated.contains(&(p.page, found)), "{found:?} is missing");
-                }
-            }
+        let area = PageArea { columns: x0..(x0 + w).min(64), rows: y0..(y0 + h).min(64) };
+        for page in 0..layout.page_count {
+            prop_assert_eq!(shown(&map, page, &area, padding), expected(&map, &layout, page, &area, padding));
         }
-        prop_assert_eq!(dilated.len(), expected);
     }
+
+    #[test]
+    fn the_padding_of_given_charts_reaches_beyond_their_rectangles(
+        corner in prop::array::uniform2(0.0f32..0.8), size in prop::array::uniform2(0.02f32..0.5), padding in 1u32..5,
+        x0 in 0i32..32, y0 in 0i32..32, w in 1i32..32, h in 1i32..32
+    ) {
+        let (scene, mut charts) = unit_quad();
+        // Two charts, apart or one over the other.
+        charts.charts = vec![
+            Chart { triangles: 0..1, given: given(corner, size), ..charts.charts[0].clone() },
+            Chart { triangles: 1..2, given: given([0.4, 0.3], [0.3, 0.5]), ..charts.charts[0].clone() },
+        ];
+        charts.chart_of = vec![0, 1];
+        let layout = Layout::pack(&charts, 1.0, 32, 2, true, &[]).unwrap();
+        let map = map_of(&scene, &charts, &layout);
+        let area = PageArea { columns: x0..(x0 + w).min(32), rows: y0..(y0 + h).min(32) };
+        let found = shown(&map, 0, &area, padding);
+        prop_assert_eq!(&found, &expected(&map, &layout, 0, &area, padding));
+        let all = shown(&map, 0, &PageArea::page(32), padding);
+        prop_assert!(all.iter().any(|&s| s != NONE));
+    }
+}
+
+fn given(offset: [f32; 2], scale: [f32; 2]) -> Option<Given> {
+    Some(Given { page: 0, offset, scale })
+}
+
+/// The sample that each texel of a rectangle shows, as composed.
+fn shown(map: &TexelMap, page: u32, area: &PageArea, padding: u32) -> Vec<u32> {
+    let mut out = vec![NONE; area.columns.len() * area.rows.len()];
+    map.compose(map.groups_of_page(page), area, padding, &mut out, |s| s, |s| s);
+    out
+}
+
+/// The same by comparing all samples of the page.
+fn expected(map: &TexelMap, layout: &Layout, page: u32, area: &PageArea, padding: u32) -> Vec<u32> {
+    let mut out = Vec::new();
+    for (y, x) in area.rows.clone().flat_map(|y| area.columns.clone().map(move |x| (y, x))) {
+        let offset = |s: u32| {
+            let t = map.samples[s as usize];
+            (x.abs_diff(t.x as i32), y.abs_diff(t.y as i32))
+        };
+        let owns = |n: usize| {
+            let p = &layout.placements[n];
+            let inside = (p.x as i32..(p.x + p.w) as i32).contains(&x) && (p.y as i32..(p.y + p.h) as i32).contains(&y);
+            p.page == page && (inside || n < layout.given as usize)
+        };
+        let samples = (0..layout.placements.len()).filter(|&n| owns(n)).flat_map(|n| map.samples_of(n as u32));
+        let near = samples.filter(|&s| offset(s).0.max(offset(s).1) <= padding);
+        let best = near.min_by_key(|&s| (offset(s).0.pow(2) + offset(s).1.pow(2), s));
+        out.push(best.unwrap_or(NONE));
+    }
+    out
 }
 
 /// A small crumpled sheet, whose triangles the unwrapper spreads over several charts.
@@ -283,7 +321,7 @@ fn a_map_without_charts_is_empty() {
     let layout = Layout::pack(&Charts::default(), 1.0, 16, 2, true, &[]).unwrap();
     let map = map_of(&scene, &Charts::default(), &layout);
     assert_eq!((map.samples.len(), layout.page_count), (0, 0));
-    assert!(map.dilate(0, 2).is_empty());
+    assert_eq!(map.group_count(), 0);
 }
 
 #[test]

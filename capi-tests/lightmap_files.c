@@ -1,0 +1,190 @@
+/* What comes out of a light map: padding around the caller's own charts, the validity layer, results and checkpoints
+ * on disk. C99. */
+#include "check.h"
+#include <math.h>
+#include <stdlib.h>
+
+enum { PAGE = 128 };
+
+static const uint32_t LIGHT_LAYERS[4] = {BK_LAYER_COMBINED, BK_LAYER_INDIRECT, BK_LAYER_DIRECT, BK_LAYER_RADIANCE};
+
+typedef struct {
+    float position[3], uv[2];
+} vertex;
+
+/* A room of 4 x 3 x 5 whose six faces have light map coordinates of their own, in two rows of three cells. */
+static const float GAP = 0.02f;
+
+static bk_scene *room(bk_device *device, float grey) {
+    static const int FACES[6][4] = {{0, 4, 5, 1}, {2, 3, 7, 6}, {0, 1, 3, 2}, {4, 6, 7, 5}, {0, 2, 6, 4}, {1, 5, 7, 3}};
+    static const int QUAD[6] = {0, 1, 2, 0, 2, 3};
+    vertex vertices[24];
+    uint32_t indices[36], id;
+    bk_material_desc material;
+    bk_mesh_desc mesh;
+    bk_light_desc light;
+    bk_scene *scene = NULL;
+    int face, i;
+
+    for (face = 0; face < 6; face++) {
+        float u = (float)(face % 3) / 3.0f, v = (float)(face / 3) / 2.0f;
+        for (i = 0; i < 4; i++) {
+            vertex *at = &vertices[4 * face + i];
+            int corner = FACES[face][i];
+            at->position[0] = (float)(corner & 1) * 4.0f;
+            at->position[1] = (float)(corner >> 1 & 1) * 3.0f;
+            at->position[2] = (float)(corner >> 2) * 5.0f;
+            at->uv[0] = i == 1 || i == 2 ? u + 1.0f / 3.0f - GAP : u + GAP;
+            at->uv[1] = i >= 2 ? v + 0.5f - GAP : v + GAP;
+        }
+        for (i = 0; i < 6; i++) indices[6 * face + i] = (uint32_t)(4 * face + QUAD[i]);
+    }
+    CHECK_OK(bk_scene_create(device, &scene));
+    bk_material_desc_init(&material);
+    material.albedo[0] = material.albedo[1] = material.albedo[2] = grey;
+    CHECK_OK(bk_scene_add_material(scene, &material, &id));
+    bk_mesh_desc_init(&mesh);
+    mesh.positions = vertices[0].position;
+    mesh.position_stride = sizeof(vertex);
+    mesh.vertex_count = 24;
+    mesh.indices = indices;
+    mesh.triangle_count = 12;
+    mesh.lightmap_uvs = vertices[0].uv;
+    mesh.lightmap_uv_stride = sizeof(vertex);
+    mesh.material = id;
+    CHECK_OK(bk_scene_add_mesh(scene, &mesh, &id));
+    bk_light_desc_init(&light);
+    light.type = BK_LIGHT_RECT;
+    light.position[0] = 1.5f;
+    light.position[1] = 2.99f;
+    light.position[2] = 2.0f;
+    light.edge_u[0] = light.edge_v[2] = 1.0f;
+    light.edge_u[1] = light.edge_u[2] = light.edge_v[0] = light.edge_v[1] = 0.0f;
+    light.color[0] = light.color[1] = light.color[2] = 10.0f;
+    CHECK_OK(bk_scene_add_light(scene, &light, &id));
+    CHECK_OK(bk_scene_commit(scene, NULL, NULL));
+    return scene;
+}
+
+static bk_lightmap *lightmap_of(const bk_scene *scene, uint32_t padding) {
+    bk_lightmap_desc desc;
+    bk_lightmap *lightmap = NULL;
+    bk_lightmap_desc_init(&desc);
+    desc.page_size = PAGE;
+    desc.padding = padding;
+    CHECK_OK(bk_lightmap_create(scene, &desc, NULL, NULL, &lightmap));
+    return lightmap;
+}
+
+/* A bake in a moment that runs every stage. */
+static bk_bake_params quick(void) {
+    bk_bake_params params;
+    bk_bake_params_init(&params);
+    params.photon_count = 20000;
+    params.direct_samples = 4;
+    return params;
+}
+
+static float *read_rgb(const bk_lightmap *lightmap, uint32_t layer) {
+    float *pixels = (float *)malloc(sizeof(float) * 3 * PAGE * PAGE);
+    CHECK_OK(bk_lightmap_read(lightmap, 0, layer, BK_FORMAT_RGB32F, pixels, 0));
+    return pixels;
+}
+
+static float *read_validity(const bk_lightmap *lightmap) {
+    float *validity = (float *)malloc(sizeof(float) * PAGE * PAGE);
+    CHECK_OK(bk_lightmap_read(lightmap, 0, BK_LAYER_VALIDITY, BK_FORMAT_R32F, validity, 0));
+    return validity;
+}
+
+/* What a shader sees at (u, v). */
+static double bilinear(const float *pixels, double u, double v) {
+    double x = u * PAGE - 0.5, y = v * PAGE - 0.5;
+    int x0 = (int)floor(x), y0 = (int)floor(y);
+    double fx = x - x0, fy = y - y0;
+    const float *a = pixels + 3 * (y0 * PAGE + x0), *b = a + 3 * PAGE;
+    return (a[0] * (1.0 - fx) + a[3] * fx) * (1.0 - fy) + (b[0] * (1.0 - fx) + b[3] * fx) * fy;
+}
+
+/* The floor lies at the page's corner: two of its edges look outwards, two at other charts. The light stands in its
+ * middle, so that opposite edges are lit alike. */
+static void edges_of_given_charts_are_not_dark(bk_device *device) {
+    bk_scene *scene = room(device, 0.75f);
+    bk_lightmap *lightmap = lightmap_of(scene, 2);
+    bk_bake_params params = quick();
+    double least = 1.0;
+    int layer, i;
+
+    CHECK_OK(bk_bake(lightmap, &params, NULL, NULL, NULL));
+    for (layer = 0; layer < 4; layer++) {
+        float *pixels = read_rgb(lightmap, LIGHT_LAYERS[layer]);
+        for (i = 0; i < 20; i++) {
+            double along = (i + 0.5) / 20.0, width = 1.0 / 3.0 - 2.0 * GAP, height = 0.5 - 2.0 * GAP;
+            /* A texel inside, at least, is a chart's own light. */
+            double texel = 1.5 / PAGE, u = GAP + along * width, v = GAP + along * height;
+            double u0 = GAP, u1 = GAP + width, v0 = GAP, v1 = GAP + height;
+            if (along < 0.1 || along > 0.9) continue;
+            least = fmin(least, bilinear(pixels, u0, v) / bilinear(pixels, u0 + texel, v));
+            least = fmin(least, bilinear(pixels, u1, v) / bilinear(pixels, u1 - texel, v));
+            least = fmin(least, bilinear(pixels, u, v0) / bilinear(pixels, u, v0 + texel));
+            least = fmin(least, bilinear(pixels, u, v1) / bilinear(pixels, u, v1 - texel));
+        }
+        free(pixels);
+    }
+    printf("least light at an edge by that a texel and a half inside: %.3f\n", least);
+    CHECK(least > 0.85);
+    bk_lightmap_release(lightmap);
+    bk_scene_release(scene);
+}
+
+/* 1 for covered, 0.5 for padding, 0 elsewhere; before a bake too. */
+static void validity_tells_covered_filled_and_empty(bk_device *device) {
+    bk_scene *scene = room(device, 0.75f);
+    bk_lightmap *lightmap = lightmap_of(scene, 3);
+    bk_bake_params params = quick();
+    float *light = (float *)malloc(sizeof(float) * 3 * PAGE * PAGE), *before, *after, *positions, *normals;
+    uint32_t *triangles = (uint32_t *)malloc(sizeof(uint32_t) * PAGE * PAGE);
+    uint64_t wrong = 0, count[3] = {0, 0, 0};
+    int i, layer;
+
+    for (layer = 0; layer < 4; layer++) {
+        CHECK_ERROR(bk_lightmap_read(lightmap, 0, LIGHT_LAYERS[layer], BK_FORMAT_RGB32F, light, 0),
+                    BK_ERROR_INVALID_STATE, "baked");
+    }
+    before = read_validity(lightmap);
+    positions = read_rgb(lightmap, BK_LAYER_POSITION);
+    normals = read_rgb(lightmap, BK_LAYER_NORMAL);
+    CHECK_OK(bk_lightmap_read(lightmap, 0, BK_LAYER_TRIANGLE, BK_FORMAT_R32U, triangles, 0));
+    CHECK_OK(bk_bake(lightmap, &params, NULL, NULL, NULL));
+    CHECK_OK(bk_lightmap_read(lightmap, 0, BK_LAYER_COMBINED, BK_FORMAT_RGB32F, light, 0));
+    after = read_validity(lightmap);
+    for (i = 0; i < PAGE * PAGE; i++) {
+        const float *n = normals + 3 * i;
+        float length = n[0] * n[0] + n[1] * n[1] + n[2] * n[2];
+        int covered = triangles[i] != BK_NONE;
+        wrong += before[i] != after[i] || (after[i] == 1.0f) != covered || (after[i] > 0.0f) != (light[3 * i] > 0.0f);
+        wrong += fabsf(length - (covered ? 1.0f : 0.0f)) > 1e-5f;
+        wrong += !covered && (positions[3 * i] != 0.0f || positions[3 * i + 1] != 0.0f);
+        count[(int)(2.0f * after[i])]++;
+    }
+    printf("%u texels empty, %u filled, %u covered\n", (unsigned)count[0], (unsigned)count[1], (unsigned)count[2]);
+    CHECK(wrong == 0);
+    CHECK(count[0] > 0 && count[1] > 1000 && count[2] > 0);
+    free(light);
+    free(before);
+    free(after);
+    free(positions);
+    free(normals);
+    free(triangles);
+    bk_lightmap_release(lightmap);
+    bk_scene_release(scene);
+}
+
+int main(void) {
+    bk_device *device = NULL;
+    CHECK_OK(bk_device_create(NULL, &device));
+    edges_of_given_charts_are_not_dark(device);
+    validity_tells_covered_filled_and_empty(device);
+    bk_device_release(device);
+    return check_report("lightmap_files");
+}
