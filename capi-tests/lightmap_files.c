@@ -180,11 +180,125 @@ static void validity_tells_covered_filled_and_empty(bk_device *device) {
     bk_scene_release(scene);
 }
 
-int main(void) {
+/* All layers of light and validity have the same bits. */
+static int same_light(const bk_lightmap *a, const bk_lightmap *b) {
+    int same = 1, layer;
+    for (layer = 0; layer < 4; layer++) {
+        float *x = read_rgb(a, LIGHT_LAYERS[layer]), *y = read_rgb(b, LIGHT_LAYERS[layer]);
+        same &= memcmp(x, y, sizeof(float) * 3 * PAGE * PAGE) == 0;
+        free(x);
+        free(y);
+    }
+    {
+        float *x = read_validity(a), *y = read_validity(b);
+        same &= memcmp(x, y, sizeof(float) * PAGE * PAGE) == 0;
+        free(x);
+        free(y);
+    }
+    return same;
+}
+
+static int32_t cancel(void *user, float fraction, const char *stage) {
+    (void)user;
+    (void)fraction;
+    (void)stage;
+    return 0;
+}
+
+static void shards_come_back_as_one_bake(bk_device *device, const char *folder) {
+    bk_scene *scene = room(device, 0.75f), *darker = room(device, 0.5f);
+    bk_lightmap *whole = lightmap_of(scene, 2), *shard = lightmap_of(scene, 2), *all = lightmap_of(scene, 2);
+    bk_lightmap *other = lightmap_of(darker, 2);
+    bk_bake_params params = quick();
+    struct bk_lightmap_info info;
+    char path[2][1024];
+    FILE *file;
+    int i;
+
+    CHECK_ERROR(bk_lightmap_save_result(all, "x", NULL, NULL), BK_ERROR_INVALID_STATE, "baked");
+    CHECK_OK(bk_bake(whole, &params, NULL, NULL, NULL));
+    bk_lightmap_info_init(&info);
+    CHECK_OK(bk_lightmap_info(whole, &info));
+    for (i = 0; i < 2; i++) {
+        snprintf(path[i], sizeof path[i], "%sshard%d", folder, i);
+        params.texel_begin = i == 0 ? 0 : info.texels / 3;
+        params.texel_end = i == 0 ? info.texels / 3 : info.texels;
+        bk_lightmap_release(shard);
+        shard = lightmap_of(scene, 2);
+        CHECK_OK(bk_bake(shard, &params, NULL, NULL, NULL));
+        CHECK_OK(bk_lightmap_save_result(shard, path[i], NULL, NULL));
+    }
+    CHECK_OK(bk_lightmap_load_result(all, path[1], NULL, NULL));
+    CHECK(!same_light(whole, all));
+    CHECK_OK(bk_lightmap_load_result(all, path[0], NULL, NULL));
+    CHECK(same_light(whole, all));
+
+    CHECK_ERROR(bk_lightmap_load_result(NULL, path[0], NULL, NULL), BK_ERROR_INVALID_ARGUMENT, "lightmap is NULL");
+    CHECK_ERROR(bk_lightmap_load_result(all, NULL, NULL, NULL), BK_ERROR_INVALID_ARGUMENT, "path is NULL");
+    CHECK_ERROR(bk_lightmap_save_result(all, NULL, NULL, NULL), BK_ERROR_INVALID_ARGUMENT, "path is NULL");
+    CHECK_ERROR(bk_lightmap_load_result(all, "/no/such/file", NULL, NULL), BK_ERROR_IO, "/no/such/file");
+    CHECK_ERROR(bk_lightmap_load_result(all, path[0], cancel, NULL), BK_ERROR_CANCELLED, "");
+    CHECK_ERROR(bk_lightmap_load_result(other, path[0], NULL, NULL), BK_ERROR_INVALID_ARGUMENT, "the scene's materials");
+    file = fopen(path[0], "r+b");
+    CHECK(file != NULL && fseek(file, 5000, SEEK_SET) == 0 && fputs("damage", file) >= 0);
+    if (file) fclose(file);
+    CHECK_ERROR(bk_lightmap_load_result(all, path[0], NULL, NULL), BK_ERROR_IO, "is damaged");
+    CHECK(same_light(whole, all));
+    bk_lightmap_release(whole);
+    bk_lightmap_release(shard);
+    bk_lightmap_release(all);
+    bk_lightmap_release(other);
+    bk_scene_release(scene);
+    bk_scene_release(darker);
+}
+
+static int32_t cancel_late(void *user, float fraction, const char *stage) {
+    (void)user;
+    (void)stage;
+    return fraction < 0.5f;
+}
+
+/* Killed processes: kill_resume.c. */
+static void a_cancelled_bake_goes_on_from_its_checkpoint(bk_device *device, const char *folder) {
+    bk_scene *scene = room(device, 0.75f);
+    bk_lightmap *whole = lightmap_of(scene, 2), *again = lightmap_of(scene, 2);
+    bk_bake_params params = quick();
+    bk_bake_stats stats;
+    char path[1024];
+
+    snprintf(path, sizeof path, "%scheckpoint", folder);
+    remove(path);
+    CHECK_OK(bk_bake(whole, &params, NULL, NULL, NULL));
+    params.checkpoint = path;
+    CHECK_ERROR(bk_bake(again, &params, cancel_late, NULL, NULL), BK_ERROR_CANCELLED, "");
+    params.seed = 1;
+    CHECK_ERROR(bk_bake(again, &params, NULL, NULL, NULL), BK_ERROR_INVALID_ARGUMENT, "seed (0, here 1)");
+    params.seed = 0;
+    params.checkpoint_seconds = -1.0f;
+    CHECK_ERROR(bk_bake(again, &params, NULL, NULL, NULL), BK_ERROR_INVALID_ARGUMENT, "checkpoint_seconds is -1");
+    params.checkpoint_seconds = 0.0f;
+    bk_bake_stats_init(&stats);
+    CHECK_OK(bk_bake(again, &params, NULL, NULL, &stats));
+    CHECK(stats.photons.rays == 0);
+    CHECK(same_light(whole, again));
+    params.checkpoint = folder;
+    CHECK_ERROR(bk_bake(again, &params, NULL, NULL, NULL), BK_ERROR_IO, folder);
+    bk_lightmap_release(whole);
+    bk_lightmap_release(again);
+    bk_scene_release(scene);
+}
+
+int main(int argc, char **argv) {
     bk_device *device = NULL;
+    if (argc != 2) {
+        fprintf(stderr, "usage: lightmap_files FOLDER/\n");
+        return 2;
+    }
     CHECK_OK(bk_device_create(NULL, &device));
     edges_of_given_charts_are_not_dark(device);
     validity_tells_covered_filled_and_empty(device);
+    shards_come_back_as_one_bake(device, argv[1]);
+    a_cancelled_bake_goes_on_from_its_checkpoint(device, argv[1]);
     bk_device_release(device);
     return check_report("lightmap_files");
 }

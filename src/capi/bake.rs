@@ -3,13 +3,13 @@
 //! A bake fills a light map with light: photons, radiance map, gather map (indirect light), direct
 //! light, composition, stitching of seams. What the scene does not need is not run.
 
-use super::args::{OutStruct, SizedStruct, init, read_struct, sized_struct, slice_mut};
+use super::args::{OutStruct, SizedStruct, init, read_struct, sized_struct, slice_mut, text};
 use super::device::{bk_progress_fn, progress, refuse_in_callback};
 use super::error::{bk_result, call, call_or};
 use super::handles::{hold, object};
 use super::lightmap::bk_lightmap;
 use crate::lightmap::plan::left_out;
-use crate::lightmap::{BakeParams, BakeStats, StageStats};
+use crate::lightmap::{BakeParams, BakeStats, CheckpointParams, StageStats};
 use std::ffi::{c_char, c_void};
 
 /// Bit of left_out. No indirect light: no photons, radiance map and gather map.
@@ -110,6 +110,19 @@ pub struct bk_bake_params {
     /// shows and no others. Done when all texels are baked. 0: no, any other value: yes. Live updates
     /// do not stitch: their finished texels have the bits of a bake with 0. Default: 1.
     pub stitch: u32,
+    /// Seconds between two writes of the checkpoint, 0 to 1e9. A process that is killed loses at most the
+    /// work of so long; 0: of the blocks of texels under way. Default: 10.
+    pub checkpoint_seconds: f32,
+    /// Name of a file, UTF-8, in which the bake keeps what it has done; NULL, the default: none. A bake with the
+    /// same scene, lights, light map and parameters that finds the file goes on from it, whatever ended
+    /// the one before (a cancel, an error, a kill), and gives the bits of a bake without a break, on any
+    /// number of threads. The file is created if it is not there. It stays when the bake is complete:
+    /// delete it when the light has been saved. bk_bake fails with BK_ERROR_INVALID_ARGUMENT if the file is of
+    /// another bake (bk_last_error says in what it differs), with BK_ERROR_IO if it is damaged, is not a checkpoint or
+    /// cannot be read or created, with BK_ERROR_INVALID_STATE if another bake is using it, and leaves it as it is. If it
+    /// cannot be written later, as on a full disk, the bake goes on, logs a warning, and what the file
+    /// holds stays whole.
+    pub checkpoint: *const c_char,
 }
 
 sized_struct!(bk_bake_params, last: texel_end: u64, defaults: {
@@ -127,6 +140,8 @@ sized_struct!(bk_bake_params, last: texel_end: u64, defaults: {
         texel_begin: p.texel_begin,
         texel_end: p.texel_end,
         stitch: p.stitch as u32,
+        checkpoint_seconds: CheckpointParams::new("").seconds as f32,
+        checkpoint: std::ptr::null(),
     }
 });
 
@@ -226,6 +241,10 @@ pub unsafe extern "C" fn bk_bake_stats_init(stats: *mut bk_bake_stats) {
 /// params: NULL for the defaults. progress, user: told how far it is; NULL if not wanted. out: what
 /// was done; NULL if not wanted.
 ///
+/// The same scene, lights, light map, parameters and seed give the same bits on any number of threads, in one
+/// bake or in several of some texels each, and on AVX2 as on AVX-512; portable kernels, which round products and sums
+/// apart, give others.
+///
 /// All light is finite and >= 0: irradiance is cut off at 1e30 W/m2 per light.
 ///
 /// Fails with BK_ERROR_INVALID_ARGUMENT if a field of params is out of its range,
@@ -259,7 +278,15 @@ pub unsafe extern "C" fn bk_bake(
             texel_end: p.texel_end,
             stitch: p.stitch != 0,
         };
-        let done = lightmap.change(|l| l.bake(&params, &self::progress(progress, user)))?;
+        let checkpoint = match p.checkpoint.is_null() {
+            true => None,
+            false => Some(CheckpointParams {
+                path: text(p.checkpoint, "checkpoint")?.into(),
+                seconds: p.checkpoint_seconds.into(),
+            }),
+        };
+        let progress = self::progress(progress, user);
+        let done = lightmap.change(|l| l.bake_with(&params, checkpoint.as_ref(), &progress))?;
         if let Some(out) = out {
             out.write(stats(&done));
         }

@@ -140,7 +140,11 @@ pub unsafe extern "C" fn bk_device_release(device: *mut bk_device) {
     })
 }
 
-/// The instruction set in use: a BK_ISA value other than BK_ISA_AUTO; BK_ISA_AUTO if device is NULL.
+/// Returns the instruction set in use: a BK_ISA value other than BK_ISA_AUTO; BK_ISA_AUTO if device is NULL.
+///
+/// BK_ISA_AVX2 and BK_ISA_AVX512 give the same bits of hits and light. BK_ISA_PORTABLE rounds products and
+/// sums apart where the others fuse them, so its bits differ: results and checkpoints of bakes are not exchanged
+/// between it and the others.
 #[unsafe(no_mangle)]
 pub unsafe extern "C" fn bk_device_isa(device: *const bk_device) -> u32 {
     call_or(BK_ISA_AUTO, || Ok(object!(device).device.isa() as u32))

@@ -1,7 +1,7 @@
 //! Reading and saving light maps
 
 use super::args::text;
-use super::device::refuse_in_callback;
+use super::device::{bk_progress_fn, progress, refuse_in_callback};
 use super::error::{bk_result, call};
 use super::handles::{is_null, object};
 use super::lightmap::bk_lightmap;
@@ -227,6 +227,60 @@ fn save(lightmap: &Lightmap, prefix: &str, file_format: u32) -> Result<()> {
 #[cfg(not(feature = "io"))]
 fn save(_: &Lightmap, prefix: &str, _: u32) -> Result<()> {
     Err(Error::Unsupported(format!("the library was built without files and cannot write {prefix}")))
+}
+
+/// Writes the light of all texels that have been baked so far to a file, from which bk_lightmap_load_result brings
+/// it back, in another process or on another machine.
+///
+/// path: UTF-8; the file is replaced as a whole or not at all. progress, user: the progress callback and its
+/// pointer; progress may be NULL.
+///
+/// Fails with BK_ERROR_INVALID_STATE before a bake, during one, or if bakes that differ in parameters or lights filled
+/// the texels; with BK_ERROR_IO, naming the file, if it cannot be written; with BK_ERROR_CANCELLED if
+/// progress says so.
+#[unsafe(no_mangle)]
+pub unsafe extern "C" fn bk_lightmap_save_result(
+    lightmap: *const bk_lightmap,
+    path: *const c_char,
+    progress: bk_progress_fn,
+    user: *mut c_void,
+) -> bk_result {
+    call(|| {
+        refuse_in_callback()?;
+        let lightmap = object!(lightmap);
+        // SAFETY: path is the caller's, or NULL.
+        let path = unsafe { text(path, "path") }?;
+        lightmap.read(|l| l.save_result(path.as_ref(), &self::progress(progress, user)))
+    })
+}
+
+/// Takes over the light of a file that bk_lightmap_save_result wrote for a light map of the same scene, lights and
+/// layout. Light of texels that the file does not have stays: so machines can bake some texels each (texel_begin
+/// and texel_end of bk_bake_params, all else equal) and one of them loads all files, in any order; the light then
+/// has the bits of one bake, and seams are stitched with the last texels.
+///
+/// path: UTF-8. progress, user: the progress callback and its pointer; progress may be NULL.
+///
+/// Fails with BK_ERROR_INVALID_ARGUMENT if the file is of another scene, light map or version of the library, of other
+/// lights, or of another instruction set (AVX2 and AVX-512 are the same in this), and bk_last_error says which;
+/// with BK_ERROR_INVALID_STATE if the file has some texels alone and the light map holds light of a bake with other
+/// parameters, or another call is using the light map; with BK_ERROR_IO, naming the file, if it cannot be read, is
+/// damaged, or is no result; with BK_ERROR_OUT_OF_MEMORY if it does not fit; with BK_ERROR_CANCELLED if progress says
+/// so. A call that fails changes nothing.
+#[unsafe(no_mangle)]
+pub unsafe extern "C" fn bk_lightmap_load_result(
+    lightmap: *mut bk_lightmap,
+    path: *const c_char,
+    progress: bk_progress_fn,
+    user: *mut c_void,
+) -> bk_result {
+    call(|| {
+        refuse_in_callback()?;
+        let lightmap = object!(lightmap);
+        // SAFETY: path is the caller's, or NULL.
+        let path = unsafe { text(path, "path") }?;
+        lightmap.change(|l| l.load_result(path.as_ref(), &self::progress(progress, user)))
+    })
 }
 
 #[cfg(test)]

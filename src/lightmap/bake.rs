@@ -8,11 +8,15 @@ use super::layout::Layout;
 use super::map::ChartMap;
 use super::plan::{Plan, left_out};
 use super::radiance::{self, Radiance, RadianceInput, RadianceMap};
+use super::saved::checkpoint::Checkpoint;
 use super::seams::Stitch;
 use super::sides;
 use super::texels::TexelMap;
 use super::upsample::{OWN_RAYS, OwnLight, OwnRays, Upsampling};
-use super::{Atlas, BakeParams, BakeStats, Light, Lightmap, LightmapDesc, LightmapInfo, StageStats, TexelState, blur};
+use super::{
+    Atlas, BakeParams, BakeStats, CheckpointParams, Light, Lightmap, LightmapDesc, LightmapInfo, Origin, StageStats,
+    TexelState, blur,
+};
 use crate::device::LogLevel;
 use crate::error::{Error, Result, invalid_argument};
 use crate::memory::try_vec;
@@ -125,7 +129,25 @@ impl Lightmap {
 
     /// Runs the pipeline. On an error or a cancel what an earlier bake left stays as it was.
     pub fn bake(&mut self, params: &BakeParams, progress: &Progress) -> Result<BakeStats> {
+        self.bake_with(params, None, progress)
+    }
+
+    /// Runs the pipeline and keeps what is done in a file, from which a later call with the same scene, lights, layout
+    /// and parameters goes on, whatever ended this one; the light has the bits of a bake without a break. The
+    /// statistics tell of what this call did.
+    ///
+    /// The file is created if it is not there (or empty), and stays when the bake is complete: the caller deletes it when
+    /// the light has been saved. `InvalidArgument` if it is of another bake, `Io` if it is damaged or cannot be read or
+    /// created, `InvalidState` if another bake is using it. If it cannot be written later, as on a full disk, the bake
+    /// goes on, a warning is logged, and what the file holds stays whole.
+    pub fn bake_with(
+        &mut self,
+        params: &BakeParams,
+        checkpoint: Option<&CheckpointParams>,
+        progress: &Progress,
+    ) -> Result<BakeStats> {
         params.validate()?;
+        checkpoint.map_or(Ok(()), CheckpointParams::validate)?;
         let total = self.atlas.map.len() as u64;
         if params.texel_begin > total || params.texel_end > total {
             return invalid_argument!(
@@ -135,6 +157,7 @@ impl Lightmap {
             );
         }
         let end = if params.texel_end == 0 { total } else { params.texel_end };
+        let origin = Origin::new(params, &self.atlas.scene.lights());
         let direct = DirectLight::new(&self.atlas.scene);
         let two_sided = !self.atlas.radiance.layout.back_of.is_empty();
         let mut plan =
@@ -145,11 +168,18 @@ impl Lightmap {
         let range = params.texel_begin as usize..end as usize;
         let (light, mut stats, stitch) = device.run(progress, || {
             let (atlas, direct, range) = (&self.atlas, &direct, range.clone());
-            let (light, mut stats) =
-                Bake { atlas, params, plan: &plan, direct, range: range.clone(), progress }.run()?;
+            let checkpoint = match checkpoint {
+                Some(c) => Some(Checkpoint::open(c, atlas, &origin, [range.start as u64, range.end as u64])?),
+                None => None,
+            };
+            let checkpoint = checkpoint.as_ref();
+            let (mut light, mut stats) =
+                Bake { atlas, params, plan: &plan, direct, range: range.clone(), progress, checkpoint }.run()?;
             stats.back_charts = light.backs.iter().filter(|&&b| b).count() as u64;
             plan.note_back_charts(stats.back_charts);
             plan.note_bright(&light.radiance.bright);
+            light.plan = plan.clone();
+            light.origin = Some(origin);
             let stitch = self.stitch(&light, &range, params, &mut plan, &mut stats, progress)?;
             Ok((light, stats, stitch))
         })?;
@@ -168,7 +198,7 @@ impl Lightmap {
     /// Takes the light of a range of samples over. Hidden texels are filled here, from all that has
     /// been baked so far, and seams are stitched anew: whatever the shards, the last one leaves the
     /// bits of a whole bake.
-    fn store(&mut self, new: Light, range: Range<usize>, stitch: Option<Stitch>) {
+    pub(super) fn store(&mut self, new: Light, range: Range<usize>, stitch: Option<Stitch>) {
         match &mut self.light {
             Some(old) if range.len() < self.atlas.map.len() => {
                 if let Some(mut before) = old.stitch.take() {
@@ -179,6 +209,8 @@ impl Lightmap {
                 old.state[range.clone()].copy_from_slice(&new.state[range]);
                 old.radiance = new.radiance;
                 old.backs = new.backs;
+                old.plan = new.plan;
+                old.origin = old.origin.filter(|&origin| Some(origin) == new.origin);
             }
             light => *light = Some(new),
         }
@@ -206,6 +238,7 @@ pub(crate) struct Bake<'a, 'p> {
     /// Samples of the light map to bake.
     pub range: Range<usize>,
     pub progress: &'a Progress<'p>,
+    pub checkpoint: Option<&'a Checkpoint<'a>>,
 }
 
 /// The gather map after blur and filling.
@@ -235,6 +268,8 @@ impl Bake<'_, '_> {
             radiance,
             backs,
             stitch: None,
+            origin: None,
+            plan: Plan::default(),
             _memory: memory,
         };
         self.compose(scene, indirect.as_ref(), &mut light, &mut stats)?;
@@ -247,8 +282,17 @@ impl Bake<'_, '_> {
         if !self.plan.runs(left_out::INDIRECT) {
             return Ok(Radiance::default());
         }
+        if let Some(c) = self.checkpoint
+            && let Some(radiance) = self.atlas.scene.device().install(|| c.radiance(self.atlas))?
+        {
+            return Ok(radiance);
+        }
         let photons = if self.plan.runs(left_out::PHOTONS) { Some(self.photons(stats)?) } else { None };
-        self.radiance(photons.as_ref(), stats)
+        let radiance = self.radiance(photons.as_ref(), stats)?;
+        if let Some(c) = self.checkpoint {
+            c.keep_radiance(&radiance);
+        }
+        Ok(radiance)
     }
 
     /// Announces the buffers of all stages but the photon map, which announces its own.
@@ -311,6 +355,9 @@ impl Bake<'_, '_> {
     /// texels need to be lit.
     pub(crate) fn backs(&self, radiance: &[Vec3]) -> Vec<bool> {
         let l = self.atlas;
+        if let Some(backs) = self.checkpoint.and_then(|c| c.backs(l.charts.charts.len())) {
+            return backs;
+        }
         // Without indirect light there is no radiance map: direct light decides.
         let light = |s: usize| match radiance.get(s) {
             Some(radiance) => radiance.element_sum(),
@@ -319,7 +366,11 @@ impl Bake<'_, '_> {
                 self.direct.irradiance(&receiver, 1, combine(self.params.seed as u32, s as u32), &mut 0).element_sum()
             }
         };
-        l.scene.device().install(|| sides::backs(l, light))
+        let backs = l.scene.device().install(|| sides::backs(l, light));
+        if let Some(c) = self.checkpoint {
+            c.keep_backs(&backs);
+        }
+        backs
     }
 
     /// Gathers, blurs and fills. Only placements that the range touches are gathered.
@@ -350,6 +401,12 @@ impl Bake<'_, '_> {
             let valid = valid[needed.clone()].par_chunks_mut(BLOCK);
             let blocks = values.zip(normals).zip(variances).zip(valid).enumerate();
             blocks.try_for_each(|(block, (((values, normals), variances), valid))| {
+                if self.checkpoint.is_some_and(|c| c.gathered(block, values, variances, valid)) {
+                    for (i, normal) in normals.iter_mut().enumerate() {
+                        *normal = l.receiver(&l.gather, backs, needed.start + block * BLOCK + i).normal;
+                    }
+                    return stage.advance(values.len() as u64);
+                }
                 let mut traced = 0;
                 for i in 0..values.len() {
                     let sample = needed.start + block * BLOCK + i;
@@ -361,6 +418,9 @@ impl Bake<'_, '_> {
                     }
                     (values[i], normals[i]) = (gathered.irradiance(), receiver.normal);
                     (variances[i], valid[i]) = (gathered.variance(), gathered.is_visible());
+                }
+                if let Some(c) = self.checkpoint {
+                    c.keep_gathered(block, values, variances, valid);
                 }
                 rays.fetch_add(traced, Relaxed);
                 stage.advance(values.len() as u64)
@@ -395,6 +455,10 @@ impl Bake<'_, '_> {
         upsampling: &Upsampling,
     ) -> Result<(OwnLight, u64)> {
         let l = self.atlas;
+        let texels = upsampling.own_work() as usize / 2;
+        if let Some(own) = self.checkpoint.and_then(|c| c.own_light(texels)) {
+            return Ok((own, 0));
+        }
         let count = self.params.gather_rays.min(OWN_RAYS);
         let rays = OwnRays {
             radiance: RadianceMap::new(&l.charts, &l.radiance, radiance),
@@ -402,7 +466,11 @@ impl Bake<'_, '_> {
             seed: purpose_seed(self.params.seed, purpose::OWN),
         };
         let stage = self.progress.stage("own light", 0.315, 0.32, upsampling.own_work());
-        upsampling.own_light(l, backs, &rays, &stage)
+        let own = upsampling.own_light(l, backs, &rays, &stage)?;
+        if let Some(c) = self.checkpoint {
+            c.keep_own_light(&own.0);
+        }
+        Ok(own)
     }
 
     /// Direct light and the interpolated indirect light of every texel of the range.
@@ -427,13 +495,19 @@ impl Bake<'_, '_> {
             let state = light.state[range.clone()].par_chunks_mut(BLOCK);
             direct.zip(indirect_out).zip(state).enumerate().try_for_each(|(block, ((direct, ind), state))| {
                 let mut traced = 0;
+                let first = range.start + block * BLOCK;
+                if let Some(indirect) = indirect {
+                    for (i, ind) in ind.iter_mut().enumerate() {
+                        *ind = indirect.upsampling.at(l, &indirect.irradiance, &indirect.own, first + i);
+                    }
+                }
+                if self.checkpoint.is_some_and(|c| c.lit(block, direct, state)) {
+                    return stage.advance(direct.len() as u64);
+                }
                 for i in 0..direct.len() {
-                    let sample = range.start + block * BLOCK + i;
+                    let sample = first + i;
                     let receiver = l.receiver(&l.map, backs, sample);
                     state[i] = TexelState::Visible;
-                    if let Some(indirect) = indirect {
-                        ind[i] = indirect.upsampling.at(l, &indirect.irradiance, &indirect.own, sample);
-                    }
                     if is_lit && is_buried(scene, receiver.origin, receiver.geometric, &mut traced) {
                         state[i] = TexelState::Hidden;
                     }
@@ -441,6 +515,9 @@ impl Bake<'_, '_> {
                         let seed = combine(seed, sample as u32);
                         direct[i] = self.direct.irradiance(&receiver, self.params.direct_samples, seed, &mut traced);
                     }
+                }
+                if let Some(c) = self.checkpoint {
+                    c.keep_lit(block, direct, state);
                 }
                 rays.fetch_add(traced, Relaxed);
                 stage.advance(direct.len() as u64)

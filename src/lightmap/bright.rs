@@ -110,6 +110,21 @@ impl Bright {
         Ok(())
     }
 
+    /// What [`again`](Self::again) makes the same patches of: the limit (0: there are none) and the shadow rays.
+    pub(crate) fn parts(&self) -> (f32, u32) {
+        (self.limit, self.shadow_rays)
+    }
+
+    /// The patches that an earlier [`find`](Self::find) found worth their rays, of the same radiance map.
+    pub(crate) fn again(atlas: &Atlas, values: &[Vec3], limit: f32, shadow_rays: u32) -> Result<Bright> {
+        if !(limit > 0.0) {
+            return Ok(Bright::default());
+        }
+        let patches = ManyLights::of_patches(patches(atlas, values, limit, MAX_PATCHES, &mut 0));
+        let memory = atlas.scene.device().memory().reserve(patches.bytes(), "bright patches")?;
+        Ok(Bright { limit, patches: Some(patches), shadow_rays, _memory: Some(memory) })
+    }
+
     /// Number of lights.
     pub(crate) fn len(&self) -> usize {
         self.patches.as_ref().map_or(0, ManyLights::len)

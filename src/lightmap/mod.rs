@@ -21,6 +21,7 @@ pub mod plan;
 mod polygon;
 pub(crate) mod radiance;
 mod read;
+pub(crate) mod saved;
 mod seams;
 mod sides;
 mod spherical;
@@ -40,6 +41,8 @@ use map::ChartMap;
 use plan::Plan;
 use radiance::Radiance;
 pub use read::MeshUvs;
+pub use saved::CheckpointParams;
+use saved::fingerprint::Origin;
 use std::sync::Arc;
 
 /// How a light map is laid out.
@@ -222,6 +225,21 @@ enum TexelState {
     Visible,
 }
 
+impl TexelState {
+    /// The state in files.
+    fn to_byte(self) -> u8 {
+        match self {
+            TexelState::Unbaked => 0,
+            TexelState::Hidden => 1,
+            TexelState::Visible => 2,
+        }
+    }
+
+    fn from_byte(byte: u8) -> Option<TexelState> {
+        [TexelState::Unbaked, TexelState::Hidden, TexelState::Visible].into_iter().find(|s| s.to_byte() == byte)
+    }
+}
+
 /// Light of the texels after a bake, by sample of the light map.
 struct Light {
     direct: Vec<Vec3>,
@@ -233,6 +251,10 @@ struct Light {
     backs: Vec<bool>,
     /// What was stitched, as it was before: stitching starts anew with every bake of some texels.
     stitch: Option<seams::Stitch>,
+    /// Parameters and lights of the bake; `None` if bakes that differ in them filled parts of the texels.
+    origin: Option<Origin>,
+    /// What was run before seams were stitched.
+    plan: Plan,
     _memory: Reservation,
 }
 

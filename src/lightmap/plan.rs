@@ -43,7 +43,7 @@ pub mod left_out {
 }
 
 /// What a bake of a scene runs.
-#[derive(Clone, Debug, PartialEq)]
+#[derive(Clone, Debug, Default, PartialEq)]
 pub struct Plan {
     /// Bits of [`left_out`].
     pub left_out: u32,
@@ -234,6 +234,11 @@ impl Plan {
     /// Whether a part runs.
     pub(crate) fn runs(&self, bit: u32) -> bool {
         self.left_out & bit == 0
+    }
+
+    /// A plan of which bits and [`text`](Self::text) are known.
+    pub(crate) fn from_text(left_out: u32, text: &str) -> Plan {
+        Plan { left_out, lines: text.lines().map(str::to_owned).collect() }
     }
 
     /// One line per part, for people.

@@ -55,7 +55,7 @@ impl Lightmap {
         Ok((uvs, pages))
     }
 
-    fn light(&self) -> Result<&Light> {
+    pub(super) fn light(&self) -> Result<&Light> {
         self.light.as_ref().ok_or_else(|| Error::InvalidState("the light map has not been baked yet".into()))
     }
 

@@ -63,6 +63,20 @@ pub(crate) struct Stitch {
 }
 
 impl Stitch {
+    /// Undoes the stitching in a copy of the stitched light.
+    pub(super) fn copy_former(&self, light: &mut Light) {
+        self.former_of(&(0..light.direct.len()), &mut light.direct, &mut light.indirect);
+    }
+
+    /// The same for a copy of the light of a range of texels.
+    pub(super) fn former_of(&self, range: &Range<usize>, direct: &mut [Vec3], indirect: &mut [Vec3]) {
+        let first = self.texels.partition_point(|&t| (t as usize) < range.start);
+        for i in (first..self.texels.len()).take_while(|&i| (self.texels[i] as usize) < range.end) {
+            let at = self.texels[i] as usize - range.start;
+            (direct[at], indirect[at]) = (self.direct[i], self.indirect[i]);
+        }
+    }
+
     /// Exchanges what the light map holds and what is held here.
     pub(super) fn swap(&mut self, light: &mut Light) {
         for (i, &texel) in self.texels.iter().enumerate() {
@@ -127,7 +141,7 @@ impl View<'_> {
 
     fn has_unbaked(&self, samples: usize) -> bool {
         let unbaked = |i| self.source(i).state[i] == TexelState::Unbaked;
-        (0..self.range.start).chain(self.range.end..samples).any(unbaked)
+        (0..samples).any(unbaked)
     }
 
     /// Direct and indirect light.

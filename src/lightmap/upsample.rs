@@ -144,18 +144,24 @@ impl Upsampling {
             return all;
         }
         // What is both, or where none is, what is joined.
-        let mut sums = [(Vec3::ZERO, 0.0); 2];
+        let mut sums = [(Vec3::ZERO, 0.0, true); 2];
         atlas.gather_around(sample, |s, w| {
             all += w * values[s];
             let is_joined = !self.are_apart(sample, s);
-            for ((sum, part), counts) in sums.iter_mut().zip([is_joined && self.are_alike(sample, s), is_joined]) {
+            for ((sum, part, is_all), counts) in
+                sums.iter_mut().zip([is_joined && self.are_alike(sample, s), is_joined])
+            {
                 if counts {
                     (*sum, *part) = (*sum + w * values[s], *part + w);
+                } else {
+                    *is_all = false;
                 }
             }
         });
-        match sums.into_iter().find(|(_, part)| *part > 0.0) {
-            Some((sum, part)) if part < 1.0 => sum / part,
+        // Weights need not add up to 1 exactly. Where none is left out they must not be divided by: a bake of some texels,
+        // among which there are no gaps or walls, gives the bits of a whole one.
+        match sums.into_iter().find(|(_, part, _)| *part > 0.0) {
+            Some((sum, part, false)) => sum / part,
             _ => all,
         }
     }

@@ -67,7 +67,7 @@ fn illuminate(
 ) -> Result<Indirect> {
     let two_sided = !atlas.radiance.layout.back_of.is_empty();
     let plan = Plan::new(&atlas.scene, direct, params, two_sided, false);
-    let bake = Bake { atlas, params, plan: &plan, direct, range: 0..atlas.map.len(), progress };
+    let bake = Bake { atlas, params, plan: &plan, direct, range: 0..atlas.map.len(), progress, checkpoint: None };
     let radiance = bake.illuminate(&mut BakeStats::default())?;
     let has_indirect = plan.runs(left_out::INDIRECT);
     let sides = match sides {

@@ -8,7 +8,7 @@
 //! count what the other wall receives.
 //!
 //! Offsets are in units of the radius, so that scenes may have any unit. The order of summation is
-//! fixed by the grid and the width of the lanes; lanes of f32 are emptied into f64 often enough
+//! fixed by the grid and is the same on every ISA; lanes of f32 are emptied into f64 often enough
 //! that a disc may hold millions.
 
 use super::PhotonView;
@@ -105,7 +105,7 @@ kernel!(avx2, Avx2);
 kernel!(avx512, Avx512);
 
 /// Lane numbers.
-static IOTA: [f32; 16] = [0.0, 1.0, 2.0, 3.0, 4.0, 5.0, 6.0, 7.0, 8.0, 9.0, 10.0, 11.0, 12.0, 13.0, 14.0, 15.0];
+static IOTA: [f32; 8] = [0.0, 1.0, 2.0, 3.0, 4.0, 5.0, 6.0, 7.0];
 
 /// Three lanes: a vector per lane.
 #[derive(Clone, Copy)]
@@ -148,7 +148,8 @@ impl<L: Lanes> V3<L> {
     }
 }
 
-/// Irradiance at one point.
+/// Irradiance at one point. With eight lanes on every ISA, so that sums have one order: AVX2 and AVX-512 give the same
+/// bits (see docs/experiments.md, "One order of sums on every ISA").
 ///
 /// # Safety
 /// The CPU must have the ISA.
@@ -158,14 +159,14 @@ unsafe fn estimate<S: Simd>(grid: &Grid, cylinder: &Cylinder, position: Vec3, no
     // from each photon's place a full vector can be read in every column.
     unsafe {
         let columns = grid.photons.pointers();
-        let inverse_radius = S::Packet::splat(1.0 / cylinder.radius);
-        let (zero, one) = (S::Packet::splat(0.0), S::Packet::splat(1.0));
-        let (top, bottom) = (S::Packet::splat(cylinder.half_height), S::Packet::splat(-cylinder.half_height));
-        let inverse_k = S::Packet::splat(cylinder.inverse_k);
-        let same_surface = S::Packet::splat(SAME_SURFACE);
-        let iota = S::Packet::load(IOTA.as_ptr());
-        let centre = V3::<S::Packet>::splat(position.to_array());
-        let n = V3::<S::Packet>::splat(normal.to_array());
+        let inverse_radius = S::F8::splat(1.0 / cylinder.radius);
+        let (zero, one) = (S::F8::splat(0.0), S::F8::splat(1.0));
+        let (top, bottom) = (S::F8::splat(cylinder.half_height), S::F8::splat(-cylinder.half_height));
+        let inverse_k = S::F8::splat(cylinder.inverse_k);
+        let same_surface = S::F8::splat(SAME_SURFACE);
+        let iota = S::F8::load(IOTA.as_ptr());
+        let centre = V3::<S::F8>::splat(position.to_array());
+        let n = V3::<S::F8>::splat(normal.to_array());
 
         let mut total = [0.0f64; 3];
         let mut sum = [zero; 3];
@@ -177,8 +178,8 @@ unsafe fn estimate<S: Simd>(grid: &Grid, cylinder: &Cylinder, position: Vec3, no
                 let mut i = begin;
                 while i < end {
                     // Lanes from `end` on belong to other rows.
-                    let in_run = iota.lt(S::Packet::splat((end - i) as f32));
-                    let p = V3::<S::Packet>::load(&columns, 0, i);
+                    let in_run = iota.lt(S::F8::splat((end - i) as f32));
+                    let p = V3::<S::F8>::load(&columns, 0, i);
                     let d = p.minus(centre).times(inverse_radius);
                     let height = d.dot(n);
                     let radial2 = d.dot(d) - height * height;
@@ -188,8 +189,8 @@ unsafe fn estimate<S: Simd>(grid: &Grid, cylinder: &Cylinder, position: Vec3, no
                         let facing = V3::load(&columns, 9, i).dot(n);
                         let counts = inside.and(travel.lt(zero)).and(same_surface.le(facing));
                         let filter = one - radial2.max(zero).sqrt() * inverse_k;
-                        let weight = S::Packet::select(counts, filter, zero);
-                        let power = V3::<S::Packet>::load(&columns, 6, i);
+                        let weight = S::F8::select(counts, filter, zero);
+                        let power = V3::<S::F8>::load(&columns, 6, i);
                         for (sum, power) in sum.iter_mut().zip(power.0) {
                             *sum = power.mul_add(weight, *sum);
                         }
@@ -199,7 +200,7 @@ unsafe fn estimate<S: Simd>(grid: &Grid, cylinder: &Cylinder, position: Vec3, no
                             pending = 0;
                         }
                     }
-                    i += S::Packet::WIDTH;
+                    i += S::F8::WIDTH;
                 }
             }
         }

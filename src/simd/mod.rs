@@ -108,6 +108,12 @@ impl Isa {
         Self::available().last().unwrap_or(Isa::Portable)
     }
 
+    /// Whether kernels round a product and a sum once (FMA) instead of twice. Bakes on ISAs that agree in this have
+    /// the same bits.
+    pub fn is_fused(self) -> bool {
+        self != Isa::Portable
+    }
+
     /// Lower-case name, as the command line takes it.
     pub fn name(self) -> &'static str {
         match self {

@@ -59,6 +59,12 @@ Bake:
   --direct-samples N     shadow rays per texel and area light [16]
   --seed N               the same seed gives the same bits [0]
   --no-stitch            leave the seams between charts as they are
+  --checkpoint FILE      keeps what is done in FILE and goes on from it after a kill;
+                         deleted in the end
+  --checkpoint-seconds F between two writes of it [10]
+  --shard I/N            bakes the I-th of N parts of the texels, 1/N to N/N
+  --save-result FILE     the light of the texels, for --load-result
+  --load-result FILE     light to take over instead of baking; may be repeated, for shards
 Machine:
   --threads N            0: one per logical core [0]
   --isa NAME             portable, avx2, avx512 or auto [auto]
@@ -137,6 +143,13 @@ pub struct BakeArgs {
     pub out: PathBuf,
     pub glb: bool,
     pub quiet: bool,
+    pub checkpoint: Option<PathBuf>,
+    pub checkpoint_seconds: f64,
+    /// Which part of the texels is baked, counted from 0, and of how many.
+    pub shard: Option<[u64; 2]>,
+    pub save_result: Option<PathBuf>,
+    /// Instead of baking.
+    pub load_results: Vec<PathBuf>,
 }
 
 impl BakeArgs {
@@ -165,6 +178,11 @@ impl Default for BakeArgs {
             out: "out".into(),
             glb: true,
             quiet: false,
+            checkpoint: None,
+            checkpoint_seconds: 10.0,
+            shard: None,
+            save_result: None,
+            load_results: Vec::new(),
         }
     }
 }
@@ -343,6 +361,11 @@ fn option(name: &str, parser: &mut lexopt::Parser, bake: &mut BakeArgs) -> Resul
         "direct-samples" => params.direct_samples = number(&flag, &value()?)?,
         "seed" => params.seed = number(&flag, &value()?)?,
         "no-stitch" => params.stitch = false,
+        "checkpoint" => bake.checkpoint = Some(value()?.into()),
+        "checkpoint-seconds" => bake.checkpoint_seconds = number(&flag, &value()?)?,
+        "shard" => bake.shard = Some(shard(&value()?)?),
+        "save-result" => bake.save_result = Some(value()?.into()),
+        "load-result" => bake.load_results.push(value()?.into()),
         "threads" => bake.threads = number(&flag, &value()?)?,
         "isa" => bake.isa = isa(&value()?)?,
         "bins" => bake.build.bins = number(&flag, &value()?)?,
@@ -395,6 +418,14 @@ fn seconds(value: &str) -> Result<f64, String> {
     match number("--seconds", value)? {
         s if s > 0.0 && f64::is_finite(s) => Ok(s),
         s => Err(format!("--seconds is {s}, not a finite number greater than 0")),
+    }
+}
+
+fn shard(value: &str) -> Result<[u64; 2], String> {
+    let parts: Option<(u64, u64)> = value.split_once('/').and_then(|(i, n)| Some((i.parse().ok()?, n.parse().ok()?)));
+    match parts {
+        Some((i, n)) if (1..=n).contains(&i) => Ok([i - 1, n]),
+        _ => Err(format!("--shard is {value:?}, not I/N with I from 1 to N")),
     }
 }
 
@@ -580,7 +611,8 @@ mod tests {
              --light rect:0,0,0:1,0,0:0,0,1:2,2,2 --texels-per-unit 2.5 --page-size 256 --padding 3 --gather-divisor 2 \
              --radiance-divisor 16 --photons 5 --bounces 6 --gather-rays 7 --radius 0.5 --blur 8 --direct-samples 9 \
              --seed 10 --threads 2 --isa portable --bins 32 --leaf 4 --build high --compact --camera 0,1,2:3,4,5:40 --up z --width 64 \
-             --height 48 --reference-spp 3 --out o --no-glb --both-sides --quiet",
+             --height 48 --reference-spp 3 --out o --no-glb --both-sides --quiet --checkpoint c --checkpoint-seconds 2.5 \
+             --shard 2/3 --save-result r --load-result a --load-result b",
         )
         .unwrap();
         assert_eq!(b.lights.len(), 7);
@@ -591,6 +623,12 @@ mod tests {
         assert_eq!((b.lights[5].light.color(), b.lights[5].image.as_deref()), ([2.5; 3], Some("a.HDR".as_ref())));
         for bad in ["sky", "sky:a.png", "sky:1,2,3:4", "sky:-1,0,0", "sun:0,-1,0:7,8,9:91"] {
             assert!(bake(&format!("bake s.obj --light {bad}")).is_err(), "{bad}");
+        }
+        assert_eq!((b.checkpoint.as_deref(), b.checkpoint_seconds), (Some("c".as_ref()), 2.5));
+        assert_eq!((b.shard, b.save_result.as_deref()), (Some([1, 3]), Some("r".as_ref())));
+        assert_eq!(b.load_results, [PathBuf::from("a"), PathBuf::from("b")]);
+        for bad in ["0/3", "4/3", "1", "1/x"] {
+            assert!(bake(&format!("bake s.obj --shard {bad}")).is_err(), "{bad}");
         }
         assert_eq!((b.desc.texels_per_unit, b.desc.page_size, b.desc.padding), (2.5, 256, 3));
         assert_eq!((b.desc.gather_divisor, b.desc.radiance_divisor, b.desc.both_sides), (2, 16, true));

@@ -51,7 +51,7 @@ use args::{BakeArgs, Command};
 use bakelite::bvh::BuildOptions;
 use bakelite::device::LogLevel;
 use bakelite::io::image::write_png_rgb8;
-use bakelite::lightmap::{BakeStats, Lightmap};
+use bakelite::lightmap::{BakeStats, CheckpointParams, Lightmap};
 use bakelite::scene::{BUILTIN_NAMES, Camera, builtin, builtin_camera};
 use bakelite::{Device, DeviceOptions, Error, Light, Result, Scene, SceneData};
 use bar::Bars;
@@ -113,7 +113,7 @@ impl<'a> Job<'a> {
         let start = Instant::now();
         output::make_folder(&self.args.out)?;
         let mut lightmap = self.unbaked()?;
-        let bake = self.bake(&mut lightmap)?;
+        let bake = self.light(&mut lightmap)?;
         self.write_maps(&lightmap)?;
         let camera = self.camera(&lightmap);
         let pictures = self.pictures(&lightmap, camera)?;
@@ -134,6 +134,10 @@ impl<'a> Job<'a> {
         };
         let text = format!("{:#}\n", report::report(&run));
         output::write_text(&path, &text)?;
+        // All that it stands for is written.
+        if let Some(path) = &self.args.checkpoint {
+            let _ = std::fs::remove_file(path);
+        }
         if !self.args.quiet {
             self.print(&lightmap, &bake, pictures.as_ref(), seconds);
         }
@@ -221,8 +225,43 @@ impl<'a> Job<'a> {
         Ok(lightmap)
     }
 
+    /// Bakes, or takes the light from results, and saves the result if that is asked for.
+    fn light(&mut self, lightmap: &mut Lightmap) -> Result<BakeStats> {
+        let stats = if self.args.load_results.is_empty() { self.bake(lightmap)? } else { self.load_results(lightmap)? };
+        if let Some(path) = &self.args.save_result {
+            let start = Instant::now();
+            self.bars.show("result", |p| lightmap.save_result(path, p))?;
+            self.files.push(path.clone());
+            self.stage("save result", start);
+        }
+        Ok(stats)
+    }
+
+    fn load_results(&mut self, lightmap: &mut Lightmap) -> Result<BakeStats> {
+        let start = Instant::now();
+        for path in &self.args.load_results {
+            self.bars.show("result", |p| lightmap.load_result(path, p))?;
+        }
+        self.stage("load results", start);
+        Ok(BakeStats::default())
+    }
+
     fn bake(&mut self, lightmap: &mut Lightmap) -> Result<BakeStats> {
-        let stats = self.bars.show("bake", |p| lightmap.bake(&self.args.params, p))?;
+        let mut params = self.args.params;
+        if let Some([shard, of]) = self.args.shard {
+            let texels = lightmap.info().texels;
+            let cut = |i: u64| (texels as u128 * i as u128 / of as u128) as u64;
+            (params.texel_begin, params.texel_end) = (cut(shard), cut(shard + 1));
+            if params.texel_begin == params.texel_end {
+                return Err(Error::InvalidArgument(format!(
+                    "--shard {}/{of} has none of the {texels} texels",
+                    shard + 1
+                )));
+            }
+        }
+        let seconds = self.args.checkpoint_seconds;
+        let checkpoint = self.args.checkpoint.clone().map(|path| CheckpointParams { path, seconds });
+        let stats = self.bars.show("bake", |p| lightmap.bake_with(&params, checkpoint.as_ref(), p))?;
         let parts = [
             ("photons", stats.photons),
             ("radiance map", stats.radiance),

@@ -1,0 +1,347 @@
+//! Checkpoints: what a bake has done so far, kept in a file, so that a bake whose process was killed goes on where it
+//! was.
+//!
+//! The file holds records (`super::records`): `CKPT` with the fingerprint of the bake, then what is done in the order
+//! in which threads finish it: `RADI` (runs of the radiance map), `RDNE` (bright patches; the radiance map is
+//! complete), `BACK` (which sides are shown), `OWNL` (texels that gather for themselves), `GATH` (blocks of the gather
+//! map), `DRCT` (blocks of direct light). All of it is the same whatever the threads and the order, so what is missing
+//! is computed again and gives the same bits. Photons, upsampling, blur and seams are not kept: they take a small part of
+//! a bake.
+//!
+//! Records are only ever appended. A kill at any moment leaves at most the last of them torn, which is cut off.
+
+use super::fingerprint::{Fingerprint, Origin};
+use super::records::{self, MAGIC, Next, Records, Tag, take};
+use super::result::is_light;
+use super::{another_kind, damaged, foreign};
+use crate::device::{Device, LogLevel};
+use crate::error::{Error, Result, invalid_argument};
+use crate::lightmap::bright::Bright;
+use crate::lightmap::radiance::Radiance;
+use crate::lightmap::upsample::OwnLight;
+use crate::lightmap::{Atlas, TexelState};
+use glam::Vec3;
+use std::collections::HashMap;
+use std::fs::{File, OpenOptions, TryLockError};
+use std::io::{BufReader, Read, Seek, SeekFrom, Write};
+use std::path::{Path, PathBuf};
+use std::sync::{Mutex, MutexGuard};
+use std::time::{Duration, Instant};
+
+const HEAD: Tag = *b"CKPT";
+const RADIANCE: Tag = *b"RADI";
+const RADIANCE_DONE: Tag = *b"RDNE";
+const BACKS: Tag = *b"BACK";
+const OWN: Tag = *b"OWNL";
+const GATHER: Tag = *b"GATH";
+const DIRECT: Tag = *b"DRCT";
+
+/// Texels of the radiance map in a record.
+const RUN: usize = 1 << 14;
+
+/// Where and how often a bake keeps what it has done.
+#[derive(Clone, Debug, PartialEq)]
+pub struct CheckpointParams {
+    /// The file. One that is there must be a checkpoint of the same bake, which then goes on from it.
+    pub path: PathBuf,
+    /// Seconds between two writes, finite, ≥ 0. A kill loses at most the work of so long; 0: of the blocks under way.
+    pub seconds: f64,
+}
+
+impl CheckpointParams {
+    /// A checkpoint that is written every ten seconds.
+    pub fn new(path: impl Into<PathBuf>) -> CheckpointParams {
+        CheckpointParams { path: path.into(), seconds: 10.0 }
+    }
+
+    /// Checks the range documented on the field.
+    pub fn validate(&self) -> Result<()> {
+        // Up to what a duration holds.
+        if !(self.seconds >= 0.0 && self.seconds <= 1e9) {
+            return invalid_argument!("checkpoint_seconds is {}, outside 0 to 1e9", self.seconds);
+        }
+        Ok(())
+    }
+}
+
+/// The checkpoint of a bake under way. Used from all threads.
+pub(crate) struct Checkpoint<'a> {
+    device: &'a Device,
+    path: PathBuf,
+    interval: Duration,
+    file: Mutex<Output>,
+    pending: Mutex<Pending>,
+    /// What an earlier run has done, by kind and number.
+    done: Mutex<HashMap<(Tag, u64), Vec<u8>>>,
+}
+
+/// Records that are still to be written.
+struct Pending {
+    bytes: Vec<u8>,
+    since: Instant,
+}
+
+/// The file, locked against other bakes.
+struct Output {
+    file: File,
+    /// Bytes of whole records.
+    whole: u64,
+    /// Whether the last write failed.
+    failed: bool,
+}
+
+impl<'a> Checkpoint<'a> {
+    /// Opens the checkpoint of the bake of `range`, or begins one.
+    pub(in crate::lightmap) fn open(
+        params: &CheckpointParams,
+        atlas: &'a Atlas,
+        origin: &Origin,
+        range: [u64; 2],
+    ) -> Result<Checkpoint<'a>> {
+        let path = &params.path;
+        let needed = Fingerprint::new(atlas, origin, range);
+        let mut head = MAGIC.to_vec();
+        records::append(&mut head, HEAD, &[bytemuck::bytes_of(&needed)]);
+        let mut file = open_locked(path)?;
+        let fail = |e| Error::Io(format!("cannot use the checkpoint {}: {e}", path.display()));
+        let size = file.metadata().map_err(fail)?.len();
+        let mut done = HashMap::new();
+        let whole = if size < head.len() as u64 && is_beginning_of(&mut file, &head).map_err(fail)? {
+            // New, or killed as it began.
+            file.seek(SeekFrom::Start(0)).and_then(|_| file.write_all(&head)).map_err(fail)?;
+            head.len() as u64
+        } else {
+            file.seek(SeekFrom::Start(0)).map_err(fail)?;
+            read(&file, size, path, &needed, &mut done)?
+        };
+        file.set_len(whole).and_then(|()| file.seek(SeekFrom::Start(whole))).map_err(fail)?;
+        Ok(Checkpoint {
+            device: atlas.scene.device(),
+            path: path.clone(),
+            interval: Duration::from_secs_f64(params.seconds),
+            file: Mutex::new(Output { file, whole, failed: false }),
+            pending: Mutex::new(Pending { bytes: Vec::new(), since: Instant::now() }),
+            done: Mutex::new(done),
+        })
+    }
+
+    /// The radiance map of an earlier run, if it was completed. To be called on the device's threads.
+    pub fn radiance(&self, atlas: &Atlas) -> Result<Option<Radiance>> {
+        let Some(end) = self.take(RADIANCE_DONE, 0) else { return Ok(None) };
+        let mut values: Vec<Vec3> = Vec::new();
+        for run in 0..atlas.radiance.len().div_ceil(RUN) as u64 {
+            let Some(content) = self.take(RADIANCE, run) else { return Ok(None) };
+            let Some(of_run) = take::<Vec3>(&mut &content[..], content.len() / size_of::<Vec3>()) else {
+                return Ok(None);
+            };
+            values.extend(of_run);
+        }
+        let mut rest = &end[..];
+        let (Some(limit), Some(shadow_rays)) = (take::<f32>(&mut rest, 1), take::<u32>(&mut rest, 1)) else {
+            return Ok(None);
+        };
+        if values.len() != atlas.radiance.len() || !is_light(&values) || !limit[0].is_finite() {
+            return Ok(None);
+        }
+        let bright = Bright::again(atlas, &values, limit[0], shadow_rays[0])?;
+        Ok(Some(Radiance { values, bright }))
+    }
+
+    pub fn keep_radiance(&self, radiance: &Radiance) {
+        for (run, values) in radiance.values.chunks(RUN).enumerate() {
+            self.keep(RADIANCE, run as u64, &[bytemuck::cast_slice(values)]);
+        }
+        let (limit, shadow_rays) = radiance.bright.parts();
+        self.keep(RADIANCE_DONE, 0, &[&limit.to_ne_bytes(), &shadow_rays.to_ne_bytes()]);
+    }
+
+    /// Per chart, whether its back is shown, of an earlier run.
+    pub fn backs(&self, charts: usize) -> Option<Vec<bool>> {
+        let content = self.take(BACKS, 0)?;
+        let fits = content.is_empty() || content.len() == charts;
+        fits.then(|| content.iter().map(|&b| b != 0).collect())
+    }
+
+    pub fn keep_backs(&self, backs: &[bool]) {
+        self.keep(BACKS, 0, &[&backs.iter().map(|&b| b.into()).collect::<Vec<u8>>()]);
+    }
+
+    /// The light of `count` texels that gather for themselves, of an earlier run.
+    pub fn own_light(&self, count: usize) -> Option<OwnLight> {
+        let content = self.take(OWN, 0)?;
+        let values: Vec<Vec3> = take(&mut &content[..], count)?;
+        // Those inside of solids are infinite.
+        let known = |v: Vec3| if v.x == f32::INFINITY { None } else { Some(v) };
+        let light: OwnLight = values.into_iter().map(known).collect();
+        let is_whole = content.len() == count * size_of::<Vec3>();
+        (is_whole && light.iter().flatten().all(|&v| is_light(&[v]))).then_some(light)
+    }
+
+    pub fn keep_own_light(&self, light: &OwnLight) {
+        let values: Vec<Vec3> = light.iter().map(|v| v.unwrap_or(Vec3::INFINITY)).collect();
+        self.keep(OWN, 0, &[bytemuck::cast_slice(&values)]);
+    }
+
+    /// Fills in a block of the gather map (irradiance, variance and whether each texel is valid) if an earlier run has
+    /// done it; tells whether it has.
+    pub fn gathered(&self, block: usize, values: &mut [Vec3], variances: &mut [f32], valid: &mut [bool]) -> bool {
+        let read = || {
+            let content = self.take(GATHER, block as u64)?;
+            let mut rest = &content[..];
+            let (light, spread) = (take::<Vec3>(&mut rest, values.len())?, take::<f32>(&mut rest, values.len())?);
+            let fits = rest.len() == values.len() && is_light(&light) && spread.iter().all(|&v| v >= 0.0);
+            fits.then(|| (light, spread, rest.to_vec()))
+        };
+        let Some((light, spread, flags)) = read() else { return false };
+        values.copy_from_slice(&light);
+        variances.copy_from_slice(&spread);
+        valid.iter_mut().zip(flags).for_each(|(valid, flag)| *valid = flag != 0);
+        true
+    }
+
+    pub fn keep_gathered(&self, block: usize, values: &[Vec3], variances: &[f32], valid: &[bool]) {
+        let parts = [bytemuck::cast_slice(values), bytemuck::cast_slice(variances), bytemuck::cast_slice(valid)];
+        self.keep(GATHER, block as u64, &parts);
+    }
+
+    /// Fills in a block of direct light and the state of its texels if an earlier run has done it; tells whether it
+    /// has.
+    pub(in crate::lightmap) fn lit(&self, block: usize, direct: &mut [Vec3], state: &mut [TexelState]) -> bool {
+        let read = || {
+            let content = self.take(DIRECT, block as u64)?;
+            let mut rest = &content[..];
+            let light = take::<Vec3>(&mut rest, direct.len())?;
+            let states = rest.iter().map(|&b| TexelState::from_byte(b)).collect::<Option<Vec<_>>>()?;
+            let fits = states.len() == direct.len() && is_light(&light) && !states.contains(&TexelState::Unbaked);
+            fits.then_some((light, states))
+        };
+        let Some((light, states)) = read() else { return false };
+        direct.copy_from_slice(&light);
+        state.copy_from_slice(&states);
+        true
+    }
+
+    pub(in crate::lightmap) fn keep_lit(&self, block: usize, direct: &[Vec3], state: &[TexelState]) {
+        let states: Vec<u8> = state.iter().map(|s| s.to_byte()).collect();
+        self.keep(DIRECT, block as u64, &[bytemuck::cast_slice(direct), &states]);
+    }
+
+    fn take(&self, tag: Tag, number: u64) -> Option<Vec<u8>> {
+        lock(&self.done).remove(&(tag, number))
+    }
+
+    fn keep(&self, tag: Tag, number: u64, parts: &[&[u8]]) {
+        let number = number.to_ne_bytes();
+        let all: Vec<&[u8]> = [&number[..]].into_iter().chain(parts.iter().copied()).collect();
+        let bytes = {
+            let mut pending = lock(&self.pending);
+            records::append(&mut pending.bytes, tag, &all);
+            if pending.since.elapsed() < self.interval {
+                return;
+            }
+            pending.since = Instant::now();
+            std::mem::take(&mut pending.bytes)
+        };
+        self.write(&bytes);
+    }
+
+    /// Writes what is pending.
+    pub fn flush(&self) {
+        let bytes = std::mem::take(&mut lock(&self.pending).bytes);
+        self.write(&bytes);
+    }
+
+    /// Appends to the file. A bake does not fail because its checkpoint cannot be written: what the file holds stays
+    /// whole, and later records are tried again.
+    fn write(&self, bytes: &[u8]) {
+        if bytes.is_empty() {
+            return;
+        }
+        let mut output = lock(&self.file);
+        let written = output.file.write_all(bytes).and_then(|()| output.file.sync_data());
+        match written {
+            Ok(()) => (output.whole, output.failed) = (output.whole + bytes.len() as u64, false),
+            Err(e) => {
+                let whole = output.whole;
+                let _ = output.file.set_len(whole).and_then(|()| output.file.seek(SeekFrom::Start(whole)));
+                if !std::mem::replace(&mut output.failed, true) {
+                    let message = format!("cannot write the checkpoint {}: {e}; the bake goes on", self.path.display());
+                    self.device.log(LogLevel::Warning, &message);
+                }
+            }
+        }
+    }
+}
+
+impl Drop for Checkpoint<'_> {
+    /// Whatever ends the bake: an error, a cancel or its completion.
+    fn drop(&mut self) {
+        self.flush();
+    }
+}
+
+fn lock<T>(mutex: &Mutex<T>) -> MutexGuard<'_, T> {
+    mutex.lock().unwrap_or_else(|e| e.into_inner())
+}
+
+/// Opens or creates the file for one bake alone.
+fn open_locked(path: &Path) -> Result<File> {
+    let fail = |e| Error::Io(format!("cannot use the checkpoint {}: {e}", path.display()));
+    // Asked first, so that opening does not wait for the other end of a FIFO.
+    if std::fs::metadata(path).is_ok_and(|m| !m.is_file()) {
+        return Err(Error::Io(format!("cannot use the checkpoint {}: it is not a file", path.display())));
+    }
+    let file = OpenOptions::new().read(true).write(true).create(true).truncate(false).open(path).map_err(fail)?;
+    match file.try_lock() {
+        Err(TryLockError::WouldBlock) => {
+            Err(Error::InvalidState(format!("the checkpoint {} is in use by another bake", path.display())))
+        }
+        // Some network file systems have no locks.
+        Ok(()) | Err(TryLockError::Error(_)) => Ok(file),
+    }
+}
+
+/// Whether the file has a part of `head`, and nothing else.
+fn is_beginning_of(file: &mut File, head: &[u8]) -> std::io::Result<bool> {
+    let mut bytes = Vec::new();
+    file.take(head.len() as u64).read_to_end(&mut bytes)?;
+    Ok(head.starts_with(&bytes))
+}
+
+/// Reads all whole records into `done`; returns where they end.
+fn read(
+    file: &File,
+    size: u64,
+    path: &Path,
+    needed: &Fingerprint,
+    done: &mut HashMap<(Tag, u64), Vec<u8>>,
+) -> Result<u64> {
+    let fail = |e| Error::Io(format!("cannot read the checkpoint {}: {e}", path.display()));
+    let mut file = BufReader::with_capacity(1 << 20, file);
+    let mut magic = [0; MAGIC.len()];
+    if file.read_exact(&mut magic).is_err() || magic != MAGIC {
+        return Err(another_kind(path, "checkpoint"));
+    }
+    let mut records = Records::new(file, size);
+    match records.next().map_err(fail)? {
+        Next::Record(HEAD, content) if content.len() == size_of::<Fingerprint>() => {
+            let found: Fingerprint = bytemuck::pod_read_unaligned(&content);
+            if let Some(differences) = found.difference(needed) {
+                return Err(foreign(path, &differences));
+            }
+        }
+        Next::Record(..) => return Err(another_kind(path, "checkpoint")),
+        _ => return Err(damaged(path)),
+    }
+    loop {
+        match records.next().map_err(fail)? {
+            Next::Record(tag, mut content) => {
+                let number: Vec<u64> = take(&mut &content[..], 1).ok_or_else(|| damaged(path))?;
+                content.drain(..8);
+                done.insert((tag, number[0]), content);
+            }
+            Next::End | Next::Torn => return Ok(records.whole),
+            Next::Damaged => return Err(damaged(path)),
+        }
+    }
+}

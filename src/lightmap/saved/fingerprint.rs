@@ -1,0 +1,228 @@
+//! The fingerprint of a bake: what baked light depends on. Files whose fingerprint differs are refused, with a sentence
+//! that says in what.
+
+use crate::lightmap::map::ChartMap;
+use crate::lightmap::{Atlas, BakeParams};
+use crate::scene::{Light, MeshMaterials, Scene};
+use bytemuck::{Pod, Zeroable};
+use std::fmt::Debug;
+
+/// What the light of a bake depends on beside scene and layout, which a light map keeps for good.
+#[derive(Clone, Copy, Debug, PartialEq)]
+pub(in crate::lightmap) struct Origin {
+    pub params: BakeParams,
+    /// Checksum of the lights.
+    lights: u32,
+}
+
+impl Origin {
+    /// Of a bake of whatever texels under the present `lights`.
+    pub fn new(params: &BakeParams, lights: &[Light]) -> Origin {
+        // Neither of these changes any bit of a texel.
+        let params = BakeParams { texel_begin: 0, texel_end: 0, memory_budget: 0, ..*params };
+        Origin { params, lights: text_sum(lights) }
+    }
+}
+
+/// Of a whole bake. Part of the file format.
+#[derive(Clone, Copy, Debug, PartialEq, Pod, Zeroable)]
+#[repr(C)]
+pub(super) struct Fingerprint {
+    version: [u8; 16],
+    /// Whether the ISA fuses multiplications and additions: those that do give the same bits, portable others.
+    is_fused: u32,
+    reserved: u32,
+    /// Checksums.
+    geometry: u32,
+    materials: u32,
+    lights: u32,
+    layout: u32,
+    photon_count: u64,
+    seed: u64,
+    /// Of checkpoints; a result may hold any.
+    texel_begin: u64,
+    texel_end: u64,
+    max_bounces: u32,
+    gather_rays: u32,
+    radius: f32,
+    blur_radius: u32,
+    direct_samples: u32,
+    stitch: u32,
+}
+
+impl Fingerprint {
+    /// Of the bake of the texels in `range` ((0, 0): any).
+    pub fn new(atlas: &Atlas, origin: &Origin, [texel_begin, texel_end]: [u64; 2]) -> Fingerprint {
+        // All fields by name: what is added to the parameters must be compared here, too.
+        let BakeParams {
+            photon_count,
+            max_bounces,
+            gather_rays,
+            radius,
+            blur_radius,
+            direct_samples,
+            seed,
+            memory_budget: _,
+            texel_begin: _,
+            texel_end: _,
+            stitch,
+        } = origin.params;
+        let mut version = [0; 16];
+        let text = env!("CARGO_PKG_VERSION").as_bytes();
+        let length = text.len().min(version.len());
+        version[..length].copy_from_slice(&text[..length]);
+        Fingerprint {
+            version,
+            is_fused: atlas.scene.device().isa().is_fused().into(),
+            reserved: 0,
+            geometry: geometry(&atlas.scene),
+            materials: materials(&atlas.scene),
+            lights: origin.lights,
+            layout: layout(atlas),
+            photon_count,
+            seed,
+            texel_begin,
+            texel_end,
+            max_bounces,
+            gather_rays,
+            radius,
+            blur_radius,
+            direct_samples,
+            stitch: stitch.into(),
+        }
+    }
+
+    /// The parameters that it tells of.
+    pub fn params(&self) -> BakeParams {
+        BakeParams {
+            photon_count: self.photon_count,
+            max_bounces: self.max_bounces,
+            gather_rays: self.gather_rays,
+            radius: self.radius,
+            blur_radius: self.blur_radius,
+            direct_samples: self.direct_samples,
+            seed: self.seed,
+            memory_budget: 0,
+            texel_begin: 0,
+            texel_end: 0,
+            stitch: self.stitch != 0,
+        }
+    }
+
+    /// The origin of the light that it tells of.
+    pub fn origin(&self) -> Origin {
+        Origin { params: self.params(), lights: self.lights }
+    }
+
+    /// In what this one, of a file, differs from the one that is needed; `None` if in nothing.
+    pub fn difference(&self, needed: &Fingerprint) -> Option<String> {
+        let mut all = Vec::new();
+        let version = |f: &Fingerprint| String::from_utf8_lossy(&f.version).trim_end_matches('\0').to_owned();
+        if self.version != needed.version {
+            all.push(format!("the library's version ({}, here {})", version(self), version(needed)));
+        }
+        if self.is_fused != needed.is_fused {
+            let isa = |f: &Fingerprint| if f.is_fused != 0 { "AVX2 or AVX-512" } else { "portable" };
+            all.push(format!("the instruction set ({}, here {})", isa(self), isa(needed)));
+        }
+        let sums = [
+            ("the scene's geometry", self.geometry, needed.geometry),
+            ("the scene's materials", self.materials, needed.materials),
+            ("the lights", self.lights, needed.lights),
+            ("the light map's layout", self.layout, needed.layout),
+        ];
+        all.extend(sums.iter().filter(|s| s.1 != s.2).map(|s| s.0.to_owned()));
+        fn compare<T: PartialEq + Debug>(all: &mut Vec<String>, name: &str, file: T, here: T) {
+            if file != here {
+                all.push(format!("{name} ({file:?}, here {here:?})"));
+            }
+        }
+        compare(&mut all, "photon_count", self.photon_count, needed.photon_count);
+        compare(&mut all, "max_bounces", self.max_bounces, needed.max_bounces);
+        compare(&mut all, "gather_rays", self.gather_rays, needed.gather_rays);
+        compare(&mut all, "radius", self.radius, needed.radius);
+        compare(&mut all, "blur_radius", self.blur_radius, needed.blur_radius);
+        compare(&mut all, "direct_samples", self.direct_samples, needed.direct_samples);
+        compare(&mut all, "seed", self.seed, needed.seed);
+        compare(&mut all, "stitch", self.stitch, needed.stitch);
+        compare(&mut all, "texel_begin", self.texel_begin, needed.texel_begin);
+        compare(&mut all, "texel_end", self.texel_end, needed.texel_end);
+        (!all.is_empty()).then(|| all.join(", "))
+    }
+}
+
+/// Checksum of what is few enough to be spelled out.
+fn text_sum(values: &(impl Debug + ?Sized)) -> u32 {
+    crc32fast::hash(format!("{values:?}").as_bytes())
+}
+
+fn geometry(scene: &Scene) -> u32 {
+    let mut sum = crc32fast::Hasher::new();
+    for mesh in scene.meshes() {
+        sum.update(bytemuck::cast_slice(&mesh.positions));
+        sum.update(bytemuck::cast_slice(&mesh.indices));
+        sum.update(bytemuck::cast_slice(&mesh.normals));
+        sum.update(bytemuck::cast_slice(&mesh.uvs));
+        match &mesh.materials {
+            MeshMaterials::One(material) => sum.update(bytemuck::bytes_of(material)),
+            MeshMaterials::PerTriangle(materials) => sum.update(bytemuck::cast_slice(materials)),
+        }
+    }
+    sum.finalize()
+}
+
+/// Of materials, textures and the images of skies.
+fn materials(scene: &Scene) -> u32 {
+    let mut sum = crc32fast::Hasher::new();
+    sum.update(&text_sum(scene.materials()).to_ne_bytes());
+    for texture in scene.textures() {
+        sum.update(bytemuck::cast_slice(&[texture.width, texture.height]));
+        sum.update(bytemuck::cast_slice(&texture.rgba8));
+    }
+    for environment in scene.environments() {
+        let (width, height) = environment.size();
+        sum.update(bytemuck::cast_slice(&[width, height]));
+        sum.update(bytemuck::cast_slice(environment.rgb()));
+    }
+    sum.finalize()
+}
+
+fn layout(atlas: &Atlas) -> u32 {
+    let mut sum = crc32fast::Hasher::new();
+    sum.update(&atlas.padding.to_ne_bytes());
+    sum.update(bytemuck::cast_slice(&atlas.charts.chart_of));
+    sum.update(bytemuck::cast_slice(&atlas.charts.corners));
+    for map in [&atlas.map, &atlas.gather, &atlas.radiance] {
+        of_map(map, &mut sum);
+    }
+    sum.finalize()
+}
+
+fn of_map(map: &ChartMap, sum: &mut crc32fast::Hasher) {
+    let layout = &map.layout;
+    sum.update(bytemuck::cast_slice(&[layout.page_size, layout.page_count, layout.given]));
+    sum.update(bytemuck::cast_slice(&layout.back_of));
+    for p in &layout.placements {
+        sum.update(bytemuck::cast_slice(&[p.page, p.swap.into()]));
+        sum.update(bytemuck::cast_slice(&[p.x, p.y, p.w, p.h]));
+        sum.update(bytemuck::cast_slice(&[p.scale, p.offset]));
+    }
+    sum.update(bytemuck::cast_slice(&map.texels.samples));
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn a_difference_is_named_with_both_values() {
+        let mut file = Fingerprint { seed: 7, lights: 1, ..Zeroable::zeroed() };
+        let mut here = file;
+        assert_eq!(file.difference(&here), None);
+        (file.seed, here.lights) = (8, 2);
+        assert_eq!(file.difference(&here).unwrap(), "the lights, seed (8, here 7)");
+        file.version[..5].copy_from_slice(b"0.0.9");
+        here.version[..5].copy_from_slice(b"0.1.0");
+        assert!(file.difference(&here).unwrap().contains("version (0.0.9, here 0.1.0)"));
+    }
+}

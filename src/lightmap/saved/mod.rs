@@ -1,0 +1,37 @@
+//! Baked light on disk: results, which come back into a light map and may be parts of a bake that several machines
+//! share, and checkpoints, from which a bake goes on after its process has ended.
+//!
+//! | file | what it does |
+//! |---|---|
+//! | `records` | the container: tagged records, each with checksums |
+//! | `fingerprint` | what a file must agree with: scene, lights, layout, parameters |
+//! | `result` | saving and loading the light of a light map |
+//! | `checkpoint` | the progress of a bake: written as it goes on, read when it starts again |
+
+pub(crate) mod checkpoint;
+pub(super) mod fingerprint;
+mod records;
+mod result;
+
+pub use checkpoint::CheckpointParams;
+
+use crate::error::Error;
+use std::path::Path;
+
+/// What a file with impossible content is refused with.
+fn damaged(path: &Path) -> Error {
+    Error::Io(format!("{} is damaged: a checksum or a length in it does not fit", path.display()))
+}
+
+/// What a file of another bake is refused with.
+fn foreign(path: &Path, differences: &str) -> Error {
+    Error::InvalidArgument(format!("{} is of another bake; it differs in {differences}", path.display()))
+}
+
+/// What a file of another kind is refused with.
+fn another_kind(path: &Path, kind: &str) -> Error {
+    Error::Io(format!("{} is no {kind} of this version of the library", path.display()))
+}
+
+#[cfg(test)]
+mod tests;

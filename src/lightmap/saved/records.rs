@@ -1,0 +1,150 @@
+//! The container of results and checkpoints: a magic number, then records.
+//!
+//! ```text
+//! bytes   record, little-endian
+//! 0..4    tag
+//! 4..12   length of the content
+//! 12..16  CRC-32 of the content
+//! 16..20  CRC-32 of bytes 0..16
+//! 20..    content
+//! ```
+//!
+//! A process that is killed while it appends leaves a file that ends within a record: a torn end. Any other change
+//! of a file shows in a checksum, that of a length in the header's own.
+
+use std::io::{self, ErrorKind, Read};
+
+/// Begins every file; the last byte is the version of the format. Numbers are stored as the machine has them, so files
+/// of machines with the other order of bytes begin otherwise.
+pub(super) const MAGIC: [u8; 8] = if cfg!(target_endian = "little") { *b"BKLIGHT1" } else { *b"1THGILKB" };
+
+/// Bytes before the content of a record.
+const HEADER: usize = 20;
+
+pub(super) type Tag = [u8; 4];
+
+/// Appends a record whose content is `parts`, one after the other.
+pub(super) fn append(out: &mut Vec<u8>, tag: Tag, parts: &[&[u8]]) {
+    let mut sum = crc32fast::Hasher::new();
+    parts.iter().for_each(|p| sum.update(p));
+    let length: usize = parts.iter().map(|p| p.len()).sum();
+    let start = out.len();
+    out.reserve(HEADER + length);
+    out.extend(tag);
+    out.extend((length as u64).to_ne_bytes());
+    out.extend(sum.finalize().to_ne_bytes());
+    let header_sum = crc32fast::hash(&out[start..]);
+    out.extend(header_sum.to_ne_bytes());
+    parts.iter().for_each(|p| out.extend_from_slice(p));
+}
+
+/// What comes next in a file.
+#[derive(Debug, PartialEq)]
+pub(super) enum Next {
+    Record(Tag, Vec<u8>),
+    /// The file ends after a record.
+    End,
+    /// The file ends within a record.
+    Torn,
+    Damaged,
+}
+
+/// Reads records one by one.
+pub(super) struct Records<R> {
+    from: R,
+    /// Bytes that the file still has.
+    left: u64,
+    /// Bytes up to the end of the last whole record.
+    pub whole: u64,
+}
+
+impl<R: Read> Records<R> {
+    /// Of a file of `size` bytes whose magic number has been read.
+    pub fn new(from: R, size: u64) -> Records<R> {
+        let whole = MAGIC.len() as u64;
+        Records { from, left: size.saturating_sub(whole), whole }
+    }
+
+    pub fn next(&mut self) -> io::Result<Next> {
+        if self.left == 0 {
+            return Ok(Next::End);
+        }
+        if self.left < HEADER as u64 {
+            return Ok(Next::Torn);
+        }
+        let mut header = [0; HEADER];
+        self.from.read_exact(&mut header)?;
+        self.left -= HEADER as u64;
+        let number = |at: usize| u32::from_ne_bytes(std::array::from_fn(|i| header[at + i]));
+        if crc32fast::hash(&header[..16]) != number(16) {
+            return Ok(Next::Damaged);
+        }
+        let length = u64::from_ne_bytes(std::array::from_fn(|i| header[4 + i]));
+        if length > self.left {
+            return Ok(Next::Torn);
+        }
+        let mut content = Vec::new();
+        content.try_reserve_exact(length as usize).map_err(|_| io::Error::from(ErrorKind::OutOfMemory))?;
+        self.from.by_ref().take(length).read_to_end(&mut content)?;
+        self.left -= length;
+        if content.len() as u64 != length || crc32fast::hash(&content) != number(12) {
+            return Ok(Next::Damaged);
+        }
+        self.whole += HEADER as u64 + length;
+        Ok(Next::Record(std::array::from_fn(|i| header[i]), content))
+    }
+}
+
+/// Takes numbers from the front of a record's content; `None` at its end.
+pub(super) fn take<T: bytemuck::Pod>(content: &mut &[u8], count: usize) -> Option<Vec<T>> {
+    let (first, rest) = content.split_at_checked(count.checked_mul(size_of::<T>())?)?;
+    *content = rest;
+    Some(bytemuck::pod_collect_to_vec(first))
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    fn all(bytes: &[u8]) -> (Vec<Next>, u64) {
+        let mut records = Records::new(bytes, (bytes.len() + MAGIC.len()) as u64);
+        let mut found = Vec::new();
+        loop {
+            found.push(records.next().unwrap());
+            if !matches!(found[found.len() - 1], Next::Record(..)) {
+                return (found, records.whole - MAGIC.len() as u64);
+            }
+        }
+    }
+
+    fn two() -> (Vec<u8>, usize) {
+        let mut out = Vec::new();
+        append(&mut out, *b"ONE ", &[b"content", b" in parts"]);
+        let first = out.len();
+        append(&mut out, *b"TWO ", &[]);
+        (out, first)
+    }
+
+    #[test]
+    fn records_come_back() {
+        let found = all(&two().0).0;
+        let one = Next::Record(*b"ONE ", b"content in parts".to_vec());
+        assert_eq!(found, [one, Next::Record(*b"TWO ", Vec::new()), Next::End]);
+    }
+
+    #[test]
+    fn every_flipped_bit_is_damage_and_every_shorter_file_is_torn_or_whole() {
+        let (bytes, first) = two();
+        for bit in 0..bytes.len() * 8 {
+            let mut flipped = bytes.clone();
+            flipped[bit / 8] ^= 1 << (bit % 8);
+            assert_eq!(*all(&flipped).0.last().unwrap(), Next::Damaged, "bit {bit}");
+        }
+        for length in 0..bytes.len() {
+            let (found, whole) = all(&bytes[..length]);
+            let end = if length == 0 || length == first { Next::End } else { Next::Torn };
+            assert_eq!(*found.last().unwrap(), end, "{length} bytes");
+            assert_eq!(whole as usize, if length >= first { first } else { 0 });
+        }
+    }
+}

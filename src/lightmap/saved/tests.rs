@@ -1,0 +1,319 @@
+//! Tests of results and checkpoints: what comes back has the bits of one bake, whatever was cut off, put together or
+//! killed in between; what is damaged or foreign is refused and changes nothing.
+
+use crate::bvh::BuildOptions;
+use crate::error::{Error, Result};
+use crate::lightmap::{BakeParams, CheckpointParams, Layer, LayerData, Lightmap, LightmapDesc};
+use crate::progress::Progress;
+use crate::scene::{Light, Scene, builtin};
+use crate::{Device, DeviceOptions, Isa};
+use std::path::{Path, PathBuf};
+use std::sync::atomic::{AtomicU32, Ordering::Relaxed};
+
+/// A file of its own, deleted in the end.
+struct Place(PathBuf);
+
+impl Place {
+    fn new() -> Place {
+        static COUNT: AtomicU32 = AtomicU32::new(0);
+        let name = format!("bakelite-saved-{}-{}", std::process::id(), COUNT.fetch_add(1, Relaxed));
+        Place(std::env::temp_dir().join(name))
+    }
+
+    fn bytes(&self) -> Vec<u8> {
+        std::fs::read(&self.0).unwrap()
+    }
+
+    fn of(bytes: &[u8]) -> Place {
+        let place = Place::new();
+        std::fs::write(&place.0, bytes).unwrap();
+        place
+    }
+}
+
+impl Drop for Place {
+    fn drop(&mut self) {
+        let _ = std::fs::remove_file(&self.0);
+    }
+}
+
+fn lightmap_with(threads: usize, texels_per_unit: f32) -> Lightmap {
+    lightmap_on(DeviceOptions { num_threads: threads, ..Default::default() }, texels_per_unit)
+}
+
+fn lightmap_on(device: DeviceOptions, texels_per_unit: f32) -> Lightmap {
+    let device = Device::new(device).unwrap();
+    let mut data = builtin("cornell").unwrap();
+    data.add_light(lamp(0.5)).unwrap();
+    let scene = Scene::commit(&device, data, &BuildOptions::default(), &Progress::none()).map_err(|e| e.1).unwrap();
+    let desc = LightmapDesc { texels_per_unit, page_size: 128, ..Default::default() };
+    Lightmap::create(&scene, &desc, &Progress::none()).unwrap()
+}
+
+fn lamp(intensity: f32) -> Light {
+    Light::Point { position: glam::Vec3::new(0.3, 0.3, 0.3), intensity: [intensity; 3] }
+}
+
+fn lightmap(threads: usize) -> Lightmap {
+    lightmap_with(threads, 20.0)
+}
+
+/// Bakes in a moment and runs every stage.
+fn params() -> BakeParams {
+    BakeParams { photon_count: 10_000, gather_rays: 16, direct_samples: 2, seed: 3, ..Default::default() }
+}
+
+fn bake(threads: usize, params: &BakeParams) -> Lightmap {
+    let mut map = lightmap(threads);
+    map.bake(params, &Progress::none()).unwrap();
+    map
+}
+
+/// All that a light map shows.
+fn bits(map: &Lightmap) -> Vec<u32> {
+    let mut all = Vec::new();
+    for page in 0..map.info().page_count {
+        for layer in [Layer::Combined, Layer::Indirect, Layer::Direct, Layer::Radiance, Layer::Validity, Layer::Normal]
+        {
+            match map.read(page, layer).unwrap() {
+                LayerData::Rgb(v) => all.extend(v.iter().flatten().map(|x| x.to_bits())),
+                LayerData::Scalar(v) => all.extend(v.iter().map(|x| x.to_bits())),
+                LayerData::Integer(v) => all.extend(v),
+            }
+        }
+    }
+    all
+}
+
+/// Says how many numbers differ, not which.
+#[track_caller]
+fn assert_same(a: &Lightmap, b: &Lightmap, what: &str) {
+    let (a, b) = (bits(a), bits(b));
+    let different: Vec<usize> = (0..a.len().max(b.len())).filter(|&i| a.get(i) != b.get(i)).collect();
+    assert!(different.is_empty(), "{what}: {} of {} differ, first {}", different.len(), b.len(), different[0]);
+}
+
+fn save(map: &Lightmap) -> Place {
+    let place = Place::new();
+    map.save_result(&place.0, &Progress::none()).unwrap();
+    place
+}
+
+fn load(map: &mut Lightmap, path: &Path) -> Result<()> {
+    map.load_result(path, &Progress::none())
+}
+
+#[test]
+fn a_result_comes_back_with_every_bit_and_its_plan() {
+    let baked = bake(2, &params());
+    let file = save(&baked);
+    let mut map = lightmap(1);
+    load(&mut map, &file.0).unwrap();
+    assert!(bits(&map) == bits(&baked));
+    assert_eq!(map.plan_text(), baked.plan_text());
+    // And goes out again as it came.
+    assert!(save(&map).bytes() == file.bytes());
+}
+
+#[test]
+fn shards_put_together_in_any_order_are_one_bake() {
+    let whole = bake(2, &params());
+    let n = whole.info().texels;
+    let cuts = [0, n / 5, n / 2, n];
+    let shards: Vec<Place> = cuts
+        .windows(2)
+        .map(|w| save(&bake(1, &BakeParams { texel_begin: w[0], texel_end: w[1], ..params() })))
+        .collect();
+    for order in [[0, 1, 2], [2, 0, 1], [1, 2, 0]] {
+        let mut map = lightmap(2);
+        for i in order {
+            assert!(bits(&map_or_dark(&map)) != bits(&whole));
+            load(&mut map, &shards[i].0).unwrap();
+        }
+        assert_same(&map, &whole, &format!("{order:?}"));
+    }
+    // Two in one file, the third baked here.
+    let mut map = lightmap(2);
+    load(&mut map, &shards[2].0).unwrap();
+    load(&mut map, &shards[0].0).unwrap();
+    let two = save(&map);
+    let mut map = lightmap(2);
+    map.bake(&BakeParams { texel_begin: cuts[1], texel_end: cuts[2], ..params() }, &Progress::none()).unwrap();
+    load(&mut map, &two.0).unwrap();
+    assert_same(&map, &whole, "two in one file");
+}
+
+/// A light map with whatever light there is; [`bits`] needs some.
+fn map_or_dark(map: &Lightmap) -> Lightmap {
+    if map.read(0, Layer::Combined).is_ok() {
+        let file = save(map);
+        let mut copy = lightmap(1);
+        load(&mut copy, &file.0).unwrap();
+        return copy;
+    }
+    let mut dark = lightmap(1);
+    dark.bake(&BakeParams { gather_rays: 0, direct_samples: 1, seed: 99, ..params() }, &Progress::none()).unwrap();
+    dark
+}
+
+#[test]
+fn a_foreign_result_is_refused_by_name_and_changes_nothing() {
+    let n = lightmap(1).info().texels;
+    let shard = |p: BakeParams| save(&bake(1, &BakeParams { texel_end: n / 2, ..p }));
+    let file = shard(params());
+    let mut other_lights = lightmap(1);
+    other_lights.scene().set_light(0, lamp(0.6)).unwrap();
+    let e = load(&mut other_lights, &file.0).unwrap_err();
+    assert!(matches!(&e, Error::InvalidArgument(s) if s.contains("the lights") && !s.contains("geometry")), "{e}");
+    assert!(other_lights.read(0, Layer::Combined).is_err());
+    let e = load(&mut lightmap_with(1, 19.0), &file.0).unwrap_err();
+    assert!(e.to_string().contains("the light map's layout") && !e.to_string().contains("materials"), "{e}");
+    // Shards of two bakes do not mix.
+    let mut map = lightmap(1);
+    load(&mut map, &shard(BakeParams { seed: 4, ..params() }).0).unwrap();
+    let before = bits(&map);
+    assert!(matches!(load(&mut map, &file.0), Err(Error::InvalidState(_))));
+    assert!(bits(&map) == before);
+    // Nor can their mixture be saved.
+    map.bake(&BakeParams { texel_begin: n / 2, ..params() }, &Progress::none()).unwrap();
+    let place = Place::new();
+    assert!(matches!(map.save_result(&place.0, &Progress::none()), Err(Error::InvalidState(_))));
+    assert!(!place.0.exists());
+}
+
+#[test]
+fn isas_that_fuse_give_the_same_bits_and_share_results_and_others_are_refused() {
+    let of = |isa| lightmap_on(DeviceOptions { num_threads: 2, isa: Some(isa), ..Default::default() }, 20.0);
+    let mut baked: Vec<(Isa, Lightmap, Place)> = Vec::new();
+    for isa in Isa::available() {
+        let mut map = of(isa);
+        map.bake(&params(), &Progress::none()).unwrap();
+        let file = save(&map);
+        for (other, other_map, other_file) in &baked {
+            let loaded = load(&mut of(isa), &other_file.0);
+            if other.is_fused() == isa.is_fused() {
+                assert!(bits(&map) == bits(other_map), "{} and {} differ", isa.name(), other.name());
+                loaded.unwrap();
+            } else {
+                let e = loaded.unwrap_err();
+                assert!(e.to_string().contains("the instruction set (portable, here AVX2 or AVX-512)"), "{e}");
+            }
+        }
+        baked.push((isa, map, file));
+    }
+}
+
+#[test]
+fn a_damaged_or_cut_result_is_refused_and_changes_nothing() {
+    let baked = bake(2, &params());
+    let bytes = save(&baked).bytes();
+    let mut map = lightmap(2);
+    map.bake(&BakeParams { seed: 8, ..params() }, &Progress::none()).unwrap();
+    let before = bits(&map);
+    for i in 0..200 {
+        let at = i * 7919 * bytes.len() / (200 * 7919);
+        let mut flipped = bytes.clone();
+        flipped[at] ^= 1 << (i % 8);
+        for damaged in [&flipped[..], &bytes[..at]] {
+            let e = load(&mut map, &Place::of(damaged).0).expect_err("damage is not seen");
+            assert!(matches!(e, Error::Io(_) | Error::InvalidArgument(_)), "{e}");
+        }
+    }
+    assert!(bits(&map) == before);
+    assert!(matches!(load(&mut map, Path::new("no-such-file")), Err(Error::Io(_))));
+}
+
+#[test]
+fn loading_can_be_cancelled_and_saving_leaves_no_half_of_a_file() {
+    let baked = bake(2, &params());
+    let file = save(&baked);
+    let cancelling = || Progress::new(|f, _| f < 0.5);
+    let mut map = lightmap(2);
+    assert_eq!(map.load_result(&file.0, &cancelling()), Err(Error::Cancelled));
+    assert!(map.read(0, Layer::Combined).is_err());
+    let other = Place::of(b"old");
+    assert_eq!(baked.save_result(&other.0, &cancelling()), Err(Error::Cancelled));
+    assert_eq!(other.bytes(), b"old");
+}
+
+fn at(place: &Place) -> CheckpointParams {
+    CheckpointParams { path: place.0.clone(), seconds: 0.0 }
+}
+
+/// Bakes with a checkpoint that is written at once, and cancels at the given part of the way.
+fn bake_until(threads: usize, place: &Place, part: f32) -> Result<Lightmap> {
+    let mut map = lightmap(threads);
+    let progress = Progress::new(|f, _| f < part);
+    map.bake_with(&params(), Some(&at(place)), &progress).map(|_| map)
+}
+
+#[test]
+fn a_bake_that_ended_anywhere_goes_on_and_gives_the_same_bits() {
+    let whole = bits(&bake(2, &params()));
+    for (i, part) in [0.05, 0.25, 0.31, 0.4, 0.5, 0.61, 0.7, 0.9, 0.99].into_iter().enumerate() {
+        let place = Place::new();
+        assert_eq!(bake_until(1 + i % 2, &place, part).err(), Some(Error::Cancelled), "{part}");
+        let begun = std::fs::metadata(&place.0).unwrap().len();
+        let map = bake_until(2 - i % 2, &place, 2.0).unwrap();
+        assert!(bits(&map) == whole, "cancelled at {part}");
+        let complete = std::fs::metadata(&place.0).unwrap().len();
+        assert!(begun < complete);
+        // Of a complete bake nothing is computed or written again.
+        let mut map = lightmap(2);
+        let stats = map.bake_with(&params(), Some(&at(&place)), &Progress::none()).unwrap();
+        assert!(bits(&map) == whole);
+        assert_eq!((stats.photons.rays, stats.radiance.rays, stats.direct.rays), (0, 0, 0));
+        assert_eq!(std::fs::metadata(&place.0).unwrap().len(), complete);
+    }
+}
+
+#[test]
+fn a_checkpoint_cut_at_any_byte_goes_on_and_a_flipped_bit_is_refused() {
+    let whole = bits(&bake(2, &params()));
+    let place = Place::new();
+    bake_until(2, &place, 2.0).unwrap();
+    let bytes = place.bytes();
+    for i in 0..24 {
+        let cut = Place::of(&bytes[..bytes.len() * i / 24]);
+        assert!(bits(&bake_until(2, &cut, 2.0).unwrap()) == whole, "cut to {i}/24");
+    }
+    for i in 0..200 {
+        let mut flipped = bytes.clone();
+        let at = (i * bytes.len() + bytes.len() / 2) / 200;
+        flipped[at] ^= 1 << (i % 8);
+        let damaged = Place::of(&flipped);
+        assert!(matches!(bake_until(2, &damaged, 2.0), Err(Error::Io(_) | Error::InvalidArgument(_))), "byte {at}");
+        assert!(damaged.bytes() == flipped, "a file that is refused is changed");
+    }
+}
+
+#[test]
+fn a_foreign_or_used_checkpoint_is_refused_and_kept() {
+    let place = Place::new();
+    let _ = bake_until(2, &place, 0.5);
+    let bytes = place.bytes();
+    let mut map = lightmap(2);
+    let mut refused = |params: BakeParams, what: &str| {
+        let e = map.bake_with(&params, Some(&at(&place)), &Progress::none()).unwrap_err();
+        assert!(matches!(&e, Error::InvalidArgument(s) if s.contains(what)), "{e}");
+        assert!(place.bytes() == bytes);
+    };
+    refused(BakeParams { seed: 9, ..params() }, "seed (3, here 9)");
+    refused(BakeParams { texel_end: 10, ..params() }, "texel_end");
+    refused(BakeParams { radius: 0.25, ..params() }, "radius (0.0, here 0.25)");
+    // A result is no checkpoint, nor is anything else.
+    for other in [save(&bake(1, &params())).bytes(), b"some text".to_vec(), vec![0; 4096]] {
+        let other = Place::of(&other);
+        let before = other.bytes();
+        assert!(matches!(bake_until(1, &other, 2.0), Err(Error::Io(_))));
+        assert!(other.bytes() == before);
+    }
+    // While one bake uses it another one cannot.
+    let progress = Progress::new(|f, _| {
+        let second = f > 0.5 && matches!(bake_until(1, &place, 2.0), Err(Error::InvalidState(_)));
+        !second
+    });
+    assert_eq!(lightmap(2).bake_with(&params(), Some(&at(&place)), &progress).err(), Some(Error::Cancelled));
+    let bad = CheckpointParams { seconds: f64::NAN, ..at(&place) };
+    assert!(matches!(map.bake_with(&params(), Some(&bad), &Progress::none()), Err(Error::InvalidArgument(_))));
+}
