@@ -189,8 +189,13 @@ BK_API void bk_device_retain(bk_device *device);
 // from it, its threads are joined. NULL is ignored.
 BK_API void bk_device_release(bk_device *device);
 
-// The instruction set in use: a BK_ISA value other than BK_ISA_AUTO; BK_ISA_AUTO if device is NULL.
-BK_API uint32_t bk_device_isa(const bk_device *device);
+// Returns the instruction set in use: a BK_ISA value other than BK_ISA_AUTO; BK_ISA_AUTO if device is NULL.
+//
+// BK_ISA_AVX2 and BK_ISA_AVX512 give the same bits of hits and light. BK_ISA_PORTABLE rounds products and
+// sums apart where the others fuse them, so its bits differ: results and checkpoints of bakes are not exchanged
+// between it and the others.
+BK_API
+uint32_t bk_device_isa(const bk_device *device);
 
 // The number of worker threads; 0 if device is NULL.
 BK_API uint32_t bk_device_num_threads(const bk_device *device);
@@ -1111,6 +1116,19 @@ typedef struct bk_bake_params {
   // shows and no others. Done when all texels are baked. 0: no, any other value: yes. Live updates
   // do not stitch: their finished texels have the bits of a bake with 0. Default: 1.
   uint32_t stitch;
+  // Seconds between two writes of the checkpoint, 0 to 1e9. A process that is killed loses at most the
+  // work of so long; 0: of the blocks of texels under way. Default: 10.
+  float checkpoint_seconds;
+  // Name of a file, UTF-8, in which the bake keeps what it has done; NULL, the default: none. A bake with the
+  // same scene, lights, light map and parameters that finds the file goes on from it, whatever ended
+  // the one before (a cancel, an error, a kill), and gives the bits of a bake without a break, on any
+  // number of threads. The file is created if it is not there. It stays when the bake is complete:
+  // delete it when the light has been saved. bk_bake fails with BK_ERROR_INVALID_ARGUMENT if the file is of
+  // another bake (bk_last_error says in what it differs), with BK_ERROR_IO if it is damaged, is not a checkpoint or
+  // cannot be read or created, with BK_ERROR_INVALID_STATE if another bake is using it, and leaves it as it is. If it
+  // cannot be written later, as on a full disk, the bake goes on, logs a warning, and what the file
+  // holds stays whole.
+  const char *checkpoint;
 } bk_bake_params;
 
 // What one stage of a bake took.
@@ -1172,6 +1190,10 @@ BK_API void bk_bake_stats_init(bk_bake_stats *stats);
 //
 // params: NULL for the defaults. progress, user: told how far it is; NULL if not wanted. out: what
 // was done; NULL if not wanted.
+//
+// The same scene, lights, light map, parameters and seed give the same bits on any number of threads, in one
+// bake or in several of some texels each, and on AVX2 as on AVX-512; portable kernels, which round products and sums
+// apart, give others.
 //
 // All light is finite and >= 0: irradiance is cut off at 1e30 W/m2 per light.
 //
@@ -1277,6 +1299,40 @@ bk_result bk_lightmap_read(const bk_lightmap *lightmap,
 // Fails with BK_ERROR_IO, naming the file, if it cannot be written, with BK_ERROR_INVALID_STATE
 // before a bake, with BK_ERROR_UNSUPPORTED if the library was built without files.
 BK_API bk_result bk_lightmap_save(const bk_lightmap *lightmap, const char *path_prefix, uint32_t file_format);
+
+// Writes the light of all texels that have been baked so far to a file, from which bk_lightmap_load_result brings
+// it back, in another process or on another machine.
+//
+// path: UTF-8; the file is replaced as a whole or not at all. progress, user: the progress callback and its
+// pointer; progress may be NULL.
+//
+// Fails with BK_ERROR_INVALID_STATE before a bake, during one, or if bakes that differ in parameters or lights filled
+// the texels; with BK_ERROR_IO, naming the file, if it cannot be written; with BK_ERROR_CANCELLED if
+// progress says so.
+BK_API
+bk_result bk_lightmap_save_result(const bk_lightmap *lightmap,
+                                  const char *path,
+                                  bk_progress_fn progress,
+                                  void *user);
+
+// Takes over the light of a file that bk_lightmap_save_result wrote for a light map of the same scene, lights and
+// layout. Light of texels that the file does not have stays: so machines can bake some texels each (texel_begin
+// and texel_end of bk_bake_params, all else equal) and one of them loads all files, in any order; the light then
+// has the bits of one bake, and seams are stitched with the last texels.
+//
+// path: UTF-8. progress, user: the progress callback and its pointer; progress may be NULL.
+//
+// Fails with BK_ERROR_INVALID_ARGUMENT if the file is of another scene, light map or version of the library, of other
+// lights, or of another instruction set (AVX2 and AVX-512 are the same in this), and bk_last_error says which;
+// with BK_ERROR_INVALID_STATE if the file has some texels alone and the light map holds light of a bake with other
+// parameters, or another call is using the light map; with BK_ERROR_IO, naming the file, if it cannot be read, is
+// damaged, or is no result; with BK_ERROR_OUT_OF_MEMORY if it does not fit; with BK_ERROR_CANCELLED if progress says
+// so. A call that fails changes nothing.
+BK_API
+bk_result bk_lightmap_load_result(bk_lightmap *lightmap,
+                                  const char *path,
+                                  bk_progress_fn progress,
+                                  void *user);
 
 /* ================================================================================================
  * Live updates
