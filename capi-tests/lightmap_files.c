@@ -140,7 +140,7 @@ static void edges_of_given_charts_are_not_dark(bk_device *device) {
 /* 1 for covered, 0.5 for padding, 0 elsewhere; before a bake too. */
 static void validity_tells_covered_filled_and_empty(bk_device *device) {
     bk_scene *scene = room(device, 0.75f);
-    bk_lightmap *lightmap = lightmap_of(scene, 3);
+    bk_lightmap *lightmap = lightmap_of(scene, 1);
     bk_bake_params params = quick();
     float *light = (float *)malloc(sizeof(float) * 3 * PAGE * PAGE), *before, *after, *positions, *normals;
     uint32_t *triangles = (uint32_t *)malloc(sizeof(uint32_t) * PAGE * PAGE);
@@ -169,7 +169,7 @@ static void validity_tells_covered_filled_and_empty(bk_device *device) {
     }
     printf("%u texels empty, %u filled, %u covered\n", (unsigned)count[0], (unsigned)count[1], (unsigned)count[2]);
     CHECK(wrong == 0);
-    CHECK(count[0] > 0 && count[1] > 1000 && count[2] > 0);
+    CHECK(count[0] > 0 && count[1] > 500 && count[2] > 0);
     free(light);
     free(before);
     free(after);
