@@ -146,8 +146,8 @@ static void nulls(bk_device *device) {
     CHECK_ERROR(bk_scene_add_light(scene, NULL, NULL), ARGUMENT, "desc is NULL");
     CHECK_ERROR(bk_scene_set_light(NULL, 0, &light), ARGUMENT, "scene is NULL");
     CHECK_ERROR(bk_scene_set_light(scene, 0, NULL), ARGUMENT, "desc is NULL");
-    CHECK_ERROR(bk_scene_load_file(NULL, "a.obj", NULL), ARGUMENT, "scene is NULL");
-    CHECK_ERROR(bk_scene_load_file(scene, NULL, NULL), ARGUMENT, "path is NULL");
+    CHECK_ERROR(bk_scene_load_file(NULL, "a.obj", NULL, NULL, NULL, NULL), ARGUMENT, "scene is NULL");
+    CHECK_ERROR(bk_scene_load_file(scene, NULL, NULL, NULL, NULL, NULL), ARGUMENT, "path is NULL");
     CHECK_ERROR(bk_scene_load_builtin(NULL, "cornell"), ARGUMENT, "scene is NULL");
     CHECK_ERROR(bk_scene_load_builtin(scene, NULL), ARGUMENT, "name is NULL");
     CHECK_ERROR(bk_scene_set_build(NULL, &build), ARGUMENT, "scene is NULL");
@@ -204,8 +204,8 @@ static void nulls(bk_device *device) {
     CHECK_ERROR(bk_bake(NULL, NULL, NULL, NULL, NULL), ARGUMENT, "lightmap is NULL");
     CHECK_ERROR(bk_lightmap_read(NULL, 0, 0, BK_FORMAT_RGB32F, vector, 0), ARGUMENT, "lightmap is NULL");
     CHECK_ERROR(bk_lightmap_read(lightmap, 0, BK_LAYER_NORMAL, BK_FORMAT_RGB32F, NULL, 0), ARGUMENT, "dst is NULL");
-    CHECK_ERROR(bk_lightmap_save(NULL, "a", BK_FILE_EXR), ARGUMENT, "lightmap is NULL");
-    CHECK_ERROR(bk_lightmap_save(lightmap, NULL, BK_FILE_EXR), ARGUMENT, "path_prefix is NULL");
+    CHECK_ERROR(bk_lightmap_save(NULL, "a", BK_FILE_EXR, NULL, NULL), ARGUMENT, "lightmap is NULL");
+    CHECK_ERROR(bk_lightmap_save(lightmap, NULL, BK_FILE_EXR, NULL, NULL), ARGUMENT, "path_prefix is NULL");
     CHECK(bk_plan_describe(NULL, NULL, 0) == 0 && strstr(bk_last_error(), "lightmap is NULL"));
     CHECK(bk_plan_describe(lightmap, NULL, 5) == 0 && strstr(bk_last_error(), "dst is NULL"));
 
@@ -258,7 +258,7 @@ static void struct_sizes(bk_device *device) {
     CHECK_ERROR(bk_scene_set_build(scene, &build), ARGUMENT, "compact is 2, not 0 or 1");
     bk_load_info_init(&load);
     load.struct_size = 1;
-    CHECK_ERROR(bk_scene_load_file(scene, "a.obj", &load), ARGUMENT, "bk_load_info.struct_size is 1");
+    CHECK_ERROR(bk_scene_load_file(scene, "a.obj", NULL, NULL, NULL, &load), ARGUMENT, "bk_load_info.struct_size is 1");
 
     add_floor(scene);
     light = lamp_desc();
@@ -645,7 +645,7 @@ static void descriptions(bk_device *device) {
     CHECK_ERROR(bk_scene_add_mesh(scene, &mesh, NULL), STATE, "committed");
     CHECK_ERROR(bk_scene_add_light(scene, &light, NULL), STATE, "committed");
     CHECK_ERROR(bk_scene_load_builtin(scene, "cornell"), STATE, "committed");
-    CHECK_ERROR(bk_scene_load_file(scene, "a.obj", NULL), STATE, "committed");
+    CHECK_ERROR(bk_scene_load_file(scene, "a.obj", NULL, NULL, NULL, NULL), STATE, "committed");
     CHECK_ERROR(bk_scene_set_build(scene, &build), STATE, "committed");
     CHECK_OK(bk_scene_set_light(scene, 0, &light));
     CHECK_ERROR(bk_scene_set_light(scene, 1, &light), ARGUMENT, "light 1");
@@ -755,28 +755,28 @@ static void files(bk_device *device) {
     bk_light_desc lamp = lamp_desc();
     char path[1024];
 
-    CHECK_ERROR(bk_scene_load_file(scene, "no/such/file.obj", NULL), BK_ERROR_IO, "no/such/file.obj");
-    CHECK_ERROR(bk_scene_load_file(scene, "no/such/file.ply", NULL), BK_ERROR_IO, "no/such/file.ply");
-    CHECK_ERROR(bk_scene_load_file(scene, "no/such/file.glb", NULL), BK_ERROR_IO, "no/such/file.glb");
-    CHECK_ERROR(bk_scene_load_file(scene, "scene.max", NULL), BK_ERROR_UNSUPPORTED, "scene.max");
-    CHECK_ERROR(bk_scene_load_file(scene, "scene\xff.obj", NULL), ARGUMENT, "path is not UTF-8");
+    CHECK_ERROR(bk_scene_load_file(scene, "no/such/file.obj", NULL, NULL, NULL, NULL), BK_ERROR_IO, "no/such/file.obj");
+    CHECK_ERROR(bk_scene_load_file(scene, "no/such/file.ply", NULL, NULL, NULL, NULL), BK_ERROR_IO, "no/such/file.ply");
+    CHECK_ERROR(bk_scene_load_file(scene, "no/such/file.glb", NULL, NULL, NULL, NULL), BK_ERROR_IO, "no/such/file.glb");
+    CHECK_ERROR(bk_scene_load_file(scene, "scene.max", NULL, NULL, NULL, NULL), BK_ERROR_UNSUPPORTED, "scene.max");
+    CHECK_ERROR(bk_scene_load_file(scene, "scene\xff.obj", NULL, NULL, NULL, NULL), ARGUMENT, "path is not UTF-8");
     snprintf(path, sizeof path, "%smalformed.obj", prefix);
     write_file(path, "v 0 0 0\nv 1 0 0\nf 1 2 77\n");
-    CHECK_ERROR(bk_scene_load_file(scene, path, NULL), BK_ERROR_IO, "malformed.obj");
+    CHECK_ERROR(bk_scene_load_file(scene, path, NULL, NULL, NULL, NULL), BK_ERROR_IO, "malformed.obj");
     snprintf(path, sizeof path, "%smalformed.ply", prefix);
     write_file(path, "ply\nformat ascii 1.0\nelement vertex 3\nproperty float x\nend_header\n0\n");
-    CHECK_ERROR(bk_scene_load_file(scene, path, NULL), BK_ERROR_IO, "malformed.ply");
+    CHECK_ERROR(bk_scene_load_file(scene, path, NULL, NULL, NULL, NULL), BK_ERROR_IO, "malformed.ply");
     snprintf(path, sizeof path, "%smalformed.glb", prefix);
     write_file(path, "glTF but not really");
-    CHECK_ERROR(bk_scene_load_file(scene, path, NULL), BK_ERROR_IO, "malformed.glb");
+    CHECK_ERROR(bk_scene_load_file(scene, path, NULL, NULL, NULL, NULL), BK_ERROR_IO, "malformed.glb");
     CHECK(bk_scene_mesh_count(scene) == 0);
 
     snprintf(path, sizeof path, "%sfloor.obj", prefix);
     write_file(path, "v 0 0 0\nv 1 0 0\nv 1 1 0\nv 0 1 0\nf 1 2 3 4\n");
     bk_load_info_init(&info);
-    CHECK_OK(bk_scene_load_file(scene, path, &info));
+    CHECK_OK(bk_scene_load_file(scene, path, NULL, NULL, NULL, &info));
     CHECK(info.meshes == 1 && info.triangles == 2 && info.first_mesh == 0 && info.materials >= 1);
-    CHECK_OK(bk_scene_load_file(scene, path, &info));
+    CHECK_OK(bk_scene_load_file(scene, path, NULL, NULL, NULL, &info));
     CHECK(info.first_mesh == 1 && info.first_material >= 1);
     CHECK_OK(bk_scene_add_light(scene, &lamp, NULL));
     CHECK_OK(bk_scene_commit(scene, NULL, NULL));
@@ -939,7 +939,7 @@ static void bakes(bk_device *device) {
 
     CHECK_ERROR(bk_lightmap_read(lightmap, 0, BK_LAYER_COMBINED, BK_FORMAT_RGB32F, pixels, 0), STATE, "baked");
     snprintf(path, sizeof path, "%sunbaked-", prefix);
-    CHECK_ERROR(bk_lightmap_save(lightmap, path, BK_FILE_EXR), STATE, "baked");
+    CHECK_ERROR(bk_lightmap_save(lightmap, path, BK_FILE_EXR, NULL, NULL), STATE, "baked");
     bake = quick_bake();
     CHECK_OK(bk_bake(lightmap, &bake, NULL, NULL, NULL));
     CHECK_ERROR(bk_lightmap_read(lightmap, 9, BK_LAYER_COMBINED, BK_FORMAT_RGB32F, pixels, 0), ARGUMENT, "page is 9");
@@ -949,8 +949,8 @@ static void bakes(bk_device *device) {
     CHECK_ERROR(bk_lightmap_read(lightmap, 0, BK_LAYER_TRIANGLE, BK_FORMAT_RGB32F, pixels, 0), ARGUMENT, "Triangle");
     CHECK_ERROR(bk_lightmap_read(lightmap, 0, BK_LAYER_COMBINED, BK_FORMAT_RGB32F, pixels, 32), ARGUMENT,
                 "row_stride is 32");
-    CHECK_ERROR(bk_lightmap_save(lightmap, path, 9), ARGUMENT, "file_format is 9");
-    CHECK_ERROR(bk_lightmap_save(lightmap, "no/such/folder/x", BK_FILE_PNG), BK_ERROR_IO, "no/such/folder/x");
+    CHECK_ERROR(bk_lightmap_save(lightmap, path, 9, NULL, NULL), ARGUMENT, "file_format is 9");
+    CHECK_ERROR(bk_lightmap_save(lightmap, "no/such/folder/x", BK_FILE_PNG, NULL, NULL), BK_ERROR_IO, "no/such/folder/x");
     CHECK_OK(bk_lightmap_read(lightmap, 0, BK_LAYER_COMBINED, BK_FORMAT_RGB32F, pixels, 0));
     bk_lightmap_release(lightmap);
     bk_scene_release(scene);

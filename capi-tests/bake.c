@@ -345,11 +345,11 @@ static void bake(const bk_scene *scene, const char *prefix) {
     free(first);
     free(second);
 
-    CHECK_OK(bk_lightmap_save(lightmap, prefix, BK_FILE_EXR));
+    CHECK_OK(bk_lightmap_save(lightmap, prefix, BK_FILE_EXR, NULL, NULL));
     CHECK(file_exists(prefix, "page0-combined.exr") && file_exists(prefix, "page0-radiance.exr"));
-    CHECK_OK(bk_lightmap_save(lightmap, prefix, BK_FILE_PNG));
+    CHECK_OK(bk_lightmap_save(lightmap, prefix, BK_FILE_PNG, NULL, NULL));
     CHECK(file_exists(prefix, "page0-direct.png") && file_exists(prefix, "page0-indirect.png"));
-    CHECK_OK(bk_lightmap_save(lightmap, prefix, BK_FILE_GLB));
+    CHECK_OK(bk_lightmap_save(lightmap, prefix, BK_FILE_GLB, NULL, NULL));
     CHECK(file_exists(prefix, "scene.glb"));
 
     bk_lightmap_release(lightmap);

@@ -405,6 +405,6 @@ int main(int argc, char **argv) {
     scene.reset();
     const bk_bake_params params = quick();
     CHECK_OK(bk_bake(lightmap.get(), &params, nullptr, nullptr, nullptr));
-    CHECK_OK(bk_lightmap_save(lightmap.get(), argc > 1 ? argv[1] : "", BK_FILE_GLB));
+    CHECK_OK(bk_lightmap_save(lightmap.get(), argc > 1 ? argv[1] : "", BK_FILE_GLB, nullptr, nullptr));
     return check_report("bake_cpp");
 }

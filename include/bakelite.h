@@ -215,6 +215,10 @@ BK_API uint32_t bk_device_num_threads(const bk_device *device);
  * magnitude of 1e12.
  * ================================================================================================ */
 
+// The files that a scene file names may lie in any folder. For scenes whose author is trusted: such a scene learns
+// what files there are, and brings their texels into its light.
+#define BK_LOAD_ANY_FOLDER 1
+
 // Binned SAH.
 #define BK_BUILD_QUALITY_DEFAULT 0
 
@@ -255,6 +259,22 @@ typedef struct bk_load_info {
   // Number of the first texture added.
   uint32_t first_texture;
 } bk_load_info;
+
+// Which files a scene may consist of, and how much of them.
+typedef struct bk_load_params {
+  // Size of this structure in bytes, set by bk_load_params_init.
+  uint32_t struct_size;
+  // BK_LOAD_ANY_FOLDER or 0. Default: 0.
+  uint32_t flags;
+  // UTF-8. Files that the scene names (material libraries, images, buffers) must lie in this folder or below,
+  // symbolic links resolved. NULL, the default: in the scene file's own folder or below. Read only inside the call.
+  const char *base_folder;
+  // Most bytes of all decoded images together, 4 per texel. It is looked at before an image is decoded. (While one
+  // is decoded, its own format takes up to 8 bytes per texel more.) Default: 2 GiB.
+  uint64_t max_texture_bytes;
+  // Most bytes of all files together, the scene file included. Default: 16 GiB.
+  uint64_t max_file_bytes;
+} bk_load_params;
 
 // How to build the acceleration structure.
 typedef struct bk_build_params {
@@ -317,16 +337,31 @@ BK_API void bk_scene_release(bk_scene *scene);
 // Sets struct_size and clears the rest.
 BK_API void bk_load_info_init(bk_load_info *info);
 
+// Fills in the defaults.
+BK_API void bk_load_params_init(bk_load_params *params);
+
 // Adds what a scene file describes: meshes, materials (emissive ones included) with their textures (PNG and
 // JPEG), lights.
 //
-// path: UTF-8, ending in .obj (with its .mtl), .ply, .gltf or .glb. out: what was added; NULL if
-// not wanted.
+// path: UTF-8, ending in .obj (with its .mtl), .ply, .gltf or .glb. params: NULL for the defaults. progress, user:
+// told how far it is, and may cancel; NULL if not wanted. out: what was added; NULL if not wanted.
 //
-// Fails with BK_ERROR_IO, naming the file, if it cannot be read or is malformed, with
-// BK_ERROR_UNSUPPORTED if its kind is unknown or the library was built without files; the scene is
-// as before then.
-BK_API bk_result bk_scene_load_file(bk_scene *scene, const char *path, bk_load_info *out);
+// Only regular files are read, never devices, FIFOs or sockets. A material library or an image that cannot be read,
+// or that lies where params allow none, is told to the device's log as a warning, and materials do without; a buffer
+// of a glTF file that cannot be read is an error.
+//
+// Fails with BK_ERROR_IO, naming the file, if it cannot be read or is malformed, with BK_ERROR_UNSUPPORTED if its
+// kind is unknown or the library was built without files, with BK_ERROR_OUT_OF_MEMORY beyond a limit of params, if
+// the memory callback refuses or memory runs out, with BK_ERROR_CANCELLED, with BK_ERROR_INVALID_STATE after the
+// commit or inside a callback; the scene is as before then. Other calls that change the scene fail meanwhile with
+// BK_ERROR_INVALID_STATE.
+BK_API
+bk_result bk_scene_load_file(bk_scene *scene,
+                             const char *path,
+                             const bk_load_params *params,
+                             bk_progress_fn progress,
+                             void *user,
+                             bk_load_info *out);
 
 // Adds a scene made by code, with its lights: "cornell" (the Cornell box), "furnace" (a closed,
 // glowing cube) or "atrium" (a two-floor court in the sun).
@@ -1269,7 +1304,13 @@ BK_API size_t bk_plan_describe(const bk_lightmap *lightmap, char *dst, size_t ca
 // Tone-mapped 8-bit images of the light layers, to look at: PREFIXpageN-LAYER.png.
 #define BK_FILE_PNG 2
 
-// The scene with the light map as second texture, for any viewer: PREFIXscene.glb.
+// The scene with its light map, for viewers and engines: PREFIXscene.glb (glTF 2.0). The light map is read through
+// TEXCOORD_1. Materials without a texture of their own are unlit and have the light map as baseColorTexture, so that
+// any viewer shows the light. Others keep their texture as baseColorTexture on TEXCOORD_0 and have the light map as
+// occlusionTexture on TEXCOORD_1: viewers with light of their own dim it by that, and importers find it there.
+// Each page is an 8-bit sRGB image of irradiance times an exposure, bent above 0.6; the extras of the asset and of
+// each material say which texture, the exposure and the curve. Triangles whose back has texels of its own are there
+// twice, one-sided.
 #define BK_FILE_GLB 3
 
 // Copies one layer of one page.
@@ -1294,11 +1335,22 @@ bk_result bk_lightmap_read(const bk_lightmap *lightmap,
 // Writes a baked light map to files.
 //
 // path_prefix: UTF-8, put before the file names that the BK_FILE values state, as "out/" for files
-// in the folder out, which must exist. file_format: one of the BK_FILE values.
+// in the folder out, which must exist. file_format: one of the BK_FILE values. progress, user: told how far it is,
+// and may cancel; NULL if not wanted.
 //
-// Fails with BK_ERROR_IO, naming the file, if it cannot be written, with BK_ERROR_INVALID_STATE
-// before a bake, with BK_ERROR_UNSUPPORTED if the library was built without files.
-BK_API bk_result bk_lightmap_save(const bk_lightmap *lightmap, const char *path_prefix, uint32_t file_format);
+// Each file is written beside the old one of its name (NAME.part), flushed to disk, and renamed: whatever ends the
+// call early, a full disk, a cancel or a kill, each old file is there as a whole or replaced as a whole. After a kill
+// NAME.part may be left; the next save writes over it.
+//
+// Fails with BK_ERROR_IO, naming the file, if it cannot be written or another call is writing it, with
+// BK_ERROR_INVALID_STATE before a bake or inside a callback, with BK_ERROR_CANCELLED, with BK_ERROR_OUT_OF_MEMORY,
+// with BK_ERROR_UNSUPPORTED if the library was built without files or a GLB file would have more than 4 GiB.
+BK_API
+bk_result bk_lightmap_save(const bk_lightmap *lightmap,
+                           const char *path_prefix,
+                           uint32_t file_format,
+                           bk_progress_fn progress,
+                           void *user);
 
 // Writes the light of all texels that have been baked so far to a file, from which bk_lightmap_load_result brings
 // it back, in another process or on another machine.

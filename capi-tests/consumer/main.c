@@ -25,7 +25,7 @@ int main(void) {
     desc.page_size = 128;
     check(bk_lightmap_create(scene, &desc, NULL, NULL, &lightmap));
     check(bk_bake(lightmap, NULL, NULL, NULL, NULL));
-    check(bk_lightmap_save(lightmap, "cornell-", BK_FILE_PNG));
+    check(bk_lightmap_save(lightmap, "cornell-", BK_FILE_PNG, NULL, NULL));
 
     bk_lightmap_release(lightmap);
     bk_scene_release(scene);

@@ -110,7 +110,7 @@ Scene::Scene(const std::string &name, const Setup &setup) {
     if (!device) fail(std::string("this machine has no ") + ISA_NAMES[setup.isa]);
     check(bk_scene_create(device, &scene));
     const bool file = name.find('.') != std::string::npos;
-    check(file ? bk_scene_load_file(scene, name.c_str(), nullptr) : bk_scene_load_builtin(scene, name.c_str()));
+    check(file ? bk_scene_load_file(scene, name.c_str(), nullptr, nullptr, nullptr, nullptr) : bk_scene_load_builtin(scene, name.c_str()));
     bk_build_params params;
     bk_build_params_init(&params);
     params.quality = setup.quality;

@@ -72,7 +72,7 @@ void LiveLight::load(const Options &options) {
     if (is_scene_file(options.scene)) {
         add(load_scene_file(options.scene));
     } else {
-        check(is_file ? bk_scene_load_file(scene.get(), options.scene.c_str(), nullptr)
+        check(is_file ? bk_scene_load_file(scene.get(), options.scene.c_str(), nullptr, nullptr, nullptr, nullptr)
                       : bk_scene_load_builtin(scene.get(), options.scene.c_str()));
         // The library does not tell the materials that it has loaded: they are drawn in grey.
         materials.emplace_back();

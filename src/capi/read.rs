@@ -7,6 +7,7 @@ use super::handles::{is_null, object};
 use super::lightmap::bk_lightmap;
 use crate::error::{Error, Result, invalid_argument};
 use crate::lightmap::{Layer, LayerData, Lightmap};
+use crate::progress::Progress;
 use std::ffi::{c_char, c_void};
 
 /// Irradiance, direct and indirect, in W/m2. RGB: BK_FORMAT_RGB32F or BK_FORMAT_RGBA16F.
@@ -181,51 +182,58 @@ fn half_bits(x: f32) -> u16 {
 pub const BK_FILE_EXR: u32 = 1;
 /// Tone-mapped 8-bit images of the light layers, to look at: PREFIXpageN-LAYER.png.
 pub const BK_FILE_PNG: u32 = 2;
-/// The scene with the light map as second texture, for any viewer: PREFIXscene.glb.
+/// The scene with its light map, for viewers and engines: PREFIXscene.glb (glTF 2.0). The light map is read through
+/// TEXCOORD_1. Materials without a texture of their own are unlit and have the light map as baseColorTexture, so that
+/// any viewer shows the light. Others keep their texture as baseColorTexture on TEXCOORD_0 and have the light map as
+/// occlusionTexture on TEXCOORD_1: viewers with light of their own dim it by that, and importers find it there.
+/// Each page is an 8-bit sRGB image of irradiance times an exposure, bent above 0.6; the extras of the asset and of
+/// each material say which texture, the exposure and the curve. Triangles whose back has texels of its own are there
+/// twice, one-sided.
 pub const BK_FILE_GLB: u32 = 3;
 
 /// Writes a baked light map to files.
 ///
 /// path_prefix: UTF-8, put before the file names that the BK_FILE values state, as "out/" for files
-/// in the folder out, which must exist. file_format: one of the BK_FILE values.
+/// in the folder out, which must exist. file_format: one of the BK_FILE values. progress, user: told how far it is,
+/// and may cancel; NULL if not wanted.
 ///
-/// Fails with BK_ERROR_IO, naming the file, if it cannot be written, with BK_ERROR_INVALID_STATE
-/// before a bake, with BK_ERROR_UNSUPPORTED if the library was built without files.
+/// Each file is written beside the old one of its name (NAME.part), flushed to disk, and renamed: whatever ends the
+/// call early, a full disk, a cancel or a kill, each old file is there as a whole or replaced as a whole. After a kill
+/// NAME.part may be left; the next save writes over it.
+///
+/// Fails with BK_ERROR_IO, naming the file, if it cannot be written or another call is writing it, with
+/// BK_ERROR_INVALID_STATE before a bake or inside a callback, with BK_ERROR_CANCELLED, with BK_ERROR_OUT_OF_MEMORY,
+/// with BK_ERROR_UNSUPPORTED if the library was built without files or a GLB file would have more than 4 GiB.
 #[unsafe(no_mangle)]
 pub unsafe extern "C" fn bk_lightmap_save(
     lightmap: *const bk_lightmap,
     path_prefix: *const c_char,
     file_format: u32,
+    progress: bk_progress_fn,
+    user: *mut c_void,
 ) -> bk_result {
     call(|| {
         refuse_in_callback()?;
         let lightmap = object!(lightmap);
         // SAFETY: path_prefix is the caller's, or NULL.
         let prefix = unsafe { text(path_prefix, "path_prefix") }?;
-        lightmap.read(|l| save(l, prefix, file_format))
+        lightmap.read(|l| save(l, prefix, file_format, &self::progress(progress, user)))
     })
 }
 
 #[cfg(feature = "io")]
-fn save(lightmap: &Lightmap, prefix: &str, file_format: u32) -> Result<()> {
+fn save(lightmap: &Lightmap, prefix: &str, file_format: u32, progress: &Progress) -> Result<()> {
     use crate::io::lightmaps;
-    use crate::progress::Progress;
     match file_format {
-        BK_FILE_EXR => lightmaps::write_exr_pages(lightmap, prefix, &Progress::none()).map(drop),
-        BK_FILE_PNG => {
-            let exposure = lightmaps::exposure(lightmap)?;
-            lightmaps::write_png_pages(lightmap, prefix, exposure, &Progress::none()).map(drop)
-        }
-        BK_FILE_GLB => {
-            let path = format!("{prefix}scene.glb");
-            lightmaps::write_scene(lightmap, path.as_ref(), lightmaps::exposure(lightmap)?)
-        }
+        BK_FILE_EXR => lightmaps::write_exr_pages(lightmap, prefix, progress).map(drop),
+        BK_FILE_PNG => lightmaps::write_png_pages(lightmap, prefix, None, progress).map(drop),
+        BK_FILE_GLB => lightmaps::write_scene(lightmap, format!("{prefix}scene.glb").as_ref(), None, progress),
         other => invalid_argument!("file_format is {other}, not one of the BK_FILE values"),
     }
 }
 
 #[cfg(not(feature = "io"))]
-fn save(_: &Lightmap, prefix: &str, _: u32) -> Result<()> {
+fn save(_: &Lightmap, prefix: &str, _: u32, _: &Progress) -> Result<()> {
     Err(Error::Unsupported(format!("the library was built without files and cannot write {prefix}")))
 }
 

@@ -11,7 +11,7 @@
 //! counter-clockwise front faces, linear RGB, all surfaces diffuse. Coordinates are valid up to a
 //! magnitude of 1e12.
 
-use super::args::{OutStruct, init, read_struct, sized_struct, text, write};
+use super::args::{OutStruct, SizedStruct, check_flags, init, read_struct, sized_struct, text, write};
 use super::device::{bk_device, bk_progress_fn, progress, refuse_in_callback};
 use super::error::{bk_result, call, call_or};
 use super::handles::{create, hold, object, release, retain};
@@ -19,6 +19,7 @@ use super::shared::{Reading, Shared};
 use crate::bvh::{BuildOptions, BuildQuality};
 use crate::device::Device;
 use crate::error::{Error, Result, invalid_argument};
+use crate::progress::Progress;
 use crate::scene::{Scene, SceneData, builtin};
 use glam::Vec3;
 use std::ffi::{c_char, c_void};
@@ -199,27 +200,94 @@ pub unsafe extern "C" fn bk_load_info_init(info: *mut bk_load_info) {
     unsafe { init(info) }
 }
 
+/// The files that a scene file names may lie in any folder. For scenes whose author is trusted: such a scene learns
+/// what files there are, and brings their texels into its light.
+pub const BK_LOAD_ANY_FOLDER: u32 = 1;
+
+/// Which files a scene may consist of, and how much of them.
+#[repr(C)]
+#[derive(Clone, Copy)]
+pub struct bk_load_params {
+    /// Size of this structure in bytes, set by bk_load_params_init.
+    pub struct_size: u32,
+    /// BK_LOAD_ANY_FOLDER or 0. Default: 0.
+    pub flags: u32,
+    /// UTF-8. Files that the scene names (material libraries, images, buffers) must lie in this folder or below,
+    /// symbolic links resolved. NULL, the default: in the scene file's own folder or below. Read only inside the call.
+    pub base_folder: *const c_char,
+    /// Most bytes of all decoded images together, 4 per texel. It is looked at before an image is decoded. (While one
+    /// is decoded, its own format takes up to 8 bytes per texel more.) Default: 2 GiB.
+    pub max_texture_bytes: u64,
+    /// Most bytes of all files together, the scene file included. Default: 16 GiB.
+    pub max_file_bytes: u64,
+}
+
+#[cfg(feature = "io")]
+fn default_limits() -> [u64; 2] {
+    let options = crate::io::LoadOptions::default();
+    [options.max_texture_bytes, options.max_file_bytes]
+}
+
+#[cfg(not(feature = "io"))]
+fn default_limits() -> [u64; 2] {
+    [0; 2]
+}
+
+sized_struct!(bk_load_params, last: max_file_bytes: u64, defaults: {
+    let [max_texture_bytes, max_file_bytes] = default_limits();
+    bk_load_params {
+        struct_size: size_of::<bk_load_params>() as u32,
+        flags: 0,
+        base_folder: std::ptr::null(),
+        max_texture_bytes,
+        max_file_bytes,
+    }
+});
+
+/// Fills in the defaults.
+#[unsafe(no_mangle)]
+pub unsafe extern "C" fn bk_load_params_init(params: *mut bk_load_params) {
+    // SAFETY: the caller's structure, or NULL.
+    unsafe { init(params) }
+}
+
 /// Adds what a scene file describes: meshes, materials (emissive ones included) with their textures (PNG and
 /// JPEG), lights.
 ///
-/// path: UTF-8, ending in .obj (with its .mtl), .ply, .gltf or .glb. out: what was added; NULL if
-/// not wanted.
+/// path: UTF-8, ending in .obj (with its .mtl), .ply, .gltf or .glb. params: NULL for the defaults. progress, user:
+/// told how far it is, and may cancel; NULL if not wanted. out: what was added; NULL if not wanted.
 ///
-/// Fails with BK_ERROR_IO, naming the file, if it cannot be read or is malformed, with
-/// BK_ERROR_UNSUPPORTED if its kind is unknown or the library was built without files; the scene is
-/// as before then.
+/// Only regular files are read, never devices, FIFOs or sockets. A material library or an image that cannot be read,
+/// or that lies where params allow none, is told to the device's log as a warning, and materials do without; a buffer
+/// of a glTF file that cannot be read is an error.
+///
+/// Fails with BK_ERROR_IO, naming the file, if it cannot be read or is malformed, with BK_ERROR_UNSUPPORTED if its
+/// kind is unknown or the library was built without files, with BK_ERROR_OUT_OF_MEMORY beyond a limit of params, if
+/// the memory callback refuses or memory runs out, with BK_ERROR_CANCELLED, with BK_ERROR_INVALID_STATE after the
+/// commit or inside a callback; the scene is as before then. Other calls that change the scene fail meanwhile with
+/// BK_ERROR_INVALID_STATE.
 #[unsafe(no_mangle)]
 pub unsafe extern "C" fn bk_scene_load_file(
     scene: *mut bk_scene,
     path: *const c_char,
+    params: *const bk_load_params,
+    progress: bk_progress_fn,
+    user: *mut c_void,
     out: *mut bk_load_info,
 ) -> bk_result {
-    // SAFETY: path and out are the caller's, or NULL.
+    // SAFETY: path, params and out are the caller's, or NULL.
     call(|| unsafe {
-        let scene = object!(scene);
+        refuse_in_callback()?;
+        let scene = hold(scene, "scene")?;
         let path = text(path, "path")?;
+        let params = if params.is_null() { bk_load_params::defaults() } else { read_struct(params, "params")? };
+        check_flags(params.flags, BK_LOAD_ANY_FOLDER, "flags")?;
+        let base = if params.base_folder.is_null() { None } else { Some(text(params.base_folder, "base_folder")?) };
         let out = OutStruct::optional(out, "out")?;
-        let info = scene.describe("files can be loaded", |d| load_file(&scene.device, &mut d.data, path))?;
+        let progress = self::progress(progress, user);
+        let info = scene.describe("files can be loaded", |d| {
+            load_file(&scene.device, &mut d.data, path, &params, base, &progress)
+        })?;
         if let Some(out) = out {
             out.write(info);
         }
@@ -228,10 +296,25 @@ pub unsafe extern "C" fn bk_scene_load_file(
 }
 
 #[cfg(feature = "io")]
-fn load_file(device: &Device, data: &mut SceneData, path: &str) -> Result<bk_load_info> {
+fn load_file(
+    device: &Device,
+    data: &mut SceneData,
+    path: &str,
+    params: &bk_load_params,
+    base_folder: Option<&str>,
+    progress: &Progress,
+) -> Result<bk_load_info> {
+    let options = crate::io::LoadOptions {
+        base_folder: base_folder.map(Into::into),
+        any_folder: params.flags & BK_LOAD_ANY_FOLDER != 0,
+        max_file_bytes: params.max_file_bytes,
+        max_texture_bytes: params.max_texture_bytes,
+        memory: device.memory().clone(),
+    };
     let (first_mesh, first_material) = (data.meshes().len() as u32, data.materials().len() as u32);
     let (first_light, first_texture) = (data.lights().len() as u32, data.textures().len() as u32);
-    let i = crate::io::load(path.as_ref(), data)?;
+    // The thread that called makes the reports meanwhile.
+    let i = device.run(progress, || crate::io::load_with(path.as_ref(), &options, progress, data))?;
     for warning in &i.warnings {
         device.log(crate::device::LogLevel::Warning, warning);
     }
@@ -252,7 +335,14 @@ fn load_file(device: &Device, data: &mut SceneData, path: &str) -> Result<bk_loa
 }
 
 #[cfg(not(feature = "io"))]
-fn load_file(_: &Device, _: &mut SceneData, path: &str) -> Result<bk_load_info> {
+fn load_file(
+    _: &Device,
+    _: &mut SceneData,
+    path: &str,
+    _: &bk_load_params,
+    _: Option<&str>,
+    _: &Progress,
+) -> Result<bk_load_info> {
     Err(Error::Unsupported(format!("the library was built without files and cannot read {path}")))
 }
 

@@ -1,18 +1,31 @@
-//! A scene with its light maps as one GLB file (glTF 2.0, binary), so that any viewer shows it.
+//! A scene with its light maps as one GLB file (glTF 2.0, binary), for viewers and engines.
 //!
-//! Each pair of light map page and material is a primitive. Its material is unlit
-//! (`KHR_materials_unlit`): `baseColorFactor` is the albedo, `baseColorTexture` the page, read
-//! through `TEXCOORD_1`. A viewer multiplies the two, so with pages that hold tone-mapped irradiance
-//! E it shows albedo × E × exposure, bent by the shoulder of [`super::image::tone_map`]: what an eye
-//! at the surface sees, albedo/π · E, up to a constant, as nothing but diffuse light is baked.
+//! Each pair of light map page and material is a primitive. `TEXCOORD_0` holds the mesh's first texture coordinates,
+//! or zeros; `TEXCOORD_1` those of the light map. glTF has no slot for light maps, so it depends on the material where
+//! the page goes:
+//! - A material without a texture is unlit (`KHR_materials_unlit`): `baseColorFactor` is the albedo,
+//!   `baseColorTexture` the page on `TEXCOORD_1`. A viewer multiplies the two, so it shows albedo × E × exposure, bent
+//!   by the shoulder of [`super::image::tone_map`]: what an eye at the surface sees, albedo/π · E, up to a constant.
+//! - A material with a texture keeps it as `baseColorTexture` on `TEXCOORD_0`, and has the page as `occlusionTexture`
+//!   on `TEXCOORD_1`. That is the one slot besides the base colour by which renderers multiply: viewers that light
+//!   the scene by an environment (three.js, Babylon.js, model-viewer) dim the texture by the page's red channel.
+//!   Importers keep image and coordinates together there: three.js as `aoMap` (to be moved to `lightMap`, for which
+//!   it uses the same second coordinates), Blender as image and UV map at the occlusion input, Godot as the ambient
+//!   occlusion texture (to be set to the second coordinates). `emissiveTexture`, the other candidate, is added and not
+//!   multiplied: it would hide the texture under the light.
+//!
+//! `extras` of the asset say how pages are encoded, `extras` of each material which texture is its page.
 //! Emissive materials are not unlit, since unlit ones do not glow: they carry `emissiveFactor` and
 //! `KHR_materials_emissive_strength`. Triangles without a chart show their albedo alone. Triangles both sides of which
 //! have places in the light map are written twice, the second time turned round, with one-sided materials.
 //!
-//! Pages are embedded as PNG files, row 0 at v = 0, without a flip (see [`super::image`]).
-//! `TEXCOORD_0` holds the mesh's first texture coordinates, or zeros. Normals are left out. Triangles
-//! that the scene skips (degenerate or not finite) are left out too.
+//! Images are embedded as PNG files, row 0 at v = 0, without a flip (see [`super::image`]). Holes become `alphaMode`
+//! `MASK`. Normals are written where meshes bring them. Triangles that the scene skips (degenerate or not finite) are
+//! left out.
 
+use super::account::Account;
+use super::image::encode_png;
+use super::source::Advance;
 use crate::error::{Error, Result, invalid_argument};
 use crate::files;
 use crate::lightmap::Lightmap;
@@ -55,31 +68,74 @@ impl GlbMesh {
 }
 
 /// The light maps of a scene.
-#[derive(Clone, Debug, Default, PartialEq)]
+#[derive(Clone, Debug, PartialEq)]
 pub struct GlbLightmap {
     /// One per mesh of the scene.
     pub meshes: Vec<GlbMesh>,
     /// One PNG file per page, as [`super::image::encode_png_rgb8`] makes them.
     pub pages: Vec<Vec<u8>>,
+    /// By which irradiance was multiplied in the pages.
+    pub exposure: f32,
 }
 
-/// Writes `scene` and its light maps to the file `path`.
+/// How pages are encoded, for the readers of a file. Constants as in [`super::image::tone_map`].
+const ENCODING: &str = "8-bit sRGB. To irradiance in W/m2 (per square unit of length): make c linear; m = max(c.r, c.g, \
+                        c.b); if m > 0.6, c = c * (0.6 - 0.4 * ln(1 - (m - 0.6) / 0.4)) / m; irradiance = c / exposure.";
+
+/// Writes `scene` and its light maps to the file `path`, which is replaced as a whole.
 pub fn write_glb(path: &Path, scene: &Scene, lightmap: &GlbLightmap) -> Result<()> {
-    files::replace_with(path, &encode_glb(scene, lightmap)?)
+    write_glb_with(path, scene, lightmap, &|_| Ok(()))
+}
+
+/// The same, with reports: `advance` is told of 2 parts, and ends the call by an error.
+pub(super) fn write_glb_with(path: &Path, scene: &Scene, lightmap: &GlbLightmap, advance: Advance) -> Result<()> {
+    let mut account = Account::new(scene.device().memory())?;
+    let (json, binary) = parts(scene, lightmap, &mut account, advance)?;
+    let headers = headers(&json, &binary)?;
+    advance(1)?;
+    files::replace(path, |file| {
+        for part in [&headers[0][..], &json, &headers[1], &binary] {
+            file.append(part, |_| advance(0))?;
+        }
+        Ok(())
+    })?;
+    advance(1)
 }
 
 /// The bytes of the file that [`write_glb`] writes.
 pub fn encode_glb(scene: &Scene, lightmap: &GlbLightmap) -> Result<Vec<u8>> {
+    let mut account = Account::new(scene.device().memory())?;
+    let (json, binary) = parts(scene, lightmap, &mut account, &|_| Ok(()))?;
+    let headers = headers(&json, &binary)?;
+    Ok([&headers[0][..], &json, &headers[1], &binary].concat())
+}
+
+/// The two chunks of the file, without their headers.
+fn parts(scene: &Scene, lightmap: &GlbLightmap, account: &mut Account, advance: Advance) -> Result<(Vec<u8>, Vec<u8>)> {
     check(scene, lightmap)?;
-    let mut file = File::default();
-    for ((page, material, one_sided), triangles) in group(scene, lightmap) {
-        let primitive = Primitive::new(scene, &triangles);
-        let material = scene.materials()[material as usize];
-        let material = Material { two_sided: material.two_sided && !one_sided, ..material };
-        file.add_primitive(&primitive, page, &material);
+    let mut file =
+        File { account, binary: Vec::new(), parts: Parts::default(), unlit: false, emissive_strength: false };
+    for (key, triangles) in group(scene, lightmap, file.account)? {
+        advance(0)?;
+        let primitive = Primitive::new(scene, &triangles, key.normals, file.account, advance)?;
+        let material = scene.materials()[key.material as usize];
+        let material = Material { two_sided: material.two_sided && !key.one_sided, ..material };
+        let textures = lightmap.pages.len();
+        file.add_primitive(&primitive, key.page, &material, textures)?;
     }
-    file.add_pages(&lightmap.pages);
-    file.finish()
+    for (page, png) in lightmap.pages.iter().enumerate() {
+        file.add_image(png, &format!("light map page {page}"), LIGHTMAP_SAMPLER)?;
+    }
+    for number in std::mem::take(&mut file.parts.own_textures) {
+        advance(0)?;
+        let texture = &scene.textures()[number as usize];
+        file.account.hold(2 * texture.bytes(), "an image")?;
+        let png = encode_png(texture.width, texture.height, &texture.rgba8, png::ColorType::Rgba, advance)?;
+        file.account.give_back(2 * texture.bytes());
+        file.add_image(&png, &format!("texture {number}"), TEXTURE_SAMPLER)?;
+    }
+    let exposure = lightmap.exposure;
+    Ok((file.json(exposure), file.binary))
 }
 
 fn check(scene: &Scene, lightmap: &GlbLightmap) -> Result<()> {
@@ -115,57 +171,96 @@ struct Triangle {
     /// Vertices and light map coordinates of its corners, in the order in which the side is a front.
     vertices: [u32; 3],
     corner_uvs: [[f32; 2]; 3],
+    is_back: bool,
 }
 
-/// The valid triangles of each (page, material, whether this side alone is to be shown).
-fn group(scene: &Scene, lightmap: &GlbLightmap) -> BTreeMap<(u32, u32, bool), Vec<Triangle>> {
-    let mut groups = BTreeMap::<_, Vec<_>>::new();
+/// What the triangles of a primitive have in common.
+#[derive(Clone, Copy, Eq, Ord, PartialEq, PartialOrd)]
+struct Key {
+    page: u32,
+    material: u32,
+    /// Whether this side alone is to be shown.
+    one_sided: bool,
+    /// Whether the meshes bring normals.
+    normals: bool,
+}
+
+/// The valid triangles of each primitive.
+fn group(scene: &Scene, lightmap: &GlbLightmap, account: &mut Account) -> Result<BTreeMap<Key, Vec<Triangle>>> {
+    let mut groups = BTreeMap::<Key, Vec<_>>::new();
     for (m, (mesh, uvs)) in (0..).zip(scene.meshes().iter().zip(&lightmap.meshes)) {
         let first = scene.first_triangle(m);
-        let backs: HashMap<usize, &GlbBack> = uvs.backs.iter().map(|b| (b.triangle as usize, b)).collect();
-        for t in (0..mesh.indices.len()).filter(|t| scene.is_valid(first + *t as u32)) {
-            let (vertices, back) = (mesh.indices[t], backs.get(&t));
-            let mut add = |page: u32, vertices, corner_uvs| {
-                let key = (page, mesh.material(t), back.is_some());
-                groups.entry(key).or_default().push(Triangle { mesh: m, vertices, corner_uvs });
+        let mut backs = uvs.backs.iter().peekable();
+        for t in 0..mesh.indices.len() {
+            let back = backs.next_if(|back| back.triangle as usize == t);
+            if !scene.is_valid(first + t as u32) {
+                continue;
+            }
+            let vertices = mesh.indices[t];
+            let mut add = |page, vertices, corner_uvs, is_back| {
+                let (material, normals) = (mesh.material(t), !mesh.normals.is_empty());
+                let key = Key { page, material, one_sided: back.is_some(), normals };
+                let triangle = Triangle { mesh: m, vertices, corner_uvs, is_back };
+                account.push(groups.entry(key).or_default(), triangle, "the triangles")
             };
-            add(uvs.pages[t], vertices, uvs.corner_uvs[t]);
+            add(uvs.pages[t], vertices, uvs.corner_uvs[t], false)?;
             if let Some(back) = back {
                 let turn = [0, 2, 1];
-                add(back.page, turn.map(|i| vertices[i]), turn.map(|i| back.corner_uvs[i]));
+                add(back.page, turn.map(|i| vertices[i]), turn.map(|i| back.corner_uvs[i]), true)?;
             }
         }
     }
-    groups
+    Ok(groups)
 }
 
 /// Indexed triangles with vertices shared by corners of one position and light map coordinate.
 #[derive(Default)]
 struct Primitive {
     positions: Vec<Vec3>,
+    /// Empty if there are none.
+    normals: Vec<Vec3>,
     uvs: Vec<Vec2>,
     lightmap_uvs: Vec<[f32; 2]>,
     indices: Vec<u32>,
 }
 
 impl Primitive {
-    fn new(scene: &Scene, triangles: &[Triangle]) -> Self {
-        let mut result = Primitive::default();
-        let mut vertex_of = HashMap::<(u32, u32, [u32; 2]), u32>::new();
-        for t in triangles {
+    fn new(
+        scene: &Scene,
+        triangles: &[Triangle],
+        normals: bool,
+        account: &mut Account,
+        advance: Advance,
+    ) -> Result<Self> {
+        let mut result = Primitive { indices: account.list(3 * triangles.len(), "the corners")?, ..Default::default() };
+        let mut vertex_of = HashMap::<(u32, u32, [u32; 2], bool), u32>::new();
+        for (i, t) in triangles.iter().enumerate() {
+            if i.is_multiple_of(1 << 14) {
+                advance(0)?;
+            }
             let mesh = &scene.meshes()[t.mesh as usize];
             for (&v, &lightmap_uv) in t.vertices.iter().zip(&t.corner_uvs) {
-                let vertex = *vertex_of.entry((t.mesh, v, lightmap_uv.map(f32::to_bits))).or_insert_with(|| {
-                    let uv = mesh.uvs.get(v as usize).copied().filter(|uv| uv.is_finite());
-                    result.positions.push(mesh.positions[v as usize]);
-                    result.uvs.push(uv.unwrap_or_default());
-                    result.lightmap_uvs.push(lightmap_uv);
-                    result.positions.len() as u32 - 1
-                });
+                let key = (t.mesh, v, lightmap_uv.map(f32::to_bits), t.is_back);
+                if let Some(vertex) = vertex_of.get(&key) {
+                    result.indices.push(*vertex);
+                    continue;
+                }
+                let vertex = result.positions.len() as u32;
+                account.make_room_in_map(&mut vertex_of, "the vertices")?;
+                vertex_of.insert(key, vertex);
+                account.push(&mut result.positions, mesh.positions[v as usize], "the vertices")?;
+                if normals {
+                    let normal = mesh.normals[v as usize].normalize_or(Vec3::Y);
+                    let normal = if t.is_back { -normal } else { normal };
+                    account.push(&mut result.normals, normal, "the normals")?;
+                }
+                let uv = mesh.uvs.get(v as usize).copied().filter(|uv| uv.is_finite()).unwrap_or_default();
+                account.push(&mut result.uvs, uv, "the texture coordinates")?;
+                account.push(&mut result.lightmap_uvs, lightmap_uv, "the texture coordinates")?;
                 result.indices.push(vertex);
             }
         }
-        result
+        Ok(result)
     }
 }
 
@@ -176,73 +271,104 @@ const ARRAY_BUFFER: u32 = 34962;
 const ELEMENT_ARRAY_BUFFER: u32 = 34963;
 const LINEAR: u32 = 9729;
 const CLAMP_TO_EDGE: u32 = 33071;
+const REPEAT: u32 = 10497;
+const LIGHTMAP_SAMPLER: usize = 0;
+const TEXTURE_SAMPLER: usize = 1;
 
 /// The file being made.
-#[derive(Default)]
-struct File {
+struct File<'a> {
+    account: &'a mut Account,
     binary: Vec<u8>,
+    parts: Parts,
+    unlit: bool,
+    emissive_strength: bool,
+}
+
+/// Arrays of the JSON.
+#[derive(Default)]
+struct Parts {
     views: Vec<Value>,
     accessors: Vec<Value>,
     primitives: Vec<Value>,
     materials: Vec<Value>,
     images: Vec<Value>,
     textures: Vec<Value>,
-    unlit: bool,
-    emissive_strength: bool,
+    /// The scene's textures that materials use, in the order in which they follow the pages.
+    own_textures: Vec<u32>,
 }
 
-impl File {
-    /// Appends bytes, aligned to 4, as a buffer view.
-    fn add_view(&mut self, bytes: impl IntoIterator<Item = u8>, target: Option<u32>) -> usize {
+impl File<'_> {
+    /// Appends values as bytes, aligned to 4, as a buffer view.
+    fn add_view(&mut self, bytes: &[u8], target: Option<u32>) -> Result<usize> {
         let offset = self.binary.len();
-        self.binary.extend(bytes);
-        let mut view = json!({ "buffer": 0, "byteOffset": offset, "byteLength": self.binary.len() - offset });
+        let end = (offset + bytes.len()).next_multiple_of(4);
+        self.account.make_room(&mut self.binary, end - offset, "the GLB file")?;
+        self.binary.extend_from_slice(bytes);
+        self.binary.resize(end, 0);
+        let mut view = json!({ "buffer": 0, "byteOffset": offset, "byteLength": bytes.len() });
         if let Some(target) = target {
             view["target"] = target.into();
         }
-        self.binary.resize(self.binary.len().next_multiple_of(4), 0);
-        self.views.push(view);
-        self.views.len() - 1
+        self.parts.views.push(view);
+        Ok(self.parts.views.len() - 1)
     }
 
     fn add_accessor(&mut self, view: usize, component: u32, kind: &str, count: usize) -> usize {
-        self.accessors.push(json!({ "bufferView": view, "componentType": component, "type": kind, "count": count }));
-        self.accessors.len() - 1
+        let accessor = json!({ "bufferView": view, "componentType": component, "type": kind, "count": count });
+        self.parts.accessors.push(accessor);
+        self.parts.accessors.len() - 1
     }
 
-    fn add_floats<const N: usize>(&mut self, vectors: impl ExactSizeIterator<Item = [f32; N]>, kind: &str) -> usize {
-        let count = vectors.len();
-        let view = self.add_view(vectors.flatten().flat_map(f32::to_le_bytes), Some(ARRAY_BUFFER));
-        self.add_accessor(view, FLOAT, kind, count)
+    fn add_floats<T: bytemuck::NoUninit>(&mut self, vectors: &[T], kind: &str) -> Result<usize> {
+        let view = self.add_view(&little_endian(vectors), Some(ARRAY_BUFFER))?;
+        Ok(self.add_accessor(view, FLOAT, kind, vectors.len()))
     }
 
-    fn add_primitive(&mut self, primitive: &Primitive, page: u32, material: &Material) {
-        let positions = self.add_floats(primitive.positions.iter().map(Vec3::to_array), "VEC3");
+    fn add_primitive(&mut self, primitive: &Primitive, page: u32, material: &Material, pages: usize) -> Result<()> {
+        let positions = self.add_floats(&primitive.positions, "VEC3")?;
         let lower = primitive.positions.iter().copied().reduce(Vec3::min).unwrap_or_default();
         let upper = primitive.positions.iter().copied().reduce(Vec3::max).unwrap_or_default();
-        self.accessors[positions]["min"] = json!(lower.to_array());
-        self.accessors[positions]["max"] = json!(upper.to_array());
-        let uvs = self.add_floats(primitive.uvs.iter().map(Vec2::to_array), "VEC2");
-        let lightmap_uvs = self.add_floats(primitive.lightmap_uvs.iter().copied(), "VEC2");
-        let bytes = primitive.indices.iter().flat_map(|i| i.to_le_bytes());
-        let view = self.add_view(bytes, Some(ELEMENT_ARRAY_BUFFER));
+        self.parts.accessors[positions]["min"] = json!(lower.to_array());
+        self.parts.accessors[positions]["max"] = json!(upper.to_array());
+        let uvs = self.add_floats(&primitive.uvs, "VEC2")?;
+        let lightmap_uvs = self.add_floats(&primitive.lightmap_uvs, "VEC2")?;
+        let mut attributes = json!({ "POSITION": positions, "TEXCOORD_0": uvs, "TEXCOORD_1": lightmap_uvs });
+        if !primitive.normals.is_empty() {
+            attributes["NORMAL"] = self.add_floats(&primitive.normals, "VEC3")?.into();
+        }
+        let view = self.add_view(&little_endian(&primitive.indices), Some(ELEMENT_ARRAY_BUFFER))?;
         let indices = self.add_accessor(view, UNSIGNED_INT, "SCALAR", primitive.indices.len());
-        self.add_material(page, material);
-        self.primitives.push(json!({
-            "attributes": { "POSITION": positions, "TEXCOORD_0": uvs, "TEXCOORD_1": lightmap_uvs },
-            "indices": indices,
-            "material": self.materials.len() - 1,
-        }));
+        self.add_material(page, material, pages);
+        let material = self.parts.materials.len() - 1;
+        self.parts.primitives.push(json!({ "attributes": attributes, "indices": indices, "material": material }));
+        Ok(())
     }
 
-    fn add_material(&mut self, page: u32, material: &Material) {
+    /// `pages`: how many textures are light map pages.
+    fn add_material(&mut self, page: u32, material: &Material, pages: usize) {
         let [r, g, b] = material.albedo;
         let mut result = json!({
             "pbrMetallicRoughness": { "baseColorFactor": [r, g, b, 1.0], "metallicFactor": 0, "roughnessFactor": 1 },
             "doubleSided": material.two_sided,
         });
+        let is_textured = material.albedo_texture != NONE;
+        if is_textured {
+            let texture = pages + self.own_texture(material.albedo_texture);
+            result["pbrMetallicRoughness"]["baseColorTexture"] = json!({ "index": texture, "texCoord": 0 });
+            if material.alpha_cutoff > 0.0 {
+                result["alphaMode"] = "MASK".into();
+                result["alphaCutoff"] = material.alpha_cutoff.into();
+            }
+        }
         if page != NONE {
-            result["pbrMetallicRoughness"]["baseColorTexture"] = json!({ "index": page, "texCoord": 1 });
+            let lightmap = json!({ "index": page, "texCoord": 1 });
+            let slot = if is_textured { "occlusionTexture" } else { "baseColorTexture" };
+            match is_textured {
+                true => result[slot] = lightmap.clone(),
+                false => result["pbrMetallicRoughness"][slot] = lightmap.clone(),
+            }
+            result["extras"]["lightmap"] = lightmap;
+            result["extras"]["lightmap"]["slot"] = slot.into();
         }
         if material.is_emissive() {
             // Factors end at 1; what is beyond goes into the strength.
@@ -252,67 +378,89 @@ impl File {
                 result["extensions"]["KHR_materials_emissive_strength"]["emissiveStrength"] = strength.into();
                 self.emissive_strength = true;
             }
-        } else {
+        } else if !is_textured || page == NONE {
             result["extensions"]["KHR_materials_unlit"] = json!({});
             self.unlit = true;
         }
-        self.materials.push(result);
+        self.parts.materials.push(result);
     }
 
-    fn add_pages(&mut self, pages: &[Vec<u8>]) {
-        for (page, png) in pages.iter().enumerate() {
-            let view = self.add_view(png.iter().copied(), None);
-            let name = format!("light map page {page}");
-            self.images.push(json!({ "bufferView": view, "mimeType": "image/png", "name": name }));
-            self.textures.push(json!({ "source": page, "sampler": 0 }));
-        }
+    /// The place of a texture of the scene among those that are used.
+    fn own_texture(&mut self, number: u32) -> usize {
+        let own = &mut self.parts.own_textures;
+        own.iter().position(|n| *n == number).unwrap_or_else(|| {
+            own.push(number);
+            own.len() - 1
+        })
     }
 
-    fn finish(self) -> Result<Vec<u8>> {
+    fn add_image(&mut self, png: &[u8], name: &str, sampler: usize) -> Result<()> {
+        let view = self.add_view(png, None)?;
+        let source = self.parts.images.len();
+        self.parts.images.push(json!({ "bufferView": view, "mimeType": "image/png", "name": name }));
+        self.parts.textures.push(json!({ "source": source, "sampler": sampler }));
+        Ok(())
+    }
+
+    /// The JSON chunk, padded.
+    fn json(&mut self, exposure: f32) -> Vec<u8> {
+        let parts = std::mem::take(&mut self.parts);
         let mut root = json!({
-            "asset": { "version": "2.0", "generator": concat!("bakelite ", env!("CARGO_PKG_VERSION")) },
+            "asset": {
+                "version": "2.0",
+                "generator": concat!("bakelite ", env!("CARGO_PKG_VERSION")),
+                "extras": { "lightmap": { "texCoord": 1, "exposure": exposure, "encoding": ENCODING } },
+            },
             "scene": 0,
             "scenes": [{ "nodes": [0] }],
             "nodes": [{ "mesh": 0 }],
-            "meshes": [{ "primitives": self.primitives }],
-            "materials": self.materials,
-            "accessors": self.accessors,
-            "bufferViews": self.views,
+            "meshes": [{ "primitives": parts.primitives }],
+            "materials": parts.materials,
+            "accessors": parts.accessors,
+            "bufferViews": parts.views,
             "buffers": [{ "byteLength": self.binary.len() }],
         });
         // glTF allows no empty arrays.
-        if !self.images.is_empty() {
-            root["images"] = self.images.into();
-            root["textures"] = self.textures.into();
-            let sampler =
-                json!({ "magFilter": LINEAR, "minFilter": LINEAR, "wrapS": CLAMP_TO_EDGE, "wrapT": CLAMP_TO_EDGE });
-            root["samplers"] = json!([sampler]);
+        if !parts.images.is_empty() {
+            root["images"] = parts.images.into();
+            root["textures"] = parts.textures.into();
+            let sampler = |wrap: u32| json!({ "magFilter": LINEAR, "minFilter": LINEAR, "wrapS": wrap, "wrapT": wrap });
+            root["samplers"] = json!([sampler(CLAMP_TO_EDGE), sampler(REPEAT)]);
         }
         let used = [("KHR_materials_unlit", self.unlit), ("KHR_materials_emissive_strength", self.emissive_strength)];
         let used: Vec<_> = used.into_iter().filter(|(_, used)| *used).map(|(name, _)| name).collect();
         if !used.is_empty() {
             root["extensionsUsed"] = json!(used);
         }
-        container(root.to_string().into_bytes(), &self.binary)
+        let mut json = root.to_string().into_bytes();
+        json.resize(json.len().next_multiple_of(4), b' ');
+        json
     }
 }
 
-/// The GLB container (glTF 2.0, chapter 4): header, JSON chunk, binary chunk.
-fn container(mut json: Vec<u8>, binary: &[u8]) -> Result<Vec<u8>> {
-    json.resize(json.len().next_multiple_of(4), b' ');
+/// Values as the file has them.
+#[cfg(target_endian = "little")]
+fn little_endian<T: bytemuck::NoUninit>(values: &[T]) -> std::borrow::Cow<'_, [u8]> {
+    bytemuck::cast_slice(values).into()
+}
+
+/// Values as the file has them: all are of 4 bytes.
+#[cfg(target_endian = "big")]
+fn little_endian<T: bytemuck::NoUninit>(values: &[T]) -> std::borrow::Cow<'_, [u8]> {
+    let mut bytes: Vec<u8> = bytemuck::cast_slice(values).to_vec();
+    bytes.as_chunks_mut::<4>().0.iter_mut().for_each(|b| b.reverse());
+    bytes.into()
+}
+
+/// What comes before each chunk of the GLB container (glTF 2.0, chapter 4).
+fn headers(json: &[u8], binary: &[u8]) -> Result<[Vec<u8>; 2]> {
     let total = 12 + 8 + json.len() + 8 + binary.len();
     let Ok(length) = u32::try_from(total) else {
         return Err(Error::Unsupported(format!("a GLB file of {total} bytes: the format ends at 4 GiB")));
     };
-    let mut file = Vec::with_capacity(total);
-    file.extend(b"glTF");
-    file.extend([2, length].map(u32::to_le_bytes).as_flattened());
-    for (kind, chunk) in [(b"JSON", &json[..]), (b"BIN\0", binary)] {
-        file.extend((chunk.len() as u32).to_le_bytes());
-        file.extend(kind);
-        file.extend(chunk);
-    }
-    Ok(file)
+    let chunk = |kind: &[u8], size: usize| [&(size as u32).to_le_bytes(), kind].concat();
+    let first = [&b"glTF\x02\0\0\0"[..], &length.to_le_bytes(), &chunk(b"JSON", json.len())].concat();
+    Ok([first, chunk(b"BIN\0", binary.len())])
 }
 
 #[cfg(test)]
@@ -321,7 +469,7 @@ pub(super) mod tests {
     use super::*;
     use crate::io::tests::{albedos, corners, load_bytes};
 
-    use crate::scene::{Mesh, MeshMaterials, SceneData};
+    use crate::scene::{Mesh, MeshMaterials, SceneData, Texture};
     use std::sync::Arc;
 
     const PAGE_COLORS: [[u8; 3]; 2] = [[200, 100, 50], [10, 20, 30]];
@@ -362,7 +510,7 @@ pub(super) mod tests {
             GlbMesh { corner_uvs: vec![low, high, high], pages: vec![0, 0, 1], backs: Vec::new() },
             GlbMesh { corner_uvs: vec![low, low, seam], pages: vec![1, NONE, NONE], backs: Vec::new() },
         ];
-        (scene, GlbLightmap { meshes, pages })
+        (scene, GlbLightmap { meshes, pages, exposure: 0.25 })
     }
 
     pub fn sample() -> Vec<u8> {
@@ -458,6 +606,107 @@ pub(super) mod tests {
         let light = mesh.lightmap.as_ref().unwrap();
         let [a, b, c] = corner_uvs;
         assert_eq!(mesh.indices[0].map(|v| light.uvs[v as usize].to_array()), [a, c, b]);
+    }
+
+    /// One triangle, its back with a place of its own, with normals and a texture with holes.
+    fn textured() -> (Arc<Scene>, GlbLightmap) {
+        let mut data = SceneData::new();
+        data.add_texture(Texture { width: 1, height: 1, rgba8: vec![[9; 4]] }).unwrap();
+        let texels = vec![[255, 0, 0, 255], [0, 255, 0, 0]];
+        let albedo_texture = data.add_texture(Texture { width: 2, height: 1, rgba8: texels }).unwrap();
+        let material = Material { albedo: [0.5; 3], albedo_texture, alpha_cutoff: 0.25, ..Default::default() };
+        data.add_material(Material { two_sided: true, ..material }).unwrap();
+        data.add_mesh(Mesh {
+            positions: vec![Vec3::ZERO, Vec3::X, Vec3::Y],
+            indices: vec![[0, 1, 2]],
+            normals: vec![Vec3::new(0.0, 0.6, 0.8); 3],
+            uvs: vec![Vec2::ZERO, Vec2::new(7.0, 0.0), Vec2::new(0.0, -3.0)],
+            ..Default::default()
+        })
+        .unwrap();
+        let corner_uvs = [[0.1, 0.2], [0.3, 0.2], [0.1, 0.4]];
+        let backs = vec![GlbBack { triangle: 0, corner_uvs, page: 1 }];
+        let meshes = vec![GlbMesh { corner_uvs: vec![corner_uvs], pages: vec![0], backs }];
+        let pages = PAGE_COLORS.map(|color| encode_png_rgb8(2, 2, &[color; 4]).unwrap()).to_vec();
+        (data.committed(), GlbLightmap { meshes, pages, exposure: 0.25 })
+    }
+
+    #[test]
+    fn a_material_keeps_its_own_texture_and_has_the_light_map_on_the_second_coordinates() {
+        let (scene, lightmap) = textured();
+        let file = encode_glb(&scene, &lightmap).unwrap();
+        let parsed = gltf::Gltf::from_slice(&file).unwrap();
+        let materials: Vec<_> = parsed.materials().collect();
+        assert_eq!(materials.len(), 2);
+        for (page, material) in materials.iter().enumerate() {
+            let base = material.pbr_metallic_roughness().base_color_texture().unwrap();
+            assert_eq!((base.texture().index(), base.tex_coord()), (2, 0));
+            assert_eq!(material.pbr_metallic_roughness().base_color_factor(), [0.5, 0.5, 0.5, 1.0]);
+            let light = material.occlusion_texture().unwrap();
+            assert_eq!((light.texture().index(), light.tex_coord()), (page, 1));
+            assert_eq!((material.unlit(), material.double_sided()), (false, false));
+            assert_eq!((material.alpha_mode(), material.alpha_cutoff()), (gltf::material::AlphaMode::Mask, Some(0.25)));
+            assert_eq!(base.texture().sampler().wrap_s(), gltf::texture::WrappingMode::Repeat);
+            assert_eq!(light.texture().sampler().wrap_s(), gltf::texture::WrappingMode::ClampToEdge);
+        }
+        // Read back: own texture, light map page and coordinates.
+        let (back, info) = load_bytes("a.glb", file).unwrap();
+        assert_eq!((info.warnings.len(), back.textures().len()), (0, 1));
+        assert_eq!(*back.textures()[0], *scene.textures()[1]);
+        let [front, behind] = back.meshes() else { panic!() };
+        let pages = [front, behind].map(|m| m.lightmap.as_ref().unwrap().pages.first().copied().unwrap_or(0));
+        assert_eq!(pages, [0, 1]);
+        assert_eq!(front.uvs[1], Vec2::new(7.0, 0.0));
+    }
+
+    #[test]
+    fn the_copy_for_a_back_is_turned_round_with_its_normals() {
+        let (scene, lightmap) = textured();
+        let (back, _) = load_bytes("a.glb", encode_glb(&scene, &lightmap).unwrap()).unwrap();
+        let given = Vec3::new(0.0, 0.6, 0.8);
+        for (mesh, sign) in back.meshes().iter().zip([1.0, -1.0]) {
+            let [a, b, c] = mesh.corners(0);
+            assert_eq!((b - a).cross(c - a), sign * Vec3::Z);
+            assert!(mesh.normals.iter().all(|n| n.abs_diff_eq(given * sign, 1e-6)), "{:?}", mesh.normals);
+        }
+    }
+
+    /// What `extras` say of the encoding, in code.
+    fn irradiance(exposure: f64, texel: [u8; 3]) -> [f64; 3] {
+        let linear = |c: u8| {
+            let c = f64::from(c) / 255.0;
+            if c <= 0.04045 { c / 12.92 } else { ((c + 0.055) / 1.055).powf(2.4) }
+        };
+        let c = texel.map(linear);
+        let m = c[0].max(c[1]).max(c[2]);
+        let scale = if m > 0.6 { (0.6 - 0.4 * (1.0 - (m - 0.6) / 0.4).ln()) / m } else { 1.0 };
+        c.map(|c| c * scale / exposure)
+    }
+
+    #[test]
+    fn the_extras_say_how_to_read_irradiance_from_a_page() {
+        let (scene, lightmap) = textured();
+        let file = encode_glb(&scene, &lightmap).unwrap();
+        let length = u32::from_le_bytes(file[12..16].try_into().unwrap()) as usize;
+        let root: Value = serde_json::from_slice(&file[20..20 + length]).unwrap();
+        let said = &root["asset"]["extras"]["lightmap"];
+        assert_eq!((said["exposure"].as_f64(), said["texCoord"].as_u64()), (Some(0.25), Some(1)));
+        assert!(said["encoding"].as_str().unwrap().contains("0.6 - 0.4 * ln(1 - (m - 0.6) / 0.4)"));
+        let slots: Vec<_> = root["materials"].as_array().unwrap().iter().map(|m| &m["extras"]["lightmap"]).collect();
+        assert_eq!(
+            slots,
+            [
+                &json!({ "index": 0, "texCoord": 1, "slot": "occlusionTexture" }),
+                &json!({ "index": 1, "texCoord": 1, "slot": "occlusionTexture" })
+            ]
+        );
+        // As it says: irradiance up to four times white comes back within the steps of 8 bits.
+        for e in [[0.1, 0.2, 0.3], [2.0, 1.0, 0.5], [3.0, 4.0, 2.0], [6.0, 1.0, 0.0]] {
+            let read = irradiance(0.25, crate::io::image::tone_map(0.25, e));
+            for (read, e) in read.into_iter().zip(e) {
+                assert!((read - f64::from(e)).abs() < 0.02 * f64::from(e) + 0.01, "{e}: {read}");
+            }
+        }
     }
 
     #[test]

@@ -5,7 +5,7 @@
 //! - `alphaMode` `MASK` cuts holes, except into surfaces that emit; `BLEND` counts as opaque.
 //!   `KHR_materials_transmission`: its factor of `baseColorFactor` passes straight through, as through a thin
 //!   sheet; textures do not change that.
-//! - Images (PNG, JPEG) come from buffer views, data URIs and files beside the scene. All repeat, whatever their
+//! - Images (PNG, JPEG) come from buffer views, data URIs and files beside or below the scene. All repeat, whatever their
 //!   sampler says, and `KHR_texture_transform` is ignored.
 //! - `TEXCOORD_0` becomes [`Mesh::uvs`], `TEXCOORD_1` the light map coordinates. Their page is the
 //!   number of the material's texture that uses them, among all textures that are used so (as our
@@ -13,12 +13,13 @@
 //!   are taken.
 //! - `KHR_lights_punctual`: candela is taken as W/sr and lux as W/m²; `range` is ignored.
 //! - Nodes that mirror flip the winding. Skins and morph targets stay in their rest pose.
-//! - Buffers: the binary chunk, data URIs, files beside the scene. Sparse accessors are read,
+//! - Buffers: the binary chunk, data URIs, files beside or below the scene. Sparse accessors are read,
 //!   `KHR_mesh_quantization` too; compressed geometry is refused as unsupported.
 //!
 //! The crate `gltf` reads the JSON; accessors are read here, because the crate's readers trust sizes
 //! in the file.
 
+use super::source::{Attempt, Checked, Opened, folder_of};
 use super::{Import, is_valid_position, texture};
 use crate::error::{Error, Result};
 use crate::scene::{Light, LightmapUvs, Material, Mesh, MeshMaterials, NONE, Texture};
@@ -29,28 +30,34 @@ use gltf::json;
 use gltf::khr_lights_punctual::Kind;
 use gltf::material::AlphaMode;
 use gltf::mesh::{Mode, Semantic};
-use std::collections::{BTreeSet, HashMap};
-use std::path::Path;
+use std::borrow::Cow;
+use std::collections::{BTreeSet, HashMap, HashSet};
+use std::io::BufReader;
+use std::ops::Range;
 
 /// Required extensions that change nothing about shapes: they may be ignored.
 const HARMLESS_EXTENSIONS: [&str; 5] =
     ["KHR_materials_", "KHR_texture_", "EXT_texture_", "KHR_mesh_quantization", "KHR_xmp"];
 
-pub(super) fn load(import: &mut Import) -> Result<()> {
-    let bytes = std::fs::read(&import.path).map_err(|e| import.error(e))?;
-    let (document, blob) = parse(import, &bytes)?;
-    drop(bytes);
-    let buffers = document
-        .buffers()
-        .map(|buffer| read_buffer(import, &buffer, blob.as_deref()))
-        .collect::<Result<Vec<Vec<u8>>>>()?;
+pub(super) fn load(import: &mut Import, opened: Opened) -> Result<()> {
+    let bytes = import.read_opened(opened)?;
+    let (json, blob) = split(import, &bytes)?;
+    let mut text = Text::new(import, json)?;
+    let document = parse(import, &mut text)?;
+    let mut buffers = import.account.list(document.buffers().len(), "the buffers")?;
+    for buffer in document.buffers() {
+        buffers.push(read_buffer(import, &buffer, &text, blob)?);
+    }
     let mut reader = Reader {
-        buffers,
+        buffers: &buffers,
+        text: &text,
         document: &document,
         materials: HashMap::new(),
         images: HashMap::new(),
         pages: lightmap_pages(&document),
         mesh_uses: vec![0; document.meshes().len()],
+        sorted: HashSet::new(),
+        number: Vec::new(),
         triangles: 0,
         textured: BTreeSet::new(),
         blended: BTreeSet::new(),
@@ -70,6 +77,7 @@ pub(super) fn load(import: &mut Import) -> Result<()> {
         for primitive in node.mesh().iter().flat_map(|mesh| mesh.primitives()) {
             let mesh = node.mesh().map_or(0, |mesh| mesh.index());
             reader.place = format!("mesh {mesh}, primitive {}", primitive.index());
+            reader.import.check()?;
             reader.add_primitive(&primitive, transform, reader.mesh_uses[mesh] == 1)?;
         }
     }
@@ -80,16 +88,144 @@ pub(super) fn load(import: &mut Import) -> Result<()> {
     Ok(())
 }
 
-fn parse(import: &Import, bytes: &[u8]) -> Result<(gltf::Document, Option<Vec<u8>>)> {
+/// The JSON of a file and its binary chunk, without copies.
+fn split<'b>(import: &Import, bytes: &'b [u8]) -> Result<(&'b [u8], Option<&'b [u8]>)> {
+    if !bytes.starts_with(b"glTF") {
+        return Ok((bytes, None));
+    }
     // The crate subtracts the header's size from the length that the header states.
-    if bytes.starts_with(b"glTF") {
-        let stated = bytes.get(8..12).map_or(0, |b| u32::from_le_bytes([b[0], b[1], b[2], b[3]]));
-        if stated < 12 {
-            return Err(import.error("the GLB header is cut off"));
+    let stated = bytes.get(8..12).map_or(0, |b| u32::from_le_bytes([b[0], b[1], b[2], b[3]]));
+    if stated < 12 {
+        return Err(import.error("the GLB header is cut off"));
+    }
+    let glb = gltf::binary::Glb::from_slice(bytes).map_err(|e| explain(import, e))?;
+    let borrowed = |chunk: Cow<'b, [u8]>| match chunk {
+        Cow::Borrowed(bytes) => Ok(bytes),
+        Cow::Owned(_) => Err(Error::Internal("a chunk was copied".into())),
+    };
+    Ok((borrowed(glb.json)?, glb.bin.map(borrowed).transpose()?))
+}
+
+/// A JSON text without its long data URIs, which the parser would copy: each is replaced by its number.
+struct Text<'b> {
+    short: Vec<u8>,
+    whole: &'b [u8],
+    /// Places of data URIs in the whole text, without quotes.
+    uris: Vec<Range<usize>>,
+}
+
+/// What stands for data URI 7: `data:#7`.
+const REPLACED: &str = "data:#";
+
+/// Data URIs up to this length may stay.
+const SHORT_URI: usize = 1 << 10;
+
+impl<'b> Text<'b> {
+    fn new(import: &mut Import, whole: &'b [u8]) -> Result<Text<'b>> {
+        let mut text = Text { short: Vec::new(), whole, uris: Vec::new() };
+        // Where a string began, and whether the byte before was a backslash in it.
+        let (mut string, mut escaped) = (None, false);
+        let mut copied = 0;
+        for (at, &c) in whole.iter().enumerate() {
+            if at.is_multiple_of(1 << 20) {
+                import.check()?;
+            }
+            match string {
+                None if c == b'"' => string = Some(at + 1),
+                None => {}
+                Some(_) if escaped => escaped = false,
+                Some(_) if c == b'\\' => escaped = true,
+                Some(start) if c == b'"' => {
+                    string = None;
+                    let uri = &whole[start..at];
+                    if uri.starts_with(b"data:") && (uri.len() > SHORT_URI || uri.starts_with(REPLACED.as_bytes())) {
+                        text.append(import, &whole[copied..start])?;
+                        let number = format!("{REPLACED}{}", text.uris.len());
+                        text.append(import, number.as_bytes())?;
+                        import.account.push(&mut text.uris, start..at, "the data URIs")?;
+                        copied = at;
+                    }
+                }
+                Some(_) => {}
+            }
+        }
+        text.append(import, &whole[copied..])?;
+        Ok(text)
+    }
+
+    fn append(&mut self, import: &mut Import, bytes: &[u8]) -> Result<()> {
+        import.account.make_room(&mut self.short, bytes.len(), "the JSON text")?;
+        self.short.extend_from_slice(bytes);
+        Ok(())
+    }
+
+    /// What a data URI holds, without `data:`; `None` if it is none.
+    fn data<'t>(&'t self, uri: &'t str) -> Option<&'t [u8]> {
+        let content = uri.strip_prefix("data:")?;
+        let number = content.strip_prefix('#').and_then(|n| n.parse::<usize>().ok());
+        Some(match number.and_then(|n| self.uris.get(n)) {
+            Some(range) => &self.whole[range.start + "data:".len()..range.end],
+            None => content.as_bytes(),
+        })
+    }
+
+    /// The bytes that a data URI holds in base64. `None` if it is none; the account counts them.
+    fn decoded(&self, import: &mut Import, uri: &str) -> Option<Attempt<Vec<u8>>> {
+        const MARK: &[u8] = b";base64,";
+        let data = self.data(uri)?;
+        let Some(mark) = data.windows(MARK.len()).position(|w| w == MARK) else {
+            return Some(Ok(Err("a data URI without base64".into())));
+        };
+        let encoded = data[mark + MARK.len()..].trim_ascii_end();
+        if !encoded.contains(&b'\\') {
+            return Some(decode_base64(import, encoded));
+        }
+        // Some writers of JSON escape the slash.
+        let plain = import.account.list(encoded.len(), "a data URI").map(|mut plain| {
+            plain.extend(encoded.iter().filter(|c| **c != b'\\'));
+            plain
+        });
+        Some(plain.and_then(|plain| {
+            let decoded = decode_base64(import, &plain);
+            import.account.give_back(plain.capacity());
+            decoded
+        }))
+    }
+}
+
+fn decode_base64(import: &mut Import, encoded: &[u8]) -> Attempt<Vec<u8>> {
+    // Of a multiple of 4, so that pieces are decoded alone.
+    const PIECE: usize = 1 << 20;
+    let size = encoded.len() / 4 * 3 + 3;
+    let mut bytes = import.account.list(size, "a data URI")?;
+    let mut piece = import.account.list::<u8>(PIECE / 4 * 3 + 3, "a data URI")?;
+    piece.resize(PIECE / 4 * 3 + 3, 0);
+    let pieces = encoded.len().div_ceil(PIECE);
+    for (i, text) in encoded.chunks(PIECE).enumerate() {
+        import.check()?;
+        // Padding ends it all.
+        if i + 1 < pieces && text.ends_with(b"=") {
+            return Ok(Err("padding in the middle of base64".into()));
+        }
+        match base64::prelude::BASE64_STANDARD.decode_slice(text, &mut piece) {
+            Ok(count) => bytes.extend_from_slice(&piece[..count]),
+            Err(e) => return Ok(Err(e.to_string())),
         }
     }
-    let parsed = gltf::Gltf::from_slice_without_validation(bytes).map_err(|e| explain(import, e))?;
-    let (blob, mut root) = (parsed.blob, parsed.document.into_json());
+    import.account.give_back(piece.capacity());
+    Ok(Ok(bytes))
+}
+
+fn parse(import: &mut Import, text: &mut Text) -> Result<gltf::Document> {
+    // What the parser makes of the text takes several times as much, and is not ours to allocate.
+    let estimate = text.short.len().saturating_mul(4);
+    import.account.hold(estimate, "the JSON of the scene")?;
+    // The parser asks for single bytes.
+    let reader = BufReader::new(Checked::new(&text.short, import.advance));
+    let mut root = json::Root::from_reader(reader).map_err(|e| import.error(e))?;
+    let size = text.short.capacity();
+    text.short = Vec::new();
+    import.account.give_back(size);
     root.extensions_required.retain(|e| !HARMLESS_EXTENSIONS.iter().any(|harmless| e.starts_with(harmless)));
     // The crate's validation looks at the positions' accessor before it has checked its number.
     for (m, mesh) in root.meshes.iter().enumerate() {
@@ -102,8 +238,7 @@ fn parse(import: &Import, bytes: &[u8]) -> Result<(gltf::Document, Option<Vec<u8
             }
         }
     }
-    let document = gltf::Document::from_json(root).map_err(|e| explain(import, e))?;
-    Ok((document, blob))
+    gltf::Document::from_json(root).map_err(|e| explain(import, e))
 }
 
 fn explain(import: &Import, e: gltf::Error) -> Error {
@@ -121,33 +256,36 @@ fn explain(import: &Import, e: gltf::Error) -> Error {
 }
 
 /// The bytes of a buffer, at least as many as it says.
-fn read_buffer(import: &Import, buffer: &gltf::Buffer, blob: Option<&[u8]>) -> Result<Vec<u8>> {
-    let fail = |what: &dyn std::fmt::Display| import.error(format_args!("buffer {}: {what}", buffer.index()));
-    let bytes = match buffer.source() {
-        gltf::buffer::Source::Bin => blob.ok_or_else(|| fail(&"there is no binary chunk and no uri"))?.to_vec(),
-        gltf::buffer::Source::Uri(uri) => match uri.strip_prefix("data:") {
-            Some(data) => {
-                let (_, text) = data.split_once(";base64,").ok_or_else(|| fail(&"a data URI without base64"))?;
-                base64::prelude::BASE64_STANDARD.decode(text.trim_end()).map_err(|e| fail(&e))?
-            }
-            None => {
-                let name = percent_decoded(uri).ok_or_else(|| fail(&format_args!("the uri {uri:?}")))?;
-                if name.contains("://") {
-                    return Err(Error::Unsupported(format!(
-                        "{}: buffer {} is at {name:?}, not beside the scene",
-                        import.path.display(),
-                        buffer.index()
-                    )));
-                }
-                let path = import.path.parent().unwrap_or(Path::new("")).join(&name);
-                std::fs::read(&path).map_err(|e| fail(&format_args!("{}: {e}", path.display())))?
-            }
-        },
+fn read_buffer<'b>(
+    import: &mut Import,
+    buffer: &gltf::Buffer,
+    text: &Text,
+    blob: Option<&'b [u8]>,
+) -> Result<Cow<'b, [u8]>> {
+    let read = match buffer.source() {
+        gltf::buffer::Source::Bin => Ok(blob.map(Cow::Borrowed).ok_or("there is no binary chunk and no uri".into())),
+        gltf::buffer::Source::Uri(uri) => read_uri(import, text, uri).map(|read| read.map(Cow::Owned)),
     };
+    let fail = |what: &dyn std::fmt::Display| import.error(format_args!("buffer {}: {what}", buffer.index()));
+    let bytes: Cow<[u8]> = read?.map_err(|what| fail(&what))?;
     if bytes.len() < buffer.length() {
         return Err(fail(&format_args!("it has {} bytes, not {}", bytes.len(), buffer.length())));
     }
     Ok(bytes)
+}
+
+/// What a URI names: data in itself, or a file beside the scene. The account counts it.
+fn read_uri(import: &mut Import, text: &Text, uri: &str) -> Attempt<Vec<u8>> {
+    if let Some(data) = text.decoded(import, uri) {
+        return data;
+    }
+    match percent_decoded(uri) {
+        Some(name) => {
+            let folder = folder_of(&import.path).to_owned();
+            import.read_named(&folder, &name.replace('\\', "/"))
+        }
+        None => Ok(Err(format!("the uri {uri:?}"))),
+    }
 }
 
 /// `%20` and the like resolved; `None` if malformed.
@@ -169,7 +307,7 @@ fn percent_decoded(uri: &str) -> Option<String> {
 
 /// The nodes of the default scene (or the first, or all roots) with their transforms to the world,
 /// parents before children, in the order of the file.
-fn place_nodes<'a>(import: &Import, document: &'a gltf::Document) -> Result<Vec<(gltf::Node<'a>, DMat4)>> {
+fn place_nodes<'a>(import: &mut Import, document: &'a gltf::Document) -> Result<Vec<(gltf::Node<'a>, DMat4)>> {
     let roots: Vec<_> = match document.default_scene().or_else(|| document.scenes().next()) {
         Some(scene) => scene.nodes().collect(),
         None => {
@@ -177,10 +315,15 @@ fn place_nodes<'a>(import: &Import, document: &'a gltf::Document) -> Result<Vec<
             document.nodes().filter(|n| !children.contains(&n.index())).collect()
         }
     };
-    let mut seen = vec![false; document.nodes().len()];
-    let mut placed = Vec::new();
+    let count = document.nodes().len();
+    let mut seen = import.account.list(count, "the nodes")?;
+    seen.resize(count, false);
+    let mut placed = import.account.list(count, "the nodes")?;
     let mut stack: Vec<_> = roots.into_iter().rev().map(|node| (node, DMat4::IDENTITY)).collect();
     while let Some((node, parent)) = stack.pop() {
+        if placed.len().is_multiple_of(1024) {
+            import.check()?;
+        }
         if std::mem::replace(&mut seen[node.index()], true) {
             return Err(import.error(format_args!("node {} has several parents", node.index())));
         }
@@ -208,9 +351,10 @@ fn lightmap_pages(document: &gltf::Document) -> HashMap<usize, u32> {
     textures.into_iter().zip(0..).collect()
 }
 
-struct Reader<'i> {
-    import: &'i mut Import,
-    buffers: Vec<Vec<u8>>,
+struct Reader<'i, 's> {
+    import: &'i mut Import<'s>,
+    buffers: &'i [Cow<'i, [u8]>],
+    text: &'i Text<'i>,
     document: &'i gltf::Document,
     /// Our material by theirs; `None` is glTF's default material. [`NONE`]: nothing can be seen of it.
     materials: HashMap<Option<usize>, u32>,
@@ -219,6 +363,10 @@ struct Reader<'i> {
     pages: HashMap<usize, u32>,
     /// How many nodes show each mesh.
     mesh_uses: Vec<u32>,
+    /// Sparse accessors whose indices were found to increase.
+    sorted: HashSet<usize>,
+    /// New numbers of vertices, [`NONE`] between primitives: many may share one large vertex buffer.
+    number: Vec<u32>,
     triangles: usize,
     /// Materials with a base colour texture by other than the first coordinates.
     textured: BTreeSet<usize>,
@@ -231,7 +379,7 @@ struct Reader<'i> {
     place: String,
 }
 
-impl Reader<'_> {
+impl<'i> Reader<'i, '_> {
     fn malformed<T>(&self, what: impl std::fmt::Display) -> Result<T> {
         Err(self.import.error(format_args!("{}: {what}", self.place)))
     }
@@ -307,7 +455,7 @@ impl Reader<'_> {
             return Ok(*id);
         }
         let read = self.image(image);
-        let id = match self.import.image(image, read) {
+        let id = match self.import.image(image, read)? {
             Some(texture) => self.import.add_texture(texture)?,
             None => NONE,
         };
@@ -316,26 +464,31 @@ impl Reader<'_> {
     }
 
     /// (From the JSON: the crate's view of images panics at those that are neither here nor there.)
-    fn image(&self, image: usize) -> std::result::Result<Texture, String> {
-        let json = self.document.as_json().images.get(image).ok_or("there is none of this number")?;
+    fn image(&mut self, image: usize) -> Attempt<Texture> {
+        let Some(json) = self.document.as_json().images.get(image) else {
+            return Ok(Err("there is none of this number".into()));
+        };
         if let Some(view) = &json.buffer_view {
-            let view = self.document.views().nth(view.value()).ok_or("its buffer view is missing")?;
+            let Some(view) = self.document.views().nth(view.value()) else {
+                return Ok(Err("its buffer view is missing".into()));
+            };
             let buffer = &self.buffers[view.buffer().index()];
             let bytes = view.offset().checked_add(view.length()).and_then(|end| buffer.get(view.offset()..end));
-            return texture::decode(bytes.ok_or("its buffer view does not fit its buffer")?);
+            return match bytes {
+                Some(bytes) => texture::decode(self.import, bytes),
+                None => Ok(Err("its buffer view does not fit its buffer".into())),
+            };
         }
-        let uri = json.uri.as_deref().ok_or("it has neither a buffer view nor a uri")?;
-        if let Some(data) = uri.strip_prefix("data:") {
-            let (_, text) = data.split_once(";base64,").ok_or("a data URI without base64")?;
-            let bytes = base64::prelude::BASE64_STANDARD.decode(text.trim_end()).map_err(|e| e.to_string())?;
-            return texture::decode(&bytes);
-        }
-        let name = percent_decoded(uri).ok_or_else(|| format!("the uri {uri:?}"))?;
-        if name.contains("://") {
-            return Err(format!("it is at {name:?}, not beside the scene"));
-        }
-        let path = self.import.path.parent().unwrap_or(Path::new("")).join(&name);
-        texture::read(&path).map_err(|what| format!("{}: {what}", path.display()))
+        let Some(uri) = json.uri.as_deref() else {
+            return Ok(Err("it has neither a buffer view nor a uri".into()));
+        };
+        let bytes = match read_uri(self.import, self.text, uri)? {
+            Ok(bytes) => bytes,
+            Err(what) => return Ok(Err(what)),
+        };
+        let texture = texture::decode(self.import, &bytes);
+        self.import.account.give_back(bytes.capacity());
+        texture
     }
 
     /// Adds a primitive as a mesh. `unique`: no other node shows it.
@@ -346,36 +499,54 @@ impl Reader<'_> {
             return Ok(());
         }
         let Some(accessor) = primitive.get(&Semantic::Positions) else { return self.malformed("it has no positions") };
-        let positions = self.vectors::<3>(&accessor)?;
+        let positions = self.column::<3>(&accessor)?;
+        let vertices = positions.count;
         let corners = match primitive.indices() {
-            Some(indices) => self.indices(&indices, positions.len())?,
-            None => (0..positions.len() as u32).collect(),
+            Some(indices) => self.indices(&indices, vertices)?,
+            None => {
+                let count = u32::try_from(vertices).or_else(|_| self.malformed("it has too many vertices"))?;
+                let mut corners = self.import.account.list(vertices, "the corners")?;
+                corners.extend(0..count);
+                corners
+            }
         };
-        let mut indices = match triangles_of(mode, &corners) {
-            Some(indices) => indices,
+        let count = match triangle_count(mode, corners.len()) {
+            Some(count) => count,
             None => return self.malformed(format_args!("{} vertices do not make triangles", corners.len())),
         };
-        self.triangles += indices.len();
+        self.triangles += count;
         self.import.check_triangle_count(self.triangles)?;
+        let mut indices = self.import.account.list(count, "the triangles")?;
+        add_triangles(mode, &corners, &mut indices);
+        self.import.account.give_back(4 * corners.capacity());
+        drop(corners);
         if transform.determinant() < 0.0 {
             indices.iter_mut().for_each(|t| t.swap(1, 2));
         }
-        let used = keep_used(&mut indices, positions.len());
-        let mut mesh = Mesh { indices, ..Default::default() };
-        for &v in &used {
-            let position = transform.transform_point3(Vec3::from(positions[v as usize]).as_dvec3()).as_vec3();
-            if !is_valid_position(position) {
-                return self.malformed(format_args!("vertex {v} is {position}, not finite or out of range"));
+        let used = self.keep_used(&mut indices, vertices)?;
+        let mut mesh = Mesh { indices, positions: self.room(&used)?, ..Default::default() };
+        for part in used.chunks(PART) {
+            self.import.check()?;
+            for &v in part {
+                let position = transform.transform_point3(Vec3::from(positions.get(v)).as_dvec3()).as_vec3();
+                if !is_valid_position(position) {
+                    return self.malformed(format_args!("vertex {v} is {position}, not finite or out of range"));
+                }
+                mesh.positions.push(position);
             }
-            mesh.positions.push(position);
         }
-        mesh.normals = self.normals(primitive, transform, &used, positions.len())?;
-        mesh.uvs = self.uvs(primitive, 0, &used, positions.len())?;
+        mesh.normals = self.normals(primitive, transform, &used, vertices)?;
+        mesh.uvs = self.uvs(primitive, 0, &used, vertices)?;
         let material = primitive.material();
-        let lightmap_uvs = if unique { self.uvs(primitive, 1, &used, positions.len())? } else { Vec::new() };
+        let lightmap_uvs = if unique { self.uvs(primitive, 1, &used, vertices)? } else { Vec::new() };
+        self.import.account.give_back(4 * used.capacity());
         if !lightmap_uvs.is_empty() {
             let page = lightmap_texture(&material).and_then(|t| self.pages.get(&t)).copied().unwrap_or(0);
-            let pages = if page == 0 { Vec::new() } else { vec![page; mesh.indices.len()] };
+            let mut pages = Vec::new();
+            if page != 0 {
+                pages = self.import.account.list(mesh.indices.len(), "the light map pages")?;
+                pages.resize(mesh.indices.len(), page);
+            }
             mesh.lightmap = Some(LightmapUvs { uvs: lightmap_uvs, pages });
         }
         let material = self.material(&material)?;
@@ -390,17 +561,42 @@ impl Reader<'_> {
         }
     }
 
+    /// Room for a value of each used vertex.
+    fn room<T>(&mut self, used: &[u32]) -> Result<Vec<T>> {
+        self.import.account.list(used.len(), "the vertices")
+    }
+
+    /// Renumbers vertices so that only used ones remain, in their order, and returns their old numbers.
+    fn keep_used(&mut self, triangles: &mut [[u32; 3]], vertices: usize) -> Result<Vec<u32>> {
+        if self.number.len() < vertices {
+            let more = vertices - self.number.len();
+            self.import.account.make_room(&mut self.number, more, "the vertices")?;
+            self.number.resize(vertices, NONE);
+        }
+        let mut used = self.import.account.list(vertices.min(3 * triangles.len()), "the vertices")?;
+        for &v in triangles.iter().flatten() {
+            if std::mem::replace(&mut self.number[v as usize], 0) == NONE {
+                used.push(v);
+            }
+        }
+        used.sort_unstable();
+        used.iter().zip(0..).for_each(|(&v, new)| self.number[v as usize] = new);
+        triangles.iter_mut().flatten().for_each(|v| *v = self.number[*v as usize]);
+        used.iter().for_each(|&v| self.number[v as usize] = NONE);
+        Ok(used)
+    }
+
     fn normals(
-        &self,
+        &mut self,
         primitive: &gltf::Primitive,
         transform: &DMat4,
         used: &[u32],
         vertices: usize,
     ) -> Result<Vec<Vec3>> {
         let Some(accessor) = primitive.get(&Semantic::Normals) else { return Ok(Vec::new()) };
-        let normals = self.vectors::<3>(&accessor)?;
-        if normals.len() != vertices {
-            return self.malformed(format_args!("it has {} normals for {vertices} vertices", normals.len()));
+        let normals = self.column::<3>(&accessor)?;
+        if normals.count != vertices {
+            return self.malformed(format_args!("it has {} normals for {vertices} vertices", normals.count));
         }
         // The cofactor matrix: the inverse transpose without the division by the determinant. Its
         // sign turns normals round where the winding is turned too.
@@ -409,20 +605,30 @@ impl Reader<'_> {
         let cofactors =
             DMat3::from_cols(m.y_axis.cross(m.z_axis), m.z_axis.cross(m.x_axis), m.x_axis.cross(m.y_axis)) * flip;
         let turn = |n: [f32; 3]| -> DVec3 { (cofactors * Vec3::from(n).as_dvec3()).normalize_or_zero() };
-        Ok(used.iter().map(|&v| turn(normals[v as usize]).as_vec3()).collect())
+        let mut turned = self.room(used)?;
+        for part in used.chunks(PART) {
+            self.import.check()?;
+            turned.extend(part.iter().map(|&v| turn(normals.get(v)).as_vec3()));
+        }
+        Ok(turned)
     }
 
     /// Texture coordinates of the used vertices; empty if there are none.
-    fn uvs(&self, primitive: &gltf::Primitive, set: u32, used: &[u32], vertices: usize) -> Result<Vec<Vec2>> {
+    fn uvs(&mut self, primitive: &gltf::Primitive, set: u32, used: &[u32], vertices: usize) -> Result<Vec<Vec2>> {
         let Some(accessor) = primitive.get(&Semantic::TexCoords(set)) else { return Ok(Vec::new()) };
-        let uvs = self.vectors::<2>(&accessor)?;
-        if uvs.len() != vertices {
-            return self.malformed(format_args!("TEXCOORD_{set} has {} entries for {vertices} vertices", uvs.len()));
+        let column = self.column::<2>(&accessor)?;
+        if column.count != vertices {
+            return self.malformed(format_args!("TEXCOORD_{set} has {} entries for {vertices} vertices", column.count));
         }
-        if let Some(v) = used.iter().find(|v| !uvs[**v as usize].iter().all(|x| x.is_finite())) {
-            return self.malformed(format_args!("TEXCOORD_{set} of vertex {v} is not finite"));
+        let mut uvs = self.room(used)?;
+        for part in used.chunks(PART) {
+            self.import.check()?;
+            uvs.extend(part.iter().map(|&v| Vec2::from(column.get(v))));
         }
-        Ok(used.iter().map(|&v| Vec2::from(uvs[v as usize])).collect())
+        match used.iter().zip(&uvs).find(|(_, uv)| !uv.is_finite()) {
+            Some((v, _)) => self.malformed(format_args!("TEXCOORD_{set} of vertex {v} is not finite")),
+            None => Ok(uvs),
+        }
     }
 
     /// The buffer view that holds an accessor's values. (Without one they would all be zeros, so many
@@ -435,13 +641,7 @@ impl Reader<'_> {
     }
 
     /// The `count` elements of `size` bytes in a buffer view, checked to lie in it.
-    fn elements(
-        &self,
-        view: gltf::buffer::View,
-        offset: usize,
-        count: usize,
-        size: usize,
-    ) -> Result<impl Iterator<Item = &[u8]> + use<'_>> {
+    fn elements(&self, view: gltf::buffer::View, offset: usize, count: usize, size: usize) -> Result<Elements<'i>> {
         let stride = view.stride().unwrap_or(size);
         if stride < size || stride == 0 {
             return self.malformed(format_args!("buffer view {} has stride {stride}, less than {size}", view.index()));
@@ -454,56 +654,86 @@ impl Reader<'_> {
         };
         let end = wanted.and_then(|n| n.checked_add(offset));
         match bytes.and_then(|bytes| bytes.get(offset..end?)) {
-            Some(bytes) => Ok(bytes.chunks(stride).map(move |chunk| &chunk[..size])),
+            Some(bytes) => Ok(Elements { bytes, stride, size }),
             None => self.malformed(format_args!("{count} elements do not fit into buffer view {}", view.index())),
         }
     }
 
-    /// An accessor of `N` components each, integers converted to floats.
-    fn vectors<const N: usize>(&self, accessor: &gltf::Accessor) -> Result<Vec<[f32; N]>> {
+    /// An accessor of `N` components each. Values are converted when they are asked for: a primitive may use few of
+    /// very many.
+    fn column<const N: usize>(&mut self, accessor: &gltf::Accessor) -> Result<Column<'i, N>> {
         if accessor.dimensions() != if N == 2 { Dimensions::Vec2 } else { Dimensions::Vec3 } {
             return self.malformed(format_args!("accessor {} is not of {N}-vectors", accessor.index()));
         }
         let (data_type, normalized) = (accessor.data_type(), accessor.normalized());
-        let (part, size) = (data_type.size(), data_type.size() * N);
-        let decode = |bytes: &[u8]| std::array::from_fn(|k| component(&bytes[k * part..], data_type, normalized));
-        let view = self.base_view(accessor)?;
-        let mut vectors: Vec<[f32; N]> =
-            self.elements(view, accessor.offset(), accessor.count(), size)?.map(decode).collect();
-        if let Some(sparse) = accessor.sparse() {
-            let index_type = match sparse.indices().index_type() {
-                gltf::accessor::sparse::IndexType::U8 => DataType::U8,
-                gltf::accessor::sparse::IndexType::U16 => DataType::U16,
-                gltf::accessor::sparse::IndexType::U32 => DataType::U32,
-            };
-            let indices = sparse.indices();
-            let at = self.elements(indices.view(), indices.offset(), sparse.count(), index_type.size())?;
-            let values = self.elements(sparse.values().view(), sparse.values().offset(), sparse.count(), size)?;
-            for (i, value) in at.map(|bytes| unsigned(bytes, index_type)).zip(values) {
-                let count = vectors.len();
-                let Some(vector) = vectors.get_mut(i as usize) else {
+        let size = data_type.size() * N;
+        let count = accessor.count();
+        let values = self.elements(self.base_view(accessor)?, accessor.offset(), count, size)?;
+        let sparse = match accessor.sparse() {
+            Some(sparse) => Some(self.sparse(accessor.index(), &sparse, count, size)?),
+            None => None,
+        };
+        Ok(Column { values, count, data_type, normalized, sparse })
+    }
+
+    fn sparse(
+        &mut self,
+        accessor: usize,
+        sparse: &gltf::accessor::sparse::Sparse,
+        count: usize,
+        size: usize,
+    ) -> Result<Sparse<'i>> {
+        let indices = sparse.indices();
+        let index_type = match indices.index_type() {
+            gltf::accessor::sparse::IndexType::U8 => DataType::U8,
+            gltf::accessor::sparse::IndexType::U16 => DataType::U16,
+            gltf::accessor::sparse::IndexType::U32 => DataType::U32,
+        };
+        let at = self.elements(indices.view(), indices.offset(), sparse.count(), index_type.size())?;
+        let values = self.elements(sparse.values().view(), sparse.values().offset(), sparse.count(), size)?;
+        let sparse = Sparse { at, index_type, values, count: sparse.count() };
+        if !self.sorted.contains(&accessor) {
+            let mut next = 0;
+            for k in 0..sparse.count {
+                if k.is_multiple_of(PART) {
+                    self.import.check()?;
+                }
+                let i = sparse.index(k);
+                if i >= count {
                     return self.malformed(format_args!("a sparse value is for element {i}, there are {count}"));
-                };
-                *vector = decode(value);
+                }
+                if i < next {
+                    return self
+                        .malformed(format_args!("sparse values are not in order: {i} comes after {}", next - 1));
+                }
+                next = i + 1;
             }
+            self.sorted.insert(accessor);
         }
-        Ok(vectors)
+        Ok(sparse)
     }
 
     /// Vertex numbers, checked to be less than `vertices`.
-    fn indices(&self, accessor: &gltf::Accessor, vertices: usize) -> Result<Vec<u32>> {
+    fn indices(&mut self, accessor: &gltf::Accessor, vertices: usize) -> Result<Vec<u32>> {
         let data_type = accessor.data_type();
         let unsigned_type = matches!(data_type, DataType::U8 | DataType::U16 | DataType::U32);
         if accessor.dimensions() != Dimensions::Scalar || !unsigned_type || accessor.sparse().is_some() {
             return self.malformed(format_args!("accessor {} is not of plain unsigned integers", accessor.index()));
         }
-        let view = self.base_view(accessor)?;
-        let elements = self.elements(view, accessor.offset(), accessor.count(), data_type.size())?;
-        let indices: Vec<u32> = elements.map(|bytes| unsigned(bytes, data_type)).collect();
-        match indices.iter().find(|i| **i as usize >= vertices) {
-            Some(i) => self.malformed(format_args!("an index names vertex {i}, there are {vertices}")),
-            None => Ok(indices),
+        let (view, count) = (self.base_view(accessor)?, accessor.count());
+        let elements = self.elements(view, accessor.offset(), count, data_type.size())?;
+        let mut indices = self.import.account.list(count, "the corners")?;
+        for k in 0..count {
+            if k.is_multiple_of(PART) {
+                self.import.check()?;
+            }
+            let i = unsigned(elements.get(k), data_type);
+            if i as usize >= vertices {
+                return self.malformed(format_args!("an index names vertex {i}, there are {vertices}"));
+            }
+            indices.push(i);
         }
+        Ok(indices)
     }
 
     fn warn(&mut self) {
@@ -525,6 +755,70 @@ impl Reader<'_> {
                 self.import.warn(format!("{count} {what}"));
             }
         }
+    }
+}
+
+/// Values that are worked on between two looks for a cancel: a millisecond or less.
+const PART: usize = 1 << 16;
+
+/// Elements in a buffer, whose bounds have been checked.
+struct Elements<'b> {
+    bytes: &'b [u8],
+    stride: usize,
+    size: usize,
+}
+
+impl<'b> Elements<'b> {
+    fn get(&self, k: usize) -> &'b [u8] {
+        &self.bytes[k * self.stride..][..self.size]
+    }
+}
+
+/// Vectors of an accessor.
+struct Column<'b, const N: usize> {
+    values: Elements<'b>,
+    count: usize,
+    data_type: DataType,
+    normalized: bool,
+    sparse: Option<Sparse<'b>>,
+}
+
+impl<const N: usize> Column<'_, N> {
+    /// Integers are converted to floats.
+    fn get(&self, vertex: u32) -> [f32; N] {
+        let v = vertex as usize;
+        let replaced = self.sparse.as_ref().and_then(|sparse| sparse.get(v));
+        let bytes = replaced.unwrap_or_else(|| self.values.get(v));
+        let part = self.data_type.size();
+        std::array::from_fn(|k| component(&bytes[k * part..], self.data_type, self.normalized))
+    }
+}
+
+/// Values that replace others, in the order of their elements.
+struct Sparse<'b> {
+    at: Elements<'b>,
+    index_type: DataType,
+    values: Elements<'b>,
+    count: usize,
+}
+
+impl<'b> Sparse<'b> {
+    fn index(&self, k: usize) -> usize {
+        unsigned(self.at.get(k), self.index_type) as usize
+    }
+
+    fn get(&self, element: usize) -> Option<&'b [u8]> {
+        // Binary search.
+        let (mut low, mut high) = (0, self.count);
+        while low < high {
+            let middle = low + (high - low) / 2;
+            if self.index(middle) < element {
+                low = middle + 1;
+            } else {
+                high = middle;
+            }
+        }
+        (low < self.count && self.index(low) == element).then(|| self.values.get(low))
     }
 }
 
@@ -550,30 +844,25 @@ fn unsigned(bytes: &[u8], data_type: DataType) -> u32 {
     }
 }
 
-/// The triangles that a list of vertices stands for (glTF 2.0, 3.7.2.1); `None` if it is too short.
-fn triangles_of(mode: Mode, corners: &[u32]) -> Option<Vec<[u32; 3]>> {
-    if corners.len() < 3 || (mode == Mode::Triangles && !corners.len().is_multiple_of(3)) {
-        return None;
+/// How many triangles a list of vertices stands for (glTF 2.0, 3.7.2.1); `None` if it is too short.
+fn triangle_count(mode: Mode, corners: usize) -> Option<usize> {
+    match mode {
+        _ if corners < 3 => None,
+        Mode::TriangleStrip | Mode::TriangleFan => Some(corners - 2),
+        _ => corners.is_multiple_of(3).then_some(corners / 3),
     }
-    Some(match mode {
-        Mode::TriangleStrip => {
-            let ordered = |(i, w): (usize, &[u32])| if i % 2 == 0 { [w[0], w[1], w[2]] } else { [w[0], w[2], w[1]] };
-            corners.windows(3).enumerate().map(ordered).collect()
-        }
-        Mode::TriangleFan => corners[1..].windows(2).map(|w| [corners[0], w[0], w[1]]).collect(),
-        _ => corners.as_chunks::<3>().0.to_vec(),
-    })
 }
 
-/// Renumbers vertices so that only used ones remain, in their order, and returns their old numbers.
-/// (Primitives often share one large vertex buffer.)
-fn keep_used(triangles: &mut [[u32; 3]], vertices: usize) -> Vec<u32> {
-    let mut number = vec![NONE; vertices];
-    triangles.iter().flatten().for_each(|&v| number[v as usize] = 0);
-    let used: Vec<u32> = (0..vertices as u32).filter(|&v| number[v as usize] == 0).collect();
-    used.iter().zip(0..).for_each(|(&v, new)| number[v as usize] = new);
-    triangles.iter_mut().flatten().for_each(|v| *v = number[*v as usize]);
-    used
+/// The triangles themselves.
+fn add_triangles(mode: Mode, corners: &[u32], triangles: &mut Vec<[u32; 3]>) {
+    match mode {
+        Mode::TriangleStrip => {
+            let ordered = |(i, w): (usize, &[u32])| if i % 2 == 0 { [w[0], w[1], w[2]] } else { [w[0], w[2], w[1]] };
+            triangles.extend(corners.windows(3).enumerate().map(ordered));
+        }
+        Mode::TriangleFan => triangles.extend(corners[1..].windows(2).map(|w| [corners[0], w[0], w[1]])),
+        _ => triangles.extend_from_slice(corners.as_chunks::<3>().0),
+    }
 }
 
 #[cfg(test)]
@@ -816,6 +1105,37 @@ pub(super) mod tests {
         std::fs::remove_file(folder.path("da ta.bin")).unwrap();
         let Err(Error::Io(message)) = load_path(&folder.path("a.gltf")) else { panic!() };
         assert!(message.contains("buffer 0") && message.contains("da ta.bin"), "{message}");
+    }
+
+    #[test]
+    fn long_data_uris_are_read_in_pieces_and_may_be_escaped() {
+        // A buffer of more than a piece, with many slashes in base64.
+        let mut large = sample();
+        large.binary.resize(3 << 20, 0xff);
+        large.root["buffers"][0]["byteLength"] = large.binary.len().into();
+        let (inside, _) = load_bytes("a.glb", large.glb()).unwrap();
+        let text = String::from_utf8(large.gltf()).unwrap();
+        for text in [text.clone(), text.replace('/', "\\/")] {
+            assert_eq!(load_bytes("a.gltf", text).unwrap().0.meshes(), inside.meshes());
+        }
+        let broken = text.replacen("////", "//=/", 1);
+        assert!(refusal("a.gltf", broken).starts_with("buffer 0: "));
+        // What stands for a long URI in the parser's text means nothing in a file.
+        let mut own = sample();
+        own.root["buffers"][0]["uri"] = "data:#0".into();
+        assert_eq!(refusal("a.gltf", own.root.to_string()), "buffer 0: a data URI without base64");
+    }
+
+    #[test]
+    fn primitives_that_share_a_large_vertex_buffer_cost_what_they_use() {
+        let mut shared = sample();
+        let primitive = shared.root["meshes"][0]["primitives"][0].clone();
+        shared.root["meshes"][0]["primitives"] = vec![primitive; 50].into();
+        let folder = Folder::new();
+        std::fs::write(folder.path("a.glb"), shared.glb()).unwrap();
+        let (scene, info) = load_path(&folder.path("a.glb")).unwrap();
+        assert_eq!((scene.meshes().len(), info.triangles, info.vertices), (50, 100, 200));
+        assert!(scene.meshes().iter().all(|mesh| mesh.positions == scene.meshes()[0].positions));
     }
 
     #[test]

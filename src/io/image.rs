@@ -5,29 +5,112 @@
 //! page is v = 0 and becomes the top row of the file, which is where glTF and Vulkan have v = 0.
 //! (OpenGL tools that expect v = 0 at the bottom show such files upside down.)
 
+use super::source::Advance;
 use crate::error::{Error, Result, invalid_argument};
 use crate::files;
-use crate::scene::{Environment, MAX_COORDINATE};
-use image::ExtendedColorType::{L8, Rgb8, Rgb32F};
+use crate::scene::{Environment, MAX_COORDINATE, MAX_ENVIRONMENT_SIZE};
+use image::ExtendedColorType::Rgb32F;
 use image::codecs::openexr::OpenExrEncoder;
-use image::codecs::png::{CompressionType, FilterType, PngEncoder};
 use image::{ImageEncoder, ImageFormat};
-use std::io::Cursor;
+use png::ColorType;
+use std::io::{self, Cursor, Seek, SeekFrom, Write};
 use std::path::Path;
 
 /// Writes linear RGB values as an OpenEXR file of 32-bit floats.
 pub fn write_exr(path: &Path, width: u32, height: u32, pixels: &[[f32; 3]]) -> Result<()> {
-    check_size(width, height, pixels.len())?;
-    let mut file = Cursor::new(Vec::new());
-    let bytes = bytemuck::cast_slice(pixels);
-    OpenExrEncoder::new(&mut file).write_image(bytes, width, height, Rgb32F).map_err(|e| fail(path, e))?;
-    files::replace_with(path, file.get_ref())
+    write_exr_with(path, width, height, pixels, &|_| Ok(()))
 }
+
+/// The same; `advance` is called often and ends the call by an error.
+pub(super) fn write_exr_with(
+    path: &Path,
+    width: u32,
+    height: u32,
+    pixels: &[[f32; 3]],
+    advance: Advance,
+) -> Result<()> {
+    check_size(width, height, pixels.len())?;
+    let mut file = Encoded::new(advance);
+    let written = OpenExrEncoder::new(&mut file).write_image(bytemuck::cast_slice(pixels), width, height, Rgb32F);
+    let bytes = file.finish(written.map_err(|e| fail(path, e)))?;
+    files::replace(path, |file| file.append(&bytes, |_| advance(0)))
+}
+
+/// A file in memory that an encoder writes to. Writing fails where there is no memory, and once the caller has asked
+/// to stop.
+struct Encoded<'a> {
+    bytes: Vec<u8>,
+    at: usize,
+    advance: Advance<'a>,
+    error: Option<Error>,
+}
+
+impl<'a> Encoded<'a> {
+    fn new(advance: Advance<'a>) -> Self {
+        Encoded { bytes: Vec::new(), at: 0, advance, error: None }
+    }
+
+    /// The file, or why there is none: encoders forget what their writer said.
+    fn finish(self, written: Result<()>) -> Result<Vec<u8>> {
+        match self.error {
+            Some(own) => Err(own),
+            None => written.map(|()| self.bytes),
+        }
+    }
+
+    fn make_room(&mut self, end: usize) -> Result<()> {
+        (self.advance)(0)?;
+        let more = end.saturating_sub(self.bytes.len());
+        self.bytes.try_reserve(more).map_err(|_| Error::OutOfMemory(format!("an image file needs {end} bytes")))?;
+        self.bytes.resize(self.bytes.len() + more, 0);
+        Ok(())
+    }
+}
+
+impl Write for Encoded<'_> {
+    fn write(&mut self, bytes: &[u8]) -> io::Result<usize> {
+        let end = self.at + bytes.len();
+        if let Err(e) = self.make_room(end) {
+            self.error = Some(e);
+            return Err(io::Error::other("the image cannot be written"));
+        }
+        self.bytes[self.at..end].copy_from_slice(bytes);
+        self.at = end;
+        Ok(bytes.len())
+    }
+
+    fn flush(&mut self) -> io::Result<()> {
+        Ok(())
+    }
+}
+
+impl Seek for Encoded<'_> {
+    fn seek(&mut self, to: SeekFrom) -> io::Result<u64> {
+        let at = match to {
+            SeekFrom::Start(at) => i64::try_from(at).ok(),
+            SeekFrom::End(by) => (self.bytes.len() as i64).checked_add(by),
+            SeekFrom::Current(by) => (self.at as i64).checked_add(by),
+        };
+        let at = at.and_then(|at| usize::try_from(at).ok());
+        self.at = at.ok_or_else(|| io::Error::new(io::ErrorKind::InvalidInput, "a place before the beginning"))?;
+        Ok(self.at as u64)
+    }
+}
+
+/// Most bytes of a sky as it is decoded: 8192 × 4096 texels of four floats.
+const MAX_ENVIRONMENT_BYTES: u64 = 512 << 20;
 
 /// Reads the image of a sky from an OpenEXR or Radiance HDR file, in linear RGB. Negative values and those
 /// that are not numbers, which cameras and filters leave in such files, become 0; too large ones the largest.
 pub fn read_environment(path: &Path) -> Result<Environment> {
-    let reader = image::ImageReader::open(path).and_then(|r| r.with_guessed_format()).map_err(|e| fail(path, e))?;
+    // A texel of 4 bytes at least.
+    let bytes = files::read(path, 4 * (MAX_ENVIRONMENT_SIZE as u64).pow(2))?;
+    let reader = image::ImageReader::new(Cursor::new(&bytes)).with_guessed_format();
+    let mut reader = reader.map_err(|e| fail(path, e))?;
+    let mut limits = image::Limits::default();
+    (limits.max_image_width, limits.max_image_height) = (Some(MAX_ENVIRONMENT_SIZE), Some(MAX_ENVIRONMENT_SIZE));
+    limits.max_alloc = Some(MAX_ENVIRONMENT_BYTES);
+    reader.limits(limits);
     match reader.format() {
         Some(ImageFormat::Hdr | ImageFormat::OpenExr) => {}
         _ => return Err(fail(path, "neither an OpenEXR nor a Radiance HDR file")),
@@ -46,26 +129,66 @@ pub fn write_exr_grey(path: &Path, width: u32, height: u32, pixels: &[f32]) -> R
 
 /// Writes sRGB colours as a PNG file.
 pub fn write_png_rgb8(path: &Path, width: u32, height: u32, pixels: &[[u8; 3]]) -> Result<()> {
-    files::replace_with(path, &encode_png_rgb8(width, height, pixels)?)
+    write_png_with(path, width, height, pixels, &|_| Ok(()))
+}
+
+/// The same; `advance` is called often and ends the call by an error.
+pub(super) fn write_png_with(path: &Path, width: u32, height: u32, pixels: &[[u8; 3]], advance: Advance) -> Result<()> {
+    let file = encode_png(width, height, pixels, ColorType::Rgb, advance)?;
+    files::replace(path, |new| new.append(&file, |_| advance(0)))
 }
 
 /// Writes grey values as a PNG file.
 pub fn write_png_grey8(path: &Path, width: u32, height: u32, pixels: &[u8]) -> Result<()> {
-    check_size(width, height, pixels.len())?;
-    files::replace_with(path, &encode_png(width, height, pixels, L8).map_err(|e| fail(path, e))?)
+    let pixels: &[[u8; 1]] = bytemuck::cast_slice(pixels);
+    files::replace_with(path, &encode_png(width, height, pixels, ColorType::Grayscale, &|_| Ok(()))?)
 }
 
 /// The bytes of a PNG file of sRGB colours.
 pub fn encode_png_rgb8(width: u32, height: u32, pixels: &[[u8; 3]]) -> Result<Vec<u8>> {
-    check_size(width, height, pixels.len())?;
-    encode_png(width, height, pixels.as_flattened(), Rgb8).map_err(|e| Error::Io(format!("encoding a PNG: {e}")))
+    encode_png(width, height, pixels, ColorType::Rgb, &|_| Ok(()))
 }
 
-fn encode_png(width: u32, height: u32, bytes: &[u8], color: image::ExtendedColorType) -> image::ImageResult<Vec<u8>> {
-    let mut png = Vec::new();
-    PngEncoder::new_with_quality(&mut png, CompressionType::Default, FilterType::Adaptive)
-        .write_image(bytes, width, height, color)?;
-    Ok(png)
+/// The bytes of a PNG file of colours of `N` channels. `advance` is called with every few rows and ends the call by an
+/// error.
+pub(super) fn encode_png<const N: usize>(
+    width: u32,
+    height: u32,
+    pixels: &[[u8; N]],
+    color: ColorType,
+    advance: Advance,
+) -> Result<Vec<u8>> {
+    check_size(width, height, pixels.len())?;
+    let mut file = Encoded::new(advance);
+    let written = write_rows(&mut file, width, height, pixels.as_flattened(), color, advance);
+    file.finish(written)
+}
+
+/// Bytes of an image between two looks for a cancel: they are filtered and compressed in some milliseconds.
+const ROWS: usize = 64 << 10;
+
+fn write_rows(
+    file: &mut Encoded,
+    width: u32,
+    height: u32,
+    bytes: &[u8],
+    color: ColorType,
+    advance: Advance,
+) -> Result<()> {
+    let fail = |e: &dyn std::fmt::Display| Error::Io(format!("encoding a PNG: {e}"));
+    let mut encoder = png::Encoder::new(file, width, height);
+    encoder.set_color(color);
+    encoder.set_depth(png::BitDepth::Eight);
+    encoder.set_compression(png::Compression::Balanced);
+    encoder.set_filter(png::Filter::Adaptive);
+    let mut header = encoder.write_header().map_err(|e| fail(&e))?;
+    let mut rows = header.stream_writer().map_err(|e| fail(&e))?;
+    for part in bytes.chunks(ROWS) {
+        advance(0)?;
+        rows.write_all(part).map_err(|e| fail(&e))?;
+    }
+    rows.finish().map_err(|e| fail(&e))?;
+    header.finish().map_err(|e| fail(&e))
 }
 
 fn check_size(width: u32, height: u32, pixels: usize) -> Result<()> {
@@ -175,6 +298,24 @@ mod tests {
         assert_eq!(back.as_raw()[..], *pixels.as_flattened());
         write_png_grey8(&path, 2, 1, &[3, 200]).unwrap();
         assert_eq!(image::open(&path).unwrap().into_luma8().as_raw()[..], [3, 200]);
+    }
+
+    #[test]
+    fn encoding_ends_soon_after_a_cancel() {
+        let pixels: Vec<[u8; 3]> =
+            (0..1u32 << 20).map(|i| i.wrapping_mul(0x9e37_79b9).to_le_bytes()).map(|b| [b[0], b[1], b[2]]).collect();
+        let folder = Folder::new();
+        let calls = std::cell::Cell::new(0);
+        let advance = |_| {
+            calls.set(calls.get() + 1);
+            if calls.get() > 5 { Err(Error::Cancelled) } else { Ok(()) }
+        };
+        let png = encode_png(1 << 10, 1 << 10, &pixels, ColorType::Rgb, &advance);
+        assert_eq!((png, calls.get() < 10), (Err(Error::Cancelled), true));
+        calls.set(0);
+        let values = vec![[0.5; 3]; 1 << 20];
+        let exr = write_exr_with(&folder.path("a.exr"), 1 << 10, 1 << 10, &values, &advance);
+        assert_eq!((exr, calls.get() < 10, folder.path("a.exr").exists()), (Err(Error::Cancelled), true, false));
     }
 
     #[test]

@@ -1,10 +1,13 @@
 //! Baked light maps as files: pages layer by layer as EXR or PNG, or the lit scene as GLB.
 
-use super::glb::{GlbLightmap, GlbMesh, write_glb};
-use super::image::{auto_exposure, encode_png_rgb8, tone_map, write_exr, write_png_rgb8};
+use super::account::Account;
+use super::glb::{GlbLightmap, GlbMesh, write_glb_with};
+use super::image::{auto_exposure, encode_png, tone_map, write_exr_with, write_png_with};
+use super::source::Advance;
 use crate::error::{Error, Result};
 use crate::lightmap::{Layer, LayerData, Lightmap};
-use crate::progress::{Progress, Stage};
+use crate::memory::{Reservation, try_vec};
+use crate::progress::Progress;
 use rayon::prelude::*;
 use std::f32::consts::PI;
 use std::path::{Path, PathBuf};
@@ -19,63 +22,101 @@ const LAYERS: [(Layer, &str); 4] = [
 
 /// One exposure for all pages (see [`auto_exposure`]), from the texels that are lit.
 pub fn exposure(lightmap: &Lightmap) -> Result<f32> {
+    let mut account = Account::new(lightmap.scene().device().memory())?;
     let mut pixels = Vec::new();
     for page in 0..lightmap.info().page_count {
-        pixels.extend(rgb(lightmap, page, Layer::Combined)?);
+        let page = rgb(lightmap, page, Layer::Combined)?;
+        account.make_room(&mut pixels, page.len(), "the exposure")?;
+        pixels.extend(page);
     }
     Ok(auto_exposure(&pixels, |_| true))
 }
 
 /// Writes the light layers as floats, `PREFIXpageN-LAYER.exr`, and returns the paths.
+///
+/// Each file replaces an older one as a whole. When the call fails or is cancelled, files that were written before
+/// stay.
 pub fn write_exr_pages(lightmap: &Lightmap, prefix: &str, progress: &Progress) -> Result<Vec<PathBuf>> {
     let info = lightmap.info();
-    each_page(lightmap, progress, |page, layer, name| {
-        let path = PathBuf::from(format!("{prefix}page{page}-{name}.exr"));
-        write_exr(&path, info.width, info.height, &rgb(lightmap, page, layer)?)?;
-        Ok(path)
+    lightmap.scene().device().run(progress, || {
+        each_page(lightmap, progress, |page, layer, name, advance| {
+            let path = PathBuf::from(format!("{prefix}page{page}-{name}.exr"));
+            write_exr_with(&path, info.width, info.height, &rgb(lightmap, page, layer)?, advance)?;
+            Ok(path)
+        })
     })
 }
 
-/// Writes the light layers tone mapped, `PREFIXpageN-LAYER.png`, and returns the paths.
-pub fn write_png_pages(lightmap: &Lightmap, prefix: &str, exposure: f32, progress: &Progress) -> Result<Vec<PathBuf>> {
+/// Writes the light layers tone mapped, `PREFIXpageN-LAYER.png`, and returns the paths. `exposure`: `None` chooses
+/// [one](exposure). Otherwise as [`write_exr_pages`].
+pub fn write_png_pages(
+    lightmap: &Lightmap,
+    prefix: &str,
+    exposure: Option<f32>,
+    progress: &Progress,
+) -> Result<Vec<PathBuf>> {
     let info = lightmap.info();
-    each_page(lightmap, progress, |page, layer, name| {
-        let path = PathBuf::from(format!("{prefix}page{page}-{name}.png"));
-        // Radiance is albedo/π times irradiance: π brings it to the brightness of the others.
-        let exposure = if layer == Layer::Radiance { exposure * PI } else { exposure };
-        write_png_rgb8(&path, info.width, info.height, &tone_mapped(lightmap, page, layer, exposure)?)?;
-        Ok(path)
+    lightmap.scene().device().run(progress, || {
+        let exposure = exposure.map_or_else(|| self::exposure(lightmap), Ok)?;
+        each_page(lightmap, progress, |page, layer, name, advance| {
+            let path = PathBuf::from(format!("{prefix}page{page}-{name}.png"));
+            // Radiance is albedo/π times irradiance: π brings it to the brightness of the others.
+            let exposure = if layer == Layer::Radiance { exposure * PI } else { exposure };
+            let pixels = tone_mapped(lightmap, page, layer, exposure)?;
+            write_png_with(&path, info.width, info.height, &pixels, advance)?;
+            Ok(path)
+        })
     })
 }
 
-/// Writes the scene with its light map to the GLB file `path`.
-pub fn write_scene(lightmap: &Lightmap, path: &Path, exposure: f32) -> Result<()> {
+/// Writes the scene with its light map to the GLB file `path`, see [`super::glb`]. `exposure`: `None` chooses
+/// [one](exposure). Otherwise as [`write_exr_pages`].
+pub fn write_scene(lightmap: &Lightmap, path: &Path, exposure: Option<f32>, progress: &Progress) -> Result<()> {
     let info = lightmap.info();
-    let meshes =
-        (0..lightmap.scene().meshes().len() as u32).map(|mesh| GlbMesh::of(lightmap, mesh)).collect::<Result<_>>()?;
-    let page =
-        |page| encode_png_rgb8(info.width, info.height, &tone_mapped(lightmap, page, Layer::Combined, exposure)?);
-    let pages = (0..info.page_count).map(page).collect::<Result<_>>()?;
-    write_glb(path, lightmap.scene(), &GlbLightmap { meshes, pages })
+    lightmap.scene().device().run(progress, || {
+        let stage = progress.stage("scene with light map", 0.0, 1.0, u64::from(info.page_count) + 2);
+        let exposure = exposure.map_or_else(|| self::exposure(lightmap), Ok)?;
+        let meshes = (0..lightmap.scene().meshes().len() as u32)
+            .map(|mesh| stage.advance(0).and_then(|()| GlbMesh::of(lightmap, mesh)))
+            .collect::<Result<_>>()?;
+        let page = |page| {
+            let _encoder = encoder_memory(lightmap)?;
+            let pixels = tone_mapped(lightmap, page, Layer::Combined, exposure)?;
+            let file =
+                encode_png(info.width, info.height, &pixels, png::ColorType::Rgb, &|parts| stage.advance(parts))?;
+            stage.advance(1)?;
+            Ok(file)
+        };
+        let pages = (0..info.page_count).into_par_iter().map(page).collect::<Result<_>>()?;
+        let glb = GlbLightmap { meshes, pages, exposure };
+        write_glb_with(path, lightmap.scene(), &glb, &|parts| stage.advance(parts))
+    })
+}
+
+/// Announces what an encoder takes for a page, which is not ours to allocate: the filtered rows and the file.
+fn encoder_memory(lightmap: &Lightmap) -> Result<Reservation> {
+    let info = lightmap.info();
+    let bytes = 24 * info.width as usize * info.height as usize;
+    lightmap.scene().device().memory().reserve(bytes, "a page being encoded")
 }
 
 /// Runs `write` for each light layer of each page, in parallel.
 fn each_page(
     lightmap: &Lightmap,
     progress: &Progress,
-    write: impl Fn(u32, Layer, &str) -> Result<PathBuf> + Sync,
+    write: impl Fn(u32, Layer, &str, Advance) -> Result<PathBuf> + Sync,
 ) -> Result<Vec<PathBuf>> {
     let jobs: Vec<(u32, Layer, &str)> =
         (0..lightmap.info().page_count).flat_map(|page| LAYERS.map(|(layer, name)| (page, layer, name))).collect();
-    let stage: Stage = progress.stage("pages", 0.0, 1.0, jobs.len() as u64);
-    lightmap.scene().device().run(progress, || {
-        let written = jobs.par_iter().map(|&(page, layer, name)| {
-            let path = write(page, layer, name)?;
-            stage.advance(1)?;
-            Ok(path)
-        });
-        written.collect()
-    })
+    let stage = progress.stage("pages", 0.0, 1.0, jobs.len() as u64);
+    let written = jobs.par_iter().map(|&(page, layer, name)| {
+        stage.advance(0)?;
+        let _encoder = encoder_memory(lightmap)?;
+        let path = write(page, layer, name, &|parts| stage.advance(parts))?;
+        stage.advance(1)?;
+        Ok(path)
+    });
+    written.collect()
 }
 
 /// A light layer of a page.
@@ -87,5 +128,8 @@ fn rgb(lightmap: &Lightmap, page: u32, layer: Layer) -> Result<Vec<[f32; 3]>> {
 }
 
 fn tone_mapped(lightmap: &Lightmap, page: u32, layer: Layer, exposure: f32) -> Result<Vec<[u8; 3]>> {
-    Ok(rgb(lightmap, page, layer)?.iter().map(|&p| tone_map(exposure, p)).collect())
+    let pixels = rgb(lightmap, page, layer)?;
+    let mut mapped = try_vec::<[u8; 3]>(pixels.len(), "a page being encoded")?;
+    mapped.iter_mut().zip(&pixels).for_each(|(to, &from)| *to = tone_map(exposure, from));
+    Ok(mapped)
 }

@@ -3,6 +3,7 @@
 //! | file | what it does |
 //! |---|---|
 //! | [`load`] | chooses a reader by the file name's extension |
+//! | `source`, `account` | which files a scene may name, limits, progress, cancelling, memory |
 //! | `obj`, `mtl` | Wavefront OBJ with material libraries |
 //! | `ply` | PLY, ASCII and binary |
 //! | `gltf` | glTF 2.0 and GLB: geometry, materials, punctual lights |
@@ -12,10 +13,11 @@
 //! | [`glb`] | a scene with its light maps as GLB, for any viewer |
 //!
 //! All surfaces become diffuse [`Material`]s with their colour textures, holes and transmission. Images that
-//! cannot be read are warnings.
+//! cannot be read, or lie where the scene must not look, are warnings.
 //! Malformed files are refused with an [`Error::Io`] that names the file and the place; degenerate
 //! triangles are kept (commit skips and counts them); vertices that are not finite are malformed.
 
+mod account;
 pub mod glb;
 mod gltf;
 pub mod image;
@@ -23,15 +25,22 @@ pub mod lightmaps;
 mod mtl;
 mod obj;
 mod ply;
+mod source;
 #[cfg(test)]
 mod tests;
 mod texture;
 
 use crate::error::{Error, Result};
+use crate::memory::MemoryMonitor;
+use crate::progress::Progress;
 use crate::scene::{MAX_ALBEDO, MAX_COORDINATE, MAX_TRIANGLES, Material, Mesh, NONE, SceneData, Texture};
+use account::Account;
 use glam::Vec3;
+use source::{Advance, Attempt, Files, Opened, Source, read_error};
 use std::fmt::Display;
+use std::io::Read;
 use std::path::{Path, PathBuf};
+use std::sync::Arc;
 use std::time::Instant;
 
 /// Sidedness of materials from files that say nothing about it (OBJ, PLY). Such files are often
@@ -63,47 +72,107 @@ pub struct LoadInfo {
     pub seconds: f64,
 }
 
+/// Which files a scene may consist of, and how much of them.
+#[derive(Clone)]
+pub struct LoadOptions {
+    /// Files that the scene names must lie in this folder or below; `None`: in the scene file's own or below.
+    pub base_folder: Option<PathBuf>,
+    /// Files that the scene names may lie anywhere. For scenes that are trusted.
+    pub any_folder: bool,
+    /// Most bytes of all files together.
+    pub max_file_bytes: u64,
+    /// Most bytes of all decoded images together, 4 per texel. Looked at before an image is decoded.
+    pub max_texture_bytes: u64,
+    /// The accounts that are asked before memory is taken: those of the device.
+    pub memory: Arc<MemoryMonitor>,
+}
+
+impl Default for LoadOptions {
+    fn default() -> Self {
+        LoadOptions {
+            base_folder: None,
+            any_folder: false,
+            max_file_bytes: 16 << 30,
+            max_texture_bytes: 2 << 30,
+            memory: Arc::default(),
+        }
+    }
+}
+
+/// As [`load_with`], with the default options and without reports of progress.
+pub fn load(path: &Path, data: &mut SceneData) -> Result<LoadInfo> {
+    load_with(path, &LoadOptions::default(), &Progress::none(), data)
+}
+
 /// Reads the scene file `path` and appends what is in it to `data`. The extension decides, in any
 /// case: `.obj`, `.ply`, `.gltf`, `.glb`.
 ///
-/// Fails with [`Error::Unsupported`] for other extensions and for files that need what is not
-/// supported, and with [`Error::Io`] for files that cannot be read or are malformed; `data` is
-/// unchanged then.
-pub fn load(path: &Path, data: &mut SceneData) -> Result<LoadInfo> {
+/// Fails with [`Error::Unsupported`] for other extensions and for files that need what is not supported, with
+/// [`Error::Io`] for files that cannot be read or are malformed, with [`Error::OutOfMemory`] beyond the limits of
+/// `options` or where there is no memory, with [`Error::Cancelled`]; `data` is unchanged then.
+pub fn load_with(path: &Path, options: &LoadOptions, progress: &Progress, data: &mut SceneData) -> Result<LoadInfo> {
     let start = Instant::now();
     let extension = path.extension().map(|e| e.to_string_lossy().to_ascii_lowercase()).unwrap_or_default();
-    let mut import = Import::new(path);
-    match extension.as_str() {
-        "obj" => obj::load(&mut import)?,
-        "ply" => ply::load(&mut import)?,
-        "gltf" | "glb" => gltf::load(&mut import)?,
+    let read = match extension.as_str() {
+        "obj" => obj::load,
+        "ply" => ply::load,
+        "gltf" | "glb" => gltf::load,
         _ => {
             return Err(Error::Unsupported(format!(
                 "{} has the extension {extension:?}, not obj, ply, gltf or glb",
                 path.display()
             )));
         }
-    }
+    };
+    let mut files = Files::new(path, options)?;
+    let opened = files.open_scene(path)?;
+    // Twice the file: nobody knows yet what its images add.
+    let stage = progress.stage("scene file", 0.0, 0.99, opened.size.saturating_mul(2));
+    let advance = |bytes| stage.advance(bytes);
+    let mut import = Import::new(path, options, files, &advance)?;
+    // Decoders know no cancel: they take it for a file that cannot be read.
+    let read = read(&mut import, opened)
+        .and_then(|()| progress.check())
+        .map_err(|e| if progress.is_cancelled() { Error::Cancelled } else { e });
+    read?;
     let mut info = import.finish(data)?;
     info.seconds = start.elapsed().as_secs_f64();
+    progress.stage("scene file", 1.0, 1.0, 1);
     Ok(info)
 }
 
 /// A scene file being read: what was found so far, apart from the caller's scene.
-struct Import {
+struct Import<'s> {
     path: PathBuf,
     scene: SceneData,
     info: LoadInfo,
+    account: Account,
+    files: Files,
+    texture_bytes_left: u64,
+    advance: Advance<'s>,
 }
 
-impl Import {
-    fn new(path: &Path) -> Self {
-        Import { path: path.to_owned(), scene: SceneData::new(), info: LoadInfo::default() }
+impl<'s> Import<'s> {
+    fn new(path: &Path, options: &LoadOptions, files: Files, advance: Advance<'s>) -> Result<Self> {
+        Ok(Import {
+            path: path.to_owned(),
+            scene: SceneData::new(),
+            info: LoadInfo::default(),
+            account: Account::new(&options.memory)?,
+            files,
+            texture_bytes_left: options.max_texture_bytes,
+            advance,
+        })
     }
 
     /// "This file is malformed": the error that names it.
     fn error(&self, what: impl std::fmt::Display) -> Error {
         Error::Io(format!("{}: {what}", self.path.display()))
+    }
+
+    /// `Err(Cancelled)` once the caller has asked to stop. Makes reports that are due.
+    fn check(&self) -> Result<()> {
+        (self.advance)(0)
     }
 
     fn warn(&mut self, what: impl Into<String>) {
@@ -121,11 +190,30 @@ impl Import {
     }
 
     /// The image of some materials, or a warning that it cannot be read; `name`: the image's.
-    fn image(&mut self, name: impl Display, image: std::result::Result<Texture, String>) -> Option<Texture> {
+    fn image(&mut self, name: impl Display, image: Attempt<Texture>) -> Result<Option<Texture>> {
+        let image = image?;
         if let Err(what) = &image {
             self.warn(format!("the image {name} cannot be read ({what}); its materials do without"));
         }
-        image.ok()
+        Ok(image.ok())
+    }
+
+    /// All bytes of a file that one in `folder` names. They are counted in the account.
+    fn read_named(&mut self, folder: &Path, name: &str) -> Attempt<Vec<u8>> {
+        match self.files.open(folder, name)? {
+            Ok(opened) => self.read_opened(opened).map(Ok),
+            Err(what) => Ok(Err(what)),
+        }
+    }
+
+    fn read_opened(&mut self, opened: Opened) -> Result<Vec<u8>> {
+        let path = opened.path.clone();
+        let size = usize::try_from(opened.size).map_err(|_| self.error("it does not fit into memory"))?;
+        let mut bytes = self.account.list(size, "a file")?;
+        let mut source = Source::new(opened, self.advance);
+        // (There is room for all of it: the list does not grow.)
+        source.read_to_end(&mut bytes).map_err(|e| read_error(e, path.display()))?;
+        Ok(bytes)
     }
 
     fn add_texture(&mut self, texture: Texture) -> Result<u32> {
@@ -154,7 +242,7 @@ impl Import {
 
     /// Hands all that was read to the caller's scene.
     fn finish(self, data: &mut SceneData) -> Result<LoadInfo> {
-        let Import { mut info, scene, .. } = self;
+        let Import { mut info, scene, account, .. } = self;
         info.meshes = scene.meshes().len() as u32;
         info.triangles = scene.triangle_count() as u64;
         info.vertices = scene.meshes().iter().map(|m| m.positions.len() as u64).sum();
@@ -162,6 +250,8 @@ impl Import {
         info.textures = scene.textures().len() as u32;
         info.lights = scene.lights().len() as u32;
         info.has_lightmap_uvs = scene.meshes().iter().any(|m| m.lightmap.is_some());
+        // From here on the memory is the scene's.
+        drop(account);
         data.append(scene)?;
         Ok(info)
     }

@@ -3,10 +3,11 @@
 //! `illum` is one of the models with transparency, 4, 6, 7 and 9. Options of maps and everything else are
 //! skipped.
 
+use super::account::Account;
+use super::source::{Source, folder_of, read_error};
 use crate::error::{Error, Result};
 use std::collections::HashMap;
 use std::fmt::Display;
-use std::io::BufRead;
 use std::path::{Path, PathBuf};
 
 /// What a library says about a material.
@@ -19,8 +20,15 @@ pub(super) struct Entry {
     filter: [f32; 3],
     model: i32,
     /// Files of `map_Kd` and `map_d`.
-    pub color_map: Option<PathBuf>,
-    pub alpha_map: Option<PathBuf>,
+    pub color_map: Option<MapFile>,
+    pub alpha_map: Option<MapFile>,
+}
+
+/// A file that a library names, and the library's folder.
+#[derive(Clone, Debug, Eq, Hash, PartialEq)]
+pub(super) struct MapFile {
+    pub folder: PathBuf,
+    pub name: String,
 }
 
 impl Entry {
@@ -34,24 +42,42 @@ impl Entry {
 pub(super) type Library = HashMap<Vec<u8>, Entry>;
 
 /// Adds the materials of a library, read from `source`; `path` is for the errors.
-pub(super) fn read(source: &mut impl BufRead, path: &Path, library: &mut Library) -> Result<()> {
-    let fail = |line: usize, what: &dyn Display| Error::Io(format!("{}, line {line}: {what}", path.display()));
-    let mut current: Option<Vec<u8>> = None;
+pub(super) fn read(source: &mut Source, path: &Path, library: &mut Library, account: &mut Account) -> Result<()> {
     let mut text = Vec::new();
+    let mut entries = Entries { path, library, current: None };
     for line in 1.. {
         text.clear();
-        if source.read_until(b'\n', &mut text).map_err(|e| fail(line, &e))? == 0 {
+        if source.read_line(&mut text, account).map_err(|e| read_error(e, path.display()))? == 0 {
             break;
         }
-        let (keyword, rest) = split_keyword(&text);
+        if text.starts_with(b"newmtl") {
+            account.hold(2 * (text.len() + size_of::<Entry>()), "a material library")?;
+        }
+        entries.statement(line, &text)?;
+    }
+    Ok(())
+}
+
+/// A library being read.
+struct Entries<'a> {
+    path: &'a Path,
+    library: &'a mut Library,
+    current: Option<Vec<u8>>,
+}
+
+impl Entries<'_> {
+    fn statement(&mut self, line: usize, text: &[u8]) -> Result<()> {
+        let path = self.path;
+        let fail = |line: usize, what: &dyn Display| Error::Io(format!("{}, line {line}: {what}", path.display()));
+        let (keyword, rest) = split_keyword(text);
         if keyword == b"newmtl" {
             if rest.is_empty() {
                 return Err(fail(line, &"newmtl without a name"));
             }
-            current = Some(rest.to_vec());
-            library.insert(rest.to_vec(), Entry::default());
+            self.current = Some(rest.to_vec());
+            self.library.insert(rest.to_vec(), Entry::default());
         }
-        let Some(entry) = current.as_ref().and_then(|name| library.get_mut(name)) else { continue };
+        let Some(entry) = self.current.as_ref().and_then(|name| self.library.get_mut(name)) else { return Ok(()) };
         match keyword {
             b"Kd" => entry.albedo = color(rest).map_err(|what| fail(line, &format_args!("Kd {what}")))?,
             b"Ke" => {
@@ -72,8 +98,8 @@ pub(super) fn read(source: &mut impl BufRead, path: &Path, library: &mut Library
             b"map_d" => entry.alpha_map = map_file(rest, path),
             _ => {}
         }
+        Ok(())
     }
-    Ok(())
 }
 
 /// The first word of a line and what follows it, without the white space around.
@@ -100,7 +126,7 @@ fn color(text: &[u8]) -> std::result::Result<Option<[f32; 3]>, String> {
 }
 
 /// The file that a map names behind its options, beside the library at `path`.
-fn map_file(mut text: &[u8], path: &Path) -> Option<PathBuf> {
+fn map_file(mut text: &[u8], path: &Path) -> Option<MapFile> {
     while text.starts_with(b"-") {
         let (option, rest) = split_keyword(text);
         let numbers = match option {
@@ -119,7 +145,7 @@ fn map_file(mut text: &[u8], path: &Path) -> Option<PathBuf> {
         }
     }
     let name = String::from_utf8_lossy(text).replace('\\', "/");
-    (!name.is_empty()).then(|| path.parent().unwrap_or(Path::new("")).join(name))
+    (!name.is_empty()).then(|| MapFile { folder: folder_of(path).to_owned(), name })
 }
 
 /// A finite number.
@@ -134,17 +160,24 @@ pub(super) fn finite(word: &[u8]) -> std::result::Result<f32, String> {
 mod tests {
     use super::*;
 
-    fn parse(text: &str) -> Result<Library> {
+    fn parse_as(path: &str, text: &str) -> Result<Library> {
         let mut library = Library::new();
-        read(&mut text.as_bytes(), Path::new("a.mtl"), &mut library)?;
+        let mut entries = Entries { path: Path::new(path), library: &mut library, current: None };
+        for (line, text) in (1..).zip(text.lines()) {
+            entries.statement(line, text.as_bytes())?;
+        }
         Ok(library)
+    }
+
+    fn parse(text: &str) -> Result<Library> {
+        parse_as("a.mtl", text)
     }
 
     #[test]
     fn colors_are_read_by_material() {
         let l = parse("Kd 9 9 9\nnewmtl a b\r\nKd 0.1 .2 3e-1 # red\nmap_Kd x.png\nnewmtl c\n Ke 5\n").unwrap();
         assert_eq!(l.len(), 2);
-        let color_map = Some("x.png".into());
+        let color_map = Some(MapFile { folder: ".".into(), name: "x.png".into() });
         assert_eq!(l[&b"a b"[..]], Entry { albedo: Some([0.1, 0.2, 0.3]), color_map, ..Default::default() });
         assert_eq!(l[&b"c"[..]], Entry { emission: [5.0; 3], ..Default::default() });
         assert_eq!(parse("newmtl a\nKd spectral x.rfl\n").unwrap()[&b"a"[..]].albedo, None);
@@ -153,16 +186,16 @@ mod tests {
     #[test]
     fn maps_are_files_beside_the_library_whatever_their_options() {
         for (map, expected) in [
-            ("map_Kd a b.png", Some("lib/a b.png")),
-            ("map_Kd -s 2 2 -o 0.5 -clamp on -bm 1 sub\\c.jpg", Some("lib/sub/c.jpg")),
-            ("map_Kd -s 1 1 1 7.png", Some("lib/7.png")),
-            ("map_Kd -mm 0 1 x", Some("lib/x")),
+            ("map_Kd a b.png", Some("a b.png")),
+            ("map_Kd -s 2 2 -o 0.5 -clamp on -bm 1 sub\\c.jpg", Some("sub/c.jpg")),
+            ("map_Kd -s 1 1 1 7.png", Some("7.png")),
+            ("map_Kd -mm 0 1 x", Some("x")),
             ("map_Kd", None),
             ("map_Kd -s 1", None),
         ] {
-            let mut library = Library::new();
-            read(&mut format!("newmtl a\n{map}\n").as_bytes(), Path::new("lib/a.mtl"), &mut library).unwrap();
-            assert_eq!(library[&b"a"[..]].color_map, expected.map(PathBuf::from), "{map}");
+            let library = parse_as("lib/a.mtl", &format!("newmtl a\n{map}\n")).unwrap();
+            let expected = expected.map(|name| MapFile { folder: "lib".into(), name: name.into() });
+            assert_eq!(library[&b"a"[..]].color_map, expected, "{map}");
         }
     }
 

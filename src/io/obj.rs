@@ -16,25 +16,23 @@
 //! faces; mixes up coordinates when only some faces have them; panics on `Kd 0.5` and, where
 //! overflow is checked, on out-of-range indices; and says no line. It takes about as long.
 
-use super::mtl::{self, Library, finite, split_keyword};
+use super::mtl::{self, Library, MapFile, finite, split_keyword};
+use super::source::{Opened, Source, folder_of, read_error};
 use super::{DEFAULT_ALBEDO, Import, TWO_SIDED_UNLESS_SAID, is_valid_position, texture};
 use crate::error::{Error, Result};
 use crate::scene::{LightmapUvs, Material, Mesh, MeshMaterials, NONE};
 use glam::{Vec2, Vec3};
-use std::collections::HashMap;
+use std::collections::{HashMap, HashSet};
 use std::fmt::Display;
-use std::fs::File;
-use std::io::{BufRead, BufReader};
 use std::ops::Range;
-use std::path::PathBuf;
 
 /// Light map pages run below this: a page costs memory even if almost empty.
 const MAX_PAGES: i64 = 4096;
 
-pub(super) fn load(import: &mut Import) -> Result<()> {
-    let file = File::open(&import.path).map_err(|e| import.error(e))?;
+pub(super) fn load(import: &mut Import, opened: Opened) -> Result<()> {
+    let mut source = Source::new(opened, import.advance);
     let mut reader = Reader::new(import);
-    reader.read(&mut BufReader::with_capacity(1 << 20, file))?;
+    reader.read(&mut source)?;
     reader.finish()
 }
 
@@ -65,13 +63,15 @@ struct Kind {
 /// Position, texture coordinate and normal of a corner, from 0; [`NONE`] where there is none.
 type Corner = [u32; 3];
 
-struct Reader<'a> {
-    import: &'a mut Import,
+struct Reader<'a, 's> {
+    import: &'a mut Import<'s>,
     line: usize,
     positions: Vec<Vec3>,
     uvs: Vec<Vec2>,
     normals: Vec<Vec3>,
     library: Library,
+    /// What `mtllib` lines have said: a file that names a library a thousand times reads it once.
+    libraries: HashSet<String>,
     names: Vec<Name>,
     name_ids: HashMap<Vec<u8>, u32>,
     /// Number of the current name.
@@ -90,8 +90,8 @@ struct Reader<'a> {
     faces_without_lightmap_uvs: u64,
 }
 
-impl<'a> Reader<'a> {
-    fn new(import: &'a mut Import) -> Self {
+impl<'a, 's> Reader<'a, 's> {
+    fn new(import: &'a mut Import<'s>) -> Self {
         Reader {
             import,
             line: 0,
@@ -99,6 +99,7 @@ impl<'a> Reader<'a> {
             uvs: Vec::new(),
             normals: Vec::new(),
             library: Library::new(),
+            libraries: HashSet::new(),
             names: vec![Name { text: Vec::new(), coordinates: Coordinates::Texture, faces: 0 }],
             name_ids: HashMap::from([(Vec::new(), 0)]),
             name: 0,
@@ -119,14 +120,15 @@ impl<'a> Reader<'a> {
         self.import.error(format_args!("line {}: {what}", self.line))
     }
 
-    fn read(&mut self, source: &mut impl BufRead) -> Result<()> {
+    fn read(&mut self, source: &mut Source) -> Result<()> {
         let mut text = Vec::new();
         loop {
             text.clear();
             let mut lines = 0;
             // A backslash at its end continues a line.
             loop {
-                let read = source.read_until(b'\n', &mut text).map_err(|e| self.import.error(e))?;
+                let read = source.read_line(&mut text, &mut self.import.account);
+                let read = read.map_err(|e| read_error(e, self.import.path.display()))?;
                 lines += (read > 0) as usize;
                 let used = text.trim_ascii_end().len();
                 if read == 0 || text[..used].last() != Some(&b'\\') {
@@ -182,20 +184,18 @@ impl<'a> Reader<'a> {
         if !is_valid_position(p) {
             return Err(self.error(format_args!("the vertex {p} is out of range")));
         }
-        self.positions.push(p);
-        Ok(())
+        self.import.account.push(&mut self.positions, p, "the vertices")
     }
 
     fn texture_coordinate(&mut self, text: &[u8]) -> Result<()> {
         let uv = Vec2::from(self.numbers("vt", text, 1)?);
-        self.uvs.push(uv);
-        Ok(())
+        self.import.account.push(&mut self.uvs, uv, "the texture coordinates")
     }
 
     fn normal(&mut self, text: &[u8]) -> Result<()> {
         let n = Vec3::from(self.numbers("vn", text, 3)?);
-        self.normals.push(n.as_dvec3().normalize_or_zero().as_vec3());
-        Ok(())
+        let n = n.as_dvec3().normalize_or_zero().as_vec3();
+        self.import.account.push(&mut self.normals, n, "the normals")
     }
 
     fn use_material(&mut self, name: &[u8]) -> Result<()> {
@@ -204,6 +204,8 @@ impl<'a> Reader<'a> {
             return Ok(());
         }
         let coordinates = coordinates_of(name).map_err(|what| self.error(what))?;
+        // Two copies of the name, in a list and a map.
+        self.import.account.hold(2 * name.len() + 4 * size_of::<Name>(), "the names of materials")?;
         self.name = self.names.len() as u32;
         self.name_ids.insert(name.to_vec(), self.name);
         self.names.push(Name { text: name.to_vec(), coordinates, faces: 0 });
@@ -212,24 +214,36 @@ impl<'a> Reader<'a> {
 
     /// `mtllib NAME…`: the rest of the line as one file name, or, as the format says, several names.
     fn open_libraries(&mut self, names: &[u8]) -> Result<()> {
-        let folder = self.import.path.parent().unwrap_or(std::path::Path::new("")).to_owned();
-        let names = String::from_utf8_lossy(names).into_owned();
-        let files = if folder.join(&names).is_file() { vec![&names[..]] } else { names.split_whitespace().collect() };
-        for name in files {
-            let path = folder.join(name);
-            match File::open(&path) {
-                Ok(file) => mtl::read(&mut BufReader::new(file), &path, &mut self.library)?,
-                Err(e) => self.import.warn(format!("the material library {name:?} cannot be opened ({e})")),
+        let folder = folder_of(&self.import.path).to_owned();
+        let names = String::from_utf8_lossy(names).replace('\\', "/");
+        if !self.libraries.insert(names.clone()) {
+            return Ok(());
+        }
+        self.import.account.hold(2 * names.len(), "the names of libraries")?;
+        if let Ok(whole) = self.import.files.open(&folder, &names)? {
+            return self.read_library(whole);
+        }
+        for name in names.split_whitespace() {
+            match self.import.files.open(&folder, name)? {
+                Ok(opened) => self.read_library(opened)?,
+                Err(what) => self.import.warn(format!("the material library {name:?} cannot be opened ({what})")),
             }
         }
         Ok(())
+    }
+
+    fn read_library(&mut self, opened: Opened) -> Result<()> {
+        let path = opened.path.clone();
+        let mut source = Source::new(opened, self.import.advance);
+        mtl::read(&mut source, &path, &mut self.library, &mut self.import.account)
     }
 
     fn face(&mut self, text: &[u8]) -> Result<()> {
         let mut corners = std::mem::take(&mut self.corners);
         corners.clear();
         for word in words(text) {
-            corners.push(self.corner(word)?);
+            let corner = self.corner(word)?;
+            self.import.account.push(&mut corners, corner, "the corners of a face")?;
         }
         if corners.len() < 3 {
             return Err(self.error(format_args!("a face has {} corners, fewer than 3", corners.len())));
@@ -237,7 +251,7 @@ impl<'a> Reader<'a> {
         self.triangles += corners.len() - 2;
         self.import.check_triangle_count(self.triangles)?;
         self.import.info.faces_triangulated += (corners.len() > 3) as u64;
-        self.add_face(&corners);
+        self.add_face(&corners)?;
         self.corners = corners;
         Ok(())
     }
@@ -267,7 +281,7 @@ impl<'a> Reader<'a> {
         Ok(corner)
     }
 
-    fn add_face(&mut self, corners: &[Corner]) {
+    fn add_face(&mut self, corners: &[Corner]) -> Result<()> {
         let name = &mut self.names[self.name as usize];
         name.faces += 1;
         let has = |k: usize| corners.iter().all(|c| c[k] != NONE);
@@ -282,59 +296,71 @@ impl<'a> Reader<'a> {
         }
         let page = if let Coordinates::Lightmap(page) = name.coordinates { page } else { 0 };
         if kind != self.kind {
-            self.finish_mesh();
+            self.finish_mesh()?;
             self.kind = kind;
         }
-        let mut fan = corners.iter().map(|&c| self.vertex(c)).collect::<Vec<_>>().into_iter();
-        let (Some(first), Some(mut previous)) = (fan.next(), fan.next()) else { return };
-        for next in fan {
-            self.mesh.indices.push([first, previous, next]);
-            self.triangle_names.push(self.name);
+        let (first, mut previous) = (self.vertex(corners[0])?, self.vertex(corners[1])?);
+        for corner in &corners[2..] {
+            let next = self.vertex(*corner)?;
+            let account = &mut self.import.account;
+            account.push(&mut self.mesh.indices, [first, previous, next], "the triangles")?;
+            account.push(&mut self.triangle_names, self.name, "the triangles")?;
             if kind.lightmap {
-                self.pages.push(page);
+                account.push(&mut self.pages, page, "the triangles")?;
             }
             previous = next;
         }
+        Ok(())
     }
 
     /// The vertex of the current mesh for a corner.
-    fn vertex(&mut self, [v, vt, vn]: Corner) -> u32 {
+    fn vertex(&mut self, [v, vt, vn]: Corner) -> Result<u32> {
         let Kind { lightmap, uvs, normals } = self.kind;
         let key = [v, if uvs || lightmap { vt } else { NONE }, if normals { vn } else { NONE }];
-        *self.vertex_of.entry(key).or_insert_with(|| {
-            let mesh = &mut self.mesh;
-            mesh.positions.push(self.positions[v as usize]);
-            if uvs || lightmap {
-                mesh.uvs.push(self.uvs[vt as usize]);
-            }
-            if normals {
-                mesh.normals.push(self.normals[vn as usize]);
-            }
-            mesh.positions.len() as u32 - 1
-        })
+        if let Some(vertex) = self.vertex_of.get(&key) {
+            return Ok(*vertex);
+        }
+        let (account, mesh) = (&mut self.import.account, &mut self.mesh);
+        account.make_room_in_map(&mut self.vertex_of, "the vertices")?;
+        let vertex = mesh.positions.len() as u32;
+        account.push(&mut mesh.positions, self.positions[v as usize], "the vertices")?;
+        if uvs || lightmap {
+            account.push(&mut mesh.uvs, self.uvs[vt as usize], "the texture coordinates")?;
+        }
+        if normals {
+            account.push(&mut mesh.normals, self.normals[vn as usize], "the normals")?;
+        }
+        self.vertex_of.insert(key, vertex);
+        Ok(vertex)
     }
 
-    fn finish_mesh(&mut self) {
-        self.vertex_of.clear();
+    fn finish_mesh(&mut self) -> Result<()> {
+        // To clear a map takes as long as its room is large, which a large mesh before may have made.
+        if self.vertex_of.capacity() / 8 > self.vertex_of.len() {
+            self.vertex_of = HashMap::new();
+        } else {
+            self.vertex_of.clear();
+        }
         let mut mesh = std::mem::take(&mut self.mesh);
         let pages = std::mem::take(&mut self.pages);
         let names = std::mem::take(&mut self.triangle_names);
         if mesh.indices.is_empty() {
-            return;
+            return Ok(());
         }
         if self.kind.lightmap {
             mesh.lightmap = Some(LightmapUvs { uvs: std::mem::take(&mut mesh.uvs), pages });
         }
-        self.done.push((mesh, names));
+        self.import.account.push(&mut self.done, (mesh, names), "the meshes")
     }
 
     fn finish(mut self) -> Result<()> {
-        self.finish_mesh();
+        self.finish_mesh()?;
         if self.done.is_empty() {
             return Err(self.import.error("there are no faces in it"));
         }
         let materials = self.add_materials()?;
         for (mut mesh, mut names) in std::mem::take(&mut self.done) {
+            self.import.check()?;
             names.iter_mut().for_each(|name| *name = materials[*name as usize]);
             mesh.materials = match names.iter().all(|m| *m == names[0]) {
                 true => MeshMaterials::One(names[0]),
@@ -393,7 +419,7 @@ impl<'a> Reader<'a> {
 }
 
 /// Texture and alpha cutoff by the files of `map_Kd` and `map_d`.
-type Images = HashMap<(Option<PathBuf>, Option<PathBuf>), (u32, f32)>;
+type Images = HashMap<(Option<MapFile>, Option<MapFile>), (u32, f32)>;
 
 /// The material of a library's entry.
 fn described(import: &mut Import, images: &mut Images, entry: &mtl::Entry) -> Result<Material> {
@@ -419,12 +445,22 @@ fn described(import: &mut Import, images: &mut Images, entry: &mtl::Entry) -> Re
 }
 
 /// Reads the images of a material into one; [`NONE`] without any.
-fn add_image(import: &mut Import, color: &Option<PathBuf>, alpha: &Option<PathBuf>) -> Result<(u32, f32)> {
-    let mut read = |path: &PathBuf| import.image(path.display(), texture::read(path));
-    let colors = color.as_ref().and_then(&mut read);
-    let alphas = if alpha == color { None } else { alpha.as_ref().and_then(&mut read) };
+fn add_image(import: &mut Import, color: &Option<MapFile>, alpha: &Option<MapFile>) -> Result<(u32, f32)> {
+    let mut read = |file: &Option<MapFile>| match file {
+        Some(file) => {
+            let image = texture::read(import, &file.folder, &file.name);
+            import.image(&file.name, image)
+        }
+        None => Ok(None),
+    };
+    let colors = read(color)?;
+    let alphas = if alpha == color { None } else { read(alpha)? };
     let image = match (colors, alphas) {
-        (colors, Some(alpha)) => texture::with_alpha(colors, &alpha),
+        (colors, Some(alpha)) => {
+            let both = texture::with_alpha(colors, &alpha, &mut import.account)?;
+            import.account.give_back(alpha.bytes());
+            both
+        }
         (Some(colors), None) => colors,
         (None, None) => return Ok((NONE, 0.0)),
     };
@@ -460,8 +496,9 @@ fn coordinates_of(name: &[u8]) -> std::result::Result<Coordinates, String> {
 #[cfg(test)]
 pub(super) mod tests {
     use super::*;
-    use crate::io::LoadInfo;
+    use crate::io::source::Files;
     use crate::io::tests::{Folder, albedos, corners, load_bytes, load_path, refusal};
+    use crate::io::{LoadInfo, LoadOptions};
     use crate::scene::SceneData;
 
     /// A bit of everything.
@@ -635,6 +672,42 @@ usemtl a\nf 1 2 3\nusemtl a|x\nf 1 2 3\nusemtl unused\nusemtl b\nf 1 2 3\n";
         assert_eq!(after_triangle("vn 0 0\n"), "line 4: vn has 2 numbers, not 3");
         assert_eq!(after_triangle("usemtl a|lm99999\n"), "line 4: light map page 99999 is not below 4096");
         assert_eq!(after_triangle("# a \\\n b\nf 1 2\n"), "line 6: a face has 2 corners, fewer than 3");
+    }
+
+    #[test]
+    fn a_kind_of_face_that_changes_often_costs_what_its_faces_do() {
+        // A large mesh, then faces with and without normals in turn.
+        let mut text = String::from("vn 0 0 1\n");
+        (0..3000).for_each(|i| text += &format!("v {i} 0 0\nv {i} 1 0\nv {i} 0 1\n"));
+        (0..3000).for_each(|i| text += &format!("f {} {} {}\n", 3 * i + 1, 3 * i + 2, 3 * i + 3));
+        text += "f 1//1 2//1 3//1\nf 1 2 3\nf 1//1 2//1 3//1\n";
+        let folder = Folder::new();
+        std::fs::write(folder.path("a.obj"), text).unwrap();
+        let options = LoadOptions::default();
+        let mut files = Files::new(&folder.path("a.obj"), &options).unwrap();
+        let opened = files.open_scene(&folder.path("a.obj")).unwrap();
+        let advance = |_| Ok(());
+        let mut import = Import::new(&folder.path("a.obj"), &options, files, &advance).unwrap();
+        let mut source = Source::new(opened, import.advance);
+        let mut reader = Reader::new(&mut import);
+        reader.read(&mut source).unwrap();
+        // To clear a map takes as long as it has room.
+        assert!(reader.vertex_of.capacity() < 100, "{}", reader.vertex_of.capacity());
+    }
+
+    #[test]
+    fn a_library_that_is_named_often_is_read_once() {
+        let folder = Folder::new();
+        std::fs::write(folder.path("a.mtl"), format!("newmtl a\nKd 0.25\n#{}\n", "x".repeat(1000))).unwrap();
+        std::fs::write(
+            folder.path("a.obj"),
+            "mtllib a.mtl\n".repeat(500) + "v 0 0 0\nv 1 0 0\nv 0 1 0\nusemtl a\nf 1 2 3\n",
+        )
+        .unwrap();
+        let options = LoadOptions { max_file_bytes: 10_000, ..Default::default() };
+        let mut scene = SceneData::new();
+        crate::io::load_with(&folder.path("a.obj"), &options, &crate::Progress::none(), &mut scene).unwrap();
+        assert_eq!(albedos(&scene), [[0.25; 3]]);
     }
 
     #[test]

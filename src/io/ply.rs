@@ -3,6 +3,7 @@
 //! Other elements and properties are skipped. A face of more than three corners becomes a fan from
 //! its first. The format has no materials: all is grey ([`DEFAULT_ALBEDO`]).
 
+use super::source::{Opened, Source, read_error};
 use super::{DEFAULT_ALBEDO, Import, TWO_SIDED_UNLESS_SAID, is_valid_position};
 use crate::error::Result;
 use crate::scene::{Material, Mesh, MeshMaterials};
@@ -11,19 +12,21 @@ use ply_rs_bw::parser::{Parser, Reader};
 use ply_rs_bw::ply::{
     BeginList, ElementDef, Encoding, Header, Property, PropertyAccess, PropertyAccessResult, PropertyType, ScalarType,
 };
-use std::fs::File;
-use std::io::{BufRead, BufReader};
 
 const NORMAL_NAMES: [&str; 3] = ["nx", "ny", "nz"];
 const INDEX_NAMES: [&str; 2] = ["vertex_indices", "vertex_index"];
 
-pub(super) fn load(import: &mut Import) -> Result<()> {
-    let file = File::open(&import.path).map_err(|e| import.error(e))?;
-    let bytes = file.metadata().map_err(|e| import.error(e))?.len();
-    let mut reader = Reader::new(BufReader::with_capacity(1 << 20, file));
+/// Bytes of a header: the parser keeps all of it.
+const MAX_HEADER: usize = 1 << 20;
+
+pub(super) fn load(import: &mut Import, opened: Opened) -> Result<()> {
+    let bytes = opened.size;
+    let mut reader = Reader::new(Source::new(opened, import.advance));
+    reader.get_mut().limit(Some(MAX_HEADER));
     let header = Parser::<Skipped>::new().read_header(&mut reader).map_err(|e| import.error(one_line(&e)))?;
+    reader.get_mut().limit(None);
     check_header(import, &header, bytes)?;
-    let mut body = Body { line: reader.line(), encoding: header.encoding, text: String::new() };
+    let mut body = Body { line: reader.line(), encoding: header.encoding, text: Vec::new() };
 
     let material = import.add_material(Material {
         albedo: [DEFAULT_ALBEDO; 3],
@@ -96,7 +99,7 @@ struct Body {
     encoding: Encoding,
     /// Of the next element, in an ASCII file.
     line: usize,
-    text: String,
+    text: Vec<u8>,
 }
 
 impl Body {
@@ -104,7 +107,7 @@ impl Body {
     fn each<E: PropertyAccess>(
         &mut self,
         import: &mut Import,
-        source: &mut impl BufRead,
+        source: &mut Source,
         element: &ElementDef,
         mut use_it: impl FnMut(&mut Import, usize, E) -> Result<()>,
     ) -> Result<()> {
@@ -114,10 +117,13 @@ impl Body {
                 Encoding::Ascii => {
                     self.text.clear();
                     self.line += 1;
-                    match source.read_line(&mut self.text) {
+                    match source.read_line(&mut self.text, &mut import.account) {
                         Ok(0) => Err("the file ends here".to_string()),
-                        Ok(_) => parser.read_ascii_element(&self.text, element).map_err(|e| one_line(&e)),
-                        Err(e) => Err(e.to_string()),
+                        Ok(_) => match str::from_utf8(&self.text) {
+                            Ok(text) => parser.read_ascii_element(text, element).map_err(|e| one_line(&e)),
+                            Err(e) => Err(e.to_string()),
+                        },
+                        Err(e) => return Err(read_error(e, import.path.display())),
                     }
                 }
                 Encoding::BinaryBigEndian => parser.read_big_endian_element(source, element).map_err(|e| one_line(&e)),
@@ -153,16 +159,16 @@ fn one_line(e: &ply_rs_bw::parser::ParseError) -> String {
 fn read_vertices(
     import: &mut Import,
     body: &mut Body,
-    source: &mut impl BufRead,
+    source: &mut Source,
     element: &ElementDef,
     mesh: &mut Mesh,
 ) -> Result<()> {
     let has = |name: &str| element.properties.contains_key(name);
     let normals = NORMAL_NAMES.into_iter().all(has);
     let uvs = (has("s") && has("t")) || (has("u") && has("v"));
-    mesh.positions.reserve_exact(element.count);
-    mesh.normals.reserve_exact(if normals { element.count } else { 0 });
-    mesh.uvs.reserve_exact(if uvs { element.count } else { 0 });
+    import.account.make_room(&mut mesh.positions, element.count, "the vertices")?;
+    import.account.make_room(&mut mesh.normals, if normals { element.count } else { 0 }, "the normals")?;
+    import.account.make_room(&mut mesh.uvs, if uvs { element.count } else { 0 }, "the texture coordinates")?;
     body.each::<Vertex>(import, source, element, |import, i, vertex| {
         if !is_valid_position(vertex.position) {
             return Err(import.error(format_args!("vertex {i} is {}, not finite or out of range", vertex.position)));
@@ -184,11 +190,11 @@ fn read_vertices(
 fn read_faces(
     import: &mut Import,
     body: &mut Body,
-    source: &mut impl BufRead,
+    source: &mut Source,
     element: &ElementDef,
     mesh: &mut Mesh,
 ) -> Result<()> {
-    mesh.indices.reserve(element.count);
+    import.account.make_room(&mut mesh.indices, element.count, "the triangles")?;
     body.each::<Face>(import, source, element, |import, i, face| {
         let corners = &face.corners;
         if let Some(negative) = face.signed.iter().find(|v| **v < 0) {
@@ -203,7 +209,7 @@ fn read_faces(
         let mut fan = corners.iter().copied().chain(signed);
         let (Some(first), Some(mut previous)) = (fan.next(), fan.next()) else { return Ok(()) };
         for next in fan {
-            mesh.indices.push([first, previous, next]);
+            import.account.push(&mut mesh.indices, [first, previous, next], "the triangles")?;
             previous = next;
         }
         import.check_triangle_count(mesh.indices.len())

@@ -1,6 +1,7 @@
 //! Arguments of the command line. Errors are sentences that name the flag and the value at fault.
 
 use bakelite::bvh::{BuildOptions, BuildQuality};
+use bakelite::io::LoadOptions;
 use bakelite::lightmap::{BakeParams, LightmapDesc};
 use bakelite::scene::{Camera, NONE};
 use bakelite::{Isa, Light};
@@ -31,6 +32,12 @@ Reports measure instead, and write tables, plots and CSV:
   stability stiff and extreme cases, each against what is known of it (SCENE:
             its energy balance too)
 
+Scene file:
+  --base-folder DIR      files that the scene names must lie in DIR or below
+                         [the folder of the scene]
+  --any-folder           they may lie anywhere: for scenes you trust
+  --max-texture-mb N     most MiB of all its images, decoded [2048]
+  --max-file-mb N        most MiB of all its files [16384]
 Lights, added to those of the scene; may be repeated:
   --light point:X,Y,Z:R,G,B               intensity in W/sr
   --light spot:X,Y,Z:DX,DY,DZ:INNER,OUTER:R,G,B
@@ -127,6 +134,11 @@ pub struct GivenLight {
 pub struct BakeArgs {
     /// A file or a built-in name.
     pub scene: String,
+    /// Which files it may consist of, and how much of them.
+    pub base_folder: Option<PathBuf>,
+    pub any_folder: bool,
+    pub max_texture_mb: u64,
+    pub max_file_mb: u64,
     pub lights: Vec<GivenLight>,
     pub desc: LightmapDesc,
     pub params: BakeParams,
@@ -153,6 +165,17 @@ pub struct BakeArgs {
 }
 
 impl BakeArgs {
+    /// How to read the scene file.
+    pub fn load_options(&self) -> LoadOptions {
+        LoadOptions {
+            base_folder: self.base_folder.clone(),
+            any_folder: self.any_folder,
+            max_texture_bytes: self.max_texture_mb.saturating_mul(1 << 20),
+            max_file_bytes: self.max_file_mb.saturating_mul(1 << 20),
+            ..Default::default()
+        }
+    }
+
     /// The scene's name for titles: its folders say more about the machine than about the scene.
     pub fn title(&self) -> String {
         let name = Path::new(&self.scene).file_name();
@@ -164,6 +187,10 @@ impl Default for BakeArgs {
     fn default() -> Self {
         BakeArgs {
             scene: "atrium".into(),
+            base_folder: None,
+            any_folder: false,
+            max_texture_mb: 2 << 10,
+            max_file_mb: 16 << 10,
             lights: Vec::new(),
             desc: LightmapDesc::default(),
             params: BakeParams::default(),
@@ -347,6 +374,10 @@ fn option(name: &str, parser: &mut lexopt::Parser, bake: &mut BakeArgs) -> Resul
     let mut value = || value(&flag, parser);
     let (desc, params) = (&mut bake.desc, &mut bake.params);
     match name {
+        "base-folder" => bake.base_folder = Some(value()?.into()),
+        "any-folder" => bake.any_folder = true,
+        "max-texture-mb" => bake.max_texture_mb = number(&flag, &value()?)?,
+        "max-file-mb" => bake.max_file_mb = number(&flag, &value()?)?,
         "light" => bake.lights.push(light(&value()?)?),
         "page-size" => desc.page_size = number(&flag, &value()?)?,
         "padding" => desc.padding = number(&flag, &value()?)?,

@@ -53,7 +53,7 @@ use bakelite::device::LogLevel;
 use bakelite::io::image::write_png_rgb8;
 use bakelite::lightmap::{BakeStats, CheckpointParams, Lightmap};
 use bakelite::scene::{BUILTIN_NAMES, Camera, builtin, builtin_camera};
-use bakelite::{Device, DeviceOptions, Error, Light, Result, Scene, SceneData};
+use bakelite::{Device, DeviceOptions, Error, Light, Progress, Result, Scene, SceneData};
 use bar::Bars;
 use pictures::{NAMES, Pictures, View};
 use std::path::{Path, PathBuf};
@@ -170,8 +170,10 @@ impl<'a> Job<'a> {
             builtin(name)?
         } else {
             let mut data = SceneData::new();
-            let info = bakelite::io::load(Path::new(name), &mut data)?;
-            self.warnings = info.warnings;
+            let options = self.args.load_options();
+            let load = |p: &Progress| bakelite::io::load_with(Path::new(name), &options, p, &mut data);
+            let loaded = self.bars.show("load", load);
+            self.warnings = loaded.map_err(name_flags)?.warnings;
             data
         };
         for given in &self.args.lights {
@@ -281,11 +283,12 @@ impl<'a> Job<'a> {
 
     fn write_maps(&mut self, lightmap: &Lightmap) -> Result<()> {
         let start = Instant::now();
-        let exposure = output::page_exposure(lightmap)?;
+        let exposure = bakelite::io::lightmaps::exposure(lightmap)?;
         let files = self.bars.show("files", |p| output::write_pages(&self.args.out, lightmap, exposure, p))?;
         self.files.extend(files);
         if self.args.glb {
-            self.files.push(output::write_scene(&self.args.out, lightmap, exposure)?);
+            let scene = self.bars.show("scene.glb", |p| output::write_scene(&self.args.out, lightmap, exposure, p))?;
+            self.files.push(scene);
         }
         let bytes = self.files.iter().filter_map(|f| std::fs::metadata(f).ok()).map(|m| m.len()).sum();
         self.stage("files", start).bytes = bytes;
@@ -382,5 +385,16 @@ impl<'a> Job<'a> {
             println!("  pictures.png: reference, indirect map + shadow rays, light map; each also alone");
         }
         println!("  report.json: all of the above and more, for programs");
+    }
+}
+
+/// The library's error, with its limits called by their flags.
+fn name_flags(e: Error) -> Error {
+    match e {
+        Error::OutOfMemory(text) => Error::OutOfMemory(
+            text.replace("max_texture_bytes", "--max-texture-mb").replace("max_file_bytes", "--max-file-mb"),
+        ),
+        Error::InvalidArgument(text) => Error::InvalidArgument(text.replace("base_folder", "--base-folder")),
+        e => e,
     }
 }

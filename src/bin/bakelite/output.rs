@@ -1,7 +1,6 @@
 //! The files of a bake: pages layer by layer, and the scene with its light map; texts of reports.
 
-use bakelite::io::glb::{GlbLightmap, GlbMesh, write_glb};
-use bakelite::io::image::{auto_exposure, encode_png_rgb8, tone_map, write_exr, write_png_rgb8};
+use bakelite::io::image::{tone_map, write_exr, write_png_rgb8};
 use bakelite::lightmap::{Layer, LayerData, Lightmap};
 use bakelite::{Error, Progress, Result};
 use rayon::prelude::*;
@@ -34,15 +33,6 @@ fn rgb(lightmap: &Lightmap, page: u32, layer: Layer) -> Result<Vec<[f32; 3]>> {
     }
 }
 
-/// One exposure for all pages, from the texels that are lit.
-pub fn page_exposure(lightmap: &Lightmap) -> Result<f32> {
-    let mut pixels = Vec::new();
-    for page in 0..lightmap.info().page_count {
-        pixels.extend(rgb(lightmap, page, Layer::Combined)?);
-    }
-    Ok(auto_exposure(&pixels, |_| true))
-}
-
 /// Writes `pageN-LAYER.exr` (values) and `.png` (tone mapped) and returns their paths.
 pub fn write_pages(folder: &Path, lightmap: &Lightmap, exposure: f32, progress: &Progress) -> Result<Vec<PathBuf>> {
     let info = lightmap.info();
@@ -65,17 +55,8 @@ pub fn write_pages(folder: &Path, lightmap: &Lightmap, exposure: f32, progress: 
 }
 
 /// Writes the scene with its light map as `scene.glb` and returns its path.
-pub fn write_scene(folder: &Path, lightmap: &Lightmap, exposure: f32) -> Result<PathBuf> {
-    let info = lightmap.info();
-    let meshes =
-        (0..lightmap.scene().meshes().len() as u32).map(|mesh| GlbMesh::of(lightmap, mesh)).collect::<Result<_>>()?;
-    let page = |page: u32| -> Result<Vec<u8>> {
-        let mapped: Vec<[u8; 3]> =
-            rgb(lightmap, page, Layer::Combined)?.iter().map(|&p| tone_map(exposure, p)).collect();
-        encode_png_rgb8(info.width, info.height, &mapped)
-    };
-    let pages = (0..info.page_count).map(page).collect::<Result<_>>()?;
+pub fn write_scene(folder: &Path, lightmap: &Lightmap, exposure: f32, progress: &Progress) -> Result<PathBuf> {
     let path = folder.join("scene.glb");
-    write_glb(&path, lightmap.scene(), &GlbLightmap { meshes, pages })?;
+    bakelite::io::lightmaps::write_scene(lightmap, &path, Some(exposure), progress)?;
     Ok(path)
 }

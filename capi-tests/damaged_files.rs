@@ -1,0 +1,82 @@
+//! Damaged files of every kind that is read: a short run of what `fuzz/` does for hours, the same each time.
+
+#[path = "../fuzz/src/damaged_files.rs"]
+mod damaged_files;
+#[path = "../fuzz/src/seeds.rs"]
+mod seeds;
+
+use seeds::{TARGETS, seeds};
+
+/// Inputs per kind of file.
+const INPUTS: usize = 500;
+
+/// A small generator of random numbers (xorshift64*).
+struct Random(u64);
+
+impl Random {
+    fn below(&mut self, n: usize) -> usize {
+        self.0 ^= self.0 >> 12;
+        self.0 ^= self.0 << 25;
+        self.0 ^= self.0 >> 27;
+        (self.0.wrapping_mul(0x2545_f491_4f6c_dd1d) >> 33) as usize % n.max(1)
+    }
+}
+
+/// Numbers that tend to be too much, too little or odd.
+const NUMBERS: [&str; 10] =
+    ["-1", "0", "1e9", "4294967295", "18446744073709551615", "1e39", "nan", "-0.5", "../a", "/dev/zero"];
+
+/// One change: a byte, a bit, a number in text or binary, a piece cut out, doubled, or taken from another file.
+fn damage(bytes: &mut Vec<u8>, other: &[u8], random: &mut Random) {
+    let at = random.below(bytes.len());
+    let piece = |random: &mut Random, length: usize| {
+        let start = random.below(length);
+        start..(start + 1 + random.below(16)).min(length)
+    };
+    match random.below(8) {
+        0 if !bytes.is_empty() => bytes[at] = random.below(256) as u8,
+        1 if !bytes.is_empty() => bytes[at] ^= 1 << random.below(8),
+        2 => {
+            let digits = |b: &[u8]| b.iter().take_while(|c| c.is_ascii_digit()).count();
+            let end = at + digits(&bytes[at.min(bytes.len())..]);
+            bytes.splice(at.min(bytes.len())..end.min(bytes.len()), NUMBERS[random.below(10)].bytes());
+        }
+        3 if bytes.len() >= 4 => {
+            let at = random.below(bytes.len() - 3);
+            let value = [0, 1, 0x7fff_ffff, 0x8000_0000, 0xffff_ffff, 0x00ff_ffff][random.below(6)];
+            bytes[at..at + 4].copy_from_slice(&u32::to_le_bytes(value));
+        }
+        4 => {
+            let cut = piece(random, bytes.len());
+            bytes.drain(cut.start..cut.end.max(cut.start));
+        }
+        5 => bytes.truncate(at),
+        6 if !other.is_empty() => {
+            let part = piece(random, other.len());
+            bytes.splice(at..at, other[part].iter().copied());
+        }
+        _ => {
+            let part = bytes[piece(random, bytes.len())].to_vec();
+            bytes.splice(at..at, part.repeat(1 + random.below(20)));
+        }
+    }
+}
+
+#[test]
+fn damaged_files_are_read_or_refused_and_nothing_else() {
+    let seeds = seeds();
+    let mut random = Random(0x9e37_79b9_7f4a_7c15);
+    for target in TARGETS {
+        let own: Vec<&[u8]> = seeds.iter().filter(|(t, _)| *t == target).map(|(_, bytes)| &bytes[..]).collect();
+        assert!(!own.is_empty(), "{target} has no seed");
+        own.iter().for_each(|bytes| damaged_files::read(target, bytes));
+        for _ in 0..INPUTS {
+            let mut bytes = own[random.below(own.len())].to_vec();
+            let other = own[random.below(own.len())];
+            for _ in 0..1 + random.below(5) {
+                damage(&mut bytes, other, &mut random);
+            }
+            damaged_files::read(target, &bytes);
+        }
+    }
+}
