@@ -12,6 +12,7 @@ use crate::bvh::layout::{ChildRef, STACK_SIZE, WIDTH};
 use crate::scene::NONE;
 use crate::simd::{Eight, Lanes, Mask, Simd};
 use glam::Vec3;
+use std::cell::Cell;
 use std::hint::select_unpredictable;
 use std::marker::PhantomData;
 use std::mem::MaybeUninit;
@@ -594,6 +595,25 @@ pub(super) unsafe fn one_of<S: Simd, T: Tree, A: Accept, const ANY: bool>(
 /// Mrays/s.)
 const FLIGHT: usize = 16;
 
+thread_local! {
+    /// An empty vector with room for [`FLIGHT`] walks: 73 kB, more than some callers' threads have of stack.
+    static ROOM: Cell<Vec<Walk>> = const { Cell::new(Vec::new()) };
+}
+
+/// The thread's room for [`FLIGHT`] walks. It has less if memory is short or the thread is ending.
+#[inline(never)]
+fn take_room() -> Vec<Walk> {
+    let mut room = ROOM.try_with(Cell::take).unwrap_or_default();
+    // If that fails, one walk is under way at a time.
+    let _ = room.try_reserve_exact(FLIGHT);
+    room
+}
+
+#[inline(never)]
+fn give_room_back(room: Vec<Walk>) {
+    let _ = ROOM.try_with(|kept| kept.set(room));
+}
+
 /// Walks that wait for the same kind of visit. One more than there can be, for a branch-free push.
 type Queue = [*mut Walk; FLIGHT + 1];
 
@@ -612,12 +632,16 @@ pub(super) unsafe fn many<S: Simd, T: Tree, const ANY: bool>(
     ray: impl Fn(usize) -> Ray,
     mut done: impl FnMut(usize, RawHit),
 ) {
-    let mut places = [const { MaybeUninit::<Walk>::uninit() }; FLIGHT];
-    let first = places.as_mut_ptr().cast::<Walk>();
+    let mut room = take_room();
+    let mut place = MaybeUninit::uninit();
+    let (first, flight) = match room.capacity() {
+        FLIGHT.. => (room.as_mut_ptr(), FLIGHT),
+        _ => (place.as_mut_ptr(), 1),
+    };
     let mut idle: Queue = std::array::from_fn(|i| first.wrapping_add(i));
     let (mut at_nodes, mut at_leaves): (Queue, Queue) = ([std::ptr::null_mut(); _], [std::ptr::null_mut(); _]);
     let (idle, at_nodes, at_leaves) = (idle.as_mut_ptr(), at_nodes.as_mut_ptr(), at_leaves.as_mut_ptr());
-    let (mut idle_count, mut node_count, mut leaf_count) = (FLIGHT, 0, 0);
+    let (mut idle_count, mut node_count, mut leaf_count) = (flight, 0, 0);
     let mut next = 0;
     // Every walk is in one queue, so that none holds more than FLIGHT: what the blocks below rely on.
     loop {
@@ -634,8 +658,8 @@ pub(super) unsafe fn many<S: Simd, T: Tree, const ANY: bool>(
             }
             next += 1;
         }
-        if idle_count == FLIGHT {
-            return;
+        if idle_count == flight {
+            return give_room_back(room);
         }
         // Puts a walk where its next visit will be: into both queues, but counted in one. It is written
         // at or before the place that is read next.
