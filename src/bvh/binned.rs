@@ -318,23 +318,31 @@ pub(super) struct Split {
     bin: usize,
 }
 
-/// Bins, and room for the costs of what lies right of each.
+/// An array of copies of `value`, which is never on the stack.
+pub(super) fn on_heap<T: Copy, const N: usize>(value: T) -> Box<[T; N]> {
+    vec![value; N].try_into().unwrap_or_else(|_| unreachable!("the vector has N elements"))
+}
+
+/// The bins of a node, and scratch space for the costs of what lies right of each.
+///
+/// Both are on the heap from the start: builds recurse, and a frame that holds them even for a moment holds
+/// them on every level.
 pub(super) struct Bins {
-    bins: [Bin; MAX_BINS],
-    right: [Vec4; MAX_BINS],
+    bins: Box<[Bin; MAX_BINS]>,
+    right: Box<[Vec4; MAX_BINS]>,
     /// Only minima and maxima depend on it, which are the same bits either way.
     #[cfg(target_arch = "x86_64")]
     has_avx: bool,
 }
 
 impl Bins {
-    pub(super) fn new() -> Box<Bins> {
-        Box::new(Bins {
-            bins: [Bin::EMPTY; MAX_BINS],
-            right: [Vec4::ZERO; MAX_BINS],
+    pub(super) fn new() -> Bins {
+        Bins {
+            bins: on_heap(Bin::EMPTY),
+            right: on_heap(Vec4::ZERO),
             #[cfg(target_arch = "x86_64")]
             has_avx: Isa::Avx2.is_available(),
-        })
+        }
     }
 
     pub(super) fn fill(&mut self, refs: &[Reference], map: &BinMap) {
@@ -343,7 +351,7 @@ impl Bins {
             return self.add(refs, map);
         }
         let parts = rayon::current_num_threads() * 2;
-        let parts: Vec<Box<Bins>> = refs
+        let parts: Vec<Bins> = refs
             .par_chunks(refs.len().div_ceil(parts))
             .map(|refs| {
                 let mut bins = Bins::new();

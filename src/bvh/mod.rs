@@ -190,6 +190,62 @@ fn build_binary(
 #[cfg(test)]
 mod tests {
     use super::*;
+    use crate::sampling::uniform;
+
+    /// Triangles around the origin, of sizes from 10^-30 to 10^12: each split takes off the few largest.
+    fn nested(n: u32) -> Vec<[Vec3; 3]> {
+        let corner = |i, k: u32| Vec3::from_array([0, 1, 2].map(|a| uniform(i, k + a, 1) - 0.5));
+        let size = |i: u32| 10f64.powf(-30.0 + 42.0 * f64::from(i) / f64::from(n)) as f32;
+        (0..n).map(|i| [0, 3, 6].map(|k| size(i) * corner(i, k))).collect()
+    }
+
+    /// Levels of inner nodes, and of those the ones of subtrees that tasks of their own may build.
+    fn depths(binary: &BinaryBvh) -> (usize, usize) {
+        fn triangles(binary: &BinaryBvh, node: u32) -> usize {
+            let mut stack = vec![node];
+            let mut sum = 0;
+            while let Some(i) = stack.pop() {
+                let node = binary.nodes[i as usize];
+                sum += node.count as usize;
+                stack.extend(if node.count == 0 { vec![i + 1, node.index] } else { vec![] });
+            }
+            sum
+        }
+        let (mut stack, mut deepest, mut large) = (vec![(0, 0)], 0, 0);
+        while let Some((i, depth)) = stack.pop() {
+            let node = binary.nodes[i as usize];
+            deepest = deepest.max(depth);
+            if node.count == 0 {
+                large = if depth > large && triangles(binary, i) > binned::PARALLEL_SUBTREE { depth } else { large };
+                stack.extend([(i + 1, depth + 1), (node.index, depth + 1)]);
+            }
+        }
+        (deepest, large)
+    }
+
+    #[test]
+    fn deep_trees_are_built_and_refitted_on_small_stacks() {
+        let corners = nested(20_000);
+        let valid: Vec<u32> = (0..corners.len() as u32).collect();
+        // A sixteenth of what the threads of a device have.
+        let pool = rayon::ThreadPoolBuilder::new().num_threads(2).stack_size(256 << 10).build().unwrap();
+        for quality in BuildQuality::ALL {
+            let options = BuildOptions { bins: 2, quality, ..Default::default() };
+            pool.install(|| {
+                let (deepest, large) = depths(&build_binary(&corners, &valid, &options, &Progress::none()).unwrap());
+                assert!(
+                    deepest > layout::SAH_DEPTH && large > 20,
+                    "{quality:?}: {deepest} levels, {large} of them large"
+                );
+                for compact in [false, true] {
+                    let options = BuildOptions { compact, ..options };
+                    let meshes = [0, corners.len() as u32];
+                    let (mut tree, _) = build(&corners, &valid, &meshes, &options, &Progress::none()).unwrap();
+                    assert!(tree.refit(&|t| corners[t as usize]).is_empty());
+                }
+            });
+        }
+    }
 
     #[test]
     fn options_out_of_range_are_refused_by_name() {

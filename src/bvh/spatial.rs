@@ -15,7 +15,8 @@
 use super::BuildOptions;
 use super::binned::{BinMap, BinaryBvh, BinaryNode, Bins, Box4, Extent, PARALLEL_SUBTREE, Reference};
 use super::binned::{
-    area_scale, best_parting, bin_count, half_areas, halve, in_parallel, leaf_cost, leaf_weight, part_few, references,
+    area_scale, best_parting, bin_count, half_areas, halve, in_parallel, leaf_cost, leaf_weight, on_heap, part_few,
+    references,
 };
 use super::layout::SAH_DEPTH;
 use crate::error::Result;
@@ -177,15 +178,15 @@ fn chop(corners: &[Vec4; 3], axis: usize, first: usize, last: usize, grid: &Grid
     }
 }
 
-/// Slabs of a node, and room for what lies right of each.
+/// The slabs of a node, and scratch space for what lies right of each. On the heap as [`Bins`] are.
 struct Slabs {
-    slabs: [Slab; SLABS],
-    right: [Slab; SLABS],
+    slabs: Box<[Slab; SLABS]>,
+    right: Box<[Slab; SLABS]>,
 }
 
 impl Slabs {
-    fn new() -> Box<Slabs> {
-        Box::new(Slabs { slabs: [Slab::EMPTY; SLABS], right: [Slab::EMPTY; SLABS] })
+    fn new() -> Slabs {
+        Slabs { slabs: on_heap(Slab::EMPTY), right: on_heap(Slab::EMPTY) }
     }
 
     fn fill(&mut self, refs: &[Reference], corners: &[[Vec3; 3]], grid: &Grid) {
@@ -193,7 +194,7 @@ impl Slabs {
         if !in_parallel(refs.len()) {
             return self.add(refs, corners, grid);
         }
-        let parts: Vec<Box<Slabs>> = refs
+        let parts: Vec<Slabs> = refs
             .par_chunks(1 << 13)
             .map(|refs| {
                 let mut slabs = Slabs::new();
@@ -202,7 +203,7 @@ impl Slabs {
             })
             .collect();
         for part in &parts {
-            self.slabs.iter_mut().zip(&part.slabs).for_each(|(s, p)| s.add(p));
+            self.slabs.iter_mut().zip(part.slabs.iter()).for_each(|(s, p)| s.add(p));
         }
     }
 
@@ -280,8 +281,8 @@ fn slab_count(n: usize) -> usize {
 
 /// Buffers of a task.
 struct Work {
-    bins: Box<Bins>,
-    slabs: Box<Slabs>,
+    bins: Bins,
+    slabs: Slabs,
     left: Vec<Reference>,
     right: Vec<Reference>,
 }
@@ -365,25 +366,42 @@ struct Sides {
 impl Builder<'_, '_> {
     /// Builds over `refs`, adding at most `extra` to them.
     fn build(&self, refs: Vec<Reference>, extent: Extent, extra: usize, depth: usize) -> Piece {
-        let mut refs = refs;
-        let mut work = Work::new();
-        let mut flat = Flat::default();
         if self.progress.is_cancelled() {
-            return Piece::Flat(flat);
+            return Piece::Flat(Flat::default());
         }
-        let n = refs.len();
-        if n <= PARALLEL_SUBTREE {
-            self.build_flat(&mut refs, n, extent, extra, depth, &mut work, &mut flat);
-            return Piece::Flat(flat);
+        if refs.len() <= PARALLEL_SUBTREE {
+            return Piece::Flat(self.build_small(refs, extent, extra, depth));
         }
-        let sides = self.split(&mut refs, &extent, extra, depth, &mut work).expect("too many for a leaf");
-        drop(refs);
-        let Work { left, right, .. } = work;
+        let (sides, left, right) = self.part(refs, &extent, extra, depth);
         let (a, b) = rayon::join(
             || self.build(left, sides.extents[0], sides.extra[0], depth + 1),
             || self.build(right, sides.extents[1], sides.extra[1], depth + 1),
         );
         Piece::Inner(extent.boxes, Box::new([a, b]))
+    }
+
+    /// Splits more references than a leaf can hold. The working buffers are gone before the sides are built, so
+    /// that no level of the recursion holds them.
+    #[inline(never)]
+    fn part(
+        &self,
+        mut refs: Vec<Reference>,
+        extent: &Extent,
+        extra: usize,
+        depth: usize,
+    ) -> (Sides, Vec<Reference>, Vec<Reference>) {
+        let mut work = Work::new();
+        let sides = self.split(&mut refs, extent, extra, depth, &mut work).expect("too many for a leaf");
+        (sides, work.left, work.right)
+    }
+
+    /// Builds a subtree on the calling thread alone.
+    #[inline(never)]
+    fn build_small(&self, mut refs: Vec<Reference>, extent: Extent, extra: usize, depth: usize) -> Flat {
+        let (mut work, mut flat) = (Work::new(), Flat::default());
+        let n = refs.len();
+        self.build_flat(&mut refs, n, extent, extra, depth, &mut work, &mut flat);
+        flat
     }
 
     /// Builds over the last `n` of `stack` and removes them.
