@@ -1,7 +1,9 @@
 //! The device: a thread pool of its own, the ISA chosen at run time with its table of kernels, the
 //! log and the memory accounts.
 
+use crate::callback;
 use crate::error::{Error, Result, invalid_argument};
+use crate::float_state;
 use crate::memory::{MemoryFn, MemoryMonitor};
 use crate::progress::Progress;
 use crate::simd::Isa;
@@ -27,13 +29,19 @@ thread_local! {
     static APART: Cell<bool> = const { Cell::new(false) };
 }
 
-/// The most threads a device accepts: a guard against garbage in the argument.
-pub const MAX_THREADS: usize = 4096;
+/// The most threads a device accepts: more than the logical cores of most machines, and few enough for the
+/// default limits of operating systems.
+pub const MAX_THREADS: usize = 1024;
+
+/// Bytes of a thread's stack, whatever RUST_MIN_STACK says. Builds recurse by up to 76 levels of half a kilobyte,
+/// and a thread that waits for another takes up other work meanwhile, on top of its own. Only what is used takes
+/// memory.
+const STACK_BYTES: usize = 4 << 20;
 
 /// What to create a [`Device`] with.
 #[derive(Default)]
 pub struct DeviceOptions {
-    /// Worker threads; 0: one per logical core.
+    /// Worker threads, at most [`MAX_THREADS`]; 0: one per logical core, as far as that allows.
     pub num_threads: usize,
     /// `None`: the best that this machine has.
     pub isa: Option<Isa>,
@@ -53,6 +61,8 @@ pub struct Device {
     kernels: &'static Kernels,
     log: Option<Box<LogFn>>,
     memory: Arc<MemoryMonitor>,
+    /// The process that the threads are in.
+    process: u32,
 }
 
 impl Device {
@@ -65,23 +75,52 @@ impl Device {
         if !isa.is_available() {
             return Err(Error::Unsupported(format!("this machine cannot run {}", isa.name())));
         }
-        let mut threads = Vec::new();
+        // (Left to itself, rayon asks the environment for the number first.)
+        let num_threads = match options.num_threads {
+            0 => std::thread::available_parallelism().map_or(1, |n| n.get()).min(MAX_THREADS),
+            n => n,
+        };
+        let mut threads = Vec::with_capacity(num_threads);
         let pool = rayon::ThreadPoolBuilder::new()
-            .num_threads(options.num_threads)
+            .num_threads(num_threads)
             .spawn_handler(|worker| {
-                let name = format!("bakelite-{}", worker.index());
-                threads.push(std::thread::Builder::new().name(name).spawn(|| worker.run())?);
+                threads.push(own_thread(format!("bakelite-{}", worker.index())).spawn(|| {
+                    float_state::set_on_own_thread();
+                    worker.run();
+                })?);
                 Ok(())
             })
-            .build()
-            .map_err(|e| Error::OutOfMemory(format!("the worker threads could not be started: {e}")))?;
+            .build();
+        let pool = match pool {
+            Ok(pool) => pool,
+            Err(e) => {
+                // Those that were started have been told to end.
+                threads.into_iter().for_each(|t| drop(t.join()));
+                return Err(Error::OutOfMemory(format!("the {num_threads} worker threads could not be started: {e}")));
+            }
+        };
         Ok(Arc::new(Device {
             pool: Some(pool),
             threads,
             kernels: Kernels::for_isa(isa),
             log: options.log,
             memory: Arc::new(MemoryMonitor::new(options.memory)),
+            process: std::process::id(),
         }))
+    }
+
+    /// Fails in a process that `fork` has made of the one in which the device was created: the threads stayed
+    /// behind, and whoever waited for them would wait for ever.
+    pub fn check_process(&self) -> Result<()> {
+        if self.is_forked() {
+            let message = "the device was created before a fork, and its threads are not in this process";
+            return Err(Error::InvalidState(message.into()));
+        }
+        Ok(())
+    }
+
+    fn is_forked(&self) -> bool {
+        self.process != std::process::id()
     }
 
     /// The ISA in use.
@@ -94,10 +133,19 @@ impl Device {
         self.threads.len()
     }
 
-    /// Runs `f` on the device's threads; rayon calls inside use them alone.
+    /// Runs `f` on the device's threads; rayon calls inside use them alone. In a callback, which may be on one
+    /// of the threads, `f` runs on a thread of its own.
+    ///
+    /// Unwinds with an [`Error`] where [`check_process`](Self::check_process) fails, which should be asked first.
     pub fn install<R: Send>(&self, f: impl FnOnce() -> R + Send) -> R {
+        if callback::is_running() {
+            return on_extra_thread(f);
+        }
         if APART.get() {
             return f();
+        }
+        if let Err(e) = self.check_process() {
+            std::panic::resume_unwind(Box::new(e));
         }
         self.pool.as_ref().expect("there until dropped").install(f)
     }
@@ -106,7 +154,8 @@ impl Device {
     /// reports of `progress`. On a thread of the device, which has to work, reports are made when work is counted.
     pub fn run<R: Send>(&self, progress: &Progress, f: impl FnOnce() -> R + Send) -> R {
         let pool = self.pool.as_ref().expect("there until dropped");
-        if APART.get() || pool.current_thread_index().is_some() || !progress.wants_attendance() {
+        let is_busy = callback::is_running() || APART.get() || pool.current_thread_index().is_some();
+        if is_busy || self.is_forked() || !progress.wants_attendance() {
             return self.install(f);
         }
         let mut result = None;
@@ -137,7 +186,7 @@ impl Device {
     /// Sends a message to the log callback.
     pub fn log(&self, level: LogLevel, message: &str) {
         if let Some(log) = &self.log {
-            log(level, message);
+            callback::run(|| log(level, message));
         }
     }
 
@@ -151,8 +200,47 @@ impl Device {
     }
 }
 
+/// A thread with a stack of the library's choice.
+fn own_thread(name: String) -> std::thread::Builder {
+    std::thread::Builder::new().name(name).stack_size(STACK_BYTES)
+}
+
+/// Runs `f` on a pool of one thread and waits without taking up other work. Unwinds with an [`Error`] if there
+/// is no thread to be had.
+fn on_extra_thread<R: Send>(f: impl FnOnce() -> R + Send) -> R {
+    let fail = |e: &dyn std::fmt::Display| -> ! {
+        let message = format!("a thread for work in a callback could not be started: {e}");
+        std::panic::resume_unwind(Box::new(Error::OutOfMemory(message)))
+    };
+    let wait = || {
+        let pool = rayon::ThreadPoolBuilder::new()
+            .num_threads(1)
+            .stack_size(STACK_BYTES)
+            // What `f` would install anywhere is for this thread.
+            .start_handler(|_| {
+                float_state::set_on_own_thread();
+                APART.set(true);
+            })
+            .build();
+        match pool {
+            Ok(pool) => pool.install(f),
+            Err(e) => fail(&e),
+        }
+    };
+    // A worker of a pool that waited for another pool would take up work of its own pool: so another thread waits.
+    std::thread::scope(|scope| match own_thread("bakelite-callback".into()).spawn_scoped(scope, wait) {
+        Ok(thread) => thread.join().unwrap_or_else(|payload| std::panic::resume_unwind(payload)),
+        Err(e) => fail(&e),
+    })
+}
+
 impl Drop for Device {
     fn drop(&mut self) {
+        if self.is_forked() {
+            // Neither can be ended nor joined here.
+            std::mem::forget((self.pool.take(), std::mem::take(&mut self.threads)));
+            return;
+        }
         drop(self.pool.take());
         // A callback may drop the last reference on one of the threads. It cannot join itself, nor
         // the others, which end only after the job that it is in: they end on their own.
@@ -169,6 +257,7 @@ impl Drop for Device {
 #[cfg(test)]
 mod tests {
     use super::*;
+    use rayon::prelude::*;
     use std::cell::RefCell;
     use std::sync::atomic::{AtomicU32, Ordering::SeqCst};
 
@@ -208,8 +297,33 @@ mod tests {
 
     #[test]
     fn an_absurd_thread_count_is_refused_by_name() {
-        let e = Device::new(DeviceOptions { num_threads: 1 << 20, ..Default::default() }).err().unwrap();
-        assert!(e.to_string().contains("num_threads is 1048576"));
+        let e = Device::new(DeviceOptions { num_threads: MAX_THREADS + 1, ..Default::default() }).err().unwrap();
+        assert!(e.to_string().contains("num_threads is 1025, more than 1024"));
+    }
+
+    #[test]
+    fn work_in_a_callback_does_not_touch_the_threads_that_called_back() {
+        let device = Device::new(DeviceOptions { num_threads: 1, ..Default::default() }).unwrap();
+        let name = || std::thread::current().name().map(str::to_owned);
+        let (outer, sums) = device.install(|| {
+            // The only thread is in a callback, so that nothing else would ever be done on it.
+            let inner = callback::run(|| {
+                let nested = || device.install(|| (name(), rayon::current_num_threads()));
+                device.install(|| (nested(), (0..1000u64).into_par_iter().sum::<u64>()))
+            });
+            (name(), inner)
+        });
+        assert_eq!(sums.1, 499_500);
+        assert!(sums.0.1 == 1 && sums.0.0 != outer, "{sums:?}");
+    }
+
+    #[test]
+    fn a_panic_in_a_callback_s_work_comes_through() {
+        let device = Device::new(DeviceOptions { num_threads: 1, ..Default::default() }).unwrap();
+        let work = || callback::run(|| device.install(|| -> u32 { std::panic::panic_any("as expected") }));
+        let payload = std::panic::catch_unwind(std::panic::AssertUnwindSafe(work)).unwrap_err();
+        assert_eq!(Error::of_panic(payload), Error::Internal("a panic was caught: as expected".into()));
+        assert!(!callback::is_running());
     }
 
     #[test]

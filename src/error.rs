@@ -1,6 +1,7 @@
 //! The library's error type: one variant per `bk_result` code, each with a sentence that names the
 //! argument and the value at fault.
 
+use std::any::Any;
 use std::fmt;
 
 /// What went wrong. The text is a full sentence for the developer who reads the log.
@@ -24,6 +25,20 @@ pub enum Error {
 
 /// The library's result type.
 pub type Result<T> = std::result::Result<T, Error>;
+
+impl Error {
+    /// What a panic that was caught says of itself; an error that was thrown as its payload is that error.
+    pub(crate) fn of_panic(payload: Box<dyn Any + Send>) -> Error {
+        let text = match payload.downcast::<Error>() {
+            Ok(e) => return *e,
+            Err(payload) => match payload.downcast::<String>() {
+                Ok(text) => *text,
+                Err(payload) => payload.downcast_ref::<&str>().copied().unwrap_or("no message").to_string(),
+            },
+        };
+        Error::Internal(format!("a panic was caught: {text}"))
+    }
+}
 
 impl fmt::Display for Error {
     fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {

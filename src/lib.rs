@@ -29,10 +29,12 @@
 //! maps hold irradiance E (W/m²): a shader shows albedo/π · E. All surfaces are diffuse.
 
 pub mod bvh;
+pub(crate) mod callback;
 pub mod capi;
 pub mod device;
 pub mod error;
 pub mod files;
+pub(crate) mod float_state;
 #[cfg(feature = "io")]
 pub mod io;
 pub mod lightmap;

@@ -43,7 +43,7 @@ impl MemoryMonitor {
     pub fn reserve(self: &Arc<Self>, bytes: usize, what: &str) -> Result<Reservation> {
         let bytes = i64::try_from(bytes).map_err(|_| Error::OutOfMemory(format!("{what} would take {bytes} bytes")))?;
         if let Some(callback) = &self.callback
-            && !callback(bytes)
+            && !crate::callback::run(|| callback(bytes))
         {
             return Err(Error::OutOfMemory(format!("the memory monitor refused {bytes} bytes for {what}")));
         }
@@ -117,7 +117,7 @@ impl Drop for Reservation {
         }
         self.monitor.current.fetch_sub(self.bytes, SeqCst);
         if let Some(callback) = &self.monitor.callback {
-            callback(-self.bytes);
+            crate::callback::run(|| callback(-self.bytes));
         }
     }
 }

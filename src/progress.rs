@@ -96,7 +96,7 @@ impl Reporter<'_> {
                 start.unwrap_or_else(|| (f32::from_bits(self.fraction.load(Relaxed)), self.news().stage));
             if callback.pace.allows(self.begin.elapsed(), start.is_some()) {
                 callback.fraction = callback.fraction.max(fraction);
-                if !(callback.function)(callback.fraction, stage) {
+                if !crate::callback::run(|| (callback.function)(callback.fraction, stage)) {
                     return false;
                 }
             }

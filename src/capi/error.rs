@@ -13,7 +13,7 @@
 //! 0, or larger than this library knows, is BK_ERROR_INVALID_ARGUMENT.
 
 use crate::error::{Error, Result};
-use std::any::Any;
+use crate::float_state::LibraryState;
 use std::cell::RefCell;
 use std::ffi::{CStr, CString, c_char};
 use std::panic::{AssertUnwindSafe, catch_unwind};
@@ -117,12 +117,8 @@ pub(super) fn call_or<T>(fallback: T, body: impl FnOnce() -> Result<T>) -> T {
 /// poisoned then, and refuse.
 #[inline]
 fn catch<T>(body: impl FnOnce() -> Result<T>) -> Result<T> {
-    catch_unwind(AssertUnwindSafe(body)).unwrap_or_else(|payload| Err(Error::Internal(panic_text(&*payload))))
-}
-
-fn panic_text(payload: &(dyn Any + Send)) -> String {
-    let text = payload.downcast_ref::<&str>().copied().or(payload.downcast_ref::<String>().map(String::as_str));
-    format!("a panic was caught: {}", text.unwrap_or("no message"))
+    let _state = LibraryState::enter();
+    catch_unwind(AssertUnwindSafe(body)).unwrap_or_else(|payload| Err(Error::of_panic(payload)))
 }
 
 #[cold]

@@ -34,7 +34,10 @@ impl bk_lightmap {
 
     pub(super) fn change<R>(&self, f: impl FnOnce(&mut Lightmap) -> Result<R>) -> Result<R> {
         match self.lightmap.try_write() {
-            Ok(mut lightmap) => f(&mut lightmap),
+            Ok(mut lightmap) => {
+                lightmap.scene().device().check_process()?;
+                f(&mut lightmap)
+            }
             Err(TryLockError::WouldBlock) => {
                 Err(Error::InvalidState("another call is using the light map at the same time".into()))
             }
@@ -121,6 +124,7 @@ pub unsafe extern "C" fn bk_lightmap_create(
         refuse_in_callback()?;
         // Its geometry as of now: it may be refitted meanwhile.
         let scene = Arc::clone(&*hold(scene, "scene")?.committed()?);
+        scene.device().check_process()?;
         let d: bk_lightmap_desc = if desc.is_null() { SizedStruct::defaults() } else { read_struct(desc, "desc")? };
         let desc = LightmapDesc {
             texels_per_unit: d.texels_per_unit,

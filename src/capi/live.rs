@@ -52,7 +52,10 @@ impl bk_live {
 
     fn change<R>(&self, f: impl FnOnce(&mut Live) -> Result<R>) -> Result<R> {
         match self.live.try_write() {
-            Ok(mut live) => f(&mut live),
+            Ok(mut live) => {
+                live.device().check_process()?;
+                f(&mut live)
+            }
             Err(TryLockError::WouldBlock) => Err(busy()),
             Err(TryLockError::Poisoned(_)) => Err(unusable()),
         }

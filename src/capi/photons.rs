@@ -8,7 +8,7 @@
 use super::args::{OutStruct, SizedStruct, check_flags, init, read_struct, sized_struct, slice, slice_mut, write};
 use super::device::{bk_progress_fn, progress, refuse_in_callback};
 use super::error::{bk_result, call, call_or};
-use super::handles::{create, hold, object, release, retain};
+use super::handles::{borrowed, create, hold, object, release, retain};
 use super::scene::bk_scene;
 use crate::photon::{PhotonMap, PhotonParams};
 use bytemuck::cast_slice;
@@ -97,6 +97,7 @@ pub unsafe extern "C" fn bk_photon_map_create(
         refuse_in_callback()?;
         // Its geometry as of now: it may be refitted meanwhile.
         let scene = Arc::clone(&*hold(scene, "scene")?.committed()?);
+        scene.device().check_process()?;
         let params = if params.is_null() { SizedStruct::defaults() } else { read_struct(params, "params")? };
         let params = core_params(&params)?;
         let map = PhotonMap::trace(&scene, &params, &self::progress(progress, user))?;
@@ -141,7 +142,7 @@ pub unsafe extern "C" fn bk_photon_map_estimate(
 ) -> bk_result {
     // SAFETY: the arrays are the caller's, or NULL.
     call(|| unsafe {
-        let map = object!(map);
+        let map = borrowed!(map);
         let positions: &[[f32; 3]] = slice(positions.cast(), count, "positions")?;
         let normals: &[[f32; 3]] = slice(normals.cast(), count, "normals")?;
         let inputs = [(cast_slice(positions), "positions"), (cast_slice(normals), "normals")];
@@ -195,7 +196,8 @@ pub unsafe extern "C" fn bk_photon_view_init(view: *mut bk_photon_view) {
 #[unsafe(no_mangle)]
 pub unsafe extern "C" fn bk_photon_map_photons(map: *const bk_photon_map, out: *mut bk_photon_view) -> bk_result {
     call(|| {
-        let map = &object!(map).map;
+        let map = object!(map);
+        let map = &map.map;
         let photons = map.photons()?;
         // SAFETY: out is the caller's, or NULL.
         unsafe { OutStruct::new(out, "out") }?.write(bk_photon_view {

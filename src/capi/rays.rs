@@ -6,12 +6,13 @@
 //! Both sides of a triangle are hit. A ray with a NaN, an infinite origin or a zero direction hits
 //! nothing.
 
-use super::args::{check_flags, read_vec3, slice, slice_mut, write};
+use super::args::{check_flags, read_vec3, slice, slice_mut};
 use super::device::refuse_in_callback;
 use super::error::{BK_NONE, bk_result, call, call_or};
-use super::handles::object;
+use super::handles::{borrowed, is_null};
 use super::scene::bk_scene;
 use crate::error::Result;
+use crate::scene::Scene;
 use crate::trace::{Hit, Ray};
 use bytemuck::{Pod, Zeroable, cast_slice, cast_slice_mut};
 
@@ -60,12 +61,17 @@ const MISS: bk_hit = bk_hit { t: f32::INFINITY, u: 0.0, v: 0.0, triangle: BK_NON
 pub unsafe extern "C" fn bk_intersect(scene: *const bk_scene, ray: *const bk_ray, out: *mut bk_hit) {
     // SAFETY: ray and out are the caller's, or NULL.
     let hit = call_or(MISS, || unsafe {
-        let scene = object!(scene).committed()?;
+        if out.is_null() {
+            return Err(is_null("out"));
+        }
+        let scene = borrowed!(scene).committed()?;
         let ray = &slice(ray, 1, "ray")?[0];
         Ok(bytemuck::cast(scene.intersect(bytemuck::cast_ref(ray))))
     });
-    // SAFETY: as above.
-    call_or((), || unsafe { write(out, hit, "out") });
+    if !out.is_null() {
+        // SAFETY: as above.
+        unsafe { out.write_unaligned(hit) };
+    }
 }
 
 /// Whether anything lies on the ray: 1 or 0. On failure 0, and bk_last_error has the reason.
@@ -73,7 +79,7 @@ pub unsafe extern "C" fn bk_intersect(scene: *const bk_scene, ray: *const bk_ray
 pub unsafe extern "C" fn bk_occluded(scene: *const bk_scene, ray: *const bk_ray) -> i32 {
     // SAFETY: ray is the caller's, or NULL.
     call_or(0, || unsafe {
-        let scene = object!(scene).committed()?;
+        let scene = borrowed!(scene).committed()?;
         let ray = &slice(ray, 1, "ray")?[0];
         Ok(scene.occluded(bytemuck::cast_ref(ray)) as i32)
     })
@@ -95,8 +101,8 @@ pub unsafe extern "C" fn bk_intersect_many(
 ) -> bk_result {
     // SAFETY: rays and out are the caller's, or NULL.
     call(|| unsafe {
-        let scene = object!(scene).committed()?;
-        let parallel = parallel(flags, BK_RAYS_COHERENT | BK_RAYS_PARALLEL)?;
+        let scene = borrowed!(scene).committed()?;
+        let parallel = parallel(&scene, flags, BK_RAYS_COHERENT | BK_RAYS_PARALLEL)?;
         let rays = slice(rays, count, "rays")?;
         let out = slice_mut(out, count, "out", &[(cast_slice(rays), "rays")])?;
         scene.intersect_many(cast_slice(rays), parallel, cast_slice_mut(out))
@@ -117,8 +123,8 @@ pub unsafe extern "C" fn bk_occluded_many(
 ) -> bk_result {
     // SAFETY: rays and out are the caller's, or NULL.
     call(|| unsafe {
-        let scene = object!(scene).committed()?;
-        let parallel = parallel(flags, BK_RAYS_COHERENT | BK_RAYS_PARALLEL)?;
+        let scene = borrowed!(scene).committed()?;
+        let parallel = parallel(&scene, flags, BK_RAYS_COHERENT | BK_RAYS_PARALLEL)?;
         let rays = slice(rays, count, "rays")?;
         let out = slice_mut(out, count, "out", &[(cast_slice(rays), "rays")])?;
         scene.occluded_many(cast_slice(rays), parallel, out)
@@ -143,8 +149,8 @@ pub unsafe extern "C" fn bk_gather(
 ) -> bk_result {
     // SAFETY: origin, directions and out are the caller's, or NULL.
     call(|| unsafe {
-        let scene = object!(scene).committed()?;
-        let parallel = parallel(flags, BK_RAYS_PARALLEL)?;
+        let scene = borrowed!(scene).committed()?;
+        let parallel = parallel(&scene, flags, BK_RAYS_PARALLEL)?;
         let origin = read_vec3(origin, "origin")?;
         let directions = slice(directions.cast::<[f32; 3]>(), count, "directions")?;
         let out = slice_mut(out, count, "out", &[(cast_slice(directions), "directions")])?;
@@ -153,11 +159,12 @@ pub unsafe extern "C" fn bk_gather(
 }
 
 /// Checks the flags; whether they ask for the device's threads.
-fn parallel(flags: u32, known: u32) -> Result<bool> {
+fn parallel(scene: &Scene, flags: u32, known: u32) -> Result<bool> {
     check_flags(flags, known, "flags")?;
     let parallel = flags & BK_RAYS_PARALLEL != 0;
     if parallel {
         refuse_in_callback()?;
+        scene.device().check_process()?;
     }
     Ok(parallel)
 }

@@ -396,7 +396,7 @@ impl Live {
         &self.blocks.status()[b as usize]
     }
 
-    fn device(&self) -> Arc<Device> {
+    pub(crate) fn device(&self) -> Arc<Device> {
         self.context.map.atlas.scene.device().clone()
     }
 
@@ -826,8 +826,13 @@ impl Live {
 impl Drop for Live {
     fn drop(&mut self) {
         if let Some(background) = self.background.take() {
-            // Nothing is lost if this is the end of it.
-            let _ = background.finish();
+            if self.device().check_process().is_err() {
+                // The threads that it waits for are in another process.
+                std::mem::forget(background);
+            } else {
+                // Nothing is lost if this is the end of it.
+                let _ = background.finish();
+            }
         }
         // Before the scene is let go: its last reference then ends here, not on the thread that relights.
         drop(std::mem::take(&mut self.relight));
