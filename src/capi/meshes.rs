@@ -312,7 +312,8 @@ pub unsafe extern "C" fn bk_scene_mesh_geometry(
     out: *mut bk_mesh_view,
 ) -> bk_result {
     call(|| {
-        let committed = object!(scene).committed()?;
+        let scene = object!(scene);
+        let committed = scene.committed()?;
         let meshes = committed.meshes();
         // SAFETY: out is the caller's, or NULL.
         let out = unsafe { OutStruct::new(out, "out") }?;

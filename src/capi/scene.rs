@@ -22,6 +22,7 @@ use crate::error::{Error, Result, invalid_argument};
 use crate::progress::Progress;
 use crate::scene::{Scene, SceneData, builtin};
 use glam::Vec3;
+use std::collections::BTreeMap;
 use std::ffi::{c_char, c_void};
 use std::sync::{Arc, Mutex, OnceLock, TryLockError};
 
@@ -37,8 +38,8 @@ pub struct bk_scene {
 struct Changes {
     /// `None` once committed.
     description: Option<Description>,
-    /// Meshes with the positions that the next refit gives them, each at most once.
-    moved: Vec<(u32, Vec<Vec3>)>,
+    /// By mesh, the positions that the next refit gives it.
+    moved: BTreeMap<u32, Vec<Vec3>>,
 }
 
 #[derive(Default)]
@@ -92,10 +93,7 @@ impl bk_scene {
         self.with_changes(|changes| {
             let positions = positions()?;
             self.committed()?.check_positions(mesh, &positions)?;
-            match changes.moved.iter_mut().find(|(m, _)| *m == mesh) {
-                Some((_, old)) => *old = positions,
-                None => changes.moved.push((mesh, positions)),
-            }
+            changes.moved.insert(mesh, positions);
             Ok(())
         })
     }
@@ -125,7 +123,7 @@ pub unsafe extern "C" fn bk_scene_create(device: *mut bk_device, out: *mut *mut 
     call(|| unsafe {
         write(out, std::ptr::null_mut(), "out")?;
         let device = object!(device).device().clone();
-        let changes = Changes { description: Some(Description::default()), moved: Vec::new() };
+        let changes = Changes { description: Some(Description::default()), moved: BTreeMap::new() };
         write(out, create(bk_scene { device, committed: OnceLock::new(), changes: Mutex::new(changes) }), "out")
     })
 }
@@ -459,6 +457,7 @@ pub unsafe extern "C" fn bk_scene_commit(
         refuse_in_callback()?;
         // SAFETY: a handle or NULL.
         let scene = unsafe { hold(scene, "scene") }?;
+        scene.device.check_process()?;
         scene.with_description(|slot| {
             let Some(Description { data, build }) = slot.take() else {
                 return Err(Error::InvalidState("the scene is committed already".into()));
@@ -502,6 +501,7 @@ pub unsafe extern "C" fn bk_scene_refit(scene: *mut bk_scene) -> bk_result {
         refuse_in_callback()?;
         // SAFETY: a handle or NULL.
         let scene = unsafe { hold(scene, "scene") }?;
+        scene.device.check_process()?;
         let shared = scene.shared()?;
         scene.with_changes(|changes| {
             if changes.moved.is_empty() {
@@ -509,7 +509,7 @@ pub unsafe extern "C" fn bk_scene_refit(scene: *mut bk_scene) -> bk_result {
             }
             let moved: Vec<(u32, &[Vec3])> = changes.moved.iter().map(|(mesh, p)| (*mesh, &p[..])).collect();
             shared.write(|scene| Scene::refit(scene, &moved))??;
-            changes.moved = Vec::new();
+            changes.moved = BTreeMap::new();
             Ok(())
         })
     })
@@ -575,7 +575,8 @@ pub unsafe extern "C" fn bk_scene_stats_init(stats: *mut bk_scene_stats) {
 #[unsafe(no_mangle)]
 pub unsafe extern "C" fn bk_scene_stats(scene: *const bk_scene, out: *mut bk_scene_stats) -> bk_result {
     call(|| {
-        let committed = object!(scene).committed()?;
+        let scene = object!(scene);
+        let committed = scene.committed()?;
         // SAFETY: out is the caller's, or NULL.
         unsafe { OutStruct::new(out, "out") }?.write(stats(committed.stats()));
         Ok(())

@@ -11,6 +11,8 @@ use crate::trace::offset::too_few_digits;
 use crate::trace::{Hit, RawHit, Ray, TreeView, View};
 use glam::{Vec2, Vec3};
 use rayon::prelude::*;
+use std::collections::HashMap;
+use std::panic::{AssertUnwindSafe, catch_unwind};
 use std::sync::{Arc, RwLock};
 use std::time::Instant;
 
@@ -128,7 +130,7 @@ impl Uses {
 }
 
 impl Scene {
-    /// Builds the acceleration structure. On an error, `data` comes back unharmed.
+    /// Builds the acceleration structure. On an error, a panic included, `data` comes back unharmed.
     // Once per scene: what is handed back may be large.
     #[allow(clippy::result_large_err)]
     pub fn commit(
@@ -137,7 +139,9 @@ impl Scene {
         options: &BuildOptions,
         progress: &Progress,
     ) -> std::result::Result<Arc<Scene>, (SceneData, Error)> {
-        let built = device.run(progress, || Self::build(device, &data, options, progress));
+        // The build only reads `data`, and what it has made of it is gone with a panic.
+        let build = AssertUnwindSafe(|| device.run(progress, || Self::build(device, &data, options, progress)));
+        let built = catch_unwind(build).unwrap_or_else(|payload| Err(Error::of_panic(payload)));
         match built.and_then(|parts| progress.check().map(|()| parts)) {
             Ok(parts) => {
                 let scene = Arc::new(parts.into_scene(device.clone(), data));
@@ -197,10 +201,9 @@ impl Scene {
 
     /// Whether a triangle of the tree could be hit with vertices moved.
     fn any_left(&self, moved: &[(u32, &[Vec3])]) -> bool {
-        self.meshes().iter().enumerate().any(|(m, mesh)| {
-            let new = moved.iter().rev().find(|(id, _)| *id as usize == m);
-            let positions = new.map_or(&mesh.positions[..], |(_, positions)| positions);
-            let first = self.first_triangle[m];
+        let new: HashMap<u32, &[Vec3]> = moved.iter().copied().collect();
+        (0..).zip(self.meshes()).zip(&self.first_triangle).any(|((m, mesh), &first)| {
+            let positions = new.get(&m).copied().unwrap_or(&mesh.positions);
             (first..).zip(&mesh.indices).any(|(t, i)| {
                 is_valid_triangle(i.map(|i| positions[i as usize])) && self.skipped.binary_search(&t).is_err()
             })
@@ -367,14 +370,12 @@ impl Scene {
         light.validate()?;
         light.check_environment(self.environments().len())?;
         let mut lights = self.lights.write().unwrap_or_else(|e| e.into_inner());
-        let mut new = (**lights).clone();
-        match new.get_mut(id as usize) {
-            Some(l) => *l = light.normalized(),
-            None => {
-                return Err(Error::InvalidArgument(format!("light {id} does not exist, the scene has {}", new.len())));
-            }
+        let count = lights.len();
+        if id as usize >= count {
+            return invalid_argument!("light {id} does not exist, the scene has {count}");
         }
-        *lights = Arc::new(new);
+        // A copy, if a bake holds them.
+        Arc::make_mut(&mut lights)[id as usize] = light.normalized();
         Ok(())
     }
 
@@ -645,6 +646,27 @@ mod tests {
         let expected = Vec3::new(MAX_ALBEDO, 0.215_861, 0.5 * 0.215_861);
         assert!((scene.albedo(0, 0.2, 0.3) - expected).abs().max_element() < 1e-6);
         assert_eq!(scene.albedo(1, 0.2, 0.3), Vec3::new(MAX_ALBEDO, MAX_ALBEDO, 0.5));
+    }
+
+    #[test]
+    fn a_commit_that_panics_or_is_cancelled_gives_the_description_back() {
+        let device = Device::new(DeviceOptions { num_threads: 1, ..Default::default() }).unwrap();
+        let mut data = SceneData::new();
+        data.add_material(Material::default()).unwrap();
+        let mesh = || Mesh { positions: FLOOR.to_vec(), indices: vec![[0, 1, 2]], ..Default::default() };
+        data.add_mesh(mesh()).unwrap();
+        // Past all checks: a mesh without triangles whose material does not exist.
+        data.meshes.push(Mesh { materials: MeshMaterials::One(7), ..Default::default() });
+        let commit = |data, progress: &Progress| {
+            Scene::commit(&device, data, &BuildOptions::default(), progress).map_err(Box::new)
+        };
+        let (data, e) = *commit(data, &Progress::new(|_, _| false)).err().unwrap();
+        assert_eq!(e, Error::Cancelled);
+        let (mut data, e) = *commit(data, &Progress::none()).err().unwrap();
+        assert!(matches!(&e, Error::Internal(s) if s.contains("panic")), "{e}");
+        assert_eq!(device.memory().current(), 0);
+        data.meshes.pop();
+        assert_eq!(commit(data, &Progress::none()).map_err(|e| e.1).unwrap().triangle_count(), 1);
     }
 
     #[test]

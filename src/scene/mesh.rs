@@ -139,7 +139,8 @@ impl Mesh {
             }
         }
         match &self.materials {
-            MeshMaterials::One(m) if *m as usize >= material_count && !self.indices.is_empty() => {
+            // Of a mesh without triangles too: whoever looks it up need not ask for triangles first.
+            MeshMaterials::One(m) if *m as usize >= material_count => {
                 return invalid_argument!("the mesh names material {m}, the scene has {material_count}");
             }
             MeshMaterials::One(_) => {}

@@ -40,6 +40,8 @@ pub const BRIGHTEST: f32 = 1e30;
 #[derive(Clone, Debug, Default)]
 pub struct SceneData {
     meshes: Vec<Mesh>,
+    /// Triangles of all meshes.
+    triangles: usize,
     materials: Vec<Material>,
     lights: Vec<Light>,
     /// Shared by the copies that refits make.
@@ -72,10 +74,7 @@ impl SceneData {
     pub fn add_mesh(&mut self, mut mesh: Mesh) -> Result<u32> {
         mesh.validate(self.materials.len())?;
         mesh.shrink_to_fit();
-        let total = self.triangle_count() + mesh.indices.len();
-        if total > MAX_TRIANGLES {
-            return invalid_argument!("the scene would have {total} triangles, more than {MAX_TRIANGLES}");
-        }
+        self.triangles = self.triangles_with(mesh.indices.len())?;
         self.meshes.push(mesh);
         Ok(self.meshes.len() as u32 - 1)
     }
@@ -97,10 +96,7 @@ impl SceneData {
     /// Moves all of `other` behind what is here; its material, texture and environment
     /// numbers are shifted. A refusal changes nothing here.
     pub fn append(&mut self, mut other: SceneData) -> Result<()> {
-        let total = self.triangle_count() + other.triangle_count();
-        if total > MAX_TRIANGLES {
-            return invalid_argument!("the scene would have {total} triangles, more than {MAX_TRIANGLES}");
-        }
+        self.triangles = self.triangles_with(other.triangles)?;
         let shift = self.materials.len() as u32;
         for mesh in &mut other.meshes {
             match &mut mesh.materials {
@@ -166,7 +162,16 @@ impl SceneData {
 
     /// Triangles in all meshes, degenerate ones included.
     pub fn triangle_count(&self) -> usize {
-        self.meshes.iter().map(|m| m.indices.len()).sum()
+        self.triangles
+    }
+
+    /// The number of triangles after `more` are added.
+    fn triangles_with(&self, more: usize) -> Result<usize> {
+        let total = self.triangles + more;
+        if total > MAX_TRIANGLES {
+            return invalid_argument!("the scene would have {total} triangles, more than {MAX_TRIANGLES}");
+        }
+        Ok(total)
     }
 }
 
