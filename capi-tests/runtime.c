@@ -383,12 +383,12 @@ static void no_thread_is_started_but_those_of_devices(void) {
     CHECK_OK(bk_lightmap_read(lightmap, 0, BK_LAYER_COMBINED, BK_FORMAT_RGB32F, texels, 0));
     CHECK(thread_count() == expected);
     for (format = BK_FILE_EXR; format <= BK_FILE_GLB; format++) {
-        CHECK_OK(bk_lightmap_save(lightmap, folder, format));
+        CHECK_OK(bk_lightmap_save(lightmap, folder, format, NULL, NULL));
         CHECK(thread_count() == expected);
     }
     CHECK_OK(bk_scene_create(device, &loaded));
     snprintf(path, sizeof path, "%sscene.glb", folder);
-    CHECK_OK(bk_scene_load_file(loaded, path, NULL));
+    CHECK_OK(bk_scene_load_file(loaded, path, NULL, NULL, NULL, NULL));
     CHECK(thread_count() == expected);
     bk_live_params_init(&live_params);
     live_params.photon_count = 1000;
@@ -455,13 +455,17 @@ static void a_forked_child_gets_errors_for_work_and_answers_to_queries(void) {
     if (child == 0) {
         static bk_hit hits[RAYS];
         bk_device *own;
-        bk_scene *own_scene;
+        bk_scene *own_scene = NULL;
         bk_photon_map *map = NULL;
         bk_lightmap *another = NULL;
         alarm(60);
         checks_failed = 0;
+        CHECK_OK(bk_scene_create(device, &own_scene));
         CHECK_ERROR(bk_scene_commit(described, NULL, NULL), STATE, "fork");
         CHECK_ERROR(bk_bake(lightmap, NULL, NULL, NULL, NULL), STATE, "fork");
+        CHECK_ERROR(bk_lightmap_save(lightmap, folder, BK_FILE_PNG, NULL, NULL), STATE, "fork");
+        CHECK_ERROR(bk_scene_load_file(own_scene, "none.obj", NULL, NULL, NULL, NULL), STATE, "fork");
+        bk_scene_release(own_scene);
         CHECK_ERROR(bk_photon_map_create(scene, NULL, NULL, NULL, &map), STATE, "fork");
         CHECK_ERROR(bk_lightmap_create(scene, NULL, NULL, NULL, &another), STATE, "fork");
         CHECK_ERROR(bk_intersect_many(scene, rays, RAYS, BK_RAYS_PARALLEL, hits), STATE, "fork");

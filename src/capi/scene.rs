@@ -280,6 +280,7 @@ pub unsafe extern "C" fn bk_scene_load_file(
         let path = text(path, "path")?;
         let params = if params.is_null() { bk_load_params::defaults() } else { read_struct(params, "params")? };
         check_flags(params.flags, BK_LOAD_ANY_FOLDER, "flags")?;
+        scene.device.check_process()?;
         let base = if params.base_folder.is_null() { None } else { Some(text(params.base_folder, "base_folder")?) };
         let out = OutStruct::optional(out, "out")?;
         let progress = self::progress(progress, user);
