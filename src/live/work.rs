@@ -237,6 +237,10 @@ impl Block {
         self.status.fresh_lod = lod;
         self.status.lod = self.status.lod.max(lod);
         self.status.rounds = rounds as u16;
+        if self.status.target(c).is_none() {
+            // A single round would leave it some weight for ever.
+            self.work.prior = Box::default();
+        }
         self.note_error(c.map.top());
         true
     }
