@@ -119,6 +119,10 @@ impl Live {
         self.reserve(held + self.display.bytes())?;
         let context = &self.context;
         let mut display = self.display.try_clone()?;
+        if self.display.room_missing_for_epochs() == 0 {
+            // Indirect light may be on its way.
+            display.make_room_for_epochs()?;
+        }
         display.end_fades();
         let mut blocks = Blocks::away(self.blocks.status())?;
         for (b, saved) in (0u32..).zip(saved) {
