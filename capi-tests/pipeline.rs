@@ -11,6 +11,7 @@ use bakelite::scene::{Environment, builtin};
 use bakelite::trace::Ray;
 use bakelite::{Device, DeviceOptions, Error, Isa, Light, Material, Progress, Scene, SceneData};
 use glam::Vec3;
+use std::collections::BTreeSet;
 use std::f64::consts::PI;
 use std::sync::{Arc, OnceLock};
 use std::time::Instant;
@@ -493,6 +494,54 @@ fn creating_a_light_map_can_be_cancelled() {
     let scene = commit("cornell", &device(2, None));
     let cancel = Progress::new(|_, _| false);
     assert_eq!(Lightmap::create(&scene, &small().0, &cancel).err(), Some(Error::Cancelled));
+}
+
+/// Cancels a call at its first report, then at its second, and so on until it makes no more; returns the stages that
+/// it was cancelled in.
+fn cancel_at_each_report(mut call: impl FnMut(&Progress) -> Result<(), Error>) -> BTreeSet<String> {
+    let mut stages = BTreeSet::new();
+    for last in 0.. {
+        let (mut reports, mut stage) = (0, String::new());
+        let result = call(&Progress::new(|_, name| {
+            reports += 1;
+            stage = name.to_owned();
+            reports <= last
+        }));
+        match result {
+            Err(Error::Cancelled) => assert_eq!(reports, last + 1, "no report follows a refusal"),
+            Ok(()) if reports <= last => return stages,
+            other => panic!("{other:?} when the report {last} of {reports} refused"),
+        }
+        stages.insert(stage);
+    }
+    stages
+}
+
+#[test]
+fn every_call_can_be_cancelled_at_every_report() {
+    let device = device(2, None);
+    let mut data = Some(builtin("cornell").unwrap());
+    let stages = cancel_at_each_report(|progress| {
+        let data = data.take().map_or_else(|| builtin("cornell"), Ok)?;
+        Scene::commit(&device, data, &BuildOptions::default(), progress).map(drop).map_err(|e| e.1)
+    });
+    assert!(stages.contains("bvh"), "{stages:?}");
+    let scene = commit("cornell", &device);
+    let photons = PhotonParams { photon_count: 50_000, ..Default::default() };
+    let stages = cancel_at_each_report(|progress| PhotonMap::trace(&scene, &photons, progress).map(drop));
+    assert!(stages.contains("photons") && stages.contains("photon grid"), "{stages:?}");
+    let map = PhotonMap::trace(&scene, &photons, &Progress::none()).unwrap();
+    let (points, normals) = (vec![[0.5; 3]; 1000], vec![[0.0, 1.0, 0.0]; 1000]);
+    let mut out = vec![[0.0; 3]; 1000];
+    let stages = cancel_at_each_report(|progress| map.estimate_many(&points, &normals, &mut out, progress));
+    assert!(stages.contains("photon estimates"), "{stages:?}");
+    let stages = cancel_at_each_report(|progress| Lightmap::create(&scene, &small().0, progress).map(drop));
+    assert!(stages.contains("unwrap") && stages.contains("texels"), "{stages:?}");
+    let mut map = small_cornell(2, None);
+    let stages = cancel_at_each_report(|progress| map.bake(&small().1, progress).map(drop));
+    for stage in ["photons", "photon grid", "radiance", "upsampling", "gather", "blur", "direct", "seams"] {
+        assert!(stages.contains(stage), "{stage} is not among {stages:?}");
+    }
 }
 
 #[test]

@@ -2,6 +2,7 @@
 //! refuse, and budgets for single calls.
 
 use crate::error::{Error, Result};
+use rayon::prelude::*;
 use std::sync::Arc;
 use std::sync::atomic::{AtomicI64, Ordering::SeqCst};
 
@@ -76,13 +77,6 @@ pub(crate) fn prefer_large_pages<T>(buffer: &[T]) {
 #[cfg(all(target_os = "linux", not(miri)))]
 const LARGE_PAGE: usize = 2 << 20;
 
-/// An empty vector with room for `capacity`, in [large pages](prefer_large_pages) if there are any.
-pub(crate) fn large_vec<T>(capacity: usize) -> Vec<T> {
-    let mut v = Vec::with_capacity(capacity);
-    prefer_large_pages(v.spare_capacity_mut());
-    v
-}
-
 /// Bytes announced to a [`MemoryMonitor`], given back on drop.
 pub struct Reservation {
     monitor: Arc<MemoryMonitor>,
@@ -122,15 +116,110 @@ impl Drop for Reservation {
     }
 }
 
-/// A `Vec` of `len` default values; an allocation that fails is an error, not an abort.
-pub fn try_vec<T: Default + Clone>(len: usize, what: &str) -> Result<Vec<T>> {
+fn too_large<T>(len: usize, what: &str) -> Error {
+    Error::OutOfMemory(format!("{what} needs {} bytes", len as u128 * size_of::<T>() as u128))
+}
+
+/// An empty `Vec` with room for `capacity` elements, in [large pages](prefer_large_pages) if there are any. As of all
+/// functions here, an allocation that fails is an error, not an abort.
+pub fn try_with_capacity<T>(capacity: usize, what: &str) -> Result<Vec<T>> {
     let mut v = Vec::new();
-    v.try_reserve_exact(len)
-        .map_err(|_| Error::OutOfMemory(format!("{what} needs {} bytes", len as u128 * size_of::<T>() as u128)))?;
+    v.try_reserve_exact(capacity).map_err(|_| too_large::<T>(capacity, what))?;
     prefer_large_pages(v.spare_capacity_mut());
-    v.resize(len, T::default());
     Ok(v)
 }
+
+/// A `Vec` of `len` default values.
+pub fn try_vec<T: Default + Clone>(len: usize, what: &str) -> Result<Vec<T>> {
+    try_filled(len, T::default(), what)
+}
+
+/// A `Vec` of `len` equal values.
+pub fn try_filled<T: Clone>(len: usize, value: T, what: &str) -> Result<Vec<T>> {
+    let mut v = try_with_capacity(len, what)?;
+    v.resize(len, value);
+    Ok(v)
+}
+
+/// A `Vec` of `len` zeros, which take no memory until they are written.
+pub fn try_zeroed<T: bytemuck::Zeroable>(len: usize, what: &str) -> Result<Vec<T>> {
+    let v = bytemuck::allocation::try_zeroed_vec(len).map_err(|_| too_large::<T>(len, what))?;
+    prefer_large_pages(&v);
+    Ok(v)
+}
+
+/// A copy of a slice.
+pub fn try_to_vec<T: Clone>(values: &[T], what: &str) -> Result<Vec<T>> {
+    let mut v = try_with_capacity(values.len(), what)?;
+    v.extend_from_slice(values);
+    Ok(v)
+}
+
+/// Adds the elements of a slice to the end.
+pub fn try_append<T: Clone>(v: &mut Vec<T>, values: &[T], what: &str) -> Result<()> {
+    v.try_reserve(values.len()).map_err(|_| too_large::<T>(v.len() + values.len(), what))?;
+    v.extend_from_slice(values);
+    Ok(())
+}
+
+/// Adds an element to the end.
+#[inline]
+pub fn try_push<T>(v: &mut Vec<T>, value: T, what: &str) -> Result<()> {
+    if v.len() == v.capacity() {
+        v.try_reserve(1).map_err(|_| too_large::<T>(2 * v.len(), what))?;
+    }
+    v.push(value);
+    Ok(())
+}
+
+/// What an iterator gives, in a `Vec` that grows as it must.
+pub fn try_collect<T>(values: impl IntoIterator<Item = T>, what: &str) -> Result<Vec<T>> {
+    let values = values.into_iter();
+    let mut v = try_with_capacity(values.size_hint().0, what)?;
+    for value in values {
+        try_push(&mut v, value, what)?;
+    }
+    Ok(v)
+}
+
+/// What a parallel iterator of known length gives, in order.
+pub fn try_par_collect<T: Send>(values: impl IndexedParallelIterator<Item = T>, what: &str) -> Result<Vec<T>> {
+    let mut v = try_with_capacity(values.len(), what)?;
+    // It reserves nothing more where there is room.
+    values.collect_into_vec(&mut v);
+    Ok(v)
+}
+
+/// What `part` adds to the end of a `Vec` for each of the numbers below `parts`, in their order. Each part should be
+/// small, all together may be many.
+pub fn try_par_gather<T: Send>(
+    parts: usize,
+    what: &str,
+    part: impl Fn(usize, &mut Vec<T>) -> Result<()> + Sync,
+) -> Result<Vec<T>> {
+    let one = |i: usize| {
+        let mut of_part = Vec::new();
+        part(i, &mut of_part).map(|()| of_part)
+    };
+    let found = try_par_collect((0..parts).into_par_iter().map(one), what)?;
+    let total = found.iter().map(|f| f.as_ref().map_or(0, Vec::len)).sum();
+    let mut all = try_with_capacity(total, what)?;
+    for of_part in found {
+        all.append(&mut of_part?);
+    }
+    Ok(all)
+}
+
+/// Those of the numbers below `count` that `keep` takes, ascending. In parallel.
+pub fn try_par_filter(count: usize, what: &str, keep: impl Fn(u32) -> bool + Sync) -> Result<Vec<u32>> {
+    try_par_gather(count.div_ceil(FILTER_PART), what, |i, out| {
+        let part = i * FILTER_PART..count.min((i + 1) * FILTER_PART);
+        part.map(|n| n as u32).filter(|&n| keep(n)).try_for_each(|n| try_push(out, n, what))
+    })
+}
+
+/// Numbers that [`try_par_filter`] gives to a thread at a time.
+const FILTER_PART: usize = 1 << 12;
 
 #[cfg(test)]
 mod tests {

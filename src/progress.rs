@@ -92,8 +92,12 @@ impl Reporter<'_> {
     fn report(&self, callback: &mut Callback) -> bool {
         loop {
             let start = self.news().starts.pop_front();
-            let (fraction, stage) =
-                start.unwrap_or_else(|| (f32::from_bits(self.fraction.load(Relaxed)), self.news().stage));
+            let now = || (f32::from_bits(self.fraction.load(Relaxed)), self.news().stage);
+            let (fraction, stage) = start.unwrap_or_else(now);
+            if stage.is_empty() {
+                // None has started yet.
+                return true;
+            }
             if callback.pace.allows(self.begin.elapsed(), start.is_some()) {
                 callback.fraction = callback.fraction.max(fraction);
                 if !crate::callback::run(|| (callback.function)(callback.fraction, stage)) {
@@ -138,8 +142,10 @@ impl<'a> Progress<'a> {
         self.cancelled.load(Relaxed)
     }
 
-    /// `Err(Cancelled)` once the callback has asked to stop.
+    /// `Err(Cancelled)` once the callback has asked to stop. Where no thread waits to call it, it is asked here, at its
+    /// intervals. Cheap enough for every few microseconds of work.
     pub fn check(&self) -> Result<()> {
+        self.count(0.0);
         if self.is_cancelled() { Err(Error::Cancelled) } else { Ok(()) }
     }
 
@@ -167,7 +173,9 @@ impl<'a> Progress<'a> {
 
     fn count(&self, fraction: f32) {
         let Some(reporter) = &self.reporter else { return };
-        reporter.fraction.fetch_max(fraction.to_bits(), Relaxed);
+        if fraction > 0.0 {
+            reporter.fraction.fetch_max(fraction.to_bits(), Relaxed);
+        }
         // Nobody waits for a callback that another thread is in.
         if !reporter.attended.load(Relaxed)
             && let Ok(mut callback) = reporter.callback.try_lock()
@@ -255,12 +263,12 @@ impl Stage<'_, '_> {
         } else {
             self.progress.count(fraction);
         }
-        self.progress.check()
+        if self.is_cancelled() { Err(Error::Cancelled) } else { Ok(()) }
     }
 
-    /// `Err(Cancelled)` once the callback has asked to stop.
+    /// See [`Progress::check`].
     pub fn check(&self) -> Result<()> {
-        self.advance(0)
+        self.progress.check()
     }
 
     /// Whether the callback has asked to stop.
@@ -349,6 +357,16 @@ mod tests {
             });
         });
         assert!(calls.load(Relaxed) >= 5);
+    }
+
+    #[test]
+    fn where_no_thread_attends_a_look_for_a_cancel_asks_the_callback() {
+        let calls = AtomicU64::new(0);
+        let progress = Progress::new(|_, _| calls.fetch_add(1, Relaxed) < 3);
+        while progress.check().is_ok() {
+            std::thread::yield_now();
+        }
+        assert_eq!(calls.load(Relaxed), 4);
     }
 
     #[test]

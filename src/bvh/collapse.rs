@@ -6,7 +6,9 @@
 use super::binned::{BinaryBvh, BinaryNode, Box4};
 use super::compact::{self, Compact, CompactNode};
 use super::layout::{ChildRef, LEAF_PAD, LEAF_STRIDE, Mbvh, Node, WIDTH};
-use crate::memory::{large_vec, prefer_large_pages};
+use crate::error::Result;
+use crate::memory::{try_append, try_par_collect, try_push, try_with_capacity, try_zeroed};
+use crate::progress::Progress;
 use glam::Vec3;
 use rayon::prelude::*;
 
@@ -51,24 +53,27 @@ struct Plan {
 ///
 /// Nodes are in depth-first order: the inner children of a node follow each other, then comes what lies below
 /// the first, below the second, and so on; leaves likewise (`refit` relies on it).
-fn plans(binary: &BinaryBvh) -> (Vec<Plan>, Vec<u32>) {
+fn plans(binary: &BinaryBvh, progress: &Progress) -> Result<(Vec<Plan>, Vec<u32>)> {
     let n = binary.triangles.len();
     let idle = Plan { children: [0; WIDTH], count: 0, first_node: 0, first_slot: 0 };
-    let mut plans = Vec::with_capacity(n / 6 + 1);
+    let mut plans = try_with_capacity(n / 6 + 1, PLANS)?;
     plans.push(idle);
-    let mut order = Vec::with_capacity(n / 6 + 1);
+    let mut order = try_with_capacity(n / 6 + 1, PLANS)?;
     let mut slot = 0;
     let mut work = vec![(0usize, 0u32)];
     while let Some((target, source)) = work.pop() {
         let (children, count) = open(binary, source);
         let first = plans.len();
         plans[target] = Plan { children, count: count as u32, first_node: first as u32, first_slot: slot };
-        order.push(target as u32);
+        try_push(&mut order, target as u32, PLANS)?;
+        if order.len() % NODES_PER_JOB == 0 {
+            progress.check()?;
+        }
         for &child in &children[..count] {
             match binary.nodes[child as usize].count {
                 0 => {
                     work.push((plans.len(), child));
-                    plans.push(idle);
+                    try_push(&mut plans, idle, PLANS)?;
                 }
                 triangles => slot += triangles,
             }
@@ -77,38 +82,37 @@ fn plans(binary: &BinaryBvh) -> (Vec<Plan>, Vec<u32>) {
         let end = work.len();
         work[end - (plans.len() - first)..].reverse();
     }
-    (plans, order)
+    Ok((plans, order))
 }
 
+const PLANS: &str = "the plan of the tree";
+
 /// The same tree with compact nodes and leaves; `meshes` as in [`Compact::new`].
-pub(super) fn collapse_compact(binary: &BinaryBvh, meshes: &[u32]) -> Compact {
+pub(super) fn collapse_compact(binary: &BinaryBvh, meshes: &[u32], progress: &Progress) -> Result<Compact> {
     let root = &binary.nodes[0];
-    let (plans, order) = plans(binary);
+    let (plans, order) = plans(binary, progress)?;
     let compact = |plan: &Plan| CompactNode::new(&node(binary, plan), plan.first_node, plan.first_slot);
-    let mut nodes = large_vec(plans.len());
-    plans.par_iter().with_min_len(1024).map(compact).collect_into_vec(&mut nodes);
-    let mut triangles = large_vec(binary.triangles.len() + compact::PAD);
+    let nodes = try_par_collect(plans.par_iter().with_min_len(1024).map(compact), "the tree")?;
+    let mut triangles = try_with_capacity(binary.triangles.len() + compact::PAD, "the tree")?;
     for &i in &order {
         for b in plans[i as usize].leaves(binary) {
-            triangles.extend_from_slice(&binary.triangles[b.index as usize..][..b.count as usize]);
+            try_append(&mut triangles, &binary.triangles[b.index as usize..][..b.count as usize], "the tree")?;
             *triangles.last_mut().expect("a leaf has triangles") |= compact::LAST;
         }
     }
-    triangles.extend([compact::LAST | compact::GONE; compact::PAD]);
+    try_append(&mut triangles, &[compact::LAST | compact::GONE; compact::PAD], "the tree")?;
     Compact::new(nodes, triangles, (root.lower, root.upper), meshes)
 }
 
 /// The 8-wide tree of a binary one.
-pub(super) fn collapse(binary: &BinaryBvh, corners: &[[Vec3; 3]]) -> Mbvh {
+pub(super) fn collapse(binary: &BinaryBvh, corners: &[[Vec3; 3]], progress: &Progress) -> Result<Mbvh> {
     let n = binary.triangles.len();
     let root = &binary.nodes[0];
     // Which binary nodes become children is quickly told; to fill in nodes and leaves takes the time.
-    let (plans, order) = plans(binary);
-    let mut nodes = large_vec(plans.len());
-    plans.par_iter().with_min_len(1024).map(|plan| node(binary, plan)).collect_into_vec(&mut nodes);
-    // (Zeros that nobody has written take no memory yet.)
-    let mut leaves = vec![0.0; n * LEAF_STRIDE + LEAF_PAD];
-    prefer_large_pages(&leaves);
+    let (plans, order) = plans(binary, progress)?;
+    let nodes = try_par_collect(plans.par_iter().with_min_len(1024).map(|plan| node(binary, plan)), "the tree")?;
+    progress.check()?;
+    let mut leaves = try_zeroed(n * LEAF_STRIDE + LEAF_PAD, "the leaves of the tree")?;
     let mut rest = &mut leaves[..n * LEAF_STRIDE];
     let mut jobs = Vec::with_capacity(order.len() / NODES_PER_JOB + 1);
     for (i, part) in order.chunks(NODES_PER_JOB).enumerate() {
@@ -118,7 +122,8 @@ pub(super) fn collapse(binary: &BinaryBvh, corners: &[[Vec3; 3]]) -> Mbvh {
         jobs.push((part, rows));
         rest = others;
     }
-    jobs.into_par_iter().for_each(|(part, mut rows)| {
+    jobs.into_par_iter().try_for_each(|(part, mut rows): (&[u32], &mut [f32])| {
+        progress.check()?;
         for &i in part {
             for b in plans[i as usize].leaves(binary) {
                 let (leaf, others) = rows.split_at_mut(b.count as usize * LEAF_STRIDE);
@@ -126,8 +131,9 @@ pub(super) fn collapse(binary: &BinaryBvh, corners: &[[Vec3; 3]]) -> Mbvh {
                 rows = others;
             }
         }
-    });
-    Mbvh { nodes, leaves, bounds: (root.lower, root.upper) }
+        Ok(())
+    })?;
+    Ok(Mbvh { nodes, leaves, bounds: (root.lower, root.upper) })
 }
 
 /// Nodes whose leaves a thread fills at a time.
@@ -209,7 +215,7 @@ mod tests {
                 BinaryBvh::build(&corners, &ids, &options, &Progress::none()).unwrap(),
                 BinaryBvh::build_spatial(&corners, &ids, &options, &Progress::none()).unwrap(),
             ] {
-                let tree = collapse(&binary, &corners);
+                let tree = collapse(&binary, &corners, &Progress::none()).unwrap();
                 let mut seen = vec![0; n];
                 for node in &tree.nodes {
                     for (i, child) in node.children.iter().enumerate() {

@@ -7,6 +7,8 @@
 
 use super::binned::half_area;
 use super::layout::{ChildRef, Node, WIDTH};
+use crate::error::Result;
+use crate::memory::{try_collect, try_to_vec};
 use bytemuck::{Pod, Zeroable};
 use glam::Vec3;
 use rayon::prelude::*;
@@ -222,7 +224,6 @@ pub(super) const PAD: usize = WIDTH - 1;
 const BLOCK: u32 = 1 << 8;
 
 /// The tree of [`CompactNode`]s. Node 0 is the root.
-#[derive(Clone)]
 pub(crate) struct Compact {
     pub(super) nodes: Vec<CompactNode>,
     /// Global triangle numbers, leaf by leaf, with [`LAST`] and [`GONE`]; [`PAD`] more behind them.
@@ -233,12 +234,28 @@ pub(crate) struct Compact {
 }
 
 impl Compact {
-    pub(super) fn new(nodes: Vec<CompactNode>, triangles: Vec<u32>, bounds: (Vec3, Vec3), meshes: &[u32]) -> Compact {
+    /// A copy for which memory may be lacking.
+    pub(super) fn try_clone(&self) -> Result<Compact> {
+        let what = "a copy of the tree";
+        Ok(Compact {
+            nodes: try_to_vec(&self.nodes, what)?,
+            triangles: try_to_vec(&self.triangles, what)?,
+            bounds: self.bounds,
+            blocks: try_to_vec(&self.blocks, what)?,
+        })
+    }
+
+    pub(super) fn new(
+        nodes: Vec<CompactNode>,
+        triangles: Vec<u32>,
+        bounds: (Vec3, Vec3),
+        meshes: &[u32],
+    ) -> Result<Compact> {
         let total = *meshes.last().expect("never empty");
         let mesh = |t: u32| meshes.partition_point(|&first| first <= t) as u32 - 1;
         // One more, for the end of the last block.
-        let blocks = (0..=total.div_ceil(BLOCK)).map(|b| mesh((b * BLOCK).min(total - 1))).collect();
-        Compact { nodes, triangles, bounds, blocks }
+        let blocks = (0..=total.div_ceil(BLOCK)).map(|b| mesh((b * BLOCK).min(total - 1)));
+        Ok(Compact { nodes, triangles, bounds, blocks: try_collect(blocks, "the tree")? })
     }
 
     pub(crate) fn bounds(&self) -> (Vec3, Vec3) {
@@ -345,7 +362,8 @@ mod tests {
         let (ids, options) = ((0..n).collect::<Vec<u32>>(), BuildOptions { max_leaf, ..Default::default() });
         let build = if split { BinaryBvh::build_spatial } else { BinaryBvh::build };
         let binary = build(corners, &ids, &options, &Progress::none()).unwrap();
-        (collapse(&binary, corners), collapse_compact(&binary, &[0, n]))
+        let none = Progress::none();
+        (collapse(&binary, corners, &none).unwrap(), collapse_compact(&binary, &[0, n], &none).unwrap())
     }
 
     #[test]
@@ -418,7 +436,7 @@ mod tests {
     fn the_mesh_of_a_triangle_is_in_its_range() {
         // Meshes of 0, 1, 300, 3, 0, 2000 and 1 triangles.
         let firsts = [0, 0, 1, 301, 304, 304, 2304, 2305];
-        let tree = Compact::new(Vec::new(), Vec::new(), (Vec3::ZERO, Vec3::ZERO), &firsts);
+        let tree = Compact::new(Vec::new(), Vec::new(), (Vec3::ZERO, Vec3::ZERO), &firsts).unwrap();
         for t in 0..2305 {
             let mesh = firsts.partition_point(|&first| first <= t) as u32 - 1;
             // SAFETY: a triangle of the meshes that the tree was built of.

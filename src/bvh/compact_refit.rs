@@ -8,6 +8,8 @@ use super::binned::{Box4, triangle_box};
 use super::collapse::set_box;
 use super::compact::{Compact, CompactNode, GONE, NUMBER, PAD};
 use super::layout::{ChildRef, Node};
+use crate::error::Result;
+use crate::memory::{try_filled, try_with_capacity};
 use crate::scene::is_valid_triangle;
 use glam::Vec3;
 use rayon::prelude::*;
@@ -15,18 +17,51 @@ use rayon::prelude::*;
 /// Nodes and triangles that a thread takes at a time.
 const CHUNK: usize = 256;
 
+/// Working memory.
+pub(crate) struct Room {
+    /// The box of each node.
+    boxes: Vec<Box4>,
+    /// The numbers of the nodes in order of their distance from the root, and where each distance begins, with the
+    /// number of nodes at the end.
+    order: Vec<u32>,
+    levels: Vec<usize>,
+    /// As large as the largest level.
+    done: Vec<(CompactNode, Box4)>,
+}
+
+impl Room {
+    pub(super) fn new(tree: &Compact) -> Result<Room> {
+        let nodes = &tree.nodes;
+        let what = "working memory of the refit";
+        let mut order = try_with_capacity(nodes.len(), what)?;
+        order.push(ChildRef::node(0).bits());
+        let mut levels = vec![0];
+        let mut largest = 1;
+        while let Some(&begin) = levels.last().filter(|&&begin| begin < order.len()) {
+            let end = order.len();
+            for i in begin..end {
+                order.extend(nodes[order[i] as usize].inner().map(|(_, c)| c.bits()));
+            }
+            largest = largest.max(end - begin);
+            levels.push(end);
+        }
+        let boxes = try_filled(nodes.len(), Box4::EMPTY, what)?;
+        Ok(Room { boxes, order, levels, done: try_with_capacity(largest, what)? })
+    }
+}
+
 /// See [`super::refit::refit`].
-pub(super) fn refit(tree: &mut Compact, corners: &(impl Fn(u32) -> [Vec3; 3] + Sync)) -> Vec<u32> {
+pub(super) fn refit(tree: &mut Compact, corners: &(impl Fn(u32) -> [Vec3; 3] + Sync), room: Room) -> Vec<u32> {
     let end = tree.triangles.len() - PAD;
     tree.triangles[..end].par_iter_mut().with_min_len(CHUNK).for_each(|t| {
         *t = if is_valid_triangle(corners(*t & NUMBER)) { *t & !GONE } else { *t | GONE };
     });
-    let mut boxes = vec![Box4::EMPTY; tree.nodes.len()];
-    for level in levels(&tree.nodes).iter().rev() {
+    let Room { mut boxes, order, levels, mut done } = room;
+    for level in levels.windows(2).rev().map(|w| &order[w[0]..w[1]]) {
         let work = level.par_iter().with_min_len(CHUNK);
-        let done: Vec<(CompactNode, Box4)> = work.map(|&i| refit_node(tree, i as usize, &boxes, corners)).collect();
-        for (&i, (node, bounds)) in level.iter().zip(done) {
-            (tree.nodes[i as usize], boxes[i as usize]) = (node, bounds);
+        work.map(|&i| refit_node(tree, i as usize, &boxes, corners)).collect_into_vec(&mut done);
+        for (&i, (node, bounds)) in level.iter().zip(&done) {
+            (tree.nodes[i as usize], boxes[i as usize]) = (*node, *bounds);
         }
     }
     tree.bounds = boxes[0].corners();
@@ -36,15 +71,6 @@ pub(super) fn refit(tree: &mut Compact, corners: &(impl Fn(u32) -> [Vec3; 3] + S
     out.sort_unstable();
     out.dedup();
     out
-}
-
-/// The numbers of the nodes, by their distance from the root.
-fn levels(nodes: &[CompactNode]) -> Vec<Vec<u32>> {
-    let mut levels = vec![vec![ChildRef::node(0).bits()]];
-    while let Some(last) = levels.last().filter(|l| !l.is_empty()) {
-        levels.push(last.iter().flat_map(|&i| nodes[i as usize].inner()).map(|(_, c)| c.bits()).collect());
-    }
-    levels
 }
 
 /// A node with new boxes, and the box around them; `boxes` are those of the nodes below.
@@ -86,7 +112,12 @@ mod tests {
         let n = corners.len() as u32;
         let ids: Vec<u32> = (0..n).collect();
         let binary = BinaryBvh::build(corners, &ids, &Default::default(), &Progress::none()).unwrap();
-        collapse_compact(&binary, &[0, n])
+        collapse_compact(&binary, &[0, n], &Progress::none()).unwrap()
+    }
+
+    fn refit_here(tree: &mut Compact, corners: &(impl Fn(u32) -> [Vec3; 3] + Sync)) -> Vec<u32> {
+        let room = Room::new(tree).unwrap();
+        refit(tree, corners, room)
     }
 
     fn bits(tree: &Compact) -> (Vec<u8>, Vec<u32>, (Vec3, Vec3)) {
@@ -99,7 +130,7 @@ mod tests {
             let corners = soup(n, 1);
             let mut tree = tree(&corners);
             let before = bits(&tree);
-            assert!(refit(&mut tree, &|t| corners[t as usize]).is_empty());
+            assert!(refit_here(&mut tree, &|t| corners[t as usize]).is_empty());
             assert!(bits(&tree) == before, "{n} triangles");
         }
     }
@@ -113,7 +144,7 @@ mod tests {
         let results = [1, 2, 7].map(|n| {
             let pool = rayon::ThreadPoolBuilder::new().num_threads(n).build().unwrap();
             let mut tree = tree(&from);
-            let out = pool.install(|| refit(&mut tree, &|t| to[t as usize]));
+            let out = pool.install(|| refit_here(&mut tree, &|t| to[t as usize]));
             (bits(&tree), out)
         });
         assert_eq!(results[0].1, (0..30_000).step_by(77).collect::<Vec<u32>>());

@@ -1,6 +1,8 @@
 //! Memory layout of the 8-wide tree.
 
 use super::binned::half_area;
+use crate::error::Result;
+use crate::memory::try_to_vec;
 use crate::simd::prefetch;
 use bytemuck::{Pod, Zeroable};
 use glam::Vec3;
@@ -174,7 +176,6 @@ pub(crate) const LEAF_STRIDE: usize = 10;
 /// Rows are loaded four at a time whatever c is; lanes beyond c hold the next row's values and are
 /// masked. That keeps leaves at 40 bytes per triangle with no transposition (padding every leaf to
 /// four triangles would take about twice that).
-#[derive(Clone)]
 pub struct Mbvh {
     pub(crate) nodes: Vec<Node>,
     pub(crate) leaves: Vec<f32>,
@@ -182,6 +183,12 @@ pub struct Mbvh {
 }
 
 impl Mbvh {
+    /// A copy for which memory may be lacking.
+    pub(super) fn try_clone(&self) -> Result<Mbvh> {
+        let what = "a copy of the tree";
+        Ok(Mbvh { nodes: try_to_vec(&self.nodes, what)?, leaves: try_to_vec(&self.leaves, what)?, bounds: self.bounds })
+    }
+
     /// Lower and upper corner of the box around all triangles.
     pub fn bounds(&self) -> (Vec3, Vec3) {
         self.bounds

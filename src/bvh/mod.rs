@@ -97,8 +97,10 @@ pub fn estimated_bytes(triangles: usize, options: &BuildOptions) -> usize {
     }
 }
 
+/// See [`Tree::room_to_refit`].
+pub(crate) type RefitRoom = Option<compact_refit::Room>;
+
 /// A scene's acceleration structure.
-#[derive(Clone)]
 pub(crate) enum Tree {
     Whole(Mbvh),
     Compact(Compact),
@@ -142,12 +144,29 @@ impl Tree {
         }
     }
 
-    /// See [`refit::refit`].
-    pub(crate) fn refit(&mut self, corners: &(impl Fn(u32) -> [Vec3; 3] + Sync)) -> Vec<u32> {
-        match self {
-            Tree::Whole(t) => refit::refit(t, corners),
-            Tree::Compact(t) => compact_refit::refit(t, corners),
+    /// The working memory of [`refit`](Self::refit).
+    pub(crate) fn room_to_refit(&self) -> Result<RefitRoom> {
+        Ok(match self {
+            Tree::Whole(_) => None,
+            Tree::Compact(t) => Some(compact_refit::Room::new(t)?),
+        })
+    }
+
+    /// See [`refit::refit`]. `room` must have been made for this tree.
+    pub(crate) fn refit(&mut self, corners: &(impl Fn(u32) -> [Vec3; 3] + Sync), room: RefitRoom) -> Vec<u32> {
+        match (self, room) {
+            (Tree::Compact(t), Some(room)) => compact_refit::refit(t, corners, room),
+            (Tree::Whole(t), _) => refit::refit(t, corners),
+            (Tree::Compact(_), None) => unreachable!("the room is this tree's"),
         }
+    }
+
+    /// A copy for which memory may be lacking.
+    pub(crate) fn try_clone(&self) -> Result<Tree> {
+        Ok(match self {
+            Tree::Whole(t) => Tree::Whole(t.try_clone()?),
+            Tree::Compact(t) => Tree::Compact(t.try_clone()?),
+        })
     }
 }
 
@@ -165,9 +184,9 @@ pub(crate) fn build(
     let binary = build_binary(corners, valid, options, progress)?;
     let cost = binary.sah_cost();
     let tree = if options.compact {
-        Tree::Compact(collapse::collapse_compact(&binary, meshes))
+        Tree::Compact(collapse::collapse_compact(&binary, meshes, progress)?)
     } else {
-        Tree::Whole(collapse::collapse(&binary, corners))
+        Tree::Whole(collapse::collapse(&binary, corners, progress)?)
     };
     Ok((tree, cost))
 }
@@ -241,7 +260,8 @@ mod tests {
                     let options = BuildOptions { compact, ..options };
                     let meshes = [0, corners.len() as u32];
                     let (mut tree, _) = build(&corners, &valid, &meshes, &options, &Progress::none()).unwrap();
-                    assert!(tree.refit(&|t| corners[t as usize]).is_empty());
+                    let room = tree.room_to_refit().unwrap();
+                    assert!(tree.refit(&|t| corners[t as usize], room).is_empty());
                 }
             });
         }

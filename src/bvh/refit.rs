@@ -178,7 +178,8 @@ mod tests {
 
     fn tree(corners: &Triangles, options: &BuildOptions) -> Mbvh {
         let valid: Vec<u32> = (0..corners.len() as u32).filter(|&t| is_valid_triangle(corners[t as usize])).collect();
-        collapse(&build_binary(corners, &valid, options, &Progress::none()).unwrap(), corners)
+        let none = Progress::none();
+        collapse(&build_binary(corners, &valid, options, &none).unwrap(), corners, &none).unwrap()
     }
 
     fn moved(mut tree: Mbvh, corners: &Triangles) -> (Mbvh, Vec<u32>) {

@@ -19,11 +19,12 @@ use super::binned::{
     references,
 };
 use super::layout::SAH_DEPTH;
-use crate::error::Result;
+use crate::error::{Error, Result};
 use crate::memory::try_vec;
 use crate::progress::Progress;
 use glam::{DVec3, Vec3, Vec4};
 use rayon::prelude::*;
+use std::sync::atomic::{AtomicBool, Ordering::Relaxed};
 
 /// Planes are tried at the borders of at most this many slabs per axis. (16: up to a fifth faster; cost
 /// within 1 % on four scenes, 4 % higher on San Miguel.)
@@ -354,6 +355,8 @@ struct Builder<'a, 'p> {
     progress: &'a Progress<'p>,
     /// Root's half area in f64, times α.
     least_overlap: f64,
+    /// Set when an allocation has failed: what is built then is thrown away.
+    out_of_memory: AtomicBool,
 }
 
 /// The two sides of a split, whose references are in [`Work`].
@@ -372,7 +375,10 @@ impl Builder<'_, '_> {
         if refs.len() <= PARALLEL_SUBTREE {
             return Piece::Flat(self.build_small(refs, extent, extra, depth));
         }
-        let (sides, left, right) = self.part(refs, &extent, extra, depth);
+        let Some((sides, left, right)) = self.part(refs, &extent, extra, depth) else {
+            self.out_of_memory.store(true, Relaxed);
+            return Piece::Flat(Flat::default());
+        };
         let (a, b) = rayon::join(
             || self.build(left, sides.extents[0], sides.extra[0], depth + 1),
             || self.build(right, sides.extents[1], sides.extra[1], depth + 1),
@@ -380,7 +386,7 @@ impl Builder<'_, '_> {
         Piece::Inner(extent.boxes, Box::new([a, b]))
     }
 
-    /// Splits more references than a leaf can hold. The working buffers are gone before the sides are built, so
+    /// Splits more references than a leaf can hold; `None` if there is no memory for both sides. The working buffers are gone before the sides are built, so
     /// that no level of the recursion holds them.
     #[inline(never)]
     fn part(
@@ -389,10 +395,15 @@ impl Builder<'_, '_> {
         extent: &Extent,
         extra: usize,
         depth: usize,
-    ) -> (Sides, Vec<Reference>, Vec<Reference>) {
+    ) -> Option<(Sides, Vec<Reference>, Vec<Reference>)> {
         let mut work = Work::new();
+        // No side gets more; what is not used is given back.
+        work.left.try_reserve(refs.len()).ok()?;
+        work.right.try_reserve(refs.len()).ok()?;
         let sides = self.split(&mut refs, extent, extra, depth, &mut work).expect("too many for a leaf");
-        (sides, work.left, work.right)
+        work.left.shrink_to_fit();
+        work.right.shrink_to_fit();
+        Some((sides, work.left, work.right))
     }
 
     /// Builds a subtree on the calling thread alone.
@@ -596,8 +607,12 @@ impl BinaryBvh {
         let (refs, extent) = references(corners, valid)?;
         let extra = ((n as f64 * f64::from(options.split_budget)) as usize).min(MAX_SLOTS - n.min(MAX_SLOTS));
         let least_overlap = extent.boxes.half_area() * f64::from(ALPHA);
-        let piece = Builder { corners, options, progress, least_overlap }.build(refs, extent, extra, 0);
+        let builder = Builder { corners, options, progress, least_overlap, out_of_memory: AtomicBool::new(false) };
+        let piece = builder.build(refs, extent, extra, 0);
         progress.check()?;
+        if builder.out_of_memory.into_inner() {
+            return Err(Error::OutOfMemory(format!("the tree over {n} triangles with spatial splits")));
+        }
         let (node_count, triangle_count) = piece.size();
         let mut nodes = try_vec::<BinaryNode>(node_count, "the binary tree")?;
         let mut triangles = try_vec::<u32>(triangle_count, "the binary tree")?;

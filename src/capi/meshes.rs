@@ -13,7 +13,7 @@ use super::error::{BK_NONE, bk_result, call, call_or};
 use super::handles::object;
 use super::scene::bk_scene;
 use crate::error::{Result, invalid_argument};
-use crate::scene::{LightmapUvs, Material, Mesh, MeshMaterials, NONE};
+use crate::scene::{LightmapUvs, Material, Mesh, MeshMaterials, NONE, SceneData};
 use glam::{Vec2, Vec3};
 
 const _: () = assert!(BK_NONE == NONE);
@@ -184,10 +184,25 @@ pub unsafe extern "C" fn bk_scene_add_mesh(
     // SAFETY: desc, the arrays in it and out_id are the caller's, or NULL.
     call(|| unsafe {
         let scene = object!(scene);
-        let mesh = read_mesh(&read_struct(desc, "desc")?)?;
-        let id = scene.describe("meshes can be added", |d| d.data.add_mesh(mesh))?;
+        let desc = read_struct(desc, "desc")?;
+        let id = scene.describe_large("meshes can be added", bytes(&desc), || read_mesh(&desc), SceneData::add_mesh)?;
         write_optional(out_id, id)
     })
+}
+
+/// What a copy of a mesh takes.
+fn bytes(d: &bk_mesh_desc) -> usize {
+    let if_given = |given: bool, bytes: usize| if given { bytes } else { 0 };
+    let per_vertex = size_of::<Vec3>()
+        + if_given(!d.normals.is_null(), size_of::<Vec3>())
+        + if_given(!d.uvs.is_null(), size_of::<Vec2>())
+        + if_given(!d.lightmap_uvs.is_null(), size_of::<Vec2>());
+    let per_triangle = size_of::<[u32; 3]>()
+        + if_given(!d.lightmap_page.is_null(), size_of::<u32>())
+        + if_given(!d.triangle_materials.is_null(), size_of::<u32>());
+    // Impossible numbers are refused by name where the arrays are read.
+    let all = d.vertex_count.saturating_mul(per_vertex).saturating_add(d.triangle_count.saturating_mul(per_triangle));
+    if all > isize::MAX as usize { 0 } else { all }
 }
 
 /// # Safety

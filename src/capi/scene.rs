@@ -19,6 +19,7 @@ use super::shared::{Reading, Shared};
 use crate::bvh::{BuildOptions, BuildQuality};
 use crate::device::Device;
 use crate::error::{Error, Result, invalid_argument};
+use crate::memory::{Reservation, try_push};
 use crate::progress::Progress;
 use crate::scene::{Scene, SceneData, builtin};
 use glam::Vec3;
@@ -46,6 +47,17 @@ struct Changes {
 pub(super) struct Description {
     pub(super) data: SceneData,
     build: BuildOptions,
+    /// What `data` holds of arrays that grow with the input.
+    announced: Vec<Reservation>,
+}
+
+impl Description {
+    /// Adds all of another scene.
+    fn append(&mut self, other: SceneData, device: &Device) -> Result<()> {
+        let reservation = device.memory().reserve(other.bytes(), "the scene's description")?;
+        self.data.append(other)?;
+        try_push(&mut self.announced, reservation, "the scene's description")
+    }
 }
 
 impl bk_scene {
@@ -54,6 +66,23 @@ impl bk_scene {
         self.with_description(|description| match description {
             Some(d) => change(d),
             None => Err(Error::InvalidState(format!("the scene is committed: {what} no more"))),
+        })
+    }
+
+    /// Adds `bytes` of arrays to the description, which are announced before `read` copies them and until the commit,
+    /// which announces the whole scene.
+    pub(super) fn describe_large<A, R>(
+        &self,
+        what: &str,
+        bytes: usize,
+        read: impl FnOnce() -> Result<A>,
+        add: impl FnOnce(&mut SceneData, A) -> Result<R>,
+    ) -> Result<R> {
+        self.describe(what, |description| {
+            let reservation = self.device.memory().reserve(bytes, "the scene's description")?;
+            let added = add(&mut description.data, read()?)?;
+            try_push(&mut description.announced, reservation, "the scene's description")?;
+            Ok(added)
         })
     }
 
@@ -285,7 +314,13 @@ pub unsafe extern "C" fn bk_scene_load_file(
         let out = OutStruct::optional(out, "out")?;
         let progress = self::progress(progress, user);
         let info = scene.describe("files can be loaded", |d| {
-            load_file(&scene.device, &mut d.data, path, &params, base, &progress)
+            let mut loaded = SceneData::new();
+            let info = load_file(&scene.device, &mut loaded, path, &params, base, &progress)?;
+            let first =
+                [d.data.meshes().len(), d.data.materials().len(), d.data.lights().len(), d.data.textures().len()];
+            d.append(loaded, &scene.device)?;
+            let [first_mesh, first_material, first_light, first_texture] = first.map(|n| n as u32);
+            Ok(bk_load_info { first_mesh, first_material, first_light, first_texture, ..info })
         })?;
         if let Some(out) = out {
             out.write(info);
@@ -353,7 +388,7 @@ pub unsafe extern "C" fn bk_scene_load_builtin(scene: *mut bk_scene, name: *cons
         let scene = object!(scene);
         // SAFETY: name is the caller's, or NULL.
         let name = unsafe { text(name, "name") }?;
-        scene.describe("scenes can be loaded", |d| d.data.append(builtin(name)?))
+        scene.describe("scenes can be loaded", |d| d.append(builtin(name)?, &scene.device))
     })
 }
 
@@ -460,9 +495,11 @@ pub unsafe extern "C" fn bk_scene_commit(
         let scene = unsafe { hold(scene, "scene") }?;
         scene.device.check_process()?;
         scene.with_description(|slot| {
-            let Some(Description { data, build }) = slot.take() else {
+            let Some(Description { data, build, announced }) = slot.take() else {
                 return Err(Error::InvalidState("the scene is committed already".into()));
             };
+            // The commit announces the same arrays again.
+            drop(announced);
             match Scene::commit(&scene.device, data, &build, &self::progress(progress, user)) {
                 Ok(committed) => {
                     // The description was there, so nothing was committed before.
@@ -470,7 +507,9 @@ pub unsafe extern "C" fn bk_scene_commit(
                     Ok(())
                 }
                 Err((data, e)) => {
-                    *slot = Some(Description { data, build });
+                    // They are held anyway, so that a refusal is no reason to lose them.
+                    let announced = scene.device.memory().reserve(data.bytes(), "the scene's description");
+                    *slot = Some(Description { data, build, announced: announced.into_iter().collect() });
                     Err(e)
                 }
             }

@@ -16,7 +16,7 @@ use super::error::{bk_result, call};
 use super::handles::{is_null, object};
 use super::scene::bk_scene;
 use crate::error::{Result, invalid_argument};
-use crate::scene::{Environment, MAX_ENVIRONMENT_SIZE, MAX_TEXTURE_SIZE, Texture};
+use crate::scene::{Environment, MAX_ENVIRONMENT_SIZE, MAX_TEXTURE_SIZE, SceneData, Texture};
 use bytemuck::Pod;
 use std::ffi::c_void;
 
@@ -75,8 +75,9 @@ pub unsafe extern "C" fn bk_scene_add_texture(
     // SAFETY: desc, the texels and out_id are the caller's, or NULL.
     call(|| unsafe {
         let scene = object!(scene);
-        let texture = read_texture(&read_struct(desc, "desc")?)?;
-        let id = scene.describe("textures can be added", |d| d.data.add_texture(texture))?;
+        let desc = read_struct(desc, "desc")?;
+        let read = || read_texture(&desc);
+        let id = scene.describe_large("textures can be added", bytes(&desc, 4), read, SceneData::add_texture)?;
         write_optional(out_id, id)
     })
 }
@@ -110,8 +111,13 @@ pub unsafe extern "C" fn bk_scene_add_environment(
     // SAFETY: desc, the texels and out_id are the caller's, or NULL.
     call(|| unsafe {
         let scene = object!(scene);
-        let environment = read_environment(&read_struct(desc, "desc")?)?;
-        let id = scene.describe("environments can be added", |d| Ok(d.data.add_environment(environment)))?;
+        let desc = read_struct(desc, "desc")?;
+        let id = scene.describe_large(
+            "environments can be added",
+            bytes(&desc, 16),
+            || read_environment(&desc),
+            |data, environment| Ok(data.add_environment(environment)),
+        )?;
         write_optional(out_id, id)
     })
 }
@@ -124,6 +130,13 @@ unsafe fn read_environment(d: &bk_texture_desc) -> Result<Environment> {
     }
     // SAFETY: forwarded.
     Environment::new(d.width, d.height, unsafe { texels(d, MAX_ENVIRONMENT_SIZE, "the environment")? })
+}
+
+/// What a copy of an image takes.
+fn bytes(d: &bk_texture_desc, per_texel: usize) -> usize {
+    // At most 2^30 texels are taken; more are refused by name where they are read.
+    let texels = d.width as usize * d.height as usize;
+    if texels > 1 << 30 { 0 } else { texels * per_texel }
 }
 
 /// A copy of an image's texels.

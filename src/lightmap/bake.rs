@@ -1,5 +1,6 @@
 //! The bake: stages in order, each with its share of progress, time and memory.
 
+use super::blur::Filling;
 use super::bright::Bright;
 use super::charts::{Charts, automatic_density};
 use super::direct::DirectLight;
@@ -80,7 +81,7 @@ impl Lightmap {
         let two_sided: Vec<u32> = (0..).zip(&charts.charts).filter(|(_, c)| c.two_sided).map(|(c, _)| c).collect();
         let pack = |divisor: u32, padding: u32, given: bool, with_backs: &[u32]| {
             let page_size = if divisor == 1 { desc.page_size } else { (desc.page_size / divisor).max(MIN_PAGE_SIZE) };
-            Layout::pack(&charts, density / divisor as f32, page_size, padding, given, with_backs)
+            Layout::pack(&charts, density / divisor as f32, page_size, padding, given, with_backs, progress)
         };
         let radiance = pack(desc.radiance_divisor, 0, false, &two_sided)?;
         let stage = progress.stage("texels", 0.5, 0.6, TexelMap::work(&radiance));
@@ -118,7 +119,7 @@ impl Lightmap {
         if let Some(message) = too_few_digits(scene, "texels", 1.0 / density, OFFSET_PART) {
             scene.device().log(LogLevel::Warning, &message);
         }
-        let direct = DirectLight::new(scene);
+        let direct = DirectLight::try_new(scene)?;
         let mut plan =
             Plan::new(scene, &direct, &BakeParams::default(), !two_sided.is_empty(), uvs.unwrapped_charts > 0);
         plan.note_both_sides(&info);
@@ -158,7 +159,7 @@ impl Lightmap {
         }
         let end = if params.texel_end == 0 { total } else { params.texel_end };
         let origin = Origin::new(params, &self.atlas.scene.lights());
-        let direct = DirectLight::new(&self.atlas.scene);
+        let direct = self.atlas.scene.device().install(|| DirectLight::try_new(&self.atlas.scene))?;
         let two_sided = !self.atlas.radiance.layout.back_of.is_empty();
         let mut plan =
             Plan::new(&self.atlas.scene, &direct, params, two_sided, self.atlas.info.uvs.unwrapped_charts > 0);
@@ -183,22 +184,38 @@ impl Lightmap {
             let stitch = self.stitch(&light, &range, params, &mut plan, &mut stats, progress)?;
             Ok((light, stats, stitch))
         })?;
+        let filling = self.filling(&light, &range)?;
         // The last moment at which nothing has changed.
         progress.check()?;
         stats.left_out = plan.left_out;
         stats.peak_bytes = device.memory().peak() as u64;
         self.plan = plan;
         let start = Instant::now();
-        device.install(|| self.store(light, range, stitch));
+        device.install(|| self.store(light, range, stitch, filling))?;
         stats.compose.seconds = start.elapsed().as_secs_f64();
         stats.seconds += stats.compose.seconds;
         Ok(stats)
     }
 
+    /// The filling of what [`store`](Self::store) will make of `new` light of a range of samples: a hidden texel beside a
+    /// lit one would show as a dark rim under bilinear filtering.
+    pub(super) fn filling(&self, new: &Light, range: &Range<usize>) -> Result<Filling> {
+        let before = self.light.as_ref().filter(|_| range.len() < self.atlas.map.len());
+        let state = |i: usize| before.filter(|_| !range.contains(&i)).unwrap_or(new).state[i];
+        let is = |s: TexelState| move |i: usize| state(i) == s;
+        Filling::new(self.atlas.map.len(), is(TexelState::Visible), is(TexelState::Hidden))
+    }
+
     /// Takes the light of a range of samples over. Hidden texels are filled here, from all that has
     /// been baked so far, and seams are stitched anew: whatever the shards, the last one leaves the
     /// bits of a whole bake.
-    pub(super) fn store(&mut self, new: Light, range: Range<usize>, stitch: Option<Stitch>) {
+    pub(super) fn store(
+        &mut self,
+        new: Light,
+        range: Range<usize>,
+        stitch: Option<Stitch>,
+        filling: Filling,
+    ) -> Result<()> {
         match &mut self.light {
             Some(old) if range.len() < self.atlas.map.len() => {
                 if let Some(mut before) = old.stitch.take() {
@@ -214,18 +231,13 @@ impl Lightmap {
             }
             light => *light = Some(new),
         }
-        let Some(light) = &mut self.light else { return };
-        let hidden: Vec<u32> =
-            (0..light.state.len() as u32).filter(|&i| light.state[i as usize] == TexelState::Hidden).collect();
-        // A hidden texel beside a lit one would show as a dark rim under bilinear filtering.
-        if !hidden.is_empty() {
-            let visible = light.state.iter().map(|&s| s == TexelState::Visible).collect();
-            blur::fill(&self.atlas.charts, &self.atlas.map, &mut light.direct, visible, hidden);
-        }
+        let Some(light) = &mut self.light else { return Ok(()) };
+        filling.fill(&self.atlas.charts, &self.atlas.map, &mut light.direct, &Progress::none())?;
         if let Some(mut stitch) = stitch {
             stitch.swap(light);
             light.stitch = Some(stitch);
         }
+        Ok(())
     }
 }
 
@@ -256,7 +268,7 @@ impl Bake<'_, '_> {
         let scene = &self.atlas.scene;
         let mut indirect = None;
         let radiance = self.illuminate(&mut stats)?;
-        let backs = self.backs(&radiance.values);
+        let backs = self.backs(&radiance.values)?;
         if self.plan.runs(left_out::INDIRECT) {
             indirect = Some(self.gather(&radiance, &backs, &mut stats)?);
         }
@@ -345,7 +357,7 @@ impl Bake<'_, '_> {
         };
         let mut rays = radiance::bake(l.scene.device(), &input, &mut values, &stage)?;
         let mut radiance = Radiance { values, bright: Bright::default() };
-        l.scene.device().install(|| Bright::find(l, &mut radiance, &mut rays))?;
+        l.scene.device().install(|| Bright::find(l, &mut radiance, &mut rays, self.progress))?;
         let bytes = (radiance.values.len() * size_of::<Vec3>() + l.radiance.bytes()) as u64;
         stats.radiance = StageStats { seconds: start.elapsed().as_secs_f64(), rays, bytes };
         Ok(radiance)
@@ -353,10 +365,10 @@ impl Bake<'_, '_> {
 
     /// Per chart with one place, whether its back is baked. With [`illuminate`](Self::illuminate)'s map all that
     /// texels need to be lit.
-    pub(crate) fn backs(&self, radiance: &[Vec3]) -> Vec<bool> {
+    pub(crate) fn backs(&self, radiance: &[Vec3]) -> Result<Vec<bool>> {
         let l = self.atlas;
         if let Some(backs) = self.checkpoint.and_then(|c| c.backs(l.charts.charts.len())) {
-            return backs;
+            return Ok(backs);
         }
         // Without indirect light there is no radiance map: direct light decides.
         let light = |s: usize| match radiance.get(s) {
@@ -366,11 +378,11 @@ impl Bake<'_, '_> {
                 self.direct.irradiance(&receiver, 1, combine(self.params.seed as u32, s as u32), &mut 0).element_sum()
             }
         };
-        let backs = l.scene.device().install(|| sides::backs(l, light));
+        let backs = l.scene.device().install(|| sides::backs(l, light, self.progress))?;
         if let Some(c) = self.checkpoint {
             c.keep_backs(&backs);
         }
-        backs
+        Ok(backs)
     }
 
     /// Gathers, blurs and fills. Only placements that the range touches are gathered.
@@ -409,6 +421,7 @@ impl Bake<'_, '_> {
                 }
                 let mut traced = 0;
                 for i in 0..values.len() {
+                    self.progress.check()?;
                     let sample = needed.start + block * BLOCK + i;
                     let receiver = l.receiver(&l.gather, backs, sample);
                     let mut gathered = Gathered::default();
@@ -426,8 +439,8 @@ impl Bake<'_, '_> {
                 stage.advance(values.len() as u64)
             })
         })?;
-        let hidden = needed.clone().filter(|&i| !valid[i]).map(|i| i as u32).collect();
-        blur::fill(&l.charts, &l.gather, &mut irradiance, valid.clone(), hidden);
+        let is_hidden = |i: usize| needed.contains(&i) && !valid[i];
+        Filling::new(n, |i| valid[i], is_hidden)?.fill(&l.charts, &l.gather, &mut irradiance, self.progress)?;
         if self.plan.runs(left_out::BLUR) {
             let stage = self.progress.stage("blur", 0.6, 0.65, n as u64);
             let mut blurred = try_vec(n, "the blurred gather map")?;
@@ -505,6 +518,7 @@ impl Bake<'_, '_> {
                     return stage.advance(direct.len() as u64);
                 }
                 for i in 0..direct.len() {
+                    self.progress.check()?;
                     let sample = first + i;
                     let receiver = l.receiver(&l.map, backs, sample);
                     state[i] = TexelState::Visible;

@@ -5,7 +5,8 @@ use super::charts::Charts;
 use super::map::ChartMap;
 use crate::device::Device;
 use crate::error::Result;
-use crate::progress::Stage;
+use crate::memory::{try_collect, try_with_capacity};
+use crate::progress::{Progress, Stage};
 use crate::scene::NONE;
 use glam::Vec3;
 use rayon::prelude::*;
@@ -21,6 +22,9 @@ const BLOCK: usize = 1024;
 
 /// Rounds of filling: a hidden region wider than twice this stays partly unfilled.
 const MAX_FILL_ROUNDS: usize = 64;
+
+/// What buffers are for, in errors.
+const FILLED: &str = "the texels to be filled";
 
 /// How many standard deviations of their noise two texels may differ by and still be taken for equally lit.
 const LIKE: f32 = 2.0;
@@ -56,6 +60,7 @@ pub(crate) fn blur(
         out.par_chunks_mut(BLOCK).enumerate().try_for_each(|(block, out)| {
             let mut window = Window::new(radius);
             for (i, out) in out.iter_mut().enumerate() {
+                stage.check()?;
                 let sample = block * BLOCK + i;
                 *out =
                     if texels.valid[sample] { window.blur(charts, map, sample, texels) } else { texels.values[sample] };
@@ -129,21 +134,51 @@ impl Window {
     }
 }
 
-/// Gives each of the texels `missing` the mean of its known or already filled neighbours in the
-/// chart, ring by ring. What charts without a known texel hold is left alone. Depends on the known
-/// texels alone, not on what the missing ones hold.
-pub(crate) fn fill(charts: &Charts, map: &ChartMap, values: &mut [Vec3], mut known: Vec<bool>, mut missing: Vec<u32>) {
-    for _ in 0..MAX_FILL_ROUNDS {
-        let ring: Vec<(u32, Vec3)> =
-            missing.iter().filter_map(|&i| Some((i, neighbours(charts, map, i, values, &known)?))).collect();
-        if ring.is_empty() {
-            break;
+/// Filling of missing texels: each gets the mean of its known or already filled neighbours in the chart, ring by ring.
+/// What charts without a known texel hold is left alone. Depends on the known texels alone, not on what the missing
+/// ones hold.
+pub(crate) struct Filling {
+    known: Vec<bool>,
+    missing: Vec<u32>,
+    /// Room for a ring of all that is missing.
+    ring: Vec<(u32, Vec3)>,
+}
+
+impl Filling {
+    /// Gets ready to fill the `missing` ones of `n` texels from those that are `known`. Filling takes no memory then.
+    pub(crate) fn new(n: usize, known: impl Fn(usize) -> bool, missing: impl Fn(usize) -> bool) -> Result<Filling> {
+        let missing = try_collect((0..n).filter(|&i| missing(i)).map(|i| i as u32), FILLED)?;
+        let ring = try_with_capacity(missing.len(), FILLED)?;
+        let known = if missing.is_empty() { Vec::new() } else { try_collect((0..n).map(known), FILLED)? };
+        Ok(Filling { known, missing, ring })
+    }
+
+    /// Fails, with part of the texels filled, on a cancel alone.
+    pub(crate) fn fill(
+        mut self,
+        charts: &Charts,
+        map: &ChartMap,
+        values: &mut [Vec3],
+        progress: &Progress,
+    ) -> Result<()> {
+        for _ in 0..MAX_FILL_ROUNDS {
+            self.ring.clear();
+            for part in self.missing.chunks(BLOCK) {
+                progress.check()?;
+                let mean = |&i: &u32| Some((i, neighbours(charts, map, i, values, &self.known)?));
+                self.ring.extend(part.iter().filter_map(mean));
+            }
+            if self.ring.is_empty() {
+                break;
+            }
+            for &(i, v) in &self.ring {
+                values[i as usize] = v;
+                self.known[i as usize] = true;
+            }
+            let known = &self.known;
+            self.missing.retain(|&i| !known[i as usize]);
         }
-        for &(i, v) in &ring {
-            values[i as usize] = v;
-            known[i as usize] = true;
-        }
-        missing.retain(|&i| !known[i as usize]);
+        Ok(())
     }
 }
 

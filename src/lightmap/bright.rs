@@ -27,7 +27,8 @@ use super::many::{ManyLights, Patch};
 use super::map::ChartMap;
 use super::radiance::{Radiance, RadianceMap};
 use crate::error::Result;
-use crate::memory::Reservation;
+use crate::memory::{Reservation, try_collect, try_par_collect, try_par_gather, try_push};
+use crate::progress::Progress;
 use crate::sampling::{combine, cosine_around, sobol_2d, uniform};
 use crate::scene::{NONE, Scene};
 use crate::trace::Ray;
@@ -70,6 +71,9 @@ const MAX_PATCHES: usize = 1 << 16;
 /// Places tried along each axis of a texel, to tell where it lies and how large it is.
 const PLACES: u32 = 2;
 
+/// Triangles on which a thread looks for bright texels at a time.
+const TRIANGLES: u32 = 64;
+
 /// Bright texels of a radiance map as lights. None, by default.
 #[derive(Default)]
 pub(crate) struct Bright {
@@ -83,8 +87,8 @@ pub(crate) struct Bright {
 impl Bright {
     /// Bright patches of the radiance map of an atlas, which has none yet, become lights if that pays. To be called on
     /// the device's threads. Adds the rays traced to `rays`.
-    pub(crate) fn find(atlas: &Atlas, radiance: &mut Radiance, rays: &mut u64) -> Result<()> {
-        let seen = seen_by_gather_rays(atlas, radiance, rays);
+    pub(crate) fn find(atlas: &Atlas, radiance: &mut Radiance, rays: &mut u64, progress: &Progress) -> Result<()> {
+        let seen = seen_by_gather_rays(atlas, radiance, rays, progress)?;
         let mean = seen.iter().sum::<f32>() / seen.len().max(1) as f32;
         let limit = LIMIT * mean;
         let square = |l: f32| seen.iter().map(|s| s.min(l).powi(2)).sum::<f32>();
@@ -95,16 +99,17 @@ impl Bright {
         }
         let beyond: f32 = seen.iter().map(|s| (s - limit).max(0.0)).sum();
         let share = beyond / (mean * seen.len() as f32);
-        let patches = patches(atlas, &radiance.values, limit, MAX_PATCHES, rays);
+        let patches = patches(atlas, &radiance.values, limit, MAX_PATCHES, rays, progress)?;
         if patches.is_empty() {
             return Ok(());
         }
-        let patches = ManyLights::of_patches(patches);
+        let patches = ManyLights::of_patches(patches)?;
+        progress.check()?;
         let memory = atlas.scene.device().memory().reserve(patches.bytes(), "bright patches")?;
         let shadow_rays = (SHADOW_RAYS * share).ceil() as u32;
-        let without = trials(atlas, radiance, rays);
+        let without = trials(atlas, radiance, rays, progress)?;
         radiance.bright = Bright { limit, patches: Some(patches), shadow_rays, _memory: Some(memory) };
-        if !pays(&trials(atlas, radiance, rays), &without) {
+        if !pays(&trials(atlas, radiance, rays, progress)?, &without) {
             radiance.bright = Bright::default();
         }
         Ok(())
@@ -120,7 +125,8 @@ impl Bright {
         if !(limit > 0.0) {
             return Ok(Bright::default());
         }
-        let patches = ManyLights::of_patches(patches(atlas, values, limit, MAX_PATCHES, &mut 0));
+        let patches = patches(atlas, values, limit, MAX_PATCHES, &mut 0, &Progress::none())?;
+        let patches = ManyLights::of_patches(patches)?;
         let memory = atlas.scene.device().memory().reserve(patches.bytes(), "bright patches")?;
         Ok(Bright { limit, patches: Some(patches), shadow_rays, _memory: Some(memory) })
     }
@@ -177,16 +183,17 @@ fn near2(map: &ChartMap, placement: u32) -> f32 {
 
 /// Every so manyth of the lit texels of a radiance map, about `count`.
 fn lit_texels(values: &[Vec3], count: usize) -> Vec<usize> {
-    let lit: Vec<usize> = (0..values.len()).filter(|&s| values[s] != Vec3::ZERO).collect();
-    let step = (lit.len() / count).max(1);
-    lit.into_iter().skip(step / 2).step_by(step).collect()
+    let lit = || (0..values.len()).filter(|&s| values[s] != Vec3::ZERO);
+    let step = (lit().count() / count).max(1);
+    lit().skip(step / 2).step_by(step).collect()
 }
 
 /// Mean and variance of rounds of gather rays from places all over the lit surfaces, sums over the channels.
-fn trials(atlas: &Atlas, radiance: &Radiance, rays: &mut u64) -> Vec<(f32, f32)> {
+fn trials(atlas: &Atlas, radiance: &Radiance, rays: &mut u64, progress: &Progress) -> Result<Vec<(f32, f32)>> {
     let lookup = RadianceMap::new(&atlas.charts, &atlas.radiance, radiance);
     let samples = SampleSet::new(ROUND as u32, 0);
     let at = |&sample: &usize| {
+        progress.check()?;
         let (_, receiver) = atlas.radiance.receiver(&atlas.scene, sample, atlas.radiance.is_back(sample));
         let mut traced = 0;
         let round = |i: u32| {
@@ -197,11 +204,12 @@ fn trials(atlas: &Atlas, radiance: &Radiance, rays: &mut u64) -> Vec<(f32, f32)>
         let light: Vec<f32> = (0..ROUNDS).map(round).collect();
         let mean = light.iter().sum::<f32>() / ROUNDS as f32;
         let squares: f32 = light.iter().map(|e| (e - mean).powi(2)).sum();
-        (mean, squares / (ROUNDS - 1) as f32, traced)
+        Ok((mean, squares / (ROUNDS - 1) as f32, traced))
     };
-    let found: Vec<(f32, f32, u64)> = lit_texels(&radiance.values, TRIALS).par_iter().map(at).collect();
+    let found: Result<Vec<(f32, f32, u64)>> = lit_texels(&radiance.values, TRIALS).par_iter().map(at).collect();
+    let found = found?;
     *rays += found.iter().map(|f| f.2).sum::<u64>();
-    found.into_iter().map(|(mean, variance, _)| (mean, variance)).collect()
+    Ok(found.into_iter().map(|(mean, variance, _)| (mean, variance)).collect())
 }
 
 /// Whether trials vary that much less, in proportion to the light.
@@ -215,12 +223,13 @@ fn pays(with: &[(f32, f32)], without: &[(f32, f32)]) -> bool {
 }
 
 /// What gather rays see from places all over the lit surfaces, sums over the channels, where it is more than nothing.
-fn seen_by_gather_rays(atlas: &Atlas, radiance: &Radiance, rays: &mut u64) -> Vec<f32> {
+fn seen_by_gather_rays(atlas: &Atlas, radiance: &Radiance, rays: &mut u64, progress: &Progress) -> Result<Vec<f32>> {
     let (scene, map, values) = (&atlas.scene, &atlas.radiance, &radiance.values);
     let lookup = RadianceMap::new(&atlas.charts, map, radiance);
     let lit = lit_texels(values, VIEWS);
     *rays += lit.len() as u64 * u64::from(RAYS);
     let from = |&sample: &usize| {
+        progress.check()?;
         let (_, receiver) = map.receiver(scene, sample, map.is_back(sample));
         let lookup = &lookup;
         let along = move |i: u32| {
@@ -231,14 +240,17 @@ fn seen_by_gather_rays(atlas: &Atlas, radiance: &Radiance, rays: &mut u64) -> Ve
             }
             lookup.reflected(&hit).map(|l| l.element_sum()).filter(|&s| s > 0.0)
         };
-        (0..RAYS).filter_map(along).collect::<Vec<f32>>()
+        Ok((0..RAYS).filter_map(along).collect::<Vec<f32>>())
     };
-    lit.par_iter().flat_map_iter(from).collect()
+    let seen: Vec<Vec<f32>> = lit.par_iter().map(from).collect::<Result<_>>()?;
+    Ok(seen.concat())
 }
 
 /// A place on a bright texel, on the side that it shows.
 struct Place {
     texel: u32,
+    /// Among the places of all texels.
+    number: u32,
     placement: u32,
     /// The part of the surface that it stands for.
     area: f32,
@@ -247,14 +259,21 @@ struct Place {
 }
 
 /// Of the bright texels or, of more, about `most` of them.
-fn patches(atlas: &Atlas, values: &[Vec3], limit: f32, most: usize, rays: &mut u64) -> Vec<Patch> {
+fn patches(
+    atlas: &Atlas,
+    values: &[Vec3],
+    limit: f32,
+    most: usize,
+    rays: &mut u64,
+    progress: &Progress,
+) -> Result<Vec<Patch>> {
     let count = values.iter().filter(|v| v.element_sum() > limit).count();
     let chance = (most as f32 / count.max(1) as f32).min(1.0);
     let is_light = |texel: usize| values[texel].element_sum() > limit && uniform(texel as u32, 0, 0) < chance;
     let traced = AtomicU64::new(0);
-    let mut places = places(atlas, is_light, &traced);
+    let mut places = places(atlas, is_light, &traced, progress)?;
     *rays += traced.into_inner();
-    places.sort_by_key(|p| p.texel);
+    places.sort_unstable_by_key(|p| (p.texel, p.number));
     let patch = |of_texel: &[Place]| {
         let area: f32 = of_texel.iter().map(|p| p.area).sum();
         let mut at = area * uniform(of_texel[0].texel, 1, 0);
@@ -267,15 +286,21 @@ fn patches(atlas: &Atlas, values: &[Vec3], limit: f32, most: usize, rays: &mut u
         let flux = radiance * ((1.0 - limit / radiance.element_sum()) * area / chance);
         Patch { position, normal, flux, near2: near2(&atlas.radiance, placement) }
     };
-    places.chunk_by(|a, b| a.texel == b.texel).map(patch).collect()
+    try_collect(places.chunk_by(|a, b| a.texel == b.texel).map(patch), "bright patches")
 }
 
 /// Those of a grid that divides texels evenly, moved at random for each triangle: of texels that lie in one triangle the
 /// area is exact, of others right on average.
-fn places(atlas: &Atlas, is_light: impl Fn(usize) -> bool + Sync, rays: &AtomicU64) -> Vec<Place> {
+fn places(
+    atlas: &Atlas,
+    is_light: impl Fn(usize) -> bool + Sync,
+    rays: &AtomicU64,
+    progress: &Progress,
+) -> Result<Vec<Place>> {
     let (scene, charts, map) = (&atlas.scene, &atlas.charts, &atlas.radiance);
-    let placements = 0..map.layout.placements.len() as u32;
-    let has_lights: Vec<bool> = placements.into_par_iter().map(|p| map.samples_of(p).any(&is_light)).collect();
+    let placements = (0..map.layout.placements.len()).into_par_iter();
+    let has_lights = placements.map(|p| map.samples_of(p as u32).any(&is_light));
+    let has_lights = try_par_collect(has_lights, "bright patches")?;
     let on_side = |t: u32, front: bool| -> Vec<Place> {
         let placement = map.layout.side(charts.chart_of[t as usize], front).filter(|&p| has_lights[p as usize]);
         let Some(placement) = placement else { return Vec::new() };
@@ -303,13 +328,24 @@ fn places(atlas: &Atlas, is_light: impl Fn(usize) -> bool + Sync, rays: &AtomicU
             // Not where there is a hole, nor a second time where another triangle covers this one.
             rays.fetch_add(1, Relaxed);
             let is_seen = scene.intersect_raw(&Ray::new(position, -normal)).triangle == t;
-            is_seen.then_some(Place { texel, placement, area: cell, position, normal })
+            is_seen.then_some(Place { texel, number: 0, placement, area: cell, position, normal })
         };
         let offset = Vec2::new(uniform(t, 2, 0), uniform(t, 3, 0));
         grid_points([a2, b2, c2], offset).filter_map(place).collect()
     };
-    let triangles = (0..scene.triangle_count()).into_par_iter().filter(|&t| charts.chart_of[t as usize] != NONE);
-    triangles.flat_map_iter(|t| [true, false].into_iter().flat_map(move |front| on_side(t, front))).collect()
+    let triangles = scene.triangle_count();
+    let mut places = try_par_gather(triangles.div_ceil(TRIANGLES) as usize, "bright patches", |part, out| {
+        progress.check()?;
+        let first = part as u32 * TRIANGLES;
+        for t in (first..triangles.min(first + TRIANGLES)).filter(|&t| charts.chart_of[t as usize] != NONE) {
+            for place in [true, false].into_iter().flat_map(|front| on_side(t, front)) {
+                try_push(out, place, "bright patches")?;
+            }
+        }
+        Ok(())
+    })?;
+    (0..).zip(&mut places).for_each(|(number, place)| place.number = number);
+    Ok(places)
 }
 
 /// Points at integer distances from `offset`, in [0, 1)², inside a triangle.
@@ -340,7 +376,6 @@ mod tests {
     use crate::lightmap::gather::{Gathered, SampleSet};
     use crate::lightmap::plan::left_out;
     use crate::lightmap::{BakeParams, Light as Baked, Lightmap, LightmapDesc};
-    use crate::progress::Progress;
     use crate::sampling::uniform_triangle;
     use crate::scene::shapes::MeshBuilder;
     use crate::scene::{Light, Material, SceneData, builtin};
@@ -428,12 +463,12 @@ mod tests {
         };
         let beyond: f32 = (0..scene.triangle_count()).map(of_triangle).sum();
         for (most, tolerance) in [(1 << 16, 0.01), (100, 0.2)] {
-            let patches = patches(atlas, values, limit, most, &mut 0);
+            let patches = patches(atlas, values, limit, most, &mut 0, &Progress::none()).unwrap();
             let flux: f32 = patches.iter().map(|p| p.flux.element_sum()).sum();
             assert!((flux / beyond - 1.0).abs() < tolerance, "{most}: {flux} {beyond}");
             assert!(patches.iter().all(|p| p.position.abs().max_element() < 2.0));
         }
-        assert!(patches(atlas, values, limit, 100, &mut 0).len() < 150);
+        assert!(patches(atlas, values, limit, 100, &mut 0, &Progress::none()).unwrap().len() < 150);
     }
 
     #[test]

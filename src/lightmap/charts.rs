@@ -8,7 +8,8 @@ use super::layout::{MAX_TEXELS, padded_extent};
 use super::unwrap;
 use crate::device::LogLevel;
 use crate::error::{Error, Result, invalid_argument};
-use crate::progress::Progress;
+use crate::memory::{try_collect, try_filled, try_push, try_with_capacity};
+use crate::progress::{Progress, Stage};
 use crate::scene::{LightmapUvs, Material, Mesh, NONE, Scene};
 use glam::{DVec2, Vec2};
 use rayon::prelude::*;
@@ -20,6 +21,9 @@ use std::time::Instant;
 /// unique (an engine's per-mesh UVs without page numbers, say): they are unwrapped instead. Below
 /// it overlaps are taken for the caller's affair and counted.
 const MAX_PAGE_COVER: f64 = 2.0;
+
+/// What buffers are for, in errors.
+pub(super) const CHARTS: &str = "the charts";
 
 /// A piece of surface with continuous texture coordinates.
 #[derive(Clone, Debug, PartialEq)]
@@ -111,14 +115,15 @@ impl Charts {
         let _memory = scene.device().memory().reserve(total as usize * 2 * Self::BYTES_PER_TRIANGLE, "the charts")?;
         let (charts, mut report) = scene.device().install(|| {
             let mut report = UvReport::default();
-            let (mut pieces, rest) = given_pieces(scene, page_size, &mut report)?;
+            let (mut pieces, rest) = given_pieces(scene, page_size, &mut report, &stage)?;
             stage.advance(total as u64 - rest.len() as u64)?;
             report.given_charts = pieces.len() as u32;
             for piece in unwrap::unwrap(scene, &rest, &stage)? {
-                split_to_fit(piece, max_extent as f32, &mut pieces);
+                stage.check()?;
+                split_to_fit(piece, max_extent as f32, &mut pieces)?;
             }
             report.unwrapped_charts = pieces.len() as u32 - report.given_charts;
-            Ok((Charts::assemble(scene, pieces), report))
+            Ok((Charts::assemble(scene, pieces, &stage)?, report))
         })?;
         stage.advance(1)?;
         report.seconds = start.elapsed().as_secs_f64();
@@ -148,15 +153,16 @@ impl Charts {
         (a * (1.0 - u - v) + b * u + c * v).to_array()
     }
 
-    fn assemble(scene: &Scene, pieces: Vec<Piece>) -> Charts {
+    fn assemble(scene: &Scene, pieces: Vec<Piece>, stage: &Stage) -> Result<Charts> {
         let total = scene.triangle_count() as usize;
         let mut charts = Charts {
-            charts: Vec::with_capacity(pieces.len()),
-            triangles: Vec::with_capacity(pieces.iter().map(|p| p.triangles.len()).sum()),
-            chart_of: vec![NONE; total],
-            corners: vec![[[0.0; 2]; 3]; total],
+            charts: try_with_capacity(pieces.len(), CHARTS)?,
+            triangles: try_with_capacity(pieces.iter().map(|p| p.triangles.len()).sum(), CHARTS)?,
+            chart_of: try_filled(total, NONE, CHARTS)?,
+            corners: try_filled(total, [[0.0; 2]; 3], CHARTS)?,
         };
         for piece in pieces {
+            stage.check()?;
             let (lower, upper) = bounds(&piece.corners);
             let first = charts.triangles.len() as u32;
             let mut area = 0.0;
@@ -175,7 +181,7 @@ impl Charts {
                 given: piece.given,
             });
         }
-        charts
+        Ok(charts)
     }
 }
 
@@ -238,24 +244,24 @@ fn bounds(corners: &[[[f32; 2]; 3]]) -> (Vec2, Vec2) {
 /// Cuts a piece in halves, along triangle borders, until each is at most `max_extent` wide and high.
 /// Where that does not help (large triangles reach across the cut), the piece stays, to be reduced
 /// in density by the layout.
-fn split_to_fit(piece: Piece, max_extent: f32, out: &mut Vec<Piece>) {
+fn split_to_fit(piece: Piece, max_extent: f32, out: &mut Vec<Piece>) -> Result<()> {
     let mut stack = vec![piece];
     while let Some(piece) = stack.pop() {
         let (lower, upper) = bounds(&piece.corners);
         let axis = if upper.x - lower.x >= upper.y - lower.y { 0 } else { 1 };
         let extent = (upper - lower)[axis];
         if extent <= max_extent || piece.triangles.len() == 1 {
-            out.push(piece);
+            try_push(out, piece, CHARTS)?;
             continue;
         }
         let middle = (0.5 * (lower + upper))[axis];
         let is_low = |c: &[[f32; 2]; 3]| (c[0][axis] + c[1][axis] + c[2][axis]) / 3.0 < middle;
-        let half = |low: bool| {
+        let half = |low: bool| -> Result<Piece> {
             let kept = || piece.triangles.iter().zip(&piece.corners).filter(|(_, c)| is_low(c) == low);
-            let triangles = kept().map(|(&t, _)| t).collect();
-            Piece { triangles, corners: kept().map(|(_, &c)| c).collect(), given: None }
+            let triangles = try_collect(kept().map(|(&t, _)| t), CHARTS)?;
+            Ok(Piece { triangles, corners: try_collect(kept().map(|(_, &c)| c), CHARTS)?, given: None })
         };
-        let halves = [half(true), half(false)];
+        let halves = [half(true)?, half(false)?];
         let shrinks = |p: &Piece| {
             let (lower, upper) = bounds(&p.corners);
             // A cut in two that leaves more than this on a side makes texels rather than room.
@@ -265,9 +271,10 @@ fn split_to_fit(piece: Piece, max_extent: f32, out: &mut Vec<Piece>) {
             let [low, high] = halves;
             stack.extend([high, low]);
         } else {
-            out.push(piece);
+            try_push(out, piece, CHARTS)?;
         }
     }
+    Ok(())
 }
 
 /// What must not meet in one chart: sides that are lit and sides that are not, and lamps and what
@@ -277,40 +284,48 @@ pub(super) fn surface_kind(material: &Material) -> u32 {
 }
 
 /// Pieces from the caller's UVs, ordered by page, and the valid triangles to unwrap, ascending.
-fn given_pieces(scene: &Scene, page_size: u32, report: &mut UvReport) -> Result<(Vec<Piece>, Vec<u32>)> {
+fn given_pieces(scene: &Scene, page_size: u32, report: &mut UvReport, stage: &Stage) -> Result<(Vec<Piece>, Vec<u32>)> {
     let mut rest = Vec::new();
     let mut usable = Vec::new();
     let mut cover = BTreeMap::<u32, f64>::new();
     for (m, mesh) in scene.meshes().iter().enumerate() {
         let first = scene.first_triangle(m as u32);
         for t in (0..mesh.indices.len()).filter(|&t| scene.is_valid(first + t as u32)) {
+            stage.check()?;
             let Some(lightmap) = &mesh.lightmap else {
-                rest.push(first + t as u32);
+                try_push(&mut rest, first + t as u32, CHARTS)?;
                 continue;
             };
             let page = given_page(lightmap, m, t, page_size)?;
             match uv_area(mesh, lightmap, t, page_size) {
                 Some(area) if area > 0.0 => {
                     *cover.entry(page).or_default() += area;
-                    usable.push((first + t as u32, page));
+                    try_push(&mut usable, (first + t as u32, page), CHARTS)?;
                     continue;
                 }
                 Some(_) => report.degenerate += 1,
                 None => report.out_of_range += 1,
             }
-            rest.push(first + t as u32);
+            try_push(&mut rest, first + t as u32, CHARTS)?;
         }
     }
-    let (kept, overlapping): (Vec<_>, Vec<_>) = usable.into_iter().partition(|(_, page)| cover[page] <= MAX_PAGE_COVER);
-    report.overlapping = overlapping.len() as u64;
-    rest.extend(overlapping.iter().map(|(t, _)| t));
+    let is_kept = |page: u32| cover[&page] <= MAX_PAGE_COVER;
+    let without_overlapping = rest.len();
+    for &(t, _) in usable.iter().filter(|(_, page)| !is_kept(*page)) {
+        try_push(&mut rest, t, CHARTS)?;
+    }
+    report.overlapping = (rest.len() - without_overlapping) as u64;
     rest.sort_unstable();
+    let mut kept = usable;
+    kept.retain(|(_, page)| is_kept(*page));
 
     let mut pieces = Vec::new();
     for of_mesh in kept.chunk_by(|a, b| scene.locate(a.0).0 == scene.locate(b.0).0) {
-        pieces.extend(islands(scene, of_mesh));
+        for piece in islands(scene, of_mesh, stage)? {
+            try_push(&mut pieces, piece, CHARTS)?;
+        }
     }
-    pieces.sort_by_key(|p: &Piece| (p.given.map(|g| g.page), p.triangles[0]));
+    pieces.sort_unstable_by_key(|p: &Piece| (p.given.map(|g| g.page), p.triangles[0]));
     Ok((pieces, rest))
 }
 
@@ -337,11 +352,11 @@ fn uv_area(mesh: &Mesh, lightmap: &LightmapUvs, triangle: usize, page_size: u32)
 }
 
 /// Pieces of one mesh: triangles with usable UVs and their pages, connected through equal vertices.
-fn islands(scene: &Scene, triangles: &[(u32, u32)]) -> Vec<Piece> {
+fn islands(scene: &Scene, triangles: &[(u32, u32)], stage: &Stage) -> Result<Vec<Piece>> {
     let mesh = &scene.meshes()[scene.locate(triangles[0].0).0 as usize];
     let uvs = &mesh.lightmap.as_ref().expect("the mesh has UVs").uvs;
     let corner = |t: u32, k: usize| mesh.indices[scene.locate(t).1 as usize][k] as usize;
-    let mut keys = Vec::with_capacity(triangles.len() * 3);
+    let mut keys = try_with_capacity(triangles.len() * 3, CHARTS)?;
     for (n, &(t, page)) in triangles.iter().enumerate() {
         let kind = surface_kind(scene.material(t));
         for k in 0..3 {
@@ -350,30 +365,32 @@ fn islands(scene: &Scene, triangles: &[(u32, u32)]) -> Vec<Piece> {
             keys.push(((page, kind, [u, v], mesh.positions[i].to_array().map(float_key)), n as u32));
         }
     }
-    groups(&connected(triangles.len(), keys))
-        .into_iter()
-        .map(|group| {
-            let page = triangles[group[0] as usize].1;
-            let numbers: Vec<u32> = group.iter().map(|&n| triangles[n as usize].0).collect();
-            let corners: Vec<_> = numbers.iter().map(|&t| [0, 1, 2].map(|k| uvs[corner(t, k)])).collect();
-            given_piece(scene, page, numbers, &corners)
-        })
-        .collect()
+    stage.check()?;
+    let groups = Groups::new(&connected(triangles.len(), keys, stage)?, stage)?;
+    let mut pieces = Vec::new();
+    for group in groups.iter() {
+        stage.check()?;
+        let page = triangles[group[0] as usize].1;
+        let numbers = try_collect(group.iter().map(|&n| triangles[n as usize].0), CHARTS)?;
+        let corners = try_collect(numbers.iter().map(|&t| [0, 1, 2].map(|k| uvs[corner(t, k)])), CHARTS)?;
+        try_push(&mut pieces, given_piece(scene, page, numbers, &corners)?, CHARTS)?;
+    }
+    Ok(pieces)
 }
 
 /// Local coordinates such that the piece keeps its area, and the placement that undoes them.
-fn given_piece(scene: &Scene, page: u32, triangles: Vec<u32>, uvs: &[[Vec2; 3]]) -> Piece {
+fn given_piece(scene: &Scene, page: u32, triangles: Vec<u32>, uvs: &[[Vec2; 3]]) -> Result<Piece> {
     let lower = uvs.iter().flatten().fold(Vec2::INFINITY, |m, &p| m.min(p));
     let twice_area = |[a, b, c]: [DVec2; 3]| (b - a).perp_dot(c - a).abs();
     let area_uv: f64 = uvs.iter().map(|t| 0.5 * twice_area(t.map(|uv| uv.as_dvec2()))).sum();
     let area: f64 = triangles.iter().map(|&t| triangle_area(scene, t)).sum();
     let scale = (area / area_uv).sqrt();
     let local = |uv: Vec2| ((uv - lower).as_dvec2() * scale).as_vec2().to_array();
-    Piece {
+    Ok(Piece {
         triangles,
-        corners: uvs.iter().map(|t| t.map(local)).collect(),
+        corners: try_collect(uvs.iter().map(|t| t.map(local)), CHARTS)?,
         given: Some(Given { page, offset: lower.to_array(), scale: [(1.0 / scale) as f32; 2] }),
-    }
+    })
 }
 
 /// A key that is equal for equal floats: +0 and −0 are one.
@@ -383,16 +400,27 @@ pub(super) fn float_key(x: f32) -> u32 {
 
 /// Which of `count` items are connected: each item's lowest connected item. `keys` are pairs of a
 /// key and an item; items with equal keys are connected.
-pub(super) fn connected<K: Ord + Send>(count: usize, mut keys: Vec<(K, u32)>) -> Vec<u32> {
+pub(super) fn connected<K: Ord + Send>(count: usize, mut keys: Vec<(K, u32)>, stage: &Stage) -> Result<Vec<u32>> {
     keys.par_sort_unstable();
-    let mut parent: Vec<u32> = (0..count as u32).collect();
-    for pair in keys.windows(2).filter(|pair| pair[0].0 == pair[1].0) {
-        let (a, b) = (root(&mut parent, pair[0].1), root(&mut parent, pair[1].1));
-        // The lower one becomes the root, so that roots do not depend on the order of joins.
-        parent[a.max(b) as usize] = a.min(b);
+    let mut parent = try_collect(0..count as u32, CHARTS)?;
+    for (i, pair) in keys.windows(2).enumerate() {
+        if i % ITEMS_PER_CHECK == 0 {
+            stage.check()?;
+        }
+        if pair[0].0 == pair[1].0 {
+            let (a, b) = (root(&mut parent, pair[0].1), root(&mut parent, pair[1].1));
+            // The lower one becomes the root, so that roots do not depend on the order of joins.
+            parent[a.max(b) as usize] = a.min(b);
+        }
     }
-    (0..count as u32).map(|i| root(&mut parent, i)).collect()
+    for i in 0..count as u32 {
+        parent[i as usize] = root(&mut parent, i);
+    }
+    Ok(parent)
 }
+
+/// A cancel is looked for whenever so many items have been looked at.
+pub(super) const ITEMS_PER_CHECK: usize = 1 << 14;
 
 fn root(parent: &mut [u32], mut i: u32) -> u32 {
     while parent[i as usize] != i {
@@ -404,18 +432,44 @@ fn root(parent: &mut [u32], mut i: u32) -> u32 {
 }
 
 /// Items by root (as from [`connected`]), ordered by root, ascending in each group.
-pub(super) fn groups(roots: &[u32]) -> Vec<Vec<u32>> {
-    let mut group_of = vec![NONE; roots.len()];
-    let mut groups: Vec<Vec<u32>> = Vec::new();
-    for (i, &r) in roots.iter().enumerate() {
+pub(super) struct Groups {
+    items: Vec<u32>,
+    /// Where each group begins, and the number of items.
+    starts: Vec<u32>,
+}
+
+impl Groups {
+    pub(super) fn new(roots: &[u32], stage: &Stage) -> Result<Groups> {
         // A root is the lowest item of its group: it comes first.
-        if r as usize == i {
-            group_of[i] = groups.len() as u32;
-            groups.push(Vec::new());
+        let mut group_of = try_filled(roots.len(), NONE, CHARTS)?;
+        let mut starts: Vec<u32> = Vec::new();
+        for (i, &root) in roots.iter().enumerate() {
+            if root as usize == i {
+                group_of[i] = starts.len() as u32;
+                try_push(&mut starts, 0, CHARTS)?;
+            }
+            starts[group_of[root as usize] as usize] += 1;
         }
-        groups[group_of[r as usize] as usize].push(i as u32);
+        stage.check()?;
+        let mut next = 0;
+        for start in &mut starts {
+            next += std::mem::replace(start, next);
+        }
+        let mut items = try_filled(roots.len(), 0, CHARTS)?;
+        for (i, &root) in roots.iter().enumerate() {
+            let place = &mut starts[group_of[root as usize] as usize];
+            items[*place as usize] = i as u32;
+            *place += 1;
+        }
+        // Each start has moved to the end of its group, where the next begins.
+        try_push(&mut starts, 0, CHARTS)?;
+        starts.rotate_right(1);
+        Ok(Groups { items, starts })
     }
-    groups
+
+    pub(super) fn iter(&self) -> impl Iterator<Item = &[u32]> {
+        self.starts.windows(2).map(|w| &self.items[w[0] as usize..w[1] as usize])
+    }
 }
 
 #[cfg(test)]

@@ -11,8 +11,11 @@
 
 use super::area::AreaLight;
 use super::distant::{Disc, push_sky};
+use super::light_tree::LIGHT_TREE;
 use super::many::ManyLights;
 use super::terminator;
+use crate::error::Result;
+use crate::memory::try_collect;
 use crate::sampling::{combine, sobol_2d};
 use crate::scene::{BRIGHTEST, Light, Scene, Sky};
 use crate::trace::Ray;
@@ -158,11 +161,16 @@ pub struct DirectLight {
 }
 
 impl DirectLight {
-    /// A snapshot of a scene's lights.
+    /// A snapshot of a scene's lights. Panics where memory is lacking.
     pub fn new(scene: &Arc<Scene>) -> DirectLight {
+        DirectLight::try_new(scene).expect("memory for the lights")
+    }
+
+    /// A snapshot of a scene's lights, for which memory may be lacking.
+    pub fn try_new(scene: &Arc<Scene>) -> Result<DirectLight> {
         let lights = scene.lights();
-        let mut areas: Vec<AreaLight> = lights.iter().filter_map(AreaLight::rect).collect();
-        areas.extend(scene.emitters().iter().map(AreaLight::emitter));
+        let all = lights.iter().filter_map(AreaLight::rect).chain(scene.emitters().iter().map(AreaLight::emitter));
+        let mut areas = try_collect(all, LIGHT_TREE)?;
         areas.retain(|a| a.radiance.max_element() > 0.0 && a.area > 0.0);
         let shines = |l: &&Light| l.color().iter().any(|&c| c > 0.0);
         let (points, mut each): (Vec<Light>, Vec<Light>) = lights
@@ -181,14 +189,14 @@ impl DirectLight {
         let area_count = areas.len();
         let few_points = points.len() <= MAX_EXACT;
         let few_areas = area_count <= MAX_EXACT;
-        let many = ManyLights::new(if few_points { &[] } else { &points }, if few_areas { &[] } else { &areas });
+        let many = ManyLights::new(if few_points { &[] } else { &points }, if few_areas { &[] } else { &areas })?;
         if few_points {
             each.extend(points);
         }
         if !few_areas {
             areas = Vec::new();
         }
-        DirectLight {
+        Ok(DirectLight {
             scene: scene.clone(),
             each,
             areas,
@@ -196,7 +204,7 @@ impl DirectLight {
             discs: discs.collect(),
             skies: skies.collect(),
             many: (many.len() > 0).then_some(many),
-        }
+        })
     }
 
     /// Rect lights and emissive triangles.

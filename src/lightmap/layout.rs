@@ -10,6 +10,8 @@
 
 use super::charts::{Chart, Charts, Given};
 use crate::error::{Error, Result, invalid_argument};
+use crate::memory::{try_collect, try_filled, try_with_capacity};
+use crate::progress::Progress;
 use crate::scene::NONE;
 
 /// The most texels in all pages of a map. Samples and indices of as many take 10 GB.
@@ -17,6 +19,9 @@ pub const MAX_TEXELS: u64 = 1 << 29;
 
 /// The largest page, in texels along an axis: texels are addressed in 16 bits.
 pub const MAX_PAGE_SIZE: u32 = 16384;
+
+/// What buffers are for, in errors.
+const LAYOUT: &str = "the layout of the charts";
 
 /// Where a chart lies. Texel coordinates of a page are continuous: texel i covers [i, i + 1].
 #[derive(Clone, Copy, Debug, PartialEq)]
@@ -79,6 +84,7 @@ impl Layout {
         padding: u32,
         honour_given: bool,
         with_backs: &[u32],
+        progress: &Progress,
     ) -> Result<Layout> {
         let max_extent = padded_extent(page_size, padding)?;
         if !(density > 0.0 && density.is_finite()) {
@@ -90,7 +96,7 @@ impl Layout {
             page_size,
             page_count: 0,
             density,
-            placements: Vec::with_capacity(charts.len()),
+            placements: try_with_capacity(charts.len() + with_backs.len(), LAYOUT)?,
             back_of: Vec::new(),
             given: given as u32,
             reduced: 0,
@@ -102,7 +108,8 @@ impl Layout {
             layout.push(chart, max_extent, padding);
         }
         if !with_backs.is_empty() {
-            layout.backs = vec![NONE; charts.len()];
+            layout.backs = try_filled(charts.len(), NONE, LAYOUT)?;
+            layout.back_of = try_with_capacity(with_backs.len(), LAYOUT)?;
             for &c in with_backs {
                 layout.backs[c as usize] = layout.placements.len() as u32;
                 layout.back_of.push(c);
@@ -111,7 +118,7 @@ impl Layout {
         }
         layout.check_size(first_page)?;
         layout.page_count = first_page;
-        layout.place();
+        layout.place(progress)?;
         layout.check_pages()?;
         Ok(layout)
     }
@@ -216,13 +223,14 @@ impl Layout {
     }
 
     /// Finds a place for all but the given charts.
-    fn place(&mut self) {
-        let mut order: Vec<u32> = (self.given..self.placements.len() as u32).collect();
+    fn place(&mut self, progress: &Progress) -> Result<()> {
+        let mut order = try_collect(self.given..self.placements.len() as u32, LAYOUT)?;
         let key = |p: &Placement| (std::cmp::Reverse(p.h), std::cmp::Reverse(p.w));
-        order.sort_by_key(|&p| (key(&self.placements[p as usize]), p));
+        order.sort_unstable_by_key(|&p| (key(&self.placements[p as usize]), p));
         let first_page = self.page_count;
         let mut pages: Vec<Skyline> = Vec::new();
         for n in order {
+            progress.check()?;
             let p = &mut self.placements[n as usize];
             let (w, h) = (p.w as u32, p.h as u32);
             let found = pages.iter_mut().enumerate().find_map(|(i, page)| Some((i, page.insert(w, h)?)));
@@ -237,6 +245,7 @@ impl Layout {
             p.offset = [p.offset[0] + x as f32, p.offset[1] + y as f32];
         }
         self.page_count = first_page + pages.len() as u32;
+        Ok(())
     }
 }
 
@@ -367,9 +376,9 @@ mod tests {
             let charts = charts_of(&sizes);
             // All of them, or every third.
             let backs: Vec<u32> = (0..sizes.len() as u32).step_by(if all { 1 } else { 3 }).filter(|_| back).collect();
-            let layout = Layout::pack(&charts, density, 1 << page, padding, false, &backs).unwrap();
+            let layout = Layout::pack(&charts, density, 1 << page, padding, false, &backs, &Progress::none()).unwrap();
             check(&charts, &layout, padding);
-            prop_assert_eq!(&layout, &Layout::pack(&charts, density, 1 << page, padding, false, &backs).unwrap());
+            prop_assert_eq!(&layout, &Layout::pack(&charts, density, 1 << page, padding, false, &backs, &Progress::none()).unwrap());
             prop_assert_eq!(layout.placements.len(), sizes.len() + backs.len());
             for c in 0..sizes.len() as u32 {
                 let back = backs.contains(&c).then_some((c, true));
@@ -386,7 +395,7 @@ mod tests {
             0.05 / (0.002 + bits as f32 / (1u32 << 24) as f32)
         };
         let charts = charts_of(&(0..20_000).map(|i| [size(i, 0), size(i, 1)]).collect::<Vec<_>>());
-        let layout = Layout::pack(&charts, 60.0, 1024, 2, false, &[]).unwrap();
+        let layout = Layout::pack(&charts, 60.0, 1024, 2, false, &[], &Progress::none()).unwrap();
         check(&charts, &layout, 2);
         assert!(layout.page_count >= 8, "{} pages are too few to say", layout.page_count);
         assert!(layout.utilisation() > 0.85, "{}", layout.utilisation());
@@ -395,7 +404,7 @@ mod tests {
     #[test]
     fn a_chart_longer_than_a_page_is_reduced_along_that_axis_alone() {
         let charts = charts_of(&[[1000.0, 3.0], [2.0, 2.0]]);
-        let layout = Layout::pack(&charts, 1.0, 64, 2, false, &[]).unwrap();
+        let layout = Layout::pack(&charts, 1.0, 64, 2, false, &[], &Progress::none()).unwrap();
         check(&charts, &layout, 2);
         assert_eq!(layout.reduced, 1);
         let p = &layout.placements[0];
@@ -405,12 +414,12 @@ mod tests {
     #[test]
     fn gigantic_requests_are_refused_before_they_are_packed() {
         let charts = charts_of(&vec![[1.0, 1.0]; 10_000]);
-        let e = Layout::pack(&charts, 1e4, 16384, 2, false, &[]).err().unwrap();
+        let e = Layout::pack(&charts, 1e4, 16384, 2, false, &[], &Progress::none()).err().unwrap();
         assert!(matches!(&e, Error::OutOfMemory(s) if s.contains("10000 charts at 10000 texels per unit")), "{e}");
         let given = Given { page: 5000, offset: [0.0; 2], scale: [1.0; 2] };
         let mut far = charts_of(&[[1.0, 1.0]]);
         far.charts[0].given = Some(given);
-        let e = Layout::pack(&far, 1.0, 1024, 2, true, &[]).err().unwrap();
+        let e = Layout::pack(&far, 1.0, 1024, 2, true, &[], &Progress::none()).err().unwrap();
         assert!(matches!(e, Error::OutOfMemory(_)), "{e}");
     }
 
@@ -418,7 +427,7 @@ mod tests {
     fn impossible_arguments_are_refused_by_name() {
         let charts = charts_of(&[[1.0, 1.0]]);
         let error = |density, page_size, padding| {
-            Layout::pack(&charts, density, page_size, padding, false, &[]).err().unwrap().to_string()
+            Layout::pack(&charts, density, page_size, padding, false, &[], &Progress::none()).err().unwrap().to_string()
         };
         assert!(error(0.0, 64, 2).contains("density is 0"));
         assert!(error(f32::INFINITY, 64, 2).contains("density is inf"));
@@ -432,13 +441,13 @@ mod tests {
     fn given_charts_stay_and_others_go_to_further_pages() {
         let mut charts = charts_of(&[[4.0, 2.0], [1.0, 1.0]]);
         charts.charts[0].given = Some(Given { page: 2, offset: [0.25, 0.5], scale: [0.125, 0.125] });
-        let layout = Layout::pack(&charts, 1.0, 64, 2, true, &[]).unwrap();
+        let layout = Layout::pack(&charts, 1.0, 64, 2, true, &[], &Progress::none()).unwrap();
         assert_eq!((layout.given, layout.page_count), (1, 4));
         let p = layout.placements[0];
         assert_eq!((p.page, p.x, p.y, p.w, p.h), (2, 16, 32, 33, 17));
         assert_eq!(layout.texel_coord(0, [4.0, 2.0]), [48.0, 48.0]);
         assert_eq!(layout.placements[1].page, 3);
-        let repacked = Layout::pack(&charts, 1.0, 64, 0, false, &[]).unwrap();
+        let repacked = Layout::pack(&charts, 1.0, 64, 0, false, &[], &Progress::none()).unwrap();
         assert_eq!((repacked.given, repacked.page_count), (0, 1));
     }
 }

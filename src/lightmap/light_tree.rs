@@ -8,8 +8,13 @@
 //! interval among its children by importance, and children that no sample falls on are left alone.
 //! So samples are spread evenly over the tree, and its upper nodes are visited once for all of them.
 
+use crate::error::Result;
+use crate::memory::{try_collect, try_with_capacity};
 use glam::Vec3;
 use std::f32::consts::PI;
+
+/// What buffers are for, in errors.
+pub(super) const LIGHT_TREE: &str = "the tree of the lights";
 
 /// Split candidates per axis.
 const BINS: usize = 12;
@@ -143,16 +148,16 @@ pub(super) struct LightTree {
 
 impl LightTree {
     /// Over lights whose power is greater than 0.
-    pub(super) fn new(lights: &[Bounds]) -> LightTree {
-        let mut tree = LightTree { nodes: Vec::with_capacity((2 * lights.len()).saturating_sub(1)) };
+    pub(super) fn new(lights: &[Bounds]) -> Result<LightTree> {
+        let mut tree = LightTree { nodes: try_with_capacity((2 * lights.len()).saturating_sub(1), LIGHT_TREE)? };
         // Powers as parts of the whole: times squared lengths, those of large scenes would overflow.
         let whole = lights.iter().map(|l| f64::from(l.power)).sum::<f64>();
         let part = |l: &Bounds| Bounds { power: (f64::from(l.power) / whole) as f32, ..*l };
-        let mut numbered: Vec<(u32, Bounds)> = (0..).zip(lights.iter().map(part)).collect();
+        let mut numbered = try_collect((0u32..).zip(lights.iter().map(part)), LIGHT_TREE)?;
         if !lights.is_empty() {
             tree.build(&mut numbered, 0);
         }
-        tree
+        Ok(tree)
     }
 
     pub(super) fn bytes(&self) -> usize {
@@ -302,7 +307,7 @@ mod tests {
     #[test]
     fn every_light_that_can_shine_on_a_receiver_is_sampled_as_often_as_due() {
         let lights = random_lights(300, 1);
-        let tree = LightTree::new(&lights);
+        let tree = LightTree::new(&lights).unwrap();
         for i in 0..40 {
             let r = |d| uniform(i, d, 2);
             let position = Vec3::new(r(0), r(1), r(2)) * 14.0 - 2.0;
@@ -346,9 +351,11 @@ mod tests {
     fn lights_in_one_place_and_no_lights_make_trees() {
         let b = random_lights(1, 3)[0];
         let mut seen = 0;
-        LightTree::new(&[b; 100]).sample((b.lower - b.axis, Vec3::X), 50, 0.5, &mut |_, _, count| seen += count);
+        LightTree::new(&[b; 100])
+            .unwrap()
+            .sample((b.lower - b.axis, Vec3::X), 50, 0.5, &mut |_, _, count| seen += count);
         assert!(seen == 50 || seen == 0);
-        LightTree::new(&[]).sample((Vec3::ZERO, Vec3::X), 50, 0.5, &mut |_, _, _| panic!());
+        LightTree::new(&[]).unwrap().sample((Vec3::ZERO, Vec3::X), 50, 0.5, &mut |_, _, _| panic!());
         assert_eq!(size_of::<Node>(), 48);
     }
 }

@@ -13,7 +13,9 @@
 
 use super::area::AreaLight;
 use super::direct::{Receiver, ShadowRays, point_light, shadow_ray};
-use super::light_tree::{Bounds, LightTree};
+use super::light_tree::{Bounds, LIGHT_TREE, LightTree};
+use crate::error::Result;
+use crate::memory::try_collect;
 use crate::sampling::{combine, sobol_2d};
 use crate::scene::Light;
 use glam::Vec3;
@@ -70,20 +72,19 @@ struct Candidate {
 
 impl ManyLights {
     /// Of point and spot lights that shine, and area lights.
-    pub(super) fn new(points: &[Light], areas: &[AreaLight]) -> ManyLights {
-        let sources: Vec<Source> =
-            points.iter().map(|&p| Source::Point(p)).chain(areas.iter().map(|&a| Source::Area(a))).collect();
-        ManyLights::of(sources)
+    pub(super) fn new(points: &[Light], areas: &[AreaLight]) -> Result<ManyLights> {
+        let sources = points.iter().map(|&p| Source::Point(p)).chain(areas.iter().map(|&a| Source::Area(a)));
+        ManyLights::of(try_collect(sources, LIGHT_TREE)?)
     }
 
     /// Of parts of surfaces.
-    pub(super) fn of_patches(patches: Vec<Patch>) -> ManyLights {
-        ManyLights::of(patches.into_iter().map(Source::Patch).collect())
+    pub(super) fn of_patches(patches: Vec<Patch>) -> Result<ManyLights> {
+        ManyLights::of(try_collect(patches.into_iter().map(Source::Patch), LIGHT_TREE)?)
     }
 
-    fn of(sources: Vec<Source>) -> ManyLights {
-        let bounds: Vec<Bounds> = sources.iter().map(bounds).collect();
-        ManyLights { tree: LightTree::new(&bounds), sources }
+    fn of(sources: Vec<Source>) -> Result<ManyLights> {
+        let bounds = try_collect(sources.iter().map(bounds), LIGHT_TREE)?;
+        Ok(ManyLights { tree: LightTree::new(&bounds)?, sources })
     }
 
     pub(super) fn bytes(&self) -> usize {

@@ -104,6 +104,7 @@ pub(crate) fn bake(device: &Device, input: &RadianceInput, values: &mut [Vec3], 
         values.par_chunks_mut(BLOCK).enumerate().try_for_each(|(block, out)| {
             let mut traced = 0;
             for (i, value) in out.iter_mut().enumerate() {
+                stage.check()?;
                 *value = texel(input, block * BLOCK + i, &mut traced);
             }
             rays.fetch_add(traced, Relaxed);

@@ -5,7 +5,7 @@ use super::radiance::{self, RadianceMap};
 use super::texels::PageArea;
 use super::{Layer, LayerData, Light, Lightmap, TexelState};
 use crate::error::{Error, Result, invalid_argument};
-use crate::memory::try_vec;
+use crate::memory::{try_collect, try_vec, try_with_capacity};
 use crate::scene::NONE;
 use crate::trace::RawHit;
 use glam::Vec3;
@@ -28,7 +28,8 @@ impl Lightmap {
     pub fn mesh_back_uvs(&self, mesh: u32) -> Result<(MeshUvs, Vec<bool>)> {
         let uvs = self.uvs_of(mesh, false)?;
         let first = self.atlas.scene.first_triangle(mesh);
-        let own = (first..first + uvs.1.len() as u32).map(|t| self.has_both_sides(t)).collect();
+        let own = (first..first + uvs.1.len() as u32).map(|t| self.has_both_sides(t));
+        let own = try_collect(own, "the UVs of a mesh")?;
         Ok((uvs, own))
     }
 
@@ -37,8 +38,8 @@ impl Lightmap {
             return invalid_argument!("mesh {mesh} does not exist, the scene has {}", self.atlas.scene.meshes().len());
         };
         let first = self.atlas.scene.first_triangle(mesh);
-        let mut uvs = Vec::with_capacity(m.indices.len());
-        let mut pages = Vec::with_capacity(m.indices.len());
+        let mut uvs = try_with_capacity(m.indices.len(), "the UVs of a mesh")?;
+        let mut pages = try_with_capacity(m.indices.len(), "the UVs of a mesh")?;
         let scale = 1.0 / self.atlas.map.layout.page_size as f32;
         for t in first..first + m.indices.len() as u32 {
             let chart = self.atlas.charts.chart_of[t as usize];

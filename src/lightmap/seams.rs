@@ -19,7 +19,10 @@ use super::plan::{Plan, left_out};
 use super::texels::TexelSample;
 use super::{Atlas, BakeParams, BakeStats, Light, Lightmap, TexelState};
 use crate::error::{Error, Result};
-use crate::memory::{Reservation, try_vec};
+use crate::memory::{
+    Reservation, try_collect, try_filled, try_par_collect, try_par_filter, try_par_gather, try_push, try_to_vec,
+    try_vec,
+};
 use crate::progress::{Progress, Stage};
 use crate::scene::NONE;
 use glam::{DVec3, Vec2, Vec3, Vec3A};
@@ -51,6 +54,12 @@ const MAX_ITERATIONS: usize = 200;
 
 /// Elements that a thread takes at a time.
 const CHUNK: usize = 1 << 12;
+
+/// Edges whose points a thread looks at at a time.
+const EDGES: usize = 64;
+
+/// What buffers are for, in errors.
+const POINTS: &str = "the seams' points";
 
 /// Moved texels and their light: before the stitching or after it, whichever the light map does not
 /// hold.
@@ -237,28 +246,39 @@ impl Job<'_, '_, '_> {
             unlike.fetch_add(u64::from(!alike), Relaxed);
             alike
         };
-        let mut points: Vec<Point> =
-            edges.par_iter().with_min_len(64).flat_map_iter(|e| self.points(e).filter(&is_stitched)).collect();
+        let mut points = try_par_gather(edges.len().div_ceil(EDGES), POINTS, |part, out| {
+            self.stage.check()?;
+            for e in &edges[part * EDGES..edges.len().min((part + 1) * EDGES)] {
+                for p in self.points(e).filter(&is_stitched) {
+                    try_push(out, p, POINTS)?;
+                }
+            }
+            Ok(())
+        })?;
         if points.is_empty() {
             return Ok(None);
         }
         self.stage.advance(0)?;
-        let texels = number(&mut points, self.atlas.map.len())?;
+        let texels = number(&mut points, self.atlas.map.len(), self.stage)?;
         let n = texels.len();
         let memory = self.reserve(n * 2 * size_of::<Vec3>(), "the light of the seams' texels")?;
         let _vectors = self.reserve(n * 8 * size_of::<Vec3A>(), "the seams' vectors")?;
-        let system = System::new(points, n);
-        let light: Vec<[Vec3; 2]> = texels.iter().map(|&t| view.light(t as usize)).collect();
-        let mut before = [0, 1].map(|layer| light.iter().map(|l| Vec3A::from(l[layer])).collect::<Vec<_>>());
-        let mut after = before.clone();
+        let system = System::new(points, n, self.stage)?;
+        let light = try_par_collect(texels.par_iter().map(|&t| view.light(t as usize)), POINTS)?;
+        let layer = |layer: usize| try_par_collect(light.par_iter().map(|l| Vec3A::from(l[layer])), POINTS);
+        let mut before = [layer(0)?, layer(1)?];
+        let mut after = [try_to_vec(&before[0], POINTS)?, try_to_vec(&before[1], POINTS)?];
         for (layer, bit) in [left_out::DIRECT, left_out::INDIRECT].into_iter().enumerate() {
             if plan.runs(bit) {
                 system.solve(&before[layer], &mut after[layer], self.stage)?;
             }
         }
         stats.seam_points = system.points.len() as u64;
+        self.stage.check()?;
         stats.seam_rms_before = system.relative_rms(&combine(&mut before));
-        let [direct, indirect] = [0, 1].map(|i: usize| after[i].iter().map(|&v| Vec3::from(v)).collect());
+        self.stage.check()?;
+        let layer = |layer: usize| try_collect(after[layer].iter().map(|&v| Vec3::from(v)), POINTS);
+        let (direct, indirect) = (layer(0)?, layer(1)?);
         stats.seam_rms_after = system.relative_rms(&combine(&mut after));
         Ok(Some((Stitch { texels, direct, indirect, _memory: memory }, [edges.len() as u64, unlike.into_inner()])))
     }
@@ -291,13 +311,21 @@ impl Job<'_, '_, '_> {
         self.stage.advance(0)?;
         // Where three or more meet, something stands on the surface, and light need not go on below
         // it. (So does the rare hash that two edges share.)
-        let mut edges: Vec<[Side; 2]> = sides
-            .par_chunk_by(|a, b| a.0 == b.0)
-            .flat_map_iter(|same| {
-                let two = if let [(_, a), (_, b)] = same { Some([*a, *b]) } else { None };
-                two.into_iter().flat_map(|edge| self.in_places(edge)).filter(|&edge| self.is_seam(edge))
-            })
-            .collect();
+        let mut edges = try_par_gather(n.div_ceil(CHUNK), "the seams", |part, out| {
+            self.stage.check()?;
+            // Those that begin in this part.
+            let starts = |i: usize| i == 0 || sides[i - 1].0 != sides[i].0;
+            for i in (part * CHUNK..n.min((part + 1) * CHUNK)).filter(|&i| starts(i)) {
+                let same = sides[i..].iter().take(3).take_while(|s| s.0 == sides[i].0).count();
+                if same == 2 {
+                    let places = self.in_places([sides[i].1, sides[i + 1].1]);
+                    for edge in places.filter(|&edge| self.is_seam(edge)) {
+                        try_push(out, edge, "the seams")?;
+                    }
+                }
+            }
+            Ok(())
+        })?;
         // Neighbours in the scene use the same texels.
         edges.par_sort_unstable();
         Ok(edges)
@@ -421,11 +449,15 @@ fn is_cut(p: &Point) -> bool {
 }
 
 /// Replaces texels by their numbers among the texels that points use. Those texels, ascending.
-fn number(points: &mut [Point], texels: usize) -> Result<Vec<u32>> {
+fn number(points: &mut [Point], texels: usize, stage: &Stage) -> Result<Vec<u32>> {
     let mut number_of: Vec<u32> = try_vec(texels, "the numbers of the seams' texels")?;
     number_of.fill(NONE);
-    points.iter().flat_map(|p| p.texels).for_each(|t| number_of[t as usize] = 0);
-    let used: Vec<u32> = (0..texels as u32).filter(|&t| number_of[t as usize] != NONE).collect();
+    for part in points.chunks(CHUNK) {
+        stage.check()?;
+        part.iter().flat_map(|p| p.texels).for_each(|t| number_of[t as usize] = 0);
+    }
+    let used = try_par_filter(texels, POINTS, |t| number_of[t as usize] != NONE)?;
+    stage.check()?;
     (0..).zip(&used).for_each(|(i, &t)| number_of[t as usize] = i);
     points.par_iter_mut().for_each(|p| p.texels = p.texels.map(|t| number_of[t as usize]));
     Ok(used)
@@ -448,19 +480,29 @@ struct System {
 }
 
 impl System {
-    fn new(points: Vec<Point>, texels: usize) -> System {
-        let used =
-            || (0..).zip(&points).flat_map(|(i, p)| (0..8).map(move |k| (i, p.texels[k], p.weights[k] * p.length)));
-        let mut first_use = vec![0; texels + 1];
-        used().filter(|u| u.2 != 0.0).for_each(|(_, t, _)| first_use[t as usize + 1] += 1);
-        (0..texels).for_each(|t| first_use[t + 1] += first_use[t]);
-        let mut uses = vec![(0, 0.0); first_use[texels]];
-        let mut next = first_use.clone();
-        for (i, t, w) in used().filter(|u| u.2 != 0.0) {
-            uses[next[t as usize]] = (i, w);
-            next[t as usize] += 1;
+    fn new(points: Vec<Point>, texels: usize, stage: &Stage) -> Result<System> {
+        let used = |part: usize| {
+            let of_part = (part * CHUNK..points.len().min((part + 1) * CHUNK)).map(|i| (i, &points[i]));
+            let all = of_part.flat_map(|(i, p)| (0..8).map(move |k| (i as u32, p.texels[k], p.weights[k] * p.length)));
+            all.filter(|u| u.2 != 0.0)
+        };
+        let parts = 0..points.len().div_ceil(CHUNK);
+        let mut first_use: Vec<usize> = try_vec(texels + 1, POINTS)?;
+        for part in parts.clone() {
+            stage.check()?;
+            used(part).for_each(|(_, t, _)| first_use[t as usize + 1] += 1);
         }
-        System { points, first_use, uses }
+        (0..texels).for_each(|t| first_use[t + 1] += first_use[t]);
+        let mut uses: Vec<(u32, f32)> = try_vec(first_use[texels], POINTS)?;
+        let mut next = try_to_vec(&first_use, POINTS)?;
+        for part in parts {
+            stage.check()?;
+            for (i, t, w) in used(part) {
+                uses[next[t as usize]] = (i, w);
+                next[t as usize] += 1;
+            }
+        }
+        Ok(System { points, first_use, uses })
     }
 
     /// A − B at every point.
@@ -479,12 +521,12 @@ impl System {
 
     /// Conjugate gradients from `before` on, each channel on its own. Light stays ≥ 0.
     fn solve(&self, before: &[Vec3A], x: &mut [Vec3A], stage: &Stage) -> Result<()> {
-        let mut differences = vec![Vec3A::ZERO; self.points.len()];
-        let mut q = vec![Vec3A::ZERO; before.len()];
+        let mut differences = try_filled(self.points.len(), Vec3A::ZERO, POINTS)?;
+        let mut q = try_filled(before.len(), Vec3A::ZERO, POINTS)?;
         self.differences(before, &mut differences);
         self.pull(&differences, &mut q);
-        let mut r: Vec<Vec3A> = q.iter().map(|&v| -v).collect();
-        let mut p = r.clone();
+        let mut r = try_par_collect(q.par_iter().map(|&v| -v), POINTS)?;
+        let mut p = try_to_vec(&r, POINTS)?;
         x.copy_from_slice(before);
         let mut rr = dot(&r, &r);
         let enough = rr * TOLERANCE * TOLERANCE;

@@ -24,7 +24,8 @@
 use super::Atlas;
 use super::map::ChartMap;
 use crate::error::Result;
-use crate::progress::Stage;
+use crate::memory::{try_par_collect, try_par_gather, try_push};
+use crate::progress::{Progress, Stage};
 use crate::sampling::{cosine_around, sobol_2d};
 use crate::scene::{Light, Scene};
 use crate::trace::Ray;
@@ -63,10 +64,10 @@ const RAYS: u32 = 4;
 /// Per chart with one place, whether its back is baked; empty if no chart has a back. `light` tells how much light a
 /// sample of the radiance map gets (any unit). To be called on the device's threads. Its time is in the bake's as a whole,
 /// its rays in no stage.
-pub(crate) fn backs(atlas: &Atlas, light: impl Fn(usize) -> f32 + Sync) -> Vec<bool> {
+pub(crate) fn backs(atlas: &Atlas, light: impl Fn(usize) -> f32 + Sync, progress: &Progress) -> Result<Vec<bool>> {
     let (scene, radiance) = (&atlas.scene, &atlas.radiance);
     if radiance.layout.back_of.is_empty() {
-        return Vec::new();
+        return Ok(Vec::new());
     }
     let lit = |placement: u32| {
         let samples = radiance.samples_of(placement);
@@ -74,6 +75,10 @@ pub(crate) fn backs(atlas: &Atlas, light: impl Fn(usize) -> f32 + Sync) -> Vec<b
         samples.map(|s| light(s) as f64).sum::<f64>() / n
     };
     let is_back = |chart: u32| {
+        // Whatever it says then is thrown away.
+        if progress.is_cancelled() {
+            return false;
+        }
         let Some(back) = radiance.layout.back(chart).filter(|_| atlas.map.layout.back(chart).is_none()) else {
             return false;
         };
@@ -86,7 +91,10 @@ pub(crate) fn backs(atlas: &Atlas, light: impl Fn(usize) -> f32 + Sync) -> Vec<b
         }
         of_back.distance * lit(back).cbrt() > BETTER * of_front.distance * lit(chart).cbrt()
     };
-    (0..atlas.charts.charts.len() as u32).into_par_iter().map(is_back).collect()
+    let charts = (0..atlas.charts.charts.len()).into_par_iter();
+    let backs = try_par_collect(charts.map(|chart| is_back(chart as u32)), "the sides of charts")?;
+    progress.check()?;
+    Ok(backs)
 }
 
 /// Those of some two-sided charts from both sides of which one sees something. Advances `stage` by one per chart.
@@ -104,8 +112,11 @@ pub(crate) fn seen_from_both(scene: &Scene, radiance: &ChartMap, charts: &[u32],
         let back = radiance.layout.back(chart);
         Ok(back.is_some_and(|back| sees(chart) && sees(back)).then_some(chart))
     };
-    let seen: Vec<Option<u32>> = scene.device().install(|| charts.par_iter().map(is_seen).collect::<Result<_>>())?;
-    Ok(seen.into_iter().flatten().collect())
+    scene.device().install(|| {
+        try_par_gather(charts.len(), "charts seen from both sides", |i, out| {
+            is_seen(&charts[i])?.map_or(Ok(()), |chart| try_push(out, chart, "charts seen from both sides"))
+        })
+    })
 }
 
 /// The mean distance from which on one sees something.
@@ -154,7 +165,6 @@ fn view(scene: &Scene, radiance: &ChartMap, placement: u32) -> View {
 mod tests {
     use super::*;
     use crate::lightmap::{Lightmap, LightmapDesc};
-    use crate::progress::Progress;
     use crate::scene::shapes::MeshBuilder;
     use crate::scene::{Material, NONE, SceneData};
     use glam::Vec3;
@@ -188,7 +198,7 @@ mod tests {
             let inwards = receiver.geometric.dot(point.position) < 0.0;
             lights[usize::from(inwards)]
         };
-        let of_chart = backs(atlas, light);
+        let of_chart = backs(atlas, light, &Progress::none()).unwrap();
         // The first triangles of the room and of the box.
         [0, 12].map(|t| of_chart[atlas.charts.chart_of[t] as usize]).to_vec()
     }
@@ -220,7 +230,7 @@ mod tests {
         let lightmap = lightmap(data, false);
         let atlas = lightmap.atlas();
         let light = |s: usize| if atlas.radiance.is_back(s) { back } else { front };
-        backs(atlas, light)[atlas.charts.chart_of[0] as usize]
+        backs(atlas, light, &Progress::none()).unwrap()[atlas.charts.chart_of[0] as usize]
     }
 
     /// Whether charts of hollow things in the open, with fronts outside or inside, show their backs.
@@ -232,7 +242,7 @@ mod tests {
         let lightmap = lightmap(data, false);
         let atlas = lightmap.atlas();
         let is_outer = |s: usize| atlas.radiance.is_back(s) == inward;
-        backs(atlas, |s| lights[usize::from(!is_outer(s))])[0]
+        backs(atlas, |s| lights[usize::from(!is_outer(s))], &Progress::none()).unwrap()[0]
     }
 
     #[test]
@@ -310,7 +320,8 @@ mod tests {
         let info = lightmap.info();
         assert_eq!((info.both_sided_charts, info.back_texels), (1, atlas.map.samples_of(wall).len() as u64));
         // A chart with two places never turns over.
-        assert!(!backs(atlas, |s| if atlas.radiance.is_back(s) { 1e6 } else { 1.0 })[wall as usize]);
+        let light = |s| if atlas.radiance.is_back(s) { 1e6 } else { 1.0 };
+        assert!(!backs(atlas, light, &Progress::none()).unwrap()[wall as usize]);
         for both_sides in [false, true] {
             let cancel = Progress::new(|_, stage| stage != "sides");
             let desc = LightmapDesc { texels_per_unit: 8.0, both_sides, ..Default::default() };

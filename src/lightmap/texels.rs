@@ -14,14 +14,15 @@ mod padding;
 
 use super::charts::Charts;
 use super::layout::Layout;
-use crate::error::Result;
-use crate::memory::{Reservation, try_vec};
+use crate::error::{Error, Result};
+use crate::memory::{Reservation, try_collect, try_push, try_to_vec, try_vec, try_with_capacity};
 use crate::progress::Stage;
 use crate::scene::{NONE, Scene};
 use glam::{DVec2, Vec3};
 pub(crate) use padding::PageArea;
 use rayon::prelude::*;
 use std::ops::Range;
+use std::sync::atomic::{AtomicU64, Ordering::Relaxed};
 
 /// What a texel shows: a point on a triangle. 16 bytes.
 #[derive(Clone, Copy, Debug, Default, PartialEq, bytemuck::Pod, bytemuck::Zeroable)]
@@ -125,15 +126,15 @@ impl TexelMap {
     /// Where given charts overlap, a texel goes to the first triangle that covers its centre, else
     /// to the one nearest to it.
     pub fn build(scene: &Scene, charts: &Charts, layout: &Layout, stage: &Stage) -> Result<TexelMap> {
-        let (groups, windows, entries) = groups(layout);
+        let (groups, windows, entries) = groups(layout)?;
         let memory = scene.device().memory();
         let mut map = TexelMap {
             samples: Vec::new(),
-            chart_start: Vec::with_capacity(layout.placements.len() + 1),
+            chart_start: try_with_capacity(layout.placements.len() + 1, INDEX)?,
             overlapping_texels: 0,
-            _memory: vec![memory.reserve(entries * 4 + windows.len() * 16, "the index of texels")?],
+            _memory: vec![memory.reserve(entries * 4 + windows.len() * 16, INDEX)?],
             windows,
-            index: try_vec(entries, "the index of texels")?,
+            index: try_vec(entries, INDEX)?,
             groups,
         };
         scene.device().install(|| {
@@ -248,24 +249,23 @@ impl TexelMap {
 
     /// First pass: which triangle each texel belongs to, and how many texels each placement has.
     fn cover(&mut self, job: &Job) -> Result<()> {
-        let slices = split(&mut self.index, self.groups.iter().map(Group::texels));
-        let covered: Result<Vec<(Vec<u32>, u64)>> = self
-            .groups
-            .par_iter()
-            .zip(slices)
-            .map_init(Vec::new, |scratch, (group, owners)| {
-                let result = cover_group(job, group, owners, scratch)?;
-                job.stage.advance(group.placements.len() as u64)?;
-                Ok(result)
-            })
-            .collect();
+        let slices = split(&mut self.index, self.groups.iter().map(Group::texels))?;
+        let placements = self.groups.last().map_or(0, |g| g.placements.end as usize);
+        let mut counts: Vec<u32> = try_vec(placements, INDEX)?;
+        let of_groups = split(&mut counts, self.groups.iter().map(|g| g.placements.len()))?;
+        let overlapping = AtomicU64::new(0);
+        self.groups.par_iter().zip(slices).zip(of_groups).try_for_each_init(
+            Vec::new,
+            |scratch, ((group, owners), counts)| {
+                overlapping.fetch_add(cover_group(job, group, owners, scratch, counts)?, Relaxed);
+                job.stage.advance(group.placements.len() as u64)
+            },
+        )?;
+        self.overlapping_texels = overlapping.into_inner();
         let mut first = 0;
-        for (counts, overlapping) in covered? {
-            self.overlapping_texels += overlapping;
-            for count in counts {
-                self.chart_start.push(first);
-                first += count;
-            }
+        for count in counts {
+            self.chart_start.push(first);
+            first += count;
         }
         self.chart_start.push(first);
         Ok(())
@@ -275,10 +275,10 @@ impl TexelMap {
     fn sample(&mut self, job: &Job) -> Result<()> {
         self.samples = try_vec(self.sample_count(), "the texel samples")?;
         let sizes = group_sizes(&self.groups, &self.chart_start);
-        let owners = split(&mut self.index, self.groups.iter().map(Group::texels));
-        let samples = split(&mut self.samples, sizes);
+        let owners = split(&mut self.index, self.groups.iter().map(Group::texels))?;
+        let samples = split(&mut self.samples, sizes)?;
         self.groups.par_iter().zip(owners).zip(samples).try_for_each(|((group, owners), samples)| {
-            sample_group(job, group, &self.chart_start, owners, samples);
+            sample_group(job, group, &self.chart_start, owners, samples)?;
             job.stage.advance(group.placements.len() as u64)
         })
     }
@@ -342,7 +342,7 @@ impl Job<'_, '_, '_> {
     }
 }
 
-fn groups(layout: &Layout) -> (Vec<Group>, Vec<Window>, usize) {
+fn groups(layout: &Layout) -> Result<(Vec<Group>, Vec<Window>, usize)> {
     let mut groups: Vec<Group> = Vec::new();
     let mut start = 0;
     let placements = &layout.placements[..];
@@ -356,11 +356,12 @@ fn groups(layout: &Layout) -> (Vec<Group>, Vec<Window>, usize) {
         let h = run.iter().map(|p| p.y + p.h).max().unwrap_or(0) - y;
         let window = Window { x, y, w, h, start: start as u32 };
         let (page, is_given) = (run[0].page, first < layout.given);
-        groups.push(Group { page, given: is_given, placements: first..first + run.len() as u32, window });
+        let placements = first..first + run.len() as u32;
+        try_push(&mut groups, Group { page, given: is_given, placements, window }, INDEX)?;
         start += w as usize * h as usize;
     }
-    let windows = groups.iter().flat_map(|g| g.placements.clone().map(|_| g.window)).collect();
-    (groups, windows, start)
+    let windows = try_collect(groups.iter().flat_map(|g| g.placements.clone().map(|_| g.window)), INDEX)?;
+    Ok((groups, windows, start))
 }
 
 fn group_sizes<'a>(groups: &'a [Group], chart_start: &'a [u32]) -> impl Iterator<Item = usize> + 'a {
@@ -369,25 +370,37 @@ fn group_sizes<'a>(groups: &'a [Group], chart_start: &'a [u32]) -> impl Iterator
 }
 
 /// Consecutive disjoint pieces of `all`.
-fn split<T>(mut all: &mut [T], sizes: impl Iterator<Item = usize>) -> Vec<&mut [T]> {
+fn split<T>(mut all: &mut [T], sizes: impl Iterator<Item = usize>) -> Result<Vec<&mut [T]>> {
     let mut pieces = Vec::new();
     for size in sizes {
         let (piece, rest) = all.split_at_mut(size);
-        pieces.push(piece);
+        try_push(&mut pieces, piece, INDEX)?;
         all = rest;
     }
-    pieces
+    Ok(pieces)
 }
+
+/// What buffers are for, in errors.
+const INDEX: &str = "the index of texels";
 
 /// Marks owners that touch a texel without covering its centre. (Slots have 28 bits.)
 const BORDER: u32 = 1 << 31;
 
 /// A cancel is looked for whenever so many texels have been visited.
-const TEXELS_PER_CHECK: u64 = 1 << 20;
+const TEXELS_PER_CHECK: u64 = 1 << 18;
 
-/// Writes the owner of each texel of a group (a slot, perhaps with [`BORDER`]; [`NONE`]); returns
-/// the number of texels of each placement and the number of centres covered more than once.
-fn cover_group(job: &Job, group: &Group, owners: &mut [u32], scratch: &mut Vec<f64>) -> Result<(Vec<u32>, u64)> {
+/// And whenever so many samples have been made.
+const SAMPLES_PER_CHECK: usize = 1 << 14;
+
+/// Writes the owner of each texel of a group (a slot, perhaps with [`BORDER`]; [`NONE`]) and the number of texels of
+/// each placement, which are 0; returns the number of centres covered more than once.
+fn cover_group(
+    job: &Job,
+    group: &Group,
+    owners: &mut [u32],
+    scratch: &mut Vec<f64>,
+    counts: &mut [u32],
+) -> Result<u64> {
     owners.fill(NONE);
     let size = [group.window.w as i64, group.window.h as i64];
     let mut overlapping = 0;
@@ -398,7 +411,7 @@ fn cover_group(job: &Job, group: &Group, owners: &mut [u32], scratch: &mut Vec<f
             return Ok(());
         }
         visited = 0;
-        job.stage.advance(0)
+        job.stage.check()
     };
     for slot in job.slots(group) {
         overlapping += cover_centres(&job.flat_triangle(group, slot), slot, size, owners);
@@ -406,6 +419,7 @@ fn cover_group(job: &Job, group: &Group, owners: &mut [u32], scratch: &mut Vec<f
     }
     // Squared distance of the nearest triangle to the centre, for texels whose centre is in none.
     scratch.clear();
+    scratch.try_reserve(owners.len()).map_err(|e| Error::OutOfMemory(format!("{INDEX}: {e}")))?;
     scratch.resize(owners.len(), f64::INFINITY);
     for slot in job.slots(group) {
         let flat = job.flat_triangle(group, slot);
@@ -422,11 +436,10 @@ fn cover_group(job: &Job, group: &Group, owners: &mut [u32], scratch: &mut Vec<f
         });
         check(flat.box_texels(size))?;
     }
-    let mut counts = vec![0; group.placements.len()];
     for &owner in owners.iter().filter(|&&o| o != NONE) {
         counts[placement_in_group(job, group, owner & !BORDER)] += 1;
     }
-    Ok((counts, overlapping))
+    Ok(overlapping)
 }
 
 /// Which of the group's placements a slot belongs to.
@@ -464,12 +477,21 @@ fn cover_centres(flat: &Flat, slot: u32, size: [i64; 2], owners: &mut [u32]) -> 
 }
 
 /// Writes the samples of a group, and their numbers over the owners.
-fn sample_group(job: &Job, group: &Group, chart_start: &[u32], owners: &mut [u32], samples: &mut [TexelSample]) {
+fn sample_group(
+    job: &Job,
+    group: &Group,
+    chart_start: &[u32],
+    owners: &mut [u32],
+    samples: &mut [TexelSample],
+) -> Result<()> {
     let first = chart_start[group.placements.start as usize];
-    let mut next = chart_start[group.placements.start as usize..group.placements.end as usize].to_vec();
+    let mut next = try_to_vec(&chart_start[group.placements.start as usize..group.placements.end as usize], INDEX)?;
     // Neighbouring texels mostly show the same triangle.
     let mut last = (NONE, Flat([DVec2::ZERO; 3]));
     for (i, owner) in owners.iter_mut().enumerate() {
+        if i % SAMPLES_PER_CHECK == 0 {
+            job.stage.check()?;
+        }
         if *owner == NONE {
             continue;
         }
@@ -494,6 +516,7 @@ fn sample_group(job: &Job, group: &Group, chart_start: &[u32], owners: &mut [u32
         *owner = *number;
         *number += 1;
     }
+    Ok(())
 }
 
 /// A triangle in texel coordinates.

@@ -8,11 +8,14 @@
 //! Without the feature `unwrap`, and for what it cannot chart, charts are single triangles and pairs
 //! of nearly coplanar triangles, projected on their plane: poor, but valid by construction.
 
-use super::charts::{Piece, connected, float_key, groups, surface_kind};
+use super::charts::{CHARTS, Groups, ITEMS_PER_CHECK, Piece, connected, float_key, surface_kind};
 use crate::error::Result;
+use crate::memory::{
+    try_append, try_collect, try_filled, try_par_collect, try_par_gather, try_push, try_to_vec, try_with_capacity,
+};
 use crate::progress::Stage;
 use crate::scene::{NONE, Scene};
-use glam::{DVec2, DVec3};
+use glam::{DVec2, DVec3, Vec3};
 use rayon::prelude::*;
 
 /// Most triangles in a part, unless they are one flat region. Large enough that few charts are cut
@@ -28,19 +31,19 @@ const PAIR_COSINE: f64 = 0.9962;
 
 /// Unwraps `triangles` (valid global numbers, ascending). Advances `stage` by one per triangle.
 pub(super) fn unwrap(scene: &Scene, triangles: &[u32], stage: &Stage) -> Result<Vec<Piece>> {
-    let of_meshes: Vec<&[u32]> = triangles.chunk_by(|&a, &b| scene.locate(a).0 == scene.locate(b).0).collect();
-    let parts: Vec<Vec<u32>> = of_meshes.par_iter().flat_map_iter(|t| parts(scene, t)).collect();
-    stage.advance(0)?;
-    let charted: Result<Vec<Vec<Piece>>> = parts
-        .into_par_iter()
-        .map(|part| {
-            let count = part.len() as u64;
-            let pieces = unwrap_part(&Geometry::of(scene, part), scene, stage)?;
-            stage.advance(count)?;
-            Ok(pieces)
-        })
-        .collect();
-    Ok(charted?.into_iter().flatten().collect())
+    let of_meshes = triangles.chunk_by(|&a, &b| scene.locate(a).0 == scene.locate(b).0);
+    let of_meshes = try_collect(of_meshes, CHARTS)?;
+    let parts = try_par_gather(of_meshes.len(), CHARTS, |i, out| {
+        stage.check()?;
+        out.append(&mut parts(scene, of_meshes[i], stage)?);
+        Ok(())
+    })?;
+    let charted = try_par_gather(parts.len(), CHARTS, |i, out: &mut Vec<Piece>| {
+        stage.check()?;
+        *out = unwrap_part(&Geometry::of(scene, &parts[i], stage)?, scene, stage)?;
+        stage.advance(parts[i].len() as u64)
+    })?;
+    Ok(charted)
 }
 
 /// Some triangles of one mesh with welded vertices.
@@ -57,32 +60,35 @@ struct Geometry {
 }
 
 impl Geometry {
-    fn of(scene: &Scene, triangles: Vec<u32>) -> Geometry {
-        let corners: Vec<_> = triangles.iter().map(|&t| scene.corners(t)).collect();
+    fn of(scene: &Scene, triangles: &[u32], stage: &Stage) -> Result<Geometry> {
+        let corners = try_par_collect(triangles.par_iter().map(|&t| scene.corners(t)), CHARTS)?;
         let key = |corner: u32| corners[corner as usize / 3][corner as usize % 3].to_array().map(float_key);
-        let mut order: Vec<u32> = (0..3 * triangles.len() as u32).collect();
+        let mut order = try_collect(0..3 * triangles.len() as u32, CHARTS)?;
+        stage.check()?;
         order.par_sort_unstable_by_key(|&c| (key(c), c));
-        let mut geometry = Geometry {
-            indices: vec![[0; 3]; triangles.len()],
-            positions: Vec::new(),
-            normals: corners
-                .iter()
-                .map(|c| {
-                    let [a, b, c] = c.map(|c| c.as_dvec3());
-                    (b - a).cross(c - a).normalize_or_zero()
-                })
-                .collect(),
-            kinds: triangles.iter().map(|&t| surface_kind(scene.material(t))).collect(),
-            triangles,
+        stage.check()?;
+        let normal = |c: &[Vec3; 3]| {
+            let [a, b, c] = c.map(|c| c.as_dvec3());
+            (b - a).cross(c - a).normalize_or_zero()
         };
-        for same in order.chunk_by(|&a, &b| key(a) == key(b)) {
+        let mut geometry = Geometry {
+            indices: try_filled(triangles.len(), [0; 3], CHARTS)?,
+            positions: Vec::new(),
+            normals: try_par_collect(corners.par_iter().map(normal), CHARTS)?,
+            kinds: try_par_collect(triangles.par_iter().map(|&t| surface_kind(scene.material(t))), CHARTS)?,
+            triangles: try_to_vec(triangles, CHARTS)?,
+        };
+        for (i, same) in order.chunk_by(|&a, &b| key(a) == key(b)).enumerate() {
+            if i % ITEMS_PER_CHECK == 0 {
+                stage.check()?;
+            }
             let (t, k) = (same[0] as usize / 3, same[0] as usize % 3);
             for &c in same {
                 geometry.indices[c as usize / 3][c as usize % 3] = geometry.positions.len() as u32;
             }
-            geometry.positions.push(corners[t][k].as_dvec3());
+            try_push(&mut geometry.positions, corners[t][k].as_dvec3(), CHARTS)?;
         }
-        geometry
+        Ok(geometry)
     }
 
     fn corners(&self, triangle: usize) -> [DVec3; 3] {
@@ -91,17 +97,21 @@ impl Geometry {
 
     /// The triangle across each edge (corners k and k + 1), [`NONE`] where there is none, where more
     /// than two meet, where the winding differs and where materials must not share a chart.
-    fn neighbours(&self) -> Vec<[u32; 3]> {
-        let mut edges = Vec::with_capacity(3 * self.indices.len());
+    fn neighbours(&self, stage: &Stage) -> Result<Vec<[u32; 3]>> {
+        let mut edges = try_with_capacity(3 * self.indices.len(), CHARTS)?;
         for (t, i) in self.indices.iter().enumerate() {
             for k in 0..3 {
                 let (a, b) = (i[k], i[(k + 1) % 3]);
                 edges.push(((a.min(b), a.max(b)), t as u32, k as u8, a < b));
             }
         }
+        stage.check()?;
         edges.par_sort_unstable();
-        let mut neighbours = vec![[NONE; 3]; self.indices.len()];
-        for same in edges.chunk_by(|a, b| a.0 == b.0) {
+        let mut neighbours = try_filled(self.indices.len(), [NONE; 3], CHARTS)?;
+        for (i, same) in edges.chunk_by(|a, b| a.0 == b.0).enumerate() {
+            if i % ITEMS_PER_CHECK == 0 {
+                stage.check()?;
+            }
             if let &[(_, t, k, forward), (_, t2, k2, forward2)] = same
                 && forward != forward2
                 && self.kinds[t as usize] == self.kinds[t2 as usize]
@@ -110,50 +120,57 @@ impl Geometry {
                 neighbours[t2 as usize][k2 as usize] = t;
             }
         }
-        neighbours
+        Ok(neighbours)
     }
 }
 
 /// Triangles of one mesh in parts: connected components together, large ones cut in space.
-fn parts(scene: &Scene, triangles: &[u32]) -> Vec<Vec<u32>> {
+fn parts(scene: &Scene, triangles: &[u32], stage: &Stage) -> Result<Vec<Vec<u32>>> {
     if triangles.len() <= PART_TRIANGLES {
-        return vec![triangles.to_vec()];
+        return Ok(vec![try_to_vec(triangles, CHARTS)?]);
     }
-    let geometry = Geometry::of(scene, triangles.to_vec());
-    let keys = geometry.indices.iter().zip(0..).flat_map(|(i, t)| i.map(|i| (i, t))).collect();
+    let geometry = Geometry::of(scene, triangles, stage)?;
+    let mut keys = try_with_capacity(3 * triangles.len(), CHARTS)?;
+    keys.extend(geometry.indices.iter().zip(0..).flat_map(|(i, t)| i.map(|i| (i, t))));
     let mut parts = Vec::new();
     let mut open: Vec<u32> = Vec::new();
     let mut neighbours = Vec::new();
-    for component in groups(&connected(triangles.len(), keys)) {
+    stage.check()?;
+    let components = Groups::new(&connected(triangles.len(), keys, stage)?, stage)?;
+    for component in components.iter() {
         if component.len() > PART_TRIANGLES {
             if neighbours.is_empty() {
-                neighbours = geometry.neighbours();
+                neighbours = geometry.neighbours(stage)?;
             }
-            parts.extend(cut(flat_regions(&geometry, &neighbours, &component)));
+            parts.append(&mut cut(flat_regions(&geometry, &neighbours, component, stage)?, stage)?);
             continue;
         }
         if open.len() + component.len() > PART_TRIANGLES {
             parts.push(std::mem::take(&mut open));
         }
-        open.extend(component);
+        try_append(&mut open, component, CHARTS)?;
     }
     parts.push(open);
     parts.retain(|p| !p.is_empty());
     for part in &mut parts {
+        stage.check()?;
         part.sort_unstable();
         part.iter_mut().for_each(|t| *t = triangles[*t as usize]);
     }
-    parts
+    Ok(parts)
 }
 
 /// A flat region and its middle.
 type Region = (DVec3, Vec<u32>);
 
 /// The flat regions of a component: connected triangles with nearly equal normals.
-fn flat_regions(geometry: &Geometry, neighbours: &[[u32; 3]], component: &[u32]) -> Vec<Region> {
-    let mut taken = vec![false; geometry.indices.len()];
+fn flat_regions(geometry: &Geometry, neighbours: &[[u32; 3]], component: &[u32], stage: &Stage) -> Result<Vec<Region>> {
+    let mut taken = try_filled(geometry.indices.len(), false, CHARTS)?;
     let mut regions = Vec::new();
-    for &seed in component {
+    for (i, &seed) in component.iter().enumerate() {
+        if i % ITEMS_PER_CHECK == 0 {
+            stage.check()?;
+        }
         if std::mem::replace(&mut taken[seed as usize], true) {
             continue;
         }
@@ -164,55 +181,61 @@ fn flat_regions(geometry: &Geometry, neighbours: &[[u32; 3]], component: &[u32])
             for n in neighbours[t as usize] {
                 let flat = n != NONE && geometry.normals[n as usize].dot(geometry.normals[seed as usize]) > FLAT_COSINE;
                 if flat && !std::mem::replace(&mut taken[n as usize], true) {
-                    members.push(n);
+                    try_push(&mut members, n, CHARTS)?;
                 }
             }
         }
         let sum: DVec3 = members.iter().flat_map(|&t| geometry.corners(t as usize)).sum();
-        regions.push((sum / (3 * members.len()) as f64, members));
+        try_push(&mut regions, (sum / (3 * members.len()) as f64, members), CHARTS)?;
     }
-    regions
+    Ok(regions)
 }
 
 /// Halves regions in space, along the longest side, until no part is too large.
-fn cut(regions: Vec<Region>) -> Vec<Vec<u32>> {
+fn cut(regions: Vec<Region>, stage: &Stage) -> Result<Vec<Vec<u32>>> {
     let mut parts = Vec::new();
     let mut stack = vec![regions];
     while let Some(mut regions) = stack.pop() {
         let total: usize = regions.iter().map(|r| r.1.len()).sum();
         if total <= PART_TRIANGLES || regions.len() == 1 {
-            parts.push(regions.into_iter().flat_map(|r| r.1).collect());
+            let mut part = try_with_capacity(total, CHARTS)?;
+            regions.iter().for_each(|r| part.extend_from_slice(&r.1));
+            parts.push(part);
             continue;
         }
         let lower = regions.iter().fold(DVec3::INFINITY, |m, r| m.min(r.0));
         let upper = regions.iter().fold(DVec3::NEG_INFINITY, |m, r| m.max(r.0));
         let axis = (upper - lower).max_position();
-        regions.sort_by(|a, b| a.0[axis].total_cmp(&b.0[axis]).then(a.1[0].cmp(&b.1[0])));
+        stage.check()?;
+        regions.sort_unstable_by(|a, b| a.0[axis].total_cmp(&b.0[axis]).then(a.1[0].cmp(&b.1[0])));
         let mut seen = 0;
         let half = regions.iter().position(|r| {
             seen += r.1.len();
             seen * 2 >= total
         });
-        let upper_half = regions.split_off(half.unwrap_or(0).clamp(1, regions.len() - 1));
+        let half = half.unwrap_or(0).clamp(1, regions.len() - 1);
+        let mut upper_half = try_with_capacity(regions.len() - half, CHARTS)?;
+        upper_half.extend(regions.drain(half..));
         stack.extend([upper_half, regions]);
     }
-    parts
+    Ok(parts)
 }
 
 #[cfg(not(feature = "unwrap"))]
 fn unwrap_part(geometry: &Geometry, _: &Scene, stage: &Stage) -> Result<Vec<Piece>> {
-    stage.advance(0)?;
-    Ok(planar_pieces(geometry, &vec![true; geometry.triangles.len()]))
+    planar_pieces(geometry, &try_filled(geometry.triangles.len(), true, CHARTS)?, stage)
 }
 
 #[cfg(feature = "unwrap")]
 fn unwrap_part(geometry: &Geometry, scene: &Scene, stage: &Stage) -> Result<Vec<Piece>> {
     use crate::device::LogLevel;
     use crate::error::Error;
-    let all = vec![true; geometry.triangles.len()];
+    let all = try_filled(geometry.triangles.len(), true, CHARTS)?;
     match charts_of_part(geometry, stage) {
         Ok((mut pieces, left)) => {
-            pieces.extend(planar_pieces(geometry, &left));
+            for piece in planar_pieces(geometry, &left, stage)? {
+                try_push(&mut pieces, piece, CHARTS)?;
+            }
             Ok(pieces)
         }
         Err(uvunwrap::Error::Cancelled) => Err(Error::Cancelled),
@@ -224,7 +247,7 @@ fn unwrap_part(geometry: &Geometry, scene: &Scene, stage: &Stage) -> Result<Vec<
                     "{count} triangles from triangle {first} on get planar charts, they could not be unwrapped: {e}"
                 ),
             );
-            Ok(planar_pieces(geometry, &all))
+            planar_pieces(geometry, &all, stage)
         }
     }
 }
@@ -260,7 +283,7 @@ fn charts_of_part(geometry: &Geometry, stage: &Stage) -> std::result::Result<(Ve
         packing: uvunwrap::Packing::Fast,
         ..Default::default()
     };
-    let atlas = uvunwrap::generate_with_progress(&[mesh], &options, |_| stage.advance(0).is_ok())?;
+    let atlas = uvunwrap::generate_with_progress(&[mesh], &options, |_| stage.check().is_ok())?;
     Ok(read_charts(geometry, &atlas, size / density as f64))
 }
 
@@ -307,32 +330,31 @@ fn read_charts(geometry: &Geometry, atlas: &uvunwrap::Atlas, texel: f64) -> (Vec
 /// Charts for the triangles marked in `which`: pairs of nearly coplanar triangles, longest shared
 /// edges first, and single triangles. The triangles of a pair lie on different sides of their edge,
 /// so they do not overlap in projection.
-fn planar_pieces(geometry: &Geometry, which: &[bool]) -> Vec<Piece> {
+fn planar_pieces(geometry: &Geometry, which: &[bool], stage: &Stage) -> Result<Vec<Piece>> {
     if !which.contains(&true) {
-        return Vec::new();
+        return Ok(Vec::new());
     }
-    let neighbours = geometry.neighbours();
+    let neighbours = geometry.neighbours(stage)?;
     let mut candidates = Vec::new();
     for t in (0..which.len()).filter(|&t| which[t]) {
         for (k, &n) in neighbours[t].iter().enumerate() {
             let open = n != NONE && which[n as usize] && n as usize > t;
             if open && geometry.normals[t].dot(geometry.normals[n as usize]) > PAIR_COSINE {
                 let corners = geometry.corners(t);
-                candidates.push((corners[k].distance_squared(corners[(k + 1) % 3]), t, n as usize));
+                let length = corners[k].distance_squared(corners[(k + 1) % 3]);
+                try_push(&mut candidates, (length, t, n as usize), CHARTS)?;
             }
         }
     }
-    candidates.sort_by(|a, b| b.0.total_cmp(&a.0).then((a.1, a.2).cmp(&(b.1, b.2))));
-    let mut partner = vec![None; which.len()];
+    candidates.sort_unstable_by(|a, b| b.0.total_cmp(&a.0).then((a.1, a.2).cmp(&(b.1, b.2))));
+    let mut partner = try_filled(which.len(), None, CHARTS)?;
     for (_, a, b) in candidates {
         if partner[a].is_none() && partner[b].is_none() {
             (partner[a], partner[b]) = (Some(b), Some(a));
         }
     }
-    (0..which.len())
-        .filter(|&t| which[t] && partner[t].is_none_or(|p| p > t))
-        .map(|t| planar_piece(geometry, t, partner[t]))
-        .collect()
+    let first = (0..which.len()).filter(|&t| which[t] && partner[t].is_none_or(|p| p > t));
+    try_collect(first.map(|t| planar_piece(geometry, t, partner[t])), CHARTS)
 }
 
 /// A triangle and its partner, if any, projected on their plane, the longest outer edge along x.
@@ -365,12 +387,16 @@ fn planar_piece(geometry: &Geometry, triangle: usize, partner: Option<usize>) ->
 mod tests {
     use super::*;
     use crate::lightmap::charts::tests::{grid, scene_on};
+    use crate::progress::Progress;
 
     #[test]
     fn planar_charts_hold_each_triangle_once_in_true_shape() {
         let scene = scene_on(1, grid(9, 7, |x, y| ((x * x + y) % 4) as f32 * 0.02));
-        let geometry = Geometry::of(&scene, (0..scene.triangle_count()).collect());
-        let pieces = planar_pieces(&geometry, &vec![true; geometry.triangles.len()]);
+        let progress = Progress::none();
+        let stage = progress.stage("unwrap", 0.0, 1.0, 1);
+        let triangles: Vec<u32> = (0..scene.triangle_count()).collect();
+        let geometry = Geometry::of(&scene, &triangles, &stage).unwrap();
+        let pieces = planar_pieces(&geometry, &vec![true; geometry.triangles.len()], &stage).unwrap();
         let mut triangles: Vec<u32> = pieces.iter().flat_map(|p| p.triangles.clone()).collect();
         triangles.sort_unstable();
         assert!(triangles.iter().copied().eq(0..scene.triangle_count()));
@@ -392,7 +418,8 @@ mod tests {
     fn parts_are_bounded_and_hold_each_triangle_once() {
         let scene = scene_on(2, grid(200, 170, |x, y| ((x * 31 + y * 17) % 11) as f32 * 0.1));
         let triangles: Vec<u32> = (0..scene.triangle_count()).collect();
-        let parts = parts(&scene, &triangles);
+        let progress = Progress::none();
+        let parts = parts(&scene, &triangles, &progress.stage("unwrap", 0.0, 1.0, 1)).unwrap();
         assert!(parts.len() >= 3 && parts.iter().all(|p| p.len() <= PART_TRIANGLES && p.is_sorted()));
         let mut all = parts.concat();
         all.sort_unstable();

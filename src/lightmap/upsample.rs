@@ -19,19 +19,25 @@ use super::map::ChartMap;
 use super::radiance::RadianceMap;
 use super::walls;
 use crate::error::Result;
-use crate::memory::{Reservation, try_vec};
+use crate::memory::{
+    Reservation, try_append, try_collect, try_filled, try_par_gather, try_push, try_vec, try_with_capacity,
+};
 use crate::progress::Stage;
 use crate::sampling::combine;
 use crate::scene::NONE;
 use glam::Vec3;
 use rayon::prelude::*;
 use std::ops::Range;
+use std::sync::atomic::{AtomicU64, Ordering::Relaxed};
+
+/// What buffers are for, in errors.
+const SHOWN: &str = "what the light map shows of the gather map";
 
 /// Texels on their own that a thread takes at a time.
 const BLOCK: usize = 64;
 
 /// A cancel is looked for whenever so many texels of a placement have been looked at.
-pub(super) const TEXELS_PER_CHECK: usize = 256;
+pub(super) const TEXELS_PER_CHECK: usize = 64;
 
 /// Rays of a texel on its own, at most.
 pub(super) const OWN_RAYS: u32 = 16;
@@ -80,19 +86,25 @@ impl Upsampling {
             Ok(found)
         };
         let device = atlas.scene.device();
-        let found: Vec<Found> =
-            device.install(|| placements.into_par_iter().map(of_placement).collect::<Result<_>>())?;
+        let first = placements.start;
+        let found = device.install(|| {
+            try_par_gather(placements.len(), SHOWN, |i, out: &mut Vec<Found>| {
+                try_push(out, of_placement(first + i as u32)?, SHOWN)
+            })
+        })?;
+        stage.check()?;
         let gather_gaps = Bits::new(found.iter().flat_map(|f| &f.gather_gaps), atlas.gather.len())?;
         let map_gaps = Bits::new(found.iter().flat_map(|f| &f.map_gaps), atlas.map.len())?;
-        let walls: Vec<(u32, u32)> = found.iter().flat_map(|f| &f.walls).copied().collect();
+        let walls = try_collect(found.iter().flat_map(|f| &f.walls).copied(), SHOWN)?;
         let walled = Bits::new(walls.iter().map(|(sample, _)| sample), atlas.map.len())?;
-        let alone: Vec<u32> = found.iter().flat_map(|f| &f.alone).copied().collect();
+        stage.check()?;
+        let alone = try_collect(found.iter().flat_map(|f| &f.alone).copied(), SHOWN)?;
         let is_alone = Bits::new(alone.iter(), atlas.map.len())?;
         let rays = found.iter().map(|f| f.rays).sum();
         let bits: usize = [&gather_gaps, &map_gaps, &walled, &is_alone].into_iter().map(Bits::bytes).sum();
         let own = alone.len() * size_of::<Option<Vec3>>();
         let bytes = bits + size_of_val(&walls[..]) + size_of_val(&alone[..]) + own;
-        let memory = device.memory().reserve(bytes, "what the light map shows of the gather map")?;
+        let memory = device.memory().reserve(bytes, SHOWN)?;
         Ok(Upsampling { gather_gaps, map_gaps, walled, walls, is_alone, alone, rays, _memory: Some(memory) })
     }
 
@@ -105,23 +117,23 @@ impl Upsampling {
         rays: &OwnRays,
         stage: &Stage,
     ) -> Result<(OwnLight, u64)> {
-        let gather_block = |texels: &[u32]| {
-            let gathered = gather_for(atlas, backs, rays, texels);
-            stage.advance(texels.len() as u64)?;
-            Ok(gathered)
-        };
+        let traced = AtomicU64::new(0);
+        let nothing = Own { irradiance: None, normal: Vec3::ZERO };
+        let mut own = try_filled(self.alone.len(), nothing, "texels on their own")?;
+        let mut light: OwnLight = try_filled(self.alone.len(), None, "texels on their own")?;
         atlas.scene.device().install(|| {
-            let blocks: Vec<(Vec<Own>, u64)> = self.alone.par_chunks(BLOCK).map(gather_block).collect::<Result<_>>()?;
-            let own: Vec<Own> = blocks.iter().flat_map(|(own, _)| own).copied().collect();
-            let blur_block = |begin: usize| {
-                let end = own.len().min(begin + BLOCK);
-                stage.advance((end - begin) as u64)?;
-                Ok((begin..end).map(|i| self.blurred(atlas, &own, i)).collect::<Vec<_>>())
-            };
-            let starts = (0..own.len()).into_par_iter().step_by(BLOCK);
-            let light: Vec<OwnLight> = starts.map(blur_block).collect::<Result<_>>()?;
-            Ok((light.concat(), blocks.iter().map(|(_, rays)| rays).sum()))
-        })
+            own.par_chunks_mut(BLOCK).zip(self.alone.par_chunks(BLOCK)).try_for_each(|(own, texels)| {
+                traced.fetch_add(gather_for(atlas, backs, rays, texels, own, stage)?, Relaxed);
+                stage.advance(texels.len() as u64)
+            })?;
+            light.par_chunks_mut(BLOCK).enumerate().try_for_each(|(block, light)| {
+                for (i, light) in (block * BLOCK..).zip(light.iter_mut()) {
+                    *light = self.blurred(atlas, &own, i);
+                }
+                stage.advance(light.len() as u64)
+            })
+        })?;
+        Ok((light, traced.into_inner()))
     }
 
     /// Steps of [`own_light`](Self::own_light).
@@ -217,18 +229,26 @@ struct Own {
     normal: Vec3,
 }
 
-/// What some texels of the light map gather, and the rays that it took.
-fn gather_for(atlas: &Atlas, backs: &[bool], own: &OwnRays, texels: &[u32]) -> (Vec<Own>, u64) {
+/// Gathers for some texels of the light map and returns the rays that it took.
+fn gather_for(
+    atlas: &Atlas,
+    backs: &[bool],
+    own: &OwnRays,
+    texels: &[u32],
+    out: &mut [Own],
+    stage: &Stage,
+) -> Result<u64> {
     let mut rays = 0;
-    let gather = |&sample: &u32| {
+    for (&sample, out) in texels.iter().zip(out) {
+        stage.check()?;
         let receiver = atlas.receiver(&atlas.map, backs, sample as usize);
         let mut gathered = Gathered::default();
         let seed = combine(own.seed, sample);
         rays += gathered.add_round(&atlas.scene, &own.radiance, &receiver, own.samples, 0, seed);
-        Own { irradiance: gathered.is_visible().then(|| gathered.irradiance()), normal: receiver.normal }
-    };
-    let gathered = texels.iter().map(gather).collect();
-    (gathered, rays)
+        let irradiance = gathered.is_visible().then(|| gathered.irradiance());
+        *out = Own { irradiance, normal: receiver.normal };
+    }
+    Ok(rays)
 }
 
 /// What there is to heed in a placement.
@@ -253,12 +273,19 @@ impl Found {
             is_in_gap(&atlas.scene, &receiver, texel, sample as u32, &mut found.rays)
         };
         let of_gather = gather.samples_of(placement);
-        let gaps: Vec<bool> = of_gather.clone().map(|s| is_in_gap(gather, s)).collect();
-        found.gather_gaps.extend(of_gather.clone().filter(|s| gaps[s - of_gather.start]).map(|s| s as u32));
+        let mut gaps: Vec<bool> = try_with_capacity(of_gather.len(), SHOWN)?;
+        for (i, sample) in of_gather.clone().enumerate() {
+            if i % TEXELS_PER_CHECK == 0 {
+                stage.check()?;
+            }
+            gaps.push(is_in_gap(gather, sample));
+        }
+        let in_gaps = of_gather.clone().filter(|s| gaps[s - of_gather.start]).map(|s| s as u32);
+        found.gather_gaps = try_collect(in_gaps, SHOWN)?;
         let mut end = 0;
         for (i, sample) in map.samples_of(placement).enumerate() {
             if i % TEXELS_PER_CHECK == 0 {
-                stage.advance(0)?;
+                stage.check()?;
             }
             let (begin, this) = (end, sample as u32);
             end += apart[begin..].iter().take_while(|(s, _)| *s == this).count();
@@ -274,12 +301,12 @@ impl Found {
                 sees_open |= !is_gap && !apart.contains(&(this, s as u32));
             });
             if has_gap && is_in_gap(map, sample) {
-                found.map_gaps.push(this);
+                try_push(&mut found.map_gaps, this, SHOWN)?;
             } else if !sees_open && n > 0 {
-                found.alone.push(this);
+                try_push(&mut found.alone, this, SHOWN)?;
             }
             if apart.len() < n {
-                found.walls.extend(apart);
+                try_append(&mut found.walls, apart, SHOWN)?;
             }
         }
         Ok(found)
@@ -297,7 +324,7 @@ impl Bits {
         let mut words = Vec::new();
         for &i in ones {
             if words.is_empty() {
-                words = try_vec(n.div_ceil(64), "what the light map shows of the gather map")?;
+                words = try_vec(n.div_ceil(64), SHOWN)?;
             }
             words[i as usize / 64] |= 1 << (i % 64);
         }

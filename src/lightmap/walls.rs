@@ -13,7 +13,8 @@
 
 use super::Atlas;
 use super::upsample::TEXELS_PER_CHECK;
-use crate::error::Result;
+use crate::error::{Error, Result};
+use crate::memory::{try_push, try_with_capacity};
 use crate::progress::Stage;
 use crate::scene::NONE;
 use crate::trace::Ray;
@@ -25,6 +26,9 @@ const ABOVE: f32 = 0.125;
 
 /// Normals whose cosine is less belong to surfaces on either side of a crease.
 const CREASE: f32 = 0.8;
+
+/// What buffers are for, in errors.
+const WALLS: &str = "texels behind walls";
 
 /// Where a texel looks from, and its normal.
 #[derive(Clone, Copy)]
@@ -51,7 +55,13 @@ pub(super) fn between(
         Eye { position: receiver.origin + receiver.geometric * above, normal: receiver.normal }
     };
     let own = gather.samples_of(placement);
-    let eyes: Vec<Eye> = own.clone().map(|s| eye(gather, s)).collect();
+    let mut eyes: Vec<Eye> = try_with_capacity(own.len(), WALLS)?;
+    for (i, sample) in own.clone().enumerate() {
+        if i % TEXELS_PER_CHECK == 0 {
+            stage.check()?;
+        }
+        eyes.push(eye(gather, sample));
+    }
     let eye_of = |s: u32| eyes[s as usize - own.start];
     let mut are_apart = |a: Eye, b: Eye| {
         if a.normal.dot(b.normal) < CREASE {
@@ -64,7 +74,7 @@ pub(super) fn between(
     let mut found = Vec::new();
     for (i, sample) in map.samples_of(placement).enumerate() {
         if i % TEXELS_PER_CHECK == 0 {
-            stage.advance(0)?;
+            stage.check()?;
         }
         let (mut around, mut n) = ([NONE; 4], 0);
         atlas.gather_around(sample, |s, _| {
@@ -76,16 +86,20 @@ pub(super) fn between(
         }
         around[..n].sort_unstable();
         let from = eye(map, sample);
+        split.try_reserve(1).map_err(|e| Error::OutOfMemory(format!("{WALLS}: {e}")))?;
         // Most are around many texels, and all alike. A single one around, as on narrow charts, tells nothing of the texel.
         let is_split = *split.entry(around).or_insert_with(|| {
             let mut pairs = (1..n).flat_map(|i| (0..i).map(move |j| (i, j)));
             around[0] == around[n - 1] || pairs.any(|(i, j)| are_apart(eye_of(around[i]), eye_of(around[j])))
         });
         if is_split {
-            let apart = around[..n].iter().filter(|&&s| are_apart(from, eye_of(s)));
-            found.extend(apart.map(|&s| (sample as u32, s)));
+            for &s in around[..n].iter().filter(|&&s| are_apart(from, eye_of(s))) {
+                try_push(&mut found, (sample as u32, s), WALLS)?;
+            }
         } else if from.normal.dot(eye_of(around[0]).normal) < CREASE {
-            found.extend(around[..n].iter().map(|&s| (sample as u32, s)));
+            for &s in &around[..n] {
+                try_push(&mut found, (sample as u32, s), WALLS)?;
+            }
         }
     }
     Ok(found)

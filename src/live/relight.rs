@@ -73,7 +73,7 @@ fn illuminate(
     let sides = match sides {
         Some(sides) => sides,
         None => {
-            let backs = bake.backs(&radiance.values);
+            let backs = bake.backs(&radiance.values)?;
             let placements = if has_indirect { atlas.map.layout.placements.len() as u32 } else { 0 };
             let upsampling = bake.upsampling(&backs, 0..placements)?;
             Arc::new(Sides { backs, upsampling })
@@ -88,7 +88,7 @@ fn illuminate(
 impl Illumination {
     /// Of the scene's lights of now, with all photons.
     pub fn new(atlas: &Atlas, params: &BakeParams, progress: &Progress) -> Result<Illumination> {
-        let direct = DirectLight::new(&atlas.scene);
+        let direct = DirectLight::try_new(&atlas.scene)?;
         let i = illuminate(atlas, params, &direct, None, progress)?;
         Ok(Illumination {
             direct: Arc::new(direct),
@@ -167,8 +167,9 @@ impl Relight {
         let abandon = Arc::new(AtomicBool::new(false));
         let (cancelled, abandoned) = (cancel.clone(), abandon.clone());
         let compute = move |params: &BakeParams, sides: Option<Arc<Sides>>, progress: &Progress| {
-            let direct = DirectLight::new(&atlas.scene);
-            let result = catch_unwind(AssertUnwindSafe(|| illuminate(&atlas, params, &direct, sides, progress)));
+            let result = catch_unwind(AssertUnwindSafe(|| {
+                illuminate(&atlas, params, &DirectLight::try_new(&atlas.scene)?, sides, progress)
+            }));
             result.unwrap_or_else(|_| Err(Error::Internal("relighting panicked".into())))
         };
         device.spawn(move || {
@@ -205,9 +206,6 @@ impl Relight {
 
     /// The newest finished result. Does not wait.
     pub fn poll(&mut self, atlas: &Arc<Atlas>, params: &BakeParams, sides: &Arc<Sides>) -> Result<Option<Indirect>> {
-        if self.running.is_none() && !self.on_hold && std::mem::take(&mut self.again) {
-            self.start(atlas, params, sides)?;
-        }
         let Some(running) = &mut self.running else { return Ok(None) };
         let results = running.results.get_mut().unwrap_or_else(|e| e.into_inner());
         let mut newest: Option<Indirect> = None;
@@ -217,9 +215,7 @@ impl Relight {
                 // Because of yet another change.
                 Ok(Err(Error::Cancelled)) => {}
                 Ok(Err(e)) => {
-                    // What failed for want of memory may succeed another time. Its other part is broken off.
-                    self.retire();
-                    self.again = true;
+                    self.running = None;
                     return Err(e);
                 }
                 Err(TryRecvError::Empty) => break,
@@ -238,21 +234,14 @@ impl Relight {
     }
 }
 
-impl Relight {
-    /// Breaks the renewal under way off.
-    fn retire(&mut self) {
-        if let Some(running) = self.running.take() {
-            running.cancel.store(true, Relaxed);
-            running.abandon.store(true, Relaxed);
-        }
-    }
-}
-
 impl Drop for Relight {
     /// Breaks a renewal off and waits for its thread, unless this is that thread (the last reference was given back
     /// in a callback that it called): the renewal then ends after the callback has returned.
     fn drop(&mut self) {
-        self.retire();
+        if let Some(running) = &self.running {
+            running.cancel.store(true, Relaxed);
+            running.abandon.store(true, Relaxed);
+        }
         // Nobody else holds the device, so that its thread is joined here.
         self.device = None;
     }

@@ -238,7 +238,7 @@ impl PhotonMap {
             let radius = if params.radius > 0.0 {
                 params.radius
             } else {
-                radius::automatic(&traced.blocks, scene.diagonal(), PHOTONS_PER_DISC)
+                radius::automatic(&traced.blocks, scene.diagonal(), PHOTONS_PER_DISC)?
             };
             let (grid, memory) = Grid::build(traced, radius, progress, (split, to))?;
             stats.grid_seconds = start.elapsed().as_secs_f64();
@@ -310,7 +310,8 @@ impl PhotonMap {
                 self.estimate_block(positions, normals, out);
                 stage.advance(positions.len() as u64)
             })
-        })
+        })?;
+        progress.check()
     }
 
     /// [`estimate`](Self::estimate) for as many points as all three slices have, on this thread.

@@ -13,9 +13,13 @@
 //! in special positions (in a diagonal of the cells, in their borders) cut other numbers of them.
 
 use super::trace::StoredPhoton;
+use crate::error::Result;
+use crate::memory::{try_collect, try_par_collect};
 use glam::{DVec3, Vec3};
 use rayon::prelude::*;
 
+/// What buffers are for, in errors.
+const SAMPLED: &str = "the photons that tell the search radius";
 /// Photons looked at, at most: evenly spaced ones in order of emission.
 const SAMPLES: usize = 1 << 17;
 /// The least average number of samples per occupied cell.
@@ -27,37 +31,35 @@ const SHIFT: DVec3 = DVec3::new(0.3713, 0.7237, 0.1829);
 
 /// Radius with which the average disc holds `per_disc` photons; at most `diagonal`, also if there
 /// are no photons. Positive for every `diagonal` > 0.
-pub(super) fn automatic(blocks: &[Vec<StoredPhoton>], diagonal: f32, per_disc: f64) -> f32 {
+pub(super) fn automatic(blocks: &[Vec<StoredPhoton>], diagonal: f32, per_disc: f64) -> Result<f32> {
     let stored: usize = blocks.iter().map(Vec::len).sum();
-    let area = lit_area(blocks, stored);
+    let area = lit_area(blocks, stored)?;
     if area == 0.0 {
-        return diagonal;
+        return Ok(diagonal);
     }
     let radius = (per_disc * area / (std::f64::consts::PI * stored as f64)).sqrt();
-    (radius as f32).clamp(f32::MIN_POSITIVE, diagonal.max(f32::MIN_POSITIVE))
+    Ok((radius as f32).clamp(f32::MIN_POSITIVE, diagonal.max(f32::MIN_POSITIVE)))
 }
 
 /// Area of the surfaces that photons reached.
-fn lit_area(blocks: &[Vec<StoredPhoton>], stored: usize) -> f64 {
+fn lit_area(blocks: &[Vec<StoredPhoton>], stored: usize) -> Result<f64> {
     let stride = stored.div_ceil(SAMPLES).max(1);
-    let samples: Vec<&StoredPhoton> = blocks.iter().flatten().step_by(stride).collect();
+    let samples = try_collect(blocks.iter().flatten().step_by(stride), SAMPLED)?;
     let lower = samples.iter().fold(Vec3::INFINITY, |b, p| b.min(p.position)).as_dvec3();
     let upper = samples.iter().fold(Vec3::NEG_INFINITY, |b, p| b.max(p.position)).as_dvec3();
     let extent = 2.0 * (upper - lower).max_element();
     if samples.is_empty() || extent <= 0.0 {
-        return 0.0;
+        return Ok(0.0);
     }
     let lower = lower - SHIFT * (0.5 * extent);
     let fine = (1u64 << LEVELS) as f64;
-    let mut keys: Vec<(u64, f32)> = samples
-        .par_iter()
-        .map(|p| {
-            let cell = (p.position.as_dvec3() - lower) * (fine / extent);
-            let [x, y, z] = cell.to_array().map(|c| spread((c as u64).min((1 << LEVELS) - 1)));
-            let n = p.normal.abs();
-            (facing(p.normal) << (3 * LEVELS) | x | y << 1 | z << 2, n.element_sum())
-        })
-        .collect();
+    let key = |p: &&StoredPhoton| {
+        let cell = (p.position.as_dvec3() - lower) * (fine / extent);
+        let [x, y, z] = cell.to_array().map(|c| spread((c as u64).min((1 << LEVELS) - 1)));
+        let n = p.normal.abs();
+        (facing(p.normal) << (3 * LEVELS) | x | y << 1 | z << 2, n.element_sum())
+    };
+    let mut keys: Vec<(u64, f32)> = try_par_collect(samples.par_iter().map(key), SAMPLED)?;
     keys.par_sort_unstable_by(|a, b| a.0.cmp(&b.0).then(a.1.total_cmp(&b.1)));
 
     // The finest level with enough samples per cell. Class bits are above all levels.
@@ -65,9 +67,10 @@ fn lit_area(blocks: &[Vec<StoredPhoton>], stored: usize) -> f64 {
     let occupied = |level| 1 + keys.windows(2).filter(|w| cell(w[0].0, level) != cell(w[1].0, level)).count();
     let level = (0..=LEVELS).take_while(|&l| occupied(l) * PER_CELL <= keys.len()).last().unwrap_or(0);
     let size = extent / (1u64 << level) as f64;
-    keys.chunk_by(|a, b| cell(a.0, level) == cell(b.0, level))
-        .map(|run| size * size * run.len() as f64 / run.iter().map(|k| k.1 as f64).sum::<f64>())
-        .sum()
+    let areas = keys
+        .chunk_by(|a, b| cell(a.0, level) == cell(b.0, level))
+        .map(|run| size * size * run.len() as f64 / run.iter().map(|k| k.1 as f64).sum::<f64>());
+    Ok(areas.sum())
 }
 
 /// The signed axis closest to `n`: 0 to 5.
@@ -109,7 +112,7 @@ mod tests {
             ] {
                 let photons = on_rectangle(n, Vec3::splat(7.0 * scale), u * scale, v * scale, 3);
                 let exact = (u * scale).as_dvec3().cross((v * scale).as_dvec3()).length();
-                let found = lit_area(&[photons], n as usize);
+                let found = lit_area(&[photons], n as usize).unwrap();
                 assert!((0.8..1.6).contains(&(found / exact)), "{n} {u} {v}: {found} for {exact}");
             }
         }
@@ -126,13 +129,13 @@ mod tests {
     fn both_sides_of_a_thin_wall_count() {
         let front = on_rectangle(40_000, Vec3::ZERO, Vec3::X, Vec3::Y, 1);
         let back = on_rectangle(40_000, Vec3::Z * 1e-4, Vec3::Y, Vec3::X, 2);
-        let found = lit_area(&[front, back], 80_000);
+        let found = lit_area(&[front, back], 80_000).unwrap();
         assert!((1.8..2.5).contains(&found), "{found}");
     }
 
     #[test]
     fn no_photons_and_coincident_photons_give_a_radius_too() {
-        assert_eq!(automatic(&[], 3.0, 60.0), 3.0);
-        assert_eq!(automatic(&[vec![StoredPhoton::default(); 100]], 3.0, 60.0), 3.0);
+        assert_eq!(automatic(&[], 3.0, 60.0).unwrap(), 3.0);
+        assert_eq!(automatic(&[vec![StoredPhoton::default(); 100]], 3.0, 60.0).unwrap(), 3.0);
     }
 }

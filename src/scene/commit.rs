@@ -5,7 +5,7 @@ use super::{Environment, Light, MAX_ALBEDO, Material, Mesh, MeshMaterials, NONE,
 use crate::bvh::{self, BuildOptions, Tree};
 use crate::device::{Device, LogLevel};
 use crate::error::{Error, Result, invalid_argument};
-use crate::memory::Reservation;
+use crate::memory::{Reservation, try_par_filter, try_to_vec, try_with_capacity};
 use crate::progress::Progress;
 use crate::trace::offset::too_few_digits;
 use crate::trace::{Hit, RawHit, Ray, TreeView, View};
@@ -176,6 +176,9 @@ impl Scene {
         if !scene.any_left(moved) {
             return Err(Error::InvalidState("all triangles of the scene would be degenerate or not finite".into()));
         }
+        // All memory before anything changes.
+        let emitters = try_with_capacity(emissive_triangles(&scene.data), EMITTERS)?;
+        let room = scene.tree.room_to_refit()?;
         if Arc::get_mut(scene).is_none() {
             *scene = Arc::new(scene.copy()?);
         }
@@ -184,7 +187,7 @@ impl Scene {
         for &(mesh, positions) in moved {
             scene.data.meshes[mesh as usize].positions.copy_from_slice(positions);
         }
-        device.install(|| scene.follow_positions());
+        device.install(|| scene.follow_positions(emitters, room));
         scene.stats.refits += 1;
         scene.stats.refit_seconds = start.elapsed().as_secs_f64();
         Ok(())
@@ -217,21 +220,22 @@ impl Scene {
         }
     }
 
-    /// Brings up to date what follows from the positions.
-    fn follow_positions(&mut self) {
+    /// Brings up to date what follows from the positions. `emitters` has room for all there may be.
+    fn follow_positions(&mut self, mut emitters: Vec<Emitter>, room: bvh::RefitRoom) {
         let (first, meshes) = (&self.first_triangle, &self.data.meshes);
         let corners = |t: u32| {
             let m = first.partition_point(|&first| first <= t) - 1;
             meshes[m].corners((t - first[m]) as usize)
         };
-        let out = self.tree.refit(&corners);
+        let out = self.tree.refit(&corners, room);
         if !out.is_empty() {
             let total = self.stats.triangles;
             let message = format!("{} of {total} triangles are degenerate or not finite after the refit", out.len());
             self.device.log(LogLevel::Warning, &message);
         }
         self.bounds = self.tree.bounds();
-        self.emitters = emitters(&self.data, &self.first_triangle, &self.skipped);
+        add_emitters(&self.data, &self.first_triangle, &self.skipped, &mut emitters);
+        self.emitters = emitters;
         self.stats.skipped_degenerate = (self.skipped.len() + out.len()) as u64;
         self.stats.wide_sah_cost = self.tree.sah_cost();
         self.warn_of_few_digits();
@@ -239,17 +243,18 @@ impl Scene {
 
     /// A scene of its own that is equal, lights shared.
     fn copy(&self) -> Result<Scene> {
-        let bytes = self.tree.bytes() + mesh_bytes(&self.data.meshes);
-        let memory = self.device.memory().reserve(bytes, "a copy of the scene to refit")?;
+        // Textures and environments are shared.
+        let bytes = self.tree.bytes() + self.data.mesh_bytes();
+        let memory = self.device.memory().reserve(bytes, COPY)?;
         Ok(Scene {
             device: self.device.clone(),
-            data: self.data.clone(),
+            data: self.data.try_clone()?,
             lights: self.lights.clone(),
             emitters: Vec::new(),
-            first_triangle: self.first_triangle.clone(),
+            first_triangle: try_to_vec(&self.first_triangle, COPY)?,
             bounds: self.bounds,
-            tree: self.tree.clone(),
-            skipped: self.skipped.clone(),
+            tree: self.tree.try_clone()?,
+            skipped: try_to_vec(&self.skipped, COPY)?,
             uses: self.uses.clone(),
             stats: self.stats,
             _memory: memory,
@@ -263,9 +268,9 @@ impl Scene {
             return Err(Error::InvalidState("the scene has no triangles".into()));
         }
         let stage = progress.stage("bvh", 0.0, 1.0, 1);
-        let mut first_triangle = Vec::with_capacity(data.meshes.len() + 1);
+        let mut first_triangle = try_with_capacity(data.meshes.len() + 1, "the scene")?;
         let mut corners = crate::memory::try_vec::<[Vec3; 3]>(total, "the triangles to build from")?;
-        let valid: Vec<u32> = device.install(|| {
+        let valid = device.install(|| {
             let mut next = 0;
             for mesh in &data.meshes {
                 first_triangle.push(next as u32);
@@ -274,9 +279,8 @@ impl Scene {
                 next += mesh.indices.len();
             }
             first_triangle.push(next as u32);
-            let triangles = (0..total as u32).into_par_iter().with_min_len(CHUNK);
-            triangles.filter(|&t| is_valid_triangle(corners[t as usize])).collect()
-        });
+            try_par_filter(total, "the triangles to build from", |t| is_valid_triangle(corners[t as usize]))
+        })?;
         progress.check()?;
         if valid.is_empty() {
             return Err(Error::InvalidState(format!(
@@ -286,7 +290,7 @@ impl Scene {
         let skipped: Vec<u32> = if valid.len() == total {
             Vec::new()
         } else {
-            (0..total as u32).filter(|&t| !is_valid_triangle(corners[t as usize])).collect()
+            try_par_filter(total, "the triangles that are skipped", |t| !is_valid_triangle(corners[t as usize]))?
         };
         if !skipped.is_empty() {
             device.log(
@@ -294,14 +298,13 @@ impl Scene {
                 &format!("{} of {total} triangles are degenerate or not finite and were skipped", skipped.len()),
             );
         }
-        let textures: usize = data.textures.iter().map(|t| t.bytes()).sum();
-        let environments: usize = data.environments.iter().map(|e| e.bytes()).sum();
-        let meshes = mesh_bytes(&data.meshes) + textures + environments;
+        let meshes = data.bytes();
         let mut memory = device.memory().reserve(meshes + bvh::estimated_bytes(valid.len(), options), "the scene")?;
         let (tree, sah_cost) = device.install(|| bvh::build(&corners, &valid, &first_triangle, options, progress))?;
         progress.check()?;
 
-        let emitters = emitters(data, &first_triangle, &skipped);
+        let mut emitters = try_with_capacity(emissive_triangles(data), EMITTERS)?;
+        add_emitters(data, &first_triangle, &skipped, &mut emitters);
         stage.advance(1)?;
         let bytes = tree.bytes() + meshes;
         memory.shrink(bytes);
@@ -559,9 +562,23 @@ impl Parts {
     }
 }
 
-/// The emissive triangles that are valid and not `skipped`.
-fn emitters(data: &SceneData, first_triangle: &[u32], skipped: &[u32]) -> Vec<Emitter> {
-    let mut emitters = Vec::new();
+/// What buffers are for, in errors.
+const COPY: &str = "a copy of the scene to refit";
+const EMITTERS: &str = "the emissive triangles";
+
+/// The number of triangles with a material that emits.
+fn emissive_triangles(data: &SceneData) -> usize {
+    let emits = |m: u32| data.materials[m as usize].is_emissive();
+    let of_mesh = |mesh: &Mesh| match &mesh.materials {
+        MeshMaterials::One(m) if mesh.indices.is_empty() || !emits(*m) => 0,
+        MeshMaterials::One(_) => mesh.indices.len(),
+        MeshMaterials::PerTriangle(materials) => materials.iter().filter(|&&m| emits(m)).count(),
+    };
+    data.meshes.iter().map(of_mesh).sum()
+}
+
+/// Adds the emissive triangles that are valid and not `skipped`.
+fn add_emitters(data: &SceneData, first_triangle: &[u32], skipped: &[u32], emitters: &mut Vec<Emitter>) {
     for (m, mesh) in data.meshes.iter().enumerate() {
         if let MeshMaterials::One(material) = mesh.materials
             && !data.materials[material as usize].is_emissive()
@@ -575,7 +592,6 @@ fn emitters(data: &SceneData, first_triangle: &[u32], skipped: &[u32]) -> Vec<Em
             }
         }
     }
-    emitters
 }
 
 fn emitter(triangle: u32, corners: [Vec3; 3], material: &Material) -> Emitter {
@@ -591,10 +607,6 @@ fn emitter(triangle: u32, corners: [Vec3; 3], material: &Material) -> Emitter {
         radiance: material.emission,
         two_sided: material.two_sided,
     }
-}
-
-fn mesh_bytes(meshes: &[Mesh]) -> usize {
-    meshes.iter().map(Mesh::bytes).sum()
 }
 
 #[cfg(test)]

@@ -2,6 +2,7 @@
 
 use super::{MAX_COORDINATE, MAX_TRIANGLES};
 use crate::error::{Result, invalid_argument};
+use crate::memory::try_to_vec;
 use glam::{Vec2, Vec3};
 
 /// Which material each triangle has.
@@ -102,6 +103,26 @@ impl Mesh {
         if let MeshMaterials::PerTriangle(m) = &mut self.materials {
             m.shrink_to_fit();
         }
+    }
+
+    /// A copy for which memory may be lacking.
+    pub(super) fn try_clone(&self) -> Result<Mesh> {
+        let what = "a copy of a mesh";
+        Ok(Mesh {
+            positions: try_to_vec(&self.positions, what)?,
+            indices: try_to_vec(&self.indices, what)?,
+            normals: try_to_vec(&self.normals, what)?,
+            uvs: try_to_vec(&self.uvs, what)?,
+            lightmap: match &self.lightmap {
+                Some(l) => Some(LightmapUvs { uvs: try_to_vec(&l.uvs, what)?, pages: try_to_vec(&l.pages, what)? }),
+                None => None,
+            },
+            materials: match &self.materials {
+                MeshMaterials::One(m) => MeshMaterials::One(*m),
+                MeshMaterials::PerTriangle(m) => MeshMaterials::PerTriangle(try_to_vec(m, what)?),
+            },
+            strict: self.strict,
+        })
     }
 
     /// The corners of `triangle`.

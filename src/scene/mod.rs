@@ -20,6 +20,7 @@ pub use mesh::{LightmapUvs, Mesh, MeshMaterials, is_valid_triangle};
 pub use texture::{MAX_TEXTURE_SIZE, Texture};
 
 use crate::error::{Error, Result, invalid_argument};
+use crate::memory::{try_to_vec, try_with_capacity};
 use std::sync::Arc;
 
 /// "No triangle", "no chart", …: never a valid index.
@@ -133,6 +134,36 @@ impl SceneData {
             None => return invalid_argument!("light {id} does not exist, the scene has {count}"),
         }
         Ok(())
+    }
+
+    /// A copy, as [`clone`](Clone::clone) makes one, for which memory may be lacking.
+    pub fn try_clone(&self) -> Result<SceneData> {
+        let mut meshes = try_with_capacity(self.meshes.len(), "a copy of the scene")?;
+        for mesh in &self.meshes {
+            meshes.push(mesh.try_clone()?);
+        }
+        let SceneData { materials, lights, textures, environments, .. } = self;
+        let what = "a copy of the scene";
+        Ok(SceneData {
+            meshes,
+            triangles: self.triangles,
+            materials: try_to_vec(materials, what)?,
+            lights: try_to_vec(lights, what)?,
+            textures: try_to_vec(textures, what)?,
+            environments: try_to_vec(environments, what)?,
+        })
+    }
+
+    /// Bytes of the arrays of meshes, textures and environments.
+    pub fn bytes(&self) -> usize {
+        let textures: usize = self.textures.iter().map(|t| t.bytes()).sum();
+        let environments: usize = self.environments.iter().map(|e| e.bytes()).sum();
+        self.mesh_bytes() + textures + environments
+    }
+
+    /// Bytes of the arrays of meshes.
+    pub(crate) fn mesh_bytes(&self) -> usize {
+        self.meshes.iter().map(Mesh::bytes).sum()
     }
 
     /// The meshes, by number.

@@ -12,10 +12,14 @@ use std::collections::BTreeMap;
 use std::time::{Duration, Instant};
 
 /// Cancels per call, unless they take longer than [`SECONDS`].
-const CANCELS: u32 = 100;
+const CANCELS: u32 = 40;
+
+/// They go through the call's time in steps of so many of its parts: some fall into each part of it, even if only the
+/// first few are made.
+const STEP: u32 = 17;
 
 /// Seconds of cancels per call, after which no further one is begun.
-const SECONDS: f64 = 120.0;
+const SECONDS: f64 = 60.0;
 
 /// What is known of one stage of a call.
 #[derive(Default)]
@@ -57,13 +61,7 @@ pub fn run(args: &BakeArgs) -> Result<()> {
     crate::output::make_folder(&args.out)?;
     measure("pages", |progress| bakelite::io::lightmaps::write_exr_pages(&lightmap, &prefix, progress).map(drop))?;
     let params = LiveParams::default();
-    measure("live", |progress| Live::new(&lightmap, &params, progress).map(drop))?;
-    let mut live = Live::new(&lightmap, &params, &Progress::none())?;
-    let state = args.out.join("live");
-    measure("live save", |progress| live.save(&state, progress))?;
-    live.save(&state, &Progress::none())?;
-    measure("live restore", |progress| live.restore(&state, progress))?;
-    std::fs::remove_file(&state).map_err(|e| Error::Io(format!("cannot remove {}: {e}", state.display())))
+    measure("live", |progress| Live::new(&lightmap, &params, progress).map(drop))
 }
 
 /// Measures a call, first undisturbed, then cancelled.
@@ -105,7 +103,8 @@ fn cancel_at_random(
         if begin.elapsed().as_secs_f64() > SECONDS {
             break;
         }
-        let wish = total.mul_f32((i as f32 + uniform(i, 0, 0)) / CANCELS as f32);
+        let part = i * STEP % CANCELS;
+        let wish = total.mul_f32((part as f32 + uniform(i, 0, 0)) / CANCELS as f32);
         let mut cancelled_in = String::new();
         let start = Instant::now();
         let result = call(&Progress::new(|_, stage| {

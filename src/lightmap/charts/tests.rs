@@ -89,7 +89,7 @@ fn check(scene: &Scene, charts: &Charts) {
         assert_eq!(charts.chart_of[t as usize] == NONE, !scene.is_valid(t));
     }
     let density = automatic_density(scene, 256, 1.0);
-    let layout = Layout::pack(charts, density, 256, 1, false, &[]).unwrap();
+    let layout = Layout::pack(charts, density, 256, 1, false, &[], &Progress::none()).unwrap();
     assert_eq!(map_of(scene, charts, &layout).overlapping_texels, 0);
 }
 
@@ -168,7 +168,7 @@ fn given_uvs_come_back() {
     let (charts, report) = charts_of(&scene, 4.0);
     assert_eq!((report.given_charts, report.unwrapped_charts), (1, 0));
     check(&scene, &charts);
-    let layout = Layout::pack(&charts, 4.0, 256, 2, true, &[]).unwrap();
+    let layout = Layout::pack(&charts, 4.0, 256, 2, true, &[], &Progress::none()).unwrap();
     assert_eq!((layout.page_count, layout.placements[0].page), (4, 3));
     for (t, i) in scene.meshes()[0].indices.iter().enumerate() {
         for k in 0..3 {
@@ -289,7 +289,9 @@ proptest! {
     #[test]
     fn connected_items_share_the_lowest_of_them(pairs in prop::collection::vec((0u32..30, 0u32..30), 0..40)) {
         let keys = pairs.iter().enumerate().flat_map(|(k, &(a, b))| [(k, a), (k, b)]).collect();
-        let roots = connected(30, keys);
+        let progress = Progress::none();
+        let stage = progress.stage("unwrap", 0.0, 1.0, 1);
+        let roots = connected(30, keys, &stage).unwrap();
         let mut expected: Vec<u32> = (0..30).collect();
         for _ in 0..30 {
             for &(a, b) in &pairs {
@@ -298,8 +300,9 @@ proptest! {
             }
         }
         prop_assert_eq!(&roots, &expected);
-        let groups = groups(&roots);
-        prop_assert_eq!(groups.iter().flatten().count(), 30);
+        let groups = Groups::new(&roots, &stage).unwrap();
+        let groups: Vec<&[u32]> = groups.iter().collect();
+        prop_assert_eq!(groups.iter().map(|g| g.len()).sum::<usize>(), 30);
         prop_assert!(groups.iter().all(|g| g.is_sorted() && g.iter().all(|&i| roots[i as usize] == g[0])));
     }
 }
@@ -319,7 +322,7 @@ fn a_real_level_keeps_its_own_pages() {
     let (charts, report) = Charts::of_scene(&scene, 0.5, 1024, 2, &Progress::none()).unwrap();
     assert!(report.given_charts > 1000, "{report:?}");
     assert_eq!((report.out_of_range, report.overlapping), (0, 0));
-    let layout = Layout::pack(&charts, 0.5, 1024, 2, true, &[]).unwrap();
+    let layout = Layout::pack(&charts, 0.5, 1024, 2, true, &[], &Progress::none()).unwrap();
     let pages = layout.placements[..layout.given as usize].iter().map(|p| p.page).max();
     assert_eq!(pages, Some(5));
     let map = map_of(&scene, &charts, &layout);

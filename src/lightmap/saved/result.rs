@@ -130,9 +130,9 @@ impl Lightmap {
         let (mut plan, mut stats) = (light.plan.clone(), BakeStats::default());
         let all = 0..texels;
         let stitch = self.stitch(&light, &all, &origin.params, &mut plan, &mut stats, progress)?;
+        let filling = self.filling(&light, &all)?;
         self.plan = plan;
-        self.store(light, all, stitch);
-        Ok(())
+        self.store(light, all, stitch, filling)
     }
 }
 
