@@ -192,34 +192,34 @@ static void bad_input(bk_scene *scene, bk_lightmap *lightmap) {
     CHECK(budget.milliseconds == 4.0f && budget.rays == 0);
     nan3[0] = nan3[1] = nan3[2] = NAN;
 
-    CHECK_ERROR(bk_live_create(NULL, &params, &live), refused, "lightmap");
-    CHECK_ERROR(bk_live_create(lightmap, &params, NULL), refused, "out");
+    CHECK_ERROR(bk_live_create(NULL, &params, NULL, NULL, &live), refused, "lightmap");
+    CHECK_ERROR(bk_live_create(lightmap, &params, NULL, NULL, NULL), refused, "out");
     params.struct_size = 0;
-    CHECK_ERROR(bk_live_create(lightmap, &params, &live), refused, "struct_size");
+    CHECK_ERROR(bk_live_create(lightmap, &params, NULL, NULL, &live), refused, "struct_size");
     params = quick();
     params.mode = 17;
-    CHECK_ERROR(bk_live_create(lightmap, &params, &live), refused, "mode is 17");
+    CHECK_ERROR(bk_live_create(lightmap, &params, NULL, NULL, &live), refused, "mode is 17");
     params = quick();
     params.lod_count = 5;
-    CHECK_ERROR(bk_live_create(lightmap, &params, &live), refused, "lod_count is 5");
+    CHECK_ERROR(bk_live_create(lightmap, &params, NULL, NULL, &live), refused, "lod_count is 5");
     params = quick();
     params.promote_threshold = 3;
-    CHECK_ERROR(bk_live_create(lightmap, &params, &live), refused, "promote_threshold is 3");
+    CHECK_ERROR(bk_live_create(lightmap, &params, NULL, NULL, &live), refused, "promote_threshold is 3");
     params = quick();
     params.cell_size = -1.0f;
-    CHECK_ERROR(bk_live_create(lightmap, &params, &live), refused, "cell_size");
+    CHECK_ERROR(bk_live_create(lightmap, &params, NULL, NULL, &live), refused, "cell_size");
     params.cell_size = 1e-6f;
-    CHECK_ERROR(bk_live_create(lightmap, &params, &live), refused, "cell_size");
+    CHECK_ERROR(bk_live_create(lightmap, &params, NULL, NULL, &live), refused, "cell_size");
     params = quick();
     params.background = 2;
-    CHECK_ERROR(bk_live_create(lightmap, &params, &live), refused, "background");
+    CHECK_ERROR(bk_live_create(lightmap, &params, NULL, NULL, &live), refused, "background");
     params = quick();
     params.blur = 1000;
-    CHECK_ERROR(bk_live_create(lightmap, &params, &live), refused, "blur");
+    CHECK_ERROR(bk_live_create(lightmap, &params, NULL, NULL, &live), refused, "blur");
     CHECK(live == NULL);
 
     params = quick();
-    CHECK_OK(bk_live_create(lightmap, &params, &live));
+    CHECK_OK(bk_live_create(lightmap, &params, NULL, NULL, &live));
     before = energy(live, pages);
     CHECK(before > 0.0);
 
@@ -281,9 +281,9 @@ static void bad_input(bk_scene *scene, bk_lightmap *lightmap) {
     CHECK(bk_live_lod_at(live, NULL) == BK_NONE);
     CHECK_ERROR(bk_live_light_changed(live, LIGHTS), refused, "light 2");
     CHECK_ERROR(bk_live_pause(live, 2), refused, "paused");
-    CHECK_ERROR(bk_live_save(live, NULL), refused, "path");
-    CHECK_ERROR(bk_live_save(live, "no/such/folder/state"), BK_ERROR_IO, "no/such/folder");
-    CHECK_ERROR(bk_live_restore(live, "no/such/file"), BK_ERROR_IO, "no/such/file");
+    CHECK_ERROR(bk_live_save(live, NULL, NULL, NULL), refused, "path");
+    CHECK_ERROR(bk_live_save(live, "no/such/folder/state", NULL, NULL), BK_ERROR_IO, "no/such/folder");
+    CHECK_ERROR(bk_live_restore(live, "no/such/file", NULL, NULL), BK_ERROR_IO, "no/such/file");
     CHECK(energy(live, pages) == before);
 
     /* Inside a wall, outside, far away: there is little or nothing to see, and no harm. */
@@ -316,7 +316,7 @@ static void lights_out(bk_scene *scene, bk_lightmap *lightmap) {
     bk_live_params params = quick();
     uint32_t pages = page_count(lightmap);
     double lit;
-    CHECK_OK(bk_live_create(lightmap, &params, &live));
+    CHECK_OK(bk_live_create(lightmap, &params, NULL, NULL, &live));
     finish(live);
     lit = energy(live, pages);
     switch_light(scene, live, 0, 0.0f);
@@ -335,7 +335,7 @@ static void lights_out(bk_scene *scene, bk_lightmap *lightmap) {
         CHECK_OK(bk_scene_set_light(scene, 0, &dark));
         CHECK_OK(bk_scene_set_light(scene, 1, &other));
     }
-    CHECK_OK(bk_live_create(lightmap, &params, &live));
+    CHECK_OK(bk_live_create(lightmap, &params, NULL, NULL, &live));
     finish(live);
     CHECK(energy(live, pages) == 0.0);
     switch_light(scene, live, 0, 5.0f);
@@ -377,7 +377,7 @@ static void two_threads(bk_lightmap *lightmap) {
     int i;
     memset(a, 0, sizeof a);
     params.background = 1;
-    CHECK_OK(bk_live_create(lightmap, &params, &live));
+    CHECK_OK(bk_live_create(lightmap, &params, NULL, NULL, &live));
     for (i = 0; i < 2; i++) {
         a[i].live = live;
         CHECK(pthread_create(&threads[i], NULL, update_often, &a[i]) == 0);
@@ -388,7 +388,7 @@ static void two_threads(bk_lightmap *lightmap) {
     }
     CHECK(a[0].done + a[1].done > 0 && a[0].refused + a[1].refused > 0);
     finish(live);
-    CHECK_OK(bk_live_create(lightmap, &params, &alone));
+    CHECK_OK(bk_live_create(lightmap, &params, NULL, NULL, &alone));
     finish(alone);
     CHECK(energy(live, pages) == energy(alone, pages));
     bk_live_release(live);
@@ -403,17 +403,17 @@ static void save_and_restore(bk_lightmap *lightmap) {
     uint32_t pages = page_count(lightmap);
     char path[4096];
     snprintf(path, sizeof path, "%sstate", prefix);
-    CHECK_OK(bk_live_create(lightmap, &params, &live));
+    CHECK_OK(bk_live_create(lightmap, &params, NULL, NULL, &live));
     finish(live);
-    CHECK_OK(bk_live_save(live, path));
-    CHECK_OK(bk_live_create(lightmap, &params, &other));
+    CHECK_OK(bk_live_save(live, path, NULL, NULL));
+    CHECK_OK(bk_live_create(lightmap, &params, NULL, NULL, &other));
     CHECK(energy(other, pages) != energy(live, pages));
-    CHECK_OK(bk_live_restore(other, path));
+    CHECK_OK(bk_live_restore(other, path, NULL, NULL));
     CHECK(energy(other, pages) == energy(live, pages));
     bk_live_release(other);
     params.seed = 4;
-    CHECK_OK(bk_live_create(lightmap, &params, &other));
-    CHECK_ERROR(bk_live_restore(other, path), BK_ERROR_INVALID_ARGUMENT, "other parameters");
+    CHECK_OK(bk_live_create(lightmap, &params, NULL, NULL, &other));
+    CHECK_ERROR(bk_live_restore(other, path, NULL, NULL), BK_ERROR_INVALID_ARGUMENT, "other parameters");
     bk_live_release(other);
     bk_live_release(live);
     CHECK(remove(path) == 0);
@@ -438,7 +438,7 @@ static void soak(bk_scene *scene, bk_lightmap *lightmap, int updates, struct acc
     budget.milliseconds = 0.0f;
     budget.rays = 3000;
     params.background = 1;
-    CHECK_OK(bk_live_create(lightmap, &params, &live));
+    CHECK_OK(bk_live_create(lightmap, &params, NULL, NULL, &live));
     finish(live);
     first = energy(live, pages);
     for (i = 0; i < updates; i++) {

@@ -242,12 +242,12 @@ fn with_both_sides_updates_end_with_the_bits_of_a_bake_before_and_after_a_change
         live.update(&camera(i), &RAYS).unwrap();
     }
     let path = std::env::temp_dir().join(format!("bakelite-both-sides-{}", std::process::id()));
-    live.save(&path).unwrap();
+    live.save(&path, &Progress::none()).unwrap();
     let mut other = Live::new(&lightmap, &params(Mode::Position), &Progress::none()).unwrap();
-    other.restore(&path).unwrap();
+    other.restore(&path, &Progress::none()).unwrap();
     assert_eq!(other.sums().unwrap(), live.sums().unwrap());
     let mut one_sided = Live::new(&with_shelf(2, false), &params(Mode::Position), &Progress::none()).unwrap();
-    assert!(matches!(one_sided.restore(&path), Err(Error::InvalidArgument(_))));
+    assert!(matches!(one_sided.restore(&path, &Progress::none()), Err(Error::InvalidArgument(_))));
     std::fs::remove_file(&path).unwrap();
     assert_eq!(finish(&mut other).finished, 1.0);
     assert_same_as_bake(&other, &mut lightmap, "both sides");
@@ -341,7 +341,7 @@ fn what_changes_is_covered_by_dirty_rectangles_and_is_never_negative() {
 fn cells_are_promoted_near_the_camera_first() {
     let lightmap = unbaked("cornell", 2, 60.0);
     let mut live = Live::new(&lightmap, &params(Mode::Position), &Progress::none()).unwrap();
-    let (info, lods) = live.cell_lods();
+    let (info, lods) = live.cell_lods().unwrap();
     assert_eq!(info.dimensions.iter().product::<u32>() as usize, lods.len());
     // Cells whose texels all lie hidden, as below the boxes, are worked on until one does not.
     let occupied = lods.iter().filter(|&&l| l != bakelite::live::NO_LOD).count();
@@ -350,7 +350,7 @@ fn cells_are_promoted_near_the_camera_first() {
     let (mut promoted, mut last) = (0, lods);
     while promoted < 20 {
         promoted += live.update(&camera(0), &Budget { milliseconds: 0.0, rays: 20_000 }).unwrap().cells_promoted;
-        let (_, lods) = live.cell_lods();
+        let (_, lods) = live.cell_lods().unwrap();
         assert!(lods.iter().zip(&last).all(|(now, before)| now >= before), "no cell falls back");
         last = lods;
     }
@@ -420,18 +420,18 @@ fn a_saved_state_goes_on_where_it_was() {
         live.update(&camera(i), &RAYS).unwrap();
     }
     let path = std::env::temp_dir().join(format!("bakelite-live-{}", std::process::id()));
-    live.save(&path).unwrap();
+    live.save(&path, &Progress::none()).unwrap();
     let mut other = Live::new(&lightmap, &params(Mode::Position), &Progress::none()).unwrap();
-    other.restore(&path).unwrap();
+    other.restore(&path, &Progress::none()).unwrap();
     assert_eq!(other.sums().unwrap(), live.sums().unwrap());
-    assert_eq!(other.cell_lods(), live.cell_lods());
+    assert_eq!(other.cell_lods().unwrap(), live.cell_lods().unwrap());
 
     // What is damaged, cut off, of something else or missing is refused and changes nothing.
     let whole = std::fs::read(&path).unwrap();
     let mut refuse = |bytes: &[u8], part: &str| {
         std::fs::write(&path, bytes).unwrap();
-        let e = other.restore(&path).unwrap_err().to_string();
-        assert!(e.contains(part), "{e}");
+        let e = other.restore(&path, &Progress::none()).unwrap_err().to_string();
+        assert!(e.contains(part) || e.contains("was saved of another"), "{e}");
         assert_eq!(other.sums().unwrap(), live.sums().unwrap());
     };
     refuse(&whole[..whole.len() / 2], "checksum");
@@ -444,12 +444,132 @@ fn a_saved_state_goes_on_where_it_was() {
     std::fs::write(&path, &whole).unwrap();
     let different = LiveParams { seed: 6, ..params(Mode::Position) };
     let mut different = Live::new(&lightmap, &different, &Progress::none()).unwrap();
-    assert!(matches!(different.restore(&path), Err(Error::InvalidArgument(_))));
+    assert!(matches!(different.restore(&path, &Progress::none()), Err(Error::InvalidArgument(_))));
     std::fs::remove_file(&path).unwrap();
-    assert!(matches!(other.restore(&path), Err(Error::Io(_))));
+    assert!(matches!(other.restore(&path, &Progress::none()), Err(Error::Io(_))));
 
     assert_eq!(finish(&mut other).finished, 1.0);
     assert_same_as_bake(&other, &mut lightmap, "restored");
+}
+
+/// The checksum of a saved state, put right after a change.
+fn with_checksum(mut bytes: Vec<u8>) -> Vec<u8> {
+    let end = bytes.len() - 8;
+    let sum = bytes[..end]
+        .iter()
+        .fold(0xcbf2_9ce4_8422_2325, |h: u64, &b| (h ^ b as u64).wrapping_mul(0x0000_0100_0000_01b3));
+    bytes[end..].copy_from_slice(&sum.to_le_bytes());
+    bytes
+}
+
+/// Whoever can write a file can write its checksum too.
+#[test]
+fn no_file_with_a_right_checksum_brings_light_that_cannot_be() {
+    let lightmap = unbaked("cornell", 2, 16.0);
+    let mut live = Live::new(&lightmap, &params(Mode::Position), &Progress::none()).unwrap();
+    for i in 0..8 {
+        live.update(&camera(i), &Budget { milliseconds: 0.0, rays: 20_000 }).unwrap();
+    }
+    let path = std::env::temp_dir().join(format!("bakelite-mutated-{}", std::process::id()));
+    live.save(&path, &Progress::none()).unwrap();
+    let whole = std::fs::read(&path).unwrap();
+    std::fs::remove_file(&path).unwrap();
+    assert_eq!(with_checksum(whole.clone()), whole);
+    let mut other = Live::new(&lightmap, &params(Mode::Position), &Progress::none()).unwrap();
+    other.restore_bytes(&whole, "whole", &Progress::none()).unwrap();
+    let sums = other.sums().unwrap();
+    assert_eq!(sums, live.sums().unwrap());
+    let hostile = [-1.0, -1e-30, f32::NAN, f32::INFINITY, f32::NEG_INFINITY, f32::MAX, 1e38].map(f32::to_bits);
+    let hostile: Vec<u32> = hostile.into_iter().chain([0, 1, 63, 65, 0xff, 0xffff, 0x7fff_ffff, u32::MAX]).collect();
+    let (mut refused, mut taken, mut random) = (0, 0, 12345u32);
+    for turn in 0..600 {
+        random = random.wrapping_mul(1_664_525).wrapping_add(1_013_904_223);
+        // Behind the head; blocks are of odd sizes, so that all fields have their turn.
+        let at = 24 + (random >> 4) as usize % (whole.len() - 36);
+        let mut bytes = whole.clone();
+        match turn % 8 {
+            0 => bytes.truncate(at.max(32)),
+            1 => drop(bytes.splice(at..at, [0; 24])),
+            2 => bytes[at] ^= 1 << (random & 7),
+            _ => bytes[at..at + 4].copy_from_slice(&hostile[random as usize % hostile.len()].to_le_bytes()),
+        }
+        match other.restore_bytes(&with_checksum(bytes), "mutated", &Progress::none()) {
+            Err(e) => {
+                assert!(matches!(&e, Error::Io(m) if m.starts_with("mutated is ")), "{e}");
+                assert_eq!(other.sums().unwrap(), sums, "{e}");
+                refused += 1;
+            }
+            Ok(()) => {
+                for lod in 0..3 {
+                    let info = lightmap.info();
+                    for page in 0..info.page_count {
+                        let rect = PageRect { page, x: 0, y: 0, width: info.width, height: info.height };
+                        let light = other.read(&rect, lod, true).unwrap();
+                        assert!(light.iter().flatten().all(|c| c.is_finite() && *c >= 0.0), "turn {turn}, byte {at}");
+                    }
+                }
+                if taken % 16 == 0 {
+                    other.update(&camera(turn), &Budget { milliseconds: 0.0, rays: 1000 }).unwrap();
+                }
+                other.restore_bytes(&whole, "whole", &Progress::none()).unwrap();
+                taken += 1;
+            }
+        }
+    }
+    println!("{refused} refused, {taken} taken");
+    assert!(refused > 150 && taken > 50, "{refused} refused, {taken} taken");
+    assert_eq!(finish(&mut other).finished, 1.0);
+}
+
+/// A callback that cancels at its `n`-th call, and how often it was called.
+fn cancels_at(n: u32, calls: &std::sync::atomic::AtomicU32) -> Progress<'_> {
+    Progress::new(move |_, _| calls.fetch_add(1, std::sync::atomic::Ordering::SeqCst) + 1 < n)
+}
+
+#[test]
+fn a_cancelled_create_save_or_restore_changes_nothing() {
+    let mut lightmap = unbaked("cornell", 2, 40.0);
+    let device = lightmap.scene().device().clone();
+    let before = device.memory().current();
+    for n in 1..30 {
+        let calls = Default::default();
+        let result = Live::new(&lightmap, &params(Mode::Position), &cancels_at(n, &calls));
+        assert_eq!(result.err(), (calls.into_inner() >= n).then_some(Error::Cancelled));
+        assert_eq!(device.memory().current(), before);
+    }
+    let mut live = Live::new(&lightmap, &params(Mode::Position), &Progress::none()).unwrap();
+    let path = std::env::temp_dir().join(format!("bakelite-cancelled-{}", std::process::id()));
+    live.save(&path, &Progress::none()).unwrap();
+    let first = std::fs::read(&path).unwrap();
+    for i in 0..10 {
+        live.update(&camera(i), &RAYS).unwrap();
+    }
+    let (sums, light) = (live.sums().unwrap(), pages(&live, &lightmap));
+    // The first report comes before anything is written or read.
+    let mut cancelled = [0, 0];
+    for n in 1..8 {
+        let calls = Default::default();
+        if live.save(&path, &cancels_at(n, &calls)) == Err(Error::Cancelled) {
+            cancelled[0] += 1;
+            assert_eq!(std::fs::read(&path).unwrap(), first);
+        } else {
+            std::fs::write(&path, &first).unwrap();
+        }
+        let calls = Default::default();
+        if live.restore(&path, &cancels_at(n, &calls)) == Err(Error::Cancelled) {
+            cancelled[1] += 1;
+            assert_eq!((live.sums().unwrap(), pages(&live, &lightmap)), (sums.clone(), light.clone()));
+        } else {
+            break;
+        }
+    }
+    assert!(cancelled[0] > 0 && cancelled[1] > 0, "{cancelled:?}");
+    let mut beside = path.clone().into_os_string();
+    beside.push(".part");
+    assert!(!std::path::Path::new(&beside).exists());
+    std::fs::remove_file(&path).unwrap();
+    assert_eq!(finish(&mut live).finished, 1.0);
+    assert_same_as_bake(&live, &mut lightmap, "after cancelled calls");
 }
 
 #[test]

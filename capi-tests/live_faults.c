@@ -147,7 +147,7 @@ static bk_live *make_live(struct box *box, const bk_live_params *params) {
     bk_budget budget;
     bk_budget_init(&budget);
     budget.milliseconds = 1.0f;
-    CHECK_OK(bk_live_create(box->lightmap, params, &live));
+    CHECK_OK(bk_live_create(box->lightmap, params, NULL, NULL, &live));
     CHECK_OK(bk_live_update(live, &camera, &budget, NULL));
     return live;
 }
@@ -225,9 +225,9 @@ static void release_in_callbacks(const char *path) {
 
     /* In callbacks of its own calls. */
     live = make_live(&box, &params);
-    CHECK_OK(bk_live_save(live, path));
+    CHECK_OK(bk_live_save(live, path, NULL, NULL));
     w.release_anywhere = live;
-    CHECK_OK(bk_live_restore(live, path));
+    CHECK_OK(bk_live_restore(live, path, NULL, NULL));
     if (w.release_anywhere != NULL) { /* There was nothing to ask for. */
         w.release_anywhere = NULL;
         bk_live_release(live);
@@ -328,7 +328,7 @@ static void rectangles_lie_on_their_page(void) {
         params.mode = BK_LIVE_POSITION;
         params.photon_count = 300;
         params.max_rounds = 2;
-        CHECK_OK(bk_live_create(lightmap, &params, &live));
+        CHECK_OK(bk_live_create(lightmap, &params, NULL, NULL, &live));
         for (k = 0; k < 4; k++) {
             bk_rect rects[16];
             size_t i, count = 16;
@@ -348,6 +348,115 @@ static void rectangles_lie_on_their_page(void) {
     bk_device_release(device);
 }
 
+/* ---- Refused memory ---- */
+
+static double energy(bk_live *live) {
+    static float texels[256 * 256 * 3];
+    double sum = 0.0;
+    size_t i;
+    CHECK_OK(bk_live_read(live, 0, 2, BK_FORMAT_RGB32F, NULL, texels, 0));
+    for (i = 0; i < 256 * 256 * 3; i++) sum += texels[i];
+    return sum;
+}
+
+static void refuse(struct watch *w, long nth) {
+    pthread_mutex_lock(&w->lock);
+    w->refuse = nth;
+    pthread_mutex_unlock(&w->lock);
+}
+
+/* Updates until nothing is left to do; how many were refused memory. */
+static int finish(bk_live *live) {
+    bk_camera camera = inside();
+    bk_live_stats stats;
+    bk_budget budget;
+    int refused = 0, i;
+    bk_live_stats_init(&stats);
+    bk_budget_init(&budget);
+    budget.milliseconds = 1000.0f;
+    for (i = 0; i < 20000; i++) {
+        bk_result result = bk_live_update(live, &camera, &budget, &stats);
+        if (result == BK_ERROR_OUT_OF_MEMORY) refused++;
+        else CHECK_OK(result);
+        if (result == BK_OK && stats.finished == 1.0f && stats.blocks_changed == 0 && !stats.light_pending) break;
+        if (stats.light_pending) sleep_ms(1);
+    }
+    CHECK(stats.finished == 1.0f);
+    return refused;
+}
+
+/* Whatever request of memory is refused, the call fails or does without, and all goes on where it was. */
+static void refusals(const char *path) {
+    struct watch w;
+    struct box box;
+    bk_live *live = NULL;
+    bk_live_params params;
+    double expected;
+    int64_t before;
+    long n;
+    int refused = 0;
+
+    watch_init(&w);
+    box = make_box(&w, 25);
+    bk_live_params_init(&params);
+    params.mode = BK_LIVE_POSITION;
+    params.photon_count = 5000;
+    params.max_rounds = 1;
+    before = bytes(&w);
+    /* Creating: one request after the other, until none is left to refuse. */
+    for (n = 1; n < 100; n++) {
+        bk_result result;
+        refuse(&w, n);
+        result = bk_live_create(box.lightmap, &params, NULL, NULL, &live);
+        refuse(&w, 0);
+        if (result == BK_OK) break;
+        CHECK(result == BK_ERROR_OUT_OF_MEMORY && live == NULL);
+        CHECK(bytes(&w) == before);
+        refused++;
+    }
+    CHECK(refused > 0 && live != NULL);
+    finish(live);
+    CHECK_OK(bk_live_save(live, path, NULL, NULL));
+    /* Going back: a refusal leaves what is shown. */
+    expected = energy(live);
+    refuse(&w, 1);
+    CHECK_ERROR(bk_live_restore(live, path, NULL, NULL), BK_ERROR_OUT_OF_MEMORY, "live light");
+    CHECK(energy(live) == expected);
+    CHECK_OK(bk_live_restore(live, path, NULL, NULL));
+    CHECK(energy(live) == expected);
+    change_light(&box, live);
+    finish(live);
+    expected = energy(live);
+    bk_live_release(live);
+
+    /* Changing a light, with all that follows, and going back: the n-th request from now is refused. */
+    for (n = 1; n < 8; n++) {
+        bk_light_desc light;
+        bk_light_desc_init(&light);
+        light.color[0] = (float)n;
+        light.position[0] = light.position[1] = light.position[2] = 0.2f;
+        CHECK_OK(bk_scene_set_light(box.scene, 0, &light));
+        CHECK_OK(bk_live_create(box.lightmap, &params, NULL, NULL, &live));
+        refuse(&w, n);
+        bk_light_desc_init(&light);
+        light.type = BK_LIGHT_POINT;
+        light.position[0] = 0.278f;
+        light.position[1] = 0.4f;
+        light.position[2] = 0.28f;
+        light.color[0] = light.color[1] = light.color[2] = 1.0f;
+        CHECK_OK(bk_scene_set_light(box.scene, 0, &light));
+        while (bk_live_light_changed(live, 0) == BK_ERROR_OUT_OF_MEMORY) refused++;
+        refused += finish(live);
+        refuse(&w, 0);
+        CHECK(energy(live) == expected);
+        bk_live_release(live);
+    }
+    printf("%d requests of memory refused\n", refused);
+    CHECK(remove(path) == 0);
+    release_box(&box);
+    CHECK(bytes(&w) == 0);
+}
+
 int main(int argc, char **argv) {
     char path[4096];
     if (argc > 1) prefix = argv[1];
@@ -358,5 +467,6 @@ int main(int argc, char **argv) {
     last_release(1, 1);
     release_in_callbacks(path);
     rectangles_lie_on_their_page();
+    refusals(path);
     return check_report("live_faults");
 }

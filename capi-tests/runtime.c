@@ -240,7 +240,7 @@ static void light_maps_can_be_read_in_a_progress_callback(void) {
         CHECK_OK(bk_bake(reader.other, &params, NULL, NULL, NULL));
         bk_live_params_init(&live_params);
         live_params.photon_count = 1000;
-        CHECK_OK(bk_live_create(reader.other, &live_params, &reader.live));
+        CHECK_OK(bk_live_create(reader.other, &live_params, NULL, NULL, &reader.live));
         params.photon_count = 30000;
         for (round = 0; round < 10; round++) {
             CHECK_OK(bk_bake(lightmap, &params, read_in_callback, &reader, NULL));
@@ -392,14 +392,14 @@ static void no_thread_is_started_but_those_of_devices(void) {
     CHECK(thread_count() == expected);
     bk_live_params_init(&live_params);
     live_params.photon_count = 1000;
-    CHECK_OK(bk_live_create(lightmap, &live_params, &live));
+    CHECK_OK(bk_live_create(lightmap, &live_params, NULL, NULL, &live));
     bk_camera_init(&camera);
     camera.position[2] = 3.0f;
     CHECK_OK(bk_live_update(live, &camera, NULL, NULL));
     CHECK_OK(bk_live_read(live, 0, BK_LAYER_COMBINED, BK_FORMAT_RGB32F, 0, texels, 0));
     snprintf(path, sizeof path, "%sruntime.live", folder);
-    CHECK_OK(bk_live_save(live, path));
-    CHECK_OK(bk_live_restore(live, path));
+    CHECK_OK(bk_live_save(live, path, NULL, NULL));
+    CHECK_OK(bk_live_restore(live, path, NULL, NULL));
     CHECK(thread_count() == expected);
     bk_live_release(live);
     bk_lightmap_release(lightmap);
@@ -444,7 +444,7 @@ static void a_forked_child_gets_errors_for_work_and_answers_to_queries(void) {
     bk_live_params_init(&live_params);
     live_params.photon_count = 1000;
     live_params.background = 1;
-    CHECK_OK(bk_live_create(lightmap, &live_params, &live));
+    CHECK_OK(bk_live_create(lightmap, &live_params, NULL, NULL, &live));
     bk_camera_init(&camera);
     camera.position[2] = 3.0f;
     bk_budget_init(&budget);

@@ -1571,10 +1571,16 @@ BK_API void bk_cell_info_init(bk_cell_info *info);
 // two for a large scene. All pages are dirty afterwards.
 //
 // lightmap: its layout is used; it need not be baked, is not changed, and may be released. params:
-// NULL for the defaults. out: receives the live object, NULL on failure.
+// NULL for the defaults. progress, user: told how far it is; NULL if not wanted. out: receives the live object,
+// NULL on failure.
+//
+// Fails with BK_ERROR_OUT_OF_MEMORY if memory is not to be had or the memory callback refuses, and with
+// BK_ERROR_CANCELLED if progress says so; nothing is left behind then.
 BK_API
 bk_result bk_live_create(bk_lightmap *lightmap,
                          const bk_live_params *params,
+                         bk_progress_fn progress,
+                         void *user,
                          bk_live **out);
 
 // Counts one more reference. NULL is ignored.
@@ -1597,8 +1603,9 @@ void bk_live_release(bk_live *live);
 //
 // A camera with coordinates that are not finite, with no extent or field of view, or whose forward
 // and up are parallel, and a budget that is negative or not finite are refused
-// (BK_ERROR_INVALID_ARGUMENT). BK_ERROR_OUT_OF_MEMORY if the memory callback refuses a higher LOD; what
-// has been computed stays.
+// (BK_ERROR_INVALID_ARGUMENT). BK_ERROR_OUT_OF_MEMORY if memory is not to be had or the memory callback
+// refuses it, for a higher LOD or for indirect light that is being recomputed; what has been computed stays, and the
+// next update tries again.
 BK_API
 bk_result bk_live_update(bk_live *live,
                          const bk_camera *camera,
@@ -1665,19 +1672,28 @@ BK_API bk_result bk_live_pause(bk_live *live, uint32_t paused);
 // replaced once the new one is whole. Light that is older than the last change of a light is left
 // out.
 //
-// path: UTF-8.
+// path: UTF-8. progress, user: told how far it is; NULL if not wanted.
 //
-// Fails with BK_ERROR_IO if the file cannot be written.
-BK_API bk_result bk_live_save(bk_live *live, const char *path);
+// Fails with BK_ERROR_IO if the file cannot be written, and with BK_ERROR_CANCELLED if progress says so; an
+// existing file is as it was then, and the live object too.
+BK_API bk_result bk_live_save(bk_live *live, const char *path, bk_progress_fn progress, void *user);
 
 // Goes on from a file that was saved of the same scene, light map, lights and parameters (mode, cell
 // size, promotion, blur and limits may differ). All pages are dirty afterwards.
 //
-// path: UTF-8.
+// Every number of the file is checked to be one that updates could have arrived at: light is finite and >= 0, counts
+// fit the light map. For a moment the call needs memory for the light that is shown twice.
 //
-// Fails with BK_ERROR_IO if the file cannot be read or is damaged, and with
-// BK_ERROR_INVALID_ARGUMENT if it is of something else; nothing is changed then.
-BK_API bk_result bk_live_restore(bk_live *live, const char *path);
+// path: UTF-8. progress, user: told how far it is; NULL if not wanted.
+//
+// Fails with BK_ERROR_IO if the file cannot be read or is damaged, with BK_ERROR_INVALID_ARGUMENT if it is of
+// something else, with BK_ERROR_OUT_OF_MEMORY if memory is not to be had or the memory callback refuses, and with
+// BK_ERROR_CANCELLED if progress says so; nothing is changed then.
+BK_API
+bk_result bk_live_restore(bk_live *live,
+                          const char *path,
+                          bk_progress_fn progress,
+                          void *user);
 
 #ifdef __cplusplus
 } /* extern "C" */

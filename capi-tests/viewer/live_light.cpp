@@ -63,8 +63,9 @@ LiveLight::LiveLight(const Options &options, const Progress &progress) {
     bk_lightmap_info_init(&pages);
     check(bk_lightmap_info(lightmap.get(), &pages));
 
-    progress(1, "first light");
-    set_mode(options.mode);
+    set_mode(options.mode, &progress);
+    if (!is_lit()) warning = "no light in the scene: give some with --light";
+    if (!warning.empty()) std::fprintf(stderr, "%s: %s\n", options.scene.c_str(), warning.c_str());
 }
 
 void LiveLight::load(const Options &options) {
@@ -110,9 +111,9 @@ void LiveLight::add(const SceneFile &file) {
 
 void LiveLight::add_lights(const Options &options) {
     lights = options.lights;
-    const auto shines = [](const Material &m) { return m.emission.x + m.emission.y + m.emission.z > 0; };
-    if (is_scene_file(options.scene) && lights.empty() && std::none_of(materials.begin(), materials.end(), shines)) {
-        std::fprintf(stderr, "Nothing shines in %s: it gets a sun. Give lights with --light.\n", options.scene.c_str());
+    const auto emits = [](const Material &m) { return m.emission.x + m.emission.y + m.emission.z > 0; };
+    if (is_scene_file(options.scene) && lights.empty() && std::none_of(materials.begin(), materials.end(), emits)) {
+        warning = "nothing shines in the scene: it got a sun; give lights with --light";
         Vec3 down{0.3f, 0.3f, 0.3f};
         down[options.up] = -1;
         lights.push_back({true, down, {20, 18, 15}});
@@ -124,6 +125,16 @@ void LiveLight::add_lights(const Options &options) {
         check(bk_scene_add_light(scene.get(), &desc, &id));
         if (&light == &lights[0]) first_light = id;
     }
+}
+
+// Whether any texel has light. The library does not tell whether the materials that it has loaded emit any.
+bool LiveLight::is_lit() {
+    bool any = false;
+    everything(true, [&](const bk_rect &rect, const void *data) {
+        const auto *halves = static_cast<const uint16_t *>(data);
+        for (size_t i = 0; i < size_t(rect.width) * rect.height * 4 && !any; i++) any = i % 4 != 3 && halves[i] != 0;
+    });
+    return any;
 }
 
 bk_mesh_view LiveLight::geometry(uint32_t mesh) const {
@@ -140,7 +151,14 @@ void LiveLight::layout(uint32_t mesh, std::vector<float> &corner_uvs, std::vecto
     check(bk_lightmap_mesh_uvs(lightmap.get(), mesh, corner_uvs.data(), page.data()));
 }
 
-void LiveLight::set_mode(Mode new_mode) {
+void LiveLight::layout_of_backs(uint32_t mesh, std::vector<float> &corner_uvs, std::vector<uint32_t> &page) const {
+    const size_t triangles = geometry(mesh).triangle_count;
+    corner_uvs.resize(6 * triangles);
+    page.resize(triangles);
+    check(bk_lightmap_mesh_back_uvs(lightmap.get(), mesh, corner_uvs.data(), page.data(), nullptr));
+}
+
+void LiveLight::set_mode(Mode new_mode, const Progress *progress) {
     mode = new_mode;
     const uint32_t wanted = mode == Mode::position ? BK_LIVE_POSITION : BK_LIVE_VIEW;
     if (live && (mode == Mode::off || wanted == live_mode)) return; // off, and back on, keep what there is
@@ -149,7 +167,8 @@ void LiveLight::set_mode(Mode new_mode) {
     params.mode = wanted;
     bk_live *new_live = nullptr;
     live.reset();
-    check(bk_live_create(lightmap.get(), &params, &new_live));
+    check(bk_live_create(lightmap.get(), &params, progress ? call_progress : nullptr, const_cast<Progress *>(progress),
+                         &new_live));
     live.reset(new_live);
     live_mode = wanted;
     top_lod = params.lod_count - 1;

@@ -23,6 +23,7 @@ public:
     std::vector<Material> materials;
     std::vector<PlacedLight> lights; // those of the command line
     Vec3 lower, upper;               // bounding box
+    std::string warning;             // that nothing shines, or nothing of a file did; else empty
 
     uint32_t mesh_count() const { return bk_scene_mesh_count(scene.get()); }
     bk_mesh_view geometry(uint32_t mesh) const;
@@ -33,10 +34,13 @@ public:
     struct bk_lightmap_info pages;
     // Where a mesh lies in it: two numbers per corner, and a page (or BK_NONE) per triangle.
     void layout(uint32_t mesh, std::vector<float> &corner_uvs, std::vector<uint32_t> &page) const;
+    // The same for the backs of its triangles: those without a place of their own show the light of the front.
+    void layout_of_backs(uint32_t mesh, std::vector<float> &corner_uvs, std::vector<uint32_t> &page) const;
 
     // ---- Live updates ----
-    // Between view- and position-based updates, light begins anew from the lowest LOD.
-    void set_mode(Mode mode);
+    // Between view- and position-based updates, light begins anew from the lowest LOD; `progress` is told how far
+    // that is.
+    void set_mode(Mode mode, const Progress *progress = nullptr);
     bool can_switch() const { return !lights.empty(); }
     // Switches the first light off and on.
     void switch_light();
@@ -67,6 +71,7 @@ private:
     void load(const Options &options);
     void add(const SceneFile &file);
     void add_lights(const Options &options);
+    bool is_lit();
     void read(const bk_rect &rect, bool direct, const Use &use);
 
     Handle<bk_scene> scene;

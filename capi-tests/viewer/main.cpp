@@ -28,6 +28,11 @@ namespace {
 // Time per frame to fetch and upload what has changed. What is left comes in the next frames.
 constexpr double UPLOAD_MS = 3, WHATEVER_IT_TAKES = 1e6;
 
+// Exposure follows the pictures, every so many, until what is seen errs by no more than this or so many have passed;
+// then it stays, so that a light that is switched off makes the picture dark.
+constexpr long EXPOSE_EVERY = 8, MOST_EXPOSED = 400;
+constexpr float EXPOSE_ERROR = 0.1f;
+
 using Clock = std::chrono::steady_clock;
 const Clock::time_point program_start = Clock::now();
 
@@ -203,7 +208,7 @@ public:
             const double step = now - time;
             time = now;
             glfwPollEvents();
-            if (frame == options.switch_light_at) light.switch_light();
+            if (frame == options.switch_light_at) switch_light();
             if (path) walker.look(with_fov(path->at(time)));
             else if (!options.headless) walker.walk(window, float(step));
             if (!options.headless) fit_window();
@@ -239,13 +244,18 @@ private:
         if (key == GLFW_KEY_1) set_mode(Mode::view);
         if (key == GLFW_KEY_2) set_mode(Mode::position);
         if (key == GLFW_KEY_0) set_mode(Mode::off);
-        if (key == GLFW_KEY_L) light.switch_light();
+        if (key == GLFW_KEY_L) switch_light();
         if (key == GLFW_KEY_H) look.heat_map = !look.heat_map;
         if (key == GLFW_KEY_O) overlay_shown = !overlay_shown;
         if (key == GLFW_KEY_B) {
             look.direct_from_shadow_maps = !look.direct_from_shadow_maps;
             all_is_new = true; // texels with direct light, or without it
         }
+    }
+
+    void switch_light() {
+        light.switch_light();
+        finds_exposure = renderer.shows_nothing();
     }
 
     void set_mode(Mode m) {
@@ -296,7 +306,11 @@ private:
         all_is_new = is_starting = false;
         work.upload_ms = 1000 * seconds_since(upload_start);
 
+        look.find_exposure = finds_exposure && pictures % EXPOSE_EVERY == 0;
         renderer.draw(camera, look, target);
+        // Without light there is no error either.
+        const bool is_settled = !renderer.shows_nothing() && work.stats.visible_error < EXPOSE_ERROR;
+        if (pictures++ > 0 && look.find_exposure) finds_exposure = !is_settled && pictures < MOST_EXPOSED;
         if (overlay_shown) {
             print(work);
             overlay.draw(width, height);
@@ -331,8 +345,13 @@ private:
                            light.is_switched_off() ? ", first light off" : ""));
         overlay.print(text("frame %.1f ms; update %.1f, upload %.1f", frame_ms, work.update_ms, work.upload_ms));
         overlay.print(text("%.1fk rays, %.1fM in all", double(stats.rays) / 1e3, double(stats.total_rays) / 1e6));
-        overlay.print(text("error %.1f %% of what is seen%s", 100.0 * double(stats.visible_error),
-                           stats.light_pending ? ", light pending" : ""));
+        if (!light.warning.empty()) overlay.print(light.warning, {1, 0.6f, 0.1f});
+        if (renderer.shows_nothing()) {
+            overlay.print("no light where the camera looks", {1, 0.6f, 0.1f});
+        } else {
+            overlay.print(text("error %.1f %% of what is seen%s", 100.0 * double(stats.visible_error),
+                               stats.light_pending ? ", light pending" : ""));
+        }
         overlay.print(text("finished %.1f %% of what is seen, %.1f %% of all", 100.0 * double(stats.visible_finished),
                            100.0 * double(stats.finished)));
         overlay.print(text("%.1f MB of %.1f", double(stats.bytes) / 1e6, double(stats.bytes_full) / 1e6));
@@ -382,7 +401,8 @@ private:
     int width, height;
     Mode mode;
     Look look;
-    bool overlay_shown, all_is_new = false, is_starting = true;
+    bool overlay_shown, all_is_new = false, is_starting = true, finds_exposure = true;
+    long pictures = 0;
     double time = 0, frame_ms = 0; // frame_ms: of the frame before
     size_t screenshots_at = 0;
     std::FILE *csv = nullptr;

@@ -29,7 +29,7 @@ Picture:
   --camera PX,PY,PZ:TX,TY,TZ[:FOV]  position, target, vertical degrees [60]
   --up x|y|z                     up axis of the scene [y]
   --width N --height N           size of the picture [960 x 540]
-  --exposure F                   0: from the first frame [0]
+  --exposure F                   0: from what is seen [0]
   --shadow-maps --heat-map --no-overlay  how to begin
 Without a person:
   --path FILE                    lines `seconds px py pz tx ty tz` that the camera follows

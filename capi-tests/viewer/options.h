@@ -33,7 +33,7 @@ struct Options {
     float budget_ms = 4;
     uint32_t threads = 0; // 0: one per core
     int width = 960, height = 540;
-    float exposure = 0; // 0: from the first frame
+    float exposure = 0; // 0: from what is seen
     bool shadow_maps = false, heat_map = false, overlay = true;
     bool headless = false, realtime = false, check = false;
     long frames = 0; // 0: until the window is closed

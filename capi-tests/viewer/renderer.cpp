@@ -11,32 +11,32 @@ enum { PAGES, MATERIALS, SHADOWS, CELLS, LINEAR };
 
 struct Vertex {
     float position[3];
-    float uv[2];
-    uint16_t page, material;
+    float uv[2], back_uv[2];
+    uint16_t page, back_page, material;
 };
 
 const char SCENE_VERTEX[] = R"(#version 330 core
 layout(location = 0) in vec3 position;
-layout(location = 1) in vec2 lightmap_uv;
-layout(location = 2) in ivec2 numbers;
+layout(location = 1) in vec4 lightmap_uvs;
+layout(location = 2) in ivec3 numbers;
 uniform mat4 camera;
 out vec3 world;
-out vec2 uv;
-flat out int page, material;
+out vec2 uv, back_uv;
+flat out int page, back_page, material;
 
 void main()
 {
     world = position;
-    uv = lightmap_uv;
-    page = numbers.x, material = numbers.y;
+    uv = lightmap_uvs.xy, back_uv = lightmap_uvs.zw;
+    page = numbers.x, back_page = numbers.y, material = numbers.z;
     gl_Position = camera * vec4(position, 1);
 }
 )";
 
 const char SCENE_FRAGMENT_BEGIN[] = R"(#version 330 core
 in vec3 world;
-in vec2 uv;
-flat in int page, material;
+in vec2 uv, back_uv;
+flat in int page, back_page, material;
 out vec4 color;
 uniform sampler2DArray pages;
 uniform sampler2D materials;
@@ -53,7 +53,7 @@ const char SCENE_FRAGMENT_END[] = R"(
 void main()
 {
     vec3 normal = normalize(cross(dFdx(world), dFdy(world))); // of the side that is seen
-    vec3 irradiance = texture(pages, vec3(uv, page)).rgb;
+    vec3 irradiance = texture(pages, gl_FrontFacing ? vec3(uv, page) : vec3(back_uv, back_page)).rgb;
     if (shade_direct) irradiance += direct(world, normal);
     vec3 albedo = texelFetch(materials, ivec2(0, material), 0).rgb;
     color.rgb = albedo / 3.14159265 * irradiance + texelFetch(materials, ivec2(1, material), 0).rgb;
@@ -91,7 +91,7 @@ void main()
 Renderer::Renderer(const LiveLight &light, int width, int height, float exposure)
     : light(light),
       scene(SCENE_VERTEX, (std::string(SCENE_FRAGMENT_BEGIN) + Shadows::SHADER + SCENE_FRAGMENT_END).c_str()),
-      tone(TONE_VERTEX, TONE_FRAGMENT), exposure(exposure) {
+      tone(TONE_VERTEX, TONE_FRAGMENT), given_exposure(exposure > 0), exposure(exposure) {
     load_triangles();
     gl::GenVertexArrays(1, &nothing);
 
@@ -128,17 +128,19 @@ Renderer::Renderer(const LiveLight &light, int width, int height, float exposure
 // Corners of neighbouring triangles may lie apart in the light map, so each triangle has its own three.
 void Renderer::load_triangles() {
     std::vector<Vertex> corners;
-    std::vector<float> uvs;
-    std::vector<uint32_t> page;
+    std::vector<float> uvs, back_uvs;
+    std::vector<uint32_t> page, back_page;
     for (uint32_t m = 0; m < light.mesh_count(); m++) {
         const bk_mesh_view mesh = light.geometry(m);
         const std::vector<uint32_t> &material = light.triangle_materials(m);
         light.layout(m, uvs, page);
+        light.layout_of_backs(m, back_uvs, back_page);
         for (size_t t = 0; t < mesh.triangle_count; t++) {
             if (page[t] == BK_NONE) continue; // degenerate
             for (size_t c = 3 * t; c < 3 * t + 3; c++) {
                 const float *p = mesh.positions + 3 * size_t(mesh.indices[c]);
-                corners.push_back({{p[0], p[1], p[2]}, {uvs[2 * c], uvs[2 * c + 1]}, uint16_t(page[t]),
+                corners.push_back({{p[0], p[1], p[2]}, {uvs[2 * c], uvs[2 * c + 1]},
+                                   {back_uvs[2 * c], back_uvs[2 * c + 1]}, uint16_t(page[t]), uint16_t(back_page[t]),
                                    uint16_t(material.empty() ? 0 : material[t])});
             }
         }
@@ -152,8 +154,8 @@ void Renderer::load_triangles() {
     gl::BufferData(GL_ARRAY_BUFFER, GLsizeiptr(corners.size() * sizeof(Vertex)), corners.data(), GL_STATIC_DRAW);
     const auto offset = [](size_t bytes) { return reinterpret_cast<const void *>(bytes); };
     gl::VertexAttribPointer(0, 3, GL_FLOAT, GL_FALSE, sizeof(Vertex), offset(offsetof(Vertex, position)));
-    gl::VertexAttribPointer(1, 2, GL_FLOAT, GL_FALSE, sizeof(Vertex), offset(offsetof(Vertex, uv)));
-    gl::VertexAttribIPointer(2, 2, GL_UNSIGNED_SHORT, sizeof(Vertex), offset(offsetof(Vertex, page)));
+    gl::VertexAttribPointer(1, 4, GL_FLOAT, GL_FALSE, sizeof(Vertex), offset(offsetof(Vertex, uv)));
+    gl::VertexAttribIPointer(2, 3, GL_UNSIGNED_SHORT, sizeof(Vertex), offset(offsetof(Vertex, page)));
     for (GLuint attribute = 0; attribute < 3; attribute++) gl::EnableVertexAttribArray(attribute);
 }
 
@@ -201,7 +203,8 @@ void Renderer::set_cells() const {
     gl::Uniform1f(scene["cell_size"], info.cell_size);
 }
 
-// So that what is seen is a medium grey on average: of roots, or lamps would count too much.
+// So that what is seen is a medium grey on average: of roots, or lamps would count too much. The first picture jumps
+// there, later ones go a part of the way, so that nobody sees a step.
 void Renderer::expose() {
     std::vector<float> rgba(size_t(width) * height * 4);
     gl::ReadPixels(0, 0, width, height, GL_RGBA, GL_FLOAT, rgba.data());
@@ -213,7 +216,10 @@ void Renderer::expose() {
         sum += std::sqrt(luminance);
         lit++;
     }
-    if (lit > 0) exposure = 0.4f / float(std::pow(sum / lit, 2));
+    is_dark = lit == 0;
+    if (is_dark || given_exposure) return;
+    const float wanted = 0.4f / float(std::pow(sum / lit, 2));
+    exposure = exposure == 0 ? wanted : exposure * std::pow(wanted / exposure, 0.3f);
 }
 
 void Renderer::draw(const bk_camera &camera, const Look &look, GLuint target) {
@@ -242,7 +248,7 @@ void Renderer::draw(const bk_camera &camera, const Look &look, GLuint target) {
     if (look.heat_map) set_cells();
     if (look.direct_from_shadow_maps) shadows->set(scene, SHADOWS, light.is_switched_off());
     draw_triangles();
-    if (exposure == 0) expose();
+    if (look.find_exposure) expose();
 
     gl::BindFramebuffer(GL_FRAMEBUFFER, target);
     tone.use();

@@ -9,11 +9,12 @@
 struct Look {
     bool direct_from_shadow_maps = false; // the light map then holds indirect light alone
     bool heat_map = false;                // LODs of cells in colours
+    bool find_exposure = true;            // from this picture, unless one was given
 };
 
 class Renderer {
 public:
-    // exposure 0: from the first picture.
+    // exposure 0: from the pictures.
     Renderer(const LiveLight &light, int width, int height, float exposure);
 
     // New texels of the light map, four half floats each.
@@ -23,6 +24,8 @@ public:
     // Into the framebuffer, which may be 0, the window's.
     void draw(const bk_camera &camera, const Look &look, GLuint framebuffer);
     void resize(int width, int height);
+    // Whether the last picture from which exposure was to be found had no light in it.
+    bool shows_nothing() const { return is_dark; }
 
 private:
     void load_triangles();
@@ -37,5 +40,6 @@ private:
     GLuint pages, materials, cells, linear, depth, framebuffer = 0; // textures, and what linear and depth belong to
     std::optional<Shadows> shadows;
     int width = 0, height = 0;
+    bool given_exposure, is_dark = false;
     float exposure;
 };

@@ -87,6 +87,13 @@ rays() { awk -F, 'NR > 1 { rays += $8 } END { print rays + 0 }' "$1/frames.csv";
 difference=$(($(mean view/frame00000.png) - $(mean shadow-maps/frame00000.png)))
 [ "${difference#-}" -le 4 ] || fail "baked direct light and that of shadow maps differ by $difference"
 
+# A scene without lights is black, and says why: in the terminal and, in letters, on the screen.
+mkdir nothing
+xvfb-run -a -s '-screen 0 640x480x24' "$viewer" room.obj --light point:1,2.5,1:0,0,0 --texels-per-unit 16 --page-size 256 \
+    --width 320 --height 240 --headless --frames 3 --screenshot-every 2 --out nothing >message 2>&1 || fail 'without light: it fails'
+grep -q 'no light' message || fail "without light it says: $(cat message)"
+[ "$(mean nothing/frame00002.png)" -gt 0 ] || fail 'without light the screen says nothing'
+
 if "$viewer" room.obj --light lamp:1,2,3:4,5,6 2>message || ! grep -q 'lamp' message; then
     fail 'a wrong light is not named'
 fi

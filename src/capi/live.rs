@@ -10,14 +10,13 @@
 //! bk_live_lod_at) exclude updates only, not each other. Source: Schouls 2017, section 3.3.
 
 use super::args::{OutStruct, SizedStruct, init, read_struct, read_vec3, sized_struct, slice_mut, text, write};
-use super::device::refuse_in_callback;
+use super::device::{bk_progress_fn, progress as report_to, refuse_in_callback};
 use super::error::{BK_NONE, bk_result, call, call_or};
 use super::handles::{create, hold, is_null, object, release, retain};
 use super::lightmap::bk_lightmap;
 use super::read::{copy_rgb, texel_bytes};
 use crate::error::{Error, Result, invalid_argument};
 use crate::live::{Budget, CellInfo, Live, LiveCamera, LiveParams, LiveStats, Mode, PageRect};
-use crate::progress::Progress;
 use glam::Vec3;
 use std::ffi::{c_char, c_void};
 use std::path::Path;
@@ -339,11 +338,17 @@ pub unsafe extern "C" fn bk_cell_info_init(info: *mut bk_cell_info) {
 /// two for a large scene. All pages are dirty afterwards.
 ///
 /// lightmap: its layout is used; it need not be baked, is not changed, and may be released. params:
-/// NULL for the defaults. out: receives the live object, NULL on failure.
+/// NULL for the defaults. progress, user: told how far it is; NULL if not wanted. out: receives the live object,
+/// NULL on failure.
+///
+/// Fails with BK_ERROR_OUT_OF_MEMORY if memory is not to be had or the memory callback refuses, and with
+/// BK_ERROR_CANCELLED if progress says so; nothing is left behind then.
 #[unsafe(no_mangle)]
 pub unsafe extern "C" fn bk_live_create(
     lightmap: *mut bk_lightmap,
     params: *const bk_live_params,
+    progress: bk_progress_fn,
+    user: *mut c_void,
     out: *mut *mut bk_live,
 ) -> bk_result {
     // SAFETY: params and out are the caller's, or NULL.
@@ -353,7 +358,7 @@ pub unsafe extern "C" fn bk_live_create(
         let lightmap = hold(lightmap, "lightmap")?;
         let p: bk_live_params = if params.is_null() { SizedStruct::defaults() } else { read_struct(params, "params")? };
         let params = core_params(&p)?;
-        let live = lightmap.read(|l| Live::new(l, &params, &Progress::none()))?;
+        let live = lightmap.read(|l| Live::new(l, &params, &report_to(progress, user)))?;
         write(out, create(bk_live { live: RwLock::new(live) }), "out")
     })
 }
@@ -388,8 +393,9 @@ pub unsafe extern "C" fn bk_live_release(live: *mut bk_live) {
 ///
 /// A camera with coordinates that are not finite, with no extent or field of view, or whose forward
 /// and up are parallel, and a budget that is negative or not finite are refused
-/// (BK_ERROR_INVALID_ARGUMENT). BK_ERROR_OUT_OF_MEMORY if the memory callback refuses a higher LOD; what
-/// has been computed stays.
+/// (BK_ERROR_INVALID_ARGUMENT). BK_ERROR_OUT_OF_MEMORY if memory is not to be had or the memory callback
+/// refuses it, for a higher LOD or for indirect light that is being recomputed; what has been computed stays, and the
+/// next update tries again.
 #[unsafe(no_mangle)]
 pub unsafe extern "C" fn bk_live_update(
     live: *mut bk_live,
@@ -512,7 +518,7 @@ pub unsafe extern "C" fn bk_live_cell_lods(
     call(|| unsafe {
         let live = object!(live);
         let info = OutStruct::new(info, "info")?;
-        let (cells, lods) = live.read(|l| Ok(l.cell_lods()))?;
+        let (cells, lods) = live.read(Live::cell_lods)?;
         if capacity > 0 {
             if capacity < lods.len() {
                 return invalid_argument!("capacity is {capacity}, the grid has {} cells", lods.len());
@@ -568,36 +574,51 @@ pub unsafe extern "C" fn bk_live_pause(live: *mut bk_live, paused: u32) -> bk_re
 /// replaced once the new one is whole. Light that is older than the last change of a light is left
 /// out.
 ///
-/// path: UTF-8.
+/// path: UTF-8. progress, user: told how far it is; NULL if not wanted.
 ///
-/// Fails with BK_ERROR_IO if the file cannot be written.
+/// Fails with BK_ERROR_IO if the file cannot be written, and with BK_ERROR_CANCELLED if progress says so; an
+/// existing file is as it was then, and the live object too.
 #[unsafe(no_mangle)]
-pub unsafe extern "C" fn bk_live_save(live: *mut bk_live, path: *const c_char) -> bk_result {
+pub unsafe extern "C" fn bk_live_save(
+    live: *mut bk_live,
+    path: *const c_char,
+    progress: bk_progress_fn,
+    user: *mut c_void,
+) -> bk_result {
     call(|| {
         refuse_in_callback()?;
         // SAFETY: a handle, or NULL.
         let live = unsafe { hold(live, "live") }?;
         // SAFETY: path is the caller's, or NULL.
         let path = unsafe { text(path, "path") }?;
-        live.change(|l| l.save(Path::new(path)))
+        live.change(|l| l.save(Path::new(path), &report_to(progress, user)))
     })
 }
 
 /// Goes on from a file that was saved of the same scene, light map, lights and parameters (mode, cell
 /// size, promotion, blur and limits may differ). All pages are dirty afterwards.
 ///
-/// path: UTF-8.
+/// Every number of the file is checked to be one that updates could have arrived at: light is finite and >= 0, counts
+/// fit the light map. For a moment the call needs memory for the light that is shown twice.
 ///
-/// Fails with BK_ERROR_IO if the file cannot be read or is damaged, and with
-/// BK_ERROR_INVALID_ARGUMENT if it is of something else; nothing is changed then.
+/// path: UTF-8. progress, user: told how far it is; NULL if not wanted.
+///
+/// Fails with BK_ERROR_IO if the file cannot be read or is damaged, with BK_ERROR_INVALID_ARGUMENT if it is of
+/// something else, with BK_ERROR_OUT_OF_MEMORY if memory is not to be had or the memory callback refuses, and with
+/// BK_ERROR_CANCELLED if progress says so; nothing is changed then.
 #[unsafe(no_mangle)]
-pub unsafe extern "C" fn bk_live_restore(live: *mut bk_live, path: *const c_char) -> bk_result {
+pub unsafe extern "C" fn bk_live_restore(
+    live: *mut bk_live,
+    path: *const c_char,
+    progress: bk_progress_fn,
+    user: *mut c_void,
+) -> bk_result {
     call(|| {
         refuse_in_callback()?;
         // SAFETY: a handle, or NULL.
         let live = unsafe { hold(live, "live") }?;
         // SAFETY: path is the caller's, or NULL.
         let path = unsafe { text(path, "path") }?;
-        live.change(|l| l.restore(Path::new(path)))
+        live.change(|l| l.restore(Path::new(path), &report_to(progress, user)))
     })
 }

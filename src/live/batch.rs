@@ -92,9 +92,12 @@ impl Batch {
     }
 
     fn outcome(self) -> Outcome {
-        let result = match self.panicked.into_inner() {
-            true => Err(Error::Internal("work on a block of texels panicked".into())),
-            false => Ok(()),
+        let result = if self.panicked.into_inner() {
+            Err(Error::Internal("work on a block of texels panicked".into()))
+        } else if self.limit.out_of_memory.into_inner() {
+            Err(Error::OutOfMemory("direct light of a block of texels".into()))
+        } else {
+            Ok(())
         };
         let items = self.items.into_iter().map(|i| i.into_inner().unwrap_or_else(|e| e.into_inner()));
         (items.collect(), self.limit.traced.into_inner(), result)

@@ -5,11 +5,15 @@
 //! resolution); the texels of a lower LOD are among those of the next, so that no ray is lost when
 //! the detail grows, and what two LODs share at the border of two blocks has one value.
 
+use crate::error::{Error, Result};
 use crate::lightmap::Atlas;
 use crate::lightmap::gather::Gathered;
 use crate::lightmap::layout::Placement;
+use crate::memory::try_vec;
+use crate::progress::Progress;
 use crate::scene::NONE;
 use glam::Vec3;
+use rayon::prelude::*;
 use std::sync::Arc;
 
 /// Gather texels along a side of a block.
@@ -159,13 +163,41 @@ pub(super) struct Blocks {
 }
 
 impl Blocks {
-    pub fn new(blocks: Vec<Block>) -> Blocks {
-        let (status, work) = blocks.into_iter().map(|b| (b.status, Some(b.work))).unzip();
-        Blocks { status, work }
+    /// Idle blocks.
+    pub fn new(count: usize) -> Result<Blocks> {
+        let mut blocks = Blocks::away(&try_vec(count, "the state of blocks")?)?;
+        blocks.work.fill_with(|| Some(Box::default()));
+        Ok(blocks)
+    }
+
+    /// Blocks that are all away.
+    pub fn away(status: &[BlockStatus]) -> Result<Blocks> {
+        let mut copy = try_vec(status.len(), "the state of blocks")?;
+        copy.copy_from_slice(status);
+        let mut work = Vec::new();
+        work.try_reserve_exact(status.len()).map_err(|_| no_room(status.len()))?;
+        work.resize_with(status.len(), || None);
+        Ok(Blocks { status: copy, work })
+    }
+
+    /// Takes the place of those of these blocks that are not away.
+    pub fn replace_by(&mut self, new: Blocks) {
+        for (b, (status, work)) in (0..).zip(new.status.into_iter().zip(new.work)) {
+            if let Some(work) = work {
+                self.put(b, Block { status, work });
+            }
+        }
     }
 
     pub fn len(&self) -> usize {
         self.status.len()
+    }
+
+    /// All blocks, for threads that work on them where they are.
+    pub fn par_iter_mut(
+        &mut self,
+    ) -> impl IndexedParallelIterator<Item = (&mut BlockStatus, &mut Option<Box<BlockWork>>)> {
+        self.status.par_iter_mut().zip(&mut self.work)
     }
 
     /// How far the blocks are, by number.
@@ -227,6 +259,11 @@ impl BlockWork {
     }
 }
 
+#[cold]
+fn no_room(blocks: usize) -> Error {
+    Error::OutOfMemory(format!("there is no room for the state of {blocks} blocks of texels"))
+}
+
 /// All blocks of an atlas, and where they are.
 pub(super) struct BlockMap {
     pub atlas: Arc<Atlas>,
@@ -242,7 +279,7 @@ pub(super) struct BlockMap {
 
 impl BlockMap {
     /// Cuts the charts of an atlas into blocks. `lods`: 1 to [`MAX_LODS`].
-    pub fn new(atlas: &Arc<Atlas>, lods: u32) -> BlockMap {
+    pub fn new(atlas: &Arc<Atlas>, lods: u32, progress: &Progress) -> Result<BlockMap> {
         let top = (lods - 1) as u8;
         // The light map has as many, of the same sides of the same charts.
         let placements = &atlas.gather.layout.placements;
@@ -251,9 +288,14 @@ impl BlockMap {
             tiles: Vec::new(),
             first: Vec::with_capacity(placements.len() + 1),
             origin: Vec::with_capacity(placements.len()),
-            lod_of: vec![top; atlas.gather.len()],
+            lod_of: try_vec(atlas.gather.len(), "the LODs of the gather map")?,
             top,
         };
+        map.lod_of.fill(top);
+        let tiles = |p: &Placement| p.w.div_ceil(TILE as u16) as usize * p.h.div_ceil(TILE as u16) as usize;
+        let count = placements.iter().map(tiles).sum();
+        map.tiles.try_reserve_exact(count).map_err(|_| no_room(count))?;
+        let stage = progress.stage("blocks", 0.0, 0.02, count as u64);
         for (number, p) in (0..).zip(placements) {
             map.first.push(map.tiles.len() as u32);
             let (x, y, w, h) = (p.x as i32, p.y as i32, p.w as i32, p.h as i32);
@@ -264,10 +306,11 @@ impl BlockMap {
                 let rect = Rect { x0, y0, x1: (x0 + TILE).min(x + w), y1: (y0 + TILE).min(y + h) };
                 let tile = map.tile(atlas, number, rect);
                 map.tiles.push(tile);
+                stage.advance(1)?;
             }
         }
         map.first.push(map.tiles.len() as u32);
-        map
+        Ok(map)
     }
 
     fn tile(&mut self, atlas: &Atlas, placement: u32, rect: Rect) -> Tile {
@@ -388,7 +431,6 @@ fn rect_in_light_map(atlas: &Atlas, placement: u32, rect: &Rect) -> Rect {
 mod tests {
     use super::*;
     use crate::lightmap::{Lightmap, LightmapDesc};
-    use crate::progress::Progress;
     use crate::scene::{Material, Mesh, MeshMaterials, SceneData};
 
     /// A sheet with one vertex far away: its texels are so large that coordinates of neighbours round to one another.
@@ -403,7 +445,7 @@ mod tests {
             let scene = data.committed();
             let desc = LightmapDesc { page_size: 64, ..Default::default() };
             let lightmap = Lightmap::create(&scene, &desc, &Progress::none()).unwrap();
-            let map = BlockMap::new(lightmap.atlas(), 3);
+            let map = BlockMap::new(lightmap.atlas(), 3, &Progress::none()).unwrap();
             assert!(!map.tiles.is_empty());
             for tile in &map.tiles {
                 let whole = Rect::of(&map.atlas.map.layout.placements[tile.placement as usize]);

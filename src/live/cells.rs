@@ -3,6 +3,7 @@
 
 use super::blocks::{BlockStatus, MAX_LODS, Tile};
 use crate::error::{Result, invalid_argument};
+use crate::memory::try_vec;
 use glam::{UVec3, Vec3};
 
 /// Cells along the longest side unless the size is given.
@@ -32,6 +33,11 @@ pub(super) struct Grid {
 }
 
 impl CellInfo {
+    /// The number of cells, at most 2^24.
+    pub(super) fn cells(&self) -> usize {
+        self.dimensions.iter().product::<u32>() as usize
+    }
+
     /// Cell of a position; those outside are clamped.
     pub(super) fn cell(&self, position: Vec3) -> u32 {
         let at = ((position - self.origin) / self.cell_size).floor().max(Vec3::ZERO).as_uvec3();
@@ -68,7 +74,8 @@ impl Grid {
             return invalid_argument!("cell_size {cell_size} makes {cells} cells, more than {MAX_CELLS}");
         }
         let info = CellInfo { origin: lower, cell_size, dimensions: cells.as_uvec3().to_array() };
-        let mut grid = Grid { info, blocks: vec![Vec::new(); cells.element_product() as usize], occupied: Vec::new() };
+        let blocks = try_vec(info.cells(), "the cells of the grid")?;
+        let mut grid = Grid { info, blocks, occupied: Vec::new() };
         for (b, tile) in tiles.iter_mut().enumerate().filter(|(_, t)| !t.texels.is_empty()) {
             tile.cell = info.cell(tile.centre);
             grid.blocks[tile.cell as usize].push(b as u32);
@@ -102,12 +109,12 @@ pub(super) struct Promotion {
 }
 
 impl Promotion {
-    pub fn new(tiles: &[Tile], grid: &Grid) -> Promotion {
-        Promotion {
-            lods: vec![0; tiles.len()],
-            counts: vec![[0; MAX_LODS]; grid.blocks.len()],
-            common: vec![0; grid.blocks.len()],
-        }
+    pub fn new(tiles: &[Tile], grid: &Grid) -> Result<Promotion> {
+        Ok(Promotion {
+            lods: try_vec(tiles.len(), "the LODs of blocks")?,
+            counts: try_vec(grid.blocks.len(), "the LODs of cells")?,
+            common: try_vec(grid.blocks.len(), "the LODs of cells")?,
+        })
     }
 
     pub fn bytes(&self) -> usize {

@@ -5,6 +5,7 @@ use super::cells::Grid;
 use super::visibility::Visibility;
 use super::work::{Context, Step};
 use super::{LiveCamera, Mode};
+use crate::memory::try_vec;
 use crate::sampling::{combine, mix};
 use std::cmp::Ordering;
 
@@ -33,18 +34,21 @@ pub(super) struct Choice<'a> {
 }
 
 impl Chooser {
-    pub fn new(map: &BlockMap, grid: &Grid) -> Chooser {
-        let cells = grid.info.dimensions.iter().product::<u32>() as usize;
-        let open: Vec<bool> = map.tiles.iter().map(|t| !t.texels.is_empty()).collect();
-        Chooser {
+    pub fn new(map: &BlockMap, grid: &Grid) -> crate::Result<Chooser> {
+        let cells = grid.info.cells();
+        let mut open = try_vec(map.tiles.len(), "the blocks that are open")?;
+        open.iter_mut().zip(&map.tiles).for_each(|(open, tile)| *open = !tile.texels.is_empty());
+        let mut stale = try_vec(cells, "the cells that are stale")?;
+        stale.fill(true);
+        Ok(Chooser {
             open_count: open.iter().filter(|&&o| o).count(),
             open,
-            least: vec![None; cells],
-            stale: vec![true; cells],
+            least: try_vec(cells, "the progress of cells")?,
+            stale,
             visible: Vec::new(),
-            is_visible: vec![false; cells],
+            is_visible: try_vec(cells, "the cells that are visible")?,
             turn: 0,
-        }
+        })
     }
 
     pub fn bytes(&self) -> usize {

@@ -3,13 +3,16 @@
 //! when a page is read. The sums of the texels are left alone.
 
 use super::blocks::{BlockMap, Blocks, DirectTile, Rect, TILE};
+use super::in_parts;
 use super::relight::Illumination;
+use crate::error::{Error, Result};
 use crate::lightmap::blur::{Texels, Window};
 use crate::memory::try_vec;
 use crate::scene::NONE;
 use glam::Vec3;
 use rayon::prelude::*;
 use std::collections::HashMap;
+use std::sync::Arc;
 
 /// Unseen texels are filled from those that are seen within this distance.
 const FILLED: i32 = TILE;
@@ -19,7 +22,6 @@ const FILLED: i32 = TILE;
 const FADE: u8 = 6;
 
 /// What is shown.
-#[derive(Clone)]
 pub(super) struct Display {
     /// Indirect irradiance per gather texel, not blurred.
     plain: Vec<Vec3>,
@@ -47,7 +49,7 @@ pub(super) struct Display {
     /// interpolated and added to it, which keeps its detail. Empty until light changes.
     old: Vec<Vec3>,
     /// Direct light at full resolution, by block.
-    tiles: Vec<Option<DirectTile>>,
+    tiles: Vec<Option<Arc<DirectTile>>>,
     /// Changes of the lights before the tile was made, and so far.
     tile_epochs: Vec<u32>,
     epoch: u32,
@@ -64,7 +66,7 @@ pub(super) struct Changed {
 }
 
 impl Display {
-    pub fn new(map: &BlockMap, blur: u32) -> crate::Result<Display> {
+    pub fn new(map: &BlockMap, blur: u32) -> Result<Display> {
         let atlas = &map.atlas;
         let n = atlas.gather.len();
         let mut normals = try_vec(n, "the gather map's normals")?;
@@ -86,23 +88,65 @@ impl Display {
             variances,
             visible,
             unseen: HashMap::new(),
-            lods: vec![0; map.tiles.len()],
-            fresh: vec![0; map.tiles.len()],
+            lods: try_vec(map.tiles.len(), "the LODs of blocks")?,
+            fresh: try_vec(map.tiles.len(), "the LODs of blocks")?,
             old: Vec::new(),
-            tiles: vec![None; map.tiles.len()],
-            tile_epochs: vec![0; map.tiles.len()],
+            tiles: try_vec(map.tiles.len(), "the direct light of blocks")?,
+            tile_epochs: try_vec(map.tiles.len(), "the epochs of blocks")?,
             epoch: 0,
-            fades: vec![0; map.tiles.len()],
+            fades: try_vec(map.tiles.len(), "the fades of blocks")?,
             blur: blur as i32,
         })
+    }
+
+    /// A copy, which shares direct light at full resolution.
+    pub fn try_clone(&self) -> Result<Display> {
+        Ok(Display {
+            plain: copy_of(&self.plain)?,
+            shown: copy_of(&self.shown)?,
+            coarse: copy_of(&self.coarse)?,
+            coarse_of_tile: copy_of(&self.coarse_of_tile)?,
+            normals: copy_of(&self.normals)?,
+            variances: copy_of(&self.variances)?,
+            visible: copy_of(&self.visible)?,
+            unseen: self.unseen.clone(),
+            lods: copy_of(&self.lods)?,
+            fresh: copy_of(&self.fresh)?,
+            old: copy_of(&self.old)?,
+            tiles: copy_of(&self.tiles)?,
+            tile_epochs: copy_of(&self.tile_epochs)?,
+            epoch: self.epoch,
+            fades: copy_of(&self.fades)?,
+            blur: self.blur,
+        })
+    }
+
+    /// Bytes of direct light at full resolution.
+    pub fn tile_bytes(&self) -> usize {
+        self.tiles.iter().flatten().map(|t| t.bytes()).sum()
+    }
+
+    /// Bytes that [`make_room_for_epochs`](Self::make_room_for_epochs) will allocate.
+    pub fn room_missing_for_epochs(&self) -> usize {
+        let missing = |v: &Vec<Vec3>| self.plain.len().saturating_sub(v.capacity()) * size_of::<Vec3>();
+        missing(&self.old) + missing(&self.coarse_of_tile)
+    }
+
+    /// Makes room for what the next epochs of light keep, so that their beginning cannot fail.
+    pub fn make_room_for_epochs(&mut self) -> Result<()> {
+        for copy in [&mut self.old, &mut self.coarse_of_tile] {
+            copy.try_reserve_exact(self.plain.len() - copy.len())
+                .map_err(|_| Error::OutOfMemory("light of before a change".into()))?;
+        }
+        Ok(())
     }
 
     /// Bytes held, without the tiles.
     pub fn bytes(&self) -> usize {
         let per_texel = 4 * size_of::<Vec3>() + size_of::<f32>() + 1;
-        let per_block = size_of::<Option<DirectTile>>() + size_of::<u32>() + 3;
+        let per_block = size_of::<Option<Arc<DirectTile>>>() + size_of::<DirectTile>() + size_of::<u32>() + 3;
         self.plain.len() * per_texel
-            + (self.coarse_of_tile.len() + self.old.len()) * size_of::<Vec3>()
+            + (self.coarse_of_tile.capacity() + self.old.capacity()) * size_of::<Vec3>()
             + self.lods.len() * per_block
     }
 
@@ -198,15 +242,14 @@ impl Display {
     }
 
     /// What would be shown if no block were above a LOD.
-    pub fn lowered(&self, map: &BlockMap, lod: u8) -> Display {
-        let mut lower = self.clone();
+    pub fn lowered(&self, map: &BlockMap, lod: u8) -> Result<Display> {
+        let mut lower = self.try_clone()?;
         lower.lods.iter_mut().for_each(|l| *l = lod.min(*l));
         lower.fresh.iter_mut().for_each(|l| *l = lod.min(*l));
         lower.old = Vec::new();
         lower.fades.fill(0);
-        let all: Vec<u32> = (0..map.tiles.len() as u32).collect();
-        map.atlas.scene.device().install(|| lower.spread(map, &all));
-        lower
+        map.atlas.scene.device().install(|| in_parts(map.tiles.len()).for_each(|some| drop(lower.spread(map, &some))));
+        Ok(lower)
     }
 
     /// Has a block reach what is known in steps of [`fade`](Self::fade). Tells whether it did not already.
@@ -315,13 +358,14 @@ impl Display {
 
     /// Keeps what is shown as the light of before a change.
     pub fn begin_indirect_epoch(&mut self) {
-        self.old.clone_from(&self.plain);
+        self.old.clear();
+        self.old.extend_from_slice(&self.plain);
     }
 
     /// Has tiles that were made under other lights than those of now corrected by coarse light.
     pub fn begin_direct_epoch(&mut self) {
         if self.coarse_of_tile.is_empty() {
-            self.coarse_of_tile = self.coarse.clone();
+            self.coarse_of_tile.extend_from_slice(&self.coarse);
         }
         self.epoch += 1;
     }
@@ -368,13 +412,13 @@ impl Display {
         }
         self.tile_epochs[b as usize] = self.epoch;
         let grown = tile.bytes() as isize;
-        let old = self.tiles[b as usize].replace(tile);
+        let old = self.tiles[b as usize].replace(Arc::new(tile));
         (self.block_rect(map, b), grown - old.map_or(0, |t| t.bytes() as isize))
     }
 
     /// Direct light of a block at full resolution, and whether it is that of the lights of now.
     pub fn direct_tile(&self, b: u32) -> Option<(&DirectTile, bool)> {
-        self.tiles[b as usize].as_ref().map(|t| (t, self.tile_epochs[b as usize] == self.epoch))
+        self.tiles[b as usize].as_deref().map(|t| (t, self.tile_epochs[b as usize] == self.epoch))
     }
 
     /// The part of the light map that shows a block.
@@ -471,6 +515,14 @@ impl Display {
         });
         if total > 0.0 { sum / total } else { Vec3::ZERO }
     }
+}
+
+fn copy_of<T: Clone>(of: &[T]) -> Result<Vec<T>> {
+    let mut copy = Vec::new();
+    copy.try_reserve_exact(of.len())
+        .map_err(|_| Error::OutOfMemory(format!("a copy of shown light needs {} bytes", size_of_val(of))))?;
+    copy.extend_from_slice(of);
+    Ok(copy)
 }
 
 fn own_rect(map: &BlockMap, placement: u32) -> Rect {

@@ -27,12 +27,12 @@ pub use blocks::MAX_LODS;
 pub use cells::{CellInfo, NO_LOD};
 
 use crate::device::Device;
-use crate::error::{Result, invalid_argument};
+use crate::error::{Error, Result, invalid_argument};
 use crate::lightmap::bake::purpose;
 use crate::lightmap::direct::DirectLight;
 use crate::lightmap::gather::{Gathered, ROUND, SampleSet};
 use crate::lightmap::{BakeParams, Lightmap, blur::MAX_BLUR_RADIUS};
-use crate::memory::Reservation;
+use crate::memory::{Reservation, try_vec};
 use crate::progress::Progress;
 use crate::sampling::purpose_seed;
 use crate::scene::{Light, Scene};
@@ -179,6 +179,9 @@ const SPARE: f64 = 0.15;
 /// Light below this part of the scene's mean counts as dark.
 const DIM: f32 = 0.02;
 
+/// Blocks that are shown at once where all are: fewer than have a MB of texels.
+const SHOWN_AT_ONCE: usize = 512;
+
 /// Memory is announced to the monitor in steps of so many bytes.
 const MEMORY_STEP: usize = 1 << 20;
 
@@ -272,17 +275,29 @@ impl Live {
     /// baked and is not changed.
     pub fn new(lightmap: &Lightmap, params: &LiveParams, progress: &Progress) -> Result<Live> {
         params.validate()?;
+        let device = lightmap.atlas().scene.device();
+        device.run(progress, || {
+            let mut live = Live::idle(lightmap, params, progress)?;
+            live.start(progress)?;
+            Ok(live)
+        })
+    }
+
+    /// All that is needed, nothing computed but photons and radiance.
+    fn idle(lightmap: &Lightmap, params: &LiveParams, progress: &Progress) -> Result<Live> {
         let atlas = lightmap.atlas();
         let bake = params.bake();
-        let mut map = BlockMap::new(atlas, params.lod_count);
+        let mut map = BlockMap::new(atlas, params.lod_count, progress)?;
         let (lower, upper) = atlas.scene.bounds();
         let grid = Grid::new(lower, upper, params.cell_size, &mut map.tiles)?;
         let lights = atlas.scene.lights();
         let light = Illumination::new(atlas, &bake, progress)?;
+        progress.check()?;
         let display = Display::new(&map, params.blur)?;
+        progress.check()?;
         let bins = ChartBins::new(&map);
-        let chooser = Chooser::new(&map, &grid);
-        let promotion = Promotion::new(&map.tiles, &grid);
+        let chooser = Chooser::new(&map, &grid)?;
+        let promotion = Promotion::new(&map.tiles, &grid)?;
         let fixed = map.bytes()
             + display.bytes()
             + grid.bytes()
@@ -295,12 +310,14 @@ impl Live {
         let memory = atlas.scene.device().memory().reserve(fixed, "the live state")?;
         let all_of = |t: &Tile| t.texels.len() * size_of::<Gathered>() + t.map_texels as usize * size_of::<Vec3>();
         let full: usize = map.tiles.iter().map(all_of).sum();
-        let blocks = Blocks::new(map.tiles.iter().map(|_| Block::default()).collect());
-        let mut live = Live {
-            visibility: Visibility::new(blocks.len()),
+        let blocks = Blocks::new(map.tiles.len())?;
+        let mut waiting = VecDeque::new();
+        waiting.try_reserve_exact(blocks.len()).map_err(|_| Error::OutOfMemory("the queue of blocks".into()))?;
+        Ok(Live {
+            visibility: Visibility::new(blocks.len())?,
             dirty: Dirty::all(atlas.info.page_count, atlas.map.layout.page_size),
-            is_waiting: vec![false; blocks.len()],
-            waiting: VecDeque::new(),
+            is_waiting: try_vec(blocks.len(), "the queue of blocks")?,
+            waiting,
             fading: Vec::new(),
             bytes_full: (fixed + full) as u64,
             params: *params,
@@ -333,61 +350,58 @@ impl Live {
             display,
             bins,
             chooser,
-        };
-        live.start(progress)?;
-        Ok(live)
+        })
     }
 
-    /// The lowest LOD everywhere.
+    /// The lowest LOD everywhere. To be called in the pool.
     fn start(&mut self, progress: &Progress) -> Result<()> {
-        let stage = progress.stage("lowest LOD", 0.5, 1.0, self.blocks.len() as u64);
+        let stage = progress.stage("lowest LOD", 0.5, 0.9, self.blocks.len() as u64);
         let limit = Limit::new(None, u64::MAX);
         let context = self.context.clone();
-        let device = self.device();
         let top = context.map.top();
-        let mut blocks: Vec<Block> = context.map.tiles.iter().map(|_| Block::default()).collect();
-        device.install(|| {
-            (&mut blocks, &context.map.tiles).into_par_iter().try_for_each(|(block, tile)| {
-                if !tile.texels.is_empty() {
-                    block.work_on_coarse(&context, tile, &limit);
-                    block.work_on_indirect(&context, tile, &limit);
-                    // One or two texels that lie hidden inside something, or against it, tell nothing of
-                    // the others.
-                    while block.status.lod < top
-                        && tile.lod_end[block.status.lod as usize] <= 2
-                        && !block.work.sees_light()
-                        && block.work_on_indirect(&context, tile, &limit)
-                    {}
-                }
-                stage.advance(1)
-            })
+        self.blocks.par_iter_mut().zip(&context.map.tiles).try_for_each(|((status, home), tile)| {
+            if !tile.texels.is_empty()
+                && let Some(work) = home.take()
+            {
+                let mut block = Block { status: *status, work };
+                block.work_on_coarse(&context, tile, &limit);
+                block.work_on_indirect(&context, tile, &limit);
+                // One or two texels that lie hidden inside something, or against it, tell nothing of
+                // the others.
+                while block.status.lod < top
+                    && tile.lod_end[block.status.lod as usize] <= 2
+                    && !block.work.sees_light()
+                    && block.work_on_indirect(&context, tile, &limit)
+                {}
+                (*status, *home) = (block.status, Some(block.work));
+            }
+            stage.advance(1)
         })?;
-        self.blocks = Blocks::new(blocks);
         self.total_rays += limit.traced.into_inner();
         let sum: f64 = self.blocks.status().iter().map(|b| (b.mean + b.direct_mean) as f64).sum();
         self.context.dim = DIM * (sum / self.blocks.len() as f64) as f32;
         self.held = self.blocks.bytes() as isize;
-        let all: Vec<u32> = (0..self.blocks.len() as u32).collect();
-        let (display, blocks) = (&mut self.display, &mut self.blocks);
-        device.install(|| display.take_coarse(&context.map, blocks, &all));
-        self.display.lods = self.blocks.status().iter().map(|b| b.lod).collect();
+        let stage = progress.stage("show", 0.9, 1.0, 2 * self.blocks.len() as u64);
+        for some in in_parts(self.blocks.len()) {
+            self.display.take_coarse(&context.map, &mut self.blocks, &some);
+            stage.advance(some.len() as u64)?;
+        }
+        for (lod, status) in self.display.lods.iter_mut().zip(self.blocks.status()) {
+            *lod = status.lod;
+        }
         self.reserve(0)?;
-        self.show_all();
+        for some in in_parts(self.blocks.len()) {
+            self.display.refresh(&context.map, &self.blocks, &some);
+            stage.advance(some.len() as u64)?;
+        }
+        self.note_all_shown();
         Ok(())
     }
 
-    /// Shows all blocks as they are, and takes note of how far they are.
-    fn show_all(&mut self) {
-        let all: Vec<u32> = (0..self.blocks.len() as u32).collect();
-        let device = self.device();
-        let (display, blocks, map) = (&mut self.display, &self.blocks, &self.context.map);
-        display.end_fades();
-        device.install(|| display.refresh(map, blocks, &all));
+    /// Takes note of how far all blocks are, and that all pages show something else.
+    fn note_all_shown(&mut self) {
         let atlas = &self.context.map.atlas;
         self.dirty = Dirty::all(atlas.info.page_count, atlas.map.layout.page_size);
-        self.waiting.clear();
-        self.is_waiting.fill(false);
-        self.fading.clear();
         self.promotion.count(&self.context.map.tiles, self.blocks.status());
         self.chooser.note_all(&self.context, self.blocks.status());
     }
@@ -617,9 +631,22 @@ impl Live {
         Ok(())
     }
 
-    fn grow_fixed(&mut self, bytes: usize) {
-        self.fixed += bytes;
-        self.bytes_full += bytes as u64;
+    /// Gives back what was announced beyond what is held.
+    fn settle(&mut self) {
+        let held = self.fixed + self.held.max(0) as usize;
+        self.memory.shrink(held.next_multiple_of(MEMORY_STEP));
+    }
+
+    /// Has room for what the display keeps of the light of before a change, so that nothing fails when new light is
+    /// there.
+    fn make_room_for_epochs(&mut self) -> Result<()> {
+        self.reserve(self.display.room_missing_for_epochs())?;
+        let before = self.display.bytes();
+        let result = self.display.make_room_for_epochs();
+        let grown = self.display.bytes() - before;
+        self.fixed += grown;
+        self.bytes_full += grown as u64;
+        result
     }
 
     /// Takes new indirect light over, if there is any.
@@ -632,13 +659,11 @@ impl Live {
         };
         let before = self.context.light.clone();
         self.context.light = Arc::new(before.renewed(new));
-        let bytes = self.display.bytes();
         self.display.begin_indirect_epoch();
         if self.context.light.direct_epoch != before.direct_epoch {
             self.display.begin_direct_epoch();
             self.keep_direct_of_same_sides(&before);
         }
-        self.grow_fixed(self.display.bytes() - bytes);
         self.chooser.note_all(&self.context, self.blocks.status());
         Ok(())
     }
@@ -722,18 +747,19 @@ impl Live {
     }
 
     fn describe(&self, stats: &mut LiveStats) {
-        let (mut error, mut light, mut marks, mut done) = (0.0, 0.0, 0.0, 0.0);
+        let (mut error, mut light, mut marks, mut done) = (0f64, 0f64, 0.0, 0.0);
         for &b in &self.visibility.seen {
             let mark = self.visibility.mark(b);
             let block = self.status(b);
-            error += mark * (block.error * block.mean).powi(2);
-            light += mark * block.mean.powi(2);
+            let (part, mean) = (mark as f64, block.mean as f64);
+            error += part * (block.error as f64 * mean).powi(2);
+            light += part * mean * mean;
             done += if self.chooser.is_open(b) { 0.0 } else { mark };
             marks += mark;
         }
         stats.light_pending = self.relight.is_pending();
         if marks > 0.0 {
-            stats.visible_error = if light > 0.0 { (error / light).sqrt() } else { 0.0 };
+            stats.visible_error = if light > 0.0 { (error / light).sqrt() as f32 } else { 0.0 };
             stats.visible_finished = done / marks;
         }
         stats.finished = self.chooser.finished();
@@ -752,10 +778,10 @@ impl Live {
         }
         let direct = Arc::new(DirectLight::try_new(self.scene())?);
         self.collect_now()?;
-        let bytes = self.display.bytes();
-        self.display.begin_direct_epoch();
-        self.grow_fixed(self.display.bytes() - bytes);
+        self.make_room_for_epochs()?;
         self.relight.start(&self.context.map.atlas, &self.bake, &self.context.light.sides)?;
+        // Nothing fails from here on.
+        self.display.begin_direct_epoch();
         self.lights = lights;
         self.context.light = Arc::new(Illumination {
             direct,
@@ -787,9 +813,10 @@ impl Live {
 
     /// The light map grid, and the LOD that each of its cells shows ([`NO_LOD`]: no surfaces), x
     /// fastest.
-    pub fn cell_lods(&self) -> (CellInfo, Vec<u8>) {
-        let cells = self.grid.info.dimensions.iter().product::<u32>();
-        (self.grid.info, (0..cells).map(|c| self.grid.lod(c, &self.display.lods)).collect())
+    pub fn cell_lods(&self) -> Result<(CellInfo, Vec<u8>)> {
+        let mut lods = try_vec(self.grid.info.cells(), "the LODs of cells")?;
+        (0..).zip(&mut lods).for_each(|(c, lod)| *lod = self.grid.lod(c, &self.display.lods));
+        Ok((self.grid.info, lods))
     }
 
     /// The LOD shown at a position; `None` outside the grid and in cells without surfaces.
@@ -799,6 +826,7 @@ impl Live {
         lod.filter(|&l| l != NO_LOD)
     }
 
+    #[doc(hidden)]
     /// Sums and rays of every gather texel, by sample: the part of the state that bakes share. For
     /// tests.
     pub fn sums(&mut self) -> Result<Vec<([f32; 3], u32)>> {
@@ -822,6 +850,12 @@ impl Live {
         }
         Ok(())
     }
+}
+
+/// The numbers of all blocks, in parts that are shown at once.
+fn in_parts(blocks: usize) -> impl Iterator<Item = Vec<u32>> {
+    let end = blocks as u32;
+    (0..end).step_by(SHOWN_AT_ONCE).map(move |first| (first..end).take(SHOWN_AT_ONCE).collect())
 }
 
 impl Drop for Live {

@@ -81,7 +81,8 @@ impl Live {
         if r.area() == 0 {
             return Ok(out);
         }
-        let lower = (lod + 1 < self.params.lod_count).then(|| self.display.lowered(&self.context.map, lod as u8));
+        let is_lower = lod + 1 < self.params.lod_count;
+        let lower = is_lower.then(|| self.display.lowered(&self.context.map, lod as u8)).transpose()?;
         let display = lower.as_ref().unwrap_or(&self.display);
         let compose = |(i, out): (usize, &mut [[f32; 3]])| {
             let y0 = r.y0 + (i * ROWS) as i32;

@@ -206,6 +206,9 @@ impl Relight {
 
     /// The newest finished result. Does not wait.
     pub fn poll(&mut self, atlas: &Arc<Atlas>, params: &BakeParams, sides: &Arc<Sides>) -> Result<Option<Indirect>> {
+        if self.running.is_none() && !self.on_hold && std::mem::take(&mut self.again) {
+            self.start(atlas, params, sides)?;
+        }
         let Some(running) = &mut self.running else { return Ok(None) };
         let results = running.results.get_mut().unwrap_or_else(|e| e.into_inner());
         let mut newest: Option<Indirect> = None;
@@ -215,7 +218,9 @@ impl Relight {
                 // Because of yet another change.
                 Ok(Err(Error::Cancelled)) => {}
                 Ok(Err(e)) => {
-                    self.running = None;
+                    // What failed for want of memory may succeed another time. Its other part is broken off.
+                    self.retire();
+                    self.again = true;
                     return Err(e);
                 }
                 Err(TryRecvError::Empty) => break,
@@ -234,14 +239,21 @@ impl Relight {
     }
 }
 
+impl Relight {
+    /// Breaks the renewal under way off.
+    fn retire(&mut self) {
+        if let Some(running) = self.running.take() {
+            running.cancel.store(true, Relaxed);
+            running.abandon.store(true, Relaxed);
+        }
+    }
+}
+
 impl Drop for Relight {
     /// Breaks a renewal off and waits for its thread, unless this is that thread (the last reference was given back
     /// in a callback that it called): the renewal then ends after the callback has returned.
     fn drop(&mut self) {
-        if let Some(running) = &self.running {
-            running.cancel.store(true, Relaxed);
-            running.abandon.store(true, Relaxed);
-        }
+        self.retire();
         // Nobody else holds the device, so that its thread is joined here.
         self.device = None;
     }

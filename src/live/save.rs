@@ -1,17 +1,35 @@
 //! Saving and restoring what has been accumulated: rays per texel, and direct light.
 //!
 //! A file holds, in little-endian order: magic, fingerprint of what the state depends on, number of
-//! blocks, the blocks, and a checksum. Light of earlier epochs is not saved.
+//! blocks, the blocks, and a checksum. Light of earlier epochs is not saved. The checksum finds accidents; that every
+//! number is one that live updates could have arrived at is checked beside it.
 
-use super::Live;
-use super::blocks::{Block, BlockStatus, BlockWork, DirectTile};
+use super::blocks::{Block, BlockStatus, BlockWork, Blocks, DirectTile, Tile};
+use super::work::owns;
+use super::{Live, in_parts};
 use crate::error::{Error, Result, invalid_argument};
 use crate::files;
 use crate::lightmap::gather::{Gathered, ROUND};
+use crate::memory::try_vec;
+use crate::progress::Progress;
 use glam::Vec3;
+use std::io::Read;
 use std::path::Path;
 
-const MAGIC: [u8; 8] = *b"BKLIVE2\0";
+const MAGIC: [u8; 8] = *b"BKLIVE3\0";
+
+/// Bytes of magic, fingerprint and number of blocks.
+const HEAD: usize = 24;
+
+/// Bytes of a block beside its texels, and of a gathered texel.
+const BLOCK_BYTES: usize = 18;
+const TEXEL_BYTES: usize = 24;
+
+/// Bytes that are read, hashed or written between two looks at the progress.
+const PIECE: usize = 1 << 18;
+
+/// More light than this cannot be: each light is cut off at 1e30 W/m².
+const MOST_LIGHT: f32 = 1e37;
 
 /// FNV-1a, 64 bits.
 struct Hash(u64);
@@ -21,10 +39,12 @@ impl Hash {
         Hash(0xcbf2_9ce4_8422_2325)
     }
 
+    fn word(&mut self, word: u64) {
+        self.0 = (self.0 ^ word).wrapping_mul(0x0000_0100_0000_01b3);
+    }
+
     fn bytes(&mut self, bytes: &[u8]) {
-        for &b in bytes {
-            self.0 = (self.0 ^ b as u64).wrapping_mul(0x0000_0100_0000_01b3);
-        }
+        bytes.iter().for_each(|&b| self.word(b as u64));
     }
 }
 
@@ -35,59 +55,115 @@ struct Saved {
     direct: Option<Box<[Vec3]>>,
 }
 
+/// A number that is not one that updates could have arrived at, or the end of the file.
+struct Impossible(&'static str);
+
+type Field<T> = std::result::Result<T, Impossible>;
+
 impl Live {
-    /// Writes the accumulated state to a file, which is replaced as a whole.
-    pub fn save(&mut self, path: &Path) -> Result<()> {
+    /// Writes the accumulated state to a file, which is replaced as a whole. When that fails or is cancelled, an old
+    /// file of that name is as it was.
+    pub fn save(&mut self, path: &Path, progress: &Progress) -> Result<()> {
         self.collect_now()?;
-        let mut out = MAGIC.to_vec();
-        out.extend(self.fingerprint().to_le_bytes());
-        out.extend((self.blocks.len() as u64).to_le_bytes());
-        for b in 0..self.blocks.len() as u32 {
-            self.write_block(b, &mut out);
-        }
-        let mut sum = Hash::new();
-        sum.bytes(&out);
-        out.extend(sum.0.to_le_bytes());
-        files::replace_with(path, &out)
+        let live = &*self;
+        live.device().run(progress, || live.write(path, progress))
+    }
+
+    fn write(&self, path: &Path, progress: &Progress) -> Result<()> {
+        let fingerprint = self.fingerprint(progress)?;
+        let stage = progress.stage("save", 0.1, 1.0, self.blocks.len() as u64);
+        files::replace(path, |file| {
+            let (mut sum, mut out) = (Hash::new(), MAGIC.to_vec());
+            out.extend(fingerprint.to_le_bytes());
+            out.extend((self.blocks.len() as u64).to_le_bytes());
+            for b in 0..self.blocks.len() as u32 {
+                self.write_block(b, &mut out)?;
+                if out.len() >= PIECE {
+                    sum.bytes(&out);
+                    file.append(&out, |_| progress.check())?;
+                    out.clear();
+                }
+                stage.advance(1)?;
+            }
+            sum.bytes(&out);
+            out.extend(sum.0.to_le_bytes());
+            file.append(&out, |_| progress.check())
+        })
     }
 
     /// Goes on from a state that was saved of the same scene, light map, lights and parameters. A file
-    /// that is refused changes nothing.
-    pub fn restore(&mut self, path: &Path) -> Result<()> {
-        let bytes = files::read(path, u64::MAX - 1)?;
-        let saved = self.parse(&bytes, path)?;
+    /// that is refused, and a call that fails or is cancelled, change nothing.
+    pub fn restore(&mut self, path: &Path, progress: &Progress) -> Result<()> {
+        let device = self.device();
+        let bytes = device.run(progress, || self.read_file(path, progress))?;
+        self.restore_bytes(&bytes, &path.display().to_string(), progress)
+    }
+
+    /// [`restore`](Self::restore) from the bytes of a file; `name` is how errors call it.
+    pub fn restore_bytes(&mut self, bytes: &[u8], name: &str, progress: &Progress) -> Result<()> {
         self.collect_now()?;
+        let device = self.device();
+        device.run(progress, || {
+            let saved = self.parse(bytes, name, progress)?;
+            let result = self.take_saved(saved, progress);
+            self.settle();
+            result
+        })
+    }
+
+    /// Puts saved blocks in the place of those of now, when all that can fail has succeeded.
+    fn take_saved(&mut self, saved: Vec<Saved>, progress: &Progress) -> Result<()> {
         let direct = |s: &Saved| s.direct.as_ref().map_or(0, |d| size_of_val(&d[..]));
-        self.reserve(saved.iter().map(|s| s.block.work.bytes() + direct(s)).sum())?;
+        let held: usize = saved.iter().map(|s| s.block.work.bytes() + direct(s)).sum();
+        // Old and new state are held at once.
+        self.reserve(held + self.display.bytes())?;
+        let context = &self.context;
+        let mut display = self.display.try_clone()?;
+        if self.display.room_missing_for_epochs() == 0 {
+            // Indirect light may be on its way.
+            display.make_room_for_epochs()?;
+        }
+        display.end_fades();
+        let mut blocks = Blocks::away(self.blocks.status())?;
         for (b, saved) in (0u32..).zip(saved) {
             if saved.block.work.gathered.is_empty() {
                 // Nothing was known; what this object began with is more.
                 continue;
             }
-            let Some(old) = self.blocks.take(b) else { continue };
-            let mut block = saved.block;
-            block.status.coarse_epoch = old.status.coarse_epoch;
-            block.status.direct_mean = old.status.direct_mean;
-            block.status.indirect_epoch = self.context.light.indirect_epoch;
-            self.held += block.work.bytes() as isize - old.work.bytes() as isize;
+            let (old, mut block) = (self.blocks.status()[b as usize], saved.block);
+            block.status.coarse_epoch = old.coarse_epoch;
+            block.status.direct_mean = old.direct_mean;
+            block.status.direct_epoch = old.direct_epoch;
+            block.status.indirect_epoch = context.light.indirect_epoch;
             if let Some(values) = saved.direct
-                && block.status.changes_behind(&self.context) == 0
+                && block.status.changes_behind(context) == 0
             {
-                block.status.direct_epoch = self.context.light.direct_epoch;
-                let tile = &self.context.map.tiles[b as usize];
-                let rect = self.context.map.rect_in_light_map(tile.placement, &tile.rect);
-                self.held += self.display.take_direct(&self.context.map, b, DirectTile { rect, values }).1;
+                block.status.direct_epoch = context.light.direct_epoch;
+                let tile = &context.map.tiles[b as usize];
+                let rect = context.map.rect_in_light_map(tile.placement, &tile.rect);
+                display.take_direct(&context.map, b, DirectTile { rect, values });
             }
-            block.note_error(self.context.map.top());
-            self.display.lods[b as usize] = saved.shown;
-            self.blocks.put(b, block);
+            block.note_error(context.map.top());
+            display.lods[b as usize] = saved.shown;
+            blocks.put(b, block);
         }
-        self.show_all();
+        let stage = progress.stage("show", 0.6, 1.0, blocks.len() as u64);
+        for some in in_parts(blocks.len()) {
+            display.refresh(&context.map, &blocks, &some);
+            stage.advance(some.len() as u64)?;
+        }
+        // Nothing fails from here on.
+        self.display = display;
+        self.blocks.replace_by(blocks);
+        self.held = self.blocks.bytes() as isize + self.display.tile_bytes() as isize;
+        // Blocks of which nothing was saved go where they were going.
+        std::mem::take(&mut self.fading).into_iter().for_each(|b| self.wait(b));
+        self.note_all_shown();
         Ok(())
     }
 
     /// Of all that the accumulated light depends on.
-    fn fingerprint(&self) -> u64 {
+    fn fingerprint(&self, progress: &Progress) -> Result<u64> {
         let mut h = Hash::new();
         let atlas = &self.context.map.atlas;
         let p = &self.params;
@@ -100,27 +176,32 @@ impl Live {
             p.seed,
             p.direct_samples as u64,
         ] {
-            h.bytes(&n.to_le_bytes());
+            h.word(n);
         }
         h.bytes(format!("{:?}", self.lights).as_bytes());
-        for v in self.context.light.radiance.values.iter() {
-            v.to_array().iter().for_each(|c| h.bytes(&c.to_bits().to_le_bytes()));
+        for values in self.context.light.radiance.values.chunks(PIECE) {
+            values.iter().flat_map(|v| v.to_array()).for_each(|c| h.word(c.to_bits() as u64));
+            progress.check()?;
         }
-        for tile in &self.context.map.tiles {
-            tile.texels.iter().for_each(|t| h.bytes(&t.to_le_bytes()));
+        for tiles in self.context.map.tiles.chunks(PIECE / 64) {
+            tiles.iter().flat_map(|t| t.texels.iter()).for_each(|&t| h.word(t as u64));
+            progress.check()?;
         }
-        h.0
+        Ok(h.0)
     }
 
-    fn write_block(&self, b: u32, out: &mut Vec<u8>) {
+    fn write_block(&self, b: u32, out: &mut Vec<u8>) -> Result<()> {
         let fresh = BlockWork::default();
-        let (mut status, mut block) = (*self.status(b), self.blocks.work(b).unwrap_or(&fresh));
+        let Some(mut block) = self.blocks.work(b) else {
+            return Err(Error::Internal(format!("block {b} is being worked on while it is saved")));
+        };
+        let mut status = self.blocks.status()[b as usize];
         // What was gathered under an earlier light is left out.
         if status.has_old_light(&self.context) {
             (status, block) = (BlockStatus::default(), &fresh);
         }
         out.extend([status.fresh_lod, self.display.lods[b as usize].min(status.fresh_lod)]);
-        for n in [status.rounds, block.cursor, block.gathered.len() as u16] {
+        for n in [status.rounds, block.gathered.len() as u16] {
             out.extend(n.to_le_bytes());
         }
         out.extend(block.deviations.to_le_bytes());
@@ -136,103 +217,194 @@ impl Live {
         for v in tile.iter().flat_map(|t| t.values.iter()) {
             v.to_array().iter().for_each(|c| out.extend(c.to_le_bytes()));
         }
+        Ok(())
     }
 
-    fn parse(&self, bytes: &[u8], path: &Path) -> Result<Vec<Saved>> {
-        let bad = |what: &str| Error::Io(format!("{} {what}", path.display()));
-        let Some((content, sum)) = bytes.split_last_chunk::<8>().filter(|(c, _)| c.starts_with(&MAGIC)) else {
-            return Err(bad("is not a saved live state"));
-        };
-        let mut h = Hash::new();
-        h.bytes(content);
-        if h.0.to_le_bytes() != *sum {
-            return Err(bad("is damaged: its checksum does not fit"));
+    /// Reads a file that can be a saved state of this object, as far as its head tells.
+    fn read_file(&self, path: &Path, progress: &Progress) -> Result<Vec<u8>> {
+        let name = path.display();
+        let failed = |e: std::io::Error| Error::Io(format!("cannot read {name}: {e}"));
+        let mut file = files::open(path).map_err(failed)?;
+        let size = file.metadata().map_err(failed)?.len();
+        let mut head = [0; HEAD];
+        if size < HEAD as u64 {
+            return Err(not_saved(&name.to_string()));
         }
-        let mut from = Reader { bytes: &content[MAGIC.len()..] };
-        let damaged = || bad("is damaged");
-        if from.u64().ok_or_else(damaged)? != self.fingerprint() {
+        file.read_exact(&mut head).map_err(failed)?;
+        self.check_head(&head, &name.to_string(), progress)?;
+        let most = self.most_bytes();
+        if size > most {
+            return Err(Error::Io(format!("{name} is damaged: it has {size} bytes, {most} is the most")));
+        }
+        let mut bytes = try_vec::<u8>(size as usize, "the saved state")?;
+        bytes[..HEAD].copy_from_slice(&head);
+        let stage = progress.stage("read", 0.1, 0.2, size);
+        for piece in bytes[HEAD..].chunks_mut(PIECE) {
+            file.read_exact(piece).map_err(failed)?;
+            stage.advance(piece.len() as u64)?;
+        }
+        Ok(bytes)
+    }
+
+    /// The most bytes that a saved state of this object has.
+    fn most_bytes(&self) -> u64 {
+        let map = &self.context.map;
+        let direct = |t: &Tile| map.rect_in_light_map(t.placement, &t.rect).area() * size_of::<Vec3>();
+        let block = |t: &Tile| (BLOCK_BYTES + t.texels.len() * TEXEL_BYTES + direct(t)) as u64;
+        (HEAD + size_of::<u64>()) as u64 + map.tiles.iter().map(block).sum::<u64>()
+    }
+
+    /// Whether magic, fingerprint and number of blocks are those of a state of this object.
+    fn check_head(&self, head: &[u8; HEAD], name: &str, progress: &Progress) -> Result<()> {
+        let mut from = Reader { bytes: head };
+        let fields = (from.take::<8>(), from.u64(), from.u64());
+        let (Ok(MAGIC), Ok(fingerprint), Ok(count)) = fields else { return Err(not_saved(name)) };
+        if fingerprint != self.fingerprint(progress)? {
             return invalid_argument!(
-                "{} was saved of another scene or light map, under other lights or with other parameters",
-                path.display()
+                "{name} was saved of another scene or light map, under other lights or with other parameters"
             );
         }
-        let count = from.u64().ok_or_else(damaged)?;
         if count != self.blocks.len() as u64 {
-            return Err(damaged());
+            let blocks = self.blocks.len();
+            return Err(Error::Io(format!("{name} is damaged: it has {count} blocks of texels, not {blocks}")));
         }
-        (0..count as u32).map(|b| self.read_block(b, &mut from).ok_or_else(damaged)).collect()
+        Ok(())
     }
 
-    /// `None` if numbers are out of range.
-    fn read_block(&self, b: u32, from: &mut Reader) -> Option<Saved> {
+    fn parse(&self, bytes: &[u8], name: &str, progress: &Progress) -> Result<Vec<Saved>> {
+        let Some((content, sum)) = bytes.split_last_chunk::<8>() else { return Err(not_saved(name)) };
+        let Some((head, mut rest)) = content.split_first_chunk::<HEAD>() else { return Err(not_saved(name)) };
+        self.check_head(head, name, progress)?;
+        let stage = progress.stage("check", 0.2, 0.3, bytes.len() as u64);
+        let mut h = Hash::new();
+        for piece in content.chunks(PIECE) {
+            h.bytes(piece);
+            stage.advance(piece.len() as u64)?;
+        }
+        if h.0.to_le_bytes() != *sum {
+            return Err(Error::Io(format!("{name} is damaged: its checksum does not fit")));
+        }
+        let stage = progress.stage("parse", 0.3, 0.6, self.blocks.len() as u64);
+        let mut saved = Vec::new();
+        saved
+            .try_reserve_exact(self.blocks.len())
+            .map_err(|_| Error::OutOfMemory(format!("the {} blocks of {name} do not fit", self.blocks.len())))?;
+        let mut from = Reader { bytes: rest };
+        for b in 0..self.blocks.len() as u32 {
+            let block = self.read_block(b, &mut from);
+            saved.push(block.map_err(|e| Error::Io(format!("{name} is damaged: block {b} has {}", e.0)))?);
+            stage.advance(1)?;
+        }
+        rest = from.bytes;
+        if !rest.is_empty() {
+            return Err(Error::Io(format!("{name} is damaged: {} bytes follow its last block", rest.len())));
+        }
+        Ok(saved)
+    }
+
+    fn read_block(&self, b: u32, from: &mut Reader) -> Field<Saved> {
         let tile = &self.context.map.tiles[b as usize];
         let [lod, shown] = from.take()?;
-        let (rounds, cursor, count) = (from.u16()?, from.u16()?, from.u16()? as usize);
+        let (rounds, count) = (from.u16()?, from.u16()? as usize);
         let (deviations, deviation_count) = (from.f32()?, from.u32()?);
-        let top = self.context.map.top();
-        if lod > top || shown > lod || rounds as u32 > self.params.max_rounds || count > tile.texels.len() {
-            return None;
-        }
-        if cursor as usize > count || !(deviations >= 0.0) {
-            return None;
-        }
-        let most = self.params.max_rounds * ROUND as u32;
-        let gathered = |from: &mut Reader| {
-            let g = Gathered { sum: from.vec3()?, rays: from.u32()?, backs: from.u32()?, squares: from.f32()? };
-            (g.sum.is_finite()
-                && g.squares >= 0.0
-                && g.rays <= most
-                && g.rays.is_multiple_of(ROUND as u32)
-                && g.backs <= g.rays)
-                .then_some(g)
-        };
-        let gathered = (0..count).map(|_| gathered(from)).collect::<Option<Vec<_>>>()?;
-        let values = from.u32()? as usize;
-        let rect = self.context.map.rect_in_light_map(tile.placement, &tile.rect);
-        if values != 0 && values != rect.area() {
-            return None;
-        }
-        let direct = (0..values).map(|_| from.vec3()).collect::<Option<Box<[Vec3]>>>()?;
-        Some(Saved {
+        let most_rounds = self.params.max_rounds;
+        check(lod <= self.context.map.top() && shown <= lod, "an impossible LOD")?;
+        check(rounds as u32 <= most_rounds && (rounds > 0 || lod == 0), "an impossible number of rounds")?;
+        check(count <= tile.texels.len(), "more texels than there are")?;
+        // A LOD is complete, or nothing is known yet.
+        let complete = if rounds > 0 { tile.lod_end[lod as usize] as usize } else { 0 };
+        check(count >= complete, "fewer texels than its LOD")?;
+        check(deviations >= 0.0, "a deviation that is none")?;
+        check(deviation_count <= count as u32 * most_rounds, "more deviations than rounds")?;
+        let least = |i: usize| if i < complete { rounds as u32 * ROUND as u32 } else { 0 };
+        let gathered = (0..count).map(|i| from.gathered(least(i)..=most_rounds * ROUND as u32));
+        let gathered = gathered.collect::<Field<Vec<_>>>()?;
+        let direct = self.read_direct(tile, from)?;
+        // The step under way begins again; texels that have its rays are left alone.
+        Ok(Saved {
             block: Block {
                 status: BlockStatus { lod, fresh_lod: lod, rounds, ..Default::default() },
-                work: Box::new(BlockWork { cursor, gathered, deviations, deviation_count, ..Default::default() }),
+                work: Box::new(BlockWork { gathered, deviations, deviation_count, ..Default::default() }),
             },
             shown,
-            direct: (values > 0).then_some(direct),
+            direct,
         })
+    }
+
+    /// Direct light at full resolution: light where the block has texels, NaN elsewhere.
+    fn read_direct(&self, tile: &Tile, from: &mut Reader) -> Field<Option<Box<[Vec3]>>> {
+        let rect = self.context.map.rect_in_light_map(tile.placement, &tile.rect);
+        let count = from.u32()? as usize;
+        if count == 0 {
+            return Ok(None);
+        }
+        check(count == rect.area(), "direct light of another size")?;
+        let values = rect.texels().map(|(x, y)| {
+            let value = from.vec3()?;
+            if owns(&self.context, tile, x, y).is_none() {
+                check(value.is_nan_mask().all(), "direct light where it has no texel")?;
+                return Ok(Vec3::NAN);
+            }
+            check(is_light(value), NO_LIGHT)?;
+            Ok(value)
+        });
+        Ok(Some(values.collect::<Field<_>>()?))
     }
 }
 
-/// Numbers from bytes; `None` at their end.
+const NO_LIGHT: &str = "light that is negative, infinite or no number";
+
+fn not_saved(name: &str) -> Error {
+    Error::Io(format!("{name} is not a saved live state"))
+}
+
+fn is_light(v: Vec3) -> bool {
+    v.cmpge(Vec3::ZERO).all() && v.cmple(Vec3::splat(MOST_LIGHT)).all()
+}
+
+fn check(is_possible: bool, what: &'static str) -> Field<()> {
+    if is_possible { Ok(()) } else { Err(Impossible(what)) }
+}
+
+/// Numbers from bytes.
 struct Reader<'a> {
     bytes: &'a [u8],
 }
 
 impl Reader<'_> {
-    fn take<const N: usize>(&mut self) -> Option<[u8; N]> {
-        let (first, rest) = self.bytes.split_first_chunk()?;
+    fn take<const N: usize>(&mut self) -> Field<[u8; N]> {
+        let (first, rest) = self.bytes.split_first_chunk().ok_or(Impossible("no end"))?;
         self.bytes = rest;
-        Some(*first)
+        Ok(*first)
     }
 
-    fn u16(&mut self) -> Option<u16> {
+    fn u16(&mut self) -> Field<u16> {
         self.take().map(u16::from_le_bytes)
     }
 
-    fn u32(&mut self) -> Option<u32> {
+    fn u32(&mut self) -> Field<u32> {
         self.take().map(u32::from_le_bytes)
     }
 
-    fn u64(&mut self) -> Option<u64> {
+    fn u64(&mut self) -> Field<u64> {
         self.take().map(u64::from_le_bytes)
     }
 
-    fn f32(&mut self) -> Option<f32> {
+    fn f32(&mut self) -> Field<f32> {
         self.take().map(f32::from_le_bytes)
     }
 
-    fn vec3(&mut self) -> Option<Vec3> {
-        Some(Vec3::new(self.f32()?, self.f32()?, self.f32()?))
+    fn vec3(&mut self) -> Field<Vec3> {
+        Ok(Vec3::new(self.f32()?, self.f32()?, self.f32()?))
+    }
+
+    /// What a texel gathered with a number of rays in `rays`.
+    fn gathered(&mut self, rays: std::ops::RangeInclusive<u32>) -> Field<Gathered> {
+        let g = Gathered { sum: self.vec3()?, rays: self.u32()?, backs: self.u32()?, squares: self.f32()? };
+        check(rays.contains(&g.rays) && g.rays.is_multiple_of(ROUND as u32), "an impossible number of rays")?;
+        check(g.backs <= g.rays, "more rays at backs than rays")?;
+        check(is_light(g.sum) && g.squares >= 0.0, NO_LIGHT)?;
+        check(g.rays > 0 || (g.sum == Vec3::ZERO && g.squares == 0.0), "light without rays")?;
+        Ok(g)
     }
 }

@@ -3,6 +3,7 @@
 
 use super::LiveCamera;
 use super::blocks::BlockMap;
+use crate::memory::try_vec;
 use crate::sampling::{combine, sobol_2d};
 use crate::scene::NONE;
 use crate::trace::{PACKET_SIZE, Packet, RawHit};
@@ -28,8 +29,8 @@ pub(super) struct Visibility {
 }
 
 impl Visibility {
-    pub fn new(blocks: usize) -> Visibility {
-        Visibility { marks: vec![0.0; blocks], ..Default::default() }
+    pub fn new(blocks: usize) -> crate::Result<Visibility> {
+        Ok(Visibility { marks: try_vec(blocks, "marks of what is visible")?, ..Default::default() })
     }
 
     pub fn mark(&self, block: u32) -> f32 {
@@ -146,7 +147,7 @@ mod tests {
         for both_sides in [true, false] {
             let desc = LightmapDesc { texels_per_unit: 16.0, both_sides, ..Default::default() };
             let lightmap = Lightmap::create(&scene, &desc, &Progress::none()).unwrap();
-            let map = BlockMap::new(lightmap.atlas(), 3);
+            let map = BlockMap::new(lightmap.atlas(), 3, &Progress::none()).unwrap();
             let chart = lightmap.atlas().charts.chart_of[0];
             let [above, below] = [1.0, -1.0].map(|z| {
                 let hit = scene.intersect_raw(&Ray::new(Vec3::new(0.3, 0.4, z), Vec3::Z * -z));

@@ -8,6 +8,7 @@ use super::blocks::{Block, BlockMap, BlockStatus, BlockWork, DirectTile, DirectW
 use super::relight::Illumination;
 use crate::lightmap::gather::{Gathered, ROUND, SampleSet};
 use crate::lightmap::radiance::RadianceMap;
+use crate::memory::try_vec;
 use crate::sampling::combine;
 use crate::scene::NONE;
 use crate::trace::solids::is_buried;
@@ -62,11 +63,19 @@ pub(super) struct Limit {
     pub traced: AtomicU64,
     /// Set by whoever wants the work back.
     pub stopped: AtomicBool,
+    /// Set when memory for the work was not to be had.
+    pub out_of_memory: AtomicBool,
 }
 
 impl Limit {
     pub fn new(deadline: Option<Instant>, rays: u64) -> Limit {
-        Limit { deadline, rays, traced: AtomicU64::new(0), stopped: AtomicBool::new(false) }
+        Limit {
+            deadline,
+            rays,
+            traced: AtomicU64::new(0),
+            stopped: AtomicBool::new(false),
+            out_of_memory: AtomicBool::new(false),
+        }
     }
 
     /// Whether there is no room for more; asked before every texel.
@@ -228,6 +237,10 @@ impl Block {
         self.status.fresh_lod = lod;
         self.status.lod = self.status.lod.max(lod);
         self.status.rounds = rounds as u16;
+        if self.status.target(c).is_none() {
+            // A single round would leave it some weight for ever.
+            self.work.prior = Box::default();
+        }
         self.note_error(c.map.top());
         true
     }
@@ -252,7 +265,7 @@ impl Block {
         let n = values().count().max(1) as f32;
         let mean = values().sum::<f32>() / n;
         self.status.mean = mean;
-        self.status.error = if mean > 0.0 {
+        let error = if mean > 0.0 {
             let spread = (values().map(|v| (v - mean).powi(2)).sum::<f32>() / n).sqrt() / mean;
             let noise = if self.work.deviation_count > 0 {
                 (self.work.deviations / self.work.deviation_count as f32 / self.status.rounds.max(1) as f32).sqrt()
@@ -267,6 +280,8 @@ impl Block {
             // Dark, or the texels so far lie hidden inside something and those of the next LOD do not.
             (self.status.fresh_lod < top) as u8 as f32
         };
+        // Squares of light beyond 1e19 are too large for floats.
+        self.status.error = if error.is_finite() { error } else { 1.0 };
     }
 
     /// Direct light of the lowest LOD's texels.
@@ -288,11 +303,18 @@ impl Block {
     /// Direct light of the block's light map texels; tells whether it was completed.
     fn work_on_direct(&mut self, c: &Context, of: &Tile, limit: &Limit) -> bool {
         let under_way = self.work.direct.take().filter(|w| w.epoch == c.light.direct_epoch);
-        let mut direct = under_way.unwrap_or_else(|| {
+        let begin = || {
             let rect = c.map.rect_in_light_map(of.placement, &of.rect);
-            let tile = DirectTile { rect, values: vec![Vec3::NAN; rect.area()].into() };
-            DirectWork { tile, next: 0, epoch: c.light.direct_epoch }
-        });
+            // Far-away vertices can make a block as large as a page.
+            let mut values = try_vec(rect.area(), "direct light").ok()?;
+            values.fill(Vec3::NAN);
+            let tile = DirectTile { rect, values: values.into() };
+            Some(DirectWork { tile, next: 0, epoch: c.light.direct_epoch })
+        };
+        let Some(mut direct) = under_way.or_else(begin) else {
+            limit.out_of_memory.store(true, Relaxed);
+            return false;
+        };
         let (width, corner) = (direct.tile.rect.width().max(1), (direct.tile.rect.x0, direct.tile.rect.y0));
         while (direct.next as usize) < direct.tile.values.len() {
             if limit.reached() {
@@ -361,25 +383,25 @@ impl BlockWork {
     }
 }
 
-/// Direct light of a texel of the light map; `None` if it is none of the block's; infinite if
-/// it is inside a solid.
-fn direct_texel(c: &Context, tile: &Tile, x: i32, y: i32, rays: &mut u64) -> Option<Vec3> {
+/// The sample of a texel of the light map; `None` if it is none of the block's.
+pub(super) fn owns(c: &Context, tile: &Tile, x: i32, y: i32) -> Option<u32> {
     let a = &c.map.atlas;
     let sample = a.map.at(tile.placement, x, y);
-    if sample == NONE {
+    if sample == NONE || a.map.placement_of(&a.charts, sample as usize) != tile.placement {
         return None;
     }
     let t = &a.map.texels.samples[sample as usize];
-    if a.map.placement_of(&a.charts, sample as usize) != tile.placement {
-        return None;
-    }
     let at = a.gather.layout.texel_coord(tile.placement, a.charts.local(t.triangle, t.u, t.v));
     // One texel more than the block's own, so that rounding leaves no gaps between blocks.
     let own = tile.rect.grown(1);
     let (gx, gy) = (at[0].floor() as i32, at[1].floor() as i32);
-    if gx < own.x0 || gx >= own.x1 || gy < own.y0 || gy >= own.y1 {
-        return None;
-    }
+    (gx >= own.x0 && gx < own.x1 && gy >= own.y0 && gy < own.y1).then_some(sample)
+}
+
+/// Direct light of a texel of the light map; `None` if it is none of the block's; infinite if
+/// it is inside a solid.
+fn direct_texel(c: &Context, tile: &Tile, x: i32, y: i32, rays: &mut u64) -> Option<Vec3> {
+    let (a, sample) = (&c.map.atlas, owns(c, tile, x, y)?);
     let receiver = a.receiver(&a.map, &c.light.sides.backs, sample as usize);
     if is_buried(&a.scene, receiver.origin, receiver.geometric, rays) {
         return Some(Vec3::INFINITY);

@@ -61,7 +61,13 @@ pub fn run(args: &BakeArgs) -> Result<()> {
     crate::output::make_folder(&args.out)?;
     measure("pages", |progress| bakelite::io::lightmaps::write_exr_pages(&lightmap, &prefix, progress).map(drop))?;
     let params = LiveParams::default();
-    measure("live", |progress| Live::new(&lightmap, &params, progress).map(drop))
+    measure("live", |progress| Live::new(&lightmap, &params, progress).map(drop))?;
+    let mut live = Live::new(&lightmap, &params, &Progress::none())?;
+    let state = args.out.join("live");
+    measure("live save", |progress| live.save(&state, progress))?;
+    live.save(&state, &Progress::none())?;
+    measure("live restore", |progress| live.restore(&state, progress))?;
+    std::fs::remove_file(&state).map_err(|e| Error::Io(format!("cannot remove {}: {e}", state.display())))
 }
 
 /// Measures a call, first undisturbed, then cancelled.
