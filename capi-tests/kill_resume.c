@@ -46,10 +46,12 @@ static int bake(const char *checkpoint, const char *result, double seconds, long
     CHECK_OK(bk_scene_commit(scene, NULL, NULL));
     bk_lightmap_desc_init(&desc);
     desc.page_size = 256;
-    desc.texels_per_unit = 150.0f;
+    desc.texels_per_unit = 50.0f;
+    desc.gather_divisor = 2;
     CHECK_OK(bk_lightmap_create(scene, &desc, NULL, NULL, &lightmap));
     bk_bake_params_init(&params);
-    params.photon_count = 100000;
+    params.photon_count = 10000;
+    params.direct_samples = 4;
     params.checkpoint = checkpoint;
     params.checkpoint_seconds = (float)seconds;
     if (limit > 0) {
