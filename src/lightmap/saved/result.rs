@@ -65,7 +65,7 @@ impl Lightmap {
             texels: texels as u64,
         };
         let stage = progress.stage("saving", 0.0, 1.0, head.radiance + head.texels);
-        files::replace(path, |file| {
+        let write_file = |file: &mut files::Replacement| {
             let mut out = MAGIC.to_vec();
             let mut write = |out: &mut Vec<u8>, items: usize| {
                 file.append(out, |_| stage.advance(0))?;
@@ -86,13 +86,32 @@ impl Lightmap {
             }
             records::append(&mut out, DONE, &[]);
             write(&mut out, 0)
-        })
+        };
+        self.atlas.scene.device().run(progress, || files::replace(path, write_file))
     }
 
     /// Takes over the light of a result that was saved of a light map of the same scene, lights and layout. What was
     /// baked or loaded before stays where the file has no texels; it must be of a bake with the same parameters. A
     /// file that is refused changes nothing.
     pub fn load_result(&mut self, path: &Path, progress: &Progress) -> Result<()> {
+        let device = self.atlas.scene.device().clone();
+        let (light, plan, stitch) = device.run(progress, || {
+            let light = self.merged(path, progress)?;
+            let (mut plan, mut stats) = (light.plan.clone(), BakeStats::default());
+            let (all, params) = (0..self.atlas.map.len(), light.origin.map(|o| o.params).unwrap_or_default());
+            let stitch = self.stitch(&light, &all, &params, &mut plan, &mut stats, progress)?;
+            Ok((light, plan, stitch))
+        })?;
+        let all = 0..self.atlas.map.len();
+        let filling = self.filling(&light, &all)?;
+        // The last moment at which nothing has changed.
+        progress.check()?;
+        self.plan = plan;
+        device.install(|| self.store(light, all, stitch, filling))
+    }
+
+    /// The light that there is, not stitched, with that of a file.
+    fn merged(&self, path: &Path, progress: &Progress) -> Result<Light> {
         let mut file = Loading::open(path, self)?;
         let texels = self.atlas.map.len();
         let memory = self.atlas.scene.device().memory();
@@ -127,12 +146,7 @@ impl Lightmap {
             }
         }
         file.read_into(&mut light, self.atlas.charts.charts.len(), progress)?;
-        let (mut plan, mut stats) = (light.plan.clone(), BakeStats::default());
-        let all = 0..texels;
-        let stitch = self.stitch(&light, &all, &origin.params, &mut plan, &mut stats, progress)?;
-        let filling = self.filling(&light, &all)?;
-        self.plan = plan;
-        self.store(light, all, stitch, filling)
+        Ok(light)
     }
 }
 
