@@ -199,7 +199,7 @@ pub(super) mod tests {
         let mut crc = !0u32;
         for byte in &file[header..header + 17] {
             crc ^= u32::from(*byte);
-            (0..8).for_each(|_| crc = crc >> 1 ^ 0xedb8_8320 * (crc & 1));
+            (0..8).for_each(|_| crc = (crc >> 1) ^ (0xedb8_8320 * (crc & 1)));
         }
         file[header + 17..header + 21].copy_from_slice(&(!crc).to_be_bytes());
         let asked = Arc::new(AtomicI64::new(0));

@@ -11,6 +11,7 @@ use bakelite::trace::Ray;
 use bakelite::{Error, Progress, Result};
 use glam::{DVec3, Vec2, Vec3};
 use std::collections::BTreeMap;
+use std::collections::btree_map::Entry;
 use std::fmt::Write;
 use std::path::Path;
 
@@ -198,8 +199,8 @@ impl Points {
         let mut at: Vec<Option<(u32, [f32; 2])>> = Vec::new();
         for &(t, front, u, v) in &self.on {
             let (mesh, triangle) = scene.locate(t);
-            if !uvs.contains_key(&mesh) {
-                uvs.insert(mesh, [lightmap.mesh_back_uvs(mesh)?.0, lightmap.mesh_uvs(mesh)?]);
+            if let Entry::Vacant(entry) = uvs.entry(mesh) {
+                entry.insert([lightmap.mesh_back_uvs(mesh)?.0, lightmap.mesh_uvs(mesh)?]);
             }
             let (corners, pages) = &uvs[&mesh][usize::from(front)];
             let [a, b, c] = corners[triangle as usize].map(Vec2::from);
