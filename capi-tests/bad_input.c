@@ -866,8 +866,12 @@ static void memory(void) {
     device_desc.user = &limit;
     CHECK_OK(bk_device_create(&device_desc, &device));
     scene = empty_scene(device);
+    CHECK_ERROR(bk_scene_load_builtin(scene, "cornell"), BK_ERROR_OUT_OF_MEMORY, "refused");
+    CHECK(bk_scene_mesh_count(scene) == 0);
+    limit = (int64_t)1 << 30;
     add_floor(scene);
     CHECK_OK(bk_scene_add_light(scene, &lamp, NULL));
+    limit = 16;
     CHECK_ERROR(bk_scene_commit(scene, NULL, NULL), BK_ERROR_OUT_OF_MEMORY, "refused");
     limit = (int64_t)1 << 30;
     CHECK_OK(bk_scene_commit(scene, NULL, NULL));

@@ -10,7 +10,7 @@ use super::args::{
     OutStruct, SizedStruct, check_flags, init, read_optional, read_strided, read_struct, sized_struct, write_optional,
 };
 use super::error::{BK_NONE, bk_result, call, call_or};
-use super::handles::object;
+use super::handles::{hold, object};
 use super::scene::bk_scene;
 use crate::error::{Result, invalid_argument};
 use crate::scene::{LightmapUvs, Material, Mesh, MeshMaterials, NONE, SceneData};
@@ -183,7 +183,8 @@ pub unsafe extern "C" fn bk_scene_add_mesh(
 ) -> bk_result {
     // SAFETY: desc, the arrays in it and out_id are the caller's, or NULL.
     call(|| unsafe {
-        let scene = object!(scene);
+        // The memory callback may release it.
+        let scene = hold(scene, "scene")?;
         let desc = read_struct(desc, "desc")?;
         let id = scene.describe_large("meshes can be added", bytes(&desc), || read_mesh(&desc), SceneData::add_mesh)?;
         write_optional(out_id, id)

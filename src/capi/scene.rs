@@ -385,7 +385,8 @@ fn load_file(
 #[unsafe(no_mangle)]
 pub unsafe extern "C" fn bk_scene_load_builtin(scene: *mut bk_scene, name: *const c_char) -> bk_result {
     call(|| {
-        let scene = object!(scene);
+        // SAFETY: a handle or NULL. The memory callback may release it.
+        let scene = unsafe { hold(scene, "scene") }?;
         // SAFETY: name is the caller's, or NULL.
         let name = unsafe { text(name, "name") }?;
         scene.describe("scenes can be loaded", |d| d.append(builtin(name)?, &scene.device))

@@ -13,7 +13,7 @@
 
 use super::args::{init, read_struct, sized_struct, write_optional};
 use super::error::{bk_result, call};
-use super::handles::{is_null, object};
+use super::handles::{hold, is_null};
 use super::scene::bk_scene;
 use crate::error::{Result, invalid_argument};
 use crate::scene::{Environment, MAX_ENVIRONMENT_SIZE, MAX_TEXTURE_SIZE, SceneData, Texture};
@@ -74,7 +74,8 @@ pub unsafe extern "C" fn bk_scene_add_texture(
 ) -> bk_result {
     // SAFETY: desc, the texels and out_id are the caller's, or NULL.
     call(|| unsafe {
-        let scene = object!(scene);
+        // The memory callback may release it.
+        let scene = hold(scene, "scene")?;
         let desc = read_struct(desc, "desc")?;
         let read = || read_texture(&desc);
         let id = scene.describe_large("textures can be added", bytes(&desc, 4), read, SceneData::add_texture)?;
@@ -110,7 +111,8 @@ pub unsafe extern "C" fn bk_scene_add_environment(
 ) -> bk_result {
     // SAFETY: desc, the texels and out_id are the caller's, or NULL.
     call(|| unsafe {
-        let scene = object!(scene);
+        // The memory callback may release it.
+        let scene = hold(scene, "scene")?;
         let desc = read_struct(desc, "desc")?;
         let id = scene.describe_large(
             "environments can be added",
