@@ -3,7 +3,7 @@
 use super::args::text;
 use super::device::{bk_progress_fn, progress, refuse_in_callback};
 use super::error::{bk_result, call};
-use super::handles::{is_null, object};
+use super::handles::{hold, is_null, object};
 use super::lightmap::bk_lightmap;
 use crate::error::{Error, Result, invalid_argument};
 use crate::lightmap::{Layer, LayerData, Lightmap};
@@ -214,7 +214,8 @@ pub unsafe extern "C" fn bk_lightmap_save(
 ) -> bk_result {
     call(|| {
         refuse_in_callback()?;
-        let lightmap = object!(lightmap);
+        // SAFETY: a handle or NULL. It is held: callbacks may release the caller's.
+        let lightmap = unsafe { hold(lightmap, "lightmap") }?;
         // SAFETY: path_prefix is the caller's, or NULL.
         let prefix = unsafe { text(path_prefix, "path_prefix") }?;
         lightmap.read(|l| save(l, prefix, file_format, &self::progress(progress, user)))
