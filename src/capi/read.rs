@@ -256,8 +256,9 @@ pub unsafe extern "C" fn bk_lightmap_save_result(
 ) -> bk_result {
     call(|| {
         refuse_in_callback()?;
-        let lightmap = object!(lightmap);
-        // SAFETY: path is the caller's, or NULL.
+        // SAFETY: a handle or NULL; path is the caller's, or NULL. A callback may release the handle: it is held.
+        let lightmap = unsafe { hold(lightmap, "lightmap") }?;
+        // SAFETY: see above.
         let path = unsafe { text(path, "path") }?;
         lightmap.read(|l| l.save_result(path.as_ref(), &self::progress(progress, user)))
     })
@@ -285,8 +286,9 @@ pub unsafe extern "C" fn bk_lightmap_load_result(
 ) -> bk_result {
     call(|| {
         refuse_in_callback()?;
-        let lightmap = object!(lightmap);
-        // SAFETY: path is the caller's, or NULL.
+        // SAFETY: a handle or NULL; path is the caller's, or NULL. A callback may release the handle: it is held.
+        let lightmap = unsafe { hold(lightmap, "lightmap") }?;
+        // SAFETY: see above.
         let path = unsafe { text(path, "path") }?;
         lightmap.change(|l| l.load_result(path.as_ref(), &self::progress(progress, user)))
     })
