@@ -360,16 +360,16 @@ static void bake(const bk_scene *scene, const char *prefix) {
 static const float SHELF[4][3] = {{-0.8f, -0.8f, 1}, {0.8f, -0.8f, 1}, {0.8f, 0.8f, 1}, {-0.8f, 0.8f, 1}};
 static const uint32_t SHELF_TRIANGLES[2][3] = {{0, 1, 2}, {0, 2, 3}};
 
-static bk_lightmap *both_sides_of(const bk_scene *scene, uint32_t struct_size, struct bk_lightmap_info *info) {
+static bk_lightmap *both_sides_of(const bk_scene *scene, uint32_t struct_size, uint32_t both, struct bk_lightmap_info *info) {
     bk_lightmap *lightmap = NULL;
     bk_lightmap_desc desc;
     bk_lightmap_desc_init(&desc);
-    CHECK(desc.both_sides == 0);
+    CHECK(desc.both_sides == 1);
     desc.struct_size = struct_size;
     desc.page_size = PAGE;
     desc.texels_per_unit = 8.0f;
     desc.gather_divisor = desc.radiance_divisor = 2;
-    desc.both_sides = 1;
+    desc.both_sides = both;
     CHECK_OK(bk_lightmap_create(scene, &desc, NULL, NULL, &lightmap));
     bk_lightmap_info_init(info);
     CHECK_OK(bk_lightmap_info(lightmap, info));
@@ -406,15 +406,19 @@ static void both_sides(bk_device *device) {
     CHECK_OK(bk_scene_add_mesh(scene, &mesh, &id));
     CHECK_OK(bk_scene_commit(scene, NULL, NULL));
 
-    /* Callers whose structures end before the field get what they got before. */
-    lightmap = both_sides_of(scene, (uint32_t)offsetof(bk_lightmap_desc, both_sides), &info);
+    /* Callers whose structures end before the field get the default. */
+    lightmap = both_sides_of(scene, (uint32_t)offsetof(bk_lightmap_desc, both_sides), 0, &info);
+    CHECK(info.both_sided_charts == 1);
+    bk_lightmap_release(lightmap);
+
+    lightmap = both_sides_of(scene, sizeof(bk_lightmap_desc), 0, &info);
     CHECK(info.both_sided_charts == 0 && info.back_texels == 0);
     CHECK_OK(bk_lightmap_mesh_uvs(lightmap, id, front, pages));
     CHECK_OK(bk_lightmap_mesh_back_uvs(lightmap, id, back, back_pages, own));
     CHECK(memcmp(front, back, 12 * sizeof(float)) == 0 && pages[1] == back_pages[1] && own[0] == 0 && own[1] == 0);
     bk_lightmap_release(lightmap);
 
-    lightmap = both_sides_of(scene, sizeof(bk_lightmap_desc), &info);
+    lightmap = both_sides_of(scene, sizeof(bk_lightmap_desc), 1, &info);
     CHECK(info.both_sided_charts == 1 && info.back_texels >= 12 * 12 && info.page_count == 1);
     memset(&old_info, 0xab, sizeof old_info);
     old_info.struct_size = (uint32_t)offsetof(struct bk_lightmap_info, both_sided_charts);

@@ -70,10 +70,11 @@ pub struct bk_lightmap_desc {
     /// Light map texels per texel of the radiance map (what gather rays see), along each axis, 1 to 64.
     /// Default: 4.
     pub radiance_divisor: u32,
-    /// Whether two-sided charts from both sides of which one sees something get a second place for their
-    /// backs, which bk_lightmap_mesh_back_uvs tells of; the open is something to see where the sun or a
-    /// sky shines as the light map is created. Without one, a chart shows the side that the bake
-    /// chooses. 0: no, any other value: yes. Default: 0.
+    /// Whether two-sided charts of which both sides are seen from open places get a second place for their
+    /// backs, which bk_lightmap_mesh_back_uvs tells of. Open places have free space around them; those
+    /// outside of buildings count where a sun or a sky shines as the light map is created. Without a second
+    /// place, a chart shows the side that is seen, or the one that the bake chooses. 0: no, any other value:
+    /// yes. Default: 1.
     pub both_sides: u32,
 }
 

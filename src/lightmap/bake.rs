@@ -2,6 +2,7 @@
 
 use super::blur::Filling;
 use super::bright::Bright;
+use super::buried::Search;
 use super::charts::{Charts, automatic_density};
 use super::direct::DirectLight;
 use super::gather::{Gathered, SampleSet};
@@ -11,6 +12,7 @@ use super::plan::{Plan, left_out};
 use super::radiance::{self, Radiance, RadianceInput, RadianceMap};
 use super::saved::checkpoint::Checkpoint;
 use super::seams::Stitch;
+use super::seen::{self, Seen};
 use super::sides;
 use super::texels::TexelMap;
 use super::upsample::{OWN_RAYS, OwnLight, OwnRays, Upsampling};
@@ -26,7 +28,6 @@ use crate::progress::Progress;
 use crate::sampling::{combine, purpose_seed};
 use crate::scene::Scene;
 use crate::trace::offset::too_few_digits;
-use crate::trace::solids::is_buried;
 use glam::Vec3;
 use rayon::prelude::*;
 use std::ops::Range;
@@ -85,21 +86,33 @@ impl Lightmap {
         };
         let radiance = pack(desc.radiance_divisor, 0, false, &two_sided)?;
         let stage = progress.stage("texels", 0.5, 0.6, TexelMap::work(&radiance));
-        let radiance = ChartMap::new(scene, &charts, radiance, &stage)?;
-        let with_backs = if desc.both_sides {
-            let stage = progress.stage("sides", 0.6, 0.65, two_sided.len() as u64);
-            sides::seen_from_both(scene, &radiance, &two_sided, &stage)?
-        } else {
-            Vec::new()
-        };
+        let mut radiance = ChartMap::new(scene, &charts, radiance, &stage)?;
+        let texel = 1.0 / density;
+        let stage = progress.stage("sides", 0.6, 0.65, Seen::work(&radiance));
+        let seen = scene.device().install(|| Seen::count(scene, &charts, &radiance, texel, &stage))?;
+        let with_backs = if desc.both_sides { sides::seen_from_both(&seen, &radiance, &two_sided) } else { Vec::new() };
         let map = pack(1, desc.padding, true, &with_backs)?;
         let gather = pack(desc.gather_divisor, 0, false, &with_backs)?;
-        let stage = progress.stage("texels", 0.65, 1.0, TexelMap::work(&map) + TexelMap::work(&gather));
-        let map = ChartMap::new(scene, &charts, map, &stage)?;
-        let gather = ChartMap::new(scene, &charts, gather, &stage)?;
+        let stage = progress.stage("texels", 0.65, 0.8, TexelMap::work(&map) + TexelMap::work(&gather));
+        let mut map = ChartMap::new(scene, &charts, map, &stage)?;
+        let mut gather = ChartMap::new(scene, &charts, gather, &stage)?;
+        let placements = [&map, &gather, &radiance].map(|map| map.layout.placements.len() as u64);
+        let stage = progress.stage("buried texels", 0.8, 1.0, placements.iter().sum());
+        let near = texel.min(seen::ROOM * scene.diagonal());
+        let search = Search { scene, charts: &charts, seen: &seen, near };
+        let mut sight_rays = seen.rays;
+        let mut move_buried = |map: &mut ChartMap| -> Result<Vec<bool>> {
+            let (buried, rays) = scene.device().install(|| search.move_buried(map, &stage))?;
+            sight_rays += rays;
+            Ok(buried)
+        };
+        move_buried(&mut radiance)?;
+        move_buried(&mut gather)?;
+        let buried = move_buried(&mut map)?;
         uvs.overlapping_texels = map.texels.overlapping_texels;
         uvs.reduced_charts = map.layout.reduced;
-        let bytes = charts.bytes() + map.bytes() + gather.bytes() + radiance.bytes();
+        let own_bytes = charts.bytes() + seen.bytes() + buried.len();
+        let bytes = own_bytes + map.bytes() + gather.bytes() + radiance.bytes();
         let info = LightmapInfo {
             page_count: map.layout.page_count,
             width: map.layout.page_size,
@@ -114,17 +127,21 @@ impl Lightmap {
             uvs,
             both_sided_charts: with_backs.len() as u32,
             back_texels: (map.len() - map.back_start) as u64,
+            buried_texels: buried.iter().filter(|&&b| b).count() as u64,
+            open_places: seen.places,
+            sight_rays,
         };
-        let memory = scene.device().memory().reserve(charts.bytes(), "the charts")?;
+        let memory = scene.device().memory().reserve(own_bytes, "the charts")?;
         if let Some(message) = too_few_digits(scene, "texels", 1.0 / density, OFFSET_PART) {
             scene.device().log(LogLevel::Warning, &message);
         }
         let direct = DirectLight::try_new(scene)?;
         let mut plan =
             Plan::new(scene, &direct, &BakeParams::default(), !two_sided.is_empty(), uvs.unwrapped_charts > 0);
-        plan.note_both_sides(&info);
+        plan.note_sides(&info);
         let scene = scene.clone();
-        let atlas = Atlas { scene, charts, map, gather, radiance, padding: desc.padding, info, _memory: memory };
+        let padding = desc.padding;
+        let atlas = Atlas { scene, charts, map, gather, radiance, padding, info, seen, buried, _memory: memory };
         Ok(Lightmap { atlas: Arc::new(atlas), plan, light: None })
     }
 
@@ -163,7 +180,7 @@ impl Lightmap {
         let two_sided = !self.atlas.radiance.layout.back_of.is_empty();
         let mut plan =
             Plan::new(&self.atlas.scene, &direct, params, two_sided, self.atlas.info.uvs.unwrapped_charts > 0);
-        plan.note_both_sides(&self.atlas.info);
+        plan.note_sides(&self.atlas.info);
         let device = self.atlas.scene.device().clone();
         device.memory().reset_peak();
         let range = params.texel_begin as usize..end as usize;
@@ -184,38 +201,21 @@ impl Lightmap {
             let stitch = self.stitch(&light, &range, params, &mut plan, &mut stats, progress)?;
             Ok((light, stats, stitch))
         })?;
-        let filling = self.filling(&light, &range)?;
         // The last moment at which nothing has changed.
         progress.check()?;
         stats.left_out = plan.left_out;
         stats.peak_bytes = device.memory().peak() as u64;
         self.plan = plan;
         let start = Instant::now();
-        device.install(|| self.store(light, range, stitch, filling))?;
+        device.install(|| self.store(light, range, stitch));
         stats.compose.seconds = start.elapsed().as_secs_f64();
         stats.seconds += stats.compose.seconds;
         Ok(stats)
     }
 
-    /// The filling of what [`store`](Self::store) will make of `new` light of a range of samples: a hidden texel beside a
-    /// lit one would show as a dark rim under bilinear filtering.
-    pub(super) fn filling(&self, new: &Light, range: &Range<usize>) -> Result<Filling> {
-        let before = self.light.as_ref().filter(|_| range.len() < self.atlas.map.len());
-        let state = |i: usize| before.filter(|_| !range.contains(&i)).unwrap_or(new).state[i];
-        let is = |s: TexelState| move |i: usize| state(i) == s;
-        Filling::new(self.atlas.map.len(), is(TexelState::Visible), is(TexelState::Hidden))
-    }
-
-    /// Takes the light of a range of samples over. Hidden texels are filled here, from all that has
-    /// been baked so far, and seams are stitched anew: whatever the shards, the last one leaves the
-    /// bits of a whole bake.
-    pub(super) fn store(
-        &mut self,
-        new: Light,
-        range: Range<usize>,
-        stitch: Option<Stitch>,
-        filling: Filling,
-    ) -> Result<()> {
+    /// Takes the light of a range of samples over. Seams are stitched anew: whatever the shards, the last one leaves
+    /// the bits of a whole bake.
+    pub(super) fn store(&mut self, new: Light, range: Range<usize>, stitch: Option<Stitch>) {
         match &mut self.light {
             Some(old) if range.len() < self.atlas.map.len() => {
                 if let Some(mut before) = old.stitch.take() {
@@ -231,13 +231,11 @@ impl Lightmap {
             }
             light => *light = Some(new),
         }
-        let Some(light) = &mut self.light else { return Ok(()) };
-        filling.fill(&self.atlas.charts, &self.atlas.map, &mut light.direct, &Progress::none())?;
+        let Some(light) = &mut self.light else { return };
         if let Some(mut stitch) = stitch {
             stitch.swap(light);
             light.stitch = Some(stitch);
         }
-        Ok(())
     }
 }
 
@@ -501,7 +499,6 @@ impl Bake<'_, '_> {
         let rays = AtomicU64::new(0);
         let range = self.range.clone();
         let backs = &light.backs[..];
-        let is_lit = indirect.is_some() || self.plan.runs(left_out::DIRECT);
         scene.device().install(|| {
             let direct = light.direct[range.clone()].par_chunks_mut(BLOCK);
             let indirect_out = light.indirect[range.clone()].par_chunks_mut(BLOCK);
@@ -521,10 +518,10 @@ impl Bake<'_, '_> {
                     self.progress.check()?;
                     let sample = first + i;
                     let receiver = l.receiver(&l.map, backs, sample);
-                    state[i] = TexelState::Visible;
-                    if is_lit && is_buried(scene, receiver.origin, receiver.geometric, &mut traced) {
-                        state[i] = TexelState::Hidden;
-                    }
+                    state[i] = match l.buried.get(sample) {
+                        Some(true) => TexelState::Hidden,
+                        _ => TexelState::Visible,
+                    };
                     if self.plan.runs(left_out::DIRECT) {
                         let seed = combine(seed, sample as u32);
                         direct[i] = self.direct.irradiance(&receiver, self.params.direct_samples, seed, &mut traced);

@@ -47,6 +47,12 @@ impl Placement {
         let [s, t] = if self.swap { [local[1], local[0]] } else { local };
         [self.offset[0] + self.scale[0] * s, self.offset[1] + self.scale[1] * t]
     }
+
+    /// The point of a placed chart at a texel coordinate.
+    pub fn local(&self, coord: [f32; 2]) -> [f32; 2] {
+        let [s, t] = [0, 1].map(|i| (coord[i] - self.offset[i]) / self.scale[i]);
+        if self.swap { [t, s] } else { [s, t] }
+    }
 }
 
 /// Where all charts lie in the square pages of a map.

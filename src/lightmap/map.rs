@@ -3,7 +3,7 @@
 use super::charts::Charts;
 use super::direct::Receiver;
 use super::layout::Layout;
-use super::texels::TexelMap;
+use super::texels::{TexelMap, TexelSample};
 use crate::error::Result;
 use crate::progress::Stage;
 use crate::scene::{NONE, Scene};
@@ -77,7 +77,11 @@ impl ChartMap {
 
     /// The point of a sample and its side as a receiver.
     pub(crate) fn receiver(&self, scene: &Scene, sample: usize, back: bool) -> (SurfacePoint, Receiver) {
-        let t = &self.texels.samples[sample];
+        Self::receiver_at(scene, &self.texels.samples[sample], back)
+    }
+
+    /// A point on a triangle and its side as a receiver.
+    pub(crate) fn receiver_at(scene: &Scene, t: &TexelSample, back: bool) -> (SurfacePoint, Receiver) {
         let point = SurfacePoint::new(scene.corners(t.triangle), t.u, t.v, scene);
         let (mesh, triangle) = scene.locate(t.triangle);
         let mesh = &scene.meshes()[mesh as usize];

@@ -8,6 +8,7 @@ mod area;
 pub(crate) mod bake;
 pub mod blur;
 pub(crate) mod bright;
+mod buried;
 pub mod charts;
 pub mod direct;
 mod distant;
@@ -23,6 +24,7 @@ pub(crate) mod radiance;
 mod read;
 pub(crate) mod saved;
 mod seams;
+mod seen;
 mod sides;
 mod spherical;
 mod terminator;
@@ -43,6 +45,7 @@ use radiance::Radiance;
 pub use read::MeshUvs;
 pub use saved::CheckpointParams;
 use saved::fingerprint::Origin;
+use seen::Seen;
 use std::sync::Arc;
 
 /// How a light map is laid out.
@@ -58,9 +61,10 @@ pub struct LightmapDesc {
     pub gather_divisor: u32,
     /// Light map texels per radiance map texel, along each axis.
     pub radiance_divisor: u32,
-    /// Whether two-sided charts from both sides of which one sees something get a second place for their backs
-    /// ([`Lightmap::mesh_back_uvs`]); the open is something to see where the sun or a sky shines as the light map is
-    /// created. Without one, a chart shows the side that the bake chooses.
+    /// Whether two-sided charts of which both sides are seen from open places get a second place for their backs
+    /// ([`Lightmap::mesh_back_uvs`]). Open places have free space around them; those outside of buildings count where a sun
+    /// or a sky shines as the light map is created. Without a second place, a chart shows the side that is seen, or the one
+    /// that the bake chooses.
     pub both_sides: bool,
 }
 
@@ -72,7 +76,7 @@ impl Default for LightmapDesc {
             padding: 2,
             gather_divisor: 4,
             radiance_divisor: 4,
-            both_sides: false,
+            both_sides: true,
         }
     }
 }
@@ -96,6 +100,13 @@ pub struct LightmapInfo {
     pub both_sided_charts: u32,
     /// Of `texels`, those of the second places.
     pub back_texels: u64,
+    /// Of `texels`, those that nobody can see, inside solids and below or behind other surfaces. They take the places of
+    /// the nearest that can be seen.
+    pub buried_texels: u64,
+    /// Open places from which was looked around to tell which sides are seen. 0 if no material is two-sided.
+    pub open_places: u64,
+    /// Rays that this and finding buried texels took.
+    pub sight_rays: u64,
 }
 
 /// How to bake.
@@ -220,7 +231,7 @@ enum TexelState {
     /// Not part of any bake yet.
     #[default]
     Unbaked,
-    /// Inside a solid; its light is filled in from its neighbours.
+    /// Nobody can see it; it shows the light of the nearest one that can be seen.
     Hidden,
     Visible,
 }
@@ -268,6 +279,9 @@ pub(crate) struct Atlas {
     pub radiance: ChartMap,
     pub padding: u32,
     pub info: LightmapInfo,
+    pub seen: Seen,
+    /// Whether each texel of the light map has the place of another one. Empty if none has.
+    pub buried: Vec<bool>,
     _memory: Reservation,
 }
 
@@ -282,6 +296,15 @@ impl Atlas {
     /// A sample of the light map or the gather map as a receiver, on the side that it shows.
     pub(crate) fn receiver(&self, map: &ChartMap, backs: &[bool], sample: usize) -> direct::Receiver {
         map.receiver(&self.scene, sample, self.is_back(map, backs, sample)).1
+    }
+
+    /// Where a sample of the light map lies in its chart, which for a buried texel is not where its light is from.
+    pub(crate) fn texel_local(&self, placement: u32, sample: usize) -> [f32; 2] {
+        let t = &self.map.texels.samples[sample];
+        match self.buried.get(sample) {
+            Some(true) => self.map.layout.placements[placement as usize].local([t.x, t.y].map(|c| f32::from(c) + 0.5)),
+            _ => self.charts.local(t.triangle, t.u, t.v),
+        }
     }
 
     /// The gather texels around a sample of the light map, with their bilinear weights.

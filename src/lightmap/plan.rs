@@ -174,8 +174,20 @@ impl Plan {
         }
     }
 
-    /// Tells of charts with a second place for their backs.
-    pub(crate) fn note_both_sides(&mut self, info: &LightmapInfo) {
+    /// Tells of charts with a second place for their backs, and of texels that nobody can see.
+    pub(crate) fn note_sides(&mut self, info: &LightmapInfo) {
+        if info.open_places > 0 {
+            self.run(&format!(
+                "sides by what is seen from {} open places; {} rays for this and for buried texels",
+                info.open_places, info.sight_rays
+            ));
+        }
+        if info.buried_texels > 0 {
+            self.run(&format!(
+                "{} of {} texels, which nobody can see, show the nearest that can be seen",
+                info.buried_texels, info.texels
+            ));
+        }
         if info.both_sided_charts > 0 {
             self.run(&format!(
                 "both sides of {} two-sided charts; their backs take {} of {} texels",

@@ -476,9 +476,8 @@ impl Display {
         if !with_direct {
             return indirect;
         }
-        let t = &atlas.map.texels.samples[sample as usize];
         let placement = atlas.map.placement_of(&atlas.charts, sample as usize);
-        let local = atlas.charts.local(t.triangle, t.u, t.v);
+        let local = atlas.texel_local(placement, sample as usize);
         // Coordinates are not negative, so that truncation rounds down.
         let at = atlas.gather.layout.texel_coord(placement, local);
         let b = map.block_at(placement, at[0] as i32, at[1] as i32) as usize;

@@ -11,7 +11,6 @@ use crate::lightmap::radiance::RadianceMap;
 use crate::memory::try_vec;
 use crate::sampling::combine;
 use crate::scene::NONE;
-use crate::trace::solids::is_buried;
 use glam::Vec3;
 use std::sync::Arc;
 use std::sync::atomic::{AtomicBool, AtomicU64, Ordering::Relaxed};
@@ -330,7 +329,6 @@ impl Block {
             limit.traced.fetch_add(rays, Relaxed);
             direct.next += 1;
         }
-        fill_hidden(&mut direct.tile);
         self.status.direct_epoch = direct.epoch;
         self.work.new_direct = Some(direct.tile);
         true
@@ -390,8 +388,7 @@ pub(super) fn owns(c: &Context, tile: &Tile, x: i32, y: i32) -> Option<u32> {
     if sample == NONE || a.map.placement_of(&a.charts, sample as usize) != tile.placement {
         return None;
     }
-    let t = &a.map.texels.samples[sample as usize];
-    let at = a.gather.layout.texel_coord(tile.placement, a.charts.local(t.triangle, t.u, t.v));
+    let at = a.gather.layout.texel_coord(tile.placement, a.texel_local(tile.placement, sample as usize));
     // One texel more than the block's own, so that rounding leaves no gaps between blocks.
     let own = tile.rect.grown(1);
     let (gx, gy) = (at[0].floor() as i32, at[1].floor() as i32);
@@ -403,42 +400,5 @@ pub(super) fn owns(c: &Context, tile: &Tile, x: i32, y: i32) -> Option<u32> {
 fn direct_texel(c: &Context, tile: &Tile, x: i32, y: i32, rays: &mut u64) -> Option<Vec3> {
     let (a, sample) = (&c.map.atlas, owns(c, tile, x, y)?);
     let receiver = a.receiver(&a.map, &c.light.sides.backs, sample as usize);
-    if is_buried(&a.scene, receiver.origin, receiver.geometric, rays) {
-        return Some(Vec3::INFINITY);
-    }
     Some(c.light.direct.irradiance(&receiver, c.direct_samples, combine(c.direct_seed, sample), rays))
-}
-
-/// Gives texels inside solids (marked infinite) the mean of their neighbours, ring by ring; without
-/// any visible one in the tile, black.
-fn fill_hidden(tile: &mut DirectTile) {
-    let width = tile.rect.width();
-    let mut hidden: Vec<usize> = (0..tile.values.len()).filter(|&i| tile.values[i].x == f32::INFINITY).collect();
-    while !hidden.is_empty() {
-        let ring: Vec<(usize, Vec3)> = hidden
-            .iter()
-            .filter_map(|&i| {
-                let (x, y) = ((i % width) as i32, (i / width) as i32);
-                let (mut sum, mut n) = (Vec3::ZERO, 0.0);
-                for (nx, ny) in (-1..=1).flat_map(|dy| (-1..=1).map(move |dx| (x + dx, y + dy))) {
-                    if nx >= 0 && ny >= 0 && (nx as usize) < width && (ny as usize) < tile.rect.height() {
-                        let v = tile.values[ny as usize * width + nx as usize];
-                        if v.is_finite() {
-                            sum += v;
-                            n += 1.0;
-                        }
-                    }
-                }
-                (n > 0.0).then(|| (i, sum / n))
-            })
-            .collect();
-        if ring.is_empty() {
-            hidden.iter().for_each(|&i| tile.values[i] = Vec3::ZERO);
-            return;
-        }
-        for &(i, v) in &ring {
-            tile.values[i] = v;
-        }
-        hidden.retain(|&i| !tile.values[i].is_finite());
-    }
 }

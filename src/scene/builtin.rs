@@ -1,13 +1,14 @@
 //! Scenes made by code, for tests, examples and first steps.
 
 use super::atrium::{atrium, atrium_camera};
+use super::rooms::{furniture, furniture_camera, partition, partition_camera};
 use super::shapes::MeshBuilder;
 use super::{Light, Material, SceneData};
 use crate::error::{Result, invalid_argument};
 use glam::Vec3;
 
 /// The names that [`builtin`] knows.
-pub const BUILTIN_NAMES: &[&str] = &["cornell", "furnace", "sealed", "atrium"];
+pub const BUILTIN_NAMES: &[&str] = &["cornell", "furnace", "sealed", "atrium", "furniture", "partition"];
 
 /// A pinhole camera.
 #[derive(Clone, Copy, Debug, PartialEq)]
@@ -28,6 +29,8 @@ pub struct Camera {
 ///   irradiance is π · 1 / (1 − 0.5) = 2π.
 /// - `sealed`: a closed box that hangs in a lit room. Mesh 0 is the room, 1 the inside of the box,
 ///   where the irradiance is exactly 0, 2 its outside, one centimetre away.
+/// - `furniture`: a room with furniture 1 to 3 cm off its walls. `partition`: two rooms with a wall of 2 cm between them
+///   that leaves a gap, and a lamp in one. Both for measurements of the light.
 /// - `atrium`: two floors around a court, columns, arches, drapes; a rect light and a sun.
 pub fn builtin(name: &str) -> Result<SceneData> {
     match name {
@@ -35,6 +38,8 @@ pub fn builtin(name: &str) -> Result<SceneData> {
         "furnace" => furnace(),
         "sealed" => sealed(),
         "atrium" => atrium(),
+        "furniture" => furniture(),
+        "partition" => partition(),
         _ => invalid_argument!("there is no built-in scene {name:?}; there are {}", BUILTIN_NAMES.join(", ")),
     }
 }
@@ -48,6 +53,8 @@ pub fn builtin_camera(name: &str) -> Option<Camera> {
         "furnace" => looking(Vec3::new(0.1, 0.5, 0.1), Vec3::new(0.6, 0.4, 0.6), 1.2),
         "sealed" => looking(Vec3::new(0.3, 2.4, 0.3), Vec3::new(2.2, 1.2, 2.2), 1.2),
         "atrium" => Some(atrium_camera()),
+        "furniture" => Some(furniture_camera()),
+        "partition" => Some(partition_camera()),
         _ => None,
     }
 }

@@ -8,6 +8,7 @@ mod environment;
 mod light;
 mod material;
 mod mesh;
+mod rooms;
 pub mod shapes;
 mod texture;
 

@@ -15,7 +15,6 @@ mod kernels;
 pub mod offset;
 mod packet;
 mod single;
-pub(crate) mod solids;
 mod tree;
 mod triangle;
 

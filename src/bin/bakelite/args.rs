@@ -56,7 +56,7 @@ Light map:
   --padding N            texels around each chart [2]
   --gather-divisor N     light map texels per gather map texel and axis [4]
   --radiance-divisor N   light map texels per radiance map texel and axis [4]
-  --both-sides           places for both sides of two-sided charts that are seen from both
+  --one-side             one side of each two-sided chart, also where both are seen
 Bake:
   --photons N            photons emitted [1000000]
   --bounces N            most reflections; 0: Russian roulette alone decides [0]
@@ -383,7 +383,7 @@ fn option(name: &str, parser: &mut lexopt::Parser, bake: &mut BakeArgs) -> Resul
         "padding" => desc.padding = number(&flag, &value()?)?,
         "gather-divisor" => desc.gather_divisor = number(&flag, &value()?)?,
         "radiance-divisor" => desc.radiance_divisor = number(&flag, &value()?)?,
-        "both-sides" => desc.both_sides = true,
+        "one-side" => desc.both_sides = false,
         "photons" => params.photon_count = number(&flag, &value()?)?,
         "bounces" => params.max_bounces = number(&flag, &value()?)?,
         "gather-rays" => params.gather_rays = number(&flag, &value()?)?,
@@ -642,7 +642,7 @@ mod tests {
              --light rect:0,0,0:1,0,0:0,0,1:2,2,2 --texels-per-unit 2.5 --page-size 256 --padding 3 --gather-divisor 2 \
              --radiance-divisor 16 --photons 5 --bounces 6 --gather-rays 7 --radius 0.5 --blur 8 --direct-samples 9 \
              --seed 10 --threads 2 --isa portable --bins 32 --leaf 4 --build high --compact --camera 0,1,2:3,4,5:40 --up z --width 64 \
-             --height 48 --reference-spp 3 --out o --no-glb --both-sides --quiet --checkpoint c --checkpoint-seconds 2.5 \
+             --height 48 --reference-spp 3 --out o --no-glb --one-side --quiet --checkpoint c --checkpoint-seconds 2.5 \
              --shard 2/3 --save-result r --load-result a --load-result b",
         )
         .unwrap();
@@ -662,7 +662,7 @@ mod tests {
             assert!(bake(&format!("bake s.obj --shard {bad}")).is_err(), "{bad}");
         }
         assert_eq!((b.desc.texels_per_unit, b.desc.page_size, b.desc.padding), (2.5, 256, 3));
-        assert_eq!((b.desc.gather_divisor, b.desc.radiance_divisor, b.desc.both_sides), (2, 16, true));
+        assert_eq!((b.desc.gather_divisor, b.desc.radiance_divisor, b.desc.both_sides), (2, 16, false));
         let p = &b.params;
         assert_eq!((p.photon_count, p.max_bounces, p.gather_rays, p.radius, p.blur_radius), (5, 6, 7, 0.5, 8));
         assert_eq!((p.direct_samples, p.seed, b.threads, b.isa), (9, 10, 2, Some(Isa::Portable)));

@@ -103,11 +103,11 @@ impl Lightmap {
             Ok((light, plan, stitch))
         })?;
         let all = 0..self.atlas.map.len();
-        let filling = self.filling(&light, &all)?;
         // The last moment at which nothing has changed.
         progress.check()?;
         self.plan = plan;
-        device.install(|| self.store(light, all, stitch, filling))
+        device.install(|| self.store(light, all, stitch));
+        Ok(())
     }
 
     /// The light that there is, not stitched, with that of a file.
