@@ -729,7 +729,7 @@ BK_API uint32_t bk_scene_light_count(const bk_scene *scene);
  * All functions take a committed scene and are safe from any threads. A closest hit is the one with
  * the least t in tmin < t <= tmax; among equal t the triangle that was added first, whichever
  * function is asked. Directions need not be normalised; t is in units of the direction's length.
- * Both sides of a triangle are hit. A ray with a NaN, an infinite origin or a zero direction hits
+ * Both sides of a triangle are hit. A ray with a NaN, an origin beyond 1e18 or a zero direction hits
  * nothing.
  * ================================================================================================ */
 

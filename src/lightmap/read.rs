@@ -50,7 +50,10 @@ impl Lightmap {
             }
             let placement = self.atlas.map.layout.place_of(chart, front);
             let corners = self.atlas.charts.corners[t as usize];
-            uvs.push(corners.map(|c| self.atlas.map.layout.texel_coord(placement, c).map(|x| x * scale)));
+            // Rounding of placements may go beyond the page by some 1e-9.
+            uvs.push(
+                corners.map(|c| self.atlas.map.layout.texel_coord(placement, c).map(|x| (x * scale).clamp(0.0, 1.0))),
+            );
             pages.push(self.atlas.map.layout.placements[placement as usize].page);
         }
         Ok((uvs, pages))

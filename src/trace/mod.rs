@@ -29,7 +29,7 @@ use glam::Vec3;
 use rayon::prelude::*;
 
 /// A ray: points `origin + t · direction` with `tmin < t ≤ tmax`. The direction need not be
-/// normalised. A ray with a NaN, an infinite origin or a zero direction hits nothing.
+/// normalised. A ray with a NaN, an origin beyond 1e18 or a zero direction hits nothing.
 #[derive(Clone, Copy, Debug, PartialEq, Pod, Zeroable)]
 #[repr(C)]
 pub struct Ray {

@@ -16,7 +16,7 @@
 //! with 32 to 1024 strata, and 0.75 to 0.94 times with texels next to each other: rays that pass the same
 //! nodes end in different leaves, and most tests of a leaf are for rays that miss its box.)
 
-use super::single::{self, BEYOND, EPSILON, OFFSET_ERROR, STEEP, barycentrics, beyond};
+use super::single::{self, BEYOND, EPSILON, FARTHEST_ORIGIN, OFFSET_ERROR, STEEP, barycentrics, beyond};
 use super::triangle::{GRAZING, Projected, Shear, V3, accurate_distance};
 use super::{RawHit, Ray};
 use crate::bvh::layout::{ChildRef, MAX_LEAF, Mbvh, Node, STACK_SIZE, WIDTH};
@@ -98,7 +98,10 @@ fn bundle(rays: &[Ray]) -> usize {
     if rays.len() < LEAST || !same(&rays[1]) || !(first.tmax > first.tmin) {
         return 0;
     }
-    let (Some(k), true) = (longest_axis(first.direction), first.origin.iter().all(|o| o.is_finite())) else { return 0 };
+    let (Some(k), true) = (longest_axis(first.direction), first.origin.iter().all(|o| o.abs() <= FARTHEST_ORIGIN))
+    else {
+        return 0;
+    };
     let (i, j) = ((k + 1) % 3, (k + 2) % 3);
     let sign = first.direction.map(|d| 1f32.copysign(d));
     let (mut least, mut most) = ([f32::INFINITY; 2], [0f32; 2]);

@@ -55,14 +55,19 @@ fn lesser(a: f32, b: f32) -> f32 {
     if a < b { a } else { b }
 }
 
+/// Rays from beyond this hit nothing: products of two distances to them would overflow.
+pub(super) const FARTHEST_ORIGIN: f32 = 1e18;
+
 /// The power of two that brings a direction's largest component into a range where the reciprocals and
 /// products of the tests neither overflow nor vanish; `None` for a ray that can hit nothing.
 #[inline(always)]
 pub(super) fn direction_scale(ray: &Ray) -> Option<f32> {
     let ([x, y, z], [ox, oy, oz]) = (ray.direction, ray.origin);
     let largest = greater(greater(x.abs(), y.abs()), z.abs());
-    // Any NaN or infinity makes this NaN; a maximum alone would lose a NaN.
-    let zero = (0.0 * x + 0.0 * y + 0.0 * z) + (0.0 * ox + 0.0 * oy + 0.0 * oz);
+    // Any NaN or infinity makes this NaN; a maximum alone would lose a NaN. Origins become infinite from
+    // `FARTHEST_ORIGIN` on.
+    const FAR: f32 = f32::MAX / FARTHEST_ORIGIN;
+    let zero = (0.0 * x + 0.0 * y + 0.0 * z) + (0.0 * (ox * FAR) + 0.0 * (oy * FAR) + 0.0 * (oz * FAR));
     if zero != 0.0 || largest == 0.0 {
         return None;
     }

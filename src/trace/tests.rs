@@ -203,8 +203,15 @@ fn unusable_rays_hit_nothing_and_extreme_lengths_do_not_matter() {
     for isa in Isa::available() {
         let scene = scene(isa, &triangles, 3);
         let reference = scene.intersect_raw(&good);
-        for bad in [f32::NAN, f32::INFINITY, f32::NEG_INFINITY] {
+        // Products of distances to the origins at 3e38 would overflow, and made hits with weights 1 and 1.
+        for (bad, far) in [(f32::NAN, 1.1e18), (f32::INFINITY, f32::MAX), (f32::NEG_INFINITY, f32::MIN)] {
             for k in 0..3 {
+                let mut from_afar = good;
+                from_afar.origin[k] = far;
+                assert!(scene.intersect_raw(&from_afar).is_miss() && !scene.occluded(&from_afar));
+                let mut bundle = [Hit::MISS; 32];
+                scene.intersect_many(&[from_afar; 32], false, &mut bundle).unwrap();
+                assert_eq!(bundle, [Hit::MISS; 32]);
                 let (mut o, mut d) = (good, good);
                 o.origin[k] = bad;
                 d.direction[k] = bad;

@@ -1,0 +1,110 @@
+#!/usr/bin/env bash
+# The C and C++ programs, and the library as far as it goes, under tools that watch memory.
+#
+#     capi-tests/sanitize.sh              c: what continuous integration runs, a minute or two
+#     capi-tests/sanitize.sh all          all of the below but threads
+#
+# c         AddressSanitizer with LeakSanitizer and UndefinedBehaviorSanitizer in every C and C++ program. They see
+#           the programs' own memory, what the library does to it by way of the C library, and all leaks. The library
+#           is the release build.
+# rust      The library too is compiled with AddressSanitizer (nightly toolchain): its small unit tests, a short run
+#           of fuzz_api, and the C programs against it.
+# valgrind  Memcheck over a small whole pipeline in C, with the kernels that Valgrind knows (at most AVX2).
+# miri      Miri over the unit tests that need no large scene: lanes, handles, arguments, locks, samples
+#           (nightly toolchain with miri and rust-src). Under it the portable kernels alone are available.
+#
+# CC, CXX: compilers (default cc, c++).
+set -euo pipefail
+cd "$(dirname "$0")/.."
+root=$PWD
+target=${CARGO_TARGET_DIR:-$root/target}
+out=$target/sanitize
+mkdir -p "$out"
+export ASAN_OPTIONS=detect_leaks=1:strict_string_checks=1 UBSAN_OPTIONS=print_stacktrace=1
+verdict=0
+
+# run NAME COMMAND...: prints what failed, and its output.
+run() {
+    local name=$1
+    shift
+    if "$@" >"$out/$name.log" 2>&1; then
+        echo "   $name: clean"
+    else
+        echo "   $name: FAILED"
+        tail -40 "$out/$name.log"
+        verdict=1
+    fi
+}
+
+# programs FOLDER FLAGS...: every C and C++ test program but runtime.c, whose stacks are too small for sanitizers, linked with the library in FOLDER, and run.
+programs() {
+    local library=$1 source name flags
+    shift
+    for source in $(grep -l 'check\.h' capi-tests/*.c capi-tests/*.cpp | grep -v runtime.c); do
+        name=$(basename "$source")
+        mkdir -p "$out/$name.out"
+        flags=(-g -O1 -fno-omit-frame-pointer "$@" -I include)
+        if [ "${name##*.}" = c ]; then
+            run "build-$name" "${CC:-cc}" -std=gnu99 "${flags[@]}" "$source" -o "$out/$name.bin" -L "$library" -lbakelite -lpthread -lm
+        else
+            run "build-$name" "${CXX:-c++}" -std=c++17 "${flags[@]}" "$source" -o "$out/$name.bin" -L "$library" -lbakelite -lpthread -lm
+        fi
+        [ -x "$out/$name.bin" ] && run "$name" env LD_LIBRARY_PATH="$library" "$out/$name.bin" "$out/$name.out/"
+        rm -rf "$out/$name.bin" "$out/$name.out"
+    done
+}
+
+c() {
+    echo '== C and C++ programs under AddressSanitizer, LeakSanitizer and UndefinedBehaviorSanitizer'
+    cargo build --release --locked --all-features --lib
+    programs "$target/release" -fsanitize=address,undefined -fno-sanitize-recover=undefined
+}
+
+rust() {
+    echo '== The library under AddressSanitizer'
+    local triple library
+    triple=$(rustc +nightly -vV | sed -n 's/^host: //p')
+    library=$target/asan/$triple/release
+    export RUSTFLAGS=-Zsanitizer=address CARGO_TARGET_DIR=$target/asan
+    run asan-unit cargo +nightly test --release --locked --features io,unwrap --target "$triple" --lib -- \
+        simd:: trace:: bvh:: capi:: io:: memory:: device:: live::save
+    run asan-fuzz cargo +nightly test --release --locked --features io,unwrap --target "$triple" --test fuzz_api
+    unset RUSTFLAGS CARGO_TARGET_DIR
+    # The run time of the sanitizer comes with the program.
+    CC=clang CXX=clang++ programs "$library" -fsanitize=address
+}
+
+memcheck() {
+    echo '== A small pipeline under Valgrind'
+    cargo build --release --locked --all-features --lib
+    "${CC:-cc}" -std=gnu99 -g -O1 -I include capi-tests/small_pipeline.c -o "$out/small_pipeline" \
+        -L "$target/release" -lbakelite -lpthread -lm
+    mkdir -p "$out/small_pipeline.out"
+    run valgrind env LD_LIBRARY_PATH="$target/release" valgrind --error-exitcode=9 --leak-check=full \
+        --errors-for-leak-kinds=definite "$out/small_pipeline" "$out/small_pipeline.out/"
+}
+
+miri() {
+    echo '== Unit tests under Miri'
+    export CARGO_TARGET_DIR=$target/miri MIRIFLAGS=-Zmiri-disable-isolation
+    run miri cargo +nightly miri test --locked --no-default-features --lib -- \
+        simd:: capi::args capi::error capi::handles capi::shared
+    unset CARGO_TARGET_DIR MIRIFLAGS
+}
+
+case ${1:-c} in
+    c | rust | miri) "${1:-c}" ;;
+    valgrind) memcheck ;;
+    all)
+        c
+        rust
+        memcheck
+        miri
+        ;;
+    *)
+        sed -n '2,/^set/p' "$0" | grep '^#'
+        exit 2
+        ;;
+esac
+[ $verdict = 0 ] && echo 'clean' || echo 'NOT clean'
+exit $verdict
