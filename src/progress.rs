@@ -378,6 +378,7 @@ mod tests {
     fn where_no_thread_attends_a_look_for_a_cancel_asks_the_callback() {
         let calls = AtomicU64::new(0);
         let progress = Progress::new(|_, _| calls.fetch_add(1, Relaxed) < 3);
+        let _stage = progress.stage("work", 0.0, 1.0, 1);
         while progress.check().is_ok() {
             std::thread::yield_now();
         }
