@@ -667,13 +667,13 @@ mod tests {
         data.add_material(Material::default()).unwrap();
         let mesh = || Mesh { positions: FLOOR.to_vec(), indices: vec![[0, 1, 2]], ..Default::default() };
         data.add_mesh(mesh()).unwrap();
-        // Past all checks: a mesh without triangles whose material does not exist.
-        data.meshes.push(Mesh { materials: MeshMaterials::One(7), ..Default::default() });
         let commit = |data, progress: &Progress| {
             Scene::commit(&device, data, &BuildOptions::default(), progress).map_err(Box::new)
         };
-        let (data, e) = *commit(data, &Progress::new(|_, _| false)).err().unwrap();
+        let (mut data, e) = *commit(data, &Progress::new(|_, _| false)).err().unwrap();
         assert_eq!(e, Error::Cancelled);
+        // Past all checks: a mesh without triangles whose material does not exist.
+        data.meshes.push(Mesh { materials: MeshMaterials::One(7), ..Default::default() });
         let (mut data, e) = *commit(data, &Progress::none()).err().unwrap();
         assert!(matches!(&e, Error::Internal(s) if s.contains("panic")), "{e}");
         assert_eq!(device.memory().current(), 0);
