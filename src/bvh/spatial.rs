@@ -292,6 +292,15 @@ impl Work {
     fn new() -> Work {
         Work { bins: Bins::new(), slabs: Slabs::new(), left: Vec::new(), right: Vec::new() }
     }
+
+    /// Room for the sides of a split of `n` references: none gets more. `None`: there is no memory.
+    fn make_room(&mut self, n: usize) -> Option<()> {
+        for side in [&mut self.left, &mut self.right] {
+            side.clear();
+            side.try_reserve(n).ok()?;
+        }
+        Some(())
+    }
 }
 
 /// A subtree: numbers in it count from its own first node and triangle.
@@ -302,10 +311,20 @@ struct Flat {
 }
 
 impl Flat {
-    fn leaf(&mut self, refs: &[Reference], bounds: &Box4) {
-        let (lower, upper) = bounds.corners();
-        self.nodes.push(BinaryNode { lower, upper, index: self.triangles.len() as u32, count: refs.len() as u32 });
+    /// `None`: there is no memory.
+    fn leaf(&mut self, refs: &[Reference], bounds: &Box4) -> Option<()> {
+        self.triangles.try_reserve(refs.len()).ok()?;
+        self.node(bounds, self.triangles.len(), refs.len())?;
         self.triangles.extend(refs.iter().map(Reference::id));
+        Some(())
+    }
+
+    /// `None`: there is no memory.
+    fn node(&mut self, bounds: &Box4, index: usize, count: usize) -> Option<()> {
+        let (lower, upper) = bounds.corners();
+        self.nodes.try_reserve(1).ok()?;
+        self.nodes.push(BinaryNode { lower, upper, index: index as u32, count: count as u32 });
+        Some(())
     }
 }
 
@@ -397,10 +416,9 @@ impl Builder<'_, '_> {
         depth: usize,
     ) -> Option<(Sides, Vec<Reference>, Vec<Reference>)> {
         let mut work = Work::new();
-        // No side gets more; what is not used is given back.
-        work.left.try_reserve(refs.len()).ok()?;
-        work.right.try_reserve(refs.len()).ok()?;
+        work.make_room(refs.len())?;
         let sides = self.split(&mut refs, extent, extra, depth, &mut work).expect("too many for a leaf");
+        // What is not used is given back.
         work.left.shrink_to_fit();
         work.right.shrink_to_fit();
         Some((sides, work.left, work.right))
@@ -411,11 +429,13 @@ impl Builder<'_, '_> {
     fn build_small(&self, mut refs: Vec<Reference>, extent: Extent, extra: usize, depth: usize) -> Flat {
         let (mut work, mut flat) = (Work::new(), Flat::default());
         let n = refs.len();
-        self.build_flat(&mut refs, n, extent, extra, depth, &mut work, &mut flat);
+        if self.build_flat(&mut refs, n, extent, extra, depth, &mut work, &mut flat).is_none() {
+            self.out_of_memory.store(true, Relaxed);
+        }
         flat
     }
 
-    /// Builds over the last `n` of `stack` and removes them.
+    /// Builds over the last `n` of `stack` and removes them. `None`: there is no memory.
     fn build_flat(
         &self,
         stack: &mut Vec<Reference>,
@@ -425,26 +445,28 @@ impl Builder<'_, '_> {
         depth: usize,
         work: &mut Work,
         out: &mut Flat,
-    ) {
+    ) -> Option<()> {
         let start = stack.len() - n;
+        work.make_room(n)?;
         let Some(sides) = self.split(&mut stack[start..], &extent, extra, depth, work) else {
-            out.leaf(&stack[start..], &extent.boxes);
-            return stack.truncate(start);
+            out.leaf(&stack[start..], &extent.boxes)?;
+            stack.truncate(start);
+            return Some(());
         };
         stack.truncate(start);
+        stack.try_reserve(work.left.len() + work.right.len()).ok()?;
         // The left side on top, because it is built first.
         stack.extend_from_slice(&work.right);
         stack.extend_from_slice(&work.left);
         let (nl, nr) = (work.left.len(), work.right.len());
         let i = out.nodes.len();
-        let (lower, upper) = extent.boxes.corners();
-        out.nodes.push(BinaryNode { lower, upper, index: 0, count: 0 });
-        self.build_flat(stack, nl, sides.extents[0], sides.extra[0], depth + 1, work, out);
+        out.node(&extent.boxes, 0, 0)?;
+        self.build_flat(stack, nl, sides.extents[0], sides.extra[0], depth + 1, work, out)?;
         out.nodes[i].index = out.nodes.len() as u32;
-        self.build_flat(stack, nr, sides.extents[1], sides.extra[1], depth + 1, work, out);
+        self.build_flat(stack, nr, sides.extents[1], sides.extra[1], depth + 1, work, out)
     }
 
-    /// Writes the two sides of the best split to `work`; `None`: make a leaf.
+    /// Writes the two sides of the best split to `work`, which [has room](Work::make_room) for them; `None`: make a leaf.
     fn split(
         &self,
         refs: &mut [Reference],
@@ -508,10 +530,8 @@ impl Builder<'_, '_> {
             return Some(self.sides(n, extra, work));
         }
         match object {
-            Some(((middle, _), split)) => {
+            Some((_, split)) => {
                 let side = map.side(&split);
-                work.left.reserve(middle);
-                work.right.reserve(n - middle);
                 for r in refs.iter() {
                     if side.is_left(r) { work.left.push(*r) } else { work.right.push(*r) }
                 }

@@ -22,7 +22,7 @@ use super::{
 };
 use crate::device::LogLevel;
 use crate::error::{Error, Result, invalid_argument};
-use crate::memory::try_vec;
+use crate::memory::{try_collect, try_vec};
 use crate::photon::{PhotonMap, PhotonParams};
 use crate::progress::Progress;
 use crate::sampling::{combine, purpose_seed};
@@ -79,7 +79,8 @@ impl Lightmap {
         };
         let (charts, mut uvs) = Charts::of_scene(scene, density, desc.page_size, desc.padding, progress)?;
         let unwrap_seconds = start.elapsed().as_secs_f64();
-        let two_sided: Vec<u32> = (0..).zip(&charts.charts).filter(|(_, c)| c.two_sided).map(|(c, _)| c).collect();
+        let two_sided = (0..).zip(&charts.charts).filter(|(_, c)| c.two_sided).map(|(c, _)| c);
+        let two_sided: Vec<u32> = try_collect(two_sided, "the two-sided charts")?;
         let pack = |divisor: u32, padding: u32, given: bool, with_backs: &[u32]| {
             let page_size = if divisor == 1 { desc.page_size } else { (desc.page_size / divisor).max(MIN_PAGE_SIZE) };
             Layout::pack(&charts, density / divisor as f32, page_size, padding, given, with_backs, progress)
@@ -90,7 +91,8 @@ impl Lightmap {
         let texel = 1.0 / density;
         let stage = progress.stage("sides", 0.6, 0.65, Seen::work(&radiance));
         let seen = scene.device().install(|| Seen::count(scene, &charts, &radiance, texel, &stage))?;
-        let with_backs = if desc.both_sides { sides::seen_from_both(&seen, &radiance, &two_sided) } else { Vec::new() };
+        let with_backs =
+            if desc.both_sides { sides::seen_from_both(&seen, &radiance, &two_sided)? } else { Vec::new() };
         let map = pack(1, desc.padding, true, &with_backs)?;
         let gather = pack(desc.gather_divisor, 0, false, &with_backs)?;
         let stage = progress.stage("texels", 0.65, 0.8, TexelMap::work(&map) + TexelMap::work(&gather));

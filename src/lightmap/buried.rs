@@ -14,7 +14,7 @@ use super::map::ChartMap;
 use super::seen::Seen;
 use super::texels::TexelSample;
 use crate::error::Result;
-use crate::memory::try_vec;
+use crate::memory::{try_append, try_collect, try_par_collect, try_push, try_vec};
 use crate::progress::Stage;
 use crate::sampling::{cosine_around, sobol_2d};
 use crate::scene::{NONE, Scene};
@@ -40,6 +40,8 @@ const POINT_TRIES: u32 = 32;
 /// Rounds of filling: texels farther than this from all that is seen stay where they are.
 const MAX_ROUNDS: usize = 64;
 
+const BURIED: &str = "which texels are buried";
+
 /// What deciding reads.
 #[derive(Clone, Copy)]
 pub(super) struct Search<'a> {
@@ -60,16 +62,20 @@ impl Search<'_> {
             Ok(found)
         };
         let placements = 0..map.layout.placements.len() as u32;
-        let found: Vec<Found> = placements.into_par_iter().map(of_placement).collect::<Result<_>>()?;
-        let rays = found.iter().map(|f| f.rays).sum();
-        for &(sample, point) in found.iter().flat_map(|f| &f.seen_parts) {
+        let mut found = try_par_collect(placements.into_par_iter().map(of_placement), BURIED)?;
+        if let Some(failed) = found.iter_mut().find(|f| f.is_err()) {
+            return Err(std::mem::replace(failed, Ok(Found::default())).err().expect("it failed"));
+        }
+        let found = || found.iter().flatten();
+        let rays = found().map(|f| f.rays).sum();
+        for &(sample, point) in found().flat_map(|f| &f.seen_parts) {
             map.texels.samples[sample as usize] = point;
         }
-        if found.iter().all(|f| f.moved.is_empty()) {
+        if found().all(|f| f.moved.is_empty()) {
             return Ok((Vec::new(), rays));
         }
-        let mut is_moved = try_vec(map.len(), "which texels are buried")?;
-        for &(sample, to) in found.iter().flat_map(|f| &f.moved) {
+        let mut is_moved = try_vec(map.len(), BURIED)?;
+        for &(sample, to) in found().flat_map(|f| &f.moved) {
             let to = map.texels.samples[to as usize];
             let texel = &mut map.texels.samples[sample as usize];
             (texel.triangle, texel.u, texel.v) = (to.triangle, to.u, to.v);
@@ -97,12 +103,12 @@ impl Search<'_> {
                 stage.advance(0)?;
             }
             if self.is_buried(&map.texels.samples[sample], sample as u32, is_back, &mut found.rays) {
-                buried.push(sample as u32);
+                try_push(&mut buried, sample as u32, BURIED)?;
             }
         }
-        self.find_seen_parts(map, placement, is_back, &samples, &mut buried, &mut found);
+        self.find_seen_parts(map, placement, is_back, &samples, &mut buried, &mut found)?;
         if !buried.is_empty() && buried.len() < samples.len() {
-            found.moved = nearest_seen(map, placement, samples, buried);
+            found.moved = nearest_seen(map, placement, samples, buried)?;
         }
         Ok(found)
     }
@@ -116,8 +122,12 @@ impl Search<'_> {
         samples: &Range<usize>,
         buried: &mut Vec<u32>,
         found: &mut Found,
-    ) {
-        let mut is_buried = vec![false; if buried.is_empty() { 0 } else { samples.len() }];
+    ) -> Result<()> {
+        if buried.is_empty() {
+            return Ok(());
+        }
+        let mut is_buried = try_vec(samples.len(), BURIED)?;
+        let mut result = Ok(());
         buried.iter().for_each(|&s| is_buried[s as usize - samples.start] = true);
         buried.retain(|&s| {
             let (x, y) = map.position(s as usize);
@@ -129,9 +139,12 @@ impl Search<'_> {
             let points =
                 if is_at_border { points_of_texel(self.charts, map, placement, s as usize) } else { Vec::new() };
             let seen = points.into_iter().find(|point| !self.is_buried(point, s, back, &mut found.rays));
-            found.seen_parts.extend(seen.map(|point| (s, point)));
+            if let Some(point) = seen {
+                result = result.clone().and_then(|()| try_push(&mut found.seen_parts, (s, point), BURIED));
+            }
             seen.is_none()
         });
+        result
     }
 
     fn is_buried(&self, point: &TexelSample, sample: u32, back: bool, rays: &mut u64) -> bool {
@@ -198,9 +211,9 @@ fn points_of_texel(charts: &Charts, map: &ChartMap, placement: u32, sample: usiz
 }
 
 /// The nearest texels that are seen to those `buried`, ring by ring.
-fn nearest_seen(map: &ChartMap, placement: u32, samples: Range<usize>, buried: Vec<u32>) -> Vec<(u32, u32)> {
+fn nearest_seen(map: &ChartMap, placement: u32, samples: Range<usize>, buried: Vec<u32>) -> Result<Vec<(u32, u32)>> {
     let local = |s: u32| s as usize - samples.start;
-    let mut to: Vec<u32> = samples.clone().map(|s| s as u32).collect();
+    let mut to: Vec<u32> = try_collect(samples.clone().map(|s| s as u32), BURIED)?;
     buried.iter().for_each(|&s| to[local(s)] = NONE);
     let (mut missing, mut moved) = (buried, Vec::new());
     for _ in 0..MAX_ROUNDS {
@@ -217,15 +230,15 @@ fn nearest_seen(map: &ChartMap, placement: u32, samples: Range<usize>, buried: V
             });
             known.min().map(|(_, known)| (s, known))
         };
-        let ring: Vec<(u32, u32)> = missing.iter().filter_map(nearest).collect();
+        let ring: Vec<(u32, u32)> = try_collect(missing.iter().filter_map(nearest), BURIED)?;
         if ring.is_empty() {
             break;
         }
         ring.iter().for_each(|&(s, known)| to[local(s)] = known);
         missing.retain(|&s| to[local(s)] == NONE);
-        moved.extend(ring);
+        try_append(&mut moved, &ring, BURIED)?;
     }
-    moved
+    Ok(moved)
 }
 
 #[cfg(test)]

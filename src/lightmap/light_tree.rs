@@ -155,7 +155,8 @@ impl LightTree {
         let part = |l: &Bounds| Bounds { power: (f64::from(l.power) / whole) as f32, ..*l };
         let mut numbered = try_collect((0u32..).zip(lights.iter().map(part)), LIGHT_TREE)?;
         if !lights.is_empty() {
-            tree.build(&mut numbered, 0);
+            let mut later = try_with_capacity(lights.len(), LIGHT_TREE)?;
+            tree.build(&mut numbered, 0, &mut later);
         }
         Ok(tree)
     }
@@ -164,18 +165,19 @@ impl LightTree {
         size_of_val(&self.nodes[..])
     }
 
-    fn build(&mut self, lights: &mut [(u32, Bounds)], depth: u32) -> Bounds {
+    /// `later` has room for all lights.
+    fn build(&mut self, lights: &mut [(u32, Bounds)], depth: u32, later: &mut Vec<(u32, Bounds)>) -> Bounds {
         if let [(light, bounds)] = lights {
             self.nodes.push(Node::new(bounds, !*light));
             return *bounds;
         }
-        let middle = split(lights, depth);
+        let middle = split(lights, depth, later);
         let (left, right) = lights.split_at_mut(middle);
         let place = self.nodes.len();
         self.nodes.push(Node::new(&left[0].1, 0));
-        let left = self.build(left, depth + 1);
+        let left = self.build(left, depth + 1, later);
         let second = self.nodes.len() as u32;
-        let both = left.union(&self.build(right, depth + 1));
+        let both = left.union(&self.build(right, depth + 1, later));
         self.nodes[place] = Node::new(&both, second);
         both
     }
@@ -225,7 +227,7 @@ impl LightTree {
 }
 
 /// Reorders at least two lights and returns where to cut.
-fn split(lights: &mut [(u32, Bounds)], depth: u32) -> usize {
+fn split(lights: &mut [(u32, Bounds)], depth: u32, later: &mut Vec<(u32, Bounds)>) -> usize {
     let half = lights.len() / 2;
     let centre = |b: &Bounds| 0.5 * (b.lower + b.upper);
     let (mut lower, mut upper) = (Vec3::INFINITY, Vec3::NEG_INFINITY);
@@ -239,7 +241,8 @@ fn split(lights: &mut [(u32, Bounds)], depth: u32) -> usize {
     };
     if depth >= HALVE_FROM || !(size.max_element() > 0.0) {
         let axis = size.max_position();
-        lights.sort_by(|(_, a), (_, b)| centre(a)[axis].total_cmp(&centre(b)[axis]));
+        // In place, unlike a stable sort: there may be no memory.
+        lights.sort_unstable_by(|(i, a), (j, b)| centre(a)[axis].total_cmp(&centre(b)[axis]).then(i.cmp(j)));
         return half;
     }
     let mut best = (f32::INFINITY, 0, 0);
@@ -269,9 +272,26 @@ fn split(lights: &mut [(u32, Bounds)], depth: u32) -> usize {
         }
     }
     let (_, axis, last) = best;
-    lights.sort_by_key(|(_, b)| bin(b, axis) > last);
-    let middle = lights.partition_point(|(_, b)| bin(b, axis) <= last);
+    let middle = partition(lights, |(_, b)| bin(b, axis) <= last, later);
     if middle == 0 || middle == lights.len() { half } else { middle }
+}
+
+/// Puts first those that `is_first` takes, and returns how many they are; all stay in order. `later` has room for the
+/// others.
+fn partition<T: Copy>(values: &mut [T], is_first: impl Fn(&T) -> bool, later: &mut Vec<T>) -> usize {
+    later.clear();
+    let mut first = 0;
+    for i in 0..values.len() {
+        let value = values[i];
+        if is_first(&value) {
+            values[first] = value;
+            first += 1;
+        } else {
+            later.push(value);
+        }
+    }
+    values[first..].copy_from_slice(later);
+    first
 }
 
 /// Rounds up. (`f64::ceil` is a call into the C library, as SSE4.1 is not taken for granted: gathering in Sponza with
@@ -345,6 +365,18 @@ mod tests {
         let spot = Node::new(&Bounds { spread: 0.3, reach: 0.0, ..b }, 0);
         assert_eq!(spot.importance(Vec3::new(0.32, 0.0, 1.0), -Vec3::Z), 0.0, "outside a cone");
         assert!(spot.importance(Vec3::new(0.28, 0.0, 1.0), -Vec3::Z) > 0.85);
+    }
+
+    #[test]
+    fn partitions_are_stable_sorts() {
+        let values: Vec<(u32, u32)> = (0..1000).map(|i| (crate::sampling::mix(i) % 7, i)).collect();
+        for from in 0..=7 {
+            let (mut sorted, mut parted, mut later) =
+                (values.clone(), values.clone(), Vec::with_capacity(values.len()));
+            sorted.sort_by_key(|v| v.0 >= from);
+            let first = partition(&mut parted, |v| v.0 < from, &mut later);
+            assert_eq!((parted, first), (sorted, values.iter().filter(|v| v.0 < from).count()));
+        }
     }
 
     #[test]

@@ -7,6 +7,7 @@
 use super::charts::Charts;
 use super::map::ChartMap;
 use crate::error::Result;
+use crate::memory::try_collect;
 use crate::progress::Stage;
 use crate::sampling::{combine, cosine_around, mix, uniform, uniform_sphere};
 use crate::scene::{Light, NONE, Scene};
@@ -45,6 +46,8 @@ const LEAST_EXPECTED: f64 = 8.0;
 /// A side that gets less than this part of the rays that are expected is hidden.
 const HIDDEN: f64 = 0.02;
 
+const COUNTS: &str = "which sides of charts are seen";
+
 /// How often the sides of charts are seen.
 #[derive(Default)]
 pub(crate) struct Seen {
@@ -71,7 +74,7 @@ impl Seen {
         }
         let room = (ROOM * scene.diagonal()).min(ROOM_TEXELS * texel);
         let look = Look { scene, charts, radiance, room, outdoors: is_outdoors(scene) };
-        let counters: Vec<[AtomicU32; 2]> = charts.charts.iter().map(|_| Default::default()).collect();
+        let counters: Vec<[AtomicU32; 2]> = try_collect(charts.charts.iter().map(|_| Default::default()), COUNTS)?;
         let (places, rays) = (AtomicU64::new(0), AtomicU64::new(0));
         (0..Self::work(radiance) as u32).into_par_iter().try_for_each(|number| {
             let mut traced = 0;
@@ -84,14 +87,15 @@ impl Seen {
             rays.fetch_add(traced, Relaxed);
             stage.advance(1)
         })?;
-        let counts: Vec<[u32; 2]> = counters.into_iter().map(|of_chart| of_chart.map(AtomicU32::into_inner)).collect();
+        let counts = counters.into_iter().map(|of_chart| of_chart.map(AtomicU32::into_inner));
+        let counts: Vec<[u32; 2]> = try_collect(counts, COUNTS)?;
         let total: u64 = counts.iter().flatten().map(|&n| u64::from(n)).sum();
         let per_texel = total as f64 / radiance.len().max(1) as f64;
         let hidden = |(chart, of_chart): (usize, &[u32; 2])| {
             let expected = radiance.samples_of(chart as u32).len() as f64 * per_texel;
             of_chart.map(|n| expected >= LEAST_EXPECTED && f64::from(n) < HIDDEN * expected)
         };
-        let hidden = counts.iter().enumerate().map(hidden).collect();
+        let hidden = try_collect(counts.iter().enumerate().map(hidden), COUNTS)?;
         Ok(Seen { counts, hidden, places: places.into_inner(), rays: rays.into_inner() })
     }
 

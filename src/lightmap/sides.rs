@@ -26,7 +26,7 @@ use super::Atlas;
 use super::map::ChartMap;
 use super::seen::Seen;
 use crate::error::Result;
-use crate::memory::try_par_collect;
+use crate::memory::{try_collect, try_par_collect};
 use crate::progress::Progress;
 use crate::sampling::{cosine_around, sobol_2d};
 use crate::scene::Scene;
@@ -105,11 +105,11 @@ pub(crate) fn backs(atlas: &Atlas, light: impl Fn(usize) -> f32 + Sync, progress
 
 /// Those of some two-sided charts of which both sides are seen, ascending. Charts that bring least per texel are left out
 /// as long as at most [`MISSING`] of all that is seen is on a side that is not shown.
-pub(crate) fn seen_from_both(seen: &Seen, radiance: &ChartMap, charts: &[u32]) -> Vec<u32> {
+pub(crate) fn seen_from_both(seen: &Seen, radiance: &ChartMap, charts: &[u32]) -> Result<Vec<u32>> {
     let missing = |chart: u32| seen.counts[chart as usize].into_iter().min().unwrap_or(0);
-    let mut both: Vec<u32> = charts.iter().copied().filter(|&chart| missing(chart) > 0).collect();
+    let mut both = try_collect(charts.iter().copied().filter(|&chart| missing(chart) > 0), BOTH)?;
     let per_texel = |chart: u32| f64::from(missing(chart)) / radiance.samples_of(chart).len().max(1) as f64;
-    both.sort_by(|&a, &b| per_texel(a).total_cmp(&per_texel(b)).then(a.cmp(&b)));
+    both.sort_unstable_by(|&a, &b| per_texel(a).total_cmp(&per_texel(b)).then(a.cmp(&b)));
     let all: u64 = seen.counts.iter().flatten().map(|&n| u64::from(n)).sum();
     let mut left = (MISSING * all as f64) as u64;
     let spared = both.iter().take_while(|&&chart| {
@@ -119,10 +119,12 @@ pub(crate) fn seen_from_both(seen: &Seen, radiance: &ChartMap, charts: &[u32]) -
         is_spared
     });
     let spared = spared.count();
-    let mut both = both.split_off(spared);
+    both.drain(..spared);
     both.sort_unstable();
-    both
+    Ok(both)
 }
+
+const BOTH: &str = "the charts of which both sides are seen";
 
 /// The mean distance below which a side is covered.
 fn something(scene: &Scene) -> f64 {

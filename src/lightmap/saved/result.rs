@@ -192,7 +192,7 @@ impl<'a> Loading<'a> {
         let fail = |e| Error::Io(format!("cannot read {}: {e}", path.display()));
         let file = files::open(path).map_err(fail)?;
         let size = file.metadata().map_err(fail)?.len();
-        let mut file = BufReader::with_capacity(1 << 20, file);
+        let mut file = BufReader::with_capacity(1 << 16, file);
         let mut magic = [0; MAGIC.len()];
         let is_ours = file.read_exact(&mut magic).is_ok() && magic == MAGIC;
         if !is_ours {
