@@ -206,6 +206,7 @@ impl Draw {
             seed: self.0.next_u64(),
             memory_budget: self.pick(&[0, 0, 0, 0, 0, 0, 1, 100_000]),
             store_direct: self.one_in(2),
+            ..PhotonParams::default()
         }
     }
 

@@ -223,5 +223,6 @@ fn core_params(p: &bk_photon_params) -> crate::Result<PhotonParams> {
         seed: p.seed,
         memory_budget: p.memory_budget,
         store_direct: p.flags & BK_PHOTONS_INDIRECT_ONLY == 0,
+        ..PhotonParams::default()
     })
 }

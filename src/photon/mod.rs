@@ -47,6 +47,9 @@ pub struct PhotonParams {
     /// Search radius of the estimate in scene units; 0: chosen so that the average disc on the
     /// surfaces that photons reached holds about [`PHOTONS_PER_DISC`].
     pub radius: f32,
+    /// The least automatic radius, in scene units: half the distance of the places that are asked for, so that the discs
+    /// around them leave no photon out.
+    pub least_radius: f32,
     /// Half the height of the search cylinder, as a fraction of the radius; more than 0.
     pub half_height: f32,
     /// Jensen's cone filter constant, ≥ 1; infinity: no filter.
@@ -57,6 +60,8 @@ pub struct PhotonParams {
     pub memory_budget: u64,
     /// Whether photons are stored at their first surface too (direct light).
     pub store_direct: bool,
+    /// About so many photons are stored at most; of more, every n-th with n times the power. 0: all.
+    pub most_stored: u64,
 }
 
 impl Default for PhotonParams {
@@ -65,11 +70,13 @@ impl Default for PhotonParams {
             photon_count: 1_000_000,
             max_bounces: 0,
             radius: 0.0,
+            least_radius: 0.0,
             half_height: 0.25,
             cone_k: 1.1,
             seed: 0,
             memory_budget: 0,
             store_direct: true,
+            most_stored: 0,
         }
     }
 }
@@ -88,6 +95,9 @@ impl PhotonParams {
         }
         if !(self.half_height > 0.0 && self.half_height.is_finite()) {
             return invalid_argument!("half_height is {}, not a finite number > 0", self.half_height);
+        }
+        if !(self.least_radius >= 0.0 && self.least_radius.is_finite()) {
+            return invalid_argument!("least_radius is {}, not a finite number ≥ 0", self.least_radius);
         }
         if self.cone_k.is_nan() || self.cone_k < 1.0 {
             return invalid_argument!("cone_k is {}, not ≥ 1 (infinity: no filter)", self.cone_k);
@@ -239,6 +249,7 @@ impl PhotonMap {
                 params.radius
             } else {
                 radius::automatic(&traced.blocks, scene.diagonal(), PHOTONS_PER_DISC)?
+                    .max(params.least_radius.min(scene.diagonal()))
             };
             let (grid, memory) = Grid::build(traced, radius, progress, (split, to))?;
             stats.grid_seconds = start.elapsed().as_secs_f64();

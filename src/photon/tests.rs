@@ -597,3 +597,26 @@ fn every_isa_finds_the_same_photons() {
         assert_close(map.estimate(p, n)[0] as f64, maps[0].estimate(p, n)[0] as f64, 0.05);
     }
 }
+
+#[test]
+fn photons_that_would_be_too_many_are_thinned_out_without_losing_power() {
+    let scene = room(0.95, Vec3::splat(3.0), Vec3::splat(1.3)).committed();
+    let params = PhotonParams { photon_count: 200_000, ..Default::default() };
+    let (all, some) = (trace(&scene, params), trace(&scene, PhotonParams { most_stored: 300_000, ..params }));
+    assert!(all.stats().stored > 3_000_000, "{}", all.stats().stored);
+    let stored = some.stats().stored as f64;
+    assert!((0.9..1.1).contains(&(stored / 300_000.0)), "{stored}");
+    for (found, expected) in stored_power(&some).into_iter().zip(stored_power(&all)) {
+        assert_close(found, expected, 0.002);
+    }
+}
+
+#[test]
+fn the_automatic_radius_is_never_less_than_the_least() {
+    let scene = room(0.9, Vec3::splat(3.0), Vec3::splat(1.3)).committed();
+    let params = PhotonParams { photon_count: 100_000, ..Default::default() };
+    let automatic = trace(&scene, params).radius();
+    assert!(automatic < 0.2);
+    assert_eq!(trace(&scene, PhotonParams { least_radius: 0.2, ..params }).radius(), 0.2);
+    assert_eq!(trace(&scene, PhotonParams { least_radius: 1e-3, ..params }).radius(), automatic);
+}

@@ -41,6 +41,10 @@ const PILOT_SEED: u64 = u64::from_be_bytes(*b"phopilot");
 /// A pilot photon and its source.
 type Guidable = (usize, PilotPhoton);
 
+/// A path is taken to store at most so many photons: if those of all paths are allowed, no block is traced to find out
+/// how many there will be. (At albedo 0.98 it is 50.)
+const MOST_PER_PATH: u64 = 64;
+
 /// What photon random numbers are drawn for.
 const PURPOSE: u32 = u32::from_be_bytes(*b"phot");
 /// Dimensions: the start of a path, its length, then one per surface met.
@@ -49,6 +53,8 @@ const EMIT_POSITION: u32 = 1;
 const EMIT_DIRECTION: u32 = 2;
 const ROULETTE: u32 = 3;
 const BOUNCE: u32 = 4;
+/// Far from those of surfaces.
+const STORED: u32 = u32::MAX;
 
 /// A photon on a surface.
 #[derive(Clone, Copy, Debug, Default, PartialEq)]
@@ -79,8 +85,9 @@ pub(super) fn trace(
     progress: &Progress,
     (from, to): (f32, f32),
 ) -> Result<Traced> {
-    let tracer = Tracer::guided(scene, lights, params)?;
+    let mut tracer = Tracer::guided(scene, lights, params)?;
     let count = tracer.emission.count();
+    tracer.thin_out(params.most_stored)?;
     let stage = progress.stage("photons", from, to, count.div_ceil(BLOCK));
     let memory = Account::new(scene.device().memory().clone(), params.memory_budget);
     let results: Vec<(Vec<StoredPhoton>, Tally)> = (0..count.div_ceil(BLOCK))
@@ -174,7 +181,9 @@ struct Tracer<'a> {
     /// Most surface interactions per path, passages through sheets not counted.
     limit: u32,
     store_direct: bool,
-    /// Rays that it took to find guides.
+    /// The part of the photons on surfaces that is stored.
+    stored_part: f32,
+    /// Rays that it took to find guides and how much is to be stored.
     pilot_rays: u64,
 }
 
@@ -183,7 +192,7 @@ impl<'a> Tracer<'a> {
         let seed = purpose_seed(params.seed, PURPOSE);
         let emission = Emission::new(scene, lights, params.photon_count, uniform(0, ALLOTMENT, seed));
         let limit = if params.max_bounces == 0 { PATH_LIMIT } else { params.max_bounces.min(PATH_LIMIT) };
-        Tracer { scene, emission, seed, limit, store_direct: params.store_direct, pilot_rays: 0 }
+        Tracer { scene, emission, seed, limit, store_direct: params.store_direct, stored_part: 1.0, pilot_rays: 0 }
     }
 
     /// The same with guides, if there are photons enough to find any.
@@ -201,6 +210,20 @@ impl<'a> Tracer<'a> {
         tracer.pilot_rays = blocks.iter().map(|b| b.1).sum();
         tracer.emission.guide(blocks.into_iter().flat_map(|b| b.0));
         Ok(tracer)
+    }
+
+    /// Has only a part of the photons stored if they would be more than `most` (0: any number) in all, judging by the first
+    /// block.
+    fn thin_out(&mut self, most: u64) -> Result<()> {
+        let count = self.emission.count();
+        if most == 0 || count < BLOCK || count.saturating_mul(MOST_PER_PATH) < most {
+            return Ok(());
+        }
+        let (stored, tally) = self.block(0, None, |_, _, _| ())?;
+        self.pilot_rays += tally.rays;
+        let expected = stored.len() as f64 * count as f64 / BLOCK as f64;
+        self.stored_part = (most as f64 / expected).min(1.0) as f32;
+        Ok(())
     }
 
     /// The photons of a block that can be guided, with how many they left on surfaces but where they ended; and the rays
@@ -241,6 +264,8 @@ impl<'a> Tracer<'a> {
         let mut hits = vec![RawHit::MISS; rays.len()];
         let mut surfaces = vec![Surface::NOTHING; rays.len()];
         let (mut stored, mut announced) = (Vec::new(), 0);
+        // Every n-th photon is stored, from a random one on.
+        let (mut due, mut kept) = (uniform(block as u32, STORED, self.seed), 0);
         let mut tally = Tally::default();
         for step in 0..PATH_LIMIT {
             if rays.is_empty() {
@@ -277,6 +302,9 @@ impl<'a> Tracer<'a> {
             }
             rays.truncate(alive);
             paths.truncate(alive);
+            if self.stored_part < 1.0 {
+                thin_out(&mut stored, &mut kept, self.stored_part, &mut due);
+            }
         }
         stored.shrink_to_fit();
         if let Some((_, memory)) = watch {
@@ -377,6 +405,21 @@ impl<'a> Tracer<'a> {
             None
         }
     }
+}
+
+/// Keeps one in 1/`part` of the photons from `kept` on, systematically, with the power of all. `due`: the part of a
+/// photon that is due from before.
+fn thin_out(stored: &mut Vec<StoredPhoton>, kept: &mut usize, part: f32, due: &mut f32) {
+    let begin = *kept;
+    for i in begin..stored.len() {
+        *due += part;
+        if *due >= 1.0 {
+            *due -= 1.0;
+            stored[*kept] = StoredPhoton { power: stored[i].power / part, ..stored[i] };
+            *kept += 1;
+        }
+    }
+    stored.truncate(*kept);
 }
 
 /// Memory announced while it grows, against the budget of one call.
