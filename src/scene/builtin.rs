@@ -32,16 +32,31 @@ pub struct Camera {
 /// - `furniture`: a room with furniture 1 to 3 cm off its walls. `partition`: two rooms with a wall of 2 cm between them
 ///   that leaves a gap, and a lamp in one. Both for measurements of the light.
 /// - `atrium`: two floors around a court, columns, arches, drapes; a rect light and a sun.
+///
+/// Two more are for measurements, and not among [`BUILTIN_NAMES`]:
+///
+/// - `furnace:ALBEDO`: the furnace with another albedo, at least 0 and less than 1.
+/// - `slit`: a closed white room, 6 × 3 × 4, with a slit 20 cm wide across its ceiling, through which the sun shines.
 pub fn builtin(name: &str) -> Result<SceneData> {
     match name {
         "cornell" => cornell(),
-        "furnace" => furnace(),
+        "furnace" => furnace(0.5),
         "sealed" => sealed(),
         "atrium" => atrium(),
         "furniture" => furniture(),
         "partition" => partition(),
+        "slit" => slit(),
+        _ if name.starts_with("furnace:") => match name["furnace:".len()..].parse() {
+            Ok(albedo) if (0.0..1.0).contains(&albedo) => furnace(albedo),
+            _ => invalid_argument!("{name:?} names no albedo of a furnace from 0 to less than 1"),
+        },
         _ => invalid_argument!("there is no built-in scene {name:?}; there are {}", BUILTIN_NAMES.join(", ")),
     }
+}
+
+/// Whether [`builtin`] knows a name, those for measurements included.
+pub fn is_builtin(name: &str) -> bool {
+    BUILTIN_NAMES.contains(&name) || name == "slit" || name.starts_with("furnace:")
 }
 
 /// The camera for the pictures of a built-in scene.
@@ -50,11 +65,12 @@ pub fn builtin_camera(name: &str) -> Option<Camera> {
     match name {
         // The original's: 25 mm of film behind 35 mm of focal length.
         "cornell" => looking(Vec3::new(2.78, 2.73, -8.0), Vec3::new(2.78, 2.73, 0.0), 2.0 * (12.5f32 / 35.0).atan()),
-        "furnace" => looking(Vec3::new(0.1, 0.5, 0.1), Vec3::new(0.6, 0.4, 0.6), 1.2),
+        _ if name.starts_with("furnace") => looking(Vec3::new(0.1, 0.5, 0.1), Vec3::new(0.6, 0.4, 0.6), 1.2),
         "sealed" => looking(Vec3::new(0.3, 2.4, 0.3), Vec3::new(2.2, 1.2, 2.2), 1.2),
         "atrium" => Some(atrium_camera()),
         "furniture" => Some(furniture_camera()),
         "partition" => Some(partition_camera()),
+        "slit" => looking(Vec3::new(0.5, 1.6, 0.5), Vec3::new(3.5, 0.8, 2.5), 1.2),
         _ => None,
     }
 }
@@ -104,12 +120,34 @@ fn cornell() -> Result<SceneData> {
     Ok(scene)
 }
 
-fn furnace() -> Result<SceneData> {
+fn furnace(albedo: f32) -> Result<SceneData> {
     let mut scene = SceneData::new();
-    let walls = scene.add_material(Material { emission: [1.0; 3], ..Default::default() })?;
+    let walls = scene.add_material(Material { emission: [1.0; 3], ..diffuse([albedo; 3]) })?;
     let mut cube = MeshBuilder::new();
     cube.box_(Vec3::ZERO, Vec3::ONE, true, walls);
     scene.add_mesh(cube.finish())?;
+    Ok(scene)
+}
+
+fn slit() -> Result<SceneData> {
+    let mut scene = SceneData::new();
+    let white = scene.add_material(diffuse([0.7; 3]))?;
+    let p = Vec3::new;
+    let mut room = MeshBuilder::new();
+    // The walls of the room between two values of x: floor, ceiling, front and back.
+    for (x0, x1, is_open) in [(0.0, 2.9, false), (2.9, 3.1, true), (3.1, 6.0, false)] {
+        room.quad(p(x0, 0.0, 0.0), p(x0, 0.0, 4.0), p(x1, 0.0, 4.0), p(x1, 0.0, 0.0), white);
+        room.quad(p(x0, 0.0, 0.0), p(x1, 0.0, 0.0), p(x1, 3.0, 0.0), p(x0, 3.0, 0.0), white);
+        room.quad(p(x0, 0.0, 4.0), p(x0, 3.0, 4.0), p(x1, 3.0, 4.0), p(x1, 0.0, 4.0), white);
+        if !is_open {
+            room.quad(p(x0, 3.0, 0.0), p(x1, 3.0, 0.0), p(x1, 3.0, 4.0), p(x0, 3.0, 4.0), white);
+        }
+    }
+    room.quad(p(0.0, 0.0, 0.0), p(0.0, 3.0, 0.0), p(0.0, 3.0, 4.0), p(0.0, 0.0, 4.0), white);
+    room.quad(p(6.0, 0.0, 0.0), p(6.0, 0.0, 4.0), p(6.0, 3.0, 4.0), p(6.0, 3.0, 0.0), white);
+    scene.add_mesh(room.finish())?;
+    let direction = p(0.2, -1.0, 0.1).normalize();
+    scene.add_light(Light::Directional { direction, irradiance: [20.0; 3], angular_radius: 0.0 })?;
     Ok(scene)
 }
 
@@ -176,6 +214,16 @@ mod tests {
         assert_volume(&sealed.meshes()[0], -48.0);
         assert_volume(&sealed.meshes()[1], -1.0);
         assert_volume(&sealed.meshes()[2], 1.02f64.powi(3));
+    }
+
+    #[test]
+    fn a_furnace_has_the_albedo_asked_for_and_the_slit_room_a_front_towards_everything() {
+        assert_eq!(builtin("furnace:0.98").unwrap().materials()[0].albedo, [0.98; 3]);
+        assert!(builtin("furnace:1").unwrap_err().to_string().contains("furnace:1"));
+        let slit = commit("slit");
+        for t in 0..slit.triangle_count() {
+            assert!(slit.normal(t).dot(Vec3::new(3.0, 1.5, 2.0) - slit.corners(t)[0]) > 0.5, "triangle {t}");
+        }
     }
 
     #[test]

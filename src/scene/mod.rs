@@ -12,7 +12,7 @@ mod rooms;
 pub mod shapes;
 mod texture;
 
-pub use builtin::{BUILTIN_NAMES, Camera, builtin, builtin_camera};
+pub use builtin::{BUILTIN_NAMES, Camera, builtin, builtin_camera, is_builtin};
 pub use commit::{Emitter, Scene, SceneStats, unit_normal};
 pub use environment::{Environment, MAX_ENVIRONMENT_SIZE, Sky};
 pub use light::Light;

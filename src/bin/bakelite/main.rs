@@ -52,7 +52,7 @@ use bakelite::bvh::BuildOptions;
 use bakelite::device::LogLevel;
 use bakelite::io::image::write_png_rgb8;
 use bakelite::lightmap::{BakeStats, CheckpointParams, Lightmap};
-use bakelite::scene::{BUILTIN_NAMES, Camera, builtin, builtin_camera};
+use bakelite::scene::{Camera, builtin, builtin_camera, is_builtin};
 use bakelite::{Device, DeviceOptions, Error, Light, Progress, Result, Scene, SceneData};
 use bar::Bars;
 use pictures::{NAMES, Pictures, View};
@@ -166,7 +166,7 @@ impl<'a> Job<'a> {
     fn load_dark(&mut self) -> Result<SceneData> {
         let start = Instant::now();
         let name = self.args.scene.as_str();
-        let mut data = if BUILTIN_NAMES.contains(&name) {
+        let mut data = if is_builtin(name) {
             builtin(name)?
         } else {
             let mut data = SceneData::new();

@@ -146,6 +146,14 @@ impl Points {
         })
     }
 
+    /// Direct light of the reference.
+    pub fn direct(&self) -> [Values; 2] {
+        std::array::from_fn(|half| {
+            let (all, indirect) = (&self.all[half], &self.indirect[half]);
+            all.iter().zip(indirect).map(|(a, i)| std::array::from_fn(|c| a[c] - i[c])).collect()
+        })
+    }
+
     /// The points and the reference, with the light of a `bake` beside it.
     pub fn csv(&self, bake: &Values) -> String {
         let mut out = format!("{COLUMNS}\n");

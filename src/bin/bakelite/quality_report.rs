@@ -45,6 +45,8 @@ struct Row {
     indirect: Errors,
     /// Direct light too, where it is part of what was computed.
     all: Option<Errors>,
+    /// Direct light alone, likewise.
+    direct: Option<Errors>,
     /// Structural similarity of a view with the path traced one, where the view can be rendered.
     ssim: Option<f64>,
 }
@@ -172,11 +174,13 @@ impl Measure<'_> {
         params: &BakeParams,
     ) -> Result<()> {
         job.bars.say(&format!("{series} {value}"));
-        let (mut indirect, mut all, mut seconds, mut ssim) = (Vec::new(), Vec::new(), Vec::new(), Some(0.0));
+        let (mut indirect, mut direct, mut all) = (Vec::new(), Vec::new(), Vec::new());
+        let (mut seconds, mut ssim) = (Vec::new(), Some(0.0));
         for seed in 0..self.args.seeds {
             let params = BakeParams { seed: params.seed + seed, ..*params };
             seconds.push(lightmap.bake(&params, &Progress::none())?.seconds);
             indirect.push(self.points.of_bake(lightmap, Layer::Indirect)?);
+            direct.push(self.points.of_bake(lightmap, Layer::Direct)?);
             all.push(self.points.of_bake(lightmap, Layer::Combined)?);
             let one = self.view.map(|view| view.of_bake(lightmap)).transpose()?.flatten();
             ssim = ssim.zip(one).map(|(sum, one)| sum + one / self.args.seeds as f64);
@@ -187,6 +191,7 @@ impl Measure<'_> {
             seconds: median(seconds),
             indirect: errors(&indirect, &self.points.indirect),
             all: Some(errors(&all, &self.points.all)),
+            direct: Some(errors(&direct, &self.points.direct())),
             ssim,
         });
         Ok(())
@@ -216,6 +221,7 @@ impl Measure<'_> {
                 seconds: start.elapsed().as_secs_f64() / self.args.seeds as f64 * all_texels,
                 indirect: errors(&runs, &self.points.indirect),
                 all: None,
+                direct: None,
                 ssim: None,
             });
         }
@@ -247,6 +253,7 @@ impl Measure<'_> {
                 seconds: median(seconds),
                 indirect: errors(&runs, &self.points.indirect),
                 all: None,
+                direct: None,
                 ssim: None,
             });
         }
@@ -410,17 +417,17 @@ fn markdown(
     }
     out.push_str(
         "\n![error against time](quality.svg)\n\n## All settings\n\n\
-         | | | seconds | RMS | relative MSE | ± | but worst | noise² | bias² | Σ | to mean | all light: MSE | but worst | Σ | SSIM |\n\
-         |---|---|---|---|---|---|---|---|---|---|---|---|---|---|---|\n",
+         | | | seconds | RMS | relative MSE | ± | but worst | noise² | bias² | Σ | to mean | direct light: MSE | but worst | Σ | all light: MSE | but worst | Σ | SSIM |\n\
+         |---|---|---|---|---|---|---|---|---|---|---|---|---|---|---|---|---|---|\n",
     );
     for r in rows {
         let e = &r.indirect;
-        let all = r
-            .all
-            .map_or("– | – | –".into(), |a| format!("{:.1e} | {:.1e} | {:.3}", a.mse, a.trimmed, 1.0 + a.mean));
+        let [direct, all] = [r.direct, r.all].map(|e| {
+            e.map_or("– | – | –".into(), |e| format!("{:.1e} | {:.1e} | {:.3}", e.mse, e.trimmed, 1.0 + e.mean))
+        });
         let _ = writeln!(
             out,
-            "| {} | {} | {:.2} | {:.2} % | {:.1e} | {:.0e} | {:.1e} | {:.1e} | {:.1e} | {:.3} | {:.1e} | {all} | {} |",
+            "| {} | {} | {:.2} | {:.2} % | {:.1e} | {:.0e} | {:.1e} | {:.1e} | {:.1e} | {:.3} | {:.1e} | {direct} | {all} | {} |",
             r.series,
             r.value,
             r.seconds,
@@ -449,7 +456,7 @@ mod tests {
 
     fn row(seconds: f64, mse: f64, bias2: f64) -> Row {
         let indirect = Errors { mse, bias2, variance: mse - bias2, ..Default::default() };
-        Row { series: "s".into(), value: String::new(), seconds, indirect, all: None, ssim: None }
+        Row { series: "s".into(), value: String::new(), seconds, indirect, all: None, direct: None, ssim: None }
     }
 
     #[test]
