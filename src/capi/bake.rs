@@ -84,15 +84,18 @@ pub struct bk_bake_params {
     /// Texels of the light map that no texel of the gather map around stands for (some 1 to 3 %) trace up to 16
     /// rays of their own. Default: 64.
     pub gather_rays: u32,
-    /// Photon search radius in scene units, finite and at least 1.2e-38; 0, the default: from the
-    /// density of photons. Photons that are not seen from the middle of their disc, as those behind a
-    /// wall, do not count, and neither does the surface there.
+    /// Photon search radius in scene units, finite and at least 1.2e-38; 0, the default: from the number of photons that
+    /// reach surfaces and the lit area, and at least three quarters of a texel of the radiance map, so that no photon
+    /// lies between the places where light is estimated. Photons that are not seen from the middle of their disc, as
+    /// those behind a wall, do not count, and neither does the surface there.
     pub radius: f32,
     /// Radius of the gather map's blur in its texels, at most 16; 0: none. Default: 2.
     pub blur_radius: u32,
     /// Shadow rays per light map texel and area light or disc of a directional light, 1 to 4096 (of
     /// more than four area lights, four times as many rays are shared out); four times as many per sky,
-    /// and for all of many lights (BK_LEFT_OUT_MANY_LIGHTS). Default: 16.
+    /// and for all of many lights (BK_LEFT_OUT_MANY_LIGHTS). They start from 4 points spread over the
+    /// texel, or from 16 in the penumbra of a disc. Point, spot and parallel lights take one ray each, and
+    /// 4 to 16 more, spread over the texel, where shadow edges cross it. Default: 16.
     pub direct_samples: u32,
     /// Seed of all random numbers. The same seed gives the same bits on any number of threads.
     /// Default: 0.

@@ -3,6 +3,7 @@
 use super::blur::Filling;
 use super::bright::Bright;
 use super::buried::Search;
+use super::chart_index::ChartIndex;
 use super::charts::{Charts, automatic_density};
 use super::direct::DirectLight;
 use super::gather::{Gathered, SampleSet};
@@ -14,6 +15,7 @@ use super::saved::checkpoint::Checkpoint;
 use super::seams::Stitch;
 use super::seen::{self, Seen};
 use super::sides;
+use super::texel_light::{TexelLight, Variation};
 use super::texels::TexelMap;
 use super::upsample::{OWN_RAYS, OwnLight, OwnRays, Upsampling};
 use super::{
@@ -24,7 +26,7 @@ use crate::device::LogLevel;
 use crate::error::{Error, Result, invalid_argument};
 use crate::memory::{try_collect, try_vec};
 use crate::photon::{PhotonMap, PhotonParams};
-use crate::progress::Progress;
+use crate::progress::{Progress, Stage};
 use crate::sampling::{combine, purpose_seed};
 use crate::scene::Scene;
 use crate::trace::offset::too_few_digits;
@@ -44,6 +46,9 @@ const AUTOMATIC_PAGES: f64 = 1.0;
 /// Bytes per gather texel while a bake runs: light, blurred light, normal, variance, whether it is valid.
 const GATHER_BYTES: usize = 3 * size_of::<Vec3>() + size_of::<f32>() + size_of::<bool>();
 
+/// Bytes per light map texel while a bake runs: direct and indirect light, what is known of it, whether direct light varies.
+const TEXEL_BYTES: usize = 2 * size_of::<Vec3>() + size_of::<TexelState>() + size_of::<Variation>();
+
 /// The offset of rays from surfaces from which on a warning is due, as a part of a texel.
 const OFFSET_PART: f32 = 0.25;
 
@@ -58,6 +63,14 @@ pub(crate) mod purpose {
     pub const DIRECT: u32 = 4;
     pub const OWN: u32 = 5;
 }
+
+/// The automatic search radius of photons is at least so many texels of the radiance map, so that the discs around its
+/// samples leave no photon out.
+const RADIUS_TEXELS: f32 = 0.75;
+
+/// Photons that are kept, at most, and per texel of the radiance map if that is more; of more, some stand for the others.
+const MOST_STORED: u64 = 1 << 24;
+const STORED_PER_TEXEL: u64 = 256;
 
 /// The radiance map, coarser than the light map, takes this part of the direct samples.
 const RADIANCE_SAMPLE_DIVISOR: u32 = 4;
@@ -113,8 +126,9 @@ impl Lightmap {
         let buried = move_buried(&mut map)?;
         uvs.overlapping_texels = map.texels.overlapping_texels;
         uvs.reduced_charts = map.layout.reduced;
+        let index = ChartIndex::new(scene.device(), &charts)?;
         let own_bytes = charts.bytes() + seen.bytes() + buried.len();
-        let bytes = own_bytes + map.bytes() + gather.bytes() + radiance.bytes();
+        let bytes = own_bytes + index.bytes() + map.bytes() + gather.bytes() + radiance.bytes();
         let info = LightmapInfo {
             page_count: map.layout.page_count,
             width: map.layout.page_size,
@@ -143,7 +157,7 @@ impl Lightmap {
         plan.note_sides(&info);
         let scene = scene.clone();
         let padding = desc.padding;
-        let atlas = Atlas { scene, charts, map, gather, radiance, padding, info, seen, buried, _memory: memory };
+        let atlas = Atlas { scene, charts, index, map, gather, radiance, padding, info, seen, buried, _memory: memory };
         Ok(Lightmap { atlas: Arc::new(atlas), plan, light: None })
     }
 
@@ -310,7 +324,7 @@ impl Bake<'_, '_> {
     /// Announces the buffers of all stages but the photon map, which announces its own.
     fn reserve(&self) -> Result<crate::memory::Reservation> {
         let l = self.atlas;
-        let mut bytes = l.map.len() * 25;
+        let mut bytes = l.map.len() * TEXEL_BYTES;
         if self.plan.runs(left_out::INDIRECT) {
             bytes += l.radiance.len() * 12 + l.gather.len() * GATHER_BYTES;
         }
@@ -332,6 +346,8 @@ impl Bake<'_, '_> {
             seed: self.params.seed,
             memory_budget: self.params.memory_budget,
             store_direct: false,
+            least_radius: RADIUS_TEXELS / self.atlas.radiance.layout.density,
+            most_stored: MOST_STORED.max(STORED_PER_TEXEL * self.atlas.radiance.len() as u64),
             ..Default::default()
         };
         let map = PhotonMap::trace_within(&self.atlas.scene, &params, self.progress, 0.0, 0.2)?;
@@ -344,17 +360,15 @@ impl Bake<'_, '_> {
     fn radiance(&self, photons: Option<&PhotonMap>, stats: &mut BakeStats) -> Result<Radiance> {
         let start = Instant::now();
         let l = self.atlas;
-        let stage = self.progress.stage("radiance", 0.2, 0.3, l.radiance.len() as u64);
+        let stage = self.progress.stage("radiance", 0.2, 0.3, 2 * l.radiance.len() as u64);
         let mut values = try_vec(l.radiance.len(), "the radiance map")?;
-        let input = RadianceInput {
-            scene: &l.scene,
-            charts: &l.charts,
-            map: &l.radiance,
+        let light = TexelLight {
+            areas: l.areas(&l.radiance),
             direct: self.direct,
-            photons,
-            direct_samples: self.params.direct_samples.div_ceil(RADIANCE_SAMPLE_DIVISOR),
+            samples: self.params.direct_samples.div_ceil(RADIANCE_SAMPLE_DIVISOR),
             seed: purpose_seed(self.params.seed, purpose::RADIANCE),
         };
+        let input = RadianceInput { light, photons };
         let mut rays = radiance::bake(l.scene.device(), &input, &mut values, &stage)?;
         let mut radiance = Radiance { values, bright: Bright::default() };
         l.scene.device().install(|| Bright::find(l, &mut radiance, &mut rays, self.progress))?;
@@ -496,16 +510,18 @@ impl Bake<'_, '_> {
     ) -> Result<()> {
         let start = Instant::now();
         let l = self.atlas;
-        let seed = purpose_seed(self.params.seed, purpose::DIRECT);
-        let stage = self.progress.stage("direct", 0.65, 1.0, self.range.len() as u64);
+        let stage = self.progress.stage("direct", 0.65, 1.0, 2 * self.range.len() as u64);
         let rays = AtomicU64::new(0);
         let range = self.range.clone();
         let backs = &light.backs[..];
+        let texels = self.texel_light();
+        // Blocks whose light a checkpoint has.
+        let mut known = vec![false; range.len().div_ceil(BLOCK)];
         scene.device().install(|| {
-            let direct = light.direct[range.clone()].par_chunks_mut(BLOCK);
+            let direct = light.direct[range.clone()].par_chunks_mut(BLOCK).zip(&mut known);
             let indirect_out = light.indirect[range.clone()].par_chunks_mut(BLOCK);
             let state = light.state[range.clone()].par_chunks_mut(BLOCK);
-            direct.zip(indirect_out).zip(state).enumerate().try_for_each(|(block, ((direct, ind), state))| {
+            direct.zip(indirect_out).zip(state).enumerate().try_for_each(|(block, (((direct, known), ind), state))| {
                 let mut traced = 0;
                 let first = range.start + block * BLOCK;
                 if let Some(indirect) = indirect {
@@ -513,7 +529,8 @@ impl Bake<'_, '_> {
                         *ind = indirect.upsampling.at(l, &indirect.irradiance, &indirect.own, first + i);
                     }
                 }
-                if self.checkpoint.is_some_and(|c| c.lit(block, direct, state)) {
+                *known = self.checkpoint.is_some_and(|c| c.lit(block, direct, state));
+                if *known {
                     return stage.advance(direct.len() as u64);
                 }
                 for i in 0..direct.len() {
@@ -525,9 +542,79 @@ impl Bake<'_, '_> {
                         _ => TexelState::Visible,
                     };
                     if self.plan.runs(left_out::DIRECT) {
-                        let seed = combine(seed, sample as u32);
-                        direct[i] = self.direct.irradiance(&receiver, self.params.direct_samples, seed, &mut traced);
+                        direct[i] = texels.sharp(&receiver, &mut traced);
                     }
+                }
+                if let Some(c) = self.checkpoint.filter(|_| !self.plan.runs(left_out::DIRECT)) {
+                    c.keep_lit(block, direct, state);
+                }
+                rays.fetch_add(traced, Relaxed);
+                stage.advance(direct.len() as u64)
+            })
+        })?;
+        if self.plan.runs(left_out::DIRECT) {
+            let traced = self.average_direct(&texels, backs, &known, &mut light.direct, &light.state, &stage)?;
+            rays.fetch_add(traced, Relaxed);
+        }
+        stats.direct = StageStats {
+            seconds: start.elapsed().as_secs_f64(),
+            rays: rays.into_inner(),
+            bytes: (l.map.len() * TEXEL_BYTES + l.map.bytes()) as u64,
+        };
+        Ok(())
+    }
+
+    /// Direct light of the light map's texels.
+    fn texel_light(&self) -> TexelLight<'_> {
+        TexelLight {
+            areas: self.atlas.areas(&self.atlas.map),
+            direct: self.direct,
+            samples: self.params.direct_samples,
+            seed: purpose_seed(self.params.seed, purpose::DIRECT),
+        }
+    }
+
+    /// Turns light without penumbrae at the samples of the range into all direct light, averaged over texels; returns the
+    /// rays traced.
+    fn average_direct(
+        &self,
+        texels: &TexelLight,
+        backs: &[bool],
+        known: &[bool],
+        direct: &mut [Vec3],
+        state: &[TexelState],
+        stage: &Stage,
+    ) -> Result<u64> {
+        let (l, range) = (self.atlas, self.range.clone());
+        let rays = AtomicU64::new(0);
+        let mut variations: Vec<Variation> = try_vec(range.len(), "where direct light varies")?;
+        l.scene.device().install(|| {
+            let sharp = &direct[..];
+            variations.par_chunks_mut(BLOCK).enumerate().for_each(|(block, out)| {
+                let mut traced = 0;
+                for (i, variation) in out.iter_mut().enumerate().filter(|_| !known[block]) {
+                    let sample = range.start + block * BLOCK + i;
+                    // What is baked by another shard, or was before, is computed here too.
+                    let is_here = |s: usize| range.contains(&s) && !known[(s - range.start) / BLOCK];
+                    *variation = texels.varies(sample, sharp[sample], |s| match is_here(s) {
+                        true => sharp[s],
+                        false => texels.sharp(&l.receiver(&l.map, backs, s), &mut traced),
+                    });
+                }
+                rays.fetch_add(traced, Relaxed);
+            });
+            let blocks = direct[range.clone()].par_chunks_mut(BLOCK).zip(state[range.clone()].par_chunks(BLOCK));
+            let blocks = blocks.zip(variations.par_chunks(BLOCK)).enumerate();
+            blocks.try_for_each(|(block, ((direct, state), variations))| {
+                if known[block] {
+                    return stage.advance(direct.len() as u64);
+                }
+                let mut traced = 0;
+                for (i, (direct, &variation)) in direct.iter_mut().zip(variations).enumerate() {
+                    self.progress.check()?;
+                    let sample = range.start + block * BLOCK + i;
+                    let (back, receiver) = (l.is_back(&l.map, backs, sample), l.receiver(&l.map, backs, sample));
+                    *direct = texels.irradiance(sample, back, &receiver, *direct, variation, &mut traced);
                 }
                 if let Some(c) = self.checkpoint {
                     c.keep_lit(block, direct, state);
@@ -536,11 +623,6 @@ impl Bake<'_, '_> {
                 stage.advance(direct.len() as u64)
             })
         })?;
-        stats.direct = StageStats {
-            seconds: start.elapsed().as_secs_f64(),
-            rays: rays.into_inner(),
-            bytes: (l.map.len() * 25 + l.map.bytes()) as u64,
-        };
-        Ok(())
+        Ok(rays.into_inner())
     }
 }

@@ -148,7 +148,7 @@ impl Search<'_> {
     }
 
     fn is_buried(&self, point: &TexelSample, sample: u32, back: bool, rays: &mut u64) -> bool {
-        let (_, receiver) = ChartMap::receiver_at(self.scene, point, back);
+        let (_, receiver) = super::map::receiver_of(self.scene, point, back);
         let (mut open, mut backs) = (0, 0);
         for i in 0..RAYS {
             let d = cosine_around(receiver.geometric, sobol_2d(i, sample));

@@ -87,27 +87,41 @@ pub(super) fn shadow_ray(receiver: &Receiver, target: Vec3) -> Ray {
 /// Shadow rays that are traced together. (Direct light of the living room, 20 texels/m: 1.4 s; one by one 2.15 s.)
 const TOGETHER: usize = 32;
 
+/// Sums of light that [`ShadowRays`] keeps apart.
+const SLOTS: usize = KINDS * MAX_POINTS;
+
 /// Shadow rays and the light that comes along them if nothing is in the way.
 pub(super) struct ShadowRays<'a> {
     scene: &'a Scene,
     rays: [Ray; TOGETHER],
     light: [Vec3; TOGETHER],
+    slots: [u8; TOGETHER],
     count: usize,
     traced: u64,
-    visible: Vec3,
+    /// The sum that the next rays belong to.
+    slot: u8,
+    visible: [Vec3; SLOTS],
 }
 
 impl<'a> ShadowRays<'a> {
     pub(super) fn new(scene: &'a Scene) -> Self {
-        let rays = [Ray::new(Vec3::ZERO, Vec3::ZERO); TOGETHER];
-        ShadowRays { scene, rays, light: [Vec3::ZERO; TOGETHER], count: 0, traced: 0, visible: Vec3::ZERO }
+        ShadowRays {
+            scene,
+            rays: [Ray::new(Vec3::ZERO, Vec3::ZERO); TOGETHER],
+            light: [Vec3::ZERO; TOGETHER],
+            slots: [0; TOGETHER],
+            count: 0,
+            traced: 0,
+            slot: 0,
+            visible: [Vec3::ZERO; SLOTS],
+        }
     }
 
     pub(super) fn push(&mut self, ray: Ray, light: Vec3) {
         if self.count == TOGETHER {
             self.trace();
         }
-        (self.rays[self.count], self.light[self.count]) = (ray, light);
+        (self.rays[self.count], self.light[self.count], self.slots[self.count]) = (ray, light, self.slot);
         self.count += 1;
     }
 
@@ -120,19 +134,18 @@ impl<'a> ShadowRays<'a> {
     }
 
     fn trace(&mut self) {
-        let mut occluded = [0; TOGETHER];
         let scene = self.scene;
+        let lit = self.light[..self.count].iter().zip(&self.slots);
         if scene.uses().transmission {
-            for (ray, light) in self.rays[..self.count].iter().zip(&self.light) {
-                self.visible += *light * scene.transmittance(ray);
+            for (ray, (light, &slot)) in self.rays[..self.count].iter().zip(lit) {
+                self.visible[slot as usize] += *light * scene.transmittance(ray);
             }
-            self.traced += self.count as u64;
-            self.count = 0;
-            return;
-        }
-        scene.occluded_block(&self.rays[..self.count], &mut occluded);
-        for (light, _) in self.light[..self.count].iter().zip(occluded).filter(|(_, occluded)| *occluded == 0) {
-            self.visible += *light;
+        } else {
+            let mut occluded = [0; TOGETHER];
+            scene.occluded_block(&self.rays[..self.count], &mut occluded);
+            for ((light, &slot), _) in lit.zip(occluded).filter(|(_, occluded)| *occluded == 0) {
+                self.visible[slot as usize] += *light;
+            }
         }
         self.traced += self.count as u64;
         self.count = 0;
@@ -142,7 +155,97 @@ impl<'a> ShadowRays<'a> {
     pub(super) fn finish(mut self, rays: &mut u64) -> Vec3 {
         self.trace();
         *rays += self.traced;
-        self.visible
+        self.visible[0]
+    }
+}
+
+/// Points that are lit together, at most.
+pub(super) const MAX_POINTS: usize = 16;
+
+/// Parts of a point's light that are estimated in different ways.
+const KINDS: usize = 4;
+
+/// Which lights shine.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub(super) enum Lights {
+    All,
+    /// Those with shadows without penumbrae: parallel lights, and point and spot lights unless they are many.
+    Sharp,
+    /// All others.
+    Soft,
+}
+
+/// An estimate by ratio: the exact unoccluded light, and what samples of it bring with and without what is in their way.
+#[derive(Clone, Copy, Debug, Default)]
+struct Ratio {
+    total: Vec3,
+    visible: Vec3,
+    samples: Vec3,
+}
+
+/// Direct light at a point, or a weighted sum over points.
+#[derive(Clone, Copy, Debug, Default)]
+pub(super) struct PointLight {
+    /// Irradiance of the lights that [`Lights::Sharp`] names.
+    pub sharp: Vec3,
+    /// Irradiance of skies and of many lights.
+    sampled: Vec3,
+    discs: Ratio,
+    areas: Ratio,
+}
+
+impl Ratio {
+    fn add(&mut self, other: &Ratio, weight: Vec3) {
+        self.total += weight * other.total;
+        self.visible += weight * other.visible;
+        self.samples += weight * other.samples;
+    }
+
+    fn value(&self) -> Vec3 {
+        let fraction = |v: f32, w: f32| if w > 0.0 { v / w } else { 0.0 };
+        let (v, w) = (self.visible, self.samples);
+        self.total * Vec3::new(fraction(v.x, w.x), fraction(v.y, w.y), fraction(v.z, w.z))
+    }
+}
+
+impl PointLight {
+    /// Adds `weight` times the light of another point.
+    pub(super) fn add(&mut self, other: &PointLight, weight: Vec3) {
+        self.sharp += weight * other.sharp;
+        self.sampled += weight * other.sampled;
+        self.discs.add(&other.discs, weight);
+        self.areas.add(&other.areas, weight);
+    }
+
+    /// The irradiance, or the sum of irradiances.
+    pub(super) fn value(&self) -> Vec3 {
+        self.sharp + self.sampled + self.discs.value() + self.areas.value()
+    }
+
+    /// Light whose shadows have narrow penumbrae or none.
+    pub(super) fn narrow(&self) -> Vec3 {
+        self.sharp + self.discs.visible
+    }
+
+    /// Light of discs, as their samples found it.
+    pub(super) fn of_discs(&self) -> Vec3 {
+        self.discs.visible
+    }
+
+    /// Light of area lights with nothing in the way.
+    pub(super) fn unoccluded_areas(&self) -> Vec3 {
+        self.areas.total
+    }
+
+    /// Whether some samples of discs are occluded and others are not.
+    pub(super) fn is_in_a_penumbra_of_discs(&self) -> bool {
+        let (visible, samples) = (self.discs.visible.element_sum(), self.discs.samples.element_sum());
+        visible > 0.0 && visible < samples * (1.0 - 1e-5)
+    }
+
+    /// Whether no sample found any light.
+    pub(super) fn is_dark(&self) -> bool {
+        self.sharp + self.sampled + self.discs.visible + self.areas.visible == Vec3::ZERO
     }
 }
 
@@ -258,29 +361,97 @@ impl DirectLight {
 
     /// `by_ratio`: area lights and discs as their exact irradiance times the visible fraction.
     fn estimate(&self, receiver: &Receiver, samples: u32, seed: u32, rays: &mut u64, by_ratio: bool) -> Vec3 {
-        let mut shadow = ShadowRays::new(&self.scene);
-        for light in &self.each {
-            push_one(light, receiver, &mut shadow);
-        }
-        if let Some(many) = self.many.as_ref().filter(|_| samples > 0) {
-            many.push(receiver, samples * MAX_LIGHTS_SAMPLED as u32, seed, &mut shadow);
-        }
-        // Sequences of skies and discs differ by their number.
-        for (i, sky) in (0..).zip(&self.skies).filter(|_| samples > 0) {
-            push_sky(sky, receiver, samples * MAX_LIGHTS_SAMPLED as u32, combine(seed, 16 + i), &mut shadow);
-        }
-        let mut sum = shadow.finish(rays);
-        for (i, disc) in (0..).zip(&self.discs) {
-            sum += disc.light(&self.scene, receiver, samples, combine(seed, 16 + i), rays, by_ratio);
-        }
-        if !self.areas.is_empty() && samples > 0 {
-            sum += self.few_area_lights(receiver, samples, seed, rays, by_ratio);
-        }
-        sum
+        let mut light = [PointLight::default()];
+        self.at_points(&[*receiver], 0, Lights::All, samples, seed, rays, &mut light);
+        let [l] = light;
+        if by_ratio { l.value() } else { l.sharp + l.sampled + l.discs.visible + l.areas.visible }
     }
 
-    /// Exact unoccluded irradiance times the visible fraction of it, or the mean of what samples bring.
-    fn few_area_lights(&self, receiver: &Receiver, samples: u32, seed: u32, rays: &mut u64, by_ratio: bool) -> Vec3 {
+    /// Whether there are lights of [`Lights::Sharp`].
+    pub(super) fn has_sharp(&self) -> bool {
+        !self.each.is_empty()
+    }
+
+    /// Whether there are lights of [`Lights::Soft`].
+    pub(super) fn has_soft(&self) -> bool {
+        !self.areas.is_empty() || self.many.is_some() || !self.discs.is_empty() || !self.skies.is_empty()
+    }
+
+    /// Direct light at up to [`MAX_POINTS`] points, which are the points `first`, `first + 1`, … of those that share
+    /// `seed`: their samples of a light are stratified together. `samples`: per point, as in
+    /// [`irradiance`](Self::irradiance).
+    // Seven arguments, of which no two belong together.
+    #[allow(clippy::too_many_arguments)]
+    pub(super) fn at_points(
+        &self,
+        receivers: &[Receiver],
+        first: u32,
+        lights: Lights,
+        samples: u32,
+        seed: u32,
+        rays: &mut u64,
+        out: &mut [PointLight],
+    ) {
+        let mut shadow = ShadowRays::new(&self.scene);
+        for (i, (receiver, out)) in receivers.iter().zip(&mut *out).enumerate() {
+            *out = PointLight::default();
+            shadow.slot = (KINDS * i) as u8;
+            if lights != Lights::Soft {
+                self.each.iter().for_each(|light| push_one(light, receiver, &mut shadow));
+            }
+            if lights != Lights::Sharp && samples > 0 {
+                self.push_soft(receiver, first + i as u32, samples, seed, &mut shadow, out);
+            }
+        }
+        shadow.trace();
+        *rays += shadow.traced;
+        for (out, sums) in out.iter_mut().zip(shadow.visible.chunks_exact(KINDS)) {
+            (out.sharp, out.sampled, out.discs.visible, out.areas.visible) = (sums[0], sums[1], sums[2], sums[3]);
+        }
+    }
+
+    /// Pushes the shadow rays of [`Lights::Soft`] from point `number` of those that share `seed`.
+    fn push_soft(
+        &self,
+        receiver: &Receiver,
+        number: u32,
+        samples: u32,
+        seed: u32,
+        shadow: &mut ShadowRays,
+        out: &mut PointLight,
+    ) {
+        // Skies and many lights begin anew at every point.
+        let own = if number == 0 { seed } else { combine(seed, 64 + number) };
+        shadow.slot += 1;
+        if let Some(many) = &self.many {
+            many.push(receiver, samples * MAX_LIGHTS_SAMPLED as u32, own, shadow);
+        }
+        // Sequences of skies and discs differ by their number.
+        for (i, sky) in (0..).zip(&self.skies) {
+            push_sky(sky, receiver, samples * MAX_LIGHTS_SAMPLED as u32, combine(own, 16 + i), shadow);
+        }
+        shadow.slot += 1;
+        for (i, disc) in (0..).zip(&self.discs) {
+            let (total, light) = disc.push(receiver, number * samples, samples, combine(seed, 16 + i), shadow);
+            out.discs.total += total;
+            out.discs.samples += light;
+        }
+        shadow.slot += 1;
+        if !self.areas.is_empty() {
+            (out.areas.total, out.areas.samples) = self.push_areas(receiver, number, samples, seed, shadow);
+        }
+    }
+
+    /// Pushes the shadow rays to few area lights. Returns their exact unoccluded irradiance, and what all samples would
+    /// bring.
+    fn push_areas(
+        &self,
+        receiver: &Receiver,
+        number: u32,
+        samples: u32,
+        seed: u32,
+        shadow: &mut ShadowRays,
+    ) -> (Vec3, Vec3) {
         let mut unoccluded = [0.0f32; MAX_EXACT];
         let (mut total, mut importance, mut shining) = (Vec3::ZERO, 0.0f32, 0);
         for (e, area) in unoccluded.iter_mut().zip(&self.areas) {
@@ -290,11 +461,11 @@ impl DirectLight {
             shining += (*e > 0.0) as usize;
         }
         if !(importance > 0.0) {
-            return Vec3::ZERO;
+            return (Vec3::ZERO, Vec3::ZERO);
         }
         let n = samples as usize * shining.min(MAX_LIGHTS_SAMPLED);
-        let (mut weights, mut shadow) = (Vec3::ZERO, ShadowRays::new(&self.scene));
-        let offset = sobol_2d(0, combine(seed, 1))[0];
+        let mut brought = Vec3::ZERO;
+        let offset = sobol_2d(number, combine(seed, 1))[0];
         let (mut light, mut below) = (0, 0.0f32);
         let mut prepared = None;
         for k in 0..n {
@@ -308,21 +479,17 @@ impl DirectLight {
             }
             let area = &self.areas[light];
             let Some(sampler) = prepared.get_or_insert_with(|| area.sampler(receiver)) else { continue };
-            let (point, weight) = area.sample(sampler, receiver, sobol_2d(k as u32, combine(seed, 2)));
+            let at = sobol_2d(number * n as u32 + k as u32, combine(seed, 2));
+            let (point, weight) = area.sample(sampler, receiver, at);
             let weight = weight / share(light).max(f32::MIN_POSITIVE);
             if !(weight > 0.0 && weight.is_finite()) {
                 continue;
             }
-            weights += weight * area.radiance;
+            let weight = weight * (importance / n as f32);
+            brought += weight * area.radiance;
             shadow.push(shadow_ray(receiver, point), weight * area.radiance);
         }
-        let visible = shadow.finish(rays);
-        if !by_ratio {
-            return visible * (importance / n as f32);
-        }
-        let fraction = |v: f32, w: f32| if w > 0.0 { v / w } else { 0.0 };
-        total
-            * Vec3::new(fraction(visible.x, weights.x), fraction(visible.y, weights.y), fraction(visible.z, weights.z))
+        (total, brought)
     }
 
     /// Emitted radiance of a front (or back) of a triangle.

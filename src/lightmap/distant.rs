@@ -10,7 +10,7 @@
 
 use super::direct::{Receiver, ShadowRays};
 use crate::sampling::{combine, cosine_hemisphere, orthonormal_basis, sobol_2d};
-use crate::scene::{Scene, Sky};
+use crate::scene::Sky;
 use crate::trace::Ray;
 use glam::Vec3;
 use std::f32::consts::PI;
@@ -47,44 +47,42 @@ impl Disc {
         (part / consts::PI).max(0.0)
     }
 
-    pub(super) fn light(
+    /// Pushes the shadow rays of samples `first` to `first + samples` of the sequence that `seed` chooses. Returns the
+    /// unoccluded irradiance, and what all samples would bring with nothing in their way.
+    pub(super) fn push(
         &self,
-        scene: &Scene,
         receiver: &Receiver,
+        first: u32,
         samples: u32,
         seed: u32,
-        rays: &mut u64,
-        by_ratio: bool,
-    ) -> Vec3 {
+        shadow: &mut ShadowRays,
+    ) -> (Vec3, Vec3) {
         let cosine = self.to_light.as_dvec3().dot(receiver.normal.as_dvec3());
         let total = self.unoccluded(cosine) as f32;
         if total <= 0.0 {
-            return Vec3::ZERO;
+            return (Vec3::ZERO, Vec3::ZERO);
         }
         let (t, b) = orthonormal_basis(self.to_light);
         // 1 − cos of the radius, without cancellation.
         let height = 2.0 * (0.5 * self.angular_radius).sin().powi(2);
-        let (mut weights, mut shadow) = (0.0, ShadowRays::new(scene));
-        for k in 0..samples {
+        // Radiance times solid angle: irradiance / (π sin²) · 2π (1 − cos).
+        let sine = self.angular_radius.sin();
+        let of_one = self.irradiance * (2.0 * height / (sine * sine) / samples as f32);
+        let mut brought = Vec3::ZERO;
+        for k in first..first + samples {
             let [u, v] = sobol_2d(k, combine(seed, 4));
             let (sin, cos) = (2.0 * PI * v).sin_cos();
             let h = u * height;
             let direction = (t * cos + b * sin) * (h * (2.0 - h)).sqrt() + self.to_light * (1.0 - h);
             let weight = direction.dot(receiver.normal);
             if weight > 0.0 {
-                weights += weight;
+                brought += of_one * weight;
                 if receiver.faces(direction) {
-                    shadow.push(Ray::new(receiver.shadow_origin, direction), Vec3::splat(weight));
+                    shadow.push(Ray::new(receiver.shadow_origin, direction), of_one * weight);
                 }
             }
         }
-        let visible = shadow.finish(rays).x;
-        if !by_ratio {
-            // Radiance times solid angle: irradiance / (π sin²) · 2π (1 − cos).
-            let sine = self.angular_radius.sin();
-            return self.irradiance * (2.0 * height / (sine * sine) * visible / samples as f32);
-        }
-        if weights > 0.0 { self.irradiance * (total * (visible / weights)) } else { Vec3::ZERO }
+        (self.irradiance * total, brought)
     }
 }
 

@@ -48,7 +48,8 @@ impl Placement {
         [self.offset[0] + self.scale[0] * s, self.offset[1] + self.scale[1] * t]
     }
 
-    /// The point of a placed chart at a texel coordinate.
+    /// The point of the chart's plane at a texel coordinate.
+    #[inline]
     pub fn local(&self, coord: [f32; 2]) -> [f32; 2] {
         let [s, t] = [0, 1].map(|i| (coord[i] - self.offset[i]) / self.scale[i]);
         if self.swap { [t, s] } else { [s, t] }

@@ -77,22 +77,7 @@ impl ChartMap {
 
     /// The point of a sample and its side as a receiver.
     pub(crate) fn receiver(&self, scene: &Scene, sample: usize, back: bool) -> (SurfacePoint, Receiver) {
-        Self::receiver_at(scene, &self.texels.samples[sample], back)
-    }
-
-    /// A point on a triangle and its side as a receiver.
-    pub(crate) fn receiver_at(scene: &Scene, t: &TexelSample, back: bool) -> (SurfacePoint, Receiver) {
-        let point = SurfacePoint::new(scene.corners(t.triangle), t.u, t.v, scene);
-        let (mesh, triangle) = scene.locate(t.triangle);
-        let mesh = &scene.meshes()[mesh as usize];
-        if mesh.normals.is_empty() {
-            let receiver = Receiver::new(scene, &point, None, back);
-            return (point, receiver);
-        }
-        let receiver = Receiver::new(scene, &point, Some(t.shading_normal(scene)), back);
-        let normals = mesh.indices[triangle as usize].map(|i| mesh.normals[i as usize]);
-        let receiver = receiver.smooth(scene, mesh.corners(triangle as usize), normals, [t.u, t.v]);
-        (point, receiver)
+        receiver_of(scene, &self.texels.samples[sample], back)
     }
 
     /// Whether a sample shows a back in a place of its own.
@@ -113,4 +98,19 @@ impl ChartMap {
         let t = &self.texels.samples[sample];
         (t.position(scene), t.shading_normal(scene))
     }
+}
+
+/// A point of a triangle and its front or back as a receiver.
+pub(super) fn receiver_of(scene: &Scene, t: &TexelSample, back: bool) -> (SurfacePoint, Receiver) {
+    let point = SurfacePoint::new(scene.corners(t.triangle), t.u, t.v, scene);
+    let (mesh, triangle) = scene.locate(t.triangle);
+    let mesh = &scene.meshes()[mesh as usize];
+    if mesh.normals.is_empty() {
+        let receiver = Receiver::new(scene, &point, None, back);
+        return (point, receiver);
+    }
+    let receiver = Receiver::new(scene, &point, Some(t.shading_normal(scene)), back);
+    let normals = mesh.indices[triangle as usize].map(|i| mesh.normals[i as usize]);
+    let receiver = receiver.smooth(scene, mesh.corners(triangle as usize), normals, [t.u, t.v]);
+    (point, receiver)
 }

@@ -9,6 +9,7 @@ pub(crate) mod bake;
 pub mod blur;
 pub(crate) mod bright;
 mod buried;
+mod chart_index;
 pub mod charts;
 pub mod direct;
 mod distant;
@@ -28,6 +29,7 @@ mod seen;
 mod sides;
 mod spherical;
 mod terminator;
+pub(crate) mod texel_light;
 pub mod texels;
 mod unwrap;
 pub(crate) mod upsample;
@@ -37,6 +39,7 @@ use crate::error::{Result, invalid_argument};
 use crate::memory::Reservation;
 use crate::photon::MAX_PHOTONS;
 use crate::scene::Scene;
+use chart_index::ChartIndex;
 use charts::Charts;
 use glam::Vec3;
 use map::ChartMap;
@@ -47,6 +50,7 @@ pub use saved::CheckpointParams;
 use saved::fingerprint::Origin;
 use seen::Seen;
 use std::sync::Arc;
+use texel_light::TexelAreas;
 
 /// How a light map is laid out.
 #[derive(Clone, Copy, Debug, PartialEq)]
@@ -120,13 +124,16 @@ pub struct BakeParams {
     /// surfaces, where there are any. Texels of the light map that no gather texel around stands for (some 1 to 3 %) trace
     /// up to 16 of their own.
     pub gather_rays: u32,
-    /// Photon search radius, finite; 0: automatic.
+    /// Photon search radius, finite; 0: from the photons' density, and at least three quarters of a texel of the
+    /// radiance map, so that no photon lies between the places where light is estimated.
     pub radius: f32,
     /// Radius of the gather map's blur in its texels; 0: none.
     pub blur_radius: u32,
     /// Shadow rays per light map texel and area light or disc of a directional light (of more than
     /// four area lights, four times as many rays are shared out by their unoccluded light); four
-    /// times as many per sky, and for all of many lights.
+    /// times as many per sky, and for all of many lights. They start from 4 points spread over the texel, or from 16 in
+    /// the penumbra of a disc. Point, spot and parallel lights take one ray each, and 4 to 16 more, spread over the
+    /// texel, where shadow edges cross it.
     pub direct_samples: u32,
     pub seed: u64,
     /// Bytes that the bake may take in addition; 0: no limit.
@@ -274,6 +281,7 @@ struct Light {
 pub(crate) struct Atlas {
     pub scene: Arc<Scene>,
     pub charts: Charts,
+    pub index: ChartIndex,
     pub map: ChartMap,
     pub gather: ChartMap,
     pub radiance: ChartMap,
@@ -291,6 +299,11 @@ impl Atlas {
     pub(crate) fn is_back(&self, map: &ChartMap, backs: &[bool], sample: usize) -> bool {
         let chart = self.charts.chart_of[map.texels.samples[sample].triangle as usize];
         map.is_back(sample) || backs.get(chart as usize).is_some_and(|&b| b)
+    }
+
+    /// The texels of one of the maps as areas.
+    pub(crate) fn areas<'a>(&'a self, map: &'a ChartMap) -> TexelAreas<'a> {
+        TexelAreas { scene: &self.scene, charts: &self.charts, index: &self.index, map }
     }
 
     /// A sample of the light map or the gather map as a receiver, on the side that it shows.

@@ -17,20 +17,21 @@
 
 use super::bright::Bright;
 use super::charts::Charts;
-use super::direct::DirectLight;
 use super::map::ChartMap;
+use super::texel_light::{Look, TexelAreas, TexelLight};
+use super::texels::TexelSample;
 use crate::device::Device;
 use crate::error::Result;
+use crate::memory::try_vec;
 use crate::photon::PhotonMap;
 use crate::photon::coverage;
 use crate::progress::Stage;
 use crate::sampling::{combine, sobol_2d};
-use crate::scene::{NONE, Scene};
+use crate::scene::NONE;
 use crate::trace::RawHit;
 use glam::{Mat2, Vec2, Vec3};
 use rayon::prelude::*;
 use std::f32::consts::PI;
-use std::sync::Arc;
 use std::sync::atomic::{AtomicU64, Ordering::Relaxed};
 
 /// Texels handed to a thread at a time.
@@ -87,25 +88,36 @@ impl<'a> RadianceMap<'a> {
 
 /// What the stage needs.
 pub(crate) struct RadianceInput<'a> {
-    pub scene: &'a Arc<Scene>,
-    pub charts: &'a Charts,
-    pub map: &'a ChartMap,
-    pub direct: &'a DirectLight,
+    pub light: TexelLight<'a>,
     /// Photons that were reflected before; `None`: there is no such light.
     pub photons: Option<&'a PhotonMap>,
-    pub direct_samples: u32,
-    pub seed: u32,
 }
 
-/// Fills in `values`, one per texel of the map; returns the rays traced.
+/// Fills in `values`, one per texel of the map; returns the rays traced. Advances `stage` by twice as many.
+///
+/// Direct light is averaged over texels: first by a few points each, then by more where those, or those of neighbouring
+/// texels, tell that it varies.
 pub(crate) fn bake(device: &Device, input: &RadianceInput, values: &mut [Vec3], stage: &Stage) -> Result<u64> {
     let rays = AtomicU64::new(0);
+    let mut looks: Vec<Look> = try_vec(values.len(), "direct light of the radiance map")?;
+    let _memory = device.memory().reserve(size_of_val(&looks[..]), "direct light of the radiance map")?;
+    let map = input.light.areas.map;
     device.install(|| {
+        looks.par_chunks_mut(BLOCK).enumerate().try_for_each(|(block, out)| {
+            let mut traced = 0;
+            for (i, look) in out.iter_mut().enumerate() {
+                stage.check()?;
+                let sample = block * BLOCK + i;
+                *look = input.light.first_look(sample, map.is_back(sample), &mut traced);
+            }
+            rays.fetch_add(traced, Relaxed);
+            stage.advance(out.len() as u64)
+        })?;
         values.par_chunks_mut(BLOCK).enumerate().try_for_each(|(block, out)| {
             let mut traced = 0;
             for (i, value) in out.iter_mut().enumerate() {
                 stage.check()?;
-                *value = texel(input, block * BLOCK + i, &mut traced);
+                *value = texel(input, &looks, block * BLOCK + i, &mut traced);
             }
             rays.fetch_add(traced, Relaxed);
             stage.advance(out.len() as u64)
@@ -114,15 +126,21 @@ pub(crate) fn bake(device: &Device, input: &RadianceInput, values: &mut [Vec3], 
     Ok(rays.into_inner())
 }
 
-fn texel(input: &RadianceInput, sample: usize, rays: &mut u64) -> Vec3 {
-    let albedo = albedo(input.scene, input.charts, input.map, sample);
+fn texel(input: &RadianceInput, looks: &[Look], sample: usize, rays: &mut u64) -> Vec3 {
+    let (light, areas) = (&input.light, &input.light.areas);
+    let albedo = albedo(areas, sample);
     if albedo == Vec3::ZERO {
         return Vec3::ZERO;
     }
-    let (point, receiver) = input.map.receiver(input.scene, sample, input.map.is_back(sample));
-    let seed = combine(input.seed, sample as u32);
-    let mut e = input.direct.irradiance(&receiver, input.direct_samples, seed, rays);
+    let back = areas.map.is_back(sample);
+    let mut e = looks[sample].irradiance;
+    if light.needs_closer_look(sample, |s| &looks[s]) {
+        let at = |t: &TexelSample| areas.scene.albedo(t.triangle, t.u, t.v);
+        e = light.closer_look(sample, back, at, rays).unwrap_or(e);
+    }
     if let Some(photons) = input.photons {
+        let (point, receiver) = areas.map.receiver(areas.scene, sample, back);
+        let seed = combine(light.seed, sample as u32);
         e += coverage::irradiance(photons, point.position, receiver.geometric, seed, rays);
     }
     albedo * e / PI
@@ -132,7 +150,8 @@ fn texel(input: &RadianceInput, sample: usize, rays: &mut u64) -> Vec3 {
 const MAX_LOOKUPS: u32 = 256;
 
 /// The albedo that a texel of a map shows.
-pub(crate) fn albedo(scene: &Scene, charts: &Charts, map: &ChartMap, sample: usize) -> Vec3 {
+pub(crate) fn albedo(areas: &TexelAreas, sample: usize) -> Vec3 {
+    let TexelAreas { scene, charts, map, .. } = *areas;
     let texel = &map.texels.samples[sample];
     let point = || scene.albedo(texel.triangle, texel.u, texel.v);
     let material = scene.material(texel.triangle);

@@ -130,7 +130,7 @@ impl Lightmap {
         if light.radiance.values.is_empty() {
             let e = light.direct[sample] + light.indirect[sample];
             let a = &self.atlas;
-            l += radiance::albedo(&a.scene, &a.charts, &a.map, sample) * e / std::f32::consts::PI;
+            l += radiance::albedo(&a.areas(&a.map), sample) * e / std::f32::consts::PI;
         } else {
             let lookup = RadianceMap::new(&self.atlas.charts, &self.atlas.radiance, &light.radiance);
             let hit = RawHit { t: 0.0, u: t.u, v: t.v, triangle: t.triangle, front: !back };

@@ -521,7 +521,7 @@ fn sample_group(
 
 /// A triangle in texel coordinates.
 #[derive(Clone, Copy, Debug)]
-struct Flat([DVec2; 3]);
+pub(super) struct Flat(pub(super) [DVec2; 3]);
 
 impl Flat {
     fn bounds(&self) -> (DVec2, DVec2) {
@@ -567,7 +567,7 @@ impl Flat {
 
     /// Calls `f` with each texel of a window of `size` whose square the triangle overlaps, row by
     /// row. A triangle without width in a direction lies in the texel above and to the right.
-    fn for_each_touched(&self, size: [i64; 2], mut f: impl FnMut(i64, i64)) {
+    pub(super) fn for_each_touched(&self, size: [i64; 2], mut f: impl FnMut(i64, i64)) {
         let (lower, upper) = self.bounds();
         let texels = |from: f64, to: f64, size: i64| {
             let first = (from.floor() as i64).clamp(0, size - 1);

@@ -127,6 +127,15 @@ pub(super) struct DirectWork {
     pub next: u32,
     /// Epoch of the lights.
     pub epoch: u32,
+    /// Light without penumbrae at the samples of the tile and of one more row and column on each side; NaN where it is
+    /// not known yet.
+    pub sharp: Box<[Vec3]>,
+}
+
+impl DirectWork {
+    pub fn bytes(&self) -> usize {
+        self.tile.bytes() + size_of_val(&self.sharp[..])
+    }
 }
 
 /// What a block has accumulated. It moves to the thread that works on it; what is shown of it is the display's.
@@ -255,7 +264,7 @@ impl BlockWork {
     pub fn bytes(&self) -> usize {
         self.gathered.capacity() * size_of::<Gathered>()
             + self.prior.len() * size_of::<Vec3>()
-            + self.direct.as_ref().map_or(0, |w| w.tile.bytes())
+            + self.direct.as_ref().map_or(0, DirectWork::bytes)
     }
 }
 

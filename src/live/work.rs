@@ -8,6 +8,7 @@ use super::blocks::{Block, BlockMap, BlockStatus, BlockWork, DirectTile, DirectW
 use super::relight::Illumination;
 use crate::lightmap::gather::{Gathered, ROUND, SampleSet};
 use crate::lightmap::radiance::RadianceMap;
+use crate::lightmap::texel_light::TexelLight;
 use crate::memory::try_vec;
 use crate::sampling::combine;
 use crate::scene::NONE;
@@ -305,10 +306,14 @@ impl Block {
         let begin = || {
             let rect = c.map.rect_in_light_map(of.placement, &of.rect);
             // Far-away vertices can make a block as large as a page.
-            let mut values = try_vec(rect.area(), "direct light").ok()?;
-            values.fill(Vec3::NAN);
-            let tile = DirectTile { rect, values: values.into() };
-            Some(DirectWork { tile, next: 0, epoch: c.light.direct_epoch })
+            let unknown = |area| {
+                let mut values = try_vec(area, "direct light").ok()?;
+                values.fill(Vec3::NAN);
+                Some(values.into())
+            };
+            let tile = DirectTile { rect, values: unknown(rect.area())? };
+            let sharp = unknown(rect.grown(1).area())?;
+            Some(DirectWork { tile, next: 0, epoch: c.light.direct_epoch, sharp })
         };
         let Some(mut direct) = under_way.or_else(begin) else {
             limit.out_of_memory.store(true, Relaxed);
@@ -323,7 +328,7 @@ impl Block {
             let at = direct.next as usize;
             let (x, y) = (corner.0 + (at % width) as i32, corner.1 + (at / width) as i32);
             let mut rays = 0;
-            if let Some(value) = direct_texel(c, of, x, y, &mut rays) {
+            if let Some(value) = direct_texel(c, of, x, y, &mut direct, &mut rays) {
                 direct.tile.values[at] = value;
             }
             limit.traced.fetch_add(rays, Relaxed);
@@ -397,8 +402,26 @@ pub(super) fn owns(c: &Context, tile: &Tile, x: i32, y: i32) -> Option<u32> {
 
 /// Direct light of a texel of the light map; `None` if it is none of the block's; infinite if
 /// it is inside a solid.
-fn direct_texel(c: &Context, tile: &Tile, x: i32, y: i32, rays: &mut u64) -> Option<Vec3> {
+fn direct_texel(c: &Context, tile: &Tile, x: i32, y: i32, work: &mut DirectWork, rays: &mut u64) -> Option<Vec3> {
     let (a, sample) = (&c.map.atlas, owns(c, tile, x, y)?);
-    let receiver = a.receiver(&a.map, &c.light.sides.backs, sample as usize);
-    Some(c.light.direct.irradiance(&receiver, c.direct_samples, combine(c.direct_seed, sample), rays))
+    let backs = &c.light.sides.backs;
+    let receiver = a.receiver(&a.map, backs, sample as usize);
+    let texels =
+        TexelLight { areas: a.areas(&a.map), direct: &c.light.direct, samples: c.direct_samples, seed: c.direct_seed };
+    // Texels that are looked at as neighbours too are computed once per tile.
+    let known = work.tile.rect.grown(1);
+    let mut sharp_at = |s: usize| {
+        let (x, y) = a.map.position(s);
+        let i = (y - known.y0) as usize * known.width() + (x - known.x0) as usize;
+        let sharp = &mut work.sharp[i];
+        if sharp.x.is_nan() {
+            *sharp = texels.sharp(&a.receiver(&a.map, backs, s), rays);
+        }
+        *sharp
+    };
+    let sample = sample as usize;
+    let sharp = sharp_at(sample);
+    let variation = texels.varies(sample, sharp, sharp_at);
+    let back = a.is_back(&a.map, backs, sample);
+    Some(texels.irradiance(sample, back, &receiver, sharp, variation, rays))
 }

@@ -1,0 +1,522 @@
+//! Direct light of a texel: an average over what the texel shows of its chart.
+//!
+//! A point sample at the texel's centre makes stairs of every shadow edge, and misses or doubles light that falls on
+//! less than a texel. Averages are taken where they matter:
+//!
+//! - Lights with penumbrae are sampled from four stratified points instead of one, with as many rays in all.
+//! - Lights without get one ray from the sample. Where that light differs from a neighbouring texel's, or where a
+//!   chart ends, points spread over the texel are lit instead, 4 or 16 of them.
+//! - Texels in the penumbra of a disc, which is narrow, get 16 points too.
+//!
+//! Points lie on the chart: each on whichever triangle of the chart covers it, with that triangle's normals. Those
+//! inside of solids or in cut-outs do not count, and neither do those behind a wall that stands on the texel: the light
+//! of the other room would leak in.
+//!
+//! Whatever is looked at of neighbours is a function of their numbers alone: shards of a bake and tiles of live updates
+//! that compute it anew have the same bits.
+
+use super::chart_index::ChartIndex;
+use super::charts::Charts;
+use super::direct::{DirectLight, Lights, MAX_POINTS, PointLight, Receiver};
+use super::map::{ChartMap, receiver_of};
+use super::texels::TexelSample;
+use crate::sampling::{combine, orthonormal_basis, sobol_2d};
+use crate::scene::{NONE, Scene};
+use crate::trace::Ray;
+use glam::{Vec2, Vec3};
+use std::ops::Range;
+
+/// Points in a texel that nothing is known to vary in.
+const FEW: u32 = 4;
+
+/// Light differs if it does by more than this part of the greater: between neighbouring texels of the light map, and
+/// between neighbours or within a texel of the radiance map, whose texels are larger and shown to gather rays only.
+const DIFFERENCE: f32 = 0.15;
+const RADIANCE_DIFFERENCE: f32 = 0.25;
+
+/// Points in a texel of the radiance map where one of the first [`MAX_POINTS`] gets more than this many times the mean:
+/// what shines there covers little of the texel.
+const MANY: u32 = 64;
+const SPIKE: f32 = 3.0;
+
+/// Lines of sight along a surface are raised by this part of their length, which clears what is curved.
+const RAISED: f32 = 0.25;
+
+/// What texels are made of.
+#[derive(Clone, Copy)]
+pub(crate) struct TexelAreas<'a> {
+    pub scene: &'a Scene,
+    pub charts: &'a Charts,
+    pub index: &'a ChartIndex,
+    pub map: &'a ChartMap,
+}
+
+impl TexelAreas<'_> {
+    /// Point `number` of a sequence that is stratified over a texel; `None` where it misses the chart or lies in a
+    /// cut-out.
+    pub(crate) fn point(&self, sample: usize, number: u32, seed: u32) -> Option<TexelSample> {
+        let own = &self.map.texels.samples[sample];
+        let placement = &self.map.layout.placements[self.map.placement_of(self.charts, sample) as usize];
+        // Of a texel that nobody can see the sample lies elsewhere, and stands alone.
+        let at = Vec2::from(placement.texel_coord(self.charts.local(own.triangle, own.u, own.v)));
+        let within = at - Vec2::new(own.x as f32, own.y as f32);
+        if within.min_element() < -0.01 || within.max_element() > 1.01 {
+            return None;
+        }
+        let [x, y] = sobol_2d(number, combine(seed, 32));
+        let local = placement.local([own.x as f32 + x, own.y as f32 + y]);
+        let chart = self.charts.chart_of[own.triangle as usize];
+        let point = self.index.locate(self.charts, chart, local.into(), own.triangle)?;
+        (!self.scene.is_hole(point.triangle, point.u, point.v)).then_some(point)
+    }
+
+    /// The sample of the same place of a chart at an offset of columns and rows, if there is one.
+    fn neighbour(&self, sample: usize, dx: i32, dy: i32) -> Option<usize> {
+        let placement = self.map.placement_of(self.charts, sample);
+        let (x, y) = self.map.position(sample);
+        let s = self.map.at(placement, x + dx, y + dy);
+        (s != NONE && self.map.placement_of(self.charts, s as usize) == placement).then_some(s as usize)
+    }
+}
+
+/// Direct light of texels.
+#[derive(Clone, Copy)]
+pub(crate) struct TexelLight<'a> {
+    pub areas: TexelAreas<'a>,
+    pub direct: &'a DirectLight,
+    /// As in [`DirectLight::irradiance`], per texel.
+    pub samples: u32,
+    /// Of the stage.
+    pub seed: u32,
+}
+
+/// Points of a texel and their light.
+struct Points {
+    samples: [TexelSample; MAX_POINTS],
+    lights: [PointLight; MAX_POINTS],
+    receivers: [Receiver; MAX_POINTS],
+    count: usize,
+}
+
+impl TexelLight<'_> {
+    /// Light without penumbrae at the sample itself.
+    pub(crate) fn sharp(&self, receiver: &Receiver, rays: &mut u64) -> Vec3 {
+        if !self.direct.has_sharp() {
+            return Vec3::ZERO;
+        }
+        let mut out = [PointLight::default()];
+        self.direct.at_points(&[*receiver], 0, Lights::Sharp, 0, 0, rays, &mut out);
+        out[0].sharp
+    }
+
+    /// Whether light without penumbrae varies in a texel, as far as its neighbours tell: `sharp` is that of the texel,
+    /// `of` gives theirs.
+    pub(crate) fn varies(&self, sample: usize, sharp: Vec3, mut of: impl FnMut(usize) -> Vec3) -> Variation {
+        if !self.direct.has_sharp() {
+            return Variation::None;
+        }
+        let mut variation = Variation::None;
+        for (dx, dy) in AROUND {
+            match self.areas.neighbour(sample, dx, dy) {
+                Some(s) if differ(sharp, of(s), DIFFERENCE) => return Variation::Some,
+                // Diagonal neighbours are missed at every second edge.
+                None if dx == 0 || dy == 0 => variation = Variation::Unknown,
+                _ => {}
+            }
+        }
+        variation
+    }
+
+    /// The direct light of a texel, whose sample is `receiver` and has the light `sharp`.
+    pub(crate) fn irradiance(
+        &self,
+        sample: usize,
+        back: bool,
+        receiver: &Receiver,
+        sharp: Vec3,
+        variation: Variation,
+        rays: &mut u64,
+    ) -> Vec3 {
+        let soft = self.direct.has_soft();
+        if variation == Variation::None && !soft {
+            return sharp;
+        }
+        let lights = match (variation, soft) {
+            (Variation::None, _) => Lights::Soft,
+            (_, false) => Lights::Sharp,
+            (_, true) => Lights::All,
+        };
+        let mut points = Points::new(receiver);
+        let few = if variation == Variation::Some { MAX_POINTS as u32 } else { FEW };
+        self.light_points(&mut points, sample, back, 0..few, lights, rays);
+        let goes_on = few == FEW
+            && (points.penumbra()
+                || (variation == Variation::Unknown && points.differ(PointLight::narrow, DIFFERENCE)));
+        if goes_on {
+            self.light_points(&mut points, sample, back, FEW..MAX_POINTS as u32, lights, rays);
+        }
+        if variation != Variation::None {
+            points.leave_out_other_rooms(self.areas.scene, receiver, sharp, rays);
+        }
+        let mut sum = PointLight::default();
+        let n = points.add_to(self.areas.scene, &mut sum, |_| Vec3::ONE, rays);
+        if n == Vec3::ZERO {
+            // A scrap of a chart between all points: its sample stands for it.
+            let seed = combine(self.seed, sample as u32);
+            let mut out = [PointLight::default()];
+            self.direct.at_points(&[*receiver], 0, Lights::Soft, self.samples, seed, rays, &mut out);
+            return sharp + out[0].value();
+        }
+        let e = sum.value() / n;
+        if variation == Variation::None { sharp + e } else { e }
+    }
+
+    /// Direct light of a texel of the radiance map by few points, and what a [closer look](Self::closer_look) depends on.
+    pub(crate) fn first_look(&self, sample: usize, back: bool, rays: &mut u64) -> Look {
+        let scene = self.areas.scene;
+        let receiver = self.areas.map.receiver(scene, sample, back).1;
+        let mut points = Points::new(&receiver);
+        self.light_points(&mut points, sample, back, 0..FEW, Lights::All, rays);
+        if points.count == 0 {
+            let seed = combine(self.seed, sample as u32);
+            self.direct.at_points(&[receiver], 0, Lights::All, self.samples, seed, rays, &mut points.lights);
+            points.count = 1;
+        }
+        let mut sum = PointLight::default();
+        let n = points.add_to(scene, &mut sum, |_| Vec3::ONE, rays);
+        let varies = points.differ(PointLight::narrow, RADIANCE_DIFFERENCE)
+            || points.differ(PointLight::unoccluded_areas, RADIANCE_DIFFERENCE);
+        Look { irradiance: sum.value() / n, narrow: sum.narrow() / n, varies }
+    }
+
+    /// Whether a texel of the radiance map needs more points: its first few differ, or its neighbours' light does.
+    pub(crate) fn needs_closer_look<'l>(&self, sample: usize, look_of: impl Fn(usize) -> &'l Look) -> bool {
+        let look = look_of(sample);
+        look.varies
+            || AROUND.into_iter().any(|(dx, dy)| {
+                let near = self.areas.neighbour(sample, dx, dy).map(&look_of);
+                near.is_some_and(|near| differ(look.narrow, near.narrow, RADIANCE_DIFFERENCE))
+            })
+    }
+
+    /// Direct light of a texel of the radiance map by 16 or 64 points, weighted by their albedos; `None` if none of them
+    /// lies on the chart.
+    pub(crate) fn closer_look(
+        &self,
+        sample: usize,
+        back: bool,
+        albedo: impl Fn(&TexelSample) -> Vec3,
+        rays: &mut u64,
+    ) -> Option<Vec3> {
+        let scene = self.areas.scene;
+        let receiver = self.areas.map.receiver(scene, sample, back).1;
+        let (mut sum, mut n, mut begin, mut end) = (PointLight::default(), Vec3::ZERO, 0, MAX_POINTS as u32);
+        while begin < end {
+            let mut points = Points::new(&receiver);
+            self.light_points(&mut points, sample, back, begin..begin + MAX_POINTS as u32, Lights::All, rays);
+            n += points.add_to(scene, &mut sum, |t| albedo(t).max(Vec3::splat(f32::MIN_POSITIVE)), rays);
+            begin += MAX_POINTS as u32;
+            if begin == end && points.has_spikes() {
+                end = MANY;
+            }
+        }
+        (n != Vec3::ZERO).then(|| sum.value() / n)
+    }
+
+    /// Lights the points of `numbers` that lie on the chart.
+    fn light_points(
+        &self,
+        points: &mut Points,
+        sample: usize,
+        back: bool,
+        numbers: Range<u32>,
+        lights: Lights,
+        rays: &mut u64,
+    ) {
+        let (first, samples) = (points.count, self.samples.div_ceil(numbers.len() as u32));
+        let seed = combine(self.seed, sample as u32);
+        for number in numbers.clone() {
+            if let Some(point) = self.areas.point(sample, number, seed) {
+                points.samples[points.count] = point;
+                points.receivers[points.count] = receiver_of(self.areas.scene, &point, back).1;
+                points.count += 1;
+            }
+        }
+        let (receivers, out) = (&points.receivers[first..points.count], &mut points.lights[first..points.count]);
+        self.direct.at_points(receivers, 0, lights, samples, combine(seed, numbers.start), rays, out);
+    }
+}
+
+/// Direct light of a texel of the radiance map at first.
+#[derive(Clone, Copy, Debug, Default)]
+pub(crate) struct Look {
+    pub irradiance: Vec3,
+    /// The part with narrow penumbrae or none.
+    narrow: Vec3,
+    varies: bool,
+}
+
+/// What is known of the light in a texel.
+#[derive(Clone, Copy, Debug, Default, PartialEq, Eq)]
+pub(crate) enum Variation {
+    #[default]
+    None,
+    /// Nothing is known beyond an edge of the chart.
+    Unknown,
+    Some,
+}
+
+/// Neighbours of a texel.
+const AROUND: [(i32, i32); 8] = [(-1, 0), (1, 0), (0, -1), (0, 1), (-1, -1), (1, -1), (-1, 1), (1, 1)];
+
+fn differ(a: Vec3, b: Vec3, part: f32) -> bool {
+    (a - b).abs().max_element() > part * a.max_element().max(b.max_element())
+}
+
+/// Whether a point lies inside a solid: straight above it and to all sides are backs of one-sided surfaces. (Straight above
+/// alone may be that of a single sheet, such as a table top, below which there is light.)
+fn is_buried(scene: &Scene, origin: Vec3, normal: Vec3, rays: &mut u64) -> bool {
+    let (x, y) = orthonormal_basis(normal);
+    [Vec3::ZERO, x, -x, y, -y].into_iter().all(|aside| {
+        *rays += 1;
+        let hit = scene.intersect_raw(&Ray::new(origin, normal + aside));
+        !hit.is_miss() && !hit.front && {
+            let material = scene.material(hit.triangle);
+            !material.two_sided && !material.transmits()
+        }
+    })
+}
+
+/// Whether something stands between two points of a surface.
+fn is_hidden(scene: &Scene, a: &Receiver, b: &Receiver, rays: &mut u64) -> bool {
+    let raise = RAISED * a.origin.distance(b.origin);
+    let (from, to) = (a.origin + raise * a.geometric, b.origin + raise * b.geometric);
+    *rays += 1;
+    scene.occluded(&Ray::new(from, to - from).within(0.0, 1.0))
+}
+
+impl Points {
+    fn new(receiver: &Receiver) -> Points {
+        Points {
+            samples: [TexelSample::default(); MAX_POINTS],
+            lights: [PointLight::default(); MAX_POINTS],
+            receivers: [*receiver; MAX_POINTS],
+            count: 0,
+        }
+    }
+
+    fn lights(&self) -> &[PointLight] {
+        &self.lights[..self.count]
+    }
+
+    fn penumbra(&self) -> bool {
+        self.lights().iter().any(PointLight::is_in_a_penumbra_of_discs) || self.differ(PointLight::of_discs, DIFFERENCE)
+    }
+
+    fn differ(&self, what: impl Fn(&PointLight) -> Vec3, part: f32) -> bool {
+        self.lights().iter().any(|l| differ(what(l), what(&self.lights[0]), part))
+    }
+
+    fn has_spikes(&self) -> bool {
+        let all = |l: &PointLight| (l.narrow() + l.unoccluded_areas()).element_sum();
+        let (sum, most) = self.lights().iter().map(all).fold((0.0, 0f32), |(sum, most), l| (sum + l, most.max(l)));
+        most * self.count as f32 > SPIKE * sum
+    }
+
+    /// Keeps the points that are seen from the texel's sample, `own`, whose light without penumbrae is `sharp`. Points with
+    /// the same light are not asked.
+    fn leave_out_other_rooms(&mut self, scene: &Scene, own: &Receiver, sharp: Vec3, rays: &mut u64) {
+        let mut kept = 0;
+        for i in 0..self.count {
+            if differ(self.lights[i].sharp, sharp, DIFFERENCE) && is_hidden(scene, own, &self.receivers[i], rays) {
+                continue;
+            }
+            self.samples[kept] = self.samples[i];
+            self.lights[kept] = self.lights[i];
+            self.receivers[kept] = self.receivers[i];
+            kept += 1;
+        }
+        self.count = kept;
+    }
+
+    /// Adds the light of the points that are not inside of solids, by their weights; returns the sum of the weights.
+    /// Only points without any light beside some with light can be, as far as that matters.
+    fn add_to(
+        &self,
+        scene: &Scene,
+        sum: &mut PointLight,
+        weight: impl Fn(&TexelSample) -> Vec3,
+        rays: &mut u64,
+    ) -> Vec3 {
+        let is_lit = self.lights().iter().any(|l| !l.is_dark());
+        let mut n = Vec3::ZERO;
+        for (i, (light, r)) in self.lights().iter().zip(&self.receivers).enumerate() {
+            if is_lit && light.is_dark() && is_buried(scene, r.origin, r.geometric, rays) {
+                continue;
+            }
+            let weight = weight(&self.samples[i]);
+            sum.add(light, weight);
+            n += weight;
+        }
+        n
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::super::{BakeParams, Lightmap, LightmapDesc};
+    use super::*;
+    use crate::progress::Progress;
+    use crate::scene::shapes::MeshBuilder;
+    use crate::scene::{Light, Material, SceneData, builtin};
+    use std::sync::Arc;
+
+    fn created(scene: &Arc<Scene>, texels_per_unit: f32) -> Lightmap {
+        let desc = LightmapDesc { texels_per_unit, page_size: 512, ..Default::default() };
+        Lightmap::create(scene, &desc, &Progress::none()).unwrap()
+    }
+
+    #[test]
+    fn points_of_a_texel_lie_in_it_and_on_its_chart() {
+        let scene = builtin("atrium").unwrap().committed();
+        let map = created(&scene, 5.0);
+        let atlas = map.atlas();
+        let areas = atlas.areas(&atlas.radiance);
+        let (mut found, mut other_triangles) = (0, 0);
+        for sample in (0..atlas.radiance.len()).step_by(11) {
+            let own = atlas.radiance.texels.samples[sample];
+            let placement = atlas.radiance.placement_of(&atlas.charts, sample);
+            for number in 0..16 {
+                let Some(p) = areas.point(sample, number, 3) else { continue };
+                assert_eq!(atlas.charts.chart_of[p.triangle as usize], atlas.charts.chart_of[own.triangle as usize]);
+                let at = atlas.radiance.layout.texel_coord(placement, atlas.charts.local(p.triangle, p.u, p.v));
+                let within = Vec2::from(at) - Vec2::new(own.x as f32, own.y as f32);
+                assert!(within.min_element() > -0.01 && within.max_element() < 1.01, "{within}");
+                found += 1;
+                other_triangles += (p.triangle != own.triangle) as u32;
+            }
+        }
+        assert!(found > 1000 && other_triangles > 100, "{found} points, {other_triangles} on other triangles");
+    }
+
+    /// A floor below a roof that ends at x = `edge`, or has a slit there, `slit` wide, under the sun at the zenith.
+    fn under_a_roof(edge: f32, slit: f32, angular_radius: f32) -> Arc<Scene> {
+        let mut data = SceneData::new();
+        let m = data.add_material(Material { albedo: [0.5; 3], two_sided: true, ..Default::default() }).unwrap();
+        let mut builder = MeshBuilder::new();
+        let p = |x: f32, y: f32, z: f32| Vec3::new(x, y, z);
+        builder.quad(p(0.0, 0.0, 0.0), p(4.0, 0.0, 0.0), p(4.0, 4.0, 0.0), p(0.0, 4.0, 0.0), m);
+        let mut roof = |x0: f32, x1: f32| {
+            builder.quad(p(x0, -1.0, 1.0), p(x1, -1.0, 1.0), p(x1, 5.0, 1.0), p(x0, 5.0, 1.0), m);
+        };
+        roof(edge, 5.0);
+        if slit > 0.0 {
+            roof(-1.0, edge - slit);
+        }
+        data.add_mesh(builder.finish()).unwrap();
+        let direction = -Vec3::Z;
+        data.add_light(Light::Directional { direction, irradiance: [2.0; 3], angular_radius }).unwrap();
+        data.committed()
+    }
+
+    #[test]
+    fn a_texel_that_a_shadow_edge_crosses_has_the_part_of_the_light_that_falls_on_it() {
+        for angular_radius in [0.0, 0.004] {
+            for edge in [1.93, 2.0, 2.07] {
+                let scene = under_a_roof(edge, 0.0, angular_radius);
+                let mut map = created(&scene, 4.0);
+                let params = BakeParams { gather_rays: 0, ..Default::default() };
+                map.bake(&params, &Progress::none()).unwrap();
+                let (atlas, light) = (map.atlas(), map.light.as_ref().unwrap());
+                let (mut crossed, mut sum, mut expected) = (0, 0.0, 0.0);
+                for (sample, direct) in light.direct.iter().enumerate() {
+                    let t = &atlas.map.texels.samples[sample];
+                    let x = t.position(&scene);
+                    if x.z > 0.5 {
+                        continue;
+                    }
+                    let part = ((edge - x.x) * 4.0 + 0.5).clamp(0.0, 1.0);
+                    assert!((direct.x / 2.0 - part).abs() < 0.1, "edge {edge}: {} at {x}, not {part}", direct.x / 2.0);
+                    crossed += (part > 0.0 && part < 1.0) as u32;
+                    sum += direct.x / 2.0;
+                    expected += part;
+                }
+                assert!(crossed > 10 || edge == 2.0, "{crossed} texels are crossed by the edge at {edge}");
+                assert!((sum / expected - 1.0).abs() < 2e-3, "{sum} instead of {expected}");
+            }
+        }
+    }
+
+    #[test]
+    fn a_floor_that_goes_on_below_a_block_has_no_dark_rim_around_it() {
+        let mut data = SceneData::new();
+        let m = data.add_material(Material { albedo: [0.5; 3], ..Default::default() }).unwrap();
+        let mut builder = MeshBuilder::new();
+        let p = |x: f32, y: f32| Vec3::new(x, y, 0.0);
+        builder.quad(p(0.0, 0.0), p(4.0, 0.0), p(4.0, 4.0), p(0.0, 4.0), m);
+        builder.box_(Vec3::new(1.0, 1.0, -1.0), Vec3::new(2.1, 2.1, 1.0), false, m);
+        data.add_mesh(builder.finish()).unwrap();
+        let (direction, irradiance) = (-Vec3::Z, [2.0; 3]);
+        data.add_light(Light::Directional { direction, irradiance, angular_radius: 0.0 }).unwrap();
+        let scene = data.committed();
+        let mut map = created(&scene, 4.0);
+        map.bake(&BakeParams { gather_rays: 0, ..Default::default() }, &Progress::none()).unwrap();
+        let (atlas, light) = (map.atlas(), map.light.as_ref().unwrap());
+        let floor = |s: &usize| {
+            let t = &atlas.map.texels.samples[*s];
+            t.geometric_normal(&scene).z > 0.9 && t.position(&scene).z.abs() < 1e-3
+        };
+        let lit: Vec<f32> = (0..light.direct.len()).filter(floor).map(|s| light.direct[s].x).collect();
+        assert!(lit.len() > 200 && lit.iter().all(|e| (e - 2.0).abs() < 1e-4), "{lit:?}");
+    }
+
+    #[test]
+    fn the_sun_does_not_leak_below_a_wall_into_the_texels_of_a_dark_room() {
+        for wall in [2.03, 2.2] {
+            let mut data = SceneData::new();
+            let m = data.add_material(Material { albedo: [0.5; 3], two_sided: true, ..Default::default() }).unwrap();
+            let mut builder = MeshBuilder::new();
+            let p = Vec3::new;
+            builder.quad(p(0.0, 0.0, 0.0), p(4.0, 0.0, 0.0), p(4.0, 4.0, 0.0), p(0.0, 4.0, 0.0), m);
+            builder.quad(p(wall, -9.0, 0.0), p(wall, 9.0, 0.0), p(wall, 9.0, 9.0), p(wall, -9.0, 9.0), m);
+            data.add_mesh(builder.finish()).unwrap();
+            let (direction, irradiance) = (p(-1.0, 0.0, -1.0).normalize(), [2.0; 3]);
+            data.add_light(Light::Directional { direction, irradiance, angular_radius: 0.0 }).unwrap();
+            let scene = data.committed();
+            let mut map = created(&scene, 4.0);
+            map.bake(&BakeParams { gather_rays: 0, ..Default::default() }, &Progress::none()).unwrap();
+            let (atlas, light) = (map.atlas(), map.light.as_ref().unwrap());
+            let mut lit = 0;
+            for (t, e) in atlas.map.texels.samples.iter().zip(&light.direct) {
+                let at = t.position(&scene);
+                if scene.normal(t.triangle).z > 0.9 {
+                    let expected = if at.x > wall { std::f32::consts::SQRT_2 } else { 0.0 };
+                    assert!((e.x - expected).abs() < 1e-4, "{} at {at}, wall at {wall}", e.x);
+                    lit += (expected > 0.0) as u32;
+                }
+            }
+            assert!(lit > 100);
+        }
+    }
+
+    #[test]
+    fn the_radiance_map_has_the_energy_of_a_patch_of_sun_smaller_than_its_texels() {
+        for (edge, angular_radius) in [(1.63, 0.0), (2.11, 0.0), (2.38, 0.0), (2.11, 0.004)] {
+            let scene = under_a_roof(edge, 0.1, angular_radius);
+            let map = created(&scene, 10.0);
+            let atlas = map.atlas();
+            let direct = DirectLight::new(&scene);
+            let light = TexelLight { areas: atlas.areas(&atlas.radiance), direct: &direct, samples: 4, seed: 5 };
+            let input = super::super::radiance::RadianceInput { light, photons: None };
+            let mut values = vec![Vec3::ZERO; atlas.radiance.len()];
+            let progress = Progress::none();
+            let stage = progress.stage("radiance", 0.0, 1.0, 1);
+            super::super::radiance::bake(scene.device(), &input, &mut values, &stage).unwrap();
+            // Texels are 0.4 wide, and 10 of them have the floor's width. Per metre of the slit:
+            let on_floor = |s: &usize| atlas.radiance.texels.samples[*s].position(&scene).z.abs() < 0.5;
+            let sum: f32 = (0..values.len()).filter(on_floor).map(|s| values[s].x * 0.16).sum();
+            let energy = sum * std::f32::consts::PI / 0.5 / 4.0;
+            assert!((energy / (2.0 * 0.1) - 1.0).abs() < 0.03, "{energy} instead of 0.2, edge {edge}");
+        }
+    }
+}
