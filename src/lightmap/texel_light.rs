@@ -372,7 +372,7 @@ mod tests {
     use std::sync::Arc;
 
     fn created(scene: &Arc<Scene>, texels_per_unit: f32) -> Lightmap {
-        let desc = LightmapDesc { texels_per_unit, page_size: 512, ..Default::default() };
+        let desc = LightmapDesc { texels_per_unit, page_size: 512, both_sides: false, ..Default::default() };
         Lightmap::create(scene, &desc, &Progress::none()).unwrap()
     }
 
