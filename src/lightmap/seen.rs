@@ -220,9 +220,11 @@ mod tests {
     use crate::scene::{Material, SceneData};
     use glam::Vec3;
 
-    /// What is seen of a room of sheets, of a wardrobe in it, and of a hollow wall of 4 cm: rays to fronts and backs, and
-    /// whether some of them are hidden.
-    fn room() -> ([([u32; 2], [bool; 2]); 3], Lightmap) {
+    /// Rays that saw the fronts and the backs of a mesh, and whether some fronts and some backs are hidden.
+    type SeenOfMesh = ([u32; 2], [bool; 2]);
+
+    /// What is seen of a room of sheets, of a wardrobe in it, and of a hollow wall of 4 cm.
+    fn room() -> ([SeenOfMesh; 3], Lightmap) {
         let mut data = SceneData::new();
         let m = data.add_material(Material { two_sided: true, ..Default::default() }).unwrap();
         let p = Vec3::new;

@@ -311,11 +311,14 @@ fn a_foreign_or_used_checkpoint_is_refused_and_kept() {
         assert!(other.bytes() == before);
     }
     // While one bake uses it another one cannot.
-    let progress = Progress::new(|f, _| {
-        let second = f > 0.5 && matches!(bake_until(1, &place, 2.0), Err(Error::InvalidState(_)));
-        !second
+    let mut seconds = Vec::new();
+    let progress = Progress::new(|_, _| {
+        seconds.push(bake_until(1, &place, 2.0).err());
+        true
     });
-    assert_eq!(lightmap(2).bake_with(&params(), Some(&at(&place)), &progress).err(), Some(Error::Cancelled));
+    lightmap(2).bake_with(&params(), Some(&at(&place)), &progress).unwrap();
+    drop(progress);
+    assert!(!seconds.is_empty() && seconds.iter().all(|e| matches!(e, Some(Error::InvalidState(_)))), "{seconds:?}");
     let bad = CheckpointParams { seconds: f64::NAN, ..at(&place) };
     assert!(matches!(map.bake_with(&params(), Some(&bad), &Progress::none()), Err(Error::InvalidArgument(_))));
 }
