@@ -222,8 +222,8 @@ fn below_a_one_sided_sheet_updates_end_with_the_bits_of_a_bake() {
 fn with_shelf(threads: usize, both_sides: bool) -> Lightmap {
     let mut data = builtin("cornell").unwrap();
     let material = data.add_material(Material { two_sided: true, ..Default::default() }).unwrap();
-    for (right, y) in [(0.45, 0.45), (0.25, 0.454)] {
-        let corners = [[0.1, 0.1], [right, 0.1], [right, 0.4], [0.1, 0.4]].map(|[x, z]| Vec3::new(x, y, z));
+    for (right, y) in [(3.6, 3.6), (2.0, 3.604)] {
+        let corners = [[0.8, 0.8], [right, 0.8], [right, 3.2], [0.8, 3.2]].map(|[x, z]| Vec3::new(x, y, z));
         let (indices, materials) = (vec![[0, 1, 2], [0, 2, 3]], MeshMaterials::One(material));
         data.add_mesh(Mesh { positions: corners.into(), indices, materials, ..Default::default() }).unwrap();
     }

@@ -354,10 +354,10 @@ fn a_scene_that_uses_none_of_it_keeps_and_runs_none_of_it() {
     assert!(map.plan_text().contains("runs: albedo textures"), "{}", map.plan_text());
 }
 
-/// Gather texels as wide as the gap below a carpet is deep: they must neither darken the floor beside the carpet nor
-/// light the floor below it.
+/// Nobody can see the floor 1 cm below a carpet: it takes its light from beside the carpet, and gather texels four times as
+/// wide as the light map's darken neither.
 #[test]
-fn a_carpet_has_no_dark_rim_and_its_gap_stays_dark() {
+fn a_carpet_has_no_dark_rim_and_what_it_covers_shows_the_light_beside_it() {
     let mut data = SceneData::new();
     let grey = data.add_material(Material { albedo: [0.5; 3], two_sided: true, ..Default::default() }).unwrap();
     room(&mut data, Vec3::new(4.0, 4.0, 3.0), grey, grey);
@@ -379,6 +379,6 @@ fn a_carpet_has_no_dark_rim_and_its_gap_stays_dark() {
         let (beside, below) =
             (mean(&coarse, 2.0 + x) / mean(&fine, 2.1 + x), mean(&coarse, 1.84 - x) / mean(&fine, 2.1));
         assert!((beside - 1.0).abs() < 0.01, "{x} beside the carpet: {beside}");
-        assert!(below < 0.03, "{x} below the carpet: {below}");
+        assert!((below - 1.0).abs() < 0.02, "{x} below the carpet: {below}");
     }
 }

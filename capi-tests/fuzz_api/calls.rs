@@ -425,9 +425,15 @@ fn check_hit(ray: &bk_ray, hit: &bk_hit, meshes: u32) {
     }
 }
 
+/// What mesh numbers of hits are below. While another thread changes the scene, the count says 0.
+fn mesh_bound(w: &W, scene: *const bk_scene) -> u32 {
+    let count = bk!(bk_scene_mesh_count(scene));
+    if count == 0 && !w.is_alone { BK_NONE } else { count }
+}
+
 fn rays(w: &W, s: &mut Source) {
     let Some(scene) = scene(w, s) else { return };
-    let meshes = bk!(bk_scene_mesh_count(scene.p()));
+    let meshes = mesh_bound(w, scene.p());
     let mut hit = bk_hit { t: f32::NAN, u: 7.0, v: 7.0, triangle: 7, mesh: 7, instance: 7 };
     let one = ray(s);
     match s.below(8) {

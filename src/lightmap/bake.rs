@@ -116,14 +116,16 @@ impl Lightmap {
         let near = texel.min(seen::ROOM * scene.diagonal());
         let search = Search { scene, charts: &charts, seen: &seen, near };
         let mut sight_rays = seen.rays;
-        let mut move_buried = |map: &mut ChartMap| -> Result<Vec<bool>> {
-            let (buried, rays) = scene.device().install(|| search.move_buried(map, &stage))?;
+        let mut move_buried = |map: &mut ChartMap, by_parts: bool| -> Result<Vec<bool>> {
+            let (buried, rays) = scene.device().install(|| search.move_buried(map, by_parts, &stage))?;
             sight_rays += rays;
             Ok(buried)
         };
-        move_buried(&mut radiance)?;
-        move_buried(&mut gather)?;
-        let buried = move_buried(&mut map)?;
+        move_buried(&mut radiance, true)?;
+        // The rest of a texel that is buried for the most part is a strip along what covers it, often darker than all
+        // around: gather texels are larger, and would spread that dark as a rim.
+        move_buried(&mut gather, false)?;
+        let buried = move_buried(&mut map, true)?;
         uvs.overlapping_texels = map.texels.overlapping_texels;
         uvs.reduced_charts = map.layout.reduced;
         let index = ChartIndex::new(scene.device(), &charts)?;
@@ -346,7 +348,8 @@ impl Bake<'_, '_> {
             seed: self.params.seed,
             memory_budget: self.params.memory_budget,
             store_direct: false,
-            least_radius: RADIUS_TEXELS / self.atlas.radiance.layout.density,
+            // Of a density that is nearly 0 the quotient is infinite.
+            least_radius: (RADIUS_TEXELS / self.atlas.radiance.layout.density).min(f32::MAX),
             most_stored: MOST_STORED.max(STORED_PER_TEXEL * self.atlas.radiance.len() as u64),
             ..Default::default()
         };

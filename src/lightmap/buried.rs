@@ -54,10 +54,11 @@ pub(super) struct Search<'a> {
 
 impl Search<'_> {
     /// Moves the buried texels of a map to the nearest that are seen, and tells which they are; none if the list is empty.
-    /// Advances `stage` by one per placement, and counts `rays`. To be called on the device's threads.
-    pub fn move_buried(&self, map: &mut ChartMap, stage: &Stage) -> Result<(Vec<bool>, u64)> {
+    /// `by_parts`: those of which another point can be seen move there instead. Others of a placement without any seen
+    /// texel do so anyhow. Advances `stage` by one per placement, and counts `rays`. To be called on the device's threads.
+    pub fn move_buried(&self, map: &mut ChartMap, by_parts: bool, stage: &Stage) -> Result<(Vec<bool>, u64)> {
         let of_placement = |placement: u32| {
-            let found = self.in_placement(map, placement, stage)?;
+            let found = self.in_placement(map, placement, by_parts, stage)?;
             stage.advance(1)?;
             Ok(found)
         };
@@ -84,7 +85,7 @@ impl Search<'_> {
         Ok((is_moved, rays))
     }
 
-    fn in_placement(&self, map: &ChartMap, placement: u32, stage: &Stage) -> Result<Found> {
+    fn in_placement(&self, map: &ChartMap, placement: u32, by_parts: bool, stage: &Stage) -> Result<Found> {
         let mut found = Found::default();
         let chart = map.layout.chart_of(placement);
         let is_back = match map.layout.is_back(placement) {
@@ -106,7 +107,9 @@ impl Search<'_> {
                 try_push(&mut buried, sample as u32, BURIED)?;
             }
         }
-        self.find_seen_parts(map, placement, is_back, &samples, &mut buried, &mut found)?;
+        if by_parts || buried.len() == samples.len() {
+            self.find_seen_parts(map, placement, is_back, &samples, &mut buried, &mut found)?;
+        }
         if !buried.is_empty() && buried.len() < samples.len() {
             found.moved = nearest_seen(map, placement, samples, buried)?;
         }

@@ -283,6 +283,9 @@ pub(super) struct BlockMap {
     origin: Vec<(i32, i32, i32)>,
     /// Lowest LOD that each gather texel belongs to.
     pub lod_of: Vec<u8>,
+    /// By block, the texels of the light map that show its light although they lie elsewhere: buried ones, which take
+    /// the place of the nearest texel that can be seen. Empty if there are none.
+    shown_elsewhere: Vec<Option<Rect>>,
     top: u8,
 }
 
@@ -298,6 +301,7 @@ impl BlockMap {
             first: Vec::with_capacity(placements.len() + 1),
             origin: Vec::with_capacity(placements.len()),
             lod_of: try_vec(atlas.gather.len(), "the LODs of the gather map")?,
+            shown_elsewhere: Vec::new(),
             top,
         };
         map.lod_of.fill(top);
@@ -319,7 +323,27 @@ impl BlockMap {
             }
         }
         map.first.push(map.tiles.len() as u32);
+        map.shown_elsewhere = map.find_shown_elsewhere()?;
         Ok(map)
+    }
+
+    fn find_shown_elsewhere(&self) -> Result<Vec<Option<Rect>>> {
+        let atlas = &self.atlas;
+        if !atlas.buried.contains(&true) {
+            return Ok(Vec::new());
+        }
+        let mut shown: Vec<Option<Rect>> = try_vec(self.tiles.len(), "where buried texels get their light")?;
+        for sample in (0..atlas.map.len()).filter(|&s| atlas.buried[s]) {
+            let (x, y) = atlas.map.position(sample);
+            let texel = Rect { x0: x, y0: y, x1: x + 1, y1: y + 1 };
+            let placement = atlas.map.placement_of(&atlas.charts, sample);
+            atlas.gather_around(sample, |s, _| {
+                let (gx, gy) = atlas.gather.position(s);
+                let of_block = &mut shown[self.block_at(placement, gx, gy) as usize];
+                *of_block = Some(of_block.map_or(texel, |r| r.union(&texel)));
+            });
+        }
+        Ok(shown)
     }
 
     fn tile(&mut self, atlas: &Atlas, placement: u32, rect: Rect) -> Tile {
@@ -395,7 +419,26 @@ impl BlockMap {
             .map(move |(i, j)| range.start + (j * columns + i) as u32)
     }
 
-    /// Where the light map shows a rectangle of a placement's gather texels: the smallest one with all of
+    /// Where the light map shows a rectangle of a placement's gather texels, buried texels included.
+    pub fn shown_in_light_map(&self, placement: u32, rect: &Rect) -> Rect {
+        let mut shown = self.rect_in_light_map(placement, rect);
+        if !self.shown_elsewhere.is_empty() {
+            let (_, _, columns) = self.origin[placement as usize];
+            let first = self.first[placement as usize] as i32;
+            let [low, high] = [(rect.x0, rect.y0), (rect.x1 - 1, rect.y1 - 1)]
+                .map(|(x, y)| self.block_at(placement, x, y) as i32 - first);
+            for j in low / columns..=high / columns {
+                for i in low % columns..=high % columns {
+                    if let Some(elsewhere) = self.shown_elsewhere[(first + j * columns + i) as usize] {
+                        shown = shown.union(&elsewhere);
+                    }
+                }
+            }
+        }
+        shown
+    }
+
+    /// Where a rectangle of a placement's gather texels lies in the light map: the smallest rectangle with all of
     /// them, within the placement's own.
     pub fn rect_in_light_map(&self, placement: u32, rect: &Rect) -> Rect {
         rect_in_light_map(&self.atlas, placement, rect)
@@ -404,7 +447,8 @@ impl BlockMap {
     /// Bytes held, with those of idle blocks.
     pub fn bytes(&self) -> usize {
         let tiles: usize = self.tiles.iter().map(Tile::bytes).sum();
-        self.first.len() * 4 + self.origin.len() * 12 + self.lod_of.len() + tiles
+        let elsewhere = size_of_val(&self.shown_elsewhere[..]);
+        self.first.len() * 4 + self.origin.len() * 12 + self.lod_of.len() + elsewhere + tiles
     }
 }
 

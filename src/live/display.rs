@@ -537,6 +537,6 @@ fn in_light_map(map: &BlockMap, placement: u32, rect: &Rect) -> Changed {
     let shown = if placement < layout.given { Rect::of(place).grown(padding) } else { Rect::of(place) };
     let size = layout.page_size as i32;
     let page = Rect { x0: 0, y0: 0, x1: size, y1: size };
-    let rect = map.rect_in_light_map(placement, rect).grown(padding).clipped(&shown).clipped(&page);
+    let rect = map.shown_in_light_map(placement, rect).grown(padding).clipped(&shown).clipped(&page);
     Changed { page: place.page, rect }
 }

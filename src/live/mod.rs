@@ -276,11 +276,14 @@ impl Live {
     pub fn new(lightmap: &Lightmap, params: &LiveParams, progress: &Progress) -> Result<Live> {
         params.validate()?;
         let device = lightmap.atlas().scene.device();
-        device.run(progress, || {
+        let live = device.run(progress, || {
             let mut live = Live::idle(lightmap, params, progress)?;
             live.start(progress)?;
             Ok(live)
-        })
+        })?;
+        // The last report may come when all work is done.
+        progress.check()?;
+        Ok(live)
     }
 
     /// All that is needed, nothing computed but photons and radiance.
