@@ -120,7 +120,15 @@ fn floor(material: u32) -> MeshBuilder {
     floor
 }
 
-/// Irradiance h I / d³ of every texel, at any height.
+/// The solid angle of a square of an edge `size` around a point `aside` (x, z) of a plane, seen from `height` above it: by
+/// what a point light of unit intensity brings to the square, the mean irradiance times the area.
+fn solid_angle([x, z]: [f64; 2], size: f64, height: f64) -> f64 {
+    let corner = |x: f64, z: f64| (x * z).atan2(height * (x * x + z * z + height * height).sqrt());
+    let ([x0, x1], [z0, z1]) = ([x - 0.5 * size, x + 0.5 * size], [z - 0.5 * size, z + 0.5 * size]);
+    corner(x1, z1) - corner(x0, z1) - corner(x1, z0) + corner(x0, z0)
+}
+
+/// The mean of the irradiance h I / d³ over every texel, at any height.
 fn point_near_wall(lab: &Lab, rows: &mut Vec<Row>) -> Result<()> {
     for height in lab.some(&[1e-1f32, 1e-2, 1e-3, 1e-4, 1e-5, 1e-6, 1e-7, 0.0]) {
         let mut data = SceneData::new();
@@ -128,10 +136,12 @@ fn point_near_wall(lab: &Lab, rows: &mut Vec<Row>) -> Result<()> {
         data.add_mesh(floor(grey).finish())?;
         let position = Vec3::new(0.4871, height, 0.5317);
         data.add_light(Light::Point { position, intensity: [1.0; 3] })?;
-        let texels = texels(&lab.baked(data, &small_desc(), &small_bake())?, Layer::Combined)?;
+        let map = lab.baked(data, &small_desc(), &small_bake())?;
+        let texels = texels(&map, Layer::Combined)?;
+        let size = 1.0 / f64::from(map.info().texels_per_unit);
         let expected = |p: Vec3| {
             let way = (position - p).as_dvec3();
-            way.y / way.length().powi(3)
+            solid_angle([way.x, way.z], size, way.y) / (size * size)
         };
         let case = "point light near a wall";
         let row = if height > 0.0 {
