@@ -7,7 +7,7 @@ use super::charts::Charts;
 use super::texels::{Flat, TexelSample};
 use crate::device::Device;
 use crate::error::Result;
-use crate::memory::{Reservation, try_vec};
+use crate::memory::{Reservation, try_vec, try_with_capacity};
 use glam::{DVec2, Vec2};
 use rayon::prelude::*;
 
@@ -123,10 +123,14 @@ impl Grid {
 impl ChartIndex {
     /// Indexes all charts.
     pub(crate) fn new(device: &Device, charts: &Charts) -> Result<ChartIndex> {
-        let grids: Result<Vec<Grid>> = device.install(|| {
-            (0..charts.charts.len() as u32).into_par_iter().map(|chart| Grid::new(charts, chart)).collect()
-        });
-        let grids = grids?;
+        let mut grids: Vec<Grid> = try_with_capacity(charts.charts.len(), "the index of the charts")?;
+        grids.resize_with(charts.charts.len(), Grid::default);
+        device.install(|| {
+            (0..charts.charts.len() as u32).into_par_iter().zip(&mut grids).try_for_each(|(chart, grid)| {
+                *grid = Grid::new(charts, chart)?;
+                Ok(())
+            })
+        })?;
         let bytes = grids.iter().map(Grid::bytes).sum();
         Ok(ChartIndex { grids, _memory: device.memory().reserve(bytes, "the index of the charts")? })
     }
