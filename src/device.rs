@@ -80,25 +80,9 @@ impl Device {
             0 => std::thread::available_parallelism().map_or(1, |n| n.get()).min(MAX_THREADS),
             n => n,
         };
-        let mut threads = Vec::with_capacity(num_threads);
-        let pool = rayon::ThreadPoolBuilder::new()
-            .num_threads(num_threads)
-            .spawn_handler(|worker| {
-                threads.push(own_thread(format!("bakelite-{}", worker.index())).spawn(|| {
-                    float_state::set_on_own_thread();
-                    worker.run();
-                })?);
-                Ok(())
-            })
-            .build();
-        let pool = match pool {
-            Ok(pool) => pool,
-            Err(e) => {
-                // Those that were started have been told to end.
-                threads.into_iter().for_each(|t| drop(t.join()));
-                return Err(Error::OutOfMemory(format!("the {num_threads} worker threads could not be started: {e}")));
-            }
-        };
+        let name = |i| format!("bakelite-{i}");
+        let (pool, threads) = start_threads(num_threads, name, float_state::set_on_own_thread)
+            .map_err(|e| Error::OutOfMemory(format!("the {num_threads} worker threads could not be started: {e}")))?;
         Ok(Arc::new(Device {
             pool: Some(pool),
             threads,
@@ -177,9 +161,10 @@ impl Device {
     /// panic.
     pub(crate) fn spawn(&self, f: impl FnOnce() + Send + 'static) {
         self.pool.as_ref().expect("there until dropped").spawn(|| {
-            APART.set(true);
+            // Work that waits may run other work meanwhile.
+            let before = APART.replace(true);
             f();
-            APART.set(false);
+            APART.set(before);
         });
     }
 
@@ -205,27 +190,63 @@ fn own_thread(name: String) -> std::thread::Builder {
     std::thread::Builder::new().name(name).stack_size(STACK_BYTES)
 }
 
+/// Starts a pool whose threads have begun with `begin`. When it fails, those that were started have ended.
+fn start_threads(
+    count: usize,
+    name: impl Fn(usize) -> String,
+    begin: fn(),
+) -> std::result::Result<(rayon::ThreadPool, Vec<JoinHandle<()>>), rayon::ThreadPoolBuildError> {
+    let mut threads = Vec::with_capacity(count);
+    let pool = rayon::ThreadPoolBuilder::new()
+        .num_threads(count)
+        .spawn_handler(|worker| {
+            threads.push(own_thread(name(worker.index())).spawn(move || {
+                begin();
+                worker.run();
+            })?);
+            Ok(())
+        })
+        .build();
+    match pool {
+        Ok(pool) => Ok((pool, threads)),
+        Err(e) => {
+            // They have been told to end.
+            join(&mut threads);
+            Err(e)
+        }
+    }
+}
+
+fn join(threads: &mut Vec<JoinHandle<()>>) {
+    threads.drain(..).for_each(|t| drop(t.join()));
+}
+
 /// Runs `f` on a pool of one thread and waits without taking up other work. Unwinds with an [`Error`] if there
 /// is no thread to be had.
 fn on_extra_thread<R: Send>(f: impl FnOnce() -> R + Send) -> R {
+    struct Joined(Vec<JoinHandle<()>>);
+    impl Drop for Joined {
+        fn drop(&mut self) {
+            join(&mut self.0);
+        }
+    }
     let fail = |e: &dyn std::fmt::Display| -> ! {
         let message = format!("a thread for work in a callback could not be started: {e}");
         std::panic::resume_unwind(Box::new(Error::OutOfMemory(message)))
     };
-    let wait = || {
-        let pool = rayon::ThreadPoolBuilder::new()
-            .num_threads(1)
-            .stack_size(STACK_BYTES)
-            // What `f` would install anywhere is for this thread.
-            .start_handler(|_| {
-                float_state::set_on_own_thread();
-                APART.set(true);
-            })
-            .build();
-        match pool {
-            Ok(pool) => pool.install(f),
-            Err(e) => fail(&e),
+    let begin = || {
+        float_state::set_on_own_thread();
+        // What `f` would install anywhere is for this thread.
+        APART.set(true);
+    };
+    let wait = || match start_threads(1, |_| "bakelite-extra".into(), begin) {
+        Ok((pool, threads)) => {
+            // Joined when the pool has been dropped, also if `f` panics.
+            let _threads = Joined(threads);
+            let pool = pool;
+            pool.install(f)
         }
+        Err(e) => fail(&e),
     };
     // A worker of a pool that waited for another pool would take up work of its own pool: so another thread waits.
     std::thread::scope(|scope| match own_thread("bakelite-callback".into()).spawn_scoped(scope, wait) {
@@ -248,9 +269,7 @@ impl Drop for Device {
         if self.threads.iter().any(|t| t.thread().id() == this) {
             return;
         }
-        for thread in self.threads.drain(..) {
-            let _ = thread.join();
-        }
+        join(&mut self.threads);
     }
 }
 
@@ -261,8 +280,8 @@ mod tests {
     use std::cell::RefCell;
     use std::sync::atomic::{AtomicU32, Ordering::SeqCst};
 
-    #[test]
-    fn dropping_a_device_joins_its_threads() {
+    /// Counts the calling thread when it ends, which takes it a while.
+    fn count_at_exit(ended: &Arc<AtomicU32>) {
         struct CountsOnDrop(Arc<AtomicU32>);
         impl Drop for CountsOnDrop {
             fn drop(&mut self) {
@@ -271,10 +290,15 @@ mod tests {
             }
         }
         thread_local!(static AT_EXIT: RefCell<Option<CountsOnDrop>> = const { RefCell::new(None) });
+        AT_EXIT.with(|c| *c.borrow_mut() = Some(CountsOnDrop(ended.clone())));
+    }
+
+    #[test]
+    fn dropping_a_device_joins_its_threads() {
         let ended = Arc::new(AtomicU32::new(0));
         let device = Device::new(DeviceOptions { num_threads: 3, ..Default::default() }).unwrap();
         let pool = device.pool.as_ref().unwrap();
-        pool.broadcast(|_| AT_EXIT.with(|c| *c.borrow_mut() = Some(CountsOnDrop(ended.clone()))));
+        pool.broadcast(|_| count_at_exit(&ended));
         drop(device);
         assert_eq!(ended.load(SeqCst), 3);
     }
@@ -315,6 +339,33 @@ mod tests {
         });
         assert_eq!(sums.1, 499_500);
         assert!(sums.0.1 == 1 && sums.0.0 != outer, "{sums:?}");
+    }
+
+    #[test]
+    fn the_thread_for_work_in_a_callback_has_ended_when_the_work_has() {
+        let device = Device::new(DeviceOptions { num_threads: 1, ..Default::default() }).unwrap();
+        let ended = Arc::new(AtomicU32::new(0));
+        callback::run(|| device.install(|| count_at_exit(&ended)));
+        assert_eq!(ended.load(SeqCst), 1);
+    }
+
+    #[test]
+    fn work_in_the_background_stays_on_its_device_after_it_has_run_other_such_work() {
+        let device = || Device::new(DeviceOptions { num_threads: 1, ..Default::default() }).unwrap();
+        let (background, other) = (device(), device());
+        let (sender, receiver) = std::sync::mpsc::channel();
+        let of_both = (background.clone(), other);
+        background.spawn(move || {
+            let (background, other) = of_both;
+            background.spawn(|| ());
+            // As a thread does that waits for a part of its work which another one has taken.
+            assert_eq!(rayon::yield_now(), Some(rayon::Yield::Executed));
+            let name = || std::thread::current().name().map(str::to_owned);
+            sender.send((std::thread::current().id(), other.install(|| std::thread::current().id()), name())).unwrap();
+            drop((background, other));
+        });
+        let (outer, inner, name) = receiver.recv().unwrap();
+        assert_eq!(outer, inner, "{name:?}");
     }
 
     #[test]

@@ -108,7 +108,7 @@ impl Replacement {
         if old.as_ref().is_some_and(|old| old.permissions().readonly()) {
             return Err(fail(io::Error::new(ErrorKind::PermissionDenied, "it is read-only")));
         }
-        let target = if old.is_some() { std::fs::canonicalize(path).map_err(fail)? } else { name.clone() };
+        let target = if old.is_some() { std::fs::canonicalize(path) } else { end_of_links(path) }.map_err(fail)?;
         let mut beside = target.clone().into_os_string();
         beside.push(".part");
         let beside = PathBuf::from(beside);
@@ -212,6 +212,20 @@ fn is_still_at(_: &File, _: &Path) -> io::Result<bool> {
     Ok(true)
 }
 
+/// Where symbolic links lead that end at no file.
+fn end_of_links(path: &Path) -> io::Result<PathBuf> {
+    let mut path = path.to_owned();
+    // (As many as Linux follows. Between two calls anybody may make a circle of them.)
+    for _ in 0..40 {
+        if !std::fs::symlink_metadata(&path).is_ok_and(|m| m.is_symlink()) {
+            return Ok(path);
+        }
+        let to = std::fs::read_link(&path)?;
+        path = path.parent().unwrap_or(Path::new("")).join(to);
+    }
+    Err(io::Error::other("too many symbolic links"))
+}
+
 fn write_error(path: &Path, e: io::Error) -> Error {
     Error::Io(format!("cannot write {}: {e}", path.display()))
 }
@@ -313,6 +327,10 @@ mod tests {
         assert!(std::fs::symlink_metadata(&link).unwrap().is_symlink());
         assert_eq!(std::fs::read(&path).unwrap(), b"new");
         assert_eq!(std::fs::metadata(&path).unwrap().permissions().mode() & 0o777, 0o640);
+        std::fs::remove_file(&path).unwrap();
+        replace_with(&link, b"newer").unwrap();
+        assert!(std::fs::symlink_metadata(&link).unwrap().is_symlink());
+        assert_eq!(std::fs::read(&path).unwrap(), b"newer");
         std::fs::set_permissions(&path, std::fs::Permissions::from_mode(0o440)).unwrap();
         assert!(replace_with(&path, b"x").unwrap_err().to_string().contains("read-only"));
         replace_with(Path::new("/dev/null"), b"x").unwrap();

@@ -137,20 +137,24 @@ fn restore((caller, before): (Word, Word)) {
 
 /// The state of the code that called the library on this thread, until this is dropped: then the library's
 /// again, whatever a callback has set meanwhile. On the library's own threads both are the default.
-pub(crate) struct CallersState(());
+pub(crate) struct CallersState {
+    outside: Word,
+}
 
 impl CallersState {
     pub(crate) fn enter() -> CallersState {
-        let outside = OUTSIDE.try_with(Cell::get).unwrap_or(DEFAULT);
+        // Calls of the callback are made in the state that it has set, or else the default.
+        let outside = OUTSIDE.try_with(|outside| outside.replace(DEFAULT)).unwrap_or(DEFAULT);
         if !is_default(outside) {
             write(outside);
         }
-        CallersState(())
+        CallersState { outside }
     }
 }
 
 impl Drop for CallersState {
     fn drop(&mut self) {
+        let _ = OUTSIDE.try_with(|outside| outside.set(self.outside));
         if !is_default(read()) {
             write(DEFAULT);
         }
@@ -182,6 +186,15 @@ mod tests {
                     assert!(is_default(read()));
                 }
                 assert_eq!(read() & !FLAGS, DEFAULT | 0x2000);
+                // It calls once more, from the default state, and is called back in that.
+                write(DEFAULT);
+                let _state = LibraryState::enter();
+                let _callback = CallersState::enter();
+                assert!(is_default(read()));
+            }
+            {
+                let _callback = CallersState::enter();
+                assert_eq!(read() & !FLAGS, STRANGE);
             }
             assert!(is_default(read()));
             drop(CallersState::enter());

@@ -180,9 +180,9 @@ impl<'b> Text<'b> {
         if !encoded.contains(&b'\\') {
             return Some(decode_base64(import, encoded));
         }
-        // Some writers of JSON escape the slash.
+        // Some writers of JSON escape the slash, some the plus sign.
         let plain = import.account.list(encoded.len(), "a data URI").map(|mut plain| {
-            plain.extend(encoded.iter().filter(|c| **c != b'\\'));
+            unescape(encoded, &mut plain);
             plain
         });
         Some(plain.and_then(|plain| {
@@ -191,6 +191,23 @@ impl<'b> Text<'b> {
             decoded
         }))
     }
+}
+
+/// Appends a JSON string without its escapes, as far as base64 goes: one of anything else stays a backslash, which is
+/// none.
+fn unescape(mut text: &[u8], out: &mut Vec<u8>) {
+    while let Some(at) = text.iter().position(|c| *c == b'\\') {
+        out.extend_from_slice(&text[..at]);
+        let code = |hex: &[u8]| u8::from_str_radix(str::from_utf8(hex).ok()?, 16).ok();
+        let (plain, length) = match &text[at + 1..] {
+            [b'/', ..] => (b'/', 2),
+            [b'u', b'0', b'0', hex @ ..] => (hex.get(..2).and_then(code).unwrap_or(b'\\'), 6),
+            _ => (b'\\', 1),
+        };
+        out.push(plain);
+        text = text.get(at + length..).unwrap_or_default();
+    }
+    out.extend_from_slice(text);
 }
 
 fn decode_base64(import: &mut Import, encoded: &[u8]) -> Attempt<Vec<u8>> {
@@ -1112,18 +1129,41 @@ pub(super) mod tests {
         // A buffer of more than a piece, with many slashes in base64.
         let mut large = sample();
         large.binary.resize(3 << 20, 0xff);
+        // In base64 plus signs.
+        large.binary[1 << 20..][2..].as_chunks_mut().0.iter_mut().for_each(|c| *c = [0xfb, 0xef, 0xbe]);
         large.root["buffers"][0]["byteLength"] = large.binary.len().into();
         let (inside, _) = load_bytes("a.glb", large.glb()).unwrap();
         let text = String::from_utf8(large.gltf()).unwrap();
-        for text in [text.clone(), text.replace('/', "\\/")] {
+        assert!(text.contains("////") && text.contains("++++"));
+        for text in [text.clone(), text.replace('/', "\\/"), text.replace('+', "\\u002B").replace("AA", "\\u0041A")] {
             assert_eq!(load_bytes("a.gltf", text).unwrap().0.meshes(), inside.meshes());
         }
-        let broken = text.replacen("////", "//=/", 1);
-        assert!(refusal("a.gltf", broken).starts_with("buffer 0: "));
+        for broken in ["//=/", "//\\n/", "//\\u2f/", "//\\u00e9"] {
+            assert!(refusal("a.gltf", text.replacen("////", broken, 1)).starts_with("buffer 0: "), "{broken}");
+        }
         // What stands for a long URI in the parser's text means nothing in a file.
         let mut own = sample();
         own.root["buffers"][0]["uri"] = "data:#0".into();
         assert_eq!(refusal("a.gltf", own.root.to_string()), "buffer 0: a data URI without base64");
+    }
+
+    #[test]
+    fn extras_may_be_any_json_value() {
+        let plain = load_bytes("a.glb", sample().glb()).unwrap().0;
+        for extras in [json!(null), json!(7.5), json!("text"), json!([1, [2], {"a": 3}]), json!({"a": [4]}), json!([])]
+        {
+            let file = changed(|root| {
+                let places =
+                    ["", "/asset", "/scenes/0", "/nodes/1", "/meshes/0", "/meshes/0/primitives/0", "/materials/0"];
+                let more = ["/materials/0/pbrMetallicRoughness", "/accessors/0", "/bufferViews/0", "/buffers/0"];
+                let light = ["/extensions/KHR_lights_punctual/lights/0"];
+                for place in places.iter().chain(&more).chain(&light) {
+                    root.pointer_mut(place).unwrap()["extras"] = extras.clone();
+                }
+            });
+            let (scene, _) = load_bytes("a.glb", file).unwrap_or_else(|e| panic!("{extras}: {e}"));
+            assert_eq!((scene.meshes(), scene.lights()), (plain.meshes(), plain.lights()));
+        }
     }
 
     #[test]
