@@ -33,31 +33,82 @@ fn oracle(ray: &Ray, triangle: &[Vec3; 3]) -> Option<(f64, f64)> {
     Some((t, weight(b, c).min(weight(c, a)).min(weight(a, b))))
 }
 
+/// By how much rounding may falsify a ray's barycentric weights on a triangle, to first order: much where the triangle
+/// is small or narrow as the ray sees it. Infinite where it may be seen from either side.
+///
+/// The kernels take weights as ratios of areas across the ray, whose corners are relative to its origin and sheared
+/// along it (see [`triangle`]).
+fn weight_error(ray: &Ray, triangle: &[Vec3; 3]) -> f64 {
+    /// Half a unit in the last place of 1.
+    const HALF: f64 = f32::EPSILON as f64 / 2.0;
+    let (o, d) = (DVec3::from(ray.origin.map(f64::from)), DVec3::from(ray.direction.map(f64::from)));
+    let z = (0..3).max_by(|&a, &b| d[a].abs().total_cmp(&d[b].abs())).unwrap();
+    let (x, y) = ((z + 1) % 3, (z + 2) % 3);
+    let corners = triangle.map(|v| v.as_dvec3() - o);
+    let across = corners.map(|c| [c[x] - c[z] * (d[x] / d[z]), c[y] - c[z] * (d[y] / d[z])]);
+    let far = corners.iter().map(|c| c.abs().max_element()).fold(0.0, f64::max);
+    let wide = across.iter().flatten().map(|c| c.abs()).fold(0.0, f64::max);
+    // Two differences, the slope (a reciprocal and a product) and its product, the sum.
+    let coordinate = HALF * (5.0 * far + wide);
+    // Products of two coordinates, and their difference.
+    let area = 4.0 * wide * coordinate + HALF * 4.0 * wide * wide;
+    let area_of = |i: usize, j: usize| across[i][0] * across[j][1] - across[i][1] * across[j][0];
+    let sum = (area_of(0, 1) + area_of(1, 2) + area_of(2, 0)).abs();
+    // Of a quotient of one area by the sum of three.
+    if sum > 4.0 * area { 4.0 * area / (sum - 4.0 * area) + 4.0 * HALF } else { f64::INFINITY }
+}
+
 /// Checks a hit against all triangles; near edges either answer is right.
 fn check(ray: &Ray, triangles: &[[Vec3; 3]], hit: RawHit, what: &str) {
-    const EDGE: f64 = 1e-4;
     let (tmin, tmax) = (ray.tmin as f64, ray.tmax as f64);
     let near = |t: f64, e: f64| (t - e).abs() <= 2e-5 * e.abs().max(1.0);
     for (i, triangle) in triangles.iter().enumerate() {
         let Some((t, weight)) = oracle(ray, triangle) else { continue };
-        let certain = weight > EDGE && t > tmin && t < tmax && !near(t, tmin) && !near(t, tmax);
+        let is_in_range = t > tmin && t < tmax && !near(t, tmin) && !near(t, tmax);
+        let certain = is_in_range && weight > 0.0 && weight > weight_error(ray, triangle);
         assert!(
             !certain || hit.t as f64 <= t || near(hit.t as f64, t),
             "{what}: {ray:?} misses {i} at {t}, has {hit:?}"
         );
     }
     if !hit.is_miss() {
-        let (t, weight) = oracle(ray, &triangles[hit.triangle as usize]).expect("a ray in a plane has no hit");
-        assert!(weight > -EDGE && near(hit.t as f64, t), "{what}: {ray:?} {hit:?}, oracle t {t} weight {weight}");
+        let triangle = &triangles[hit.triangle as usize];
+        let (t, weight) = oracle(ray, triangle).expect("a ray in a plane has no hit");
+        let [a, b, c] = triangle.map(|v| v.as_dvec3());
+        let direction = DVec3::from(ray.direction.map(f64::from));
+        // How far from the ray's place in the plane the hit may be, which lies between the triangle's edges.
+        let error = weight_error(ray, triangle);
+        let bound = error * ((b - a).length() + (c - a).length());
+        let is_at_t = near(hit.t as f64, t) || (hit.t as f64 - t).abs() * direction.length() <= bound;
+        assert!(weight >= -error && is_at_t, "{what}: {ray:?} {hit:?}, oracle t {t} weight {weight} error {error}");
         assert!(hit.t > ray.tmin && hit.t <= ray.tmax);
-        let normal = crate::scene::unit_normal(triangles[hit.triangle as usize]);
-        let facing = normal.dot(Vec3::from(ray.direction).normalize());
-        assert!(facing.abs() < 1e-5 || hit.front == (facing < 0.0), "{what}: {hit:?} {facing}");
-        let [a, b, c] = triangles[hit.triangle as usize];
-        let p = a + hit.u * (b - a) + hit.v * (c - a);
-        let q = Vec3::from(ray.origin) + hit.t * Vec3::from(ray.direction);
-        let scale = q.length().max(a.length()).max(1.0);
-        assert!((p - q).length() <= 1e-4 * scale, "{what}: {hit:?} barycentrics say {p}, t says {q}");
+        let facing = (b - a).cross(c - a).dot(direction);
+        assert!(error.is_infinite() || hit.front == (facing < 0.0), "{what}: {hit:?} {facing}");
+        let p = a + f64::from(hit.u) * (b - a) + f64::from(hit.v) * (c - a);
+        let q = DVec3::from(ray.origin.map(f64::from)) + t * direction;
+        assert!((p - q).length() <= bound, "{what}: {ray:?} {hit:?} barycentrics say {p}, t says {q}, {bound} at most");
+    }
+}
+#[test]
+fn hits_on_triangles_seen_edge_on_are_as_accurate_as_their_areas_allow() {
+    for thin in [1.0, 0.03, 1e-3] {
+        let triangles: Vec<_> = soup(60, 1.0, 31).into_iter().map(|[a, b, c]| [a, b, b + thin * (c - b)]).collect();
+        for isa in Isa::available() {
+            let scene = scene(isa, &triangles, 1);
+            for (i, &[a, b, c]) in (0..).zip(&triangles) {
+                let normal = crate::scene::unit_normal([a, b, c]);
+                let (x, y) = orthonormal_basis(normal);
+                for j in 0..100 {
+                    let random = |d| uniform(100 * i + j, d, 3);
+                    let [u, v] = crate::sampling::uniform_triangle([random(0), random(1)]);
+                    let (sin, cos) = (std::f32::consts::TAU * random(2)).sin_cos();
+                    let slope = 10f32.powf(-5.0 * random(3));
+                    let away = 3.0 * random(4) * (cos * x + sin * y + slope * normal);
+                    let ray = Ray::new(a + u * (b - a) + v * (c - a) + away, -away);
+                    check(&ray, &triangles, scene.intersect_raw(&ray), &format!("{isa:?} {thin} {slope}"));
+                }
+            }
+        }
     }
 }
 
