@@ -28,9 +28,9 @@
 //! that is created in the child. An object that another thread is changing during the fork stays
 //! locked in the child: calls with it fail with BK_ERROR_INVALID_STATE too.
 
-use super::args::{UserPointer, check_flags, init, read_struct, sized_struct, write};
+use super::args::{UserPointer, check_flags, init, read_struct, sized_struct, text, write};
 use super::error::{bk_result, c_string, call, call_or};
-use super::handles::{create, object, release, retain};
+use super::handles::{create, hold, object, release, retain};
 use crate::callback;
 use crate::device::{Device, DeviceOptions};
 use crate::error::{Error, Result, invalid_argument};
@@ -214,4 +214,23 @@ pub(super) fn refuse_in_callback() -> Result<()> {
         return Err(Error::InvalidState("a callback must not start work on a device's threads".into()));
     }
     Ok(())
+}
+
+/// Runs the body of a call that reads or writes a file with the object behind `handle`, which is held: callbacks may
+/// release the caller's reference. `name` and `path_name` are those of the arguments.
+///
+/// # Safety
+/// `handle` is NULL or that of a living object; `path` is NULL or a string that ends with a NUL.
+pub(super) unsafe fn call_with_file<T>(
+    (handle, name): (*const T, &str),
+    (path, path_name): (*const c_char, &str),
+    body: impl FnOnce(&T, &str) -> Result<()>,
+) -> bk_result {
+    call(|| {
+        refuse_in_callback()?;
+        // SAFETY: by contract.
+        let object = unsafe { hold(handle, name) }?;
+        // SAFETY: by contract.
+        body(&object, unsafe { text(path, path_name) }?)
+    })
 }

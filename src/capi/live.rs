@@ -9,8 +9,8 @@
 //! fails with BK_ERROR_INVALID_STATE and changes nothing. Reads (bk_live_read, bk_live_cell_lods,
 //! bk_live_lod_at) exclude updates only, not each other. Source: Schouls 2017, section 3.3.
 
-use super::args::{OutStruct, SizedStruct, init, read_struct, read_vec3, sized_struct, slice_mut, text, write};
-use super::device::{bk_progress_fn, progress as report_to, refuse_in_callback};
+use super::args::{OutStruct, SizedStruct, init, read_struct, read_vec3, sized_struct, slice_mut, write};
+use super::device::{bk_progress_fn, call_with_file, progress as report_to, refuse_in_callback};
 use super::error::{BK_NONE, bk_result, call, call_or};
 use super::handles::{create, hold, is_null, object, release, retain};
 use super::lightmap::bk_lightmap;
@@ -19,7 +19,6 @@ use crate::error::{Error, Result, invalid_argument};
 use crate::live::{Budget, CellInfo, Live, LiveCamera, LiveParams, LiveStats, Mode, PageRect};
 use glam::Vec3;
 use std::ffi::{c_char, c_void};
-use std::path::Path;
 use std::sync::{RwLock, TryLockError};
 
 /// Work on what the camera sees, most where estimated error times visibility is largest.
@@ -585,14 +584,12 @@ pub unsafe extern "C" fn bk_live_save(
     progress: bk_progress_fn,
     user: *mut c_void,
 ) -> bk_result {
-    call(|| {
-        refuse_in_callback()?;
-        // SAFETY: a handle, or NULL.
-        let live = unsafe { hold(live, "live") }?;
-        // SAFETY: path is the caller's, or NULL.
-        let path = unsafe { text(path, "path") }?;
-        live.change(|l| l.save(Path::new(path), &report_to(progress, user)))
-    })
+    // SAFETY: a handle or NULL; path is the caller's, or NULL.
+    unsafe {
+        call_with_file((live.cast_const(), "live"), (path, "path"), |live, path| {
+            live.change(|l| l.save(path.as_ref(), &report_to(progress, user)))
+        })
+    }
 }
 
 /// Goes on from a file that was saved of the same scene, light map, lights and parameters (mode, cell
@@ -613,12 +610,10 @@ pub unsafe extern "C" fn bk_live_restore(
     progress: bk_progress_fn,
     user: *mut c_void,
 ) -> bk_result {
-    call(|| {
-        refuse_in_callback()?;
-        // SAFETY: a handle, or NULL.
-        let live = unsafe { hold(live, "live") }?;
-        // SAFETY: path is the caller's, or NULL.
-        let path = unsafe { text(path, "path") }?;
-        live.change(|l| l.restore(Path::new(path), &report_to(progress, user)))
-    })
+    // SAFETY: a handle or NULL; path is the caller's, or NULL.
+    unsafe {
+        call_with_file((live.cast_const(), "live"), (path, "path"), |live, path| {
+            live.change(|l| l.restore(path.as_ref(), &report_to(progress, user)))
+        })
+    }
 }

@@ -1,9 +1,8 @@
 //! Reading and saving light maps
 
-use super::args::text;
-use super::device::{bk_progress_fn, progress, refuse_in_callback};
+use super::device::{bk_progress_fn, call_with_file, progress};
 use super::error::{bk_result, call};
-use super::handles::{hold, is_null, object};
+use super::handles::{is_null, object};
 use super::lightmap::bk_lightmap;
 use crate::error::{Error, Result, invalid_argument};
 use crate::lightmap::{Layer, LayerData, Lightmap};
@@ -212,14 +211,12 @@ pub unsafe extern "C" fn bk_lightmap_save(
     progress: bk_progress_fn,
     user: *mut c_void,
 ) -> bk_result {
-    call(|| {
-        refuse_in_callback()?;
-        // SAFETY: a handle or NULL. It is held: callbacks may release the caller's.
-        let lightmap = unsafe { hold(lightmap, "lightmap") }?;
-        // SAFETY: path_prefix is the caller's, or NULL.
-        let prefix = unsafe { text(path_prefix, "path_prefix") }?;
-        lightmap.read(|l| save(l, prefix, file_format, &self::progress(progress, user)))
-    })
+    // SAFETY: a handle or NULL; path_prefix is the caller's, or NULL.
+    unsafe {
+        call_with_file((lightmap, "lightmap"), (path_prefix, "path_prefix"), |lightmap, prefix| {
+            lightmap.read(|l| save(l, prefix, file_format, &self::progress(progress, user)))
+        })
+    }
 }
 
 #[cfg(feature = "io")]
@@ -254,14 +251,12 @@ pub unsafe extern "C" fn bk_lightmap_save_result(
     progress: bk_progress_fn,
     user: *mut c_void,
 ) -> bk_result {
-    call(|| {
-        refuse_in_callback()?;
-        // SAFETY: a handle or NULL; path is the caller's, or NULL. A callback may release the handle: it is held.
-        let lightmap = unsafe { hold(lightmap, "lightmap") }?;
-        // SAFETY: see above.
-        let path = unsafe { text(path, "path") }?;
-        lightmap.read(|l| l.save_result(path.as_ref(), &self::progress(progress, user)))
-    })
+    // SAFETY: a handle or NULL; path is the caller's, or NULL.
+    unsafe {
+        call_with_file((lightmap, "lightmap"), (path, "path"), |lightmap, path| {
+            lightmap.read(|l| l.save_result(path.as_ref(), &self::progress(progress, user)))
+        })
+    }
 }
 
 /// Takes over the light of a file that bk_lightmap_save_result wrote for a light map of the same scene, lights and
@@ -284,14 +279,12 @@ pub unsafe extern "C" fn bk_lightmap_load_result(
     progress: bk_progress_fn,
     user: *mut c_void,
 ) -> bk_result {
-    call(|| {
-        refuse_in_callback()?;
-        // SAFETY: a handle or NULL; path is the caller's, or NULL. A callback may release the handle: it is held.
-        let lightmap = unsafe { hold(lightmap, "lightmap") }?;
-        // SAFETY: see above.
-        let path = unsafe { text(path, "path") }?;
-        lightmap.change(|l| l.load_result(path.as_ref(), &self::progress(progress, user)))
-    })
+    // SAFETY: a handle or NULL; path is the caller's, or NULL.
+    unsafe {
+        call_with_file((lightmap.cast_const(), "lightmap"), (path, "path"), |lightmap, path| {
+            lightmap.change(|l| l.load_result(path.as_ref(), &self::progress(progress, user)))
+        })
+    }
 }
 
 #[cfg(test)]

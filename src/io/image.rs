@@ -5,7 +5,7 @@
 //! page is v = 0 and becomes the top row of the file, which is where glTF and Vulkan have v = 0.
 //! (OpenGL tools that expect v = 0 at the bottom show such files upside down.)
 
-use super::source::Advance;
+use super::source::{Advance, place};
 use crate::error::{Error, Result, invalid_argument};
 use crate::files;
 use crate::scene::{Environment, MAX_COORDINATE, MAX_ENVIRONMENT_SIZE};
@@ -86,13 +86,7 @@ impl Write for Encoded<'_> {
 
 impl Seek for Encoded<'_> {
     fn seek(&mut self, to: SeekFrom) -> io::Result<u64> {
-        let at = match to {
-            SeekFrom::Start(at) => i64::try_from(at).ok(),
-            SeekFrom::End(by) => (self.bytes.len() as i64).checked_add(by),
-            SeekFrom::Current(by) => (self.at as i64).checked_add(by),
-        };
-        let at = at.and_then(|at| usize::try_from(at).ok());
-        self.at = at.ok_or_else(|| io::Error::new(io::ErrorKind::InvalidInput, "a place before the beginning"))?;
+        self.at = place(to, self.at, self.bytes.len())?;
         Ok(self.at as u64)
     }
 }

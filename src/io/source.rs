@@ -195,13 +195,29 @@ impl<'a> Source<'a> {
     }
 }
 
+/// [`Read::read`] of what has a buffer.
+fn read_buffered(from: &mut impl BufRead, buffer: &mut [u8]) -> io::Result<usize> {
+    let available = from.fill_buf()?;
+    let count = available.len().min(buffer.len());
+    buffer[..count].copy_from_slice(&available[..count]);
+    from.consume(count);
+    Ok(count)
+}
+
+/// The place that [`Seek::seek`] goes to from `at` in `length` bytes; it may lie behind them.
+pub(super) fn place(to: SeekFrom, at: usize, length: usize) -> io::Result<usize> {
+    let place = match to {
+        SeekFrom::Start(place) => i64::try_from(place).ok(),
+        SeekFrom::End(by) => (length as i64).checked_add(by),
+        SeekFrom::Current(by) => (at as i64).checked_add(by),
+    };
+    let place = place.and_then(|place| usize::try_from(place).ok());
+    place.ok_or_else(|| io::Error::new(io::ErrorKind::InvalidInput, "a place before the beginning"))
+}
+
 impl Read for Source<'_> {
     fn read(&mut self, buffer: &mut [u8]) -> io::Result<usize> {
-        let available = self.fill_buf()?;
-        let count = available.len().min(buffer.len());
-        buffer[..count].copy_from_slice(&available[..count]);
-        self.consume(count);
-        Ok(count)
+        read_buffered(self, buffer)
     }
 }
 
@@ -241,11 +257,7 @@ impl<'b> Checked<'b> {
 
 impl Read for Checked<'_> {
     fn read(&mut self, buffer: &mut [u8]) -> io::Result<usize> {
-        let available = self.fill_buf()?;
-        let count = available.len().min(buffer.len());
-        buffer[..count].copy_from_slice(&available[..count]);
-        self.consume(count);
-        Ok(count)
+        read_buffered(self, buffer)
     }
 }
 
@@ -263,13 +275,7 @@ impl BufRead for Checked<'_> {
 
 impl Seek for Checked<'_> {
     fn seek(&mut self, to: SeekFrom) -> io::Result<u64> {
-        let at = match to {
-            SeekFrom::Start(at) => i64::try_from(at).ok(),
-            SeekFrom::End(by) => (self.bytes.len() as i64).checked_add(by),
-            SeekFrom::Current(by) => (self.at as i64).checked_add(by),
-        };
-        let at = at.and_then(|at| usize::try_from(at).ok());
-        self.at = at.ok_or_else(|| io::Error::new(io::ErrorKind::InvalidInput, "a place before the beginning"))?;
+        self.at = place(to, self.at, self.bytes.len())?;
         Ok(self.at as u64)
     }
 }
