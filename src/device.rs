@@ -136,7 +136,17 @@ impl Device {
 
     /// Runs `f` on the device's threads, as [`install`](Self::install) does, while the calling thread makes the
     /// reports of `progress`. On a thread of the device, which has to work, reports are made when work is counted.
-    pub fn run<R: Send>(&self, progress: &Progress, f: impl FnOnce() -> R + Send) -> R {
+    ///
+    /// Fails with `f`, and if the callback of `progress` has cancelled, in whichever report: so `f` leaves to its
+    /// caller what cannot be undone.
+    pub fn run<R: Send>(&self, progress: &Progress, f: impl FnOnce() -> Result<R> + Send) -> Result<R> {
+        let done = self.run_attended(progress, f)?;
+        // The last report may come when all work is done.
+        progress.check()?;
+        Ok(done)
+    }
+
+    fn run_attended<R: Send>(&self, progress: &Progress, f: impl FnOnce() -> R + Send) -> R {
         let pool = self.pool.as_ref().expect("there until dropped");
         let is_busy = callback::is_running() || APART.get() || pool.current_thread_index().is_some();
         if is_busy || self.is_forked() || !progress.wants_attendance() {
@@ -317,6 +327,23 @@ mod tests {
         });
         drop(device);
         receiver.recv().unwrap();
+    }
+
+    #[test]
+    fn a_cancel_counts_that_comes_when_the_work_has_looked_for_the_last_time() {
+        let device = Device::new(DeviceOptions { num_threads: 1, ..Default::default() }).unwrap();
+        let all_is_done = AtomicU32::new(0);
+        let progress = Progress::new(|_, stage| stage != "work" || all_is_done.load(SeqCst) == 0);
+        let done = device.run(&progress, || {
+            let stage = progress.stage("work", 0.0, 1.0, 1);
+            stage.advance(1)?;
+            progress.check()?;
+            all_is_done.store(1, SeqCst);
+            // As long as the calling thread waits between two reports, and longer.
+            std::thread::sleep(std::time::Duration::from_millis(60));
+            Ok(())
+        });
+        assert_eq!(done, Err(Error::Cancelled));
     }
 
     #[test]

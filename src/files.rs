@@ -71,9 +71,18 @@ fn check_regular(metadata: &Metadata) -> io::Result<()> {
 /// or FIFO is written to as it is. Fails if another call is just writing the same file, and if the old file is
 /// read-only.
 pub fn replace(path: &Path, write: impl FnOnce(&mut Replacement) -> Result<()>) -> Result<()> {
+    prepare(path, write)?.finish()
+}
+
+/// The part of [`replace`] that takes time: writes beside the old file, which stays until
+/// [`finish`](Replacement::finish).
+pub fn prepare(path: &Path, write: impl FnOnce(&mut Replacement) -> Result<()>) -> Result<Replacement> {
     let mut new = Replacement::begin(path)?;
     write(&mut new)?;
-    new.finish()
+    if new.beside.is_some() {
+        new.file.sync_all().map_err(|e| write_error(path, e))?;
+    }
+    Ok(new)
 }
 
 /// As [`replace`], with all bytes at hand.
@@ -131,10 +140,9 @@ impl Replacement {
     }
 
     /// Puts the new file in the place of the old one.
-    fn finish(mut self) -> Result<()> {
+    pub fn finish(mut self) -> Result<()> {
         let Some(beside) = self.beside.take() else { return Ok(()) };
-        let renamed = self.file.sync_all().and_then(|()| std::fs::rename(&beside, &self.target));
-        if let Err(e) = renamed {
+        if let Err(e) = std::fs::rename(&beside, &self.target) {
             self.beside = Some(beside);
             return Err(write_error(&self.name, e));
         }

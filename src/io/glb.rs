@@ -84,22 +84,29 @@ const ENCODING: &str = "8-bit sRGB. To irradiance in W/m2 (per square unit of le
 
 /// Writes `scene` and its light maps to the file `path`, which is replaced as a whole.
 pub fn write_glb(path: &Path, scene: &Scene, lightmap: &GlbLightmap) -> Result<()> {
-    write_glb_with(path, scene, lightmap, &|_| Ok(()))
+    prepare_glb(path, scene, lightmap, &|_| Ok(()))?.finish()
 }
 
-/// The same, with reports: `advance` is told of 2 parts, and ends the call by an error.
-pub(super) fn write_glb_with(path: &Path, scene: &Scene, lightmap: &GlbLightmap, advance: Advance) -> Result<()> {
+/// The same up to [`finish`](files::Replacement::finish), with reports: `advance` is told of 2 parts, and ends the call
+/// by an error.
+pub(super) fn prepare_glb(
+    path: &Path,
+    scene: &Scene,
+    lightmap: &GlbLightmap,
+    advance: Advance,
+) -> Result<files::Replacement> {
     let mut account = Account::new(scene.device().memory())?;
     let (json, binary) = parts(scene, lightmap, &mut account, advance)?;
     let headers = headers(&json, &binary)?;
     advance(1)?;
-    files::replace(path, |file| {
+    let new = files::prepare(path, |file| {
         for part in [&headers[0][..], &json, &headers[1], &binary] {
             file.append(part, |_| advance(0))?;
         }
         Ok(())
     })?;
-    advance(1)
+    advance(1)?;
+    Ok(new)
 }
 
 /// The bytes of the file that [`write_glb`] writes.

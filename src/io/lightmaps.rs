@@ -1,7 +1,7 @@
 //! Baked light maps as files: pages layer by layer as EXR or PNG, or the lit scene as GLB.
 
 use super::account::Account;
-use super::glb::{GlbLightmap, GlbMesh, write_glb_with};
+use super::glb::{GlbLightmap, GlbMesh, prepare_glb};
 use super::image::{auto_exposure, encode_png, tone_map, write_exr_with, write_png_with};
 use super::source::Advance;
 use crate::error::{Error, Result};
@@ -73,7 +73,7 @@ pub fn write_png_pages(
 /// [one](exposure). Otherwise as [`write_exr_pages`].
 pub fn write_scene(lightmap: &Lightmap, path: &Path, exposure: Option<f32>, progress: &Progress) -> Result<()> {
     let info = lightmap.info();
-    lightmap.scene().device().run(progress, || {
+    let new = lightmap.scene().device().run(progress, || {
         let stage = progress.stage("scene with light map", 0.0, 1.0, u64::from(info.page_count) + 2);
         let exposure = exposure.map_or_else(|| self::exposure(lightmap), Ok)?;
         let meshes = (0..lightmap.scene().meshes().len() as u32)
@@ -89,8 +89,9 @@ pub fn write_scene(lightmap: &Lightmap, path: &Path, exposure: Option<f32>, prog
         };
         let pages = (0..info.page_count).into_par_iter().map(page).collect::<Result<_>>()?;
         let glb = GlbLightmap { meshes, pages, exposure };
-        write_glb_with(path, lightmap.scene(), &glb, &|parts| stage.advance(parts))
-    })
+        prepare_glb(path, lightmap.scene(), &glb, &|parts| stage.advance(parts))
+    })?;
+    new.finish()
 }
 
 /// Announces what an encoder takes for a page, which is not ours to allocate: the filtered rows and the file.

@@ -131,13 +131,13 @@ pub fn load_with(path: &Path, options: &LoadOptions, progress: &Progress, data: 
     let advance = |bytes| stage.advance(bytes);
     let mut import = Import::new(path, options, files, &advance)?;
     // Decoders know no cancel: they take it for a file that cannot be read.
-    let read = read(&mut import, opened)
-        .and_then(|()| progress.check())
-        .map_err(|e| if progress.is_cancelled() { Error::Cancelled } else { e });
+    let read = read(&mut import, opened).map_err(|e| if progress.is_cancelled() { Error::Cancelled } else { e });
     read?;
+    // The last report comes before `data` changes.
+    progress.stage("scene file", 1.0, 1.0, 1);
+    progress.check()?;
     let mut info = import.finish(data)?;
     info.seconds = start.elapsed().as_secs_f64();
-    progress.stage("scene file", 1.0, 1.0, 1);
     Ok(info)
 }
 

@@ -79,9 +79,7 @@ impl Lightmap {
     /// Unwraps what brings no usable UVs, lays out the pages and maps texels to triangles.
     pub fn create(scene: &Arc<Scene>, desc: &LightmapDesc, progress: &Progress) -> Result<Lightmap> {
         desc.validate()?;
-        let lightmap = scene.device().run(progress, || Self::lay_out(scene, desc, progress))?;
-        progress.check()?;
-        Ok(lightmap)
+        scene.device().run(progress, || Self::lay_out(scene, desc, progress))
     }
 
     fn lay_out(scene: &Arc<Scene>, desc: &LightmapDesc, progress: &Progress) -> Result<Lightmap> {
@@ -219,8 +217,6 @@ impl Lightmap {
             let stitch = self.stitch(&light, &range, params, &mut plan, &mut stats, progress)?;
             Ok((light, stats, stitch))
         })?;
-        // The last moment at which nothing has changed.
-        progress.check()?;
         stats.left_out = plan.left_out;
         stats.peak_bytes = device.memory().peak() as u64;
         self.plan = plan;

@@ -68,8 +68,12 @@ const NEAR: f32 = 16.0;
 /// So many texels become lights; of more, so many are taken at random, each for several.
 const MAX_PATCHES: usize = 1 << 16;
 
-/// Places tried along each axis of a texel, to tell where it lies and how large it is.
-const PLACES: u32 = 2;
+/// Places tried on all patches together, about, to tell where each lies and how large it is, and the fewest and the most
+/// along an axis of a texel. (Sponza by two lamps, light reflected once: with 2 along each axis gathered light
+/// is 0.977 of the reference's, with these 0.981: at edges of triangles a few places tell too little of a texel's area, and
+/// few texels make most of the light.)
+const PLACES: usize = 1 << 18;
+const PLACES_ALONG_AXIS: [u32; 2] = [2, 16];
 
 /// Triangles on which a thread looks for bright texels at a time.
 const TRIANGLES: u32 = 64;
@@ -270,8 +274,10 @@ fn patches(
     let count = values.iter().filter(|v| v.element_sum() > limit).count();
     let chance = (most as f32 / count.max(1) as f32).min(1.0);
     let is_light = |texel: usize| values[texel].element_sum() > limit && uniform(texel as u32, 0, 0) < chance;
+    let [fewest, most_along_axis] = PLACES_ALONG_AXIS;
+    let along_axis = ((PLACES / count.clamp(1, most.max(1))).isqrt() as u32).clamp(fewest, most_along_axis);
     let traced = AtomicU64::new(0);
-    let mut places = places(atlas, is_light, &traced, progress)?;
+    let mut places = places(atlas, along_axis, is_light, &traced, progress)?;
     *rays += traced.into_inner();
     places.sort_unstable_by_key(|p| (p.texel, p.number));
     let patch = |of_texel: &[Place]| {
@@ -293,6 +299,7 @@ fn patches(
 /// area is exact, of others right on average.
 fn places(
     atlas: &Atlas,
+    along_axis: u32,
     is_light: impl Fn(usize) -> bool + Sync,
     rays: &AtomicU64,
     progress: &Progress,
@@ -307,7 +314,7 @@ fn places(
         let [a, b, c] = scene.corners(t);
         let area = 0.5 * (b - a).cross(c - a).length();
         let texel = |u, v| Vec2::from(map.layout.texel_coord(placement, charts.local(t, u, v)));
-        let (origin, scale) = (texel(0.0, 0.0), 1.0 / PLACES as f32);
+        let (origin, scale) = (texel(0.0, 0.0), 1.0 / along_axis as f32);
         let [a2, b2, c2] = [origin, texel(1.0, 0.0), texel(0.0, 1.0)].map(|c| c / scale);
         let weights = Mat2::from_cols(b2 - a2, c2 - a2);
         let cell = area / (0.5 * weights.determinant().abs());

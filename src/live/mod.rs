@@ -276,14 +276,11 @@ impl Live {
     pub fn new(lightmap: &Lightmap, params: &LiveParams, progress: &Progress) -> Result<Live> {
         params.validate()?;
         let device = lightmap.atlas().scene.device();
-        let live = device.run(progress, || {
+        device.run(progress, || {
             let mut live = Live::idle(lightmap, params, progress)?;
             live.start(progress)?;
             Ok(live)
-        })?;
-        // The last report may come when all work is done.
-        progress.check()?;
-        Ok(live)
+        })
     }
 
     /// All that is needed, nothing computed but photons and radiance.

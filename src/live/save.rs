@@ -5,6 +5,7 @@
 //! number is one that live updates could have arrived at is checked beside it.
 
 use super::blocks::{Block, BlockStatus, BlockWork, Blocks, DirectTile, Tile};
+use super::display::Display;
 use super::work::owns;
 use super::{Live, in_parts};
 use crate::error::{Error, Result, invalid_argument};
@@ -66,13 +67,13 @@ impl Live {
     pub fn save(&mut self, path: &Path, progress: &Progress) -> Result<()> {
         self.collect_now()?;
         let live = &*self;
-        live.device().run(progress, || live.write(path, progress))
+        live.device().run(progress, || live.write(path, progress))?.finish()
     }
 
-    fn write(&self, path: &Path, progress: &Progress) -> Result<()> {
+    fn write(&self, path: &Path, progress: &Progress) -> Result<files::Replacement> {
         let fingerprint = self.fingerprint(progress)?;
         let stage = progress.stage("save", 0.1, 1.0, self.blocks.len() as u64);
-        files::replace(path, |file| {
+        files::prepare(path, |file| {
             let (mut sum, mut out) = (Hash::new(), MAGIC.to_vec());
             out.extend(fingerprint.to_le_bytes());
             out.extend((self.blocks.len() as u64).to_le_bytes());
@@ -103,16 +104,17 @@ impl Live {
     pub fn restore_bytes(&mut self, bytes: &[u8], name: &str, progress: &Progress) -> Result<()> {
         self.collect_now()?;
         let device = self.device();
-        device.run(progress, || {
+        let restored = device.run(progress, || {
             let saved = self.parse(bytes, name, progress)?;
-            let result = self.take_saved(saved, progress);
-            self.settle();
-            result
-        })
+            self.restored(saved, progress)
+        });
+        let result = restored.map(|(display, blocks)| self.go_on_from(display, blocks));
+        self.settle();
+        result
     }
 
-    /// Puts saved blocks in the place of those of now, when all that can fail has succeeded.
-    fn take_saved(&mut self, saved: Vec<Saved>, progress: &Progress) -> Result<()> {
+    /// Display and blocks with what was saved. All that can fail.
+    fn restored(&mut self, saved: Vec<Saved>, progress: &Progress) -> Result<(Display, Blocks)> {
         let direct = |s: &Saved| s.direct.as_ref().map_or(0, |d| size_of_val(&d[..]));
         let held: usize = saved.iter().map(|s| s.block.work.bytes() + direct(s)).sum();
         // Old and new state are held at once.
@@ -152,14 +154,16 @@ impl Live {
             display.refresh(&context.map, &blocks, &some);
             stage.advance(some.len() as u64)?;
         }
-        // Nothing fails from here on.
+        Ok((display, blocks))
+    }
+
+    fn go_on_from(&mut self, display: Display, blocks: Blocks) {
         self.display = display;
         self.blocks.replace_by(blocks);
         self.held = self.blocks.bytes() as isize + self.display.tile_bytes() as isize;
         // Blocks of which nothing was saved go where they were going.
         std::mem::take(&mut self.fading).into_iter().for_each(|b| self.wait(b));
         self.note_all_shown();
-        Ok(())
     }
 
     /// Of all that the accumulated light depends on.

@@ -219,9 +219,7 @@ impl PhotonMap {
     /// `OutOfMemory` if `memory_budget` or the memory monitor refuses. Lights without power make an
     /// empty map.
     pub fn trace(scene: &Arc<Scene>, params: &PhotonParams, progress: &Progress) -> Result<PhotonMap> {
-        let map = scene.device().run(progress, || Self::trace_within(scene, params, progress, 0.0, 1.0))?;
-        progress.check()?;
-        Ok(map)
+        scene.device().run(progress, || Self::trace_within(scene, params, progress, 0.0, 1.0))
     }
 
     /// The same as a part of a longer call: reports progress over `[from, to]` of the bar.
@@ -321,8 +319,7 @@ impl PhotonMap {
                 self.estimate_block(positions, normals, out);
                 stage.advance(positions.len() as u64)
             })
-        })?;
-        progress.check()
+        })
     }
 
     /// [`estimate`](Self::estimate) for as many points as all three slices have, on this thread.

@@ -142,7 +142,7 @@ impl Scene {
         // The build only reads `data`, and what it has made of it is gone with a panic.
         let build = AssertUnwindSafe(|| device.run(progress, || Self::build(device, &data, options, progress)));
         let built = catch_unwind(build).unwrap_or_else(|payload| Err(Error::of_panic(payload)));
-        match built.and_then(|parts| progress.check().map(|()| parts)) {
+        match built {
             Ok(parts) => {
                 let scene = Arc::new(parts.into_scene(device.clone(), data));
                 scene.warn_of_few_digits();

@@ -87,7 +87,7 @@ impl Lightmap {
             records::append(&mut out, DONE, &[]);
             write(&mut out, 0)
         };
-        self.atlas.scene.device().run(progress, || files::replace(path, write_file))
+        self.atlas.scene.device().run(progress, || files::prepare(path, write_file))?.finish()
     }
 
     /// Takes over the light of a result that was saved of a light map of the same scene, lights and layout. What was
@@ -103,8 +103,6 @@ impl Lightmap {
             Ok((light, plan, stitch))
         })?;
         let all = 0..self.atlas.map.len();
-        // The last moment at which nothing has changed.
-        progress.check()?;
         self.plan = plan;
         device.install(|| self.store(light, all, stitch));
         Ok(())
