@@ -332,7 +332,7 @@ static bk_lightmap *baked(bk_device *device, float sun) {
     bk_mesh_desc mesh;
     bk_light_desc light;
     bk_lightmap *lightmap;
-    bk_texture_init(&texture);
+    bk_texture_desc_init(&texture);
     texture.width = texture.height = 2;
     texture.data = texels;
     bk_material_desc_init(&material);

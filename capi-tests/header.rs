@@ -13,9 +13,6 @@ use std::path::Path;
 const SECTIONS: [&str; 12] =
     ["error", "device", "scene", "textures", "meshes", "lights", "rays", "photons", "lightmap", "bake", "read", "live"];
 
-/// Structures that share their name with a function, so that C allows no typedef for them.
-const TAG_ONLY: [&str; 2] = ["bk_scene_stats", "bk_lightmap_info"];
-
 const HEAD: &str = "\
 /*
  * Bakelite: SIMD light-baking kernels.
@@ -75,11 +72,7 @@ fn section(source: &Path) -> String {
     let mut out = Vec::new();
     let bindings = Builder::new().with_config(config()).with_src(source).generate();
     bindings.unwrap_or_else(|e| panic!("{}: {e}", source.display())).write(&mut out);
-    let mut items = String::from_utf8(out).expect("cbindgen writes UTF-8");
-    for name in TAG_ONLY {
-        items = items.replace(&format!("typedef struct {name} {{"), &format!("struct {name} {{"));
-        items = items.replace(&format!("}} {name};"), "};");
-    }
+    let items = String::from_utf8(out).expect("cbindgen writes UTF-8");
     format!("\n{}\n{}", heading(source), tidy(&items))
 }
 
@@ -103,14 +96,8 @@ fn tidy(items: &str) -> String {
             }
             continue;
         }
-        let definition = line.starts_with("typedef struct") || line.starts_with("struct");
-        let mut line = if definition { line.to_string() } else { line.replace("struct bk_", "bk_") };
-        if !definition {
-            for name in TAG_ONLY {
-                line = line.replace(&format!("{name} *"), &format!("struct {name} *"));
-            }
-        }
-        out += &line;
+        let definition = line.starts_with("typedef struct");
+        out += &if definition { line.to_string() } else { line.replace("struct bk_", "bk_") };
         out.push('\n');
     }
     out

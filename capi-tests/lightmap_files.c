@@ -210,7 +210,7 @@ static void shards_come_back_as_one_bake(bk_device *device, const char *folder) 
     bk_lightmap *whole = lightmap_of(scene, 2), *shard = lightmap_of(scene, 2), *all = lightmap_of(scene, 2);
     bk_lightmap *other = lightmap_of(darker, 2);
     bk_bake_params params = quick();
-    struct bk_lightmap_info info;
+    bk_lightmap_info info;
     char path[2][1024];
     FILE *file;
     int i;
@@ -218,7 +218,7 @@ static void shards_come_back_as_one_bake(bk_device *device, const char *folder) 
     CHECK_ERROR(bk_lightmap_save_result(all, "x", NULL, NULL), BK_ERROR_INVALID_STATE, "baked");
     CHECK_OK(bk_bake(whole, &params, NULL, NULL, NULL));
     bk_lightmap_info_init(&info);
-    CHECK_OK(bk_lightmap_info(whole, &info));
+    CHECK_OK(bk_lightmap_get_info(whole, &info));
     for (i = 0; i < 2; i++) {
         snprintf(path[i], sizeof path[i], "%sshard%d", folder, i);
         params.texel_begin = i == 0 ? 0 : info.texels / 3;

@@ -123,9 +123,9 @@ static bk_camera camera_at(int i) {
 }
 
 static uint32_t page_count(bk_lightmap *lightmap) {
-    struct bk_lightmap_info info;
+    bk_lightmap_info info;
     bk_lightmap_info_init(&info);
-    CHECK_OK(bk_lightmap_info(lightmap, &info));
+    CHECK_OK(bk_lightmap_get_info(lightmap, &info));
     return info.page_count;
 }
 

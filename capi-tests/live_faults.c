@@ -290,7 +290,7 @@ static void rectangles_lie_on_their_page(void) {
     bk_light_desc light;
     bk_mesh_desc mesh;
     bk_lightmap_desc desc;
-    struct bk_lightmap_info info;
+    bk_lightmap_info info;
     bk_live_params params;
     bk_camera camera;
     bk_budget budget;
@@ -323,7 +323,7 @@ static void rectangles_lie_on_their_page(void) {
         desc.both_sides = both;
         CHECK_OK(bk_lightmap_create(scene, &desc, NULL, NULL, &lightmap));
         bk_lightmap_info_init(&info);
-        CHECK_OK(bk_lightmap_info(lightmap, &info));
+        CHECK_OK(bk_lightmap_get_info(lightmap, &info));
         bk_live_params_init(&params);
         params.mode = BK_LIVE_POSITION;
         params.photon_count = 300;

@@ -43,7 +43,7 @@ static uint32_t add_texture(bk_scene *scene, uint32_t height) {
     };
     uint32_t id = BK_NONE;
     bk_texture_desc texture;
-    bk_texture_init(&texture);
+    bk_texture_desc_init(&texture);
     CHECK(texture.struct_size == sizeof texture && texture.format == BK_TEXTURE_RGBA8_SRGB);
     texture.width = 2;
     texture.height = height;

@@ -67,16 +67,16 @@ static float height(const bk_scene *scene) {
     return hit.t;
 }
 
-static struct bk_scene_stats stats_of(const bk_scene *scene) {
-    struct bk_scene_stats stats;
+static bk_scene_stats stats_of(const bk_scene *scene) {
+    bk_scene_stats stats;
     bk_scene_stats_init(&stats);
-    CHECK_OK(bk_scene_stats(scene, &stats));
+    CHECK_OK(bk_scene_get_stats(scene, &stats));
     return stats;
 }
 
 static void test_use(bk_device *device) {
     bk_scene *scene = committed_scene(device, 0);
-    struct bk_scene_stats before = stats_of(scene), after;
+    bk_scene_stats before = stats_of(scene), after;
     struct { float position[3], other[2]; } vertices[4];
     float ceiling[4][3], lower[3], upper[3];
     bk_mesh_view view;
@@ -101,7 +101,7 @@ static void test_use(bk_device *device) {
     CHECK_OK(bk_scene_bounds(scene, lower, upper));
     CHECK(lower[2] == 0.0f && upper[2] == 3.125f);
     bk_mesh_view_init(&view);
-    CHECK_OK(bk_scene_mesh_geometry(scene, 1, &view));
+    CHECK_OK(bk_scene_get_mesh(scene, 1, &view));
     CHECK(view.vertex_count == 4 && view.positions[2] == 3.125f);
     after = stats_of(scene);
     CHECK(after.refits == 1 && after.sah_cost == before.sah_cost && after.refit_seconds > 0.0);

@@ -119,7 +119,7 @@ static uint64_t bits(unsigned at_creation, unsigned at_calls) {
     bk_photon_map *map = NULL;
     bk_photon_params photons;
     bk_bake_params params;
-    struct bk_lightmap_info info;
+    bk_lightmap_info info;
     bk_hit hit;
     uint32_t page;
     _mm_setcsr(at_creation);
@@ -157,7 +157,7 @@ static uint64_t bits(unsigned at_creation, unsigned at_calls) {
     CHECK_OK(bk_bake(lightmap, &params, look_at_state, NULL, NULL));
     check_state("bk_bake");
     bk_lightmap_info_init(&info);
-    CHECK_OK(bk_lightmap_info(lightmap, &info));
+    CHECK_OK(bk_lightmap_get_info(lightmap, &info));
     for (page = 0; page < info.page_count; page++) {
         CHECK_OK(bk_lightmap_read(lightmap, page, BK_LAYER_COMBINED, BK_FORMAT_RGB32F, texels, 0));
         sum = hash(sum, texels, sizeof texels);
@@ -332,7 +332,7 @@ static void all_handles_can_be_released_in_a_callback(void) {
                                               &more));
             } else {
                 bk_photon_view_init(&view);
-                CHECK_OK(bk_photon_map_photons(handles.photons, &view));
+                CHECK_OK(bk_photon_map_get_photons(handles.photons, &view));
             }
             bk_photon_map_release(more);
             handles.is_over = 1;

@@ -39,7 +39,7 @@ int main(int argc, char **argv) {
 
         bk_mesh_view view;
         bk_mesh_view_init(&view);
-        CHECK_OK(bk_scene_mesh_geometry(scene, 0, &view));
+        CHECK_OK(bk_scene_get_mesh(scene, 0, &view));
         float *moved = (float *)malloc(3 * sizeof(float) * view.vertex_count);
         memcpy(moved, view.positions, 3 * sizeof(float) * view.vertex_count);
         moved[1] += 0.01f;
@@ -62,7 +62,7 @@ int main(int argc, char **argv) {
         bk_photon_view stored;
         bk_photon_view_init(&stored);
         CHECK_OK(bk_photon_map_create(scene, &photons, progress, &reports, &map));
-        CHECK_OK(bk_photon_map_photons(map, &stored));
+        CHECK_OK(bk_photon_map_get_photons(map, &stored));
         bk_photon_map_release(map);
 
         bk_lightmap_desc layout;

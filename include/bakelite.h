@@ -169,8 +169,6 @@ typedef struct bk_device_desc {
   uint32_t num_threads;
   // One of the BK_ISA values. Default: BK_ISA_AUTO.
   uint32_t isa;
-  // None are defined yet: 0.
-  uint32_t flags;
   // Receives log messages. Default: NULL.
   bk_log_fn log;
   // Asked before large allocations. Default: NULL.
@@ -312,7 +310,7 @@ typedef struct bk_build_params {
 } bk_build_params;
 
 // Numbers about a committed scene.
-struct bk_scene_stats {
+typedef struct bk_scene_stats {
   // Size of this structure in bytes, set by bk_scene_stats_init.
   uint32_t struct_size;
   // Surface area heuristic cost of the binary tree, traversal and intersection costing 1 each, at
@@ -337,7 +335,7 @@ struct bk_scene_stats {
   uint32_t refits;
   // Time of the last of these, in seconds; 0 if there was none.
   double refit_seconds;
-};
+} bk_scene_stats;
 
 // Creates an empty scene.
 //
@@ -416,7 +414,7 @@ BK_API bk_result bk_scene_commit(bk_scene *scene, bk_progress_fn progress, void 
 // Triangles that become degenerate or not finite are not hit while they are; those that were so at
 // the commit stay out for good. Light maps, photon maps and live objects that were made before keep
 // the geometry that they were made of (the scene is copied then, else changed in place) and go on
-// following the scene's lights. Pointers from bk_scene_mesh_geometry become invalid.
+// following the scene's lights. Pointers from bk_scene_get_mesh become invalid.
 //
 // Fails with BK_ERROR_INVALID_STATE if the scene is not committed, if no triangle would be left that
 // can be hit, or if another thread queries or changes the scene; with BK_ERROR_OUT_OF_MEMORY if the
@@ -424,11 +422,10 @@ BK_API bk_result bk_scene_commit(bk_scene *scene, bk_progress_fn progress, void 
 BK_API bk_result bk_scene_refit(bk_scene *scene);
 
 // Sets struct_size and clears the rest.
-BK_API void bk_scene_stats_init(struct bk_scene_stats *stats);
+BK_API void bk_scene_stats_init(bk_scene_stats *stats);
 
-// Numbers about a committed scene. (The structure shares the function's name, so it is always
-// written with `struct`.)
-BK_API bk_result bk_scene_stats(const bk_scene *scene, struct bk_scene_stats *out);
+// Numbers about a committed scene.
+BK_API bk_result bk_scene_get_stats(const bk_scene *scene, bk_scene_stats *out);
 
 // The bounding box of all valid triangles of a committed scene.
 BK_API bk_result bk_scene_bounds(const bk_scene *scene, float lower[3], float upper[3]);
@@ -456,7 +453,7 @@ BK_API bk_result bk_scene_bounds(const bk_scene *scene, float lower[3], float up
 
 // An image. The texels are copied.
 typedef struct bk_texture_desc {
-  // Size of this structure in bytes, set by bk_texture_init.
+  // Size of this structure in bytes, set by bk_texture_desc_init.
   uint32_t struct_size;
   // One of BK_TEXTURE. Default: BK_TEXTURE_RGBA8_SRGB.
   uint32_t format;
@@ -471,7 +468,7 @@ typedef struct bk_texture_desc {
 } bk_texture_desc;
 
 // Fills in the defaults.
-BK_API void bk_texture_init(bk_texture_desc *desc);
+BK_API void bk_texture_desc_init(bk_texture_desc *desc);
 
 // Adds a texture.
 //
@@ -495,6 +492,18 @@ BK_API
 bk_result bk_scene_add_environment(bk_scene *scene,
                                    const bk_texture_desc *desc,
                                    uint32_t *out_id);
+
+// The number of textures, committed or not; 0 on failure.
+BK_API uint32_t bk_scene_texture_count(const bk_scene *scene);
+
+// Shows a texture, without a copy.
+BK_API bk_result bk_scene_get_texture(const bk_scene *scene, uint32_t id, bk_texture_desc *out);
+
+// The number of environments, committed or not; 0 on failure.
+BK_API uint32_t bk_scene_environment_count(const bk_scene *scene);
+
+// Shows an environment, without a copy.
+BK_API bk_result bk_scene_get_environment(const bk_scene *scene, uint32_t id, bk_texture_desc *out);
 
 /* ================================================================================================
  * Materials and meshes
@@ -572,16 +581,14 @@ typedef struct bk_mesh_desc {
   const uint32_t *triangle_materials;
   // Material number of all triangles if triangle_materials is NULL. Default: 0.
   uint32_t material;
-  // Not used yet: 0.
-  uint32_t reserved;
 } bk_mesh_desc;
 
 // The triangles of a mesh.
 typedef struct bk_mesh_view {
   // Size of this structure in bytes, set by bk_mesh_view_init.
   uint32_t struct_size;
-  // Not used yet.
-  uint32_t reserved;
+  // Material number of all triangles if triangle_materials is NULL, else BK_NONE.
+  uint32_t material;
   // vertex_count positions of three floats, packed.
   const float *positions;
   // Number of vertices.
@@ -590,6 +597,16 @@ typedef struct bk_mesh_view {
   const uint32_t *indices;
   // Number of triangles, degenerate ones included.
   size_t triangle_count;
+  // vertex_count shading normals of three floats, packed; NULL if the mesh has none.
+  const float *normals;
+  // vertex_count texture coordinates of two floats, packed; NULL if the mesh has none.
+  const float *uvs;
+  // vertex_count light map coordinates of two floats, packed, as the caller gave them; NULL if the mesh has none.
+  const float *lightmap_uvs;
+  // Light map page per triangle, packed, as the caller gave them; NULL if all are on page 0.
+  const uint32_t *lightmap_page;
+  // Material number per triangle, packed; NULL if all have `material`.
+  const uint32_t *triangle_materials;
 } bk_mesh_view;
 
 // Fills in the defaults.
@@ -603,6 +620,12 @@ BK_API
 bk_result bk_scene_add_material(bk_scene *scene,
                                 const bk_material_desc *desc,
                                 uint32_t *out_id);
+
+// The number of materials, committed or not; 0 on failure.
+BK_API uint32_t bk_scene_material_count(const bk_scene *scene);
+
+// Fetches a material, committed or not.
+BK_API bk_result bk_scene_get_material(const bk_scene *scene, uint32_t id, bk_material_desc *out);
 
 // Fills in the defaults.
 BK_API void bk_mesh_desc_init(bk_mesh_desc *desc);
@@ -643,7 +666,7 @@ BK_API void bk_mesh_view_init(bk_mesh_view *view);
 // Shows the triangles of a mesh of a committed scene, without a copy.
 //
 // out: receives pointers that are valid while the scene lives, until the next bk_scene_refit.
-BK_API bk_result bk_scene_mesh_geometry(const bk_scene *scene, uint32_t mesh, bk_mesh_view *out);
+BK_API bk_result bk_scene_get_mesh(const bk_scene *scene, uint32_t mesh, bk_mesh_view *out);
 
 /* ================================================================================================
  * Lights
@@ -720,6 +743,9 @@ BK_API bk_result bk_scene_add_light(bk_scene *scene, const bk_light_desc *desc, 
 // told by bk_live_light_changed.
 BK_API bk_result bk_scene_set_light(bk_scene *scene, uint32_t id, const bk_light_desc *desc);
 
+// Fetches a light, committed or not.
+BK_API bk_result bk_scene_get_light(const bk_scene *scene, uint32_t id, bk_light_desc *out);
+
 // The number of lights (emissive materials not counted), committed or not; 0 on failure.
 BK_API uint32_t bk_scene_light_count(const bk_scene *scene);
 
@@ -733,12 +759,8 @@ BK_API uint32_t bk_scene_light_count(const bk_scene *scene);
  * nothing.
  * ================================================================================================ */
 
-// Flag: neighbouring rays are alike (a camera's, a tile's); they may be traced together. Results
-// do not depend on it.
-#define BK_RAYS_COHERENT 1
-
 // Flag: spread the rays over the device's threads. Without it the calling thread does the work.
-#define BK_RAYS_PARALLEL 2
+#define BK_RAYS_PARALLEL 1
 
 // The points origin + t direction with tmin < t <= tmax.
 typedef struct bk_ray {
@@ -775,7 +797,7 @@ BK_API int32_t bk_occluded(const bk_scene *scene, const bk_ray *ray);
 // nearly the same way, as those of a pinhole camera do in small square tiles of pixels; the hits are
 // the same, bit for bit, in any order of rays.
 //
-// rays: count rays, aligned to 4 bytes. flags: BK_RAYS_COHERENT, BK_RAYS_PARALLEL. out: receives
+// rays: count rays, aligned to 4 bytes. flags: 0 or BK_RAYS_PARALLEL. out: receives
 // count hits in the order of the rays; must not overlap them.
 BK_API
 bk_result bk_intersect_many(const bk_scene *scene,
@@ -786,7 +808,7 @@ bk_result bk_intersect_many(const bk_scene *scene,
 
 // Whether anything lies on each of many rays.
 //
-// rays: count rays, aligned to 4 bytes. flags: BK_RAYS_COHERENT, BK_RAYS_PARALLEL. out: receives
+// rays: count rays, aligned to 4 bytes. flags: 0 or BK_RAYS_PARALLEL. out: receives
 // count bytes, 1 or 0, in the order of the rays; must not overlap them.
 BK_API
 bk_result bk_occluded_many(const bk_scene *scene,
@@ -919,7 +941,7 @@ BK_API void bk_photon_view_init(bk_photon_view *view);
 //
 // Fails with BK_ERROR_OUT_OF_MEMORY if the memory callback refuses the packed copy that the first
 // call makes.
-BK_API bk_result bk_photon_map_photons(const bk_photon_map *map, bk_photon_view *out);
+BK_API bk_result bk_photon_map_get_photons(const bk_photon_map *map, bk_photon_view *out);
 
 /* ================================================================================================
  * Light maps
@@ -962,7 +984,7 @@ typedef struct bk_lightmap_desc {
 } bk_lightmap_desc;
 
 // Numbers about a light map's layout.
-struct bk_lightmap_info {
+typedef struct bk_lightmap_info {
   // Size of this structure in bytes, set by bk_lightmap_info_init.
   uint32_t struct_size;
   // Number of pages.
@@ -979,6 +1001,10 @@ struct bk_lightmap_info {
   uint32_t unwrapped_charts;
   // Of those, reduced in density to fit a page.
   uint32_t reduced_charts;
+  // Of charts, those with a second place for their backs; see both_sides of bk_lightmap_desc.
+  uint32_t both_sided_charts;
+  // Texels per scene unit in use.
+  float texels_per_unit;
   // Texels that a triangle covers: the range of texel_begin and texel_end of a bake.
   uint64_t texels;
   // Texels of the gather map.
@@ -995,15 +1021,9 @@ struct bk_lightmap_info {
   uint64_t uv_overlapping_texels;
   // Time of unwrapping, in seconds.
   double unwrap_seconds;
-  // Texels per scene unit in use.
-  float texels_per_unit;
-  // Not used yet.
-  uint32_t reserved;
-  // Of charts, those with a second place for their backs; see both_sides of bk_lightmap_desc.
-  uint64_t both_sided_charts;
   // Of texels, those of the second places: the last so many.
   uint64_t back_texels;
-};
+} bk_lightmap_info;
 
 // Fills in the defaults.
 BK_API void bk_lightmap_desc_init(bk_lightmap_desc *desc);
@@ -1035,11 +1055,10 @@ BK_API void bk_lightmap_retain(bk_lightmap *lightmap);
 BK_API void bk_lightmap_release(bk_lightmap *lightmap);
 
 // Sets struct_size and clears the rest.
-BK_API void bk_lightmap_info_init(struct bk_lightmap_info *info);
+BK_API void bk_lightmap_info_init(bk_lightmap_info *info);
 
-// Numbers about the layout. (The structure shares the function's name, so it is always written
-// with `struct`.)
-BK_API bk_result bk_lightmap_info(const bk_lightmap *lightmap, struct bk_lightmap_info *out);
+// Numbers about the layout.
+BK_API bk_result bk_lightmap_get_info(const bk_lightmap *lightmap, bk_lightmap_info *out);
 
 // Where the triangles of a mesh lie in the light map.
 //
@@ -1111,21 +1130,21 @@ bk_result bk_lightmap_mesh_back_uvs(const bk_lightmap *lightmap,
 #define BK_LEFT_OUT_TRANSMISSION 1024
 
 // Bit of left_out. No light from a sky.
-#define BK_LEFT_OUT_SKY 4096
+#define BK_LEFT_OUT_SKY 2048
 
 // Bit of left_out. No directional light with an angular_radius.
-#define BK_LEFT_OUT_SUN_DISC 8192
+#define BK_LEFT_OUT_SUN_DISC 4096
 
 // Bit of left_out. No choice among many lights: at most 64 point and spot lights, each of which gets a
 // shadow ray, and at most 64 rect lights and emissive triangles. More of either are sampled, with up to 4
 // direct_samples shadow rays for all.
-#define BK_LEFT_OUT_MANY_LIGHTS 16384
+#define BK_LEFT_OUT_MANY_LIGHTS 8192
 
 // Bit of left_out. No stitching of seams.
-#define BK_LEFT_OUT_SEAMS 65536
+#define BK_LEFT_OUT_SEAMS 16384
 
 // Bit of left_out. No bright patches of surfaces as lights: gather rays find most of what is bright.
-#define BK_LEFT_OUT_BRIGHT_PATCHES 131072
+#define BK_LEFT_OUT_BRIGHT_PATCHES 32768
 
 // How to bake.
 typedef struct bk_bake_params {

@@ -38,9 +38,9 @@ CommitTimes time_commits(const Scene &s, const Setup &setup, Mode mode, unsigned
 OurTree our_tree(const Scene &s, uint32_t quality) {
     bk_scene *const scene = our_scene(s.device, s, quality);
     check(bk_scene_commit(scene, nullptr, nullptr));
-    struct bk_scene_stats stats;
+    bk_scene_stats stats;
     bk_scene_stats_init(&stats);
-    check(bk_scene_stats(scene, &stats));
+    check(bk_scene_get_stats(scene, &stats));
     bk_scene_release(scene);
     return {{double(stats.bvh_bytes), double(stats.bytes)}, double(stats.wide_sah_cost)};
 }

@@ -266,7 +266,7 @@ void primary(Kind &k, const Scene &s, size_t count, Random &random) {
     camera_rays(k.rays, best_eye, best_toward, side);
     k.rays.finish();
     k.ours = [&k, &s](size_t begin, size_t end) {
-        check(bk_intersect_many(s.scene, &k.rays.rays[begin], end - begin, BK_RAYS_COHERENT, &k.hits[begin]));
+        check(bk_intersect_many(s.scene, &k.rays.rays[begin], end - begin, 0, &k.hits[begin]));
     };
     k.ways = {intersect1(k.rays), intersect16(k.rays, true), intersect_stream(k.rays, STREAM, true)};
 }

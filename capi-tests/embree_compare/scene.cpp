@@ -117,7 +117,7 @@ Scene::Scene(const std::string &name, const Setup &setup) {
     check(bk_scene_set_build(scene, &params));
     check(bk_scene_commit(scene, nullptr, nullptr));
     bk_scene_stats_init(&stats);
-    check(bk_scene_stats(scene, &stats));
+    check(bk_scene_get_stats(scene, &stats));
 
     float lower[3], upper[3];
     check(bk_scene_bounds(scene, lower, upper));
@@ -127,7 +127,7 @@ Scene::Scene(const std::string &name, const Setup &setup) {
     for (uint32_t m = 0; m < bk_scene_mesh_count(scene); m++) {
         bk_mesh_view view;
         bk_mesh_view_init(&view);
-        check(bk_scene_mesh_geometry(scene, m, &view));
+        check(bk_scene_get_mesh(scene, m, &view));
         meshes.push_back(view);
         for (uint32_t t = 0; t < view.triangle_count; t++) {
             const Vec3d a = load(vertex(m, t, 0)), b = load(vertex(m, t, 1)), c = load(vertex(m, t, 2));

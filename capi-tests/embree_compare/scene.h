@@ -29,7 +29,7 @@ struct Scene {
     std::vector<bk_mesh_view> meshes;
     std::vector<std::pair<uint32_t, uint32_t>> triangles; // (mesh, triangle) of those with an area
     std::vector<double> area_sums;
-    struct bk_scene_stats stats;
+    bk_scene_stats stats;
     Vec3d center{};
     double diagonal = 0;
 

@@ -82,7 +82,6 @@ pub fn create_device(w: &W, s: &mut Source) {
         n => 1 + n as u32 % 3,
     };
     desc.isa = if s.one_in(6) { s.integer() } else { s.below(4) as u32 };
-    desc.flags = if s.one_in(20) { s.integer() } else { 0 };
     desc.struct_size = if s.one_in(20) { s.integer() } else { desc.struct_size };
     desc.log = s.one_in(2).then_some(log);
     desc.memory = Some(memory);
@@ -303,7 +302,7 @@ fn add_mesh(scene: &Handle, s: &mut Source, hostile: bool) -> bk_result {
 fn image(w: &W, s: &mut Source) {
     let Some(scene) = scene(w, s) else { return };
     let texels: Vec<f32> = (0..3 * 64).map(|_| if s.one_in(300) { s.float() } else { s.unit() }).collect();
-    let mut desc = defaults!(bk_texture_desc, bk_texture_init);
+    let mut desc = defaults!(bk_texture_desc, bk_texture_desc_init);
     desc.format = if s.one_in(8) { s.integer() } else { s.below(2) as u32 };
     (desc.width, desc.height) = (1 + s.below(8) as u32, 1 + s.below(8) as u32);
     desc.data = texels.as_ptr().cast();
@@ -381,7 +380,7 @@ fn refit(w: &W, s: &mut Source) {
 fn scene_numbers(w: &W, s: &mut Source) {
     let Some(scene) = scene(w, s) else { return };
     let mut stats = defaults!(bk_scene_stats, bk_scene_stats_init);
-    if ask!(bk_scene_stats(scene.p(), &mut stats)) == BK_OK && stats.skipped_degenerate > stats.triangles {
+    if ask!(bk_scene_get_stats(scene.p(), &mut stats)) == BK_OK && stats.skipped_degenerate > stats.triangles {
         broken("more triangles are skipped than there are");
     }
     let (mut lower, mut upper) = ([0f32; 3], [0f32; 3]);
@@ -393,13 +392,45 @@ fn scene_numbers(w: &W, s: &mut Source) {
     let mesh = if s.one_in(4) { s.index() } else { s.below(count as usize) as u32 };
     let mut view = defaults!(bk_mesh_view, bk_mesh_view_init);
     // Another thread may move the triangles, which ends the life of the pointers.
-    if ask!(bk_scene_mesh_geometry(scene.p(), mesh, &mut view)) == BK_OK && w.is_alone && !view.indices.is_null() {
+    if ask!(bk_scene_get_mesh(scene.p(), mesh, &mut view)) == BK_OK && w.is_alone && !view.indices.is_null() {
         // SAFETY: valid until the next refit.
         let indices = unsafe { std::slice::from_raw_parts(view.indices, 3 * view.triangle_count) };
         if indices.iter().any(|&i| i as usize >= view.vertex_count) {
             broken("a mesh has a vertex that it has not");
         }
     }
+    // As many of each as there are, or one behind them.
+    let one_of = |count: u32, s: &mut Source| if s.one_in(4) { s.index() } else { s.below(count as usize) as u32 };
+    let id = one_of(bk!(bk_scene_material_count(scene.p())), s);
+    let mut material = defaults!(bk_material_desc, bk_material_desc_init);
+    if ask!(bk_scene_get_material(scene.p(), id, &mut material)) == BK_OK && !(0.0..=1.0).contains(&material.albedo[0])
+    {
+        broken("a material reflects more than there is");
+    }
+    let id = one_of(bk!(bk_scene_light_count(scene.p())), s);
+    let mut light = defaults!(bk_light_desc, bk_light_desc_init);
+    if ask!(bk_scene_get_light(scene.p(), id, &mut light)) == BK_OK && !(1..=5).contains(&light.r#type) {
+        broken("a light has no type");
+    }
+    let mut image = defaults!(bk_texture_desc, bk_texture_desc_init);
+    let id = one_of(bk!(bk_scene_texture_count(scene.p())), s);
+    if ask!(bk_scene_get_texture(scene.p(), id, &mut image)) == BK_OK {
+        // SAFETY: valid while the scene lives, which is held.
+        let texels = unsafe { std::slice::from_raw_parts(image.data.cast::<u8>(), image_bytes(&image, 4)) };
+        std::hint::black_box(texels.iter().fold(0, |a, b| a ^ b));
+    }
+    let id = one_of(bk!(bk_scene_environment_count(scene.p())), s);
+    if ask!(bk_scene_get_environment(scene.p(), id, &mut image)) == BK_OK {
+        // SAFETY: as above; three floats per texel.
+        let texels = unsafe { std::slice::from_raw_parts(image.data.cast::<f32>(), image_bytes(&image, 12) / 4) };
+        if texels.iter().any(|t| !(*t >= 0.0 && t.is_finite())) {
+            broken("a sky has light that is none");
+        }
+    }
+}
+
+fn image_bytes(image: &bk_texture_desc, per_texel: usize) -> usize {
+    image.width as usize * image.height as usize * per_texel
 }
 
 fn ray(s: &mut Source) -> bk_ray {
@@ -452,7 +483,7 @@ fn rays(w: &W, s: &mut Source) {
                 (0..n).map(|_| if kind < 6 { bk_ray { origin: one.origin, ..ray(s) } } else { ray(s) }).collect();
             let mut hits = vec![hit; n];
             let mut shadows = vec![7u8; n];
-            let flags = if s.one_in(10) { s.integer() } else { s.below(4) as u32 };
+            let flags = if s.one_in(10) { s.integer() } else { s.below(2) as u32 };
             let result = ask!(bk_intersect_many(scene.p(), rays.as_ptr(), n, flags, hits.as_mut_ptr()));
             if result == BK_OK {
                 rays.iter().zip(&hits).for_each(|(r, h)| check_hit(r, h, meshes));
@@ -470,7 +501,7 @@ fn rays(w: &W, s: &mut Source) {
             }
             let directions: Vec<[f32; 3]> = rays.iter().map(|r| r.direction).collect();
             let (directions, out) = (directions.as_ptr().cast(), hits.as_mut_ptr());
-            ask!(bk_gather(scene.p(), one.origin.as_ptr(), directions, n, one.tmax, flags & 2, out));
+            ask!(bk_gather(scene.p(), one.origin.as_ptr(), directions, n, one.tmax, flags, out));
             // Sizes that no memory has, arrays that overlap.
             ask!(bk_intersect_many(scene.p(), rays.as_ptr(), usize::MAX, 0, out));
             ask!(bk_occluded_many(scene.p(), null(), 1 + n, 0, shadows.as_mut_ptr()));
@@ -510,10 +541,10 @@ fn photon_numbers(w: &W, s: &mut Source) {
         }
     }
     let mut view = defaults!(bk_photon_view, bk_photon_view_init);
-    if ask!(bk_photon_map_photons(map.p(), &mut view)) == BK_OK && view.count > 0 {
+    if ask!(bk_photon_map_get_photons(map.p(), &mut view)) == BK_OK && view.count > 0 {
         // SAFETY: valid while the map lives.
         let power = unsafe { std::slice::from_raw_parts(view.power, 3 * view.count) };
-        check_light("bk_photon_map_photons", power);
+        check_light("bk_photon_map_get_photons", power);
     }
 }
 
@@ -524,7 +555,7 @@ fn lightmap(w: &W, s: &mut Source) {
     desc.texels_per_unit = if s.one_in(4) { 0.0 } else { 1.0 + 5.0 * s.unit() };
     desc.padding = 1 + s.below(3) as u32;
     (desc.gather_divisor, desc.radiance_divisor) = (1 + s.below(4) as u32, 1 + s.below(4) as u32);
-    desc.both_sides = s.below(2) as u32;
+    desc.both_sides = if s.one_in(20) { s.integer() } else { s.below(2) as u32 };
     s.mutate(&mut desc);
     if (129..=16_384).contains(&desc.page_size) {
         desc.page_size = 128;
@@ -541,7 +572,7 @@ fn lightmap(w: &W, s: &mut Source) {
 
 fn info(lightmap: &Handle) -> Option<bk_lightmap_info> {
     let mut info = defaults!(bk_lightmap_info, bk_lightmap_info_init);
-    (ask!(bk_lightmap_info(lightmap.p(), &mut info)) == BK_OK).then_some(info)
+    (ask!(bk_lightmap_get_info(lightmap.p(), &mut info)) == BK_OK).then_some(info)
 }
 
 fn lightmap_numbers(w: &W, s: &mut Source) {
@@ -578,7 +609,7 @@ fn bake_params(w: &W, s: &mut Source) -> bk_bake_params {
     params.direct_samples = 1 + s.below(3) as u32;
     params.blur_radius = s.below(3) as u32;
     params.max_bounces = s.below(3) as u32;
-    params.stitch = s.below(2) as u32;
+    params.stitch = if s.one_in(20) { s.integer() } else { s.below(2) as u32 };
     params.seed = s.next();
     params
 }
@@ -891,7 +922,7 @@ fn null_handles(s: &mut Source) {
                 broken("no scene is hit");
             }
             failed(ask!(bk_photon_map_create(null(), null(), None, null_mut(), words.as_mut_ptr().cast())));
-            failed(ask!(bk_photon_map_photons(null(), null_mut())));
+            failed(ask!(bk_photon_map_get_photons(null(), null_mut())));
             failed(ask!(bk_photon_map_estimate(null(), null(), null(), 1, null_mut())));
         }
         _ => {

@@ -61,7 +61,7 @@ LiveLight::LiveLight(const Options &options, const Progress &progress) {
     check(bk_lightmap_create(scene.get(), &lightmap_desc, call_progress, user, &new_lightmap));
     lightmap.reset(new_lightmap);
     bk_lightmap_info_init(&pages);
-    check(bk_lightmap_info(lightmap.get(), &pages));
+    check(bk_lightmap_get_info(lightmap.get(), &pages));
 
     set_mode(options.mode, &progress);
     if (!is_lit()) warning = "no light in the scene: give some with --light";
@@ -140,7 +140,7 @@ bool LiveLight::is_lit() {
 bk_mesh_view LiveLight::geometry(uint32_t mesh) const {
     bk_mesh_view view;
     bk_mesh_view_init(&view);
-    check(bk_scene_mesh_geometry(scene.get(), mesh, &view));
+    check(bk_scene_get_mesh(scene.get(), mesh, &view));
     return view;
 }
 

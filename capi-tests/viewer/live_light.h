@@ -31,7 +31,7 @@ public:
     const std::vector<uint32_t> &triangle_materials(uint32_t mesh) const { return material_of[mesh]; }
 
     // ---- The light map ----
-    struct bk_lightmap_info pages;
+    bk_lightmap_info pages;
     // Where a mesh lies in it: two numbers per corner, and a page (or BK_NONE) per triangle.
     void layout(uint32_t mesh, std::vector<float> &corner_uvs, std::vector<uint32_t> &page) const;
     // The same for the backs of its triangles: those without a place of their own show the light of the front.

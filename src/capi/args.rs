@@ -9,28 +9,29 @@ use std::mem::size_of;
 /// A structure that starts with `uint32_t struct_size` and may grow at its end.
 ///
 /// # Safety
-/// `repr(C)`, starts with a `u32` that holds the size, has no padding that a later field could
-/// slip into (see [`sized_struct`]), and every bit pattern of it is valid.
+/// `repr(C)`, starts with a `u32` that holds the size, and every bit pattern of it is valid. It must not end in padding
+/// either, into which a later field could slip: `capi-tests/abi.py` checks that.
 pub(super) unsafe trait SizedStruct: Copy {
     const NAME: &'static str;
-    /// Its size in the first release that had it.
+    /// Its size in the first release that had it: the least that a caller may state.
     const FIRST_SIZE: usize;
     /// The defaults, with `struct_size` set.
     fn defaults() -> Self;
 }
 
-/// Implements [`SizedStruct`]; `last` is the last field of the first release, never to be changed.
+/// Implements [`SizedStruct`]. A structure that has grown since its first release states the last field which that release
+/// had, with its type: `sized_struct!(bk_x, last: field: u32, defaults: …)`.
 macro_rules! sized_struct {
-    ($name:ident, last: $last:ident: $type:ty, defaults: $defaults:expr) => {
-        // SAFETY: the size comes first; the assertions see to it that the first release had no
-        // padding at its end; fields are integers, floats, pointers and optional function pointers.
-        // (The last are only ever copied from a caller's structure of the same type.)
+    ($name:ident, $(last: $last:ident: $type:ty,)? defaults: $defaults:expr) => {
+        // SAFETY: the size comes first, as is asserted; fields are integers, floats, pointers and optional
+        // function pointers. (The last are only ever copied from a caller's structure of the same type.)
         unsafe impl $crate::capi::args::SizedStruct for $name {
             const NAME: &'static str = stringify!($name);
             const FIRST_SIZE: usize = {
-                let end = std::mem::offset_of!($name, $last) + size_of::<$type>();
-                assert!(std::mem::offset_of!($name, struct_size) == 0 && end.is_multiple_of(align_of::<$name>()));
-                end
+                assert!(std::mem::offset_of!($name, struct_size) == 0);
+                let first = size_of::<$name>();
+                $( let first = { let _ = first; std::mem::offset_of!($name, $last) + size_of::<$type>() }; )?
+                first
             };
             fn defaults() -> Self {
                 $defaults
@@ -270,6 +271,15 @@ pub(super) fn check_flags(flags: u32, known: u32, name: &str) -> Result<()> {
     match flags & !known {
         0 => Ok(()),
         unknown => invalid_argument!("{name} is {flags:#x}, of which {unknown:#x} is unknown"),
+    }
+}
+
+/// Reads a field that is 0 or 1.
+pub(super) fn read_bool(value: u32, name: &str) -> Result<bool> {
+    match value {
+        0 => Ok(false),
+        1 => Ok(true),
+        other => invalid_argument!("{name} is {other}, not 0 or 1"),
     }
 }
 

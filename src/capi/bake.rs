@@ -3,7 +3,7 @@
 //! A bake fills a light map with light: photons, radiance map, gather map (indirect light), direct
 //! light, composition, stitching of seams. What the scene does not need is not run.
 
-use super::args::{OutStruct, SizedStruct, init, read_struct, sized_struct, slice_mut, text};
+use super::args::{OutStruct, SizedStruct, init, read_bool, read_struct, sized_struct, slice_mut, text};
 use super::device::{bk_progress_fn, progress, refuse_in_callback};
 use super::error::{bk_result, call, call_or};
 use super::handles::{hold, object};
@@ -35,17 +35,17 @@ pub const BK_LEFT_OUT_CUTOUTS: u32 = 512;
 /// Bit of left_out. No light through surfaces.
 pub const BK_LEFT_OUT_TRANSMISSION: u32 = 1024;
 /// Bit of left_out. No light from a sky.
-pub const BK_LEFT_OUT_SKY: u32 = 4096;
+pub const BK_LEFT_OUT_SKY: u32 = 2048;
 /// Bit of left_out. No directional light with an angular_radius.
-pub const BK_LEFT_OUT_SUN_DISC: u32 = 8192;
+pub const BK_LEFT_OUT_SUN_DISC: u32 = 4096;
 /// Bit of left_out. No choice among many lights: at most 64 point and spot lights, each of which gets a
 /// shadow ray, and at most 64 rect lights and emissive triangles. More of either are sampled, with up to 4
 /// direct_samples shadow rays for all.
-pub const BK_LEFT_OUT_MANY_LIGHTS: u32 = 16384;
+pub const BK_LEFT_OUT_MANY_LIGHTS: u32 = 8192;
 /// Bit of left_out. No stitching of seams.
-pub const BK_LEFT_OUT_SEAMS: u32 = 65536;
+pub const BK_LEFT_OUT_SEAMS: u32 = 16384;
 /// Bit of left_out. No bright patches of surfaces as lights: gather rays find most of what is bright.
-pub const BK_LEFT_OUT_BRIGHT_PATCHES: u32 = 131072;
+pub const BK_LEFT_OUT_BRIGHT_PATCHES: u32 = 32768;
 
 // The numbers are literal for the header's sake.
 const _: () = assert!(
@@ -128,7 +128,7 @@ pub struct bk_bake_params {
     pub checkpoint: *const c_char,
 }
 
-sized_struct!(bk_bake_params, last: texel_end: u64, defaults: {
+sized_struct!(bk_bake_params, defaults: {
     let p = BakeParams::default();
     bk_bake_params {
         struct_size: size_of::<bk_bake_params>() as u32,
@@ -207,7 +207,7 @@ pub struct bk_bake_stats {
     pub seam_seconds: f64,
 }
 
-sized_struct!(bk_bake_stats, last: back_charts: u64, defaults: stats(&Default::default()));
+sized_struct!(bk_bake_stats, defaults: stats(&Default::default()));
 
 fn stats(s: &BakeStats) -> bk_bake_stats {
     let stage = |s: &StageStats| bk_stage_stats { seconds: s.seconds, rays: s.rays, bytes: s.bytes };
@@ -279,7 +279,7 @@ pub unsafe extern "C" fn bk_bake(
             memory_budget: p.memory_budget,
             texel_begin: p.texel_begin,
             texel_end: p.texel_end,
-            stitch: p.stitch != 0,
+            stitch: read_bool(p.stitch, "stitch")?,
         };
         let checkpoint = match p.checkpoint.is_null() {
             true => None,

@@ -28,7 +28,7 @@
 //! that is created in the child. An object that another thread is changing during the fork stays
 //! locked in the child: calls with it fail with BK_ERROR_INVALID_STATE too.
 
-use super::args::{UserPointer, check_flags, init, read_struct, sized_struct, text, write};
+use super::args::{UserPointer, init, read_struct, sized_struct, text, write};
 use super::error::{bk_result, c_string, call, call_or};
 use super::handles::{create, hold, object, release, retain};
 use crate::callback;
@@ -95,8 +95,6 @@ pub struct bk_device_desc {
     pub num_threads: u32,
     /// One of the BK_ISA values. Default: BK_ISA_AUTO.
     pub isa: u32,
-    /// None are defined yet: 0.
-    pub flags: u32,
     /// Receives log messages. Default: NULL.
     pub log: bk_log_fn,
     /// Asked before large allocations. Default: NULL.
@@ -105,11 +103,10 @@ pub struct bk_device_desc {
     pub user: *mut c_void,
 }
 
-sized_struct!(bk_device_desc, last: user: *mut c_void, defaults: bk_device_desc {
+sized_struct!(bk_device_desc, defaults: bk_device_desc {
     struct_size: size_of::<bk_device_desc>() as u32,
     num_threads: 0,
     isa: BK_ISA_AUTO,
-    flags: 0,
     log: None,
     memory: None,
     user: std::ptr::null_mut(),
@@ -173,7 +170,6 @@ pub unsafe extern "C" fn bk_device_num_threads(device: *const bk_device) -> u32 
 }
 
 fn options(desc: bk_device_desc) -> Result<DeviceOptions> {
-    check_flags(desc.flags, 0, "flags")?;
     let isa = match desc.isa {
         BK_ISA_AUTO => None,
         BK_ISA_PORTABLE => Some(Isa::Portable),

@@ -7,7 +7,7 @@
 //! One thread at a time may bake a light map; reads are safe from any threads. A read during a bake,
 //! or a second bake, fails with BK_ERROR_INVALID_STATE.
 
-use super::args::{OutStruct, SizedStruct, init, read_struct, sized_struct, slice_mut, write};
+use super::args::{OutStruct, SizedStruct, init, read_bool, read_struct, sized_struct, slice_mut, write};
 use super::device::{bk_progress_fn, progress, refuse_in_callback};
 use super::error::{bk_result, call, call_or};
 use super::handles::{create, hold, object, release, retain};
@@ -78,7 +78,7 @@ pub struct bk_lightmap_desc {
     pub both_sides: u32,
 }
 
-sized_struct!(bk_lightmap_desc, last: radiance_divisor: u32, defaults: {
+sized_struct!(bk_lightmap_desc, defaults: {
     let d = LightmapDesc::default();
     bk_lightmap_desc {
         struct_size: size_of::<bk_lightmap_desc>() as u32,
@@ -133,7 +133,7 @@ pub unsafe extern "C" fn bk_lightmap_create(
             padding: d.padding,
             gather_divisor: d.gather_divisor,
             radiance_divisor: d.radiance_divisor,
-            both_sides: d.both_sides != 0,
+            both_sides: read_bool(d.both_sides, "both_sides")?,
         };
         let lightmap = Lightmap::create(&scene, &desc, &self::progress(progress, user))?;
         write(out, create(bk_lightmap { lightmap: RwLock::new(lightmap) }), "out")
@@ -177,6 +177,10 @@ pub struct bk_lightmap_info {
     pub unwrapped_charts: u32,
     /// Of those, reduced in density to fit a page.
     pub reduced_charts: u32,
+    /// Of charts, those with a second place for their backs; see both_sides of bk_lightmap_desc.
+    pub both_sided_charts: u32,
+    /// Texels per scene unit in use.
+    pub texels_per_unit: f32,
     /// Texels that a triangle covers: the range of texel_begin and texel_end of a bake.
     pub texels: u64,
     /// Texels of the gather map.
@@ -193,17 +197,11 @@ pub struct bk_lightmap_info {
     pub uv_overlapping_texels: u64,
     /// Time of unwrapping, in seconds.
     pub unwrap_seconds: f64,
-    /// Texels per scene unit in use.
-    pub texels_per_unit: f32,
-    /// Not used yet.
-    pub reserved: u32,
-    /// Of charts, those with a second place for their backs; see both_sides of bk_lightmap_desc.
-    pub both_sided_charts: u64,
     /// Of texels, those of the second places: the last so many.
     pub back_texels: u64,
 }
 
-sized_struct!(bk_lightmap_info, last: reserved: u32, defaults: info(&Default::default()));
+sized_struct!(bk_lightmap_info, defaults: info(&Default::default()));
 
 fn info(i: &LightmapInfo) -> bk_lightmap_info {
     bk_lightmap_info {
@@ -215,6 +213,8 @@ fn info(i: &LightmapInfo) -> bk_lightmap_info {
         given_charts: i.uvs.given_charts,
         unwrapped_charts: i.uvs.unwrapped_charts,
         reduced_charts: i.uvs.reduced_charts,
+        both_sided_charts: i.both_sided_charts,
+        texels_per_unit: i.texels_per_unit,
         texels: i.texels,
         gather_texels: i.gather_texels,
         radiance_texels: i.radiance_texels,
@@ -223,9 +223,6 @@ fn info(i: &LightmapInfo) -> bk_lightmap_info {
         uv_degenerate: i.uvs.degenerate,
         uv_overlapping_texels: i.uvs.overlapping_texels,
         unwrap_seconds: i.unwrap_seconds,
-        texels_per_unit: i.texels_per_unit,
-        reserved: 0,
-        both_sided_charts: i.both_sided_charts.into(),
         back_texels: i.back_texels,
     }
 }
@@ -237,10 +234,9 @@ pub unsafe extern "C" fn bk_lightmap_info_init(info: *mut bk_lightmap_info) {
     unsafe { init(info) }
 }
 
-/// Numbers about the layout. (The structure shares the function's name, so it is always written
-/// with `struct`.)
+/// Numbers about the layout.
 #[unsafe(no_mangle)]
-pub unsafe extern "C" fn bk_lightmap_info(lightmap: *const bk_lightmap, out: *mut bk_lightmap_info) -> bk_result {
+pub unsafe extern "C" fn bk_lightmap_get_info(lightmap: *const bk_lightmap, out: *mut bk_lightmap_info) -> bk_result {
     call(|| {
         let lightmap = object!(lightmap);
         // SAFETY: out is the caller's, or NULL.

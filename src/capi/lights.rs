@@ -2,7 +2,7 @@
 //!
 //! Added to a scene before its commit, changed at any time. Emissive materials make lights too.
 
-use super::args::{init, read_struct, sized_struct, write_optional};
+use super::args::{OutStruct, SizedStruct, init, read_struct, sized_struct, write_optional};
 use super::error::{BK_NONE, bk_result, call, call_or};
 use super::handles::object;
 use super::scene::bk_scene;
@@ -63,7 +63,7 @@ pub struct bk_light_desc {
     pub rotation: f32,
 }
 
-sized_struct!(bk_light_desc, last: cone_outer: f32, defaults: bk_light_desc {
+sized_struct!(bk_light_desc, defaults: bk_light_desc {
     struct_size: size_of::<bk_light_desc>() as u32,
     r#type: BK_LIGHT_POINT,
     position: [0.0; 3],
@@ -145,6 +145,53 @@ fn light(d: &bk_light_desc) -> Result<Light> {
             rotation: d.rotation,
         }),
         other => invalid_argument!("type is {other}, not one of the BK_LIGHT values"),
+    }
+}
+
+/// Fetches a light, committed or not.
+#[unsafe(no_mangle)]
+pub unsafe extern "C" fn bk_scene_get_light(scene: *const bk_scene, id: u32, out: *mut bk_light_desc) -> bk_result {
+    call(|| {
+        let scene = object!(scene);
+        // SAFETY: out is the caller's, or NULL.
+        let out = unsafe { OutStruct::new(out, "out") }?;
+        out.write(light_desc(&scene.either(|d| find(d.lights(), id), |s| find(&s.lights(), id))?));
+        Ok(())
+    })
+}
+
+fn find(lights: &[Light], id: u32) -> Result<Light> {
+    match lights.get(id as usize) {
+        Some(light) => Ok(*light),
+        None => invalid_argument!("light {id} does not exist, the scene has {}", lights.len()),
+    }
+}
+
+fn light_desc(light: &Light) -> bk_light_desc {
+    let d = bk_light_desc { color: light.color(), ..SizedStruct::defaults() };
+    match *light {
+        Light::Point { position, .. } => bk_light_desc { r#type: BK_LIGHT_POINT, position: position.to_array(), ..d },
+        Light::Spot { position, direction, inner, outer, .. } => bk_light_desc {
+            r#type: BK_LIGHT_SPOT,
+            position: position.to_array(),
+            direction: direction.to_array(),
+            cone_inner: inner,
+            cone_outer: outer,
+            ..d
+        },
+        Light::Directional { direction, angular_radius, .. } => {
+            bk_light_desc { r#type: BK_LIGHT_DIRECTIONAL, direction: direction.to_array(), angular_radius, ..d }
+        }
+        Light::Rect { position, edge_u, edge_v, .. } => bk_light_desc {
+            r#type: BK_LIGHT_RECT,
+            position: position.to_array(),
+            edge_u: edge_u.to_array(),
+            edge_v: edge_v.to_array(),
+            ..d
+        },
+        Light::Sky { environment, up, rotation, .. } => {
+            bk_light_desc { r#type: BK_LIGHT_SKY, environment, up: up.to_array(), rotation, ..d }
+        }
     }
 }
 

@@ -9,7 +9,7 @@
 //! fails with BK_ERROR_INVALID_STATE and changes nothing. Reads (bk_live_read, bk_live_cell_lods,
 //! bk_live_lod_at) exclude updates only, not each other. Source: Schouls 2017, section 3.3.
 
-use super::args::{OutStruct, SizedStruct, init, read_struct, read_vec3, sized_struct, slice_mut, write};
+use super::args::{OutStruct, SizedStruct, init, read_bool, read_struct, read_vec3, sized_struct, slice_mut, write};
 use super::device::{bk_progress_fn, call_with_file, progress as report_to, refuse_in_callback};
 use super::error::{BK_NONE, bk_result, call, call_or};
 use super::handles::{create, hold, is_null, object, release, retain};
@@ -106,7 +106,7 @@ pub struct bk_live_params {
     pub background: u32,
 }
 
-sized_struct!(bk_live_params, last: background: u32, defaults: {
+sized_struct!(bk_live_params, defaults: {
     let p = LiveParams::default();
     bk_live_params {
         struct_size: size_of::<bk_live_params>() as u32,
@@ -140,9 +140,6 @@ fn core_params(p: &bk_live_params) -> Result<LiveParams> {
         BK_LIVE_UNIFORM => Mode::Uniform,
         other => return invalid_argument!("mode is {other}, not one of the BK_LIVE values"),
     };
-    if p.background > 1 {
-        return invalid_argument!("background is {}, not 0 or 1", p.background);
-    }
     Ok(LiveParams {
         mode,
         lod_count: p.lod_count,
@@ -156,7 +153,7 @@ fn core_params(p: &bk_live_params) -> Result<LiveParams> {
         max_bounces: p.max_bounces,
         direct_samples: p.direct_samples,
         radius: p.radius,
-        background: p.background == 1,
+        background: read_bool(p.background, "background")?,
     })
 }
 
@@ -180,7 +177,7 @@ pub struct bk_camera {
     pub fov_y: f32,
 }
 
-sized_struct!(bk_camera, last: fov_y: f32, defaults: bk_camera {
+sized_struct!(bk_camera, defaults: bk_camera {
     struct_size: size_of::<bk_camera>() as u32,
     width: 1920,
     height: 1080,
@@ -209,7 +206,7 @@ pub struct bk_budget {
     pub rays: u64,
 }
 
-sized_struct!(bk_budget, last: rays: u64, defaults: bk_budget {
+sized_struct!(bk_budget, defaults: bk_budget {
     struct_size: size_of::<bk_budget>() as u32,
     milliseconds: 4.0,
     rays: 0,
@@ -252,7 +249,7 @@ pub struct bk_live_stats {
     pub bytes_full: u64,
 }
 
-sized_struct!(bk_live_stats, last: bytes_full: u64, defaults: stats(&Default::default()));
+sized_struct!(bk_live_stats, defaults: stats(&Default::default()));
 
 fn stats(s: &LiveStats) -> bk_live_stats {
     bk_live_stats {
@@ -315,7 +312,7 @@ pub struct bk_cell_info {
     pub cell_size: f32,
 }
 
-sized_struct!(bk_cell_info, last: cell_size: f32, defaults: cell_info(&CellInfo::default()));
+sized_struct!(bk_cell_info, defaults: cell_info(&CellInfo::default()));
 
 fn cell_info(i: &CellInfo) -> bk_cell_info {
     bk_cell_info {
@@ -562,10 +559,8 @@ pub unsafe extern "C" fn bk_live_pause(live: *mut bk_live, paused: u32) -> bk_re
     call(|| {
         // SAFETY: a handle, or NULL.
         let live = unsafe { hold(live, "live") }?;
-        if paused > 1 {
-            return invalid_argument!("paused is {paused}, not 0 or 1");
-        }
-        live.change(|l| l.pause(paused == 1))
+        let paused = read_bool(paused, "paused")?;
+        live.change(|l| l.pause(paused))
     })
 }
 

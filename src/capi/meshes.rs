@@ -47,8 +47,9 @@ pub struct bk_material_desc {
     pub transmission: [f32; 3],
 }
 
-sized_struct!(bk_material_desc, last: emission: [f32; 3], defaults: {
-    let m = Material::default();
+sized_struct!(bk_material_desc, defaults: material_desc(&Material::default()));
+
+fn material_desc(m: &Material) -> bk_material_desc {
     bk_material_desc {
         struct_size: size_of::<bk_material_desc>() as u32,
         flags: if m.two_sided { BK_MATERIAL_TWO_SIDED } else { 0 },
@@ -58,7 +59,7 @@ sized_struct!(bk_material_desc, last: emission: [f32; 3], defaults: {
         alpha_cutoff: m.alpha_cutoff,
         transmission: m.transmission,
     }
-});
+}
 
 /// Fills in the defaults.
 #[unsafe(no_mangle)]
@@ -94,6 +95,35 @@ pub unsafe extern "C" fn bk_scene_add_material(
         // SAFETY: out_id is the caller's, or NULL.
         unsafe { write_optional(out_id, id) }
     })
+}
+
+/// The number of materials, committed or not; 0 on failure.
+#[unsafe(no_mangle)]
+pub unsafe extern "C" fn bk_scene_material_count(scene: *const bk_scene) -> u32 {
+    call_or(0, || object!(scene).count(|d| d.materials().len(), |s| s.materials().len()))
+}
+
+/// Fetches a material, committed or not.
+#[unsafe(no_mangle)]
+pub unsafe extern "C" fn bk_scene_get_material(
+    scene: *const bk_scene,
+    id: u32,
+    out: *mut bk_material_desc,
+) -> bk_result {
+    call(|| {
+        let scene = object!(scene);
+        // SAFETY: out is the caller's, or NULL.
+        let out = unsafe { OutStruct::new(out, "out") }?;
+        out.write(material_desc(&scene.either(|d| find(d.materials(), id), |s| find(s.materials(), id))?));
+        Ok(())
+    })
+}
+
+fn find(materials: &[Material], id: u32) -> Result<Material> {
+    match materials.get(id as usize) {
+        Some(material) => Ok(*material),
+        None => invalid_argument!("material {id} does not exist, the scene has {}", materials.len()),
+    }
 }
 
 /// Flag: refuse degenerate triangles and vertices that are not finite, naming the first, rather
@@ -137,11 +167,9 @@ pub struct bk_mesh_desc {
     pub triangle_materials: *const u32,
     /// Material number of all triangles if triangle_materials is NULL. Default: 0.
     pub material: u32,
-    /// Not used yet: 0.
-    pub reserved: u32,
 }
 
-sized_struct!(bk_mesh_desc, last: reserved: u32, defaults: bk_mesh_desc {
+sized_struct!(bk_mesh_desc, defaults: bk_mesh_desc {
     struct_size: size_of::<bk_mesh_desc>() as u32,
     flags: 0,
     positions: std::ptr::null(),
@@ -158,7 +186,6 @@ sized_struct!(bk_mesh_desc, last: reserved: u32, defaults: bk_mesh_desc {
     lightmap_page: std::ptr::null(),
     triangle_materials: std::ptr::null(),
     material: 0,
-    reserved: 0,
 });
 
 /// Fills in the defaults.
@@ -210,7 +237,6 @@ fn bytes(d: &bk_mesh_desc) -> usize {
 /// The arrays hold what the description says.
 unsafe fn read_mesh(d: &bk_mesh_desc) -> Result<Mesh> {
     check_flags(d.flags, BK_MESH_STRICT, "flags")?;
-    check_flags(d.reserved, 0, "reserved")?;
     let (vertices, triangles) = (d.vertex_count, d.triangle_count);
     if d.lightmap_uvs.is_null() && !d.lightmap_page.is_null() {
         return invalid_argument!("lightmap_page is given, but lightmap_uvs is NULL");
@@ -290,8 +316,8 @@ pub unsafe extern "C" fn bk_scene_mesh_count(scene: *const bk_scene) -> u32 {
 pub struct bk_mesh_view {
     /// Size of this structure in bytes, set by bk_mesh_view_init.
     pub struct_size: u32,
-    /// Not used yet.
-    pub reserved: u32,
+    /// Material number of all triangles if triangle_materials is NULL, else BK_NONE.
+    pub material: u32,
     /// vertex_count positions of three floats, packed.
     pub positions: *const f32,
     /// Number of vertices.
@@ -300,15 +326,30 @@ pub struct bk_mesh_view {
     pub indices: *const u32,
     /// Number of triangles, degenerate ones included.
     pub triangle_count: usize,
+    /// vertex_count shading normals of three floats, packed; NULL if the mesh has none.
+    pub normals: *const f32,
+    /// vertex_count texture coordinates of two floats, packed; NULL if the mesh has none.
+    pub uvs: *const f32,
+    /// vertex_count light map coordinates of two floats, packed, as the caller gave them; NULL if the mesh has none.
+    pub lightmap_uvs: *const f32,
+    /// Light map page per triangle, packed, as the caller gave them; NULL if all are on page 0.
+    pub lightmap_page: *const u32,
+    /// Material number per triangle, packed; NULL if all have `material`.
+    pub triangle_materials: *const u32,
 }
 
-sized_struct!(bk_mesh_view, last: triangle_count: usize, defaults: bk_mesh_view {
+sized_struct!(bk_mesh_view, defaults: bk_mesh_view {
     struct_size: size_of::<bk_mesh_view>() as u32,
-    reserved: 0,
+    material: BK_NONE,
     positions: std::ptr::null(),
     vertex_count: 0,
     indices: std::ptr::null(),
     triangle_count: 0,
+    normals: std::ptr::null(),
+    uvs: std::ptr::null(),
+    lightmap_uvs: std::ptr::null(),
+    lightmap_page: std::ptr::null(),
+    triangle_materials: std::ptr::null(),
 });
 
 /// Sets struct_size and clears the rest.
@@ -322,11 +363,7 @@ pub unsafe extern "C" fn bk_mesh_view_init(view: *mut bk_mesh_view) {
 ///
 /// out: receives pointers that are valid while the scene lives, until the next bk_scene_refit.
 #[unsafe(no_mangle)]
-pub unsafe extern "C" fn bk_scene_mesh_geometry(
-    scene: *const bk_scene,
-    mesh: u32,
-    out: *mut bk_mesh_view,
-) -> bk_result {
+pub unsafe extern "C" fn bk_scene_get_mesh(scene: *const bk_scene, mesh: u32, out: *mut bk_mesh_view) -> bk_result {
     call(|| {
         let scene = object!(scene);
         let committed = scene.committed()?;
@@ -336,7 +373,18 @@ pub unsafe extern "C" fn bk_scene_mesh_geometry(
         let Some(m) = meshes.get(mesh as usize) else {
             return invalid_argument!("mesh {mesh} does not exist, the scene has {}", meshes.len());
         };
+        let (material, triangle_materials) = match &m.materials {
+            MeshMaterials::One(material) => (*material, std::ptr::null()),
+            MeshMaterials::PerTriangle(materials) => (BK_NONE, pointer(materials)),
+        };
+        let lightmap = m.lightmap.as_ref();
         out.write(bk_mesh_view {
+            material,
+            triangle_materials,
+            normals: pointer(&m.normals).cast(),
+            uvs: pointer(&m.uvs).cast(),
+            lightmap_uvs: lightmap.map_or(std::ptr::null(), |l| pointer(&l.uvs).cast()),
+            lightmap_page: lightmap.map_or(std::ptr::null(), |l| pointer(&l.pages)),
             positions: m.positions.as_ptr().cast(),
             vertex_count: m.positions.len(),
             indices: m.indices.as_ptr().cast(),
@@ -345,4 +393,9 @@ pub unsafe extern "C" fn bk_scene_mesh_geometry(
         });
         Ok(())
     })
+}
+
+/// The array, or NULL if it is empty: then the mesh has none.
+fn pointer<T>(array: &[T]) -> *const T {
+    if array.is_empty() { std::ptr::null() } else { array.as_ptr() }
 }

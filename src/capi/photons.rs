@@ -52,7 +52,7 @@ pub struct bk_photon_params {
     pub memory_budget: u64,
 }
 
-sized_struct!(bk_photon_params, last: memory_budget: u64, defaults: {
+sized_struct!(bk_photon_params, defaults: {
     let p = PhotonParams::default();
     bk_photon_params {
         struct_size: size_of::<bk_photon_params>() as u32,
@@ -170,7 +170,7 @@ pub struct bk_photon_view {
     pub power: *const f32,
 }
 
-sized_struct!(bk_photon_view, last: power: *const f32, defaults: bk_photon_view {
+sized_struct!(bk_photon_view, defaults: bk_photon_view {
     struct_size: size_of::<bk_photon_view>() as u32,
     radius: 0.0,
     count: 0,
@@ -194,7 +194,7 @@ pub unsafe extern "C" fn bk_photon_view_init(view: *mut bk_photon_view) {
 /// Fails with BK_ERROR_OUT_OF_MEMORY if the memory callback refuses the packed copy that the first
 /// call makes.
 #[unsafe(no_mangle)]
-pub unsafe extern "C" fn bk_photon_map_photons(map: *const bk_photon_map, out: *mut bk_photon_view) -> bk_result {
+pub unsafe extern "C" fn bk_photon_map_get_photons(map: *const bk_photon_map, out: *mut bk_photon_view) -> bk_result {
     call(|| {
         let map = object!(map);
         let map = &map.map;

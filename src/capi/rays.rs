@@ -16,11 +16,8 @@ use crate::scene::Scene;
 use crate::trace::{Hit, Ray};
 use bytemuck::{Pod, Zeroable, cast_slice, cast_slice_mut};
 
-/// Flag: neighbouring rays are alike (a camera's, a tile's); they may be traced together. Results
-/// do not depend on it.
-pub const BK_RAYS_COHERENT: u32 = 1;
 /// Flag: spread the rays over the device's threads. Without it the calling thread does the work.
-pub const BK_RAYS_PARALLEL: u32 = 2;
+pub const BK_RAYS_PARALLEL: u32 = 1;
 
 /// The points origin + t direction with tmin < t <= tmax.
 #[repr(C)]
@@ -89,7 +86,7 @@ pub unsafe extern "C" fn bk_occluded(scene: *const bk_scene, ray: *const bk_ray)
 /// nearly the same way, as those of a pinhole camera do in small square tiles of pixels; the hits are
 /// the same, bit for bit, in any order of rays.
 ///
-/// rays: count rays, aligned to 4 bytes. flags: BK_RAYS_COHERENT, BK_RAYS_PARALLEL. out: receives
+/// rays: count rays, aligned to 4 bytes. flags: 0 or BK_RAYS_PARALLEL. out: receives
 /// count hits in the order of the rays; must not overlap them.
 #[unsafe(no_mangle)]
 pub unsafe extern "C" fn bk_intersect_many(
@@ -102,7 +99,7 @@ pub unsafe extern "C" fn bk_intersect_many(
     // SAFETY: rays and out are the caller's, or NULL.
     call(|| unsafe {
         let scene = borrowed!(scene).committed()?;
-        let parallel = parallel(&scene, flags, BK_RAYS_COHERENT | BK_RAYS_PARALLEL)?;
+        let parallel = parallel(&scene, flags)?;
         let rays = slice(rays, count, "rays")?;
         let out = slice_mut(out, count, "out", &[(cast_slice(rays), "rays")])?;
         scene.intersect_many(cast_slice(rays), parallel, cast_slice_mut(out))
@@ -111,7 +108,7 @@ pub unsafe extern "C" fn bk_intersect_many(
 
 /// Whether anything lies on each of many rays.
 ///
-/// rays: count rays, aligned to 4 bytes. flags: BK_RAYS_COHERENT, BK_RAYS_PARALLEL. out: receives
+/// rays: count rays, aligned to 4 bytes. flags: 0 or BK_RAYS_PARALLEL. out: receives
 /// count bytes, 1 or 0, in the order of the rays; must not overlap them.
 #[unsafe(no_mangle)]
 pub unsafe extern "C" fn bk_occluded_many(
@@ -124,7 +121,7 @@ pub unsafe extern "C" fn bk_occluded_many(
     // SAFETY: rays and out are the caller's, or NULL.
     call(|| unsafe {
         let scene = borrowed!(scene).committed()?;
-        let parallel = parallel(&scene, flags, BK_RAYS_COHERENT | BK_RAYS_PARALLEL)?;
+        let parallel = parallel(&scene, flags)?;
         let rays = slice(rays, count, "rays")?;
         let out = slice_mut(out, count, "out", &[(cast_slice(rays), "rays")])?;
         scene.occluded_many(cast_slice(rays), parallel, out)
@@ -150,7 +147,7 @@ pub unsafe extern "C" fn bk_gather(
     // SAFETY: origin, directions and out are the caller's, or NULL.
     call(|| unsafe {
         let scene = borrowed!(scene).committed()?;
-        let parallel = parallel(&scene, flags, BK_RAYS_PARALLEL)?;
+        let parallel = parallel(&scene, flags)?;
         let origin = read_vec3(origin, "origin")?;
         let directions = slice(directions.cast::<[f32; 3]>(), count, "directions")?;
         let out = slice_mut(out, count, "out", &[(cast_slice(directions), "directions")])?;
@@ -159,8 +156,8 @@ pub unsafe extern "C" fn bk_gather(
 }
 
 /// Checks the flags; whether they ask for the device's threads.
-fn parallel(scene: &Scene, flags: u32, known: u32) -> Result<bool> {
-    check_flags(flags, known, "flags")?;
+fn parallel(scene: &Scene, flags: u32) -> Result<bool> {
+    check_flags(flags, BK_RAYS_PARALLEL, "flags")?;
     let parallel = flags & BK_RAYS_PARALLEL != 0;
     if parallel {
         refuse_in_callback()?;

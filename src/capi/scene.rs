@@ -11,7 +11,7 @@
 //! counter-clockwise front faces, linear RGB, all surfaces diffuse. Coordinates are valid up to a
 //! magnitude of 1e12.
 
-use super::args::{OutStruct, SizedStruct, check_flags, init, read_struct, sized_struct, text, write};
+use super::args::{OutStruct, SizedStruct, check_flags, init, read_bool, read_struct, sized_struct, text, write};
 use super::device::{bk_device, bk_progress_fn, progress, refuse_in_callback};
 use super::error::{bk_result, call, call_or};
 use super::handles::{create, hold, object, release, retain};
@@ -127,19 +127,28 @@ impl bk_scene {
         })
     }
 
-    /// A number about the scene in either state.
+    /// Reads something that the scene has in either state.
+    pub(super) fn either<R>(
+        &self,
+        described: impl Fn(&SceneData) -> Result<R>,
+        committed: impl Fn(&Scene) -> Result<R>,
+    ) -> Result<R> {
+        if self.is_committed() {
+            return committed(&**self.committed()?);
+        }
+        self.with_description(|d| match d {
+            Some(d) => described(&d.data),
+            None => committed(&**self.committed()?),
+        })
+    }
+
+    /// Counts something that the scene has in either state.
     pub(super) fn count(
         &self,
         described: impl Fn(&SceneData) -> usize,
         committed: impl Fn(&Scene) -> usize,
     ) -> Result<u32> {
-        if self.is_committed() {
-            return Ok(committed(&**self.committed()?) as u32);
-        }
-        self.with_description(|d| match d {
-            Some(d) => Ok(described(&d.data) as u32),
-            None => Ok(committed(&**self.committed()?) as u32),
-        })
+        self.either(|d| Ok(described(d) as u32), |s| Ok(committed(s) as u32))
     }
 }
 
@@ -205,7 +214,7 @@ pub struct bk_load_info {
     pub first_texture: u32,
 }
 
-sized_struct!(bk_load_info, last: seconds: f64, defaults: bk_load_info {
+sized_struct!(bk_load_info, defaults: bk_load_info {
     struct_size: size_of::<bk_load_info>() as u32,
     meshes: 0,
     first_mesh: 0,
@@ -260,7 +269,7 @@ fn default_limits() -> [u64; 2] {
     [0; 2]
 }
 
-sized_struct!(bk_load_params, last: max_file_bytes: u64, defaults: {
+sized_struct!(bk_load_params, defaults: {
     let [max_texture_bytes, max_file_bytes] = default_limits();
     bk_load_params {
         struct_size: size_of::<bk_load_params>() as u32,
@@ -423,7 +432,7 @@ pub const BK_BUILD_QUALITY_DEFAULT: u32 = 0;
 /// triangles are met later.
 pub const BK_BUILD_QUALITY_HIGH: u32 = 1;
 
-sized_struct!(bk_build_params, last: max_leaf: u32, defaults: {
+sized_struct!(bk_build_params, defaults: {
     let b = BuildOptions::default();
     bk_build_params {
         struct_size: size_of::<bk_build_params>() as u32,
@@ -454,15 +463,12 @@ pub unsafe extern "C" fn bk_scene_set_build(scene: *mut bk_scene, params: *const
             BK_BUILD_QUALITY_HIGH => BuildQuality::High,
             q => return invalid_argument!("quality is {q}, not one of BK_BUILD_QUALITY_*"),
         };
-        if params.compact > 1 {
-            return invalid_argument!("compact is {}, not 0 or 1", params.compact);
-        }
         let build = BuildOptions {
             bins: params.bins,
             max_leaf: params.max_leaf,
             quality,
             split_budget: params.split_budget,
-            compact: params.compact == 1,
+            compact: read_bool(params.compact, "compact")?,
         };
         build.validate()?;
         scene.describe("the build can be chosen", |d| {
@@ -531,7 +537,7 @@ pub unsafe extern "C" fn bk_scene_commit(
 /// Triangles that become degenerate or not finite are not hit while they are; those that were so at
 /// the commit stay out for good. Light maps, photon maps and live objects that were made before keep
 /// the geometry that they were made of (the scene is copied then, else changed in place) and go on
-/// following the scene's lights. Pointers from bk_scene_mesh_geometry become invalid.
+/// following the scene's lights. Pointers from bk_scene_get_mesh become invalid.
 ///
 /// Fails with BK_ERROR_INVALID_STATE if the scene is not committed, if no triangle would be left that
 /// can be hit, or if another thread queries or changes the scene; with BK_ERROR_OUT_OF_MEMORY if the
@@ -586,7 +592,7 @@ pub struct bk_scene_stats {
     pub refit_seconds: f64,
 }
 
-sized_struct!(bk_scene_stats, last: build_seconds: f64, defaults: stats(&Default::default()));
+sized_struct!(bk_scene_stats, defaults: stats(&Default::default()));
 
 fn stats(s: &crate::scene::SceneStats) -> bk_scene_stats {
     bk_scene_stats {
@@ -611,10 +617,9 @@ pub unsafe extern "C" fn bk_scene_stats_init(stats: *mut bk_scene_stats) {
     unsafe { init(stats) }
 }
 
-/// Numbers about a committed scene. (The structure shares the function's name, so it is always
-/// written with `struct`.)
+/// Numbers about a committed scene.
 #[unsafe(no_mangle)]
-pub unsafe extern "C" fn bk_scene_stats(scene: *const bk_scene, out: *mut bk_scene_stats) -> bk_result {
+pub unsafe extern "C" fn bk_scene_get_stats(scene: *const bk_scene, out: *mut bk_scene_stats) -> bk_result {
     call(|| {
         let scene = object!(scene);
         let committed = scene.committed()?;

@@ -11,14 +11,15 @@
 //!
 //! A scene without images spends neither memory nor time on them.
 
-use super::args::{init, read_struct, sized_struct, write_optional};
-use super::error::{bk_result, call};
-use super::handles::{hold, is_null};
+use super::args::{OutStruct, SizedStruct, init, read_struct, sized_struct, write_optional};
+use super::error::{bk_result, call, call_or};
+use super::handles::{hold, is_null, object};
 use super::scene::bk_scene;
 use crate::error::{Result, invalid_argument};
 use crate::scene::{Environment, MAX_ENVIRONMENT_SIZE, MAX_TEXTURE_SIZE, SceneData, Texture};
 use bytemuck::Pod;
 use std::ffi::c_void;
+use std::sync::Arc;
 
 /// Format: four bytes per texel, sRGB red, green and blue and linear alpha (255: opaque).
 pub const BK_TEXTURE_RGBA8_SRGB: u32 = 0;
@@ -29,7 +30,7 @@ pub const BK_TEXTURE_RGB32F: u32 = 1;
 #[repr(C)]
 #[derive(Clone, Copy)]
 pub struct bk_texture_desc {
-    /// Size of this structure in bytes, set by bk_texture_init.
+    /// Size of this structure in bytes, set by bk_texture_desc_init.
     pub struct_size: u32,
     /// One of BK_TEXTURE. Default: BK_TEXTURE_RGBA8_SRGB.
     pub format: u32,
@@ -43,7 +44,7 @@ pub struct bk_texture_desc {
     pub row_stride: usize,
 }
 
-sized_struct!(bk_texture_desc, last: row_stride: usize, defaults: bk_texture_desc {
+sized_struct!(bk_texture_desc, defaults: bk_texture_desc {
     struct_size: size_of::<bk_texture_desc>() as u32,
     format: BK_TEXTURE_RGBA8_SRGB,
     width: 0,
@@ -54,7 +55,7 @@ sized_struct!(bk_texture_desc, last: row_stride: usize, defaults: bk_texture_des
 
 /// Fills in the defaults.
 #[unsafe(no_mangle)]
-pub unsafe extern "C" fn bk_texture_init(desc: *mut bk_texture_desc) {
+pub unsafe extern "C" fn bk_texture_desc_init(desc: *mut bk_texture_desc) {
     // SAFETY: the caller's structure, or NULL.
     unsafe { init(desc) }
 }
@@ -132,6 +133,67 @@ unsafe fn read_environment(d: &bk_texture_desc) -> Result<Environment> {
     }
     // SAFETY: forwarded.
     Environment::new(d.width, d.height, unsafe { texels(d, MAX_ENVIRONMENT_SIZE, "the environment")? })
+}
+
+/// The number of textures, committed or not; 0 on failure.
+#[unsafe(no_mangle)]
+pub unsafe extern "C" fn bk_scene_texture_count(scene: *const bk_scene) -> u32 {
+    call_or(0, || object!(scene).count(|d| d.textures().len(), |s| s.textures().len()))
+}
+
+/// Shows a texture, without a copy.
+#[unsafe(no_mangle)]
+pub unsafe extern "C" fn bk_scene_get_texture(scene: *const bk_scene, id: u32, out: *mut bk_texture_desc) -> bk_result {
+    call(|| {
+        let scene = object!(scene);
+        // SAFETY: out is the caller's, or NULL.
+        let out = unsafe { OutStruct::new(out, "out") }?;
+        let find = |textures: &[Arc<Texture>]| find(textures, id, "texture");
+        // The scene keeps its textures in either state, and they never move.
+        let texture = scene.either(|d| find(d.textures()), |s| find(s.textures()))?;
+        out.write(bk_texture_desc {
+            format: BK_TEXTURE_RGBA8_SRGB,
+            width: texture.width,
+            height: texture.height,
+            data: texture.rgba8.as_ptr().cast(),
+            ..SizedStruct::defaults()
+        });
+        Ok(())
+    })
+}
+
+/// The number of environments, committed or not; 0 on failure.
+#[unsafe(no_mangle)]
+pub unsafe extern "C" fn bk_scene_environment_count(scene: *const bk_scene) -> u32 {
+    call_or(0, || object!(scene).count(|d| d.environments().len(), |s| s.environments().len()))
+}
+
+/// Shows an environment, without a copy.
+#[unsafe(no_mangle)]
+pub unsafe extern "C" fn bk_scene_get_environment(
+    scene: *const bk_scene,
+    id: u32,
+    out: *mut bk_texture_desc,
+) -> bk_result {
+    call(|| {
+        let scene = object!(scene);
+        // SAFETY: out is the caller's, or NULL.
+        let out = unsafe { OutStruct::new(out, "out") }?;
+        let find = |environments: &[Arc<Environment>]| find(environments, id, "environment");
+        // As textures, they never move.
+        let environment = scene.either(|d| find(d.environments()), |s| find(s.environments()))?;
+        let (width, height) = environment.size();
+        let data = environment.rgb().as_ptr().cast();
+        out.write(bk_texture_desc { format: BK_TEXTURE_RGB32F, width, height, data, ..SizedStruct::defaults() });
+        Ok(())
+    })
+}
+
+fn find<T>(images: &[Arc<T>], id: u32, what: &str) -> Result<Arc<T>> {
+    match images.get(id as usize) {
+        Some(image) => Ok(image.clone()),
+        None => invalid_argument!("{what} {id} does not exist, the scene has {}", images.len()),
+    }
 }
 
 /// What a copy of an image takes.

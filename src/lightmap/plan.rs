@@ -31,15 +31,15 @@ pub mod left_out {
     /// No light through surfaces.
     pub const TRANSMISSION: u32 = 1 << 10;
     /// No light from a sky.
-    pub const SKY: u32 = 1 << 12;
+    pub const SKY: u32 = 1 << 11;
     /// No directional light with a disc.
-    pub const SUN_DISC: u32 = 1 << 13;
+    pub const SUN_DISC: u32 = 1 << 12;
     /// No choice among many lights: all are few enough to be evaluated one by one.
-    pub const MANY_LIGHTS: u32 = 1 << 14;
+    pub const MANY_LIGHTS: u32 = 1 << 13;
     /// No stitching of seams.
-    pub const SEAMS: u32 = 1 << 16;
+    pub const SEAMS: u32 = 1 << 14;
     /// No bright patches as lights: gather rays find most of what is bright.
-    pub const BRIGHT_PATCHES: u32 = 1 << 17;
+    pub const BRIGHT_PATCHES: u32 = 1 << 15;
 }
 
 /// What a bake of a scene runs.
