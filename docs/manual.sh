@@ -1,0 +1,75 @@
+#!/usr/bin/env bash
+# Builds the HTML manual: README.md, docs/ and what belongs to them by pandoc, include/bakelite.h by Doxygen. Names of the
+# header that the documents mention lead to its pages.
+#
+#     docs/manual.sh [FOLDER]        default: target/manual; start with index.html
+#
+# Fails if a document links to one that is not part of the manual and not in the repository.
+set -euo pipefail
+cd "$(dirname "$0")/.."
+out=${1:-target/manual}
+for tool in doxygen pandoc; do
+    command -v $tool >/dev/null || {
+        echo "There is no $tool: apt-get install doxygen pandoc" >&2
+        exit 1
+    }
+done
+rm -rf "$out"
+mkdir -p "$out"
+work=$(mktemp -d)
+trap 'rm -rf "$work"' EXIT
+
+# ---- The header ----
+
+doxygen - <<DOXYFILE
+PROJECT_NAME = Bakelite
+PROJECT_BRIEF = "SIMD light-baking kernels: bakelite.h"
+INPUT = include/bakelite.h
+STRIP_FROM_PATH = include
+INPUT_FILTER = "awk -f docs/manual/header.awk"
+OUTPUT_DIRECTORY = $out
+HTML_OUTPUT = header
+GENERATE_LATEX = NO
+HAVE_DOT = NO
+GENERATE_TAGFILE = $work/header.tag
+OPTIMIZE_OUTPUT_FOR_C = YES
+TYPEDEF_HIDES_STRUCT = YES
+JAVADOC_AUTOBRIEF = YES
+SORT_MEMBER_DOCS = NO
+SHOW_INCLUDE_FILES = NO
+ALPHABETICAL_INDEX = YES
+MACRO_EXPANSION = YES
+EXPAND_ONLY_PREDEF = YES
+PREDEFINED = BK_API=
+DISABLE_INDEX = NO
+GENERATE_TREEVIEW = YES
+QUIET = YES
+DOXYFILE
+
+# ---- The documents ----
+
+pages='index:README.md guide:docs/guide.md performance:docs/performance.md accuracy:docs/accuracy.md
+    architecture:docs/architecture.md robustness:docs/robustness.md experiments:docs/experiments.md
+    contributing:CONTRIBUTING.md security:SECURITY.md changelog:CHANGELOG.md'
+{
+    echo '<nav>'
+    for page in $pages; do
+        name=${page%%:*}
+        echo "<a href=\"$name.html\">${name/index/start}</a>"
+        [ "$name" != guide ] || echo '<a href="header/topics.html">header</a>'
+    done
+    echo '</nav>'
+} >"$work/nav.html"
+# Doxygen renamed the list of groups.
+[ -e "$out/header/topics.html" ] || sed -i 's|header/topics.html|header/modules.html|' "$work/nav.html"
+
+for page in $pages; do
+    name=${page%%:*}
+    file=${page#*:}
+    MANUAL_PAGES=$pages MANUAL_TAGS=$work/header.tag MANUAL_FILE=$file pandoc --from gfm --to html5 --standalone \
+        --metadata "title=Bakelite: $(sed -n '1s/^# //p' "$file")" --lua-filter docs/manual/links.lua \
+        --css manual.css --include-before-body "$work/nav.html" --output "$out/$name.html" "$file"
+done
+cp docs/manual/manual.css "$out"
+cp benches/pictures/atrium.jpg LICENSE-APACHE LICENSE-MIT "$out"
+echo "$out/index.html"
