@@ -1,13 +1,11 @@
-//! The device: a thread pool of its own, the ISA chosen at run time with its table of kernels, the
+//! The device: a thread pool of its own, the ISA chosen at run time, the
 //! log and the memory accounts.
 
-use crate::callback;
+use crate::base::{callback, float_state};
 use crate::error::{Error, Result, invalid_argument};
-use crate::float_state;
 use crate::memory::{MemoryFn, MemoryMonitor};
 use crate::progress::Progress;
 use crate::simd::Isa;
-use crate::trace::Kernels;
 use std::cell::Cell;
 use std::sync::Arc;
 use std::thread::JoinHandle;
@@ -58,7 +56,8 @@ pub struct Device {
     /// `Some` until dropped.
     pool: Option<rayon::ThreadPool>,
     threads: Vec<JoinHandle<()>>,
-    kernels: &'static Kernels,
+    /// One that this machine can run.
+    isa: Isa,
     log: Option<Box<LogFn>>,
     memory: Arc<MemoryMonitor>,
     /// The process that the threads are in.
@@ -86,7 +85,7 @@ impl Device {
         Ok(Arc::new(Device {
             pool: Some(pool),
             threads,
-            kernels: Kernels::for_isa(isa),
+            isa,
             log: options.log,
             memory: Arc::new(MemoryMonitor::new(options.memory)),
             process: std::process::id(),
@@ -107,9 +106,10 @@ impl Device {
         self.process != std::process::id()
     }
 
-    /// The ISA in use.
+    /// The ISA in use, which this machine can run.
+    #[inline]
     pub fn isa(&self) -> Isa {
-        self.kernels.isa
+        self.isa
     }
 
     /// The number of worker threads.
@@ -188,10 +188,6 @@ impl Device {
     /// The memory accounts.
     pub fn memory(&self) -> &Arc<MemoryMonitor> {
         &self.memory
-    }
-
-    pub(crate) fn kernels(&self) -> &'static Kernels {
-        self.kernels
     }
 }
 

@@ -28,27 +28,23 @@
 //! perpendicular plane (W/m²), area lights, skies and emissive materials by radiance (W/(m²·sr)). Light
 //! maps hold irradiance E (W/m²): a shader shows albedo/π · E. All surfaces are diffuse.
 
+pub(crate) mod base;
 pub mod bvh;
-pub(crate) mod callback;
 pub mod capi;
 pub mod device;
-pub mod error;
-pub mod files;
-pub(crate) mod float_state;
 #[cfg(feature = "io")]
 pub mod io;
 pub mod lightmap;
 pub mod live;
-pub mod memory;
 pub mod photon;
-pub mod progress;
 #[cfg(feature = "reference")]
 pub mod reference;
-pub mod sampling;
 pub mod scene;
 pub(crate) mod simd;
 pub mod trace;
 
+pub(crate) use base::{callback, float_state};
+pub use base::{error, files, memory, progress, sampling};
 pub use device::{Device, DeviceOptions};
 pub use error::{Error, Result};
 pub use progress::Progress;

@@ -8,9 +8,9 @@ use super::binned::{Box4, triangle_box};
 use super::collapse::set_box;
 use super::compact::{Compact, CompactNode, GONE, NUMBER, PAD};
 use super::layout::{ChildRef, Node};
+use crate::base::geometry::is_valid_triangle;
 use crate::error::Result;
 use crate::memory::{try_filled, try_with_capacity};
-use crate::scene::is_valid_triangle;
 use glam::Vec3;
 use rayon::prelude::*;
 

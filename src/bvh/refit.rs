@@ -8,7 +8,7 @@
 use super::binned::{Box4, triangle_box};
 use super::collapse::set_box;
 use super::layout::{ChildRef, LEAF_PAD, LEAF_STRIDE, Mbvh, Node, WIDTH};
-use crate::scene::is_valid_triangle;
+use crate::base::geometry::is_valid_triangle;
 use glam::Vec3;
 use rayon::prelude::*;
 

@@ -29,7 +29,7 @@ use crate::photon::{PhotonMap, PhotonParams};
 use crate::progress::{Progress, Stage};
 use crate::sampling::{combine, purpose_seed};
 use crate::scene::Scene;
-use crate::trace::offset::too_few_digits;
+use crate::scene::precision::too_few_digits;
 use glam::Vec3;
 use rayon::prelude::*;
 use std::ops::Range;

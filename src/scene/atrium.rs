@@ -950,7 +950,7 @@ mod tests {
     use crate::progress::Progress;
     use crate::sampling::{cosine_around, sobol_2d};
     use crate::scene::Scene;
-    use crate::scene::mesh::is_valid_triangle;
+    use crate::scene::is_valid_triangle;
     use crate::trace::Ray;
     use std::sync::Arc;
 

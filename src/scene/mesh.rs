@@ -1,6 +1,7 @@
 //! Triangle meshes as the caller describes them.
 
-use super::{MAX_COORDINATE, MAX_TRIANGLES};
+use super::MAX_TRIANGLES;
+use crate::base::geometry::is_valid_triangle;
 use crate::error::{Result, invalid_argument};
 use crate::memory::try_to_vec;
 use glam::{Vec2, Vec3};
@@ -197,13 +198,4 @@ impl Mesh {
         }
         Ok(())
     }
-}
-
-/// Whether a triangle has finite corners in the valid range and an area. Corners on a line count as
-/// no area only if the f64 cross product is exactly zero: slivers are kept.
-#[inline]
-pub fn is_valid_triangle(corners: [Vec3; 3]) -> bool {
-    let in_range = corners.iter().all(|c| c.abs().max_element() <= MAX_COORDINATE && !c.is_nan());
-    let [a, b, c] = corners.map(|c| c.as_dvec3());
-    in_range && (b - a).cross(c - a).length_squared() > 0.0
 }

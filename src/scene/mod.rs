@@ -2,37 +2,36 @@
 //! work on ([`Scene`]), compact and immutable after commit.
 
 mod atrium;
+mod build;
 mod builtin;
-mod commit;
+mod committed;
+mod emitters;
 mod environment;
 mod light;
 mod material;
 mod mesh;
+pub(crate) mod precision;
+mod refit;
 mod rooms;
 pub mod shapes;
 mod texture;
 
+pub use crate::base::geometry::{MAX_COORDINATE, NONE, is_valid_triangle, unit_normal};
 pub use builtin::{BUILTIN_NAMES, Camera, builtin, builtin_camera, is_builtin};
-pub use commit::{Emitter, Scene, SceneStats, unit_normal};
+pub use committed::{Scene, SceneStats};
+pub use emitters::Emitter;
 pub use environment::{Environment, MAX_ENVIRONMENT_SIZE, Sky};
 pub use light::Light;
 pub use material::{MAX_ALBEDO, Material};
-pub use mesh::{LightmapUvs, Mesh, MeshMaterials, is_valid_triangle};
+pub use mesh::{LightmapUvs, Mesh, MeshMaterials};
 pub use texture::{MAX_TEXTURE_SIZE, Texture};
 
 use crate::error::{Error, Result, invalid_argument};
 use crate::memory::{try_to_vec, try_with_capacity};
 use std::sync::Arc;
 
-/// "No triangle", "no chart", …: never a valid index.
-pub const NONE: u32 = u32::MAX;
-
 /// The most triangles in a scene: leaf references hold 28 bits.
 pub const MAX_TRIANGLES: usize = 1 << 28;
-
-/// Coordinates up to this magnitude are valid: products of three of them stay finite in f32, as the
-/// triangle test needs.
-pub const MAX_COORDINATE: f32 = 1e12;
 
 /// Irradiance beyond this is cut off, W/m²: what a light of 10¹² gives at a distance of 10⁻⁹. Sums of
 /// thousands of such values are still finite.

@@ -246,7 +246,7 @@ pub(crate) fn enclosed_volume(mesh: &Mesh) -> Option<f64> {
 
 #[cfg(test)]
 mod tests {
-    use super::super::mesh::is_valid_triangle;
+    use crate::scene::is_valid_triangle;
     use super::*;
 
     /// The volume that `build` encloses; fails if the mesh is open or has degenerate triangles.

@@ -5,8 +5,9 @@
 //! one or transmit, the ray is traced again by a kernel that asks a [`Filter`] about every triangle met:
 //! from the beginning, since from the hit on it would lose what coincides with it.
 
+use super::queries::TreeView;
 use super::single::direction_scale;
-use super::{Packet, RawHit, Ray, TreeView};
+use super::{Packet, RawHit, Ray};
 use crate::scene::Scene;
 use glam::Vec3;
 
@@ -132,7 +133,7 @@ impl Scene {
     /// The closest hit (`ANY`: any) among those that count, which are all of the ray's from its beginning.
     #[cold]
     fn filtered<const ANY: bool>(&self, ray: &Ray, crossings: Option<&mut Vec<Crossing>>) -> RawHit {
-        let (kernels, mut filter) = (self.device().kernels(), Filter { scene: self, crossings });
+        let (kernels, mut filter) = (self.kernels(), Filter { scene: self, crossings });
         match self.tree() {
             TreeView::Whole(tree) => kernels.filtered::<ANY>(tree, ray, &mut filter),
             TreeView::Compact(tree) => kernels.compact_filtered::<ANY>(&tree, ray, &mut filter),

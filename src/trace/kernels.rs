@@ -7,13 +7,13 @@ use super::compact::View;
 use super::filter::Filter;
 use super::{PACKET_SIZE, Packet, RawHit, Ray, gather, packet, single};
 use crate::bvh::Mbvh;
+use crate::device::Device;
 use crate::simd::{self, Isa, entry_point, isa_features};
 use glam::Vec3;
 
-/// Kernels of one ISA. Tables exist for every ISA, but only [`Kernels::for_isa`] hands them out,
+/// Kernels of one ISA. Tables exist for every ISA, but only [`Kernels::of`] hands them out,
 /// and only those that the machine can run: that makes the methods safe.
 pub(crate) struct Kernels {
-    pub(crate) isa: Isa,
     intersect: unsafe fn(&Mbvh, &Ray) -> RawHit,
     intersect_block: unsafe fn(&Mbvh, &[Ray], &mut [RawHit]),
     occluded: unsafe fn(&Mbvh, &Ray) -> bool,
@@ -84,7 +84,6 @@ macro_rules! table {
             } }
 
             pub(super) static TABLE: Kernels = Kernels {
-                isa: Isa::$isa,
                 intersect,
                 intersect_block,
                 occluded,
@@ -107,13 +106,26 @@ table!(AVX2, avx2, Avx2);
 table!(AVX512, avx512, Avx512);
 
 impl Kernels {
+    /// Those that a device is for.
+    #[inline]
+    pub(crate) fn of(device: &Device) -> &'static Kernels {
+        // Devices exist only with an ISA that the machine can run.
+        Self::table(device.isa())
+    }
+
     /// The table of an ISA; of the portable one if the machine cannot run `isa`.
+    #[cfg(test)]
     pub(crate) fn for_isa(isa: Isa) -> &'static Kernels {
+        Self::table(if isa.is_available() { isa } else { Isa::Portable })
+    }
+
+    #[inline]
+    fn table(isa: Isa) -> &'static Kernels {
         match isa {
             #[cfg(target_arch = "x86_64")]
-            Isa::Avx2 if isa.is_available() => &AVX2,
+            Isa::Avx2 => &AVX2,
             #[cfg(target_arch = "x86_64")]
-            Isa::Avx512 if isa.is_available() => &AVX512,
+            Isa::Avx512 => &AVX512,
             _ => &PORTABLE,
         }
     }
@@ -121,7 +133,7 @@ impl Kernels {
     /// Closest hit.
     #[inline]
     pub(crate) fn intersect(&self, bvh: &Mbvh, ray: &Ray) -> RawHit {
-        // SAFETY: `for_isa` checked that the machine has the ISA.
+        // SAFETY: `of` vouches that the machine has the ISA.
         unsafe { (self.intersect)(bvh, ray) }
     }
 

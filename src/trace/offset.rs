@@ -8,39 +8,14 @@
 //! hundred metres is as imprecise as the triangle's corners, and scenes come in any unit.
 
 use crate::scene::Scene;
+pub use crate::scene::precision::ray_epsilon;
 use glam::{DVec3, Vec3};
-
-/// The distance in rounding steps (2^-24 of the magnitude). A hit point interpolated in f64 is
-/// within 1, and the triangle tests, relative to the origin, add a handful; the rest is reserve.
-/// In a scene of 30 m the distance is 0.06 mm.
-const STEPS: f32 = 32.0 / (1 << 24) as f32;
-
-/// How far [`offset_ray_origin`] moves a point, in scene units.
-#[inline]
-pub fn ray_epsilon(position: Vec3, scene: &Scene) -> f32 {
-    STEPS * position.abs().max_element().max(scene.diagonal())
-}
 
 /// The origin for a ray that leaves a surface at `position` on the side that `normal` points to
 /// (unit geometric normal, turned to the ray's side). Trace from it with `tmin` 0.
 #[inline]
 pub fn offset_ray_origin(position: Vec3, normal: Vec3, scene: &Scene) -> Vec3 {
     position + normal * ray_epsilon(position, scene)
-}
-
-/// A sentence if rays start further above the scene's surfaces than a `part` of `size`, a length that the
-/// caller knows as `what`: too few digits of the f32 coordinates are left for it so far from the origin.
-pub(crate) fn too_few_digits(scene: &Scene, what: &str, size: f32, part: f32) -> Option<String> {
-    let (lower, upper) = scene.bounds();
-    let farthest = lower.abs().max(upper.abs());
-    let offset = ray_epsilon(farthest, scene);
-    (offset > part * size).then(|| {
-        format!(
-            "coordinates of magnitude {:.2e} have too few digits for {what} of {size:.2e}: rays start {offset:.2e} \
-             above surfaces; move the scene nearer to the origin",
-            farthest.max_element()
-        )
-    })
 }
 
 /// How far from the edges of its triangle a ray starts, in [`ray_epsilon`]s: with the offset along the

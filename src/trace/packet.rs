@@ -19,8 +19,8 @@
 use super::single::{self, BEYOND, EPSILON, FARTHEST_ORIGIN, OFFSET_ERROR, STEEP, barycentrics, beyond};
 use super::triangle::{GRAZING, Projected, Shear, V3, accurate_distance};
 use super::{RawHit, Ray};
+use crate::base::geometry::NONE;
 use crate::bvh::layout::{ChildRef, MAX_LEAF, Mbvh, Node, STACK_SIZE, WIDTH};
-use crate::scene::NONE;
 use crate::simd::{Eight, Lanes, Mask, Simd};
 use std::mem::MaybeUninit;
 

@@ -1,6 +1,8 @@
 //! Every query on every ISA against an f64 brute-force oracle.
 
 use super::*;
+use crate::scene::Scene;
+use glam::Vec3;
 use crate::sampling::{orthonormal_basis, sobol_2d, uniform, uniform_sphere};
 use crate::{Device, DeviceOptions, Isa, Material, Mesh, Progress, SceneData};
 use glam::DVec3;

@@ -1,0 +1,277 @@
+//! The plan of the house: each floor of the library imports only from those above it in docs/architecture.md, and no two
+//! folders or files import each other in a circle.
+//!
+//! Paths that begin with `crate::` or `super::` are looked at, tests apart. Names that `lib.rs` re-exports count for the
+//! floor that they come from.
+
+use std::collections::{BTreeMap, BTreeSet};
+use std::path::{Path, PathBuf};
+
+/// From the top: light flows downwards, imports go upwards in this list.
+const FLOORS: &[&str] =
+    &["base", "simd", "device", "bvh", "scene", "trace", "photon", "lightmap", "live", "reference", "io", "capi"];
+
+/// What `lib.rs` re-exports under a shorter name, and the floor that it is on.
+const NAMES: &[(&str, &str)] = &[
+    ("callback", "base"),
+    ("error", "base"),
+    ("files", "base"),
+    ("float_state", "base"),
+    ("memory", "base"),
+    ("progress", "base"),
+    ("sampling", "base"),
+    ("Error", "base"),
+    ("Result", "base"),
+    ("Progress", "base"),
+    ("Isa", "simd"),
+    ("Device", "device"),
+    ("DeviceOptions", "device"),
+    ("Light", "scene"),
+    ("Material", "scene"),
+    ("Mesh", "scene"),
+    ("Scene", "scene"),
+    ("SceneData", "scene"),
+];
+
+/// A file of the library, by its module path.
+struct File {
+    path: PathBuf,
+    module: Vec<String>,
+    /// Without comments and tests.
+    text: String,
+}
+
+fn files() -> Vec<File> {
+    let root = Path::new(env!("CARGO_MANIFEST_DIR")).join("src");
+    let (mut folders, mut found) = (vec![root.clone()], Vec::new());
+    while let Some(folder) = folders.pop() {
+        for entry in std::fs::read_dir(&folder).unwrap() {
+            let path = entry.unwrap().path();
+            let relative = path.strip_prefix(&root).unwrap();
+            if relative.starts_with("bin") || relative == Path::new("lib.rs") {
+                continue;
+            }
+            if path.is_dir() {
+                folders.push(path);
+                continue;
+            }
+            let mut module: Vec<String> =
+                relative.with_extension("").iter().map(|s| s.to_str().unwrap().to_owned()).collect();
+            if module.last().unwrap() == "mod" {
+                module.pop();
+            }
+            if module.last().unwrap() == "tests" {
+                continue;
+            }
+            let text = without_tests(&std::fs::read_to_string(&path).unwrap());
+            found.push(File { path, module, text });
+        }
+    }
+    found.sort_by(|a, b| a.module.cmp(&b.module));
+    assert!(found.len() > 100, "{} files", found.len());
+    found
+}
+
+/// The text up to the module of tests, which is the last item of a file, without items for tests alone and comments.
+fn without_tests(text: &str) -> String {
+    let end = text.find("#[cfg(test)]\nmod tests").or(text.find("#[cfg(test)]\npub(super) mod tests"));
+    let mut out = String::new();
+    let mut lines = text[..end.unwrap_or(text.len())].lines();
+    while let Some(line) = lines.next() {
+        if line.trim() == "#[cfg(test)]" {
+            // An item at the same indentation, or one line.
+            let indent = line.len() - line.trim_start().len();
+            for line in lines.by_ref() {
+                let ends = line.trim_end().ends_with([';', '}']) && line.len() - line.trim_start().len() == indent;
+                if ends {
+                    break;
+                }
+            }
+            continue;
+        }
+        out.push_str(line.split("//").next().unwrap());
+        out.push('\n');
+    }
+    out
+}
+
+/// The paths below the crate that a file names, each as its segments. `{a, b::c}` is taken apart.
+fn paths(file: &File) -> BTreeSet<Vec<String>> {
+    let mut found = BTreeSet::new();
+    let text: String = file.text.clone();
+    for (start, _) in text.match_indices("crate::") {
+        let is_word = text[..start].chars().next_back().is_some_and(|c| c.is_alphanumeric() || c == '_' || c == '$');
+        if !is_word {
+            expand(&text[start + "crate::".len()..], &[], &mut found);
+        }
+    }
+    for (start, _) in text.match_indices("super::") {
+        // The first of a chain.
+        let before = text[..start].trim_end();
+        if before.ends_with("super::") || before.ends_with("in ") {
+            continue;
+        }
+        let mut rest = &text[start..];
+        let is_mod = file.path.file_name().unwrap() == "mod.rs";
+        let mut base = file.module.clone();
+        if !is_mod && !file.path.with_extension("").is_dir() {
+            base.pop();
+        } else {
+            base.pop();
+        }
+        rest = rest.strip_prefix("super::").unwrap();
+        while let Some(further) = rest.strip_prefix("super::") {
+            base.pop();
+            rest = further;
+        }
+        expand(rest, &base, &mut found);
+    }
+    found
+}
+
+fn expand(text: &str, before: &[String], found: &mut BTreeSet<Vec<String>>) {
+    let word: String = text.chars().take_while(|c| c.is_alphanumeric() || *c == '_').collect();
+    let mut path = before.to_vec();
+    if word.is_empty() {
+        let Some(inner) = text.strip_prefix('{') else {
+            found.insert(path);
+            return;
+        };
+        let (mut depth, mut start) = (1, 0);
+        for (i, c) in inner.char_indices() {
+            match c {
+                '{' => depth += 1,
+                '}' => depth -= 1,
+                _ => {}
+            }
+            if depth == 0 || (depth == 1 && c == ',') {
+                let item = inner[start..i].trim();
+                if !item.is_empty() {
+                    expand(item, before, found);
+                }
+                start = i + 1;
+            }
+            if depth == 0 {
+                break;
+            }
+        }
+        return;
+    }
+    path.push(word.clone());
+    match text[word.len()..].strip_prefix("::") {
+        Some(rest) => expand(rest, &path, found),
+        None => {
+            found.insert(path);
+        }
+    }
+}
+
+/// The floor of a path below the crate.
+fn floor(path: &[String]) -> Option<usize> {
+    let first = path.first()?.as_str();
+    let name = NAMES.iter().find(|(name, _)| *name == first).map_or(first, |(_, floor)| floor);
+    FLOORS.iter().position(|f| *f == name)
+}
+
+#[test]
+fn floors_import_only_from_those_above_them() {
+    let mut upward = Vec::new();
+    for file in files() {
+        let own = floor(&file.module).unwrap_or_else(|| panic!("{} is on no floor", file.path.display()));
+        for path in paths(&file) {
+            let Some(to) = floor(&path) else {
+                // A macro of the crate, or a name that has come from elsewhere.
+                assert!(path.len() < 2 || !FLOORS.contains(&path[0].as_str()), "{path:?}");
+                continue;
+            };
+            if to > own {
+                upward.push(format!("{} imports {}", file.module.join("::"), path.join("::")));
+            }
+        }
+    }
+    assert!(upward.is_empty(), "imports from lower floors:\n{}", upward.join("\n"));
+}
+
+/// Nodes that lie on a circle of edges.
+fn circles(edges: &BTreeMap<String, BTreeSet<String>>) -> Vec<String> {
+    let reaches = |from: &String| {
+        let (mut seen, mut open) = (BTreeSet::new(), vec![from]);
+        while let Some(n) = open.pop() {
+            for to in edges.get(n).into_iter().flatten() {
+                if seen.insert(to) {
+                    open.push(to);
+                }
+            }
+        }
+        seen
+    };
+    edges.keys().filter(|n| reaches(n).contains(n)).cloned().collect()
+}
+
+/// Edges between files, or between folders below the floors. A file's own folder, which re-exports it, does not count.
+fn edges(of: impl Fn(&[String]) -> String) -> BTreeMap<String, BTreeSet<String>> {
+    let all = files();
+    let modules: BTreeSet<Vec<String>> = all.iter().map(|f| f.module.clone()).collect();
+    let mut edges: BTreeMap<String, BTreeSet<String>> = BTreeMap::new();
+    for file in &all {
+        for path in paths(file) {
+            let mut path = path;
+            if let Some((_, floor)) = NAMES.iter().find(|(name, _)| path.first().is_some_and(|p| p == name))
+                && *floor == "base"
+                && path[0].chars().next().is_some_and(char::is_lowercase)
+            {
+                path.insert(0, "base".into());
+            }
+            // The longest prefix that is a file.
+            while !path.is_empty() && !modules.contains(&path) {
+                path.pop();
+            }
+            if path.is_empty() || path == file.module || file.module.starts_with(&path) {
+                continue;
+            }
+            let (from, to) = (of(&file.module), of(&path));
+            if from != to {
+                edges.entry(from).or_default().insert(to);
+            }
+        }
+    }
+    assert!(edges.len() > 5, "{edges:?}");
+    edges
+}
+
+#[test]
+fn folders_do_not_import_each_other_in_a_circle() {
+    let folder = |module: &[String]| {
+        let depth = if Path::new(env!("CARGO_MANIFEST_DIR")).join("src").join(module.join("/")).is_dir() {
+            module.len()
+        } else {
+            module.len() - 1
+        };
+        module[..depth.max(1)].join("::")
+    };
+    let found = circles(&edges(folder));
+    assert!(found.is_empty(), "folders in circles: {}", found.join(", "));
+}
+
+#[test]
+fn files_do_not_import_each_other_in_a_circle() {
+    let found = circles(&edges(|module| module.join("::")));
+    assert!(found.is_empty(), "files in circles: {}", found.join(", "));
+}
+
+#[test]
+fn the_parser_sees_what_it_is_for() {
+    let file = |module: &str, text: &str| File {
+        path: PathBuf::from(format!("src/{}.rs", module.replace("::", "/"))),
+        module: module.split("::").map(str::to_owned).collect(),
+        text: without_tests(text),
+    };
+    let of = |f: &File| paths(f).into_iter().map(|p| p.join("::")).collect::<Vec<_>>();
+    let text = "use crate::live::{self, Live, save::{A, B}};\nuse super::x::Y;\nlet a = crate::trace::offset(1);\n\
+                #[cfg(test)]\nfn t() {\n    crate::capi::no()\n}\n// crate::io\n#[cfg(test)]\nmod tests { use crate::io; }";
+    let expected = ["lightmap::x::Y", "live::Live", "live::save::A", "live::save::B", "live::self", "trace::offset"];
+    assert_eq!(of(&file("lightmap::bake", text)), expected);
+    assert_eq!(floor(&["Scene".into()]), floor(&["scene".into(), "x".into()]));
+    let edge = |a: &str, b: &str| (a.to_owned(), BTreeSet::from([b.to_owned()]));
+    assert_eq!(circles(&BTreeMap::from([edge("a", "b"), edge("b", "c"), edge("c", "b")])), ["b", "c"]);
+}

@@ -1,0 +1,26 @@
+//! Triangles: which are valid, and their normals.
+
+use glam::Vec3;
+
+/// "No triangle", "no chart", …: never a valid index.
+pub const NONE: u32 = u32::MAX;
+
+/// Coordinates up to this magnitude are valid: products of three of them stay finite in f32, as the
+/// triangle test needs.
+pub const MAX_COORDINATE: f32 = 1e12;
+
+/// Whether a triangle has finite corners in the valid range and an area. Corners on a line count as
+/// no area only if the f64 cross product is exactly zero: slivers are kept.
+#[inline]
+pub fn is_valid_triangle(corners: [Vec3; 3]) -> bool {
+    let in_range = corners.iter().all(|c| c.abs().max_element() <= MAX_COORDINATE && !c.is_nan());
+    let [a, b, c] = corners.map(|c| c.as_dvec3());
+    in_range && (b - a).cross(c - a).length_squared() > 0.0
+}
+
+/// Unit normal of a valid triangle, computed in f64.
+#[inline]
+pub fn unit_normal(corners: [Vec3; 3]) -> Vec3 {
+    let [a, b, c] = corners.map(|c| c.as_dvec3());
+    (b - a).cross(c - a).normalize_or_zero().as_vec3()
+}

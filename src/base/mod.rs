@@ -1,0 +1,11 @@
+//! What every floor uses: errors, progress, memory accounts, files, samples, geometry, and the state of threads that
+//! call or are called.
+
+pub(crate) mod callback;
+pub mod error;
+pub mod files;
+pub(crate) mod float_state;
+pub mod geometry;
+pub mod memory;
+pub mod progress;
+pub mod sampling;

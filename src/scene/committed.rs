@@ -1,0 +1,243 @@
+//! The committed scene: what it consists of, and its parts by number.
+
+use super::{
+    Emitter, Environment, Light, MAX_ALBEDO, Material, Mesh, SceneData, Sky, Texture, is_valid_triangle, unit_normal,
+};
+use crate::bvh::Tree;
+use crate::device::Device;
+use crate::error::{Result, invalid_argument};
+use crate::memory::Reservation;
+use glam::{Vec2, Vec3};
+use std::sync::{Arc, RwLock};
+
+/// Numbers about a committed scene.
+#[derive(Clone, Copy, Debug, Default)]
+pub struct SceneStats {
+    /// Triangles in all meshes.
+    pub triangles: u64,
+    /// Of those, degenerate or not finite at the commit, or since a refit: not in the tree, or in it and
+    /// never hit.
+    pub skipped_degenerate: u64,
+    /// 8-wide nodes.
+    pub nodes: u64,
+    /// Bytes of the acceleration structure.
+    pub bvh_bytes: u64,
+    /// Of these, of its nodes.
+    pub node_bytes: u64,
+    /// Bytes of the whole committed scene.
+    pub bytes: u64,
+    /// Surface area heuristic cost of the binary tree, traversal and intersection costing 1 each. A refit
+    /// leaves it as it was.
+    pub sah_cost: f32,
+    /// Wall time of the build.
+    pub build_seconds: f64,
+    /// Surface area heuristic cost of the 8-wide tree as it is now, per node and per triangle 1: compared with
+    /// its value after the commit, it tells how much a refitted tree has lost.
+    pub wide_sah_cost: f32,
+    /// Refits since the commit.
+    pub refits: u32,
+    /// Wall time of the last refit, 0 if there was none.
+    pub refit_seconds: f64,
+}
+
+/// A committed scene. Queries are safe from any number of threads.
+pub struct Scene {
+    pub(super) device: Arc<Device>,
+    pub(super) data: SceneData,
+    /// One for a scene and all copies that refits make of it: light maps go on following the lights.
+    pub(super) lights: Arc<RwLock<Arc<Vec<Light>>>>,
+    pub(super) emitters: Vec<Emitter>,
+    /// First global triangle number per mesh, and the total at the end.
+    pub(super) first_triangle: Vec<u32>,
+    pub(super) bounds: (Vec3, Vec3),
+    pub(super) tree: Tree,
+    /// Triangles that are not in the tree, ascending.
+    pub(super) skipped: Vec<u32>,
+    pub(super) uses: Uses,
+    pub(super) stats: SceneStats,
+    pub(super) _memory: Reservation,
+}
+
+/// What a scene uses of what materials can do.
+#[derive(Clone, Debug, Default, PartialEq)]
+pub(crate) struct Uses {
+    /// Whether a texture colours a surface.
+    pub textures: bool,
+    /// By material, whether it has holes; empty if none that a surface has does.
+    pub holes: Vec<bool>,
+    /// Whether light passes through a surface.
+    pub transmission: bool,
+    /// Whether a surface is opaque and shows one side only, as those of solids: light does not get behind it.
+    pub solids: bool,
+}
+
+impl Scene {
+    /// The device that the scene lives on.
+    pub fn device(&self) -> &Arc<Device> {
+        &self.device
+    }
+
+    /// The meshes, by number.
+    pub fn meshes(&self) -> &[Mesh] {
+        &self.data.meshes
+    }
+
+    /// The materials, by number.
+    pub fn materials(&self) -> &[Material] {
+        &self.data.materials
+    }
+
+    /// The textures, by number.
+    pub fn textures(&self) -> &[Arc<Texture>] {
+        &self.data.textures
+    }
+
+    /// What it uses of what materials can do.
+    #[inline]
+    pub(crate) fn uses(&self) -> &Uses {
+        &self.uses
+    }
+
+    /// The images of skies, by number.
+    pub fn environments(&self) -> &[Arc<Environment>] {
+        &self.data.environments
+    }
+
+    /// A snapshot of the lights, by number.
+    pub fn lights(&self) -> Arc<Vec<Light>> {
+        self.lights.read().unwrap_or_else(|e| e.into_inner()).clone()
+    }
+
+    /// A sky light as it is sampled; `None` for other lights.
+    pub fn sky(&self, light: &Light) -> Option<Sky> {
+        let Light::Sky { radiance, environment, up, rotation } = *light else { return None };
+        Some(Sky::new(radiance, environment, up, rotation, self.environments()))
+    }
+
+    /// Replaces light `id`. Bakes that are running keep the lights that they started with.
+    pub fn set_light(&self, id: u32, light: Light) -> Result<()> {
+        light.validate()?;
+        light.check_environment(self.environments().len())?;
+        let mut lights = self.lights.write().unwrap_or_else(|e| e.into_inner());
+        let count = lights.len();
+        if id as usize >= count {
+            return invalid_argument!("light {id} does not exist, the scene has {count}");
+        }
+        // A copy, if a bake holds them.
+        Arc::make_mut(&mut lights)[id as usize] = light.normalized();
+        Ok(())
+    }
+
+    /// The emissive triangles.
+    pub fn emitters(&self) -> &[Emitter] {
+        &self.emitters
+    }
+
+    /// Lower and upper corner of the bounding box of all valid triangles.
+    pub fn bounds(&self) -> (Vec3, Vec3) {
+        self.bounds
+    }
+
+    /// Length of the bounding box's diagonal.
+    pub fn diagonal(&self) -> f32 {
+        (self.bounds.1 - self.bounds.0).length()
+    }
+
+    /// Numbers about the scene.
+    pub fn stats(&self) -> &SceneStats {
+        &self.stats
+    }
+
+    /// Triangles in all meshes; global triangle numbers run below this.
+    pub fn triangle_count(&self) -> u32 {
+        *self.first_triangle.last().expect("never empty")
+    }
+
+    /// The mesh and the triangle in it of a global triangle number.
+    #[inline]
+    pub fn locate(&self, triangle: u32) -> (u32, u32) {
+        let mesh = self.first_triangle.partition_point(|&first| first <= triangle) - 1;
+        (mesh as u32, triangle - self.first_triangle[mesh])
+    }
+
+    /// The global number of a mesh's first triangle.
+    pub fn first_triangle(&self, mesh: u32) -> u32 {
+        self.first_triangle[mesh as usize]
+    }
+
+    /// The corners of a global triangle number.
+    #[inline]
+    pub fn corners(&self, triangle: u32) -> [Vec3; 3] {
+        let (m, t) = self.locate(triangle);
+        self.data.meshes[m as usize].corners(t as usize)
+    }
+
+    /// Whether a global triangle number is a valid triangle (not skipped by the build, and not made degenerate
+    /// by a refit).
+    pub fn is_valid(&self, triangle: u32) -> bool {
+        is_valid_triangle(self.corners(triangle)) && self.skipped.binary_search(&triangle).is_err()
+    }
+
+    /// The material of a global triangle number.
+    #[inline]
+    pub fn material(&self, triangle: u32) -> &Material {
+        &self.data.materials[self.material_id(triangle) as usize]
+    }
+
+    /// The material number of a global triangle number.
+    #[inline]
+    pub fn material_id(&self, triangle: u32) -> u32 {
+        let (m, t) = self.locate(triangle);
+        self.data.meshes[m as usize].material(t as usize)
+    }
+
+    /// Diffuse reflectance at a point of a global triangle number, with weights `u` and `v` of its corners 1
+    /// and 2: the material's, multiplied with its texture.
+    #[inline]
+    pub fn albedo(&self, triangle: u32, u: f32, v: f32) -> Vec3 {
+        let (m, t) = self.locate(triangle);
+        let mesh = &self.data.meshes[m as usize];
+        let material = &self.data.materials[mesh.material(t as usize) as usize];
+        self.albedo_at(material, || mesh.texture_coordinates(t as usize, u, v))
+    }
+
+    /// The same of a material at the texture coordinates that `uv` tells, which textured ones ask for.
+    #[inline]
+    pub(crate) fn albedo_at(&self, material: &Material, uv: impl FnOnce() -> Option<Vec2>) -> Vec3 {
+        let factor = Vec3::from(material.albedo);
+        match self.data.textures.get(material.albedo_texture as usize) {
+            None => factor,
+            Some(texture) => uv().map_or(factor, |uv| factor * texture.color(uv)).min(Vec3::splat(MAX_ALBEDO)),
+        }
+    }
+
+    /// Whether a point of a global triangle number, with weights `u` and `v` of its corners 1 and 2, is a hole.
+    pub fn is_hole(&self, triangle: u32, u: f32, v: f32) -> bool {
+        if self.uses.holes.is_empty() {
+            return false;
+        }
+        let (m, t) = self.locate(triangle);
+        let mesh = &self.data.meshes[m as usize];
+        let id = mesh.material(t as usize) as usize;
+        if !self.uses.holes[id] {
+            return false;
+        }
+        let material = &self.data.materials[id];
+        let texture = self.data.textures.get(material.albedo_texture as usize);
+        match (texture, mesh.texture_coordinates(t as usize, u, v)) {
+            (Some(texture), Some(uv)) => texture.alpha(uv) < material.alpha_cutoff,
+            _ => false,
+        }
+    }
+
+    /// Unit geometric normal of a global triangle number (f64 inside: right for slivers too).
+    #[inline]
+    pub fn normal(&self, triangle: u32) -> Vec3 {
+        unit_normal(self.corners(triangle))
+    }
+    /// The acceleration structure, with the first global triangle number per mesh and the total at the end.
+    #[inline]
+    pub(crate) fn acceleration(&self) -> (&Tree, &[u32]) {
+        (&self.tree, &self.first_triangle)
+    }
+}

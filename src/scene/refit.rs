@@ -1,0 +1,119 @@
+//! Refits: vertices move, the tree keeps its shape, and all that follows from positions follows.
+
+use super::emitters::{EMITTERS, add_emitters, emissive_triangles};
+use super::{Emitter, Scene, is_valid_triangle};
+use crate::bvh;
+use crate::device::LogLevel;
+use crate::error::{Error, Result, invalid_argument};
+use crate::memory::{try_to_vec, try_with_capacity};
+use glam::Vec3;
+use std::collections::HashMap;
+use std::sync::Arc;
+use std::time::Instant;
+
+/// What memory is for, in errors.
+const COPY: &str = "a copy of the scene to refit";
+
+impl Scene {
+    /// Moves vertices: `moved` names meshes and the new positions of all their vertices. (Of a mesh that is
+    /// named twice the last holds.) The tree keeps its shape and gets new boxes, which takes a fraction of a
+    /// commit; so it serves well as long as neighbours stay neighbours, and
+    /// [`wide_sah_cost`](SceneStats::wide_sah_cost) tells when a new commit would be better. Emitters, bounds
+    /// and numbers are renewed; shading normals, texture and light map coordinates stay as they were given.
+    ///
+    /// If `scene` is the only reference, it is changed in place; otherwise it is replaced by a copy, and who
+    /// holds the other references (light maps, live objects) keeps the old geometry and shares the lights.
+    ///
+    /// Triangles that become degenerate or not finite are not hit while they are; those that were so at the
+    /// commit are not in the tree and stay out whatever becomes of them. After a build with spatial splits,
+    /// boxes become those of whole triangles: right, but larger than before.
+    ///
+    /// Fails, and leaves `scene` as it was, if a mesh does not exist, has another number of vertices or is
+    /// strict and gets a degenerate triangle or a vertex that is not finite; if no triangle would be left that
+    /// a ray can hit; or if memory is refused.
+    pub fn refit(scene: &mut Arc<Scene>, moved: &[(u32, &[Vec3])]) -> Result<()> {
+        let start = Instant::now();
+        for &(mesh, positions) in moved {
+            scene.check_positions(mesh, positions)?;
+        }
+        if !scene.any_left(moved) {
+            return Err(Error::InvalidState("all triangles of the scene would be degenerate or not finite".into()));
+        }
+        // All memory before anything changes.
+        let emitters = try_with_capacity(emissive_triangles(&scene.data), EMITTERS)?;
+        let room = scene.tree.room_to_refit()?;
+        if Arc::get_mut(scene).is_none() {
+            *scene = Arc::new(scene.copy()?);
+        }
+        let device = scene.device.clone();
+        let scene = Arc::get_mut(scene).expect("a new Arc, or the only one");
+        for &(mesh, positions) in moved {
+            scene.data.meshes[mesh as usize].positions.copy_from_slice(positions);
+        }
+        device.install(|| scene.follow_positions(emitters, room));
+        scene.stats.refits += 1;
+        scene.stats.refit_seconds = start.elapsed().as_secs_f64();
+        Ok(())
+    }
+
+    /// Whether [`refit`](Self::refit) takes these positions for a mesh.
+    pub fn check_positions(&self, mesh: u32, positions: &[Vec3]) -> Result<()> {
+        let meshes = self.meshes();
+        match meshes.get(mesh as usize) {
+            None => invalid_argument!("mesh {mesh} does not exist, the scene has {}", meshes.len()),
+            Some(m) => m.check_positions(positions),
+        }
+    }
+
+    /// Whether a triangle of the tree could be hit with vertices moved.
+    fn any_left(&self, moved: &[(u32, &[Vec3])]) -> bool {
+        let new: HashMap<u32, &[Vec3]> = moved.iter().copied().collect();
+        (0..).zip(self.meshes()).zip(&self.first_triangle).any(|((m, mesh), &first)| {
+            let positions = new.get(&m).copied().unwrap_or(&mesh.positions);
+            (first..).zip(&mesh.indices).any(|(t, i)| {
+                is_valid_triangle(i.map(|i| positions[i as usize])) && self.skipped.binary_search(&t).is_err()
+            })
+        })
+    }
+
+    /// Brings up to date what follows from the positions. `emitters` has room for all there may be.
+    fn follow_positions(&mut self, mut emitters: Vec<Emitter>, room: bvh::RefitRoom) {
+        let (first, meshes) = (&self.first_triangle, &self.data.meshes);
+        let corners = |t: u32| {
+            let m = first.partition_point(|&first| first <= t) - 1;
+            meshes[m].corners((t - first[m]) as usize)
+        };
+        let out = self.tree.refit(&corners, room);
+        if !out.is_empty() {
+            let total = self.stats.triangles;
+            let message = format!("{} of {total} triangles are degenerate or not finite after the refit", out.len());
+            self.device.log(LogLevel::Warning, &message);
+        }
+        self.bounds = self.tree.bounds();
+        add_emitters(&self.data, &self.first_triangle, &self.skipped, &mut emitters);
+        self.emitters = emitters;
+        self.stats.skipped_degenerate = (self.skipped.len() + out.len()) as u64;
+        self.stats.wide_sah_cost = self.tree.sah_cost();
+        self.warn_of_few_digits();
+    }
+
+    /// A scene of its own that is equal, lights shared.
+    fn copy(&self) -> Result<Scene> {
+        // Textures and environments are shared.
+        let bytes = self.tree.bytes() + self.data.mesh_bytes();
+        let memory = self.device.memory().reserve(bytes, COPY)?;
+        Ok(Scene {
+            device: self.device.clone(),
+            data: self.data.try_clone()?,
+            lights: self.lights.clone(),
+            emitters: Vec::new(),
+            first_triangle: try_to_vec(&self.first_triangle, COPY)?,
+            bounds: self.bounds,
+            tree: self.tree.try_clone()?,
+            skipped: try_to_vec(&self.skipped, COPY)?,
+            uses: self.uses.clone(),
+            stats: self.stats,
+            _memory: memory,
+        })
+    }
+}

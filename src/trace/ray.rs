@@ -1,0 +1,99 @@
+//! Rays, packets of them, and hits.
+
+use crate::base::geometry::NONE;
+use bytemuck::{Pod, Zeroable};
+use glam::Vec3;
+
+/// A ray: points `origin + t · direction` with `tmin < t ≤ tmax`. The direction need not be
+/// normalised. A ray with a NaN, an origin beyond 1e18 or a zero direction hits nothing.
+#[derive(Clone, Copy, Debug, PartialEq, Pod, Zeroable)]
+#[repr(C)]
+pub struct Ray {
+    pub origin: [f32; 3],
+    pub tmin: f32,
+    pub direction: [f32; 3],
+    pub tmax: f32,
+}
+
+impl Ray {
+    /// The ray from `origin` along `direction` with `0 < t`.
+    pub fn new(origin: Vec3, direction: Vec3) -> Self {
+        Ray { origin: origin.to_array(), tmin: 0.0, direction: direction.to_array(), tmax: f32::INFINITY }
+    }
+
+    /// The same ray limited to `tmin < t ≤ tmax`.
+    pub fn within(self, tmin: f32, tmax: f32) -> Self {
+        Ray { tmin, tmax, ..self }
+    }
+}
+
+/// A hit by global triangle number, as kernels report it. A miss has `t = +inf`, triangle [`NONE`].
+#[derive(Clone, Copy, Debug, PartialEq)]
+pub struct RawHit {
+    pub t: f32,
+    /// Barycentric weight of vertex 1.
+    pub u: f32,
+    /// Barycentric weight of vertex 2.
+    pub v: f32,
+    /// Global triangle number.
+    pub triangle: u32,
+    /// Whether the ray met the front, from which the corners go round counter-clockwise.
+    pub front: bool,
+}
+
+impl RawHit {
+    /// No hit.
+    pub const MISS: RawHit = RawHit { t: f32::INFINITY, u: 0.0, v: 0.0, triangle: NONE, front: false };
+
+    /// Whether nothing was hit.
+    #[inline]
+    pub fn is_miss(&self) -> bool {
+        self.triangle == NONE
+    }
+}
+
+/// A hit by mesh and triangle, as callers see it.
+#[derive(Clone, Copy, Debug, PartialEq, Pod, Zeroable)]
+#[repr(C)]
+pub struct Hit {
+    pub t: f32,
+    pub u: f32,
+    pub v: f32,
+    pub triangle: u32,
+    pub mesh: u32,
+    pub instance: u32,
+}
+
+impl Hit {
+    /// No hit.
+    pub const MISS: Hit = Hit { t: f32::INFINITY, u: 0.0, v: 0.0, triangle: NONE, mesh: NONE, instance: NONE };
+}
+
+/// Rays in a gather packet.
+pub const PACKET_SIZE: usize = 32;
+
+/// Directions of up to [`PACKET_SIZE`] rays with one origin, component by component.
+#[derive(Clone, Copy, Debug)]
+#[repr(C, align(64))]
+pub struct Packet {
+    pub x: [f32; PACKET_SIZE],
+    pub y: [f32; PACKET_SIZE],
+    pub z: [f32; PACKET_SIZE],
+    /// How many of the directions count, from the first.
+    pub count: usize,
+}
+
+impl Default for Packet {
+    fn default() -> Self {
+        Packet { x: [0.0; PACKET_SIZE], y: [0.0; PACKET_SIZE], z: [0.0; PACKET_SIZE], count: 0 }
+    }
+}
+
+impl Packet {
+    /// Adds a direction. The packet must not be full.
+    #[inline]
+    pub fn push(&mut self, d: Vec3) {
+        (self.x[self.count], self.y[self.count], self.z[self.count]) = (d.x, d.y, d.z);
+        self.count += 1;
+    }
+}
