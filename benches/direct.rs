@@ -8,7 +8,7 @@
 mod common;
 
 use bakelite::bvh::BuildOptions;
-use bakelite::lightmap::direct::{DirectLight, Receiver};
+use bakelite::direct::{DirectLight, Receiver};
 use bakelite::sampling::{combine, sobol_2d, uniform, uniform_sphere, uniform_triangle};
 use bakelite::scene::Material;
 use bakelite::scene::shapes::MeshBuilder;

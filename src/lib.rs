@@ -32,6 +32,7 @@ pub(crate) mod base;
 pub mod bvh;
 pub mod capi;
 pub mod device;
+pub mod direct;
 #[cfg(feature = "io")]
 pub mod io;
 pub mod lightmap;

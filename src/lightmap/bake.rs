@@ -1,35 +1,27 @@
 //! The bake: stages in order, each with its share of progress, time and memory.
 
-use super::blur::Filling;
-use super::bright::Bright;
-use super::buried::Search;
-use super::chart_index::ChartIndex;
-use super::charts::{Charts, automatic_density};
-use super::direct::DirectLight;
-use super::gather::{Gathered, SampleSet};
-use super::layout::Layout;
-use super::map::ChartMap;
+use super::atlas::Atlas;
+use super::atlas::two_sided;
+use super::indirect::blur;
+use super::indirect::blur::Filling;
+use super::indirect::bright_patches::Bright;
+use super::indirect::find_bright_patches;
+use super::indirect::gather::Gathered;
+use super::indirect::radiance_map::{self, Radiance, RadianceInput, RadianceMap};
+use super::indirect::sample_set::SampleSet;
+use super::indirect::upsample::{OWN_RAYS, OwnLight, OwnRays, Upsampling};
 use super::plan::{Plan, left_out};
-use super::radiance::{self, Radiance, RadianceInput, RadianceMap};
 use super::saved::checkpoint::Checkpoint;
 use super::seams::Stitch;
-use super::seen::{self, Seen};
-use super::sides;
 use super::texel_light::{TexelLight, Variation};
-use super::texels::TexelMap;
-use super::upsample::{OWN_RAYS, OwnLight, OwnRays, Upsampling};
-use super::{
-    Atlas, BakeParams, BakeStats, CheckpointParams, Light, Lightmap, LightmapDesc, LightmapInfo, Origin, StageStats,
-    TexelState, blur,
-};
-use crate::device::LogLevel;
+use super::{BakeParams, BakeStats, CheckpointParams, Light, Lightmap, Origin, StageStats, TexelState};
+use crate::direct::DirectLight;
 use crate::error::{Error, Result, invalid_argument};
-use crate::memory::{try_collect, try_vec};
+use crate::memory::try_vec;
 use crate::photon::{PhotonMap, PhotonParams};
 use crate::progress::{Progress, Stage};
 use crate::sampling::{combine, purpose_seed};
 use crate::scene::Scene;
-use crate::scene::precision::too_few_digits;
 use glam::Vec3;
 use rayon::prelude::*;
 use std::ops::Range;
@@ -40,20 +32,11 @@ use std::time::Instant;
 /// Texels handed to a thread at a time.
 const BLOCK: usize = 256;
 
-/// Pages that a scene about fills if the caller leaves the density open.
-const AUTOMATIC_PAGES: f64 = 1.0;
-
 /// Bytes per gather texel while a bake runs: light, blurred light, normal, variance, whether it is valid.
 const GATHER_BYTES: usize = 3 * size_of::<Vec3>() + size_of::<f32>() + size_of::<bool>();
 
 /// Bytes per light map texel while a bake runs: direct and indirect light, what is known of it, whether direct light varies.
 const TEXEL_BYTES: usize = 2 * size_of::<Vec3>() + size_of::<TexelState>() + size_of::<Variation>();
-
-/// The offset of rays from surfaces from which on a warning is due, as a part of a texel.
-const OFFSET_PART: f32 = 0.25;
-
-/// Coarse maps of small light maps have pages of this size at least.
-const MIN_PAGE_SIZE: u32 = 64;
 
 /// What the random numbers of a bake are for.
 pub(crate) mod purpose {
@@ -76,91 +59,6 @@ const STORED_PER_TEXEL: u64 = 256;
 const RADIANCE_SAMPLE_DIVISOR: u32 = 4;
 
 impl Lightmap {
-    /// Unwraps what brings no usable UVs, lays out the pages and maps texels to triangles.
-    pub fn create(scene: &Arc<Scene>, desc: &LightmapDesc, progress: &Progress) -> Result<Lightmap> {
-        desc.validate()?;
-        scene.device().run(progress, || Self::lay_out(scene, desc, progress))
-    }
-
-    fn lay_out(scene: &Arc<Scene>, desc: &LightmapDesc, progress: &Progress) -> Result<Lightmap> {
-        let start = Instant::now();
-        let density = match desc.texels_per_unit {
-            0.0 => automatic_density(scene, desc.page_size, AUTOMATIC_PAGES),
-            d => d,
-        };
-        let (charts, mut uvs) = Charts::of_scene(scene, density, desc.page_size, desc.padding, progress)?;
-        let unwrap_seconds = start.elapsed().as_secs_f64();
-        let two_sided = (0..).zip(&charts.charts).filter(|(_, c)| c.two_sided).map(|(c, _)| c);
-        let two_sided: Vec<u32> = try_collect(two_sided, "the two-sided charts")?;
-        let pack = |divisor: u32, padding: u32, given: bool, with_backs: &[u32]| {
-            let page_size = if divisor == 1 { desc.page_size } else { (desc.page_size / divisor).max(MIN_PAGE_SIZE) };
-            Layout::pack(&charts, density / divisor as f32, page_size, padding, given, with_backs, progress)
-        };
-        let radiance = pack(desc.radiance_divisor, 0, false, &two_sided)?;
-        let stage = progress.stage("texels", 0.5, 0.6, TexelMap::work(&radiance));
-        let mut radiance = ChartMap::new(scene, &charts, radiance, &stage)?;
-        let texel = 1.0 / density;
-        let stage = progress.stage("sides", 0.6, 0.65, Seen::work(&radiance));
-        let seen = scene.device().install(|| Seen::count(scene, &charts, &radiance, texel, &stage))?;
-        let with_backs =
-            if desc.both_sides { sides::seen_from_both(&seen, &radiance, &two_sided)? } else { Vec::new() };
-        let map = pack(1, desc.padding, true, &with_backs)?;
-        let gather = pack(desc.gather_divisor, 0, false, &with_backs)?;
-        let stage = progress.stage("texels", 0.65, 0.8, TexelMap::work(&map) + TexelMap::work(&gather));
-        let mut map = ChartMap::new(scene, &charts, map, &stage)?;
-        let mut gather = ChartMap::new(scene, &charts, gather, &stage)?;
-        let placements = [&map, &gather, &radiance].map(|map| map.layout.placements.len() as u64);
-        let stage = progress.stage("buried texels", 0.8, 1.0, placements.iter().sum());
-        let near = texel.min(seen::ROOM * scene.diagonal());
-        let search = Search { scene, charts: &charts, seen: &seen, near };
-        let mut sight_rays = seen.rays;
-        let mut move_buried = |map: &mut ChartMap, by_parts: bool| -> Result<Vec<bool>> {
-            let (buried, rays) = scene.device().install(|| search.move_buried(map, by_parts, &stage))?;
-            sight_rays += rays;
-            Ok(buried)
-        };
-        move_buried(&mut radiance, true)?;
-        // The rest of a texel that is buried for the most part is a strip along what covers it, often darker than all
-        // around: gather texels are larger, and would spread that dark as a rim.
-        move_buried(&mut gather, false)?;
-        let buried = move_buried(&mut map, true)?;
-        uvs.overlapping_texels = map.texels.overlapping_texels;
-        uvs.reduced_charts = map.layout.reduced;
-        let index = ChartIndex::new(scene.device(), &charts)?;
-        let own_bytes = charts.bytes() + seen.bytes() + buried.len();
-        let bytes = own_bytes + index.bytes() + map.bytes() + gather.bytes() + radiance.bytes();
-        let info = LightmapInfo {
-            page_count: map.layout.page_count,
-            width: map.layout.page_size,
-            height: map.layout.page_size,
-            charts: charts.charts.len() as u32,
-            texels: map.len() as u64,
-            gather_texels: gather.len() as u64,
-            radiance_texels: radiance.len() as u64,
-            bytes: bytes as u64,
-            unwrap_seconds,
-            texels_per_unit: density,
-            uvs,
-            both_sided_charts: with_backs.len() as u32,
-            back_texels: (map.len() - map.back_start) as u64,
-            buried_texels: buried.iter().filter(|&&b| b).count() as u64,
-            open_places: seen.places,
-            sight_rays,
-        };
-        let memory = scene.device().memory().reserve(own_bytes, "the charts")?;
-        if let Some(message) = too_few_digits(scene, "texels", 1.0 / density, OFFSET_PART) {
-            scene.device().log(LogLevel::Warning, &message);
-        }
-        let direct = DirectLight::try_new(scene)?;
-        let mut plan =
-            Plan::new(scene, &direct, &BakeParams::default(), !two_sided.is_empty(), uvs.unwrapped_charts > 0);
-        plan.note_sides(&info);
-        let scene = scene.clone();
-        let padding = desc.padding;
-        let atlas = Atlas { scene, charts, index, map, gather, radiance, padding, info, seen, buried, _memory: memory };
-        Ok(Lightmap { atlas: Arc::new(atlas), plan, light: None })
-    }
-
     /// Runs the pipeline. On an error or a cancel what an earlier bake left stays as it was.
     pub fn bake(&mut self, params: &BakeParams, progress: &Progress) -> Result<BakeStats> {
         self.bake_with(params, None, progress)
@@ -368,9 +266,9 @@ impl Bake<'_, '_> {
             seed: purpose_seed(self.params.seed, purpose::RADIANCE),
         };
         let input = RadianceInput { light, photons };
-        let mut rays = radiance::bake(l.scene.device(), &input, &mut values, &stage)?;
+        let mut rays = radiance_map::bake(l.scene.device(), &input, &mut values, &stage)?;
         let mut radiance = Radiance { values, bright: Bright::default() };
-        l.scene.device().install(|| Bright::find(l, &mut radiance, &mut rays, self.progress))?;
+        l.scene.device().install(|| find_bright_patches::find(l, &mut radiance, &mut rays, self.progress))?;
         let bytes = (radiance.values.len() * size_of::<Vec3>() + l.radiance.bytes()) as u64;
         stats.radiance = StageStats { seconds: start.elapsed().as_secs_f64(), rays, bytes };
         Ok(radiance)
@@ -391,7 +289,7 @@ impl Bake<'_, '_> {
                 self.direct.irradiance(&receiver, 1, combine(self.params.seed as u32, s as u32), &mut 0).element_sum()
             }
         };
-        let backs = l.scene.device().install(|| sides::backs(l, light, self.progress))?;
+        let backs = l.scene.device().install(|| two_sided::backs(l, light, self.progress))?;
         if let Some(c) = self.checkpoint {
             c.keep_backs(&backs);
         }

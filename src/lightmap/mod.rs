@@ -4,53 +4,30 @@
 //! the gather map (indirect irradiance) and the radiance map (what gather rays see). A bake runs
 //! photons → radiance map → gather map → blur → upsampling, direct light and composition → stitching of seams.
 
-mod area;
+pub mod atlas;
 pub(crate) mod bake;
-pub mod blur;
-pub(crate) mod bright;
-mod buried;
-mod chart_index;
-pub mod charts;
-pub mod direct;
-mod distant;
-mod gaps;
-pub(crate) mod gather;
-pub mod layout;
-mod light_tree;
-mod many;
-pub(crate) mod map;
+mod create;
+pub mod indirect;
 pub mod plan;
-mod polygon;
-pub(crate) mod radiance;
-mod read;
+mod readback;
 pub(crate) mod saved;
 mod seams;
-mod seen;
-mod sides;
-mod spherical;
-mod terminator;
 pub(crate) mod texel_light;
-pub mod texels;
-mod unwrap;
-pub(crate) mod upsample;
-mod walls;
 
 use crate::error::{Result, invalid_argument};
 use crate::memory::Reservation;
 use crate::photon::MAX_PHOTONS;
 use crate::scene::Scene;
-use chart_index::ChartIndex;
-use charts::Charts;
+use atlas::Atlas;
+use atlas::charts::MAX_PAGE_SIZE;
 use glam::Vec3;
-use map::ChartMap;
+use indirect::blur;
+use indirect::radiance_map::Radiance;
 use plan::Plan;
-use radiance::Radiance;
-pub use read::MeshUvs;
+pub use readback::MeshUvs;
 pub use saved::CheckpointParams;
 use saved::fingerprint::Origin;
-use seen::Seen;
 use std::sync::Arc;
-use texel_light::TexelAreas;
 
 /// How a light map is laid out.
 #[derive(Clone, Copy, Debug, PartialEq)]
@@ -99,7 +76,7 @@ pub struct LightmapInfo {
     pub bytes: u64,
     pub unwrap_seconds: f64,
     pub texels_per_unit: f32,
-    pub uvs: charts::UvReport,
+    pub uvs: atlas::charts::UvReport,
     /// Charts with a second place for their backs.
     pub both_sided_charts: u32,
     /// Of `texels`, those of the second places.
@@ -276,60 +253,6 @@ struct Light {
     _memory: Reservation,
 }
 
-/// Charts and texels of a scene: all of a light map but its light. Does not change once made, and is
-/// shared with live updates.
-pub(crate) struct Atlas {
-    pub scene: Arc<Scene>,
-    pub charts: Charts,
-    pub index: ChartIndex,
-    pub map: ChartMap,
-    pub gather: ChartMap,
-    pub radiance: ChartMap,
-    pub padding: u32,
-    pub info: LightmapInfo,
-    pub seen: Seen,
-    /// Whether each texel of the light map has the place of another one. Empty if none has.
-    pub buried: Vec<bool>,
-    _memory: Reservation,
-}
-
-impl Atlas {
-    /// Whether a sample of the light map or the gather map shows the back: in a place of its own, or since
-    /// `backs` (per chart; empty: fronts) says so.
-    pub(crate) fn is_back(&self, map: &ChartMap, backs: &[bool], sample: usize) -> bool {
-        let chart = self.charts.chart_of[map.texels.samples[sample].triangle as usize];
-        map.is_back(sample) || backs.get(chart as usize).is_some_and(|&b| b)
-    }
-
-    /// The texels of one of the maps as areas.
-    pub(crate) fn areas<'a>(&'a self, map: &'a ChartMap) -> TexelAreas<'a> {
-        TexelAreas { scene: &self.scene, charts: &self.charts, index: &self.index, map }
-    }
-
-    /// A sample of the light map or the gather map as a receiver, on the side that it shows.
-    pub(crate) fn receiver(&self, map: &ChartMap, backs: &[bool], sample: usize) -> direct::Receiver {
-        map.receiver(&self.scene, sample, self.is_back(map, backs, sample)).1
-    }
-
-    /// Where a sample of the light map lies in its chart, which for a buried texel is not where its light is from.
-    pub(crate) fn texel_local(&self, placement: u32, sample: usize) -> [f32; 2] {
-        let t = &self.map.texels.samples[sample];
-        match self.buried.get(sample) {
-            Some(true) => self.map.layout.placements[placement as usize].local([t.x, t.y].map(|c| f32::from(c) + 0.5)),
-            _ => self.charts.local(t.triangle, t.u, t.v),
-        }
-    }
-
-    /// The gather texels around a sample of the light map, with their bilinear weights.
-    #[inline]
-    pub(crate) fn gather_around(&self, sample: usize, visit: impl FnMut(usize, f32)) {
-        let t = &self.map.texels.samples[sample];
-        // The gather map has the light map's placements.
-        let placement = self.map.placement_of(&self.charts, sample);
-        self.gather.bilinear(placement, self.charts.local(t.triangle, t.u, t.v), visit);
-    }
-}
-
 /// Light maps of a scene: layout, texels and, after [`bake`](Lightmap::bake), light.
 pub struct Lightmap {
     atlas: Arc<Atlas>,
@@ -343,8 +266,8 @@ impl LightmapDesc {
         if !(self.texels_per_unit >= 0.0 && self.texels_per_unit.is_finite()) {
             return invalid_argument!("texels_per_unit is {}, not a finite number ≥ 0", self.texels_per_unit);
         }
-        if !(16..=layout::MAX_PAGE_SIZE).contains(&self.page_size) {
-            return invalid_argument!("page_size is {}, outside 16 to {}", self.page_size, layout::MAX_PAGE_SIZE);
+        if !(16..=MAX_PAGE_SIZE).contains(&self.page_size) {
+            return invalid_argument!("page_size is {}, outside 16 to {}", self.page_size, MAX_PAGE_SIZE);
         }
         if !(1..=64).contains(&self.padding) || 4 * self.padding > self.page_size {
             return invalid_argument!("padding is {}, outside 1 to 64 or over a quarter of a page", self.padding);

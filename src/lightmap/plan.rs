@@ -1,9 +1,9 @@
 //! The plan of a bake: which stages and features a scene needs, and what is left out and why.
 
-use super::bright::Bright;
-use super::direct::DirectLight;
-use super::gather::ROUND;
+use super::indirect::bright_patches::Bright;
+use super::indirect::sample_set::ROUND;
 use super::{BakeParams, LightmapInfo};
+use crate::direct::DirectLight;
 use crate::scene::{Light, Scene};
 
 /// Bits of [`super::BakeStats::left_out`].

@@ -14,10 +14,11 @@
 //! Edges are compared by the positions of their ends: vertices on the middle of another triangle's
 //! edge are not found.
 
-use super::charts::float_key;
+use super::atlas::Atlas;
+use super::atlas::pieces::float_key;
+use super::atlas::texels::TexelSample;
 use super::plan::{Plan, left_out};
-use super::texels::TexelSample;
-use super::{Atlas, BakeParams, BakeStats, Light, Lightmap, TexelState};
+use super::{BakeParams, BakeStats, Light, Lightmap, TexelState};
 use crate::error::{Error, Result};
 use crate::memory::{
     Reservation, try_collect, try_filled, try_par_collect, try_par_filter, try_par_gather, try_push, try_to_vec,

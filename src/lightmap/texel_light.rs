@@ -15,11 +15,14 @@
 //! Whatever is looked at of neighbours is a function of their numbers alone: shards of a bake and tiles of live updates
 //! that compute it anew have the same bits.
 
-use super::chart_index::ChartIndex;
-use super::charts::Charts;
-use super::direct::{DirectLight, Lights, MAX_POINTS, PointLight, Receiver};
-use super::map::{ChartMap, receiver_of};
-use super::texels::TexelSample;
+use super::atlas::Atlas;
+use super::atlas::chart_index::ChartIndex;
+use super::atlas::chart_map::{ChartMap, receiver_of};
+use super::atlas::charts::Charts;
+use super::atlas::texels::TexelSample;
+use crate::direct::Receiver;
+use crate::direct::direct_light::{DirectLight, Lights, PointLight};
+use crate::direct::shadow_rays::MAX_POINTS;
 use crate::sampling::{combine, orthonormal_basis, sobol_2d};
 use crate::scene::{NONE, Scene};
 use crate::trace::Ray;
@@ -49,6 +52,13 @@ pub(crate) struct TexelAreas<'a> {
     pub charts: &'a Charts,
     pub index: &'a ChartIndex,
     pub map: &'a ChartMap,
+}
+
+impl Atlas {
+    /// The texels of one of the maps as areas.
+    pub(crate) fn areas<'a>(&'a self, map: &'a ChartMap) -> TexelAreas<'a> {
+        TexelAreas { scene: &self.scene, charts: &self.charts, index: &self.index, map }
+    }
 }
 
 impl TexelAreas<'_> {
@@ -514,11 +524,11 @@ mod tests {
             let atlas = map.atlas();
             let direct = DirectLight::new(&scene);
             let light = TexelLight { areas: atlas.areas(&atlas.radiance), direct: &direct, samples: 4, seed: 5 };
-            let input = super::super::radiance::RadianceInput { light, photons: None };
+            let input = crate::lightmap::indirect::radiance_map::RadianceInput { light, photons: None };
             let mut values = vec![Vec3::ZERO; atlas.radiance.len()];
             let progress = Progress::none();
             let stage = progress.stage("radiance", 0.0, 1.0, 1);
-            super::super::radiance::bake(scene.device(), &input, &mut values, &stage).unwrap();
+            crate::lightmap::indirect::radiance_map::bake(scene.device(), &input, &mut values, &stage).unwrap();
             // Texels are 0.4 wide, and 10 of them have the floor's width. Per metre of the slit:
             let on_floor = |s: &usize| atlas.radiance.texels.samples[*s].position(&scene).z.abs() < 0.5;
             let sum: f32 = (0..values.len()).filter(on_floor).map(|s| values[s].x * 0.16).sum();

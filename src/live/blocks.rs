@@ -6,9 +6,9 @@
 //! the detail grows, and what two LODs share at the border of two blocks has one value.
 
 use crate::error::{Error, Result};
-use crate::lightmap::Atlas;
-use crate::lightmap::gather::Gathered;
-use crate::lightmap::layout::Placement;
+use crate::lightmap::atlas::Atlas;
+use crate::lightmap::atlas::layout::Placement;
+use crate::lightmap::indirect::gather::Gathered;
 use crate::memory::try_vec;
 use crate::progress::Progress;
 use crate::scene::NONE;

@@ -6,7 +6,7 @@ use super::blocks::{BlockMap, Blocks, DirectTile, Rect, TILE};
 use super::in_parts;
 use super::relight::Illumination;
 use crate::error::{Error, Result};
-use crate::lightmap::blur::{Texels, Window};
+use crate::lightmap::indirect::blur::{Texels, Window};
 use crate::memory::try_vec;
 use crate::scene::NONE;
 use glam::Vec3;

@@ -27,11 +27,13 @@ pub use blocks::MAX_LODS;
 pub use cells::{CellInfo, NO_LOD};
 
 use crate::device::Device;
+use crate::direct::DirectLight;
 use crate::error::{Error, Result, invalid_argument};
 use crate::lightmap::bake::purpose;
-use crate::lightmap::direct::DirectLight;
-use crate::lightmap::gather::{Gathered, ROUND, SampleSet};
-use crate::lightmap::{BakeParams, Lightmap, blur::MAX_BLUR_RADIUS};
+use crate::lightmap::indirect::blur::MAX_BLUR_RADIUS;
+use crate::lightmap::indirect::gather::Gathered;
+use crate::lightmap::indirect::sample_set::{ROUND, SampleSet};
+use crate::lightmap::{BakeParams, Lightmap};
 use crate::memory::{Reservation, try_vec};
 use crate::progress::Progress;
 use crate::sampling::purpose_seed;

@@ -4,7 +4,7 @@ use super::blocks::{BlockMap, Rect};
 use super::display::Display;
 use super::{Live, PageRect};
 use crate::error::{Result, invalid_argument};
-use crate::lightmap::texels::PageArea;
+use crate::lightmap::atlas::texels::PageArea;
 use rayon::prelude::*;
 
 /// Side of a bin in texels. (16 is no faster: time goes to the search of the nearest texel in the padding.)
@@ -16,7 +16,7 @@ const ROWS: usize = 16;
 /// Rectangles of fewer texels are composed by the calling thread: waking others takes longer.
 const SMALL: usize = 4096;
 
-/// Groups of charts (see [`TexelMap::group_count`](crate::lightmap::texels::TexelMap)) by where they lie: bins of
+/// Groups of charts (see [`TexelMap::group_count`](crate::lightmap::atlas::texels::TexelMap)) by where they lie: bins of
 /// 64 × 64 texels of the pages.
 pub(super) struct ChartBins {
     /// Bins along a side of a page.

@@ -7,13 +7,14 @@
 //! them, Sponza showed 8 % error for a second): sides change with all photons only.
 
 use crate::device::{Device, DeviceOptions};
+use crate::direct::DirectLight;
 use crate::error::{Error, Result};
+use crate::lightmap::atlas::Atlas;
 use crate::lightmap::bake::Bake;
-use crate::lightmap::direct::DirectLight;
+use crate::lightmap::indirect::radiance_map::Radiance;
+use crate::lightmap::indirect::upsample::{OwnLight, Upsampling};
 use crate::lightmap::plan::{Plan, left_out};
-use crate::lightmap::radiance::Radiance;
-use crate::lightmap::upsample::{OwnLight, Upsampling};
-use crate::lightmap::{Atlas, BakeParams, BakeStats};
+use crate::lightmap::{BakeParams, BakeStats};
 use crate::progress::Progress;
 use glam::Vec3;
 use std::panic::{AssertUnwindSafe, catch_unwind};

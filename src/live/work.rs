@@ -6,8 +6,9 @@
 
 use super::blocks::{Block, BlockMap, BlockStatus, BlockWork, DirectTile, DirectWork, Tile};
 use super::relight::Illumination;
-use crate::lightmap::gather::{Gathered, ROUND, SampleSet};
-use crate::lightmap::radiance::RadianceMap;
+use crate::lightmap::indirect::gather::Gathered;
+use crate::lightmap::indirect::radiance_map::RadianceMap;
+use crate::lightmap::indirect::sample_set::{ROUND, SampleSet};
 use crate::lightmap::texel_light::TexelLight;
 use crate::memory::try_vec;
 use crate::sampling::combine;

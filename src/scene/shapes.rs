@@ -246,8 +246,8 @@ pub(crate) fn enclosed_volume(mesh: &Mesh) -> Option<f64> {
 
 #[cfg(test)]
 mod tests {
-    use crate::scene::is_valid_triangle;
     use super::*;
+    use crate::scene::is_valid_triangle;
 
     /// The volume that `build` encloses; fails if the mesh is open or has degenerate triangles.
     fn volume(build: impl Fn(&mut MeshBuilder)) -> f64 {

@@ -1,11 +1,11 @@
 //! Every query on every ISA against an f64 brute-force oracle.
 
 use super::*;
-use crate::scene::Scene;
-use glam::Vec3;
 use crate::sampling::{orthonormal_basis, sobol_2d, uniform, uniform_sphere};
+use crate::scene::Scene;
 use crate::{Device, DeviceOptions, Isa, Material, Mesh, Progress, SceneData};
 use glam::DVec3;
+use glam::Vec3;
 use proptest::prelude::*;
 use std::sync::Arc;
 

@@ -3,8 +3,8 @@
 //! light map alone. All show outgoing radiance, albedo/π · E plus emission, at the same exposure.
 
 use crate::font;
+use bakelite::direct::{DirectLight, Receiver};
 use bakelite::io::image::{auto_exposure, tone_map};
-use bakelite::lightmap::direct::{DirectLight, Receiver};
 use bakelite::lightmap::{Layer, Lightmap};
 use bakelite::reference::PathTracer;
 use bakelite::sampling::{combine, sobol_2d};

@@ -2,7 +2,7 @@
 //! runs with different seeds, bias and variance apart.
 
 use crate::quality_places;
-use bakelite::lightmap::texels::TexelSample;
+use bakelite::lightmap::atlas::texels::TexelSample;
 use bakelite::lightmap::{Layer, LayerData, Lightmap, MeshUvs};
 use bakelite::reference::{PathTracer, SurfacePoint};
 use bakelite::sampling::{uniform, uniform_sphere};

@@ -9,7 +9,7 @@ use crate::plot::{Plot, Series};
 use crate::quality_measure::{Errors, Points, Values, errors};
 use crate::quality_view::ViewReference;
 use crate::texel_paths::TexelPaths;
-use bakelite::lightmap::direct::{DirectLight, Receiver};
+use bakelite::direct::{DirectLight, Receiver};
 use bakelite::lightmap::{BakeParams, Layer, Lightmap, LightmapDesc};
 use bakelite::photon::{PhotonMap, PhotonParams};
 use bakelite::trace::PACKET_SIZE;

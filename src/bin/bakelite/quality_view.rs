@@ -4,8 +4,8 @@
 use crate::pictures::{PRIMARY_RAYS, background, missed, receiver, render, tone_mapped};
 use crate::ssim::ssim;
 use crate::texel_paths::TexelPaths;
+use bakelite::direct::DirectLight;
 use bakelite::io::image::auto_exposure;
-use bakelite::lightmap::direct::DirectLight;
 use bakelite::lightmap::{Layer, Lightmap};
 use bakelite::sampling::combine;
 use bakelite::scene::Camera;

@@ -5,7 +5,7 @@
 //! roulette, which also decides whether they pass a sheet that transmits, and the first direction of
 //! each texel is an Owen-scrambled Sobol sequence.
 
-use bakelite::lightmap::direct::{DirectLight, Receiver};
+use bakelite::direct::{DirectLight, Receiver};
 use bakelite::sampling::{combine, cosine_around, cosine_hemisphere, orthonormal_basis, sobol_2d, uniform};
 use bakelite::scene::NONE;
 use bakelite::trace::offset::{SurfacePoint, offset_ray_origin};

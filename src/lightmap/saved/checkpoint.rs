@@ -16,10 +16,11 @@ use super::result::is_light;
 use super::{another_kind, damaged, foreign};
 use crate::device::{Device, LogLevel};
 use crate::error::{Error, Result, invalid_argument};
-use crate::lightmap::bright::Bright;
-use crate::lightmap::radiance::Radiance;
-use crate::lightmap::upsample::OwnLight;
-use crate::lightmap::{Atlas, TexelState};
+use crate::lightmap::TexelState;
+use crate::lightmap::atlas::Atlas;
+use crate::lightmap::indirect::find_bright_patches;
+use crate::lightmap::indirect::radiance_map::Radiance;
+use crate::lightmap::indirect::upsample::OwnLight;
 use glam::Vec3;
 use std::collections::HashMap;
 use std::fs::{File, OpenOptions, TryLockError};
@@ -170,7 +171,7 @@ impl<'a> Checkpoint<'a> {
         if values.len() != atlas.radiance.len() || !is_light(&values) || !limit[0].is_finite() {
             return Ok(None);
         }
-        let bright = Bright::again(atlas, &values, limit[0], shadow_rays[0])?;
+        let bright = find_bright_patches::again(atlas, &values, limit[0], shadow_rays[0])?;
         Ok(Some(Radiance { values, bright }))
     }
 

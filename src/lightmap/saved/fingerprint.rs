@@ -1,8 +1,9 @@
 //! The fingerprint of a bake: what baked light depends on. Files whose fingerprint differs are refused, with a sentence
 //! that says in what.
 
-use crate::lightmap::map::ChartMap;
-use crate::lightmap::{Atlas, BakeParams};
+use crate::lightmap::BakeParams;
+use crate::lightmap::atlas::Atlas;
+use crate::lightmap::atlas::chart_map::ChartMap;
 use crate::scene::{Light, MeshMaterials, Scene};
 use bytemuck::{Pod, Zeroable};
 use std::fmt::Debug;

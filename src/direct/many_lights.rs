@@ -1,0 +1,185 @@
+//! Light of many lights, or of [bright patches](crate::lightmap::indirect::bright_patches): candidates from the light tree, of which a few get shadow rays.
+//!
+//! Resampled importance sampling (Talbot, Cline and Egbert, *Importance Resampling for Global
+//! Illumination*, 2005), with systematic sampling in both steps: a light that is due at least one
+//! candidate is one, with its exact share; the unoccluded light of the candidates is computed, and
+//! those that bring much of it get a ray each, the rest in proportion.
+//!
+//! Measured on Sponza with 1,000 point lights of powers over two decades (benches/direct.rs): relative
+//! MSE 1.8e-2 with 47 shadow rays, where lights chosen by power alone had 1.24 with 64 and 3.7e-2 with
+//! 1,024. With 1,000 emissive triangles: 4.5e-2 with 53 rays, by power 0.50 with 1,024. At equal time
+//! that is 10 to 40 times less error. Candidates per ray: 1 loses a factor of 2 on triangles at equal
+//! time, 4 to 16 are alike; on point lights all are.
+
+use super::area_light::AreaLight;
+use super::light_tree::{Bounds, LIGHT_TREE, LightTree};
+use super::point_light::point_light;
+use super::receiver::Receiver;
+use super::shadow_rays::{ShadowRays, shadow_ray};
+use crate::error::Result;
+use crate::memory::try_collect;
+use crate::sampling::{combine, sobol_2d};
+use crate::scene::Light;
+use glam::Vec3;
+use std::f32::consts::{FRAC_PI_2, PI};
+
+/// Candidates per shadow ray.
+const CANDIDATES: u32 = 8;
+
+#[derive(Clone, Copy)]
+enum Source {
+    /// A point or spot light.
+    Point(Light),
+    Area(AreaLight),
+    Patch(Patch),
+}
+
+/// A small part of a surface, as a light.
+#[derive(Clone, Copy)]
+pub(crate) struct Patch {
+    /// Off the surface.
+    pub position: Vec3,
+    /// On the side that shines.
+    pub normal: Vec3,
+    /// Radiance times area.
+    pub flux: Vec3,
+    /// It only shines on what is further away than this, squared.
+    pub near2: f32,
+}
+
+impl Patch {
+    /// Unoccluded irradiance.
+    fn light(&self, receiver: &Receiver) -> Option<Vec3> {
+        let way = self.position - receiver.origin;
+        let d2 = way.length_squared();
+        // (The square of d2 would overflow in scenes of 1e9 units.)
+        let direction = way / d2.sqrt();
+        let (here, there) = (direction.dot(receiver.normal), -direction.dot(self.normal));
+        (d2 > self.near2 && here > 0.0 && there > 0.0 && receiver.faces(way)).then(|| self.flux * (here * there / d2))
+    }
+}
+
+/// Lights that are sampled.
+pub(crate) struct ManyLights {
+    sources: Vec<Source>,
+    tree: LightTree,
+}
+
+/// A place on a light, and the light from there if nothing is in the way, divided by the
+/// probability of the candidate.
+struct Candidate {
+    target: Vec3,
+    light: Vec3,
+}
+
+impl ManyLights {
+    /// Of point and spot lights that shine, and area lights.
+    pub(crate) fn new(points: &[Light], areas: &[AreaLight]) -> Result<ManyLights> {
+        let sources = points.iter().map(|&p| Source::Point(p)).chain(areas.iter().map(|&a| Source::Area(a)));
+        ManyLights::of(try_collect(sources, LIGHT_TREE)?)
+    }
+
+    /// Of parts of surfaces.
+    pub(crate) fn of_patches(patches: Vec<Patch>) -> Result<ManyLights> {
+        ManyLights::of(try_collect(patches.into_iter().map(Source::Patch), LIGHT_TREE)?)
+    }
+
+    fn of(sources: Vec<Source>) -> Result<ManyLights> {
+        let bounds = try_collect(sources.iter().map(bounds), LIGHT_TREE)?;
+        Ok(ManyLights { tree: LightTree::new(&bounds)?, sources })
+    }
+
+    pub(crate) fn bytes(&self) -> usize {
+        size_of_val(&self.sources[..]) + self.tree.bytes()
+    }
+
+    pub(crate) fn len(&self) -> usize {
+        self.sources.len()
+    }
+
+    /// Pushes up to `n` shadow rays, whose sum is the irradiance without bias. Returns what it would be with
+    /// nothing in the way, summed over the channels.
+    pub(crate) fn push(&self, receiver: &Receiver, n: u32, seed: u32, shadow: &mut ShadowRays) -> f32 {
+        let candidates = self.candidates(receiver, n * CANDIDATES, seed);
+        let total: f32 = candidates.iter().map(|c| c.light.element_sum()).sum();
+        if !(total > 0.0 && total.is_finite()) {
+            return 0.0;
+        }
+        let mut at = sobol_2d(0, combine(seed, 3))[0] - 1.0;
+        for c in &candidates {
+            let due = c.light.element_sum() / total * n as f32;
+            at += due;
+            if due >= 1.0 {
+                shadow.push(shadow_ray(receiver, c.target), c.light);
+                // What it is due beyond a whole ray does not shift the others' chances.
+                at -= due;
+            } else if at >= 0.0 {
+                shadow.push(shadow_ray(receiver, c.target), c.light / due);
+                at -= 1.0;
+            }
+        }
+        total
+    }
+
+    fn candidates(&self, receiver: &Receiver, n: u32, seed: u32) -> Vec<Candidate> {
+        let mut candidates = Vec::with_capacity(n as usize);
+        let offset = sobol_2d(0, combine(seed, 1))[0];
+        let mut next = 0;
+        self.tree.sample((receiver.origin, receiver.normal), n, offset, &mut |light, due, count| {
+            // A light that is due several gets them rounded down or up and divides its light among them.
+            let share = 1.0 / if due >= 1.0 { count as f32 } else { due };
+            match &self.sources[light] {
+                Source::Point(light) => {
+                    if let Some((target, light)) = point_light(light, receiver) {
+                        candidates.push(Candidate { target, light: light * (share * count as f32) });
+                    }
+                }
+                Source::Patch(patch) => {
+                    if let Some(light) = patch.light(receiver) {
+                        candidates.push(Candidate { target: patch.position, light: light * (share * count as f32) });
+                    }
+                }
+                Source::Area(area) => {
+                    let Some(sampler) = area.sampler(receiver) else { return };
+                    for _ in 0..count {
+                        let (target, weight) = area.sample(&sampler, receiver, sobol_2d(next, combine(seed, 2)));
+                        next += 1;
+                        if weight > 0.0 && weight.is_finite() {
+                            candidates.push(Candidate { target, light: area.radiance * (weight * share) });
+                        }
+                    }
+                }
+            }
+        });
+        candidates
+    }
+}
+
+fn bounds(source: &Source) -> Bounds {
+    let everywhere =
+        |position| Bounds { lower: position, upper: position, axis: Vec3::Z, spread: PI, reach: 0.0, power: 0.0 };
+    match *source {
+        Source::Point(Light::Spot { position, direction, outer, intensity, .. }) => Bounds {
+            axis: direction,
+            spread: outer,
+            power: Vec3::from(intensity).element_sum(),
+            ..everywhere(position)
+        },
+        Source::Point(Light::Point { position, intensity }) => {
+            Bounds { power: Vec3::from(intensity).element_sum(), ..everywhere(position) }
+        }
+        Source::Point(_) => unreachable!("only point and spot lights are made points"),
+        Source::Patch(p) => Bounds {
+            axis: p.normal,
+            spread: 0.0,
+            reach: FRAC_PI_2,
+            power: p.flux.element_sum(),
+            ..everywhere(p.position)
+        },
+        Source::Area(a) => {
+            let (lower, upper) = a.bounds();
+            let spread = if a.two_sided { PI } else { 0.0 };
+            Bounds { lower, upper, axis: a.normal, spread, reach: FRAC_PI_2, power: a.radiance.element_sum() * a.area }
+        }
+    }
+}

@@ -1,0 +1,375 @@
+//! Texels that nobody can see: inside solids, below what stands on their surface, behind mouldings, in hollow walls.
+//!
+//! What they get is not the light of the surface beside them that is seen, and bilinear reading and interpolation would
+//! bring it there: dark rims where walls meet, light that leaks below them. So they are not computed: each takes the
+//! place of the nearest texel of its chart that can be seen, in the light map, the gather map and the radiance map alike,
+//! unless another point of the texel itself can be seen.
+//! All that follows, bakes and live updates, finds them there and needs to know nothing of it.
+//!
+//! A texel is buried if, from the side that it shows, almost all rays end within about a texel, on the backs of one-sided
+//! surfaces, or on sides that no [open place](super::seen) sees, or most on such backs.
+
+use super::chart_map::ChartMap;
+use super::charts::Charts;
+use super::seen::Seen;
+use super::texels::TexelSample;
+use crate::error::Result;
+use crate::memory::{try_append, try_collect, try_par_collect, try_push, try_vec};
+use crate::progress::Stage;
+use crate::sampling::{cosine_around, sobol_2d};
+use crate::scene::{NONE, Scene};
+use crate::trace::{RawHit, Ray};
+use glam::{Mat2, Vec2};
+use rayon::prelude::*;
+use std::ops::Range;
+
+/// Rays that decide, at most.
+const RAYS: u32 = 16;
+
+/// So many that end in the open tell that a texel is seen, unless more than half end on backs.
+const OPEN: u32 = 3;
+
+/// A first ray that gets so many times as far into the open decides alone: most texels take one ray.
+const AT_ONCE: f32 = 4.0;
+
+/// Other points of a texel that are looked at if its sample's is buried, and how many are tried that may lie beside its
+/// triangle.
+const POINTS: usize = 4;
+const POINT_TRIES: u32 = 32;
+
+/// Rounds of filling: texels farther than this from all that is seen stay where they are.
+const MAX_ROUNDS: usize = 64;
+
+const BURIED: &str = "which texels are buried";
+
+/// What deciding reads.
+#[derive(Clone, Copy)]
+pub(in crate::lightmap) struct Search<'a> {
+    pub scene: &'a Scene,
+    pub charts: &'a Charts,
+    pub seen: &'a Seen,
+    /// Nothing nearer is light from the open: the width of a texel of the light map.
+    pub near: f32,
+}
+
+impl Search<'_> {
+    /// Moves the buried texels of a map to the nearest that are seen, and tells which they are; none if the list is empty.
+    /// `by_parts`: those of which another point can be seen move there instead. Others of a placement without any seen
+    /// texel do so anyhow. Advances `stage` by one per placement, and counts `rays`. To be called on the device's threads.
+    pub fn move_buried(&self, map: &mut ChartMap, by_parts: bool, stage: &Stage) -> Result<(Vec<bool>, u64)> {
+        let of_placement = |placement: u32| {
+            let found = self.in_placement(map, placement, by_parts, stage)?;
+            stage.advance(1)?;
+            Ok(found)
+        };
+        let placements = 0..map.layout.placements.len() as u32;
+        let mut found = try_par_collect(placements.into_par_iter().map(of_placement), BURIED)?;
+        if let Some(failed) = found.iter_mut().find(|f| f.is_err()) {
+            return Err(std::mem::replace(failed, Ok(Found::default())).err().expect("it failed"));
+        }
+        let found = || found.iter().flatten();
+        let rays = found().map(|f| f.rays).sum();
+        for &(sample, point) in found().flat_map(|f| &f.seen_parts) {
+            map.texels.samples[sample as usize] = point;
+        }
+        if found().all(|f| f.moved.is_empty()) {
+            return Ok((Vec::new(), rays));
+        }
+        let mut is_moved = try_vec(map.len(), BURIED)?;
+        for &(sample, to) in found().flat_map(|f| &f.moved) {
+            let to = map.texels.samples[to as usize];
+            let texel = &mut map.texels.samples[sample as usize];
+            (texel.triangle, texel.u, texel.v) = (to.triangle, to.u, to.v);
+            is_moved[sample as usize] = true;
+        }
+        Ok((is_moved, rays))
+    }
+
+    fn in_placement(&self, map: &ChartMap, placement: u32, by_parts: bool, stage: &Stage) -> Result<Found> {
+        let mut found = Found::default();
+        let chart = map.layout.chart_of(placement);
+        let is_back = match map.layout.is_back(placement) {
+            true => true,
+            false if !self.charts.charts[chart as usize].two_sided || map.layout.back(chart).is_some() => false,
+            // Which side is shown is for the bake to choose where nobody looks.
+            false => match self.seen.shows_back(chart) {
+                Some(back) => back,
+                None => return Ok(found),
+            },
+        };
+        let samples = map.samples_of(placement);
+        let mut buried = Vec::new();
+        for (i, sample) in samples.clone().enumerate() {
+            if i % 256 == 0 {
+                stage.advance(0)?;
+            }
+            if self.is_buried(&map.texels.samples[sample], sample as u32, is_back, &mut found.rays) {
+                try_push(&mut buried, sample as u32, BURIED)?;
+            }
+        }
+        if by_parts || buried.len() == samples.len() {
+            self.find_seen_parts(map, placement, is_back, &samples, &mut buried, &mut found)?;
+        }
+        if !buried.is_empty() && buried.len() < samples.len() {
+            found.moved = nearest_seen(map, placement, samples, buried)?;
+        }
+        Ok(found)
+    }
+
+    /// Takes those texels from the `buried` ones of which another point can be seen, and notes it.
+    fn find_seen_parts(
+        &self,
+        map: &ChartMap,
+        placement: u32,
+        back: bool,
+        samples: &Range<usize>,
+        buried: &mut Vec<u32>,
+        found: &mut Found,
+    ) -> Result<()> {
+        if buried.is_empty() {
+            return Ok(());
+        }
+        let mut is_buried = try_vec(samples.len(), BURIED)?;
+        let mut result = Ok(());
+        buried.iter().for_each(|&s| is_buried[s as usize - samples.start] = true);
+        buried.retain(|&s| {
+            let (x, y) = map.position(s as usize);
+            // Deep among buried ones nothing can be seen of a texel.
+            let is_at_border = (-1..=1).flat_map(|dy| (-1..=1).map(move |dx| (x + dx, y + dy))).any(|(x, y)| {
+                let neighbour = map.at(placement, x, y);
+                !samples.contains(&(neighbour as usize)) || !is_buried[neighbour as usize - samples.start]
+            });
+            let points =
+                if is_at_border { points_of_texel(self.charts, map, placement, s as usize) } else { Vec::new() };
+            let seen = points.into_iter().find(|point| !self.is_buried(point, s, back, &mut found.rays));
+            if let Some(point) = seen {
+                result = result.clone().and_then(|()| try_push(&mut found.seen_parts, (s, point), BURIED));
+            }
+            seen.is_none()
+        });
+        result
+    }
+
+    fn is_buried(&self, point: &TexelSample, sample: u32, back: bool, rays: &mut u64) -> bool {
+        let (_, receiver) = super::chart_map::receiver_of(self.scene, point, back);
+        let (mut open, mut backs) = (0, 0);
+        for i in 0..RAYS {
+            let d = cosine_around(receiver.geometric, sobol_2d(i, sample));
+            let hit = self.scene.intersect_raw(&Ray::new(receiver.origin, d));
+            *rays += 1;
+            match self.seen_by(&hit) {
+                Sight::Open if i == 0 && hit.t > AT_ONCE * self.near => return false,
+                Sight::Open => open += 1,
+                Sight::Back => backs += 1,
+                Sight::Covered => {}
+            }
+            if open == OPEN && backs == 0 {
+                return false;
+            }
+        }
+        open < OPEN || 2 * backs > RAYS
+    }
+
+    fn seen_by(&self, hit: &RawHit) -> Sight {
+        if hit.is_miss() {
+            return Sight::Open;
+        }
+        let material = self.scene.material(hit.triangle);
+        if !hit.front && !material.two_sided && !material.transmits() {
+            return Sight::Back;
+        }
+        let chart = self.charts.chart_of[hit.triangle as usize];
+        if hit.t <= self.near || self.seen.is_hidden(chart, hit.front) { Sight::Covered } else { Sight::Open }
+    }
+}
+
+/// Where a ray ends.
+enum Sight {
+    Open,
+    /// On the back of a one-sided surface.
+    Back,
+    /// Within a texel, or on a side that no open place sees.
+    Covered,
+}
+
+#[derive(Default)]
+struct Found {
+    /// Buried texels and those whose places they take.
+    moved: Vec<(u32, u32)>,
+    /// Texels that can be seen, but not where their samples are, and where else.
+    seen_parts: Vec<(u32, TexelSample)>,
+    rays: u64,
+}
+
+/// Some points of what a texel holds of its sample's triangle.
+fn points_of_texel(charts: &Charts, map: &ChartMap, placement: u32, sample: usize) -> Vec<TexelSample> {
+    let texel = map.texels.samples[sample];
+    let place = |u, v| Vec2::from(map.layout.texel_coord(placement, charts.local(texel.triangle, u, v)));
+    let origin = place(0.0, 0.0);
+    let weights = Mat2::from_cols(place(1.0, 0.0) - origin, place(0.0, 1.0) - origin).inverse();
+    let corner = Vec2::new(f32::from(texel.x), f32::from(texel.y)) - origin;
+    let point = |i| weights * (corner + Vec2::from(sobol_2d(i, sample as u32)));
+    let points = (0..POINT_TRIES).map(point).filter(|w| w.min_element() >= 0.0 && w.x + w.y <= 1.0);
+    points.map(|w| TexelSample { u: w.x, v: w.y, ..texel }).take(POINTS).collect()
+}
+
+/// The nearest texels that are seen to those `buried`, ring by ring.
+fn nearest_seen(map: &ChartMap, placement: u32, samples: Range<usize>, buried: Vec<u32>) -> Result<Vec<(u32, u32)>> {
+    let local = |s: u32| s as usize - samples.start;
+    let mut to: Vec<u32> = try_collect(samples.clone().map(|s| s as u32), BURIED)?;
+    buried.iter().for_each(|&s| to[local(s)] = NONE);
+    let (mut missing, mut moved) = (buried, Vec::new());
+    for _ in 0..MAX_ROUNDS {
+        let nearest = |&s: &u32| -> Option<(u32, u32)> {
+            let (ox, oy) = map.position(s as usize);
+            let around = (-1..=1).flat_map(|dy| (-1..=1).map(move |dx| (ox + dx, oy + dy)));
+            let known = around.filter_map(|(x, y)| {
+                let neighbour = map.at(placement, x, y);
+                // Among given charts there may be another one.
+                let is_own = neighbour != NONE && samples.contains(&(neighbour as usize));
+                let known = is_own.then(|| to[local(neighbour)]).filter(|&t| t != NONE)?;
+                let (kx, ky) = map.position(known as usize);
+                Some(((kx - ox).pow(2) + (ky - oy).pow(2), known))
+            });
+            known.min().map(|(_, known)| (s, known))
+        };
+        let ring: Vec<(u32, u32)> = try_collect(missing.iter().filter_map(nearest), BURIED)?;
+        if ring.is_empty() {
+            break;
+        }
+        ring.iter().for_each(|&(s, known)| to[local(s)] = known);
+        missing.retain(|&s| to[local(s)] == NONE);
+        try_append(&mut moved, &ring, BURIED)?;
+    }
+    Ok(moved)
+}
+
+#[cfg(test)]
+mod tests {
+    use crate::lightmap::{Lightmap, LightmapDesc};
+    use crate::progress::Progress;
+    use crate::scene::shapes::MeshBuilder;
+    use crate::scene::{Light, Material, SceneData};
+    use glam::{Mat2, Vec2, Vec3};
+
+    /// The light map of a room of 4 × 3 × 4 m, of sheets or of a solid's inside, with a closed box in it.
+    fn room(two_sided: bool, [lower, upper]: [Vec3; 2]) -> Lightmap {
+        let mut data = SceneData::new();
+        let m = data.add_material(Material { two_sided, ..Default::default() }).unwrap();
+        for (lower, upper, inward) in [(Vec3::ZERO, Vec3::new(4.0, 3.0, 4.0), true), (lower, upper, false)] {
+            let mut builder = MeshBuilder::new();
+            builder.box_(lower, upper, inward, m);
+            data.add_mesh(builder.finish()).unwrap();
+        }
+        data.add_light(Light::Point { position: Vec3::new(2.0, 2.5, 3.5), intensity: [9.0; 3] }).unwrap();
+        let desc = LightmapDesc { texels_per_unit: 20.0, ..Default::default() };
+        Lightmap::create(&data.committed(), &desc, &Progress::none()).unwrap()
+    }
+
+    /// Texels of the room's floor and walls whose centres `is_covered` by the box and that are, or are not, buried.
+    fn counted(lightmap: &Lightmap, is_covered: impl Fn(Vec3) -> bool) -> [usize; 2] {
+        let atlas = lightmap.atlas();
+        let mut n = [0; 2];
+        for placement in 0..atlas.map.layout.placements.len() as u32 {
+            for s in atlas.map.samples_of(placement) {
+                if atlas.map.is_back(s) {
+                    continue;
+                }
+                // The centre, wherever the texel's light is from.
+                let local = Vec2::from(atlas.texel_local(placement, s));
+                let chart = atlas.map.layout.chart_of(placement);
+                let place = atlas.charts.triangles_of(chart).iter().filter(|&&t| t < 12).find_map(|&t| {
+                    let [a, b, c] = atlas.charts.corners[t as usize].map(Vec2::from);
+                    let w = Mat2::from_cols(b - a, c - a).inverse() * (local - a);
+                    let [p, q, r] = atlas.scene.corners(t);
+                    let is_in = w.min_element() > -1e-3 && w.x + w.y < 1.001;
+                    is_in.then(|| p + (q - p) * w.x + (r - p) * w.y)
+                });
+                if place.is_some_and(&is_covered) {
+                    n[usize::from(atlas.buried.get(s) == Some(&true))] += 1;
+                }
+            }
+        }
+        n
+    }
+
+    #[test]
+    fn the_floor_below_a_box_is_buried_and_takes_its_light_from_beside_it() {
+        let (lower, upper) = (Vec3::new(1.0, -0.1, 1.0), Vec3::new(1.6, 1.0, 1.6));
+        for two_sided in [false, true] {
+            let lightmap = room(two_sided, [lower, upper]);
+            let below = |margin: f32| {
+                move |p: Vec3| {
+                    p.y < 0.01
+                        && p.x > lower.x + margin
+                        && p.x < upper.x - margin
+                        && p.z > lower.z + margin
+                        && p.z < upper.z - margin
+                }
+            };
+            let [seen, buried] = counted(&lightmap, below(0.05));
+            // A box that one fits into, of sheets, has a floor that could be seen.
+            if two_sided {
+                assert!(seen > 80, "{seen} {buried}");
+                continue;
+            }
+            assert!(buried > 80 && seen == 0, "{seen} {buried}");
+            let [_, elsewhere] = counted(&lightmap, |p| !below(-0.05)(p));
+            assert_eq!(elsewhere, 0);
+            let atlas = lightmap.atlas();
+            for s in (0..atlas.map.len()).filter(|&s| atlas.buried[s]) {
+                let p = atlas.map.surface(&atlas.scene, s).0;
+                assert!(!below(0.0)(p) && below(-0.11)(p) || p.y < 0.0, "{p}");
+            }
+        }
+    }
+
+    #[test]
+    fn a_strip_of_floor_in_a_hollow_wall_of_sheets_is_buried() {
+        let (lower, upper) = (Vec3::new(1.0, -0.01, -0.01), Vec3::new(1.08, 3.01, 4.01));
+        let lightmap = room(true, [lower, upper]);
+        let [seen, buried] = counted(&lightmap, |p| p.y < 0.01 && p.x > 1.02 && p.x < 1.06);
+        // Some see the wall's ends.
+        assert!(buried > 8 * seen && buried > 60, "{seen} {buried}");
+        let [_, elsewhere] = counted(&lightmap, |p| p.x < 0.97 || p.x > 1.11);
+        assert_eq!(elsewhere, 0);
+    }
+
+    #[test]
+    fn what_a_wardrobe_5_mm_off_the_wall_covers_is_buried_and_what_one_a_hand_off_covers_is_not() {
+        for (gap, expected) in [(0.005, true), (0.15, false)] {
+            let lightmap = room(false, [Vec3::new(gap, 0.0, 1.0), Vec3::new(0.6, 2.0, 2.0)]);
+            let [seen, buried] =
+                counted(&lightmap, |p| p.x < 0.001 && p.y > 0.1 && p.y < 1.9 && p.z > 1.1 && p.z < 1.9);
+            assert!(if expected { buried > 9 * seen } else { buried * 50 < seen }, "{gap}: {seen} {buried}");
+        }
+    }
+
+    /// A wall between two rooms, and a poster 5 mm behind a part of it.
+    #[test]
+    fn a_back_with_a_place_of_its_own_has_buried_texels_of_its_own() {
+        let mut data = SceneData::new();
+        let m = data.add_material(Material { two_sided: true, ..Default::default() }).unwrap();
+        let quad = |size: f32, z: f32| {
+            let p = |x: f32, y: f32| Vec3::new(x, y, z);
+            let mut builder = MeshBuilder::new();
+            builder.quad(p(-size, -size), p(size, -size), p(size, size), p(-size, size), m);
+            builder.finish()
+        };
+        data.add_mesh(quad(2.0, 0.0)).unwrap();
+        data.add_mesh(quad(0.8, -0.005)).unwrap();
+        let mut room = MeshBuilder::new();
+        room.box_(Vec3::splat(-2.0), Vec3::splat(2.0), true, m);
+        data.add_mesh(room.finish()).unwrap();
+        let desc = LightmapDesc { texels_per_unit: 20.0, ..Default::default() };
+        let lightmap = Lightmap::create(&data.committed(), &desc, &Progress::none()).unwrap();
+        let atlas = lightmap.atlas();
+        let wall = atlas.charts.chart_of[0];
+        let back = atlas.map.layout.back(wall).unwrap();
+        let buried = |placement: u32| atlas.map.samples_of(placement).filter(|&s| atlas.buried[s]).count();
+        assert_eq!(buried(wall), 0);
+        // 32 × 32 texels lie behind it.
+        assert!((900..1100).contains(&buried(back)), "{}", buried(back));
+        assert_eq!(lightmap.info().buried_texels, (buried(back) + buried(atlas.charts.chart_of[2])) as u64);
+    }
+}

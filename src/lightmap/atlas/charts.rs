@@ -1,0 +1,388 @@
+//! Charts: pieces of surface that are flat in the light map (thesis 3.2.3).
+//!
+//! Charts come from the caller's UVs where those are usable, else from [`super::unwrap`]. They know
+//! nothing of texels: their coordinates are in scene units, and each map packs them at its own
+//! density ([`super::layout`]).
+
+pub use super::pieces::Given;
+use super::pieces::{CHARTS, Groups, Piece, connected, float_key, surface_kind};
+use super::unwrap;
+use crate::device::LogLevel;
+use crate::error::{Error, Result, invalid_argument};
+use crate::memory::{try_collect, try_filled, try_push, try_with_capacity};
+use crate::progress::{Progress, Stage};
+use crate::scene::{LightmapUvs, Mesh, NONE, Scene};
+use glam::{DVec2, Vec2};
+use std::collections::BTreeMap;
+use std::ops::Range;
+use std::time::Instant;
+
+/// The most texels in all pages of a map. Samples and indices of as many take 10 GB.
+pub const MAX_TEXELS: u64 = 1 << 29;
+
+/// The largest page, in texels along an axis: texels are addressed in 16 bits.
+pub const MAX_PAGE_SIZE: u32 = 16384;
+
+/// Triangles whose UVs cover a page more than this many times over cannot have been meant to be
+/// unique (an engine's per-mesh UVs without page numbers, say): they are unwrapped instead. Below
+/// it overlaps are taken for the caller's affair and counted.
+const MAX_PAGE_COVER: f64 = 2.0;
+
+/// A piece of surface with continuous texture coordinates.
+#[derive(Clone, Debug, PartialEq)]
+pub struct Chart {
+    /// Its triangles, as a range of [`Charts::triangles`].
+    pub triangles: Range<u32>,
+    /// Extent of its local coordinates, which start at (0, 0), in scene units.
+    pub size: [f32; 2],
+    /// Surface area, in squared scene units.
+    pub area: f32,
+    /// Whether its material is two-sided.
+    pub two_sided: bool,
+    /// Where the caller's UVs put it in the light map.
+    pub given: Option<Given>,
+}
+
+/// What was found about UVs. Counts of triangles unless said otherwise.
+#[derive(Clone, Copy, Debug, Default, PartialEq)]
+pub struct UvReport {
+    /// Charts taken from the caller's UVs.
+    pub given_charts: u32,
+    /// Charts made by unwrapping.
+    pub unwrapped_charts: u32,
+    /// With UVs outside [0, 1] or not finite; unwrapped instead.
+    pub out_of_range: u64,
+    /// Without area in UV space though not in space; unwrapped instead.
+    pub degenerate: u64,
+    /// On pages that the given UVs cover more than twice over; unwrapped instead.
+    pub overlapping: u64,
+    /// Texels whose centre several triangles of given UVs cover.
+    pub overlapping_texels: u64,
+    /// Charts reduced in density to fit a page.
+    pub reduced_charts: u32,
+    pub seconds: f64,
+}
+
+/// All charts of a scene. Those with given placement come first, ordered by page.
+#[derive(Clone, Debug, Default, PartialEq)]
+pub struct Charts {
+    pub charts: Vec<Chart>,
+    /// Global triangle numbers, chart by chart, ascending in each.
+    pub triangles: Vec<u32>,
+    /// Chart of each global triangle, [`crate::scene::NONE`] for degenerate ones.
+    pub chart_of: Vec<u32>,
+    /// Local coordinates of the corners of each global triangle.
+    pub corners: Vec<[[f32; 2]; 3]>,
+}
+
+impl Charts {
+    /// The charts of a scene: from the caller's UVs where there are usable ones, else by unwrapping.
+    ///
+    /// A triangle's UVs are usable if all are within half a texel of [0, 1] and enclose an area.
+    /// `texels_per_unit` (finite, > 0), `page_size` and `padding` (texels) are those of the finest
+    /// map: unwrapped charts that would not fit its pages are cut where there are triangle borders
+    /// to cut along. `OutOfMemory` if the surface would take more than [`MAX_TEXELS`] at this
+    /// density, `InvalidArgument` for a page number for which that is so.
+    ///
+    /// Reports as stage "unwrap" from 0 to 0.5 of the bar.
+    pub fn of_scene(
+        scene: &Scene,
+        texels_per_unit: f32,
+        page_size: u32,
+        padding: u32,
+        progress: &Progress,
+    ) -> Result<(Charts, UvReport)> {
+        let start = Instant::now();
+        let max_extent = padded_extent(page_size, padding)? as f64 / texels_per_unit as f64;
+        check_density(surface_area(scene), texels_per_unit)?;
+        let total = scene.triangle_count();
+        let stage = progress.stage("unwrap", 0.0, 0.5, total as u64 + 1);
+        // Pieces and charts side by side, and what the unwrapping of a part takes.
+        let _memory = scene.device().memory().reserve(total as usize * 2 * Self::BYTES_PER_TRIANGLE, "the charts")?;
+        let (charts, mut report) = scene.device().install(|| {
+            let mut report = UvReport::default();
+            let (mut pieces, rest) = given_pieces(scene, page_size, &mut report, &stage)?;
+            stage.advance(total as u64 - rest.len() as u64)?;
+            report.given_charts = pieces.len() as u32;
+            for piece in unwrap::unwrap(scene, &rest, &stage)? {
+                stage.check()?;
+                split_to_fit(piece, max_extent as f32, &mut pieces)?;
+            }
+            report.unwrapped_charts = pieces.len() as u32 - report.given_charts;
+            Ok((Charts::assemble(scene, pieces, &stage)?, report))
+        })?;
+        stage.advance(1)?;
+        report.seconds = start.elapsed().as_secs_f64();
+        log_report(scene, &report);
+        Ok((charts, report))
+    }
+
+    /// What a triangle takes in a `Charts`, for memory accounts.
+    pub(crate) const BYTES_PER_TRIANGLE: usize = 24 + 4 + 4;
+
+    /// Bytes held.
+    pub fn bytes(&self) -> usize {
+        self.corners.len() * 24 + (self.triangles.len() + self.chart_of.len()) * 4 + size_of_val(&self.charts[..])
+    }
+
+    /// The global triangle numbers of a chart, ascending.
+    pub fn triangles_of(&self, chart: u32) -> &[u32] {
+        let Range { start, end } = self.charts[chart as usize].triangles;
+        &self.triangles[start as usize..end as usize]
+    }
+
+    /// Local coordinates of the point of a global triangle with weights `u` and `v` of its corners
+    /// 1 and 2.
+    #[inline]
+    pub fn local(&self, triangle: u32, u: f32, v: f32) -> [f32; 2] {
+        let [a, b, c] = self.corners[triangle as usize].map(Vec2::from_array);
+        (a * (1.0 - u - v) + b * u + c * v).to_array()
+    }
+
+    fn assemble(scene: &Scene, pieces: Vec<Piece>, stage: &Stage) -> Result<Charts> {
+        let total = scene.triangle_count() as usize;
+        let mut charts = Charts {
+            charts: try_with_capacity(pieces.len(), CHARTS)?,
+            triangles: try_with_capacity(pieces.iter().map(|p| p.triangles.len()).sum(), CHARTS)?,
+            chart_of: try_filled(total, NONE, CHARTS)?,
+            corners: try_filled(total, [[0.0; 2]; 3], CHARTS)?,
+        };
+        for piece in pieces {
+            stage.check()?;
+            let (lower, upper) = bounds(&piece.corners);
+            let first = charts.triangles.len() as u32;
+            let mut area = 0.0;
+            for (&t, corners) in piece.triangles.iter().zip(&piece.corners) {
+                charts.chart_of[t as usize] = charts.charts.len() as u32;
+                charts.corners[t as usize] = corners.map(|c| (Vec2::from_array(c) - lower).to_array());
+                area += triangle_area(scene, t);
+            }
+            let two_sided = scene.material(piece.triangles[0]).two_sided;
+            charts.triangles.extend(&piece.triangles);
+            charts.charts.push(Chart {
+                triangles: first..charts.triangles.len() as u32,
+                size: (upper - lower).to_array(),
+                area: area as f32,
+                two_sided,
+                given: piece.given,
+            });
+        }
+        Ok(charts)
+    }
+}
+
+/// The area of all valid triangles, in squared scene units.
+pub fn surface_area(scene: &Scene) -> f64 {
+    let areas = |m: usize, mesh: &Mesh| -> f64 {
+        let first = scene.first_triangle(m as u32);
+        (first..first + mesh.indices.len() as u32).filter(|&t| scene.is_valid(t)).map(|t| triangle_area(scene, t)).sum()
+    };
+    scene.meshes().iter().enumerate().map(|(m, mesh)| areas(m, mesh)).sum()
+}
+
+/// The density in texels per scene unit at which the scene's surface fills about `pages` pages,
+/// two thirds of each page's texels being covered.
+pub fn automatic_density(scene: &Scene, page_size: u32, pages: f64) -> f32 {
+    let texels = pages * (page_size as f64).powi(2) * 2.0 / 3.0;
+    ((texels / surface_area(scene)).sqrt() as f32).clamp(f32::MIN_POSITIVE, f32::MAX)
+}
+
+/// Area of a global triangle number, in squared scene units.
+pub(in crate::lightmap) fn triangle_area(scene: &Scene, triangle: u32) -> f64 {
+    let [a, b, c] = scene.corners(triangle).map(|c| c.as_dvec3());
+    0.5 * (b - a).cross(c - a).length()
+}
+
+/// Texels that a chart may take along an axis of a page; checks page size and padding.
+pub(in crate::lightmap) fn padded_extent(page_size: u32, padding: u32) -> Result<u32> {
+    if !(1..=MAX_PAGE_SIZE).contains(&page_size) {
+        return invalid_argument!("page_size is {page_size}, outside 1 to {MAX_PAGE_SIZE}");
+    }
+    match page_size.checked_sub(padding.saturating_mul(2)) {
+        Some(extent) if extent > 0 => Ok(extent),
+        _ => invalid_argument!("padding {padding} on both sides leaves nothing of page_size {page_size}"),
+    }
+}
+
+fn check_density(area: f64, texels_per_unit: f32) -> Result<()> {
+    if !(texels_per_unit > 0.0 && texels_per_unit.is_finite()) {
+        return invalid_argument!("texels_per_unit is {texels_per_unit}, not a finite number above 0");
+    }
+    let texels = area * (texels_per_unit as f64).powi(2);
+    if texels > MAX_TEXELS as f64 {
+        return Err(Error::OutOfMemory(format!(
+            "texels_per_unit {texels_per_unit} on a surface of {area:.3} squared units makes {texels:.3e} texels, \
+             more than {MAX_TEXELS}"
+        )));
+    }
+    Ok(())
+}
+
+fn log_report(scene: &Scene, report: &UvReport) {
+    let unusable = report.out_of_range + report.degenerate + report.overlapping;
+    if unusable > 0 {
+        scene.device().log(
+            LogLevel::Warning,
+            &format!(
+                "the light map UVs of {unusable} triangles are not usable and were replaced by unwrapping \
+                 ({} out of range, {} without area, {} on pages covered more than twice over)",
+                report.out_of_range, report.degenerate, report.overlapping
+            ),
+        );
+    }
+}
+
+/// Lower and upper corner of local coordinates.
+fn bounds(corners: &[[[f32; 2]; 3]]) -> (Vec2, Vec2) {
+    let points = corners.iter().flatten().map(|&p| Vec2::from_array(p));
+    points.fold((Vec2::INFINITY, Vec2::NEG_INFINITY), |(lo, hi), p| (lo.min(p), hi.max(p)))
+}
+
+/// Cuts a piece in halves, along triangle borders, until each is at most `max_extent` wide and high.
+/// Where that does not help (large triangles reach across the cut), the piece stays, to be reduced
+/// in density by the layout.
+fn split_to_fit(piece: Piece, max_extent: f32, out: &mut Vec<Piece>) -> Result<()> {
+    let mut stack = vec![piece];
+    while let Some(piece) = stack.pop() {
+        let (lower, upper) = bounds(&piece.corners);
+        let axis = if upper.x - lower.x >= upper.y - lower.y { 0 } else { 1 };
+        let extent = (upper - lower)[axis];
+        if extent <= max_extent || piece.triangles.len() == 1 {
+            try_push(out, piece, CHARTS)?;
+            continue;
+        }
+        let middle = (0.5 * (lower + upper))[axis];
+        let is_low = |c: &[[f32; 2]; 3]| (c[0][axis] + c[1][axis] + c[2][axis]) / 3.0 < middle;
+        let half = |low: bool| -> Result<Piece> {
+            let kept = || piece.triangles.iter().zip(&piece.corners).filter(|(_, c)| is_low(c) == low);
+            let triangles = try_collect(kept().map(|(&t, _)| t), CHARTS)?;
+            Ok(Piece { triangles, corners: try_collect(kept().map(|(_, &c)| c), CHARTS)?, given: None })
+        };
+        let halves = [half(true)?, half(false)?];
+        let shrinks = |p: &Piece| {
+            let (lower, upper) = bounds(&p.corners);
+            // A cut in two that leaves more than this on a side makes texels rather than room.
+            !p.triangles.is_empty() && (upper - lower)[axis] <= 0.8 * extent
+        };
+        if halves.iter().all(shrinks) {
+            let [low, high] = halves;
+            stack.extend([high, low]);
+        } else {
+            try_push(out, piece, CHARTS)?;
+        }
+    }
+    Ok(())
+}
+
+/// Pieces from the caller's UVs, ordered by page, and the valid triangles to unwrap, ascending.
+fn given_pieces(scene: &Scene, page_size: u32, report: &mut UvReport, stage: &Stage) -> Result<(Vec<Piece>, Vec<u32>)> {
+    let mut rest = Vec::new();
+    let mut usable = Vec::new();
+    let mut cover = BTreeMap::<u32, f64>::new();
+    for (m, mesh) in scene.meshes().iter().enumerate() {
+        let first = scene.first_triangle(m as u32);
+        for t in (0..mesh.indices.len()).filter(|&t| scene.is_valid(first + t as u32)) {
+            stage.check()?;
+            let Some(lightmap) = &mesh.lightmap else {
+                try_push(&mut rest, first + t as u32, CHARTS)?;
+                continue;
+            };
+            let page = given_page(lightmap, m, t, page_size)?;
+            match uv_area(mesh, lightmap, t, page_size) {
+                Some(area) if area > 0.0 => {
+                    *cover.entry(page).or_default() += area;
+                    try_push(&mut usable, (first + t as u32, page), CHARTS)?;
+                    continue;
+                }
+                Some(_) => report.degenerate += 1,
+                None => report.out_of_range += 1,
+            }
+            try_push(&mut rest, first + t as u32, CHARTS)?;
+        }
+    }
+    let is_kept = |page: u32| cover[&page] <= MAX_PAGE_COVER;
+    let without_overlapping = rest.len();
+    for &(t, _) in usable.iter().filter(|(_, page)| !is_kept(*page)) {
+        try_push(&mut rest, t, CHARTS)?;
+    }
+    report.overlapping = (rest.len() - without_overlapping) as u64;
+    rest.sort_unstable();
+    let mut kept = usable;
+    kept.retain(|(_, page)| is_kept(*page));
+
+    let mut pieces = Vec::new();
+    for of_mesh in kept.chunk_by(|a, b| scene.locate(a.0).0 == scene.locate(b.0).0) {
+        for piece in islands(scene, of_mesh, stage)? {
+            try_push(&mut pieces, piece, CHARTS)?;
+        }
+    }
+    pieces.sort_unstable_by_key(|p: &Piece| (p.given.map(|g| g.page), p.triangles[0]));
+    Ok((pieces, rest))
+}
+
+fn given_page(lightmap: &LightmapUvs, mesh: usize, triangle: usize, page_size: u32) -> Result<u32> {
+    let page = lightmap.pages.get(triangle).copied().unwrap_or(0);
+    let limit = MAX_TEXELS / (page_size as u64).pow(2);
+    if page as u64 >= limit {
+        return invalid_argument!(
+            "lightmap_page of triangle {triangle} of mesh {mesh} is {page}; with pages of {page_size}×{page_size} \
+             texels there can be {limit}"
+        );
+    }
+    Ok(page)
+}
+
+/// The area of a triangle in UV space, `None` if its UVs are not finite or more than half a texel
+/// outside [0, 1].
+fn uv_area(mesh: &Mesh, lightmap: &LightmapUvs, triangle: usize, page_size: u32) -> Option<f64> {
+    let tolerance = 0.5 / page_size as f32;
+    let uvs = mesh.indices[triangle].map(|i| lightmap.uvs[i as usize]);
+    let inside = |uv: &Vec2| uv.to_array().iter().all(|c| (-tolerance..=1.0 + tolerance).contains(c));
+    let [a, b, c] = uvs.map(|uv| uv.as_dvec2());
+    uvs.iter().all(inside).then(|| 0.5 * (b - a).perp_dot(c - a).abs())
+}
+
+/// Pieces of one mesh: triangles with usable UVs and their pages, connected through equal vertices.
+fn islands(scene: &Scene, triangles: &[(u32, u32)], stage: &Stage) -> Result<Vec<Piece>> {
+    let mesh = &scene.meshes()[scene.locate(triangles[0].0).0 as usize];
+    let uvs = &mesh.lightmap.as_ref().expect("the mesh has UVs").uvs;
+    let corner = |t: u32, k: usize| mesh.indices[scene.locate(t).1 as usize][k] as usize;
+    let mut keys = try_with_capacity(triangles.len() * 3, CHARTS)?;
+    for (n, &(t, page)) in triangles.iter().enumerate() {
+        let kind = surface_kind(scene.material(t));
+        for k in 0..3 {
+            let i = corner(t, k);
+            let [u, v] = uvs[i].to_array().map(float_key);
+            keys.push(((page, kind, [u, v], mesh.positions[i].to_array().map(float_key)), n as u32));
+        }
+    }
+    stage.check()?;
+    let groups = Groups::new(&connected(triangles.len(), keys, stage)?, stage)?;
+    let mut pieces = Vec::new();
+    for group in groups.iter() {
+        stage.check()?;
+        let page = triangles[group[0] as usize].1;
+        let numbers = try_collect(group.iter().map(|&n| triangles[n as usize].0), CHARTS)?;
+        let corners = try_collect(numbers.iter().map(|&t| [0, 1, 2].map(|k| uvs[corner(t, k)])), CHARTS)?;
+        try_push(&mut pieces, given_piece(scene, page, numbers, &corners)?, CHARTS)?;
+    }
+    Ok(pieces)
+}
+
+/// Local coordinates such that the piece keeps its area, and the placement that undoes them.
+fn given_piece(scene: &Scene, page: u32, triangles: Vec<u32>, uvs: &[[Vec2; 3]]) -> Result<Piece> {
+    let lower = uvs.iter().flatten().fold(Vec2::INFINITY, |m, &p| m.min(p));
+    let twice_area = |[a, b, c]: [DVec2; 3]| (b - a).perp_dot(c - a).abs();
+    let area_uv: f64 = uvs.iter().map(|t| 0.5 * twice_area(t.map(|uv| uv.as_dvec2()))).sum();
+    let area: f64 = triangles.iter().map(|&t| triangle_area(scene, t)).sum();
+    let scale = (area / area_uv).sqrt();
+    let local = |uv: Vec2| ((uv - lower).as_dvec2() * scale).as_vec2().to_array();
+    Ok(Piece {
+        triangles,
+        corners: try_collect(uvs.iter().map(|t| t.map(local)), CHARTS)?,
+        given: Some(Given { page, offset: lower.to_array(), scale: [(1.0 / scale) as f32; 2] }),
+    })
+}
+
+#[cfg(test)]
+pub(super) mod tests;

@@ -1,0 +1,71 @@
+//! The atlas: charts and texels of a scene, which side of a chart each shows, and what of it can be seen.
+
+pub(crate) mod buried;
+pub(crate) mod chart_index;
+pub(crate) mod chart_map;
+pub mod charts;
+pub mod layout;
+pub(crate) mod pieces;
+pub(crate) mod seen;
+pub mod texels;
+pub(crate) mod two_sided;
+mod unwrap;
+
+use super::LightmapInfo;
+use crate::direct::Receiver;
+use crate::memory::Reservation;
+use crate::scene::Scene;
+use chart_index::ChartIndex;
+use chart_map::ChartMap;
+use charts::Charts;
+use seen::Seen;
+use std::sync::Arc;
+
+/// Charts and texels of a scene: all of a light map but its light. Does not change once made, and is
+/// shared with live updates.
+pub(crate) struct Atlas {
+    pub scene: Arc<Scene>,
+    pub charts: Charts,
+    pub index: ChartIndex,
+    pub map: ChartMap,
+    pub gather: ChartMap,
+    pub radiance: ChartMap,
+    pub padding: u32,
+    pub info: LightmapInfo,
+    pub seen: Seen,
+    /// Whether each texel of the light map has the place of another one. Empty if none has.
+    pub buried: Vec<bool>,
+    pub(in crate::lightmap) _memory: Reservation,
+}
+
+impl Atlas {
+    /// Whether a sample of the light map or the gather map shows the back: in a place of its own, or since
+    /// `backs` (per chart; empty: fronts) says so.
+    pub(crate) fn is_back(&self, map: &ChartMap, backs: &[bool], sample: usize) -> bool {
+        let chart = self.charts.chart_of[map.texels.samples[sample].triangle as usize];
+        map.is_back(sample) || backs.get(chart as usize).is_some_and(|&b| b)
+    }
+
+    /// A sample of the light map or the gather map as a receiver, on the side that it shows.
+    pub(crate) fn receiver(&self, map: &ChartMap, backs: &[bool], sample: usize) -> Receiver {
+        map.receiver(&self.scene, sample, self.is_back(map, backs, sample)).1
+    }
+
+    /// Where a sample of the light map lies in its chart, which for a buried texel is not where its light is from.
+    pub(crate) fn texel_local(&self, placement: u32, sample: usize) -> [f32; 2] {
+        let t = &self.map.texels.samples[sample];
+        match self.buried.get(sample) {
+            Some(true) => self.map.layout.placements[placement as usize].local([t.x, t.y].map(|c| f32::from(c) + 0.5)),
+            _ => self.charts.local(t.triangle, t.u, t.v),
+        }
+    }
+
+    /// The gather texels around a sample of the light map, with their bilinear weights.
+    #[inline]
+    pub(crate) fn gather_around(&self, sample: usize, visit: impl FnMut(usize, f32)) {
+        let t = &self.map.texels.samples[sample];
+        // The gather map has the light map's placements.
+        let placement = self.map.placement_of(&self.charts, sample);
+        self.gather.bilinear(placement, self.charts.local(t.triangle, t.u, t.v), visit);
+    }
+}

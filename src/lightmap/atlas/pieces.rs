@@ -1,0 +1,116 @@
+//! Charts in the making: pieces of surface and how they are connected.
+
+use crate::error::Result;
+use crate::memory::{try_collect, try_filled, try_push};
+use crate::progress::Stage;
+use crate::scene::{Material, NONE};
+use rayon::prelude::*;
+
+/// What buffers are for, in errors.
+pub(in crate::lightmap) const CHARTS: &str = "the charts";
+
+/// Placement by the caller's UVs: uv = `offset` + `scale` · local.
+#[derive(Clone, Copy, Debug, PartialEq)]
+pub struct Given {
+    pub page: u32,
+    pub offset: [f32; 2],
+    pub scale: [f32; 2],
+}
+
+/// A chart in the making. Local coordinates need not start at (0, 0).
+pub(in crate::lightmap) struct Piece {
+    /// Global numbers, ascending.
+    pub triangles: Vec<u32>,
+    /// Local coordinates of the corners, per entry of `triangles`.
+    pub corners: Vec<[[f32; 2]; 3]>,
+    pub given: Option<Given>,
+}
+
+/// What must not meet in one chart: sides that are lit and sides that are not, and lamps and what
+/// they light (a texel of the radiance map belongs to one or the other).
+pub(in crate::lightmap) fn surface_kind(material: &Material) -> u32 {
+    material.two_sided as u32 | (material.is_emissive() as u32) << 1
+}
+
+/// A key that is equal for equal floats: +0 and −0 are one.
+pub(in crate::lightmap) fn float_key(x: f32) -> u32 {
+    (x + 0.0).to_bits()
+}
+
+/// Which of `count` items are connected: each item's lowest connected item. `keys` are pairs of a
+/// key and an item; items with equal keys are connected.
+pub(in crate::lightmap) fn connected<K: Ord + Send>(
+    count: usize,
+    mut keys: Vec<(K, u32)>,
+    stage: &Stage,
+) -> Result<Vec<u32>> {
+    keys.par_sort_unstable();
+    let mut parent = try_collect(0..count as u32, CHARTS)?;
+    for (i, pair) in keys.windows(2).enumerate() {
+        if i % ITEMS_PER_CHECK == 0 {
+            stage.check()?;
+        }
+        if pair[0].0 == pair[1].0 {
+            let (a, b) = (root(&mut parent, pair[0].1), root(&mut parent, pair[1].1));
+            // The lower one becomes the root, so that roots do not depend on the order of joins.
+            parent[a.max(b) as usize] = a.min(b);
+        }
+    }
+    for i in 0..count as u32 {
+        parent[i as usize] = root(&mut parent, i);
+    }
+    Ok(parent)
+}
+
+/// A cancel is looked for whenever so many items have been looked at.
+pub(in crate::lightmap) const ITEMS_PER_CHECK: usize = 1 << 14;
+
+fn root(parent: &mut [u32], mut i: u32) -> u32 {
+    while parent[i as usize] != i {
+        let next = parent[parent[i as usize] as usize];
+        parent[i as usize] = next;
+        i = next;
+    }
+    i
+}
+
+/// Items by root (as from [`connected`]), ordered by root, ascending in each group.
+pub(in crate::lightmap) struct Groups {
+    items: Vec<u32>,
+    /// Where each group begins, and the number of items.
+    starts: Vec<u32>,
+}
+
+impl Groups {
+    pub(in crate::lightmap) fn new(roots: &[u32], stage: &Stage) -> Result<Groups> {
+        // A root is the lowest item of its group: it comes first.
+        let mut group_of = try_filled(roots.len(), NONE, CHARTS)?;
+        let mut starts: Vec<u32> = Vec::new();
+        for (i, &root) in roots.iter().enumerate() {
+            if root as usize == i {
+                group_of[i] = starts.len() as u32;
+                try_push(&mut starts, 0, CHARTS)?;
+            }
+            starts[group_of[root as usize] as usize] += 1;
+        }
+        stage.check()?;
+        let mut next = 0;
+        for start in &mut starts {
+            next += std::mem::replace(start, next);
+        }
+        let mut items = try_filled(roots.len(), 0, CHARTS)?;
+        for (i, &root) in roots.iter().enumerate() {
+            let place = &mut starts[group_of[root as usize] as usize];
+            items[*place as usize] = i as u32;
+            *place += 1;
+        }
+        // Each start has moved to the end of its group, where the next begins.
+        try_push(&mut starts, 0, CHARTS)?;
+        starts.rotate_right(1);
+        Ok(Groups { items, starts })
+    }
+
+    pub(in crate::lightmap) fn iter(&self) -> impl Iterator<Item = &[u32]> {
+        self.starts.windows(2).map(|w| &self.items[w[0] as usize..w[1] as usize])
+    }
+}

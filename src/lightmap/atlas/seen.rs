@@ -1,0 +1,271 @@
+//! How often the sides of charts are seen from open places.
+//!
+//! An open place lies between two surfaces, or before one in scenes under a sun or a sky, with free space around it, and not
+//! inside a solid. Random rays from such places meet sides as often as somebody sees them who goes about in the scene.
+//! Whether light gets there is not asked: lamps may be switched on later.
+
+use super::chart_map::ChartMap;
+use super::charts::Charts;
+use crate::error::Result;
+use crate::memory::try_collect;
+use crate::progress::Stage;
+use crate::sampling::{combine, cosine_around, mix, uniform, uniform_sphere};
+use crate::scene::{Light, NONE, Scene};
+use crate::trace::{PACKET_SIZE, Packet, RawHit, Ray};
+use glam::Vec3;
+use rayon::prelude::*;
+use std::sync::atomic::{AtomicU32, AtomicU64, Ordering::Relaxed};
+
+/// Places that are tried: as many as this times the texels of the radiance map, within limits.
+const TRIES_PER_TEXEL: usize = 4;
+const LEAST_TRIES: usize = 1 << 10;
+const MOST_TRIES: usize = 1 << 14;
+
+/// Packets of rays from an open place. The first tells whether it is open.
+const PACKETS: u32 = 4;
+
+/// Free space around an open place: the smaller of this part of the scene's diagonal, and so many texels of the light map.
+pub(in crate::lightmap) const ROOM: f32 = 0.01;
+const ROOM_TEXELS: f32 = 4.0;
+
+/// An open place sees at most this part of its rays end on backs of one-sided surfaces.
+const BACKS: f32 = 0.05;
+
+/// Indoors, at least this part ends on surfaces.
+const ENCLOSED: f32 = 0.5;
+
+/// Outdoors, places before a surface that faces the open are so far away at most, as a part of the diagonal.
+const BEFORE: f32 = 0.1;
+
+/// A chart shows the side that is seen so many times as often as the other one, if there is such a side.
+const CLEARLY: u32 = 10;
+
+/// Of a side of which fewer rays are expected it is not known whether it is seen.
+const LEAST_EXPECTED: f64 = 8.0;
+
+/// A side that gets less than this part of the rays that are expected is hidden.
+const HIDDEN: f64 = 0.02;
+
+const COUNTS: &str = "which sides of charts are seen";
+
+/// How often the sides of charts are seen.
+#[derive(Default)]
+pub(crate) struct Seen {
+    /// Rays that met the front and the back of each chart. Empty if no chart is two-sided.
+    pub counts: Vec<[u32; 2]>,
+    /// Whether hardly any ray met the front and the back of each chart.
+    hidden: Vec<[bool; 2]>,
+    pub places: u64,
+    pub rays: u64,
+}
+
+impl Seen {
+    /// Looks around from open places. Advances `stage` by [`work`](Self::work). To be called on the device's threads.
+    /// `texel` is the width of a texel of the light map.
+    pub(crate) fn count(
+        scene: &Scene,
+        charts: &Charts,
+        radiance: &ChartMap,
+        texel: f32,
+        stage: &Stage,
+    ) -> Result<Seen> {
+        if radiance.layout.back_of.is_empty() {
+            return Ok(Seen::default());
+        }
+        let room = (ROOM * scene.diagonal()).min(ROOM_TEXELS * texel);
+        let look = Look { scene, charts, radiance, room, outdoors: is_outdoors(scene) };
+        let counters: Vec<[AtomicU32; 2]> = try_collect(charts.charts.iter().map(|_| Default::default()), COUNTS)?;
+        let (places, rays) = (AtomicU64::new(0), AtomicU64::new(0));
+        (0..Self::work(radiance) as u32).into_par_iter().try_for_each(|number| {
+            let mut traced = 0;
+            if let Some((position, first)) = look.open_place(number, &mut traced) {
+                look.around(position, &first, number, &mut traced, |chart, side| {
+                    counters[chart][side].fetch_add(1, Relaxed);
+                });
+                places.fetch_add(1, Relaxed);
+            }
+            rays.fetch_add(traced, Relaxed);
+            stage.advance(1)
+        })?;
+        let counts = counters.into_iter().map(|of_chart| of_chart.map(AtomicU32::into_inner));
+        let counts: Vec<[u32; 2]> = try_collect(counts, COUNTS)?;
+        let total: u64 = counts.iter().flatten().map(|&n| u64::from(n)).sum();
+        let per_texel = total as f64 / radiance.len().max(1) as f64;
+        let hidden = |(chart, of_chart): (usize, &[u32; 2])| {
+            let expected = radiance.samples_of(chart as u32).len() as f64 * per_texel;
+            of_chart.map(|n| expected >= LEAST_EXPECTED && f64::from(n) < HIDDEN * expected)
+        };
+        let hidden = try_collect(counts.iter().enumerate().map(hidden), COUNTS)?;
+        Ok(Seen { counts, hidden, places: places.into_inner(), rays: rays.into_inner() })
+    }
+
+    /// What [`count`](Self::count) advances its stage by.
+    pub(crate) fn work(radiance: &ChartMap) -> u64 {
+        match radiance.layout.back_of.len() {
+            0 => 0,
+            _ => (TRIES_PER_TEXEL * radiance.len()).clamp(LEAST_TRIES, MOST_TRIES) as u64,
+        }
+    }
+
+    /// Whether hardly any open place sees a side of a chart.
+    pub(crate) fn is_hidden(&self, chart: u32, front: bool) -> bool {
+        self.hidden.get(chart as usize).is_some_and(|hidden| hidden[usize::from(!front)])
+    }
+
+    /// Whether of a two-sided chart the back is seen and the front hardly ever, or the other way round; `None` if it is
+    /// neither.
+    pub(crate) fn shows_back(&self, chart: u32) -> Option<bool> {
+        let [front, back] = self.counts.get(chart as usize).copied().unwrap_or_default();
+        match front.max(back) {
+            0 => None,
+            most if most >= CLEARLY.saturating_mul(front.min(back)) => Some(back > front),
+            _ => None,
+        }
+    }
+
+    pub(crate) fn bytes(&self) -> usize {
+        size_of_val(&self.counts[..]) + size_of_val(&self.hidden[..])
+    }
+}
+
+/// Whether a sun or a sky shines.
+pub(in crate::lightmap) fn is_outdoors(scene: &Scene) -> bool {
+    let lights = scene.lights();
+    let shines =
+        |light: &Light| matches!(light, Light::Directional { .. } | Light::Sky { .. }) && light.color() != [0.0; 3];
+    lights.iter().any(shines)
+}
+
+/// What looking around reads.
+struct Look<'a> {
+    scene: &'a Scene,
+    charts: &'a Charts,
+    radiance: &'a ChartMap,
+    room: f32,
+    outdoors: bool,
+}
+
+impl Look<'_> {
+    /// Place `number` among those that are tried, if it is open, and what a first packet of rays meets from there.
+    fn open_place(&self, number: u32, rays: &mut u64) -> Option<(Vec3, [RawHit; PACKET_SIZE])> {
+        let sample = (u64::from(mix(number)) * self.radiance.len() as u64) >> 32;
+        let (_, from) = self.radiance.receiver(self.scene, sample as usize, self.radiance.is_back(sample as usize));
+        let random = |dimension| uniform(number, dimension, 0);
+        let direction = cosine_around(from.geometric, [random(0), random(1)]);
+        let hit = self.scene.intersect_raw(&Ray::new(from.origin, direction));
+        *rays += 1;
+        let away = match hit.is_miss() {
+            true if !self.outdoors => return None,
+            true => random(2) * BEFORE * self.scene.diagonal(),
+            false => (0.25 + 0.5 * random(2)) * hit.t,
+        };
+        if away < self.room {
+            return None;
+        }
+        let position = from.origin + away * direction;
+        let hits = self.packet(position, number, 0, rays);
+        let (mut met, mut backs) = (0.0, 0.0);
+        for hit in hits.iter().filter(|hit| !hit.is_miss()) {
+            if hit.t < self.room {
+                return None;
+            }
+            met += 1.0;
+            backs += f32::from(u8::from(!hit.front && !self.scene.material(hit.triangle).two_sided));
+        }
+        let is_enclosed = self.outdoors || met >= ENCLOSED * PACKET_SIZE as f32;
+        (is_enclosed && backs <= BACKS * met).then_some((position, hits))
+    }
+
+    /// Packet `k` of rays from a place to all sides.
+    fn packet(&self, position: Vec3, number: u32, k: u32, rays: &mut u64) -> [RawHit; PACKET_SIZE] {
+        let (mut packet, mut hits) = (Packet::default(), [RawHit::MISS; PACKET_SIZE]);
+        for i in 0..PACKET_SIZE as u32 {
+            let index = k * PACKET_SIZE as u32 + i;
+            packet.push(uniform_sphere([0, 1].map(|d| uniform(index, d, combine(number, 1)))));
+        }
+        self.scene.gather_packet(position, &packet, 0.0, f32::INFINITY, &mut hits);
+        *rays += PACKET_SIZE as u64;
+        hits
+    }
+
+    /// Names the charts that are seen from a place, and 0 for their fronts or 1 for their backs.
+    fn around(
+        &self,
+        position: Vec3,
+        first: &[RawHit; PACKET_SIZE],
+        number: u32,
+        rays: &mut u64,
+        mut see: impl FnMut(usize, usize),
+    ) {
+        let mut see_all = |hits: &[RawHit; PACKET_SIZE]| {
+            for hit in hits.iter().filter(|hit| !hit.is_miss()) {
+                let chart = self.charts.chart_of[hit.triangle as usize];
+                if chart != NONE {
+                    see(chart as usize, usize::from(!hit.front));
+                }
+            }
+        };
+        see_all(first);
+        for k in 1..PACKETS {
+            see_all(&self.packet(position, number, k, rays));
+        }
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use crate::lightmap::{Lightmap, LightmapDesc};
+    use crate::progress::Progress;
+    use crate::scene::shapes::MeshBuilder;
+    use crate::scene::{Material, SceneData};
+    use glam::Vec3;
+
+    /// Rays that saw the fronts and the backs of a mesh, and whether some fronts and some backs are hidden.
+    type SeenOfMesh = ([u32; 2], [bool; 2]);
+
+    /// What is seen of a room of sheets, of a wardrobe in it, and of a hollow wall of 4 cm.
+    fn room() -> ([SeenOfMesh; 3], Lightmap) {
+        let mut data = SceneData::new();
+        let m = data.add_material(Material { two_sided: true, ..Default::default() }).unwrap();
+        let p = Vec3::new;
+        for [lower, upper] in [
+            [p(0.0, 0.0, 0.0), p(4.0, 3.0, 4.0)],
+            [p(0.5, 0.8, 0.5), p(1.5, 2.0, 1.5)],
+            [p(2.4, 0.3, 0.3), p(2.44, 2.7, 2.0)],
+        ] {
+            let mut b = MeshBuilder::new();
+            b.box_(lower, upper, false, m);
+            data.add_mesh(b.finish()).unwrap();
+        }
+        let desc = LightmapDesc { texels_per_unit: 20.0, ..Default::default() };
+        let lightmap = Lightmap::create(&data.committed(), &desc, &Progress::none()).unwrap();
+        let atlas = lightmap.atlas();
+        let of_mesh = |mesh: u32| {
+            let (mut counts, mut hidden) = ([0; 2], [false; 2]);
+            let first = atlas.scene.first_triangle(mesh);
+            for chart in (first..first + 12).map(|t| atlas.charts.chart_of[t as usize]) {
+                for side in [0, 1] {
+                    counts[side] += atlas.seen.counts[chart as usize][side];
+                    hidden[side] |= atlas.seen.is_hidden(chart, side == 0);
+                }
+            }
+            (counts, hidden)
+        };
+        ([0, 1, 2].map(of_mesh), lightmap)
+    }
+
+    #[test]
+    fn rooms_are_seen_from_inside_and_solid_things_from_outside() {
+        let ([room, wardrobe, wall], lightmap) = room();
+        assert!(room.0[1] > 1000 && room.0[0] == 0 && !room.1[1], "{room:?}");
+        // There is room for somebody in the wardrobe.
+        assert!(wardrobe.0[0] > 500 && wardrobe.0[1] > 100 && wardrobe.1 == [false; 2], "{wardrobe:?}");
+        // Nobody fits into the wall.
+        assert!(wall.0[0] > 500 && wall.0[1] == 0 && wall.1 == [false, true], "{wall:?}");
+        let (atlas, info) = (lightmap.atlas(), lightmap.info());
+        let first = atlas.scene.first_triangle(1);
+        let both =
+            atlas.map.layout.back_of.iter().all(|&c| (first..first + 12).contains(&atlas.charts.triangles_of(c)[0]));
+        assert!(both && info.both_sided_charts > 0, "the wardrobe alone has two places");
+    }
+}

@@ -1,0 +1,118 @@
+//! Creates light maps: unwraps, lays out pages, maps texels to triangles and finds what of them can be seen.
+
+use super::atlas::Atlas;
+use super::atlas::buried::Search;
+use super::atlas::chart_index::ChartIndex;
+use super::atlas::chart_map::ChartMap;
+use super::atlas::charts::{Charts, automatic_density};
+use super::atlas::layout::Layout;
+use super::atlas::seen::{self, Seen};
+use super::atlas::texels::TexelMap;
+use super::atlas::two_sided;
+use super::plan::Plan;
+use super::{BakeParams, Lightmap, LightmapDesc, LightmapInfo};
+use crate::device::LogLevel;
+use crate::direct::DirectLight;
+use crate::error::Result;
+use crate::memory::try_collect;
+use crate::progress::Progress;
+use crate::scene::Scene;
+use crate::scene::precision::too_few_digits;
+use std::sync::Arc;
+use std::time::Instant;
+
+/// Pages that a scene about fills if the caller leaves the density open.
+const AUTOMATIC_PAGES: f64 = 1.0;
+
+/// The offset of rays from surfaces from which on a warning is due, as a part of a texel.
+const OFFSET_PART: f32 = 0.25;
+
+/// Coarse maps of small light maps have pages of this size at least.
+const MIN_PAGE_SIZE: u32 = 64;
+
+impl Lightmap {
+    /// Unwraps what brings no usable UVs, lays out the pages and maps texels to triangles.
+    pub fn create(scene: &Arc<Scene>, desc: &LightmapDesc, progress: &Progress) -> Result<Lightmap> {
+        desc.validate()?;
+        scene.device().run(progress, || Self::lay_out(scene, desc, progress))
+    }
+
+    fn lay_out(scene: &Arc<Scene>, desc: &LightmapDesc, progress: &Progress) -> Result<Lightmap> {
+        let start = Instant::now();
+        let density = match desc.texels_per_unit {
+            0.0 => automatic_density(scene, desc.page_size, AUTOMATIC_PAGES),
+            d => d,
+        };
+        let (charts, mut uvs) = Charts::of_scene(scene, density, desc.page_size, desc.padding, progress)?;
+        let unwrap_seconds = start.elapsed().as_secs_f64();
+        let two_sided = (0..).zip(&charts.charts).filter(|(_, c)| c.two_sided).map(|(c, _)| c);
+        let two_sided: Vec<u32> = try_collect(two_sided, "the two-sided charts")?;
+        let pack = |divisor: u32, padding: u32, given: bool, with_backs: &[u32]| {
+            let page_size = if divisor == 1 { desc.page_size } else { (desc.page_size / divisor).max(MIN_PAGE_SIZE) };
+            Layout::pack(&charts, density / divisor as f32, page_size, padding, given, with_backs, progress)
+        };
+        let radiance = pack(desc.radiance_divisor, 0, false, &two_sided)?;
+        let stage = progress.stage("texels", 0.5, 0.6, TexelMap::work(&radiance));
+        let mut radiance = ChartMap::new(scene, &charts, radiance, &stage)?;
+        let texel = 1.0 / density;
+        let stage = progress.stage("sides", 0.6, 0.65, Seen::work(&radiance));
+        let seen = scene.device().install(|| Seen::count(scene, &charts, &radiance, texel, &stage))?;
+        let with_backs =
+            if desc.both_sides { two_sided::seen_from_both(&seen, &radiance, &two_sided)? } else { Vec::new() };
+        let map = pack(1, desc.padding, true, &with_backs)?;
+        let gather = pack(desc.gather_divisor, 0, false, &with_backs)?;
+        let stage = progress.stage("texels", 0.65, 0.8, TexelMap::work(&map) + TexelMap::work(&gather));
+        let mut map = ChartMap::new(scene, &charts, map, &stage)?;
+        let mut gather = ChartMap::new(scene, &charts, gather, &stage)?;
+        let placements = [&map, &gather, &radiance].map(|map| map.layout.placements.len() as u64);
+        let stage = progress.stage("buried texels", 0.8, 1.0, placements.iter().sum());
+        let near = texel.min(seen::ROOM * scene.diagonal());
+        let search = Search { scene, charts: &charts, seen: &seen, near };
+        let mut sight_rays = seen.rays;
+        let mut move_buried = |map: &mut ChartMap, by_parts: bool| -> Result<Vec<bool>> {
+            let (buried, rays) = scene.device().install(|| search.move_buried(map, by_parts, &stage))?;
+            sight_rays += rays;
+            Ok(buried)
+        };
+        move_buried(&mut radiance, true)?;
+        // The rest of a texel that is buried for the most part is a strip along what covers it, often darker than all
+        // around: gather texels are larger, and would spread that dark as a rim.
+        move_buried(&mut gather, false)?;
+        let buried = move_buried(&mut map, true)?;
+        uvs.overlapping_texels = map.texels.overlapping_texels;
+        uvs.reduced_charts = map.layout.reduced;
+        let index = ChartIndex::new(scene.device(), &charts)?;
+        let own_bytes = charts.bytes() + seen.bytes() + buried.len();
+        let bytes = own_bytes + index.bytes() + map.bytes() + gather.bytes() + radiance.bytes();
+        let info = LightmapInfo {
+            page_count: map.layout.page_count,
+            width: map.layout.page_size,
+            height: map.layout.page_size,
+            charts: charts.charts.len() as u32,
+            texels: map.len() as u64,
+            gather_texels: gather.len() as u64,
+            radiance_texels: radiance.len() as u64,
+            bytes: bytes as u64,
+            unwrap_seconds,
+            texels_per_unit: density,
+            uvs,
+            both_sided_charts: with_backs.len() as u32,
+            back_texels: (map.len() - map.back_start) as u64,
+            buried_texels: buried.iter().filter(|&&b| b).count() as u64,
+            open_places: seen.places,
+            sight_rays,
+        };
+        let memory = scene.device().memory().reserve(own_bytes, "the charts")?;
+        if let Some(message) = too_few_digits(scene, "texels", 1.0 / density, OFFSET_PART) {
+            scene.device().log(LogLevel::Warning, &message);
+        }
+        let direct = DirectLight::try_new(scene)?;
+        let mut plan =
+            Plan::new(scene, &direct, &BakeParams::default(), !two_sided.is_empty(), uvs.unwrapped_charts > 0);
+        plan.note_sides(&info);
+        let scene = scene.clone();
+        let padding = desc.padding;
+        let atlas = Atlas { scene, charts, index, map, gather, radiance, padding, info, seen, buried, _memory: memory };
+        Ok(Lightmap { atlas: Arc::new(atlas), plan, light: None })
+    }
+}

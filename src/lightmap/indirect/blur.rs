@@ -1,0 +1,200 @@
+//! Filters over the texels of a map: a blur of the gather map (thesis 3.2.5) that stays inside
+//! charts and does not reach through walls, and the filling of texels that cannot be seen.
+
+use crate::device::Device;
+use crate::error::Result;
+use crate::lightmap::atlas::chart_map::ChartMap;
+use crate::lightmap::atlas::charts::Charts;
+use crate::memory::{try_collect, try_with_capacity};
+use crate::progress::{Progress, Stage};
+use crate::scene::NONE;
+use glam::Vec3;
+use rayon::prelude::*;
+
+/// Largest blur radius in texels.
+pub const MAX_BLUR_RADIUS: u32 = 16;
+
+/// Width of the largest window.
+const MAX_WINDOW: usize = 2 * MAX_BLUR_RADIUS as usize + 1;
+
+/// Texels handed to a thread at a time.
+const BLOCK: usize = 1024;
+
+/// Rounds of filling: a hidden region wider than twice this stays partly unfilled.
+const MAX_FILL_ROUNDS: usize = 64;
+
+/// What buffers are for, in errors.
+const FILLED: &str = "the texels to be filled";
+
+/// How many standard deviations of their noise two texels may differ by and still be taken for equally lit.
+const LIKE: f32 = 2.0;
+
+/// What a blur reads, by sample of the map.
+#[derive(Clone, Copy)]
+pub(crate) struct Texels<'a> {
+    pub values: &'a [Vec3],
+    /// Variance of the values' sums over the channels; infinite where nothing is known of it.
+    pub variances: &'a [f32],
+    pub valid: &'a [bool],
+    pub normals: &'a [Vec3],
+}
+
+/// Blur of the valid texels within a square of `radius`, by a Gaussian that leaves out what differs by more
+/// than noise: the weight falls with the difference of two texels by the standard deviation of that difference
+/// (the range filter of Tomasi and Manduchi, *Bilateral filtering*, 1998, its width from the samples' variance
+/// as in Rousselle, Knaus and Zwicker, *Adaptive rendering with non-local means filtering*, 2012). So shadows
+/// of indirect light stay sharp where they are known, and the blur's bias goes with the noise. A texel takes
+/// part only if a path of valid texels of the same chart, within the square, leads to it: light on one
+/// side of a wall that stands on the chart does not cross the hidden texels below the wall.
+pub(crate) fn blur(
+    device: &Device,
+    charts: &Charts,
+    map: &ChartMap,
+    texels: Texels,
+    radius: u32,
+    out: &mut [Vec3],
+    stage: &Stage,
+) -> Result<()> {
+    let radius = radius.min(MAX_BLUR_RADIUS) as i32;
+    device.install(|| {
+        out.par_chunks_mut(BLOCK).enumerate().try_for_each(|(block, out)| {
+            let mut window = Window::new(radius);
+            for (i, out) in out.iter_mut().enumerate() {
+                stage.check()?;
+                let sample = block * BLOCK + i;
+                *out =
+                    if texels.valid[sample] { window.blur(charts, map, sample, texels) } else { texels.values[sample] };
+            }
+            stage.advance(out.len() as u64)
+        })
+    })
+}
+
+/// Scratch space for one texel's neighbourhood.
+pub(crate) struct Window {
+    radius: i32,
+    /// Gaussian weight by squared distance.
+    weights: Vec<f32>,
+    seen: [u64; MAX_WINDOW],
+    queue: Vec<(i32, i32)>,
+}
+
+impl Window {
+    pub(crate) fn new(radius: i32) -> Window {
+        // The radius is two standard deviations.
+        let s = 2.0 / (radius as f32 * radius as f32).max(1.0);
+        let weights = (0..=2 * radius * radius).map(|d2| (-(d2 as f32) * s).exp()).collect();
+        Window { radius, weights, seen: [0; MAX_WINDOW], queue: Vec::new() }
+    }
+
+    /// The blurred value of one valid texel.
+    pub(crate) fn blur(&mut self, charts: &Charts, map: &ChartMap, sample: usize, texels: Texels) -> Vec3 {
+        let Texels { values, variances, valid, normals } = texels;
+        let (brightness, variance) = (values[sample].element_sum(), variances[sample]);
+        let (x, y) = map.position(sample);
+        let placement = map.placement_of(charts, sample);
+        self.seen = [0; MAX_WINDOW];
+        self.queue.clear();
+        self.visit(0, 0);
+        let (mut sum, mut total) = (Vec3::ZERO, 0.0);
+        let mut next = 0;
+        while next < self.queue.len() {
+            let (dx, dy) = self.queue[next];
+            next += 1;
+            let s = map.at(placement, x + dx, y + dy);
+            if s == NONE || !valid[s as usize] {
+                continue;
+            }
+            // Charts may bend; light from another direction is another light.
+            let bend = normals[sample].dot(normals[s as usize]).max(0.0);
+            let bend = bend * bend * bend * bend;
+            let s = s as usize;
+            let deviation = (variance + variances[s]).sqrt() + f32::MIN_POSITIVE;
+            let difference = (values[s].element_sum() - brightness) / (LIKE * deviation);
+            // Not a number where light overflows.
+            let like = if s == sample { 1.0 } else { (-0.5 * difference * difference).exp().max(0.0) };
+            let w = self.weights[(dx * dx + dy * dy) as usize] * bend * like;
+            sum += w * values[s];
+            total += w;
+            for (nx, ny) in [(dx - 1, dy), (dx + 1, dy), (dx, dy - 1), (dx, dy + 1)] {
+                if nx.abs() <= self.radius && ny.abs() <= self.radius {
+                    self.visit(nx, ny);
+                }
+            }
+        }
+        sum / total
+    }
+
+    fn visit(&mut self, dx: i32, dy: i32) {
+        let (row, bit) = ((dy + self.radius) as usize, 1u64 << (dx + self.radius));
+        if self.seen[row] & bit == 0 {
+            self.seen[row] |= bit;
+            self.queue.push((dx, dy));
+        }
+    }
+}
+
+/// Filling of missing texels: each gets the mean of its known or already filled neighbours in the chart, ring by ring.
+/// What charts without a known texel hold is left alone. Depends on the known texels alone, not on what the missing
+/// ones hold.
+pub(crate) struct Filling {
+    known: Vec<bool>,
+    missing: Vec<u32>,
+    /// Room for a ring of all that is missing.
+    ring: Vec<(u32, Vec3)>,
+}
+
+impl Filling {
+    /// Gets ready to fill the `missing` ones of `n` texels from those that are `known`. Filling takes no memory then.
+    pub(crate) fn new(n: usize, known: impl Fn(usize) -> bool, missing: impl Fn(usize) -> bool) -> Result<Filling> {
+        let missing = try_collect((0..n).filter(|&i| missing(i)).map(|i| i as u32), FILLED)?;
+        let ring = try_with_capacity(missing.len(), FILLED)?;
+        let known = if missing.is_empty() { Vec::new() } else { try_collect((0..n).map(known), FILLED)? };
+        Ok(Filling { known, missing, ring })
+    }
+
+    /// Fails, with part of the texels filled, on a cancel alone.
+    pub(crate) fn fill(
+        mut self,
+        charts: &Charts,
+        map: &ChartMap,
+        values: &mut [Vec3],
+        progress: &Progress,
+    ) -> Result<()> {
+        for _ in 0..MAX_FILL_ROUNDS {
+            self.ring.clear();
+            for part in self.missing.chunks(BLOCK) {
+                progress.check()?;
+                let mean = |&i: &u32| Some((i, neighbours(charts, map, i, values, &self.known)?));
+                self.ring.extend(part.iter().filter_map(mean));
+            }
+            if self.ring.is_empty() {
+                break;
+            }
+            for &(i, v) in &self.ring {
+                values[i as usize] = v;
+                self.known[i as usize] = true;
+            }
+            let known = &self.known;
+            self.missing.retain(|&i| !known[i as usize]);
+        }
+        Ok(())
+    }
+}
+
+/// Mean of the known neighbours of a texel in its chart.
+fn neighbours(charts: &Charts, map: &ChartMap, sample: u32, values: &[Vec3], known: &[bool]) -> Option<Vec3> {
+    let (x, y) = map.position(sample as usize);
+    let placement = map.placement_of(charts, sample as usize);
+    let (mut sum, mut n) = (Vec3::ZERO, 0.0);
+    for dy in -1..=1 {
+        for dx in -1..=1 {
+            let s = map.at(placement, x + dx, y + dy);
+            if s != NONE && known[s as usize] {
+                sum += values[s as usize];
+                n += 1.0;
+            }
+        }
+    }
+    (n > 0.0).then(|| sum / n)
+}

@@ -1,0 +1,11 @@
+//! Indirect light: the radiance map, the gather map, and what brings it to the light map's texels.
+
+pub mod blur;
+pub(crate) mod bright_patches;
+pub(crate) mod find_bright_patches;
+pub(crate) mod gather;
+mod narrow_gaps;
+pub(crate) mod radiance_map;
+pub(crate) mod sample_set;
+pub(crate) mod upsample;
+mod upsample_visibility;

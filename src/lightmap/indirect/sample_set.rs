@@ -1,0 +1,42 @@
+//! Points of the square from which gather rays get their directions, in rounds.
+
+use crate::sampling::sobol_2d_bits;
+
+/// Rays of a round.
+pub(crate) const ROUND: usize = 64;
+
+/// Points of the unit square, in fixed point, that every texel uses in its own shift.
+pub(crate) struct SampleSet {
+    points: Vec<[u32; 2]>,
+}
+
+impl SampleSet {
+    pub(crate) fn new(count: u32, seed: u32) -> SampleSet {
+        let mut points: Vec<[u32; 2]> = (0..count).map(|i| sobol_2d_bits(i, seed)).collect();
+        for round in points.chunks_mut(ROUND) {
+            round.sort_unstable_by_key(|&[x, y]| morton(x >> 16, y >> 16));
+        }
+        SampleSet { points }
+    }
+
+    /// All points, round by round.
+    pub(crate) fn points(&self) -> &[[u32; 2]] {
+        &self.points
+    }
+
+    /// Rounds, the last of which may be shorter.
+    pub(crate) fn rounds(&self) -> usize {
+        self.points.len().div_ceil(ROUND)
+    }
+}
+
+/// Bits of two 16-bit numbers interleaved.
+fn morton(x: u32, y: u32) -> u32 {
+    let spread = |mut v: u32| {
+        v = (v | v << 8) & 0x00ff_00ff;
+        v = (v | v << 4) & 0x0f0f_0f0f;
+        v = (v | v << 2) & 0x3333_3333;
+        (v | v << 1) & 0x5555_5555
+    };
+    spread(x) | spread(y) << 1
+}

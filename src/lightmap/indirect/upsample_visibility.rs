@@ -1,0 +1,181 @@
+//! Texels of the gather map behind walls and across creases.
+//!
+//! Where a wall stands on a floor, a texel of the light map may lie on one side of it and some of the gather texels that
+//! it interpolates between on the other. Those that it does not see from a little above the surface are left out, and
+//! those whose normals differ much from its own, as on either side of a fold. (As probes behind walls are left out in
+//! Majercik, Guertin, Nowrouzezahrai and McGuire, *Dynamic Diffuse Global Illumination with Ray-Traced Irradiance Fields*,
+//! 2019.)
+//!
+//! Living room, 20 texels/m: mean squared relative error of all but the worst hundredth of 300 points 4.0e-3 instead of
+//! 1.1e-2, of all but three hundredths 2.1e-3 instead of 4.1e-3. Seen from a quarter of a texel above, not an eighth, the
+//! same, from half a texel 6.3e-3, from 0.03 texels 6.6e-3. Creases: all points of Sponza in the sun 0.141 -> 0.050, by lamps
+//! 1.35e-2 as before; with cosines of 0.97, 0.9 and 0.5 instead, 0.050, 0.042 and 0.141 in the sun, no difference by lamps.
+
+use crate::error::{Error, Result};
+use crate::lightmap::atlas::Atlas;
+use crate::memory::{try_push, try_with_capacity};
+use crate::progress::Stage;
+use crate::scene::NONE;
+use crate::trace::Ray;
+use glam::Vec3;
+use std::collections::HashMap;
+
+/// A cancel is looked for whenever so many texels of a placement have been looked at.
+pub(in crate::lightmap) const TEXELS_PER_CHECK: usize = 64;
+
+/// Texels look at one another from so many texels of the gather map above the surface.
+const ABOVE: f32 = 0.125;
+
+/// Normals whose cosine is less belong to surfaces on either side of a crease.
+const CREASE: f32 = 0.8;
+
+/// What buffers are for, in errors.
+const WALLS: &str = "texels behind walls";
+
+/// Where a texel looks from, and its normal.
+#[derive(Clone, Copy)]
+struct Eye {
+    position: Vec3,
+    normal: Vec3,
+}
+
+/// The pairs of texels of a placement in the light map and in the gather map that interpolation would join through a
+/// wall or across a crease, on the side that `backs` tells of, in ascending order. Adds the rays traced to `rays`;
+/// `stage` may cancel.
+pub(in crate::lightmap) fn between(
+    atlas: &Atlas,
+    placement: u32,
+    backs: &[bool],
+    stage: &Stage,
+    rays: &mut u64,
+) -> Result<Vec<(u32, u32)>> {
+    let (gather, map) = (&atlas.gather, &atlas.map);
+    let scale = gather.layout.placements[placement as usize].scale;
+    let above = ABOVE / scale[0].min(scale[1]);
+    let eye = |map, sample: usize| -> Eye {
+        let receiver = atlas.receiver(map, backs, sample);
+        Eye { position: receiver.origin + receiver.geometric * above, normal: receiver.normal }
+    };
+    let own = gather.samples_of(placement);
+    let mut eyes: Vec<Eye> = try_with_capacity(own.len(), WALLS)?;
+    for (i, sample) in own.clone().enumerate() {
+        if i % TEXELS_PER_CHECK == 0 {
+            stage.check()?;
+        }
+        eyes.push(eye(gather, sample));
+    }
+    let eye_of = |s: u32| eyes[s as usize - own.start];
+    let mut are_apart = |a: Eye, b: Eye| {
+        if a.normal.dot(b.normal) < CREASE {
+            return true;
+        }
+        *rays += 1;
+        atlas.scene.occluded(&Ray::new(a.position, b.position - a.position).within(0.0, 1.0))
+    };
+    let mut split: HashMap<[u32; 4], bool> = HashMap::new();
+    let mut found = Vec::new();
+    for (i, sample) in map.samples_of(placement).enumerate() {
+        if i % TEXELS_PER_CHECK == 0 {
+            stage.check()?;
+        }
+        let (mut around, mut n) = ([NONE; 4], 0);
+        atlas.gather_around(sample, |s, _| {
+            around[n] = s as u32;
+            n += 1;
+        });
+        if n == 0 {
+            continue;
+        }
+        around[..n].sort_unstable();
+        let from = eye(map, sample);
+        split.try_reserve(1).map_err(|e| Error::OutOfMemory(format!("{WALLS}: {e}")))?;
+        // Most are around many texels, and all alike. A single one around, as on narrow charts, tells nothing of the texel.
+        let is_split = *split.entry(around).or_insert_with(|| {
+            let mut pairs = (1..n).flat_map(|i| (0..i).map(move |j| (i, j)));
+            around[0] == around[n - 1] || pairs.any(|(i, j)| are_apart(eye_of(around[i]), eye_of(around[j])))
+        });
+        if is_split {
+            for &s in around[..n].iter().filter(|&&s| are_apart(from, eye_of(s))) {
+                try_push(&mut found, (sample as u32, s), WALLS)?;
+            }
+        } else if from.normal.dot(eye_of(around[0]).normal) < CREASE {
+            for &s in &around[..n] {
+                try_push(&mut found, (sample as u32, s), WALLS)?;
+            }
+        }
+    }
+    Ok(found)
+}
+
+#[cfg(test)]
+mod tests {
+    use crate::lightmap::atlas::chart_map::ChartMap;
+    use crate::lightmap::indirect::upsample::tests::{dark, find};
+    use crate::lightmap::{Lightmap, LightmapDesc};
+    use crate::progress::Progress;
+    use crate::scene::shapes::MeshBuilder;
+    use crate::scene::{LightmapUvs, Material, SceneData};
+    use glam::{Vec2, Vec3};
+
+    /// A floor of 4 × 4 with a thin wall on it at x = 0.03, or none.
+    fn light_map(wall: bool) -> Lightmap {
+        let mut data = SceneData::new();
+        let m = data.add_material(Material { two_sided: true, ..Default::default() }).unwrap();
+        let p = Vec3::new;
+        let mut builder = MeshBuilder::new();
+        builder.quad(p(-2.0, -2.0, 0.0), p(2.0, -2.0, 0.0), p(2.0, 2.0, 0.0), p(-2.0, 2.0, 0.0), m);
+        if wall {
+            builder.box_(p(0.03, -3.0, -0.01), p(0.04, 3.0, 1.0), false, m);
+        }
+        data.add_mesh(builder.finish()).unwrap();
+        let desc = LightmapDesc { texels_per_unit: 20.0, gather_divisor: 4, ..Default::default() };
+        Lightmap::create(&data.committed(), &desc, &Progress::none()).unwrap()
+    }
+
+    /// Texels of the only chart that show some of a light on gather texels with x < `edge`, but for those to `skip`,
+    /// and whether interpolation has anything to heed.
+    fn mixed(lightmap: &Lightmap, edge: f32, skip: impl Fn(f32) -> bool) -> (usize, bool) {
+        let atlas = lightmap.atlas();
+        let upsampling = find(atlas, 0..1, &[]);
+        let x = |map: &ChartMap, s: usize| map.surface(&atlas.scene, s).0.x;
+        let light = |s: usize| Vec3::splat(f32::from(u8::from(x(&atlas.gather, s) < edge)));
+        let values: Vec<Vec3> = (0..atlas.gather.len()).map(light).collect();
+        let is_mixed = |s: &usize| {
+            let shown = upsampling.at(atlas, &values, &dark(&upsampling), *s).x;
+            !skip(x(&atlas.map, *s)) && shown > 0.01 && shown < 0.99
+        };
+        (atlas.map.samples_of(atlas.charts.chart_of[0]).filter(is_mixed).count(), !upsampling.is_plain())
+    }
+
+    #[test]
+    fn light_does_not_go_through_walls_by_interpolation() {
+        for wall in [true, false] {
+            // Below the wall nothing is seen.
+            let (mixed, heeds) = mixed(&light_map(wall), 0.035, |x| (0.02..0.05).contains(&x));
+            assert_eq!((mixed > 0, heeds), (!wall, wall), "{mixed}");
+        }
+    }
+
+    #[test]
+    fn light_does_not_go_around_creases_by_interpolation() {
+        for degrees in [60.0f32, -60.0, 20.0] {
+            let (sin, cos) = degrees.to_radians().sin_cos();
+            let mut data = SceneData::new();
+            let m = data.add_material(Material::default()).unwrap();
+            let mut builder = MeshBuilder::new();
+            builder.sheet(2, 1, m, |u, v| {
+                let x = 4.0 * u - 2.0;
+                Vec3::new(if x > 0.0 { cos * x } else { x }, 4.0 * v - 2.0, sin * x.max(0.0))
+            });
+            let mut mesh = builder.finish();
+            let unfolded = |p: &Vec3| Vec2::new(if p.x > 0.0 { p.x / cos } else { p.x }, p.y) * 0.2 + 0.5;
+            mesh.lightmap = Some(LightmapUvs { uvs: mesh.positions.iter().map(unfolded).collect(), pages: Vec::new() });
+            data.add_mesh(mesh).unwrap();
+            let desc = LightmapDesc { texels_per_unit: 20.0, gather_divisor: 4, ..Default::default() };
+            let lightmap = Lightmap::create(&data.committed(), &desc, &Progress::none()).unwrap();
+            assert_eq!(lightmap.atlas().charts.charts.len(), 1);
+            let (mixed, heeds) = mixed(&lightmap, 0.0, |x| x.abs() < 0.01);
+            assert_eq!((mixed > 0, heeds), (degrees == 20.0, degrees != 20.0), "{mixed} at {degrees}");
+        }
+    }
+}

@@ -1,0 +1,206 @@
+//! Reading light maps out: pages layer by layer, UVs, and filtered lookups as a shader would do.
+
+use super::atlas::texels::PageArea;
+use super::indirect::radiance_map;
+use super::indirect::radiance_map::RadianceMap;
+use super::{Layer, LayerData, Light, Lightmap, TexelState};
+use crate::direct::DirectLight;
+use crate::error::{Error, Result, invalid_argument};
+use crate::memory::{try_collect, try_vec, try_with_capacity};
+use crate::scene::NONE;
+use crate::trace::RawHit;
+use glam::Vec3;
+
+/// What the validity layer says of a texel filled from its neighbours.
+const FILLED: f32 = 0.5;
+
+/// Corner UVs of each triangle, and its page.
+pub type MeshUvs = (Vec<[[f32; 2]; 3]>, Vec<u32>);
+
+impl Lightmap {
+    /// Light map UV in [0, 1] of each corner, and the page of each triangle of `mesh`. Triangles
+    /// without texels (degenerate ones) have page [`NONE`] and UVs 0.
+    pub fn mesh_uvs(&self, mesh: u32) -> Result<MeshUvs> {
+        self.uvs_of(mesh, true)
+    }
+
+    /// The same for the backs of `mesh`'s triangles, and whether each has a place of its own. Those that have none
+    /// share the front's.
+    pub fn mesh_back_uvs(&self, mesh: u32) -> Result<(MeshUvs, Vec<bool>)> {
+        let uvs = self.uvs_of(mesh, false)?;
+        let first = self.atlas.scene.first_triangle(mesh);
+        let own = (first..first + uvs.1.len() as u32).map(|t| self.has_both_sides(t));
+        let own = try_collect(own, "the UVs of a mesh")?;
+        Ok((uvs, own))
+    }
+
+    fn uvs_of(&self, mesh: u32, front: bool) -> Result<MeshUvs> {
+        let Some(m) = self.atlas.scene.meshes().get(mesh as usize) else {
+            return invalid_argument!("mesh {mesh} does not exist, the scene has {}", self.atlas.scene.meshes().len());
+        };
+        let first = self.atlas.scene.first_triangle(mesh);
+        let mut uvs = try_with_capacity(m.indices.len(), "the UVs of a mesh")?;
+        let mut pages = try_with_capacity(m.indices.len(), "the UVs of a mesh")?;
+        let scale = 1.0 / self.atlas.map.layout.page_size as f32;
+        for t in first..first + m.indices.len() as u32 {
+            let chart = self.atlas.charts.chart_of[t as usize];
+            if chart == NONE {
+                uvs.push([[0.0; 2]; 3]);
+                pages.push(NONE);
+                continue;
+            }
+            let placement = self.atlas.map.layout.place_of(chart, front);
+            let corners = self.atlas.charts.corners[t as usize];
+            // Rounding of placements may go beyond the page by some 1e-9.
+            uvs.push(
+                corners.map(|c| self.atlas.map.layout.texel_coord(placement, c).map(|x| (x * scale).clamp(0.0, 1.0))),
+            );
+            pages.push(self.atlas.map.layout.placements[placement as usize].page);
+        }
+        Ok((uvs, pages))
+    }
+
+    pub(super) fn light(&self) -> Result<&Light> {
+        self.light.as_ref().ok_or_else(|| Error::InvalidState("the light map has not been baked yet".into()))
+    }
+
+    /// Returns one layer of one page, row-major from v = 0. The layers of light (combined, indirect, direct, radiance)
+    /// need a bake (`InvalidState` before); the others can be read at any time. In the layers of light, texels around charts
+    /// repeat the nearest covered texel, up to the padding.
+    pub fn read(&self, page: u32, layer: Layer) -> Result<LayerData> {
+        if page >= self.atlas.info.page_count {
+            return invalid_argument!("page is {page}, the light map has {}", self.atlas.info.page_count);
+        }
+        let map = &self.atlas.map;
+        match layer {
+            Layer::Combined => {
+                let light = self.light()?;
+                self.page_of_light(page, |s| (light.direct[s] + light.indirect[s]).to_array())
+            }
+            Layer::Direct => {
+                let light = self.light()?;
+                self.page_of_light(page, |s| light.direct[s].to_array())
+            }
+            Layer::Indirect => {
+                let light = self.light()?;
+                self.page_of_light(page, |s| light.indirect[s].to_array())
+            }
+            Layer::Radiance => {
+                let light = self.light()?;
+                self.page_of_light(page, |s| self.radiance_at(light, s))
+            }
+            Layer::Validity => {
+                let padding = self.atlas.padding;
+                Ok(LayerData::Scalar(self.page(page, 0.0, padding, |s| self.validity(s), |v| FILLED.min(v))?))
+            }
+            Layer::Position => {
+                let position = |s| map.surface(&self.atlas.scene, s).0.to_array();
+                Ok(LayerData::Rgb(self.page_of_samples(page, [0.0; 3], position)?))
+            }
+            Layer::Normal => {
+                let backs = self.light.as_ref().map_or(&[][..], |l| &l.backs);
+                let normal = |s: usize| {
+                    let n = map.surface(&self.atlas.scene, s).1;
+                    if self.atlas.is_back(map, backs, s) { -n } else { n }.to_array()
+                };
+                Ok(LayerData::Rgb(self.page_of_samples(page, [0.0; 3], normal)?))
+            }
+            Layer::Triangle => {
+                let triangle = |s: usize| map.texels.samples[s].triangle;
+                Ok(LayerData::Integer(self.page_of_samples(page, NONE, triangle)?))
+            }
+        }
+    }
+
+    /// What the validity layer says of a sample.
+    fn validity(&self, sample: usize) -> f32 {
+        // Before a bake: what a bake will cover.
+        let Some(light) = &self.light else { return 1.0 };
+        match light.state[sample] {
+            TexelState::Visible => 1.0,
+            TexelState::Hidden => FILLED,
+            TexelState::Unbaked => 0.0,
+        }
+    }
+
+    /// Outgoing radiance of a texel: reflected, from the radiance map, plus emitted.
+    fn radiance_at(&self, light: &Light, sample: usize) -> [f32; 3] {
+        let t = self.atlas.map.texels.samples[sample];
+        let back = self.atlas.is_back(&self.atlas.map, &light.backs, sample);
+        let mut l = DirectLight::emitted(&self.atlas.scene, t.triangle, back);
+        if light.radiance.values.is_empty() {
+            let e = light.direct[sample] + light.indirect[sample];
+            let a = &self.atlas;
+            l += radiance_map::albedo(&a.areas(&a.map), sample) * e / std::f32::consts::PI;
+        } else {
+            let lookup = RadianceMap::new(&self.atlas.charts, &self.atlas.radiance, &light.radiance);
+            let hit = RawHit { t: 0.0, u: t.u, v: t.v, triangle: t.triangle, front: !back };
+            l += lookup.reflected(&hit).unwrap_or_default();
+        }
+        l.to_array()
+    }
+
+    /// A page of values by sample; `fill` gives what a texel within `padding` of a chart shows by the value of the
+    /// nearest sample.
+    fn page<T: Copy + Default>(
+        &self,
+        page: u32,
+        empty: T,
+        padding: u32,
+        value: impl Fn(usize) -> T,
+        fill: impl Fn(T) -> T,
+    ) -> Result<Vec<T>> {
+        let size = self.atlas.map.layout.page_size;
+        let mut out = try_vec::<T>(size as usize * size as usize, "a page")?;
+        out.fill(empty);
+        let texels = &self.atlas.map.texels;
+        let groups = texels.groups_of_page(page);
+        texels.compose(groups, &PageArea::page(size), padding, &mut out, |s| value(s as usize), fill);
+        Ok(out)
+    }
+
+    /// A page of light: the padding repeats the nearest sample.
+    fn page_of_light(&self, page: u32, value: impl Fn(usize) -> [f32; 3]) -> Result<LayerData> {
+        Ok(LayerData::Rgb(self.page(page, [0.0; 3], self.atlas.padding, value, |v| v)?))
+    }
+
+    /// A page of what covered texels alone have.
+    fn page_of_samples<T: Copy + Default>(&self, page: u32, empty: T, value: impl Fn(usize) -> T) -> Result<Vec<T>> {
+        self.page(page, empty, 0, value, |v| v)
+    }
+
+    /// Whether the back of a global triangle has a place of its own.
+    fn has_both_sides(&self, triangle: u32) -> bool {
+        self.atlas.map.layout.back(self.atlas.charts.chart_of[triangle as usize]).is_some()
+    }
+
+    /// Whether the light map holds the light of a side of a global triangle. Before a bake, of two sides in one place
+    /// that is the front.
+    pub fn shows(&self, triangle: u32, front: bool) -> bool {
+        let backs = self.light.as_ref().map_or(&[][..], |l| &l.backs);
+        let back = backs.get(self.atlas.charts.chart_of[triangle as usize] as usize).is_some_and(|&b| b);
+        front != back || self.has_both_sides(triangle)
+    }
+
+    /// What a shader sees at a point of a side of a global triangle (weights of vertices 1 and 2):
+    /// a light layer, bilinearly filtered within the chart; of two sides in one place the one that
+    /// is [shown](Self::shows). Zero before a bake and for the layers that are not light.
+    pub fn sample(&self, layer: Layer, triangle: u32, front: bool, u: f32, v: f32) -> [f32; 3] {
+        let Some(light) = &self.light else { return [0.0; 3] };
+        let chart = self.atlas.charts.chart_of[triangle as usize];
+        if chart == NONE {
+            return [0.0; 3];
+        }
+        let value = |s: usize| match layer {
+            Layer::Combined => light.direct[s] + light.indirect[s],
+            Layer::Direct => light.direct[s],
+            Layer::Indirect => light.indirect[s],
+            Layer::Radiance => self.radiance_at(light, s).into(),
+            _ => Vec3::ZERO,
+        };
+        let mut sum = Vec3::ZERO;
+        let placement = self.atlas.map.layout.place_of(chart, front);
+        self.atlas.map.bilinear(placement, self.atlas.charts.local(triangle, u, v), |s, w| sum += w * value(s));
+        sum.to_array()
+    }
+}
