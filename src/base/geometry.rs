@@ -1,4 +1,4 @@
-//! Triangles: which are valid, and their normals.
+//! Triangles and boxes: which triangles are valid, their normals, and areas.
 
 use glam::Vec3;
 
@@ -23,4 +23,10 @@ pub fn is_valid_triangle(corners: [Vec3; 3]) -> bool {
 pub fn unit_normal(corners: [Vec3; 3]) -> Vec3 {
     let [a, b, c] = corners.map(|c| c.as_dvec3());
     (b - a).cross(c - a).normalize_or_zero().as_vec3()
+}
+
+/// Half the surface area of a box. In f64: sums over huge scenes neither overflow nor cancel.
+pub(crate) fn half_area(lower: Vec3, upper: Vec3) -> f64 {
+    let d = (upper - lower).max(Vec3::ZERO).as_dvec3();
+    d.x * d.y + d.y * d.z + d.z * d.x
 }

@@ -7,6 +7,7 @@
 
 use super::BuildOptions;
 use super::layout::SAH_DEPTH;
+use crate::base::geometry::half_area;
 use crate::error::Result;
 use crate::memory::try_vec;
 use crate::progress::Progress;
@@ -163,12 +164,6 @@ impl Reference {
     pub(super) fn centre(&self) -> Vec4 {
         self.0.upper - self.0.neg_lower
     }
-}
-
-/// In f64: sums over huge scenes neither overflow nor cancel.
-pub(super) fn half_area(lower: Vec3, upper: Vec3) -> f64 {
-    let d = (upper - lower).max(Vec3::ZERO).as_dvec3();
-    d.x * d.y + d.y * d.z + d.z * d.x
 }
 
 /// Half the surface areas of boxes of extents `d`, in lanes.

@@ -5,8 +5,8 @@
 //! Other than there, grids start at a float and boxes are decoded to floats, which contain those of
 //! [`Node`]: so the box test is that of whole nodes, with all that makes it conservative.
 
-use super::binned::half_area;
 use super::layout::{ChildRef, Node, WIDTH};
+use crate::base::geometry::half_area;
 use crate::error::Result;
 use crate::memory::{try_collect, try_to_vec};
 use bytemuck::{Pod, Zeroable};

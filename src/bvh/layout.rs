@@ -1,6 +1,6 @@
 //! Memory layout of the 8-wide tree.
 
-use super::binned::half_area;
+use crate::base::geometry::half_area;
 use crate::error::Result;
 use crate::memory::try_to_vec;
 use crate::simd::prefetch;

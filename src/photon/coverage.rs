@@ -12,7 +12,7 @@
 //! room – 1.4 % of the median point instead of 0.5 % – and were three times as many there as photons.)
 
 use super::PhotonMap;
-use super::estimate::SAME_SURFACE;
+use super::cylinder::SAME_SURFACE;
 use crate::sampling::{concentric_disc, orthonormal_basis, sobol_2d};
 use crate::trace::Ray;
 use crate::trace::offset::offset_ray_origin;

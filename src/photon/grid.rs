@@ -12,7 +12,7 @@
 //! of the arrays.
 
 use super::PhotonView;
-use super::estimate::Cylinder;
+use super::cylinder::Cylinder;
 use super::trace::{StoredPhoton, Traced};
 use crate::error::{Error, Result};
 use crate::memory::{Reservation, try_vec};

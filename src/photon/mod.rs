@@ -12,6 +12,7 @@
 //! The same seed and ISA give the same map and the same estimates for any number of threads.
 
 pub(crate) mod coverage;
+mod cylinder;
 mod emission;
 mod estimate;
 mod grid;
@@ -25,7 +26,8 @@ use crate::memory::{MemoryMonitor, Reservation, try_vec};
 use crate::progress::Progress;
 use crate::scene::Scene;
 use crate::trace::Ray;
-use estimate::{Cylinder, EstimateFn};
+use cylinder::Cylinder;
+use estimate::EstimateFn;
 use glam::Vec3;
 use grid::Grid;
 use rayon::prelude::*;

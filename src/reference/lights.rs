@@ -6,23 +6,13 @@
 //! weighted against directions sampled by cosine with the balance heuristic (Veach 1997, section
 //! 9.2.2), which keeps surfaces close to them free of fireflies.
 
+use super::proposal::{Proposal, balance, brightness, rgb};
 use super::random::{Random, triangle_point};
 use super::sky::Sky;
 use crate::scene::{Environment, Light, Material, Mesh};
 use glam::{DVec3, Vec3};
 use std::f64::consts::{PI, TAU};
 use std::sync::Arc;
-
-/// What a light would do to a surface element if nothing is in the way.
-#[derive(Clone, Copy, Debug)]
-pub struct Proposal {
-    /// Irradiance, weighted by the balance heuristic and divided by the density of the sample.
-    pub irradiance: DVec3,
-    /// Unit vector towards the light.
-    pub direction: DVec3,
-    /// How far away it is; infinite for directional lights.
-    pub distance: f64,
-}
 
 /// A flat piece of surface that radiates.
 #[derive(Clone, Copy, Debug)]
@@ -47,15 +37,6 @@ pub struct Lights {
     emitters: Vec<Area>,
     /// Running sums of the emitters' power (in luminance-like units), the total last.
     power: Vec<f64>,
-}
-
-/// Sum of the channels: what random choices go by.
-pub fn brightness(color: DVec3) -> f64 {
-    color.element_sum()
-}
-
-pub fn rgb(color: [f32; 3]) -> DVec3 {
-    Vec3::from_array(color).as_dvec3()
 }
 
 impl Area {
@@ -84,12 +65,6 @@ impl Area {
         // Radiance · cosine / density, times density / (density + density by cosine).
         Some(Proposal { irradiance: self.radiance * (cosine / (density + cosine / PI)), direction, distance })
     }
-}
-
-/// Share of a sample that was found by following a direction of density `by_direction`, when area
-/// sampling would have found it with density `by_area`.
-pub fn balance(by_direction: f64, by_area: f64) -> f64 {
-    by_direction / (by_direction + by_area)
 }
 
 impl Lights {

@@ -11,6 +11,7 @@ mod geometry;
 mod lights;
 mod oracle;
 mod path;
+mod proposal;
 mod random;
 mod sky;
 mod surfaces;

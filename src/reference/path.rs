@@ -7,7 +7,8 @@
 //! transmit are passed straight or reflect, by chance.
 
 use super::geometry::{Geometry, Hit64, Ray64};
-use super::lights::{Lights, rgb};
+use super::lights::Lights;
+use super::proposal::rgb;
 use super::random::{Random, cosine_direction};
 use super::surfaces::Surfaces;
 use crate::device::Device;

@@ -1,7 +1,7 @@
 //! Skies of the path tracer: written from their description alone, in f64, so that a mistake in the
 //! library's own is not shared.
 
-use super::lights::{Proposal, balance, rgb};
+use super::proposal::{Proposal, balance, rgb};
 use super::random::Random;
 use crate::scene::{Environment, Light, NONE};
 use glam::{DVec2, DVec3};

@@ -2,7 +2,7 @@
 //! library's.
 
 use super::geometry::{Geometry, Hit64, Ray64};
-use super::lights::rgb;
+use super::proposal::rgb;
 use crate::scene::{MAX_ALBEDO, Material, Mesh, NONE, Texture};
 use glam::{DVec2, DVec3};
 use std::sync::Arc;

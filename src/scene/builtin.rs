@@ -1,6 +1,7 @@
 //! Scenes made by code, for tests, examples and first steps.
 
 use super::atrium::{atrium, atrium_camera};
+use super::camera::Camera;
 use super::rooms::{furniture, furniture_camera, partition, partition_camera};
 use super::shapes::MeshBuilder;
 use super::{Light, Material, SceneData};
@@ -9,16 +10,6 @@ use glam::Vec3;
 
 /// The names that [`builtin`] knows.
 pub const BUILTIN_NAMES: &[&str] = &["cornell", "furnace", "sealed", "atrium", "furniture", "partition"];
-
-/// A pinhole camera.
-#[derive(Clone, Copy, Debug, PartialEq)]
-pub struct Camera {
-    pub position: Vec3,
-    pub target: Vec3,
-    pub up: Vec3,
-    /// Vertical field of view in radians.
-    pub fov_y: f32,
-}
 
 /// A built-in scene by name, with its lights. Units are metres, y is up.
 ///

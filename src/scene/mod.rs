@@ -4,6 +4,7 @@
 mod atrium;
 mod build;
 mod builtin;
+mod camera;
 mod committed;
 mod emitters;
 mod environment;
@@ -17,7 +18,8 @@ pub mod shapes;
 mod texture;
 
 pub use crate::base::geometry::{MAX_COORDINATE, NONE, is_valid_triangle, unit_normal};
-pub use builtin::{BUILTIN_NAMES, Camera, builtin, builtin_camera, is_builtin};
+pub use builtin::{BUILTIN_NAMES, builtin, builtin_camera, is_builtin};
+pub use camera::Camera;
 pub use committed::{Scene, SceneStats};
 pub use emitters::Emitter;
 pub use environment::{Environment, MAX_ENVIRONMENT_SIZE, Sky};

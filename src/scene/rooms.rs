@@ -1,6 +1,6 @@
 //! Small rooms for measurements of light, each with one difficulty. Units are metres, y is up.
 
-use super::builtin::Camera;
+use super::camera::Camera;
 use super::shapes::MeshBuilder;
 use super::{Light, Material, SceneData};
 use crate::error::Result;

@@ -44,8 +44,8 @@ fn slab(node: &BinaryNode, origin: Vec3, reciprocal: Vec3, tmin: f32, tmax: f32)
     let a = Vec3::select(a.is_nan_mask(), Vec3::NEG_INFINITY, a);
     let b = Vec3::select(b.is_nan_mask(), Vec3::INFINITY, b);
     let near = a.min(b).max_element().max(tmin);
-    let far = a.max(b).min_element() * super::single::FAR_SCALE;
-    if near <= far.min(super::single::beyond(tmax)) { near } else { f32::INFINITY }
+    let far = a.max(b).min_element() * super::tree::FAR_SCALE;
+    if near <= far.min(super::tree::beyond(tmax)) { near } else { f32::INFINITY }
 }
 
 /// Edge functions in 3D (Kensler and Shirley 2006): other arithmetic than that of the kernels.
@@ -63,6 +63,6 @@ fn intersect(corners: &[Vec3; 3], triangle: u32, origin: Vec3, direction: Vec3) 
         return None;
     }
     let sum = u + v + w;
-    let (u, v) = super::single::barycentrics(u, v, sum);
+    let (u, v) = super::triangle::barycentrics(u, v, sum);
     Some(RawHit { t: normal.dot(v0) / den, u, v, triangle, front: sum < 0.0 })
 }

@@ -5,8 +5,7 @@
 //! comes to leaves whose own box it passes; a hit counts only if the ray meets that box, computed from the
 //! corners. So hits are those of whole trees, bit for bit.
 
-use super::single::RaySetup;
-use super::tree::{Leaf, Tree};
+use super::tree::{Leaf, RaySetup, Tree};
 use super::triangle::{Projected, Shear, V3, accurate_distance};
 use crate::bvh::compact::{Compact, CompactNode, GONE, NUMBER, ORDER};
 use crate::bvh::layout::{ChildRef, MAX_LEAF, WIDTH};

@@ -11,11 +11,13 @@ mod gather;
 mod kernels;
 pub mod offset;
 mod packet;
+mod pass_through;
 mod queries;
 mod ray;
 mod single;
 mod tree;
 mod triangle;
+mod whole;
 
 pub(crate) use kernels::Kernels;
 pub use ray::{Hit, PACKET_SIZE, Packet, RawHit, Ray};

@@ -16,8 +16,9 @@
 //! with 32 to 1024 strata, and 0.75 to 0.94 times with texels next to each other: rays that pass the same
 //! nodes end in different leaves, and most tests of a leaf are for rays that miss its box.)
 
-use super::single::{self, BEYOND, EPSILON, FARTHEST_ORIGIN, OFFSET_ERROR, STEEP, barycentrics, beyond};
-use super::triangle::{GRAZING, Projected, Shear, V3, accurate_distance};
+use super::single;
+use super::tree::{BEYOND, EPSILON, FARTHEST_ORIGIN, OFFSET_ERROR, STEEP, beyond};
+use super::triangle::{GRAZING, Projected, Shear, V3, accurate_distance, barycentrics};
 use super::{RawHit, Ray};
 use crate::base::geometry::NONE;
 use crate::bvh::layout::{ChildRef, MAX_LEAF, Mbvh, Node, STACK_SIZE, WIDTH};

@@ -1,7 +1,7 @@
 //! Queries of a committed scene: closest hits, occlusion and shared-origin gathers, one ray or many.
 //!
 //! Points that a texture cuts out are no hits. In scenes that have some, hits and occlusion are
-//! [checked](super::filter) after the kernels, which are those of all scenes.
+//! [checked](super::pass_through) after the kernels, which are those of all scenes.
 
 use super::compact::View;
 use super::{Hit, Kernels, PACKET_SIZE, Packet, RawHit, Ray};

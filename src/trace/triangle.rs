@@ -226,3 +226,9 @@ pub(super) unsafe fn accurate_distance(leaf: *const f32, count: usize, i: usize,
     let [least, most] = range.unwrap_or_else(nearest);
     (normal.dot(a) / slope).max(least).min(most) as f32
 }
+
+/// Weights of corners 1 and 2 from the edge functions. The sum vanishes only where all three do.
+#[inline(always)]
+pub(super) fn barycentrics(u: f32, v: f32, sum: f32) -> (f32, f32) {
+    if sum == 0.0 { (0.0, 0.0) } else { ((u / sum).min(1.0), (v / sum).min(1.0)) }
+}

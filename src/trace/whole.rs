@@ -1,0 +1,86 @@
+//! Rays through the whole tree, [`Mbvh`].
+
+use super::tree::{Leaf, RaySetup, Tree};
+use super::triangle::{Projected, Shear, accurate_distance};
+use crate::bvh::layout::{ChildRef, Mbvh, Node, WIDTH};
+use crate::simd::{Four, Lanes, Simd};
+use std::mem::MaybeUninit;
+
+impl Tree for Mbvh {
+    type Node = Node;
+    type Leaf<'a> = Rows;
+
+    const ROW: u32 = 4 * WIDTH as u32;
+
+    #[inline(always)]
+    fn prefetch(&self, child: ChildRef) {
+        self.prefetch(child);
+    }
+
+    #[inline(always)]
+    unsafe fn node(&self, node: ChildRef) -> &Node {
+        debug_assert!(node.node_index() < self.nodes.len());
+        // SAFETY: inner references of the tree are in range.
+        unsafe { self.nodes.get_unchecked(node.node_index()) }
+    }
+
+    #[inline(always)]
+    unsafe fn planes<S: Simd>(node: &Node, _: usize, row: u32) -> S::F8 {
+        let bytes = std::ptr::from_ref(node).cast::<u8>();
+        // SAFETY: planes come first in a node, in rows of eight; the caller vouches for the ISA.
+        unsafe { S::F8::load(bytes.add(row as usize).cast()) }
+    }
+
+    #[inline(always)]
+    fn names(node: &Node, _: &mut MaybeUninit<[u32; WIDTH]>) -> *const u32 {
+        node.children.as_ptr().cast()
+    }
+
+    #[inline(always)]
+    fn order(node: &Node) -> *const u32 {
+        node.order.as_ptr()
+    }
+
+    #[inline(always)]
+    unsafe fn leaf<S: Simd>(&self, leaf: ChildRef) -> Rows {
+        // SAFETY: forwarded.
+        Rows { rows: unsafe { self.leaf(leaf) }, count: leaf.leaf_count() }
+    }
+}
+
+/// A leaf of an [`Mbvh`].
+pub(super) struct Rows {
+    rows: *const f32,
+    count: usize,
+}
+
+impl Leaf for Rows {
+    #[inline(always)]
+    fn count(&self) -> usize {
+        self.count
+    }
+
+    #[inline(always)]
+    unsafe fn project<L: Four>(&self, first: usize, ray: &Shear) -> Projected<L> {
+        // SAFETY: `rows` is a leaf of `count`; the caller vouches for the rest.
+        unsafe { Projected::load(self.rows, self.count, first, ray) }
+    }
+
+    #[inline(always)]
+    unsafe fn accurate_distance(&self, i: usize, ray: &Shear) -> f32 {
+        // SAFETY: as above.
+        unsafe { accurate_distance(self.rows, self.count, i, ray) }
+    }
+
+    #[inline(always)]
+    unsafe fn number(&self, i: usize) -> u32 {
+        // SAFETY: row 9 of the leaf holds `count` numbers.
+        unsafe { self.rows.add(9 * self.count + i).read().to_bits() }
+    }
+
+    /// Always: the leaf's box has been met.
+    #[inline(always)]
+    unsafe fn counts<S: Simd>(&self, _: usize, _: &RaySetup, _: f32) -> bool {
+        true
+    }
+}
