@@ -1,5 +1,6 @@
 //! `include/bakelite.h` is generated from `src/capi` and committed. This test generates it again
 //! and fails on a difference; `BAKELITE_UPDATE_HEADER=1 cargo test --test header` writes it.
+//! `check_header.py` judges what it says, `abi.py` whether it is still the same interface.
 //!
 //! cbindgen sorts a file's items by kind (constants, types, functions). So that the header reads by
 //! subject, it is made section by section: one per source file, headed by the file's `//!` text.
@@ -14,7 +15,8 @@ const SECTIONS: [&str; 12] =
     ["error", "device", "scene", "textures", "meshes", "lights", "rays", "photons", "lightmap", "bake", "read", "live"];
 
 const HEAD: &str = "\
-/*
+/**
+ * @file bakelite.h
  * Bakelite: SIMD light-baking kernels.
  *
  * Generated from src/capi by cbindgen; do not edit. To update it:
@@ -33,6 +35,11 @@ const HEAD: &str = "\
 #else
 #define BK_API
 #endif
+#endif
+
+/* Declares what may still change: see the first section. */
+#ifndef BK_EXPERIMENTAL
+#define BK_EXPERIMENTAL BK_API
 #endif
 
 #ifdef __cplusplus
@@ -73,21 +80,35 @@ fn section(source: &Path) -> String {
     let bindings = Builder::new().with_config(config()).with_src(source).generate();
     bindings.unwrap_or_else(|e| panic!("{}: {e}", source.display())).write(&mut out);
     let items = String::from_utf8(out).expect("cbindgen writes UTF-8");
-    format!("\n{}\n{}", heading(source), tidy(&items))
+    format!("\n{}\n{}\n/** @}} */\n", heading(source), tidy(&items).trim_end())
 }
 
-/// The file's `//!` text between rulers.
+/// The file's `//!` text below a ruler, as the head of a group for Doxygen. The first line is the title.
 fn heading(source: &Path) -> String {
     let text = std::fs::read_to_string(source).expect("the source can be read");
-    let head: Vec<String> = text.lines().map_while(|l| l.strip_prefix("//!")).map(|l| format!(" *{l}\n")).collect();
-    format!("/* {0}\n{1} * {0} */\n", "=".repeat(96), head.concat())
+    let mut head = text.lines().map_while(|l| l.strip_prefix("//!"));
+    let name = source.file_stem().expect("a file").to_string_lossy().into_owned();
+    let title = head.next().expect("a title").trim();
+    let text: String = head.map(|l| format!(" *{l}\n")).collect();
+    let ruler = "=".repeat(94);
+    format!("/* {ruler} */\n/**\n * @defgroup {name} {title}\n{text} *\n * @{{\n */\n/* {ruler} */\n")
 }
 
 /// Types are known by their typedefs: drops the `struct` where it is not needed. Constants get the
 /// look that C programmers expect: negative ones in parentheses, all bits set in hexadecimal.
+///
+/// Functions whose text has a paragraph that begins with "Experimental:" are declared so.
 fn tidy(items: &str) -> String {
     let mut out = String::with_capacity(items.len());
+    let mut experimental = false;
     for line in items.lines() {
+        experimental |= line.starts_with("/// Experimental:");
+        if line.starts_with("BK_API") {
+            let api = if std::mem::take(&mut experimental) { "BK_EXPERIMENTAL" } else { "BK_API" };
+            out += &line.replace("struct bk_", "bk_").replacen("BK_API", api, 1);
+            out.push('\n');
+            continue;
+        }
         if let Some((name, value)) = line.strip_prefix("#define ").and_then(|l| l.split_once(' ')) {
             match value {
                 "4294967295" => out += &format!("#define {name} 0xffffffffu\n"),
@@ -109,7 +130,8 @@ fn config() -> Config {
         style: Style::Both,
         no_includes: true,
         usize_is_size_t: true,
-        documentation_style: DocumentationStyle::C99,
+        // Comments that Doxygen reads.
+        documentation_style: DocumentationStyle::Cxx,
         documentation_length: DocumentationLength::Full,
         // Used by other sections than the one that defines it.
         export: ExportConfig { include: vec!["bk_progress_fn".into()], ..Default::default() },

@@ -1,7 +1,13 @@
 //! Baking
 //!
-//! A bake fills a light map with light: photons, radiance map, gather map (indirect light), direct
-//! light, composition, stitching of seams. What the scene does not need is not run.
+//! A bake computes the light of a light map in stages: photons, radiance map, gather map (indirect
+//! light), direct light, composition, stitching of seams. Stages that the scene does not need are
+//! left out.
+//!
+//! Thread safety: one thread at a time may bake a light map; a second one fails with
+//! BK_ERROR_INVALID_STATE.
+//!
+//! Cost: see bk_bake; the other functions take microseconds at most.
 
 use super::args::{OutStruct, SizedStruct, init, read_bool, read_struct, sized_struct, slice_mut, text};
 use super::device::{bk_progress_fn, progress, refuse_in_callback};
@@ -12,39 +18,40 @@ use crate::lightmap::plan::left_out;
 use crate::lightmap::{BakeParams, BakeStats, CheckpointParams, StageStats};
 use std::ffi::{c_char, c_void};
 
-/// Bit of left_out. No indirect light: no photons, radiance map and gather map.
+/// Bit of left_out: indirect light with photons, radiance map and gather map.
 pub const BK_LEFT_OUT_INDIRECT: u32 = 1;
-/// Bit of left_out. No photons and no estimate: no light is reflected more than once.
+/// Bit of left_out: photons and their estimate, so that no light is reflected more than once.
 pub const BK_LEFT_OUT_PHOTONS: u32 = 2;
-/// Bit of left_out. No direct light: nothing shines.
+/// Bit of left_out: direct light, as the scene has no lights.
 pub const BK_LEFT_OUT_DIRECT: u32 = 4;
-/// Bit of left_out. No sampling of area lights.
+/// Bit of left_out: sampling of area lights.
 pub const BK_LEFT_OUT_AREA_LIGHTS: u32 = 8;
-/// Bit of left_out. No radiance of back sides.
+/// Bit of left_out: radiance of back sides.
 pub const BK_LEFT_OUT_BACK_SIDES: u32 = 16;
-/// Bit of left_out. No blur of the gather map.
+/// Bit of left_out: blur of the gather map.
 pub const BK_LEFT_OUT_BLUR: u32 = 32;
-/// Bit of left_out. No unwrapping: all meshes bring usable coordinates.
+/// Bit of left_out: unwrapping, as all meshes have usable light map coordinates.
 pub const BK_LEFT_OUT_UNWRAP: u32 = 64;
-/// Bit of left_out. No interpolation of shading normals.
+/// Bit of left_out: interpolation of shading normals.
 pub const BK_LEFT_OUT_SHADING_NORMALS: u32 = 128;
-/// Bit of left_out. No look-ups of albedo textures.
+/// Bit of left_out: look-ups of albedo textures.
 pub const BK_LEFT_OUT_TEXTURES: u32 = 256;
-/// Bit of left_out. No tests for holes that textures cut out.
+/// Bit of left_out: alpha tests.
 pub const BK_LEFT_OUT_CUTOUTS: u32 = 512;
-/// Bit of left_out. No light through surfaces.
+/// Bit of left_out: light that passes through surfaces.
 pub const BK_LEFT_OUT_TRANSMISSION: u32 = 1024;
-/// Bit of left_out. No light from a sky.
+/// Bit of left_out: light of skies.
 pub const BK_LEFT_OUT_SKY: u32 = 2048;
-/// Bit of left_out. No directional light with an angular_radius.
+/// Bit of left_out: discs of directional lights.
 pub const BK_LEFT_OUT_SUN_DISC: u32 = 4096;
-/// Bit of left_out. No choice among many lights: at most 64 point and spot lights, each of which gets a
-/// shadow ray, and at most 64 rect lights and emissive triangles. More of either are sampled, with up to 4
-/// direct_samples shadow rays for all.
+/// Bit of left_out: sampling of many lights, as there are at most 64 point and spot lights, each of
+/// which gets a shadow ray, and at most 64 rect lights and emissive triangles. More of either kind
+/// are sampled with up to 4 times bk_bake_params.direct_samples shadow rays for all of them.
 pub const BK_LEFT_OUT_MANY_LIGHTS: u32 = 8192;
-/// Bit of left_out. No stitching of seams.
+/// Bit of left_out: stitching of seams.
 pub const BK_LEFT_OUT_SEAMS: u32 = 16384;
-/// Bit of left_out. No bright patches of surfaces as lights: gather rays find most of what is bright.
+/// Bit of left_out: sampling of bright patches of surfaces as lights, as gather rays find most of
+/// them.
 pub const BK_LEFT_OUT_BRIGHT_PATCHES: u32 = 32768;
 
 // The numbers are literal for the header's sake.
@@ -67,64 +74,70 @@ const _: () = assert!(
         && BK_LEFT_OUT_BRIGHT_PATCHES == left_out::BRIGHT_PATCHES
 );
 
-/// How to bake.
+/// Parameters of bk_bake.
 #[repr(C)]
 #[derive(Clone, Copy)]
 pub struct bk_bake_params {
     /// Size of this structure in bytes, set by bk_bake_params_init.
     pub struct_size: u32,
-    /// Most reflections of light before it reaches a texel; 0, the default: Russian roulette alone
-    /// decides.
+    /// Maximum number of reflections of light before it reaches a texel; 0: Russian roulette alone
+    /// decides. Default: 0.
     pub max_bounces: u32,
-    /// Photons to emit, at most 2^32; 0: no light that is reflected more than once. A sixteenth as many, at
-    /// most 65,536, are traced before to find out where to send them. Default: 1,000,000.
+    /// Number of photons to emit, at most 2^32; 0: no light that is reflected more than once. A
+    /// pilot of a sixteenth as many, at most 65,536, finds out beforehand where to send them.
+    /// Default: 1,000,000.
     pub photon_count: u64,
-    /// Rays per texel of the gather map, at most 65536; 0: no indirect light. With every 64 go up to 16
-    /// shadow rays to bright patches of surfaces, where there are any (BK_LEFT_OUT_BRIGHT_PATCHES).
-    /// Texels of the light map that no texel of the gather map around stands for (some 1 to 3 %) trace up to 16
-    /// rays of their own. Default: 64.
+    /// Number of rays per texel of the gather map, at most 65536; 0: no indirect light. Each 64
+    /// rays are accompanied by up to 16 shadow rays to bright patches of surfaces, where there are
+    /// any (BK_LEFT_OUT_BRIGHT_PATCHES). Light map texels for which none of the gather texels
+    /// around is a valid source of interpolation (1 to 3 %) trace up to 16 gather rays themselves.
+    /// Default: 64.
     pub gather_rays: u32,
-    /// Photon search radius in scene units, finite and at least 1.2e-38; 0, the default: from the number of photons that
-    /// reach surfaces and the lit area, and at least three quarters of a texel of the radiance map, so that no photon
-    /// lies between the places where light is estimated. Photons that are not seen from the middle of their disc, as
-    /// those behind a wall, do not count, and neither does the surface there.
+    /// Search radius of photons in scene units, finite and at least 1.2e-38; 0: from the number of
+    /// photons that reach surfaces and the lit area, and at least three quarters of a texel of the
+    /// radiance map, so that no photon lies between the discs of the estimates. Photons (and area
+    /// of the disc) that are occluded from the centre of the disc, for example behind a wall, are
+    /// excluded from the estimate. Default: 0.
     pub radius: f32,
-    /// Radius of the gather map's blur in its texels, at most 16; 0: none. Default: 2.
+    /// Radius of the gather map's blur in texels of the gather map, at most 16; 0: no blur.
+    /// Default: 2.
     pub blur_radius: u32,
-    /// Shadow rays per light map texel and area light or disc of a directional light, 1 to 4096 (of
-    /// more than four area lights, four times as many rays are shared out); four times as many per sky,
-    /// and for all of many lights (BK_LEFT_OUT_MANY_LIGHTS). They start from 4 points spread over the
-    /// texel, or from 16 in the penumbra of a disc. Point, spot and parallel lights take one ray each, and
-    /// 4 to 16 more, spread over the texel, where shadow edges cross it. Default: 16.
+    /// Number of shadow rays per light map texel and area light or disc of a directional light, 1
+    /// to 4096. More than four area lights share four times as many rays; a sky takes four times as
+    /// many, and many lights together do (BK_LEFT_OUT_MANY_LIGHTS). The rays start from 4 points of
+    /// the texel, or from 16 in the penumbra of a disc. Point, spot and parallel lights take one
+    /// ray each, and 4 to 16 more, spread over the texel, where shadow edges cross it. Default: 16.
     pub direct_samples: u32,
     /// Seed of all random numbers. The same seed gives the same bits on any number of threads.
     /// Default: 0.
     pub seed: u64,
-    /// Bytes that the bake may take in addition to scene and light map; 0, the default: no limit.
+    /// Limit in bytes of the memory that the bake takes in addition to scene and light map; 0: no
+    /// limit. Default: 0.
     pub memory_budget: u64,
-    /// First covered texel to bake, for spreading a bake over several runs, at most the number of
-    /// texels that bk_lightmap_info tells. Default: 0.
+    /// Number of the first covered texel to bake, to spread a bake over several runs; at most
+    /// bk_lightmap_info.texels. Default: 0.
     pub texel_begin: u64,
-    /// One behind the last covered texel to bake, above texel_begin and at most the number of texels;
-    /// 0, the default: all.
+    /// Number of the covered texel behind the last one to bake, above `texel_begin` and at most
+    /// bk_lightmap_info.texels; 0: all. Default: 0.
     pub texel_end: u64,
-    /// Whether seams are stitched: where a smooth surface is cut open in the light map, both sides of
-    /// the edge are made to show the same under bilinear filtering, by moving the texels that the edge
-    /// shows and no others. Done when all texels are baked. 0: no, any other value: yes. Live updates
-    /// do not stitch: their finished texels have the bits of a bake with 0. Default: 1.
+    /// 1: stitch seams. Where a smooth surface is cut in the light map, the texels along the edge
+    /// are changed so that both sides look the same under bilinear filtering. Seams are stitched
+    /// when all texels are baked. Live updates do not stitch: their finished texels have the bits
+    /// of a bake with 0. 0: leave seams as they are. Default: 1.
     pub stitch: u32,
-    /// Seconds between two writes of the checkpoint, 0 to 1e9. A process that is killed loses at most the
-    /// work of so long; 0: of the blocks of texels under way. Default: 10.
+    /// Experimental: interval in seconds between two writes of the checkpoint, 0 to 1e9. A process
+    /// that is killed loses at most the work of this interval; with 0, that of the blocks of texels
+    /// under way. Default: 10.
     pub checkpoint_seconds: f32,
-    /// Name of a file, UTF-8, in which the bake keeps what it has done; NULL, the default: none. A bake with the
-    /// same scene, lights, light map and parameters that finds the file goes on from it, whatever ended
-    /// the one before (a cancel, an error, a kill), and gives the bits of a bake without a break, on any
-    /// number of threads. The file is created if it is not there. It stays when the bake is complete:
-    /// delete it when the light has been saved. bk_bake fails with BK_ERROR_INVALID_ARGUMENT if the file is of
-    /// another bake (bk_last_error says in what it differs), with BK_ERROR_IO if it is damaged, is not a checkpoint or
-    /// cannot be read or created, with BK_ERROR_INVALID_STATE if another bake is using it, and leaves it as it is. If it
-    /// cannot be written later, as on a full disk, the bake goes on, logs a warning, and what the file
-    /// holds stays whole.
+    /// Experimental: name of the checkpoint, a file in which the bake keeps finished work; UTF-8.
+    /// May be NULL: no checkpoint. Default: NULL.
+    ///
+    /// A bake with the same scene, lights, light map and parameters that finds the file continues
+    /// from it, whether the bake before was cancelled, failed or was killed, and gives the bits of
+    /// an uninterrupted bake, on any number of threads. The file is created if it does not exist
+    /// and stays when the bake is complete: delete it when the light has been saved. If the file
+    /// cannot be written later, for example because the disk is full, the bake continues and logs a
+    /// warning, and the file stays readable. See bk_bake for errors, which leave the file as it is.
     pub checkpoint: *const c_char,
 }
 
@@ -148,62 +161,66 @@ sized_struct!(bk_bake_params, defaults: {
     }
 });
 
-/// Fills in the defaults.
+/// Sets `struct_size` and fills in the defaults.
+///
+/// @param params  structure to fill in; NULL is ignored
 #[unsafe(no_mangle)]
 pub unsafe extern "C" fn bk_bake_params_init(params: *mut bk_bake_params) {
     // SAFETY: the caller's structure, or NULL.
     unsafe { init(params) }
 }
 
-/// What one stage of a bake took.
+/// Numbers about one stage of a bake.
 #[repr(C)]
 #[derive(Clone, Copy)]
 pub struct bk_stage_stats {
-    /// Time, in seconds.
+    /// Duration in seconds.
     pub seconds: f64,
-    /// Rays traced.
+    /// Number of rays traced.
     pub rays: u64,
-    /// Bytes of its buffers.
+    /// Size of the stage's buffers in bytes.
     pub bytes: u64,
 }
 
-/// What a bake did.
+/// Numbers about a bake.
 #[repr(C)]
 #[derive(Clone, Copy)]
 pub struct bk_bake_stats {
     /// Size of this structure in bytes, set by bk_bake_stats_init.
     pub struct_size: u32,
-    /// BK_LEFT_OUT bits: what the plan found unnecessary.
+    /// BK_LEFT_OUT bits: work that the scene does not need.
     pub left_out: u32,
-    /// Time of the whole bake, in seconds.
+    /// Duration of the whole bake in seconds.
     pub seconds: f64,
-    /// The most bytes held at once on the device, scene and light map included.
+    /// Maximum of the memory that the device's objects held at once, in bytes, scene and light map
+    /// included.
     pub peak_bytes: u64,
-    /// Photons emitted.
+    /// Number of photons emitted.
     pub photons_emitted: u64,
-    /// Photons stored on surfaces.
+    /// Number of photons stored on surfaces.
     pub photons_stored: u64,
-    /// Tracing and sorting photons.
+    /// Tracing and sorting of photons.
     pub photons: bk_stage_stats,
-    /// The radiance map: outgoing radiance from the photons.
+    /// Radiance map: outgoing radiance from photons and direct light.
     pub radiance: bk_stage_stats,
-    /// The gather map: indirect light.
+    /// Gather map: indirect light.
     pub gather: bk_stage_stats,
     /// Direct light with shadow rays.
     pub direct: bk_stage_stats,
     /// Filtering and composition.
     pub compose: bk_stage_stats,
-    /// Two-sided charts whose light map shows the back, because the distance that one sees from it
-    /// times the cube root of its light is more than twice that of the front.
+    /// Number of two-sided charts whose texels show the back, because the distance that is seen
+    /// from it times the cube root of its light is more than twice that of the front.
     pub back_charts: u64,
-    /// Points, half a texel apart at most, along the edges that were stitched.
+    /// Number of points along stitched edges, at most half a texel apart.
     pub seam_points: u64,
-    /// How much the two sides of these edges showed different light under bilinear filtering: root mean
-    /// square over the edges' lengths, relative to the mean irradiance there. 0 without seams.
+    /// Difference of light between the two sides of stitched edges under bilinear filtering, before
+    /// the stitching: root mean square over the length of the edges, relative to the mean
+    /// irradiance there. 0 without seams.
     pub seam_rms_before: f64,
-    /// The same after the stitching.
+    /// The same relative difference after the stitching.
     pub seam_rms_after: f64,
-    /// Finding and stitching seams, in seconds.
+    /// Duration of finding and stitching seams, in seconds.
     pub seam_seconds: f64,
 }
 
@@ -231,29 +248,39 @@ fn stats(s: &BakeStats) -> bk_bake_stats {
     }
 }
 
-/// Sets struct_size and clears the rest.
+/// Sets `struct_size` and clears the other fields.
+///
+/// @param stats  structure to fill in; NULL is ignored
 #[unsafe(no_mangle)]
 pub unsafe extern "C" fn bk_bake_stats_init(stats: *mut bk_bake_stats) {
     // SAFETY: the caller's structure, or NULL.
     unsafe { init(stats) }
 }
 
-/// Computes the light of all texels, or of the given range, on the device's threads. May be called
-/// again, with other lights or parameters.
+/// Bakes a light map: computes the light of all texels, or of a range, on the device's threads.
 ///
-/// params: NULL for the defaults. progress, user: told how far it is; NULL if not wanted. out: what
-/// was done; NULL if not wanted.
+/// Can be called again, with other lights or parameters. The same scene, lights, light map,
+/// parameters and seed give the same bits on any number of threads, in one bake or in several of
+/// some texels each, and on AVX2 and AVX-512; the portable kernels, which round products and sums
+/// separately, give others. All light is finite and >= 0: the irradiance of each light is clamped
+/// to 1e30 W/m2. A bake that fails or is cancelled keeps the light of earlier bakes, and can be
+/// repeated.
 ///
-/// The same scene, lights, light map, parameters and seed give the same bits on any number of threads, in one
-/// bake or in several of some texels each, and on AVX2 as on AVX-512; portable kernels, which round products and sums
-/// apart, give others.
+/// Cost: seconds to hours, in proportion to the number of texels, `gather_rays` and
+/// `direct_samples`.
 ///
-/// All light is finite and >= 0: irradiance is cut off at 1e30 W/m2 per light.
-///
-/// Fails with BK_ERROR_INVALID_ARGUMENT if a field of params is out of its range,
-/// BK_ERROR_INVALID_STATE if another call is using the light map, BK_ERROR_OUT_OF_MEMORY if
-/// memory_budget is exceeded or the memory callback refuses, BK_ERROR_CANCELLED if progress says so. A
-/// bake that fails or is cancelled keeps what was baked before, and can be repeated.
+/// @param lightmap  any light map
+/// @param params  parameters; NULL for the defaults
+/// @param progress,user  progress callback and its pointer; may be NULL
+/// @param out  receives numbers about the bake; may be NULL
+/// @retval BK_ERROR_INVALID_ARGUMENT  a field of `params` is out of its range, or the checkpoint is
+///   of another bake; bk_last_error says in which respect
+/// @retval BK_ERROR_INVALID_STATE  another call is using the light map, or another bake the
+///   checkpoint
+/// @retval BK_ERROR_OUT_OF_MEMORY  `memory_budget` is exceeded or the memory callback refuses
+/// @retval BK_ERROR_IO  the checkpoint is damaged, is another kind of file, or cannot be read or
+///   created
+/// @retval BK_ERROR_CANCELLED  the progress callback returned 0
 #[unsafe(no_mangle)]
 pub unsafe extern "C" fn bk_bake(
     lightmap: *mut bk_lightmap,
@@ -297,13 +324,15 @@ pub unsafe extern "C" fn bk_bake(
     })
 }
 
-/// Describes in words what the last bake ran (before the first: what a bake with default parameters
-/// would run), and what it left out and why, one line each.
+/// Writes a text about the last bake, one line per stage: what ran, what was left out, and why.
+/// Before the first bake the text is about a bake with default parameters.
 ///
-/// dst: receives as much of the text (UTF-8) as fits, with a NUL; may be NULL if capacity is 0.
-/// capacity: bytes that dst has room for.
-///
-/// Returns the length of the whole text without its NUL, whatever the capacity; 0 on failure.
+/// @param lightmap  any light map
+/// @param dst  receives as much of the text as fits, UTF-8 with a NUL; may be NULL if `capacity` is
+///   0
+/// @param capacity  size of `dst` in bytes
+/// @return  length of the whole text in bytes without its NUL, whatever the capacity; 0 on failure,
+///   for example during a bake
 #[unsafe(no_mangle)]
 pub unsafe extern "C" fn bk_plan_describe(lightmap: *const bk_lightmap, dst: *mut c_char, capacity: usize) -> usize {
     // SAFETY: dst is the caller's, or NULL.

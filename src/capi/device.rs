@@ -2,31 +2,39 @@
 //!
 //! A device owns worker threads, the choice of instruction set, the log and the memory accounts.
 //!
-//! Handles (bk_device, bk_scene, bk_photon_map, bk_lightmap) are opaque and reference-counted: a
-//! create function hands out one reference, bk_..._retain adds one, bk_..._release gives one back,
-//! and NULL is ignored by both. What is made from an object keeps what it needs of it alive, so
-//! parents may be released first. Retaining and releasing is safe from any thread.
+//! Ownership: handles (bk_device, bk_scene, bk_photon_map, bk_lightmap, bk_live) are opaque and
+//! reference-counted. A create function hands out one reference, which the caller releases with
+//! bk_..._release; bk_..._retain adds one. An object keeps alive what it was made from, so parents
+//! may be released first.
 //!
-//! Callbacks may run on any thread and must not throw or jump out. They may call functions that do
-//! not work on a device's threads, releases among them; the others (commit, create, bake, save,
-//! BK_RAYS_PARALLEL), and changes to the object whose call they are in, fail with
-//! BK_ERROR_INVALID_STATE. Strings given to callbacks are valid during the callback only.
+//! Callbacks may run on any thread and must not throw exceptions or jump out. Inside a callback,
+//! functions that work on a device's threads (commit, refit, create, bake, load, save, live
+//! updates, BK_RAYS_PARALLEL) and changes to the object whose call is running fail with
+//! BK_ERROR_INVALID_STATE; all others are allowed, releases among them. Strings passed to callbacks
+//! are valid during the callback only.
 //!
-//! Floating-point state: all functions compute with rounding to nearest, with denormals and with all
-//! exceptions masked, whatever the calling thread has set (in MXCSR on x86-64, in FPCR on AArch64; on
-//! other architectures nothing is set), and restore the caller's state before they return. Callbacks
-//! see the caller's state on the caller's thread and the default state on others; what they change of
-//! it lasts until they return. That costs a call about 6 ns where the caller's state is the default
-//! and 10 ns where it is not, once for all rays of bk_intersect_many, bk_occluded_many and bk_gather.
+//! Floating-point state: all functions compute with rounding to nearest, with denormals and with
+//! all exceptions masked, whatever the calling thread has set (in MXCSR on x86-64, in FPCR on
+//! AArch64; on other architectures nothing is set), and restore the caller's state before they
+//! return. Callbacks see the caller's state on the caller's thread and the default state on others;
+//! their changes to it last until they return. Saving and restoring costs about 6 ns per call where
+//! the caller's state is the default and 10 ns where it is not, once for all rays of
+//! bk_intersect_many, bk_occluded_many and bk_gather.
 //!
-//! Stacks: the calling thread needs 64 KB of stack for queries (bk_intersect, bk_occluded, their like
-//! for many rays, bk_gather, bk_photon_map_estimate) and 256 KB for all other functions. The stacks of
-//! the library's own threads have 4 MB, of which only what is used takes memory.
+//! Stacks: the calling thread needs 64 KB of stack for queries (bk_intersect, bk_occluded,
+//! bk_intersect_many, bk_occluded_many, bk_gather, bk_photon_map_estimate) and 256 KB for all other
+//! functions. Each thread of the library reserves 4 MB of address space for its stack; only used
+//! pages take memory.
 //!
-//! fork: a device's threads do not follow into the child process. There, calls that need them fail
-//! with BK_ERROR_INVALID_STATE; queries without BK_RAYS_PARALLEL and releases work, and so does a device
-//! that is created in the child. An object that another thread is changing during the fork stays
-//! locked in the child: calls with it fail with BK_ERROR_INVALID_STATE too.
+//! fork: a device's threads do not exist in the child process. There, calls that need them fail
+//! with BK_ERROR_INVALID_STATE; queries without BK_RAYS_PARALLEL, releases, and devices created in
+//! the child work. An object that another thread was changing during the fork stays locked in the
+//! child: calls with it fail with BK_ERROR_INVALID_STATE.
+//!
+//! Thread safety: any thread, all functions at the same time.
+//!
+//! Cost: bk_device_create starts threads, in about 0.1 ms each, and the last release joins them;
+//! the other functions take nanoseconds.
 
 use super::args::{UserPointer, init, read_struct, sized_struct, text, write};
 use super::error::{bk_result, c_string, call, call_or};
@@ -39,41 +47,56 @@ use crate::simd::Isa;
 use std::ffi::{c_char, c_void};
 use std::sync::Arc;
 
-/// The best instruction set that the machine has.
+/// Instruction set: the best that the machine has.
 pub const BK_ISA_AUTO: u32 = 0;
-/// The baseline of the target: SSE2 on x86-64, NEON on AArch64.
+/// Instruction set: the baseline of the target (SSE2 on x86-64, NEON on AArch64).
 pub const BK_ISA_PORTABLE: u32 = 1;
-/// AVX2 with FMA.
+/// Instruction set: AVX2 with FMA.
 pub const BK_ISA_AVX2: u32 = 2;
-/// AVX-512 F, VL, DQ and BW.
+/// Instruction set: AVX-512 F, VL, DQ and BW.
 pub const BK_ISA_AVX512: u32 = 3;
 
-/// Log level: something failed that no result reports.
+/// Log level: a failure that no result code reports.
 pub const BK_LOG_ERROR: u32 = 0;
-/// Log level: something about the input or the run deserves attention, as skipped triangles.
+/// Log level: something about the input or the run that deserves attention, for example skipped
+/// triangles.
 pub const BK_LOG_WARNING: u32 = 1;
-/// Log level: what is going on.
+/// Log level: progress of the work.
 pub const BK_LOG_INFO: u32 = 2;
 
-/// Told how far a call is: fraction in [0, 1], never falling, and the name of the stage, as
-/// "gather". Called on the thread that made the call, and only until that call returns: when a stage
-/// starts and about every 15 ms, at most 100 times in any second. (A stage that starts when 20 others
-/// just have is reported with the next call.) The library's own threads go on working meanwhile.
-/// Return 0 to cancel: the call then ends with BK_ERROR_CANCELLED, as a rule within 50 ms. NULL is
-/// allowed wherever one is taken.
+/// Reports the progress of a call, and can cancel it.
+///
+/// Runs on the thread that made the call, and only until that call returns: when a stage starts and
+/// about every 15 ms, at most 100 times in any second. (A stage that starts when 20 others have
+/// just started is reported with the next call.) The library's own threads go on working meanwhile.
+/// NULL is allowed wherever a function takes a progress callback.
+///
+/// @param user  pointer that was passed beside the callback
+/// @param fraction  part of the work that is done, in [0, 1], never falling
+/// @param stage  name of the stage, for example "gather"
+/// @return  0 to cancel: the call then ends with BK_ERROR_CANCELLED, as a rule within 50 ms; any
+///   other value to go on
 pub type bk_progress_fn = Option<unsafe extern "C" fn(user: *mut c_void, fraction: f32, stage: *const c_char) -> i32>;
 
-/// Receives log messages (UTF-8) with one of the BK_LOG levels, from any thread, several at a time.
+/// Receives log messages, from any thread and several at a time.
+///
+/// @param user  bk_device_desc.user
+/// @param level  one of the BK_LOG values
+/// @param message  UTF-8, valid during the call only
 pub type bk_log_fn = Option<unsafe extern "C" fn(user: *mut c_void, level: u32, message: *const c_char)>;
 
-/// Asked before a large allocation, with its size in bytes: return 0 to refuse, and the call that
-/// wanted it ends with BK_ERROR_OUT_OF_MEMORY. Told after a free, with the size negative; the
-/// answer is ignored then. From any thread, several at a time; for the last time when the last
-/// object of the device is released.
+/// Allows or refuses a large allocation, and is notified when it is freed.
+///
+/// Runs on any thread, several calls at a time; for the last time when the last object of the
+/// device is released. After a refusal the call that needed the memory ends with
+/// BK_ERROR_OUT_OF_MEMORY.
+///
+/// @param user  bk_device_desc.user
+/// @param bytes  size of the allocation in bytes; negative after a free
+/// @return  0 to refuse the allocation, any other value to allow it; ignored after a free
 pub type bk_memory_fn = Option<unsafe extern "C" fn(user: *mut c_void, bytes: i64) -> i32>;
 
-/// Worker threads, instruction set, log and memory accounts. All functions on a device are safe
-/// from any thread.
+/// Handle of a device.
 pub struct bk_device {
     device: Arc<Device>,
 }
@@ -84,22 +107,23 @@ impl bk_device {
     }
 }
 
-/// What to create a device with.
+/// Parameters of bk_device_create.
 #[repr(C)]
 #[derive(Clone, Copy)]
 pub struct bk_device_desc {
     /// Size of this structure in bytes, set by bk_device_desc_init.
     pub struct_size: u32,
-    /// Worker threads, at most 1024; 0, the default: one per logical core, as far as that allows.
-    /// Results do not depend on it.
+    /// Number of worker threads, at most 1024; 0: one per logical core, at most 1024. Results do
+    /// not depend on it. Default: 0.
     pub num_threads: u32,
     /// One of the BK_ISA values. Default: BK_ISA_AUTO.
     pub isa: u32,
-    /// Receives log messages. Default: NULL.
+    /// Log callback, or NULL. Default: NULL.
     pub log: bk_log_fn,
-    /// Asked before large allocations. Default: NULL.
+    /// Memory callback, or NULL. Default: NULL.
     pub memory: bk_memory_fn,
-    /// Handed to log and memory; must outlive the device and all that was made from it.
+    /// Pointer passed to `log` and `memory`; must stay valid until the device and all that was made
+    /// from it are gone. Default: NULL.
     pub user: *mut c_void,
 }
 
@@ -112,19 +136,22 @@ sized_struct!(bk_device_desc, defaults: bk_device_desc {
     user: std::ptr::null_mut(),
 });
 
-/// Fills in the defaults.
+/// Sets `struct_size` and fills in the defaults.
+///
+/// @param desc  structure to fill in; NULL is ignored
 #[unsafe(no_mangle)]
 pub unsafe extern "C" fn bk_device_desc_init(desc: *mut bk_device_desc) {
     // SAFETY: the caller's structure, or NULL.
     unsafe { init(desc) }
 }
 
-/// Starts a device.
+/// Creates a device and starts its threads.
 ///
-/// desc: NULL for the defaults. out: receives the device, NULL on failure.
-///
-/// Fails with BK_ERROR_UNSUPPORTED if the machine lacks the instruction set asked for, with
-/// BK_ERROR_OUT_OF_MEMORY if the threads cannot be started.
+/// @param desc  parameters; NULL for the defaults
+/// @param out  receives the device, which the caller releases with bk_device_release; NULL on
+///   failure
+/// @retval BK_ERROR_UNSUPPORTED  the machine lacks the requested instruction set
+/// @retval BK_ERROR_OUT_OF_MEMORY  the threads cannot be started
 #[unsafe(no_mangle)]
 pub unsafe extern "C" fn bk_device_create(desc: *const bk_device_desc, out: *mut *mut bk_device) -> bk_result {
     // SAFETY: desc and out are the caller's, or NULL.
@@ -135,15 +162,19 @@ pub unsafe extern "C" fn bk_device_create(desc: *const bk_device_desc, out: *mut
     })
 }
 
-/// Counts one more reference. NULL is ignored.
+/// Adds one reference.
+///
+/// @param device  NULL is ignored
 #[unsafe(no_mangle)]
 pub unsafe extern "C" fn bk_device_retain(device: *mut bk_device) {
     // SAFETY: a handle or NULL.
     unsafe { retain(device) }
 }
 
-/// Gives one reference back. When the last is given back, of the device and of all that was made
-/// from it, its threads are joined. NULL is ignored.
+/// Releases one reference. The last release of the device and of all that was made from it joins
+/// the threads; no callback comes afterwards.
+///
+/// @param device  NULL is ignored
 #[unsafe(no_mangle)]
 pub unsafe extern "C" fn bk_device_release(device: *mut bk_device) {
     // SAFETY: a handle whose reference the caller gives up, or NULL.
@@ -153,17 +184,23 @@ pub unsafe extern "C" fn bk_device_release(device: *mut bk_device) {
     })
 }
 
-/// Returns the instruction set in use: a BK_ISA value other than BK_ISA_AUTO; BK_ISA_AUTO if device is NULL.
+/// Returns the instruction set in use.
 ///
-/// BK_ISA_AVX2 and BK_ISA_AVX512 give the same bits of hits and light. BK_ISA_PORTABLE rounds products and
-/// sums apart where the others fuse them, so its bits differ: results and checkpoints of bakes are not exchanged
-/// between it and the others.
+/// BK_ISA_AVX2 and BK_ISA_AVX512 give the same bits of hits and light. BK_ISA_PORTABLE rounds
+/// products and sums separately where the others fuse them, so its bits differ: results and
+/// checkpoints of bakes cannot be exchanged between it and the others.
+///
+/// @param device  NULL gives BK_ISA_AUTO
+/// @return  a BK_ISA value other than BK_ISA_AUTO
 #[unsafe(no_mangle)]
 pub unsafe extern "C" fn bk_device_isa(device: *const bk_device) -> u32 {
     call_or(BK_ISA_AUTO, || Ok(object!(device).device.isa() as u32))
 }
 
-/// The number of worker threads; 0 if device is NULL.
+/// Returns the number of worker threads.
+///
+/// @param device  NULL gives 0
+/// @return  number of threads, 1 to 1024
 #[unsafe(no_mangle)]
 pub unsafe extern "C" fn bk_device_num_threads(device: *const bk_device) -> u32 {
     call_or(0, || Ok(object!(device).device.num_threads() as u32))

@@ -1,16 +1,36 @@
 //! Results and version
 //!
-//! Functions that can fail return a `bk_result`: BK_OK, or a negative code. The sentence that names
-//! the argument and the value at fault is then in `bk_last_error()`. A call that fails changes
-//! nothing unless its description says so; every object can be used as before.
+//! Functions that can fail return a `bk_result`: BK_OK, or a negative code. `bk_last_error()` then
+//! returns a sentence that names the argument and the value at fault. A call that fails changes
+//! nothing unless its description says otherwise, and every object can still be used.
 //!
-//! Enums and flags travel as uint32_t constants. Values and flags that are not listed are refused.
+//! These rules hold for all functions; descriptions state exceptions only:
 //!
-//! Every structure whose name ends in _desc, _params, _info, _stats or _view starts with
-//! `uint32_t struct_size`. Its `bk_..._init(&x)` function sets that size and fills in the defaults.
-//! Programs compiled against an older, shorter version of a structure keep working: the missing
-//! fields of an input get their defaults, and an output is written as far as it reaches. A size of
-//! 0, or larger than this library knows, is BK_ERROR_INVALID_ARGUMENT.
+//! - Pointers must not be NULL unless the description of the parameter allows it. NULL elsewhere, a
+//!   value or flag that is not listed, and a wrong `struct_size` give BK_ERROR_INVALID_ARGUMENT.
+//! - Pointers to input are read during the call only; what is needed later is copied.
+//! - Pointers to output must be valid for the whole call. Output is written on success only, except
+//!   that a create function sets its `out` to NULL on failure.
+//! - Any function with a `bk_result` can return BK_ERROR_INTERNAL, and is listed with the other
+//!   codes it can return.
+//!
+//! Enums and flags are passed as uint32_t constants. Numbers of meshes, materials, lights and
+//! images count from 0 in the order of addition. Strings are UTF-8 and end with a NUL.
+//!
+//! Every structure whose name ends in _desc, _params, _info, _stats or _view, and bk_camera and
+//! bk_budget, start with `uint32_t struct_size`. The function `bk_..._init` sets that size and the
+//! default of every other field. Later versions of the library add fields at the end only and
+//! accept the size of an older version: missing fields of an input have their defaults, and an
+//! output is written up to the size.
+//!
+//! Functions that are declared with BK_EXPERIMENTAL, and fields whose description begins with
+//! "Experimental:", may change or disappear in any release, without the care that the rest gets.
+//! Define BK_EXPERIMENTAL before including this header, for example as a deprecation attribute, to
+//! find their uses.
+//!
+//! Thread safety: any thread; bk_last_error is per thread.
+//!
+//! Cost: none of these functions allocates or waits.
 
 use crate::error::{Error, Result};
 use crate::float_state::LibraryState;
@@ -18,46 +38,50 @@ use std::cell::RefCell;
 use std::ffi::{CStr, CString, c_char};
 use std::panic::{AssertUnwindSafe, catch_unwind};
 
-/// Major version: programs must be recompiled when it changes.
+/// Major version. Programs must be recompiled when it changes.
 pub const BK_VERSION_MAJOR: u32 = 0;
-/// Minor version: functions and fields were added.
+/// Minor version. It grows when functions or fields are added.
 pub const BK_VERSION_MINOR: u32 = 1;
-/// Patch version: only behaviour was mended.
+/// Patch version. It grows when only behaviour is corrected.
 pub const BK_VERSION_PATCH: u32 = 0;
-/// The version of this header: major << 16 | minor << 8 | patch.
+/// Version of this header: major << 16 | minor << 8 | patch.
 pub const BK_VERSION: u32 = BK_VERSION_MAJOR << 16 | BK_VERSION_MINOR << 8 | BK_VERSION_PATCH;
 
 /// "None" where an index is expected or reported.
 pub const BK_NONE: u32 = 0xffff_ffff;
 
-/// What became of a call: BK_OK, or one of the negative BK_ERROR codes.
+/// Result code of a function: BK_OK, or one of the negative BK_ERROR codes.
 pub type bk_result = i32;
 
-/// All went well.
+/// The call succeeded.
 pub const BK_OK: bk_result = 0;
 /// An argument is NULL or out of its documented range.
 pub const BK_ERROR_INVALID_ARGUMENT: bk_result = -1;
-/// The call is not allowed in the object's present state, or while another thread changes it.
+/// The object does not allow the call in its present state, or another thread is changing it.
 pub const BK_ERROR_INVALID_STATE: bk_result = -2;
-/// Memory ran out, or a memory budget or the memory callback refused.
+/// Memory ran out, a memory budget is too small, or the memory callback refused.
 pub const BK_ERROR_OUT_OF_MEMORY: bk_result = -3;
 /// The progress callback returned 0.
 pub const BK_ERROR_CANCELLED: bk_result = -4;
-/// This build or this machine cannot do it.
+/// This build of the library or this machine does not support the request.
 pub const BK_ERROR_UNSUPPORTED: bk_result = -5;
 /// A file could not be read or written, or its content is malformed.
 pub const BK_ERROR_IO: bk_result = -6;
 /// A bug in the library, caught before it reached the caller.
 pub const BK_ERROR_INTERNAL: bk_result = -7;
 
-/// The version of the library in use, to compare with BK_VERSION.
+/// Returns the version of the library in use, to compare with BK_VERSION.
+///
+/// @return  major << 16 | minor << 8 | patch
 #[unsafe(no_mangle)]
 pub extern "C" fn bk_version() -> u32 {
     BK_VERSION
 }
 
-/// The name of a result, as "BK_OK"; "unknown bk_result" for a value that is none. Never NULL; the
-/// string is constant.
+/// Returns the name of a result code, for example "BK_OK".
+///
+/// @param result  any value
+/// @return  a constant string that is never NULL; "unknown bk_result" for a value that is no code
 #[unsafe(no_mangle)]
 pub extern "C" fn bk_result_string(result: bk_result) -> *const c_char {
     let name: &CStr = match result {
@@ -74,10 +98,14 @@ pub extern "C" fn bk_result_string(result: bk_result) -> *const c_char {
     name.as_ptr()
 }
 
-/// What went wrong in the last call of the calling thread that failed: one UTF-8 sentence that names
-/// the argument and the value at fault; empty if none failed yet. Never NULL; valid until the
-/// thread's next call into the library. Functions without a bk_result (as bk_intersect) leave their
-/// failures here too; a call that succeeds leaves the text alone.
+/// Returns a sentence about the last call of the calling thread that failed.
+///
+/// The sentence names the argument and the value at fault. Functions without a `bk_result`, for
+/// example bk_intersect, report their failures here too; a call that succeeds leaves the text as it
+/// is.
+///
+/// @return  a string that is never NULL, owned by the library and valid until the thread's next
+///   call into it; empty if no call has failed yet
 #[unsafe(no_mangle)]
 pub extern "C" fn bk_last_error() -> *const c_char {
     // During a thread's destruction the slot may be gone.

@@ -2,10 +2,13 @@
 //!
 //! A light map lays the surfaces of a committed scene out on square pages and, once baked, holds
 //! irradiance E (W/m2) per texel: a shader shows albedo / pi * E. Texel (0, 0) is at uv (0, 0);
-//! rows follow v.
+//! rows follow v. Indirect light is computed in two coarser maps with the same charts: the radiance
+//! map, which gather rays look up, and the gather map.
 //!
-//! One thread at a time may bake a light map; reads are safe from any threads. A read during a bake,
-//! or a second bake, fails with BK_ERROR_INVALID_STATE.
+//! Thread safety: one thread at a time may bake a light map; reads are safe from any thread. A read
+//! during a bake, and a second bake, fail with BK_ERROR_INVALID_STATE.
+//!
+//! Cost: see bk_lightmap_create; the other functions copy what they return.
 
 use super::args::{OutStruct, SizedStruct, init, read_bool, read_struct, sized_struct, slice_mut, write};
 use super::device::{bk_progress_fn, progress, refuse_in_callback};
@@ -17,7 +20,7 @@ use crate::lightmap::{Lightmap, LightmapDesc, LightmapInfo, MeshUvs};
 use std::ffi::c_void;
 use std::sync::{Arc, RwLock, TryLockError};
 
-/// A light map: a layout and, once baked, light.
+/// Handle of a light map: a layout and, once baked, light.
 pub struct bk_lightmap {
     /// Only ever tried, never waited for.
     lightmap: RwLock<Lightmap>,
@@ -50,31 +53,32 @@ fn unusable() -> Error {
     Error::InvalidState("an internal error has left the light map unusable".into())
 }
 
-/// How to lay out a light map.
+/// Parameters of bk_lightmap_create.
 #[repr(C)]
 #[derive(Clone, Copy)]
 pub struct bk_lightmap_desc {
     /// Size of this structure in bytes, set by bk_lightmap_desc_init.
     pub struct_size: u32,
-    /// Texels per scene unit of what is unwrapped, finite and >= 0; 0, the default: so that the scene
-    /// fills about one page. All pages of a map together hold at most 2^29 texels.
+    /// Density of unwrapped charts in texels per scene unit, finite and >= 0; 0: chosen so that the
+    /// scene fills about one page. All pages of a map together hold at most 2^29 texels. Default:
+    /// 0.
     pub texels_per_unit: f32,
     /// Width and height of a page in texels, 16 to 16384. Default: 1024.
     pub page_size: u32,
-    /// Texels around each chart that filtering may read, 1 to 64, at most a quarter of page_size.
-    /// Default: 2.
+    /// Distance around each chart that filtering may read, in texels, 1 to 64 and at most a quarter
+    /// of `page_size`. Default: 2.
     pub padding: u32,
-    /// Light map texels per texel of the gather map (indirect light), along each axis, 1 to 64.
-    /// Default: 4.
+    /// Number of light map texels per texel of the gather map, along each axis, 1 to 64. Default:
+    /// 4.
     pub gather_divisor: u32,
-    /// Light map texels per texel of the radiance map (what gather rays see), along each axis, 1 to 64.
-    /// Default: 4.
+    /// Number of light map texels per texel of the radiance map, along each axis, 1 to 64. Default:
+    /// 4.
     pub radiance_divisor: u32,
-    /// Whether two-sided charts of which both sides are seen from open places get a second place for their
-    /// backs, which bk_lightmap_mesh_back_uvs tells of. Open places have free space around them; those
-    /// outside of buildings count where a sun or a sky shines as the light map is created. Without a second
-    /// place, a chart shows the side that is seen, or the one that the bake chooses. 0: no, any other value:
-    /// yes. Default: 1.
+    /// 1: two-sided charts that can be seen from open places on both sides get separate texels for
+    /// their backs, see bk_lightmap_mesh_back_uvs. Open places are points with free space around
+    /// them; those outside of buildings count if a directional light or a sky shines when the light
+    /// map is created. 0: no separate texels; each two-sided chart shows the side that can be seen,
+    /// or the one that the bake chooses (bk_bake_stats.back_charts). Default: 1.
     pub both_sides: u32,
 }
 
@@ -91,26 +95,35 @@ sized_struct!(bk_lightmap_desc, defaults: {
     }
 });
 
-/// Fills in the defaults.
+/// Sets `struct_size` and fills in the defaults.
+///
+/// @param desc  structure to fill in; NULL is ignored
 #[unsafe(no_mangle)]
 pub unsafe extern "C" fn bk_lightmap_desc_init(desc: *mut bk_lightmap_desc) {
     // SAFETY: the caller's structure, or NULL.
     unsafe { init(desc) }
 }
 
-/// Lays out a light map of a committed scene: meshes with light map coordinates keep them, the
-/// others are unwrapped, texels are mapped to triangles. Runs on the device's threads.
+/// Creates a light map of a committed scene: meshes with light map coordinates keep them, the
+/// others are unwrapped, and texels are mapped to triangles, on the device's threads.
 ///
-/// scene: kept alive by the light map. desc: NULL for the defaults. progress, user: told how far it
-/// is; NULL if not wanted. out: receives the light map, NULL on failure.
+/// The light map keeps the geometry of the scene as it is now, and follows its lights. Logs a
+/// warning if the scene lies so far from the origin that rays start more than a quarter of a texel
+/// above surfaces (32 rounding steps of its coordinates).
 ///
-/// Logs a warning if the scene lies so far from the origin that rays start more than a quarter of a
-/// texel above surfaces: 32 rounding steps of its coordinates.
+/// Cost: most of the time goes into unwrapping, 20 to 50 s per million triangles and thread.
 ///
-/// Fails with BK_ERROR_INVALID_ARGUMENT if a field of desc is out of its range or a mesh names a page
-/// beyond 2^29 texels, BK_ERROR_INVALID_STATE if the scene is not committed, BK_ERROR_OUT_OF_MEMORY
-/// if there would be more than 2^29 texels, they do not fit, or the memory callback refuses,
-/// BK_ERROR_CANCELLED if progress says so.
+/// @param scene  committed scene, kept alive by the light map
+/// @param desc  parameters; NULL for the defaults
+/// @param progress,user  progress callback and its pointer; may be NULL
+/// @param out  receives the light map, which the caller releases with bk_lightmap_release; NULL on
+///   failure
+/// @retval BK_ERROR_INVALID_ARGUMENT  a field of `desc` is out of its range, or a mesh names a page
+///   beyond 2^29 texels
+/// @retval BK_ERROR_INVALID_STATE  the scene is not committed or is being refitted
+/// @retval BK_ERROR_OUT_OF_MEMORY  there would be more than 2^29 texels, they do not fit, or the
+///   memory callback refuses
+/// @retval BK_ERROR_CANCELLED  the progress callback returned 0
 #[unsafe(no_mangle)]
 pub unsafe extern "C" fn bk_lightmap_create(
     scene: *const bk_scene,
@@ -140,14 +153,18 @@ pub unsafe extern "C" fn bk_lightmap_create(
     })
 }
 
-/// Counts one more reference. NULL is ignored.
+/// Adds one reference.
+///
+/// @param lightmap  NULL is ignored
 #[unsafe(no_mangle)]
 pub unsafe extern "C" fn bk_lightmap_retain(lightmap: *mut bk_lightmap) {
     // SAFETY: a handle or NULL.
     unsafe { retain(lightmap) }
 }
 
-/// Gives one reference back. NULL is ignored.
+/// Releases one reference.
+///
+/// @param lightmap  NULL is ignored
 #[unsafe(no_mangle)]
 pub unsafe extern "C" fn bk_lightmap_release(lightmap: *mut bk_lightmap) {
     // SAFETY: a handle whose reference the caller gives up, or NULL.
@@ -157,7 +174,7 @@ pub unsafe extern "C" fn bk_lightmap_release(lightmap: *mut bk_lightmap) {
     })
 }
 
-/// Numbers about a light map's layout.
+/// Numbers about the layout of a light map.
 #[repr(C)]
 #[derive(Clone, Copy)]
 pub struct bk_lightmap_info {
@@ -169,35 +186,37 @@ pub struct bk_lightmap_info {
     pub width: u32,
     /// Height of each page in texels.
     pub height: u32,
-    /// Charts: pieces of surface that are flat in the light map.
+    /// Number of charts: pieces of surface with continuous light map coordinates.
     pub charts: u32,
-    /// Of those, taken from the caller's coordinates.
+    /// Number of charts that have the caller's coordinates.
     pub given_charts: u32,
-    /// Of those, made by unwrapping.
+    /// Number of charts that were made by unwrapping.
     pub unwrapped_charts: u32,
-    /// Of those, reduced in density to fit a page.
+    /// Number of charts whose density was reduced so that they fit a page.
     pub reduced_charts: u32,
-    /// Of charts, those with a second place for their backs; see both_sides of bk_lightmap_desc.
+    /// Number of charts with separate texels for their backs, see bk_lightmap_desc.both_sides.
     pub both_sided_charts: u32,
-    /// Texels per scene unit in use.
+    /// Density in use, in texels per scene unit.
     pub texels_per_unit: f32,
-    /// Texels that a triangle covers: the range of texel_begin and texel_end of a bake.
+    /// Number of texels that a triangle covers: the range of texel_begin and texel_end of
+    /// bk_bake_params.
     pub texels: u64,
-    /// Texels of the gather map.
+    /// Number of texels of the gather map.
     pub gather_texels: u64,
-    /// Texels of the radiance map.
+    /// Number of texels of the radiance map.
     pub radiance_texels: u64,
-    /// Bytes held.
+    /// Size of the light map in bytes.
     pub bytes: u64,
-    /// Triangles whose given coordinates lie outside [0, 1]; they were unwrapped.
+    /// Number of triangles that were unwrapped because their given coordinates lie outside [0, 1].
     pub uv_out_of_range: u64,
-    /// Triangles with an area in space whose given coordinates have none; they were unwrapped.
+    /// Number of triangles that were unwrapped because they have an area in space and none in their
+    /// given coordinates.
     pub uv_degenerate: u64,
-    /// Texels whose centre is covered by several triangles of given coordinates.
+    /// Number of texels whose centre is covered by several triangles of given coordinates.
     pub uv_overlapping_texels: u64,
-    /// Time of unwrapping, in seconds.
+    /// Duration of unwrapping in seconds.
     pub unwrap_seconds: f64,
-    /// Of texels, those of the second places: the last so many.
+    /// Number of texels that belong to backs: the last ones of `texels`.
     pub back_texels: u64,
 }
 
@@ -227,14 +246,20 @@ fn info(i: &LightmapInfo) -> bk_lightmap_info {
     }
 }
 
-/// Sets struct_size and clears the rest.
+/// Sets `struct_size` and clears the other fields.
+///
+/// @param info  structure to fill in; NULL is ignored
 #[unsafe(no_mangle)]
 pub unsafe extern "C" fn bk_lightmap_info_init(info: *mut bk_lightmap_info) {
     // SAFETY: the caller's structure, or NULL.
     unsafe { init(info) }
 }
 
-/// Numbers about the layout.
+/// Gets numbers about the layout of a light map.
+///
+/// @param lightmap  any light map
+/// @param out  receives the numbers
+/// @retval BK_ERROR_INVALID_STATE  the light map is being baked
 #[unsafe(no_mangle)]
 pub unsafe extern "C" fn bk_lightmap_get_info(lightmap: *const bk_lightmap, out: *mut bk_lightmap_info) -> bk_result {
     call(|| {
@@ -246,14 +271,16 @@ pub unsafe extern "C" fn bk_lightmap_get_info(lightmap: *const bk_lightmap, out:
     })
 }
 
-/// Where the triangles of a mesh lie in the light map.
+/// Copies the light map coordinates of the triangles of a mesh.
 ///
-/// out_corner_uvs: receives u and v in [0, 1] of each corner, 3 * triangles * 2 floats, aligned to 4
-/// bytes; NULL if not wanted. out_page_per_triangle: receives triangles page numbers, BK_NONE for
-/// triangles without texels; NULL if not wanted.
-///
-/// Fails with BK_ERROR_INVALID_ARGUMENT if there is no such mesh, with BK_ERROR_INVALID_STATE while
-/// the light map is being baked.
+/// @param lightmap  any light map
+/// @param mesh  number of the mesh
+/// @param out_corner_uvs  receives u and v in [0, 1] of each corner, 6 floats per triangle, aligned
+///   to 4 bytes; may be NULL
+/// @param out_page_per_triangle  receives the page of each triangle, BK_NONE for triangles without
+///   texels, aligned to 4 bytes; may be NULL
+/// @retval BK_ERROR_INVALID_ARGUMENT  there is no such mesh
+/// @retval BK_ERROR_INVALID_STATE  the light map is being baked
 #[unsafe(no_mangle)]
 pub unsafe extern "C" fn bk_lightmap_mesh_uvs(
     lightmap: *const bk_lightmap,
@@ -268,28 +295,36 @@ pub unsafe extern "C" fn bk_lightmap_mesh_uvs(
     })
 }
 
-/// Where the backs of the triangles of a mesh lie in the light map. A shader that reads
-/// gl_FrontFacing ? uv : back_uv, and the page accordingly, shows the right light on both sides.
+/// Copies the light map coordinates of the backs of the triangles of a mesh.
 ///
-/// out_corner_uvs, out_page_per_triangle: as of bk_lightmap_mesh_uvs; of triangles whose back has no
-/// place of its own, the same as there. out_own_place_per_triangle: receives triangles bytes, 1 where
-/// the back has a place of its own (see both_sides of bk_lightmap_desc), else 0; NULL if not wanted.
+/// A shader that reads `gl_FrontFacing ? uv : back_uv`, and the page accordingly, shows the right
+/// light on both sides. Where a back has no separate texels (see bk_lightmap_desc.both_sides), its
+/// coordinates and page are those of the front.
 ///
-/// Fails as bk_lightmap_mesh_uvs does.
+/// @param lightmap  any light map
+/// @param mesh  number of the mesh
+/// @param out_corner_uvs  receives u and v in [0, 1] of each corner, 6 floats per triangle, aligned
+///   to 4 bytes; may be NULL
+/// @param out_page_per_triangle  receives the page of each triangle, BK_NONE for triangles without
+///   texels, aligned to 4 bytes; may be NULL
+/// @param out_separate_per_triangle  receives one byte per triangle: 1 if the back has separate
+///   texels, else 0; may be NULL
+/// @retval BK_ERROR_INVALID_ARGUMENT  there is no such mesh
+/// @retval BK_ERROR_INVALID_STATE  the light map is being baked
 #[unsafe(no_mangle)]
 pub unsafe extern "C" fn bk_lightmap_mesh_back_uvs(
     lightmap: *const bk_lightmap,
     mesh: u32,
     out_corner_uvs: *mut f32,
     out_page_per_triangle: *mut u32,
-    out_own_place_per_triangle: *mut u8,
+    out_separate_per_triangle: *mut u8,
 ) -> bk_result {
     // SAFETY: the arrays are the caller's, or NULL.
     call(|| unsafe {
         let (uvs, own) = object!(lightmap).read(|l| l.mesh_back_uvs(mesh))?;
         copy_uvs(&uvs, out_corner_uvs, out_page_per_triangle)?;
-        if !out_own_place_per_triangle.is_null() {
-            let out = slice_mut(out_own_place_per_triangle, own.len(), "out_own_place_per_triangle", &[])?;
+        if !out_separate_per_triangle.is_null() {
+            let out = slice_mut(out_separate_per_triangle, own.len(), "out_separate_per_triangle", &[])?;
             out.iter_mut().zip(own).for_each(|(out, own)| *out = own.into());
         }
         Ok(())

@@ -1,13 +1,16 @@
 //! Live updates
 //!
-//! A live object lights a scene at once, coarsely, and refines it while somebody walks through: call
-//! bk_live_update once per frame with the camera and a time budget, fetch the rectangles of texels
-//! that changed, and read and upload those. All levels of detail (LODs) are shown in pages of the
-//! light map's size and layout; a lower LOD is interpolated.
+//! A live object lights a scene at once, coarsely, and refines the light while a camera moves
+//! through it: call bk_live_update once per frame with the camera and a time budget, fetch the
+//! rectangles of texels that changed, and read and upload them. All levels of detail (LODs) are
+//! shown in pages of the light map's size and layout; lower LODs are interpolated. Source: Schouls
+//! 2017, section 3.3.
 //!
-//! One call at a time may use a live object, from any thread: a second one that comes while it runs
-//! fails with BK_ERROR_INVALID_STATE and changes nothing. Reads (bk_live_read, bk_live_cell_lods,
-//! bk_live_lod_at) exclude updates only, not each other. Source: Schouls 2017, section 3.3.
+//! Thread safety: any thread, one call at a time per live object: a second call that comes while
+//! the first runs fails with BK_ERROR_INVALID_STATE and changes nothing. bk_live_read,
+//! bk_live_cell_lods and bk_live_lod_at exclude other calls but not each other.
+//!
+//! Cost: see each function; those without a remark take microseconds.
 
 use super::args::{OutStruct, SizedStruct, init, read_bool, read_struct, read_vec3, sized_struct, slice_mut, write};
 use super::device::{bk_progress_fn, call_with_file, progress as report_to, refuse_in_callback};
@@ -21,19 +24,19 @@ use glam::Vec3;
 use std::ffi::{c_char, c_void};
 use std::sync::{RwLock, TryLockError};
 
-/// Work on what the camera sees, most where estimated error times visibility is largest.
+/// Mode: refine what the camera sees, first where estimated error times visibility is largest.
 pub const BK_LIVE_VIEW: u32 = 0;
-/// Work on the grid cells near the camera, visible ones first. A cell shows its next LOD when all its
-/// texels have it.
+/// Mode: refine the grid cells near the camera, visible ones first. A cell shows its next LOD when
+/// all its texels have it.
 pub const BK_LIVE_POSITION: u32 = 1;
-/// Work anywhere, at random: to compare with.
+/// Mode: refine anywhere, at random, for comparison.
 pub const BK_LIVE_UNIFORM: u32 = 2;
 
-/// Added to the format of bk_live_read: leave direct light out, for applications that shade it
+/// Flag added to the format of bk_live_read: leave out direct light, for applications that shade it
 /// themselves.
 pub const BK_FORMAT_INDIRECT_ONLY: u32 = 0x100;
 
-/// A scene's light under refinement.
+/// Handle of a live object.
 pub struct bk_live {
     /// Only ever tried, never waited for.
     live: RwLock<Live>,
@@ -68,7 +71,7 @@ fn unusable() -> Error {
     Error::InvalidState("an internal error has left the live object unusable".into())
 }
 
-/// How to update.
+/// Parameters of bk_live_create.
 #[repr(C)]
 #[derive(Clone, Copy)]
 pub struct bk_live_params {
@@ -76,33 +79,34 @@ pub struct bk_live_params {
     pub struct_size: u32,
     /// One of the BK_LIVE modes. Default: BK_LIVE_VIEW.
     pub mode: u32,
-    /// Levels of detail, 1 to 4: the lowest computes every 2^(lod_count - 1)-th texel of the gather map
-    /// along each axis, the highest all. Default: 3.
+    /// Number of levels of detail, 1 to 4: the lowest computes every 2^(lod_count - 1)-th texel of
+    /// the gather map along each axis, the highest all. Default: 3.
     pub lod_count: u32,
-    /// Rounds of 64 rays that each texel of a cell needs before the cell shows its next LOD, 1 to
-    /// max_rounds. Default: 1.
+    /// Number of rounds of 64 rays that each texel of a cell needs before the cell shows its next
+    /// LOD, 1 to `max_rounds`. Default: 1.
     pub promote_threshold: u32,
-    /// Rounds of 64 rays after which a texel is finished, 1 to 1024. Default: 16.
+    /// Number of rounds of 64 rays after which a texel is finished, 1 to 1024. Default: 16.
     pub max_rounds: u32,
-    /// The most rays that an update traces, whatever its budget; 0, the default: no such limit.
+    /// Maximum number of rays that an update traces, whatever its budget; 0: no limit. Default: 0.
     pub rays_per_update: u32,
-    /// Radius in texels of the gather map of a blur for display, 0 to 16; what is accumulated is not
+    /// Radius of a blur for display, in texels of the gather map, 0 to 16; accumulated light is not
     /// blurred. Default: 2.
     pub blur: u32,
-    /// Edge of a grid cell in scene units, finite and >= 0; 0, the default: a sixteenth of the scene's
-    /// longest side. A grid of more than 2^24 cells is refused.
+    /// Edge of a grid cell in scene units, finite and >= 0; 0: a sixteenth of the scene's longest
+    /// side. A grid of more than 2^24 cells is refused. Default: 0.
     pub cell_size: f32,
-    /// Seed of all random numbers, as in bk_bake_params. Default: 0.
+    /// Seed of all random numbers, see bk_bake_params. Default: 0.
     pub seed: u64,
-    /// Photons to emit, as in bk_bake_params. Default: 1,000,000.
+    /// Number of photons to emit, see bk_bake_params. Default: 1,000,000.
     pub photon_count: u64,
-    /// Most reflections, as in bk_bake_params. Default: 0.
+    /// Maximum number of reflections, see bk_bake_params. Default: 0.
     pub max_bounces: u32,
-    /// Shadow rays per light map texel and area light, as in bk_bake_params. Default: 16.
+    /// Number of shadow rays per light map texel and area light, see bk_bake_params. Default: 16.
     pub direct_samples: u32,
-    /// Photon search radius, as in bk_bake_params. Default: 0.
+    /// Search radius of photons in scene units, see bk_bake_params. Default: 0.
     pub radius: f32,
-    /// 1: the device's threads go on working between updates, on what the last one saw. Default: 0.
+    /// 1: the device's threads go on working between updates, on what the last one saw. 0: they
+    /// rest. Default: 0.
     pub background: u32,
 }
 
@@ -126,7 +130,9 @@ sized_struct!(bk_live_params, defaults: {
     }
 });
 
-/// Fills in the defaults.
+/// Sets `struct_size` and fills in the defaults.
+///
+/// @param params  structure to fill in; NULL is ignored
 #[unsafe(no_mangle)]
 pub unsafe extern "C" fn bk_live_params_init(params: *mut bk_live_params) {
     // SAFETY: the caller's structure, or NULL.
@@ -157,21 +163,21 @@ fn core_params(p: &bk_live_params) -> Result<LiveParams> {
     })
 }
 
-/// Where somebody looks from.
+/// A perspective camera.
 #[repr(C)]
 #[derive(Clone, Copy)]
 pub struct bk_camera {
     /// Size of this structure in bytes, set by bk_camera_init.
     pub struct_size: u32,
-    /// Width of the picture in pixels, >= 1: only the aspect matters. Default: 1920.
+    /// Width of the picture in pixels, >= 1; only the ratio to `height` matters. Default: 1920.
     pub width: u32,
     /// Height of the picture in pixels, >= 1. Default: 1080.
     pub height: u32,
-    /// Position in the scene. Default: the origin.
+    /// Position in scene units. Default: the origin.
     pub position: [f32; 3],
-    /// Direction of view, of any length > 0. Default: -z.
+    /// Direction of view, a vector of any length > 0. Default: -z.
     pub forward: [f32; 3],
-    /// Upwards, of any length > 0, not parallel to forward. Default: +y.
+    /// Upward direction, a vector of any length > 0, not parallel to `forward`. Default: +y.
     pub up: [f32; 3],
     /// Vertical field of view in radians, in (0, pi). Default: 1.
     pub fov_y: f32,
@@ -187,22 +193,25 @@ sized_struct!(bk_camera, defaults: bk_camera {
     fov_y: 1.0,
 });
 
-/// Fills in the defaults.
+/// Sets `struct_size` and fills in the defaults.
+///
+/// @param camera  structure to fill in; NULL is ignored
 #[unsafe(no_mangle)]
 pub unsafe extern "C" fn bk_camera_init(camera: *mut bk_camera) {
     // SAFETY: the caller's structure, or NULL.
     unsafe { init(camera) }
 }
 
-/// What an update may take. Both limits 0: nothing is traced.
+/// Limits of an update. With both limits 0 nothing is traced.
 #[repr(C)]
 #[derive(Clone, Copy)]
 pub struct bk_budget {
     /// Size of this structure in bytes, set by bk_budget_init.
     pub struct_size: u32,
-    /// Time in milliseconds, finite and >= 0; 0: no limit by time. Default: 4.
+    /// Time limit in milliseconds, finite and >= 0; 0: none. Default: 4.
     pub milliseconds: f32,
-    /// Rays; 0, the default: no limit by rays. A round of 64 that was begun is finished.
+    /// Limit of the number of rays; 0: none. A round of 64 rays that has begun is finished.
+    /// Default: 0.
     pub rays: u64,
 }
 
@@ -212,14 +221,16 @@ sized_struct!(bk_budget, defaults: bk_budget {
     rays: 0,
 });
 
-/// Fills in the defaults.
+/// Sets `struct_size` and fills in the defaults.
+///
+/// @param budget  structure to fill in; NULL is ignored
 #[unsafe(no_mangle)]
 pub unsafe extern "C" fn bk_budget_init(budget: *mut bk_budget) {
     // SAFETY: the caller's structure, or NULL.
     unsafe { init(budget) }
 }
 
-/// What an update did, and how things stand.
+/// Numbers about an update, and the state after it.
 #[repr(C)]
 #[derive(Clone, Copy)]
 pub struct bk_live_stats {
@@ -227,25 +238,25 @@ pub struct bk_live_stats {
     pub struct_size: u32,
     /// 1 while indirect light is being recomputed because a light has changed, else 0.
     pub light_pending: u32,
-    /// Time that the update took.
+    /// Duration of the update in milliseconds.
     pub milliseconds: f32,
-    /// Estimated relative error of indirect light where the camera looks.
+    /// Estimated relative error of the indirect light that the camera sees.
     pub visible_error: f32,
-    /// Part of the light map that is finished, 0 to 1.
+    /// Fraction of the light map that is finished, 0 to 1.
     pub finished: f32,
-    /// Part of what the camera sees that is finished, 0 to 1.
+    /// Fraction of the surfaces in view that is finished, 0 to 1.
     pub visible_finished: f32,
-    /// Rays traced by the update, and in the background since the one before.
+    /// Number of rays traced by the update, and in the background since the update before.
     pub rays: u64,
-    /// Rays traced since the beginning.
+    /// Number of rays traced since the live object was created.
     pub total_rays: u64,
-    /// Cells that went to a higher LOD (BK_LIVE_POSITION).
+    /// Number of cells that went to a higher LOD (BK_LIVE_POSITION).
     pub cells_promoted: u32,
-    /// Blocks of 8 x 8 texels of the gather map whose shown light changed.
+    /// Number of blocks of 8 x 8 texels of the gather map whose shown light changed.
     pub blocks_changed: u32,
-    /// Bytes that the live object holds.
+    /// Size of the live object in bytes.
     pub bytes: u64,
-    /// Bytes that it would hold with all LODs worked on everywhere.
+    /// Size in bytes that the live object would have with all LODs in use everywhere.
     pub bytes_full: u64,
 }
 
@@ -268,7 +279,9 @@ fn stats(s: &LiveStats) -> bk_live_stats {
     }
 }
 
-/// Sets struct_size and clears the rest.
+/// Sets `struct_size` and clears the other fields.
+///
+/// @param stats  structure to fill in; NULL is ignored
 #[unsafe(no_mangle)]
 pub unsafe extern "C" fn bk_live_stats_init(stats: *mut bk_live_stats) {
     // SAFETY: the caller's structure, or NULL.
@@ -281,15 +294,15 @@ pub unsafe extern "C" fn bk_live_stats_init(stats: *mut bk_live_stats) {
 pub struct bk_rect {
     /// Number of the page.
     pub page: u32,
-    /// LOD of what is to be read; of dirty rectangles always the highest: lod_count - 1.
+    /// LOD to read; in dirty rectangles always the highest, lod_count - 1.
     pub lod: u32,
-    /// First column.
+    /// First column, in texels.
     pub x: u32,
-    /// First row.
+    /// First row, in texels.
     pub y: u32,
-    /// Columns.
+    /// Number of columns, in texels.
     pub width: u32,
-    /// Rows.
+    /// Number of rows, in texels.
     pub height: u32,
 }
 
@@ -298,15 +311,15 @@ unsafe impl bytemuck::Zeroable for bk_rect {}
 // SAFETY: as above.
 unsafe impl bytemuck::Pod for bk_rect {}
 
-/// Where the cells of the light map grid lie.
+/// Geometry of the light map grid.
 #[repr(C)]
 #[derive(Clone, Copy)]
 pub struct bk_cell_info {
     /// Size of this structure in bytes, set by bk_cell_info_init.
     pub struct_size: u32,
-    /// Cells along x, y and z.
+    /// Number of cells along x, y and z.
     pub dimensions: [u32; 3],
-    /// Lower corner of the first cell, in the scene.
+    /// Lower corner of the first cell, in scene units.
     pub origin: [f32; 3],
     /// Edge of a cell in scene units.
     pub cell_size: f32,
@@ -323,22 +336,30 @@ fn cell_info(i: &CellInfo) -> bk_cell_info {
     }
 }
 
-/// Sets struct_size and clears the rest.
+/// Sets `struct_size` and clears the other fields.
+///
+/// @param info  structure to fill in; NULL is ignored
 #[unsafe(no_mangle)]
 pub unsafe extern "C" fn bk_cell_info_init(info: *mut bk_cell_info) {
     // SAFETY: the caller's structure, or NULL.
     unsafe { init(info) }
 }
 
-/// Computes photons and the lowest LOD under the lights of now, on the device's threads: a second or
-/// two for a large scene. All pages are dirty afterwards.
+/// Creates a live object: computes photons and the lowest LOD under the present lights, on the
+/// device's threads. All pages are dirty afterwards.
 ///
-/// lightmap: its layout is used; it need not be baked, is not changed, and may be released. params:
-/// NULL for the defaults. progress, user: told how far it is; NULL if not wanted. out: receives the live object,
-/// NULL on failure.
+/// Cost: a second or two for a large scene.
 ///
-/// Fails with BK_ERROR_OUT_OF_MEMORY if memory is not to be had or the memory callback refuses, and with
-/// BK_ERROR_CANCELLED if progress says so; nothing is left behind then.
+/// @param lightmap  light map whose layout is used; need not be baked, is not changed, and may be
+///   released
+/// @param params  parameters; NULL for the defaults
+/// @param progress,user  progress callback and its pointer; may be NULL
+/// @param out  receives the live object, which the caller releases with bk_live_release; NULL on
+///   failure
+/// @retval BK_ERROR_INVALID_ARGUMENT  a field of `params` is out of its range
+/// @retval BK_ERROR_INVALID_STATE  the light map is being baked
+/// @retval BK_ERROR_OUT_OF_MEMORY  the live object does not fit or the memory callback refuses
+/// @retval BK_ERROR_CANCELLED  the progress callback returned 0
 #[unsafe(no_mangle)]
 pub unsafe extern "C" fn bk_live_create(
     lightmap: *mut bk_lightmap,
@@ -359,20 +380,25 @@ pub unsafe extern "C" fn bk_live_create(
     })
 }
 
-/// Counts one more reference. NULL is ignored.
+/// Adds one reference.
+///
+/// @param live  NULL is ignored
 #[unsafe(no_mangle)]
 pub unsafe extern "C" fn bk_live_retain(live: *mut bk_live) {
     // SAFETY: a handle or NULL.
     unsafe { retain(live) }
 }
 
-/// Gives one reference back. NULL is ignored.
+/// Releases one reference.
 ///
-/// The last release stops work between updates and the recomputation of indirect light, and waits until both have
-/// ended: no callback comes from them afterwards. It may be made in a callback, on any thread; only when it is made
-/// in a memory callback that the recomputation of indirect light calls, that work ends just after the callback has
-/// returned, and may call the memory callback once more for what it gives back. A thread that makes the last
-/// release must not hold a lock that a callback takes.
+/// The last release stops work between updates and the recomputation of indirect light, and waits
+/// until both have ended; no callback comes from them afterwards. It may be made in a callback, on
+/// any thread. Only if it is made in a memory callback that the recomputation of indirect light
+/// calls, that work ends just after the callback has returned, and may call the memory callback
+/// once more for the memory that it frees. A thread that makes the last release must not hold a
+/// lock that a callback takes.
+///
+/// @param live  NULL is ignored
 #[unsafe(no_mangle)]
 pub unsafe extern "C" fn bk_live_release(live: *mut bk_live) {
     // SAFETY: a handle whose reference the caller gives up, or NULL.
@@ -382,16 +408,19 @@ pub unsafe extern "C" fn bk_live_release(live: *mut bk_live) {
     })
 }
 
-/// Refines the light for as long as the budget allows, on the device's threads.
+/// Updates the light for as long as the budget allows, on the device's threads.
 ///
-/// camera: where somebody looks from; it may be inside walls or outside the scene. budget: NULL for
-/// 4 ms. out: what was done; NULL if not wanted.
+/// Cost: the budget, which is exceeded by 0.04 ms in the median.
 ///
-/// A camera with coordinates that are not finite, with no extent or field of view, or whose forward
-/// and up are parallel, and a budget that is negative or not finite are refused
-/// (BK_ERROR_INVALID_ARGUMENT). BK_ERROR_OUT_OF_MEMORY if memory is not to be had or the memory callback
-/// refuses it, for a higher LOD or for indirect light that is being recomputed; what has been computed stays, and the
-/// next update tries again.
+/// @param live  live object
+/// @param camera  camera with finite coordinates; may be inside walls or outside the scene
+/// @param budget  limits; NULL for 4 milliseconds
+/// @param out  receives numbers about the update; may be NULL
+/// @retval BK_ERROR_INVALID_ARGUMENT  a field of `camera` or `budget` is out of its range or not
+///   finite
+/// @retval BK_ERROR_INVALID_STATE  another call is using the live object
+/// @retval BK_ERROR_OUT_OF_MEMORY  a higher LOD or recomputed indirect light does not fit, or the
+///   memory callback refuses; finished work stays, and the next update tries again
 #[unsafe(no_mangle)]
 pub unsafe extern "C" fn bk_live_update(
     live: *mut bk_live,
@@ -423,11 +452,16 @@ pub unsafe extern "C" fn bk_live_update(
     })
 }
 
-/// Fetches rectangles of texels whose shown light has changed since they were last fetched, merged
-/// where that adds little. Texels around charts (padding) are included.
+/// Fetches rectangles of texels whose shown light has changed since they were last fetched, padding
+/// around charts included. Rectangles are merged where that adds few texels.
 ///
-/// out: receives at most capacity rectangles; NULL if capacity is 0. count: receives how many. What
-/// does not fit is kept for the next call: fetch until count < capacity.
+/// @param live  live object
+/// @param out  receives at most `capacity` rectangles, aligned to 4 bytes; may be NULL if
+///   `capacity` is 0
+/// @param capacity  number of rectangles that `out` holds
+/// @param count  receives the number of rectangles fetched; the others are kept for the next call,
+///   so fetch until `count` is less than `capacity`
+/// @retval BK_ERROR_INVALID_STATE  another call is using the live object
 #[unsafe(no_mangle)]
 pub unsafe extern "C" fn bk_live_dirty_rects(
     live: *mut bk_live,
@@ -450,13 +484,23 @@ pub unsafe extern "C" fn bk_live_dirty_rects(
     })
 }
 
-/// Copies irradiance as shown, in W/m2, for a rectangle of a page.
+/// Copies the shown irradiance, in W/m2, of a rectangle of a page.
 ///
-/// lod: lod_count - 1 for what is shown; less: what would be shown if no texel were above that LOD
-/// (slow: for comparison). format: BK_FORMAT_RGB32F or BK_FORMAT_RGBA16F, with BK_FORMAT_INDIRECT_ONLY
-/// added or not. rect: x, y, width and height count, page and lod do not; NULL: the whole page. dst:
-/// receives the rectangle's rows, row_stride bytes apart; needs no alignment. row_stride: at least
-/// the bytes of a row; 0: just that many.
+/// Cost: about 0.2 microseconds per texel; more for an LOD below the highest.
+///
+/// @param live  live object
+/// @param page  number of the page
+/// @param lod  lod_count - 1 for the light as shown; less for the light as it would be shown if no
+///   texel were above that LOD
+/// @param format  BK_FORMAT_RGB32F or BK_FORMAT_RGBA16F, with or without BK_FORMAT_INDIRECT_ONLY
+/// @param rect  `x`, `y`, `width` and `height` of the rectangle; its `page` and `lod` are ignored.
+///   NULL: the whole page
+/// @param dst  receives the rectangle's rows; needs no alignment
+/// @param row_stride  distance between rows in bytes, at least the bytes of a row; 0: packed
+/// @retval BK_ERROR_INVALID_ARGUMENT  page, LOD or format does not exist, the rectangle is not
+///   within the page, or `row_stride` is too small
+/// @retval BK_ERROR_INVALID_STATE  another call is changing the live object
+/// @retval BK_ERROR_OUT_OF_MEMORY  the rectangle does not fit
 #[unsafe(no_mangle)]
 pub unsafe extern "C" fn bk_live_read(
     live: *const bk_live,
@@ -498,11 +542,16 @@ pub unsafe extern "C" fn bk_live_read(
     })
 }
 
-/// The light map grid and the LOD that each of its cells shows, to be put into a 3D texture.
+/// Copies the light map grid and the LOD that each of its cells shows, for example into a 3D
+/// texture.
 ///
-/// info: receives where the cells lie. out: receives one LOD per cell, x fastest, 255 in cells without
-/// surfaces; NULL if capacity is 0 and only info is wanted. capacity: bytes that out has room for, at
-/// least the number of cells unless 0.
+/// @param live  live object
+/// @param info  receives the geometry of the grid
+/// @param out  receives one LOD per cell, x fastest, 255 for cells without surfaces; may be NULL if
+///   `capacity` is 0
+/// @param capacity  size of `out` in bytes, at least the number of cells; 0 to get `info` only
+/// @retval BK_ERROR_INVALID_ARGUMENT  `capacity` is too small
+/// @retval BK_ERROR_INVALID_STATE  another call is changing the live object
 #[unsafe(no_mangle)]
 pub unsafe extern "C" fn bk_live_cell_lods(
     live: *const bk_live,
@@ -526,8 +575,11 @@ pub unsafe extern "C" fn bk_live_cell_lods(
     })
 }
 
-/// The LOD that is shown at a position: three floats. BK_NONE outside the grid, in cells without
-/// surfaces, and on failure.
+/// Returns the LOD that is shown at a position.
+///
+/// @param live  live object
+/// @param position  three floats, in scene units
+/// @return  the LOD; BK_NONE outside the grid, in cells without surfaces, and on failure
 #[unsafe(no_mangle)]
 pub unsafe extern "C" fn bk_live_lod_at(live: *const bk_live, position: *const f32) -> u32 {
     call_or(BK_NONE, || {
@@ -538,22 +590,31 @@ pub unsafe extern "C" fn bk_live_lod_at(live: *const bk_live, position: *const f
     })
 }
 
-/// To be called after bk_scene_set_light: direct light follows in the next
-/// updates, first where the camera looks; photons are traced again on a thread of their own, and
-/// indirect light follows as they come, the old fading out. Several changes may be followed by one
-/// call.
+/// Announces that bk_scene_set_light has changed lights.
 ///
-/// light: number of a light that changed.
+/// Direct light follows in the next updates, first where the camera looks. Photons are traced again
+/// on a thread of their own; indirect light follows as they arrive, while the old light fades out.
+/// One call can follow several changes.
+///
+/// @param live  live object
+/// @param light  number of one of the lights that changed
+/// @retval BK_ERROR_INVALID_ARGUMENT  there is no such light
+/// @retval BK_ERROR_INVALID_STATE  another call is using the live object
 #[unsafe(no_mangle)]
 pub unsafe extern "C" fn bk_live_light_changed(live: *mut bk_live, light: u32) -> bk_result {
     // SAFETY: a handle, or NULL.
     call(|| unsafe { hold(live, "live") }?.change(|l| l.light_changed(light)))
 }
 
-/// Stops work between updates (background), and the recomputation of indirect light, or lets both go
-/// on with the next update. Updates still do what their budget allows.
+/// Pauses or resumes work between updates (bk_live_params.background) and the recomputation of
+/// indirect light. They resume with the next update; updates themselves still do what their budget
+/// allows.
 ///
-/// paused: 1 or 0.
+/// Cost: pausing waits for the work under way.
+///
+/// @param live  live object
+/// @param paused  1 to pause, 0 to resume
+/// @retval BK_ERROR_INVALID_STATE  another call is using the live object
 #[unsafe(no_mangle)]
 pub unsafe extern "C" fn bk_live_pause(live: *mut bk_live, paused: u32) -> bk_result {
     call(|| {
@@ -564,14 +625,20 @@ pub unsafe extern "C" fn bk_live_pause(live: *mut bk_live, paused: u32) -> bk_re
     })
 }
 
-/// Writes what has been accumulated to a file, to go on from another time; an existing file is
-/// replaced once the new one is whole. Light that is older than the last change of a light is left
-/// out.
+/// Saves accumulated light to a file, from which bk_live_restore continues. Light that is older
+/// than the last change of a light is left out.
 ///
-/// path: UTF-8. progress, user: told how far it is; NULL if not wanted.
+/// Experimental: another version of the library may refuse the file.
 ///
-/// Fails with BK_ERROR_IO if the file cannot be written, and with BK_ERROR_CANCELLED if progress says so; an
-/// existing file is as it was then, and the live object too.
+/// Cost: the time of writing the file.
+///
+/// @param live  live object
+/// @param path  name of the file, which is replaced as a whole or not at all; UTF-8
+/// @param progress,user  progress callback and its pointer; may be NULL
+/// @retval BK_ERROR_INVALID_STATE  another call is using the live object
+/// @retval BK_ERROR_IO  the file cannot be written; bk_last_error names it
+/// @retval BK_ERROR_OUT_OF_MEMORY  a buffer does not fit
+/// @retval BK_ERROR_CANCELLED  the progress callback returned 0
 #[unsafe(no_mangle)]
 pub unsafe extern "C" fn bk_live_save(
     live: *mut bk_live,
@@ -587,17 +654,26 @@ pub unsafe extern "C" fn bk_live_save(
     }
 }
 
-/// Goes on from a file that was saved of the same scene, light map, lights and parameters (mode, cell
-/// size, promotion, blur and limits may differ). All pages are dirty afterwards.
+/// Restores light that bk_live_save wrote for the same scene, light map, lights and parameters
+/// (mode, cell size, promotion, blur and limits may differ). All pages are dirty afterwards. A call
+/// that fails changes nothing.
 ///
-/// Every number of the file is checked to be one that updates could have arrived at: light is finite and >= 0, counts
-/// fit the light map. For a moment the call needs memory for the light that is shown twice.
+/// Every number of the file is checked: light must be finite and >= 0, counts must fit the light
+/// map.
 ///
-/// path: UTF-8. progress, user: told how far it is; NULL if not wanted.
+/// Experimental: another version of the library may refuse the file.
 ///
-/// Fails with BK_ERROR_IO if the file cannot be read or is damaged, with BK_ERROR_INVALID_ARGUMENT if it is of
-/// something else, with BK_ERROR_OUT_OF_MEMORY if memory is not to be had or the memory callback refuses, and with
-/// BK_ERROR_CANCELLED if progress says so; nothing is changed then.
+/// Cost: the time of reading the file; for a moment, twice the memory of the shown light.
+///
+/// @param live  live object
+/// @param path  name of the file; UTF-8
+/// @param progress,user  progress callback and its pointer; may be NULL
+/// @retval BK_ERROR_INVALID_ARGUMENT  the file is of another scene, light map, lights or parameters
+/// @retval BK_ERROR_INVALID_STATE  another call is using the live object
+/// @retval BK_ERROR_IO  the file cannot be read, is damaged, or is another kind of file;
+///   bk_last_error names it
+/// @retval BK_ERROR_OUT_OF_MEMORY  the light does not fit or the memory callback refuses
+/// @retval BK_ERROR_CANCELLED  the progress callback returned 0
 #[unsafe(no_mangle)]
 pub unsafe extern "C" fn bk_live_restore(
     live: *mut bk_live,

@@ -1,10 +1,15 @@
 //! Materials and meshes
 //!
-//! Added to a scene before its commit; vertices can move after it. A refused addition changes
-//! nothing.
+//! Materials and meshes are added to a scene before its commit; vertices can move after it.
 //!
-//! Input arrays are read inside the call only. Strides are in bytes, 0 means packed; neither
-//! alignment nor bytes behind the last element are needed.
+//! Input arrays need neither alignment nor bytes behind the last element. Strides are in bytes; 0
+//! means packed.
+//!
+//! Thread safety: as for scenes; the functions that read are safe from any thread, but before the
+//! commit fail with BK_ERROR_INVALID_STATE while another thread is changing the scene.
+//!
+//! Cost: adding and moving copy the arrays; reading copies nothing but the structure and takes less
+//! than a microsecond.
 
 use super::args::{
     OutStruct, SizedStruct, check_flags, init, read_optional, read_strided, read_struct, sized_struct, write_optional,
@@ -18,8 +23,8 @@ use glam::{Vec2, Vec3};
 
 const _: () = assert!(BK_NONE == NONE);
 
-/// Flag: the back side reflects and emits like the front. The back of a one-sided material absorbs
-/// what meets it and is not transmitted.
+/// Flag of bk_material_desc: the back reflects and emits like the front. The back of a one-sided
+/// material absorbs light and transmits none.
 pub const BK_MATERIAL_TWO_SIDED: u32 = 1;
 
 /// A diffuse material.
@@ -30,20 +35,23 @@ pub struct bk_material_desc {
     pub struct_size: u32,
     /// BK_MATERIAL flags. Default: 0.
     pub flags: u32,
-    /// Diffuse reflectance per channel, in [0, 1); with albedo_texture: its factor, in [0, 1]. Default: 0.5.
+    /// Diffuse reflectance per channel, a fraction in [0, 1); with `albedo_texture` a factor in [0,
+    /// 1]. Default: 0.5.
     pub albedo: [f32; 3],
     /// Emitted radiance per channel in W/(m2 sr), >= 0. Default: 0.
     pub emission: [f32; 3],
-    /// Number of the texture that is multiplied with albedo, the product being limited to 0.98; BK_NONE: none.
-    /// Where a mesh has no uvs, albedo alone counts. Default: BK_NONE.
+    /// Number of the texture that is multiplied with `albedo`, or BK_NONE; the product is clamped
+    /// to 0.98. Meshes without `uvs` use `albedo` alone. Default: BK_NONE.
     pub albedo_texture: u32,
-    /// Points where the texture's alpha, interpolated and from 0 to 1, is less than this are holes, which rays and
-    /// photons do not meet, from whichever side. In [0, 1]; not for materials that emit. Holes cost rays that
-    /// meet them a second search. Default: 0, no holes.
+    /// Threshold of alpha tests, a fraction in [0, 1]: points where the interpolated alpha of the
+    /// texture is smaller are cut out, and rays and photons pass them from either side. Must be 0
+    /// for materials that emit. Rays that hit a cut-out are traced a second time. Default: 0,
+    /// nothing is cut out.
     pub alpha_cutoff: f32,
-    /// Fraction of light per channel that passes straight through, from either side, as through a pane of
-    /// stained glass; at most 1 together with albedo. It is not textured. Light of lamps that comes through
-    /// is direct light. bk_intersect, bk_occluded and their like meet the surface all the same. Default: 0.
+    /// Fraction of light per channel that passes straight through, from either side, as through
+    /// stained glass; its sum with `albedo` is at most 1. It is not textured. Transmitted light of
+    /// lights counts as direct light. bk_intersect, bk_occluded and the other ray queries hit the
+    /// surface nevertheless. Default: 0.
     pub transmission: [f32; 3],
 }
 
@@ -61,7 +69,9 @@ fn material_desc(m: &Material) -> bk_material_desc {
     }
 }
 
-/// Fills in the defaults.
+/// Sets `struct_size` and fills in the defaults.
+///
+/// @param desc  structure to fill in; NULL is ignored
 #[unsafe(no_mangle)]
 pub unsafe extern "C" fn bk_material_desc_init(desc: *mut bk_material_desc) {
     // SAFETY: the caller's structure, or NULL.
@@ -70,8 +80,11 @@ pub unsafe extern "C" fn bk_material_desc_init(desc: *mut bk_material_desc) {
 
 /// Adds a material. The texture that it names must have been added before.
 ///
-/// out_id: receives its number, for meshes; NULL if not wanted. Numbers count up from 0 in the
-/// order of addition.
+/// @param scene  scene that is not committed
+/// @param desc  copied
+/// @param out_id  receives the number of the material, for meshes; may be NULL
+/// @retval BK_ERROR_INVALID_ARGUMENT  a field of `desc` is out of its range or names no texture
+/// @retval BK_ERROR_INVALID_STATE  the scene is committed or another thread is changing it
 #[unsafe(no_mangle)]
 pub unsafe extern "C" fn bk_scene_add_material(
     scene: *mut bk_scene,
@@ -97,13 +110,22 @@ pub unsafe extern "C" fn bk_scene_add_material(
     })
 }
 
-/// The number of materials, committed or not; 0 on failure.
+/// Returns the number of materials of a scene, committed or not.
+///
+/// @param scene  any scene
+/// @return  number of materials; 0 on failure
 #[unsafe(no_mangle)]
 pub unsafe extern "C" fn bk_scene_material_count(scene: *const bk_scene) -> u32 {
     call_or(0, || object!(scene).count(|d| d.materials().len(), |s| s.materials().len()))
 }
 
-/// Fetches a material, committed or not.
+/// Gets a material of a scene, committed or not.
+///
+/// @param scene  any scene
+/// @param id  number of the material
+/// @param out  receives a copy of the material
+/// @retval BK_ERROR_INVALID_ARGUMENT  there is no such material
+/// @retval BK_ERROR_INVALID_STATE  another thread is changing the scene
 #[unsafe(no_mangle)]
 pub unsafe extern "C" fn bk_scene_get_material(
     scene: *const bk_scene,
@@ -126,11 +148,11 @@ fn find(materials: &[Material], id: u32) -> Result<Material> {
     }
 }
 
-/// Flag: refuse degenerate triangles and vertices that are not finite, naming the first, rather
-/// than skip and count them.
+/// Flag of bk_mesh_desc: degenerate triangles and vertices that are not finite are errors, instead
+/// of being skipped and counted.
 pub const BK_MESH_STRICT: u32 = 1;
 
-/// An indexed triangle mesh. The arrays are copied.
+/// An indexed triangle mesh.
 #[repr(C)]
 #[derive(Clone, Copy)]
 pub struct bk_mesh_desc {
@@ -138,34 +160,38 @@ pub struct bk_mesh_desc {
     pub struct_size: u32,
     /// BK_MESH flags. Default: 0.
     pub flags: u32,
-    /// vertex_count positions of three floats.
+    /// `vertex_count` positions of three floats, in scene units. Default: NULL.
     pub positions: *const f32,
-    /// Bytes from one position to the next, at least 12; 0: packed.
+    /// Distance between positions in bytes, at least 12; 0: packed. Default: 0.
     pub position_stride: usize,
-    /// Number of vertices.
+    /// Number of vertices. Default: 0.
     pub vertex_count: usize,
-    /// Three vertex numbers per triangle, packed, each less than vertex_count.
+    /// Three vertex numbers per triangle, packed, each less than `vertex_count`. Default: NULL.
     pub indices: *const u32,
-    /// Number of triangles; at most 2^28 in a scene.
+    /// Number of triangles; at most 2^28 in a scene. Default: 0.
     pub triangle_count: usize,
-    /// Optional: vertex_count shading normals of three floats.
+    /// `vertex_count` shading normals of three floats, unit vectors; may be NULL. Default: NULL,
+    /// geometric normals.
     pub normals: *const f32,
-    /// Bytes from one normal to the next, at least 12; 0: packed.
+    /// Distance between normals in bytes, at least 12; 0: packed. Default: 0.
     pub normal_stride: usize,
-    /// Optional: vertex_count texture coordinates of two floats, which place the textures of materials.
+    /// `vertex_count` texture coordinates of two floats, 1 per width or height of an image; may be
+    /// NULL. Default: NULL.
     pub uvs: *const f32,
-    /// Bytes from one texture coordinate to the next, at least 8; 0: packed.
+    /// Distance between texture coordinates in bytes, at least 8; 0: packed. Default: 0.
     pub uv_stride: usize,
-    /// Optional: vertex_count light map coordinates of two floats, in [0, 1] on a page, no two
-    /// points of a page's triangles at the same place. Without them the mesh is unwrapped.
+    /// `vertex_count` light map coordinates of two floats in [0, 1], 1 per width or height of a
+    /// page; triangles of a page must not overlap. May be NULL: the mesh is unwrapped. Default:
+    /// NULL.
     pub lightmap_uvs: *const f32,
-    /// Bytes from one light map coordinate to the next, at least 8; 0: packed.
+    /// Distance between light map coordinates in bytes, at least 8; 0: packed. Default: 0.
     pub lightmap_uv_stride: usize,
-    /// Optional, with lightmap_uvs only: light map page per triangle, packed. NULL: all on page 0.
+    /// Light map page of each triangle, packed; needs `lightmap_uvs`. May be NULL: all on page 0.
+    /// Default: NULL.
     pub lightmap_page: *const u32,
-    /// Optional: material number per triangle, packed. NULL: all have `material`.
+    /// Material number of each triangle, packed. May be NULL: all have `material`. Default: NULL.
     pub triangle_materials: *const u32,
-    /// Material number of all triangles if triangle_materials is NULL. Default: 0.
+    /// Material number of all triangles if `triangle_materials` is NULL. Default: 0.
     pub material: u32,
 }
 
@@ -188,7 +214,9 @@ sized_struct!(bk_mesh_desc, defaults: bk_mesh_desc {
     material: 0,
 });
 
-/// Fills in the defaults.
+/// Sets `struct_size` and fills in the defaults.
+///
+/// @param desc  structure to fill in; NULL is ignored
 #[unsafe(no_mangle)]
 pub unsafe extern "C" fn bk_mesh_desc_init(desc: *mut bk_mesh_desc) {
     // SAFETY: the caller's structure, or NULL.
@@ -197,11 +225,13 @@ pub unsafe extern "C" fn bk_mesh_desc_init(desc: *mut bk_mesh_desc) {
 
 /// Adds a mesh. The materials that it names must have been added before.
 ///
-/// out_id: receives its number, as hits report it; NULL if not wanted. Numbers count up from 0 in
-/// the order of addition.
-///
-/// Fails with BK_ERROR_INVALID_ARGUMENT, naming triangle and vertex, if an index or a material is
-/// out of range or BK_MESH_STRICT finds something.
+/// @param scene  scene that is not committed
+/// @param desc  the arrays are copied
+/// @param out_id  receives the number of the mesh, as hits report it; may be NULL
+/// @retval BK_ERROR_INVALID_ARGUMENT  an index or a material is out of range, or the mesh is not
+///   what BK_MESH_STRICT demands; bk_last_error names triangle and vertex
+/// @retval BK_ERROR_INVALID_STATE  the scene is committed or another thread is changing it
+/// @retval BK_ERROR_OUT_OF_MEMORY  the copy does not fit or the memory callback refuses
 #[unsafe(no_mangle)]
 pub unsafe extern "C" fn bk_scene_add_mesh(
     scene: *mut bk_scene,
@@ -266,17 +296,22 @@ unsafe fn read_mesh(d: &bk_mesh_desc) -> Result<Mesh> {
     }
 }
 
-/// Sets new positions for all vertices of a mesh of a committed scene, to be put in force by
-/// bk_scene_refit; until then nothing changes. What was set for the mesh since the last refit is
-/// replaced.
+/// Sets new positions for all vertices of a mesh of a committed scene. Nothing changes before
+/// bk_scene_refit, which applies the last positions that were set for each mesh.
 ///
-/// mesh: number of the mesh. positions: vertex_count positions of three floats, copied. vertex_count:
-/// as when the mesh was added. stride: bytes from one position to the next, at least 12; 0: packed.
-/// Shading normals, texture and light map coordinates stay as they were given.
+/// Shading normals, texture coordinates and light map coordinates stay as they are. Positions that
+/// are not finite are accepted, and their triangles are not hit after the refit, unless the mesh
+/// has BK_MESH_STRICT.
 ///
-/// Positions that are not finite are taken, and their triangles are not hit after the refit, unless the
-/// mesh has BK_MESH_STRICT. Fails with BK_ERROR_INVALID_STATE if the scene is not committed or another
-/// thread is changing it.
+/// @param scene  committed scene
+/// @param mesh  number of the mesh
+/// @param positions  `vertex_count` positions of three floats in scene units; copied
+/// @param vertex_count  number of vertices, as when the mesh was added
+/// @param stride  distance between positions in bytes, at least 12; 0: packed
+/// @retval BK_ERROR_INVALID_ARGUMENT  there is no such mesh, `vertex_count` or `stride` is wrong,
+///   or the mesh is not what BK_MESH_STRICT demands
+/// @retval BK_ERROR_INVALID_STATE  the scene is not committed or another thread is changing it
+/// @retval BK_ERROR_OUT_OF_MEMORY  the copy does not fit
 #[unsafe(no_mangle)]
 pub unsafe extern "C" fn bk_mesh_set_positions(
     scene: *mut bk_scene,
@@ -304,21 +339,24 @@ pub unsafe extern "C" fn bk_mesh_set_positions(
     })
 }
 
-/// The number of meshes, committed or not; 0 on failure.
+/// Returns the number of meshes of a scene, committed or not.
+///
+/// @param scene  any scene
+/// @return  number of meshes; 0 on failure
 #[unsafe(no_mangle)]
 pub unsafe extern "C" fn bk_scene_mesh_count(scene: *const bk_scene) -> u32 {
     call_or(0, || object!(scene).count(|d| d.meshes().len(), |s| s.meshes().len()))
 }
 
-/// The triangles of a mesh.
+/// Pointers to the data of a mesh.
 #[repr(C)]
 #[derive(Clone, Copy)]
 pub struct bk_mesh_view {
     /// Size of this structure in bytes, set by bk_mesh_view_init.
     pub struct_size: u32,
-    /// Material number of all triangles if triangle_materials is NULL, else BK_NONE.
+    /// Material number of all triangles if `triangle_materials` is NULL, else BK_NONE.
     pub material: u32,
-    /// vertex_count positions of three floats, packed.
+    /// `vertex_count` positions of three floats, packed, in scene units.
     pub positions: *const f32,
     /// Number of vertices.
     pub vertex_count: usize,
@@ -326,15 +364,18 @@ pub struct bk_mesh_view {
     pub indices: *const u32,
     /// Number of triangles, degenerate ones included.
     pub triangle_count: usize,
-    /// vertex_count shading normals of three floats, packed; NULL if the mesh has none.
+    /// `vertex_count` shading normals of three floats, packed, unit vectors as they were given;
+    /// NULL if the mesh has none.
     pub normals: *const f32,
-    /// vertex_count texture coordinates of two floats, packed; NULL if the mesh has none.
+    /// `vertex_count` texture coordinates of two floats, packed, 1 per width or height of an image;
+    /// NULL if the mesh has none.
     pub uvs: *const f32,
-    /// vertex_count light map coordinates of two floats, packed, as the caller gave them; NULL if the mesh has none.
+    /// `vertex_count` light map coordinates of two floats in [0, 1], packed, as they were given;
+    /// NULL if the mesh has none.
     pub lightmap_uvs: *const f32,
-    /// Light map page per triangle, packed, as the caller gave them; NULL if all are on page 0.
+    /// Light map page of each triangle, packed, as it was given; NULL if all are on page 0.
     pub lightmap_page: *const u32,
-    /// Material number per triangle, packed; NULL if all have `material`.
+    /// Material number of each triangle, packed; NULL if all have `material`.
     pub triangle_materials: *const u32,
 }
 
@@ -352,16 +393,23 @@ sized_struct!(bk_mesh_view, defaults: bk_mesh_view {
     triangle_materials: std::ptr::null(),
 });
 
-/// Sets struct_size and clears the rest.
+/// Sets `struct_size` and clears the other fields.
+///
+/// @param view  structure to fill in; NULL is ignored
 #[unsafe(no_mangle)]
 pub unsafe extern "C" fn bk_mesh_view_init(view: *mut bk_mesh_view) {
     // SAFETY: the caller's structure, or NULL.
     unsafe { init(view) }
 }
 
-/// Shows the triangles of a mesh of a committed scene, without a copy.
+/// Gets pointers to triangles and vertices of a mesh of a committed scene, without a copy.
 ///
-/// out: receives pointers that are valid while the scene lives, until the next bk_scene_refit.
+/// @param scene  committed scene
+/// @param mesh  number of the mesh
+/// @param out  receives pointers that are valid while the scene lives, until the next
+///   bk_scene_refit
+/// @retval BK_ERROR_INVALID_ARGUMENT  there is no such mesh
+/// @retval BK_ERROR_INVALID_STATE  the scene is not committed or is being refitted
 #[unsafe(no_mangle)]
 pub unsafe extern "C" fn bk_scene_get_mesh(scene: *const bk_scene, mesh: u32, out: *mut bk_mesh_view) -> bk_result {
     call(|| {

@@ -1,10 +1,18 @@
 //! Rays
 //!
-//! All functions take a committed scene and are safe from any threads. A closest hit is the one with
-//! the least t in tmin < t <= tmax; among equal t the triangle that was added first, whichever
-//! function is asked. Directions need not be normalised; t is in units of the direction's length.
-//! Both sides of a triangle are hit. A ray with a NaN, an origin beyond 1e18 or a zero direction hits
-//! nothing.
+//! All functions take a committed scene. A closest hit is the one with the least t in tmin < t <=
+//! tmax; among hits of equal t the triangle that was added first, whichever function is called.
+//! Both sides of a triangle are hit. A ray with a NaN, an origin beyond a magnitude of 1e18 or a
+//! zero direction hits nothing.
+//!
+//! Units: origins are in scene units. Directions need not have length 1; t, tmin and tmax are in
+//! multiples of the direction's length.
+//!
+//! Thread safety: any thread, all functions at the same time; during bk_scene_refit they fail with
+//! BK_ERROR_INVALID_STATE.
+//!
+//! Cost: grows with the logarithm of the number of triangles; the calling thread does the work
+//! unless BK_RAYS_PARALLEL is set. Nothing is allocated.
 
 use super::args::{check_flags, read_vec3, slice, slice_mut};
 use super::device::refuse_in_callback;
@@ -19,31 +27,35 @@ use bytemuck::{Pod, Zeroable, cast_slice, cast_slice_mut};
 /// Flag: spread the rays over the device's threads. Without it the calling thread does the work.
 pub const BK_RAYS_PARALLEL: u32 = 1;
 
-/// The points origin + t direction with tmin < t <= tmax.
+/// A ray: the points origin + t direction with tmin < t <= tmax.
 #[repr(C)]
 #[derive(Clone, Copy, Debug, Pod, Zeroable)]
 pub struct bk_ray {
+    /// Origin, in scene units.
     pub origin: [f32; 3],
+    /// Lower limit of t, exclusive, in multiples of the direction's length.
     pub tmin: f32,
+    /// Direction, a vector of any length but 0, in scene units.
     pub direction: [f32; 3],
+    /// Upper limit of t, inclusive, in multiples of the direction's length; may be infinite.
     pub tmax: f32,
 }
 
-/// What a ray hits. A miss has t = +infinity, u = v = 0, and BK_NONE in the rest.
+/// A hit. A miss has t = +infinity, u = v = 0, and BK_NONE in the other fields.
 #[repr(C)]
 #[derive(Clone, Copy, Debug, Pod, Zeroable)]
 pub struct bk_hit {
-    /// Distance in units of the direction's length.
+    /// Distance in multiples of the direction's length.
     pub t: f32,
-    /// Barycentric weight of the triangle's vertex 1.
+    /// Barycentric weight of the triangle's vertex 1, a fraction in [0, 1].
     pub u: f32,
-    /// Barycentric weight of the triangle's vertex 2.
+    /// Barycentric weight of the triangle's vertex 2, a fraction in [0, 1].
     pub v: f32,
     /// Number of the triangle in its mesh.
     pub triangle: u32,
     /// Number of the mesh.
     pub mesh: u32,
-    /// Not used yet: BK_NONE.
+    /// Number of the instance: always BK_NONE, as scenes have no instances yet.
     pub instance: u32,
 }
 
@@ -52,8 +64,12 @@ const _: () = assert!(size_of::<bk_hit>() == 24 && size_of::<bk_hit>() == size_o
 
 const MISS: bk_hit = bk_hit { t: f32::INFINITY, u: 0.0, v: 0.0, triangle: BK_NONE, mesh: BK_NONE, instance: BK_NONE };
 
-/// The closest hit of one ray. On failure (a scene that is NULL or not committed, a NULL ray) out
-/// receives a miss, and bk_last_error the reason.
+/// Finds the closest hit of one ray.
+///
+/// @param scene  committed scene
+/// @param ray  the ray
+/// @param out  receives the hit; on failure (a scene that is not committed, a NULL pointer) a miss,
+///   and bk_last_error has the reason
 #[unsafe(no_mangle)]
 pub unsafe extern "C" fn bk_intersect(scene: *const bk_scene, ray: *const bk_ray, out: *mut bk_hit) {
     // SAFETY: ray and out are the caller's, or NULL.
@@ -71,7 +87,11 @@ pub unsafe extern "C" fn bk_intersect(scene: *const bk_scene, ray: *const bk_ray
     }
 }
 
-/// Whether anything lies on the ray: 1 or 0. On failure 0, and bk_last_error has the reason.
+/// Returns whether anything lies on a ray.
+///
+/// @param scene  committed scene
+/// @param ray  the ray
+/// @return  1 or 0; 0 on failure, and bk_last_error has the reason
 #[unsafe(no_mangle)]
 pub unsafe extern "C" fn bk_occluded(scene: *const bk_scene, ray: *const bk_ray) -> i32 {
     // SAFETY: ray is the caller's, or NULL.
@@ -82,12 +102,18 @@ pub unsafe extern "C" fn bk_occluded(scene: *const bk_scene, ray: *const bk_ray)
     })
 }
 
-/// The closest hits of many rays. Fastest where consecutive rays share origin, tmin and tmax and go
-/// nearly the same way, as those of a pinhole camera do in small square tiles of pixels; the hits are
-/// the same, bit for bit, in any order of rays.
+/// Finds the closest hits of many rays.
 ///
-/// rays: count rays, aligned to 4 bytes. flags: 0 or BK_RAYS_PARALLEL. out: receives
-/// count hits in the order of the rays; must not overlap them.
+/// The call is fastest where consecutive rays share `origin`, `tmin` and `tmax` and have nearly the
+/// same direction, like those of a pinhole camera in small square tiles of pixels. The hits are the
+/// same, bit for bit, in any order of rays.
+///
+/// @param scene  committed scene
+/// @param rays  `count` rays, aligned to 4 bytes; may be NULL if `count` is 0
+/// @param count  number of rays
+/// @param flags  0 or BK_RAYS_PARALLEL
+/// @param out  receives `count` hits in the order of the rays; must not overlap `rays`
+/// @retval BK_ERROR_INVALID_STATE  the scene is not committed or is being refitted
 #[unsafe(no_mangle)]
 pub unsafe extern "C" fn bk_intersect_many(
     scene: *const bk_scene,
@@ -106,10 +132,14 @@ pub unsafe extern "C" fn bk_intersect_many(
     })
 }
 
-/// Whether anything lies on each of many rays.
+/// Finds out for many rays whether anything lies on them.
 ///
-/// rays: count rays, aligned to 4 bytes. flags: 0 or BK_RAYS_PARALLEL. out: receives
-/// count bytes, 1 or 0, in the order of the rays; must not overlap them.
+/// @param scene  committed scene
+/// @param rays  `count` rays, aligned to 4 bytes; may be NULL if `count` is 0
+/// @param count  number of rays
+/// @param flags  0 or BK_RAYS_PARALLEL
+/// @param out  receives `count` bytes, 1 or 0, in the order of the rays; must not overlap `rays`
+/// @retval BK_ERROR_INVALID_STATE  the scene is not committed or is being refitted
 #[unsafe(no_mangle)]
 pub unsafe extern "C" fn bk_occluded_many(
     scene: *const bk_scene,
@@ -129,11 +159,20 @@ pub unsafe extern "C" fn bk_occluded_many(
 }
 
 /// cbindgen:ptrs-as-arrays=[[origin; 3]]
-/// The closest hits of rays that share an origin, with 0 < t <= tmax: those of bk_intersect_many.
-/// Faster than as many single rays; use 32 directions and more.
+/// Finds the closest hits, with 0 < t <= tmax, of rays that share an origin.
 ///
-/// directions: count directions of three floats, packed, aligned to 4 bytes. flags:
-/// BK_RAYS_PARALLEL. out: receives count hits in the order of the directions; must not overlap them.
+/// The hits are those of bk_intersect_many. The call is faster than as many single rays from 32
+/// directions on.
+///
+/// @param scene  committed scene
+/// @param origin  origin of all rays, in scene units
+/// @param directions  `count` directions of three floats, packed, aligned to 4 bytes; may be NULL
+///   if `count` is 0
+/// @param count  number of directions
+/// @param tmax  upper limit of t, inclusive, in multiples of a direction's length
+/// @param flags  0 or BK_RAYS_PARALLEL
+/// @param out  receives `count` hits in the order of the directions; must not overlap `directions`
+/// @retval BK_ERROR_INVALID_STATE  the scene is not committed or is being refitted
 #[unsafe(no_mangle)]
 pub unsafe extern "C" fn bk_gather(
     scene: *const bk_scene,

@@ -1,4 +1,10 @@
 //! Reading and saving light maps
+//!
+//! Thread safety: any thread; during a bake of the light map these functions fail with
+//! BK_ERROR_INVALID_STATE.
+//!
+//! Cost: reading copies a page, in up to 0.2 s per million texels; writing files takes the time of
+//! compression and of the disk.
 
 use super::device::{bk_progress_fn, call_with_file, progress};
 use super::error::{bk_result, call};
@@ -9,48 +15,53 @@ use crate::lightmap::{Layer, LayerData, Lightmap};
 use crate::progress::Progress;
 use std::ffi::{c_char, c_void};
 
-/// Irradiance, direct and indirect, in W/m2. RGB: BK_FORMAT_RGB32F or BK_FORMAT_RGBA16F.
+/// Layer: irradiance in W/m2, direct and indirect. RGB: BK_FORMAT_RGB32F or BK_FORMAT_RGBA16F.
 pub const BK_LAYER_COMBINED: u32 = 0;
-/// Irradiance by way of other surfaces, in W/m2. RGB.
+/// Layer: irradiance in W/m2 that was reflected by other surfaces. RGB.
 pub const BK_LAYER_INDIRECT: u32 = 1;
-/// Irradiance straight from lights, in W/m2. RGB.
+/// Layer: irradiance in W/m2 that comes straight from lights. RGB.
 pub const BK_LAYER_DIRECT: u32 = 2;
-/// Outgoing radiance as gather rays see it, in W/(m2 sr). RGB.
+/// Layer: outgoing radiance in W/(m2 sr), as gather rays see it. RGB.
 pub const BK_LAYER_RADIANCE: u32 = 3;
-/// 1 for a texel that a triangle covers; 0.5 for one whose light is filled in from its neighbours, because
-/// it lies in the padding around a chart or inside a solid; 0 for an empty one. After a bake of some
-/// texels, those that are not baked yet, and the padding that repeats them, are 0 too; before the first
-/// bake covered texels are 1. BK_FORMAT_R32F.
+/// Layer: 1 for a texel that a triangle covers; 0.5 for one whose light is copied from its
+/// neighbours, because it lies in the padding around a chart or inside a solid; 0 for an empty one.
+/// After a bake of a range of texels, texels that are not baked yet and the padding that repeats
+/// them are 0 too; before the first bake covered texels are 1. BK_FORMAT_R32F.
 pub const BK_LAYER_VALIDITY: u32 = 4;
-/// Position of the texel's sample in the scene; 0 where no triangle covers the texel. RGB.
+/// Layer: position of the texel's sample in scene units; 0 where no triangle covers the texel. RGB.
 pub const BK_LAYER_POSITION: u32 = 5;
-/// Unit normal of the texel's sample, on the side whose light it holds (before a bake the front, but for
-/// backs with texels of their own); 0 where no triangle covers the texel. RGB.
+/// Layer: unit normal of the texel's sample, on the side whose light it holds (before a bake the
+/// front, but for separate texels of backs); 0 where no triangle covers the texel. RGB.
 pub const BK_LAYER_NORMAL: u32 = 6;
-/// Number of the triangle that covers the texel, counted through all meshes in their order; BK_NONE
-/// where there is none. BK_FORMAT_R32U.
+/// Layer: number of the triangle that covers the texel, counted through all meshes in their order;
+/// BK_NONE where there is none. BK_FORMAT_R32U.
 pub const BK_LAYER_TRIANGLE: u32 = 7;
 
-/// Three floats: 12 bytes per texel.
+/// Format: three floats, 12 bytes per texel.
 pub const BK_FORMAT_RGB32F: u32 = 1;
-/// Four half floats: 8 bytes per texel. Alpha is 1; values beyond 65504 are clamped to it.
+/// Format: four half floats, 8 bytes per texel. Alpha is 1; values beyond 65504 are clamped to it.
 pub const BK_FORMAT_RGBA16F: u32 = 2;
-/// One float: 4 bytes per texel.
+/// Format: one float, 4 bytes per texel.
 pub const BK_FORMAT_R32F: u32 = 3;
-/// One uint32_t: 4 bytes per texel.
+/// Format: one uint32_t, 4 bytes per texel.
 pub const BK_FORMAT_R32U: u32 = 4;
 
 /// Copies one layer of one page.
 ///
-/// layer: one of the BK_LAYER values. BK_LAYER_COMBINED, INDIRECT, DIRECT and RADIANCE hold light and need
-/// a bake; VALIDITY, POSITION, NORMAL and TRIANGLE can be read at any time but during one. In the layers
-/// of light each texel of the padding repeats the nearest covered texel. format: one of the BK_FORMAT
-/// values that suits the layer, as stated there. dst: receives height rows, row_stride bytes apart, of
-/// width texels; needs no alignment. row_stride: at least the bytes of a row of texels; 0: just that many.
+/// In the layers of light each texel of the padding repeats the nearest covered texel.
 ///
-/// Fails with BK_ERROR_INVALID_ARGUMENT if page, layer or format does not exist or row_stride is too
-/// small, BK_ERROR_INVALID_STATE if the layer holds light and there was no bake, or during a bake,
-/// BK_ERROR_OUT_OF_MEMORY if a page does not fit.
+/// @param lightmap  light map; baked, if the layer holds light
+/// @param page  number of the page
+/// @param layer  one of the BK_LAYER values; COMBINED, INDIRECT, DIRECT and RADIANCE hold light
+/// @param format  one of the BK_FORMAT values that the layer allows
+/// @param dst  receives bk_lightmap_info.height rows of bk_lightmap_info.width texels; needs no
+///   alignment
+/// @param row_stride  distance between rows in bytes, at least the bytes of a row; 0: packed
+/// @retval BK_ERROR_INVALID_ARGUMENT  page or layer does not exist, the format does not suit the
+///   layer, or `row_stride` is too small
+/// @retval BK_ERROR_INVALID_STATE  the layer holds light and there was no bake, or the light map is
+///   being baked
+/// @retval BK_ERROR_OUT_OF_MEMORY  a page does not fit
 #[unsafe(no_mangle)]
 pub unsafe extern "C" fn bk_lightmap_read(
     lightmap: *const bk_lightmap,
@@ -176,33 +187,40 @@ fn half_bits(x: f32) -> u16 {
     sign | half as u16
 }
 
-/// Float images of the light layers: PREFIXpageN-LAYER.exr, LAYER one of combined, indirect, direct,
-/// radiance.
+/// Kind of file: float images of the light layers, PREFIXpageN-LAYER.exr with LAYER one of
+/// combined, indirect, direct, radiance.
 pub const BK_FILE_EXR: u32 = 1;
-/// Tone-mapped 8-bit images of the light layers, to look at: PREFIXpageN-LAYER.png.
+/// Kind of file: tone-mapped 8-bit images of the light layers for viewing, PREFIXpageN-LAYER.png.
 pub const BK_FILE_PNG: u32 = 2;
-/// The scene with its light map, for viewers and engines: PREFIXscene.glb (glTF 2.0). The light map is read through
-/// TEXCOORD_1. Materials without a texture of their own are unlit and have the light map as baseColorTexture, so that
-/// any viewer shows the light. Others keep their texture as baseColorTexture on TEXCOORD_0 and have the light map as
-/// occlusionTexture on TEXCOORD_1: viewers with light of their own dim it by that, and importers find it there.
-/// Each page is an 8-bit sRGB image of irradiance times an exposure, bent above 0.6; the extras of the asset and of
-/// each material say which texture, the exposure and the curve. Triangles whose back has texels of its own are there
-/// twice, one-sided.
+/// Kind of file: the scene with its light map for viewers and engines, PREFIXscene.glb (glTF 2.0).
+///
+/// The light map is addressed by TEXCOORD_1. Materials without a texture are unlit and have the
+/// light map as baseColorTexture, so that any viewer shows the light. The others keep their texture
+/// as baseColorTexture on TEXCOORD_0 and have the light map as occlusionTexture on TEXCOORD_1:
+/// viewers with lights of their own dim those by it, and importers find it there. Each page is an
+/// 8-bit sRGB image of irradiance times an exposure, compressed above 0.6; the extras of the asset
+/// and of each material state texture, exposure and curve. Triangles whose backs have separate
+/// texels are written twice, one-sided.
 pub const BK_FILE_GLB: u32 = 3;
 
 /// Writes a baked light map to files.
 ///
-/// path_prefix: UTF-8, put before the file names that the BK_FILE values state, as "out/" for files
-/// in the folder out, which must exist. file_format: one of the BK_FILE values. progress, user: told how far it is,
-/// and may cancel; NULL if not wanted.
+/// Each file is written beside the old one of its name (NAME.part), flushed to disk, and renamed:
+/// whatever ends the call early, for example a full disk, a cancel or a kill, each old file is kept
+/// or replaced as a whole. After a kill NAME.part may be left over; the next save overwrites it.
 ///
-/// Each file is written beside the old one of its name (NAME.part), flushed to disk, and renamed: whatever ends the
-/// call early, a full disk, a cancel or a kill, each old file is there as a whole or replaced as a whole. After a kill
-/// NAME.part may be left; the next save writes over it.
-///
-/// Fails with BK_ERROR_IO, naming the file, if it cannot be written or another call is writing it, with
-/// BK_ERROR_INVALID_STATE before a bake or inside a callback, with BK_ERROR_CANCELLED, with BK_ERROR_OUT_OF_MEMORY,
-/// with BK_ERROR_UNSUPPORTED if the library was built without files or a GLB file would have more than 4 GiB.
+/// @param lightmap  baked light map
+/// @param path_prefix  beginning of the file names that the BK_FILE values state, for example
+///   "out/" for files in the folder out, which must exist; UTF-8
+/// @param file_format  one of the BK_FILE values
+/// @param progress,user  progress callback and its pointer; may be NULL
+/// @retval BK_ERROR_IO  a file cannot be written or another call is writing it; bk_last_error names
+///   it
+/// @retval BK_ERROR_INVALID_STATE  there was no bake, or the light map is being baked
+/// @retval BK_ERROR_UNSUPPORTED  the library was built without files, or a GLB file would have more
+///   than 4 GiB
+/// @retval BK_ERROR_OUT_OF_MEMORY  the images do not fit or the memory callback refuses
+/// @retval BK_ERROR_CANCELLED  the progress callback returned 0
 #[unsafe(no_mangle)]
 pub unsafe extern "C" fn bk_lightmap_save(
     lightmap: *const bk_lightmap,
@@ -235,15 +253,18 @@ fn save(_: &Lightmap, prefix: &str, _: u32, _: &Progress) -> Result<()> {
     Err(Error::Unsupported(format!("the library was built without files and cannot write {prefix}")))
 }
 
-/// Writes the light of all texels that have been baked so far to a file, from which bk_lightmap_load_result brings
-/// it back, in another process or on another machine.
+/// Saves the light of all texels that have been baked so far, to be loaded by
+/// bk_lightmap_load_result in another process or on another machine.
 ///
-/// path: UTF-8; the file is replaced as a whole or not at all. progress, user: the progress callback and its
-/// pointer; progress may be NULL.
+/// Experimental: another version of the library may refuse the file.
 ///
-/// Fails with BK_ERROR_INVALID_STATE before a bake, during one, or if bakes that differ in parameters or lights filled
-/// the texels; with BK_ERROR_IO, naming the file, if it cannot be written; with BK_ERROR_CANCELLED if
-/// progress says so.
+/// @param lightmap  baked light map
+/// @param path  name of the file, which is replaced as a whole or not at all; UTF-8
+/// @param progress,user  progress callback and its pointer; may be NULL
+/// @retval BK_ERROR_INVALID_STATE  there was no bake, the light map is being baked, or bakes with
+///   different parameters or lights filled the texels
+/// @retval BK_ERROR_IO  the file cannot be written; bk_last_error names it
+/// @retval BK_ERROR_CANCELLED  the progress callback returned 0
 #[unsafe(no_mangle)]
 pub unsafe extern "C" fn bk_lightmap_save_result(
     lightmap: *const bk_lightmap,
@@ -259,19 +280,28 @@ pub unsafe extern "C" fn bk_lightmap_save_result(
     }
 }
 
-/// Takes over the light of a file that bk_lightmap_save_result wrote for a light map of the same scene, lights and
-/// layout. Light of texels that the file does not have stays: so machines can bake some texels each (texel_begin
-/// and texel_end of bk_bake_params, all else equal) and one of them loads all files, in any order; the light then
-/// has the bits of one bake, and seams are stitched with the last texels.
+/// Loads light that bk_lightmap_save_result wrote for a light map of the same scene, lights and
+/// layout.
 ///
-/// path: UTF-8. progress, user: the progress callback and its pointer; progress may be NULL.
+/// Light of texels that the file does not hold stays. So several machines can bake some texels each
+/// (texel_begin and texel_end of bk_bake_params, all else equal), and one of them loads all files,
+/// in any order: the light then has the bits of one bake, and seams are stitched with the last
+/// texels. A call that fails changes nothing.
 ///
-/// Fails with BK_ERROR_INVALID_ARGUMENT if the file is of another scene, light map or version of the library, of other
-/// lights, or of another instruction set (AVX2 and AVX-512 are the same in this), and bk_last_error says which;
-/// with BK_ERROR_INVALID_STATE if the file has some texels alone and the light map holds light of a bake with other
-/// parameters, or another call is using the light map; with BK_ERROR_IO, naming the file, if it cannot be read, is
-/// damaged, or is no result; with BK_ERROR_OUT_OF_MEMORY if it does not fit; with BK_ERROR_CANCELLED if progress says
-/// so. A call that fails changes nothing.
+/// Experimental: another version of the library may refuse the file.
+///
+/// @param lightmap  any light map
+/// @param path  name of the file; UTF-8
+/// @param progress,user  progress callback and its pointer; may be NULL
+/// @retval BK_ERROR_INVALID_ARGUMENT  the file is of another scene, light map, version of the
+///   library or instruction set (AVX2 and AVX-512 count as one), or of other lights; bk_last_error
+///   says which
+/// @retval BK_ERROR_INVALID_STATE  another call is using the light map, or the file holds some
+///   texels only and the light map holds light of a bake with other parameters
+/// @retval BK_ERROR_IO  the file cannot be read, is damaged, or is another kind of file;
+///   bk_last_error names it
+/// @retval BK_ERROR_OUT_OF_MEMORY  the light does not fit
+/// @retval BK_ERROR_CANCELLED  the progress callback returned 0
 #[unsafe(no_mangle)]
 pub unsafe extern "C" fn bk_lightmap_load_result(
     lightmap: *mut bk_lightmap,

@@ -1,15 +1,20 @@
 //! Scenes
 //!
-//! A scene is described (materials, meshes, lights, files), then committed: its acceleration
-//! structure is built, and from then on it can be queried and baked but only its lights change, and
-//! its vertices by bk_mesh_set_positions and bk_scene_refit. Describing, committing and moving want
-//! one thread at a time per scene; a call that meets another one fails with BK_ERROR_INVALID_STATE.
-//! Queries on a committed scene are safe from any threads, except during bk_scene_refit: then
-//! whichever comes second fails with BK_ERROR_INVALID_STATE.
+//! A scene is first described (materials, meshes, lights, files) and then committed: the commit
+//! builds the acceleration structure. A committed scene can be queried and baked. Only its lights
+//! (bk_scene_set_light) and the positions of its vertices (bk_mesh_set_positions, bk_scene_refit)
+//! can change.
 //!
-//! Right-handed coordinates, any up axis, any unit of length (W/m2 then means per square unit),
-//! counter-clockwise front faces, linear RGB, all surfaces diffuse. Coordinates are valid up to a
-//! magnitude of 1e12.
+//! Units: coordinates are right-handed with any up axis, in any unit of length ("scene units"; W/m2
+//! then means watts per square scene unit), valid up to a magnitude of 1e12. Front faces are
+//! counter-clockwise. Colours are linear RGB. All surfaces are diffuse.
+//!
+//! Thread safety: one thread at a time may describe, commit, move or refit a scene; a second one
+//! fails with BK_ERROR_INVALID_STATE. Queries of a committed scene are safe from any thread, at any
+//! time except during bk_scene_refit: then the later call fails with BK_ERROR_INVALID_STATE.
+//!
+//! Cost: functions that are not described otherwise take less than a microsecond beside copying
+//! their input.
 
 use super::args::{OutStruct, SizedStruct, check_flags, init, read_bool, read_struct, sized_struct, text, write};
 use super::device::{bk_device, bk_progress_fn, progress, refuse_in_callback};
@@ -27,7 +32,7 @@ use std::collections::BTreeMap;
 use std::ffi::{c_char, c_void};
 use std::sync::{Arc, Mutex, OnceLock, TryLockError};
 
-/// A scene: being described, or committed.
+/// Handle of a scene, described or committed.
 pub struct bk_scene {
     device: Arc<Device>,
     /// Set once by the commit.
@@ -154,7 +159,9 @@ impl bk_scene {
 
 /// Creates an empty scene.
 ///
-/// device: kept alive by the scene. out: receives the scene, NULL on failure.
+/// @param device  kept alive by the scene
+/// @param out  receives the scene, which the caller releases with bk_scene_release; NULL on failure
+/// @retval BK_ERROR_INVALID_ARGUMENT  a pointer is NULL
 #[unsafe(no_mangle)]
 pub unsafe extern "C" fn bk_scene_create(device: *mut bk_device, out: *mut *mut bk_scene) -> bk_result {
     // SAFETY: out is the caller's, or NULL.
@@ -166,14 +173,18 @@ pub unsafe extern "C" fn bk_scene_create(device: *mut bk_device, out: *mut *mut 
     })
 }
 
-/// Counts one more reference. NULL is ignored.
+/// Adds one reference.
+///
+/// @param scene  NULL is ignored
 #[unsafe(no_mangle)]
 pub unsafe extern "C" fn bk_scene_retain(scene: *mut bk_scene) {
     // SAFETY: a handle or NULL.
     unsafe { retain(scene) }
 }
 
-/// Gives one reference back. NULL is ignored.
+/// Releases one reference.
+///
+/// @param scene  NULL is ignored
 #[unsafe(no_mangle)]
 pub unsafe extern "C" fn bk_scene_release(scene: *mut bk_scene) {
     // SAFETY: a handle whose reference the caller gives up, or NULL.
@@ -183,34 +194,34 @@ pub unsafe extern "C" fn bk_scene_release(scene: *mut bk_scene) {
     })
 }
 
-/// What a file brought.
+/// Numbers about a file that was loaded.
 #[repr(C)]
 #[derive(Clone, Copy)]
 pub struct bk_load_info {
     /// Size of this structure in bytes, set by bk_load_info_init.
     pub struct_size: u32,
-    /// Meshes added, the first with number first_mesh.
+    /// Number of meshes added.
     pub meshes: u32,
-    /// Number of the first mesh added.
+    /// Number of the first mesh added; the others follow it.
     pub first_mesh: u32,
-    /// Materials added, the first with number first_material.
+    /// Number of materials added.
     pub materials: u32,
-    /// Number of the first material added.
+    /// Number of the first material added; the others follow it.
     pub first_material: u32,
-    /// Lights added (emissive materials not counted), the first with number first_light.
+    /// Number of lights added, emissive materials not counted.
     pub lights: u32,
-    /// Number of the first light added.
+    /// Number of the first light added; the others follow it.
     pub first_light: u32,
-    /// Materials of which a reflectance was outside [0, 0.98] and was clamped to that.
+    /// Number of materials with a reflectance outside [0, 0.98], which was clamped to that range.
     pub clamped_albedos: u32,
-    /// Triangles added, degenerate ones included.
+    /// Number of triangles added, degenerate ones included.
     pub triangles: u64,
-    /// Time to read the file, in seconds.
+    /// Duration of the call in seconds.
     pub seconds: f64,
-    /// Textures added, the first with number first_texture. An image that cannot be read is told to the device's
-    /// log as a warning, and its materials do without.
+    /// Number of textures added. An image that cannot be read is left out, with a warning in the
+    /// log.
     pub textures: u32,
-    /// Number of the first texture added.
+    /// Number of the first texture added; the others follow it.
     pub first_texture: u32,
 }
 
@@ -229,18 +240,21 @@ sized_struct!(bk_load_info, defaults: bk_load_info {
     first_texture: 0,
 });
 
-/// Sets struct_size and clears the rest.
+/// Sets `struct_size` and clears the other fields.
+///
+/// @param info  structure to fill in; NULL is ignored
 #[unsafe(no_mangle)]
 pub unsafe extern "C" fn bk_load_info_init(info: *mut bk_load_info) {
     // SAFETY: the caller's structure, or NULL.
     unsafe { init(info) }
 }
 
-/// The files that a scene file names may lie in any folder. For scenes whose author is trusted: such a scene learns
-/// what files there are, and brings their texels into its light.
+/// Flag of bk_load_params: files that the scene file names may lie in any folder. Use it for scenes
+/// of trusted authors only: such a scene can find out which files exist, and can show their texels
+/// in its light.
 pub const BK_LOAD_ANY_FOLDER: u32 = 1;
 
-/// Which files a scene may consist of, and how much of them.
+/// Limits of bk_scene_load_file: which files it may read, and how much of them.
 #[repr(C)]
 #[derive(Clone, Copy)]
 pub struct bk_load_params {
@@ -248,13 +262,14 @@ pub struct bk_load_params {
     pub struct_size: u32,
     /// BK_LOAD_ANY_FOLDER or 0. Default: 0.
     pub flags: u32,
-    /// UTF-8. Files that the scene names (material libraries, images, buffers) must lie in this folder or below,
-    /// symbolic links resolved. NULL, the default: in the scene file's own folder or below. Read only inside the call.
+    /// Folder in or below which all files must lie that the scene file names (material libraries,
+    /// images, buffers), symbolic links resolved. UTF-8; NULL: the folder of the scene file.
+    /// Default: NULL.
     pub base_folder: *const c_char,
-    /// Most bytes of all decoded images together, 4 per texel. It is looked at before an image is decoded. (While one
-    /// is decoded, its own format takes up to 8 bytes per texel more.) Default: 2 GiB.
+    /// Limit in bytes for all decoded images together, 4 per texel, checked before an image is
+    /// decoded. (Decoding takes up to 8 more bytes per texel of the image.) Default: 2 GiB.
     pub max_texture_bytes: u64,
-    /// Most bytes of all files together, the scene file included. Default: 16 GiB.
+    /// Limit in bytes for all files together, the scene file included. Default: 16 GiB.
     pub max_file_bytes: u64,
 }
 
@@ -280,28 +295,38 @@ sized_struct!(bk_load_params, defaults: {
     }
 });
 
-/// Fills in the defaults.
+/// Sets `struct_size` and fills in the defaults.
+///
+/// @param params  structure to fill in; NULL is ignored
 #[unsafe(no_mangle)]
 pub unsafe extern "C" fn bk_load_params_init(params: *mut bk_load_params) {
     // SAFETY: the caller's structure, or NULL.
     unsafe { init(params) }
 }
 
-/// Adds what a scene file describes: meshes, materials (emissive ones included) with their textures (PNG and
-/// JPEG), lights.
+/// Loads a scene file and adds its meshes, materials with their textures (PNG and JPEG), and
+/// lights.
 ///
-/// path: UTF-8, ending in .obj (with its .mtl), .ply, .gltf or .glb. params: NULL for the defaults. progress, user:
-/// told how far it is, and may cancel; NULL if not wanted. out: what was added; NULL if not wanted.
+/// Only regular files are read, never devices, FIFOs or sockets. A material library or an image
+/// that cannot be read, or that lies where `params` allows none, is left out with a warning in the
+/// log; a buffer of a glTF file that cannot be read is an error. bk_scene_get_mesh,
+/// bk_scene_get_material, bk_scene_get_texture and bk_scene_get_light read back all that was
+/// loaded.
 ///
-/// Only regular files are read, never devices, FIFOs or sockets. A material library or an image that cannot be read,
-/// or that lies where params allow none, is told to the device's log as a warning, and materials do without; a buffer
-/// of a glTF file that cannot be read is an error.
+/// Cost: 0.2 (PLY) to 2 s (OBJ) per million triangles, on one thread, and the decoding of images.
 ///
-/// Fails with BK_ERROR_IO, naming the file, if it cannot be read or is malformed, with BK_ERROR_UNSUPPORTED if its
-/// kind is unknown or the library was built without files, with BK_ERROR_OUT_OF_MEMORY beyond a limit of params, if
-/// the memory callback refuses or memory runs out, with BK_ERROR_CANCELLED, with BK_ERROR_INVALID_STATE after the
-/// commit or inside a callback; the scene is as before then. Other calls that change the scene fail meanwhile with
-/// BK_ERROR_INVALID_STATE.
+/// @param scene  scene that is not committed
+/// @param path  name of a file that ends in .obj (with its .mtl), .ply, .gltf or .glb; UTF-8
+/// @param params  limits; NULL for the defaults
+/// @param progress,user  progress callback and its pointer; may be NULL
+/// @param out  receives what was added; may be NULL
+/// @retval BK_ERROR_IO  a file cannot be read or is malformed; bk_last_error names it
+/// @retval BK_ERROR_UNSUPPORTED  the kind of file is unknown, or the library was built without
+///   files
+/// @retval BK_ERROR_OUT_OF_MEMORY  a limit of `params` is exceeded, the memory callback refuses, or
+///   memory runs out
+/// @retval BK_ERROR_CANCELLED  the progress callback returned 0
+/// @retval BK_ERROR_INVALID_STATE  the scene is committed or another thread is changing it
 #[unsafe(no_mangle)]
 pub unsafe extern "C" fn bk_scene_load_file(
     scene: *mut bk_scene,
@@ -389,8 +414,16 @@ fn load_file(
     Err(Error::Unsupported(format!("the library was built without files and cannot read {path}")))
 }
 
-/// Adds a scene made by code, with its lights: "cornell" (the Cornell box), "furnace" (a closed,
-/// glowing cube) or "atrium" (a two-floor court in the sun).
+/// Adds a built-in scene with its lights.
+///
+/// Cost: less than 0.1 s.
+///
+/// @param scene  scene that is not committed
+/// @param name  "cornell" (the Cornell box), "furnace" (a closed, glowing cube) or "atrium" (a
+///   two-floor court in the sun)
+/// @retval BK_ERROR_INVALID_ARGUMENT  there is no such scene
+/// @retval BK_ERROR_INVALID_STATE  the scene is committed or another thread is changing it
+/// @retval BK_ERROR_OUT_OF_MEMORY  the memory callback refuses
 #[unsafe(no_mangle)]
 pub unsafe extern "C" fn bk_scene_load_builtin(scene: *mut bk_scene, name: *const c_char) -> bk_result {
     call(|| {
@@ -402,34 +435,35 @@ pub unsafe extern "C" fn bk_scene_load_builtin(scene: *mut bk_scene, name: *cons
     })
 }
 
-/// How to build the acceleration structure.
+/// Parameters of the acceleration structure.
 #[repr(C)]
 #[derive(Clone, Copy)]
 pub struct bk_build_params {
     /// Size of this structure in bytes, set by bk_build_params_init.
     pub struct_size: u32,
-    /// Bins per axis of the surface area heuristic, 2 to 256. Default: 64.
+    /// Number of bins per axis of the surface area heuristic, 2 to 256. Default: 64.
     pub bins: u32,
-    /// Most triangles per leaf, 1 to 8. Default: 4, as many as are tested at a time.
+    /// Maximum number of triangles per leaf, 1 to 8. Default: 4, the number that is tested at a
+    /// time.
     pub max_leaf: u32,
-    /// One of BK_BUILD_QUALITY_*. Default: BK_BUILD_QUALITY_DEFAULT.
+    /// One of the BK_BUILD_QUALITY values. Default: BK_BUILD_QUALITY_DEFAULT.
     pub quality: u32,
-    /// With BK_BUILD_QUALITY_HIGH: most references that cuts may add, in parts of the number of
-    /// triangles, 0 to 4; leaves grow by at most as much. Default: 0.25.
+    /// With BK_BUILD_QUALITY_HIGH: maximum number of references that spatial splits may add, as a
+    /// fraction of the number of triangles, 0 to 4. Leaves grow by at most as much. Default: 0.25.
     pub split_budget: f32,
-    /// 1: the acceleration structure takes a fifth of the memory that it takes else, for rays that take
-    /// longer; hits are the same. (After BK_BUILD_QUALITY_HIGH, except for rays that graze an edge
-    /// within rounding.) Default: 0.
+    /// Experimental: 1 builds compact trees, which take a fifth of the memory and make rays slower;
+    /// 0 builds full ones. The hits are the same, except for rays that graze an edge within
+    /// rounding after BK_BUILD_QUALITY_HIGH. Default: 0.
     pub compact: u32,
 }
 
-/// Binned SAH.
+/// Build quality: binned surface area heuristic.
 pub const BK_BUILD_QUALITY_DEFAULT: u32 = 0;
 
-/// Binned SAH with spatial splits: triangles may be cut. The build takes several times as long and the
-/// tree up to a sixth more memory. Closest hits are found with 10 to 20 % less work where large or slanted
-/// triangles overlap others, as in most buildings; occlusion rays may take a tenth more, since large
-/// triangles are met later.
+/// Build quality: binned surface area heuristic with spatial splits, which may cut triangles. The
+/// build takes several times as long and the tree up to a sixth more memory. Closest hits take 10
+/// to 20 % less work where large or slanted triangles overlap others, as in most buildings;
+/// occlusion rays may take 10 % more, since they reach large triangles later.
 pub const BK_BUILD_QUALITY_HIGH: u32 = 1;
 
 sized_struct!(bk_build_params, defaults: {
@@ -444,14 +478,21 @@ sized_struct!(bk_build_params, defaults: {
     }
 });
 
-/// Fills in the defaults.
+/// Sets `struct_size` and fills in the defaults.
+///
+/// @param params  structure to fill in; NULL is ignored
 #[unsafe(no_mangle)]
 pub unsafe extern "C" fn bk_build_params_init(params: *mut bk_build_params) {
     // SAFETY: the caller's structure, or NULL.
     unsafe { init(params) }
 }
 
-/// Chooses how bk_scene_commit builds; without it the defaults hold.
+/// Sets the parameters with which bk_scene_commit builds the acceleration structure.
+///
+/// @param scene  scene that is not committed
+/// @param params  copied
+/// @retval BK_ERROR_INVALID_ARGUMENT  a field of `params` is out of its range
+/// @retval BK_ERROR_INVALID_STATE  the scene is committed or another thread is changing it
 #[unsafe(no_mangle)]
 pub unsafe extern "C" fn bk_scene_set_build(scene: *mut bk_scene, params: *const bk_build_params) -> bk_result {
     call(|| {
@@ -478,18 +519,24 @@ pub unsafe extern "C" fn bk_scene_set_build(scene: *mut bk_scene, params: *const
     })
 }
 
-/// Ends the description: builds the acceleration structure on the device's threads. Afterwards the
-/// scene can be queried and baked, and only bk_scene_set_light, bk_mesh_set_positions and
-/// bk_scene_refit change it.
+/// Commits a scene: ends its description and builds the acceleration structure on the device's
+/// threads.
 ///
-/// progress, user: told how far it is; NULL if not wanted.
+/// Logs a warning if triangles are skipped, or if the scene lies so far from the origin that its
+/// f32 coordinates have too few digits for its size: rays start 32 rounding steps above surfaces,
+/// which spoils light from a distance of about a thousand times the scene's size on. A commit that
+/// fails or is cancelled leaves the description as it was.
 ///
-/// Logs a warning if triangles are skipped, or if the scene lies so far from the origin that its f32
-/// coordinates have too few digits for its size: rays start 32 rounding steps above surfaces, and from
-/// about a thousand times the scene's size from the origin on that spoils light.
+/// Cost: about 0.7 s per million triangles on one thread, 1.5 to 4 times that with
+/// BK_BUILD_QUALITY_HIGH; nearly half on two threads.
 ///
-/// Fails with BK_ERROR_INVALID_STATE if the scene is committed already or holds no usable triangle.
-/// A commit that fails or is cancelled leaves the description as it was.
+/// @param scene  scene that is not committed
+/// @param progress,user  progress callback and its pointer; may be NULL
+/// @retval BK_ERROR_INVALID_STATE  the scene is committed already, has no usable triangle, or
+///   another thread is changing it
+/// @retval BK_ERROR_OUT_OF_MEMORY  the acceleration structure does not fit or the memory callback
+///   refuses
+/// @retval BK_ERROR_CANCELLED  the progress callback returned 0
 #[unsafe(no_mangle)]
 pub unsafe extern "C" fn bk_scene_commit(
     scene: *mut bk_scene,
@@ -524,24 +571,29 @@ pub unsafe extern "C" fn bk_scene_commit(
     })
 }
 
-/// Gives the meshes of a committed scene the positions set by bk_mesh_set_positions since the last
-/// refit; without any it does nothing. Queries then meet the moved triangles, and what follows from
-/// positions (geometric normals, light of emissive triangles, bounds, statistics) follows.
+/// Applies the positions that bk_mesh_set_positions has set since the last refit; does nothing if
+/// there are none.
 ///
-/// The acceleration structure keeps its shape and gets new boxes, on the device's threads, in a
-/// fraction of the time of a commit. It serves well while neighbours stay neighbours; where
-/// bk_scene_stats.wide_sah_cost has grown much since the commit, rays are slower,
-/// and a new scene would be better. After BK_BUILD_QUALITY_HIGH the first refit loses more than the
-/// cuts had gained, however little moved: scenes to be refitted want BK_BUILD_QUALITY_DEFAULT.
+/// Queries then hit the moved triangles; geometric normals, light of emissive triangles, bounds and
+/// statistics follow. The acceleration structure keeps its shape and gets new boxes. It serves well
+/// while neighbours stay neighbours; where bk_scene_stats.wide_sah_cost has grown much since the
+/// commit, rays are slower and a new scene is better. After BK_BUILD_QUALITY_HIGH the first refit
+/// loses more than the cuts had gained, however little moved: use BK_BUILD_QUALITY_DEFAULT for
+/// scenes that are refitted.
 ///
 /// Triangles that become degenerate or not finite are not hit while they are; those that were so at
-/// the commit stay out for good. Light maps, photon maps and live objects that were made before keep
-/// the geometry that they were made of (the scene is copied then, else changed in place) and go on
-/// following the scene's lights. Pointers from bk_scene_get_mesh become invalid.
+/// the commit are never hit. Light maps, photon maps and live objects that were made before keep
+/// the old geometry (the scene is copied if there are any, else changed in place) and still follow
+/// the scene's lights. Pointers from bk_scene_get_mesh become invalid.
 ///
-/// Fails with BK_ERROR_INVALID_STATE if the scene is not committed, if no triangle would be left that
-/// can be hit, or if another thread queries or changes the scene; with BK_ERROR_OUT_OF_MEMORY if the
-/// copy is refused. The scene is as before then, and the positions wait for the next refit.
+/// Cost: a tenth to a fifth of the time of a commit, on the device's threads; if there is a copy,
+/// more.
+///
+/// @param scene  committed scene
+/// @retval BK_ERROR_INVALID_STATE  the scene is not committed, no triangle would be left that can
+///   be hit, or another thread queries or changes the scene; the positions wait for the next refit
+/// @retval BK_ERROR_OUT_OF_MEMORY  the memory callback refuses the copy; the positions wait for the
+///   next refit
 #[unsafe(no_mangle)]
 pub unsafe extern "C" fn bk_scene_refit(scene: *mut bk_scene) -> bk_result {
     call(|| {
@@ -568,27 +620,29 @@ pub unsafe extern "C" fn bk_scene_refit(scene: *mut bk_scene) -> bk_result {
 pub struct bk_scene_stats {
     /// Size of this structure in bytes, set by bk_scene_stats_init.
     pub struct_size: u32,
-    /// Surface area heuristic cost of the binary tree, traversal and intersection costing 1 each, at
-    /// the commit.
+    /// Surface area heuristic cost of the binary tree after the commit, a relative number: 1 per
+    /// traversal step and per intersection.
     pub sah_cost: f32,
-    /// Triangles in all meshes.
+    /// Number of triangles in all meshes.
     pub triangles: u64,
-    /// Of those, degenerate or not finite at the commit, or since bk_scene_refit.
+    /// Number of triangles that are degenerate or not finite, at the commit or since
+    /// bk_scene_refit, and are not hit.
     pub skipped_degenerate: u64,
-    /// 8-wide nodes of the acceleration structure.
+    /// Number of 8-wide nodes of the acceleration structure.
     pub nodes: u64,
-    /// Bytes of the acceleration structure.
+    /// Size of the acceleration structure in bytes.
     pub bvh_bytes: u64,
-    /// Bytes of the whole committed scene.
+    /// Size of the whole committed scene in bytes.
     pub bytes: u64,
-    /// Time of the build, in seconds.
+    /// Duration of the build in seconds.
     pub build_seconds: f64,
-    /// Surface area heuristic cost of the 8-wide tree as it is now, 1 for each node and each triangle
-    /// that a ray is expected to meet. Compare it with its value after the commit.
+    /// Surface area heuristic cost of the 8-wide tree in its present shape, a relative number: 1
+    /// for each node and each triangle that a random ray is expected to visit. Compare it with its
+    /// value after the commit.
     pub wide_sah_cost: f32,
-    /// Times that bk_scene_refit moved something.
+    /// Number of calls of bk_scene_refit that moved something.
     pub refits: u32,
-    /// Time of the last of these, in seconds; 0 if there was none.
+    /// Duration of the last of these calls in seconds; 0 if there was none.
     pub refit_seconds: f64,
 }
 
@@ -610,14 +664,20 @@ fn stats(s: &crate::scene::SceneStats) -> bk_scene_stats {
     }
 }
 
-/// Sets struct_size and clears the rest.
+/// Sets `struct_size` and clears the other fields.
+///
+/// @param stats  structure to fill in; NULL is ignored
 #[unsafe(no_mangle)]
 pub unsafe extern "C" fn bk_scene_stats_init(stats: *mut bk_scene_stats) {
     // SAFETY: the caller's structure, or NULL.
     unsafe { init(stats) }
 }
 
-/// Numbers about a committed scene.
+/// Gets numbers about a committed scene.
+///
+/// @param scene  committed scene
+/// @param out  receives the numbers
+/// @retval BK_ERROR_INVALID_STATE  the scene is not committed or is being refitted
 #[unsafe(no_mangle)]
 pub unsafe extern "C" fn bk_scene_get_stats(scene: *const bk_scene, out: *mut bk_scene_stats) -> bk_result {
     call(|| {
@@ -630,7 +690,12 @@ pub unsafe extern "C" fn bk_scene_get_stats(scene: *const bk_scene, out: *mut bk
 }
 
 /// cbindgen:ptrs-as-arrays=[[lower; 3], [upper; 3]]
-/// The bounding box of all valid triangles of a committed scene.
+/// Gets the bounding box of all valid triangles of a committed scene.
+///
+/// @param scene  committed scene
+/// @param lower  receives the smallest x, y and z, in scene units
+/// @param upper  receives the largest x, y and z, in scene units
+/// @retval BK_ERROR_INVALID_STATE  the scene is not committed or is being refitted
 #[unsafe(no_mangle)]
 pub unsafe extern "C" fn bk_scene_bounds(scene: *const bk_scene, lower: *mut f32, upper: *mut f32) -> bk_result {
     call(|| {

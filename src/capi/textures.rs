@@ -1,15 +1,20 @@
 //! Textures
 //!
-//! Images that a scene uses. Added before its commit, and before what names them.
+//! Textures colour surfaces and cut parts of them out by alpha. Meshes place them by
+//! bk_mesh_desc.uvs; they repeat beyond [0, 1] and are interpolated between the centres of texels.
 //!
-//! Textures colour surfaces and cut holes into them. They are addressed by the first texture coordinates of
-//! meshes (bk_mesh_desc.uvs), repeat beyond [0, 1], and are interpolated between the centres of texels.
+//! Environments are images of the sky: all directions by longitude and latitude. Row 0 is at the
+//! zenith, the last row at the nadir; the middle of a row is the sky's front, and texels follow one
+//! another to the right as seen from inside. Each texel is an area of uniform radiance, without
+//! interpolation.
 //!
-//! Environments are the images of skies: the whole sphere of directions by longitude and latitude. Row 0 is at
-//! the zenith, the last row at the nadir; the middle of a row is the sky's front, and texels follow one another
-//! to the right as seen from inside. Each texel is an area of uniform radiance, without interpolation.
+//! Textures and environments are added to a scene before its commit, and before the materials and
+//! lights that name them. A scene without images spends neither memory nor time on them.
 //!
-//! A scene without images spends neither memory nor time on them.
+//! Thread safety: as for scenes; the functions that read are safe from any thread, but before the
+//! commit fail with BK_ERROR_INVALID_STATE while another thread is changing the scene.
+//!
+//! Cost: adding copies the texels; reading copies nothing and takes less than a microsecond.
 
 use super::args::{OutStruct, SizedStruct, init, read_struct, sized_struct, write_optional};
 use super::error::{bk_result, call, call_or};
@@ -21,26 +26,28 @@ use bytemuck::Pod;
 use std::ffi::c_void;
 use std::sync::Arc;
 
-/// Format: four bytes per texel, sRGB red, green and blue and linear alpha (255: opaque).
+/// Format of textures: four bytes per texel, sRGB red, green and blue and linear alpha (255:
+/// opaque).
 pub const BK_TEXTURE_RGBA8_SRGB: u32 = 0;
-/// Format: three floats per texel, linear red, green and blue, finite and >= 0.
+/// Format of environments: three floats per texel, linear red, green and blue, finite and >= 0.
 pub const BK_TEXTURE_RGB32F: u32 = 1;
 
-/// An image. The texels are copied.
+/// An image.
 #[repr(C)]
 #[derive(Clone, Copy)]
 pub struct bk_texture_desc {
     /// Size of this structure in bytes, set by bk_texture_desc_init.
     pub struct_size: u32,
-    /// One of BK_TEXTURE. Default: BK_TEXTURE_RGBA8_SRGB.
+    /// One of the BK_TEXTURE values. Default: BK_TEXTURE_RGBA8_SRGB.
     pub format: u32,
-    /// Texels along u, 1 to 16384.
+    /// Number of texels along u, 1 to 16384. Default: 0, to be set.
     pub width: u32,
-    /// Texels along v, 1 to 16384.
+    /// Number of texels along v, 1 to 16384. Default: 0, to be set.
     pub height: u32,
-    /// height rows of width texels. Row 0 lies at v = 0 and the first texel of a row at u = 0, as in glTF.
+    /// `height` rows of `width` texels, without alignment. Row 0 lies at v = 0 and the first texel
+    /// of a row at u = 0, as in glTF. Default: NULL, to be set.
     pub data: *const c_void,
-    /// Bytes from one row to the next, at least those of a row; 0: packed.
+    /// Distance between rows in bytes, at least the bytes of a row; 0: packed. Default: 0.
     pub row_stride: usize,
 }
 
@@ -53,7 +60,9 @@ sized_struct!(bk_texture_desc, defaults: bk_texture_desc {
     row_stride: 0,
 });
 
-/// Fills in the defaults.
+/// Sets `struct_size` and fills in the defaults.
+///
+/// @param desc  structure to fill in; NULL is ignored
 #[unsafe(no_mangle)]
 pub unsafe extern "C" fn bk_texture_desc_init(desc: *mut bk_texture_desc) {
     // SAFETY: the caller's structure, or NULL.
@@ -62,11 +71,13 @@ pub unsafe extern "C" fn bk_texture_desc_init(desc: *mut bk_texture_desc) {
 
 /// Adds a texture.
 ///
-/// out_id: receives its number, for materials; NULL if not wanted. Numbers count up from 0 in the order of
-/// addition.
-///
-/// Fails with BK_ERROR_INVALID_ARGUMENT if a size or the stride is out of range, the format is unknown or data
-/// is NULL, with BK_ERROR_OUT_OF_MEMORY if there is no memory for a copy.
+/// @param scene  scene that is not committed
+/// @param desc  image of format BK_TEXTURE_RGBA8_SRGB; the texels are copied
+/// @param out_id  receives the number of the texture, for materials; may be NULL
+/// @retval BK_ERROR_INVALID_ARGUMENT  a size or the stride is out of range, the format is another,
+///   or `data` is NULL
+/// @retval BK_ERROR_INVALID_STATE  the scene is committed or another thread is changing it
+/// @retval BK_ERROR_OUT_OF_MEMORY  the copy does not fit or the memory callback refuses
 #[unsafe(no_mangle)]
 pub unsafe extern "C" fn bk_scene_add_texture(
     scene: *mut bk_scene,
@@ -95,15 +106,18 @@ unsafe fn read_texture(d: &bk_texture_desc) -> Result<Texture> {
     Ok(Texture { width: d.width, height: d.height, rgba8 })
 }
 
-/// Adds an environment, for lights of type BK_LIGHT_SKY. Its format must be BK_TEXTURE_RGB32F. It takes 16
-/// bytes per texel.
+/// Adds an environment, for lights of type BK_LIGHT_SKY.
 ///
-/// out_id: receives its number; NULL if not wanted. Numbers count up from 0 in the order of addition, apart
-/// from those of other images.
+/// Cost: 16 bytes of memory per texel, and time in proportion.
 ///
-/// Fails with BK_ERROR_INVALID_ARGUMENT if a size or the stride is out of range, the format is another, data
-/// is NULL or a texel is not finite or less than 0; with BK_ERROR_OUT_OF_MEMORY if there is no memory for a
-/// copy; with BK_ERROR_INVALID_STATE after the commit.
+/// @param scene  scene that is not committed
+/// @param desc  image of format BK_TEXTURE_RGB32F; the texels are copied
+/// @param out_id  receives the number of the environment, for lights; may be NULL. Environments are
+///   numbered apart from textures
+/// @retval BK_ERROR_INVALID_ARGUMENT  a size or the stride is out of range, the format is another,
+///   `data` is NULL, or a texel is not finite or negative
+/// @retval BK_ERROR_INVALID_STATE  the scene is committed or another thread is changing it
+/// @retval BK_ERROR_OUT_OF_MEMORY  the copy does not fit or the memory callback refuses
 #[unsafe(no_mangle)]
 pub unsafe extern "C" fn bk_scene_add_environment(
     scene: *mut bk_scene,
@@ -135,13 +149,23 @@ unsafe fn read_environment(d: &bk_texture_desc) -> Result<Environment> {
     Environment::new(d.width, d.height, unsafe { texels(d, MAX_ENVIRONMENT_SIZE, "the environment")? })
 }
 
-/// The number of textures, committed or not; 0 on failure.
+/// Returns the number of textures of a scene, committed or not.
+///
+/// @param scene  any scene
+/// @return  number of textures; 0 on failure
 #[unsafe(no_mangle)]
 pub unsafe extern "C" fn bk_scene_texture_count(scene: *const bk_scene) -> u32 {
     call_or(0, || object!(scene).count(|d| d.textures().len(), |s| s.textures().len()))
 }
 
-/// Shows a texture, without a copy.
+/// Gets a texture of a scene, committed or not, without a copy.
+///
+/// @param scene  any scene
+/// @param id  number of the texture
+/// @param out  receives size, format and a pointer to packed texels, which stays valid while the
+///   scene lives
+/// @retval BK_ERROR_INVALID_ARGUMENT  there is no such texture
+/// @retval BK_ERROR_INVALID_STATE  another thread is changing the scene
 #[unsafe(no_mangle)]
 pub unsafe extern "C" fn bk_scene_get_texture(scene: *const bk_scene, id: u32, out: *mut bk_texture_desc) -> bk_result {
     call(|| {
@@ -162,13 +186,23 @@ pub unsafe extern "C" fn bk_scene_get_texture(scene: *const bk_scene, id: u32, o
     })
 }
 
-/// The number of environments, committed or not; 0 on failure.
+/// Returns the number of environments of a scene, committed or not.
+///
+/// @param scene  any scene
+/// @return  number of environments; 0 on failure
 #[unsafe(no_mangle)]
 pub unsafe extern "C" fn bk_scene_environment_count(scene: *const bk_scene) -> u32 {
     call_or(0, || object!(scene).count(|d| d.environments().len(), |s| s.environments().len()))
 }
 
-/// Shows an environment, without a copy.
+/// Gets an environment of a scene, committed or not, without a copy.
+///
+/// @param scene  any scene
+/// @param id  number of the environment
+/// @param out  receives size, format and a pointer to packed texels, which stays valid while the
+///   scene lives
+/// @retval BK_ERROR_INVALID_ARGUMENT  there is no such environment
+/// @retval BK_ERROR_INVALID_STATE  another thread is changing the scene
 #[unsafe(no_mangle)]
 pub unsafe extern "C" fn bk_scene_get_environment(
     scene: *const bk_scene,
