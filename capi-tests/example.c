@@ -22,8 +22,8 @@ int main(int argc, char **argv)
     int failed = argc != 2 || bk_device_create(NULL, &device) || bk_scene_create(device, &scene) ||
         bk_scene_load_file(scene, argv[1], NULL, progress, NULL, NULL) || bk_scene_add_light(scene, &sun, NULL) ||
         bk_scene_commit(scene, progress, NULL) || bk_lightmap_create(scene, NULL, progress, NULL, &map) ||
-        bk_bake(map, NULL, progress, NULL, NULL) || bk_lightmap_save(map, "baked", BK_FILE_EXR, NULL, NULL) ||
-        bk_lightmap_save(map, "baked", BK_FILE_GLB, NULL, NULL);
+        bk_bake(map, NULL, progress, NULL, NULL) || bk_lightmap_save(map, "baked-", BK_FILE_EXR, NULL, NULL) ||
+        bk_lightmap_save(map, "baked-", BK_FILE_GLB, NULL, NULL);
     fprintf(stderr, "\n%s\n", argc != 2 ? "usage: example SCENE" : failed ? bk_last_error() : "done");
     bk_lightmap_release(map);
     bk_scene_release(scene);
