@@ -170,6 +170,57 @@ fn links_between_documents_lead_to_files_and_headings() {
     assert!(wrong.is_empty(), "{wrong:#?}");
 }
 
+/// Paths of the repository in code of a text.
+fn paths(text: &str) -> impl Iterator<Item = &str> {
+    let code = text.split('`').skip(1).step_by(2);
+    code.filter(|c| {
+        ["src/", "capi-tests/", "benches/", "fuzz/", "cmake/", "include/", "docs/"].iter().any(|f| c.starts_with(f))
+    })
+    .filter(|c| c.chars().all(|c| c.is_alphanumeric() || "/._-".contains(c)))
+}
+
+#[test]
+fn files_that_documents_name_are_there() {
+    let mut wrong = Vec::new();
+    let mut count = 0;
+    for document in documents() {
+        let text = read(&document);
+        // Without fenced blocks, whose marks would be taken for code.
+        let mut fenced = false;
+        let prose = text.lines().filter(|line| {
+            let mark = line.starts_with("```");
+            fenced ^= mark;
+            !fenced && !mark
+        });
+        for path in paths(&prose.collect::<Vec<_>>().join("\n")) {
+            count += 1;
+            if !root().join(path).exists() {
+                wrong.push(format!("{}: {path}", document.display()));
+            }
+        }
+    }
+    assert!(count > 100, "only {count} files are named");
+    assert!(wrong.is_empty(), "{wrong:#?}");
+}
+
+/// The last section of docs/architecture.md: rows of a question, a path, and words that the file there has.
+#[test]
+fn one_guess_at_a_path_answers_each_question_of_a_fresh_reader() {
+    let text = read(Path::new("docs/architecture.md"));
+    let (_, section) = text.split_once("## A fresh reader's test").unwrap();
+    let rows: Vec<Vec<&str>> = section
+        .lines()
+        .filter(|l| l.starts_with("| ") && l.contains("`src/"))
+        .map(|l| l.split('|').map(str::trim).collect())
+        .collect();
+    assert!(rows.len() >= 10, "there are {} questions", rows.len());
+    for row in rows {
+        let (question, path, words) = (row[1], row[2].trim_matches('`'), row[3].trim_matches('`'));
+        let file = std::fs::read_to_string(root().join(path)).unwrap_or_else(|e| panic!("{question} {path}: {e}"));
+        assert!(file.contains(words), "{question} {path} does not have \"{words}\"");
+    }
+}
+
 #[test]
 fn the_readme_fits_a_few_screens() {
     let bytes = read(Path::new("README.md")).len();
