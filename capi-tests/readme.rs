@@ -170,6 +170,38 @@ fn links_between_documents_lead_to_files_and_headings() {
     assert!(wrong.is_empty(), "{wrong:#?}");
 }
 
+/// The Rust files below a folder.
+fn sources(folder: &Path, found: &mut Vec<PathBuf>) {
+    for entry in std::fs::read_dir(root().join(folder)).unwrap() {
+        let path = folder.join(entry.unwrap().file_name());
+        if root().join(&path).is_dir() {
+            sources(&path, found);
+        } else if path.extension().is_some_and(|e| e == "rs") {
+            found.push(path);
+        }
+    }
+}
+
+#[test]
+fn comments_point_to_sections_that_documents_have() {
+    let mut files = Vec::new();
+    sources(Path::new("src"), &mut files);
+    let (mut wrong, mut count) = (Vec::new(), 0);
+    for file in files {
+        for rest in read(&file).split("docs/").skip(1) {
+            let end = rest.find(|c: char| !(c.is_alphanumeric() || "._-#".contains(c))).unwrap_or(rest.len());
+            let Some((document, anchor)) = rest[..end].trim_end_matches('.').split_once('#') else { continue };
+            count += 1;
+            let document = Path::new("docs").join(document);
+            if !root().join(&document).exists() || !anchors(&read(&document)).contains(anchor) {
+                wrong.push(format!("{}: {}#{anchor}", file.display(), document.display()));
+            }
+        }
+    }
+    assert!(count >= 5, "only {count} comments point to documents");
+    assert!(wrong.is_empty(), "{wrong:#?}");
+}
+
 /// Paths of the repository in code of a text.
 fn paths(text: &str) -> impl Iterator<Item = &str> {
     let code = text.split('`').skip(1).step_by(2);

@@ -11,10 +11,7 @@
 //! through more boxes, but a triangle counts only for rays that meet the box of its leaf, and since
 //! rounding is monotonic these meet all boxes around it.
 //!
-//! (Tried for final gathering: bundles of one stratum's rays of 8 × 8 neighbouring texels, each with its own
-//! origin. In Sponza, San Miguel and the living room they were 0.45 to 0.8 times as fast as the same rays alone
-//! with 32 to 1024 strata, and 0.75 to 0.94 times with texels next to each other: rays that pass the same
-//! nodes end in different leaves, and most tests of a leaf are for rays that miss its box.)
+//! Tried for final gathering, with an origin per ray: slower, see docs/experiments.md#bundles-for-final-gathering.
 
 use super::single;
 use super::tree::{BEYOND, EPSILON, FARTHEST_ORIGIN, OFFSET_ERROR, STEEP, beyond};

@@ -6,21 +6,13 @@
 //! known, or both are seen and there is one place, the side from which one sees far before one sees another surface, as
 //! from inside a room rather than from inside its furniture or from the void around, and which is lit.
 //!
-//! Measured as the part of the surfaces seen from random places inside that show their other side: living room 1.8 %,
-//! Sponza in the sun 11.3 %, by two lamps 11.6 % (cloths and vaults seen from both sides, for the most part). By light
-//! alone, a back that gets ten times the front's, these were 2.9, 15.1 and 12.5 %: the sun shines on roofs, and some
-//! light leaks into sofas. By distance alone 1.6, 11.1 and 11.1 %, but the side of a block in the Cornell box that
-//! faces its open front lost to its dark inside; the square root of light, or the fourth, or a factor of 1.2 or 1.5
-//! instead of 2 change half a percent.
+//! Measured, by this rule and by others: docs/experiments.md#which-side-is-shown.
 //!
 //! Before that, a side that other surfaces cover loses to one that they do not, however bright it is: light leaks between
-//! the layers of cloths. By `report quality` at 5 texels/m (3,000 points, hollow walls included) the part on sides that are
-//! not shown is 15.7 instead of 16.8 % in Sponza by two lamps, 13.1 instead of 14.2 % in the sun, and 6.6 instead of 7.4 %
-//! in the living room.
+//! the layers of cloths.
 //!
-//! And the front of what is in the open stays if it is clearly brighter than the back: of the bunny in sun and sky, whose
-//! hollow body gets some light through the holes in its base, 34 charts showed their dark backs (RMSE of a picture of it
-//! 82 %, now 1.5 %). In Sponza nothing is in the open; the figures above are the same with and without this rule.
+//! And the front of what is in the open stays if it is clearly brighter than the back: a hollow body gets some light
+//! through its holes.
 
 use super::Atlas;
 use super::chart_map::ChartMap;

@@ -7,18 +7,8 @@
 //! light is the sum of a bounded part and of light from points on surfaces, and where each is good, is from Kollig and
 //! Keller, *Illumination in the Presence of Weak Singularities*, 2006.)
 //!
-//! Relative MSE of indirect light and its noise at 300 points, and seconds of a bake, without -> with: Sponza by two lamps
-//! 4.2e-2 -> 1.2e-2, 3.5e-2 -> 2.6e-3, 5.9 -> 6.4; in the sun 0.21 -> 0.12, 4.3e-2 -> 1.3e-2, 7.7 -> 11; living room
-//! 0.142 -> 0.141, 1.2e-3 -> 1.1e-3, 2.9 -> 3.3; Cornell box 4.2e-4 -> 3.8e-4, 2.5e-4 -> 2.0e-4, 0.60 -> 0.61. With half
-//! and twice the shadow rays, noise in the sun 4.4e-2 and 0.9e-2 for 11 and 16 s; by lamps no difference. With a limit of
-//! twice or eight times what is seen on average instead of four, 1.2 and 1.3 times the noise (lamps).
-//!
-//! It brings little where much is in the sun, which stratified rays find well: in the built-in atrium with its 35,000
-//! patches 9.6e-3 -> 7.5e-3 takes 9.8 -> 11.3 s. So rounds of gather rays from some places are traced with and without
-//! them. The variance of rounds with them is 0.3 (Sponza by lamps), 0.5 (in the sun), 0.6 (Cornell box), 0.7 (atrium) and
-//! 0.9 (living room) of that without, and its product with the time of rounds 0.2, 1.1, 0.7, 1.9 and 1.1. Half or a quarter
-//! of the candidates per shadow ray or a sixteenth of the patches did not make the product smaller by more than a fifth in
-//! any of them.
+//! They bring little where much is in the sun, which stratified rays find well. So rounds of gather rays from some texels are
+//! traced with and without them first. Measured: docs/experiments.md#bright-patches-as-lights.
 
 use super::sample_set::ROUND;
 use crate::direct::Receiver;

@@ -8,18 +8,8 @@
 //! the bundles. (One set of 256 rays sorted as a whole traces 0 to 15 % faster than four rounds;
 //! the rays of 64 neighbouring texels stratum by stratum 3 to 8 % faster than texel by texel.)
 //!
-//! Tried: more rays where their relative variance is largest. At 128 rays on average, 64 everywhere and 192 more in a third
-//! of the texels (or 640 more in a tenth), noise is 4.6e-4 (6.0e-4) instead of 3.6e-4 in the Cornell box, 8.5e-4 (8.7e-4)
-//! instead of 7.8e-4 in the living room, 2.2e-3 (2.8e-3) as before in Sponza by two lamps; and as texels that found little
-//! light get no more, it is 1 % too dark.
-//!
-//! Tried: half of the rays where the photons around a texel come from (64 cells of the square, their histogram blurred; Jensen,
-//! *Importance driven path tracing using the photon map*, 1995). Without [bright patches](super::bright_patches) indirect light errs by
-//! 2.5e-3 instead of 3.1e-3 in the Cornell box, 2.7e-2 instead of 4.2e-2 in Sponza by two lamps and 7.2e-2 instead of 0.119 in
-//! the sun; with them, which bring more, by 2.2e-3 instead of 2.7e-3, 8.3e-3 instead of 9.5e-3 and 4.9e-2 instead of 5.4e-2, in
-//! the living room by 3.8e-3 instead of 4.1e-3 without the worst hundredth, in the same time. (Four fifths of the rays, or
-//! photons from twice as far: no better.) Not worth what live updates would have to keep for it, 48 bytes per photon or a
-//! distribution per texel.
+//! Tried, and not worth it: more rays where their variance is largest, and rays guided by photons; see
+//! docs/experiments.md#adaptive-and-guided-gather-rays.
 
 use super::radiance_map::RadianceMap;
 use super::sample_set::{ROUND, SampleSet};

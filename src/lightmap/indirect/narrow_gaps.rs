@@ -5,11 +5,7 @@
 //! come, dark rims lie around what stands on or hangs before a surface, and gaps shine.
 //! [Upsampling](super::upsample) keeps what lies in gaps apart from what does not.
 //!
-//! Living room, 20 texels/m and gather_divisor 4: mean squared relative error of all but the worst hundredth of the
-//! points 8.5e-3 instead of 16e-3, and none of the other scenes measured more than before. What brought less: the mean
-//! of open neighbours for gather texels in gaps (10e-3, but gaps shine: 0.27 instead of 0.11 with the worst), moving
-//! their samples to places in the open (11e-3, and 0.27 instead of 0.09 in Sponza), a blur that keeps them apart
-//! (no difference), gaps of half the width (12e-3) or twice that (13e-3).
+//! Measured, with what was tried instead: docs/experiments.md#narrow-gaps.
 
 use crate::direct::Receiver;
 use crate::sampling::{cosine_around, sobol_2d};

@@ -10,10 +10,7 @@
 //! what the texel shows of its triangle. (Rather than from a mip chain, which would be kept for this alone:
 //! a texel's shadow rays take longer.)
 //!
-//! Tried, relative MSE of indirect light in the Cornell box, the living room, Sponza by two lamps and in the sun:
-//! 4.2e-4, 0.141, 4.2e-2 and 0.21 as it is; 5.1e-4, 0.138, 3.1e-2 and 0.23 with look-ups that interpolate within the
-//! chart (less noise, and light that crosses edges of charts); 4.3e-4, 0.138, 4.2e-2 and 0.22 with radii for 60 photons
-//! each, between a quarter and twice the automatic one.
+//! Tried: look-ups that interpolate, and a radius per texel; see docs/experiments.md#look-ups-in-the-radiance-map.
 
 use super::bright_patches::Bright;
 use crate::device::Device;

@@ -5,12 +5,7 @@
 //! itself, or do not as it does not, and are behind no [wall or crease](super::upsample_visibility). What lies in no gap that is known of
 //! and finds none in the open, as a narrow face of a moulding, is on its own: it gathers a few rays, blurred among its like.
 //!
-//! Rays of their own, 20 texels/m, 1.8 % of the texels of Sponza and 3 % of the living room's: all points of Sponza by two
-//! lamps 1.36e-2 -> 0.95e-2, in the sun 5.0e-2 -> 5.4e-2, the living room without the worst hundredth 4.2e-3 -> 4.1e-3; its
-//! picture 10.1 -> 9.6 % RMSE, that of an arcade in San Miguel at 6.8 texels/m 18.0 -> 16.2 %, black jambs and mouldings gone;
-//! for 0.4 of 8 s, 0.6 of 13 s, 0.03 of 3.5 s. With 64 rays, not blurred, no more for three times the time; blurred over 4
-//! texels the same, over 8 in the sun 0.21. For texels in gaps, too: the living room 0.130 -> 0.020, but the dark of what
-//! lies behind a moulding shows as a rim around it.
+//! Measured: docs/experiments.md#fallback-gather.
 
 use super::gather::Gathered;
 use super::narrow_gaps::is_in_gap;

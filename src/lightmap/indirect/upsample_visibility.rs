@@ -6,10 +6,7 @@
 //! Majercik, Guertin, Nowrouzezahrai and McGuire, *Dynamic Diffuse Global Illumination with Ray-Traced Irradiance Fields*,
 //! 2019.)
 //!
-//! Living room, 20 texels/m: mean squared relative error of all but the worst hundredth of 300 points 4.0e-3 instead of
-//! 1.1e-2, of all but three hundredths 2.1e-3 instead of 4.1e-3. Seen from a quarter of a texel above, not an eighth, the
-//! same, from half a texel 6.3e-3, from 0.03 texels 6.6e-3. Creases: all points of Sponza in the sun 0.141 -> 0.050, by lamps
-//! 1.35e-2 as before; with cosines of 0.97, 0.9 and 0.5 instead, 0.050, 0.042 and 0.141 in the sun, no difference by lamps.
+//! Measured: docs/experiments.md#walls-and-creases.
 
 use crate::error::{Error, Result};
 use crate::lightmap::atlas::Atlas;
