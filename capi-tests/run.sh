@@ -21,6 +21,8 @@ command -v cmake >/dev/null || need+=(cmake)
 command -v make >/dev/null || need+=(make)
 command -v g++ >/dev/null || need+=(g++)
 command -v pkg-config >/dev/null || need+=(pkg-config)
+command -v python3 >/dev/null || need+=(python3)
+command -v doxygen >/dev/null || need+=(doxygen)
 [ -e /usr/include/embree3/rtcore.h ] || need+=(libembree-dev)
 # The viewer, and a screen and OpenGL in software to test it with.
 [ -e /usr/include/GLFW/glfw3.h ] || need+=(libglfw3-dev)

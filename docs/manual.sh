@@ -21,30 +21,12 @@ trap 'rm -rf "$work"' EXIT
 
 # ---- The header ----
 
-doxygen - <<DOXYFILE
-PROJECT_NAME = Bakelite
-PROJECT_BRIEF = "SIMD light-baking kernels: bakelite.h"
-INPUT = include/bakelite.h
-STRIP_FROM_PATH = include
-OUTPUT_DIRECTORY = $out
-HTML_OUTPUT = header
-GENERATE_LATEX = NO
-HAVE_DOT = NO
-GENERATE_TAGFILE = $work/header.tag
-OPTIMIZE_OUTPUT_FOR_C = YES
-TYPEDEF_HIDES_STRUCT = YES
-JAVADOC_AUTOBRIEF = YES
-SORT_MEMBER_DOCS = NO
-SHOW_INCLUDE_FILES = NO
-ALPHABETICAL_INDEX = YES
-MACRO_EXPANSION = YES
-EXPAND_ONLY_PREDEF = YES
-PREDEFINED = BK_API= BK_EXPERIMENTAL=
-DISABLE_INDEX = NO
-GENERATE_TREEVIEW = YES
-QUIET = YES
-WARN_AS_ERROR = FAIL_ON_WARNINGS
-DOXYFILE
+{
+    cat docs/Doxyfile
+    echo "OUTPUT_DIRECTORY = $out"
+    echo "HTML_OUTPUT = header"
+    echo "GENERATE_TAGFILE = $work/header.tag"
+} | doxygen -
 
 # ---- The documents ----
 

@@ -753,6 +753,8 @@ typedef struct bk_mesh_desc {
   uint32_t struct_size;
   /// BK_MESH flags. Default: 0.
   uint32_t flags;
+  /// Material number of all triangles if `triangle_materials` is NULL. Default: 0.
+  uint32_t material;
   /// `vertex_count` positions of three floats, in scene units. Default: NULL.
   const float *positions;
   /// Distance between positions in bytes, at least 12; 0: packed. Default: 0.
@@ -784,8 +786,6 @@ typedef struct bk_mesh_desc {
   const uint32_t *lightmap_page;
   /// Material number of each triangle, packed. May be NULL: all have `material`. Default: NULL.
   const uint32_t *triangle_materials;
-  /// Material number of all triangles if `triangle_materials` is NULL. Default: 0.
-  uint32_t material;
 } bk_mesh_desc;
 
 /// Pointers to the data of a mesh.
@@ -1147,8 +1147,8 @@ bk_result bk_occluded_many(const bk_scene *scene,
 ///
 /// @param scene  committed scene
 /// @param origin  origin of all rays, in scene units
-/// @param directions  `count` directions of three floats, packed, aligned to 4 bytes; may be NULL
-///   if `count` is 0
+/// @param directions  `count` vectors of any length, of three floats, packed, aligned to 4 bytes;
+///   may be NULL if `count` is 0
 /// @param count  number of directions
 /// @param tmax  upper limit of t, inclusive, in multiples of a direction's length
 /// @param flags  0 or BK_RAYS_PARALLEL

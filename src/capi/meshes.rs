@@ -160,6 +160,8 @@ pub struct bk_mesh_desc {
     pub struct_size: u32,
     /// BK_MESH flags. Default: 0.
     pub flags: u32,
+    /// Material number of all triangles if `triangle_materials` is NULL. Default: 0.
+    pub material: u32,
     /// `vertex_count` positions of three floats, in scene units. Default: NULL.
     pub positions: *const f32,
     /// Distance between positions in bytes, at least 12; 0: packed. Default: 0.
@@ -191,13 +193,12 @@ pub struct bk_mesh_desc {
     pub lightmap_page: *const u32,
     /// Material number of each triangle, packed. May be NULL: all have `material`. Default: NULL.
     pub triangle_materials: *const u32,
-    /// Material number of all triangles if `triangle_materials` is NULL. Default: 0.
-    pub material: u32,
 }
 
 sized_struct!(bk_mesh_desc, defaults: bk_mesh_desc {
     struct_size: size_of::<bk_mesh_desc>() as u32,
     flags: 0,
+    material: 0,
     positions: std::ptr::null(),
     position_stride: 0,
     vertex_count: 0,
@@ -211,7 +212,6 @@ sized_struct!(bk_mesh_desc, defaults: bk_mesh_desc {
     lightmap_uv_stride: 0,
     lightmap_page: std::ptr::null(),
     triangle_materials: std::ptr::null(),
-    material: 0,
 });
 
 /// Sets `struct_size` and fills in the defaults.

@@ -166,8 +166,8 @@ pub unsafe extern "C" fn bk_occluded_many(
 ///
 /// @param scene  committed scene
 /// @param origin  origin of all rays, in scene units
-/// @param directions  `count` directions of three floats, packed, aligned to 4 bytes; may be NULL
-///   if `count` is 0
+/// @param directions  `count` vectors of any length, of three floats, packed, aligned to 4 bytes;
+///   may be NULL if `count` is 0
 /// @param count  number of directions
 /// @param tmax  upper limit of t, inclusive, in multiples of a direction's length
 /// @param flags  0 or BK_RAYS_PARALLEL
