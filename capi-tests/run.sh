@@ -63,6 +63,9 @@ verdict=0
 echo '== Rust, without features'
 cargo check --release --locked --no-default-features
 
+echo '== Rust documentation'
+RUSTDOCFLAGS='-D warnings' cargo doc --release --locked --no-deps --lib --all-features
+
 echo '== Rust, with all features'
 export PROPTEST_RNG_SEED=${PROPTEST_RNG_SEED:-1}
 cargo test --release --locked --all-features --no-fail-fast 2>&1 | tee -a "$log" || verdict=1

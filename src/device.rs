@@ -14,8 +14,11 @@ use std::thread::JoinHandle;
 #[derive(Clone, Copy, Debug, PartialEq, Eq, PartialOrd, Ord)]
 #[repr(u32)]
 pub enum LogLevel {
+    /// A failure that no result reports.
     Error = 0,
+    /// Something about the input or the run that deserves attention.
     Warning = 1,
+    /// Progress of the work.
     Info = 2,
 }
 

@@ -120,7 +120,7 @@ fn too_large<T>(len: usize, what: &str) -> Error {
     Error::OutOfMemory(format!("{what} needs {} bytes", len as u128 * size_of::<T>() as u128))
 }
 
-/// An empty `Vec` with room for `capacity` elements, in [large pages](prefer_large_pages) if there are any. As of all
+/// An empty `Vec` with room for `capacity` elements, in large pages if there are any. As of all
 /// functions here, an allocation that fails is an error, not an abort.
 pub fn try_with_capacity<T>(capacity: usize, what: &str) -> Result<Vec<T>> {
     let mut v = Vec::new();

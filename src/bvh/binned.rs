@@ -31,9 +31,11 @@ const MAX_BINS: usize = 256;
 #[derive(Clone, Copy, Debug, Default)]
 #[repr(C)]
 pub struct BinaryNode {
+    /// Lower corner of the node's box.
     pub lower: Vec3,
     /// Inner: number of the right child. Leaf: first triangle slot.
     pub index: u32,
+    /// Upper corner of the node's box.
     pub upper: Vec3,
     /// Triangles of a leaf; 0 in an inner node.
     pub count: u32,

@@ -98,9 +98,13 @@ impl ChildRef {
 #[derive(Clone, Copy, Debug, Pod, Zeroable)]
 #[repr(C, align(64))]
 pub struct Node {
+    /// Minima of the children's boxes, by axis.
     pub lower: [[f32; WIDTH]; 3],
+    /// Maxima of the children's boxes, by axis.
     pub upper: [[f32; WIDTH]; 3],
+    /// The children.
     pub children: [ChildRef; WIDTH],
+    /// Order of the children by octant, three bits each, as drawn above.
     pub order: [u32; WIDTH],
 }
 

@@ -49,10 +49,11 @@ pub struct GlbMesh {
 /// Where the back of a triangle lies in the light map.
 #[derive(Clone, Copy, Debug, PartialEq)]
 pub struct GlbBack {
-    /// Its number in the mesh.
+    /// Number of the triangle in the mesh.
     pub triangle: u32,
-    /// Of its corners, in the order of the front, in [0, 1].
+    /// Light map coordinates of its corners, in the order of the front, in [0, 1].
     pub corner_uvs: [[f32; 2]; 3],
+    /// Number of the page.
     pub page: u32,
 }
 

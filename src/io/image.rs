@@ -200,7 +200,7 @@ fn fail(path: &Path, e: impl std::fmt::Display) -> Error {
 const SHOULDER: f32 = 0.6;
 
 /// Linear radiance or irradiance to an sRGB colour: times `exposure`, then a curve that is linear up
-/// to [`SHOULDER`] and from there approaches 1 exponentially, without a kink, then the sRGB transfer
+/// to `SHOULDER` and from there approaches 1 exponentially, without a kink, then the sRGB transfer
 /// function. The curve works on the largest channel and the others follow in proportion, so hue and
 /// saturation stay. Values that are negative or not numbers count as 0.
 pub fn tone_map(exposure: f32, rgb: [f32; 3]) -> [u8; 3] {

@@ -54,11 +54,17 @@ pub const DEFAULT_ALBEDO: f32 = 0.5;
 /// What [`load`] found.
 #[derive(Clone, Debug, Default, PartialEq)]
 pub struct LoadInfo {
+    /// Number of meshes added.
     pub meshes: u32,
+    /// Number of triangles added, degenerate ones included.
     pub triangles: u64,
+    /// Number of vertices added.
     pub vertices: u64,
+    /// Number of materials added, emissive ones included.
     pub materials: u32,
+    /// Number of textures added.
     pub textures: u32,
+    /// Number of lights added, emissive materials not counted.
     pub lights: u32,
     /// Materials of which a reflectance was outside [0, [`MAX_ALBEDO`]] and was clamped.
     pub albedos_clamped: u32,

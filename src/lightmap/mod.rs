@@ -65,19 +65,29 @@ impl Default for LightmapDesc {
 /// Numbers about a light map.
 #[derive(Clone, Copy, Debug, Default)]
 pub struct LightmapInfo {
+    /// Number of pages.
     pub page_count: u32,
+    /// Width of a page in texels.
     pub width: u32,
+    /// Height of a page in texels.
     pub height: u32,
+    /// Number of charts, pieces of surface with continuous coordinates.
     pub charts: u32,
-    /// Texels that a triangle covers.
+    /// Number of texels that a triangle covers.
     pub texels: u64,
+    /// Number of texels of the gather map.
     pub gather_texels: u64,
+    /// Number of texels of the radiance map.
     pub radiance_texels: u64,
+    /// Size of the light map in bytes.
     pub bytes: u64,
+    /// Duration of unwrapping in seconds.
     pub unwrap_seconds: f64,
+    /// Density in use, in texels per scene unit.
     pub texels_per_unit: f32,
+    /// Numbers about the caller's coordinates.
     pub uvs: atlas::charts::UvReport,
-    /// Charts with a second place for their backs.
+    /// Number of charts with separate texels for their backs.
     pub both_sided_charts: u32,
     /// Of `texels`, those of the second places.
     pub back_texels: u64,
@@ -112,12 +122,13 @@ pub struct BakeParams {
     /// the penumbra of a disc. Point, spot and parallel lights take one ray each, and 4 to 16 more, spread over the
     /// texel, where shadow edges cross it.
     pub direct_samples: u32,
+    /// Seed of all random numbers. The same seed gives the same bits on any number of threads.
     pub seed: u64,
-    /// Bytes that the bake may take in addition; 0: no limit.
+    /// Limit in bytes of the memory that the bake takes in addition to scene and light map; 0: no limit.
     pub memory_budget: u64,
-    /// Only these of the light map's covered texels, in chart order, backs with places of their own
-    /// last; `texel_end` 0: all.
+    /// First covered texel to bake, in the order of charts, separate texels of backs last.
     pub texel_begin: u64,
+    /// The covered texel behind the last one to bake; 0: all.
     pub texel_end: u64,
     /// Whether both sides of edges at which smooth surfaces are cut open in the light map are made to
     /// agree under bilinear filtering. Moves only the texels that such edges show, once all texels
@@ -147,35 +158,48 @@ impl Default for BakeParams {
 /// Wall time and work of one stage.
 #[derive(Clone, Copy, Debug, Default, PartialEq)]
 pub struct StageStats {
+    /// Wall time in seconds.
     pub seconds: f64,
+    /// Number of rays traced.
     pub rays: u64,
+    /// Size of the stage's buffers in bytes.
     pub bytes: u64,
 }
 
 /// What a bake did.
 #[derive(Clone, Copy, Debug, Default)]
 pub struct BakeStats {
+    /// Tracing and sorting of photons.
     pub photons: StageStats,
+    /// Number of photons emitted.
     pub photons_emitted: u64,
+    /// Number of photons stored on surfaces.
     pub photons_stored: u64,
+    /// Radiance map.
     pub radiance: StageStats,
+    /// Gather map: indirect light.
     pub gather: StageStats,
+    /// Direct light with shadow rays.
     pub direct: StageStats,
+    /// Filtering and composition.
     pub compose: StageStats,
     /// Two-sided charts whose back was baked because one sees further from it, or more light falls on it, than from and on
     /// the front.
     pub back_charts: u64,
+    /// Wall time of the whole bake in seconds.
     pub seconds: f64,
+    /// Maximum of the memory that the device's objects held at once, in bytes.
     pub peak_bytes: u64,
-    /// Bits of [`left_out`].
+    /// Bits of [`plan::left_out`]: work that the scene does not need.
     pub left_out: u32,
-    /// Points along edges that were stitched, half a texel apart at most.
+    /// Number of points along stitched edges, at most half a texel apart.
     pub seam_points: u64,
-    /// Root mean square of what the two sides of stitched edges show differently, relative to the mean
-    /// irradiance there: before, and after.
+    /// Difference of light between the two sides of stitched edges, before the stitching: root mean square relative to
+    /// the mean irradiance there.
     pub seam_rms_before: f64,
+    /// The same relative difference after the stitching.
     pub seam_rms_after: f64,
-    /// Finding and stitching seams.
+    /// Duration of finding and stitching seams, in seconds.
     pub seam_seconds: f64,
 }
 
@@ -185,7 +209,9 @@ pub struct BakeStats {
 pub enum Layer {
     /// Irradiance, direct plus indirect (RGB, W/m²).
     Combined = 0,
+    /// Irradiance that was reflected by other surfaces (RGB, W/m²).
     Indirect = 1,
+    /// Irradiance that comes straight from lights (RGB, W/m²).
     Direct = 2,
     /// Outgoing radiance (RGB, W/(m²·sr)).
     Radiance = 3,
@@ -204,8 +230,11 @@ pub enum Layer {
 /// The content of one layer of one page, row-major, row 0 at v = 0.
 #[derive(Clone, Debug)]
 pub enum LayerData {
+    /// Colours or vectors.
     Rgb(Vec<[f32; 3]>),
+    /// Single numbers.
     Scalar(Vec<f32>),
+    /// Indices.
     Integer(Vec<u32>),
 }
 

@@ -18,8 +18,11 @@ pub const NO_LOD: u8 = 255;
 /// Where the cells lie.
 #[derive(Clone, Copy, Debug, Default, PartialEq)]
 pub struct CellInfo {
+    /// Lower corner of the first cell, in scene units.
     pub origin: Vec3,
+    /// Edge of a cell in scene units.
     pub cell_size: f32,
+    /// Number of cells along x, y and z.
     pub dimensions: [u32; 3],
 }
 

@@ -2,7 +2,7 @@
 //! within a time budget per frame, and relit when lights change.
 //!
 //! Creating a [`Live`] object computes photons and radiance map as a bake does, and the texels of the
-//! lowest LOD. Each update then works on [`blocks`] of texels: in view-based mode (3.3.1) on those
+//! lowest LOD. Each update then works on `blocks` of texels: in view-based mode (3.3.1) on those
 //! that the camera sees, where estimated error times visibility is largest; in position-based mode
 //! (3.3.2) on the cells of the light map grid that are near, visible ones first. The thesis picks
 //! texels at random and lets neighbouring cells of different LOD show their border; here the texels
@@ -68,26 +68,32 @@ pub enum Mode {
 /// How to update.
 #[derive(Clone, Copy, Debug, PartialEq)]
 pub struct LiveParams {
+    /// Where updates work.
     pub mode: Mode,
-    /// 1 to [`MAX_LODS`]. The lowest LOD computes every 2^(lod_count − 1)-th gather texel per axis.
+    /// Number of levels of detail, 1 to [`MAX_LODS`]. The lowest computes every 2^(lod_count − 1)-th gather texel per
+    /// axis.
     pub lod_count: u32,
-    /// Rounds of 64 rays that a texel needs before its cell shows the next LOD, ≥ 1.
+    /// Rounds of 64 rays that each texel of a cell needs before the cell shows its next LOD, ≥ 1.
     pub promote_threshold: u32,
-    /// Rounds per texel after which it is finished, at least `promote_threshold`, at most 1024.
+    /// Rounds of 64 rays after which a texel is finished, at least `promote_threshold`, at most 1024.
     pub max_rounds: u32,
-    /// Rays per update at most, whatever the budget; 0: no limit.
+    /// Maximum number of rays per update, whatever its budget; 0: no limit.
     pub rays_per_update: u32,
-    /// Blur radius in gather texels, for display alone.
+    /// Radius of a blur for display, in gather texels; accumulated light is not blurred.
     pub blur: u32,
     /// Edge of a grid cell in scene units; 0: a sixteenth of the scene's longest side.
     pub cell_size: f32,
+    /// Seed of all random numbers, as in a bake.
     pub seed: u64,
-    /// As in a bake.
+    /// Number of photons to emit, as in a bake.
     pub photon_count: u64,
+    /// Maximum number of reflections, as in a bake.
     pub max_bounces: u32,
+    /// Shadow rays per light map texel and area light, as in a bake.
     pub direct_samples: u32,
+    /// Search radius of photons in scene units, as in a bake.
     pub radius: f32,
-    /// The device's threads go on working between updates.
+    /// Whether the device's threads go on working between updates.
     pub background: bool,
 }
 
@@ -115,56 +121,68 @@ impl Default for LiveParams {
 /// Where somebody looks from.
 #[derive(Clone, Copy, Debug, PartialEq)]
 pub struct LiveCamera {
+    /// Position in scene units.
     pub position: Vec3,
-    /// Any length.
+    /// Direction of view, of any length.
     pub forward: Vec3,
-    /// Any length, not parallel to `forward`.
+    /// Upward direction, of any length, not parallel to `forward`.
     pub up: Vec3,
     /// Vertical field of view in radians, in (0, π).
     pub fov_y: f32,
+    /// Width of the picture in pixels; only the ratio to `height` matters.
     pub width: u32,
+    /// Height of the picture in pixels.
     pub height: u32,
 }
 
 /// What an update may take. Both 0: nothing is traced.
 #[derive(Clone, Copy, Debug, PartialEq)]
 pub struct Budget {
-    /// 0: no limit by time.
+    /// Time limit in milliseconds; 0: none.
     pub milliseconds: f32,
-    /// 0: no limit by rays.
+    /// Limit of the number of rays; 0: none.
     pub rays: u64,
 }
 
 /// What an update did, and how things stand.
 #[derive(Clone, Copy, Debug, Default, PartialEq)]
 pub struct LiveStats {
-    /// Indirect light is being recomputed because a light has changed.
+    /// Whether indirect light is being recomputed because a light has changed.
     pub light_pending: bool,
-    /// That the update took.
+    /// Duration of the update in milliseconds.
     pub milliseconds: f32,
-    /// Estimated relative error (RMS) of indirect light where the camera looks.
+    /// Estimated relative error (RMS) of the indirect light that the camera sees.
     pub visible_error: f32,
-    /// Part of the blocks that are finished, of all and of those that the camera sees.
+    /// Fraction of all blocks that is finished.
     pub finished: f32,
+    /// Fraction of the blocks in view that is finished.
     pub visible_finished: f32,
-    /// Traced by the update, and since the beginning.
+    /// Number of rays traced by the update, and in the background since the update before.
     pub rays: u64,
+    /// Number of rays traced since the beginning.
     pub total_rays: u64,
+    /// Number of cells that went to a higher LOD.
     pub cells_promoted: u32,
-    /// Blocks whose shown light changed.
+    /// Number of blocks whose shown light changed.
     pub blocks_changed: u32,
-    /// Held now, and with all LODs allocated everywhere.
+    /// Size of the live object in bytes.
     pub bytes: u64,
+    /// Size in bytes with all LODs in use everywhere.
     pub bytes_full: u64,
 }
 
 /// A rectangle of texels of a page.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub struct PageRect {
+    /// Number of the page.
     pub page: u32,
+    /// First column.
     pub x: u32,
+    /// First row.
     pub y: u32,
+    /// Number of columns.
     pub width: u32,
+    /// Number of rows.
     pub height: u32,
 }
 

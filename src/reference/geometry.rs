@@ -12,9 +12,13 @@ use glam::{DVec3, Vec3};
 /// A ray in f64: points `origin + t · direction` with `tmin < t ≤ tmax`.
 #[derive(Clone, Copy, Debug, PartialEq)]
 pub struct Ray64 {
+    /// Origin, in scene units.
     pub origin: DVec3,
+    /// Direction, of any length.
     pub direction: DVec3,
+    /// Lower limit of t, exclusive, in multiples of the direction's length.
     pub tmin: f64,
+    /// Upper limit of t, inclusive.
     pub tmax: f64,
 }
 
@@ -39,9 +43,11 @@ impl From<&Ray> for Ray64 {
 /// A closest hit.
 #[derive(Clone, Copy, Debug, PartialEq)]
 pub struct Hit64 {
+    /// Distance in multiples of the direction's length.
     pub t: f64,
-    /// Weights of corners 1 and 2.
+    /// Weight of corner 1.
     pub u: f64,
+    /// Weight of corner 2.
     pub v: f64,
     /// Global triangle number.
     pub triangle: u32,

@@ -21,10 +21,11 @@ const RING: u32 = 16;
 /// A triangle that the ray hits or nearly hits.
 #[derive(Clone, Copy, Debug, PartialEq)]
 pub struct Candidate {
-    /// Where the ray meets the triangle's plane.
+    /// Distance at which the ray crosses the triangle's plane.
     pub t: f64,
-    /// Weights of corners 1 and 2; outside [0, 1] where the ray passes beside it.
+    /// Weight of corner 1; outside [0, 1] where the ray passes beside the triangle.
     pub u: f64,
+    /// Weight of corner 2.
     pub v: f64,
     /// Global triangle number.
     pub triangle: u32,

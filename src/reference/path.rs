@@ -38,6 +38,7 @@ const TILE: usize = 8;
 /// A point on a surface, where irradiance is wanted.
 #[derive(Clone, Copy, Debug, PartialEq)]
 pub struct SurfacePoint {
+    /// Position in scene units.
     pub position: DVec3,
     /// Unit normal of the side that receives light.
     pub normal: DVec3,

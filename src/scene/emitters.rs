@@ -11,15 +11,19 @@ pub(super) const EMITTERS: &str = "the emissive triangles";
 pub struct Emitter {
     /// Global triangle number.
     pub triangle: u32,
-    /// Corner 0 and the edges to corners 1 and 2.
+    /// Corner 0.
     pub corner: Vec3,
+    /// Edge from corner 0 to corner 1.
     pub edge_u: Vec3,
+    /// Edge from corner 0 to corner 2.
     pub edge_v: Vec3,
     /// Unit geometric normal.
     pub normal: Vec3,
+    /// Area in square scene units.
     pub area: f32,
-    /// W/(m²·sr).
+    /// Emitted radiance in W/(m²·sr).
     pub radiance: [f32; 3],
+    /// Whether the back emits too.
     pub two_sided: bool,
 }
 

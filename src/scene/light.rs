@@ -7,26 +7,59 @@ use glam::Vec3;
 /// A light. Directions need not be normalised; they are when the light is added to a scene.
 #[derive(Clone, Copy, Debug, PartialEq)]
 pub enum Light {
-    /// Radiates equally in all directions. `intensity` in W/sr.
-    Point { position: Vec3, intensity: [f32; 3] },
-    /// Radiates in a cone around `direction`: fully within `inner` radians of it, not at all beyond
-    /// `outer` (≤ π), smoothly in between (Hermite interpolation in the cosine). `intensity` in W/sr on the axis.
-    Spot { position: Vec3, direction: Vec3, inner: f32, outer: f32, intensity: [f32; 3] },
-    /// Light from infinitely far away that travels along `direction`, parallel or, with an
-    /// `angular_radius` (radians, in [0, π/2]; less than 1e-5 counts as 0), from a disc of uniform
-    /// radiance around it; the sun's is 0.00465. `irradiance` in W/m² on a plane that faces the middle
-    /// of the disc with all of it above its horizon.
-    Directional { direction: Vec3, irradiance: [f32; 3], angular_radius: f32 },
-    /// The parallelogram with a corner at `position` and edges `edge_u` and `edge_v`. It radiates
-    /// from the side that `edge_u × edge_v` points to. `radiance` in W/(m²·sr). It casts light but
-    /// is not itself hit by rays.
-    Rect { position: Vec3, edge_u: Vec3, edge_v: Vec3, radiance: [f32; 3] },
-    /// Light from all directions, infinitely far away: of `radiance` in W/(m²·sr), or `radiance` times
-    /// the scene's [`Environment`](super::Environment) of number `environment` ([`NONE`]: none). The
-    /// image's zenith is at `up`; its front, the middle, looks along −z, or along +y if `up` is less than
-    /// 45° from the z axis, made perpendicular to `up` and turned by `rotation` radians about it,
-    /// counter-clockwise as seen from its tip.
-    Sky { radiance: [f32; 3], environment: u32, up: Vec3, rotation: f32 },
+    /// Radiates equally in all directions.
+    Point {
+        /// Position in scene units.
+        position: Vec3,
+        /// Radiant intensity in W/sr.
+        intensity: [f32; 3],
+    },
+    /// Radiates in a cone around `direction`: fully up to `inner`, not at all beyond `outer`, smoothly in between (Hermite
+    /// interpolation in the cosine).
+    Spot {
+        /// Position in scene units.
+        position: Vec3,
+        /// Axis of the cone.
+        direction: Vec3,
+        /// Half angle of the cone of full intensity, in radians, at most `outer`.
+        inner: f32,
+        /// Half angle of the whole cone, in radians, in (0, π].
+        outer: f32,
+        /// Radiant intensity on the axis in W/sr.
+        intensity: [f32; 3],
+    },
+    /// Light from infinitely far away, parallel or from a disc of uniform radiance (the sun).
+    Directional {
+        /// Direction in which the light travels.
+        direction: Vec3,
+        /// Irradiance in W/m² on a plane that faces the middle of the disc, with the whole disc above its horizon.
+        irradiance: [f32; 3],
+        /// Radius of the disc in radians, in [0, π/2]; less than 1e-5 counts as 0, parallel light. The sun's is 0.00465.
+        angular_radius: f32,
+    },
+    /// A parallelogram that radiates from the side that `edge_u × edge_v` points to. Rays do not hit it.
+    Rect {
+        /// A corner, in scene units.
+        position: Vec3,
+        /// An edge from that corner.
+        edge_u: Vec3,
+        /// The other edge from that corner.
+        edge_v: Vec3,
+        /// Radiance in W/(m²·sr).
+        radiance: [f32; 3],
+    },
+    /// Light from all directions, infinitely far away.
+    Sky {
+        /// Radiance in W/(m²·sr) or, with an environment, the factor of the image.
+        radiance: [f32; 3],
+        /// Number of the scene's [`Environment`](super::Environment); [`NONE`]: the same radiance from all directions.
+        environment: u32,
+        /// Direction of the image's zenith. The front of the image, its middle, looks along −z, or along +y if `up` is less
+        /// than 45° from the z axis, made perpendicular to `up`.
+        up: Vec3,
+        /// Angle in radians by which the image is turned about `up`, counter-clockwise as seen from its tip.
+        rotation: f32,
+    },
 }
 
 /// Discs of less than this radius are points.

@@ -18,7 +18,7 @@ impl Scene {
     /// Moves vertices: `moved` names meshes and the new positions of all their vertices. (Of a mesh that is
     /// named twice the last holds.) The tree keeps its shape and gets new boxes, which takes a fraction of a
     /// commit; so it serves well as long as neighbours stay neighbours, and
-    /// [`wide_sah_cost`](SceneStats::wide_sah_cost) tells when a new commit would be better. Emitters, bounds
+    /// [`wide_sah_cost`](super::SceneStats::wide_sah_cost) tells when a new commit would be better. Emitters, bounds
     /// and numbers are renewed; shading normals, texture and light map coordinates stay as they were given.
     ///
     /// If `scene` is the only reference, it is changed in place; otherwise it is replaced by a copy, and who

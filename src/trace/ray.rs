@@ -9,9 +9,13 @@ use glam::Vec3;
 #[derive(Clone, Copy, Debug, PartialEq, Pod, Zeroable)]
 #[repr(C)]
 pub struct Ray {
+    /// Origin, in scene units.
     pub origin: [f32; 3],
+    /// Lower limit of t, exclusive, in multiples of the direction's length.
     pub tmin: f32,
+    /// Direction, of any length but 0.
     pub direction: [f32; 3],
+    /// Upper limit of t, inclusive; may be infinite.
     pub tmax: f32,
 }
 
@@ -30,6 +34,7 @@ impl Ray {
 /// A hit by global triangle number, as kernels report it. A miss has `t = +inf`, triangle [`NONE`].
 #[derive(Clone, Copy, Debug, PartialEq)]
 pub struct RawHit {
+    /// Distance in multiples of the direction's length.
     pub t: f32,
     /// Barycentric weight of vertex 1.
     pub u: f32,
@@ -56,11 +61,17 @@ impl RawHit {
 #[derive(Clone, Copy, Debug, PartialEq, Pod, Zeroable)]
 #[repr(C)]
 pub struct Hit {
+    /// Distance in multiples of the direction's length.
     pub t: f32,
+    /// Barycentric weight of vertex 1.
     pub u: f32,
+    /// Barycentric weight of vertex 2.
     pub v: f32,
+    /// Number of the triangle in its mesh.
     pub triangle: u32,
+    /// Number of the mesh.
     pub mesh: u32,
+    /// Number of the instance: always [`NONE`], as scenes have no instances yet.
     pub instance: u32,
 }
 
@@ -76,8 +87,11 @@ pub const PACKET_SIZE: usize = 32;
 #[derive(Clone, Copy, Debug)]
 #[repr(C, align(64))]
 pub struct Packet {
+    /// Components along x.
     pub x: [f32; PACKET_SIZE],
+    /// Components along y.
     pub y: [f32; PACKET_SIZE],
+    /// Components along z.
     pub z: [f32; PACKET_SIZE],
     /// How many of the directions count, from the first.
     pub count: usize,

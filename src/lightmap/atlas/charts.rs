@@ -1,6 +1,6 @@
 //! Charts: pieces of surface that are flat in the light map (thesis 3.2.3).
 //!
-//! Charts come from the caller's UVs where those are usable, else from [`super::unwrap`]. They know
+//! Charts come from the caller's UVs where those are usable, else from `super::unwrap`. They know
 //! nothing of texels: their coordinates are in scene units, and each map packs them at its own
 //! density ([`super::layout`]).
 
@@ -50,22 +50,24 @@ pub struct UvReport {
     pub given_charts: u32,
     /// Charts made by unwrapping.
     pub unwrapped_charts: u32,
-    /// With UVs outside [0, 1] or not finite; unwrapped instead.
+    /// Triangles with UVs outside [0, 1] or not finite; unwrapped instead.
     pub out_of_range: u64,
-    /// Without area in UV space though not in space; unwrapped instead.
+    /// Triangles without area in UV space though not in space; unwrapped instead.
     pub degenerate: u64,
-    /// On pages that the given UVs cover more than twice over; unwrapped instead.
+    /// Triangles on pages that the given UVs cover more than twice over; unwrapped instead.
     pub overlapping: u64,
     /// Texels whose centre several triangles of given UVs cover.
     pub overlapping_texels: u64,
     /// Charts reduced in density to fit a page.
     pub reduced_charts: u32,
+    /// Duration of unwrapping in seconds.
     pub seconds: f64,
 }
 
 /// All charts of a scene. Those with given placement come first, ordered by page.
 #[derive(Clone, Debug, Default, PartialEq)]
 pub struct Charts {
+    /// The charts, by number.
     pub charts: Vec<Chart>,
     /// Global triangle numbers, chart by chart, ascending in each.
     pub triangles: Vec<u32>,

@@ -21,17 +21,22 @@ const LAYOUT: &str = "the layout of the charts";
 /// Where a chart lies. Texel coordinates of a page are continuous: texel i covers [i, i + 1].
 #[derive(Clone, Copy, Debug, PartialEq)]
 pub struct Placement {
+    /// Number of the page.
     pub page: u32,
-    /// The rectangle of texels that the chart owns, padding included. (Given charts need not own
-    /// theirs alone.)
+    /// First column of the rectangle of texels that the chart owns, padding included. (Given charts need not own theirs
+    /// alone.)
     pub x: u16,
+    /// First row of the rectangle.
     pub y: u16,
+    /// Columns of the rectangle.
     pub w: u16,
+    /// Rows of the rectangle.
     pub h: u16,
     /// Whether the chart lies on its side: local coordinates change places before the rest.
     pub swap: bool,
-    /// Texel coordinate = `offset` + `scale` · local.
+    /// Texels per unit of local coordinates: texel coordinate = `offset` + `scale` · local.
     pub scale: [f32; 2],
+    /// Texel coordinate of the local origin.
     pub offset: [f32; 2],
 }
 
@@ -56,6 +61,7 @@ impl Placement {
 pub struct Layout {
     /// Width and height of a page in texels.
     pub page_size: u32,
+    /// Number of pages.
     pub page_count: u32,
     /// Texels per scene unit, except for given and reduced charts.
     pub density: f32,
@@ -73,7 +79,7 @@ pub struct Layout {
 
 impl Layout {
     /// Places `charts` at `density` texels per scene unit (finite, > 0) in as many pages of
-    /// `page_size` (1 to [`MAX_PAGE_SIZE`]) as they need, with `padding` texels around each.
+    /// `page_size` (1 to [`MAX_PAGE_SIZE`](super::charts::MAX_PAGE_SIZE)) as they need, with `padding` texels around each.
     ///
     /// With `honour_given` the charts that the caller placed stay where they are, and the others
     /// go to further pages. The charts of `with_backs`, ascending, get a second place for their backs.

@@ -12,8 +12,11 @@ pub(in crate::lightmap) const CHARTS: &str = "the charts";
 /// Placement by the caller's UVs: uv = `offset` + `scale` · local.
 #[derive(Clone, Copy, Debug, PartialEq)]
 pub struct Given {
+    /// Number of the page.
     pub page: u32,
+    /// UV of the local origin.
     pub offset: [f32; 2],
+    /// UV per unit of local coordinates.
     pub scale: [f32; 2],
 }
 

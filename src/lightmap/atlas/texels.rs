@@ -28,13 +28,15 @@ use std::sync::atomic::{AtomicU64, Ordering::Relaxed};
 #[derive(Clone, Copy, Debug, Default, PartialEq, bytemuck::Pod, bytemuck::Zeroable)]
 #[repr(C)]
 pub struct TexelSample {
-    /// The texel in its page. (The page is that of the sample's placement.)
+    /// Column of the texel in its page, which is that of the sample's placement.
     pub x: u16,
+    /// Row of the texel.
     pub y: u16,
     /// Global triangle number.
     pub triangle: u32,
-    /// Weights of the triangle's corners 1 and 2; u, v ≥ 0, u + v ≤ 1 up to rounding.
+    /// Weight of the triangle's corner 1; u, v ≥ 0, u + v ≤ 1 up to rounding.
     pub u: f32,
+    /// Weight of the triangle's corner 2.
     pub v: f32,
 }
 
@@ -72,7 +74,9 @@ impl TexelSample {
 /// repeat a used sample.
 #[derive(Clone, Copy, Debug, PartialEq)]
 pub struct Bilinear {
+    /// Numbers of the four samples.
     pub samples: [u32; 4],
+    /// Weight of each.
     pub weights: [f32; 4],
 }
 
