@@ -160,14 +160,14 @@ fn around_given_charts_bakes_and_live_light_are_padded_alike() {
 fn around_given_charts_whatever_changes_is_dirty() {
     let lightmap = unbaked_of(room_with_uvs(0.04), 2, 20.0);
     let mut live = Live::new(&lightmap, &params(Mode::Uniform), &Progress::none()).unwrap();
-    live.take_dirty(usize::MAX);
+    live.take_dirty(usize::MAX).unwrap();
     let mut before = pages(&live, &lightmap);
     let width = lightmap.info().width;
     for i in 0..6 {
         live.update(&camera(i), &RAYS).unwrap();
         let mut uploaded = before.clone();
         let after = pages(&live, &lightmap);
-        for r in live.take_dirty(usize::MAX) {
+        for r in live.take_dirty(usize::MAX).unwrap() {
             for (y, x) in (r.y..r.y + r.height).flat_map(|y| (r.x..r.x + r.width).map(move |x| (y, x))) {
                 uploaded[(y * width + x) as usize] = after[(y * width + x) as usize];
             }
@@ -317,12 +317,12 @@ fn what_changes_is_covered_by_dirty_rectangles_and_is_never_negative() {
         let mut live = Live::new(&lightmap, &params(mode), &Progress::none()).unwrap();
         let size = lightmap.info().width;
         let whole = PageRect { page: 0, x: 0, y: 0, width: size, height: size };
-        assert_eq!(live.take_dirty(1), [whole]);
+        assert_eq!(live.take_dirty(1).unwrap(), [whole]);
         let mut copy = pages(&live, &lightmap);
-        live.take_dirty(usize::MAX);
+        live.take_dirty(usize::MAX).unwrap();
         for i in 0..40 {
             live.update(&camera(i), &Budget { milliseconds: 0.0, rays: 30_000 }).unwrap();
-            while let Some(r) = live.take_dirty(1).pop() {
+            while let Some(r) = live.take_dirty(1).unwrap().pop() {
                 let values = live.read(&r, live.params().lod_count - 1, true).unwrap();
                 for (k, v) in values.into_iter().enumerate() {
                     let (x, y) = (r.x + k as u32 % r.width, r.y + k as u32 / r.width);
@@ -618,7 +618,7 @@ fn a_monitor_that_refuses_growth_stops_the_work_and_nothing_else() {
 fn bad_cameras_and_budgets_are_refused_and_change_nothing() {
     let lightmap = unbaked("cornell", 1, 60.0);
     let mut live = Live::new(&lightmap, &params(Mode::View), &Progress::none()).unwrap();
-    live.take_dirty(usize::MAX);
+    live.take_dirty(usize::MAX).unwrap();
     let before = (live.sums().unwrap(), pages(&live, &lightmap));
     let good = camera(0);
     let bad = [
@@ -640,7 +640,7 @@ fn bad_cameras_and_budgets_are_refused_and_change_nothing() {
     let stats = live.update(&good, &Budget { milliseconds: 0.0, rays: 0 }).unwrap();
     assert_eq!((stats.rays, stats.blocks_changed), (0, 0));
     assert_eq!((live.sums().unwrap(), pages(&live, &lightmap)), before);
-    assert!(live.take_dirty(8).is_empty());
+    assert!(live.take_dirty(8).unwrap().is_empty());
     // From inside a wall, outside the scene and very far away: nothing to see, and no harm.
     for position in [Vec3::new(0.0, -0.001, 0.0), Vec3::splat(100.0), Vec3::splat(1e18)] {
         live.update(&LiveCamera { position, ..good }, &RAYS).unwrap();

@@ -190,6 +190,25 @@ pub fn try_par_collect<T: Send>(values: impl IndexedParallelIterator<Item = T>, 
     Ok(v)
 }
 
+/// What an iterator gives, up to its first error.
+pub fn try_collect_ok<T>(values: impl IntoIterator<Item = Result<T>>, what: &str) -> Result<Vec<T>> {
+    let values = values.into_iter();
+    let mut v = try_with_capacity(values.size_hint().0, what)?;
+    for value in values {
+        try_push(&mut v, value?, what)?;
+    }
+    Ok(v)
+}
+
+/// What a parallel iterator of known length gives, in order, or the first of its errors. (All elements are asked for:
+/// work that can be cancelled must find that out by itself.)
+pub fn try_par_collect_ok<T: Send>(
+    values: impl IndexedParallelIterator<Item = Result<T>>,
+    what: &str,
+) -> Result<Vec<T>> {
+    try_collect_ok(try_par_collect(values, what)?, what)
+}
+
 /// What `part` adds to the end of a `Vec` for each of the numbers below `parts`, in their order. Each part should be
 /// small, all together may be many.
 pub fn try_par_gather<T: Send>(

@@ -51,7 +51,7 @@ impl Room {
 }
 
 /// See [`super::refit::refit`].
-pub(super) fn refit(tree: &mut Compact, corners: &(impl Fn(u32) -> [Vec3; 3] + Sync), room: Room) -> Vec<u32> {
+pub(super) fn refit(tree: &mut Compact, corners: &(impl Fn(u32) -> [Vec3; 3] + Sync), room: Room) {
     let end = tree.triangles.len() - PAD;
     tree.triangles[..end].par_iter_mut().with_min_len(CHUNK).for_each(|t| {
         *t = if is_valid_triangle(corners(*t & NUMBER)) { *t & !GONE } else { *t | GONE };
@@ -65,12 +65,6 @@ pub(super) fn refit(tree: &mut Compact, corners: &(impl Fn(u32) -> [Vec3; 3] + S
         }
     }
     tree.bounds = boxes[0].corners();
-    let gone = tree.triangles[..end].iter().filter(|&t| t & GONE != 0);
-    let mut out: Vec<u32> = gone.map(|t| t & NUMBER).collect();
-    // By leaves until here, and several times if cut.
-    out.sort_unstable();
-    out.dedup();
-    out
 }
 
 /// A node with new boxes, and the box around them; `boxes` are those of the nodes below.
@@ -115,9 +109,14 @@ mod tests {
         collapse_compact(&binary, &[0, n], &Progress::none()).unwrap()
     }
 
+    /// A refit; the triangles that no ray can hit afterwards.
     fn refit_here(tree: &mut Compact, corners: &(impl Fn(u32) -> [Vec3; 3] + Sync)) -> Vec<u32> {
         let room = Room::new(tree).unwrap();
-        refit(tree, corners, room)
+        refit(tree, corners, room);
+        let gone = tree.triangles[..tree.triangles.len() - PAD].iter().filter(|&t| t & GONE != 0);
+        let mut out: Vec<u32> = gone.map(|t| t & NUMBER).collect();
+        out.sort_unstable();
+        out
     }
 
     fn bits(tree: &Compact) -> (Vec<u8>, Vec<u32>, (Vec3, Vec3)) {

@@ -153,7 +153,7 @@ impl Tree {
     }
 
     /// See [`refit::refit`]. `room` must have been made for this tree.
-    pub(crate) fn refit(&mut self, corners: &(impl Fn(u32) -> [Vec3; 3] + Sync), room: RefitRoom) -> Vec<u32> {
+    pub(crate) fn refit(&mut self, corners: &(impl Fn(u32) -> [Vec3; 3] + Sync), room: RefitRoom) {
         match (self, room) {
             (Tree::Compact(t), Some(room)) => compact_refit::refit(t, corners, room),
             (Tree::Whole(t), _) => refit::refit(t, corners),
@@ -261,7 +261,7 @@ mod tests {
                     let meshes = [0, corners.len() as u32];
                     let (mut tree, _) = build(&corners, &valid, &meshes, &options, &Progress::none()).unwrap();
                     let room = tree.room_to_refit().unwrap();
-                    assert!(tree.refit(&|t| corners[t as usize], room).is_empty());
+                    tree.refit(&|t| corners[t as usize], room);
                 }
             });
         }

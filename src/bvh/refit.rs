@@ -28,43 +28,30 @@ struct Part<'a> {
     first_slot: usize,
 }
 
-/// What is known of a subtree once it is done.
-struct Below {
-    bounds: Box4,
-    /// See [`refit`].
-    out: Vec<u32>,
-}
-
-/// Moves the triangles of `tree` to where `corners` (by global number) says, and gives the numbers,
-/// ascending, of those which no ray can hit there because they are degenerate or not finite. These stay in
-/// the tree and can come back with the next refit; they widen no box. Where no triangle is left, boxes are
-/// empty, the bounds too.
+/// Moves the triangles of `tree` to where `corners` (by global number) says. Those which no ray can hit there because
+/// they are degenerate or not finite stay in the tree and can come back with the next refit; they widen no box. Where
+/// no triangle is left, boxes are empty, the bounds too. Takes no memory.
 ///
 /// Leaf boxes become those of whole triangles: where spatial splits had cut triangles, they are larger
 /// than the builder's even if nothing moved.
-pub(crate) fn refit(tree: &mut Mbvh, corners: &(impl Fn(u32) -> [Vec3; 3] + Sync)) -> Vec<u32> {
+pub(crate) fn refit(tree: &mut Mbvh, corners: &(impl Fn(u32) -> [Vec3; 3] + Sync)) {
     let (root, nodes) = tree.nodes.split_first_mut().expect("there is a root");
     let end = tree.leaves.len() - LEAF_PAD;
     let part = Part { nodes, first_node: 1, rows: &mut tree.leaves[..end], first_slot: 0 };
-    let Below { bounds, mut out } = refit_node(root, part, corners);
-    tree.bounds = bounds.corners();
-    // By leaves until here, and several times if cut.
-    out.sort_unstable();
-    out.dedup();
-    out
+    tree.bounds = refit_node(root, part, corners).corners();
 }
 
-fn refit_node(node: &mut Node, part: Part, corners: &(impl Fn(u32) -> [Vec3; 3] + Sync)) -> Below {
+/// The box around all that lies below a node, once that is done.
+fn refit_node(node: &mut Node, part: Part, corners: &(impl Fn(u32) -> [Vec3; 3] + Sync)) -> Box4 {
     let parallel = part.nodes.len() > PARALLEL_SUBTREE;
     let Part { nodes, first_node, rows, first_slot } = part;
     let mut boxes = [Box4::EMPTY; WIDTH];
-    let mut out = Vec::new();
 
     let mut used = 0;
     for (i, leaf) in leaves(node) {
         let count = leaf.leaf_count();
         debug_assert!(leaf.leaf_slot() == first_slot + used / LEAF_STRIDE);
-        boxes[i] = refit_leaf(&mut rows[used..][..LEAF_STRIDE * count], corners, &mut out);
+        boxes[i] = refit_leaf(&mut rows[used..][..LEAF_STRIDE * count], corners);
         used += LEAF_STRIDE * count;
     }
 
@@ -74,17 +61,17 @@ fn refit_node(node: &mut Node, part: Part, corners: &(impl Fn(u32) -> [Vec3; 3] 
     let (block, mut nodes) = nodes.split_at_mut(inner);
     let (mut rows, first_node) = (&mut rows[used..], first_node + inner);
     let first_slot = first_slot + used / LEAF_STRIDE;
-    let mut shares: [Option<(&mut Node, Part, Below)>; WIDTH] = Default::default();
+    let mut shares: [Option<(&mut Node, Part, Box4)>; WIDTH] = Default::default();
     for (share, child) in shares[..inner].iter_mut().zip(block).rev() {
         let node = self::inner(child).next().map_or(first_node + nodes.len(), |(_, c)| c.node_index());
         let (before, own_nodes) = nodes.split_at_mut(node - first_node);
         let slot = first_slot_below(child, own_nodes, node);
         let (rows_before, own_rows) = rows.split_at_mut((slot - first_slot) * LEAF_STRIDE);
         let part = Part { nodes: own_nodes, first_node: node, rows: own_rows, first_slot: slot };
-        *share = Some((child, part, Below { bounds: Box4::EMPTY, out: Vec::new() }));
+        *share = Some((child, part, Box4::EMPTY));
         (nodes, rows) = (before, rows_before);
     }
-    let run = |share: &mut Option<(&mut Node, Part, Below)>| {
+    let run = |share: &mut Option<(&mut Node, Part, Box4)>| {
         let (child, part, below) = share.as_mut().expect("as many as there are inner children");
         *below = refit_node(child, std::mem::take(part), corners);
     };
@@ -95,15 +82,14 @@ fn refit_node(node: &mut Node, part: Part, corners: &(impl Fn(u32) -> [Vec3; 3] 
     }
     for ((i, _), share) in self::inner(node).zip(shares) {
         let (_, _, below) = share.expect("as many as there are inner children");
-        boxes[i] = below.bounds;
-        out.extend(below.out);
+        boxes[i] = below;
     }
 
     for (i, b) in boxes.iter().enumerate() {
         set_box(node, i, b);
     }
     node.sort_children();
-    Below { bounds: boxes.into_iter().fold(Box4::EMPTY, Box4::join), out }
+    boxes.into_iter().fold(Box4::EMPTY, Box4::join)
 }
 
 fn leaves(node: &Node) -> impl Iterator<Item = (usize, ChildRef)> + use<> {
@@ -126,7 +112,7 @@ fn first_slot_below<'a>(mut node: &'a Node, below: &'a [Node], first: usize) -> 
 }
 
 /// Rewrites the rows of a leaf and gives its box.
-fn refit_leaf(rows: &mut [f32], corners: &impl Fn(u32) -> [Vec3; 3], out: &mut Vec<u32>) -> Box4 {
+fn refit_leaf(rows: &mut [f32], corners: &impl Fn(u32) -> [Vec3; 3]) -> Box4 {
     let count = rows.len() / LEAF_STRIDE;
     let mut bounds = Box4::EMPTY;
     for k in 0..count {
@@ -137,7 +123,6 @@ fn refit_leaf(rows: &mut [f32], corners: &impl Fn(u32) -> [Vec3; 3], out: &mut V
         } else {
             // Its edge functions are NaN: no ray is inside.
             c = [Vec3::NAN; 3];
-            out.push(triangle);
         }
         for row in 0..9 {
             rows[row * count + k] = c[row / 3][row % 3];
@@ -182,8 +167,18 @@ mod tests {
         collapse(&build_binary(corners, &valid, options, &none).unwrap(), corners, &none).unwrap()
     }
 
+    /// The tree after a refit, and the triangles that no ray can hit.
     fn moved(mut tree: Mbvh, corners: &Triangles) -> (Mbvh, Vec<u32>) {
-        let out = refit(&mut tree, &|t| corners[t as usize]);
+        refit(&mut tree, &|t| corners[t as usize]);
+        let mut out = Vec::new();
+        for (_, leaf) in tree.nodes.iter().flat_map(leaves) {
+            let (slot, count) = (leaf.leaf_slot() * LEAF_STRIDE, leaf.leaf_count());
+            let rows = &tree.leaves[slot..][..LEAF_STRIDE * count];
+            out.extend((0..count).filter(|&k| rows[k].is_nan()).map(|k| rows[9 * count + k].to_bits()));
+        }
+        // Several times if cut.
+        out.sort_unstable();
+        out.dedup();
         (tree, out)
     }
 

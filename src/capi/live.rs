@@ -477,10 +477,14 @@ pub unsafe extern "C" fn bk_live_dirty_rects(
         let taken = live.change(|l| {
             let lod = l.params().lod_count - 1;
             let rect = |r: PageRect| bk_rect { page: r.page, lod, x: r.x, y: r.y, width: r.width, height: r.height };
-            Ok(l.take_dirty(capacity).into_iter().map(rect).collect::<Vec<_>>())
+            let mut taken = 0;
+            l.take_each_dirty(capacity, |r| {
+                out[taken] = rect(r);
+                taken += 1;
+            });
+            Ok(taken)
         })?;
-        out[..taken.len()].copy_from_slice(&taken);
-        write(count, taken.len(), "count")
+        write(count, taken, "count")
     })
 }
 

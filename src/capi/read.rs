@@ -12,6 +12,7 @@ use super::handles::{is_null, object};
 use super::lightmap::bk_lightmap;
 use crate::error::{Error, Result, invalid_argument};
 use crate::lightmap::{Layer, LayerData, Lightmap};
+use crate::memory::try_with_capacity;
 use crate::progress::Progress;
 use std::ffi::{c_char, c_void};
 
@@ -84,7 +85,7 @@ pub unsafe extern "C" fn bk_lightmap_read(
         if stride < packed {
             return invalid_argument!("row_stride is {row_stride}, less than the {packed} bytes of a row");
         }
-        let bytes = encode(&data, format).ok_or_else(|| {
+        let bytes = encode(&data, format)?.ok_or_else(|| {
             Error::InvalidArgument(format!("format is {format}, which does not suit the layer {layer:?}"))
         })?;
         if bytes.len() != packed * info.height as usize {
@@ -120,7 +121,7 @@ pub(super) unsafe fn copy_rgb(
     stride: usize,
 ) -> Result<()> {
     let bytes = LayerData::Rgb(texels);
-    let bytes = encode(&bytes, format)
+    let bytes = encode(&bytes, format)?
         .ok_or_else(|| Error::InvalidArgument(format!("format is {format}, not one of the formats of light")))?;
     if width > 0 {
         // SAFETY: by contract.
@@ -153,17 +154,19 @@ pub(super) fn texel_bytes(format: u32) -> Result<usize> {
 }
 
 /// The texels of a layer in a format, or `None` if the format does not suit it.
-fn encode(data: &LayerData, format: u32) -> Option<std::borrow::Cow<'_, [u8]>> {
-    match (data, format) {
+fn encode(data: &LayerData, format: u32) -> Result<Option<std::borrow::Cow<'_, [u8]>>> {
+    Ok(match (data, format) {
         (LayerData::Rgb(rgb), BK_FORMAT_RGB32F) => Some(bytemuck::cast_slice(rgb).into()),
         (LayerData::Rgb(rgb), BK_FORMAT_RGBA16F) => {
             let half = |rgb: &[f32; 3]| [rgb[0], rgb[1], rgb[2], 1.0].map(half_bits);
-            Some(rgb.iter().flat_map(|t| bytemuck::cast::<[u16; 4], [u8; 8]>(half(t))).collect())
+            let mut bytes = try_with_capacity(8 * rgb.len(), "a page")?;
+            bytes.extend(rgb.iter().flat_map(|t| bytemuck::cast::<[u16; 4], [u8; 8]>(half(t))));
+            Some(bytes.into())
         }
         (LayerData::Scalar(v), BK_FORMAT_R32F) => Some(bytemuck::cast_slice(v).into()),
         (LayerData::Integer(v), BK_FORMAT_R32U) => Some(bytemuck::cast_slice(v).into()),
         _ => None,
-    }
+    })
 }
 
 /// IEEE 754 half precision, rounded to nearest even; magnitudes beyond the largest half are clamped
@@ -357,10 +360,10 @@ mod tests {
 
     #[test]
     fn a_format_that_does_not_suit_the_layer_is_none() {
-        assert!(encode(&LayerData::Rgb(vec![[1.0; 3]]), BK_FORMAT_R32F).is_none());
-        assert!(encode(&LayerData::Integer(vec![1]), BK_FORMAT_R32F).is_none());
+        assert_eq!(encode(&LayerData::Rgb(vec![[1.0; 3]]), BK_FORMAT_R32F), Ok(None));
+        assert_eq!(encode(&LayerData::Integer(vec![1]), BK_FORMAT_R32F), Ok(None));
         let rgb = LayerData::Rgb(vec![[1.0, 0.5, 0.0]]);
-        let half = encode(&rgb, BK_FORMAT_RGBA16F).unwrap();
+        let half = encode(&rgb, BK_FORMAT_RGBA16F).unwrap().unwrap();
         assert_eq!(*half, *bytemuck::cast_slice::<u16, u8>(&[0x3c00, 0x3800, 0, 0x3c00]));
     }
 }

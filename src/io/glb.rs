@@ -29,6 +29,7 @@ use super::source::Advance;
 use crate::error::{Error, Result, invalid_argument};
 use crate::files;
 use crate::lightmap::Lightmap;
+use crate::memory::{try_append, try_collect};
 use crate::scene::{Material, NONE, Scene};
 use glam::{Vec2, Vec3};
 use serde_json::{Value, json};
@@ -63,7 +64,7 @@ impl GlbMesh {
         let (corner_uvs, pages) = lightmap.mesh_uvs(mesh)?;
         let ((back_uvs, back_pages), own) = lightmap.mesh_back_uvs(mesh)?;
         let back = |t: usize| GlbBack { triangle: t as u32, corner_uvs: back_uvs[t], page: back_pages[t] };
-        let backs = (0..own.len()).filter(|&t| own[t]).map(back).collect();
+        let backs = try_collect((0..own.len()).filter(|&t| own[t]).map(back), "the backs of a mesh")?;
         Ok(GlbMesh { corner_uvs, pages, backs })
     }
 }
@@ -115,7 +116,11 @@ pub fn encode_glb(scene: &Scene, lightmap: &GlbLightmap) -> Result<Vec<u8>> {
     let mut account = Account::new(scene.device().memory())?;
     let (json, binary) = parts(scene, lightmap, &mut account, &|_| Ok(()))?;
     let headers = headers(&json, &binary)?;
-    Ok([&headers[0][..], &json, &headers[1], &binary].concat())
+    let mut file = Vec::new();
+    for part in [&headers[0][..], &json, &headers[1], &binary] {
+        try_append(&mut file, part, "the GLB file")?;
+    }
+    Ok(file)
 }
 
 /// The two chunks of the file, without their headers.

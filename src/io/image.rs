@@ -8,6 +8,7 @@
 use super::source::{Advance, place};
 use crate::error::{Error, Result, invalid_argument};
 use crate::files;
+use crate::memory::try_collect;
 use crate::scene::{Environment, MAX_COORDINATE, MAX_ENVIRONMENT_SIZE};
 use image::ExtendedColorType::Rgb32F;
 use image::codecs::openexr::OpenExrEncoder;
@@ -112,13 +113,13 @@ pub fn read_environment(path: &Path) -> Result<Environment> {
     let image = reader.decode().map_err(|e| fail(path, e))?.into_rgb32f();
     let (width, height) = image.dimensions();
     let value = |c: f32| if c > 0.0 { c.min(MAX_COORDINATE) } else { 0.0 };
-    let rgb = image.pixels().map(|p| p.0.map(value)).collect();
+    let rgb = try_collect(image.pixels().map(|p| p.0.map(value)), "the image of a sky")?;
     Environment::new(width, height, rgb).map_err(|e| fail(path, e))
 }
 
 /// Writes single values as an OpenEXR file of 32-bit floats, the same in R, G and B.
 pub fn write_exr_grey(path: &Path, width: u32, height: u32, pixels: &[f32]) -> Result<()> {
-    write_exr(path, width, height, &pixels.iter().map(|&v| [v; 3]).collect::<Vec<_>>())
+    write_exr(path, width, height, &try_collect(pixels.iter().map(|&v| [v; 3]), "an image")?)
 }
 
 /// Writes sRGB colours as a PNG file.
@@ -234,7 +235,12 @@ const EXPOSURE_PERCENTILE: f64 = 0.9;
 /// are none.
 pub fn auto_exposure(pixels: &[[f32; 3]], mask: impl Fn(usize) -> bool) -> f32 {
     let included = pixels.iter().enumerate().filter(|(i, _)| mask(*i));
-    let mut lit: Vec<f32> = included.map(|(_, p)| luminance(*p)).filter(|l| *l > 0.0 && l.is_finite()).collect();
+    exposure_of(&mut included.map(|(_, p)| luminance(*p)).collect())
+}
+
+/// [`auto_exposure`] from luminances, of which those that are not lit or not finite are removed.
+pub(super) fn exposure_of(lit: &mut Vec<f32>) -> f32 {
+    lit.retain(|l| *l > 0.0 && l.is_finite());
     if lit.is_empty() {
         return 1.0;
     }

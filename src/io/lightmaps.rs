@@ -2,11 +2,11 @@
 
 use super::account::Account;
 use super::glb::{GlbLightmap, GlbMesh, prepare_glb};
-use super::image::{auto_exposure, encode_png, tone_map, write_exr_with, write_png_with};
+use super::image::{encode_png, exposure_of, luminance, tone_map, write_exr_with, write_png_with};
 use super::source::Advance;
 use crate::error::{Error, Result};
 use crate::lightmap::{Layer, LayerData, Lightmap};
-use crate::memory::{Reservation, try_vec};
+use crate::memory::{Reservation, try_collect_ok, try_vec};
 use crate::progress::Progress;
 use rayon::prelude::*;
 use std::f32::consts::PI;
@@ -20,16 +20,16 @@ const LAYERS: [(Layer, &str); 4] = [
     (Layer::Radiance, "radiance"),
 ];
 
-/// One exposure for all pages (see [`auto_exposure`]), from the texels that are lit.
+/// One exposure for all pages (see [`auto_exposure`](super::image::auto_exposure)), from the texels that are lit.
 pub fn exposure(lightmap: &Lightmap) -> Result<f32> {
     let mut account = Account::new(lightmap.scene().device().memory())?;
-    let mut pixels = Vec::new();
+    let mut luminances = Vec::new();
     for page in 0..lightmap.info().page_count {
         let page = rgb(lightmap, page, Layer::Combined)?;
-        account.make_room(&mut pixels, page.len(), "the exposure")?;
-        pixels.extend(page);
+        account.make_room(&mut luminances, page.len(), "the exposure")?;
+        luminances.extend(page.into_iter().map(luminance));
     }
-    Ok(auto_exposure(&pixels, |_| true))
+    Ok(exposure_of(&mut luminances))
 }
 
 /// Writes the light layers as floats, `PREFIXpageN-LAYER.exr`, and returns the paths.
@@ -77,8 +77,8 @@ pub fn write_scene(lightmap: &Lightmap, path: &Path, exposure: Option<f32>, prog
         let stage = progress.stage("scene with light map", 0.0, 1.0, u64::from(info.page_count) + 2);
         let exposure = exposure.map_or_else(|| self::exposure(lightmap), Ok)?;
         let meshes = (0..lightmap.scene().meshes().len() as u32)
-            .map(|mesh| stage.advance(0).and_then(|()| GlbMesh::of(lightmap, mesh)))
-            .collect::<Result<_>>()?;
+            .map(|mesh| stage.advance(0).and_then(|()| GlbMesh::of(lightmap, mesh)));
+        let meshes = try_collect_ok(meshes, "the meshes")?;
         let page = |page| {
             let _encoder = encoder_memory(lightmap)?;
             let pixels = tone_mapped(lightmap, page, Layer::Combined, exposure)?;

@@ -17,7 +17,7 @@ use super::texel_light::{TexelLight, Variation};
 use super::{BakeParams, BakeStats, CheckpointParams, Light, Lightmap, Origin, StageStats, TexelState};
 use crate::direct::DirectLight;
 use crate::error::{Error, Result, invalid_argument};
-use crate::memory::try_vec;
+use crate::memory::{try_filled, try_vec};
 use crate::photon::{PhotonMap, PhotonParams};
 use crate::progress::{Progress, Stage};
 use crate::sampling::{combine, purpose_seed};
@@ -278,7 +278,7 @@ impl Bake<'_, '_> {
     /// texels need to be lit.
     pub(crate) fn backs(&self, radiance: &[Vec3]) -> Result<Vec<bool>> {
         let l = self.atlas;
-        if let Some(backs) = self.checkpoint.and_then(|c| c.backs(l.charts.charts.len())) {
+        if let Some(backs) = self.checkpoint.map(|c| c.backs(l.charts.charts.len())).transpose()?.flatten() {
             return Ok(backs);
         }
         // Without indirect light there is no radiance map: direct light decides.
@@ -380,7 +380,7 @@ impl Bake<'_, '_> {
     ) -> Result<(OwnLight, u64)> {
         let l = self.atlas;
         let texels = upsampling.own_work() as usize / 2;
-        if let Some(own) = self.checkpoint.and_then(|c| c.own_light(texels)) {
+        if let Some(own) = self.checkpoint.map(|c| c.own_light(texels)).transpose()?.flatten() {
             return Ok((own, 0));
         }
         let count = self.params.gather_rays.min(OWN_RAYS);
@@ -413,7 +413,7 @@ impl Bake<'_, '_> {
         let backs = &light.backs[..];
         let texels = self.texel_light();
         // Blocks whose light a checkpoint has.
-        let mut known = vec![false; range.len().div_ceil(BLOCK)];
+        let mut known = try_filled(range.len().div_ceil(BLOCK), false, "blocks of texels")?;
         scene.device().install(|| {
             let direct = light.direct[range.clone()].par_chunks_mut(BLOCK).zip(&mut known);
             let indirect_out = light.indirect[range.clone()].par_chunks_mut(BLOCK);

@@ -155,7 +155,7 @@ impl Lightmap {
         out.fill(empty);
         let texels = &self.atlas.map.texels;
         let groups = texels.groups_of_page(page);
-        texels.compose(groups, &PageArea::page(size), padding, &mut out, |s| value(s as usize), fill);
+        texels.compose(groups, &PageArea::page(size), padding, &mut out, |s| value(s as usize), fill)?;
         Ok(out)
     }
 

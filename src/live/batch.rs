@@ -1,10 +1,11 @@
 //! Blocks that several threads work on: during an update, or between updates. The blocks are moved
 //! into the batch and taken back from it, so that nothing is locked that anybody else reads.
 
-use super::blocks::Block;
+use super::blocks::{Block, Blocks};
 use super::work::{Context, Done, Limit, Step};
 use crate::device::Device;
 use crate::error::{Error, Result};
+use crate::memory::try_with_capacity;
 use std::panic::{AssertUnwindSafe, catch_unwind};
 use std::sync::atomic::{AtomicBool, AtomicUsize, Ordering::Relaxed};
 use std::sync::{Arc, Condvar, Mutex, MutexGuard};
@@ -33,29 +34,33 @@ pub(super) struct Batch {
 }
 
 /// The result of a batch: its blocks, the rays traced, and an error if a thread panicked.
-pub(super) type Outcome = (Vec<Item>, u64, Result<()>);
+pub(super) type Outcome = (Vec<Mutex<Item>>, u64, Result<()>);
 
 impl Batch {
+    /// Takes the `chosen` of the blocks that are not away. An error takes none.
     pub fn new(
         context: Context,
-        blocks: impl Iterator<Item = (u32, Block)>,
+        blocks: &mut Blocks,
+        chosen: &[u32],
         step: Step,
         limit: Limit,
         showing: Duration,
-    ) -> Batch {
-        let item = |(number, block): (u32, Block)| {
-            Mutex::new(Item { number, bytes: block.work.bytes(), block, done: Done::default() })
-        };
-        Batch {
+    ) -> Result<Batch> {
+        let mut items = try_with_capacity(chosen.len(), "blocks to be worked on")?;
+        items.extend(chosen.iter().filter_map(|&number| {
+            let block = blocks.take(number)?;
+            Some(Mutex::new(Item { number, bytes: block.work.bytes(), block, done: Done::default() }))
+        }));
+        Ok(Batch {
             context,
-            items: blocks.map(item).collect(),
+            items,
             step,
             limit,
             showing,
             next: AtomicUsize::new(0),
             completed: AtomicUsize::new(0),
             panicked: AtomicBool::new(false),
-        }
+        })
     }
 
     /// Works on the threads of the pool that this is called in, as many as come, and waits for those.
@@ -94,13 +99,10 @@ impl Batch {
     fn outcome(self) -> Outcome {
         let result = if self.panicked.into_inner() {
             Err(Error::Internal("work on a block of texels panicked".into()))
-        } else if self.limit.out_of_memory.into_inner() {
-            Err(Error::OutOfMemory("direct light of a block of texels".into()))
         } else {
-            Ok(())
+            self.limit.check_memory()
         };
-        let items = self.items.into_iter().map(|i| i.into_inner().unwrap_or_else(|e| e.into_inner()));
-        (items.collect(), self.limit.traced.into_inner(), result)
+        (self.items, self.limit.traced.into_inner(), result)
     }
 }
 

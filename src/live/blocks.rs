@@ -5,11 +5,11 @@
 //! resolution); the texels of a lower LOD are among those of the next, so that no ray is lost when
 //! the detail grows, and what two LODs share at the border of two blocks has one value.
 
-use crate::error::{Error, Result};
+use crate::error::Result;
 use crate::lightmap::atlas::Atlas;
 use crate::lightmap::atlas::layout::Placement;
 use crate::lightmap::indirect::gather::Gathered;
-use crate::memory::try_vec;
+use crate::memory::{try_collect, try_to_vec, try_vec, try_with_capacity};
 use crate::progress::Progress;
 use crate::scene::NONE;
 use glam::Vec3;
@@ -18,6 +18,9 @@ use std::sync::Arc;
 
 /// Gather texels along a side of a block.
 pub(super) const TILE: i32 = 8;
+
+/// Gather texels of a block, at most.
+pub(super) const BLOCK_TEXELS: usize = (TILE * TILE) as usize;
 
 /// The most LODs: the lowest then computes one texel of a block.
 pub const MAX_LODS: usize = 4;
@@ -161,32 +164,29 @@ pub(super) struct BlockWork {
 #[derive(Debug, Default)]
 pub(super) struct Block {
     pub status: BlockStatus,
-    pub work: Box<BlockWork>,
+    pub work: BlockWork,
 }
 
 /// All blocks. The work of some may be away, in a [`Batch`](super::batch::Batch); their status never is.
 pub(super) struct Blocks {
     status: Vec<BlockStatus>,
     /// `None`: away.
-    work: Vec<Option<Box<BlockWork>>>,
+    work: Vec<Option<BlockWork>>,
 }
 
 impl Blocks {
     /// Idle blocks.
     pub fn new(count: usize) -> Result<Blocks> {
-        let mut blocks = Blocks::away(&try_vec(count, "the state of blocks")?)?;
-        blocks.work.fill_with(|| Some(Box::default()));
+        let mut blocks = Blocks::away(&try_vec(count, STATE)?)?;
+        blocks.work.fill_with(|| Some(BlockWork::default()));
         Ok(blocks)
     }
 
     /// Blocks that are all away.
     pub fn away(status: &[BlockStatus]) -> Result<Blocks> {
-        let mut copy = try_vec(status.len(), "the state of blocks")?;
-        copy.copy_from_slice(status);
-        let mut work = Vec::new();
-        work.try_reserve_exact(status.len()).map_err(|_| no_room(status.len()))?;
+        let mut work = try_with_capacity(status.len(), STATE)?;
         work.resize_with(status.len(), || None);
-        Ok(Blocks { status: copy, work })
+        Ok(Blocks { status: try_to_vec(status, STATE)?, work })
     }
 
     /// Takes the place of those of these blocks that are not away.
@@ -203,9 +203,7 @@ impl Blocks {
     }
 
     /// All blocks, for threads that work on them where they are.
-    pub fn par_iter_mut(
-        &mut self,
-    ) -> impl IndexedParallelIterator<Item = (&mut BlockStatus, &mut Option<Box<BlockWork>>)> {
+    pub fn par_iter_mut(&mut self) -> impl IndexedParallelIterator<Item = (&mut BlockStatus, &mut Option<BlockWork>)> {
         self.status.par_iter_mut().zip(&mut self.work)
     }
 
@@ -220,11 +218,11 @@ impl Blocks {
 
     /// What a block has accumulated; `None` while it is away.
     pub fn work(&self, b: u32) -> Option<&BlockWork> {
-        self.work[b as usize].as_deref()
+        self.work[b as usize].as_ref()
     }
 
     pub fn work_mut(&mut self, b: u32) -> Option<&mut BlockWork> {
-        self.work[b as usize].as_deref_mut()
+        self.work[b as usize].as_mut()
     }
 
     /// Hands a block out to be worked on; `None` if it is away already.
@@ -254,8 +252,7 @@ impl DirectTile {
 impl Tile {
     /// Bytes held, with those of an idle block.
     pub fn bytes(&self) -> usize {
-        let block = size_of::<BlockStatus>() + size_of::<Option<Box<BlockWork>>>() + size_of::<BlockWork>();
-        size_of::<Tile>() + block + self.texels.len() * 4
+        size_of::<Tile>() + size_of::<BlockStatus>() + size_of::<Option<BlockWork>>() + self.texels.len() * 4
     }
 }
 
@@ -268,10 +265,8 @@ impl BlockWork {
     }
 }
 
-#[cold]
-fn no_room(blocks: usize) -> Error {
-    Error::OutOfMemory(format!("there is no room for the state of {blocks} blocks of texels"))
-}
+/// What buffers are for, in errors.
+const STATE: &str = "the state of blocks";
 
 /// All blocks of an atlas, and where they are.
 pub(super) struct BlockMap {
@@ -298,8 +293,8 @@ impl BlockMap {
         let mut map = BlockMap {
             atlas: atlas.clone(),
             tiles: Vec::new(),
-            first: Vec::with_capacity(placements.len() + 1),
-            origin: Vec::with_capacity(placements.len()),
+            first: try_with_capacity(placements.len() + 1, STATE)?,
+            origin: try_with_capacity(placements.len(), STATE)?,
             lod_of: try_vec(atlas.gather.len(), "the LODs of the gather map")?,
             shown_elsewhere: Vec::new(),
             top,
@@ -307,7 +302,8 @@ impl BlockMap {
         map.lod_of.fill(top);
         let tiles = |p: &Placement| p.w.div_ceil(TILE as u16) as usize * p.h.div_ceil(TILE as u16) as usize;
         let count = placements.iter().map(tiles).sum();
-        map.tiles.try_reserve_exact(count).map_err(|_| no_room(count))?;
+        map.tiles = try_with_capacity(count, STATE)?;
+        let mut texels = Vec::with_capacity(BLOCK_TEXELS);
         let stage = progress.stage("blocks", 0.0, 0.02, count as u64);
         for (number, p) in (0..).zip(placements) {
             map.first.push(map.tiles.len() as u32);
@@ -317,7 +313,7 @@ impl BlockMap {
             for (i, j) in (0..rows).flat_map(|j| (0..columns).map(move |i| (i, j))) {
                 let (x0, y0) = (x + i * TILE, y + j * TILE);
                 let rect = Rect { x0, y0, x1: (x0 + TILE).min(x + w), y1: (y0 + TILE).min(y + h) };
-                let tile = map.tile(atlas, number, rect);
+                let tile = map.tile(atlas, number, rect, &mut texels)?;
                 map.tiles.push(tile);
                 stage.advance(1)?;
             }
@@ -346,14 +342,13 @@ impl BlockMap {
         Ok(shown)
     }
 
-    fn tile(&mut self, atlas: &Atlas, placement: u32, rect: Rect) -> Tile {
-        let mut texels: Vec<(u8, u32)> = rect
-            .texels()
-            .filter_map(|(x, y)| {
-                let sample = atlas.gather.at(placement, x, y);
-                (sample != NONE).then(|| (self.lod_at(placement, x, y), sample))
-            })
-            .collect();
+    /// The block of a rectangle. `texels` is scratch space.
+    fn tile(&mut self, atlas: &Atlas, placement: u32, rect: Rect, texels: &mut Vec<(u8, u32)>) -> Result<Tile> {
+        texels.clear();
+        texels.extend(rect.texels().filter_map(|(x, y)| {
+            let sample = atlas.gather.at(placement, x, y);
+            (sample != NONE).then(|| (self.lod_at(placement, x, y), sample))
+        }));
         texels.sort_by_key(|t| t.0);
         // A block must not be without light: its first texel, if none falls on the lowest LOD's grid.
         if let Some(t) = texels.first_mut() {
@@ -361,14 +356,14 @@ impl BlockMap {
         }
         let lod_end = std::array::from_fn(|l| texels.iter().filter(|t| t.0 as usize <= l).count() as u16);
         let mut centre = glam::DVec3::ZERO;
-        for &(lod, sample) in &texels {
+        for &(lod, sample) in &*texels {
             self.lod_of[sample as usize] = lod;
             centre += atlas.gather.texels.samples[sample as usize].position(&atlas.scene).as_dvec3();
         }
         let centre = (centre / texels.len().max(1) as f64).as_vec3();
         let map_texels = rect_in_light_map(atlas, placement, &rect).area() as u32;
-        let texels = texels.into_iter().map(|t| t.1).collect();
-        Tile { placement, rect, texels, lod_end, centre, map_texels, cell: 0 }
+        let texels = try_collect(texels.iter().map(|t| t.1), STATE)?.into_boxed_slice();
+        Ok(Tile { placement, rect, texels, lod_end, centre, map_texels, cell: 0 })
     }
 
     /// The LOD on whose grid a texel of the gather map lies.

@@ -2,8 +2,9 @@
 //! of all LODs belong. A cell shows its next LOD when all its blocks have it.
 
 use super::blocks::{BlockStatus, MAX_LODS, Tile};
+use super::lists::Lists;
 use crate::error::{Result, invalid_argument};
-use crate::memory::try_vec;
+use crate::memory::{try_collect, try_vec};
 use glam::{UVec3, Vec3};
 
 /// Cells along the longest side unless the size is given.
@@ -30,7 +31,7 @@ pub struct CellInfo {
 pub(super) struct Grid {
     pub info: CellInfo,
     /// Blocks of each cell.
-    blocks: Vec<Vec<u32>>,
+    blocks: Lists,
     /// Cells with blocks.
     pub occupied: Vec<u32>,
 }
@@ -77,18 +78,19 @@ impl Grid {
             return invalid_argument!("cell_size {cell_size} makes {cells} cells, more than {MAX_CELLS}");
         }
         let info = CellInfo { origin: lower, cell_size, dimensions: cells.as_uvec3().to_array() };
-        let blocks = try_vec(info.cells(), "the cells of the grid")?;
+        tiles.iter_mut().filter(|t| !t.texels.is_empty()).for_each(|tile| tile.cell = info.cell(tile.centre));
+        let blocks = Lists::new(info.cells(), "the cells of the grid", |add| {
+            let with_texels = (0..).zip(tiles.iter()).filter(|(_, t)| !t.texels.is_empty());
+            with_texels.for_each(|(b, tile)| add(tile.cell as usize, b));
+        })?;
         let mut grid = Grid { info, blocks, occupied: Vec::new() };
-        for (b, tile) in tiles.iter_mut().enumerate().filter(|(_, t)| !t.texels.is_empty()) {
-            tile.cell = info.cell(tile.centre);
-            grid.blocks[tile.cell as usize].push(b as u32);
-        }
-        grid.occupied = (0..grid.blocks.len() as u32).filter(|&c| !grid.blocks_of(c).is_empty()).collect();
+        let is_occupied = |&c: &u32| !grid.blocks_of(c).is_empty();
+        grid.occupied = try_collect((0..grid.blocks.len() as u32).filter(is_occupied), "the cells with blocks")?;
         Ok(grid)
     }
 
     pub fn blocks_of(&self, cell: u32) -> &[u32] {
-        &self.blocks[cell as usize]
+        self.blocks.get(cell as usize)
     }
 
     /// The lowest of the LODs that the blocks of a cell show.
@@ -96,8 +98,13 @@ impl Grid {
         self.blocks_of(cell).iter().map(|&b| shown[b as usize]).min().unwrap_or(NO_LOD)
     }
 
+    /// Blocks of the cell that has most.
+    pub fn most_blocks(&self) -> usize {
+        self.blocks.longest()
+    }
+
     pub fn bytes(&self) -> usize {
-        self.blocks.len() * size_of::<Vec<u32>>() + self.blocks.iter().map(|b| b.capacity() * 4).sum::<usize>()
+        self.blocks.bytes() + size_of_val(&self.occupied[..])
     }
 }
 

@@ -5,7 +5,7 @@ use super::cells::Grid;
 use super::visibility::Visibility;
 use super::work::{Context, Step};
 use super::{LiveCamera, Mode};
-use crate::memory::try_vec;
+use crate::memory::{try_filled, try_vec, try_with_capacity};
 use crate::sampling::{combine, mix};
 use std::cmp::Ordering;
 
@@ -23,6 +23,19 @@ pub(super) struct Chooser {
     is_visible: Vec<bool>,
     /// Number of choices so far.
     turn: u32,
+    scratch: Scratch,
+}
+
+/// A cell by its turn: hidden ones last, then by distance.
+type KeyedCell = (bool, f32, u32);
+
+/// Room for what is sorted, taken once: no update lacks it.
+#[derive(Default)]
+struct Scratch {
+    /// Blocks by what they gain.
+    blocks: Vec<(f32, u32)>,
+    cells: Vec<KeyedCell>,
+    of_cell: Vec<u32>,
 }
 
 /// What there is to choose from.
@@ -38,21 +51,28 @@ impl Chooser {
         let cells = grid.info.cells();
         let mut open = try_vec(map.tiles.len(), "the blocks that are open")?;
         open.iter_mut().zip(&map.tiles).for_each(|(open, tile)| *open = !tile.texels.is_empty());
-        let mut stale = try_vec(cells, "the cells that are stale")?;
-        stale.fill(true);
+        let what = "the choice of blocks";
         Ok(Chooser {
+            scratch: Scratch {
+                blocks: try_with_capacity(map.tiles.len(), what)?,
+                cells: try_with_capacity(grid.occupied.len(), what)?,
+                of_cell: try_with_capacity(grid.most_blocks(), what)?,
+            },
             open_count: open.iter().filter(|&&o| o).count(),
             open,
             least: try_vec(cells, "the progress of cells")?,
-            stale,
-            visible: Vec::new(),
+            stale: try_filled(cells, true, "the cells that are stale")?,
+            visible: try_with_capacity(grid.occupied.len(), "the cells that are visible")?,
             is_visible: try_vec(cells, "the cells that are visible")?,
             turn: 0,
         })
     }
 
     pub fn bytes(&self) -> usize {
-        self.open.len() + self.least.len() * (size_of::<Option<u32>>() + 2)
+        let Scratch { blocks, cells, of_cell } = &self.scratch;
+        let scratch = blocks.capacity() * size_of::<(f32, u32)>() + cells.capacity() * size_of::<KeyedCell>();
+        let listed = (self.visible.capacity() + of_cell.capacity()) * size_of::<u32>();
+        self.open.len() + self.least.len() * (size_of::<Option<u32>>() + 2) + scratch + listed
     }
 
     /// Part of the blocks on which nothing is left to do.
@@ -95,12 +115,12 @@ impl Chooser {
 
     /// Seen blocks whose coarse direct light is of other lights than those of now: those that most is
     /// seen of first, and those first that have waited for long.
-    pub fn wrong(&self, from: &Choice, count: usize) -> Vec<u32> {
+    pub fn wrong(&mut self, from: &Choice, count: usize) -> Vec<u32> {
         let wrong = |&b: &u32| {
             let behind = from.blocks[b as usize].changes_behind(from.context);
             (behind > 0).then(|| (from.visibility.mark(b) * behind as f32, b))
         };
-        greatest(from.visibility.seen.iter().filter_map(wrong).collect(), count)
+        greatest(&mut self.scratch.blocks, from.visibility.seen.iter().filter_map(wrong), count)
     }
 
     /// The next blocks to work on, the most urgent first, and what is to be done to them.
@@ -109,11 +129,13 @@ impl Chooser {
         if mode == Mode::Position && self.turn.is_multiple_of(2) {
             // In turn with cells, direct light of what is seen: shadows that end at the border of a cell
             // are seen more than any other.
+            let open = &self.open;
             let missing = |&b: &u32| {
-                let is_missing = self.is_open(b) && !from.blocks[b as usize].has_direct(from.context);
+                let is_missing = open[b as usize] && !from.blocks[b as usize].has_direct(from.context);
                 is_missing.then(|| (from.visibility.mark(b), b))
             };
-            let missing = greatest(from.visibility.seen.iter().filter_map(missing).collect(), count);
+            let missing = from.visibility.seen.iter().filter_map(missing);
+            let missing = greatest(&mut self.scratch.blocks, missing, count);
             if !missing.is_empty() {
                 return (Step::Direct, missing);
             }
@@ -128,8 +150,8 @@ impl Chooser {
                     let gain = from.blocks[b as usize].next(from.context, &from.context.map.tiles[b as usize]);
                     from.visibility.mark(b) * gain.map_or(0.0, |g| g.1)
                 };
-                let open = from.visibility.seen.iter().filter(|&&b| self.is_open(b));
-                greatest(open.map(|&b| (urgency(b), b)).collect(), count)
+                let open = from.visibility.seen.iter().filter(|&&b| self.open[b as usize]);
+                greatest(&mut self.scratch.blocks, open.map(|&b| (urgency(b), b)), count)
             }
             Mode::Uniform => {
                 let n = self.open.len() as u32;
@@ -161,7 +183,9 @@ impl Chooser {
             is_new * (1 + block.fresh_lod as u32 + rounds)
         };
         let info = &from.grid.info;
-        let mut cells = Vec::new();
+        let mut scratch = std::mem::take(&mut self.scratch);
+        let Scratch { cells, of_cell, .. } = &mut scratch;
+        cells.clear();
         for &cell in &from.grid.occupied {
             let c = cell as usize;
             if std::mem::replace(&mut self.stale[c], false) {
@@ -173,38 +197,39 @@ impl Chooser {
                 cells.push((!self.is_visible[c], away * (1u64 << least.min(40)) as f32, cell));
             }
         }
-        let order = |a: &(bool, f32, u32), b: &(bool, f32, u32)| -> Ordering {
-            a.0.cmp(&b.0).then(a.1.total_cmp(&b.1)).then(a.2.cmp(&b.2))
-        };
+        let order =
+            |a: &KeyedCell, b: &KeyedCell| -> Ordering { a.0.cmp(&b.0).then(a.1.total_cmp(&b.1)).then(a.2.cmp(&b.2)) };
         // Each of these has at least one open block.
         if cells.len() > count {
             cells.select_nth_unstable_by(count, order);
             cells.truncate(count);
         }
         cells.sort_unstable_by(order);
-        let mut chosen = Vec::new();
-        for &(_, _, cell) in &cells {
+        let mut chosen = Vec::with_capacity(count);
+        for &(_, _, cell) in &*cells {
             // The least advanced of the cell first: it is promoted as a whole.
-            let mut of_cell: Vec<u32> =
-                from.grid.blocks_of(cell).iter().copied().filter(|&b| self.is_open(b)).collect();
-            of_cell.sort_by_key(|&b| (progress(b), from.visibility.mark(b) == 0.0));
-            chosen.extend(of_cell);
+            of_cell.clear();
+            of_cell.extend(from.grid.blocks_of(cell).iter().filter(|&&b| self.is_open(b)));
+            of_cell.sort_unstable_by_key(|&b| (progress(b), from.visibility.mark(b) == 0.0, b));
+            chosen.extend(of_cell.iter().take(count - chosen.len()));
             if chosen.len() >= count {
                 break;
             }
         }
-        chosen.truncate(count);
+        self.scratch = scratch;
         chosen
     }
 }
 
-/// The `count` greatest, in falling order.
-fn greatest(mut keyed: Vec<(f32, u32)>, count: usize) -> Vec<u32> {
+/// The `count` greatest, in falling order. `keyed` is scratch space with room for all.
+fn greatest(keyed: &mut Vec<(f32, u32)>, all: impl Iterator<Item = (f32, u32)>, count: usize) -> Vec<u32> {
+    keyed.clear();
+    keyed.extend(all);
     let order = |a: &(f32, u32), b: &(f32, u32)| b.0.total_cmp(&a.0).then(a.1.cmp(&b.1));
     if keyed.len() > count {
         keyed.select_nth_unstable_by(count, order);
         keyed.truncate(count);
     }
     keyed.sort_unstable_by(order);
-    keyed.into_iter().map(|k| k.1).collect()
+    keyed.iter().map(|k| k.1).collect()
 }

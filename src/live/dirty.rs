@@ -3,6 +3,8 @@
 
 use super::blocks::Rect;
 use super::display::Changed;
+use crate::error::Result;
+use crate::memory::{try_collect_ok, try_with_capacity};
 
 /// Two rectangles become one if that has at most this many times the area of both.
 const SLACK: f64 = 1.3;
@@ -17,9 +19,21 @@ pub(super) struct Dirty {
 
 impl Dirty {
     /// All of all pages.
-    pub fn all(pages: u32, size: u32) -> Dirty {
-        let page = Rect { x0: 0, y0: 0, x1: size as i32, y1: size as i32 };
-        Dirty { pages: vec![vec![page]; pages as usize] }
+    pub fn all(pages: u32, size: u32) -> Result<Dirty> {
+        let what = "the list of changes";
+        // Room for one rectangle, into which all others can go.
+        let lists = (0..pages).map(|_| try_with_capacity(1, what));
+        let mut dirty = Dirty { pages: try_collect_ok(lists, what)? };
+        dirty.mark_all(size);
+        Ok(dirty)
+    }
+
+    /// All of all pages have changed.
+    pub fn mark_all(&mut self, size: u32) {
+        for rects in &mut self.pages {
+            rects.clear();
+            rects.push(Rect { x0: 0, y0: 0, x1: size as i32, y1: size as i32 });
+        }
     }
 
     pub fn add(&mut self, changed: Changed) {
@@ -32,24 +46,30 @@ impl Dirty {
         while let Some(i) = rects.iter().position(|r| merges(r, &new)) {
             new = new.union(&rects.swap_remove(i));
         }
-        rects.push(new);
-        if rects.len() > MAX_RECTS {
-            let all = rects.iter().fold(new, |a, r| a.union(r));
-            *rects = vec![all];
+        // Where there is no memory for more, one must do too: light that has changed must not be forgotten.
+        if rects.len() >= MAX_RECTS || rects.try_reserve(1).is_err() {
+            new = rects.iter().fold(new, |a, r| a.union(r));
+            rects.clear();
         }
+        rects.push(new);
     }
 
-    /// Removes and returns up to `capacity` rectangles with their pages.
-    pub fn take(&mut self, capacity: usize) -> Vec<(u32, Rect)> {
-        let mut out = Vec::new();
-        for (page, rects) in self.pages.iter_mut().enumerate() {
-            while out.len() < capacity
+    /// The number of rectangles.
+    pub fn len(&self) -> usize {
+        self.pages.iter().map(Vec::len).sum()
+    }
+
+    /// Hands out up to `capacity` rectangles with their pages.
+    pub fn take(&mut self, capacity: usize, mut put: impl FnMut(u32, Rect)) {
+        let mut left = capacity;
+        for (page, rects) in (0..).zip(&mut self.pages) {
+            while left > 0
                 && let Some(rect) = rects.pop()
             {
-                out.push((page as u32, rect));
+                put(page, rect);
+                left -= 1;
             }
         }
-        out
     }
 }
 
@@ -69,7 +89,12 @@ mod tests {
     fn added(rects: &[Rect]) -> Vec<Rect> {
         let mut dirty = Dirty { pages: vec![Vec::new(); 2] };
         rects.iter().for_each(|&rect| dirty.add(Changed { page: 1, rect }));
-        dirty.take(usize::MAX).into_iter().map(|(page, r)| (assert_eq!(page, 1), r).1).collect()
+        let mut all = Vec::new();
+        dirty.take(usize::MAX, |page, r| {
+            assert_eq!(page, 1);
+            all.push(r);
+        });
+        all
     }
 
     #[test]
@@ -88,10 +113,21 @@ mod tests {
 
     #[test]
     fn what_does_not_fit_is_kept() {
-        let mut dirty = Dirty::all(3, 16);
-        assert_eq!(dirty.take(2).len(), 2);
-        assert_eq!(dirty.take(0).len(), 0);
-        assert_eq!(dirty.take(8).len(), 1);
-        assert_eq!(dirty.take(8).len(), 0);
+        let mut dirty = Dirty::all(3, 16).unwrap();
+        let counts = [2, 0, 8, 8].map(|capacity| {
+            let mut count = 0;
+            dirty.take(capacity, |_, _| count += 1);
+            count
+        });
+        assert_eq!((counts, dirty.len()), ([2, 0, 1, 0], 0));
+    }
+
+    #[test]
+    fn very_many_rectangles_become_one() {
+        let apart = |i: i32| rect(8 * i, 0, 8 * i + 1, 1);
+        let many: Vec<Rect> = (0..MAX_RECTS as i32).map(apart).collect();
+        assert_eq!(added(&many).len(), MAX_RECTS);
+        let more: Vec<Rect> = (0..=MAX_RECTS as i32).map(apart).collect();
+        assert_eq!(added(&more), [rect(0, 0, 8 * MAX_RECTS as i32 + 1, 1)]);
     }
 }

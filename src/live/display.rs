@@ -2,16 +2,15 @@
 //! of a lower LOD, filled where it cannot be seen, blurred; and its composition with direct light
 //! when a page is read. The sums of the texels are left alone.
 
-use super::blocks::{BlockMap, Blocks, DirectTile, Rect, TILE};
-use super::in_parts;
+use super::blocks::{BLOCK_TEXELS, BlockMap, Blocks, DirectTile, Rect, TILE};
 use super::relight::Illumination;
+use super::{SHOWN_AT_ONCE, in_parts};
 use crate::error::{Error, Result};
 use crate::lightmap::indirect::blur::{Texels, Window};
-use crate::memory::try_vec;
+use crate::memory::{try_filled, try_to_vec, try_vec, try_with_capacity};
 use crate::scene::NONE;
 use glam::Vec3;
 use rayon::prelude::*;
-use std::collections::HashMap;
 use std::sync::Arc;
 
 /// Unseen texels are filled from those that are seen within this distance.
@@ -39,8 +38,9 @@ pub(super) struct Display {
     variances: Vec<f32>,
     /// Whether a gather texel can be seen, as far as is known.
     visible: Vec<bool>,
-    /// Gather texels that cannot, by block.
-    unseen: HashMap<u32, Vec<u32>>,
+    /// How many gather texels cannot, by block, and the number of blocks with such texels.
+    unseen: Vec<u8>,
+    blocks_with_unseen: u32,
     /// The LOD in use, by block: that of the work, or less until the block's cell is promoted.
     pub lods: Vec<u8>,
     /// The LOD whose texels have light of now, by block, at most that in use.
@@ -56,6 +56,79 @@ pub(super) struct Display {
     /// Updates left of the fade, by block.
     fades: Vec<u8>,
     blur: i32,
+    scratch: Scratch,
+}
+
+/// New values of texels of the display, in the making.
+type NewValue = (u32, Vec3);
+
+/// Blocks whose texels get new values at a time.
+const BLOCKS_AT_ONCE: usize = 256;
+
+/// Room for what changes at a time, taken once: no update lacks it.
+#[derive(Default)]
+struct Scratch {
+    /// Blocks that interpolate, and those that are filled.
+    all: Vec<u32>,
+    to_fill: Vec<u32>,
+    /// New values by block, in slots of equal size. A slot that is not full ends with the sample [`NONE`].
+    values: Vec<NewValue>,
+}
+
+impl Scratch {
+    fn new(blocks: usize, blur: i32) -> Result<Scratch> {
+        let what = "changes of the shown light";
+        // Blocks and their neighbours; those that interpolate and those that are filled come together.
+        let most = 2 * 9 * SHOWN_AT_ONCE;
+        Ok(Scratch {
+            all: try_with_capacity(most, what)?,
+            to_fill: try_with_capacity(most, what)?,
+            values: try_vec(blocks.min(BLOCKS_AT_ONCE) * slot(blur), what)?,
+        })
+    }
+
+    fn bytes(&self) -> usize {
+        (self.all.capacity() + self.to_fill.capacity()) * size_of::<u32>() + size_of_val(&self.values[..])
+    }
+}
+
+/// Texels of a block and those within the blur's radius of it.
+fn slot(blur: i32) -> usize {
+    (TILE + 2 * blur).pow(2) as usize
+}
+
+/// Has `compute` put new values of texels of each block into its slot, in parallel.
+fn compute_values<B: Copy + Sync>(
+    values: &mut [NewValue],
+    slot: usize,
+    blocks: &[B],
+    compute: impl Fn(B, &mut Slot) + Sync,
+) {
+    values.par_chunks_mut(slot).zip(blocks).for_each(|(room, &b)| {
+        let mut slot = Slot { room, used: 0 };
+        compute(b, &mut slot);
+        if let Some(end) = slot.room.get_mut(slot.used) {
+            end.0 = NONE;
+        }
+    });
+}
+
+/// What [`compute_values`] has computed for so many blocks.
+fn computed(values: &[NewValue], slot: usize, blocks: usize) -> impl Iterator<Item = NewValue> {
+    values.chunks(slot).take(blocks).flat_map(|of_block| of_block.iter().copied().take_while(|v| v.0 != NONE))
+}
+
+/// New values of one block.
+struct Slot<'a> {
+    room: &'a mut [NewValue],
+    used: usize,
+}
+
+impl Slot<'_> {
+    fn put(&mut self, sample: u32, value: Vec3) {
+        self.room[self.used] = (sample, value);
+        self.used += 1;
+    }
 }
 
 /// Where changes of the shown light lie in the light map: a rectangle of a page.
@@ -75,19 +148,17 @@ impl Display {
                 *normal = atlas.receiver(&atlas.gather, &[], i).normal;
             });
         });
-        let mut variances = try_vec(n, "the gather map's variance")?;
-        variances.fill(f32::INFINITY);
-        let mut visible = try_vec(n, "the gather map's validity")?;
-        visible.fill(true);
+        let blur = blur as i32;
         Ok(Display {
             plain: try_vec(n, "live indirect light")?,
             shown: try_vec(n, "shown indirect light")?,
             coarse: try_vec(n, "live direct light")?,
             coarse_of_tile: Vec::new(),
             normals,
-            variances,
-            visible,
-            unseen: HashMap::new(),
+            variances: try_filled(n, f32::INFINITY, "the gather map's variance")?,
+            visible: try_filled(n, true, "the gather map's validity")?,
+            unseen: try_vec(map.tiles.len(), "hidden texels of blocks")?,
+            blocks_with_unseen: 0,
             lods: try_vec(map.tiles.len(), "the LODs of blocks")?,
             fresh: try_vec(map.tiles.len(), "the LODs of blocks")?,
             old: Vec::new(),
@@ -95,7 +166,8 @@ impl Display {
             tile_epochs: try_vec(map.tiles.len(), "the epochs of blocks")?,
             epoch: 0,
             fades: try_vec(map.tiles.len(), "the fades of blocks")?,
-            blur: blur as i32,
+            blur,
+            scratch: Scratch::new(map.tiles.len(), blur)?,
         })
     }
 
@@ -109,7 +181,8 @@ impl Display {
             normals: copy_of(&self.normals)?,
             variances: copy_of(&self.variances)?,
             visible: copy_of(&self.visible)?,
-            unseen: self.unseen.clone(),
+            unseen: copy_of(&self.unseen)?,
+            blocks_with_unseen: self.blocks_with_unseen,
             lods: copy_of(&self.lods)?,
             fresh: copy_of(&self.fresh)?,
             old: copy_of(&self.old)?,
@@ -118,6 +191,7 @@ impl Display {
             epoch: self.epoch,
             fades: copy_of(&self.fades)?,
             blur: self.blur,
+            scratch: Scratch::new(self.lods.len(), self.blur)?,
         })
     }
 
@@ -144,15 +218,16 @@ impl Display {
     /// Bytes held, without the tiles.
     pub fn bytes(&self) -> usize {
         let per_texel = 4 * size_of::<Vec3>() + size_of::<f32>() + 1;
-        let per_block = size_of::<Option<Arc<DirectTile>>>() + size_of::<DirectTile>() + size_of::<u32>() + 3;
+        let per_block = size_of::<Option<Arc<DirectTile>>>() + size_of::<DirectTile>() + size_of::<u32>() + 4;
         self.plain.len() * per_texel
             + (self.coarse_of_tile.capacity() + self.old.capacity()) * size_of::<Vec3>()
             + self.lods.len() * per_block
+            + self.scratch.bytes()
     }
 
-    /// Shows what `changed` blocks know now; returns where that changes the light map. A block that is away keeps
-    /// what it shows until it is back.
-    pub fn refresh(&mut self, map: &BlockMap, blocks: &Blocks, changed: &[u32]) -> Vec<Changed> {
+    /// Shows what `changed` blocks know now, at most [`SHOWN_AT_ONCE`]; tells `note` where that changes the light map.
+    /// A block that is away keeps what it shows until it is back.
+    pub fn refresh(&mut self, map: &BlockMap, blocks: &Blocks, changed: &[u32], note: impl FnMut(Changed)) {
         for &b in changed {
             let Some(block) = blocks.work(b) else { continue };
             let tile = &map.tiles[b as usize];
@@ -166,79 +241,92 @@ impl Display {
                 self.note_visible(b, tile.texels[i], block.is_visible(i));
             }
         }
-        self.spread(map, changed)
+        self.spread(map, changed, note);
     }
 
-    /// Interpolates, fills and blurs what depends on texels of the `changed` blocks; returns where that
+    /// Interpolates, fills and blurs what depends on texels of the `changed` blocks; tells `note` where that
     /// changes the light map.
-    fn spread(&mut self, map: &BlockMap, changed: &[u32]) -> Vec<Changed> {
+    fn spread(&mut self, map: &BlockMap, changed: &[u32], mut note: impl FnMut(Changed)) {
+        let mut scratch = std::mem::take(&mut self.scratch);
+        let Scratch { all, to_fill, values } = &mut scratch;
         let top = map.top();
         // Neighbours that interpolate do so between texels of these blocks too.
-        let mut all = changed.to_vec();
+        all.clear();
+        all.extend_from_slice(changed);
         for &b in changed {
             all.extend(map.neighbours(b).filter(|&n| self.fresh[n as usize] < top));
         }
         all.sort_unstable();
         all.dedup();
-        let interpolate = |&b: &u32| -> Vec<(u32, Vec3)> {
-            let (tile, lod) = (&map.tiles[b as usize], self.fresh[b as usize]);
-            let known =
-                |s: u32, x, y| map.lod_of[s as usize] <= self.fresh[map.block_at(tile.placement, x, y) as usize];
-            let value = |s: u32| {
-                if self.old.is_empty() {
-                    return self.interpolate(map, b, lod, s, known, |s| self.plain[s]);
-                }
-                // What is around has changed by so much; but where that is more than there was here, by such a
-                // part: nothing goes black because its surroundings lost more than it had.
-                let around = |of: &[Vec3]| self.interpolate(map, b, lod, s, known, |s| of[s]);
-                let (old, before, now) = (self.old[s as usize], around(&self.old), around(&self.plain));
-                let sum = old + (now - before);
-                Vec3::select(sum.cmpge(Vec3::ZERO), sum, old * now / before.max(Vec3::splat(f32::MIN_POSITIVE)))
-            };
-            tile.texels[tile.lod_end[lod as usize] as usize..].iter().map(|&s| (s, value(s))).collect()
-        };
-        let interpolated: Vec<(u32, Vec3)> = all.par_iter().flat_map_iter(interpolate).collect();
-        for (sample, value) in interpolated {
-            self.plain[sample as usize] = value;
-            self.variances[sample as usize] = f32::INFINITY;
+        // The texels that are interpolated are none of those between which others are: parts of all blocks may follow
+        // one another.
+        for some in all.chunks(BLOCKS_AT_ONCE) {
+            compute_values(values, BLOCK_TEXELS, some, |b, slot| self.interpolate_block(map, b, slot));
+            for (sample, value) in computed(values, BLOCK_TEXELS, some.len()) {
+                self.plain[sample as usize] = value;
+                self.variances[sample as usize] = f32::INFINITY;
+            }
         }
 
-        let mut to_fill = Vec::new();
-        if !self.unseen.is_empty() {
+        to_fill.clear();
+        if self.blocks_with_unseen > 0 {
             to_fill.extend(changed.iter().flat_map(|&b| map.neighbours(b).chain([b])));
-            to_fill.retain(|b| self.unseen.contains_key(b));
+            to_fill.retain(|&b| self.unseen[b as usize] > 0);
             to_fill.sort_unstable();
             to_fill.dedup();
         }
-        let filled: Vec<(u32, Vec3)> = to_fill.par_iter().flat_map_iter(|&b| self.fill(map, b)).collect();
-        for (sample, value) in filled {
-            self.plain[sample as usize] = value;
+        // Those that can be seen, which alone are looked at, are not filled.
+        for some in to_fill.chunks(BLOCKS_AT_ONCE) {
+            compute_values(values, BLOCK_TEXELS, some, |b, slot| self.fill(map, b, slot));
+            for (sample, value) in computed(values, BLOCK_TEXELS, some.len()) {
+                self.plain[sample as usize] = value;
+            }
         }
 
+        all.extend_from_slice(to_fill);
+        all.sort_unstable();
+        all.dedup();
         let grown = |b: u32| {
             let tile = &map.tiles[b as usize];
             (tile.placement, tile.rect.grown(self.blur).clipped(&own_rect(map, tile.placement)))
         };
-        all.extend(to_fill);
-        all.sort_unstable();
-        all.dedup();
-        let touched: Vec<(u32, Rect)> = all.into_iter().map(grown).collect();
-        let shown: Vec<(u32, Vec3)> = touched
-            .par_iter()
-            .flat_map_iter(|&(placement, rect)| {
+        let slot_size = slot(self.blur);
+        for some in all.chunks(BLOCKS_AT_ONCE) {
+            compute_values(values, slot_size, some, |b, slot| {
+                let (placement, rect) = grown(b);
                 let mut window = Window::new(self.blur);
                 // Blocks that fade get there by themselves.
                 let is_still = |&(x, y): &(i32, i32)| self.fades[map.block_at(placement, x, y) as usize] == 0;
                 let at = |(x, y)| map.atlas.gather.at(placement, x, y);
                 let samples = rect.texels().filter(is_still).map(at).filter(|&s| s != NONE);
-                samples.map(|s| (s, self.blurred(map, &mut window, s as usize))).collect::<Vec<_>>()
-            })
-            .collect();
-        for (sample, value) in shown {
-            self.shown[sample as usize] = value;
+                samples.for_each(|s| slot.put(s, self.blurred(map, &mut window, s as usize)));
+            });
+            for (sample, value) in computed(values, slot_size, some.len()) {
+                self.shown[sample as usize] = value;
+            }
         }
         // A texel of the light map interpolates between four of the gather map.
-        touched.iter().map(|(placement, rect)| in_light_map(map, *placement, &rect.grown(1))).collect()
+        let changes = all.iter().map(|&b| grown(b)).map(|(p, rect)| in_light_map(map, p, &rect.grown(1)));
+        changes.for_each(&mut note);
+        self.scratch = scratch;
+    }
+
+    /// The indirect light of a block's texels above the LOD whose light is of now.
+    fn interpolate_block(&self, map: &BlockMap, b: u32, slot: &mut Slot) {
+        let (tile, lod) = (&map.tiles[b as usize], self.fresh[b as usize]);
+        let known = |s: u32, x, y| map.lod_of[s as usize] <= self.fresh[map.block_at(tile.placement, x, y) as usize];
+        let value = |s: u32| {
+            if self.old.is_empty() {
+                return self.interpolate(map, b, lod, s, known, |s| self.plain[s]);
+            }
+            // What is around has changed by so much; but where that is more than there was here, by such a
+            // part: nothing goes black because its surroundings lost more than it had.
+            let around = |of: &[Vec3]| self.interpolate(map, b, lod, s, known, |s| of[s]);
+            let (old, before, now) = (self.old[s as usize], around(&self.old), around(&self.plain));
+            let sum = old + (now - before);
+            Vec3::select(sum.cmpge(Vec3::ZERO), sum, old * now / before.max(Vec3::splat(f32::MIN_POSITIVE)))
+        };
+        tile.texels[tile.lod_end[lod as usize] as usize..].iter().for_each(|&s| slot.put(s, value(s)));
     }
 
     /// What would be shown if no block were above a LOD.
@@ -248,7 +336,8 @@ impl Display {
         lower.fresh.iter_mut().for_each(|l| *l = lod.min(*l));
         lower.old = Vec::new();
         lower.fades.fill(0);
-        map.atlas.scene.device().install(|| in_parts(map.tiles.len()).for_each(|some| drop(lower.spread(map, &some))));
+        let device = map.atlas.scene.device();
+        device.install(|| in_parts(map.tiles.len()).for_each(|some| lower.spread(map, &some, |_| ())));
         Ok(lower)
     }
 
@@ -267,24 +356,28 @@ impl Display {
         self.fades[b as usize] > 0
     }
 
-    /// One step of blocks that fade; returns where that changes the light map.
-    pub fn fade(&mut self, map: &BlockMap, blocks: &[u32]) -> Vec<Changed> {
-        let step = |&b: &u32| -> Vec<(u32, Vec3)> {
-            let mut window = Window::new(self.blur);
-            let part = 1.0 / self.fades[b as usize] as f32;
-            let mut value = |s: u32| {
-                let (shown, goal) = (self.shown[s as usize], self.blurred(map, &mut window, s as usize));
-                // The last step must leave no rounding error.
-                if part == 1.0 { goal } else { shown + (goal - shown) * part }
-            };
-            map.tiles[b as usize].texels.iter().map(|&s| (s, value(s))).collect()
-        };
-        let values: Vec<(u32, Vec3)> = blocks.par_iter().flat_map_iter(step).collect();
-        for (sample, value) in values {
-            self.shown[sample as usize] = value;
+    /// One step of blocks that fade; tells `note` where that changes the light map.
+    pub fn fade(&mut self, map: &BlockMap, blocks: &[u32], mut note: impl FnMut(Changed)) {
+        let mut scratch = std::mem::take(&mut self.scratch);
+        for some in blocks.chunks(BLOCKS_AT_ONCE) {
+            compute_values(&mut scratch.values, BLOCK_TEXELS, some, |b, slot| self.fade_block(map, b, slot));
+            for (sample, value) in computed(&scratch.values, BLOCK_TEXELS, some.len()) {
+                self.shown[sample as usize] = value;
+            }
         }
+        self.scratch = scratch;
         blocks.iter().for_each(|&b| self.fades[b as usize] -= 1);
-        blocks.iter().map(|&b| self.block_rect(map, b)).collect()
+        blocks.iter().for_each(|&b| note(self.block_rect(map, b)));
+    }
+
+    fn fade_block(&self, map: &BlockMap, b: u32, slot: &mut Slot) {
+        let mut window = Window::new(self.blur);
+        let part = 1.0 / self.fades[b as usize] as f32;
+        for &s in &map.tiles[b as usize].texels {
+            let (shown, goal) = (self.shown[s as usize], self.blurred(map, &mut window, s as usize));
+            // The last step must leave no rounding error.
+            slot.put(s, if part == 1.0 { goal } else { shown + (goal - shown) * part });
+        }
     }
 
     fn blurred(&self, map: &BlockMap, window: &mut Window, sample: usize) -> Vec3 {
@@ -302,15 +395,20 @@ impl Display {
             return;
         }
         self.visible[sample as usize] = visible;
-        let list = self.unseen.entry(b).or_default();
+        let unseen = &mut self.unseen[b as usize];
         if visible {
-            list.retain(|&s| s != sample);
-            if list.is_empty() {
-                self.unseen.remove(&b);
-            }
+            *unseen -= 1;
+            self.blocks_with_unseen -= u32::from(*unseen == 0);
         } else {
-            list.push(sample);
+            self.blocks_with_unseen += u32::from(*unseen == 0);
+            *unseen += 1;
         }
+    }
+
+    /// The texels of a block that cannot be seen.
+    fn unseen_of<'a>(&'a self, map: &'a BlockMap, b: u32) -> impl Iterator<Item = u32> + 'a {
+        let texels = if self.unseen[b as usize] > 0 { &map.tiles[b as usize].texels[..] } else { &[] };
+        texels.iter().copied().filter(|&s| !self.visible[s as usize])
     }
 
     /// The value of a texel that has none of its own at LOD `lod`: bilinear between the corners of that
@@ -377,29 +475,37 @@ impl Display {
         }
     }
 
-    /// Takes over the direct light of the lowest LOD's texels of `changed` blocks, and interpolates it
-    /// to the others; returns where that changes the light map.
-    pub fn take_coarse(&mut self, map: &BlockMap, blocks: &mut Blocks, changed: &[u32]) -> Vec<Changed> {
+    /// Takes over the direct light of the lowest LOD's texels of `changed` blocks, at most [`SHOWN_AT_ONCE`], and
+    /// interpolates it to the others; tells `note` where that changes the light map.
+    pub fn take_coarse(&mut self, map: &BlockMap, blocks: &mut Blocks, changed: &[u32], mut note: impl FnMut(Changed)) {
+        let mut scratch = std::mem::take(&mut self.scratch);
+        let Scratch { all, values, .. } = &mut scratch;
         for &b in changed {
             let values = blocks.work_mut(b).map(|w| std::mem::take(&mut w.new_coarse)).unwrap_or_default();
             for (&sample, value) in map.tiles[b as usize].texels.iter().zip(values) {
                 self.coarse[sample as usize] = value;
             }
         }
-        let mut all: Vec<u32> = changed.iter().flat_map(|&b| map.neighbours(b).chain([b])).collect();
+        all.clear();
+        all.extend(changed.iter().flat_map(|&b| map.neighbours(b).chain([b])));
         all.sort_unstable();
         all.dedup();
-        let others = |&b: &u32| -> Vec<(u32, Vec3)> {
-            let tile = &map.tiles[b as usize];
-            let lowest = |s: u32, _, _| map.lod_of[s as usize] == 0;
-            let value = |s: u32| self.interpolate(map, b, 0, s, lowest, |s| self.coarse[s]);
-            tile.texels[tile.lod_end[0] as usize..].iter().map(|&s| (s, value(s))).collect()
-        };
-        let others: Vec<(u32, Vec3)> = all.par_iter().flat_map_iter(others).collect();
-        for (sample, value) in others {
-            self.coarse[sample as usize] = value;
+        for some in all.chunks(BLOCKS_AT_ONCE) {
+            compute_values(values, BLOCK_TEXELS, some, |b, slot| self.interpolate_coarse(map, b, slot));
+            for (sample, value) in computed(values, BLOCK_TEXELS, some.len()) {
+                self.coarse[sample as usize] = value;
+            }
         }
-        all.iter().map(|&b| self.block_rect(map, b)).collect()
+        all.iter().for_each(|&b| note(self.block_rect(map, b)));
+        self.scratch = scratch;
+    }
+
+    /// The coarse direct light of a block's texels above the lowest LOD.
+    fn interpolate_coarse(&self, map: &BlockMap, b: u32, slot: &mut Slot) {
+        let tile = &map.tiles[b as usize];
+        let lowest = |s: u32, _, _| map.lod_of[s as usize] == 0;
+        let value = |s: u32| self.interpolate(map, b, 0, s, lowest, |s| self.coarse[s]);
+        tile.texels[tile.lod_end[0] as usize..].iter().for_each(|&s| slot.put(s, value(s)));
     }
 
     /// Takes over the direct light of a block at full resolution; returns where that changes the light
@@ -429,44 +535,57 @@ impl Display {
 
     /// The unseen texels of a block with the mean of their neighbours, ring by ring from those that are
     /// seen. (A bake fills across whole charts: here work on a block must stay short.)
-    fn fill(&self, map: &BlockMap, b: u32) -> Vec<(u32, Vec3)> {
+    fn fill(&self, map: &BlockMap, b: u32, slot: &mut Slot) {
         let tile = &map.tiles[b as usize];
-        let around = |b: u32| self.unseen.get(&b).into_iter().flatten().copied();
-        let mut missing: Vec<u32> = map.neighbours(b).chain([b]).flat_map(around).collect();
-        missing.sort_unstable();
-        let mut filled: HashMap<u32, Vec3> = HashMap::new();
-        for _ in 0..FILLED {
-            let ring: Vec<(u32, Vec3)> = missing
-                .iter()
-                .filter_map(|&s| {
-                    let (x, y) = map.atlas.gather.position(s as usize);
-                    let (mut sum, mut n) = (Vec3::ZERO, 0.0);
-                    for (nx, ny) in (-1..=1).flat_map(|dy| (-1..=1).map(move |dx| (x + dx, y + dy))) {
-                        let t = map.atlas.gather.at(tile.placement, nx, ny);
-                        if t == NONE {
-                            continue;
-                        }
-                        let value = if self.visible[t as usize] {
-                            Some(self.plain[t as usize])
-                        } else {
-                            filled.get(&t).copied()
-                        };
-                        if let Some(value) = value {
-                            sum += value;
-                            n += 1.0;
-                        }
+        // Texels in ascending order, with the ring that filled them; 0: none yet.
+        let mut room = [(NONE, 0, Vec3::ZERO); 9 * BLOCK_TEXELS];
+        let mut count = 0;
+        for s in map.neighbours(b).chain([b]).flat_map(|b| self.unseen_of(map, b)) {
+            room[count].0 = s;
+            count += 1;
+        }
+        let missing = &mut room[..count];
+        missing.sort_unstable_by_key(|m| m.0);
+        for ring in 1..=FILLED {
+            let mut is_empty = true;
+            for i in 0..missing.len() {
+                let (s, filled_by, _) = missing[i];
+                if filled_by > 0 {
+                    continue;
+                }
+                let (x, y) = map.atlas.gather.position(s as usize);
+                let (mut sum, mut n) = (Vec3::ZERO, 0.0);
+                for (nx, ny) in (-1..=1).flat_map(|dy| (-1..=1).map(move |dx| (x + dx, y + dy))) {
+                    let t = map.atlas.gather.at(tile.placement, nx, ny);
+                    if t == NONE {
+                        continue;
                     }
-                    (n > 0.0).then(|| (s, sum / n))
-                })
-                .collect();
-            if ring.is_empty() {
+                    let value = if self.visible[t as usize] {
+                        Some(self.plain[t as usize])
+                    } else {
+                        let known = missing.binary_search_by_key(&t, |m| m.0).ok().map(|i| missing[i]);
+                        known.filter(|m| (1..ring).contains(&m.1)).map(|m| m.2)
+                    };
+                    if let Some(value) = value {
+                        sum += value;
+                        n += 1.0;
+                    }
+                }
+                if n > 0.0 {
+                    missing[i] = (s, ring, sum / n);
+                    is_empty = false;
+                }
+            }
+            if is_empty {
                 break;
             }
-            filled.extend(ring);
-            missing.retain(|s| !filled.contains_key(s));
         }
-        let own = self.unseen.get(&b).into_iter().flatten();
-        own.filter_map(|s| filled.get(s).map(|&value| (*s, value))).collect()
+        for s in self.unseen_of(map, b) {
+            let filled = missing.binary_search_by_key(&s, |m| m.0).ok().map(|i| missing[i]);
+            if let Some((_, 1.., value)) = filled {
+                slot.put(s, value);
+            }
+        }
     }
 
     /// Irradiance shown at a sample of the light map; `with_direct` false: indirect light alone.
@@ -517,11 +636,7 @@ impl Display {
 }
 
 fn copy_of<T: Clone>(of: &[T]) -> Result<Vec<T>> {
-    let mut copy = Vec::new();
-    copy.try_reserve_exact(of.len())
-        .map_err(|_| Error::OutOfMemory(format!("a copy of shown light needs {} bytes", size_of_val(of))))?;
-    copy.extend_from_slice(of);
-    Ok(copy)
+    try_to_vec(of, "a copy of shown light")
 }
 
 fn own_rect(map: &BlockMap, placement: u32) -> Rect {

@@ -17,6 +17,7 @@ mod cells;
 mod choose;
 mod dirty;
 mod display;
+mod lists;
 mod read;
 mod relight;
 mod save;
@@ -34,7 +35,7 @@ use crate::lightmap::indirect::blur::MAX_BLUR_RADIUS;
 use crate::lightmap::indirect::gather::Gathered;
 use crate::lightmap::indirect::sample_set::{ROUND, SampleSet};
 use crate::lightmap::{BakeParams, Lightmap};
-use crate::memory::{Reservation, try_vec};
+use crate::memory::{Reservation, try_vec, try_with_capacity};
 use crate::progress::Progress;
 use crate::sampling::purpose_seed;
 use crate::scene::{Light, Scene};
@@ -43,13 +44,13 @@ use blocks::{Block, BlockMap, BlockStatus, Blocks, Rect, Tile};
 use cells::{Grid, Promotion};
 use choose::{Choice, Chooser};
 use dirty::Dirty;
-use display::{Changed, Display};
+use display::Display;
 use glam::Vec3;
 use rayon::prelude::*;
 use read::ChartBins;
 use relight::{Illumination, Relight};
 use std::collections::VecDeque;
-use std::sync::Arc;
+use std::sync::{Arc, Mutex};
 use std::time::{Duration, Instant};
 use visibility::Visibility;
 use work::{Context, Limit, Step};
@@ -225,8 +226,9 @@ pub struct Live {
     /// Blocks to show anew.
     waiting: VecDeque<u32>,
     is_waiting: Vec<bool>,
-    /// Blocks that fade to what is known.
+    /// Blocks that fade to what is known, and room for those that go on fading. All blocks fit into each.
     fading: Vec<u32>,
+    still_fading: Vec<u32>,
     /// Work that goes on between updates, on blocks that are then away from `blocks`.
     background: Option<Background>,
     paused: bool,
@@ -315,7 +317,7 @@ impl Live {
         progress.check()?;
         let display = Display::new(&map, params.blur)?;
         progress.check()?;
-        let bins = ChartBins::new(&map);
+        let bins = ChartBins::new(&map)?;
         let chooser = Chooser::new(&map, &grid)?;
         let promotion = Promotion::new(&map.tiles, &grid)?;
         let fixed = map.bytes()
@@ -325,8 +327,8 @@ impl Live {
             + bins.bytes()
             + chooser.bytes()
             + light.radiance.values.len() * size_of::<Vec3>()
-            // Marks, and the queue of what is to be shown.
-            + map.tiles.len() * 9;
+            // Marks, what is seen, and the queues of what is to be shown and fades.
+            + map.tiles.len() * 21;
         let memory = atlas.scene.device().memory().reserve(fixed, "the live state")?;
         let all_of = |t: &Tile| t.texels.len() * size_of::<Gathered>() + t.map_texels as usize * size_of::<Vec3>();
         let full: usize = map.tiles.iter().map(all_of).sum();
@@ -335,10 +337,11 @@ impl Live {
         waiting.try_reserve_exact(blocks.len()).map_err(|_| Error::OutOfMemory("the queue of blocks".into()))?;
         Ok(Live {
             visibility: Visibility::new(blocks.len())?,
-            dirty: Dirty::all(atlas.info.page_count, atlas.map.layout.page_size),
+            dirty: Dirty::all(atlas.info.page_count, atlas.map.layout.page_size)?,
             is_waiting: try_vec(blocks.len(), "the queue of blocks")?,
             waiting,
-            fading: Vec::new(),
+            fading: try_with_capacity(blocks.len(), "the queue of blocks")?,
+            still_fading: try_with_capacity(blocks.len(), "the queue of blocks")?,
             bytes_full: (fixed + full) as u64,
             params: *params,
             relight: Relight::default(),
@@ -395,6 +398,7 @@ impl Live {
                 {}
                 (*status, *home) = (block.status, Some(block.work));
             }
+            limit.check_memory()?;
             stage.advance(1)
         })?;
         self.total_rays += limit.traced.into_inner();
@@ -403,7 +407,7 @@ impl Live {
         self.held = self.blocks.bytes() as isize;
         let stage = progress.stage("show", 0.9, 1.0, 2 * self.blocks.len() as u64);
         for some in in_parts(self.blocks.len()) {
-            self.display.take_coarse(&context.map, &mut self.blocks, &some);
+            self.display.take_coarse(&context.map, &mut self.blocks, &some, |_| ());
             stage.advance(some.len() as u64)?;
         }
         for (lod, status) in self.display.lods.iter_mut().zip(self.blocks.status()) {
@@ -411,7 +415,7 @@ impl Live {
         }
         self.reserve(0)?;
         for some in in_parts(self.blocks.len()) {
-            self.display.refresh(&context.map, &self.blocks, &some);
+            self.display.refresh(&context.map, &self.blocks, &some, |_| ());
             stage.advance(some.len() as u64)?;
         }
         self.note_all_shown();
@@ -420,8 +424,7 @@ impl Live {
 
     /// Takes note of how far all blocks are, and that all pages show something else.
     fn note_all_shown(&mut self) {
-        let atlas = &self.context.map.atlas;
-        self.dirty = Dirty::all(atlas.info.page_count, atlas.map.layout.page_size);
+        self.dirty.mark_all(self.page_size());
         self.promotion.count(&self.context.map.tiles, self.blocks.status());
         self.chooser.note_all(&self.context, self.blocks.status());
     }
@@ -451,14 +454,16 @@ impl Live {
         budget.validate()?;
         let mut stats = LiveStats::default();
         let device = self.device();
-        self.collect(&mut stats)?;
-        self.take_new_light()?;
-        if !budget.is_nothing() {
-            // On the pool as a whole: going there and back takes as long as a hundred rays.
-            device.install(|| self.spend(start, camera, budget, &mut stats))?;
-        }
-        self.start_background(camera)?;
+        let result = self.collect(&mut stats).and_then(|()| {
+            self.take_new_light()?;
+            if !budget.is_nothing() {
+                // On the pool as a whole: going there and back takes as long as a hundred rays.
+                device.install(|| self.spend(start, camera, budget, &mut stats))?;
+            }
+            self.start_background(camera)
+        });
         self.total_rays += stats.rays;
+        result?;
         self.describe(&mut stats);
         stats.milliseconds = start.elapsed().as_secs_f32() * 1e3;
         Ok(stats)
@@ -497,7 +502,6 @@ impl Live {
             let deadline = end.map(|e| e.checked_sub(spare).unwrap_or(e));
             traced += self.work_on(&chosen, step, Limit::new(deadline, most_rays - traced), stats)?;
         }
-        stats.rays += traced;
         self.show_waiting(end, stats);
         Ok(())
     }
@@ -509,33 +513,37 @@ impl Live {
         let start = Instant::now();
         // Showing what is completed takes time too.
         let seconds = if step == Step::Coarse { self.coarse_seconds } else { self.refresh_seconds };
-        let blocks = &mut self.blocks;
-        let taken = chosen.iter().filter_map(|&b| Some((b, blocks.take(b)?)));
-        let batch = Batch::new(self.context.clone(), taken, step, limit, Duration::from_secs_f64(seconds));
+        let showing = Duration::from_secs_f64(seconds);
+        let batch = Batch::new(self.context.clone(), &mut self.blocks, chosen, step, limit, showing)?;
         let (items, traced, result) = batch.run();
         self.take_over(items, stats);
         if step == Step::Coarse {
             let seconds = start.elapsed().as_secs_f64() / chosen.len() as f64;
             self.coarse_seconds += 0.2 * (seconds - self.coarse_seconds);
         }
+        stats.rays += traced;
         result.map(|()| traced)
     }
 
     /// Puts blocks back and shows, or has shown, what became of them. To be called in the pool.
-    fn take_over(&mut self, items: Vec<Item>, stats: &mut LiveStats) {
+    fn take_over(&mut self, mut items: Vec<Mutex<Item>>, stats: &mut LiveStats) {
         let map = self.context.map.clone();
-        let done: Vec<_> = items.iter().map(|i| (i.number, i.done)).collect();
-        for item in items {
+        let mut coarse = Vec::new();
+        for item in &mut items {
+            let item = inside(item);
             self.held += item.block.work.bytes() as isize - item.bytes as isize;
-            self.blocks.put(item.number, item.block);
+            self.blocks.put(item.number, std::mem::take(&mut item.block));
+            if item.done.coarse {
+                coarse.push(item.number);
+            }
         }
-        let coarse: Vec<u32> = done.iter().filter(|d| d.1.coarse).map(|d| d.0).collect();
         if !coarse.is_empty() {
-            let changed = self.display.take_coarse(&map, &mut self.blocks, &coarse);
-            changed.into_iter().for_each(|c| self.dirty.add(c));
+            let dirty = &mut self.dirty;
+            self.display.take_coarse(&map, &mut self.blocks, &coarse, |c| dirty.add(c));
             stats.blocks_changed += coarse.len() as u32;
         }
-        for (b, done) in done {
+        for item in &mut items {
+            let &mut Item { number: b, done, .. } = inside(item);
             if let Some(tile) = self.blocks.work_mut(b).and_then(|w| w.new_direct.take()) {
                 let (changed, grown) = self.display.take_direct(&map, b, tile);
                 self.dirty.add(changed);
@@ -590,8 +598,8 @@ impl Live {
                 return;
             }
             let batch: Vec<u32> = self.waiting.drain(..fit.min(PASS).min(self.waiting.len())).collect();
-            let changed: Vec<Changed> = self.display.refresh(&self.context.map, &self.blocks, &batch);
-            changed.into_iter().for_each(|c| self.dirty.add(c));
+            let dirty = &mut self.dirty;
+            self.display.refresh(&self.context.map, &self.blocks, &batch, |c| dirty.add(c));
             for &b in &batch {
                 self.is_waiting[b as usize] = false;
                 let status = *self.status(b);
@@ -608,27 +616,32 @@ impl Live {
 
     /// One step of the blocks that fade, as far as there is time; those left come first next time.
     fn show_fading(&mut self, end: Option<Instant>, stats: &mut LiveStats) {
-        let mut todo: Vec<u32> = Vec::new();
-        let mut rest: Vec<u32> = Vec::new();
-        for b in std::mem::take(&mut self.fading) {
-            // What waits is not known to the display yet.
-            if self.is_waiting[b as usize] { rest.push(b) } else { todo.push(b) }
-        }
-        let mut todo = todo.into_iter();
-        while todo.len() > 0 {
+        let rest = &mut self.still_fading;
+        // What waits is not known to the display yet.
+        self.fading.retain(|&b| {
+            let waits = self.is_waiting[b as usize];
+            if waits {
+                rest.push(b);
+            }
+            !waits
+        });
+        let mut shown = 0;
+        while shown < self.fading.len() {
             let left = end.map_or(f64::INFINITY, |e| e.saturating_duration_since(Instant::now()).as_secs_f64());
             // A fade must not take the time of all work.
             let fit = (0.5 * left / self.refresh_seconds) as usize;
             if fit == 0 {
                 break;
             }
-            let batch: Vec<u32> = todo.by_ref().take(fit.min(PASS)).collect();
-            let changed = self.display.fade(&self.context.map, &batch);
-            changed.into_iter().for_each(|c| self.dirty.add(c));
+            let batch = &self.fading[shown..self.fading.len().min(shown + fit.min(PASS))];
+            let dirty = &mut self.dirty;
+            self.display.fade(&self.context.map, batch, |c| dirty.add(c));
             stats.blocks_changed += batch.len() as u32;
-            rest.extend(batch.into_iter().filter(|&b| self.display.is_fading(b)));
+            rest.extend(batch.iter().filter(|&&b| self.display.is_fading(b)));
+            shown += batch.len();
         }
-        self.fading = todo.chain(rest).collect();
+        self.fading.drain(..shown);
+        self.fading.append(rest);
     }
 
     /// Announces what work on blocks may allocate.
@@ -678,7 +691,8 @@ impl Live {
             return Ok(());
         };
         let before = self.context.light.clone();
-        self.context.light = Arc::new(before.renewed(new));
+        let renewed = before.renewed(new).inspect_err(|_| self.relight.redo())?;
+        self.context.light = Arc::new(renewed);
         self.display.begin_indirect_epoch();
         if self.context.light.direct_epoch != before.direct_epoch {
             self.display.begin_direct_epoch();
@@ -732,10 +746,8 @@ impl Live {
         }
         self.reserve_for(&chosen)?;
         let most_rays = Some(self.params.rays_per_update as u64).filter(|&r| r > 0).unwrap_or(u64::MAX);
-        let blocks = &mut self.blocks;
-        let taken = chosen.iter().filter_map(|&b| Some((b, blocks.take(b)?)));
         let limit = Limit::new(None, most_rays);
-        let batch = Batch::new(self.context.clone(), taken, step, limit, Duration::ZERO);
+        let batch = Batch::new(self.context.clone(), &mut self.blocks, &chosen, step, limit, Duration::ZERO)?;
         self.background = Some(Background::start(batch, &self.device()));
         Ok(())
     }
@@ -814,16 +826,22 @@ impl Live {
 
     /// Removes and returns up to `capacity` rectangles whose shown light has changed since they were
     /// last taken. At first all pages are.
-    pub fn take_dirty(&mut self, capacity: usize) -> Vec<PageRect> {
+    pub fn take_dirty(&mut self, capacity: usize) -> Result<Vec<PageRect>> {
+        let mut all = try_with_capacity(capacity.min(self.dirty.len()), "the list of changes")?;
+        self.take_each_dirty(capacity, |rect| all.push(rect));
+        Ok(all)
+    }
+
+    /// [`take_dirty`](Self::take_dirty), handed out one by one.
+    pub fn take_each_dirty(&mut self, capacity: usize, mut put: impl FnMut(PageRect)) {
         let size = self.page_size() as i32;
         let page = Rect { x0: 0, y0: 0, x1: size, y1: size };
         let padding = self.context.map.atlas.padding as i32;
-        let rect = |(number, rect): (u32, Rect)| {
+        self.dirty.take(capacity, |number, rect| {
             let r = rect.grown(padding).clipped(&page);
             let (width, height) = (r.width() as u32, r.height() as u32);
-            PageRect { page: number, x: r.x0 as u32, y: r.y0 as u32, width, height }
-        };
-        self.dirty.take(capacity).into_iter().map(rect).collect()
+            put(PageRect { page: number, x: r.x0 as u32, y: r.y0 as u32, width, height });
+        });
     }
 
     /// Width and height of the pages, as those of the light map.
@@ -851,7 +869,7 @@ impl Live {
     /// tests.
     pub fn sums(&mut self) -> Result<Vec<([f32; 3], u32)>> {
         self.collect_now()?;
-        let mut sums = vec![([0.0; 3], 0); self.context.map.atlas.gather.len()];
+        let mut sums = try_vec(self.context.map.atlas.gather.len(), "the sums of texels")?;
         for (b, tile) in (0..).zip(&self.context.map.tiles) {
             let gathered = self.blocks.work(b).map_or(&[][..], |w| &w.gathered);
             for (&s, g) in tile.texels.iter().zip(gathered) {
@@ -870,6 +888,11 @@ impl Live {
         }
         Ok(())
     }
+}
+
+/// What nobody else has a lock on.
+fn inside<T>(of: &mut Mutex<T>) -> &mut T {
+    of.get_mut().unwrap_or_else(|e| e.into_inner())
 }
 
 /// The numbers of all blocks, in parts that are shown at once.

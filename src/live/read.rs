@@ -2,9 +2,11 @@
 
 use super::blocks::{BlockMap, Rect};
 use super::display::Display;
+use super::lists::Lists;
 use super::{Live, PageRect};
 use crate::error::{Result, invalid_argument};
 use crate::lightmap::atlas::texels::PageArea;
+use crate::memory::{try_append, try_vec};
 use rayon::prelude::*;
 
 /// Side of a bin in texels. (16 is no faster: time goes to the search of the nearest texel in the padding.)
@@ -21,44 +23,46 @@ const SMALL: usize = 4096;
 pub(super) struct ChartBins {
     /// Bins along a side of a page.
     side: i32,
-    bins: Vec<Vec<u32>>,
+    bins: Lists,
 }
 
 impl ChartBins {
-    pub fn new(map: &BlockMap) -> ChartBins {
+    pub fn new(map: &BlockMap) -> Result<ChartBins> {
         let atlas = &map.atlas;
         let side = (atlas.map.layout.page_size as i32 + BIN - 1) / BIN;
-        let pages = atlas.info.page_count as i32;
-        let mut bins = ChartBins { side, bins: vec![Vec::new(); (side * side * pages) as usize] };
-        for group in 0..atlas.map.texels.group_count() {
-            let (page, area) = atlas.map.texels.group_area(group, atlas.padding);
-            for i in bins.overlapping(page, &area) {
-                bins.bins[i].push(group as u32);
+        let count = (side * side) as usize * atlas.info.page_count as usize;
+        let bins = Lists::new(count, "where charts lie", |add| {
+            for group in 0..atlas.map.texels.group_count() {
+                let (page, area) = atlas.map.texels.group_area(group, atlas.padding);
+                overlapping(side, page, &area).for_each(|bin| add(bin, group as u32));
             }
-        }
-        bins
-    }
-
-    fn overlapping(&self, page: u32, area: &PageArea) -> impl Iterator<Item = usize> + use<> {
-        let side = self.side;
-        let clamp = |v: i32| v.clamp(0, side - 1);
-        let columns = clamp(area.columns.start / BIN)..clamp((area.columns.end - 1) / BIN) + 1;
-        let rows = clamp(area.rows.start / BIN)..clamp((area.rows.end - 1) / BIN) + 1;
-        rows.flat_map(move |j| columns.clone().map(move |i| (i, j)))
-            .map(move |(i, j)| ((page as i32 * side + j) * side + i) as usize)
+        })?;
+        Ok(ChartBins { side, bins })
     }
 
     /// Groups that a rectangle of a page may show, with their padding, in order.
-    fn groups(&self, page: u32, area: &PageArea) -> Vec<u32> {
-        let mut all: Vec<u32> = self.overlapping(page, area).flat_map(|i| self.bins[i].iter().copied()).collect();
+    fn groups(&self, page: u32, area: &PageArea) -> Result<Vec<u32>> {
+        let mut all = Vec::new();
+        for bin in overlapping(self.side, page, area) {
+            try_append(&mut all, self.bins.get(bin), "the charts of a page")?;
+        }
         all.sort_unstable();
         all.dedup();
-        all
+        Ok(all)
     }
 
     pub fn bytes(&self) -> usize {
-        self.bins.iter().map(|b| size_of::<Vec<u32>>() + b.capacity() * 4).sum()
+        self.bins.bytes()
     }
+}
+
+/// The bins that a rectangle of a page lies in, of pages with `side` bins along each side.
+fn overlapping(side: i32, page: u32, area: &PageArea) -> impl Iterator<Item = usize> + use<> {
+    let clamp = |v: i32| v.clamp(0, side - 1);
+    let columns = clamp(area.columns.start / BIN)..clamp((area.columns.end - 1) / BIN) + 1;
+    let rows = clamp(area.rows.start / BIN)..clamp((area.rows.end - 1) / BIN) + 1;
+    rows.flat_map(move |j| columns.clone().map(move |i| (i, j)))
+        .map(move |(i, j)| (page as usize * side as usize + j as usize) * side as usize + i as usize)
 }
 
 impl Live {
@@ -76,7 +80,7 @@ impl Live {
         if lod >= self.params.lod_count {
             return invalid_argument!("lod is {lod}, the live object has {}", self.params.lod_count);
         }
-        let mut out = crate::memory::try_vec::<[f32; 3]>(rect.width as usize * rect.height as usize, "a page")?;
+        let mut out = try_vec::<[f32; 3]>(rect.width as usize * rect.height as usize, "a page")?;
         let r = Rect { x0: rect.x as i32, y0: rect.y as i32, x1: right as i32, y1: bottom as i32 };
         if r.area() == 0 {
             return Ok(out);
@@ -87,23 +91,30 @@ impl Live {
         let compose = |(i, out): (usize, &mut [[f32; 3]])| {
             let y0 = r.y0 + (i * ROWS) as i32;
             let rows = Rect { y0, y1: (y0 + ROWS as i32).min(r.y1), ..r };
-            self.compose(display, rect.page, &rows, with_direct, out);
+            self.compose(display, rect.page, &rows, with_direct, out)
         };
         if r.area() < SMALL {
-            out.chunks_mut(r.width() * ROWS).enumerate().for_each(compose);
+            out.chunks_mut(r.width() * ROWS).enumerate().try_for_each(compose)?;
         } else {
             let device = atlas.scene.device();
-            device.install(|| out.par_chunks_mut(r.width() * ROWS).enumerate().for_each(compose));
+            device.install(|| out.par_chunks_mut(r.width() * ROWS).enumerate().try_for_each(compose))?;
         }
         Ok(out)
     }
 
-    fn compose(&self, display: &Display, page: u32, rows: &Rect, with_direct: bool, out: &mut [[f32; 3]]) {
+    fn compose(
+        &self,
+        display: &Display,
+        page: u32,
+        rows: &Rect,
+        with_direct: bool,
+        out: &mut [[f32; 3]],
+    ) -> Result<()> {
         let (map, light) = (&self.context.map, &*self.context.light);
         let atlas = &map.atlas;
         let area = PageArea { columns: rows.x0..rows.x1, rows: rows.y0..rows.y1 };
-        let groups = self.bins.groups(page, &area).into_iter().map(|g| g as usize);
+        let groups = self.bins.groups(page, &area)?.into_iter().map(|g| g as usize);
         let value = |sample: u32| display.irradiance(map, light, sample, with_direct).to_array();
-        atlas.map.texels.compose(groups, &area, atlas.padding, out, value, |v| v);
+        atlas.map.texels.compose(groups, &area, atlas.padding, out, value, |v| v)
     }
 }

@@ -15,6 +15,7 @@ use crate::lightmap::indirect::radiance_map::Radiance;
 use crate::lightmap::indirect::upsample::{OwnLight, Upsampling};
 use crate::lightmap::plan::{Plan, left_out};
 use crate::lightmap::{BakeParams, BakeStats};
+use crate::memory::{try_collect, try_vec};
 use crate::progress::Progress;
 use glam::Vec3;
 use std::panic::{AssertUnwindSafe, catch_unwind};
@@ -103,7 +104,7 @@ impl Illumination {
     }
 
     /// With new indirect light.
-    pub fn renewed(&self, new: Indirect) -> Illumination {
+    pub fn renewed(&self, new: Indirect) -> Result<Illumination> {
         let mut light = Illumination { indirect_epoch: self.indirect_epoch + 1, ..self.clone() };
         if new.has_indirect {
             light.radiance = Arc::new(new.radiance);
@@ -115,11 +116,12 @@ impl Illumination {
             light.has_indirect = true;
         } else {
             // All went dark: what is there fades to black, on the sides that are shown.
-            light.radiance =
-                Arc::new(Radiance { values: vec![Vec3::ZERO; self.radiance.values.len()], ..Default::default() });
-            light.own = Arc::new(self.own.iter().map(|own| own.map(|_| Vec3::ZERO)).collect());
+            let values = try_vec(self.radiance.values.len(), "the radiance map")?;
+            light.radiance = Arc::new(Radiance { values, ..Default::default() });
+            let own = self.own.iter().map(|own| own.map(|_| Vec3::ZERO));
+            light.own = Arc::new(try_collect(own, "texels on their own")?);
         }
-        light
+        Ok(light)
     }
 }
 
@@ -182,6 +184,11 @@ impl Relight {
         self.device = Some(device);
         self.running = Some(Running { results: Mutex::new(results), cancel, abandon });
         Ok(())
+    }
+
+    /// Has what was computed last computed again: it was lost.
+    pub fn redo(&mut self) {
+        self.again = true;
     }
 
     /// Whether results are still to come.
@@ -287,14 +294,14 @@ mod tests {
             own,
             has_indirect: true,
         };
-        let quick = before.renewed(new(&shown, vec![Some(Vec3::Y), None]));
+        let quick = before.renewed(new(&shown, vec![Some(Vec3::Y), None])).unwrap();
         assert_eq!((quick.direct_epoch, quick.indirect_epoch, quick.radiance.values[0]), (1, 2, Vec3::ONE));
         assert_eq!((&quick.sides.backs, quick.own[0]), (&before.sides.backs, Some(Vec3::Y)));
-        let full = quick.renewed(new(&sides([true, true]), vec![Some(Vec3::Z)]));
+        let full = quick.renewed(new(&sides([true, true]), vec![Some(Vec3::Z)])).unwrap();
         assert_eq!((full.direct_epoch, full.indirect_epoch), (2, 3));
         assert_eq!((&full.sides.backs[..], &full.own[..]), (&[true, true][..], &[Some(Vec3::Z)][..]));
         // Texels that gather for themselves must not go on shining.
-        let dark = quick.renewed(Indirect { has_indirect: false, ..new(&sides([true, true]), Vec::new()) });
+        let dark = quick.renewed(Indirect { has_indirect: false, ..new(&sides([true, true]), Vec::new()) }).unwrap();
         assert_eq!((&dark.sides.backs, &dark.own[..]), (&shown.backs, &[Some(Vec3::ZERO), None][..]));
     }
 
@@ -329,7 +336,7 @@ mod tests {
         }
         for new in renewals() {
             assert!(!new.has_indirect);
-            let dark = light.renewed(new);
+            let dark = light.renewed(new).unwrap();
             assert!(dark.own.len() == light.own.len() && dark.own.iter().flatten().all(|&e| e == Vec3::ZERO));
         }
     }

@@ -12,9 +12,10 @@ use crate::error::{Error, Result, invalid_argument};
 use crate::files;
 use crate::lightmap::indirect::gather::Gathered;
 use crate::lightmap::indirect::sample_set::ROUND;
-use crate::memory::try_vec;
+use crate::memory::{try_vec, try_with_capacity};
 use crate::progress::Progress;
 use glam::Vec3;
+use std::fmt::Write;
 use std::io::Read;
 use std::path::Path;
 
@@ -50,6 +51,14 @@ impl Hash {
     }
 }
 
+/// Text, as its bytes.
+impl std::fmt::Write for Hash {
+    fn write_str(&mut self, text: &str) -> std::fmt::Result {
+        self.bytes(text.as_bytes());
+        Ok(())
+    }
+}
+
 /// A block as saved.
 struct Saved {
     block: Block,
@@ -57,10 +66,20 @@ struct Saved {
     direct: Option<Box<[Vec3]>>,
 }
 
-/// A number that is not one that updates could have arrived at, or the end of the file.
-struct Impossible(&'static str);
+/// Why a part of a file is not taken over.
+enum Refusal {
+    /// A number is not one that updates could have arrived at, or the file ends.
+    Impossible(&'static str),
+    Failed(Error),
+}
 
-type Field<T> = std::result::Result<T, Impossible>;
+impl From<Error> for Refusal {
+    fn from(e: Error) -> Self {
+        Refusal::Failed(e)
+    }
+}
+
+type Field<T> = std::result::Result<T, Refusal>;
 
 impl Live {
     /// Writes the accumulated state to a file, which is replaced as a whole. When that fails or is cancelled, an old
@@ -75,7 +94,8 @@ impl Live {
         let fingerprint = self.fingerprint(progress)?;
         let stage = progress.stage("save", 0.1, 1.0, self.blocks.len() as u64);
         files::prepare(path, |file| {
-            let (mut sum, mut out) = (Hash::new(), MAGIC.to_vec());
+            let (mut sum, mut out) = (Hash::new(), try_with_capacity(2 * PIECE, SAVED)?);
+            out.extend(MAGIC);
             out.extend(fingerprint.to_le_bytes());
             out.extend((self.blocks.len() as u64).to_le_bytes());
             for b in 0..self.blocks.len() as u32 {
@@ -152,7 +172,7 @@ impl Live {
         }
         let stage = progress.stage("show", 0.6, 1.0, blocks.len() as u64);
         for some in in_parts(blocks.len()) {
-            display.refresh(&context.map, &blocks, &some);
+            display.refresh(&context.map, &blocks, &some, |_| ());
             stage.advance(some.len() as u64)?;
         }
         Ok((display, blocks))
@@ -163,7 +183,9 @@ impl Live {
         self.blocks.replace_by(blocks);
         self.held = self.blocks.bytes() as isize + self.display.tile_bytes() as isize;
         // Blocks of which nothing was saved go where they were going.
-        std::mem::take(&mut self.fading).into_iter().for_each(|b| self.wait(b));
+        while let Some(b) = self.fading.pop() {
+            self.wait(b);
+        }
         self.note_all_shown();
     }
 
@@ -183,7 +205,7 @@ impl Live {
         ] {
             h.word(n);
         }
-        h.bytes(format!("{:?}", self.lights).as_bytes());
+        write!(h, "{:?}", self.lights).map_err(|_| Error::Internal("lights have no text".into()))?;
         for values in self.context.light.radiance.values.chunks(PIECE) {
             values.iter().flat_map(|v| v.to_array()).for_each(|c| h.word(c.to_bits() as u64));
             progress.check()?;
@@ -205,6 +227,9 @@ impl Live {
         if status.has_old_light(&self.context) {
             (status, block) = (BlockStatus::default(), &fresh);
         }
+        let tile = self.display.direct_tile(b).filter(|t| t.1).map(|t| t.0);
+        let bytes = BLOCK_BYTES + block.gathered.len() * TEXEL_BYTES + tile.map_or(0, |t| t.bytes());
+        out.try_reserve(bytes).map_err(|_| Error::OutOfMemory(format!("{SAVED} needs {bytes} bytes for a block")))?;
         out.extend([status.fresh_lod, self.display.lods[b as usize].min(status.fresh_lod)]);
         for n in [status.rounds, block.gathered.len() as u16] {
             out.extend(n.to_le_bytes());
@@ -217,7 +242,6 @@ impl Live {
             out.extend(g.backs.to_le_bytes());
             out.extend(g.squares.to_le_bytes());
         }
-        let tile = self.display.direct_tile(b).filter(|t| t.1).map(|t| t.0);
         out.extend(tile.map_or(0, |t| t.values.len() as u32).to_le_bytes());
         for v in tile.iter().flat_map(|t| t.values.iter()) {
             v.to_array().iter().for_each(|c| out.extend(c.to_le_bytes()));
@@ -241,7 +265,7 @@ impl Live {
         if size > most {
             return Err(Error::Io(format!("{name} is damaged: it has {size} bytes, {most} is the most")));
         }
-        let mut bytes = try_vec::<u8>(size as usize, "the saved state")?;
+        let mut bytes = try_vec::<u8>(size as usize, SAVED)?;
         bytes[..HEAD].copy_from_slice(&head);
         let stage = progress.stage("read", 0.1, 0.2, size);
         for piece in bytes[HEAD..].chunks_mut(PIECE) {
@@ -290,14 +314,13 @@ impl Live {
             return Err(Error::Io(format!("{name} is damaged: its checksum does not fit")));
         }
         let stage = progress.stage("parse", 0.3, 0.6, self.blocks.len() as u64);
-        let mut saved = Vec::new();
-        saved
-            .try_reserve_exact(self.blocks.len())
-            .map_err(|_| Error::OutOfMemory(format!("the {} blocks of {name} do not fit", self.blocks.len())))?;
+        let mut saved = try_with_capacity(self.blocks.len(), SAVED)?;
         let mut from = Reader { bytes: rest };
         for b in 0..self.blocks.len() as u32 {
-            let block = self.read_block(b, &mut from);
-            saved.push(block.map_err(|e| Error::Io(format!("{name} is damaged: block {b} has {}", e.0)))?);
+            saved.push(self.read_block(b, &mut from).map_err(|e| match e {
+                Refusal::Impossible(what) => Error::Io(format!("{name} is damaged: block {b} has {what}")),
+                Refusal::Failed(e) => e,
+            })?);
             stage.advance(1)?;
         }
         rest = from.bytes;
@@ -322,14 +345,16 @@ impl Live {
         check(deviations >= 0.0, "a deviation that is none")?;
         check(deviation_count <= count as u32 * most_rounds, "more deviations than rounds")?;
         let least = |i: usize| if i < complete { rounds as u32 * ROUND as u32 } else { 0 };
-        let gathered = (0..count).map(|i| from.gathered(least(i)..=most_rounds * ROUND as u32));
-        let gathered = gathered.collect::<Field<Vec<_>>>()?;
+        let mut gathered = try_with_capacity(count, SAVED)?;
+        for i in 0..count {
+            gathered.push(from.gathered(least(i)..=most_rounds * ROUND as u32)?);
+        }
         let direct = self.read_direct(tile, from)?;
         // The step under way begins again; texels that have its rays are left alone.
         Ok(Saved {
             block: Block {
                 status: BlockStatus { lod, fresh_lod: lod, rounds, ..Default::default() },
-                work: Box::new(BlockWork { gathered, deviations, deviation_count, ..Default::default() }),
+                work: BlockWork { gathered, deviations, deviation_count, ..Default::default() },
             },
             shown,
             direct,
@@ -344,18 +369,23 @@ impl Live {
             return Ok(None);
         }
         check(count == rect.area(), "direct light of another size")?;
-        let values = rect.texels().map(|(x, y)| {
+        let mut values = try_with_capacity(count, SAVED)?;
+        for (x, y) in rect.texels() {
             let value = from.vec3()?;
             if owns(&self.context, tile, x, y).is_none() {
                 check(value.is_nan_mask().all(), "direct light where it has no texel")?;
-                return Ok(Vec3::NAN);
+                values.push(Vec3::NAN);
+                continue;
             }
             check(is_light(value), NO_LIGHT)?;
-            Ok(value)
-        });
-        Ok(Some(values.collect::<Field<_>>()?))
+            values.push(value);
+        }
+        Ok(Some(values.into_boxed_slice()))
     }
 }
+
+/// What buffers are for, in errors.
+const SAVED: &str = "the saved state";
 
 const NO_LIGHT: &str = "light that is negative, infinite or no number";
 
@@ -368,7 +398,7 @@ fn is_light(v: Vec3) -> bool {
 }
 
 fn check(is_possible: bool, what: &'static str) -> Field<()> {
-    if is_possible { Ok(()) } else { Err(Impossible(what)) }
+    if is_possible { Ok(()) } else { Err(Refusal::Impossible(what)) }
 }
 
 /// Numbers from bytes.
@@ -378,7 +408,7 @@ struct Reader<'a> {
 
 impl Reader<'_> {
     fn take<const N: usize>(&mut self) -> Field<[u8; N]> {
-        let (first, rest) = self.bytes.split_first_chunk().ok_or(Impossible("no end"))?;
+        let (first, rest) = self.bytes.split_first_chunk().ok_or(Refusal::Impossible("no end"))?;
         self.bytes = rest;
         Ok(*first)
     }

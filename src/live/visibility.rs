@@ -3,7 +3,7 @@
 
 use super::LiveCamera;
 use super::blocks::BlockMap;
-use crate::memory::try_vec;
+use crate::memory::{try_vec, try_with_capacity};
 use crate::sampling::{combine, sobol_2d};
 use crate::scene::NONE;
 use crate::trace::{PACKET_SIZE, Packet, RawHit};
@@ -19,7 +19,6 @@ const FADING: f32 = 0.93;
 const FORGOTTEN: f32 = 0.01;
 
 /// Marks of what is visible.
-#[derive(Default)]
 pub(super) struct Visibility {
     /// By block.
     marks: Vec<f32>,
@@ -30,7 +29,9 @@ pub(super) struct Visibility {
 
 impl Visibility {
     pub fn new(blocks: usize) -> crate::Result<Visibility> {
-        Ok(Visibility { marks: try_vec(blocks, "marks of what is visible")?, ..Default::default() })
+        // All blocks may be seen: no update has to make room.
+        let what = "marks of what is visible";
+        Ok(Visibility { marks: try_vec(blocks, what)?, seen: try_with_capacity(blocks, what)?, updates: 0 })
     }
 
     pub fn mark(&self, block: u32) -> f32 {

@@ -6,11 +6,12 @@
 
 use super::blocks::{Block, BlockMap, BlockStatus, BlockWork, DirectTile, DirectWork, Tile};
 use super::relight::Illumination;
+use crate::error::{Error, Result};
 use crate::lightmap::indirect::gather::Gathered;
 use crate::lightmap::indirect::radiance_map::RadianceMap;
 use crate::lightmap::indirect::sample_set::{ROUND, SampleSet};
 use crate::lightmap::texel_light::TexelLight;
-use crate::memory::try_vec;
+use crate::memory::{try_collect, try_filled};
 use crate::sampling::combine;
 use crate::scene::NONE;
 use glam::Vec3;
@@ -77,6 +78,19 @@ impl Limit {
             stopped: AtomicBool::new(false),
             out_of_memory: AtomicBool::new(false),
         }
+    }
+
+    /// An error if memory for the work was not to be had.
+    pub fn check_memory(&self) -> Result<()> {
+        if self.out_of_memory.load(Relaxed) {
+            return Err(Error::OutOfMemory("the light of a block of texels".into()));
+        }
+        Ok(())
+    }
+
+    /// What there is, if there was memory for it; takes note if there was none.
+    fn granted<T>(&self, result: Result<T>) -> Option<T> {
+        result.inspect_err(|_| self.out_of_memory.store(true, Relaxed)).ok()
     }
 
     /// Whether there is no room for more; asked before every texel.
@@ -187,8 +201,10 @@ impl Block {
             return done;
         }
         if self.status.changes_behind(c) > 0 {
-            self.work_on_coarse(c, tile, limit);
-            done.coarse = true;
+            done.coarse = self.work_on_coarse(c, tile, limit);
+            if !done.coarse {
+                return done;
+            }
         }
         let kind = match step {
             Step::Coarse => None,
@@ -206,14 +222,20 @@ impl Block {
     /// One step of indirect light; tells whether it was completed.
     pub fn work_on_indirect(&mut self, c: &Context, tile: &Tile, limit: &Limit) -> bool {
         let Some((lod, rounds)) = self.status.target(c) else { return false };
-        if self.status.indirect_epoch != c.light.indirect_epoch {
-            self.begin_epoch(tile, c.light.indirect_epoch);
+        if self.status.indirect_epoch != c.light.indirect_epoch
+            && limit.granted(self.begin_epoch(tile, c.light.indirect_epoch)).is_none()
+        {
+            return false;
         }
         let atlas = &c.map.atlas;
         let lookup = RadianceMap::new(&atlas.charts, &atlas.radiance, &c.light.radiance);
         let end = tile.lod_end[lod as usize];
-        let work = &mut *self.work;
-        work.gathered.reserve_exact((end as usize).saturating_sub(work.gathered.len()));
+        let work = &mut self.work;
+        let missing = (end as usize).saturating_sub(work.gathered.len());
+        if work.gathered.try_reserve_exact(missing).is_err() {
+            limit.out_of_memory.store(true, Relaxed);
+            return false;
+        }
         while work.cursor < end {
             let i = work.cursor as usize;
             let sample = tile.texels[i];
@@ -246,17 +268,19 @@ impl Block {
         true
     }
 
-    /// Keeps the light of now as a prior and starts over.
-    fn begin_epoch(&mut self, tile: &Tile, epoch: u32) {
-        let work = &mut *self.work;
+    /// Keeps the light of now as a prior and starts over. An error changes nothing.
+    fn begin_epoch(&mut self, tile: &Tile, epoch: u32) -> Result<()> {
+        let work = &mut self.work;
         if !work.gathered.is_empty() {
-            work.prior = (0..tile.texels.len()).map(|i| work.estimate(i).unwrap_or(Vec3::NAN)).collect();
+            let known = (0..tile.texels.len()).map(|i| work.estimate(i).unwrap_or(Vec3::NAN));
+            work.prior = try_collect(known, "light of before a change")?.into_boxed_slice();
         }
         work.gathered.clear();
         work.cursor = 0;
         (work.deviations, work.deviation_count) = (0.0, 0);
         let status = &mut self.status;
         (status.indirect_epoch, status.fresh_lod, status.rounds) = (epoch, 0, 0);
+        Ok(())
     }
 
     /// Estimates mean and relative error of the block's indirect light: the spread of its rounds, where there is more
@@ -285,20 +309,22 @@ impl Block {
         self.status.error = if error.is_finite() { error } else { 1.0 };
     }
 
-    /// Direct light of the lowest LOD's texels.
-    pub fn work_on_coarse(&mut self, c: &Context, tile: &Tile, limit: &Limit) {
+    /// Direct light of the lowest LOD's texels; tells whether there was memory for it.
+    pub fn work_on_coarse(&mut self, c: &Context, tile: &Tile, limit: &Limit) -> bool {
         let (atlas, mut rays) = (&c.map.atlas, 0);
         let samples = c.direct_samples.min(COARSE_SAMPLES);
         let value = |&s: &u32| {
             let receiver = atlas.receiver(&atlas.gather, &c.light.sides.backs, s as usize);
             c.light.direct.irradiance(&receiver, samples, combine(c.direct_seed, s), &mut rays)
         };
-        let values: Box<[Vec3]> = tile.texels[..tile.lod_end[0] as usize].iter().map(value).collect();
+        let values = try_collect(tile.texels[..tile.lod_end[0] as usize].iter().map(value), "coarse direct light");
+        let Some(values) = limit.granted(values) else { return false };
         let sum: f32 = values.iter().map(|v| v.element_sum()).sum();
         self.status.direct_mean = sum / values.len().max(1) as f32;
         self.status.coarse_epoch = c.light.direct_epoch;
-        self.work.new_coarse = values;
+        self.work.new_coarse = values.into_boxed_slice();
         limit.traced.fetch_add(rays, Relaxed);
+        true
     }
 
     /// Direct light of the block's light map texels; tells whether it was completed.
@@ -307,19 +333,12 @@ impl Block {
         let begin = || {
             let rect = c.map.rect_in_light_map(of.placement, &of.rect);
             // Far-away vertices can make a block as large as a page.
-            let unknown = |area| {
-                let mut values = try_vec(area, "direct light").ok()?;
-                values.fill(Vec3::NAN);
-                Some(values.into())
-            };
+            let unknown = |area| limit.granted(try_filled(area, Vec3::NAN, "direct light")).map(Vec::into_boxed_slice);
             let tile = DirectTile { rect, values: unknown(rect.area())? };
             let sharp = unknown(rect.grown(1).area())?;
             Some(DirectWork { tile, next: 0, epoch: c.light.direct_epoch, sharp })
         };
-        let Some(mut direct) = under_way.or_else(begin) else {
-            limit.out_of_memory.store(true, Relaxed);
-            return false;
-        };
+        let Some(mut direct) = under_way.or_else(begin) else { return false };
         let (width, corner) = (direct.tile.rect.width().max(1), (direct.tile.rect.x0, direct.tile.rect.y0));
         while (direct.next as usize) < direct.tile.values.len() {
             if limit.reached() {

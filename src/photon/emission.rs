@@ -16,6 +16,8 @@
 
 use super::guide::{Guide, PilotPhoton};
 use super::spot::SpotProfile;
+use crate::error::{Error, Result};
+use crate::memory::{try_filled, try_push, try_with_capacity};
 use crate::sampling::{concentric_disc, cosine_around, orthonormal_basis, uniform_triangle};
 use crate::scene::{Emitter, Light, Scene, Sky};
 use crate::trace::offset::{offset_ray_origin, ray_epsilon};
@@ -117,17 +119,19 @@ pub(super) struct Emission<'a> {
 impl<'a> Emission<'a> {
     /// Allots `count` photons to `lights` and to the scene's emissive triangles. `offset` in [0, 1)
     /// places the first photon.
-    pub(super) fn new(scene: &'a Scene, lights: &[Light], count: u64, offset: f32) -> Self {
+    pub(super) fn new(scene: &'a Scene, lights: &[Light], count: u64, offset: f32) -> Result<Self> {
         let (mut sources, mut skies) = (Vec::new(), Vec::new());
         let mut unaimed = DVec3::ZERO;
         for light in lights {
+            // As many as any light makes.
+            sources.try_reserve(MOST_SOURCES).map_err(|_| no_room(lights.len()))?;
             unaimed += add_sources(scene, light, &mut sources, &mut skies);
         }
         let powers = || sources.iter().map(|s| s.power).chain(scene.emitters().iter().map(emitter_power));
         let aimed: DVec3 = powers().sum();
         let total = mean(aimed);
         let photons_per_watt = if total > 0.0 { count as f64 / total } else { 0.0 };
-        let mut first = Vec::with_capacity(sources.len() + scene.emitters().len() + 1);
+        let mut first = try_with_capacity(sources.len() + scene.emitters().len() + 1, "the photons of each light")?;
         let mut below = 0.0;
         for power in powers() {
             first.push(((below * photons_per_watt - offset as f64).ceil().max(0.0) as u64).min(count));
@@ -136,8 +140,8 @@ impl<'a> Emission<'a> {
         first.push(if total > 0.0 { count } else { 0 });
         let (centre, radius) = sphere_of_scene(scene);
         let power = aimed + unaimed;
-        let guides = vec![None; sources.len()];
-        Emission { scene, sources, skies, centre, radius, first, guides, photons_per_watt, power, unaimed }
+        let guides = try_filled(sources.len(), None, "the guides of lights")?;
+        Ok(Emission { scene, sources, skies, centre, radius, first, guides, photons_per_watt, power, unaimed })
     }
 
     /// Photons to emit: the count asked for, or 0 if no light has any power.
@@ -172,10 +176,14 @@ impl<'a> Emission<'a> {
     }
 
     /// From now on guided by pilot photons, each with its source.
-    pub(super) fn guide(&mut self, pilot: impl Iterator<Item = (usize, PilotPhoton)>) {
-        let mut of_source = vec![Vec::new(); self.sources.len()];
-        pilot.for_each(|(source, photon)| of_source[source].push(photon));
-        self.guides = of_source.iter().map(|photons| Guide::new(photons)).collect();
+    pub(super) fn guide(&mut self, pilot: impl Iterator<Item = (usize, PilotPhoton)>) -> Result<()> {
+        let what = "the pilot photons of lights";
+        let mut of_source: Vec<Vec<PilotPhoton>> = try_filled(self.sources.len(), Vec::new(), what)?;
+        for (source, photon) in pilot {
+            try_push(&mut of_source[source], photon, what)?;
+        }
+        self.guides.iter_mut().zip(&of_source).for_each(|(guide, photons)| *guide = Guide::new(photons));
+        Ok(())
     }
 
     /// Photon `index`, its position on the light chosen by `p` and its direction by `d`, both
@@ -254,6 +262,14 @@ impl<'a> Emission<'a> {
         let position = e.corner + e.edge_u * u + e.edge_v * v;
         (offset_ray_origin(position, normal, self.scene), cosine_around(normal, d))
     }
+}
+
+/// Sources that one light makes, at most: a beam through each of three faces.
+const MOST_SOURCES: usize = 3;
+
+#[cold]
+fn no_room(lights: usize) -> Error {
+    Error::OutOfMemory(format!("the sources of {lights} lights"))
 }
 
 /// Adds the sources that make up `light` and returns its power that is not aimed at the scene.

@@ -15,7 +15,7 @@ use super::PhotonView;
 use super::cylinder::Cylinder;
 use super::trace::{StoredPhoton, Traced};
 use crate::error::{Error, Result};
-use crate::memory::{Reservation, try_vec};
+use crate::memory::{Reservation, try_par_collect_ok, try_to_vec, try_vec, try_with_capacity};
 use crate::progress::{Progress, Stage};
 use glam::{DVec3, Vec3};
 use rayon::prelude::*;
@@ -130,13 +130,11 @@ impl Grid {
 
         let stage = progress.stage("photon grid", from, to, 2 * blocks.len() as u64);
         let ranges = Ranges::new(cells);
-        let offsets: Vec<Vec<u32>> = blocks
-            .par_iter_mut()
-            .map(|block| {
-                stage.advance(1)?;
-                sort_block(block, &frame, &ranges)
-            })
-            .collect::<Result<_>>()?;
+        let sorted = blocks.par_iter_mut().map(|block| {
+            stage.advance(1)?;
+            sort_block(block, &frame, &ranges)
+        });
+        let offsets: Vec<Vec<u32>> = try_par_collect_ok(sorted, "the photons being sorted")?;
         let mut columns: [Vec<f32>; COLUMNS] = Default::default();
         for column in &mut columns {
             *column = try_vec(len + PADDING, "the photon map")?;
@@ -276,14 +274,14 @@ impl Ranges {
 /// Sorts a block by range of cells, stably. Returns where each range starts, and the block's length.
 fn sort_block(block: &mut Vec<StoredPhoton>, frame: &Frame, ranges: &Ranges) -> Result<Vec<u32>> {
     let range_of = |p: &StoredPhoton| frame.cell(p.position) / ranges.per_range;
-    let mut offsets = vec![0u32; ranges.count() + 1];
+    let mut offsets: Vec<u32> = try_vec(ranges.count() + 1, "the photons being sorted")?;
     for p in block.iter() {
         offsets[range_of(p) + 1] += 1;
     }
     for i in 1..offsets.len() {
         offsets[i] += offsets[i - 1];
     }
-    let mut next = offsets.clone();
+    let mut next = try_to_vec(&offsets, "the photons being sorted")?;
     let mut sorted: Vec<StoredPhoton> = try_vec(block.len(), "the photons being sorted")?;
     for p in block.iter() {
         let place = &mut next[range_of(p)];
@@ -312,7 +310,7 @@ fn fill_ranges(
     columns: &mut [Vec<f32>; COLUMNS],
     stage: &Stage,
 ) -> Result<()> {
-    let mut parts = Vec::with_capacity(ranges.count());
+    let mut parts = try_with_capacity(ranges.count(), "the photons being sorted")?;
     let mut columns = columns.each_mut().map(|c| c.as_mut_slice());
     let mut first = 0;
     for range in 0..ranges.count() {

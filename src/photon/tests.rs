@@ -309,7 +309,7 @@ fn the_photons_of_all_lights_carry_exactly_their_power() {
     data.add_light(white_sky(0.3)).unwrap();
     let scene = data.committed();
     for count in [1_000, 9_999] {
-        let emission = emission::Emission::new(&scene, &scene.lights(), count, 0.37);
+        let emission = emission::Emission::new(&scene, &scene.lights(), count, 0.37).unwrap();
         let sum: glam::DVec3 = (0..count).map(|i| emission.emit(i, [0.5; 2], [0.5; 2]).power.as_dvec3()).sum();
         for c in 0..3 {
             assert_close(sum[c], emission.power[c], 1e-5);
@@ -326,7 +326,7 @@ fn a_light_too_faint_for_a_photon_keeps_its_power_in_expectation() {
     let offsets = 1000;
     let mut blue = 0.0;
     for i in 0..offsets {
-        let emission = emission::Emission::new(&scene, &scene.lights(), 4, (i as f32 + 0.5) / offsets as f32);
+        let emission = emission::Emission::new(&scene, &scene.lights(), 4, (i as f32 + 0.5) / offsets as f32).unwrap();
         let only = |p: &emission::Emitted| p.power.x == 0.0;
         let photons = (0..4).map(|i| emission.emit(i, [0.5; 2], [0.5; 2]));
         blue += photons.filter(only).map(|p| p.power.z as f64).sum::<f64>() / offsets as f64;

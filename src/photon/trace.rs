@@ -10,7 +10,7 @@ use super::emission::Emission;
 use super::guide::PilotPhoton;
 use super::{PATH_LIMIT, PhotonParams, PhotonStats};
 use crate::error::{Error, Result};
-use crate::memory::{MemoryMonitor, Reservation};
+use crate::memory::{MemoryMonitor, Reservation, try_collect, try_filled, try_par_collect_ok, try_with_capacity};
 use crate::progress::{Progress, Stage};
 use crate::sampling::{combine, cosine_around, purpose_seed, sobol_2d, sobol_2d_bits, uniform};
 use crate::scene::{Light, NONE, Scene};
@@ -90,17 +90,16 @@ pub(super) fn trace(
     tracer.thin_out(params.most_stored)?;
     let stage = progress.stage("photons", from, to, count.div_ceil(BLOCK));
     let memory = Account::new(scene.device().memory().clone(), params.memory_budget);
-    let results: Vec<(Vec<StoredPhoton>, Tally)> = (0..count.div_ceil(BLOCK))
-        .into_par_iter()
-        .map(|block| {
-            let result = tracer.block(block, Some((&stage, &memory)), |_, _, _| ())?;
-            stage.advance(1)?;
-            Ok(result)
-        })
-        .collect::<Result<_>>()?;
+    let traced = tracer.blocks().into_par_iter().map(|block| {
+        stage.check()?;
+        let result = tracer.block(block as u64, Some((&stage, &memory)), |_, _, _| ())?;
+        stage.advance(1)?;
+        Ok(result)
+    });
+    let results: Vec<(Vec<StoredPhoton>, Tally)> = try_par_collect_ok(traced, "blocks of photons")?;
 
     let mut tally = Tally::default();
-    let mut blocks = Vec::with_capacity(results.len());
+    let mut blocks = try_with_capacity(results.len(), "blocks of photons")?;
     for (block, t) in results {
         tally.add(&t);
         blocks.push(block);
@@ -188,28 +187,33 @@ struct Tracer<'a> {
 }
 
 impl<'a> Tracer<'a> {
-    fn new(scene: &'a Scene, lights: &[Light], params: &PhotonParams) -> Self {
+    fn new(scene: &'a Scene, lights: &[Light], params: &PhotonParams) -> Result<Self> {
         let seed = purpose_seed(params.seed, PURPOSE);
-        let emission = Emission::new(scene, lights, params.photon_count, uniform(0, ALLOTMENT, seed));
+        let emission = Emission::new(scene, lights, params.photon_count, uniform(0, ALLOTMENT, seed))?;
         let limit = if params.max_bounces == 0 { PATH_LIMIT } else { params.max_bounces.min(PATH_LIMIT) };
-        Tracer { scene, emission, seed, limit, store_direct: params.store_direct, stored_part: 1.0, pilot_rays: 0 }
+        let store_direct = params.store_direct;
+        Ok(Tracer { scene, emission, seed, limit, store_direct, stored_part: 1.0, pilot_rays: 0 })
     }
 
     /// The same with guides, if there are photons enough to find any.
     fn guided(scene: &'a Scene, lights: &[Light], params: &PhotonParams) -> Result<Self> {
         let count = (params.photon_count / PILOT_PART).min(MAX_PILOT);
-        let mut tracer = Tracer::new(scene, lights, params);
+        let mut tracer = Tracer::new(scene, lights, params)?;
         if count < BLOCK || !tracer.emission.can_be_guided() {
             return Ok(tracer);
         }
         let params = PhotonParams { photon_count: count, seed: params.seed ^ PILOT_SEED, ..*params };
-        let pilot = Tracer::new(scene, lights, &params);
-        let blocks =
-            (0..pilot.emission.count().div_ceil(BLOCK)).into_par_iter().map(|block| pilot.left_by_block(block));
-        let blocks: Vec<(Vec<Guidable>, u64)> = blocks.collect::<Result<_>>()?;
+        let pilot = Tracer::new(scene, lights, &params)?;
+        let blocks = pilot.blocks().into_par_iter().map(|block| pilot.left_by_block(block as u64));
+        let blocks: Vec<(Vec<Guidable>, u64)> = try_par_collect_ok(blocks, "pilot photons")?;
         tracer.pilot_rays = blocks.iter().map(|b| b.1).sum();
-        tracer.emission.guide(blocks.into_iter().flat_map(|b| b.0));
+        tracer.emission.guide(blocks.into_iter().flat_map(|b| b.0))?;
         Ok(tracer)
+    }
+
+    /// The numbers of the blocks of photons.
+    fn blocks(&self) -> std::ops::Range<usize> {
+        0..self.emission.count().div_ceil(BLOCK) as usize
     }
 
     /// Has only a part of the photons stored if they would be more than `most` (0: any number) in all, judging by the first
@@ -242,7 +246,7 @@ impl<'a> Tracer<'a> {
             let (source, place) = self.emission.guidable(photon, at(EMIT_POSITION), at(EMIT_DIRECTION))?;
             Some((source, PilotPhoton { place, left }))
         });
-        Ok((guidable.collect(), tally.rays))
+        Ok((try_collect(guidable, "pilot photons")?, tally.rays))
     }
 
     /// Traces one block of photons; `watch` may cancel and counts the memory; `see` gets the number, the rays and the
@@ -254,15 +258,16 @@ impl<'a> Tracer<'a> {
         mut see: impl FnMut(u32, &[Ray], &[Path]),
     ) -> Result<(Vec<StoredPhoton>, Tally)> {
         let numbers = block * BLOCK..((block + 1) * BLOCK).min(self.emission.count());
-        let mut rays = Vec::with_capacity(BLOCK as usize);
-        let mut paths = Vec::with_capacity(BLOCK as usize);
+        let what = "a block of photons";
+        let mut rays = try_with_capacity(BLOCK as usize, what)?;
+        let mut paths = try_with_capacity(BLOCK as usize, what)?;
         for number in numbers {
             let (ray, path) = self.emit(number as u32);
             rays.push(ray);
             paths.push(path);
         }
-        let mut hits = vec![RawHit::MISS; rays.len()];
-        let mut surfaces = vec![Surface::NOTHING; rays.len()];
+        let mut hits = try_filled(rays.len(), RawHit::MISS, what)?;
+        let mut surfaces = try_filled(rays.len(), Surface::NOTHING, what)?;
         let (mut stored, mut announced) = (Vec::new(), 0);
         // Every n-th photon is stored, from a random one on.
         let (mut due, mut kept) = (uniform(block as u32, STORED, self.seed), 0);
@@ -540,7 +545,7 @@ mod tests {
                 }
                 (inside, red, all, emitted)
             };
-            let plain = sums(Tracer::new(&scene, lights, &params));
+            let plain = sums(Tracer::new(&scene, lights, &params).unwrap());
             let guided = sums(Tracer::guided(&scene, lights, &params).unwrap());
             // A hundredth of the pilot photons makes coarse guides. The plain 1,316 photons have 3 % noise.
             let (more, tolerance) = if lights.len() < 100 { (2.0, 0.03) } else { (1.5, 0.06) };

@@ -7,6 +7,7 @@ use crate::device::LogLevel;
 use crate::error::{Error, Result, invalid_argument};
 use crate::memory::{try_to_vec, try_with_capacity};
 use glam::Vec3;
+use rayon::prelude::*;
 use std::collections::HashMap;
 use std::sync::Arc;
 use std::time::Instant;
@@ -83,16 +84,18 @@ impl Scene {
             let m = first.partition_point(|&first| first <= t) - 1;
             meshes[m].corners((t - first[m]) as usize)
         };
-        let out = self.tree.refit(&corners, room);
-        if !out.is_empty() {
-            let total = self.stats.triangles;
-            let message = format!("{} of {total} triangles are degenerate or not finite after the refit", out.len());
+        self.tree.refit(&corners, room);
+        let total = self.stats.triangles as u32;
+        let is_gone = |&t: &u32| !is_valid_triangle(corners(t)) && self.skipped.binary_search(&t).is_err();
+        let gone = (0..total).into_par_iter().filter(is_gone).count();
+        if gone > 0 {
+            let message = format!("{gone} of {total} triangles are degenerate or not finite after the refit");
             self.device.log(LogLevel::Warning, &message);
         }
         self.bounds = self.tree.bounds();
         add_emitters(&self.data, &self.first_triangle, &self.skipped, &mut emitters);
         self.emitters = emitters;
-        self.stats.skipped_degenerate = (self.skipped.len() + out.len()) as u64;
+        self.stats.skipped_degenerate = (self.skipped.len() + gone) as u64;
         self.stats.wide_sah_cost = self.tree.sah_cost();
         self.warn_of_few_digits();
     }

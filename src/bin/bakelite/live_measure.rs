@@ -328,7 +328,7 @@ pub fn walk(
     let radius = 0.01 * scene.diagonal();
     let mut live = Live::new(lightmap, params, &Progress::none())?;
     // The first upload is that of everything.
-    live.take_dirty(usize::MAX);
+    live.take_dirty(usize::MAX).unwrap();
     let mut walk = Walk { threads: scene.device().num_threads(), budget_ms, frames: Vec::new(), change_ms: 0.0 };
     for i in 0..updates {
         if i % CHANGE_INTERVAL == CHANGE_INTERVAL - 1 && !scene.lights().is_empty() {
@@ -342,7 +342,7 @@ pub fn walk(
         let stats = live.update(&camera, &budget)?;
         let used_ms = start.elapsed().as_secs_f64() * 1e3;
         let start = Instant::now();
-        let dirty = live.take_dirty(usize::MAX);
+        let dirty = live.take_dirty(usize::MAX).unwrap();
         for rect in &dirty {
             std::hint::black_box(live.read(rect, live.params().lod_count - 1, true)?);
         }

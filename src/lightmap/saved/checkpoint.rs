@@ -11,7 +11,7 @@
 //! Records are only ever appended. A kill at any moment leaves at most the last of them torn, which is cut off.
 
 use super::fingerprint::{Fingerprint, Origin};
-use super::records::{self, MAGIC, Next, Records, Tag, take};
+use super::records::{self, MAGIC, Next, Records, Tag, take, take_one};
 use super::result::is_light;
 use super::{another_kind, damaged, foreign};
 use crate::device::{Device, LogLevel};
@@ -21,6 +21,7 @@ use crate::lightmap::atlas::Atlas;
 use crate::lightmap::indirect::find_bright_patches;
 use crate::lightmap::indirect::radiance_map::Radiance;
 use crate::lightmap::indirect::upsample::OwnLight;
+use crate::memory::{try_collect, try_vec};
 use glam::Vec3;
 use std::collections::HashMap;
 use std::fs::{File, OpenOptions, TryLockError};
@@ -123,7 +124,7 @@ impl<'a> Checkpoint<'a> {
         let path = &params.path;
         let needed = Fingerprint::new(atlas, origin, range);
         let mut head = MAGIC.to_vec();
-        records::append(&mut head, HEAD, &[bytemuck::bytes_of(&needed)]);
+        records::append(&mut head, HEAD, &[bytemuck::bytes_of(&needed)])?;
         let mut file = open_locked(path)?;
         let fail = |e| Error::Io(format!("cannot use the checkpoint {}: {e}", path.display()));
         let size = file.metadata().map_err(fail)?.len();
@@ -156,22 +157,21 @@ impl<'a> Checkpoint<'a> {
     /// The radiance map of an earlier run, if it was completed. To be called on the device's threads.
     pub fn radiance(&self, atlas: &Atlas) -> Result<Option<Radiance>> {
         let Some(end) = self.take(RADIANCE_DONE, 0) else { return Ok(None) };
-        let mut values: Vec<Vec3> = Vec::new();
-        for run in 0..atlas.radiance.len().div_ceil(RUN) as u64 {
+        let mut values: Vec<Vec3> = try_vec(atlas.radiance.len(), "the radiance map of a checkpoint")?;
+        for (run, of_run) in (0..).zip(values.chunks_mut(RUN)) {
             let Some(content) = self.take(RADIANCE, run) else { return Ok(None) };
-            let Some(of_run) = take::<Vec3>(&mut &content[..], content.len() / size_of::<Vec3>()) else {
+            if content.len() != size_of_val(of_run) || take(&mut &content[..], of_run).is_none() {
                 return Ok(None);
-            };
-            values.extend(of_run);
+            }
         }
         let mut rest = &end[..];
-        let (Some(limit), Some(shadow_rays)) = (take::<f32>(&mut rest, 1), take::<u32>(&mut rest, 1)) else {
+        let (Some(limit), Some(shadow_rays)) = (take_one::<f32>(&mut rest), take_one::<u32>(&mut rest)) else {
             return Ok(None);
         };
-        if values.len() != atlas.radiance.len() || !is_light(&values) || !limit[0].is_finite() {
+        if !is_light(&values) || !limit.is_finite() {
             return Ok(None);
         }
-        let bright = find_bright_patches::again(atlas, &values, limit[0], shadow_rays[0])?;
+        let bright = find_bright_patches::again(atlas, &values, limit, shadow_rays)?;
         Ok(Some(Radiance { values, bright }))
     }
 
@@ -184,30 +184,34 @@ impl<'a> Checkpoint<'a> {
     }
 
     /// Per chart, whether its back is shown, of an earlier run.
-    pub fn backs(&self, charts: usize) -> Option<Vec<bool>> {
-        let content = self.take(BACKS, 0)?;
+    pub fn backs(&self, charts: usize) -> Result<Option<Vec<bool>>> {
+        let Some(content) = self.take(BACKS, 0) else { return Ok(None) };
         let fits = content.is_empty() || content.len() == charts;
-        fits.then(|| content.iter().map(|&b| b != 0).collect())
+        fits.then(|| try_collect(content.iter().map(|&b| b != 0), "the sides of a checkpoint")).transpose()
     }
 
     pub fn keep_backs(&self, backs: &[bool]) {
-        self.keep(BACKS, 0, &[&backs.iter().map(|&b| b.into()).collect::<Vec<u8>>()]);
+        self.keep(BACKS, 0, &[bytemuck::cast_slice(backs)]);
     }
 
     /// The light of `count` texels that gather for themselves, of an earlier run.
-    pub fn own_light(&self, count: usize) -> Option<OwnLight> {
-        let content = self.take(OWN, 0)?;
-        let values: Vec<Vec3> = take(&mut &content[..], count)?;
+    pub fn own_light(&self, count: usize) -> Result<Option<OwnLight>> {
+        let Some(content) = self.take(OWN, 0) else { return Ok(None) };
+        if content.len() != count * size_of::<Vec3>() {
+            return Ok(None);
+        }
         // Those inside of solids are infinite.
         let known = |v: Vec3| if v.x == f32::INFINITY { None } else { Some(v) };
-        let light: OwnLight = values.into_iter().map(known).collect();
-        let is_whole = content.len() == count * size_of::<Vec3>();
-        (is_whole && light.iter().flatten().all(|&v| is_light(&[v]))).then_some(light)
+        let values = content.chunks_exact(size_of::<Vec3>()).map(bytemuck::pod_read_unaligned::<Vec3>);
+        let light = try_collect(values.map(known), "light of a checkpoint")?;
+        Ok(light.iter().flatten().all(|&v| is_light(&[v])).then_some(light))
     }
 
     pub fn keep_own_light(&self, light: &OwnLight) {
-        let values: Vec<Vec3> = light.iter().map(|v| v.unwrap_or(Vec3::INFINITY)).collect();
-        self.keep(OWN, 0, &[bytemuck::cast_slice(&values)]);
+        match try_collect(light.iter().map(|v| v.unwrap_or(Vec3::INFINITY)), "light of a checkpoint") {
+            Ok(values) => self.keep(OWN, 0, &[bytemuck::cast_slice(&values)]),
+            Err(e) => self.warn(&e),
+        }
     }
 
     /// Fills in a block of the gather map (irradiance, variance and whether each texel is valid) if an earlier run has
@@ -216,7 +220,10 @@ impl<'a> Checkpoint<'a> {
         let read = || {
             let content = self.take(GATHER, block as u64)?;
             let mut rest = &content[..];
-            let (light, spread) = (take::<Vec3>(&mut rest, values.len())?, take::<f32>(&mut rest, values.len())?);
+            // Few: those of a block.
+            let (mut light, mut spread) = (vec![Vec3::ZERO; values.len()], vec![0f32; values.len()]);
+            take(&mut rest, &mut light)?;
+            take(&mut rest, &mut spread)?;
             let fits = rest.len() == values.len() && is_light(&light) && spread.iter().all(|&v| v >= 0.0);
             fits.then(|| (light, spread, rest.to_vec()))
         };
@@ -238,7 +245,8 @@ impl<'a> Checkpoint<'a> {
         let read = || {
             let content = self.take(DIRECT, block as u64)?;
             let mut rest = &content[..];
-            let light = take::<Vec3>(&mut rest, direct.len())?;
+            let mut light = vec![Vec3::ZERO; direct.len()];
+            take(&mut rest, &mut light)?;
             let states = rest.iter().map(|&b| TexelState::from_byte(b)).collect::<Option<Vec<_>>>()?;
             let fits = states.len() == direct.len() && is_light(&light) && !states.contains(&TexelState::Unbaked);
             fits.then_some((light, states))
@@ -263,7 +271,18 @@ impl<'a> Checkpoint<'a> {
         let all: Vec<&[u8]> = [&number[..]].into_iter().chain(parts.iter().copied()).collect();
         let bytes = {
             let mut pending = lock(&self.pending);
-            records::append(&mut pending.bytes, tag, &all);
+            let mut appended = records::append(&mut pending.bytes, tag, &all);
+            if appended.is_err() && !pending.bytes.is_empty() {
+                // What is pending may be all that takes the room.
+                let bytes = std::mem::take(&mut pending.bytes);
+                self.write(&bytes);
+                drop(bytes);
+                appended = records::append(&mut pending.bytes, tag, &all);
+            }
+            if let Err(e) = appended {
+                self.warn(&e);
+                return;
+            }
             if pending.since.elapsed() < self.interval {
                 return;
             }
@@ -292,11 +311,17 @@ impl<'a> Checkpoint<'a> {
                 let whole = output.whole;
                 let _ = output.file.set_len(whole).and_then(|()| output.file.seek(SeekFrom::Start(whole)));
                 if !std::mem::replace(&mut output.failed, true) {
-                    let message = format!("cannot write the checkpoint {}: {e}; the bake goes on", self.path.display());
-                    self.device.log(LogLevel::Warning, &message);
+                    drop(output);
+                    self.warn(&e);
                 }
             }
         }
+    }
+
+    /// A bake goes on although its checkpoint lacks something.
+    fn warn(&self, e: &dyn std::fmt::Display) {
+        let message = format!("cannot write the checkpoint {}: {e}; the bake goes on", self.path.display());
+        self.device.log(LogLevel::Warning, &message);
     }
 }
 
@@ -363,9 +388,11 @@ fn read(
     loop {
         match records.next().map_err(fail)? {
             Next::Record(tag, mut content) => {
-                let number: Vec<u64> = take(&mut &content[..], 1).ok_or_else(|| damaged(path))?;
+                let number: u64 = take_one(&mut &content[..]).ok_or_else(|| damaged(path))?;
                 content.drain(..8);
-                done.insert((tag, number[0]), content);
+                let no_room = |_| Error::OutOfMemory(format!("the checkpoint {}", path.display()));
+                done.try_reserve(1).map_err(no_room)?;
+                done.insert((tag, number), content);
             }
             Next::End | Next::Torn => return Ok(records.whole),
             Next::Damaged => return Err(damaged(path)),

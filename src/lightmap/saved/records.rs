@@ -12,6 +12,7 @@
 //! A process that is killed while it appends leaves a file that ends within a record: a torn end. Any other change
 //! of a file shows in a checksum, that of a length in the header's own.
 
+use crate::error::{Error, Result};
 use std::io::{self, ErrorKind, Read};
 
 /// Begins every file; the last byte is the version of the format. Numbers are stored as the machine has them, so files
@@ -23,19 +24,21 @@ const HEADER: usize = 20;
 
 pub(super) type Tag = [u8; 4];
 
-/// Appends a record whose content is `parts`, one after the other.
-pub(super) fn append(out: &mut Vec<u8>, tag: Tag, parts: &[&[u8]]) {
+/// Appends a record whose content is `parts`, one after the other. An error appends nothing.
+pub(super) fn append(out: &mut Vec<u8>, tag: Tag, parts: &[&[u8]]) -> Result<()> {
     let mut sum = crc32fast::Hasher::new();
     parts.iter().for_each(|p| sum.update(p));
     let length: usize = parts.iter().map(|p| p.len()).sum();
     let start = out.len();
-    out.reserve(HEADER + length);
+    let no_room = |_| Error::OutOfMemory(format!("a record needs {length} bytes"));
+    out.try_reserve(HEADER + length).map_err(no_room)?;
     out.extend(tag);
     out.extend((length as u64).to_ne_bytes());
     out.extend(sum.finalize().to_ne_bytes());
     let header_sum = crc32fast::hash(&out[start..]);
     out.extend(header_sum.to_ne_bytes());
     parts.iter().for_each(|p| out.extend_from_slice(p));
+    Ok(())
 }
 
 /// What comes next in a file.
@@ -95,11 +98,18 @@ impl<R: Read> Records<R> {
     }
 }
 
-/// Takes numbers from the front of a record's content; `None` at its end.
-pub(super) fn take<T: bytemuck::Pod>(content: &mut &[u8], count: usize) -> Option<Vec<T>> {
-    let (first, rest) = content.split_at_checked(count.checked_mul(size_of::<T>())?)?;
+/// Takes numbers from the front of a record's content; `None` if there are fewer.
+pub(super) fn take<T: bytemuck::Pod>(content: &mut &[u8], into: &mut [T]) -> Option<()> {
+    let (first, rest) = content.split_at_checked(size_of_val(into))?;
     *content = rest;
-    Some(bytemuck::pod_collect_to_vec(first))
+    bytemuck::cast_slice_mut(into).copy_from_slice(first);
+    Some(())
+}
+
+/// Takes one number.
+pub(super) fn take_one<T: bytemuck::Pod>(content: &mut &[u8]) -> Option<T> {
+    let mut one = [T::zeroed()];
+    take(content, &mut one).map(|()| one[0])
 }
 
 #[cfg(test)]
@@ -119,9 +129,9 @@ mod tests {
 
     fn two() -> (Vec<u8>, usize) {
         let mut out = Vec::new();
-        append(&mut out, *b"ONE ", &[b"content", b" in parts"]);
+        append(&mut out, *b"ONE ", &[b"content", b" in parts"]).unwrap();
         let first = out.len();
-        append(&mut out, *b"TWO ", &[]);
+        append(&mut out, *b"TWO ", &[]).unwrap();
         (out, first)
     }
 

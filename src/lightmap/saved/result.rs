@@ -6,7 +6,7 @@
 //! together of several results have the bits of one bake.
 
 use super::fingerprint::Fingerprint;
-use super::records::{self, MAGIC, Next, Records, Tag, take};
+use super::records::{self, MAGIC, Next, Records, Tag, take, take_one};
 use super::{another_kind, damaged, foreign};
 use crate::error::{Error, Result};
 use crate::files;
@@ -14,7 +14,7 @@ use crate::lightmap::indirect::bright_patches::Bright;
 use crate::lightmap::indirect::radiance_map::Radiance;
 use crate::lightmap::plan::Plan;
 use crate::lightmap::{BakeStats, Light, Lightmap, TexelState};
-use crate::memory::try_vec;
+use crate::memory::{try_collect, try_push, try_to_vec, try_vec, try_with_capacity};
 use crate::progress::Progress;
 use bytemuck::{Pod, Zeroable};
 use glam::Vec3;
@@ -56,7 +56,7 @@ impl Lightmap {
                     .into(),
             ));
         };
-        let runs = runs(&light.state);
+        let runs = runs(&light.state)?;
         let texels: usize = runs.iter().map(Range::len).sum();
         let head = Head {
             fingerprint: Fingerprint::new(&self.atlas, origin, [0; 2]),
@@ -72,19 +72,18 @@ impl Lightmap {
                 out.clear();
                 stage.advance(items as u64)
             };
-            records::append(&mut out, HEAD, &[bytemuck::bytes_of(&head)]);
-            records::append(&mut out, PLAN, &[light.plan.text().as_bytes()]);
-            let backs: Vec<u8> = light.backs.iter().map(|&b| b.into()).collect();
-            records::append(&mut out, BACKS, &[&backs]);
+            records::append(&mut out, HEAD, &[bytemuck::bytes_of(&head)])?;
+            records::append(&mut out, PLAN, &[light.plan.text().as_bytes()])?;
+            records::append(&mut out, BACKS, &[bytemuck::cast_slice(&light.backs)])?;
             for values in light.radiance.values.chunks(RUN) {
-                records::append(&mut out, RADIANCE, &[bytemuck::cast_slice(values)]);
+                records::append(&mut out, RADIANCE, &[bytemuck::cast_slice(values)])?;
                 write(&mut out, values.len())?;
             }
             for run in runs.iter().flat_map(|r| r.clone().step_by(RUN).map(|i| i..r.end.min(i + RUN))) {
-                append_texels(light, run.clone(), &mut out);
+                append_texels(light, run.clone(), &mut out)?;
                 write(&mut out, run.len())?;
             }
-            records::append(&mut out, DONE, &[]);
+            records::append(&mut out, DONE, &[])?;
             write(&mut out, 0)
         };
         self.atlas.scene.device().run(progress, || files::prepare(path, write_file))?.finish()
@@ -149,27 +148,28 @@ impl Lightmap {
 }
 
 /// Runs of baked texels.
-fn runs(state: &[TexelState]) -> Vec<Range<usize>> {
+fn runs(state: &[TexelState]) -> Result<Vec<Range<usize>>> {
     let mut runs: Vec<Range<usize>> = Vec::new();
     for i in (0..state.len()).filter(|&i| state[i] != TexelState::Unbaked) {
         match runs.last_mut() {
             Some(last) if last.end == i => last.end = i + 1,
-            _ => runs.push(i..i + 1),
+            _ => try_push(&mut runs, i..i + 1, "the runs of baked texels")?,
         }
     }
-    runs
+    Ok(runs)
 }
 
-fn append_texels(light: &Light, run: Range<usize>, out: &mut Vec<u8>) {
-    let (mut direct, mut indirect) = (light.direct[run.clone()].to_vec(), light.indirect[run.clone()].to_vec());
+fn append_texels(light: &Light, run: Range<usize>, out: &mut Vec<u8>) -> Result<()> {
+    let copy = |of: &[Vec3]| try_to_vec(&of[run.clone()], "texels to be saved");
+    let (mut direct, mut indirect) = (copy(&light.direct)?, copy(&light.indirect)?);
     if let Some(stitch) = &light.stitch {
         stitch.former_of(&run, &mut direct, &mut indirect);
     }
-    let states: Vec<u8> = light.state[run.clone()].iter().map(|s| s.to_byte()).collect();
+    let states = try_collect(light.state[run.clone()].iter().map(|s| s.to_byte()), "texels to be saved")?;
     let place = [run.start as u64, run.len() as u64];
     let parts =
         [bytemuck::cast_slice(&place), bytemuck::cast_slice(&direct), bytemuck::cast_slice(&indirect), &states[..]];
-    records::append(out, TEXELS, &parts);
+    records::append(out, TEXELS, &parts)
 }
 
 /// Whether all are what light can be.
@@ -222,13 +222,7 @@ impl<'a> Loading<'a> {
         let stage = progress.stage("loading", 0.0, 1.0, self.head.radiance + self.head.texels);
         let mut texels = 0;
         light.radiance = Radiance { values: Vec::new(), bright: Bright::default() };
-        light.radiance.values.try_reserve_exact(self.head.radiance as usize).map_err(|_| {
-            Error::OutOfMemory(format!(
-                "the radiance map of {} takes {} texels",
-                self.path.display(),
-                self.head.radiance
-            ))
-        })?;
+        light.radiance.values = try_with_capacity(self.head.radiance as usize, "the radiance map of a result")?;
         loop {
             let next = self.records.next();
             let next = next.map_err(|e| Error::Io(format!("cannot read {}: {e}", self.path.display())))?;
@@ -238,7 +232,7 @@ impl<'a> Loading<'a> {
                     .ok()
                     .map(|text| light.plan = Plan::from_text(self.head.left_out as u32, &text))
                     .map(|()| 0),
-                BACKS => read_backs(&content, charts).map(|backs| light.backs = backs).map(|()| 0),
+                BACKS => read_backs(&content, charts)?.map(|backs| light.backs = backs).map(|()| 0),
                 RADIANCE => read_radiance(&content, self.head.radiance as usize, &mut light.radiance.values),
                 TEXELS => read_texels(&content, light).inspect(|&n| texels += n as u64),
                 DONE => break,
@@ -253,37 +247,39 @@ impl<'a> Loading<'a> {
     }
 }
 
-fn read_backs(content: &[u8], charts: usize) -> Option<Vec<bool>> {
+fn read_backs(content: &[u8], charts: usize) -> Result<Option<Vec<bool>>> {
     let fits = content.is_empty() || content.len() == charts;
-    (fits && content.iter().all(|&b| b <= 1)).then(|| content.iter().map(|&b| b == 1).collect())
+    let are_possible = fits && content.iter().all(|&b| b <= 1);
+    are_possible.then(|| try_collect(content.iter().map(|&b| b == 1), "the sides of charts")).transpose()
 }
 
 /// Appends a run of the radiance map; returns its length.
 fn read_radiance(mut content: &[u8], all: usize, values: &mut Vec<Vec3>) -> Option<usize> {
-    let count = content.len() / size_of::<Vec3>();
-    let run: Vec<Vec3> = take(&mut content, count)?;
-    if !content.is_empty() || !is_light(&run) || values.len() + run.len() > all {
+    let (first, count) = (values.len(), content.len() / size_of::<Vec3>());
+    if first + count > all {
         return None;
     }
-    values.extend_from_slice(&run);
-    Some(run.len())
+    // There is room for all.
+    values.resize(first + count, Vec3::ZERO);
+    take(&mut content, &mut values[first..])?;
+    (content.is_empty() && is_light(&values[first..])).then_some(count)
 }
 
-/// Reads a run of texels; returns its length.
+/// Reads a run of texels; returns its length. If it is refused, some texels may have been written.
 fn read_texels(mut content: &[u8], light: &mut Light) -> Option<usize> {
-    let place: Vec<u64> = take(&mut content, 2)?;
-    let (first, count) = (place[0] as usize, place[1] as usize);
+    let [first, count] = take_one::<[u64; 2]>(&mut content)?.map(|n| n as usize);
     let run = first..first.checked_add(count)?;
     if run.end > light.state.len() || count > RUN {
         return None;
     }
-    let (direct, indirect) = (take(&mut content, count)?, take(&mut content, count)?);
-    let states = content.iter().map(|&b| TexelState::from_byte(b)).collect::<Option<Vec<_>>>()?;
-    if states.len() != count || !is_light(&direct) || !is_light(&indirect) || states.contains(&TexelState::Unbaked) {
+    let (direct, indirect) = (&mut light.direct[run.clone()], &mut light.indirect[run.clone()]);
+    take(&mut content, direct)?;
+    take(&mut content, indirect)?;
+    if content.len() != count || !is_light(direct) || !is_light(indirect) {
         return None;
     }
-    light.direct[run.clone()].copy_from_slice(&direct);
-    light.indirect[run.clone()].copy_from_slice(&indirect);
-    light.state[run].copy_from_slice(&states);
+    for (state, &byte) in light.state[run].iter_mut().zip(content) {
+        *state = TexelState::from_byte(byte).filter(|&s| s != TexelState::Unbaked)?;
+    }
     Some(count)
 }

@@ -5,6 +5,8 @@
 //! Exact: first the nearest covered texel in each column, then the best of the columns around.
 
 use super::{Group, NONE, TexelMap};
+use crate::error::{Error, Result};
+use crate::memory::try_push;
 use std::collections::HashMap;
 use std::ops::Range;
 
@@ -68,43 +70,48 @@ impl TexelMap {
         out: &mut [T],
         mut value: impl FnMut(u32) -> T,
         fill: impl Fn(T) -> T,
-    ) {
+    ) -> Result<()> {
         let (mut filled, mut outside) = (Vec::new(), HashMap::new());
         for group in groups {
             filled.clear();
             self.shown(group, area, padding, |x, y, sample, is_covered| {
-                let Some(i) = area.index(x, y) else { return };
+                let Some(i) = area.index(x, y) else { return Ok(()) };
                 if is_covered {
                     out[i] = value(sample);
-                } else {
-                    filled.push((i, sample));
+                    return Ok(());
                 }
-            });
+                try_push(&mut filled, (i, sample), "the padding of a page")
+            })?;
             // Up to a dozen texels of the padding repeat a sample: its value is not computed again.
             for &(i, sample) in &filled {
                 let t = &self.samples[sample as usize];
                 out[i] = fill(match area.index(t.x as i32, t.y as i32) {
                     Some(own) => out[own],
-                    None => *outside.entry(sample).or_insert_with(|| value(sample)),
+                    None => {
+                        let no_room = |_| Error::OutOfMemory("the padding of a page".into());
+                        outside.try_reserve(1).map_err(no_room)?;
+                        *outside.entry(sample).or_insert_with(|| value(sample))
+                    }
                 });
             }
         }
+        Ok(())
     }
 
     /// Calls `visit` with column, row, sample and whether the texel is covered for every texel of `area` that a
-    /// group shows, row by row.
+    /// group shows, row by row, up to its first error.
     pub(super) fn shown(
         &self,
         group: usize,
         area: &PageArea,
         padding: u32,
-        mut visit: impl FnMut(i32, i32, u32, bool),
-    ) {
+        mut visit: impl FnMut(i32, i32, u32, bool) -> Result<()>,
+    ) -> Result<()> {
         let window = self.groups[group].area();
         let reach = padding as i32;
         let shown = self.group_area(group, padding).1.clipped(area);
         if shown.columns.is_empty() || shown.rows.is_empty() {
-            return;
+            return Ok(());
         }
         let around = shown.grown(reach).clipped(&window);
         let width = window.columns.len();
@@ -130,7 +137,7 @@ impl TexelMap {
             let is_near = |row: i32| row != i32::MIN && row.abs_diff(y) <= padding;
             for x in shown.columns.clone() {
                 if window.index(x, y).is_some() && entry(x, y) != NONE {
-                    visit(x, y, entry(x, y), true);
+                    visit(x, y, entry(x, y), true)?;
                     continue;
                 }
                 let columns = around.columns.start.max(x - reach)..around.columns.end.min(x + reach + 1);
@@ -143,10 +150,11 @@ impl TexelMap {
                     .map(|(column, row)| ((column - x).pow(2) + (row - y).pow(2), entry(column, row)))
                     .min();
                 if let Some((_, sample)) = nearest {
-                    visit(x, y, sample, false);
+                    visit(x, y, sample, false)?;
                 }
             }
         }
+        Ok(())
     }
 }
 

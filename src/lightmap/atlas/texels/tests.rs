@@ -187,7 +187,7 @@ fn given(offset: [f32; 2], scale: [f32; 2]) -> Option<Given> {
 /// The sample that each texel of a rectangle shows, as composed.
 fn shown(map: &TexelMap, page: u32, area: &PageArea, padding: u32) -> Vec<u32> {
     let mut out = vec![NONE; area.columns.len() * area.rows.len()];
-    map.compose(map.groups_of_page(page), area, padding, &mut out, |s| s, |s| s);
+    map.compose(map.groups_of_page(page), area, padding, &mut out, |s| s, |s| s).unwrap();
     out
 }
 
