@@ -343,7 +343,7 @@ impl Compact {
 
 #[cfg(test)]
 mod tests {
-    use super::super::binned::BinaryBvh;
+    use super::super::BinaryBvh;
     use super::super::collapse::{collapse, collapse_compact};
     use super::super::layout::LEAF_STRIDE;
     use super::super::{BuildOptions, Mbvh};

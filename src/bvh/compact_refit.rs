@@ -4,10 +4,10 @@
 //!
 //! Threads share a level; the result does not depend on their number.
 
-use super::binned::{Box4, triangle_box};
 use super::collapse::set_box;
 use super::compact::{Compact, CompactNode, GONE, NUMBER, PAD};
 use super::layout::{ChildRef, Node};
+use super::references::{Box4, triangle_box};
 use crate::base::geometry::is_valid_triangle;
 use crate::error::Result;
 use crate::memory::{try_filled, try_with_capacity};
@@ -91,7 +91,7 @@ fn refit_node(
 
 #[cfg(test)]
 mod tests {
-    use super::super::binned::BinaryBvh;
+    use super::super::BinaryBvh;
     use super::super::collapse::collapse_compact;
     use super::*;
     use crate::progress::Progress;

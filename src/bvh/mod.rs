@@ -1,15 +1,19 @@
 //! Acceleration structures: a binary tree built by binned SAH, with spatial splits if asked, collapsed to
 //! the 8-wide MBVH that the kernels traverse, or to the compact one.
 
+mod binary;
 mod binned;
+mod bins;
 mod collapse;
 pub(crate) mod compact;
 mod compact_refit;
 pub(crate) mod layout;
+mod partings;
+mod references;
 mod refit;
 mod spatial;
 
-pub use binned::{BinaryBvh, BinaryNode};
+pub use binary::{BinaryBvh, BinaryNode};
 pub(crate) use collapse::outwards;
 pub(crate) use compact::Compact;
 pub use layout::{ChildRef, Mbvh, Node};

@@ -5,9 +5,9 @@
 //! The tree is walked as it lies in memory (see [`Part`]): threads share neither nodes nor rows, each
 //! finds its own next to each other, and the result does not depend on their number.
 
-use super::binned::{Box4, triangle_box};
 use super::collapse::set_box;
 use super::layout::{ChildRef, LEAF_PAD, LEAF_STRIDE, Mbvh, Node, WIDTH};
+use super::references::{Box4, triangle_box};
 use crate::base::geometry::is_valid_triangle;
 use glam::Vec3;
 use rayon::prelude::*;

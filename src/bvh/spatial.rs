@@ -13,12 +13,12 @@
 //! more than this rounding over the triangle's extent, and no ray slips past a cut.
 
 use super::BuildOptions;
-use super::binned::{BinMap, BinaryBvh, BinaryNode, Bins, Box4, Extent, PARALLEL_SUBTREE, Reference};
-use super::binned::{
-    area_scale, best_parting, bin_count, half_areas, halve, in_parallel, leaf_cost, leaf_weight, on_heap, part_few,
-    references,
-};
+use super::binary::{BinaryBvh, BinaryNode};
+use super::binned::PARALLEL_SUBTREE;
+use super::bins::{BinMap, Bins, bin_count, in_parallel, on_heap};
 use super::layout::SAH_DEPTH;
+use super::partings::{best_parting, halve, leaf_cost, leaf_weight, part_few};
+use super::references::{Box4, Extent, Reference, area_scale, half_areas, references};
 use crate::error::{Error, Result};
 use crate::memory::try_vec;
 use crate::progress::Progress;

@@ -14,6 +14,8 @@
 //! Edges are compared by the positions of their ends: vertices on the middle of another triangle's
 //! edge are not found.
 
+mod solver;
+
 use super::atlas::Atlas;
 use super::atlas::pieces::float_key;
 use super::atlas::texels::TexelSample;
@@ -21,13 +23,13 @@ use super::plan::{Plan, left_out};
 use super::{BakeParams, BakeStats, Light, Lightmap, TexelState};
 use crate::error::{Error, Result};
 use crate::memory::{
-    Reservation, try_collect, try_filled, try_par_collect, try_par_filter, try_par_gather, try_push, try_to_vec,
-    try_vec,
+    Reservation, try_collect, try_par_collect, try_par_filter, try_par_gather, try_push, try_to_vec, try_vec,
 };
 use crate::progress::{Progress, Stage};
 use crate::scene::NONE;
-use glam::{DVec3, Vec2, Vec3, Vec3A};
+use glam::{Vec2, Vec3, Vec3A};
 use rayon::prelude::*;
+use solver::{CHUNK, POINTS, Point, System};
 use std::ops::Range;
 use std::sync::atomic::{AtomicU64, Ordering::Relaxed};
 use std::time::Instant;
@@ -43,24 +45,8 @@ const CONTRAST: f32 = 4.0;
 /// Texels between the points of an edge: both sides are linear between texels, each in its own grid.
 const SPACING: f32 = 0.5;
 
-/// What moving a texel costs, λ. Much less than the weight of a texel in the points around it (about
-/// 1/2), so that both sides agree, and enough to hold what a point hardly shows.
-const STIFFNESS: f32 = 0.01;
-
-/// Ends the iteration: the gradient's length by its length at the start.
-const TOLERANCE: f64 = 1e-4;
-
-/// Far more iterations than it takes.
-const MAX_ITERATIONS: usize = 200;
-
-/// Elements that a thread takes at a time.
-const CHUNK: usize = 1 << 12;
-
 /// Edges whose points a thread looks at at a time.
 const EDGES: usize = 64;
-
-/// What buffers are for, in errors.
-const POINTS: &str = "the seams' points";
 
 /// Moved texels and their light: before the stitching or after it, whichever the light map does not
 /// hold.
@@ -208,17 +194,6 @@ impl Side {
         let k = self.corner();
         [corners[k], corners[(k + 1) % 3]]
     }
-}
-
-/// What the two sides of an edge show at a point of it.
-#[derive(Clone, Copy, Debug, Default)]
-struct Point {
-    /// Texels of the one side, then of the other.
-    texels: [u32; 8],
-    /// Sum to 1 on the one side, to −1 on the other.
-    weights: [f32; 8],
-    /// The length that it stands for, in texels.
-    length: f32,
 }
 
 struct Job<'a, 'p, 'c> {
@@ -469,120 +444,6 @@ fn combine(layers: &mut [Vec<Vec3A>; 2]) -> Vec<Vec3A> {
     let [first, second] = layers;
     first.iter_mut().zip(second).for_each(|(a, b)| *a += *b);
     std::mem::take(first)
-}
-
-/// The least squares problem: J is what points show, its rows times the roots of their lengths.
-struct System {
-    points: Vec<Point>,
-    /// Where the uses of each texel begin, and the number of uses at the end.
-    first_use: Vec<usize>,
-    /// Points that show a texel, with its weight there times their length.
-    uses: Vec<(u32, f32)>,
-}
-
-impl System {
-    fn new(points: Vec<Point>, texels: usize, stage: &Stage) -> Result<System> {
-        let used = |part: usize| {
-            let of_part = (part * CHUNK..points.len().min((part + 1) * CHUNK)).map(|i| (i, &points[i]));
-            let all = of_part.flat_map(|(i, p)| (0..8).map(move |k| (i as u32, p.texels[k], p.weights[k] * p.length)));
-            all.filter(|u| u.2 != 0.0)
-        };
-        let parts = 0..points.len().div_ceil(CHUNK);
-        let mut first_use: Vec<usize> = try_vec(texels + 1, POINTS)?;
-        for part in parts.clone() {
-            stage.check()?;
-            used(part).for_each(|(_, t, _)| first_use[t as usize + 1] += 1);
-        }
-        (0..texels).for_each(|t| first_use[t + 1] += first_use[t]);
-        let mut uses: Vec<(u32, f32)> = try_vec(first_use[texels], POINTS)?;
-        let mut next = try_to_vec(&first_use, POINTS)?;
-        for part in parts {
-            stage.check()?;
-            for (i, t, w) in used(part) {
-                uses[next[t as usize]] = (i, w);
-                next[t as usize] += 1;
-            }
-        }
-        Ok(System { points, first_use, uses })
-    }
-
-    /// A − B at every point.
-    fn differences(&self, x: &[Vec3A], out: &mut [Vec3A]) {
-        let show = |p: &Point| (0..8).fold(Vec3A::ZERO, |sum, k| sum + p.weights[k] * x[p.texels[k] as usize]);
-        out.par_iter_mut().zip(&self.points).with_min_len(CHUNK).for_each(|(d, p)| *d = show(p));
-    }
-
-    /// JᵀJ of what the differences are of. (Sums in the order of points, whatever the threads.)
-    fn pull(&self, differences: &[Vec3A], out: &mut [Vec3A]) {
-        out.par_iter_mut().enumerate().with_min_len(CHUNK).for_each(|(t, out)| {
-            let uses = &self.uses[self.first_use[t]..self.first_use[t + 1]];
-            *out = uses.iter().fold(Vec3A::ZERO, |sum, &(p, w)| sum + w * differences[p as usize]);
-        });
-    }
-
-    /// Conjugate gradients from `before` on, each channel on its own. Light stays ≥ 0.
-    fn solve(&self, before: &[Vec3A], x: &mut [Vec3A], stage: &Stage) -> Result<()> {
-        let mut differences = try_filled(self.points.len(), Vec3A::ZERO, POINTS)?;
-        let mut q = try_filled(before.len(), Vec3A::ZERO, POINTS)?;
-        self.differences(before, &mut differences);
-        self.pull(&differences, &mut q);
-        let mut r = try_par_collect(q.par_iter().map(|&v| -v), POINTS)?;
-        let mut p = try_to_vec(&r, POINTS)?;
-        x.copy_from_slice(before);
-        let mut rr = dot(&r, &r);
-        let enough = rr * TOLERANCE * TOLERANCE;
-        for _ in 0..MAX_ITERATIONS {
-            stage.advance(0)?;
-            if rr.cmple(enough).all() {
-                break;
-            }
-            self.differences(&p, &mut differences);
-            self.pull(&differences, &mut q);
-            q.par_iter_mut().zip(&p).with_min_len(CHUNK).for_each(|(q, &p)| *q += STIFFNESS * p);
-            let step = ratio(rr, dot(&p, &q));
-            x.par_iter_mut().zip(&p).with_min_len(CHUNK).for_each(|(x, &p)| *x += step * p);
-            r.par_iter_mut().zip(&q).with_min_len(CHUNK).for_each(|(r, &q)| *r -= step * q);
-            let next = dot(&r, &r);
-            let keep = ratio(next, rr);
-            p.par_iter_mut().zip(&r).with_min_len(CHUNK).for_each(|(p, &r)| *p = r + keep * *p);
-            rr = next;
-        }
-        for (x, &before) in x.iter_mut().zip(before) {
-            *x = if x.is_finite() { x.max(Vec3A::ZERO) } else { before };
-        }
-        Ok(())
-    }
-
-    /// Root mean square of A − B over lengths and channels, relative to the mean light; 0 in the dark.
-    fn relative_rms(&self, x: &[Vec3A]) -> f64 {
-        let (mut squares, mut sum, mut total) = (DVec3::ZERO, DVec3::ZERO, 0.0);
-        for p in &self.points {
-            let length = p.length as f64;
-            let [a, b] = [0..4, 4..8].map(|side: Range<usize>| {
-                side.fold(DVec3::ZERO, |s, k| s + (p.weights[k].abs() * x[p.texels[k] as usize]).as_dvec3())
-            });
-            squares += length * (a - b) * (a - b);
-            sum += length * 0.5 * (a + b);
-            total += length;
-        }
-        let mean = sum.element_sum() / 3.0 / total;
-        if mean > 0.0 { (squares.element_sum() / 3.0 / total).sqrt() / mean } else { 0.0 }
-    }
-}
-
-/// Per channel, in f64 and in a fixed order.
-fn dot(a: &[Vec3A], b: &[Vec3A]) -> DVec3 {
-    let part = |(a, b): (&[Vec3A], &[Vec3A])| {
-        a.iter().zip(b).fold(DVec3::ZERO, |sum, (a, b)| sum + a.as_dvec3() * b.as_dvec3())
-    };
-    let parts: Vec<DVec3> = a.par_chunks(CHUNK).zip(b.par_chunks(CHUNK)).map(part).collect();
-    parts.into_iter().sum()
-}
-
-/// Per channel; 0 for a channel that is done.
-fn ratio(a: DVec3, b: DVec3) -> Vec3A {
-    let q = a / b;
-    DVec3::select(b.cmpgt(DVec3::ZERO), q, DVec3::ZERO).as_vec3a()
 }
 
 #[cfg(test)]

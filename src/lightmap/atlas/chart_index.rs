@@ -4,7 +4,8 @@
 //! cell lists the triangles that overlap it. All maps share the index, whatever their resolution.
 
 use super::charts::Charts;
-use super::texels::{Flat, TexelSample};
+use super::flat_triangle::Flat;
+use super::texels::TexelSample;
 use crate::device::Device;
 use crate::error::Result;
 use crate::memory::{Reservation, try_vec, try_with_capacity};

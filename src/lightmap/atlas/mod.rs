@@ -4,6 +4,7 @@ pub(crate) mod buried;
 pub(crate) mod chart_index;
 pub(crate) mod chart_map;
 pub mod charts;
+pub(crate) mod flat_triangle;
 pub mod layout;
 pub(crate) mod pieces;
 pub(crate) mod seen;

@@ -1,8 +1,10 @@
+use super::solver::STIFFNESS;
 use super::*;
 use crate::device::{Device, DeviceOptions};
 use crate::lightmap::{Layer, LightmapDesc};
 use crate::scene::shapes::MeshBuilder;
 use crate::scene::{LightmapUvs, Material, Mesh, MeshMaterials, Scene, SceneData};
+use glam::DVec3;
 use std::f32::consts::FRAC_PI_6;
 use std::sync::Arc;
 

@@ -1,0 +1,52 @@
+//! The binary tree, before it is collapsed to wide nodes.
+
+use crate::base::geometry::half_area;
+use glam::Vec3;
+use rayon::prelude::*;
+
+/// A node of the binary tree, 32 bytes. The left child of an inner node follows it.
+#[derive(Clone, Copy, Debug, Default)]
+#[repr(C)]
+pub struct BinaryNode {
+    /// Lower corner of the node's box.
+    pub lower: Vec3,
+    /// Inner: number of the right child. Leaf: first triangle slot.
+    pub index: u32,
+    /// Upper corner of the node's box.
+    pub upper: Vec3,
+    /// Triangles of a leaf; 0 in an inner node.
+    pub count: u32,
+}
+
+/// The binary tree, before collapse.
+pub struct BinaryBvh {
+    /// Node 0 is the root. Slots of subtrees that ended early are unused.
+    pub nodes: Vec<BinaryNode>,
+    /// Global triangle numbers, leaf by leaf.
+    pub triangles: Vec<u32>,
+}
+
+impl BinaryBvh {
+    /// Surface area heuristic: expected cost of a random ray through the root's box, traversal
+    /// step and intersection costing 1 each.
+    pub fn sah_cost(&self) -> f32 {
+        let root = &self.nodes[0];
+        let root_area = half_area(root.lower, root.upper);
+        if root_area == 0.0 {
+            return self.triangles.len() as f32;
+        }
+        // Unused slots have no area.
+        let chunks: Vec<f64> = self
+            .nodes
+            .par_chunks(1 << 14)
+            .map(|nodes| nodes.iter().map(|n| f64::from(n.count.max(1)) * half_area(n.lower, n.upper)).sum())
+            .collect();
+        (chunks.iter().sum::<f64>() / root_area) as f32
+    }
+
+    /// Half the surface area of a node's box.
+    pub(super) fn half_area(&self, node: u32) -> f64 {
+        let n = &self.nodes[node as usize];
+        half_area(n.lower, n.upper)
+    }
+}

@@ -1,0 +1,185 @@
+//! Boxes of four lanes, and the references to triangles that builders sort.
+
+use crate::base::geometry::half_area;
+use crate::error::Result;
+use crate::memory::try_vec;
+use glam::{Mat4, Vec3, Vec4, Vec4Swizzles};
+use rayon::prelude::*;
+
+/// What one thread takes of a range of references at a time.
+pub(super) const CHUNK: usize = 1 << 12;
+
+/// A box as its negated lower and its upper corner, so that one maximum of eight lanes joins two.
+#[derive(Clone, Copy)]
+#[repr(C, align(32))]
+pub(super) struct Box4 {
+    pub(super) neg_lower: Vec4,
+    pub(super) upper: Vec4,
+}
+
+impl Box4 {
+    pub(super) const EMPTY: Box4 = Box4 { neg_lower: Vec4::NEG_INFINITY, upper: Vec4::NEG_INFINITY };
+
+    pub(super) fn new(lower: Vec3, upper: Vec3) -> Box4 {
+        // −0 + 0 = +0: of two zeros, min and max return one by its place, not by its sign.
+        Box4 { neg_lower: (-(lower + Vec3::ZERO)).extend(0.0), upper: (upper + Vec3::ZERO).extend(0.0) }
+    }
+
+    pub(super) fn corners(&self) -> (Vec3, Vec3) {
+        (-self.neg_lower.truncate(), self.upper.truncate())
+    }
+
+    #[inline(always)]
+    pub(super) fn join(self, o: Box4) -> Box4 {
+        Box4 { neg_lower: self.neg_lower.max(o.neg_lower), upper: self.upper.max(o.upper) }
+    }
+
+    #[inline(always)]
+    pub(super) fn add(&mut self, p: Vec4) {
+        *self = self.join(Box4 { neg_lower: -p, upper: p });
+    }
+
+    /// The part that both cover, which may be empty.
+    pub(super) fn meet(self, o: Box4) -> Box4 {
+        Box4 { neg_lower: self.neg_lower.min(o.neg_lower), upper: self.upper.min(o.upper) }
+    }
+
+    pub(super) fn is_empty(&self) -> bool {
+        (self.upper + self.neg_lower).truncate().min_element() < 0.0
+    }
+
+    /// Half the surface area, 0 if empty.
+    pub(super) fn half_area(&self) -> f64 {
+        let (lower, upper) = self.corners();
+        if self.is_empty() { 0.0 } else { half_area(lower, upper) }
+    }
+
+    /// Extent, 0 on axes where there is nothing.
+    #[inline(always)]
+    pub(super) fn extent(&self) -> Vec4 {
+        (self.upper + self.neg_lower).max(Vec4::ZERO)
+    }
+}
+
+/// The box of a triangle.
+#[inline(always)]
+pub(super) fn triangle_box([a, b, c]: [Vec3; 3]) -> Box4 {
+    Box4::new(a.min(b).min(c), a.max(b).max(c))
+}
+
+/// Bounds of centres.
+#[derive(Clone, Copy)]
+pub(super) struct Range4 {
+    pub(super) lower: Vec4,
+    pub(super) upper: Vec4,
+}
+
+impl Range4 {
+    pub(super) const EMPTY: Range4 = Range4 { lower: Vec4::INFINITY, upper: Vec4::NEG_INFINITY };
+
+    #[inline(always)]
+    pub(super) fn grow(&mut self, c: Vec4) {
+        self.lower = self.lower.min(c);
+        self.upper = self.upper.max(c);
+    }
+
+    pub(super) fn join(self, o: Range4) -> Range4 {
+        Range4 { lower: self.lower.min(o.lower), upper: self.upper.max(o.upper) }
+    }
+}
+
+/// A triangle's box; its number rides in `neg_lower.w` as the low bits of a normal float (arithmetic
+/// on denormals would be slow), which no result depends on.
+#[derive(Clone, Copy)]
+#[repr(transparent)]
+pub(super) struct Reference(pub(super) Box4);
+
+impl Default for Reference {
+    fn default() -> Self {
+        Reference(Box4 { neg_lower: Vec4::ZERO, upper: Vec4::ZERO })
+    }
+}
+
+impl Reference {
+    const NORMAL: u32 = 0x4000_0000;
+
+    pub(super) fn new(id: u32, corners: [Vec3; 3]) -> Self {
+        Reference::of_box(id, triangle_box(corners))
+    }
+
+    pub(super) fn of_box(id: u32, mut b: Box4) -> Self {
+        debug_assert!(id < Self::NORMAL);
+        b.neg_lower.w = f32::from_bits(id | Self::NORMAL);
+        Reference(b)
+    }
+
+    pub(super) fn bounds(&self) -> Box4 {
+        self.0
+    }
+
+    pub(super) fn id(&self) -> u32 {
+        self.0.neg_lower.w.to_bits() & (Self::NORMAL - 1)
+    }
+
+    /// Twice the box's centre: no rounding for the division, and all comparisons are the same.
+    #[inline(always)]
+    pub(super) fn centre(&self) -> Vec4 {
+        self.0.upper - self.0.neg_lower
+    }
+}
+
+/// Half the surface areas of boxes of extents `d`, in lanes.
+#[inline(always)]
+pub(super) fn half_areas(d: [Vec4; 4]) -> Vec4 {
+    let [a, b, c, d] = d.map(|d| d * d.yzxw());
+    let sums = Mat4::from_cols(a, b, c, d).transpose();
+    sums.x_axis + sums.y_axis + sums.z_axis
+}
+
+/// A power of two near 1 / greatest extent, so that f32 areas of boxes inside neither over- nor
+/// underflow, and scaling is exact.
+#[inline(always)]
+pub(super) fn area_scale(b: &Box4) -> f32 {
+    let exponent = b.extent().truncate().max_element().to_bits() & 0x7f80_0000;
+    f32::from_bits((0x7f00_0000 - exponent.min(0x7e80_0000)).max(1 << 23))
+}
+
+/// Bounds of the boxes and of their centres.
+#[derive(Clone, Copy)]
+pub(super) struct Extent {
+    pub(super) boxes: Box4,
+    pub(super) centres: Range4,
+}
+
+impl Extent {
+    pub(super) const EMPTY: Extent = Extent { boxes: Box4::EMPTY, centres: Range4::EMPTY };
+
+    pub(super) fn of(refs: &[Reference]) -> Extent {
+        let mut e = Extent::EMPTY;
+        for r in refs {
+            e.boxes = e.boxes.join(r.0);
+            e.centres.grow(r.centre());
+        }
+        e
+    }
+
+    pub(super) fn join(self, o: Extent) -> Extent {
+        Extent { boxes: self.boxes.join(o.boxes), centres: self.centres.join(o.centres) }
+    }
+}
+
+/// References to the triangles `valid` of `corners`, and their extent.
+pub(super) fn references(corners: &[[Vec3; 3]], valid: &[u32]) -> Result<(Vec<Reference>, Extent)> {
+    let mut refs = try_vec::<Reference>(valid.len(), "references to triangles")?;
+    let extent = refs
+        .par_chunks_mut(CHUNK)
+        .zip(valid.par_chunks(CHUNK))
+        .map(|(refs, valid)| {
+            for (r, &t) in refs.iter_mut().zip(valid) {
+                *r = Reference::new(t, corners[t as usize]);
+            }
+            Extent::of(refs)
+        })
+        .reduce(|| Extent::EMPTY, Extent::join);
+    Ok((refs, extent))
+}
