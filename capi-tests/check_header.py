@@ -43,8 +43,8 @@ SAID_ONCE = {
 
 # Words that the glossary has better ones for, and sentences that cannot be read alone.
 AVOID = re.compile(
-    r"\b(tells?|told|meets?|met|stands? for|what becomes of|has something done|on its own)\b|\bas there[.,;]|\bof those, "
-    r"|^(Of|That|Nor|What|Whether|Where|To be) ",
+    r"\b(what|tells?|told|meets?|met|stands? for|has something done|on its own)\b|\bas there[.,;]|\bof those, "
+    r"|^(Of|That|Nor|Whether|Where|To be) ",
     re.IGNORECASE,
 )
 

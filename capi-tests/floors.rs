@@ -125,13 +125,8 @@ fn paths(file: &File) -> BTreeSet<Vec<String>> {
             continue;
         }
         let mut rest = &text[start..];
-        let is_mod = file.path.file_name().unwrap() == "mod.rs";
         let mut base = file.module.clone();
-        if !is_mod && !file.path.with_extension("").is_dir() {
-            base.pop();
-        } else {
-            base.pop();
-        }
+        base.pop();
         rest = rest.strip_prefix("super::").unwrap();
         while let Some(further) = rest.strip_prefix("super::") {
             base.pop();

@@ -19,6 +19,18 @@ const HEAD: &str = "\
  * @file bakelite.h
  * Bakelite: SIMD light-baking kernels.
  *
+ * A bake takes these calls, each of which is described below:
+ *
+ *     bk_device_create      threads and instruction set
+ *     bk_scene_create       then bk_scene_load_file, or bk_scene_add_material, bk_scene_add_mesh
+ *     bk_scene_add_light    lights that are not in the file
+ *     bk_scene_commit       builds the acceleration structure; from here on bk_intersect works
+ *     bk_lightmap_create    unwraps and lays out pages of texels
+ *     bk_bake               computes the light
+ *     bk_lightmap_read      texels, with bk_lightmap_mesh_uvs; or files: bk_lightmap_save
+ *
+ * bk_live_create refines the light of a scene while it is shown, instead of a bake.
+ *
  * Generated from src/capi by cbindgen; do not edit. To update it:
  *     BAKELITE_UPDATE_HEADER=1 cargo test --test header
  */
@@ -37,7 +49,7 @@ const HEAD: &str = "\
 #endif
 #endif
 
-/* Declares what may still change: see the first section. */
+/* Declares functions that may still change: see the first section. */
 #ifndef BK_EXPERIMENTAL
 #define BK_EXPERIMENTAL BK_API
 #endif
@@ -80,7 +92,7 @@ fn section(source: &Path) -> String {
     let bindings = Builder::new().with_config(config()).with_src(source).generate();
     bindings.unwrap_or_else(|e| panic!("{}: {e}", source.display())).write(&mut out);
     let items = String::from_utf8(out).expect("cbindgen writes UTF-8");
-    format!("\n{}\n{}\n/** @}} */\n", heading(source), tidy(&items).trim_end())
+    format!("\n{}\n{}\n\n/** @}} */\n", heading(source), tidy(&items).trim_end())
 }
 
 /// The file's `//!` text below a ruler, as the head of a group for Doxygen. The first line is the title.

@@ -2,6 +2,18 @@
  * @file bakelite.h
  * Bakelite: SIMD light-baking kernels.
  *
+ * A bake takes these calls, each of which is described below:
+ *
+ *     bk_device_create      threads and instruction set
+ *     bk_scene_create       then bk_scene_load_file, or bk_scene_add_material, bk_scene_add_mesh
+ *     bk_scene_add_light    lights that are not in the file
+ *     bk_scene_commit       builds the acceleration structure; from here on bk_intersect works
+ *     bk_lightmap_create    unwraps and lays out pages of texels
+ *     bk_bake               computes the light
+ *     bk_lightmap_read      texels, with bk_lightmap_mesh_uvs; or files: bk_lightmap_save
+ *
+ * bk_live_create refines the light of a scene while it is shown, instead of a bake.
+ *
  * Generated from src/capi by cbindgen; do not edit. To update it:
  *     BAKELITE_UPDATE_HEADER=1 cargo test --test header
  */
@@ -20,7 +32,7 @@
 #endif
 #endif
 
-/* Declares what may still change: see the first section. */
+/* Declares functions that may still change: see the first section. */
 #ifndef BK_EXPERIMENTAL
 #define BK_EXPERIMENTAL BK_API
 #endif
@@ -41,7 +53,7 @@ extern "C" {
  *
  * - Pointers must not be NULL unless the description of the parameter allows it. NULL elsewhere, a
  *   value or flag that is not listed, and a wrong `struct_size` give BK_ERROR_INVALID_ARGUMENT.
- * - Pointers to input are read during the call only; what is needed later is copied.
+ * - Pointers to input are read during the call only; the library copies all that it needs later.
  * - Pointers to output must be valid for the whole call. Output is written on success only, except
  *   that a create function sets its `out` to NULL on failure.
  * - Any function with a `bk_result` can return BK_ERROR_INTERNAL, and is listed with the other
@@ -131,6 +143,7 @@ BK_API const char *bk_result_string(bk_result result);
 /// @return  a string that is never NULL, owned by the library and valid until the thread's next
 ///   call into it; empty if no call has failed yet
 BK_API const char *bk_last_error(void);
+
 /** @} */
 
 /* ============================================================================================== */
@@ -141,8 +154,8 @@ BK_API const char *bk_last_error(void);
  *
  * Ownership: handles (bk_device, bk_scene, bk_photon_map, bk_lightmap, bk_live) are opaque and
  * reference-counted. A create function hands out one reference, which the caller releases with
- * bk_..._release; bk_..._retain adds one. An object keeps alive what it was made from, so parents
- * may be released first.
+ * bk_..._release; bk_..._retain adds one. An object keeps its parents alive, so they may be
+ * released first.
  *
  * Callbacks may run on any thread and must not throw exceptions or jump out. Inside a callback,
  * functions that work on a device's threads (commit, refit, create, bake, load, save, live
@@ -292,6 +305,7 @@ BK_API uint32_t bk_device_isa(const bk_device *device);
 /// @param device  NULL gives 0
 /// @return  number of threads, 1 to 1024
 BK_API uint32_t bk_device_num_threads(const bk_device *device);
+
 /** @} */
 
 /* ============================================================================================== */
@@ -464,8 +478,7 @@ BK_API void bk_load_params_init(bk_load_params *params);
 /// Only regular files are read, never devices, FIFOs or sockets. A material library or an image
 /// that cannot be read, or that lies where `params` allows none, is left out with a warning in the
 /// log; a buffer of a glTF file that cannot be read is an error. bk_scene_get_mesh,
-/// bk_scene_get_material, bk_scene_get_texture and bk_scene_get_light read back all that was
-/// loaded.
+/// bk_scene_get_material, bk_scene_get_texture and bk_scene_get_light read the loaded objects back.
 ///
 /// Cost: 0.2 (PLY) to 2 s (OBJ) per million triangles, on one thread, and the decoding of images.
 ///
@@ -473,7 +486,7 @@ BK_API void bk_load_params_init(bk_load_params *params);
 /// @param path  name of a file that ends in .obj (with its .mtl), .ply, .gltf or .glb; UTF-8
 /// @param params  limits; NULL for the defaults
 /// @param progress,user  progress callback and its pointer; may be NULL
-/// @param out  receives what was added; may be NULL
+/// @param out  receives the numbers of the objects added; may be NULL
 /// @retval BK_ERROR_IO  a file cannot be read or is malformed; bk_last_error names it
 /// @retval BK_ERROR_UNSUPPORTED  the kind of file is unknown, or the library was built without
 ///   files
@@ -578,6 +591,7 @@ BK_API bk_result bk_scene_get_stats(const bk_scene *scene, bk_scene_stats *out);
 /// @param upper  receives the largest x, y and z, in scene units
 /// @retval BK_ERROR_INVALID_STATE  the scene is not committed or is being refitted
 BK_API bk_result bk_scene_bounds(const bk_scene *scene, float lower[3], float upper[3]);
+
 /** @} */
 
 /* ============================================================================================== */
@@ -692,6 +706,7 @@ BK_API uint32_t bk_scene_environment_count(const bk_scene *scene);
 /// @retval BK_ERROR_INVALID_ARGUMENT  there is no such environment
 /// @retval BK_ERROR_INVALID_STATE  another thread is changing the scene
 BK_API bk_result bk_scene_get_environment(const bk_scene *scene, uint32_t id, bk_texture_desc *out);
+
 /** @} */
 
 /* ============================================================================================== */
@@ -859,8 +874,8 @@ BK_API void bk_mesh_desc_init(bk_mesh_desc *desc);
 /// @param scene  scene that is not committed
 /// @param desc  the arrays are copied
 /// @param out_id  receives the number of the mesh, as hits report it; may be NULL
-/// @retval BK_ERROR_INVALID_ARGUMENT  an index or a material is out of range, or the mesh is not
-///   what BK_MESH_STRICT demands; bk_last_error names triangle and vertex
+/// @retval BK_ERROR_INVALID_ARGUMENT  an index or a material is out of range, or the mesh violates
+///   BK_MESH_STRICT; bk_last_error names triangle and vertex
 /// @retval BK_ERROR_INVALID_STATE  the scene is committed or another thread is changing it
 /// @retval BK_ERROR_OUT_OF_MEMORY  the copy does not fit or the memory callback refuses
 BK_API bk_result bk_scene_add_mesh(bk_scene *scene, const bk_mesh_desc *desc, uint32_t *out_id);
@@ -878,7 +893,7 @@ BK_API bk_result bk_scene_add_mesh(bk_scene *scene, const bk_mesh_desc *desc, ui
 /// @param vertex_count  number of vertices, as when the mesh was added
 /// @param stride  distance between positions in bytes, at least 12; 0: packed
 /// @retval BK_ERROR_INVALID_ARGUMENT  there is no such mesh, `vertex_count` or `stride` is wrong,
-///   or the mesh is not what BK_MESH_STRICT demands
+///   or the new positions violate BK_MESH_STRICT
 /// @retval BK_ERROR_INVALID_STATE  the scene is not committed or another thread is changing it
 /// @retval BK_ERROR_OUT_OF_MEMORY  the copy does not fit
 BK_API
@@ -908,6 +923,7 @@ BK_API void bk_mesh_view_init(bk_mesh_view *view);
 /// @retval BK_ERROR_INVALID_ARGUMENT  there is no such mesh
 /// @retval BK_ERROR_INVALID_STATE  the scene is not committed or is being refitted
 BK_API bk_result bk_scene_get_mesh(const bk_scene *scene, uint32_t mesh, bk_mesh_view *out);
+
 /** @} */
 
 /* ============================================================================================== */
@@ -1036,6 +1052,7 @@ BK_API bk_result bk_scene_get_light(const bk_scene *scene, uint32_t id, bk_light
 /// @param scene  any scene
 /// @return  number of lights; 0 on failure
 BK_API uint32_t bk_scene_light_count(const bk_scene *scene);
+
 /** @} */
 
 /* ============================================================================================== */
@@ -1162,6 +1179,7 @@ bk_result bk_gather(const bk_scene *scene,
                     float tmax,
                     uint32_t flags,
                     bk_hit *out);
+
 /** @} */
 
 /* ============================================================================================== */
@@ -1239,7 +1257,8 @@ BK_API void bk_photon_params_init(bk_photon_params *params);
 
 /// Creates a photon map: traces photons through a committed scene, on the device's threads.
 ///
-/// The map keeps alive what it needs of the scene. Lights without power make an empty map.
+/// The map keeps the parts of the scene alive that it needs. Lights without power make an empty
+/// map.
 ///
 /// Cost: 3 to 7 million rays per second on two threads; a photon takes 1 / (1 - albedo) rays on
 /// average.
@@ -1307,6 +1326,7 @@ BK_API void bk_photon_view_init(bk_photon_view *view);
 ///   be read
 /// @retval BK_ERROR_OUT_OF_MEMORY  the memory callback refuses the packed copy
 BK_API bk_result bk_photon_map_get_photons(const bk_photon_map *map, bk_photon_view *out);
+
 /** @} */
 
 /* ============================================================================================== */
@@ -1321,7 +1341,7 @@ BK_API bk_result bk_photon_map_get_photons(const bk_photon_map *map, bk_photon_v
  * Thread safety: one thread at a time may bake a light map; reads are safe from any thread. A read
  * during a bake, and a second bake, fail with BK_ERROR_INVALID_STATE.
  *
- * Cost: see bk_lightmap_create; the other functions copy what they return.
+ * Cost: see bk_lightmap_create; the other functions copy their results.
  *
  * @{
  */
@@ -1493,6 +1513,7 @@ bk_result bk_lightmap_mesh_back_uvs(const bk_lightmap *lightmap,
                                     float *out_corner_uvs,
                                     uint32_t *out_page_per_triangle,
                                     uint8_t *out_separate_per_triangle);
+
 /** @} */
 
 /* ============================================================================================== */
@@ -1719,7 +1740,7 @@ bk_result bk_bake(bk_lightmap *lightmap,
                   void *user,
                   bk_bake_stats *out);
 
-/// Writes a text about the last bake, one line per stage: what ran, what was left out, and why.
+/// Writes a text about the last bake, one line per stage: whether it ran or was left out, and why.
 /// Before the first bake the text is about a bake with default parameters.
 ///
 /// @param lightmap  any light map
@@ -1729,6 +1750,7 @@ bk_result bk_bake(bk_lightmap *lightmap,
 /// @return  length of the whole text in bytes without its NUL, whatever the capacity; 0 on failure,
 ///   for example during a bake
 BK_API size_t bk_plan_describe(const bk_lightmap *lightmap, char *dst, size_t capacity);
+
 /** @} */
 
 /* ============================================================================================== */
@@ -1898,6 +1920,7 @@ bk_result bk_lightmap_load_result(bk_lightmap *lightmap,
                                   const char *path,
                                   bk_progress_fn progress,
                                   void *user);
+
 /** @} */
 
 /* ============================================================================================== */
@@ -1920,7 +1943,7 @@ bk_result bk_lightmap_load_result(bk_lightmap *lightmap,
  */
 /* ============================================================================================== */
 
-/// Mode: refine what the camera sees, first where estimated error times visibility is largest.
+/// Mode: refine the surfaces in view, first where estimated error times visibility is largest.
 #define BK_LIVE_VIEW 0
 
 /// Mode: refine the grid cells near the camera, visible ones first. A cell shows its next LOD when
@@ -1969,8 +1992,8 @@ typedef struct bk_live_params {
   uint32_t direct_samples;
   /// Search radius of photons in scene units, see bk_bake_params. Default: 0.
   float radius;
-  /// 1: the device's threads go on working between updates, on what the last one saw. 0: they
-  /// rest. Default: 0.
+  /// 1: the device's threads go on working between updates, on the surfaces that the last one
+  /// saw. 0: they rest. Default: 0.
   uint32_t background;
 } bk_live_params;
 
@@ -2220,8 +2243,7 @@ BK_API uint32_t bk_live_lod_at(const bk_live *live, const float *position);
 BK_API bk_result bk_live_light_changed(bk_live *live, uint32_t light);
 
 /// Pauses or resumes work between updates (bk_live_params.background) and the recomputation of
-/// indirect light. They resume with the next update; updates themselves still do what their budget
-/// allows.
+/// indirect light. They resume with the next update; updates themselves go on.
 ///
 /// Cost: pausing waits for the work under way.
 ///
@@ -2267,6 +2289,7 @@ BK_EXPERIMENTAL bk_result bk_live_save(bk_live *live, const char *path, bk_progr
 /// @retval BK_ERROR_OUT_OF_MEMORY  the light does not fit or the memory callback refuses
 /// @retval BK_ERROR_CANCELLED  the progress callback returned 0
 BK_EXPERIMENTAL bk_result bk_live_restore(bk_live *live, const char *path, bk_progress_fn progress, void *user);
+
 /** @} */
 
 #ifdef __cplusplus

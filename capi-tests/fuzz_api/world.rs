@@ -13,7 +13,7 @@ use std::cell::{Cell, RefCell};
 use std::collections::BTreeMap;
 use std::ffi::{CStr, c_char, c_void};
 use std::sync::atomic::{AtomicBool, AtomicI64, AtomicU64, Ordering::SeqCst};
-use std::sync::{Arc, Mutex, Weak};
+use std::sync::{Arc, Mutex, OnceLock, Weak};
 use std::time::{Duration, Instant};
 
 /// Bytes that a device's memory callback grants at most: hostile sizes shall not take the machine's memory.
@@ -106,6 +106,30 @@ pub fn last_error() -> String {
     unsafe { CStr::from_ptr(text) }.to_str().unwrap_or_else(|_| broken("the last error is not UTF-8")).to_string()
 }
 
+/// The codes that the header lists for a function, and the one that it does not repeat.
+fn listed(function: &str) -> &'static [bk_result] {
+    static LISTED: OnceLock<BTreeMap<&str, Vec<bk_result>>> = OnceLock::new();
+    let all = LISTED.get_or_init(|| {
+        let (mut all, mut codes) = (BTreeMap::new(), vec![BK_ERROR_INVALID_ARGUMENT]);
+        for line in include_str!("../../include/bakelite.h").lines() {
+            if let Some(text) = line.strip_prefix("/// @retval ") {
+                codes.extend((BK_ERROR_INTERNAL..BK_OK).find(|&code| {
+                    // SAFETY: never NULL, and constant.
+                    let name = unsafe { CStr::from_ptr(bk_result_string(code)) };
+                    text.split(' ').next() == name.to_str().ok()
+                }));
+            } else if !line.starts_with("//")
+                && let Some((before, _)) = line.split_once('(')
+                && let Some(at) = before.rfind("bk_")
+            {
+                all.insert(&before[at..], std::mem::replace(&mut codes, vec![BK_ERROR_INVALID_ARGUMENT]));
+            }
+        }
+        all
+    });
+    all.get(function).map_or(&[], |codes| codes)
+}
+
 pub fn check_result(name: &'static str, result: bk_result) -> bk_result {
     if result == BK_OK {
         return result;
@@ -120,6 +144,11 @@ pub fn check_result(name: &'static str, result: bk_result) -> bk_result {
     }
     if !(BK_ERROR_INTERNAL..BK_OK).contains(&result) {
         broken(&format!("{name} gave {result}, which is no result"));
+    }
+    if !listed(name).contains(&result) {
+        // SAFETY: never NULL, and constant.
+        let code = unsafe { CStr::from_ptr(bk_result_string(result)) };
+        broken(&format!("{name} gave {code:?}, which the header does not list for it: {error}"));
     }
     if error.is_empty() {
         broken(&format!("{name} gave {result} and no error text"));

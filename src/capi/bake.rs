@@ -324,7 +324,7 @@ pub unsafe extern "C" fn bk_bake(
     })
 }
 
-/// Writes a text about the last bake, one line per stage: what ran, what was left out, and why.
+/// Writes a text about the last bake, one line per stage: whether it ran or was left out, and why.
 /// Before the first bake the text is about a bake with default parameters.
 ///
 /// @param lightmap  any light map

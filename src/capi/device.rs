@@ -4,8 +4,8 @@
 //!
 //! Ownership: handles (bk_device, bk_scene, bk_photon_map, bk_lightmap, bk_live) are opaque and
 //! reference-counted. A create function hands out one reference, which the caller releases with
-//! bk_..._release; bk_..._retain adds one. An object keeps alive what it was made from, so parents
-//! may be released first.
+//! bk_..._release; bk_..._retain adds one. An object keeps its parents alive, so they may be
+//! released first.
 //!
 //! Callbacks may run on any thread and must not throw exceptions or jump out. Inside a callback,
 //! functions that work on a device's threads (commit, refit, create, bake, load, save, live

@@ -8,7 +8,7 @@
 //!
 //! - Pointers must not be NULL unless the description of the parameter allows it. NULL elsewhere, a
 //!   value or flag that is not listed, and a wrong `struct_size` give BK_ERROR_INVALID_ARGUMENT.
-//! - Pointers to input are read during the call only; what is needed later is copied.
+//! - Pointers to input are read during the call only; the library copies all that it needs later.
 //! - Pointers to output must be valid for the whole call. Output is written on success only, except
 //!   that a create function sets its `out` to NULL on failure.
 //! - Any function with a `bk_result` can return BK_ERROR_INTERNAL, and is listed with the other
@@ -116,8 +116,7 @@ thread_local! {
     static LAST_ERROR: RefCell<CString> = RefCell::default();
 }
 
-/// Runs the body of an entry point: what it panics with is caught, what it fails with is kept for
-/// `bk_last_error`.
+/// Runs the body of an entry point: catches a panic, and keeps an error for `bk_last_error`.
 pub(super) fn call(body: impl FnOnce() -> Result<()>) -> bk_result {
     match catch(body) {
         Ok(()) => BK_OK,

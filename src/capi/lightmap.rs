@@ -8,7 +8,7 @@
 //! Thread safety: one thread at a time may bake a light map; reads are safe from any thread. A read
 //! during a bake, and a second bake, fail with BK_ERROR_INVALID_STATE.
 //!
-//! Cost: see bk_lightmap_create; the other functions copy what they return.
+//! Cost: see bk_lightmap_create; the other functions copy their results.
 
 use super::args::{OutStruct, SizedStruct, init, read_bool, read_struct, sized_struct, slice_mut, write};
 use super::device::{bk_progress_fn, progress, refuse_in_callback};

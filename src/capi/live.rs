@@ -24,7 +24,7 @@ use glam::Vec3;
 use std::ffi::{c_char, c_void};
 use std::sync::{RwLock, TryLockError};
 
-/// Mode: refine what the camera sees, first where estimated error times visibility is largest.
+/// Mode: refine the surfaces in view, first where estimated error times visibility is largest.
 pub const BK_LIVE_VIEW: u32 = 0;
 /// Mode: refine the grid cells near the camera, visible ones first. A cell shows its next LOD when
 /// all its texels have it.
@@ -105,8 +105,8 @@ pub struct bk_live_params {
     pub direct_samples: u32,
     /// Search radius of photons in scene units, see bk_bake_params. Default: 0.
     pub radius: f32,
-    /// 1: the device's threads go on working between updates, on what the last one saw. 0: they
-    /// rest. Default: 0.
+    /// 1: the device's threads go on working between updates, on the surfaces that the last one
+    /// saw. 0: they rest. Default: 0.
     pub background: u32,
 }
 
@@ -611,8 +611,7 @@ pub unsafe extern "C" fn bk_live_light_changed(live: *mut bk_live, light: u32) -
 }
 
 /// Pauses or resumes work between updates (bk_live_params.background) and the recomputation of
-/// indirect light. They resume with the next update; updates themselves still do what their budget
-/// allows.
+/// indirect light. They resume with the next update; updates themselves go on.
 ///
 /// Cost: pausing waits for the work under way.
 ///

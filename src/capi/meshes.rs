@@ -228,8 +228,8 @@ pub unsafe extern "C" fn bk_mesh_desc_init(desc: *mut bk_mesh_desc) {
 /// @param scene  scene that is not committed
 /// @param desc  the arrays are copied
 /// @param out_id  receives the number of the mesh, as hits report it; may be NULL
-/// @retval BK_ERROR_INVALID_ARGUMENT  an index or a material is out of range, or the mesh is not
-///   what BK_MESH_STRICT demands; bk_last_error names triangle and vertex
+/// @retval BK_ERROR_INVALID_ARGUMENT  an index or a material is out of range, or the mesh violates
+///   BK_MESH_STRICT; bk_last_error names triangle and vertex
 /// @retval BK_ERROR_INVALID_STATE  the scene is committed or another thread is changing it
 /// @retval BK_ERROR_OUT_OF_MEMORY  the copy does not fit or the memory callback refuses
 #[unsafe(no_mangle)]
@@ -248,7 +248,7 @@ pub unsafe extern "C" fn bk_scene_add_mesh(
     })
 }
 
-/// What a copy of a mesh takes.
+/// Size of a copy of a mesh in bytes.
 fn bytes(d: &bk_mesh_desc) -> usize {
     let if_given = |given: bool, bytes: usize| if given { bytes } else { 0 };
     let per_vertex = size_of::<Vec3>()
@@ -309,7 +309,7 @@ unsafe fn read_mesh(d: &bk_mesh_desc) -> Result<Mesh> {
 /// @param vertex_count  number of vertices, as when the mesh was added
 /// @param stride  distance between positions in bytes, at least 12; 0: packed
 /// @retval BK_ERROR_INVALID_ARGUMENT  there is no such mesh, `vertex_count` or `stride` is wrong,
-///   or the mesh is not what BK_MESH_STRICT demands
+///   or the new positions violate BK_MESH_STRICT
 /// @retval BK_ERROR_INVALID_STATE  the scene is not committed or another thread is changing it
 /// @retval BK_ERROR_OUT_OF_MEMORY  the copy does not fit
 #[unsafe(no_mangle)]

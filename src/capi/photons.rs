@@ -84,7 +84,8 @@ pub unsafe extern "C" fn bk_photon_params_init(params: *mut bk_photon_params) {
 
 /// Creates a photon map: traces photons through a committed scene, on the device's threads.
 ///
-/// The map keeps alive what it needs of the scene. Lights without power make an empty map.
+/// The map keeps the parts of the scene alive that it needs. Lights without power make an empty
+/// map.
 ///
 /// Cost: 3 to 7 million rays per second on two threads; a photon takes 1 / (1 - albedo) rays on
 /// average.

@@ -37,7 +37,7 @@ pub struct bk_scene {
     device: Arc<Device>,
     /// Set once by the commit.
     committed: OnceLock<Shared<Arc<Scene>>>,
-    /// What changes the scene. Only ever tried, never waited for.
+    /// State that changes before and after the commit. Only ever tried, never waited for.
     changes: Mutex<Changes>,
 }
 
@@ -52,7 +52,7 @@ struct Changes {
 pub(super) struct Description {
     pub(super) data: SceneData,
     build: BuildOptions,
-    /// What `data` holds of arrays that grow with the input.
+    /// Announced bytes of the arrays in `data`, which grow with the input.
     announced: Vec<Reservation>,
 }
 
@@ -310,8 +310,7 @@ pub unsafe extern "C" fn bk_load_params_init(params: *mut bk_load_params) {
 /// Only regular files are read, never devices, FIFOs or sockets. A material library or an image
 /// that cannot be read, or that lies where `params` allows none, is left out with a warning in the
 /// log; a buffer of a glTF file that cannot be read is an error. bk_scene_get_mesh,
-/// bk_scene_get_material, bk_scene_get_texture and bk_scene_get_light read back all that was
-/// loaded.
+/// bk_scene_get_material, bk_scene_get_texture and bk_scene_get_light read the loaded objects back.
 ///
 /// Cost: 0.2 (PLY) to 2 s (OBJ) per million triangles, on one thread, and the decoding of images.
 ///
@@ -319,7 +318,7 @@ pub unsafe extern "C" fn bk_load_params_init(params: *mut bk_load_params) {
 /// @param path  name of a file that ends in .obj (with its .mtl), .ply, .gltf or .glb; UTF-8
 /// @param params  limits; NULL for the defaults
 /// @param progress,user  progress callback and its pointer; may be NULL
-/// @param out  receives what was added; may be NULL
+/// @param out  receives the numbers of the objects added; may be NULL
 /// @retval BK_ERROR_IO  a file cannot be read or is malformed; bk_last_error names it
 /// @retval BK_ERROR_UNSUPPORTED  the kind of file is unknown, or the library was built without
 ///   files

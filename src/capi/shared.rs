@@ -1,4 +1,4 @@
-//! What many threads read and one may change: a lock that nobody waits for.
+//! A lock for data that many threads read and one may change; nobody ever waits for it.
 //!
 //! Readers count themselves in on one of several counters, each on a cache line of its own, so that
 //! threads which trace single rays do not take a line from each other. (One `RwLock` would make them.)
@@ -55,7 +55,7 @@ impl<T> Shared<T> {
         // SAFETY: this call alone raised the flag, and saw no readers after that; who has come since sees
         // the flag and does not read.
         let result = change(unsafe { &mut *self.value.get() });
-        // Not after a panic: what it left may be half changed.
+        // Not after a panic, which may have left the data half changed.
         self.writing.store(false, SeqCst);
         Ok(result)
     }

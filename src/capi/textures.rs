@@ -230,7 +230,7 @@ fn find<T>(images: &[Arc<T>], id: u32, what: &str) -> Result<Arc<T>> {
     }
 }
 
-/// What a copy of an image takes.
+/// Size of a copy of an image in bytes.
 fn bytes(d: &bk_texture_desc, per_texel: usize) -> usize {
     // At most 2^30 texels are taken; more are refused by name where they are read.
     let texels = d.width as usize * d.height as usize;

@@ -51,7 +51,7 @@ pub const TWO_SIDED_UNLESS_SAID: bool = true;
 /// Reflectance where a file names a material without describing it, or none at all.
 pub const DEFAULT_ALBEDO: f32 = 0.5;
 
-/// What [`load`] found.
+/// Numbers about a file that was loaded.
 #[derive(Clone, Debug, Default, PartialEq)]
 pub struct LoadInfo {
     /// Number of meshes added.

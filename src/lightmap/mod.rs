@@ -29,23 +29,23 @@ pub use saved::CheckpointParams;
 use saved::fingerprint::Origin;
 use std::sync::Arc;
 
-/// How a light map is laid out.
+/// Parameters of a light map's layout.
 #[derive(Clone, Copy, Debug, PartialEq)]
 pub struct LightmapDesc {
-    /// Texels per scene unit; 0: chosen so that the scene about fills one page.
+    /// Density of unwrapped charts in texels per scene unit; 0: chosen so that the scene fills about one page.
     pub texels_per_unit: f32,
     /// Width and height of a page in texels, 16 to 16384.
     pub page_size: u32,
-    /// Texels around each chart that filtering may read, ≥ 1.
+    /// Distance around each chart that filtering may read, in texels, ≥ 1.
     pub padding: u32,
     /// Light map texels per gather map texel, along each axis.
     pub gather_divisor: u32,
     /// Light map texels per radiance map texel, along each axis.
     pub radiance_divisor: u32,
-    /// Whether two-sided charts of which both sides are seen from open places get a second place for their backs
-    /// ([`Lightmap::mesh_back_uvs`]). Open places have free space around them; those outside of buildings count where a sun
-    /// or a sky shines as the light map is created. Without a second place, a chart shows the side that is seen, or the one
-    /// that the bake chooses.
+    /// Whether two-sided charts that can be seen from open places on both sides get separate texels for their backs
+    /// ([`Lightmap::mesh_back_uvs`]). Open places are points with free space around them; those outside of buildings
+    /// count if a directional light or a sky shines when the light map is created. Without separate texels, a chart
+    /// shows the side that can be seen, or the one that the bake chooses.
     pub both_sides: bool,
 }
 
@@ -62,7 +62,7 @@ impl Default for LightmapDesc {
     }
 }
 
-/// Numbers about a light map.
+/// Numbers about a light map's layout.
 #[derive(Clone, Copy, Debug, Default)]
 pub struct LightmapInfo {
     /// Number of pages.
@@ -100,27 +100,26 @@ pub struct LightmapInfo {
     pub sight_rays: u64,
 }
 
-/// How to bake.
+/// Parameters of a bake.
 #[derive(Clone, Copy, Debug, PartialEq)]
 pub struct BakeParams {
-    /// At most [`MAX_PHOTONS`]; 0: no light that is reflected more than once.
+    /// Number of photons to emit, at most [`MAX_PHOTONS`]; 0: no light that is reflected more than once.
     pub photon_count: u64,
-    /// Most reflections of light before it reaches a texel; 0: Russian roulette alone decides.
+    /// Maximum number of reflections of light before it reaches a texel; 0: Russian roulette alone decides.
     pub max_bounces: u32,
-    /// Rays per gather map texel; 0: no indirect light. With every 64 go up to 16 shadow rays to bright patches of
-    /// surfaces, where there are any. Texels of the light map that no gather texel around stands for (some 1 to 3 %) trace
-    /// up to 16 of their own.
+    /// Number of rays per gather map texel; 0: no indirect light. Each 64 rays are accompanied by up to 16 shadow rays
+    /// to bright patches of surfaces, where there are any. Light map texels for which none of the gather texels around
+    /// is a valid source of interpolation (1 to 3 %) trace up to 16 gather rays themselves.
     pub gather_rays: u32,
-    /// Photon search radius, finite; 0: from the photons' density, and at least three quarters of a texel of the
-    /// radiance map, so that no photon lies between the places where light is estimated.
+    /// Search radius of photons in scene units, finite; 0: from the photons' density, and at least three quarters of a
+    /// texel of the radiance map, so that no photon lies between the discs of the estimates.
     pub radius: f32,
-    /// Radius of the gather map's blur in its texels; 0: none.
+    /// Radius of the gather map's blur in gather texels; 0: none.
     pub blur_radius: u32,
-    /// Shadow rays per light map texel and area light or disc of a directional light (of more than
-    /// four area lights, four times as many rays are shared out by their unoccluded light); four
-    /// times as many per sky, and for all of many lights. They start from 4 points spread over the texel, or from 16 in
-    /// the penumbra of a disc. Point, spot and parallel lights take one ray each, and 4 to 16 more, spread over the
-    /// texel, where shadow edges cross it.
+    /// Number of shadow rays per light map texel and area light or disc of a directional light. More than four area
+    /// lights share four times as many rays by their unoccluded light; a sky takes four times as many, and many lights
+    /// together do. The rays start from 4 points of the texel, or from 16 in the penumbra of a disc. Point, spot and
+    /// parallel lights take one ray each, and 4 to 16 more, spread over the texel, where shadow edges cross it.
     pub direct_samples: u32,
     /// Seed of all random numbers. The same seed gives the same bits on any number of threads.
     pub seed: u64,
@@ -130,10 +129,9 @@ pub struct BakeParams {
     pub texel_begin: u64,
     /// The covered texel behind the last one to bake; 0: all.
     pub texel_end: u64,
-    /// Whether both sides of edges at which smooth surfaces are cut open in the light map are made to
-    /// agree under bilinear filtering. Moves only the texels that such edges show, once all texels
-    /// are baked. Live updates do not stitch: [`LiveParams::bake`](crate::live::LiveParams::bake)
-    /// says `false`.
+    /// Whether to stitch seams: where a smooth surface is cut in the light map, the texels along the edge are changed
+    /// so that both sides look the same under bilinear filtering, once all texels are baked. Live updates do not
+    /// stitch: [`LiveParams::bake`](crate::live::LiveParams::bake) says `false`.
     pub stitch: bool,
 }
 
@@ -166,7 +164,7 @@ pub struct StageStats {
     pub bytes: u64,
 }
 
-/// What a bake did.
+/// Numbers about a bake.
 #[derive(Clone, Copy, Debug, Default)]
 pub struct BakeStats {
     /// Tracing and sorting of photons.
@@ -183,8 +181,8 @@ pub struct BakeStats {
     pub direct: StageStats,
     /// Filtering and composition.
     pub compose: StageStats,
-    /// Two-sided charts whose back was baked because one sees further from it, or more light falls on it, than from and on
-    /// the front.
+    /// Number of two-sided charts whose texels show the back, because the view from it is longer, or more light falls
+    /// on it.
     pub back_charts: u64,
     /// Wall time of the whole bake in seconds.
     pub seconds: f64,
@@ -203,7 +201,7 @@ pub struct BakeStats {
     pub seam_seconds: f64,
 }
 
-/// What a bake can read out.
+/// Layers of a light map that can be read.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 #[repr(u32)]
 pub enum Layer {
@@ -215,9 +213,9 @@ pub enum Layer {
     Direct = 2,
     /// Outgoing radiance (RGB, W/(m²·sr)).
     Radiance = 3,
-    /// 1 for a covered texel, 0.5 for one filled from its neighbours (the padding, and what lies inside solids), 0 for
-    /// an empty one. After a bake of some texels those that are not baked yet are 0; before the first bake covered
-    /// texels are 1.
+    /// 1 for a covered texel; 0.5 for one whose light is copied from its neighbours (padding, texels inside solids); 0
+    /// for an empty one. After a bake of a range of texels those that are not baked yet are 0; before the first bake
+    /// covered texels are 1.
     Validity = 4,
     /// Position of the texel's sample in the scene (RGB); 0 for texels that no triangle covers.
     Position = 5,

@@ -16,7 +16,7 @@ const MAX_CELLS: u64 = 1 << 24;
 /// LOD of cells without surfaces.
 pub const NO_LOD: u8 = 255;
 
-/// Where the cells lie.
+/// Geometry of the light map grid.
 #[derive(Clone, Copy, Debug, Default, PartialEq)]
 pub struct CellInfo {
     /// Lower corner of the first cell, in scene units.

@@ -1,4 +1,4 @@
-//! Live updates (thesis 3.3): coarse light at once, refined while somebody walks through the scene,
+//! Live updates (thesis 3.3): coarse light at once, refined while a camera moves through the scene,
 //! within a time budget per frame, and relit when lights change.
 //!
 //! Creating a [`Live`] object computes photons and radiance map as a bake does, and the texels of the
@@ -6,7 +6,7 @@
 //! that the camera sees, where estimated error times visibility is largest; in position-based mode
 //! (3.3.2) on the cells of the light map grid that are near, visible ones first. The thesis picks
 //! texels at random and lets neighbouring cells of different LOD show their border; here the texels
-//! of a LOD are among those of the next and what lies between is interpolated across cells.
+//! of an LOD are among those of the next, and the texels between them are interpolated across cells.
 //!
 //! A texel's sums depend on its number of rounds alone. When all texels have k rounds they have the
 //! bits of a bake with 64 · k gather rays and without stitching, whatever the order of the updates.
@@ -58,15 +58,15 @@ use work::{Context, Limit, Step};
 /// Which blocks updates work on.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub enum Mode {
-    /// What the camera sees.
+    /// Refine the surfaces in view.
     View,
-    /// What is near the camera, visible or not, cell by cell.
+    /// Refine the cells near the camera, visible or not.
     Position,
-    /// Anywhere, at random: for comparison.
+    /// Refine anywhere, at random, for comparison.
     Uniform,
 }
 
-/// How to update.
+/// Parameters of live updates.
 #[derive(Clone, Copy, Debug, PartialEq)]
 pub struct LiveParams {
     /// Where updates work.
@@ -119,7 +119,7 @@ impl Default for LiveParams {
     }
 }
 
-/// Where somebody looks from.
+/// A perspective camera.
 #[derive(Clone, Copy, Debug, PartialEq)]
 pub struct LiveCamera {
     /// Position in scene units.
@@ -136,7 +136,7 @@ pub struct LiveCamera {
     pub height: u32,
 }
 
-/// What an update may take. Both 0: nothing is traced.
+/// Limits of an update. With both 0 nothing is traced.
 #[derive(Clone, Copy, Debug, PartialEq)]
 pub struct Budget {
     /// Time limit in milliseconds; 0: none.
@@ -145,7 +145,7 @@ pub struct Budget {
     pub rays: u64,
 }
 
-/// What an update did, and how things stand.
+/// Numbers about an update, and the state after it.
 #[derive(Clone, Copy, Debug, Default, PartialEq)]
 pub struct LiveStats {
     /// Whether indirect light is being recomputed because a light has changed.

@@ -43,7 +43,7 @@ pub struct Chart {
     pub given: Option<Given>,
 }
 
-/// What was found about UVs. Counts of triangles unless said otherwise.
+/// Numbers about the UVs of a scene.
 #[derive(Clone, Copy, Debug, Default, PartialEq)]
 pub struct UvReport {
     /// Charts taken from the caller's UVs.
