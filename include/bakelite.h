@@ -488,8 +488,8 @@ BK_API void bk_load_params_init(bk_load_params *params);
 /// @param progress,user  progress callback and its pointer; may be NULL
 /// @param out  receives the numbers of the objects added; may be NULL
 /// @retval BK_ERROR_IO  a file cannot be read or is malformed; bk_last_error names it
-/// @retval BK_ERROR_UNSUPPORTED  the kind of file is unknown, or the library was built without
-///   files
+/// @retval BK_ERROR_UNSUPPORTED  the kind of file is unknown, the file requires an extension of
+///   glTF that is not supported, or the library was built without files
 /// @retval BK_ERROR_OUT_OF_MEMORY  a limit of `params` is exceeded, the memory callback refuses, or
 ///   memory runs out
 /// @retval BK_ERROR_CANCELLED  the progress callback returned 0
@@ -1485,6 +1485,7 @@ BK_API bk_result bk_lightmap_get_info(const bk_lightmap *lightmap, bk_lightmap_i
 ///   texels, aligned to 4 bytes; may be NULL
 /// @retval BK_ERROR_INVALID_ARGUMENT  there is no such mesh
 /// @retval BK_ERROR_INVALID_STATE  the light map is being baked
+/// @retval BK_ERROR_OUT_OF_MEMORY  a copy does not fit
 BK_API
 bk_result bk_lightmap_mesh_uvs(const bk_lightmap *lightmap,
                                uint32_t mesh,
@@ -1507,6 +1508,7 @@ bk_result bk_lightmap_mesh_uvs(const bk_lightmap *lightmap,
 ///   texels, else 0; may be NULL
 /// @retval BK_ERROR_INVALID_ARGUMENT  there is no such mesh
 /// @retval BK_ERROR_INVALID_STATE  the light map is being baked
+/// @retval BK_ERROR_OUT_OF_MEMORY  a copy does not fit
 BK_API
 bk_result bk_lightmap_mesh_back_uvs(const bk_lightmap *lightmap,
                                     uint32_t mesh,
@@ -1885,6 +1887,7 @@ bk_result bk_lightmap_save(const bk_lightmap *lightmap,
 /// @param progress,user  progress callback and its pointer; may be NULL
 /// @retval BK_ERROR_INVALID_STATE  there was no bake, the light map is being baked, or bakes with
 ///   different parameters or lights filled the texels
+/// @retval BK_ERROR_OUT_OF_MEMORY  a buffer does not fit
 /// @retval BK_ERROR_IO  the file cannot be written; bk_last_error names it
 /// @retval BK_ERROR_CANCELLED  the progress callback returned 0
 BK_EXPERIMENTAL
@@ -2217,6 +2220,7 @@ bk_result bk_live_read(const bk_live *live,
 /// @param capacity  size of `out` in bytes, at least the number of cells; 0 to get `info` only
 /// @retval BK_ERROR_INVALID_ARGUMENT  `capacity` is too small
 /// @retval BK_ERROR_INVALID_STATE  another call is changing the live object
+/// @retval BK_ERROR_OUT_OF_MEMORY  a copy does not fit
 BK_API
 bk_result bk_live_cell_lods(const bk_live *live,
                             bk_cell_info *info,
@@ -2240,6 +2244,8 @@ BK_API uint32_t bk_live_lod_at(const bk_live *live, const float *position);
 /// @param light  number of one of the lights that changed
 /// @retval BK_ERROR_INVALID_ARGUMENT  there is no such light
 /// @retval BK_ERROR_INVALID_STATE  another call is using the live object
+/// @retval BK_ERROR_OUT_OF_MEMORY  the recomputation of indirect light does not fit or the memory
+///   callback refuses
 BK_API bk_result bk_live_light_changed(bk_live *live, uint32_t light);
 
 /// Pauses or resumes work between updates (bk_live_params.background) and the recomputation of
@@ -2250,6 +2256,8 @@ BK_API bk_result bk_live_light_changed(bk_live *live, uint32_t light);
 /// @param live  live object
 /// @param paused  1 to pause, 0 to resume
 /// @retval BK_ERROR_INVALID_STATE  another call is using the live object
+/// @retval BK_ERROR_OUT_OF_MEMORY  the recomputation of indirect light does not fit or the memory
+///   callback refuses
 BK_API bk_result bk_live_pause(bk_live *live, uint32_t paused);
 
 /// Saves accumulated light to a file, from which bk_live_restore continues. Light that is older

@@ -281,6 +281,7 @@ pub unsafe extern "C" fn bk_lightmap_get_info(lightmap: *const bk_lightmap, out:
 ///   texels, aligned to 4 bytes; may be NULL
 /// @retval BK_ERROR_INVALID_ARGUMENT  there is no such mesh
 /// @retval BK_ERROR_INVALID_STATE  the light map is being baked
+/// @retval BK_ERROR_OUT_OF_MEMORY  a copy does not fit
 #[unsafe(no_mangle)]
 pub unsafe extern "C" fn bk_lightmap_mesh_uvs(
     lightmap: *const bk_lightmap,
@@ -311,6 +312,7 @@ pub unsafe extern "C" fn bk_lightmap_mesh_uvs(
 ///   texels, else 0; may be NULL
 /// @retval BK_ERROR_INVALID_ARGUMENT  there is no such mesh
 /// @retval BK_ERROR_INVALID_STATE  the light map is being baked
+/// @retval BK_ERROR_OUT_OF_MEMORY  a copy does not fit
 #[unsafe(no_mangle)]
 pub unsafe extern "C" fn bk_lightmap_mesh_back_uvs(
     lightmap: *const bk_lightmap,

@@ -556,6 +556,7 @@ pub unsafe extern "C" fn bk_live_read(
 /// @param capacity  size of `out` in bytes, at least the number of cells; 0 to get `info` only
 /// @retval BK_ERROR_INVALID_ARGUMENT  `capacity` is too small
 /// @retval BK_ERROR_INVALID_STATE  another call is changing the live object
+/// @retval BK_ERROR_OUT_OF_MEMORY  a copy does not fit
 #[unsafe(no_mangle)]
 pub unsafe extern "C" fn bk_live_cell_lods(
     live: *const bk_live,
@@ -604,6 +605,8 @@ pub unsafe extern "C" fn bk_live_lod_at(live: *const bk_live, position: *const f
 /// @param light  number of one of the lights that changed
 /// @retval BK_ERROR_INVALID_ARGUMENT  there is no such light
 /// @retval BK_ERROR_INVALID_STATE  another call is using the live object
+/// @retval BK_ERROR_OUT_OF_MEMORY  the recomputation of indirect light does not fit or the memory
+///   callback refuses
 #[unsafe(no_mangle)]
 pub unsafe extern "C" fn bk_live_light_changed(live: *mut bk_live, light: u32) -> bk_result {
     // SAFETY: a handle, or NULL.
@@ -618,6 +621,8 @@ pub unsafe extern "C" fn bk_live_light_changed(live: *mut bk_live, light: u32) -
 /// @param live  live object
 /// @param paused  1 to pause, 0 to resume
 /// @retval BK_ERROR_INVALID_STATE  another call is using the live object
+/// @retval BK_ERROR_OUT_OF_MEMORY  the recomputation of indirect light does not fit or the memory
+///   callback refuses
 #[unsafe(no_mangle)]
 pub unsafe extern "C" fn bk_live_pause(live: *mut bk_live, paused: u32) -> bk_result {
     call(|| {

@@ -266,6 +266,7 @@ fn save(_: &Lightmap, prefix: &str, _: u32, _: &Progress) -> Result<()> {
 /// @param progress,user  progress callback and its pointer; may be NULL
 /// @retval BK_ERROR_INVALID_STATE  there was no bake, the light map is being baked, or bakes with
 ///   different parameters or lights filled the texels
+/// @retval BK_ERROR_OUT_OF_MEMORY  a buffer does not fit
 /// @retval BK_ERROR_IO  the file cannot be written; bk_last_error names it
 /// @retval BK_ERROR_CANCELLED  the progress callback returned 0
 #[unsafe(no_mangle)]

@@ -320,8 +320,8 @@ pub unsafe extern "C" fn bk_load_params_init(params: *mut bk_load_params) {
 /// @param progress,user  progress callback and its pointer; may be NULL
 /// @param out  receives the numbers of the objects added; may be NULL
 /// @retval BK_ERROR_IO  a file cannot be read or is malformed; bk_last_error names it
-/// @retval BK_ERROR_UNSUPPORTED  the kind of file is unknown, or the library was built without
-///   files
+/// @retval BK_ERROR_UNSUPPORTED  the kind of file is unknown, the file requires an extension of
+///   glTF that is not supported, or the library was built without files
 /// @retval BK_ERROR_OUT_OF_MEMORY  a limit of `params` is exceeded, the memory callback refuses, or
 ///   memory runs out
 /// @retval BK_ERROR_CANCELLED  the progress callback returned 0
