@@ -118,7 +118,7 @@ fn listed(function: &str) -> &'static [bk_result] {
                     let name = unsafe { CStr::from_ptr(bk_result_string(code)) };
                     text.split(' ').next() == name.to_str().ok()
                 }));
-            } else if !line.starts_with("//")
+            } else if line.starts_with(['B', 'b'])
                 && let Some((before, _)) = line.split_once('(')
                 && let Some(at) = before.rfind("bk_")
             {
