@@ -1,8 +1,8 @@
 //! Files on disk: only regular ones are read, and what is written replaces the old file as a whole or not at all.
 //!
 //! [`replace`] writes beside the target, flushes that to disk and renames it. Whatever ends it early (a full disk, a
-//! cancel, a kill, power that fails) leaves the old file as it was. Only a kill leaves the file beside, `NAME.part`;
-//! the next save of the same name writes over it.
+//! cancel, a kill, power that fails) leaves the old file as it was. Only a kill leaves the file beside, `NAME.part` (of a
+//! name too long for that its checksum, `CHECKSUM.part`); the next save of the same name writes over it.
 
 use crate::error::{Error, Result};
 use std::fs::{File, Metadata, OpenOptions, TryLockError};
@@ -118,10 +118,15 @@ impl Replacement {
             return Err(fail(io::Error::new(ErrorKind::PermissionDenied, "it is read-only")));
         }
         let target = if old.is_some() { std::fs::canonicalize(path) } else { end_of_links(path) }.map_err(fail)?;
-        let mut beside = target.clone().into_os_string();
-        beside.push(".part");
-        let beside = PathBuf::from(beside);
-        let file = open_beside(&beside).map_err(fail)?;
+        let [mut beside, short] = names_beside(&target);
+        let file = open_beside(&beside).or_else(|e| match e.kind() {
+            ErrorKind::InvalidFilename => {
+                beside = short;
+                open_beside(&beside)
+            }
+            _ => Err(e),
+        });
+        let file = file.map_err(fail)?;
         let new = Replacement { file, name, target, beside: Some(beside), unsynced: 0 };
         new.file.set_len(0).map_err(fail)?;
         if let Some(old) = old {
@@ -178,6 +183,14 @@ impl Drop for Replacement {
             let _ = std::fs::remove_file(beside);
         }
     }
+}
+
+/// Names of the file beside the target: the second where the first is too long for the file system.
+fn names_beside(target: &Path) -> [PathBuf; 2] {
+    let mut long = target.as_os_str().to_owned();
+    long.push(".part");
+    let sum = crc32fast::hash(target.file_name().unwrap_or_default().as_encoded_bytes());
+    [long.into(), target.with_file_name(format!("{sum:08x}.part"))]
 }
 
 /// Opens the file beside the target, one that a killed process has left included, and locks it: of two calls that
@@ -298,6 +311,26 @@ mod tests {
         std::fs::write(folder.0.join("a.part"), "much longer than the new content").unwrap();
         replace_with(&path, b"new").unwrap();
         assert_eq!((std::fs::read(&path).unwrap(), folder.names()), (b"new".to_vec(), vec!["a".into()]));
+    }
+
+    #[test]
+    fn names_may_be_as_long_as_the_file_system_allows() {
+        let folder = Folder::new("long");
+        for length in [250, 251, 255] {
+            let name = "n".repeat(length);
+            let path = folder.0.join(&name);
+            replace_with(&path, b"old").unwrap();
+            replace(&path, |file| {
+                let e = replace_with(&path, b"second").unwrap_err().to_string();
+                assert!(e.contains("another call"), "{e}");
+                file.append(b"new", |_| Ok(()))
+            })
+            .unwrap();
+            assert_eq!((std::fs::read(&path).unwrap(), folder.names()), (b"new".to_vec(), vec![name]));
+            std::fs::remove_file(&path).unwrap();
+        }
+        assert!(matches!(replace_with(&folder.0.join("n".repeat(256)), b"x"), Err(Error::Io(_))));
+        assert!(folder.names().is_empty());
     }
 
     #[test]
