@@ -2,6 +2,10 @@
 
 #[path = "../fuzz/src/damaged_files.rs"]
 mod damaged_files;
+#[path = "../fuzz/src/room.rs"]
+mod room;
+#[path = "../fuzz/src/saved.rs"]
+mod saved;
 #[path = "../fuzz/src/seeds.rs"]
 mod seeds;
 

@@ -1,12 +1,16 @@
 //! Reads a file of any content and checks what may come of it: a valid scene or image, or an error and nothing else.
 
+use crate::saved::Saved;
 use bakelite::scene::{SceneData, is_valid_triangle};
 use bakelite::{Error, Progress, io};
 use std::path::{Path, PathBuf};
-use std::sync::OnceLock;
+use std::sync::{LazyLock, Mutex, OnceLock};
 
 const TRIANGLES: &str = "mtllib a.mtl\nv 0 0 0\nv 1 0 0\nv 0 1 0\nvt 0 0\nusemtl red\nf 1/1 2/1 3/1\nusemtl lamp\n\
     f 1/1 2/1 3/1\nusemtl cut\nf 1/1 2/1 3/1\n";
+
+static RESULT: LazyLock<Mutex<Saved>> = LazyLock::new(|| Mutex::new(Saved::result()));
+static CHECKPOINT: LazyLock<Mutex<Saved>> = LazyLock::new(|| Mutex::new(Saved::checkpoint()));
 
 /// The folder of this process. It holds an OBJ file, a library and an image that inputs may name.
 fn folder() -> &'static Path {
@@ -27,7 +31,7 @@ fn folder() -> &'static Path {
     })
 }
 
-/// Reads `bytes` as a file of the kind `target`. Panics if what comes of it is not in order.
+/// Reads `bytes` as a file of the kind `target`, or as changes to one that was saved. Panics if what comes of it is not in order.
 pub fn read(target: &str, bytes: &[u8]) {
     let write = |name: &str| {
         let path = folder().join(name);
@@ -44,6 +48,8 @@ pub fn read(target: &str, bytes: &[u8]) {
             write("image");
             load(&folder().join("triangles.obj"));
         }
+        "saved_result" => RESULT.lock().expect("no earlier panic").load(bytes),
+        "checkpoint" => CHECKPOINT.lock().expect("no earlier panic").resume(bytes),
         _ => match io::image::read_environment(&write("sky")) {
             Ok(sky) => assert!(sky.rgb().as_flattened().iter().all(|c| c.is_finite() && *c >= 0.0)),
             Err(e) => check_error(&e),

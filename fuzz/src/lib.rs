@@ -2,4 +2,6 @@
 //! toolchain.
 
 pub mod damaged_files;
+pub mod room;
+pub mod saved;
 pub mod seeds;

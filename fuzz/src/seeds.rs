@@ -8,9 +8,10 @@ use image::{ExtendedColorType as Color, ImageEncoder, Rgb};
 use std::io::Cursor;
 
 /// The targets: kinds of files.
-pub const TARGETS: [&str; 9] = ["obj", "mtl", "ply", "gltf", "glb", "png", "jpeg", "hdr", "exr"];
+pub const TARGETS: [&str; 11] =
+    ["obj", "mtl", "ply", "gltf", "glb", "png", "jpeg", "hdr", "exr", "saved_result", "checkpoint"];
 
-/// Valid files, each with its target.
+/// Valid files, each with its target, and changes to saved ones.
 pub fn seeds() -> Vec<(&'static str, Vec<u8>)> {
     let mut all: Vec<(&str, Vec<u8>)> = Vec::new();
     all.extend(OBJ.map(|text| ("obj", text.into())));
@@ -28,7 +29,14 @@ pub fn seeds() -> Vec<(&'static str, Vec<u8>)> {
     all.extend(pngs().into_iter().map(|file| ("png", file)));
     all.extend([Color::L8, Color::Rgb8].map(|color| ("jpeg", jpeg(color))));
     all.extend([("hdr", hdr(2)), ("hdr", hdr(16)), ("exr", exr())]);
+    all.extend(["saved_result", "checkpoint"].into_iter().flat_map(|target| changes().map(move |c| (target, c))));
     all
+}
+
+/// Changes of each kind to the first and to later records (see `saved`), and none at all.
+fn changes() -> impl Iterator<Item = Vec<u8>> {
+    let to = |record: u8| (0..8).map(move |what| [&[record, 64 + what, 9, 0][..], &[0xff; 8]].concat());
+    [Vec::new()].into_iter().chain((0..8).flat_map(to))
 }
 
 const OBJ: [&str; 3] = [

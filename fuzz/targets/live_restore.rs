@@ -2,40 +2,18 @@
 //! shows light that is finite and not negative, and can be refined.
 #![no_main]
 
-use bakelite::bvh::BuildOptions;
-use bakelite::lightmap::{Lightmap, LightmapDesc};
+use bakelite::Progress;
 use bakelite::live::{Budget, Live, LiveCamera, LiveParams, PageRect};
-use bakelite::scene::{Light, LightmapUvs, MeshMaterials};
-use bakelite::{Device, DeviceOptions, Material, Mesh, Progress, Scene, SceneData};
+use bakelite_fuzz::room::{self, PAGE};
 use std::sync::{LazyLock, Mutex};
 
-const PAGE: u32 = 32;
 const HEAD: usize = 24;
 
 /// A live object, and a state of it.
 static ROOM: LazyLock<Mutex<(Live, Vec<u8>)>> = LazyLock::new(|| Mutex::new(room()));
 
-/// Two facing squares with a lamp between them, each on half of a page.
 fn room() -> (Live, Vec<u8>) {
-    let device = Device::new(DeviceOptions { num_threads: 1, ..Default::default() }).unwrap();
-    let mut data = SceneData::new();
-    let material = data.add_material(Material { two_sided: true, ..Default::default() }).unwrap();
-    for (z, left) in [(-1.0, 0.05), (1.0, 0.55)] {
-        let corners = [[0.0, 0.0], [1.0, 0.0], [1.0, 1.0], [0.0, 1.0]];
-        let uvs = corners.map(|[x, y]| [left + 0.4 * x, 0.05 + 0.9 * y].into()).to_vec();
-        let mesh = Mesh {
-            positions: corners.map(|[x, y]: [f32; 2]| [2.0 * x - 1.0, 2.0 * y - 1.0, z].into()).to_vec(),
-            indices: vec![[0, 1, 2], [0, 2, 3]],
-            lightmap: Some(LightmapUvs { uvs, pages: Vec::new() }),
-            materials: MeshMaterials::One(material),
-            ..Default::default()
-        };
-        data.add_mesh(mesh).unwrap();
-    }
-    data.add_light(Light::Point { position: [0.2, 0.1, 0.0].into(), intensity: [2.0, 1.0, 0.5] }).unwrap();
-    let scene = Scene::commit(&device, data, &BuildOptions::default(), &Progress::none()).map_err(|e| e.1).unwrap();
-    let desc = LightmapDesc { page_size: PAGE, gather_divisor: 1, radiance_divisor: 1, ..Default::default() };
-    let lightmap = Lightmap::create(&scene, &desc, &Progress::none()).unwrap();
+    let lightmap = room::lightmap();
     let params = LiveParams { photon_count: 2000, max_rounds: 3, ..Default::default() };
     let mut live = Live::new(&lightmap, &params, &Progress::none()).unwrap();
     live.update(&camera(), &Budget { milliseconds: 0.0, rays: 20_000 }).unwrap();
