@@ -8,12 +8,13 @@
 //! is computed again and gives the same bits. Photons, upsampling, blur and seams are not kept: they take a small part of
 //! a bake.
 //!
-//! Records are only ever appended. A kill at any moment leaves at most the last of them torn, which is cut off.
+//! Records are only ever appended. A kill at any moment leaves at most the last of them torn, and power that fails
+//! leaves what was not flushed torn or as zeros; either is cut off.
 
 use super::fingerprint::{Fingerprint, Origin};
-use super::records::{self, MAGIC, Next, Records, Tag, take, take_one};
+use super::records::{self, MAGIC, Next, Tag, take, take_one};
 use super::result::is_light;
-use super::{another_kind, damaged, foreign};
+use super::{damaged, foreign};
 use crate::device::{Device, LogLevel};
 use crate::error::{Error, Result, invalid_argument};
 use crate::lightmap::TexelState;
@@ -71,7 +72,7 @@ pub(crate) struct Checkpoint<'a> {
     device: &'a Device,
     path: PathBuf,
     interval: Duration,
-    file: Mutex<Output>,
+    file: Mutex<Output<File>>,
     pending: Mutex<Pending>,
     /// What an earlier run has done, by kind and number.
     done: Mutex<HashMap<(Tag, u64), Vec<u8>>>,
@@ -83,12 +84,28 @@ struct Pending {
     since: Instant,
 }
 
+/// What a file does for a checkpoint. (Tests have others, which fail.)
+trait Storage: Write + Seek {
+    fn set_len(&self, bytes: u64) -> std::io::Result<()>;
+    fn sync_data(&self) -> std::io::Result<()>;
+}
+
+impl Storage for File {
+    fn set_len(&self, bytes: u64) -> std::io::Result<()> {
+        File::set_len(self, bytes)
+    }
+
+    fn sync_data(&self) -> std::io::Result<()> {
+        File::sync_data(self)
+    }
+}
+
 /// The file, locked against other bakes.
-struct Output {
-    file: File,
+struct Output<F> {
+    file: F,
     /// Bytes of whole records.
     whole: u64,
-    /// Whether the last write failed.
+    /// Whether the last write failed, and may have left a part of a record.
     failed: bool,
     /// When the file was last flushed to disk, and how long that took.
     flushed: Instant,
@@ -99,8 +116,17 @@ struct Output {
 /// that was written. A flush of a block takes from 1 to more than 100 ms.)
 const FLUSH_SHARE: u32 = 100;
 
-impl Output {
+impl<F: Storage> Output<F> {
+    fn new(file: F, whole: u64) -> Output<F> {
+        Output { file, whole, failed: false, flushed: Instant::now(), flush_time: Duration::ZERO }
+    }
+
+    /// Appends whole records. What a write that failed has left is cut off first: behind it they could not be read.
     fn append(&mut self, bytes: &[u8]) -> std::io::Result<()> {
+        if self.failed {
+            self.cut()?;
+        }
+        self.failed = true;
         self.file.write_all(bytes)?;
         if self.flushed.elapsed() >= FLUSH_SHARE * self.flush_time {
             let start = Instant::now();
@@ -109,6 +135,14 @@ impl Output {
             self.flush_time = self.flushed - start;
         }
         self.whole += bytes.len() as u64;
+        self.failed = false;
+        Ok(())
+    }
+
+    /// Cuts the file to its whole records.
+    fn cut(&mut self) -> std::io::Result<()> {
+        self.file.set_len(self.whole)?;
+        self.file.seek(SeekFrom::Start(self.whole))?;
         Ok(())
     }
 }
@@ -137,18 +171,13 @@ impl<'a> Checkpoint<'a> {
             file.seek(SeekFrom::Start(0)).map_err(fail)?;
             read(&file, size, path, &needed, &mut done)?
         };
-        file.set_len(whole).and_then(|()| file.seek(SeekFrom::Start(whole))).map_err(fail)?;
+        let mut output = Output::new(file, whole);
+        output.cut().map_err(fail)?;
         Ok(Checkpoint {
             device: atlas.scene.device(),
             path: path.clone(),
             interval: Duration::from_secs_f64(params.seconds),
-            file: Mutex::new(Output {
-                file,
-                whole,
-                failed: false,
-                flushed: Instant::now(),
-                flush_time: Duration::ZERO,
-            }),
+            file: Mutex::new(output),
             pending: Mutex::new(Pending { bytes: Vec::new(), since: Instant::now() }),
             done: Mutex::new(done),
         })
@@ -305,15 +334,13 @@ impl<'a> Checkpoint<'a> {
             return;
         }
         let mut output = lock(&self.file);
-        match output.append(bytes) {
-            Ok(()) => output.failed = false,
-            Err(e) => {
-                let whole = output.whole;
-                let _ = output.file.set_len(whole).and_then(|()| output.file.seek(SeekFrom::Start(whole)));
-                if !std::mem::replace(&mut output.failed, true) {
-                    drop(output);
-                    self.warn(&e);
-                }
+        let had_failed = output.failed;
+        if let Err(e) = output.append(bytes) {
+            // At once, if it can be, for a process that is killed before the next write.
+            let _ = output.cut();
+            drop(output);
+            if !had_failed {
+                self.warn(&e);
             }
         }
     }
@@ -369,21 +396,10 @@ fn read(
     done: &mut HashMap<(Tag, u64), Vec<u8>>,
 ) -> Result<u64> {
     let fail = |e| Error::Io(format!("cannot read the checkpoint {}: {e}", path.display()));
-    let mut file = BufReader::with_capacity(1 << 20, file);
-    let mut magic = [0; MAGIC.len()];
-    if file.read_exact(&mut magic).is_err() || magic != MAGIC {
-        return Err(another_kind(path, "checkpoint"));
-    }
-    let mut records = Records::new(file, size);
-    match records.next().map_err(fail)? {
-        Next::Record(HEAD, content) if content.len() == size_of::<Fingerprint>() => {
-            let found: Fingerprint = bytemuck::pod_read_unaligned(&content);
-            if let Some(differences) = found.difference(needed) {
-                return Err(foreign(path, &differences));
-            }
-        }
-        Next::Record(..) => return Err(another_kind(path, "checkpoint")),
-        _ => return Err(damaged(path)),
+    let from = BufReader::with_capacity(1 << 20, file);
+    let (mut records, found): (_, Fingerprint) = records::begin(from, size, HEAD, path, "checkpoint")?;
+    if let Some(differences) = found.difference(needed) {
+        return Err(foreign(path, &differences));
     }
     loop {
         match records.next().map_err(fail)? {
@@ -395,7 +411,78 @@ fn read(
                 done.insert((tag, number), content);
             }
             Next::End | Next::Torn => return Ok(records.whole),
-            Next::Damaged => return Err(damaged(path)),
+            Next::Damaged(end) => {
+                let whole = records.whole;
+                // (Through the file itself, whose position nobody needs any more.)
+                let mut file = file;
+                let torn = records::ends_in_zeros(&mut file, whole, end, size).map_err(fail)?;
+                return if torn { Ok(whole) } else { Err(damaged(path)) };
+            }
         }
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use std::io::Cursor;
+
+    /// A disk that takes so many bytes more, and may refuse to cut files.
+    struct Disk {
+        content: std::cell::RefCell<Cursor<Vec<u8>>>,
+        room: usize,
+        can_cut: bool,
+    }
+
+    impl Write for Disk {
+        fn write(&mut self, bytes: &[u8]) -> std::io::Result<usize> {
+            let n = bytes.len().min(self.room);
+            if n == 0 {
+                return Err(std::io::ErrorKind::StorageFull.into());
+            }
+            self.room -= n;
+            self.content.get_mut().write(&bytes[..n])
+        }
+
+        fn flush(&mut self) -> std::io::Result<()> {
+            Ok(())
+        }
+    }
+
+    impl Seek for Disk {
+        fn seek(&mut self, to: SeekFrom) -> std::io::Result<u64> {
+            self.content.get_mut().seek(to)
+        }
+    }
+
+    impl Storage for Disk {
+        fn set_len(&self, bytes: u64) -> std::io::Result<()> {
+            if !self.can_cut {
+                return Err(std::io::ErrorKind::PermissionDenied.into());
+            }
+            self.content.borrow_mut().get_mut().truncate(bytes as usize);
+            Ok(())
+        }
+
+        fn sync_data(&self) -> std::io::Result<()> {
+            Ok(())
+        }
+    }
+
+    #[test]
+    fn no_record_is_written_behind_one_that_was_torn() {
+        let disk = Disk { content: Default::default(), room: 5, can_cut: false };
+        let mut output = Output::new(disk, 0);
+        output.append(b"one").unwrap();
+        assert!(output.append(b"three").is_err());
+        output.cut().unwrap_err();
+        // There is room again, but the torn record is still there.
+        output.file.room = 100;
+        assert!(output.append(b"four").is_err());
+        assert_eq!(output.file.content.borrow().get_ref(), b"oneth");
+        output.file.can_cut = true;
+        output.append(b"five").unwrap();
+        output.append(b"six").unwrap();
+        assert_eq!(output.file.content.borrow().get_ref(), b"onefivesix");
     }
 }

@@ -9,11 +9,15 @@
 //! 20..    content
 //! ```
 //!
-//! A process that is killed while it appends leaves a file that ends within a record: a torn end. Any other change
-//! of a file shows in a checksum, that of a length in the header's own.
+//! A process that is killed while it appends leaves a file that ends within a record: a torn end. Where power fails, a
+//! file system may have kept the new length of the file but not the last blocks of its content, which then read as
+//! zeros: a torn end, too ([`ends_in_zeros`]). Any other change of a file shows in a checksum, that of a length in the
+//! header's own.
 
+use super::{another_kind, damaged};
 use crate::error::{Error, Result};
-use std::io::{self, ErrorKind, Read};
+use std::io::{self, ErrorKind, Read, Seek, SeekFrom};
+use std::path::Path;
 
 /// Begins every file; the last byte is the version of the format. Numbers are stored as the machine has them, so files
 /// of machines with the other order of bytes begin otherwise.
@@ -21,6 +25,9 @@ pub(super) const MAGIC: [u8; 8] = if cfg!(target_endian = "little") { *b"BKLIGHT
 
 /// Bytes before the content of a record.
 const HEADER: usize = 20;
+
+/// File systems lose content in blocks of at least so many bytes.
+const LEAST_BLOCK: u64 = 512;
 
 pub(super) type Tag = [u8; 4];
 
@@ -49,7 +56,8 @@ pub(super) enum Next {
     End,
     /// The file ends within a record.
     Torn,
-    Damaged,
+    /// A checksum does not fit, of the header or of a content that goes up to this position.
+    Damaged(u64),
 }
 
 /// Reads records one by one.
@@ -80,7 +88,7 @@ impl<R: Read> Records<R> {
         self.left -= HEADER as u64;
         let number = |at: usize| u32::from_ne_bytes(std::array::from_fn(|i| header[at + i]));
         if crc32fast::hash(&header[..16]) != number(16) {
-            return Ok(Next::Damaged);
+            return Ok(Next::Damaged(self.whole + HEADER as u64));
         }
         let length = u64::from_ne_bytes(std::array::from_fn(|i| header[4 + i]));
         if length > self.left {
@@ -90,11 +98,50 @@ impl<R: Read> Records<R> {
         content.try_reserve_exact(length as usize).map_err(|_| io::Error::from(ErrorKind::OutOfMemory))?;
         self.from.by_ref().take(length).read_to_end(&mut content)?;
         self.left -= length;
+        let end = self.whole + HEADER as u64 + length;
         if content.len() as u64 != length || crc32fast::hash(&content) != number(12) {
-            return Ok(Next::Damaged);
+            return Ok(Next::Damaged(end));
         }
-        self.whole += HEADER as u64 + length;
+        self.whole = end;
         Ok(Next::Record(std::array::from_fn(|i| header[i]), content))
+    }
+}
+
+/// Reads the magic number and the first record, which must be a `T` under `tag`: the beginning of a file of `size`
+/// bytes. `kind` is what messages call such a file.
+pub(super) fn begin<T: bytemuck::Pod, R: Read>(
+    mut from: R,
+    size: u64,
+    tag: Tag,
+    path: &Path,
+    kind: &str,
+) -> Result<(Records<R>, T)> {
+    let mut magic = [0; MAGIC.len()];
+    if from.read_exact(&mut magic).is_err() || magic != MAGIC {
+        return Err(another_kind(path, kind));
+    }
+    let mut records = Records::new(from, size);
+    match records.next().map_err(|e| Error::Io(format!("cannot read the {kind} {}: {e}", path.display())))? {
+        Next::Record(found, content) if found == tag && content.len() == size_of::<T>() => {
+            Ok((records, bytemuck::pod_read_unaligned(&content)))
+        }
+        Next::Record(..) => Err(another_kind(path, kind)),
+        Next::End | Next::Torn | Next::Damaged(_) => Err(damaged(path)),
+    }
+}
+
+/// Whether the damaged record from `start` to `end` may be the one whose own end was lost when power failed: its last
+/// byte is zero, as is all that follows in the file of `size` bytes, at least a block.
+pub(super) fn ends_in_zeros(file: &mut (impl Read + Seek), start: u64, end: u64, size: u64) -> io::Result<bool> {
+    let last_block = size.saturating_sub(1) / LEAST_BLOCK * LEAST_BLOCK;
+    file.seek(SeekFrom::Start(last_block.clamp(start, end - 1)))?;
+    let mut piece = vec![0; 1 << 16];
+    loop {
+        match file.read(&mut piece)? {
+            0 => return Ok(true),
+            n if piece[..n].iter().any(|&b| b != 0) => return Ok(false),
+            _ => {}
+        }
     }
 }
 
@@ -148,7 +195,7 @@ mod tests {
         for bit in 0..bytes.len() * 8 {
             let mut flipped = bytes.clone();
             flipped[bit / 8] ^= 1 << (bit % 8);
-            assert_eq!(*all(&flipped).0.last().unwrap(), Next::Damaged, "bit {bit}");
+            assert!(matches!(all(&flipped).0.last().unwrap(), Next::Damaged(_)), "bit {bit}");
         }
         for length in 0..bytes.len() {
             let (found, whole) = all(&bytes[..length]);

@@ -7,7 +7,7 @@
 
 use super::fingerprint::Fingerprint;
 use super::records::{self, MAGIC, Next, Records, Tag, take, take_one};
-use super::{another_kind, damaged, foreign};
+use super::{damaged, foreign};
 use crate::error::{Error, Result};
 use crate::files;
 use crate::lightmap::indirect::bright_patches::Bright;
@@ -18,7 +18,7 @@ use crate::memory::{try_collect, try_push, try_to_vec, try_vec, try_with_capacit
 use crate::progress::Progress;
 use bytemuck::{Pod, Zeroable};
 use glam::Vec3;
-use std::io::{BufReader, Read};
+use std::io::BufReader;
 use std::ops::Range;
 use std::path::Path;
 
@@ -190,18 +190,8 @@ impl<'a> Loading<'a> {
         let fail = |e| Error::Io(format!("cannot read {}: {e}", path.display()));
         let file = files::open(path).map_err(fail)?;
         let size = file.metadata().map_err(fail)?.len();
-        let mut file = BufReader::with_capacity(1 << 16, file);
-        let mut magic = [0; MAGIC.len()];
-        let is_ours = file.read_exact(&mut magic).is_ok() && magic == MAGIC;
-        if !is_ours {
-            return Err(another_kind(path, "result of a bake"));
-        }
-        let mut records = Records::new(file, size);
-        let head: Head = match records.next().map_err(fail)? {
-            Next::Record(HEAD, content) if content.len() == size_of::<Head>() => bytemuck::pod_read_unaligned(&content),
-            Next::Record(..) => return Err(another_kind(path, "result of a bake")),
-            _ => return Err(damaged(path)),
-        };
+        let file = BufReader::with_capacity(1 << 16, file);
+        let (records, head): (_, Head) = records::begin(file, size, HEAD, path, "result of a bake")?;
         let atlas = &lightmap.atlas;
         // Whatever the parameters were, they are taken over: only scene, lights and layout must be those of here.
         let origin = super::fingerprint::Origin::new(&head.fingerprint.params(), &atlas.scene.lights());

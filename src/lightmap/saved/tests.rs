@@ -289,6 +289,40 @@ fn a_checkpoint_cut_at_any_byte_goes_on_and_a_flipped_bit_is_refused() {
     }
 }
 
+/// As a file system leaves a file whose last blocks were not on disk when power failed.
+#[test]
+fn a_checkpoint_whose_end_is_zeros_goes_on() {
+    let whole = bits(&bake(2, &params()));
+    let place = Place::new();
+    bake_until(2, &place, 2.0).unwrap();
+    let bytes = place.bytes();
+    for (i, lost) in [1, 30, 512, 5_000, bytes.len() / 2].into_iter().enumerate() {
+        for behind in [0, 7, 4096] {
+            let mut zeroed = bytes.clone();
+            let start = (bytes.len() + behind - lost) / 512 * 512;
+            zeroed.resize(bytes.len() + behind, 0);
+            zeroed[start..].fill(0);
+            let file = Place::of(&zeroed);
+            let mut map = lightmap(1 + i % 2);
+            map.bake_with(&params(), Some(&at(&file)), &Progress::none()).unwrap();
+            assert!(bits(&map) == whole, "{lost} bytes and {behind} more");
+            // It has become a checkpoint without zeros.
+            assert!(file.bytes().len() == bytes.len());
+        }
+    }
+    // Zeros in the middle are damage, and so is a flipped bit before zeros.
+    let mut damaged = bytes.clone();
+    damaged[bytes.len() / 2..][..600].fill(0);
+    let mut flipped = bytes.clone();
+    *flipped.last_mut().unwrap() ^= 1 << 7;
+    flipped.resize(bytes.len() + 4096, 0);
+    for damaged in [damaged, flipped] {
+        let file = Place::of(&damaged);
+        assert!(matches!(bake_until(2, &file, 2.0), Err(Error::Io(_))));
+        assert!(file.bytes() == damaged);
+    }
+}
+
 #[test]
 fn a_foreign_or_used_checkpoint_is_refused_and_kept() {
     let place = Place::new();
