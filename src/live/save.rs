@@ -14,6 +14,7 @@ use crate::lightmap::indirect::gather::Gathered;
 use crate::lightmap::indirect::sample_set::ROUND;
 use crate::memory::{try_vec, try_with_capacity};
 use crate::progress::Progress;
+use crate::scene::MOST_LIGHT;
 use glam::Vec3;
 use std::fmt::Write;
 use std::io::Read;
@@ -30,9 +31,6 @@ const TEXEL_BYTES: usize = 24;
 
 /// Bytes that are read, hashed or written between two looks at the progress.
 const PIECE: usize = 1 << 18;
-
-/// More light than this cannot be: each light is cut off at 1e30 W/m².
-const MOST_LIGHT: f32 = 1e37;
 
 /// FNV-1a, 64 bits.
 struct Hash(u64);

@@ -39,6 +39,9 @@ pub const MAX_TRIANGLES: usize = 1 << 28;
 /// thousands of such values are still finite.
 pub const BRIGHTEST: f32 = 1e30;
 
+/// More light than this cannot be, as each light is cut off at [`BRIGHTEST`]: files that say so are damaged.
+pub(crate) const MOST_LIGHT: f32 = 1e37;
+
 /// A scene being described. Everything added is checked; a refused addition changes nothing.
 #[derive(Clone, Debug, Default)]
 pub struct SceneData {

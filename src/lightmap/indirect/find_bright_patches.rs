@@ -38,8 +38,9 @@ const ROUNDS: u32 = 2;
 /// Light weaker than this part of the mean need not be right in proportion.
 const LEAST: f32 = 0.1;
 
-/// A round of gather rays comes with this many shadow rays, times the part of the light that the patches make.
-const SHADOW_RAYS: f32 = 16.0;
+/// A round of gather rays comes with this many shadow rays, times the part of the light that the patches make, and
+/// with one at least.
+pub(crate) const MAX_SHADOW_RAYS: u32 = 16;
 
 /// So many texels become lights; of more, so many are taken at random, each for several.
 const MAX_PATCHES: usize = 1 << 16;
@@ -75,7 +76,7 @@ pub(crate) fn find(atlas: &Atlas, radiance: &mut Radiance, rays: &mut u64, progr
     let patches = ManyLights::of_patches(patches)?;
     progress.check()?;
     let memory = atlas.scene.device().memory().reserve(patches.bytes(), "bright patches")?;
-    let shadow_rays = (SHADOW_RAYS * share).ceil() as u32;
+    let shadow_rays = ((MAX_SHADOW_RAYS as f32 * share).ceil() as u32).clamp(1, MAX_SHADOW_RAYS);
     let without = trials(atlas, radiance, rays, progress)?;
     radiance.bright = Bright { limit, patches: Some(patches), shadow_rays, _memory: Some(memory) };
     if !pays(&trials(atlas, radiance, rays, progress)?, &without) {

@@ -19,7 +19,7 @@ use crate::device::{Device, LogLevel};
 use crate::error::{Error, Result, invalid_argument};
 use crate::lightmap::TexelState;
 use crate::lightmap::atlas::Atlas;
-use crate::lightmap::indirect::find_bright_patches;
+use crate::lightmap::indirect::find_bright_patches::{self, MAX_SHADOW_RAYS};
 use crate::lightmap::indirect::radiance_map::Radiance;
 use crate::lightmap::indirect::upsample::OwnLight;
 use crate::memory::{try_collect, try_vec};
@@ -197,7 +197,8 @@ impl<'a> Checkpoint<'a> {
         let (Some(limit), Some(shadow_rays)) = (take_one::<f32>(&mut rest), take_one::<u32>(&mut rest)) else {
             return Ok(None);
         };
-        if !is_light(&values) || !limit.is_finite() {
+        let is_possible = limit.is_finite() && (limit <= 0.0 || (1..=MAX_SHADOW_RAYS).contains(&shadow_rays));
+        if !is_light(&values) || !is_possible {
             return Ok(None);
         }
         let bright = find_bright_patches::again(atlas, &values, limit, shadow_rays)?;

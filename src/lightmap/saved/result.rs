@@ -16,6 +16,7 @@ use crate::lightmap::plan::Plan;
 use crate::lightmap::{BakeStats, Light, Lightmap, TexelState};
 use crate::memory::{try_collect, try_push, try_to_vec, try_vec, try_with_capacity};
 use crate::progress::Progress;
+use crate::scene::MOST_LIGHT;
 use bytemuck::{Pod, Zeroable};
 use glam::Vec3;
 use std::io::BufReader;
@@ -174,7 +175,7 @@ fn append_texels(light: &Light, run: Range<usize>, out: &mut Vec<u8>) -> Result<
 
 /// Whether all are what light can be.
 pub(super) fn is_light(values: &[Vec3]) -> bool {
-    values.iter().all(|v| v.is_finite() && v.min_element() >= 0.0)
+    values.iter().all(|v| v.cmpge(Vec3::ZERO).all() && v.cmple(Vec3::splat(MOST_LIGHT)).all())
 }
 
 /// A result that is being read.

@@ -1,6 +1,7 @@
 //! Tests of results and checkpoints: what comes back has the bits of one bake, whatever was cut off, put together or
 //! killed in between; what is damaged or foreign is refused and changes nothing.
 
+use super::records::{self, Next, Records};
 use crate::bvh::BuildOptions;
 use crate::error::{Error, Result};
 use crate::lightmap::{BakeParams, CheckpointParams, Layer, LayerData, Lightmap, LightmapDesc};
@@ -358,4 +359,48 @@ fn a_foreign_or_used_checkpoint_is_refused_and_kept() {
     assert!(!seconds.is_empty() && seconds.iter().all(|e| matches!(e, Some(Error::InvalidState(_)))), "{seconds:?}");
     let bad = CheckpointParams { seconds: f64::NAN, ..at(&place) };
     assert!(matches!(map.bake_with(&params(), Some(&bad), &Progress::none()), Err(Error::InvalidArgument(_))));
+}
+
+/// A file with changed content and right checksums.
+fn with_records(bytes: &[u8], mut change: impl FnMut(&[u8; 4], &mut [u8])) -> Place {
+    let mut file = records::MAGIC.to_vec();
+    let mut from = Records::new(&bytes[file.len()..], bytes.len() as u64);
+    while let Next::Record(tag, mut content) = from.next().unwrap() {
+        change(&tag, &mut content);
+        records::append(&mut file, tag, &[&content]).unwrap();
+    }
+    Place::of(&file)
+}
+
+#[test]
+fn a_checkpoint_with_numbers_of_shadow_rays_that_no_bake_has_is_not_believed() {
+    let whole = bits(&bake(2, &params()));
+    let place = Place::new();
+    bake_until(2, &place, 2.0).unwrap();
+    for shadow_rays in [0, 17u32] {
+        let file = with_records(&place.bytes(), |tag, content| match tag {
+            b"RDNE" => {
+                content[8..12].copy_from_slice(&1e-3f32.to_ne_bytes());
+                content[12..16].copy_from_slice(&shadow_rays.to_ne_bytes());
+            }
+            // To be computed again, from the radiance map.
+            _ if tag != b"CKPT" && tag != b"RADI" => content[..8].fill(0xff),
+            _ => {}
+        });
+        assert!(bits(&bake_until(2, &file, 2.0).unwrap()) == whole, "{shadow_rays}");
+    }
+}
+
+#[test]
+fn a_result_with_more_light_than_can_be_is_refused() {
+    let baked = bake(2, &params());
+    let bytes = save(&baked).bytes();
+    for (tag, first) in [(b"RADI", 0), (b"TEXL", 16)] {
+        let file = with_records(&bytes, |t, content| {
+            if t == tag {
+                content[first..first + 4].copy_from_slice(&3e38f32.to_ne_bytes());
+            }
+        });
+        assert!(matches!(load(&mut lightmap(1), &file.0), Err(Error::Io(_))), "{tag:?}");
+    }
 }
