@@ -6,9 +6,10 @@
 //! soon seen, then with all. So few photons cannot tell which side of a sheet is the lit one (with
 //! them, Sponza showed 8 % error for a second): sides change with all photons only.
 
+use super::Live;
 use crate::device::{Device, DeviceOptions};
 use crate::direct::DirectLight;
-use crate::error::{Error, Result};
+use crate::error::{Error, Result, invalid_argument};
 use crate::lightmap::atlas::Atlas;
 use crate::lightmap::bake::Bake;
 use crate::lightmap::indirect::radiance_map::Radiance;
@@ -22,6 +23,7 @@ use std::panic::{AssertUnwindSafe, catch_unwind};
 use std::sync::atomic::{AtomicBool, Ordering::Relaxed};
 use std::sync::mpsc::{Receiver, TryRecvError, channel};
 use std::sync::{Arc, Mutex};
+use std::time::Duration;
 
 /// The first renewal takes this part of the photons.
 const QUICK_PART: u64 = 16;
@@ -264,6 +266,87 @@ impl Drop for Relight {
         self.retire();
         // Nobody else holds the device, so that its thread is joined here.
         self.device = None;
+    }
+}
+
+impl Live {
+    /// Takes new indirect light over, if there is any.
+    pub(super) fn take_new_light(&mut self) -> Result<()> {
+        if self.paused {
+            return Ok(());
+        }
+        let Some(new) = self.relight.poll(&self.context.map.atlas, &self.bake, &self.context.light.sides)? else {
+            return Ok(());
+        };
+        let before = self.context.light.clone();
+        let renewed = before.renewed(new).inspect_err(|_| self.relight.redo())?;
+        self.context.light = Arc::new(renewed);
+        self.display.begin_indirect_epoch();
+        if self.context.light.direct_epoch != before.direct_epoch {
+            self.display.begin_direct_epoch();
+            self.keep_direct_of_same_sides(&before);
+        }
+        self.chooser.note_all(&self.context, self.blocks.status());
+        Ok(())
+    }
+
+    /// New indirect light may turn charts over; the direct light of all others stays good.
+    pub(super) fn keep_direct_of_same_sides(&mut self, before: &Illumination) {
+        let light = self.context.light.clone();
+        for (b, tile) in (0u32..).zip(&self.context.map.tiles) {
+            let chart = self.context.map.atlas.gather.layout.chart_of(tile.placement) as usize;
+            if before.sides.backs.get(chart) != light.sides.backs.get(chart) {
+                continue;
+            }
+            let renew = |epoch: &mut u32| {
+                let is_good = *epoch == before.direct_epoch;
+                *epoch = if is_good { light.direct_epoch } else { *epoch };
+                is_good
+            };
+            let status = &mut self.blocks.status_mut()[b as usize];
+            if renew(&mut status.coarse_epoch) {
+                if renew(&mut status.direct_epoch) {
+                    self.display.keep_tile(b);
+                }
+                if let Some(work) = self.blocks.work_mut(b).and_then(|w| w.direct.as_mut()) {
+                    renew(&mut work.epoch);
+                }
+            }
+        }
+    }
+
+    /// Takes a change of light `id` of the scene into account: direct light in the next updates,
+    /// indirect light as it is recomputed in the background.
+    pub fn light_changed(&mut self, id: u32) -> Result<()> {
+        let lights = self.scene().lights();
+        let count = lights.len();
+        if id as usize >= count {
+            return invalid_argument!("light {id} does not exist, the scene has {count}");
+        }
+        let direct = Arc::new(DirectLight::try_new(self.scene())?);
+        self.collect_now()?;
+        self.make_room_for_epochs()?;
+        self.relight.start(&self.context.map.atlas, &self.bake, &self.context.light.sides)?;
+        // Nothing fails from here on.
+        self.display.begin_direct_epoch();
+        self.lights = lights;
+        self.context.light = Arc::new(Illumination {
+            direct,
+            direct_epoch: self.context.light.direct_epoch + 1,
+            ..(*self.context.light).clone()
+        });
+        self.chooser.note_all(&self.context, self.blocks.status());
+        Ok(())
+    }
+
+    /// Waits for indirect light that is being recomputed and takes it over.
+    pub fn finish_relighting(&mut self) -> Result<()> {
+        self.collect_now()?;
+        while self.relight.is_pending() && !self.paused {
+            self.take_new_light()?;
+            std::thread::sleep(Duration::from_millis(1));
+        }
+        Ok(())
     }
 }
 

@@ -3,10 +3,11 @@
 use super::blocks::{BlockMap, Rect};
 use super::display::Display;
 use super::lists::Lists;
-use super::{Live, PageRect};
+use super::{CellInfo, Live, NO_LOD, PageRect};
 use crate::error::{Result, invalid_argument};
 use crate::lightmap::atlas::texels::PageArea;
-use crate::memory::{try_append, try_vec};
+use crate::memory::{try_append, try_vec, try_with_capacity};
+use glam::Vec3;
 use rayon::prelude::*;
 
 /// Side of a bin in texels. (16 is no faster: time goes to the search of the nearest texel in the padding.)
@@ -116,5 +117,62 @@ impl Live {
         let groups = self.bins.groups(page, &area)?.into_iter().map(|g| g as usize);
         let value = |sample: u32| display.irradiance(map, light, sample, with_direct).to_array();
         atlas.map.texels.compose(groups, &area, atlas.padding, out, value, |v| v)
+    }
+}
+
+impl Live {
+    /// Removes and returns up to `capacity` rectangles whose shown light has changed since they were
+    /// last taken. At first all pages are.
+    pub fn take_dirty(&mut self, capacity: usize) -> Result<Vec<PageRect>> {
+        let mut all = try_with_capacity(capacity.min(self.dirty.len()), "the list of changes")?;
+        self.take_each_dirty(capacity, |rect| all.push(rect));
+        Ok(all)
+    }
+
+    /// [`take_dirty`](Self::take_dirty), handed out one by one.
+    pub fn take_each_dirty(&mut self, capacity: usize, mut put: impl FnMut(PageRect)) {
+        let size = self.page_size() as i32;
+        let page = Rect { x0: 0, y0: 0, x1: size, y1: size };
+        let padding = self.context.map.atlas.padding as i32;
+        self.dirty.take(capacity, |number, rect| {
+            let r = rect.grown(padding).clipped(&page);
+            let (width, height) = (r.width() as u32, r.height() as u32);
+            put(PageRect { page: number, x: r.x0 as u32, y: r.y0 as u32, width, height });
+        });
+    }
+
+    /// Width and height of the pages, as those of the light map.
+    pub fn page_size(&self) -> u32 {
+        self.context.map.atlas.map.layout.page_size
+    }
+
+    /// The light map grid, and the LOD that each of its cells shows ([`NO_LOD`]: no surfaces), x
+    /// fastest.
+    pub fn cell_lods(&self) -> Result<(CellInfo, Vec<u8>)> {
+        let mut lods = try_vec(self.grid.info.cells(), "the LODs of cells")?;
+        (0..).zip(&mut lods).for_each(|(c, lod)| *lod = self.grid.lod(c, &self.display.lods));
+        Ok((self.grid.info, lods))
+    }
+
+    /// The LOD shown at a position; `None` outside the grid and in cells without surfaces.
+    pub fn lod_at(&self, position: Vec3) -> Option<u8> {
+        let info = &self.grid.info;
+        let lod = info.contains(position).then(|| self.grid.lod(info.cell(position), &self.display.lods));
+        lod.filter(|&l| l != NO_LOD)
+    }
+
+    #[doc(hidden)]
+    /// Sums and rays of every gather texel, by sample: the part of the state that bakes share. For
+    /// tests.
+    pub fn sums(&mut self) -> Result<Vec<([f32; 3], u32)>> {
+        self.collect_now()?;
+        let mut sums = try_vec(self.context.map.atlas.gather.len(), "the sums of texels")?;
+        for (b, tile) in (0..).zip(&self.context.map.tiles) {
+            let gathered = self.blocks.work(b).map_or(&[][..], |w| &w.gathered);
+            for (&s, g) in tile.texels.iter().zip(gathered) {
+                sums[s as usize] = (g.sum.to_array(), g.rays);
+            }
+        }
+        Ok(sums)
     }
 }

@@ -1,0 +1,80 @@
+//! Work between updates, on the device's threads.
+
+use super::batch::{Background, Batch};
+use super::choose::Choice;
+use super::work::Limit;
+use super::{Live, LiveCamera, LiveStats};
+use crate::error::Result;
+use std::time::Duration;
+
+/// Blocks that are worked on between two updates, at most.
+const BACKGROUND_BLOCKS: usize = 256;
+
+impl Live {
+    /// Has the pool go on with what was seen last.
+    pub(super) fn start_background(&mut self, camera: &LiveCamera) -> Result<()> {
+        if !self.params.background || self.paused {
+            return Ok(());
+        }
+        let from = Choice {
+            context: &self.context,
+            blocks: self.blocks.status(),
+            grid: &self.grid,
+            visibility: &self.visibility,
+        };
+        let (step, mut chosen) = self.chooser.next(&from, self.params.mode, camera, BACKGROUND_BLOCKS);
+        // What waits to be shown must be there for it.
+        chosen.retain(|&b| !self.is_waiting[b as usize]);
+        if chosen.is_empty() {
+            return Ok(());
+        }
+        self.reserve_for(&chosen)?;
+        let most_rays = Some(self.params.rays_per_update as u64).filter(|&r| r > 0).unwrap_or(u64::MAX);
+        let limit = Limit::new(None, most_rays);
+        let batch = Batch::new(self.context.clone(), &mut self.blocks, &chosen, step, limit, Duration::ZERO)?;
+        self.background = Some(Background::start(batch, &self.device()));
+        Ok(())
+    }
+
+    /// Ends work in the background and takes it over, whatever became of it.
+    pub(super) fn collect(&mut self, stats: &mut LiveStats) -> Result<()> {
+        let Some(background) = self.background.take() else { return Ok(()) };
+        let (items, traced, result) = background.finish();
+        stats.rays += traced;
+        let device = self.device();
+        device.install(|| self.take_over(items, stats));
+        result
+    }
+
+    /// [`collect`](Self::collect) outside of updates.
+    pub(super) fn collect_now(&mut self) -> Result<()> {
+        let mut stats = LiveStats::default();
+        let result = self.collect(&mut stats);
+        self.total_rays += stats.rays;
+        result
+    }
+
+    /// Stops work in the background, or lets it go on with the next update: refinement between
+    /// updates, and the recomputation of indirect light.
+    pub fn pause(&mut self, paused: bool) -> Result<()> {
+        self.paused = paused;
+        self.relight.hold(paused, &self.context.map.atlas, &self.bake, &self.context.light.sides)?;
+        self.collect_now()
+    }
+}
+
+impl Drop for Live {
+    fn drop(&mut self) {
+        if let Some(background) = self.background.take() {
+            if self.device().check_process().is_err() {
+                // The threads that it waits for are in another process.
+                std::mem::forget(background);
+            } else {
+                // Nothing is lost if this is the end of it.
+                let _ = background.finish();
+            }
+        }
+        // Before the scene is let go: its last reference then ends here, not on the thread that relights.
+        drop(std::mem::take(&mut self.relight));
+    }
+}

@@ -1,0 +1,158 @@
+//! Creates live objects: photons and radiance map, and the texels of the lowest LOD.
+
+use super::blocks::{Block, BlockMap, Blocks, Tile};
+use super::cells::{Grid, Promotion};
+use super::choose::Chooser;
+use super::dirty::Dirty;
+use super::display::Display;
+use super::readback::ChartBins;
+use super::relight::{Illumination, Relight};
+use super::visibility::Visibility;
+use super::work::{Context, Limit};
+use super::{Live, LiveParams, in_parts};
+use crate::error::{Error, Result};
+use crate::lightmap::Lightmap;
+use crate::lightmap::bake::purpose;
+use crate::lightmap::indirect::gather::Gathered;
+use crate::lightmap::indirect::sample_set::SampleSet;
+use crate::memory::{try_vec, try_with_capacity};
+use crate::progress::Progress;
+use crate::sampling::purpose_seed;
+use glam::Vec3;
+use rayon::prelude::*;
+use std::collections::VecDeque;
+use std::sync::Arc;
+
+/// Light below this part of the scene's mean counts as dark.
+const DIM: f32 = 0.02;
+
+impl Live {
+    /// Computes the lowest LOD of everything, under the scene's lights of now. `lightmap` need not be
+    /// baked and is not changed.
+    pub fn new(lightmap: &Lightmap, params: &LiveParams, progress: &Progress) -> Result<Live> {
+        params.validate()?;
+        let device = lightmap.atlas().scene.device();
+        device.run(progress, || {
+            let mut live = Live::idle(lightmap, params, progress)?;
+            live.start(progress)?;
+            Ok(live)
+        })
+    }
+
+    /// All that is needed, nothing computed but photons and radiance.
+    pub(super) fn idle(lightmap: &Lightmap, params: &LiveParams, progress: &Progress) -> Result<Live> {
+        let atlas = lightmap.atlas();
+        let bake = params.bake();
+        let mut map = BlockMap::new(atlas, params.lod_count, progress)?;
+        let (lower, upper) = atlas.scene.bounds();
+        let grid = Grid::new(lower, upper, params.cell_size, &mut map.tiles)?;
+        let lights = atlas.scene.lights();
+        let light = Illumination::new(atlas, &bake, progress)?;
+        progress.check()?;
+        let display = Display::new(&map, params.blur)?;
+        progress.check()?;
+        let bins = ChartBins::new(&map)?;
+        let chooser = Chooser::new(&map, &grid)?;
+        let promotion = Promotion::new(&map.tiles, &grid)?;
+        let fixed = map.bytes()
+            + display.bytes()
+            + grid.bytes()
+            + promotion.bytes()
+            + bins.bytes()
+            + chooser.bytes()
+            + light.radiance.values.len() * size_of::<Vec3>()
+            // Marks, what is seen, and the queues of what is to be shown and fades.
+            + map.tiles.len() * 21;
+        let memory = atlas.scene.device().memory().reserve(fixed, "the live state")?;
+        let all_of = |t: &Tile| t.texels.len() * size_of::<Gathered>() + t.map_texels as usize * size_of::<Vec3>();
+        let full: usize = map.tiles.iter().map(all_of).sum();
+        let blocks = Blocks::new(map.tiles.len())?;
+        let mut waiting = VecDeque::new();
+        waiting.try_reserve_exact(blocks.len()).map_err(|_| Error::OutOfMemory("the queue of blocks".into()))?;
+        Ok(Live {
+            visibility: Visibility::new(blocks.len())?,
+            dirty: Dirty::all(atlas.info.page_count, atlas.map.layout.page_size)?,
+            is_waiting: try_vec(blocks.len(), "the queue of blocks")?,
+            waiting,
+            fading: try_with_capacity(blocks.len(), "the queue of blocks")?,
+            still_fading: try_with_capacity(blocks.len(), "the queue of blocks")?,
+            bytes_full: (fixed + full) as u64,
+            params: *params,
+            relight: Relight::default(),
+            background: None,
+            paused: false,
+            refresh_seconds: 1e-4,
+            coarse_seconds: 1e-4,
+            total_rays: 0,
+            fixed,
+            held: 0,
+            memory,
+            context: Context {
+                map: Arc::new(map),
+                samples: Arc::new(SampleSet::new(bake.gather_rays, purpose_seed(params.seed, purpose::GATHER_SET))),
+                gather_seed: purpose_seed(params.seed, purpose::GATHER),
+                direct_seed: purpose_seed(params.seed, purpose::DIRECT),
+                direct_samples: params.direct_samples,
+                direct_rays: light.direct.rays_per_point(params.direct_samples),
+                dim: 0.0,
+                promote_threshold: params.promote_threshold,
+                max_rounds: params.max_rounds,
+                light: Arc::new(light),
+            },
+            lights,
+            bake,
+            blocks,
+            grid,
+            promotion,
+            display,
+            bins,
+            chooser,
+        })
+    }
+
+    /// The lowest LOD everywhere. To be called in the pool.
+    pub(super) fn start(&mut self, progress: &Progress) -> Result<()> {
+        let stage = progress.stage("lowest LOD", 0.5, 0.9, self.blocks.len() as u64);
+        let limit = Limit::new(None, u64::MAX);
+        let context = self.context.clone();
+        let top = context.map.top();
+        self.blocks.par_iter_mut().zip(&context.map.tiles).try_for_each(|((status, home), tile)| {
+            if !tile.texels.is_empty()
+                && let Some(work) = home.take()
+            {
+                let mut block = Block { status: *status, work };
+                block.work_on_coarse(&context, tile, &limit);
+                block.work_on_indirect(&context, tile, &limit);
+                // One or two texels that lie hidden inside something, or against it, tell nothing of
+                // the others.
+                while block.status.lod < top
+                    && tile.lod_end[block.status.lod as usize] <= 2
+                    && !block.work.sees_light()
+                    && block.work_on_indirect(&context, tile, &limit)
+                {}
+                (*status, *home) = (block.status, Some(block.work));
+            }
+            limit.check_memory()?;
+            stage.advance(1)
+        })?;
+        self.total_rays += limit.traced.into_inner();
+        let sum: f64 = self.blocks.status().iter().map(|b| (b.mean + b.direct_mean) as f64).sum();
+        self.context.dim = DIM * (sum / self.blocks.len() as f64) as f32;
+        self.held = self.blocks.bytes() as isize;
+        let stage = progress.stage("show", 0.9, 1.0, 2 * self.blocks.len() as u64);
+        for some in in_parts(self.blocks.len()) {
+            self.display.take_coarse(&context.map, &mut self.blocks, &some, |_| ());
+            stage.advance(some.len() as u64)?;
+        }
+        for (lod, status) in self.display.lods.iter_mut().zip(self.blocks.status()) {
+            *lod = status.lod;
+        }
+        self.reserve(0)?;
+        for some in in_parts(self.blocks.len()) {
+            self.display.refresh(&context.map, &self.blocks, &some, |_| ());
+            stage.advance(some.len() as u64)?;
+        }
+        self.note_all_shown();
+        Ok(())
+    }
+}

@@ -1,0 +1,189 @@
+//! What live updates are asked for and what they report.
+
+use super::MAX_LODS;
+use crate::error::{Result, invalid_argument};
+use crate::lightmap::BakeParams;
+use crate::lightmap::indirect::blur::MAX_BLUR_RADIUS;
+use crate::lightmap::indirect::sample_set::ROUND;
+use glam::Vec3;
+
+/// Which blocks updates work on.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub enum Mode {
+    /// Refine the surfaces in view.
+    View,
+    /// Refine the cells near the camera, visible or not.
+    Position,
+    /// Refine anywhere, at random, for comparison.
+    Uniform,
+}
+
+/// Parameters of live updates.
+#[derive(Clone, Copy, Debug, PartialEq)]
+pub struct LiveParams {
+    /// Where updates work.
+    pub mode: Mode,
+    /// Number of levels of detail, 1 to [`MAX_LODS`]. The lowest computes every 2^(lod_count − 1)-th gather texel per
+    /// axis.
+    pub lod_count: u32,
+    /// Rounds of 64 rays that each texel of a cell needs before the cell shows its next LOD, ≥ 1.
+    pub promote_threshold: u32,
+    /// Rounds of 64 rays after which a texel is finished, at least `promote_threshold`, at most 1024.
+    pub max_rounds: u32,
+    /// Maximum number of rays per update, whatever its budget; 0: no limit.
+    pub rays_per_update: u32,
+    /// Radius of a blur for display, in gather texels; accumulated light is not blurred.
+    pub blur: u32,
+    /// Edge of a grid cell in scene units; 0: a sixteenth of the scene's longest side.
+    pub cell_size: f32,
+    /// Seed of all random numbers, as in a bake.
+    pub seed: u64,
+    /// Number of photons to emit, as in a bake.
+    pub photon_count: u64,
+    /// Maximum number of reflections, as in a bake.
+    pub max_bounces: u32,
+    /// Shadow rays per light map texel and area light, as in a bake.
+    pub direct_samples: u32,
+    /// Search radius of photons in scene units, as in a bake.
+    pub radius: f32,
+    /// Whether the device's threads go on working between updates.
+    pub background: bool,
+}
+
+impl Default for LiveParams {
+    fn default() -> Self {
+        let bake = BakeParams::default();
+        LiveParams {
+            mode: Mode::View,
+            lod_count: 3,
+            promote_threshold: 1,
+            max_rounds: 16,
+            rays_per_update: 0,
+            blur: bake.blur_radius,
+            cell_size: 0.0,
+            seed: bake.seed,
+            photon_count: bake.photon_count,
+            max_bounces: bake.max_bounces,
+            direct_samples: bake.direct_samples,
+            radius: bake.radius,
+            background: false,
+        }
+    }
+}
+
+/// A perspective camera.
+#[derive(Clone, Copy, Debug, PartialEq)]
+pub struct LiveCamera {
+    /// Position in scene units.
+    pub position: Vec3,
+    /// Direction of view, of any length.
+    pub forward: Vec3,
+    /// Upward direction, of any length, not parallel to `forward`.
+    pub up: Vec3,
+    /// Vertical field of view in radians, in (0, π).
+    pub fov_y: f32,
+    /// Width of the picture in pixels; only the ratio to `height` matters.
+    pub width: u32,
+    /// Height of the picture in pixels.
+    pub height: u32,
+}
+
+/// Limits of an update. With both 0 nothing is traced.
+#[derive(Clone, Copy, Debug, PartialEq)]
+pub struct Budget {
+    /// Time limit in milliseconds; 0: none.
+    pub milliseconds: f32,
+    /// Limit of the number of rays; 0: none.
+    pub rays: u64,
+}
+
+/// Numbers about an update, and the state after it.
+#[derive(Clone, Copy, Debug, Default, PartialEq)]
+pub struct LiveStats {
+    /// Whether indirect light is being recomputed because a light has changed.
+    pub light_pending: bool,
+    /// Duration of the update in milliseconds.
+    pub milliseconds: f32,
+    /// Estimated relative error (RMS) of the indirect light that the camera sees.
+    pub visible_error: f32,
+    /// Fraction of all blocks that is finished.
+    pub finished: f32,
+    /// Fraction of the blocks in view that is finished.
+    pub visible_finished: f32,
+    /// Number of rays traced by the update, and in the background since the update before.
+    pub rays: u64,
+    /// Number of rays traced since the beginning.
+    pub total_rays: u64,
+    /// Number of cells that went to a higher LOD.
+    pub cells_promoted: u32,
+    /// Number of blocks whose shown light changed.
+    pub blocks_changed: u32,
+    /// Size of the live object in bytes.
+    pub bytes: u64,
+    /// Size in bytes with all LODs in use everywhere.
+    pub bytes_full: u64,
+}
+
+/// A rectangle of texels of a page.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub struct PageRect {
+    /// Number of the page.
+    pub page: u32,
+    /// First column.
+    pub x: u32,
+    /// First row.
+    pub y: u32,
+    /// Number of columns.
+    pub width: u32,
+    /// Number of rows.
+    pub height: u32,
+}
+
+impl LiveParams {
+    /// Checks the ranges documented on the fields.
+    pub fn validate(&self) -> Result<()> {
+        if !(1..=MAX_LODS as u32).contains(&self.lod_count) {
+            return invalid_argument!("lod_count is {}, outside 1 to {MAX_LODS}", self.lod_count);
+        }
+        if !(1..=1024).contains(&self.max_rounds) {
+            return invalid_argument!("max_rounds is {}, outside 1 to 1024", self.max_rounds);
+        }
+        if !(1..=self.max_rounds).contains(&self.promote_threshold) {
+            let (t, m) = (self.promote_threshold, self.max_rounds);
+            return invalid_argument!("promote_threshold is {t}, outside 1 to max_rounds ({m})");
+        }
+        if self.blur > MAX_BLUR_RADIUS {
+            return invalid_argument!("blur is {}, more than {MAX_BLUR_RADIUS}", self.blur);
+        }
+        self.bake().validate()
+    }
+
+    /// The bake that the updates converge to.
+    pub fn bake(&self) -> BakeParams {
+        BakeParams {
+            photon_count: self.photon_count,
+            max_bounces: self.max_bounces,
+            gather_rays: self.max_rounds * ROUND as u32,
+            radius: self.radius,
+            blur_radius: self.blur,
+            direct_samples: self.direct_samples,
+            seed: self.seed,
+            // What is shown changes block by block, and each block is shown as it is.
+            stitch: false,
+            ..Default::default()
+        }
+    }
+}
+
+impl Budget {
+    pub(super) fn is_nothing(&self) -> bool {
+        self.milliseconds == 0.0 && self.rays == 0
+    }
+
+    pub(super) fn validate(&self) -> Result<()> {
+        if !(self.milliseconds >= 0.0 && self.milliseconds.is_finite()) {
+            return invalid_argument!("the budget is {} milliseconds, not a finite number ≥ 0", self.milliseconds);
+        }
+        Ok(())
+    }
+}

@@ -1,0 +1,100 @@
+//! What has been computed is shown: blocks that wait for the display, and those that fade from one LOD to the next.
+
+use super::{Live, LiveStats, Mode, PASS};
+use std::time::Instant;
+
+impl Live {
+    /// Takes note of how far all blocks are, and that all pages show something else.
+    pub(super) fn note_all_shown(&mut self) {
+        self.dirty.mark_all(self.page_size());
+        self.promotion.count(&self.context.map.tiles, self.blocks.status());
+        self.chooser.note_all(&self.context, self.blocks.status());
+    }
+
+    /// Has a block that completed a step shown: at once, or, in position-based mode, with its cell.
+    pub(super) fn promote(&mut self, b: u32, stats: &mut LiveStats) {
+        let cell = self.context.map.tiles[b as usize].cell;
+        let lod = self.status(b).lod;
+        let common = self.promotion.note(b, cell, lod);
+        if self.params.mode != Mode::Position {
+            self.display.lods[b as usize] = lod;
+            self.wait(b);
+        } else if let Some(common) = common {
+            stats.cells_promoted += 1;
+            for i in 0..self.grid.blocks_of(cell).len() {
+                let b = self.grid.blocks_of(cell)[i];
+                self.display.lods[b as usize] = common;
+                if self.display.begin_fade(b) {
+                    self.fading.push(b);
+                }
+                self.wait(b);
+            }
+        } else if self.status(b).fresh_lod <= self.display.lods[b as usize] {
+            self.wait(b);
+        }
+    }
+
+    pub(super) fn wait(&mut self, b: u32) {
+        if !std::mem::replace(&mut self.is_waiting[b as usize], true) {
+            self.waiting.push_back(b);
+        }
+    }
+
+    /// Shows waiting blocks as long as there is time.
+    pub(super) fn show_waiting(&mut self, end: Option<Instant>, stats: &mut LiveStats) {
+        while !self.waiting.is_empty() {
+            let start = Instant::now();
+            let left = end.map_or(f64::INFINITY, |e| e.saturating_duration_since(start).as_secs_f64());
+            let fit = (left / self.refresh_seconds) as usize;
+            if fit == 0 {
+                // One slow moment must not keep light from being shown for ever.
+                self.refresh_seconds *= 0.9;
+                return;
+            }
+            let batch: Vec<u32> = self.waiting.drain(..fit.min(PASS).min(self.waiting.len())).collect();
+            let dirty = &mut self.dirty;
+            self.display.refresh(&self.context.map, &self.blocks, &batch, |c| dirty.add(c));
+            for &b in &batch {
+                self.is_waiting[b as usize] = false;
+                let status = *self.status(b);
+                let Some(block) = self.blocks.work_mut(b) else { continue };
+                self.held -= block.bytes() as isize;
+                block.drop_faded_prior(&status);
+                self.held += block.bytes() as isize;
+            }
+            stats.blocks_changed += batch.len() as u32;
+            let seconds = start.elapsed().as_secs_f64() / batch.len() as f64;
+            self.refresh_seconds += 0.2 * (seconds - self.refresh_seconds);
+        }
+    }
+
+    /// One step of the blocks that fade, as far as there is time; those left come first next time.
+    pub(super) fn show_fading(&mut self, end: Option<Instant>, stats: &mut LiveStats) {
+        let rest = &mut self.still_fading;
+        // What waits is not known to the display yet.
+        self.fading.retain(|&b| {
+            let waits = self.is_waiting[b as usize];
+            if waits {
+                rest.push(b);
+            }
+            !waits
+        });
+        let mut shown = 0;
+        while shown < self.fading.len() {
+            let left = end.map_or(f64::INFINITY, |e| e.saturating_duration_since(Instant::now()).as_secs_f64());
+            // A fade must not take the time of all work.
+            let fit = (0.5 * left / self.refresh_seconds) as usize;
+            if fit == 0 {
+                break;
+            }
+            let batch = &self.fading[shown..self.fading.len().min(shown + fit.min(PASS))];
+            let dirty = &mut self.dirty;
+            self.display.fade(&self.context.map, batch, |c| dirty.add(c));
+            stats.blocks_changed += batch.len() as u32;
+            rest.extend(batch.iter().filter(|&&b| self.display.is_fading(b)));
+            shown += batch.len();
+        }
+        self.fading.drain(..shown);
+        self.fading.append(rest);
+    }
+}
