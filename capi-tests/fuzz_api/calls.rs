@@ -555,7 +555,7 @@ fn lightmap(w: &W, s: &mut Source) {
     desc.texels_per_unit = if s.one_in(4) { 0.0 } else { 1.0 + 5.0 * s.unit() };
     desc.padding = 1 + s.below(3) as u32;
     (desc.gather_divisor, desc.radiance_divisor) = (1 + s.below(4) as u32, 1 + s.below(4) as u32);
-    desc.both_sides = if s.one_in(20) { s.integer() } else { s.below(2) as u32 };
+    desc.both_sides = s.below(2) as u32;
     s.mutate(&mut desc);
     if (129..=16_384).contains(&desc.page_size) {
         desc.page_size = 128;
@@ -609,7 +609,7 @@ fn bake_params(w: &W, s: &mut Source) -> bk_bake_params {
     params.direct_samples = 1 + s.below(3) as u32;
     params.blur_radius = s.below(3) as u32;
     params.max_bounces = s.below(3) as u32;
-    params.stitch = if s.one_in(20) { s.integer() } else { s.below(2) as u32 };
+    params.stitch = s.below(2) as u32;
     params.seed = s.next();
     params
 }
