@@ -8,15 +8,17 @@
 //! One test, because the allocator is that of the whole process.
 
 use bakelite::bvh::{BuildOptions, BuildQuality};
+use bakelite::io::lightmaps::{write_png_pages, write_scene};
 use bakelite::io::{LoadOptions, load_with};
-use bakelite::lightmap::{BakeParams, Layer, LayerData, Lightmap, LightmapDesc};
-use bakelite::live::{Live, LiveParams, PageRect};
+use bakelite::lightmap::{BakeParams, CheckpointParams, Layer, LayerData, Lightmap, LightmapDesc};
+use bakelite::live::{Budget, Live, LiveCamera, LiveParams, Mode, PageRect};
 use bakelite::photon::{PhotonMap, PhotonParams};
 use bakelite::scene::{LightmapUvs, MeshMaterials};
 use bakelite::{Device, DeviceOptions, Error, Light, Material, Mesh, Progress, Result, Scene, SceneData};
 use glam::{Vec2, Vec3};
 use std::alloc::{GlobalAlloc, Layout, System};
 use std::hash::{DefaultHasher, Hash, Hasher};
+use std::ops::Range;
 use std::path::Path;
 use std::sync::Arc;
 use std::sync::atomic::{AtomicI64, AtomicUsize, Ordering::SeqCst};
@@ -24,6 +26,12 @@ use std::sync::atomic::{AtomicI64, AtomicUsize, Ordering::SeqCst};
 /// Allocations of fewer bytes never fail. In the scene below, what grows with the number of triangles or texels takes
 /// more.
 static LARGE: AtomicUsize = AtomicUsize::new(128 << 10);
+
+/// For live objects and saved results: what grows with the number of blocks or texels takes more, although there are few.
+const LARGE_OF_LIVE: usize = 16 << 10;
+
+/// For their updates: the sums of one block's texels. (Queues of rayon, which cannot fail, take 1,520 bytes.)
+const LARGE_OF_UPDATES: usize = 1536;
 
 /// For readers of files, which take their input in pieces of fixed size that are smaller.
 const LARGER_THAN_PIECES: usize = 512 << 10;
@@ -110,13 +118,13 @@ fn fail_all<T>(what: &str, mut call: impl FnMut() -> Result<T>) -> T {
 /// Squares along each side of the ground.
 const SIDE: usize = 180;
 
-/// A hilly ground of many triangles, of which some are degenerate and some shine, with light map UVs, below a roof.
-fn description() -> Result<SceneData> {
+/// A hilly ground of `side` × `side` squares, of which some are degenerate and some shine, with light map UVs, below a roof.
+fn description(side: usize) -> Result<SceneData> {
     let mut data = SceneData::new();
     let white = data.add_material(Material { albedo: [0.8; 3], two_sided: true, ..Default::default() })?;
     let lamp = data.add_material(Material { emission: [5.0; 3], ..Default::default() })?;
-    let place = |i: usize| [i % (SIDE + 1), i / (SIDE + 1)].map(|c| c as f32 / SIDE as f32);
-    let vertices = (SIDE + 1) * (SIDE + 1);
+    let place = |i: usize| [i % (side + 1), i / (side + 1)].map(|c| c as f32 / side as f32);
+    let vertices = (side + 1) * (side + 1);
     let height = |x: f32, y: f32| 0.05 * (9.0 * x).sin() * (7.0 * y).cos();
     let mut mesh = Mesh {
         positions: (0..vertices).map(place).map(|[x, y]| Vec3::new(x, y, height(x, y))).collect(),
@@ -124,12 +132,12 @@ fn description() -> Result<SceneData> {
         uvs: vec![Vec2::ZERO; vertices],
         lightmap: Some(LightmapUvs {
             uvs: (0..vertices).map(|i| Vec2::from(place(i)) * 0.98 + 0.01).collect(),
-            pages: vec![0; 2 * SIDE * SIDE],
+            pages: vec![0; 2 * side * side],
         }),
         ..Default::default()
     };
-    for i in (0..SIDE * SIDE).map(|i| (i / SIDE * (SIDE + 1) + i % SIDE) as u32) {
-        let up = SIDE as u32 + 1;
+    for i in (0..side * side).map(|i| (i / side * (side + 1) + i % side) as u32) {
+        let up = side as u32 + 1;
         mesh.indices.extend([[i, i + 1, i + up + 1], [i, i + up + 1, i + up]]);
     }
     let triangles = mesh.indices.len();
@@ -176,11 +184,20 @@ fn every_large_allocation_and_every_request_may_fail_and_nothing_is_lost() {
     let device = Device::new(options).unwrap();
     let none = Progress::none();
 
+    let folder = std::env::temp_dir().join(format!("bakelite-out-of-memory-{}", std::process::id()));
+    std::fs::create_dir_all(&folder).unwrap();
+    let large = LARGE.swap(LARGE_OF_LIVE, SeqCst);
+    let mut small = small_lightmap(&device);
+    live(&small, &folder.join("light.live"));
+    LARGE.store(large, SeqCst);
+    checkpoints(&mut small, &folder.join("light.checkpoint"));
+    drop(small);
+
     let mut scene = None;
     for compact in [false, true] {
         for quality in BuildQuality::ALL {
             let build = BuildOptions { compact, quality, ..Default::default() };
-            let original = description().unwrap();
+            let original = description(SIDE).unwrap();
             let mut data = None;
             let committed = fail_all(&format!("commit, {quality:?}, compact: {compact}"), || {
                 // What a commit that failed gave back is committed next.
@@ -230,11 +247,8 @@ fn every_large_allocation_and_every_request_may_fail_and_nothing_is_lost() {
 
     fail_each("reading UVs", &ALLOCATIONS_LEFT, || lightmap.mesh_uvs(0));
 
-    let folder = std::env::temp_dir().join(format!("bakelite-out-of-memory-{}", std::process::id()));
-    std::fs::create_dir_all(&folder).unwrap();
-    live(&lightmap);
     LARGE.store(LARGER_THAN_PIECES, SeqCst);
-    results(&mut lightmap, &folder.join("light.result"), expected);
+    results(&mut lightmap, &folder, expected);
     load(&device, &folder.join("ground.obj"));
     std::fs::remove_dir_all(&folder).unwrap();
 
@@ -242,28 +256,211 @@ fn every_large_allocation_and_every_request_may_fail_and_nothing_is_lost() {
     assert_eq!(ANNOUNCED.load(SeqCst), 0, "bytes announced, but not given back");
 }
 
-/// Loads the light map's result, which is saved before.
-fn results(lightmap: &mut Lightmap, path: &Path, expected: u64) {
+/// Saves and loads the light map's result, and saves its pages. (EXR files have a test of their own, without this
+/// allocator: the crate that encodes them cannot do without memory.)
+fn results(lightmap: &mut Lightmap, folder: &Path, expected: u64) {
     let none = Progress::none();
-    lightmap.save_result(path, &none).unwrap();
+    let path = &folder.join("light.result");
+    LARGE.store(LARGE_OF_LIVE, SeqCst);
+    fail_each("saving a result", &ALLOCATIONS_LEFT, || lightmap.save_result(path, &none));
+    LARGE.store(LARGER_THAN_PIECES, SeqCst);
     fail_all("loading a result", || lightmap.load_result(path, &none));
+    assert_eq!(bits(lightmap), expected);
+    let prefix = folder.join("pages-").display().to_string();
+    fail_all("PNG pages", || write_png_pages(lightmap, &prefix, None, &none));
+    fail_all("GLB", || write_scene(lightmap, &folder.join("light.glb"), None, &none));
+}
+
+/// Bakes with a checkpoint. What cannot be kept for want of memory is left out and computed again; what is there cannot
+/// be read without memory.
+fn checkpoints(lightmap: &mut Lightmap, path: &Path) {
+    let none = Progress::none();
+    let params = &BakeParams { photon_count: 20_000, gather_rays: 4, direct_samples: 1, ..Default::default() };
+    lightmap.bake(params, &none).unwrap();
+    let expected = bits(lightmap);
+    // All of it is written at the end: much is kept in memory.
+    let checkpoint = CheckpointParams { seconds: 1e6, ..CheckpointParams::new(path) };
+    let (mut failures, mut completed) = (0, 0);
+    for n in 0.. {
+        eprintln!("bake with checkpoint: without number {n}");
+        let _ = std::fs::remove_file(path);
+        ALLOCATIONS_LEFT.store(n, SeqCst);
+        let result = lightmap.bake_with(params, Some(&checkpoint), &none);
+        let failed = ALLOCATIONS_LEFT.swap(-1, SeqCst) < 0;
+        match result {
+            Ok(_) => {
+                assert_eq!(bits(lightmap), expected);
+                completed += 1;
+            }
+            Err(Error::OutOfMemory(_)) if failed => failures += 1,
+            Err(e) => panic!("{e}"),
+        }
+        if !failed {
+            break;
+        }
+    }
+    assert!(failures > 0 && completed > 0, "{failures} failed, {completed} did not");
+    fail_each("bake that goes on", &ALLOCATIONS_LEFT, || lightmap.bake_with(params, Some(&checkpoint), &none));
     assert_eq!(bits(lightmap), expected);
 }
 
-/// Live objects, whose own allocations may not fail: refused by the monitor, and read.
-fn live(lightmap: &Lightmap) {
+/// A light map of a smaller ground without emissive triangles, of which there are so many in the other one that light
+/// takes long.
+fn small_lightmap(device: &Arc<Device>) -> Lightmap {
     let none = Progress::none();
-    let params = LiveParams { photon_count: 100_000, direct_samples: 1, max_rounds: 1, ..Default::default() };
-    let live = fail_each("live, monitor", &REQUESTS_LEFT, || Live::new(lightmap, &params, &none));
+    let ground = description(60).unwrap();
+    let mut data = SceneData::new();
+    data.add_material(Material { albedo: [0.8; 3], two_sided: true, ..Default::default() }).unwrap();
+    for mesh in ground.meshes() {
+        data.add_mesh(Mesh { materials: MeshMaterials::One(0), ..mesh.clone() }).unwrap();
+    }
+    data.add_light(Light::Point { position: Vec3::new(0.5, 0.5, 0.4), intensity: [1.0; 3] }).unwrap();
+    let scene = Scene::commit(device, data, &BuildOptions::default(), &none).map_err(|(_, e)| e).unwrap();
+    let desc = LightmapDesc { texels_per_unit: 100.0, page_size: 256, ..Default::default() };
+    Lightmap::create(&scene, &desc, &none).unwrap()
+}
+
+/// Live objects: made, refined, relit, read, saved and restored.
+fn live(lightmap: &Lightmap, path: &Path) {
+    let none = Progress::none();
+    // At random, so that what no camera sees is worked on too.
+    let mode = Mode::Uniform;
+    let params = LiveParams { mode, photon_count: 4_000, direct_samples: 1, max_rounds: 2, ..Default::default() };
+    let mut live = fail_all("live", || Live::new(lightmap, &params, &none));
     let page = PageRect { page: 0, x: 0, y: 0, width: lightmap.info().width, height: lightmap.info().height };
-    let lod = params.lod_count - 1;
-    let expected = live.read(&page, lod, true).unwrap();
-    assert!(fail_each("reading live light", &ALLOCATIONS_LEFT, || live.read(&page, lod, true)) == expected);
+    let top = params.lod_count - 1;
+    let read = |live: &Live, lod| live.read(&page, lod, true).unwrap();
+    for lod in [top, 0] {
+        let expected = read(&live, lod);
+        assert!(fail_each("reading live light", &ALLOCATIONS_LEFT, || live.read(&page, lod, true)) == expected);
+    }
+
+    let mut expected = Live::new(lightmap, &params, &none).unwrap();
+    refine(&mut expected, 0..0, u32::MAX);
+    let begun = read(&live, top);
+    let all = expected.sums().unwrap();
+    for (mode, background) in [(Mode::View, false), (Mode::Position, false), (Mode::Uniform, true)] {
+        let what = format!("{mode:?}, background: {background}");
+        let mut other = Live::new(lightmap, &LiveParams { mode, background, ..params }, &none).unwrap();
+        // Some blocks are never seen.
+        let turns = if mode == Mode::View { 100 } else { u32::MAX };
+        let failures = refine(&mut other, 0..1000, turns);
+        eprintln!("updates, {what}: {failures} failed");
+        assert!(failures >= 5, "{what}");
+        if turns == u32::MAX {
+            assert!(other.sums().unwrap() == all, "{what}: light was lost");
+            assert!(read(&other, top) == read(&expected, top), "{what}: other light is shown");
+        } else {
+            // What a texel has gathered depends on the number of its rays alone.
+            let sums = other.sums().unwrap();
+            let complete: Vec<_> = sums.iter().zip(&all).filter(|(a, b)| a.1 == b.1).collect();
+            assert!(complete.len() > 500 && complete.iter().all(|(a, b)| a == b), "{what}: {}", complete.len());
+        }
+    }
+
+    // On hold nothing is computed beside the calls.
+    let before = lightmap.scene().lights()[0];
+    let dimmer = Light::Point { position: Vec3::new(0.5, 0.5, 0.4), intensity: [0.5; 3] };
+    live.pause(true).unwrap();
+    fail_each("change of light", &ALLOCATIONS_LEFT, || {
+        lightmap.scene().set_light(0, dimmer)?;
+        live.light_changed(0)
+    });
+    live.pause(false).unwrap();
+    relight(&mut live);
+    let mut again = Live::new(lightmap, &params, &none).unwrap();
+    refine(&mut live, 0..20, u32::MAX);
+    refine(&mut again, 0..0, u32::MAX);
+    assert!(live.sums().unwrap() == again.sums().unwrap(), "light of after a change was lost");
+
+    let whole = live.sums().unwrap();
+    fail_each("saving live light", &ALLOCATIONS_LEFT, || live.save(path, &none));
+    let mut restored = Live::new(lightmap, &params, &none).unwrap();
+    let begun_again = read(&restored, top);
+    assert!(begun_again != begun && begun_again != read(&live, top));
+    let mut failures = 0;
+    fail_all("restoring live light", || {
+        let result = restored.restore(path, &none);
+        failures += 1;
+        if result.is_err() && failures % 8 == 1 {
+            let left = [&ALLOCATIONS_LEFT, &REQUESTS_LEFT].map(|left| left.swap(-1, SeqCst));
+            assert!([&begun_again, &read(&live, top)].contains(&&read(&restored, top)), "failure {failures}");
+            ALLOCATIONS_LEFT.store(left[0], SeqCst);
+            REQUESTS_LEFT.store(left[1], SeqCst);
+        }
+        result
+    });
+    assert!(restored.sums().unwrap() == whole);
+    drop((live, restored, again, expected));
+    lightmap.scene().set_light(0, before).unwrap();
+}
+
+/// Changes of light whose renewals lack memory. Unlike in other calls an allocation may fail without an error: that of a
+/// renewal that another one has taken the place of, and that ends by and by.
+fn relight(live: &mut Live) {
+    let mut failures = 0;
+    for n in 0.. {
+        eprintln!("relighting: without number {n}");
+        ALLOCATIONS_LEFT.store(n, SeqCst);
+        let result = live.light_changed(0).and_then(|()| live.finish_relighting());
+        let failed = ALLOCATIONS_LEFT.swap(-1, SeqCst) < 0;
+        match result {
+            Ok(()) if !failed => break,
+            Ok(()) => {}
+            Err(Error::OutOfMemory(_)) if failed => failures += 1,
+            Err(e) => panic!("relighting: without number {n}: {e}"),
+        }
+    }
+    assert!(failures > 5, "{failures}");
+    live.finish_relighting().unwrap();
+}
+
+/// Updates an object until nothing is left to do, or `turns` times; in each update, and in what follows it in the background, an
+/// allocation fails, another one each time, as long as its number is among `numbers`. Returns how many failed.
+fn refine(live: &mut Live, numbers: Range<i64>, turns: u32) -> u32 {
+    let camera = LiveCamera {
+        position: Vec3::new(0.5, 0.5, 0.5),
+        forward: Vec3::new(0.1, 0.2, -1.0),
+        up: Vec3::Y,
+        fov_y: 2.0,
+        width: 64,
+        height: 64,
+    };
+    let large = LARGE.swap(LARGE_OF_UPDATES, SeqCst);
+    let (mut number, mut failures) = (numbers.start, 0);
+    let (mut finished, mut turns_when_finished) = (0.0, 0);
+    for turn in 0..turns {
+        assert!(turn < 20_000, "{finished} of all blocks are finished");
+        if numbers.contains(&number) {
+            ALLOCATIONS_LEFT.store(number, SeqCst);
+        }
+        // What nobody sees is finished too, in time: the camera turns.
+        let angle = turn as f32;
+        let camera = LiveCamera { forward: Vec3::new(angle.cos(), angle.sin(), -0.5), ..camera };
+        let updated = live.update(&camera, &Budget { milliseconds: 0.0, rays: 40_000 });
+        let paused = live.pause(true).and(live.pause(false));
+        let failed = numbers.contains(&number) && ALLOCATIONS_LEFT.swap(-1, SeqCst) < 0;
+        let result = updated.and_then(|stats| paused.map(|()| stats));
+        number = if failed { number + 1 } else { numbers.start };
+        match result {
+            Err(Error::OutOfMemory(_)) if failed => failures += 1,
+            Err(e) => panic!("update {turn}: {e}"),
+            Ok(_) if failed => panic!("update {turn}: memory was missing, but the update did not fail"),
+            Ok(stats) => finished = stats.finished,
+        }
+        // What was promoted last fades in for some updates more.
+        turns_when_finished += u32::from(finished == 1.0);
+        if turns_when_finished > 16 {
+            break;
+        }
+    }
+    LARGE.store(large, SeqCst);
+    failures
 }
 
 /// Loads a file of the same ground.
 fn load(device: &Device, path: &Path) {
-    let ground = description().unwrap();
+    let ground = description(SIDE).unwrap();
     let mesh = &ground.meshes()[0];
     let vertices = mesh.positions.iter().map(|p| format!("v {} {} {}\n", p.x, p.y, p.z));
     let corners = |t: &[u32; 3]| format!("f {} {} {}\n", t[0] + 1, t[1] + 1, t[2] + 1);

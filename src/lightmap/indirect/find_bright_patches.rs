@@ -7,7 +7,7 @@ use super::sample_set::{ROUND, SampleSet};
 use crate::direct::many_lights::{ManyLights, Patch};
 use crate::error::Result;
 use crate::lightmap::atlas::Atlas;
-use crate::memory::{try_collect, try_par_collect, try_par_gather, try_push};
+use crate::memory::{try_append, try_collect, try_par_collect, try_par_collect_ok, try_par_gather, try_push};
 use crate::progress::Progress;
 use crate::sampling::{combine, cosine_around, sobol_2d, uniform};
 use crate::scene::NONE;
@@ -96,11 +96,14 @@ pub(crate) fn again(atlas: &Atlas, values: &[Vec3], limit: f32, shadow_rays: u32
     Ok(Bright { limit, patches: Some(patches), shadow_rays, _memory: Some(memory) })
 }
 
+/// What buffers are for, in errors.
+const TEXELS: &str = "lit texels that are looked from";
+
 /// Every so manyth of the lit texels of a radiance map, about `count`.
-fn lit_texels(values: &[Vec3], count: usize) -> Vec<usize> {
+fn lit_texels(values: &[Vec3], count: usize) -> Result<Vec<usize>> {
     let lit = || (0..values.len()).filter(|&s| values[s] != Vec3::ZERO);
     let step = (lit().count() / count).max(1);
-    lit().skip(step / 2).step_by(step).collect()
+    try_collect(lit().skip(step / 2).step_by(step), TEXELS)
 }
 
 /// Mean and variance of rounds of gather rays from places all over the lit surfaces, sums over the channels.
@@ -121,10 +124,10 @@ fn trials(atlas: &Atlas, radiance: &Radiance, rays: &mut u64, progress: &Progres
         let squares: f32 = light.iter().map(|e| (e - mean).powi(2)).sum();
         Ok((mean, squares / (ROUNDS - 1) as f32, traced))
     };
-    let found: Result<Vec<(f32, f32, u64)>> = lit_texels(&radiance.values, TRIALS).par_iter().map(at).collect();
-    let found = found?;
+    let lit = lit_texels(&radiance.values, TRIALS)?;
+    let found: Vec<(f32, f32, u64)> = try_par_collect_ok(lit.par_iter().map(at), TEXELS)?;
     *rays += found.iter().map(|f| f.2).sum::<u64>();
-    Ok(found.into_iter().map(|(mean, variance, _)| (mean, variance)).collect())
+    try_collect(found.into_iter().map(|(mean, variance, _)| (mean, variance)), TEXELS)
 }
 
 /// Whether trials vary that much less, in proportion to the light.
@@ -141,7 +144,7 @@ fn pays(with: &[(f32, f32)], without: &[(f32, f32)]) -> bool {
 fn seen_by_gather_rays(atlas: &Atlas, radiance: &Radiance, rays: &mut u64, progress: &Progress) -> Result<Vec<f32>> {
     let (scene, map, values) = (&atlas.scene, &atlas.radiance, &radiance.values);
     let lookup = RadianceMap::new(&atlas.charts, map, radiance);
-    let lit = lit_texels(values, VIEWS);
+    let lit = lit_texels(values, VIEWS)?;
     *rays += lit.len() as u64 * u64::from(RAYS);
     let from = |&sample: &usize| {
         progress.check()?;
@@ -155,10 +158,14 @@ fn seen_by_gather_rays(atlas: &Atlas, radiance: &Radiance, rays: &mut u64, progr
             }
             lookup.reflected(&hit).map(|l| l.element_sum()).filter(|&s| s > 0.0)
         };
-        Ok((0..RAYS).filter_map(along).collect::<Vec<f32>>())
+        try_collect((0..RAYS).filter_map(along), TEXELS)
     };
-    let seen: Vec<Vec<f32>> = lit.par_iter().map(from).collect::<Result<_>>()?;
-    Ok(seen.concat())
+    let seen: Vec<Vec<f32>> = try_par_collect_ok(lit.par_iter().map(from), TEXELS)?;
+    let mut all = Vec::new();
+    for one in &seen {
+        try_append(&mut all, one, TEXELS)?;
+    }
+    Ok(all)
 }
 
 /// A place on a bright texel, on the side that it shows.

@@ -397,7 +397,7 @@ fn read(
     done: &mut HashMap<(Tag, u64), Vec<u8>>,
 ) -> Result<u64> {
     let fail = |e| Error::Io(format!("cannot read the checkpoint {}: {e}", path.display()));
-    let from = BufReader::with_capacity(1 << 20, file);
+    let from = BufReader::with_capacity(1 << 16, file);
     let (mut records, found): (_, Fingerprint) = records::begin(from, size, HEAD, path, "checkpoint")?;
     if let Some(differences) = found.difference(needed) {
         return Err(foreign(path, &differences));
