@@ -14,7 +14,7 @@
 use super::fingerprint::{Fingerprint, Origin};
 use super::records::{self, MAGIC, Next, Tag, take, take_one};
 use super::result::is_light;
-use super::{damaged, foreign};
+use super::{damaged, foreign, unreadable};
 use crate::device::{Device, LogLevel};
 use crate::error::{Error, Result, invalid_argument};
 use crate::lightmap::TexelState;
@@ -396,7 +396,7 @@ fn read(
     needed: &Fingerprint,
     done: &mut HashMap<(Tag, u64), Vec<u8>>,
 ) -> Result<u64> {
-    let fail = |e| Error::Io(format!("cannot read the checkpoint {}: {e}", path.display()));
+    let fail = |e| unreadable(path, e);
     let from = BufReader::with_capacity(1 << 16, file);
     let (mut records, found): (_, Fingerprint) = records::begin(from, size, HEAD, path, "checkpoint")?;
     if let Some(differences) = found.difference(needed) {

@@ -16,11 +16,18 @@ mod result;
 pub use checkpoint::CheckpointParams;
 
 use crate::error::Error;
+use std::io;
 use std::path::Path;
 
 /// What a file with impossible content is refused with.
 fn damaged(path: &Path) -> Error {
     Error::Io(format!("{} is damaged: a checksum or a length in it does not fit", path.display()))
+}
+
+/// What a failed read ends with.
+fn unreadable(path: &Path, e: io::Error) -> Error {
+    let message = format!("cannot read {}: {e}", path.display());
+    if e.kind() == io::ErrorKind::OutOfMemory { Error::OutOfMemory(message) } else { Error::Io(message) }
 }
 
 /// What a file of another bake is refused with.

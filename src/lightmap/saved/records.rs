@@ -14,7 +14,7 @@
 //! zeros: a torn end, too ([`ends_in_zeros`]). Any other change of a file shows in a checksum, that of a length in the
 //! header's own.
 
-use super::{another_kind, damaged};
+use super::{another_kind, damaged, unreadable};
 use crate::error::{Error, Result};
 use std::io::{self, ErrorKind, Read, Seek, SeekFrom};
 use std::path::Path;
@@ -121,7 +121,7 @@ pub(super) fn begin<T: bytemuck::Pod, R: Read>(
         return Err(another_kind(path, kind));
     }
     let mut records = Records::new(from, size);
-    match records.next().map_err(|e| Error::Io(format!("cannot read the {kind} {}: {e}", path.display())))? {
+    match records.next().map_err(|e| unreadable(path, e))? {
         Next::Record(found, content) if found == tag && content.len() == size_of::<T>() => {
             Ok((records, bytemuck::pod_read_unaligned(&content)))
         }

@@ -7,7 +7,7 @@
 
 use super::fingerprint::Fingerprint;
 use super::records::{self, MAGIC, Next, Records, Tag, take, take_one};
-use super::{damaged, foreign};
+use super::{damaged, foreign, unreadable};
 use crate::error::{Error, Result};
 use crate::files;
 use crate::lightmap::indirect::bright_patches::Bright;
@@ -188,7 +188,7 @@ struct Loading<'a> {
 impl<'a> Loading<'a> {
     /// Opens a result and compares its fingerprint with a light map's.
     fn open(path: &'a Path, lightmap: &Lightmap) -> Result<Self> {
-        let fail = |e| Error::Io(format!("cannot read {}: {e}", path.display()));
+        let fail = |e| unreadable(path, e);
         let file = files::open(path).map_err(fail)?;
         let size = file.metadata().map_err(fail)?.len();
         let file = BufReader::with_capacity(1 << 16, file);
@@ -216,7 +216,7 @@ impl<'a> Loading<'a> {
         light.radiance.values = try_with_capacity(self.head.radiance as usize, "the radiance map of a result")?;
         loop {
             let next = self.records.next();
-            let next = next.map_err(|e| Error::Io(format!("cannot read {}: {e}", self.path.display())))?;
+            let next = next.map_err(|e| unreadable(self.path, e))?;
             let Next::Record(tag, content) = next else { return Err(damaged(self.path)) };
             let read = match tag {
                 PLAN => String::from_utf8(content)
