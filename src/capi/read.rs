@@ -14,6 +14,8 @@ use crate::error::{Error, Result, invalid_argument};
 use crate::lightmap::{Layer, LayerData, Lightmap};
 use crate::memory::try_with_capacity;
 use crate::progress::Progress;
+use half::f16;
+use half::slice::HalfFloatSliceExt;
 use std::ffi::{c_char, c_void};
 
 /// Layer: irradiance in W/m2, direct and indirect. RGB: BK_FORMAT_RGB32F or BK_FORMAT_RGBA16F.
@@ -158,7 +160,7 @@ fn encode(data: &LayerData, format: u32) -> Result<Option<std::borrow::Cow<'_, [
     Ok(match (data, format) {
         (LayerData::Rgb(rgb), BK_FORMAT_RGB32F) => Some(bytemuck::cast_slice(rgb).into()),
         (LayerData::Rgb(rgb), BK_FORMAT_RGBA16F) => {
-            let half = |rgb: &[f32; 3]| [rgb[0], rgb[1], rgb[2], 1.0].map(half_bits);
+            let half = |&[r, g, b]: &[f32; 3]| half_bits([r, g, b, 1.0]);
             let mut bytes = try_with_capacity(8 * rgb.len(), "a page")?;
             bytes.extend(rgb.iter().flat_map(|t| bytemuck::cast::<[u16; 4], [u8; 8]>(half(t))));
             Some(bytes.into())
@@ -171,23 +173,11 @@ fn encode(data: &LayerData, format: u32) -> Result<Option<std::borrow::Cow<'_, [
 
 /// IEEE 754 half precision, rounded to nearest even; magnitudes beyond the largest half are clamped
 /// to it, NaN stays NaN.
-fn half_bits(x: f32) -> u16 {
-    const LARGEST: f32 = 65504.0;
-    const SMALLEST_NORMAL: f32 = 6.103_515_6e-5;
-    let sign = (x.to_bits() >> 16) as u16 & 0x8000;
-    if x.is_nan() {
-        return sign | 0x7e00;
-    }
-    let magnitude = x.abs().min(LARGEST);
-    let half = if magnitude < SMALLEST_NORMAL {
-        // Adding 0.5 leaves the units of a subnormal half (2^-24) in the last bits, rounded by the FPU.
-        (magnitude + 0.5).to_bits() - 0.5f32.to_bits()
-    } else {
-        // Exponent bias 127 becomes 15; 13 bits of the fraction go, rounded to even by their top.
-        let bits = magnitude.to_bits() - ((127 - 15) << 23);
-        (bits + 0xfff + (bits >> 13 & 1)) >> 13
-    };
-    sign | half as u16
+fn half_bits(values: [f32; 4]) -> [u16; 4] {
+    let largest = f32::from(f16::MAX);
+    let mut halves = [f16::ZERO; 4];
+    halves.convert_from_f32_slice(&values.map(|x| x.clamp(-largest, largest)));
+    halves.map(f16::to_bits)
 }
 
 /// Kind of file: float images of the light layers, PREFIXpageN-LAYER.exr with LAYER one of
@@ -338,7 +328,7 @@ mod tests {
     #[test]
     fn every_finite_half_survives_the_way_through_f32() {
         for bits in (0..=0x7bffu16).chain(0x8000..=0xfbff) {
-            assert_eq!(half_bits(half_value(bits) as f32), bits);
+            assert_eq!(half_bits([half_value(bits) as f32; 4]), [bits; 4]);
         }
     }
 
@@ -347,16 +337,16 @@ mod tests {
         for bits in 0..0x7bffu16 {
             let (low, high) = (half_value(bits), half_value(bits + 1));
             let middle = ((low + high) / 2.0) as f32;
-            assert_eq!(half_bits(middle), bits + (bits & 1));
-            assert_eq!(half_bits(middle.next_down()), bits);
-            assert_eq!(half_bits(middle.next_up()), bits + 1);
+            let rounded = half_bits([middle, middle.next_down(), middle.next_up(), -middle]);
+            let even = bits + (bits & 1);
+            assert_eq!(rounded, [even, bits, bits + 1, even | 0x8000]);
         }
     }
 
     #[test]
     fn halves_are_clamped_and_nan_stays() {
-        assert_eq!([1e9, f32::INFINITY, -1e9].map(half_bits), [0x7bff, 0x7bff, 0xfbff]);
-        assert_eq!(half_bits(f32::NAN) & 0x7fff, 0x7e00);
+        let halves = half_bits([1e9, f32::INFINITY, -1e9, f32::NAN]);
+        assert_eq!((&halves[..3], halves[3] & 0x7fff), (&[0x7bff, 0x7bff, 0xfbff][..], 0x7e00));
     }
 
     #[test]
