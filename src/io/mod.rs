@@ -4,7 +4,7 @@
 //! |---|---|
 //! | [`load`] | chooses a reader by the file name's extension |
 //! | `source`, `account` | which files a scene may name, limits, progress, cancelling, memory |
-//! | `obj`, `mtl` | Wavefront OBJ with material libraries |
+//! | `obj` | Wavefront OBJ with material libraries |
 //! | `ply` | PLY, ASCII and binary |
 //! | `gltf` | glTF 2.0 and GLB: geometry, materials, punctual lights |
 //! | `texture` | PNG and JPEG images of materials |
@@ -22,7 +22,6 @@ pub mod glb;
 mod gltf;
 pub mod image;
 pub mod lightmaps;
-mod mtl;
 mod obj;
 mod ply;
 mod source;

@@ -3,9 +3,9 @@
 //! `illum` is one of the models with transparency, 4, 6, 7 and 9. Options of maps and everything else are
 //! skipped.
 
-use super::account::Account;
-use super::source::{Source, folder_of, read_error};
 use crate::error::{Error, Result};
+use crate::io::account::Account;
+use crate::io::source::{Source, folder_of, read_error};
 use std::collections::HashMap;
 use std::fmt::Display;
 use std::path::{Path, PathBuf};
