@@ -2,7 +2,7 @@
 //! indirect light of the light map plus direct light by shadow rays at each pixel; the composite
 //! light map alone. All show outgoing radiance, albedo/π · E plus emission, at the same exposure.
 
-use crate::font;
+use crate::plot::font;
 use bakelite::direct::{DirectLight, Receiver};
 use bakelite::io::image::{auto_exposure, tone_map};
 use bakelite::lightmap::{Layer, Lightmap};

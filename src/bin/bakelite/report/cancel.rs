@@ -1,8 +1,8 @@
 //! `bakelite report cancel`: how long each long call is silent, stage by stage, and how soon it ends when it is
 //! cancelled at random times.
 
-use crate::Job;
 use crate::args::BakeArgs;
+use crate::job::Job;
 use bakelite::lightmap::Lightmap;
 use bakelite::live::{Live, LiveParams};
 use bakelite::photon::{PhotonMap, PhotonParams};
@@ -58,7 +58,7 @@ pub fn run(args: &BakeArgs) -> Result<()> {
     let mut lightmap = Lightmap::create(&scene, &args.desc, &Progress::none())?;
     measure("bake", |progress| lightmap.bake(&args.params, progress).map(drop))?;
     let prefix = args.out.join("page").to_string_lossy().into_owned();
-    crate::output::make_folder(&args.out)?;
+    crate::files::make_folder(&args.out)?;
     measure("pages", |progress| bakelite::io::lightmaps::write_exr_pages(&lightmap, &prefix, progress).map(drop))?;
     let params = LiveParams::default();
     measure("live", |progress| Live::new(&lightmap, &params, progress).map(drop))?;

@@ -1,9 +1,9 @@
 //! `bakelite report memory`: bytes per triangle of a committed scene by part, of default and compact trees,
 //! and the rate of rays in compact ones.
 
-use crate::Job;
 use crate::args::BakeArgs;
-use crate::measure::median;
+use crate::job::Job;
+use crate::report::measure::median;
 use bakelite::bvh::BuildOptions;
 use bakelite::sampling::{cosine_around, mix, uniform, uniform_triangle};
 use bakelite::trace::{Hit, Ray};

@@ -2,7 +2,7 @@
 
 use crate::args::BakeArgs;
 use crate::pictures::{NAMES, Pictures};
-use crate::table::Stage;
+use crate::stages::Stage;
 use bakelite::lightmap::{BakeStats, Lightmap};
 use bakelite::scene::NONE;
 use bakelite::{Light, Scene};
@@ -10,7 +10,7 @@ use glam::Vec3;
 use serde_json::{Value, json};
 use std::path::PathBuf;
 
-/// What a run leaves to report.
+/// What a run leaves to record.
 pub struct Run<'a> {
     pub args: &'a BakeArgs,
     pub lightmap: &'a Lightmap,
@@ -23,8 +23,8 @@ pub struct Run<'a> {
     pub seconds: f64,
 }
 
-/// The report. Units are in the names; rates per second; colours and vectors are arrays of three.
-pub fn report(run: &Run) -> Value {
+/// The record. Units are in the names; rates per second; colours and vectors are arrays of three.
+pub fn json(run: &Run) -> Value {
     let scene = run.lightmap.scene();
     json!({
         "bakelite": env!("CARGO_PKG_VERSION"),

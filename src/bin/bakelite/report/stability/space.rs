@@ -1,8 +1,6 @@
 //! Cases of `bakelite report stability` about shapes: how large, where, how thin.
 
-use crate::stability::{
-    Case, Lab, Row, Texel, Verdict, deviation, diffuse, largest, mean, small_bake, small_desc, texels,
-};
+use super::lab::{Case, Lab, Row, Texel, Verdict, deviation, diffuse, largest, mean, small_bake, small_desc, texels};
 use bakelite::lightmap::{BakeParams, Layer, LightmapDesc};
 use bakelite::scene::builtin;
 use bakelite::scene::shapes::MeshBuilder;

@@ -1,9 +1,9 @@
 //! What a camera sees of the light: views of bakes against one that is path traced with the library's
 //! kernels, by structural similarity.
 
+use super::ssim::ssim;
+use super::texel_paths::TexelPaths;
 use crate::pictures::{PRIMARY_RAYS, background, missed, receiver, render, tone_mapped};
-use crate::ssim::ssim;
-use crate::texel_paths::TexelPaths;
 use bakelite::direct::DirectLight;
 use bakelite::io::image::auto_exposure;
 use bakelite::lightmap::{Layer, Lightmap};

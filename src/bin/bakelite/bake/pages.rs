@@ -1,4 +1,4 @@
-//! The files of a bake: pages layer by layer, and the scene with its light map; texts of reports.
+//! The files of a bake: pages layer by layer, and the scene with its light map.
 
 use bakelite::io::image::{tone_map, write_exr, write_png_rgb8};
 use bakelite::lightmap::{Layer, LayerData, Lightmap};
@@ -14,16 +14,6 @@ const LAYERS: [(Layer, &str); 4] = [
     (Layer::Direct, "direct"),
     (Layer::Radiance, "radiance"),
 ];
-
-/// Makes the folder that all files go to.
-pub fn make_folder(folder: &Path) -> Result<()> {
-    std::fs::create_dir_all(folder).map_err(|e| Error::Io(format!("{}: {e}", folder.display())))
-}
-
-/// Writes a text file.
-pub fn write_text(path: &Path, text: &str) -> Result<()> {
-    bakelite::files::replace_with(path, text.as_bytes())
-}
 
 /// A light layer of a page.
 fn rgb(lightmap: &Lightmap, page: u32, layer: Layer) -> Result<Vec<[f32; 3]>> {

@@ -1,7 +1,7 @@
 //! Measurements of the error of light: the points compared, their reference, and the error of several
 //! runs with different seeds, bias and variance apart.
 
-use crate::quality_places;
+use super::places;
 use bakelite::lightmap::atlas::texels::TexelSample;
 use bakelite::lightmap::{Layer, LayerData, Lightmap, MeshUvs};
 use bakelite::reference::{PathTracer, SurfacePoint};
@@ -172,7 +172,7 @@ impl Points {
     /// Hits of random rays from places in turn.
     fn choose(&mut self, lightmap: &Lightmap, camera: &Camera, count: usize) -> Result<()> {
         let scene = lightmap.scene();
-        let places = quality_places::find(scene, &known_places(lightmap, camera), camera.up.normalize());
+        let places = places::find(scene, &known_places(lightmap, camera), camera.up.normalize());
         for i in 0..count as u32 * TRIES {
             if places.is_empty() || self.len() == count {
                 break;
@@ -298,8 +298,8 @@ pub fn errors(runs: &[Values], [a, b]: &[Values; 2]) -> Errors {
 #[cfg(test)]
 mod tests {
     use super::*;
-    use crate::Job;
     use crate::args::BakeArgs;
+    use crate::job::Job;
     use bakelite::lightmap::BakeParams;
     use bakelite::sampling::mix;
     use bakelite::scene::builtin_camera;

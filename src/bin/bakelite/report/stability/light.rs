@@ -1,8 +1,6 @@
 //! Cases of `bakelite report stability` about light: how much there is, and where lights are.
 
-use crate::stability::{
-    Case, Lab, Row, Texel, deviation, diffuse, largest, mean, scenes, small_bake, small_desc, texels,
-};
+use super::lab::{Case, Lab, Row, Texel, deviation, diffuse, largest, mean, scenes, small_bake, small_desc, texels};
 use bakelite::lightmap::{BakeParams, Layer, LightmapDesc};
 use bakelite::photon::{PhotonMap, PhotonParams};
 use bakelite::reference::{PathTracer, SurfacePoint};

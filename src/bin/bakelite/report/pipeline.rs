@@ -2,11 +2,11 @@
 //! beside those of the bare kernels on rays of the same distribution, bytes per second beside what the memory
 //! gives. And where the power of the lights goes, at several photon counts.
 
-use crate::Job;
 use crate::args::BakeArgs;
-use crate::bar_chart::{self, Bar};
-use crate::measure::{median, pick, visible_texels};
-use crate::output;
+use crate::files;
+use crate::job::Job;
+use crate::plot::bars::{self, Bar};
+use crate::report::measure::{median, pick, visible_texels};
 use bakelite::lightmap::{BakeStats, Lightmap, StageStats};
 use bakelite::photon::{PhotonMap, PhotonParams, PhotonStats, photon_rays};
 use bakelite::sampling::{cosine_hemisphere, mix, orthonormal_basis, sobol_2d};
@@ -51,7 +51,7 @@ struct Row {
 
 /// Runs the report.
 pub fn run(args: &BakeArgs) -> Result<()> {
-    output::make_folder(&args.out)?;
+    files::make_folder(&args.out)?;
     let mut job = Job::new(args);
     let mut lightmap = job.unbaked()?;
     let mut bakes: Vec<BakeStats> = Vec::new();
@@ -91,7 +91,7 @@ pub fn run(args: &BakeArgs) -> Result<()> {
     let energy = ENERGY_PHOTONS.into_iter().map(|n| energy(&scene, n)).collect::<Result<Vec<_>>>()?;
     let text = markdown(args, &lightmap, &rows, memory) + &energy_table(&energy);
     for (name, content) in [("pipeline.csv", &csv(&rows)), ("pipeline.svg", &chart(&rows)), ("pipeline.md", &text)] {
-        output::write_text(&args.out.join(name), content)?;
+        files::write_text(&args.out.join(name), content)?;
     }
     if !args.quiet {
         println!("{text}\nWrote to {}: pipeline.md, pipeline.csv, pipeline.svg", args.out.display());
@@ -238,11 +238,7 @@ fn chart(rows: &[Row]) -> String {
         Bar { name: r.stage, value: r.seconds, note, apart }
     };
     let title = format!("Stages of a bake: {all:.2} s, {others:.2} s without unwrapping");
-    bar_chart::svg(
-        &title,
-        "seconds (share of all, and of all but unwrapping)",
-        &rows.iter().map(bar).collect::<Vec<_>>(),
-    )
+    bars::svg(&title, "seconds (share of all, and of all but unwrapping)", &rows.iter().map(bar).collect::<Vec<_>>())
 }
 
 fn markdown(args: &BakeArgs, lightmap: &Lightmap, rows: &[Row], memory: f64) -> String {

@@ -1,6 +1,6 @@
 //! Cases of `bakelite report stability` about limits: settings and scenes at and beyond the ends of their ranges.
 
-use crate::stability::{Case, Lab, Row, mean, small_bake, small_desc, texels};
+use super::lab::{Case, Lab, Row, mean, small_bake, small_desc, texels};
 use bakelite::lightmap::{BakeParams, Layer, Lightmap, LightmapDesc};
 use bakelite::photon::{MAX_PHOTONS, PhotonMap, PhotonParams};
 use bakelite::scene::builtin;
@@ -24,7 +24,7 @@ fn texel_requests(lab: &Lab, rows: &mut Vec<Row>) -> Result<()> {
         let desc = LightmapDesc { texels_per_unit, page_size: 16, ..Default::default() };
         let mut map = Lightmap::create(&scene, &desc, &Progress::none())?;
         map.bake(&small_bake(), &Progress::none())?;
-        let got = mean(&crate::stability::texels(&map, Layer::Combined)?);
+        let got = mean(&super::lab::texels(&map, Layer::Combined)?);
         let row = Row::sound("texels", format!("{texels_per_unit:e} per unit"), got);
         rows.push(row.note(format!("{} texels, mean {got:.3}", map.info().texels)));
     }

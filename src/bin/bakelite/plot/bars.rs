@@ -1,6 +1,6 @@
 //! Bars of one quantity, one below the other, as SVG.
 
-use crate::plot::{COLORS, text};
+use super::svg::{COLORS, text};
 use std::fmt::Write;
 
 /// A bar. It begins at 0.

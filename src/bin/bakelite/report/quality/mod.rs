@@ -1,22 +1,28 @@
 //! `bakelite report quality`: error of the light against run time, for every knob of a bake, for path
 //! tracing each texel with the same kernels, and for the photon map alone.
 
-use crate::Job;
+mod measure;
+mod places;
+mod ssim;
+mod texel_paths;
+mod view;
+
 use crate::args::ReportArgs;
-use crate::measure::median;
-use crate::output;
-use crate::plot::{Plot, Series};
-use crate::quality_measure::{Errors, Points, Values, errors};
-use crate::quality_view::ViewReference;
-use crate::texel_paths::TexelPaths;
+use crate::files;
+use crate::job::Job;
+use crate::plot::curves::{Plot, Series};
+use crate::report::measure::median;
 use bakelite::direct::{DirectLight, Receiver};
 use bakelite::lightmap::{BakeParams, Layer, Lightmap, LightmapDesc};
 use bakelite::photon::{PhotonMap, PhotonParams};
 use bakelite::trace::PACKET_SIZE;
 use bakelite::trace::offset::SurfacePoint;
 use bakelite::{Error, Progress, Result};
+use measure::{Errors, Points, Values, errors};
 use std::fmt::{Display, Write};
 use std::time::Instant;
+use texel_paths::TexelPaths;
+use view::ViewReference;
 
 const GATHER_RAYS: [u32; 7] = [16, 32, 64, 128, 256, 512, 1024];
 const PHOTONS: [u64; 4] = [10_000, 100_000, 1_000_000, 4_000_000];
@@ -53,7 +59,7 @@ struct Row {
 
 /// Runs the report.
 pub fn run(args: &ReportArgs) -> Result<()> {
-    output::make_folder(&args.bake.out)?;
+    files::make_folder(&args.bake.out)?;
     let mut job = Job::new(&args.bake);
     let mut lightmap = job.unbaked()?;
     let params = args.bake.params;
@@ -93,7 +99,7 @@ pub fn run(args: &ReportArgs) -> Result<()> {
         ("quality-points.csv", &at_points),
         ("quality.svg", &plot(&rows)),
     ] {
-        output::write_text(&args.bake.out.join(name), content)?;
+        files::write_text(&args.bake.out.join(name), content)?;
     }
     if !args.bake.quiet {
         println!(

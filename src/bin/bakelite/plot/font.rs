@@ -93,7 +93,7 @@ mod tests {
 
     #[test]
     fn captions_use_only_glyphs_that_exist() {
-        let texts = super::super::pictures::TITLES.concat() + "RMSE 0.0123456789% NOISE (), 480 / 270: +-";
+        let texts = crate::pictures::TITLES.concat() + "RMSE 0.0123456789% NOISE (), 480 / 270: +-";
         for c in texts.chars().filter(|c| *c != ' ') {
             assert_ne!(glyph(c), [0; 7], "{c:?}");
         }

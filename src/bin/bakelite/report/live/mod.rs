@@ -1,16 +1,18 @@
 //! `bakelite report live`: measures live updates of a scene and writes tables, plots and figures.
 
-use crate::Job;
+mod measure;
+
 use crate::args::{BakeArgs, ReportArgs};
-use crate::live_measure::{CHANGE_INTERVAL, Curve, FOLLOW_MS, Frame, MODES, ModeRun, Point, Seen, Walk, Watch};
-use crate::live_measure::{bake, live_camera, moved_light, ray_count, walk};
-use crate::output;
+use crate::files;
+use crate::job::Job;
 use crate::pictures::percent;
-use crate::plot::{Plot, Series};
+use crate::plot::curves::{Plot, Series};
 use bakelite::lightmap::{BakeParams, Lightmap};
 use bakelite::live::LiveParams;
 use bakelite::scene::Camera;
 use bakelite::{Error, Light, Result};
+use measure::{CHANGE_INTERVAL, Curve, FOLLOW_MS, Frame, MODES, ModeRun, Point, Seen, Walk, Watch};
+use measure::{bake, live_camera, moved_light, ray_count, walk};
 use std::fmt::Write;
 
 /// Gather rays of the bakes that updates are compared with.
@@ -55,7 +57,7 @@ struct Measured {
 
 /// Runs the report.
 pub fn run(args: &ReportArgs) -> Result<()> {
-    output::make_folder(&args.bake.out)?;
+    files::make_folder(&args.bake.out)?;
     let mut job = Job::new(&args.bake);
     let mut lightmap = job.unbaked()?;
     let (mut measured, camera) = errors(&job, args, &mut lightmap)?;
@@ -66,7 +68,7 @@ pub fn run(args: &ReportArgs) -> Result<()> {
     let mut save = |name: String, text: &str| {
         let path = args.bake.out.join(&name);
         names.push(name);
-        output::write_text(&path, text)
+        files::write_text(&path, text)
     };
     save("live.md".into(), &markdown(args, &lightmap, &camera, &measured))?;
     save("live-errors.csv".into(), &errors_csv(&measured.phases))?;

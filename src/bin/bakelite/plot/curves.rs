@@ -1,5 +1,6 @@
 //! Curves in log-log axes, as SVG.
 
+use super::svg::{COLORS, text};
 use std::fmt::Write;
 use std::ops::Range;
 
@@ -22,9 +23,6 @@ const WIDTH: f64 = 720.0;
 const HEIGHT: f64 = 420.0;
 /// Around the axes: left, right (for the legend), top, bottom.
 const MARGIN: [f64; 4] = [72.0, 130.0, 40.0, 52.0];
-
-/// Told apart by the colour-blind too (Okabe and Ito 2008).
-pub const COLORS: [&str; 6] = ["#0072b2", "#d55e00", "#009e73", "#cc79a7", "#e69f00", "#000000"];
 
 /// A logarithmic axis over whole decades, from `from` to `to` in the picture.
 struct Axis {
@@ -122,12 +120,6 @@ fn curve(out: &mut String, color: &str, points: impl Iterator<Item = [f64; 2]> +
     for [x, y] in points {
         let _ = writeln!(out, "<circle cx=\"{x:.1}\" cy=\"{y:.1}\" r=\"2.5\" fill=\"{color}\"/>");
     }
-}
-
-/// Adds a text; `more`: further attributes.
-pub fn text(out: &mut String, [x, y]: [f64; 2], anchor: &str, more: &str, text: &str) {
-    let escaped = text.replace('&', "&amp;").replace('<', "&lt;");
-    let _ = writeln!(out, "<text x=\"{x:.1}\" y=\"{y:.1}\" text-anchor=\"{anchor}\" {more}>{escaped}</text>");
 }
 
 #[cfg(test)]

@@ -1,4 +1,4 @@
-//! The table of stages that is printed at the end.
+//! What the stages of a run took, and the table of them that is printed at the end.
 
 use std::fmt::Write;
 
@@ -32,7 +32,7 @@ fn rate(count: u64, seconds: f64) -> Option<f64> {
 }
 
 /// The table as text. `total` is the time of the whole run.
-pub fn text(stages: &[Stage], total: f64) -> String {
+pub fn table(stages: &[Stage], total: f64) -> String {
     let mut out = String::new();
     let rule = "-".repeat(72);
     let _ =
@@ -62,7 +62,7 @@ mod tests {
             Stage { name: "photons", seconds: 0.5, photons: 1000, ..Default::default() },
             Stage { name: "instant", seconds: 0.0, rays: 5, ..Default::default() },
         ];
-        let text = text(&stages, 4.0);
+        let text = table(&stages, 4.0);
         let line =
             |name: &str| text.lines().find(|l| l.starts_with(name)).unwrap().split_whitespace().collect::<Vec<_>>();
         assert_eq!(line("gather"), ["gather", "2.000", "50.0%", "1.50", "1.5"]);

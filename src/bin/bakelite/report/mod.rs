@@ -1,0 +1,19 @@
+//! `bakelite report`: measurements, with tables, plots and CSV.
+//!
+//! | file | what it measures |
+//! |---|---|
+//! | `cancel` | how long calls are silent, and how soon they end when cancelled |
+//! | `live` | live updates: error against time and rays, budgets, traffic |
+//! | `memory` | a scene's memory by part, and what little of it costs rays |
+//! | `pipeline` | the stages of a bake, and what bounds each |
+//! | `quality` | error of the light against run time |
+//! | `stability` | stiff and extreme cases against what is known of them |
+//! | `measure` | what they share |
+
+pub mod cancel;
+pub mod live;
+mod measure;
+pub mod memory;
+pub mod pipeline;
+pub mod quality;
+pub mod stability;
