@@ -54,9 +54,14 @@ programs() {
     done
 }
 
+# shared: the shared library, with all that the programs call.
+shared() {
+    cargo rustc --release --locked --features io,unwrap --lib --crate-type cdylib
+}
+
 c() {
     echo '== C and C++ programs under AddressSanitizer, LeakSanitizer and UndefinedBehaviorSanitizer'
-    cargo build --release --locked --all-features --lib
+    shared
     programs "$target/release" -fsanitize=address,undefined -fno-sanitize-recover=undefined
 }
 
@@ -69,6 +74,7 @@ rust() {
     run asan-unit cargo +nightly test --release --locked --features io,unwrap --target "$triple" --lib -- \
         simd:: trace:: bvh:: capi:: io:: memory:: device:: live::save
     run asan-fuzz cargo +nightly test --release --locked --features io,unwrap --target "$triple" --test fuzz_api
+    run asan-library cargo +nightly rustc --release --locked --features io,unwrap --target "$triple" --lib --crate-type cdylib
     unset RUSTFLAGS CARGO_TARGET_DIR
     # The run time of the sanitizer comes with the program.
     CC=clang CXX=clang++ programs "$library" -fsanitize=address
@@ -76,7 +82,7 @@ rust() {
 
 memcheck() {
     echo '== A small pipeline under Valgrind'
-    cargo build --release --locked --all-features --lib
+    shared
     "${CC:-cc}" -std=gnu99 -g -O1 -I include capi-tests/small_pipeline.c -o "$out/small_pipeline" \
         -L "$target/release" -lbakelite -lpthread -lm
     mkdir -p "$out/small_pipeline.out"
