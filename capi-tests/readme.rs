@@ -84,7 +84,7 @@ fn programs_shown_are_the_files_that_stand_beside_the_tests() {
     assert_eq!(rust.len(), 1);
     assert_eq!(rust[0].1, include_str!("example.rs"));
     let c = blocks(&read(Path::new("docs/guide.md")), "c");
-    assert_eq!(c.first().map(|b| b.1.as_str()), Some(include_str!("example.c")));
+    assert_eq!(c.first().map(|b| b.1.as_str()), Some(include_str!("../examples/bake.c")));
 }
 
 #[cfg(unix)]

@@ -22,6 +22,7 @@ command -v make >/dev/null || need+=(make)
 command -v g++ >/dev/null || need+=(g++)
 command -v pkg-config >/dev/null || need+=(pkg-config)
 command -v python3 >/dev/null || need+=(python3)
+/usr/bin/python3 -c 'import numpy' 2>/dev/null || need+=(python3-numpy)
 command -v doxygen >/dev/null || need+=(doxygen)
 [ -e /usr/include/embree3/rtcore.h ] || need+=(libembree-dev)
 # The viewer, and a screen and OpenGL in software to test it with.

@@ -24,7 +24,7 @@ int main(int argc, char **argv)
         bk_scene_commit(scene, progress, NULL) || bk_lightmap_create(scene, NULL, progress, NULL, &map) ||
         bk_bake(map, NULL, progress, NULL, NULL) || bk_lightmap_save(map, "baked-", BK_FILE_EXR, NULL, NULL) ||
         bk_lightmap_save(map, "baked-", BK_FILE_GLB, NULL, NULL);
-    fprintf(stderr, "\n%s\n", argc != 2 ? "usage: example SCENE" : failed ? bk_last_error() : "done");
+    fprintf(stderr, "\n%s\n", argc != 2 ? "usage: bake SCENE" : failed ? bk_last_error() : "done");
     bk_lightmap_release(map);
     bk_scene_release(scene);
     bk_device_release(device);
