@@ -30,7 +30,7 @@ trap 'rm -rf "$work"' EXIT
 
 # ---- The documents ----
 
-pages='index:README.md guide:docs/guide.md performance:docs/performance.md accuracy:docs/accuracy.md
+pages='index:README.md guide:docs/guide.md install:docs/install.md performance:docs/performance.md accuracy:docs/accuracy.md
     architecture:docs/architecture.md robustness:docs/robustness.md experiments:docs/experiments.md
     contributing:CONTRIBUTING.md security:SECURITY.md changelog:CHANGELOG.md'
 {
