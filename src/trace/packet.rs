@@ -2,14 +2,20 @@
 //! the 8-wide tree together (Overbeck, Ramamoorthi and Mark, *Large Ray Packets for Real-time Whitted
 //! Ray Tracing*, 2008; Wald et al., *Interactive Rendering with Coherent Ray Tracing*, 2001).
 //!
-//! Of a node, the pyramid around the rays is tested against all eight children at once. What it meets is
-//! later tested against groups of rays, one ray per lane, from the first group that met the parent on; a
-//! node is entered at the first group that meets it, so that coherent rays cost one test or two per node.
-//! Leaves are tested group by group.
+//! ```text
+//! push the root, with group 0                     (a group: as many rays as there are lanes)
+//! while a child is popped, with the first group that may hit it:
+//!     advance that group until one hits the child's box; if none does, pop the next child
+//!     leaf:  for each group from there on that hits the leaf's box, test the leaf's triangles
+//!     node:  test the frustum around all rays against the node's eight children at once;
+//!            push those that it overlaps, the nearest last, each with that first group
+//! ```
 //!
-//! Hits are those of [`single`], bit for bit: groups do its arithmetic, lane by lane. The pyramid may let
-//! through more boxes, but a triangle counts only for rays that meet the box of its leaf, and since
-//! rounding is monotonic these meet all boxes around it.
+//! So coherent rays cost one or two tests per node.
+//!
+//! Hits are those of [`single`], bit for bit: groups do its arithmetic, lane by lane. The frustum may let
+//! through more boxes, but a triangle counts only for rays that hit the box of its leaf, and since
+//! rounding is monotonic these rays hit all boxes around it.
 //!
 //! Tried for final gathering, with an origin per ray: slower, see docs/experiments.md#bundles-for-final-gathering.
 
@@ -146,25 +152,25 @@ struct Bundle {
     triangle: Column,
 }
 
-/// What the rays of a bundle share.
+/// Data that all rays of a bundle share.
 struct Shared {
     origin: [f32; 3],
     tmin: f32,
-    /// Of the scene's axes in the rays' frames, as in [`Shear`].
+    /// The scene's axes in the order of the rays' frames, as in [`Shear`].
     axes: [usize; 3],
     /// The origin in the order of `axes`.
     frame_origin: [f32; 3],
     negative: [bool; 3],
-    /// Of the octant in [`Node::order`].
+    /// Shift of the rays' octant in [`Node::order`].
     shift: u32,
     /// Groups of lanes that have rays.
     groups: usize,
 }
 
-/// The pyramid around the rays. Distances are along the longest axis; they differ from t by a factor per ray.
+/// The frustum around the rays. Distances are along the longest axis; they differ from t by a factor per ray.
 /// So the three intervals of a box are independent, and the test is exact but for rounding: a common
 /// distance exists if and only if one exists for any two of them.
-struct Pyramid {
+struct Frustum {
     /// 1 or −1: planes × `sign` + `near` or `far` are distances from the origin along the axis.
     sign: [f32; 3],
     near: [f32; 3],
@@ -177,11 +183,11 @@ struct Pyramid {
     end: f32,
 }
 
-/// More than what rounding may cost in the pyramid's tests.
+/// More than what rounding may cost in the frustum's tests.
 const SLACK: f32 = 2e-6;
 
-impl Pyramid {
-    /// Near distances of a node's boxes, and which of them the pyramid meets.
+impl Frustum {
+    /// Near distances of a node's boxes, and a mask of those that the frustum overlaps.
     ///
     /// # Safety
     /// The CPU must have the ISA.
@@ -227,7 +233,7 @@ struct Stack {
     near: [MaybeUninit<f32>; STACK_SIZE],
     /// 8 · the parent's number + which child. (There are fewer nodes than triangle slots, of 2^28.)
     child: [MaybeUninit<u32>; STACK_SIZE],
-    /// Groups that may meet it begin here.
+    /// First group that may hit it.
     first: [MaybeUninit<u8>; STACK_SIZE],
 }
 
@@ -267,7 +273,7 @@ unsafe fn replace<L: Lanes>(column: &mut Column, g: usize, mask: L::Mask, x: L) 
 unsafe fn trace<S: Simd>(bvh: &Mbvh, rays: &[Ray], out: &mut [RawHit]) {
     let mut place = MaybeUninit::uninit();
     // SAFETY: forwarded.
-    let (rays, shared, mut pyramid) = unsafe { begin::<S>(rays, &mut place) };
+    let (rays, shared, mut frustum) = unsafe { begin::<S>(rays, &mut place) };
     let mut stack = MaybeUninit::<Stack>::uninit();
     let stack = stack.as_mut_ptr();
     // SAFETY: addresses within the stack; nothing is read.
@@ -284,7 +290,7 @@ unsafe fn trace<S: Simd>(bvh: &Mbvh, rays: &[Ray], out: &mut [RawHit]) {
         // that there is room for eight more children (see `STACK_SIZE`). The caller vouches for the ISA.
         unsafe {
             let node = bvh.nodes.get_unchecked(number);
-            let (near, mask) = pyramid.node::<S>(node, shared.negative);
+            let (near, mask) = frustum.node::<S>(node, shared.negative);
             let names: [u32; WIDTH] = std::array::from_fn(|i| (number * WIDTH + i) as u32);
             let (nears, children) = (nears.add(count), children.add(count));
             let set = near.compress(names.as_ptr(), node.order.as_ptr(), shared.shift, mask, nears, children);
@@ -300,7 +306,7 @@ unsafe fn trace<S: Simd>(bvh: &Mbvh, rays: &[Ray], out: &mut [RawHit]) {
             // SAFETY: entries below the count have been written, and name children of this tree's nodes. Groups
             // are below `shared.groups`. The caller vouches for the ISA.
             unsafe {
-                if *nears.add(count) > pyramid.end {
+                if *nears.add(count) > frustum.end {
                     continue;
                 }
                 let name = *children.add(count) as usize;
@@ -328,7 +334,7 @@ unsafe fn trace<S: Simd>(bvh: &Mbvh, rays: &[Ray], out: &mut [RawHit]) {
                     break;
                 }
                 if rays.leaf::<S>(bvh, child, &shared, &planes, first) {
-                    pyramid.end = rays.end::<S::Packet>(shared.groups);
+                    frustum.end = rays.end::<S::Packet>(shared.groups);
                 }
             }
         }
@@ -340,7 +346,7 @@ unsafe fn trace<S: Simd>(bvh: &Mbvh, rays: &[Ray], out: &mut [RawHit]) {
 /// # Safety
 /// As for [`trace`].
 #[inline(always)]
-unsafe fn begin<'a, S: Simd>(rays: &[Ray], place: &'a mut MaybeUninit<Bundle>) -> (&'a mut Bundle, Shared, Pyramid) {
+unsafe fn begin<'a, S: Simd>(rays: &[Ray], place: &'a mut MaybeUninit<Bundle>) -> (&'a mut Bundle, Shared, Frustum) {
     let width = S::Packet::WIDTH;
     let Ray { origin, direction, tmin, tmax } = rays[0];
     let axes = Shear::new(origin, direction).axes.map(|a| a as usize);
@@ -398,7 +404,7 @@ unsafe fn begin<'a, S: Simd>(rays: &[Ray], place: &'a mut MaybeUninit<Bundle>) -
         let sign = negative.map(|n| if n { -1.0 } else { 1.0 });
         // More than what rays alone take off for rounding, which all of them do.
         let margin = origin.map(|o| 16.0 * EPSILON * o.abs());
-        let pyramid = Pyramid {
+        let frustum = Frustum {
             sign,
             near: [0, 1, 2].map(|a| -origin[a] * sign[a] - margin[a]),
             far: [0, 1, 2].map(|a| -origin[a] * sign[a] + margin[a]),
@@ -407,7 +413,7 @@ unsafe fn begin<'a, S: Simd>(rays: &[Ray], place: &'a mut MaybeUninit<Bundle>) -
             begin: begin - SLACK * begin.abs(),
             end: b.end::<S::Packet>(shared.groups),
         };
-        (b, shared, pyramid)
+        (b, shared, frustum)
     }
 }
 
@@ -427,7 +433,7 @@ fn finish(rays: &Bundle, out: &mut [RawHit]) {
 }
 
 impl Bundle {
-    /// Which rays of a group meet a box, by its near and far planes per axis: what `RaySetup::node` does.
+    /// Mask of a group's rays that hit a box, given by its near and far planes per axis; the arithmetic of `RaySetup`.
     ///
     /// # Safety
     /// The CPU must have the ISA; the group must be of the bundle.
