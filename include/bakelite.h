@@ -480,6 +480,9 @@ BK_API void bk_load_params_init(bk_load_params *params);
 /// log; a buffer of a glTF file that cannot be read is an error. bk_scene_get_mesh,
 /// bk_scene_get_material, bk_scene_get_texture and bk_scene_get_light read the loaded objects back.
 ///
+/// Files from untrusted sources are safe to load, within the limits of `params`: malformed content
+/// gives an error, or is left out with a warning.
+///
 /// Cost: 0.2 (PLY) to 2 s (OBJ) per million triangles, on one thread, and the decoding of images.
 ///
 /// @param scene  scene that is not committed
@@ -1904,6 +1907,9 @@ bk_result bk_lightmap_save_result(const bk_lightmap *lightmap,
 /// in any order: the light then has the bits of one bake, and seams are stitched with the last
 /// texels. A call that fails changes nothing.
 ///
+/// Files from untrusted sources are safe to load: every number is checked, and light is finite and
+/// >= 0. It may be any such light, though.
+///
 /// Experimental: another version of the library may refuse the file.
 ///
 /// @param lightmap  any light map
@@ -2280,8 +2286,8 @@ BK_EXPERIMENTAL bk_result bk_live_save(bk_live *live, const char *path, bk_progr
 /// (mode, cell size, promotion, blur and limits may differ). All pages are dirty afterwards. A call
 /// that fails changes nothing.
 ///
-/// Every number of the file is checked: light must be finite and >= 0, counts must fit the light
-/// map.
+/// Files from untrusted sources are safe to restore: every number is checked, light must be finite
+/// and >= 0, and counts must fit the light map. It may be any such light, though.
 ///
 /// Experimental: another version of the library may refuse the file.
 ///

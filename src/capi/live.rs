@@ -666,8 +666,8 @@ pub unsafe extern "C" fn bk_live_save(
 /// (mode, cell size, promotion, blur and limits may differ). All pages are dirty afterwards. A call
 /// that fails changes nothing.
 ///
-/// Every number of the file is checked: light must be finite and >= 0, counts must fit the light
-/// map.
+/// Files from untrusted sources are safe to restore: every number is checked, light must be finite
+/// and >= 0, and counts must fit the light map. It may be any such light, though.
 ///
 /// Experimental: another version of the library may refuse the file.
 ///

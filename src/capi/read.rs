@@ -282,6 +282,9 @@ pub unsafe extern "C" fn bk_lightmap_save_result(
 /// in any order: the light then has the bits of one bake, and seams are stitched with the last
 /// texels. A call that fails changes nothing.
 ///
+/// Files from untrusted sources are safe to load: every number is checked, and light is finite and
+/// >= 0. It may be any such light, though.
+///
 /// Experimental: another version of the library may refuse the file.
 ///
 /// @param lightmap  any light map

@@ -312,6 +312,9 @@ pub unsafe extern "C" fn bk_load_params_init(params: *mut bk_load_params) {
 /// log; a buffer of a glTF file that cannot be read is an error. bk_scene_get_mesh,
 /// bk_scene_get_material, bk_scene_get_texture and bk_scene_get_light read the loaded objects back.
 ///
+/// Files from untrusted sources are safe to load, within the limits of `params`: malformed content
+/// gives an error, or is left out with a warning.
+///
 /// Cost: 0.2 (PLY) to 2 s (OBJ) per million triangles, on one thread, and the decoding of images.
 ///
 /// @param scene  scene that is not committed
