@@ -32,13 +32,13 @@ use std::time::Instant;
 /// Texels handed to a thread at a time.
 const BLOCK: usize = 256;
 
-/// Bytes per gather texel while a bake runs: light, blurred light, normal, variance, whether it is valid.
+/// Bytes per gather texel while a bake runs: light, blurred light, normal, variance, validity.
 const GATHER_BYTES: usize = 3 * size_of::<Vec3>() + size_of::<f32>() + size_of::<bool>();
 
-/// Bytes per light map texel while a bake runs: direct and indirect light, what is known of it, whether direct light varies.
+/// Bytes per light map texel while a bake runs: direct and indirect light, state, variation of direct light.
 const TEXEL_BYTES: usize = 2 * size_of::<Vec3>() + size_of::<TexelState>() + size_of::<Variation>();
 
-/// What the random numbers of a bake are for.
+/// Purposes of the random numbers of a bake.
 pub(crate) mod purpose {
     pub const RADIANCE: u32 = 1;
     pub const GATHER_SET: u32 = 2;
@@ -47,31 +47,32 @@ pub(crate) mod purpose {
     pub const OWN: u32 = 5;
 }
 
-/// The automatic search radius of photons is at least so many texels of the radiance map, so that the discs around its
-/// samples leave no photon out.
+/// Lower bound of the automatic search radius of photons in texels of the radiance map: the discs around its samples
+/// then leave no photon out.
 const RADIUS_TEXELS: f32 = 0.75;
 
-/// Photons that are kept, at most, and per texel of the radiance map if that is more; of more, some stand for the others.
+/// Maximum number of photons kept: the larger of a fixed number and a number per texel of the radiance map. Of more,
+/// every n-th is kept, with n times the power.
 const MOST_STORED: u64 = 1 << 24;
 const STORED_PER_TEXEL: u64 = 256;
 
-/// The radiance map, coarser than the light map, takes this part of the direct samples.
+/// Divisor of `direct_samples` in the radiance map, which is coarser than the light map.
 const RADIANCE_SAMPLE_DIVISOR: u32 = 4;
 
 impl Lightmap {
-    /// Runs the pipeline. On an error or a cancel what an earlier bake left stays as it was.
+    /// Runs the pipeline. After an error or a cancel, the light of earlier bakes is unchanged.
     pub fn bake(&mut self, params: &BakeParams, progress: &Progress) -> Result<BakeStats> {
         self.bake_with(params, None, progress)
     }
 
-    /// Runs the pipeline and keeps what is done in a file, from which a later call with the same scene, lights, layout
-    /// and parameters goes on, whatever ended this one; the light has the bits of a bake without a break. The
-    /// statistics tell of what this call did.
+    /// Runs the pipeline and keeps finished work in a file. A later call with the same scene, lights, layout and
+    /// parameters continues from it, whatever ended this one; the light has the bits of an uninterrupted bake. The
+    /// statistics cover the work of this call only.
     ///
-    /// The file is created if it is not there (or empty), and stays when the bake is complete: the caller deletes it when
-    /// the light has been saved. `InvalidArgument` if it is of another bake, `Io` if it is damaged or cannot be read or
-    /// created, `InvalidState` if another bake is using it. If it cannot be written later, as on a full disk, the bake
-    /// goes on, a warning is logged, and what the file holds stays whole.
+    /// The file is created if it is not there (or empty), and stays when the bake is complete: the caller deletes it
+    /// when the light has been saved. `InvalidArgument` if it is of another bake, `Io` if it is damaged or cannot be
+    /// read or created, `InvalidState` if another bake is using it. If it cannot be written later, as on a full disk,
+    /// the bake goes on, a warning is logged, and the content already in the file stays valid.
     pub fn bake_with(
         &mut self,
         params: &BakeParams,
@@ -125,7 +126,7 @@ impl Lightmap {
         Ok(stats)
     }
 
-    /// Takes the light of a range of samples over. Seams are stitched anew: whatever the shards, the last one leaves
+    /// Stores the new light of a range of samples. Seams are stitched anew: whatever the shards, the last one leaves
     /// the bits of a whole bake.
     pub(super) fn store(&mut self, new: Light, range: Range<usize>, stitch: Option<Stitch>) {
         match &mut self.light {
@@ -151,7 +152,7 @@ impl Lightmap {
     }
 }
 
-/// One bake under way.
+/// Inputs of one bake in progress.
 pub(crate) struct Bake<'a, 'p> {
     pub atlas: &'a Atlas,
     pub params: &'a BakeParams,
@@ -199,7 +200,7 @@ impl Bake<'_, '_> {
         Ok((light, stats))
     }
 
-    /// The radiance map; empty if the plan leaves indirect light out.
+    /// Computes the radiance map, or reads it from the checkpoint; empty if the plan leaves indirect light out.
     pub(crate) fn illuminate(&self, stats: &mut BakeStats) -> Result<Radiance> {
         if !self.plan.runs(left_out::INDIRECT) {
             return Ok(Radiance::default());
@@ -242,7 +243,7 @@ impl Bake<'_, '_> {
             seed: self.params.seed,
             memory_budget: self.params.memory_budget,
             store_direct: false,
-            // Of a density that is nearly 0 the quotient is infinite.
+            // The quotient is infinite if the density is nearly 0.
             least_radius: (RADIUS_TEXELS / self.atlas.radiance.layout.density).min(f32::MAX),
             most_stored: MOST_STORED.max(STORED_PER_TEXEL * self.atlas.radiance.len() as u64),
             ..Default::default()
@@ -274,8 +275,8 @@ impl Bake<'_, '_> {
         Ok(radiance)
     }
 
-    /// Per chart with one place, whether its back is baked. With [`illuminate`](Self::illuminate)'s map all that
-    /// texels need to be lit.
+    /// Decides for each two-sided chart without separate texels for its back whether the back is baked. With the
+    /// radiance map of [`illuminate`](Self::illuminate), this is all that lighting texels needs.
     pub(crate) fn backs(&self, radiance: &[Vec3]) -> Result<Vec<bool>> {
         let l = self.atlas;
         if let Some(backs) = self.checkpoint.map(|c| c.backs(l.charts.charts.len())).transpose()?.flatten() {
@@ -296,7 +297,7 @@ impl Bake<'_, '_> {
         Ok(backs)
     }
 
-    /// Gathers, blurs and fills. Only placements that the range touches are gathered.
+    /// Gathers indirect light, fills and blurs it. Only placements that the range touches are gathered.
     fn gather(&self, radiance: &Radiance, backs: &[bool], stats: &mut BakeStats) -> Result<Indirect> {
         let start = Instant::now();
         let l = self.atlas;
@@ -365,13 +366,14 @@ impl Bake<'_, '_> {
         Ok(Indirect { irradiance, upsampling, own })
     }
 
-    /// How the light map shows some placements of the gather map.
+    /// Finds how texels of the light map interpolate between gather texels, for some placements.
     pub(crate) fn upsampling(&self, backs: &[bool], placements: Range<u32>) -> Result<Upsampling> {
         let stage = self.progress.stage("upsampling", 0.3, 0.315, placements.len() as u64);
         Upsampling::find(self.atlas, placements, backs, &stage)
     }
 
-    /// Light of the texels that no gather texel stands for, and the rays that it takes.
+    /// Traces the fallback gathers of texels without a valid gather texel around them. Returns their light and the
+    /// number of rays.
     pub(crate) fn own_light(
         &self,
         radiance: &Radiance,
@@ -397,7 +399,7 @@ impl Bake<'_, '_> {
         Ok(own)
     }
 
-    /// Direct light and the interpolated indirect light of every texel of the range.
+    /// Computes direct light and interpolates indirect light for every texel of the range.
     fn compose(
         &self,
         scene: &Arc<Scene>,
@@ -412,7 +414,7 @@ impl Bake<'_, '_> {
         let range = self.range.clone();
         let backs = &light.backs[..];
         let texels = self.texel_light();
-        // Blocks whose light a checkpoint has.
+        // Blocks whose light is in the checkpoint.
         let mut known = try_filled(range.len().div_ceil(BLOCK), false, "blocks of texels")?;
         scene.device().install(|| {
             let direct = light.direct[range.clone()].par_chunks_mut(BLOCK).zip(&mut known);
@@ -461,7 +463,7 @@ impl Bake<'_, '_> {
         Ok(())
     }
 
-    /// Direct light of the light map's texels.
+    /// Returns the computation of direct light for the light map's texels.
     fn texel_light(&self) -> TexelLight<'_> {
         TexelLight {
             areas: self.atlas.areas(&self.atlas.map),
@@ -471,8 +473,8 @@ impl Bake<'_, '_> {
         }
     }
 
-    /// Turns light without penumbrae at the samples of the range into all direct light, averaged over texels; returns the
-    /// rays traced.
+    /// Replaces direct light without penumbrae at the samples of the range by all direct light, averaged over texels.
+    /// Returns the number of rays.
     fn average_direct(
         &self,
         texels: &TexelLight,
@@ -491,7 +493,7 @@ impl Bake<'_, '_> {
                 let mut traced = 0;
                 for (i, variation) in out.iter_mut().enumerate().filter(|_| !known[block]) {
                     let sample = range.start + block * BLOCK + i;
-                    // What is baked by another shard, or was before, is computed here too.
+                    // Neighbours that another shard bakes, or that a checkpoint has, are computed here too.
                     let is_here = |s: usize| range.contains(&s) && !known[(s - range.start) / BLOCK];
                     *variation = texels.varies(sample, sharp[sample], |s| match is_here(s) {
                         true => sharp[s],

@@ -1,4 +1,4 @@
-//! Creates light maps: unwraps, lays out pages, maps texels to triangles and finds what of them can be seen.
+//! Creates light maps: unwraps, lays out pages, maps texels to triangles and finds the texels that can be seen.
 
 use super::atlas::Atlas;
 use super::atlas::buried::Search;
@@ -21,17 +21,17 @@ use crate::scene::precision::too_few_digits;
 use std::sync::Arc;
 use std::time::Instant;
 
-/// Pages that a scene about fills if the caller leaves the density open.
+/// Number of pages that a scene fills, roughly, with the automatic density.
 const AUTOMATIC_PAGES: f64 = 1.0;
 
-/// The offset of rays from surfaces from which on a warning is due, as a part of a texel.
+/// Offset of rays from surfaces above which a warning is logged, as a fraction of a texel.
 const OFFSET_PART: f32 = 0.25;
 
-/// Coarse maps of small light maps have pages of this size at least.
+/// Minimum page size of the gather and radiance maps.
 const MIN_PAGE_SIZE: u32 = 64;
 
 impl Lightmap {
-    /// Unwraps what brings no usable UVs, lays out the pages and maps texels to triangles.
+    /// Creates a light map: unwraps meshes without usable UVs, lays out the pages and maps texels to triangles.
     pub fn create(scene: &Arc<Scene>, desc: &LightmapDesc, progress: &Progress) -> Result<Lightmap> {
         desc.validate()?;
         scene.device().run(progress, || Self::lay_out(scene, desc, progress))
@@ -75,8 +75,8 @@ impl Lightmap {
             Ok(buried)
         };
         move_buried(&mut radiance, true)?;
-        // The rest of a texel that is buried for the most part is a strip along what covers it, often darker than all
-        // around: gather texels are larger, and would spread that dark as a rim.
+        // The visible part of a mostly buried texel is a strip along the surface that covers it, often darker than its
+        // surroundings. Gather texels are larger and would spread that darkness as a rim.
         move_buried(&mut gather, false)?;
         let buried = move_buried(&mut map, true)?;
         uvs.overlapping_texels = map.texels.overlapping_texels;

@@ -89,14 +89,15 @@ pub struct LightmapInfo {
     pub uvs: atlas::charts::UvReport,
     /// Number of charts with separate texels for their backs.
     pub both_sided_charts: u32,
-    /// Of `texels`, those of the second places.
+    /// Number of separate texels for backs, included in `texels`.
     pub back_texels: u64,
-    /// Of `texels`, those that nobody can see, inside solids and below or behind other surfaces. They take the places of
-    /// the nearest that can be seen.
+    /// Number of texels that nobody can see (inside solids, below or behind other surfaces), included in `texels`. They
+    /// show the light of the nearest texels that can be seen.
     pub buried_texels: u64,
-    /// Open places from which was looked around to tell which sides are seen. 0 if no material is two-sided.
+    /// Number of open places from which rays were traced to find the sides that can be seen. 0 if no material is
+    /// two-sided.
     pub open_places: u64,
-    /// Rays that this and finding buried texels took.
+    /// Number of rays traced from open places and to find buried texels.
     pub sight_rays: u64,
 }
 
@@ -236,7 +237,7 @@ pub enum LayerData {
     Integer(Vec<u32>),
 }
 
-/// What is known of a texel.
+/// State of a texel after bakes.
 #[derive(Clone, Copy, Debug, Default, PartialEq, Eq)]
 enum TexelState {
     /// Not part of any bake yet.
@@ -271,11 +272,11 @@ struct Light {
     radiance: Radiance,
     /// Whether a chart with one place shows its back, by chart. Empty if none is two-sided.
     backs: Vec<bool>,
-    /// What was stitched, as it was before: stitching starts anew with every bake of some texels.
+    /// Stitched texels with their light before stitching, since every bake of some texels stitches anew.
     stitch: Option<seams::Stitch>,
     /// Parameters and lights of the bake; `None` if bakes that differ in them filled parts of the texels.
     origin: Option<Origin>,
-    /// What was run before seams were stitched.
+    /// Plan of the bake, without the stitching of seams.
     plan: Plan,
     _memory: Reservation,
 }
@@ -337,23 +338,23 @@ impl BakeParams {
 }
 
 impl Lightmap {
-    /// The scene that is lit.
+    /// Returns the scene that is lit.
     pub fn scene(&self) -> &Arc<Scene> {
         &self.atlas.scene
     }
 
-    /// Charts and texels.
+    /// Returns charts and texels of the three maps.
     pub(crate) fn atlas(&self) -> &Arc<Atlas> {
         &self.atlas
     }
 
-    /// Numbers about layout and texels.
+    /// Returns numbers about layout and texels.
     pub fn info(&self) -> LightmapInfo {
         self.atlas.info
     }
 
-    /// What the last bake ran (before the first: what a bake with default parameters would run) and
-    /// what it left out and why, one line each.
+    /// Describes the plan of the last bake (before the first: of a bake with default parameters): what runs, and what
+    /// is left out and why, one line each.
     pub fn plan_text(&self) -> String {
         self.plan.text()
     }

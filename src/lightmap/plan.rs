@@ -12,7 +12,7 @@ pub mod left_out {
     pub const INDIRECT: u32 = 1 << 0;
     /// No photons and no estimate: no light is reflected more than once.
     pub const PHOTONS: u32 = 1 << 1;
-    /// No direct light: nothing shines.
+    /// No direct light: the scene has no lights.
     pub const DIRECT: u32 = 1 << 2;
     /// No sampling of area lights.
     pub const AREA_LIGHTS: u32 = 1 << 3;
@@ -20,15 +20,15 @@ pub mod left_out {
     pub const BACK_SIDES: u32 = 1 << 4;
     /// No blur of the gather map.
     pub const BLUR: u32 = 1 << 5;
-    /// No unwrapping: all meshes bring usable UVs.
+    /// No unwrapping: all meshes have usable UVs.
     pub const UNWRAP: u32 = 1 << 6;
     /// No interpolation of shading normals.
     pub const SHADING_NORMALS: u32 = 1 << 7;
     /// No look-ups of albedo textures.
     pub const TEXTURES: u32 = 1 << 8;
-    /// No tests for holes that textures cut out.
+    /// No alpha tests for cut-outs.
     pub const CUTOUTS: u32 = 1 << 9;
-    /// No light through surfaces.
+    /// No light through transmissive surfaces.
     pub const TRANSMISSION: u32 = 1 << 10;
     /// No light from a sky.
     pub const SKY: u32 = 1 << 11;
@@ -38,11 +38,11 @@ pub mod left_out {
     pub const MANY_LIGHTS: u32 = 1 << 13;
     /// No stitching of seams.
     pub const SEAMS: u32 = 1 << 14;
-    /// No bright patches as lights: gather rays find most of what is bright.
+    /// No bright patches as lights: gather rays find most of the bright texels.
     pub const BRIGHT_PATCHES: u32 = 1 << 15;
 }
 
-/// What a bake of a scene runs.
+/// Stages and features that a bake of a scene runs.
 #[derive(Clone, Debug, Default, PartialEq)]
 pub struct Plan {
     /// Bits of [`left_out`].
@@ -51,7 +51,7 @@ pub struct Plan {
 }
 
 impl Plan {
-    /// Derived from the scene, its lights and the parameters.
+    /// Derives the plan from the scene, its lights and the parameters.
     pub(crate) fn new(
         scene: &Scene,
         direct: &DirectLight,
@@ -112,7 +112,7 @@ impl Plan {
         plan
     }
 
-    /// What materials ask for.
+    /// Adds the features that materials need.
     fn materials(&mut self, scene: &Scene) {
         let uses = scene.uses();
         if uses.textures {
@@ -174,7 +174,7 @@ impl Plan {
         }
     }
 
-    /// Tells of charts with a second place for their backs, and of texels that nobody can see.
+    /// Adds lines on charts with separate texels for their backs, and on texels that nobody can see.
     pub(crate) fn note_sides(&mut self, info: &LightmapInfo) {
         if info.open_places > 0 {
             self.run(&format!(
@@ -196,7 +196,7 @@ impl Plan {
         }
     }
 
-    /// Tells of two-sided charts of which the back was baked.
+    /// Adds a line on two-sided charts whose back was baked.
     pub(crate) fn note_back_charts(&mut self, count: u64) {
         if count > 0 {
             self.run(&format!(

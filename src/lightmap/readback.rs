@@ -11,21 +11,21 @@ use crate::scene::NONE;
 use crate::trace::RawHit;
 use glam::Vec3;
 
-/// What the validity layer says of a texel filled from its neighbours.
+/// Validity of a texel that is filled from its neighbours.
 const FILLED: f32 = 0.5;
 
-/// Corner UVs of each triangle, and its page.
+/// UVs of the corners of each triangle, and its page.
 pub type MeshUvs = (Vec<[[f32; 2]; 3]>, Vec<u32>);
 
 impl Lightmap {
-    /// Light map UV in [0, 1] of each corner, and the page of each triangle of `mesh`. Triangles
-    /// without texels (degenerate ones) have page [`NONE`] and UVs 0.
+    /// Returns the light map UV in [0, 1] of each corner, and the page of each triangle of `mesh`. Triangles without
+    /// texels (degenerate ones) have page [`NONE`] and UVs 0.
     pub fn mesh_uvs(&self, mesh: u32) -> Result<MeshUvs> {
         self.uvs_of(mesh, true)
     }
 
-    /// The same for the backs of `mesh`'s triangles, and whether each has a place of its own. Those that have none
-    /// share the front's.
+    /// Returns UVs and pages for the backs of `mesh`'s triangles, and for each triangle whether its back has separate
+    /// texels. Backs without separate texels share those of the front.
     pub fn mesh_back_uvs(&self, mesh: u32) -> Result<(MeshUvs, Vec<bool>)> {
         let uvs = self.uvs_of(mesh, false)?;
         let first = self.atlas.scene.first_triangle(mesh);
@@ -112,9 +112,9 @@ impl Lightmap {
         }
     }
 
-    /// What the validity layer says of a sample.
+    /// Returns the value of the validity layer for a sample.
     fn validity(&self, sample: usize) -> f32 {
-        // Before a bake: what a bake will cover.
+        // Before the first bake, all covered texels are valid.
         let Some(light) = &self.light else { return 1.0 };
         match light.state[sample] {
             TexelState::Visible => 1.0,
@@ -123,7 +123,7 @@ impl Lightmap {
         }
     }
 
-    /// Outgoing radiance of a texel: reflected, from the radiance map, plus emitted.
+    /// Returns the outgoing radiance of a texel: reflected radiance from the radiance map, plus emitted.
     fn radiance_at(&self, light: &Light, sample: usize) -> [f32; 3] {
         let t = self.atlas.map.texels.samples[sample];
         let back = self.atlas.is_back(&self.atlas.map, &light.backs, sample);
@@ -140,8 +140,8 @@ impl Lightmap {
         l.to_array()
     }
 
-    /// A page of values by sample; `fill` gives what a texel within `padding` of a chart shows by the value of the
-    /// nearest sample.
+    /// Composes a page from values of samples. `fill` turns the value of the nearest sample into that of a texel within
+    /// `padding` of a chart.
     fn page<T: Copy + Default>(
         &self,
         page: u32,
@@ -159,32 +159,32 @@ impl Lightmap {
         Ok(out)
     }
 
-    /// A page of light: the padding repeats the nearest sample.
+    /// Composes a page of light, in which the padding repeats the nearest sample.
     fn page_of_light(&self, page: u32, value: impl Fn(usize) -> [f32; 3]) -> Result<LayerData> {
         Ok(LayerData::Rgb(self.page(page, [0.0; 3], self.atlas.padding, value, |v| v)?))
     }
 
-    /// A page of what covered texels alone have.
+    /// Composes a page of values that only covered texels have.
     fn page_of_samples<T: Copy + Default>(&self, page: u32, empty: T, value: impl Fn(usize) -> T) -> Result<Vec<T>> {
         self.page(page, empty, 0, value, |v| v)
     }
 
-    /// Whether the back of a global triangle has a place of its own.
+    /// Whether the back of a global triangle has separate texels.
     fn has_both_sides(&self, triangle: u32) -> bool {
         self.atlas.map.layout.back(self.atlas.charts.chart_of[triangle as usize]).is_some()
     }
 
-    /// Whether the light map holds the light of a side of a global triangle. Before a bake, of two sides in one place
-    /// that is the front.
+    /// Whether the light map holds the light of a side of a global triangle. Before a bake, texels that both sides
+    /// share hold the front.
     pub fn shows(&self, triangle: u32, front: bool) -> bool {
         let backs = self.light.as_ref().map_or(&[][..], |l| &l.backs);
         let back = backs.get(self.atlas.charts.chart_of[triangle as usize] as usize).is_some_and(|&b| b);
         front != back || self.has_both_sides(triangle)
     }
 
-    /// What a shader sees at a point of a side of a global triangle (weights of vertices 1 and 2):
-    /// a light layer, bilinearly filtered within the chart; of two sides in one place the one that
-    /// is [shown](Self::shows). Zero before a bake and for the layers that are not light.
+    /// Samples a layer of light as a shader would, at a point of one side of a global triangle (`u`, `v`: weights of
+    /// vertices 1 and 2), bilinearly filtered within the chart. If both sides share texels, the result is the light of
+    /// the side that is [shown](Self::shows). Zero before a bake and for layers that are not light.
     pub fn sample(&self, layer: Layer, triangle: u32, front: bool, u: f32, v: f32) -> [f32; 3] {
         let Some(light) = &self.light else { return [0.0; 3] };
         let chart = self.atlas.charts.chart_of[triangle as usize];

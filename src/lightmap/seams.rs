@@ -1,18 +1,19 @@
-//! Seams: edges at which the light map is cut open, so that the texels of either side are filtered
-//! apart and show different light along what should look like one surface.
+//! Seams: edges at which a smooth surface is cut open in the light map, so that the two sides are filtered separately
+//! and show different light along the edge.
 //!
-//! After Iwanicki, *Lighting Technology of "The Last of Us"* (SIGGRAPH talks 2013): points along the
-//! edges tell as weights of texels what the two sides A and B show there, and the texels x are moved
-//! from x₀, as little as possible, so that both agree: least Σ l (A − B)² + λ Σ (x − x₀)², l being
-//! the length in texels that a point stands for. (Ray et al., *Invisible Seams*, EGSR 2010, make
-//! both sides agree exactly, for which the texel grids must meet.) The normal equations are solved
-//! by conjugate gradients (Hestenes and Stiefel 1952), one set of texels for each layer of light.
+//! After Iwanicki, *Lighting Technology of "The Last of Us"* (SIGGRAPH talks 2013): at points along the edges, the
+//! values A and B of the two sides are written as weighted sums of texels, and the texels x are changed from x₀, as
+//! little as possible, so that both agree: minimise Σ l (A − B)² + λ Σ (x − x₀)², where l is the length of the part of
+//! the edge around a point, in texels. (Ray et al., *Invisible Seams*, EGSR 2010, make both sides agree exactly, for
+//! which the texel grids of both sides must be aligned.) The normal equations are solved by conjugate gradients
+//! (Hestenes and Stiefel 1952), one set of texels for each layer of light.
 //!
-//! Where the two sides show very different indirect light, one of them is not what is seen there: it shows its other
-//! face, or lies in a gap. Stitched, it would shine into the other, so such points are left as they are.
+//! If the two sides have very different indirect light, one of them is not visible there: its texels show the other
+//! face of the surface, or it lies in a narrow gap. Stitching would spread its light to the visible side, so such
+//! points are left unstitched.
 //!
-//! Edges are compared by the positions of their ends: vertices on the middle of another triangle's
-//! edge are not found.
+//! Edges are compared by the positions of their ends: T-junctions, where a vertex lies inside another triangle's edge,
+//! are not found.
 
 mod solver;
 
@@ -34,22 +35,22 @@ use std::ops::Range;
 use std::sync::atomic::{AtomicU64, Ordering::Relaxed};
 use std::time::Instant;
 
-/// Surfaces that meet at more than this angle (30 degrees) have an edge of their own.
+/// Cosine of the greatest angle (30 degrees) between the normals of a smooth surface. Sharper edges are not stitched.
 const SMOOTH_COSINE: f32 = 0.866;
 
-/// Points whose sides differ by more than this factor in indirect light are not stitched. In the living room that took
-/// a shade beside a lamp from 9.9 to 4.4 (5.5 is right) and the mean squared relative error of all but the worst hundredth
-/// of the points from 1.36e-2 to 1.15e-2; 2 is no better and 8 as without. No difference in Sponza, whatever the factor.
+/// Points whose sides differ by more than this factor in indirect light are not stitched. In the living room this
+/// changed a shade beside a lamp from 9.9 to 4.4 (5.5 is right) and the mean squared relative error of all but the
+/// worst hundredth of the points from 1.36e-2 to 1.15e-2; 2 is no better, and 8 is no better than no limit. No
+/// difference in Sponza, whatever the factor.
 const CONTRAST: f32 = 4.0;
 
-/// Texels between the points of an edge: both sides are linear between texels, each in its own grid.
+/// Distance between the points of an edge, in texels: both sides are linear between texels, each in its own grid.
 const SPACING: f32 = 0.5;
 
-/// Edges whose points a thread looks at at a time.
+/// Number of edges whose points a thread computes at a time.
 const EDGES: usize = 64;
 
-/// Moved texels and their light: before the stitching or after it, whichever the light map does not
-/// hold.
+/// Stitched texels and their light: before the stitching or after it, whichever the light map does not hold.
 pub(crate) struct Stitch {
     /// Ascending.
     texels: Vec<u32>,
@@ -64,7 +65,7 @@ impl Stitch {
         self.former_of(&(0..light.direct.len()), &mut light.direct, &mut light.indirect);
     }
 
-    /// The same for a copy of the light of a range of texels.
+    /// Undoes the stitching in a copy of the light of a range of texels.
     pub(super) fn former_of(&self, range: &Range<usize>, direct: &mut [Vec3], indirect: &mut [Vec3]) {
         let first = self.texels.partition_point(|&t| (t as usize) < range.start);
         for i in (first..self.texels.len()).take_while(|&i| (self.texels[i] as usize) < range.end) {
@@ -73,7 +74,7 @@ impl Stitch {
         }
     }
 
-    /// Exchanges what the light map holds and what is held here.
+    /// Swaps the light of the stitched texels in the light map with the light held here.
     pub(super) fn swap(&mut self, light: &mut Light) {
         for (i, &texel) in self.texels.iter().enumerate() {
             std::mem::swap(&mut self.direct[i], &mut light.direct[texel as usize]);
@@ -83,9 +84,9 @@ impl Stitch {
 }
 
 impl Lightmap {
-    /// Stitches what [`store`](Lightmap::store) will make of `new` light of a range of samples.
-    /// `None` if there is nothing to stitch, or texels are still to be baked: then the shard that
-    /// comes last does it. Changes nothing yet, so that it can be cancelled.
+    /// Stitches the light map that [`store`](Lightmap::store) will make from the `new` light of a range of samples.
+    /// `None` if there is nothing to stitch, or if texels are still to be baked: then the last shard stitches. Changes
+    /// nothing yet, so that it can be cancelled.
     pub(super) fn stitch(
         &self,
         new: &Light,
@@ -122,7 +123,7 @@ impl Lightmap {
     }
 }
 
-/// The light as it is going to be, not yet stitched.
+/// The light of all texels after the bake is stored, without stitching.
 struct View<'a> {
     new: &'a Light,
     range: &'a Range<usize>,
@@ -130,7 +131,7 @@ struct View<'a> {
 }
 
 impl View<'_> {
-    /// Whose light of a sample it is.
+    /// Returns the light, new or old, that a sample comes from.
     fn source(&self, sample: usize) -> &Light {
         self.old.filter(|_| !self.range.contains(&sample)).unwrap_or(self.new)
     }
@@ -140,7 +141,7 @@ impl View<'_> {
         (0..samples).any(unbaked)
     }
 
-    /// Direct and indirect light.
+    /// Returns direct and indirect light of a sample before stitching.
     fn light(&self, sample: usize) -> [Vec3; 2] {
         let source = self.source(sample);
         let stitched = source.stitch.as_ref();
@@ -159,8 +160,8 @@ impl View<'_> {
         a.max(b) <= CONTRAST * a.min(b)
     }
 
-    /// Whether a sample may be moved: hidden ones repeat what is around them, and what has overflown
-    /// must not spread.
+    /// Whether a sample may be changed: hidden ones repeat texels around them, and values that have overflowed must not
+    /// spread.
     fn is_valid(&self, sample: usize) -> bool {
         let source = self.source(sample);
         let finite = source.direct[sample].is_finite() && source.indirect[sample].is_finite();
@@ -168,8 +169,8 @@ impl View<'_> {
     }
 }
 
-/// An edge of a triangle in one of its places: three times the triangle's global number, plus that of the corner that
-/// the edge starts at (triangle numbers have 28 bits), plus [`SECOND`] in the place of a back.
+/// An edge of a triangle in one of its placements: three times the triangle's global number, plus the number of the
+/// corner that the edge starts at (triangle numbers have 28 bits), plus [`SECOND`] in the placement of a back.
 #[derive(Clone, Copy, Debug, Default, PartialEq, Eq, PartialOrd, Ord)]
 struct Side(u32);
 
@@ -180,7 +181,7 @@ impl Side {
         (self.0 & !SECOND) / 3
     }
 
-    /// Which of the triangle's corners it starts at.
+    /// Returns the number of the triangle's corner that the edge starts at.
     fn corner(self) -> usize {
         ((self.0 & !SECOND) % 3) as usize
     }
@@ -189,7 +190,7 @@ impl Side {
         self.0 & SECOND != 0
     }
 
-    /// Start and end among the triangle's corners.
+    /// Returns the edge's start and end among values of the triangle's corners.
     fn ends<T: Copy>(self, corners: [T; 3]) -> [T; 2] {
         let k = self.corner();
         [corners[k], corners[(k + 1) % 3]]
@@ -198,14 +199,15 @@ impl Side {
 
 struct Job<'a, 'p, 'c> {
     atlas: &'a Atlas,
-    /// Per chart with one place, whether its back is shown; empty: fronts.
+    /// Whether the back is shown, for each chart without separate texels for it; empty: all show fronts.
     backs: &'a [bool],
     budget: u64,
     stage: &'a Stage<'p, 'c>,
 }
 
 impl Job<'_, '_, '_> {
-    /// The stitched light, the number of edges, and that of points whose sides differ too much. `None` if there are none.
+    /// Returns the stitched light, the number of edges, and the number of points whose sides differ too much. `None` if
+    /// there is nothing to stitch.
     fn run(&self, view: &View, plan: &Plan, stats: &mut BakeStats) -> Result<Option<(Stitch, [u64; 2])>> {
         let edges = self.edges()?;
         self.stage.advance(0)?;
@@ -269,7 +271,7 @@ impl Job<'_, '_, '_> {
         self.atlas.scene.device().memory().reserve(bytes, what)
     }
 
-    /// The edges that are cut open, each with its two sides.
+    /// Finds the edges that are cut open, each with its two sides.
     fn edges(&self) -> Result<Vec<[Side; 2]>> {
         let (scene, triangles) = (&self.atlas.scene, &self.atlas.charts.triangles[..]);
         let n = 3 * triangles.len();
@@ -285,11 +287,11 @@ impl Job<'_, '_, '_> {
         self.stage.advance(0)?;
         sides.par_sort_unstable();
         self.stage.advance(0)?;
-        // Where three or more meet, something stands on the surface, and light need not go on below
-        // it. (So does the rare hash that two edges share.)
+        // If three or more triangles share an edge, another surface stands on this one, and light need not continue
+        // below it. (The rare edges that share a hash are skipped too.)
         let mut edges = try_par_gather(n.div_ceil(CHUNK), "the seams", |part, out| {
             self.stage.check()?;
-            // Those that begin in this part.
+            // Edges whose first entry is in this part.
             let starts = |i: usize| i == 0 || sides[i - 1].0 != sides[i].0;
             for i in (part * CHUNK..n.min((part + 1) * CHUNK)).filter(|&i| starts(i)) {
                 let same = sides[i..].iter().take(3).take_while(|s| s.0 == sides[i].0).count();
@@ -302,7 +304,7 @@ impl Job<'_, '_, '_> {
             }
             Ok(())
         })?;
-        // Neighbours in the scene use the same texels.
+        // Sorted, since neighbours in the scene use the same texels.
         edges.par_sort_unstable();
         Ok(edges)
     }
@@ -311,7 +313,7 @@ impl Job<'_, '_, '_> {
         self.atlas.charts.chart_of[side.triangle() as usize]
     }
 
-    /// An edge between all places of its two triangles.
+    /// Returns the edge in all pairs of placements of its two triangles.
     fn in_places(&self, edge: [Side; 2]) -> impl Iterator<Item = [Side; 2]> + use<> {
         let [a, b] = edge.map(|side| {
             let second = self.atlas.map.layout.back(self.chart(side)).map(|_| Side(side.0 | SECOND));
@@ -328,14 +330,14 @@ impl Job<'_, '_, '_> {
         side.is_second() || self.backs.get(self.chart(side) as usize).is_some_and(|&b| b)
     }
 
-    /// Whether the second side runs from the first one's end to its start, as in a mesh it should.
+    /// Whether the second side runs from the first one's end to its start, as in a mesh of consistent winding.
     fn runs_back(&self, [a, b]: [Side; 2]) -> bool {
         let [start, _] = a.ends(self.atlas.scene.corners(a.triangle()));
         let [_, end] = b.ends(self.atlas.scene.corners(b.triangle()));
         start == end
     }
 
-    /// Whether the shown sides of the surface go on smoothly over an edge, but the light map does not.
+    /// Whether the surface continues smoothly across an edge, on the sides that are shown, but the light map does not.
     fn is_seam(&self, edge: [Side; 2]) -> bool {
         let [a, b] = edge;
         let ends = edge.map(|s| s.ends(self.atlas.scene.corners(s.triangle())));
@@ -361,19 +363,19 @@ impl Job<'_, '_, '_> {
         })
     }
 
-    /// Start and end of an edge in the charts of both sides.
+    /// Returns start and end of an edge in the charts of both sides.
     fn in_charts(&self, edge: [Side; 2]) -> [[Vec2; 2]; 2] {
         let corners = |s: Side| s.ends(self.atlas.charts.corners[s.triangle() as usize].map(Vec2::from_array));
         let [a, [start, end]] = edge.map(corners);
         [a, if self.runs_back(edge) { [end, start] } else { [start, end] }]
     }
 
-    /// The texel coordinate of a point of a side's chart.
+    /// Returns the texel coordinate of a point of a side's chart.
     fn texel(&self, side: Side, local: Vec2) -> Vec2 {
         self.atlas.map.layout.texel_coord(self.placement(side), local.to_array()).into()
     }
 
-    /// The length of an edge in texels, on the side where it takes more of them.
+    /// Returns the length of an edge in texels, on the side where it is longer.
     fn length(&self, edge: &[Side; 2]) -> f32 {
         let locals = self.in_charts(*edge);
         let length = |i: usize| (self.texel(edge[i], locals[i][0]) - self.texel(edge[i], locals[i][1])).length();
@@ -397,7 +399,7 @@ impl Job<'_, '_, '_> {
                     (point.texels[at], point.weights[at]) = (texel as u32, sign * weight);
                     at += 1;
                 });
-                // What is not used repeats a used one, with weight 0.
+                // Unused entries repeat a used texel, with weight 0.
                 let used = point.texels[4 * side];
                 point.texels[at..4 * side + 4].fill(used);
             }
@@ -406,7 +408,7 @@ impl Job<'_, '_, '_> {
     }
 }
 
-/// The same for both directions of an edge.
+/// Hashes an edge, with the same result for both directions.
 fn hash(ends: [Vec3; 2]) -> u64 {
     let [a, b] = ends.map(|p| p.to_array().map(float_key));
     let (low, high) = if a < b { (a, b) } else { (b, a) };
@@ -416,15 +418,15 @@ fn hash(ends: [Vec3; 2]) -> u64 {
     })
 }
 
-/// Whether the sides of a point show different texels, or the same ones in different parts. (Charts
-/// that the caller placed side by side share texels. A placement without texels has weights 0.)
+/// Whether the two sides of a point use different texels, or the same ones with different weights. (Charts that the
+/// caller placed side by side share texels. A placement without texels has weights 0.)
 fn is_cut(p: &Point) -> bool {
     let sum: f32 = p.weights.iter().map(|w| w.abs()).sum();
     let part = |t: u32| p.texels.iter().zip(&p.weights).filter(|(u, _)| **u == t).map(|(_, w)| w).sum::<f32>();
     sum > 1.5 && p.texels.iter().any(|&t| part(t).abs() > 1e-3)
 }
 
-/// Replaces texels by their numbers among the texels that points use. Those texels, ascending.
+/// Replaces texels by their numbers among the texels that points use. Returns those texels, ascending.
 fn number(points: &mut [Point], texels: usize, stage: &Stage) -> Result<Vec<u32>> {
     let mut number_of: Vec<u32> = try_vec(texels, "the numbers of the seams' texels")?;
     number_of.fill(NONE);

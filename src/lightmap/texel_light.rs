@@ -1,19 +1,19 @@
-//! Direct light of a texel: an average over what the texel shows of its chart.
+//! Direct light of a texel: an average over the part of the chart that the texel covers.
 //!
-//! A point sample at the texel's centre makes stairs of every shadow edge, and misses or doubles light that falls on
-//! less than a texel. Averages are taken where they matter:
+//! A point sample at the texel's centre turns every shadow edge into stairs, and misses or exaggerates light that falls
+//! on less than a texel. Averages are taken where they matter:
 //!
 //! - Lights with penumbrae are sampled from four stratified points instead of one, with as many rays in all.
-//! - Lights without get one ray from the sample. Where that light differs from a neighbouring texel's, or where a
-//!   chart ends, points spread over the texel are lit instead, 4 or 16 of them.
+//! - Lights without penumbrae get one ray from the texel's sample. If that light differs from a neighbouring texel's,
+//!   or at the border of a chart, 4 or 16 points spread over the texel are lit instead.
 //! - Texels in the penumbra of a disc, which is narrow, get 16 points too.
 //!
-//! Points lie on the chart: each on whichever triangle of the chart covers it, with that triangle's normals. Those
-//! inside of solids or in cut-outs do not count, and neither do those behind a wall that stands on the texel: the light
-//! of the other room would leak in.
+//! Points lie on the chart: each on whichever triangle of the chart covers it, with that triangle's normals. Points
+//! inside solids, in cut-outs, or behind a wall that stands on the texel do not count: the light of the other room
+//! would leak in.
 //!
-//! Whatever is looked at of neighbours is a function of their numbers alone: shards of a bake and tiles of live updates
-//! that compute it anew have the same bits.
+//! The data used of neighbours is a function of their numbers alone, so that shards of a bake and tiles of live
+//! updates, which recompute it, have the same bits.
 
 use super::atlas::Atlas;
 use super::atlas::chart_index::ChartIndex;
@@ -29,23 +29,24 @@ use crate::trace::Ray;
 use glam::{Vec2, Vec3};
 use std::ops::Range;
 
-/// Points in a texel that nothing is known to vary in.
+/// Number of points in a texel in which light is not known to vary.
 const FEW: u32 = 4;
 
-/// Light differs if it does by more than this part of the greater: between neighbouring texels of the light map, and
-/// between neighbours or within a texel of the radiance map, whose texels are larger and shown to gather rays only.
+/// Two values of light differ if their difference is more than this fraction of the greater: the first between
+/// neighbouring texels of the light map, the second between neighbours or within a texel of the radiance map, whose
+/// texels are larger and seen by gather rays only.
 const DIFFERENCE: f32 = 0.15;
 const RADIANCE_DIFFERENCE: f32 = 0.25;
 
-/// Points in a texel of the radiance map where one of the first [`MAX_POINTS`] gets more than this many times the mean:
-/// what shines there covers little of the texel.
+/// Number of points in a texel of the radiance map if one of the first [`MAX_POINTS`] gets more than `SPIKE` times the
+/// mean, since the lit area then covers little of the texel.
 const MANY: u32 = 64;
 const SPIKE: f32 = 3.0;
 
-/// Lines of sight along a surface are raised by this part of their length, which clears what is curved.
+/// Height of lines of sight above the surface they run along, as a fraction of their length: it clears curved surfaces.
 const RAISED: f32 = 0.25;
 
-/// What texels are made of.
+/// Data from which the surface under a texel is found.
 #[derive(Clone, Copy)]
 pub(crate) struct TexelAreas<'a> {
     pub scene: &'a Scene,
@@ -55,19 +56,19 @@ pub(crate) struct TexelAreas<'a> {
 }
 
 impl Atlas {
-    /// The texels of one of the maps as areas.
+    /// Returns the texels of one of the maps as areas.
     pub(crate) fn areas<'a>(&'a self, map: &'a ChartMap) -> TexelAreas<'a> {
         TexelAreas { scene: &self.scene, charts: &self.charts, index: &self.index, map }
     }
 }
 
 impl TexelAreas<'_> {
-    /// Point `number` of a sequence that is stratified over a texel; `None` where it misses the chart or lies in a
+    /// Returns point `number` of a sequence that is stratified over a texel; `None` if it misses the chart or lies in a
     /// cut-out.
     pub(crate) fn point(&self, sample: usize, number: u32, seed: u32) -> Option<TexelSample> {
         let own = &self.map.texels.samples[sample];
         let placement = &self.map.layout.placements[self.map.placement_of(self.charts, sample) as usize];
-        // Of a texel that nobody can see the sample lies elsewhere, and stands alone.
+        // The sample of a buried texel lies in another texel; no other points are used.
         let at = Vec2::from(placement.texel_coord(self.charts.local(own.triangle, own.u, own.v)));
         let within = at - Vec2::new(own.x as f32, own.y as f32);
         if within.min_element() < -0.01 || within.max_element() > 1.01 {
@@ -80,7 +81,7 @@ impl TexelAreas<'_> {
         (!self.scene.is_hole(point.triangle, point.u, point.v)).then_some(point)
     }
 
-    /// The sample of the same place of a chart at an offset of columns and rows, if there is one.
+    /// Returns the sample at an offset of columns and rows in the same placement, if there is one.
     fn neighbour(&self, sample: usize, dx: i32, dy: i32) -> Option<usize> {
         let placement = self.map.placement_of(self.charts, sample);
         let (x, y) = self.map.position(sample);
@@ -94,9 +95,9 @@ impl TexelAreas<'_> {
 pub(crate) struct TexelLight<'a> {
     pub areas: TexelAreas<'a>,
     pub direct: &'a DirectLight,
-    /// As in [`DirectLight::irradiance`], per texel.
+    /// Number of samples per texel, as in [`DirectLight::irradiance`].
     pub samples: u32,
-    /// Of the stage.
+    /// Seed of the stage.
     pub seed: u32,
 }
 
@@ -109,7 +110,7 @@ struct Points {
 }
 
 impl TexelLight<'_> {
-    /// Light without penumbrae at the sample itself.
+    /// Computes light without penumbrae at the sample itself.
     pub(crate) fn sharp(&self, receiver: &Receiver, rays: &mut u64) -> Vec3 {
         if !self.direct.has_sharp() {
             return Vec3::ZERO;
@@ -119,8 +120,8 @@ impl TexelLight<'_> {
         out[0].sharp
     }
 
-    /// Whether light without penumbrae varies in a texel, as far as its neighbours tell: `sharp` is that of the texel,
-    /// `of` gives theirs.
+    /// Whether light without penumbrae varies in a texel, judged by its neighbours: `sharp` is the texel's own light,
+    /// and `of` returns a neighbour's.
     pub(crate) fn varies(&self, sample: usize, sharp: Vec3, mut of: impl FnMut(usize) -> Vec3) -> Variation {
         if !self.direct.has_sharp() {
             return Variation::None;
@@ -137,7 +138,7 @@ impl TexelLight<'_> {
         variation
     }
 
-    /// The direct light of a texel, whose sample is `receiver` and has the light `sharp`.
+    /// Computes the direct light of a texel whose sample is `receiver` and has the light `sharp`.
     pub(crate) fn irradiance(
         &self,
         sample: usize,
@@ -171,7 +172,7 @@ impl TexelLight<'_> {
         let mut sum = PointLight::default();
         let n = points.add_to(self.areas.scene, &mut sum, |_| Vec3::ONE, rays);
         if n == Vec3::ZERO {
-            // A scrap of a chart between all points: its sample stands for it.
+            // All points miss a small part of a chart: its sample alone is lit.
             let seed = combine(self.seed, sample as u32);
             let mut out = [PointLight::default()];
             self.direct.at_points(&[*receiver], 0, Lights::Soft, self.samples, seed, rays, &mut out);
@@ -181,14 +182,16 @@ impl TexelLight<'_> {
             && !goes_on
             && !points.lights().iter().any(|l| differ(l.sharp, sharp, DIFFERENCE));
         if is_even {
-            // The sample lies in the middle of what the texel holds of the chart; few points lie anywhere in it.
+            // The sample lies in the middle of the chart's part in the texel, whereas the few points lie anywhere in
+            // it.
             sum.sharp = sharp * n;
         }
         let e = sum.value() / n;
         if variation == Variation::None { sharp + e } else { e }
     }
 
-    /// Direct light of a texel of the radiance map by few points, and what a [closer look](Self::closer_look) depends on.
+    /// Computes direct light of a texel of the radiance map by few points, and the values that decide on a [closer
+    /// look](Self::closer_look).
     pub(crate) fn first_look(&self, sample: usize, back: bool, rays: &mut u64) -> Look {
         let scene = self.areas.scene;
         let receiver = self.areas.map.receiver(scene, sample, back).1;
@@ -216,8 +219,8 @@ impl TexelLight<'_> {
             })
     }
 
-    /// Direct light of a texel of the radiance map by 16 or 64 points, weighted by their albedos; `None` if none of them
-    /// lies on the chart.
+    /// Computes direct light of a texel of the radiance map by 16 or 64 points, weighted by their albedos; `None` if
+    /// none of them lies on the chart.
     pub(crate) fn closer_look(
         &self,
         sample: usize,
@@ -264,34 +267,34 @@ impl TexelLight<'_> {
     }
 }
 
-/// Direct light of a texel of the radiance map at first.
+/// Result of the first look at a texel of the radiance map.
 #[derive(Clone, Copy, Debug, Default)]
 pub(crate) struct Look {
     pub irradiance: Vec3,
-    /// The part with narrow penumbrae or none.
+    /// Light of sources with narrow penumbrae or none.
     narrow: Vec3,
     varies: bool,
 }
 
-/// What is known of the light in a texel.
+/// Whether light without penumbrae varies in a texel.
 #[derive(Clone, Copy, Debug, Default, PartialEq, Eq)]
 pub(crate) enum Variation {
     #[default]
     None,
-    /// Nothing is known beyond an edge of the chart.
+    /// Not known: the texel is at the border of its chart.
     Unknown,
     Some,
 }
 
-/// Neighbours of a texel.
+/// Offsets of the neighbours of a texel.
 const AROUND: [(i32, i32); 8] = [(-1, 0), (1, 0), (0, -1), (0, 1), (-1, -1), (1, -1), (-1, 1), (1, 1)];
 
 fn differ(a: Vec3, b: Vec3, part: f32) -> bool {
     (a - b).abs().max_element() > part * a.max_element().max(b.max_element())
 }
 
-/// Whether a point lies inside a solid: straight above it and to all sides are backs of one-sided surfaces. (Straight above
-/// alone may be that of a single sheet, such as a table top, below which there is light.)
+/// Whether a point lies inside a solid: the rays straight up and to four sides all hit backs of one-sided surfaces.
+/// (The ray straight up alone may hit the back of a single sheet, such as a table top, below which there is light.)
 fn is_buried(scene: &Scene, origin: Vec3, normal: Vec3, rays: &mut u64) -> bool {
     let (x, y) = orthonormal_basis(normal);
     [Vec3::ZERO, x, -x, y, -y].into_iter().all(|aside| {
@@ -304,7 +307,7 @@ fn is_buried(scene: &Scene, origin: Vec3, normal: Vec3, rays: &mut u64) -> bool 
     })
 }
 
-/// Whether something stands between two points of a surface.
+/// Whether another surface stands between two points of a surface.
 fn is_hidden(scene: &Scene, a: &Receiver, b: &Receiver, rays: &mut u64) -> bool {
     let raise = RAISED * a.origin.distance(b.origin);
     let (from, to) = (a.origin + raise * a.geometric, b.origin + raise * b.geometric);
@@ -340,8 +343,8 @@ impl Points {
         most * self.count as f32 > SPIKE * sum
     }
 
-    /// Keeps the points that are seen from the texel's sample, `own`, whose light without penumbrae is `sharp`. Points with
-    /// the same light are not asked.
+    /// Keeps the points that are seen from the texel's sample, `own`, whose light without penumbrae is `sharp`. Points
+    /// with the same light are kept without a test.
     fn leave_out_other_rooms(&mut self, scene: &Scene, own: &Receiver, sharp: Vec3, rays: &mut u64) {
         let mut kept = 0;
         for i in 0..self.count {
@@ -357,7 +360,7 @@ impl Points {
     }
 
     /// Adds the light of the points that are not inside of solids, by their weights; returns the sum of the weights.
-    /// Only points without any light beside some with light can be, as far as that matters.
+    /// Only unlit points beside lit ones are tested, since others make no difference.
     fn add_to(
         &self,
         scene: &Scene,

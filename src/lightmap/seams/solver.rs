@@ -7,39 +7,40 @@ use glam::{DVec3, Vec3A};
 use rayon::prelude::*;
 use std::ops::Range;
 
-/// What moving a texel costs, λ. Much less than the weight of a texel in the points around it (about
-/// 1/2), so that both sides agree, and enough to hold what a point hardly shows.
+/// Penalty λ for changing a texel. Much less than the weight of a texel in the points around it (about 1/2), so that
+/// both sides agree, and large enough to keep texels that have hardly any weight.
 pub(super) const STIFFNESS: f32 = 0.01;
 
-/// Ends the iteration: the gradient's length by its length at the start.
+/// Relative length of the gradient, compared with the start, at which the iteration ends.
 const TOLERANCE: f64 = 1e-4;
 
-/// Far more iterations than it takes.
+/// Maximum number of iterations, far more than are needed.
 const MAX_ITERATIONS: usize = 200;
 
-/// Elements that a thread takes at a time.
+/// Number of elements that a thread processes at a time.
 pub(super) const CHUNK: usize = 1 << 12;
 
-/// What buffers are for, in errors.
+/// Name of the buffers in error messages.
 pub(super) const POINTS: &str = "the seams' points";
 
-/// What the two sides of an edge show at a point of it.
+/// A point of an edge, with the texels that each side interpolates there.
 #[derive(Clone, Copy, Debug, Default)]
 pub(super) struct Point {
     /// Texels of the one side, then of the other.
     pub(super) texels: [u32; 8],
-    /// Sum to 1 on the one side, to −1 on the other.
+    /// Interpolation weights, which sum to 1 on the one side and to −1 on the other.
     pub(super) weights: [f32; 8],
-    /// The length that it stands for, in texels.
+    /// Length of the part of the edge around the point, in texels.
     pub(super) length: f32,
 }
 
-/// The least squares problem: J is what points show, its rows times the roots of their lengths.
+/// The least squares problem: row i of J has the weights of texels at point i, times the square root of the point's
+/// length.
 pub(super) struct System {
     pub(super) points: Vec<Point>,
-    /// Where the uses of each texel begin, and the number of uses at the end.
+    /// Index of the first use of each texel; the last element is the number of uses.
     first_use: Vec<usize>,
-    /// Points that show a texel, with its weight there times their length.
+    /// Points that use a texel, each with the texel's weight there times the point's length.
     uses: Vec<(u32, f32)>,
 }
 
@@ -69,13 +70,13 @@ impl System {
         Ok(System { points, first_use, uses })
     }
 
-    /// A − B at every point.
+    /// Computes A − B at every point.
     pub(super) fn differences(&self, x: &[Vec3A], out: &mut [Vec3A]) {
         let show = |p: &Point| (0..8).fold(Vec3A::ZERO, |sum, k| sum + p.weights[k] * x[p.texels[k] as usize]);
         out.par_iter_mut().zip(&self.points).with_min_len(CHUNK).for_each(|(d, p)| *d = show(p));
     }
 
-    /// JᵀJ of what the differences are of. (Sums in the order of points, whatever the threads.)
+    /// Computes JᵀJ x from the differences of x. (Sums are in the order of points, on any number of threads.)
     pub(super) fn pull(&self, differences: &[Vec3A], out: &mut [Vec3A]) {
         out.par_iter_mut().enumerate().with_min_len(CHUNK).for_each(|(t, out)| {
             let uses = &self.uses[self.first_use[t]..self.first_use[t + 1]];
@@ -83,7 +84,7 @@ impl System {
         });
     }
 
-    /// Conjugate gradients from `before` on, each channel on its own. Light stays ≥ 0.
+    /// Solves by conjugate gradients, starting at `before`, for each channel separately. Light stays ≥ 0.
     pub(super) fn solve(&self, before: &[Vec3A], x: &mut [Vec3A], stage: &Stage) -> Result<()> {
         let mut differences = try_filled(self.points.len(), Vec3A::ZERO, POINTS)?;
         let mut q = try_filled(before.len(), Vec3A::ZERO, POINTS)?;
@@ -116,7 +117,8 @@ impl System {
         Ok(())
     }
 
-    /// Root mean square of A − B over lengths and channels, relative to the mean light; 0 in the dark.
+    /// Returns the root mean square of A − B over lengths and channels, relative to the mean light; 0 if there is no
+    /// light.
     pub(super) fn relative_rms(&self, x: &[Vec3A]) -> f64 {
         let (mut squares, mut sum, mut total) = (DVec3::ZERO, DVec3::ZERO, 0.0);
         for p in &self.points {
@@ -133,7 +135,7 @@ impl System {
     }
 }
 
-/// Per channel, in f64 and in a fixed order.
+/// Dot product per channel, in f64 and in a fixed order.
 fn dot(a: &[Vec3A], b: &[Vec3A]) -> DVec3 {
     let part = |(a, b): (&[Vec3A], &[Vec3A])| {
         a.iter().zip(b).fold(DVec3::ZERO, |sum, (a, b)| sum + a.as_dvec3() * b.as_dvec3())
@@ -142,7 +144,7 @@ fn dot(a: &[Vec3A], b: &[Vec3A]) -> DVec3 {
     parts.into_iter().sum()
 }
 
-/// Per channel; 0 for a channel that is done.
+/// Quotient per channel; 0 for a channel that has converged.
 fn ratio(a: DVec3, b: DVec3) -> Vec3A {
     let q = a / b;
     DVec3::select(b.cmpgt(DVec3::ZERO), q, DVec3::ZERO).as_vec3a()
