@@ -7,11 +7,11 @@ use super::{Live, LiveCamera, LiveStats};
 use crate::error::Result;
 use std::time::Duration;
 
-/// Blocks that are worked on between two updates, at most.
+/// Maximum number of blocks that are worked on between two updates.
 const BACKGROUND_BLOCKS: usize = 256;
 
 impl Live {
-    /// Has the pool go on with what was seen last.
+    /// Lets the thread pool continue with the blocks that the camera saw last.
     pub(super) fn start_background(&mut self, camera: &LiveCamera) -> Result<()> {
         if !self.params.background || self.paused {
             return Ok(());
@@ -23,7 +23,7 @@ impl Live {
             visibility: &self.visibility,
         };
         let (step, mut chosen) = self.chooser.next(&from, self.params.mode, camera, BACKGROUND_BLOCKS);
-        // What waits to be shown must be there for it.
+        // The work of blocks that wait to be shown must stay available to the display.
         chosen.retain(|&b| !self.is_waiting[b as usize]);
         if chosen.is_empty() {
             return Ok(());
@@ -36,7 +36,7 @@ impl Live {
         Ok(())
     }
 
-    /// Ends work in the background and takes it over, whatever became of it.
+    /// Stops background work and takes over its blocks and results, complete or not.
     pub(super) fn collect(&mut self, stats: &mut LiveStats) -> Result<()> {
         let Some(background) = self.background.take() else { return Ok(()) };
         let (items, traced, result) = background.finish();
@@ -46,7 +46,7 @@ impl Live {
         result
     }
 
-    /// [`collect`](Self::collect) outside of updates.
+    /// Does the work of [`collect`](Self::collect) outside of updates.
     pub(super) fn collect_now(&mut self) -> Result<()> {
         let mut stats = LiveStats::default();
         let result = self.collect(&mut stats);
@@ -54,8 +54,8 @@ impl Live {
         result
     }
 
-    /// Stops work in the background, or lets it go on with the next update: refinement between
-    /// updates, and the recomputation of indirect light.
+    /// Stops work in the background (refinement between updates, and the recomputation of indirect light), or lets it
+    /// go on with the next update.
     pub fn pause(&mut self, paused: bool) -> Result<()> {
         self.paused = paused;
         self.relight.hold(paused, &self.context.map.atlas, &self.bake, &self.context.light.sides)?;
@@ -67,14 +67,15 @@ impl Drop for Live {
     fn drop(&mut self) {
         if let Some(background) = self.background.take() {
             if self.device().check_process().is_err() {
-                // The threads that it waits for are in another process.
+                // The threads that it would wait for are in another process.
                 std::mem::forget(background);
             } else {
-                // Nothing is lost if this is the end of it.
+                // An error is ignored: the object ends here and nothing is lost.
                 let _ = background.finish();
             }
         }
-        // Before the scene is let go: its last reference then ends here, not on the thread that relights.
+        // Drops the relighting before the scene: the last reference to the scene then ends here, not on the thread that
+        // relights.
         drop(std::mem::take(&mut self.relight));
     }
 }

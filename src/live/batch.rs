@@ -11,16 +11,16 @@ use std::sync::atomic::{AtomicBool, AtomicUsize, Ordering::Relaxed};
 use std::sync::{Arc, Condvar, Mutex, MutexGuard};
 use std::time::{Duration, Instant};
 
-/// A block on its way through a batch.
+/// A block while it is in a batch.
 pub(super) struct Item {
     pub number: u32,
     pub block: Block,
-    /// Bytes that the block held before.
+    /// Bytes that the block held before the work.
     pub bytes: usize,
     pub done: Done,
 }
 
-/// Blocks, the most urgent first, and what to do with them.
+/// Blocks, the most urgent first, with the work to be done on them.
 pub(super) struct Batch {
     context: Context,
     items: Vec<Mutex<Item>>,
@@ -37,7 +37,7 @@ pub(super) struct Batch {
 pub(super) type Outcome = (Vec<Mutex<Item>>, u64, Result<()>);
 
 impl Batch {
-    /// Takes the `chosen` of the blocks that are not away. An error takes none.
+    /// Takes those of the `chosen` blocks that are not away. If it fails, none is taken.
     pub fn new(
         context: Context,
         blocks: &mut Blocks,
@@ -106,10 +106,10 @@ impl Batch {
     }
 }
 
-/// A batch on which a device's threads work while the caller does something else.
+/// A batch that a device's threads work on while the caller does something else.
 ///
-/// Jobs that a busy pool starts late, when the batch has been taken back, find the door closed: they hold nothing
-/// of the batch, hence nothing of the scene, whose last reference must not end on such a thread.
+/// Jobs that a busy pool starts late, when the batch has been taken back, find it closed: they hold no reference to the
+/// batch, hence none to the scene, whose last reference must not end on such a thread.
 pub(super) struct Background {
     door: Arc<Door>,
 }
@@ -122,14 +122,14 @@ struct Door {
 
 #[derive(Default)]
 struct Inside {
-    /// `None`: closed.
+    /// The batch; `None` once it is closed.
     batch: Option<Arc<Batch>>,
-    /// Threads at work.
+    /// Number of threads at work.
     active: usize,
 }
 
 impl Background {
-    /// Works on the device's threads and returns at once.
+    /// Starts work on the device's threads and returns at once.
     pub fn start(batch: Batch, device: &Device) -> Background {
         let inside = Inside { batch: Some(Arc::new(batch)), active: 0 };
         let door = Arc::new(Door { state: Mutex::new(inside), ..Default::default() });
@@ -144,8 +144,8 @@ impl Background {
         Background { door }
     }
 
-    /// Stops the work and takes the blocks back. Waits for threads that are at work, each of which ends with the
-    /// texel it is at, and calls no callback meanwhile; afterwards no thread holds anything of the batch.
+    /// Stops the work and takes the blocks back. Waits for threads that are at work, each of which finishes its current
+    /// texel, and calls no callback meanwhile; afterwards no thread holds a reference to the batch.
     pub fn finish(self) -> Outcome {
         let mut inside = self.door.inside();
         let Some(batch) = inside.batch.take() else { return (Vec::new(), 0, Ok(())) };

@@ -79,40 +79,40 @@ impl Rect {
 #[derive(Clone, Debug)]
 pub(super) struct DirectTile {
     pub rect: Rect,
-    /// Row by row; only those of the block's own texels mean anything.
+    /// Light row by row; only the values of the block's own texels are meaningful.
     pub values: Box<[Vec3]>,
 }
 
-/// What of a block never changes.
+/// The constant part of a block.
 #[derive(Debug)]
 pub(super) struct Tile {
     pub placement: u32,
-    /// Where it lies in the gather map.
+    /// The block's rectangle in the gather map.
     pub rect: Rect,
-    /// Its gather texels, by LOD.
+    /// Gather texels of the block, by LOD.
     pub texels: Box<[u32]>,
     /// The texels of LOD l are the first `lod_end[l]`.
     pub lod_end: [u16; MAX_LODS],
     pub centre: Vec3,
-    /// Texels of the light map around it, roughly.
+    /// Approximate number of light map texels around the block.
     pub map_texels: u32,
     /// Cell of the light map grid.
     pub cell: u32,
 }
 
-/// How far a block is. It may be read at any time, also while a thread works on the block: it then says how far
-/// the block was when the work began.
+/// Progress of a block. It may be read at any time, also while a thread works on the block: it then has the values from
+/// when the work began.
 #[derive(Clone, Copy, Debug, Default)]
 pub(super) struct BlockStatus {
     /// The highest LOD whose texels have all been gathered, under whatever light.
     pub lod: u8,
-    /// The LOD whose texels have all been gathered under the light of now, at most `lod`, and how many
-    /// rounds they have; 0 rounds: no step has been completed under that light.
+    /// The LOD whose texels have all been gathered under the current light, at most `lod`, and how many rounds they
+    /// have; 0 rounds: no step has been completed under that light.
     pub fresh_lod: u8,
     pub rounds: u16,
-    /// Epoch of the radiance that was gathered.
+    /// Epoch of the radiance map that was gathered.
     pub indirect_epoch: u32,
-    /// Epochs of the lights that the coarse direct light saw, and the direct light at full resolution.
+    /// Epochs of the lights of the coarse direct light, and of the direct light at full resolution.
     pub coarse_epoch: u32,
     pub direct_epoch: u32,
     /// Estimated relative error of indirect light; the mean of that light, and of coarse direct light, by
@@ -128,10 +128,10 @@ pub(super) struct DirectWork {
     pub tile: DirectTile,
     /// The next texel of the tile.
     pub next: u32,
-    /// Epoch of the lights.
+    /// Epoch of the lights under which it is computed.
     pub epoch: u32,
-    /// Light without penumbrae at the samples of the tile and of one more row and column on each side; NaN where it is
-    /// not known yet.
+    /// Light without penumbrae at the samples of the tile and of one more row and column on each side; NaN where it has
+    /// not been computed yet.
     pub sharp: Box<[Vec3]>,
 }
 
@@ -141,10 +141,11 @@ impl DirectWork {
     }
 }
 
-/// What a block has accumulated. It moves to the thread that works on it; what is shown of it is the display's.
+/// Accumulated light of a block. It moves to the thread that works on the block; the shown light is kept by the
+/// display.
 #[derive(Debug, Default)]
 pub(super) struct BlockWork {
-    /// What the texels gathered, as far as they have been worked on.
+    /// Sums gathered by the texels that have been worked on so far.
     pub gathered: Vec<Gathered>,
     /// Light of an earlier epoch, by texel, that fades out while new rays come in; may be empty.
     pub prior: Box<[Vec3]>,
@@ -155,12 +156,12 @@ pub(super) struct BlockWork {
     /// direct light at full resolution.
     pub new_coarse: Box<[Vec3]>,
     pub new_direct: Option<DirectTile>,
-    /// Squared deviations of the rounds from the mean so far, by the sum of the channels, and how many.
+    /// Sum of squared deviations of the rounds from the mean so far, summed over the channels, and their number.
     pub deviations: f32,
     pub deviation_count: u32,
 }
 
-/// A block on which one thread works.
+/// A block while one thread works on it.
 #[derive(Debug, Default)]
 pub(super) struct Block {
     pub status: BlockStatus,
@@ -170,26 +171,26 @@ pub(super) struct Block {
 /// All blocks. The work of some may be away, in a [`Batch`](super::batch::Batch); their status never is.
 pub(super) struct Blocks {
     status: Vec<BlockStatus>,
-    /// `None`: away.
+    /// Work of each block; `None` while it is away.
     work: Vec<Option<BlockWork>>,
 }
 
 impl Blocks {
-    /// Idle blocks.
+    /// Creates `count` idle blocks.
     pub fn new(count: usize) -> Result<Blocks> {
         let mut blocks = Blocks::away(&try_vec(count, STATE)?)?;
         blocks.work.fill_with(|| Some(BlockWork::default()));
         Ok(blocks)
     }
 
-    /// Blocks that are all away.
+    /// Creates blocks whose work is all away.
     pub fn away(status: &[BlockStatus]) -> Result<Blocks> {
         let mut work = try_with_capacity(status.len(), STATE)?;
         work.resize_with(status.len(), || None);
         Ok(Blocks { status: try_to_vec(status, STATE)?, work })
     }
 
-    /// Takes the place of those of these blocks that are not away.
+    /// Replaces those of these blocks that are not away.
     pub fn replace_by(&mut self, new: Blocks) {
         for (b, (status, work)) in (0..).zip(new.status.into_iter().zip(new.work)) {
             if let Some(work) = work {
@@ -202,12 +203,12 @@ impl Blocks {
         self.status.len()
     }
 
-    /// All blocks, for threads that work on them where they are.
+    /// Iterates over all blocks, for threads that work on them in place.
     pub fn par_iter_mut(&mut self) -> impl IndexedParallelIterator<Item = (&mut BlockStatus, &mut Option<BlockWork>)> {
         self.status.par_iter_mut().zip(&mut self.work)
     }
 
-    /// How far the blocks are, by number.
+    /// Progress of the blocks, by number.
     pub fn status(&self) -> &[BlockStatus] {
         &self.status
     }
@@ -216,7 +217,7 @@ impl Blocks {
         &mut self.status
     }
 
-    /// What a block has accumulated; `None` while it is away.
+    /// Accumulated light of a block; `None` while it is away.
     pub fn work(&self, b: u32) -> Option<&BlockWork> {
         self.work[b as usize].as_ref()
     }
@@ -225,19 +226,19 @@ impl Blocks {
         self.work[b as usize].as_mut()
     }
 
-    /// Hands a block out to be worked on; `None` if it is away already.
+    /// Takes a block out to be worked on; `None` if it is away already.
     pub fn take(&mut self, b: u32) -> Option<Block> {
         let work = self.work[b as usize].take()?;
         Some(Block { status: self.status[b as usize], work })
     }
 
-    /// Takes a block back.
+    /// Puts a block back.
     pub fn put(&mut self, b: u32, block: Block) {
         self.status[b as usize] = block.status;
         self.work[b as usize] = Some(block.work);
     }
 
-    /// Bytes that the blocks at home hold beside the structures themselves.
+    /// Bytes held by blocks that are not away, beside the structures themselves.
     pub fn bytes(&self) -> usize {
         self.work.iter().flatten().map(|w| w.bytes()).sum()
     }
@@ -250,14 +251,14 @@ impl DirectTile {
 }
 
 impl Tile {
-    /// Bytes held, with those of an idle block.
+    /// Bytes held, those of an idle block included.
     pub fn bytes(&self) -> usize {
         size_of::<Tile>() + size_of::<BlockStatus>() + size_of::<Option<BlockWork>>() + self.texels.len() * 4
     }
 }
 
 impl BlockWork {
-    /// Bytes held beside the structure itself.
+    /// Bytes held, without the structure itself.
     pub fn bytes(&self) -> usize {
         self.gathered.capacity() * size_of::<Gathered>()
             + self.prior.len() * size_of::<Vec3>()
@@ -265,21 +266,21 @@ impl BlockWork {
     }
 }
 
-/// What buffers are for, in errors.
+/// Name of these buffers in error messages.
 const STATE: &str = "the state of blocks";
 
-/// All blocks of an atlas, and where they are.
+/// All blocks of an atlas, with their positions.
 pub(super) struct BlockMap {
     pub atlas: Arc<Atlas>,
     pub tiles: Vec<Tile>,
     /// First block of each placement.
     first: Vec<u32>,
-    /// Corner and number of columns of each placement's tiles, in texels of the gather map.
+    /// Corner of each placement's grid of blocks, in texels of the gather map, and the number of its columns.
     origin: Vec<(i32, i32, i32)>,
     /// Lowest LOD that each gather texel belongs to.
     pub lod_of: Vec<u8>,
-    /// By block, the texels of the light map that show its light although they lie elsewhere: buried ones, which take
-    /// the place of the nearest texel that can be seen. Empty if there are none.
+    /// By block, the rectangle of light map texels elsewhere that show its light: buried ones, which are filled from
+    /// the nearest texel that can be seen. Empty if there are none.
     shown_elsewhere: Vec<Option<Rect>>,
     top: u8,
 }
@@ -288,7 +289,7 @@ impl BlockMap {
     /// Cuts the charts of an atlas into blocks. `lods`: 1 to [`MAX_LODS`].
     pub fn new(atlas: &Arc<Atlas>, lods: u32, progress: &Progress) -> Result<BlockMap> {
         let top = (lods - 1) as u8;
-        // The light map has as many, of the same sides of the same charts.
+        // The light map has as many placements, of the same sides of the same charts.
         let placements = &atlas.gather.layout.placements;
         let mut map = BlockMap {
             atlas: atlas.clone(),
@@ -342,7 +343,7 @@ impl BlockMap {
         Ok(shown)
     }
 
-    /// The block of a rectangle. `texels` is scratch space.
+    /// Makes the block of a rectangle. `texels` is scratch space.
     fn tile(&mut self, atlas: &Atlas, placement: u32, rect: Rect, texels: &mut Vec<(u8, u32)>) -> Result<Tile> {
         texels.clear();
         texels.extend(rect.texels().filter_map(|(x, y)| {
@@ -350,7 +351,7 @@ impl BlockMap {
             (sample != NONE).then(|| (self.lod_at(placement, x, y), sample))
         }));
         texels.sort_by_key(|t| t.0);
-        // A block must not be without light: its first texel, if none falls on the lowest LOD's grid.
+        // Every block must have light: its first texel is on the lowest LOD if no other texel falls on that grid.
         if let Some(t) = texels.first_mut() {
             t.0 = 0;
         }
@@ -414,7 +415,7 @@ impl BlockMap {
             .map(move |(i, j)| range.start + (j * columns + i) as u32)
     }
 
-    /// Where the light map shows a rectangle of a placement's gather texels, buried texels included.
+    /// The rectangle of the light map that shows a rectangle of a placement's gather texels, buried texels included.
     pub fn shown_in_light_map(&self, placement: u32, rect: &Rect) -> Rect {
         let mut shown = self.rect_in_light_map(placement, rect);
         if !self.shown_elsewhere.is_empty() {
@@ -433,13 +434,13 @@ impl BlockMap {
         shown
     }
 
-    /// Where a rectangle of a placement's gather texels lies in the light map: the smallest rectangle with all of
-    /// them, within the placement's own.
+    /// The rectangle of the light map in which a rectangle of a placement's gather texels lies: the smallest that
+    /// contains them all, within the placement's own rectangle.
     pub fn rect_in_light_map(&self, placement: u32, rect: &Rect) -> Rect {
         rect_in_light_map(&self.atlas, placement, rect)
     }
 
-    /// Bytes held, with those of idle blocks.
+    /// Bytes held, those of idle blocks included.
     pub fn bytes(&self) -> usize {
         let tiles: usize = self.tiles.iter().map(Tile::bytes).sum();
         let elsewhere = size_of_val(&self.shown_elsewhere[..]);
@@ -460,7 +461,8 @@ fn rect_in_light_map(atlas: &Atlas, placement: u32, rect: &Rect) -> Rect {
     };
     let corners =
         [corner(rect.x0, rect.y0), corner(rect.x1, rect.y0), corner(rect.x0, rect.y1), corner(rect.x1, rect.y1)];
-    // Vertices may be as far away as floats go: clipped while they are floats, that no integer overflows.
+    // Vertices may be as far away as floats go: coordinates are clipped while they are floats, so that no integer
+    // overflows.
     let whole = Rect::of(map);
     let ends = [(whole.x0, whole.x1), (whole.y0, whole.y1)];
     let [(x0, x1), (y0, y1)] = std::array::from_fn(|k| {
@@ -468,7 +470,7 @@ fn rect_in_light_map(atlas: &Atlas, placement: u32, rect: &Rect) -> Rect {
         let bound = |f: fn(f32, f32) -> f32| corners[1..].iter().fold(corners[0][k], |b, c| f(b, c[k]));
         let inside = |v: f32| v.clamp(first as f32, end as f32) as i32;
         let (low, high) = (inside(bound(f32::min).floor() - 1.0), inside(bound(f32::max).ceil() + 1.0));
-        // Where digits have run out, it can be anywhere in the placement.
+        // If coordinates have lost all precision, the position can be anywhere in the placement.
         let is_known = corners.iter().all(|c| c[k].is_finite()) && low < high;
         if is_known { (low, high) } else { (first, end) }
     });

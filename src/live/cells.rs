@@ -1,5 +1,5 @@
-//! The light map grid (thesis 3.3.2): a uniform grid over the scene, to whose cells blocks of texels
-//! of all LODs belong. A cell shows its next LOD when all its blocks have it.
+//! The light map grid (thesis 3.3.2): a uniform grid over the scene. A block of texels belongs to one cell, with all
+//! its LODs. A cell shows its next LOD when all its blocks have it.
 
 use super::blocks::{BlockStatus, MAX_LODS, Tile};
 use super::lists::Lists;
@@ -7,13 +7,13 @@ use crate::error::{Result, invalid_argument};
 use crate::memory::{try_collect, try_vec};
 use glam::{UVec3, Vec3};
 
-/// Cells along the longest side unless the size is given.
+/// Number of cells along the longest side unless the size is given.
 const AUTOMATIC_CELLS: f32 = 16.0;
 
-/// More would make a 3D texture that nobody wants.
+/// Maximum number of cells; more would make an unreasonably large 3D texture.
 const MAX_CELLS: u64 = 1 << 24;
 
-/// LOD of cells without surfaces.
+/// The LOD reported for cells without surfaces.
 pub const NO_LOD: u8 = 255;
 
 /// Geometry of the light map grid.
@@ -27,7 +27,7 @@ pub struct CellInfo {
     pub dimensions: [u32; 3],
 }
 
-/// The grid.
+/// The light map grid with its blocks.
 pub(super) struct Grid {
     pub info: CellInfo,
     /// Blocks of each cell.
@@ -42,7 +42,7 @@ impl CellInfo {
         self.dimensions.iter().product::<u32>() as usize
     }
 
-    /// Cell of a position; those outside are clamped.
+    /// The cell of a position; positions outside are clamped.
     pub(super) fn cell(&self, position: Vec3) -> u32 {
         let at = ((position - self.origin) / self.cell_size).floor().max(Vec3::ZERO).as_uvec3();
         let at = at.min(UVec3::from(self.dimensions) - 1);
@@ -98,7 +98,7 @@ impl Grid {
         self.blocks_of(cell).iter().map(|&b| shown[b as usize]).min().unwrap_or(NO_LOD)
     }
 
-    /// Blocks of the cell that has most.
+    /// Number of blocks of the cell that has most.
     pub fn most_blocks(&self) -> usize {
         self.blocks.longest()
     }
@@ -108,13 +108,13 @@ impl Grid {
     }
 }
 
-/// Finds out when all blocks of a cell have a LOD.
+/// Detects when all blocks of a cell have reached a LOD.
 pub(super) struct Promotion {
     /// LOD of the work, by block.
     lods: Vec<u8>,
-    /// Blocks of each LOD, by cell.
+    /// Number of blocks at each LOD, by cell.
     counts: Vec<[u32; MAX_LODS]>,
-    /// LOD that all blocks of a cell have.
+    /// The LOD that all blocks of a cell have reached.
     common: Vec<u8>,
 }
 
@@ -131,7 +131,7 @@ impl Promotion {
         self.lods.len() + self.counts.len() * (size_of::<[u32; MAX_LODS]>() + 1)
     }
 
-    /// Begins anew.
+    /// Counts all blocks anew.
     pub fn count(&mut self, tiles: &[Tile], blocks: &[BlockStatus]) {
         self.counts.fill([0; MAX_LODS]);
         for ((tile, block), lod) in tiles.iter().zip(blocks).zip(&mut self.lods) {
@@ -145,7 +145,7 @@ impl Promotion {
         }
     }
 
-    /// Takes note of the LOD of a block; returns that of its whole cell if it has risen.
+    /// Records the LOD of a block; returns that of its whole cell if it has risen.
     pub fn note(&mut self, b: u32, cell: u32, lod: u8) -> Option<u8> {
         let old = std::mem::replace(&mut self.lods[b as usize], lod);
         let counts = &mut self.counts[cell as usize];

@@ -9,14 +9,14 @@ use crate::memory::{try_filled, try_vec, try_with_capacity};
 use crate::sampling::{combine, mix};
 use std::cmp::Ordering;
 
-/// What choosing needs to remember.
+/// State that choosing keeps from update to update.
 pub(super) struct Chooser {
-    /// Per block, whether something is left to do.
+    /// Per block, whether work is left to do.
     open: Vec<bool>,
     open_count: usize,
     /// Per cell, the least progress of its open blocks; `None`: all are finished.
     least: Vec<Option<u32>>,
-    /// Cells whose `least` is to be found anew.
+    /// Cells whose `least` must be recomputed.
     stale: Vec<bool>,
     /// Cells with marked blocks, in the update under way.
     visible: Vec<u32>,
@@ -26,19 +26,19 @@ pub(super) struct Chooser {
     scratch: Scratch,
 }
 
-/// A cell by its turn: hidden ones last, then by distance.
+/// Sort key of a cell: hidden cells last, then by distance.
 type KeyedCell = (bool, f32, u32);
 
-/// Room for what is sorted, taken once: no update lacks it.
+/// Buffers for sorting, allocated once, so that no update fails for lack of them.
 #[derive(Default)]
 struct Scratch {
-    /// Blocks by what they gain.
+    /// Blocks with their gain.
     blocks: Vec<(f32, u32)>,
     cells: Vec<KeyedCell>,
     of_cell: Vec<u32>,
 }
 
-/// What there is to choose from.
+/// Input of a choice.
 pub(super) struct Choice<'a> {
     pub context: &'a Context,
     pub blocks: &'a [BlockStatus],
@@ -75,7 +75,7 @@ impl Chooser {
         self.open.len() + self.least.len() * (size_of::<Option<u32>>() + 2) + scratch + listed
     }
 
-    /// Part of the blocks on which nothing is left to do.
+    /// Fraction of blocks that are finished.
     pub fn finished(&self) -> f32 {
         1.0 - self.open_count as f32 / self.open.len().max(1) as f32
     }
@@ -84,7 +84,7 @@ impl Chooser {
         self.open[b as usize]
     }
 
-    /// Takes note that a block was worked on.
+    /// Records that a block was worked on.
     pub fn note(&mut self, context: &Context, b: u32, block: &BlockStatus) {
         let tile = &context.map.tiles[b as usize];
         let open = !tile.texels.is_empty() && !block.is_finished(context);
@@ -97,12 +97,12 @@ impl Chooser {
         }
     }
 
-    /// Takes note that the light has changed.
+    /// Records that the light has changed.
     pub fn note_all(&mut self, context: &Context, blocks: &[BlockStatus]) {
         (0..).zip(blocks).for_each(|(b, block)| self.note(context, b, block));
     }
 
-    /// Takes note of what is seen in this update.
+    /// Records which blocks are visible in this update.
     pub fn look(&mut self, map: &BlockMap, visibility: &Visibility) {
         self.visible.drain(..).for_each(|cell| self.is_visible[cell as usize] = false);
         for &b in &visibility.seen {
@@ -113,8 +113,8 @@ impl Chooser {
         }
     }
 
-    /// Seen blocks whose coarse direct light is of other lights than those of now: those that most is
-    /// seen of first, and those first that have waited for long.
+    /// Visible blocks whose coarse direct light was computed under other lights than the current ones: the most visible
+    /// first, and first of all those that have waited for long.
     pub fn wrong(&mut self, from: &Choice, count: usize) -> Vec<u32> {
         let wrong = |&b: &u32| {
             let behind = from.blocks[b as usize].changes_behind(from.context);
@@ -123,12 +123,12 @@ impl Chooser {
         greatest(&mut self.scratch.blocks, from.visibility.seen.iter().filter_map(wrong), count)
     }
 
-    /// The next blocks to work on, the most urgent first, and what is to be done to them.
+    /// The next blocks to work on, the most urgent first, and the step to be done on them.
     pub fn next(&mut self, from: &Choice, mode: Mode, camera: &LiveCamera, count: usize) -> (Step, Vec<u32>) {
         self.turn = self.turn.wrapping_add(1);
         if mode == Mode::Position && self.turn.is_multiple_of(2) {
-            // In turn with cells, direct light of what is seen: shadows that end at the border of a cell
-            // are seen more than any other.
+            // Alternates cells with direct light of visible blocks: shadows that end at the border of a cell are the
+            // most visible of all defects.
             let open = &self.open;
             let missing = |&b: &u32| {
                 let is_missing = open[b as usize] && !from.blocks[b as usize].has_direct(from.context);
@@ -157,7 +157,7 @@ impl Chooser {
                 let n = self.open.len() as u32;
                 let random = |i: u32| mix(combine(self.turn, i)) % n.max(1);
                 if self.open_count < self.open.len() / 16 {
-                    // Few are left: the next ones from somewhere on.
+                    // Few blocks are left: takes the next ones from a random position on.
                     let from = random(0);
                     let around = (from..n).chain(0..from);
                     return around.filter(|&b| self.is_open(b)).take(count).collect();
@@ -172,8 +172,8 @@ impl Chooser {
         }
     }
 
-    /// Blocks of the cells that are next: visible cells before hidden ones, near before far, where each
-    /// LOD that a cell has makes it twice as far.
+    /// Blocks of the next cells: visible cells before hidden ones, near before far, where each LOD that a cell has
+    /// doubles its distance.
     fn next_of_cells(&mut self, from: &Choice, camera: &LiveCamera, count: usize) -> Vec<u32> {
         let top = from.context.map.top() as u32;
         let progress = |b: u32| {
@@ -207,7 +207,7 @@ impl Chooser {
         cells.sort_unstable_by(order);
         let mut chosen = Vec::with_capacity(count);
         for &(_, _, cell) in &*cells {
-            // The least advanced of the cell first: it is promoted as a whole.
+            // The least advanced blocks of the cell come first: a cell is promoted as a whole.
             of_cell.clear();
             of_cell.extend(from.grid.blocks_of(cell).iter().filter(|&&b| self.is_open(b)));
             of_cell.sort_unstable_by_key(|&b| (progress(b), from.visibility.mark(b) == 0.0, b));
@@ -221,7 +221,7 @@ impl Chooser {
     }
 }
 
-/// The `count` greatest, in falling order. `keyed` is scratch space with room for all.
+/// Returns the `count` greatest, in descending order. `keyed` is scratch space with capacity for all.
 fn greatest(keyed: &mut Vec<(f32, u32)>, all: impl Iterator<Item = (f32, u32)>, count: usize) -> Vec<u32> {
     keyed.clear();
     keyed.extend(all);

@@ -27,8 +27,8 @@ use std::sync::Arc;
 const DIM: f32 = 0.02;
 
 impl Live {
-    /// Computes the lowest LOD of everything, under the scene's lights of now. `lightmap` need not be
-    /// baked and is not changed.
+    /// Computes the lowest LOD of all texels, under the scene's current lights. `lightmap` need not be baked and is not
+    /// changed.
     pub fn new(lightmap: &Lightmap, params: &LiveParams, progress: &Progress) -> Result<Live> {
         params.validate()?;
         let device = lightmap.atlas().scene.device();
@@ -39,7 +39,7 @@ impl Live {
         })
     }
 
-    /// All that is needed, nothing computed but photons and radiance.
+    /// Creates the object with all buffers; only photons and radiance are computed.
     pub(super) fn idle(lightmap: &Lightmap, params: &LiveParams, progress: &Progress) -> Result<Live> {
         let atlas = lightmap.atlas();
         let bake = params.bake();
@@ -61,7 +61,7 @@ impl Live {
             + bins.bytes()
             + chooser.bytes()
             + light.radiance.values.len() * size_of::<Vec3>()
-            // Marks, what is seen, and the queues of what is to be shown and fades.
+            // Marks, visible blocks, and the queues of blocks that wait to be shown or fade.
             + map.tiles.len() * 21;
         let memory = atlas.scene.device().memory().reserve(fixed, "the live state")?;
         let all_of = |t: &Tile| t.texels.len() * size_of::<Gathered>() + t.map_texels as usize * size_of::<Vec3>();
@@ -110,7 +110,7 @@ impl Live {
         })
     }
 
-    /// The lowest LOD everywhere. To be called in the pool.
+    /// Computes the lowest LOD everywhere. It must be called in the pool.
     pub(super) fn start(&mut self, progress: &Progress) -> Result<()> {
         let stage = progress.stage("lowest LOD", 0.5, 0.9, self.blocks.len() as u64);
         let limit = Limit::new(None, u64::MAX);
@@ -123,8 +123,7 @@ impl Live {
                 let mut block = Block { status: *status, work };
                 block.work_on_coarse(&context, tile, &limit);
                 block.work_on_indirect(&context, tile, &limit);
-                // One or two texels that lie hidden inside something, or against it, tell nothing of
-                // the others.
+                // One or two texels that lie hidden inside something, or against it, are no evidence about the others.
                 while block.status.lod < top
                     && tile.lod_end[block.status.lod as usize] <= 2
                     && !block.work.sees_light()

@@ -6,10 +6,10 @@ use super::display::Changed;
 use crate::error::Result;
 use crate::memory::{try_collect_ok, try_with_capacity};
 
-/// Two rectangles become one if that has at most this many times the area of both.
+/// Two rectangles are merged if the result has at most this many times the area of both.
 const SLACK: f64 = 1.3;
 
-/// More rectangles than this on one page become one.
+/// Maximum number of rectangles on a page; more are merged into one.
 const MAX_RECTS: usize = 1024;
 
 /// Changed rectangles, by page.
@@ -18,17 +18,17 @@ pub(super) struct Dirty {
 }
 
 impl Dirty {
-    /// All of all pages.
+    /// Creates the list with all pages marked as changed.
     pub fn all(pages: u32, size: u32) -> Result<Dirty> {
         let what = "the list of changes";
-        // Room for one rectangle, into which all others can go.
+        // Capacity for one rectangle, into which all others can be merged.
         let lists = (0..pages).map(|_| try_with_capacity(1, what));
         let mut dirty = Dirty { pages: try_collect_ok(lists, what)? };
         dirty.mark_all(size);
         Ok(dirty)
     }
 
-    /// All of all pages have changed.
+    /// Marks all of all pages as changed.
     pub fn mark_all(&mut self, size: u32) {
         for rects in &mut self.pages {
             rects.clear();
@@ -42,11 +42,11 @@ impl Dirty {
         }
         let rects = &mut self.pages[changed.page as usize];
         let mut new = changed.rect;
-        // A grown rectangle may swallow others in turn.
+        // A grown rectangle may contain others in turn.
         while let Some(i) = rects.iter().position(|r| merges(r, &new)) {
             new = new.union(&rects.swap_remove(i));
         }
-        // Where there is no memory for more, one must do too: light that has changed must not be forgotten.
+        // If there is no memory for more, all are merged into one: light that has changed must not be forgotten.
         if rects.len() >= MAX_RECTS || rects.try_reserve(1).is_err() {
             new = rects.iter().fold(new, |a, r| a.union(r));
             rects.clear();
@@ -59,7 +59,7 @@ impl Dirty {
         self.pages.iter().map(Vec::len).sum()
     }
 
-    /// Hands out up to `capacity` rectangles with their pages.
+    /// Removes up to `capacity` rectangles and passes them with their pages to `put`.
     pub fn take(&mut self, capacity: usize, mut put: impl FnMut(u32, Rect)) {
         let mut left = capacity;
         for (page, rects) in (0..).zip(&mut self.pages) {

@@ -1,6 +1,6 @@
-//! What is shown: indirect light of every gather texel, from its own rays or interpolated from those
-//! of a lower LOD, filled where it cannot be seen, blurred; and its composition with direct light
-//! when a page is read. The sums of the texels are left alone.
+//! The shown light: indirect light of every gather texel, from its own rays or interpolated from those of a lower LOD,
+//! filled where the texel cannot be seen, blurred; and its composition with direct light when a page is read. The sums
+//! of the texels are not changed.
 
 use super::blocks::{BLOCK_TEXELS, BlockMap, Blocks, DirectTile, Rect, TILE};
 use super::relight::Illumination;
@@ -13,62 +13,61 @@ use glam::Vec3;
 use rayon::prelude::*;
 use std::sync::Arc;
 
-/// Unseen texels are filled from those that are seen within this distance.
+/// Distance in gather texels within which texels that cannot be seen are filled from those that can.
 const FILLED: i32 = TILE;
 
-/// Updates over which a block whose cell was promoted goes from what was shown to what is known: cells
-/// are large, and would be seen to jump.
+/// Number of updates in which a block whose cell was promoted fades from its shown to its newest light: cells are
+/// large, and sudden changes would be visible.
 const FADE: u8 = 6;
 
-/// What is shown.
+/// The shown light.
 pub(super) struct Display {
     /// Indirect irradiance per gather texel, not blurred.
     plain: Vec<Vec3>,
-    /// What is shown of it.
+    /// Indirect irradiance as shown: blurred, and fading.
     shown: Vec<Vec3>,
-    /// Direct irradiance of the lowest LOD per gather texel, interpolated: shown until a block has
-    /// more.
+    /// Direct irradiance of the lowest LOD per gather texel, interpolated: shown until a block has direct light at full
+    /// resolution.
     coarse: Vec<Vec3>,
-    /// What `coarse` was when a block's direct tile was made. The difference corrects tiles that were
-    /// made under other lights, which keeps the shadows of the lights that did not change. Empty
-    /// until a light changes.
+    /// Value of `coarse` when a block's direct tile was made. The difference corrects tiles that were made under other
+    /// lights, which keeps the shadows of the lights that did not change. Empty until a light changes.
     coarse_of_tile: Vec<Vec3>,
     normals: Vec<Vec3>,
-    /// Of `plain`; infinite where it is interpolated.
+    /// Variances of `plain`; infinite where it is interpolated.
     variances: Vec<f32>,
-    /// Whether a gather texel can be seen, as far as is known.
+    /// Whether a gather texel can be seen, as far as is known so far.
     visible: Vec<bool>,
-    /// How many gather texels cannot, by block, and the number of blocks with such texels.
+    /// Number of gather texels that cannot be seen, by block, and the number of blocks with such texels.
     unseen: Vec<u8>,
     blocks_with_unseen: u32,
-    /// The LOD in use, by block: that of the work, or less until the block's cell is promoted.
+    /// The LOD in use, by block: that of its work, or a lower one until the block's cell is promoted.
     pub lods: Vec<u8>,
-    /// The LOD whose texels have light of now, by block, at most that in use.
+    /// The LOD whose texels have current light, by block, at most that in use.
     fresh: Vec<u8>,
-    /// Indirect irradiance before the last change of light. What the fresh texels differ from it by is
-    /// interpolated and added to it, which keeps its detail. Empty until light changes.
+    /// Indirect irradiance before the last change of light. The change at fresh texels is interpolated and added to it,
+    /// which keeps its detail. Empty until light changes.
     old: Vec<Vec3>,
     /// Direct light at full resolution, by block.
     tiles: Vec<Option<Arc<DirectTile>>>,
-    /// Changes of the lights before the tile was made, and so far.
+    /// Epoch of the lights, counted in changes, when the tile was made, and now.
     tile_epochs: Vec<u32>,
     epoch: u32,
-    /// Updates left of the fade, by block.
+    /// Number of updates left of the fade, by block.
     fades: Vec<u8>,
     blur: i32,
     scratch: Scratch,
 }
 
-/// New values of texels of the display, in the making.
+/// A new value of a texel of the display.
 type NewValue = (u32, Vec3);
 
-/// Blocks whose texels get new values at a time.
+/// Number of blocks whose texels get new values at a time.
 const BLOCKS_AT_ONCE: usize = 256;
 
-/// Room for what changes at a time, taken once: no update lacks it.
+/// Buffers for the values that change at a time, allocated once, so that no update fails for lack of them.
 #[derive(Default)]
 struct Scratch {
-    /// Blocks that interpolate, and those that are filled.
+    /// Blocks that interpolate, and blocks that are filled.
     all: Vec<u32>,
     to_fill: Vec<u32>,
     /// New values by block, in slots of equal size. A slot that is not full ends with the sample [`NONE`].
@@ -97,7 +96,7 @@ fn slot(blur: i32) -> usize {
     (TILE + 2 * blur).pow(2) as usize
 }
 
-/// Has `compute` put new values of texels of each block into its slot, in parallel.
+/// Calls `compute` in parallel to put new values of texels of each block into its slot.
 fn compute_values<B: Copy + Sync>(
     values: &mut [NewValue],
     slot: usize,
@@ -113,12 +112,12 @@ fn compute_values<B: Copy + Sync>(
     });
 }
 
-/// What [`compute_values`] has computed for so many blocks.
+/// The values that [`compute_values`] has computed for the first `blocks` blocks.
 fn computed(values: &[NewValue], slot: usize, blocks: usize) -> impl Iterator<Item = NewValue> {
     values.chunks(slot).take(blocks).flat_map(|of_block| of_block.iter().copied().take_while(|v| v.0 != NONE))
 }
 
-/// New values of one block.
+/// Buffer for the new values of one block.
 struct Slot<'a> {
     room: &'a mut [NewValue],
     used: usize,
@@ -131,7 +130,7 @@ impl Slot<'_> {
     }
 }
 
-/// Where changes of the shown light lie in the light map: a rectangle of a page.
+/// A change of the shown light: a rectangle of a page of the light map.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub(super) struct Changed {
     pub page: u32,
@@ -171,7 +170,7 @@ impl Display {
         })
     }
 
-    /// A copy, which shares direct light at full resolution.
+    /// Copies the display; direct light at full resolution is shared.
     pub fn try_clone(&self) -> Result<Display> {
         Ok(Display {
             plain: copy_of(&self.plain)?,
@@ -195,7 +194,7 @@ impl Display {
         })
     }
 
-    /// Bytes of direct light at full resolution.
+    /// Bytes held by direct light at full resolution.
     pub fn tile_bytes(&self) -> usize {
         self.tiles.iter().flatten().map(|t| t.bytes()).sum()
     }
@@ -206,7 +205,7 @@ impl Display {
         missing(&self.old) + missing(&self.coarse_of_tile)
     }
 
-    /// Makes room for what the next epochs of light keep, so that their beginning cannot fail.
+    /// Allocates the buffers of the next epochs of light, so that their beginning cannot fail.
     pub fn make_room_for_epochs(&mut self) -> Result<()> {
         for copy in [&mut self.old, &mut self.coarse_of_tile] {
             copy.try_reserve_exact(self.plain.len() - copy.len())
@@ -215,7 +214,7 @@ impl Display {
         Ok(())
     }
 
-    /// Bytes held, without the tiles.
+    /// Bytes held, without those of the tiles.
     pub fn bytes(&self) -> usize {
         let per_texel = 4 * size_of::<Vec3>() + size_of::<f32>() + 1;
         let per_block = size_of::<Option<Arc<DirectTile>>>() + size_of::<DirectTile>() + size_of::<u32>() + 4;
@@ -225,8 +224,8 @@ impl Display {
             + self.scratch.bytes()
     }
 
-    /// Shows what `changed` blocks know now, at most [`SHOWN_AT_ONCE`]; tells `note` where that changes the light map.
-    /// A block that is away keeps what it shows until it is back.
+    /// Shows the newest light of the `changed` blocks, at most [`SHOWN_AT_ONCE`]; reports to `note` where that changes
+    /// the light map. A block that is away keeps its shown light until it is back.
     pub fn refresh(&mut self, map: &BlockMap, blocks: &Blocks, changed: &[u32], note: impl FnMut(Changed)) {
         for &b in changed {
             let Some(block) = blocks.work(b) else { continue };
@@ -244,13 +243,13 @@ impl Display {
         self.spread(map, changed, note);
     }
 
-    /// Interpolates, fills and blurs what depends on texels of the `changed` blocks; tells `note` where that
-    /// changes the light map.
+    /// Interpolates, fills and blurs the texels that depend on those of the `changed` blocks; reports to `note` where
+    /// that changes the light map.
     fn spread(&mut self, map: &BlockMap, changed: &[u32], mut note: impl FnMut(Changed)) {
         let mut scratch = std::mem::take(&mut self.scratch);
         let Scratch { all, to_fill, values } = &mut scratch;
         let top = map.top();
-        // Neighbours that interpolate do so between texels of these blocks too.
+        // Neighbouring blocks that interpolate use texels of these blocks too.
         all.clear();
         all.extend_from_slice(changed);
         for &b in changed {
@@ -258,8 +257,8 @@ impl Display {
         }
         all.sort_unstable();
         all.dedup();
-        // The texels that are interpolated are none of those between which others are: parts of all blocks may follow
-        // one another.
+        // No texel is both interpolated and a source of interpolation, so parts of all blocks may be processed one
+        // after the other.
         for some in all.chunks(BLOCKS_AT_ONCE) {
             compute_values(values, BLOCK_TEXELS, some, |b, slot| self.interpolate_block(map, b, slot));
             for (sample, value) in computed(values, BLOCK_TEXELS, some.len()) {
@@ -275,7 +274,7 @@ impl Display {
             to_fill.sort_unstable();
             to_fill.dedup();
         }
-        // Those that can be seen, which alone are looked at, are not filled.
+        // Only texels that can be seen are read, and these are not filled.
         for some in to_fill.chunks(BLOCKS_AT_ONCE) {
             compute_values(values, BLOCK_TEXELS, some, |b, slot| self.fill(map, b, slot));
             for (sample, value) in computed(values, BLOCK_TEXELS, some.len()) {
@@ -295,7 +294,7 @@ impl Display {
             compute_values(values, slot_size, some, |b, slot| {
                 let (placement, rect) = grown(b);
                 let mut window = Window::new(self.blur);
-                // Blocks that fade get there by themselves.
+                // Blocks that fade reach their values by fading.
                 let is_still = |&(x, y): &(i32, i32)| self.fades[map.block_at(placement, x, y) as usize] == 0;
                 let at = |(x, y)| map.atlas.gather.at(placement, x, y);
                 let samples = rect.texels().filter(is_still).map(at).filter(|&s| s != NONE);
@@ -305,13 +304,13 @@ impl Display {
                 self.shown[sample as usize] = value;
             }
         }
-        // A texel of the light map interpolates between four of the gather map.
+        // A texel of the light map interpolates between four texels of the gather map.
         let changes = all.iter().map(|&b| grown(b)).map(|(p, rect)| in_light_map(map, p, &rect.grown(1)));
         changes.for_each(&mut note);
         self.scratch = scratch;
     }
 
-    /// The indirect light of a block's texels above the LOD whose light is of now.
+    /// Interpolates the indirect light of a block's texels above the LOD that has current light.
     fn interpolate_block(&self, map: &BlockMap, b: u32, slot: &mut Slot) {
         let (tile, lod) = (&map.tiles[b as usize], self.fresh[b as usize]);
         let known = |s: u32, x, y| map.lod_of[s as usize] <= self.fresh[map.block_at(tile.placement, x, y) as usize];
@@ -319,8 +318,8 @@ impl Display {
             if self.old.is_empty() {
                 return self.interpolate(map, b, lod, s, known, |s| self.plain[s]);
             }
-            // What is around has changed by so much; but where that is more than there was here, by such a
-            // part: nothing goes black because its surroundings lost more than it had.
+            // Adds the change of the surroundings; where the sum would be negative, scales by their relative change
+            // instead: nothing goes black because its surroundings lost more light than it had.
             let around = |of: &[Vec3]| self.interpolate(map, b, lod, s, known, |s| of[s]);
             let (old, before, now) = (self.old[s as usize], around(&self.old), around(&self.plain));
             let sum = old + (now - before);
@@ -329,7 +328,7 @@ impl Display {
         tile.texels[tile.lod_end[lod as usize] as usize..].iter().for_each(|&s| slot.put(s, value(s)));
     }
 
-    /// What would be shown if no block were above a LOD.
+    /// The display as it would be if no block were above a LOD.
     pub fn lowered(&self, map: &BlockMap, lod: u8) -> Result<Display> {
         let mut lower = self.try_clone()?;
         lower.lods.iter_mut().for_each(|l| *l = lod.min(*l));
@@ -341,22 +340,23 @@ impl Display {
         Ok(lower)
     }
 
-    /// Has a block reach what is known in steps of [`fade`](Self::fade). Tells whether it did not already.
+    /// Starts fading a block to its newest light in steps of [`fade`](Self::fade). Returns whether it was not fading
+    /// already.
     pub fn begin_fade(&mut self, b: u32) -> bool {
         std::mem::replace(&mut self.fades[b as usize], FADE) == 0
     }
 
-    /// Whatever fades is there with the next refresh.
+    /// Ends all fades: with the next refresh blocks show their newest light.
     pub fn end_fades(&mut self) {
         self.fades.fill(0);
     }
 
-    /// Whether a block is still to fade.
+    /// Whether a block is still fading.
     pub fn is_fading(&self, b: u32) -> bool {
         self.fades[b as usize] > 0
     }
 
-    /// One step of blocks that fade; tells `note` where that changes the light map.
+    /// Does one step of fading `blocks`; reports to `note` where that changes the light map.
     pub fn fade(&mut self, map: &BlockMap, blocks: &[u32], mut note: impl FnMut(Changed)) {
         let mut scratch = std::mem::take(&mut self.scratch);
         for some in blocks.chunks(BLOCKS_AT_ONCE) {
@@ -411,8 +411,8 @@ impl Display {
         texels.iter().copied().filter(|&s| !self.visible[s as usize])
     }
 
-    /// The value of a texel that has none of its own at LOD `lod`: bilinear between the corners of that
-    /// LOD's grid that are `known`; else the mean of the block's own by inverse square distance.
+    /// Value of a texel that has no value of its own at LOD `lod`: bilinear between the corners of that LOD's grid that
+    /// are `known`; else the mean of the block's own values by inverse square distance.
     fn interpolate(
         &self,
         map: &BlockMap,
@@ -454,13 +454,13 @@ impl Display {
         if total > 0.0 { sum / total } else { Vec3::ZERO }
     }
 
-    /// Keeps what is shown as the light of before a change.
+    /// Keeps the indirect light as that before a change.
     pub fn begin_indirect_epoch(&mut self) {
         self.old.clear();
         self.old.extend_from_slice(&self.plain);
     }
 
-    /// Has tiles that were made under other lights than those of now corrected by coarse light.
+    /// Begins an epoch in which tiles that were made under older lights are corrected by coarse light.
     pub fn begin_direct_epoch(&mut self) {
         if self.coarse_of_tile.is_empty() {
             self.coarse_of_tile.extend_from_slice(&self.coarse);
@@ -468,7 +468,7 @@ impl Display {
         self.epoch += 1;
     }
 
-    /// A tile that was current before the last change is so still.
+    /// Marks a tile that was current before the last change as still current.
     pub fn keep_tile(&mut self, b: u32) {
         if self.tile_epochs[b as usize] + 1 == self.epoch {
             self.tile_epochs[b as usize] = self.epoch;
@@ -476,7 +476,7 @@ impl Display {
     }
 
     /// Takes over the direct light of the lowest LOD's texels of `changed` blocks, at most [`SHOWN_AT_ONCE`], and
-    /// interpolates it to the others; tells `note` where that changes the light map.
+    /// interpolates it to the other texels; reports to `note` where that changes the light map.
     pub fn take_coarse(&mut self, map: &BlockMap, blocks: &mut Blocks, changed: &[u32], mut note: impl FnMut(Changed)) {
         let mut scratch = std::mem::take(&mut self.scratch);
         let Scratch { all, values, .. } = &mut scratch;
@@ -500,7 +500,7 @@ impl Display {
         self.scratch = scratch;
     }
 
-    /// The coarse direct light of a block's texels above the lowest LOD.
+    /// Interpolates the coarse direct light of a block's texels above the lowest LOD.
     fn interpolate_coarse(&self, map: &BlockMap, b: u32, slot: &mut Slot) {
         let tile = &map.tiles[b as usize];
         let lowest = |s: u32, _, _| map.lod_of[s as usize] == 0;
@@ -508,8 +508,8 @@ impl Display {
         tile.texels[tile.lod_end[0] as usize..].iter().for_each(|&s| slot.put(s, value(s)));
     }
 
-    /// Takes over the direct light of a block at full resolution; returns where that changes the light
-    /// map, and by how many bytes the display has grown.
+    /// Takes over the direct light of a block at full resolution; returns the rectangle that changes, and by how many
+    /// bytes the display has grown.
     pub fn take_direct(&mut self, map: &BlockMap, b: u32, tile: DirectTile) -> (Changed, isize) {
         if !self.coarse_of_tile.is_empty() {
             for &s in &map.tiles[b as usize].texels {
@@ -522,7 +522,7 @@ impl Display {
         (self.block_rect(map, b), grown - old.map_or(0, |t| t.bytes() as isize))
     }
 
-    /// Direct light of a block at full resolution, and whether it is that of the lights of now.
+    /// Direct light of a block at full resolution, and whether it was computed under the current lights.
     pub fn direct_tile(&self, b: u32) -> Option<(&DirectTile, bool)> {
         self.tiles[b as usize].as_deref().map(|t| (t, self.tile_epochs[b as usize] == self.epoch))
     }
@@ -533,11 +533,11 @@ impl Display {
         in_light_map(map, tile.placement, &tile.rect.grown(1))
     }
 
-    /// The unseen texels of a block with the mean of their neighbours, ring by ring from those that are
-    /// seen. (A bake fills across whole charts: here work on a block must stay short.)
+    /// Fills a block's texels that cannot be seen with the mean of their neighbours, ring by ring from those that can.
+    /// (A bake fills across whole charts: here work on a block must stay short.)
     fn fill(&self, map: &BlockMap, b: u32, slot: &mut Slot) {
         let tile = &map.tiles[b as usize];
-        // Texels in ascending order, with the ring that filled them; 0: none yet.
+        // Texels in ascending order, with the ring that filled them; 0: not filled yet.
         let mut room = [(NONE, 0, Vec3::ZERO); 9 * BLOCK_TEXELS];
         let mut count = 0;
         for s in map.neighbours(b).chain([b]).flat_map(|b| self.unseen_of(map, b)) {
@@ -597,7 +597,7 @@ impl Display {
         }
         let placement = atlas.map.placement_of(&atlas.charts, sample as usize);
         let local = atlas.texel_local(placement, sample as usize);
-        // Coordinates are not negative, so that truncation rounds down.
+        // Coordinates are not negative, so truncation rounds down.
         let at = atlas.gather.layout.texel_coord(placement, local);
         let b = map.block_at(placement, at[0] as i32, at[1] as i32) as usize;
         let fine = self.tiles[b].as_ref().and_then(|tile| {
@@ -618,8 +618,8 @@ impl Display {
             }
     }
 
-    /// What the coarse direct light around a point has changed by since the tile of its block was made.
-    /// Neighbours whose tiles are of other times say nothing of that.
+    /// Change of the coarse direct light around a point since the tile of its block was made. Neighbours whose tiles
+    /// were made in other epochs do not contribute.
     fn change_of_direct(&self, map: &BlockMap, placement: u32, local: [f32; 2], b: usize) -> Vec3 {
         let gather = &map.atlas.gather;
         let (mut sum, mut total) = (Vec3::ZERO, 0.0);
@@ -643,7 +643,8 @@ fn own_rect(map: &BlockMap, placement: u32) -> Rect {
     Rect::of(&map.atlas.gather.layout.placements[placement as usize])
 }
 
-/// Where the light map shows a rectangle of a placement's gather texels, the padding that repeats it included.
+/// The rectangle of the light map that shows a rectangle of a placement's gather texels, the padding around it
+/// included.
 fn in_light_map(map: &BlockMap, placement: u32, rect: &Rect) -> Changed {
     let layout = &map.atlas.map.layout;
     let padding = map.atlas.padding as i32;

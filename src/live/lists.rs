@@ -1,17 +1,17 @@
-//! Very many short lists of numbers in two buffers: whatever their number, there are two allocations that can fail.
+//! Very many short lists of numbers in two buffers: however many lists there are, only two allocations can fail.
 
 use crate::error::{Error, Result};
 use crate::memory::try_vec;
 
-/// Lists of numbers, which never change.
+/// Immutable lists of numbers.
 pub(super) struct Lists {
-    /// Where each list begins; one more than there are lists.
+    /// Start of each list, and the end of the last.
     first: Vec<u32>,
     items: Vec<u32>,
 }
 
 impl Lists {
-    /// `count` lists. `visit` calls its argument with the number of a list and what comes next in it. It is called
+    /// Makes `count` lists. `visit` calls its argument with the index of a list and the next number in it. It is called
     /// twice and must do the same both times.
     pub fn new(count: usize, what: &str, visit: impl Fn(&mut dyn FnMut(usize, u32))) -> Result<Lists> {
         let mut first: Vec<u32> = try_vec(count + 1, what)?;
@@ -32,7 +32,7 @@ impl Lists {
             items[first[list] as usize] = item;
             first[list] += 1;
         });
-        // Each list now has its end, which is where the next one begins.
+        // Each entry is now the end of its list, which is the start of the next one.
         first.rotate_right(1);
         first[0] = 0;
         Ok(Lists { first, items })

@@ -53,26 +53,26 @@ use std::time::{Duration, Instant};
 use visibility::Visibility;
 use work::{Context, Limit, Step};
 
-/// Blocks that one pass of an update works on. More would let their light wait; fewer would leave
-/// threads without work at the end of a pass.
+/// Number of blocks that one pass of an update works on. With more, their light would be shown later; with fewer,
+/// threads would be without work at the end of a pass.
 const PASS: usize = 32;
 
-/// Part of the time budget that is left to showing what was computed and to leaving.
+/// Fraction of the time budget that is reserved for showing results and for returning.
 const SPARE: f64 = 0.15;
 
-/// Blocks that are shown at once where all are: fewer than have a MB of texels.
+/// Number of blocks that are shown at a time when all are: their texels take less than a MB.
 const SHOWN_AT_ONCE: usize = 512;
 
-/// Memory is announced to the monitor in steps of so many bytes.
+/// Memory is announced to the monitor in steps of this many bytes.
 const MEMORY_STEP: usize = 1 << 20;
 
-/// A scene's light under refinement.
+/// Live light of a scene, refined by updates.
 pub struct Live {
     params: LiveParams,
     bake: BakeParams,
-    /// Blocks with their lights, as work on them sees them.
+    /// Blocks with their light, as needed by work on them.
     context: Context,
-    /// The lights that direct light is of.
+    /// The lights under which direct light is computed.
     lights: Arc<Vec<Light>>,
     relight: Relight,
     blocks: Blocks,
@@ -83,20 +83,20 @@ pub struct Live {
     visibility: Visibility,
     chooser: Chooser,
     dirty: Dirty,
-    /// Blocks to show anew.
+    /// Queue of blocks whose shown light must be refreshed.
     waiting: VecDeque<u32>,
     is_waiting: Vec<bool>,
-    /// Blocks that fade to what is known, and room for those that go on fading. All blocks fit into each.
+    /// Blocks that are fading, and a buffer for those that go on fading. Each has capacity for all blocks.
     fading: Vec<u32>,
     still_fading: Vec<u32>,
     /// Work that goes on between updates, on blocks that are then away from `blocks`.
     background: Option<Background>,
     paused: bool,
-    /// Seconds that showing a block took lately: its indirect light; coarse direct light.
+    /// Recent duration in seconds of showing a block: its indirect light; coarse direct light.
     refresh_seconds: f64,
     coarse_seconds: f64,
     total_rays: u64,
-    /// Bytes of what never grows, and of what blocks and display have allocated since.
+    /// Bytes held by buffers that never grow, and those allocated since by blocks and display.
     fixed: usize,
     held: isize,
     bytes_full: u64,
@@ -112,12 +112,12 @@ impl Live {
         self.context.map.atlas.scene.device().clone()
     }
 
-    /// The scene that is lit.
+    /// The scene whose light this is.
     pub fn scene(&self) -> &Arc<Scene> {
         &self.context.map.atlas.scene
     }
 
-    /// How it was made.
+    /// The parameters it was created with.
     pub fn params(&self) -> &LiveParams {
         &self.params
     }
@@ -132,7 +132,7 @@ impl Live {
         let result = self.collect(&mut stats).and_then(|()| {
             self.take_new_light()?;
             if !budget.is_nothing() {
-                // On the pool as a whole: going there and back takes as long as a hundred rays.
+                // Enters the pool once per update: each entry takes as long as a hundred rays.
                 device.install(|| self.spend(start, camera, budget, &mut stats))?;
             }
             self.start_background(camera)
@@ -144,7 +144,7 @@ impl Live {
         Ok(stats)
     }
 
-    /// Works until the budget is used up. To be called in the pool.
+    /// Works until the budget is used up. It must be called in the pool.
     fn spend(&mut self, start: Instant, camera: &LiveCamera, budget: &Budget, stats: &mut LiveStats) -> Result<()> {
         let seconds = budget.milliseconds as f64 * 1e-3;
         let end = (seconds > 0.0).then(|| start + Duration::from_secs_f64(seconds));
@@ -156,7 +156,7 @@ impl Live {
         let mut traced = 0;
         let over = |traced: u64| traced >= most_rays || end.is_some_and(|e| Instant::now() >= e);
         while !over(traced) {
-            // What is waiting to be shown comes first, then wrong light, then the next blocks.
+            // Blocks that wait to be shown come first, then wrong direct light, then the next blocks.
             self.show_waiting(end, stats);
             let left = end.map_or(f64::INFINITY, |e| e.saturating_duration_since(Instant::now()).as_secs_f64());
             let mut step = Step::Coarse;
@@ -181,12 +181,11 @@ impl Live {
         Ok(())
     }
 
-    /// Works on blocks in order, each on one thread, and takes over what became of them; returns the
-    /// rays traced.
+    /// Works on blocks in order, each on one thread, and takes over their results; returns the number of rays traced.
     fn work_on(&mut self, chosen: &[u32], step: Step, limit: Limit, stats: &mut LiveStats) -> Result<u64> {
         self.reserve_for(chosen)?;
         let start = Instant::now();
-        // Showing what is completed takes time too.
+        // Showing completed blocks takes time too.
         let seconds = if step == Step::Coarse { self.coarse_seconds } else { self.refresh_seconds };
         let showing = Duration::from_secs_f64(seconds);
         let batch = Batch::new(self.context.clone(), &mut self.blocks, chosen, step, limit, showing)?;
@@ -200,7 +199,7 @@ impl Live {
         result.map(|()| traced)
     }
 
-    /// Puts blocks back and shows, or has shown, what became of them. To be called in the pool.
+    /// Puts blocks back and shows their results or queues them to be shown. It must be called in the pool.
     fn take_over(&mut self, mut items: Vec<Mutex<Item>>, stats: &mut LiveStats) {
         let map = self.context.map.clone();
         let mut coarse = Vec::new();
@@ -232,18 +231,18 @@ impl Live {
         }
     }
 
-    /// Announces what work on blocks may allocate.
+    /// Announces the memory that work on blocks may allocate.
     fn reserve_for(&mut self, chosen: &[u32]) -> Result<()> {
         let growth = |&b: &u32| {
             let tile = &self.context.map.tiles[b as usize];
-            // Direct light under way is held beside that which is shown.
+            // Direct light under way is held beside the shown one.
             tile.texels.len() * (size_of::<Gathered>() + size_of::<Vec3>())
                 + 2 * tile.map_texels as usize * size_of::<Vec3>()
         };
         self.reserve(chosen.iter().map(growth).sum())
     }
 
-    /// Announces more bytes than are held, in steps, so that the monitor is rarely asked.
+    /// Announces more bytes than are held, in steps, so that the monitor is called rarely.
     fn reserve(&mut self, more: usize) -> Result<()> {
         let needed = self.fixed + self.held.max(0) as usize + more;
         if needed > self.memory.bytes() {
@@ -252,14 +251,14 @@ impl Live {
         Ok(())
     }
 
-    /// Gives back what was announced beyond what is held.
+    /// Returns the announced bytes that are not held.
     fn settle(&mut self) {
         let held = self.fixed + self.held.max(0) as usize;
         self.memory.shrink(held.next_multiple_of(MEMORY_STEP));
     }
 
-    /// Has room for what the display keeps of the light of before a change, so that nothing fails when new light is
-    /// there.
+    /// Allocates the buffers in which the display keeps the light from before a change, so that taking over new light
+    /// cannot fail.
     fn make_room_for_epochs(&mut self) -> Result<()> {
         self.reserve(self.display.room_missing_for_epochs())?;
         let before = self.display.bytes();
@@ -293,12 +292,12 @@ impl Live {
     }
 }
 
-/// What nobody else has a lock on.
+/// The content of a mutex on which nobody else has a lock.
 fn inside<T>(of: &mut Mutex<T>) -> &mut T {
     of.get_mut().unwrap_or_else(|e| e.into_inner())
 }
 
-/// The numbers of all blocks, in parts that are shown at once.
+/// The numbers of all blocks, in parts that are shown at a time.
 fn in_parts(blocks: usize) -> impl Iterator<Item = Vec<u32>> {
     let end = blocks as u32;
     (0..end).step_by(SHOWN_AT_ONCE).map(move |first| (first..end).take(SHOWN_AT_ONCE).collect())

@@ -1,4 +1,4 @@
-//! What live updates are asked for and what they report.
+//! Parameters of live updates, and the numbers that they report.
 
 use super::MAX_LODS;
 use crate::error::{Result, invalid_argument};
@@ -7,7 +7,7 @@ use crate::lightmap::indirect::blur::MAX_BLUR_RADIUS;
 use crate::lightmap::indirect::sample_set::ROUND;
 use glam::Vec3;
 
-/// Which blocks updates work on.
+/// The choice of blocks that updates work on.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub enum Mode {
     /// Refine the surfaces in view.
@@ -21,7 +21,7 @@ pub enum Mode {
 /// Parameters of live updates.
 #[derive(Clone, Copy, Debug, PartialEq)]
 pub struct LiveParams {
-    /// Where updates work.
+    /// The choice of blocks that updates work on.
     pub mode: Mode,
     /// Number of levels of detail, 1 to [`MAX_LODS`]. The lowest computes every 2^(lod_count − 1)-th gather texel per
     /// axis.
@@ -88,7 +88,7 @@ pub struct LiveCamera {
     pub height: u32,
 }
 
-/// Limits of an update. With both 0 nothing is traced.
+/// Limits of an update. If both are 0, nothing is traced.
 #[derive(Clone, Copy, Debug, PartialEq)]
 pub struct Budget {
     /// Time limit in milliseconds; 0: none.
@@ -114,7 +114,7 @@ pub struct LiveStats {
     pub rays: u64,
     /// Number of rays traced since the beginning.
     pub total_rays: u64,
-    /// Number of cells that went to a higher LOD.
+    /// Number of cells that were promoted to a higher LOD.
     pub cells_promoted: u32,
     /// Number of blocks whose shown light changed.
     pub blocks_changed: u32,
@@ -158,7 +158,7 @@ impl LiveParams {
         self.bake().validate()
     }
 
-    /// The bake that the updates converge to.
+    /// Parameters of the bake that the updates converge to.
     pub fn bake(&self) -> BakeParams {
         BakeParams {
             photon_count: self.photon_count,
@@ -168,7 +168,7 @@ impl LiveParams {
             blur_radius: self.blur,
             direct_samples: self.direct_samples,
             seed: self.seed,
-            // What is shown changes block by block, and each block is shown as it is.
+            // Shown light changes block by block, and each block is shown as it is.
             stitch: false,
             ..Default::default()
         }

@@ -1,4 +1,4 @@
-//! Reading rectangles of the shown light: which groups of charts lie in a rectangle, and their composition.
+//! Reads rectangles of the shown light: finds the groups of charts that lie in a rectangle, and composes them.
 
 use super::blocks::{BlockMap, Rect};
 use super::display::Display;
@@ -10,19 +10,19 @@ use crate::memory::{try_append, try_vec, try_with_capacity};
 use glam::Vec3;
 use rayon::prelude::*;
 
-/// Side of a bin in texels. (16 is no faster: time goes to the search of the nearest texel in the padding.)
+/// Side of a bin in texels. (16 is no faster: the time goes into the search for the nearest texel in the padding.)
 const BIN: i32 = 64;
 
-/// Rows that a thread composes at a time.
+/// Number of rows that a thread composes at a time.
 const ROWS: usize = 16;
 
-/// Rectangles of fewer texels are composed by the calling thread: waking others takes longer.
+/// Rectangles of fewer texels are composed by the calling thread: waking others would take longer.
 const SMALL: usize = 4096;
 
-/// Groups of charts (see [`TexelMap::group_count`](crate::lightmap::atlas::texels::TexelMap)) by where they lie: bins of
+/// Groups of charts (see [`TexelMap::group_count`](crate::lightmap::atlas::texels::TexelMap)) by position, in bins of
 /// 64 × 64 texels of the pages.
 pub(super) struct ChartBins {
-    /// Bins along a side of a page.
+    /// Number of bins along a side of a page.
     side: i32,
     bins: Lists,
 }
@@ -57,7 +57,7 @@ impl ChartBins {
     }
 }
 
-/// The bins that a rectangle of a page lies in, of pages with `side` bins along each side.
+/// Indices of the bins that a rectangle of a page overlaps; pages have `side` bins along each side.
 fn overlapping(side: i32, page: u32, area: &PageArea) -> impl Iterator<Item = usize> + use<> {
     let clamp = |v: i32| v.clamp(0, side - 1);
     let columns = clamp(area.columns.start / BIN)..clamp((area.columns.end - 1) / BIN) + 1;
@@ -67,9 +67,9 @@ fn overlapping(side: i32, page: u32, area: &PageArea) -> impl Iterator<Item = us
 }
 
 impl Live {
-    /// Irradiance shown in a rectangle of a page, row by row; `with_direct` false: indirect light
-    /// alone. Texels around charts repeat the nearest of the chart, up to the padding. `lod` below the
-    /// highest: what would be shown if no block were above it (slow).
+    /// Irradiance shown in a rectangle of a page, row by row; `with_direct` false: indirect light alone. Texels around
+    /// charts repeat the chart's nearest texel, up to the padding. `lod` below the highest: reads the light as it would
+    /// be shown if no block were above it (slow).
     pub fn read(&self, rect: &PageRect, lod: u32, with_direct: bool) -> Result<Vec<[f32; 3]>> {
         let atlas = &self.context.map.atlas;
         let size = self.page_size();
@@ -121,15 +121,15 @@ impl Live {
 }
 
 impl Live {
-    /// Removes and returns up to `capacity` rectangles whose shown light has changed since they were
-    /// last taken. At first all pages are.
+    /// Removes and returns up to `capacity` rectangles whose shown light has changed since they were last taken. At
+    /// first these are all pages.
     pub fn take_dirty(&mut self, capacity: usize) -> Result<Vec<PageRect>> {
         let mut all = try_with_capacity(capacity.min(self.dirty.len()), "the list of changes")?;
         self.take_each_dirty(capacity, |rect| all.push(rect));
         Ok(all)
     }
 
-    /// [`take_dirty`](Self::take_dirty), handed out one by one.
+    /// Does the work of [`take_dirty`](Self::take_dirty), but passes the rectangles to `put` one by one.
     pub fn take_each_dirty(&mut self, capacity: usize, mut put: impl FnMut(PageRect)) {
         let size = self.page_size() as i32;
         let page = Rect { x0: 0, y0: 0, x1: size, y1: size };
@@ -141,7 +141,7 @@ impl Live {
         });
     }
 
-    /// Width and height of the pages, as those of the light map.
+    /// Width and height of the pages: the same as those of the light map.
     pub fn page_size(&self) -> u32 {
         self.context.map.atlas.map.layout.page_size
     }
@@ -162,8 +162,7 @@ impl Live {
     }
 
     #[doc(hidden)]
-    /// Sums and rays of every gather texel, by sample: the part of the state that bakes share. For
-    /// tests.
+    /// Sums and numbers of rays of every gather texel, by sample: the part of the state that bakes share. For tests.
     pub fn sums(&mut self) -> Result<Vec<([f32; 3], u32)>> {
         self.collect_now()?;
         let mut sums = try_vec(self.context.map.atlas.gather.len(), "the sums of texels")?;

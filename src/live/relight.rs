@@ -1,5 +1,5 @@
-//! What live updates are lit by: lights, radiance map and sides, and their renewal in the background
-//! when a light changes.
+//! The light that live updates show: lights, radiance map and sides of charts, and their renewal in the background when
+//! a light changes.
 //!
 //! Direct light follows at once. Indirect light needs new photons and a new radiance map, which one
 //! thread computes beside the updates: first with a sixteenth of the photons, so that the change is
@@ -25,35 +25,35 @@ use std::sync::mpsc::{Receiver, TryRecvError, channel};
 use std::sync::{Arc, Mutex};
 use std::time::Duration;
 
-/// The first renewal takes this part of the photons.
+/// Divisor of the photon count in the first, quick renewal.
 const QUICK_PART: u64 = 16;
 
-/// The sides that are shown.
+/// The shown sides of charts.
 #[derive(Default)]
 pub(super) struct Sides {
-    /// Per chart with one place, whether its back is shown.
+    /// Per chart with one placement, whether its back is shown.
     pub backs: Vec<bool>,
-    /// What the light map shows of the gather map there; all as it comes without indirect light.
+    /// Interpolation from the gather map to the light map for these sides; unconstrained without indirect light.
     pub upsampling: Upsampling,
 }
 
-/// Light as texels see it.
+/// Light as gathered and shown by texels.
 #[derive(Clone)]
 pub(super) struct Illumination {
     pub direct: Arc<DirectLight>,
-    /// By sample of the radiance map.
+    /// The radiance map, by sample.
     pub radiance: Arc<Radiance>,
     pub sides: Arc<Sides>,
-    /// Of the texels that no gather texel stands for.
+    /// Light of the texels that gather for themselves, as no gather texel can be interpolated for them.
     pub own: Arc<OwnLight>,
-    /// Whether there is, or ever was, any indirect light.
+    /// Whether there is any indirect light, or ever was.
     pub has_indirect: bool,
-    /// Numbers that change with the parts.
+    /// Epochs of direct and indirect light: they change with the data.
     pub direct_epoch: u32,
     pub indirect_epoch: u32,
 }
 
-/// Radiance map and sides, which may be those that were shown before.
+/// New radiance map and sides; the sides may be those that were shown before.
 pub(super) struct Indirect {
     radiance: Radiance,
     sides: Arc<Sides>,
@@ -61,7 +61,7 @@ pub(super) struct Indirect {
     has_indirect: bool,
 }
 
-/// Computes radiance map and sides under the scene's lights of now, or keeps `sides`.
+/// Computes radiance map and sides under the scene's current lights, or keeps `sides`.
 fn illuminate(
     atlas: &Atlas,
     params: &BakeParams,
@@ -83,14 +83,14 @@ fn illuminate(
             Arc::new(Sides { backs, upsampling })
         }
     };
-    // In the dark there is no radiance map to look at.
+    // Without indirect light there is no radiance map to look up.
     let own =
         if has_indirect { bake.own_light(&radiance, &sides.backs, &sides.upsampling)?.0 } else { OwnLight::new() };
     Ok(Indirect { radiance, sides, own, has_indirect })
 }
 
 impl Illumination {
-    /// Of the scene's lights of now, with all photons.
+    /// Computes the light of the scene's current lights, with all photons.
     pub fn new(atlas: &Atlas, params: &BakeParams, progress: &Progress) -> Result<Illumination> {
         let direct = DirectLight::try_new(&atlas.scene)?;
         let i = illuminate(atlas, params, &direct, None, progress)?;
@@ -105,19 +105,19 @@ impl Illumination {
         })
     }
 
-    /// With new indirect light.
+    /// Makes a copy with new indirect light.
     pub fn renewed(&self, new: Indirect) -> Result<Illumination> {
         let mut light = Illumination { indirect_epoch: self.indirect_epoch + 1, ..self.clone() };
         if new.has_indirect {
             light.radiance = Arc::new(new.radiance);
             if light.sides.backs != new.sides.backs {
-                // Other sides are shown: their direct light is another one too.
+                // Other sides are shown: their direct light differs too.
                 light.direct_epoch += 1;
             }
             (light.sides, light.own) = (new.sides, Arc::new(new.own));
             light.has_indirect = true;
         } else {
-            // All went dark: what is there fades to black, on the sides that are shown.
+            // All lights have gone dark: the shown light fades to black, on the shown sides.
             let values = try_vec(self.radiance.values.len(), "the radiance map")?;
             light.radiance = Arc::new(Radiance { values, ..Default::default() });
             let own = self.own.iter().map(|own| own.map(|_| Vec3::ZERO));
@@ -130,26 +130,26 @@ impl Illumination {
 /// Renews indirect light on a thread of its own.
 #[derive(Default)]
 pub(super) struct Relight {
-    /// One thread, from the first renewal on.
+    /// Device with one thread, created at the first renewal.
     device: Option<Arc<Device>>,
     running: Option<Running>,
-    /// The lights changed while a renewal under older ones was under way, or while on hold.
+    /// Whether the lights changed while a renewal under older ones was under way, or while on hold.
     again: bool,
     on_hold: bool,
 }
 
 struct Running {
-    /// Closed when the renewal has ended.
+    /// Receives the results; disconnected when the renewal has ended.
     results: Mutex<Receiver<Result<Indirect>>>,
-    /// Ends the part with all photons; a change of light does.
+    /// Cancels the part with all photons; set when a light changes.
     cancel: Arc<AtomicBool>,
-    /// Ends the quick part too; the end of the live object does.
+    /// Cancels the quick part too; set when the live object ends.
     abandon: Arc<AtomicBool>,
 }
 
 impl Relight {
-    /// Begins a renewal, or has the one under way followed by another. The quick part of that one is
-    /// always finished: lights that move all the time are followed in steps. It keeps the `sides` that are shown.
+    /// Begins a renewal, or makes another one follow the one under way. The quick part of the latter is always
+    /// finished: lights that move all the time are followed in steps. It keeps the shown `sides`.
     pub fn start(&mut self, atlas: &Arc<Atlas>, params: &BakeParams, sides: &Arc<Sides>) -> Result<()> {
         if let Some(running) = &self.running {
             running.cancel.store(true, Relaxed);
@@ -179,7 +179,7 @@ impl Relight {
         };
         device.spawn(move || {
             let quick = BakeParams { photon_count: params.photon_count.div_ceil(QUICK_PART), ..params };
-            // Nobody listens any more when the live object is gone.
+            // Nobody receives the result when the live object is gone.
             let _ = sender.send(compute(&quick, Some(shown), &Progress::new(|_, _| !abandoned.load(Relaxed))));
             let _ = sender.send(compute(&params, None, &Progress::new(|_, _| !cancelled.load(Relaxed))));
         });
@@ -188,17 +188,17 @@ impl Relight {
         Ok(())
     }
 
-    /// Has what was computed last computed again: it was lost.
+    /// Requests a new computation of the last result, which was lost.
     pub fn redo(&mut self) {
         self.again = true;
     }
 
-    /// Whether results are still to come.
+    /// Whether results are still expected.
     pub fn is_pending(&self) -> bool {
         self.running.is_some() || self.again
     }
 
-    /// Breaks a renewal off, to be begun again when it is no longer on hold.
+    /// Stops a renewal; it begins again when the hold is over.
     pub fn hold(&mut self, on_hold: bool, atlas: &Arc<Atlas>, params: &BakeParams, sides: &Arc<Sides>) -> Result<()> {
         self.on_hold = on_hold;
         if on_hold {
@@ -214,7 +214,7 @@ impl Relight {
         Ok(())
     }
 
-    /// The newest finished result. Does not wait.
+    /// Returns the newest finished result. Does not wait.
     pub fn poll(&mut self, atlas: &Arc<Atlas>, params: &BakeParams, sides: &Arc<Sides>) -> Result<Option<Indirect>> {
         if self.running.is_none() && !self.on_hold && std::mem::take(&mut self.again) {
             self.start(atlas, params, sides)?;
@@ -225,10 +225,11 @@ impl Relight {
         loop {
             match results.try_recv() {
                 Ok(Ok(indirect)) => newest = Some(indirect),
-                // Because of yet another change.
+                // Cancelled because of another change of light.
                 Ok(Err(Error::Cancelled)) => {}
                 Ok(Err(e)) => {
-                    // What failed for want of memory may succeed another time. Its other part is broken off.
+                    // A computation that failed for lack of memory may succeed another time. Its other part is
+                    // cancelled.
                     self.retire();
                     self.again = true;
                     return Err(e);
@@ -237,7 +238,7 @@ impl Relight {
                 Err(TryRecvError::Disconnected) => {
                     self.running = None;
                     if !self.on_hold && std::mem::take(&mut self.again) {
-                        // Those that the caller will show.
+                        // Uses the sides that the caller will show.
                         let newer = newest.as_ref().filter(|new| new.has_indirect).map(|new| &new.sides);
                         self.start(atlas, params, newer.unwrap_or(sides))?;
                     }
@@ -250,7 +251,7 @@ impl Relight {
 }
 
 impl Relight {
-    /// Breaks the renewal under way off.
+    /// Cancels the renewal under way.
     fn retire(&mut self) {
         if let Some(running) = self.running.take() {
             running.cancel.store(true, Relaxed);
@@ -260,17 +261,17 @@ impl Relight {
 }
 
 impl Drop for Relight {
-    /// Breaks a renewal off and waits for its thread, unless this is that thread (the last reference was given back
-    /// in a callback that it called): the renewal then ends after the callback has returned.
+    /// Cancels a renewal and waits for its thread, unless this is that thread (the last reference was released in a
+    /// callback that it called): the renewal then ends after the callback has returned.
     fn drop(&mut self) {
         self.retire();
-        // Nobody else holds the device, so that its thread is joined here.
+        // Nobody else holds the device, so its thread is joined here.
         self.device = None;
     }
 }
 
 impl Live {
-    /// Takes new indirect light over, if there is any.
+    /// Takes over new indirect light, if there is any.
     pub(super) fn take_new_light(&mut self) -> Result<()> {
         if self.paused {
             return Ok(());
@@ -290,7 +291,8 @@ impl Live {
         Ok(())
     }
 
-    /// New indirect light may turn charts over; the direct light of all others stays good.
+    /// Keeps the direct light of charts whose sides have not changed valid: new indirect light may turn other charts
+    /// over.
     pub(super) fn keep_direct_of_same_sides(&mut self, before: &Illumination) {
         let light = self.context.light.clone();
         for (b, tile) in (0u32..).zip(&self.context.map.tiles) {
@@ -315,8 +317,8 @@ impl Live {
         }
     }
 
-    /// Takes a change of light `id` of the scene into account: direct light in the next updates,
-    /// indirect light as it is recomputed in the background.
+    /// Applies a change of light `id` of the scene: to direct light in the next updates, to indirect light when it has
+    /// been recomputed in the background.
     pub fn light_changed(&mut self, id: u32) -> Result<()> {
         let lights = self.scene().lights();
         let count = lights.len();
@@ -327,7 +329,7 @@ impl Live {
         self.collect_now()?;
         self.make_room_for_epochs()?;
         self.relight.start(&self.context.map.atlas, &self.bake, &self.context.light.sides)?;
-        // Nothing fails from here on.
+        // Nothing can fail from here on.
         self.display.begin_direct_epoch();
         self.lights = lights;
         self.context.light = Arc::new(Illumination {
@@ -339,7 +341,7 @@ impl Live {
         Ok(())
     }
 
-    /// Waits for indirect light that is being recomputed and takes it over.
+    /// Waits for indirect light that is being recomputed, and takes it over.
     pub fn finish_relighting(&mut self) -> Result<()> {
         self.collect_now()?;
         while self.relight.is_pending() && !self.paused {

@@ -1,8 +1,8 @@
-//! Saving and restoring what has been accumulated: rays per texel, and direct light.
+//! Saving and restoring of accumulated light: rays per texel, and direct light.
 //!
-//! A file holds, in little-endian order: magic, fingerprint of what the state depends on, number of
-//! blocks, the blocks, and a checksum. Light of earlier epochs is not saved. The checksum finds accidents; that every
-//! number is one that live updates could have arrived at is checked beside it.
+//! A file holds, in little-endian order: magic, fingerprint of everything that the state depends on, number of blocks,
+//! the blocks, and a checksum. Light of earlier epochs is not saved. The checksum detects accidental damage; in
+//! addition every number is checked to be one that live updates could have reached.
 
 use super::blocks::{Block, BlockStatus, BlockWork, Blocks, DirectTile, Tile};
 use super::display::Display;
@@ -22,17 +22,17 @@ use std::path::Path;
 
 const MAGIC: [u8; 8] = *b"BKLIVE3\0";
 
-/// Bytes of magic, fingerprint and number of blocks.
+/// Size in bytes of magic, fingerprint and number of blocks.
 const HEAD: usize = 24;
 
-/// Bytes of a block beside its texels, and of a gathered texel.
+/// Size in bytes of a block without its texels, and of a gathered texel.
 const BLOCK_BYTES: usize = 18;
 const TEXEL_BYTES: usize = 24;
 
-/// Bytes that are read, hashed or written between two looks at the progress.
+/// Number of bytes that are read, hashed or written between two progress reports.
 const PIECE: usize = 1 << 18;
 
-/// FNV-1a, 64 bits.
+/// FNV-1a hash of 64 bits.
 struct Hash(u64);
 
 impl Hash {
@@ -49,7 +49,7 @@ impl Hash {
     }
 }
 
-/// Text, as its bytes.
+/// Hashes text as its bytes.
 impl std::fmt::Write for Hash {
     fn write_str(&mut self, text: &str) -> std::fmt::Result {
         self.bytes(text.as_bytes());
@@ -57,16 +57,16 @@ impl std::fmt::Write for Hash {
     }
 }
 
-/// A block as saved.
+/// A block as read from a file.
 struct Saved {
     block: Block,
     shown: u8,
     direct: Option<Box<[Vec3]>>,
 }
 
-/// Why a part of a file is not taken over.
+/// Reason for which a part of a file is rejected.
 enum Refusal {
-    /// A number is not one that updates could have arrived at, or the file ends.
+    /// A number is not one that updates could have reached, or the file ends too early.
     Impossible(&'static str),
     Failed(Error),
 }
@@ -80,8 +80,8 @@ impl From<Error> for Refusal {
 type Field<T> = std::result::Result<T, Refusal>;
 
 impl Live {
-    /// Writes the accumulated state to a file, which is replaced as a whole. When that fails or is cancelled, an old
-    /// file of that name is as it was.
+    /// Writes the accumulated state to a file, which is replaced as a whole. If that fails or is cancelled, an old file
+    /// of that name is unchanged.
     pub fn save(&mut self, path: &Path, progress: &Progress) -> Result<()> {
         self.collect_now()?;
         let live = &*self;
@@ -111,15 +111,15 @@ impl Live {
         })
     }
 
-    /// Goes on from a state that was saved of the same scene, light map, lights and parameters. A file
-    /// that is refused, and a call that fails or is cancelled, change nothing.
+    /// Continues from a state that was saved of the same scene, light map, lights and parameters. A file that is
+    /// rejected, and a call that fails or is cancelled, change nothing.
     pub fn restore(&mut self, path: &Path, progress: &Progress) -> Result<()> {
         let device = self.device();
         let bytes = device.run(progress, || self.read_file(path, progress))?;
         self.restore_bytes(&bytes, &path.display().to_string(), progress)
     }
 
-    /// [`restore`](Self::restore) from the bytes of a file; `name` is how errors call it.
+    /// Restores as [`restore`](Self::restore) does, from the bytes of a file; errors call it `name`.
     pub fn restore_bytes(&mut self, bytes: &[u8], name: &str, progress: &Progress) -> Result<()> {
         self.collect_now()?;
         let device = self.device();
@@ -132,23 +132,23 @@ impl Live {
         result
     }
 
-    /// Display and blocks with what was saved. All that can fail.
+    /// Makes display and blocks from the saved ones: the part of restoring that can fail.
     fn restored(&mut self, saved: Vec<Saved>, progress: &Progress) -> Result<(Display, Blocks)> {
         let direct = |s: &Saved| s.direct.as_ref().map_or(0, |d| size_of_val(&d[..]));
         let held: usize = saved.iter().map(|s| s.block.work.bytes() + direct(s)).sum();
-        // Old and new state are held at once.
+        // Old and new state are held at the same time.
         self.reserve(held + self.display.bytes())?;
         let context = &self.context;
         let mut display = self.display.try_clone()?;
         if self.display.room_missing_for_epochs() == 0 {
-            // Indirect light may be on its way.
+            // New indirect light may be on its way.
             display.make_room_for_epochs()?;
         }
         display.end_fades();
         let mut blocks = Blocks::away(self.blocks.status())?;
         for (b, saved) in (0u32..).zip(saved) {
             if saved.block.work.gathered.is_empty() {
-                // Nothing was known; what this object began with is more.
+                // The file has no light of this block; the light that this object began with is more.
                 continue;
             }
             let (old, mut block) = (self.blocks.status()[b as usize], saved.block);
@@ -180,14 +180,14 @@ impl Live {
         self.display = display;
         self.blocks.replace_by(blocks);
         self.held = self.blocks.bytes() as isize + self.display.tile_bytes() as isize;
-        // Blocks of which nothing was saved go where they were going.
+        // Blocks of which nothing was saved end their fades.
         while let Some(b) = self.fading.pop() {
             self.wait(b);
         }
         self.note_all_shown();
     }
 
-    /// Of all that the accumulated light depends on.
+    /// Fingerprint of everything that the accumulated light depends on.
     fn fingerprint(&self, progress: &Progress) -> Result<u64> {
         let mut h = Hash::new();
         let atlas = &self.context.map.atlas;
@@ -221,7 +221,7 @@ impl Live {
             return Err(Error::Internal(format!("block {b} is being worked on while it is saved")));
         };
         let mut status = self.blocks.status()[b as usize];
-        // What was gathered under an earlier light is left out.
+        // Light that was gathered in an earlier epoch is left out.
         if status.has_old_light(&self.context) {
             (status, block) = (BlockStatus::default(), &fresh);
         }
@@ -247,7 +247,7 @@ impl Live {
         Ok(())
     }
 
-    /// Reads a file that can be a saved state of this object, as far as its head tells.
+    /// Reads a file that, as far as its head shows, is a saved state of this object.
     fn read_file(&self, path: &Path, progress: &Progress) -> Result<Vec<u8>> {
         let name = path.display();
         let failed = |e: std::io::Error| Error::Io(format!("cannot read {name}: {e}"));
@@ -273,7 +273,7 @@ impl Live {
         Ok(bytes)
     }
 
-    /// The most bytes that a saved state of this object has.
+    /// Maximum size in bytes of a saved state of this object.
     fn most_bytes(&self) -> u64 {
         let map = &self.context.map;
         let direct = |t: &Tile| map.rect_in_light_map(t.placement, &t.rect).area() * size_of::<Vec3>();
@@ -337,7 +337,7 @@ impl Live {
         check(lod <= self.context.map.top() && shown <= lod, "an impossible LOD")?;
         check(rounds as u32 <= most_rounds && (rounds > 0 || lod == 0), "an impossible number of rounds")?;
         check(count <= tile.texels.len(), "more texels than there are")?;
-        // A LOD is complete, or nothing is known yet.
+        // A LOD is complete, or no texel has been gathered yet.
         let complete = if rounds > 0 { tile.lod_end[lod as usize] as usize } else { 0 };
         check(count >= complete, "fewer texels than its LOD")?;
         check(deviations >= 0.0, "a deviation that is none")?;
@@ -348,7 +348,7 @@ impl Live {
             gathered.push(from.gathered(least(i)..=most_rounds * ROUND as u32)?);
         }
         let direct = self.read_direct(tile, from)?;
-        // The step under way begins again; texels that have its rays are left alone.
+        // The step under way begins again; texels that already have its rays are skipped.
         Ok(Saved {
             block: Block {
                 status: BlockStatus { lod, fresh_lod: lod, rounds, ..Default::default() },
@@ -359,7 +359,7 @@ impl Live {
         })
     }
 
-    /// Direct light at full resolution: light where the block has texels, NaN elsewhere.
+    /// Reads direct light at full resolution: light where the block has texels, NaN elsewhere.
     fn read_direct(&self, tile: &Tile, from: &mut Reader) -> Field<Option<Box<[Vec3]>>> {
         let rect = self.context.map.rect_in_light_map(tile.placement, &tile.rect);
         let count = from.u32()? as usize;
@@ -382,7 +382,7 @@ impl Live {
     }
 }
 
-/// What buffers are for, in errors.
+/// Name of these buffers in error messages.
 const SAVED: &str = "the saved state";
 
 const NO_LIGHT: &str = "light that is negative, infinite or no number";
@@ -399,7 +399,7 @@ fn check(is_possible: bool, what: &'static str) -> Field<()> {
     if is_possible { Ok(()) } else { Err(Refusal::Impossible(what)) }
 }
 
-/// Numbers from bytes.
+/// Reads numbers from bytes.
 struct Reader<'a> {
     bytes: &'a [u8],
 }
@@ -431,7 +431,7 @@ impl Reader<'_> {
         Ok(Vec3::new(self.f32()?, self.f32()?, self.f32()?))
     }
 
-    /// What a texel gathered with a number of rays in `rays`.
+    /// Reads the sums of a texel, whose number of rays must be in `rays`.
     fn gathered(&mut self, rays: std::ops::RangeInclusive<u32>) -> Field<Gathered> {
         let g = Gathered { sum: self.vec3()?, rays: self.u32()?, backs: self.u32()?, squares: self.f32()? };
         check(rays.contains(&g.rays) && g.rays.is_multiple_of(ROUND as u32), "an impossible number of rays")?;

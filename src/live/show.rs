@@ -1,17 +1,17 @@
-//! What has been computed is shown: blocks that wait for the display, and those that fade from one LOD to the next.
+//! Shows computed light: blocks that wait for the display, and blocks that fade from one LOD to the next.
 
 use super::{Live, LiveStats, Mode, PASS};
 use std::time::Instant;
 
 impl Live {
-    /// Takes note of how far all blocks are, and that all pages show something else.
+    /// Records the progress of all blocks, and that all pages have changed.
     pub(super) fn note_all_shown(&mut self) {
         self.dirty.mark_all(self.page_size());
         self.promotion.count(&self.context.map.tiles, self.blocks.status());
         self.chooser.note_all(&self.context, self.blocks.status());
     }
 
-    /// Has a block that completed a step shown: at once, or, in position-based mode, with its cell.
+    /// Shows a block that completed a step: at once, or, in position-based mode, together with its cell.
     pub(super) fn promote(&mut self, b: u32, stats: &mut LiveStats) {
         let cell = self.context.map.tiles[b as usize].cell;
         let lod = self.status(b).lod;
@@ -40,14 +40,14 @@ impl Live {
         }
     }
 
-    /// Shows waiting blocks as long as there is time.
+    /// Shows waiting blocks while there is time.
     pub(super) fn show_waiting(&mut self, end: Option<Instant>, stats: &mut LiveStats) {
         while !self.waiting.is_empty() {
             let start = Instant::now();
             let left = end.map_or(f64::INFINITY, |e| e.saturating_duration_since(start).as_secs_f64());
             let fit = (left / self.refresh_seconds) as usize;
             if fit == 0 {
-                // One slow moment must not keep light from being shown for ever.
+                // One slow measurement must not keep light from being shown for ever.
                 self.refresh_seconds *= 0.9;
                 return;
             }
@@ -68,10 +68,10 @@ impl Live {
         }
     }
 
-    /// One step of the blocks that fade, as far as there is time; those left come first next time.
+    /// Advances the fades by one step, as far as there is time; the remaining blocks come first next time.
     pub(super) fn show_fading(&mut self, end: Option<Instant>, stats: &mut LiveStats) {
         let rest = &mut self.still_fading;
-        // What waits is not known to the display yet.
+        // The display has not yet received the values of waiting blocks.
         self.fading.retain(|&b| {
             let waits = self.is_waiting[b as usize];
             if waits {
@@ -82,7 +82,7 @@ impl Live {
         let mut shown = 0;
         while shown < self.fading.len() {
             let left = end.map_or(f64::INFINITY, |e| e.saturating_duration_since(Instant::now()).as_secs_f64());
-            // A fade must not take the time of all work.
+            // Fades must not take all the time of an update.
             let fit = (0.5 * left / self.refresh_seconds) as usize;
             if fit == 0 {
                 break;

@@ -1,5 +1,5 @@
-//! What the camera looks at (thesis 3.3.1): primary rays, denser in the middle of the picture, mark
-//! the blocks that they hit. Marks fade over some updates, so that few rays per update suffice.
+//! Visibility for the camera (thesis 3.3.1): primary rays, denser in the middle of the picture, mark the blocks that
+//! they hit. Marks fade over some updates, so that few rays per update suffice.
 
 use super::LiveCamera;
 use super::blocks::BlockMap;
@@ -9,18 +9,18 @@ use crate::scene::NONE;
 use crate::trace::{PACKET_SIZE, Packet, RawHit};
 use glam::Vec3;
 
-/// Packets of primary rays per update. A packet is one column of the picture.
+/// Number of packets of primary rays per update. A packet is one column of the picture.
 const PACKETS: usize = 16;
 
-/// What is left of a mark after an update.
+/// Factor by which a mark fades per update.
 const FADING: f32 = 0.93;
 
-/// Below this a mark is dropped: after some sixty updates.
+/// A mark below this is dropped: after some sixty updates.
 const FORGOTTEN: f32 = 0.01;
 
-/// Marks of what is visible.
+/// Visibility marks of blocks.
 pub(super) struct Visibility {
-    /// By block.
+    /// Strength of the mark, by block.
     marks: Vec<f32>,
     /// Blocks with a mark.
     pub seen: Vec<u32>,
@@ -29,7 +29,7 @@ pub(super) struct Visibility {
 
 impl Visibility {
     pub fn new(blocks: usize) -> crate::Result<Visibility> {
-        // All blocks may be seen: no update has to make room.
+        // Capacity for all blocks: no update has to allocate.
         let what = "marks of what is visible";
         Ok(Visibility { marks: try_vec(blocks, what)?, seen: try_with_capacity(blocks, what)?, updates: 0 })
     }
@@ -38,7 +38,7 @@ impl Visibility {
         self.marks[block as usize]
     }
 
-    /// Traces the primary rays of one update; returns how many.
+    /// Traces the primary rays of one update; returns their number.
     pub fn look(&mut self, map: &BlockMap, camera: &LiveCamera) -> u64 {
         let marks = &mut self.marks;
         self.seen.retain(|&b| {
@@ -58,10 +58,10 @@ impl Visibility {
         for p in 0..PACKETS {
             let mut packet = Packet::default();
             for _ in 0..PACKET_SIZE {
-                // A sequence of its own per column: every 16th part of one sequence would leave gaps.
+                // Each column has a sequence of its own: every 16th element of one sequence would leave gaps.
                 let i = self.updates.wrapping_mul(PACKET_SIZE as u32) + packet.count as u32;
                 let [a, b] = sobol_2d(i & 0xffff, combine(0x5eed, p as u32));
-                // The packet's column of the picture, in coordinates from −1 to 1.
+                // Position in the packet's column of the picture, in coordinates from −1 to 1.
                 let u = denser_in_the_middle(((p as f32 + a) / PACKETS as f32) * 2.0 - 1.0);
                 let v = denser_in_the_middle(b * 2.0 - 1.0);
                 packet.push((forward + right * u + down * v).normalize());
@@ -105,7 +105,7 @@ fn block_of(map: &BlockMap, hit: &RawHit) -> Option<u32> {
 }
 
 impl LiveCamera {
-    /// Whether numbers make sense: finite, with an extent, an aspect and a field of view.
+    /// Checks the numbers: finite, with an extent, an aspect ratio and a field of view.
     pub fn validate(&self) -> crate::Result<()> {
         use crate::error::invalid_argument;
         let finite = |v: Vec3| v.is_finite();

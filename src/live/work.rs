@@ -1,8 +1,7 @@
-//! Work on one block, in steps: coarse direct light, a few rays of indirect light where that is of an
-//! earlier time, then whichever mends more per ray: direct light at full resolution, the texels of
-//! the next LOD, or another round of 64 rays for all. Work can stop after any texel and go on later;
-//! the sums of a texel depend on its number of rounds alone, so they have the bits of a bake with as
-//! many rays.
+//! Work on one block, in steps: coarse direct light; a few rays of indirect light if that is of an earlier epoch; then
+//! whichever reduces more error per ray: direct light at full resolution, the texels of the next LOD, or another round
+//! of 64 rays for all. Work can stop after any texel and continue later; the sums of a texel depend on its number of
+//! rounds alone, so they have the bits of a bake with as many rays.
 
 use super::blocks::{Block, BlockMap, BlockStatus, BlockWork, DirectTile, DirectWork, Tile};
 use super::relight::Illumination;
@@ -19,21 +18,21 @@ use std::sync::Arc;
 use std::sync::atomic::{AtomicBool, AtomicU64, Ordering::Relaxed};
 use std::time::Instant;
 
-/// Shadow rays per area light for coarse direct light, at most.
+/// Maximum number of shadow rays per area light for coarse direct light.
 const COARSE_SAMPLES: u32 = 4;
 
 /// Gain of rays under new light.
 const OLD_LIGHT: f32 = 1e30;
 
-/// Error of coarse direct light, by its mean: shadows are missing or blurred over whole blocks, which is
-/// seen first.
+/// Relative error assumed of coarse direct light: shadows are missing or blurred over whole blocks, which is the most
+/// visible error.
 const DIRECT_ERROR: f32 = 2.0;
 
-/// Weight of old light beside the first round of rays under new light. More would hide the noise of
-/// that round, but old light is mostly further from the truth.
+/// Weight of old light relative to the first round of rays under new light. More would hide the noise of that round,
+/// but old light is mostly further from the truth.
 const PRIOR_WEIGHT: f32 = 0.25;
 
-/// What all work on blocks reads.
+/// Shared input of all work on blocks.
 #[derive(Clone)]
 pub(super) struct Context {
     pub map: Arc<BlockMap>,
@@ -42,30 +41,30 @@ pub(super) struct Context {
     pub gather_seed: u32,
     pub direct_seed: u32,
     pub direct_samples: u32,
-    /// About so many rays take direct light at a point.
+    /// Approximate number of rays that direct light at a point takes.
     pub direct_rays: f32,
-    /// Light below which places count as dark: a small part of the scene's mean.
+    /// Light below which a texel counts as dark: a small part of the scene's mean.
     pub dim: f32,
     pub promote_threshold: u32,
     pub max_rounds: u32,
 }
 
-/// What a block can do next.
+/// Kind of work that a block can do next.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub(super) enum Kind {
     Direct,
     Indirect,
 }
 
-/// What ends the work of an update.
+/// Conditions that end the work of an update.
 pub(super) struct Limit {
     pub deadline: Option<Instant>,
-    /// Rays that may be traced; `u64::MAX`: any number.
+    /// Number of rays that may be traced; `u64::MAX`: any number.
     pub rays: u64,
     pub traced: AtomicU64,
-    /// Set by whoever wants the work back.
+    /// Set to get the work back.
     pub stopped: AtomicBool,
-    /// Set when memory for the work was not to be had.
+    /// Set when memory for the work could not be allocated.
     pub out_of_memory: AtomicBool,
 }
 
@@ -80,7 +79,7 @@ impl Limit {
         }
     }
 
-    /// An error if memory for the work was not to be had.
+    /// Returns an error if memory for the work could not be allocated.
     pub fn check_memory(&self) -> Result<()> {
         if self.out_of_memory.load(Relaxed) {
             return Err(Error::OutOfMemory("the light of a block of texels".into()));
@@ -88,12 +87,12 @@ impl Limit {
         Ok(())
     }
 
-    /// What there is, if there was memory for it; takes note if there was none.
+    /// Unwraps the result of an allocation; records a failure.
     fn granted<T>(&self, result: Result<T>) -> Option<T> {
         result.inspect_err(|_| self.out_of_memory.store(true, Relaxed)).ok()
     }
 
-    /// Whether there is no room for more; asked before every texel.
+    /// Whether the limit has been reached; asked before every texel.
     pub fn reached(&self) -> bool {
         self.stopped.load(Relaxed)
             || self.traced.load(Relaxed) >= self.rays
@@ -101,10 +100,11 @@ impl Limit {
     }
 }
 
-/// How much of a block is to be worked on.
+/// Amount of work to be done on a block.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub(super) enum Step {
-    /// Coarse direct light, if it is of other lights than those of now. The other steps begin so too.
+    /// Coarse direct light, if it was computed under other lights than the current ones. The other steps begin with
+    /// this too.
     Coarse,
     /// Direct light at full resolution.
     Direct,
@@ -112,14 +112,14 @@ pub(super) enum Step {
     Next,
 }
 
-/// What became of a block.
+/// Results of work on a block.
 #[derive(Clone, Copy, Debug, Default, PartialEq, Eq)]
 pub(super) struct Done {
-    /// Its coarse direct light is new.
+    /// Coarse direct light is new.
     pub coarse: bool,
-    /// Its direct light at full resolution is new.
+    /// Direct light at full resolution is new.
     pub direct: bool,
-    /// A step of its indirect light was completed.
+    /// A step of indirect light was completed.
     pub indirect: bool,
 }
 
@@ -131,13 +131,13 @@ impl Done {
 }
 
 impl BlockStatus {
-    /// LOD and rounds that the next step works towards; `None` if nothing is left to do.
+    /// LOD and number of rounds that the next step works towards; `None` if nothing is left to do.
     fn target(&self, c: &Context) -> Option<(u8, u32)> {
         let top = c.map.top();
         if !c.light.has_indirect {
             None
         } else if self.indirect_epoch != c.light.indirect_epoch || self.rounds == 0 {
-            // New light: a little of it everywhere first.
+            // New light: begins with a little of it everywhere.
             Some((0, c.promote_threshold))
         } else if self.fresh_lod < top {
             Some((self.fresh_lod + 1, c.promote_threshold))
@@ -148,33 +148,34 @@ impl BlockStatus {
         }
     }
 
-    /// Whether all rays have been traced under the light of now.
+    /// Whether all rays have been traced under the current light.
     pub fn is_finished(&self, c: &Context) -> bool {
         self.has_direct(c) && self.target(c).is_none()
     }
 
-    /// Whether direct light is known at full resolution under the light of now.
+    /// Whether direct light has been computed at full resolution under the current light.
     pub fn has_direct(&self, c: &Context) -> bool {
         self.direct_epoch == c.light.direct_epoch
     }
 
-    /// Whether its indirect light is of an earlier epoch altogether.
+    /// Whether all of the block's indirect light is of an earlier epoch.
     pub fn has_old_light(&self, c: &Context) -> bool {
         c.light.has_indirect && self.indirect_epoch != c.light.indirect_epoch
     }
 
-    /// Changes of the lights since the coarse direct light was computed.
+    /// Number of changes of the lights since the coarse direct light was computed.
     pub fn changes_behind(&self, c: &Context) -> u32 {
         c.light.direct_epoch - self.coarse_epoch
     }
 
-    /// What gains most next, and how much: error mended per ray.
+    /// The kind of work that gains most next, and its gain: reduction of error per ray.
     pub fn next(&self, c: &Context, tile: &Tile) -> Option<(Kind, f32)> {
         if self.has_old_light(c) {
-            // Few rays change much; before all else.
+            // Few rays make a great difference here, so they come before all else.
             return Some((Kind::Indirect, OLD_LIGHT));
         }
-        // Errors of dark places are seen better than their size tells, less than their ratio does.
+        // Errors in dark places are more visible than their absolute size suggests, and less than their relative size
+        // does.
         let scale = 1.0 / (self.mean + self.direct_mean + c.dim).max(f32::MIN_POSITIVE).sqrt();
         let direct = (!self.has_direct(c)).then(|| {
             let rays = tile.map_texels as f32 * c.direct_rays;
@@ -183,7 +184,7 @@ impl BlockStatus {
         let indirect = self.target(c).map(|(lod, rounds)| {
             let known = if lod > 0 && rounds == c.promote_threshold { tile.lod_end[lod as usize - 1] } else { 0 };
             let rays = (tile.lod_end[lod as usize] - known) as f32 * ROUND as f32;
-            // A finished block of no error still has its turn.
+            // Even a block with an error of 0 gets its turn.
             (Kind::Indirect, scale * self.error.max(1e-4) * (self.mean + c.dim) / rays.max(1.0))
         });
         match (direct, indirect) {
@@ -219,7 +220,7 @@ impl Block {
         done
     }
 
-    /// One step of indirect light; tells whether it was completed.
+    /// Does one step of indirect light; returns whether it was completed.
     pub fn work_on_indirect(&mut self, c: &Context, tile: &Tile, limit: &Limit) -> bool {
         let Some((lod, rounds)) = self.status.target(c) else { return false };
         if self.status.indirect_epoch != c.light.indirect_epoch
@@ -261,14 +262,14 @@ impl Block {
         self.status.lod = self.status.lod.max(lod);
         self.status.rounds = rounds as u16;
         if self.status.target(c).is_none() {
-            // A single round would leave it some weight for ever.
+            // A single round would leave the prior some weight for ever.
             self.work.prior = Box::default();
         }
         self.note_error(c.map.top());
         true
     }
 
-    /// Keeps the light of now as a prior and starts over. An error changes nothing.
+    /// Keeps the current light as a prior and starts over. An error changes nothing.
     fn begin_epoch(&mut self, tile: &Tile, epoch: u32) -> Result<()> {
         let work = &mut self.work;
         if !work.gathered.is_empty() {
@@ -283,8 +284,8 @@ impl Block {
         Ok(())
     }
 
-    /// Estimates mean and relative error of the block's indirect light: the spread of its rounds, where there is more
-    /// than one, and, where texels are interpolated, half the spread of those that are not.
+    /// Estimates mean and relative error of the block's indirect light: the spread of its rounds, if there is more than
+    /// one, and, if texels are interpolated, half the spread of those that are not.
     pub fn note_error(&mut self, top: u8) {
         let values = || self.work.gathered.iter().filter(|g| g.rays > 0).map(|g| g.irradiance().element_sum());
         let n = values().count().max(1) as f32;
@@ -296,20 +297,20 @@ impl Block {
                 (self.work.deviations / self.work.deviation_count as f32 / self.status.rounds.max(1) as f32).sqrt()
                     / mean
             } else {
-                // One round alone tells nothing of its noise; neighbours differ by it at least. Few
-                // texels do not tell even that.
+                // A single round gives no estimate of its noise; it makes neighbours differ at least that much. Few
+                // texels do not even give this estimate.
                 spread.max(1.0 / n).min(1.0) / (self.status.rounds.max(1) as f32).sqrt()
             };
             if self.status.fresh_lod < top { noise + 0.5 * spread.min(1.0) + 0.02 } else { noise }
         } else {
-            // Dark, or the texels so far lie hidden inside something and those of the next LOD do not.
+            // The block is dark, or the texels so far lie hidden inside something and those of the next LOD do not.
             (self.status.fresh_lod < top) as u8 as f32
         };
-        // Squares of light beyond 1e19 are too large for floats.
+        // The square of light beyond 1e19 overflows a float.
         self.status.error = if error.is_finite() { error } else { 1.0 };
     }
 
-    /// Direct light of the lowest LOD's texels; tells whether there was memory for it.
+    /// Computes direct light of the lowest LOD's texels; returns whether there was memory for it.
     pub fn work_on_coarse(&mut self, c: &Context, tile: &Tile, limit: &Limit) -> bool {
         let (atlas, mut rays) = (&c.map.atlas, 0);
         let samples = c.direct_samples.min(COARSE_SAMPLES);
@@ -327,12 +328,12 @@ impl Block {
         true
     }
 
-    /// Direct light of the block's light map texels; tells whether it was completed.
+    /// Computes direct light of the block's light map texels; returns whether it was completed.
     fn work_on_direct(&mut self, c: &Context, of: &Tile, limit: &Limit) -> bool {
         let under_way = self.work.direct.take().filter(|w| w.epoch == c.light.direct_epoch);
         let begin = || {
             let rect = c.map.rect_in_light_map(of.placement, &of.rect);
-            // Far-away vertices can make a block as large as a page.
+            // Vertices far away can make a block as large as a page.
             let unknown = |area| limit.granted(try_filled(area, Vec3::NAN, "direct light")).map(Vec::into_boxed_slice);
             let tile = DirectTile { rect, values: unknown(rect.area())? };
             let sharp = unknown(rect.grown(1).area())?;
@@ -361,7 +362,7 @@ impl Block {
 }
 
 impl BlockWork {
-    /// What is known of texel `i`: its own rays, with the prior's light fading while they are few.
+    /// Estimate of the light of texel `i`: from its own rays, with the prior's light fading while these are few.
     pub fn estimate(&self, i: usize) -> Option<Vec3> {
         let prior = self.prior.get(i).copied().filter(|p| p.is_finite());
         let Some(g) = self.gathered.get(i).filter(|g| g.rays > 0) else { return prior };
@@ -372,12 +373,12 @@ impl BlockWork {
         Some((prior * weight + g.irradiance() * n) / (weight + n))
     }
 
-    /// Variance of what texel `i` has gathered, infinite before it has gathered anything.
+    /// Variance of the light that texel `i` has gathered, infinite before it has gathered any.
     pub fn variance(&self, i: usize) -> f32 {
         self.gathered.get(i).filter(|g| g.rays > 0).map_or(f32::INFINITY, |g| g.variance())
     }
 
-    /// Whether texel `i` can be seen, as far as is known.
+    /// Whether texel `i` can be seen, as far as is known so far.
     pub fn is_visible(&self, i: usize) -> bool {
         self.gathered.get(i).is_none_or(|g| g.is_visible())
     }
@@ -387,14 +388,14 @@ impl BlockWork {
         self.gathered.iter().any(|g| g.is_visible() && g.sum != Vec3::ZERO)
     }
 
-    /// Drops the prior once it has no weight: when a step of the second round has been completed.
+    /// Drops the prior when it has no weight left: when a step of the second round has been completed.
     pub fn drop_faded_prior(&mut self, status: &BlockStatus) {
         if status.rounds >= 2 && self.cursor == 0 {
             self.prior = Box::default();
         }
     }
 
-    /// Takes note of how far a round lies from the rounds before it (Welford 1962).
+    /// Records how far a round lies from the mean of the rounds before it (Welford 1962).
     fn note_deviation(&mut self, before: &Gathered, i: usize) {
         let (n, after) = (before.rays as f32 / ROUND as f32, &self.gathered[i]);
         if n > 0.0 {
@@ -406,7 +407,7 @@ impl BlockWork {
     }
 }
 
-/// The sample of a texel of the light map; `None` if it is none of the block's.
+/// The sample of a texel of the light map; `None` if the texel is not the block's.
 pub(super) fn owns(c: &Context, tile: &Tile, x: i32, y: i32) -> Option<u32> {
     let a = &c.map.atlas;
     let sample = a.map.at(tile.placement, x, y);
@@ -414,21 +415,20 @@ pub(super) fn owns(c: &Context, tile: &Tile, x: i32, y: i32) -> Option<u32> {
         return None;
     }
     let at = a.gather.layout.texel_coord(tile.placement, a.texel_local(tile.placement, sample as usize));
-    // One texel more than the block's own, so that rounding leaves no gaps between blocks.
+    // Includes one texel around the block's own, so that rounding leaves no gaps between blocks.
     let own = tile.rect.grown(1);
     let (gx, gy) = (at[0].floor() as i32, at[1].floor() as i32);
     (gx >= own.x0 && gx < own.x1 && gy >= own.y0 && gy < own.y1).then_some(sample)
 }
 
-/// Direct light of a texel of the light map; `None` if it is none of the block's; infinite if
-/// it is inside a solid.
+/// Direct light of a texel of the light map; `None` if the texel is not the block's; infinite if it is inside a solid.
 fn direct_texel(c: &Context, tile: &Tile, x: i32, y: i32, work: &mut DirectWork, rays: &mut u64) -> Option<Vec3> {
     let (a, sample) = (&c.map.atlas, owns(c, tile, x, y)?);
     let backs = &c.light.sides.backs;
     let receiver = a.receiver(&a.map, backs, sample as usize);
     let texels =
         TexelLight { areas: a.areas(&a.map), direct: &c.light.direct, samples: c.direct_samples, seed: c.direct_seed };
-    // Texels that are looked at as neighbours too are computed once per tile.
+    // Light without penumbrae of texels that are needed as neighbours too is computed once per tile.
     let known = work.tile.rect.grown(1);
     let mut sharp_at = |s: usize| {
         let (x, y) = a.map.position(s);

@@ -1,5 +1,5 @@
-//! The readable baseline: ordered single-ray traversal of the binary tree, one box and one triangle
-//! at a time (thesis 3.1.1). The tables compare the kernels with it; nothing else uses it.
+//! Readable baseline: ordered single-ray traversal of the binary tree, one box and one triangle at a time (thesis
+//! 3.1.1). The tables compare the kernels with it; nothing else uses it.
 
 use super::{RawHit, Ray};
 use crate::bvh::{BinaryBvh, BinaryNode};
@@ -40,7 +40,7 @@ pub fn closest(bvh: &BinaryBvh, corners: &[[Vec3; 3]], ray: &Ray) -> RawHit {
 /// Distance at which the ray enters a box, +inf if it does not (slab test, Kay and Kajiya 1986).
 fn slab(node: &BinaryNode, origin: Vec3, reciprocal: Vec3, tmin: f32, tmax: f32) -> f32 {
     let (a, b) = ((node.lower - origin) * reciprocal, (node.upper - origin) * reciprocal);
-    // 0 · ∞ where the origin lies on a plane of a slab that the ray runs along: inside.
+    // 0 · ∞ if the origin lies on a plane of a slab that the ray is parallel to: inside.
     let a = Vec3::select(a.is_nan_mask(), Vec3::NEG_INFINITY, a);
     let b = Vec3::select(b.is_nan_mask(), Vec3::INFINITY, b);
     let near = a.min(b).max_element().max(tmin);
@@ -48,7 +48,7 @@ fn slab(node: &BinaryNode, origin: Vec3, reciprocal: Vec3, tmin: f32, tmax: f32)
     if near <= far.min(super::tree::beyond(tmax)) { near } else { f32::INFINITY }
 }
 
-/// Edge functions in 3D (Kensler and Shirley 2006): other arithmetic than that of the kernels.
+/// Ray-triangle test by edge functions in 3D (Kensler and Shirley 2006): other arithmetic than that of the kernels.
 fn intersect(corners: &[Vec3; 3], triangle: u32, origin: Vec3, direction: Vec3) -> Option<RawHit> {
     let [v0, v1, v2] = corners.map(|c| c - origin);
     let u = (v2 - v0).cross(v2 + v0).dot(direction);

@@ -1,9 +1,9 @@
-//! Rays through the compact tree of [`crate::bvh::compact`]: planes are decoded as they are tested, corners
-//! read from the meshes through their indices.
+//! Rays through the compact tree of [`crate::bvh::compact`]: planes are decoded when they are tested, corners are read
+//! from the meshes through their indices.
 //!
-//! Triangles meet the arithmetic that they meet in whole trees. Boxes are larger than there, so that a ray
-//! comes to leaves whose own box it passes; a hit counts only if the ray meets that box, computed from the
-//! corners. So hits are those of whole trees, bit for bit.
+//! Triangles are tested by the same arithmetic as in full trees. Boxes are larger than there, so that a ray reaches
+//! leaves whose exact box it misses; a hit counts only if the ray intersects that box, computed from the corners. So
+//! hits are those of full trees, bit for bit.
 
 use super::tree::{Leaf, RaySetup, Tree};
 use super::triangle::{Projected, Shear, V3, accurate_distance};
@@ -15,7 +15,7 @@ use crate::simd::{Eight, Four, Lanes, Simd, prefetch};
 use glam::Vec3;
 use std::mem::{MaybeUninit, offset_of};
 
-/// A compact tree with the meshes that it is of.
+/// A compact tree together with the meshes that it was built of.
 #[derive(Clone, Copy)]
 pub(crate) struct View<'a> {
     tree: &'a Compact,
@@ -126,7 +126,7 @@ impl CompactLeaf<'_> {
         unsafe { self.view.corners(self.triangles.add(i).read() & NUMBER) }
     }
 
-    /// The box that this leaf has in a whole tree without cut triangles.
+    /// The box that this leaf has in a full tree without cut triangles.
     #[cold]
     fn outer_box(&self) -> (Vec3, Vec3) {
         let (mut lower, mut upper) = (Vec3::INFINITY, Vec3::NEG_INFINITY);
@@ -146,7 +146,7 @@ impl CompactLeaf<'_> {
     }
 }
 
-/// From four corners to the origin, in the ray's frame. (Functions: closures were not inlined.)
+/// Vectors from four corners to the origin, in the ray's frame. (Functions: closures were not inlined.)
 ///
 /// # Safety
 /// The CPU must have the ISA, and three floats must be readable at each pointer.

@@ -1,24 +1,24 @@
-//! Rays that pass through some of what they meet: holes that textures cut out, and thin sheets that
+//! Filters for rays that pass through some of the surfaces that they hit: cut-outs of textures, and thin sheets that
 //! transmit light.
 //!
-//! The ordinary kernels know nothing of them. Where one has reported a hole, or an occluder that may be
-//! one or transmit, the ray is traced again by a kernel that asks a [`Filter`] about every triangle met:
-//! from the beginning, since from the hit on it would lose what coincides with it.
+//! The ordinary kernels know nothing of them. If one has reported a hit on a cut-out, or an occluder that may be one or
+//! transmit, the ray is traced again by a kernel that asks a [`Filter`] about every triangle it hits: from the
+//! beginning, since from the hit on it would lose surfaces that coincide with it.
 
 use super::RawHit;
 use super::triangle::barycentrics;
 use crate::scene::Scene;
 
-/// Which hits count, asked for each that could be the best so far.
+/// Decides which hits count; asked for each that could be the best so far.
 pub(super) trait Accept {
-    /// Whether any may be refused. If not, nothing is asked.
+    /// Whether any hit may be rejected. If not, nothing is asked.
     const FILTERS: bool;
 
-    /// Whether a hit counts: `t` as the kernel has it, `weights` of corners 1, 2 and 0 up to a factor.
+    /// Whether a hit counts: `t` is the kernel's, `weights` are those of corners 1, 2 and 0 up to a factor.
     fn accepts(&mut self, triangle: u32, t: f32, weights: [f32; 3]) -> bool;
 }
 
-/// All hits count.
+/// Accepts all hits.
 pub(super) struct All;
 
 impl Accept for All {
@@ -30,14 +30,14 @@ impl Accept for All {
     }
 }
 
-/// A sheet that a ray passes through.
+/// A hit on a transmissive sheet, which the ray passes through.
 #[derive(Clone, Copy)]
 pub(crate) struct Crossing {
     pub hit: RawHit,
     pub(super) on_edge: bool,
 }
 
-/// Refuses holes and, if asked to, takes down and refuses sheets that transmit.
+/// Rejects cut-outs; if asked to, records transmissive sheets and passes through them.
 pub(crate) struct Filter<'a> {
     pub(super) scene: &'a Scene,
     pub(super) crossings: Option<&'a mut Vec<Crossing>>,

@@ -1,8 +1,8 @@
-//! Shared-origin gather: a packet of rays from one point (thesis 3.2.5).
+//! Shared-origin gather: traces a packet of rays from one point (thesis 3.2.5).
 //!
-//! The rays go one by one, several in flight. Packets that pass the tree together, with planes and
-//! triangles relative to the origin once for all, were slower: 32 rays of a hemisphere part within two
-//! levels of an 8-wide tree (Sponza: 0.59 of `rtcIntersect1`, against 0.97 in flight on the same day).
+//! The rays are traced one by one, several under way at a time. Packets that traverse the tree together, with planes
+//! and triangles relative to the origin once for all, were slower: 32 rays of a hemisphere diverge within two levels of
+//! an 8-wide tree (Sponza: 0.59 of `rtcIntersect1`, against 0.97 one by one on the same day).
 
 use super::single::many;
 use super::{PACKET_SIZE, Packet, RawHit, Ray};

@@ -11,8 +11,8 @@ use crate::device::Device;
 use crate::simd::{self, Isa, entry_point, isa_features};
 use glam::Vec3;
 
-/// Kernels of one ISA. Tables exist for every ISA, but only [`Kernels::of`] hands them out,
-/// and only those that the machine can run: that makes the methods safe.
+/// Kernels of one ISA. Tables exist for every ISA, but [`Kernels::of`] returns only those that the machine can run:
+/// that makes the methods safe.
 pub(crate) struct Kernels {
     intersect: unsafe fn(&Mbvh, &Ray) -> RawHit,
     intersect_block: unsafe fn(&Mbvh, &[Ray], &mut [RawHit]),
@@ -21,7 +21,7 @@ pub(crate) struct Kernels {
     gather: unsafe fn(&Mbvh, Vec3, &Packet, f32, f32, &mut [RawHit; PACKET_SIZE]),
     compact_intersect: unsafe fn(&View, &[Ray], &mut [RawHit]),
     compact_occluded: unsafe fn(&View, &[Ray], &mut [u8]),
-    /// The closest hit, and any.
+    /// Closest hit and any hit, among those that a filter accepts.
     filtered: [unsafe fn(&Mbvh, &Ray, &mut Filter) -> RawHit; 2],
     compact_filtered: [unsafe fn(&View, &Ray, &mut Filter) -> RawHit; 2],
 }
@@ -106,14 +106,14 @@ table!(AVX2, avx2, Avx2);
 table!(AVX512, avx512, Avx512);
 
 impl Kernels {
-    /// Those that a device is for.
+    /// The kernels of a device's ISA.
     #[inline]
     pub(crate) fn of(device: &Device) -> &'static Kernels {
         // Devices exist only with an ISA that the machine can run.
         Self::table(device.isa())
     }
 
-    /// The table of an ISA; of the portable one if the machine cannot run `isa`.
+    /// The table of an ISA; that of the portable one if the machine cannot run `isa`.
     #[cfg(test)]
     pub(crate) fn for_isa(isa: Isa) -> &'static Kernels {
         Self::table(if isa.is_available() { isa } else { Isa::Portable })
@@ -183,13 +183,13 @@ impl Kernels {
         unsafe { (self.compact_occluded)(tree, rays, out) }
     }
 
-    /// Closest (or any) of the hits that a filter accepts.
+    /// Closest hit (`ANY`: any hit) among those that a filter accepts.
     pub(crate) fn filtered<const ANY: bool>(&self, tree: &Mbvh, ray: &Ray, filter: &mut Filter) -> RawHit {
         // SAFETY: see `intersect`.
         unsafe { (self.filtered[ANY as usize])(tree, ray, filter) }
     }
 
-    /// The same in a compact tree.
+    /// Closest hit (`ANY`: any hit) in a compact tree, among those that a filter accepts.
     pub(crate) fn compact_filtered<const ANY: bool>(&self, tree: &View, ray: &Ray, filter: &mut Filter) -> RawHit {
         // SAFETY: see `intersect`.
         unsafe { (self.compact_filtered[ANY as usize])(tree, ray, filter) }

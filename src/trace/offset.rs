@@ -18,15 +18,14 @@ pub fn offset_ray_origin(position: Vec3, normal: Vec3, scene: &Scene) -> Vec3 {
     position + normal * ray_epsilon(position, scene)
 }
 
-/// How far from the edges of its triangle a ray starts, in [`ray_epsilon`]s: with the offset along the
-/// normal that is inside of walls that meet at 8° or more.
+/// Distance from the edges of its triangle at which a ray starts, in [`ray_epsilon`]s: with the offset along the normal
+/// that is inside of walls that meet at 8° or more.
 const EDGE_DISTANCE: f64 = 8.0;
 
-/// How far a point moves at most to get away from edges, in [`ray_epsilon`]s: enough for corners of
-/// 30° and more.
+/// Maximum distance by which a point moves away from edges, in [`ray_epsilon`]s: enough for corners of 30° and more.
 const MAX_MOVE: f64 = 4.0 * EDGE_DISTANCE;
 
-/// A point of a triangle with all that a path needs to go on from it.
+/// A point of a triangle with all that a path needs to continue from it.
 pub struct SurfacePoint {
     /// The hit point, rounded once.
     pub position: Vec3,
@@ -41,7 +40,7 @@ pub struct SurfacePoint {
 }
 
 impl SurfacePoint {
-    /// The point with barycentric weights `u` and `v` of vertices 1 and 2.
+    /// The point of a triangle with barycentric weights `u` and `v` of vertices 1 and 2.
     #[inline]
     pub fn new(corners: [Vec3; 3], u: f32, v: f32, scene: &Scene) -> SurfacePoint {
         let corners = corners.map(|c| c.as_dvec3());
@@ -77,7 +76,7 @@ fn nearest_on_inner_triangle(corners: [DVec3; 3], lengths: [f64; 3], fraction: f
     let on_edge = |i: usize| {
         let (from, edge) = (inner[i], inner[(i + 1) % 3] - inner[i]);
         let t = (p - from).dot(edge) / edge.length_squared();
-        // Not a number for an edge of no length.
+        // NaN for an edge of no length.
         from + edge * if t > 0.0 { t.min(1.0) } else { 0.0 }
     };
     let points = [on_edge(0), on_edge(1), on_edge(2)];

@@ -28,16 +28,16 @@ use crate::bvh::layout::{ChildRef, MAX_LEAF, Mbvh, Node, STACK_SIZE, WIDTH};
 use crate::simd::{Eight, Lanes, Mask, Simd};
 use std::mem::MaybeUninit;
 
-/// Most rays in a bundle. (In tiles of 4 × 4 pixels, 128 were no faster.)
+/// Maximum number of rays in a bundle. (In tiles of 4 × 4 pixels, 128 were no faster.)
 const SIZE: usize = 64;
 
-/// Fewer rays go alone.
+/// Minimum number of rays in a bundle; fewer are traced one by one.
 const LEAST: usize = 12;
 
-/// How far slopes against the longest axis may differ in a bundle.
+/// Maximum difference of slopes against the longest axis in a bundle.
 const SPREAD: f32 = 0.4;
 
-/// Closest hits of as many rays as both slices have: bundles together, others alone.
+/// Closest hits of as many rays as both slices have: bundles are traced together, other rays one by one.
 ///
 /// # Safety
 /// The CPU must have the ISA.
@@ -69,8 +69,8 @@ pub(super) unsafe fn block<S: Simd>(bvh: &Mbvh, rays: &[Ray], out: &mut [RawHit]
     }
 }
 
-/// The axis of the largest component, which must be the only one, of a direction which no test has to
-/// treat specially.
+/// The axis of the largest component of a direction; `None` if there are several such axes or the direction needs
+/// special treatment in a test.
 #[inline(always)]
 fn longest_axis(d: [f32; 3]) -> Option<usize> {
     let [x, y, z] = d.map(f32::abs);
@@ -87,18 +87,18 @@ fn longest_axis(d: [f32; 3]) -> Option<usize> {
     ((1e-6..=1e6).contains(&largest) && least > STEEP * largest).then_some(k)
 }
 
-/// How many rays, from the first, make a bundle: they share origin and range, and their directions octant
-/// and longest axis, and nearly their slopes. 0 or 1 if there is none.
+/// Number of rays, from the first, that make a bundle: they share origin and range, octant and longest axis of their
+/// directions, and nearly their slopes. It is 0 or 1 if there is no bundle.
 #[inline(always)]
 fn bundle(rays: &[Ray]) -> usize {
     let first = &rays[0];
-    // By bits, and all at once, without branches.
+    // Compares bits, all at once, without branches.
     let differ = |a: f32, b: f32| a.to_bits() ^ b.to_bits();
     let same = |r: &Ray| {
         let origin = (0..3).fold(0, |sum, a| sum | differ(r.origin[a], first.origin[a]));
         origin | differ(r.tmin, first.tmin) | differ(r.tmax, first.tmax) == 0
     };
-    // At once for most rays that are in no bundle.
+    // Rejects most rays that are in no bundle at once.
     if rays.len() < LEAST || !same(&rays[1]) || !(first.tmax > first.tmin) {
         return 0;
     }
@@ -111,7 +111,7 @@ fn bundle(rays: &[Ray]) -> usize {
     let (mut least, mut most) = ([f32::INFINITY; 2], [0f32; 2]);
     for (n, r) in rays.iter().take(SIZE).enumerate() {
         let [x, y, z] = [r.direction[i] * sign[i], r.direction[j] * sign[j], r.direction[k] * sign[k]];
-        // What `longest_axis` asks, without branches, which took a tenth of the time; and the octant.
+        // The conditions of `longest_axis`, without branches, which took a tenth of the time; and the octant.
         let is_alike = (x < z) & (y < z) & (x > STEEP * z) & (y > STEEP * z) & (1e-6..=1e6).contains(&z);
         let inverse = 1.0 / z;
         for (a, s) in [x * inverse, y * inverse].into_iter().enumerate() {
@@ -133,22 +133,22 @@ type Column = [f32; SIZE];
 #[repr(C, align(64))]
 struct Bundle {
     direction: [Column; 3],
-    /// As in `RaySetup`.
+    /// Reciprocals of directions, as in `RaySetup`.
     reciprocal: [Column; 3],
     near_offset: [Column; 3],
     far_offset: [Column; 3],
-    /// As in [`Shear`].
+    /// Shears of the rays' frames, as in [`Shear`].
     shear: [Column; 2],
     grazing: Column,
-    /// The largest component: from t to the distance along its axis.
+    /// The largest component of the direction: factor from t to the distance along its axis.
     length: Column,
-    /// Boxes that begin behind this are not entered. −inf behind the last ray.
+    /// Conservative tmax: boxes that begin behind it are not entered. −inf for lanes behind the last ray.
     limit: Column,
     t: Column,
     u: Column,
     v: Column,
     sum: Column,
-    /// Numbers as bits.
+    /// Triangle numbers, stored as the bits of floats.
     triangle: Column,
 }
 
@@ -156,38 +156,38 @@ struct Bundle {
 struct Shared {
     origin: [f32; 3],
     tmin: f32,
-    /// The scene's axes in the order of the rays' frames, as in [`Shear`].
+    /// The scene's axes in the order of the rays' frame, as in [`Shear`].
     axes: [usize; 3],
     /// The origin in the order of `axes`.
     frame_origin: [f32; 3],
     negative: [bool; 3],
-    /// Shift of the rays' octant in [`Node::order`].
+    /// Shift that selects the rays' octant in [`Node::order`].
     shift: u32,
-    /// Groups of lanes that have rays.
+    /// Number of lane groups that have rays.
     groups: usize,
 }
 
-/// The frustum around the rays. Distances are along the longest axis; they differ from t by a factor per ray.
-/// So the three intervals of a box are independent, and the test is exact but for rounding: a common
-/// distance exists if and only if one exists for any two of them.
+/// Frustum that encloses the rays. Distances are along the longest axis; they differ from t by a factor per ray, so the
+/// three intervals of a box are independent, and the test is exact but for rounding: a common distance exists if and
+/// only if one exists for any two of them.
 struct Frustum {
     /// 1 or −1: planes × `sign` + `near` or `far` are distances from the origin along the axis.
     sign: [f32; 3],
     near: [f32; 3],
     far: [f32; 3],
-    /// Least and greatest reciprocal slopes.
+    /// Least and greatest reciprocal slopes of the rays.
     least: [f32; 3],
     most: [f32; 3],
-    /// Range of distances.
+    /// Range of distances of the rays.
     begin: f32,
     end: f32,
 }
 
-/// More than what rounding may cost in the frustum's tests.
+/// Relative margin, larger than the rounding error of the frustum's tests.
 const SLACK: f32 = 2e-6;
 
 impl Frustum {
-    /// Near distances of a node's boxes, and a mask of those that the frustum overlaps.
+    /// Near distances of a node's boxes, and a mask of the boxes that the frustum overlaps.
     ///
     /// # Safety
     /// The CPU must have the ISA.
@@ -204,7 +204,7 @@ impl Frustum {
         (near, near.le(far))
     }
 
-    /// Distances of a node's near and far planes. (A function: as a closure it was not inlined.)
+    /// Distances of a node's near and far planes across an axis. (A function: as a closure it was not inlined.)
     ///
     /// # Safety
     /// The CPU must have the ISA.
@@ -228,16 +228,17 @@ fn planes(node: &Node, a: usize, negative: [bool; 3]) -> (&[f32; WIDTH], &[f32; 
     if negative[a] { (&node.upper[a], &node.lower[a]) } else { (&node.lower[a], &node.upper[a]) }
 }
 
-/// Children still to be visited, nearest on top.
+/// Traversal stack of a bundle, nearest child on top.
 struct Stack {
     near: [MaybeUninit<f32>; STACK_SIZE],
-    /// 8 · the parent's number + which child. (There are fewer nodes than triangle slots, of 2^28.)
+    /// Child to be visited: 8 · the parent's number + its index there. (There are fewer nodes than triangle slots, of
+    /// 2^28.)
     child: [MaybeUninit<u32>; STACK_SIZE],
-    /// First group that may hit it.
+    /// First group of rays that may hit the child.
     first: [MaybeUninit<u8>; STACK_SIZE],
 }
 
-/// Lanes of group `g`.
+/// Loads the lanes of group `g`.
 ///
 /// # Safety
 /// The CPU must have the ISA; the group must lie in the column.
@@ -313,7 +314,7 @@ unsafe fn trace<S: Simd>(bvh: &Mbvh, rays: &[Ray], out: &mut [RawHit]) {
                 first = *firsts.add(count) as usize;
                 let (node, lane) = (bvh.nodes.get_unchecked(name / WIDTH), name % WIDTH);
                 let child = node.children[lane];
-                // The one that comes next, most likely.
+                // Prefetches the child that most likely comes next.
                 if count > 0 {
                     let next = *children.add(count - 1) as usize;
                     bvh.prefetch(bvh.nodes.get_unchecked(next / WIDTH).children[next % WIDTH]);
@@ -402,7 +403,7 @@ unsafe fn begin<'a, S: Simd>(rays: &[Ray], place: &'a mut MaybeUninit<Bundle>) -
         let least = [least[0].to_array(), least[1].to_array(), least[2].to_array()];
         let most = [most[0].to_array(), most[1].to_array(), most[2].to_array()];
         let sign = negative.map(|n| if n { -1.0 } else { 1.0 });
-        // More than what rays alone take off for rounding, which all of them do.
+        // Larger than the margin for rounding of a single ray's test; all rays have that one.
         let margin = origin.map(|o| 16.0 * EPSILON * o.abs());
         let frustum = Frustum {
             sign,
@@ -417,10 +418,10 @@ unsafe fn begin<'a, S: Simd>(rays: &[Ray], place: &'a mut MaybeUninit<Bundle>) -
     }
 }
 
-/// Hits from the best ones.
+/// Writes hits out, with barycentrics.
 #[inline(always)]
 fn finish(rays: &Bundle, out: &mut [RawHit]) {
-    // Like this the divisions become vectors'.
+    // Written like this, the divisions are vectorised.
     let (mut u, mut v): (Column, Column) = ([0.0; SIZE], [0.0; SIZE]);
     for i in 0..SIZE {
         (u[i], v[i]) = barycentrics(rays.u[i], rays.v[i], rays.sum[i]);
@@ -433,7 +434,8 @@ fn finish(rays: &Bundle, out: &mut [RawHit]) {
 }
 
 impl Bundle {
-    /// Mask of a group's rays that hit a box, given by its near and far planes per axis; the arithmetic of `RaySetup`.
+    /// Mask of a group's rays that intersect a box, given by its near and far planes per axis; the arithmetic of
+    /// `RaySetup`.
     ///
     /// # Safety
     /// The CPU must have the ISA; the group must be of the bundle.
@@ -454,7 +456,7 @@ impl Bundle {
         }
     }
 
-    /// Greatest distance, along the longest axis, at which any ray may still find something.
+    /// Greatest distance, along the longest axis, at which any ray may still hit something.
     ///
     /// # Safety
     /// The CPU must have the ISA; there must be as many groups.
@@ -471,8 +473,8 @@ impl Bundle {
         end + SLACK * end.abs()
     }
 
-    /// Improves hits by the triangles of a leaf in the box of `planes`, from group `first` on; says whether
-    /// it did.
+    /// Tests the rays, from group `first` on, against the box of `planes` and the triangles of the leaf in it, and
+    /// updates their hits; returns whether any has changed.
     ///
     /// # Safety
     /// The CPU must have the ISA; `leaf` must be a leaf of `bvh`.
@@ -487,7 +489,7 @@ impl Bundle {
     ) -> bool {
         // SAFETY: forwarded.
         let (rows, count) = (unsafe { bvh.leaf(leaf) }, leaf.leaf_count());
-        // From corners to the origin, in the frame that all rays share.
+        // Vectors from corners to the origin, in the frame that all rays share.
         let mut corners = [[0.0f32; MAX_LEAF]; 9];
         for i in (0..count).step_by(4) {
             for a in 0..3 {
@@ -529,7 +531,7 @@ impl Bundle {
         improved
     }
 
-    /// Improves the hits of `candidates` of group `g` by triangle `i` of a leaf; says whether it did.
+    /// Updates the hits of `candidates` of group `g` by triangle `i` of a leaf; returns whether any has changed.
     ///
     /// # Safety
     /// The CPU must have the ISA; `rows` must be a leaf of `count` triangles, more than `i`.
@@ -563,7 +565,7 @@ impl Bundle {
             }
             let best = lanes::<L>(&self.t, g);
             let in_range = candidates.and(L::splat(shared.tmin).lt(t));
-            // Among equal t, the lowest number.
+            // Among equal t, the lowest number wins.
             let number = rows.add(9 * count + i).read();
             let mut equal = in_range.and(t.le(best)).and(best.le(t)).bits();
             let nearer = in_range.and(t.lt(best));
@@ -574,7 +576,7 @@ impl Bundle {
                 replace(&mut self.v, g, nearer, seen.v);
                 replace(&mut self.sum, g, nearer, sum);
                 replace(&mut self.triangle, g, nearer, L::splat(number));
-                // As `beyond`.
+                // Conservative tmax, as `beyond`.
                 replace(&mut self.limit, g, nearer, t + L::splat(BEYOND) * t.max(zero - t));
             }
             if equal != 0 {
@@ -594,7 +596,7 @@ impl Bundle {
         }
     }
 
-    /// Puts the distances of `inaccurate` rays of those from `first` on right, as for rays alone.
+    /// Recomputes the distances of `inaccurate` rays, counted from `first` on, as for single rays.
     ///
     /// # Safety
     /// `rows` must be a leaf of `count` triangles, more than `i`.
@@ -614,7 +616,7 @@ impl Bundle {
             let lane = inaccurate.trailing_zeros() as usize;
             inaccurate &= inaccurate - 1;
             let direction = [0, 1, 2].map(|a| self.direction[a][first + lane]);
-            // Where all edge functions vanish, the ray lies in the plane.
+            // If all edge functions vanish, the ray lies in the plane.
             t[lane] = if sums[lane] != 0.0 {
                 // SAFETY: forwarded.
                 unsafe { accurate_distance(rows, count, i, &Shear::new(shared.origin, direction)) }

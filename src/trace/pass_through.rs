@@ -1,5 +1,5 @@
-//! Rays of a scene that pass through holes and thin sheets: what is found by the ordinary kernels is put right, and the
-//! light that sheets let through computed, by the kernels with a [`Filter`].
+//! Queries of scenes with cut-outs and transmissive sheets: corrects the results of the ordinary kernels, and computes
+//! the light that sheets transmit, by the kernels with a [`Filter`].
 
 use super::filter::{Crossing, Filter};
 use super::queries::TreeView;
@@ -8,12 +8,12 @@ use super::{Packet, RawHit, Ray};
 use crate::scene::Scene;
 use glam::Vec3;
 
-/// Hits of a ray on an edge that are nearer to each other than this part of their distance are one if they
-/// have one material: it meets both triangles of the edge.
+/// Two hits of a ray on an edge are one if they have one material and their distances differ by less than this
+/// fraction: the ray then hits both triangles of the edge.
 const SAME_EDGE: f32 = 1e-5;
 
 impl Scene {
-    /// Puts hits right that are holes.
+    /// Traces rays again whose closest hit is a cut-out.
     #[cold]
     pub(super) fn leave_holes(&self, rays: &[Ray], hits: &mut [RawHit]) {
         for (ray, hit) in rays.iter().zip(hits) {
@@ -23,7 +23,7 @@ impl Scene {
         }
     }
 
-    /// The same of a packet.
+    /// Traces those rays of a packet again whose closest hit is a cut-out.
     #[cold]
     pub(super) fn leave_holes_of_packet(
         &self,
@@ -39,7 +39,7 @@ impl Scene {
         }
     }
 
-    /// Puts occlusion right that is by holes alone.
+    /// Corrects occlusion that is by cut-outs alone.
     #[cold]
     pub(super) fn look_through_holes(&self, rays: &[Ray], occluded: &mut [u8]) {
         for (ray, occluded) in rays.iter().zip(occluded).filter(|(_, occluded)| **occluded != 0) {
@@ -47,8 +47,8 @@ impl Scene {
         }
     }
 
-    /// The fraction of light, per channel, that gets along a ray: 0 if anything opaque lies on it, else the
-    /// product of what the sheets on it transmit.
+    /// The fraction of light, per channel, that passes along a ray: 0 if anything opaque lies on it, else the product
+    /// of the transmittances of the sheets on it.
     pub fn transmittance(&self, ray: &Ray) -> Vec3 {
         if !self.uses().transmission {
             return if self.occluded(ray) { Vec3::ZERO } else { Vec3::ONE };
@@ -64,7 +64,7 @@ impl Scene {
         crossings.iter().map(|c| Vec3::from(self.material(c.hit.triangle).transmission)).product()
     }
 
-    /// The closest hit on something opaque and, in order, the sheets that transmit before it.
+    /// The closest hit on something opaque and, in order, the transmissive sheets before it.
     pub(crate) fn intersect_through(&self, ray: &Ray, crossings: &mut Vec<Crossing>) -> RawHit {
         crossings.clear();
         let hit = self.filtered::<false>(ray, Some(crossings));
@@ -72,7 +72,7 @@ impl Scene {
         hit
     }
 
-    /// The closest hit (`ANY`: any) among those that count, which are all of the ray's from its beginning.
+    /// The closest hit (`ANY`: any hit) that counts, found by tracing the ray from its beginning.
     #[cold]
     fn filtered<const ANY: bool>(&self, ray: &Ray, crossings: Option<&mut Vec<Crossing>>) -> RawHit {
         let (kernels, mut filter) = (self.kernels(), Filter { scene: self, crossings });
@@ -82,7 +82,7 @@ impl Scene {
         }
     }
 
-    /// Orders crossings, and leaves those that lie behind `hit` and those that are counted twice.
+    /// Sorts crossings, and removes those that lie behind `hit` and those that are counted twice.
     fn tidy(&self, crossings: &mut Vec<Crossing>, ray: &Ray, hit: &RawHit) {
         let scale = direction_scale(ray).unwrap_or(1.0);
         crossings.iter_mut().for_each(|c| c.hit.t *= scale);

@@ -1,6 +1,6 @@
 //! Queries of a committed scene: closest hits, occlusion and shared-origin gathers, one ray or many.
 //!
-//! Points that a texture cuts out are no hits. In scenes that have some, hits and occlusion are
+//! Hits on cut-outs of textures do not count. In scenes that have some, hits and occlusion are
 //! [checked](super::pass_through) after the kernels, which are those of all scenes.
 
 use super::compact::View;
@@ -12,7 +12,7 @@ use crate::scene::Scene;
 use glam::Vec3;
 use rayon::prelude::*;
 
-/// The tree of a scene, for kernels.
+/// The tree of a scene, in the form that kernels take.
 #[derive(Clone, Copy)]
 pub(super) enum TreeView<'a> {
     Whole(&'a Mbvh),
@@ -23,7 +23,7 @@ pub(super) enum TreeView<'a> {
 const BLOCK: usize = 1024;
 
 impl Scene {
-    /// The kernels for the machine that the scene's device is for.
+    /// The kernels of the ISA of the scene's device.
     #[inline]
     pub(super) fn kernels(&self) -> &'static Kernels {
         Kernels::of(self.device())
@@ -48,7 +48,7 @@ impl Scene {
         self.to_hit(self.intersect_raw(ray))
     }
 
-    /// From global to (mesh, triangle) numbers.
+    /// Converts a global triangle number to mesh and triangle.
     #[inline]
     pub fn to_hit(&self, hit: RawHit) -> Hit {
         if hit.triangle == NONE {
@@ -58,7 +58,7 @@ impl Scene {
         Hit { t: hit.t, u: hit.u, v: hit.v, triangle, mesh, instance: NONE }
     }
 
-    /// The same of many. Neighbours mostly hit the same mesh, which is then looked up once.
+    /// Converts many hits as `to_hit`. Neighbours mostly hit the same mesh, which is then looked up once.
     pub(crate) fn to_hits(&self, hits: &[RawHit], out: &mut [Hit]) {
         let first_triangle = self.acceleration().1;
         let (mut mesh, mut begin, mut end) = (0, 0, 0);
@@ -78,7 +78,7 @@ impl Scene {
 
     /// Closest hits of many rays, in order. `parallel`: spread over the device's threads.
     ///
-    /// Consecutive rays of a pinhole camera, with one origin and range, pass the tree together and are several
+    /// Consecutive rays of a pinhole camera, with one origin and range, traverse the tree together and are several
     /// times as fast as others: best in small square tiles of pixels. Hits are the same, bit for bit.
     pub fn intersect_many(&self, rays: &[Ray], parallel: bool, out: &mut [Hit]) -> Result<()> {
         if rays.len() != out.len() {
@@ -115,7 +115,7 @@ impl Scene {
         Ok(())
     }
 
-    /// Closest hits of rays that share an origin, `0 < t ≤ tmax`, in order: those of
+    /// Closest hits of rays that share an origin, `0 < t ≤ tmax`, in order: the same as those of
     /// [`intersect_many`](Self::intersect_many).
     pub fn gather(
         &self,
@@ -194,7 +194,7 @@ impl Scene {
         occluded[0] != 0
     }
 
-    /// Whether anything lies on the ray, holes included.
+    /// Whether anything lies on the ray, cut-outs included.
     #[inline]
     pub(super) fn anything_on(&self, ray: &Ray) -> bool {
         match self.tree() {
@@ -229,7 +229,7 @@ impl Scene {
         }
     }
 
-    /// Whether hits may be holes.
+    /// Whether hits may be on cut-outs.
     #[inline]
     fn has_holes(&self) -> bool {
         !self.uses().holes.is_empty()

@@ -25,13 +25,13 @@ impl Ray {
         Ray { origin: origin.to_array(), tmin: 0.0, direction: direction.to_array(), tmax: f32::INFINITY }
     }
 
-    /// The same ray limited to `tmin < t ≤ tmax`.
+    /// Restricts the ray to `tmin < t ≤ tmax`.
     pub fn within(self, tmin: f32, tmax: f32) -> Self {
         Ray { tmin, tmax, ..self }
     }
 }
 
-/// A hit by global triangle number, as kernels report it. A miss has `t = +inf`, triangle [`NONE`].
+/// A hit by global triangle number, as kernels report it. A miss has `t = +inf` and triangle [`NONE`].
 #[derive(Clone, Copy, Debug, PartialEq)]
 pub struct RawHit {
     /// Distance in multiples of the direction's length.
@@ -42,12 +42,12 @@ pub struct RawHit {
     pub v: f32,
     /// Global triangle number.
     pub triangle: u32,
-    /// Whether the ray met the front, from which the corners go round counter-clockwise.
+    /// Whether the ray hit the front, on which the corners go round counter-clockwise.
     pub front: bool,
 }
 
 impl RawHit {
-    /// No hit.
+    /// A miss.
     pub const MISS: RawHit = RawHit { t: f32::INFINITY, u: 0.0, v: 0.0, triangle: NONE, front: false };
 
     /// Whether nothing was hit.
@@ -57,7 +57,7 @@ impl RawHit {
     }
 }
 
-/// A hit by mesh and triangle, as callers see it.
+/// A hit by mesh and triangle, as callers get it.
 #[derive(Clone, Copy, Debug, PartialEq, Pod, Zeroable)]
 #[repr(C)]
 pub struct Hit {
@@ -76,11 +76,11 @@ pub struct Hit {
 }
 
 impl Hit {
-    /// No hit.
+    /// A miss.
     pub const MISS: Hit = Hit { t: f32::INFINITY, u: 0.0, v: 0.0, triangle: NONE, mesh: NONE, instance: NONE };
 }
 
-/// Rays in a gather packet.
+/// Maximum number of rays in a gather packet.
 pub const PACKET_SIZE: usize = 32;
 
 /// Directions of up to [`PACKET_SIZE`] rays with one origin, component by component.
@@ -93,7 +93,7 @@ pub struct Packet {
     pub y: [f32; PACKET_SIZE],
     /// Components along z.
     pub z: [f32; PACKET_SIZE],
-    /// How many of the directions count, from the first.
+    /// Number of valid directions, counted from the first.
     pub count: usize,
 }
 

@@ -22,7 +22,7 @@ pub(super) struct Best {
     pub triangle: u32,
     pub u: f32,
     pub v: f32,
-    /// u + v + w: positive where the ray meets the front.
+    /// u + v + w: positive if the ray hits the front.
     pub sum: f32,
 }
 
@@ -42,7 +42,8 @@ impl Best {
     }
 }
 
-/// Improves `best` by the triangles of a leaf; `ANY`: stops at the first. Says whether it did.
+/// Tests a ray against the triangles of a leaf and updates `best`; `ANY`: stops at the first hit. Returns whether
+/// `best` has changed.
 ///
 /// # Safety
 /// The CPU must have the ISA; `leaf` must be a leaf of `tree`.
@@ -75,7 +76,7 @@ unsafe fn leaf<S: Simd, T: Tree, A: Accept, const ANY: bool>(
                 let i = inaccurate.trailing_zeros() as usize;
                 inaccurate &= inaccurate - 1;
                 let weights = [projected.u, projected.v, projected.w].map(|l| l.to_array()[i]);
-                // Where all vanish, the ray lies in the plane.
+                // If all vanish, the ray lies in the plane.
                 let is_seen = weights[0] + weights[1] + weights[2] != 0.0;
                 // SAFETY: `candidates` has no lane beyond the count.
                 t[i] = if is_seen { unsafe { leaf.accurate_distance(first + i, &ray.shear) } } else { f32::NAN };
@@ -96,7 +97,7 @@ unsafe fn leaf<S: Simd, T: Tree, A: Accept, const ANY: bool>(
                     continue;
                 }
                 if ANY {
-                    // Any number tells that there is one.
+                    // Any triangle number marks a hit.
                     best.triangle = 0;
                     return true;
                 }
@@ -113,21 +114,22 @@ unsafe fn leaf<S: Simd, T: Tree, A: Accept, const ANY: bool>(
     improved
 }
 
-/// What a ray has still to visit, nearest on top: children and how far away they begin. None begins
-/// behind the closest hit so far. The lowest [`BOTTOM`] entries are [`ChildRef::EMPTY`], which the walk ends
-/// with.
+/// Traversal stack of a ray, nearest entry on top: children still to be visited and the distances at which their boxes
+/// begin. No box begins behind the closest hit so far. The lowest [`BOTTOM`] entries are [`ChildRef::EMPTY`], which end
+/// the traversal.
 struct Stack {
     near: [MaybeUninit<f32>; BOTTOM + STACK_SIZE],
     child: [MaybeUninit<ChildRef>; BOTTOM + STACK_SIZE],
     count: usize,
 }
 
-/// So many that what lies under any eight entries, counted from the top, is never read.
+/// Number of sentinels at the bottom of the stack: enough that no group of eight entries, counted from the top, reaches
+/// below the stack.
 const BOTTOM: usize = WIDTH;
 
 impl Stack {
-    /// Pushes the children of a node that `mask` tells, far ones first. Returns which
-    /// places they have in the node's order.
+    /// Pushes the children of a node that are set in `mask`, far ones first. Returns the set of their positions in the
+    /// node's order.
     ///
     /// # Safety
     /// The CPU must have the ISA; `node` must be a node of the tree that the stack is used for.
@@ -155,10 +157,10 @@ impl Stack {
         set
     }
 
-    /// Takes the top off.
+    /// Removes and returns the top entry.
     ///
     /// # Safety
-    /// Of the lowest [`BOTTOM`] entries, one at most must have been taken off since the count was set.
+    /// At most one of the lowest [`BOTTOM`] entries must have been popped since the count was set.
     #[inline(always)]
     unsafe fn pop(&mut self) -> ChildRef {
         self.count -= 1;
@@ -166,8 +168,8 @@ impl Stack {
         unsafe { self.child.get_unchecked(self.count).assume_init() }
     }
 
-    /// Drops what begins behind `tmax`. (Entry by entry, without branches, random rays in Sponza took some 10 %
-    /// longer.)
+    /// Removes the entries that begin behind `tmax`. (Entry by entry, without branches, random rays in Sponza took some
+    /// 10 % longer.)
     ///
     /// # Safety
     /// The CPU must have the ISA; there must be at least [`BOTTOM`] entries.
@@ -175,7 +177,7 @@ impl Stack {
     unsafe fn cut<S: Simd>(&mut self, tmax: f32) {
         const IN_ORDER: [u32; WIDTH] = [0, 1, 2, 3, 4, 5, 6, 7];
         let (nears, children) = (self.near.as_mut_ptr().cast::<f32>(), self.child.as_mut_ptr().cast::<u32>());
-        // What is left out, fewer than eight, is of the bottom.
+        // The skipped entries, fewer than eight, are sentinels.
         let mut kept = self.count % WIDTH;
         for first in (kept..self.count).step_by(WIDTH) {
             // SAFETY: entries below `count` have been written, and these eight are; `kept ≤ first`, so that only
@@ -192,24 +194,24 @@ impl Stack {
     }
 }
 
-/// A ray on its way through the tree.
+/// Traversal state of a ray.
 struct Walk {
     ray: RaySetup,
     best: Best,
-    /// Boxes that begin behind this are not entered.
+    /// Conservative tmax: boxes that begin behind it are not entered.
     limit: f32,
-    /// To be visited now.
+    /// Child to be visited now.
     current: ChildRef,
-    /// From the walk's t to the ray's own.
+    /// Factor from the traversal's t to the ray's own t.
     scale: f32,
-    /// Of the ray, among many.
+    /// Index of the ray in its batch.
     number: usize,
     stack: Stack,
 }
 
 impl Walk {
-    /// Begins the walk of a ray in `place`; says whether there is anything to be walked: some rays cannot
-    /// hit anything.
+    /// Begins the traversal of a ray in `place`; returns whether there is anything to traverse: some rays cannot hit
+    /// anything.
     #[inline(always)]
     fn begin<T: Tree>(place: &mut MaybeUninit<Walk>, ray: &Ray, number: usize) -> bool {
         let Some(scale) = direction_scale(ray) else { return false };
@@ -232,11 +234,11 @@ impl Walk {
             (&raw mut (*p).scale).write(scale);
             (&raw mut (*p).number).write(number);
             (&raw mut (*p).stack.count).write(BOTTOM);
-            // Never behind a hit, so that they stay.
+            // Sentinels never begin behind a hit, so that `cut` keeps them.
             (&raw mut (*p).stack.near).cast::<[f32; BOTTOM]>().write([f32::NEG_INFINITY; BOTTOM]);
             (&raw mut (*p).stack.child).cast::<[ChildRef; BOTTOM]>().write([ChildRef::EMPTY; BOTTOM]);
-            // In place: a call that may change a ray keeps it from being built where it will be, and in between
-            // it went through memory twice.
+            // The change is made in place: a call that may change a ray keeps the compiler from building it at its
+            // destination, and the ray was then copied through memory twice.
             if RaySetup::must_be_slow(d) {
                 (*p).ray.make_slow::<T>(ray.origin, d);
             }
@@ -244,9 +246,9 @@ impl Walk {
         true
     }
 
-    /// Visits the current node and goes on to the next child. `ALONE`: takes the nearest child from the node
-    /// itself, which is sooner there than on the stack, but as another branch. (Rays one by one take 4 to 7 %
-    /// less time.)
+    /// Visits the current node and goes on to the next child. `ALONE`: takes the nearest child from the node itself,
+    /// which gives it sooner than the stack, but at the cost of another branch. (Rays one by one take 4 to 7 % less
+    /// time.)
     ///
     /// # Safety
     /// The CPU must have the ISA; the walk must have been begun in `tree`, and `current` be a node.
@@ -270,8 +272,8 @@ impl Walk {
         }
     }
 
-    /// Visits the current leaf and goes on to the next child, which is [`ChildRef::EMPTY`] when there is none,
-    /// or when the walk has met something and `ANY`.
+    /// Visits the current leaf and goes on to the next child, which is [`ChildRef::EMPTY`] when there is none, or when
+    /// `ANY` is set and the ray has hit something.
     ///
     /// # Safety
     /// The CPU must have the ISA; the walk must have been begun in `tree`, and `current` be a leaf.
@@ -304,7 +306,7 @@ impl Walk {
     }
 }
 
-/// The closest hit; `ANY`: any hit, of which only whether there is one is told.
+/// Traces one ray to its closest hit; `ANY`: to any hit, whose result says only whether there is one.
 ///
 /// # Safety
 /// The CPU must have the ISA.
@@ -314,7 +316,7 @@ pub(super) unsafe fn one<S: Simd, T: Tree, const ANY: bool>(tree: &T, ray: &Ray)
     unsafe { one_of::<S, T, All, ANY>(tree, ray, &mut All) }
 }
 
-/// The same among the hits that `accept` accepts.
+/// Traces one ray as `one` does, but counts only the hits that `accept` accepts.
 ///
 /// # Safety
 /// The CPU must have the ISA.
@@ -337,7 +339,7 @@ pub(super) unsafe fn one_of<S: Simd, T: Tree, A: Accept, const ANY: bool>(
                 walk.visit_leaf::<S, T, A, ANY>(tree, accept);
             } else {
                 walk.visit_node::<S, T, true>(tree);
-                // What comes after. (5 to 8 % of the time.)
+                // Prefetches the entry that follows. (5 to 8 % of the time.)
                 tree.prefetch(walk.stack.child.get_unchecked(walk.stack.count - 1).assume_init());
             }
         }
@@ -345,20 +347,21 @@ pub(super) unsafe fn one_of<S: Simd, T: Tree, A: Accept, const ANY: bool>(
     walk.hit()
 }
 
-/// Rays under way at the same time. (Sponza, random rays: 4 trace 2.3, 8 trace 2.6, 16 and 32 trace 3.0
+/// Number of rays under way at the same time. (Sponza, random rays: 4 trace 2.3, 8 trace 2.6, 16 and 32 trace 3.0
 /// Mrays/s.)
 const FLIGHT: usize = 16;
 
 thread_local! {
-    /// An empty vector with room for [`FLIGHT`] walks: 73 kB, more than some callers' threads have of stack.
+    /// An empty vector with capacity for [`FLIGHT`] traversals: 73 kB, more than some callers' threads have of stack.
     static ROOM: Cell<Vec<Walk>> = const { Cell::new(Vec::new()) };
 }
 
-/// The thread's room for [`FLIGHT`] walks. It has less if memory is short or the thread is ending.
+/// Takes the thread's buffer for [`FLIGHT`] traversals. Its capacity is smaller if memory is short or the thread is
+/// ending.
 #[inline(never)]
 fn take_room() -> Vec<Walk> {
     let mut room = ROOM.try_with(Cell::take).unwrap_or_default();
-    // If that fails, one walk is under way at a time.
+    // If that fails, one ray is under way at a time.
     let _ = room.try_reserve_exact(FLIGHT);
     room
 }
@@ -368,11 +371,11 @@ fn give_room_back(room: Vec<Walk>) {
     let _ = ROOM.try_with(|kept| kept.set(room));
 }
 
-/// Walks that wait for the same kind of visit. One more than there can be, for a branch-free push.
+/// Traversals that wait for the same kind of visit: one more than there can be, for a branch-free push.
 type Queue = [*mut Walk; FLIGHT + 1];
 
-/// Traces many rays, [`FLIGHT`] of them at a time: `ray` gives the rays from 0 to `count`, `done` takes
-/// their hits, in any order.
+/// Traces many rays, [`FLIGHT`] of them at a time: `ray` returns the rays from 0 to `count`, `done` receives their
+/// hits, in any order.
 ///
 /// While one ray waits for memory, others go on; and visits of nodes and of leaves are done by turns
 /// for all rays under way, so that the kind of the next child is not a branch to be mispredicted.
@@ -397,7 +400,7 @@ pub(super) unsafe fn many<S: Simd, T: Tree, const ANY: bool>(
     let (idle, at_nodes, at_leaves) = (idle.as_mut_ptr(), at_nodes.as_mut_ptr(), at_leaves.as_mut_ptr());
     let (mut idle_count, mut node_count, mut leaf_count) = (flight, 0, 0);
     let mut next = 0;
-    // Every walk is in one queue, so that none holds more than FLIGHT: what the blocks below rely on.
+    // Every traversal is in one queue, so that no queue holds more than FLIGHT; the blocks below rely on that.
     loop {
         while idle_count > 0 && next < count {
             // SAFETY: the queue's last entry, which names one of the places; nothing else refers to an idle one.
@@ -415,8 +418,8 @@ pub(super) unsafe fn many<S: Simd, T: Tree, const ANY: bool>(
         if idle_count == flight {
             return give_room_back(room);
         }
-        // Puts a walk where its next visit will be: into both queues, but counted in one. It is written
-        // at or before the place that is read next.
+        // Puts a traversal into the queue of its next visit: it is written to both queues, but counted in one, at or
+        // before the position that is read next.
         let enqueue = |walk: *mut Walk, child: ChildRef, nodes: &mut usize, leaves: &mut usize| {
             tree.prefetch(child);
             // SAFETY: at most FLIGHT walks are counted in a queue, and each has room for one more.

@@ -1,5 +1,5 @@
-//! What single rays need of a tree: the whole one of [`Mbvh`], or the [compact](super::compact) one. Kernels
-//! are compiled for each; which of them runs is chosen once per call.
+//! The interface through which single rays traverse a tree: the full one, [`Mbvh`], or the [compact](super::compact)
+//! one. Kernels are compiled for each; which of them runs is chosen once per call.
 //!
 //! The box test is conservative (Ize, *Robust BVH Ray Traversal*, 2013): the builder moves planes, and
 //! a ray its origin, by more than rounding can.
@@ -13,33 +13,33 @@ use std::hint::select_unpredictable;
 use std::marker::PhantomData;
 use std::mem::MaybeUninit;
 
-/// A tree that rays can walk through.
+/// A tree that rays can traverse.
 pub(super) trait Tree {
     type Node;
     type Leaf<'a>: Leaf
     where
         Self: 'a;
 
-    /// Bytes between a node's rows of planes: minima of x, y, z, maxima of x, y, z.
+    /// Distance in bytes between a node's rows of planes: minima of x, y, z, maxima of x, y, z.
     const ROW: u32;
 
-    /// Asks for the memory of a child that will be visited soon.
+    /// Prefetches a child that will be visited soon.
     fn prefetch(&self, child: ChildRef);
 
     /// # Safety
     /// `node` must be an inner reference of this tree.
     unsafe fn node(&self, node: ChildRef) -> &Self::Node;
 
-    /// Planes of all children across `axis`, those of the row that begins at `row`.
+    /// Returns the planes of all children across `axis`, from the row that begins at `row`.
     ///
     /// # Safety
     /// The CPU must have the ISA, and `row` must be a multiple of [`Self::ROW`] for one of that axis.
     unsafe fn planes<S: Simd>(node: &Self::Node, axis: usize, row: u32) -> S::F8;
 
-    /// References to the children, which may be put into `room`.
+    /// Returns the references to the children, for which `room` may serve as a buffer.
     fn names(node: &Self::Node, room: &mut MaybeUninit<[u32; WIDTH]>) -> *const u32;
 
-    /// As [`Node::order`].
+    /// Order of the children by octant, as [`Node::order`].
     fn order(node: &Self::Node) -> *const u32;
 
     /// # Safety
@@ -52,26 +52,26 @@ pub(super) trait Leaf {
     /// Number of triangles.
     fn count(&self) -> usize;
 
-    /// Triangles `first .. first + 4` as a ray sees them. Lanes beyond the count are garbage.
+    /// Projects triangles `first .. first + 4` along a ray. Lanes beyond the count are garbage.
     ///
     /// # Safety
     /// The CPU must have the ISA, and `first` must be below the count.
     unsafe fn project<L: Four>(&self, first: usize, ray: &Shear) -> Projected<L>;
 
-    /// See [`accurate_distance`].
+    /// Distance to triangle `i` in f64: see [`accurate_distance`].
     ///
     /// # Safety
     /// `i` must be below the count.
     unsafe fn accurate_distance(&self, i: usize, ray: &Shear) -> f32;
 
-    /// The number of triangle `i`.
+    /// Global number of triangle `i`.
     ///
     /// # Safety
     /// `i` must be below the count.
     unsafe fn number(&self, i: usize) -> u32;
 
-    /// Whether hits of triangle `i` by a ray that walks up to `limit` count. To be asked before a hit is taken:
-    /// it may take a while.
+    /// Whether a hit on triangle `i` counts for a ray with the conservative tmax `limit`. This may be slow, so it is
+    /// asked only before a hit is accepted.
     ///
     /// # Safety
     /// The CPU must have the ISA, and `i` must be below the count.
@@ -81,46 +81,46 @@ pub(super) trait Leaf {
 /// Ize's 1 + 2γ₃ for box tests that subtract the origin from planes, rounded up.
 pub(super) const FAR_SCALE: f32 = 1.0 + 4e-7;
 
-/// A box is entered up to this distance: a triangle's t has a larger rounding error than its box's, and
-/// of triangles at equal t all must be seen.
+/// Conservative tmax of the slab test for a hit at `t`: a triangle's t has a larger rounding error than its box's, and
+/// of triangles at equal t all must be tested.
 #[inline(always)]
 pub(super) fn beyond(t: f32) -> f32 {
     t + BEYOND * t.abs()
 }
 
-/// See [`beyond`].
+/// Relative margin of [`beyond`].
 pub(super) const BEYOND: f32 = 4e-6;
 
 /// A direction component below this fraction of the largest counts as zero in box tests.
 pub(super) const PARALLEL: f32 = 1e-18;
 
-/// Reciprocal of a zero component: with [`nudge`] its product is beyond any t, but never NaN.
+/// Reciprocal of a zero component: its product with [`nudge`] is beyond any t, but never NaN.
 pub(super) const PARALLEL_RECIPROCAL: f32 = 1e38;
 
-/// How far box planes are moved outwards for rays along them, so that an origin on a plane counts
-/// as inside on both sides: over an ulp, and over what `PARALLEL_RECIPROCAL` needs to reach 1e18.
+/// Distance by which box planes are moved outwards for rays along them, so that an origin on a plane counts as inside
+/// on both sides: over an ulp, and over the distance that `PARALLEL_RECIPROCAL` needs to reach 1e18.
 #[inline(always)]
 pub(super) fn nudge(origin: f32) -> f32 {
     (origin.abs() * 2.4e-7).max(1e-20)
 }
 
-/// One instruction, where `f32::max` takes four to treat NaN.
+/// The greater value in one instruction; `f32::max` takes four to treat NaN.
 #[inline(always)]
 fn greater(a: f32, b: f32) -> f32 {
     if a > b { a } else { b }
 }
 
-/// Likewise.
+/// The lesser value in one instruction, as `greater`.
 #[inline(always)]
 fn lesser(a: f32, b: f32) -> f32 {
     if a < b { a } else { b }
 }
 
-/// Rays from beyond this hit nothing: products of two distances to them would overflow.
+/// Rays whose origin is beyond this hit nothing: products of two distances to them would overflow.
 pub(super) const FARTHEST_ORIGIN: f32 = 1e18;
 
-/// The power of two that brings a direction's largest component into a range where the reciprocals and
-/// products of the tests neither overflow nor vanish; `None` for a ray that can hit nothing.
+/// The power of two that scales a direction's largest component into a range where the reciprocals and products of the
+/// tests neither overflow nor vanish; `None` for a ray that can hit nothing.
 #[inline(always)]
 pub(super) fn direction_scale(ray: &Ray) -> Option<f32> {
     let ([x, y, z], [ox, oy, oz]) = (ray.direction, ray.origin);
@@ -143,26 +143,27 @@ pub(super) fn direction_scale(ray: &Ray) -> Option<f32> {
 /// A ray whose direction has a component below this fraction of the largest takes the slower box test.
 pub(super) const STEEP: f32 = 1e-10;
 
-/// Rounding of one operation.
+/// Relative rounding error of one operation.
 pub(super) const EPSILON: f32 = f32::EPSILON / 2.0;
 
-/// Bound, as a part of the product of origin and reciprocal, of its rounding, of the reciprocal's, of the
-/// box test's fused sum and of the sum with this, and some to spare. (The builder has moved planes outwards
-/// by their own share.)
+/// Relative bound of the error of a slab test's offset, as a part of the product of origin and reciprocal: the rounding
+/// of the product, of the reciprocal, of the box test's fused sum and of the sum with this bound, and some to spare.
+/// (The builder has moved planes outwards by their own share.)
 pub(super) const OFFSET_ERROR: f32 = 6.0 * EPSILON;
 
-/// What a ray is for the tests.
+/// A ray prepared for box and triangle tests.
 #[derive(Clone, Copy)]
 pub(super) struct RaySetup {
-    /// t of a plane is `reciprocal` · plane + `near_offset` or `far_offset`: minus the origin's, less or
-    /// more what rounding that may have cost. In the slower test, offsets are origins.
+    /// The t of a plane is `reciprocal` · plane + `near_offset` or `far_offset`. An offset is the negative product of
+    /// origin and reciprocal, lowered or raised by its greatest rounding error. In the slower test, offsets are
+    /// origins.
     reciprocal: [f32; 3],
     near_offset: [f32; 3],
     far_offset: [f32; 3],
-    /// Bytes from the first row of a node's planes to the near and far ones, per axis.
+    /// Offset in bytes from the first row of a node's planes to the near and far ones, per axis.
     near: [u32; 3],
     far: [u32; 3],
-    /// Of the direction's octant in [`Tree::order`].
+    /// Shift that selects the direction's octant in [`Tree::order`].
     pub(super) shift: u32,
     is_slow: bool,
     pub(super) tmin: f32,
@@ -170,8 +171,8 @@ pub(super) struct RaySetup {
 }
 
 impl RaySetup {
-    /// If [`must_be_slow`](Self::must_be_slow), then [`make_slow`](Self::make_slow). (All axes in one vector by
-    /// hand take no fewer instructions.)
+    /// Sets up a ray for the fast box test. If [`must_be_slow`](Self::must_be_slow) says so,
+    /// [`make_slow`](Self::make_slow) must follow. (All axes in one vector by hand take no fewer instructions.)
     #[inline(always)]
     pub(super) fn new<T: Tree>(origin: [f32; 3], direction: [f32; 3], tmin: f32) -> Self {
         let shear = Shear::new(origin, direction);
@@ -179,7 +180,7 @@ impl RaySetup {
         let reciprocal = direction.map(|d| 1.0 / d);
         let offset: [f32; 3] = std::array::from_fn(|a| -origin[a] * reciprocal[a]);
         let error: [f32; 3] = std::array::from_fn(|a| OFFSET_ERROR * offset[a].abs());
-        // (Half of the branches that this became were mispredicted.)
+        // (Half of the branches that the compiler made of this were mispredicted.)
         let near =
             std::array::from_fn(|a| select_unpredictable(is_negative[a], T::ROW * (a as u32 + 3), T::ROW * a as u32));
         RaySetup {
@@ -201,7 +202,8 @@ impl RaySetup {
         lesser(lesser(x, y), z) <= STEEP * greater(greater(x, y), z)
     }
 
-    /// Where a reciprocal is infinite or too large for [`Self::node`].
+    /// Changes the setup to the slower box test, for directions of which a reciprocal is infinite or too large for the
+    /// fast one.
     #[cold]
     pub(super) fn make_slow<T: Tree>(&mut self, origin: [f32; 3], direction: [f32; 3]) {
         let [x, y, z] = direction.map(f32::abs);
@@ -213,14 +215,14 @@ impl RaySetup {
                 self.reciprocal[a] = PARALLEL_RECIPROCAL;
                 self.near_offset[a] += nudge(origin[a]);
                 self.far_offset[a] -= nudge(origin[a]);
-                // The sign of a direction that is not quite 0 must not matter.
+                // The sign of a component that counts as zero must not matter.
                 self.near[a] = T::ROW * a as u32;
                 self.far[a] = T::ROW * (a as u32 + 3);
             }
         }
     }
 
-    /// Near distances of boxes, and which of them the ray meets up to `tmax`.
+    /// Distances at which the ray enters boxes, and a mask of those that it intersects up to `tmax`.
     ///
     /// # Safety
     /// The CPU must have the ISA.
@@ -256,7 +258,7 @@ impl RaySetup {
         }
     }
 
-    /// The same of rays that are slow.
+    /// Distances of near and far planes across an axis, by the slower test.
     ///
     /// # Safety
     /// As for [`Self::axis`].
@@ -267,12 +269,12 @@ impl RaySetup {
             let r = L::splat(self.reciprocal[a]);
             let near = (boxes.planes(a, self.near[a]) - L::splat(self.near_offset[a])) * r;
             let far = (boxes.planes(a, self.far[a]) - L::splat(self.far_offset[a])) * r;
-            // Away from the near planes, on either side of the origin.
+            // Rounds the far distance away from the near planes, on either side of the origin.
             (near, (far * L::splat(FAR_SCALE)).max(far * L::splat(2.0 - FAR_SCALE)))
         }
     }
 
-    /// Whether the ray, set up for `T`, meets a box up to `tmax`, by the arithmetic that nodes meet.
+    /// Whether the ray, set up for `T`, intersects a box up to `tmax`, with the arithmetic of the test of nodes.
     ///
     /// # Safety
     /// The CPU must have the ISA.
@@ -286,7 +288,7 @@ impl RaySetup {
 
 /// Boxes that rays are tested against.
 pub(super) trait Boxes<L> {
-    /// Planes across `axis`, of the row that begins at `row` as in [`Tree::planes`].
+    /// Planes across `axis`, from the row that begins at `row`, as in [`Tree::planes`].
     ///
     /// # Safety
     /// As for [`Tree::planes`].
@@ -307,7 +309,7 @@ impl<S: Simd, T: Tree> Boxes<S::F8> for Children<'_, S, T> {
     }
 }
 
-/// One box, in all lanes.
+/// A single box, repeated in all lanes.
 struct OneBox<T> {
     planes: [Vec3; 2],
     tree: PhantomData<T>,

@@ -7,8 +7,9 @@
 //! exact difference or is 0; both triangles of an edge, and all of a corner, accept 0: no ray passes
 //! between them. (Formed without contraction: fused, the sign would depend on the order of corners.)
 //!
-//! The distance comes from the plane, which is accurate for large triangles along the axes. Where f32 cannot
-//! tell it, it comes in f64, and is kept between the edges that the ray passes: no hit lies off its triangle.
+//! The distance is that of the plane, which is accurate for large triangles along the axes. If f32 is not precise
+//! enough for it, it is computed in f64 and clamped to the range between the edges that the ray crosses: no hit lies
+//! off its triangle.
 
 use crate::simd::{Lanes, Mask};
 use glam::DVec3;
@@ -58,16 +59,16 @@ const AXES: [[u32; 3]; 6] = [[1, 2, 0], [2, 0, 1], [0, 1, 2], [2, 1, 0], [0, 2, 
 /// A ray in its own frame: z along the axis of the direction's largest component.
 #[derive(Clone, Copy)]
 pub(super) struct Shear {
-    /// Of the scene's axes, which are x, y, and z of the frame. Right-handed if the direction's z is
-    /// positive in it, left-handed if not: the winding of corners stays what it is seen from the origin.
+    /// The scene's axes that are x, y and z of the frame. The frame is right-handed if the direction's z is positive in
+    /// it, left-handed if not: the winding of corners stays as it is seen from the origin.
     pub axes: [u32; 3],
-    /// In the frame's order.
+    /// Origin, in the frame's order.
     pub origin: [f32; 3],
-    /// Where the ray comes from: the direction negated, in the frame's order.
+    /// Direction negated, in the frame's order: it points to where the ray comes from.
     pub back: [f32; 3],
     /// −x/z and −y/z of the direction.
     pub shear: [f32; 2],
-    /// [`GRAZING`] times the direction's length, at least.
+    /// Lower bound of [`GRAZING`] times the direction's length.
     pub grazing: f32,
 }
 
@@ -76,9 +77,9 @@ impl Shear {
     pub(super) fn new(origin: [f32; 3], d: [f32; 3]) -> Shear {
         let [x, y, z] = d.map(f32::abs);
         let k = if x > y && x > z { 0 } else { 2 - usize::from(y > z) };
-        // (Half of the branches that this became were mispredicted.)
+        // (Half of the branches that the compiler made of this were mispredicted.)
         let axes = &AXES[select_unpredictable(d[k] < 0.0, k + 3, k)];
-        // (Four of each, so that no index is checked.)
+        // (Four elements each, so that no index is checked.)
         let [d4, origin4] = [d, origin].map(|v| [v[0], v[1], v[2], 0.0]);
         let of = |v: &[f32; 4], a: usize| v[axes[a] as usize & 3];
         let inverse = -1.0 / of(&d4, 2);
@@ -92,10 +93,10 @@ impl Shear {
     }
 }
 
-/// Triangles of a leaf as a ray sees them.
+/// Triangles of a leaf, projected along a ray.
 #[derive(Clone, Copy)]
 pub(super) struct Projected<L> {
-    /// From the corners to the origin, in the ray's frame, not sheared.
+    /// Vectors from the corners to the origin, in the ray's frame, not sheared.
     corners: [V3<L>; 3],
     /// Edge functions opposite of corners 1, 2 and 0: weights of these corners, up to a factor.
     pub u: L,
@@ -104,7 +105,7 @@ pub(super) struct Projected<L> {
 }
 
 impl<L: Lanes> Projected<L> {
-    /// Triangles `first .. first + WIDTH` of a leaf of `count` (lanes beyond `count` are garbage).
+    /// Loads and projects triangles `first .. first + WIDTH` of a leaf of `count` (lanes beyond `count` are garbage).
     ///
     /// # Safety
     /// The CPU must have the ISA; `leaf` must point to a leaf of `count` triangles in an
@@ -123,8 +124,8 @@ impl<L: Lanes> Projected<L> {
         Self::new(corners, unsafe { [L::splat(ray.shear[0]), L::splat(ray.shear[1])] })
     }
 
-    /// From `corners` to the origin, in the ray's frame. Lanes are triangles of one ray, or rays of one
-    /// triangle.
+    /// Projects triangles given by the vectors from `corners` to the origin, in the ray's frame. Lanes are triangles of
+    /// one ray, or rays of one triangle.
     #[inline(always)]
     pub(super) fn new(corners: [V3<L>; 3], [sx, sy]: [L; 2]) -> Self {
         // (`map` was not inlined everywhere.)
@@ -135,7 +136,7 @@ impl<L: Lanes> Projected<L> {
         Projected { corners, u: ax * cy - ay * cx, v: bx * ay - by * ax, w: cx * by - cy * bx }
     }
 
-    /// Where the ray passes inside, edges and corners included.
+    /// Mask of the lanes in which the ray passes through the triangle, edges and corners included.
     ///
     /// # Safety
     /// The CPU must have the ISA.
@@ -147,8 +148,8 @@ impl<L: Lanes> Projected<L> {
         zero.le(u.min(v).min(w)).or(u.max(v).max(w).le(zero))
     }
 
-    /// Distances by the plane, and where these are accurate. They are not on thin triangles, whose normal is
-    /// rounded, where the ray grazes the plane, and where areas are too small for f32: see
+    /// Distances to the planes, and a mask of the lanes where these are accurate. They are not on thin triangles, whose
+    /// normal is rounded, where the ray grazes the plane, and where areas are too small for f32: see
     /// [`accurate_distance`].
     ///
     /// # Safety
@@ -159,7 +160,7 @@ impl<L: Lanes> Projected<L> {
         unsafe { self.distances_along(V3::splat(ray.back), L::splat(ray.grazing)) }
     }
 
-    /// The same of rays by [`Shear::back`] and [`Shear::grazing`].
+    /// Distances as of `distances`, of rays given by [`Shear::back`] and [`Shear::grazing`].
     ///
     /// # Safety
     /// The CPU must have the ISA.
@@ -172,7 +173,7 @@ impl<L: Lanes> Projected<L> {
         let splat = |x: f32| unsafe { L::splat(x) };
         let zero = splat(0.0);
         let slope = normal.dot(back);
-        // Divided before the product with a corner, which may be too small for f32.
+        // Divides before the product with a corner, which may be too small for f32.
         let reciprocal = splat(1.0).div(slope);
         let t = normal.map(|n| n * reciprocal).dot(a);
         let abs = |x: L| x.max(zero - x);
@@ -183,15 +184,15 @@ impl<L: Lanes> Projected<L> {
     }
 }
 
-/// Double area of a triangle over its longest edge's square below which it is thin. Below, t would lose more
-/// than some 1e-6.
+/// Twice a triangle's area over its longest edge's square, below which it is thin. Below, t would lose more than some
+/// 1e-6.
 const THIN: f32 = 0.05;
 
-/// Sine of the angle to a plane below which a ray grazes it, likewise.
+/// Sine of the angle between ray and plane below which the ray grazes it. Below, t would lose as much.
 pub(super) const GRAZING: f32 = 0.03;
 
-/// The distance to a triangle's plane in f64 from the corners themselves, kept between the edges that the
-/// ray passes: all that is left to tell where it lies in the plane.
+/// Distance to a triangle's plane in f64 from the corners themselves, clamped to the range between the edges that the
+/// ray crosses, which is the only other information about where the hit lies in the plane.
 ///
 /// # Safety
 /// As for [`Projected::load`]; `i` must be below `count`.
@@ -206,7 +207,7 @@ pub(super) unsafe fn accurate_distance(leaf: *const f32, count: usize, i: usize,
     let d = -DVec3::from(ray.back.map(f64::from));
     let normal = (b - a).cross(c - a);
     let slope = normal.dot(d);
-    // Corners across the ray, along the axis on which they lie farther apart.
+    // Coordinates of the corners across the ray, along the axis on which they lie farther apart.
     let across = |k: usize| corners.map(|v| v[k] - v.z * (d[k] / d.z));
     let spread = |s: [f64; 3]| s[0].max(s[1]).max(s[2]) - s[0].min(s[1]).min(s[2]);
     let (x, y) = (across(0), across(1));
@@ -218,7 +219,7 @@ pub(super) unsafe fn accurate_distance(leaf: *const f32, count: usize, i: usize,
     let crossings = [crossing(0, 1), crossing(1, 2), crossing(2, 0)].into_iter().flatten();
     let range =
         crossings.fold(None, |r: Option<[f64; 2]>, t| r.map_or(Some([t; 2]), |[a, b]| Some([a.min(t), b.max(t)])));
-    // Beside the triangle by less than f32 can tell: the corner next to the ray.
+    // The ray passes beside the triangle by less than f32 resolves: takes the corner nearest to the ray.
     let nearest = || {
         let k = (0..3).min_by(|&i, &j| s[i].abs().total_cmp(&s[j].abs())).unwrap_or(0);
         [corners[k].z / d.z; 2]
@@ -227,7 +228,7 @@ pub(super) unsafe fn accurate_distance(leaf: *const f32, count: usize, i: usize,
     (normal.dot(a) / slope).max(least).min(most) as f32
 }
 
-/// Weights of corners 1 and 2 from the edge functions. The sum vanishes only where all three do.
+/// Barycentric weights of corners 1 and 2 from the edge functions. The sum vanishes only if all three do.
 #[inline(always)]
 pub(super) fn barycentrics(u: f32, v: f32, sum: f32) -> (f32, f32) {
     if sum == 0.0 { (0.0, 0.0) } else { ((u / sum).min(1.0), (v / sum).min(1.0)) }

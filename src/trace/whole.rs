@@ -1,4 +1,4 @@
-//! Rays through the whole tree, [`Mbvh`].
+//! Rays through the full tree, [`Mbvh`].
 
 use super::tree::{Leaf, RaySetup, Tree};
 use super::triangle::{Projected, Shear, accurate_distance};
@@ -78,7 +78,7 @@ impl Leaf for Rows {
         unsafe { self.rows.add(9 * self.count + i).read().to_bits() }
     }
 
-    /// Always: the leaf's box has been met.
+    /// Always true: the leaf's box has been tested.
     #[inline(always)]
     unsafe fn counts<S: Simd>(&self, _: usize, _: &RaySetup, _: f32) -> bool {
         true
