@@ -1,5 +1,5 @@
-//! Filters over the texels of a map: a blur of the gather map (thesis 3.2.5) that stays inside
-//! charts and does not reach through walls, and the filling of texels that cannot be seen.
+//! Filters over the texels of a map: a blur of the gather map (thesis 3.2.5) that stays inside charts and does not
+//! cross walls, and the filling of texels that cannot be seen.
 
 use crate::device::Device;
 use crate::error::Result;
@@ -17,35 +17,35 @@ pub const MAX_BLUR_RADIUS: u32 = 16;
 /// Width of the largest window.
 const MAX_WINDOW: usize = 2 * MAX_BLUR_RADIUS as usize + 1;
 
-/// Texels handed to a thread at a time.
+/// Number of texels that a thread processes at a time.
 const BLOCK: usize = 1024;
 
-/// Rounds of filling: a hidden region wider than twice this stays partly unfilled.
+/// Maximum number of rounds of filling: a hidden region wider than twice this many texels stays partly unfilled.
 const MAX_FILL_ROUNDS: usize = 64;
 
-/// What buffers are for, in errors.
+/// Name of the buffers in error messages.
 const FILLED: &str = "the texels to be filled";
 
-/// How many standard deviations of their noise two texels may differ by and still be taken for equally lit.
+/// Difference of two texels, in standard deviations of their noise, up to which they are taken for equally lit.
 const LIKE: f32 = 2.0;
 
-/// What a blur reads, by sample of the map.
+/// Inputs of a blur, by sample of the map.
 #[derive(Clone, Copy)]
 pub(crate) struct Texels<'a> {
     pub values: &'a [Vec3],
-    /// Variance of the values' sums over the channels; infinite where nothing is known of it.
+    /// Variance of the values' sums over the channels; infinite if unknown.
     pub variances: &'a [f32],
     pub valid: &'a [bool],
     pub normals: &'a [Vec3],
 }
 
-/// Blur of the valid texels within a square of `radius`, by a Gaussian that leaves out what differs by more
-/// than noise: the weight falls with the difference of two texels by the standard deviation of that difference
-/// (the range filter of Tomasi and Manduchi, *Bilateral filtering*, 1998, its width from the samples' variance
-/// as in Rousselle, Knaus and Zwicker, *Adaptive rendering with non-local means filtering*, 2012). So shadows
-/// of indirect light stay sharp where they are known, and the blur's bias goes with the noise. A texel takes
-/// part only if a path of valid texels of the same chart, within the square, leads to it: light on one
-/// side of a wall that stands on the chart does not cross the hidden texels below the wall.
+/// Blurs each valid texel over the valid texels within a square of `radius`, by a Gaussian that leaves out texels that
+/// differ by more than noise: the weight falls with the difference of two texels by the standard deviation of that
+/// difference (the range filter of Tomasi and Manduchi, *Bilateral filtering*, 1998, its width from the samples'
+/// variance as in Rousselle, Knaus and Zwicker, *Adaptive rendering with non-local means filtering*, 2012). Shadows of
+/// indirect light therefore stay sharp where there is little noise, and the blur's bias vanishes with the noise. A
+/// texel takes part only if a path of valid texels of the same chart, within the square, leads to it: light on one side
+/// of a wall that stands on the chart does not cross the hidden texels below the wall.
 pub(crate) fn blur(
     device: &Device,
     charts: &Charts,
@@ -87,7 +87,7 @@ impl Window {
         Window { radius, weights, seen: [0; MAX_WINDOW], queue: Vec::new() }
     }
 
-    /// The blurred value of one valid texel.
+    /// Returns the blurred value of one valid texel.
     pub(crate) fn blur(&mut self, charts: &Charts, map: &ChartMap, sample: usize, texels: Texels) -> Vec3 {
         let Texels { values, variances, valid, normals } = texels;
         let (brightness, variance) = (values[sample].element_sum(), variances[sample]);
@@ -105,13 +105,13 @@ impl Window {
             if s == NONE || !valid[s as usize] {
                 continue;
             }
-            // Charts may bend; light from another direction is another light.
+            // Charts may bend, and texels with other normals receive other light.
             let bend = normals[sample].dot(normals[s as usize]).max(0.0);
             let bend = bend * bend * bend * bend;
             let s = s as usize;
             let deviation = (variance + variances[s]).sqrt() + f32::MIN_POSITIVE;
             let difference = (values[s].element_sum() - brightness) / (LIKE * deviation);
-            // Not a number where light overflows.
+            // The difference is not a number if light overflows.
             let like = if s == sample { 1.0 } else { (-0.5 * difference * difference).exp().max(0.0) };
             let w = self.weights[(dx * dx + dy * dy) as usize] * bend * like;
             sum += w * values[s];
@@ -134,18 +134,18 @@ impl Window {
     }
 }
 
-/// Filling of missing texels: each gets the mean of its known or already filled neighbours in the chart, ring by ring.
-/// What charts without a known texel hold is left alone. Depends on the known texels alone, not on what the missing
-/// ones hold.
+/// Fills missing texels: each gets the mean of its known or already filled neighbours in the chart, ring by ring.
+/// Charts without a known texel are left unchanged. The result depends on the known texels alone, not on the values of
+/// missing ones.
 pub(crate) struct Filling {
     known: Vec<bool>,
     missing: Vec<u32>,
-    /// Room for a ring of all that is missing.
+    /// Buffer for one ring, large enough for all missing texels.
     ring: Vec<(u32, Vec3)>,
 }
 
 impl Filling {
-    /// Gets ready to fill the `missing` ones of `n` texels from those that are `known`. Filling takes no memory then.
+    /// Prepares to fill the `missing` ones of `n` texels from the `known` ones. Filling itself allocates no memory.
     pub(crate) fn new(n: usize, known: impl Fn(usize) -> bool, missing: impl Fn(usize) -> bool) -> Result<Filling> {
         let missing = try_collect((0..n).filter(|&i| missing(i)).map(|i| i as u32), FILLED)?;
         let ring = try_with_capacity(missing.len(), FILLED)?;
@@ -153,7 +153,7 @@ impl Filling {
         Ok(Filling { known, missing, ring })
     }
 
-    /// Fails, with part of the texels filled, on a cancel alone.
+    /// Fills the texels. Fails only on a cancel, with part of the texels filled.
     pub(crate) fn fill(
         mut self,
         charts: &Charts,
@@ -182,7 +182,7 @@ impl Filling {
     }
 }
 
-/// Mean of the known neighbours of a texel in its chart.
+/// Returns the mean of the known neighbours of a texel in its chart.
 fn neighbours(charts: &Charts, map: &ChartMap, sample: u32, values: &[Vec3], known: &[bool]) -> Option<Vec3> {
     let (x, y) = map.position(sample as usize);
     let placement = map.placement_of(charts, sample as usize);

@@ -1,4 +1,5 @@
-//! Which texels of a radiance map become [bright patches](super::bright_patches), and whether that pays.
+//! Chooses the texels of a radiance map that become [bright patches](super::bright_patches), and tests whether they
+//! reduce noise enough.
 
 use super::bright_patches::{Bright, near2};
 use super::gather::Gathered;
@@ -17,46 +18,49 @@ use glam::{Mat2, Vec2, Vec3};
 use rayon::prelude::*;
 use std::sync::atomic::{AtomicU64, Ordering::Relaxed};
 
-/// Gather rays see at most this many times what they see on average.
+/// Limit of the radiance that gather rays see, as a multiple of its mean.
 const LIMIT: f32 = 4.0;
 
-/// If the mean square of what they see is more than this part of what it is without the limit, nothing is done.
+/// Bright patches are not tried unless the limit reduces the mean square of the radiance that gather rays see below
+/// this fraction.
 const GAIN: f32 = 0.8;
 
-/// Nor is it if the variance of gathered light is more than this part of what it is without. (Rounds take up to two and
-/// a half times as long with them, but a bake is not gather rays alone.)
+/// Bright patches are dropped unless they reduce the variance of gathered light below this fraction. (Rounds take up to
+/// two and a half times as long with them, but gather rays are only a part of a bake.)
 const PAYS: f32 = 0.65;
 
-/// Lit texels of the radiance map from which rays tell what gather rays see, and rays from each.
+/// Number of lit texels of the radiance map from which rays estimate the radiance that gather rays see, and of rays
+/// from each.
 const VIEWS: usize = 2048;
 const RAYS: u32 = 16;
 
-/// Lit texels from which rounds of gather rays tell that variance, and rounds from each.
+/// Number of lit texels from which rounds of gather rays estimate the variance of gathered light, and of rounds from
+/// each.
 const TRIALS: usize = 4096;
 const ROUNDS: u32 = 2;
 
-/// Light weaker than this part of the mean need not be right in proportion.
+/// Light weaker than this fraction of the mean is judged by its absolute error rather than the relative one.
 const LEAST: f32 = 0.1;
 
-/// A round of gather rays comes with this many shadow rays, times the part of the light that the patches make, and
-/// with one at least.
+/// Number of shadow rays per round of gather rays, to be multiplied by the patches' fraction of the light; at least one
+/// is traced.
 pub(crate) const MAX_SHADOW_RAYS: u32 = 16;
 
-/// So many texels become lights; of more, so many are taken at random, each for several.
+/// Maximum number of texels that become lights. Of more, about this many are chosen at random and weighted up.
 const MAX_PATCHES: usize = 1 << 16;
 
-/// Places tried on all patches together, about, to tell where each lies and how large it is, and the fewest and the most
-/// along an axis of a texel. (Sponza by two lamps, light reflected once: with 2 along each axis gathered light
-/// is 0.977 of the reference's, with these 0.981: at edges of triangles a few places tell too little of a texel's area, and
-/// few texels make most of the light.)
+/// Approximate number of grid points on all patches together, which give the position and the area of each, and the
+/// minimum and maximum number along an axis of a texel. (Sponza by two lamps, light reflected once: with 2 along each
+/// axis gathered light is 0.977 of the reference's, with these 0.981: at edges of triangles a few points are too few to
+/// estimate a texel's area, and few texels make most of the light.)
 const PLACES: usize = 1 << 18;
 const PLACES_ALONG_AXIS: [u32; 2] = [2, 16];
 
-/// Triangles on which a thread looks for bright texels at a time.
+/// Number of triangles that a thread searches for bright texels at a time.
 const TRIANGLES: u32 = 64;
 
-/// Bright patches of the radiance map of an atlas, which has none yet, become lights if that pays. To be called on
-/// the device's threads. Adds the rays traced to `rays`.
+/// Makes lights of the bright patches of an atlas's radiance map, which has none yet, if they reduce noise enough. To
+/// be called on the device's threads. Adds the rays traced to `rays`.
 pub(crate) fn find(atlas: &Atlas, radiance: &mut Radiance, rays: &mut u64, progress: &Progress) -> Result<()> {
     let seen = seen_by_gather_rays(atlas, radiance, rays, progress)?;
     let mean = seen.iter().sum::<f32>() / seen.len().max(1) as f32;
@@ -85,7 +89,7 @@ pub(crate) fn find(atlas: &Atlas, radiance: &mut Radiance, rays: &mut u64, progr
     Ok(())
 }
 
-/// The patches that an earlier [`find`] found worth their rays, of the same radiance map.
+/// Makes the patches again that an earlier [`find`] kept, from the same radiance map.
 pub(crate) fn again(atlas: &Atlas, values: &[Vec3], limit: f32, shadow_rays: u32) -> Result<Bright> {
     if !(limit > 0.0) {
         return Ok(Bright::default());
@@ -96,17 +100,18 @@ pub(crate) fn again(atlas: &Atlas, values: &[Vec3], limit: f32, shadow_rays: u32
     Ok(Bright { limit, patches: Some(patches), shadow_rays, _memory: Some(memory) })
 }
 
-/// What buffers are for, in errors.
+/// Name of the buffers in error messages.
 const TEXELS: &str = "lit texels that are looked from";
 
-/// Every so manyth of the lit texels of a radiance map, about `count`.
+/// Returns about `count` of the lit texels of a radiance map, at regular intervals.
 fn lit_texels(values: &[Vec3], count: usize) -> Result<Vec<usize>> {
     let lit = || (0..values.len()).filter(|&s| values[s] != Vec3::ZERO);
     let step = (lit().count() / count).max(1);
     try_collect(lit().skip(step / 2).step_by(step), TEXELS)
 }
 
-/// Mean and variance of rounds of gather rays from places all over the lit surfaces, sums over the channels.
+/// Traces rounds of gather rays from texels all over the lit surfaces and returns their means and variances, summed
+/// over the channels.
 fn trials(atlas: &Atlas, radiance: &Radiance, rays: &mut u64, progress: &Progress) -> Result<Vec<(f32, f32)>> {
     let lookup = RadianceMap::new(&atlas.charts, &atlas.radiance, radiance);
     let samples = SampleSet::new(ROUND as u32, 0);
@@ -130,7 +135,7 @@ fn trials(atlas: &Atlas, radiance: &Radiance, rays: &mut u64, progress: &Progres
     try_collect(found.into_iter().map(|(mean, variance, _)| (mean, variance)), TEXELS)
 }
 
-/// Whether trials vary that much less, in proportion to the light.
+/// Whether the relative variance of the trials is sufficiently less with patches than without.
 fn pays(with: &[(f32, f32)], without: &[(f32, f32)]) -> bool {
     let light: Vec<f32> = with.iter().zip(without).map(|(a, b)| 0.5 * (a.0 + b.0)).collect();
     let least = LEAST * light.iter().sum::<f32>() / light.len().max(1) as f32;
@@ -140,7 +145,8 @@ fn pays(with: &[(f32, f32)], without: &[(f32, f32)]) -> bool {
     relative(with) < PAYS * relative(without)
 }
 
-/// What gather rays see from places all over the lit surfaces, sums over the channels, where it is more than nothing.
+/// Returns the radiance that gather rays see from texels all over the lit surfaces, summed over the channels, if it is
+/// not zero.
 fn seen_by_gather_rays(atlas: &Atlas, radiance: &Radiance, rays: &mut u64, progress: &Progress) -> Result<Vec<f32>> {
     let (scene, map, values) = (&atlas.scene, &atlas.radiance, &radiance.values);
     let lookup = RadianceMap::new(&atlas.charts, map, radiance);
@@ -168,19 +174,19 @@ fn seen_by_gather_rays(atlas: &Atlas, radiance: &Radiance, rays: &mut u64, progr
     Ok(all)
 }
 
-/// A place on a bright texel, on the side that it shows.
+/// A grid point on a bright texel, on the side that the texel shows.
 struct Place {
     texel: u32,
-    /// Among the places of all texels.
+    /// Number among the points of all texels.
     number: u32,
     placement: u32,
-    /// The part of the surface that it stands for.
+    /// Area of the surface around the point.
     area: f32,
     position: Vec3,
     normal: Vec3,
 }
 
-/// Of the bright texels or, of more, about `most` of them.
+/// Makes patches of the bright texels or, if there are more, of about `most` of them.
 fn patches(
     atlas: &Atlas,
     values: &[Vec3],
@@ -213,8 +219,8 @@ fn patches(
     try_collect(places.chunk_by(|a, b| a.texel == b.texel).map(patch), "bright patches")
 }
 
-/// Those of a grid that divides texels evenly, moved at random for each triangle: of texels that lie in one triangle the
-/// area is exact, of others right on average.
+/// Returns points on bright texels from a grid that divides texels evenly, shifted at random for each triangle. The
+/// area of texels that lie in one triangle is exact, that of others right on average.
 fn places(
     atlas: &Atlas,
     along_axis: u32,
@@ -250,7 +256,7 @@ fn places(
             let point = SurfacePoint::new([a, b, c], u, v, scene);
             let normal = if front { point.normal } else { -point.normal };
             let position = offset_ray_origin(point.interior, normal, scene);
-            // Not where there is a hole, nor a second time where another triangle covers this one.
+            // Points in cut-outs do not count, nor points that another triangle covers.
             rays.fetch_add(1, Relaxed);
             let is_seen = scene.intersect_raw(&Ray::new(position, -normal)).triangle == t;
             is_seen.then_some(Place { texel, number: 0, placement, area: cell, position, normal })
@@ -273,7 +279,7 @@ fn places(
     Ok(places)
 }
 
-/// Points at integer distances from `offset`, in [0, 1)², inside a triangle.
+/// Returns the points at integer distances from `offset`, in [0, 1)², inside a triangle.
 fn grid_points(corners: [Vec2; 3], offset: Vec2) -> impl Iterator<Item = Vec2> {
     let corners = corners.map(|c| c - offset);
     let [lowest, highest] =
@@ -283,7 +289,7 @@ fn grid_points(corners: [Vec2; 3], offset: Vec2) -> impl Iterator<Item = Vec2> {
         let (mut left, mut right) = (f32::INFINITY, f32::NEG_INFINITY);
         for (i, p) in corners.iter().enumerate() {
             let q = corners[(i + 1) % 3];
-            // Of two edges that meet at a height one has it.
+            // If two edges share an end at this height, only one of them includes it.
             if (p.y <= y as f32) != (q.y <= y as f32) {
                 let x = p.x + (q.x - p.x) * ((y as f32 - p.y) / (q.y - p.y));
                 (left, right) = (left.min(x), right.max(x));

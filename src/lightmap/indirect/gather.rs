@@ -1,5 +1,5 @@
-//! Gather map (thesis 3.2.5): indirect irradiance by final gathering. From each texel a packet of
-//! cosine-distributed rays is traced; a hit looks the outgoing radiance up in the radiance map.
+//! Gather map (thesis 3.2.5): indirect irradiance by final gathering. From each texel cosine-distributed rays are
+//! traced; where a ray hits, the outgoing radiance is looked up in the radiance map.
 //!
 //! Rays come in rounds of 64, so that a texel can be refined at any time: its sum over k rounds has
 //! the same bits however they were spread over bakes and live updates. The sample set is made once:
@@ -21,31 +21,30 @@ use crate::trace::{PACKET_SIZE, Packet, RawHit, Ray};
 use glam::Vec3;
 use std::f32::consts::PI;
 
-/// A texel more than this fraction of whose rays meet the backs of one-sided surfaces lies inside a
-/// solid.
+/// Fraction of rays that may hit backs of one-sided surfaces; a texel with more lies inside a solid.
 const MAX_BACK_FACES: f32 = 0.5;
 
-/// What a texel has gathered so far.
+/// Sums that a texel has gathered so far.
 #[derive(Clone, Copy, Debug, Default, PartialEq)]
 pub(crate) struct Gathered {
-    /// Sum of the radiance that rays met, W/(m²·sr).
+    /// Sum of the radiance seen by the rays, W/(m²·sr).
     pub sum: Vec3,
     /// Gather rays traced.
     pub rays: u32,
-    /// Of these, how many met the back of a one-sided surface.
+    /// Number of gather rays that hit the back of a one-sided surface.
     pub backs: u32,
     /// Sum of the squares of the rays' radiance, summed over the channels.
     pub squares: f32,
 }
 
 impl Gathered {
-    /// Indirect irradiance, W/m².
+    /// Returns the indirect irradiance, W/m².
     pub(crate) fn irradiance(&self) -> Vec3 {
         self.sum * (PI / self.rays as f32)
     }
 
-    /// Variance of the [`irradiance`](Self::irradiance)'s sum over the channels, from the spread of the rays
-    /// (those of a stratified set vary less; what decides by it knows).
+    /// Returns the variance of the [`irradiance`](Self::irradiance)'s sum over the channels, from the spread of the
+    /// rays (an overestimate, since the rays are stratified; its users allow for that).
     pub(crate) fn variance(&self) -> f32 {
         let n = self.rays as f32;
         let mean = self.sum.element_sum() / n;
@@ -86,7 +85,8 @@ impl Gathered {
                 if hit.is_miss() {
                     continue;
                 }
-                // Under the true surface where the shading normal leans away from it: no light.
+                // A ray below the true surface, possible if the shading normal differs from the geometric one, carries
+                // no light.
                 let d = Vec3::new(packet.x[i], packet.y[i], packet.z[i]);
                 if d.dot(receiver.geometric) <= 0.0 {
                     continue;
@@ -119,7 +119,7 @@ impl Gathered {
     }
 }
 
-/// Reflected radiance that comes along a ray from sheets that transmit and from what lies behind them.
+/// Returns the reflected radiance along a ray from transmissive sheets and from the surface behind them.
 #[cold]
 fn through(scene: &Scene, radiance: &RadianceMap, ray: &Ray, crossings: &mut Vec<Crossing>) -> Vec3 {
     let behind = scene.intersect_through(ray, crossings);

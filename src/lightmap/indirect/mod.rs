@@ -1,4 +1,4 @@
-//! Indirect light: the radiance map, the gather map, and what brings it to the light map's texels.
+//! Indirect light: the radiance map, the gather map, and its upsampling to the light map's texels.
 
 pub mod blur;
 pub(crate) mod bright_patches;

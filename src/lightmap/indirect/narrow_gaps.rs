@@ -1,25 +1,25 @@
-//! Texels in gaps narrower than themselves.
+//! Finds texels in gaps narrower than a gather texel.
 //!
-//! The light behind a picture frame, below a skirting board or between a carpet and the floor is not that of the
-//! wall and the floor beside it, and a gather texel there may be as wide as the gap is deep. Interpolated as they
-//! come, dark rims lie around what stands on or hangs before a surface, and gaps shine.
-//! [Upsampling](super::upsample) keeps what lies in gaps apart from what does not.
+//! The light behind a picture frame, below a skirting board or between a carpet and the floor is not that of the wall
+//! and the floor beside it, and a gather texel there may be as wide as the gap is deep. Plain interpolation makes dark
+//! rims around objects that stand on a surface or hang before it, and makes gaps too bright.
+//! [Upsampling](super::upsample) does not interpolate between texels inside and outside of narrow gaps.
 //!
-//! Measured, with what was tried instead: docs/experiments.md#narrow-gaps.
+//! Measured, with alternatives that were tried: docs/experiments.md#narrow-gaps.
 
 use crate::direct::Receiver;
 use crate::sampling::{cosine_around, sobol_2d};
 use crate::scene::Scene;
 use crate::trace::Ray;
 
-/// Rays that tell whether a texel is in a gap, at most.
+/// Maximum number of rays that test whether a texel is in a gap.
 const PROBES: u32 = 16;
 
-/// Outside of gaps at least so many of them get further than a texel.
+/// Minimum number of these rays that get further than a gather texel outside of gaps.
 const AWAY: u32 = 2;
 
-/// Whether all but a few rays from a texel meet something within `distance`, the width of a gather texel. Adds the rays
-/// traced to `rays`.
+/// Whether all but at most one of the rays from a texel hit a surface within `distance`, the width of a gather texel.
+/// Adds the rays traced to `rays`.
 pub(in crate::lightmap) fn is_in_gap(
     scene: &Scene,
     receiver: &Receiver,

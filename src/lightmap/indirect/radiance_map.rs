@@ -6,9 +6,9 @@
 //! percent or two of a bake.) Emission is not part of it: the emitters are sampled as lights
 //! wherever light is gathered, and would count twice.
 //!
-//! The albedo of a texel is that of its point or, where a texture varies, the average of look-ups spread over
-//! what the texel shows of its triangle. (Rather than from a mip chain, which would be kept for this alone:
-//! a texel's shadow rays take longer.)
+//! The albedo of a texel is that of its point or, if a texture varies, the average of look-ups spread over the part of
+//! its triangle in the texel. (A mip chain would be kept for this alone, and the look-ups take less time than a texel's
+//! shadow rays.)
 //!
 //! Tried: look-ups that interpolate, and a radius per texel; see docs/experiments.md#look-ups-in-the-radiance-map.
 
@@ -31,10 +31,10 @@ use rayon::prelude::*;
 use std::f32::consts::PI;
 use std::sync::atomic::{AtomicU64, Ordering::Relaxed};
 
-/// Texels handed to a thread at a time.
+/// Number of texels that a thread processes at a time.
 const BLOCK: usize = 512;
 
-/// Reflected radiance per texel, with what a lookup needs.
+/// Reflected radiance per texel, with the charts and the map that a look-up needs.
 pub(crate) struct RadianceMap<'a> {
     charts: &'a Charts,
     map: &'a ChartMap,
@@ -53,24 +53,25 @@ impl<'a> RadianceMap<'a> {
         RadianceMap { charts, map, radiance }
     }
 
-    /// Reflected radiance towards a ray that hit; `None` on the back of a one-sided surface.
+    /// Returns the radiance reflected towards a ray at its hit; `None` on the back of a one-sided surface.
     pub(crate) fn reflected(&self, hit: &RawHit) -> Option<Vec3> {
         self.met(hit).map(|(_, radiance)| radiance)
     }
 
-    /// What of it a gather ray sees; the rest is that of [`bright`](Self::bright).
+    /// Returns the part of the reflected radiance that a gather ray sees; the rest is sampled by
+    /// [`bright`](Self::bright).
     #[inline]
     pub(crate) fn seen(&self, hit: &RawHit) -> Option<Vec3> {
         let (placement, radiance) = self.met(hit)?;
         Some(self.radiance.bright.seen(radiance, self.map, placement, hit.t))
     }
 
-    /// Bright patches, of which gather rays do not see all.
+    /// Returns the bright patches, whose full radiance gather rays do not see.
     pub(crate) fn bright(&self) -> &Bright {
         &self.radiance.bright
     }
 
-    /// Placement and radiance where a ray hit.
+    /// Returns placement and radiance at a hit.
     #[inline]
     fn met(&self, hit: &RawHit) -> Option<(u32, Vec3)> {
         let chart = self.charts.chart_of[hit.triangle as usize];
@@ -83,17 +84,17 @@ impl<'a> RadianceMap<'a> {
     }
 }
 
-/// What the stage needs.
+/// Inputs of the stage.
 pub(crate) struct RadianceInput<'a> {
     pub light: TexelLight<'a>,
-    /// Photons that were reflected before; `None`: there is no such light.
+    /// Photons that have been reflected at least once; `None`: their light is left out.
     pub photons: Option<&'a PhotonMap>,
 }
 
-/// Fills in `values`, one per texel of the map; returns the rays traced. Advances `stage` by twice as many.
+/// Computes `values`, one per texel of the map; returns the number of rays. Advances `stage` by two per texel.
 ///
-/// Direct light is averaged over texels: first by a few points each, then by more where those, or those of neighbouring
-/// texels, tell that it varies.
+/// Direct light is averaged over texels: first by a few points each, then by more if it varies between those points or
+/// those of neighbouring texels.
 pub(crate) fn bake(device: &Device, input: &RadianceInput, values: &mut [Vec3], stage: &Stage) -> Result<u64> {
     let rays = AtomicU64::new(0);
     let mut looks: Vec<Look> = try_vec(values.len(), "direct light of the radiance map")?;
@@ -143,10 +144,10 @@ fn texel(input: &RadianceInput, looks: &[Look], sample: usize, rays: &mut u64) -
     albedo * e / PI
 }
 
-/// Look-ups of a texture in one texel, at most.
+/// Maximum number of look-ups of a texture in one texel.
 const MAX_LOOKUPS: u32 = 256;
 
-/// The albedo that a texel of a map shows.
+/// Returns the albedo of a texel of a map.
 pub(crate) fn albedo(areas: &TexelAreas, sample: usize) -> Vec3 {
     let TexelAreas { scene, charts, map, .. } = *areas;
     let texel = &map.texels.samples[sample];
@@ -158,7 +159,7 @@ pub(crate) fn albedo(areas: &TexelAreas, sample: usize) -> Vec3 {
     let (mesh, triangle) = scene.locate(texel.triangle);
     let mesh = &scene.meshes()[mesh as usize];
     let uv = |w: Vec2| mesh.texture_coordinates(triangle as usize, w.x, w.y).unwrap_or_default();
-    // Weights of corners 1 and 2 as a function of places in the map, in texels.
+    // Weights of corners 1 and 2 as a function of texel coordinates in the map.
     let placement = map.texels.placement_of(sample as u32);
     let place = |u, v| Vec2::from(map.layout.texel_coord(placement, charts.local(texel.triangle, u, v)));
     let origin = place(0.0, 0.0);

@@ -2,10 +2,10 @@
 
 use crate::sampling::sobol_2d_bits;
 
-/// Rays of a round.
+/// Number of rays of a round.
 pub(crate) const ROUND: usize = 64;
 
-/// Points of the unit square, in fixed point, that every texel uses in its own shift.
+/// Points of the unit square, in fixed point, to which every texel applies its own shift.
 pub(crate) struct SampleSet {
     points: Vec<[u32; 2]>,
 }
@@ -19,18 +19,18 @@ impl SampleSet {
         SampleSet { points }
     }
 
-    /// All points, round by round.
+    /// Returns all points, round by round.
     pub(crate) fn points(&self) -> &[[u32; 2]] {
         &self.points
     }
 
-    /// Rounds, the last of which may be shorter.
+    /// Returns the number of rounds, the last of which may be shorter.
     pub(crate) fn rounds(&self) -> usize {
         self.points.len().div_ceil(ROUND)
     }
 }
 
-/// Bits of two 16-bit numbers interleaved.
+/// Interleaves the bits of two 16-bit numbers.
 fn morton(x: u32, y: u32) -> u32 {
     let spread = |mut v: u32| {
         v = (v | v << 8) & 0x00ff_00ff;

@@ -1,9 +1,11 @@
-//! The light map's indirect light from the coarser gather map: joint bilateral upsampling (Kopf, Cohen, Lischinski and
-//! Uyttendaele, 2007).
+//! Interpolates the light map's indirect light from the coarser gather map: joint bilateral upsampling (Kopf, Cohen,
+//! Lischinski and Uyttendaele, 2007).
 //!
-//! A texel of the light map interpolates between those gather texels around it that lie in a [gap](super::narrow_gaps) as it does
-//! itself, or do not as it does not, and are behind no [wall or crease](super::upsample_visibility). What lies in no gap that is known of
-//! and finds none in the open, as a narrow face of a moulding, is on its own: it gathers a few rays, blurred among its like.
+//! A texel of the light map interpolates only between those of the surrounding gather texels that are in the same
+//! class, inside or outside a [narrow gap](super::narrow_gaps), and are not behind a [wall or
+//! crease](super::upsample_visibility). A texel that is not in a known narrow gap and has no valid gather texel around
+//! it outside gaps, as on a narrow face of a moulding, gets a fallback gather: it traces a few rays itself, and the
+//! result is blurred among such texels.
 //!
 //! Measured: docs/experiments.md#fallback-gather.
 
@@ -26,52 +28,54 @@ use rayon::prelude::*;
 use std::ops::Range;
 use std::sync::atomic::{AtomicU64, Ordering::Relaxed};
 
-/// What buffers are for, in errors.
+/// Name of the buffers in error messages.
 const SHOWN: &str = "what the light map shows of the gather map";
 
-/// Texels on their own that a thread takes at a time.
+/// Number of fallback gathers that a thread computes at a time.
 const BLOCK: usize = 64;
 
-/// Rays of a texel on its own, at most.
+/// Maximum number of rays of a fallback gather.
 pub(in crate::lightmap) const OWN_RAYS: u32 = 16;
 
-/// What they bring is blurred over so many texels of the light map to each side.
+/// Radius of the blur of fallback gathers, in texels of the light map.
 const RADIUS: i32 = 2;
 
-/// What texels of the light map show of the gather map. Depends on the scene and the sides that are shown, not on light.
+/// Interpolation constraints of the light map's texels. They depend on the scene and the sides that are shown, not on
+/// light.
 #[derive(Default)]
 pub(crate) struct Upsampling {
-    /// Gather texels in gaps.
+    /// Gather texels in narrow gaps.
     gather_gaps: Bits,
-    /// Texels of the light map in gaps, of those around which some gather texel is in one.
+    /// Texels of the light map in narrow gaps. Only texels with at least one gather texel in a gap around them are
+    /// tested.
     map_gaps: Bits,
-    /// Texels of the light map of which `walls` tells.
+    /// Texels of the light map that are in `walls`.
     walled: Bits,
-    /// A texel of the light map and one of the gather map behind a wall or a crease, in ascending order; never all around
-    /// a texel.
+    /// Pairs of a texel of the light map and one of the gather map that a wall or a crease separates, in ascending
+    /// order; never all gather texels around a texel.
     walls: Vec<(u32, u32)>,
     is_alone: Bits,
-    /// Texels of the light map on their own, in ascending order.
+    /// Texels of the light map with a fallback gather, in ascending order.
     alone: Vec<u32>,
-    /// Rays that it took.
+    /// Number of rays traced to find the constraints.
     pub rays: u64,
     _memory: Option<Reservation>,
 }
 
-/// Indirect irradiance of the texels that an [`Upsampling`] finds alone, in its order; `None` inside of solids.
+/// Indirect irradiance of the fallback gathers of an [`Upsampling`], in its order; `None` inside solids.
 pub(crate) type OwnLight = Vec<Option<Vec3>>;
 
-/// How texels gather for themselves.
+/// Inputs of fallback gathers.
 pub(crate) struct OwnRays<'a> {
     pub radiance: RadianceMap<'a>,
-    /// Of which the first round is used.
+    /// Sample set, of which the first round is used.
     pub samples: &'a SampleSet,
     pub seed: u32,
 }
 
 impl Upsampling {
-    /// Of some `placements` of an atlas, on the sides that `backs` tells of charts with one place. Advances `stage` by
-    /// one per placement.
+    /// Finds the constraints for some `placements` of an atlas. `backs` says which charts without separate texels for
+    /// their backs show the back. Advances `stage` by one per placement.
     pub(crate) fn find(atlas: &Atlas, placements: Range<u32>, backs: &[bool], stage: &Stage) -> Result<Upsampling> {
         let of_placement = |placement: u32| {
             let found = Found::in_placement(atlas, backs, placement, stage)?;
@@ -101,7 +105,7 @@ impl Upsampling {
         Ok(Upsampling { gather_gaps, map_gaps, walled, walls, is_alone, alone, rays, _memory: Some(memory) })
     }
 
-    /// What the texels on their own gather, and the rays that it takes. Advances `stage` by
+    /// Traces the fallback gathers. Returns their light and the number of rays. Advances `stage` by
     /// [`own_work`](Self::own_work).
     pub(crate) fn own_light(
         &self,
@@ -129,12 +133,13 @@ impl Upsampling {
         Ok((light, traced.into_inner()))
     }
 
-    /// Steps of [`own_light`](Self::own_light).
+    /// Returns the number of steps of [`own_light`](Self::own_light).
     pub(crate) fn own_work(&self) -> u64 {
         2 * self.alone.len() as u64
     }
 
-    /// A gather map's `values`, and the light of texels on their own ([`OwnLight`]), as a sample of the light map shows them.
+    /// Interpolates a gather map's `values` at a sample of the light map, or returns the light of its fallback gather
+    /// from `own` ([`OwnLight`]).
     #[inline]
     pub(crate) fn at(&self, atlas: &Atlas, values: &[Vec3], own: &[Option<Vec3>], sample: usize) -> Vec3 {
         if self.is_alone.has(sample)
@@ -148,7 +153,8 @@ impl Upsampling {
             atlas.gather_around(sample, |s, w| all += w * values[s]);
             return all;
         }
-        // What is both, or where none is, what is joined.
+        // Sums over gather texels that are joined and alike, and over those that are joined, which serve if there are
+        // none of the first kind.
         let mut sums = [(Vec3::ZERO, 0.0, true); 2];
         atlas.gather_around(sample, |s, w| {
             all += w * values[s];
@@ -163,15 +169,15 @@ impl Upsampling {
                 }
             }
         });
-        // Weights need not add up to 1 exactly. Where none is left out they must not be divided by: a bake of some texels,
-        // among which there are no gaps or walls, gives the bits of a whole one.
+        // Weights need not add up to 1 exactly. If no gather texel is left out, the sum must not be divided by them: a
+        // bake of some texels, among which there are no gaps or walls, gives the bits of a whole one.
         match sums.into_iter().find(|(_, part, _)| *part > 0.0) {
             Some((sum, part, false)) => sum / part,
             _ => all,
         }
     }
 
-    /// Whether a texel of the light map and one of the gather map both lie in gaps, or neither.
+    /// Whether a texel of the light map and one of the gather map both lie in narrow gaps, or neither does.
     #[inline]
     fn are_alike(&self, map: usize, gather: usize) -> bool {
         self.map_gaps.has(map) == self.gather_gaps.has(gather)
@@ -182,14 +188,14 @@ impl Upsampling {
         self.walled.has(map) && self.walls.binary_search(&(map as u32, gather as u32)).is_ok()
     }
 
-    /// Whether all is interpolated as it comes, but for texels on their own.
+    /// Whether there are no constraints other than fallback gathers.
     #[inline]
     pub(in crate::lightmap) fn is_plain(&self) -> bool {
         self.gather_gaps.words.is_empty() && self.walls.is_empty()
     }
 
-    /// The mean of what texels on their own within [`RADIUS`] in the same chart gathered that face the same way as number
-    /// `i`. (Whether a wall thinner than that is between them is not asked.)
+    /// Returns the mean of fallback gather `i` and those within [`RADIUS`] in the same chart, weighted by how far they
+    /// face the same way. (There is no test for thin walls between them.)
     fn blurred(&self, atlas: &Atlas, own: &[Own], i: usize) -> Option<Vec3> {
         let (sample, normal) = (self.alone[i] as usize, own[i].normal);
         own[i].irradiance?;
@@ -214,15 +220,15 @@ impl Upsampling {
     }
 }
 
-/// What a texel on its own gathered.
+/// Result of a fallback gather before the blur.
 #[derive(Clone, Copy)]
 struct Own {
-    /// `None` inside of a solid.
+    /// `None` inside a solid.
     irradiance: Option<Vec3>,
     normal: Vec3,
 }
 
-/// Gathers for some texels of the light map and returns the rays that it took.
+/// Traces the fallback gathers of some texels of the light map and returns the number of rays.
 fn gather_for(
     atlas: &Atlas,
     backs: &[bool],
@@ -244,7 +250,7 @@ fn gather_for(
     Ok(rays)
 }
 
-/// What there is to heed in a placement.
+/// Interpolation constraints of one placement.
 #[derive(Default)]
 struct Found {
     gather_gaps: Vec<u32>,
@@ -306,7 +312,7 @@ impl Found {
     }
 }
 
-/// A bit per sample; none at all if all are 0.
+/// A bit per sample; empty if all are 0.
 #[derive(Default)]
 struct Bits {
     words: Vec<u64>,

@@ -1,10 +1,10 @@
-//! Texels of the gather map behind walls and across creases.
+//! Finds texels of the gather map that are behind walls or across creases.
 //!
-//! Where a wall stands on a floor, a texel of the light map may lie on one side of it and some of the gather texels that
-//! it interpolates between on the other. Those that it does not see from a little above the surface are left out, and
-//! those whose normals differ much from its own, as on either side of a fold. (As probes behind walls are left out in
-//! Majercik, Guertin, Nowrouzezahrai and McGuire, *Dynamic Diffuse Global Illumination with Ray-Traced Irradiance Fields*,
-//! 2019.)
+//! If a wall stands on a floor, a texel of the light map may lie on one side of it and some of the surrounding gather
+//! texels on the other. Gather texels that are occluded, as seen from a little above the surface, are left out, and so
+//! are those whose normals differ much from the texel's own, as on either side of a fold. (Probes behind walls are left
+//! out in a similar way in Majercik, Guertin, Nowrouzezahrai and McGuire, *Dynamic Diffuse Global Illumination with
+//! Ray-Traced Irradiance Fields*, 2019.)
 //!
 //! Measured: docs/experiments.md#walls-and-creases.
 
@@ -17,28 +17,28 @@ use crate::trace::Ray;
 use glam::Vec3;
 use std::collections::HashMap;
 
-/// A cancel is looked for whenever so many texels of a placement have been looked at.
+/// Number of texels of a placement between two checks for a cancel.
 pub(in crate::lightmap) const TEXELS_PER_CHECK: usize = 64;
 
-/// Texels look at one another from so many texels of the gather map above the surface.
+/// Height above the surface at which lines of sight between texels start and end, in texels of the gather map.
 const ABOVE: f32 = 0.125;
 
-/// Normals whose cosine is less belong to surfaces on either side of a crease.
+/// Cosine of the angle between normals below which two texels lie on different sides of a crease.
 const CREASE: f32 = 0.8;
 
-/// What buffers are for, in errors.
+/// Name of the buffers in error messages.
 const WALLS: &str = "texels behind walls";
 
-/// Where a texel looks from, and its normal.
+/// End of a texel's lines of sight, and its normal.
 #[derive(Clone, Copy)]
 struct Eye {
     position: Vec3,
     normal: Vec3,
 }
 
-/// The pairs of texels of a placement in the light map and in the gather map that interpolation would join through a
-/// wall or across a crease, on the side that `backs` tells of, in ascending order. Adds the rays traced to `rays`;
-/// `stage` may cancel.
+/// Returns the pairs of texels of a placement in the light map and in the gather map between which there is a wall or a
+/// crease, in ascending order. `backs` says which charts without separate texels for their backs show the back. Adds
+/// the rays traced to `rays`; `stage` may cancel.
 pub(in crate::lightmap) fn between(
     atlas: &Atlas,
     placement: u32,
@@ -86,7 +86,8 @@ pub(in crate::lightmap) fn between(
         around[..n].sort_unstable();
         let from = eye(map, sample);
         split.try_reserve(1).map_err(|e| Error::OutOfMemory(format!("{WALLS}: {e}")))?;
-        // Most are around many texels, and all alike. A single one around, as on narrow charts, tells nothing of the texel.
+        // Most groups of gather texels surround many texels, and are on one side. A group of a single gather texel, as
+        // on narrow charts, says nothing about the texel.
         let is_split = *split.entry(around).or_insert_with(|| {
             let mut pairs = (1..n).flat_map(|i| (0..i).map(move |j| (i, j)));
             around[0] == around[n - 1] || pairs.any(|(i, j)| are_apart(eye_of(around[i]), eye_of(around[j])))
