@@ -1,10 +1,11 @@
-//! Texels that nobody can see: inside solids, below what stands on their surface, behind mouldings, in hollow walls.
+//! Texels that nobody can see: inside solids, below objects that stand on their surface, behind mouldings, in hollow
+//! walls.
 //!
-//! What they get is not the light of the surface beside them that is seen, and bilinear reading and interpolation would
-//! bring it there: dark rims where walls meet, light that leaks below them. So they are not computed: each takes the
-//! place of the nearest texel of its chart that can be seen, in the light map, the gather map and the radiance map alike,
-//! unless another point of the texel itself can be seen.
-//! All that follows, bakes and live updates, finds them there and needs to know nothing of it.
+//! Their light differs from that of the visible surface beside them, and bilinear filtering and interpolation would
+//! spread it there, as dark rims where walls meet or light that leaks below walls. Therefore the sample of each is
+//! moved to that of the nearest texel of its chart that can be seen, in the light map, the gather map and the radiance
+//! map alike, unless another point of the texel itself can be seen. Bakes and live updates use the moved samples
+//! without further distinction.
 //!
 //! A texel is buried if, from the side that it shows, almost all rays end within about a texel, on the backs of one-sided
 //! surfaces, or on sides that no [open place](super::seen) sees, or most on such backs.
@@ -23,39 +24,42 @@ use glam::{Mat2, Vec2};
 use rayon::prelude::*;
 use std::ops::Range;
 
-/// Rays that decide, at most.
+/// Maximum number of rays that test a point.
 const RAYS: u32 = 16;
 
-/// So many that end in the open tell that a texel is seen, unless more than half end on backs.
+/// Minimum number of rays that end in the open for a texel to be visible, unless more than half of all rays end on
+/// backs.
 const OPEN: u32 = 3;
 
-/// A first ray that gets so many times as far into the open decides alone: most texels take one ray.
+/// A texel is visible at once if its first ray ends in the open, farther away than this many times `near` of the
+/// [`Search`]: most texels need only one ray.
 const AT_ONCE: f32 = 4.0;
 
-/// Other points of a texel that are looked at if its sample's is buried, and how many are tried that may lie beside its
-/// triangle.
+/// Number of other points of a texel that are tested if its sample is buried, and number of candidates for them, which
+/// may miss its triangle.
 const POINTS: usize = 4;
 const POINT_TRIES: u32 = 32;
 
-/// Rounds of filling: texels farther than this from all that is seen stay where they are.
+/// Maximum number of rounds of filling: samples farther than this many texels from all visible ones are not moved.
 const MAX_ROUNDS: usize = 64;
 
 const BURIED: &str = "which texels are buried";
 
-/// What deciding reads.
+/// Inputs of the search for buried texels.
 #[derive(Clone, Copy)]
 pub(in crate::lightmap) struct Search<'a> {
     pub scene: &'a Scene,
     pub charts: &'a Charts,
     pub seen: &'a Seen,
-    /// Nothing nearer is light from the open: the width of a texel of the light map.
+    /// Distance up to which surfaces cover a texel, at most the width of a texel of the light map.
     pub near: f32,
 }
 
 impl Search<'_> {
-    /// Moves the buried texels of a map to the nearest that are seen, and tells which they are; none if the list is empty.
-    /// `by_parts`: those of which another point can be seen move there instead. Others of a placement without any seen
-    /// texel do so anyhow. Advances `stage` by one per placement, and counts `rays`. To be called on the device's threads.
+    /// Moves the samples of a map's buried texels to the nearest visible ones, and returns which texels were moved
+    /// (empty: none) and the number of rays. If `by_parts`, samples of texels with another point that can be seen are
+    /// moved to that point instead; in placements without any visible sample this is done in any case. Advances `stage`
+    /// by one per placement. To be called on the device's threads.
     pub fn move_buried(&self, map: &mut ChartMap, by_parts: bool, stage: &Stage) -> Result<(Vec<bool>, u64)> {
         let of_placement = |placement: u32| {
             let found = self.in_placement(map, placement, by_parts, stage)?;
@@ -91,7 +95,7 @@ impl Search<'_> {
         let is_back = match map.layout.is_back(placement) {
             true => true,
             false if !self.charts.charts[chart as usize].two_sided || map.layout.back(chart).is_some() => false,
-            // Which side is shown is for the bake to choose where nobody looks.
+            // The bake chooses the side if open places do not decide it.
             false => match self.seen.shows_back(chart) {
                 Some(back) => back,
                 None => return Ok(found),
@@ -116,7 +120,8 @@ impl Search<'_> {
         Ok(found)
     }
 
-    /// Takes those texels from the `buried` ones of which another point can be seen, and notes it.
+    /// Removes the texels from `buried` that have another point that can be seen, and adds them to `found` with this
+    /// point.
     fn find_seen_parts(
         &self,
         map: &ChartMap,
@@ -134,7 +139,7 @@ impl Search<'_> {
         buried.iter().for_each(|&s| is_buried[s as usize - samples.start] = true);
         buried.retain(|&s| {
             let (x, y) = map.position(s as usize);
-            // Deep among buried ones nothing can be seen of a texel.
+            // A texel surrounded by buried ones has no visible point.
             let is_at_border = (-1..=1).flat_map(|dy| (-1..=1).map(move |dx| (x + dx, y + dy))).any(|(x, y)| {
                 let neighbour = map.at(placement, x, y);
                 !samples.contains(&(neighbour as usize)) || !is_buried[neighbour as usize - samples.start]
@@ -183,7 +188,7 @@ impl Search<'_> {
     }
 }
 
-/// Where a ray ends.
+/// Kind of end of a ray.
 enum Sight {
     Open,
     /// On the back of a one-sided surface.
@@ -194,14 +199,14 @@ enum Sight {
 
 #[derive(Default)]
 struct Found {
-    /// Buried texels and those whose places they take.
+    /// Buried texels, each with the visible one whose sample it takes.
     moved: Vec<(u32, u32)>,
-    /// Texels that can be seen, but not where their samples are, and where else.
+    /// Texels that can be seen at another point than their sample, with that point.
     seen_parts: Vec<(u32, TexelSample)>,
     rays: u64,
 }
 
-/// Some points of what a texel holds of its sample's triangle.
+/// Returns some points of the part of the sample's triangle in its texel.
 fn points_of_texel(charts: &Charts, map: &ChartMap, placement: u32, sample: usize) -> Vec<TexelSample> {
     let texel = map.texels.samples[sample];
     let place = |u, v| Vec2::from(map.layout.texel_coord(placement, charts.local(texel.triangle, u, v)));
@@ -213,7 +218,7 @@ fn points_of_texel(charts: &Charts, map: &ChartMap, placement: u32, sample: usiz
     points.map(|w| TexelSample { u: w.x, v: w.y, ..texel }).take(POINTS).collect()
 }
 
-/// The nearest texels that are seen to those `buried`, ring by ring.
+/// Finds the nearest visible texels to those `buried`, ring by ring.
 fn nearest_seen(map: &ChartMap, placement: u32, samples: Range<usize>, buried: Vec<u32>) -> Result<Vec<(u32, u32)>> {
     let local = |s: u32| s as usize - samples.start;
     let mut to: Vec<u32> = try_collect(samples.clone().map(|s| s as u32), BURIED)?;
@@ -225,7 +230,7 @@ fn nearest_seen(map: &ChartMap, placement: u32, samples: Range<usize>, buried: V
             let around = (-1..=1).flat_map(|dy| (-1..=1).map(move |dx| (ox + dx, oy + dy)));
             let known = around.filter_map(|(x, y)| {
                 let neighbour = map.at(placement, x, y);
-                // Among given charts there may be another one.
+                // The window of given charts may contain another chart.
                 let is_own = neighbour != NONE && samples.contains(&(neighbour as usize));
                 let known = is_own.then(|| to[local(neighbour)]).filter(|&t| t != NONE)?;
                 let (kx, ky) = map.position(known as usize);

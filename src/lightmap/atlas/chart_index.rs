@@ -1,4 +1,4 @@
-//! Point location in charts: which triangle a point of a chart's plane belongs to.
+//! Point location in charts: finds the triangle that a point of a chart's plane belongs to.
 //!
 //! Every chart of more than a few triangles has a uniform grid of about as many cells over its local coordinates; a
 //! cell lists the triangles that overlap it. All maps share the index, whatever their resolution.
@@ -12,22 +12,22 @@ use crate::memory::{Reservation, try_vec, try_with_capacity};
 use glam::{DVec2, Vec2};
 use rayon::prelude::*;
 
-/// Charts of up to this many triangles have no grid: all are looked at.
+/// Maximum number of triangles of a chart without a grid: all of them are tested.
 const SMALL: usize = 4;
 
 /// A grid is made coarser until its cells list at most this many triangles per triangle of the chart.
 const ENTRIES_PER_TRIANGLE: usize = 8;
 
-/// Triangles looked at for one point, at most. Only charts with fans of very many slivers have more in a cell; a point
-/// that is not found among these counts as outside.
+/// Maximum number of triangles tested for one point. Only charts with fans of very many slivers have more in a cell; a
+/// point that is not found among these counts as outside.
 const MAX_TESTS: usize = 256;
 
-/// Barycentric weights may be this much below 0, so that no point falls between two triangles.
+/// Tolerance of barycentric weights below 0, so that no point falls between two triangles.
 const TOLERANCE: f64 = 1e-6;
 
 /// Finds triangles of charts by local coordinates.
 pub(crate) struct ChartIndex {
-    /// By chart.
+    /// Grids, by chart.
     grids: Vec<Grid>,
     _memory: Reservation,
 }
@@ -69,7 +69,7 @@ impl Grid {
         }
     }
 
-    /// `None` if the cells would list more than `limit` triangles.
+    /// Makes a grid of given size; `None` if the cells would list more than `limit` triangles.
     fn of_cells(
         charts: &Charts,
         triangles: &[u32],
@@ -136,13 +136,13 @@ impl ChartIndex {
         Ok(ChartIndex { grids, _memory: device.memory().reserve(bytes, "the index of the charts")? })
     }
 
-    /// Bytes held.
+    /// Returns the size in bytes.
     pub(crate) fn bytes(&self) -> usize {
         self.grids.iter().map(Grid::bytes).sum()
     }
 
-    /// The point of a chart at local coordinates, `None` outside of its triangles. Where triangles overlap, `first` is
-    /// preferred, then the lowest number.
+    /// Returns the point of a chart at local coordinates, `None` outside of its triangles. If triangles overlap,
+    /// `first` is preferred, then the lowest number.
     pub(crate) fn locate(&self, charts: &Charts, chart: u32, local: Vec2, first: u32) -> Option<TexelSample> {
         let inside = |t: u32| {
             let [u, v] = weights(charts.corners[t as usize], local)?;
@@ -154,13 +154,13 @@ impl ChartIndex {
     }
 }
 
-/// Barycentric weights of corners 1 and 2 for a point in a triangle.
+/// Returns the barycentric weights of corners 1 and 2 for a point in a triangle.
 fn weights(corners: [[f32; 2]; 3], p: Vec2) -> Option<[f32; 2]> {
     let [a, b, c] = corners.map(|c| Vec2::from(c).as_dvec2());
     let (p, edge_u, edge_v): (DVec2, DVec2, DVec2) = (p.as_dvec2() - a, b - a, c - a);
     let twice_area = edge_u.perp_dot(edge_v);
     let (u, v) = (p.perp_dot(edge_v) / twice_area, edge_u.perp_dot(p) / twice_area);
-    // (False for the NaN of triangles without area.)
+    // The comparison is false for the NaN of triangles without area.
     let inside = u >= -TOLERANCE && v >= -TOLERANCE && u + v <= 1.0 + TOLERANCE;
     inside.then(|| {
         let (u, v) = (u.clamp(0.0, 1.0), v.clamp(0.0, 1.0));

@@ -1,4 +1,4 @@
-//! A map of one resolution: where the charts lie in it, and its texels.
+//! A map of one resolution: the layout of the charts in it, and its texels.
 
 use super::charts::Charts;
 use super::layout::Layout;
@@ -15,7 +15,7 @@ use std::ops::Range;
 pub(crate) struct ChartMap {
     pub layout: Layout,
     pub texels: TexelMap,
-    /// The first sample that shows a back in a place of its own.
+    /// First sample of the separate texels for backs.
     pub back_start: usize,
 }
 
@@ -27,7 +27,7 @@ impl ChartMap {
         Ok(ChartMap { layout, texels, back_start })
     }
 
-    /// Number of texels that show a surface.
+    /// Returns the number of texels that show a surface.
     pub(crate) fn len(&self) -> usize {
         self.texels.samples.len()
     }
@@ -36,27 +36,27 @@ impl ChartMap {
         self.texels.bytes() + size_of_val(&self.layout.placements[..])
     }
 
-    /// Column and row of a sample in its page.
+    /// Returns column and row of a sample in its page.
     #[inline]
     pub(crate) fn position(&self, sample: usize) -> (i32, i32) {
         let t = &self.texels.samples[sample];
         (t.x as i32, t.y as i32)
     }
 
-    /// The samples of a placement.
+    /// Returns the samples of a placement.
     pub(crate) fn samples_of(&self, placement: u32) -> Range<usize> {
         let r = self.texels.samples_of(placement);
         r.start as usize..r.end as usize
     }
 
-    /// The sample of a placement at a column and row, [`NONE`] if there is none.
+    /// Returns the sample of a placement at a column and row, [`NONE`] if there is none.
     #[inline]
     pub(crate) fn at(&self, placement: u32, x: i32, y: i32) -> u32 {
         if x < 0 || y < 0 { NONE } else { self.texels.texel_index(placement, x as u32, y as u32) }
     }
 
-    /// The sample nearest to a point of a placed chart; `None` if the placement has no texel (given
-    /// charts that others cover).
+    /// Returns the sample nearest to a point of a placed chart; `None` if the placement has no texel (a given chart
+    /// that others cover).
     #[inline]
     pub(crate) fn nearest(&self, placement: u32, local: [f32; 2]) -> Option<u32> {
         let sample = self.texels.nearest(placement, self.layout.texel_coord(placement, local));
@@ -75,32 +75,32 @@ impl ChartMap {
         }
     }
 
-    /// The point of a sample and its side as a receiver.
+    /// Returns the point of a sample, and one side of it as a receiver.
     pub(crate) fn receiver(&self, scene: &Scene, sample: usize, back: bool) -> (SurfacePoint, Receiver) {
         receiver_of(scene, &self.texels.samples[sample], back)
     }
 
-    /// Whether a sample shows a back in a place of its own.
+    /// Whether a sample is one of the separate texels for backs.
     #[inline]
     pub(crate) fn is_back(&self, sample: usize) -> bool {
         sample >= self.back_start
     }
 
-    /// The placement of a sample.
+    /// Returns the placement of a sample.
     #[inline]
     pub(crate) fn placement_of(&self, charts: &Charts, sample: usize) -> u32 {
         let chart = charts.chart_of[self.texels.samples[sample].triangle as usize];
         if self.is_back(sample) { self.layout.place_of(chart, false) } else { chart }
     }
 
-    /// Position and normal of a sample.
+    /// Returns position and normal of a sample.
     pub(crate) fn surface(&self, scene: &Scene, sample: usize) -> (Vec3, Vec3) {
         let t = &self.texels.samples[sample];
         (t.position(scene), t.shading_normal(scene))
     }
 }
 
-/// A point of a triangle and its front or back as a receiver.
+/// Returns a point of a triangle, and its front or back as a receiver.
 pub(in crate::lightmap) fn receiver_of(scene: &Scene, t: &TexelSample, back: bool) -> (SurfacePoint, Receiver) {
     let point = SurfacePoint::new(scene.corners(t.triangle), t.u, t.v, scene);
     let (mesh, triangle) = scene.locate(t.triangle);

@@ -1,8 +1,7 @@
 //! Charts: pieces of surface that are flat in the light map (thesis 3.2.3).
 //!
-//! Charts come from the caller's UVs where those are usable, else from `super::unwrap`. They know
-//! nothing of texels: their coordinates are in scene units, and each map packs them at its own
-//! density ([`super::layout`]).
+//! Charts come from the caller's UVs where those are usable, else from `super::unwrap`. They do not depend on texels:
+//! their coordinates are in scene units, and each map packs them at its own density ([`super::layout`]).
 
 pub use super::pieces::Given;
 use super::pieces::{CHARTS, Groups, Piece, connected, float_key, surface_kind};
@@ -17,15 +16,15 @@ use std::collections::BTreeMap;
 use std::ops::Range;
 use std::time::Instant;
 
-/// The most texels in all pages of a map. Samples and indices of as many take 10 GB.
+/// Maximum number of texels in all pages of a map. Samples and indices of this many take 10 GB.
 pub const MAX_TEXELS: u64 = 1 << 29;
 
-/// The largest page, in texels along an axis: texels are addressed in 16 bits.
+/// Maximum size of a page, in texels along an axis: texels are addressed in 16 bits.
 pub const MAX_PAGE_SIZE: u32 = 16384;
 
-/// Triangles whose UVs cover a page more than this many times over cannot have been meant to be
-/// unique (an engine's per-mesh UVs without page numbers, say): they are unwrapped instead. Below
-/// it overlaps are taken for the caller's affair and counted.
+/// Maximum number of times that given UVs may cover a page. If they cover it more often, they cannot have been meant to
+/// be unique (an engine's per-mesh UVs without page numbers, for instance), and the triangles are unwrapped instead. Up
+/// to this limit, overlaps are accepted and counted.
 const MAX_PAGE_COVER: f64 = 2.0;
 
 /// A piece of surface with continuous texture coordinates.
@@ -39,7 +38,7 @@ pub struct Chart {
     pub area: f32,
     /// Whether its material is two-sided.
     pub two_sided: bool,
-    /// Where the caller's UVs put it in the light map.
+    /// Placement in the light map by the caller's UVs, if any.
     pub given: Option<Given>,
 }
 
@@ -56,7 +55,7 @@ pub struct UvReport {
     pub degenerate: u64,
     /// Triangles on pages that the given UVs cover more than twice over; unwrapped instead.
     pub overlapping: u64,
-    /// Texels whose centre several triangles of given UVs cover.
+    /// Texels whose centre is covered by several triangles with given UVs.
     pub overlapping_texels: u64,
     /// Charts reduced in density to fit a page.
     pub reduced_charts: u32,
@@ -78,13 +77,12 @@ pub struct Charts {
 }
 
 impl Charts {
-    /// The charts of a scene: from the caller's UVs where there are usable ones, else by unwrapping.
+    /// Makes the charts of a scene: from the caller's UVs where they are usable, else by unwrapping.
     ///
-    /// A triangle's UVs are usable if all are within half a texel of [0, 1] and enclose an area.
-    /// `texels_per_unit` (finite, > 0), `page_size` and `padding` (texels) are those of the finest
-    /// map: unwrapped charts that would not fit its pages are cut where there are triangle borders
-    /// to cut along. `OutOfMemory` if the surface would take more than [`MAX_TEXELS`] at this
-    /// density, `InvalidArgument` for a page number for which that is so.
+    /// A triangle's UVs are usable if all are within half a texel of [0, 1] and enclose an area. `texels_per_unit`
+    /// (finite, > 0), `page_size` and `padding` (texels) are those of the finest map: unwrapped charts that would not
+    /// fit its pages are cut along triangle borders, if possible. `OutOfMemory` if the surface would take more than
+    /// [`MAX_TEXELS`] at this density, `InvalidArgument` if pages up to a given page number would.
     ///
     /// Reports as stage "unwrap" from 0 to 0.5 of the bar.
     pub fn of_scene(
@@ -99,7 +97,7 @@ impl Charts {
         check_density(surface_area(scene), texels_per_unit)?;
         let total = scene.triangle_count();
         let stage = progress.stage("unwrap", 0.0, 0.5, total as u64 + 1);
-        // Pieces and charts side by side, and what the unwrapping of a part takes.
+        // Memory of pieces and charts, which exist at the same time, and of the unwrapping of a part.
         let _memory = scene.device().memory().reserve(total as usize * 2 * Self::BYTES_PER_TRIANGLE, "the charts")?;
         let (charts, mut report) = scene.device().install(|| {
             let mut report = UvReport::default();
@@ -119,22 +117,21 @@ impl Charts {
         Ok((charts, report))
     }
 
-    /// What a triangle takes in a `Charts`, for memory accounts.
+    /// Size in bytes of a triangle's entries, for memory accounts.
     pub(crate) const BYTES_PER_TRIANGLE: usize = 24 + 4 + 4;
 
-    /// Bytes held.
+    /// Returns the size in bytes.
     pub fn bytes(&self) -> usize {
         self.corners.len() * 24 + (self.triangles.len() + self.chart_of.len()) * 4 + size_of_val(&self.charts[..])
     }
 
-    /// The global triangle numbers of a chart, ascending.
+    /// Returns the global triangle numbers of a chart, ascending.
     pub fn triangles_of(&self, chart: u32) -> &[u32] {
         let Range { start, end } = self.charts[chart as usize].triangles;
         &self.triangles[start as usize..end as usize]
     }
 
-    /// Local coordinates of the point of a global triangle with weights `u` and `v` of its corners
-    /// 1 and 2.
+    /// Returns the local coordinates of the point of a global triangle with weights `u` and `v` of its corners 1 and 2.
     #[inline]
     pub fn local(&self, triangle: u32, u: f32, v: f32) -> [f32; 2] {
         let [a, b, c] = self.corners[triangle as usize].map(Vec2::from_array);
@@ -173,7 +170,7 @@ impl Charts {
     }
 }
 
-/// The area of all valid triangles, in squared scene units.
+/// Returns the area of all valid triangles, in squared scene units.
 pub fn surface_area(scene: &Scene) -> f64 {
     let areas = |m: usize, mesh: &Mesh| -> f64 {
         let first = scene.first_triangle(m as u32);
@@ -182,20 +179,20 @@ pub fn surface_area(scene: &Scene) -> f64 {
     scene.meshes().iter().enumerate().map(|(m, mesh)| areas(m, mesh)).sum()
 }
 
-/// The density in texels per scene unit at which the scene's surface fills about `pages` pages,
-/// two thirds of each page's texels being covered.
+/// Returns the density in texels per scene unit at which the scene's surface fills about `pages` pages, two thirds of
+/// each page's texels being covered.
 pub fn automatic_density(scene: &Scene, page_size: u32, pages: f64) -> f32 {
     let texels = pages * (page_size as f64).powi(2) * 2.0 / 3.0;
     ((texels / surface_area(scene)).sqrt() as f32).clamp(f32::MIN_POSITIVE, f32::MAX)
 }
 
-/// Area of a global triangle number, in squared scene units.
+/// Returns the area of a global triangle, in squared scene units.
 pub(in crate::lightmap) fn triangle_area(scene: &Scene, triangle: u32) -> f64 {
     let [a, b, c] = scene.corners(triangle).map(|c| c.as_dvec3());
     0.5 * (b - a).cross(c - a).length()
 }
 
-/// Texels that a chart may take along an axis of a page; checks page size and padding.
+/// Returns the number of texels that a chart may take along an axis of a page; checks page size and padding.
 pub(in crate::lightmap) fn padded_extent(page_size: u32, padding: u32) -> Result<u32> {
     if !(1..=MAX_PAGE_SIZE).contains(&page_size) {
         return invalid_argument!("page_size is {page_size}, outside 1 to {MAX_PAGE_SIZE}");
@@ -234,15 +231,14 @@ fn log_report(scene: &Scene, report: &UvReport) {
     }
 }
 
-/// Lower and upper corner of local coordinates.
+/// Returns lower and upper corner of local coordinates.
 fn bounds(corners: &[[[f32; 2]; 3]]) -> (Vec2, Vec2) {
     let points = corners.iter().flatten().map(|&p| Vec2::from_array(p));
     points.fold((Vec2::INFINITY, Vec2::NEG_INFINITY), |(lo, hi), p| (lo.min(p), hi.max(p)))
 }
 
-/// Cuts a piece in halves, along triangle borders, until each is at most `max_extent` wide and high.
-/// Where that does not help (large triangles reach across the cut), the piece stays, to be reduced
-/// in density by the layout.
+/// Cuts a piece in halves, along triangle borders, until each is at most `max_extent` wide and high. If that does not
+/// help (large triangles reach across the cut), the piece stays, and the layout reduces its density.
 fn split_to_fit(piece: Piece, max_extent: f32, out: &mut Vec<Piece>) -> Result<()> {
     let mut stack = vec![piece];
     while let Some(piece) = stack.pop() {
@@ -263,7 +259,7 @@ fn split_to_fit(piece: Piece, max_extent: f32, out: &mut Vec<Piece>) -> Result<(
         let halves = [half(true)?, half(false)?];
         let shrinks = |p: &Piece| {
             let (lower, upper) = bounds(&p.corners);
-            // A cut in two that leaves more than this on a side makes texels rather than room.
+            // A cut that leaves a half longer than this adds border texels and hardly makes charts smaller.
             !p.triangles.is_empty() && (upper - lower)[axis] <= 0.8 * extent
         };
         if halves.iter().all(shrinks) {
@@ -276,7 +272,7 @@ fn split_to_fit(piece: Piece, max_extent: f32, out: &mut Vec<Piece>) -> Result<(
     Ok(())
 }
 
-/// Pieces from the caller's UVs, ordered by page, and the valid triangles to unwrap, ascending.
+/// Returns pieces from the caller's UVs, ordered by page, and the valid triangles to unwrap, ascending.
 fn given_pieces(scene: &Scene, page_size: u32, report: &mut UvReport, stage: &Stage) -> Result<(Vec<Piece>, Vec<u32>)> {
     let mut rest = Vec::new();
     let mut usable = Vec::new();
@@ -334,8 +330,8 @@ fn given_page(lightmap: &LightmapUvs, mesh: usize, triangle: usize, page_size: u
     Ok(page)
 }
 
-/// The area of a triangle in UV space, `None` if its UVs are not finite or more than half a texel
-/// outside [0, 1].
+/// Returns the area of a triangle in UV space, `None` if its UVs are not finite or more than half a texel outside [0,
+/// 1].
 fn uv_area(mesh: &Mesh, lightmap: &LightmapUvs, triangle: usize, page_size: u32) -> Option<f64> {
     let tolerance = 0.5 / page_size as f32;
     let uvs = mesh.indices[triangle].map(|i| lightmap.uvs[i as usize]);
@@ -344,7 +340,7 @@ fn uv_area(mesh: &Mesh, lightmap: &LightmapUvs, triangle: usize, page_size: u32)
     uvs.iter().all(inside).then(|| 0.5 * (b - a).perp_dot(c - a).abs())
 }
 
-/// Pieces of one mesh: triangles with usable UVs and their pages, connected through equal vertices.
+/// Returns the pieces of one mesh: its `triangles` with usable UVs and their pages, connected through equal vertices.
 fn islands(scene: &Scene, triangles: &[(u32, u32)], stage: &Stage) -> Result<Vec<Piece>> {
     let mesh = &scene.meshes()[scene.locate(triangles[0].0).0 as usize];
     let uvs = &mesh.lightmap.as_ref().expect("the mesh has UVs").uvs;
@@ -371,7 +367,8 @@ fn islands(scene: &Scene, triangles: &[(u32, u32)], stage: &Stage) -> Result<Vec
     Ok(pieces)
 }
 
-/// Local coordinates such that the piece keeps its area, and the placement that undoes them.
+/// Makes a piece from UVs: local coordinates are scaled so that the piece keeps its area, and its placement maps them
+/// back to the UVs.
 fn given_piece(scene: &Scene, page: u32, triangles: Vec<u32>, uvs: &[[Vec2; 3]]) -> Result<Piece> {
     let lower = uvs.iter().flatten().fold(Vec2::INFINITY, |m, &p| m.min(p));
     let twice_area = |[a, b, c]: [DVec2; 3]| (b - a).perp_dot(c - a).abs();

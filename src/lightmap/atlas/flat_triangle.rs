@@ -1,4 +1,4 @@
-//! Triangles in texel coordinates: which texels they touch, and what of a texel they cover.
+//! Triangles in texel coordinates: the texels that they touch, and the part of a texel that they cover.
 //!
 //! Geometry is computed in f64. Triangles that share an edge compute the same crossings with texel rows, so no centre falls
 //! between them.
@@ -15,25 +15,25 @@ impl Flat {
         (a.min(b).min(c), a.max(b).max(c))
     }
 
-    /// Texels of the bounding box that lie in a window of `size`, at least 1.
+    /// Returns the number of texels of the bounding box that lie in a window of `size`, at least 1.
     pub(in crate::lightmap) fn box_texels(&self, size: [i64; 2]) -> u64 {
         let (lower, upper) = self.bounds();
         let extent = (upper - lower + 1.0).clamp(DVec2::ONE, DVec2::new(size[0] as f64, size[1] as f64));
         (extent.x * extent.y) as u64
     }
 
-    /// Ends of the longest edge, as numbers of corners.
+    /// Returns the ends of the longest edge, as numbers of corners.
     pub(in crate::lightmap) fn longest_edge(&self) -> (usize, usize) {
         let length = |(i, j): (usize, usize)| self.0[i].distance_squared(self.0[j]);
         [(0, 1), (1, 2), (2, 0)].into_iter().fold((0, 1), |m, e| if length(e) > length(m) { e } else { m })
     }
 
-    /// Least and greatest x of the triangle's part with y in [y0, y1]. (+∞, −∞) where there is none.
+    /// Returns least and greatest x of the triangle's part with y in [y0, y1]; (+∞, −∞) if there is none.
     pub(in crate::lightmap) fn slab(&self, y0: f64, y1: f64) -> (f64, f64) {
         let (mut left, mut right) = (f64::INFINITY, f64::NEG_INFINITY);
         let mut include = |x: f64| (left, right) = (left.min(x), right.max(x));
         for k in 0..3 {
-            // In an order that both triangles of an edge agree on, so that crossings are equal.
+            // Ends are ordered, so that both triangles of an edge compute equal crossings.
             let (p, q) = (self.0[k], self.0[(k + 1) % 3]);
             let (p, q) = if (p.y, p.x) <= (q.y, q.x) { (p, q) } else { (q, p) };
             for end in [p, q] {
@@ -69,7 +69,7 @@ impl Flat {
         }
     }
 
-    /// The part in the square of texel (x, y).
+    /// Returns the part of the triangle in the square of texel (x, y).
     pub(in crate::lightmap) fn clip(&self, x: i64, y: i64) -> Polygon {
         let mut polygon = Polygon { points: [DVec2::ZERO; 8], count: 3 };
         polygon.points[..3].copy_from_slice(&self.0);
@@ -80,8 +80,8 @@ impl Flat {
         polygon
     }
 
-    /// The point in texel (x, y), which the triangle touches, that is nearest to the texel's centre,
-    /// and its squared distance.
+    /// Returns the triangle's point in texel (x, y), which it touches, that is nearest to the texel's centre, and its
+    /// squared distance.
     pub(in crate::lightmap) fn nearest_in_texel(&self, x: i64, y: i64) -> (DVec2, f64) {
         let corner = DVec2::new(x as f64, y as f64);
         let centre = corner + 0.5;
@@ -97,7 +97,7 @@ impl Flat {
         for (k, &p) in points.iter().enumerate() {
             consider(nearest_on_segment(p, points[(k + 1) % points.len()], centre));
         }
-        // Nothing left in rounding: the triangle's border, moved into the texel.
+        // If rounding leaves no part, the triangle's border is used, moved into the texel.
         if points.is_empty() {
             for k in 0..3 {
                 consider(nearest_on_segment(self.0[k], self.0[(k + 1) % 3], centre));
@@ -106,7 +106,7 @@ impl Flat {
         best
     }
 
-    /// The centroid of the part in texel (x, y), which the triangle touches; of a part without width the
+    /// Returns the centroid of the triangle's part in texel (x, y), which it touches; for a part without width, the
     /// point nearest to the texel's centre.
     pub(in crate::lightmap) fn centroid_in_texel(&self, x: i64, y: i64) -> DVec2 {
         let corner = DVec2::new(x as f64, y as f64);
@@ -114,11 +114,11 @@ impl Flat {
         if area > THIN { centroid.clamp(corner, corner + 1.0) } else { self.nearest_in_texel(x, y).0 }
     }
 
-    /// Weights of corners 1 and 2 for a point of the triangle; points just outside are moved in.
+    /// Returns the weights of corners 1 and 2 for a point of the triangle; points just outside are moved in.
     ///
-    /// First how far along the longest edge, which every triangle tells well, then how far across,
-    /// which in a sliver is a quotient of rounding errors and gives way: so the weights' point is
-    /// never farther from `p` than the triangle is high.
+    /// The position along the longest edge comes first, which is well defined in every triangle. The position across
+    /// it, in a sliver a quotient of rounding errors, is then limited to the triangle. So the weights' point is never
+    /// farther from `p` than the triangle is high.
     pub(in crate::lightmap) fn weights(&self, p: DVec2) -> [f64; 2] {
         let (i, j) = self.longest_edge();
         let k = 3 - i - j;
@@ -137,7 +137,7 @@ impl Flat {
     }
 }
 
-/// Parts of texels smaller than this are taken for lines: their area would be a difference of rounding errors.
+/// Area of parts of texels below which they are taken for lines, as it would be a difference of rounding errors.
 const THIN: f64 = 1e-9;
 
 /// A triangle clipped by up to four half-planes.
@@ -147,7 +147,7 @@ pub(in crate::lightmap) struct Polygon {
 }
 
 impl Polygon {
-    /// The part where sign · coordinate ≥ sign · bound (Sutherland and Hodgman 1974).
+    /// Returns the part in which sign · coordinate ≥ sign · bound (Sutherland and Hodgman 1974).
     pub(in crate::lightmap) fn cut(&self, axis: usize, bound: f64, sign: f64) -> Polygon {
         let mut out = Polygon { points: [DVec2::ZERO; 8], count: 0 };
         let mut push = |p: DVec2| {
@@ -173,7 +173,7 @@ impl Polygon {
         out
     }
 
-    /// Area and centroid; the latter means nothing if there is no area.
+    /// Returns area and centroid; the centroid is meaningless if there is no area.
     pub(in crate::lightmap) fn area_and_centroid(&self) -> (f64, DVec2) {
         let points = &self.points[..self.count];
         let origin = points.first().copied().unwrap_or_default();

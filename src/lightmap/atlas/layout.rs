@@ -1,4 +1,4 @@
-//! Layouts: where each chart lies in the pages of a map of a given resolution (thesis 3.2.3).
+//! Layouts: the placement of each chart in the pages of a map of a given resolution (thesis 3.2.3).
 //!
 //! The light map, the gather map and the radiance map show the same charts at different densities.
 //! Each packs them anew, so that no texel of a coarse map is shared by two charts. Only the light
@@ -15,16 +15,16 @@ use crate::memory::{try_collect, try_filled, try_with_capacity};
 use crate::progress::Progress;
 use crate::scene::NONE;
 
-/// What buffers are for, in errors.
+/// Name of the buffers in error messages.
 const LAYOUT: &str = "the layout of the charts";
 
-/// Where a chart lies. Texel coordinates of a page are continuous: texel i covers [i, i + 1].
+/// Placement of a chart in a page. Texel coordinates of a page are continuous: texel i covers [i, i + 1].
 #[derive(Clone, Copy, Debug, PartialEq)]
 pub struct Placement {
     /// Number of the page.
     pub page: u32,
-    /// First column of the rectangle of texels that the chart owns, padding included. (Given charts need not own theirs
-    /// alone.)
+    /// First column of the rectangle of texels that the chart owns, padding included. (The rectangles of given charts
+    /// may overlap.)
     pub x: u16,
     /// First row of the rectangle.
     pub y: u16,
@@ -32,7 +32,7 @@ pub struct Placement {
     pub w: u16,
     /// Rows of the rectangle.
     pub h: u16,
-    /// Whether the chart lies on its side: local coordinates change places before the rest.
+    /// Whether the chart is turned: its two local coordinates are swapped before scale and offset are applied.
     pub swap: bool,
     /// Texels per unit of local coordinates: texel coordinate = `offset` + `scale` · local.
     pub scale: [f32; 2],
@@ -41,14 +41,14 @@ pub struct Placement {
 }
 
 impl Placement {
-    /// The texel coordinate of a point of the chart.
+    /// Returns the texel coordinate of a point of the chart.
     #[inline]
     pub fn texel_coord(&self, local: [f32; 2]) -> [f32; 2] {
         let [s, t] = if self.swap { [local[1], local[0]] } else { local };
         [self.offset[0] + self.scale[0] * s, self.offset[1] + self.scale[1] * t]
     }
 
-    /// The point of the chart's plane at a texel coordinate.
+    /// Returns the point of the chart's plane at a texel coordinate.
     #[inline]
     pub fn local(&self, coord: [f32; 2]) -> [f32; 2] {
         let [s, t] = [0, 1].map(|i| (coord[i] - self.offset[i]) / self.scale[i]);
@@ -56,7 +56,7 @@ impl Placement {
     }
 }
 
-/// Where all charts lie in the square pages of a map.
+/// Placements of all charts in the square pages of a map.
 #[derive(Clone, Debug, PartialEq)]
 pub struct Layout {
     /// Width and height of a page in texels.
@@ -65,11 +65,11 @@ pub struct Layout {
     pub page_count: u32,
     /// Texels per scene unit, except for given and reduced charts.
     pub density: f32,
-    /// One per chart, by chart number, then one per back side.
+    /// Placements: one per chart, by chart number, then one per back side.
     pub placements: Vec<Placement>,
     /// Charts of the back sides: placement `charts.len() + k` is the back of chart `back_of[k]`.
     pub back_of: Vec<u32>,
-    /// The first so many placements are the caller's, ordered by page.
+    /// Number of placements by the caller, which come first, ordered by page.
     pub given: u32,
     /// Charts reduced in density because they would not fit a page.
     pub reduced: u32,
@@ -81,10 +81,9 @@ impl Layout {
     /// Places `charts` at `density` texels per scene unit (finite, > 0) in as many pages of
     /// `page_size` (1 to [`MAX_PAGE_SIZE`](super::charts::MAX_PAGE_SIZE)) as they need, with `padding` texels around each.
     ///
-    /// With `honour_given` the charts that the caller placed stay where they are, and the others
-    /// go to further pages. The charts of `with_backs`, ascending, get a second place for their backs.
-    /// A chart too long for a page is shown at a lower density along that axis. `OutOfMemory` if
-    /// the pages would hold more than [`MAX_TEXELS`].
+    /// If `honour_given`, the charts that the caller placed stay where they are, and the others go to further pages.
+    /// The charts of `with_backs`, ascending, get a second placement for their backs. A chart too long for a page is
+    /// shown at a lower density along that axis. `OutOfMemory` if the pages would hold more than [`MAX_TEXELS`].
     pub fn pack(
         charts: &Charts,
         density: f32,
@@ -131,7 +130,7 @@ impl Layout {
         Ok(layout)
     }
 
-    /// The chart that a placement shows.
+    /// Returns the chart that a placement shows.
     #[inline]
     pub fn chart_of(&self, placement: u32) -> u32 {
         let charts = self.placements.len() - self.back_of.len();
@@ -144,36 +143,36 @@ impl Layout {
         placement as usize >= self.placements.len() - self.back_of.len()
     }
 
-    /// The placement of a chart's back side, if the layout has one.
+    /// Returns the placement of a chart's back side, if the layout has one.
     #[inline]
     pub fn back(&self, chart: u32) -> Option<u32> {
         self.backs.get(chart as usize).copied().filter(|&p| p != NONE)
     }
 
-    /// The placement that shows this very side of a chart, if the layout has one.
+    /// Returns the placement for exactly this side of a chart, if the layout has one.
     #[inline]
     pub fn side(&self, chart: u32, front: bool) -> Option<u32> {
         if front { Some(chart) } else { self.back(chart) }
     }
 
-    /// The placement that shows a side of a chart: a back without a place of its own shares the front's.
+    /// Returns the placement that shows a side of a chart: a back without a separate placement shares the front's.
     #[inline]
     pub fn place_of(&self, chart: u32, front: bool) -> u32 {
         if front { chart } else { self.back(chart).unwrap_or(chart) }
     }
 
-    /// The texel coordinate of a point of a placed chart.
+    /// Returns the texel coordinate of a point of a placed chart.
     #[inline]
     pub fn texel_coord(&self, placement: u32, local: [f32; 2]) -> [f32; 2] {
         self.placements[placement as usize].texel_coord(local)
     }
 
-    /// Texels in all pages.
+    /// Returns the number of texels in all pages.
     pub fn texels(&self) -> u64 {
         self.page_count as u64 * (self.page_size as u64).pow(2)
     }
 
-    /// Share of the packed pages that rectangles of charts, padding included, take.
+    /// Returns the fraction of the packed pages that rectangles of charts, padding included, take.
     pub fn utilisation(&self) -> f64 {
         let given = &self.placements[..self.given as usize];
         let pages = self.page_count - given.last().map_or(0, |p| p.page + 1);
@@ -181,12 +180,12 @@ impl Layout {
         texels as f64 / (pages as f64 * (self.page_size as f64).powi(2)).max(1.0)
     }
 
-    /// Adds a chart whose place is yet to be found, long side along x.
+    /// Adds a chart, long side along x, whose position is found later.
     fn push(&mut self, chart: &Chart, max_extent: u32, padding: u32) {
         let swap = chart.size[1] > chart.size[0];
         let size = if swap { [chart.size[1], chart.size[0]] } else { chart.size };
-        // Room for rounding: coordinates in the page are exact to an ulp of the page's size, and
-        // a chart must not touch the next texel by as much.
+        // Margin for rounding: coordinates in the page are exact to an ulp of the page's size, and a chart must not
+        // touch the next texel by that much.
         let slack = self.page_size as f64 / (1 << 20) as f64;
         let mut reduced = false;
         let [(w, sx, ox), (h, sy, oy)] = size.map(|s| {
@@ -195,7 +194,7 @@ impl Layout {
             let fitting = texels - 2.0 * slack;
             reduced |= wanted > max_extent as f64 + 1.0;
             let scale = if wanted > fitting { fitting / s as f64 } else { self.density as f64 };
-            // In the middle, so that the centres of border texels lie in the chart if they can.
+            // The chart is centred, so that the centres of border texels lie in it if possible.
             let margin = 0.5 * (texels - scale * s as f64);
             (texels as u16 + 2 * padding as u16, scale as f32, (margin + padding as f64) as f32)
         });
@@ -203,7 +202,7 @@ impl Layout {
         self.placements.push(Placement { page: 0, x: 0, y: 0, w, h, swap, scale: [sx, sy], offset: [ox, oy] });
     }
 
-    /// Refuses what cannot be packed before it is tried.
+    /// Refuses a layout that is too large, before it is packed.
     fn check_size(&self, given_pages: u32) -> Result<()> {
         let packed = &self.placements[self.given as usize..];
         let rects: u64 = packed.iter().map(|p| p.w as u64 * p.h as u64).sum();
@@ -230,7 +229,7 @@ impl Layout {
         Ok(())
     }
 
-    /// Finds a place for all but the given charts.
+    /// Packs all but the given charts.
     fn place(&mut self, progress: &Progress) -> Result<()> {
         let mut order = try_collect(self.given..self.placements.len() as u32, LAYOUT)?;
         let key = |p: &Placement| (std::cmp::Reverse(p.h), std::cmp::Reverse(p.w));
@@ -270,10 +269,10 @@ fn given_placement(chart: &Chart, given: &Given, page_size: u32) -> Placement {
     Placement { page: given.page, x, y, w, h, swap: false, scale, offset }
 }
 
-/// The upper outline of what a page holds: steps of equal height from left to right.
+/// The upper outline of the rectangles in a page: steps, each of one height, from left to right.
 struct Skyline {
     size: u32,
-    /// Left end and height of each step; it ends where the next begins.
+    /// Left end and height of each step, which ends where the next begins.
     steps: Vec<[u32; 2]>,
     lowest: u32,
 }
@@ -303,7 +302,7 @@ impl Skyline {
         Some(corner)
     }
 
-    /// The height on which a rectangle from step `i` to `right` rests, if below `limit`.
+    /// Returns the height on which a rectangle from step `i` to `right` rests, if below `limit`.
     fn rest(&self, i: usize, right: u32, limit: u32) -> Option<u32> {
         let mut y = 0;
         for &[x, top] in &self.steps[i..] {

@@ -1,4 +1,4 @@
-//! The atlas: charts and texels of a scene, which side of a chart each shows, and what of it can be seen.
+//! The atlas: charts and texels of a scene, the side of its chart that each texel shows, and which texels can be seen.
 
 pub(crate) mod buried;
 pub(crate) mod chart_index;
@@ -22,8 +22,7 @@ use charts::Charts;
 use seen::Seen;
 use std::sync::Arc;
 
-/// Charts and texels of a scene: all of a light map but its light. Does not change once made, and is
-/// shared with live updates.
+/// Charts and texels of a scene: all of a light map but its light. Immutable, and shared with live updates.
 pub(crate) struct Atlas {
     pub scene: Arc<Scene>,
     pub charts: Charts,
@@ -34,25 +33,26 @@ pub(crate) struct Atlas {
     pub padding: u32,
     pub info: LightmapInfo,
     pub seen: Seen,
-    /// Whether each texel of the light map has the place of another one. Empty if none has.
+    /// Whether each texel of the light map is buried, with the sample point of another one. Empty if none is.
     pub buried: Vec<bool>,
     pub(in crate::lightmap) _memory: Reservation,
 }
 
 impl Atlas {
-    /// Whether a sample of the light map or the gather map shows the back: in a place of its own, or since
-    /// `backs` (per chart; empty: fronts) says so.
+    /// Whether a sample of the light map or the gather map shows the back: as a separate texel for the back, or because
+    /// of `backs` (per chart; empty: fronts).
     pub(crate) fn is_back(&self, map: &ChartMap, backs: &[bool], sample: usize) -> bool {
         let chart = self.charts.chart_of[map.texels.samples[sample].triangle as usize];
         map.is_back(sample) || backs.get(chart as usize).is_some_and(|&b| b)
     }
 
-    /// A sample of the light map or the gather map as a receiver, on the side that it shows.
+    /// Returns a sample of the light map or the gather map as a receiver, on the side that it shows.
     pub(crate) fn receiver(&self, map: &ChartMap, backs: &[bool], sample: usize) -> Receiver {
         map.receiver(&self.scene, sample, self.is_back(map, backs, sample)).1
     }
 
-    /// Where a sample of the light map lies in its chart, which for a buried texel is not where its light is from.
+    /// Returns the local coordinates of a texel of the light map in its chart. For a buried texel, these are not those
+    /// of its sample, which lies in another texel.
     pub(crate) fn texel_local(&self, placement: u32, sample: usize) -> [f32; 2] {
         let t = &self.map.texels.samples[sample];
         match self.buried.get(sample) {
@@ -61,7 +61,7 @@ impl Atlas {
         }
     }
 
-    /// The gather texels around a sample of the light map, with their bilinear weights.
+    /// Calls `visit` with the gather texels around a sample of the light map and their bilinear weights.
     #[inline]
     pub(crate) fn gather_around(&self, sample: usize, visit: impl FnMut(usize, f32)) {
         let t = &self.map.texels.samples[sample];

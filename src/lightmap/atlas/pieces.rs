@@ -1,4 +1,4 @@
-//! Charts in the making: pieces of surface and how they are connected.
+//! Pieces of surface from which charts are made, and how they are connected.
 
 use crate::error::Result;
 use crate::memory::{try_collect, try_filled, try_push};
@@ -6,7 +6,7 @@ use crate::progress::Stage;
 use crate::scene::{Material, NONE};
 use rayon::prelude::*;
 
-/// What buffers are for, in errors.
+/// Name of the buffers in error messages.
 pub(in crate::lightmap) const CHARTS: &str = "the charts";
 
 /// Placement by the caller's UVs: uv = `offset` + `scale` · local.
@@ -20,28 +20,28 @@ pub struct Given {
     pub scale: [f32; 2],
 }
 
-/// A chart in the making. Local coordinates need not start at (0, 0).
+/// A piece of surface that becomes a chart. Local coordinates need not start at (0, 0).
 pub(in crate::lightmap) struct Piece {
-    /// Global numbers, ascending.
+    /// Global triangle numbers, ascending.
     pub triangles: Vec<u32>,
     /// Local coordinates of the corners, per entry of `triangles`.
     pub corners: Vec<[[f32; 2]; 3]>,
     pub given: Option<Given>,
 }
 
-/// What must not meet in one chart: sides that are lit and sides that are not, and lamps and what
-/// they light (a texel of the radiance map belongs to one or the other).
+/// Returns the kind of surface of a material. Different kinds must not share a chart: two-sided and one-sided surfaces,
+/// and emissive surfaces and others (a texel of the radiance map belongs to one or the other).
 pub(in crate::lightmap) fn surface_kind(material: &Material) -> u32 {
     material.two_sided as u32 | (material.is_emissive() as u32) << 1
 }
 
-/// A key that is equal for equal floats: +0 and −0 are one.
+/// Returns a key that is equal for equal floats, +0 and −0 included.
 pub(in crate::lightmap) fn float_key(x: f32) -> u32 {
     (x + 0.0).to_bits()
 }
 
-/// Which of `count` items are connected: each item's lowest connected item. `keys` are pairs of a
-/// key and an item; items with equal keys are connected.
+/// Finds connected items among `count` and returns, for each item, the lowest item connected to it. `keys` are pairs of
+/// a key and an item; items with equal keys are connected.
 pub(in crate::lightmap) fn connected<K: Ord + Send>(
     count: usize,
     mut keys: Vec<(K, u32)>,
@@ -65,7 +65,7 @@ pub(in crate::lightmap) fn connected<K: Ord + Send>(
     Ok(parent)
 }
 
-/// A cancel is looked for whenever so many items have been looked at.
+/// Number of items between two checks for a cancel.
 pub(in crate::lightmap) const ITEMS_PER_CHECK: usize = 1 << 14;
 
 fn root(parent: &mut [u32], mut i: u32) -> u32 {
@@ -80,7 +80,7 @@ fn root(parent: &mut [u32], mut i: u32) -> u32 {
 /// Items by root (as from [`connected`]), ordered by root, ascending in each group.
 pub(in crate::lightmap) struct Groups {
     items: Vec<u32>,
-    /// Where each group begins, and the number of items.
+    /// Index of each group's first item; the last element is the number of items.
     starts: Vec<u32>,
 }
 

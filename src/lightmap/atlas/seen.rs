@@ -1,8 +1,8 @@
-//! How often the sides of charts are seen from open places.
+//! Counts how often the sides of charts are seen from open places.
 //!
-//! An open place lies between two surfaces, or before one in scenes under a sun or a sky, with free space around it, and not
-//! inside a solid. Random rays from such places meet sides as often as somebody sees them who goes about in the scene.
-//! Whether light gets there is not asked: lamps may be switched on later.
+//! An open place lies between two surfaces, or before one in scenes under a sun or a sky, with free space around it,
+//! and not inside a solid. Random rays from such places hit a side about as often as somebody who walks about in the
+//! scene sees it. Light does not matter, since lamps may be switched on later.
 
 use super::chart_map::ChartMap;
 use super::charts::Charts;
@@ -16,52 +16,53 @@ use glam::Vec3;
 use rayon::prelude::*;
 use std::sync::atomic::{AtomicU32, AtomicU64, Ordering::Relaxed};
 
-/// Places that are tried: as many as this times the texels of the radiance map, within limits.
+/// Number of places that are tried, per texel of the radiance map, and limits of the total.
 const TRIES_PER_TEXEL: usize = 4;
 const LEAST_TRIES: usize = 1 << 10;
 const MOST_TRIES: usize = 1 << 14;
 
-/// Packets of rays from an open place. The first tells whether it is open.
+/// Number of packets of rays from an open place. The first decides whether the place is open.
 const PACKETS: u32 = 4;
 
-/// Free space around an open place: the smaller of this part of the scene's diagonal, and so many texels of the light map.
+/// Free space around an open place: the smaller of this fraction of the scene's diagonal and this many texels of the
+/// light map.
 pub(in crate::lightmap) const ROOM: f32 = 0.01;
 const ROOM_TEXELS: f32 = 4.0;
 
-/// An open place sees at most this part of its rays end on backs of one-sided surfaces.
+/// Maximum fraction of the hits of rays from an open place that lie on backs of one-sided surfaces.
 const BACKS: f32 = 0.05;
 
-/// Indoors, at least this part ends on surfaces.
+/// Minimum fraction of the rays from an open place indoors that end on surfaces.
 const ENCLOSED: f32 = 0.5;
 
-/// Outdoors, places before a surface that faces the open are so far away at most, as a part of the diagonal.
+/// Maximum distance of a place from a surface that faces the open, in outdoor scenes, as a fraction of the diagonal.
 const BEFORE: f32 = 0.1;
 
-/// A chart shows the side that is seen so many times as often as the other one, if there is such a side.
+/// A chart shows a side that is seen at least this many times as often as the other one.
 const CLEARLY: u32 = 10;
 
-/// Of a side of which fewer rays are expected it is not known whether it is seen.
+/// Minimum number of expected rays from which it can be decided whether a side is hidden.
 const LEAST_EXPECTED: f64 = 8.0;
 
-/// A side that gets less than this part of the rays that are expected is hidden.
+/// A side that gets less than this fraction of the expected rays is hidden.
 const HIDDEN: f64 = 0.02;
 
 const COUNTS: &str = "which sides of charts are seen";
 
-/// How often the sides of charts are seen.
+/// Counts of how often the sides of charts are seen.
 #[derive(Default)]
 pub(crate) struct Seen {
-    /// Rays that met the front and the back of each chart. Empty if no chart is two-sided.
+    /// Numbers of rays that hit the front and the back of each chart. Empty if no chart is two-sided.
     pub counts: Vec<[u32; 2]>,
-    /// Whether hardly any ray met the front and the back of each chart.
+    /// Whether the front and the back of each chart are hidden: hardly any ray hit them.
     hidden: Vec<[bool; 2]>,
     pub places: u64,
     pub rays: u64,
 }
 
 impl Seen {
-    /// Looks around from open places. Advances `stage` by [`work`](Self::work). To be called on the device's threads.
-    /// `texel` is the width of a texel of the light map.
+    /// Finds open places and traces rays from them. Advances `stage` by [`work`](Self::work). To be called on the
+    /// device's threads. `texel` is the width of a texel of the light map.
     pub(crate) fn count(
         scene: &Scene,
         charts: &Charts,
@@ -99,7 +100,7 @@ impl Seen {
         Ok(Seen { counts, hidden, places: places.into_inner(), rays: rays.into_inner() })
     }
 
-    /// What [`count`](Self::count) advances its stage by.
+    /// Returns the number of steps by which [`count`](Self::count) advances its stage.
     pub(crate) fn work(radiance: &ChartMap) -> u64 {
         match radiance.layout.back_of.len() {
             0 => 0,
@@ -107,13 +108,13 @@ impl Seen {
         }
     }
 
-    /// Whether hardly any open place sees a side of a chart.
+    /// Whether a side of a chart can hardly be seen from any open place.
     pub(crate) fn is_hidden(&self, chart: u32, front: bool) -> bool {
         self.hidden.get(chart as usize).is_some_and(|hidden| hidden[usize::from(!front)])
     }
 
-    /// Whether of a two-sided chart the back is seen and the front hardly ever, or the other way round; `None` if it is
-    /// neither.
+    /// Returns `true` if the back of a two-sided chart is seen and its front hardly ever, `false` if it is the other
+    /// way round, and `None` otherwise.
     pub(crate) fn shows_back(&self, chart: u32) -> Option<bool> {
         let [front, back] = self.counts.get(chart as usize).copied().unwrap_or_default();
         match front.max(back) {
@@ -136,7 +137,7 @@ pub(in crate::lightmap) fn is_outdoors(scene: &Scene) -> bool {
     lights.iter().any(shines)
 }
 
-/// What looking around reads.
+/// Inputs of the search for open places.
 struct Look<'a> {
     scene: &'a Scene,
     charts: &'a Charts,
@@ -146,7 +147,8 @@ struct Look<'a> {
 }
 
 impl Look<'_> {
-    /// Place `number` among those that are tried, if it is open, and what a first packet of rays meets from there.
+    /// Returns place `number` of those that are tried, if it is open, and the hits of a first packet of rays from
+    /// there.
     fn open_place(&self, number: u32, rays: &mut u64) -> Option<(Vec3, [RawHit; PACKET_SIZE])> {
         let sample = (u64::from(mix(number)) * self.radiance.len() as u64) >> 32;
         let (_, from) = self.radiance.receiver(self.scene, sample as usize, self.radiance.is_back(sample as usize));
@@ -176,7 +178,7 @@ impl Look<'_> {
         (is_enclosed && backs <= BACKS * met).then_some((position, hits))
     }
 
-    /// Packet `k` of rays from a place to all sides.
+    /// Traces packet `k` of rays from a place in all directions.
     fn packet(&self, position: Vec3, number: u32, k: u32, rays: &mut u64) -> [RawHit; PACKET_SIZE] {
         let (mut packet, mut hits) = (Packet::default(), [RawHit::MISS; PACKET_SIZE]);
         for i in 0..PACKET_SIZE as u32 {
@@ -188,7 +190,7 @@ impl Look<'_> {
         hits
     }
 
-    /// Names the charts that are seen from a place, and 0 for their fronts or 1 for their backs.
+    /// Calls `see` with each chart that a ray from a place hits, and 0 for its front or 1 for its back.
     fn around(
         &self,
         position: Vec3,

@@ -1,14 +1,13 @@
 //! Texels: inverse mapping from texels to points on triangles (thesis 3.2.3).
 //!
-//! Every texel that a chart touches gets one sample: the texel's centre if it lies in the chart,
-//! else the centroid of what the texel holds of the chart's triangle that is nearest to the centre.
-//! So borders are covered conservatively: any point of a chart lies in a texel that has a sample of
-//! this chart. (With the nearest point itself, samples lie on the charts' very edges, where walls
-//! meet: in a furnished room at 10 texels per metre the mean squared error of light was a tenth
-//! more.)
+//! Every texel that a chart touches gets one sample: the texel's centre if it lies in the chart, else the centroid of
+//! the part in the texel of the chart's triangle that is nearest to the centre. Borders are covered conservatively: any
+//! point of a chart lies in a texel that has a sample of this chart. (If the nearest point itself is taken, samples lie
+//! exactly on the charts' edges, where walls meet: in a furnished room at 10 texels per metre the mean squared error of
+//! light was a tenth more.)
 //!
-//! Geometry is computed in f64 on texel coordinates relative to the rectangle at hand. Triangles
-//! that share an edge compute the same crossings with texel rows, so no centre falls between them.
+//! Geometry is computed in f64 on texel coordinates relative to the rectangle of each group. Triangles that share an
+//! edge compute the same crossings with texel rows, so no centre falls between them.
 
 mod padding;
 
@@ -42,21 +41,21 @@ pub struct TexelSample {
 }
 
 impl TexelSample {
-    /// Position in the scene.
+    /// Returns the position in the scene.
     #[inline]
     pub fn position(&self, scene: &Scene) -> Vec3 {
         let [a, b, c] = scene.corners(self.triangle).map(|c| c.as_dvec3());
         (a + (b - a) * self.u as f64 + (c - a) * self.v as f64).as_vec3()
     }
 
-    /// Unit geometric normal, of the front side.
+    /// Returns the unit geometric normal of the front side.
     #[inline]
     pub fn geometric_normal(&self, scene: &Scene) -> Vec3 {
         scene.normal(self.triangle)
     }
 
-    /// Unit shading normal of the front side: interpolated where the mesh has normals and they
-    /// point to the front, else the geometric normal.
+    /// Returns the unit shading normal of the front side: interpolated if the mesh has normals and the result points to
+    /// the front, else the geometric normal.
     pub fn shading_normal(&self, scene: &Scene) -> Vec3 {
         let geometric = self.geometric_normal(scene);
         let (mesh, triangle) = scene.locate(self.triangle);
@@ -83,13 +82,13 @@ pub struct Bilinear {
 
 /// The texels of all charts of a layout.
 pub struct TexelMap {
-    /// Ordered by placement, row, column.
+    /// Samples, ordered by placement, row, column.
     pub samples: Vec<TexelSample>,
     /// First sample of each placement, and the number of samples at the end.
     pub chart_start: Vec<u32>,
-    /// Texels whose centre several triangles cover.
+    /// Texels whose centre is covered by several triangles.
     pub overlapping_texels: u64,
-    /// Where to look a placement's texels up.
+    /// Window of each placement in the index.
     windows: Vec<Window>,
     /// Sample of each texel of each window, row-major, [`NONE`] where there is none.
     index: Vec<u32>,
@@ -128,8 +127,8 @@ impl TexelMap {
     /// Maps the texels of `layout`, which must be of `charts`, which must be of `scene`. Runs on the
     /// device's threads and advances `stage` by [`work`](Self::work) in all.
     ///
-    /// Where given charts overlap, a texel goes to the first triangle that covers its centre, else
-    /// to the one nearest to it.
+    /// If given charts overlap, a texel belongs to the first triangle that covers its centre, else to the one nearest
+    /// to it.
     pub fn build(scene: &Scene, charts: &Charts, layout: &Layout, stage: &Stage) -> Result<TexelMap> {
         let (groups, windows, entries) = groups(layout)?;
         let memory = scene.device().memory();
@@ -152,24 +151,24 @@ impl TexelMap {
         Ok(map)
     }
 
-    /// What building a map of `layout` advances its stage by.
+    /// Returns the number of steps by which building a map of `layout` advances its stage.
     pub fn work(layout: &Layout) -> u64 {
         2 * layout.placements.len() as u64
     }
 
-    /// The placement of a sample: the chart's number, or that of its back side.
+    /// Returns the placement of a sample: the chart's number, or the placement of its back.
     pub fn placement_of(&self, sample: u32) -> u32 {
         self.chart_start.partition_point(|&first| first <= sample) as u32 - 1
     }
 
-    /// The samples of a placement.
+    /// Returns the samples of a placement.
     #[inline]
     pub fn samples_of(&self, placement: u32) -> Range<u32> {
         self.chart_start[placement as usize]..self.chart_start[placement as usize + 1]
     }
 
-    /// The sample of a texel (x, y) of the page, [`NONE`] if it lies outside the placement's
-    /// rectangle or is not covered. Among given charts it may be the sample of another chart.
+    /// Returns the sample of a texel (x, y) of the page, [`NONE`] if it lies outside the placement's rectangle or is
+    /// not covered. Among given charts it may be the sample of another chart.
     #[inline]
     pub fn texel_index(&self, placement: u32, x: u32, y: u32) -> u32 {
         let w = &self.windows[placement as usize];
@@ -177,7 +176,7 @@ impl TexelMap {
         if x < w.w as u32 && y < w.h as u32 { self.index[w.at(x, y)] } else { NONE }
     }
 
-    /// The sample nearest to a texel coordinate of the placement's page.
+    /// Returns the sample nearest to a texel coordinate of the placement's page.
     #[inline]
     pub fn nearest(&self, placement: u32, coord: [f32; 2]) -> u32 {
         let w = &self.windows[placement as usize];
@@ -186,8 +185,8 @@ impl TexelMap {
         if sample != NONE { sample } else { self.search(w, x, y) }
     }
 
-    /// Up to four samples around a texel coordinate of the placement's page. Texels without a
-    /// sample, and those outside the placement's rectangle, leave their weight to the others.
+    /// Returns up to four samples around a texel coordinate of the placement's page. The weight of texels without a
+    /// sample, and of those outside the placement's rectangle, is shared by the others.
     #[inline]
     pub fn bilinear(&self, placement: u32, coord: [f32; 2]) -> Bilinear {
         let w = &self.windows[placement as usize];
@@ -205,8 +204,8 @@ impl TexelMap {
             }
             sum += weights[i];
         }
-        // The texel of a coordinate in the chart is covered and has a weight of at least 1/4. What
-        // rounding moved out of the chart finds the nearest sample.
+        // The texel of a coordinate in the chart is covered and has a weight of at least 1/4. A coordinate that
+        // rounding moved out of the chart gets the nearest sample.
         if !(sum > 0.01) {
             return Bilinear { samples: [self.nearest(placement, coord); 4], weights: [1.0, 0.0, 0.0, 0.0] };
         }
@@ -218,7 +217,7 @@ impl TexelMap {
         Bilinear { samples, weights }
     }
 
-    /// Bytes held.
+    /// Returns the size in bytes.
     pub fn bytes(&self) -> usize {
         size_of_val(&self.samples[..])
             + (self.index.len() + self.chart_start.len()) * 4
@@ -252,7 +251,7 @@ impl TexelMap {
         best.1
     }
 
-    /// First pass: which triangle each texel belongs to, and how many texels each placement has.
+    /// First pass: finds the triangle that each texel belongs to, and counts the texels of each placement.
     fn cover(&mut self, job: &Job) -> Result<()> {
         let slices = split(&mut self.index, self.groups.iter().map(Group::texels))?;
         let placements = self.groups.last().map_or(0, |g| g.placements.end as usize);
@@ -276,7 +275,7 @@ impl TexelMap {
         Ok(())
     }
 
-    /// Second pass: the samples; the index then names them.
+    /// Second pass: makes the samples, and writes their numbers to the index.
     fn sample(&mut self, job: &Job) -> Result<()> {
         self.samples = try_vec(self.sample_count(), "the texel samples")?;
         let sizes = group_sizes(&self.groups, &self.chart_start);
@@ -295,8 +294,7 @@ impl Window {
         self.start as usize + y as usize * self.w as usize + x as usize
     }
 
-    /// Column in the window of a texel of the page, clamped. (NaN gives 0.)
-    /// The column of a coordinate, rounded down, or the nearest that there is.
+    /// Returns the column of the window that a coordinate of the page lies in, clamped to the window. (NaN gives 0.)
     #[inline]
     fn column(&self, x: f32) -> u32 {
         (x - self.x as f32).max(0.0).min(self.w as f32 - 1.0) as u32
@@ -308,15 +306,15 @@ impl Window {
     }
 }
 
-/// Rounds a coordinate down. (`f32::floor` is a call into the C library, as SSE4.1 is not taken for
-/// granted: reading live light takes 80 ns per texel, with that call 92.)
+/// Rounds a coordinate down. (`f32::floor` is a call into the C library, since SSE4.1 is not required: reading live
+/// light takes 80 ns per texel, with that call 92.)
 #[inline]
 fn floor(x: f32) -> f32 {
     let towards_zero = x as i32 as f32;
     if towards_zero > x { towards_zero - 1.0 } else { towards_zero }
 }
 
-/// What the passes read.
+/// Inputs of the two passes.
 struct Job<'a, 'p, 'c> {
     charts: &'a Charts,
     layout: &'a Layout,
@@ -324,15 +322,14 @@ struct Job<'a, 'p, 'c> {
 }
 
 impl Job<'_, '_, '_> {
-    /// Triangles of a group as slots of [`Charts::triangles`]. They are contiguous: a group is one
-    /// chart or some of the given charts, which come first.
+    /// Returns the triangles of a group as slots of [`Charts::triangles`]. They are contiguous: a group is one chart or
+    /// some of the given charts, which come first.
     fn slots(&self, group: &Group) -> Range<u32> {
         let chart = |placement| &self.charts.charts[self.layout.chart_of(placement) as usize].triangles;
         chart(group.placements.start).start..chart(group.placements.end - 1).end
     }
 
-    /// Corners of a slot's triangle in texels of the group's window. `placement` only matters
-    /// for groups of a single one.
+    /// Returns the corners of a slot's triangle in texels of the group's window.
     fn flat_triangle(&self, group: &Group, slot: u32) -> Flat {
         let triangle = self.charts.triangles[slot as usize];
         let placement =
@@ -374,7 +371,7 @@ fn group_sizes<'a>(groups: &'a [Group], chart_start: &'a [u32]) -> impl Iterator
     groups.iter().map(move |g| start(g.placements.end) - start(g.placements.start))
 }
 
-/// Consecutive disjoint pieces of `all`.
+/// Splits `all` into consecutive pieces.
 fn split<T>(mut all: &mut [T], sizes: impl Iterator<Item = usize>) -> Result<Vec<&mut [T]>> {
     let mut pieces = Vec::new();
     for size in sizes {
@@ -385,16 +382,16 @@ fn split<T>(mut all: &mut [T], sizes: impl Iterator<Item = usize>) -> Result<Vec
     Ok(pieces)
 }
 
-/// What buffers are for, in errors.
+/// Name of the buffers in error messages.
 const INDEX: &str = "the index of texels";
 
 /// Marks owners that touch a texel without covering its centre. (Slots have 28 bits.)
 const BORDER: u32 = 1 << 31;
 
-/// A cancel is looked for whenever so many texels have been visited.
+/// Number of visited texels between two checks for a cancel.
 const TEXELS_PER_CHECK: u64 = 1 << 18;
 
-/// And whenever so many samples have been made.
+/// Number of samples made between two checks for a cancel.
 const SAMPLES_PER_CHECK: usize = 1 << 14;
 
 /// Writes the owner of each texel of a group (a slot, perhaps with [`BORDER`]; [`NONE`]) and the number of texels of
@@ -447,7 +444,7 @@ fn cover_group(
     Ok(overlapping)
 }
 
-/// Which of the group's placements a slot belongs to.
+/// Returns the index in the group of the placement that a slot belongs to.
 #[inline]
 fn placement_in_group(job: &Job, group: &Group, slot: u32) -> usize {
     if group.placements.len() == 1 {
@@ -457,9 +454,9 @@ fn placement_in_group(job: &Job, group: &Group, slot: u32) -> usize {
     (chart - group.placements.start) as usize
 }
 
-/// Claims the texels whose centre a triangle covers; returns how many it would have had to share.
+/// Claims the free texels whose centre a triangle covers; returns the number of those that were claimed before.
 fn cover_centres(flat: &Flat, slot: u32, size: [i64; 2], owners: &mut [u32]) -> u64 {
-    // What overlaps by less than this may just touch.
+    // Triangles that overlap by less than this may just touch.
     const TOUCH: f64 = 1e-3;
     let (lower, upper) = flat.bounds();
     let mut overlapping = 0;

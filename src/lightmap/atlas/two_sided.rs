@@ -1,18 +1,18 @@
-//! Which side of two-sided charts the light map shows.
+//! Chooses the side of two-sided charts that the light map shows.
 //!
-//! A texel holds the light of one side. In modelled scenes many two-sided surfaces have their fronts where nobody
-//! looks: ceilings that face the roof, sofas turned inside out. Charts of which both sides are seen from
-//! [open places](super::seen) have a place for each. Of the others that side is shown which is seen; where that is not
-//! known, or both are seen and there is one place, the side from which one sees far before one sees another surface, as
-//! from inside a room rather than from inside its furniture or from the void around, and which is lit.
+//! A texel holds the light of one side. In modelled scenes, many two-sided surfaces have fronts that nobody can see:
+//! ceilings that face the roof, sofas turned inside out. Charts whose sides can both be seen from [open
+//! places](super::seen) have separate texels for each. The others show the side that can be seen. If that is not known,
+//! or if both sides can be seen and share texels, the choice is the side with the longer view, as from inside a room
+//! rather than from inside its furniture or from the void around, and with more light.
 //!
-//! Measured, by this rule and by others: docs/experiments.md#which-side-is-shown.
+//! Measured, with this rule and with others: docs/experiments.md#which-side-is-shown.
 //!
-//! Before that, a side that other surfaces cover loses to one that they do not, however bright it is: light leaks between
-//! the layers of cloths.
+//! Before views are compared, a side that other surfaces cover loses to one that is not covered, however bright it is,
+//! since light leaks between layers of cloth.
 //!
-//! And the front of what is in the open stays if it is clearly brighter than the back: a hollow body gets some light
-//! through its holes.
+//! The front of a surface in the open is kept if it is clearly brighter than the back: some light gets into a hollow
+//! body through its openings.
 
 use super::Atlas;
 use super::chart_map::ChartMap;
@@ -25,37 +25,38 @@ use crate::scene::Scene;
 use crate::trace::Ray;
 use rayon::prelude::*;
 
-/// Of two sides that are both covered, or neither, the back is shown if the distance seen from it
-/// times the cube root of its light is more than this many times that of the front: twice as far, or eight times as
-/// bright. Between sides that are alike the front is preferred: it is what users expect, and it does not change when a
-/// light moves a little.
+/// Factor by which the back must be better than the front to be shown, if both sides are covered or neither is. The
+/// measure is the length of the view times the cube root of the light: the factor is reached by a view twice as long,
+/// or by light eight times as bright. The front is preferred between similar sides: users expect it, and it does not
+/// change when a light moves a little.
 const BETTER: f64 = 2.0;
 
-/// A front in the open that gets this many times the light of its back stays, however far one sees in there.
+/// A front in the open that gets more than this many times the light of its back is shown, however long the view from
+/// the back is.
 const BRIGHTER: f64 = 4.0;
 
-/// In the open is what meets nothing with this part of its rays.
+/// A side is in the open if at least this fraction of its rays hit nothing.
 const OPEN: f64 = 0.5;
 
-/// Everything beyond this part of the scene's diagonal is as far as that.
+/// Maximum length of a view, as a fraction of the scene's diagonal; longer ones count as this long.
 const FAR: f32 = 0.3;
 
-/// Where nothing is seen, this part of it.
+/// Length of a view in which a ray hits nothing, as a fraction of [`FAR`].
 const VOID: f32 = 0.05;
 
-/// Part of what is seen that may lie on sides that are not shown, as far as that saves texels.
+/// Fraction of the rays from open places that may end on sides that are not shown, to save texels.
 const MISSING: f64 = 0.003;
 
-/// Other surfaces are close to a side from which one sees less than this part of [`FAR`] on average.
+/// A side is covered by other surfaces if the mean length of its views is less than this fraction of [`FAR`].
 const SOMETHING: f32 = 0.1;
 
-/// Places that are looked from, per side of a chart, and rays from each.
+/// Maximum number of points per side of a chart from which rays start, and number of rays from each.
 const PLACES: usize = 64;
 const RAYS: u32 = 4;
 
-/// Per chart with one place, whether its back is baked; empty if no chart has a back. `light` tells how much light a
-/// sample of the radiance map gets (any unit). To be called on the device's threads. Its time is in the bake's as a whole,
-/// its rays in no stage.
+/// Decides for each chart without separate texels for its back whether the back is baked; empty if no chart has a back.
+/// `light` returns how much light a sample of the radiance map gets (any unit). To be called on the device's threads.
+/// Its time is part of the whole bake's; its rays are not counted in any stage.
 pub(crate) fn backs(atlas: &Atlas, light: impl Fn(usize) -> f32 + Sync, progress: &Progress) -> Result<Vec<bool>> {
     let (scene, radiance) = (&atlas.scene, &atlas.radiance);
     if radiance.layout.back_of.is_empty() {
@@ -67,7 +68,7 @@ pub(crate) fn backs(atlas: &Atlas, light: impl Fn(usize) -> f32 + Sync, progress
         samples.map(|s| light(s) as f64).sum::<f64>() / n
     };
     let is_back = |chart: u32| {
-        // Whatever it says then is thrown away.
+        // The result is discarded after a cancel.
         if progress.is_cancelled() {
             return false;
         }
@@ -95,8 +96,8 @@ pub(crate) fn backs(atlas: &Atlas, light: impl Fn(usize) -> f32 + Sync, progress
     Ok(backs)
 }
 
-/// Those of some two-sided charts of which both sides are seen, ascending. Charts that bring least per texel are left out
-/// as long as at most [`MISSING`] of all that is seen is on a side that is not shown.
+/// Returns those of the given two-sided charts whose sides can both be seen, ascending. Charts that gain least per
+/// texel are left out as long as at most [`MISSING`] of all rays from open places end on sides that are not shown.
 pub(crate) fn seen_from_both(seen: &Seen, radiance: &ChartMap, charts: &[u32]) -> Result<Vec<u32>> {
     let missing = |chart: u32| seen.counts[chart as usize].into_iter().min().unwrap_or(0);
     let mut both = try_collect(charts.iter().copied().filter(|&chart| missing(chart) > 0), BOTH)?;
@@ -118,16 +119,16 @@ pub(crate) fn seen_from_both(seen: &Seen, radiance: &ChartMap, charts: &[u32]) -
 
 const BOTH: &str = "the charts of which both sides are seen";
 
-/// The mean distance below which a side is covered.
+/// Returns the mean length of views below which a side is covered.
 fn something(scene: &Scene) -> f64 {
     f64::from(SOMETHING * FAR * scene.diagonal())
 }
 
-/// What is seen from a side.
+/// The view from a side.
 struct View {
-    /// The mean distance, [`VOID`] where there is nothing.
+    /// Mean length in scene units; [`VOID`] of the maximum for rays that hit nothing.
     distance: f64,
-    /// The part of the rays that meet nothing.
+    /// Fraction of the rays that hit nothing.
     void: f64,
 }
 

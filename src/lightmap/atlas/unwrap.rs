@@ -1,11 +1,10 @@
 //! Unwrapping by parts, in parallel, for triangles without usable UVs (thesis 3.2.3).
 //!
-//! Triangles are grouped into parts of bounded size, each part is unwrapped on its own by the crate
-//! `uvunwrap` (region growing, LSCM refined as rigidly as possible), and only its charts are kept:
-//! packing is the layout's work. The parts depend on the mesh alone, so the charts do not depend on
-//! the number of threads.
+//! Triangles are grouped into parts of bounded size, each part is unwrapped separately by the crate `uvunwrap` (region
+//! growing, LSCM refined as rigidly as possible), and only its charts are kept: packing is done by the layout. The
+//! parts depend on the mesh alone, so the charts do not depend on the number of threads.
 //!
-//! Without the feature `unwrap`, and for what it cannot chart, charts are single triangles and pairs
+//! Without the feature `unwrap`, and for triangles that the crate cannot unwrap, charts are single triangles and pairs
 //! of nearly coplanar triangles, projected on their plane: poor, but valid by construction.
 
 use super::pieces::{CHARTS, Groups, ITEMS_PER_CHECK, Piece, connected, float_key, surface_kind};
@@ -18,15 +17,15 @@ use crate::scene::{NONE, Scene};
 use glam::{DVec2, DVec3, Vec3};
 use rayon::prelude::*;
 
-/// Most triangles in a part, unless they are one flat region. Large enough that few charts are cut
-/// at part borders, small enough that parts keep many threads busy and a cancel is seen in time.
+/// Maximum number of triangles in a part, unless they are one flat region. Large enough that few charts are cut at part
+/// borders, small enough that parts keep many threads busy and a cancel is seen in time.
 const PART_TRIANGLES: usize = 30_000;
 
-/// Triangles are one flat region if their normals are within this of the first one's (the cosine
-/// of a quarter degree, as in `uvunwrap`). Parts never cut a flat region.
+/// Cosine of the greatest angle between the normals of a flat region's triangles and of its first one (a quarter
+/// degree, as in `uvunwrap`). Parts never cut a flat region.
 const FLAT_COSINE: f64 = 1.0 - 1e-5;
 
-/// Pairs of triangles share a planar chart up to this angle between their normals (5 degrees).
+/// Cosine of the greatest angle between the normals of two triangles that share a planar chart (5 degrees).
 const PAIR_COSINE: f64 = 0.9962;
 
 /// Unwraps `triangles` (valid global numbers, ascending). Advances `stage` by one per triangle.
@@ -48,14 +47,14 @@ pub(in crate::lightmap) fn unwrap(scene: &Scene, triangles: &[u32], stage: &Stag
 
 /// Some triangles of one mesh with welded vertices.
 struct Geometry {
-    /// Global numbers, ascending.
+    /// Global triangle numbers, ascending.
     triangles: Vec<u32>,
     /// Vertices of each triangle; equal positions are one vertex.
     indices: Vec<[u32; 3]>,
     positions: Vec<DVec3>,
     /// Unit normals of the triangles.
     normals: Vec<DVec3>,
-    /// See [`surface_kind`].
+    /// Kind of surface of each triangle, see [`surface_kind`].
     kinds: Vec<u32>,
 }
 
@@ -95,8 +94,8 @@ impl Geometry {
         self.indices[triangle].map(|i| self.positions[i as usize])
     }
 
-    /// The triangle across each edge (corners k and k + 1), [`NONE`] where there is none, where more
-    /// than two meet, where the winding differs and where materials must not share a chart.
+    /// Returns the triangle across each edge (corners k and k + 1). It is [`NONE`] if there is none, if more than two
+    /// triangles share the edge, if the winding differs, or if the materials must not share a chart.
     fn neighbours(&self, stage: &Stage) -> Result<Vec<[u32; 3]>> {
         let mut edges = try_with_capacity(3 * self.indices.len(), CHARTS)?;
         for (t, i) in self.indices.iter().enumerate() {
@@ -124,7 +123,7 @@ impl Geometry {
     }
 }
 
-/// Triangles of one mesh in parts: connected components together, large ones cut in space.
+/// Divides the triangles of one mesh into parts: connected components stay together, and large ones are cut in space.
 fn parts(scene: &Scene, triangles: &[u32], stage: &Stage) -> Result<Vec<Vec<u32>>> {
     if triangles.len() <= PART_TRIANGLES {
         return Ok(vec![try_to_vec(triangles, CHARTS)?]);
@@ -160,10 +159,10 @@ fn parts(scene: &Scene, triangles: &[u32], stage: &Stage) -> Result<Vec<Vec<u32>
     Ok(parts)
 }
 
-/// A flat region and its middle.
+/// A flat region, preceded by its middle.
 type Region = (DVec3, Vec<u32>);
 
-/// The flat regions of a component: connected triangles with nearly equal normals.
+/// Finds the flat regions of a component: connected triangles with nearly equal normals.
 fn flat_regions(geometry: &Geometry, neighbours: &[[u32; 3]], component: &[u32], stage: &Stage) -> Result<Vec<Region>> {
     let mut taken = try_filled(geometry.indices.len(), false, CHARTS)?;
     let mut regions = Vec::new();
@@ -252,11 +251,11 @@ fn unwrap_part(geometry: &Geometry, scene: &Scene, stage: &Stage) -> Result<Vec<
     }
 }
 
-/// The charts that `uvunwrap` makes of a part, and which triangles it left without one (too thin
-/// for its single-precision UVs).
+/// Returns the charts that `uvunwrap` makes of a part, and flags for the triangles without one (too thin for its
+/// single-precision UVs).
 #[cfg(feature = "unwrap")]
 fn charts_of_part(geometry: &Geometry, stage: &Stage) -> std::result::Result<(Vec<Piece>, Vec<bool>), uvunwrap::Error> {
-    // Normalised, so that huge, tiny and far-off parts lose no precision.
+    // Positions are normalised, so that huge, tiny and far-off parts lose no precision.
     let lower = geometry.positions.iter().fold(DVec3::INFINITY, |m, &p| m.min(p));
     let upper = geometry.positions.iter().fold(DVec3::NEG_INFINITY, |m, &p| m.max(p));
     let (middle, size) = (0.5 * (lower + upper), (upper - lower).length());
@@ -268,7 +267,7 @@ fn charts_of_part(geometry: &Geometry, stage: &Stage) -> std::result::Result<(Ve
             0.5 * (b - a).cross(c - a).length()
         })
         .sum();
-    // Of its packing only the page's size matters, since UVs are relative to it.
+    // Only the page's size matters of its packing, since UVs are relative to it.
     let density = (PACKING_TEXELS / area).sqrt().min(MAX_PACKING_DENSITY) as f32;
     let mesh = uvunwrap::MeshInput {
         face_materials: Some(&geometry.kinds),
@@ -287,12 +286,12 @@ fn charts_of_part(geometry: &Geometry, stage: &Stage) -> std::result::Result<(Ve
     Ok(read_charts(geometry, &atlas, size / density as f64))
 }
 
-/// Texels of the page that `uvunwrap` packs a part into: few, since its packing takes time and is
-/// thrown away (San Miguel took 21 s of processor time with 512², 14.5 s with 128²). Not fewer, since
-/// charts take at least a texel and UVs are rounded to single precision of the whole page.
+/// Number of texels of the page that `uvunwrap` packs a part into: few, since its packing takes time and is discarded
+/// (San Miguel took 21 s of processor time with 512², 14.5 s with 128²). Not fewer, since charts take at least a texel
+/// and UVs are rounded to single precision of the whole page.
 #[cfg(feature = "unwrap")]
 const PACKING_TEXELS: f64 = 128.0 * 128.0;
-/// Texels that a part's diagonal may take in that page, for parts with hardly any area.
+/// Maximum number of texels that a part's diagonal may take in that page, for parts with hardly any area.
 #[cfg(feature = "unwrap")]
 const MAX_PACKING_DENSITY: f64 = 65536.0;
 /// Largest angle between a triangle and its chart, in degrees.
@@ -302,7 +301,7 @@ const MAX_CHART_ANGLE: f32 = 60.0;
 #[cfg(feature = "unwrap")]
 const MAX_AREA_DISTORTION: f32 = 2.0;
 
-/// The charts of an atlas whose texels are `texel` scene units wide.
+/// Reads the charts of an atlas whose texels are `texel` scene units wide.
 #[cfg(feature = "unwrap")]
 fn read_charts(geometry: &Geometry, atlas: &uvunwrap::Atlas, texel: f64) -> (Vec<Piece>, Vec<bool>) {
     let unit = DVec2::new(atlas.width as f64, atlas.height as f64) * texel;
@@ -314,7 +313,7 @@ fn read_charts(geometry: &Geometry, atlas: &uvunwrap::Atlas, texel: f64) -> (Vec
         let corners = [0, 1, 2].map(|k| mesh.vertices[corners[k] as usize]);
         let local = corners.map(|v| DVec2::from_array(v.uv.map(f64::from)) * unit);
         let [a, b, c] = local;
-        // What has no chart of its own is folded into a point of some chart.
+        // Triangles without a chart are degenerate in UV space, at a point of some chart.
         match corners[0].chart {
             Some(chart) if (b - a).perp_dot(c - a) > 0.0 => {
                 pieces[chart as usize].triangles.push(geometry.triangles[t]);
@@ -327,9 +326,9 @@ fn read_charts(geometry: &Geometry, atlas: &uvunwrap::Atlas, texel: f64) -> (Vec
     (pieces, left)
 }
 
-/// Charts for the triangles marked in `which`: pairs of nearly coplanar triangles, longest shared
-/// edges first, and single triangles. The triangles of a pair lie on different sides of their edge,
-/// so they do not overlap in projection.
+/// Makes charts for the triangles marked in `which`: pairs of nearly coplanar triangles, longest shared edges first,
+/// and single triangles. The triangles of a pair lie on different sides of their edge, so they do not overlap in
+/// projection.
 fn planar_pieces(geometry: &Geometry, which: &[bool], stage: &Stage) -> Result<Vec<Piece>> {
     if !which.contains(&true) {
         return Ok(Vec::new());
@@ -357,7 +356,7 @@ fn planar_pieces(geometry: &Geometry, which: &[bool], stage: &Stage) -> Result<V
     try_collect(first.map(|t| planar_piece(geometry, t, partner[t])), CHARTS)
 }
 
-/// A triangle and its partner, if any, projected on their plane, the longest outer edge along x.
+/// Makes a chart of a triangle and its partner, if any, projected on their plane, with the longest outer edge along x.
 fn planar_piece(geometry: &Geometry, triangle: usize, partner: Option<usize>) -> Piece {
     let members: Vec<usize> = [Some(triangle), partner].into_iter().flatten().collect();
     let normal = members.iter().map(|&t| geometry.normals[t]).sum::<DVec3>().normalize_or(DVec3::Z);

@@ -1,8 +1,8 @@
-//! The padding of pages: which sample each texel shows. A covered texel shows its own sample; an uncovered one
-//! near a chart repeats the nearest, so that bilinear filtering at a chart's border reads no empty texel. Bakes
-//! and live updates compose their pages here, so that both agree on every texel.
+//! The padding of pages: finds the sample that each texel shows. A covered texel shows its own sample; an uncovered one
+//! near a chart repeats the nearest, so that bilinear filtering at a chart's border reads no empty texel. Bakes and
+//! live updates both compose their pages here, and so agree on every texel.
 //!
-//! Exact: first the nearest covered texel in each column, then the best of the columns around.
+//! The search is exact: first the nearest covered texel in each column is found, then the best of the columns around.
 
 use super::{Group, NONE, TexelMap};
 use crate::error::{Error, Result};
@@ -10,7 +10,7 @@ use crate::memory::try_push;
 use std::collections::HashMap;
 use std::ops::Range;
 
-/// A rectangle of a page: columns and rows. May reach beyond the page where a chart's surroundings are meant.
+/// A rectangle of a page: columns and rows. The rectangle around a chart may reach beyond the page.
 #[derive(Clone, Debug, PartialEq)]
 pub(crate) struct PageArea {
     pub columns: Range<i32>,
@@ -18,7 +18,7 @@ pub(crate) struct PageArea {
 }
 
 impl PageArea {
-    /// A whole square page.
+    /// Returns the rectangle of a whole square page.
     pub fn page(size: u32) -> PageArea {
         PageArea { columns: 0..size as i32, rows: 0..size as i32 }
     }
@@ -33,7 +33,7 @@ impl PageArea {
         PageArea { columns: grow(&self.columns), rows: grow(&self.rows) }
     }
 
-    /// The place of a texel in a row-major array of the rectangle.
+    /// Returns the index of a texel in a row-major array of the rectangle.
     fn index(&self, x: i32, y: i32) -> Option<usize> {
         let inside = self.columns.contains(&x) && self.rows.contains(&y);
         inside.then(|| (y - self.rows.start) as usize * self.columns.len() + (x - self.columns.start) as usize)
@@ -41,27 +41,28 @@ impl PageArea {
 }
 
 impl TexelMap {
-    /// The number of groups: all given charts of a page are one, every other placement is one of its own.
+    /// Returns the number of groups: all given charts of a page are one group, and every other placement is a group by
+    /// itself.
     pub(crate) fn group_count(&self) -> usize {
         self.groups.len()
     }
 
-    /// Page of a group and the rectangle of texels that it shows with `padding` texels around its charts. The
-    /// rectangles of packed charts have their padding inside; around given charts it may reach beyond the page.
+    /// Returns the page of a group and the rectangle of texels that it shows with `padding` texels around its charts.
+    /// The rectangles of packed charts have their padding inside; around given charts it may reach beyond the page.
     pub(crate) fn group_area(&self, group: usize, padding: u32) -> (u32, PageArea) {
         let g = &self.groups[group];
         (g.page, g.area().grown(if g.given { padding as i32 } else { 0 }))
     }
 
-    /// The groups of a page.
+    /// Returns the groups of a page.
     pub(crate) fn groups_of_page(&self, page: u32) -> impl Iterator<Item = usize> {
         (0..self.groups.len()).filter(move |&g| self.groups[g].page == page)
     }
 
-    /// Composes a rectangle of a page from `groups`, which hold all that it shows, each once. `out` is row-major and
-    /// keeps what it has where nothing is shown. `value` gives what a sample shows; a texel of the padding
-    /// shows `fill` of the value of the nearest sample within `padding` rows and columns (of equally near
-    /// ones the first).
+    /// Composes a rectangle of a page from `groups`, which must include all groups that overlap it, each once. `out` is
+    /// row-major and unchanged at texels that show no sample. `value` returns the value of a sample; a texel of the
+    /// padding gets `fill` of the value of the nearest sample within `padding` rows and columns (the first of equally
+    /// near ones).
     pub(crate) fn compose<T: Copy>(
         &self,
         groups: impl Iterator<Item = usize>,
@@ -159,7 +160,7 @@ impl TexelMap {
 }
 
 impl Group {
-    /// The rectangle of its window.
+    /// Returns the rectangle of the group's window.
     fn area(&self) -> PageArea {
         let (x, y) = (self.window.x as i32, self.window.y as i32);
         PageArea { columns: x..x + self.window.w as i32, rows: y..y + self.window.h as i32 }
