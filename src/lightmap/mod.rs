@@ -270,7 +270,7 @@ struct Light {
     state: Vec<TexelState>,
     /// Reflected radiance, by sample of the radiance map. Empty if the bake left it out.
     radiance: Radiance,
-    /// Whether a chart with one place shows its back, by chart. Empty if none is two-sided.
+    /// Whether a chart without separate texels for its back shows the back, by chart. Empty if none is two-sided.
     backs: Vec<bool>,
     /// Stitched texels with their light before stitching, since every bake of some texels stitches anew.
     stitch: Option<seams::Stitch>,

@@ -31,8 +31,8 @@ const RAYS: u32 = 16;
 /// backs.
 const OPEN: u32 = 3;
 
-/// A texel is visible at once if its first ray ends in the open, farther away than this many times `near` of the
-/// [`Search`]: most texels need only one ray.
+/// A texel is visible at once if its first ray ends in the open, farther away than this many times `near`: most texels
+/// need only one ray.
 const AT_ONCE: f32 = 4.0;
 
 /// Number of other points of a texel that are tested if its sample is buried, and number of candidates for them, which

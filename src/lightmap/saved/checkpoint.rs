@@ -1,15 +1,13 @@
-//! Checkpoints: what a bake has done so far, kept in a file, so that a bake whose process was killed goes on where it
-//! was.
+//! Checkpoints: the finished work of a bake, kept in a file, so that a bake whose process was killed can continue.
 //!
-//! The file holds records (`super::records`): `CKPT` with the fingerprint of the bake, then what is done in the order
+//! The file holds records (`super::records`): `CKPT` with the fingerprint of the bake, then finished work in the order
 //! in which threads finish it: `RADI` (runs of the radiance map), `RDNE` (bright patches; the radiance map is
-//! complete), `BACK` (which sides are shown), `OWNL` (texels that gather for themselves), `GATH` (blocks of the gather
-//! map), `DRCT` (blocks of direct light). All of it is the same whatever the threads and the order, so what is missing
-//! is computed again and gives the same bits. Photons, upsampling, blur and seams are not kept: they take a small part of
-//! a bake.
+//! complete), `BACK` (the sides that are shown), `OWNL` (fallback gathers), `GATH` (blocks of the gather map), `DRCT`
+//! (blocks of direct light). All of it is independent of the number of threads and the order, so missing work is done
+//! again and gives the same bits. Photons, upsampling, blur and seams are not kept: they take a small part of a bake.
 //!
-//! Records are only ever appended. A kill at any moment leaves at most the last of them torn, and power that fails
-//! leaves what was not flushed torn or as zeros; either is cut off.
+//! Records are only ever appended. If the process is killed, at most the last of them is incomplete; after a power
+//! failure, data that was not flushed may be incomplete or zero. Either is cut off.
 
 use super::fingerprint::{Fingerprint, Origin};
 use super::records::{self, MAGIC, Next, Tag, take, take_one};
@@ -39,27 +37,28 @@ const OWN: Tag = *b"OWNL";
 const GATHER: Tag = *b"GATH";
 const DIRECT: Tag = *b"DRCT";
 
-/// Texels of the radiance map in a record.
+/// Number of texels of the radiance map in a record.
 const RUN: usize = 1 << 14;
 
-/// Where and how often a bake keeps what it has done.
+/// File of a checkpoint, and how often a bake writes to it.
 #[derive(Clone, Debug, PartialEq)]
 pub struct CheckpointParams {
-    /// The file. One that is there must be a checkpoint of the same bake, which then goes on from it.
+    /// Path of the file. If it exists, it must be a checkpoint of the same bake, which then continues from it.
     pub path: PathBuf,
-    /// Seconds between two writes, finite, ≥ 0. A kill loses at most the work of so long; 0: of the blocks under way.
+    /// Seconds between two writes, finite, ≥ 0. If the process is killed, at most the work of this time is lost; 0:
+    /// only that of unfinished blocks.
     pub seconds: f64,
 }
 
 impl CheckpointParams {
-    /// A checkpoint that is written every ten seconds.
+    /// Makes parameters of a checkpoint that is written every ten seconds.
     pub fn new(path: impl Into<PathBuf>) -> CheckpointParams {
         CheckpointParams { path: path.into(), seconds: 10.0 }
     }
 
     /// Checks the range documented on the field.
     pub fn validate(&self) -> Result<()> {
-        // Up to what a duration holds.
+        // The upper limit fits a duration.
         if !(self.seconds >= 0.0 && self.seconds <= 1e9) {
             return invalid_argument!("checkpoint_seconds is {}, outside 0 to 1e9", self.seconds);
         }
@@ -67,14 +66,14 @@ impl CheckpointParams {
     }
 }
 
-/// The checkpoint of a bake under way. Used from all threads.
+/// The checkpoint of a bake in progress. Used from all threads.
 pub(crate) struct Checkpoint<'a> {
     device: &'a Device,
     path: PathBuf,
     interval: Duration,
     file: Mutex<Output<File>>,
     pending: Mutex<Pending>,
-    /// What an earlier run has done, by kind and number.
+    /// Finished work of earlier runs, by kind and number.
     done: Mutex<HashMap<(Tag, u64), Vec<u8>>>,
 }
 
@@ -84,7 +83,7 @@ struct Pending {
     since: Instant,
 }
 
-/// What a file does for a checkpoint. (Tests have others, which fail.)
+/// Operations on the file of a checkpoint. (Tests have implementations that fail.)
 trait Storage: Write + Seek {
     fn set_len(&self, bytes: u64) -> std::io::Result<()>;
     fn sync_data(&self) -> std::io::Result<()>;
@@ -105,15 +104,15 @@ struct Output<F> {
     file: F,
     /// Bytes of whole records.
     whole: u64,
-    /// Whether the last write failed, and may have left a part of a record.
+    /// Whether the last write failed and may have left an incomplete record.
     failed: bool,
-    /// When the file was last flushed to disk, and how long that took.
+    /// Time of the last flush to disk; its duration is `flush_time`.
     flushed: Instant,
     flush_time: Duration,
 }
 
-/// Flushes to disk, which matter when power fails, take at most one part in so many of the time. (A kill loses nothing
-/// that was written. A flush of a block takes from 1 to more than 100 ms.)
+/// Reciprocal of the fraction of the time that flushes to disk may take. They matter for power failures only: data that
+/// was written survives a killed process. (A flush of a block takes from 1 to more than 100 ms.)
 const FLUSH_SHARE: u32 = 100;
 
 impl<F: Storage> Output<F> {
@@ -121,7 +120,7 @@ impl<F: Storage> Output<F> {
         Output { file, whole, failed: false, flushed: Instant::now(), flush_time: Duration::ZERO }
     }
 
-    /// Appends whole records. What a write that failed has left is cut off first: behind it they could not be read.
+    /// Appends whole records. The rest of a failed write is cut off first, since records behind it could not be read.
     fn append(&mut self, bytes: &[u8]) -> std::io::Result<()> {
         if self.failed {
             self.cut()?;
@@ -148,7 +147,7 @@ impl<F: Storage> Output<F> {
 }
 
 impl<'a> Checkpoint<'a> {
-    /// Opens the checkpoint of the bake of `range`, or begins one.
+    /// Opens the checkpoint of the bake of `range`, or creates one.
     pub(in crate::lightmap) fn open(
         params: &CheckpointParams,
         atlas: &'a Atlas,
@@ -164,7 +163,7 @@ impl<'a> Checkpoint<'a> {
         let size = file.metadata().map_err(fail)?.len();
         let mut done = HashMap::new();
         let whole = if size < head.len() as u64 && is_beginning_of(&mut file, &head).map_err(fail)? {
-            // New, or killed as it began.
+            // The file is new, or the process was killed as it wrote the head.
             file.seek(SeekFrom::Start(0)).and_then(|_| file.write_all(&head)).map_err(fail)?;
             head.len() as u64
         } else {
@@ -183,7 +182,7 @@ impl<'a> Checkpoint<'a> {
         })
     }
 
-    /// The radiance map of an earlier run, if it was completed. To be called on the device's threads.
+    /// Returns the radiance map of an earlier run, if it was completed. To be called on the device's threads.
     pub fn radiance(&self, atlas: &Atlas) -> Result<Option<Radiance>> {
         let Some(end) = self.take(RADIANCE_DONE, 0) else { return Ok(None) };
         let mut values: Vec<Vec3> = try_vec(atlas.radiance.len(), "the radiance map of a checkpoint")?;
@@ -213,7 +212,7 @@ impl<'a> Checkpoint<'a> {
         self.keep(RADIANCE_DONE, 0, &[&limit.to_ne_bytes(), &shadow_rays.to_ne_bytes()]);
     }
 
-    /// Per chart, whether its back is shown, of an earlier run.
+    /// Returns for each chart whether its back is shown, from an earlier run.
     pub fn backs(&self, charts: usize) -> Result<Option<Vec<bool>>> {
         let Some(content) = self.take(BACKS, 0) else { return Ok(None) };
         let fits = content.is_empty() || content.len() == charts;
@@ -224,13 +223,13 @@ impl<'a> Checkpoint<'a> {
         self.keep(BACKS, 0, &[bytemuck::cast_slice(backs)]);
     }
 
-    /// The light of `count` texels that gather for themselves, of an earlier run.
+    /// Returns the light of `count` fallback gathers from an earlier run.
     pub fn own_light(&self, count: usize) -> Result<Option<OwnLight>> {
         let Some(content) = self.take(OWN, 0) else { return Ok(None) };
         if content.len() != count * size_of::<Vec3>() {
             return Ok(None);
         }
-        // Those inside of solids are infinite.
+        // Texels inside solids are stored as infinite.
         let known = |v: Vec3| if v.x == f32::INFINITY { None } else { Some(v) };
         let values = content.chunks_exact(size_of::<Vec3>()).map(bytemuck::pod_read_unaligned::<Vec3>);
         let light = try_collect(values.map(known), "light of a checkpoint")?;
@@ -244,13 +243,13 @@ impl<'a> Checkpoint<'a> {
         }
     }
 
-    /// Fills in a block of the gather map (irradiance, variance and whether each texel is valid) if an earlier run has
-    /// done it; tells whether it has.
+    /// Fills in a block of the gather map (irradiance, variance and validity of each texel) if an earlier run has
+    /// finished it; returns whether it has.
     pub fn gathered(&self, block: usize, values: &mut [Vec3], variances: &mut [f32], valid: &mut [bool]) -> bool {
         let read = || {
             let content = self.take(GATHER, block as u64)?;
             let mut rest = &content[..];
-            // Few: those of a block.
+            // These vectors are small: they hold one block.
             let (mut light, mut spread) = (vec![Vec3::ZERO; values.len()], vec![0f32; values.len()]);
             take(&mut rest, &mut light)?;
             take(&mut rest, &mut spread)?;
@@ -269,8 +268,8 @@ impl<'a> Checkpoint<'a> {
         self.keep(GATHER, block as u64, &parts);
     }
 
-    /// Fills in a block of direct light and the state of its texels if an earlier run has done it; tells whether it
-    /// has.
+    /// Fills in a block of direct light and the state of its texels if an earlier run has finished it; returns whether
+    /// it has.
     pub(in crate::lightmap) fn lit(&self, block: usize, direct: &mut [Vec3], state: &mut [TexelState]) -> bool {
         let read = || {
             let content = self.take(DIRECT, block as u64)?;
@@ -303,7 +302,7 @@ impl<'a> Checkpoint<'a> {
             let mut pending = lock(&self.pending);
             let mut appended = records::append(&mut pending.bytes, tag, &all);
             if appended.is_err() && !pending.bytes.is_empty() {
-                // What is pending may be all that takes the room.
+                // The pending records may take most of the memory: they are written, and it is tried again.
                 let bytes = std::mem::take(&mut pending.bytes);
                 self.write(&bytes);
                 drop(bytes);
@@ -322,14 +321,14 @@ impl<'a> Checkpoint<'a> {
         self.write(&bytes);
     }
 
-    /// Writes what is pending.
+    /// Writes the pending records.
     pub fn flush(&self) {
         let bytes = std::mem::take(&mut lock(&self.pending).bytes);
         self.write(&bytes);
     }
 
-    /// Appends to the file. A bake does not fail because its checkpoint cannot be written: what the file holds stays
-    /// whole, and later records are tried again.
+    /// Appends to the file. A bake does not fail because its checkpoint cannot be written: records already in the file
+    /// stay valid, and later ones are still tried.
     fn write(&self, bytes: &[u8]) {
         if bytes.is_empty() {
             return;
@@ -337,7 +336,7 @@ impl<'a> Checkpoint<'a> {
         let mut output = lock(&self.file);
         let had_failed = output.failed;
         if let Err(e) = output.append(bytes) {
-            // At once, if it can be, for a process that is killed before the next write.
+            // The rest is cut off at once, if possible, in case the process is killed before the next write.
             let _ = output.cut();
             drop(output);
             if !had_failed {
@@ -346,7 +345,7 @@ impl<'a> Checkpoint<'a> {
         }
     }
 
-    /// A bake goes on although its checkpoint lacks something.
+    /// Logs that the checkpoint could not be written; the bake goes on.
     fn warn(&self, e: &dyn std::fmt::Display) {
         let message = format!("cannot write the checkpoint {}: {e}; the bake goes on", self.path.display());
         self.device.log(LogLevel::Warning, &message);
@@ -354,7 +353,7 @@ impl<'a> Checkpoint<'a> {
 }
 
 impl Drop for Checkpoint<'_> {
-    /// Whatever ends the bake: an error, a cancel or its completion.
+    /// Writes the pending records, whatever ends the bake: an error, a cancel or its completion.
     fn drop(&mut self) {
         self.flush();
     }
@@ -364,10 +363,10 @@ fn lock<T>(mutex: &Mutex<T>) -> MutexGuard<'_, T> {
     mutex.lock().unwrap_or_else(|e| e.into_inner())
 }
 
-/// Opens or creates the file for one bake alone.
+/// Opens or creates the file and locks it for one bake.
 fn open_locked(path: &Path) -> Result<File> {
     let fail = |e| Error::Io(format!("cannot use the checkpoint {}: {e}", path.display()));
-    // Asked first, so that opening does not wait for the other end of a FIFO.
+    // The kind of file is checked first, so that opening does not wait for the other end of a FIFO.
     if std::fs::metadata(path).is_ok_and(|m| !m.is_file()) {
         return Err(Error::Io(format!("cannot use the checkpoint {}: it is not a file", path.display())));
     }
@@ -381,14 +380,14 @@ fn open_locked(path: &Path) -> Result<File> {
     }
 }
 
-/// Whether the file has a part of `head`, and nothing else.
+/// Whether the file consists of the beginning of `head`, and nothing else.
 fn is_beginning_of(file: &mut File, head: &[u8]) -> std::io::Result<bool> {
     let mut bytes = Vec::new();
     file.take(head.len() as u64).read_to_end(&mut bytes)?;
     Ok(head.starts_with(&bytes))
 }
 
-/// Reads all whole records into `done`; returns where they end.
+/// Reads all whole records into `done`; returns the position of their end.
 fn read(
     file: &File,
     size: u64,
@@ -414,7 +413,7 @@ fn read(
             Next::End | Next::Torn => return Ok(records.whole),
             Next::Damaged(end) => {
                 let whole = records.whole;
-                // (Through the file itself, whose position nobody needs any more.)
+                // The position of the file may change, as it is not needed any more.
                 let mut file = file;
                 let torn = records::ends_in_zeros(&mut file, whole, end, size).map_err(fail)?;
                 return if torn { Ok(whole) } else { Err(damaged(path)) };

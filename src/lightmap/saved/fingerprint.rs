@@ -1,5 +1,5 @@
-//! The fingerprint of a bake: what baked light depends on. Files whose fingerprint differs are refused, with a sentence
-//! that says in what.
+//! The fingerprint of a bake: everything that baked light depends on. Files with another fingerprint are refused, with
+//! a sentence that names the differences.
 
 use crate::lightmap::BakeParams;
 use crate::lightmap::atlas::Atlas;
@@ -8,7 +8,7 @@ use crate::scene::{Light, MeshMaterials, Scene};
 use bytemuck::{Pod, Zeroable};
 use std::fmt::Debug;
 
-/// What the light of a bake depends on beside scene and layout, which a light map keeps for good.
+/// Parameters and lights of a bake. Light depends on these and on scene and layout, which never change in a light map.
 #[derive(Clone, Copy, Debug, PartialEq)]
 pub(in crate::lightmap) struct Origin {
     pub params: BakeParams,
@@ -17,30 +17,31 @@ pub(in crate::lightmap) struct Origin {
 }
 
 impl Origin {
-    /// Of a bake of whatever texels under the present `lights`.
+    /// Makes the origin of a bake under the present `lights`, whatever texels it bakes.
     pub fn new(params: &BakeParams, lights: &[Light]) -> Origin {
-        // Neither of these changes any bit of a texel.
+        // None of these parameters changes any bit of a texel.
         let params = BakeParams { texel_begin: 0, texel_end: 0, memory_budget: 0, ..*params };
         Origin { params, lights: text_sum(lights) }
     }
 }
 
-/// Of a whole bake. Part of the file format.
+/// Fingerprint of a whole bake. Part of the file format.
 #[derive(Clone, Copy, Debug, PartialEq, Pod, Zeroable)]
 #[repr(C)]
 pub(super) struct Fingerprint {
     version: [u8; 16],
-    /// Whether the ISA fuses multiplications and additions: those that do give the same bits, portable others.
+    /// Whether the ISA fuses multiplications and additions: all ISAs that do give the same bits, portable kernels give
+    /// others.
     is_fused: u32,
     reserved: u32,
-    /// Checksums.
+    /// Checksum of the geometry, followed by those of materials, lights and layout.
     geometry: u32,
     materials: u32,
     lights: u32,
     layout: u32,
     photon_count: u64,
     seed: u64,
-    /// Of checkpoints; a result may hold any.
+    /// First texel of the bake of a checkpoint; 0 in results, which may hold any texels.
     texel_begin: u64,
     texel_end: u64,
     max_bounces: u32,
@@ -52,9 +53,9 @@ pub(super) struct Fingerprint {
 }
 
 impl Fingerprint {
-    /// Of the bake of the texels in `range` ((0, 0): any).
+    /// Makes the fingerprint of the bake of a range of texels ((0, 0): any).
     pub fn new(atlas: &Atlas, origin: &Origin, [texel_begin, texel_end]: [u64; 2]) -> Fingerprint {
-        // All fields by name: what is added to the parameters must be compared here, too.
+        // All fields are named, since parameters that are added must be compared here, too.
         let BakeParams {
             photon_count,
             max_bounces,
@@ -93,7 +94,7 @@ impl Fingerprint {
         }
     }
 
-    /// The parameters that it tells of.
+    /// Returns the parameters of the bake.
     pub fn params(&self) -> BakeParams {
         BakeParams {
             photon_count: self.photon_count,
@@ -110,12 +111,13 @@ impl Fingerprint {
         }
     }
 
-    /// The origin of the light that it tells of.
+    /// Returns parameters and lights of the bake.
     pub fn origin(&self) -> Origin {
         Origin { params: self.params(), lights: self.lights }
     }
 
-    /// In what this one, of a file, differs from the one that is needed; `None` if in nothing.
+    /// Names the differences between this fingerprint, from a file, and the one that is needed; `None` if there are
+    /// none.
     pub fn difference(&self, needed: &Fingerprint) -> Option<String> {
         let mut all = Vec::new();
         let version = |f: &Fingerprint| String::from_utf8_lossy(&f.version).trim_end_matches('\0').to_owned();
@@ -152,7 +154,7 @@ impl Fingerprint {
     }
 }
 
-/// Checksum of what is few enough to be spelled out.
+/// Computes the checksum of values that are few enough to be written as text.
 fn text_sum(values: &(impl Debug + ?Sized)) -> u32 {
     crc32fast::hash(format!("{values:?}").as_bytes())
 }
@@ -172,7 +174,7 @@ fn geometry(scene: &Scene) -> u32 {
     sum.finalize()
 }
 
-/// Of materials, textures and the images of skies.
+/// Computes the checksum of materials, textures and the images of skies.
 fn materials(scene: &Scene) -> u32 {
     let mut sum = crc32fast::Hasher::new();
     sum.update(&text_sum(scene.materials()).to_ne_bytes());

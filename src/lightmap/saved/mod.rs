@@ -1,5 +1,5 @@
-//! Baked light on disk: results, which come back into a light map and may be parts of a bake that several machines
-//! share, and checkpoints, from which a bake goes on after its process has ended.
+//! Baked light on disk: results, which can be loaded into a light map and may be parts of a bake that several machines
+//! share, and checkpoints, from which a bake continues after its process has ended.
 //!
 //! | file | what it does |
 //! |---|---|
@@ -19,23 +19,23 @@ use crate::error::Error;
 use std::io;
 use std::path::Path;
 
-/// What a file with impossible content is refused with.
+/// Makes the error for a file with impossible content.
 fn damaged(path: &Path) -> Error {
     Error::Io(format!("{} is damaged: a checksum or a length in it does not fit", path.display()))
 }
 
-/// What a failed read ends with.
+/// Makes the error for a failed read.
 fn unreadable(path: &Path, e: io::Error) -> Error {
     let message = format!("cannot read {}: {e}", path.display());
     if e.kind() == io::ErrorKind::OutOfMemory { Error::OutOfMemory(message) } else { Error::Io(message) }
 }
 
-/// What a file of another bake is refused with.
+/// Makes the error for a file of another bake.
 fn foreign(path: &Path, differences: &str) -> Error {
     Error::InvalidArgument(format!("{} is of another bake; it differs in {differences}", path.display()))
 }
 
-/// What a file of another kind is refused with.
+/// Makes the error for a file of another kind.
 fn another_kind(path: &Path, kind: &str) -> Error {
     Error::Io(format!("{} is no {kind} of this version of the library", path.display()))
 }

@@ -9,24 +9,24 @@
 //! 20..    content
 //! ```
 //!
-//! A process that is killed while it appends leaves a file that ends within a record: a torn end. Where power fails, a
-//! file system may have kept the new length of the file but not the last blocks of its content, which then read as
-//! zeros: a torn end, too ([`ends_in_zeros`]). Any other change of a file shows in a checksum, that of a length in the
-//! header's own.
+//! A process that is killed while it appends leaves a file that ends within a record: a torn end. After a power
+//! failure, a file system may have kept the new length of the file but not the last blocks of its content, which then
+//! read as zeros: a torn end, too ([`ends_in_zeros`]). Any other change of a file is found by a checksum; changes of a
+//! length are found by that of the header.
 
 use super::{another_kind, damaged, unreadable};
 use crate::error::{Error, Result};
 use std::io::{self, ErrorKind, Read, Seek, SeekFrom};
 use std::path::Path;
 
-/// Begins every file; the last byte is the version of the format. Numbers are stored as the machine has them, so files
-/// of machines with the other order of bytes begin otherwise.
+/// Magic number at the start of every file; its last byte is the version of the format. Numbers are stored in the
+/// machine's byte order, so files of machines with the other byte order have another magic number.
 pub(super) const MAGIC: [u8; 8] = if cfg!(target_endian = "little") { *b"BKLIGHT1" } else { *b"1THGILKB" };
 
-/// Bytes before the content of a record.
+/// Number of bytes before the content of a record.
 const HEADER: usize = 20;
 
-/// File systems lose content in blocks of at least so many bytes.
+/// Minimum size in bytes of the blocks in which file systems lose content.
 const LEAST_BLOCK: u64 = 512;
 
 pub(super) type Tag = [u8; 4];
@@ -48,7 +48,7 @@ pub(super) fn append(out: &mut Vec<u8>, tag: Tag, parts: &[&[u8]]) -> Result<()>
     Ok(())
 }
 
-/// What comes next in a file.
+/// Result of reading the next record of a file.
 #[derive(Debug, PartialEq)]
 pub(super) enum Next {
     Record(Tag, Vec<u8>),
@@ -56,21 +56,21 @@ pub(super) enum Next {
     End,
     /// The file ends within a record.
     Torn,
-    /// A checksum does not fit, of the header or of a content that goes up to this position.
+    /// The checksum of the header or of the content does not fit. The header or the content ends at this position.
     Damaged(u64),
 }
 
 /// Reads records one by one.
 pub(super) struct Records<R> {
     from: R,
-    /// Bytes that the file still has.
+    /// Number of bytes of the file that are not read yet.
     left: u64,
-    /// Bytes up to the end of the last whole record.
+    /// Number of bytes up to the end of the last whole record.
     pub whole: u64,
 }
 
 impl<R: Read> Records<R> {
-    /// Of a file of `size` bytes whose magic number has been read.
+    /// Makes a reader of a file of `size` bytes whose magic number has been read.
     pub fn new(from: R, size: u64) -> Records<R> {
         let whole = MAGIC.len() as u64;
         Records { from, left: size.saturating_sub(whole), whole }
@@ -108,7 +108,7 @@ impl<R: Read> Records<R> {
 }
 
 /// Reads the magic number and the first record, which must be a `T` under `tag`: the beginning of a file of `size`
-/// bytes. `kind` is what messages call such a file.
+/// bytes. `kind` names such a file in messages.
 pub(super) fn begin<T: bytemuck::Pod, R: Read>(
     mut from: R,
     size: u64,

@@ -1,9 +1,9 @@
-//! Results: the light of all baked texels of a light map in a file, and back.
+//! Results: saving the light of all baked texels of a light map to a file, and loading it.
 //!
-//! A file holds records (`super::records`): `RSLT` with fingerprint and counts, `PLAN`, `BACK` (which sides are shown),
-//! `RADI` (the radiance map, in runs), `TEXL` (direct and indirect light and state of runs of texels), `DONE`. Light is
-//! kept as it was before seams were stitched: what loads the last texels stitches anew, so that light maps put
-//! together of several results have the bits of one bake.
+//! A file holds records (`super::records`): `RSLT` with fingerprint and counts, `PLAN`, `BACK` (the sides that are
+//! shown), `RADI` (the radiance map, in runs), `TEXL` (direct and indirect light and state of runs of texels), `DONE`.
+//! Light is saved as it was before seams were stitched. Loading the last texels stitches anew, so that light maps
+//! assembled from several results have the bits of one bake.
 
 use super::fingerprint::Fingerprint;
 use super::records::{self, MAGIC, Next, Records, Tag, take, take_one};
@@ -30,7 +30,7 @@ const RADIANCE: Tag = *b"RADI";
 const TEXELS: Tag = *b"TEXL";
 const DONE: Tag = *b"DONE";
 
-/// Texels of a record.
+/// Number of texels of a record.
 const RUN: usize = 1 << 14;
 
 /// The content of the first record.
@@ -40,9 +40,9 @@ struct Head {
     fingerprint: Fingerprint,
     /// Bits of [`left_out`](crate::lightmap::plan::left_out), before stitching.
     left_out: u64,
-    /// Texels of the radiance map; 0 if there is none.
+    /// Number of texels of the radiance map; 0 if there is none.
     radiance: u64,
-    /// Texels that follow.
+    /// Number of texels in the file.
     texels: u64,
 }
 
@@ -90,9 +90,9 @@ impl Lightmap {
         self.atlas.scene.device().run(progress, || files::prepare(path, write_file))?.finish()
     }
 
-    /// Takes over the light of a result that was saved of a light map of the same scene, lights and layout. What was
-    /// baked or loaded before stays where the file has no texels; it must be of a bake with the same parameters. A
-    /// file that is refused changes nothing.
+    /// Loads the light of a result that was saved from a light map of the same scene, lights and layout. Texels that
+    /// the file does not have keep the light that was baked or loaded before, which must be of a bake with the same
+    /// parameters. A file that is refused changes nothing.
     pub fn load_result(&mut self, path: &Path, progress: &Progress) -> Result<()> {
         let device = self.atlas.scene.device().clone();
         let (light, plan, stitch) = device.run(progress, || {
@@ -108,7 +108,7 @@ impl Lightmap {
         Ok(())
     }
 
-    /// The light that there is, not stitched, with that of a file.
+    /// Returns the present light, without stitching, merged with that of a file.
     fn merged(&self, path: &Path, progress: &Progress) -> Result<Light> {
         let mut file = Loading::open(path, self)?;
         let texels = self.atlas.map.len();
@@ -148,7 +148,7 @@ impl Lightmap {
     }
 }
 
-/// Runs of baked texels.
+/// Finds the runs of baked texels.
 fn runs(state: &[TexelState]) -> Result<Vec<Range<usize>>> {
     let mut runs: Vec<Range<usize>> = Vec::new();
     for i in (0..state.len()).filter(|&i| state[i] != TexelState::Unbaked) {
@@ -173,7 +173,7 @@ fn append_texels(light: &Light, run: Range<usize>, out: &mut Vec<u8>) -> Result<
     records::append(out, TEXELS, &parts)
 }
 
-/// Whether all are what light can be.
+/// Whether all values are possible for light.
 pub(super) fn is_light(values: &[Vec3]) -> bool {
     values.iter().all(|v| v.cmpge(Vec3::ZERO).all() && v.cmple(Vec3::splat(MOST_LIGHT)).all())
 }
@@ -194,7 +194,7 @@ impl<'a> Loading<'a> {
         let file = BufReader::with_capacity(1 << 16, file);
         let (records, head): (_, Head) = records::begin(file, size, HEAD, path, "result of a bake")?;
         let atlas = &lightmap.atlas;
-        // Whatever the parameters were, they are taken over: only scene, lights and layout must be those of here.
+        // Parameters are taken from the file: only scene, lights and layout must be those of this light map.
         let origin = super::fingerprint::Origin::new(&head.fingerprint.params(), &atlas.scene.lights());
         let needed = Fingerprint::new(atlas, &origin, [0; 2]);
         if let Some(differences) = head.fingerprint.difference(&needed) {
@@ -250,7 +250,7 @@ fn read_radiance(mut content: &[u8], all: usize, values: &mut Vec<Vec3>) -> Opti
     if first + count > all {
         return None;
     }
-    // There is room for all.
+    // The capacity suffices for all values, so this does not allocate.
     values.resize(first + count, Vec3::ZERO);
     take(&mut content, &mut values[first..])?;
     (content.is_empty() && is_light(&values[first..])).then_some(count)
