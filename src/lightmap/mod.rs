@@ -196,7 +196,8 @@ pub struct BakeStats {
     /// Difference of light between the two sides of stitched edges, before the stitching: root mean square relative to
     /// the mean irradiance there.
     pub seam_rms_before: f64,
-    /// The same relative difference after the stitching.
+    /// Difference of light between the two sides of stitched edges after the stitching, relative like
+    /// `seam_rms_before`.
     pub seam_rms_after: f64,
     /// Duration of finding and stitching seams, in seconds.
     pub seam_seconds: f64,
@@ -240,16 +241,16 @@ pub enum LayerData {
 /// State of a texel after bakes.
 #[derive(Clone, Copy, Debug, Default, PartialEq, Eq)]
 enum TexelState {
-    /// Not part of any bake yet.
+    /// The texel is not part of any bake yet.
     #[default]
     Unbaked,
-    /// Nobody can see it; it shows the light of the nearest one that can be seen.
+    /// Nobody can see the texel; it shows the light of the nearest one that can be seen.
     Hidden,
     Visible,
 }
 
 impl TexelState {
-    /// The state in files.
+    /// Returns the number of the state in files.
     fn to_byte(self) -> u8 {
         match self {
             TexelState::Unbaked => 0,

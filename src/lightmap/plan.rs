@@ -205,7 +205,7 @@ impl Plan {
         }
     }
 
-    /// Tells of bright patches of surfaces.
+    /// Adds a line on bright patches.
     pub(crate) fn note_bright(&mut self, bright: &Bright) {
         match bright.len() {
             0 if !self.runs(left_out::INDIRECT) => self.left_out |= left_out::BRIGHT_PATCHES,
@@ -220,7 +220,7 @@ impl Plan {
         }
     }
 
-    /// Tells of stitched edges.
+    /// Adds a line on stitched edges.
     pub(crate) fn run_seams(&mut self, edges: u64, unlike: u64) {
         let but = match unlike {
             0 => String::new(),
@@ -229,7 +229,7 @@ impl Plan {
         self.run(&format!("stitching of {edges} edges at which smooth surfaces are cut open{but}"));
     }
 
-    /// Tells why nothing was stitched.
+    /// Adds a line on why nothing was stitched.
     pub(crate) fn leave_out_seams(&mut self, why: &str) {
         self.leave_out(left_out::SEAMS, "stitching of seams", why);
     }
@@ -243,17 +243,17 @@ impl Plan {
         self.lines.push(format!("left out: {what} ({why})"));
     }
 
-    /// Whether a part runs.
+    /// Whether a part of the bake, given by its bit of [`left_out`], runs.
     pub(crate) fn runs(&self, bit: u32) -> bool {
         self.left_out & bit == 0
     }
 
-    /// A plan of which bits and [`text`](Self::text) are known.
+    /// Makes a plan from its bits and its [`text`](Self::text).
     pub(crate) fn from_text(left_out: u32, text: &str) -> Plan {
         Plan { left_out, lines: text.lines().map(str::to_owned).collect() }
     }
 
-    /// One line per part, for people.
+    /// Returns the plan as text, one line per part.
     pub fn text(&self) -> String {
         self.lines.join("\n") + "\n"
     }

@@ -65,8 +65,8 @@ impl Lightmap {
     }
 
     /// Returns one layer of one page, row-major from v = 0. The layers of light (combined, indirect, direct, radiance)
-    /// need a bake (`InvalidState` before); the others can be read at any time. In the layers of light, texels around charts
-    /// repeat the nearest covered texel, up to the padding.
+    /// need a bake (`InvalidState` before); the others can be read at any time. In the layers of light, texels around
+    /// charts repeat the nearest covered texel, up to the padding.
     pub fn read(&self, page: u32, layer: Layer) -> Result<LayerData> {
         if page >= self.atlas.info.page_count {
             return invalid_argument!("page is {page}, the light map has {}", self.atlas.info.page_count);

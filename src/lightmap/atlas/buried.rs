@@ -7,8 +7,8 @@
 //! map alike, unless another point of the texel itself can be seen. Bakes and live updates use the moved samples
 //! without further distinction.
 //!
-//! A texel is buried if, from the side that it shows, almost all rays end within about a texel, on the backs of one-sided
-//! surfaces, or on sides that no [open place](super::seen) sees, or most on such backs.
+//! A texel is buried if, on the side that it shows, almost all rays end within about a texel, on backs of one-sided
+//! surfaces, or on sides that cannot be seen from any [open place](super::seen), or if most of them end on such backs.
 
 use super::chart_map::ChartMap;
 use super::charts::Charts;
@@ -139,7 +139,7 @@ impl Search<'_> {
         buried.iter().for_each(|&s| is_buried[s as usize - samples.start] = true);
         buried.retain(|&s| {
             let (x, y) = map.position(s as usize);
-            // A texel surrounded by buried ones has no visible point.
+            // A texel surrounded by buried ones is taken to have no visible point.
             let is_at_border = (-1..=1).flat_map(|dy| (-1..=1).map(move |dx| (x + dx, y + dy))).any(|(x, y)| {
                 let neighbour = map.at(placement, x, y);
                 !samples.contains(&(neighbour as usize)) || !is_buried[neighbour as usize - samples.start]
@@ -193,7 +193,7 @@ enum Sight {
     Open,
     /// On the back of a one-sided surface.
     Back,
-    /// Within a texel, or on a side that no open place sees.
+    /// Within a texel, or on a side that cannot be seen from any open place.
     Covered,
 }
 

@@ -30,13 +30,13 @@ const MAX_PAGE_COVER: f64 = 2.0;
 /// A piece of surface with continuous texture coordinates.
 #[derive(Clone, Debug, PartialEq)]
 pub struct Chart {
-    /// Its triangles, as a range of [`Charts::triangles`].
+    /// Triangles of the chart, as a range of [`Charts::triangles`].
     pub triangles: Range<u32>,
-    /// Extent of its local coordinates, which start at (0, 0), in scene units.
+    /// Extent of the chart's local coordinates, which start at (0, 0), in scene units.
     pub size: [f32; 2],
     /// Surface area, in squared scene units.
     pub area: f32,
-    /// Whether its material is two-sided.
+    /// Whether the chart's material is two-sided.
     pub two_sided: bool,
     /// Placement in the light map by the caller's UVs, if any.
     pub given: Option<Given>,

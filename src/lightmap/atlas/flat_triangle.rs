@@ -1,7 +1,7 @@
 //! Triangles in texel coordinates: the texels that they touch, and the part of a texel that they cover.
 //!
-//! Geometry is computed in f64. Triangles that share an edge compute the same crossings with texel rows, so no centre falls
-//! between them.
+//! Geometry is computed in f64. Triangles that share an edge compute the same crossings with texel rows, so that no
+//! centre falls between them.
 
 use glam::DVec2;
 

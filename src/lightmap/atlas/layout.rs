@@ -78,8 +78,8 @@ pub struct Layout {
 }
 
 impl Layout {
-    /// Places `charts` at `density` texels per scene unit (finite, > 0) in as many pages of
-    /// `page_size` (1 to [`MAX_PAGE_SIZE`](super::charts::MAX_PAGE_SIZE)) as they need, with `padding` texels around each.
+    /// Packs `charts` at `density` texels per scene unit (finite, > 0) in as many pages of `page_size` (1 to
+    /// [`MAX_PAGE_SIZE`](super::charts::MAX_PAGE_SIZE)) as they need, with `padding` texels around each.
     ///
     /// If `honour_given`, the charts that the caller placed stay where they are, and the others go to further pages.
     /// The charts of `with_backs`, ascending, get a second placement for their backs. A chart too long for a page is

@@ -96,7 +96,7 @@ pub struct TexelMap {
     _memory: Vec<Reservation>,
 }
 
-/// A rectangle of texels and where its entries begin in the index.
+/// A rectangle of texels, and the start of its entries in the index.
 #[derive(Clone, Copy, Debug)]
 struct Window {
     x: u16,

@@ -5,7 +5,7 @@
 //! class, inside or outside a [narrow gap](super::narrow_gaps), and are not behind a [wall or
 //! crease](super::upsample_visibility). A texel that is not in a known narrow gap and has no valid gather texel around
 //! it outside gaps, as on a narrow face of a moulding, gets a fallback gather: it traces a few rays itself, and the
-//! result is blurred among such texels.
+//! result is averaged with those of such texels nearby.
 //!
 //! Measured: docs/experiments.md#fallback-gather.
 
@@ -205,7 +205,7 @@ impl Upsampling {
         let (mut sum, mut total) = (Vec3::ZERO, 0.0);
         for (dx, dy) in (-RADIUS..=RADIUS).flat_map(|dy| (-RADIUS..=RADIUS).map(move |dx| (dx, dy))) {
             let s = atlas.map.at(placement, x + dx, y + dy);
-            // Among given charts there may be another one, which other shards bake.
+            // The window of given charts may contain another chart, which other shards bake.
             if s == NONE || !of_placement.contains(&(s as usize)) || !self.is_alone.has(s as usize) {
                 continue;
             }
