@@ -3,7 +3,7 @@
 //! The light behind a picture frame, below a skirting board or between a carpet and the floor is not that of the wall
 //! and the floor beside it, and a gather texel there may be as wide as the gap is deep. Plain interpolation makes dark
 //! rims around objects that stand on a surface or hang before it, and makes gaps too bright.
-//! [Upsampling](super::upsample) does not interpolate between texels inside and outside of narrow gaps.
+//! [Upsampling](super::upsample) keeps texels inside and outside of narrow gaps apart.
 //!
 //! Measured, with alternatives that were tried: docs/experiments.md#narrow-gaps.
 

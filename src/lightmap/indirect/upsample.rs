@@ -1,9 +1,10 @@
 //! Interpolates the light map's indirect light from the coarser gather map: joint bilateral upsampling (Kopf, Cohen,
 //! Lischinski and Uyttendaele, 2007).
 //!
-//! A texel of the light map interpolates only between those of the surrounding gather texels that are in the same
-//! class, inside or outside a [narrow gap](super::narrow_gaps), and are not behind a [wall or
-//! crease](super::upsample_visibility). A texel that is not in a known narrow gap and has no valid gather texel around
+//! A texel of the light map interpolates between those of the surrounding gather texels that are in the same class,
+//! inside or outside a [narrow gap](super::narrow_gaps), and are not behind a [wall or
+//! crease](super::upsample_visibility); if there are none, the class does not matter, and if all are behind walls or
+//! creases, these do not matter either. A texel that is not in a known narrow gap and has no valid gather texel around
 //! it outside gaps, as on a narrow face of a moulding, gets a fallback gather: it traces a few rays itself, and the
 //! result is averaged with those of such texels nearby.
 //!
