@@ -10,11 +10,11 @@ use rayon::prelude::*;
 pub struct BinaryNode {
     /// Lower corner of the node's box.
     pub lower: Vec3,
-    /// Inner: number of the right child. Leaf: first triangle slot.
+    /// Index of the right child of an inner node; first triangle slot of a leaf.
     pub index: u32,
     /// Upper corner of the node's box.
     pub upper: Vec3,
-    /// Triangles of a leaf; 0 in an inner node.
+    /// Number of triangles of a leaf; 0 in an inner node.
     pub count: u32,
 }
 
@@ -27,8 +27,8 @@ pub struct BinaryBvh {
 }
 
 impl BinaryBvh {
-    /// Surface area heuristic: expected cost of a random ray through the root's box, traversal
-    /// step and intersection costing 1 each.
+    /// Surface area heuristic: expected cost of a random ray through the root's box; a traversal step and an
+    /// intersection cost 1 each.
     pub fn sah_cost(&self) -> f32 {
         let root = &self.nodes[0];
         let root_area = half_area(root.lower, root.upper);

@@ -1,9 +1,9 @@
 //! Binary BVH by binned surface area heuristic (thesis 3.1.1; Wald, *On fast Construction of
 //! SAH-based Bounding Volume Hierarchies*, 2007), parallel and deterministic.
 //!
-//! A subtree over n triangles owns a fixed range of 2n − 1 node slots and of n triangle slots, so
-//! threads never share anything. References move between two buffers by a stable partition, which
-//! several threads can share; so the tree does not depend on their number.
+//! A subtree over n triangles owns a fixed range of 2n − 1 node slots and of n triangle slots, so threads never share
+//! any of them. References move between two buffers by a stable partition, which several threads can carry out
+//! together; so the tree does not depend on their number.
 
 use super::BuildOptions;
 use super::binary::{BinaryBvh, BinaryNode};
@@ -20,8 +20,8 @@ use rayon::prelude::*;
 /// Subtrees of more triangles than this are built as separate tasks.
 pub(super) const PARALLEL_SUBTREE: usize = 4096;
 
-/// Copies `from` to `to`: first those left of a split, `middle` in number, then the others, both in
-/// their old order. Gives the bounds of the centres of both sides.
+/// Copies `from` to `to`: first the references left of a split, `middle` in number, then the others, both in their old
+/// order. Returns the bounds of the centres of both sides.
 fn partition(from: &[Reference], to: &mut [Reference], middle: usize, map: &BinMap, split: &Split) -> [Range4; 2] {
     let (left, right) = to.split_at_mut(middle);
     if !in_parallel(from.len()) {
@@ -55,8 +55,8 @@ fn partition_chunk(
     let side = map.side(split);
     let [mut low, mut high] = [Range4::EMPTY; 2];
     let (mut l, mut r, mut i) = (0, 0, 0);
-    // Without branches on the side: every reference is written to both, and the wrong copy is
-    // overwritten by the next.
+    // Without branches on the side: every reference is written to both sides, and the wrong copy is overwritten by the
+    // next.
     while l < left.len() && r < right.len() {
         let reference = &from[i];
         let mask = Vec4::splat(side.bin(reference)).cmplt(Vec4::splat(side.first_right));
@@ -81,16 +81,16 @@ fn partition_chunk(
 
 /// The slots of a subtree.
 struct Slots<'a> {
-    /// 2n − 1 nodes, the first is number `base`.
+    /// 2n − 1 nodes, the first of which has index `base`.
     nodes: &'a mut [BinaryNode],
     base: u32,
-    /// n triangles, the first is number `first`.
+    /// n triangles, the first of which has index `first`.
     triangles: &'a mut [u32],
     first: u32,
 }
 
 impl<'a> Slots<'a> {
-    /// The slots of the children, the left one over `n` triangles.
+    /// Divides the slots among a node and its children, the left one over `n` triangles.
     fn split(self, n: usize) -> (&'a mut BinaryNode, Slots<'a>, Slots<'a>) {
         let (node, rest) = self.nodes.split_first_mut().expect("a subtree has a node");
         let (left, right) = rest.split_at_mut(2 * n - 1);
@@ -122,7 +122,7 @@ struct Builder<'a, 'p> {
 }
 
 impl Builder<'_, '_> {
-    /// Builds the subtree over `refs`; `other` is as long and holds nothing.
+    /// Builds the subtree over `refs`; `other` is a buffer of the same length.
     fn build(
         &self,
         refs: &mut [Reference],
@@ -157,13 +157,13 @@ impl Builder<'_, '_> {
         if may_be_leaf {
             return slots.leaf(refs, &extent.boxes);
         }
-        // All centres equal, or too deep.
+        // All centres are equal, or the node is too deep.
         let middle = halve(refs, &extent);
         let extents = [Extent::of(&refs[..middle]), Extent::of(&refs[middle..])];
         self.children(refs, other, slots, extent, extents, middle, depth, bins);
     }
 
-    /// Builds the subtree over two to four triangles by trying every way to part them.
+    /// Builds the subtree over two to four triangles by trying every partition.
     fn few(
         &self,
         refs: &mut [Reference],
@@ -179,7 +179,7 @@ impl Builder<'_, '_> {
             return slots.leaf(refs, &extent.boxes);
         }
         let middle = part_few(refs, parting);
-        // Nothing looks at the centres of so few, unless too deep.
+        // The centres of so few are not needed, unless the node is too deep.
         let extents = [&refs[..middle], &refs[middle..]].map(|refs| {
             let boxes = refs.iter().fold(Box4::EMPTY, |b, r| b.join(r.0));
             Extent { boxes, centres: extent.centres }

@@ -11,7 +11,7 @@ const PARALLEL_RANGE: usize = 1 << 15;
 
 const MAX_BINS: usize = 256;
 
-/// Whether to share the work on a range among threads. The results are the same.
+/// Whether the work on a range is shared among threads. The results are the same.
 pub(super) fn in_parallel(n: usize) -> bool {
     n > PARALLEL_RANGE && rayon::current_num_threads() > 1
 }
@@ -34,8 +34,7 @@ impl BinMap {
         BinMap { origin: centres.lower, scale, last: Vec4::splat(bins as f32 - 1.0), bins }
     }
 
-    /// The bins as floats: any monotonic rounding will do, so the nearest is taken, which is one
-    /// addition.
+    /// Bins of a reference as floats: any monotonic rounding will do, so it rounds to nearest, which is one addition.
     #[inline(always)]
     pub(super) fn bin(&self, r: &Reference) -> Vec4 {
         let b = (r.centre() - self.origin) * self.scale - Vec4::splat(0.5);
@@ -48,7 +47,7 @@ impl BinMap {
         Side { axis, origin: self.origin[axis], scale: self.scale[axis], first_right }
     }
 
-    /// The bins as numbers.
+    /// Bins of a reference as integers.
     #[inline(always)]
     pub(super) fn indices(&self, r: &Reference) -> [usize; 3] {
         let b = self.bin(r);
@@ -56,7 +55,7 @@ impl BinMap {
     }
 }
 
-/// Tells the sides of a split by the same arithmetic as [`BinMap::bin`].
+/// Determines the sides of a split by the same arithmetic as [`BinMap::bin`].
 pub(super) struct Side {
     pub(super) axis: usize,
     pub(super) origin: f32,
@@ -81,7 +80,7 @@ impl Side {
 #[derive(Clone, Copy)]
 struct Bin {
     boxes: [Box4; 3],
-    /// Signed, because that converts to floats in one instruction; the last is unused.
+    /// Signed, because these convert to floats in one instruction; the last is unused.
     counts: [i32; 4],
 }
 
@@ -98,8 +97,8 @@ impl Bin {
         }
     }
 
-    /// Areas times counts per axis, with extents scaled; infinite where there is nothing. (Counted in
-    /// fours, as they are tested, random rays are no faster.)
+    /// Areas times counts per axis, with extents scaled; infinite for empty bins. (Counted in fours, as they are
+    /// tested, random rays are no faster.)
     #[inline(always)]
     fn cost(&self, scale: Vec4) -> Vec4 {
         let n = Vec4::from_array(self.counts.map(|n| n as f32));
@@ -118,19 +117,19 @@ pub(super) struct Split {
     pub(super) bin: usize,
 }
 
-/// An array of copies of `value`, which is never on the stack.
+/// Allocates an array of copies of `value` without putting it on the stack.
 pub(super) fn on_heap<T: Copy, const N: usize>(value: T) -> Box<[T; N]> {
     vec![value; N].try_into().unwrap_or_else(|_| unreachable!("the vector has N elements"))
 }
 
-/// The bins of a node, and scratch space for the costs of what lies right of each.
+/// The bins of a node, and scratch space for the costs of the parts to the right of each.
 ///
 /// Both are on the heap from the start: builds recurse, and a frame that holds them even for a moment holds
 /// them on every level.
 pub(super) struct Bins {
     bins: Box<[Bin; MAX_BINS]>,
     right: Box<[Vec4; MAX_BINS]>,
-    /// Only minima and maxima depend on it, which are the same bits either way.
+    /// Affects only how minima and maxima are computed, which have the same bits either way.
     #[cfg(target_arch = "x86_64")]
     has_avx: bool,
 }
@@ -181,8 +180,8 @@ impl Bins {
         }
     }
 
-    /// The same with boxes in one register each. (Even and odd references into two sets of bins, so
-    /// that they do not wait for each other's stores: 0 to 3 %, not kept.)
+    /// Adds references with boxes in one register each. (Even and odd references into two sets of bins, so that they do
+    /// not wait for each other's stores: 0 to 3 %, not kept.)
     #[cfg(target_arch = "x86_64")]
     #[target_feature(enable = "avx")]
     fn add_avx(&mut self, refs: &[Reference], map: &BinMap) {
@@ -222,7 +221,7 @@ impl Bins {
         (best[axis] < f32::INFINITY).then(|| Split { cost: best[axis], axis, bin: best_bin[axis] as usize })
     }
 
-    /// Triangles left of a split, and the boxes of both sides.
+    /// Number of triangles left of a split, and the boxes of both sides.
     pub(super) fn sides(&self, map: &BinMap, split: &Split) -> (usize, [Box4; 2]) {
         let join = |bins: &[Bin]| bins.iter().fold(Box4::EMPTY, |b, bin| b.join(bin.boxes[split.axis]));
         let (left, right) = self.bins[..map.bins].split_at(split.bin);
@@ -231,9 +230,9 @@ impl Bins {
     }
 }
 
-/// Few triangles do not fill many bins; fewer bins find the same splits sooner. (2n bins: longer for
-/// the same cost; n / 20 + 4: a tenth faster, cost up to 0.6 % higher. How many bins there are at
-/// most hardly matters then: 16 to 64 take the same time within 5 %.)
+/// Number of bins for a node of `n` triangles. Few triangles do not fill many bins; fewer bins find the same splits
+/// sooner. (2n bins: longer for the same cost; n / 20 + 4: a tenth faster, cost up to 0.6 % higher. How many bins there
+/// are at most hardly matters then: 16 to 64 take the same time within 5 %.)
 pub(super) fn bin_count(most: usize, n: usize) -> usize {
     most.min(n / 4 + 6)
 }

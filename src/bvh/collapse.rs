@@ -13,11 +13,10 @@ use crate::progress::Progress;
 use glam::Vec3;
 use rayon::prelude::*;
 
-/// Boxes grow by this part of their coordinates, which pays for the rounding of planes in the box test of
-/// the kernels.
+/// Fraction of their coordinates by which boxes grow, to cover the rounding of planes in the box test of the kernels.
 const OUTWARDS: f32 = 2.0 * f32::EPSILON;
 
-/// The box of a child, from that around its triangles.
+/// Box of a child: the box around its triangles, moved outwards.
 #[inline(always)]
 pub(crate) fn outwards(lower: Vec3, upper: Vec3) -> (Vec3, Vec3) {
     (lower - OUTWARDS * lower.abs(), upper + OUTWARDS * upper.abs())
@@ -25,7 +24,7 @@ pub(crate) fn outwards(lower: Vec3, upper: Vec3) -> (Vec3, Vec3) {
 
 /// Sets the box of child `i`, moved outwards; an empty one is hit by no ray.
 pub(super) fn set_box(node: &mut Node, i: usize, b: &Box4) {
-    // From infinities it would make NaN.
+    // Infinities would give NaN.
     if b.is_empty() {
         for axis in 0..3 {
             (node.lower[axis][i], node.upper[axis][i]) = (f32::INFINITY, f32::NEG_INFINITY);
@@ -39,21 +38,21 @@ pub(super) fn set_box(node: &mut Node, i: usize, b: &Box4) {
     }
 }
 
-/// The binary nodes that an 8-wide node has as children.
+/// The binary nodes that become the children of an 8-wide node.
 #[derive(Clone, Copy)]
 struct Plan {
     children: [u32; WIDTH],
     count: u32,
-    /// Number of the node of the first inner child, and slot of the first triangle of the first leaf;
-    /// those of the others follow.
+    /// Index of the node of the first inner child, and slot of the first triangle of the first leaf; those of the
+    /// others follow.
     first_node: u32,
     first_slot: u32,
 }
 
-/// The plans of all 8-wide nodes, and their numbers in the order of their leaves.
+/// Computes the plans of all 8-wide nodes, and the indices of these plans in the order of their leaves.
 ///
-/// Nodes are in depth-first order: the inner children of a node follow each other, then comes what lies below
-/// the first, below the second, and so on; leaves likewise (`refit` relies on it).
+/// Nodes are in depth-first order: the inner children of a node follow each other, then come the nodes below the first
+/// of them, those below the second, and so on; leaves likewise (`refit` relies on it).
 fn plans(binary: &BinaryBvh, progress: &Progress) -> Result<(Vec<Plan>, Vec<u32>)> {
     let n = binary.triangles.len();
     let idle = Plan { children: [0; WIDTH], count: 0, first_node: 0, first_slot: 0 };
@@ -79,7 +78,7 @@ fn plans(binary: &BinaryBvh, progress: &Progress) -> Result<(Vec<Plan>, Vec<u32>
                 triangles => slot += triangles,
             }
         }
-        // The first child's subtree comes next.
+        // The first child's subtree is next.
         let end = work.len();
         work[end - (plans.len() - first)..].reverse();
     }
@@ -88,7 +87,7 @@ fn plans(binary: &BinaryBvh, progress: &Progress) -> Result<(Vec<Plan>, Vec<u32>
 
 const PLANS: &str = "the plan of the tree";
 
-/// The same tree with compact nodes and leaves; `meshes` as in [`Compact::new`].
+/// Collapses a binary tree to one of compact nodes and leaves; `meshes` as in [`Compact::new`].
 pub(super) fn collapse_compact(binary: &BinaryBvh, meshes: &[u32], progress: &Progress) -> Result<Compact> {
     let root = &binary.nodes[0];
     let (plans, order) = plans(binary, progress)?;
@@ -105,11 +104,11 @@ pub(super) fn collapse_compact(binary: &BinaryBvh, meshes: &[u32], progress: &Pr
     Compact::new(nodes, triangles, (root.lower, root.upper), meshes)
 }
 
-/// The 8-wide tree of a binary one.
+/// Collapses a binary tree to an 8-wide one.
 pub(super) fn collapse(binary: &BinaryBvh, corners: &[[Vec3; 3]], progress: &Progress) -> Result<Mbvh> {
     let n = binary.triangles.len();
     let root = &binary.nodes[0];
-    // Which binary nodes become children is quickly told; to fill in nodes and leaves takes the time.
+    // Choosing the binary nodes that become children is quick; filling in nodes and leaves takes the time.
     let (plans, order) = plans(binary, progress)?;
     let nodes = try_par_collect(plans.par_iter().with_min_len(1024).map(|plan| node(binary, plan)), "the tree")?;
     progress.check()?;
@@ -137,7 +136,7 @@ pub(super) fn collapse(binary: &BinaryBvh, corners: &[[Vec3; 3]], progress: &Pro
     Ok(Mbvh { nodes, leaves, bounds: (root.lower, root.upper) })
 }
 
-/// Nodes whose leaves a thread fills at a time.
+/// Number of nodes whose leaves a thread fills at a time.
 const NODES_PER_JOB: usize = 1024;
 
 impl Plan {
@@ -164,7 +163,7 @@ fn node(binary: &BinaryBvh, plan: &Plan) -> Node {
     node
 }
 
-/// Descendants of `source` that cover it, up to eight, and how many.
+/// Finds up to eight descendants of `source` that cover it; returns them and their number.
 fn open(binary: &BinaryBvh, source: u32) -> ([u32; WIDTH], usize) {
     // A leaf is never opened. Its area counts as negative.
     let area = |node: u32| if binary.nodes[node as usize].count == 0 { binary.half_area(node) } else { -1.0 };

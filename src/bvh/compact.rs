@@ -1,9 +1,9 @@
-//! The tree in little memory (Ylitie, Karras and Laine, *Efficient Incoherent Ray Traversal on GPUs Through
-//! Compressed Wide BVHs*, 2017): boxes of children in bytes on a grid over the node's own box, their order
-//! told by their place in the node, and leaves that hold numbers of triangles, whose corners are the meshes'.
+//! The compact tree (Ylitie, Karras and Laine, *Efficient Incoherent Ray Traversal on GPUs Through Compressed Wide
+//! BVHs*, 2017): boxes of children are quantised to bytes on a grid over the node's own box, their order follows from
+//! their slot in the node, and leaves hold triangle numbers, whose corners are read from the meshes.
 //!
-//! Other than there, grids start at a float and boxes are decoded to floats, which contain those of
-//! [`Node`]: so the box test is that of whole nodes, with all that makes it conservative.
+//! Unlike in the paper, grids start at a float and boxes are decoded to floats, and these boxes contain those of
+//! [`Node`]: so the box test is that of full nodes and as conservative.
 
 use super::layout::{ChildRef, Node, WIDTH};
 use crate::base::geometry::half_area;
@@ -29,8 +29,8 @@ use rayon::prelude::*;
 /// Child i lies towards the corner of the node that bits 0 to 2 of i name (bit a: the greater end of axis
 /// a). Rays of octant o visit children in the order of i xor o.
 ///
-/// Missing children have minima 255, maxima 0. A ray from very far may take that for a box, so they name a
-/// leaf of the node, which can be visited twice: only nodes that have no inner child lack any.
+/// Missing children have minima 255, maxima 0. A ray from very far may take that for a box, so they refer to a leaf of
+/// the node, which can be visited twice: only nodes that have no inner child lack any.
 #[derive(Clone, Copy, Debug, Pod, Zeroable)]
 #[repr(C, align(16))]
 pub(crate) struct CompactNode {
@@ -46,7 +46,7 @@ pub(crate) struct CompactNode {
 
 const LEAF: u8 = 1 << 7;
 
-/// [`Node::order`] of all nodes.
+/// The [`Node::order`] of all compact nodes.
 pub(crate) static ORDER: [u32; WIDTH] = {
     let mut order = [0; WIDTH];
     let mut place = 0;
@@ -61,22 +61,22 @@ pub(crate) static ORDER: [u32; WIDTH] = {
     order
 };
 
-/// A number of a triangle in [`Compact::triangles`].
+/// Mask of the triangle number in an entry of [`Compact::triangles`].
 pub(crate) const NUMBER: u32 = (1 << 28) - 1;
 
-/// The triangle is the last of its leaf.
+/// Flag: the triangle is the last of its leaf.
 pub(crate) const LAST: u32 = 1 << 31;
 
-/// The triangle is degenerate or not finite since a refit: not to be hit.
+/// Flag: the triangle is degenerate or not finite since a refit and cannot be hit.
 pub(crate) const GONE: u32 = 1 << 30;
 
 impl CompactNode {
-    /// From a whole node, with the first node and the first slot below it.
+    /// Makes a node from a full one, with the first node and the first slot below it.
     pub(super) fn new(node: &Node, first_node: u32, first_slot: u32) -> CompactNode {
         let mut compact = CompactNode::zeroed();
         (compact.first_node, compact.first_leaf) = (first_node, ChildRef::leaf(first_slot as usize, 1).bits());
         let places = places(node);
-        // Boxes where they belong.
+        // Children are moved to their slots.
         let mut placed = Node::EMPTY;
         for (child, &place) in places.iter().enumerate() {
             let reference = node.children[child];
@@ -103,7 +103,7 @@ impl CompactNode {
         compact
     }
 
-    /// Sets the boxes of the children, in the order of this node, to such as contain those of `node`.
+    /// Sets the boxes of the children, in the order of this node, so that they contain those of `node`.
     pub(super) fn set_boxes(&mut self, node: &Node) {
         for axis in 0..3 {
             let (lower, upper) = (&node.lower[axis], &node.upper[axis]);
@@ -124,7 +124,7 @@ impl CompactNode {
             }
             for i in (0..WIDTH).filter(|&i| lower[i] <= upper[i]) {
                 let cells = |x: f32| (f64::from(x) - f64::from(least)) / f64::from(self.cell(axis));
-                // Decoding rounds, perhaps the wrong way. 0 is `least` itself, and 255 is `most` or more.
+                // Decoding rounds, possibly inwards. 0 is `least` itself, and 255 is `most` or more.
                 let mut below = cells(lower[i]) as u8;
                 while decode(self, below) > lower[i] {
                     below -= 1;
@@ -138,17 +138,17 @@ impl CompactNode {
         }
     }
 
-    /// Edge of a cell of the grid.
+    /// Edge length of a cell of the grid.
     #[inline(always)]
     pub(crate) fn cell(&self, axis: usize) -> f32 {
         f32::from_bits((self.exponents[axis] as u32) << 23)
     }
 
-    /// References to the children; of leaves all say that they hold one triangle.
+    /// References to the children; every leaf's reference says that it holds one triangle.
     #[inline(always)]
     pub(crate) fn names(&self) -> [u32; WIDTH] {
         let mut names = [0; WIDTH];
-        // (A loop: `map` was not made vectors of.)
+        // (A loop: `map` was not vectorised.)
         for i in 0..WIDTH {
             let child = self.children[i] as u32;
             let first = if child & LEAF as u32 != 0 { self.first_leaf } else { self.first_node };
@@ -162,17 +162,17 @@ impl CompactNode {
         (0..WIDTH).filter(move |i| present >> i & 1 == 1).map(move |i| (i, ChildRef::from_bits(names[i])))
     }
 
-    /// The leaves, by their places.
+    /// The leaves, with their slots in the node.
     pub(super) fn leaves(&self) -> impl Iterator<Item = (usize, ChildRef)> + use<> {
         self.children().filter(|(_, c)| c.is_leaf())
     }
 
-    /// The inner children, by their places.
+    /// The inner children, with their slots in the node.
     pub(super) fn inner(&self) -> impl Iterator<Item = (usize, ChildRef)> + use<> {
         self.children().filter(|(_, c)| !c.is_leaf())
     }
 
-    /// Lower and upper corner of the box of child `i` as rays see it.
+    /// Lower and upper corner of the box of child `i` as rays test it.
     fn decoded(&self, i: usize) -> [Vec3; 2] {
         [&self.lower, &self.upper].map(|rows| {
             Vec3::from_array([0, 1, 2].map(|axis| self.origin[axis] + rows[axis][i] as f32 * self.cell(axis)))
@@ -180,8 +180,8 @@ impl CompactNode {
     }
 }
 
-/// Where each child of a node goes: where its centre lies farthest towards the corner that the place stands
-/// for, the clearest cases first.
+/// Slot of each child of a node: the one towards whose corner its centre lies farthest; the clearest cases are assigned
+/// first.
 fn places(node: &Node) -> [usize; WIDTH] {
     let is_there = |i: usize| node.lower[0][i] <= node.upper[0][i];
     let centre = |i: usize| Vec3::from_array([0, 1, 2].map(|a| 0.5 * node.lower[a][i] + 0.5 * node.upper[a][i]));
@@ -200,7 +200,7 @@ fn places(node: &Node) -> [usize; WIDTH] {
     });
     let mut places = [WIDTH; WIDTH];
     let mut is_taken = [false; WIDTH];
-    // Children that are there first, so that missing ones get what is left.
+    // Existing children come first, so that missing ones get the remaining slots.
     for wanted in [true, false] {
         for _ in (0..WIDTH).filter(|&i| is_there(i) == wanted) {
             let mut best = (f32::NEG_INFINITY, 0, 0);
@@ -217,16 +217,17 @@ fn places(node: &Node) -> [usize; WIDTH] {
     places
 }
 
-/// Numbers that may be read behind the last leaf.
+/// Number of entries that may be read behind the last leaf.
 pub(super) const PAD: usize = WIDTH - 1;
 
-/// Triangles whose mesh is looked up together: see [`Compact::mesh_range`].
+/// Number of triangles whose mesh is looked up together: see [`Compact::mesh_range`].
 const BLOCK: u32 = 1 << 8;
 
 /// The tree of [`CompactNode`]s. Node 0 is the root.
 pub(crate) struct Compact {
     pub(super) nodes: Vec<CompactNode>,
-    /// Global triangle numbers, leaf by leaf, with [`LAST`] and [`GONE`]; [`PAD`] more behind them.
+    /// Global triangle numbers, leaf by leaf, with the flags [`LAST`] and [`GONE`]; [`PAD`] more entries follow the
+    /// last leaf.
     pub(super) triangles: Vec<u32>,
     pub(super) bounds: (Vec3, Vec3),
     /// The mesh of every 256th triangle.
@@ -234,7 +235,7 @@ pub(crate) struct Compact {
 }
 
 impl Compact {
-    /// A copy for which memory may be lacking.
+    /// Copies the tree; fails if there is not enough memory.
     pub(super) fn try_clone(&self) -> Result<Compact> {
         let what = "a copy of the tree";
         Ok(Compact {
@@ -274,7 +275,7 @@ impl Compact {
         self.node_bytes() + size_of_val(&self.triangles[..]) + size_of_val(&self.blocks[..])
     }
 
-    /// First and last mesh that a triangle may be of.
+    /// First and last mesh that may contain a triangle.
     ///
     /// # Safety
     /// The triangle must be one of the scene.
@@ -309,7 +310,7 @@ impl Compact {
         unsafe { self.triangles.as_ptr().add(leaf.leaf_slot()) }
     }
 
-    /// Address of what a reference names.
+    /// Address of the node or leaf of a reference.
     #[inline(always)]
     pub(crate) fn address(&self, child: ChildRef) -> *const u8 {
         if child.is_leaf() {
@@ -319,14 +320,14 @@ impl Compact {
         }
     }
 
-    /// The numbers of a leaf.
+    /// The triangle numbers of a leaf.
     pub(super) fn leaf_triangles(&self, leaf: ChildRef) -> &[u32] {
         let all = &self.triangles[leaf.leaf_slot()..];
         let last = all.iter().position(|t| t & LAST != 0).expect("every leaf ends");
         &all[..=last]
     }
 
-    /// See [`super::Mbvh::sah_cost`]; here of the decoded boxes, which are larger.
+    /// Cost as [`super::Mbvh::sah_cost`]; here of the decoded boxes, which are larger.
     pub(crate) fn sah_cost(&self) -> f32 {
         let cost = |node: &CompactNode| -> f64 {
             let child = |(i, c): (usize, ChildRef)| {

@@ -1,6 +1,6 @@
-//! Refit of the compact tree: what [`refit`](super::refit) does to whole nodes. Numbers of triangles that no
-//! ray can hit are marked, boxes computed anew from the leaves up, level by level; which child has which
-//! place in its node stays.
+//! Refit of the compact tree, as [`refit`](super::refit) does it for full nodes. Numbers of triangles that no ray can
+//! hit are marked, and boxes computed anew from the leaves up, level by level; children keep their slots in their
+//! nodes.
 //!
 //! Threads share a level; the result does not depend on their number.
 
@@ -14,18 +14,18 @@ use crate::memory::{try_filled, try_with_capacity};
 use glam::Vec3;
 use rayon::prelude::*;
 
-/// Nodes and triangles that a thread takes at a time.
+/// Number of nodes or triangles that a thread takes at a time.
 const CHUNK: usize = 256;
 
-/// Working memory.
+/// Working memory of a refit.
 pub(crate) struct Room {
     /// The box of each node.
     boxes: Vec<Box4>,
-    /// The numbers of the nodes in order of their distance from the root, and where each distance begins, with the
-    /// number of nodes at the end.
+    /// The nodes in order of their distance from the root, and the start of each distance, with the number of nodes at
+    /// the end.
     order: Vec<u32>,
     levels: Vec<usize>,
-    /// As large as the largest level.
+    /// Buffer as large as the largest level.
     done: Vec<(CompactNode, Box4)>,
 }
 
@@ -50,7 +50,7 @@ impl Room {
     }
 }
 
-/// See [`super::refit::refit`].
+/// Refits the tree as [`super::refit::refit`] does.
 pub(super) fn refit(tree: &mut Compact, corners: &(impl Fn(u32) -> [Vec3; 3] + Sync), room: Room) {
     let end = tree.triangles.len() - PAD;
     tree.triangles[..end].par_iter_mut().with_min_len(CHUNK).for_each(|t| {
@@ -67,7 +67,7 @@ pub(super) fn refit(tree: &mut Compact, corners: &(impl Fn(u32) -> [Vec3; 3] + S
     tree.bounds = boxes[0].corners();
 }
 
-/// A node with new boxes, and the box around them; `boxes` are those of the nodes below.
+/// Computes a node with new boxes, and the box around them; `boxes` are those of the nodes below.
 fn refit_node(
     tree: &Compact,
     number: usize,

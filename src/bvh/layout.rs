@@ -8,22 +8,22 @@ use bytemuck::{Pod, Zeroable};
 use glam::Vec3;
 use rayon::prelude::*;
 
-/// Most triangles that a leaf reference can name.
+/// Maximum number of triangles of a leaf reference.
 pub(crate) const MAX_LEAF: usize = 8;
 
-/// Most binary levels from the root to a leaf: the builder falls back to halving below
-/// [`SAH_DEPTH`], and 2^28 triangles are halved 28 times.
+/// Maximum number of binary levels from the root to a leaf: the builder falls back to halving below [`SAH_DEPTH`], and
+/// 2^28 triangles are halved 28 times.
 pub(crate) const MAX_DEPTH: usize = SAH_DEPTH + 28;
 
-/// Levels on which the builder may follow the SAH freely.
+/// Number of levels on which the builder may follow the SAH freely.
 pub(crate) const SAH_DEPTH: usize = 48;
 
-/// Children of a node.
+/// Number of children of a node.
 pub(crate) const WIDTH: usize = 8;
 
-/// Entries that a traversal stack can need: each level of the 8-wide tree leaves at most seven
-/// siblings behind, and an 8-wide level is at least one binary level. Children are pushed eight at a
-/// time, whatever their number.
+/// Number of entries that a traversal stack can need: each level of the 8-wide tree leaves at most seven siblings
+/// behind, and an 8-wide level is at least one binary level. Children are pushed eight at a time, whatever their
+/// number.
 pub(crate) const STACK_SIZE: usize = (WIDTH - 1) * MAX_DEPTH + 1 + WIDTH;
 
 /// A reference to a child: another node, a leaf, or nothing.
@@ -60,7 +60,7 @@ impl ChildRef {
         ChildRef(bits)
     }
 
-    /// Whether it names a leaf (or nothing).
+    /// Whether the reference is to a leaf (or empty).
     #[inline(always)]
     pub(crate) fn is_leaf(self) -> bool {
         (self.0 as i32) < 0
@@ -116,11 +116,11 @@ impl Node {
         order: [0; WIDTH],
     };
 
-    /// What the children add to the tree's cost, times half the area of its bounds.
+    /// Sum of the children's contributions to the tree's cost, times half the area of its bounds.
     fn sah_cost(&self) -> f64 {
         let child = |i: usize| {
             let c = self.children[i];
-            // Nothing, or a leaf whose triangles cannot be hit.
+            // An empty child, or a leaf whose triangles cannot be hit.
             if self.lower[0][i] > self.upper[0][i] {
                 return 0.0;
             }
@@ -130,8 +130,8 @@ impl Node {
         (0..WIDTH).map(child).sum()
     }
 
-    /// Fills in `order` from the boxes: by their centres along the octant's diagonal. (By where boxes begin
-    /// costs random rays 3 % more instructions.)
+    /// Fills in `order` from the boxes, by their centres along the octant's diagonal. (Ordering by where boxes begin costs
+    /// random rays 3 % more instructions.)
     pub(crate) fn sort_children(&mut self) {
         self.order = [0; WIDTH];
         for octant in 0..4u32 {
@@ -140,7 +140,7 @@ impl Node {
                     let centre = self.lower[a][i] + self.upper[a][i];
                     if octant >> a & 1 == 1 { -centre } else { centre }
                 };
-                // Nobody asks for the place of a missing child.
+                // The position of a missing child is never used.
                 if self.children[i] == ChildRef::EMPTY { f32::INFINITY } else { along(0) + along(1) + along(2) }
             });
             let mut far_to_near = [0usize; WIDTH];
@@ -161,10 +161,10 @@ impl Node {
     }
 }
 
-/// Floats that leaf loads may read beyond a leaf's end.
+/// Number of floats that leaf loads may read beyond a leaf's end.
 pub(crate) const LEAF_PAD: usize = 16;
 
-/// Floats per triangle in a leaf: nine coordinates and the number.
+/// Number of floats per triangle in a leaf: nine coordinates and the number.
 pub(crate) const LEAF_STRIDE: usize = 10;
 
 /// The 8-wide tree that the kernels traverse. Node 0 is the root.
@@ -187,7 +187,7 @@ pub struct Mbvh {
 }
 
 impl Mbvh {
-    /// A copy for which memory may be lacking.
+    /// Copies the tree; fails if there is not enough memory.
     pub(super) fn try_clone(&self) -> Result<Mbvh> {
         let what = "a copy of the tree";
         Ok(Mbvh { nodes: try_to_vec(&self.nodes, what)?, leaves: try_to_vec(&self.leaves, what)?, bounds: self.bounds })
@@ -203,22 +203,22 @@ impl Mbvh {
         self.nodes.len()
     }
 
-    /// Bytes of nodes and leaves.
+    /// Size in bytes of nodes and leaves.
     pub fn bytes(&self) -> usize {
         self.nodes.len() * size_of::<Node>() + self.leaves.len() * size_of::<f32>()
     }
 
-    /// Surface area heuristic cost: how many nodes plus triangles a ray through the bounds is expected to
-    /// meet. From the boxes as they are now, so a refit changes it.
+    /// Surface area heuristic cost: expected number of nodes plus triangles that a ray through the bounds is tested
+    /// against. It is computed from the current boxes, so a refit changes it.
     pub fn sah_cost(&self) -> f32 {
         let root_area = half_area(self.bounds.0, self.bounds.1);
-        // By chunks, whose sums do not depend on the number of threads.
+        // Sums are taken by chunks, so that they do not depend on the number of threads.
         let chunks: Vec<f64> =
             self.nodes.par_chunks(1 << 10).map(|nodes| nodes.iter().map(Node::sah_cost).sum()).collect();
         (1.0 + chunks.iter().sum::<f64>() / root_area) as f32
     }
 
-    /// Asks for the memory of a child that will be visited soon.
+    /// Prefetches a child that will be visited soon.
     #[inline(always)]
     pub(crate) fn prefetch(&self, child: ChildRef) {
         let p = if child.is_leaf() {
@@ -226,7 +226,7 @@ impl Mbvh {
         } else {
             self.nodes.as_ptr().wrapping_add(child.node_index()).cast::<u8>()
         };
-        // One line: the others follow by themselves. (Two and four lines are no faster.)
+        // One cache line: the hardware prefetches the others. (Two and four lines are no faster.)
         prefetch(p);
     }
 

@@ -22,7 +22,7 @@ use crate::error::{Result, invalid_argument};
 use crate::progress::Progress;
 use glam::Vec3;
 
-/// How much effort the build takes.
+/// Quality of the build, against its time.
 #[derive(Clone, Copy, Debug, Default, PartialEq, Eq)]
 #[repr(u32)]
 pub enum BuildQuality {
@@ -38,24 +38,24 @@ pub enum BuildQuality {
 pub struct BuildOptions {
     /// Bins per axis of the surface area heuristic, 2 to 256. Thesis: 64.
     pub bins: u32,
-    /// Most triangles per leaf, 1 to 8. Thesis: 3 or 4; four are tested at a time. Default: 4.
+    /// Maximum number of triangles per leaf, 1 to 8. Thesis: 3 or 4; four are tested at a time. Default: 4.
     pub max_leaf: u32,
     /// Whether triangles may be cut by spatial splits.
     pub quality: BuildQuality,
-    /// With [`BuildQuality::High`]: most references that cuts may add, in parts of the number of
+    /// With [`BuildQuality::High`]: maximum number of references that cuts may add, as a fraction of the number of
     /// triangles, 0 to 4. Leaves grow by at most as much. Default: 0.25.
     pub split_budget: f32,
-    /// Whether the tree is to take little memory: a fifth of what it takes else, for rays that take longer. Hits
-    /// are the same, bit for bit, except that after spatial splits a ray that grazes an edge within rounding may
-    /// meet the triangle in one tree and pass it in the other. Default: false.
+    /// Whether to build the compact tree, which takes a fifth of the memory; rays take longer. Hits are the same, bit
+    /// for bit, except that after spatial splits a ray that grazes an edge within rounding may hit the triangle in one
+    /// tree and miss it in the other. Default: false.
     pub compact: bool,
 }
 
 impl BuildQuality {
-    /// Both, by rising effort.
+    /// Both qualities, by rising effort.
     pub const ALL: [BuildQuality; 2] = [BuildQuality::Default, BuildQuality::High];
 
-    /// Its name on the command line and in reports: "default" or "high".
+    /// Name on the command line and in reports: "default" or "high".
     pub fn name(self) -> &'static str {
         match self {
             BuildQuality::Default => "default",
@@ -86,12 +86,12 @@ impl BuildOptions {
     }
 }
 
-/// Upper bound of an [`Mbvh`]'s size with the builder's working memory, for the memory monitor.
+/// Upper bound of an [`Mbvh`]'s size together with the builder's working memory, for the memory monitor.
 pub fn estimated_bytes(triangles: usize, options: &BuildOptions) -> usize {
-    // Per triangle: 40 in leaves and up to 256/7 of nodes, or 4 and up to 80/7; with 40/7 of their plan.
+    // Bytes per triangle: 40 in leaves and up to 256/7 of nodes, or 4 and up to 80/7; with 40/7 of their plan.
     let tree = if options.compact { 22 } else { 84 };
     match options.quality {
-        // While building 64 of references, 64 of binary nodes, 4 of numbers and 36 of corners.
+        // Bytes during the build: 64 of references, 64 of binary nodes, 4 of numbers and 36 of corners.
         BuildQuality::Default => triangles * (tree + 168),
         // Per reference twice the binary nodes and numbers, because subtrees are joined at the end.
         BuildQuality::High => {
@@ -101,7 +101,7 @@ pub fn estimated_bytes(triangles: usize, options: &BuildOptions) -> usize {
     }
 }
 
-/// See [`Tree::room_to_refit`].
+/// Working memory of a refit: see [`Tree::room_to_refit`].
 pub(crate) type RefitRoom = Option<compact_refit::Room>;
 
 /// A scene's acceleration structure.
@@ -140,7 +140,7 @@ impl Tree {
         }
     }
 
-    /// See [`Mbvh::sah_cost`].
+    /// Cost as [`Mbvh::sah_cost`].
     pub(crate) fn sah_cost(&self) -> f32 {
         match self {
             Tree::Whole(t) => t.sah_cost(),
@@ -148,7 +148,7 @@ impl Tree {
         }
     }
 
-    /// The working memory of [`refit`](Self::refit).
+    /// Allocates the working memory of [`refit`](Self::refit).
     pub(crate) fn room_to_refit(&self) -> Result<RefitRoom> {
         Ok(match self {
             Tree::Whole(_) => None,
@@ -156,7 +156,7 @@ impl Tree {
         })
     }
 
-    /// See [`refit::refit`]. `room` must have been made for this tree.
+    /// Refits the tree as [`refit::refit`] does. `room` must have been made for this tree.
     pub(crate) fn refit(&mut self, corners: &(impl Fn(u32) -> [Vec3; 3] + Sync), room: RefitRoom) {
         match (self, room) {
             (Tree::Compact(t), Some(room)) => compact_refit::refit(t, corners, room),
@@ -165,7 +165,7 @@ impl Tree {
         }
     }
 
-    /// A copy for which memory may be lacking.
+    /// Copies the tree; fails if there is not enough memory.
     pub(crate) fn try_clone(&self) -> Result<Tree> {
         Ok(match self {
             Tree::Whole(t) => Tree::Whole(t.try_clone()?),
@@ -174,8 +174,8 @@ impl Tree {
     }
 }
 
-/// Builds the tree over the triangles `valid` (global numbers, ascending) and gives its SAH cost:
-/// that of the binary tree with traversal and intersection costing 1 each.
+/// Builds the tree over the triangles `valid` (global numbers, ascending). Returns it with its SAH cost: that of the
+/// binary tree with traversal and intersection costing 1 each.
 ///
 /// `meshes`: the first triangle of each mesh, and the number of all triangles at the end.
 pub(crate) fn build(

@@ -1,24 +1,24 @@
-//! Nodes of few triangles: what a leaf costs, and the best way to part two to four references.
+//! Nodes of few triangles: the cost of a leaf, and the best partition of two to four references.
 
 use super::references::{Box4, Extent, Reference, half_areas};
 
-/// Cost of testing n triangles, of which four are tested at a time, in traversal steps. (With n alone,
-/// random rays take 3 to 4 % more instructions; with 3 + n / 2 as many.)
+/// Cost of testing n triangles, of which four are tested at a time, in traversal steps. (With n alone, random rays take
+/// 3 to 4 % more instructions; with 3 + n / 2 as many.)
 pub(super) fn leaf_weight(n: usize) -> f32 {
     if n <= 4 { 1.0 + 0.5 * n as f32 } else { n as f32 }
 }
 
-/// Cost of a leaf less that of a traversal step, in the units of [`Bins::best_split`].
+/// Cost of a leaf minus that of a traversal step, in the units of [`Bins::best_split`].
 pub(super) fn leaf_cost(bounds: &Box4, scale: f32, n: usize) -> f32 {
     half_areas([bounds.extent() * scale; 4]).x * (leaf_weight(n) - 1.0)
 }
 
-/// A way to part two to four references: 0 to 3: that one from the others; 4 to 6: the first and one
-/// more from the other two.
+/// A partition of two to four references: 0 to 3: that one from the others; 4 to 6: the first and one more from the
+/// other two.
 #[derive(Clone, Copy)]
 pub(super) struct Parting(usize);
 
-/// The best way to part two to four references, with its cost.
+/// The best partition of two to four references, with its cost.
 pub(super) fn best_parting(refs: &[Reference], scale: f32) -> (f32, Parting) {
     let n = refs.len();
     let boxes: [Box4; 4] = std::array::from_fn(|i| if i < n { refs[i].0 } else { Box4::EMPTY });
@@ -46,7 +46,7 @@ pub(super) fn best_parting(refs: &[Reference], scale: f32) -> (f32, Parting) {
     (best.0, Parting(best.1))
 }
 
-/// Brings references into the order of a parting and says how many are on the left.
+/// Reorders references for a partition and returns the number on the left.
 pub(super) fn part_few(refs: &mut [Reference], Parting(i): Parting) -> usize {
     if i < 4 {
         refs.swap(0, i);

@@ -6,10 +6,10 @@ use crate::memory::try_vec;
 use glam::{Mat4, Vec3, Vec4, Vec4Swizzles};
 use rayon::prelude::*;
 
-/// What one thread takes of a range of references at a time.
+/// Number of references that one thread takes of a range at a time.
 pub(super) const CHUNK: usize = 1 << 12;
 
-/// A box as its negated lower and its upper corner, so that one maximum of eight lanes joins two.
+/// A box stored as its negated lower and its upper corner, so that one maximum of eight lanes joins two.
 #[derive(Clone, Copy)]
 #[repr(C, align(32))]
 pub(super) struct Box4 {
@@ -21,7 +21,7 @@ impl Box4 {
     pub(super) const EMPTY: Box4 = Box4 { neg_lower: Vec4::NEG_INFINITY, upper: Vec4::NEG_INFINITY };
 
     pub(super) fn new(lower: Vec3, upper: Vec3) -> Box4 {
-        // −0 + 0 = +0: of two zeros, min and max return one by its place, not by its sign.
+        // −0 + 0 = +0: of two zeros, min and max return one by operand order, not by sign.
         Box4 { neg_lower: (-(lower + Vec3::ZERO)).extend(0.0), upper: (upper + Vec3::ZERO).extend(0.0) }
     }
 
@@ -39,7 +39,7 @@ impl Box4 {
         *self = self.join(Box4 { neg_lower: -p, upper: p });
     }
 
-    /// The part that both cover, which may be empty.
+    /// The intersection of two boxes, which may be empty.
     pub(super) fn meet(self, o: Box4) -> Box4 {
         Box4 { neg_lower: self.neg_lower.min(o.neg_lower), upper: self.upper.min(o.upper) }
     }
@@ -54,7 +54,7 @@ impl Box4 {
         if self.is_empty() { 0.0 } else { half_area(lower, upper) }
     }
 
-    /// Extent, 0 on axes where there is nothing.
+    /// Extent per axis, 0 if empty.
     #[inline(always)]
     pub(super) fn extent(&self) -> Vec4 {
         (self.upper + self.neg_lower).max(Vec4::ZERO)
@@ -67,7 +67,7 @@ pub(super) fn triangle_box([a, b, c]: [Vec3; 3]) -> Box4 {
     Box4::new(a.min(b).min(c), a.max(b).max(c))
 }
 
-/// Bounds of centres.
+/// Bounds of the centres of boxes.
 #[derive(Clone, Copy)]
 pub(super) struct Range4 {
     pub(super) lower: Vec4,
@@ -88,8 +88,8 @@ impl Range4 {
     }
 }
 
-/// A triangle's box; its number rides in `neg_lower.w` as the low bits of a normal float (arithmetic
-/// on denormals would be slow), which no result depends on.
+/// The box of a triangle; its number is stored in `neg_lower.w` as the low bits of a normal float (arithmetic on
+/// denormals would be slow), which no result depends on.
 #[derive(Clone, Copy)]
 #[repr(transparent)]
 pub(super) struct Reference(pub(super) Box4);
@@ -121,14 +121,14 @@ impl Reference {
         self.0.neg_lower.w.to_bits() & (Self::NORMAL - 1)
     }
 
-    /// Twice the box's centre: no rounding for the division, and all comparisons are the same.
+    /// Twice the box's centre: without the rounding of a division; all comparisons are the same.
     #[inline(always)]
     pub(super) fn centre(&self) -> Vec4 {
         self.0.upper - self.0.neg_lower
     }
 }
 
-/// Half the surface areas of boxes of extents `d`, in lanes.
+/// Half the surface areas of boxes with extents `d`, one per lane.
 #[inline(always)]
 pub(super) fn half_areas(d: [Vec4; 4]) -> Vec4 {
     let [a, b, c, d] = d.map(|d| d * d.yzxw());
@@ -144,7 +144,7 @@ pub(super) fn area_scale(b: &Box4) -> f32 {
     f32::from_bits((0x7f00_0000 - exponent.min(0x7e80_0000)).max(1 << 23))
 }
 
-/// Bounds of the boxes and of their centres.
+/// Bounds of boxes and of their centres.
 #[derive(Clone, Copy)]
 pub(super) struct Extent {
     pub(super) boxes: Box4,

@@ -1,9 +1,9 @@
-//! Refit: new corners in an old tree. Leaf rows are rewritten, boxes and orders of children computed anew
-//! from the leaves up; which triangles share a leaf, and which leaves a node, stays. (Compact trees:
+//! Refit: puts new corners into an existing tree. Leaf rows are rewritten, boxes and orders of children computed anew
+//! from the leaves up; the assignment of triangles to leaves and of leaves to nodes stays. (Compact trees:
 //! `compact_refit`.)
 //!
-//! The tree is walked as it lies in memory (see [`Part`]): threads share neither nodes nor rows, each
-//! finds its own next to each other, and the result does not depend on their number.
+//! The tree is processed in memory order (see [`Part`]): threads share neither nodes nor rows, those of each are
+//! contiguous, and the result does not depend on their number.
 
 use super::collapse::set_box;
 use super::layout::{ChildRef, LEAF_PAD, LEAF_STRIDE, Mbvh, Node, WIDTH};
@@ -15,22 +15,22 @@ use rayon::prelude::*;
 /// Subtrees of more nodes than this are shared among threads.
 const PARALLEL_SUBTREE: usize = 256;
 
-/// What lies below a node in memory, because the collapse works depth-first: the node's inner children,
-/// one after the other, then all that lies below the first of them, below the second, and so on; and the
+/// The part of the tree below a node, which is contiguous in memory because the collapse works depth-first: the node's
+/// inner children, one after the other, then all nodes below the first of them, below the second, and so on; and the
 /// rows of the node's leaves, then of those below the first inner child, and so on.
 #[derive(Default)]
 struct Part<'a> {
     nodes: &'a mut [Node],
-    /// Number of `nodes[0]`.
+    /// Index of `nodes[0]`.
     first_node: usize,
     rows: &'a mut [f32],
     /// Triangle slot at which `rows` begins.
     first_slot: usize,
 }
 
-/// Moves the triangles of `tree` to where `corners` (by global number) says. Those which no ray can hit there because
-/// they are degenerate or not finite stay in the tree and can come back with the next refit; they widen no box. Where
-/// no triangle is left, boxes are empty, the bounds too. Takes no memory.
+/// Moves the triangles of `tree` to the corners given by `corners` (by global number). Triangles that become degenerate
+/// or not finite, so that no ray can hit them, stay in the tree and can come back with the next refit; they widen no
+/// box. If no triangle is left, boxes are empty, the bounds too. Takes no memory.
 ///
 /// Leaf boxes become those of whole triangles: where spatial splits had cut triangles, they are larger
 /// than the builder's even if nothing moved.
@@ -41,7 +41,7 @@ pub(crate) fn refit(tree: &mut Mbvh, corners: &(impl Fn(u32) -> [Vec3; 3] + Sync
     tree.bounds = refit_node(root, part, corners).corners();
 }
 
-/// The box around all that lies below a node, once that is done.
+/// Refits a node with all nodes below it; returns the box around them.
 fn refit_node(node: &mut Node, part: Part, corners: &(impl Fn(u32) -> [Vec3; 3] + Sync)) -> Box4 {
     let parallel = part.nodes.len() > PARALLEL_SUBTREE;
     let Part { nodes, first_node, rows, first_slot } = part;
@@ -55,8 +55,8 @@ fn refit_node(node: &mut Node, part: Part, corners: &(impl Fn(u32) -> [Vec3; 3] 
         used += LEAF_STRIDE * count;
     }
 
-    // The shares of the inner children, cut off from the back: where one's nodes and rows begin is known
-    // from itself, where they end from the next.
+    // The parts of the inner children, split off from the back: the start of a child's nodes and rows is known from
+    // itself, their end from the next child.
     let inner = inner(node).count();
     let (block, mut nodes) = nodes.split_at_mut(inner);
     let (mut rows, first_node) = (&mut rows[used..], first_node + inner);
@@ -100,7 +100,7 @@ fn inner(node: &Node) -> impl Iterator<Item = (usize, ChildRef)> + use<> {
     node.children.into_iter().enumerate().filter(|(_, c)| !c.is_leaf())
 }
 
-/// The first triangle slot below `node`; `below` are the nodes below it, from number `first` on.
+/// The first triangle slot below `node`; `below` are the nodes below it, from index `first` on.
 fn first_slot_below<'a>(mut node: &'a Node, below: &'a [Node], first: usize) -> usize {
     loop {
         if let Some((_, leaf)) = leaves(node).next() {
@@ -111,7 +111,7 @@ fn first_slot_below<'a>(mut node: &'a Node, below: &'a [Node], first: usize) -> 
     }
 }
 
-/// Rewrites the rows of a leaf and gives its box.
+/// Rewrites the rows of a leaf and returns its box.
 fn refit_leaf(rows: &mut [f32], corners: &impl Fn(u32) -> [Vec3; 3]) -> Box4 {
     let count = rows.len() / LEAF_STRIDE;
     let mut bounds = Box4::EMPTY;

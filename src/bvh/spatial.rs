@@ -8,9 +8,9 @@
 //!
 //! A reference's box holds its part of the triangle with a margin. The kernels decide hits on
 //! corners that the subtraction of the ray's origin has rounded, by up to 2^-24 of the distance
-//! between them. Around a whole triangle, the box test's own margin covers that; at a cut it need
-//! not, because the corners can be much farther away than the box. So parts are padded by a little
-//! more than this rounding over the triangle's extent, and no ray slips past a cut.
+//! between them. Around a whole triangle, the box test's own margin covers that; at a cut it may not, because the
+//! corners can be much farther away than the box. So parts are padded by a little more than this rounding over the
+//! triangle's extent, and no ray slips past a cut.
 
 use super::BuildOptions;
 use super::binary::{BinaryBvh, BinaryNode};
@@ -26,8 +26,8 @@ use glam::{DVec3, Vec3, Vec4};
 use rayon::prelude::*;
 use std::sync::atomic::{AtomicBool, Ordering::Relaxed};
 
-/// Planes are tried at the borders of at most this many slabs per axis. (16: up to a fifth faster; cost
-/// within 1 % on four scenes, 4 % higher on San Miguel.)
+/// Maximum number of slabs per axis at whose borders planes are tried. (16: up to a fifth faster; cost within 1 % on
+/// four scenes, 4 % higher on San Miguel.)
 const SLABS: usize = 32;
 
 /// Planes are tried only where the halves of the best split between triangles overlap by more than
@@ -35,25 +35,24 @@ const SLABS: usize = 32;
 /// plane that makes the root huge does not at once forbid all cuts).
 const ALPHA: f32 = 1e-6;
 
-/// … and by more than this part of the node's own area. Without that (the paper has only α) the
-/// build takes twice as long, for trees of 1 % less cost.
+/// Planes are tried only where the halves also overlap by more than this fraction of the node's own area. Without that
+/// (the paper has only α) the build takes twice as long, for trees of 1 % less cost.
 const OVERLAP: f64 = 0.2;
 
 /// Levels on which the surface area decides. One less than elsewhere, because cut triangles can
 /// double the references that are halved below it.
 const FREE_DEPTH: usize = SAH_DEPTH - 1;
 
-/// Slots that leaf references can number.
+/// Maximum number of slots that leaf references can address.
 const MAX_SLOTS: usize = (1 << 28) - 2;
 
-/// Padding of parts in extents of the triangle: four times what rounding moves its corners by.
+/// Padding of parts as a fraction of the triangle's extent: four times the distance that rounding moves its corners.
 const PADDING: f64 = 1.0 / (1 << 22) as f64;
 
-/// Bound of the rounding of a cut's f64 coordinates, by the greatest coordinate.
+/// Relative bound of the rounding error of a cut's f64 coordinates, by the greatest coordinate.
 const ROUNDING: f64 = 1.0 / (1u64 << 48) as f64;
 
-/// The parts of a triangle below and above `position` on `axis`, within `bounds`; an empty box where
-/// there is none.
+/// The parts of a triangle below and above `position` on `axis`, within `bounds`; an empty box for an empty part.
 fn cut(corners: &[Vec3; 3], bounds: Box4, axis: usize, position: f32) -> [Box4; 2] {
     let v = corners.map(|c| c.as_dvec3());
     let plane = f64::from(position);
@@ -91,11 +90,11 @@ fn round_down(x: f64) -> f32 {
     if f64::from(y) > x { y.next_down() } else { y }
 }
 
-/// What lies in one slab of each axis.
+/// One slab on each axis.
 #[derive(Clone, Copy)]
 struct Slab {
     boxes: [Box4; 3],
-    /// References whose first and last slab it is. The fourth is unused.
+    /// Number of references whose first and last slab it is. The fourth is unused.
     first: [i32; 4],
     last: [i32; 4],
 }
@@ -141,7 +140,7 @@ impl Grid {
     }
 }
 
-/// A plane, and what it would leave on either side.
+/// A plane, and the references it would leave on either side.
 struct Plane {
     cost: f32,
     axis: usize,
@@ -179,7 +178,7 @@ fn chop(corners: &[Vec4; 3], axis: usize, first: usize, last: usize, grid: &Grid
     }
 }
 
-/// The slabs of a node, and scratch space for what lies right of each. On the heap as [`Bins`] are.
+/// The slabs of a node, and scratch space for the parts to the right of each. On the heap as [`Bins`] are.
 struct Slabs {
     slabs: Box<[Slab; SLABS]>,
     right: Box<[Slab; SLABS]>,
@@ -275,7 +274,7 @@ impl Slabs {
     }
 }
 
-/// Few triangles need few planes.
+/// Number of slabs: few triangles need few planes.
 fn slab_count(n: usize) -> usize {
     SLABS.min(n / 16 + 8)
 }
@@ -293,7 +292,7 @@ impl Work {
         Work { bins: Bins::new(), slabs: Slabs::new(), left: Vec::new(), right: Vec::new() }
     }
 
-    /// Room for the sides of a split of `n` references: none gets more. `None`: there is no memory.
+    /// Makes room for the sides of a split of `n` references: neither gets more. `None`: there is not enough memory.
     fn make_room(&mut self, n: usize) -> Option<()> {
         for side in [&mut self.left, &mut self.right] {
             side.clear();
@@ -303,7 +302,7 @@ impl Work {
     }
 }
 
-/// A subtree: numbers in it count from its own first node and triangle.
+/// A subtree: indices in it count from its own first node and triangle.
 #[derive(Default)]
 struct Flat {
     nodes: Vec<BinaryNode>,
@@ -311,7 +310,7 @@ struct Flat {
 }
 
 impl Flat {
-    /// `None`: there is no memory.
+    /// Adds a leaf. `None`: there is not enough memory.
     fn leaf(&mut self, refs: &[Reference], bounds: &Box4) -> Option<()> {
         self.triangles.try_reserve(refs.len()).ok()?;
         self.node(bounds, self.triangles.len(), refs.len())?;
@@ -319,7 +318,7 @@ impl Flat {
         Some(())
     }
 
-    /// `None`: there is no memory.
+    /// Adds a node. `None`: there is not enough memory.
     fn node(&mut self, bounds: &Box4, index: usize, count: usize) -> Option<()> {
         let (lower, upper) = bounds.corners();
         self.nodes.try_reserve(1).ok()?;
@@ -328,7 +327,7 @@ impl Flat {
     }
 }
 
-/// A tree of subtrees, as the tasks made them.
+/// A tree of subtrees, as built by the tasks.
 enum Piece {
     Flat(Flat),
     Inner(Box4, Box<[Piece; 2]>),
@@ -372,16 +371,16 @@ struct Builder<'a, 'p> {
     corners: &'a [[Vec3; 3]],
     options: &'a BuildOptions,
     progress: &'a Progress<'p>,
-    /// Root's half area in f64, times α.
+    /// Half the root's area in f64, times α.
     least_overlap: f64,
-    /// Set when an allocation has failed: what is built then is thrown away.
+    /// Set when an allocation has failed: the result is then discarded.
     out_of_memory: AtomicBool,
 }
 
 /// The two sides of a split, whose references are in [`Work`].
 struct Sides {
     extents: [Extent; 2],
-    /// How many references may be added in each.
+    /// Number of references that may be added in each side.
     extra: [usize; 2],
 }
 
@@ -405,8 +404,8 @@ impl Builder<'_, '_> {
         Piece::Inner(extent.boxes, Box::new([a, b]))
     }
 
-    /// Splits more references than a leaf can hold; `None` if there is no memory for both sides. The working buffers are gone before the sides are built, so
-    /// that no level of the recursion holds them.
+    /// Splits more references than a leaf can hold; `None` if there is not enough memory for both sides. The working
+    /// buffers are freed before the sides are built, so that no level of the recursion holds them.
     #[inline(never)]
     fn part(
         &self,
@@ -418,7 +417,7 @@ impl Builder<'_, '_> {
         let mut work = Work::new();
         work.make_room(refs.len())?;
         let sides = self.split(&mut refs, extent, extra, depth, &mut work).expect("too many for a leaf");
-        // What is not used is given back.
+        // Unused capacity is freed.
         work.left.shrink_to_fit();
         work.right.shrink_to_fit();
         Some((sides, work.left, work.right))
@@ -435,7 +434,7 @@ impl Builder<'_, '_> {
         flat
     }
 
-    /// Builds over the last `n` of `stack` and removes them. `None`: there is no memory.
+    /// Builds over the last `n` references of `stack` and removes them. `None`: there is not enough memory.
     fn build_flat(
         &self,
         stack: &mut Vec<Reference>,
@@ -455,7 +454,7 @@ impl Builder<'_, '_> {
         };
         stack.truncate(start);
         stack.try_reserve(work.left.len() + work.right.len()).ok()?;
-        // The left side on top, because it is built first.
+        // The left side goes on top, because it is built first.
         stack.extend_from_slice(&work.right);
         stack.extend_from_slice(&work.left);
         let (nl, nr) = (work.left.len(), work.right.len());
@@ -486,7 +485,7 @@ impl Builder<'_, '_> {
             return (!may_be_leaf).then(|| self.halve(refs, extent, extra, work));
         }
         let scale = area_scale(&extent.boxes);
-        // Between triangles.
+        // Splits between triangles.
         let few = (n <= 4).then(|| {
             let (cost, parting) = best_parting(refs, scale);
             (cost, part_few(refs, parting))
@@ -507,7 +506,7 @@ impl Builder<'_, '_> {
             (_, Some(((_, [a, b]), split))) => (split.cost, a.meet(*b).half_area()),
             _ => (f32::INFINITY, f64::INFINITY),
         };
-        // By a plane.
+        // Splits by a plane.
         let mut plane = None;
         if extra > 0 && overlap > self.least_overlap.max(OVERLAP * extent.boxes.half_area()) {
             let grid = Grid::new(&extent.boxes, n);
@@ -541,7 +540,7 @@ impl Builder<'_, '_> {
         }
     }
 
-    /// Halves along the widest axis of the centres.
+    /// Halves references along the widest axis of the centres.
     fn halve(&self, refs: &mut [Reference], extent: &Extent, extra: usize, work: &mut Work) -> Sides {
         let n = refs.len();
         let middle = halve(refs, extent);
@@ -551,9 +550,9 @@ impl Builder<'_, '_> {
         self.sides(n, extra, work)
     }
 
-    /// Cuts by a plane what it crosses, unless a reference is better left whole on one side (the
-    /// paper's reference unsplitting, with the sizes that were estimated for the sides, so that the
-    /// order of references does not matter). Whether anything is on both sides.
+    /// Cuts the references that a plane crosses, unless one is better left whole on one side (the paper's reference
+    /// unsplitting, with the sizes that were estimated for the sides, so that the order of references does not matter).
+    /// Returns whether both sides have references.
     fn cut_all(&self, refs: &[Reference], plane: &Plane, scale: f32, extra: usize, work: &mut Work) -> bool {
         let area = |b: Box4| half_areas([b.extent() * scale; 4]).x;
         let [left, right] = plane.boxes;
@@ -598,8 +597,8 @@ impl Builder<'_, '_> {
         ok
     }
 
-    /// The extents of both sides, and their shares of what remains to be added: by their areas
-    /// times references, which is where more cuts can save most.
+    /// The extents of both sides, and their shares of the references that may still be added: by their areas times
+    /// references, which is where more cuts can save most.
     fn sides(&self, n: usize, extra: usize, work: &Work) -> Sides {
         let extents = [Extent::of(&work.left), Extent::of(&work.right)];
         let remaining = extra - (work.left.len() + work.right.len() - n);
@@ -616,7 +615,7 @@ fn share_weight(n: usize, area: f64) -> f64 {
 
 impl BinaryBvh {
     /// Builds the tree over the triangles `valid` of `corners` with spatial splits, which add at most
-    /// `options.split_budget` times as many references. On the current rayon pool.
+    /// `options.split_budget` times as many references. Runs on the current rayon pool.
     pub fn build_spatial(
         corners: &[[Vec3; 3]],
         valid: &[u32],

@@ -1,9 +1,9 @@
-//! Lights with an area: rect lights and emissive triangles.
+//! Lights with an area: rectangular lights and emissive triangles.
 //!
-//! Where a light is large as seen from a point, samples are uniform in solid angle, elsewhere in
-//! area. At 0.01 to 0.5 from the foot of a wall of light 1 high, behind a low board, 16 rays have a mean
-//! squared error of 2.7e-3 of the unoccluded light, two thousandths of bias; uniform in area they had 0.25,
-//! and 0.3 of bias (simulated), since few see past the board and the ratio rests on those.
+//! A light that is large as seen from a point is sampled uniformly in solid angle, others in area. At 0.01 to 0.5 from
+//! the foot of a wall of light 1 high, behind a low board, 16 rays have a mean squared error of 2.7e-3 of the
+//! unoccluded light, two thousandths of bias; uniform in area they had 0.25, and 0.3 of bias (simulated), since few see
+//! past the board and the ratio rests on those.
 
 use super::polygon;
 use super::receiver::Receiver;
@@ -30,12 +30,12 @@ pub(crate) struct AreaLight {
     pub radiance: Vec3,
 }
 
-/// How points are chosen on a light for one receiver.
+/// Strategy for choosing points on a light for one receiver.
 // It lives on the stack, for the rays of one light.
 #[allow(clippy::large_enum_variant)]
 pub(crate) enum AreaSampler {
     Area,
-    /// Two triangles of a parallelogram, with the share of the first; of a triangle, twice the same.
+    /// Two triangles of a parallelogram, with the probability of the first; a triangle is stored twice.
     SolidAngle {
         parts: [SphericalTriangle; 2],
         share: f32,
@@ -72,7 +72,7 @@ impl AreaLight {
         }
     }
 
-    /// The box around it.
+    /// Bounding box of the light.
     pub(crate) fn bounds(&self) -> (Vec3, Vec3) {
         let (c, u, v) = (self.corner, self.edge_u, self.edge_v);
         let last = if self.triangle { c } else { c + u + v };
@@ -98,7 +98,7 @@ impl AreaLight {
         }
     }
 
-    /// How to sample it for a receiver; `None` if it faces away.
+    /// Sampler of the light for a receiver; `None` if the light faces away.
     pub(crate) fn sampler(&self, receiver: &Receiver) -> Option<AreaSampler> {
         self.faces(receiver.origin).then(|| self.sampler_facing(receiver))
     }
@@ -106,7 +106,7 @@ impl AreaLight {
     fn sampler_facing(&self, receiver: &Receiver) -> AreaSampler {
         let c = self.corner.as_dvec3() - receiver.origin.as_dvec3();
         let (u, v) = (self.edge_u.as_dvec3(), self.edge_v.as_dvec3());
-        // What is far away cannot be large.
+        // A light that is far away cannot be large.
         let reach = u.length() + v.length();
         let nearest = c.length() - reach;
         if nearest > 0.0 && (self.area as f64) < LARGE * nearest * nearest {
@@ -123,8 +123,8 @@ impl AreaLight {
         AreaSampler::SolidAngle { parts: [first, second], share, solid_angle: both as f32 }
     }
 
-    /// A point on the light and what it stands for: irradiance for radiance 1 divided by the density
-    /// of the point. (Its mean is the unoccluded irradiance.)
+    /// Samples a point on the light; returns it with its weight: irradiance for radiance 1 divided by the density of
+    /// the point. (The mean of the weights is the unoccluded irradiance.)
     pub(crate) fn sample(&self, sampler: &AreaSampler, receiver: &Receiver, u: [f32; 2]) -> (Vec3, f32) {
         match sampler {
             AreaSampler::Area => {
@@ -144,7 +144,7 @@ impl AreaLight {
         }
     }
 
-    /// The point of the light's plane in a direction.
+    /// The point of the light's plane in a given direction.
     fn along(&self, origin: Vec3, direction: DVec3) -> Vec3 {
         let (origin, normal) = (origin.as_dvec3(), self.edge_u.as_dvec3().cross(self.edge_v.as_dvec3()));
         let t = (self.corner.as_dvec3() - origin).dot(normal) / direction.dot(normal);
@@ -160,7 +160,7 @@ impl AreaLight {
         }
         let there = -way.dot(self.normal);
         let there = if self.two_sided { there.abs() } else { there.max(0.0) };
-        // Divided one by one: the fourth power of a distance of 10⁹ overflows.
+        // Divides twice: the fourth power of a distance of 10⁹ overflows.
         way.dot(receiver.normal).max(0.0) / d2 * (there / d2)
     }
 }

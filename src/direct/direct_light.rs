@@ -1,13 +1,13 @@
 //! Direct light at points of surfaces, by shadow rays (thesis 3.2.6).
 //!
-//! Point, spot and parallel lights take one ray. For area lights (rect lights and emissive
-//! triangles) the unoccluded irradiance is computed exactly and multiplied by the fraction of it
-//! that rays find visible (the ratio estimator of Heitz, Hill and McGuire, *Combining Analytic
-//! Direct Illumination and Stochastic Shadows*, 2018): without occluders there is no noise. Of very
-//! many lights a [tree](super::light_tree) tells which to try, and the estimate is the plain unbiased
-//! one. Discs and skies have [a file of their own](super::sun_sky).
+//! Point, spot and parallel lights take one ray. For area lights (rectangular lights and emissive triangles) the
+//! unoccluded irradiance is computed exactly and multiplied by the fraction of it that rays find visible (the ratio
+//! estimator of Heitz, Hill and McGuire, *Combining Analytic Direct Illumination and Stochastic Shadows*, 2018):
+//! without occluders there is no noise. If there are very many lights, candidates are chosen by a
+//! [tree](super::light_tree), and the estimate is the plain unbiased one. Discs and skies have [a file of their
+//! own](super::sun_sky).
 //!
-//! Where surfaces transmit light, what comes along a ray is multiplied with what they let through.
+//! In scenes with transmissive surfaces, the light along a ray is multiplied by their transmittance.
 
 use super::area_light::AreaLight;
 use super::light_tree::LIGHT_TREE;
@@ -27,21 +27,21 @@ use std::sync::Arc;
 /// spot lights get a ray each: no noise, and no more rays than sampling takes.
 const MAX_EXACT: usize = 64;
 
-/// Rays to area lights from one point, at most, and to all of many lights: this many times those for
-/// one light.
+/// Maximum number of area lights that get rays from one point, in multiples of the rays for one light; also the number
+/// of rays to all of many lights.
 const MAX_LIGHTS_SAMPLED: usize = 4;
 
-/// Which lights shine.
+/// Subset of the lights.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub(crate) enum Lights {
     All,
-    /// Those with shadows without penumbrae: parallel lights, and point and spot lights unless they are many.
+    /// Lights whose shadows have no penumbrae: parallel lights, and point and spot lights unless they are many.
     Sharp,
-    /// All others.
+    /// All other lights.
     Soft,
 }
 
-/// An estimate by ratio: the exact unoccluded light, and what samples of it bring with and without what is in their way.
+/// A ratio estimate: the exact unoccluded light, and the sums of samples of it with and without occlusion.
 #[derive(Clone, Copy, Debug, Default)]
 struct Ratio {
     total: Vec3,
@@ -52,7 +52,7 @@ struct Ratio {
 /// Direct light at a point, or a weighted sum over points.
 #[derive(Clone, Copy, Debug, Default)]
 pub(crate) struct PointLight {
-    /// Irradiance of the lights that [`Lights::Sharp`] names.
+    /// Irradiance of the lights of [`Lights::Sharp`].
     pub sharp: Vec3,
     /// Irradiance of skies and of many lights.
     sampled: Vec3,
@@ -88,17 +88,17 @@ impl PointLight {
         self.sharp + self.sampled + self.discs.value() + self.areas.value()
     }
 
-    /// Light whose shadows have narrow penumbrae or none.
+    /// Irradiance from lights whose shadows have narrow penumbrae or none.
     pub(crate) fn narrow(&self) -> Vec3 {
         self.sharp + self.discs.visible
     }
 
-    /// Light of discs, as their samples found it.
+    /// Irradiance from discs, as estimated by their samples.
     pub(crate) fn of_discs(&self) -> Vec3 {
         self.discs.visible
     }
 
-    /// Light of area lights with nothing in the way.
+    /// Unoccluded irradiance from area lights.
     pub(crate) fn unoccluded_areas(&self) -> Vec3 {
         self.areas.total
     }
@@ -118,24 +118,24 @@ impl PointLight {
 /// The lights of a scene, ready to be sampled.
 pub struct DirectLight {
     scene: Arc<Scene>,
-    /// Lights that each get a ray from every point: parallel ones, and few point and spot lights.
+    /// Lights that each get a ray from every point: parallel ones, and point and spot lights if these are few.
     each: Vec<Light>,
-    /// Few area lights.
+    /// Area lights, if they are few.
     areas: Vec<AreaLight>,
     area_count: usize,
     discs: Vec<Disc>,
     skies: Vec<Sky>,
-    /// Many point and spot lights, many area lights.
+    /// Point and spot lights if these are many, and area lights if these are many.
     many: Option<ManyLights>,
 }
 
 impl DirectLight {
-    /// A snapshot of a scene's lights. Panics where memory is lacking.
+    /// Takes a snapshot of a scene's lights. Panics if there is not enough memory.
     pub fn new(scene: &Arc<Scene>) -> DirectLight {
         DirectLight::try_new(scene).expect("memory for the lights")
     }
 
-    /// A snapshot of a scene's lights, for which memory may be lacking.
+    /// Takes a snapshot of a scene's lights. Fails if there is not enough memory.
     pub fn try_new(scene: &Arc<Scene>) -> Result<DirectLight> {
         let lights = scene.lights();
         let all = lights.iter().filter_map(AreaLight::rect).chain(scene.emitters().iter().map(AreaLight::emitter));
@@ -176,34 +176,34 @@ impl DirectLight {
         })
     }
 
-    /// Rect lights and emissive triangles.
+    /// Number of rectangular lights and emissive triangles.
     pub fn area_light_count(&self) -> usize {
         self.area_count
     }
 
-    /// Lights that are sampled because they are many.
+    /// Number of lights that are sampled because they are many.
     pub fn many_light_count(&self) -> usize {
         self.many.as_ref().map_or(0, ManyLights::len)
     }
 
-    /// Directional lights with a disc.
+    /// Number of directional lights with a disc.
     pub fn disc_count(&self) -> usize {
         self.discs.len()
     }
 
-    /// Skies that shine.
+    /// Number of skies that shine.
     pub fn sky_count(&self) -> usize {
         self.skies.len()
     }
 
-    /// Rays that [`irradiance`](Self::irradiance) traces where all lights shine.
+    /// Number of rays that [`irradiance`](Self::irradiance) traces at a point where all lights shine.
     pub fn rays_per_point(&self, samples: u32) -> f32 {
         let four = self.skies.len() + self.many.is_some() as usize;
         let sampled = self.areas.len().min(MAX_LIGHTS_SAMPLED) + self.discs.len() + four * MAX_LIGHTS_SAMPLED;
         (self.each.len() + samples as usize * sampled) as f32
     }
 
-    /// Whether any light shines.
+    /// Whether no light shines.
     pub fn is_dark(&self) -> bool {
         self.area_count == 0
             && self.each.is_empty()
@@ -212,20 +212,21 @@ impl DirectLight {
             && self.skies.is_empty()
     }
 
-    /// Irradiance in W/m² at a receiver. `samples`: rays per area light or disc, and a quarter of those
-    /// per sky and for all of many lights. `seed`: of this point. Adds the rays traced to `rays`.
+    /// Irradiance in W/m² at a receiver. `samples`: rays per area light or disc, and a quarter of the rays per sky and
+    /// for all of many lights. `seed`: seed of this point. Adds the rays traced to `rays`.
     pub fn irradiance(&self, receiver: &Receiver, samples: u32, seed: u32, rays: &mut u64) -> Vec3 {
         self.estimate(receiver, samples, seed, rays, true)
     }
 
-    /// The same by Monte Carlo alone: noise even where nothing is in the way, but no bias, however few the
-    /// samples. (The visible fraction of one sample does not know how much that sample would bring: by it, path
-    /// tracing the Cornell box with one shadow ray per vertex is 1 % too dark.)
+    /// Irradiance by Monte Carlo alone: with noise even without occluders, but without bias, however few the samples.
+    /// (The visible fraction of a single sample does not weigh it by its contribution: with the ratio, path tracing the
+    /// Cornell box with one shadow ray per vertex is 1 % too dark.)
     pub fn unbiased(&self, receiver: &Receiver, samples: u32, seed: u32, rays: &mut u64) -> Vec3 {
         self.estimate(receiver, samples, seed, rays, false)
     }
 
-    /// `by_ratio`: area lights and discs as their exact irradiance times the visible fraction.
+    /// Irradiance by samples; `by_ratio`: that of area lights and discs as their exact irradiance times the visible
+    /// fraction.
     fn estimate(&self, receiver: &Receiver, samples: u32, seed: u32, rays: &mut u64, by_ratio: bool) -> Vec3 {
         let mut light = [PointLight::default()];
         self.at_points(&[*receiver], 0, Lights::All, samples, seed, rays, &mut light);
@@ -246,7 +247,7 @@ impl DirectLight {
     /// Direct light at up to [`MAX_POINTS`] points, which are the points `first`, `first + 1`, … of those that share
     /// `seed`: their samples of a light are stratified together. `samples`: per point, as in
     /// [`irradiance`](Self::irradiance).
-    // Seven arguments, of which no two belong together.
+    // Seven arguments, no two of which belong together.
     #[allow(clippy::too_many_arguments)]
     pub(crate) fn at_points(
         &self,
@@ -286,7 +287,7 @@ impl DirectLight {
         shadow: &mut ShadowRays,
         out: &mut PointLight,
     ) {
-        // Skies and many lights begin anew at every point.
+        // The sequences of skies and many lights begin anew at every point.
         let own = if number == 0 { seed } else { combine(seed, 64 + number) };
         shadow.slot += 1;
         if let Some(many) = &self.many {
@@ -308,8 +309,8 @@ impl DirectLight {
         }
     }
 
-    /// Pushes the shadow rays to few area lights. Returns their exact unoccluded irradiance, and what all samples would
-    /// bring.
+    /// Pushes the shadow rays to few area lights. Returns their exact unoccluded irradiance, and the unoccluded sum of
+    /// all samples.
     fn push_areas(
         &self,
         receiver: &Receiver,
@@ -335,7 +336,7 @@ impl DirectLight {
         let (mut light, mut below) = (0, 0.0f32);
         let mut prepared = None;
         for k in 0..n {
-            // Systematic: the k-th ray goes to the light that the k-th stratum of the sum falls on.
+            // Systematic sampling: the k-th ray goes to the light that the k-th stratum of the sum falls on.
             let target = (k as f32 + offset) / n as f32 * importance;
             let share = |i: usize| unoccluded[i] * self.areas[i].radiance.element_sum();
             while light + 1 < self.areas.len() && below + share(light) <= target {

@@ -1,28 +1,28 @@
 //! Importance of many lights: a light tree after Conty Estevez and Kulla, *Importance Sampling of
 //! Many Lights with Adaptive Tree Splitting*, 2018.
 //!
-//! Each node bounds the places, directions and power of its lights, and from those what they can do
-//! to a receiver; where that is nothing (all behind the horizon, all facing away, outside all cones)
-//! it is exactly 0. Instead of one walk per sample with splitting, all samples go down together:
-//! they stand systematically (k + offset)/n on the unit interval, each node divides its part of the
-//! interval among its children by importance, and children that no sample falls on are left alone.
-//! So samples are spread evenly over the tree, and its upper nodes are visited once for all of them.
+//! Each node bounds the positions, directions and power of its lights, and thereby their contribution to a receiver; if
+//! there can be none (all behind the horizon, all facing away, outside all cones) the importance is exactly 0. Instead
+//! of one descent per sample with splitting, all samples descend together: they are spaced systematically, (k +
+//! offset)/n, on the unit interval, each node divides its part of the interval among its children by importance, and
+//! children that no sample falls on are skipped. This spreads the samples evenly over the tree, and its upper nodes are
+//! visited once for all of them.
 
 use crate::error::Result;
 use crate::memory::{try_collect, try_with_capacity};
 use glam::Vec3;
 use std::f32::consts::PI;
 
-/// What buffers are for, in errors.
+/// Name of these buffers in error messages.
 pub(crate) const LIGHT_TREE: &str = "the tree of the lights";
 
-/// Split candidates per axis.
+/// Number of split candidates per axis.
 const BINS: usize = 12;
 
 /// From this depth on nodes are halved, so that the tree is never deeper than some 70 nodes.
 const HALVE_FROM: u32 = 40;
 
-/// What bounds a light, or several.
+/// Bounds of one light, or of several.
 #[derive(Clone, Copy, Debug)]
 pub(crate) struct Bounds {
     pub lower: Vec3,
@@ -30,7 +30,7 @@ pub(crate) struct Bounds {
     /// Directions of the lights' axes: a cone of half-angle `spread` around this unit vector.
     pub axis: Vec3,
     pub spread: f32,
-    /// How far from their axes the lights shine, at most π/2. (An area light: π/2, with the cosine. A
+    /// Maximum angle from their axes at which the lights shine, at most π/2. (An area light: π/2, with the cosine. A
     /// spot has all of its cone as `spread`, and 0.)
     pub reach: f32,
     /// Sum over the channels of radiant intensity, in the direction where it is largest.
@@ -50,8 +50,8 @@ impl Bounds {
         }
     }
 
-    /// Surface area orientation heuristic, section 4.4 of the paper, with the square of the diagonal
-    /// for the surface area: a row or a ceiling of lamps has none.
+    /// Surface area orientation heuristic, section 4.4 of the paper, with the square of the diagonal for the surface
+    /// area, which a row or a ceiling of lamps lacks.
     fn cost(&self) -> f32 {
         let (o, w) = (self.spread, (self.spread + self.reach).min(PI));
         let directions = 2.0 * PI * (1.0 - o.cos())
@@ -73,11 +73,11 @@ fn cone_union(a: (Vec3, f32), b: (Vec3, f32)) -> (Vec3, f32) {
         return (a.0, PI);
     }
     let turn = spread - a.1;
-    // A little more, for what rounding took.
+    // Slightly enlarged to cover rounding.
     ((a.0 * turn.cos() + around.cross(a.0) * turn.sin()).normalize(), (spread + 1e-5).min(PI))
 }
 
-/// 48 bytes; the left child of an inner node is the next one.
+/// A node of 48 bytes; the left child of an inner node follows it.
 #[derive(Clone, Copy, Debug)]
 struct Node {
     centre: Vec3,
@@ -88,7 +88,7 @@ struct Node {
     cos_spread: f32,
     sin_spread: f32,
     cos_reach: f32,
-    /// Right child; of a leaf, the complement of its light's number.
+    /// Right child; for a leaf, the complement of its light's number.
     right: u32,
 }
 
@@ -101,14 +101,14 @@ impl Node {
             power: b.power,
             cos_spread: if b.spread >= PI { -1.0 } else { b.spread.cos() },
             sin_spread: if b.spread >= PI { 0.0 } else { b.spread.sin() },
-            // A little more, for what rounding took.
+            // Slightly enlarged to cover rounding.
             cos_reach: (b.reach + 1e-4).cos(),
             right,
         }
     }
 
-    /// What its lights can do to a receiver, section 4.3 of the paper. (By the distance to the nearest
-    /// instead of the middle of a node: 1.3 to 2 times the error.)
+    /// Importance of the node's lights for a receiver, section 4.3 of the paper. (With the distance to the nearest
+    /// point instead of the centre of a node: 1.3 to 2 times the error.)
     #[inline]
     fn importance(&self, position: Vec3, normal: Vec3) -> f32 {
         let way = self.centre - position;
@@ -132,7 +132,7 @@ impl Node {
     }
 }
 
-/// Cosine of the angle with cosine `cosine`, made smaller by another one, but not below 0.
+/// Cosine of the angle with cosine `cosine`, reduced by another angle, but not below 0.
 #[inline]
 fn less(cosine: f32, by_cos: f32, by_sin: f32) -> f32 {
     if cosine >= by_cos {
@@ -141,16 +141,17 @@ fn less(cosine: f32, by_cos: f32, by_sin: f32) -> f32 {
     cosine * by_cos + (1.0 - cosine * cosine).max(0.0).sqrt() * by_sin
 }
 
-/// Part of the lights of a scene, ready to be sampled.
+/// Light tree over some of the lights of a scene, ready to be sampled.
 pub(crate) struct LightTree {
     nodes: Vec<Node>,
 }
 
 impl LightTree {
-    /// Over lights whose power is greater than 0.
+    /// Builds the tree over the lights whose power is greater than 0.
     pub(crate) fn new(lights: &[Bounds]) -> Result<LightTree> {
         let mut tree = LightTree { nodes: try_with_capacity((2 * lights.len()).saturating_sub(1), LIGHT_TREE)? };
-        // Powers as parts of the whole: times squared lengths, those of large scenes would overflow.
+        // Powers are taken as parts of the whole: those of large scenes would overflow when multiplied by squared
+        // lengths.
         let whole = lights.iter().map(|l| f64::from(l.power)).sum::<f64>();
         let part = |l: &Bounds| Bounds { power: (f64::from(l.power) / whole) as f32, ..*l };
         let mut numbered = try_collect((0u32..).zip(lights.iter().map(part)), LIGHT_TREE)?;
@@ -165,7 +166,7 @@ impl LightTree {
         size_of_val(&self.nodes[..])
     }
 
-    /// `later` has room for all lights.
+    /// Builds the subtree over `lights`. `later` has capacity for all lights.
     fn build(&mut self, lights: &mut [(u32, Bounds)], depth: u32, later: &mut Vec<(u32, Bounds)>) -> Bounds {
         if let [(light, bounds)] = lights {
             self.nodes.push(Node::new(bounds, !*light));
@@ -182,9 +183,9 @@ impl LightTree {
         both
     }
 
-    /// Calls `visit` with each light that gets any of `n` systematic samples: its number, the samples
-    /// that it is due (n times its probability) and those that it gets, which is that rounded down or
-    /// up. `offset` in [0, 1). Lights that can contribute have a probability greater than 0.
+    /// Calls `visit` with each light that gets any of `n` systematic samples: its number, its expected number of
+    /// samples (n times its probability) and its actual number, which is the former rounded down or up. `offset` is in
+    /// [0, 1). Lights that can contribute have a probability greater than 0.
     pub(crate) fn sample(
         &self,
         (position, normal): (Vec3, Vec3),
@@ -226,7 +227,7 @@ impl LightTree {
     }
 }
 
-/// Reorders at least two lights and returns where to cut.
+/// Reorders at least two lights and returns the index at which to split them.
 fn split(lights: &mut [(u32, Bounds)], depth: u32, later: &mut Vec<(u32, Bounds)>) -> usize {
     let half = lights.len() / 2;
     let centre = |b: &Bounds| 0.5 * (b.lower + b.upper);
@@ -241,7 +242,7 @@ fn split(lights: &mut [(u32, Bounds)], depth: u32, later: &mut Vec<(u32, Bounds)
     };
     if depth >= HALVE_FROM || !(size.max_element() > 0.0) {
         let axis = size.max_position();
-        // In place, unlike a stable sort: there may be no memory.
+        // Sorts in place, unlike a stable sort, which may fail to get memory.
         lights.sort_unstable_by(|(i, a), (j, b)| centre(a)[axis].total_cmp(&centre(b)[axis]).then(i.cmp(j)));
         return half;
     }
@@ -276,8 +277,8 @@ fn split(lights: &mut [(u32, Bounds)], depth: u32, later: &mut Vec<(u32, Bounds)
     if middle == 0 || middle == lights.len() { half } else { middle }
 }
 
-/// Puts first those that `is_first` takes, and returns how many they are; all stay in order. `later` has room for the
-/// others.
+/// Moves the values that `is_first` accepts to the front, and returns their number; the order within both groups is
+/// kept. `later` has capacity for the others.
 fn partition<T: Copy>(values: &mut [T], is_first: impl Fn(&T) -> bool, later: &mut Vec<T>) -> usize {
     later.clear();
     let mut first = 0;
@@ -294,8 +295,8 @@ fn partition<T: Copy>(values: &mut [T], is_first: impl Fn(&T) -> bool, later: &m
     first
 }
 
-/// Rounds up. (`f64::ceil` is a call into the C library, as SSE4.1 is not taken for granted: gathering in Sponza with
-/// 45,000 bright patches takes 4 % longer with it.)
+/// Rounds up. (`f64::ceil` is a call into the C library, as SSE4.1 is not assumed: gathering in Sponza with 45,000
+/// bright patches takes 4 % longer with it.)
 #[inline]
 fn ceil(x: f64) -> f64 {
     let towards_zero = x as i64 as f64;

@@ -1,9 +1,10 @@
-//! Light of many lights, or of [bright patches](crate::lightmap::indirect::bright_patches): candidates from the light tree, of which a few get shadow rays.
+//! Sampling of many lights, or of [bright patches](crate::lightmap::indirect::bright_patches): candidates from the
+//! light tree, of which a few get shadow rays.
 //!
-//! Resampled importance sampling (Talbot, Cline and Egbert, *Importance Resampling for Global
-//! Illumination*, 2005), with systematic sampling in both steps: a light that is due at least one
-//! candidate is one, with its exact share; the unoccluded light of the candidates is computed, and
-//! those that bring much of it get a ray each, the rest in proportion.
+//! Resampled importance sampling (Talbot, Cline and Egbert, *Importance Resampling for Global Illumination*, 2005),
+//! with systematic sampling in both steps: a light that is due at least one candidate is one, with its exact share; the
+//! unoccluded light of the candidates is computed, and those that contribute much of it get a ray each, the others in
+//! proportion.
 //!
 //! At equal time 10 to 40 times less error than lights chosen by power; see docs/experiments.md#many-lights.
 
@@ -19,7 +20,7 @@ use crate::scene::Light;
 use glam::Vec3;
 use std::f32::consts::{FRAC_PI_2, PI};
 
-/// Candidates per shadow ray.
+/// Number of candidates per shadow ray.
 const CANDIDATES: u32 = 8;
 
 #[derive(Clone, Copy)]
@@ -33,18 +34,18 @@ enum Source {
 /// A small part of a surface, as a light.
 #[derive(Clone, Copy)]
 pub(crate) struct Patch {
-    /// Off the surface.
+    /// Position, slightly off the surface.
     pub position: Vec3,
-    /// On the side that shines.
+    /// Unit normal on the emitting side.
     pub normal: Vec3,
     /// Radiance times area.
     pub flux: Vec3,
-    /// It only shines on what is further away than this, squared.
+    /// Square of the distance within which the patch does not shine on receivers.
     pub near2: f32,
 }
 
 impl Patch {
-    /// Unoccluded irradiance.
+    /// Unoccluded irradiance at a receiver.
     fn light(&self, receiver: &Receiver) -> Option<Vec3> {
         let way = self.position - receiver.origin;
         let d2 = way.length_squared();
@@ -55,27 +56,26 @@ impl Patch {
     }
 }
 
-/// Lights that are sampled.
+/// Lights that are sampled because they are many.
 pub(crate) struct ManyLights {
     sources: Vec<Source>,
     tree: LightTree,
 }
 
-/// A place on a light, and the light from there if nothing is in the way, divided by the
-/// probability of the candidate.
+/// A point on a light, and its unoccluded light divided by the probability of the candidate.
 struct Candidate {
     target: Vec3,
     light: Vec3,
 }
 
 impl ManyLights {
-    /// Of point and spot lights that shine, and area lights.
+    /// Makes the set of point and spot lights that shine, and of area lights.
     pub(crate) fn new(points: &[Light], areas: &[AreaLight]) -> Result<ManyLights> {
         let sources = points.iter().map(|&p| Source::Point(p)).chain(areas.iter().map(|&a| Source::Area(a)));
         ManyLights::of(try_collect(sources, LIGHT_TREE)?)
     }
 
-    /// Of parts of surfaces.
+    /// Makes the set of small parts of surfaces.
     pub(crate) fn of_patches(patches: Vec<Patch>) -> Result<ManyLights> {
         ManyLights::of(try_collect(patches.into_iter().map(Source::Patch), LIGHT_TREE)?)
     }
@@ -93,8 +93,8 @@ impl ManyLights {
         self.sources.len()
     }
 
-    /// Pushes up to `n` shadow rays, whose sum is the irradiance without bias. Returns what it would be with
-    /// nothing in the way, summed over the channels.
+    /// Pushes up to `n` shadow rays, whose sum is the irradiance without bias. Returns the unoccluded irradiance by the
+    /// same samples, summed over the channels.
     pub(crate) fn push(&self, receiver: &Receiver, n: u32, seed: u32, shadow: &mut ShadowRays) -> f32 {
         let candidates = self.candidates(receiver, n * CANDIDATES, seed);
         let total: f32 = candidates.iter().map(|c| c.light.element_sum()).sum();
@@ -107,7 +107,7 @@ impl ManyLights {
             at += due;
             if due >= 1.0 {
                 shadow.push(shadow_ray(receiver, c.target), c.light);
-                // What it is due beyond a whole ray does not shift the others' chances.
+                // The share beyond whole rays does not shift the others' probabilities.
                 at -= due;
             } else if at >= 0.0 {
                 shadow.push(shadow_ray(receiver, c.target), c.light / due);
@@ -122,7 +122,8 @@ impl ManyLights {
         let offset = sobol_2d(0, combine(seed, 1))[0];
         let mut next = 0;
         self.tree.sample((receiver.origin, receiver.normal), n, offset, &mut |light, due, count| {
-            // A light that is due several gets them rounded down or up and divides its light among them.
+            // A light that is due several candidates gets that number rounded down or up and divides its light among
+            // them.
             let share = 1.0 / if due >= 1.0 { count as f32 } else { due };
             match &self.sources[light] {
                 Source::Point(light) => {

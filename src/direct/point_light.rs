@@ -6,7 +6,7 @@ use crate::scene::{BRIGHTEST, Light};
 use crate::trace::Ray;
 use glam::Vec3;
 
-/// The ray to a light of which every point gets one.
+/// Pushes the ray to a light that gets one from every point.
 pub(crate) fn push_one(light: &Light, receiver: &Receiver, shadow: &mut ShadowRays) {
     if let Light::Directional { direction, irradiance, .. } = *light {
         let cosine = -direction.dot(receiver.normal);
@@ -19,7 +19,7 @@ pub(crate) fn push_one(light: &Light, receiver: &Receiver, shadow: &mut ShadowRa
     }
 }
 
-/// Where a point or spot light is, and its unoccluded irradiance; `None` if it cannot shine there.
+/// Position of a point or spot light, and its unoccluded irradiance; `None` if it cannot shine on the receiver.
 pub(crate) fn point_light(light: &Light, receiver: &Receiver) -> Option<(Vec3, Vec3)> {
     let (position, intensity) = match *light {
         Light::Point { position, intensity } => (position, Vec3::from(intensity)),
@@ -29,7 +29,7 @@ pub(crate) fn point_light(light: &Light, receiver: &Receiver) -> Option<(Vec3, V
         }
         _ => return None,
     };
-    // From the surface itself, not from where rays start: a light may be nearer to it than that.
+    // The direction is that from the surface itself, not from where rays start: a light may be nearer to it than that.
     let way = position.as_dvec3() - receiver.position.as_dvec3();
     let d2 = way.length_squared();
     let cosine = way.dot(receiver.normal.as_dvec3());

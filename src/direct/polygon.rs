@@ -4,9 +4,9 @@
 
 use glam::DVec3;
 
-/// Form factor × π of a polygon seen from the origin with unit normal `normal`: the irradiance if
-/// its radiance is 1. Corners in either order; the sign is dropped. f64 inside: the corner
-/// directions of small or distant lights differ little.
+/// Form factor × π of a polygon seen from the origin with unit normal `normal`: the irradiance if its radiance is 1.
+/// Corners may be in either order; the sign is dropped. Computed in f64: the corner directions of small or distant
+/// lights differ little.
 pub(crate) fn irradiance(corners: &[DVec3], normal: DVec3) -> f64 {
     let mut clipped = [DVec3::ZERO; 5];
     let n = clip_to_horizon(corners, normal, &mut clipped);
@@ -19,7 +19,7 @@ pub(crate) fn irradiance(corners: &[DVec3], normal: DVec3) -> f64 {
         let cross = a.cross(b);
         let sine = cross.length();
         if sine > 0.0 {
-            // atan2 is right for small angles, where acos of the dot product is not.
+            // atan2 is accurate for small angles, unlike acos of the dot product.
             sum += cross * (sine.atan2(a.dot(b)) / sine);
         }
     }

@@ -1,4 +1,4 @@
-//! Points that receive light, on the side of the surface that they are on.
+//! Receivers: points that receive light, each on one side of its surface.
 
 use super::shadow_terminator;
 use crate::scene::Scene;
@@ -8,23 +8,23 @@ use glam::Vec3;
 /// A point that receives light.
 #[derive(Clone, Copy, Debug)]
 pub struct Receiver {
-    /// Where its rays start.
+    /// Origin of rays from the point.
     pub origin: Vec3,
     /// Unit normal of the irradiance.
     pub normal: Vec3,
     /// Unit geometric normal on the same side.
     pub geometric: Vec3,
-    /// The point whose light is wanted: on the surface, or raised from it.
+    /// The point at which light is computed: on the surface, or raised from it.
     pub position: Vec3,
-    /// Where its shadow rays start.
+    /// Origin of shadow rays from the point.
     pub shadow_origin: Vec3,
-    /// Raised to the smooth surface that its normals stand on: the flat one shades nothing there.
+    /// Whether the point is raised to the smooth surface of its normals, where the flat one must not shade it.
     pub raised: bool,
 }
 
 impl Receiver {
-    /// The front (or back) of a point of a triangle. `shading` is the interpolated normal, if the
-    /// mesh has any; it is turned to the side.
+    /// Makes a receiver on the front (or back) of a triangle at a point. `shading` is the interpolated normal, if the
+    /// mesh has any; it is turned to that side.
     pub fn new(scene: &Scene, point: &SurfacePoint, shading: Option<Vec3>, back: bool) -> Receiver {
         let geometric = if back { -point.normal } else { point.normal };
         let normal = match shading {
@@ -36,7 +36,7 @@ impl Receiver {
         Receiver { origin, normal, geometric, position: point.position, shadow_origin: origin, raised: false }
     }
 
-    /// The same on a mesh with normals: those of the corners of the point's triangle.
+    /// Raises the receiver on a mesh with normals, given those of the corners of the point's triangle.
     pub(crate) fn smooth(self, scene: &Scene, corners: [Vec3; 3], normals: [Vec3; 3], uv: [f32; 2]) -> Receiver {
         let normals = normals.map(|n| if n.dot(self.geometric) < 0.0 { -n } else { n });
         match shadow_terminator::raised(scene, corners, normals, uv, self.geometric, self.origin) {
@@ -45,7 +45,7 @@ impl Receiver {
         }
     }
 
-    /// Whether the flat surface faces what lies in a direction, as far as that matters.
+    /// Whether the flat surface faces a direction; always true for raised points, where that does not matter.
     pub(crate) fn faces(&self, direction: Vec3) -> bool {
         self.raised || direction.dot(self.geometric) > 0.0
     }

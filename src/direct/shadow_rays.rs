@@ -1,4 +1,4 @@
-//! Shadow rays, collected and traced together, with the light that comes along them.
+//! Shadow rays, collected and traced together, with the unoccluded light of each.
 
 use super::receiver::Receiver;
 use crate::scene::Scene;
@@ -6,7 +6,7 @@ use crate::trace::Ray;
 use crate::trace::offset::ray_epsilon;
 use glam::Vec3;
 
-/// Shadow rays end this far before a light, as a fraction of the way; before a point at most.
+/// Fraction of the way by which shadow rays end before a light; before a point at most.
 const LIGHT_MARGIN: f32 = 1e-4;
 
 /// The shadow ray to a point on a light.
@@ -14,13 +14,14 @@ pub(crate) fn shadow_ray(receiver: &Receiver, target: Vec3) -> Ray {
     Ray::new(receiver.shadow_origin, target - receiver.shadow_origin).within(0.0, 1.0 - LIGHT_MARGIN)
 }
 
-/// Shadow rays that are traced together. (Direct light of the living room, 20 texels/m: 1.4 s; one by one 2.15 s.)
+/// Number of shadow rays that are traced together. (Direct light of the living room, 20 texels/m: 1.4 s; one by one
+/// 2.15 s.)
 const TOGETHER: usize = 32;
 
-/// Sums of light that [`ShadowRays`] keeps apart.
+/// Number of sums of light that [`ShadowRays`] keeps apart.
 const SLOTS: usize = KINDS * MAX_POINTS;
 
-/// Shadow rays and the light that comes along them if nothing is in the way.
+/// Shadow rays, each with the light that it carries if nothing occludes it.
 pub(crate) struct ShadowRays<'a> {
     scene: &'a Scene,
     rays: [Ray; TOGETHER],
@@ -55,8 +56,8 @@ impl<'a> ShadowRays<'a> {
         self.count += 1;
     }
 
-    /// The ray to a point light. It ends as far before it as rays start from surfaces: a light may lie on a wall,
-    /// but also close inside of a housing that must hold its light back.
+    /// Pushes the ray to a point light. It ends as far before the light as rays start from surfaces: a light may lie on
+    /// a wall, but also close inside of a housing that must block it.
     pub(crate) fn push_point(&mut self, receiver: &Receiver, position: Vec3, light: Vec3) {
         let way = position - receiver.shadow_origin;
         let margin = (ray_epsilon(position, self.scene) / way.length()).min(LIGHT_MARGIN);
@@ -81,7 +82,7 @@ impl<'a> ShadowRays<'a> {
         self.count = 0;
     }
 
-    /// The light that arrives; adds the rays traced to `rays`.
+    /// Traces the remaining rays and returns the light that arrives; adds the rays traced to `rays`.
     pub(crate) fn finish(mut self, rays: &mut u64) -> Vec3 {
         self.trace();
         *rays += self.traced;
@@ -89,8 +90,8 @@ impl<'a> ShadowRays<'a> {
     }
 }
 
-/// Points that are lit together, at most.
+/// Maximum number of points that are lit together.
 pub(crate) const MAX_POINTS: usize = 16;
 
-/// Parts of a point's light that are estimated in different ways.
+/// Number of parts of a point's light that are estimated in different ways.
 pub(crate) const KINDS: usize = 4;

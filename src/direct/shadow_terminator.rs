@@ -1,26 +1,26 @@
-//! Where shadow rays start on smooth normals: Hanika, *Hacking the Shadow Terminator* (Ray Tracing
-//! Gems II, 2021, chapter 4).
+//! Origins of shadow rays on smooth normals: Hanika, *Hacking the Shadow Terminator* (Ray Tracing Gems II, 2021,
+//! chapter 4).
 //!
-//! Normals that are interpolated over flat triangles say that light arrives at places that their own
-//! or a neighbouring triangle shades: black facets where the smooth surface would still be lit. The
-//! paper raises the point to a surface between the planes that the corners' normals stand on, which
-//! clears the triangles of a convex surface and leaves concave ones where they are.
+//! Normals that are interpolated over flat triangles let light arrive at points that their own or a neighbouring
+//! triangle shades: black facets where the smooth surface would still be lit. The paper raises the point to a surface
+//! between the planes perpendicular to the corners' normals, which clears the triangles of a convex surface and leaves
+//! the points of concave ones where they are.
 //!
-//! Two things keep that from lighting what must be dark. Corners whose normals lean far from the
-//! triangle's are hard edges that a modelling tool has smoothed (a box: 55°): they raise nothing. And
-//! what is between the surface and the raised point keeps the point down.
+//! Two conditions prevent that from lighting points that must be dark. Corners whose normals lean far from the
+//! triangle's are hard edges that a modelling tool has smoothed (a box: 55°): they raise nothing. And geometry between
+//! the surface and the raised point keeps the point down.
 
 use crate::scene::Scene;
 use crate::trace::Ray;
 use crate::trace::offset::ray_epsilon;
 use glam::{DVec3, Vec3};
 
-/// Cosine between a corner's normal and the triangle's from which on the corner raises: 45°. A
-/// sphere of twenty triangles, the coarsest that is meant as one, has 37°.
+/// Minimum cosine between a corner's normal and the triangle's with which the corner raises points: 45°. A sphere of
+/// twenty triangles, the coarsest that is meant as one, has 37°.
 const LEAST_COSINE: f32 = 0.7;
 
-/// The raised point of a triangle on the side of `geometric`; `None` if it stays where it is.
-/// `normals`: of the corners, turned to that side. `origin`: where rays from the surface start.
+/// The raised point of a triangle on the side of `geometric`; `None` if it stays where it is. `normals`: those of the
+/// corners, turned to that side. `origin`: origin of rays from the surface.
 pub(crate) fn raised(
     scene: &Scene,
     corners: [Vec3; 3],

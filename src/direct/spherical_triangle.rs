@@ -1,8 +1,8 @@
 //! Directions uniform in the solid angle of a triangle: Arvo, *Stratified Sampling of Spherical
 //! Triangles*, SIGGRAPH 1995.
 //!
-//! Samples uniform in area crowd, as seen from a point close to a light, where the light is far and
-//! matters little. Uniform in solid angle, what each one brings is its cosine at the point: bounded.
+//! Samples uniform in area crowd, as seen from a point close to a light, where the light is far and matters little. If
+//! they are uniform in solid angle, the contribution of each is its cosine at the point: bounded.
 
 use glam::DVec3;
 
@@ -28,7 +28,7 @@ fn solid_angle([a, b, c]: [DVec3; 3]) -> f64 {
 }
 
 impl SphericalTriangle {
-    /// Of corners seen from the origin, in any order; `None` if one of them is the origin or they
+    /// Makes a triangle from corners seen from the origin, in any order; `None` if one of them is the origin or they
     /// lie in a plane with it.
     pub(crate) fn new(corners: [DVec3; 3]) -> Option<SphericalTriangle> {
         let [a, b, c] = corners.map(DVec3::normalize_or_zero);
@@ -40,26 +40,26 @@ impl SphericalTriangle {
         valid.then(|| SphericalTriangle { a, b, c, alpha, sin_alpha, cos_alpha, cos_ab: a.dot(b), solid_angle })
     }
 
-    /// In steradians.
+    /// Solid angle in steradians.
     pub(crate) fn solid_angle(&self) -> f64 {
         self.solid_angle
     }
 
     /// A unit direction, uniform in the triangle for `u` uniform in the unit square.
     pub(crate) fn sample(&self, u: [f32; 2]) -> DVec3 {
-        // The part of the triangle of area u₀ times the whole that has the side ab and a corner on ac.
+        // Corner on ac of the part of the triangle that has the side ab and u₀ times the area of the whole.
         let (s, t) = (u[0] as f64 * self.solid_angle - self.alpha).sin_cos();
         let (p, q) = (t - self.cos_alpha, s + self.sin_alpha * self.cos_ab);
         let cos_side = ((q * t - p * s) * self.cos_alpha - q) / ((q * s + p * t) * self.sin_alpha);
         // Rounding may leave 0/0 at u₀ = 0.
         let cos_side = if cos_side.is_nan() { 1.0 } else { cos_side.clamp(-1.0, 1.0) };
         let corner = towards(self.a, self.c, cos_side);
-        // On the arc from b to that corner.
+        // The direction lies on the arc from b to that corner.
         towards(self.b, corner, 1.0 - u[1] as f64 * (1.0 - corner.dot(self.b)))
     }
 }
 
-/// The direction at the angle with cosine `cosine` from `from` on the arc to `to`.
+/// The direction on the arc from `from` to `to` at the angle from `from` whose cosine is `cosine`.
 fn towards(from: DVec3, to: DVec3, cosine: f64) -> DVec3 {
     let across = to.reject_from_normalized(from).normalize_or_zero();
     from * cosine + across * (1.0 - cosine * cosine).max(0.0).sqrt()

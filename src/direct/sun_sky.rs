@@ -1,12 +1,11 @@
 //! Direct light of discs and skies infinitely far away.
 //!
-//! A disc (the sun) is a ratio estimate as area lights are: its unoccluded irradiance, exact even
-//! where the horizon cuts it (the form factor of a sphere as seen from its tangent cone; Howell, *A
-//! Catalog of Radiation Heat Transfer Configuration Factors*, B-42), times the visible fraction of
-//! directions uniform in it. A constant sky is sampled by cosine, so without occluders it has no
-//! noise. A sky with an image is sampled half by importance, half by cosine, and both halves are
-//! weighted by the density of the mixture (Veach 1997, section 9.2.2). Gather rays that leave the
-//! scene bring nothing: skies are direct light, and would count twice.
+//! A disc (the sun) is a ratio estimate as area lights are: its unoccluded irradiance, exact even where the horizon
+//! cuts it (the form factor of a sphere as seen from its tangent cone; Howell, *A Catalog of Radiation Heat Transfer
+//! Configuration Factors*, B-42), times the visible fraction of directions uniform in it. A constant sky is sampled by
+//! cosine, so without occluders it has no noise. A sky with an image is sampled half by importance, half by cosine, and
+//! both halves are weighted by the density of the mixture (Veach 1997, section 9.2.2). Gather rays that leave the scene
+//! contribute nothing: skies are direct light, and would count twice.
 
 use super::receiver::Receiver;
 use super::shadow_rays::ShadowRays;
@@ -22,15 +21,15 @@ use std::f64::consts;
 pub(crate) struct Disc {
     /// Unit vector to its middle.
     pub to_light: Vec3,
-    /// On a plane that faces it.
+    /// Irradiance on a plane that faces the disc.
     pub irradiance: Vec3,
-    /// Greater than 0, at most π/2.
+    /// Angular radius in radians, greater than 0, at most π/2.
     pub angular_radius: f32,
 }
 
 impl Disc {
-    /// Irradiance at a receiver that sees all of it that is above the horizon, as a part of
-    /// `irradiance`; `cosine`: of the angle between its middle and the normal.
+    /// Irradiance at a receiver from the unoccluded part of the disc above its horizon, as a fraction of `irradiance`;
+    /// `cosine`: that of the angle between the disc's centre and the normal.
     fn unoccluded(&self, cosine: f64) -> f64 {
         let sine = (self.angular_radius as f64).sin();
         if cosine >= sine {
@@ -39,7 +38,7 @@ impl Disc {
         if cosine <= -sine {
             return 0.0;
         }
-        // h is the distance of a unit sphere that looks like the disc.
+        // h is the distance of a unit sphere of the disc's apparent size.
         let h2 = 1.0 / (sine * sine);
         let beyond = (h2 - 1.0).max(0.0);
         let k = (1.0 - h2 * cosine * cosine).max(0.0).sqrt();
@@ -49,7 +48,7 @@ impl Disc {
     }
 
     /// Pushes the shadow rays of samples `first` to `first + samples` of the sequence that `seed` chooses. Returns the
-    /// unoccluded irradiance, and what all samples would bring with nothing in their way.
+    /// unoccluded irradiance, and the unoccluded sum of all samples.
     pub(crate) fn push(
         &self,
         receiver: &Receiver,
@@ -64,7 +63,7 @@ impl Disc {
             return (Vec3::ZERO, Vec3::ZERO);
         }
         let (t, b) = orthonormal_basis(self.to_light);
-        // 1 − cos of the radius, without cancellation.
+        // 1 − cos of the angular radius, without cancellation.
         let height = 2.0 * (0.5 * self.angular_radius).sin().powi(2);
         // Radiance times solid angle: irradiance / (π sin²) · 2π (1 − cos).
         let sine = self.angular_radius.sin();
@@ -104,7 +103,7 @@ pub(crate) fn push_sky(sky: &Sky, receiver: &Receiver, n: u32, seed: u32, shadow
         (0..n).for_each(|k| push(by_cosine(sobol_2d(k, combine(seed, 5))), light));
         return;
     }
-    // All samples of a kind together have the density n/2 · p; both kinds, their sum.
+    // All samples of one kind together have the density n/2 · p; both kinds together, the sum of their densities.
     let half = n.div_ceil(2);
     let weighted = |direction: Vec3, radiance: Vec3, by_image: f32| {
         let cosine = direction.dot(receiver.normal).max(0.0);

@@ -1,13 +1,13 @@
-//! What is seen of the disc of an irradiance estimate.
+//! Visible part of the disc of an irradiance estimate.
 //!
-//! The estimate divides the power of all photons in a disc by the disc's area. Where part of the disc lies beside
-//! the surface – along every edge and in every corner – that is too dark, to half at an edge and to a quarter in the
-//! corner of a box. And where it reaches through a wall, light of the other room comes in. So short rays probe
-//! the disc: those along the normal tell where the surface goes on, and from what they find, and from the photons
-//! themselves, others tell whether it is seen from above the disc's centre. The estimate counts for the part of its light
-//! that comes from photons that are seen, and is divided by the part of the disc, weighted by the filter, where surface
-//! is seen (Jensen 2001, section 7.5, and Hey and Purgathofer, *Advanced Radiance Estimation for Photon Map Global
-//! Illumination*, 2002, divide by the area of the surfaces in the same spirit). Where all of the disc is seen both
+//! The estimate divides the power of all photons in a disc by the disc's area. Where part of the disc lies beside the
+//! surface – along every edge and in every corner – that is too dark, to half at an edge and to a quarter in the corner
+//! of a box. And where the disc reaches through a wall, light of the other room comes in. So short rays probe the disc:
+//! those along the normal find where the surface continues; others test whether the surface points they find, and the
+//! photons themselves, are visible from above the disc's centre. The estimate is multiplied by the part of its light
+//! that comes from visible photons, and divided by the part of the disc, weighted by the filter, where surface is
+//! visible (Jensen 2001, section 7.5, and Hey and Purgathofer, *Advanced Radiance Estimation for Photon Map Global
+//! Illumination*, 2002, divide by the area of the surfaces in the same spirit). Where all of the disc is visible both
 //! are exactly 1. (Pieces of all surfaces in a grid of their own, summed as photons are, left more bias in a furnished
 //! room – 1.4 % of the median point instead of 0.5 % – and were three times as many there as photons.)
 
@@ -18,20 +18,20 @@ use crate::trace::Ray;
 use crate::trace::offset::offset_ray_origin;
 use glam::{Vec2, Vec3};
 
-/// Estimates are raised by a factor of four at most, as the corner of a box needs: on scraps of surface that
-/// hardly any photon hits, more would make single photons shine.
+/// Minimum of the visible part of a disc: estimates are raised by a factor of four at most, as the corner of a box
+/// needs. On scraps of surface that hardly any photon hits, more would make single photons shine.
 const LEAST: f32 = 0.25;
 
-/// Probes of a disc, and photons looked at, at most. Where there are no more photons, what is seen of them is exact.
-/// (16 or 64, or twice [`FIRST`]: the living room 0.125 to 0.126, Sponza by two lamps 9.4e-3 to 1.1e-2, in the sun 5.2e-2 to
-/// 5.9e-2 with four seeds, in no order.)
+/// Maximum number of probes of a disc, and of photons tested. If there are no more photons, the visible part of their
+/// light is exact. (16 or 64, or twice [`FIRST`]: the living room 0.125 to 0.126, Sponza by two lamps 9.4e-3 to 1.1e-2,
+/// in the sun 5.2e-2 to 5.9e-2 with four seeds, in no order.)
 const PROBES: u32 = 32;
 
-/// If these of them are all seen, so are the others, it is supposed: at most points there is no edge nearby. Of a part p
-/// that is hidden, p (1 − p)⁸ escapes notice in the mean, 4 % at most.
+/// Number of first tests after which, if all were visible, the rest are assumed to be visible too: at most points there
+/// is no edge nearby. Of a part p that is hidden, p (1 − p)⁸ escapes notice in the mean, 4 % at most.
 const FIRST: u32 = 8;
 
-/// Irradiance at a point by what is seen from it of the photons and the surface around. Counts the rays that takes.
+/// Irradiance at a point from the photons and the surface that are visible from it. Adds the rays traced to `rays`.
 pub(crate) fn irradiance(map: &PhotonMap, position: Vec3, normal: Vec3, seed: u32, rays: &mut u64) -> Vec3 {
     let estimate = Vec3::from(map.estimate(position, normal));
     if estimate == Vec3::ZERO {
@@ -46,9 +46,9 @@ struct Disc<'a> {
     map: &'a PhotonMap,
     position: Vec3,
     normal: Vec3,
-    /// Above the position, in the cylinder of the estimate, and in the same room.
+    /// Point above the position, in the cylinder of the estimate, and in the same room.
     apex: Vec3,
-    /// How far above.
+    /// Height of the apex above the position.
     up: f32,
     /// Half the height of the cylinder.
     height: f32,
@@ -65,7 +65,7 @@ impl<'a> Disc<'a> {
         Disc { map, position, normal, apex: position + up * normal, up, height }
     }
 
-    /// The part of the disc, weighted by the filter, where surface is seen; in [1/4, 1].
+    /// The part of the disc, weighted by the filter, where surface is visible; in [1/4, 1].
     fn surface(&self, seed: u32, rays: &mut u64) -> f32 {
         let (x, y) = orthonormal_basis(self.normal);
         let (mut covered, mut all) = (0.0, 0.0);
@@ -84,7 +84,7 @@ impl<'a> Disc<'a> {
         (covered / all).max(LEAST)
     }
 
-    /// The part of the photons' light that comes from photons that are seen, by channel.
+    /// The part of the photons' light that comes from visible photons, by channel.
     fn light(&self, seed: u32, rays: &mut u64) -> Vec3 {
         let (mut seen, mut all, mut looked_at, mut hidden) = (Vec3::ZERO, Vec3::ZERO, 0, 0);
         let (photons, cylinder) = (self.map.columns(), &self.map.cylinder);
@@ -105,7 +105,8 @@ impl<'a> Disc<'a> {
         if hidden == 0 { Vec3::ONE } else { seen / all.max(Vec3::splat(f32::MIN_POSITIVE)) }
     }
 
-    /// The surface that faces as the normal below a point at the apex's height, and its normal on that side.
+    /// Finds the surface below a point at the apex's height, if it faces as the normal does; returns the point and its
+    /// normal on that side.
     fn probe(&self, above: Vec3, rays: &mut u64) -> Option<(Vec3, Vec3)> {
         let (scene, normal) = (self.map.scene(), self.normal);
         *rays += 1;
@@ -117,7 +118,7 @@ impl<'a> Disc<'a> {
         (facing.dot(normal) >= SAME_SURFACE).then(|| (above - hit.t * normal, facing))
     }
 
-    /// Whether nothing is between the apex and a surface.
+    /// Whether nothing lies between the apex and a surface point.
     fn sees(&self, point: Vec3, facing: Vec3, rays: &mut u64) -> bool {
         let origin = offset_ray_origin(point, facing, self.map.scene());
         *rays += 1;

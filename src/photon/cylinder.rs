@@ -3,23 +3,23 @@
 use super::PhotonView;
 use glam::Vec3;
 
-/// The least cosine between a photon's surface normal and the estimate's: 60°, coarse tessellations
-/// of columns and vaults included.
+/// Minimum cosine between a photon's surface normal and the estimate's: 60°, coarse tessellations of columns and vaults
+/// included.
 pub(super) const SAME_SURFACE: f32 = 0.5;
 
-/// The volume searched, and the filter in it.
+/// The searched volume, with its filter.
 #[derive(Clone, Copy, Debug)]
 pub(super) struct Cylinder {
     pub(super) radius: f32,
-    /// As a fraction of the radius.
+    /// Half the height, as a fraction of the radius.
     pub(super) half_height: f32,
     pub(super) inverse_k: f32,
-    /// From filtered power to irradiance.
+    /// Factor from filtered power to irradiance.
     pub(super) scale: f64,
 }
 
 impl Cylinder {
-    /// From checked parameters.
+    /// Makes the cylinder from parameters that have been checked.
     pub(super) fn new(radius: f32, half_height: f32, cone_k: f32) -> Self {
         let r = radius as f64;
         let inverse_k = 1.0 / cone_k as f64;

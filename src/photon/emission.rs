@@ -1,4 +1,4 @@
-//! Emission: which light a photon comes from, where it starts, where it goes and what it carries.
+//! Photon emission: the choice of a light, and start, direction and power of each photon.
 //!
 //! Lights get photons in proportion to their power (thesis 3.2.2) by systematic allotment: photon i
 //! stands at (i + offset)/N of the total power, so a light gets its share rounded down or up, and
@@ -10,9 +10,9 @@
 //! Photons are aimed at the scene where that is exact and cheap. A parallel light shines through
 //! the faces of the scene's bounding box that it meets, which is the whole of its light that can
 //! reach the scene. Discs and skies shine through discs around the scene's bounding sphere, each
-//! perpendicular to its photon. A point light outside the box's bounding sphere emits into the cone of that
-//! sphere; the rest of its power is counted as escaped without being traced. Where in all that photons do more
-//! good, [guides](super::guide) tell.
+//! perpendicular to its photon. A point light outside the box's bounding sphere emits into the cone of that sphere; the
+//! rest of its power is counted as escaped without being traced. [Guides](super::guide) send more photons where they
+//! are more useful.
 
 use super::guide::{Guide, PilotPhoton};
 use super::spot::SpotProfile;
@@ -30,14 +30,14 @@ pub(super) struct Emitted {
     pub(super) origin: Vec3,
     /// Unit direction of travel.
     pub(super) direction: Vec3,
-    /// W per channel.
+    /// Power in W per channel.
     pub(super) power: Vec3,
 }
 
-/// Where the photons of a light without geometry start, and where they go.
+/// Distribution of start points and directions of the photons of a light without geometry.
 #[derive(Clone, Copy, Debug)]
 enum Shape {
-    /// From a point into the cone around `axis`, uniformly; `height` is 1 − cos of its half-angle.
+    /// Emission from a point into the cone around `axis`, uniformly; `height` is 1 − cos of its half-angle.
     Cone {
         position: Vec3,
         axis: Vec3,
@@ -48,21 +48,21 @@ enum Shape {
         axis: Vec3,
         profile: SpotProfile,
     },
-    /// From a parallelogram along `direction`.
+    /// Emission from a parallelogram along `direction`.
     Beam {
         corner: Vec3,
         edge_u: Vec3,
         edge_v: Vec3,
         direction: Vec3,
     },
-    /// From all around, in the cone around `axis`, uniformly; `height` as above.
+    /// Emission from all around, in the cone around `axis`, uniformly; `height` as above.
     Disc {
         axis: Vec3,
         height: f64,
     },
-    /// From all around, in proportion to the radiance of a sky (by number).
+    /// Emission from all around, in proportion to the radiance of a sky (by number).
     Sky(usize),
-    /// From a parallelogram, cosine-distributed around `normal`.
+    /// Emission from a parallelogram, cosine-distributed around `normal`.
     Rect {
         corner: Vec3,
         edge_u: Vec3,
@@ -79,7 +79,7 @@ enum Square {
 }
 
 impl Shape {
-    /// The one in which photons that leave something differ most from those that do not; `None`: no guide.
+    /// The pair of random numbers that best separates useful photons from useless ones; `None`: no guide.
     fn square(&self) -> Option<Square> {
         match self {
             Shape::Cone { .. } | Shape::Spot { .. } => Some(Square::Direction),
@@ -92,7 +92,7 @@ impl Shape {
 #[derive(Clone, Copy, Debug)]
 struct Source {
     shape: Shape,
-    /// W per channel.
+    /// Power in W per channel.
     power: DVec3,
 }
 
@@ -106,13 +106,13 @@ pub(super) struct Emission<'a> {
     radius: f32,
     /// First photon of each source, then of each emissive triangle, then the number of photons.
     first: Vec<u64>,
-    /// Of each source.
+    /// Guide of each source, if it has one.
     guides: Vec<Option<Guide>>,
     /// Photons per watt (of the mean over the channels).
     photons_per_watt: f64,
     /// Power of all lights, W per channel.
     pub(super) power: DVec3,
-    /// Of that, what is not aimed at the scene.
+    /// Part of that power that is not aimed at the scene.
     pub(super) unaimed: DVec3,
 }
 
@@ -123,7 +123,7 @@ impl<'a> Emission<'a> {
         let (mut sources, mut skies) = (Vec::new(), Vec::new());
         let mut unaimed = DVec3::ZERO;
         for light in lights {
-            // As many as any light makes.
+            // Capacity for as many sources as any light makes.
             sources.try_reserve(MOST_SOURCES).map_err(|_| no_room(lights.len()))?;
             unaimed += add_sources(scene, light, &mut sources, &mut skies);
         }
@@ -162,8 +162,8 @@ impl<'a> Emission<'a> {
         (light, power / share)
     }
 
-    /// The source that a pilot photon comes from, and its place in the square that a guide divides; `None` for lights
-    /// with an area.
+    /// The source that a pilot photon comes from, and its position in the unit square that a guide divides; `None` for
+    /// lights with an area.
     pub(super) fn guidable(&self, index: u64, p: [f32; 2], d: [f32; 2]) -> Option<(usize, [f32; 2])> {
         let (light, _) = self.light_of(index);
         let square = self.sources.get(light)?.shape.square()?;
@@ -175,7 +175,7 @@ impl<'a> Emission<'a> {
         self.sources.iter().any(|s| s.shape.square().is_some())
     }
 
-    /// From now on guided by pilot photons, each with its source.
+    /// Guides the emission from now on by pilot photons, each given with its source.
     pub(super) fn guide(&mut self, pilot: impl Iterator<Item = (usize, PilotPhoton)>) -> Result<()> {
         let what = "the pilot photons of lights";
         let mut of_source: Vec<Vec<PilotPhoton>> = try_filled(self.sources.len(), Vec::new(), what)?;
@@ -186,8 +186,8 @@ impl<'a> Emission<'a> {
         Ok(())
     }
 
-    /// Photon `index`, its position on the light chosen by `p` and its direction by `d`, both
-    /// uniform in the unit square.
+    /// Emits photon `index`; `p` chooses its position on the light and `d` its direction, both uniform in the unit
+    /// square.
     pub(super) fn emit(&self, index: u64, p: [f32; 2], d: [f32; 2]) -> Emitted {
         let (light, power) = self.light_of(index);
         let mut power = power.as_vec3();
@@ -236,11 +236,11 @@ impl<'a> Emission<'a> {
     fn all_around(&self, direction: Vec3, p: [f32; 2]) -> Vec3 {
         let (t, b) = orthonormal_basis(direction);
         let [x, y] = concentric_disc(p);
-        // A little before the sphere, so that rounding leaves all surfaces ahead.
+        // The point lies a little before the sphere, so that rounding leaves all surfaces ahead.
         self.centre + (t * x + b * y - direction * 1.01) * self.radius
     }
 
-    /// A direction that a sky shines from, and its colour there beside the mean of all photons.
+    /// A direction from which a sky shines, and its colour there relative to the mean of all photons.
     fn sky_direction(&self, sky: &Sky, d: [f32; 2]) -> (Vec3, Vec3) {
         let (from, radiance, density) = sky.sample(d);
         let mean = sky.integral().as_vec3();
@@ -251,7 +251,7 @@ impl<'a> Emission<'a> {
     fn leave_triangle(&self, e: &Emitter, p: [f32; 2], mut d: [f32; 2]) -> (Vec3, Vec3) {
         let mut normal = e.normal;
         if e.two_sided {
-            // The halves of one dimension are the sides: each stays stratified.
+            // Each half of one dimension serves one side of the triangle, so that each stays stratified.
             d[0] *= 2.0;
             if d[0] >= 1.0 {
                 d[0] -= 1.0;
@@ -264,7 +264,7 @@ impl<'a> Emission<'a> {
     }
 }
 
-/// Sources that one light makes, at most: a beam through each of three faces.
+/// Maximum number of sources that one light makes: a beam through each of three faces.
 const MOST_SOURCES: usize = 3;
 
 #[cold]
@@ -315,11 +315,11 @@ fn add_sources(scene: &Scene, light: &Light, sources: &mut Vec<Source>, skies: &
     DVec3::ZERO
 }
 
-/// Middle and radius of the sphere around the scene's bounding box.
+/// Centre and radius of the sphere around the scene's bounding box.
 fn sphere_of_scene(scene: &Scene) -> (Vec3, f32) {
     let (lower, upper) = scene.bounds();
     let (l, u) = (lower.as_dvec3(), upper.as_dvec3());
-    // A little more, so that what rounding puts outside is covered too.
+    // The sphere is slightly enlarged, so that points moved outside by rounding are covered too.
     let radius = 0.5005 * (u - l).length() + ray_epsilon(lower.abs().max(upper.abs()), scene) as f64;
     (((l + u) * 0.5).as_vec3(), radius as f32)
 }
@@ -331,7 +331,7 @@ fn cone_of_scene(scene: &Scene, position: Vec3) -> (Vec3, f64) {
     let (lower, upper) = (lower.as_dvec3(), upper.as_dvec3());
     let to_centre = (lower + upper) * 0.5 - position.as_dvec3();
     let distance = to_centre.length();
-    // A little more than the sphere, so that rounded directions cover its rim too.
+    // The cone is slightly larger than the sphere's, so that rounded directions cover its rim too.
     let radius = 0.5005 * (upper - lower).length() + ray_epsilon(position, scene) as f64;
     if distance <= radius {
         return (Vec3::Z, 2.0);
@@ -341,8 +341,8 @@ fn cone_of_scene(scene: &Scene, position: Vec3) -> (Vec3, f64) {
     ((to_centre / distance).as_vec3(), sin2 / (1.0 + (1.0 - sin2).sqrt()))
 }
 
-/// The up to three faces of the scene's bounding box that parallel light along `direction` enters
-/// through, as corner and edges, moved back against the light so that surfaces in a face are ahead.
+/// The up to three faces of the scene's bounding box through which parallel light along `direction` enters, as corner
+/// and edges, moved back against the light so that surfaces in a face are ahead.
 fn lit_faces(scene: &Scene, direction: Vec3) -> Vec<(Vec3, Vec3, Vec3)> {
     let (lower, upper) = scene.bounds();
     let size = upper - lower;

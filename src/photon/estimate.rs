@@ -16,11 +16,11 @@ use super::grid::Grid;
 use crate::simd::{self, Isa, Lanes, Mask, Simd, entry_point, isa_features};
 use glam::Vec3;
 
-/// Vectors summed in f32 before their sums go to f64: bounds the rounding error to 2⁻¹⁹ while most
-/// estimates go to f64 once.
+/// Number of vectors summed in f32 before their sums are added in f64: bounds the rounding error to 2⁻¹⁹ while most
+/// estimates do that once.
 const FLUSH: usize = 64;
 
-/// Estimates at as many points as all three slices (positions, normals, results) have.
+/// Kernel that computes estimates at as many points as all three slices (positions, normals, results) have.
 pub(super) type EstimateFn = fn(&Grid, &Cylinder, &[[f32; 3]], &[[f32; 3]], &mut [[f32; 3]]);
 
 /// The kernel of an ISA; the portable one if the machine cannot run `isa`.
@@ -65,7 +65,7 @@ kernel!(avx512, Avx512);
 /// Lane numbers.
 static IOTA: [f32; 8] = [0.0, 1.0, 2.0, 3.0, 4.0, 5.0, 6.0, 7.0];
 
-/// Three lanes: a vector per lane.
+/// Three components, each a vector of lanes.
 #[derive(Clone, Copy)]
 struct V3<L>([L; 3]);
 
@@ -88,8 +88,8 @@ impl<L: Lanes> V3<L> {
         }
     }
 
-    // Written out, here and below: closures do not inherit an entry point's target features, and
-    // where one is not inlined (in `array::map`) every operation on lanes becomes a call.
+    // The operations are written out, here and below: closures do not inherit an entry point's target features, and one
+    // that is not inlined (in `array::map`) makes every operation on lanes a call.
     #[inline(always)]
     fn minus(self, o: Self) -> Self {
         V3([self.0[0] - o.0[0], self.0[1] - o.0[1], self.0[2] - o.0[2]])
@@ -166,7 +166,7 @@ unsafe fn estimate<S: Simd>(grid: &Grid, cylinder: &Cylinder, position: Vec3, no
             flush(&mut sum, &mut total, zero);
         }
         let s = cylinder.scale;
-        // A photon in the middle of a disc of 1e-30 units: still a number that others can be added to.
+        // A photon in the middle of a disc of 1e-30 units must still give a number to which others can be added.
         let finite = |x: f64| x.min(crate::scene::BRIGHTEST as f64) as f32;
         [finite(total[0] * s), finite(total[1] * s), finite(total[2] * s)]
     }

@@ -23,13 +23,13 @@ use std::ops::Range;
 
 /// Cell size as a fraction of the search radius.
 const CELL_SIZE: f64 = 0.5;
-/// Most cells per photon, so that the grid's memory stays below that of the photons.
+/// Maximum number of cells per photon, so that the grid's memory stays below that of the photons.
 const CELLS_PER_PHOTON: usize = 4;
-/// Ranges of cells that are sorted in parallel, at most.
+/// Maximum number of ranges of cells that are sorted in parallel.
 const RANGES: usize = 256;
-/// Entries behind the last photon, so that vectors may be loaded from its place.
+/// Number of entries behind the last photon, so that vectors may be loaded from its index.
 const PADDING: usize = 16;
-/// Components of a photon.
+/// Number of components of a photon.
 const COLUMNS: usize = 12;
 
 /// Photon components, each in an array of its own.
@@ -53,7 +53,7 @@ impl Photons {
     }
 }
 
-/// The grid and its photons.
+/// The grid with its photons.
 pub(super) struct Grid {
     pub(super) photons: Photons,
     frame: Frame,
@@ -61,17 +61,17 @@ pub(super) struct Grid {
     starts: Vec<u32>,
 }
 
-/// Where the cells are.
+/// Position and size of the cells.
 #[derive(Clone, Copy, Debug)]
 struct Frame {
     lower: DVec3,
-    /// Cells per scene unit.
+    /// Number of cells per scene unit.
     inverse_size: f64,
     dims: [usize; 3],
 }
 
 impl Frame {
-    /// Cells of about `size` over a box, but at most `most` of them.
+    /// Lays cells of about `size` over a box, but at most `most` of them.
     fn new(lower: Vec3, upper: Vec3, size: f64, most: usize) -> Frame {
         let extent = (upper.as_dvec3() - lower.as_dvec3()).max(DVec3::ZERO);
         let cells = |size: f64| (extent / size).floor() + DVec3::ONE;
@@ -80,7 +80,7 @@ impl Frame {
         if count(size) > most as f64 {
             let (mut low, mut high) = (size, extent.max_element());
             for _ in 0..64 {
-                // By ratio: the sizes may be many orders of magnitude apart.
+                // Bisects by ratio: the sizes may be many orders of magnitude apart.
                 let middle = low.sqrt() * high.sqrt();
                 if count(middle) > most as f64 { low = middle } else { high = middle }
             }
@@ -145,8 +145,8 @@ impl Grid {
         Ok((Grid { photons: Photons { columns, len }, frame, starts }, memory))
     }
 
-    /// Calls `visit` with the photons in all rows that a cylinder may meet, each far from those before, until it returns
-    /// false or has seen all.
+    /// Calls `visit` with the photons in all rows that a cylinder may overlap, each far from those before, until it
+    /// returns false or all have been visited.
     pub(super) fn spread(&self, search: &Search, seed: u32, mut visit: impl FnMut(usize) -> bool) {
         let rows = (search.z.0..search.z.1).flat_map(|z| (search.y.0..search.y.1).map(move |y| (y, z)));
         let runs: Vec<Range<usize>> =
@@ -166,7 +166,7 @@ impl Grid {
         self.photons.columns.iter().map(|c| c.len() * 4).sum::<usize>() + self.starts.len() * 4
     }
 
-    /// The rows of cells that a cylinder around `normal` at `position` may meet.
+    /// The rows of cells that a cylinder around `normal` at `position` may overlap.
     #[inline(always)]
     pub(super) fn search(&self, position: Vec3, normal: Vec3, cylinder: &Cylinder) -> Search {
         let size = self.frame.inverse_size;
@@ -180,20 +180,20 @@ impl Grid {
         let range = |axis: usize| {
             let last = self.frame.dims[axis] as f64 - 1.0;
             let (low, high) = ((centre[axis] - reach[axis]).floor(), (centre[axis] + reach[axis]).floor());
-            // Empty if the cylinder lies outside, or if anything is NaN.
+            // The range is empty if the cylinder lies outside, or if anything is NaN.
             if high >= 0.0 && low <= last { (low.max(0.0) as usize, high.min(last) as usize + 1) } else { (0, 0) }
         };
         let ball2 = grow(radius).powi(2) + half_height.powi(2);
         Search { centre, normal: n, ball2, half_height, y: range(1), z: range(2) }
     }
 
-    /// The run of photons in the part of row (`y`, `z`) that the cylinder may meet.
+    /// The run of photons in the part of row (`y`, `z`) that the cylinder may overlap.
     #[inline(always)]
     pub(super) fn row(&self, s: &Search, y: usize, z: usize) -> (usize, usize) {
         // Nearest and farthest offsets of the row from the cylinder's centre.
         let (dy, dz) = (y as f64 + 0.5 - s.centre.y, z as f64 + 0.5 - s.centre.z);
         let (near_y, near_z) = ((dy.abs() - 0.5).max(0.0), (dz.abs() - 0.5).max(0.0));
-        // The cylinder is in a ball …
+        // The cylinder lies in a ball …
         let left = s.ball2 - near_y * near_y - near_z * near_z;
         if left < 0.0 {
             return (0, 0);
@@ -223,7 +223,8 @@ impl Grid {
     }
 }
 
-/// A step that visits all of `total` places, wherever it starts, each far from the ones before: near the golden section.
+/// A stride that visits all `total` indices, wherever it starts, each far from the ones before: near the golden
+/// section.
 fn spreading_stride(total: usize) -> usize {
     let gcd = |mut a: usize, mut b: usize| {
         while b > 0 {
@@ -235,7 +236,7 @@ fn spreading_stride(total: usize) -> usize {
     (golden.max(1)..).find(|&s| gcd(s, total) == 1).unwrap_or(1)
 }
 
-/// A cylinder in units of cells, a little enlarged, and the rows that it may meet.
+/// A cylinder in units of cells, slightly enlarged, and the rows that it may overlap.
 pub(super) struct Search {
     centre: DVec3,
     normal: DVec3,
@@ -255,7 +256,7 @@ fn bounds(blocks: &[Vec<StoredPhoton>]) -> (Vec3, Vec3) {
     if lower.x <= upper.x { (lower, upper) } else { (Vec3::ZERO, Vec3::ZERO) }
 }
 
-/// Consecutive cells, taken together.
+/// Ranges of consecutive cells.
 struct Ranges {
     cells: usize,
     per_range: usize,
@@ -271,7 +272,7 @@ impl Ranges {
     }
 }
 
-/// Sorts a block by range of cells, stably. Returns where each range starts, and the block's length.
+/// Sorts a block by range of cells, stably. Returns the start of each range, and the block's length.
 fn sort_block(block: &mut Vec<StoredPhoton>, frame: &Frame, ranges: &Ranges) -> Result<Vec<u32>> {
     let range_of = |p: &StoredPhoton| frame.cell(p.position) / ranges.per_range;
     let mut offsets: Vec<u32> = try_vec(ranges.count() + 1, "the photons being sorted")?;
@@ -295,7 +296,7 @@ fn sort_block(block: &mut Vec<StoredPhoton>, frame: &Frame, ranges: &Ranges) -> 
 /// A range's own part of the arrays.
 struct Part<'a> {
     range: usize,
-    /// Place of the part's first photon in the whole.
+    /// Index of the part's first photon in the whole.
     first: u32,
     starts: &'a mut [u32],
     columns: [&'a mut [f32]; COLUMNS],

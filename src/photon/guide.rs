@@ -1,33 +1,33 @@
 //! Emission guided by a pilot: more photons go where they lead to surfaces that light reaches only by reflection.
 //!
-//! Most photons of a sun meet roofs and are gone; what lights the rooms comes through few windows. So a part of the
-//! photons is traced first, and the square of random numbers by which a light chooses where its photons go, or where they
-//! come in, is divided in cells. A cell gets photons in proportion to the root mean square of how many its
-//! pilot photons left on surfaces after a reflection (the allocation of Neyman, *On the Two Different Aspects of the
-//! Representative Method*, 1934), each with as much less power. (Dutré and Willems, *Potential-Driven Monte Carlo
-//! Particle Tracing for Diffuse Environments with Adaptive Probability Density Functions*, 1995, guide all reflections
-//! so, by what they bring to a picture.)
+//! Most photons of the sun hit roofs and are lost; rooms are lit through a few windows. So a part of the photons is
+//! traced first, as a pilot, and the square of random numbers by which a light chooses directions or start points of
+//! its photons is divided into cells. A cell gets photons in proportion to the root mean square of the number of
+//! photons that its pilot photons left on surfaces after a reflection (the allocation of Neyman, *On the Two Different
+//! Aspects of the Representative Method*, 1934), each with as much less power. (Dutré and Willems, *Potential-Driven
+//! Monte Carlo Particle Tracing for Diffuse Environments with Adaptive Probability Density Functions*, 1995, guide all
+//! reflections in this way, by their contribution to a picture.)
 //!
 //! Each light has a guide of its own. Measured: docs/experiments.md#photon-guiding.
 
-/// Pilot photons per cell, at least.
+/// Minimum number of pilot photons per cell.
 const PER_CELL: usize = 32;
 
-/// Cells along an axis, at most.
+/// Maximum number of cells along an axis.
 const MAX_SIDE: usize = 64;
 
-/// A cell gets at least this part of the photons that it would get without a guide.
+/// Minimum density of a cell, relative to that without a guide.
 const LEAST: f32 = 0.5;
 
-/// Without this many times the photons on surfaces there is no guide: powers that differ are noise too.
+/// Minimum gain of photons on surfaces for which a guide is used: powers that differ are noise too.
 const GAIN: f32 = 1.25;
 
 /// A photon of the pilot.
 #[derive(Clone, Copy, Debug)]
 pub(super) struct PilotPhoton {
-    /// Its place in the square.
+    /// Position in the unit square.
     pub place: [f32; 2],
-    /// How many times it was left on a surface after a reflection.
+    /// Number of times it was left on a surface after a reflection.
     pub left: u32,
 }
 
@@ -35,14 +35,14 @@ pub(super) struct PilotPhoton {
 #[derive(Clone, Debug, PartialEq)]
 pub(super) struct Guide {
     side: usize,
-    /// Of the rows, cumulative, from 0 to 1.
+    /// Cumulative distribution of the rows, from 0 to 1.
     rows: Vec<f32>,
-    /// Of each row, over its columns, likewise.
+    /// Cumulative distribution of the columns of each row, from 0 to 1.
     columns: Vec<f32>,
 }
 
 impl Guide {
-    /// From the pilot photons of a light; `None` if a guide does not pay.
+    /// Makes a guide from the pilot photons of a light; `None` if it would not pay.
     pub(super) fn new(pilot: &[PilotPhoton]) -> Option<Guide> {
         let mut side = 1;
         while 4 * side * side * PER_CELL <= pilot.len() && side < MAX_SIDE {
@@ -74,25 +74,25 @@ impl Guide {
         Some(Guide { side, rows: cumulative(&sums), columns: raised.chunks(side).flat_map(cumulative).collect() })
     }
 
-    /// A place with the guide's density, from a uniform one; and the density.
+    /// Maps a uniform point of the unit square to one with the guide's density; returns that density too.
     pub(super) fn place(&self, [x, y]: [f32; 2]) -> ([f32; 2], f32) {
         let (row, y, of_row) = invert(&self.rows, y);
         let stride = self.side + 1;
         let (column, x, of_column) = invert(&self.columns[row * stride..(row + 1) * stride], x);
         let place = |cell: usize, within: f32| (cell as f32 + within) / self.side as f32;
-        // Rounding must not put it into the next cell, whose density is another one; nor on 1.
+        // Rounding must not put the point into the next cell, whose density is different; nor on 1.
         let inside = |cell: usize, p: f32| p.min((cell + 1) as f32 / self.side as f32 * (1.0 - f32::EPSILON));
         ([inside(column, place(column, x)), inside(row, place(row, y))], of_row * of_column)
     }
 }
 
-/// The cell of a place.
+/// The cell of a point of the unit square.
 fn cell([x, y]: [f32; 2], side: usize) -> usize {
     let at = |v: f32| ((v * side as f32) as usize).min(side - 1);
     at(y) * side + at(x)
 }
 
-/// Sums of the first 0, 1, … parts of the whole.
+/// Cumulative sums of parts of the whole: of the first 0, 1, … parts.
 fn cumulative(parts: &[f32]) -> Vec<f32> {
     let whole: f64 = parts.iter().map(|&p| f64::from(p)).sum();
     let mut sum = 0.0;
@@ -106,7 +106,7 @@ fn cumulative(parts: &[f32]) -> Vec<f32> {
     sums
 }
 
-/// The part that a number in [0, 1) falls in, where in it, and the density there.
+/// The part that a number in [0, 1) falls in, the position in it, and the density there.
 fn invert(sums: &[f32], at: f32) -> (usize, f32, f32) {
     let part = (sums.partition_point(|&s| s <= at) - 1).min(sums.len() - 2);
     let width = sums[part + 1] - sums[part];

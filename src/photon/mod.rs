@@ -7,7 +7,7 @@
 //! | `radius.rs` | the automatic search radius |
 //! | `grid.rs` | photons sorted into a uniform grid, one array per component |
 //! | `estimate.rs` | the irradiance estimate, over the lanes of each ISA |
-//! | `coverage.rs` | what is seen of its disc |
+//! | `coverage.rs` | the visible part of the estimate's disc |
 //!
 //! The same seed and ISA give the same map and the same estimates for any number of threads.
 
@@ -34,7 +34,7 @@ use rayon::prelude::*;
 use std::sync::{Arc, OnceLock};
 use std::time::Instant;
 
-/// The most photons that can be emitted: their numbers are 32-bit.
+/// Maximum number of photons that can be emitted: their numbers are 32-bit.
 pub const MAX_PHOTONS: u64 = 1 << 32;
 
 /// Parameters of a photon map.
@@ -43,26 +43,26 @@ pub struct PhotonParams {
     /// Photons emitted, 1 to [`MAX_PHOTONS`]. A sixteenth as many, at most 65,536, are traced before to find out where
     /// to send them.
     pub photon_count: u64,
-    /// Most surface interactions per photon (1: direct light only); 0: Russian roulette alone ends
-    /// paths, and [`PATH_LIMIT`] as a safeguard.
+    /// Maximum number of surface interactions per photon (1: direct light only); 0: paths are ended by Russian roulette
+    /// alone, and by [`PATH_LIMIT`] as a safeguard.
     pub max_bounces: u32,
     /// Search radius of the estimate in scene units; 0: chosen so that the average disc on the
     /// surfaces that photons reached holds about [`PHOTONS_PER_DISC`].
     pub radius: f32,
-    /// The least automatic radius, in scene units: half the distance of the places that are asked for, so that the discs
-    /// around them leave no photon out.
+    /// Minimum of the automatic radius, in scene units: half the distance between the points where estimates are
+    /// needed, so that the discs around them leave no photon out.
     pub least_radius: f32,
     /// Half the height of the search cylinder, as a fraction of the radius; more than 0.
     pub half_height: f32,
     /// Jensen's cone filter constant, ≥ 1; infinity: no filter.
     pub cone_k: f32,
-    /// Chooses the random numbers.
+    /// Seed of the random numbers.
     pub seed: u64,
     /// Bytes that the map may take while it is made; 0: no limit.
     pub memory_budget: u64,
     /// Whether photons are stored at their first surface too (direct light).
     pub store_direct: bool,
-    /// About so many photons are stored at most; of more, every n-th with n times the power. 0: all.
+    /// Approximate maximum number of stored photons; of more, every n-th is stored with n times the power. 0: all.
     pub most_stored: u64,
 }
 
@@ -117,7 +117,7 @@ pub const PATH_LIMIT: u32 = 10_000;
 /// is worth more than smoothness.
 pub const PHOTONS_PER_DISC: f64 = 60.0;
 
-/// What tracing did.
+/// Statistics of photon tracing.
 ///
 /// The light that hits surfaces is accounted by expectation at each interaction (reflectance times
 /// power), so `absorbed + escaped + truncated = emitted` holds up to the sampling error of Russian
@@ -130,14 +130,14 @@ pub struct PhotonStats {
     pub stored: u64,
     /// Rays traced.
     pub rays: u64,
-    /// Power of all lights, W per channel. Of directional lights: what meets the bounding box; of those
-    /// with a disc and of skies: what meets the bounding sphere.
+    /// Power of all lights, W per channel. For directional lights: the power that reaches the bounding box; for those
+    /// with a disc and for skies: the power that reaches the bounding sphere.
     pub emitted_power: [f64; 3],
-    /// Absorbed by surfaces, including the back sides of one-sided ones.
+    /// Power absorbed by surfaces, including the back sides of one-sided ones, W per channel.
     pub absorbed_power: [f64; 3],
-    /// Missed every surface, or was not aimed at the scene to begin with.
+    /// Power that missed every surface, or was not aimed at the scene to begin with, W per channel.
     pub escaped_power: [f64; 3],
-    /// Would have been reflected where `max_bounces` (or [`PATH_LIMIT`]) ended the path.
+    /// Power that would have been reflected where `max_bounces` (or [`PATH_LIMIT`]) ended the path, W per channel.
     pub truncated_power: [f64; 3],
     /// Wall time of emission and tracing.
     pub trace_seconds: f64,
@@ -160,11 +160,11 @@ pub struct PhotonView<'a> {
 
 /// The stored photons as packed triples.
 pub struct PackedPhotons {
-    /// In scene units.
+    /// Positions in scene units.
     pub position: Vec<[f32; 3]>,
     /// Unit directions of travel.
     pub direction: Vec<[f32; 3]>,
-    /// W per channel.
+    /// Power in W per channel.
     pub power: Vec<[f32; 3]>,
     _memory: Reservation,
 }
@@ -200,7 +200,7 @@ impl PhotonView<'_> {
     }
 }
 
-/// Estimates are handed to threads in blocks of this many points: some 50 µs of work.
+/// Number of points per block in which estimates are handed to threads: some 50 µs of work.
 const BLOCK: usize = 128;
 
 /// Photons on the surfaces of a scene, in a uniform grid.
@@ -224,7 +224,7 @@ impl PhotonMap {
         scene.device().run(progress, || Self::trace_within(scene, params, progress, 0.0, 1.0))
     }
 
-    /// The same as a part of a longer call: reports progress over `[from, to]` of the bar.
+    /// Does the work of `trace` as a part of a longer call: reports progress over `[from, to]` of the bar.
     pub fn trace_within(
         scene: &Arc<Scene>,
         params: &PhotonParams,
@@ -265,12 +265,12 @@ impl PhotonMap {
         })
     }
 
-    /// The scene that it was made from.
+    /// The scene that the map was made from.
     pub fn scene(&self) -> &Arc<Scene> {
         &self.scene
     }
 
-    /// Numbers about the tracing.
+    /// Statistics of the tracing.
     pub fn stats(&self) -> PhotonStats {
         self.stats
     }
@@ -285,9 +285,9 @@ impl PhotonMap {
         self.grid.bytes()
     }
 
-    /// Irradiance (W/m²) at `position` on the side that the unit vector `normal` points to: the
-    /// photons in a cylinder around the normal, whose surfaces face within 60° of it and whose
-    /// light comes from the front, weighted by Jensen's cone filter.
+    /// Irradiance (W/m²) at `position` on the side that the unit vector `normal` points to: from the photons in a
+    /// cylinder around the normal, whose surfaces face within 60° of it and whose light comes from the front, weighted
+    /// by Jensen's cone filter.
     ///
     /// The estimate assumes that the disc lies wholly on the surface: less than a radius from an
     /// edge it falls, to half at the edge itself.
@@ -341,7 +341,7 @@ impl PhotonMap {
             return Ok(packed);
         }
         let packed = PackedPhotons::new(self.columns(), self.scene.device().memory())?;
-        // Of two threads that come here at once, one keeps its copy.
+        // If two threads make copies at once, one copy is kept.
         Ok(self.packed.get_or_init(|| packed))
     }
 }

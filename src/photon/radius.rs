@@ -1,5 +1,5 @@
-//! The automatic search radius: one with which the average disc on the surfaces that photons
-//! reached holds about K photons, π r² · stored / lit area = K.
+//! The automatic search radius: chosen so that the average disc on the surfaces that photons reached holds about K
+//! photons, π r² · stored / lit area = K.
 //!
 //! The lit area is measured by counting: photons are put into cubic cells of the size at which an
 //! occupied cell holds some 16 of the photons looked at, so that few lit cells are missed. A plane
@@ -18,19 +18,19 @@ use crate::memory::{try_collect, try_par_collect};
 use glam::{DVec3, Vec3};
 use rayon::prelude::*;
 
-/// What buffers are for, in errors.
+/// Name of these buffers in error messages.
 const SAMPLED: &str = "the photons that tell the search radius";
-/// Photons looked at, at most: evenly spaced ones in order of emission.
+/// Maximum number of photons sampled: evenly spaced ones in order of emission.
 const SAMPLES: usize = 1 << 17;
-/// The least average number of samples per occupied cell.
+/// Minimum average number of samples per occupied cell.
 const PER_CELL: usize = 16;
-/// Bits per axis of the finest cells.
+/// Number of bits per axis of the finest cells.
 const LEVELS: u32 = 20;
-/// Where the corner of the cells is, in extents below the photons.
+/// Offset of the cells' corner below the photons, in extents.
 const SHIFT: DVec3 = DVec3::new(0.3713, 0.7237, 0.1829);
 
-/// Radius with which the average disc holds `per_disc` photons; at most `diagonal`, also if there
-/// are no photons. Positive for every `diagonal` > 0.
+/// The radius with which the average disc holds `per_disc` photons; at most `diagonal`, also if there are no photons.
+/// Positive for every `diagonal` > 0.
 pub(super) fn automatic(blocks: &[Vec<StoredPhoton>], diagonal: f32, per_disc: f64) -> Result<f32> {
     let stored: usize = blocks.iter().map(Vec::len).sum();
     let area = lit_area(blocks, stored)?;
@@ -79,7 +79,7 @@ fn facing(n: Vec3) -> u64 {
     2 * axis as u64 + (n[axis] < 0.0) as u64
 }
 
-/// Bit i of a 21-bit x to bit 3i: halves move apart, then quarters, …
+/// Moves bit i of a 21-bit x to bit 3i: halves move apart, then quarters, …
 fn spread(x: u64) -> u64 {
     let x = (x | x << 32) & 0x001f_0000_0000_ffff;
     let x = (x | x << 16) & 0x001f_0000_ff00_00ff;

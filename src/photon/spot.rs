@@ -16,7 +16,7 @@ pub(super) struct SpotProfile {
 }
 
 impl SpotProfile {
-    /// From the half-angles in radians, 0 ≤ `inner` ≤ `outer` ≤ π.
+    /// Makes the profile from the half-angles in radians, 0 ≤ `inner` ≤ `outer` ≤ π.
     pub(super) fn new(inner: f32, outer: f32) -> Self {
         // 1 − cos a = 2 sin²(a/2), without cancellation for narrow cones.
         let height = |a: f32| 2.0 * (0.5 * a as f64).sin().powi(2);

@@ -20,40 +20,40 @@ use glam::{DVec3, Vec3};
 use rayon::prelude::*;
 use std::sync::{Arc, Mutex};
 
-/// Photons per block: some 5 ms of work, so that cancelling is quick and threads stay busy.
+/// Number of photons per block: some 5 ms of work, so that cancelling is quick and threads stay busy.
 const BLOCK: u64 = 1024;
 
 /// Memory is announced in steps of this many bytes while photons are traced.
 const MEMORY_STEP: usize = 16 << 20;
 
-/// The same within a block, as its photons are stored.
+/// Memory is announced in steps of this many bytes within a block, as its photons are stored.
 const BLOCK_STEP: usize = 1 << 20;
 
-/// A pilot of one photon in so many tells where to send the others.
+/// Divisor of the photon count for the pilot, from which guides are made.
 const PILOT_PART: u64 = 16;
 
-/// Pilot photons, at most.
+/// Maximum number of pilot photons.
 const MAX_PILOT: u64 = 1 << 16;
 
-/// What makes their random numbers others.
+/// Changes the seed for the random numbers of the pilot.
 const PILOT_SEED: u64 = u64::from_be_bytes(*b"phopilot");
 
 /// A pilot photon and its source.
 type Guidable = (usize, PilotPhoton);
 
-/// A path is taken to store at most so many photons: if those of all paths are allowed, no block is traced to find out
-/// how many there will be. (At albedo 0.98 it is 50.)
+/// Assumed maximum number of photons that a path stores: if those of all paths are allowed, no block is traced to
+/// estimate their number. (At albedo 0.98 it is 50.)
 const MOST_PER_PATH: u64 = 64;
 
-/// What photon random numbers are drawn for.
+/// Purpose of photon random numbers.
 const PURPOSE: u32 = u32::from_be_bytes(*b"phot");
-/// Dimensions: the start of a path, its length, then one per surface met.
+/// Dimensions: the start of a path, its length, then one per surface hit.
 const ALLOTMENT: u32 = 0;
 const EMIT_POSITION: u32 = 1;
 const EMIT_DIRECTION: u32 = 2;
 const ROULETTE: u32 = 3;
 const BOUNCE: u32 = 4;
-/// Far from those of surfaces.
+/// Dimension of the choice of stored photons, far from those of surfaces.
 const STORED: u32 = u32::MAX;
 
 /// A photon on a surface.
@@ -62,15 +62,15 @@ pub(super) struct StoredPhoton {
     pub(super) position: Vec3,
     /// Unit direction of travel.
     pub(super) direction: Vec3,
-    /// W per channel.
+    /// Power in W per channel.
     pub(super) power: Vec3,
-    /// Unit geometric normal on the side that was hit. The estimate compares it with that of the
-    /// point asked for, to leave out photons of the other wall in a corner. Three floats rather
-    /// than a packed octahedral one: the lanes then compare it without unpacking.
+    /// Unit geometric normal on the side that was hit. The estimate compares it with that of its point, to leave out
+    /// photons of the other wall in a corner. Three floats rather than a packed octahedral one: the lanes then compare
+    /// it without unpacking.
     pub(super) normal: Vec3,
 }
 
-/// Photons in order of blocks, within a block by bounce and number.
+/// Stored photons in order of blocks, within a block by bounce and number.
 pub(super) struct Traced {
     pub(super) blocks: Vec<Vec<StoredPhoton>>,
     pub(super) stats: PhotonStats,
@@ -117,7 +117,7 @@ pub(super) fn trace(
     Ok(Traced { blocks, stats, memory })
 }
 
-/// The rays of all paths.
+/// Records the rays of all paths.
 pub(super) fn record_rays(scene: &Arc<Scene>, lights: &[Light], params: &PhotonParams) -> Result<Vec<Ray>> {
     let tracer = Tracer::guided(scene, lights, params)?;
     let mut rays = Vec::new();
@@ -149,21 +149,21 @@ impl Tally {
 #[derive(Clone, Copy)]
 struct Path {
     photon: u32,
-    /// What Russian roulette is played with: uniform in (0, 1), given that the path is still alive.
+    /// Random number of Russian roulette: uniform in (0, 1), given that the path is still alive.
     luck: f32,
     power: Vec3,
-    /// How often it was reflected.
+    /// Number of reflections so far.
     bounces: u32,
 }
 
-/// What a path meets.
+/// The surface that a path hits.
 #[derive(Clone, Copy)]
 struct Surface {
     corners: [Vec3; 3],
     /// Barycentric weights of vertices 1 and 2.
     weights: [f32; 2],
     front: bool,
-    /// [`NONE`] where nothing was hit.
+    /// Material number; [`NONE`] if nothing was hit.
     material: u32,
     albedo: Vec3,
 }
@@ -177,12 +177,12 @@ struct Tracer<'a> {
     scene: &'a Scene,
     emission: Emission<'a>,
     seed: u32,
-    /// Most surface interactions per path, passages through sheets not counted.
+    /// Maximum number of surface interactions per path, passages through sheets not counted.
     limit: u32,
     store_direct: bool,
     /// The part of the photons on surfaces that is stored.
     stored_part: f32,
-    /// Rays that it took to find guides and how much is to be stored.
+    /// Number of rays traced to find guides and the part of photons to be stored.
     pilot_rays: u64,
 }
 
@@ -195,7 +195,7 @@ impl<'a> Tracer<'a> {
         Ok(Tracer { scene, emission, seed, limit, store_direct, stored_part: 1.0, pilot_rays: 0 })
     }
 
-    /// The same with guides, if there are photons enough to find any.
+    /// Makes a tracer with guides, if there are enough photons to find any.
     fn guided(scene: &'a Scene, lights: &[Light], params: &PhotonParams) -> Result<Self> {
         let count = (params.photon_count / PILOT_PART).min(MAX_PILOT);
         let mut tracer = Tracer::new(scene, lights, params)?;
@@ -216,8 +216,8 @@ impl<'a> Tracer<'a> {
         0..self.emission.count().div_ceil(BLOCK) as usize
     }
 
-    /// Has only a part of the photons stored if they would be more than `most` (0: any number) in all, judging by the first
-    /// block.
+    /// Stores only a part of the photons if they would be more than `most` (0: any number) in all, estimated from the
+    /// first block.
     fn thin_out(&mut self, most: u64) -> Result<()> {
         let count = self.emission.count();
         if most == 0 || count < BLOCK || count.saturating_mul(MOST_PER_PATH) < most {
@@ -230,12 +230,12 @@ impl<'a> Tracer<'a> {
         Ok(())
     }
 
-    /// The photons of a block that can be guided, with how many they left on surfaces but where they ended; and the rays
-    /// traced.
+    /// The photons of a block that can be guided, with the number of photons that each left on surfaces after a
+    /// reflection, without the last one; and the number of rays traced.
     fn left_by_block(&self, block: u64) -> Result<(Vec<Guidable>, u64)> {
         let mut left = [0; BLOCK as usize];
         let (_, tally) = self.block(block, None, |step, _, paths| {
-            // What goes on from a surface after the first was left on it.
+            // A path that continues from a surface after the first has left a photon on it.
             if step >= 2 {
                 paths.iter().for_each(|p| left[(u64::from(p.photon) - block * BLOCK) as usize] += 1);
             }
@@ -249,8 +249,8 @@ impl<'a> Tracer<'a> {
         Ok((try_collect(guidable, "pilot photons")?, tally.rays))
     }
 
-    /// Traces one block of photons; `watch` may cancel and counts the memory; `see` gets the number, the rays and the
-    /// paths of each wave.
+    /// Traces one block of photons; `watch` may cancel and counts the memory; `see` receives the number, the rays and
+    /// the paths of each wave.
     fn block(
         &self,
         block: u64,
@@ -269,7 +269,7 @@ impl<'a> Tracer<'a> {
         let mut hits = try_filled(rays.len(), RawHit::MISS, what)?;
         let mut surfaces = try_filled(rays.len(), Surface::NOTHING, what)?;
         let (mut stored, mut announced) = (Vec::new(), 0);
-        // Every n-th photon is stored, from a random one on.
+        // Every n-th photon is stored, beginning with a random one.
         let (mut due, mut kept) = (uniform(block as u32, STORED, self.seed), 0);
         let mut tally = Tally::default();
         for step in 0..PATH_LIMIT {
@@ -291,8 +291,8 @@ impl<'a> Tracer<'a> {
             self.scene.intersect_block(&rays, &mut hits);
             tally.rays += rays.len() as u64;
             stored.try_reserve(rays.len()).map_err(|e| Error::OutOfMemory(format!("the photons being traced: {e}")))?;
-            // In a loop of its own, short enough for the processor to work on the cache misses of
-            // several hits at a time: within the next one, tracing Sponza took a tenth longer.
+            // Surfaces have a loop of their own, short enough for the processor to overlap the cache misses of several
+            // hits: within the next loop, tracing Sponza took a tenth longer.
             for (surface, hit) in surfaces.iter_mut().zip(&hits[..rays.len()]) {
                 *surface = self.surface(hit);
             }
@@ -321,13 +321,13 @@ impl<'a> Tracer<'a> {
     fn emit(&self, photon: u32) -> (Ray, Path) {
         let at = |dimension| sobol_2d(photon, combine(self.seed, dimension));
         let e = self.emission.emit(photon as u64, at(EMIT_POSITION), at(EMIT_DIRECTION));
-        // All 32 bits: of paths with 10⁷ others, the longest are decided by the last.
+        // Uses all 32 bits: the longest of 10⁷ paths are decided by the last bits.
         let [luck, _] = sobol_2d_bits(photon, combine(self.seed, ROULETTE));
         let luck = ((luck as f64 + 0.5) / (1u64 << 32) as f64) as f32;
         (Ray::new(e.origin, e.direction), Path { photon, luck, power: e.power, bounces: 0 })
     }
 
-    /// What the hit lies on.
+    /// The surface of a hit.
     #[inline]
     fn surface(&self, hit: &RawHit) -> Surface {
         if hit.is_miss() {
@@ -346,7 +346,8 @@ impl<'a> Tracer<'a> {
         }
     }
 
-    /// What becomes of a path at the end of `ray`, the `step`-th: the photon is stored, and goes on or not.
+    /// Continues a path at the end of `ray`, the `step`-th: stores the photon, and returns the next ray if the path
+    /// goes on.
     #[inline]
     fn interact(
         &self,
@@ -390,13 +391,13 @@ impl<'a> Tracer<'a> {
         // the least noise (Jensen 2001, section 5.2).
         let brightest = path.power.max_element();
         let (reflects, passes) = (reflected.max_element() / brightest, passed.max_element() / brightest);
-        // More than 1 together where other channels are reflected than pass.
+        // The sum is more than 1 if different channels are reflected and transmitted.
         let all = (reflects + passes).max(1.0);
         let (reflects, passes) = (reflects / all, passes / all);
-        // One number decides a whole path: what is below a probability is uniform again when divided by
-        // it. The numbers of all photons being stratified, so are the lengths of their paths, and the power
-        // that reaches surfaces is almost free of noise (albedo 0.999, 2,000 photons: with independent
-        // numbers it was off by 2 %). Below neither if they are NaN, of photons too faint for f32.
+        // One number decides a whole path: if it is below a probability, it is uniform again when divided by it. Since
+        // the numbers of all photons are stratified, so are the lengths of their paths, and the power that reaches
+        // surfaces is almost free of noise (albedo 0.999, 2,000 photons: with independent numbers it was off by 2 %).
+        // NaN probabilities, of photons too faint for f32, end the path.
         if path.luck < reflects {
             let u = sobol_2d(path.photon, combine(self.seed, BOUNCE + step));
             let origin = offset_ray_origin(point.interior, normal, self.scene);
@@ -412,8 +413,8 @@ impl<'a> Tracer<'a> {
     }
 }
 
-/// Keeps one in 1/`part` of the photons from `kept` on, systematically, with the power of all. `due`: the part of a
-/// photon that is due from before.
+/// Keeps one in 1/`part` of the photons from `kept` on, systematically, with the power of all. `due`: fraction of a
+/// photon carried over from before.
 fn thin_out(stored: &mut Vec<StoredPhoton>, kept: &mut usize, part: f32, due: &mut f32) {
     let begin = *kept;
     for i in begin..stored.len() {
@@ -427,7 +428,7 @@ fn thin_out(stored: &mut Vec<StoredPhoton>, kept: &mut usize, part: f32, due: &m
     stored.truncate(*kept);
 }
 
-/// Memory announced while it grows, against the budget of one call.
+/// Memory announced while photons are stored, checked against the budget of one call.
 pub(super) struct Account {
     monitor: Arc<MemoryMonitor>,
     budget: u64,
@@ -460,7 +461,7 @@ impl Account {
         Ok(())
     }
 
-    /// Announces `bytes` beside what is held already, for `what`.
+    /// Announces `bytes` beside those held already, for `what`.
     pub(super) fn reserve(&self, bytes: usize, what: &str) -> Result<Reservation> {
         let used = self.state.lock().unwrap_or_else(|e| e.into_inner()).used;
         self.check(used + bytes)?;

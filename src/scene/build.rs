@@ -1,4 +1,4 @@
-//! Commit: checks the triangles, builds the acceleration structure and notes what the scene uses.
+//! Commit: checks the triangles, builds the acceleration structure and records which features the scene uses.
 
 use super::committed::{SceneStats, Uses};
 use super::emitters::{EMITTERS, add_emitters, emissive_triangles};
@@ -15,16 +15,16 @@ use std::panic::{AssertUnwindSafe, catch_unwind};
 use std::sync::{Arc, RwLock};
 use std::time::Instant;
 
-/// Triangles that a thread takes at a time.
+/// Number of triangles that a thread takes at a time.
 const CHUNK: usize = 1 << 12;
 
-/// The offset of rays from surfaces from which on a warning is due, as a part of the scene's diagonal. (The
+/// Minimum offset of rays from surfaces at which a warning is logged, as a fraction of the scene's diagonal. (The
 /// Cornell box at 1,000 times its size from the origin: 1/900, irradiance wrong by 0.7 %; at 10,000: 14 %.)
 const OFFSET_PART: f32 = 1.0 / 256.0;
 
 impl Uses {
     fn of(data: &SceneData) -> Uses {
-        // Holes need texels that are less opaque than the cutoff.
+        // Cut-outs need texels that are less opaque than the cutoff.
         let has_holes = |m: &Material| {
             m.alpha_cutoff > 0.0
                 && data.textures.get(m.albedo_texture as usize).is_some_and(|t| t.least_alpha() < m.alpha_cutoff)
@@ -51,8 +51,8 @@ impl Uses {
 }
 
 impl Scene {
-    /// Builds the acceleration structure. On an error, a panic included, `data` comes back unharmed.
-    // Once per scene: what is handed back may be large.
+    /// Builds the acceleration structure. On an error, a panic included, `data` is returned unchanged.
+    // Called once per scene: the returned error may be large.
     #[allow(clippy::result_large_err)]
     pub fn commit(
         device: &Arc<Device>,
@@ -60,7 +60,7 @@ impl Scene {
         options: &BuildOptions,
         progress: &Progress,
     ) -> std::result::Result<Arc<Scene>, (SceneData, Error)> {
-        // The build only reads `data`, and what it has made of it is gone with a panic.
+        // The build only reads `data`, and a panic drops everything that the build has made.
         let build = AssertUnwindSafe(|| device.run(progress, || Self::build(device, &data, options, progress)));
         let built = catch_unwind(build).unwrap_or_else(|payload| Err(Error::of_panic(payload)));
         match built {
@@ -73,7 +73,7 @@ impl Scene {
         }
     }
 
-    /// Logs a warning if the scene lies so far from the origin, for its size, that light is wrong.
+    /// Logs a warning if the scene lies so far from the origin, for its size, that light is inaccurate.
     pub(super) fn warn_of_few_digits(&self) {
         if let Some(message) = too_few_digits(self, "a scene with a diagonal", self.diagonal(), OFFSET_PART) {
             self.device.log(LogLevel::Warning, &message);

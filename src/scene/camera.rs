@@ -1,4 +1,4 @@
-//! Cameras from which scenes are looked at.
+//! Cameras for views of scenes.
 
 use glam::Vec3;
 
@@ -7,7 +7,7 @@ use glam::Vec3;
 pub struct Camera {
     /// Position in scene units.
     pub position: Vec3,
-    /// Point that is seen in the middle of the picture.
+    /// Point in the middle of the picture.
     pub target: Vec3,
     /// Upward direction, not parallel to the direction of view.
     pub up: Vec3,

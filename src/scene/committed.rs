@@ -1,4 +1,4 @@
-//! The committed scene: what it consists of, and its parts by number.
+//! The committed scene: its contents, and access to its parts by number.
 
 use super::{
     Emitter, Environment, Light, MAX_ALBEDO, Material, Mesh, SceneData, Sky, Texture, is_valid_triangle, unit_normal,
@@ -10,31 +10,31 @@ use crate::memory::Reservation;
 use glam::{Vec2, Vec3};
 use std::sync::{Arc, RwLock};
 
-/// Numbers about a committed scene.
+/// Statistics of a committed scene.
 #[derive(Clone, Copy, Debug, Default)]
 pub struct SceneStats {
-    /// Triangles in all meshes.
+    /// Number of triangles in all meshes.
     pub triangles: u64,
-    /// Of those, degenerate or not finite at the commit, or since a refit: not in the tree, or in it and
-    /// never hit.
+    /// Number of triangles that were degenerate or not finite at the commit, or are since a refit: they are not in the
+    /// tree, or in it and never hit.
     pub skipped_degenerate: u64,
-    /// 8-wide nodes.
+    /// Number of 8-wide nodes.
     pub nodes: u64,
-    /// Bytes of the acceleration structure.
+    /// Size of the acceleration structure in bytes.
     pub bvh_bytes: u64,
-    /// Of these, of its nodes.
+    /// Size of the acceleration structure's nodes in bytes.
     pub node_bytes: u64,
-    /// Bytes of the whole committed scene.
+    /// Size of the whole committed scene in bytes.
     pub bytes: u64,
-    /// Surface area heuristic cost of the binary tree, traversal and intersection costing 1 each. A refit
-    /// leaves it as it was.
+    /// Surface area heuristic cost of the binary tree, traversal and intersection costing 1 each. A refit does not
+    /// change it.
     pub sah_cost: f32,
     /// Wall time of the build.
     pub build_seconds: f64,
-    /// Surface area heuristic cost of the 8-wide tree as it is now, per node and per triangle 1: compared with
-    /// its value after the commit, it tells how much a refitted tree has lost.
+    /// Surface area heuristic cost of the current 8-wide tree, 1 per node and per triangle: compared with its value
+    /// after the commit, it shows how much quality a refitted tree has lost.
     pub wide_sah_cost: f32,
-    /// Refits since the commit.
+    /// Number of refits since the commit.
     pub refits: u32,
     /// Wall time of the last refit, 0 if there was none.
     pub refit_seconds: f64,
@@ -44,7 +44,7 @@ pub struct SceneStats {
 pub struct Scene {
     pub(super) device: Arc<Device>,
     pub(super) data: SceneData,
-    /// One for a scene and all copies that refits make of it: light maps go on following the lights.
+    /// Lights, shared by a scene and all copies that refits make of it: light maps keep following them.
     pub(super) lights: Arc<RwLock<Arc<Vec<Light>>>>,
     pub(super) emitters: Vec<Emitter>,
     /// First global triangle number per mesh, and the total at the end.
@@ -58,21 +58,21 @@ pub struct Scene {
     pub(super) _memory: Reservation,
 }
 
-/// What a scene uses of what materials can do.
+/// Features of materials that a scene uses.
 #[derive(Clone, Debug, Default, PartialEq)]
 pub(crate) struct Uses {
     /// Whether a texture colours a surface.
     pub textures: bool,
-    /// By material, whether it has holes; empty if none that a surface has does.
+    /// Whether each material has cut-outs; empty if no surface has any.
     pub holes: Vec<bool>,
     /// Whether light passes through a surface.
     pub transmission: bool,
-    /// Whether a surface is opaque and shows one side only, as those of solids: light does not get behind it.
+    /// Whether a surface is opaque and one-sided, as those of solids: light does not get behind it.
     pub solids: bool,
 }
 
 impl Scene {
-    /// The device that the scene lives on.
+    /// The device of the scene.
     pub fn device(&self) -> &Arc<Device> {
         &self.device
     }
@@ -92,7 +92,7 @@ impl Scene {
         &self.data.textures
     }
 
-    /// What it uses of what materials can do.
+    /// The features of materials that the scene uses.
     #[inline]
     pub(crate) fn uses(&self) -> &Uses {
         &self.uses
@@ -108,7 +108,7 @@ impl Scene {
         self.lights.read().unwrap_or_else(|e| e.into_inner()).clone()
     }
 
-    /// A sky light as it is sampled; `None` for other lights.
+    /// A sky light prepared for sampling; `None` for other lights.
     pub fn sky(&self, light: &Light) -> Option<Sky> {
         let Light::Sky { radiance, environment, up, rotation } = *light else { return None };
         Some(Sky::new(radiance, environment, up, rotation, self.environments()))
@@ -123,7 +123,7 @@ impl Scene {
         if id as usize >= count {
             return invalid_argument!("light {id} does not exist, the scene has {count}");
         }
-        // A copy, if a bake holds them.
+        // Makes a copy if a bake holds the lights.
         Arc::make_mut(&mut lights)[id as usize] = light.normalized();
         Ok(())
     }
@@ -143,12 +143,12 @@ impl Scene {
         (self.bounds.1 - self.bounds.0).length()
     }
 
-    /// Numbers about the scene.
+    /// Statistics of the scene.
     pub fn stats(&self) -> &SceneStats {
         &self.stats
     }
 
-    /// Triangles in all meshes; global triangle numbers run below this.
+    /// Number of triangles in all meshes; global triangle numbers are below it.
     pub fn triangle_count(&self) -> u32 {
         *self.first_triangle.last().expect("never empty")
     }
@@ -165,34 +165,34 @@ impl Scene {
         self.first_triangle[mesh as usize]
     }
 
-    /// The corners of a global triangle number.
+    /// The corners of a triangle by its global number.
     #[inline]
     pub fn corners(&self, triangle: u32) -> [Vec3; 3] {
         let (m, t) = self.locate(triangle);
         self.data.meshes[m as usize].corners(t as usize)
     }
 
-    /// Whether a global triangle number is a valid triangle (not skipped by the build, and not made degenerate
-    /// by a refit).
+    /// Whether a triangle, by its global number, is valid (not skipped by the build, and not made degenerate by a
+    /// refit).
     pub fn is_valid(&self, triangle: u32) -> bool {
         is_valid_triangle(self.corners(triangle)) && self.skipped.binary_search(&triangle).is_err()
     }
 
-    /// The material of a global triangle number.
+    /// The material of a triangle by its global number.
     #[inline]
     pub fn material(&self, triangle: u32) -> &Material {
         &self.data.materials[self.material_id(triangle) as usize]
     }
 
-    /// The material number of a global triangle number.
+    /// The material number of a triangle by its global number.
     #[inline]
     pub fn material_id(&self, triangle: u32) -> u32 {
         let (m, t) = self.locate(triangle);
         self.data.meshes[m as usize].material(t as usize)
     }
 
-    /// Diffuse reflectance at a point of a global triangle number, with weights `u` and `v` of its corners 1
-    /// and 2: the material's, multiplied with its texture.
+    /// Diffuse reflectance at a point of a triangle, given by its global number, with weights `u` and `v` of its
+    /// corners 1 and 2: the material's, multiplied with its texture.
     #[inline]
     pub fn albedo(&self, triangle: u32, u: f32, v: f32) -> Vec3 {
         let (m, t) = self.locate(triangle);
@@ -201,7 +201,8 @@ impl Scene {
         self.albedo_at(material, || mesh.texture_coordinates(t as usize, u, v))
     }
 
-    /// The same of a material at the texture coordinates that `uv` tells, which textured ones ask for.
+    /// Diffuse reflectance of a material at the texture coordinates that `uv` returns; `uv` is called for textured
+    /// materials only.
     #[inline]
     pub(crate) fn albedo_at(&self, material: &Material, uv: impl FnOnce() -> Option<Vec2>) -> Vec3 {
         let factor = Vec3::from(material.albedo);
@@ -211,7 +212,8 @@ impl Scene {
         }
     }
 
-    /// Whether a point of a global triangle number, with weights `u` and `v` of its corners 1 and 2, is a hole.
+    /// Whether a point of a triangle, given by its global number, with weights `u` and `v` of its corners 1 and 2, is
+    /// cut out.
     pub fn is_hole(&self, triangle: u32, u: f32, v: f32) -> bool {
         if self.uses.holes.is_empty() {
             return false;
@@ -230,7 +232,7 @@ impl Scene {
         }
     }
 
-    /// Unit geometric normal of a global triangle number (f64 inside: right for slivers too).
+    /// Unit geometric normal of a triangle by its global number (computed in f64: accurate for slivers too).
     #[inline]
     pub fn normal(&self, triangle: u32) -> Vec3 {
         unit_normal(self.corners(triangle))

@@ -3,10 +3,10 @@
 use super::{Material, Mesh, MeshMaterials, SceneData, is_valid_triangle};
 use glam::Vec3;
 
-/// What their memory is for, in errors.
+/// Name of this memory in error messages.
 pub(super) const EMITTERS: &str = "the emissive triangles";
 
-/// An emissive triangle, as a light.
+/// An emissive triangle as a light.
 #[derive(Clone, Copy, Debug)]
 pub struct Emitter {
     /// Global triangle number.
@@ -27,7 +27,7 @@ pub struct Emitter {
     pub two_sided: bool,
 }
 
-/// The number of triangles with a material that emits.
+/// Number of triangles with a material that emits.
 pub(super) fn emissive_triangles(data: &SceneData) -> usize {
     let emits = |m: u32| data.materials[m as usize].is_emissive();
     let of_mesh = |mesh: &Mesh| match &mesh.materials {

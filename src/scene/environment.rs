@@ -1,6 +1,6 @@
-//! Skies: light from infinitely far away, the same in all directions or as an image shows it, and the
-//! choice of directions by importance (Pharr, Jakob and Humphreys, *Physically Based Rendering*,
-//! section 12.5, with the exact solid angle of each pixel instead of its sine).
+//! Skies: light from infinitely far away, equal in all directions or given by an image, and the choice of directions by
+//! importance (Pharr, Jakob and Humphreys, *Physically Based Rendering*, section 12.5, with the exact solid angle of
+//! each pixel instead of its sine).
 
 use super::check_energy;
 use crate::error::{Result, invalid_argument};
@@ -9,30 +9,30 @@ use std::f32::consts::{FRAC_PI_4, PI, TAU};
 use std::f64;
 use std::sync::Arc;
 
-/// The most pixels of an environment along each axis.
+/// Maximum number of pixels of an environment along each axis.
 pub const MAX_ENVIRONMENT_SIZE: u32 = 1 << 14;
 
 /// An image of the whole sphere of directions by longitude and latitude, in linear RGB.
 ///
 /// Row 0 is at the zenith, the last row at the nadir. The middle of the image is the sky's front, and
 /// columns follow one another to the right as seen from inside; the left and right border are behind.
-/// Radiance is that of the pixel, without interpolation: what is sampled is exactly what is there.
+/// Radiance is that of the pixel, without interpolation: sampling follows it exactly.
 #[derive(Clone, Debug, PartialEq)]
 pub struct Environment {
     width: u32,
     height: u32,
     rgb: Vec<[f32; 3]>,
-    /// Up to and with each row: its part of the image's light.
+    /// Cumulative part of the image's light, up to and including each row.
     rows: Vec<f64>,
-    /// The same for each pixel within its row.
+    /// Cumulative part of a row's light, up to and including each pixel.
     pixels: Vec<f32>,
     /// Integral of radiance over the sphere.
     integral: DVec3,
 }
 
 impl Environment {
-    /// From `width` × `height` radiances or factors, row by row. Both sizes in 1 to
-    /// [`MAX_ENVIRONMENT_SIZE`]; values finite and at least 0.
+    /// Makes an environment from `width` × `height` radiances or factors, row by row. Both sizes must be in 1 to
+    /// [`MAX_ENVIRONMENT_SIZE`], values finite and at least 0.
     pub fn new(width: u32, height: u32, rgb: Vec<[f32; 3]>) -> Result<Environment> {
         for (name, size) in [("width", width), ("height", height)] {
             if !(1..=MAX_ENVIRONMENT_SIZE).contains(&size) {
@@ -79,7 +79,7 @@ impl Environment {
         (cosine(y), cosine(y + 1))
     }
 
-    /// Pixels along longitude and latitude.
+    /// Number of pixels along longitude and latitude.
     pub fn size(&self) -> (u32, u32) {
         (self.width, self.height)
     }
@@ -89,12 +89,12 @@ impl Environment {
         &self.rgb
     }
 
-    /// Bytes of pixels and tables.
+    /// Size of pixels and tables in bytes.
     pub fn bytes(&self) -> usize {
         size_of_val(&self.rgb[..]) + size_of_val(&self.rows[..]) + size_of_val(&self.pixels[..])
     }
 
-    /// The pixel at an angle to the right of the front, and the cosine of that to the zenith.
+    /// The pixel at the angle `right` to the right of the front and at `height`, the cosine of the angle to the zenith.
     fn pixel(&self, right: f32, height: f32) -> usize {
         let x = ((right / TAU + 0.5) * self.width as f32) as u32;
         let y = (height.clamp(-1.0, 1.0).acos() / PI * self.height as f32) as u32;
@@ -106,8 +106,8 @@ impl Environment {
         (brightness(&self.rgb[pixel]) / self.integral.element_sum()) as f32
     }
 
-    /// A pixel in proportion to its light, and a direction uniform in it: angle to the right and cosine
-    /// to the zenith.
+    /// Chooses a pixel in proportion to its light, and a direction uniform in it: angle to the right and cosine to the
+    /// zenith.
     fn sample(&self, u: [f32; 2]) -> (usize, f32, f32) {
         let v = u[1] as f64;
         let y = self.rows.partition_point(|&r| r <= v).min(self.height as usize - 1);
@@ -127,7 +127,7 @@ fn brightness(rgb: &[f32; 3]) -> f64 {
     rgb.iter().map(|&c| c as f64).sum()
 }
 
-/// A sky as it is sampled: an environment, if it has one, turned as the light says.
+/// A sky prepared for sampling: its environment, if it has one, turned as the light specifies.
 #[derive(Clone, Debug)]
 pub struct Sky {
     radiance: Vec3,
@@ -138,7 +138,7 @@ pub struct Sky {
 }
 
 impl Sky {
-    /// Of [`Light::Sky`](super::Light::Sky)'s fields; `up` is a unit vector.
+    /// Makes a sky from the fields of [`Light::Sky`](super::Light::Sky); `up` is a unit vector.
     pub(crate) fn new(
         radiance: [f32; 3],
         environment: u32,
@@ -148,7 +148,7 @@ impl Sky {
     ) -> Sky {
         // (No image has the number NONE.)
         let image = environments.get(environment as usize).cloned();
-        // What is the front before the sky is turned.
+        // Direction of the front before the sky is turned.
         let ahead = if up.z.abs() > FRAC_PI_4.cos() { Vec3::Y } else { Vec3::NEG_Z };
         let ahead = ahead.reject_from_normalized(up).normalize_or(up.any_orthonormal_vector());
         let side = ahead.cross(up);
@@ -163,13 +163,13 @@ impl Sky {
         }
     }
 
-    /// Whether it shines at all.
+    /// Whether the sky does not shine at all.
     pub fn is_dark(&self) -> bool {
         let image = self.image.as_ref().map_or(DVec3::ONE, |i| i.integral);
         (self.radiance.as_dvec3() * image).max_element() <= 0.0
     }
 
-    /// Whether its radiance is the same in all directions.
+    /// Whether the sky's radiance is the same in all directions.
     pub fn is_constant(&self) -> bool {
         self.image.is_none()
     }
@@ -188,7 +188,7 @@ impl Sky {
         (self.radiance * Vec3::from(image.rgb[pixel]), image.density(pixel))
     }
 
-    /// A direction by importance, with its radiance and density.
+    /// Chooses a direction by importance; returns it with its radiance and density.
     pub fn sample(&self, u: [f32; 2]) -> (Vec3, Vec3, f32) {
         let Some(image) = &self.image else {
             return (crate::sampling::uniform_sphere(u), self.radiance, 0.25 / PI);

@@ -62,11 +62,11 @@ pub enum Light {
     },
 }
 
-/// Discs of less than this radius are points.
+/// Discs of a smaller radius count as points.
 const MIN_ANGULAR_RADIUS: f32 = 1e-5;
 
 impl Light {
-    /// The colour field, whatever its unit.
+    /// Value of the colour field, whatever its unit.
     pub fn color(&self) -> [f32; 3] {
         match *self {
             Light::Point { intensity, .. } | Light::Spot { intensity, .. } => intensity,
@@ -75,7 +75,7 @@ impl Light {
         }
     }
 
-    /// Falloff of a spot light with the cosine of the angle to its axis, in [0, 1].
+    /// Falloff of a spot light by the cosine of the angle to its axis, in [0, 1].
     pub fn spot_falloff(cosine: f32, inner: f32, outer: f32) -> f32 {
         let (ci, co) = (inner.cos(), outer.cos());
         if cosine >= ci {
@@ -88,7 +88,7 @@ impl Light {
         }
     }
 
-    /// The same light with its direction normalised (in f64: extreme lengths do not overflow).
+    /// Returns the light with its direction normalised (in f64: extreme lengths do not overflow).
     pub(crate) fn normalized(self) -> Light {
         let unit = |d: Vec3| d.as_dvec3().normalize().as_vec3();
         match self {
@@ -106,7 +106,7 @@ impl Light {
         }
     }
 
-    /// Checks that the scene's environment exists, if it is a sky with one.
+    /// Checks that the environment of a sky, if it has one, exists in the scene.
     pub(crate) fn check_environment(&self, count: usize) -> Result<()> {
         match *self {
             Light::Sky { environment, .. } if environment != NONE && environment as usize >= count => {

@@ -1,30 +1,30 @@
-//! Materials: diffuse reflectance, emission, holes and what passes through.
+//! Materials: diffuse reflectance, emission, cut-outs and transmission.
 
 use super::{NONE, check_energy};
 use crate::error::{Result, invalid_argument};
 
-/// File loaders clamp reflectances to this, and so do look-ups of textures; the API refuses 1 and above.
+/// Maximum reflectance that file loaders and look-ups of textures return; the API refuses 1 and above.
 pub const MAX_ALBEDO: f32 = 0.98;
 
 /// A diffuse material.
 #[derive(Clone, Copy, Debug, PartialEq)]
 pub struct Material {
-    /// Diffuse reflectance per channel, in [0, 1). With a texture: its factor, in [0, 1].
+    /// Diffuse reflectance per channel, in [0, 1). With a texture: the factor of the texture, in [0, 1].
     pub albedo: [f32; 3],
     /// Emitted radiance per channel in W/(m²·sr), from the front side, and from the back too if the
     /// material is two-sided.
     pub emission: [f32; 3],
-    /// Whether the back side reflects and emits like the front. The back of a one-sided material
-    /// absorbs what meets it and is not transmitted.
+    /// Whether the back side reflects and emits like the front. The back of a one-sided material absorbs all light that
+    /// hits it and is not transmitted.
     pub two_sided: bool,
     /// Number of the [texture](super::Texture) that is multiplied with `albedo`, the product limited to
     /// [`MAX_ALBEDO`]; [`NONE`]: none. Where a mesh has no texture coordinates, `albedo` alone counts.
     pub albedo_texture: u32,
-    /// Points of the surface where the texture's alpha is less than this are holes: rays and photons, from
-    /// either side, do not meet them. In [0, 1]; 0: no holes.
+    /// Points of the surface where the texture's alpha is less than this are cut out: rays and photons pass through
+    /// them from either side. In [0, 1]; 0: no cut-outs.
     pub alpha_cutoff: f32,
-    /// Fraction of light, per channel, that passes straight through, from either side, as through stained
-    /// glass; with `albedo` at most 1. Geometric ray queries meet the surface all the same.
+    /// Fraction of light, per channel, that passes straight through, from either side, as through stained glass; with
+    /// `albedo` at most 1. Geometric ray queries hit the surface all the same.
     pub transmission: [f32; 3],
 }
 
@@ -41,22 +41,22 @@ impl Default for Material {
     }
 }
 
-/// Rounding of a sum of two fractions that make 1.
+/// Tolerance for the rounding of two fractions that sum to 1.
 const SUM_SLACK: f32 = 1e-6;
 
 impl Material {
-    /// Whether it emits light.
+    /// Whether the material emits light.
     pub fn is_emissive(&self) -> bool {
         self.emission.iter().any(|&e| e > 0.0)
     }
 
-    /// Whether light passes through.
+    /// Whether light passes through the material.
     #[inline]
     pub fn transmits(&self) -> bool {
         self.transmission.iter().any(|&t| t > 0.0)
     }
 
-    /// Checks the ranges documented on the fields; `textures`: how many there are.
+    /// Checks the ranges documented on the fields; `textures`: number of textures of the scene.
     pub fn validate(&self, textures: usize) -> Result<()> {
         let textured = self.albedo_texture != NONE;
         for (c, &a) in self.albedo.iter().enumerate() {

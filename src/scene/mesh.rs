@@ -1,4 +1,4 @@
-//! Triangle meshes as the caller describes them.
+//! Triangle meshes as given by the caller.
 
 use super::MAX_TRIANGLES;
 use crate::base::geometry::is_valid_triangle;
@@ -6,20 +6,20 @@ use crate::error::{Result, invalid_argument};
 use crate::memory::try_to_vec;
 use glam::{Vec2, Vec3};
 
-/// Which material each triangle has.
+/// Assignment of materials to triangles.
 #[derive(Clone, Debug, PartialEq)]
 pub enum MeshMaterials {
     /// One material for the whole mesh.
     One(u32),
-    /// One per triangle.
+    /// One material per triangle.
     PerTriangle(Vec<u32>),
 }
 
-/// Light map coordinates that the caller brings.
+/// Light map coordinates given by the caller.
 #[derive(Clone, Debug, PartialEq)]
 pub struct LightmapUvs {
-    /// One per vertex. Meant to be unique and in [0, 1]; what is not is counted and reported when
-    /// the light map is created, and repaired by unwrapping those triangles.
+    /// One coordinate pair per vertex. They should be unique and in [0, 1]; triangles that violate this are counted and
+    /// reported when the light map is created, and repaired by unwrapping.
     pub uvs: Vec<Vec2>,
     /// Page per triangle; empty: all on page 0.
     pub pages: Vec<u32>,
@@ -34,14 +34,14 @@ pub struct Mesh {
     pub indices: Vec<[u32; 3]>,
     /// Shading normals, one per vertex, or empty: the geometric normal is used.
     pub normals: Vec<Vec3>,
-    /// First texture coordinates, one per vertex, or empty: where textures lie on the surface.
+    /// First texture coordinates, one per vertex, or empty.
     pub uvs: Vec<Vec2>,
     /// The caller's light map coordinates, if any.
     pub lightmap: Option<LightmapUvs>,
     /// Materials by number.
     pub materials: MeshMaterials,
-    /// Refuse degenerate triangles and non-finite vertices, naming the first, rather than skip and
-    /// count them.
+    /// Whether to refuse degenerate triangles and non-finite vertices, naming the first, rather than skip and count
+    /// them.
     pub strict: bool,
 }
 
@@ -79,7 +79,7 @@ impl Mesh {
         Some(a + (b - a) * u + (c - a) * v)
     }
 
-    /// Bytes of its arrays.
+    /// Size of the mesh's arrays in bytes.
     pub(super) fn bytes(&self) -> usize {
         let per_triangle = if let MeshMaterials::PerTriangle(m) = &self.materials { size_of_val(&m[..]) } else { 0 };
         let lightmap = self.lightmap.as_ref().map_or(0, |l| size_of_val(&l.uvs[..]) + size_of_val(&l.pages[..]));
@@ -91,7 +91,7 @@ impl Mesh {
             + per_triangle
     }
 
-    /// Frees what arrays have room for beyond their length: as much again in the worst case, after files are read.
+    /// Frees unused capacity of the arrays: as much again in the worst case, after files are read.
     pub(super) fn shrink_to_fit(&mut self) {
         self.positions.shrink_to_fit();
         self.indices.shrink_to_fit();
@@ -106,7 +106,7 @@ impl Mesh {
         }
     }
 
-    /// A copy for which memory may be lacking.
+    /// Copies the mesh; fails if there is not enough memory.
     pub(super) fn try_clone(&self) -> Result<Mesh> {
         let what = "a copy of a mesh";
         Ok(Mesh {
@@ -161,7 +161,8 @@ impl Mesh {
             }
         }
         match &self.materials {
-            // Of a mesh without triangles too: whoever looks it up need not ask for triangles first.
+            // Checked for a mesh without triangles too: code that looks the material up need not check for triangles
+            // first.
             MeshMaterials::One(m) if *m as usize >= material_count => {
                 return invalid_argument!("the mesh names material {m}, the scene has {material_count}");
             }
@@ -182,8 +183,7 @@ impl Mesh {
         self.check_positions(&self.positions)
     }
 
-    /// Checks positions that might take the place of the mesh's own: their number, and themselves if
-    /// `strict`.
+    /// Checks positions that might replace the mesh's own: their number, and their values if `strict`.
     pub(super) fn check_positions(&self, positions: &[Vec3]) -> Result<()> {
         if positions.len() != self.positions.len() {
             let (new, old) = (positions.len(), self.positions.len());

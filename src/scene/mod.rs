@@ -1,5 +1,5 @@
-//! Scenes: what the caller describes ([`SceneData`]), checked as it comes in, and what the kernels
-//! work on ([`Scene`]), compact and immutable after commit.
+//! Scenes: the caller's description ([`SceneData`]), checked as it is added, and the committed form that the kernels
+//! work on ([`Scene`]), compact and immutable.
 
 mod atrium;
 mod build;
@@ -32,25 +32,25 @@ use crate::error::{Error, Result, invalid_argument};
 use crate::memory::{try_to_vec, try_with_capacity};
 use std::sync::Arc;
 
-/// The most triangles in a scene: leaf references hold 28 bits.
+/// Maximum number of triangles in a scene: leaf references hold 28 bits.
 pub const MAX_TRIANGLES: usize = 1 << 28;
 
-/// Irradiance beyond this is cut off, W/m²: what a light of 10¹² gives at a distance of 10⁻⁹. Sums of
+/// Maximum irradiance in W/m², to which each light is clamped: that of a light of 10¹² at a distance of 10⁻⁹. Sums of
 /// thousands of such values are still finite.
 pub const BRIGHTEST: f32 = 1e30;
 
-/// More light than this cannot be, as each light is cut off at [`BRIGHTEST`]: files that say so are damaged.
+/// Upper bound of all light, as each light is clamped to [`BRIGHTEST`]: files with larger values are damaged.
 pub(crate) const MOST_LIGHT: f32 = 1e37;
 
-/// A scene being described. Everything added is checked; a refused addition changes nothing.
+/// Description of a scene under construction. Everything added is checked; a refused addition changes nothing.
 #[derive(Clone, Debug, Default)]
 pub struct SceneData {
     meshes: Vec<Mesh>,
-    /// Triangles of all meshes.
+    /// Number of triangles of all meshes.
     triangles: usize,
     materials: Vec<Material>,
     lights: Vec<Light>,
-    /// Shared by the copies that refits make.
+    /// Textures, shared by the copies that refits make.
     textures: Vec<Arc<Texture>>,
     environments: Vec<Arc<Environment>>,
 }
@@ -99,8 +99,8 @@ impl SceneData {
         self.environments.len() as u32 - 1
     }
 
-    /// Moves all of `other` behind what is here; its material, texture and environment
-    /// numbers are shifted. A refusal changes nothing here.
+    /// Appends everything in `other`; its material, texture and environment numbers are shifted. A refusal changes
+    /// nothing here.
     pub fn append(&mut self, mut other: SceneData) -> Result<()> {
         self.triangles = self.triangles_with(other.triangles)?;
         let shift = self.materials.len() as u32;
@@ -141,7 +141,7 @@ impl SceneData {
         Ok(())
     }
 
-    /// A copy, as [`clone`](Clone::clone) makes one, for which memory may be lacking.
+    /// Copies the data as [`clone`](Clone::clone) does, but fails if there is not enough memory.
     pub fn try_clone(&self) -> Result<SceneData> {
         let mut meshes = try_with_capacity(self.meshes.len(), "a copy of the scene")?;
         for mesh in &self.meshes {
@@ -159,14 +159,14 @@ impl SceneData {
         })
     }
 
-    /// Bytes of the arrays of meshes, textures and environments.
+    /// Size of the arrays of meshes, textures and environments in bytes.
     pub fn bytes(&self) -> usize {
         let textures: usize = self.textures.iter().map(|t| t.bytes()).sum();
         let environments: usize = self.environments.iter().map(|e| e.bytes()).sum();
         self.mesh_bytes() + textures + environments
     }
 
-    /// Bytes of the arrays of meshes.
+    /// Size of the arrays of meshes in bytes.
     pub(crate) fn mesh_bytes(&self) -> usize {
         self.meshes.iter().map(Mesh::bytes).sum()
     }
@@ -196,12 +196,12 @@ impl SceneData {
         &self.environments
     }
 
-    /// Triangles in all meshes, degenerate ones included.
+    /// Number of triangles in all meshes, degenerate ones included.
     pub fn triangle_count(&self) -> usize {
         self.triangles
     }
 
-    /// The number of triangles after `more` are added.
+    /// Number of triangles after `more` are added.
     fn triangles_with(&self, more: usize) -> Result<usize> {
         let total = self.triangles + more;
         if total > MAX_TRIANGLES {
@@ -211,7 +211,7 @@ impl SceneData {
     }
 }
 
-/// Refuses NaN and infinities, and magnitudes beyond [`MAX_COORDINATE`].
+/// Refuses NaN, infinities, and magnitudes beyond [`MAX_COORDINATE`].
 pub(crate) fn check_finite(what: &str, values: &[f32]) -> Result<()> {
     match values.iter().find(|v| !(v.abs() <= MAX_COORDINATE)) {
         Some(v) => {

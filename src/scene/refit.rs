@@ -1,4 +1,4 @@
-//! Refits: vertices move, the tree keeps its shape, and all that follows from positions follows.
+//! Refits: vertices move, the tree keeps its topology, and all data that depend on positions are updated.
 
 use super::emitters::{EMITTERS, add_emitters, emissive_triangles};
 use super::{Emitter, Scene, is_valid_triangle};
@@ -12,22 +12,22 @@ use std::collections::HashMap;
 use std::sync::Arc;
 use std::time::Instant;
 
-/// What memory is for, in errors.
+/// Name of this memory in error messages.
 const COPY: &str = "a copy of the scene to refit";
 
 impl Scene {
-    /// Moves vertices: `moved` names meshes and the new positions of all their vertices. (Of a mesh that is
-    /// named twice the last holds.) The tree keeps its shape and gets new boxes, which takes a fraction of a
-    /// commit; so it serves well as long as neighbours stay neighbours, and
-    /// [`wide_sah_cost`](super::SceneStats::wide_sah_cost) tells when a new commit would be better. Emitters, bounds
-    /// and numbers are renewed; shading normals, texture and light map coordinates stay as they were given.
+    /// Moves vertices: `moved` names meshes and the new positions of all their vertices. (If a mesh is named twice, the
+    /// last entry counts.) The tree keeps its shape and gets new boxes, which takes a fraction of a commit; so it
+    /// serves well as long as neighbours stay neighbours, and [`wide_sah_cost`](super::SceneStats::wide_sah_cost) shows
+    /// when a new commit would be better. Emitters, bounds and statistics are renewed; shading normals, texture and
+    /// light map coordinates stay as they were given.
     ///
-    /// If `scene` is the only reference, it is changed in place; otherwise it is replaced by a copy, and who
-    /// holds the other references (light maps, live objects) keeps the old geometry and shares the lights.
+    /// If `scene` is the only reference, it is changed in place; otherwise it is replaced by a copy, and holders of
+    /// other references (light maps, live objects) keep the old geometry and share the lights.
     ///
-    /// Triangles that become degenerate or not finite are not hit while they are; those that were so at the
-    /// commit are not in the tree and stay out whatever becomes of them. After a build with spatial splits,
-    /// boxes become those of whole triangles: right, but larger than before.
+    /// Triangles that become degenerate or not finite are not hit while they are; those that were so at the commit are
+    /// not in the tree and stay out in any case. After a build with spatial splits, boxes become those of whole
+    /// triangles: right, but larger than before.
     ///
     /// Fails, and leaves `scene` as it was, if a mesh does not exist, has another number of vertices or is
     /// strict and gets a degenerate triangle or a vertex that is not finite; if no triangle would be left that
@@ -40,7 +40,7 @@ impl Scene {
         if !scene.any_left(moved) {
             return Err(Error::InvalidState("all triangles of the scene would be degenerate or not finite".into()));
         }
-        // All memory before anything changes.
+        // All memory is allocated before anything changes.
         let emitters = try_with_capacity(emissive_triangles(&scene.data), EMITTERS)?;
         let room = scene.tree.room_to_refit()?;
         if Arc::get_mut(scene).is_none() {
@@ -57,7 +57,7 @@ impl Scene {
         Ok(())
     }
 
-    /// Whether [`refit`](Self::refit) takes these positions for a mesh.
+    /// Checks whether [`refit`](Self::refit) accepts these positions for a mesh.
     pub fn check_positions(&self, mesh: u32, positions: &[Vec3]) -> Result<()> {
         let meshes = self.meshes();
         match meshes.get(mesh as usize) {
@@ -66,7 +66,7 @@ impl Scene {
         }
     }
 
-    /// Whether a triangle of the tree could be hit with vertices moved.
+    /// Whether any triangle of the tree can be hit after vertices have moved.
     fn any_left(&self, moved: &[(u32, &[Vec3])]) -> bool {
         let new: HashMap<u32, &[Vec3]> = moved.iter().copied().collect();
         (0..).zip(self.meshes()).zip(&self.first_triangle).any(|((m, mesh), &first)| {
@@ -77,7 +77,7 @@ impl Scene {
         })
     }
 
-    /// Brings up to date what follows from the positions. `emitters` has room for all there may be.
+    /// Updates all data that depend on positions. `emitters` has capacity for all there may be.
     fn follow_positions(&mut self, mut emitters: Vec<Emitter>, room: bvh::RefitRoom) {
         let (first, meshes) = (&self.first_triangle, &self.data.meshes);
         let corners = |t: u32| {
@@ -100,7 +100,7 @@ impl Scene {
         self.warn_of_few_digits();
     }
 
-    /// A scene of its own that is equal, lights shared.
+    /// Copies the scene; the lights are shared.
     fn copy(&self) -> Result<Scene> {
         // Textures and environments are shared.
         let bytes = self.tree.bytes() + self.data.mesh_bytes();

@@ -1,4 +1,4 @@
-//! Shapes that the built-in scenes and the tests are made of.
+//! Shapes for the built-in scenes and the tests.
 //!
 //! A [`MeshBuilder`] collects triangles with a material each and welds corners at equal positions,
 //! so that a closed shape becomes a closed mesh: every edge is used by two triangles, once in each
@@ -228,7 +228,7 @@ fn icosphere(subdivisions: u32) -> Vec<[DVec3; 3]> {
     triangles
 }
 
-/// What a mesh encloses: its volume by the divergence theorem, positive if it looks outward, or
+/// Volume enclosed by a mesh, by the divergence theorem: positive if its faces look outward;
 /// `None` if it is not closed. Vertices count as equal by number.
 #[cfg(test)]
 pub(crate) fn enclosed_volume(mesh: &Mesh) -> Option<f64> {

@@ -1,25 +1,25 @@
-//! Images on surfaces: albedo and alpha, addressed by the meshes' first texture coordinates.
+//! Textures: albedo and alpha, addressed by the meshes' first texture coordinates.
 //!
-//! A look-up is what a shader shows of the full image: the image repeats, and what lies between the
-//! centres of four texels is interpolated (colours in linear light). Nothing is stored beside the
-//! image; what sees areas of a surface averages look-ups.
+//! A look-up returns what a shader shows of the full image: the image repeats, and values are interpolated between the
+//! centres of four texels (colours in linear light). Nothing is stored beside the image; callers that need the colour
+//! of an area average look-ups.
 
 use crate::error::{Result, invalid_argument};
 use glam::{Vec2, Vec3};
 use std::sync::LazyLock;
 
-/// The most texels of a texture along each axis.
+/// Maximum number of texels of a texture along each axis.
 pub const MAX_TEXTURE_SIZE: u32 = 1 << 14;
 
 /// An image of 8-bit sRGB colours and linear alpha. Row 0 lies at v = 0, column 0 at u = 0, as in glTF;
 /// u and v repeat beyond [0, 1].
 #[derive(Clone, Debug, PartialEq)]
 pub struct Texture {
-    /// Texels along u, 1 to [`MAX_TEXTURE_SIZE`].
+    /// Number of texels along u, 1 to [`MAX_TEXTURE_SIZE`].
     pub width: u32,
-    /// Texels along v, likewise.
+    /// Number of texels along v, 1 to [`MAX_TEXTURE_SIZE`].
     pub height: u32,
-    /// Row by row.
+    /// Texels, row by row.
     pub rgba8: Vec<[u8; 4]>,
 }
 
@@ -31,7 +31,7 @@ static LINEAR: LazyLock<[f32; 256]> = LazyLock::new(|| {
     })
 });
 
-/// The four texels around a point, and where between them it lies.
+/// The four texels around a point, with its position between them.
 struct Around {
     texels: [[u8; 4]; 4],
     x: f32,
@@ -49,7 +49,7 @@ impl Around {
 }
 
 impl Texture {
-    /// Checks the sizes.
+    /// Checks width, height and the number of texels.
     pub fn validate(&self) -> Result<()> {
         for (name, size) in [("width", self.width), ("height", self.height)] {
             if !(1..=MAX_TEXTURE_SIZE).contains(&size) {
@@ -63,17 +63,17 @@ impl Texture {
         Ok(())
     }
 
-    /// Bytes of its texels.
+    /// Size of the texels in bytes.
     pub fn bytes(&self) -> usize {
         size_of_val(&self.rgba8[..])
     }
 
-    /// Texels along u and v.
+    /// Number of texels along u and v.
     pub(crate) fn size(&self) -> Vec2 {
         Vec2::new(self.width as f32, self.height as f32)
     }
 
-    /// The least alpha of any texel: no look-up gives less.
+    /// Minimum alpha of all texels: no look-up returns less.
     pub(crate) fn least_alpha(&self) -> f32 {
         self.rgba8.iter().map(|t| t[3]).min().map_or(1.0, |a| a as f32 / 255.0)
     }
@@ -93,8 +93,8 @@ impl Texture {
 
     #[inline]
     fn around(&self, uv: Vec2) -> Around {
-        // The texels beside a point along an axis, and how far it is from the first to the second.
-        // (What is not finite becomes 0.)
+        // The texels beside a point along an axis, and its distance from the first towards the second. (Coordinates
+        // that are not finite become 0.)
         let along = |x: f32, size: u32| {
             let at = (x - x.floor()) * size as f32 - 0.5;
             let below = at.floor();
