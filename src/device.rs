@@ -10,7 +10,7 @@ use std::cell::Cell;
 use std::sync::Arc;
 use std::thread::JoinHandle;
 
-/// How much a log message matters.
+/// Severity of a log message.
 #[derive(Clone, Copy, Debug, PartialEq, Eq, PartialOrd, Ord)]
 #[repr(u32)]
 pub enum LogLevel {
@@ -26,29 +26,29 @@ pub enum LogLevel {
 pub type LogFn = dyn Fn(LogLevel, &str) + Send + Sync;
 
 thread_local! {
-    /// Set while a thread runs what was given to [`Device::spawn`].
+    /// Set while a thread runs work given to [`Device::spawn`].
     static APART: Cell<bool> = const { Cell::new(false) };
 }
 
-/// The most threads a device accepts: more than the logical cores of most machines, and few enough for the
-/// default limits of operating systems.
+/// Maximum number of threads of a device: more than the logical cores of most machines, and few enough for the default
+/// limits of operating systems.
 pub const MAX_THREADS: usize = 1024;
 
-/// Bytes of a thread's stack, whatever RUST_MIN_STACK says. Builds recurse by up to 76 levels of half a kilobyte,
-/// and a thread that waits for another takes up other work meanwhile, on top of its own. Only what is used takes
-/// memory.
+/// Stack size of a thread in bytes, whatever RUST_MIN_STACK says. Builds recurse by up to 76 levels of half a kilobyte,
+/// and a thread that waits for another takes up other work meanwhile, on top of its own. Only the part that is used
+/// takes memory.
 const STACK_BYTES: usize = 4 << 20;
 
-/// What to create a [`Device`] with.
+/// Options for creating a [`Device`].
 #[derive(Default)]
 pub struct DeviceOptions {
-    /// Worker threads, at most [`MAX_THREADS`]; 0: one per logical core, as far as that allows.
+    /// Number of worker threads, at most [`MAX_THREADS`]; 0: one per logical core, up to that maximum.
     pub num_threads: usize,
-    /// `None`: the best that this machine has.
+    /// The ISA to use; `None`: the best that this machine has.
     pub isa: Option<Isa>,
     /// Receives log messages.
     pub log: Option<Box<LogFn>>,
-    /// Asked before large allocations.
+    /// Called before large allocations.
     pub memory: Option<Box<MemoryFn>>,
 }
 
@@ -56,14 +56,14 @@ pub struct DeviceOptions {
 ///
 /// Dropping the device joins its threads.
 pub struct Device {
-    /// `Some` until dropped.
+    /// The thread pool; `Some` until the device is dropped.
     pool: Option<rayon::ThreadPool>,
     threads: Vec<JoinHandle<()>>,
-    /// One that this machine can run.
+    /// An ISA that this machine can run.
     isa: Isa,
     log: Option<Box<LogFn>>,
     memory: Arc<MemoryMonitor>,
-    /// The process that the threads are in.
+    /// Id of the process in which the threads were started.
     process: u32,
 }
 
@@ -95,8 +95,8 @@ impl Device {
         }))
     }
 
-    /// Fails in a process that `fork` has made of the one in which the device was created: the threads stayed
-    /// behind, and whoever waited for them would wait for ever.
+    /// Fails in a process that `fork` has made from the one in which the device was created: the threads are not in the
+    /// new process, and waiting for them would never end.
     pub fn check_process(&self) -> Result<()> {
         if self.is_forked() {
             let message = "the device was created before a fork, and its threads are not in this process";
@@ -120,10 +120,10 @@ impl Device {
         self.threads.len()
     }
 
-    /// Runs `f` on the device's threads; rayon calls inside use them alone. In a callback, which may be on one
-    /// of the threads, `f` runs on a thread of its own.
+    /// Runs `f` on the device's threads; rayon calls inside use them alone. When called in a callback, which may be on
+    /// one of the threads, `f` runs on a thread of its own.
     ///
-    /// Unwinds with an [`Error`] where [`check_process`](Self::check_process) fails, which should be asked first.
+    /// Unwinds with an [`Error`] if [`check_process`](Self::check_process) fails, which should be called first.
     pub fn install<R: Send>(&self, f: impl FnOnce() -> R + Send) -> R {
         if callback::is_running() {
             return on_extra_thread(f);
@@ -137,11 +137,12 @@ impl Device {
         self.pool.as_ref().expect("there until dropped").install(f)
     }
 
-    /// Runs `f` on the device's threads, as [`install`](Self::install) does, while the calling thread makes the
-    /// reports of `progress`. On a thread of the device, which has to work, reports are made when work is counted.
+    /// Runs `f` on the device's threads, as [`install`](Self::install) does, while the calling thread makes the reports
+    /// of `progress`. If the caller is a thread of the device, which has to work, reports are made when work is
+    /// counted.
     ///
-    /// Fails with `f`, and if the callback of `progress` has cancelled, in whichever report: so `f` leaves to its
-    /// caller what cannot be undone.
+    /// Fails if `f` fails or if the callback of `progress` has cancelled, in any report: so `f` must leave to its
+    /// caller any action that cannot be undone.
     pub fn run<R: Send>(&self, progress: &Progress, f: impl FnOnce() -> Result<R> + Send) -> Result<R> {
         let done = self.run_attended(progress, f)?;
         // The last report may come when all work is done.
@@ -168,13 +169,12 @@ impl Device {
         result.expect("the scope waits for what it spawned, and passes its panic on")
     }
 
-    /// Runs `f` on one of the device's threads and returns at once. What it would
-    /// [`install`](Self::install) in any device runs on this one's threads too: long work in the
-    /// background that must not keep the threads of another device from short work. `f` must not
-    /// panic.
+    /// Runs `f` on one of the device's threads and returns at once. Work that it would [`install`](Self::install) in
+    /// any device runs on this one's threads too: this is for long work in the background that must not keep the
+    /// threads of another device from short work. `f` must not panic.
     pub(crate) fn spawn(&self, f: impl FnOnce() + Send + 'static) {
         self.pool.as_ref().expect("there until dropped").spawn(|| {
-            // Work that waits may run other work meanwhile.
+            // A thread that waits for a part of its work may run other work meanwhile.
             let before = APART.replace(true);
             f();
             APART.set(before);
@@ -199,7 +199,7 @@ fn own_thread(name: String) -> std::thread::Builder {
     std::thread::Builder::new().name(name).stack_size(STACK_BYTES)
 }
 
-/// Starts a pool whose threads have begun with `begin`. When it fails, those that were started have ended.
+/// Starts a pool whose threads begin with `begin`. If that fails, the threads that were started have ended.
 fn start_threads(
     count: usize,
     name: impl Fn(usize) -> String,
@@ -219,7 +219,7 @@ fn start_threads(
     match pool {
         Ok(pool) => Ok((pool, threads)),
         Err(e) => {
-            // They have been told to end.
+            // The threads have been told to end.
             join(&mut threads);
             Err(e)
         }
@@ -230,8 +230,8 @@ fn join(threads: &mut Vec<JoinHandle<()>>) {
     threads.drain(..).for_each(|t| drop(t.join()));
 }
 
-/// Runs `f` on a pool of one thread and waits without taking up other work. Unwinds with an [`Error`] if there
-/// is no thread to be had.
+/// Runs `f` on a pool of one thread and waits without taking up other work. Unwinds with an [`Error`] if no thread can
+/// be started.
 fn on_extra_thread<R: Send>(f: impl FnOnce() -> R + Send) -> R {
     struct Joined(Vec<JoinHandle<()>>);
     impl Drop for Joined {
@@ -245,12 +245,12 @@ fn on_extra_thread<R: Send>(f: impl FnOnce() -> R + Send) -> R {
     };
     let begin = || {
         float_state::set_on_own_thread();
-        // What `f` would install anywhere is for this thread.
+        // Work that `f` would install in any device runs on this thread.
         APART.set(true);
     };
     let wait = || match start_threads(1, |_| "bakelite-extra".into(), begin) {
         Ok((pool, threads)) => {
-            // Joined when the pool has been dropped, also if `f` panics.
+            // The threads are joined when the pool has been dropped, also if `f` panics.
             let _threads = Joined(threads);
             let pool = pool;
             pool.install(f)
@@ -267,7 +267,7 @@ fn on_extra_thread<R: Send>(f: impl FnOnce() -> R + Send) -> R {
 impl Drop for Device {
     fn drop(&mut self) {
         if self.is_forked() {
-            // Neither can be ended nor joined here.
+            // In this process the threads can be neither ended nor joined.
             std::mem::forget((self.pool.take(), std::mem::take(&mut self.threads)));
             return;
         }

@@ -1,15 +1,15 @@
 //! Calls of the caller's functions: progress, log and memory callbacks.
 //!
-//! A callback may run on one of a device's threads, in the middle of a call. If it started work on the device's
-//! threads and waited for it, its thread would take up other work of that call meanwhile, and report it to the
-//! callback that has not returned yet; with one thread it would wait for itself. So whoever starts such work
-//! asks [`is_running`] first.
+//! A callback may run on one of a device's threads, in the middle of a call. If it started work on the device's threads
+//! and waited for it, its thread would take up other work of that call meanwhile, and report it to the callback that
+//! has not returned yet; with one thread it would wait for itself. So code that starts such work asks [`is_running`]
+//! first.
 
 use crate::float_state::CallersState;
 use std::cell::Cell;
 
 thread_local! {
-    /// Callbacks that this thread is in.
+    /// Number of callbacks that this thread is in.
     static DEPTH: Cell<u32> = const { Cell::new(0) };
 }
 
@@ -21,7 +21,7 @@ pub(crate) fn run<R>(callback: impl FnOnce() -> R) -> R {
             let _ = DEPTH.try_with(|depth| depth.set(depth.get() - 1));
         }
     }
-    // During a thread's destruction the slot may be gone; no library call is under way on it then.
+    // While a thread ends, the slot may be gone; no library call is under way on it then.
     let _leave = DEPTH.try_with(|depth| depth.set(depth.get() + 1)).is_ok().then_some(Leave);
     let _state = CallersState::enter();
     callback()

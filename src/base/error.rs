@@ -4,7 +4,7 @@
 use std::any::Any;
 use std::fmt;
 
-/// What went wrong. The text is a full sentence for the developer who reads the log.
+/// Reason why a call failed. The text is a full sentence for the developer who reads the log.
 #[derive(Clone, Debug, PartialEq, Eq)]
 pub enum Error {
     /// An argument is out of its documented range.
@@ -27,7 +27,8 @@ pub enum Error {
 pub type Result<T> = std::result::Result<T, Error>;
 
 impl Error {
-    /// What a panic that was caught says of itself; an error that was thrown as its payload is that error.
+    /// Converts the payload of a panic that was caught: an `Error` is returned as it is, a message becomes an
+    /// internal error.
     pub(crate) fn of_panic(payload: Box<dyn Any + Send>) -> Error {
         let text = match payload.downcast::<Error>() {
             Ok(e) => return *e,
@@ -56,7 +57,7 @@ impl fmt::Display for Error {
 
 impl std::error::Error for Error {}
 
-/// `Err(Error::InvalidArgument(format!(…)))`, the commonest way out.
+/// Returns `Err(Error::InvalidArgument(format!(…)))`, the most frequent error.
 macro_rules! invalid_argument {
     ($($arg:tt)*) => { Err($crate::error::Error::InvalidArgument(format!($($arg)*))) };
 }

@@ -1,19 +1,21 @@
-//! Files on disk: only regular ones are read, and what is written replaces the old file as a whole or not at all.
+//! Files on disk: only regular ones are read, and a file is replaced as a whole or not at all.
 //!
-//! [`replace`] writes beside the target, flushes that to disk and renames it. Whatever ends it early (a full disk, a
-//! cancel, a kill, power that fails) leaves the old file as it was. Only a kill leaves the file beside, `NAME.part` (of a
-//! name too long for that its checksum, `CHECKSUM.part`); the next save of the same name writes over it.
+//! [`replace`] writes a file beside the target, flushes it to disk and renames it. If that ends early (a full disk, a
+//! cancel, a kill, a power failure), the old file is unchanged. Only a kill leaves the file beside the target,
+//! `NAME.part` (for a name too long for that its checksum, `CHECKSUM.part`); the next save of the same name overwrites
+//! it.
 
 use crate::error::{Error, Result};
 use std::fs::{File, Metadata, OpenOptions, TryLockError};
 use std::io::{self, ErrorKind, Read, Write};
 use std::path::{Path, PathBuf};
 
-/// Bytes between two flushes to disk: so much goes to a slow disk in about 50 ms, and a call can end in between.
+/// Number of bytes between two flushes to disk: a slow disk takes about 50 ms for so many, and a call can end in
+/// between.
 const SYNC_BYTES: usize = 4 << 20;
 
 /// Opens a regular file to read. Fails for folders, devices, FIFOs and sockets, and never waits for one of them: the
-/// check looks at what was opened, not at what had the name before.
+/// check examines the file that was opened, not the one that had the name before.
 pub fn open(path: &Path) -> io::Result<File> {
     let mut options = OpenOptions::new();
     options.read(true);
@@ -36,7 +38,7 @@ pub fn read(path: &Path, most: u64) -> Result<Vec<u8>> {
     bytes
         .try_reserve_exact(size as usize + 1)
         .map_err(|_| Error::OutOfMemory(format!("{} needs {size} bytes", path.display())))?;
-    // What grows meanwhile is read to the size that it had, and one byte more tells.
+    // A file that grows meanwhile is read to its first size; one byte more shows that it has grown.
     file.take(size + 1).read_to_end(&mut bytes).map_err(fail)?;
     if bytes.len() as u64 > size && size == most {
         return Err(too_large());
@@ -65,17 +67,16 @@ fn check_regular(metadata: &Metadata) -> io::Result<()> {
     Err(io::Error::new(ErrorKind::InvalidInput, what))
 }
 
-/// Replaces the file `path` by what `write` writes. When it fails, the old file is as it was.
+/// Replaces the file `path` by the data that `write` writes. If that fails, the old file is unchanged.
 ///
-/// The new file has the permissions of the old one. A symbolic link stays and what it points to is replaced. A device
-/// or FIFO is written to as it is. Fails if another call is just writing the same file, and if the old file is
+/// The new file has the permissions of the old one. A symbolic link stays and its target is replaced. A device or FIFO
+/// is written to directly. Fails if another call is writing the same file at the time, and if the old file is
 /// read-only.
 pub fn replace(path: &Path, write: impl FnOnce(&mut Replacement) -> Result<()>) -> Result<()> {
     prepare(path, write)?.finish()
 }
 
-/// The part of [`replace`] that takes time: writes beside the old file, which stays until
-/// [`finish`](Replacement::finish).
+/// The slow part of [`replace`]: writes a file beside the old one, which stays until [`finish`](Replacement::finish).
 pub fn prepare(path: &Path, write: impl FnOnce(&mut Replacement) -> Result<()>) -> Result<Replacement> {
     let mut new = Replacement::begin(path)?;
     write(&mut new)?;
@@ -85,18 +86,18 @@ pub fn prepare(path: &Path, write: impl FnOnce(&mut Replacement) -> Result<()>) 
     Ok(new)
 }
 
-/// As [`replace`], with all bytes at hand.
+/// Replaces a file as [`replace`] does, by `bytes`.
 pub fn replace_with(path: &Path, bytes: &[u8]) -> Result<()> {
     replace(path, |file| file.append(bytes, |_| Ok(())))
 }
 
-/// A file being written, to replace another in the end. Dropped before that, it leaves nothing behind.
+/// A file being written, which will replace another. Dropped before that, it leaves nothing behind.
 pub struct Replacement {
     file: File,
-    /// What the caller called the file, for errors.
+    /// Name of the file as given by the caller, for errors.
     name: PathBuf,
     target: PathBuf,
-    /// Where it is written; `None`: straight to a device.
+    /// Path of the file beside the target; `None`: writes directly to a device.
     beside: Option<PathBuf>,
     unsynced: usize,
 }
@@ -135,7 +136,8 @@ impl Replacement {
         Ok(new)
     }
 
-    /// Appends bytes; `advance` is told how many at least every 4 MiB, and ends the call by an error.
+    /// Appends bytes; `advance` is called with their number at least every 4 MiB, and ends the call by returning an
+    /// error.
     pub fn append(&mut self, bytes: &[u8], mut advance: impl FnMut(u64) -> Result<()>) -> Result<()> {
         for part in bytes.chunks(SYNC_BYTES) {
             self.write_all(part).map_err(|e| write_error(&self.name, e))?;
@@ -144,14 +146,14 @@ impl Replacement {
         Ok(())
     }
 
-    /// Puts the new file in the place of the old one.
+    /// Replaces the old file by the new one.
     pub fn finish(mut self) -> Result<()> {
         let Some(beside) = self.beside.take() else { return Ok(()) };
         if let Err(e) = std::fs::rename(&beside, &self.target) {
             self.beside = Some(beside);
             return Err(write_error(&self.name, e));
         }
-        // The new name, too, should outlive a power failure. Where folders cannot be flushed there is no more to do.
+        // The new name should survive a power failure, too. If the folder cannot be flushed, nothing more can be done.
         #[cfg(unix)]
         {
             let folder = self.target.parent().filter(|f| !f.as_os_str().is_empty()).unwrap_or(Path::new("."));
@@ -185,7 +187,7 @@ impl Drop for Replacement {
     }
 }
 
-/// Names of the file beside the target: the second where the first is too long for the file system.
+/// Names of the file beside the target: the second is for when the first is too long for the file system.
 fn names_beside(target: &Path) -> [PathBuf; 2] {
     let mut long = target.as_os_str().to_owned();
     long.push(".part");
@@ -193,8 +195,8 @@ fn names_beside(target: &Path) -> [PathBuf; 2] {
     [long.into(), target.with_file_name(format!("{sum:08x}.part"))]
 }
 
-/// Opens the file beside the target, one that a killed process has left included, and locks it: of two calls that
-/// save under one name, in one process or in two, the second fails.
+/// Opens the file beside the target, including one left by a killed process, and locks it: of two calls that save under
+/// one name, in one process or in two, the second fails.
 fn open_beside(path: &Path) -> io::Result<File> {
     loop {
         let mut options = OpenOptions::new();
@@ -209,7 +211,7 @@ fn open_beside(path: &Path) -> io::Result<File> {
             // Some network file systems have no locks.
             Ok(()) | Err(TryLockError::Error(_)) => {}
         }
-        // Between the two calls above another one may have renamed the file: then it is finished work.
+        // Between the two calls above another call may have renamed the file: then it is a finished file.
         if is_still_at(&file, path)? {
             return Ok(file);
         }
@@ -227,16 +229,16 @@ fn is_still_at(file: &File, path: &Path) -> io::Result<bool> {
     }
 }
 
-/// Open files are not renamed by others here.
+/// On these systems an open file cannot be renamed by others.
 #[cfg(not(unix))]
 fn is_still_at(_: &File, _: &Path) -> io::Result<bool> {
     Ok(true)
 }
 
-/// Where symbolic links lead that end at no file.
+/// Follows symbolic links to a path that is none; there need not be a file.
 fn end_of_links(path: &Path) -> io::Result<PathBuf> {
     let mut path = path.to_owned();
-    // (As many as Linux follows. Between two calls anybody may make a circle of them.)
+    // (As many links as Linux follows. Between two calls anybody may make a circle of them.)
     for _ in 0..40 {
         if !std::fs::symlink_metadata(&path).is_ok_and(|m| m.is_symlink()) {
             return Ok(path);

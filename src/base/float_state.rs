@@ -1,4 +1,4 @@
-//! The floating-point state of a thread: the one that the library computes in, whatever the caller has set.
+//! The floating-point state of a thread: the library computes in its own, whatever the caller has set.
 //!
 //! On x86-64 that is MXCSR (no x87 instruction is used), on AArch64 FPCR: rounding to nearest, no flushing of
 //! denormals, all exceptions masked. On other architectures nothing is set.
@@ -17,7 +17,7 @@ mod register {
     /// All exceptions masked, rounding to nearest, neither FTZ nor DAZ.
     pub(super) const DEFAULT: Word = 0x1f80;
 
-    /// The sticky flags of exceptions, which change nothing that is computed.
+    /// The sticky flags of exceptions, which do not affect results.
     pub(super) const FLAGS: Word = 0x3f;
 
     #[inline(always)]
@@ -82,7 +82,7 @@ mod register {
 use register::{DEFAULT, FLAGS, Word, read, write};
 
 thread_local! {
-    /// What the code that called the library on this thread has set.
+    /// The state that the code that called the library on this thread has set.
     static OUTSIDE: Cell<Word> = const { Cell::new(DEFAULT) };
 }
 
@@ -97,11 +97,11 @@ pub(crate) fn set_on_own_thread() {
     write(DEFAULT);
 }
 
-/// The library's state, until this is dropped: then the caller's again.
+/// Guard that sets the library's floating-point state; when dropped, it restores the caller's.
 ///
-/// Where the caller's is the same already, as it mostly is, only the register is read.
+/// If the caller's state is the same already, as it mostly is, only the register is read.
 pub(crate) struct LibraryState {
-    /// The caller's state and the one outside of the call before, if they are not the default.
+    /// The caller's state and the one outside of the previous call, if they are not the default.
     outside: Option<(Word, Word)>,
 }
 
@@ -116,7 +116,7 @@ impl LibraryState {
 #[cold]
 fn replace(caller: Word) -> (Word, Word) {
     write(DEFAULT);
-    // During a thread's destruction the slot may be gone: callbacks see the default then.
+    // While a thread ends, the slot may be gone: callbacks get the default then.
     (caller, OUTSIDE.try_with(|outside| outside.replace(caller)).unwrap_or(DEFAULT))
 }
 
@@ -135,7 +135,7 @@ fn restore((caller, before): (Word, Word)) {
     write(caller);
 }
 
-/// The state of the code that called the library on this thread, until this is dropped: then the library's
+/// Guard that sets the state of the code that called the library on this thread; when dropped, it sets the library's
 /// again, whatever a callback has set meanwhile. On the library's own threads both are the default.
 pub(crate) struct CallersState {
     outside: Word,
@@ -143,7 +143,7 @@ pub(crate) struct CallersState {
 
 impl CallersState {
     pub(crate) fn enter() -> CallersState {
-        // Calls of the callback are made in the state that it has set, or else the default.
+        // Callbacks of library calls that the callback makes run in the state that it has set, or else in the default.
         let outside = OUTSIDE.try_with(|outside| outside.replace(DEFAULT)).unwrap_or(DEFAULT);
         if !is_default(outside) {
             write(outside);

@@ -6,8 +6,8 @@ use rayon::prelude::*;
 use std::sync::Arc;
 use std::sync::atomic::{AtomicI64, Ordering::SeqCst};
 
-/// Asked before a large allocation with its size in bytes, told with a negative size after it is
-/// freed. `false` refuses (the answer to a negative size is ignored).
+/// Called before a large allocation with its size in bytes, and with a negative size after it is freed. `false` refuses
+/// (the answer to a negative size is ignored).
 pub type MemoryFn = dyn Fn(i64) -> bool + Send + Sync;
 
 /// The accounts of one device.
@@ -19,28 +19,28 @@ pub struct MemoryMonitor {
 }
 
 impl MemoryMonitor {
-    /// Accounts that ask `callback`, if there is one.
+    /// Makes accounts that ask `callback`, if there is one.
     pub fn new(callback: Option<Box<MemoryFn>>) -> Self {
         MemoryMonitor { callback, ..Default::default() }
     }
 
-    /// Bytes held now.
+    /// Number of bytes held now.
     pub fn current(&self) -> i64 {
         self.current.load(SeqCst)
     }
 
-    /// The most bytes held at once since the last [`reset_peak`](Self::reset_peak).
+    /// Maximum number of bytes held at once since the last [`reset_peak`](Self::reset_peak).
     pub fn peak(&self) -> i64 {
         self.peak.load(SeqCst)
     }
 
-    /// Starts a new peak at what is held now.
+    /// Resets the peak to the bytes held now.
     pub fn reset_peak(&self) {
         self.peak.store(self.current(), SeqCst);
     }
 
-    /// Announces `bytes` for `what`; they are given back when the reservation is dropped. Hold it
-    /// beside the buffer that it stands for.
+    /// Announces `bytes` for `what`; they are given back when the reservation is dropped. It must be held beside the
+    /// buffer that it accounts for.
     pub fn reserve(self: &Arc<Self>, bytes: usize, what: &str) -> Result<Reservation> {
         let bytes = i64::try_from(bytes).map_err(|_| Error::OutOfMemory(format!("{what} would take {bytes} bytes")))?;
         if let Some(callback) = &self.callback
@@ -54,9 +54,9 @@ impl MemoryMonitor {
     }
 }
 
-/// Asks the system for large pages behind a buffer that is read at random; for the time before it is first
-/// written. (Most systems give them only on demand. Random rays take 8 % less time in Sponza's tree of 18 MB,
-/// 17 % in San Miguel's.) A wish: nothing happens where there are none, or to a small buffer.
+/// Asks the system for large pages behind a buffer that is read at random; to be called before the buffer is first
+/// written. (Most systems give them only on demand. Random rays take 8 % less time in Sponza's tree of 18 MB, 17 % in
+/// San Miguel's.) This is a hint: nothing happens on systems without large pages, or to a small buffer.
 pub(crate) fn prefer_large_pages<T>(buffer: &[T]) {
     #[cfg(all(target_os = "linux", not(miri)))]
     {
@@ -73,7 +73,7 @@ pub(crate) fn prefer_large_pages<T>(buffer: &[T]) {
     let _ = buffer;
 }
 
-/// Of x86-64, and of AArch64 with small pages of 4 KB.
+/// Size of large pages on x86-64, and on AArch64 with small pages of 4 KB.
 #[cfg(all(target_os = "linux", not(miri)))]
 const LARGE_PAGE: usize = 2 << 20;
 
@@ -89,7 +89,7 @@ impl Reservation {
         self.bytes as usize
     }
 
-    /// Announces more, so that `bytes` are held in all; a refusal changes nothing.
+    /// Announces more bytes, so that `bytes` are held in all; a refusal changes nothing.
     pub fn grow(&mut self, bytes: usize, what: &str) -> Result<()> {
         let mut more = self.monitor.reserve(bytes.saturating_sub(self.bytes()), what)?;
         self.bytes += std::mem::take(&mut more.bytes);
@@ -120,8 +120,8 @@ fn too_large<T>(len: usize, what: &str) -> Error {
     Error::OutOfMemory(format!("{what} needs {} bytes", len as u128 * size_of::<T>() as u128))
 }
 
-/// An empty `Vec` with room for `capacity` elements, in large pages if there are any. As of all
-/// functions here, an allocation that fails is an error, not an abort.
+/// Makes an empty `Vec` with capacity for `capacity` elements, in large pages if there are any. As in all functions
+/// here, an allocation that fails is an error, not an abort.
 pub fn try_with_capacity<T>(capacity: usize, what: &str) -> Result<Vec<T>> {
     let mut v = Vec::new();
     v.try_reserve_exact(capacity).map_err(|_| too_large::<T>(capacity, what))?;
@@ -129,26 +129,26 @@ pub fn try_with_capacity<T>(capacity: usize, what: &str) -> Result<Vec<T>> {
     Ok(v)
 }
 
-/// A `Vec` of `len` default values.
+/// Makes a `Vec` of `len` default values.
 pub fn try_vec<T: Default + Clone>(len: usize, what: &str) -> Result<Vec<T>> {
     try_filled(len, T::default(), what)
 }
 
-/// A `Vec` of `len` equal values.
+/// Makes a `Vec` of `len` equal values.
 pub fn try_filled<T: Clone>(len: usize, value: T, what: &str) -> Result<Vec<T>> {
     let mut v = try_with_capacity(len, what)?;
     v.resize(len, value);
     Ok(v)
 }
 
-/// A `Vec` of `len` zeros, which take no memory until they are written.
+/// Makes a `Vec` of `len` zeros, which take no memory until they are written.
 pub fn try_zeroed<T: bytemuck::Zeroable>(len: usize, what: &str) -> Result<Vec<T>> {
     let v = bytemuck::allocation::try_zeroed_vec(len).map_err(|_| too_large::<T>(len, what))?;
     prefer_large_pages(&v);
     Ok(v)
 }
 
-/// A copy of a slice.
+/// Copies a slice.
 pub fn try_to_vec<T: Clone>(values: &[T], what: &str) -> Result<Vec<T>> {
     let mut v = try_with_capacity(values.len(), what)?;
     v.extend_from_slice(values);
@@ -172,7 +172,7 @@ pub fn try_push<T>(v: &mut Vec<T>, value: T, what: &str) -> Result<()> {
     Ok(())
 }
 
-/// What an iterator gives, in a `Vec` that grows as it must.
+/// Collects the items of an iterator in a `Vec` that grows as needed.
 pub fn try_collect<T>(values: impl IntoIterator<Item = T>, what: &str) -> Result<Vec<T>> {
     let values = values.into_iter();
     let mut v = try_with_capacity(values.size_hint().0, what)?;
@@ -182,15 +182,15 @@ pub fn try_collect<T>(values: impl IntoIterator<Item = T>, what: &str) -> Result
     Ok(v)
 }
 
-/// What a parallel iterator of known length gives, in order.
+/// Collects the items of a parallel iterator of known length, in order.
 pub fn try_par_collect<T: Send>(values: impl IndexedParallelIterator<Item = T>, what: &str) -> Result<Vec<T>> {
     let mut v = try_with_capacity(values.len(), what)?;
-    // It reserves nothing more where there is room.
+    // This reserves nothing more if the capacity suffices.
     values.collect_into_vec(&mut v);
     Ok(v)
 }
 
-/// What an iterator gives, up to its first error.
+/// Collects the items of an iterator, up to its first error.
 pub fn try_collect_ok<T>(values: impl IntoIterator<Item = Result<T>>, what: &str) -> Result<Vec<T>> {
     let values = values.into_iter();
     let mut v = try_with_capacity(values.size_hint().0, what)?;
@@ -200,8 +200,8 @@ pub fn try_collect_ok<T>(values: impl IntoIterator<Item = Result<T>>, what: &str
     Ok(v)
 }
 
-/// What a parallel iterator of known length gives, in order, or the first of its errors. (All elements are asked for:
-/// work that can be cancelled must find that out by itself.)
+/// Collects the items of a parallel iterator of known length, in order, or returns the first of its errors. (All items
+/// are computed: work that can be cancelled must check for that itself.)
 pub fn try_par_collect_ok<T: Send>(
     values: impl IndexedParallelIterator<Item = Result<T>>,
     what: &str,
@@ -209,8 +209,8 @@ pub fn try_par_collect_ok<T: Send>(
     try_collect_ok(try_par_collect(values, what)?, what)
 }
 
-/// What `part` adds to the end of a `Vec` for each of the numbers below `parts`, in their order. Each part should be
-/// small, all together may be many.
+/// Calls `part` with each of the numbers below `parts`, in parallel, and concatenates the items that it adds to its
+/// `Vec`, in order of the numbers. Each part should be small, all together may be many.
 pub fn try_par_gather<T: Send>(
     parts: usize,
     what: &str,
@@ -229,7 +229,7 @@ pub fn try_par_gather<T: Send>(
     Ok(all)
 }
 
-/// Those of the numbers below `count` that `keep` takes, ascending. In parallel.
+/// The numbers below `count` that `keep` accepts, ascending. Computed in parallel.
 pub fn try_par_filter(count: usize, what: &str, keep: impl Fn(u32) -> bool + Sync) -> Result<Vec<u32>> {
     try_par_gather(count.div_ceil(FILTER_PART), what, |i, out| {
         let part = i * FILTER_PART..count.min((i + 1) * FILTER_PART);
@@ -237,7 +237,7 @@ pub fn try_par_filter(count: usize, what: &str, keep: impl Fn(u32) -> bool + Syn
     })
 }
 
-/// Numbers that [`try_par_filter`] gives to a thread at a time.
+/// Number of candidates that [`try_par_filter`] gives to a thread at a time.
 const FILTER_PART: usize = 1 << 12;
 
 #[cfg(test)]

@@ -1,5 +1,5 @@
-//! What every floor uses: errors, progress, memory accounts, files, samples, geometry, and the state of threads that
-//! call or are called.
+//! Common basis of all modules: errors, progress, memory accounts, files, samples, geometry, and the state of threads
+//! that call or are called.
 
 pub(crate) mod callback;
 pub mod error;

@@ -1,10 +1,10 @@
 //! Progress reports and cancelling.
 //!
-//! A long call gets one [`Progress`]. Its stages each own a share of the bar and count work from any thread.
-//! While [`Device::run`](crate::device::Device::run) carries the work out on the device's threads, the thread that
-//! made the call waits for it and makes all reports: the callback is told the same stage again when no thread gets to
-//! count anything, no worker ever waits for a callback, and a callback that waits for workers does not block them.
-//! Work that is not run that way reports whenever it counts, on the thread that counts.
+//! A long call gets one [`Progress`]. Its stages each own a share of the bar and count work from any thread. While
+//! [`Device::run`](crate::device::Device::run) carries the work out on the device's threads, the thread that made the
+//! call waits for it and makes all reports: the same stage is reported again when no thread gets to count anything, no
+//! worker ever waits for a callback, and a callback that waits for workers does not block them. Work that is not run
+//! that way reports whenever it counts, on the thread that counts.
 
 use crate::error::{Error, Result};
 use std::collections::VecDeque;
@@ -18,10 +18,10 @@ pub type ProgressFn<'a> = dyn FnMut(f32, &str) -> bool + Send + 'a;
 /// Time between two reports of the same stage.
 const INTERVAL: Duration = Duration::from_millis(15);
 
-/// Reports of starting stages that may follow each other at once.
+/// Maximum number of reports of starting stages that may follow each other at once.
 const BURST: f64 = 20.0;
 
-/// Reports per second on average. With [`BURST`] at most 100 in any second.
+/// Average number of reports per second. With [`BURST`] there are at most 100 in any second.
 const RATE: f64 = 80.0;
 
 /// Decides which reports are made: those of the same stage at intervals, those of starting stages at once, and never
@@ -37,7 +37,7 @@ impl Pace {
         Pace { last_report: None, credit: BURST, credit_at: Duration::ZERO }
     }
 
-    /// Whether to report at the time `now`, and if so, counts the report.
+    /// Whether to report at the time `now`; if so, counts the report.
     fn allows(&mut self, now: Duration, starts_stage: bool) -> bool {
         if !starts_stage && self.last_report.is_some_and(|last| now.saturating_sub(last) < INTERVAL) {
             return false;
@@ -54,20 +54,20 @@ impl Pace {
     }
 }
 
-/// The caller's function and what it has been told.
+/// The caller's function with the progress reported to it.
 struct Callback<'a> {
     function: Box<ProgressFn<'a>>,
     pace: Pace,
     fraction: f32,
 }
 
-/// What there is to report.
+/// News that are still to be reported.
 #[derive(Default)]
 struct News {
     /// Fraction and name of stages that have started, and of the end, not yet reported.
     starts: VecDeque<(f32, &'static str)>,
     stage: &'static str,
-    /// Set when the work ends that a thread attends to.
+    /// Set when the attended work ends.
     ended: bool,
 }
 
@@ -76,7 +76,7 @@ struct Reporter<'a> {
     callback: Mutex<Callback<'a>>,
     news: Mutex<News>,
     wake: Condvar,
-    /// The largest fraction counted, as bits (which are ordered as the fractions are).
+    /// The largest fraction counted, stored as bits (which are ordered as the fractions are).
     fraction: AtomicU32,
     /// Whether a thread waits in [`Progress::attend`] and makes the reports.
     attended: AtomicBool,
@@ -84,18 +84,18 @@ struct Reporter<'a> {
 
 impl Reporter<'_> {
     fn news(&self) -> MutexGuard<'_, News> {
-        // No panic leaves it half changed.
+        // No panic leaves the news half changed.
         self.news.lock().unwrap_or_else(PoisonError::into_inner)
     }
 
-    /// Makes the reports that are due; whether the callback wants the call to go on.
+    /// Makes the reports that are due; returns whether the callback wants the call to continue.
     fn report(&self, callback: &mut Callback) -> bool {
         loop {
             let start = self.news().starts.pop_front();
             let now = || (f32::from_bits(self.fraction.load(Relaxed)), self.news().stage);
             let (fraction, stage) = start.unwrap_or_else(now);
             if stage.is_empty() {
-                // None has started yet.
+                // No stage has started yet.
                 return true;
             }
             if callback.pace.allows(self.begin.elapsed(), start.is_some()) {
@@ -119,7 +119,7 @@ pub struct Progress<'a> {
 }
 
 impl<'a> Progress<'a> {
-    /// Reports to `callback`.
+    /// Makes a progress that reports to `callback`.
     pub fn new(callback: impl FnMut(f32, &str) -> bool + Send + 'a) -> Self {
         let reporter = Reporter {
             begin: Instant::now(),
@@ -132,7 +132,7 @@ impl<'a> Progress<'a> {
         Progress { reporter: Some(reporter), cancelled: AtomicBool::new(false) }
     }
 
-    /// Reports to nobody and is never cancelled.
+    /// Makes a progress that reports to nobody and is never cancelled.
     pub fn none() -> Self {
         Progress::default()
     }
@@ -142,8 +142,8 @@ impl<'a> Progress<'a> {
         self.cancelled.load(Relaxed)
     }
 
-    /// `Err(Cancelled)` once the callback has asked to stop. Where no thread waits to call it, it is asked here, at its
-    /// intervals. Cheap enough for every few microseconds of work.
+    /// Returns `Err(Cancelled)` once the callback has asked to stop. If no thread attends to the callback, it is called
+    /// here, at its intervals. Cheap enough for every few microseconds of work.
     pub fn check(&self) -> Result<()> {
         self.count(0.0);
         if self.is_cancelled() { Err(Error::Cancelled) } else { Ok(()) }
@@ -176,7 +176,7 @@ impl<'a> Progress<'a> {
         if fraction > 0.0 {
             reporter.fraction.fetch_max(fraction.to_bits(), Relaxed);
         }
-        // Nobody waits for a callback that another thread is in.
+        // No thread waits for a callback that another thread is in.
         if !reporter.attended.load(Relaxed)
             && let Ok(mut callback) = reporter.callback.try_lock()
         {
@@ -190,13 +190,13 @@ impl<'a> Progress<'a> {
         }
     }
 
-    /// Whether there is a callback that no thread attends to yet.
+    /// Whether there is a callback to which no thread attends yet.
     pub(crate) fn wants_attendance(&self) -> bool {
         self.reporter.as_ref().is_some_and(|r| !r.attended.load(Relaxed))
     }
 
-    /// Makes all reports of the work that `start` gets under way, on the calling thread, until that work drops what
-    /// it is handed.
+    /// Makes all reports of the work that `start` begins, on the calling thread, until that work drops the `Attended`
+    /// it gets.
     pub(crate) fn attend<'p>(&'p self, start: impl FnOnce(Attended<'p, 'a>)) {
         let Some(reporter) = &self.reporter else { return start(Attended(self)) };
         reporter.attended.store(true, Relaxed);
@@ -222,7 +222,7 @@ impl<'a> Progress<'a> {
     }
 }
 
-/// Held by work that a thread [attends](Progress::attend) to; says on drop that it has ended.
+/// Held by work that a thread [attends](Progress::attend) to; its drop signals that the work has ended.
 pub(crate) struct Attended<'p, 'a>(&'p Progress<'a>);
 
 impl Drop for Attended<'_, '_> {
@@ -242,7 +242,7 @@ impl Drop for CancelOnDrop<'_> {
     }
 }
 
-/// A part of a [`Progress`] bar, advanced from any thread.
+/// A part of the bar of a [`Progress`], advanced from any thread.
 pub struct Stage<'p, 'a> {
     progress: &'p Progress<'a>,
     name: &'static str,
@@ -253,7 +253,7 @@ pub struct Stage<'p, 'a> {
 }
 
 impl Stage<'_, '_> {
-    /// Counts `items` more as done; `Err(Cancelled)` once the callback has asked to stop.
+    /// Counts `items` more as done; returns `Err(Cancelled)` once the callback has asked to stop.
     pub fn advance(&self, items: u64) -> Result<()> {
         let before = self.done.fetch_add(items, Relaxed).min(self.total);
         let done = (before + items).min(self.total);
@@ -266,7 +266,7 @@ impl Stage<'_, '_> {
         if self.is_cancelled() { Err(Error::Cancelled) } else { Ok(()) }
     }
 
-    /// See [`Progress::check`].
+    /// Checks for a cancel as [`Progress::check`].
     pub fn check(&self) -> Result<()> {
         self.progress.check()
     }

@@ -10,7 +10,7 @@
 use glam::Vec3;
 use std::f32::consts::{PI, TAU};
 
-/// A 32-bit mix (the finaliser of MurmurHash3): every input bit changes every output bit.
+/// Mixes 32 bits (the finaliser of MurmurHash3): every input bit affects every output bit.
 #[inline]
 pub fn mix(mut x: u32) -> u32 {
     x ^= x >> 16;
@@ -20,13 +20,13 @@ pub fn mix(mut x: u32) -> u32 {
     x ^ (x >> 16)
 }
 
-/// A seed made from a seed and one more number.
+/// Makes a seed from a seed and another number.
 #[inline]
 pub fn combine(seed: u32, value: u32) -> u32 {
     mix(seed ^ mix(value.wrapping_add(0x9e37_79b9)))
 }
 
-/// A 32-bit seed for one purpose (a stage of the pipeline) from the caller's 64-bit seed.
+/// Makes a 32-bit seed for one purpose (a stage of the pipeline) from the caller's 64-bit seed.
 #[inline]
 pub fn purpose_seed(seed: u64, purpose: u32) -> u32 {
     combine(combine(mix(seed as u32), (seed >> 32) as u32), purpose)
@@ -61,7 +61,7 @@ fn sobol_second(index: u32) -> u32 {
     x.reverse_bits()
 }
 
-/// [0, 1): 24 bits, so that the result is never rounded up to 1.
+/// Maps 32 bits to [0, 1): 24 bits, so that the result is never rounded up to 1.
 #[inline]
 pub fn unit_float(x: u32) -> f32 {
     (x >> 8) as f32 * (1.0 / (1 << 24) as f32)
@@ -73,8 +73,8 @@ pub fn sobol_2d(index: u32, seed: u32) -> [f32; 2] {
     sobol_2d_bits(index, seed).map(unit_float)
 }
 
-/// The same in fixed point: 32 binary digits behind the point. XOR with a constant per coordinate
-/// (a digital shift) gives another (0,2)-sequence with the same points in each elementary interval.
+/// Point `index` of the sequence of `sobol_2d` in fixed point: 32 binary digits behind the point. XOR with a constant
+/// per coordinate (a digital shift) gives another (0,2)-sequence with the same points in each elementary interval.
 #[inline]
 pub fn sobol_2d_bits(index: u32, seed: u32) -> [u32; 2] {
     let shuffled = owen_scramble(index, combine(seed, 0));
@@ -87,15 +87,15 @@ pub fn uniform(index: u32, dimension: u32, seed: u32) -> f32 {
     unit_float(combine(combine(seed, dimension), index))
 }
 
-/// Unit square to the hemisphere around +z with density cos θ / π (Malley's method with Shirley and
-/// Chiu's concentric map).
+/// Maps the unit square to the hemisphere around +z with density cos θ / π (Malley's method with Shirley and Chiu's
+/// concentric map).
 #[inline]
 pub fn cosine_hemisphere(u: [f32; 2]) -> Vec3 {
     let [x, y] = concentric_disc(u);
     Vec3::new(x, y, (1.0 - x * x - y * y).max(0.0).sqrt())
 }
 
-/// Unit square to the unit disc, uniformly (Shirley and Chiu 1997).
+/// Maps the unit square to the unit disc, uniformly (Shirley and Chiu 1997).
 #[inline]
 pub fn concentric_disc(u: [f32; 2]) -> [f32; 2] {
     let (a, b) = (2.0 * u[0] - 1.0, 2.0 * u[1] - 1.0);
@@ -106,13 +106,13 @@ pub fn concentric_disc(u: [f32; 2]) -> [f32; 2] {
     [r * phi.cos(), r * phi.sin()]
 }
 
-/// Unit square to the unit sphere, uniformly.
+/// Maps the unit square to the unit sphere, uniformly.
 #[inline]
 pub fn uniform_sphere(u: [f32; 2]) -> Vec3 {
     uniform_cone(u, -1.0)
 }
 
-/// Unit square to the cone around +z of half-angle acos(`cos_max`), uniformly in solid angle.
+/// Maps the unit square to the cone around +z of half-angle acos(`cos_max`), uniformly in solid angle.
 #[inline]
 pub fn uniform_cone(u: [f32; 2], cos_max: f32) -> Vec3 {
     let z = 1.0 - u[0] * (1.0 - cos_max);
@@ -121,7 +121,7 @@ pub fn uniform_cone(u: [f32; 2], cos_max: f32) -> Vec3 {
     Vec3::new(r * cos, r * sin, z)
 }
 
-/// Unit square to barycentrics (weights of vertices 1 and 2), uniformly in area.
+/// Maps the unit square to barycentrics (weights of vertices 1 and 2), uniformly in area.
 #[inline]
 pub fn uniform_triangle(u: [f32; 2]) -> [f32; 2] {
     let s = u[0].sqrt();
