@@ -2,7 +2,7 @@
 
 use glam::Vec3;
 
-/// Index that stands for "no triangle", "no chart", …: never a valid one.
+/// Index that means "no triangle", "no chart", …: never a valid one.
 pub const NONE: u32 = u32::MAX;
 
 /// Coordinates up to this magnitude are valid: products of three of them stay finite in f32, as the

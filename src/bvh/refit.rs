@@ -217,7 +217,8 @@ mod tests {
         all
     }
 
-    /// The same t, and of the same triangle the same u and v; other triangles may tie.
+    /// Checks that hits have the same t and, if they are on the same triangle, the same u and v; other triangles may
+    /// tie.
     fn assert_same_hits(a: &Mbvh, b: &Mbvh, rays: &[Ray]) -> usize {
         let (a, b) = (hits(a, rays), hits(b, rays));
         for (i, (a, b)) in a.iter().zip(&b).enumerate() {

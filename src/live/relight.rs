@@ -390,7 +390,7 @@ mod tests {
         assert_eq!((&dark.sides.backs, &dark.own[..]), (&shown.backs, &[Some(Vec3::ZERO), None][..]));
     }
 
-    /// What few photons bring fits what is shown, whatever sides are found later.
+    /// The result of a renewal with few photons fits the shown sides, whatever sides are found later.
     #[test]
     fn a_quick_renewal_keeps_the_sides_and_renews_what_texels_gather_for_themselves() {
         let scene = builtin("atrium").unwrap().committed();

@@ -7,8 +7,8 @@
 //! the power that makes the expectation right. Positions and directions are pairs of Owen-scrambled
 //! Sobol dimensions over the photon number: any run of consecutive numbers is stratified.
 //!
-//! Photons are aimed at the scene where that is exact and cheap. A parallel light shines through
-//! the faces of the scene's bounding box that it meets, which is the whole of its light that can
+//! Photons are aimed at the scene where that is exact and cheap. A parallel light emits them through
+//! the faces of the scene's bounding box on which it falls, which is the whole of its light that can
 //! reach the scene. Discs and skies shine through discs around the scene's bounding sphere, each
 //! perpendicular to its photon. A point light outside the box's bounding sphere emits into the cone of that sphere; the
 //! rest of its power is counted as escaped without being traced. [Guides](super::guide) send more photons where they

@@ -118,7 +118,7 @@ mod tests {
     use super::*;
     use crate::sampling::sobol_2d;
 
-    /// Of a light most of whose photons are lost: one in a corner leaves three, others one by chance.
+    /// Pilot of a light most of whose photons are lost: one in a corner leaves three, others one by chance.
     fn pilot() -> Vec<PilotPhoton> {
         let photon = |i: u32| {
             let [x, y] = sobol_2d(i, 1);

@@ -4,7 +4,7 @@
 //! The lit area is measured by counting: photons are put into cubic cells of the size at which an
 //! occupied cell holds some 16 of the photons looked at, so that few lit cells are missed. A plane
 //! of area A with normal n cuts, on average over its position, A·(|nx| + |ny| + |nz|)/s² cells of
-//! size s (the sum of its three projections); each occupied cell therefore stands for
+//! size s (the sum of its three projections); each occupied cell therefore represents
 //! s²/(|nx| + |ny| + |nz|). Photons are counted apart by the axis that their normal is closest to,
 //! so that the walls of a corner or the two sides of a thin wall count one by one.
 //!

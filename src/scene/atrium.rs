@@ -599,9 +599,9 @@ fn baluster(part: &mut Part, axis: Vec2, bottom: f32, top: f32, material: u32) {
 /// Way in which a drape hangs.
 #[derive(Clone, Copy)]
 enum Hang {
-    /// Across the bay.
+    /// Cloth across the bay.
     Full,
-    /// In two halves, tied back to the columns.
+    /// Cloth in two halves, tied back to the columns.
     Tied,
 }
 
@@ -795,7 +795,7 @@ struct Part {
     normals: Vec<Vec3>,
     indices: Vec<[u32; 3]>,
     materials: Vec<u32>,
-    /// Vertices by the bits of position and normal: faces that meet share them.
+    /// Vertices by the bits of position and normal: adjacent faces share them.
     known: HashMap<[u32; 6], u32>,
 }
 

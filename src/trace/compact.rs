@@ -253,7 +253,7 @@ mod tests {
             .collect()
     }
 
-    /// From in and around the scene, to corners, edges and anywhere, and along axes.
+    /// Rays from in and around the scene, to corners, edges and anywhere, and along axes.
     fn rays(triangles: &[[Vec3; 3]], n: u32, seed: u32, scale: f32, offset: Vec3) -> Vec<Ray> {
         (0..n)
             .map(|i| {

@@ -144,7 +144,7 @@ mod tests {
             }
         }
 
-        /// Of slivers too: their shadows once moved by a third of their length.
+        /// Slivers are included: their shadows once moved by a third of their length.
         #[test]
         fn the_interior_point_is_in_the_triangle_and_near_the_point(
             (u, v) in (0.0f32..=1.0, 0.0f32..=1.0),

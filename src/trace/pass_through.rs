@@ -190,7 +190,7 @@ mod tests {
         hits.iter().map(bits).zip(occluded.iter().map(|&o| o == 1)).collect()
     }
 
-    /// From one origin, as bundles, and from many.
+    /// Rays from one origin, as bundles, and from many origins.
     fn rays(seed: u32) -> Vec<Ray> {
         let direction = |i: u32| uniform_sphere([uniform(i, 0, seed), uniform(i, 1, seed)]);
         let narrow = |i: u32| Vec3::new(uniform(i, 0, seed), uniform(i, 1, seed), -8.0) * 0.3;
