@@ -130,8 +130,8 @@ impl Node {
         (0..WIDTH).map(child).sum()
     }
 
-    /// Fills in `order` from the boxes, by their centres along the octant's diagonal. (Ordering by where boxes begin costs
-    /// random rays 3 % more instructions.)
+    /// Fills in `order` from the boxes, by their centres along the octant's diagonal. (Ordering by where boxes begin
+    /// costs random rays 3 % more instructions.)
     pub(crate) fn sort_children(&mut self) {
         self.order = [0; WIDTH];
         for octant in 0..4u32 {

@@ -465,7 +465,8 @@ impl Builder<'_, '_> {
         self.build_flat(stack, nr, sides.extents[1], sides.extra[1], depth + 1, work, out)
     }
 
-    /// Writes the two sides of the best split to `work`, which [has room](Work::make_room) for them; `None`: make a leaf.
+    /// Writes the two sides of the best split to `work`, which [has room](Work::make_room) for them; `None`: the node
+    /// must become a leaf.
     fn split(
         &self,
         refs: &mut [Reference],
