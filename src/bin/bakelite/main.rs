@@ -33,14 +33,6 @@ const USAGE: u8 = 2;
 
 fn main() -> ExitCode {
     let result = match args::parse(std::env::args_os().skip(1)) {
-        Ok(Command::Help) => {
-            print!("{}", args::HELP);
-            Ok(())
-        }
-        Ok(Command::Version) => {
-            println!("bakelite {}", env!("CARGO_PKG_VERSION"));
-            Ok(())
-        }
         Ok(Command::Bake(bake)) => bake::run(&bake),
         Ok(Command::ReportCancel(args)) => report::cancel::run(&args),
         Ok(Command::ReportLive(report)) => report::live::run(&report),
@@ -48,9 +40,10 @@ fn main() -> ExitCode {
         Ok(Command::ReportPipeline(args)) => report::pipeline::run(&args),
         Ok(Command::ReportQuality(report)) => report::quality::run(&report),
         Ok(Command::ReportStability(args)) => report::stability::run(&args),
+        // Help and the version, too.
         Err(e) => {
-            eprintln!("bakelite: {e}\nTry bakelite --help");
-            return ExitCode::from(USAGE);
+            let _ = e.print();
+            return ExitCode::from(if e.use_stderr() { USAGE } else { 0 });
         }
     };
     if let Err(e) = result {

@@ -91,6 +91,13 @@ fn parameters(args: &BakeArgs) -> Value {
         "width": args.width,
         "height": args.height,
         "reference_spp": args.reference_spp,
+        "layers": args.layers.iter().map(|l| l.name).collect::<Vec<_>>(),
+        "formats": {
+            "exr": args.formats.exr,
+            "exr_half": args.formats.exr_half,
+            "png": args.formats.png,
+            "glb": args.formats.glb,
+        },
     })
 }
 

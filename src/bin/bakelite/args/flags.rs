@@ -1,0 +1,322 @@
+//! Flags with their help, defaults and ranges. Lengths are in scene units, colours are linear.
+
+use super::values::{self, GivenLight, of};
+use bakelite::Isa;
+use bakelite::bvh::{BuildOptions, BuildQuality};
+use bakelite::lightmap::{BakeParams, LightmapDesc};
+use bakelite::scene::Camera;
+use clap::builder::PossibleValuesParser;
+use clap::{Args, Parser, Subcommand};
+use std::path::PathBuf;
+
+/// Bakes light maps
+///
+/// Without a command, `bake` is meant; without a scene, the built-in atrium.
+#[derive(Parser)]
+#[command(name = "bakelite", version, override_usage = USAGE, after_help = EXAMPLES)]
+pub struct CommandLine {
+    #[command(subcommand)]
+    pub verb: Verb,
+}
+
+const USAGE: &str = "bakelite [bake] [SCENE] [OPTIONS]
+       bakelite report WHAT [SCENE] [OPTIONS]";
+
+const EXAMPLES: &str = "Examples:
+  bakelite                                     bakes the built-in atrium into out/
+  bakelite bake scene.glb --light sky:1,1,1    bakes a scene under a grey sky
+  bakelite help bake                           lists all flags of a bake
+  bakelite help report                         lists what there is to report";
+
+#[derive(Subcommand)]
+pub enum Verb {
+    /// Bakes the light of a scene into light maps
+    Bake(Box<Flags>),
+    /// Measures instead, and writes tables, plots and CSV
+    #[command(subcommand)]
+    Report(Report),
+}
+
+#[derive(Subcommand)]
+pub enum Report {
+    /// How long each call is silent, and how soon it ends when it is cancelled
+    Cancel(Box<Flags>),
+    /// Live updates: error against time and rays, budgets, traffic, memory
+    Live(Box<LiveFlags>),
+    /// The scene's memory, default and compact, and what that costs rays
+    Memory(Box<Flags>),
+    /// What each stage of a bake takes, and what bounds it
+    Pipeline(Box<Flags>),
+    /// Error of the light and likeness of a view against run time, for every knob of a bake, path tracing and photons
+    /// alone
+    Quality(Box<QualityFlags>),
+    /// Stiff and extreme cases, each against what is known of it (SCENE: its energy balance too)
+    Stability(Box<Flags>),
+}
+
+#[derive(Args)]
+pub struct LiveFlags {
+    #[command(flatten)]
+    pub flags: Flags,
+    /// Most time per curve of errors
+    #[arg(long, value_name = "F", help_heading = "Report live", default_value_t = 20.0, value_parser = values::positive)]
+    pub seconds: f64,
+    /// Updates per time budget, of 1, 2, 4 and 8 ms; 0: budgets are not measured
+    #[arg(long, value_name = "N", help_heading = "Report live", default_value_t = 10_000)]
+    pub updates: u32,
+}
+
+/// What a report of quality varies.
+pub const KNOBS: [&str; 9] = [
+    "gather-rays",
+    "photons",
+    "radius",
+    "blur",
+    "direct-samples",
+    "gather-divisor",
+    "radiance-divisor",
+    "path-tracing",
+    "photons-alone",
+];
+
+#[derive(Args)]
+#[command(next_help_heading = "Report quality")]
+pub struct QualityFlags {
+    /// Points at which light is compared
+    #[arg(long, value_name = "N", default_value_t = 400, value_parser = clap::value_parser!(u32).range(1..))]
+    pub points: u32,
+    /// Bakes per setting, to tell noise from bias
+    #[arg(long, value_name = "N", default_value_t = 4, value_parser = clap::value_parser!(u64).range(1..))]
+    pub seeds: u64,
+    /// Paths per point of the path traced reference
+    #[arg(long, value_name = "N", default_value_t = 4096, value_parser = clap::value_parser!(u32).range(1..))]
+    pub paths: u32,
+    /// Points and reference of an earlier report of the same scene and lights: its quality-points.csv
+    #[arg(long, value_name = "FILE")]
+    pub reference: Option<PathBuf>,
+    /// Paths per pixel of a path traced view, 1024 or times that; 0: no view
+    #[arg(long, value_name = "N", default_value_t = 1024)]
+    pub view_paths: u32,
+    /// What to vary [default: all but none]
+    #[arg(long, value_name = "A,B,..", value_delimiter = ',', default_values = KNOBS, hide_default_value = true,
+          value_parser = PossibleValuesParser::new(KNOBS.into_iter().chain(["none"])))]
+    pub knobs: Vec<String>,
+    #[command(flatten)]
+    pub flags: Flags,
+}
+
+// Flags of all commands. (A doc comment would be what the commands are about.)
+#[derive(Args)]
+pub struct Flags {
+    /// A file (.obj, .ply, .gltf, .glb) or a built-in scene (atrium, cornell, furnace) [default: atrium]
+    #[arg(value_parser = values::scene)]
+    pub scene: Option<String>,
+    /// The same
+    #[arg(long = "scene", value_name = "SCENE", conflicts_with = "scene", value_parser = values::scene)]
+    pub scene_flag: Option<String>,
+    #[command(flatten)]
+    pub file: FileFlags,
+    #[command(flatten)]
+    pub lights: LightFlags,
+    #[command(flatten)]
+    pub lightmap: LightmapFlags,
+    #[command(flatten)]
+    pub bake: BakeFlags,
+    #[command(flatten)]
+    pub parts: PartFlags,
+    #[command(flatten)]
+    pub machine: MachineFlags,
+    #[command(flatten)]
+    pub pictures: PictureFlags,
+    #[command(flatten)]
+    pub output: OutputFlags,
+}
+
+#[derive(Args)]
+#[command(next_help_heading = "Scene file")]
+pub struct FileFlags {
+    /// Files that the scene names must lie in DIR or below [default: the folder of the scene]
+    #[arg(long, value_name = "DIR")]
+    pub base_folder: Option<PathBuf>,
+    /// They may lie anywhere: for scenes you trust
+    #[arg(long)]
+    pub any_folder: bool,
+    /// Most MiB of all its images, decoded
+    #[arg(long, value_name = "N", default_value_t = 2 << 10)]
+    pub max_texture_mb: u64,
+    /// Most MiB of all its files
+    #[arg(long, value_name = "N", default_value_t = 16 << 10)]
+    pub max_file_mb: u64,
+}
+
+const LIGHTS: &str = "A light, added to those of the scene; may be repeated
+
+point:X,Y,Z:R,G,B - intensity in W/sr
+spot:X,Y,Z:DX,DY,DZ:INNER,OUTER:R,G,B - cone angles in degrees, intensity in W/sr
+sun:DX,DY,DZ:R,G,B[:DEGREES] - direction of travel, irradiance in W/m2, radius of its disc [0; the sun's: 0.27]
+sky:R,G,B - the same radiance from all directions
+sky:FILE.hdr|.exr[:SCALE] - an image by longitude and latitude, its zenith along --up, times SCALE
+rect:X,Y,Z:UX,UY,UZ:VX,VY,VZ:R,G,B - corner and edges, shines along u x v, radiance in W/(m2 sr)";
+
+#[derive(Args)]
+#[command(next_help_heading = "Lights")]
+pub struct LightFlags {
+    #[arg(long, value_name = "LIGHT", value_parser = values::light, help = LIGHTS)]
+    pub light: Vec<GivenLight>,
+}
+
+#[derive(Args)]
+#[command(next_help_heading = "Light map")]
+pub struct LightmapFlags {
+    /// Density; 0: about one page [default: 0; the atrium: 30]
+    #[arg(long, value_name = "F", value_parser = of(|d: &mut LightmapDesc, v| d.texels_per_unit = v))]
+    pub texels_per_unit: Option<f32>,
+    /// Width and height of a page in texels
+    #[arg(long, value_name = "N", default_value_t = LightmapDesc::default().page_size,
+          value_parser = of(|d: &mut LightmapDesc, v| d.page_size = v))]
+    pub page_size: u32,
+    /// Texels around each chart
+    #[arg(long, value_name = "N", default_value_t = LightmapDesc::default().padding,
+          value_parser = of(|d: &mut LightmapDesc, v| d.padding = v))]
+    pub padding: u32,
+    /// Light map texels per gather map texel and axis
+    #[arg(long, value_name = "N", default_value_t = LightmapDesc::default().gather_divisor,
+          value_parser = of(|d: &mut LightmapDesc, v| d.gather_divisor = v))]
+    pub gather_divisor: u32,
+    /// Light map texels per radiance map texel and axis
+    #[arg(long, value_name = "N", default_value_t = LightmapDesc::default().radiance_divisor,
+          value_parser = of(|d: &mut LightmapDesc, v| d.radiance_divisor = v))]
+    pub radiance_divisor: u32,
+    /// One side of each two-sided chart, also where both are seen
+    #[arg(long)]
+    pub one_side: bool,
+}
+
+#[derive(Args)]
+#[command(next_help_heading = "Bake")]
+pub struct BakeFlags {
+    /// Photons emitted
+    #[arg(long, value_name = "N", default_value_t = BakeParams::default().photon_count,
+          value_parser = of(|p: &mut BakeParams, v| p.photon_count = v))]
+    pub photons: u64,
+    /// Most reflections; 0: Russian roulette alone decides
+    #[arg(long, value_name = "N", default_value_t = BakeParams::default().max_bounces,
+          value_parser = of(|p: &mut BakeParams, v| p.max_bounces = v))]
+    pub bounces: u32,
+    /// Rays per gather map texel; 0: no indirect light
+    #[arg(long, value_name = "N", default_value_t = BakeParams::default().gather_rays,
+          value_parser = of(|p: &mut BakeParams, v| p.gather_rays = v))]
+    pub gather_rays: u32,
+    /// Photon search radius; 0: automatic
+    #[arg(long, value_name = "F", default_value_t = BakeParams::default().radius,
+          value_parser = of(|p: &mut BakeParams, v| p.radius = v))]
+    pub radius: f32,
+    /// Blur radius in gather map texels
+    #[arg(long, value_name = "N", default_value_t = BakeParams::default().blur_radius,
+          value_parser = of(|p: &mut BakeParams, v| p.blur_radius = v))]
+    pub blur: u32,
+    /// Shadow rays per texel and area light
+    #[arg(long, value_name = "N", default_value_t = BakeParams::default().direct_samples,
+          value_parser = of(|p: &mut BakeParams, v| p.direct_samples = v))]
+    pub direct_samples: u32,
+    /// The same seed gives the same bits
+    #[arg(long, value_name = "N", default_value_t = BakeParams::default().seed,
+          value_parser = of(|p: &mut BakeParams, v| p.seed = v))]
+    pub seed: u64,
+    /// Leave the seams between charts as they are
+    #[arg(long)]
+    pub no_stitch: bool,
+}
+
+#[derive(Args)]
+#[command(next_help_heading = "Checkpoints and shards")]
+pub struct PartFlags {
+    /// Keeps what is done in FILE and goes on from it after a kill; deleted in the end
+    #[arg(long, value_name = "FILE")]
+    pub checkpoint: Option<PathBuf>,
+    /// Between two writes of it
+    #[arg(long, value_name = "F", default_value_t = 10.0, value_parser = values::checkpoint_seconds)]
+    pub checkpoint_seconds: f64,
+    /// Bakes the I-th of N parts of the texels, 1/N to N/N
+    #[arg(long, value_name = "I/N", value_parser = values::shard)]
+    pub shard: Option<[u64; 2]>,
+    /// The light of the texels, for --load-result
+    #[arg(long, value_name = "FILE")]
+    pub save_result: Option<PathBuf>,
+    /// Light to take over instead of baking; may be repeated, for shards
+    #[arg(long, value_name = "FILE")]
+    pub load_result: Vec<PathBuf>,
+}
+
+#[derive(Args)]
+#[command(next_help_heading = "Machine")]
+pub struct MachineFlags {
+    /// 0: one per logical core
+    #[arg(long, value_name = "N", default_value_t = 0)]
+    pub threads: usize,
+    /// Instructions of the ray kernels
+    #[arg(long, value_name = "NAME", default_value = "auto",
+          value_parser = PossibleValuesParser::new(Isa::ALL.map(Isa::name).into_iter().chain(["auto"])))]
+    pub isa: String,
+    /// Bins of the tree builder
+    #[arg(long, value_name = "N", default_value_t = BuildOptions::default().bins,
+          value_parser = of(|o: &mut BuildOptions, v| o.bins = v))]
+    pub bins: u32,
+    /// Most triangles per leaf
+    #[arg(long, value_name = "N", default_value_t = BuildOptions::default().max_leaf,
+          value_parser = of(|o: &mut BuildOptions, v| o.max_leaf = v))]
+    pub leaf: u32,
+    /// How to build the tree; high: with spatial splits, for faster rays
+    #[arg(long, value_name = "NAME", default_value = BuildOptions::default().quality.name(),
+          value_parser = PossibleValuesParser::new(BuildQuality::ALL.map(BuildQuality::name)))]
+    pub build: String,
+    /// The tree in a fifth of the memory, for slower rays
+    #[arg(long)]
+    pub compact: bool,
+}
+
+/// Images beyond this width or height are a slip of the finger.
+const MAX_PICTURE: i64 = 16384;
+
+#[derive(Args)]
+#[command(next_help_heading = "Pictures (path traced reference; indirect map and shadow rays; light map alone)")]
+pub struct PictureFlags {
+    /// PX,PY,PZ:TX,TY,TZ[:FOV]: position, target, vertical degrees [60]; without it, a view is looked for
+    #[arg(long, value_name = "CAMERA", allow_hyphen_values = true, value_parser = values::camera)]
+    pub camera: Option<Camera>,
+    /// Up axis of the scene, for the camera and skies
+    #[arg(long, value_name = "AXIS", default_value = "y", value_parser = ["x", "y", "z"])]
+    pub up: String,
+    /// Width of each
+    #[arg(long, value_name = "N", default_value_t = 480, value_parser = clap::value_parser!(u32).range(1..=MAX_PICTURE))]
+    pub width: u32,
+    /// Height of each
+    #[arg(long, value_name = "N", default_value_t = 270, value_parser = clap::value_parser!(u32).range(1..=MAX_PICTURE))]
+    pub height: u32,
+    /// Paths per pixel of the reference; 0: no pictures [default: 0; built-in scenes: 32]
+    #[arg(long, value_name = "N")]
+    pub reference_spp: Option<u32>,
+}
+
+#[derive(Args)]
+#[command(next_help_heading = "Output")]
+pub struct OutputFlags {
+    /// Where all files go
+    #[arg(long, value_name = "DIR", default_value = "out")]
+    pub out: PathBuf,
+    /// Layers of the light map that become pages
+    #[arg(long, value_name = "A,B,..", value_delimiter = ',', default_values = ["combined", "indirect", "direct", "radiance"],
+          value_parser = PossibleValuesParser::new(super::LAYERS.map(|l| l.name)))]
+    pub layers: Vec<String>,
+    /// Files to write: pages as floats or half floats (EXR), pages tone mapped (PNG; layers of light alone), the scene
+    /// with its light map (GLB)
+    #[arg(long, value_name = "A,B,..", value_delimiter = ',', default_values = ["exr", "png", "glb"],
+          value_parser = ["exr", "exr-half", "png", "glb"])]
+    pub format: Vec<String>,
+    /// No GLB, whatever --format says
+    #[arg(long)]
+    pub no_glb: bool,
+    /// No progress, no table
+    #[arg(long)]
+    pub quiet: bool,
+}
