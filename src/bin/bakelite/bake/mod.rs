@@ -54,16 +54,18 @@ pub fn run(args: &BakeArgs) -> Result<()> {
     Ok(())
 }
 
-/// What a run without a scene says first.
+/// Text that a run without a scene shows first.
 fn first_words(args: &BakeArgs) -> String {
-    let mut text = format!(
-        "No scene is given: baking the built-in atrium into {}/, which takes a quarter of a minute on two cores",
+    let time = if args.reference_spp > 0 {
+        "half a minute on two cores, most of it for a path traced picture to compare with (--reference-spp 0: none)"
+    } else {
+        "a quarter of a minute on two cores"
+    };
+    format!(
+        "No scene is given: baking the built-in atrium into {}/, which takes {time}.\n\
+         A scene of your own: bakelite bake SCENE; all flags: bakelite help bake.",
         args.out.display()
-    );
-    if args.reference_spp > 0 {
-        text.push_str(", and as long again for a path traced picture to compare with (--reference-spp 0: none)");
-    }
-    text + ".\nA scene of your own: bakelite bake SCENE; all flags: bakelite help bake."
+    )
 }
 
 impl Job<'_> {
