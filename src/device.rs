@@ -7,6 +7,7 @@ use crate::memory::{MemoryFn, MemoryMonitor};
 use crate::progress::Progress;
 use crate::simd::Isa;
 use std::cell::Cell;
+use std::io::Write;
 use std::sync::Arc;
 use std::thread::JoinHandle;
 
@@ -39,6 +40,9 @@ pub const MAX_THREADS: usize = 1024;
 /// takes memory.
 const STACK_BYTES: usize = 4 << 20;
 
+/// Environment variable that shows log messages on standard error, see [`DeviceOptions::log`].
+const LOG_VARIABLE: &str = "BAKELITE_LOG";
+
 /// Options for creating a [`Device`].
 #[derive(Default)]
 pub struct DeviceOptions {
@@ -46,7 +50,8 @@ pub struct DeviceOptions {
     pub num_threads: usize,
     /// The ISA to use; `None`: the best that this machine has.
     pub isa: Option<Isa>,
-    /// Receives log messages.
+    /// Receives log messages. `None`: they go to standard error as far as the environment variable `BAKELITE_LOG` asks
+    /// for it (`error`, `warning`, or `info`, which any other word means too), else nowhere.
     pub log: Option<Box<LogFn>>,
     /// Called before large allocations.
     pub memory: Option<Box<MemoryFn>>,
@@ -85,14 +90,18 @@ impl Device {
         let name = |i| format!("bakelite-{i}");
         let (pool, threads) = start_threads(num_threads, name, float_state::set_on_own_thread)
             .map_err(|e| Error::OutOfMemory(format!("the {num_threads} worker threads could not be started: {e}")))?;
-        Ok(Arc::new(Device {
+        let device = Device {
             pool: Some(pool),
             threads,
             isa,
-            log: options.log,
+            log: options.log.or_else(|| log_to(std::io::stderr, &std::env::var(LOG_VARIABLE).ok()?)),
             memory: Arc::new(MemoryMonitor::new(options.memory)),
             process: std::process::id(),
-        }))
+        };
+        device.log_info(|| {
+            format!("version {}, {num_threads} threads, instruction set {}", env!("CARGO_PKG_VERSION"), isa.name())
+        });
+        Ok(Arc::new(device))
     }
 
     /// Fails in a process that `fork` has made from the one in which the device was created: the threads are not in the
@@ -188,10 +197,33 @@ impl Device {
         }
     }
 
+    /// Sends a message about the progress of the work to the log callback. The message is made only if there is one.
+    pub(crate) fn log_info(&self, message: impl FnOnce() -> String) {
+        if self.log.is_some() {
+            self.log(LogLevel::Info, &message());
+        }
+    }
+
     /// The memory accounts.
     pub fn memory(&self) -> &Arc<MemoryMonitor> {
         &self.memory
     }
+}
+
+/// A log that writes messages up to a level to a stream; `None` for an empty word. A message that cannot be written,
+/// because the stream is closed, is lost.
+fn log_to<W: Write>(stream: impl Fn() -> W + Send + Sync + 'static, level: &str) -> Option<Box<LogFn>> {
+    let most = match level {
+        "" => return None,
+        "error" => LogLevel::Error,
+        "warning" => LogLevel::Warning,
+        _ => LogLevel::Info,
+    };
+    Some(Box::new(move |level, message| {
+        if level <= most {
+            drop(writeln!(stream(), "bakelite: {message}"));
+        }
+    }))
 }
 
 /// A thread with a stack of the library's choice.
@@ -401,6 +433,34 @@ mod tests {
         let payload = std::panic::catch_unwind(std::panic::AssertUnwindSafe(work)).unwrap_err();
         assert_eq!(Error::of_panic(payload), Error::Internal("a panic was caught: as expected".into()));
         assert!(!callback::is_running());
+    }
+
+    #[test]
+    fn the_log_of_the_environment_writes_up_to_its_level() {
+        #[derive(Clone, Default)]
+        struct Written(Arc<std::sync::Mutex<Vec<u8>>>);
+        impl Write for Written {
+            fn write(&mut self, bytes: &[u8]) -> std::io::Result<usize> {
+                self.0.lock().unwrap().write(bytes)
+            }
+            fn flush(&mut self) -> std::io::Result<()> {
+                Ok(())
+            }
+        }
+        let written = |level: &str| {
+            let all = Written::default();
+            let stream = all.clone();
+            let log = log_to(move || stream.clone(), level).unwrap();
+            for level in [LogLevel::Error, LogLevel::Warning, LogLevel::Info] {
+                log(level, &format!("{level:?}"));
+            }
+            String::from_utf8(all.0.lock().unwrap().clone()).unwrap()
+        };
+        assert_eq!(written("error"), "bakelite: Error\n");
+        assert_eq!(written("warning"), "bakelite: Error\nbakelite: Warning\n");
+        assert_eq!(written("info"), "bakelite: Error\nbakelite: Warning\nbakelite: Info\n");
+        assert_eq!(written("1"), written("info"));
+        assert!(log_to(std::io::stderr, "").is_none());
     }
 
     #[test]

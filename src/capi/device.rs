@@ -61,7 +61,8 @@ pub const BK_LOG_ERROR: u32 = 0;
 /// Log level: something about the input or the run that deserves attention, for example skipped
 /// triangles.
 pub const BK_LOG_WARNING: u32 = 1;
-/// Log level: progress of the work.
+/// Log level: progress of the work. One message each for a device, a commit, a light map and a bake,
+/// with sizes, times and the text of bk_plan_describe.
 pub const BK_LOG_INFO: u32 = 2;
 
 /// Reports the progress of a call, and can cancel it.
@@ -118,7 +119,9 @@ pub struct bk_device_desc {
     pub num_threads: u32,
     /// One of the BK_ISA values. Default: BK_ISA_AUTO.
     pub isa: u32,
-    /// Log callback, or NULL. Default: NULL.
+    /// Log callback, or NULL: messages then go to standard error if the environment variable
+    /// BAKELITE_LOG is set to "error", "warning" or "info", the least important level to write, and
+    /// else nowhere. Default: NULL.
     pub log: bk_log_fn,
     /// Memory callback, or NULL. Default: NULL.
     pub memory: bk_memory_fn,

@@ -106,6 +106,23 @@ impl Lightmap {
         if let Some(message) = too_few_digits(scene, "texels", 1.0 / density, OFFSET_PART) {
             scene.device().log(LogLevel::Warning, &message);
         }
+        scene.device().log_info(|| {
+            let (i, seconds) = (&info, start.elapsed().as_secs_f64());
+            format!(
+                "light map: {} pages of {} x {}, {:.3} texels per unit, {} charts, {} texels ({} gather, {} radiance), \
+                 {} bytes, {seconds:.3} s of which unwrapping {:.3}",
+                i.page_count,
+                i.width,
+                i.height,
+                i.texels_per_unit,
+                i.charts,
+                i.texels,
+                i.gather_texels,
+                i.radiance_texels,
+                i.bytes,
+                i.unwrap_seconds
+            )
+        });
         let direct = DirectLight::try_new(scene)?;
         let mut plan =
             Plan::new(scene, &direct, &BakeParams::default(), !two_sided.is_empty(), uvs.unwrapped_charts > 0);

@@ -67,6 +67,10 @@ impl Scene {
             Ok(parts) => {
                 let scene = Arc::new(parts.into_scene(device.clone(), data));
                 scene.warn_of_few_digits();
+                device.log_info(|| {
+                    let s = scene.stats();
+                    format!("committed {} triangles: {} bytes, {:.3} s", s.triangles, s.bytes, s.build_seconds)
+                });
                 Ok(scene)
             }
             Err(e) => Err((data, e)),
@@ -246,7 +250,11 @@ mod tests {
             let messages = Arc::new(std::sync::Mutex::new(Vec::<String>::new()));
             let log = {
                 let messages = messages.clone();
-                move |_: LogLevel, message: &str| messages.lock().unwrap().push(message.to_owned())
+                move |level: LogLevel, message: &str| {
+                    if level == LogLevel::Warning {
+                        messages.lock().unwrap().push(message.to_owned());
+                    }
+                }
             };
             let options = DeviceOptions { num_threads: 1, log: Some(Box::new(log)), ..Default::default() };
             let device = Device::new(options).unwrap();

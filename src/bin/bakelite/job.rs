@@ -96,11 +96,11 @@ impl<'a> Job<'a> {
         Ok(scene)
     }
 
-    /// The device that the arguments ask for. Its messages go to standard error.
+    /// The device that the arguments ask for. Its warnings go to standard error.
     pub fn device(&self) -> Result<Arc<Device>> {
         let quiet = self.args.quiet;
         let log = move |level: LogLevel, message: &str| {
-            if level == LogLevel::Error || !quiet {
+            if level == LogLevel::Error || level == LogLevel::Warning && !quiet {
                 eprintln!("{message}");
             }
         };
