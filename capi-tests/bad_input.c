@@ -385,7 +385,7 @@ static void textures(bk_scene *scene) {
     CHECK_ERROR(bk_scene_add_material(scene, &material, NULL), ARGUMENT, "alpha_cutoff is 1.5");
     material.alpha_cutoff = 1.0f;
     material.emission[0] = 1.0f;
-    CHECK_ERROR(bk_scene_add_material(scene, &material, NULL), ARGUMENT, "cannot have holes");
+    CHECK_ERROR(bk_scene_add_material(scene, &material, NULL), ARGUMENT, "cannot have cut-outs");
 }
 
 static void meshes(bk_scene *scene) {

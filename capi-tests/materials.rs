@@ -348,14 +348,14 @@ fn a_scene_that_uses_none_of_it_keeps_and_runs_none_of_it() {
     let params = BakeParams { photon_count: 1000, gather_rays: 16, ..Default::default() };
     let (map, stats) = bake(&plain(false), [8, 8], &params);
     assert_eq!(stats.left_out & bits, bits);
-    assert!(map.plan_text().contains("left out: holes cut out by alpha (no surface has any)"), "{}", map.plan_text());
+    assert!(map.plan_text().contains("left out: alpha cut-outs (no surface has any)"), "{}", map.plan_text());
     let (map, stats) = bake(&plain(true), [8, 8], &params);
     assert_eq!(stats.left_out & bits, left_out::CUTOUTS | left_out::TRANSMISSION);
     assert!(map.plan_text().contains("runs: albedo textures"), "{}", map.plan_text());
 }
 
-/// Nobody can see the floor 1 cm below a carpet: it takes its light from beside the carpet, and gather texels four times as
-/// wide as the light map's darken neither.
+/// Nobody can see the floor 1 cm below a carpet: it takes its light from beside the carpet, and gather texels four
+/// times as wide as the light map's darken neither.
 #[test]
 fn a_carpet_has_no_dark_rim_and_what_it_covers_shows_the_light_beside_it() {
     let mut data = SceneData::new();

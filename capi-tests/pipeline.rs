@@ -184,7 +184,7 @@ fn a_two_sided_room_turned_inside_out_has_the_same_light() {
     let stats = map.bake(&BakeParams::default(), &Progress::none()).unwrap();
     // The undersides of the two blocks are dark on both sides.
     assert_eq!(stats.back_charts, map.info().charts as u64 - 2);
-    assert!(map.plan_text().contains("the backs of"));
+    assert!(map.plan_text().contains("backs instead of fronts for"));
     let reference = cornell_reference();
     let turned = |p: &Place| Place { u: p.v, v: p.u, ..*p };
     let error = |(place, e): &(Place, Irradiance)| {
@@ -231,7 +231,7 @@ fn both_sides_of_a_sheet_have_their_own_light() {
     map.bake(&BakeParams::default(), &Progress::none()).unwrap();
     let info = map.info();
     assert_eq!(info.both_sided_charts, 1);
-    let line = format!("both sides of 1 two-sided charts; their backs take {} of", info.back_texels);
+    let line = format!("separate texels for the backs of 1 two-sided charts: {} of", info.back_texels);
     assert!(map.plan_text().contains(&line), "{}", map.plan_text());
     let scene = map.scene().clone();
     let tracer = PathTracer::new(&scene);

@@ -113,7 +113,7 @@ void LiveLight::add_lights(const Options &options) {
     lights = options.lights;
     const auto emits = [](const Material &m) { return m.emission.x + m.emission.y + m.emission.z > 0; };
     if (is_scene_file(options.scene) && lights.empty() && std::none_of(materials.begin(), materials.end(), emits)) {
-        warning = "nothing shines in the scene: it got a sun; give lights with --light";
+        warning = "no light in the scene emits, so a sun was added; --light adds others";
         Vec3 down{0.3f, 0.3f, 0.3f};
         down[options.up] = -1;
         lights.push_back({true, down, {20, 18, 15}});

@@ -1,4 +1,6 @@
 //! The bake: stages in order, each with its share of progress, time and memory.
+//!
+//! The file is long because it has every stage once, in order: this order is what a reader looks for here.
 
 use super::atlas::Atlas;
 use super::atlas::two_sided;
@@ -99,6 +101,7 @@ impl Lightmap {
         let device = self.atlas.scene.device().clone();
         device.memory().reset_peak();
         let range = params.texel_begin as usize..end as usize;
+        let count = range.len();
         let (light, mut stats, stitch) = device.run(progress, || {
             let (atlas, direct, range) = (&self.atlas, &direct, range.clone());
             let checkpoint = match checkpoint {
@@ -123,6 +126,18 @@ impl Lightmap {
         device.install(|| self.store(light, range, stitch));
         stats.compose.seconds = start.elapsed().as_secs_f64();
         stats.seconds += stats.compose.seconds;
+        device.log_info(|| {
+            let s = &stats;
+            let stages = [("photons", &s.photons), ("radiance map", &s.radiance), ("gather map", &s.gather)];
+            let stages = stages.map(|(name, s)| format!("{name} {:.3} s", s.seconds)).join(", ");
+            format!(
+                "baked {count} texels in {:.3} s ({stages}, direct light {:.3} s), at most {} bytes\n{}",
+                s.seconds,
+                s.direct.seconds,
+                s.peak_bytes,
+                self.plan.text().trim_end()
+            )
+        });
         Ok(stats)
     }
 

@@ -73,23 +73,23 @@ impl Plan {
         ));
         let reflects = scene.materials().iter().any(|m| m.albedo.iter().any(|&a| a > 0.0));
         let no_indirect = if direct.is_dark() {
-            Some("nothing shines")
+            Some("no light emits")
         } else if !reflects {
-            Some("nothing reflects")
+            Some("all albedos are 0")
         } else if params.gather_rays == 0 {
             Some("gather_rays is 0")
         } else {
             None
         };
         if direct.is_dark() {
-            plan.leave_out(left_out::DIRECT, "direct light", "nothing shines");
+            plan.leave_out(left_out::DIRECT, "direct light", "no light emits");
         } else {
             plan.run("direct light by shadow rays");
         }
         if direct.area_light_count() == 0 {
-            plan.leave_out(left_out::AREA_LIGHTS, "sampling of area lights", "there are none");
+            plan.leave_out(left_out::AREA_LIGHTS, "sampling of area lights", "the scene has none");
         } else {
-            plan.run(&format!("sampling of area lights, {} rays each", params.direct_samples));
+            plan.run(&format!("sampling of area lights, {} shadow rays per light", params.direct_samples));
         }
         plan.distant_and_many(direct, params.direct_samples);
         match no_indirect {
@@ -101,12 +101,12 @@ impl Plan {
         if unwrapped {
             plan.run("unwrapping of meshes without light map UVs");
         } else {
-            plan.leave_out(left_out::UNWRAP, "unwrapping", "all meshes bring usable light map UVs");
+            plan.leave_out(left_out::UNWRAP, "unwrapping", "all meshes have usable light map UVs");
         }
         if scene.meshes().iter().all(|m| m.normals.is_empty()) {
-            plan.leave_out(left_out::SHADING_NORMALS, "interpolation of normals", "no mesh brings any");
+            plan.leave_out(left_out::SHADING_NORMALS, "interpolation of shading normals", "no mesh has vertex normals");
         } else {
-            plan.run("interpolation of normals");
+            plan.run("interpolation of shading normals");
         }
         plan.materials(scene);
         plan
@@ -117,34 +117,35 @@ impl Plan {
         let uses = scene.uses();
         if uses.textures {
             let bytes: usize = scene.textures().iter().map(|t| t.bytes()).sum();
-            self.run(&format!("albedo textures, {} of {bytes} bytes", scene.textures().len()));
+            self.run(&format!("albedo textures: {}, {bytes} bytes in all", scene.textures().len()));
         } else {
             self.leave_out(left_out::TEXTURES, "albedo textures", "no surface has one");
         }
         if uses.holes.is_empty() {
-            self.leave_out(left_out::CUTOUTS, "holes cut out by alpha", "no surface has any");
+            self.leave_out(left_out::CUTOUTS, "alpha cut-outs", "no surface has any");
         } else {
-            self.run(&format!("holes cut out by alpha, in {} materials", uses.holes.iter().filter(|&&h| h).count()));
+            self.run(&format!("alpha cut-outs in {} materials", uses.holes.iter().filter(|&&h| h).count()));
         }
         if uses.transmission {
-            self.run("light through surfaces that transmit");
+            self.run("light through transmissive sheets");
         } else {
-            self.leave_out(left_out::TRANSMISSION, "light through surfaces", "none transmits");
+            self.leave_out(left_out::TRANSMISSION, "light through transmissive sheets", "no surface transmits");
         }
     }
 
     fn distant_and_many(&mut self, direct: &DirectLight, samples: u32) {
         match direct.many_light_count() {
-            0 => self.leave_out(left_out::MANY_LIGHTS, "choice among many lights", "they are few"),
-            n => self.run(&format!("choice among {n} lights by a light tree, {} rays for all", 4 * samples)),
+            0 => self.leave_out(left_out::MANY_LIGHTS, "sampling of many lights", "there are few enough to trace each"),
+            n => self
+                .run(&format!("sampling of {n} lights by a light tree, {} shadow rays for all of them", 4 * samples)),
         }
         match direct.disc_count() {
             0 => self.leave_out(left_out::SUN_DISC, "discs of directional lights", "none has an angular radius"),
-            n => self.run(&format!("discs of {n} directional lights, {samples} rays each")),
+            n => self.run(&format!("discs of {n} directional lights, {samples} shadow rays per light")),
         }
         match direct.sky_count() {
-            0 => self.leave_out(left_out::SKY, "light from the sky", "there is none"),
-            n => self.run(&format!("light from {n} sky, {} rays", 4 * samples * n as u32)),
+            0 => self.leave_out(left_out::SKY, "sky light", "the scene has no sky"),
+            n => self.run(&format!("sky light of {n} skies, {} shadow rays", 4 * samples * n as u32)),
         }
     }
 
@@ -178,19 +179,19 @@ impl Plan {
     pub(crate) fn note_sides(&mut self, info: &LightmapInfo) {
         if info.open_places > 0 {
             self.run(&format!(
-                "sides by what is seen from {} open places; {} rays for this and for buried texels",
+                "visibility of both sides of surfaces from {} open places; {} rays, those for buried texels included",
                 info.open_places, info.sight_rays
             ));
         }
         if info.buried_texels > 0 {
             self.run(&format!(
-                "{} of {} texels, which nobody can see, show the nearest that can be seen",
+                "fill of {} buried texels, of {} in all, from the nearest visible ones",
                 info.buried_texels, info.texels
             ));
         }
         if info.both_sided_charts > 0 {
             self.run(&format!(
-                "both sides of {} two-sided charts; their backs take {} of {} texels",
+                "separate texels for the backs of {} two-sided charts: {} of {}",
                 info.both_sided_charts, info.back_texels, info.texels
             ));
         }
@@ -200,7 +201,7 @@ impl Plan {
     pub(crate) fn note_back_charts(&mut self, count: u64) {
         if count > 0 {
             self.run(&format!(
-                "the backs of {count} two-sided charts, which see further or get more light than their fronts"
+                "backs instead of fronts for {count} two-sided charts, where they see further or get more light"
             ));
         }
     }
@@ -210,12 +211,14 @@ impl Plan {
         match bright.len() {
             0 if !self.runs(left_out::INDIRECT) => self.left_out |= left_out::BRIGHT_PATCHES,
             0 => {
-                let why = "gather rays find most of what is bright";
-                self.leave_out(left_out::BRIGHT_PATCHES, "bright patches as lights", why);
+                let why = "gather rays find most of the bright texels";
+                self.leave_out(left_out::BRIGHT_PATCHES, "sampling of bright patches as lights", why);
             }
             n => {
                 let rays = bright.shadow_rays();
-                self.run(&format!("{n} bright patches as lights, {rays} shadow rays with each {ROUND} gather rays"));
+                self.run(&format!(
+                    "sampling of {n} bright patches as lights, {rays} shadow rays per {ROUND} gather rays"
+                ));
             }
         }
     }
@@ -224,9 +227,9 @@ impl Plan {
     pub(crate) fn run_seams(&mut self, edges: u64, unlike: u64) {
         let but = match unlike {
             0 => String::new(),
-            n => format!(", but for {n} points of them whose sides have very different indirect light"),
+            n => format!(", except {n} points with very different indirect light on the two sides"),
         };
-        self.run(&format!("stitching of {edges} edges at which smooth surfaces are cut open{but}"));
+        self.run(&format!("stitching of seams at {edges} edges of smooth surfaces{but}"));
     }
 
     /// Adds a line on why nothing was stitched.

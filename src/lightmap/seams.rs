@@ -100,11 +100,11 @@ impl Lightmap {
         let view = View { new, range, old: self.light.as_ref() };
         let dark = !plan.runs(left_out::DIRECT) && !plan.runs(left_out::INDIRECT);
         let why = if !params.stitch {
-            "it is switched off"
+            "stitch is 0"
         } else if dark {
-            "nothing shines"
+            "no light emits"
         } else if view.has_unbaked(self.atlas.map.len()) {
-            "texels are still to be baked"
+            "some texels are not baked yet"
         } else {
             let stage = progress.stage("seams", 1.0, 1.0, 1);
             let job = Job { atlas: &self.atlas, backs: &new.backs, budget: params.memory_budget, stage: &stage };
@@ -116,7 +116,7 @@ impl Lightmap {
                 plan.run_seams(edges, unlike);
                 return Ok(Some(stitch));
             }
-            "no edge of a smooth surface is cut open where both sides show alike light"
+            "no edge of a smooth surface is a seam between sides of similar light"
         };
         plan.leave_out_seams(why);
         Ok(None)

@@ -81,7 +81,10 @@ impl Material {
             return invalid_argument!("alpha_cutoff is {}, but there is no albedo_texture", self.alpha_cutoff);
         }
         if self.alpha_cutoff > 0.0 && self.is_emissive() {
-            return invalid_argument!("a material that emits cannot have holes (alpha_cutoff {})", self.alpha_cutoff);
+            return invalid_argument!(
+                "a material that emits cannot have cut-outs (alpha_cutoff {})",
+                self.alpha_cutoff
+            );
         }
         for (c, (&t, &a)) in self.transmission.iter().zip(&self.albedo).enumerate() {
             if !(0.0..=1.0).contains(&t) {
@@ -113,7 +116,7 @@ mod tests {
             (Material { alpha_cutoff: 0.5, ..m }, "there is no albedo_texture"),
             (Material { alpha_cutoff: f32::NAN, ..textured }, "alpha_cutoff is NaN"),
             (Material { alpha_cutoff: 1.5, ..textured }, "alpha_cutoff is 1.5"),
-            (Material { alpha_cutoff: 0.5, emission: [1.0; 3], ..textured }, "cannot have holes"),
+            (Material { alpha_cutoff: 0.5, emission: [1.0; 3], ..textured }, "cannot have cut-outs"),
             (Material { transmission: [0.0, -0.1, 0.0], ..m }, "transmission[1] is -0.1"),
             (Material { transmission: [0.0, 0.0, 0.6], ..m }, "transmission[2] 0.6 are more than 1"),
             (Material { transmission: [f32::NAN; 3], ..m }, "transmission[0] is NaN"),

@@ -243,7 +243,7 @@ fn unwrap_part(geometry: &Geometry, scene: &Scene, stage: &Stage) -> Result<Vec<
             scene.device().log(
                 LogLevel::Warning,
                 &format!(
-                    "{count} triangles from triangle {first} on get planar charts, they could not be unwrapped: {e}"
+                    "{count} triangles from triangle {first} on could not be unwrapped and get planar charts: {e}"
                 ),
             );
             planar_pieces(geometry, &all, stage)

@@ -347,7 +347,7 @@ impl<'a> Checkpoint<'a> {
 
     /// Logs that the checkpoint could not be written; the bake goes on.
     fn warn(&self, e: &dyn std::fmt::Display) {
-        let message = format!("cannot write the checkpoint {}: {e}; the bake goes on", self.path.display());
+        let message = format!("cannot write the checkpoint {}: {e}; the bake continues without", self.path.display());
         self.device.log(LogLevel::Warning, &message);
     }
 }
