@@ -201,7 +201,7 @@ def self_test(text):
         ("life of a string", r"and valid until the", "and free before the", "how long its result is valid"),
         ("thread safety", r" \* Thread safety: any thread, all functions at the same time; during bk_scene_refit", " * Whenever; during bk_scene_refit", "has no thread safety"),
         ("cost", r" \* Cost: grows with", " * It grows with", "has no cost"),
-        ("a default", r"page_size`. Default: 2\.", "page_size`.", "padding: has no default"),
+        ("a default", r"between charts\. Default: 2\.", "page_size`.", "padding: has no default"),
         ("an optional callback", r"progress callback and its pointer; may be NULL", "progress callback and its pointer", "not said to be optional"),
         ("UTF-8", r"name of the file; UTF-8", "name of the file", "not said to be UTF-8"),
         ("what is said once", r"Pointers to input are read during the call only", "Pointers to input are read", "section error does not say"),

@@ -240,8 +240,8 @@ struct MeshDesc : bk_mesh_desc {
 
 // ---- Progress ----
 
-/// A callable `bool(float fraction, const char *stage)` for the time of a call; false cancels. What it throws cancels too, and
-/// comes out of the call.
+/// A callable `bool(float fraction, const char *stage)` for the time of a call; false cancels. What it throws cancels
+/// too, and comes out of the call.
 class Progress {
 public:
     Progress() = default;

@@ -19,8 +19,8 @@ pub(super) unsafe trait SizedStruct: Copy {
     fn defaults() -> Self;
 }
 
-/// Implements [`SizedStruct`]. A structure that has grown since its first release states the last field which that release
-/// had, with its type: `sized_struct!(bk_x, last: field: u32, defaults: …)`.
+/// Implements [`SizedStruct`]. A structure that has grown since its first release states the last field which that
+/// release had, with its type: `sized_struct!(bk_x, last: field: u32, defaults: …)`.
 macro_rules! sized_struct {
     ($name:ident, $(last: $last:ident: $type:ty,)? defaults: $defaults:expr) => {
         // SAFETY: the size comes first, as is asserted; fields are integers, floats, pointers and optional

@@ -28,6 +28,12 @@
 //! Define BK_EXPERIMENTAL before including this header, for example as a deprecation attribute, to
 //! find their uses.
 //!
+//! Versions: until 1.0, a new minor version may change or remove functions and fields, so that
+//! programs must be recompiled; a new patch version corrects behaviour or adds functions and fields,
+//! and runs programs compiled with earlier ones. From 1.0 on the major version takes the part of
+//! the minor one, and the minor version grows when functions or fields are added. The name of the
+//! shared library (libbakelite.so.0.1), the CMake package and the Rust crate follow this rule.
+//!
 //! Thread safety: any thread; bk_last_error is per thread.
 //!
 //! Cost: none of these functions allocates or waits.
@@ -38,11 +44,11 @@ use std::cell::RefCell;
 use std::ffi::{CStr, CString, c_char};
 use std::panic::{AssertUnwindSafe, catch_unwind};
 
-/// Major version. Programs must be recompiled when it changes.
+/// Major version; see "Versions" above.
 pub const BK_VERSION_MAJOR: u32 = 0;
-/// Minor version. It grows when functions or fields are added.
+/// Minor version. Programs must be recompiled when it changes and the major version is 0.
 pub const BK_VERSION_MINOR: u32 = 1;
-/// Patch version. It grows when only behaviour is corrected.
+/// Patch version. Programs run with a later one without being recompiled.
 pub const BK_VERSION_PATCH: u32 = 0;
 /// Version of this header: major << 16 | minor << 8 | patch.
 pub const BK_VERSION: u32 = BK_VERSION_MAJOR << 16 | BK_VERSION_MINOR << 8 | BK_VERSION_PATCH;

@@ -12,6 +12,8 @@
 //!
 //! Cost: see each function; those without a remark take microseconds.
 
+// The file is long because a section of the header is one file, and a third of it the text for the C reader.
+
 use super::args::{OutStruct, SizedStruct, init, read_bool, read_struct, read_vec3, sized_struct, slice_mut, write};
 use super::device::{bk_progress_fn, call_with_file, progress as report_to, refuse_in_callback};
 use super::error::{BK_NONE, bk_result, call, call_or};
@@ -72,41 +74,55 @@ fn unusable() -> Error {
 }
 
 /// Parameters of bk_live_create.
+///
+/// Measured curves of these fields: docs/performance.md, "Live updates".
 #[repr(C)]
 #[derive(Clone, Copy)]
 pub struct bk_live_params {
     /// Size of this structure in bytes, set by bk_live_params_init.
     pub struct_size: u32,
-    /// One of the BK_LIVE modes. Default: BK_LIVE_VIEW.
+    /// One of the BK_LIVE modes. In Sponza an error of 1 % took BK_LIVE_VIEW 2.3 s and
+    /// BK_LIVE_POSITION 4.0 s; the latter changes the LOD of whole cells at a time, which
+    /// bk_live_cell_lods reports. Default: BK_LIVE_VIEW.
     pub mode: u32,
     /// Number of levels of detail, 1 to 4: the lowest computes every 2^(lod_count - 1)-th texel of
-    /// the gather map along each axis, the highest all. Default: 3.
+    /// the gather map along each axis, the highest all. Raise it for a sooner and coarser first
+    /// picture; lower it where coarse light must not be seen. Default: 3.
     pub lod_count: u32,
     /// Number of rounds of 64 rays that each texel of a cell needs before the cell shows its next
-    /// LOD, 1 to `max_rounds`. Default: 1.
+    /// LOD, 1 to `max_rounds`. Raise it so that cells change their LOD with less noise and later.
+    /// Default: 1.
     pub promote_threshold: u32,
-    /// Number of rounds of 64 rays after which a texel is finished, 1 to 1024. Default: 16.
+    /// Number of rounds of 64 rays after which a texel is finished, 1 to 1024. Raise it for less
+    /// final noise, lower it to be finished sooner: 1 round has the rays of a default bake, 4 those
+    /// of final light, and the time until all is finished grows in proportion. Default: 16.
     pub max_rounds: u32,
-    /// Maximum number of rays that an update traces, whatever its budget; 0: no limit. Default: 0.
+    /// Maximum number of rays that an update traces, whatever its budget; 0: no limit. Set it where
+    /// the work per frame must not depend on the speed of the machine, as in tests. Default: 0.
     pub rays_per_update: u32,
     /// Radius of a blur for display, in texels of the gather map, 0 to 16; accumulated light is not
-    /// blurred. Default: 2.
+    /// blurred. Lower it to 1 or 0 where contact shadows matter and noise at the beginning does
+    /// not; it costs time when texels are shown. Default: 2.
     pub blur: u32,
     /// Edge of a grid cell in scene units, finite and >= 0; 0: a sixteenth of the scene's longest
-    /// side. A grid of more than 2^24 cells is refused. Default: 0.
+    /// side. A grid of more than 2^24 cells is refused. Lower it for finer decisions in
+    /// BK_LIVE_POSITION; more cells take more time per update to sort. Default: 0.
     pub cell_size: f32,
     /// Seed of all random numbers, see bk_bake_params. Default: 0.
     pub seed: u64,
-    /// Number of photons to emit, see bk_bake_params. Default: 1,000,000.
+    /// Number of photons to emit, see bk_bake_params. Lower it where bk_live_create and changes of
+    /// light must be quick: both trace all photons. Default: 1,000,000.
     pub photon_count: u64,
-    /// Maximum number of reflections, see bk_bake_params. Default: 0.
+    /// Maximum number of reflections, see bk_bake_params. Leave it at 0. Default: 0.
     pub max_bounces: u32,
-    /// Number of shadow rays per light map texel and area light, see bk_bake_params. Default: 16.
+    /// Number of shadow rays per light map texel and area light, see bk_bake_params. Lower it where
+    /// lights change often: direct light is computed anew each time. Default: 16.
     pub direct_samples: u32,
     /// Search radius of photons in scene units, see bk_bake_params. Default: 0.
     pub radius: f32,
     /// 1: the device's threads go on working between updates, on the surfaces that the last one
-    /// saw. 0: they rest. Default: 0.
+    /// saw. 0: they rest. Set it to 1 where the application leaves cores idle between updates:
+    /// light converges sooner, and the cores are busy all the time. Default: 0.
     pub background: u32,
 }
 

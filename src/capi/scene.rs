@@ -16,6 +16,8 @@
 //! Cost: functions that are not described otherwise take less than a microsecond beside copying
 //! their input.
 
+// The file is long because a section of the header is one file, and a third of it the text for the C reader.
+
 use super::args::{OutStruct, SizedStruct, check_flags, init, read_bool, read_struct, sized_struct, text, write};
 use super::device::{bk_device, bk_progress_fn, progress, refuse_in_callback};
 use super::error::{bk_result, call, call_or};
