@@ -1,10 +1,11 @@
 #!/usr/bin/env bash
-# Builds the HTML manual: README.md, docs/ and what belongs to them by pandoc, include/bakelite.h by Doxygen. Names of the
-# header that the documents mention lead to its pages.
+# Builds the manual: README.md, docs/ and what belongs to them by pandoc, include/bakelite.h by Doxygen. Names of
+# the header that the documents mention lead to its pages.
 #
 #     docs/manual.sh [FOLDER]        default: target/manual; start with index.html
+#     man -M FOLDER/man bk_bake      each function, structure and constant has a man page
 #
-# Fails if a document links to what is not there, or if Doxygen warns.
+# Fails if a document or a man page leads to what is not there, or if Doxygen warns.
 set -euo pipefail
 cd "$(dirname "$0")/.."
 out=${1:-target/manual}
@@ -26,7 +27,24 @@ trap 'rm -rf "$work"' EXIT
     echo "OUTPUT_DIRECTORY = $out"
     echo "HTML_OUTPUT = header"
     echo "GENERATE_TAGFILE = $work/header.tag"
+    echo "GENERATE_MAN = YES"
+    echo "MAN_LINKS = YES"
 } | doxygen -
+
+# Doxygen names the page of a section as the header does ("device"), and makes one for every field ("width"). Sections are
+# renamed so that they cannot hide pages of other libraries, and fields are found on the pages of their structures.
+cd "$out/man/man3"
+sections=$(sed -n 's/^ \* @defgroup \([a-z]*\) .*/\1/p' "$OLDPWD/include/bakelite.h")
+for section in $sections; do
+    mv "$section.3" "bakelite-$section.3"
+    sed -i "1s/^.TH \"$section\"/.TH \"bakelite-$section\"/; s/^$section \\\\-/bakelite-$section \\\\-/" "bakelite-$section.3"
+done
+sed -i -E 's|^\.so man3/([a-z]+\.3)$|.so man3/bakelite-\1|' bk_*.3 BK_*.3
+find . -name '*.3' ! -name 'bk_*' ! -name 'BK_*' ! -name 'bakelite*' -delete
+sed -n 's|^\.so man3/||p' ./*.3 | sort -u | while read -r page; do
+    [ -e "$page" ] || { echo "man pages lead to $page, which is not there" >&2 && exit 1; }
+done
+cd "$OLDPWD"
 
 # ---- The documents ----
 
