@@ -5,8 +5,8 @@
 //!
 //! - `obvhs`: 8-wide nodes of quantised boxes (Ylitie, Karras and Laine 2017) over PLOC with reinsertion,
 //!   traversed with SSE2, in Rust. Its presets `medium_build` and `very_slow_build`; the latter cuts triangles.
-//! - `tinybvh-rs` 0.1.0-beta.3 is left out: it needs a C++20 compiler, shows its one fast kernel, `BVH8_CPU`, only to code
-//!   that is compiled for AVX2, and that kernel crashes on the first of these rays.
+//! - `tinybvh-rs` 0.1.0-beta.3 is left out: it needs a C++20 compiler, shows its one fast kernel, `BVH8_CPU`, only to
+//!   code that is compiled for AVX2, and that kernel crashes on the first of these rays.
 //!
 //! obvhs is not watertight. A rate is a median, a ratio the median over alternating pairs (ours, theirs) of our
 //! rate to theirs. Hits agree if both name the same triangle or the same t, up to 1e-4 relative; what is counted

@@ -1,8 +1,8 @@
-//! The plan of the house: each floor of the library imports only from those above it in docs/architecture.md, and no two
-//! folders or files import each other in a circle. Nor do those of the command line.
+//! The plan of the house: each floor of the library imports only from those above it in docs/architecture.md, and no
+//! two folders or files import each other in a circle. Nor do those of the command line.
 //!
-//! Paths that begin with `crate::` or `super::` are looked at, tests apart. Names that `lib.rs` re-exports count for the
-//! floor that they come from.
+//! Paths that begin with `crate::` or `super::` are looked at, tests apart. Names that `lib.rs` re-exports count for
+//! the floor that they come from.
 
 use std::collections::{BTreeMap, BTreeSet};
 use std::path::{Path, PathBuf};

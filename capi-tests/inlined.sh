@@ -1,13 +1,13 @@
 #!/usr/bin/env bash
-# Lane code is inlined into the entry points of the kernels (x86-64). A lane method or closure that is called there instead
-# has been compiled without the entry point's instruction set: the hits stay right, and the speed is a fraction.
+# Lane code is inlined into the entry points of the kernels (x86-64). A lane method or closure that is called there
+# instead has been compiled without the entry point's instruction set: the hits stay right, and the speed is a fraction.
 #
 #     inlined.sh LIBRARY.a      with its symbols; the calls are read from the relocations
 #     inlined.sh --self-test    the check fails where it must
 set -euo pipefail
 
-# What entry points may call of this crate. Rare: rays nearly parallel to an axis, distances in wider precision, buffers of
-# a call. Without lanes: a leaf's one box, and what a filter says of one hit.
+# What entry points may call of this crate. Rare: rays nearly parallel to an axis, distances in wider precision, buffers
+# of a call. Without lanes: a leaf's one box, and what a filter says of one hit.
 allowed='RaySetup::make_slow|Bundle::accurate|triangle::accurate_distance|single::(take_room|give_room_back)'
 allowed+='|CompactLeaf::outer_box|<bakelite::trace::filter::Filter as bakelite::trace::filter::Accept>::accepts'
 # Entry points: src/trace/kernels.rs and src/photon/estimate.rs, of each ISA.

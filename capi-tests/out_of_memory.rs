@@ -27,7 +27,8 @@ use std::sync::atomic::{AtomicI64, AtomicUsize, Ordering::SeqCst};
 /// more.
 static LARGE: AtomicUsize = AtomicUsize::new(128 << 10);
 
-/// For live objects and saved results: what grows with the number of blocks or texels takes more, although there are few.
+/// For live objects and saved results: what grows with the number of blocks or texels takes more, although there are
+/// few.
 const LARGE_OF_LIVE: usize = 16 << 10;
 
 /// For their updates: the sums of one block's texels. (Queues of rayon, which cannot fail, take 1,520 bytes.)
@@ -121,7 +122,8 @@ fn fail_all<T>(what: &str, mut call: impl FnMut() -> Result<T>) -> T {
 /// Squares along each side of the ground.
 const SIDE: usize = 180;
 
-/// A hilly ground of `side` × `side` squares, of which some are degenerate and some shine, with light map UVs, below a roof.
+/// A hilly ground of `side` × `side` squares, of which some are degenerate and some shine, with light map UVs, below a
+/// roof.
 fn description(side: usize) -> Result<SceneData> {
     let mut data = SceneData::new();
     let white = data.add_material(Material { albedo: [0.8; 3], two_sided: true, ..Default::default() })?;
@@ -401,8 +403,8 @@ fn live(lightmap: &Lightmap, path: &Path) {
     lightmap.scene().set_light(0, before).unwrap();
 }
 
-/// Changes of light whose renewals lack memory. Unlike in other calls an allocation may fail without an error: that of a
-/// renewal that another one has taken the place of, and that ends by and by.
+/// Changes of light whose renewals lack memory. Unlike in other calls an allocation may fail without an error: that of
+/// a renewal that another one has taken the place of, and that ends by and by.
 fn relight(live: &mut Live) {
     let mut failures = 0;
     for n in 0.. {
@@ -421,8 +423,9 @@ fn relight(live: &mut Live) {
     live.finish_relighting().unwrap();
 }
 
-/// Updates an object until nothing is left to do, or `turns` times; in each update, and in what follows it in the background, an
-/// allocation fails, another one each time, as long as its number is among `numbers`. Returns how many failed.
+/// Updates an object until nothing is left to do, or `turns` times; in each update, and in what follows it in the
+/// background, an allocation fails, another one each time, as long as its number is among `numbers`. Returns how many
+/// failed.
 fn refine(live: &mut Live, numbers: Range<i64>, turns: u32) -> u32 {
     let camera = LiveCamera {
         position: Vec3::new(0.5, 0.5, 0.5),

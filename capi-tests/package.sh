@@ -1,14 +1,14 @@
 #!/usr/bin/env bash
-# The packages, as somebody gets them who has never seen the sources: .deb and .tar.gz are built, the .deb is installed on
-# a fresh Debian, a small program is compiled there with pkg-config and with CMake, and bakes; and the library is built
-# without a network from `cargo vendor`.
+# The packages, as somebody gets them who has never seen the sources: .deb and .tar.gz are built, the .deb is installed
+# on a fresh Debian, a small program is compiled there with pkg-config and with CMake, and bakes; and the library is
+# built without a network from `cargo vendor`.
 #
 #     capi-tests/package.sh              all of it
 #     capi-tests/package.sh packages     without the build from vendored sources
 #     capi-tests/package.sh vendored     that alone
 #
-# BAKELITE_CHROOT: a fresh Debian with gcc, libc6-dev, make, cmake and pkg-config (default: made by debootstrap, which takes root
-# and a network; without either the package is unpacked to an empty folder instead, and that is said).
+# BAKELITE_CHROOT: a fresh Debian with gcc, libc6-dev, make, cmake and pkg-config (default: made by debootstrap, which
+# takes root and a network; without either the package is unpacked to an empty folder instead, and that is said).
 set -euo pipefail
 cd "$(dirname "$0")/.."
 root=$PWD

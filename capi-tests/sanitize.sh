@@ -36,7 +36,8 @@ run() {
     fi
 }
 
-# programs FOLDER FLAGS...: every C and C++ test program but runtime.c, whose stacks are too small for sanitizers, linked with the library in FOLDER, and run.
+# programs FOLDER FLAGS...: every C and C++ test program but runtime.c, whose stacks are too small for sanitizers,
+# linked with the library in FOLDER, and run.
 programs() {
     local library=$1 source name flags
     shift

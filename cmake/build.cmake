@@ -62,10 +62,10 @@ function(run)
   endif()
 endfunction()
 
-# Links an archive to one object with what the functions of bakelite.h need, as a fresh archive in `dir`. That is an eighth of
-# the size, since most of Rust's library and of the solver for unwrapping is not needed; and what is not part of the header is local,
-# so that a program can link other libraries written in Rust as well. Functions keep sections of their own: what a
-# program does not call, its linker leaves out.
+# Links an archive to one object with what the functions of bakelite.h need, as a fresh archive in `dir`. That is an
+# eighth of the size, since most of Rust's library and of the solver for unwrapping is not needed; and what is not part
+# of the header is local, so that a program can link other libraries written in Rust as well. Functions keep sections of
+# their own: what a program does not call, its linker leaves out.
 function(slim_down archive dir)
   file(MAKE_DIRECTORY "${dir}")
   # The sections .llvm... hold the compiler's intermediate code.

@@ -31,7 +31,8 @@ fn folder() -> &'static Path {
     })
 }
 
-/// Reads `bytes` as a file of the kind `target`, or as changes to one that was saved. Panics if what comes of it is not in order.
+/// Reads `bytes` as a file of the kind `target`, or as changes to one that was saved. Panics if what comes of it is not
+/// in order.
 pub fn read(target: &str, bytes: &[u8]) {
     let write = |name: &str| {
         let path = folder().join(name);

@@ -11,6 +11,9 @@
 //! between them. Around a whole triangle, the box test's own margin covers that; at a cut it may not, because the
 //! corners can be much farther away than the box. So parts are padded by a little more than this rounding over the
 //! triangle's extent, and no ray slips past a cut.
+//!
+//! The file is long because the search for a plane, the cut and the recursion pass one set of references and its
+//! rounding rule among them.
 
 use super::BuildOptions;
 use super::binary::{BinaryBvh, BinaryNode};

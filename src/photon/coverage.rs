@@ -138,7 +138,8 @@ mod tests {
         square_of(1 << 20, add)
     }
 
-    /// Photons with a search radius of 0.1 on a square below a light that gives it 2 W/m², and on what `add` puts there.
+    /// Photons with a search radius of 0.1 on a square below a light that gives it 2 W/m², and on what `add` puts
+    /// there.
     fn square_of(photon_count: u64, add: impl Fn(&mut MeshBuilder, u32)) -> PhotonMap {
         let mut data = SceneData::new();
         let m = data.add_material(Material { albedo: [0.0; 3], ..Default::default() }).unwrap();

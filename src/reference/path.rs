@@ -3,8 +3,8 @@
 //!
 //! What it computes is what the library means: one-sided surfaces seen or hit from behind are black
 //! and absorb, two-sided ones reflect and emit on both sides, rect lights emit from one side and are
-//! not hit by rays, the background is black but for skies. Textures colour surfaces and cut holes into them; sheets that
-//! transmit are passed straight or reflect, by chance.
+//! not hit by rays, the background is black but for skies. Textures colour surfaces and cut holes into them; sheets
+//! that transmit are passed straight or reflect, by chance.
 
 use super::geometry::{Geometry, Hit64, Ray64};
 use super::lights::Lights;

@@ -9,6 +9,8 @@
 //! and arch soffits are developable); edges where parts meet hide under mouldings; walls are 0.3 m thick or more, so
 //! that no light gets round the back of a face; every one-sided face is seen from its front alone. Faces on which
 //! something stands (floors under columns) continue below it: those texels are dark and hidden.
+//!
+//! The file is long because it is one model: its parts share the measures at its head.
 
 use super::{Camera, Light, Material, Mesh, MeshMaterials, SceneData};
 use crate::error::Result;

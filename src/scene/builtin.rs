@@ -20,8 +20,8 @@ pub const BUILTIN_NAMES: &[&str] = &["cornell", "furnace", "sealed", "atrium", "
 ///   irradiance is π · 1 / (1 − 0.5) = 2π.
 /// - `sealed`: a closed box that hangs in a lit room. Mesh 0 is the room, 1 the inside of the box,
 ///   where the irradiance is exactly 0, 2 its outside, one centimetre away.
-/// - `furniture`: a room with furniture 1 to 3 cm off its walls. `partition`: two rooms with a wall of 2 cm between them
-///   that leaves a gap, and a lamp in one. Both for measurements of the light.
+/// - `furniture`: a room with furniture 1 to 3 cm off its walls. `partition`: two rooms with a wall of 2 cm between
+///   them that leaves a gap, and a lamp in one. Both for measurements of the light.
 /// - `atrium`: two floors around a court, columns, arches, drapes; a rect light and a sun.
 ///
 /// Two more are for measurements, and not among [`BUILTIN_NAMES`]:

@@ -14,8 +14,8 @@ pub enum Light {
         /// Radiant intensity in W/sr.
         intensity: [f32; 3],
     },
-    /// Radiates in a cone around `direction`: fully up to `inner`, not at all beyond `outer`, smoothly in between (Hermite
-    /// interpolation in the cosine).
+    /// Radiates in a cone around `direction`: fully up to `inner`, not at all beyond `outer`, smoothly in between
+    /// (Hermite interpolation in the cosine).
     Spot {
         /// Position in scene units.
         position: Vec3,
@@ -34,7 +34,8 @@ pub enum Light {
         direction: Vec3,
         /// Irradiance in W/m² on a plane that faces the middle of the disc, with the whole disc above its horizon.
         irradiance: [f32; 3],
-        /// Radius of the disc in radians, in [0, π/2]; less than 1e-5 counts as 0, parallel light. The sun's is 0.00465.
+        /// Radius of the disc in radians, in [0, π/2]; less than 1e-5 counts as 0, parallel light. The sun's is
+        /// 0.00465.
         angular_radius: f32,
     },
     /// A parallelogram that radiates from the side that `edge_u × edge_v` points to. Rays do not hit it.
@@ -54,8 +55,8 @@ pub enum Light {
         radiance: [f32; 3],
         /// Number of the scene's [`Environment`](super::Environment); [`NONE`]: the same radiance from all directions.
         environment: u32,
-        /// Direction of the image's zenith. The front of the image, its middle, looks along −z, or along +y if `up` is less
-        /// than 45° from the z axis, made perpendicular to `up`.
+        /// Direction of the image's zenith. The front of the image, its middle, looks along −z, or along +y if `up` is
+        /// less than 45° from the z axis, made perpendicular to `up`.
         up: Vec3,
         /// Angle in radians by which the image is turned about `up`, counter-clockwise as seen from its tip.
         rotation: f32,

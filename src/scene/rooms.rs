@@ -23,7 +23,8 @@ fn room(size: Vec3, lamp: Vec3, things: &[[Vec3; 2]]) -> Result<SceneData> {
     Ok(scene)
 }
 
-/// A room with a wardrobe 1 cm, a sideboard 2 cm and a hanging shelf 3 cm off the walls, and a moulding 5 mm before one.
+/// A room with a wardrobe 1 cm, a sideboard 2 cm and a hanging shelf 3 cm off the walls, and a moulding 5 mm before
+/// one.
 pub(super) fn furniture() -> Result<SceneData> {
     let p = Vec3::new;
     let things = [

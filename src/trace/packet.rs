@@ -18,6 +18,8 @@
 //! rounding is monotonic these rays hit all boxes around it.
 //!
 //! Tried for final gathering, with an origin per ray: slower, see docs/experiments.md#bundles-for-final-gathering.
+//!
+//! The file is long because all of it is inlined into one entry point per instruction set.
 
 use super::single;
 use super::tree::{BEYOND, EPSILON, FARTHEST_ORIGIN, OFFSET_ERROR, STEEP, beyond};

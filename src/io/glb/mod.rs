@@ -5,7 +5,8 @@
 //! the page goes:
 //! - A material without a texture is unlit (`KHR_materials_unlit`): `baseColorFactor` is the albedo,
 //!   `baseColorTexture` the page on `TEXCOORD_1`. A viewer multiplies the two, so it shows albedo × E × exposure, bent
-//!   by the shoulder of [`crate::io::image::tone_map`]: what an eye at the surface sees, albedo/π · E, up to a constant.
+//!   by the shoulder of [`crate::io::image::tone_map`]: what an eye at the surface sees, albedo/π · E, up to a
+//!   constant.
 //! - A material with a texture keeps it as `baseColorTexture` on `TEXCOORD_0`, and has the page as `occlusionTexture`
 //!   on `TEXCOORD_1`. That is the one slot besides the base colour by which renderers multiply: viewers that light
 //!   the scene by an environment (three.js, Babylon.js, model-viewer) dim the texture by the page's red channel.
@@ -19,9 +20,9 @@
 //! `KHR_materials_emissive_strength`. Triangles without a chart show their albedo alone. Triangles both sides of which
 //! have places in the light map are written twice, the second time turned round, with one-sided materials.
 //!
-//! Images are embedded as PNG files, row 0 at v = 0, without a flip (see [`crate::io::image`]). Holes become `alphaMode`
-//! `MASK`. Normals are written where meshes bring them. Triangles that the scene skips (degenerate or not finite) are
-//! left out.
+//! Images are embedded as PNG files, row 0 at v = 0, without a flip (see [`crate::io::image`]). Holes become
+//! `alphaMode` `MASK`. Normals are written where meshes bring them. Triangles that the scene skips (degenerate or not
+//! finite) are left out.
 
 mod file;
 mod primitives;

@@ -1,4 +1,5 @@
-//! Typed values in buffers. Sizes, offsets and counts are those of the file and trusted no further than they are checked.
+//! Typed values in buffers. Sizes, offsets and counts are those of the file and trusted no further than they are
+//! checked.
 
 use super::{PART, Reader};
 use crate::error::Result;

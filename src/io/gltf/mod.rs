@@ -5,10 +5,10 @@
 //! - `alphaMode` `MASK` cuts holes, except into surfaces that emit; `BLEND` counts as opaque.
 //!   `KHR_materials_transmission`: its factor of `baseColorFactor` passes straight through, as through a thin
 //!   sheet; textures do not change that.
-//! - Images (PNG, JPEG) come from buffer views, data URIs and files beside or below the scene. All repeat, whatever their
-//!   sampler says, and `KHR_texture_transform` is ignored.
-//! - `TEXCOORD_0` becomes [`Mesh::uvs`](crate::scene::Mesh::uvs), `TEXCOORD_1` the light map coordinates. Their page is the
-//!   number of the material's texture that uses them, among all textures that are used so (as our
+//! - Images (PNG, JPEG) come from buffer views, data URIs and files beside or below the scene. All repeat, whatever
+//!   their sampler says, and `KHR_texture_transform` is ignored.
+//! - `TEXCOORD_0` becomes [`Mesh::uvs`](crate::scene::Mesh::uvs), `TEXCOORD_1` the light map coordinates. Their page is
+//!   the number of the material's texture that uses them, among all textures that are used so (as our
 //!   own export writes them), else 0. A mesh that several nodes show has no unique coordinates: none
 //!   are taken.
 //! - `KHR_lights_punctual`: candela is taken as W/sr and lux as W/m²; `range` is ignored.

@@ -212,8 +212,8 @@ mod tests {
         }
     }
 
-    /// Whether a wall between two rooms shows its back, which may be covered by another `layer`, if so much light falls on
-    /// its front and its back.
+    /// Whether a wall between two rooms shows its back, which may be covered by another `layer`, if so much light falls
+    /// on its front and its back.
     fn wall_shows_back(layer: bool, front: f32, back: f32) -> bool {
         let (mut data, m) = two_sided();
         let p = |x: f32, y: f32| Vec3::new(x, y, 0.0);

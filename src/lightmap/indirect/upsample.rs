@@ -351,8 +351,8 @@ pub(super) mod tests {
     use crate::scene::{Light, LightmapUvs, Material, SceneData};
     use glam::{Vec2, Vec3};
 
-    /// A floor from −2 to 2 m, and the top and the bottom of a plank 1 cm above it where x < 0: too far away for its texels
-    /// to be buried.
+    /// A floor from −2 to 2 m, and the top and the bottom of a plank 1 cm above it where x < 0: too far away for its
+    /// texels to be buried.
     fn plank() -> Lightmap {
         let mut data = SceneData::new();
         let m = data.add_material(Material::default()).unwrap();
@@ -485,8 +485,8 @@ pub(super) mod tests {
         assert!((shown(&[], one, &[None]) - 1.0).abs() < 1e-6);
     }
 
-    /// Folded sheets 4 m long in a closed room, each along a profile of (x, z) that it is unfolded from, side by side in one
-    /// page without a gap.
+    /// Folded sheets 4 m long in a closed room, each along a profile of (x, z) that it is unfolded from, side by side
+    /// in one page without a gap.
     fn folded(profiles: &[&[[f32; 2]]]) -> Lightmap {
         let mut data = SceneData::new();
         let m = data.add_material(Material { two_sided: true, ..Default::default() }).unwrap();

@@ -8,7 +8,8 @@ use exr::meta::attribute::{AttributeValue, Text};
 use exr::prelude::{Encoding, Image, Layer, LayerAttributes, SpecificChannels, Vec2, WritableImage, f16};
 use std::io::Cursor;
 
-/// Encodes a page. Attributes: `units`, `page` (from 0), `pages`, `seed`, `texelsPerUnit`, and `software` with the version.
+/// Encodes a page. Attributes: `units`, `page` (from 0), `pages`, `seed`, `texelsPerUnit`, and `software` with the
+/// version.
 pub fn encode(
     lightmap: &Lightmap,
     page: u32,

@@ -66,8 +66,8 @@ pub struct Errors {
 }
 
 impl Points {
-    /// Chooses `count` points of surfaces that are seen from places that can be reached from `camera` and from the lamps,
-    /// on whatever side, and path traces the reference there, with `paths` in f64 per point.
+    /// Chooses `count` points of surfaces that are seen from places that can be reached from `camera` and from the
+    /// lamps, on whatever side, and path traces the reference there, with `paths` in f64 per point.
     pub fn new(lightmap: &Lightmap, camera: &Camera, count: usize, paths: u32, progress: &Progress) -> Result<Points> {
         let mut points = Points::default();
         points.choose(lightmap, camera, count)?;

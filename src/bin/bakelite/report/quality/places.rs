@@ -1,8 +1,8 @@
 //! Places where somebody can stand in the rooms of a scene, from which reports look at its light.
 //!
-//! From interior positions that are known (the camera's, those of lamps), free space is explored by lines of sight as wide
-//! as a body, which do not fit through cracks and into hollow walls. A place has surfaces around it, no backs of one-sided
-//! ones, and a floor below.
+//! From interior positions that are known (the camera's, those of lamps), free space is explored by lines of sight as
+//! wide as a body, which do not fit through cracks and into hollow walls. A place has surfaces around it, no backs of
+//! one-sided ones, and a floor below.
 
 use bakelite::Scene;
 use bakelite::sampling::{orthonormal_basis, uniform, uniform_sphere};
@@ -76,7 +76,8 @@ fn way(scene: &Scene, from: Vec3, direction: Vec3) -> f32 {
     (nearest - body).max(0.0)
 }
 
-/// Whether a place has room for a body, sees surfaces in a part `enclosed` of all directions, and none from inside a solid.
+/// Whether a place has room for a body, sees surfaces in a part `enclosed` of all directions, and none from inside a
+/// solid.
 fn is_free(scene: &Scene, place: Vec3, enclosed: f32) -> bool {
     let (mut hits, mut backs, mut nearest) = (0, 0, f32::INFINITY);
     for i in 0..PROBES {

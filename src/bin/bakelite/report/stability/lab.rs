@@ -1,4 +1,5 @@
-//! What the cases of `bakelite report stability` work with: rows with verdicts, a device that keeps its warnings, texels.
+//! What the cases of `bakelite report stability` work with: rows with verdicts, a device that keeps its warnings,
+//! texels.
 
 use crate::args::BakeArgs;
 use crate::job::Job;

@@ -118,8 +118,8 @@ fn floor(material: u32) -> MeshBuilder {
     floor
 }
 
-/// The solid angle of a square of an edge `size` around a point `aside` (x, z) of a plane, seen from `height` above it: by
-/// what a point light of unit intensity brings to the square, the mean irradiance times the area.
+/// The solid angle of a square of an edge `size` around a point `aside` (x, z) of a plane, seen from `height` above it:
+/// by what a point light of unit intensity brings to the square, the mean irradiance times the area.
 fn solid_angle([x, z]: [f64; 2], size: f64, height: f64) -> f64 {
     let corner = |x: f64, z: f64| (x * z).atan2(height * (x * x + z * z + height * height).sqrt());
     let ([x0, x1], [z0, z1]) = ([x - 0.5 * size, x + 0.5 * size], [z - 0.5 * size, z + 0.5 * size]);
