@@ -26,11 +26,11 @@ packages() {
     cmake --build "$out/build" --target package >/dev/null
     (cd "$out/build" && ls -l ./*.deb ./*.tar.gz)
     local libraries="$out/build/lib" bytes
-    # Promised in docs/performance.md, for all features; without files they are smaller.
+    # Promised in docs/install.md for all features. Readers and writers of files take a third of it.
     bytes=$(stat -Lc %s "$libraries/libbakelite.a")
     [ "$bytes" -le 30000000 ] || { echo "libbakelite.a has $bytes bytes, more than 30 MB" && exit 1; }
     bytes=$(stat -Lc %s "$libraries/libbakelite.so")
-    [ "$bytes" -le 10000000 ] || { echo "libbakelite.so has $bytes bytes, more than 10 MB" && exit 1; }
+    [ "$bytes" -le 11000000 ] || { echo "libbakelite.so has $bytes bytes, more than 11 MB" && exit 1; }
 }
 
 # A picture of a lit room is no single colour: its file cannot be compressed to nothing.
