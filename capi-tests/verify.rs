@@ -11,7 +11,7 @@ mod scenes;
 use bakelite::bvh::{BuildOptions, BuildQuality};
 use bakelite::sampling::uniform;
 use bakelite::scene::{MAX_COORDINATE, NONE};
-use bakelite::trace::{Hit, Ray};
+use bakelite::trace::{Hit, RawHit, Ray};
 use bakelite::{Device, DeviceOptions, Error, Isa, Material, Mesh, Progress, Scene, SceneData};
 use glam::Vec3;
 use oracle::{Fault, Triangle, Truth};
@@ -60,6 +60,16 @@ fn gathered(scene: &Scene, origin: Vec3, directions: &[[f32; 3]], tmax: f32) -> 
     let mut out = vec![Hit { t: f32::NAN, ..Hit::MISS }; directions.len()];
     scene.gather(origin, directions, tmax, false, &mut out).unwrap();
     out
+}
+
+/// Closest hits and occlusion of rays in a stream of 24 times as many, so that each octant has enough for lists.
+fn streamed(scene: &Scene, rays: &[Ray]) -> Vec<(Hit, u8)> {
+    let (count, rays) = (rays.len(), rays.repeat(24));
+    let (mut hits, mut shadows) = (vec![RawHit { t: f32::NAN, ..RawHit::MISS }; rays.len()], vec![2; rays.len()]);
+    scene.intersect_stream(&rays, &mut hits);
+    scene.occluded_stream(&rays, &mut shadows);
+    let last = rays.len() - count;
+    hits[last..].iter().map(|&hit| scene.to_hit(hit)).zip(shadows[last..].iter().copied()).collect()
 }
 
 /// Equal bits, so that NaN and the sign of 0 count too.
@@ -139,6 +149,15 @@ impl Case {
         for (scene, compact) in self.scenes.clone().into_iter().zip(self.compact.clone()) {
             let (hits, shadows) = (closest(&scene, rays), occluded(&scene, rays));
             let (same_hits, same_shadows) = (closest(&compact, rays), occluded(&compact, rays));
+            for (name, scene) in [("stream", &scene), ("compact stream", &compact)] {
+                for (ray, &(hit, shadow)) in rays.iter().zip(&streamed(scene, rays)) {
+                    let alone = (scene.intersect(ray), u8::from(scene.occluded(ray)));
+                    if !same_bits(&[hit], &[alone.0]) || shadow != alone.1 {
+                        let what = format!("{hit:?} and occluded {shadow} in a stream, {alone:?} alone");
+                        self.fail(Fault::Wrong, scene, name, ray, &what);
+                    }
+                }
+            }
             for i in 0..rays.len() {
                 if !same_bits(&[hits[i]], &[same_hits[i]]) || shadows[i] != same_shadows[i] {
                     let what = format!(

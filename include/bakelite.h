@@ -1138,8 +1138,10 @@ BK_API int32_t bk_occluded(const bk_scene *scene, const bk_ray *ray);
 /// Finds the closest hits of many rays.
 ///
 /// The call is fastest where consecutive rays share `origin`, `tmin` and `tmax` and have nearly the
-/// same direction, like those of a pinhole camera in small square tiles of pixels. The hits are the
-/// same, bit for bit, in any order of rays.
+/// same direction, like those of a pinhole camera in small square tiles of pixels; and where some
+/// hundreds or thousands of consecutive rays start near one another, in any directions, like those of
+/// neighbouring texels, which are traced together as a stream. The hits are the same, bit for bit, in
+/// any order of rays.
 ///
 /// @param scene  committed scene
 /// @param rays  `count` rays, aligned to 4 bytes; may be NULL if `count` is 0
@@ -1155,6 +1157,8 @@ bk_result bk_intersect_many(const bk_scene *scene,
                             bk_hit *out);
 
 /// Finds out for many rays whether anything lies on them.
+///
+/// The call is fastest where some hundreds or thousands of consecutive rays start near one another.
 ///
 /// @param scene  committed scene
 /// @param rays  `count` rays, aligned to 4 bytes; may be NULL if `count` is 0
@@ -1172,7 +1176,7 @@ bk_result bk_occluded_many(const bk_scene *scene,
 /// Finds the closest hits, with 0 < t <= tmax, of rays that share an origin.
 ///
 /// The hits are those of bk_intersect_many. The call is faster than as many single rays from 32
-/// directions on.
+/// directions on, and the faster the more there are.
 ///
 /// @param scene  committed scene
 /// @param origin  origin of all rays, in scene units

@@ -105,8 +105,10 @@ pub unsafe extern "C" fn bk_occluded(scene: *const bk_scene, ray: *const bk_ray)
 /// Finds the closest hits of many rays.
 ///
 /// The call is fastest where consecutive rays share `origin`, `tmin` and `tmax` and have nearly the
-/// same direction, like those of a pinhole camera in small square tiles of pixels. The hits are the
-/// same, bit for bit, in any order of rays.
+/// same direction, like those of a pinhole camera in small square tiles of pixels; and where some
+/// hundreds or thousands of consecutive rays start near one another, in any directions, like those of
+/// neighbouring texels, which are traced together as a stream. The hits are the same, bit for bit, in
+/// any order of rays.
 ///
 /// @param scene  committed scene
 /// @param rays  `count` rays, aligned to 4 bytes; may be NULL if `count` is 0
@@ -133,6 +135,8 @@ pub unsafe extern "C" fn bk_intersect_many(
 }
 
 /// Finds out for many rays whether anything lies on them.
+///
+/// The call is fastest where some hundreds or thousands of consecutive rays start near one another.
 ///
 /// @param scene  committed scene
 /// @param rays  `count` rays, aligned to 4 bytes; may be NULL if `count` is 0
@@ -162,7 +166,7 @@ pub unsafe extern "C" fn bk_occluded_many(
 /// Finds the closest hits, with 0 < t <= tmax, of rays that share an origin.
 ///
 /// The hits are those of bk_intersect_many. The call is faster than as many single rays from 32
-/// directions on.
+/// directions on, and the faster the more there are.
 ///
 /// @param scene  committed scene
 /// @param origin  origin of all rays, in scene units

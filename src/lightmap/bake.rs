@@ -8,7 +8,7 @@ use super::indirect::blur;
 use super::indirect::blur::Filling;
 use super::indirect::bright_patches::Bright;
 use super::indirect::find_bright_patches;
-use super::indirect::gather::Gathered;
+use super::indirect::gather::{Gathered, TILE, Tile};
 use super::indirect::radiance_map::{self, Radiance, RadianceInput, RadianceMap};
 use super::indirect::sample_set::SampleSet;
 use super::indirect::upsample::{OWN_RAYS, OwnLight, OwnRays, Upsampling};
@@ -346,18 +346,22 @@ impl Bake<'_, '_> {
                     }
                     return stage.advance(values.len() as u64);
                 }
-                let mut traced = 0;
-                for i in 0..values.len() {
+                let (mut traced, mut tile) = (0, Tile::new()?);
+                for start in (0..values.len()).step_by(TILE) {
                     self.progress.check()?;
-                    let sample = needed.start + block * BLOCK + i;
-                    let receiver = l.receiver(&l.gather, backs, sample);
-                    let mut gathered = Gathered::default();
+                    let first = needed.start + block * BLOCK;
+                    let samples_of_tile = first + start..first + values.len().min(start + TILE);
+                    let texel =
+                        |s: usize| (l.receiver(&l.gather, backs, s), combine(seed, s as u32), Gathered::default());
+                    let mut texels: Vec<_> = samples_of_tile.map(texel).collect();
                     for round in 0..samples.rounds() {
-                        let seed = combine(seed, sample as u32);
-                        traced += gathered.add_round(&l.scene, &lookup, &receiver, &samples, round, seed);
+                        traced += tile.add_round(&l.scene, &lookup, &mut texels, &samples, round);
                     }
-                    (values[i], normals[i]) = (gathered.irradiance(), receiver.normal);
-                    (variances[i], valid[i]) = (gathered.variance(), gathered.is_visible());
+                    for (i, (receiver, _, gathered)) in texels.iter().enumerate() {
+                        let i = start + i;
+                        (values[i], normals[i]) = (gathered.irradiance(), receiver.normal);
+                        (variances[i], valid[i]) = (gathered.variance(), gathered.is_visible());
+                    }
                 }
                 if let Some(c) = self.checkpoint {
                     c.keep_gathered(block, values, variances, valid);

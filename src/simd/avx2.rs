@@ -12,7 +12,57 @@ impl Simd for Avx2 {
     type F4 = A4;
     type F8 = A8;
     type Packet = A8;
+
+    #[inline(always)]
+    unsafe fn pick(masks: *const u8, numbers: *const u16, count: usize, bit: u32, out: *mut u16) -> usize {
+        // SAFETY: forwarded.
+        unsafe { pick(masks, numbers, count, bit, out) }
+    }
 }
+
+/// [`Simd::pick`]: the bits of 32 masks by `vpmovmskb`, then eight numbers at a time by a table of shuffles.
+///
+/// # Safety
+/// As there.
+#[inline(always)]
+pub(super) unsafe fn pick(masks: *const u8, numbers: *const u16, count: usize, bit: u32, out: *mut u16) -> usize {
+    let mut n = 0;
+    // SAFETY: the caller vouches for masks and numbers up to the next multiples of 32 and 8, and for `out`, of which
+    // no more than `count` numbers have been taken when eight more are written.
+    unsafe {
+        let shift = _mm_cvtsi32_si128(7 - bit as i32);
+        for first in (0..count).step_by(32) {
+            let masks = _mm256_loadu_si256(masks.add(first).cast());
+            // The bit is the highest of its byte; what comes from the byte below lies lower.
+            let mut sets = _mm256_movemask_epi8(_mm256_sll_epi16(masks, shift)) as u32;
+            for i in (first..count.min(first + 32)).step_by(8) {
+                let set = sets as usize & 0xff;
+                let kept = _mm_loadu_si128(NUMBERS_OF[set].as_ptr().cast());
+                let picked = _mm_shuffle_epi8(_mm_loadu_si128(numbers.add(i).cast()), kept);
+                _mm_storeu_si128(out.add(n).cast(), picked);
+                n += set.count_ones() as usize;
+                sets >>= 8;
+            }
+        }
+    }
+    n
+}
+
+/// For each set of eight 16-bit numbers, the bytes of the set's numbers in ascending order.
+static NUMBERS_OF: [[u8; 16]; 256] = {
+    let mut table = [[0; 16]; 256];
+    let mut set = 0;
+    while set < 256 {
+        let mut i = 0;
+        while i < 8 {
+            table[set][2 * i] = 2 * LANES_OF[set][i];
+            table[set][2 * i + 1] = 2 * LANES_OF[set][i] + 1;
+            i += 1;
+        }
+        set += 1;
+    }
+    table
+};
 
 #[derive(Clone, Copy)]
 pub(crate) struct A4(pub(super) __m128);
@@ -193,6 +243,38 @@ impl Four for A4 {
 }
 
 impl Eight for A8 {
+    #[inline(always)]
+    unsafe fn pair(low: *const f32, high: *const f32) -> Self {
+        // SAFETY: the caller vouches for four floats at each pointer.
+        A8(unsafe { _mm256_insertf128_ps::<1>(_mm256_castps128_ps256(_mm_loadu_ps(low)), _mm_loadu_ps(high)) })
+    }
+
+    #[inline(always)]
+    fn spread<const I: i32>(self) -> Self {
+        match I {
+            0 => A8(on_values!(_mm256_permute_ps::<0x00>, self.0)),
+            1 => A8(on_values!(_mm256_permute_ps::<0x55>, self.0)),
+            2 => A8(on_values!(_mm256_permute_ps::<0xaa>, self.0)),
+            _ => A8(on_values!(_mm256_permute_ps::<0xff>, self.0)),
+        }
+    }
+
+    #[inline(always)]
+    fn transpose(r: [A8; 8]) -> [A8; 8] {
+        // Pairs, then fours of each half, then halves.
+        let low = |a: A8, b: A8| A8(on_values!(_mm256_unpacklo_ps, a.0, b.0));
+        let high = |a: A8, b: A8| A8(on_values!(_mm256_unpackhi_ps, a.0, b.0));
+        let (a0, a1, a2, a3) = (low(r[0], r[1]), high(r[0], r[1]), low(r[2], r[3]), high(r[2], r[3]));
+        let (a4, a5, a6, a7) = (low(r[4], r[5]), high(r[4], r[5]), low(r[6], r[7]), high(r[6], r[7]));
+        let low = |a: A8, b: A8| A8(on_values!(_mm256_shuffle_ps::<0x44>, a.0, b.0));
+        let high = |a: A8, b: A8| A8(on_values!(_mm256_shuffle_ps::<0xee>, a.0, b.0));
+        let (b0, b1, b2, b3) = (low(a0, a2), high(a0, a2), low(a1, a3), high(a1, a3));
+        let (b4, b5, b6, b7) = (low(a4, a6), high(a4, a6), low(a5, a7), high(a5, a7));
+        let low = |a: A8, b: A8| A8(on_values!(_mm256_permute2f128_ps::<0x20>, a.0, b.0));
+        let high = |a: A8, b: A8| A8(on_values!(_mm256_permute2f128_ps::<0x31>, a.0, b.0));
+        [low(b0, b4), low(b1, b5), low(b2, b6), low(b3, b7), high(b0, b4), high(b1, b5), high(b2, b6), high(b3, b7)]
+    }
+
     #[inline(always)]
     unsafe fn from_bytes(p: *const u8) -> Self {
         // SAFETY: the caller vouches for eight bytes.

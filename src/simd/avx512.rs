@@ -1,7 +1,7 @@
 //! Lanes over AVX-512: 512-bit vectors with mask registers for packets. Nodes and leaves keep the
 //! 128- and 256-bit vectors of AVX2, whose shape they have: four triangles, eight children.
 
-use super::avx2::{A4, A8};
+use super::avx2::{A4, A8, pick};
 use super::{Lanes, Mask, Simd};
 use std::arch::x86_64::*;
 use std::ops::{Add, Mul, Sub};
@@ -14,6 +14,12 @@ impl Simd for Avx512 {
     type F4 = A4;
     type F8 = A8;
     type Packet = A16;
+
+    #[inline(always)]
+    unsafe fn pick(masks: *const u8, numbers: *const u16, count: usize, bit: u32, out: *mut u16) -> usize {
+        // SAFETY: forwarded.
+        unsafe { pick(masks, numbers, count, bit, out) }
+    }
 }
 
 #[derive(Clone, Copy)]

@@ -130,6 +130,14 @@ pub(crate) trait Simd: Copy {
     type F4: Four;
     type F8: Eight;
     type Packet: Lanes;
+
+    /// Writes those of `count` numbers whose mask byte has the bit `bit`, in their order, to `out`; returns how many.
+    ///
+    /// # Safety
+    /// The CPU must have the ISA. `masks` must be valid for reading `count` bytes, rounded up to a multiple of 32, of which
+    /// those from `count` on are 0; `numbers` for reading, and `out` for writing, `count` numbers rounded up to a
+    /// multiple of 8. `out` may overlap what lies behind the `count` numbers.
+    unsafe fn pick(masks: *const u8, numbers: *const u16, count: usize, bit: u32, out: *mut u16) -> usize;
 }
 
 /// Asks for the cache line at `p`, which need not be valid.
@@ -216,8 +224,20 @@ pub(crate) trait Four: Lanes {
     unsafe fn gather(from: [*const f32; 4]) -> Self;
 }
 
-/// Eight lanes, one per child of a node.
+/// Eight lanes: one per child of a node, or four triangles for each of two rays.
 pub(crate) trait Eight: Lanes {
+    /// Four floats from `low` in the lower half, four from `high` in the upper.
+    ///
+    /// # Safety
+    /// The CPU must have the ISA, and both pointers must be valid for reading four floats.
+    unsafe fn pair(low: *const f32, high: *const f32) -> Self;
+
+    /// Lane `I` of each half in all lanes of that half. `I` must be below 4.
+    fn spread<const I: i32>(self) -> Self;
+
+    /// Lane j of row i becomes lane i of row j.
+    fn transpose(rows: [Self; 8]) -> [Self; 8];
+
     /// Eight bytes as numbers 0 to 255.
     ///
     /// # Safety

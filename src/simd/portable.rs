@@ -14,6 +14,19 @@ impl Simd for Portable {
     type F8 = P8;
     // Four lanes, not eight: with 16 SSE2 registers a pair of them per value spills.
     type Packet = P4;
+
+    #[inline(always)]
+    unsafe fn pick(masks: *const u8, numbers: *const u16, count: usize, bit: u32, out: *mut u16) -> usize {
+        let mut n = 0;
+        for i in 0..count {
+            // SAFETY: the caller vouches for `count` masks, numbers, and places; n ≤ i.
+            unsafe {
+                out.add(n).write(numbers.add(i).read());
+                n += (masks.add(i).read() >> bit & 1) as usize;
+            }
+        }
+        n
+    }
 }
 
 #[derive(Clone, Copy)]
@@ -200,6 +213,25 @@ impl Four for P4 {
 }
 
 impl Eight for P8 {
+    #[inline(always)]
+    unsafe fn pair(low: *const f32, high: *const f32) -> Self {
+        // SAFETY: the caller vouches for four floats at each pointer.
+        unsafe { P8(P4::load(low), P4::load(high)) }
+    }
+
+    #[inline(always)]
+    fn spread<const I: i32>(self) -> Self {
+        let of = |v: P4| P4(f32x4::splat(v.0.to_array()[I as usize & 3]));
+        P8(of(self.0), of(self.1))
+    }
+
+    #[inline(always)]
+    fn transpose(rows: [P8; 8]) -> [P8; 8] {
+        let rows = rows.map(|r| r.to_array());
+        let four = |j: usize, i: usize| P4(f32x4::new([0, 1, 2, 3].map(|k| rows[i + k][j])));
+        std::array::from_fn(|j| P8(four(j, 0), four(j, 4)))
+    }
+
     #[inline(always)]
     unsafe fn from_bytes(p: *const u8) -> Self {
         // SAFETY: the caller vouches for eight bytes.

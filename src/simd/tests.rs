@@ -123,6 +123,40 @@ unsafe fn check_bytes<E: Eight>() {
     }
 }
 
+unsafe fn check_halves<E: Eight>() {
+    let p = SPECIAL.as_ptr();
+    // SAFETY: `SPECIAL` has 16 floats, and the caller vouches for the ISA.
+    let (pair, v) = unsafe { (E::pair(p.add(5), p.add(1)).to_array(), E::load(p.add(4))) };
+    assert!((0..4).all(|i| same(pair[i], SPECIAL[5 + i]) && same(pair[4 + i], SPECIAL[1 + i])));
+    let spread = [v.spread::<0>(), v.spread::<1>(), v.spread::<2>(), v.spread::<3>()].map(|v| v.to_array());
+    for (k, spread) in spread.iter().enumerate() {
+        assert!((0..8).all(|i| same(spread[i], SPECIAL[4 + i / 4 * 4 + k])));
+    }
+    // SAFETY: as above.
+    let rows = std::array::from_fn(|i| unsafe { E::load(p.add(i)) });
+    for (j, column) in E::transpose(rows).into_iter().enumerate() {
+        assert!((0..8).all(|i| same(column.to_array()[i], SPECIAL[i + j])));
+    }
+}
+
+unsafe fn check_pick<S: Simd>() {
+    for count in (0..70).chain([255, 256, 1000]) {
+        // Beyond `count` masks are 0, whereas numbers may be anything.
+        let masks: Vec<u8> = (0..count + 32).map(|i| if i < count { (i * i * 37 + i / 3) as u8 } else { 0 }).collect();
+        for bit in 0..8 {
+            let mut numbers: Vec<u16> = (0..2 * count + 32).map(|i| 60_000 + i as u16).collect();
+            let chosen = (0..count).filter(|&i| masks[i] >> bit & 1 == 1);
+            let expected: Vec<u16> = chosen.map(|i| 60_000 + i as u16).collect();
+            // SAFETY: there are 32 masks and numbers more than `count`, and the caller vouches for the ISA.
+            let n = unsafe {
+                let numbers = numbers.as_mut_ptr();
+                S::pick(masks.as_ptr(), numbers, count, bit, numbers.add(count))
+            };
+            assert_eq!(numbers[count..count + n], expected);
+        }
+    }
+}
+
 unsafe fn check_simd<S: Simd>() {
     // SAFETY: the caller vouches for the ISA; `SPECIAL` has 16 floats.
     unsafe {
@@ -132,6 +166,8 @@ unsafe fn check_simd<S: Simd>() {
         check_lanes::<S::F8>();
         check_lanes::<S::Packet>();
         check_compress::<S::F8>();
+        check_halves::<S::F8>();
+        check_pick::<S>();
     }
 }
 

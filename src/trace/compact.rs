@@ -5,7 +5,7 @@
 //! leaves whose exact box it misses; a hit counts only if the ray intersects that box, computed from the corners. So
 //! hits are those of full trees, bit for bit.
 
-use super::tree::{Leaf, RaySetup, Tree};
+use super::tree::{Leaf, LeafRows, RaySetup, Tree};
 use super::triangle::{Projected, Shear, V3, accurate_distance};
 use crate::bvh::compact::{Compact, CompactNode, GONE, NUMBER, ORDER};
 use crate::bvh::layout::{ChildRef, MAX_LEAF, WIDTH};
@@ -166,6 +166,23 @@ unsafe fn along<L: Four>([a, b, c, d]: [*const f32; 4], ray: &Shear, axis: usize
 }
 
 impl Leaf for CompactLeaf<'_> {
+    const ALWAYS_COUNTS: bool = false;
+
+    #[inline(always)]
+    fn rows(&self, room: &mut MaybeUninit<LeafRows>) -> *const f32 {
+        let rows = room.write([0.0; size_of::<LeafRows>() / 4]);
+        for i in 0..self.count {
+            // SAFETY: `i` is below the count. Corners are three floats.
+            let corners = unsafe { self.corners(i).map(|c| c.cast::<[f32; 3]>().read()) };
+            for (k, corner) in corners.iter().enumerate() {
+                for (a, &value) in corner.iter().enumerate() {
+                    rows[(3 * k + a) * self.count + i] = value;
+                }
+            }
+        }
+        rows.as_ptr()
+    }
+
     #[inline(always)]
     fn count(&self) -> usize {
         self.count

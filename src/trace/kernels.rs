@@ -5,7 +5,7 @@
 
 use super::compact::View;
 use super::filter::Filter;
-use super::{PACKET_SIZE, Packet, RawHit, Ray, gather, packet, single};
+use super::{PACKET_SIZE, Packet, RawHit, Ray, gather, packet, single, stream};
 use crate::bvh::Mbvh;
 use crate::device::Device;
 use crate::simd::{self, Isa, entry_point, isa_features};
@@ -18,6 +18,10 @@ pub(crate) struct Kernels {
     intersect_block: unsafe fn(&Mbvh, &[Ray], &mut [RawHit]),
     occluded: unsafe fn(&Mbvh, &Ray) -> bool,
     occluded_block: unsafe fn(&Mbvh, &[Ray], &mut [u8]),
+    stream: unsafe fn(&Mbvh, &[Ray], &mut [RawHit]),
+    stream_occluded: unsafe fn(&Mbvh, &[Ray], &mut [u8]),
+    compact_stream: unsafe fn(&View, &[Ray], &mut [RawHit]),
+    compact_stream_occluded: unsafe fn(&View, &[Ray], &mut [u8]),
     gather: unsafe fn(&Mbvh, Vec3, &Packet, f32, f32, &mut [RawHit; PACKET_SIZE]),
     compact_intersect: unsafe fn(&View, &[Ray], &mut [RawHit]),
     compact_occluded: unsafe fn(&View, &[Ray], &mut [u8]),
@@ -45,6 +49,30 @@ macro_rules! table {
                 fn occluded_block(bvh: &Mbvh, rays: &[Ray], out: &mut [u8]) {
                     let n = rays.len().min(out.len());
                     single::many::<S, _, true>(bvh, n, |i| rays[i], |i, hit| out[i] = !hit.is_miss() as u8)
+                }
+            } }
+            isa_features! { $isa => entry_point! {
+                fn stream(bvh: &Mbvh, rays: &[Ray], out: &mut [RawHit]) {
+                    let n = rays.len().min(out.len());
+                    stream::stream::<S, _, false>(bvh, &rays[..n], |i, hit| out[i] = hit)
+                }
+            } }
+            isa_features! { $isa => entry_point! {
+                fn stream_occluded(bvh: &Mbvh, rays: &[Ray], out: &mut [u8]) {
+                    let n = rays.len().min(out.len());
+                    stream::stream::<S, _, true>(bvh, &rays[..n], |i, hit| out[i] = !hit.is_miss() as u8)
+                }
+            } }
+            isa_features! { $isa => entry_point! {
+                fn compact_stream(tree: &View, rays: &[Ray], out: &mut [RawHit]) {
+                    let n = rays.len().min(out.len());
+                    stream::stream::<S, _, false>(tree, &rays[..n], |i, hit| out[i] = hit)
+                }
+            } }
+            isa_features! { $isa => entry_point! {
+                fn compact_stream_occluded(tree: &View, rays: &[Ray], out: &mut [u8]) {
+                    let n = rays.len().min(out.len());
+                    stream::stream::<S, _, true>(tree, &rays[..n], |i, hit| out[i] = !hit.is_miss() as u8)
                 }
             } }
             isa_features! { $isa => entry_point! {
@@ -88,6 +116,10 @@ macro_rules! table {
                 intersect_block,
                 occluded,
                 occluded_block,
+                stream,
+                stream_occluded,
+                compact_stream,
+                compact_stream_occluded,
                 gather,
                 compact_intersect,
                 compact_occluded,
@@ -154,6 +186,30 @@ impl Kernels {
     pub(crate) fn occluded_block(&self, bvh: &Mbvh, rays: &[Ray], out: &mut [u8]) {
         // SAFETY: see `intersect`.
         unsafe { (self.occluded_block)(bvh, rays, out) }
+    }
+
+    /// Closest hits of as many rays as both slices have, as a stream.
+    pub(crate) fn stream(&self, bvh: &Mbvh, rays: &[Ray], out: &mut [RawHit]) {
+        // SAFETY: see `intersect`.
+        unsafe { (self.stream)(bvh, rays, out) }
+    }
+
+    /// Any hit of as many rays as both slices have, as a stream: 1 or 0.
+    pub(crate) fn stream_occluded(&self, bvh: &Mbvh, rays: &[Ray], out: &mut [u8]) {
+        // SAFETY: see `intersect`.
+        unsafe { (self.stream_occluded)(bvh, rays, out) }
+    }
+
+    /// Closest hits of as many rays as both slices have, as a stream through a compact tree.
+    pub(crate) fn compact_stream(&self, tree: &View, rays: &[Ray], out: &mut [RawHit]) {
+        // SAFETY: see `intersect`.
+        unsafe { (self.compact_stream)(tree, rays, out) }
+    }
+
+    /// Any hit of as many rays as both slices have, as a stream through a compact tree: 1 or 0.
+    pub(crate) fn compact_stream_occluded(&self, tree: &View, rays: &[Ray], out: &mut [u8]) {
+        // SAFETY: see `intersect`.
+        unsafe { (self.compact_stream_occluded)(tree, rays, out) }
     }
 
     /// Closest hits of a packet of rays from one origin.

@@ -15,6 +15,8 @@ mod pass_through;
 mod queries;
 mod ray;
 mod single;
+mod stream;
+mod stream_rays;
 mod tree;
 mod triangle;
 mod whole;
@@ -22,5 +24,7 @@ mod whole;
 pub(crate) use kernels::Kernels;
 pub use ray::{Hit, PACKET_SIZE, Packet, RawHit, Ray};
 
+#[cfg(test)]
+mod stream_tests;
 #[cfg(test)]
 mod tests;

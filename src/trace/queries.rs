@@ -8,6 +8,7 @@ use super::{Hit, Kernels, PACKET_SIZE, Packet, RawHit, Ray};
 use crate::base::geometry::NONE;
 use crate::bvh::{Mbvh, Tree};
 use crate::error::{Result, invalid_argument};
+use crate::memory::try_filled;
 use crate::scene::Scene;
 use glam::Vec3;
 use rayon::prelude::*;
@@ -19,8 +20,25 @@ pub(super) enum TreeView<'a> {
     Compact(View<'a>),
 }
 
-/// Work items are handed to threads in blocks of this many rays.
-const BLOCK: usize = 1024;
+/// Maximum number of rays of a stream that queries make.
+const STREAM: usize = 4096;
+
+/// Minimum number of rays of a stream that queries make.
+const LEAST_STREAM: usize = 64;
+
+/// Greatest extent of the origins of a stream's rays, as a fraction of the scene's.
+const NEAR: f32 = 0.1;
+
+/// Cosine of the greatest angle between two rays of a bundle that follow each other.
+const BUNDLED: f32 = 0.995;
+
+/// Number of pairs of rays that are looked at to tell bundles.
+const PAIRS: usize = 16;
+
+/// Number of rays that are handed to a thread at a time: some blocks per thread, but long streams.
+fn block_size(rays: usize) -> usize {
+    rays.div_ceil(4 * rayon::current_num_threads()).clamp(512, STREAM)
+}
 
 impl Scene {
     /// The kernels of the ISA of the scene's device.
@@ -85,19 +103,55 @@ impl Scene {
             return invalid_argument!("{} rays, but room for {} hits", rays.len(), out.len());
         }
         let block = |rays: &[Ray], out: &mut [Hit]| {
-            let mut raw = [RawHit::MISS; 256];
-            for (rays, out) in rays.chunks(256).zip(out.chunks_mut(256)) {
-                self.intersect_block(rays, &mut raw);
-                self.to_hits(&raw, out);
+            for (rays, out) in rays.chunks(STREAM).zip(out.chunks_mut(STREAM)) {
+                if self.go_alike(rays) {
+                    // Room for the hits of a stream; without, rays are traced in smaller blocks.
+                    if let Ok(mut raw) = try_filled(rays.len(), RawHit::MISS, "hits") {
+                        self.intersect_stream(rays, &mut raw);
+                        self.to_hits(&raw, out);
+                        continue;
+                    }
+                }
+                let mut raw = [RawHit::MISS; 256];
+                for (rays, out) in rays.chunks(256).zip(out.chunks_mut(256)) {
+                    self.intersect_block(rays, &mut raw);
+                    self.to_hits(&raw, out);
+                }
             }
         };
         if parallel {
-            self.device()
-                .install(|| rays.par_chunks(BLOCK).zip(out.par_chunks_mut(BLOCK)).for_each(|(r, o)| block(r, o)));
+            self.device().install(|| {
+                let size = block_size(rays.len());
+                rays.par_chunks(size).zip(out.par_chunks_mut(size)).for_each(|(r, o)| block(r, o));
+            });
         } else {
             block(rays, out);
         }
         Ok(())
+    }
+
+    /// Whether rays are worth tracing as a stream: many, from places near one another. Rays of a pinhole camera are not: they
+    /// are faster as bundles.
+    fn go_alike(&self, rays: &[Ray]) -> bool {
+        if rays.len() < LEAST_STREAM {
+            return false;
+        }
+        let (mut lower, mut upper) = (Vec3::INFINITY, Vec3::NEG_INFINITY);
+        for ray in rays {
+            let origin = Vec3::from(ray.origin);
+            (lower, upper) = (lower.min(origin), upper.max(origin));
+        }
+        let bounds = self.bounds();
+        // False for NaN.
+        if !((upper - lower).length() <= NEAR * (bounds.1 - bounds.0).length()) {
+            return false;
+        }
+        let is_bundled = |pair: &[Ray]| {
+            let [a, b] = [pair[0], pair[1]].map(|ray| Vec3::from(ray.direction));
+            pair[0].origin == pair[1].origin && a.dot(b) > BUNDLED * (a.length_squared() * b.length_squared()).sqrt()
+        };
+        let pairs = rays.windows(2).step_by(rays.len() / PAIRS);
+        pairs.filter(|pair| is_bundled(pair)).count() < PAIRS / 2
     }
 
     /// Whether each of many rays hits anything, in order: 1 or 0.
@@ -105,10 +159,19 @@ impl Scene {
         if rays.len() != out.len() {
             return invalid_argument!("{} rays, but room for {} answers", rays.len(), out.len());
         }
-        let block = |rays: &[Ray], out: &mut [u8]| self.occluded_block(rays, out);
+        let block = |rays: &[Ray], out: &mut [u8]| {
+            for (rays, out) in rays.chunks(STREAM).zip(out.chunks_mut(STREAM)) {
+                match self.go_alike(rays) {
+                    true => self.occluded_stream(rays, out),
+                    false => self.occluded_block(rays, out),
+                }
+            }
+        };
         if parallel {
-            self.device()
-                .install(|| rays.par_chunks(BLOCK).zip(out.par_chunks_mut(BLOCK)).for_each(|(r, o)| block(r, o)));
+            self.device().install(|| {
+                let size = block_size(rays.len());
+                rays.par_chunks(size).zip(out.par_chunks_mut(size)).for_each(|(r, o)| block(r, o));
+            });
         } else {
             block(rays, out);
         }
@@ -128,19 +191,30 @@ impl Scene {
         if directions.len() != out.len() {
             return invalid_argument!("{} directions, but room for {} hits", directions.len(), out.len());
         }
+        let nothing = Ray::new(Vec3::ZERO, Vec3::ZERO);
+        let trace = |directions: &[[f32; 3]], rays: &mut [Ray], raw: &mut [RawHit], out: &mut [Hit]| {
+            for (directions, out) in directions.chunks(rays.len()).zip(out.chunks_mut(rays.len())) {
+                let ray = |d: &[f32; 3]| Ray::new(origin, Vec3::from(*d)).within(0.0, tmax);
+                rays.iter_mut().zip(directions).for_each(|(r, d)| *r = ray(d));
+                self.intersect_stream(&rays[..directions.len()], raw);
+                self.to_hits(&raw[..directions.len()], out);
+            }
+        };
         let block = |directions: &[[f32; 3]], out: &mut [Hit]| {
-            // (Blocks of 128 through `intersect_block` are a fifth slower: it looks for bundles.)
-            let mut raw = [RawHit::MISS; PACKET_SIZE];
-            for (d, o) in directions.chunks(PACKET_SIZE).zip(out.chunks_mut(PACKET_SIZE)) {
-                let mut packet = Packet::default();
-                d.iter().for_each(|&d| packet.push(Vec3::from_array(d)));
-                self.gather_packet(origin, &packet, 0.0, tmax, &mut raw);
-                o.iter_mut().zip(&raw).for_each(|(o, &r)| *o = self.to_hit(r));
+            // Long streams are faster, but their rays need memory.
+            const SHORT: usize = 256;
+            let size = directions.len().min(STREAM);
+            let room =
+                (size > SHORT).then(|| (try_filled(size, nothing, "rays"), try_filled(size, RawHit::MISS, "hits")));
+            match room {
+                Some((Ok(mut rays), Ok(mut raw))) => trace(directions, &mut rays, &mut raw, out),
+                _ => trace(directions, &mut [nothing; SHORT], &mut [RawHit::MISS; SHORT], out),
             }
         };
         if parallel {
             self.device().install(|| {
-                directions.par_chunks(BLOCK).zip(out.par_chunks_mut(BLOCK)).for_each(|(d, o)| block(d, o));
+                let size = block_size(directions.len());
+                directions.par_chunks(size).zip(out.par_chunks_mut(size)).for_each(|(d, o)| block(d, o));
             });
         } else {
             block(directions, out);
@@ -215,6 +289,29 @@ impl Scene {
         }
         if self.has_holes() {
             self.leave_holes(rays, out);
+        }
+    }
+
+    /// Closest hits of as many rays as both slices have, which start near one another: traced as a stream. The hits are
+    /// those of [`intersect_raw`](Self::intersect_raw), bit for bit.
+    pub fn intersect_stream(&self, rays: &[Ray], out: &mut [RawHit]) {
+        match self.tree() {
+            TreeView::Whole(tree) => self.kernels().stream(tree, rays, out),
+            TreeView::Compact(tree) => self.kernels().compact_stream(&tree, rays, out),
+        }
+        if self.has_holes() {
+            self.leave_holes(rays, out);
+        }
+    }
+
+    /// Any hit of as many rays as both slices have, which start near one another, traced as a stream: 1 or 0.
+    pub fn occluded_stream(&self, rays: &[Ray], out: &mut [u8]) {
+        match self.tree() {
+            TreeView::Whole(tree) => self.kernels().stream_occluded(tree, rays, out),
+            TreeView::Compact(tree) => self.kernels().compact_stream_occluded(&tree, rays, out),
+        }
+        if self.has_holes() {
+            self.look_through_holes(rays, out);
         }
     }
 

@@ -6,7 +6,7 @@
 
 use super::Ray;
 use super::triangle::{Projected, Shear};
-use crate::bvh::layout::{ChildRef, WIDTH};
+use crate::bvh::layout::{ChildRef, LEAF_PAD, LEAF_STRIDE, MAX_LEAF, WIDTH};
 use crate::simd::{Four, Lanes, Mask, Simd};
 use glam::Vec3;
 use std::hint::select_unpredictable;
@@ -47,8 +47,18 @@ pub(super) trait Tree {
     unsafe fn leaf<S: Simd>(&self, leaf: ChildRef) -> Self::Leaf<'_>;
 }
 
+/// Rows of a leaf, as in [`Mbvh`](crate::bvh::Mbvh), and what loads may read behind them.
+pub(super) type LeafRows = [f32; LEAF_STRIDE * MAX_LEAF + LEAF_PAD];
+
 /// A leaf of a tree.
 pub(super) trait Leaf {
+    /// Whether [`counts`](Self::counts) is always true.
+    const ALWAYS_COUNTS: bool;
+
+    /// Rows of the corners as in [`Mbvh`](crate::bvh::Mbvh), for which `room` may serve as a buffer; they can be read as
+    /// long as the leaf and `room` live.
+    fn rows(&self, room: &mut MaybeUninit<LeafRows>) -> *const f32;
+
     /// Number of triangles.
     fn count(&self) -> usize;
 

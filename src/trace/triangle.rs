@@ -54,7 +54,7 @@ impl<L: Lanes> V3<L> {
 }
 
 /// [`Shear::axes`] by the axis of the largest component, three for positive and three for negative ones.
-const AXES: [[u32; 3]; 6] = [[1, 2, 0], [2, 0, 1], [0, 1, 2], [2, 1, 0], [0, 2, 1], [1, 0, 2]];
+pub(super) static AXES: [[u32; 3]; 6] = [[1, 2, 0], [2, 0, 1], [0, 1, 2], [2, 1, 0], [0, 2, 1], [1, 0, 2]];
 
 /// A ray in its own frame: z along the axis of the direction's largest component.
 #[derive(Clone, Copy)]

@@ -1,6 +1,6 @@
 //! Rays through the full tree, [`Mbvh`].
 
-use super::tree::{Leaf, RaySetup, Tree};
+use super::tree::{Leaf, LeafRows, RaySetup, Tree};
 use super::triangle::{Projected, Shear, accurate_distance};
 use crate::bvh::layout::{ChildRef, Mbvh, Node, WIDTH};
 use crate::simd::{Four, Lanes, Simd};
@@ -55,6 +55,13 @@ pub(super) struct Rows {
 }
 
 impl Leaf for Rows {
+    const ALWAYS_COUNTS: bool = true;
+
+    #[inline(always)]
+    fn rows(&self, _: &mut MaybeUninit<LeafRows>) -> *const f32 {
+        self.rows
+    }
+
     #[inline(always)]
     fn count(&self) -> usize {
         self.count

@@ -20,7 +20,7 @@ use crate::progress::Stage;
 use crate::sampling::{cosine_around, sobol_2d};
 use crate::scene::{NONE, Scene};
 use crate::trace::{RawHit, Ray};
-use glam::{Mat2, Vec2};
+use glam::{Mat2, Vec2, Vec3};
 use rayon::prelude::*;
 use std::ops::Range;
 
@@ -39,6 +39,9 @@ const AT_ONCE: f32 = 4.0;
 /// may miss its triangle.
 const POINTS: usize = 4;
 const POINT_TRIES: u32 = 32;
+
+/// Number of points that are tested together.
+const BLOCK: usize = 256;
 
 /// Maximum number of rounds of filling: samples farther than this many texels from all visible ones are not moved.
 const MAX_ROUNDS: usize = 64;
@@ -103,12 +106,12 @@ impl Search<'_> {
         };
         let samples = map.samples_of(placement);
         let mut buried = Vec::new();
-        for (i, sample) in samples.clone().enumerate() {
-            if i % 256 == 0 {
-                stage.advance(0)?;
-            }
-            if self.is_buried(&map.texels.samples[sample], sample as u32, is_back, &mut found.rays) {
-                try_push(&mut buried, sample as u32, BURIED)?;
+        for first in samples.clone().step_by(BLOCK) {
+            stage.advance(0)?;
+            let points = &map.texels.samples[first..samples.end.min(first + BLOCK)];
+            let are_buried = self.are_buried(points, first as u32, is_back, &mut found.rays);
+            for (i, _) in are_buried.iter().take(points.len()).enumerate().filter(|(_, is)| **is) {
+                try_push(&mut buried, (first + i) as u32, BURIED)?;
             }
         }
         if by_parts || buried.len() == samples.len() {
@@ -146,7 +149,8 @@ impl Search<'_> {
             });
             let points =
                 if is_at_border { points_of_texel(self.charts, map, placement, s as usize) } else { Vec::new() };
-            let seen = points.into_iter().find(|point| !self.is_buried(point, s, back, &mut found.rays));
+            let mut is_buried = |point: &TexelSample| self.are_buried(&[*point], s, back, &mut found.rays)[0];
+            let seen = points.into_iter().find(|point| !is_buried(point));
             if let Some(point) = seen {
                 result = result.clone().and_then(|()| try_push(&mut found.seen_parts, (s, point), BURIED));
             }
@@ -155,24 +159,44 @@ impl Search<'_> {
         result
     }
 
-    fn is_buried(&self, point: &TexelSample, sample: u32, back: bool, rays: &mut u64) -> bool {
-        let (_, receiver) = super::chart_map::receiver_of(self.scene, point, back);
-        let (mut open, mut backs) = (0, 0);
+    /// Which of at most [`BLOCK`] points, in texels from `first` on, are buried. Rays come in rounds of one per point that
+    /// is undecided, which are traced as streams: neighbours look the same ways.
+    fn are_buried(&self, points: &[TexelSample], first: u32, back: bool, rays: &mut u64) -> [bool; BLOCK] {
+        let mut undecided: [Undecided; BLOCK] = std::array::from_fn(|i| {
+            let Some(point) = points.get(i) else { return Undecided::default() };
+            let (_, receiver) = super::chart_map::receiver_of(self.scene, point, back);
+            Undecided { number: i as u32, origin: receiver.origin, normal: receiver.geometric, open: 0, backs: 0 }
+        });
+        let mut probes = [Ray::new(Vec3::ZERO, Vec3::ZERO); BLOCK];
+        let mut hits = [RawHit::MISS; BLOCK];
+        let mut count = points.len();
         for i in 0..RAYS {
-            let d = cosine_around(receiver.geometric, sobol_2d(i, sample));
-            let hit = self.scene.intersect_raw(&Ray::new(receiver.origin, d));
-            *rays += 1;
-            match self.seen_by(&hit) {
-                Sight::Open if i == 0 && hit.t > AT_ONCE * self.near => return false,
-                Sight::Open => open += 1,
-                Sight::Back => backs += 1,
-                Sight::Covered => {}
+            for (probe, point) in probes.iter_mut().zip(&undecided[..count]) {
+                *probe = Ray::new(point.origin, cosine_around(point.normal, sobol_2d(i, first + point.number)));
             }
-            if open == OPEN && backs == 0 {
-                return false;
+            self.scene.intersect_stream(&probes[..count], &mut hits);
+            *rays += count as u64;
+            let mut kept = 0;
+            for k in 0..count {
+                let (mut point, hit) = (undecided[k], &hits[k]);
+                match self.seen_by(hit) {
+                    Sight::Open if i == 0 && hit.t > AT_ONCE * self.near => continue,
+                    Sight::Open => point.open += 1,
+                    Sight::Back => point.backs += 1,
+                    Sight::Covered => {}
+                }
+                if point.open < OPEN || point.backs > 0 {
+                    undecided[kept] = point;
+                    kept += 1;
+                }
             }
+            count = kept;
         }
-        open < OPEN || 2 * backs > RAYS
+        let mut are_buried = [false; BLOCK];
+        for point in &undecided[..count] {
+            are_buried[point.number as usize] = point.open < OPEN || 2 * point.backs > RAYS;
+        }
+        are_buried
     }
 
     fn seen_by(&self, hit: &RawHit) -> Sight {
@@ -195,6 +219,19 @@ enum Sight {
     Back,
     /// Within a texel, or on a side that cannot be seen from any open place.
     Covered,
+}
+
+/// A point of which rays have not told yet whether it is buried.
+#[derive(Clone, Copy, Default)]
+struct Undecided {
+    /// Its number among the points.
+    number: u32,
+    origin: Vec3,
+    normal: Vec3,
+    /// Rays that ended in the open.
+    open: u32,
+    /// Rays that ended on backs.
+    backs: u32,
 }
 
 #[derive(Default)]

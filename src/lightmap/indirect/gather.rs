@@ -3,10 +3,8 @@
 //!
 //! Rays come in rounds of 64, so that a texel can be refined at any time: its sum over k rounds has
 //! the same bits however they were spread over bakes and live updates. The sample set is made once:
-//! the Sobol sequence, in each round sorted along a Morton curve so that each packet of 32 is a
-//! narrower bundle. Each texel shifts it digitally (XOR), which keeps both the stratification and
-//! the bundles. (One set of 256 rays sorted as a whole traces 0 to 15 % faster than four rounds;
-//! the rays of 64 neighbouring texels stratum by stratum 3 to 8 % faster than texel by texel.)
+//! the Sobol sequence, in each round sorted along a Morton curve. Each texel shifts it digitally (XOR), which keeps the
+//! stratification. The rays of neighbouring texels pass the tree together as a [stream](crate::trace).
 //!
 //! Tried, and not worth it: more rays where their variance is largest, and rays guided by photons; see
 //! docs/experiments.md#adaptive-and-guided-gather-rays.
@@ -14,10 +12,12 @@
 use super::radiance_map::RadianceMap;
 use super::sample_set::{ROUND, SampleSet};
 use crate::direct::Receiver;
+use crate::error::Result;
+use crate::memory::try_filled;
 use crate::sampling::{combine, concentric_disc, orthonormal_basis, unit_float};
 use crate::scene::Scene;
 use crate::trace::filter::Crossing;
-use crate::trace::{PACKET_SIZE, Packet, RawHit, Ray};
+use crate::trace::{RawHit, Ray};
 use glam::Vec3;
 use std::f32::consts::PI;
 
@@ -67,55 +67,120 @@ impl Gathered {
         round: usize,
         seed: u32,
     ) -> u64 {
-        let points = &samples.points()[round * ROUND..samples.points().len().min((round + 1) * ROUND)];
-        let shift = [combine(seed, 1), combine(seed, 2)];
-        let (tangent, bitangent) = orthonormal_basis(receiver.normal);
-        let mut hits = [RawHit::MISS; PACKET_SIZE];
+        let mut rays = [Ray::new(Vec3::ZERO, Vec3::ZERO); ROUND];
+        let mut hits = [RawHit::MISS; ROUND];
+        let points = points_of(samples, round);
+        let rays = &mut rays[..points.len()];
+        aim(receiver, points, seed, rays);
+        scene.intersect_stream(rays, &mut hits);
+        self.add(scene, radiance, receiver, rays, &hits, combine(seed, 16 + round as u32))
+    }
+
+    /// Adds the radiance seen by one round of rays from a receiver, and that of bright patches; `seed` is the round's own.
+    /// Returns the rays traced.
+    fn add(
+        &mut self,
+        scene: &Scene,
+        radiance: &RadianceMap,
+        receiver: &Receiver,
+        rays: &[Ray],
+        hits: &[RawHit],
+        seed: u32,
+    ) -> u64 {
         let (mut sum, mut squares) = (Vec3::ZERO, 0.0);
         let (transmits, mut crossings) = (scene.uses().transmission, Vec::new());
-        for bundle in points.chunks(PACKET_SIZE) {
-            let mut packet = Packet::default();
-            for p in bundle {
-                let [x, y] = concentric_disc([unit_float(p[0] ^ shift[0]), unit_float(p[1] ^ shift[1])]);
-                let z = (1.0 - x * x - y * y).max(0.0).sqrt();
-                packet.push(x * tangent + y * bitangent + z * receiver.normal);
+        for (ray, hit) in rays.iter().zip(hits) {
+            if hit.is_miss() {
+                continue;
             }
-            scene.gather_packet(receiver.origin, &packet, 0.0, f32::INFINITY, &mut hits);
-            for (i, hit) in hits[..packet.count].iter().enumerate() {
-                if hit.is_miss() {
-                    continue;
+            // A ray below the true surface, possible if the shading normal differs from the geometric one, carries
+            // no light.
+            if Vec3::from(ray.direction).dot(receiver.geometric) <= 0.0 {
+                continue;
+            }
+            let mut seen = radiance.seen(hit);
+            if transmits && scene.material(hit.triangle).transmits() {
+                seen = Some(through(scene, radiance, ray, &mut crossings));
+            }
+            match seen {
+                Some(l) => {
+                    sum += l;
+                    squares += l.element_sum() * l.element_sum();
                 }
-                // A ray below the true surface, possible if the shading normal differs from the geometric one, carries
-                // no light.
-                let d = Vec3::new(packet.x[i], packet.y[i], packet.z[i]);
-                if d.dot(receiver.geometric) <= 0.0 {
-                    continue;
-                }
-                let mut seen = radiance.seen(hit);
-                if transmits && scene.material(hit.triangle).transmits() {
-                    seen = Some(through(scene, radiance, &Ray::new(receiver.origin, d), &mut crossings));
-                }
-                match seen {
-                    Some(l) => {
-                        sum += l;
-                        squares += l.element_sum() * l.element_sum();
-                    }
-                    None => self.backs += 1,
-                }
+                None => self.backs += 1,
             }
         }
-        let mut rays = points.len() as u64;
+        let mut traced = rays.len() as u64;
         if radiance.bright().len() > 0 {
-            let seed = combine(seed, 16 + round as u32);
-            let (e, variance) = radiance.bright().irradiance(scene, receiver, points.len(), seed, &mut rays);
-            let scale = points.len() as f32 / PI;
+            let (e, variance) = radiance.bright().irradiance(scene, receiver, rays.len(), seed, &mut traced);
+            let scale = rays.len() as f32 / PI;
             sum += e * scale;
             squares += variance * scale * scale;
         }
         self.sum += sum;
         self.squares += squares;
-        self.rays += points.len() as u32;
-        rays
+        self.rays += rays.len() as u32;
+        traced
+    }
+}
+
+/// Number of texels whose rays are traced together.
+pub(crate) const TILE: usize = 64;
+
+/// Rounds of rays from neighbouring texels, which are traced together as a stream: the light of a texel has the bits that it
+/// has when gathered alone.
+#[derive(Default)]
+pub(crate) struct Tile {
+    rays: Vec<Ray>,
+    hits: Vec<RawHit>,
+}
+
+impl Tile {
+    /// Allocates room for [`TILE`] texels.
+    pub(crate) fn new() -> Result<Tile> {
+        let what = "the gather rays of a tile";
+        let ray = Ray::new(Vec3::ZERO, Vec3::ZERO);
+        Ok(Tile { rays: try_filled(TILE * ROUND, ray, what)?, hits: try_filled(TILE * ROUND, RawHit::MISS, what)? })
+    }
+
+    /// Adds one round of rays from each of at most [`TILE`] texels: their receivers, their own seeds, and their sums.
+    /// Returns the rays traced.
+    pub(crate) fn add_round(
+        &mut self,
+        scene: &Scene,
+        radiance: &RadianceMap,
+        texels: &mut [(Receiver, u32, Gathered)],
+        samples: &SampleSet,
+        round: usize,
+    ) -> u64 {
+        let points = points_of(samples, round);
+        let count = texels.len() * points.len();
+        for ((receiver, seed, _), rays) in texels.iter().zip(self.rays.chunks_mut(points.len())) {
+            aim(receiver, points, *seed, rays);
+        }
+        scene.intersect_stream(&self.rays[..count], &mut self.hits);
+        let rays = self.rays[..count].chunks(points.len()).zip(self.hits.chunks(points.len()));
+        let add =
+            |((receiver, seed, gathered), (rays, hits)): (&mut (Receiver, u32, Gathered), (&[Ray], &[RawHit]))| {
+                gathered.add(scene, radiance, receiver, rays, hits, combine(*seed, 16 + round as u32))
+            };
+        texels.iter_mut().zip(rays).map(add).sum()
+    }
+}
+
+/// The sample points of a round.
+fn points_of(samples: &SampleSet, round: usize) -> &[[u32; 2]] {
+    &samples.points()[round * ROUND..samples.points().len().min((round + 1) * ROUND)]
+}
+
+/// Aims a ray from a receiver at each point of a round; `seed` is the texel's own.
+fn aim(receiver: &Receiver, points: &[[u32; 2]], seed: u32, rays: &mut [Ray]) {
+    let shift = [combine(seed, 1), combine(seed, 2)];
+    let (tangent, bitangent) = orthonormal_basis(receiver.normal);
+    for (ray, p) in rays.iter_mut().zip(points) {
+        let [x, y] = concentric_disc([unit_float(p[0] ^ shift[0]), unit_float(p[1] ^ shift[1])]);
+        let z = (1.0 - x * x - y * y).max(0.0).sqrt();
+        *ray = Ray::new(receiver.origin, x * tangent + y * bitangent + z * receiver.normal);
     }
 }
 
@@ -134,6 +199,7 @@ fn through(scene: &Scene, radiance: &RadianceMap, ray: &Ray, crossings: &mut Vec
 #[cfg(test)]
 mod tests {
     use super::*;
+    use crate::trace::PACKET_SIZE;
 
     #[test]
     fn every_packet_is_a_narrower_bundle_than_its_round() {

@@ -1,0 +1,114 @@
+//! Gather rays of tiles of neighbouring texels: as streams, and ray by ray.
+
+use bakelite::bvh::BuildOptions;
+use bakelite::io::load;
+use bakelite::sampling::{concentric_disc, orthonormal_basis, uniform};
+use bakelite::trace::{PACKET_SIZE, Packet, RawHit, Ray};
+use bakelite::{Device, DeviceOptions, Isa, Progress, Scene, SceneData};
+use glam::Vec3;
+use std::path::Path;
+use std::time::Instant;
+
+fn median(mut v: Vec<f64>) -> f64 {
+    v.sort_by(f64::total_cmp);
+    v[v.len() / 2]
+}
+
+/// Rays of a tile of `side`² texels, `rays` each.
+fn tile(scene: &Scene, number: u32, side: u32, rays: u32, spacing: f32) -> Option<Vec<Ray>> {
+    let t = (uniform(number, 0, 7) * scene.triangle_count() as f32) as u32 % scene.triangle_count();
+    let [a, b, c] = scene.corners(t);
+    let normal = (b - a).cross(c - a).normalize_or_zero();
+    if normal == Vec3::ZERO {
+        return None;
+    }
+    let normal = if uniform(number, 3, 7) < 0.5 { normal } else { -normal };
+    let (u, v) = (uniform(number, 1, 7), uniform(number, 2, 7));
+    let (u, v) = if u + v > 1.0 { (1.0 - u, 1.0 - v) } else { (u, v) };
+    let centre = a + u * (b - a) + v * (c - a) + 1e-3 * normal;
+    let (tangent, bitangent) = orthonormal_basis(normal);
+    let mut out = Vec::new();
+    for y in 0..side {
+        for x in 0..side {
+            let origin = centre + spacing * (x as f32 * tangent + y as f32 * bitangent);
+            for i in 0..rays {
+                let seed = number * 1000 + y * side + x;
+                let [p, q] = concentric_disc([uniform(i, 4, seed), uniform(i, 5, seed)]);
+                let z = (1.0 - p * p - q * q).max(0.0).sqrt();
+                out.push(Ray::new(origin, p * tangent + q * bitangent + z * normal));
+            }
+        }
+    }
+    Some(out)
+}
+
+/// Traces the rays of each origin in packets, one by one.
+fn packets(scene: &Scene, rays: &[Ray], out: &mut [RawHit]) {
+    for (rays, out) in rays.chunks(PACKET_SIZE).zip(out.chunks_mut(PACKET_SIZE)) {
+        let mut packet = Packet::default();
+        rays.iter().for_each(|r| packet.push(Vec3::from(r.direction)));
+        let mut hits = [RawHit::MISS; PACKET_SIZE];
+        scene.gather_packet(Vec3::from(rays[0].origin), &packet, 0.0, f32::INFINITY, &mut hits);
+        out.copy_from_slice(&hits[..out.len()]);
+    }
+}
+
+fn main() {
+    let scenes: Vec<String> = std::env::args().skip(1).filter(|a| !a.starts_with('-')).collect();
+    for file in &scenes {
+        let mut data = SceneData::new();
+        load(Path::new(file), &mut data).expect("scene");
+        for isa in Isa::available() {
+            let device =
+                Device::new(DeviceOptions { isa: Some(isa), num_threads: 1, ..Default::default() }).expect("device");
+            let scene = Scene::commit(&device, data.clone(), &BuildOptions::default(), &Progress::none())
+                .map_err(|e| e.1)
+                .expect("commit");
+            let area: f32 = (0..scene.triangle_count())
+                .map(|t| {
+                    let [a, b, c] = scene.corners(t);
+                    0.5 * (b - a).cross(c - a).length()
+                })
+                .sum();
+            let spacing = 0.12 * (area / 7000.0).sqrt();
+            for (side, per_texel) in [(8, 64), (8, 32), (16, 64), (1, 1024), (1, 256), (1, 64), (1, 32)] {
+                let n = (400_000 / (side * side * per_texel)).max(8);
+                let tiles: Vec<Vec<Ray>> =
+                    (0..).filter_map(|i| tile(&scene, i, side, per_texel, spacing)).take(n as usize).collect();
+                let count: usize = tiles.iter().map(Vec::len).sum();
+                let mut a = vec![RawHit::MISS; 16384];
+                let mut b = vec![RawHit::MISS; 16384];
+                let (mut ratios, mut times) = (vec![], vec![]);
+                for round in 0..7 {
+                    let start = Instant::now();
+                    for t in &tiles {
+                        packets(&scene, t, &mut a[..t.len()]);
+                    }
+                    let single = start.elapsed().as_secs_f64();
+                    let start = Instant::now();
+                    for t in &tiles {
+                        scene.intersect_stream(t, &mut b);
+                    }
+                    let stream = start.elapsed().as_secs_f64();
+                    if round > 0 {
+                        ratios.push(single / stream);
+                        times.push(stream);
+                    }
+                }
+                let mut differ = 0;
+                for t in &tiles {
+                    packets(&scene, t, &mut a[..t.len()]);
+                    scene.intersect_stream(t, &mut b);
+                    differ += (0..t.len()).filter(|&i| a[i] != b[i]).count();
+                }
+                println!(
+                    "{} {} {side}x{side}x{per_texel}: {:.2} Mrays/s stream, ratio {:.2}, {differ} of {count} differ",
+                    Path::new(file).file_stem().unwrap().to_string_lossy(),
+                    isa.name(),
+                    count as f64 / median(times) / 1e6,
+                    median(ratios)
+                );
+            }
+        }
+    }
+}
