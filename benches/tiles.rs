@@ -1,4 +1,8 @@
-//! Gather rays of tiles of neighbouring texels: as streams, and ray by ray.
+//! Gather rays of tiles of neighbouring texels and of one origin: as streams, and in packets whose rays are traced one by one.
+//!
+//!     cargo bench --features io --bench tiles -- SCENE...
+//!
+//! Alternating pairs in one process, one thread; medians, and a count of hits whose bits differ.
 
 use bakelite::bvh::BuildOptions;
 use bakelite::io::load;

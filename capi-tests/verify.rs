@@ -62,9 +62,9 @@ fn gathered(scene: &Scene, origin: Vec3, directions: &[[f32; 3]], tmax: f32) -> 
     out
 }
 
-/// Closest hits and occlusion of rays in a stream of 24 times as many, so that each octant has enough for lists.
+/// Closest hits and occlusion of rays in a stream of six times as many, so that each octant has enough for lists.
 fn streamed(scene: &Scene, rays: &[Ray]) -> Vec<(Hit, u8)> {
-    let (count, rays) = (rays.len(), rays.repeat(24));
+    let (count, rays) = (rays.len(), rays.repeat(6));
     let (mut hits, mut shadows) = (vec![RawHit { t: f32::NAN, ..RawHit::MISS }; rays.len()], vec![2; rays.len()]);
     scene.intersect_stream(&rays, &mut hits);
     scene.occluded_stream(&rays, &mut shadows);

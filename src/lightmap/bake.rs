@@ -8,7 +8,7 @@ use super::indirect::blur;
 use super::indirect::blur::Filling;
 use super::indirect::bright_patches::Bright;
 use super::indirect::find_bright_patches;
-use super::indirect::gather::{Gathered, TILE, Tile};
+use super::indirect::gather::{Gathered, TILE, Tile, TileTexel};
 use super::indirect::radiance_map::{self, Radiance, RadianceInput, RadianceMap};
 use super::indirect::sample_set::SampleSet;
 use super::indirect::upsample::{OWN_RAYS, OwnLight, OwnRays, Upsampling};
@@ -351,13 +351,16 @@ impl Bake<'_, '_> {
                     self.progress.check()?;
                     let first = needed.start + block * BLOCK;
                     let samples_of_tile = first + start..first + values.len().min(start + TILE);
-                    let texel =
-                        |s: usize| (l.receiver(&l.gather, backs, s), combine(seed, s as u32), Gathered::default());
+                    let texel = |s: usize| TileTexel {
+                        receiver: l.receiver(&l.gather, backs, s),
+                        seed: combine(seed, s as u32),
+                        gathered: Gathered::default(),
+                    };
                     let mut texels: Vec<_> = samples_of_tile.map(texel).collect();
                     for round in 0..samples.rounds() {
                         traced += tile.add_round(&l.scene, &lookup, &mut texels, &samples, round);
                     }
-                    for (i, (receiver, _, gathered)) in texels.iter().enumerate() {
+                    for (i, TileTexel { receiver, gathered, .. }) in texels.iter().enumerate() {
                         let i = start + i;
                         (values[i], normals[i]) = (gathered.irradiance(), receiver.normal);
                         (variances[i], valid[i]) = (gathered.variance(), gathered.is_visible());

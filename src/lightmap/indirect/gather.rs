@@ -127,6 +127,14 @@ impl Gathered {
 /// Number of texels whose rays are traced together.
 pub(crate) const TILE: usize = 64;
 
+/// A texel of a tile.
+pub(crate) struct TileTexel {
+    pub receiver: Receiver,
+    /// The texel's own seed.
+    pub seed: u32,
+    pub gathered: Gathered,
+}
+
 /// Rounds of rays from neighbouring texels, which are traced together as a stream: the light of a texel has the bits that it
 /// has when gathered alone.
 #[derive(Default)]
@@ -143,28 +151,28 @@ impl Tile {
         Ok(Tile { rays: try_filled(TILE * ROUND, ray, what)?, hits: try_filled(TILE * ROUND, RawHit::MISS, what)? })
     }
 
-    /// Adds one round of rays from each of at most [`TILE`] texels: their receivers, their own seeds, and their sums.
-    /// Returns the rays traced.
+    /// Adds one round of rays from each of at most [`TILE`] texels. Returns the rays traced.
     pub(crate) fn add_round(
         &mut self,
         scene: &Scene,
         radiance: &RadianceMap,
-        texels: &mut [(Receiver, u32, Gathered)],
+        texels: &mut [TileTexel],
         samples: &SampleSet,
         round: usize,
     ) -> u64 {
         let points = points_of(samples, round);
         let count = texels.len() * points.len();
-        for ((receiver, seed, _), rays) in texels.iter().zip(self.rays.chunks_mut(points.len())) {
-            aim(receiver, points, *seed, rays);
+        for (texel, rays) in texels.iter().zip(self.rays.chunks_mut(points.len())) {
+            aim(&texel.receiver, points, texel.seed, rays);
         }
         scene.intersect_stream(&self.rays[..count], &mut self.hits);
+        let mut traced = 0;
         let rays = self.rays[..count].chunks(points.len()).zip(self.hits.chunks(points.len()));
-        let add =
-            |((receiver, seed, gathered), (rays, hits)): (&mut (Receiver, u32, Gathered), (&[Ray], &[RawHit]))| {
-                gathered.add(scene, radiance, receiver, rays, hits, combine(*seed, 16 + round as u32))
-            };
-        texels.iter_mut().zip(rays).map(add).sum()
+        for (texel, (rays, hits)) in texels.iter_mut().zip(rays) {
+            let seed = combine(texel.seed, 16 + round as u32);
+            traced += texel.gathered.add(scene, radiance, &texel.receiver, rays, hits, seed);
+        }
+        traced
     }
 }
 
