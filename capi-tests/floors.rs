@@ -1,4 +1,4 @@
-//! The plan of the house: each floor of the library imports only from those above it in docs/architecture.md, and no
+//! Each module (floor) of the library imports only from those above it in docs/architecture.md, and no
 //! two folders or files import each other in a circle. Nor do those of the command line.
 //!
 //! Paths that begin with `crate::` or `super::` are looked at, tests apart. Names that `lib.rs` re-exports count for
