@@ -14,6 +14,7 @@ use bakelite::lightmap::{BakeParams, CheckpointParams, Layer, LayerData, Lightma
 use bakelite::live::{Budget, Live, LiveCamera, LiveParams, Mode, PageRect};
 use bakelite::photon::{PhotonMap, PhotonParams};
 use bakelite::scene::{LightmapUvs, MeshMaterials};
+use bakelite::trace::Ray;
 use bakelite::{Device, DeviceOptions, Error, Light, Material, Mesh, Progress, Result, Scene, SceneData};
 use glam::{Vec2, Vec3};
 use std::alloc::{GlobalAlloc, Layout, System};
@@ -193,6 +194,7 @@ fn every_large_allocation_and_every_request_may_fail_and_nothing_is_lost() {
     std::fs::create_dir_all(&folder).unwrap();
     let large = LARGE.swap(LARGE_OF_LIVE, SeqCst);
     let mut small = small_lightmap(&device);
+    trace_streams(small.scene());
     live(&small, &folder.join("light.live"));
     LARGE.store(large, SeqCst);
     let expected = checkpoints(&mut small, &folder.join("light.checkpoint"));
@@ -326,6 +328,15 @@ fn small_lightmap(device: &Arc<Device>) -> Lightmap {
     let scene = Scene::commit(device, data, &BuildOptions::default(), &none).map_err(|(_, e)| e).unwrap();
     let desc = LightmapDesc { texels_per_unit: 100.0, page_size: 256, ..Default::default() };
     Lightmap::create(&scene, &desc, &none).unwrap()
+}
+
+/// Traces streams on all threads. Each keeps the memory that it takes for them; without, rays are traced one by one, so that
+/// no call fails for it.
+fn trace_streams(scene: &Scene) {
+    let up = |i: usize| Ray::new(Vec3::splat(0.1), Vec3::new((i % 7) as f32 - 3.0, (i % 5) as f32 - 2.5, 1.0));
+    let rays: Vec<Ray> = (0..1 << 18).map(up).collect();
+    let mut occluded = vec![0; rays.len()];
+    scene.occluded_many(&rays, true, &mut occluded).unwrap();
 }
 
 /// Live objects: made, refined, relit, read, saved and restored.
