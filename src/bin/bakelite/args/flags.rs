@@ -64,6 +64,24 @@ pub struct LiveFlags {
     /// Updates per time budget, of 1, 2, 4 and 8 ms; 0: budgets are not measured
     #[arg(long, value_name = "N", help_heading = "Report live", default_value_t = 10_000)]
     pub updates: u32,
+    /// Levels of detail
+    #[arg(long, value_name = "N", help_heading = "Report live", default_value_t = 3,
+          value_parser = clap::value_parser!(u32).range(1..=4))]
+    pub lods: u32,
+    /// Rounds of 64 rays until a texel is finished, where errors are followed
+    #[arg(long, value_name = "N", help_heading = "Report live", default_value_t = 16,
+          value_parser = clap::value_parser!(u32).range(1..=1024))]
+    pub rounds: u32,
+    /// Rounds of all texels of a cell before it shows its next level of detail, at most --rounds
+    #[arg(long, value_name = "N", help_heading = "Report live", default_value_t = 1,
+          value_parser = clap::value_parser!(u32).range(1..=1024))]
+    pub promote: u32,
+    /// Edge of a grid cell [default: a sixteenth of the scene's longest side]
+    #[arg(long, value_name = "F", help_heading = "Report live", value_parser = values::positive)]
+    pub cell_size: Option<f64>,
+    /// Most rays of an update; 0: no limit
+    #[arg(long, value_name = "N", help_heading = "Report live", default_value_t = 0)]
+    pub update_rays: u32,
 }
 
 /// What a report of quality varies.

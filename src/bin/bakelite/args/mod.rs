@@ -14,6 +14,7 @@ use bakelite::Isa;
 use bakelite::bvh::{BuildOptions, BuildQuality};
 use bakelite::io::LoadOptions;
 use bakelite::lightmap::{BakeParams, Layer, LightmapDesc};
+use bakelite::live::LiveParams;
 use bakelite::scene::{Camera, is_builtin};
 use clap::error::ErrorKind;
 use clap::{CommandFactory, FromArgMatches};
@@ -150,6 +151,8 @@ pub struct ReportArgs {
     pub seconds: f64,
     /// Live: updates per time budget; 0: budgets are not measured.
     pub updates: u32,
+    /// Live: parameters of the updates.
+    pub live: LiveParams,
     /// Quality: points at which light is compared.
     pub points: usize,
     /// Quality: bakes per setting.
@@ -213,8 +216,26 @@ fn command_of(line: CommandLine) -> Result<Command, String> {
         Verb::Report(Report::Pipeline(flags)) => Command::ReportPipeline(boxed(flags)?),
         Verb::Report(Report::Stability(flags)) => Command::ReportStability(boxed(flags)?),
         Verb::Report(Report::Live(live)) => {
-            let (seconds, updates) = (live.seconds, live.updates);
-            Command::ReportLive(Box::new(ReportArgs { seconds, updates, ..report_args(live.flags)? }))
+            if live.promote > live.rounds {
+                return Err(format!("--promote is {}, more than --rounds {}", live.promote, live.rounds));
+            }
+            let mut args = ReportArgs { seconds: live.seconds, updates: live.updates, ..report_args(live.flags)? };
+            let bake = &args.bake.params;
+            args.live = LiveParams {
+                lod_count: live.lods,
+                max_rounds: live.rounds,
+                promote_threshold: live.promote,
+                cell_size: live.cell_size.unwrap_or(0.0) as f32,
+                rays_per_update: live.update_rays,
+                blur: bake.blur_radius,
+                seed: bake.seed,
+                photon_count: bake.photon_count,
+                max_bounces: bake.max_bounces,
+                direct_samples: bake.direct_samples,
+                radius: bake.radius,
+                ..Default::default()
+            };
+            Command::ReportLive(Box::new(args))
         }
         Verb::Report(Report::Quality(quality)) => Command::ReportQuality(Box::new(ReportArgs {
             points: quality.points as usize,
@@ -234,6 +255,7 @@ fn report_args(flags: Flags) -> Result<ReportArgs, String> {
         bake: bake_args(flags)?,
         seconds: 0.0,
         updates: 0,
+        live: LiveParams::default(),
         points: 0,
         seeds: 0,
         paths: 0,

@@ -60,6 +60,11 @@ fn a_report_takes_the_flags_of_a_bake_and_its_own() {
     let r = report("report live --scene s.obj --photons 5 --seconds 2.5 --updates 7");
     assert_eq!((r.bake.scene.as_str(), r.bake.params.photon_count), ("s.obj", 5));
     assert_eq!((r.seconds, r.updates), (2.5, 7));
+    assert_eq!(r.live, LiveParams { photon_count: 5, ..Default::default() });
+    let r = report("report live --lods 2 --rounds 8 --promote 3 --cell-size 0.5 --update-rays 9 --blur 1");
+    let (l, b) = (r.live, r.bake.params);
+    assert_eq!((l.lod_count, l.max_rounds, l.promote_threshold, l.cell_size), (2, 8, 3, 0.5));
+    assert_eq!((l.rays_per_update, l.blur, l.direct_samples), (9, 1, b.direct_samples));
     let r = report("report live");
     assert_eq!((r.bake.scene.as_str(), r.bake.desc.texels_per_unit), ("atrium", ATRIUM_DENSITY));
     assert_eq!((r.seconds, r.updates), (20.0, 10_000));
@@ -183,6 +188,8 @@ fn errors_name_the_flag_and_the_value() {
         ("a.obj b.obj", &["'b.obj'"]),
         ("report dead", &["unrecognized subcommand 'dead'"]),
         ("report live --seconds 0", &["'0' for '--seconds <F>'", "not a finite number greater than 0"]),
+        ("report live --promote 3 --rounds 2", &["--promote is 3, more than --rounds 2"]),
+        ("report live --lods 5", &["5 is not in 1..=4"]),
         ("report live --updates 1.5", &["'1.5' for '--updates <N>'"]),
         ("report memory --updates 5", &["'--updates'"]),
         ("--updates 5", &["'--updates'"]),

@@ -21,9 +21,6 @@ const BAKE_RAYS: [u32; 5] = [64, 128, 256, 512, 1024];
 /// Gather rays of the references.
 const REFERENCE_RAYS: u32 = 4096;
 
-/// Rounds of live updates whose errors are followed: they end with as many rays as the last bake.
-const ROUNDS: u32 = 16;
-
 /// Rounds on walks, so many that work remains.
 const WALK_ROUNDS: u32 = 1024;
 
@@ -86,19 +83,6 @@ pub fn run(args: &ReportArgs) -> Result<()> {
     Ok(())
 }
 
-fn live_params(params: &BakeParams) -> LiveParams {
-    LiveParams {
-        max_rounds: ROUNDS,
-        blur: params.blur_radius,
-        seed: params.seed,
-        photon_count: params.photon_count,
-        max_bounces: params.max_bounces,
-        direct_samples: params.direct_samples,
-        radius: params.radius,
-        ..Default::default()
-    }
-}
-
 fn aspect(args: &BakeArgs) -> f32 {
     args.width as f32 / args.height as f32
 }
@@ -141,7 +125,7 @@ fn errors(job: &Job, args: &ReportArgs, lightmap: &mut Lightmap) -> Result<(Meas
     let mut runs = Vec::new();
     for (mode, name) in MODES {
         job.bars.say(&format!("{name} updates"));
-        let params = LiveParams { mode, ..live_params(&params) };
+        let params = LiveParams { mode, ..args.live };
         let after = moved_reference.as_ref().map(|(light, reference)| (*light, &reference[..]));
         let mut run = watch.run(lightmap, &params, &reference, after)?;
         phases[0].curves.push(Curve { name, points: std::mem::take(&mut run.from_nothing) });
@@ -160,7 +144,7 @@ fn walks(job: &Job, args: &ReportArgs, camera: &Camera) -> Result<Vec<Walk>> {
         // Threads belong to the device, and so does the scene.
         let again = BakeArgs { threads, quiet: true, ..args.bake.clone() };
         let lightmap = Job::new(&again).unbaked()?;
-        let params = LiveParams { max_rounds: WALK_ROUNDS, ..live_params(&args.bake.params) };
+        let params = LiveParams { max_rounds: WALK_ROUNDS, ..args.live };
         for budget in BUDGETS_MS {
             job.bars.say(&format!("{} updates of {budget} ms, threads: {threads}", args.updates));
             walks.push(walk(&lightmap, &params, &live_camera(camera, aspect(&args.bake)), budget, args.updates)?);
@@ -254,6 +238,10 @@ fn introduction(args: &ReportArgs, lightmap: &Lightmap, camera: &Camera, measure
     let (scene, info, params) = (lightmap.scene(), lightmap.info(), &args.bake.params);
     let device = scene.device();
     let (position, target) = (camera.position, camera.target);
+    let cells = match args.live.cell_size {
+        0.0 => "cells of the automatic size".into(),
+        size => format!("cells of {size}"),
+    };
     format!(
         "# Live updates: {}\n\n\
          {triangles} triangles, {texels} texels ({gather} of them gather) on {pages} pages of {width} × {height}; \
@@ -265,7 +253,8 @@ fn introduction(args: &ReportArgs, lightmap: &Lightmap, camera: &Camera, measure
          included: what is left is the noise of gathering. As its first rays are those of the others, errors are \
          slightly too small, by about an eighth with {last} rays. Rays are those for gathering, for direct light \
          and, in live updates, for what the camera sees; those of photons and radiance map are left out. Live updates \
-         are of {FOLLOW_MS} ms, with at most {ROUNDS} rounds of 64 rays per texel; their time includes that of \
+         are of {FOLLOW_MS} ms, with at most {rounds} rounds of 64 rays per texel, {lods} levels of detail, cells that show the next after \
+         {promote} rounds, and {cells}; their time includes that of \
          creating the live state but not that of measuring errors. They end when all that is seen is finished, or \
          after {seconds} s.\n\n",
         args.bake.title(),
@@ -284,7 +273,10 @@ fn introduction(args: &ReportArgs, lightmap: &Lightmap, camera: &Camera, measure
         threads = device.num_threads(),
         isa = device.isa().name(),
         seen = measured.seen,
-        last = ROUNDS * 64,
+        last = args.live.max_rounds * 64,
+        rounds = args.live.max_rounds,
+        lods = args.live.lod_count,
+        promote = args.live.promote_threshold,
         seconds = args.seconds,
         rays = ray_count(aspect(&args.bake)),
     )
