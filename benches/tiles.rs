@@ -1,6 +1,8 @@
 //! Gather rays of tiles of neighbouring texels and of one origin: as streams, and in packets whose rays are traced one by one.
 //!
-//!     cargo bench --features io --bench tiles -- SCENE...
+//!     cargo bench --features io --bench tiles -- SCENE... [ISA...] [8x8x64...]
+//!
+//! Instruction sets (portable, avx2, avx512) and kinds of tiles (side × side texels × rays) that are named are the only ones.
 //!
 //! Alternating pairs in one process, one thread; medians, and a count of hits whose bits differ.
 
@@ -12,6 +14,13 @@ use bakelite::{Device, DeviceOptions, Isa, Progress, Scene, SceneData};
 use glam::Vec3;
 use std::path::Path;
 use std::time::Instant;
+
+/// Kinds of tiles: texels along a side, and rays per texel.
+const KINDS: [(u32, u32); 7] = [(8, 64), (8, 32), (16, 64), (1, 1024), (1, 256), (1, 64), (1, 32)];
+
+fn name_of((side, rays): (u32, u32)) -> String {
+    format!("{side}x{side}x{rays}")
+}
 
 fn median(mut v: Vec<f64>) -> f64 {
     v.sort_by(f64::total_cmp);
@@ -58,11 +67,17 @@ fn packets(scene: &Scene, rays: &[Ray], out: &mut [RawHit]) {
 }
 
 fn main() {
-    let scenes: Vec<String> = std::env::args().skip(1).filter(|a| !a.starts_with('-')).collect();
-    for file in &scenes {
+    let arguments: Vec<String> = std::env::args().skip(1).filter(|a| !a.starts_with('-')).collect();
+    let is_isa = |a: &String| Isa::ALL.iter().any(|isa| isa.name() == a);
+    let is_kind = |a: &String| KINDS.iter().any(|&kind| name_of(kind) == *a);
+    let is_wanted = |name: &str, is_of: &dyn Fn(&String) -> bool| {
+        let mut named = arguments.iter().filter(|a| is_of(a)).peekable();
+        named.peek().is_none() || named.any(|a| a == name)
+    };
+    for file in arguments.iter().filter(|a| !is_isa(a) && !is_kind(a)) {
         let mut data = SceneData::new();
         load(Path::new(file), &mut data).expect("scene");
-        for isa in Isa::available() {
+        for isa in Isa::available().filter(|isa| is_wanted(isa.name(), &is_isa)) {
             let device =
                 Device::new(DeviceOptions { isa: Some(isa), num_threads: 1, ..Default::default() }).expect("device");
             let scene = Scene::commit(&device, data.clone(), &BuildOptions::default(), &Progress::none())
@@ -75,7 +90,7 @@ fn main() {
                 })
                 .sum();
             let spacing = 0.12 * (area / 7000.0).sqrt();
-            for (side, per_texel) in [(8, 64), (8, 32), (16, 64), (1, 1024), (1, 256), (1, 64), (1, 32)] {
+            for (side, per_texel) in KINDS.into_iter().filter(|&kind| is_wanted(&name_of(kind), &is_kind)) {
                 let n = (400_000 / (side * side * per_texel)).max(8);
                 let tiles: Vec<Vec<Ray>> =
                     (0..).filter_map(|i| tile(&scene, i, side, per_texel, spacing)).take(n as usize).collect();

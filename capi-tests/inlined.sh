@@ -12,7 +12,7 @@ allowed='RaySetup::make_slow|Bundle::accurate|triangle::accurate_distance|single
 allowed+='|stream_rays::Room::(take|give_back|leave_alone)|stream::Traversal<T>::leave_alone'
 allowed+='|CompactLeaf::outer_box|<bakelite::trace::filter::Filter as bakelite::trace::filter::Accept>::accepts'
 # Entry points: src/trace/kernels.rs and src/photon/estimate.rs, of each ISA.
-entry='bakelite::(trace::kernels|photon::estimate)::(portable|avx2|avx512)::'
+entry='bakelite::(trace::kernels|photon::estimate)::(portable|avx2|avx512|vbmi2)(_streams)?::'
 # Fewer than these were not all found: 9 kernels of rays and one of photons, 3 ISAs.
 least=30
 

@@ -25,7 +25,7 @@ mod portable;
 #[cfg(target_arch = "x86_64")]
 pub(crate) use avx2::Avx2;
 #[cfg(target_arch = "x86_64")]
-pub(crate) use avx512::Avx512;
+pub(crate) use avx512::{Avx512, Avx512Vbmi2};
 pub(crate) use portable::Portable;
 
 /// Calls the macro `$then` with the CPU features of an ISA in brackets, followed by `$args`.
@@ -38,6 +38,12 @@ macro_rules! isa_features {
     (Avx512 => $then:ident! { $($args:tt)* }) => {
         $then! {
             ["avx2" "fma" "popcnt" "lzcnt" "bmi1" "bmi2" "avx512f" "avx512vl" "avx512dq" "avx512bw"] $($args)*
+        }
+    };
+    (Avx512Vbmi2 => $then:ident! { $($args:tt)* }) => {
+        $then! {
+            ["avx2" "fma" "popcnt" "lzcnt" "bmi1" "bmi2" "avx512f" "avx512vl" "avx512dq" "avx512bw" "avx512vbmi2"]
+            $($args)*
         }
     };
 }
@@ -98,6 +104,18 @@ impl Isa {
         }
     }
 
+    /// Whether this machine has VBMI2 beside AVX-512.
+    pub(crate) fn has_vbmi2() -> bool {
+        #[cfg(all(target_arch = "x86_64", not(miri), not(bakelite_portable)))]
+        {
+            isa_features! { Avx512Vbmi2 => cpu_has! {} }
+        }
+        #[cfg(any(not(target_arch = "x86_64"), miri, bakelite_portable))]
+        {
+            false
+        }
+    }
+
     /// Those that this machine can run, best last.
     pub fn available() -> impl Iterator<Item = Isa> {
         Self::ALL.into_iter().filter(|i| i.is_available())
@@ -135,8 +153,8 @@ pub(crate) trait Simd: Copy {
     ///
     /// # Safety
     /// The CPU must have the ISA. `masks` must be valid for reading `count` bytes, rounded up to a multiple of 32, of which
-    /// those from `count` on are 0; `numbers` for reading, and `out` for writing, `count` numbers rounded up to a
-    /// multiple of 8. `out` may overlap what lies behind the `count` numbers.
+    /// those from `count` on are 0; `numbers` for reading, and `out` for writing, `count` numbers rounded up likewise. `out`
+    /// may overlap what lies behind the `count` numbers.
     unsafe fn pick(masks: *const u8, numbers: *const u16, count: usize, bit: u32, out: *mut u16) -> usize;
 }
 

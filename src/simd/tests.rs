@@ -174,4 +174,9 @@ unsafe fn check_simd<S: Simd>() {
 #[test]
 fn lanes_agree_with_scalars_on_every_isa() {
     on_every_isa!(check_simd);
+    #[cfg(target_arch = "x86_64")]
+    if Isa::has_vbmi2() {
+        // SAFETY: the machine has it.
+        unsafe { check_simd::<Avx512Vbmi2>() };
+    }
 }

@@ -73,6 +73,11 @@ impl Tree for View<'_> {
     }
 
     #[inline(always)]
+    fn prefetch_whole(&self, child: ChildRef) {
+        prefetch(self.tree.address(child));
+    }
+
+    #[inline(always)]
     unsafe fn node(&self, node: ChildRef) -> &CompactNode {
         // SAFETY: forwarded.
         unsafe { self.tree.node(node) }

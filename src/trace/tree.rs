@@ -26,6 +26,9 @@ pub(super) trait Tree {
     /// Prefetches a child that will be visited soon.
     fn prefetch(&self, child: ChildRef);
 
+    /// Prefetches all cache lines of a child.
+    fn prefetch_whole(&self, child: ChildRef);
+
     /// # Safety
     /// `node` must be an inner reference of this tree.
     unsafe fn node(&self, node: ChildRef) -> &Self::Node;

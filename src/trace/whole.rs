@@ -18,6 +18,11 @@ impl Tree for Mbvh {
     }
 
     #[inline(always)]
+    fn prefetch_whole(&self, child: ChildRef) {
+        self.prefetch_whole(child);
+    }
+
+    #[inline(always)]
     unsafe fn node(&self, node: ChildRef) -> &Node {
         debug_assert!(node.node_index() < self.nodes.len());
         // SAFETY: inner references of the tree are in range.
