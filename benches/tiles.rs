@@ -27,14 +27,25 @@ fn median(mut v: Vec<f64>) -> f64 {
     v[v.len() / 2]
 }
 
-/// Rays of a tile of `side`² texels, `rays` each.
-fn tile(scene: &Scene, number: u32, side: u32, rays: u32, spacing: f32) -> Option<Vec<Ray>> {
-    let t = (uniform(number, 0, 7) * scene.triangle_count() as f32) as u32 % scene.triangle_count();
-    let [a, b, c] = scene.corners(t);
-    let normal = (b - a).cross(c - a).normalize_or_zero();
-    if normal == Vec3::ZERO {
-        return None;
-    }
+/// Sums of the areas of the triangles up to each.
+fn areas(scene: &Scene) -> Vec<f32> {
+    let area = |t: u32| {
+        let [a, b, c] = scene.corners(t).map(|v| v.as_dvec3());
+        0.5 * (b - a).cross(c - a).length()
+    };
+    let sums = (0..scene.triangle_count()).scan(0.0, |sum, t| {
+        *sum += area(t);
+        Some(*sum as f32)
+    });
+    sums.collect()
+}
+
+/// Rays of a tile of `side`² texels, `rays` each, at a place that is uniform over the surface.
+fn tile(scene: &Scene, areas: &[f32], number: u32, side: u32, rays: u32, spacing: f32) -> Vec<Ray> {
+    let at = uniform(number, 0, 7) * areas[areas.len() - 1];
+    let t = areas.partition_point(|&sum| sum <= at).min(areas.len() - 1);
+    let [a, b, c] = scene.corners(t as u32);
+    let normal = (b - a).cross(c - a).normalize();
     let normal = if uniform(number, 3, 7) < 0.5 { normal } else { -normal };
     let (u, v) = (uniform(number, 1, 7), uniform(number, 2, 7));
     let (u, v) = if u + v > 1.0 { (1.0 - u, 1.0 - v) } else { (u, v) };
@@ -52,7 +63,7 @@ fn tile(scene: &Scene, number: u32, side: u32, rays: u32, spacing: f32) -> Optio
             }
         }
     }
-    Some(out)
+    out
 }
 
 /// Traces the rays of each origin in packets, one by one.
@@ -83,17 +94,11 @@ fn main() {
             let scene = Scene::commit(&device, data.clone(), &BuildOptions::default(), &Progress::none())
                 .map_err(|e| e.1)
                 .expect("commit");
-            let area: f32 = (0..scene.triangle_count())
-                .map(|t| {
-                    let [a, b, c] = scene.corners(t);
-                    0.5 * (b - a).cross(c - a).length()
-                })
-                .sum();
-            let spacing = 0.12 * (area / 7000.0).sqrt();
+            let areas = areas(&scene);
+            let spacing = 0.12 * (areas[areas.len() - 1] / 7000.0).sqrt();
             for (side, per_texel) in KINDS.into_iter().filter(|&kind| is_wanted(&name_of(kind), &is_kind)) {
                 let n = (400_000 / (side * side * per_texel)).max(8);
-                let tiles: Vec<Vec<Ray>> =
-                    (0..).filter_map(|i| tile(&scene, i, side, per_texel, spacing)).take(n as usize).collect();
+                let tiles: Vec<Vec<Ray>> = (0..n).map(|i| tile(&scene, &areas, i, side, per_texel, spacing)).collect();
                 let count: usize = tiles.iter().map(Vec::len).sum();
                 let mut a = vec![RawHit::MISS; 16384];
                 let mut b = vec![RawHit::MISS; 16384];

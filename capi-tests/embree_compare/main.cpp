@@ -240,12 +240,12 @@ size_t run_kind(Kind &k, const Scene &s, const EmbreeScenes &embree, const Optio
         }
         row.threads = threads;
         row.ours = double(count) / median(our_times) * 1e-6;
-        std::fprintf(o.text(), "  %-26s %8.3f   %u thread%s\n", "bakelite", row.ours, threads, threads == 1 ? "" : "s");
+        std::fprintf(o.text(), "  %-32s %8.3f   %u thread%s\n", "bakelite", row.ours, threads, threads == 1 ? "" : "s");
         // By the fastest run, which noise spoils least. (The least of several ratios would be the noisiest.)
         Rate best[MODES];
         for (size_t w = 0; w < k.ways.size(); w++) {
             row.way = k.ways[w].name;
-            std::fprintf(o.text(), "  %-26s", k.ways[w].name);
+            std::fprintf(o.text(), "  %-32s", k.ways[w].name.c_str());
             for (int mode = 0; mode < MODES; mode++) {
                 const Rate &r = rates[w * MODES + size_t(mode)];
                 if (r.fastest > best[mode].fastest) best[mode] = r;
@@ -258,7 +258,7 @@ size_t run_kind(Kind &k, const Scene &s, const EmbreeScenes &embree, const Optio
             }
             std::fprintf(o.text(), "\n");
         }
-        std::fprintf(o.text(), "  %-26s", "against the best of them");
+        std::fprintf(o.text(), "  %-32s", "against the best of them");
         for (const Rate &r : best) std::fprintf(o.text(), " %8.3f %7.2fx  ", r.mrays, r.ratio);
         std::fprintf(o.text(), "\n");
     }
@@ -269,13 +269,13 @@ size_t run_kind(Kind &k, const Scene &s, const EmbreeScenes &embree, const Optio
 
 size_t run_rays(const Scene &s, const Setup &setup, const Options &o, const Row &row, std::vector<Row> &rows) {
     const EmbreeScenes embree(s, setup);
-    std::fprintf(o.text(), "%-28s", ("Mrays/s, our " + row.build + " build").c_str());
+    std::fprintf(o.text(), "%-34s", ("Mrays/s, our " + row.build + " build").c_str());
     for (const char *mode : MODE_NAMES) std::fprintf(o.text(), " %17s  ", (std::string("Embree ") + mode).c_str());
     std::fprintf(o.text(), "\n");
     size_t real = 0;
     for (size_t kind = 0; kind < KINDS; kind++) {
         Kind k;
-        make_kind(k, kind, s, o.rays / STREAM * STREAM, o.seed);
+        make_kind(k, kind, s, o.rays, o.seed);
         real += run_kind(k, s, embree, o, row, rows);
     }
     return real;

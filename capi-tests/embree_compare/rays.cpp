@@ -224,7 +224,98 @@ void gather(Kind &k, const Scene &s, size_t count, Random &random) {
         }
     };
     k.ways = {intersect1(k.rays), intersect16(k.rays, true), intersect16(k.rays, false),
-              intersect_stream(k.rays, k.unit, true), intersect_stream(k.rays, k.unit, false)};
+              intersect_stream(k.rays, std::min(k.unit, STREAM), true),
+              intersect_stream(k.rays, std::min(k.unit, STREAM), false)};
+}
+
+// Calls place(origin, n) for the texels of a square tile around a random point, n its facing normal. Texels are 12 cm
+// apart in a scene of the size of Sponza.
+template <typename Place> void tile(const Scene &s, size_t texels, double side, Random &random, const Place &place) {
+    const Random::Point p = random.on_surface(s);
+    const Vec3d n = p.normal * side, first = p.position + n * (1e-4 * s.diagonal);
+    const Vec3d x = around(n, {1, 0, 0}, 0), y = around(n, {0, 1, 0}, 0);
+    const double spacing = 0.12 * std::sqrt(s.area_sums.back() / 7000);
+    for (size_t j = 0; j < texels; j++) {
+        for (size_t i = 0; i < texels; i++) place(first + x * (spacing * double(i)) + y * (spacing * double(j)), n);
+    }
+}
+
+// Octant, longest axis and place of a direction on a curve through the cells of a cube's face: rays that follow one another
+// go alike.
+uint32_t direction_key(const bk_ray &r) {
+    const float *d = r.direction;
+    const size_t a = std::abs(d[0]) > std::abs(d[1]) ? (std::abs(d[0]) > std::abs(d[2]) ? 0 : 2)
+                                                     : (std::abs(d[1]) > std::abs(d[2]) ? 1 : 2);
+    uint32_t key = 0;
+    for (size_t i = 0; i < 3; i++) key |= uint32_t(d[i] < 0) << i;
+    key = key * 3 + uint32_t(a);
+    const float u = std::abs(d[(a + 1) % 3] / d[a]), v = std::abs(d[(a + 2) % 3] / d[a]);
+    const auto cell = [](float x) { return std::min(255u, uint32_t(x * 256)); };
+    for (int bit = 7; bit >= 0; bit--) key = key << 2 | (cell(u) >> bit & 1) << 1 | (cell(v) >> bit & 1);
+    return key;
+}
+
+// Gather rays of tiles of 8 x 8 texels, 64 rays each: what a baker traces. Each texel turns the set of directions. Three
+// quarters of a tile's rays hit something, if there are such places.
+void tiles(Kind &k, const Scene &s, size_t count, Random &random) {
+    const size_t per_texel = k.unit / 64;
+    const double side = busier_side(s, random);
+    std::vector<uint8_t> hit(k.unit);
+    for (size_t made = 0, tries = 0; made < count; tries++) {
+        tile(s, 8, side, random, [&](Vec3d origin, Vec3d n) {
+            const double turn = 2 * PI * random.uniform(), shift = random.uniform();
+            for (size_t i = 0; i < per_texel; i++) {
+                const double v = double(i) * 0.6180339887498949 + shift;
+                const Vec3d d = cosine_hemisphere((double(i) + 0.5) / double(per_texel), v - std::floor(v));
+                k.rays.add(origin, 0, around(n, d, turn), INF);
+            }
+        });
+        // In rooms, where somebody sees the light: not on roofs, whose rays miss.
+        check(bk_occluded_many(s.scene, &k.rays.rays[made], k.unit, 0, hit.data()));
+        const size_t hits = size_t(std::count(hit.begin(), hit.end(), 1));
+        if (4 * hits >= 3 * k.unit || tries > 20 * (count / k.unit)) {
+            made += k.unit;
+        } else {
+            k.rays.rays.resize(made);
+        }
+    }
+    k.rays.finish();
+    k.sorted.rays = k.rays.rays;
+    for (auto unit = k.sorted.rays.begin(); unit < k.sorted.rays.end(); unit += long(k.unit)) {
+        std::stable_sort(unit, unit + long(k.unit), [](const bk_ray &a, const bk_ray &b) {
+            return direction_key(a) < direction_key(b);
+        });
+    }
+    k.sorted.finish();
+    k.ours = [&k, &s](size_t begin, size_t end) {
+        for (size_t i = begin; i < end; i += k.unit) {
+            check(bk_intersect_many(s.scene, &k.rays.rays[i], k.unit, 0, &k.hits[i]));
+        }
+    };
+    k.ways = {intersect1(k.rays), intersect16(k.rays, true), intersect16(k.rays, false),
+              intersect_stream(k.rays, STREAM, false)};
+    for (Way way : {intersect1(k.sorted), intersect16(k.sorted, true), intersect16(k.sorted, false),
+                    intersect_stream(k.sorted, STREAM, true)}) {
+        way.name += ", sorted";
+        k.ways.push_back(way);
+    }
+}
+
+// Shadow rays of tiles of 16 x 16 texels to a point some way off another surface.
+void tiles_to_lamp(Kind &k, const Scene &s, size_t count, Random &random) {
+    const double side = busier_side(s, random);
+    while (k.rays.rays.size() < count) {
+        const Random::Point p = random.on_surface(s);
+        const Vec3d lamp = p.position + p.normal * (side * 0.02 * s.diagonal);
+        tile(s, 16, side, random, [&](Vec3d origin, Vec3d) { k.rays.add(origin, 0, lamp - origin, 1); });
+    }
+    k.rays.finish();
+    k.ours = [&k, &s](size_t begin, size_t end) {
+        for (size_t i = begin; i < end; i += k.unit) {
+            check(bk_occluded_many(s.scene, &k.rays.rays[i], k.unit, 0, &k.occluded[i]));
+        }
+    };
+    k.ways = {occluded1(k.rays), occluded16(k.rays, true), occluded16(k.rays, false)};
 }
 
 // A pinhole camera, 90 degrees, square, in tiles of 4 x 4 pixels.
@@ -317,13 +408,15 @@ const struct {
     void (*make)(Kind &, const Scene &, size_t count, Random &);
 } HOW[KINDS] = {
     {STREAM, false, random_incoherent}, {32, false, gather},   {256, false, gather},        {STREAM, false, primary},
-    {STREAM, false, axis_aligned},      {16, true, occlusion}, {STREAM, false, one_by_one},
+    {STREAM, false, axis_aligned},      {16, true, occlusion}, {STREAM, false, one_by_one}, {4096, false, tiles},
+    {1024, false, gather},              {256, true, tiles_to_lamp},
 };
 
 } // namespace
 
 const char *const KIND_NAMES[KINDS] = {"random",       "gather 32", "gather 256", "primary",
-                                       "axis-aligned", "occluded",  "one by one"};
+                                       "axis-aligned", "occluded",  "one by one", "tiles 8x8x64",
+                                       "gather 1024",  "tile to lamp"};
 
 void make_kind(Kind &k, size_t number, const Scene &s, size_t count, uint64_t seed) {
     k.name = KIND_NAMES[number];
@@ -331,7 +424,7 @@ void make_kind(Kind &k, size_t number, const Scene &s, size_t count, uint64_t se
     k.occlusion = HOW[number].occlusion;
     // Each kind has random numbers of its own, so that a new one does not change the others.
     Random random(seed + number);
-    HOW[number].make(k, s, count, random);
+    HOW[number].make(k, s, std::max(k.unit, count / k.unit * k.unit), random);
     k.hits.resize(k.occlusion ? 0 : k.rays.rays.size());
     k.occluded.resize(k.occlusion ? k.rays.rays.size() : 0);
 }

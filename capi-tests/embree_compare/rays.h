@@ -55,7 +55,7 @@ using Run = std::function<void(size_t begin, size_t end)>;
 using EmbreeRun = std::function<void(RTCScene, size_t begin, size_t end)>;
 
 struct Way {
-    const char *name;
+    std::string name;
     EmbreeRun run;
 };
 
@@ -71,15 +71,16 @@ struct Kind {
     size_t unit; // rays that belong together
     bool occlusion;
     Rays rays;
+    Rays sorted;                   // the same in the order that suits Embree best, unit by unit; empty if there is none
     std::vector<bk_hit> hits;      // ours
     std::vector<uint8_t> occluded; // ours
     Run ours;
     std::vector<Way> ways;
 };
 
-const size_t KINDS = 7;
+const size_t KINDS = 10;
 extern const char *const KIND_NAMES[KINDS];
 
-// Makes rays of the kind with that number: the same for the same seed and scene, whatever traces them. count: a
-// multiple of STREAM.
+// Makes rays of the kind with that number: the same for the same seed and scene, whatever traces them. As many as
+// count, rounded down to whole units, but one unit at least.
 void make_kind(Kind &k, size_t number, const Scene &s, size_t count, uint64_t seed);
