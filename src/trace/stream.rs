@@ -106,7 +106,13 @@ impl<T: Tree> Traversal<'_, T> {
             // SAFETY: entries below `depth` have been written; children of the tree are its nodes and leaves; the builder
             // bounds the tree's depth so that there is room on the stack (see `STACK_SIZE`).
             unsafe {
-                let entry = stack.get_unchecked(depth).assume_init();
+                let mut entry = stack.get_unchecked(depth).assume_init();
+                if ANY {
+                    entry.count = self.drop_done(entry);
+                    if entry.count == 0 {
+                        continue;
+                    }
+                }
                 if entry.child.is_leaf() {
                     self.visit_leaf::<S, ANY>(entry);
                 } else {
@@ -114,6 +120,26 @@ impl<T: Tree> Traversal<'_, T> {
                 }
             }
         }
+    }
+
+    /// Drops rays from a list that hit no further box, for they have their hit. Returns how many are left.
+    ///
+    /// # Safety
+    /// `entry` must have been pushed.
+    #[inline(always)]
+    unsafe fn drop_done(&mut self, entry: Entry) -> u32 {
+        let mut left = 0;
+        // SAFETY: the list lies within `numbers`, which are those of slabs that were set up.
+        unsafe {
+            let numbers = self.room.numbers.as_mut_ptr().add(entry.start as usize);
+            let slabs = self.room.slabs.as_ptr();
+            for i in 0..entry.count as usize {
+                let number = *numbers.add(i);
+                *numbers.add(left) = number;
+                left += usize::from((*slabs.add(number as usize)).limit != f32::NEG_INFINITY);
+            }
+        }
+        left as u32
     }
 
     /// Tests the rays of a list against the children of a node, and pushes those that any ray hits. Returns how many.
