@@ -47,38 +47,8 @@ impl Lightmap {
         let unwrap_seconds = start.elapsed().as_secs_f64();
         let two_sided = (0..).zip(&charts.charts).filter(|(_, c)| c.two_sided).map(|(c, _)| c);
         let two_sided: Vec<u32> = try_collect(two_sided, "the two-sided charts")?;
-        let pack = |divisor: u32, padding: u32, given: bool, with_backs: &[u32]| {
-            let page_size = if divisor == 1 { desc.page_size } else { (desc.page_size / divisor).max(MIN_PAGE_SIZE) };
-            Layout::pack(&charts, density / divisor as f32, page_size, padding, given, with_backs, progress)
-        };
-        let radiance = pack(desc.radiance_divisor, 0, false, &two_sided)?;
-        let stage = progress.stage("texels", 0.5, 0.6, TexelMap::work(&radiance));
-        let mut radiance = ChartMap::new(scene, &charts, radiance, &stage)?;
-        let texel = 1.0 / density;
-        let stage = progress.stage("sides", 0.6, 0.65, Seen::work(&radiance));
-        let seen = scene.device().install(|| Seen::count(scene, &charts, &radiance, texel, &stage))?;
-        let with_backs =
-            if desc.both_sides { two_sided::seen_from_both(&seen, &radiance, &two_sided)? } else { Vec::new() };
-        let map = pack(1, desc.padding, true, &with_backs)?;
-        let gather = pack(desc.gather_divisor, 0, false, &with_backs)?;
-        let stage = progress.stage("texels", 0.65, 0.8, TexelMap::work(&map) + TexelMap::work(&gather));
-        let mut map = ChartMap::new(scene, &charts, map, &stage)?;
-        let mut gather = ChartMap::new(scene, &charts, gather, &stage)?;
-        let placements = [&map, &gather, &radiance].map(|map| map.layout.placements.len() as u64);
-        let stage = progress.stage("buried texels", 0.8, 1.0, placements.iter().sum());
-        let near = texel.min(seen::ROOM * scene.diagonal());
-        let search = Search { scene, charts: &charts, seen: &seen, near };
-        let mut sight_rays = seen.rays;
-        let mut move_buried = |map: &mut ChartMap, by_parts: bool| -> Result<Vec<bool>> {
-            let (buried, rays) = scene.device().install(|| search.move_buried(map, by_parts, &stage))?;
-            sight_rays += rays;
-            Ok(buried)
-        };
-        move_buried(&mut radiance, true)?;
-        // The visible part of a mostly buried texel is a strip along the surface that covers it, often darker than its
-        // surroundings. Gather texels are larger and would spread that darkness as a rim.
-        move_buried(&mut gather, false)?;
-        let buried = move_buried(&mut map, true)?;
+        let Maps { map, gather, radiance, seen, with_backs, buried, sight_rays } =
+            Maps::lay_out(scene, desc, &charts, &two_sided, density, progress)?;
         uvs.overlapping_texels = map.texels.overlapping_texels;
         uvs.reduced_charts = map.layout.reduced;
         let index = ChartIndex::new(scene.device(), &charts)?;
@@ -106,23 +76,7 @@ impl Lightmap {
         if let Some(message) = too_few_digits(scene, "texels", 1.0 / density, OFFSET_PART) {
             scene.device().log(LogLevel::Warning, &message);
         }
-        scene.device().log_info(|| {
-            let (i, seconds) = (&info, start.elapsed().as_secs_f64());
-            format!(
-                "light map: {} pages of {} x {}, {:.3} texels per unit, {} charts, {} texels ({} gather, {} radiance), \
-                 {} bytes, {seconds:.3} s of which unwrapping {:.3}",
-                i.page_count,
-                i.width,
-                i.height,
-                i.texels_per_unit,
-                i.charts,
-                i.texels,
-                i.gather_texels,
-                i.radiance_texels,
-                i.bytes,
-                i.unwrap_seconds
-            )
-        });
+        scene.device().log_info(|| summary(&info, start.elapsed().as_secs_f64()));
         let direct = DirectLight::try_new(scene)?;
         let mut plan =
             Plan::new(scene, &direct, &BakeParams::default(), !two_sided.is_empty(), uvs.unwrapped_charts > 0);
@@ -132,4 +86,82 @@ impl Lightmap {
         let atlas = Atlas { scene, charts, index, map, gather, radiance, padding, info, seen, buried, _memory: memory };
         Ok(Lightmap { atlas: Arc::new(atlas), plan, light: None })
     }
+}
+
+/// Places of the charts in the three maps, and the counts that laying them out brought.
+struct Maps {
+    map: ChartMap,
+    gather: ChartMap,
+    radiance: ChartMap,
+    seen: Seen,
+    /// Two-sided charts whose backs have texels of their own.
+    with_backs: Vec<u32>,
+    /// By texel of the light map; empty if none is.
+    buried: Vec<bool>,
+    sight_rays: u64,
+}
+
+impl Maps {
+    /// Lays out the radiance map first: rays from its texels count which sides can be seen, and the sides decide which
+    /// charts need a second place in the other two maps.
+    fn lay_out(
+        scene: &Arc<Scene>,
+        desc: &LightmapDesc,
+        charts: &Charts,
+        two_sided: &[u32],
+        density: f32,
+        progress: &Progress,
+    ) -> Result<Maps> {
+        let pack = |divisor: u32, padding: u32, given: bool, with_backs: &[u32]| {
+            let page_size = if divisor == 1 { desc.page_size } else { (desc.page_size / divisor).max(MIN_PAGE_SIZE) };
+            Layout::pack(charts, density / divisor as f32, page_size, padding, given, with_backs, progress)
+        };
+        let radiance = pack(desc.radiance_divisor, 0, false, two_sided)?;
+        let stage = progress.stage("texels", 0.5, 0.6, TexelMap::work(&radiance));
+        let mut radiance = ChartMap::new(scene, charts, radiance, &stage)?;
+        let texel = 1.0 / density;
+        let stage = progress.stage("sides", 0.6, 0.65, Seen::work(&radiance));
+        let seen = scene.device().install(|| Seen::count(scene, charts, &radiance, texel, &stage))?;
+        let with_backs =
+            if desc.both_sides { two_sided::seen_from_both(&seen, &radiance, two_sided)? } else { Vec::new() };
+        let map = pack(1, desc.padding, true, &with_backs)?;
+        let gather = pack(desc.gather_divisor, 0, false, &with_backs)?;
+        let stage = progress.stage("texels", 0.65, 0.8, TexelMap::work(&map) + TexelMap::work(&gather));
+        let mut map = ChartMap::new(scene, charts, map, &stage)?;
+        let mut gather = ChartMap::new(scene, charts, gather, &stage)?;
+        let placements = [&map, &gather, &radiance].map(|map| map.layout.placements.len() as u64);
+        let stage = progress.stage("buried texels", 0.8, 1.0, placements.iter().sum());
+        let near = texel.min(seen::ROOM * scene.diagonal());
+        let search = Search { scene, charts, seen: &seen, near };
+        let mut sight_rays = seen.rays;
+        let mut move_buried = |map: &mut ChartMap, by_parts: bool| -> Result<Vec<bool>> {
+            let (buried, rays) = scene.device().install(|| search.move_buried(map, by_parts, &stage))?;
+            sight_rays += rays;
+            Ok(buried)
+        };
+        move_buried(&mut radiance, true)?;
+        // The visible part of a mostly buried texel is a strip along the surface that covers it, often darker than its
+        // surroundings. Gather texels are larger and would spread that darkness as a rim.
+        move_buried(&mut gather, false)?;
+        let buried = move_buried(&mut map, true)?;
+        Ok(Maps { map, gather, radiance, seen, with_backs, buried, sight_rays })
+    }
+}
+
+/// The log's line for a light map that was created.
+fn summary(i: &LightmapInfo, seconds: f64) -> String {
+    format!(
+        "light map: {} pages of {} x {}, {:.3} texels per unit, {} charts, {} texels ({} gather, {} radiance), \
+         {} bytes, {seconds:.3} s of which unwrapping {:.3}",
+        i.page_count,
+        i.width,
+        i.height,
+        i.texels_per_unit,
+        i.charts,
+        i.texels,
+        i.gather_texels,
+        i.radiance_texels,
+        i.bytes,
+        i.unwrap_seconds
+    )
 }

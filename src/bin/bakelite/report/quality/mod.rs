@@ -360,12 +360,28 @@ fn markdown(
     view: Option<&ViewReference>,
     rows: &[Row],
 ) -> String {
+    let mut out = introduction(args, lightmap, [seen, points], reference_seconds);
+    if let Some(view) = view {
+        add_view(&mut out, view);
+    }
+    add_times(&mut out, rows);
+    add_settings(&mut out, rows);
+    out
+}
+
+/// Says which points are compared with which reference, and how to read the figures.
+fn introduction(
+    args: &ReportArgs,
+    lightmap: &Lightmap,
+    [seen, points]: [&Points; 2],
+    reference_seconds: f64,
+) -> String {
     let (scene, info, params) = (lightmap.scene(), lightmap.info(), &args.bake.params);
     let reference = match &args.reference {
         Some(file) => format!("those in {}", file.display()),
         None => format!("{} paths per point ({reference_seconds:.0} s)", args.paths),
     };
-    let mut out = format!(
+    format!(
         "# Quality: {}\n\n\
          {triangles} triangles; {texels} texels at {density:.2} per unit, {gather} gather and {radiance} radiance \
          texels; {photons} photons, {rays} gather rays, blur {blur} unless another value is named; threads: {threads}, \
@@ -396,21 +412,27 @@ fn markdown(
         others = seen.len() - points.len(),
         part = 100.0 * (1.0 - points.len() as f64 / seen.len() as f64),
         seeds = args.seeds,
+    )
+}
+
+/// Adds how the view was compared.
+fn add_view(out: &mut String, view: &ViewReference) {
+    let _ = write!(
+        out,
+        "SSIM (Wang 2004) compares the light map alone, as the camera shows it in {} × {} pixels, with the same view \
+         path traced by the bake's kernels with {} paths per pixel ({:.0} s), both tone mapped alike. Two halves of \
+         the reference, with half the paths each, have an SSIM of {}: an exact bake would have more than that, but \
+         not 1.\n\n",
+        view.size[0],
+        view.size[1],
+        view.paths,
+        view.seconds,
+        likeness(view.of_halves),
     );
-    if let Some(view) = view {
-        let _ = write!(
-            out,
-            "SSIM (Wang 2004) compares the light map alone, as the camera shows it in {} × {} pixels, with the same view \
-             path traced by the bake's kernels with {} paths per pixel ({:.0} s), both tone mapped alike. Two halves of \
-             the reference, with half the paths each, have an SSIM of {}: an exact bake would have more than that, but \
-             not 1.\n\n",
-            view.size[0],
-            view.size[1],
-            view.paths,
-            view.seconds,
-            likeness(view.of_halves),
-        );
-    }
+}
+
+/// Adds the seconds that each method takes to reach some errors.
+fn add_times(out: &mut String, rows: &[Row]) {
     out.push_str("## Time to an error of indirect light\n\n| | 10 % | 5 % | 1 % | slope |\n|---|---|---|---|---|\n");
     for s in series(rows)
         .into_iter()
@@ -421,6 +443,10 @@ fn markdown(
         let name = if s[0].series == "gather rays" { "this bake, by gather rays" } else { &s[0].series };
         let _ = writeln!(out, "| {name} | {a} | {b} | {c} | {slope} |");
     }
+}
+
+/// Adds the curves, and a row for each setting.
+fn add_settings(out: &mut String, rows: &[Row]) {
     out.push_str(
         "\n![error against time](quality.svg)\n\n## All settings\n\n\
          | | | seconds | RMS | relative MSE | ± | but worst | noise² | bias² | Σ | to mean | direct light: MSE | but worst | Σ | all light: MSE | but worst | Σ | SSIM |\n\
@@ -448,7 +474,6 @@ fn markdown(
             likeness(r.ssim),
         );
     }
-    out
 }
 
 /// A similarity for people.
