@@ -83,17 +83,17 @@ impl<T: SizedStruct> OutStruct<T> {
     /// Checks the caller's structure. Done before the work, so that a wrong size costs nothing.
     ///
     /// # Safety
-    /// As [`read_struct`]; the structure stays writable until [`write`](Self::write).
+    /// Same as for [`read_struct`]; the structure stays writable until [`write`](Self::write).
     pub(super) unsafe fn new(p: *mut T, name: &str) -> Result<Self> {
         // SAFETY: by contract.
         let size = unsafe { caller_size(p, name) }?;
         Ok(OutStruct { p, size })
     }
 
-    /// As [`new`](Self::new); NULL means that the caller does not care.
+    /// Same as [`new`](Self::new); NULL means that the caller does not want the output.
     ///
     /// # Safety
-    /// As [`new`](Self::new).
+    /// Same as for [`new`](Self::new).
     pub(super) unsafe fn optional(p: *mut T, name: &str) -> Result<Option<Self>> {
         // SAFETY: by contract.
         if p.is_null() { Ok(None) } else { unsafe { Self::new(p, name) }.map(Some) }
@@ -156,7 +156,7 @@ pub(super) unsafe fn read_strided<T: AnyBitPattern>(
 /// An array that is only there if its pointer is.
 ///
 /// # Safety
-/// As [`read_strided`].
+/// Same as for [`read_strided`].
 pub(super) unsafe fn read_optional<T: AnyBitPattern>(
     p: *const impl Copy,
     stride: usize,
@@ -244,10 +244,10 @@ pub(super) unsafe fn write<T>(p: *mut T, value: T, name: &str) -> Result<()> {
     Ok(())
 }
 
-/// As [`write`]; NULL means that the caller does not care.
+/// Same as [`write`]; NULL means that the caller does not want the output.
 ///
 /// # Safety
-/// As [`write`].
+/// Same as for [`write`].
 pub(super) unsafe fn write_optional<T>(p: *mut T, value: T) -> Result<()> {
     // SAFETY: by contract.
     if p.is_null() { Ok(()) } else { unsafe { write(p, value, "") } }

@@ -134,7 +134,7 @@ pub(super) fn call(body: impl FnOnce() -> Result<()>) -> bk_result {
     }
 }
 
-/// As [`call`], for entry points that return a value: `fallback` on failure.
+/// Same as [`call`], for entry points that return a value: `fallback` on failure.
 #[inline]
 pub(super) fn call_or<T>(fallback: T, body: impl FnOnce() -> Result<T>) -> T {
     match catch(body) {

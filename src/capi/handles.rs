@@ -25,7 +25,7 @@ pub(super) unsafe fn retain<T>(handle: *const T) {
 /// Gives one reference back; NULL is fine.
 ///
 /// # Safety
-/// As [`retain`]; the reference that is given back must be the caller's.
+/// Same as for [`retain`]; the reference that is given back must be the caller's.
 pub(super) unsafe fn release<T>(handle: *const T) {
     if !handle.is_null() {
         // SAFETY: by contract the pointer is that of a living Arc, and one count of it is ours.
@@ -44,10 +44,10 @@ pub(super) unsafe fn borrow<'a, T>(handle: *const T, name: &str) -> Result<&'a T
     unsafe { handle.as_ref() }.ok_or_else(|| is_null(name))
 }
 
-/// As [`borrow`], with a reference of its own: the caller might release the handle in a callback of the call.
+/// Same as [`borrow`], with a reference of its own: the caller might release the handle in a callback of the call.
 ///
 /// # Safety
-/// As [`retain`].
+/// Same as for [`retain`].
 pub(super) unsafe fn hold<T>(handle: *const T, name: &str) -> Result<Arc<T>> {
     if handle.is_null() {
         return Err(is_null(name));
@@ -76,7 +76,7 @@ macro_rules! object {
 }
 pub(super) use object;
 
-/// As `object!`, [borrowed](borrow): for queries that are called by the million.
+/// Same as `object!`, but [borrowed](borrow): for queries that are called by the million.
 macro_rules! borrowed {
     ($handle:ident) => {{
         #[allow(unused_unsafe)] // some callers are in an unsafe block already

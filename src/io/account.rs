@@ -1,5 +1,5 @@
-//! Room for what a file brings: announced to the device's memory monitor before it is taken, and an error, not an
-//! abort, where there is none.
+//! Memory for the contents of a file: announced to the device's memory monitor before it is allocated. Where there is
+//! none, that is an error and not an abort.
 
 use crate::error::{Error, Result};
 use crate::memory::{MemoryMonitor, Reservation};
@@ -10,7 +10,7 @@ use std::sync::Arc;
 /// Bytes are announced in such steps, so that the monitor is not asked for every small array.
 const STEP: usize = 1 << 20;
 
-/// What one call that reads a file holds.
+/// Memory held by one call that reads a file.
 pub(super) struct Account {
     held: usize,
     reservation: Reservation,
@@ -31,13 +31,13 @@ impl Account {
         Ok(())
     }
 
-    /// Gives back `bytes` of what is held.
+    /// Gives back `bytes` of the memory that is held.
     pub fn give_back(&mut self, bytes: usize) {
         self.held = self.held.saturating_sub(bytes);
         self.reservation.shrink(self.held.next_multiple_of(STEP));
     }
 
-    /// Appends a value. The room doubles when it is used up.
+    /// Appends a value. The capacity doubles when it is used up.
     #[inline]
     pub fn push<T>(&mut self, list: &mut Vec<T>, value: T, what: &str) -> Result<()> {
         if list.len() == list.capacity() {
@@ -47,7 +47,7 @@ impl Account {
         Ok(())
     }
 
-    /// Makes room for `more` values, at least twice of what there was.
+    /// Reserves capacity for `more` values, and at least doubles it.
     #[cold]
     pub fn make_room<T>(&mut self, list: &mut Vec<T>, more: usize, what: &str) -> Result<()> {
         if list.capacity() - list.len() >= more {
@@ -58,7 +58,7 @@ impl Account {
         list.try_reserve_exact(wanted - list.len()).map_err(|_| no_room(wanted.saturating_mul(size_of::<T>()), what))
     }
 
-    /// An empty list with room for `len` values.
+    /// An empty list with capacity for `len` values.
     pub fn list<T>(&mut self, len: usize, what: &str) -> Result<Vec<T>> {
         let mut list = Vec::new();
         self.hold(len.saturating_mul(size_of::<T>()), what)?;
@@ -66,7 +66,7 @@ impl Account {
         Ok(list)
     }
 
-    /// Makes room for one more entry.
+    /// Reserves capacity for one more entry.
     #[inline]
     pub fn make_room_in_map<K: Eq + Hash, V>(&mut self, map: &mut HashMap<K, V>, what: &str) -> Result<()> {
         if map.len() < map.capacity() {

@@ -22,7 +22,7 @@ pub fn write_exr(path: &Path, width: u32, height: u32, pixels: &[[f32; 3]]) -> R
     write_exr_with(path, width, height, pixels, &|_| Ok(()))
 }
 
-/// The same; `advance` is called often and ends the call by an error.
+/// Same as [`write_exr`]; `advance` is called often and ends the call by an error.
 pub(super) fn write_exr_with(
     path: &Path,
     width: u32,
@@ -51,7 +51,7 @@ impl<'a> Encoded<'a> {
         Encoded { bytes: Vec::new(), at: 0, advance, error: None }
     }
 
-    /// The file, or why there is none: encoders forget what their writer said.
+    /// The file, or the error of the writer, which encoders do not pass on.
     fn finish(self, written: Result<()>) -> Result<Vec<u8>> {
         match self.error {
             Some(own) => Err(own),
@@ -127,7 +127,7 @@ pub fn write_png_rgb8(path: &Path, width: u32, height: u32, pixels: &[[u8; 3]]) 
     write_png_with(path, width, height, pixels, &|_| Ok(()))
 }
 
-/// The same; `advance` is called often and ends the call by an error.
+/// Same as [`write_png_rgb8`]; `advance` is called often and ends the call by an error.
 pub(super) fn write_png_with(path: &Path, width: u32, height: u32, pixels: &[[u8; 3]], advance: Advance) -> Result<()> {
     let file = encode_png(width, height, pixels, ColorType::Rgb, advance)?;
     files::replace(path, |new| new.append(&file, |_| advance(0)))

@@ -48,7 +48,7 @@ pub fn write_exr_pages(lightmap: &Lightmap, prefix: &str, progress: &Progress) -
 }
 
 /// Writes the light layers tone mapped, `PREFIXpageN-LAYER.png`, and returns the paths. `exposure`: `None` chooses
-/// [one](exposure). Otherwise as [`write_exr_pages`].
+/// [one](exposure). Otherwise same as [`write_exr_pages`].
 pub fn write_png_pages(
     lightmap: &Lightmap,
     prefix: &str,
@@ -70,7 +70,7 @@ pub fn write_png_pages(
 }
 
 /// Writes the scene with its light map to the GLB file `path`, see [`super::glb`]. `exposure`: `None` chooses
-/// [one](exposure). Otherwise as [`write_exr_pages`].
+/// [one](exposure). Otherwise same as [`write_exr_pages`].
 pub fn write_scene(lightmap: &Lightmap, path: &Path, exposure: Option<f32>, progress: &Progress) -> Result<()> {
     let info = lightmap.info();
     let new = lightmap.scene().device().run(progress, || {
@@ -94,7 +94,7 @@ pub fn write_scene(lightmap: &Lightmap, path: &Path, exposure: Option<f32>, prog
     new.finish()
 }
 
-/// Announces what an encoder takes for a page, which is not ours to allocate: the filtered rows and the file.
+/// Announces the memory that an encoder allocates by itself for a page: the filtered rows and the file.
 fn encoder_memory(lightmap: &Lightmap) -> Result<Reservation> {
     let info = lightmap.info();
     let bytes = 24 * info.width as usize * info.height as usize;

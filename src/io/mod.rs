@@ -47,7 +47,7 @@ use std::time::Instant;
 /// surfaces then emit from both sides too.
 pub const TWO_SIDED_UNLESS_SAID: bool = true;
 
-/// Reflectance where a file names a material without describing it, or none at all.
+/// Reflectance of surfaces whose file names no material, or names one without describing it.
 pub const DEFAULT_ALBEDO: f32 = 0.5;
 
 /// Numbers about a file that was loaded.
@@ -71,7 +71,7 @@ pub struct LoadInfo {
     pub faces_triangulated: u64,
     /// Whether any mesh brings light map coordinates.
     pub has_lightmap_uvs: bool,
-    /// What was ignored or replaced, a sentence each.
+    /// Things of the file that were ignored or replaced, a sentence each.
     pub warnings: Vec<String>,
     /// Wall time.
     pub seconds: f64,
@@ -82,7 +82,7 @@ pub struct LoadInfo {
 pub struct LoadOptions {
     /// Files that the scene names must lie in this folder or below; `None`: in the scene file's own or below.
     pub base_folder: Option<PathBuf>,
-    /// Files that the scene names may lie anywhere. For scenes that are trusted.
+    /// Whether files that the scene names may lie anywhere: for scenes that are trusted.
     pub any_folder: bool,
     /// Most bytes of all files together.
     pub max_file_bytes: u64,
@@ -104,7 +104,7 @@ impl Default for LoadOptions {
     }
 }
 
-/// As [`load_with`], with the default options and without reports of progress.
+/// Same as [`load_with`], with the default options and without reports of progress.
 pub fn load(path: &Path, data: &mut SceneData) -> Result<LoadInfo> {
     load_with(path, &LoadOptions::default(), &Progress::none(), data)
 }
@@ -170,7 +170,7 @@ impl<'s> Import<'s> {
         })
     }
 
-    /// "This file is malformed": the error that names it.
+    /// The error that the file is malformed, which names it.
     fn error(&self, what: impl std::fmt::Display) -> Error {
         Error::Io(format!("{}: {what}", self.path.display()))
     }
@@ -184,7 +184,7 @@ impl<'s> Import<'s> {
         self.info.warnings.push(what.into());
     }
 
-    /// Adds a material, its reflectance clamped and counted, and limited to what does not pass through.
+    /// Adds a material. Clamps its reflectance, counts that, and limits it to the light that does not pass through.
     fn add_material(&mut self, mut material: Material) -> Result<u32> {
         let limit = if material.albedo_texture == NONE { MAX_ALBEDO } else { 1.0 };
         let clamped = material.albedo.map(|a| a.clamp(0.0, limit));
@@ -194,7 +194,7 @@ impl<'s> Import<'s> {
         self.scene.add_material(material).map_err(|e| self.rename(e))
     }
 
-    /// The image of some materials, or a warning that it cannot be read; `name`: the image's.
+    /// Adds the image of some materials, which is called `name`, or a warning that it cannot be read.
     fn image(&mut self, name: impl Display, image: Attempt<Texture>) -> Result<Option<Texture>> {
         let image = image?;
         if let Err(what) = &image {
@@ -229,7 +229,7 @@ impl<'s> Import<'s> {
         self.scene.add_mesh(mesh).map(|_| ()).map_err(|e| self.rename(e))
     }
 
-    /// What the scene refuses is the file's fault.
+    /// Turns a refusal of the scene into an error that names the file.
     fn rename(&self, e: Error) -> Error {
         match e {
             Error::InvalidArgument(what) => self.error(what),
@@ -245,7 +245,7 @@ impl<'s> Import<'s> {
         Ok(())
     }
 
-    /// Hands all that was read to the caller's scene.
+    /// Moves everything that was read to the caller's scene.
     fn finish(self, data: &mut SceneData) -> Result<LoadInfo> {
         let Import { mut info, scene, account, .. } = self;
         info.meshes = scene.meshes().len() as u32;

@@ -52,7 +52,7 @@ pub(super) fn load(import: &mut Import, opened: Opened) -> Result<()> {
     import.add_mesh(mesh)
 }
 
-/// Refuses what cannot be: missing coordinates, and counts for which the file is too short (before
+/// Refuses headers without coordinates, and counts for which the file is too short (before
 /// memory is reserved for them).
 fn check_header(import: &Import, header: &Header, bytes: u64) -> Result<()> {
     let element = |name: &str| {
@@ -83,7 +83,7 @@ fn check_header(import: &Import, header: &Header, bytes: u64) -> Result<()> {
     Ok(())
 }
 
-/// Bytes that a property takes at least.
+/// Minimum size of a property in bytes.
 fn smallest_size(data_type: &PropertyType) -> u64 {
     let (PropertyType::Scalar(scalar) | PropertyType::List(scalar, _)) = data_type;
     match scalar {
@@ -94,10 +94,10 @@ fn smallest_size(data_type: &PropertyType) -> u64 {
     }
 }
 
-/// Where we are behind the header.
+/// The position in the part of the file behind the header.
 struct Body {
     encoding: Encoding,
-    /// Of the next element, in an ASCII file.
+    /// Line number of the next element, in an ASCII file.
     line: usize,
     text: Vec<u8>,
 }
@@ -144,7 +144,7 @@ impl Body {
     }
 }
 
-/// The crate's messages quote lines of the file on lines of their own.
+/// A message of the crate on one line: its own ones quote lines of the file on further lines.
 fn one_line(e: &ply_rs_bw::parser::ParseError) -> String {
     let text = e.to_string();
     let mut line = text.split_whitespace().collect::<Vec<_>>().join(" ");
@@ -283,7 +283,7 @@ impl PropertyAccess for Face {
     }
 }
 
-/// An element that we have no use for.
+/// An element that is skipped.
 struct Skipped;
 
 impl PropertyAccess for Skipped {

@@ -1,7 +1,7 @@
 //! The files that a scene consists of: which of them may be opened, how much of them may be read, and reading that
 //! counts progress and can be cancelled.
 //!
-//! A scene file comes from anywhere, and what it names should not be more than its author could have put beside it.
+//! A scene file may come from anywhere, so it may name only files that its author could have put beside it.
 //! So names are resolved against the folder of the file that names them, and must stay below one base folder: neither
 //! `..` nor an absolute path nor a symbolic link leads out of it. Only regular files are read.
 
@@ -20,12 +20,13 @@ const CHUNK: usize = 128 << 10;
 /// asked to stop.
 pub(super) type Advance<'a> = &'a dyn Fn(u64) -> Result<()>;
 
-/// Either what was asked for, or a sentence why the scene has to do without. The outer error ends the whole load.
+/// Either the thing asked for, or a sentence that says why the scene is loaded without it. The outer error ends the
+/// load.
 pub(super) type Attempt<T> = Result<std::result::Result<T, String>>;
 
 /// Opens files for one scene.
 pub(super) struct Files {
-    /// Where named files must lie, without symbolic links; `None`: anywhere.
+    /// Folder that named files must lie in, without symbolic links; `None`: anywhere.
     base: Option<PathBuf>,
     /// Bytes that may still be read.
     bytes_left: u64,
@@ -40,7 +41,7 @@ pub(super) struct Opened {
 }
 
 impl Files {
-    /// For the scene file `scene`.
+    /// The source of files for the scene file `scene`.
     pub fn new(scene: &Path, options: &LoadOptions) -> Result<Files> {
         let base = match &options.base_folder {
             _ if options.any_folder => None,
@@ -125,7 +126,7 @@ impl Files {
     }
 }
 
-/// The library's own error inside of one of a reader, or that a file cannot be read.
+/// The library's own error, if a reader's error wraps one; else the error that the file cannot be read.
 pub(super) fn read_error(e: io::Error, name: impl std::fmt::Display) -> Error {
     match e.downcast::<Error>() {
         Ok(own) => own,
@@ -195,7 +196,7 @@ impl<'a> Source<'a> {
     }
 }
 
-/// [`Read::read`] of what has a buffer.
+/// [`Read::read`] of a reader that has a buffer.
 fn read_buffered(from: &mut impl BufRead, buffer: &mut [u8]) -> io::Result<usize> {
     let available = from.fill_buf()?;
     let count = available.len().min(buffer.len());

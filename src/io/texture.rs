@@ -1,5 +1,5 @@
-//! Images of materials: PNG and JPEG files. What is wrong with one is told as a warning, and its material does
-//! without: a scene is worth having without an image.
+//! Images of materials: PNG and JPEG files. An image that cannot be read is a warning, and its material has no texture:
+//! a scene is useful without one of its images.
 
 use super::Import;
 use super::account::Account;
@@ -9,10 +9,10 @@ use crate::scene::{MAX_TEXTURE_SIZE, Texture};
 use image::{ColorType, ImageDecoder, ImageFormat, ImageReader, Limits};
 use std::path::Path;
 
-/// Alpha below which surfaces of formats that know no cutoff are holes.
+/// Alpha below which surfaces are cut out, for formats without a cutoff of their own.
 pub(super) const CUTOFF: f32 = 0.5;
 
-/// An image from the bytes of a file, row 0 being its top row. What it takes is looked at before it is decoded.
+/// Decodes the bytes of a file to an image whose row 0 is the top row. The memory that it takes is checked first.
 pub(super) fn decode(import: &mut Import, bytes: &[u8]) -> Attempt<Texture> {
     let decoder = match open(import, bytes) {
         Ok(decoder) => decoder,
@@ -37,7 +37,7 @@ pub(super) fn decode(import: &mut Import, bytes: &[u8]) -> Attempt<Texture> {
     }))
 }
 
-/// The same of the file that another one in `folder` names.
+/// Decodes the file that another one in `folder` names.
 pub(super) fn read(import: &mut Import, folder: &Path, name: &str) -> Attempt<Texture> {
     let bytes = match import.read_named(folder, name)? {
         Ok(bytes) => bytes,
@@ -60,7 +60,7 @@ fn open<'b>(import: &Import<'b>, bytes: &'b [u8]) -> std::result::Result<impl Im
     reader.into_decoder().map_err(|e| e.to_string())
 }
 
-/// All texels, in the room that was made for them. The file's own format takes as much again while it is converted.
+/// Decodes all texels into memory that was announced. The file's own format takes as much again while it is converted.
 fn rgba8(decoder: impl ImageDecoder, mut texels: Vec<[u8; 4]>, account: &mut Account) -> Attempt<Vec<[u8; 4]>> {
     let (width, height) = decoder.dimensions();
     let (color, count) = (decoder.color_type(), width as usize * height as usize);
@@ -97,7 +97,7 @@ fn rgba8(decoder: impl ImageDecoder, mut texels: Vec<[u8; 4]>, account: &mut Acc
     Ok(Ok(texels))
 }
 
-/// Alpha from an image of its own: its alpha or, where that is opaque all over, its first channel. Where sizes
+/// Takes alpha from a second image: its alpha or, where that is opaque all over, its first channel. Where sizes
 /// differ, the nearest texel counts; without colours all are white.
 pub(super) fn with_alpha(color: Option<Texture>, alpha: &Texture, account: &mut Account) -> Result<Texture> {
     let channel = if is_opaque(alpha) { 0 } else { 3 };
@@ -123,7 +123,7 @@ pub(super) fn is_opaque(texture: &Texture) -> bool {
     texture.rgba8.iter().all(|t| t[3] == 255)
 }
 
-/// Turned upside down, for formats that have v = 0 at the bottom.
+/// Turns an image upside down, for formats that have v = 0 at the bottom.
 pub(super) fn flipped(mut texture: Texture) -> Texture {
     let (width, rows) = (texture.width as usize, texture.height as usize);
     let (top, bottom) = texture.rgba8.split_at_mut(width * (rows / 2));

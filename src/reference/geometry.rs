@@ -205,7 +205,7 @@ impl Geometry {
     }
 
     /// Calls `visit(triangle, limit)` for the triangles whose boxes, grown by `margin`, the ray
-    /// meets before `limit`, roughly from near to far; `visit` returns the new limit.
+    /// enters before `limit`, roughly from near to far; `visit` returns the new limit.
     #[inline(always)]
     pub(super) fn traverse(&self, ray: &Ray64, margin: f64, mut visit: impl FnMut(&Triangle, f64) -> f64) {
         let slabs = Slabs::new(ray, margin);
@@ -280,7 +280,7 @@ impl Slabs {
         Slabs { origin: ray.origin, inverse, margin: DVec3::splat(margin), tmin: ray.tmin }
     }
 
-    /// Where the ray enters the node's box, if that is before `limit`. Never misses by rounding:
+    /// Distance at which the ray enters the node's box, if that is before `limit`. Never misses by rounding:
     /// both ends move outward by more than the error of a subtraction and a product.
     #[inline(always)]
     fn enter(&self, node: &Node, limit: f64) -> Option<f64> {

@@ -46,7 +46,7 @@ impl Area {
     }
 
     /// Density per solid angle of an area sample seen under `cosine` (on the light) at `distance`;
-    /// `None` where it does not radiate to.
+    /// `None` on the side that does not radiate.
     fn solid_angle_density(&self, cosine: f64, distance: f64) -> Option<f64> {
         let cosine = if self.two_sided { cosine.abs() } else { cosine };
         (cosine > 0.0).then(|| self.density * distance * distance / cosine)
@@ -135,7 +135,7 @@ impl Lights {
         chosen.map(|p| Proposal { irradiance: p.irradiance * (total / brightness(p.irradiance)), ..p })
     }
 
-    /// Radiance that a ray sampled by cosine meets in rect lights between two distances, weighted against
+    /// Radiance of the rect lights that a ray sampled by cosine crosses between two distances, weighted against
     /// area sampling. (Rect lights stop no rays, so there may be several.)
     pub fn rects_along(&self, origin: DVec3, direction: DVec3, range: [f64; 2], by_direction: f64) -> DVec3 {
         self.rects.iter().fold(DVec3::ZERO, |sum, rect| sum + rect_along(rect, origin, direction, range, by_direction))
@@ -156,7 +156,7 @@ impl Lights {
     }
 }
 
-/// What a material radiates per area, in units of [`brightness`].
+/// Radiant exitance of a material, in units of [`brightness`].
 fn brightness_of(material: &Material) -> f64 {
     brightness(rgb(material.emission)) * if material.two_sided { 2.0 } else { 1.0 }
 }
@@ -201,7 +201,7 @@ fn propose_simple(light: &Light, point: DVec3, normal: DVec3, square: [f64; 2]) 
             let axis = -direction.as_dvec3().normalize();
             let (x, y) = axis.any_orthonormal_pair();
             // A disc in the plane across the axis projects to the cap: radiance L, density cos/(π sin² α),
-            // so what a sample stands for is L π sin² α / cos = irradiance / cos.
+            // so the weight of a sample is L π sin² α / cos = irradiance / cos.
             let sine = (angular_radius as f64).sin() * square[0].sqrt();
             let cosine = (1.0 - sine * sine).sqrt();
             let (sin, cos) = (TAU * square[1]).sin_cos();

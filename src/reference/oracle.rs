@@ -1,7 +1,7 @@
-//! Judging f32 answers to a ray: is a disagreement a mistake, or may it be had either way?
+//! Judges f32 answers to a ray: is a disagreement a mistake, or are both answers defensible?
 //!
 //! A kernel in f32 works on positions relative to the ray's origin, which it knows to a few units
-//! in the last place of their length. That is the yardstick: an edge that the ray passes within it
+//! in the last place of their length. This error is the tolerance: an edge that the ray passes within it
 //! may count as hit or missed, and two hits nearer to each other than their errors along the ray
 //! may come in either order.
 
@@ -37,18 +37,18 @@ pub struct Candidate {
     pub t_error: f64,
 }
 
-/// What to think of one answer.
+/// Verdict on one answer.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub enum Verdict {
     /// The closest hit, or rightly a miss.
     Right,
     /// Coincident or grazing: as good as the f64 answer within f32's accuracy.
     Defensible,
-    /// Through a triangle, or of a triangle that the ray does not hit, or at a wrong t.
+    /// The ray went through a triangle, or the triangle is one that it does not hit, or t is wrong.
     Wrong,
 }
 
-/// How two answers to one ray compare.
+/// Result of comparing two answers to one ray.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub enum Agreement {
     /// Both miss, or both hit the same triangle at the same t up to f32's accuracy.

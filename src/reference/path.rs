@@ -1,9 +1,9 @@
 //! Path tracer: the light transport equation of diffuse surfaces by Monte Carlo (Kajiya 1986), with
 //! next event estimation at every vertex and Russian roulette.
 //!
-//! What it computes is what the library means: one-sided surfaces seen or hit from behind are black
+//! The model is that of the library: one-sided surfaces seen or hit from behind are black
 //! and absorb, two-sided ones reflect and emit on both sides, rect lights emit from one side and are
-//! not hit by rays, the background is black but for skies. Textures colour surfaces and cut holes into them; sheets
+//! not hit by rays, the background is black but for skies. Textures colour surfaces and make cut-outs; sheets
 //! that transmit are passed straight or reflect, by chance.
 
 use super::geometry::{Geometry, Hit64, Ray64};
@@ -89,12 +89,12 @@ pub struct PathTracer {
 }
 
 impl PathTracer {
-    /// Of a committed scene, with its lights of now.
+    /// Prepares a committed scene, with its present lights.
     pub fn new(scene: &Scene) -> Self {
         Self::from_parts(scene.meshes(), scene.materials(), scene.textures(), scene.environments(), &scene.lights())
     }
 
-    /// Of a scene that has not been committed.
+    /// Prepares a scene that has not been committed.
     pub fn from_data(data: &SceneData) -> Self {
         Self::from_parts(data.meshes(), data.materials(), data.textures(), data.environments(), data.lights())
     }
@@ -133,7 +133,7 @@ impl PathTracer {
 
     /// Irradiance at a point. `samples` ≥ 16 is rounded down to 16 · k²: sixteen independent
     /// estimates, each stratified k × k in the first direction and the place on area lights.
-    /// `stream` tells points with the same seed apart.
+    /// `stream` is a number that differs between points with the same seed.
     pub fn irradiance(&self, point: &SurfacePoint, samples: u32, seed: u64, stream: u64) -> Irradiance {
         let k = (samples / BATCHES).isqrt().max(1);
         let mut random = Random::new(seed, stream);
@@ -593,7 +593,7 @@ mod tests {
         for t in 0..mesh.indices.len() {
             let [a, b, c] = mesh.corners(t).map(Vec3::as_dvec3);
             let doubled = (b - a).cross(c - a);
-            // Stratified over the triangle; the differences of neighbours stand for the variance.
+            // Stratified over the triangle; the differences of neighbours estimate the variance.
             for cell in 0..k * k {
                 let mut one = || {
                     let [u, v] = super::super::random::triangle_point(random.cell(cell % k, cell / k, k));

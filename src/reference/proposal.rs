@@ -2,14 +2,14 @@
 
 use glam::{DVec3, Vec3};
 
-/// What a light would do to a surface element if nothing is in the way.
+/// A light sample: its effect on a surface element if nothing lies between.
 #[derive(Clone, Copy, Debug)]
 pub struct Proposal {
     /// Irradiance, weighted by the balance heuristic and divided by the density of the sample.
     pub irradiance: DVec3,
     /// Unit vector towards the light.
     pub direction: DVec3,
-    /// How far away it is; infinite for directional lights.
+    /// Distance of the light; infinite for directional lights.
     pub distance: f64,
 }
 
@@ -19,7 +19,7 @@ pub fn balance(by_direction: f64, by_area: f64) -> f64 {
     by_direction / (by_direction + by_area)
 }
 
-/// Sum of the channels: what random choices go by.
+/// Sum of the channels, by which random choices are weighted.
 pub fn brightness(color: DVec3) -> f64 {
     color.element_sum()
 }

@@ -15,7 +15,7 @@ pub struct Sky {
     /// Running sums of brightness times solid angle, over all pixels.
     sums: Vec<f64>,
     up: DVec3,
-    /// Where the middle of the image is.
+    /// Direction of the middle of the image.
     front: DVec3,
 }
 
@@ -75,7 +75,7 @@ impl Sky {
         (cosine > 0.0).then_some(Proposal { irradiance, direction, distance: f64::INFINITY })
     }
 
-    /// Radiance along a ray that meets nothing.
+    /// Radiance along a ray that hits nothing.
     pub fn along(&self, direction: DVec3, by_cosine: Option<f64>) -> DVec3 {
         let (radiance, density) = self.look(direction);
         by_cosine.map_or(radiance, |d| radiance * balance(d, density))

@@ -1,4 +1,4 @@
-//! What surfaces do with light: textures, holes and sheets, in f64. The look-ups share nothing with the
+//! How surfaces reflect and pass light: textures, cut-outs and sheets, in f64. The look-ups share nothing with the
 //! library's.
 
 use super::geometry::{Geometry, Hit64, Ray64};

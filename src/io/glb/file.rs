@@ -7,7 +7,8 @@ use crate::scene::{Material, NONE};
 use glam::Vec3;
 use serde_json::{Value, json};
 
-/// How pages are encoded, for the readers of a file. Constants as in [`super::image::tone_map`].
+/// Description of the encoding of pages, for the readers of a file. The constants are those of
+/// [`super::image::tone_map`].
 const ENCODING: &str = "8-bit sRGB. To irradiance in W/m2 (per square unit of length): make c linear; m = max(c.r, c.g, \
                         c.b); if m > 0.6, c = c * (0.6 - 0.4 * ln(1 - (m - 0.6) / 0.4)) / m; irradiance = c / exposure.";
 
@@ -106,7 +107,7 @@ impl<'a> File<'a> {
         Ok(())
     }
 
-    /// `pages`: how many textures are light map pages.
+    /// `pages`: number of textures that are light map pages.
     fn add_material(&mut self, page: u32, material: &Material, pages: usize) {
         let [r, g, b] = material.albedo;
         let mut result = json!({
@@ -200,13 +201,13 @@ impl<'a> File<'a> {
     }
 }
 
-/// Values as the file has them.
+/// Bytes of values as the file stores them.
 #[cfg(target_endian = "little")]
 fn little_endian<T: bytemuck::NoUninit>(values: &[T]) -> std::borrow::Cow<'_, [u8]> {
     bytemuck::cast_slice(values).into()
 }
 
-/// Values as the file has them: all are of 4 bytes.
+/// Bytes of values of 4 bytes each, as the file stores them.
 #[cfg(target_endian = "big")]
 fn little_endian<T: bytemuck::NoUninit>(values: &[T]) -> std::borrow::Cow<'_, [u8]> {
     let mut bytes: Vec<u8> = bytemuck::cast_slice(values).to_vec();

@@ -18,9 +18,9 @@
 //! `extras` of the asset say how pages are encoded, `extras` of each material which texture is its page.
 //! Emissive materials are not unlit, since unlit ones do not glow: they carry `emissiveFactor` and
 //! `KHR_materials_emissive_strength`. Triangles without a chart show their albedo alone. Triangles both sides of which
-//! have places in the light map are written twice, the second time turned round, with one-sided materials.
+//! have texels in the light map are written twice, the second time turned round, with one-sided materials.
 //!
-//! Images are embedded as PNG files, row 0 at v = 0, without a flip (see [`crate::io::image`]). Holes become
+//! Images are embedded as PNG files, row 0 at v = 0, without a flip (see [`crate::io::image`]). Cut-outs become
 //! `alphaMode` `MASK`. Normals are written where meshes bring them. Triangles that the scene skips (degenerate or not
 //! finite) are left out.
 
@@ -44,7 +44,7 @@ use std::path::Path;
 /// Light map coordinates of one mesh.
 #[derive(Clone, Debug, Default, PartialEq)]
 pub struct GlbMesh {
-    /// Of the corners of each triangle, in [0, 1].
+    /// Light map coordinates of the corners of each triangle, in [0, 1].
     pub corner_uvs: Vec<[[f32; 2]; 3]>,
     /// Page of each triangle; [`NONE`]: it has no chart.
     pub pages: Vec<u32>,
@@ -64,7 +64,7 @@ pub struct GlbBack {
 }
 
 impl GlbMesh {
-    /// Of a mesh of a light map.
+    /// The coordinates of a mesh of a light map.
     pub fn of(lightmap: &Lightmap, mesh: u32) -> Result<GlbMesh> {
         let (corner_uvs, pages) = lightmap.mesh_uvs(mesh)?;
         let ((back_uvs, back_pages), own) = lightmap.mesh_back_uvs(mesh)?;
@@ -81,7 +81,7 @@ pub struct GlbLightmap {
     pub meshes: Vec<GlbMesh>,
     /// One PNG file per page, as [`super::image::encode_png_rgb8`] makes them.
     pub pages: Vec<Vec<u8>>,
-    /// By which irradiance was multiplied in the pages.
+    /// Factor by which irradiance was multiplied in the pages.
     pub exposure: f32,
 }
 
@@ -90,8 +90,8 @@ pub fn write_glb(path: &Path, scene: &Scene, lightmap: &GlbLightmap) -> Result<(
     prepare_glb(path, scene, lightmap, &|_| Ok(()))?.finish()
 }
 
-/// The same up to [`finish`](files::Replacement::finish), with reports: `advance` is told of 2 parts, and ends the call
-/// by an error.
+/// Same as `write_glb` up to [`finish`](files::Replacement::finish), with reports: `advance` is called with each of 2
+/// parts, and ends the call by an error.
 pub(super) fn prepare_glb(
     path: &Path,
     scene: &Scene,
@@ -178,7 +178,7 @@ fn check(scene: &Scene, lightmap: &GlbLightmap) -> Result<()> {
     Ok(())
 }
 
-/// What comes before each chunk of the GLB container (glTF 2.0, chapter 4).
+/// The header of a chunk of the GLB container (glTF 2.0, chapter 4).
 fn headers(json: &[u8], binary: &[u8]) -> Result<[Vec<u8>; 2]> {
     let total = 12 + 8 + json.len() + 8 + binary.len();
     let Ok(length) = u32::try_from(total) else {

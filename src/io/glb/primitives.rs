@@ -17,7 +17,7 @@ pub(super) struct Triangle {
     is_back: bool,
 }
 
-/// What the triangles of a primitive have in common.
+/// The properties that all triangles of a primitive share.
 #[derive(Clone, Copy, Eq, Ord, PartialEq, PartialOrd)]
 pub(super) struct Key {
     pub page: u32,

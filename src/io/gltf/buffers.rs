@@ -1,4 +1,4 @@
-//! The bytes of buffers, and of what URIs name.
+//! The bytes of buffers, and of files and data that URIs name.
 
 use super::text::Text;
 use crate::error::Result;
@@ -25,7 +25,7 @@ pub(super) fn read<'b>(
     Ok(bytes)
 }
 
-/// What a URI names: data in itself, or a file beside the scene. The account counts it.
+/// The bytes that a URI names: in the URI itself, or in a file beside the scene. The account counts them.
 pub(super) fn read_uri(import: &mut Import, text: &Text, uri: &str) -> Attempt<Vec<u8>> {
     if let Some(data) = text.decoded(import, uri) {
         return data;
@@ -39,7 +39,7 @@ pub(super) fn read_uri(import: &mut Import, text: &Text, uri: &str) -> Attempt<V
     }
 }
 
-/// `%20` and the like resolved; `None` if malformed.
+/// Resolves `%20` and the like; `None` if malformed.
 fn percent_decoded(uri: &str) -> Option<String> {
     let mut bytes = Vec::with_capacity(uri.len());
     let mut rest = uri.as_bytes();

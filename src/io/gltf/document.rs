@@ -11,7 +11,7 @@ use std::borrow::Cow;
 use std::collections::BTreeSet;
 use std::io::BufReader;
 
-/// Required extensions that change nothing about shapes: they may be ignored.
+/// Required extensions that may be ignored, since they change no shapes.
 const HARMLESS_EXTENSIONS: [&str; 5] =
     ["KHR_materials_", "KHR_texture_", "EXT_texture_", "KHR_mesh_quantization", "KHR_xmp"];
 

@@ -1,4 +1,4 @@
-//! Materials with their images, and which texture stands for which page of the light map.
+//! Materials with their images, and the light map page of each texture.
 
 use super::Reader;
 use super::buffers::read_uri;
@@ -72,7 +72,7 @@ impl Reader<'_, '_> {
         Ok(id)
     }
 
-    /// Our texture for an image, read when first wanted.
+    /// The scene's texture for an image, which is read when it is first used.
     fn texture(&mut self, image: usize) -> Result<u32> {
         if let Some(id) = self.images.get(&image) {
             return Ok(*id);
@@ -86,7 +86,7 @@ impl Reader<'_, '_> {
         Ok(id)
     }
 
-    /// (From the JSON: the crate's view of images panics at those that are neither here nor there.)
+    /// (Read from the JSON: the crate's view of images panics at images without a URI and a buffer view.)
     fn image(&mut self, image: usize) -> Attempt<Texture> {
         let Some(json) = self.document.as_json().images.get(image) else {
             return Ok(Err("there is none of this number".into()));

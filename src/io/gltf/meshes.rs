@@ -79,7 +79,7 @@ impl Reader<'_, '_> {
         }
     }
 
-    /// Room for a value of each used vertex.
+    /// An empty list with capacity for a value of each used vertex.
     fn room<T>(&mut self, used: &[u32]) -> Result<Vec<T>> {
         self.import.account.list(used.len(), "the vertices")
     }
@@ -150,7 +150,7 @@ impl Reader<'_, '_> {
     }
 }
 
-/// How many triangles a list of vertices stands for (glTF 2.0, 3.7.2.1); `None` if it is too short.
+/// Number of triangles that a list of vertices makes (glTF 2.0, 3.7.2.1); `None` if it is too short.
 fn triangle_count(mode: Mode, corners: usize) -> Option<usize> {
     match mode {
         _ if corners < 3 => None,
@@ -159,7 +159,7 @@ fn triangle_count(mode: Mode, corners: usize) -> Option<usize> {
     }
 }
 
-/// The triangles themselves.
+/// Appends the triangles that a list of vertices makes.
 fn add_triangles(mode: Mode, corners: &[u32], triangles: &mut Vec<[u32; 3]>) {
     match mode {
         Mode::TriangleStrip => {

@@ -2,7 +2,7 @@
 //!
 //! - Albedo is `baseColorFactor` × `baseColorTexture` (metalness is ignored), emission is `emissiveFactor` ×
 //!   `KHR_materials_emissive_strength` without its texture, sidedness is `doubleSided`.
-//! - `alphaMode` `MASK` cuts holes, except into surfaces that emit; `BLEND` counts as opaque.
+//! - `alphaMode` `MASK` makes cut-outs, except in surfaces that emit; `BLEND` counts as opaque.
 //!   `KHR_materials_transmission`: its factor of `baseColorFactor` passes straight through, as through a thin
 //!   sheet; textures do not change that.
 //! - Images (PNG, JPEG) come from buffer views, data URIs and files beside or below the scene. All repeat, whatever
@@ -105,12 +105,12 @@ struct Reader<'i, 's> {
     buffers: &'i [Cow<'i, [u8]>],
     text: &'i Text<'i>,
     document: &'i gltf::Document,
-    /// Our material by theirs; `None` is glTF's default material. [`NONE`]: nothing can be seen of it.
+    /// The scene's material by the file's; `None` is glTF's default material. [`NONE`]: it is invisible.
     materials: HashMap<Option<usize>, u32>,
-    /// Our texture by their image; [`NONE`] if it cannot be read.
+    /// The scene's texture by the file's image; [`NONE`] if it cannot be read.
     images: HashMap<usize, u32>,
     pages: HashMap<usize, u32>,
-    /// How many nodes show each mesh.
+    /// Number of nodes that show each mesh.
     mesh_uses: Vec<u32>,
     /// Sparse accessors whose indices were found to increase.
     sorted: HashSet<usize>,
@@ -122,7 +122,7 @@ struct Reader<'i, 's> {
     /// Materials that are blended.
     blended: BTreeSet<usize>,
     skipped_primitives: u32,
-    /// Primitives that are holes all over.
+    /// Number of primitives that are cut out entirely.
     invisible_primitives: u32,
     /// The primitive at hand, for errors.
     place: String,

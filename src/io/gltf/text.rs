@@ -1,4 +1,4 @@
-//! The JSON of a file without its long data URIs, and what those hold.
+//! The JSON of a file without its long data URIs, and the data in these.
 
 use crate::error::Result;
 use crate::io::Import;
@@ -14,7 +14,7 @@ pub(super) struct Text<'b> {
     uris: Vec<Range<usize>>,
 }
 
-/// What stands for data URI 7: `data:#7`.
+/// Start of a replaced data URI; number 7 is `data:#7`.
 const REPLACED: &str = "data:#";
 
 /// Data URIs up to this length may stay.
@@ -59,7 +59,7 @@ impl<'b> Text<'b> {
         Ok(())
     }
 
-    /// What a data URI holds, without `data:`; `None` if it is none.
+    /// The text of a data URI behind `data:`; `None` if it is none.
     fn data<'t>(&'t self, uri: &'t str) -> Option<&'t [u8]> {
         let content = uri.strip_prefix("data:")?;
         let number = content.strip_prefix('#').and_then(|n| n.parse::<usize>().ok());

@@ -8,7 +8,7 @@
 //! - Normals and coordinates belong to whole meshes here and to single faces in the file: a new mesh
 //!   starts wherever faces with begin or end. So triangles keep their global order.
 //! - Images have v = 0 at their bottom and are turned over, for here it is row 0. Where one has alpha (that of
-//!   `map_d`, else that of `map_Kd`) below one half are holes, except in surfaces that emit.
+//!   `map_d`, else that of `map_Kd`) below one half are cut-outs, except in surfaces that emit.
 //! - Groups, smoothing and free forms are ignored, and points and lines too.
 //!
 //! Why not the crate `tobj` (which the tests compare with): it forgets the names of materials that no
@@ -44,9 +44,9 @@ pub(super) fn load(import: &mut Import, opened: Opened) -> Result<()> {
 /// A `usemtl` name.
 struct Name {
     text: Vec<u8>,
-    /// What its `vt` are.
+    /// Meaning of its `vt`.
     coordinates: Coordinates,
-    /// Faces that use it.
+    /// Number of faces that use it.
     faces: u64,
 }
 
@@ -57,7 +57,7 @@ enum Coordinates {
     Nothing,
 }
 
-/// What the faces of one mesh have in common.
+/// The properties that all faces of one mesh share.
 #[derive(Clone, Copy, Default, PartialEq)]
 struct Kind {
     lightmap: bool,
@@ -75,7 +75,7 @@ struct Reader<'a, 's> {
     uvs: Vec<Vec2>,
     normals: Vec<Vec3>,
     library: Library,
-    /// What `mtllib` lines have said: a file that names a library a thousand times reads it once.
+    /// Texts of `mtllib` lines so far: a library that is named a thousand times is read once.
     libraries: HashSet<String>,
     names: Vec<Name>,
     name_ids: HashMap<Vec<u8>, u32>,
@@ -168,7 +168,7 @@ impl<'a, 's> Reader<'a, 's> {
         }
     }
 
-    /// `N` numbers of which the first `required` must be there; the others are 0.
+    /// Reads `N` numbers, of which the first `required` must be present; the others are 0 without.
     fn numbers<const N: usize>(&self, keyword: &str, text: &[u8], required: usize) -> Result<[f32; N]> {
         let mut values = [0.0; N];
         let mut words = words(text);
@@ -402,7 +402,7 @@ fn base_name(name: &[u8]) -> &[u8] {
     &name[..name.iter().rposition(|c| *c == b'|').unwrap_or(name.len())]
 }
 
-/// What the `vt` of a material's faces are: `…|lmN` says light map page N, a negative N nothing.
+/// Meaning of the `vt` of a material's faces: with `…|lmN` coordinates on light map page N, with a negative N none.
 fn coordinates_of(name: &[u8]) -> std::result::Result<Coordinates, String> {
     let suffix: Range<usize> = (base_name(name).len() + 1).min(name.len())..name.len();
     match name[suffix].strip_prefix(b"lm").and_then(integer) {

@@ -1,5 +1,5 @@
 //! Material libraries of OBJ files: of each `newmtl`, `Kd` (diffuse reflectance, linear) with `map_Kd`, `Ke`
-//! (here: emitted radiance in W/(m²·sr)), `map_d` (where there are holes), and `Tf` (what passes through) if
+//! (here: emitted radiance in W/(m²·sr)), `map_d` (cut-outs), and `Tf` (transmission) if
 //! `illum` is one of the models with transparency, 4, 6, 7 and 9. Options of maps and everything else are
 //! skipped.
 
@@ -10,7 +10,7 @@ use std::collections::HashMap;
 use std::fmt::Display;
 use std::path::{Path, PathBuf};
 
-/// What a library says about a material.
+/// A material as a library describes it.
 #[derive(Clone, Debug, Default, PartialEq)]
 pub(super) struct Entry {
     /// `None` where there is no `Kd`, or one in a form that is not RGB.
@@ -32,7 +32,7 @@ pub(super) struct MapFile {
 }
 
 impl Entry {
-    /// What passes straight through.
+    /// Fraction of light that passes straight through.
     pub fn transmission(&self) -> [f32; 3] {
         if matches!(self.model, 4 | 6 | 7 | 9) { self.filter } else { [0.0; 3] }
     }
@@ -109,7 +109,7 @@ pub(super) fn split_keyword(line: &[u8]) -> (&[u8], &[u8]) {
     (&line[..end], line[end..].trim_ascii_start())
 }
 
-/// `r [g b]`; one number stands for all three. `None` for the `spectral` and `xyz` forms.
+/// Reads `r [g b]`; a single number is the value of all three. `None` for the forms `spectral` and `xyz`.
 fn color(text: &[u8]) -> std::result::Result<Option<[f32; 3]>, String> {
     if text.starts_with(b"spectral") || text.starts_with(b"xyz") {
         return Ok(None);
