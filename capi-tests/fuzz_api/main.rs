@@ -194,7 +194,7 @@ fn sequence(seed: u64, folder: &str) {
     world::SEED.store(seed, SeqCst);
     let mut s = Source::new(seed);
     let threads = if s.one_in(4) { 2 + s.below(3) } else { 1 };
-    let w = World::new(folder, threads == 1);
+    let w = World::new(folder, threads == 1, calls::any);
     calls::create_device(&w, &mut s);
     calls::create_scene(&w, &mut s);
     let calls = 100 + s.below(300);

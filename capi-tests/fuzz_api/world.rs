@@ -1,7 +1,6 @@
 //! What the calls of a sequence act on: handles that are alive as long as somebody uses them, callbacks that
 //! refuse, cancel and call back, and the checks that hold for every call.
 
-use crate::calls;
 use crate::source::Source;
 use bakelite::capi::device::*;
 use bakelite::capi::error::*;
@@ -289,11 +288,13 @@ pub struct World {
     pub folder: String,
     /// Whether only one thread makes calls: pointers into a scene may be followed then.
     pub is_alone: bool,
+    /// Makes any call, from within callbacks.
+    call: fn(&Arc<World>, &mut Source),
 }
 
 impl World {
-    pub fn new(folder: &str, is_alone: bool) -> Arc<World> {
-        Arc::new(World { handles: Default::default(), folder: folder.into(), is_alone })
+    pub fn new(folder: &str, is_alone: bool, call: fn(&Arc<World>, &mut Source)) -> Arc<World> {
+        Arc::new(World { handles: Default::default(), folder: folder.into(), is_alone, call })
     }
 
     pub fn add(&self, handle: Arc<Handle>) {
@@ -357,7 +358,7 @@ fn call_back(world: &Mutex<Option<Weak<World>>>, seed: u64) {
     let Some(world) = world else { return };
     DEPTH.set(DEPTH.get() + 1);
     for _ in 0..1 + s.below(3) {
-        calls::any(&world, &mut s);
+        (world.call)(&world, &mut s);
     }
     drop(world);
     DEPTH.set(DEPTH.get() - 1);

@@ -275,7 +275,7 @@ private:
         glfwGetFramebufferSize(window, &w, &h);
         if (w < 1 || h < 1 || (w == width && h == height)) return;
         width = w, height = h;
-        renderer.resize(w, h);
+        renderer.set_size(w, h);
     }
 
     // Pixels of a hidden window are nobody's, so headless pictures go to a texture.

@@ -112,7 +112,7 @@ Renderer::Renderer(const LiveLight &light, int width, int height, float exposure
     linear = gl::make_texture(GL_TEXTURE_2D, GL_NEAREST);
     depth = gl::make_texture(GL_TEXTURE_2D, GL_NEAREST);
     gl::GenFramebuffers(1, &framebuffer);
-    resize(width, height);
+    set_size(width, height);
 
     gl::PixelStorei(GL_UNPACK_ALIGNMENT, 1);
     gl::PixelStorei(GL_PACK_ALIGNMENT, 1);
@@ -159,7 +159,7 @@ void Renderer::load_triangles() {
     for (GLuint attribute = 0; attribute < 3; attribute++) gl::EnableVertexAttribArray(attribute);
 }
 
-void Renderer::resize(int new_width, int new_height) {
+void Renderer::set_size(int new_width, int new_height) {
     width = new_width, height = new_height;
     gl::bind_texture(LINEAR, GL_TEXTURE_2D, depth);
     gl::allocate(GL_TEXTURE_2D, GL_DEPTH_COMPONENT32F, width, height, 0, GL_DEPTH_COMPONENT, GL_FLOAT, nullptr);

@@ -23,7 +23,7 @@ public:
     std::vector<uint16_t> uploaded() const;
     // Into the framebuffer, which may be 0, the window's.
     void draw(const bk_camera &camera, const Look &look, GLuint framebuffer);
-    void resize(int width, int height);
+    void set_size(int width, int height);
     // Whether the last picture from which exposure was to be found had no light in it.
     bool shows_nothing() const { return is_dark; }
 

@@ -44,15 +44,15 @@ template <class F> void each_line(const std::string &text, F line) {
 }
 
 // The numbers at the beginning of a text.
-template <size_t N> std::array<float, N> numbers(const std::string &text) {
+template <size_t N> std::array<float, N> leading_numbers(const std::string &text) {
     std::array<float, N> values{};
     char *at = const_cast<char *>(text.c_str());
     for (float &value : values) value = std::strtof(at, &at);
     return values;
 }
 
-Vec3 vector(const std::string &text) {
-    const auto v = numbers<3>(text);
+Vec3 three_numbers(const std::string &text) {
+    const auto v = leading_numbers<3>(text);
     return {v[0], v[1], v[2]};
 }
 
@@ -62,9 +62,9 @@ std::map<std::string, Material> load_mtl(const std::string &path) {
     each_line(read_file(path), [&](const std::string &keyword, const std::string &rest) {
         if (keyword == "newmtl") current = &materials[rest];
         if (!current) return;
-        if (keyword == "Ke") current->emission = vector(rest);
+        if (keyword == "Ke") current->emission = three_numbers(rest);
         if (keyword == "Kd") {
-            current->albedo = vector(rest);
+            current->albedo = three_numbers(rest);
             // No surface reflects all light, and the library refuses such a one.
             for (int c = 0; c < 3; c++) current->albedo[c] = std::min(std::max(current->albedo[c], 0.0f), 0.98f);
         }
@@ -87,9 +87,9 @@ public:
 private:
     void statement(const std::string &keyword, const std::string &rest) {
         if (keyword == "v") {
-            positions.push_back(numbers<3>(rest));
+            positions.push_back(leading_numbers<3>(rest));
         } else if (keyword == "vt") {
-            uvs.push_back(numbers<2>(rest));
+            uvs.push_back(leading_numbers<2>(rest));
         } else if (keyword == "f") {
             face(rest);
         } else if (keyword == "usemtl") {
