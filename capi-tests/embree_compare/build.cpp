@@ -109,7 +109,7 @@ void grow(RTCBounds &b, const float p[3]) {
     b.lower_z = std::min(b.lower_z, p[2]), b.upper_z = std::max(b.upper_z, p[2]);
 }
 
-RTCBounds empty() {
+RTCBounds no_bounds() {
     RTCBounds b{};
     b.lower_x = b.lower_y = b.lower_z = INF;
     b.upper_x = b.upper_y = b.upper_z = -INF;
@@ -120,7 +120,7 @@ RTCBounds empty() {
 void split(const RTCBuildPrimitive *primitive, unsigned axis, float position, RTCBounds *left, RTCBounds *right,
            void *user) {
     const Scene &s = *static_cast<const Scene *>(user);
-    *left = *right = empty();
+    *left = *right = no_bounds();
     for (int c = 0; c < 3; c++) {
         const float *const a = s.vertex(primitive->geomID, primitive->primID, c);
         const float *const b = s.vertex(primitive->geomID, primitive->primID, (c + 1) % 3);
@@ -144,10 +144,10 @@ void split(const RTCBuildPrimitive *primitive, unsigned axis, float position, RT
 
 double embree_sah(const Scene &s, const Setup &setup, Mode mode) {
     std::vector<RTCBuildPrimitive> primitives;
-    RTCBounds bounds = empty();
+    RTCBounds bounds = no_bounds();
     for (uint32_t m = 0; m < s.meshes.size(); m++) {
         for (uint32_t t = 0; t < s.meshes[m].triangle_count; t++) {
-            RTCBounds box = empty();
+            RTCBounds box = no_bounds();
             for (int c = 0; c < 3; c++) grow(box, s.vertex(m, t, c));
             if (!std::isfinite(half_area(box))) continue;
             primitives.push_back({box.lower_x, box.lower_y, box.lower_z, m, box.upper_x, box.upper_y, box.upper_z, t});
