@@ -42,7 +42,7 @@ look() {
     echo "   baked: $out/$(basename "$picture")"
 }
 
-# What somebody types on a fresh Debian. Written down in docs/guide.md, Installation.
+# What somebody types on a fresh Debian: docs/install.md, "Packages".
 cat >"$out/commands.sh" <<'COMMANDS'
 set -eux
 dpkg -i /packages/*.deb

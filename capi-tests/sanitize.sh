@@ -41,7 +41,7 @@ run() {
 programs() {
     local library=$1 source name flags
     shift
-    for source in $(grep -l 'check\.h' capi-tests/*.c capi-tests/*.cpp | grep -v runtime.c); do
+    for source in $(grep -l 'check\.h' capi-tests/c/*.c capi-tests/c/*.cpp | grep -v runtime.c); do
         name=$(basename "$source")
         mkdir -p "$out/$name.out"
         flags=(-g -O1 -fno-omit-frame-pointer "$@" -I include)
@@ -84,7 +84,7 @@ rust() {
 memcheck() {
     echo '== A small pipeline under Valgrind'
     shared
-    "${CC:-cc}" -std=gnu99 -g -O1 -I include capi-tests/small_pipeline.c -o "$out/small_pipeline" \
+    "${CC:-cc}" -std=gnu99 -g -O1 -I include capi-tests/c/small_pipeline.c -o "$out/small_pipeline" \
         -L "$target/release" -lbakelite -lpthread -lm
     mkdir -p "$out/small_pipeline.out"
     run valgrind env LD_LIBRARY_PATH="$target/release" valgrind --error-exitcode=9 --leak-check=full \

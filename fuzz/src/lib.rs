@@ -1,4 +1,4 @@
-//! What the fuzz targets share. Its files are also those of `capi-tests/damaged_files.rs`, a short run with the stable
+//! What the fuzz targets share. Its files are also those of `capi-tests/rust/damaged_files.rs`, a short run with the stable
 //! toolchain.
 
 pub mod damaged_files;

@@ -1,6 +1,8 @@
 //! The shown light: indirect light of every gather texel, from its own rays or interpolated from those of a lower LOD,
 //! filled where the texel cannot be seen, blurred; and its composition with direct light when a page is read. The sums
 //! of the texels are not changed.
+//!
+//! The file is long because the shown light has one owner: indirect light, fades and direct light are written here alone.
 
 use super::blocks::{BLOCK_TEXELS, BlockMap, Blocks, DirectTile, Rect, TILE};
 use super::relight::Illumination;

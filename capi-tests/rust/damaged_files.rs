@@ -1,12 +1,12 @@
 //! Damaged files of every kind that is read: a short run of what `fuzz/` does for hours, the same each time.
 
-#[path = "../fuzz/src/damaged_files.rs"]
+#[path = "../../fuzz/src/damaged_files.rs"]
 mod damaged_files;
-#[path = "../fuzz/src/room.rs"]
+#[path = "../../fuzz/src/room.rs"]
 mod room;
-#[path = "../fuzz/src/saved.rs"]
+#[path = "../../fuzz/src/saved.rs"]
 mod saved;
-#[path = "../fuzz/src/seeds.rs"]
+#[path = "../../fuzz/src/seeds.rs"]
 mod seeds;
 
 use seeds::{TARGETS, seeds};

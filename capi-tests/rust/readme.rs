@@ -84,7 +84,7 @@ fn programs_shown_are_the_files_that_stand_beside_the_tests() {
     assert_eq!(rust.len(), 1);
     assert_eq!(rust[0].1, include_str!("example.rs"));
     let c = blocks(&read(Path::new("docs/guide.md")), "c");
-    assert_eq!(c.first().map(|b| b.1.as_str()), Some(include_str!("../examples/bake.c")));
+    assert_eq!(c.first().map(|b| b.1.as_str()), Some(include_str!("../../examples/bake.c")));
 }
 
 #[cfg(unix)]
@@ -208,7 +208,9 @@ fn comments_point_to_sections_that_documents_have() {
 fn paths(text: &str) -> impl Iterator<Item = &str> {
     let code = text.split('`').skip(1).step_by(2);
     code.filter(|c| {
-        ["src/", "capi-tests/", "benches/", "fuzz/", "cmake/", "include/", "docs/"].iter().any(|f| c.starts_with(f))
+        ["src/", "capi-tests/", "examples/", "benches/", "fuzz/", "cmake/", "include/", "docs/"]
+            .iter()
+            .any(|f| c.starts_with(f))
     })
     .filter(|c| c.chars().all(|c| c.is_alphanumeric() || "/._-".contains(c)))
 }

@@ -110,7 +110,7 @@ fn listed(function: &str) -> &'static [bk_result] {
     static LISTED: OnceLock<BTreeMap<&str, Vec<bk_result>>> = OnceLock::new();
     let all = LISTED.get_or_init(|| {
         let (mut all, mut codes) = (BTreeMap::new(), vec![BK_ERROR_INVALID_ARGUMENT]);
-        for line in include_str!("../../include/bakelite.h").lines() {
+        for line in include_str!("../../../include/bakelite.h").lines() {
             if let Some(text) = line.strip_prefix("/// @retval ") {
                 codes.extend((BK_ERROR_INTERNAL..BK_OK).find(|&code| {
                     // SAFETY: never NULL, and constant.

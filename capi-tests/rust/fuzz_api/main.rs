@@ -97,7 +97,7 @@ fn main() -> ExitCode {
 /// Functions of the header that the sequences never call.
 fn functions_without_calls() -> Vec<&'static str> {
     let calls = concat!(include_str!("calls.rs"), include_str!("world.rs"));
-    let declared = include_str!("../../include/bakelite.h").lines().filter(|l| !l.trim_start().starts_with("//"));
+    let declared = include_str!("../../../include/bakelite.h").lines().filter(|l| !l.trim_start().starts_with("//"));
     let names = declared.flat_map(|line| line.match_indices('(').map(|(at, _)| &line[..at])).filter_map(|before| {
         let start = before.rfind(|c: char| !c.is_ascii_alphanumeric() && c != '_').map_or(0, |i| i + 1);
         before[start..].starts_with("bk_").then_some(&before[start..])
