@@ -47,7 +47,8 @@ fn rays(c: &mut Criterion) {
         if isa == Isa::Portable {
             let corners: Vec<[Vec3; 3]> = (0..scene.triangle_count()).map(|t| scene.corners(t)).collect();
             let ids: Vec<u32> = (0..scene.triangle_count()).filter(|&t| scene.is_valid(t)).collect();
-            let tree = BinaryBvh::build(&corners, &ids, &BuildOptions::default(), &Progress::none()).expect("tree");
+            let tree = BinaryBvh::build(&|t| corners[t as usize], &ids, &BuildOptions::default(), &Progress::none())
+                .expect("tree");
             group.bench_function(BenchmarkId::new("closest", "binary baseline"), |b| {
                 b.iter(|| random.iter().filter(|r| !baseline::closest(&tree, &corners, r).is_miss()).count());
             });

@@ -148,6 +148,12 @@ pub fn try_zeroed<T: bytemuck::Zeroable>(len: usize, what: &str) -> Result<Vec<T
     Ok(v)
 }
 
+/// Makes a `Vec` of `len` zeros of which large parts may never be written: in small pages, as untouched ones then take no
+/// memory.
+pub fn try_zeroed_as_needed<T: bytemuck::Zeroable>(len: usize, what: &str) -> Result<Vec<T>> {
+    bytemuck::allocation::try_zeroed_vec(len).map_err(|_| too_large::<T>(len, what))
+}
+
 /// Copies a slice.
 pub fn try_to_vec<T: Clone>(values: &[T], what: &str) -> Result<Vec<T>> {
     let mut v = try_with_capacity(values.len(), what)?;

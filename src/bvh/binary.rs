@@ -1,11 +1,12 @@
 //! The binary tree, before it is collapsed to wide nodes.
 
 use crate::base::geometry::half_area;
+use bytemuck::Zeroable;
 use glam::Vec3;
 use rayon::prelude::*;
 
 /// A node of the binary tree, 32 bytes. The left child of an inner node follows it.
-#[derive(Clone, Copy, Debug, Default)]
+#[derive(Clone, Copy, Debug, Default, Zeroable)]
 #[repr(C)]
 pub struct BinaryNode {
     /// Lower corner of the node's box.
@@ -20,7 +21,7 @@ pub struct BinaryNode {
 
 /// The binary tree, before collapse.
 pub struct BinaryBvh {
-    /// Node 0 is the root. Slots of subtrees that ended early are unused.
+    /// Node 0 is the root. Slots of subtrees that ended early are unused and zero.
     pub nodes: Vec<BinaryNode>,
     /// Global triangle numbers, leaf by leaf.
     pub triangles: Vec<u32>,

@@ -2,117 +2,221 @@
 //! SAH-based Bounding Volume Hierarchies*, 2007), parallel and deterministic.
 //!
 //! A subtree over n triangles owns a fixed range of 2n − 1 node slots and of n triangle slots, so threads never share
-//! any of them. References move between two buffers by a stable partition, which several threads can carry out
-//! together; so the tree does not depend on their number.
+//! any of them; what one thread builds lies at the beginning of its range, so that slots that are not needed take no
+//! memory. References move in place. Their order depends on how ranges are cut into blocks; but bins, boxes and
+//! partings are the same in any order, and leaves are sorted, so the tree depends on the triangles alone.
 
 use super::BuildOptions;
 use super::binary::{BinaryBvh, BinaryNode};
-use super::bins::{BinMap, Bins, Split, bin_count, in_parallel};
+use super::bins::{BinMap, Bins, Side, Split, bin_count, in_parallel, on_heap};
 use super::layout::SAH_DEPTH;
 use super::partings::{best_parting, halve, leaf_cost, part_few};
-use super::references::{Box4, CHUNK, Extent, Range4, Reference, area_scale, references};
+use super::references::{Box4, Extent, Range4, Reference, area_scale, references};
 use crate::error::Result;
-use crate::memory::try_vec;
+use crate::memory::{try_zeroed, try_zeroed_as_needed};
 use crate::progress::Progress;
+#[cfg(target_arch = "x86_64")]
+use crate::simd::Isa;
 use glam::{Vec3, Vec4};
 use rayon::prelude::*;
 
 /// Subtrees of more triangles than this are built as separate tasks.
 pub(super) const PARALLEL_SUBTREE: usize = 4096;
 
-/// Copies `from` to `to`: first the references left of a split, `middle` in number, then the others, both in their old
-/// order. Returns the bounds of the centres of both sides.
-fn partition(from: &[Reference], to: &mut [Reference], middle: usize, map: &BinMap, split: &Split) -> [Range4; 2] {
-    let (left, right) = to.split_at_mut(middle);
-    if !in_parallel(from.len()) {
-        return partition_chunk(from, left, right, map, split);
+/// Number of references that are partitioned at a time, so that those in between stay in the cache.
+const BLOCK: usize = 1 << 10;
+
+/// Room for those references of a block that belong to the right.
+type Scratch = Box<[Reference; BLOCK]>;
+
+/// Moves the references left of a split, `middle` in number, before the others. Returns the bounds of the centres of
+/// both sides.
+fn partition(refs: &mut [Reference], middle: usize, map: &BinMap, split: &Split, scratch: &mut Scratch) -> [Range4; 2] {
+    let join = |[a, b]: [Range4; 2], [c, d]: [Range4; 2]| [a.join(c), b.join(d)];
+    if refs.len() <= BLOCK {
+        return partition_block(refs, map, split, scratch).1;
     }
-    let side = map.side(split);
-    let counts: Vec<usize> =
-        from.par_chunks(CHUNK).map(|chunk| chunk.iter().filter(|r| side.is_left(r)).count()).collect();
-    let (mut left, mut right) = (left, right);
-    let mut parts = Vec::with_capacity(counts.len());
-    for (chunk, &n) in from.chunks(CHUNK).zip(&counts) {
-        let (l, rest) = std::mem::take(&mut left).split_at_mut(n);
-        left = rest;
-        let (r, rest) = std::mem::take(&mut right).split_at_mut(chunk.len() - n);
-        right = rest;
-        parts.push((chunk, l, r));
-    }
-    parts
-        .into_par_iter()
-        .map(|(chunk, l, r)| partition_chunk(chunk, l, r, map, split))
-        .reduce(|| [Range4::EMPTY; 2], |[a, b], [c, d]| [a.join(c), b.join(d)])
+    // First within blocks, then between them.
+    let (counts, ranges): (Vec<usize>, Vec<[Range4; 2]>) = if in_parallel(refs.len()) {
+        let blocks = refs.par_chunks_mut(BLOCK).with_min_len(BLOCKS_PER_THREAD);
+        let new_scratch = || on_heap(Reference::default());
+        blocks.map_init(new_scratch, |scratch, block| partition_block(block, map, split, scratch)).unzip()
+    } else {
+        refs.chunks_mut(BLOCK).map(|block| partition_block(block, map, split, scratch)).unzip()
+    };
+    swap_misplaced(refs, middle, &counts);
+    ranges.into_iter().fold([Range4::EMPTY; 2], join)
 }
 
-fn partition_chunk(
-    from: &[Reference],
-    left: &mut [Reference],
-    right: &mut [Reference],
-    map: &BinMap,
-    split: &Split,
-) -> [Range4; 2] {
+/// Number of blocks that a thread takes at a time.
+const BLOCKS_PER_THREAD: usize = 8;
+
+/// Swaps the right references below `middle` with the left ones above, given the number of left ones in each block,
+/// which come first in it. There are equally many.
+fn swap_misplaced(refs: &mut [Reference], middle: usize, counts: &[usize]) {
+    let parallel = in_parallel(refs.len());
+    let (low, high) = refs.split_at_mut(middle);
+    let (mut low, mut high) = (Runs::new(low, 0), Runs::new(high, middle));
+    let mut pairs = Vec::new();
+    let (mut rights, mut lefts) = (Default::default(), Default::default());
+    let mut from_low = counts.iter().enumerate().map(|(i, &n)| i * BLOCK + n..(i + 1) * BLOCK);
+    let mut from_high = counts.iter().enumerate().map(|(i, &n)| i * BLOCK..i * BLOCK + n);
+    loop {
+        let (Some(a), Some(b)) = (low.next(&mut rights, &mut from_low), high.next(&mut lefts, &mut from_high)) else {
+            break;
+        };
+        let n = a.len().min(b.len());
+        let ((a, rest_a), (b, rest_b)) = (a.split_at_mut(n), b.split_at_mut(n));
+        (rights, lefts) = (rest_a, rest_b);
+        if parallel { pairs.push((a, b)) } else { a.swap_with_slice(b) }
+    }
+    pairs.into_par_iter().with_min_len(BLOCKS_PER_THREAD).for_each(|(a, b)| a.swap_with_slice(b));
+}
+
+/// What is left of one side of a range, whose misplaced runs are taken off in order.
+struct Runs<'a> {
+    rest: &'a mut [Reference],
+    /// Place of the first of `rest` in the range.
+    start: usize,
+}
+
+impl<'a> Runs<'a> {
+    fn new(rest: &'a mut [Reference], start: usize) -> Self {
+        Runs { rest, start }
+    }
+
+    /// Returns `current`, or the next run of `places` that lies on this side if there is nothing left of it.
+    fn next(
+        &mut self,
+        current: &mut &'a mut [Reference],
+        places: &mut impl Iterator<Item = std::ops::Range<usize>>,
+    ) -> Option<&'a mut [Reference]> {
+        while current.is_empty() {
+            let end = self.start + self.rest.len();
+            let place = places.next()?;
+            let place = place.start.clamp(self.start, end)..place.end.clamp(self.start, end);
+            let (run, rest) = std::mem::take(&mut self.rest)[place.start - self.start..].split_at_mut(place.len());
+            (*current, self.rest, self.start) = (run, rest, place.end);
+        }
+        Some(std::mem::take(current))
+    }
+}
+
+/// Moves the left references of a block before the others, both in their old order. Returns their number, and the
+/// bounds of the centres of both sides.
+fn partition_block(refs: &mut [Reference], map: &BinMap, split: &Split, scratch: &mut Scratch) -> (usize, [Range4; 2]) {
     let side = map.side(split);
+    #[cfg(target_arch = "x86_64")]
+    if Isa::Avx2.is_available() {
+        // SAFETY: the CPU has AVX2.
+        return unsafe { partition_block_avx2(refs, &side, scratch) };
+    }
     let [mut low, mut high] = [Range4::EMPTY; 2];
-    let (mut l, mut r, mut i) = (0, 0, 0);
+    let (mut l, mut r) = (0, 0);
     // Without branches on the side: every reference is written to both sides, and the wrong copy is overwritten by the
     // next.
-    while l < left.len() && r < right.len() {
-        let reference = &from[i];
-        let mask = Vec4::splat(side.bin(reference)).cmplt(Vec4::splat(side.first_right));
-        let is_left = (mask.bitmask() & 1) as usize;
-        left[l] = *reference;
-        right[r] = *reference;
-        l += is_left;
-        r += 1 - is_left;
-        i += 1;
-        let c = reference.centre();
-        low.lower = low.lower.min(Vec4::select(mask, c, Vec4::INFINITY));
-        low.upper = low.upper.max(Vec4::select(mask, c, Vec4::NEG_INFINITY));
-        high.lower = high.lower.min(Vec4::select(mask, Vec4::INFINITY, c));
-        high.upper = high.upper.max(Vec4::select(mask, Vec4::NEG_INFINITY, c));
+    for i in 0..refs.len().min(BLOCK) {
+        let reference = refs[i];
+        let is_left = side.is_left(&reference);
+        refs[l] = reference;
+        scratch[r] = reference;
+        l += usize::from(is_left);
+        r += usize::from(!is_left);
+        if is_left { low.grow(reference.centre()) } else { high.grow(reference.centre()) }
     }
-    let rest = &from[i..];
-    let (to, range) = if l < left.len() { (&mut left[l..], &mut low) } else { (&mut right[r..], &mut high) };
-    to.copy_from_slice(rest);
-    rest.iter().for_each(|r| range.grow(r.centre()));
-    [low, high]
+    refs[l..].copy_from_slice(&scratch[..r]);
+    (l, [low, high])
 }
 
-/// The slots of a subtree.
+/// The same with each reference in one register.
+#[cfg(target_arch = "x86_64")]
+#[target_feature(enable = "avx2")]
+fn partition_block_avx2(refs: &mut [Reference], side: &Side, scratch: &mut Scratch) -> (usize, [Range4; 2]) {
+    use std::arch::x86_64::*;
+    let n = refs.len().min(BLOCK);
+    let (from, to) = (refs.as_mut_ptr().cast::<f32>(), scratch.as_mut_ptr().cast::<f32>());
+    let axis = _mm256_set1_epi32(side.axis as i32);
+    let [origin, scale, first_right] = [side.origin, side.scale, side.first_right].map(|x| _mm256_set1_ps(x));
+    let nothing = _mm256_set1_ps(f32::NEG_INFINITY);
+    // Greatest centre and greatest negated centre of either side.
+    let [mut low, mut high] = [nothing; 2];
+    let mut l = 0;
+    for i in 0..n {
+        // SAFETY: i < n. References are eight floats, aligned for this.
+        let r = unsafe { _mm256_load_ps(from.add(8 * i)) };
+        // The centre, then the same negated.
+        let c = _mm256_sub_ps(_mm256_permute2f128_ps::<1>(r, r), r);
+        let on_axis = _mm256_permutevar8x32_ps(c, axis);
+        let bin = _mm256_mul_ps(_mm256_sub_ps(on_axis, origin), scale);
+        let left = _mm256_cmp_ps::<_CMP_LT_OQ>(bin, first_right);
+        // SAFETY: l ≤ i and i − l ≤ i. Nothing is overwritten before it is read.
+        unsafe {
+            _mm256_store_ps(from.add(8 * l), r);
+            _mm256_store_ps(to.add(8 * (i - l)), r);
+        }
+        l += (_mm256_movemask_ps(left) & 1) as usize;
+        low = _mm256_max_ps(low, _mm256_blendv_ps(nothing, c, left));
+        high = _mm256_max_ps(high, _mm256_blendv_ps(c, nothing, left));
+    }
+    refs[l..n].copy_from_slice(&scratch[..n - l]);
+    let range = |m: __m256| {
+        let [upper, neg_lower] = [_mm256_castps256_ps128(m), _mm256_extractf128_ps::<1>(m)].map(Vec4::from);
+        Range4 { lower: -neg_lower, upper }
+    };
+    (l, [range(low), range(high)])
+}
+
+/// The slots of a subtree over n triangles, or of some that one thread builds one after the other.
 struct Slots<'a> {
-    /// 2n − 1 nodes, the first of which has index `base`.
+    /// 2n − 1 nodes, the first of which has index `base`, and the number of those in use.
     nodes: &'a mut [BinaryNode],
     base: u32,
-    /// n triangles, the first of which has index `first`.
+    used: usize,
+    /// n triangles, the first of which has index `first`, and the number of those in leaves.
     triangles: &'a mut [u32],
     first: u32,
+    filled: usize,
 }
 
 impl<'a> Slots<'a> {
-    /// Divides the slots among a node and its children, the left one over `n` triangles.
-    fn split(self, n: usize) -> (&'a mut BinaryNode, Slots<'a>, Slots<'a>) {
-        let (node, rest) = self.nodes.split_first_mut().expect("a subtree has a node");
-        let (left, right) = rest.split_at_mut(2 * n - 1);
+    /// Divides slots of which only the first node is in use among its children, the left one over `n` triangles.
+    fn split(&mut self, n: usize) -> [Slots<'_>; 2] {
+        let (left, right) = self.nodes[1..].split_at_mut(2 * n - 1);
         let (left_triangles, right_triangles) = self.triangles.split_at_mut(n);
-        (
-            node,
-            Slots { nodes: left, base: self.base + 1, triangles: left_triangles, first: self.first },
-            Slots {
-                nodes: right,
-                base: self.base + 2 * n as u32,
-                triangles: right_triangles,
-                first: self.first + n as u32,
-            },
-        )
+        let slots = |nodes, base, triangles, first| Slots { nodes, base, used: 0, triangles, first, filled: 0 };
+        [
+            slots(left, self.base + 1, left_triangles, self.first),
+            slots(right, self.base + 2 * n as u32, right_triangles, self.first + n as u32),
+        ]
     }
 
-    fn leaf(self, refs: &[Reference], bounds: &Box4) {
+    /// Adds a node and returns its place.
+    fn node(&mut self, bounds: &Box4, index: u32, count: u32) -> usize {
         let (lower, upper) = bounds.corners();
-        self.nodes[0] = BinaryNode { lower, upper, index: self.first, count: refs.len() as u32 };
-        for (t, r) in self.triangles.iter_mut().zip(refs) {
+        self.nodes[self.used] = BinaryNode { lower, upper, index, count };
+        self.used += 1;
+        self.used - 1
+    }
+
+    fn leaf(&mut self, refs: &mut [Reference], bounds: &Box4) {
+        sort_few(refs);
+        self.node(bounds, self.first + self.filled as u32, refs.len() as u32);
+        for (t, r) in self.triangles[self.filled..].iter_mut().zip(refs.iter()) {
             *t = r.id();
         }
+        self.filled += refs.len();
+    }
+}
+
+/// Buffers of a task.
+struct Work {
+    bins: Bins,
+    scratch: Scratch,
+}
+
+impl Work {
+    fn new() -> Work {
+        Work { bins: Bins::new(), scratch: on_heap(Reference::default()) }
     }
 }
 
@@ -122,36 +226,28 @@ struct Builder<'a, 'p> {
 }
 
 impl Builder<'_, '_> {
-    /// Builds the subtree over `refs`; `other` is a buffer of the same length.
-    fn build(
-        &self,
-        refs: &mut [Reference],
-        other: &mut [Reference],
-        slots: Slots,
-        extent: Extent,
-        depth: usize,
-        bins: &mut Bins,
-    ) {
+    /// Builds the subtree over `refs`.
+    fn build(&self, refs: &mut [Reference], slots: &mut Slots, extent: Extent, depth: usize, work: &mut Work) {
         let n = refs.len();
         if n == 1 {
             return slots.leaf(refs, &extent.boxes);
         }
         let may_be_leaf = n <= self.options.max_leaf as usize;
         if n <= 4 && depth < SAH_DEPTH {
-            return self.few(refs, other, slots, extent, depth, bins);
+            return self.few(refs, slots, extent, depth, work);
         }
         if depth < SAH_DEPTH {
             let scale = area_scale(&extent.boxes);
             let map = BinMap::new(&extent.centres, bin_count(self.options.bins as usize, n));
-            bins.fill(refs, &map);
-            if let Some(split) = bins.best_split(&map, scale) {
+            work.bins.fill(refs, &map);
+            if let Some(split) = work.bins.best_split(&map, scale) {
                 if may_be_leaf && leaf_cost(&extent.boxes, scale, n) <= split.cost {
                     return slots.leaf(refs, &extent.boxes);
                 }
-                let (middle, boxes) = bins.sides(&map, &split);
-                let centres = partition(refs, other, middle, &map, &split);
-                let [left, right] = [0, 1].map(|i| Extent { boxes: boxes[i], centres: centres[i] });
-                return self.children(other, refs, slots, extent, [left, right], middle, depth, bins);
+                let (middle, boxes) = work.bins.sides(&map, &split);
+                let centres = partition(refs, middle, &map, &split, &mut work.scratch);
+                let extents = [0, 1].map(|i| Extent { boxes: boxes[i], centres: centres[i] });
+                return self.children(refs, slots, extent, extents, middle, depth, work);
             }
         }
         if may_be_leaf {
@@ -160,19 +256,12 @@ impl Builder<'_, '_> {
         // All centres are equal, or the node is too deep.
         let middle = halve(refs, &extent);
         let extents = [Extent::of(&refs[..middle]), Extent::of(&refs[middle..])];
-        self.children(refs, other, slots, extent, extents, middle, depth, bins);
+        self.children(refs, slots, extent, extents, middle, depth, work);
     }
 
     /// Builds the subtree over two to four triangles by trying every partition.
-    fn few(
-        &self,
-        refs: &mut [Reference],
-        other: &mut [Reference],
-        slots: Slots,
-        extent: Extent,
-        depth: usize,
-        bins: &mut Bins,
-    ) {
+    fn few(&self, refs: &mut [Reference], slots: &mut Slots, extent: Extent, depth: usize, work: &mut Work) {
+        sort_few(refs);
         let scale = area_scale(&extent.boxes);
         let (cost, parting) = best_parting(refs, scale);
         if refs.len() <= self.options.max_leaf as usize && leaf_cost(&extent.boxes, scale, refs.len()) <= cost {
@@ -184,54 +273,63 @@ impl Builder<'_, '_> {
             let boxes = refs.iter().fold(Box4::EMPTY, |b, r| b.join(r.0));
             Extent { boxes, centres: extent.centres }
         });
-        self.children(refs, other, slots, extent, extents, middle, depth, bins);
+        self.children(refs, slots, extent, extents, middle, depth, work);
     }
 
     /// Builds an inner node and its children, over the first `middle` of `refs` and the others.
     fn children(
         &self,
         refs: &mut [Reference],
-        other: &mut [Reference],
-        slots: Slots,
+        slots: &mut Slots,
         extent: Extent,
         [left_extent, right_extent]: [Extent; 2],
         middle: usize,
         depth: usize,
-        bins: &mut Bins,
+        work: &mut Work,
     ) {
         let parallel = refs.len() > PARALLEL_SUBTREE;
         let (left_refs, right_refs) = refs.split_at_mut(middle);
-        let (left_other, right_other) = other.split_at_mut(middle);
-        let (node, left, right) = slots.split(middle);
-        let (lower, upper) = extent.boxes.corners();
-        *node = BinaryNode { lower, upper, index: right.base, count: 0 };
+        let node = slots.node(&extent.boxes, 0, 0);
         if !parallel {
-            self.build(left_refs, left_other, left, left_extent, depth + 1, bins);
-            self.build(right_refs, right_other, right, right_extent, depth + 1, bins);
+            self.build(left_refs, slots, left_extent, depth + 1, work);
+            slots.nodes[node].index = slots.base + slots.used as u32;
+            self.build(right_refs, slots, right_extent, depth + 1, work);
         } else if !self.progress.is_cancelled() {
+            slots.nodes[node].index = slots.base + 2 * middle as u32;
+            let [mut left, mut right] = slots.split(middle);
             rayon::join(
-                || self.build(left_refs, left_other, left, left_extent, depth + 1, bins),
-                || self.build(right_refs, right_other, right, right_extent, depth + 1, &mut Bins::new()),
+                || self.build(left_refs, &mut left, left_extent, depth + 1, work),
+                || self.build(right_refs, &mut right, right_extent, depth + 1, &mut Work::new()),
             );
         }
     }
 }
 
+/// Sorts the references of a leaf, or so few, by number: no result depends on the order in which they come.
+fn sort_few(refs: &mut [Reference]) {
+    for end in 1..refs.len() {
+        let mut i = end;
+        while i > 0 && refs[i - 1].id() > refs[i].id() {
+            refs.swap(i - 1, i);
+            i -= 1;
+        }
+    }
+}
+
 impl BinaryBvh {
-    /// Builds the tree over the triangles `valid` of `corners`, on the current rayon pool.
+    /// Builds the tree over the triangles `valid` with the `corners`, on the current rayon pool.
     pub fn build(
-        corners: &[[Vec3; 3]],
+        corners: &(impl Fn(u32) -> [Vec3; 3] + Sync),
         valid: &[u32],
         options: &BuildOptions,
         progress: &Progress,
     ) -> Result<BinaryBvh> {
         let n = valid.len();
         let (mut refs, extent) = references(corners, valid)?;
-        let mut other = try_vec::<Reference>(n, "references to triangles")?;
-        let mut nodes = try_vec::<BinaryNode>(2 * n - 1, "the binary tree")?;
-        let mut triangles = try_vec::<u32>(n, "the binary tree")?;
-        let slots = Slots { nodes: &mut nodes, base: 0, triangles: &mut triangles, first: 0 };
-        Builder { options, progress }.build(&mut refs, &mut other, slots, extent, 0, &mut Bins::new());
+        let mut nodes = try_zeroed_as_needed::<BinaryNode>(2 * n - 1, "the binary tree")?;
+        let mut triangles = try_zeroed::<u32>(n, "the binary tree")?;
+        let mut slots = Slots { nodes: &mut nodes, base: 0, used: 0, triangles: &mut triangles, first: 0, filled: 0 };
+        Builder { options, progress }.build(&mut refs, &mut slots, extent, 0, &mut Work::new());
         progress.check()?;
         Ok(BinaryBvh { nodes, triangles })
     }
@@ -251,7 +349,7 @@ pub(super) mod tests {
 
     fn build(corners: &[[Vec3; 3]], options: BuildOptions) -> BinaryBvh {
         let ids: Vec<u32> = (0..corners.len() as u32).collect();
-        BinaryBvh::build(corners, &ids, &options, &Progress::none()).unwrap()
+        BinaryBvh::build(&|t| corners[t as usize], &ids, &options, &Progress::none()).unwrap()
     }
 
     /// Every triangle once, in a leaf of allowed size, inside all boxes above it; returns the depth.

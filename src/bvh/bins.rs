@@ -26,7 +26,9 @@ pub(super) struct BinMap {
 }
 
 impl BinMap {
+    /// `centres` must hold the centres of all references.
     pub(super) fn new(centres: &Range4, bins: usize) -> Self {
+        assert!((1..=MAX_BINS).contains(&bins));
         let extent = centres.upper - centres.lower;
         let scale = Vec4::splat(bins as f32) / extent;
         let ok = extent.cmpgt(Vec4::ZERO) & scale.cmplt(Vec4::INFINITY);
@@ -34,28 +36,21 @@ impl BinMap {
         BinMap { origin: centres.lower, scale, last: Vec4::splat(bins as f32 - 1.0), bins }
     }
 
-    /// Bins of a reference as floats: any monotonic rounding will do, so it rounds to nearest, which is one addition.
-    #[inline(always)]
-    pub(super) fn bin(&self, r: &Reference) -> Vec4 {
-        let b = (r.centre() - self.origin) * self.scale - Vec4::splat(0.5);
-        b.max(Vec4::ZERO).min(self.last) + Vec4::splat(8_388_608.0)
-    }
-
     pub(super) fn side(&self, split: &Split) -> Side {
         let axis = split.axis;
-        let first_right = split.bin as f32 + 8_388_608.0;
-        Side { axis, origin: self.origin[axis], scale: self.scale[axis], first_right }
+        Side { axis, origin: self.origin[axis], scale: self.scale[axis], first_right: split.bin as f32 }
     }
 
-    /// Bins of a reference as integers.
+    /// Bins of a reference.
     #[inline(always)]
     pub(super) fn indices(&self, r: &Reference) -> [usize; 3] {
-        let b = self.bin(r);
-        [b.x, b.y, b.z].map(|b| (b.to_bits() & 0xff) as usize)
+        let b = ((r.centre() - self.origin) * self.scale).min(self.last);
+        [b.x, b.y, b.z].map(|b| b as usize)
     }
 }
 
-/// Determines the sides of a split by the same arithmetic as [`BinMap::bin`].
+/// Determines the sides of a split by the same arithmetic as [`BinMap::indices`]: what is less than a whole number is so
+/// rounded down, too, and the last bin is never on the left.
 pub(super) struct Side {
     pub(super) axis: usize,
     pub(super) origin: f32,
@@ -65,14 +60,9 @@ pub(super) struct Side {
 
 impl Side {
     #[inline(always)]
-    pub(super) fn bin(&self, r: &Reference) -> f32 {
-        let c = r.0.upper[self.axis] - r.0.neg_lower[self.axis];
-        (c - self.origin) * self.scale - 0.5 + 8_388_608.0
-    }
-
-    #[inline(always)]
     pub(super) fn is_left(&self, r: &Reference) -> bool {
-        self.bin(r) < self.first_right
+        let c = r.0.upper[self.axis] - r.0.neg_lower[self.axis];
+        (c - self.origin) * self.scale < self.first_right
     }
 }
 
@@ -131,7 +121,7 @@ pub(super) struct Bins {
     right: Box<[Vec4; MAX_BINS]>,
     /// Affects only how minima and maxima are computed, which have the same bits either way.
     #[cfg(target_arch = "x86_64")]
-    has_avx: bool,
+    has_avx2: bool,
 }
 
 impl Bins {
@@ -140,7 +130,7 @@ impl Bins {
             bins: on_heap(Bin::EMPTY),
             right: on_heap(Vec4::ZERO),
             #[cfg(target_arch = "x86_64")]
-            has_avx: Isa::Avx2.is_available(),
+            has_avx2: Isa::Avx2.is_available(),
         }
     }
 
@@ -167,9 +157,9 @@ impl Bins {
 
     fn add(&mut self, refs: &[Reference], map: &BinMap) {
         #[cfg(target_arch = "x86_64")]
-        if self.has_avx {
-            // SAFETY: the CPU has AVX2, and with it AVX.
-            return unsafe { self.add_avx(refs, map) };
+        if self.has_avx2 {
+            // SAFETY: the CPU has AVX2.
+            return unsafe { self.add_avx2(refs, map) };
         }
         for r in refs {
             for (axis, b) in map.indices(r).into_iter().enumerate() {
@@ -180,21 +170,33 @@ impl Bins {
         }
     }
 
-    /// Adds references with boxes in one register each. (Even and odd references into two sets of bins, so that they do
-    /// not wait for each other's stores: 0 to 3 %, not kept.)
+    /// Adds references with boxes in one register each, and bins as offsets in bytes. (Even and odd references into two
+    /// sets of bins, so that they do not wait for each other's stores: 0 to 3 %, not kept.)
     #[cfg(target_arch = "x86_64")]
-    #[target_feature(enable = "avx")]
-    fn add_avx(&mut self, refs: &[Reference], map: &BinMap) {
-        use std::arch::x86_64::{_mm256_load_ps, _mm256_max_ps, _mm256_store_ps};
+    #[target_feature(enable = "avx2")]
+    fn add_avx2(&mut self, refs: &[Reference], map: &BinMap) {
+        use std::arch::x86_64::*;
+        const SHIFT: i32 = size_of::<Bin>().trailing_zeros() as i32;
+        const { assert!(size_of::<Bin>() == 1 << SHIFT) };
+        let [origin, scale, last] = [map.origin, map.scale, map.last].map(__m128::from);
+        let bins = self.bins.as_mut_ptr();
         for r in refs {
             // SAFETY: a box is eight floats, aligned for this.
             let new = unsafe { _mm256_load_ps((&raw const r.0).cast()) };
-            for (axis, b) in map.indices(r).into_iter().enumerate() {
-                let bin = &mut self.bins[b];
-                let p = (&raw mut bin.boxes[axis]).cast();
-                // SAFETY: as above.
-                unsafe { _mm256_store_ps(p, _mm256_max_ps(_mm256_load_ps(p), new)) };
-                bin.counts[axis] += 1;
+            let centre = _mm_sub_ps(_mm256_extractf128_ps::<1>(new), _mm256_castps256_ps128(new));
+            let b = _mm_mul_ps(_mm_sub_ps(centre, origin), scale);
+            let b = _mm_min_ps(_mm_max_ps(b, _mm_setzero_ps()), last);
+            let b = _mm_slli_epi32::<SHIFT>(_mm_cvttps_epi32(b));
+            let offsets = [_mm_extract_epi32::<0>(b), _mm_extract_epi32::<1>(b), _mm_extract_epi32::<2>(b)];
+            for (axis, offset) in offsets.into_iter().enumerate() {
+                // SAFETY: 0 ≤ bin ≤ `last`, whatever the reference; a map has at most as many bins as there are here. Boxes
+                // are aligned as above.
+                unsafe {
+                    let bin = bins.byte_add(offset as u32 as usize);
+                    let p = (&raw mut (*bin).boxes[axis]).cast();
+                    _mm256_store_ps(p, _mm256_max_ps(_mm256_load_ps(p), new));
+                    (*bin).counts[axis] += 1;
+                }
             }
         }
     }
@@ -202,16 +204,43 @@ impl Bins {
     /// The best split with triangles on both sides. `scale` keeps f32 areas from over- and
     /// underflow.
     pub(super) fn best_split(&mut self, map: &BinMap, scale: f32) -> Option<Split> {
+        #[cfg(target_arch = "x86_64")]
+        if self.has_avx2 {
+            // SAFETY: the CPU has AVX2.
+            return unsafe { self.best_split_avx2(map, scale) };
+        }
+        self.sweep(map, scale, Bin::add)
+    }
+
+    #[cfg(target_arch = "x86_64")]
+    #[target_feature(enable = "avx2")]
+    fn best_split_avx2(&mut self, map: &BinMap, scale: f32) -> Option<Split> {
+        use std::arch::x86_64::{_mm256_load_ps, _mm256_max_ps, _mm256_store_ps};
+        self.sweep(map, scale, |sum, bin| {
+            for axis in 0..3 {
+                let (p, q) = ((&raw mut sum.boxes[axis]).cast(), (&raw const bin.boxes[axis]).cast());
+                // SAFETY: a box is eight floats, aligned for this.
+                unsafe { _mm256_store_ps(p, _mm256_max_ps(_mm256_load_ps(p), _mm256_load_ps(q))) };
+            }
+            for axis in 0..4 {
+                sum.counts[axis] += bin.counts[axis];
+            }
+        })
+    }
+
+    /// The best split, given how a bin is added to a sum.
+    #[inline(always)]
+    fn sweep(&mut self, map: &BinMap, scale: f32, add: impl Fn(&mut Bin, &Bin)) -> Option<Split> {
         let scale = Vec4::splat(scale);
         let mut sum = Bin::EMPTY;
         for i in (1..map.bins).rev() {
-            sum.add(&self.bins[i]);
+            add(&mut sum, &self.bins[i]);
             self.right[i] = sum.cost(scale);
         }
         let mut sum = Bin::EMPTY;
         let (mut best, mut best_bin) = (Vec4::INFINITY, Vec4::ZERO);
         for i in 1..map.bins {
-            sum.add(&self.bins[i - 1]);
+            add(&mut sum, &self.bins[i - 1]);
             let cost = sum.cost(scale) + self.right[i];
             let better = cost.cmplt(best);
             best = Vec4::select(better, cost, best);

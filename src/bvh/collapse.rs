@@ -105,7 +105,11 @@ pub(super) fn collapse_compact(binary: &BinaryBvh, meshes: &[u32], progress: &Pr
 }
 
 /// Collapses a binary tree to an 8-wide one.
-pub(super) fn collapse(binary: &BinaryBvh, corners: &[[Vec3; 3]], progress: &Progress) -> Result<Mbvh> {
+pub(super) fn collapse(
+    binary: &BinaryBvh,
+    corners: &(impl Fn(u32) -> [Vec3; 3] + Sync),
+    progress: &Progress,
+) -> Result<Mbvh> {
     let n = binary.triangles.len();
     let root = &binary.nodes[0];
     // Choosing the binary nodes that become children is quick; filling in nodes and leaves takes the time.
@@ -184,10 +188,10 @@ fn open(binary: &BinaryBvh, source: u32) -> ([u32; WIDTH], usize) {
     (children, count)
 }
 
-fn fill_leaf(leaf: &mut [f32], triangles: &[u32], corners: &[[Vec3; 3]]) {
+fn fill_leaf(leaf: &mut [f32], triangles: &[u32], corners: &impl Fn(u32) -> [Vec3; 3]) {
     let count = triangles.len();
     for (i, &t) in triangles.iter().enumerate() {
-        for (corner, v) in corners[t as usize].iter().enumerate() {
+        for (corner, v) in corners(t).iter().enumerate() {
             for axis in 0..3 {
                 leaf[(3 * corner + axis) * count + i] = v[axis];
             }
@@ -211,11 +215,12 @@ mod tests {
                 .collect();
             let ids: Vec<u32> = (0..n as u32).collect();
             let options = BuildOptions { max_leaf, ..Default::default() };
+            let of = |t: u32| corners[t as usize];
             for binary in [
-                BinaryBvh::build(&corners, &ids, &options, &Progress::none()).unwrap(),
-                BinaryBvh::build_spatial(&corners, &ids, &options, &Progress::none()).unwrap(),
+                BinaryBvh::build(&of, &ids, &options, &Progress::none()).unwrap(),
+                BinaryBvh::build_spatial(&of, &ids, &options, &Progress::none()).unwrap(),
             ] {
-                let tree = collapse(&binary, &corners, &Progress::none()).unwrap();
+                let tree = collapse(&binary, &of, &Progress::none()).unwrap();
                 let mut seen = vec![0; n];
                 for node in &tree.nodes {
                     for (i, child) in node.children.iter().enumerate() {

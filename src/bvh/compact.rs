@@ -361,10 +361,10 @@ mod tests {
     fn trees(corners: &[[Vec3; 3]], max_leaf: u32, split: bool) -> (Mbvh, Compact) {
         let n = corners.len() as u32;
         let (ids, options) = ((0..n).collect::<Vec<u32>>(), BuildOptions { max_leaf, ..Default::default() });
+        let (none, of) = (Progress::none(), |t: u32| corners[t as usize]);
         let build = if split { BinaryBvh::build_spatial } else { BinaryBvh::build };
-        let binary = build(corners, &ids, &options, &Progress::none()).unwrap();
-        let none = Progress::none();
-        (collapse(&binary, corners, &none).unwrap(), collapse_compact(&binary, &[0, n], &none).unwrap())
+        let binary = build(&of, &ids, &options, &none).unwrap();
+        (collapse(&binary, &of, &none).unwrap(), collapse_compact(&binary, &[0, n], &none).unwrap())
     }
 
     #[test]

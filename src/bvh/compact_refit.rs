@@ -105,7 +105,7 @@ mod tests {
     fn tree(corners: &[[Vec3; 3]]) -> Compact {
         let n = corners.len() as u32;
         let ids: Vec<u32> = (0..n).collect();
-        let binary = BinaryBvh::build(corners, &ids, &Default::default(), &Progress::none()).unwrap();
+        let binary = BinaryBvh::build(&|t| corners[t as usize], &ids, &Default::default(), &Progress::none()).unwrap();
         collapse_compact(&binary, &[0, n], &Progress::none()).unwrap()
     }
 

@@ -134,28 +134,26 @@ impl Node {
     /// costs random rays 3 % more instructions.)
     pub(crate) fn sort_children(&mut self) {
         self.order = [0; WIDTH];
+        let centre: [[f32; WIDTH]; 3] =
+            std::array::from_fn(|a| std::array::from_fn(|i| self.lower[a][i] + self.upper[a][i]));
         for octant in 0..4u32 {
+            let sign = |a: u32| if octant >> a & 1 == 1 { -1.0 } else { 1.0 };
             let key: [f32; WIDTH] = std::array::from_fn(|i| {
-                let along = |a: usize| {
-                    let centre = self.lower[a][i] + self.upper[a][i];
-                    if octant >> a & 1 == 1 { -centre } else { centre }
-                };
-                // The position of a missing child is never used.
-                if self.children[i] == ChildRef::EMPTY { f32::INFINITY } else { along(0) + along(1) + along(2) }
+                let along = sign(0) * centre[0][i] + sign(1) * centre[1][i] + centre[2][i];
+                // The position of a missing child, or of one that no ray hits, is never used.
+                if along.is_nan() { f32::INFINITY } else { along }
             });
-            let mut far_to_near = [0usize; WIDTH];
-            for i in 1..WIDTH {
-                let mut place = i;
-                while place > 0 && key[far_to_near[place - 1]] < key[i] {
-                    far_to_near[place] = far_to_near[place - 1];
-                    place -= 1;
+            // The number of children that come before each: those farther away, and of equal ones the first.
+            let mut place = [0u32; WIDTH];
+            for (j, &other) in key.iter().enumerate() {
+                for (i, place) in place.iter_mut().enumerate() {
+                    *place += u32::from(if j < i { other >= key[i] } else { other > key[i] });
                 }
-                far_to_near[place] = i;
             }
-            for (place, &child) in far_to_near.iter().enumerate() {
-                self.order[place] |= (child as u32) << (3 * octant);
+            for (child, place) in place.into_iter().enumerate() {
+                self.order[place as usize] |= (child as u32) << (3 * octant);
                 // The opposite octant.
-                self.order[WIDTH - 1 - place] |= (child as u32) << (3 * (7 - octant));
+                self.order[WIDTH - 1 - place as usize] |= (child as u32) << (3 * (7 - octant));
             }
         }
     }

@@ -174,12 +174,12 @@ impl Tree {
     }
 }
 
-/// Builds the tree over the triangles `valid` (global numbers, ascending). Returns it with its SAH cost: that of the
+/// Builds the tree over the triangles `valid` (global numbers, ascending) with the `corners`. Returns it with its SAH cost: that of the
 /// binary tree with traversal and intersection costing 1 each.
 ///
 /// `meshes`: the first triangle of each mesh, and the number of all triangles at the end.
 pub(crate) fn build(
-    corners: &[[Vec3; 3]],
+    corners: &(impl Fn(u32) -> [Vec3; 3] + Sync),
     valid: &[u32],
     meshes: &[u32],
     options: &BuildOptions,
@@ -196,7 +196,7 @@ pub(crate) fn build(
 }
 
 fn build_binary(
-    corners: &[[Vec3; 3]],
+    corners: &(impl Fn(u32) -> [Vec3; 3] + Sync),
     valid: &[u32],
     options: &BuildOptions,
     progress: &Progress,
@@ -249,13 +249,14 @@ mod tests {
     #[test]
     fn deep_trees_are_built_and_refitted_on_small_stacks() {
         let corners = nested(20_000);
+        let of = |t: u32| corners[t as usize];
         let valid: Vec<u32> = (0..corners.len() as u32).collect();
         // A sixteenth of what the threads of a device have.
         let pool = rayon::ThreadPoolBuilder::new().num_threads(2).stack_size(256 << 10).build().unwrap();
         for quality in BuildQuality::ALL {
             let options = BuildOptions { bins: 2, quality, ..Default::default() };
             pool.install(|| {
-                let (deepest, large) = depths(&build_binary(&corners, &valid, &options, &Progress::none()).unwrap());
+                let (deepest, large) = depths(&build_binary(&of, &valid, &options, &Progress::none()).unwrap());
                 assert!(
                     deepest > layout::SAH_DEPTH && large > 20,
                     "{quality:?}: {deepest} levels, {large} of them large"
@@ -263,7 +264,7 @@ mod tests {
                 for compact in [false, true] {
                     let options = BuildOptions { compact, ..options };
                     let meshes = [0, corners.len() as u32];
-                    let (mut tree, _) = build(&corners, &valid, &meshes, &options, &Progress::none()).unwrap();
+                    let (mut tree, _) = build(&of, &valid, &meshes, &options, &Progress::none()).unwrap();
                     let room = tree.room_to_refit().unwrap();
                     tree.refit(&|t| corners[t as usize], room);
                 }

@@ -2,7 +2,8 @@
 
 use crate::base::geometry::half_area;
 use crate::error::Result;
-use crate::memory::try_vec;
+use crate::memory::try_zeroed;
+use bytemuck::Zeroable;
 use glam::{Mat4, Vec3, Vec4, Vec4Swizzles};
 use rayon::prelude::*;
 
@@ -10,7 +11,7 @@ use rayon::prelude::*;
 pub(super) const CHUNK: usize = 1 << 12;
 
 /// A box stored as its negated lower and its upper corner, so that one maximum of eight lanes joins two.
-#[derive(Clone, Copy)]
+#[derive(Clone, Copy, Zeroable)]
 #[repr(C, align(32))]
 pub(super) struct Box4 {
     pub(super) neg_lower: Vec4,
@@ -45,7 +46,7 @@ impl Box4 {
     }
 
     pub(super) fn is_empty(&self) -> bool {
-        (self.upper + self.neg_lower).truncate().min_element() < 0.0
+        (self.upper + self.neg_lower).cmplt(Vec4::ZERO).bitmask() & 7 != 0
     }
 
     /// Half the surface area, 0 if empty.
@@ -90,7 +91,7 @@ impl Range4 {
 
 /// The box of a triangle; its number is stored in `neg_lower.w` as the low bits of a normal float (arithmetic on
 /// denormals would be slow), which no result depends on.
-#[derive(Clone, Copy)]
+#[derive(Clone, Copy, Zeroable)]
 #[repr(transparent)]
 pub(super) struct Reference(pub(super) Box4);
 
@@ -168,15 +169,18 @@ impl Extent {
     }
 }
 
-/// References to the triangles `valid` of `corners`, and their extent.
-pub(super) fn references(corners: &[[Vec3; 3]], valid: &[u32]) -> Result<(Vec<Reference>, Extent)> {
-    let mut refs = try_vec::<Reference>(valid.len(), "references to triangles")?;
+/// References to the triangles `valid` with the `corners`, and their extent.
+pub(super) fn references(
+    corners: &(impl Fn(u32) -> [Vec3; 3] + Sync),
+    valid: &[u32],
+) -> Result<(Vec<Reference>, Extent)> {
+    let mut refs = try_zeroed::<Reference>(valid.len(), "references to triangles")?;
     let extent = refs
         .par_chunks_mut(CHUNK)
         .zip(valid.par_chunks(CHUNK))
         .map(|(refs, valid)| {
             for (r, &t) in refs.iter_mut().zip(valid) {
-                *r = Reference::new(t, corners[t as usize]);
+                *r = Reference::new(t, corners(t));
             }
             Extent::of(refs)
         })

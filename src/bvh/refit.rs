@@ -163,8 +163,8 @@ mod tests {
 
     fn tree(corners: &Triangles, options: &BuildOptions) -> Mbvh {
         let valid: Vec<u32> = (0..corners.len() as u32).filter(|&t| is_valid_triangle(corners[t as usize])).collect();
-        let none = Progress::none();
-        collapse(&build_binary(corners, &valid, options, &none).unwrap(), corners, &none).unwrap()
+        let (none, of) = (Progress::none(), |t: u32| corners[t as usize]);
+        collapse(&build_binary(&of, &valid, options, &none).unwrap(), &of, &none).unwrap()
     }
 
     /// The tree after a refit, and the triangles that no ray can hit.

@@ -156,7 +156,7 @@ impl Scene {
     /// The mesh and the triangle in it of a global triangle number.
     #[inline]
     pub fn locate(&self, triangle: u32) -> (u32, u32) {
-        let mesh = self.first_triangle.partition_point(|&first| first <= triangle) - 1;
+        let mesh = mesh_of(&self.first_triangle, triangle);
         (mesh as u32, triangle - self.first_triangle[mesh])
     }
 
@@ -242,4 +242,10 @@ impl Scene {
     pub(crate) fn acceleration(&self) -> (&Tree, &[u32]) {
         (&self.tree, &self.first_triangle)
     }
+}
+
+/// The mesh of a global triangle number, given the first triangle of each mesh.
+#[inline]
+pub(super) fn mesh_of(first_triangle: &[u32], triangle: u32) -> usize {
+    first_triangle.partition_point(|&first| first <= triangle) - 1
 }

@@ -1,5 +1,6 @@
 //! Refits: vertices move, the tree keeps its topology, and all data that depend on positions are updated.
 
+use super::committed::mesh_of;
 use super::emitters::{EMITTERS, add_emitters, emissive_triangles};
 use super::{Emitter, Scene, is_valid_triangle};
 use crate::bvh;
@@ -81,7 +82,7 @@ impl Scene {
     fn follow_positions(&mut self, mut emitters: Vec<Emitter>, room: bvh::RefitRoom) {
         let (first, meshes) = (&self.first_triangle, &self.data.meshes);
         let corners = |t: u32| {
-            let m = first.partition_point(|&first| first <= t) - 1;
+            let m = mesh_of(first, t);
             meshes[m].corners((t - first[m]) as usize)
         };
         self.tree.refit(&corners, room);

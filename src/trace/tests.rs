@@ -162,7 +162,8 @@ fn every_query_finds_the_closest_triangle_of_a_soup() {
 fn the_baseline_finds_the_same_triangles() {
     let triangles = soup(2000, 0.1, 4);
     let ids: Vec<u32> = (0..2000).collect();
-    let binary = crate::bvh::BinaryBvh::build(&triangles, &ids, &Default::default(), &Progress::none()).unwrap();
+    let binary =
+        crate::bvh::BinaryBvh::build(&|t| triangles[t as usize], &ids, &Default::default(), &Progress::none()).unwrap();
     for d in sphere_directions(2000, 3) {
         let ray = Ray::new(Vec3::new(0.1, 0.2, 0.3), d.into());
         check(&ray, &triangles, baseline::closest(&binary, &triangles, &ray), "baseline");
