@@ -97,8 +97,9 @@ impl Charts {
         check_density(surface_area(scene), texels_per_unit)?;
         let total = scene.triangle_count();
         let stage = progress.stage("unwrap", 0.0, 0.5, total as u64 + 1);
-        // Memory of pieces and charts, which exist at the same time, and of the unwrapping of a part.
-        let _memory = scene.device().memory().reserve(total as usize * 2 * Self::BYTES_PER_TRIANGLE, "the charts")?;
+        // Memory of pieces and charts, which exist at the same time, and of the meshes that are unwrapped.
+        let per_triangle = 2 * Self::BYTES_PER_TRIANGLE + unwrap::BYTES_PER_TRIANGLE;
+        let _memory = scene.device().memory().reserve(total as usize * per_triangle, "the charts")?;
         let (charts, mut report) = scene.device().install(|| {
             let mut report = UvReport::default();
             let (mut pieces, rest) = given_pieces(scene, page_size, &mut report, &stage)?;

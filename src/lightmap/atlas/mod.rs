@@ -7,10 +7,12 @@ pub mod charts;
 pub(crate) mod flat_triangle;
 pub mod layout;
 pub(crate) mod pieces;
+mod planar;
 pub(crate) mod seen;
 pub mod texels;
 pub(crate) mod two_sided;
 mod unwrap;
+mod welded;
 
 use super::LightmapInfo;
 use crate::direct::Receiver;

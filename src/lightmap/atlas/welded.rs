@@ -1,0 +1,118 @@
+//! The triangles of a mesh with welded vertices, and which lie next to which.
+
+use super::pieces::{CHARTS, ITEMS_PER_CHECK, float_key, surface_kind};
+use crate::error::Result;
+use crate::memory::{try_collect, try_filled, try_par_collect, try_with_capacity};
+use crate::progress::Stage;
+use crate::scene::{NONE, Scene};
+use glam::DVec3;
+use rayon::prelude::*;
+
+/// Some triangles of one mesh with welded vertices.
+pub(super) struct Geometry {
+    /// Global triangle numbers, ascending.
+    pub triangles: Vec<u32>,
+    /// Vertices of each triangle; equal positions are one vertex.
+    pub indices: Vec<[u32; 3]>,
+    /// Positions by ascending bits, x first, so that they do not depend on the order of the mesh's vertices.
+    pub positions: Vec<DVec3>,
+    /// Unit normals of the triangles.
+    pub normals: Vec<DVec3>,
+    /// Kind of surface of each triangle, see [`surface_kind`].
+    pub kinds: Vec<u32>,
+}
+
+impl Geometry {
+    /// Upper bound of the bytes that a triangle takes, with its neighbours and while these are found.
+    pub(super) const BYTES_PER_TRIANGLE: usize = 4 + 12 + 24 + 24 + 4 + 12 + 48;
+
+    /// Welds `triangles`, which are most of the valid ones of one mesh (global numbers, ascending).
+    pub(super) fn of(scene: &Scene, triangles: &[u32], stage: &Stage) -> Result<Geometry> {
+        let (m, _) = scene.locate(triangles[0]);
+        let (mesh, first) = (&scene.meshes()[m as usize], scene.first_triangle(m));
+        let corners = |t: u32| mesh.indices[(t - first) as usize];
+        let mut welded = try_filled(mesh.positions.len(), NONE, CHARTS)?;
+        for (i, &t) in triangles.iter().enumerate() {
+            if i % ITEMS_PER_CHECK == 0 {
+                stage.check()?;
+            }
+            corners(t).map(|v| welded[v as usize] = 0);
+        }
+        let key = |v: u32| mesh.positions[v as usize].to_array().map(float_key);
+        let used = (0..mesh.positions.len() as u32).filter(|&v| welded[v as usize] == 0);
+        let mut order = try_collect(used.map(|v| (key(v), v)), CHARTS)?;
+        stage.check()?;
+        order.par_sort_unstable();
+        stage.check()?;
+        let mut positions = try_with_capacity(order.len(), CHARTS)?;
+        for same in order.chunk_by(|a, b| a.0 == b.0) {
+            same.iter().for_each(|&(_, v)| welded[v as usize] = positions.len() as u32);
+            positions.push(mesh.positions[same[0].1 as usize].as_dvec3());
+        }
+        stage.check()?;
+        let normal = |&t: &u32| {
+            let [a, b, c] = corners(t).map(|v| mesh.positions[v as usize].as_dvec3());
+            (b - a).cross(c - a).normalize_or_zero()
+        };
+        let kind = |&t: &u32| surface_kind(&scene.materials()[mesh.material((t - first) as usize) as usize]);
+        Ok(Geometry {
+            indices: try_par_collect(triangles.par_iter().map(|&t| corners(t).map(|v| welded[v as usize])), CHARTS)?,
+            positions,
+            normals: try_par_collect(triangles.par_iter().map(normal), CHARTS)?,
+            kinds: try_par_collect(triangles.par_iter().map(kind), CHARTS)?,
+            triangles: crate::memory::try_to_vec(triangles, CHARTS)?,
+        })
+    }
+
+    /// Some of these triangles (by their place here, ascending) with the vertices that they need.
+    pub(super) fn part(&self, triangles: &[u32], stage: &Stage) -> Result<Geometry> {
+        let mut used = try_with_capacity(3 * triangles.len(), CHARTS)?;
+        used.extend(triangles.iter().flat_map(|&t| self.indices[t as usize]));
+        stage.check()?;
+        used.sort_unstable();
+        used.dedup();
+        let place = |v: u32| used.binary_search(&v).unwrap_or_default() as u32;
+        let of = |t: &u32| *t as usize;
+        Ok(Geometry {
+            indices: try_collect(triangles.iter().map(|t| self.indices[of(t)].map(place)), CHARTS)?,
+            positions: try_collect(used.iter().map(|v| self.positions[of(v)]), CHARTS)?,
+            normals: try_collect(triangles.iter().map(|t| self.normals[of(t)]), CHARTS)?,
+            kinds: try_collect(triangles.iter().map(|t| self.kinds[of(t)]), CHARTS)?,
+            triangles: try_collect(triangles.iter().map(|t| self.triangles[of(t)]), CHARTS)?,
+        })
+    }
+
+    pub(super) fn corners(&self, triangle: usize) -> [DVec3; 3] {
+        self.indices[triangle].map(|i| self.positions[i as usize])
+    }
+
+    /// Returns the triangle across each edge (corners k and k + 1). It is [`NONE`] if there is none, if more than two
+    /// triangles share the edge, if the winding differs, or if the materials must not share a chart.
+    pub(super) fn neighbours(&self, stage: &Stage) -> Result<Vec<[u32; 3]>> {
+        let mut edges = try_with_capacity(3 * self.indices.len(), CHARTS)?;
+        for (t, i) in self.indices.iter().enumerate() {
+            if t % ITEMS_PER_CHECK == 0 {
+                stage.check()?;
+            }
+            for k in 0..3 {
+                let (a, b) = (i[k], i[(k + 1) % 3]);
+                edges.push(((u64::from(a.min(b)) << 32) | u64::from(a.max(b)), t as u32, k as u8, a < b));
+            }
+        }
+        edges.par_sort_unstable();
+        let mut neighbours = try_filled(self.indices.len(), [NONE; 3], CHARTS)?;
+        for (i, same) in edges.chunk_by(|a, b| a.0 == b.0).enumerate() {
+            if i % ITEMS_PER_CHECK == 0 {
+                stage.check()?;
+            }
+            if let &[(_, t, k, forward), (_, t2, k2, forward2)] = same
+                && forward != forward2
+                && self.kinds[t as usize] == self.kinds[t2 as usize]
+            {
+                neighbours[t as usize][k as usize] = t2;
+                neighbours[t2 as usize][k2 as usize] = t;
+            }
+        }
+        Ok(neighbours)
+    }
+}
