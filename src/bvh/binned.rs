@@ -11,7 +11,7 @@ use super::binary::{BinaryBvh, BinaryNode};
 use super::bins::{BinMap, Bins, Side, Split, bin_count, in_parallel, on_heap};
 use super::layout::SAH_DEPTH;
 use super::partings::{best_parting, halve, leaf_cost, part_few};
-use super::references::{Box4, Extent, Range4, Reference, area_scale, references};
+use super::references::{Box4, Extent, Range4, Reference, References, area_scale};
 use crate::error::Result;
 use crate::memory::{try_zeroed, try_zeroed_as_needed};
 use crate::progress::Progress;
@@ -324,8 +324,13 @@ impl BinaryBvh {
         options: &BuildOptions,
         progress: &Progress,
     ) -> Result<BinaryBvh> {
-        let n = valid.len();
-        let (mut refs, extent) = references(corners, valid)?;
+        BinaryBvh::of(References::of(valid, corners)?, options, progress)
+    }
+
+    /// Builds the tree over at least one reference.
+    pub(super) fn of(references: References, options: &BuildOptions, progress: &Progress) -> Result<BinaryBvh> {
+        let References { mut refs, extent } = references;
+        let n = refs.len();
         let mut nodes = try_zeroed_as_needed::<BinaryNode>(2 * n - 1, "the binary tree")?;
         let mut triangles = try_zeroed::<u32>(n, "the binary tree")?;
         let mut slots = Slots { nodes: &mut nodes, base: 0, used: 0, triangles: &mut triangles, first: 0, filled: 0 };

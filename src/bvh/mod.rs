@@ -17,6 +17,7 @@ pub use binary::{BinaryBvh, BinaryNode};
 pub(crate) use collapse::outwards;
 pub(crate) use compact::Compact;
 pub use layout::{ChildRef, Mbvh, Node};
+pub(crate) use references::References;
 
 use crate::error::{Result, invalid_argument};
 use crate::progress::Progress;
@@ -91,9 +92,9 @@ pub fn estimated_bytes(triangles: usize, options: &BuildOptions) -> usize {
     // Bytes per triangle: 40 in leaves and up to 256/7 of nodes, or 4 and up to 80/7; with 40/7 of their plan.
     let tree = if options.compact { 22 } else { 84 };
     match options.quality {
-        // Bytes during the build: 8 of numbers and up to 64 of binary nodes, to which 32 of references are added before
+        // Bytes during the build: 4 of numbers and up to 64 of binary nodes, to which 32 of references are added before
         // there is a tree. (Most leaves hold several triangles: real scenes take 60 % of this.)
-        BuildQuality::Default => triangles * (72 + tree.max(32)),
+        BuildQuality::Default => triangles * (68 + tree.max(32)),
         // Per reference twice the binary nodes and numbers, because subtrees are joined at the end.
         BuildQuality::High => {
             let references = triangles as f64 * (1.0 + f64::from(options.split_budget));
@@ -175,18 +176,18 @@ impl Tree {
     }
 }
 
-/// Builds the tree over the triangles `valid` (global numbers, ascending) with the `corners`. Returns it with its SAH cost: that of the
+/// Builds the tree over the triangles of at least one reference with the `corners`. Returns it with its SAH cost: that of the
 /// binary tree with traversal and intersection costing 1 each.
 ///
 /// `meshes`: the first triangle of each mesh, and the number of all triangles at the end.
 pub(crate) fn build(
     corners: &(impl Fn(u32) -> [Vec3; 3] + Sync),
-    valid: &[u32],
+    references: References,
     meshes: &[u32],
     options: &BuildOptions,
     progress: &Progress,
 ) -> Result<(Tree, f32)> {
-    let binary = build_binary(corners, valid, options, progress)?;
+    let binary = build_binary(corners, references, options, progress)?;
     let cost = binary.sah_cost();
     let tree = if options.compact {
         Tree::Compact(collapse::collapse_compact(&binary, meshes, progress)?)
@@ -198,14 +199,14 @@ pub(crate) fn build(
 
 fn build_binary(
     corners: &(impl Fn(u32) -> [Vec3; 3] + Sync),
-    valid: &[u32],
+    references: References,
     options: &BuildOptions,
     progress: &Progress,
 ) -> Result<BinaryBvh> {
     options.validate()?;
     let binary = match options.quality {
-        BuildQuality::Default => BinaryBvh::build(corners, valid, options, progress)?,
-        BuildQuality::High => BinaryBvh::build_spatial(corners, valid, options, progress)?,
+        BuildQuality::Default => BinaryBvh::of(references, options, progress)?,
+        BuildQuality::High => BinaryBvh::spatial_of(references, corners, options, progress)?,
     };
     progress.check()?;
     Ok(binary)
@@ -257,7 +258,9 @@ mod tests {
         for quality in BuildQuality::ALL {
             let options = BuildOptions { bins: 2, quality, ..Default::default() };
             pool.install(|| {
-                let (deepest, large) = depths(&build_binary(&of, &valid, &options, &Progress::none()).unwrap());
+                let (deepest, large) = depths(
+                    &build_binary(&of, References::of(&valid, &of).unwrap(), &options, &Progress::none()).unwrap(),
+                );
                 assert!(
                     deepest > layout::SAH_DEPTH && large > 20,
                     "{quality:?}: {deepest} levels, {large} of them large"
@@ -265,7 +268,8 @@ mod tests {
                 for compact in [false, true] {
                     let options = BuildOptions { compact, ..options };
                     let meshes = [0, corners.len() as u32];
-                    let (mut tree, _) = build(&of, &valid, &meshes, &options, &Progress::none()).unwrap();
+                    let (mut tree, _) =
+                        build(&of, References::of(&valid, &of).unwrap(), &meshes, &options, &Progress::none()).unwrap();
                     let room = tree.room_to_refit().unwrap();
                     tree.refit(&|t| corners[t as usize], room);
                 }

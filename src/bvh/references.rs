@@ -169,21 +169,54 @@ impl Extent {
     }
 }
 
-/// References to the triangles `valid` with the `corners`, and their extent.
-pub(super) fn references(
-    corners: &(impl Fn(u32) -> [Vec3; 3] + Sync),
-    valid: &[u32],
-) -> Result<(Vec<Reference>, Extent)> {
-    let mut refs = try_zeroed::<Reference>(valid.len(), "references to triangles")?;
-    let extent = refs
-        .par_chunks_mut(CHUNK)
-        .zip(valid.par_chunks(CHUNK))
-        .map(|(refs, valid)| {
-            for (r, &t) in refs.iter_mut().zip(valid) {
-                *r = Reference::new(t, corners(t));
-            }
-            Extent::of(refs)
+/// References to all triangles that a tree is built over, and their extent.
+pub(crate) struct References {
+    pub(super) refs: Vec<Reference>,
+    pub(super) extent: Extent,
+}
+
+impl References {
+    /// References to the triangles with numbers below `count` whose corners are `valid`.
+    pub(crate) fn of_valid(
+        count: usize,
+        corners: &(impl Fn(u32) -> [Vec3; 3] + Sync),
+        valid: impl Fn([Vec3; 3]) -> bool + Sync,
+    ) -> Result<References> {
+        References::collect(count, |i| {
+            let corners = corners(i as u32);
+            valid(corners).then(|| Reference::new(i as u32, corners))
         })
-        .reduce(|| Extent::EMPTY, Extent::join);
-    Ok((refs, extent))
+    }
+
+    /// References to some triangles by their numbers.
+    pub(super) fn of(triangles: &[u32], corners: &(impl Fn(u32) -> [Vec3; 3] + Sync)) -> Result<References> {
+        References::collect(triangles.len(), |i| Some(Reference::new(triangles[i], corners(triangles[i]))))
+    }
+
+    fn collect(count: usize, reference: impl Fn(usize) -> Option<Reference> + Sync) -> Result<References> {
+        let mut refs = try_zeroed::<Reference>(count, "references to triangles")?;
+        let fill = |(i, chunk): (usize, &mut [Reference])| {
+            let mut n = 0;
+            for r in (i * CHUNK..i * CHUNK + chunk.len()).filter_map(&reference) {
+                chunk[n] = r;
+                n += 1;
+            }
+            (n, Extent::of(&chunk[..n]))
+        };
+        let chunks: Vec<(usize, Extent)> = refs.par_chunks_mut(CHUNK).enumerate().map(fill).collect();
+        // Chunks move up to those before.
+        let mut end = 0;
+        for (i, &(n, _)) in chunks.iter().enumerate() {
+            if end < i * CHUNK {
+                refs.copy_within(i * CHUNK..i * CHUNK + n, end);
+            }
+            end += n;
+        }
+        refs.truncate(end);
+        Ok(References { refs, extent: chunks.iter().fold(Extent::EMPTY, |e, c| e.join(c.1)) })
+    }
+
+    pub(crate) fn len(&self) -> usize {
+        self.refs.len()
+    }
 }

@@ -134,7 +134,7 @@ fn refit_leaf(rows: &mut [f32], corners: &impl Fn(u32) -> [Vec3; 3]) -> Box4 {
 #[cfg(test)]
 mod tests {
     use super::super::collapse::collapse;
-    use super::super::{BuildOptions, BuildQuality, build_binary};
+    use super::super::{BuildOptions, BuildQuality, References, build_binary};
     use super::*;
     use crate::progress::Progress;
     use crate::sampling::{uniform, uniform_sphere};
@@ -164,7 +164,8 @@ mod tests {
     fn tree(corners: &Triangles, options: &BuildOptions) -> Mbvh {
         let valid: Vec<u32> = (0..corners.len() as u32).filter(|&t| is_valid_triangle(corners[t as usize])).collect();
         let (none, of) = (Progress::none(), |t: u32| corners[t as usize]);
-        collapse(&build_binary(&of, &valid, options, &none).unwrap(), &of, &none).unwrap()
+        let references = References::of(&valid, &of).unwrap();
+        collapse(&build_binary(&of, references, options, &none).unwrap(), &of, &none).unwrap()
     }
 
     /// The tree after a refit, and the triangles that no ray can hit.

@@ -4,7 +4,7 @@ use super::committed::{SceneStats, Uses, mesh_of};
 use super::emitters::{EMITTERS, add_emitters, emissive_triangles};
 use super::precision::too_few_digits;
 use super::{Emitter, Material, MeshMaterials, NONE, Scene, SceneData, is_valid_triangle};
-use crate::bvh::{self, BuildOptions, Tree};
+use crate::bvh::{self, BuildOptions, References, Tree};
 use crate::device::{Device, LogLevel};
 use crate::error::{Error, Result};
 use crate::memory::{Reservation, try_par_filter, try_with_capacity};
@@ -98,18 +98,20 @@ impl Scene {
             let mesh = mesh_of(&first_triangle, t);
             data.meshes[mesh].corners((t - first_triangle[mesh]) as usize)
         };
-        let filter = |keep: &(dyn Fn(u32) -> bool + Sync)| try_par_filter(total, "the triangles to build from", keep);
-        let valid = device.install(|| filter(&|t| is_valid_triangle(corners(t))))?;
+        let meshes = data.bytes();
+        let mut memory = device.memory().reserve(meshes + bvh::estimated_bytes(total, options), "the scene")?;
+        let references = device.install(|| References::of_valid(total, &corners, is_valid_triangle))?;
         progress.check()?;
-        if valid.is_empty() {
+        if references.len() == 0 {
             return Err(Error::InvalidState(format!(
                 "all {total} triangles of the scene are degenerate or not finite"
             )));
         }
-        let skipped: Vec<u32> = if valid.len() == total {
+        let skipped: Vec<u32> = if references.len() == total {
             Vec::new()
         } else {
-            device.install(|| filter(&|t| !is_valid_triangle(corners(t))))?
+            let is_skipped = |t| !is_valid_triangle(corners(t));
+            device.install(|| try_par_filter(total, "the triangles that are skipped", is_skipped))?
         };
         if !skipped.is_empty() {
             device.log(
@@ -117,9 +119,8 @@ impl Scene {
                 &format!("{} of {total} triangles are degenerate or not finite and were skipped", skipped.len()),
             );
         }
-        let meshes = data.bytes();
-        let mut memory = device.memory().reserve(meshes + bvh::estimated_bytes(valid.len(), options), "the scene")?;
-        let (tree, sah_cost) = device.install(|| bvh::build(&corners, &valid, &first_triangle, options, progress))?;
+        let (tree, sah_cost) =
+            device.install(|| bvh::build(&corners, references, &first_triangle, options, progress))?;
         progress.check()?;
 
         let mut emitters = try_with_capacity(emissive_triangles(data), EMITTERS)?;
