@@ -2,7 +2,7 @@
 
 use crate::base::geometry::half_area;
 use crate::error::Result;
-use crate::memory::try_zeroed;
+use crate::memory::{try_par_collect, try_zeroed};
 use bytemuck::Zeroable;
 use glam::{Mat4, Vec3, Vec4, Vec4Swizzles};
 use rayon::prelude::*;
@@ -203,7 +203,7 @@ impl References {
             }
             (n, Extent::of(&chunk[..n]))
         };
-        let chunks: Vec<(usize, Extent)> = refs.par_chunks_mut(CHUNK).enumerate().map(fill).collect();
+        let chunks = try_par_collect(refs.par_chunks_mut(CHUNK).enumerate().map(fill), "references to triangles")?;
         // Chunks move up to those before.
         let mut end = 0;
         for (i, &(n, _)) in chunks.iter().enumerate() {

@@ -105,7 +105,7 @@ pub(super) fn flat_piece(
             }
         }
     }
-    turn_upright(&mut flat, &mut border);
+    turn_upright(&mut flat, &mut border)?;
     if members.len() > 2 && overlaps_itself(&flat, stage)? {
         return Ok(None);
     }
@@ -122,26 +122,11 @@ fn doubled_area([a, b, c]: [DVec3; 3]) -> DVec3 {
 
 /// Turns triangles so that the box around them is the smallest there is: one of its sides lies along the convex hull of
 /// their `border`, which has the starts of all border edges.
-fn turn_upright(triangles: &mut [[DVec2; 3]], border: &mut [DVec2]) {
-    border.sort_unstable_by(|a, b| a.x.total_cmp(&b.x).then(a.y.total_cmp(&b.y)));
-    // Andrew's monotone chain, once along the lower side and once back along the upper one.
-    let mut hull: Vec<DVec2> = Vec::new();
-    let mut chain = |points: &mut dyn Iterator<Item = &DVec2>| {
-        let start = hull.len();
-        for &p in points {
-            while let [.., a, b] = hull[start..]
-                && (b - a).perp_dot(p - b) <= 0.0
-            {
-                hull.pop();
-            }
-            hull.push(p);
-        }
-        hull.pop();
-    };
-    chain(&mut border.iter());
-    chain(&mut border.iter().rev());
-    let mut edges: Vec<DVec2> = (0..hull.len()).map(|i| hull[(i + 1) % hull.len()] - hull[i]).collect();
-    edges.sort_by(|a, b| b.length_squared().total_cmp(&a.length_squared()));
+fn turn_upright(triangles: &mut [[DVec2; 3]], border: &mut [DVec2]) -> Result<()> {
+    let hull = convex_hull(border)?;
+    let edges = (0..hull.len()).map(|i| hull[(i + 1) % hull.len()] - hull[i]);
+    let mut edges: Vec<DVec2> = try_collect(edges, CHARTS)?;
+    edges.sort_unstable_by(|a, b| b.length_squared().total_cmp(&a.length_squared()));
     let turned = |x: DVec2, p: DVec2| DVec2::new(x.dot(p), x.perp_dot(p));
     let box_area = |x: DVec2| {
         let points = || hull.iter().map(|&p| turned(x, p));
@@ -151,6 +136,28 @@ fn turn_upright(triangles: &mut [[DVec2; 3]], border: &mut [DVec2]) {
     let tried = edges.into_iter().take(EDGES_TRIED).filter_map(DVec2::try_normalize).map(|x| (box_area(x), x));
     let best = tried.fold((f64::INFINITY, DVec2::X), |m, t| if t.0 < m.0 { t } else { m }).1;
     triangles.iter_mut().for_each(|t| *t = t.map(|p| turned(best, p)));
+    Ok(())
+}
+
+/// Corners of the convex hull, counter-clockwise (Andrew 1979). Sorts the points.
+fn convex_hull(points: &mut [DVec2]) -> Result<Vec<DVec2>> {
+    points.sort_unstable_by(|a, b| a.x.total_cmp(&b.x).then(a.y.total_cmp(&b.y)));
+    let mut hull: Vec<DVec2> = Vec::new();
+    // Once along the lower side and once back along the upper one.
+    for back in [false, true] {
+        let start = hull.len();
+        for i in 0..points.len() {
+            let p = points[if back { points.len() - 1 - i } else { i }];
+            while let [.., a, b] = hull[start..]
+                && (b - a).perp_dot(p - b) <= 0.0
+            {
+                hull.pop();
+            }
+            try_push(&mut hull, p, CHARTS)?;
+        }
+        hull.pop();
+    }
+    Ok(hull)
 }
 
 /// Maximum number of edges of the hull that are tried, longest first.
@@ -342,6 +349,22 @@ mod tests {
         assert!(with([0.7, 0.3, 0.8, 0.3, 0.8, 0.4]));
         assert!(with([-2.0, 0.4, 2.0, 0.4, 2.0, 0.6]));
         assert!(with([0.99, 0.5, 2.0, 0.0, 2.0, 1.0]));
+    }
+
+    #[test]
+    fn rectangles_lie_straight() {
+        // A rectangle of 2 by 1, turned, with points within.
+        let x = DVec2::from_angle(0.3);
+        let at = |u: f64, v: f64| u * x + v * x.perp();
+        let mut points = vec![at(0.0, 0.0), at(1.0, 0.5), at(2.0, 1.0), at(0.0, 1.0), at(2.0, 0.0), at(1.0, 0.0)];
+        let mut triangles =
+            vec![[at(0.0, 0.0), at(2.0, 0.0), at(2.0, 1.0)], [at(0.0, 0.0), at(2.0, 1.0), at(0.0, 1.0)]];
+        assert_eq!(convex_hull(&mut points.clone()).unwrap().len(), 4);
+        turn_upright(&mut triangles, &mut points).unwrap();
+        let corners = || triangles.iter().flatten().copied();
+        let size = corners().fold(DVec2::NEG_INFINITY, DVec2::max) - corners().fold(DVec2::INFINITY, DVec2::min);
+        assert!(size.distance(DVec2::new(2.0, 1.0)) < 1e-9, "{size}");
+        assert!(convex_hull(&mut []).unwrap().is_empty());
     }
 
     #[test]
