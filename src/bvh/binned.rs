@@ -61,10 +61,7 @@ fn swap_misplaced(refs: &mut [Reference], middle: usize, counts: &[usize]) {
     let (mut rights, mut lefts) = (Default::default(), Default::default());
     let mut from_low = counts.iter().enumerate().map(|(i, &n)| i * BLOCK + n..(i + 1) * BLOCK);
     let mut from_high = counts.iter().enumerate().map(|(i, &n)| i * BLOCK..i * BLOCK + n);
-    loop {
-        let (Some(a), Some(b)) = (low.next(&mut rights, &mut from_low), high.next(&mut lefts, &mut from_high)) else {
-            break;
-        };
+    while let (Some(a), Some(b)) = (low.next(&mut rights, &mut from_low), high.next(&mut lefts, &mut from_high)) {
         let n = a.len().min(b.len());
         let ((a, rest_a), (b, rest_b)) = (a.split_at_mut(n), b.split_at_mut(n));
         (rights, lefts) = (rest_a, rest_b);

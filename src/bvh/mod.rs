@@ -176,8 +176,8 @@ impl Tree {
     }
 }
 
-/// Builds the tree over the triangles of at least one reference with the `corners`. Returns it with its SAH cost: that of the
-/// binary tree with traversal and intersection costing 1 each.
+/// Builds the tree over the triangles of at least one reference, with the `corners`. Returns it with its SAH cost: that
+/// of the binary tree with traversal and intersection costing 1 each.
 ///
 /// `meshes`: the first triangle of each mesh, and the number of all triangles at the end.
 pub(crate) fn build(

@@ -36,7 +36,7 @@ impl Geometry {
             if i % ITEMS_PER_CHECK == 0 {
                 stage.check()?;
             }
-            corners(t).map(|v| welded[v as usize] = 0);
+            corners(t).into_iter().for_each(|v| welded[v as usize] = 0);
         }
         let key = |v: u32| mesh.positions[v as usize].to_array().map(float_key);
         let used = (0..mesh.positions.len() as u32).filter(|&v| welded[v as usize] == 0);
