@@ -7,7 +7,7 @@
 use super::pieces::{CHARTS, ITEMS_PER_CHECK, Piece};
 use super::welded::Geometry;
 use crate::error::Result;
-use crate::memory::{try_collect, try_filled, try_push, try_with_capacity};
+use crate::memory::{try_collect, try_filled, try_push};
 use crate::progress::Stage;
 use crate::scene::NONE;
 use glam::{DVec2, DVec3};

@@ -14,7 +14,7 @@ use super::welded::Geometry;
 use crate::error::Result;
 use crate::memory::{try_append, try_collect, try_filled, try_par_gather, try_push, try_with_capacity};
 use crate::progress::Stage;
-use crate::scene::{NONE, Scene};
+use crate::scene::Scene;
 use glam::{DVec2, DVec3};
 
 /// Maximum number of triangles in a part, unless they are one flat region. Large enough that few charts are cut at part
