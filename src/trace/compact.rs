@@ -66,6 +66,8 @@ impl Tree for View<'_> {
         Self: 'a;
 
     const ROW: u32 = WIDTH as u32;
+    /// Their order is by place.
+    const IS_BY_WORTH: bool = false;
 
     #[inline(always)]
     fn prefetch(&self, child: ChildRef) {

@@ -127,14 +127,17 @@ struct Stack {
 /// below the stack.
 const BOTTOM: usize = WIDTH;
 
+/// The order of lanes that keeps them as they are.
+const IN_ORDER: [u32; WIDTH] = [0, 1, 2, 3, 4, 5, 6, 7];
+
 impl Stack {
-    /// Pushes the children of a node that are set in `mask`, far ones first. Returns the set of their positions in the
-    /// node's order.
+    /// Pushes the children of a node that are set in `mask`, far ones first; `ANY`: in the node's own order if that is
+    /// [by worth](Tree::IS_BY_WORTH). Returns the set of their positions in that order.
     ///
     /// # Safety
     /// The CPU must have the ISA; `node` must be a node of the tree that the stack is used for.
     #[inline(always)]
-    unsafe fn push<S: Simd, T: Tree>(
+    unsafe fn push<S: Simd, T: Tree, const ANY: bool>(
         &mut self,
         node: &T::Node,
         shift: u32,
@@ -142,11 +145,12 @@ impl Stack {
         mask: <S::F8 as Lanes>::Mask,
     ) -> u32 {
         let mut room = MaybeUninit::uninit();
+        let (order, shift) = if ANY && T::IS_BY_WORTH { (IN_ORDER.as_ptr(), 0) } else { (T::order(node), shift) };
         // SAFETY: the builder bounds the tree's depth so that there is room (see `STACK_SIZE`).
         let set = unsafe {
             near.compress(
                 T::names(node, &mut room),
-                T::order(node),
+                order,
                 shift,
                 mask,
                 self.near.as_mut_ptr().add(self.count).cast(),
@@ -155,6 +159,17 @@ impl Stack {
         };
         self.count += set.count_ones() as usize;
         set
+    }
+
+    /// The entry that lies under `above` others.
+    ///
+    /// # Safety
+    /// `above` must be below [`BOTTOM`] - 1, and at most one of the lowest [`BOTTOM`] entries must have been popped since
+    /// the count was set.
+    #[inline(always)]
+    unsafe fn peek(&self, above: usize) -> ChildRef {
+        // SAFETY: entries below `count` have been written.
+        unsafe { self.child.get_unchecked(self.count - 1 - above).assume_init() }
     }
 
     /// Removes and returns the top entry.
@@ -175,7 +190,6 @@ impl Stack {
     /// The CPU must have the ISA; there must be at least [`BOTTOM`] entries.
     #[inline(always)]
     unsafe fn cut<S: Simd>(&mut self, tmax: f32) {
-        const IN_ORDER: [u32; WIDTH] = [0, 1, 2, 3, 4, 5, 6, 7];
         let (nears, children) = (self.near.as_mut_ptr().cast::<f32>(), self.child.as_mut_ptr().cast::<u32>());
         // The skipped entries, fewer than eight, are sentinels.
         let mut kept = self.count % WIDTH;
@@ -253,16 +267,20 @@ impl Walk {
     /// # Safety
     /// The CPU must have the ISA; the walk must have been begun in `tree`, and `current` be a node.
     #[inline(always)]
-    unsafe fn visit_node<S: Simd, T: Tree, const ALONE: bool>(&mut self, tree: &T) -> ChildRef {
+    unsafe fn visit_node<S: Simd, T: Tree, const ALONE: bool, const ANY: bool>(&mut self, tree: &T) -> ChildRef {
         // SAFETY: forwarded; a bit of `set` is below the node's eight children.
         unsafe {
             let node = tree.node(self.current);
             let boxes = Children::<S, T> { node, isa: PhantomData };
             let (near, mask) = self.ray.boxes::<S::F8>(&boxes, self.limit);
-            let set = self.stack.push::<S, T>(node, self.ray.shift, near, mask);
+            let set = self.stack.push::<S, T, ANY>(node, self.ray.shift, near, mask);
             self.current = if ALONE && set != 0 {
                 self.stack.count -= 1;
-                let lane = T::order(node).add(set.ilog2() as usize).read() >> self.ray.shift & 7;
+                let place = set.ilog2();
+                let lane = match ANY && T::IS_BY_WORTH {
+                    true => place,
+                    false => T::order(node).add(place as usize).read() >> self.ray.shift & 7,
+                };
                 let mut room = MaybeUninit::uninit();
                 T::names(node, &mut room).add(lane as usize).cast::<ChildRef>().read()
             } else {
@@ -338,9 +356,12 @@ pub(super) unsafe fn one_of<S: Simd, T: Tree, A: Accept, const ANY: bool>(
             if walk.current.is_leaf() {
                 walk.visit_leaf::<S, T, A, ANY>(tree, accept);
             } else {
-                walk.visit_node::<S, T, true>(tree);
-                // Prefetches the entry that follows. (5 to 8 % of the time.)
-                tree.prefetch(walk.stack.child.get_unchecked(walk.stack.count - 1).assume_init());
+                walk.visit_node::<S, T, true, ANY>(tree);
+                // Prefetches what is next, before it is known to be a node or a leaf, and two entries that follow. (One entry
+                // alone takes 1 to 3 % more time; more are no faster: docs/experiments.md#single-rays.)
+                tree.prefetch(walk.current);
+                tree.prefetch(walk.stack.peek(0));
+                tree.prefetch(walk.stack.peek(1));
             }
         }
     }
@@ -436,7 +457,7 @@ pub(super) unsafe fn many<S: Simd, T: Tree, const ANY: bool>(
             // vouches for the ISA.
             let (walk, child) = unsafe {
                 let walk = *at_nodes.add(k);
-                (walk, (*walk).visit_node::<S, T, false>(tree))
+                (walk, (*walk).visit_node::<S, T, false, ANY>(tree))
             };
             enqueue(walk, child, &mut node_count, &mut leaf_count);
         }

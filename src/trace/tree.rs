@@ -23,6 +23,9 @@ pub(super) trait Tree {
     /// Distance in bytes between a node's rows of planes: minima of x, y, z, maxima of x, y, z.
     const ROW: u32;
 
+    /// Whether the children of a node come in the order in which rays to any hit should visit them, from last to first.
+    const IS_BY_WORTH: bool;
+
     /// Prefetches a child that will be visited soon.
     fn prefetch(&self, child: ChildRef);
 

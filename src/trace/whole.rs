@@ -11,6 +11,7 @@ impl Tree for Mbvh {
     type Leaf<'a> = Rows;
 
     const ROW: u32 = 4 * WIDTH as u32;
+    const IS_BY_WORTH: bool = true;
 
     #[inline(always)]
     fn prefetch(&self, child: ChildRef) {
