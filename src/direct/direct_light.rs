@@ -14,7 +14,7 @@ use super::light_tree::LIGHT_TREE;
 use super::many_lights::ManyLights;
 use super::point_light::push_one;
 use super::receiver::Receiver;
-use super::shadow_rays::{KINDS, ShadowRays, shadow_ray};
+use super::shadow_rays::{PointRoom, ShadowRays, shadow_ray};
 use super::sun_sky::{Disc, push_sky};
 use crate::error::Result;
 use crate::memory::try_collect;
@@ -75,6 +75,11 @@ impl Ratio {
 }
 
 impl PointLight {
+    /// Takes over the light that has arrived in a point's slots.
+    pub(crate) fn take(&mut self, sums: &[Vec3]) {
+        (self.sharp, self.sampled, self.discs.visible, self.areas.visible) = (sums[0], sums[1], sums[2], sums[3]);
+    }
+
     /// Adds `weight` times the light of another point.
     pub(crate) fn add(&mut self, other: &PointLight, weight: Vec3) {
         self.sharp += weight * other.sharp;
@@ -158,7 +163,11 @@ impl DirectLight {
         let area_count = areas.len();
         let few_points = points.len() <= MAX_EXACT;
         let few_areas = area_count <= MAX_EXACT;
-        let many = ManyLights::new(if few_points { &[] } else { &points }, if few_areas { &[] } else { &areas })?;
+        let many = ManyLights::new(
+            scene.device().isa(),
+            if few_points { &[] } else { &points },
+            if few_areas { &[] } else { &areas },
+        )?;
         if few_points {
             each.extend(points);
         }
@@ -228,9 +237,7 @@ impl DirectLight {
     /// Irradiance by samples; `by_ratio`: that of area lights and discs as their exact irradiance times the visible
     /// fraction.
     fn estimate(&self, receiver: &Receiver, samples: u32, seed: u32, rays: &mut u64, by_ratio: bool) -> Vec3 {
-        let mut light = [PointLight::default()];
-        self.at_points(&[*receiver], 0, Lights::All, samples, seed, rays, &mut light);
-        let [l] = light;
+        let l = self.at_point(receiver, Lights::All, samples, seed, rays);
         if by_ratio { l.value() } else { l.sharp + l.sampled + l.discs.visible + l.areas.visible }
     }
 
@@ -244,37 +251,43 @@ impl DirectLight {
         !self.areas.is_empty() || self.many.is_some() || !self.discs.is_empty() || !self.skies.is_empty()
     }
 
-    /// Direct light at up to [`MAX_POINTS`] points, which are the points `first`, `first + 1`, … of those that share
-    /// `seed`: their samples of a light are stratified together. `samples`: per point, as in
-    /// [`irradiance`](Self::irradiance).
-    // Seven arguments, no two of which belong together.
-    #[allow(clippy::too_many_arguments)]
-    pub(crate) fn at_points(
+    /// Direct light at one point. `samples`: as in [`irradiance`](Self::irradiance).
+    pub(crate) fn at_point(
         &self,
-        receivers: &[Receiver],
-        first: u32,
+        receiver: &Receiver,
         lights: Lights,
         samples: u32,
         seed: u32,
         rays: &mut u64,
-        out: &mut [PointLight],
-    ) {
-        let mut shadow = ShadowRays::new(&self.scene);
-        for (i, (receiver, out)) in receivers.iter().zip(&mut *out).enumerate() {
-            *out = PointLight::default();
-            shadow.slot = (KINDS * i) as u8;
-            if lights != Lights::Soft {
-                self.each.iter().for_each(|light| push_one(light, receiver, &mut shadow));
-            }
-            if lights != Lights::Sharp && samples > 0 {
-                self.push_soft(receiver, first + i as u32, samples, seed, &mut shadow, out);
-            }
+    ) -> PointLight {
+        let mut room = PointRoom::new();
+        let mut shadow = room.begin(&self.scene);
+        let mut light = self.push(receiver, 0, lights, samples, seed, &mut shadow);
+        light.take(shadow.finish(rays));
+        light
+    }
+
+    /// Pushes the shadow rays of a point, for the [`KINDS`](super::shadow_rays::KINDS) slots from the current one on. It
+    /// is point `number` of those that share `seed`: their samples of a light are stratified together. Returns the
+    /// point's light, which is to [take](PointLight::take) what arrives in these slots. `samples`: per point, as in
+    /// [`irradiance`](Self::irradiance).
+    pub(crate) fn push(
+        &self,
+        receiver: &Receiver,
+        number: u32,
+        lights: Lights,
+        samples: u32,
+        seed: u32,
+        shadow: &mut ShadowRays,
+    ) -> PointLight {
+        let mut out = PointLight::default();
+        if lights != Lights::Soft {
+            self.each.iter().for_each(|light| push_one(light, receiver, shadow));
         }
-        shadow.trace();
-        *rays += shadow.traced;
-        for (out, sums) in out.iter_mut().zip(shadow.visible.chunks_exact(KINDS)) {
-            (out.sharp, out.sampled, out.discs.visible, out.areas.visible) = (sums[0], sums[1], sums[2], sums[3]);
+        if lights != Lights::Sharp && samples > 0 {
+            self.push_soft(receiver, number, samples, seed, shadow, &mut out);
         }
+        out
     }
 
     /// Pushes the shadow rays of [`Lights::Soft`] from point `number` of those that share `seed`.

@@ -6,12 +6,13 @@
 //! of one descent per sample with splitting, all samples descend together: they are spaced systematically, (k +
 //! offset)/n, on the unit interval, each node divides its part of the interval among its children by importance, and
 //! children that no sample falls on are skipped. This spreads the samples evenly over the tree, and its upper nodes are
-//! visited once for all of them.
+//! visited once for all of them. The nodes of a level that samples fall on are weighed eight at a time.
 
+use super::light_node::{Bounds, ImportanceFn, Node, kernel};
 use crate::error::Result;
 use crate::memory::{try_collect, try_with_capacity};
+use crate::simd::Isa;
 use glam::Vec3;
-use std::f32::consts::PI;
 
 /// Name of these buffers in error messages.
 pub(crate) const LIGHT_TREE: &str = "the tree of the lights";
@@ -22,134 +23,25 @@ const BINS: usize = 12;
 /// From this depth on nodes are halved, so that the tree is never deeper than some 70 nodes.
 const HALVE_FROM: u32 = 40;
 
-/// Bounds of one light, or of several.
-#[derive(Clone, Copy, Debug)]
-pub(crate) struct Bounds {
-    pub lower: Vec3,
-    pub upper: Vec3,
-    /// Directions of the lights' axes: a cone of half-angle `spread` around this unit vector.
-    pub axis: Vec3,
-    pub spread: f32,
-    /// Maximum angle from their axes at which the lights shine, at most π/2. (An area light: π/2, with the cosine. A
-    /// spot has all of its cone as `spread`, and 0.)
-    pub reach: f32,
-    /// Sum over the channels of radiant intensity, in the direction where it is largest.
-    pub power: f32,
-}
-
-impl Bounds {
-    fn union(&self, o: &Bounds) -> Bounds {
-        let (axis, spread) = cone_union((self.axis, self.spread), (o.axis, o.spread));
-        Bounds {
-            lower: self.lower.min(o.lower),
-            upper: self.upper.max(o.upper),
-            axis,
-            spread,
-            reach: self.reach.max(o.reach),
-            power: self.power + o.power,
-        }
-    }
-
-    /// Surface area orientation heuristic, section 4.4 of the paper, with the square of the diagonal for the surface
-    /// area, which a row or a ceiling of lamps lacks.
-    fn cost(&self) -> f32 {
-        let (o, w) = (self.spread, (self.spread + self.reach).min(PI));
-        let directions = 2.0 * PI * (1.0 - o.cos())
-            + PI / 2.0 * (2.0 * w * o.sin() - (o - 2.0 * w).cos() - 2.0 * o * o.sin() + o.cos());
-        self.power * directions * (self.upper - self.lower).length_squared()
-    }
-}
-
-/// The smallest cone, as axis and half-angle, that contains two.
-fn cone_union(a: (Vec3, f32), b: (Vec3, f32)) -> (Vec3, f32) {
-    let (a, b) = if a.1 >= b.1 { (a, b) } else { (b, a) };
-    let between = a.0.angle_between(b.0);
-    if a.1 >= PI || (between + b.1).min(PI) <= a.1 {
-        return a;
-    }
-    let spread = 0.5 * (a.1 + between + b.1);
-    let around = a.0.cross(b.0).normalize_or_zero();
-    if spread >= PI || around == Vec3::ZERO {
-        return (a.0, PI);
-    }
-    let turn = spread - a.1;
-    // Slightly enlarged to cover rounding.
-    ((a.0 * turn.cos() + around.cross(a.0) * turn.sin()).normalize(), (spread + 1e-5).min(PI))
-}
-
-/// A node of 48 bytes; the left child of an inner node follows it.
-#[derive(Clone, Copy, Debug)]
-struct Node {
-    centre: Vec3,
-    /// Square of the radius of the bounding sphere.
-    radius2: f32,
-    axis: Vec3,
-    power: f32,
-    cos_spread: f32,
-    sin_spread: f32,
-    cos_reach: f32,
-    /// Right child; for a leaf, the complement of its light's number.
-    right: u32,
-}
-
-impl Node {
-    fn new(b: &Bounds, right: u32) -> Node {
-        Node {
-            centre: 0.5 * (b.lower + b.upper),
-            radius2: 0.25 * (b.upper - b.lower).length_squared() * (1.0 + 1e-5),
-            axis: b.axis,
-            power: b.power,
-            cos_spread: if b.spread >= PI { -1.0 } else { b.spread.cos() },
-            sin_spread: if b.spread >= PI { 0.0 } else { b.spread.sin() },
-            // Slightly enlarged to cover rounding.
-            cos_reach: (b.reach + 1e-4).cos(),
-            right,
-        }
-    }
-
-    /// Importance of the node's lights for a receiver, section 4.3 of the paper. (With the distance to the nearest
-    /// point instead of the centre of a node: 1.3 to 2 times the error.)
-    #[inline]
-    fn importance(&self, position: Vec3, normal: Vec3) -> f32 {
-        let way = self.centre - position;
-        let d2 = way.length_squared();
-        if d2 <= self.radius2 {
-            return self.power / self.radius2.max(f32::MIN_POSITIVE);
-        }
-        let inverse = 1.0 / d2.sqrt();
-        let sin2 = self.radius2 / d2;
-        let (sin_size, cos_size) = (sin2.sqrt(), (1.0 - sin2).sqrt());
-        let here = less(way.dot(normal) * inverse, cos_size, sin_size);
-        if here <= 0.0 {
-            return 0.0;
-        }
-        let there = less(-way.dot(self.axis) * inverse, self.cos_spread, self.sin_spread);
-        let there = less(there, cos_size, sin_size);
-        if there < self.cos_reach {
-            return 0.0;
-        }
-        self.power * here * there.max(1e-3) / d2
-    }
-}
-
-/// Cosine of the angle with cosine `cosine`, reduced by another angle, but not below 0.
-#[inline]
-fn less(cosine: f32, by_cos: f32, by_sin: f32) -> f32 {
-    if cosine >= by_cos {
-        return 1.0;
-    }
-    cosine * by_cos + (1.0 - cosine * cosine).max(0.0).sqrt() * by_sin
-}
-
 /// Light tree over some of the lights of a scene, ready to be sampled.
 pub(crate) struct LightTree {
     nodes: Vec<Node>,
+    importances: ImportanceFn,
+}
+
+/// Part of the unit interval, times the number of samples, that falls on a node.
+#[derive(Clone, Copy)]
+struct Part {
+    node: u32,
+    from: f64,
+    to: f64,
 }
 
 impl LightTree {
-    /// Builds the tree over the lights whose power is greater than 0.
-    pub(crate) fn new(lights: &[Bounds]) -> Result<LightTree> {
-        let mut tree = LightTree { nodes: try_with_capacity((2 * lights.len()).saturating_sub(1), LIGHT_TREE)? };
+    /// Builds the tree over the lights whose power is greater than 0, to be sampled by the kernels of an ISA.
+    pub(crate) fn new(isa: Isa, lights: &[Bounds]) -> Result<LightTree> {
+        let nodes = try_with_capacity((2 * lights.len()).saturating_sub(1), LIGHT_TREE)?;
+        let mut tree = LightTree { nodes, importances: kernel(isa) };
         // Powers are taken as parts of the whole: those of large scenes would overflow when multiplied by squared
         // lengths.
         let whole = lights.iter().map(|l| f64::from(l.power)).sum::<f64>();
@@ -191,38 +83,53 @@ impl LightTree {
         (position, normal): (Vec3, Vec3),
         n: u32,
         offset: f32,
-        visit: &mut impl FnMut(usize, f32, u32),
+        mut visit: impl FnMut(usize, f32, u32),
     ) {
-        if !self.nodes.is_empty() {
-            self.descend(0, position, normal, (0.0, n as f64), offset as f64, visit);
-        }
-    }
-
-    fn descend(
-        &self,
-        node: u32,
-        position: Vec3,
-        normal: Vec3,
-        (from, to): (f64, f64),
-        offset: f64,
-        visit: &mut impl FnMut(usize, f32, u32),
-    ) {
-        let samples = |from: f64, to: f64| ceil(to - offset) - ceil(from - offset);
-        let right = self.nodes[node as usize].right;
-        if right > i32::MAX as u32 {
-            return visit(!right as usize, (to - from) as f32, samples(from, to) as u32);
-        }
-        let left = node + 1;
-        let [l, r] = [left, right].map(|n| self.nodes[n as usize].importance(position, normal) as f64);
-        if !(l + r > 0.0) {
+        if self.nodes.is_empty() {
             return;
         }
-        let middle = if r == 0.0 { to } else { from + (to - from) * (l / (l + r)) };
-        if samples(from, middle) > 0.0 {
-            self.descend(left, position, normal, (from, middle), offset, visit);
+        let samples = |from: f64, to: f64| ceil(to - offset as f64) - ceil(from - offset as f64);
+        // The parts of a level in order; each but the root's has a sample. (Eight at a time, level by level, a round of
+        // gather rays with 45,000 bright patches takes 0.43 of the time of descents one after the other.)
+        let most = n as usize + 1;
+        let (mut level, mut next) = (Vec::with_capacity(most), Vec::with_capacity(most));
+        let (mut children, mut importances) = (Vec::with_capacity(2 * most), Vec::with_capacity(2 * most));
+        level.push(Part { node: 0, from: 0.0, to: n as f64 });
+        let right_of = |part: &Part| self.nodes[part.node as usize].right;
+        let is_leaf = |part: &Part| right_of(part) > i32::MAX as u32;
+        loop {
+            children.clear();
+            children.extend(level.iter().filter(|&p| !is_leaf(p)).flat_map(|p| [p.node + 1, right_of(p)]));
+            if children.is_empty() {
+                break;
+            }
+            importances.resize(children.len(), 0.0);
+            (self.importances)(&self.nodes, &children, [position, normal], &mut importances);
+            let mut of_children = importances.chunks_exact(2).zip(children.chunks_exact(2));
+            next.clear();
+            for part in &level {
+                if is_leaf(part) {
+                    next.push(*part);
+                    continue;
+                }
+                let Some((weights, nodes)) = of_children.next() else { break };
+                let (l, r) = (weights[0] as f64, weights[1] as f64);
+                if !(l + r > 0.0) {
+                    continue;
+                }
+                let (from, to) = (part.from, part.to);
+                let middle = if r == 0.0 { to } else { from + (to - from) * (l / (l + r)) };
+                if samples(from, middle) > 0.0 {
+                    next.push(Part { node: nodes[0], from, to: middle });
+                }
+                if samples(middle, to) > 0.0 {
+                    next.push(Part { node: nodes[1], from: middle, to });
+                }
+            }
+            std::mem::swap(&mut level, &mut next);
         }
-        if samples(middle, to) > 0.0 {
-            self.descend(right, position, normal, (middle, to), offset, visit);
+        for part in &level {
+            visit(!right_of(part) as usize, (part.to - part.from) as f32, samples(part.from, part.to) as u32);
         }
     }
 }
@@ -307,6 +214,7 @@ fn ceil(x: f64) -> f64 {
 mod tests {
     use super::*;
     use crate::sampling::{uniform, uniform_sphere};
+    use std::f32::consts::PI;
 
     fn random_lights(count: u32, seed: u32) -> Vec<Bounds> {
         (0..count)
@@ -328,7 +236,7 @@ mod tests {
     #[test]
     fn every_light_that_can_shine_on_a_receiver_is_sampled_as_often_as_due() {
         let lights = random_lights(300, 1);
-        let tree = LightTree::new(&lights).unwrap();
+        let tree = LightTree::new(Isa::best(), &lights).unwrap();
         for i in 0..40 {
             let r = |d| uniform(i, d, 2);
             let position = Vec3::new(r(0), r(1), r(2)) * 14.0 - 2.0;
@@ -337,7 +245,7 @@ mod tests {
             let (rounds, n) = (2000, 16);
             let mut sampled = vec![0.0; lights.len()];
             for round in 0..rounds {
-                tree.sample((position, normal), n, (round as f32 + 0.5) / rounds as f32, &mut |light, d, count| {
+                tree.sample((position, normal), n, (round as f32 + 0.5) / rounds as f32, |light, d, count| {
                     due[light] = d;
                     sampled[light] += count as f32 / rounds as f32;
                     assert!(count as f32 >= d.floor() && count as f32 <= d.ceil());
@@ -384,11 +292,11 @@ mod tests {
     fn lights_in_one_place_and_no_lights_make_trees() {
         let b = random_lights(1, 3)[0];
         let mut seen = 0;
-        LightTree::new(&[b; 100])
+        LightTree::new(Isa::best(), &[b; 100])
             .unwrap()
-            .sample((b.lower - b.axis, Vec3::X), 50, 0.5, &mut |_, _, count| seen += count);
+            .sample((b.lower - b.axis, Vec3::X), 50, 0.5, |_, _, count| seen += count);
         assert!(seen == 50 || seen == 0);
-        LightTree::new(&[]).unwrap().sample((Vec3::ZERO, Vec3::X), 50, 0.5, &mut |_, _, _| panic!());
+        LightTree::new(Isa::best(), &[]).unwrap().sample((Vec3::ZERO, Vec3::X), 50, 0.5, |_, _, _| panic!());
         assert_eq!(size_of::<Node>(), 48);
     }
 }

@@ -9,7 +9,8 @@
 //! At equal time 10 to 40 times less error than lights chosen by power; see docs/experiments.md#many-lights.
 
 use super::area_light::AreaLight;
-use super::light_tree::{Bounds, LIGHT_TREE, LightTree};
+use super::light_node::Bounds;
+use super::light_tree::{LIGHT_TREE, LightTree};
 use super::point_light::point_light;
 use super::receiver::Receiver;
 use super::shadow_rays::{ShadowRays, shadow_ray};
@@ -17,6 +18,7 @@ use crate::error::Result;
 use crate::memory::try_collect;
 use crate::sampling::{combine, sobol_2d};
 use crate::scene::Light;
+use crate::simd::Isa;
 use glam::Vec3;
 use std::f32::consts::{FRAC_PI_2, PI};
 
@@ -70,19 +72,19 @@ struct Candidate {
 
 impl ManyLights {
     /// Makes the set of point and spot lights that shine, and of area lights.
-    pub(crate) fn new(points: &[Light], areas: &[AreaLight]) -> Result<ManyLights> {
+    pub(crate) fn new(isa: Isa, points: &[Light], areas: &[AreaLight]) -> Result<ManyLights> {
         let sources = points.iter().map(|&p| Source::Point(p)).chain(areas.iter().map(|&a| Source::Area(a)));
-        ManyLights::of(try_collect(sources, LIGHT_TREE)?)
+        ManyLights::of(isa, try_collect(sources, LIGHT_TREE)?)
     }
 
     /// Makes the set of small parts of surfaces.
-    pub(crate) fn of_patches(patches: Vec<Patch>) -> Result<ManyLights> {
-        ManyLights::of(try_collect(patches.into_iter().map(Source::Patch), LIGHT_TREE)?)
+    pub(crate) fn of_patches(isa: Isa, patches: Vec<Patch>) -> Result<ManyLights> {
+        ManyLights::of(isa, try_collect(patches.into_iter().map(Source::Patch), LIGHT_TREE)?)
     }
 
-    fn of(sources: Vec<Source>) -> Result<ManyLights> {
+    fn of(isa: Isa, sources: Vec<Source>) -> Result<ManyLights> {
         let bounds = try_collect(sources.iter().map(bounds), LIGHT_TREE)?;
-        Ok(ManyLights { tree: LightTree::new(&bounds)?, sources })
+        Ok(ManyLights { tree: LightTree::new(isa, &bounds)?, sources })
     }
 
     pub(crate) fn bytes(&self) -> usize {
@@ -121,7 +123,7 @@ impl ManyLights {
         let mut candidates = Vec::with_capacity(n as usize);
         let offset = sobol_2d(0, combine(seed, 1))[0];
         let mut next = 0;
-        self.tree.sample((receiver.origin, receiver.normal), n, offset, &mut |light, due, count| {
+        self.tree.sample((receiver.origin, receiver.normal), n, offset, |light, due, count| {
             // A light that is due several candidates gets that number rounded down or up and divides its light among
             // them.
             let share = 1.0 / if due >= 1.0 { count as f32 } else { due };

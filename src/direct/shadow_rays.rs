@@ -1,6 +1,11 @@
 //! Shadow rays, collected and traced together, with the unoccluded light of each.
+//!
+//! Those of a tile of texels go down the tree as a [stream](crate::trace). The light that arrives is added up per slot in
+//! the order of the rays, whatever is traced together: a point has the same bits alone and in a tile.
 
 use super::receiver::Receiver;
+use crate::error::Result;
+use crate::memory::try_filled;
 use crate::scene::Scene;
 use crate::trace::Ray;
 use crate::trace::offset::ray_epsilon;
@@ -14,45 +19,104 @@ pub(crate) fn shadow_ray(receiver: &Receiver, target: Vec3) -> Ray {
     Ray::new(receiver.shadow_origin, target - receiver.shadow_origin).within(0.0, 1.0 - LIGHT_MARGIN)
 }
 
-/// Number of shadow rays that are traced together. (Direct light of the living room, 20 texels/m: 1.4 s; one by one
-/// 2.15 s.)
+/// Number of shadow rays of one point that are traced together. (Direct light of the living room, 20 texels/m: 1.4 s; one
+/// by one 2.15 s.)
 const TOGETHER: usize = 32;
 
-/// Number of sums of light that [`ShadowRays`] keeps apart.
-const SLOTS: usize = KINDS * MAX_POINTS;
+/// Maximum number of shadow rays of a tile that are traced together, and the minimum that are worth a stream.
+const STREAM: usize = 2048;
+const LEAST_STREAM: usize = 32;
+
+/// Number of parts of a point's light that are estimated in different ways.
+pub(crate) const KINDS: usize = 4;
+
+/// A shadow ray's light if nothing occludes it, and the sum that it belongs to.
+#[derive(Clone, Copy, Default)]
+pub(crate) struct Carried {
+    light: Vec3,
+    slot: u32,
+}
+
+/// Room for the shadow rays of points: in arrays on the stack for one point, in vectors for tiles.
+pub(crate) struct Room<R, C, O, V> {
+    rays: R,
+    carried: C,
+    occluded: O,
+    visible: V,
+}
+
+/// Room for one point.
+pub(crate) type PointRoom = Room<[Ray; TOGETHER], [Carried; TOGETHER], [u8; TOGETHER], [Vec3; KINDS]>;
+
+/// Room for a tile.
+pub(crate) type TileRoom = Room<Vec<Ray>, Vec<Carried>, Vec<u8>, Vec<Vec3>>;
+
+const NOTHING: Ray = Ray { origin: [0.0; 3], tmin: 0.0, direction: [0.0; 3], tmax: 0.0 };
+
+impl PointRoom {
+    pub(crate) fn new() -> Self {
+        Room {
+            rays: [NOTHING; TOGETHER],
+            carried: [Carried::default(); TOGETHER],
+            occluded: [0; TOGETHER],
+            visible: [Vec3::ZERO; KINDS],
+        }
+    }
+}
+
+impl TileRoom {
+    /// Allocates room for the rays of a number of points and for `slots` sums. (More rays are traced in parts.)
+    pub(crate) fn new(slots: usize, points: usize) -> Result<Self> {
+        let what = "the shadow rays of a tile";
+        let most = (2 * points).clamp(TOGETHER, STREAM);
+        Ok(Room {
+            rays: try_filled(most, NOTHING, what)?,
+            carried: try_filled(most, Carried::default(), what)?,
+            occluded: try_filled(most, 0, what)?,
+            visible: try_filled(slots, Vec3::ZERO, what)?,
+        })
+    }
+}
+
+impl<R: AsMut<[Ray]>, C: AsMut<[Carried]>, O: AsMut<[u8]>, V: AsMut<[Vec3]>> Room<R, C, O, V> {
+    /// Returns shadow rays in a scene, none so far, whose sums are 0.
+    pub(crate) fn begin<'a>(&'a mut self, scene: &'a Scene) -> ShadowRays<'a> {
+        let visible = self.visible.as_mut();
+        visible.fill(Vec3::ZERO);
+        ShadowRays {
+            scene,
+            rays: self.rays.as_mut(),
+            carried: self.carried.as_mut(),
+            occluded: self.occluded.as_mut(),
+            visible,
+            count: 0,
+            traced: 0,
+            slot: 0,
+        }
+    }
+}
 
 /// Shadow rays, each with the light that it carries if nothing occludes it.
 pub(crate) struct ShadowRays<'a> {
     scene: &'a Scene,
-    rays: [Ray; TOGETHER],
-    light: [Vec3; TOGETHER],
-    slots: [u8; TOGETHER],
+    rays: &'a mut [Ray],
+    carried: &'a mut [Carried],
+    occluded: &'a mut [u8],
+    /// Light that has arrived, by slot.
+    visible: &'a mut [Vec3],
     count: usize,
-    pub(super) traced: u64,
+    traced: u64,
     /// The sum that the next rays belong to.
-    pub(super) slot: u8,
-    pub(super) visible: [Vec3; SLOTS],
+    pub(crate) slot: usize,
 }
 
-impl<'a> ShadowRays<'a> {
-    pub(crate) fn new(scene: &'a Scene) -> Self {
-        ShadowRays {
-            scene,
-            rays: [Ray::new(Vec3::ZERO, Vec3::ZERO); TOGETHER],
-            light: [Vec3::ZERO; TOGETHER],
-            slots: [0; TOGETHER],
-            count: 0,
-            traced: 0,
-            slot: 0,
-            visible: [Vec3::ZERO; SLOTS],
-        }
-    }
-
+impl ShadowRays<'_> {
     pub(crate) fn push(&mut self, ray: Ray, light: Vec3) {
-        if self.count == TOGETHER {
+        if self.count == self.rays.len() {
             self.trace();
         }
-        (self.rays[self.count], self.light[self.count], self.slots[self.count]) = (ray, light, self.slot);
+        self.rays[self.count] = ray;
+        self.carried[self.count] = Carried { light, slot: self.slot as u32 };
         self.count += 1;
     }
 
@@ -64,34 +128,31 @@ impl<'a> ShadowRays<'a> {
         self.push(Ray::new(receiver.shadow_origin, way).within(0.0, 1.0 - margin), light);
     }
 
-    pub(super) fn trace(&mut self) {
+    fn trace(&mut self) {
         let scene = self.scene;
-        let lit = self.light[..self.count].iter().zip(&self.slots);
+        let (rays, carried) = (&self.rays[..self.count], &self.carried[..self.count]);
         if scene.uses().transmission {
-            for (ray, (light, &slot)) in self.rays[..self.count].iter().zip(lit) {
-                self.visible[slot as usize] += *light * scene.transmittance(ray);
+            for (ray, c) in rays.iter().zip(carried) {
+                self.visible[c.slot as usize] += c.light * scene.transmittance(ray);
             }
         } else {
-            let mut occluded = [0; TOGETHER];
-            scene.occluded_block(&self.rays[..self.count], &mut occluded);
-            for ((light, &slot), _) in lit.zip(occluded).filter(|(_, occluded)| *occluded == 0) {
-                self.visible[slot as usize] += *light;
+            let occluded = &mut self.occluded[..self.count];
+            match self.count >= LEAST_STREAM {
+                true => scene.occluded_stream(rays, occluded),
+                false => scene.occluded_block(rays, occluded),
+            }
+            for (c, _) in carried.iter().zip(occluded).filter(|(_, occluded)| **occluded == 0) {
+                self.visible[c.slot as usize] += c.light;
             }
         }
         self.traced += self.count as u64;
         self.count = 0;
     }
 
-    /// Traces the remaining rays and returns the light that arrives; adds the rays traced to `rays`.
-    pub(crate) fn finish(mut self, rays: &mut u64) -> Vec3 {
+    /// Traces the remaining rays and returns the light that has arrived, by slot; adds the rays traced to `rays`.
+    pub(crate) fn finish(&mut self, rays: &mut u64) -> &[Vec3] {
         self.trace();
-        *rays += self.traced;
-        self.visible[0]
+        *rays += std::mem::take(&mut self.traced);
+        self.visible
     }
 }
-
-/// Maximum number of points that are lit together.
-pub(crate) const MAX_POINTS: usize = 16;
-
-/// Number of parts of a point's light that are estimated in different ways.
-pub(crate) const KINDS: usize = 4;

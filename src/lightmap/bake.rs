@@ -8,18 +8,19 @@ use super::indirect::blur;
 use super::indirect::blur::Filling;
 use super::indirect::bright_patches::Bright;
 use super::indirect::find_bright_patches;
-use super::indirect::gather::{Gathered, TILE, Tile, TileTexel};
+use super::indirect::gather::{Gathered, Tile, TileTexel};
 use super::indirect::radiance_map::{self, Radiance, RadianceInput, RadianceMap};
 use super::indirect::sample_set::SampleSet;
 use super::indirect::upsample::{OWN_RAYS, OwnLight, OwnRays, Upsampling};
 use super::plan::{Plan, left_out};
 use super::saved::checkpoint::Checkpoint;
 use super::seams::Stitch;
-use super::texel_light::{TexelLight, Variation};
+use super::texel_light::{Averaged, TexelLight, TilePoints, Variation};
+use super::tiles::{TILE, in_order};
 use super::{BakeParams, BakeStats, CheckpointParams, Light, Lightmap, Origin, StageStats, TexelState};
 use crate::direct::DirectLight;
 use crate::error::{Error, Result, invalid_argument};
-use crate::memory::{try_filled, try_vec};
+use crate::memory::{try_filled, try_vec, try_with_capacity};
 use crate::photon::{PhotonMap, PhotonParams};
 use crate::progress::{Progress, Stage};
 use crate::sampling::{combine, purpose_seed};
@@ -32,7 +33,7 @@ use std::sync::atomic::{AtomicU64, Ordering::Relaxed};
 use std::time::Instant;
 
 /// Texels handed to a thread at a time.
-const BLOCK: usize = 256;
+const BLOCK: usize = 1024;
 
 /// Bytes per gather texel while a bake runs: light, blurred light, normal, variance, validity.
 const GATHER_BYTES: usize = 3 * size_of::<Vec3>() + size_of::<f32>() + size_of::<bool>();
@@ -347,21 +348,20 @@ impl Bake<'_, '_> {
                     return stage.advance(values.len() as u64);
                 }
                 let (mut traced, mut tile) = (0, Tile::new()?);
-                for start in (0..values.len()).step_by(TILE) {
+                let first = needed.start + block * BLOCK;
+                for samples_of_tile in in_order(&l.gather, first..first + values.len())?.chunks(TILE) {
                     self.progress.check()?;
-                    let first = needed.start + block * BLOCK;
-                    let samples_of_tile = first + start..first + values.len().min(start + TILE);
-                    let texel = |s: usize| TileTexel {
-                        receiver: l.receiver(&l.gather, backs, s),
-                        seed: combine(seed, s as u32),
+                    let texel = |&s: &u32| TileTexel {
+                        receiver: l.receiver(&l.gather, backs, s as usize),
+                        seed: combine(seed, s),
                         gathered: Gathered::default(),
                     };
-                    let mut texels: Vec<_> = samples_of_tile.map(texel).collect();
+                    let mut texels: Vec<_> = samples_of_tile.iter().map(texel).collect();
                     for round in 0..samples.rounds() {
                         traced += tile.add_round(&l.scene, &lookup, &mut texels, &samples, round);
                     }
-                    for (i, TileTexel { receiver, gathered, .. }) in texels.iter().enumerate() {
-                        let i = start + i;
+                    for (&sample, TileTexel { receiver, gathered, .. }) in samples_of_tile.iter().zip(&texels) {
+                        let i = sample as usize - first;
                         (values[i], normals[i]) = (gathered.irradiance(), receiver.normal);
                         (variances[i], valid[i]) = (gathered.variance(), gathered.is_visible());
                     }
@@ -454,16 +454,19 @@ impl Bake<'_, '_> {
                 if *known {
                     return stage.advance(direct.len() as u64);
                 }
-                for i in 0..direct.len() {
-                    self.progress.check()?;
-                    let sample = first + i;
-                    let receiver = l.receiver(&l.map, backs, sample);
-                    state[i] = match l.buried.get(sample) {
+                for (i, state) in state.iter_mut().enumerate() {
+                    *state = match l.buried.get(first + i) {
                         Some(true) => TexelState::Hidden,
                         _ => TexelState::Visible,
                     };
-                    if self.plan.runs(left_out::DIRECT) {
-                        direct[i] = texels.sharp(&receiver, &mut traced);
+                }
+                if self.plan.runs(left_out::DIRECT) && self.direct.has_sharp() {
+                    let mut tile = TilePoints::new(TILE)?;
+                    for samples in in_order(&l.map, first..first + direct.len())?.chunks(4 * TILE) {
+                        self.progress.check()?;
+                        let receivers = samples.iter().map(|&s| l.receiver(&l.map, backs, s as usize));
+                        let place = |i: usize| samples[i] as usize - first;
+                        texels.sharp_of_tile(receivers, &mut tile, &mut traced, |i, sharp| direct[place(i)] = sharp);
                     }
                 }
                 if let Some(c) = self.checkpoint.filter(|_| !self.plan.runs(left_out::DIRECT)) {
@@ -530,12 +533,21 @@ impl Bake<'_, '_> {
                 if known[block] {
                     return stage.advance(direct.len() as u64);
                 }
-                let mut traced = 0;
-                for (i, (direct, &variation)) in direct.iter_mut().zip(variations).enumerate() {
+                let (mut traced, first) = (0, range.start + block * BLOCK);
+                let mut tile = TilePoints::new(TILE)?;
+                let mut of_tile = try_with_capacity(TILE, "the texels of a tile")?;
+                for samples in in_order(&l.map, first..first + direct.len())?.chunks(TILE) {
                     self.progress.check()?;
-                    let sample = range.start + block * BLOCK + i;
-                    let (back, receiver) = (l.is_back(&l.map, backs, sample), l.receiver(&l.map, backs, sample));
-                    *direct = texels.irradiance(sample, back, &receiver, *direct, variation, &mut traced);
+                    of_tile.clear();
+                    of_tile.extend(samples.iter().map(|&s| s as usize).map(|sample| Averaged {
+                        sample,
+                        back: l.is_back(&l.map, backs, sample),
+                        receiver: l.receiver(&l.map, backs, sample),
+                        sharp: direct[sample - first],
+                        variation: variations[sample - first],
+                    }));
+                    let place = |i: usize| samples[i] as usize - first;
+                    texels.irradiance(&of_tile, &mut tile, &mut traced, |i, e| direct[place(i)] = e);
                 }
                 if let Some(c) = self.checkpoint {
                     c.keep_lit(block, direct, state);

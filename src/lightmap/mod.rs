@@ -13,6 +13,7 @@ mod readback;
 pub(crate) mod saved;
 mod seams;
 pub(crate) mod texel_light;
+pub(crate) mod tiles;
 
 use crate::error::{Result, invalid_argument};
 use crate::memory::Reservation;

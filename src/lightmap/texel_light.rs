@@ -13,21 +13,28 @@
 //! would leak in.
 //!
 //! The data used of neighbours is a function of their numbers alone, so that shards of a bake and tiles of live
-//! updates, which recompute it, have the same bits.
+//! updates, which recompute it, have the same bits. The shadow rays of a [tile](super::tiles) are traced together, which
+//! changes no bit.
 
 use super::atlas::Atlas;
 use super::atlas::chart_index::ChartIndex;
 use super::atlas::chart_map::{ChartMap, receiver_of};
 use super::atlas::charts::Charts;
 use super::atlas::texels::TexelSample;
+use super::tiles::TILE;
 use crate::direct::Receiver;
 use crate::direct::direct_light::{DirectLight, Lights, PointLight};
-use crate::direct::shadow_rays::MAX_POINTS;
+use crate::direct::shadow_rays::{KINDS, TileRoom};
+use crate::error::Result;
+use crate::memory::{try_filled, try_with_capacity};
 use crate::sampling::{combine, orthonormal_basis, sobol_2d};
 use crate::scene::{NONE, Scene};
 use crate::trace::Ray;
 use glam::{Vec2, Vec3};
 use std::ops::Range;
+
+/// Maximum number of points of a texel that are lit together.
+const MAX_POINTS: usize = 16;
 
 /// Number of points in a texel in which light is not known to vary.
 const FEW: u32 = 4;
@@ -101,12 +108,44 @@ pub(crate) struct TexelLight<'a> {
     pub seed: u32,
 }
 
-/// Points of a texel and their light.
-struct Points {
-    samples: [TexelSample; MAX_POINTS],
-    lights: [PointLight; MAX_POINTS],
-    receivers: [Receiver; MAX_POINTS],
-    count: usize,
+/// A point of a texel and its light.
+#[derive(Clone, Copy)]
+struct Point {
+    on: TexelSample,
+    receiver: Receiver,
+    light: PointLight,
+}
+
+/// Points of the texels of a tile, up to [`MAX_POINTS`] of each at a time.
+pub(crate) struct TilePoints {
+    points: Vec<Point>,
+    /// Number of points of each texel.
+    counts: Vec<usize>,
+    /// Points whose light has not arrived yet.
+    pending: Vec<u32>,
+    room: TileRoom,
+}
+
+/// Points of a texel that are to be lit.
+struct Wanted {
+    /// Place of the texel in its tile.
+    texel: usize,
+    sample: usize,
+    back: bool,
+    numbers: Range<u32>,
+    lights: Lights,
+}
+
+/// A texel whose direct light is to be averaged.
+#[derive(Clone, Copy)]
+pub(crate) struct Averaged {
+    pub sample: usize,
+    pub back: bool,
+    /// The texel's sample.
+    pub receiver: Receiver,
+    /// The light of its sample without penumbrae.
+    pub sharp: Vec3,
+    pub variation: Variation,
 }
 
 impl TexelLight<'_> {
@@ -115,9 +154,29 @@ impl TexelLight<'_> {
         if !self.direct.has_sharp() {
             return Vec3::ZERO;
         }
-        let mut out = [PointLight::default()];
-        self.direct.at_points(&[*receiver], 0, Lights::Sharp, 0, 0, rays, &mut out);
-        out[0].sharp
+        self.direct.at_point(receiver, Lights::Sharp, 0, 0, rays).sharp
+    }
+
+    /// Computes light without penumbrae at the samples of a tile.
+    pub(crate) fn sharp_of_tile(
+        &self,
+        receivers: impl Iterator<Item = Receiver>,
+        tile: &mut TilePoints,
+        rays: &mut u64,
+        mut out: impl FnMut(usize, Vec3),
+    ) {
+        let mut shadow = tile.room.begin(self.areas.scene);
+        let mut count = 0;
+        for receiver in receivers {
+            shadow.slot = KINDS * count;
+            self.direct.push(&receiver, 0, Lights::Sharp, 0, 0, &mut shadow);
+            count += 1;
+        }
+        let mut light = PointLight::default();
+        for (i, sums) in shadow.finish(rays).chunks_exact(KINDS).take(count).enumerate() {
+            light.take(sums);
+            out(i, light.sharp);
+        }
     }
 
     /// Whether light without penumbrae varies in a texel, judged by its neighbours: `sharp` is the texel's own light,
@@ -138,75 +197,103 @@ impl TexelLight<'_> {
         variation
     }
 
-    /// Computes the direct light of a texel whose sample is `receiver` and has the light `sharp`.
+    /// Computes the direct light of the texels of a tile.
     pub(crate) fn irradiance(
         &self,
-        sample: usize,
-        back: bool,
-        receiver: &Receiver,
-        sharp: Vec3,
-        variation: Variation,
+        texels: &[Averaged],
+        tile: &mut TilePoints,
         rays: &mut u64,
-    ) -> Vec3 {
+        mut out: impl FnMut(usize, Vec3),
+    ) {
         let soft = self.direct.has_soft();
-        if variation == Variation::None && !soft {
-            return sharp;
-        }
-        let lights = match (variation, soft) {
-            (Variation::None, _) => Lights::Soft,
-            (_, false) => Lights::Sharp,
-            (_, true) => Lights::All,
+        let lights_of = |variation| match (variation, soft) {
+            (Variation::None, false) => None,
+            (Variation::None, true) => Some(Lights::Soft),
+            (_, false) => Some(Lights::Sharp),
+            (_, true) => Some(Lights::All),
         };
-        let mut points = Points::new(receiver);
-        let few = if variation == Variation::Some { MAX_POINTS as u32 } else { FEW };
-        self.light_points(&mut points, sample, back, 0..few, lights, rays);
-        let goes_on = few == FEW
-            && (points.penumbra()
-                || (variation == Variation::Unknown && points.differ(PointLight::narrow, DIFFERENCE)));
-        if goes_on {
-            self.light_points(&mut points, sample, back, FEW..MAX_POINTS as u32, lights, rays);
+        let few = |variation| if variation == Variation::Some { MAX_POINTS as u32 } else { FEW };
+        let wanted = |texel: usize, t: &Averaged, numbers| {
+            let lights = lights_of(t.variation)?;
+            Some(Wanted { texel, sample: t.sample, back: t.back, numbers, lights })
+        };
+        let first = texels.iter().enumerate().filter_map(|(i, t)| wanted(i, t, 0..few(t.variation)));
+        tile.clear();
+        tile.light(self, first, rays);
+        let mut goes_on = [false; TILE];
+        for (i, (t, goes_on)) in texels.iter().zip(&mut goes_on).enumerate() {
+            let points = tile.of(i);
+            *goes_on = few(t.variation) == FEW
+                && (has_penumbra(points)
+                    || (t.variation == Variation::Unknown && vary(points, PointLight::narrow, DIFFERENCE)));
         }
-        if variation != Variation::None {
-            points.leave_out_other_rooms(self.areas.scene, receiver, sharp, rays);
+        let more = texels.iter().enumerate().filter(|(i, _)| goes_on[*i]);
+        tile.light(self, more.filter_map(|(i, t)| wanted(i, t, FEW..MAX_POINTS as u32)), rays);
+        for (i, t) in texels.iter().enumerate() {
+            let e = match lights_of(t.variation) {
+                Some(_) => self.average(t, tile.of_mut(i), goes_on[i], rays),
+                None => t.sharp,
+            };
+            out(i, e);
         }
+    }
+
+    /// Averages the light of a texel's points; `goes_on`: more than the first few have been lit.
+    fn average(&self, t: &Averaged, points: &mut [Point], goes_on: bool, rays: &mut u64) -> Vec3 {
+        let (scene, sharp) = (self.areas.scene, t.sharp);
+        let points = match t.variation {
+            Variation::None => points,
+            _ => without_other_rooms(points, scene, &t.receiver, sharp, rays),
+        };
         let mut sum = PointLight::default();
-        let n = points.add_to(self.areas.scene, &mut sum, |_| Vec3::ONE, rays);
+        let n = add_to(points, scene, &mut sum, |_| Vec3::ONE, rays);
         if n == Vec3::ZERO {
             // All points miss a small part of a chart: its sample alone is lit.
-            let seed = combine(self.seed, sample as u32);
-            let mut out = [PointLight::default()];
-            self.direct.at_points(&[*receiver], 0, Lights::Soft, self.samples, seed, rays, &mut out);
-            return sharp + out[0].value();
+            let seed = combine(self.seed, t.sample as u32);
+            return sharp + self.direct.at_point(&t.receiver, Lights::Soft, self.samples, seed, rays).value();
         }
-        let is_even = variation == Variation::Unknown
+        let is_even = t.variation == Variation::Unknown
             && !goes_on
-            && !points.lights().iter().any(|l| differ(l.sharp, sharp, DIFFERENCE));
+            && !points.iter().any(|p| differ(p.light.sharp, sharp, DIFFERENCE));
         if is_even {
             // The sample lies in the middle of the chart's part in the texel, whereas the few points lie anywhere in
             // it.
             sum.sharp = sharp * n;
         }
         let e = sum.value() / n;
-        if variation == Variation::None { sharp + e } else { e }
+        if t.variation == Variation::None { sharp + e } else { e }
     }
 
-    /// Computes direct light of a texel of the radiance map by few points, and the values that decide on a [closer
+    /// Computes direct light of a tile of the radiance map by few points, and the values that decide on a [closer
     /// look](Self::closer_look).
-    pub(crate) fn first_look(&self, sample: usize, back: bool, rays: &mut u64) -> Look {
-        let scene = self.areas.scene;
-        let receiver = self.areas.map.receiver(scene, sample, back).1;
-        let mut points = Points::new(&receiver);
-        self.light_points(&mut points, sample, back, 0..FEW, Lights::All, rays);
-        if points.count == 0 {
-            let seed = combine(self.seed, sample as u32);
-            self.direct.at_points(&[receiver], 0, Lights::All, self.samples, seed, rays, &mut points.lights);
-            points.count = 1;
+    pub(crate) fn first_look(
+        &self,
+        samples: &[u32],
+        tile: &mut TilePoints,
+        rays: &mut u64,
+        mut out: impl FnMut(usize, Look),
+    ) {
+        let (scene, map) = (self.areas.scene, self.areas.map);
+        tile.clear();
+        tile.light(self, samples.iter().enumerate().map(|(i, &s)| self.all_of(i, s as usize, 0..FEW)), rays);
+        for (i, &sample) in samples.iter().enumerate() {
+            let (mut sum, points) = (PointLight::default(), tile.of(i));
+            let mut n = add_to(points, scene, &mut sum, |_| Vec3::ONE, rays);
+            if points.is_empty() {
+                let (seed, sample) = (combine(self.seed, sample), sample as usize);
+                let (on, receiver) = (map.texels.samples[sample], map.receiver(scene, sample, map.is_back(sample)).1);
+                let light = self.direct.at_point(&receiver, Lights::All, self.samples, seed, rays);
+                n = add_to(&[Point { on, receiver, light }], scene, &mut sum, |_| Vec3::ONE, rays);
+            }
+            let varies = vary(points, PointLight::narrow, RADIANCE_DIFFERENCE)
+                || vary(points, PointLight::unoccluded_areas, RADIANCE_DIFFERENCE);
+            out(i, Look { irradiance: sum.value() / n, narrow: sum.narrow() / n, varies });
         }
-        let mut sum = PointLight::default();
-        let n = points.add_to(scene, &mut sum, |_| Vec3::ONE, rays);
-        let varies = points.differ(PointLight::narrow, RADIANCE_DIFFERENCE)
-            || points.differ(PointLight::unoccluded_areas, RADIANCE_DIFFERENCE);
-        Look { irradiance: sum.value() / n, narrow: sum.narrow() / n, varies }
+    }
+
+    /// Points of a texel of the radiance map, to be lit by all lights.
+    fn all_of(&self, texel: usize, sample: usize, numbers: Range<u32>) -> Wanted {
+        Wanted { texel, sample, back: self.areas.map.is_back(sample), numbers, lights: Lights::All }
     }
 
     /// Whether a texel of the radiance map needs more points: its first few differ, or its neighbours' light does.
@@ -219,51 +306,100 @@ impl TexelLight<'_> {
             })
     }
 
-    /// Computes direct light of a texel of the radiance map by 16 or 64 points, weighted by their albedos; `None` if
-    /// none of them lies on the chart.
+    /// Computes direct light of texels of the radiance map by 16 or 64 points, weighted by their albedos; `None` if none of
+    /// them lies on the chart.
     pub(crate) fn closer_look(
         &self,
-        sample: usize,
-        back: bool,
+        samples: &[u32],
+        tile: &mut TilePoints,
         albedo: impl Fn(&TexelSample) -> Vec3,
         rays: &mut u64,
-    ) -> Option<Vec3> {
+        mut out: impl FnMut(usize, Option<Vec3>),
+    ) {
         let scene = self.areas.scene;
-        let receiver = self.areas.map.receiver(scene, sample, back).1;
-        let (mut sum, mut n, mut begin, mut end) = (PointLight::default(), Vec3::ZERO, 0, MAX_POINTS as u32);
-        while begin < end {
-            let mut points = Points::new(&receiver);
-            self.light_points(&mut points, sample, back, begin..begin + MAX_POINTS as u32, Lights::All, rays);
-            n += points.add_to(scene, &mut sum, |t| albedo(t).max(Vec3::splat(f32::MIN_POSITIVE)), rays);
-            begin += MAX_POINTS as u32;
-            if begin == end && points.has_spikes() {
-                end = MANY;
+        let weight = |t: &TexelSample| albedo(t).max(Vec3::splat(f32::MIN_POSITIVE));
+        let (mut sums, mut weights) = ([PointLight::default(); TILE], [Vec3::ZERO; TILE]);
+        // Texels that go on after the first round of points.
+        let mut has_spikes = [true; TILE];
+        for begin in (0..MANY).step_by(MAX_POINTS) {
+            let numbers = begin..begin + MAX_POINTS as u32;
+            let wanted = samples.iter().enumerate().filter(|(i, _)| has_spikes[*i]);
+            tile.clear();
+            tile.light(self, wanted.map(|(i, &s)| self.all_of(i, s as usize, numbers.clone())), rays);
+            for i in (0..samples.len()).filter(|&i| has_spikes[i]) {
+                weights[i] += add_to(tile.of(i), scene, &mut sums[i], weight, rays);
+            }
+            if begin == 0 {
+                for (i, has_spikes) in has_spikes.iter_mut().enumerate() {
+                    *has_spikes = i < samples.len() && spikes(tile.of(i));
+                }
             }
         }
-        (n != Vec3::ZERO).then(|| sum.value() / n)
+        for (i, (sum, n)) in sums.iter().zip(weights).take(samples.len()).enumerate() {
+            out(i, (n != Vec3::ZERO).then(|| sum.value() / n));
+        }
+    }
+}
+
+impl TilePoints {
+    /// Allocates room for the points of a tile of at most `texels`, which are at most [`TILE`].
+    pub(crate) fn new(texels: usize) -> Result<TilePoints> {
+        let what = "the points of a tile";
+        let receiver = Receiver {
+            origin: Vec3::ZERO,
+            normal: Vec3::ZERO,
+            geometric: Vec3::ZERO,
+            position: Vec3::ZERO,
+            shadow_origin: Vec3::ZERO,
+            raised: false,
+        };
+        let point = Point { on: TexelSample::default(), receiver, light: PointLight::default() };
+        let points = texels * MAX_POINTS;
+        Ok(TilePoints {
+            points: try_filled(points, point, what)?,
+            counts: try_filled(texels, 0, what)?,
+            pending: try_with_capacity(points, what)?,
+            room: TileRoom::new(KINDS * points, points)?,
+        })
     }
 
-    /// Lights the points of `numbers` that lie on the chart.
-    fn light_points(
-        &self,
-        points: &mut Points,
-        sample: usize,
-        back: bool,
-        numbers: Range<u32>,
-        lights: Lights,
-        rays: &mut u64,
-    ) {
-        let (first, samples) = (points.count, self.samples.div_ceil(numbers.len() as u32));
-        let seed = combine(self.seed, sample as u32);
-        for number in numbers.clone() {
-            if let Some(point) = self.areas.point(sample, number, seed) {
-                points.samples[points.count] = point;
-                points.receivers[points.count] = receiver_of(self.areas.scene, &point, back).1;
-                points.count += 1;
+    fn clear(&mut self) {
+        self.counts.fill(0);
+    }
+
+    fn of(&self, texel: usize) -> &[Point] {
+        &self.points[texel * MAX_POINTS..][..self.counts[texel]]
+    }
+
+    fn of_mut(&mut self, texel: usize) -> &mut [Point] {
+        &mut self.points[texel * MAX_POINTS..][..self.counts[texel]]
+    }
+
+    /// Lights the wanted points that lie on their charts, and adds them to those of their texels.
+    fn light(&mut self, by: &TexelLight, wanted: impl Iterator<Item = Wanted>, rays: &mut u64) {
+        let scene = by.areas.scene;
+        let mut shadow = self.room.begin(scene);
+        self.pending.clear();
+        for Wanted { texel, sample, back, numbers, lights } in wanted {
+            let samples = by.samples.div_ceil(numbers.len() as u32);
+            let (seed, first) = (combine(by.seed, sample as u32), self.counts[texel]);
+            let of_round = combine(seed, numbers.start);
+            for number in numbers {
+                let Some(on) = by.areas.point(sample, number, seed) else { continue };
+                let receiver = receiver_of(scene, &on, back).1;
+                let (count, place) = (self.counts[texel], texel * MAX_POINTS + self.counts[texel]);
+                shadow.slot = KINDS * place;
+                let light = by.direct.push(&receiver, (count - first) as u32, lights, samples, of_round, &mut shadow);
+                self.points[place] = Point { on, receiver, light };
+                self.pending.push(place as u32);
+                self.counts[texel] += 1;
             }
         }
-        let (receivers, out) = (&points.receivers[first..points.count], &mut points.lights[first..points.count]);
-        self.direct.at_points(receivers, 0, lights, samples, combine(seed, numbers.start), rays, out);
+        let arrived = shadow.finish(rays);
+        for &place in &self.pending {
+            let place = place as usize;
+            self.points[place].light.take(&arrived[KINDS * place..][..KINDS]);
+        }
     }
 }
 
@@ -315,71 +451,64 @@ fn is_hidden(scene: &Scene, a: &Receiver, b: &Receiver, rays: &mut u64) -> bool 
     scene.occluded(&Ray::new(from, to - from).within(0.0, 1.0))
 }
 
-impl Points {
-    fn new(receiver: &Receiver) -> Points {
-        Points {
-            samples: [TexelSample::default(); MAX_POINTS],
-            lights: [PointLight::default(); MAX_POINTS],
-            receivers: [*receiver; MAX_POINTS],
-            count: 0,
+/// Whether some point lies in the penumbra of a disc.
+fn has_penumbra(points: &[Point]) -> bool {
+    points.iter().any(|p| p.light.is_in_a_penumbra_of_discs()) || vary(points, PointLight::of_discs, DIFFERENCE)
+}
+
+/// Whether a part of the light of points differs between them.
+fn vary(points: &[Point], what: impl Fn(&PointLight) -> Vec3, part: f32) -> bool {
+    points.iter().any(|p| differ(what(&p.light), what(&points[0].light), part))
+}
+
+/// Whether one point has far more light than the mean.
+fn spikes(points: &[Point]) -> bool {
+    let all = |p: &Point| (p.light.narrow() + p.light.unoccluded_areas()).element_sum();
+    let (sum, most) = points.iter().map(all).fold((0.0, 0f32), |(sum, most), l| (sum + l, most.max(l)));
+    most * points.len() as f32 > SPIKE * sum
+}
+
+/// Returns the points that are seen from the texel's sample, `own`, whose light without penumbrae is `sharp`. Points with
+/// the same light are kept without a test.
+fn without_other_rooms<'p>(
+    points: &'p mut [Point],
+    scene: &Scene,
+    own: &Receiver,
+    sharp: Vec3,
+    rays: &mut u64,
+) -> &'p mut [Point] {
+    let mut kept = 0;
+    for i in 0..points.len() {
+        let point = points[i];
+        if differ(point.light.sharp, sharp, DIFFERENCE) && is_hidden(scene, own, &point.receiver, rays) {
+            continue;
         }
+        points[kept] = point;
+        kept += 1;
     }
+    &mut points[..kept]
+}
 
-    fn lights(&self) -> &[PointLight] {
-        &self.lights[..self.count]
-    }
-
-    fn penumbra(&self) -> bool {
-        self.lights().iter().any(PointLight::is_in_a_penumbra_of_discs) || self.differ(PointLight::of_discs, DIFFERENCE)
-    }
-
-    fn differ(&self, what: impl Fn(&PointLight) -> Vec3, part: f32) -> bool {
-        self.lights().iter().any(|l| differ(what(l), what(&self.lights[0]), part))
-    }
-
-    fn has_spikes(&self) -> bool {
-        let all = |l: &PointLight| (l.narrow() + l.unoccluded_areas()).element_sum();
-        let (sum, most) = self.lights().iter().map(all).fold((0.0, 0f32), |(sum, most), l| (sum + l, most.max(l)));
-        most * self.count as f32 > SPIKE * sum
-    }
-
-    /// Keeps the points that are seen from the texel's sample, `own`, whose light without penumbrae is `sharp`. Points
-    /// with the same light are kept without a test.
-    fn leave_out_other_rooms(&mut self, scene: &Scene, own: &Receiver, sharp: Vec3, rays: &mut u64) {
-        let mut kept = 0;
-        for i in 0..self.count {
-            if differ(self.lights[i].sharp, sharp, DIFFERENCE) && is_hidden(scene, own, &self.receivers[i], rays) {
-                continue;
-            }
-            self.samples[kept] = self.samples[i];
-            self.lights[kept] = self.lights[i];
-            self.receivers[kept] = self.receivers[i];
-            kept += 1;
+/// Adds the light of the points that are not inside of solids, by their weights; returns the sum of the weights. Only
+/// unlit points beside lit ones are tested, since others make no difference.
+fn add_to(
+    points: &[Point],
+    scene: &Scene,
+    sum: &mut PointLight,
+    weight: impl Fn(&TexelSample) -> Vec3,
+    rays: &mut u64,
+) -> Vec3 {
+    let is_lit = points.iter().any(|p| !p.light.is_dark());
+    let mut n = Vec3::ZERO;
+    for Point { on, receiver, light } in points {
+        if is_lit && light.is_dark() && is_buried(scene, receiver.origin, receiver.geometric, rays) {
+            continue;
         }
-        self.count = kept;
+        let weight = weight(on);
+        sum.add(light, weight);
+        n += weight;
     }
-
-    /// Adds the light of the points that are not inside of solids, by their weights; returns the sum of the weights.
-    /// Only unlit points beside lit ones are tested, since others make no difference.
-    fn add_to(
-        &self,
-        scene: &Scene,
-        sum: &mut PointLight,
-        weight: impl Fn(&TexelSample) -> Vec3,
-        rays: &mut u64,
-    ) -> Vec3 {
-        let is_lit = self.lights().iter().any(|l| !l.is_dark());
-        let mut n = Vec3::ZERO;
-        for (i, (light, r)) in self.lights().iter().zip(&self.receivers).enumerate() {
-            if is_lit && light.is_dark() && is_buried(scene, r.origin, r.geometric, rays) {
-                continue;
-            }
-            let weight = weight(&self.samples[i]);
-            sum.add(light, weight);
-            n += weight;
-        }
-        n
-    }
+    n
 }
 
 #[cfg(test)]

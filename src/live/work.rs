@@ -9,7 +9,7 @@ use crate::error::{Error, Result};
 use crate::lightmap::indirect::gather::Gathered;
 use crate::lightmap::indirect::radiance_map::RadianceMap;
 use crate::lightmap::indirect::sample_set::{ROUND, SampleSet};
-use crate::lightmap::texel_light::TexelLight;
+use crate::lightmap::texel_light::{Averaged, TexelLight, TilePoints};
 use crate::memory::{try_collect, try_filled};
 use crate::sampling::combine;
 use crate::scene::NONE;
@@ -340,6 +340,10 @@ impl Block {
             Some(DirectWork { tile, next: 0, epoch: c.light.direct_epoch, sharp })
         };
         let Some(mut direct) = under_way.or_else(begin) else { return false };
+        let Some(mut points) = limit.granted(TilePoints::new(1)) else {
+            self.work.direct = Some(direct);
+            return false;
+        };
         let (width, corner) = (direct.tile.rect.width().max(1), (direct.tile.rect.x0, direct.tile.rect.y0));
         while (direct.next as usize) < direct.tile.values.len() {
             if limit.reached() {
@@ -349,7 +353,7 @@ impl Block {
             let at = direct.next as usize;
             let (x, y) = (corner.0 + (at % width) as i32, corner.1 + (at / width) as i32);
             let mut rays = 0;
-            if let Some(value) = direct_texel(c, of, x, y, &mut direct, &mut rays) {
+            if let Some(value) = direct_texel(c, of, x, y, &mut direct, &mut points, &mut rays) {
                 direct.tile.values[at] = value;
             }
             limit.traced.fetch_add(rays, Relaxed);
@@ -422,7 +426,15 @@ pub(super) fn owns(c: &Context, tile: &Tile, x: i32, y: i32) -> Option<u32> {
 }
 
 /// Direct light of a texel of the light map; `None` if the texel is not the block's; infinite if it is inside a solid.
-fn direct_texel(c: &Context, tile: &Tile, x: i32, y: i32, work: &mut DirectWork, rays: &mut u64) -> Option<Vec3> {
+fn direct_texel(
+    c: &Context,
+    tile: &Tile,
+    x: i32,
+    y: i32,
+    work: &mut DirectWork,
+    points: &mut TilePoints,
+    rays: &mut u64,
+) -> Option<Vec3> {
     let (a, sample) = (&c.map.atlas, owns(c, tile, x, y)?);
     let backs = &c.light.sides.backs;
     let receiver = a.receiver(&a.map, backs, sample as usize);
@@ -443,5 +455,7 @@ fn direct_texel(c: &Context, tile: &Tile, x: i32, y: i32, work: &mut DirectWork,
     let sharp = sharp_at(sample);
     let variation = texels.varies(sample, sharp, sharp_at);
     let back = a.is_back(&a.map, backs, sample);
-    Some(texels.irradiance(sample, back, &receiver, sharp, variation, rays))
+    let mut light = Vec3::ZERO;
+    texels.irradiance(&[Averaged { sample, back, receiver, sharp, variation }], points, rays, |_, e| light = e);
+    Some(light)
 }

@@ -8,15 +8,18 @@
 //! that comes from visible photons, and divided by the part of the disc, weighted by the filter, where surface is
 //! visible (Jensen 2001, section 7.5, and Hey and Purgathofer, *Advanced Radiance Estimation for Photon Map Global
 //! Illumination*, 2002, divide by the area of the surfaces in the same spirit). Where all of the disc is visible both
-//! are exactly 1. (Pieces of all surfaces in a grid of their own, summed as photons are, left more bias in a furnished
+//! are exactly 1. The discs of a tile of texels trace their rays together, as [streams](crate::trace), step by step. (Pieces of all surfaces in a grid of their own, summed as photons are, left more bias in a furnished
 //! room – 1.4 % of the median point instead of 0.5 % – and were three times as many there as photons.)
 
 use super::PhotonMap;
 use super::cylinder::SAME_SURFACE;
+use crate::error::Result;
+use crate::memory::{try_filled, try_with_capacity};
 use crate::sampling::{concentric_disc, orthonormal_basis, sobol_2d};
-use crate::trace::Ray;
 use crate::trace::offset::offset_ray_origin;
+use crate::trace::{RawHit, Ray};
 use glam::{Vec2, Vec3};
+use std::ops::Range;
 
 /// Minimum of the visible part of a disc: estimates are raised by a factor of four at most, as the corner of a box
 /// needs. On scraps of surface that hardly any photon hits, more would make single photons shine.
@@ -31,99 +34,224 @@ const PROBES: u32 = 32;
 /// is no edge nearby. Of a part p that is hidden, p (1 − p)⁸ escapes notice in the mean, 4 % at most.
 const FIRST: u32 = 8;
 
-/// Irradiance at a point from the photons and the surface that are visible from it. Adds the rays traced to `rays`.
-pub(crate) fn irradiance(map: &PhotonMap, position: Vec3, normal: Vec3, seed: u32, rays: &mut u64) -> Vec3 {
-    let estimate = Vec3::from(map.estimate(position, normal));
-    if estimate == Vec3::ZERO {
-        return estimate;
-    }
-    let disc = Disc::new(map, position, normal, rays);
-    let light = disc.light(seed, rays);
-    if light == Vec3::ZERO { light } else { estimate * light / disc.surface(seed, rays) }
+/// Discs around the points of a tile, whose rays are traced together.
+pub(crate) struct Discs {
+    discs: Vec<Disc>,
+    rays: Vec<Ray>,
+    /// The disc that each ray is for, and what it carries.
+    carried: Vec<(u32, Vec3)>,
+    hits: Vec<RawHit>,
+    occluded: Vec<u8>,
 }
 
-struct Disc<'a> {
-    map: &'a PhotonMap,
+/// A disc and what has been found out about it so far.
+#[derive(Clone, Copy)]
+struct Disc {
     position: Vec3,
     normal: Vec3,
+    seed: u32,
+    estimate: Vec3,
     /// Point above the position, in the cylinder of the estimate, and in the same room.
     apex: Vec3,
     /// Height of the apex above the position.
     up: f32,
-    /// Half the height of the cylinder.
-    height: f32,
+    /// Light of the photons that were looked at, by channel, and of those that are visible.
+    all_light: Vec3,
+    seen: Vec3,
+    some_are_hidden: bool,
+    /// Weights of the probes, and of those that found visible surface.
+    all: f32,
+    covered: f32,
 }
 
-impl<'a> Disc<'a> {
-    fn new(map: &'a PhotonMap, position: Vec3, normal: Vec3, rays: &mut u64) -> Self {
-        let scene = map.scene();
-        let height = (map.cylinder.radius * map.cylinder.half_height).min(scene.diagonal());
-        let origin = offset_ray_origin(position, normal, scene);
-        *rays += 1;
-        let free = scene.intersect_raw(&Ray::new(origin, normal).within(0.0, 2.0 * height));
-        let up = if free.is_miss() { height } else { 0.5 * free.t };
-        Disc { map, position, normal, apex: position + up * normal, up, height }
+impl Discs {
+    /// Allocates room for a number of discs.
+    pub(crate) fn new(most: usize) -> Result<Discs> {
+        let (what, rays) = ("the discs of a tile", most * PROBES as usize);
+        Ok(Discs {
+            discs: try_with_capacity(most, what)?,
+            rays: try_with_capacity(rays, what)?,
+            carried: try_with_capacity(rays, what)?,
+            hits: try_filled(rays, RawHit::MISS, what)?,
+            occluded: try_filled(rays, 0, what)?,
+        })
+    }
+
+    /// Computes the irradiance at points (position, normal, seed) from the photons and the surface that are visible from
+    /// each. Adds the rays traced to `rays`.
+    pub(crate) fn irradiance(
+        &mut self,
+        map: &PhotonMap,
+        points: impl Iterator<Item = (Vec3, Vec3, u32)>,
+        rays: &mut u64,
+        mut out: impl FnMut(usize, Vec3),
+    ) {
+        self.discs.clear();
+        self.discs.extend(points.map(|(position, normal, seed)| Disc::new(map, position, normal, seed)));
+        self.find_apexes(map, rays);
+        self.look_at_photons(map, 0..FIRST as usize, |_| true, rays);
+        self.look_at_photons(map, FIRST as usize..PROBES as usize, |d| d.some_are_hidden, rays);
+        self.probe(map, 0..FIRST, |_| true, rays);
+        self.probe(map, FIRST..PROBES, |d| d.covered != d.all, rays);
+        self.discs.iter().enumerate().for_each(|(i, disc)| out(i, disc.irradiance()));
+    }
+
+    fn find_apexes(&mut self, map: &PhotonMap, rays: &mut u64) {
+        let (scene, height) = (map.scene(), half_height(map));
+        self.clear_rays();
+        for (i, disc) in (0..).zip(&self.discs).filter(|(_, d)| d.is_lit()) {
+            let origin = offset_ray_origin(disc.position, disc.normal, scene);
+            self.rays.push(Ray::new(origin, disc.normal).within(0.0, 2.0 * height));
+            self.carried.push((i, Vec3::ZERO));
+        }
+        *rays += self.rays.len() as u64;
+        scene.intersect_stream(&self.rays, &mut self.hits);
+        for (&(i, _), free) in self.carried.iter().zip(&self.hits) {
+            let disc = &mut self.discs[i as usize];
+            disc.up = if free.is_miss() { height } else { 0.5 * free.t };
+            disc.apex = disc.position + disc.up * disc.normal;
+        }
+    }
+
+    /// Tests which photons are visible, those of the given numbers of each disc that `goes_on`.
+    fn look_at_photons(
+        &mut self,
+        map: &PhotonMap,
+        numbers: Range<usize>,
+        goes_on: impl Fn(&Disc) -> bool,
+        rays: &mut u64,
+    ) {
+        let (photons, cylinder) = (map.columns(), &map.cylinder);
+        let vector = |columns: &[&[f32]; 3], i: usize| Vec3::new(columns[0][i], columns[1][i], columns[2][i]);
+        self.clear_rays();
+        for (k, disc) in (0..).zip(&self.discs).filter(|(_, d)| d.is_lit() && goes_on(d)) {
+            let mut number = 0;
+            map.grid.spread(&map.grid.search(disc.position, disc.normal, cylinder), disc.seed, |i| {
+                let Some(weight) = cylinder.weight(&photons, i, disc.position, disc.normal) else { return true };
+                if numbers.contains(&number) {
+                    let (point, facing) = (vector(&photons.position, i), vector(&photons.normal, i));
+                    self.rays.push(line_of_sight(map, point, facing, disc.apex));
+                    self.carried.push((k, weight * vector(&photons.power, i)));
+                }
+                number += 1;
+                number < numbers.end
+            });
+        }
+        self.trace_lines_of_sight(map, rays);
+        for (&(k, power), &occluded) in self.carried.iter().zip(&self.occluded) {
+            let disc = &mut self.discs[k as usize];
+            disc.all_light += power;
+            if occluded == 0 {
+                disc.seen += power;
+            } else {
+                disc.some_are_hidden = true;
+            }
+        }
+    }
+
+    /// Probes of the given numbers find where there is visible surface in each disc that `goes_on`: rays down from points at
+    /// the apex's height, and lines of sight from surfaces that they find, if these face as the normal does.
+    fn probe(&mut self, map: &PhotonMap, numbers: Range<u32>, goes_on: impl Fn(&Disc) -> bool, rays: &mut u64) {
+        let (scene, height, radius) = (map.scene(), half_height(map), map.cylinder.radius);
+        self.clear_rays();
+        for (k, disc) in (0..).zip(&mut self.discs).filter(|(_, d)| d.light() != Vec3::ZERO && goes_on(d)) {
+            let (x, y) = orthonormal_basis(disc.normal);
+            for i in numbers.clone() {
+                let d = Vec2::from(concentric_disc(sobol_2d(i, disc.seed)));
+                let weight = map.cylinder.filter(d.length());
+                disc.all += weight;
+                let above = disc.apex + radius * (d.x * x + d.y * y);
+                self.rays.push(Ray::new(above, -disc.normal).within(0.0, disc.up + height));
+                self.carried.push((k, Vec3::splat(weight)));
+            }
+        }
+        *rays += self.rays.len() as u64;
+        scene.intersect_stream(&self.rays, &mut self.hits);
+        let mut found = 0;
+        for i in 0..self.rays.len() {
+            let (hit, carried) = (self.hits[i], self.carried[i]);
+            let disc = &self.discs[carried.0 as usize];
+            if hit.is_miss() || !(hit.front || scene.material(hit.triangle).two_sided) {
+                continue;
+            }
+            let facing = if hit.front { scene.normal(hit.triangle) } else { -scene.normal(hit.triangle) };
+            if facing.dot(disc.normal) >= SAME_SURFACE {
+                let point = Vec3::from(self.rays[i].origin) - hit.t * disc.normal;
+                self.rays[found] = line_of_sight(map, point, facing, disc.apex);
+                self.carried[found] = carried;
+                found += 1;
+            }
+        }
+        self.rays.truncate(found);
+        self.carried.truncate(found);
+        self.trace_lines_of_sight(map, rays);
+        for (&(k, weight), _) in self.carried.iter().zip(&self.occluded).filter(|(_, occluded)| **occluded == 0) {
+            self.discs[k as usize].covered += weight.x;
+        }
+    }
+
+    fn clear_rays(&mut self) {
+        self.rays.clear();
+        self.carried.clear();
+    }
+
+    fn trace_lines_of_sight(&mut self, map: &PhotonMap, rays: &mut u64) {
+        *rays += self.rays.len() as u64;
+        map.scene().occluded_stream(&self.rays, &mut self.occluded);
+    }
+}
+
+impl Disc {
+    fn new(map: &PhotonMap, position: Vec3, normal: Vec3, seed: u32) -> Disc {
+        Disc {
+            position,
+            normal,
+            seed,
+            estimate: Vec3::from(map.estimate(position, normal)),
+            apex: position,
+            up: 0.0,
+            all_light: Vec3::ZERO,
+            seen: Vec3::ZERO,
+            some_are_hidden: false,
+            all: 0.0,
+            covered: 0.0,
+        }
+    }
+
+    /// Whether there is any light. Nothing is traced for discs without.
+    fn is_lit(&self) -> bool {
+        self.estimate != Vec3::ZERO
+    }
+
+    /// The part of the estimate's light that comes from visible photons, by channel; 0 if there is no light.
+    fn light(&self) -> Vec3 {
+        match (self.is_lit(), self.some_are_hidden) {
+            (false, _) => Vec3::ZERO,
+            (true, false) => Vec3::ONE,
+            (true, true) => self.seen / self.all_light.max(Vec3::splat(f32::MIN_POSITIVE)),
+        }
+    }
+
+    fn irradiance(&self) -> Vec3 {
+        let light = self.light();
+        if light == Vec3::ZERO { light } else { self.estimate * light / self.surface() }
     }
 
     /// The part of the disc, weighted by the filter, where surface is visible; in [1/4, 1].
-    fn surface(&self, seed: u32, rays: &mut u64) -> f32 {
-        let (x, y) = orthonormal_basis(self.normal);
-        let (mut covered, mut all) = (0.0, 0.0);
-        for i in 0..PROBES {
-            if i == FIRST && covered == all {
-                return 1.0;
-            }
-            let d = Vec2::from(concentric_disc(sobol_2d(i, seed)));
-            let weight = self.map.cylinder.filter(d.length());
-            all += weight;
-            let above = self.apex + self.map.cylinder.radius * (d.x * x + d.y * y);
-            if self.probe(above, rays).is_some_and(|(point, facing)| self.sees(point, facing, rays)) {
-                covered += weight;
-            }
-        }
-        (covered / all).max(LEAST)
+    fn surface(&self) -> f32 {
+        if self.covered == self.all { 1.0 } else { (self.covered / self.all).max(LEAST) }
     }
+}
 
-    /// The part of the photons' light that comes from visible photons, by channel.
-    fn light(&self, seed: u32, rays: &mut u64) -> Vec3 {
-        let (mut seen, mut all, mut looked_at, mut hidden) = (Vec3::ZERO, Vec3::ZERO, 0, 0);
-        let (photons, cylinder) = (self.map.columns(), &self.map.cylinder);
-        let vector = |columns: &[&[f32]; 3], i: usize| Vec3::new(columns[0][i], columns[1][i], columns[2][i]);
-        let grid = &self.map.grid;
-        grid.spread(&grid.search(self.position, self.normal, cylinder), seed, |i| {
-            let Some(weight) = cylinder.weight(&photons, i, self.position, self.normal) else { return true };
-            let power = weight * vector(&photons.power, i);
-            all += power;
-            looked_at += 1;
-            if self.sees(vector(&photons.position, i), vector(&photons.normal, i), rays) {
-                seen += power;
-            } else {
-                hidden += 1;
-            }
-            looked_at < if hidden == 0 { FIRST } else { PROBES }
-        });
-        if hidden == 0 { Vec3::ONE } else { seen / all.max(Vec3::splat(f32::MIN_POSITIVE)) }
-    }
+/// Half the height of the cylinder of an estimate.
+fn half_height(map: &PhotonMap) -> f32 {
+    (map.cylinder.radius * map.cylinder.half_height).min(map.scene().diagonal())
+}
 
-    /// Finds the surface below a point at the apex's height, if it faces as the normal does; returns the point and its
-    /// normal on that side.
-    fn probe(&self, above: Vec3, rays: &mut u64) -> Option<(Vec3, Vec3)> {
-        let (scene, normal) = (self.map.scene(), self.normal);
-        *rays += 1;
-        let hit = scene.intersect_raw(&Ray::new(above, -normal).within(0.0, self.up + self.height));
-        if hit.is_miss() || !(hit.front || scene.material(hit.triangle).two_sided) {
-            return None;
-        }
-        let facing = if hit.front { scene.normal(hit.triangle) } else { -scene.normal(hit.triangle) };
-        (facing.dot(normal) >= SAME_SURFACE).then(|| (above - hit.t * normal, facing))
-    }
-
-    /// Whether nothing lies between the apex and a surface point.
-    fn sees(&self, point: Vec3, facing: Vec3, rays: &mut u64) -> bool {
-        let origin = offset_ray_origin(point, facing, self.map.scene());
-        *rays += 1;
-        !self.map.scene().occluded(&Ray::new(origin, self.apex - origin).within(0.0, 1.0))
-    }
+/// The ray from a surface point to the apex of a disc.
+fn line_of_sight(map: &PhotonMap, point: Vec3, facing: Vec3, apex: Vec3) -> Ray {
+    let origin = offset_ray_origin(point, facing, map.scene());
+    Ray::new(origin, apex - origin).within(0.0, 1.0)
 }
 
 #[cfg(test)]
@@ -156,10 +284,21 @@ mod tests {
         Vec3::new(x, y, 0.0)
     }
 
+    /// A disc at a point by each seed, as if there were light.
+    fn discs_at(map: &PhotonMap, position: Vec3, normal: Vec3, seeds: Range<u32>) -> Discs {
+        let mut discs = Discs::new(seeds.len()).unwrap();
+        let lit = |seed| Disc { estimate: Vec3::ONE, ..Disc::new(map, position, normal, seed) };
+        discs.discs.extend(seeds.map(lit));
+        discs.find_apexes(map, &mut 0);
+        discs
+    }
+
     /// The mean over many seeds.
     fn mean_surface(map: &PhotonMap, position: Vec3, normal: Vec3) -> f32 {
-        let (seeds, disc) = (64, Disc::new(map, position, normal, &mut 0));
-        (0..seeds).map(|s| disc.surface(s, &mut 0)).sum::<f32>() / seeds as f32
+        let mut discs = discs_at(map, position, normal, 0..64);
+        discs.probe(map, 0..FIRST, |_| true, &mut 0);
+        discs.probe(map, FIRST..PROBES, |d| d.covered != d.all, &mut 0);
+        discs.discs.iter().map(Disc::surface).sum::<f32>() / 64.0
     }
 
     #[test]
@@ -180,8 +319,9 @@ mod tests {
 
     /// The mean over many seeds.
     fn mean_irradiance(map: &PhotonMap, position: Vec3) -> f32 {
-        let seeds = 64;
-        (0..seeds).map(|s| irradiance(map, position, Vec3::Z, s, &mut 0).x).sum::<f32>() / seeds as f32
+        let (mut discs, mut sum) = (Discs::new(64).unwrap(), 0.0);
+        discs.irradiance(map, (0..64).map(|s| (position, Vec3::Z, s)), &mut 0, |_, e| sum += e.x);
+        sum / 64.0
     }
 
     #[test]
@@ -232,9 +372,10 @@ mod tests {
             }
         }
         assert!((9..=PROBES).contains(&count) && seen > 0.0 && seen < all, "{count}: {seen} of {all}");
-        let disc = Disc::new(&map, position, Vec3::Z, &mut 0);
-        let mut rays = 0;
-        assert!((disc.light(3, &mut rays).x - seen / all).abs() < 1e-5);
+        let (mut discs, mut rays) = (discs_at(&map, position, Vec3::Z, 3..4), 0);
+        discs.look_at_photons(&map, 0..FIRST as usize, |_| true, &mut rays);
+        discs.look_at_photons(&map, FIRST as usize..PROBES as usize, |d| d.some_are_hidden, &mut rays);
+        assert!((discs.discs[0].light().x - seen / all).abs() < 1e-5);
         assert_eq!(rays, u64::from(count));
     }
 
@@ -255,7 +396,8 @@ mod tests {
         let map = square(|_, _| ());
         let rays_at = |position| {
             let mut rays = 0;
-            irradiance(&map, position, Vec3::Z, 0, &mut rays);
+            let mut discs = Discs::new(1).unwrap();
+            discs.irradiance(&map, [(position, Vec3::Z, 0)].into_iter(), &mut rays, |_, _| ());
             rays
         };
         // To the apex, to each photon, and two per probe.

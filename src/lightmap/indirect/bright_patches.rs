@@ -17,7 +17,6 @@ use crate::direct::many_lights::ManyLights;
 use crate::direct::shadow_rays::ShadowRays;
 use crate::lightmap::atlas::chart_map::ChartMap;
 use crate::memory::Reservation;
-use crate::scene::Scene;
 use glam::Vec3;
 
 /// Gather rays see the full radiance of a texel if they are shorter than the square root of this many times its area.
@@ -61,26 +60,38 @@ impl Bright {
         radiance * (self.limit / sum)
     }
 
-    /// Estimates the irradiance by the radiance beyond the limit, for a round of `gather_rays`, and the variance of its
-    /// sum over the channels. Adds the rays traced to `rays`.
-    pub(crate) fn irradiance(
+    /// Pushes the shadow rays of a round of `gather_rays`, whose sum is the irradiance by the radiance beyond the limit.
+    pub(crate) fn push(
         &self,
-        scene: &Scene,
         receiver: &Receiver,
         gather_rays: usize,
         seed: u32,
-        rays: &mut u64,
-    ) -> (Vec3, f32) {
-        let Some(patches) = &self.patches else { return (Vec3::ZERO, 0.0) };
+        shadow: &mut ShadowRays,
+    ) -> Unoccluded {
+        let Some(patches) = &self.patches else { return Unoccluded::default() };
         // Shadow rays start where gather rays do.
         let receiver = Receiver { shadow_origin: receiver.origin, raised: false, ..*receiver };
-        let mut shadow = ShadowRays::new(scene);
-        let shadow_rays = (self.shadow_rays * gather_rays as u32).div_ceil(ROUND as u32);
-        let unoccluded = patches.push(&receiver, shadow_rays, seed, &mut shadow);
-        let e = shadow.finish(rays);
+        let rays = (self.shadow_rays * gather_rays as u32).div_ceil(ROUND as u32);
+        Unoccluded { sum: patches.push(&receiver, rays, seed, shadow), rays }
+    }
+}
+
+/// Light of the shadow rays of a round if nothing occludes them, summed over the channels.
+#[derive(Clone, Copy, Default)]
+pub(crate) struct Unoccluded {
+    sum: f32,
+    rays: u32,
+}
+
+impl Unoccluded {
+    /// Returns the variance of the sum over the channels of what arrives.
+    pub(crate) fn variance(&self, arrived: Vec3) -> f32 {
+        if self.rays == 0 {
+            return 0.0;
+        }
         // Each ray contributes about the same amount, or nothing.
-        let sum = e.element_sum();
-        (e, sum * (unoccluded - sum).max(0.0) / shadow_rays as f32)
+        let sum = arrived.element_sum();
+        sum * (self.sum - sum).max(0.0) / self.rays as f32
     }
 }
 

@@ -77,7 +77,7 @@ pub(crate) fn find(atlas: &Atlas, radiance: &mut Radiance, rays: &mut u64, progr
     if patches.is_empty() {
         return Ok(());
     }
-    let patches = ManyLights::of_patches(patches)?;
+    let patches = ManyLights::of_patches(atlas.scene.device().isa(), patches)?;
     progress.check()?;
     let memory = atlas.scene.device().memory().reserve(patches.bytes(), "bright patches")?;
     let shadow_rays = ((MAX_SHADOW_RAYS as f32 * share).ceil() as u32).clamp(1, MAX_SHADOW_RAYS);
@@ -95,7 +95,7 @@ pub(crate) fn again(atlas: &Atlas, values: &[Vec3], limit: f32, shadow_rays: u32
         return Ok(Bright::default());
     }
     let patches = patches(atlas, values, limit, MAX_PATCHES, &mut 0, &Progress::none())?;
-    let patches = ManyLights::of_patches(patches)?;
+    let patches = ManyLights::of_patches(atlas.scene.device().isa(), patches)?;
     let memory = atlas.scene.device().memory().reserve(patches.bytes(), "bright patches")?;
     Ok(Bright { limit, patches: Some(patches), shadow_rays, _memory: Some(memory) })
 }

@@ -4,15 +4,19 @@
 //! Rays come in rounds of 64, so that a texel can be refined at any time: its sum over k rounds has
 //! the same bits however they were spread over bakes and live updates. The sample set is made once:
 //! the Sobol sequence, in each round sorted along a Morton curve. Each texel shifts it digitally (XOR), which keeps the
-//! stratification. The rays of neighbouring texels pass the tree together as a [stream](crate::trace).
+//! stratification. The rays of neighbouring texels pass the tree together as a [stream](crate::trace), and so do their shadow
+//! rays to bright patches.
 //!
 //! Tried, and not worth it: more rays where their variance is largest, and rays guided by photons; see
 //! docs/experiments.md#adaptive-and-guided-gather-rays.
 
+use super::bright_patches::Unoccluded;
 use super::radiance_map::RadianceMap;
 use super::sample_set::{ROUND, SampleSet};
 use crate::direct::Receiver;
+use crate::direct::shadow_rays::{PointRoom, TileRoom};
 use crate::error::Result;
+use crate::lightmap::tiles::TILE;
 use crate::memory::try_filled;
 use crate::sampling::{combine, concentric_disc, orthonormal_basis, unit_float};
 use crate::scene::Scene;
@@ -73,11 +77,20 @@ impl Gathered {
         let rays = &mut rays[..points.len()];
         aim(receiver, points, seed, rays);
         scene.intersect_stream(rays, &mut hits);
-        self.add(scene, radiance, receiver, rays, &hits, combine(seed, 16 + round as u32))
+        let mut traced = rays.len() as u64;
+        let mut bright = (Vec3::ZERO, Unoccluded::default());
+        if radiance.bright().len() > 0 {
+            let mut room = PointRoom::new();
+            let mut shadow = room.begin(scene);
+            bright.1 = radiance.bright().push(receiver, rays.len(), seed_of_round(seed, round), &mut shadow);
+            bright.0 = shadow.finish(&mut traced)[0];
+        }
+        self.add(scene, radiance, receiver, rays, &hits, bright);
+        traced
     }
 
-    /// Adds the radiance seen by one round of rays from a receiver, and that of bright patches; `seed` is the round's own.
-    /// Returns the rays traced.
+    /// Adds the radiance seen by one round of rays from a receiver, and that of bright patches: what has arrived from them,
+    /// and what they would send if nothing occluded it.
     fn add(
         &mut self,
         scene: &Scene,
@@ -85,8 +98,8 @@ impl Gathered {
         receiver: &Receiver,
         rays: &[Ray],
         hits: &[RawHit],
-        seed: u32,
-    ) -> u64 {
+        (arrived, unoccluded): (Vec3, Unoccluded),
+    ) {
         let (mut sum, mut squares) = (Vec3::ZERO, 0.0);
         let (transmits, mut crossings) = (scene.uses().transmission, Vec::new());
         for (ray, hit) in rays.iter().zip(hits) {
@@ -110,22 +123,16 @@ impl Gathered {
                 None => self.backs += 1,
             }
         }
-        let mut traced = rays.len() as u64;
         if radiance.bright().len() > 0 {
-            let (e, variance) = radiance.bright().irradiance(scene, receiver, rays.len(), seed, &mut traced);
             let scale = rays.len() as f32 / PI;
-            sum += e * scale;
-            squares += variance * scale * scale;
+            sum += arrived * scale;
+            squares += unoccluded.variance(arrived) * scale * scale;
         }
         self.sum += sum;
         self.squares += squares;
         self.rays += rays.len() as u32;
-        traced
     }
 }
-
-/// Number of texels whose rays are traced together.
-pub(crate) const TILE: usize = 64;
 
 /// A texel of a tile.
 pub(crate) struct TileTexel {
@@ -137,10 +144,10 @@ pub(crate) struct TileTexel {
 
 /// Rounds of rays from neighbouring texels, which are traced together as a stream: the light of a texel has the bits that it
 /// has when gathered alone.
-#[derive(Default)]
 pub(crate) struct Tile {
     rays: Vec<Ray>,
     hits: Vec<RawHit>,
+    shadow: TileRoom,
 }
 
 impl Tile {
@@ -148,7 +155,8 @@ impl Tile {
     pub(crate) fn new() -> Result<Tile> {
         let what = "the gather rays of a tile";
         let ray = Ray::new(Vec3::ZERO, Vec3::ZERO);
-        Ok(Tile { rays: try_filled(TILE * ROUND, ray, what)?, hits: try_filled(TILE * ROUND, RawHit::MISS, what)? })
+        let (rays, hits) = (try_filled(TILE * ROUND, ray, what)?, try_filled(TILE * ROUND, RawHit::MISS, what)?);
+        Ok(Tile { rays, hits, shadow: TileRoom::new(TILE, TILE * ROUND)? })
     }
 
     /// Adds one round of rays from each of at most [`TILE`] texels. Returns the rays traced.
@@ -166,14 +174,28 @@ impl Tile {
             aim(&texel.receiver, points, texel.seed, rays);
         }
         scene.intersect_stream(&self.rays[..count], &mut self.hits);
-        let mut traced = 0;
+        let mut traced = count as u64;
+        let mut unoccluded = [Unoccluded::default(); TILE];
+        let mut shadow = self.shadow.begin(scene);
+        if radiance.bright().len() > 0 {
+            for (slot, (texel, unoccluded)) in texels.iter().zip(&mut unoccluded).enumerate() {
+                shadow.slot = slot;
+                let seed = seed_of_round(texel.seed, round);
+                *unoccluded = radiance.bright().push(&texel.receiver, points.len(), seed, &mut shadow);
+            }
+        }
+        let bright = shadow.finish(&mut traced).iter().copied().zip(unoccluded);
         let rays = self.rays[..count].chunks(points.len()).zip(self.hits.chunks(points.len()));
-        for (texel, (rays, hits)) in texels.iter_mut().zip(rays) {
-            let seed = combine(texel.seed, 16 + round as u32);
-            traced += texel.gathered.add(scene, radiance, &texel.receiver, rays, hits, seed);
+        for ((texel, (rays, hits)), bright) in texels.iter_mut().zip(rays).zip(bright) {
+            texel.gathered.add(scene, radiance, &texel.receiver, rays, hits, bright);
         }
         traced
     }
+}
+
+/// Seed of a round of a texel with a seed of its own.
+fn seed_of_round(seed: u32, round: usize) -> u32 {
+    combine(seed, 16 + round as u32)
 }
 
 /// The sample points of a round.

@@ -18,10 +18,11 @@ use crate::error::Result;
 use crate::lightmap::atlas::chart_map::ChartMap;
 use crate::lightmap::atlas::charts::Charts;
 use crate::lightmap::atlas::texels::TexelSample;
-use crate::lightmap::texel_light::{Look, TexelAreas, TexelLight};
+use crate::lightmap::texel_light::{Look, TexelAreas, TexelLight, TilePoints};
+use crate::lightmap::tiles::{TILE, in_order};
 use crate::memory::try_vec;
 use crate::photon::PhotonMap;
-use crate::photon::coverage;
+use crate::photon::coverage::Discs;
 use crate::progress::Stage;
 use crate::sampling::{combine, sobol_2d};
 use crate::scene::NONE;
@@ -32,7 +33,7 @@ use std::f32::consts::PI;
 use std::sync::atomic::{AtomicU64, Ordering::Relaxed};
 
 /// Number of texels that a thread processes at a time.
-const BLOCK: usize = 512;
+const BLOCK: usize = 1024;
 
 /// Reflected radiance per texel, with the charts and the map that a look-up needs.
 pub(crate) struct RadianceMap<'a> {
@@ -102,20 +103,23 @@ pub(crate) fn bake(device: &Device, input: &RadianceInput, values: &mut [Vec3], 
     let map = input.light.areas.map;
     device.install(|| {
         looks.par_chunks_mut(BLOCK).enumerate().try_for_each(|(block, out)| {
-            let mut traced = 0;
-            for (i, look) in out.iter_mut().enumerate() {
+            let (mut traced, first) = (0, block * BLOCK);
+            let mut tile = TilePoints::new(TILE)?;
+            for samples in in_order(map, first..first + out.len())?.chunks(TILE) {
                 stage.check()?;
-                let sample = block * BLOCK + i;
-                *look = input.light.first_look(sample, map.is_back(sample), &mut traced);
+                let place = |i: usize| samples[i] as usize - first;
+                input.light.first_look(samples, &mut tile, &mut traced, |i, look| out[place(i)] = look);
             }
             rays.fetch_add(traced, Relaxed);
             stage.advance(out.len() as u64)
         })?;
         values.par_chunks_mut(BLOCK).enumerate().try_for_each(|(block, out)| {
-            let mut traced = 0;
-            for (i, value) in out.iter_mut().enumerate() {
+            let (mut traced, first) = (0, block * BLOCK);
+            let mut room = RadianceTile { points: TilePoints::new(TILE)?, discs: Discs::new(TILE)? };
+            for samples in in_order(map, first..first + out.len())?.chunks(TILE) {
                 stage.check()?;
-                *value = texel(input, &looks, block * BLOCK + i, &mut traced);
+                let place = |i: usize| samples[i] as usize - first;
+                room.radiance(input, &looks, samples, &mut traced, |i, value| out[place(i)] = value);
             }
             rays.fetch_add(traced, Relaxed);
             stage.advance(out.len() as u64)
@@ -124,24 +128,62 @@ pub(crate) fn bake(device: &Device, input: &RadianceInput, values: &mut [Vec3], 
     Ok(rays.into_inner())
 }
 
-fn texel(input: &RadianceInput, looks: &[Look], sample: usize, rays: &mut u64) -> Vec3 {
-    let (light, areas) = (&input.light, &input.light.areas);
-    let albedo = albedo(areas, sample);
-    if albedo == Vec3::ZERO {
-        return Vec3::ZERO;
-    }
-    let back = areas.map.is_back(sample);
-    let mut e = looks[sample].irradiance;
-    if light.needs_closer_look(sample, |s| &looks[s]) {
+/// Working memory for a tile of the radiance map.
+struct RadianceTile {
+    points: TilePoints,
+    discs: Discs,
+}
+
+impl RadianceTile {
+    /// Computes the radiance of the texels of a tile.
+    fn radiance(
+        &mut self,
+        input: &RadianceInput,
+        looks: &[Look],
+        samples: &[u32],
+        rays: &mut u64,
+        mut out: impl FnMut(usize, Vec3),
+    ) {
+        let (light, areas) = (&input.light, &input.light.areas);
+        let (mut albedos, mut sums) = ([Vec3::ZERO; TILE], [Vec3::ZERO; TILE]);
+        // The places in the tile of texels that reflect light, and of those that need more points.
+        let (mut reflecting, mut reflecting_count) = ([0; TILE], 0);
+        let (mut looked_at, mut looked_at_count) = ([0; TILE], 0);
+        for (i, &sample) in samples.iter().enumerate() {
+            let sample = sample as usize;
+            albedos[i] = albedo(areas, sample);
+            if albedos[i] != Vec3::ZERO {
+                sums[i] = looks[sample].irradiance;
+                reflecting[reflecting_count] = i;
+                reflecting_count += 1;
+                if light.needs_closer_look(sample, |s| &looks[s]) {
+                    looked_at[looked_at_count] = i;
+                    looked_at_count += 1;
+                }
+            }
+        }
+        let (reflecting, looked_at) = (&reflecting[..reflecting_count], &looked_at[..looked_at_count]);
+        let mut closer = [0; TILE];
+        let closer = &mut closer[..looked_at.len()];
+        closer.iter_mut().zip(looked_at).for_each(|(sample, &i)| *sample = samples[i]);
         let at = |t: &TexelSample| areas.scene.albedo(t.triangle, t.u, t.v);
-        e = light.closer_look(sample, back, at, rays).unwrap_or(e);
+        light.closer_look(closer, &mut self.points, at, rays, |k, e| {
+            if let Some(e) = e {
+                sums[looked_at[k]] = e;
+            }
+        });
+        if let Some(photons) = input.photons {
+            let disc = |&i: &usize| {
+                let sample = samples[i] as usize;
+                let (point, receiver) = areas.map.receiver(areas.scene, sample, areas.map.is_back(sample));
+                (point.position, receiver.geometric, combine(light.seed, sample as u32))
+            };
+            self.discs.irradiance(photons, reflecting.iter().map(disc), rays, |k, e| sums[reflecting[k]] += e);
+        }
+        for i in 0..samples.len() {
+            out(i, albedos[i] * sums[i] / PI);
+        }
     }
-    if let Some(photons) = input.photons {
-        let (point, receiver) = areas.map.receiver(areas.scene, sample, back);
-        let seed = combine(light.seed, sample as u32);
-        e += coverage::irradiance(photons, point.position, receiver.geometric, seed, rays);
-    }
-    albedo * e / PI
 }
 
 /// Maximum number of look-ups of a texture in one texel.

@@ -10,7 +10,7 @@
 //!
 //! Measured: docs/experiments.md#fallback-gather.
 
-use super::gather::Gathered;
+use super::gather::{Gathered, Tile, TileTexel};
 use super::narrow_gaps::is_in_gap;
 use super::radiance_map::RadianceMap;
 use super::sample_set::SampleSet;
@@ -18,6 +18,7 @@ use super::upsample_visibility::{self, TEXELS_PER_CHECK};
 use crate::error::Result;
 use crate::lightmap::atlas::Atlas;
 use crate::lightmap::atlas::chart_map::ChartMap;
+use crate::lightmap::tiles::TILE;
 use crate::memory::{
     Reservation, try_append, try_collect, try_filled, try_par_gather, try_push, try_vec, try_with_capacity,
 };
@@ -33,7 +34,7 @@ use std::sync::atomic::{AtomicU64, Ordering::Relaxed};
 const SHOWN: &str = "what the light map shows of the gather map";
 
 /// Number of fallback gathers that a thread computes at a time.
-const BLOCK: usize = 64;
+const BLOCK: usize = 4 * TILE;
 
 /// Maximum number of rays of a fallback gather.
 pub(in crate::lightmap) const OWN_RAYS: u32 = 16;
@@ -238,15 +239,21 @@ fn gather_for(
     out: &mut [Own],
     stage: &Stage,
 ) -> Result<u64> {
+    let texel = |&sample: &u32| TileTexel {
+        receiver: atlas.receiver(&atlas.map, backs, sample as usize),
+        seed: combine(own.seed, sample),
+        gathered: Gathered::default(),
+    };
     let mut rays = 0;
-    for (&sample, out) in texels.iter().zip(out) {
+    let mut tile = Tile::new()?;
+    for (texels, out) in texels.chunks(TILE).zip(out.chunks_mut(TILE)) {
         stage.check()?;
-        let receiver = atlas.receiver(&atlas.map, backs, sample as usize);
-        let mut gathered = Gathered::default();
-        let seed = combine(own.seed, sample);
-        rays += gathered.add_round(&atlas.scene, &own.radiance, &receiver, own.samples, 0, seed);
-        let irradiance = gathered.is_visible().then(|| gathered.irradiance());
-        *out = Own { irradiance, normal: receiver.normal };
+        let mut texels: Vec<_> = texels.iter().map(texel).collect();
+        rays += tile.add_round(&atlas.scene, &own.radiance, &mut texels, own.samples, 0);
+        for (TileTexel { receiver, gathered, .. }, out) in texels.iter().zip(out) {
+            let irradiance = gathered.is_visible().then(|| gathered.irradiance());
+            *out = Own { irradiance, normal: receiver.normal };
+        }
     }
     Ok(rays)
 }

@@ -1,0 +1,34 @@
+//! Tiles: groups of neighbouring texels, whose rays are traced together as [streams](crate::trace).
+//!
+//! Texels are numbered row by row, and a run of them may be a long line. What is traced together changes no bit of any
+//! texel, so that a block of texels may be worked on in any order.
+
+use super::atlas::chart_map::ChartMap;
+use crate::error::Result;
+use crate::memory::try_with_capacity;
+use std::ops::Range;
+
+/// Maximum number of texels of a tile.
+pub(crate) const TILE: usize = 64;
+
+/// Bits of the width of the squares.
+const WIDTH_BITS: u16 = 3;
+
+/// Returns the samples of a range in the order of squares of 8 × 8 texels, placement by placement: runs of [`TILE`] of
+/// them, or of a few times as many, are tiles.
+pub(crate) fn in_order(map: &ChartMap, range: Range<usize>) -> Result<Vec<u32>> {
+    let mut order: Vec<u32> = try_with_capacity(range.len(), "the order of texels")?;
+    let mut begin = range.start;
+    while begin < range.end {
+        let placement = map.texels.placement_of(begin as u32);
+        let end = map.samples_of(placement).end.min(range.end);
+        let first = order.len();
+        order.extend(begin as u32..end as u32);
+        order[first..].sort_unstable_by_key(|&s| {
+            let texel = &map.texels.samples[s as usize];
+            (texel.y >> WIDTH_BITS, texel.x >> WIDTH_BITS, s)
+        });
+        begin = end;
+    }
+    Ok(order)
+}
