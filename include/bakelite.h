@@ -247,7 +247,9 @@ typedef struct bk_device_desc {
   /// Number of worker threads, at most 1024; 0: one per logical core, at most 1024. Results do
   /// not depend on it. Default: 0.
   uint32_t num_threads;
-  /// One of the BK_ISA values. Default: BK_ISA_AUTO.
+  /// One of the BK_ISA values; BK_ISA_AUTO is the best that the machine has. The environment
+  /// variable BAKELITE_ISA ("portable", "avx2" or "avx512") forbids what is better than it names.
+  /// Default: BK_ISA_AUTO.
   uint32_t isa;
   /// Log callback, or NULL: messages then go to standard error if the environment variable
   /// BAKELITE_LOG is set to "error", "warning" or "info", the least important level to write, and

@@ -5,7 +5,7 @@ use crate::base::{callback, float_state};
 use crate::error::{Error, Result, invalid_argument};
 use crate::memory::{MemoryFn, MemoryMonitor};
 use crate::progress::Progress;
-use crate::simd::Isa;
+use crate::simd::{Isa, LIMIT_VARIABLE};
 use std::cell::Cell;
 use std::io::Write;
 use std::sync::Arc;
@@ -48,7 +48,8 @@ const LOG_VARIABLE: &str = "BAKELITE_LOG";
 pub struct DeviceOptions {
     /// Number of worker threads, at most [`MAX_THREADS`]; 0: one per logical core, up to that maximum.
     pub num_threads: usize,
-    /// The ISA to use; `None`: the best that this machine has.
+    /// The ISA to use; `None`: the best that this machine has and the environment variable `BAKELITE_ISA` allows
+    /// (`portable`, `avx2`, `avx512`; unset: all).
     pub isa: Option<Isa>,
     /// Receives log messages. `None`: they go to standard error as far as the environment variable `BAKELITE_LOG` asks
     /// for it (`error`, `warning`, or `info`, which any other word means too), else nowhere.
@@ -80,7 +81,9 @@ impl Device {
         }
         let isa = options.isa.unwrap_or_else(Isa::best);
         if !isa.is_available() {
-            return Err(Error::Unsupported(format!("this machine cannot run {}", isa.name())));
+            let message =
+                format!("this machine cannot run {}, or {LIMIT_VARIABLE} in the environment forbids it", isa.name());
+            return Err(Error::Unsupported(message));
         }
         // (Left to itself, rayon asks the environment for the number first.)
         let num_threads = match options.num_threads {
@@ -482,6 +485,33 @@ mod tests {
         for isa in Isa::available() {
             let d = Device::new(DeviceOptions { isa: Some(isa), num_threads: 1, ..Default::default() }).unwrap();
             assert_eq!(d.isa(), isa);
+        }
+    }
+
+    /// The environment is read once per process, so each limit has a process of its own, which runs this test.
+    #[test]
+    fn the_environment_forbids_better_isas() {
+        let variable = "BAKELITE_TEST_BEST";
+        if let Ok(expected) = std::env::var(variable) {
+            match Device::new(DeviceOptions { num_threads: 1, ..Default::default() }) {
+                Ok(device) => assert_eq!(device.isa().name(), expected),
+                Err(e) => assert!(expected.is_empty() && e.to_string().contains(LIMIT_VARIABLE), "{e}"),
+            }
+            let better = Isa::ALL.into_iter().skip_while(|isa| isa.name() != expected).skip(1);
+            for isa in better {
+                assert!(Device::new(DeviceOptions { isa: Some(isa), num_threads: 1, ..Default::default() }).is_err());
+            }
+            return;
+        }
+        let names = Isa::available().map(|isa| (isa.name(), isa.name()));
+        for (limit, expected) in names.chain([("avx", ""), ("", "")]) {
+            let test = "device::tests::the_environment_forbids_better_isas";
+            let status = std::process::Command::new(std::env::current_exe().unwrap())
+                .args(["--exact", test])
+                .env(LIMIT_VARIABLE, limit)
+                .env(variable, expected)
+                .status();
+            assert!(status.unwrap().success(), "{limit}");
         }
     }
 }

@@ -117,7 +117,9 @@ pub struct bk_device_desc {
     /// Number of worker threads, at most 1024; 0: one per logical core, at most 1024. Results do
     /// not depend on it. Default: 0.
     pub num_threads: u32,
-    /// One of the BK_ISA values. Default: BK_ISA_AUTO.
+    /// One of the BK_ISA values; BK_ISA_AUTO is the best that the machine has. The environment
+    /// variable BAKELITE_ISA ("portable", "avx2" or "avx512") forbids what is better than it names.
+    /// Default: BK_ISA_AUTO.
     pub isa: u32,
     /// Log callback, or NULL: messages then go to standard error if the environment variable
     /// BAKELITE_LOG is set to "error", "warning" or "info", the least important level to write, and

@@ -15,6 +15,7 @@
 //! features from [`isa_features`], so that no entry point can use a feature which the check leaves out.
 
 use std::ops::{Add, Mul, Sub};
+use std::sync::OnceLock;
 
 #[cfg(target_arch = "x86_64")]
 mod avx2;
@@ -68,13 +69,26 @@ macro_rules! entry_point {
 pub(crate) use entry_point;
 
 /// Whether the CPU has all of the features.
-#[cfg(all(target_arch = "x86_64", not(miri), not(bakelite_portable)))]
+#[cfg(all(target_arch = "x86_64", not(miri)))]
 macro_rules! cpu_has {
     ([$($feature:tt)*]) => { true $(&& std::arch::is_x86_feature_detected!($feature))* };
 }
 
-/// An instruction set that kernels are compiled for.
-#[derive(Clone, Copy, Debug, PartialEq, Eq, Hash)]
+/// Environment variable with the name of the best ISA to use, whatever the machine has. Any other word than a name
+/// allows none, so that a misspelt one is not taken for a test of what it meant.
+pub(crate) const LIMIT_VARIABLE: &str = "BAKELITE_ISA";
+
+/// What the environment allows; read once, so that it is the same for a whole process.
+fn limit() -> Option<Isa> {
+    static LIMIT: OnceLock<Option<Isa>> = OnceLock::new();
+    *LIMIT.get_or_init(|| match std::env::var_os(LIMIT_VARIABLE) {
+        Some(name) => Isa::ALL.into_iter().find(|isa| name == isa.name()),
+        None => Some(Isa::Avx512),
+    })
+}
+
+/// An instruction set that kernels are compiled for; the greater, the better.
+#[derive(Clone, Copy, Debug, PartialEq, Eq, PartialOrd, Hash)]
 #[repr(u32)]
 pub enum Isa {
     /// The `wide` crate's vectors at the target's baseline: SSE2, NEON, simd128 or scalar.
@@ -89,19 +103,19 @@ impl Isa {
     /// All of them, best last.
     pub const ALL: [Isa; 3] = [Isa::Portable, Isa::Avx2, Isa::Avx512];
 
-    /// Whether this machine can run it.
+    /// Whether this machine can run it, and the environment variable `BAKELITE_ISA` allows it.
     pub fn is_available(self) -> bool {
-        // Miri interprets no intrinsics of wide vectors. `bakelite_portable` is for tests of machines without them.
-        #[cfg(all(target_arch = "x86_64", not(miri), not(bakelite_portable)))]
-        match self {
+        let is_allowed = limit().is_some_and(|best| self <= best);
+        // Miri interprets no intrinsics of wide vectors.
+        #[cfg(all(target_arch = "x86_64", not(miri)))]
+        let is_there = match self {
             Isa::Portable => true,
             Isa::Avx2 => isa_features! { Avx2 => cpu_has! {} },
             Isa::Avx512 => isa_features! { Avx512 => cpu_has! {} },
-        }
-        #[cfg(any(not(target_arch = "x86_64"), miri, bakelite_portable))]
-        {
-            self == Isa::Portable
-        }
+        };
+        #[cfg(any(not(target_arch = "x86_64"), miri))]
+        let is_there = self == Isa::Portable;
+        is_allowed && is_there
     }
 
     /// Whether this machine has VBMI2 beside AVX-512.
