@@ -115,10 +115,10 @@ impl Search<'_> {
             }
         }
         if by_parts || buried.len() == samples.len() {
-            self.find_seen_parts(map, placement, is_back, &samples, &mut buried, &mut found)?;
+            self.find_seen_parts(map, placement, is_back, &samples, &mut buried, &mut found, stage)?;
         }
         if !buried.is_empty() && buried.len() < samples.len() {
-            found.moved = nearest_seen(map, placement, samples, buried)?;
+            found.moved = nearest_seen(map, placement, samples, buried, stage)?;
         }
         Ok(found)
     }
@@ -133,6 +133,7 @@ impl Search<'_> {
         samples: &Range<usize>,
         buried: &mut Vec<u32>,
         found: &mut Found,
+        stage: &Stage,
     ) -> Result<()> {
         if buried.is_empty() {
             return Ok(());
@@ -141,9 +142,13 @@ impl Search<'_> {
         let mut result = Ok(());
         buried.iter().for_each(|&s| is_buried[s as usize - samples.start] = true);
         buried.retain(|&s| {
-            let (x, y) = map.position(s as usize);
+            // Up to 64 rays.
+            result = result.clone().and_then(|()| stage.check());
+            if result.is_err() {
+                return true;
+            }
             // A texel surrounded by buried ones is taken to have no visible point.
-            let is_at_border = (-1..=1).flat_map(|dy| (-1..=1).map(move |dx| (x + dx, y + dy))).any(|(x, y)| {
+            let is_at_border = around(map.position(s as usize)).any(|(x, y)| {
                 let neighbour = map.at(placement, x, y);
                 !samples.contains(&(neighbour as usize)) || !is_buried[neighbour as usize - samples.start]
             });
@@ -152,7 +157,7 @@ impl Search<'_> {
             let mut is_buried = |point: &TexelSample| self.are_buried(&[*point], s, back, &mut found.rays)[0];
             let seen = points.into_iter().find(|point| !is_buried(point));
             if let Some(point) = seen {
-                result = result.clone().and_then(|()| try_push(&mut found.seen_parts, (s, point), BURIED));
+                result = try_push(&mut found.seen_parts, (s, point), BURIED);
             }
             seen.is_none()
         });
@@ -255,17 +260,28 @@ fn points_of_texel(charts: &Charts, map: &ChartMap, placement: u32, sample: usiz
     points.map(|w| TexelSample { u: w.x, v: w.y, ..texel }).take(POINTS).collect()
 }
 
+/// A texel and its eight neighbours.
+fn around((x, y): (i32, i32)) -> impl Iterator<Item = (i32, i32)> {
+    (0..9).map(move |i| (x + i % 3 - 1, y + i / 3 - 1))
+}
+
 /// Finds the nearest visible texels to those `buried`, ring by ring.
-fn nearest_seen(map: &ChartMap, placement: u32, samples: Range<usize>, buried: Vec<u32>) -> Result<Vec<(u32, u32)>> {
+fn nearest_seen(
+    map: &ChartMap,
+    placement: u32,
+    samples: Range<usize>,
+    buried: Vec<u32>,
+    stage: &Stage,
+) -> Result<Vec<(u32, u32)>> {
     let local = |s: u32| s as usize - samples.start;
     let mut to: Vec<u32> = try_collect(samples.clone().map(|s| s as u32), BURIED)?;
     buried.iter().for_each(|&s| to[local(s)] = NONE);
     let (mut missing, mut moved) = (buried, Vec::new());
     for _ in 0..MAX_ROUNDS {
+        stage.check()?;
         let nearest = |&s: &u32| -> Option<(u32, u32)> {
             let (ox, oy) = map.position(s as usize);
-            let around = (-1..=1).flat_map(|dy| (-1..=1).map(move |dx| (ox + dx, oy + dy)));
-            let known = around.filter_map(|(x, y)| {
+            let known = around((ox, oy)).filter_map(|(x, y)| {
                 let neighbour = map.at(placement, x, y);
                 // The window of given charts may contain another chart.
                 let is_own = neighbour != NONE && samples.contains(&(neighbour as usize));
