@@ -1,6 +1,6 @@
 /*
  * What the library's surroundings may do to it: floating-point states, small stacks, forks, callbacks that call
- * back, deep trees, and commits that fail.
+ * back, deep trees, commits that fail, and many meshes.
  *
  *     runtime FOLDER/ [TEST]
  *
@@ -15,6 +15,7 @@
 #include <pthread.h>
 #include <stdlib.h>
 #include <sys/wait.h>
+#include <time.h>
 #include <unistd.h>
 #ifdef __SSE2__
 #include <xmmintrin.h>
@@ -653,6 +654,43 @@ static void a_commit_that_fails_can_be_repeated(void) {
     bk_device_release(device);
 }
 
+/* ---- Many meshes ---- */
+
+/* Processor time of adding meshes of one triangle: unlike time on a clock, it is the same on a busy machine. */
+static double seconds_to_add(uint32_t meshes) {
+    static const float positions[9] = {0.0f, 0.0f, 0.0f, 1.0f, 0.0f, 0.0f, 0.0f, 1.0f, 0.0f};
+    static const uint32_t indices[3] = {0, 1, 2};
+    bk_device *device = device_of(1);
+    bk_scene *scene = NULL;
+    bk_material_desc material;
+    bk_mesh_desc mesh;
+    clock_t start;
+    double seconds;
+    uint32_t i;
+    CHECK_OK(bk_scene_create(device, &scene));
+    bk_material_desc_init(&material);
+    CHECK_OK(bk_scene_add_material(scene, &material, NULL));
+    bk_mesh_desc_init(&mesh);
+    mesh.positions = positions;
+    mesh.vertex_count = 3;
+    mesh.indices = indices;
+    mesh.triangle_count = 1;
+    start = clock();
+    for (i = 0; i < meshes; i++) {
+        CHECK_OK(bk_scene_add_mesh(scene, &mesh, NULL));
+    }
+    seconds = (double)(clock() - start) / CLOCKS_PER_SEC;
+    bk_scene_release(scene);
+    bk_device_release(device);
+    return seconds;
+}
+
+/* 16 times as many meshes: 16 times the time, where it grew with the square 256 times. */
+static void adding_meshes_takes_time_in_proportion(void) {
+    double few = seconds_to_add(5000), many = seconds_to_add(80000);
+    CHECK(many < 64.0 * few);
+}
+
 int main(int argc, char **argv) {
     static void (*const tests[])(void) = {
         /* First, while no other test has started a thread. */
@@ -665,6 +703,7 @@ int main(int argc, char **argv) {
         a_stack_of_64_kb_is_enough_for_every_query,
         deep_trees_do_not_overflow_stacks,
         a_commit_that_fails_can_be_repeated,
+        adding_meshes_takes_time_in_proportion,
     };
     size_t i;
     folder = argc > 1 ? argv[1] : "";
