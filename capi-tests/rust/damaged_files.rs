@@ -1,7 +1,14 @@
 //! Damaged files of every kind that is read: a short run of what `fuzz/` does for hours, the same each time.
+//!
+//!     BAKELITE_DAMAGED_FILES=checkpoint,600,7 cargo test --release --all-features --test damaged_files -- --nocapture
+//!
+//! tries other inputs instead, of one kind, for so many seconds, from a seed of one's own, and counts them: without the
+//! nightly toolchain that `fuzz/` needs.
 
 #[path = "../../fuzz/src/damaged_files.rs"]
 mod damaged_files;
+#[path = "../../fuzz/src/live_state.rs"]
+mod live_state;
 #[path = "../../fuzz/src/room.rs"]
 mod room;
 #[path = "../../fuzz/src/saved.rs"]
@@ -10,6 +17,7 @@ mod saved;
 mod seeds;
 
 use seeds::{TARGETS, seeds};
+use std::time::{Duration, Instant};
 
 /// Inputs per kind of file.
 const INPUTS: usize = 500;
@@ -66,21 +74,37 @@ fn damage(bytes: &mut Vec<u8>, other: &[u8], random: &mut Random) {
     }
 }
 
+/// Reads damaged files of one kind while `more` says so of their number, which it returns.
+fn read_damaged(target: &str, random: &mut Random, more: impl Fn(usize) -> bool) -> usize {
+    let seeds = seeds();
+    let own: Vec<&[u8]> = seeds.iter().filter(|(t, _)| *t == target).map(|(_, bytes)| &bytes[..]).collect();
+    assert!(!own.is_empty(), "{target} has no seed");
+    own.iter().for_each(|bytes| damaged_files::read(target, bytes));
+    let mut inputs = 0;
+    while more(inputs) {
+        let mut bytes = own[random.below(own.len())].to_vec();
+        let other = own[random.below(own.len())];
+        for _ in 0..1 + random.below(5) {
+            damage(&mut bytes, other, random);
+        }
+        damaged_files::read(target, &bytes);
+        inputs += 1;
+    }
+    inputs
+}
+
 #[test]
 fn damaged_files_are_read_or_refused_and_nothing_else() {
-    let seeds = seeds();
+    if let Ok(run) = std::env::var("BAKELITE_DAMAGED_FILES") {
+        let [target, seconds, seed] = run.split(',').collect::<Vec<_>>().try_into().expect("KIND,SECONDS,SEED");
+        let (start, time) = (Instant::now(), Duration::from_secs(seconds.parse().expect("seconds")));
+        let mut random = Random(1 + seed.parse::<u64>().expect("a seed"));
+        let inputs = read_damaged(target, &mut random, |_| start.elapsed() < time);
+        println!("{target}: {inputs} files in {seconds} s, none of which broke anything");
+        return;
+    }
     let mut random = Random(0x9e37_79b9_7f4a_7c15);
     for target in TARGETS {
-        let own: Vec<&[u8]> = seeds.iter().filter(|(t, _)| *t == target).map(|(_, bytes)| &bytes[..]).collect();
-        assert!(!own.is_empty(), "{target} has no seed");
-        own.iter().for_each(|bytes| damaged_files::read(target, bytes));
-        for _ in 0..INPUTS {
-            let mut bytes = own[random.below(own.len())].to_vec();
-            let other = own[random.below(own.len())];
-            for _ in 0..1 + random.below(5) {
-                damage(&mut bytes, other, &mut random);
-            }
-            damaged_files::read(target, &bytes);
-        }
+        read_damaged(target, &mut random, |inputs| inputs < INPUTS);
     }
 }

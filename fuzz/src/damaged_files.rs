@@ -1,5 +1,6 @@
 //! Reads a file of any content and checks what may come of it: a valid scene or image, or an error and nothing else.
 
+use crate::live_state::LiveState;
 use crate::saved::Saved;
 use bakelite::scene::{SceneData, is_valid_triangle};
 use bakelite::{Error, Progress, io};
@@ -10,6 +11,7 @@ const TRIANGLES: &str = "mtllib a.mtl\nv 0 0 0\nv 1 0 0\nv 0 1 0\nvt 0 0\nusemtl
     f 1/1 2/1 3/1\nusemtl cut\nf 1/1 2/1 3/1\n";
 
 static RESULT: LazyLock<Mutex<Saved>> = LazyLock::new(|| Mutex::new(Saved::result()));
+static LIVE_STATE: LazyLock<Mutex<LiveState>> = LazyLock::new(|| Mutex::new(LiveState::new()));
 static CHECKPOINT: LazyLock<Mutex<Saved>> = LazyLock::new(|| Mutex::new(Saved::checkpoint()));
 
 /// The folder of this process. It holds an OBJ file, a library and an image that inputs may name.
@@ -49,6 +51,7 @@ pub fn read(target: &str, bytes: &[u8]) {
             write("image");
             load(&folder().join("triangles.obj"));
         }
+        "live_restore" => LIVE_STATE.lock().expect("no earlier panic").restore(bytes),
         "saved_result" => RESULT.lock().expect("no earlier panic").load(bytes),
         "checkpoint" => CHECKPOINT.lock().expect("no earlier panic").resume(bytes),
         _ => match io::image::read_environment(&write("sky")) {

@@ -2,6 +2,7 @@
 //! toolchain.
 
 pub mod damaged_files;
+pub mod live_state;
 pub mod room;
 pub mod saved;
 pub mod seeds;

@@ -8,8 +8,8 @@ use image::{ExtendedColorType as Color, ImageEncoder, Rgb};
 use std::io::Cursor;
 
 /// The targets: kinds of files.
-pub const TARGETS: [&str; 11] =
-    ["obj", "mtl", "ply", "gltf", "glb", "png", "jpeg", "hdr", "exr", "saved_result", "checkpoint"];
+pub const TARGETS: [&str; 12] =
+    ["obj", "mtl", "ply", "gltf", "glb", "png", "jpeg", "hdr", "exr", "saved_result", "checkpoint", "live_restore"];
 
 /// Valid files, each with its target, and changes to saved ones.
 pub fn seeds() -> Vec<(&'static str, Vec<u8>)> {
@@ -30,6 +30,7 @@ pub fn seeds() -> Vec<(&'static str, Vec<u8>)> {
     all.extend([Color::L8, Color::Rgb8].map(|color| ("jpeg", jpeg(color))));
     all.extend([("hdr", hdr(2)), ("hdr", hdr(16)), ("exr", exr())]);
     all.extend(["saved_result", "checkpoint"].into_iter().flat_map(|target| changes().map(move |c| (target, c))));
+    all.extend(live_changes().map(|c| ("live_restore", c)));
     all
 }
 
@@ -37,6 +38,13 @@ pub fn seeds() -> Vec<(&'static str, Vec<u8>)> {
 fn changes() -> impl Iterator<Item = Vec<u8>> {
     let to = |record: u8| (0..8).map(move |what| [&[record, 64 + what, 9, 0][..], &[0xff; 8]].concat());
     [Vec::new()].into_iter().chain((0..8).flat_map(to))
+}
+
+/// Four bytes of ones, zeros and a negative number at places throughout a live state (see `live_state`), and none.
+fn live_changes() -> impl Iterator<Item = Vec<u8>> {
+    let at =
+        |i: u16| [[0xff; 4], [0; 4], [0, 0, 0x80, 0xbf]].map(|new| [&(997 * i).to_le_bytes(), &[4][..], &new].concat());
+    [Vec::new()].into_iter().chain((0..8).flat_map(at))
 }
 
 const OBJ: [&str; 3] = [
