@@ -248,7 +248,7 @@ typedef struct bk_device_desc {
   /// not depend on it. Default: 0.
   uint32_t num_threads;
   /// One of the BK_ISA values; BK_ISA_AUTO is the best that the machine has. The environment
-  /// variable BAKELITE_ISA ("portable", "avx2" or "avx512") forbids what is better than it names.
+  /// variable BAKELITE_ISA ("portable", "avx2" or "avx512") forbids better ones than it names.
   /// Default: BK_ISA_AUTO.
   uint32_t isa;
   /// Log callback, or NULL: messages then go to standard error if the environment variable

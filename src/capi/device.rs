@@ -118,7 +118,7 @@ pub struct bk_device_desc {
     /// not depend on it. Default: 0.
     pub num_threads: u32,
     /// One of the BK_ISA values; BK_ISA_AUTO is the best that the machine has. The environment
-    /// variable BAKELITE_ISA ("portable", "avx2" or "avx512") forbids what is better than it names.
+    /// variable BAKELITE_ISA ("portable", "avx2" or "avx512") forbids better ones than it names.
     /// Default: BK_ISA_AUTO.
     pub isa: u32,
     /// Log callback, or NULL: messages then go to standard error if the environment variable
