@@ -11,7 +11,7 @@ const TRIANGLES: &str = "mtllib a.mtl\nv 0 0 0\nv 1 0 0\nv 0 1 0\nvt 0 0\nusemtl
     f 1/1 2/1 3/1\nusemtl cut\nf 1/1 2/1 3/1\n";
 
 static RESULT: LazyLock<Mutex<Saved>> = LazyLock::new(|| Mutex::new(Saved::result()));
-static LIVE_STATE: LazyLock<Mutex<LiveState>> = LazyLock::new(|| Mutex::new(LiveState::new()));
+static LIVE_STATE: LazyLock<Mutex<LiveState>> = LazyLock::new(|| Mutex::new(LiveState::of_room()));
 static CHECKPOINT: LazyLock<Mutex<Saved>> = LazyLock::new(|| Mutex::new(Saved::checkpoint()));
 
 /// The folder of this process. It holds an OBJ file, a library and an image that inputs may name.

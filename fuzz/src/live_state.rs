@@ -15,7 +15,7 @@ pub struct LiveState {
 }
 
 impl LiveState {
-    pub fn new() -> LiveState {
+    pub fn of_room() -> LiveState {
         let params = LiveParams { photon_count: 2000, max_rounds: 3, ..Default::default() };
         let mut live = Live::new(&room::lightmap(), &params, &Progress::none()).expect("a live object");
         live.update(&camera(), &Budget { milliseconds: 0.0, rays: 20_000 }).expect("an update");
