@@ -10,6 +10,7 @@
 # PROPTEST_RNG_SEED, PROPTEST_CASES: where property tests start (the same place each time, so that a
 # failure is the change's) and how many cases they try. To look for what no run has met yet:
 #     PROPTEST_CASES=10000 cargo test --release --locked --all-features
+# BAKELITE_ISA: portable or avx2, to test what machines without better instruction sets run.
 set -euo pipefail
 cd "$(dirname "$0")/.."
 root=$PWD
