@@ -124,7 +124,7 @@ impl Isa {
         {
             isa_features! { Avx512Vbmi2 => cpu_has! {} }
         }
-        #[cfg(any(not(target_arch = "x86_64"), miri, bakelite_portable))]
+        #[cfg(any(not(target_arch = "x86_64"), miri))]
         {
             false
         }
