@@ -1,10 +1,10 @@
 //! The device: a thread pool of its own, the ISA chosen at run time, the
 //! log and the memory accounts.
 
+use crate::base::error::{Error, Result, invalid_argument};
+use crate::base::memory::{MemoryFn, MemoryMonitor};
+use crate::base::progress::Progress;
 use crate::base::{callback, float_state};
-use crate::error::{Error, Result, invalid_argument};
-use crate::memory::{MemoryFn, MemoryMonitor};
-use crate::progress::Progress;
 use crate::simd::{Isa, LIMIT_VARIABLE};
 use std::cell::Cell;
 use std::io::Write;

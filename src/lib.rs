@@ -52,7 +52,6 @@ pub mod scene;
 pub(crate) mod simd;
 pub mod trace;
 
-pub(crate) use base::{callback, float_state};
 pub use base::{error, files, memory, progress, sampling};
 pub use device::{Device, DeviceOptions};
 pub use error::{Error, Result};

@@ -1,8 +1,8 @@
 //! Each module (floor) of the library imports only from those above it in docs/architecture.md, and no
 //! two folders or files import each other in a circle. Nor do those of the command line.
 //!
-//! Paths that begin with `crate::` or `super::` are looked at, tests apart. Names that `lib.rs` re-exports count for
-//! the floor that they come from.
+//! Paths that begin with `crate::` or `super::` are looked at, tests apart. What `lib.rs` re-exports is for users of the
+//! library: inside, imports name the module that an item is defined in.
 
 use std::collections::{BTreeMap, BTreeSet};
 use std::path::{Path, PathBuf};
@@ -22,28 +22,6 @@ const FLOORS: &[&str] = &[
     "reference",
     "io",
     "capi",
-];
-
-/// What `lib.rs` re-exports under a shorter name, and the floor that it is on.
-const NAMES: &[(&str, &str)] = &[
-    ("callback", "base"),
-    ("error", "base"),
-    ("files", "base"),
-    ("float_state", "base"),
-    ("memory", "base"),
-    ("progress", "base"),
-    ("sampling", "base"),
-    ("Error", "base"),
-    ("Result", "base"),
-    ("Progress", "base"),
-    ("Isa", "simd"),
-    ("Device", "device"),
-    ("DeviceOptions", "device"),
-    ("Light", "scene"),
-    ("Material", "scene"),
-    ("Mesh", "scene"),
-    ("Scene", "scene"),
-    ("SceneData", "scene"),
 ];
 
 /// A file of the library, by its module path.
@@ -197,28 +175,26 @@ fn expand(text: &str, before: &[String], found: &mut BTreeSet<Vec<String>>) {
 
 /// The floor of a path below the crate.
 fn floor(path: &[String]) -> Option<usize> {
-    let first = path.first()?.as_str();
-    let name = NAMES.iter().find(|(name, _)| *name == first).map_or(first, |(_, floor)| floor);
-    FLOORS.iter().position(|f| *f == name)
+    let first = path.first()?;
+    FLOORS.iter().position(|f| f == first)
 }
 
 #[test]
 fn floors_import_only_from_those_above_them() {
-    let mut upward = Vec::new();
+    let (mut upward, mut through_lib) = (Vec::new(), Vec::new());
     for file in files(Crate::Library) {
         let own = floor(&file.module).unwrap_or_else(|| panic!("{} is on no floor", file.path.display()));
         for path in paths(&file) {
-            let Some(to) = floor(&path) else {
-                // A macro of the crate, or a name that has come from elsewhere.
-                assert!(path.len() < 2 || !FLOORS.contains(&path[0].as_str()), "{path:?}");
-                continue;
-            };
-            if to > own {
-                upward.push(format!("{} imports {}", file.module.join("::"), path.join("::")));
+            let import = format!("{} imports {}", file.module.join("::"), path.join("::"));
+            match floor(&path) {
+                None => through_lib.push(import),
+                Some(to) if to > own => upward.push(import),
+                Some(_) => {}
             }
         }
     }
     assert!(upward.is_empty(), "imports from lower floors:\n{}", upward.join("\n"));
+    assert!(through_lib.is_empty(), "imports of what lib.rs re-exports:\n{}", through_lib.join("\n"));
 }
 
 /// Nodes that lie on a circle of edges.
@@ -245,12 +221,6 @@ fn edges(of_crate: Crate, by_folder: bool, of: impl Fn(&[String]) -> String) -> 
     for file in &all {
         for path in paths(file) {
             let mut path = path;
-            if let Some((_, floor)) = NAMES.iter().find(|(name, _)| path.first().is_some_and(|p| p == name))
-                && *floor == "base"
-                && path[0].chars().next().is_some_and(char::is_lowercase)
-            {
-                path.insert(0, "base".into());
-            }
             // The longest prefix that is a file.
             while !path.is_empty() && !modules.contains(&path) {
                 path.pop();
@@ -303,7 +273,7 @@ fn the_parser_sees_what_it_is_for() {
                 #[cfg(test)]\nfn t() {\n    crate::capi::no()\n}\n// crate::io\n#[cfg(test)]\nmod tests { use crate::io; }";
     let expected = ["lightmap::x::Y", "live::Live", "live::save::A", "live::save::B", "live::self", "trace::offset"];
     assert_eq!(of(&file("lightmap::bake", text)), expected);
-    assert_eq!(floor(&["Scene".into()]), floor(&["scene".into(), "x".into()]));
+    assert_eq!([floor(&["scene".into(), "x".into()]), floor(&["Scene".into()])], [Some(4), None]);
     let edge = |a: &str, b: &str| (a.to_owned(), BTreeSet::from([b.to_owned()]));
     assert_eq!(circles(&BTreeMap::from([edge("a", "b"), edge("b", "c"), edge("c", "b")])), ["b", "c"]);
 }

@@ -5,7 +5,7 @@
 //! has not returned yet; with one thread it would wait for itself. So code that starts such work asks [`is_running`]
 //! first.
 
-use crate::float_state::CallersState;
+use crate::base::float_state::CallersState;
 use std::cell::Cell;
 
 thread_local! {

@@ -59,6 +59,6 @@ impl std::error::Error for Error {}
 
 /// Returns `Err(Error::InvalidArgument(format!(…)))`, the most frequent error.
 macro_rules! invalid_argument {
-    ($($arg:tt)*) => { Err($crate::error::Error::InvalidArgument(format!($($arg)*))) };
+    ($($arg:tt)*) => { Err($crate::base::error::Error::InvalidArgument(format!($($arg)*))) };
 }
 pub(crate) use invalid_argument;

@@ -5,7 +5,7 @@
 //! `NAME.part` (for a name too long for that its checksum, `CHECKSUM.part`); the next save of the same name overwrites
 //! it.
 
-use crate::error::{Error, Result};
+use crate::base::error::{Error, Result};
 use std::fs::{File, Metadata, OpenOptions, TryLockError};
 use std::io::{self, ErrorKind, Read, Write};
 use std::path::{Path, PathBuf};

@@ -1,7 +1,7 @@
 //! Accounts of large allocations: a running total with its peak, an optional monitor that may
 //! refuse, and budgets for single calls.
 
-use crate::error::{Error, Result};
+use crate::base::error::{Error, Result};
 use rayon::prelude::*;
 use std::sync::Arc;
 use std::sync::atomic::{AtomicI64, Ordering::SeqCst};
@@ -44,7 +44,7 @@ impl MemoryMonitor {
     pub fn reserve(self: &Arc<Self>, bytes: usize, what: &str) -> Result<Reservation> {
         let bytes = i64::try_from(bytes).map_err(|_| Error::OutOfMemory(format!("{what} would take {bytes} bytes")))?;
         if let Some(callback) = &self.callback
-            && !crate::callback::run(|| callback(bytes))
+            && !crate::base::callback::run(|| callback(bytes))
         {
             return Err(Error::OutOfMemory(format!("the memory monitor refused {bytes} bytes for {what}")));
         }
@@ -111,7 +111,7 @@ impl Drop for Reservation {
         }
         self.monitor.current.fetch_sub(self.bytes, SeqCst);
         if let Some(callback) = &self.monitor.callback {
-            crate::callback::run(|| callback(-self.bytes));
+            crate::base::callback::run(|| callback(-self.bytes));
         }
     }
 }

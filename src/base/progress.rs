@@ -6,7 +6,7 @@
 //! worker ever waits for a callback, and a callback that waits for workers does not block them. Work that is not run
 //! that way reports whenever it counts, on the thread that counts.
 
-use crate::error::{Error, Result};
+use crate::base::error::{Error, Result};
 use std::collections::VecDeque;
 use std::sync::atomic::{AtomicBool, AtomicU32, AtomicU64, Ordering::Relaxed};
 use std::sync::{Condvar, Mutex, MutexGuard, PoisonError};
@@ -100,7 +100,7 @@ impl Reporter<'_> {
             }
             if callback.pace.allows(self.begin.elapsed(), start.is_some()) {
                 callback.fraction = callback.fraction.max(fraction);
-                if !crate::callback::run(|| (callback.function)(callback.fraction, stage)) {
+                if !crate::base::callback::run(|| (callback.function)(callback.fraction, stage)) {
                     return false;
                 }
             }

@@ -12,9 +12,9 @@ use super::bins::{BinMap, Bins, Side, Split, bin_count, in_parallel, on_heap};
 use super::layout::SAH_DEPTH;
 use super::partings::{best_parting, halve, leaf_cost, part_few};
 use super::references::{Box4, Extent, Range4, Reference, References, area_scale};
-use crate::error::Result;
-use crate::memory::{try_zeroed, try_zeroed_as_needed};
-use crate::progress::Progress;
+use crate::base::error::Result;
+use crate::base::memory::{try_zeroed, try_zeroed_as_needed};
+use crate::base::progress::Progress;
 #[cfg(target_arch = "x86_64")]
 use crate::simd::Isa;
 use glam::{Vec3, Vec4};
@@ -340,7 +340,7 @@ impl BinaryBvh {
 #[cfg(test)]
 pub(super) mod tests {
     use super::*;
-    use crate::sampling::uniform;
+    use crate::base::sampling::uniform;
 
     fn soup(n: usize, seed: u32, size: f32) -> Vec<[Vec3; 3]> {
         let p = |i: usize, k: u32| {

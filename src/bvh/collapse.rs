@@ -11,9 +11,9 @@ use super::binary::{BinaryBvh, BinaryNode};
 use super::compact::{self, Compact, CompactNode};
 use super::layout::{ChildRef, LEAF_PAD, LEAF_STRIDE, Mbvh, Node, WIDTH};
 use super::references::Box4;
-use crate::error::Result;
-use crate::memory::{try_append, try_par_collect, try_push, try_with_capacity, try_zeroed};
-use crate::progress::Progress;
+use crate::base::error::Result;
+use crate::base::memory::{try_append, try_par_collect, try_push, try_with_capacity, try_zeroed};
+use crate::base::progress::Progress;
 use glam::Vec3;
 use rayon::prelude::*;
 
@@ -228,9 +228,9 @@ fn fill_leaf(leaf: &mut [f32], triangles: &[u32], corners: &impl Fn(u32) -> [Vec
 #[cfg(test)]
 mod tests {
     use super::*;
+    use crate::base::progress::Progress;
+    use crate::base::sampling::uniform;
     use crate::bvh::BuildOptions;
-    use crate::progress::Progress;
-    use crate::sampling::uniform;
 
     #[test]
     fn every_triangle_is_in_one_leaf_with_its_corners_and_number() {

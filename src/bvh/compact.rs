@@ -6,9 +6,9 @@
 //! [`Node`]: so the box test is that of full nodes and as conservative.
 
 use super::layout::{ChildRef, Node, WIDTH};
+use crate::base::error::Result;
 use crate::base::geometry::half_area;
-use crate::error::Result;
-use crate::memory::{try_collect, try_to_vec};
+use crate::base::memory::{try_collect, try_to_vec};
 use bytemuck::{Pod, Zeroable};
 use glam::Vec3;
 use rayon::prelude::*;
@@ -349,8 +349,8 @@ mod tests {
     use super::super::layout::LEAF_STRIDE;
     use super::super::{BuildOptions, Mbvh};
     use super::*;
-    use crate::progress::Progress;
-    use crate::sampling::uniform;
+    use crate::base::progress::Progress;
+    use crate::base::sampling::uniform;
     use proptest::prelude::*;
 
     fn soup(n: u32, seed: u32, scale: f32) -> Vec<[Vec3; 3]> {

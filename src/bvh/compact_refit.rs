@@ -8,9 +8,9 @@ use super::collapse::set_box;
 use super::compact::{Compact, CompactNode, GONE, NUMBER, PAD};
 use super::layout::{ChildRef, Node};
 use super::references::{Box4, triangle_box};
+use crate::base::error::Result;
 use crate::base::geometry::is_valid_triangle;
-use crate::error::Result;
-use crate::memory::{try_filled, try_with_capacity};
+use crate::base::memory::{try_filled, try_with_capacity};
 use glam::Vec3;
 use rayon::prelude::*;
 
@@ -94,8 +94,8 @@ mod tests {
     use super::super::BinaryBvh;
     use super::super::collapse::collapse_compact;
     use super::*;
-    use crate::progress::Progress;
-    use crate::sampling::uniform;
+    use crate::base::progress::Progress;
+    use crate::base::sampling::uniform;
 
     fn soup(n: u32, seed: u32) -> Vec<[Vec3; 3]> {
         let point = |i, k: u32| Vec3::from_array([0, 1, 2].map(|a| uniform(i, k + a, seed)));

@@ -1,8 +1,8 @@
 //! Memory layout of the 8-wide tree.
 
+use crate::base::error::Result;
 use crate::base::geometry::half_area;
-use crate::error::Result;
-use crate::memory::try_to_vec;
+use crate::base::memory::try_to_vec;
 use crate::simd::prefetch;
 use bytemuck::{Pod, Zeroable};
 use glam::Vec3;

@@ -19,8 +19,8 @@ pub(crate) use compact::Compact;
 pub use layout::{ChildRef, Mbvh, Node};
 pub(crate) use references::References;
 
-use crate::error::{Result, invalid_argument};
-use crate::progress::Progress;
+use crate::base::error::{Result, invalid_argument};
+use crate::base::progress::Progress;
 use glam::Vec3;
 
 /// Quality of the build, against its time.
@@ -215,7 +215,7 @@ fn build_binary(
 #[cfg(test)]
 mod tests {
     use super::*;
-    use crate::sampling::uniform;
+    use crate::base::sampling::uniform;
 
     /// Triangles around the origin, of sizes from 10^-30 to 10^12: each split takes off the few largest.
     fn nested(n: u32) -> Vec<[Vec3; 3]> {

@@ -1,8 +1,8 @@
 //! Boxes of four lanes, and the references to triangles that builders sort.
 
+use crate::base::error::Result;
 use crate::base::geometry::half_area;
-use crate::error::Result;
-use crate::memory::{try_par_collect, try_zeroed};
+use crate::base::memory::{try_par_collect, try_zeroed};
 use bytemuck::Zeroable;
 use glam::{Mat4, Vec3, Vec4, Vec4Swizzles};
 use rayon::prelude::*;

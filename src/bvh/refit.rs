@@ -136,8 +136,8 @@ mod tests {
     use super::super::collapse::collapse;
     use super::super::{BuildOptions, BuildQuality, References, build_binary};
     use super::*;
-    use crate::progress::Progress;
-    use crate::sampling::{uniform, uniform_sphere};
+    use crate::base::progress::Progress;
+    use crate::base::sampling::{uniform, uniform_sphere};
     use crate::simd::Isa;
 
     use crate::trace::{Kernels, RawHit, Ray};

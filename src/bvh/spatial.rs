@@ -22,9 +22,9 @@ use super::bins::{BinMap, Bins, bin_count, in_parallel, on_heap};
 use super::layout::SAH_DEPTH;
 use super::partings::{best_parting, halve, leaf_cost, leaf_weight, part_few};
 use super::references::{Box4, Extent, Reference, References, area_scale, half_areas};
-use crate::error::{Error, Result};
-use crate::memory::try_zeroed;
-use crate::progress::Progress;
+use crate::base::error::{Error, Result};
+use crate::base::memory::try_zeroed;
+use crate::base::progress::Progress;
 use glam::{DVec3, Vec3, Vec4};
 use rayon::prelude::*;
 use std::sync::atomic::{AtomicBool, Ordering::Relaxed};
@@ -701,10 +701,10 @@ impl BinaryBvh {
 #[cfg(test)]
 mod tests {
     use super::*;
+    use crate::base::sampling::uniform;
     use crate::bvh::BuildQuality;
     use crate::bvh::binned::tests::assert_no_matter_how_many_threads;
     use crate::bvh::layout::MAX_DEPTH;
-    use crate::sampling::uniform;
 
     type Triangles = Vec<[Vec3; 3]>;
 

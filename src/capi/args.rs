@@ -1,7 +1,7 @@
 //! Arguments: structures that carry their size, arrays with strides, outputs, flags, callbacks.
 
 use super::handles::is_null;
-use crate::error::{Error, Result, invalid_argument};
+use crate::base::error::{Error, Result, invalid_argument};
 use bytemuck::{AnyBitPattern, Pod};
 use std::ffi::{CStr, c_char, c_void};
 use std::mem::size_of;

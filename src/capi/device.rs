@@ -39,10 +39,10 @@
 use super::args::{UserPointer, init, read_struct, sized_struct, text, write};
 use super::error::{bk_result, c_string, call, call_or};
 use super::handles::{create, hold, object, release, retain};
-use crate::callback;
+use crate::base::callback;
+use crate::base::error::{Error, Result, invalid_argument};
+use crate::base::progress::Progress;
 use crate::device::{Device, DeviceOptions};
-use crate::error::{Error, Result, invalid_argument};
-use crate::progress::Progress;
 use crate::simd::Isa;
 use std::ffi::{c_char, c_void};
 use std::sync::Arc;

@@ -38,8 +38,8 @@
 //!
 //! Cost: none of these functions allocates or waits.
 
-use crate::error::{Error, Result};
-use crate::float_state::LibraryState;
+use crate::base::error::{Error, Result};
+use crate::base::float_state::LibraryState;
 use std::cell::RefCell;
 use std::ffi::{CStr, CString, c_char};
 use std::panic::{AssertUnwindSafe, catch_unwind};

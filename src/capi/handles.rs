@@ -3,7 +3,7 @@
 //! A handle is the pointer of an `Arc`, so that retain and release are its counts. Children hold
 //! `Arc`s of what they need of their parents, which therefore outlive them.
 
-use crate::error::{Error, Result};
+use crate::base::error::{Error, Result};
 use std::sync::Arc;
 
 /// Hands a new object to C, which owns the one reference.

@@ -15,7 +15,7 @@ use super::device::{bk_progress_fn, progress, refuse_in_callback};
 use super::error::{bk_result, call, call_or};
 use super::handles::{create, hold, object, release, retain};
 use super::scene::bk_scene;
-use crate::error::{Error, Result};
+use crate::base::error::{Error, Result};
 use crate::lightmap::{Lightmap, LightmapDesc, LightmapInfo, MeshUvs};
 use std::ffi::c_void;
 use std::sync::{Arc, RwLock, TryLockError};

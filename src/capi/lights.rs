@@ -14,7 +14,7 @@ use super::args::{OutStruct, SizedStruct, init, read_struct, sized_struct, write
 use super::error::{BK_NONE, bk_result, call, call_or};
 use super::handles::object;
 use super::scene::bk_scene;
-use crate::error::{Result, invalid_argument};
+use crate::base::error::{Result, invalid_argument};
 use crate::scene::Light;
 use glam::Vec3;
 

@@ -20,7 +20,7 @@ use super::error::{BK_NONE, bk_result, call, call_or};
 use super::handles::{create, hold, is_null, object, release, retain};
 use super::lightmap::bk_lightmap;
 use super::read::{copy_rgb, texel_bytes};
-use crate::error::{Error, Result, invalid_argument};
+use crate::base::error::{Error, Result, invalid_argument};
 use crate::live::{Budget, CellInfo, Live, LiveCamera, LiveParams, LiveStats, Mode, PageRect};
 use glam::Vec3;
 use std::ffi::{c_char, c_void};

@@ -17,7 +17,7 @@ use super::args::{
 use super::error::{BK_NONE, bk_result, call, call_or};
 use super::handles::{hold, object};
 use super::scene::bk_scene;
-use crate::error::{Result, invalid_argument};
+use crate::base::error::{Result, invalid_argument};
 use crate::scene::{LightmapUvs, Material, Mesh, MeshMaterials, NONE, SceneData};
 use glam::{Vec2, Vec3};
 

@@ -241,7 +241,7 @@ pub unsafe extern "C" fn bk_photon_map_get_photons(map: *const bk_photon_map, ou
     })
 }
 
-fn core_params(p: &bk_photon_params) -> crate::Result<PhotonParams> {
+fn core_params(p: &bk_photon_params) -> crate::base::error::Result<PhotonParams> {
     check_flags(p.flags, BK_PHOTONS_INDIRECT_ONLY, "flags")?;
     Ok(PhotonParams {
         photon_count: p.photon_count,

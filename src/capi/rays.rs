@@ -19,7 +19,7 @@ use super::device::refuse_in_callback;
 use super::error::{BK_NONE, bk_result, call, call_or};
 use super::handles::{borrowed, is_null};
 use super::scene::bk_scene;
-use crate::error::Result;
+use crate::base::error::Result;
 use crate::scene::Scene;
 use crate::trace::{Hit, Ray};
 use bytemuck::{Pod, Zeroable, cast_slice, cast_slice_mut};

@@ -7,7 +7,7 @@
 //!
 //! crossbeam's `ShardedLock` takes as long and more instructions, and can wait: docs/experiments.md.
 
-use crate::error::{Error, Result};
+use crate::base::error::{Error, Result};
 use std::cell::{Cell, UnsafeCell};
 use std::ops::Deref;
 use std::sync::atomic::{AtomicBool, AtomicU32, AtomicUsize, Ordering::SeqCst};

@@ -20,7 +20,7 @@ use super::args::{OutStruct, SizedStruct, init, read_struct, sized_struct, write
 use super::error::{bk_result, call, call_or};
 use super::handles::{hold, is_null, object};
 use super::scene::bk_scene;
-use crate::error::{Result, invalid_argument};
+use crate::base::error::{Result, invalid_argument};
 use crate::scene::{Environment, MAX_ENVIRONMENT_SIZE, MAX_TEXTURE_SIZE, SceneData, Texture};
 use bytemuck::Pod;
 use std::ffi::c_void;
@@ -257,7 +257,7 @@ unsafe fn texels<T: Pod + Default>(d: &bk_texture_desc, most: u32, what: &str) -
     if d.data.is_null() {
         return Err(is_null("data"));
     }
-    let mut out = crate::memory::try_vec::<T>(width * height, what)?;
+    let mut out = crate::base::memory::try_vec::<T>(width * height, what)?;
     for (y, texels) in out.chunks_exact_mut(width).enumerate() {
         // SAFETY: by contract the row is there; as bytes it needs no alignment.
         unsafe {

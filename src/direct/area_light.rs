@@ -8,7 +8,7 @@
 use super::polygon;
 use super::receiver::Receiver;
 use super::spherical_triangle::SphericalTriangle;
-use crate::sampling::uniform_triangle;
+use crate::base::sampling::uniform_triangle;
 use crate::scene::{Emitter, Light};
 use glam::{DVec3, Vec3};
 
@@ -168,7 +168,7 @@ impl AreaLight {
 #[cfg(test)]
 mod tests {
     use super::*;
-    use crate::sampling::{sobol_2d, uniform, uniform_sphere};
+    use crate::base::sampling::{sobol_2d, uniform, uniform_sphere};
 
     fn receiver(position: Vec3, normal: Vec3) -> Receiver {
         let origin = position;

@@ -16,9 +16,9 @@ use super::point_light::push_one;
 use super::receiver::Receiver;
 use super::shadow_rays::{PointRoom, ShadowRays, shadow_ray};
 use super::sun_sky::{Disc, push_sky};
-use crate::error::Result;
-use crate::memory::try_collect;
-use crate::sampling::{combine, sobol_2d};
+use crate::base::error::Result;
+use crate::base::memory::try_collect;
+use crate::base::sampling::{combine, sobol_2d};
 use crate::scene::{Light, Scene, Sky};
 use glam::Vec3;
 use std::sync::Arc;
@@ -382,9 +382,9 @@ impl DirectLight {
 #[cfg(test)]
 mod tests {
     use super::*;
+    use crate::base::sampling::{uniform, uniform_sphere};
     use crate::direct::point_light::point_light;
     use crate::direct::polygon;
-    use crate::sampling::{uniform, uniform_sphere};
     use crate::scene::shapes::MeshBuilder;
     use crate::scene::{Material, SceneData, builtin};
     use crate::trace::offset::offset_ray_origin;

@@ -234,7 +234,7 @@ unsafe fn importances<S: Simd>(n: &[&Node; 8], [position, normal]: [Vec3; 2]) ->
 #[cfg(test)]
 mod tests {
     use super::*;
-    use crate::sampling::{uniform, uniform_sphere};
+    use crate::base::sampling::{uniform, uniform_sphere};
 
     #[test]
     fn importance_has_the_same_bits_on_every_instruction_set_and_one_by_one() {

@@ -9,8 +9,8 @@
 //! visited once for all of them. The nodes of a level that samples fall on are weighed eight at a time.
 
 use super::light_node::{Bounds, ImportanceFn, Node, kernel};
-use crate::error::Result;
-use crate::memory::{try_collect, try_with_capacity};
+use crate::base::error::Result;
+use crate::base::memory::{try_collect, try_with_capacity};
 use crate::simd::Isa;
 use glam::Vec3;
 
@@ -213,7 +213,7 @@ fn ceil(x: f64) -> f64 {
 #[cfg(test)]
 mod tests {
     use super::*;
-    use crate::sampling::{uniform, uniform_sphere};
+    use crate::base::sampling::{uniform, uniform_sphere};
     use std::f32::consts::PI;
 
     fn random_lights(count: u32, seed: u32) -> Vec<Bounds> {
@@ -278,7 +278,7 @@ mod tests {
 
     #[test]
     fn partitions_are_stable_sorts() {
-        let values: Vec<(u32, u32)> = (0..1000).map(|i| (crate::sampling::mix(i) % 7, i)).collect();
+        let values: Vec<(u32, u32)> = (0..1000).map(|i| (crate::base::sampling::mix(i) % 7, i)).collect();
         for from in 0..=7 {
             let (mut sorted, mut parted, mut later) =
                 (values.clone(), values.clone(), Vec::with_capacity(values.len()));

@@ -4,8 +4,8 @@
 //! the order of the rays, whatever is traced together: a point has the same bits alone and in a tile.
 
 use super::receiver::Receiver;
-use crate::error::Result;
-use crate::memory::try_filled;
+use crate::base::error::Result;
+use crate::base::memory::try_filled;
 use crate::scene::Scene;
 use crate::trace::Ray;
 use crate::trace::offset::ray_epsilon;

@@ -68,7 +68,7 @@ fn towards(from: DVec3, to: DVec3, cosine: f64) -> DVec3 {
 #[cfg(test)]
 mod tests {
     use super::*;
-    use crate::sampling::sobol_2d;
+    use crate::base::sampling::sobol_2d;
     use std::f64::consts::PI;
 
     #[test]

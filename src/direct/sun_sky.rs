@@ -9,7 +9,7 @@
 
 use super::receiver::Receiver;
 use super::shadow_rays::ShadowRays;
-use crate::sampling::{combine, cosine_hemisphere, orthonormal_basis, sobol_2d};
+use crate::base::sampling::{combine, cosine_hemisphere, orthonormal_basis, sobol_2d};
 use crate::scene::Sky;
 use crate::trace::Ray;
 use glam::Vec3;

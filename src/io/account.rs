@@ -1,8 +1,8 @@
 //! Memory for the contents of a file: announced to the device's memory monitor before it is allocated. Where there is
 //! none, that is an error and not an abort.
 
-use crate::error::{Error, Result};
-use crate::memory::{MemoryMonitor, Reservation};
+use crate::base::error::{Error, Result};
+use crate::base::memory::{MemoryMonitor, Reservation};
 use std::collections::HashMap;
 use std::hash::Hash;
 use std::sync::Arc;

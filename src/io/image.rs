@@ -6,9 +6,9 @@
 //! (OpenGL tools that expect v = 0 at the bottom show such files upside down.)
 
 use super::source::{Advance, place};
-use crate::error::{Error, Result, invalid_argument};
-use crate::files;
-use crate::memory::try_collect;
+use crate::base::error::{Error, Result, invalid_argument};
+use crate::base::files;
+use crate::base::memory::try_collect;
 use crate::scene::{Environment, MAX_COORDINATE, MAX_ENVIRONMENT_SIZE};
 use image::ExtendedColorType::Rgb32F;
 use image::codecs::openexr::OpenExrEncoder;

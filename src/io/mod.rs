@@ -29,9 +29,9 @@ mod source;
 mod tests;
 mod texture;
 
-use crate::error::{Error, Result};
-use crate::memory::MemoryMonitor;
-use crate::progress::Progress;
+use crate::base::error::{Error, Result};
+use crate::base::memory::MemoryMonitor;
+use crate::base::progress::Progress;
 use crate::scene::{MAX_ALBEDO, MAX_COORDINATE, MAX_TRIANGLES, Material, Mesh, NONE, SceneData, Texture};
 use account::Account;
 use glam::Vec3;

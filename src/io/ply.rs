@@ -5,7 +5,7 @@
 
 use super::source::{Opened, Source, read_error};
 use super::{DEFAULT_ALBEDO, Import, TWO_SIDED_UNLESS_SAID, is_valid_position};
-use crate::error::Result;
+use crate::base::error::Result;
 use crate::scene::{Material, Mesh, MeshMaterials};
 use glam::{Vec2, Vec3};
 use ply_rs_bw::parser::{Parser, Reader};

@@ -1,7 +1,7 @@
 //! Tests that go through [`load`](super::load), and what the tests of the readers share.
 
 use super::{LoadInfo, load};
-use crate::error::{Error, Result};
+use crate::base::error::{Error, Result};
 use crate::scene::{Light, Material, Mesh, MeshMaterials, SceneData};
 use glam::Vec3;
 use proptest::prelude::*;

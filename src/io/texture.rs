@@ -4,7 +4,7 @@
 use super::Import;
 use super::account::Account;
 use super::source::{Attempt, Checked};
-use crate::error::{Error, Result};
+use crate::base::error::{Error, Result};
 use crate::scene::{MAX_TEXTURE_SIZE, Texture};
 use image::{ColorType, ImageDecoder, ImageFormat, ImageReader, Limits};
 use std::path::Path;
@@ -136,9 +136,9 @@ pub(super) fn flipped(mut texture: Texture) -> Texture {
 #[cfg(test)]
 pub(super) mod tests {
     use super::*;
+    use crate::base::memory::MemoryMonitor;
     use crate::io::LoadOptions;
     use crate::io::source::{Advance, Files};
-    use crate::memory::MemoryMonitor;
     use image::codecs::jpeg::JpegEncoder;
     use image::codecs::png::PngEncoder;
     use image::{ExtendedColorType, ImageEncoder};

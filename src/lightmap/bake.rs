@@ -18,12 +18,12 @@ use super::seams::Stitch;
 use super::texel_light::{Averaged, TexelLight, TilePoints, Variation};
 use super::tiles::{TILE, in_order};
 use super::{BakeParams, BakeStats, CheckpointParams, Light, Lightmap, Origin, StageStats, TexelState};
+use crate::base::error::{Error, Result, invalid_argument};
+use crate::base::memory::{try_filled, try_vec, try_with_capacity};
+use crate::base::progress::{Progress, Stage};
+use crate::base::sampling::{combine, purpose_seed};
 use crate::direct::DirectLight;
-use crate::error::{Error, Result, invalid_argument};
-use crate::memory::{try_filled, try_vec, try_with_capacity};
 use crate::photon::{PhotonMap, PhotonParams};
-use crate::progress::{Progress, Stage};
-use crate::sampling::{combine, purpose_seed};
 use crate::scene::Scene;
 use glam::Vec3;
 use rayon::prelude::*;
@@ -235,7 +235,7 @@ impl Bake<'_, '_> {
     }
 
     /// Announces the buffers of all stages but the photon map, which announces its own.
-    fn reserve(&self) -> Result<crate::memory::Reservation> {
+    fn reserve(&self) -> Result<crate::base::memory::Reservation> {
         let l = self.atlas;
         let mut bytes = l.map.len() * TEXEL_BYTES;
         if self.plan.runs(left_out::INDIRECT) {

@@ -15,8 +15,8 @@ mod seams;
 pub(crate) mod texel_light;
 pub(crate) mod tiles;
 
-use crate::error::{Result, invalid_argument};
-use crate::memory::Reservation;
+use crate::base::error::{Result, invalid_argument};
+use crate::base::memory::Reservation;
 use crate::photon::MAX_PHOTONS;
 use crate::scene::Scene;
 use atlas::Atlas;

@@ -22,11 +22,11 @@ use super::atlas::pieces::float_key;
 use super::atlas::texels::TexelSample;
 use super::plan::{Plan, left_out};
 use super::{BakeParams, BakeStats, Light, Lightmap, TexelState};
-use crate::error::{Error, Result};
-use crate::memory::{
+use crate::base::error::{Error, Result};
+use crate::base::memory::{
     Reservation, try_collect, try_par_collect, try_par_filter, try_par_gather, try_push, try_to_vec, try_vec,
 };
-use crate::progress::{Progress, Stage};
+use crate::base::progress::{Progress, Stage};
 use crate::scene::NONE;
 use glam::{Vec2, Vec3, Vec3A};
 use rayon::prelude::*;

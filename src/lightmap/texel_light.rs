@@ -22,12 +22,12 @@ use super::atlas::chart_map::{ChartMap, receiver_of};
 use super::atlas::charts::Charts;
 use super::atlas::texels::TexelSample;
 use super::tiles::TILE;
+use crate::base::error::Result;
+use crate::base::memory::{try_filled, try_with_capacity};
+use crate::base::sampling::{combine, orthonormal_basis, sobol_2d};
 use crate::direct::Receiver;
 use crate::direct::direct_light::{DirectLight, Lights, PointLight};
 use crate::direct::shadow_rays::{KINDS, TileRoom};
-use crate::error::Result;
-use crate::memory::{try_filled, try_with_capacity};
-use crate::sampling::{combine, orthonormal_basis, sobol_2d};
 use crate::scene::{NONE, Scene};
 use crate::trace::Ray;
 use glam::{Vec2, Vec3};
@@ -515,7 +515,7 @@ fn add_to(
 mod tests {
     use super::super::{BakeParams, Lightmap, LightmapDesc};
     use super::*;
-    use crate::progress::Progress;
+    use crate::base::progress::Progress;
     use crate::scene::shapes::MeshBuilder;
     use crate::scene::{Light, Material, SceneData, builtin};
     use std::sync::Arc;

@@ -4,8 +4,8 @@
 //! texel, so that a block of texels may be worked on in any order.
 
 use super::atlas::chart_map::ChartMap;
-use crate::error::Result;
-use crate::memory::try_with_capacity;
+use crate::base::error::Result;
+use crate::base::memory::try_with_capacity;
 use std::ops::Range;
 
 /// Maximum number of texels of a tile.

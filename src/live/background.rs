@@ -4,7 +4,7 @@ use super::batch::{Background, Batch};
 use super::choose::Choice;
 use super::work::Limit;
 use super::{Live, LiveCamera, LiveStats};
-use crate::error::Result;
+use crate::base::error::Result;
 use std::time::Duration;
 
 /// Maximum number of blocks that are worked on between two updates.

@@ -3,9 +3,9 @@
 
 use super::blocks::{Block, Blocks};
 use super::work::{Context, Done, Limit, Step};
+use crate::base::error::{Error, Result};
+use crate::base::memory::try_with_capacity;
 use crate::device::Device;
-use crate::error::{Error, Result};
-use crate::memory::try_with_capacity;
 use std::panic::{AssertUnwindSafe, catch_unwind};
 use std::sync::atomic::{AtomicBool, AtomicUsize, Ordering::Relaxed};
 use std::sync::{Arc, Condvar, Mutex, MutexGuard};

@@ -5,12 +5,12 @@
 //! resolution); the texels of a lower LOD are among those of the next, so that no ray is lost when
 //! the detail grows, and what two LODs share at the border of two blocks has one value.
 
-use crate::error::Result;
+use crate::base::error::Result;
+use crate::base::memory::{try_collect, try_to_vec, try_vec, try_with_capacity};
+use crate::base::progress::Progress;
 use crate::lightmap::atlas::Atlas;
 use crate::lightmap::atlas::layout::Placement;
 use crate::lightmap::indirect::gather::Gathered;
-use crate::memory::{try_collect, try_to_vec, try_vec, try_with_capacity};
-use crate::progress::Progress;
 use crate::scene::NONE;
 use glam::Vec3;
 use rayon::prelude::*;

@@ -3,8 +3,8 @@
 
 use super::blocks::{BlockStatus, MAX_LODS, Tile};
 use super::lists::Lists;
-use crate::error::{Result, invalid_argument};
-use crate::memory::{try_collect, try_vec};
+use crate::base::error::{Result, invalid_argument};
+use crate::base::memory::{try_collect, try_vec};
 use glam::{UVec3, Vec3};
 
 /// Number of cells along the longest side unless the size is given.

@@ -5,8 +5,8 @@ use super::cells::Grid;
 use super::visibility::Visibility;
 use super::work::{Context, Step};
 use super::{LiveCamera, Mode};
-use crate::memory::{try_filled, try_vec, try_with_capacity};
-use crate::sampling::{combine, mix};
+use crate::base::memory::{try_filled, try_vec, try_with_capacity};
+use crate::base::sampling::{combine, mix};
 use std::cmp::Ordering;
 
 /// State that choosing keeps from update to update.
@@ -47,7 +47,7 @@ pub(super) struct Choice<'a> {
 }
 
 impl Chooser {
-    pub fn new(map: &BlockMap, grid: &Grid) -> crate::Result<Chooser> {
+    pub fn new(map: &BlockMap, grid: &Grid) -> crate::base::error::Result<Chooser> {
         let cells = grid.info.cells();
         let mut open = try_vec(map.tiles.len(), "the blocks that are open")?;
         open.iter_mut().zip(&map.tiles).for_each(|(open, tile)| *open = !tile.texels.is_empty());

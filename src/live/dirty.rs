@@ -3,8 +3,8 @@
 
 use super::blocks::Rect;
 use super::display::Changed;
-use crate::error::Result;
-use crate::memory::{try_collect_ok, try_with_capacity};
+use crate::base::error::Result;
+use crate::base::memory::{try_collect_ok, try_with_capacity};
 
 /// Two rectangles are merged if the result has at most this many times the area of both.
 const SLACK: f64 = 1.3;

@@ -7,9 +7,9 @@
 use super::blocks::{BLOCK_TEXELS, BlockMap, Blocks, DirectTile, Rect, TILE};
 use super::relight::Illumination;
 use super::{SHOWN_AT_ONCE, in_parts};
-use crate::error::{Error, Result};
+use crate::base::error::{Error, Result};
+use crate::base::memory::{try_filled, try_to_vec, try_vec, try_with_capacity};
 use crate::lightmap::indirect::blur::{Texels, Window};
-use crate::memory::{try_filled, try_to_vec, try_vec, try_with_capacity};
 use crate::scene::NONE;
 use glam::Vec3;
 use rayon::prelude::*;

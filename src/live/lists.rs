@@ -1,7 +1,7 @@
 //! Very many short lists of numbers in two buffers: however many lists there are, only two allocations can fail.
 
-use crate::error::{Error, Result};
-use crate::memory::try_vec;
+use crate::base::error::{Error, Result};
+use crate::base::memory::try_vec;
 
 /// Immutable lists of numbers.
 pub(super) struct Lists {

@@ -32,11 +32,11 @@ pub use blocks::MAX_LODS;
 pub use cells::{CellInfo, NO_LOD};
 pub use params::{Budget, LiveCamera, LiveParams, LiveStats, Mode, PageRect};
 
+use crate::base::error::Result;
+use crate::base::memory::Reservation;
 use crate::device::Device;
-use crate::error::Result;
 use crate::lightmap::BakeParams;
 use crate::lightmap::indirect::gather::Gathered;
-use crate::memory::Reservation;
 use crate::scene::{Light, Scene};
 use batch::{Background, Batch, Item};
 use blocks::{BlockStatus, Blocks};

@@ -1,7 +1,7 @@
 //! Parameters of live updates, and the numbers that they report.
 
 use super::MAX_LODS;
-use crate::error::{Result, invalid_argument};
+use crate::base::error::{Result, invalid_argument};
 use crate::lightmap::BakeParams;
 use crate::lightmap::indirect::blur::MAX_BLUR_RADIUS;
 use crate::lightmap::indirect::sample_set::ROUND;

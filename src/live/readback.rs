@@ -4,9 +4,9 @@ use super::blocks::{BlockMap, Rect};
 use super::display::Display;
 use super::lists::Lists;
 use super::{CellInfo, Live, NO_LOD, PageRect};
-use crate::error::{Result, invalid_argument};
+use crate::base::error::{Result, invalid_argument};
+use crate::base::memory::{try_append, try_vec, try_with_capacity};
 use crate::lightmap::atlas::texels::PageArea;
-use crate::memory::{try_append, try_vec, try_with_capacity};
 use glam::Vec3;
 use rayon::prelude::*;
 

@@ -7,17 +7,17 @@
 //! them, Sponza showed 8 % error for a second): sides change with all photons only.
 
 use super::Live;
+use crate::base::error::{Error, Result, invalid_argument};
+use crate::base::memory::{try_collect, try_vec};
+use crate::base::progress::Progress;
 use crate::device::{Device, DeviceOptions};
 use crate::direct::DirectLight;
-use crate::error::{Error, Result, invalid_argument};
 use crate::lightmap::atlas::Atlas;
 use crate::lightmap::bake::Bake;
 use crate::lightmap::indirect::radiance_map::Radiance;
 use crate::lightmap::indirect::upsample::{OwnLight, Upsampling};
 use crate::lightmap::plan::{Plan, left_out};
 use crate::lightmap::{BakeParams, BakeStats};
-use crate::memory::{try_collect, try_vec};
-use crate::progress::Progress;
 use glam::Vec3;
 use std::panic::{AssertUnwindSafe, catch_unwind};
 use std::sync::atomic::{AtomicBool, Ordering::Relaxed};

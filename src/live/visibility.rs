@@ -3,8 +3,8 @@
 
 use super::LiveCamera;
 use super::blocks::BlockMap;
-use crate::memory::{try_vec, try_with_capacity};
-use crate::sampling::{combine, sobol_2d};
+use crate::base::memory::{try_vec, try_with_capacity};
+use crate::base::sampling::{combine, sobol_2d};
 use crate::scene::NONE;
 use crate::trace::{PACKET_SIZE, Packet, RawHit};
 use glam::Vec3;
@@ -28,7 +28,7 @@ pub(super) struct Visibility {
 }
 
 impl Visibility {
-    pub fn new(blocks: usize) -> crate::Result<Visibility> {
+    pub fn new(blocks: usize) -> crate::base::error::Result<Visibility> {
         // Capacity for all blocks: no update has to allocate.
         let what = "marks of what is visible";
         Ok(Visibility { marks: try_vec(blocks, what)?, seen: try_with_capacity(blocks, what)?, updates: 0 })
@@ -106,8 +106,8 @@ fn block_of(map: &BlockMap, hit: &RawHit) -> Option<u32> {
 
 impl LiveCamera {
     /// Checks the numbers: finite, with an extent, an aspect ratio and a field of view.
-    pub fn validate(&self) -> crate::Result<()> {
-        use crate::error::invalid_argument;
+    pub fn validate(&self) -> crate::base::error::Result<()> {
+        use crate::base::error::invalid_argument;
         let finite = |v: Vec3| v.is_finite();
         if !(finite(self.position) && finite(self.forward) && finite(self.up)) {
             return invalid_argument!("the camera has a coordinate that is not finite: {self:?}");
@@ -129,8 +129,8 @@ impl LiveCamera {
 #[cfg(test)]
 mod tests {
     use super::*;
+    use crate::base::progress::Progress;
     use crate::lightmap::{Lightmap, LightmapDesc};
-    use crate::progress::Progress;
     use crate::scene::shapes::MeshBuilder;
     use crate::scene::{Material, SceneData};
     use crate::trace::Ray;

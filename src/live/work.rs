@@ -5,13 +5,13 @@
 
 use super::blocks::{Block, BlockMap, BlockStatus, BlockWork, DirectTile, DirectWork, Tile};
 use super::relight::Illumination;
-use crate::error::{Error, Result};
+use crate::base::error::{Error, Result};
+use crate::base::memory::{try_collect, try_filled};
+use crate::base::sampling::combine;
 use crate::lightmap::indirect::gather::Gathered;
 use crate::lightmap::indirect::radiance_map::RadianceMap;
 use crate::lightmap::indirect::sample_set::{ROUND, SampleSet};
 use crate::lightmap::texel_light::{Averaged, TexelLight, TilePoints};
-use crate::memory::{try_collect, try_filled};
-use crate::sampling::combine;
 use crate::scene::NONE;
 use glam::Vec3;
 use std::sync::Arc;

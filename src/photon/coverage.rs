@@ -13,9 +13,9 @@
 
 use super::PhotonMap;
 use super::cylinder::SAME_SURFACE;
-use crate::error::Result;
-use crate::memory::{try_filled, try_with_capacity};
-use crate::sampling::{concentric_disc, orthonormal_basis, sobol_2d};
+use crate::base::error::Result;
+use crate::base::memory::{try_filled, try_with_capacity};
+use crate::base::sampling::{concentric_disc, orthonormal_basis, sobol_2d};
 use crate::trace::offset::offset_ray_origin;
 use crate::trace::{RawHit, Ray};
 use glam::{Vec2, Vec3};
@@ -257,8 +257,8 @@ fn line_of_sight(map: &PhotonMap, point: Vec3, facing: Vec3, apex: Vec3) -> Ray 
 #[cfg(test)]
 mod tests {
     use super::*;
+    use crate::base::progress::Progress;
     use crate::photon::PhotonParams;
-    use crate::progress::Progress;
     use crate::scene::shapes::MeshBuilder;
     use crate::scene::{Light, Material, SceneData};
 

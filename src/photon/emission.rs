@@ -16,9 +16,9 @@
 
 use super::guide::{Guide, PilotPhoton};
 use super::spot::SpotProfile;
-use crate::error::{Error, Result};
-use crate::memory::{try_filled, try_push, try_with_capacity};
-use crate::sampling::{concentric_disc, cosine_around, orthonormal_basis, uniform_triangle};
+use crate::base::error::{Error, Result};
+use crate::base::memory::{try_filled, try_push, try_with_capacity};
+use crate::base::sampling::{concentric_disc, cosine_around, orthonormal_basis, uniform_triangle};
 use crate::scene::{Emitter, Light, Scene, Sky};
 use crate::trace::offset::{offset_ray_origin, ray_epsilon};
 use glam::{DVec3, Vec3};

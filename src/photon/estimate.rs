@@ -186,10 +186,10 @@ fn flush<L: Lanes>(sum: &mut [L; 3], total: &mut [f64; 3], zero: L) {
 #[cfg(test)]
 mod tests {
     use super::*;
-    use crate::memory::MemoryMonitor;
+    use crate::base::memory::MemoryMonitor;
+    use crate::base::progress::Progress;
+    use crate::base::sampling::{sobol_2d, uniform, uniform_sphere};
     use crate::photon::trace::{Account, StoredPhoton, Traced};
-    use crate::progress::Progress;
-    use crate::sampling::{sobol_2d, uniform, uniform_sphere};
     use std::f64::consts::PI;
     use std::sync::Arc;
 

@@ -14,9 +14,9 @@
 use super::PhotonView;
 use super::cylinder::Cylinder;
 use super::trace::{StoredPhoton, Traced};
-use crate::error::{Error, Result};
-use crate::memory::{Reservation, try_par_collect_ok, try_to_vec, try_vec, try_with_capacity};
-use crate::progress::{Progress, Stage};
+use crate::base::error::{Error, Result};
+use crate::base::memory::{Reservation, try_par_collect_ok, try_to_vec, try_vec, try_with_capacity};
+use crate::base::progress::{Progress, Stage};
 use glam::{DVec3, Vec3};
 use rayon::prelude::*;
 use std::ops::Range;

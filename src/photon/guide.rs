@@ -116,7 +116,7 @@ fn invert(sums: &[f32], at: f32) -> (usize, f32, f32) {
 #[cfg(test)]
 mod tests {
     use super::*;
-    use crate::sampling::sobol_2d;
+    use crate::base::sampling::sobol_2d;
 
     /// Pilot of a light most of whose photons are lost: one in a corner leaves three, others one by chance.
     fn pilot() -> Vec<PilotPhoton> {

@@ -21,9 +21,9 @@ mod radius;
 mod spot;
 mod trace;
 
-use crate::error::{Error, Result, invalid_argument};
-use crate::memory::{MemoryMonitor, Reservation, try_vec};
-use crate::progress::Progress;
+use crate::base::error::{Error, Result, invalid_argument};
+use crate::base::memory::{MemoryMonitor, Reservation, try_vec};
+use crate::base::progress::Progress;
 use crate::scene::Scene;
 use crate::trace::Ray;
 use cylinder::Cylinder;

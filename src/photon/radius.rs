@@ -13,8 +13,8 @@
 //! in special positions (in a diagonal of the cells, in their borders) cut other numbers of them.
 
 use super::trace::StoredPhoton;
-use crate::error::Result;
-use crate::memory::{try_collect, try_par_collect};
+use crate::base::error::Result;
+use crate::base::memory::{try_collect, try_par_collect};
 use glam::{DVec3, Vec3};
 use rayon::prelude::*;
 
@@ -91,7 +91,7 @@ fn spread(x: u64) -> u64 {
 #[cfg(test)]
 mod tests {
     use super::*;
-    use crate::sampling::sobol_2d;
+    use crate::base::sampling::sobol_2d;
 
     fn on_rectangle(n: u32, corner: Vec3, u: Vec3, v: Vec3, seed: u32) -> Vec<StoredPhoton> {
         let photon = |i| {

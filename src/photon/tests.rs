@@ -1,9 +1,9 @@
 //! The photon map as physics, and its manners.
 
 use super::*;
+use crate::base::sampling::sobol_2d;
 use crate::bvh::BuildOptions;
 use crate::device::{Device, DeviceOptions};
-use crate::sampling::sobol_2d;
 use crate::scene::{Light, Material, Mesh, MeshMaterials, SceneData, builtin};
 use crate::simd::Isa;
 use std::f64::consts::PI;
@@ -551,7 +551,7 @@ fn the_memory_budget_is_kept_within_a_block() {
 #[test]
 fn all_memory_is_accounted_for_and_given_back() {
     let limit = 4 << 20;
-    let memory: Box<crate::memory::MemoryFn> = Box::new(move |bytes| bytes < 64 << 20);
+    let memory: Box<crate::base::memory::MemoryFn> = Box::new(move |bytes| bytes < 64 << 20);
     let device = Device::new(DeviceOptions { memory: Some(memory), ..Default::default() }).unwrap();
     let scene = commit_on(&device, cornell_like());
     let before = device.memory().current();

@@ -9,10 +9,10 @@
 use super::emission::Emission;
 use super::guide::PilotPhoton;
 use super::{PATH_LIMIT, PhotonParams, PhotonStats};
-use crate::error::{Error, Result};
-use crate::memory::{MemoryMonitor, Reservation, try_collect, try_filled, try_par_collect_ok, try_with_capacity};
-use crate::progress::{Progress, Stage};
-use crate::sampling::{combine, cosine_around, purpose_seed, sobol_2d, sobol_2d_bits, uniform};
+use crate::base::error::{Error, Result};
+use crate::base::memory::{MemoryMonitor, Reservation, try_collect, try_filled, try_par_collect_ok, try_with_capacity};
+use crate::base::progress::{Progress, Stage};
+use crate::base::sampling::{combine, cosine_around, purpose_seed, sobol_2d, sobol_2d_bits, uniform};
 use crate::scene::{Light, NONE, Scene};
 use crate::trace::offset::{SurfacePoint, offset_ray_origin};
 use crate::trace::{RawHit, Ray};

@@ -11,9 +11,9 @@ use super::lights::Lights;
 use super::proposal::rgb;
 use super::random::{Random, cosine_direction};
 use super::surfaces::Surfaces;
+use crate::base::error::{Result, invalid_argument};
+use crate::base::progress::Progress;
 use crate::device::Device;
-use crate::error::{Result, invalid_argument};
-use crate::progress::Progress;
 use crate::scene::{Camera, Environment, Light, Material, Mesh, Scene, SceneData, Texture};
 use glam::{DVec3, Vec3};
 use rayon::prelude::*;
@@ -362,7 +362,7 @@ impl View {
 #[cfg(test)]
 mod tests {
     use super::*;
-    use crate::DeviceOptions;
+    use crate::device::DeviceOptions;
     use crate::scene::shapes::MeshBuilder;
     use crate::scene::{MeshMaterials, builtin};
 
@@ -665,9 +665,9 @@ mod tests {
         let camera = Camera { position: Vec3::splat(0.5), target: Vec3::X, up: Vec3::Y, fov_y: 1.0 };
         let progress = Progress::new(|fraction, _| fraction == 0.0);
         let image = tracer.render(&device, &camera, 640, 480, 64, 0, &progress);
-        assert_eq!(image.err(), Some(crate::Error::Cancelled));
+        assert_eq!(image.err(), Some(crate::base::error::Error::Cancelled));
         let progress = Progress::new(|fraction, _| fraction == 0.0);
         let many = tracer.irradiance_many(&device, &[WALL; 1000], 4096, 0, &progress);
-        assert_eq!(many.err(), Some(crate::Error::Cancelled));
+        assert_eq!(many.err(), Some(crate::base::error::Error::Cancelled));
     }
 }

@@ -13,7 +13,7 @@
 //! The file is long because it is one model: its parts share the measures at its head.
 
 use super::{Camera, Light, Material, Mesh, MeshMaterials, SceneData};
-use crate::error::Result;
+use crate::base::error::Result;
 use glam::{Vec2, Vec3};
 use std::collections::HashMap;
 use std::f32::consts::{PI, TAU};
@@ -945,10 +945,10 @@ impl Part {
 #[cfg(test)]
 mod tests {
     use super::*;
+    use crate::base::progress::Progress;
+    use crate::base::sampling::{cosine_around, sobol_2d};
     use crate::bvh::BuildOptions;
     use crate::device::Device;
-    use crate::progress::Progress;
-    use crate::sampling::{cosine_around, sobol_2d};
     use crate::scene::Scene;
     use crate::scene::is_valid_triangle;
     use crate::trace::Ray;

@@ -5,7 +5,7 @@ use super::camera::Camera;
 use super::rooms::{furniture, furniture_camera, partition, partition_camera};
 use super::shapes::MeshBuilder;
 use super::{Light, Material, SceneData};
-use crate::error::{Result, invalid_argument};
+use crate::base::error::{Result, invalid_argument};
 use glam::Vec3;
 
 /// The names that [`builtin`] knows.

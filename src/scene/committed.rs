@@ -3,10 +3,10 @@
 use super::{
     Emitter, Environment, Light, MAX_ALBEDO, Material, Mesh, SceneData, Sky, Texture, is_valid_triangle, unit_normal,
 };
+use crate::base::error::{Result, invalid_argument};
+use crate::base::memory::Reservation;
 use crate::bvh::Tree;
 use crate::device::Device;
-use crate::error::{Result, invalid_argument};
-use crate::memory::Reservation;
 use glam::{Vec2, Vec3};
 use std::sync::{Arc, RwLock};
 

@@ -3,7 +3,7 @@
 //! each pixel instead of its sine).
 
 use super::check_energy;
-use crate::error::{Result, invalid_argument};
+use crate::base::error::{Result, invalid_argument};
 use glam::{DVec3, Vec3};
 use std::f32::consts::{FRAC_PI_4, PI, TAU};
 use std::f64;
@@ -51,7 +51,7 @@ impl Environment {
     }
 
     fn prepare(&mut self) -> Result<()> {
-        self.pixels = crate::memory::try_vec(self.rgb.len(), "an environment")?;
+        self.pixels = crate::base::memory::try_vec(self.rgb.len(), "an environment")?;
         let mut below = 0.0;
         for y in 0..self.height {
             let row = y as usize * self.width as usize..(y + 1) as usize * self.width as usize;
@@ -191,7 +191,7 @@ impl Sky {
     /// Chooses a direction by importance; returns it with its radiance and density.
     pub fn sample(&self, u: [f32; 2]) -> (Vec3, Vec3, f32) {
         let Some(image) = &self.image else {
-            return (crate::sampling::uniform_sphere(u), self.radiance, 0.25 / PI);
+            return (crate::base::sampling::uniform_sphere(u), self.radiance, 0.25 / PI);
         };
         let (pixel, right, height) = image.sample(u);
         let flat = (1.0 - height * height).max(0.0).sqrt();
@@ -204,7 +204,7 @@ impl Sky {
 #[cfg(test)]
 mod tests {
     use super::*;
-    use crate::sampling::{sobol_2d, uniform, uniform_sphere};
+    use crate::base::sampling::{sobol_2d, uniform, uniform_sphere};
 
     fn random_image(width: u32, height: u32) -> Environment {
         let rgb = (0..width * height).map(|i| [0, 1, 2].map(|d| uniform(i, d, 4).powi(4))).collect();

@@ -1,7 +1,7 @@
 //! Lights without geometry. (Emissive triangles are lights too; see [`super::Emitter`].)
 
 use super::{NONE, check_energy, check_finite};
-use crate::error::{Result, invalid_argument};
+use crate::base::error::{Result, invalid_argument};
 use glam::Vec3;
 
 /// A light. Directions need not be normalised; they are when the light is added to a scene.

@@ -1,7 +1,7 @@
 //! Materials: diffuse reflectance, emission, cut-outs and transmission.
 
 use super::{NONE, check_energy};
-use crate::error::{Result, invalid_argument};
+use crate::base::error::{Result, invalid_argument};
 
 /// Maximum reflectance that file loaders and look-ups of textures return; the API refuses 1 and above.
 pub const MAX_ALBEDO: f32 = 0.98;

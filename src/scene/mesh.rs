@@ -1,9 +1,9 @@
 //! Triangle meshes as given by the caller.
 
 use super::MAX_TRIANGLES;
+use crate::base::error::{Result, invalid_argument};
 use crate::base::geometry::is_valid_triangle;
-use crate::error::{Result, invalid_argument};
-use crate::memory::try_to_vec;
+use crate::base::memory::try_to_vec;
 use glam::{Vec2, Vec3};
 
 /// Assignment of materials to triangles.

@@ -28,8 +28,8 @@ pub use material::{MAX_ALBEDO, Material};
 pub use mesh::{LightmapUvs, Mesh, MeshMaterials};
 pub use texture::{MAX_TEXTURE_SIZE, Texture};
 
-use crate::error::{Error, Result, invalid_argument};
-use crate::memory::{try_to_vec, try_with_capacity};
+use crate::base::error::{Error, Result, invalid_argument};
+use crate::base::memory::{try_to_vec, try_with_capacity};
 use std::sync::Arc;
 
 /// Maximum number of triangles in a scene: leaf references hold 28 bits.

@@ -3,10 +3,10 @@
 use super::committed::mesh_of;
 use super::emitters::{EMITTERS, add_emitters, emissive_triangles};
 use super::{Emitter, Scene, is_valid_triangle};
+use crate::base::error::{Error, Result, invalid_argument};
+use crate::base::memory::{try_to_vec, try_with_capacity};
 use crate::bvh;
 use crate::device::LogLevel;
-use crate::error::{Error, Result, invalid_argument};
-use crate::memory::{try_to_vec, try_with_capacity};
 use glam::Vec3;
 use rayon::prelude::*;
 use std::collections::HashMap;

@@ -3,7 +3,7 @@
 use super::camera::Camera;
 use super::shapes::MeshBuilder;
 use super::{Light, Material, SceneData};
-use crate::error::Result;
+use crate::base::error::Result;
 use glam::Vec3;
 
 /// Makes a room with a lamp at its ceiling, and things that are closed boxes in it.

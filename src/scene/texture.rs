@@ -4,7 +4,7 @@
 //! centres of four texels (colours in linear light). Nothing is stored beside the image; callers that need the colour
 //! of an area average look-ups.
 
-use crate::error::{Result, invalid_argument};
+use crate::base::error::{Result, invalid_argument};
 use glam::{Vec2, Vec3};
 use std::sync::LazyLock;
 

@@ -120,7 +120,7 @@ impl Isa {
 
     /// Whether this machine has VBMI2 beside AVX-512.
     pub(crate) fn has_vbmi2() -> bool {
-        #[cfg(all(target_arch = "x86_64", not(miri), not(bakelite_portable)))]
+        #[cfg(all(target_arch = "x86_64", not(miri)))]
         {
             isa_features! { Avx512Vbmi2 => cpu_has! {} }
         }

@@ -239,10 +239,13 @@ impl Leaf for CompactLeaf<'_> {
 
 #[cfg(test)]
 mod tests {
+    use crate::base::progress::Progress;
+    use crate::base::sampling::{uniform, uniform_sphere};
     use crate::bvh::{BuildOptions, BuildQuality};
-    use crate::sampling::{uniform, uniform_sphere};
+    use crate::device::{Device, DeviceOptions};
+    use crate::scene::{Material, Mesh, Scene, SceneData};
+    use crate::simd::Isa;
     use crate::trace::{Hit, Ray};
-    use crate::{Device, DeviceOptions, Isa, Material, Mesh, Progress, Scene, SceneData};
     use glam::Vec3;
     use proptest::prelude::*;
     use std::sync::{Arc, LazyLock};

@@ -111,11 +111,13 @@ impl Scene {
 #[cfg(test)]
 mod tests {
     use super::*;
+    use crate::base::progress::Progress;
+    use crate::base::sampling::{uniform, uniform_sphere};
     use crate::bvh::{BuildOptions, BuildQuality};
-    use crate::sampling::{uniform, uniform_sphere};
+    use crate::device::{Device, DeviceOptions};
     use crate::scene::{Material, Mesh, MeshMaterials, NONE, SceneData, Texture};
+    use crate::simd::Isa;
     use crate::trace::Hit;
-    use crate::{Device, DeviceOptions, Isa, Progress};
     use glam::Vec2;
     use std::sync::Arc;
 

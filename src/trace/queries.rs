@@ -5,10 +5,10 @@
 
 use super::compact::View;
 use super::{Hit, Kernels, PACKET_SIZE, Packet, RawHit, Ray};
+use crate::base::error::{Result, invalid_argument};
 use crate::base::geometry::NONE;
+use crate::base::memory::try_filled;
 use crate::bvh::{Mbvh, Tree};
-use crate::error::{Result, invalid_argument};
-use crate::memory::try_filled;
 use crate::scene::Scene;
 use glam::Vec3;
 use rayon::prelude::*;

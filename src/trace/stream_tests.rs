@@ -1,9 +1,12 @@
 //! Streams against single rays, bit by bit: on every ISA, in whole and compact trees.
 
 use super::{RawHit, Ray};
+use crate::base::progress::Progress;
+use crate::base::sampling::{uniform, uniform_sphere};
 use crate::bvh::BuildOptions;
-use crate::sampling::{uniform, uniform_sphere};
-use crate::{Device, DeviceOptions, Isa, Material, Mesh, Progress, Scene, SceneData};
+use crate::device::{Device, DeviceOptions};
+use crate::scene::{Material, Mesh, Scene, SceneData};
+use crate::simd::Isa;
 use glam::Vec3;
 use std::sync::Arc;
 

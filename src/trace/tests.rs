@@ -1,9 +1,12 @@
 //! Every query on every ISA against an f64 brute-force oracle.
 
 use super::*;
-use crate::sampling::{orthonormal_basis, sobol_2d, uniform, uniform_sphere};
+use crate::base::progress::Progress;
+use crate::base::sampling::{orthonormal_basis, sobol_2d, uniform, uniform_sphere};
+use crate::device::{Device, DeviceOptions};
 use crate::scene::Scene;
-use crate::{Device, DeviceOptions, Isa, Material, Mesh, Progress, SceneData};
+use crate::scene::{Material, Mesh, SceneData};
+use crate::simd::Isa;
 use glam::DVec3;
 use glam::Vec3;
 use proptest::prelude::*;
@@ -102,7 +105,7 @@ fn hits_on_triangles_seen_edge_on_are_as_accurate_as_their_areas_allow() {
                 let (x, y) = orthonormal_basis(normal);
                 for j in 0..100 {
                     let random = |d| uniform(100 * i + j, d, 3);
-                    let [u, v] = crate::sampling::uniform_triangle([random(0), random(1)]);
+                    let [u, v] = crate::base::sampling::uniform_triangle([random(0), random(1)]);
                     let (sin, cos) = (std::f32::consts::TAU * random(2)).sin_cos();
                     let slope = 10f32.powf(-5.0 * random(3));
                     let away = 3.0 * random(4) * (cos * x + sin * y + slope * normal);

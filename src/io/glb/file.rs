@@ -1,7 +1,7 @@
 //! The JSON and the binary chunk of the file.
 
 use super::primitives::Primitive;
-use crate::error::Result;
+use crate::base::error::Result;
 use crate::io::account::Account;
 use crate::scene::{Material, NONE};
 use glam::Vec3;

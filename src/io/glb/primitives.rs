@@ -1,7 +1,7 @@
 //! The triangles of each pair of light map page and material, with their own vertices.
 
 use super::GlbLightmap;
-use crate::error::Result;
+use crate::base::error::Result;
 use crate::io::account::Account;
 use crate::io::source::Advance;
 use crate::scene::Scene;

@@ -2,7 +2,7 @@
 //! checked.
 
 use super::{PART, Reader};
-use crate::error::Result;
+use crate::base::error::Result;
 use gltf::accessor::{DataType, Dimensions};
 
 /// Elements in a buffer, whose bounds have been checked.

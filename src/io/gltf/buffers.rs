@@ -1,7 +1,7 @@
 //! The bytes of buffers, and of files and data that URIs name.
 
 use super::text::Text;
-use crate::error::Result;
+use crate::base::error::Result;
 use crate::io::Import;
 use crate::io::source::{Attempt, folder_of};
 use std::borrow::Cow;

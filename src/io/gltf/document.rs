@@ -1,7 +1,7 @@
 //! The parsed JSON of a file, and its nodes in the world.
 
 use super::text::Text;
-use crate::error::{Error, Result};
+use crate::base::error::{Error, Result};
 use crate::io::Import;
 use crate::io::source::Checked;
 use glam::{DMat4, Mat4};

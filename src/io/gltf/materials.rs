@@ -2,7 +2,7 @@
 
 use super::Reader;
 use super::buffers::read_uri;
-use crate::error::{Error, Result};
+use crate::base::error::{Error, Result};
 use crate::io::source::Attempt;
 use crate::io::texture;
 use crate::scene::{Material, NONE, Texture};

@@ -2,7 +2,7 @@
 
 use super::materials::lightmap_texture;
 use super::{PART, Reader};
-use crate::error::Result;
+use crate::base::error::Result;
 use crate::io::is_valid_position;
 use crate::scene::{LightmapUvs, Mesh, MeshMaterials, NONE};
 use glam::{DMat3, DMat4, DVec3, Vec2, Vec3};

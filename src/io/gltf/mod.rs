@@ -39,7 +39,7 @@ mod text;
 
 use super::Import;
 use super::source::Opened;
-use crate::error::{Error, Result};
+use crate::base::error::{Error, Result};
 use crate::scene::Light;
 use glam::DMat4;
 use gltf::khr_lights_punctual::Kind;

@@ -1,6 +1,6 @@
 //! Files that are written here, as they should be and damaged.
 
-use crate::error::Error;
+use crate::base::error::Error;
 use crate::io::tests::{Folder, albedos, corners, load_bytes, load_path, refusal};
 use crate::scene::{Light, NONE};
 use base64::Engine;

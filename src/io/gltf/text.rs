@@ -1,6 +1,6 @@
 //! The JSON of a file without its long data URIs, and the data in these.
 
-use crate::error::Result;
+use crate::base::error::Result;
 use crate::io::Import;
 use crate::io::source::Attempt;
 use base64::Engine;

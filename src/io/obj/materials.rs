@@ -2,7 +2,7 @@
 
 use super::mtl::{self, MapFile};
 use super::{Reader, base_name};
-use crate::error::Result;
+use crate::base::error::Result;
 use crate::io::{DEFAULT_ALBEDO, Import, TWO_SIDED_UNLESS_SAID, texture};
 use crate::scene::{Material, NONE};
 use std::collections::HashMap;

@@ -23,7 +23,7 @@ pub(super) mod tests;
 
 use super::source::{Opened, Source, folder_of, read_error};
 use super::{Import, is_valid_position};
-use crate::error::{Error, Result};
+use crate::base::error::{Error, Result};
 use crate::scene::{LightmapUvs, Mesh, MeshMaterials, NONE};
 use glam::{Vec2, Vec3};
 use mtl::{Library, finite, split_keyword};

@@ -3,7 +3,7 @@
 //! `illum` is one of the models with transparency, 4, 6, 7 and 9. Options of maps and everything else are
 //! skipped.
 
-use crate::error::{Error, Result};
+use crate::base::error::{Error, Result};
 use crate::io::account::Account;
 use crate::io::source::{Source, folder_of, read_error};
 use std::collections::HashMap;

@@ -210,7 +210,8 @@ fn a_library_that_is_named_often_is_read_once() {
     .unwrap();
     let options = LoadOptions { max_file_bytes: 10_000, ..Default::default() };
     let mut scene = SceneData::new();
-    crate::io::load_with(&folder.path("a.obj"), &options, &crate::Progress::none(), &mut scene).unwrap();
+    crate::io::load_with(&folder.path("a.obj"), &options, &crate::base::progress::Progress::none(), &mut scene)
+        .unwrap();
     assert_eq!(albedos(&scene), [[0.25; 3]]);
 }
 

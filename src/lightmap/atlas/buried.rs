@@ -14,10 +14,10 @@ use super::chart_map::ChartMap;
 use super::charts::Charts;
 use super::seen::Seen;
 use super::texels::TexelSample;
-use crate::error::Result;
-use crate::memory::{try_append, try_collect, try_par_collect, try_push, try_vec};
-use crate::progress::Stage;
-use crate::sampling::{cosine_around, sobol_2d};
+use crate::base::error::Result;
+use crate::base::memory::{try_append, try_collect, try_par_collect, try_push, try_vec};
+use crate::base::progress::Stage;
+use crate::base::sampling::{cosine_around, sobol_2d};
 use crate::scene::{NONE, Scene};
 use crate::trace::{RawHit, Ray};
 use glam::{Mat2, Vec2, Vec3};
@@ -304,8 +304,8 @@ fn nearest_seen(
 
 #[cfg(test)]
 mod tests {
+    use crate::base::progress::Progress;
     use crate::lightmap::{Lightmap, LightmapDesc};
-    use crate::progress::Progress;
     use crate::scene::shapes::MeshBuilder;
     use crate::scene::{Light, Material, SceneData};
     use glam::{Mat2, Vec2, Vec3};

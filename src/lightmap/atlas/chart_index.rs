@@ -6,9 +6,9 @@
 use super::charts::Charts;
 use super::flat_triangle::Flat;
 use super::texels::TexelSample;
+use crate::base::error::Result;
+use crate::base::memory::{Reservation, try_vec, try_with_capacity};
 use crate::device::Device;
-use crate::error::Result;
-use crate::memory::{Reservation, try_vec, try_with_capacity};
 use glam::{DVec2, Vec2};
 use rayon::prelude::*;
 
@@ -172,8 +172,8 @@ fn weights(corners: [[f32; 2]; 3], p: Vec2) -> Option<[f32; 2]> {
 #[cfg(test)]
 mod tests {
     use super::*;
-    use crate::progress::Progress;
-    use crate::sampling::{sobol_2d, uniform_triangle};
+    use crate::base::progress::Progress;
+    use crate::base::sampling::{sobol_2d, uniform_triangle};
     use crate::scene::builtin;
 
     #[test]

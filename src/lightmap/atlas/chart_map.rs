@@ -3,9 +3,9 @@
 use super::charts::Charts;
 use super::layout::Layout;
 use super::texels::{TexelMap, TexelSample};
+use crate::base::error::Result;
+use crate::base::progress::Stage;
 use crate::direct::Receiver;
-use crate::error::Result;
-use crate::progress::Stage;
 use crate::scene::{NONE, Scene};
 use crate::trace::offset::SurfacePoint;
 use glam::Vec3;

@@ -6,10 +6,10 @@
 pub use super::pieces::Given;
 use super::pieces::{CHARTS, Groups, Piece, connected, float_key, surface_kind};
 use super::unwrap;
+use crate::base::error::{Error, Result, invalid_argument};
+use crate::base::memory::{try_collect, try_filled, try_push, try_with_capacity};
+use crate::base::progress::{Progress, Stage};
 use crate::device::LogLevel;
-use crate::error::{Error, Result, invalid_argument};
-use crate::memory::{try_collect, try_filled, try_push, try_with_capacity};
-use crate::progress::{Progress, Stage};
 use crate::scene::{LightmapUvs, Mesh, NONE, Scene};
 use glam::{DVec2, Vec2};
 use std::collections::BTreeMap;

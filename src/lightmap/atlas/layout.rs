@@ -10,9 +10,9 @@
 
 use super::charts::{Chart, Charts, MAX_TEXELS, padded_extent};
 use super::pieces::Given;
-use crate::error::{Error, Result, invalid_argument};
-use crate::memory::{try_collect, try_filled, try_with_capacity};
-use crate::progress::Progress;
+use crate::base::error::{Error, Result, invalid_argument};
+use crate::base::memory::{try_collect, try_filled, try_with_capacity};
+use crate::base::progress::Progress;
 use crate::scene::NONE;
 
 /// Name of the buffers in error messages.

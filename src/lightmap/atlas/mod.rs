@@ -15,8 +15,8 @@ mod unwrap;
 mod welded;
 
 use super::LightmapInfo;
+use crate::base::memory::Reservation;
 use crate::direct::Receiver;
-use crate::memory::Reservation;
 use crate::scene::Scene;
 use chart_index::ChartIndex;
 use chart_map::ChartMap;

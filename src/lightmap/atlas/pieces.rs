@@ -1,8 +1,8 @@
 //! Pieces of surface from which charts are made, and how they are connected.
 
-use crate::error::Result;
-use crate::memory::{try_collect, try_filled, try_push};
-use crate::progress::Stage;
+use crate::base::error::Result;
+use crate::base::memory::{try_collect, try_filled, try_push};
+use crate::base::progress::Stage;
 use crate::scene::{Material, NONE};
 use rayon::prelude::*;
 

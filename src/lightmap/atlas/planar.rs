@@ -6,9 +6,9 @@
 
 use super::pieces::{CHARTS, ITEMS_PER_CHECK, Piece};
 use super::welded::Geometry;
-use crate::error::Result;
-use crate::memory::{try_collect, try_filled, try_push};
-use crate::progress::Stage;
+use crate::base::error::Result;
+use crate::base::memory::{try_collect, try_filled, try_push};
+use crate::base::progress::Stage;
 use crate::scene::NONE;
 use glam::{DVec2, DVec3};
 
@@ -302,8 +302,8 @@ fn planar_piece(geometry: &Geometry, triangle: usize, partner: Option<usize>) ->
 #[cfg(test)]
 mod tests {
     use super::*;
+    use crate::base::progress::Progress;
     use crate::lightmap::atlas::charts::tests::{grid, scene_on};
-    use crate::progress::Progress;
 
     #[test]
     fn planar_charts_hold_each_triangle_once_in_true_shape() {

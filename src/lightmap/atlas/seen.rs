@@ -6,10 +6,10 @@
 
 use super::chart_map::ChartMap;
 use super::charts::Charts;
-use crate::error::Result;
-use crate::memory::try_collect;
-use crate::progress::Stage;
-use crate::sampling::{combine, cosine_around, mix, uniform, uniform_sphere};
+use crate::base::error::Result;
+use crate::base::memory::try_collect;
+use crate::base::progress::Stage;
+use crate::base::sampling::{combine, cosine_around, mix, uniform, uniform_sphere};
 use crate::scene::{Light, NONE, Scene};
 use crate::trace::{PACKET_SIZE, Packet, RawHit, Ray};
 use glam::Vec3;
@@ -216,8 +216,8 @@ impl Look<'_> {
 
 #[cfg(test)]
 mod tests {
+    use crate::base::progress::Progress;
     use crate::lightmap::{Lightmap, LightmapDesc};
-    use crate::progress::Progress;
     use crate::scene::shapes::MeshBuilder;
     use crate::scene::{Material, SceneData};
     use glam::Vec3;

@@ -17,10 +17,10 @@
 use super::Atlas;
 use super::chart_map::ChartMap;
 use super::seen::Seen;
-use crate::error::Result;
-use crate::memory::{try_collect, try_par_collect};
-use crate::progress::Progress;
-use crate::sampling::{cosine_around, sobol_2d};
+use crate::base::error::Result;
+use crate::base::memory::{try_collect, try_par_collect};
+use crate::base::progress::Progress;
+use crate::base::sampling::{cosine_around, sobol_2d};
 use crate::scene::Scene;
 use crate::trace::Ray;
 use rayon::prelude::*;

@@ -11,9 +11,9 @@
 use super::pieces::{CHARTS, Groups, Piece, connected};
 use super::planar::{flat_piece, flat_regions, planar_pieces};
 use super::welded::Geometry;
-use crate::error::Result;
-use crate::memory::{try_append, try_collect, try_filled, try_par_gather, try_push, try_with_capacity};
-use crate::progress::Stage;
+use crate::base::error::Result;
+use crate::base::memory::{try_append, try_collect, try_filled, try_par_gather, try_push, try_with_capacity};
+use crate::base::progress::Stage;
 use crate::scene::Scene;
 use glam::{DVec2, DVec3};
 
@@ -148,8 +148,8 @@ fn unwrap_part(geometry: &Geometry, _: &Scene, stage: &Stage) -> Result<Vec<Piec
 
 #[cfg(feature = "unwrap")]
 fn unwrap_part(geometry: &Geometry, scene: &Scene, stage: &Stage) -> Result<Vec<Piece>> {
+    use crate::base::error::Error;
     use crate::device::LogLevel;
-    use crate::error::Error;
     let all = try_filled(geometry.triangles.len(), true, CHARTS)?;
     match charts_of_part(geometry, stage) {
         Ok((mut pieces, left)) => {
@@ -250,8 +250,8 @@ fn read_charts(geometry: &Geometry, atlas: &uvunwrap::Atlas, texel: f64) -> (Vec
 #[cfg(test)]
 mod tests {
     use super::*;
+    use crate::base::progress::Progress;
     use crate::lightmap::atlas::charts::tests::{grid, scene_on};
-    use crate::progress::Progress;
 
     #[test]
     fn parts_are_bounded_and_hold_each_triangle_once() {

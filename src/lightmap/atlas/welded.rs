@@ -1,9 +1,9 @@
 //! The triangles of a mesh with welded vertices, and which lie next to which.
 
 use super::pieces::{CHARTS, ITEMS_PER_CHECK, float_key, surface_kind};
-use crate::error::Result;
-use crate::memory::{try_collect, try_filled, try_par_collect, try_with_capacity};
-use crate::progress::Stage;
+use crate::base::error::Result;
+use crate::base::memory::{try_collect, try_filled, try_par_collect, try_with_capacity};
+use crate::base::progress::Stage;
 use crate::scene::{NONE, Scene};
 use glam::DVec3;
 use rayon::prelude::*;
@@ -60,7 +60,7 @@ impl Geometry {
             positions,
             normals: try_par_collect(triangles.par_iter().map(normal), CHARTS)?,
             kinds: try_par_collect(triangles.par_iter().map(kind), CHARTS)?,
-            triangles: crate::memory::try_to_vec(triangles, CHARTS)?,
+            triangles: crate::base::memory::try_to_vec(triangles, CHARTS)?,
         })
     }
 

@@ -1,12 +1,12 @@
 //! Filters over the texels of a map: a blur of the gather map (thesis 3.2.5) that stays inside charts and does not
 //! cross walls, and the filling of texels that cannot be seen.
 
+use crate::base::error::Result;
+use crate::base::memory::{try_collect, try_with_capacity};
+use crate::base::progress::{Progress, Stage};
 use crate::device::Device;
-use crate::error::Result;
 use crate::lightmap::atlas::chart_map::ChartMap;
 use crate::lightmap::atlas::charts::Charts;
-use crate::memory::{try_collect, try_with_capacity};
-use crate::progress::{Progress, Stage};
 use crate::scene::NONE;
 use glam::Vec3;
 use rayon::prelude::*;

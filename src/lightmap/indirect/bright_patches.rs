@@ -12,11 +12,11 @@
 //! docs/experiments.md#bright-patches-as-lights.
 
 use super::sample_set::ROUND;
+use crate::base::memory::Reservation;
 use crate::direct::Receiver;
 use crate::direct::many_lights::ManyLights;
 use crate::direct::shadow_rays::ShadowRays;
 use crate::lightmap::atlas::chart_map::ChartMap;
-use crate::memory::Reservation;
 use glam::Vec3;
 
 /// Gather rays see the full radiance of a texel if they are shorter than the square root of this many times its area.

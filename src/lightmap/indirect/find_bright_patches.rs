@@ -5,12 +5,12 @@ use super::bright_patches::{Bright, near2};
 use super::gather::Gathered;
 use super::radiance_map::{Radiance, RadianceMap};
 use super::sample_set::{ROUND, SampleSet};
+use crate::base::error::Result;
+use crate::base::memory::{try_append, try_collect, try_par_collect, try_par_collect_ok, try_par_gather, try_push};
+use crate::base::progress::Progress;
+use crate::base::sampling::{combine, cosine_around, sobol_2d, uniform};
 use crate::direct::many_lights::{ManyLights, Patch};
-use crate::error::Result;
 use crate::lightmap::atlas::Atlas;
-use crate::memory::{try_append, try_collect, try_par_collect, try_par_collect_ok, try_par_gather, try_push};
-use crate::progress::Progress;
-use crate::sampling::{combine, cosine_around, sobol_2d, uniform};
 use crate::scene::NONE;
 use crate::trace::Ray;
 use crate::trace::offset::{SurfacePoint, offset_ray_origin};
@@ -304,11 +304,11 @@ fn grid_points(corners: [Vec2; 3], offset: Vec2) -> impl Iterator<Item = Vec2> {
 #[cfg(test)]
 mod tests {
     use super::*;
+    use crate::base::sampling::uniform_triangle;
     use crate::lightmap::indirect::gather::Gathered;
     use crate::lightmap::indirect::sample_set::SampleSet;
     use crate::lightmap::plan::left_out;
     use crate::lightmap::{BakeParams, Light as Baked, Lightmap, LightmapDesc};
-    use crate::sampling::uniform_triangle;
     use crate::scene::shapes::MeshBuilder;
     use crate::scene::{Light, Material, SceneData, builtin};
     use crate::trace::RawHit;

@@ -13,12 +13,12 @@
 use super::bright_patches::Unoccluded;
 use super::radiance_map::RadianceMap;
 use super::sample_set::{ROUND, SampleSet};
+use crate::base::error::Result;
+use crate::base::memory::try_filled;
+use crate::base::sampling::{combine, concentric_disc, orthonormal_basis, unit_float};
 use crate::direct::Receiver;
 use crate::direct::shadow_rays::{PointRoom, TileRoom};
-use crate::error::Result;
 use crate::lightmap::tiles::TILE;
-use crate::memory::try_filled;
-use crate::sampling::{combine, concentric_disc, orthonormal_basis, unit_float};
 use crate::scene::Scene;
 use crate::trace::filter::Crossing;
 use crate::trace::{RawHit, Ray};

@@ -7,8 +7,8 @@
 //!
 //! Measured, with alternatives that were tried: docs/experiments.md#narrow-gaps.
 
+use crate::base::sampling::{cosine_around, sobol_2d};
 use crate::direct::Receiver;
-use crate::sampling::{cosine_around, sobol_2d};
 use crate::scene::Scene;
 use crate::trace::Ray;
 

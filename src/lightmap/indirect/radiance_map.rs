@@ -13,18 +13,18 @@
 //! Tried: look-ups that interpolate, and a radius per texel; see docs/experiments.md#look-ups-in-the-radiance-map.
 
 use super::bright_patches::Bright;
+use crate::base::error::Result;
+use crate::base::memory::try_vec;
+use crate::base::progress::Stage;
+use crate::base::sampling::{combine, sobol_2d};
 use crate::device::Device;
-use crate::error::Result;
 use crate::lightmap::atlas::chart_map::ChartMap;
 use crate::lightmap::atlas::charts::Charts;
 use crate::lightmap::atlas::texels::TexelSample;
 use crate::lightmap::texel_light::{Look, TexelAreas, TexelLight, TilePoints};
 use crate::lightmap::tiles::{TILE, in_order};
-use crate::memory::try_vec;
 use crate::photon::PhotonMap;
 use crate::photon::coverage::Discs;
-use crate::progress::Stage;
-use crate::sampling::{combine, sobol_2d};
 use crate::scene::NONE;
 use crate::trace::RawHit;
 use glam::{Mat2, Vec2, Vec3};

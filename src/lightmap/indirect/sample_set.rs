@@ -1,6 +1,6 @@
 //! Points of the square from which gather rays get their directions, in rounds.
 
-use crate::sampling::sobol_2d_bits;
+use crate::base::sampling::sobol_2d_bits;
 
 /// Number of rays of a round.
 pub(crate) const ROUND: usize = 64;

@@ -15,15 +15,15 @@ use super::narrow_gaps::is_in_gap;
 use super::radiance_map::RadianceMap;
 use super::sample_set::SampleSet;
 use super::upsample_visibility::{self, TEXELS_PER_CHECK};
-use crate::error::Result;
+use crate::base::error::Result;
+use crate::base::memory::{
+    Reservation, try_append, try_collect, try_filled, try_par_gather, try_push, try_vec, try_with_capacity,
+};
+use crate::base::progress::Stage;
+use crate::base::sampling::combine;
 use crate::lightmap::atlas::Atlas;
 use crate::lightmap::atlas::chart_map::ChartMap;
 use crate::lightmap::tiles::TILE;
-use crate::memory::{
-    Reservation, try_append, try_collect, try_filled, try_par_gather, try_push, try_vec, try_with_capacity,
-};
-use crate::progress::Stage;
-use crate::sampling::combine;
 use crate::scene::NONE;
 use glam::Vec3;
 use rayon::prelude::*;
@@ -351,9 +351,9 @@ impl Bits {
 #[cfg(test)]
 pub(super) mod tests {
     use super::*;
+    use crate::base::progress::Progress;
     use crate::lightmap::indirect::radiance_map::Radiance;
     use crate::lightmap::{Lightmap, LightmapDesc};
-    use crate::progress::Progress;
     use crate::scene::shapes::MeshBuilder;
     use crate::scene::{Light, LightmapUvs, Material, SceneData};
     use glam::{Vec2, Vec3};

@@ -8,10 +8,10 @@
 //!
 //! Measured: docs/experiments.md#walls-and-creases.
 
-use crate::error::{Error, Result};
+use crate::base::error::{Error, Result};
+use crate::base::memory::{try_push, try_with_capacity};
+use crate::base::progress::Stage;
 use crate::lightmap::atlas::Atlas;
-use crate::memory::{try_push, try_with_capacity};
-use crate::progress::Stage;
 use crate::scene::NONE;
 use crate::trace::Ray;
 use glam::Vec3;
@@ -107,10 +107,10 @@ pub(in crate::lightmap) fn between(
 
 #[cfg(test)]
 mod tests {
+    use crate::base::progress::Progress;
     use crate::lightmap::atlas::chart_map::ChartMap;
     use crate::lightmap::indirect::upsample::tests::{dark, find};
     use crate::lightmap::{Lightmap, LightmapDesc};
-    use crate::progress::Progress;
     use crate::scene::shapes::MeshBuilder;
     use crate::scene::{LightmapUvs, Material, SceneData};
     use glam::{Vec2, Vec3};

@@ -15,7 +15,7 @@ mod result;
 
 pub use checkpoint::CheckpointParams;
 
-use crate::error::Error;
+use crate::base::error::Error;
 use std::io;
 use std::path::Path;
 

@@ -15,7 +15,7 @@
 //! length are found by that of the header.
 
 use super::{another_kind, damaged, unreadable};
-use crate::error::{Error, Result};
+use crate::base::error::{Error, Result};
 use std::io::{self, ErrorKind, Read, Seek, SeekFrom};
 use std::path::Path;
 

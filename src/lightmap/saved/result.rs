@@ -8,14 +8,14 @@
 use super::fingerprint::Fingerprint;
 use super::records::{self, MAGIC, Next, Records, Tag, take, take_one};
 use super::{damaged, foreign, unreadable};
-use crate::error::{Error, Result};
-use crate::files;
+use crate::base::error::{Error, Result};
+use crate::base::files;
+use crate::base::memory::{try_collect, try_push, try_to_vec, try_vec, try_with_capacity};
+use crate::base::progress::Progress;
 use crate::lightmap::indirect::bright_patches::Bright;
 use crate::lightmap::indirect::radiance_map::Radiance;
 use crate::lightmap::plan::Plan;
 use crate::lightmap::{BakeStats, Light, Lightmap, TexelState};
-use crate::memory::{try_collect, try_push, try_to_vec, try_vec, try_with_capacity};
-use crate::progress::Progress;
 use crate::scene::MOST_LIGHT;
 use bytemuck::{Pod, Zeroable};
 use glam::Vec3;

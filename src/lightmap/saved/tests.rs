@@ -2,12 +2,13 @@
 //! killed in between; what is damaged or foreign is refused and changes nothing.
 
 use super::records::{self, Next, Records};
+use crate::base::error::{Error, Result};
+use crate::base::progress::Progress;
 use crate::bvh::BuildOptions;
-use crate::error::{Error, Result};
+use crate::device::{Device, DeviceOptions};
 use crate::lightmap::{BakeParams, CheckpointParams, Layer, LayerData, Lightmap, LightmapDesc};
-use crate::progress::Progress;
 use crate::scene::{Light, Scene, builtin};
-use crate::{Device, DeviceOptions, Isa};
+use crate::simd::Isa;
 use std::path::{Path, PathBuf};
 use std::sync::atomic::{AtomicU32, Ordering::Relaxed};
 

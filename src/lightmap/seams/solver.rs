@@ -1,8 +1,8 @@
 //! The least squares problem of the seams and its solution by conjugate gradients (Hestenes and Stiefel 1952).
 
-use crate::error::Result;
-use crate::memory::{try_filled, try_par_collect, try_to_vec, try_vec};
-use crate::progress::Stage;
+use crate::base::error::Result;
+use crate::base::memory::{try_filled, try_par_collect, try_to_vec, try_vec};
+use crate::base::progress::Stage;
 use glam::{DVec3, Vec3A};
 use rayon::prelude::*;
 use std::ops::Range;

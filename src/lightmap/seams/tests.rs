@@ -310,7 +310,7 @@ fn light_stays_at_least_zero() {
 #[test]
 fn the_light_found_is_the_least_squares_solution() {
     let n = 12;
-    let random = |i: u32| crate::sampling::uniform(i, 0, 7);
+    let random = |i: u32| crate::base::sampling::uniform(i, 0, 7);
     let points: Vec<Point> = (0..20)
         .map(|i| {
             let mut p = Point { length: 0.1 + random(i), ..Default::default() };

@@ -5,8 +5,8 @@
 //! The search is exact: first the nearest covered texel in each column is found, then the best of the columns around.
 
 use super::{Group, NONE, TexelMap};
-use crate::error::{Error, Result};
-use crate::memory::try_push;
+use crate::base::error::{Error, Result};
+use crate::base::memory::try_push;
 use std::collections::HashMap;
 use std::ops::Range;
 

@@ -1,11 +1,11 @@
 //! Tests of the inverse mapping.
 
 use super::*;
-use crate::error::Error;
+use crate::base::error::Error;
+use crate::base::progress::Progress;
 use crate::lightmap::atlas::charts::Chart;
 use crate::lightmap::atlas::charts::tests::{grid, map_of, quad, scene_of, scene_on};
 use crate::lightmap::atlas::pieces::Given;
-use crate::progress::Progress;
 use crate::scene::Mesh;
 use proptest::prelude::*;
 
