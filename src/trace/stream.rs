@@ -6,7 +6,8 @@
 //! push (root, all rays)
 //! while (child, list) is popped:
 //!     node:  test each ray of the list against the eight boxes, whose planes stay in registers;
-//!            for each child that any ray hits, from far to near: push (child, list of these rays)
+//!            for each child that any ray hits, from far to near, or to any hit from least to most worth:
+//!            push (child, list of these rays)
 //!     leaf:  test each ray of the list against the triangles, two rays at a time
 //! ```
 //!
@@ -116,7 +117,7 @@ impl<T: Tree> Traversal<'_, T> {
                 if entry.child.is_leaf() {
                     self.visit_leaf::<S, ANY>(entry);
                 } else {
-                    depth += self.visit_node::<S>(entry, stack.as_mut_ptr().add(depth).cast());
+                    depth += self.visit_node::<S, ANY>(entry, stack.as_mut_ptr().add(depth).cast());
                 }
             }
         }
@@ -147,7 +148,7 @@ impl<T: Tree> Traversal<'_, T> {
     /// # Safety
     /// The CPU must have the ISA; `entry` must be of a node of the tree, and `stack` have room for eight entries.
     #[inline(always)]
-    unsafe fn visit_node<S: Simd>(&mut self, entry: Entry, stack: *mut Entry) -> usize {
+    unsafe fn visit_node<S: Simd, const ANY: bool>(&mut self, entry: Entry, stack: *mut Entry) -> usize {
         let (start, count) = (entry.start as usize, entry.count as usize);
         let room = &mut *self.room;
         // SAFETY: a list's numbers are below the number of slabs that were set up, and the list lies within `numbers`. There
@@ -187,7 +188,11 @@ impl<T: Tree> Traversal<'_, T> {
             }
             let mut pushed = 0;
             for place in 0..WIDTH {
-                let lane = order.add(place).read() >> (3 * self.group.octant) & 7;
+                // (By worth, shadow rays of tiles to a lamp are 1.45 times as fast in Sponza, 1.3 times in the living room.)
+                let lane = match ANY && T::IS_BY_WORTH {
+                    true => place as u32,
+                    false => order.add(place).read() >> (3 * self.group.octant) & 7,
+                };
                 if met >> lane & 1 == 0 {
                     continue;
                 }
