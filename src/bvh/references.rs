@@ -3,6 +3,7 @@
 use crate::base::error::Result;
 use crate::base::geometry::half_area;
 use crate::base::memory::{try_par_collect, try_zeroed};
+use crate::base::progress::Progress;
 use bytemuck::Zeroable;
 use glam::{Mat4, Vec3, Vec4, Vec4Swizzles};
 use rayon::prelude::*;
@@ -181,22 +182,32 @@ impl References {
         count: usize,
         corners: &(impl Fn(u32) -> [Vec3; 3] + Sync),
         valid: impl Fn([Vec3; 3]) -> bool + Sync,
+        progress: &Progress,
     ) -> Result<References> {
-        References::collect(count, |i| {
+        let reference = |i| {
             let corners = corners(i as u32);
             valid(corners).then(|| Reference::new(i as u32, corners))
-        })
+        };
+        References::collect(count, reference, progress)
     }
 
     /// References to some triangles by their numbers.
     pub(super) fn of(triangles: &[u32], corners: &(impl Fn(u32) -> [Vec3; 3] + Sync)) -> Result<References> {
-        References::collect(triangles.len(), |i| Some(Reference::new(triangles[i], corners(triangles[i]))))
+        let reference = |i| Some(Reference::new(triangles[i], corners(triangles[i])));
+        References::collect(triangles.len(), reference, &Progress::none())
     }
 
-    fn collect(count: usize, reference: impl Fn(usize) -> Option<Reference> + Sync) -> Result<References> {
+    fn collect(
+        count: usize,
+        reference: impl Fn(usize) -> Option<Reference> + Sync,
+        progress: &Progress,
+    ) -> Result<References> {
         let mut refs = try_zeroed::<Reference>(count, "references to triangles")?;
         let fill = |(i, chunk): (usize, &mut [Reference])| {
             let mut n = 0;
+            if progress.is_cancelled() {
+                return (n, Extent::EMPTY);
+            }
             for r in (i * CHUNK..i * CHUNK + chunk.len()).filter_map(&reference) {
                 chunk[n] = r;
                 n += 1;
@@ -204,6 +215,7 @@ impl References {
             (n, Extent::of(&chunk[..n]))
         };
         let chunks = try_par_collect(refs.par_chunks_mut(CHUNK).enumerate().map(fill), "references to triangles")?;
+        progress.check()?;
         // Chunks move up to those before.
         let mut end = 0;
         for (i, &(n, _)) in chunks.iter().enumerate() {

@@ -350,7 +350,6 @@ impl Bake<'_, '_> {
                 let (mut traced, mut tile) = (0, Tile::new()?);
                 let first = needed.start + block * BLOCK;
                 for samples_of_tile in in_order(&l.gather, first..first + values.len())?.chunks(TILE) {
-                    self.progress.check()?;
                     let texel = |&s: &u32| TileTexel {
                         receiver: l.receiver(&l.gather, backs, s as usize),
                         seed: combine(seed, s),
@@ -358,6 +357,8 @@ impl Bake<'_, '_> {
                     };
                     let mut texels: Vec<_> = samples_of_tile.iter().map(texel).collect();
                     for round in 0..samples.rounds() {
+                        // A tile may have 4 million rays.
+                        self.progress.check()?;
                         traced += tile.add_round(&l.scene, &lookup, &mut texels, &samples, round);
                     }
                     for (&sample, TileTexel { receiver, gathered, .. }) in samples_of_tile.iter().zip(&texels) {

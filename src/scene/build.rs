@@ -100,7 +100,7 @@ impl Scene {
         };
         let meshes = data.bytes();
         let mut memory = device.memory().reserve(meshes + bvh::estimated_bytes(total, options), "the scene")?;
-        let references = device.install(|| References::of_valid(total, &corners, is_valid_triangle))?;
+        let references = device.install(|| References::of_valid(total, &corners, is_valid_triangle, progress))?;
         progress.check()?;
         if references.len() == 0 {
             return Err(Error::InvalidState(format!(

@@ -76,7 +76,10 @@ pub(super) fn flat_piece(
 ) -> Result<Option<Piece>> {
     let seed = geometry.normals[region[0] as usize];
     let is_inner = |n: u32| geometry.normals[n as usize].dot(seed) > FLAT_COSINE;
-    for &t in region {
+    for (i, &t) in region.iter().enumerate() {
+        if i % ITEMS_PER_CHECK == ITEMS_PER_CHECK - 1 {
+            stage.check()?;
+        }
         for n in neighbours[t as usize] {
             // A flat neighbour is in the region, unless an earlier one has taken it.
             if n != NONE
@@ -89,6 +92,7 @@ pub(super) fn flat_piece(
     }
     let mut members = try_collect(region.iter().copied(), CHARTS)?;
     members.sort_unstable();
+    stage.check()?;
     let normal: DVec3 = members.iter().map(|&t| doubled_area(geometry.corners(t as usize))).sum();
     let normal = normal.normalize_or(DVec3::Z);
     let x = normal.any_orthonormal_vector();
@@ -98,7 +102,10 @@ pub(super) fn flat_piece(
     let flat = members.iter().map(|&t| geometry.corners(t as usize).map(project));
     let mut flat: Vec<[DVec2; 3]> = try_collect(flat, CHARTS)?;
     let mut border = Vec::new();
-    for (&t, corners) in members.iter().zip(&flat) {
+    for (i, (&t, corners)) in members.iter().zip(&flat).enumerate() {
+        if i % ITEMS_PER_CHECK == ITEMS_PER_CHECK - 1 {
+            stage.check()?;
+        }
         for (k, n) in neighbours[t as usize].into_iter().enumerate() {
             if n == NONE || !is_inner(n) {
                 try_push(&mut border, corners[k], CHARTS)?;
@@ -106,6 +113,7 @@ pub(super) fn flat_piece(
         }
     }
     turn_upright(&mut flat, &mut border)?;
+    stage.check()?;
     if members.len() > 2 && overlaps_itself(&flat, stage)? {
         return Ok(None);
     }
@@ -184,6 +192,7 @@ fn overlaps_itself(triangles: &[[DVec2; 3]], stage: &Stage) -> Result<bool> {
     let mut starts = try_filled(columns * cells.y as usize + 1, 0u32, CHARTS)?;
     let ranges = triangles.iter().map(|[a, b, c]| [cell(a.min(*b).min(*c)), cell(a.max(*b).max(*c))]);
     let ranges = try_collect(ranges, CHARTS)?;
+    stage.check()?;
     let mut total = 0;
     for (i, [from, to]) in ranges.iter().enumerate() {
         if i % ITEMS_PER_CHECK == 0 {
@@ -204,6 +213,9 @@ fn overlaps_itself(triangles: &[[DVec2; 3]], stage: &Stage) -> Result<bool> {
     }
     let mut items = try_filled(total, 0u32, CHARTS)?;
     for (i, [from, to]) in ranges.iter().enumerate() {
+        if i % ITEMS_PER_CHECK == 0 {
+            stage.check()?;
+        }
         for y in from[1]..=to[1] {
             for s in &mut starts[y * columns + from[0]..=y * columns + to[0]] {
                 *s -= 1;
@@ -222,6 +234,10 @@ fn overlaps_itself(triangles: &[[DVec2; 3]], stage: &Stage) -> Result<bool> {
             return Ok(true);
         }
         for (k, &a) in here.iter().enumerate() {
+            // One cell may hold so many that it takes seconds.
+            if k % 64 == 63 {
+                stage.check()?;
+            }
             let overlaps_a = |&b: &u32| overlap(&triangles[a as usize], &triangles[b as usize], touch);
             if here[k + 1..].iter().any(overlaps_a) {
                 return Ok(true);
