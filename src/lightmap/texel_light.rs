@@ -157,7 +157,7 @@ impl TexelLight<'_> {
         self.direct.at_point(receiver, Lights::Sharp, 0, 0, rays).sharp
     }
 
-    /// Computes light without penumbrae at the samples of a tile.
+    /// Computes light without penumbrae at samples: at most [`MAX_POINTS`] times as many as `tile` has room for texels.
     pub(crate) fn sharp_of_tile(
         &self,
         receivers: impl Iterator<Item = Receiver>,

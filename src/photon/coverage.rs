@@ -8,8 +8,11 @@
 //! that comes from visible photons, and divided by the part of the disc, weighted by the filter, where surface is
 //! visible (Jensen 2001, section 7.5, and Hey and Purgathofer, *Advanced Radiance Estimation for Photon Map Global
 //! Illumination*, 2002, divide by the area of the surfaces in the same spirit). Where all of the disc is visible both
-//! are exactly 1. The discs of a tile of texels trace their rays together, as [streams](crate::trace), step by step. (Pieces of all surfaces in a grid of their own, summed as photons are, left more bias in a furnished
+//! are exactly 1. (Pieces of all surfaces in a grid of their own, summed as photons are, left more bias in a furnished
 //! room – 1.4 % of the median point instead of 0.5 % – and were three times as many there as photons.)
+//!
+//! The discs of a tile of texels trace their rays together, as [streams](crate::trace), step by step: a disc has the same
+//! bits alone and in a tile.
 
 use super::PhotonMap;
 use super::cylinder::SAME_SURFACE;

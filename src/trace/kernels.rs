@@ -165,6 +165,7 @@ table!(PORTABLE, portable, Portable, [&portable_streams::TABLE; 2]);
 table!(AVX2, avx2, Avx2, [&avx2_streams::TABLE; 2]);
 #[cfg(target_arch = "x86_64")]
 table!(AVX512, avx512, Avx512, [&avx512_streams::TABLE, &vbmi2_streams::TABLE]);
+
 impl Kernels {
     /// The kernels of a device's ISA.
     #[inline]

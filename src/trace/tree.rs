@@ -29,7 +29,7 @@ pub(super) trait Tree {
     /// Prefetches a child that will be visited soon.
     fn prefetch(&self, child: ChildRef);
 
-    /// Prefetches all cache lines of a child.
+    /// Prefetches what is read of a child as soon as it is visited, as far as that is worth it.
     fn prefetch_whole(&self, child: ChildRef);
 
     /// # Safety

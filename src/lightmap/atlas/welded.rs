@@ -2,7 +2,7 @@
 
 use super::pieces::{CHARTS, ITEMS_PER_CHECK, float_key, surface_kind};
 use crate::base::error::Result;
-use crate::base::memory::{try_collect, try_filled, try_par_collect, try_with_capacity};
+use crate::base::memory::{try_collect, try_filled, try_par_collect, try_to_vec, try_with_capacity};
 use crate::base::progress::Stage;
 use crate::scene::{NONE, Scene};
 use glam::DVec3;
@@ -60,7 +60,7 @@ impl Geometry {
             positions,
             normals: try_par_collect(triangles.par_iter().map(normal), CHARTS)?,
             kinds: try_par_collect(triangles.par_iter().map(kind), CHARTS)?,
-            triangles: crate::base::memory::try_to_vec(triangles, CHARTS)?,
+            triangles: try_to_vec(triangles, CHARTS)?,
         })
     }
 
