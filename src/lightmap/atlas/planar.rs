@@ -177,74 +177,85 @@ fn overlaps_itself(triangles: &[[DVec2; 3]], stage: &Stage) -> Result<bool> {
     let lower = corners().fold(DVec2::INFINITY, DVec2::min);
     let extent = corners().fold(DVec2::NEG_INFINITY, DVec2::max) - lower;
     let touch = TOUCH * extent.max_element();
-    let n = triangles.len();
-    // A grid of about as many cells as triangles.
-    let side = (extent.x * extent.y / n as f64).sqrt().max(extent.max_element() / n as f64);
-    if !(side > 0.0) {
-        return Ok(true);
-    }
-    let cells = (extent / side).ceil().max(DVec2::ONE).min(DVec2::splat(n as f64));
-    let columns = cells.x as usize;
-    let cell = |p: DVec2| {
-        let c = ((p - lower) / side).floor().clamp(DVec2::ZERO, cells - 1.0);
-        [c.x as usize, c.y as usize]
-    };
-    let mut starts = try_filled(columns * cells.y as usize + 1, 0u32, CHARTS)?;
-    let ranges = triangles.iter().map(|[a, b, c]| [cell(a.min(*b).min(*c)), cell(a.max(*b).max(*c))]);
-    let ranges = try_collect(ranges, CHARTS)?;
-    stage.check()?;
-    let mut total = 0;
-    for (i, [from, to]) in ranges.iter().enumerate() {
-        if i % ITEMS_PER_CHECK == 0 {
-            stage.check()?;
-        }
-        total += (to[0] - from[0] + 1) * (to[1] - from[1] + 1);
-        if total > CELLS_PER_TRIANGLE * n {
-            return Ok(true);
-        }
-        for y in from[1]..=to[1] {
-            starts[y * columns + from[0]..=y * columns + to[0]].iter_mut().for_each(|s| *s += 1);
-        }
-    }
-    let mut sum = 0;
-    for s in &mut starts {
-        sum += *s;
-        *s = sum;
-    }
-    let mut items = try_filled(total, 0u32, CHARTS)?;
-    for (i, [from, to]) in ranges.iter().enumerate() {
-        if i % ITEMS_PER_CHECK == 0 {
-            stage.check()?;
-        }
-        for y in from[1]..=to[1] {
-            for s in &mut starts[y * columns + from[0]..=y * columns + to[0]] {
-                *s -= 1;
-                items[*s as usize] = i as u32;
-            }
-        }
-    }
-    let mut tests = 0;
-    for (i, w) in starts.windows(2).enumerate() {
-        if i % ITEMS_PER_CHECK == 0 {
-            stage.check()?;
-        }
-        let here = &items[w[0] as usize..w[1] as usize];
+    let Some(cells) = Cells::of(triangles, lower, extent, stage)? else { return Ok(true) };
+    let (mut tests, mut since_check) = (0, 0);
+    for w in cells.starts.windows(2) {
+        let here = &cells.items[w[0] as usize..w[1] as usize];
         tests += here.len() * here.len() / 2;
-        if tests > TESTS_PER_TRIANGLE * n {
+        if tests > TESTS_PER_TRIANGLE * triangles.len() {
             return Ok(true);
         }
         for (k, &a) in here.iter().enumerate() {
-            // One cell may hold so many that it takes seconds.
-            if k % 64 == 63 {
+            let others = &here[k + 1..];
+            since_check += 1 + others.len();
+            if since_check > ITEMS_PER_CHECK {
                 stage.check()?;
+                since_check = 0;
             }
-            let overlaps_a = |&b: &u32| overlap(&triangles[a as usize], &triangles[b as usize], touch);
-            if here[k + 1..].iter().any(overlaps_a) {
+            if others.iter().any(|&b| overlap(&triangles[a as usize], &triangles[b as usize], touch)) {
                 return Ok(true);
             }
         }
     }
     Ok(false)
+}
+
+/// A grid of about as many cells as triangles, with the triangles whose boxes meet each cell.
+struct Cells {
+    /// Where those of each cell begin in `items`, and where the last ones end.
+    starts: Vec<u32>,
+    items: Vec<u32>,
+}
+
+impl Cells {
+    /// Puts triangles, which have these bounds, into cells; `None` if they have no extent, or meet too many cells.
+    fn of(triangles: &[[DVec2; 3]], lower: DVec2, extent: DVec2, stage: &Stage) -> Result<Option<Cells>> {
+        let n = triangles.len();
+        let side = (extent.x * extent.y / n as f64).sqrt().max(extent.max_element() / n as f64);
+        if !(side > 0.0) {
+            return Ok(None);
+        }
+        let cells = (extent / side).ceil().max(DVec2::ONE).min(DVec2::splat(n as f64));
+        let columns = cells.x as usize;
+        let cell = |p: DVec2| {
+            let c = ((p - lower) / side).floor().clamp(DVec2::ZERO, cells - 1.0);
+            [c.x as usize, c.y as usize]
+        };
+        let mut starts = try_filled(columns * cells.y as usize + 1, 0u32, CHARTS)?;
+        let ranges = triangles.iter().map(|[a, b, c]| [cell(a.min(*b).min(*c)), cell(a.max(*b).max(*c))]);
+        let ranges = try_collect(ranges, CHARTS)?;
+        let mut total = 0;
+        for (i, [from, to]) in ranges.iter().enumerate() {
+            if i % ITEMS_PER_CHECK == 0 {
+                stage.check()?;
+            }
+            total += (to[0] - from[0] + 1) * (to[1] - from[1] + 1);
+            if total > CELLS_PER_TRIANGLE * n {
+                return Ok(None);
+            }
+            for y in from[1]..=to[1] {
+                starts[y * columns + from[0]..=y * columns + to[0]].iter_mut().for_each(|s| *s += 1);
+            }
+        }
+        let mut sum = 0;
+        for s in &mut starts {
+            sum += *s;
+            *s = sum;
+        }
+        let mut items = try_filled(total, 0u32, CHARTS)?;
+        for (i, [from, to]) in ranges.iter().enumerate() {
+            if i % ITEMS_PER_CHECK == 0 {
+                stage.check()?;
+            }
+            for y in from[1]..=to[1] {
+                for s in &mut starts[y * columns + from[0]..=y * columns + to[0]] {
+                    *s -= 1;
+                    items[*s as usize] = i as u32;
+                }
+            }
+        }
+        Ok(Some(Cells { starts, items }))
+    }
 }
 
 /// Whether two counter-clockwise triangles overlap by more than `touch`: no edge of either separates them.
