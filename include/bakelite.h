@@ -286,7 +286,8 @@ BK_API void bk_device_desc_init(bk_device_desc *desc);
 /// @param desc  parameters; NULL for the defaults
 /// @param out  receives the device, which the caller releases with bk_device_release; NULL on
 ///   failure
-/// @retval BK_ERROR_UNSUPPORTED  the machine lacks the requested instruction set
+/// @retval BK_ERROR_UNSUPPORTED  the machine lacks the requested instruction set, or BAKELITE_ISA
+///   forbids it (a word that names none forbids all)
 /// @retval BK_ERROR_OUT_OF_MEMORY  the threads cannot be started
 BK_API bk_result bk_device_create(const bk_device_desc *desc, bk_device **out);
 

@@ -155,7 +155,8 @@ pub unsafe extern "C" fn bk_device_desc_init(desc: *mut bk_device_desc) {
 /// @param desc  parameters; NULL for the defaults
 /// @param out  receives the device, which the caller releases with bk_device_release; NULL on
 ///   failure
-/// @retval BK_ERROR_UNSUPPORTED  the machine lacks the requested instruction set
+/// @retval BK_ERROR_UNSUPPORTED  the machine lacks the requested instruction set, or BAKELITE_ISA
+///   forbids it (a word that names none forbids all)
 /// @retval BK_ERROR_OUT_OF_MEMORY  the threads cannot be started
 #[unsafe(no_mangle)]
 pub unsafe extern "C" fn bk_device_create(desc: *const bk_device_desc, out: *mut *mut bk_device) -> bk_result {
