@@ -16,7 +16,7 @@ use super::plan::{Plan, left_out};
 use super::saved::checkpoint::Checkpoint;
 use super::seams::Stitch;
 use super::texel_light::{Averaged, TexelLight, TilePoints, Variation};
-use super::tiles::{TILE, in_order};
+use super::tiles::{TILE, in_order, texels_per_tile};
 use super::{BakeParams, BakeStats, CheckpointParams, Light, Lightmap, Origin, StageStats, TexelState};
 use crate::base::error::{Error, Result, invalid_argument};
 use crate::base::memory::{try_filled, try_vec, try_with_capacity};
@@ -537,7 +537,7 @@ impl Bake<'_, '_> {
                 let (mut traced, first) = (0, range.start + block * BLOCK);
                 let mut tile = TilePoints::new(TILE)?;
                 let mut of_tile = try_with_capacity(TILE, "the texels of a tile")?;
-                for samples in in_order(&l.map, first..first + direct.len())?.chunks(TILE) {
+                for samples in in_order(&l.map, first..first + direct.len())?.chunks(texels_per_tile(texels.samples)) {
                     self.progress.check()?;
                     of_tile.clear();
                     of_tile.extend(samples.iter().map(|&s| s as usize).map(|sample| Averaged {

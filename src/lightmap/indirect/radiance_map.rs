@@ -22,7 +22,7 @@ use crate::lightmap::atlas::chart_map::ChartMap;
 use crate::lightmap::atlas::charts::Charts;
 use crate::lightmap::atlas::texels::TexelSample;
 use crate::lightmap::texel_light::{Look, TexelAreas, TexelLight, TilePoints};
-use crate::lightmap::tiles::{TILE, in_order};
+use crate::lightmap::tiles::{TILE, in_order, texels_per_tile};
 use crate::photon::PhotonMap;
 use crate::photon::coverage::Discs;
 use crate::scene::NONE;
@@ -101,11 +101,12 @@ pub(crate) fn bake(device: &Device, input: &RadianceInput, values: &mut [Vec3], 
     let mut looks: Vec<Look> = try_vec(values.len(), "direct light of the radiance map")?;
     let _memory = device.memory().reserve(size_of_val(&looks[..]), "direct light of the radiance map")?;
     let map = input.light.areas.map;
+    let per_tile = texels_per_tile(input.light.samples);
     device.install(|| {
         looks.par_chunks_mut(BLOCK).enumerate().try_for_each(|(block, out)| {
             let (mut traced, first) = (0, block * BLOCK);
             let mut tile = TilePoints::new(TILE)?;
-            for samples in in_order(map, first..first + out.len())?.chunks(TILE) {
+            for samples in in_order(map, first..first + out.len())?.chunks(per_tile) {
                 stage.check()?;
                 let place = |i: usize| samples[i] as usize - first;
                 input.light.first_look(samples, &mut tile, &mut traced, |i, look| out[place(i)] = look);
@@ -116,7 +117,7 @@ pub(crate) fn bake(device: &Device, input: &RadianceInput, values: &mut [Vec3], 
         values.par_chunks_mut(BLOCK).enumerate().try_for_each(|(block, out)| {
             let (mut traced, first) = (0, block * BLOCK);
             let mut room = RadianceTile { points: TilePoints::new(TILE)?, discs: Discs::new(TILE)? };
-            for samples in in_order(map, first..first + out.len())?.chunks(TILE) {
+            for samples in in_order(map, first..first + out.len())?.chunks(per_tile) {
                 stage.check()?;
                 let place = |i: usize| samples[i] as usize - first;
                 room.radiance(input, &looks, samples, &mut traced, |i, value| out[place(i)] = value);
