@@ -9,3 +9,4 @@ pub mod geometry;
 pub mod memory;
 pub mod progress;
 pub mod sampling;
+pub(crate) mod scratch;

@@ -22,6 +22,7 @@ use crate::base::error::{Error, Result, invalid_argument};
 use crate::base::memory::{try_filled, try_vec, try_with_capacity};
 use crate::base::progress::{Progress, Stage};
 use crate::base::sampling::{combine, purpose_seed};
+use crate::base::scratch::Scratch;
 use crate::direct::DirectLight;
 use crate::photon::{PhotonMap, PhotonParams};
 use crate::scene::Scene;
@@ -334,6 +335,7 @@ impl Bake<'_, '_> {
         let mut variances: Vec<f32> = try_vec(n, "the gather map's variance")?;
         let mut valid: Vec<bool> = try_vec(n, "the gather map's validity")?;
         let rays = AtomicU64::new(upsampling.rays + own_rays);
+        let tiles = Scratch::new();
         device.install(|| {
             let values = irradiance[needed.clone()].par_chunks_mut(BLOCK);
             let normals = normals[needed.clone()].par_chunks_mut(BLOCK);
@@ -347,7 +349,7 @@ impl Bake<'_, '_> {
                     }
                     return stage.advance(values.len() as u64);
                 }
-                let (mut traced, mut tile) = (0, Tile::new()?);
+                let (mut traced, mut tile) = (0, tiles.take(Tile::new)?);
                 let first = needed.start + block * BLOCK;
                 for samples_of_tile in in_order(&l.gather, first..first + values.len())?.chunks(TILE) {
                     let texel = |&s: &u32| TileTexel {
@@ -439,6 +441,7 @@ impl Bake<'_, '_> {
         let texels = self.texel_light();
         // Blocks whose light is in the checkpoint.
         let mut known = try_filled(range.len().div_ceil(BLOCK), false, "blocks of texels")?;
+        let tiles = Scratch::new();
         scene.device().install(|| {
             let direct = light.direct[range.clone()].par_chunks_mut(BLOCK).zip(&mut known);
             let indirect_out = light.indirect[range.clone()].par_chunks_mut(BLOCK);
@@ -462,7 +465,7 @@ impl Bake<'_, '_> {
                     };
                 }
                 if self.plan.runs(left_out::DIRECT) && self.direct.has_sharp() {
-                    let mut tile = TilePoints::new(TILE)?;
+                    let mut tile = tiles.take(|| TilePoints::new(TILE))?;
                     for samples in in_order(&l.map, first..first + direct.len())?.chunks(4 * TILE) {
                         self.progress.check()?;
                         let receivers = samples.iter().map(|&s| l.receiver(&l.map, backs, s as usize));
@@ -513,6 +516,7 @@ impl Bake<'_, '_> {
         let (l, range) = (self.atlas, self.range.clone());
         let rays = AtomicU64::new(0);
         let mut variations: Vec<Variation> = try_vec(range.len(), "where direct light varies")?;
+        let tiles = Scratch::new();
         l.scene.device().install(|| {
             let sharp = &direct[..];
             variations.par_chunks_mut(BLOCK).enumerate().for_each(|(block, out)| {
@@ -535,7 +539,7 @@ impl Bake<'_, '_> {
                     return stage.advance(direct.len() as u64);
                 }
                 let (mut traced, first) = (0, range.start + block * BLOCK);
-                let mut tile = TilePoints::new(TILE)?;
+                let mut tile = tiles.take(|| TilePoints::new(TILE))?;
                 let mut of_tile = try_with_capacity(TILE, "the texels of a tile")?;
                 for samples in in_order(&l.map, first..first + direct.len())?.chunks(texels_per_tile(texels.samples)) {
                     self.progress.check()?;

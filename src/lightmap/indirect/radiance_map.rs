@@ -17,6 +17,7 @@ use crate::base::error::Result;
 use crate::base::memory::try_vec;
 use crate::base::progress::Stage;
 use crate::base::sampling::{combine, sobol_2d};
+use crate::base::scratch::Scratch;
 use crate::device::Device;
 use crate::lightmap::atlas::chart_map::ChartMap;
 use crate::lightmap::atlas::charts::Charts;
@@ -102,10 +103,11 @@ pub(crate) fn bake(device: &Device, input: &RadianceInput, values: &mut [Vec3], 
     let _memory = device.memory().reserve(size_of_val(&looks[..]), "direct light of the radiance map")?;
     let map = input.light.areas.map;
     let per_tile = texels_per_tile(input.light.samples);
+    let (tiles, rooms) = (Scratch::new(), Scratch::new());
     device.install(|| {
         looks.par_chunks_mut(BLOCK).enumerate().try_for_each(|(block, out)| {
             let (mut traced, first) = (0, block * BLOCK);
-            let mut tile = TilePoints::new(TILE)?;
+            let mut tile = tiles.take(|| TilePoints::new(TILE))?;
             for samples in in_order(map, first..first + out.len())?.chunks(per_tile) {
                 stage.check()?;
                 let place = |i: usize| samples[i] as usize - first;
@@ -116,7 +118,8 @@ pub(crate) fn bake(device: &Device, input: &RadianceInput, values: &mut [Vec3], 
         })?;
         values.par_chunks_mut(BLOCK).enumerate().try_for_each(|(block, out)| {
             let (mut traced, first) = (0, block * BLOCK);
-            let mut room = RadianceTile { points: TilePoints::new(TILE)?, discs: Discs::new(TILE)? };
+            let make = || Ok(RadianceTile { points: TilePoints::new(TILE)?, discs: Discs::new(TILE)? });
+            let mut room = rooms.take(make)?;
             for samples in in_order(map, first..first + out.len())?.chunks(per_tile) {
                 stage.check()?;
                 let place = |i: usize| samples[i] as usize - first;

@@ -21,6 +21,7 @@ use crate::base::memory::{
 };
 use crate::base::progress::Stage;
 use crate::base::sampling::combine;
+use crate::base::scratch::Scratch;
 use crate::lightmap::atlas::Atlas;
 use crate::lightmap::atlas::chart_map::ChartMap;
 use crate::lightmap::tiles::TILE;
@@ -120,9 +121,11 @@ impl Upsampling {
         let nothing = Own { irradiance: None, normal: Vec3::ZERO };
         let mut own = try_filled(self.alone.len(), nothing, "texels on their own")?;
         let mut light: OwnLight = try_filled(self.alone.len(), None, "texels on their own")?;
+        let tiles = Scratch::new();
         atlas.scene.device().install(|| {
             own.par_chunks_mut(BLOCK).zip(self.alone.par_chunks(BLOCK)).try_for_each(|(own, texels)| {
-                traced.fetch_add(gather_for(atlas, backs, rays, texels, own, stage)?, Relaxed);
+                let mut tile = tiles.take(Tile::new)?;
+                traced.fetch_add(gather_for(atlas, backs, rays, texels, own, &mut tile, stage)?, Relaxed);
                 stage.advance(texels.len() as u64)
             })?;
             light.par_chunks_mut(BLOCK).enumerate().try_for_each(|(block, light)| {
@@ -237,6 +240,7 @@ fn gather_for(
     own: &OwnRays,
     texels: &[u32],
     out: &mut [Own],
+    tile: &mut Tile,
     stage: &Stage,
 ) -> Result<u64> {
     let texel = |&sample: &u32| TileTexel {
@@ -245,7 +249,6 @@ fn gather_for(
         gathered: Gathered::default(),
     };
     let mut rays = 0;
-    let mut tile = Tile::new()?;
     for (texels, out) in texels.chunks(TILE).zip(out.chunks_mut(TILE)) {
         stage.check()?;
         let mut texels: Vec<_> = texels.iter().map(texel).collect();
