@@ -64,7 +64,7 @@ fn plans(binary: &BinaryBvh, progress: &Progress) -> Result<(Vec<Plan>, Vec<u32>
     plans.push(idle);
     let mut order = try_with_capacity(n / 6 + 1, PLANS)?;
     let mut slot = 0;
-    let mut work = vec![(0usize, Subtree::new(binary, 0, binary.nodes.len() as u32))];
+    let mut work = vec![(0usize, Subtree::new(binary, 0, 0, n as u32))];
     while let Some((target, source)) = work.pop() {
         let (subtrees, count) = open(binary, source);
         let children = subtrees.map(|s| s.node);
@@ -176,20 +176,21 @@ fn node(binary: &BinaryBvh, plan: &Plan) -> Node {
 #[derive(Clone, Copy)]
 struct Subtree {
     node: u32,
-    /// Index behind its nodes and unused slots: these are about twice as many as triangles.
+    /// Range of its triangles, which follow one another as its leaves do.
+    first: u32,
     end: u32,
     /// Half its surface area.
     area: f64,
 }
 
 impl Subtree {
-    fn new(binary: &BinaryBvh, node: u32, end: u32) -> Subtree {
-        Subtree { node, end, area: binary.half_area(node) }
+    fn new(binary: &BinaryBvh, node: u32, first: u32, end: u32) -> Subtree {
+        Subtree { node, first, end, area: binary.half_area(node) }
     }
 
     /// Probability of a hit for the cost of finding it.
     fn worth(&self) -> f64 {
-        self.area / f64::from(self.end - self.node)
+        self.area / f64::from(self.end - self.first)
     }
 }
 
@@ -203,10 +204,13 @@ fn open(binary: &BinaryBvh, source: Subtree) -> ([Subtree; WIDTH], usize) {
         let is_inner = |&i: &usize| binary.nodes[children[i].node as usize].count == 0;
         let by_area = |&a: &usize, &b: &usize| children[a].area.total_cmp(&children[b].area);
         let Some(largest) = (0..count).rev().filter(is_inner).max_by(by_area) else { break };
-        let Subtree { node, end, .. } = children[largest];
+        let Subtree { node, first, end, .. } = children[largest];
         let right = binary.nodes[node as usize].index;
-        children[largest] = Subtree::new(binary, node + 1, right);
-        children[count] = Subtree::new(binary, right, end);
+        // The first leaf below the right child.
+        let leaf = binary.nodes[right as usize..].iter().find(|b| b.count > 0);
+        let middle = leaf.map_or(end, |b| b.index);
+        children[largest] = Subtree::new(binary, node + 1, first, middle);
+        children[count] = Subtree::new(binary, right, middle, end);
         count += 1;
     }
     children[..count].sort_by(|a, b| a.worth().total_cmp(&b.worth()));
