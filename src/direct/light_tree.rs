@@ -33,8 +33,19 @@ pub(crate) struct LightTree {
 #[derive(Clone, Copy)]
 struct Part {
     node: u32,
+    /// The node's right child, or what a leaf has in its place.
+    right: u32,
     from: f64,
     to: f64,
+    /// Number of samples below `from`, and below `to`. (Kept, with `right`, and not found again at each look, gathering in
+    /// Sponza with bright patches takes 0.93 of the time.)
+    below: [f64; 2],
+}
+
+impl Part {
+    fn is_leaf(&self) -> bool {
+        self.right > i32::MAX as u32
+    }
 }
 
 impl LightTree {
@@ -88,48 +99,56 @@ impl LightTree {
         if self.nodes.is_empty() {
             return;
         }
-        let samples = |from: f64, to: f64| ceil(to - offset as f64) - ceil(from - offset as f64);
+        let below = |x: f64| ceil(x - offset as f64);
+        let right_of = |node: u32| self.nodes[node as usize].right;
         // The parts of a level in order; each but the root's has a sample. (Eight at a time, level by level, a round of
         // gather rays with 45,000 bright patches takes 0.43 of the time of descents one after the other.)
         let most = n as usize + 1;
         let (mut level, mut next) = (Vec::with_capacity(most), Vec::with_capacity(most));
         let (mut children, mut importances) = (Vec::with_capacity(2 * most), Vec::with_capacity(2 * most));
-        level.push(Part { node: 0, from: 0.0, to: n as f64 });
-        let right_of = |part: &Part| self.nodes[part.node as usize].right;
-        let is_leaf = |part: &Part| right_of(part) > i32::MAX as u32;
+        let (from, to) = (0.0, n as f64);
+        level.push(Part { node: 0, right: right_of(0), from, to, below: [below(from), below(to)] });
         loop {
             children.clear();
-            children.extend(level.iter().filter(|&p| !is_leaf(p)).flat_map(|p| [p.node + 1, right_of(p)]));
+            children.extend(level.iter().filter(|p| !p.is_leaf()).flat_map(|p| [p.node + 1, p.right]));
             if children.is_empty() {
                 break;
             }
             importances.resize(children.len(), 0.0);
             (self.importances)(&self.nodes, &children, [position, normal], &mut importances);
-            let mut of_children = importances.chunks_exact(2).zip(children.chunks_exact(2));
+            let mut weights = importances.chunks_exact(2);
             next.clear();
             for part in &level {
-                if is_leaf(part) {
+                if part.is_leaf() {
                     next.push(*part);
                     continue;
                 }
-                let Some((weights, nodes)) = of_children.next() else { break };
+                let Some(weights) = weights.next() else { break };
                 let (l, r) = (weights[0] as f64, weights[1] as f64);
                 if !(l + r > 0.0) {
                     continue;
                 }
-                let (from, to) = (part.from, part.to);
+                let Part { node, right, from, to, below: [first, end] } = *part;
                 let middle = if r == 0.0 { to } else { from + (to - from) * (l / (l + r)) };
-                if samples(from, middle) > 0.0 {
-                    next.push(Part { node: nodes[0], from, to: middle });
+                let half = below(middle);
+                if half > first {
+                    next.push(Part {
+                        node: node + 1,
+                        right: right_of(node + 1),
+                        from,
+                        to: middle,
+                        below: [first, half],
+                    });
                 }
-                if samples(middle, to) > 0.0 {
-                    next.push(Part { node: nodes[1], from: middle, to });
+                if end > half {
+                    next.push(Part { node: right, right: right_of(right), from: middle, to, below: [half, end] });
                 }
             }
             std::mem::swap(&mut level, &mut next);
         }
         for part in &level {
-            visit(!right_of(part) as usize, (part.to - part.from) as f32, samples(part.from, part.to) as u32);
+            let [first, end] = part.below;
+            visit(!part.right as usize, (part.to - part.from) as f32, (end - first) as u32);
         }
     }
 }
