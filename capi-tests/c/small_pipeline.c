@@ -9,8 +9,9 @@ static int32_t progress(void *user, float fraction, const char *stage) {
     return fraction <= 1.0f;
 }
 
+/* Several calls come at a time. */
 static int32_t memory(void *user, int64_t bytes) {
-    *(int64_t *)user += bytes;
+    __atomic_fetch_add((int64_t *)user, bytes, __ATOMIC_SEQ_CST);
     return 1;
 }
 
