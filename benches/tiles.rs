@@ -8,11 +8,13 @@
 //!
 //! Alternating pairs in one process, one thread; medians, and a count of hits whose bits differ.
 
+mod common;
+
 use bakelite::bvh::BuildOptions;
 use bakelite::io::load;
-use bakelite::sampling::{concentric_disc, orthonormal_basis, uniform};
 use bakelite::trace::{PACKET_SIZE, Packet, RawHit, Ray};
 use bakelite::{Device, DeviceOptions, Isa, Progress, Scene, SceneData};
+use common::{areas, median, tile};
 use glam::Vec3;
 use std::path::Path;
 use std::time::Instant;
@@ -25,50 +27,6 @@ const LAMP: &str = "lamp";
 
 fn name_of((side, rays): (u32, u32)) -> String {
     format!("{side}x{side}x{rays}")
-}
-
-fn median(mut v: Vec<f64>) -> f64 {
-    v.sort_by(f64::total_cmp);
-    v[v.len() / 2]
-}
-
-/// Sums of the areas of the triangles up to each.
-fn areas(scene: &Scene) -> Vec<f32> {
-    let area = |t: u32| {
-        let [a, b, c] = scene.corners(t).map(|v| v.as_dvec3());
-        0.5 * (b - a).cross(c - a).length()
-    };
-    let sums = (0..scene.triangle_count()).scan(0.0, |sum, t| {
-        *sum += area(t);
-        Some(*sum as f32)
-    });
-    sums.collect()
-}
-
-/// Rays of a tile of `side`² texels, `rays` each, at a place that is uniform over the surface.
-fn tile(scene: &Scene, areas: &[f32], number: u32, side: u32, rays: u32, spacing: f32) -> Vec<Ray> {
-    let at = uniform(number, 0, 7) * areas[areas.len() - 1];
-    let t = areas.partition_point(|&sum| sum <= at).min(areas.len() - 1);
-    let [a, b, c] = scene.corners(t as u32);
-    let normal = (b - a).cross(c - a).normalize();
-    let normal = if uniform(number, 3, 7) < 0.5 { normal } else { -normal };
-    let (u, v) = (uniform(number, 1, 7), uniform(number, 2, 7));
-    let (u, v) = if u + v > 1.0 { (1.0 - u, 1.0 - v) } else { (u, v) };
-    let centre = a + u * (b - a) + v * (c - a) + 1e-3 * normal;
-    let (tangent, bitangent) = orthonormal_basis(normal);
-    let mut out = Vec::new();
-    for y in 0..side {
-        for x in 0..side {
-            let origin = centre + spacing * (x as f32 * tangent + y as f32 * bitangent);
-            for i in 0..rays {
-                let seed = number * 1000 + y * side + x;
-                let [p, q] = concentric_disc([uniform(i, 4, seed), uniform(i, 5, seed)]);
-                let z = (1.0 - p * p - q * q).max(0.0).sqrt();
-                out.push(Ray::new(origin, p * tangent + q * bitangent + z * normal));
-            }
-        }
-    }
-    out
 }
 
 /// Traces the rays of each origin in packets, one by one.

@@ -1,4 +1,4 @@
-//! Collapse of the binary tree to eight-wide nodes (Dammertz, Hanika and Keller, *Shallow Bounding
+//! Collapse of the binary tree to wide nodes (Dammertz, Hanika and Keller, *Shallow Bounding
 //! Volume Hierarchies for Fast SIMD Ray Tracing of Incoherent Rays*, 2008): the child of largest
 //! area is opened first. (The best choice, by dynamic programming as in Ylitie, Karras and Laine 2017, makes
 //! rays visit 1 to 3 % fewer nodes and takes a sixth of the whole build's time.)
@@ -27,7 +27,7 @@ pub(crate) fn outwards(lower: Vec3, upper: Vec3) -> (Vec3, Vec3) {
 }
 
 /// Sets the box of child `i`, moved outwards; an empty one is hit by no ray.
-pub(super) fn set_box(node: &mut Node, i: usize, b: &Box4) {
+pub(super) fn set_box<const W: usize>(node: &mut Node<W>, i: usize, b: &Box4) {
     // Infinities would give NaN.
     if b.is_empty() {
         for axis in 0..3 {
@@ -42,10 +42,10 @@ pub(super) fn set_box(node: &mut Node, i: usize, b: &Box4) {
     }
 }
 
-/// The binary nodes that become the children of an 8-wide node.
+/// The binary nodes that become the children of a wide node.
 #[derive(Clone, Copy)]
-struct Plan {
-    children: [u32; WIDTH],
+struct Plan<const W: usize> {
+    children: [u32; W],
     count: u32,
     /// Index of the node of the first inner child, and slot of the first triangle of the first leaf; those of the
     /// others follow.
@@ -53,20 +53,20 @@ struct Plan {
     first_slot: u32,
 }
 
-/// Computes the plans of all 8-wide nodes, and the indices of these plans in the order of their leaves.
+/// Computes the plans of all nodes, and the indices of these plans in the order of their leaves.
 ///
 /// Nodes are in depth-first order: the inner children of a node follow each other, then come the nodes below the first
 /// of them, those below the second, and so on; leaves likewise (`refit` relies on it).
-fn plans(binary: &BinaryBvh, progress: &Progress) -> Result<(Vec<Plan>, Vec<u32>)> {
+fn plans<const W: usize>(binary: &BinaryBvh, progress: &Progress) -> Result<(Vec<Plan<W>>, Vec<u32>)> {
     let n = binary.triangles.len();
-    let idle = Plan { children: [0; WIDTH], count: 0, first_node: 0, first_slot: 0 };
+    let idle = Plan { children: [0; W], count: 0, first_node: 0, first_slot: 0 };
     let mut plans = try_with_capacity(n / 6 + 1, PLANS)?;
     plans.push(idle);
     let mut order = try_with_capacity(n / 6 + 1, PLANS)?;
     let mut slot = 0;
     let mut work = vec![(0usize, Subtree::new(binary, 0, 0, n as u32))];
     while let Some((target, source)) = work.pop() {
-        let (subtrees, count) = open(binary, source);
+        let (subtrees, count) = open::<W>(binary, source);
         let children = subtrees.map(|s| s.node);
         let first = plans.len();
         plans[target] = Plan { children, count: count as u32, first_node: first as u32, first_slot: slot };
@@ -95,8 +95,8 @@ const PLANS: &str = "the plan of the tree";
 /// Collapses a binary tree to one of compact nodes and leaves; `meshes` as in [`Compact::new`].
 pub(super) fn collapse_compact(binary: &BinaryBvh, meshes: &[u32], progress: &Progress) -> Result<Compact> {
     let root = &binary.nodes[0];
-    let (plans, order) = plans(binary, progress)?;
-    let compact = |plan: &Plan| CompactNode::new(&node(binary, plan), plan.first_node, plan.first_slot);
+    let (plans, order) = plans::<WIDTH>(binary, progress)?;
+    let compact = |plan: &Plan<WIDTH>| CompactNode::new(&node(binary, plan), plan.first_node, plan.first_slot);
     let nodes = try_par_collect(plans.par_iter().with_min_len(1024).map(compact), "the tree")?;
     let mut triangles = try_with_capacity(binary.triangles.len() + compact::PAD, "the tree")?;
     for &i in &order {
@@ -109,12 +109,12 @@ pub(super) fn collapse_compact(binary: &BinaryBvh, meshes: &[u32], progress: &Pr
     Compact::new(nodes, triangles, (root.lower, root.upper), meshes)
 }
 
-/// Collapses a binary tree to an 8-wide one.
-pub(super) fn collapse(
+/// Collapses a binary tree to one of `W` children per node.
+pub(super) fn collapse<const W: usize>(
     binary: &BinaryBvh,
     corners: &(impl Fn(u32) -> [Vec3; 3] + Sync),
     progress: &Progress,
-) -> Result<Mbvh> {
+) -> Result<Mbvh<W>> {
     let n = binary.triangles.len();
     let root = &binary.nodes[0];
     // Choosing the binary nodes that become children is quick; filling in nodes and leaves takes the time.
@@ -148,13 +148,13 @@ pub(super) fn collapse(
 /// Number of nodes whose leaves a thread fills at a time.
 const NODES_PER_JOB: usize = 1024;
 
-impl Plan {
+impl<const W: usize> Plan<W> {
     fn leaves<'a>(&'a self, binary: &'a BinaryBvh) -> impl Iterator<Item = &'a BinaryNode> {
         self.children[..self.count as usize].iter().map(|&c| &binary.nodes[c as usize]).filter(|b| b.count > 0)
     }
 }
 
-fn node(binary: &BinaryBvh, plan: &Plan) -> Node {
+fn node<const W: usize>(binary: &BinaryBvh, plan: &Plan<W>) -> Node<W> {
     let mut node = Node::EMPTY;
     let (mut next_node, mut next_slot) = (plan.first_node as usize, plan.first_slot as usize);
     for (i, &child) in plan.children[..plan.count as usize].iter().enumerate() {
@@ -194,12 +194,12 @@ impl Subtree {
     }
 }
 
-/// Finds up to eight descendants of `source` that cover it; returns them, in the order of a node's children, and their
+/// Finds up to `W` descendants of `source` that cover it; returns them, in the order of a node's children, and their
 /// number.
-fn open(binary: &BinaryBvh, source: Subtree) -> ([Subtree; WIDTH], usize) {
-    let mut children = [source; WIDTH];
+fn open<const W: usize>(binary: &BinaryBvh, source: Subtree) -> ([Subtree; W], usize) {
+    let mut children = [source; W];
     let mut count = 1;
-    while count < WIDTH {
+    while count < W {
         // A leaf is never opened.
         let is_inner = |&i: &usize| binary.nodes[children[i].node as usize].count == 0;
         let by_area = |&a: &usize, &b: &usize| children[a].area.total_cmp(&children[b].area);
@@ -249,7 +249,7 @@ mod tests {
                 BinaryBvh::build(&of, &ids, &options, &Progress::none()).unwrap(),
                 BinaryBvh::build_spatial(&of, &ids, &options, &Progress::none()).unwrap(),
             ] {
-                let tree = collapse(&binary, &of, &Progress::none()).unwrap();
+                let tree: Mbvh = collapse(&binary, &of, &Progress::none()).unwrap();
                 let mut seen = vec![0; n];
                 for node in &tree.nodes {
                     for (i, child) in node.children.iter().enumerate() {

@@ -1,4 +1,4 @@
-//! Memory layout of the 8-wide tree.
+//! Memory layout of the 8-wide tree, and of trees of other widths.
 
 use crate::base::error::Result;
 use crate::base::geometry::half_area;
@@ -18,7 +18,7 @@ pub(crate) const MAX_DEPTH: usize = SAH_DEPTH + 28;
 /// Number of levels on which the builder may follow the SAH freely.
 pub(crate) const SAH_DEPTH: usize = 48;
 
-/// Number of children of a node.
+/// Greatest number of children of a node, and that of the tree that scenes have.
 pub(crate) const WIDTH: usize = 8;
 
 /// Number of entries that a traversal stack can need: each level of the 8-wide tree leaves at most seven siblings
@@ -84,7 +84,7 @@ impl ChildRef {
     }
 }
 
-/// An 8-wide node, 256 bytes, four cache lines.
+/// An 8-wide node, 256 bytes, four cache lines. (A 4-wide one has four values wherever this has eight, and 128 bytes.)
 ///
 /// ```text
 /// byte   0  minima of x (eight f32), of y, of z
@@ -95,25 +95,25 @@ impl ChildRef {
 /// ```
 ///
 /// Missing children have minima +inf, maxima −inf: no ray hits them.
-#[derive(Clone, Copy, Debug, Pod, Zeroable)]
+#[derive(Clone, Copy, Debug)]
 #[repr(C, align(64))]
-pub struct Node {
+pub struct Node<const W: usize = WIDTH> {
     /// Minima of the children's boxes, by axis.
-    pub lower: [[f32; WIDTH]; 3],
+    pub lower: [[f32; W]; 3],
     /// Maxima of the children's boxes, by axis.
-    pub upper: [[f32; WIDTH]; 3],
+    pub upper: [[f32; W]; 3],
     /// The children.
-    pub children: [ChildRef; WIDTH],
+    pub children: [ChildRef; W],
     /// Order of the children by octant, three bits each, as drawn above.
-    pub order: [u32; WIDTH],
+    pub order: [u32; W],
 }
 
-impl Node {
-    pub(crate) const EMPTY: Node = Node {
-        lower: [[f32::INFINITY; WIDTH]; 3],
-        upper: [[f32::NEG_INFINITY; WIDTH]; 3],
-        children: [ChildRef::EMPTY; WIDTH],
-        order: [0; WIDTH],
+impl<const W: usize> Node<W> {
+    pub(crate) const EMPTY: Self = Node {
+        lower: [[f32::INFINITY; W]; 3],
+        upper: [[f32::NEG_INFINITY; W]; 3],
+        children: [ChildRef::EMPTY; W],
+        order: [0; W],
     };
 
     /// Sum of the children's contributions to the tree's cost, times half the area of its bounds.
@@ -127,24 +127,24 @@ impl Node {
             let [lower, upper] = [&self.lower, &self.upper].map(|b| Vec3::new(b[0][i], b[1][i], b[2][i]));
             half_area(lower, upper) * if c.is_leaf() { c.leaf_count() as f64 } else { 1.0 }
         };
-        (0..WIDTH).map(child).sum()
+        (0..W).map(child).sum()
     }
 
     /// Fills in `order` from the boxes, by their centres along the octant's diagonal. (Ordering by where boxes begin
     /// costs random rays 3 % more instructions.)
     pub(crate) fn sort_children(&mut self) {
-        self.order = [0; WIDTH];
-        let centre: [[f32; WIDTH]; 3] =
+        self.order = [0; W];
+        let centre: [[f32; W]; 3] =
             std::array::from_fn(|a| std::array::from_fn(|i| self.lower[a][i] + self.upper[a][i]));
         for octant in 0..4u32 {
             let sign = |a: u32| if octant >> a & 1 == 1 { -1.0 } else { 1.0 };
-            let key: [f32; WIDTH] = std::array::from_fn(|i| {
+            let key: [f32; W] = std::array::from_fn(|i| {
                 let along = sign(0) * centre[0][i] + sign(1) * centre[1][i] + centre[2][i];
                 // The position of a missing child, or of one that no ray hits, is never used.
                 if along.is_nan() { f32::INFINITY } else { along }
             });
             // The number of children that come before each: those farther away, and of equal ones the first.
-            let mut place = [0u32; WIDTH];
+            let mut place = [0u32; W];
             for (j, &other) in key.iter().enumerate() {
                 for (i, place) in place.iter_mut().enumerate() {
                     *place += u32::from(if j < i { other >= key[i] } else { other > key[i] });
@@ -153,7 +153,7 @@ impl Node {
             for (child, place) in place.into_iter().enumerate() {
                 self.order[place as usize] |= (child as u32) << (3 * octant);
                 // The opposite octant.
-                self.order[WIDTH - 1 - place as usize] |= (child as u32) << (3 * (7 - octant));
+                self.order[W - 1 - place as usize] |= (child as u32) << (3 * (7 - octant));
             }
         }
     }
@@ -165,7 +165,7 @@ pub(crate) const LEAF_PAD: usize = 16;
 /// Number of floats per triangle in a leaf: nine coordinates and the number.
 pub(crate) const LEAF_STRIDE: usize = 10;
 
-/// The 8-wide tree that the kernels traverse. Node 0 is the root.
+/// The tree that the kernels traverse; that of a scene is 8-wide. Node 0 is the root.
 ///
 /// Triangles lie leaf by leaf. A leaf of c triangles that starts at slot s occupies floats 10·s to
 /// 10·(s + c): ten rows of c values each:
@@ -178,15 +178,15 @@ pub(crate) const LEAF_STRIDE: usize = 10;
 /// Rows are loaded four at a time whatever c is; lanes beyond c hold the next row's values and are
 /// masked. That keeps leaves at 40 bytes per triangle with no transposition (padding every leaf to
 /// four triangles would take about twice that).
-pub struct Mbvh {
-    pub(crate) nodes: Vec<Node>,
+pub struct Mbvh<const W: usize = WIDTH> {
+    pub(crate) nodes: Vec<Node<W>>,
     pub(crate) leaves: Vec<f32>,
     pub(crate) bounds: (Vec3, Vec3),
 }
 
-impl Mbvh {
+impl<const W: usize> Mbvh<W> {
     /// Copies the tree; fails if there is not enough memory.
-    pub(super) fn try_clone(&self) -> Result<Mbvh> {
+    pub(super) fn try_clone(&self) -> Result<Self> {
         let what = "a copy of the tree";
         Ok(Mbvh { nodes: try_to_vec(&self.nodes, what)?, leaves: try_to_vec(&self.leaves, what)?, bounds: self.bounds })
     }
@@ -196,14 +196,14 @@ impl Mbvh {
         self.bounds
     }
 
-    /// Number of 8-wide nodes.
+    /// Number of nodes.
     pub fn node_count(&self) -> usize {
         self.nodes.len()
     }
 
     /// Size in bytes of nodes and leaves.
     pub fn bytes(&self) -> usize {
-        self.nodes.len() * size_of::<Node>() + self.leaves.len() * size_of::<f32>()
+        self.nodes.len() * size_of::<Node<W>>() + self.leaves.len() * size_of::<f32>()
     }
 
     /// Surface area heuristic cost: expected number of nodes plus triangles that a ray through the bounds is tested
@@ -212,7 +212,7 @@ impl Mbvh {
         let root_area = half_area(self.bounds.0, self.bounds.1);
         // Sums are taken by chunks, so that they do not depend on the number of threads.
         let chunks: Vec<f64> =
-            self.nodes.par_chunks(1 << 10).map(|nodes| nodes.iter().map(Node::sah_cost).sum()).collect();
+            self.nodes.par_chunks(1 << 10).map(|nodes| nodes.iter().map(Node::<W>::sah_cost).sum()).collect();
         (1.0 + chunks.iter().sum::<f64>() / root_area) as f32
     }
 
@@ -223,11 +223,11 @@ impl Mbvh {
         prefetch(self.address(child));
     }
 
-    /// Prefetches all of a child: four cache lines of a node, or those of a leaf.
+    /// Prefetches all of a child: the cache lines of a node, or those of a leaf.
     #[inline(always)]
     pub(crate) fn prefetch_whole(&self, child: ChildRef) {
         let p = self.address(child);
-        let bytes = if child.is_leaf() { 4 * LEAF_STRIDE * child.leaf_count() } else { size_of::<Node>() };
+        let bytes = if child.is_leaf() { 4 * LEAF_STRIDE * child.leaf_count() } else { size_of::<Node<W>>() };
         for line in (0..bytes).step_by(64) {
             prefetch(p.wrapping_add(line));
         }

@@ -197,6 +197,17 @@ pub(crate) fn build(
     Ok((tree, cost))
 }
 
+/// Builds the 4-wide tree over the triangles of at least one reference, as [`build`] does.
+#[cfg(any(test, feature = "reference"))]
+pub(crate) fn build_four_wide(
+    corners: &(impl Fn(u32) -> [Vec3; 3] + Sync),
+    references: References,
+    options: &BuildOptions,
+    progress: &Progress,
+) -> Result<Mbvh<4>> {
+    collapse::collapse(&build_binary(corners, references, options, progress)?, corners, progress)
+}
+
 fn build_binary(
     corners: &(impl Fn(u32) -> [Vec3; 3] + Sync),
     references: References,

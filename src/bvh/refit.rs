@@ -141,6 +141,7 @@ mod tests {
     use crate::simd::Isa;
 
     use crate::trace::{Kernels, RawHit, Ray};
+    use bytemuck::bytes_of;
     use glam::Quat;
     use proptest::prelude::*;
 
@@ -185,10 +186,12 @@ mod tests {
 
     /// All of a tree, bit by bit.
     fn bits(tree: &Mbvh) -> (Vec<u8>, Vec<u32>, [u32; 6]) {
+        let node =
+            |n: &Node| [bytes_of(&n.lower), bytes_of(&n.upper), bytes_of(&n.children), bytes_of(&n.order)].concat();
         let (l, u) = tree.bounds;
         let bounds = [l.x, l.y, l.z, u.x, u.y, u.z].map(f32::to_bits);
         (
-            bytemuck::cast_slice(&tree.nodes).to_vec(),
+            tree.nodes.iter().flat_map(node).collect(),
             tree.leaves[..tree.leaves.len() - LEAF_PAD].iter().map(|x| x.to_bits()).collect(),
             bounds,
         )

@@ -1,6 +1,6 @@
 //! Lanes over AVX2 and FMA: 128-bit vectors of four, 256-bit vectors of eight.
 
-use super::{Eight, Four, Lanes, Mask, Simd};
+use super::{Compress, Eight, Four, Lanes, Mask, Simd};
 use std::arch::x86_64::*;
 use std::ops::{Add, Mul, Sub};
 
@@ -242,6 +242,33 @@ impl Four for A4 {
     }
 }
 
+impl Compress for A4 {
+    #[inline(always)]
+    unsafe fn compress(
+        self,
+        names: *const u32,
+        order: *const u32,
+        shift: u32,
+        mask: A4,
+        values: *mut f32,
+        out_names: *mut u32,
+    ) -> u32 {
+        // SAFETY: the caller vouches for four values at each pointer. Permutations use the lowest
+        // two bits of each index alone.
+        unsafe {
+            let order = _mm_srl_epi32(_mm_loadu_si128(order.cast()), _mm_cvtsi32_si128(shift as i32));
+            let set = _mm_movemask_ps(_mm_permutevar_ps(mask.0, order)) as usize;
+            // A set of four lanes is one of eight without the others.
+            let kept = _mm_cvtepu8_epi32(_mm_loadu_si32(LANES_OF[set].as_ptr().cast()));
+            let from = _mm_castps_si128(_mm_permutevar_ps(_mm_castsi128_ps(order), kept));
+            _mm_storeu_ps(values, _mm_permutevar_ps(self.0, from));
+            let names = _mm_permutevar_ps(_mm_loadu_ps(names.cast()), from);
+            _mm_storeu_ps(out_names.cast(), names);
+            set as u32
+        }
+    }
+}
+
 impl Eight for A8 {
     #[inline(always)]
     unsafe fn pair(low: *const f32, high: *const f32) -> Self {
@@ -286,7 +313,9 @@ impl Eight for A8 {
         // SAFETY: the caller vouches for eight numbers.
         unsafe { _mm256_movemask_ps(_mm256_loadu_ps(p.cast())) as u32 }
     }
+}
 
+impl Compress for A8 {
     #[inline(always)]
     unsafe fn compress(
         self,

@@ -247,8 +247,8 @@ pub(crate) trait Lanes: Copy + Add<Output = Self> + Sub<Output = Self> + Mul<Out
     }
 }
 
-/// Four lanes, one per triangle of a leaf.
-pub(crate) trait Four: Lanes {
+/// Four lanes: one per triangle of a leaf, or per child of a 4-wide node.
+pub(crate) trait Four: Compress {
     /// Lane i from where `from[i]` points.
     ///
     /// # Safety
@@ -256,8 +256,8 @@ pub(crate) trait Four: Lanes {
     unsafe fn gather(from: [*const f32; 4]) -> Self;
 }
 
-/// Eight lanes: one per child of a node, or four triangles for each of two rays.
-pub(crate) trait Eight: Lanes {
+/// Eight lanes: one per child of an 8-wide node, or four triangles for each of two rays.
+pub(crate) trait Eight: Compress {
     /// Four floats from `low` in the lower half, four from `high` in the upper.
     ///
     /// # Safety
@@ -281,13 +281,16 @@ pub(crate) trait Eight: Lanes {
     /// # Safety
     /// The CPU must have the ISA, and `p` must be valid for reading eight numbers, which need not be aligned.
     unsafe fn highest_bits(p: *const u32) -> u32;
+}
 
+/// Lanes of which each is for a child of a node.
+pub(crate) trait Compress: Lanes {
     /// Writes the lanes of `mask` to `values`, and the same lanes of `names` to `out_names`, in the
     /// order that bits `shift` to `shift + 2` of each of `order` tell; returns, as bits, which places in that
-    /// order were taken. All eight entries behind both outputs may be overwritten.
+    /// order were taken. As many entries behind both outputs as there are lanes may be overwritten.
     ///
     /// # Safety
-    /// All pointers must be valid for eight values. `out_names` may overlap `names` if `order` tells the
+    /// The CPU must have the ISA, and all pointers must be valid for as many values as there are lanes. `out_names` may overlap `names` if `order` tells the
     /// lanes' own and it does not lie behind.
     unsafe fn compress(
         self,

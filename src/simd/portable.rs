@@ -1,7 +1,7 @@
 //! Lanes over the `wide` crate: SSE2, NEON, simd128 or plain scalars, whatever the target's baseline
 //! has.
 
-use super::{Eight, Four, Lanes, Mask, Simd};
+use super::{Compress, Eight, Four, Lanes, Mask, Simd};
 use std::ops::{Add, Mul, Sub};
 use wide::f32x4;
 
@@ -244,29 +244,38 @@ impl Eight for P8 {
         // SAFETY: the caller vouches for eight numbers.
         (0..8).fold(0, |bits, i| bits | unsafe { p.add(i).read_unaligned() } >> 31 << i)
     }
+}
 
-    #[inline(always)]
-    unsafe fn compress(
-        self,
-        names: *const u32,
-        order: *const u32,
-        shift: u32,
-        mask: M8,
-        values: *mut f32,
-        out_names: *mut u32,
-    ) -> u32 {
-        let (own, mask) = (self.to_array(), mask.bits());
-        let (mut n, mut set) = (0, 0);
-        for i in 0..8 {
-            // SAFETY: the caller vouches for eight values at each pointer; n ≤ i and `lane` are below 8.
-            unsafe {
-                let lane = (order.add(i).read() >> shift & 7) as usize;
-                values.add(n).write(own[lane]);
-                out_names.add(n).write(names.add(lane).read());
-                n += (mask >> lane & 1) as usize;
-                set |= (mask >> lane & 1) << i;
+macro_rules! compress {
+    ($v:ident, $width:literal) => {
+        impl Compress for $v {
+            #[inline(always)]
+            unsafe fn compress(
+                self,
+                names: *const u32,
+                order: *const u32,
+                shift: u32,
+                mask: Self::Mask,
+                values: *mut f32,
+                out_names: *mut u32,
+            ) -> u32 {
+                let (own, mask) = (self.to_array(), mask.bits());
+                let (mut n, mut set) = (0, 0);
+                for i in 0..$width {
+                    // SAFETY: the caller vouches for `$width` values at each pointer; n ≤ i and `lane` are below it.
+                    unsafe {
+                        let lane = (order.add(i).read() >> shift & 7) as usize;
+                        values.add(n).write(own[lane]);
+                        out_names.add(n).write(names.add(lane).read());
+                        n += (mask >> lane & 1) as usize;
+                        set |= (mask >> lane & 1) << i;
+                    }
+                }
+                set
             }
         }
-        set
-    }
+    };
 }
+
+compress!(P4, 4);
+compress!(P8, 8);

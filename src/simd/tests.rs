@@ -77,24 +77,24 @@ unsafe fn check_lanes<L: Lanes>() {
     }
 }
 
-unsafe fn check_compress<E: Eight>() {
+unsafe fn check_compress<L: Compress>(orders: [[u32; 8]; 2]) {
     let names: [u32; 8] = std::array::from_fn(|i| 100 + i as u32);
     let values: [f32; 8] = std::array::from_fn(|i| i as f32);
     // Two orders in one word, at different shifts.
-    let orders: [[u32; 8]; 2] = [[0, 1, 2, 3, 4, 5, 6, 7], [6, 2, 7, 0, 5, 1, 3, 4]];
     let order: [u32; 8] = std::array::from_fn(|i| orders[0][i] | orders[1][i] << 21);
-    for set in 0..256u32 {
+    for set in 0..1u32 << L::WIDTH {
         let chosen: [f32; 8] = std::array::from_fn(|i| (set >> i & 1) as f32);
         for (k, shift) in [0, 21].into_iter().enumerate() {
             let (mut out, mut out_names) = ([0.0; 8], [0; 8]);
             // SAFETY: arrays of eight, and the caller vouches for the ISA.
             let places = unsafe {
-                let mask = E::splat(0.5).lt(E::load(chosen.as_ptr()));
-                let v = E::load(values.as_ptr());
+                let mask = L::splat(0.5).lt(L::load(chosen.as_ptr()));
+                let v = L::load(values.as_ptr());
                 v.compress(names.as_ptr(), order.as_ptr(), shift, mask, out.as_mut_ptr(), out_names.as_mut_ptr())
             };
-            let expected: Vec<u32> = orders[k].into_iter().filter(|&lane| set >> lane & 1 == 1).collect();
-            let taken = (0..8).filter(|&i| set >> orders[k][i] & 1 == 1);
+            let expected: Vec<u32> =
+                orders[k][..L::WIDTH].iter().copied().filter(|&lane| set >> lane & 1 == 1).collect();
+            let taken = (0..L::WIDTH).filter(|&i| set >> orders[k][i] & 1 == 1);
             assert_eq!(places, taken.map(|i| 1u32 << i).sum::<u32>());
             for (i, lane) in expected.into_iter().enumerate() {
                 assert_eq!((out[i], out_names[i]), (lane as f32, 100 + lane));
@@ -165,7 +165,8 @@ unsafe fn check_simd<S: Simd>() {
         check_lanes::<S::F4>();
         check_lanes::<S::F8>();
         check_lanes::<S::Packet>();
-        check_compress::<S::F8>();
+        check_compress::<S::F4>([[0, 1, 2, 3, 0, 0, 0, 0], [2, 0, 3, 1, 0, 0, 0, 0]]);
+        check_compress::<S::F8>([[0, 1, 2, 3, 4, 5, 6, 7], [6, 2, 7, 0, 5, 1, 3, 4]]);
         check_halves::<S::F8>();
         check_pick::<S>();
     }

@@ -65,6 +65,8 @@ impl Tree for View<'_> {
     where
         Self: 'a;
 
+    const WIDTH: usize = WIDTH;
+    type Lanes<S: Simd> = S::F8;
     const ROW: u32 = WIDTH as u32;
     /// Their order is by place.
     const IS_BY_WORTH: bool = false;

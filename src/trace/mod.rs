@@ -7,6 +7,8 @@
 pub mod baseline;
 mod compact;
 pub(crate) mod filter;
+#[cfg(any(test, feature = "reference"))]
+pub mod four_wide;
 mod gather;
 mod kernels;
 pub mod offset;

@@ -27,7 +27,7 @@ use super::triangle::{GRAZING, Projected, Shear, V3, accurate_distance, barycent
 use super::{RawHit, Ray};
 use crate::base::geometry::NONE;
 use crate::bvh::layout::{ChildRef, MAX_LEAF, Mbvh, Node, STACK_SIZE, WIDTH};
-use crate::simd::{Eight, Lanes, Mask, Simd};
+use crate::simd::{Compress, Lanes, Mask, Simd};
 use std::mem::MaybeUninit;
 
 /// Maximum number of rays in a bundle. (In tiles of 4 × 4 pixels, 128 were no faster.)

@@ -1,4 +1,4 @@
-//! Single rays through the 8-wide tree: ordered closest hit and any hit (thesis 3.1.2; Wald,
+//! Single rays through a wide tree: ordered closest hit and any hit (thesis 3.1.2; Wald,
 //! Benthin and Boulos, *Getting Rid of Packets*, 2008; Dammertz et al. 2008).
 //!
 //! The box test is conservative (Ize, *Robust BVH Ray Traversal*, 2013): the builder moves planes, and
@@ -10,7 +10,7 @@ use super::triangle::barycentrics;
 use super::{RawHit, Ray};
 use crate::base::geometry::NONE;
 use crate::bvh::layout::{ChildRef, STACK_SIZE, WIDTH};
-use crate::simd::{Eight, Lanes, Mask, Simd};
+use crate::simd::{Compress, Lanes, Mask, Simd};
 use std::cell::Cell;
 use std::marker::PhantomData;
 use std::mem::MaybeUninit;
@@ -141,8 +141,8 @@ impl Stack {
         &mut self,
         node: &T::Node,
         shift: u32,
-        near: S::F8,
-        mask: <S::F8 as Lanes>::Mask,
+        near: T::Lanes<S>,
+        mask: <T::Lanes<S> as Lanes>::Mask,
     ) -> u32 {
         let mut room = MaybeUninit::uninit();
         let (order, shift) = if ANY && T::IS_BY_WORTH { (IN_ORDER.as_ptr(), 0) } else { (T::order(node), shift) };
@@ -272,7 +272,7 @@ impl Walk {
         unsafe {
             let node = tree.node(self.current);
             let boxes = Children::<S, T> { node, isa: PhantomData };
-            let (near, mask) = self.ray.boxes::<S::F8>(&boxes, self.limit);
+            let (near, mask) = self.ray.boxes::<T::Lanes<S>>(&boxes, self.limit);
             let set = self.stack.push::<S, T, ANY>(node, self.ray.shift, near, mask);
             self.current = if ALONE && set != 0 {
                 self.stack.count -= 1;

@@ -5,7 +5,7 @@
 //! for each octant of directions, with all of its rays:
 //! push (root, all rays)
 //! while (child, list) is popped:
-//!     node:  test each ray of the list against the eight boxes, whose planes stay in registers;
+//!     node:  test each ray of the list against the children's boxes, whose planes stay in registers;
 //!            for each child that any ray hits, from far to near, or to any hit from least to most worth:
 //!            push (child, list of these rays)
 //!     leaf:  test each ray of the list against the triangles, two rays at a time
@@ -19,11 +19,11 @@
 //! which of a leaf's hits is the closest does not depend on the order of visits. Rays that need special treatment in a
 //! test, rays of octants that few rays have, and rays whose lists find no room are traced one by one.
 
-use super::stream_rays::{Box8, Group, MAX_RAYS, Room, sort};
+use super::stream_rays::{ChildBoxes, Group, MAX_RAYS, Room, sort};
 use super::tree::{Leaf, RaySetup, Tree, beyond};
 use super::triangle::{Projected, V3, accurate_distance};
 use super::{RawHit, Ray, single};
-use crate::bvh::layout::{ChildRef, STACK_SIZE, WIDTH};
+use crate::bvh::layout::{ChildRef, STACK_SIZE};
 use crate::simd::{Eight, Lanes, Mask, Simd};
 use std::mem::MaybeUninit;
 
@@ -155,7 +155,7 @@ impl<T: Tree> Traversal<'_, T> {
         // are as many masks as rays, rounded up to 32, and more.
         unsafe {
             let node = self.tree.node(entry.child);
-            let boxes = Box8::<S::F8>::new::<S, T>(node, self.group.octant);
+            let boxes = ChildBoxes::new::<S, T>(node, self.group.octant);
             let (numbers, masks) = (room.numbers.as_mut_ptr(), room.masks.as_mut_ptr());
             let slabs = room.slabs.as_ptr();
             let mut met = 0;
@@ -187,7 +187,7 @@ impl<T: Tree> Traversal<'_, T> {
                 children &= children - 1;
             }
             let mut pushed = 0;
-            for place in 0..WIDTH {
+            for place in 0..T::WIDTH {
                 // (By worth, shadow rays of tiles to a lamp are 1.45 times as fast in Sponza, 1.3 times in the living room.)
                 let lane = match ANY && T::IS_BY_WORTH {
                     true => place as u32,

@@ -100,20 +100,20 @@ impl Group {
 }
 
 /// The planes of a node's children that rays of an octant reach first and last, by axis.
-pub(super) struct Box8<L> {
+pub(super) struct ChildBoxes<L> {
     near: [L; 3],
     far: [L; 3],
 }
 
-impl<L: Eight> Box8<L> {
+impl<L: Lanes> ChildBoxes<L> {
     /// # Safety
     /// The CPU must have the ISA.
     #[inline(always)]
-    pub(super) unsafe fn new<S: Simd<F8 = L>, T: Tree>(node: &T::Node, octant: usize) -> Self {
+    pub(super) unsafe fn new<S: Simd, T: Tree<Lanes<S> = L>>(node: &T::Node, octant: usize) -> Self {
         let row = |a: usize, far: bool| T::ROW * (a as u32 + if (octant >> a & 1 != 0) != far { 3 } else { 0 });
         // SAFETY: forwarded; rows are those of the axes.
         unsafe {
-            Box8 {
+            ChildBoxes {
                 near: [
                     T::planes::<S>(node, 0, row(0, false)),
                     T::planes::<S>(node, 1, row(1, false)),

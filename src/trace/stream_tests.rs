@@ -1,6 +1,7 @@
 //! Streams against single rays, bit by bit: on every ISA, in whole and compact trees.
 
-use super::{RawHit, Ray};
+use super::four_wide::FourWide;
+use super::{Hit, RawHit, Ray};
 use crate::base::progress::Progress;
 use crate::base::sampling::{uniform, uniform_sphere};
 use crate::bvh::BuildOptions;
@@ -109,6 +110,46 @@ fn rays_that_streams_leave_alone_have_their_hits() {
             }
         }
         assert!(assert_same(&scene, &rays, "special") > 1000);
+    }
+}
+
+#[test]
+fn groups_of_rays_from_scattered_places_have_the_hits_of_single_rays() {
+    for scene in scenes(&soup(3000, 0.1, 6), 4) {
+        let rays: Vec<Ray> = (0..40).flat_map(|place| rays(128, 0.0, place)).collect();
+        let mut hits = vec![Hit::MISS; rays.len()];
+        let mut occluded = vec![2; rays.len()];
+        scene.intersect_many(&rays, false, &mut hits).unwrap();
+        scene.occluded_many(&rays, false, &mut occluded).unwrap();
+        for (i, ray) in rays.iter().enumerate() {
+            assert_eq!(hits[i], scene.intersect(ray), "{:?}: {i} {ray:?}", scene.device().isa());
+            assert_eq!(occluded[i], u8::from(scene.occluded(ray)), "{:?}: {i} {ray:?}", scene.device().isa());
+        }
+        assert!(hits.iter().filter(|h| h.t.is_finite()).count() > 1000);
+    }
+}
+
+#[test]
+fn four_wide_trees_have_the_hits_of_scenes() {
+    let bits = |h: &RawHit| (h.t.to_bits(), h.u.to_bits(), h.v.to_bits(), h.triangle, h.front);
+    for (n, size, max_leaf) in [(1, 1.0, 4), (60, 0.7, 8), (3000, 0.1, 3)] {
+        for scene in scenes(&soup(n, size, n), max_leaf) {
+            let four = FourWide::new(&scene, &BuildOptions { max_leaf, ..Default::default() }).unwrap();
+            let mut rays = rays(3000, 0.3, n);
+            // Parallel to two axes: the slower test of boxes.
+            rays.iter_mut().step_by(50).for_each(|r| r.direction = [0.0, -1.0, 0.0]);
+            let mut hits = [vec![RawHit::MISS; rays.len()], vec![RawHit::MISS; rays.len()]];
+            four.intersect_many(&rays, &mut hits[0]);
+            four.stream(&rays, &mut hits[1]);
+            for (i, ray) in rays.iter().enumerate() {
+                let (isa, expected) = (scene.device().isa(), scene.intersect_raw(ray));
+                for hit in [hits[0][i], hits[1][i], four.intersect(ray)] {
+                    assert_eq!(bits(&hit), bits(&expected), "{isa:?}, {n} triangles: {i} {ray:?}");
+                }
+                assert_eq!(four.occluded(ray), scene.occluded(ray), "{isa:?}, {n} triangles: {i} {ray:?}");
+            }
+            assert!(n < 60 || hits[0].iter().filter(|h| !h.is_miss()).count() > 300);
+        }
     }
 }
 

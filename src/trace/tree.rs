@@ -7,7 +7,7 @@
 use super::Ray;
 use super::triangle::{Projected, Shear};
 use crate::bvh::layout::{ChildRef, LEAF_PAD, LEAF_STRIDE, MAX_LEAF, WIDTH};
-use crate::simd::{Four, Lanes, Mask, Simd};
+use crate::simd::{Compress, Four, Lanes, Mask, Simd};
 use glam::Vec3;
 use std::hint::select_unpredictable;
 use std::marker::PhantomData;
@@ -19,6 +19,12 @@ pub(super) trait Tree {
     type Leaf<'a>: Leaf
     where
         Self: 'a;
+
+    /// Number of children of a node, up to [`WIDTH`].
+    const WIDTH: usize;
+
+    /// Lanes, one per child.
+    type Lanes<S: Simd>: Compress;
 
     /// Distance in bytes between a node's rows of planes: minima of x, y, z, maxima of x, y, z.
     const ROW: u32;
@@ -40,7 +46,7 @@ pub(super) trait Tree {
     ///
     /// # Safety
     /// The CPU must have the ISA, and `row` must be a multiple of [`Self::ROW`] for one of that axis.
-    unsafe fn planes<S: Simd>(node: &Self::Node, axis: usize, row: u32) -> S::F8;
+    unsafe fn planes<S: Simd>(node: &Self::Node, axis: usize, row: u32) -> Self::Lanes<S>;
 
     /// Returns the references to the children, for which `room` may serve as a buffer.
     fn names(node: &Self::Node, room: &mut MaybeUninit<[u32; WIDTH]>) -> *const u32;
@@ -317,9 +323,9 @@ pub(super) struct Children<'a, S, T: Tree> {
     pub(super) isa: PhantomData<S>,
 }
 
-impl<S: Simd, T: Tree> Boxes<S::F8> for Children<'_, S, T> {
+impl<S: Simd, T: Tree> Boxes<T::Lanes<S>> for Children<'_, S, T> {
     #[inline(always)]
-    unsafe fn planes(&self, axis: usize, row: u32) -> S::F8 {
+    unsafe fn planes(&self, axis: usize, row: u32) -> T::Lanes<S> {
         // SAFETY: forwarded.
         unsafe { T::planes::<S>(self.node, axis, row) }
     }

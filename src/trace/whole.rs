@@ -6,53 +6,63 @@ use crate::bvh::layout::{ChildRef, Mbvh, Node, WIDTH};
 use crate::simd::{Four, Lanes, Simd};
 use std::mem::MaybeUninit;
 
-impl Tree for Mbvh {
-    type Node = Node;
-    type Leaf<'a> = Rows;
+macro_rules! tree {
+    ($width:literal, $lanes:ident) => {
+        impl Tree for Mbvh<$width> {
+            type Node = Node<$width>;
+            type Leaf<'a> = Rows;
 
-    const ROW: u32 = 4 * WIDTH as u32;
-    const IS_BY_WORTH: bool = true;
+            const WIDTH: usize = $width;
+            type Lanes<S: Simd> = S::$lanes;
+            const ROW: u32 = 4 * $width;
+            const IS_BY_WORTH: bool = true;
 
-    #[inline(always)]
-    fn prefetch(&self, child: ChildRef) {
-        self.prefetch(child);
-    }
+            #[inline(always)]
+            fn prefetch(&self, child: ChildRef) {
+                self.prefetch(child);
+            }
 
-    #[inline(always)]
-    fn prefetch_whole(&self, child: ChildRef) {
-        self.prefetch_whole(child);
-    }
+            #[inline(always)]
+            fn prefetch_whole(&self, child: ChildRef) {
+                self.prefetch_whole(child);
+            }
 
-    #[inline(always)]
-    unsafe fn node(&self, node: ChildRef) -> &Node {
-        debug_assert!(node.node_index() < self.nodes.len());
-        // SAFETY: inner references of the tree are in range.
-        unsafe { self.nodes.get_unchecked(node.node_index()) }
-    }
+            #[inline(always)]
+            unsafe fn node(&self, node: ChildRef) -> &Node<$width> {
+                debug_assert!(node.node_index() < self.nodes.len());
+                // SAFETY: inner references of the tree are in range.
+                unsafe { self.nodes.get_unchecked(node.node_index()) }
+            }
 
-    #[inline(always)]
-    unsafe fn planes<S: Simd>(node: &Node, _: usize, row: u32) -> S::F8 {
-        let bytes = std::ptr::from_ref(node).cast::<u8>();
-        // SAFETY: planes come first in a node, in rows of eight; the caller vouches for the ISA.
-        unsafe { S::F8::load(bytes.add(row as usize).cast()) }
-    }
+            #[inline(always)]
+            unsafe fn planes<S: Simd>(node: &Node<$width>, _: usize, row: u32) -> S::$lanes {
+                let bytes = std::ptr::from_ref(node).cast::<u8>();
+                // SAFETY: planes come first in a node, in rows of `$width`; the caller vouches for the ISA.
+                unsafe { S::$lanes::load(bytes.add(row as usize).cast()) }
+            }
 
-    #[inline(always)]
-    fn names(node: &Node, _: &mut MaybeUninit<[u32; WIDTH]>) -> *const u32 {
-        node.children.as_ptr().cast()
-    }
+            #[inline(always)]
+            fn names(node: &Node<$width>, _: &mut MaybeUninit<[u32; WIDTH]>) -> *const u32 {
+                node.children.as_ptr().cast()
+            }
 
-    #[inline(always)]
-    fn order(node: &Node) -> *const u32 {
-        node.order.as_ptr()
-    }
+            #[inline(always)]
+            fn order(node: &Node<$width>) -> *const u32 {
+                node.order.as_ptr()
+            }
 
-    #[inline(always)]
-    unsafe fn leaf<S: Simd>(&self, leaf: ChildRef) -> Rows {
-        // SAFETY: forwarded.
-        Rows { rows: unsafe { self.leaf(leaf) }, count: leaf.leaf_count() }
-    }
+            #[inline(always)]
+            unsafe fn leaf<S: Simd>(&self, leaf: ChildRef) -> Rows {
+                // SAFETY: forwarded.
+                Rows { rows: unsafe { self.leaf(leaf) }, count: leaf.leaf_count() }
+            }
+        }
+    };
 }
+
+tree!(8, F8);
+#[cfg(any(test, feature = "reference"))]
+tree!(4, F4);
 
 /// A leaf of an [`Mbvh`].
 pub(super) struct Rows {
