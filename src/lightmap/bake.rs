@@ -3,13 +3,14 @@
 //! The file is long because it has every stage once, in order: this order is what a reader looks for here.
 
 use super::atlas::Atlas;
+use super::atlas::ids::{GatherTexel, LightMap, LightTexel, PerTexel, RadianceTexel};
 use super::atlas::two_sided;
 use super::indirect::blur;
 use super::indirect::blur::Filling;
 use super::indirect::bright_patches::Bright;
 use super::indirect::find_bright_patches;
 use super::indirect::gather::{Gathered, Tile, TileTexel};
-use super::indirect::radiance_map::{self, Radiance, RadianceInput, RadianceMap};
+use super::indirect::radiance_map::{self, Radiance, RadianceInput, RadianceLookup};
 use super::indirect::sample_set::SampleSet;
 use super::indirect::upsample::{OWN_RAYS, OwnLight, OwnRays, Upsampling};
 use super::plan::{Plan, left_out};
@@ -300,11 +301,12 @@ impl Bake<'_, '_> {
             return Ok(backs);
         }
         // Without indirect light there is no radiance map: direct light decides.
-        let light = |s: usize| match radiance.get(s) {
+        let light = |texel: RadianceTexel| match radiance.get(texel.index()) {
             Some(radiance) => radiance.element_sum(),
             None => {
-                let (_, receiver) = l.radiance.receiver(&l.scene, s, l.radiance.is_back(s));
-                self.direct.irradiance(&receiver, 1, combine(self.params.seed as u32, s as u32), &mut 0).element_sum()
+                let (_, receiver) = l.radiance.receiver(&l.scene, texel, l.radiance.is_back(texel));
+                let seed = combine(self.params.seed as u32, texel.seed());
+                self.direct.irradiance(&receiver, 1, seed, &mut 0).element_sum()
             }
         };
         let backs = l.scene.device().install(|| two_sided::backs(l, light, self.progress))?;
@@ -319,13 +321,13 @@ impl Bake<'_, '_> {
         let start = Instant::now();
         let l = self.atlas;
         let device = l.scene.device();
-        let placements = l.map.texels.placement_of(self.range.start as u32)
-            ..l.map.texels.placement_of(self.range.end as u32 - 1) + 1;
-        let needed = l.gather.texels.chart_start[placements.start as usize] as usize
-            ..l.gather.texels.chart_start[placements.end as usize] as usize;
+        let placement_of = |i: usize| l.map.texels.placement_of(i as u32).index();
+        let placements = placement_of(self.range.start)..placement_of(self.range.end - 1) + 1;
+        let starts = &l.gather.texels.chart_start;
+        let needed = starts[placements.start] as usize..starts[placements.end] as usize;
         let upsampling = self.upsampling(backs, placements)?;
         let (own, own_rays) = self.own_light(radiance, backs, &upsampling)?;
-        let lookup = RadianceMap::new(&l.charts, &l.radiance, radiance);
+        let lookup = RadianceLookup::new(&l.charts, &l.radiance, radiance);
         let samples = SampleSet::new(self.params.gather_rays, purpose_seed(self.params.seed, purpose::GATHER_SET));
         let seed = purpose_seed(self.params.seed, purpose::GATHER);
         let stage = self.progress.stage("gather", 0.32, 0.6, needed.len() as u64);
@@ -345,26 +347,27 @@ impl Bake<'_, '_> {
             blocks.try_for_each(|(block, (((values, normals), variances), valid))| {
                 if self.checkpoint.is_some_and(|c| c.gathered(block, values, variances, valid)) {
                     for (i, normal) in normals.iter_mut().enumerate() {
-                        *normal = l.receiver(&l.gather, backs, needed.start + block * BLOCK + i).normal;
+                        let texel = GatherTexel::new(needed.start + block * BLOCK + i);
+                        *normal = l.receiver(&l.gather, backs, texel).normal;
                     }
                     return stage.advance(values.len() as u64);
                 }
                 let (mut traced, mut tile) = (0, tiles.take(Tile::new)?);
                 let first = needed.start + block * BLOCK;
-                for samples_of_tile in in_order(&l.gather, first..first + values.len())?.chunks(TILE) {
-                    let texel = |&s: &u32| TileTexel {
-                        receiver: l.receiver(&l.gather, backs, s as usize),
-                        seed: combine(seed, s),
+                for texels_of_tile in in_order(&l.gather, first..first + values.len())?.chunks(TILE) {
+                    let texel = |&texel: &GatherTexel| TileTexel {
+                        receiver: l.receiver(&l.gather, backs, texel),
+                        seed: combine(seed, texel.seed()),
                         gathered: Gathered::default(),
                     };
-                    let mut texels: Vec<_> = samples_of_tile.iter().map(texel).collect();
+                    let mut texels: Vec<_> = texels_of_tile.iter().map(texel).collect();
                     for round in 0..samples.rounds() {
                         // A tile may have 4 million rays.
                         self.progress.check()?;
                         traced += tile.add_round(&l.scene, &lookup, &mut texels, &samples, round);
                     }
-                    for (&sample, TileTexel { receiver, gathered, .. }) in samples_of_tile.iter().zip(&texels) {
-                        let i = sample as usize - first;
+                    for (texel, TileTexel { receiver, gathered, .. }) in texels_of_tile.iter().zip(&texels) {
+                        let i = texel.index() - first;
                         (values[i], normals[i]) = (gathered.irradiance(), receiver.normal);
                         (variances[i], valid[i]) = (gathered.variance(), gathered.is_visible());
                     }
@@ -392,7 +395,7 @@ impl Bake<'_, '_> {
     }
 
     /// Finds how texels of the light map interpolate between gather texels, for some placements.
-    pub(crate) fn upsampling(&self, backs: &[bool], placements: Range<u32>) -> Result<Upsampling> {
+    pub(crate) fn upsampling(&self, backs: &[bool], placements: Range<usize>) -> Result<Upsampling> {
         let stage = self.progress.stage("upsampling", 0.3, 0.315, placements.len() as u64);
         Upsampling::find(self.atlas, placements, backs, &stage)
     }
@@ -412,7 +415,7 @@ impl Bake<'_, '_> {
         }
         let count = self.params.gather_rays.min(OWN_RAYS);
         let rays = OwnRays {
-            radiance: RadianceMap::new(&l.charts, &l.radiance, radiance),
+            radiance: RadianceLookup::new(&l.charts, &l.radiance, radiance),
             samples: &SampleSet::new(count, purpose_seed(self.params.seed, purpose::GATHER_SET)),
             seed: purpose_seed(self.params.seed, purpose::OWN),
         };
@@ -450,8 +453,9 @@ impl Bake<'_, '_> {
                 let mut traced = 0;
                 let first = range.start + block * BLOCK;
                 if let Some(indirect) = indirect {
-                    for (i, ind) in ind.iter_mut().enumerate() {
-                        *ind = indirect.upsampling.at(l, &indirect.irradiance, &indirect.own, first + i);
+                    let irradiance = PerTexel::new(&indirect.irradiance);
+                    for (texel, ind) in LightTexel::range(first..first + ind.len()).zip(ind) {
+                        *ind = indirect.upsampling.at(l, irradiance, &indirect.own, texel);
                     }
                 }
                 *known = self.checkpoint.is_some_and(|c| c.lit(block, direct, state));
@@ -466,10 +470,10 @@ impl Bake<'_, '_> {
                 }
                 if self.plan.runs(left_out::DIRECT) && self.direct.has_sharp() {
                     let mut tile = tiles.take(|| TilePoints::new(TILE))?;
-                    for samples in in_order(&l.map, first..first + direct.len())?.chunks(4 * TILE) {
+                    for of_tile in in_order(&l.map, first..first + direct.len())?.chunks(4 * TILE) {
                         self.progress.check()?;
-                        let receivers = samples.iter().map(|&s| l.receiver(&l.map, backs, s as usize));
-                        let place = |i: usize| samples[i] as usize - first;
+                        let receivers = of_tile.iter().map(|&texel| l.receiver(&l.map, backs, texel));
+                        let place = |i: usize| of_tile[i].index() - first;
                         texels.sharp_of_tile(receivers, &mut tile, &mut traced, |i, sharp| direct[place(i)] = sharp);
                     }
                 }
@@ -493,7 +497,7 @@ impl Bake<'_, '_> {
     }
 
     /// Returns the computation of direct light for the light map's texels.
-    fn texel_light(&self) -> TexelLight<'_> {
+    fn texel_light(&self) -> TexelLight<'_, LightMap> {
         TexelLight {
             areas: self.atlas.areas(&self.atlas.map),
             direct: self.direct,
@@ -506,7 +510,7 @@ impl Bake<'_, '_> {
     /// Returns the number of rays.
     fn average_direct(
         &self,
-        texels: &TexelLight,
+        texels: &TexelLight<LightMap>,
         backs: &[bool],
         known: &[bool],
         direct: &mut [Vec3],
@@ -522,12 +526,12 @@ impl Bake<'_, '_> {
             variations.par_chunks_mut(BLOCK).enumerate().for_each(|(block, out)| {
                 let mut traced = 0;
                 for (i, variation) in out.iter_mut().enumerate().filter(|_| !known[block]) {
-                    let sample = range.start + block * BLOCK + i;
+                    let texel = LightTexel::new(range.start + block * BLOCK + i);
                     // Neighbours that another shard bakes, or that a checkpoint has, are computed here too.
-                    let is_here = |s: usize| range.contains(&s) && !known[(s - range.start) / BLOCK];
-                    *variation = texels.varies(sample, sharp[sample], |s| match is_here(s) {
-                        true => sharp[s],
-                        false => texels.sharp(&l.receiver(&l.map, backs, s), &mut traced),
+                    let is_here = |i: usize| range.contains(&i) && !known[(i - range.start) / BLOCK];
+                    *variation = texels.varies(texel, sharp[texel.index()], |near| match is_here(near.index()) {
+                        true => sharp[near.index()],
+                        false => texels.sharp(&l.receiver(&l.map, backs, near), &mut traced),
                     });
                 }
                 rays.fetch_add(traced, Relaxed);
@@ -544,18 +548,18 @@ impl Bake<'_, '_> {
                 let mut order = in_order(&l.map, first..first + direct.len())?;
                 // The others have their light. (Direct light of Sponza in the sun, 12 texels/m: 0.85 of the time with their
                 // receivers.)
-                order.retain(|&s| self.direct.has_soft() || variations[s as usize - first] != Variation::None);
-                for samples in order.chunks(texels_per_tile(texels.samples)) {
+                order.retain(|t| self.direct.has_soft() || variations[t.index() - first] != Variation::None);
+                for some in order.chunks(texels_per_tile(texels.samples)) {
                     self.progress.check()?;
                     of_tile.clear();
-                    of_tile.extend(samples.iter().map(|&s| s as usize).map(|sample| Averaged {
-                        sample,
-                        back: l.is_back(&l.map, backs, sample),
-                        receiver: l.receiver(&l.map, backs, sample),
-                        sharp: direct[sample - first],
-                        variation: variations[sample - first],
+                    of_tile.extend(some.iter().map(|&texel| Averaged {
+                        texel,
+                        back: l.is_back(&l.map, backs, texel),
+                        receiver: l.receiver(&l.map, backs, texel),
+                        sharp: direct[texel.index() - first],
+                        variation: variations[texel.index() - first],
                     }));
-                    let place = |i: usize| samples[i] as usize - first;
+                    let place = |i: usize| some[i].index() - first;
                     texels.irradiance(&of_tile, &mut tile, &mut traced, |i, e| direct[place(i)] = e);
                 }
                 if let Some(c) = self.checkpoint {

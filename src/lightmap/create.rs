@@ -5,6 +5,7 @@ use super::atlas::buried::Search;
 use super::atlas::chart_index::ChartIndex;
 use super::atlas::chart_map::ChartMap;
 use super::atlas::charts::{Charts, automatic_density};
+use super::atlas::ids::{ChartId, GatherMap, LightMap, RadianceMap};
 use super::atlas::layout::Layout;
 use super::atlas::seen::{self, Seen};
 use super::atlas::texels::TexelMap;
@@ -45,8 +46,8 @@ impl Lightmap {
         };
         let (charts, mut uvs) = Charts::of_scene(scene, density, desc.page_size, desc.padding, progress)?;
         let unwrap_seconds = start.elapsed().as_secs_f64();
-        let two_sided = (0..).zip(&charts.charts).filter(|(_, c)| c.two_sided).map(|(c, _)| c);
-        let two_sided: Vec<u32> = try_collect(two_sided, "the two-sided charts")?;
+        let two_sided: Vec<ChartId> =
+            try_collect(charts.ids().filter(|&c| charts[c].two_sided), "the two-sided charts")?;
         let Maps { map, gather, radiance, seen, with_backs, buried, sight_rays } =
             Maps::lay_out(scene, desc, &charts, &two_sided, density, progress)?;
         uvs.overlapping_texels = map.texels.overlapping_texels;
@@ -67,7 +68,7 @@ impl Lightmap {
             texels_per_unit: density,
             uvs,
             both_sided_charts: with_backs.len() as u32,
-            back_texels: (map.len() - map.back_start) as u64,
+            back_texels: (map.len() - map.back_start.index()) as u64,
             buried_texels: buried.iter().filter(|&&b| b).count() as u64,
             open_places: seen.places,
             sight_rays,
@@ -90,12 +91,12 @@ impl Lightmap {
 
 /// Places of the charts in the three maps, and the counts that laying them out brought.
 struct Maps {
-    map: ChartMap,
-    gather: ChartMap,
-    radiance: ChartMap,
+    map: ChartMap<LightMap>,
+    gather: ChartMap<GatherMap>,
+    radiance: ChartMap<RadianceMap>,
     seen: Seen,
     /// Two-sided charts whose backs have texels of their own.
-    with_backs: Vec<u32>,
+    with_backs: Vec<ChartId>,
     /// By texel of the light map; empty if none is.
     buried: Vec<bool>,
     sight_rays: u64,
@@ -108,11 +109,11 @@ impl Maps {
         scene: &Arc<Scene>,
         desc: &LightmapDesc,
         charts: &Charts,
-        two_sided: &[u32],
+        two_sided: &[ChartId],
         density: f32,
         progress: &Progress,
     ) -> Result<Maps> {
-        let pack = |divisor: u32, padding: u32, given: bool, with_backs: &[u32]| {
+        let pack = |divisor: u32, padding: u32, given: bool, with_backs: &[ChartId]| {
             let page_size = if divisor == 1 { desc.page_size } else { (desc.page_size / divisor).max(MIN_PAGE_SIZE) };
             Layout::pack(charts, density / divisor as f32, page_size, padding, given, with_backs, progress)
         };
@@ -129,21 +130,19 @@ impl Maps {
         let stage = progress.stage("texels", 0.65, 0.8, TexelMap::work(&map) + TexelMap::work(&gather));
         let mut map = ChartMap::new(scene, charts, map, &stage)?;
         let mut gather = ChartMap::new(scene, charts, gather, &stage)?;
-        let placements = [&map, &gather, &radiance].map(|map| map.layout.placements.len() as u64);
+        let placements = [&map.layout, &gather.layout, &radiance.layout].map(|layout| layout.placements.len() as u64);
         let stage = progress.stage("buried texels", 0.8, 1.0, placements.iter().sum());
         let near = texel.min(seen::ROOM * scene.diagonal());
         let search = Search { scene, charts, seen: &seen, near };
-        let mut sight_rays = seen.rays;
-        let mut move_buried = |map: &mut ChartMap, by_parts: bool| -> Result<Vec<bool>> {
-            let (buried, rays) = scene.device().install(|| search.move_buried(map, by_parts, &stage))?;
-            sight_rays += rays;
-            Ok(buried)
-        };
-        move_buried(&mut radiance, true)?;
         // The visible part of a mostly buried texel is a strip along the surface that covers it, often darker than its
         // surroundings. Gather texels are larger and would spread that darkness as a rim.
-        move_buried(&mut gather, false)?;
-        let buried = move_buried(&mut map, true)?;
+        let (buried, rays) = scene.device().install(|| {
+            let (_, of_radiance) = search.move_buried(&mut radiance, true, &stage)?;
+            let (_, of_gather) = search.move_buried(&mut gather, false, &stage)?;
+            let (buried, of_map) = search.move_buried(&mut map, true, &stage)?;
+            Ok((buried, of_radiance + of_gather + of_map))
+        })?;
+        let sight_rays = seen.rays + rays;
         Ok(Maps { map, gather, radiance, seen, with_backs, buried, sight_rays })
     }
 }

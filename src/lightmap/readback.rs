@@ -1,8 +1,9 @@
 //! Reading light maps out: pages layer by layer, UVs, and filtered lookups as a shader would do.
 
+use super::atlas::ids::{ChartId, LightTexel};
 use super::atlas::texels::PageArea;
 use super::indirect::radiance_map;
-use super::indirect::radiance_map::RadianceMap;
+use super::indirect::radiance_map::RadianceLookup;
 use super::{Layer, LayerData, Light, Lightmap, TexelState};
 use crate::base::error::{Error, Result, invalid_argument};
 use crate::base::memory::{try_collect, try_vec, try_with_capacity};
@@ -43,8 +44,8 @@ impl Lightmap {
         let mut pages = try_with_capacity(m.indices.len(), "the UVs of a mesh")?;
         let scale = 1.0 / self.atlas.map.layout.page_size as f32;
         for t in first..first + m.indices.len() as u32 {
-            let chart = self.atlas.charts.chart_of[t as usize];
-            if chart == NONE {
+            let chart = self.atlas.charts.chart_of(t);
+            if chart == ChartId::NONE {
                 uvs.push([[0.0; 2]; 3]);
                 pages.push(NONE);
                 continue;
@@ -55,7 +56,7 @@ impl Lightmap {
             uvs.push(
                 corners.map(|c| self.atlas.map.layout.texel_coord(placement, c).map(|x| (x * scale).clamp(0.0, 1.0))),
             );
-            pages.push(self.atlas.map.layout.placements[placement as usize].page);
+            pages.push(self.atlas.map.layout[placement].page);
         }
         Ok((uvs, pages))
     }
@@ -75,15 +76,15 @@ impl Lightmap {
         match layer {
             Layer::Combined => {
                 let light = self.light()?;
-                self.page_of_light(page, |s| (light.direct[s] + light.indirect[s]).to_array())
+                self.page_of_light(page, |s| (light.direct[s.index()] + light.indirect[s.index()]).to_array())
             }
             Layer::Direct => {
                 let light = self.light()?;
-                self.page_of_light(page, |s| light.direct[s].to_array())
+                self.page_of_light(page, |s| light.direct[s.index()].to_array())
             }
             Layer::Indirect => {
                 let light = self.light()?;
-                self.page_of_light(page, |s| light.indirect[s].to_array())
+                self.page_of_light(page, |s| light.indirect[s.index()].to_array())
             }
             Layer::Radiance => {
                 let light = self.light()?;
@@ -99,24 +100,24 @@ impl Lightmap {
             }
             Layer::Normal => {
                 let backs = self.light.as_ref().map_or(&[][..], |l| &l.backs);
-                let normal = |s: usize| {
+                let normal = |s: LightTexel| {
                     let n = map.surface(&self.atlas.scene, s).1;
                     if self.atlas.is_back(map, backs, s) { -n } else { n }.to_array()
                 };
                 Ok(LayerData::Rgb(self.page_of_samples(page, [0.0; 3], normal)?))
             }
             Layer::Triangle => {
-                let triangle = |s: usize| map.texels.samples[s].triangle;
+                let triangle = |s: LightTexel| map[s].triangle;
                 Ok(LayerData::Integer(self.page_of_samples(page, NONE, triangle)?))
             }
         }
     }
 
-    /// Returns the value of the validity layer for a sample.
-    fn validity(&self, sample: usize) -> f32 {
+    /// Returns the value of the validity layer for a texel.
+    fn validity(&self, texel: LightTexel) -> f32 {
         // Before the first bake, all covered texels are valid.
         let Some(light) = &self.light else { return 1.0 };
-        match light.state[sample] {
+        match light.state[texel.index()] {
             TexelState::Visible => 1.0,
             TexelState::Hidden => FILLED,
             TexelState::Unbaked => 0.0,
@@ -124,30 +125,30 @@ impl Lightmap {
     }
 
     /// Returns the outgoing radiance of a texel: reflected radiance from the radiance map, plus emitted.
-    fn radiance_at(&self, light: &Light, sample: usize) -> [f32; 3] {
-        let t = self.atlas.map.texels.samples[sample];
-        let back = self.atlas.is_back(&self.atlas.map, &light.backs, sample);
+    fn radiance_at(&self, light: &Light, texel: LightTexel) -> [f32; 3] {
+        let t = self.atlas.map[texel];
+        let back = self.atlas.is_back(&self.atlas.map, &light.backs, texel);
         let mut l = DirectLight::emitted(&self.atlas.scene, t.triangle, back);
         if light.radiance.values.is_empty() {
-            let e = light.direct[sample] + light.indirect[sample];
+            let e = light.direct[texel.index()] + light.indirect[texel.index()];
             let a = &self.atlas;
-            l += radiance_map::albedo(&a.areas(&a.map), sample) * e / std::f32::consts::PI;
+            l += radiance_map::albedo(&a.areas(&a.map), texel) * e / std::f32::consts::PI;
         } else {
-            let lookup = RadianceMap::new(&self.atlas.charts, &self.atlas.radiance, &light.radiance);
+            let lookup = RadianceLookup::new(&self.atlas.charts, &self.atlas.radiance, &light.radiance);
             let hit = RawHit { t: 0.0, u: t.u, v: t.v, triangle: t.triangle, front: !back };
             l += lookup.reflected(&hit).unwrap_or_default();
         }
         l.to_array()
     }
 
-    /// Composes a page from values of samples. `fill` turns the value of the nearest sample into that of a texel within
+    /// Composes a page from values of texels. `fill` turns the value of the nearest covered texel into that of a texel within
     /// `padding` of a chart.
     fn page<T: Copy + Default>(
         &self,
         page: u32,
         empty: T,
         padding: u32,
-        value: impl Fn(usize) -> T,
+        value: impl Fn(LightTexel) -> T,
         fill: impl Fn(T) -> T,
     ) -> Result<Vec<T>> {
         let size = self.atlas.map.layout.page_size;
@@ -155,30 +156,42 @@ impl Lightmap {
         out.fill(empty);
         let texels = &self.atlas.map.texels;
         let groups = texels.groups_of_page(page);
-        texels.compose(groups, &PageArea::page(size), padding, &mut out, |s| value(s as usize), fill)?;
+        texels.compose(
+            groups,
+            &PageArea::page(size),
+            padding,
+            &mut out,
+            |s| value(LightTexel::new(s as usize)),
+            fill,
+        )?;
         Ok(out)
     }
 
     /// Composes a page of light, in which the padding repeats the nearest sample.
-    fn page_of_light(&self, page: u32, value: impl Fn(usize) -> [f32; 3]) -> Result<LayerData> {
+    fn page_of_light(&self, page: u32, value: impl Fn(LightTexel) -> [f32; 3]) -> Result<LayerData> {
         Ok(LayerData::Rgb(self.page(page, [0.0; 3], self.atlas.padding, value, |v| v)?))
     }
 
     /// Composes a page of values that only covered texels have.
-    fn page_of_samples<T: Copy + Default>(&self, page: u32, empty: T, value: impl Fn(usize) -> T) -> Result<Vec<T>> {
+    fn page_of_samples<T: Copy + Default>(
+        &self,
+        page: u32,
+        empty: T,
+        value: impl Fn(LightTexel) -> T,
+    ) -> Result<Vec<T>> {
         self.page(page, empty, 0, value, |v| v)
     }
 
     /// Whether the back of a global triangle has separate texels.
     fn has_both_sides(&self, triangle: u32) -> bool {
-        self.atlas.map.layout.back(self.atlas.charts.chart_of[triangle as usize]).is_some()
+        self.atlas.map.layout.back(self.atlas.charts.chart_of(triangle)).is_some()
     }
 
     /// Whether the light map holds the light of a side of a global triangle. Before a bake, texels that both sides
     /// share hold the front.
     pub fn shows(&self, triangle: u32, front: bool) -> bool {
         let backs = self.light.as_ref().map_or(&[][..], |l| &l.backs);
-        let back = backs.get(self.atlas.charts.chart_of[triangle as usize] as usize).is_some_and(|&b| b);
+        let back = backs.get(self.atlas.charts.chart_of(triangle).index()).is_some_and(|&b| b);
         front != back || self.has_both_sides(triangle)
     }
 
@@ -187,14 +200,14 @@ impl Lightmap {
     /// the side that is [shown](Self::shows). Zero before a bake and for layers that are not light.
     pub fn sample(&self, layer: Layer, triangle: u32, front: bool, u: f32, v: f32) -> [f32; 3] {
         let Some(light) = &self.light else { return [0.0; 3] };
-        let chart = self.atlas.charts.chart_of[triangle as usize];
-        if chart == NONE {
+        let chart = self.atlas.charts.chart_of(triangle);
+        if chart == ChartId::NONE {
             return [0.0; 3];
         }
-        let value = |s: usize| match layer {
-            Layer::Combined => light.direct[s] + light.indirect[s],
-            Layer::Direct => light.direct[s],
-            Layer::Indirect => light.indirect[s],
+        let value = |s: LightTexel| match layer {
+            Layer::Combined => light.direct[s.index()] + light.indirect[s.index()],
+            Layer::Direct => light.direct[s.index()],
+            Layer::Indirect => light.indirect[s.index()],
             Layer::Radiance => self.radiance_at(light, s).into(),
             _ => Vec3::ZERO,
         };

@@ -18,6 +18,7 @@
 mod solver;
 
 use super::atlas::Atlas;
+use super::atlas::ids::{ChartId, PlacementId};
 use super::atlas::pieces::float_key;
 use super::atlas::texels::TexelSample;
 use super::plan::{Plan, left_out};
@@ -309,8 +310,8 @@ impl Job<'_, '_, '_> {
         Ok(edges)
     }
 
-    fn chart(&self, side: Side) -> u32 {
-        self.atlas.charts.chart_of[side.triangle() as usize]
+    fn chart(&self, side: Side) -> ChartId {
+        self.atlas.charts.chart_of(side.triangle())
     }
 
     /// Returns the edge in all pairs of placements of its two triangles.
@@ -322,12 +323,12 @@ impl Job<'_, '_, '_> {
         a.flat_map(move |a| b.clone().map(move |b| [a, b]))
     }
 
-    fn placement(&self, side: Side) -> u32 {
+    fn placement(&self, side: Side) -> PlacementId {
         self.atlas.map.layout.place_of(self.chart(side), !side.is_second())
     }
 
     fn is_back(&self, side: Side) -> bool {
-        side.is_second() || self.backs.get(self.chart(side) as usize).is_some_and(|&b| b)
+        side.is_second() || self.backs.get(self.chart(side).index()).is_some_and(|&b| b)
     }
 
     /// Whether the second side runs from the first one's end to its start, as in a mesh of consistent winding.
@@ -396,7 +397,7 @@ impl Job<'_, '_, '_> {
                 let local = locals[side][0].lerp(locals[side][1], s);
                 let mut at = 4 * side;
                 self.atlas.map.bilinear(self.placement(edge[side]), local.to_array(), |texel, weight| {
-                    (point.texels[at], point.weights[at]) = (texel as u32, sign * weight);
+                    (point.texels[at], point.weights[at]) = (texel.seed(), sign * weight);
                     at += 1;
                 });
                 // Unused entries repeat a used texel, with weight 0.

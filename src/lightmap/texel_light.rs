@@ -20,6 +20,7 @@ use super::atlas::Atlas;
 use super::atlas::chart_index::ChartIndex;
 use super::atlas::chart_map::{ChartMap, receiver_of};
 use super::atlas::charts::Charts;
+use super::atlas::ids::{LightMap, LightTexel, Map, PerTexel, RadianceMap, RadianceTexel, TexelId};
 use super::atlas::texels::TexelSample;
 use super::tiles::TILE;
 use crate::base::error::Result;
@@ -28,7 +29,7 @@ use crate::base::sampling::{combine, orthonormal_basis, sobol_2d};
 use crate::direct::Receiver;
 use crate::direct::direct_light::{DirectLight, Lights, PointLight};
 use crate::direct::shadow_rays::{KINDS, TileRoom};
-use crate::scene::{NONE, Scene};
+use crate::scene::Scene;
 use crate::trace::Ray;
 use glam::{Vec2, Vec3};
 use std::ops::Range;
@@ -55,26 +56,26 @@ const RAISED: f32 = 0.25;
 
 /// Data from which the surface under a texel is found.
 #[derive(Clone, Copy)]
-pub(crate) struct TexelAreas<'a> {
+pub(crate) struct TexelAreas<'a, M: Map> {
     pub scene: &'a Scene,
     pub charts: &'a Charts,
     pub index: &'a ChartIndex,
-    pub map: &'a ChartMap,
+    pub map: &'a ChartMap<M>,
 }
 
 impl Atlas {
     /// Returns the texels of one of the maps as areas.
-    pub(crate) fn areas<'a>(&'a self, map: &'a ChartMap) -> TexelAreas<'a> {
+    pub(crate) fn areas<'a, M: Map>(&'a self, map: &'a ChartMap<M>) -> TexelAreas<'a, M> {
         TexelAreas { scene: &self.scene, charts: &self.charts, index: &self.index, map }
     }
 }
 
-impl TexelAreas<'_> {
+impl<M: Map> TexelAreas<'_, M> {
     /// Returns point `number` of a sequence that is stratified over a texel; `None` if it misses the chart or lies in a
     /// cut-out.
-    pub(crate) fn point(&self, sample: usize, number: u32, seed: u32) -> Option<TexelSample> {
-        let own = &self.map.texels.samples[sample];
-        let placement = &self.map.layout.placements[self.map.placement_of(self.charts, sample) as usize];
+    pub(crate) fn point(&self, texel: TexelId<M>, number: u32, seed: u32) -> Option<TexelSample> {
+        let own = &self.map[texel];
+        let placement = &self.map.layout[self.map.placement_of(self.charts, texel)];
         // The sample of a buried texel lies in another texel; no other points are used.
         let at = Vec2::from(placement.texel_coord(self.charts.local(own.triangle, own.u, own.v)));
         let within = at - Vec2::new(own.x as f32, own.y as f32);
@@ -83,24 +84,24 @@ impl TexelAreas<'_> {
         }
         let [x, y] = sobol_2d(number, combine(seed, 32));
         let local = placement.local([own.x as f32 + x, own.y as f32 + y]);
-        let chart = self.charts.chart_of[own.triangle as usize];
+        let chart = self.charts.chart_of(own.triangle);
         let point = self.index.locate(self.charts, chart, local.into(), own.triangle)?;
         (!self.scene.is_hole(point.triangle, point.u, point.v)).then_some(point)
     }
 
-    /// Returns the sample at an offset of columns and rows in the same placement, if there is one.
-    fn neighbour(&self, sample: usize, dx: i32, dy: i32) -> Option<usize> {
-        let placement = self.map.placement_of(self.charts, sample);
-        let (x, y) = self.map.position(sample);
-        let s = self.map.at(placement, x + dx, y + dy);
-        (s != NONE && self.map.placement_of(self.charts, s as usize) == placement).then_some(s as usize)
+    /// Returns the texel at an offset of columns and rows in the same placement, if there is one.
+    fn neighbour(&self, texel: TexelId<M>, dx: i32, dy: i32) -> Option<TexelId<M>> {
+        let placement = self.map.placement_of(self.charts, texel);
+        let (x, y) = self.map.position(texel);
+        let near = self.map.at(placement, x + dx, y + dy)?;
+        (self.map.placement_of(self.charts, near) == placement).then_some(near)
     }
 }
 
-/// Direct light of texels.
+/// Direct light of texels of map `M`.
 #[derive(Clone, Copy)]
-pub(crate) struct TexelLight<'a> {
-    pub areas: TexelAreas<'a>,
+pub(crate) struct TexelLight<'a, M: Map> {
+    pub areas: TexelAreas<'a, M>,
     pub direct: &'a DirectLight,
     /// Number of samples per texel, as in [`DirectLight::irradiance`].
     pub samples: u32,
@@ -127,10 +128,10 @@ pub(crate) struct TilePoints {
 }
 
 /// Points of a texel that are to be lit.
-struct Wanted {
+struct Wanted<M: Map> {
     /// Place of the texel in its tile.
-    texel: usize,
-    sample: usize,
+    place: usize,
+    texel: TexelId<M>,
     back: bool,
     numbers: Range<u32>,
     lights: Lights,
@@ -139,7 +140,7 @@ struct Wanted {
 /// A texel whose direct light is to be averaged.
 #[derive(Clone, Copy)]
 pub(crate) struct Averaged {
-    pub sample: usize,
+    pub texel: LightTexel,
     pub back: bool,
     /// The texel's sample.
     pub receiver: Receiver,
@@ -148,7 +149,7 @@ pub(crate) struct Averaged {
     pub variation: Variation,
 }
 
-impl TexelLight<'_> {
+impl TexelLight<'_, LightMap> {
     /// Computes light without penumbrae at the sample itself.
     pub(crate) fn sharp(&self, receiver: &Receiver, rays: &mut u64) -> Vec3 {
         if !self.direct.has_sharp() {
@@ -181,13 +182,13 @@ impl TexelLight<'_> {
 
     /// Whether light without penumbrae varies in a texel, judged by its neighbours: `sharp` is the texel's own light,
     /// and `of` returns a neighbour's.
-    pub(crate) fn varies(&self, sample: usize, sharp: Vec3, mut of: impl FnMut(usize) -> Vec3) -> Variation {
+    pub(crate) fn varies(&self, texel: LightTexel, sharp: Vec3, mut of: impl FnMut(LightTexel) -> Vec3) -> Variation {
         if !self.direct.has_sharp() {
             return Variation::None;
         }
         let mut variation = Variation::None;
         for (dx, dy) in AROUND {
-            match self.areas.neighbour(sample, dx, dy) {
+            match self.areas.neighbour(texel, dx, dy) {
                 Some(s) if differ(sharp, of(s), DIFFERENCE) => return Variation::Some,
                 // Diagonal neighbours are missed at every second edge.
                 None if dx == 0 || dy == 0 => variation = Variation::Unknown,
@@ -213,9 +214,9 @@ impl TexelLight<'_> {
             (_, true) => Some(Lights::All),
         };
         let few = |variation| if variation == Variation::Some { MAX_POINTS as u32 } else { FEW };
-        let wanted = |texel: usize, t: &Averaged, numbers| {
+        let wanted = |place: usize, t: &Averaged, numbers| {
             let lights = lights_of(t.variation)?;
-            Some(Wanted { texel, sample: t.sample, back: t.back, numbers, lights })
+            Some(Wanted { place, texel: t.texel, back: t.back, numbers, lights })
         };
         let first = texels.iter().enumerate().filter_map(|(i, t)| wanted(i, t, 0..few(t.variation)));
         tile.clear();
@@ -249,7 +250,7 @@ impl TexelLight<'_> {
         let n = add_to(points, scene, &mut sum, |_| Vec3::ONE, rays);
         if n == Vec3::ZERO {
             // All points miss a small part of a chart: its sample alone is lit.
-            let seed = combine(self.seed, t.sample as u32);
+            let seed = combine(self.seed, t.texel.seed());
             return sharp + self.direct.at_point(&t.receiver, Lights::Soft, self.samples, seed, rays).value();
         }
         let is_even = t.variation == Variation::Unknown
@@ -263,25 +264,27 @@ impl TexelLight<'_> {
         let e = sum.value() / n;
         if t.variation == Variation::None { sharp + e } else { e }
     }
+}
 
+impl TexelLight<'_, RadianceMap> {
     /// Computes direct light of a tile of the radiance map by few points, and the values that decide on a [closer
     /// look](Self::closer_look).
     pub(crate) fn first_look(
         &self,
-        samples: &[u32],
+        texels: &[RadianceTexel],
         tile: &mut TilePoints,
         rays: &mut u64,
         mut out: impl FnMut(usize, Look),
     ) {
         let (scene, map) = (self.areas.scene, self.areas.map);
         tile.clear();
-        tile.light(self, samples.iter().enumerate().map(|(i, &s)| self.all_of(i, s as usize, 0..FEW)), rays);
-        for (i, &sample) in samples.iter().enumerate() {
+        tile.light(self, texels.iter().enumerate().map(|(i, &texel)| self.all_of(i, texel, 0..FEW)), rays);
+        for (i, &texel) in texels.iter().enumerate() {
             let (mut sum, points) = (PointLight::default(), tile.of(i));
             let mut n = add_to(points, scene, &mut sum, |_| Vec3::ONE, rays);
             if points.is_empty() {
-                let (seed, sample) = (combine(self.seed, sample), sample as usize);
-                let (on, receiver) = (map.texels.samples[sample], map.receiver(scene, sample, map.is_back(sample)).1);
+                let seed = combine(self.seed, texel.seed());
+                let (on, receiver) = (map[texel], map.receiver(scene, texel, map.is_back(texel)).1);
                 let light = self.direct.at_point(&receiver, Lights::All, self.samples, seed, rays);
                 n = add_to(&[Point { on, receiver, light }], scene, &mut sum, |_| Vec3::ONE, rays);
             }
@@ -292,17 +295,17 @@ impl TexelLight<'_> {
     }
 
     /// Points of a texel of the radiance map, to be lit by all lights.
-    fn all_of(&self, texel: usize, sample: usize, numbers: Range<u32>) -> Wanted {
-        Wanted { texel, sample, back: self.areas.map.is_back(sample), numbers, lights: Lights::All }
+    fn all_of(&self, place: usize, texel: RadianceTexel, numbers: Range<u32>) -> Wanted<RadianceMap> {
+        Wanted { place, texel, back: self.areas.map.is_back(texel), numbers, lights: Lights::All }
     }
 
     /// Whether a texel of the radiance map needs more points: its first few differ, or its neighbours' light does.
-    pub(crate) fn needs_closer_look<'l>(&self, sample: usize, look_of: impl Fn(usize) -> &'l Look) -> bool {
-        let look = look_of(sample);
+    pub(crate) fn needs_closer_look(&self, texel: RadianceTexel, looks: PerTexel<RadianceMap, Look>) -> bool {
+        let look = &looks[texel];
         look.varies
             || AROUND.into_iter().any(|(dx, dy)| {
-                let near = self.areas.neighbour(sample, dx, dy).map(&look_of);
-                near.is_some_and(|near| differ(look.narrow, near.narrow, RADIANCE_DIFFERENCE))
+                let near = self.areas.neighbour(texel, dx, dy);
+                near.is_some_and(|near| differ(look.narrow, looks[near].narrow, RADIANCE_DIFFERENCE))
             })
     }
 
@@ -310,7 +313,7 @@ impl TexelLight<'_> {
     /// them lies on the chart.
     pub(crate) fn closer_look(
         &self,
-        samples: &[u32],
+        texels: &[RadianceTexel],
         tile: &mut TilePoints,
         albedo: impl Fn(&TexelSample) -> Vec3,
         rays: &mut u64,
@@ -323,19 +326,19 @@ impl TexelLight<'_> {
         let mut has_spikes = [true; TILE];
         for begin in (0..MANY).step_by(MAX_POINTS) {
             let numbers = begin..begin + MAX_POINTS as u32;
-            let wanted = samples.iter().enumerate().filter(|(i, _)| has_spikes[*i]);
+            let wanted = texels.iter().enumerate().filter(|(i, _)| has_spikes[*i]);
             tile.clear();
-            tile.light(self, wanted.map(|(i, &s)| self.all_of(i, s as usize, numbers.clone())), rays);
-            for i in (0..samples.len()).filter(|&i| has_spikes[i]) {
+            tile.light(self, wanted.map(|(i, &texel)| self.all_of(i, texel, numbers.clone())), rays);
+            for i in (0..texels.len()).filter(|&i| has_spikes[i]) {
                 weights[i] += add_to(tile.of(i), scene, &mut sums[i], weight, rays);
             }
             if begin == 0 {
                 for (i, has_spikes) in has_spikes.iter_mut().enumerate() {
-                    *has_spikes = i < samples.len() && spikes(tile.of(i));
+                    *has_spikes = i < texels.len() && spikes(tile.of(i));
                 }
             }
         }
-        for (i, (sum, n)) in sums.iter().zip(weights).take(samples.len()).enumerate() {
+        for (i, (sum, n)) in sums.iter().zip(weights).take(texels.len()).enumerate() {
             out(i, (n != Vec3::ZERO).then(|| sum.value() / n));
         }
     }
@@ -367,32 +370,32 @@ impl TilePoints {
         self.counts.fill(0);
     }
 
-    fn of(&self, texel: usize) -> &[Point] {
-        &self.points[texel * MAX_POINTS..][..self.counts[texel]]
+    fn of(&self, place: usize) -> &[Point] {
+        &self.points[place * MAX_POINTS..][..self.counts[place]]
     }
 
-    fn of_mut(&mut self, texel: usize) -> &mut [Point] {
-        &mut self.points[texel * MAX_POINTS..][..self.counts[texel]]
+    fn of_mut(&mut self, place: usize) -> &mut [Point] {
+        &mut self.points[place * MAX_POINTS..][..self.counts[place]]
     }
 
     /// Lights the wanted points that lie on their charts, and adds them to those of their texels.
-    fn light(&mut self, by: &TexelLight, wanted: impl Iterator<Item = Wanted>, rays: &mut u64) {
+    fn light<M: Map>(&mut self, by: &TexelLight<M>, wanted: impl Iterator<Item = Wanted<M>>, rays: &mut u64) {
         let scene = by.areas.scene;
         let mut shadow = self.room.begin(scene);
         self.pending.clear();
-        for Wanted { texel, sample, back, numbers, lights } in wanted {
+        for Wanted { place, texel, back, numbers, lights } in wanted {
             let samples = by.samples.div_ceil(numbers.len() as u32);
-            let (seed, first) = (combine(by.seed, sample as u32), self.counts[texel]);
+            let (seed, first) = (combine(by.seed, texel.seed()), self.counts[place]);
             let of_round = combine(seed, numbers.start);
             for number in numbers {
-                let Some(on) = by.areas.point(sample, number, seed) else { continue };
+                let Some(on) = by.areas.point(texel, number, seed) else { continue };
                 let receiver = receiver_of(scene, &on, back).1;
-                let (count, place) = (self.counts[texel], texel * MAX_POINTS + self.counts[texel]);
-                shadow.slot = KINDS * place;
+                let (count, at) = (self.counts[place], place * MAX_POINTS + self.counts[place]);
+                shadow.slot = KINDS * at;
                 let light = by.direct.push(&receiver, (count - first) as u32, lights, samples, of_round, &mut shadow);
-                self.points[place] = Point { on, receiver, light };
-                self.pending.push(place as u32);
-                self.counts[texel] += 1;
+                self.points[at] = Point { on, receiver, light };
+                self.pending.push(at as u32);
+                self.counts[place] += 1;
             }
         }
         let arrived = shadow.finish(rays);
@@ -532,12 +535,12 @@ mod tests {
         let atlas = map.atlas();
         let areas = atlas.areas(&atlas.radiance);
         let (mut found, mut other_triangles) = (0, 0);
-        for sample in (0..atlas.radiance.len()).step_by(11) {
-            let own = atlas.radiance.texels.samples[sample];
+        for sample in atlas.radiance.all().step_by(11) {
+            let own = atlas.radiance[sample];
             let placement = atlas.radiance.placement_of(&atlas.charts, sample);
             for number in 0..16 {
                 let Some(p) = areas.point(sample, number, 3) else { continue };
-                assert_eq!(atlas.charts.chart_of[p.triangle as usize], atlas.charts.chart_of[own.triangle as usize]);
+                assert_eq!(atlas.charts.chart_of(p.triangle), atlas.charts.chart_of(own.triangle));
                 let at = atlas.radiance.layout.texel_coord(placement, atlas.charts.local(p.triangle, p.u, p.v));
                 let within = Vec2::from(at) - Vec2::new(own.x as f32, own.y as f32);
                 assert!(within.min_element() > -0.01 && within.max_element() < 1.01, "{within}");

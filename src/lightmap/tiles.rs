@@ -4,6 +4,7 @@
 //! texel, so that a block of texels may be worked on in any order.
 
 use super::atlas::chart_map::ChartMap;
+use super::atlas::ids::{Map, TexelId};
 use crate::base::error::Result;
 use crate::base::memory::try_with_capacity;
 use std::ops::Range;
@@ -21,18 +22,18 @@ pub(crate) fn texels_per_tile(samples: u32) -> usize {
 /// Bits of the width of the squares.
 const WIDTH_BITS: u16 = 3;
 
-/// Returns the samples of a range in the order of squares of 8 × 8 texels, placement by placement: runs of [`TILE`] of
+/// Returns the texels of a range in the order of squares of 8 × 8 texels, placement by placement: runs of [`TILE`] of
 /// them, or of a few times as many, are tiles.
-pub(crate) fn in_order(map: &ChartMap, range: Range<usize>) -> Result<Vec<u32>> {
-    let mut order: Vec<u32> = try_with_capacity(range.len(), "the order of texels")?;
+pub(crate) fn in_order<M: Map>(map: &ChartMap<M>, range: Range<usize>) -> Result<Vec<TexelId<M>>> {
+    let mut order: Vec<TexelId<M>> = try_with_capacity(range.len(), "the order of texels")?;
     let mut begin = range.start;
     while begin < range.end {
         let placement = map.texels.placement_of(begin as u32);
-        let end = map.samples_of(placement).end.min(range.end);
+        let end = map.texels_of(placement).indices().end.min(range.end);
         let first = order.len();
-        order.extend(begin as u32..end as u32);
+        order.extend(TexelId::range(begin..end));
         order[first..].sort_unstable_by_key(|&s| {
-            let texel = &map.texels.samples[s as usize];
+            let texel = &map[s];
             (texel.y >> WIDTH_BITS, texel.x >> WIDTH_BITS, s)
         });
         begin = end;

@@ -9,9 +9,9 @@ use crate::base::error::Result;
 use crate::base::memory::{try_collect, try_to_vec, try_vec, try_with_capacity};
 use crate::base::progress::Progress;
 use crate::lightmap::atlas::Atlas;
+use crate::lightmap::atlas::ids::{GatherTexel, PlacementId};
 use crate::lightmap::atlas::layout::Placement;
 use crate::lightmap::indirect::gather::Gathered;
-use crate::scene::NONE;
 use glam::Vec3;
 use rayon::prelude::*;
 use std::sync::Arc;
@@ -86,11 +86,11 @@ pub(super) struct DirectTile {
 /// The constant part of a block.
 #[derive(Debug)]
 pub(super) struct Tile {
-    pub placement: u32,
+    pub placement: PlacementId,
     /// The block's rectangle in the gather map.
     pub rect: Rect,
     /// Gather texels of the block, by LOD.
-    pub texels: Box<[u32]>,
+    pub texels: Box<[GatherTexel]>,
     /// The texels of LOD l are the first `lod_end[l]`.
     pub lod_end: [u16; MAX_LODS],
     pub centre: Vec3,
@@ -306,7 +306,7 @@ impl BlockMap {
         map.tiles = try_with_capacity(count, STATE)?;
         let mut texels = Vec::with_capacity(BLOCK_TEXELS);
         let stage = progress.stage("blocks", 0.0, 0.02, count as u64);
-        for (number, p) in (0..).zip(placements) {
+        for (number, p) in placements.iter().enumerate() {
             map.first.push(map.tiles.len() as u32);
             let (x, y, w, h) = (p.x as i32, p.y as i32, p.w as i32, p.h as i32);
             let (columns, rows) = ((w + TILE - 1) / TILE, (h + TILE - 1) / TILE);
@@ -314,7 +314,7 @@ impl BlockMap {
             for (i, j) in (0..rows).flat_map(|j| (0..columns).map(move |i| (i, j))) {
                 let (x0, y0) = (x + i * TILE, y + j * TILE);
                 let rect = Rect { x0, y0, x1: (x0 + TILE).min(x + w), y1: (y0 + TILE).min(y + h) };
-                let tile = map.tile(atlas, number, rect, &mut texels)?;
+                let tile = map.tile(atlas, PlacementId::new(number), rect, &mut texels)?;
                 map.tiles.push(tile);
                 stage.advance(1)?;
             }
@@ -330,11 +330,11 @@ impl BlockMap {
             return Ok(Vec::new());
         }
         let mut shown: Vec<Option<Rect>> = try_vec(self.tiles.len(), "where buried texels get their light")?;
-        for sample in (0..atlas.map.len()).filter(|&s| atlas.buried[s]) {
-            let (x, y) = atlas.map.position(sample);
+        for buried in atlas.map.all().filter(|s| atlas.buried[s.index()]) {
+            let (x, y) = atlas.map.position(buried);
             let texel = Rect { x0: x, y0: y, x1: x + 1, y1: y + 1 };
-            let placement = atlas.map.placement_of(&atlas.charts, sample);
-            atlas.gather_around(sample, |s, _| {
+            let placement = atlas.map.placement_of(&atlas.charts, buried);
+            atlas.gather_around(buried, |s, _| {
                 let (gx, gy) = atlas.gather.position(s);
                 let of_block = &mut shown[self.block_at(placement, gx, gy) as usize];
                 *of_block = Some(of_block.map_or(texel, |r| r.union(&texel)));
@@ -344,12 +344,17 @@ impl BlockMap {
     }
 
     /// Makes the block of a rectangle. `texels` is scratch space.
-    fn tile(&mut self, atlas: &Atlas, placement: u32, rect: Rect, texels: &mut Vec<(u8, u32)>) -> Result<Tile> {
+    fn tile(
+        &mut self,
+        atlas: &Atlas,
+        placement: PlacementId,
+        rect: Rect,
+        texels: &mut Vec<(u8, GatherTexel)>,
+    ) -> Result<Tile> {
         texels.clear();
-        texels.extend(rect.texels().filter_map(|(x, y)| {
-            let sample = atlas.gather.at(placement, x, y);
-            (sample != NONE).then(|| (self.lod_at(placement, x, y), sample))
-        }));
+        texels.extend(
+            rect.texels().filter_map(|(x, y)| Some((self.lod_at(placement, x, y), atlas.gather.at(placement, x, y)?))),
+        );
         texels.sort_by_key(|t| t.0);
         // Every block must have light: its first texel is on the lowest LOD if no other texel falls on that grid.
         if let Some(t) = texels.first_mut() {
@@ -357,9 +362,9 @@ impl BlockMap {
         }
         let lod_end = std::array::from_fn(|l| texels.iter().filter(|t| t.0 as usize <= l).count() as u16);
         let mut centre = glam::DVec3::ZERO;
-        for &(lod, sample) in &*texels {
-            self.lod_of[sample as usize] = lod;
-            centre += atlas.gather.texels.samples[sample as usize].position(&atlas.scene).as_dvec3();
+        for &(lod, texel) in &*texels {
+            self.lod_of[texel.index()] = lod;
+            centre += atlas.gather[texel].position(&atlas.scene).as_dvec3();
         }
         let centre = (centre / texels.len().max(1) as f64).as_vec3();
         let map_texels = rect_in_light_map(atlas, placement, &rect).area() as u32;
@@ -368,8 +373,8 @@ impl BlockMap {
     }
 
     /// The LOD on whose grid a texel of the gather map lies.
-    fn lod_at(&self, placement: u32, x: i32, y: i32) -> u8 {
-        let (ox, oy, _) = self.origin[placement as usize];
+    fn lod_at(&self, placement: PlacementId, x: i32, y: i32) -> u8 {
+        let (ox, oy, _) = self.origin[placement.index()];
         let zeros = ((x - ox) | (y - oy)).trailing_zeros();
         self.top - zeros.min(self.top as u32) as u8
     }
@@ -380,30 +385,30 @@ impl BlockMap {
     }
 
     /// Corner of a placement's grid of texels.
-    pub fn origin(&self, placement: u32) -> (i32, i32) {
-        let (x, y, _) = self.origin[placement as usize];
+    pub fn origin(&self, placement: PlacementId) -> (i32, i32) {
+        let (x, y, _) = self.origin[placement.index()];
         (x, y)
     }
 
     /// The block of a texel of the gather map, which must be one of the placement's rectangle; others
     /// are clamped to it.
-    pub fn block_at(&self, placement: u32, x: i32, y: i32) -> u32 {
-        let (ox, oy, columns) = self.origin[placement as usize];
-        let (first, end) = (self.first[placement as usize], self.first[placement as usize + 1]);
+    pub fn block_at(&self, placement: PlacementId, x: i32, y: i32) -> u32 {
+        let (ox, oy, columns) = self.origin[placement.index()];
+        let (first, end) = (self.first[placement.index()], self.first[placement.index() + 1]);
         let rows = (end - first) as i32 / columns.max(1);
         let (i, j) = (((x - ox) / TILE).clamp(0, columns - 1), ((y - oy) / TILE).clamp(0, rows - 1));
         first + (j * columns + i) as u32
     }
 
     /// The blocks of a placement.
-    pub fn of_placement(&self, placement: u32) -> std::ops::Range<u32> {
-        self.first[placement as usize]..self.first[placement as usize + 1]
+    pub fn of_placement(&self, placement: PlacementId) -> std::ops::Range<u32> {
+        self.first[placement.index()]..self.first[placement.index() + 1]
     }
 
     /// The up to eight blocks around a block in its placement.
     pub fn neighbours(&self, b: u32) -> impl Iterator<Item = u32> + '_ {
         let tile = &self.tiles[b as usize];
-        let (_, _, columns) = self.origin[tile.placement as usize];
+        let (_, _, columns) = self.origin[tile.placement.index()];
         let range = self.of_placement(tile.placement);
         let rows = (range.end - range.start) as i32 / columns.max(1);
         let at = (b - range.start) as i32;
@@ -416,11 +421,11 @@ impl BlockMap {
     }
 
     /// The rectangle of the light map that shows a rectangle of a placement's gather texels, buried texels included.
-    pub fn shown_in_light_map(&self, placement: u32, rect: &Rect) -> Rect {
+    pub fn shown_in_light_map(&self, placement: PlacementId, rect: &Rect) -> Rect {
         let mut shown = self.rect_in_light_map(placement, rect);
         if !self.shown_elsewhere.is_empty() {
-            let (_, _, columns) = self.origin[placement as usize];
-            let first = self.first[placement as usize] as i32;
+            let (_, _, columns) = self.origin[placement.index()];
+            let first = self.first[placement.index()] as i32;
             let [low, high] = [(rect.x0, rect.y0), (rect.x1 - 1, rect.y1 - 1)]
                 .map(|(x, y)| self.block_at(placement, x, y) as i32 - first);
             for j in low / columns..=high / columns {
@@ -436,7 +441,7 @@ impl BlockMap {
 
     /// The rectangle of the light map in which a rectangle of a placement's gather texels lies: the smallest that
     /// contains them all, within the placement's own rectangle.
-    pub fn rect_in_light_map(&self, placement: u32, rect: &Rect) -> Rect {
+    pub fn rect_in_light_map(&self, placement: PlacementId, rect: &Rect) -> Rect {
         rect_in_light_map(&self.atlas, placement, rect)
     }
 
@@ -448,9 +453,9 @@ impl BlockMap {
     }
 }
 
-fn rect_in_light_map(atlas: &Atlas, placement: u32, rect: &Rect) -> Rect {
-    let gather = &atlas.gather.layout.placements[placement as usize];
-    let map = &atlas.map.layout.placements[placement as usize];
+fn rect_in_light_map(atlas: &Atlas, placement: PlacementId, rect: &Rect) -> Rect {
+    let gather = &atlas.gather.layout[placement];
+    let map = &atlas.map.layout[placement];
     let corner = |x: i32, y: i32| {
         let at = [x as f32, y as f32];
         let mut local: [f32; 2] = std::array::from_fn(|k| (at[k] - gather.offset[k]) / gather.scale[k]);
@@ -498,7 +503,7 @@ mod tests {
             let map = BlockMap::new(lightmap.atlas(), 3, &Progress::none()).unwrap();
             assert!(!map.tiles.is_empty());
             for tile in &map.tiles {
-                let whole = Rect::of(&map.atlas.map.layout.placements[tile.placement as usize]);
+                let whole = Rect::of(&map.atlas.map.layout[tile.placement]);
                 for grown in [0, 1, 20, 1 << 20] {
                     let r = map.rect_in_light_map(tile.placement, &tile.rect.grown(grown));
                     assert!(r.area() > 0 && r.clipped(&whole) == r, "{far}: {r:?} is not within {whole:?}");

@@ -9,8 +9,8 @@ use super::relight::Illumination;
 use super::{SHOWN_AT_ONCE, in_parts};
 use crate::base::error::{Error, Result};
 use crate::base::memory::{try_filled, try_to_vec, try_vec, try_with_capacity};
+use crate::lightmap::atlas::ids::{GatherTexel, LightTexel, PerTexel, PlacementId};
 use crate::lightmap::indirect::blur::{Texels, Window};
-use crate::scene::NONE;
 use glam::Vec3;
 use rayon::prelude::*;
 use std::sync::Arc;
@@ -61,7 +61,7 @@ pub(super) struct Display {
 }
 
 /// A new value of a texel of the display.
-type NewValue = (u32, Vec3);
+type NewValue = (GatherTexel, Vec3);
 
 /// Number of blocks whose texels get new values at a time.
 const BLOCKS_AT_ONCE: usize = 256;
@@ -72,7 +72,7 @@ struct Scratch {
     /// Blocks that interpolate, and blocks that are filled.
     all: Vec<u32>,
     to_fill: Vec<u32>,
-    /// New values by block, in slots of equal size. A slot that is not full ends with the sample [`NONE`].
+    /// New values by block, in slots of equal size. A slot that is not full ends with the texel [`NONE`](GatherTexel::NONE).
     values: Vec<NewValue>,
 }
 
@@ -109,14 +109,17 @@ fn compute_values<B: Copy + Sync>(
         let mut slot = Slot { room, used: 0 };
         compute(b, &mut slot);
         if let Some(end) = slot.room.get_mut(slot.used) {
-            end.0 = NONE;
+            end.0 = GatherTexel::NONE;
         }
     });
 }
 
 /// The values that [`compute_values`] has computed for the first `blocks` blocks.
 fn computed(values: &[NewValue], slot: usize, blocks: usize) -> impl Iterator<Item = NewValue> {
-    values.chunks(slot).take(blocks).flat_map(|of_block| of_block.iter().copied().take_while(|v| v.0 != NONE))
+    values
+        .chunks(slot)
+        .take(blocks)
+        .flat_map(|of_block| of_block.iter().copied().take_while(|v| v.0 != GatherTexel::NONE))
 }
 
 /// Buffer for the new values of one block.
@@ -126,8 +129,8 @@ struct Slot<'a> {
 }
 
 impl Slot<'_> {
-    fn put(&mut self, sample: u32, value: Vec3) {
-        self.room[self.used] = (sample, value);
+    fn put(&mut self, texel: GatherTexel, value: Vec3) {
+        self.room[self.used] = (texel, value);
         self.used += 1;
     }
 }
@@ -146,7 +149,7 @@ impl Display {
         let mut normals = try_vec(n, "the gather map's normals")?;
         atlas.scene.device().install(|| {
             normals.par_iter_mut().enumerate().for_each(|(i, normal): (usize, &mut Vec3)| {
-                *normal = atlas.receiver(&atlas.gather, &[], i).normal;
+                *normal = atlas.receiver(&atlas.gather, &[], GatherTexel::new(i)).normal;
             });
         });
         let blur = blur as i32;
@@ -236,8 +239,8 @@ impl Display {
             self.fresh[b as usize] = fresh;
             for i in 0..tile.lod_end[fresh as usize] as usize {
                 if let Some(value) = block.estimate(i) {
-                    self.plain[tile.texels[i] as usize] = value;
-                    self.variances[tile.texels[i] as usize] = block.variance(i);
+                    self.plain[tile.texels[i].index()] = value;
+                    self.variances[tile.texels[i].index()] = block.variance(i);
                 }
                 self.note_visible(b, tile.texels[i], block.is_visible(i));
             }
@@ -263,9 +266,9 @@ impl Display {
         // after the other.
         for some in all.chunks(BLOCKS_AT_ONCE) {
             compute_values(values, BLOCK_TEXELS, some, |b, slot| self.interpolate_block(map, b, slot));
-            for (sample, value) in computed(values, BLOCK_TEXELS, some.len()) {
-                self.plain[sample as usize] = value;
-                self.variances[sample as usize] = f32::INFINITY;
+            for (texel, value) in computed(values, BLOCK_TEXELS, some.len()) {
+                self.plain[texel.index()] = value;
+                self.variances[texel.index()] = f32::INFINITY;
             }
         }
 
@@ -279,8 +282,8 @@ impl Display {
         // Only texels that can be seen are read, and these are not filled.
         for some in to_fill.chunks(BLOCKS_AT_ONCE) {
             compute_values(values, BLOCK_TEXELS, some, |b, slot| self.fill(map, b, slot));
-            for (sample, value) in computed(values, BLOCK_TEXELS, some.len()) {
-                self.plain[sample as usize] = value;
+            for (texel, value) in computed(values, BLOCK_TEXELS, some.len()) {
+                self.plain[texel.index()] = value;
             }
         }
 
@@ -299,11 +302,11 @@ impl Display {
                 // Blocks that fade reach their values by fading.
                 let is_still = |&(x, y): &(i32, i32)| self.fades[map.block_at(placement, x, y) as usize] == 0;
                 let at = |(x, y)| map.atlas.gather.at(placement, x, y);
-                let samples = rect.texels().filter(is_still).map(at).filter(|&s| s != NONE);
-                samples.for_each(|s| slot.put(s, self.blurred(map, &mut window, s as usize)));
+                let texels = rect.texels().filter(is_still).filter_map(at);
+                texels.for_each(|s| slot.put(s, self.blurred(map, &mut window, s)));
             });
-            for (sample, value) in computed(values, slot_size, some.len()) {
-                self.shown[sample as usize] = value;
+            for (texel, value) in computed(values, slot_size, some.len()) {
+                self.shown[texel.index()] = value;
             }
         }
         // A texel of the light map interpolates between four texels of the gather map.
@@ -315,15 +318,16 @@ impl Display {
     /// Interpolates the indirect light of a block's texels above the LOD that has current light.
     fn interpolate_block(&self, map: &BlockMap, b: u32, slot: &mut Slot) {
         let (tile, lod) = (&map.tiles[b as usize], self.fresh[b as usize]);
-        let known = |s: u32, x, y| map.lod_of[s as usize] <= self.fresh[map.block_at(tile.placement, x, y) as usize];
-        let value = |s: u32| {
+        let known =
+            |s: GatherTexel, x, y| map.lod_of[s.index()] <= self.fresh[map.block_at(tile.placement, x, y) as usize];
+        let value = |s: GatherTexel| {
             if self.old.is_empty() {
-                return self.interpolate(map, b, lod, s, known, |s| self.plain[s]);
+                return self.interpolate(map, b, lod, s, known, |s| self.plain[s.index()]);
             }
             // Adds the change of the surroundings; where the sum would be negative, scales by their relative change
             // instead: nothing goes black because its surroundings lost more light than it had.
-            let around = |of: &[Vec3]| self.interpolate(map, b, lod, s, known, |s| of[s]);
-            let (old, before, now) = (self.old[s as usize], around(&self.old), around(&self.plain));
+            let around = |of: &[Vec3]| self.interpolate(map, b, lod, s, known, |s| of[s.index()]);
+            let (old, before, now) = (self.old[s.index()], around(&self.old), around(&self.plain));
             let sum = old + (now - before);
             Vec3::select(sum.cmpge(Vec3::ZERO), sum, old * now / before.max(Vec3::splat(f32::MIN_POSITIVE)))
         };
@@ -363,8 +367,8 @@ impl Display {
         let mut scratch = std::mem::take(&mut self.scratch);
         for some in blocks.chunks(BLOCKS_AT_ONCE) {
             compute_values(&mut scratch.values, BLOCK_TEXELS, some, |b, slot| self.fade_block(map, b, slot));
-            for (sample, value) in computed(&scratch.values, BLOCK_TEXELS, some.len()) {
-                self.shown[sample as usize] = value;
+            for (texel, value) in computed(&scratch.values, BLOCK_TEXELS, some.len()) {
+                self.shown[texel.index()] = value;
             }
         }
         self.scratch = scratch;
@@ -376,27 +380,27 @@ impl Display {
         let mut window = Window::new(self.blur);
         let part = 1.0 / self.fades[b as usize] as f32;
         for &s in &map.tiles[b as usize].texels {
-            let (shown, goal) = (self.shown[s as usize], self.blurred(map, &mut window, s as usize));
+            let (shown, goal) = (self.shown[s.index()], self.blurred(map, &mut window, s));
             // The last step must leave no rounding error.
             slot.put(s, if part == 1.0 { goal } else { shown + (goal - shown) * part });
         }
     }
 
-    fn blurred(&self, map: &BlockMap, window: &mut Window, sample: usize) -> Vec3 {
-        if self.blur == 0 || !self.visible[sample] {
-            return self.plain[sample];
+    fn blurred(&self, map: &BlockMap, window: &mut Window, texel: GatherTexel) -> Vec3 {
+        if self.blur == 0 || !self.visible[texel.index()] {
+            return self.plain[texel.index()];
         }
         let atlas = &map.atlas;
         let texels =
             Texels { values: &self.plain, variances: &self.variances, valid: &self.visible, normals: &self.normals };
-        window.blur(&atlas.charts, &atlas.gather, sample, texels)
+        window.blur(&atlas.charts, &atlas.gather, texel, texels)
     }
 
-    fn note_visible(&mut self, b: u32, sample: u32, visible: bool) {
-        if self.visible[sample as usize] == visible {
+    fn note_visible(&mut self, b: u32, texel: GatherTexel, visible: bool) {
+        if self.visible[texel.index()] == visible {
             return;
         }
-        self.visible[sample as usize] = visible;
+        self.visible[texel.index()] = visible;
         let unseen = &mut self.unseen[b as usize];
         if visible {
             *unseen -= 1;
@@ -408,9 +412,9 @@ impl Display {
     }
 
     /// The texels of a block that cannot be seen.
-    fn unseen_of<'a>(&'a self, map: &'a BlockMap, b: u32) -> impl Iterator<Item = u32> + 'a {
+    fn unseen_of<'a>(&'a self, map: &'a BlockMap, b: u32) -> impl Iterator<Item = GatherTexel> + 'a {
         let texels = if self.unseen[b as usize] > 0 { &map.tiles[b as usize].texels[..] } else { &[] };
-        texels.iter().copied().filter(|&s| !self.visible[s as usize])
+        texels.iter().copied().filter(|&s| !self.visible[s.index()])
     }
 
     /// Value of a texel that has no value of its own at LOD `lod`: bilinear between the corners of that LOD's grid that
@@ -420,12 +424,12 @@ impl Display {
         map: &BlockMap,
         b: u32,
         lod: u8,
-        sample: u32,
-        known: impl Fn(u32, i32, i32) -> bool,
-        values: impl Fn(usize) -> Vec3,
+        texel: GatherTexel,
+        known: impl Fn(GatherTexel, i32, i32) -> bool,
+        values: impl Fn(GatherTexel) -> Vec3,
     ) -> Vec3 {
         let (tile, gather) = (&map.tiles[b as usize], &map.atlas.gather);
-        let (x, y) = gather.position(sample as usize);
+        let (x, y) = gather.position(texel);
         let (ox, oy) = map.origin(tile.placement);
         let step = 1 << (map.top() - lod);
         let (x0, y0) = (x - (x - ox) % step, y - (y - oy) % step);
@@ -437,9 +441,12 @@ impl Display {
             (x0, y0 + step, (1.0 - fx) * fy),
             (x0 + step, y0 + step, fx * fy),
         ] {
-            let s = gather.at(tile.placement, cx, cy);
-            if w > 0.0 && s != NONE && self.visible[s as usize] && known(s, cx, cy) {
-                sum += w * values(s as usize);
+            if w > 0.0
+                && let Some(s) = gather.at(tile.placement, cx, cy)
+                && self.visible[s.index()]
+                && known(s, cx, cy)
+            {
+                sum += w * values(s);
                 total += w;
             }
         }
@@ -447,10 +454,10 @@ impl Display {
             return sum / total;
         }
         for &s in &tile.texels[..tile.lod_end[lod as usize] as usize] {
-            let (sx, sy) = gather.position(s as usize);
-            let weight = if self.visible[s as usize] { 1.0 } else { 1e-3 };
+            let (sx, sy) = gather.position(s);
+            let weight = if self.visible[s.index()] { 1.0 } else { 1e-3 };
             let w = weight / ((sx - x).pow(2) + (sy - y).pow(2)).max(1) as f32;
-            sum += w * values(s as usize);
+            sum += w * values(s);
             total += w;
         }
         if total > 0.0 { sum / total } else { Vec3::ZERO }
@@ -484,8 +491,8 @@ impl Display {
         let Scratch { all, values, .. } = &mut scratch;
         for &b in changed {
             let values = blocks.work_mut(b).map(|w| std::mem::take(&mut w.new_coarse)).unwrap_or_default();
-            for (&sample, value) in map.tiles[b as usize].texels.iter().zip(values) {
-                self.coarse[sample as usize] = value;
+            for (&texel, value) in map.tiles[b as usize].texels.iter().zip(values) {
+                self.coarse[texel.index()] = value;
             }
         }
         all.clear();
@@ -494,8 +501,8 @@ impl Display {
         all.dedup();
         for some in all.chunks(BLOCKS_AT_ONCE) {
             compute_values(values, BLOCK_TEXELS, some, |b, slot| self.interpolate_coarse(map, b, slot));
-            for (sample, value) in computed(values, BLOCK_TEXELS, some.len()) {
-                self.coarse[sample as usize] = value;
+            for (texel, value) in computed(values, BLOCK_TEXELS, some.len()) {
+                self.coarse[texel.index()] = value;
             }
         }
         all.iter().for_each(|&b| note(self.block_rect(map, b)));
@@ -505,8 +512,8 @@ impl Display {
     /// Interpolates the coarse direct light of a block's texels above the lowest LOD.
     fn interpolate_coarse(&self, map: &BlockMap, b: u32, slot: &mut Slot) {
         let tile = &map.tiles[b as usize];
-        let lowest = |s: u32, _, _| map.lod_of[s as usize] == 0;
-        let value = |s: u32| self.interpolate(map, b, 0, s, lowest, |s| self.coarse[s]);
+        let lowest = |s: GatherTexel, _, _| map.lod_of[s.index()] == 0;
+        let value = |s: GatherTexel| self.interpolate(map, b, 0, s, lowest, |s| self.coarse[s.index()]);
         tile.texels[tile.lod_end[0] as usize..].iter().for_each(|&s| slot.put(s, value(s)));
     }
 
@@ -515,7 +522,7 @@ impl Display {
     pub fn take_direct(&mut self, map: &BlockMap, b: u32, tile: DirectTile) -> (Changed, isize) {
         if !self.coarse_of_tile.is_empty() {
             for &s in &map.tiles[b as usize].texels {
-                self.coarse_of_tile[s as usize] = self.coarse[s as usize];
+                self.coarse_of_tile[s.index()] = self.coarse[s.index()];
             }
         }
         self.tile_epochs[b as usize] = self.epoch;
@@ -540,7 +547,7 @@ impl Display {
     fn fill(&self, map: &BlockMap, b: u32, slot: &mut Slot) {
         let tile = &map.tiles[b as usize];
         // Texels in ascending order, with the ring that filled them; 0: not filled yet.
-        let mut room = [(NONE, 0, Vec3::ZERO); 9 * BLOCK_TEXELS];
+        let mut room = [(GatherTexel::NONE, 0, Vec3::ZERO); 9 * BLOCK_TEXELS];
         let mut count = 0;
         for s in map.neighbours(b).chain([b]).flat_map(|b| self.unseen_of(map, b)) {
             room[count].0 = s;
@@ -555,15 +562,12 @@ impl Display {
                 if filled_by > 0 {
                     continue;
                 }
-                let (x, y) = map.atlas.gather.position(s as usize);
+                let (x, y) = map.atlas.gather.position(s);
                 let (mut sum, mut n) = (Vec3::ZERO, 0.0);
                 for (nx, ny) in (-1..=1).flat_map(|dy| (-1..=1).map(move |dx| (x + dx, y + dy))) {
-                    let t = map.atlas.gather.at(tile.placement, nx, ny);
-                    if t == NONE {
-                        continue;
-                    }
-                    let value = if self.visible[t as usize] {
-                        Some(self.plain[t as usize])
+                    let Some(t) = map.atlas.gather.at(tile.placement, nx, ny) else { continue };
+                    let value = if self.visible[t.index()] {
+                        Some(self.plain[t.index()])
                     } else {
                         let known = missing.binary_search_by_key(&t, |m| m.0).ok().map(|i| missing[i]);
                         known.filter(|m| (1..ring).contains(&m.1)).map(|m| m.2)
@@ -590,20 +594,20 @@ impl Display {
         }
     }
 
-    /// Irradiance shown at a sample of the light map; `with_direct` false: indirect light alone.
-    pub fn irradiance(&self, map: &BlockMap, light: &Illumination, sample: u32, with_direct: bool) -> Vec3 {
+    /// Irradiance shown at a texel of the light map; `with_direct` false: indirect light alone.
+    pub fn irradiance(&self, map: &BlockMap, light: &Illumination, texel: LightTexel, with_direct: bool) -> Vec3 {
         let atlas = &map.atlas;
-        let indirect = light.sides.upsampling.at(atlas, &self.shown, &light.own, sample as usize);
+        let indirect = light.sides.upsampling.at(atlas, PerTexel::new(&self.shown), &light.own, texel);
         if !with_direct {
             return indirect;
         }
-        let placement = atlas.map.placement_of(&atlas.charts, sample as usize);
-        let local = atlas.texel_local(placement, sample as usize);
+        let placement = atlas.map.placement_of(&atlas.charts, texel);
+        let local = atlas.texel_local(placement, texel);
         // Coordinates are not negative, so truncation rounds down.
         let at = atlas.gather.layout.texel_coord(placement, local);
         let b = map.block_at(placement, at[0] as i32, at[1] as i32) as usize;
         let fine = self.tiles[b].as_ref().and_then(|tile| {
-            let (x, y) = atlas.map.position(sample as usize);
+            let (x, y) = atlas.map.position(texel);
             let r = &tile.rect;
             let inside = x >= r.x0 && x < r.x1 && y >= r.y0 && y < r.y1;
             inside.then(|| tile.values[(y - r.y0) as usize * r.width() + (x - r.x0) as usize]).filter(|v| v.is_finite())
@@ -614,7 +618,7 @@ impl Display {
                 Some(old) => (old + self.change_of_direct(map, placement, local, b)).max(Vec3::ZERO),
                 None => {
                     let mut coarse = Vec3::ZERO;
-                    atlas.gather.bilinear(placement, local, |s, w| coarse += w * self.coarse[s]);
+                    atlas.gather.bilinear(placement, local, |s, w| coarse += w * self.coarse[s.index()]);
                     coarse
                 }
             }
@@ -622,14 +626,14 @@ impl Display {
 
     /// Change of the coarse direct light around a point since the tile of its block was made. Neighbours whose tiles
     /// were made in other epochs do not contribute.
-    fn change_of_direct(&self, map: &BlockMap, placement: u32, local: [f32; 2], b: usize) -> Vec3 {
+    fn change_of_direct(&self, map: &BlockMap, placement: PlacementId, local: [f32; 2], b: usize) -> Vec3 {
         let gather = &map.atlas.gather;
         let (mut sum, mut total) = (Vec3::ZERO, 0.0);
         gather.bilinear(placement, local, |s, w| {
             let (x, y) = gather.position(s);
             let of = map.block_at(placement, x, y) as usize;
             if of == b || (self.tiles[of].is_some() && self.tile_epochs[of] == self.tile_epochs[b]) {
-                sum += w * (self.coarse[s] - self.coarse_of_tile[s]);
+                sum += w * (self.coarse[s.index()] - self.coarse_of_tile[s.index()]);
                 total += w;
             }
         });
@@ -641,18 +645,19 @@ fn copy_of<T: Clone>(of: &[T]) -> Result<Vec<T>> {
     try_to_vec(of, "a copy of shown light")
 }
 
-fn own_rect(map: &BlockMap, placement: u32) -> Rect {
-    Rect::of(&map.atlas.gather.layout.placements[placement as usize])
+fn own_rect(map: &BlockMap, placement: PlacementId) -> Rect {
+    Rect::of(&map.atlas.gather.layout[placement])
 }
 
 /// The rectangle of the light map that shows a rectangle of a placement's gather texels, the padding around it
 /// included.
-fn in_light_map(map: &BlockMap, placement: u32, rect: &Rect) -> Changed {
+fn in_light_map(map: &BlockMap, placement: PlacementId, rect: &Rect) -> Changed {
     let layout = &map.atlas.map.layout;
     let padding = map.atlas.padding as i32;
-    let place = &layout.placements[placement as usize];
+    let place = &layout[placement];
     // The padding of packed charts lies in their rectangles, that of given charts around them.
-    let shown = if placement < layout.given { Rect::of(place).grown(padding) } else { Rect::of(place) };
+    let shown =
+        if placement.index() < layout.given as usize { Rect::of(place).grown(padding) } else { Rect::of(place) };
     let size = layout.page_size as i32;
     let page = Rect { x0: 0, y0: 0, x1: size, y1: size };
     let rect = map.shown_in_light_map(placement, rect).grown(padding).clipped(&shown).clipped(&page);

@@ -6,6 +6,7 @@ use super::lists::Lists;
 use super::{CellInfo, Live, NO_LOD, PageRect};
 use crate::base::error::{Result, invalid_argument};
 use crate::base::memory::{try_append, try_vec, try_with_capacity};
+use crate::lightmap::atlas::ids::LightTexel;
 use crate::lightmap::atlas::texels::PageArea;
 use glam::Vec3;
 use rayon::prelude::*;
@@ -115,7 +116,7 @@ impl Live {
         let atlas = &map.atlas;
         let area = PageArea { columns: rows.x0..rows.x1, rows: rows.y0..rows.y1 };
         let groups = self.bins.groups(page, &area)?.into_iter().map(|g| g as usize);
-        let value = |sample: u32| display.irradiance(map, light, sample, with_direct).to_array();
+        let value = |i: u32| display.irradiance(map, light, LightTexel::new(i as usize), with_direct).to_array();
         atlas.map.texels.compose(groups, &area, atlas.padding, out, value, |v| v)
     }
 }
@@ -169,7 +170,7 @@ impl Live {
         for (b, tile) in (0..).zip(&self.context.map.tiles) {
             let gathered = self.blocks.work(b).map_or(&[][..], |w| &w.gathered);
             for (&s, g) in tile.texels.iter().zip(gathered) {
-                sums[s as usize] = (g.sum.to_array(), g.rays);
+                sums[s.index()] = (g.sum.to_array(), g.rays);
             }
         }
         Ok(sums)

@@ -78,7 +78,7 @@ fn illuminate(
         Some(sides) => sides,
         None => {
             let backs = bake.backs(&radiance.values)?;
-            let placements = if has_indirect { atlas.map.layout.placements.len() as u32 } else { 0 };
+            let placements = if has_indirect { atlas.map.layout.placements.len() } else { 0 };
             let upsampling = bake.upsampling(&backs, 0..placements)?;
             Arc::new(Sides { backs, upsampling })
         }
@@ -296,7 +296,7 @@ impl Live {
     pub(super) fn keep_direct_of_same_sides(&mut self, before: &Illumination) {
         let light = self.context.light.clone();
         for (b, tile) in (0u32..).zip(&self.context.map.tiles) {
-            let chart = self.context.map.atlas.gather.layout.chart_of(tile.placement) as usize;
+            let chart = self.context.map.atlas.gather.layout.chart_of(tile.placement).index();
             if before.sides.backs.get(chart) != light.sides.backs.get(chart) {
                 continue;
             }

@@ -209,7 +209,7 @@ impl Live {
             progress.check()?;
         }
         for tiles in self.context.map.tiles.chunks(PIECE / 64) {
-            tiles.iter().flat_map(|t| t.texels.iter()).for_each(|&t| h.word(t as u64));
+            tiles.iter().flat_map(|t| t.texels.iter()).for_each(|&t| h.word(t.index() as u64));
             progress.check()?;
         }
         Ok(h.0)

@@ -5,7 +5,7 @@ use super::LiveCamera;
 use super::blocks::BlockMap;
 use crate::base::memory::{try_vec, try_with_capacity};
 use crate::base::sampling::{combine, sobol_2d};
-use crate::scene::NONE;
+use crate::lightmap::atlas::ids::ChartId;
 use crate::trace::{PACKET_SIZE, Packet, RawHit};
 use glam::Vec3;
 
@@ -92,8 +92,8 @@ fn block_of(map: &BlockMap, hit: &RawHit) -> Option<u32> {
         return None;
     }
     let atlas = &map.atlas;
-    let chart = atlas.charts.chart_of[hit.triangle as usize];
-    if chart == NONE {
+    let chart = atlas.charts.chart_of(hit.triangle);
+    if chart == ChartId::NONE {
         return None;
     }
     let placement = atlas.gather.layout.place_of(chart, hit.front);
@@ -130,6 +130,7 @@ impl LiveCamera {
 mod tests {
     use super::*;
     use crate::base::progress::Progress;
+    use crate::lightmap::atlas::ids::PlacementId;
     use crate::lightmap::{Lightmap, LightmapDesc};
     use crate::scene::shapes::MeshBuilder;
     use crate::scene::{Material, SceneData};
@@ -149,7 +150,7 @@ mod tests {
             let desc = LightmapDesc { texels_per_unit: 16.0, both_sides, ..Default::default() };
             let lightmap = Lightmap::create(&scene, &desc, &Progress::none()).unwrap();
             let map = BlockMap::new(lightmap.atlas(), 3, &Progress::none()).unwrap();
-            let chart = lightmap.atlas().charts.chart_of[0];
+            let chart = lightmap.atlas().charts.chart_of(0);
             let [above, below] = [1.0, -1.0].map(|z| {
                 let hit = scene.intersect_raw(&Ray::new(Vec3::new(0.3, 0.4, z), Vec3::Z * -z));
                 let tile = &map.tiles[block_of(&map, &hit).unwrap() as usize];
@@ -157,8 +158,9 @@ mod tests {
                 assert!(near < 1.5, "a block is 2 m wide, and {near} m away");
                 tile.placement
             });
-            assert_eq!(above, chart);
-            assert_eq!(Some(below).filter(|&b| b != chart), map.atlas.gather.layout.back(chart));
+            let front = PlacementId::front_of(chart);
+            assert_eq!(above, front);
+            assert_eq!(Some(below).filter(|&b| b != front), map.atlas.gather.layout.back(chart));
             assert_eq!(above != below, both_sides);
         }
     }

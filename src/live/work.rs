@@ -8,11 +8,11 @@ use super::relight::Illumination;
 use crate::base::error::{Error, Result};
 use crate::base::memory::{try_collect, try_filled};
 use crate::base::sampling::combine;
+use crate::lightmap::atlas::ids::{GatherTexel, LightTexel};
 use crate::lightmap::indirect::gather::Gathered;
-use crate::lightmap::indirect::radiance_map::RadianceMap;
+use crate::lightmap::indirect::radiance_map::RadianceLookup;
 use crate::lightmap::indirect::sample_set::{ROUND, SampleSet};
 use crate::lightmap::texel_light::{Averaged, TexelLight, TilePoints};
-use crate::scene::NONE;
 use glam::Vec3;
 use std::sync::Arc;
 use std::sync::atomic::{AtomicBool, AtomicU64, Ordering::Relaxed};
@@ -229,7 +229,7 @@ impl Block {
             return false;
         }
         let atlas = &c.map.atlas;
-        let lookup = RadianceMap::new(&atlas.charts, &atlas.radiance, &c.light.radiance);
+        let lookup = RadianceLookup::new(&atlas.charts, &atlas.radiance, &c.light.radiance);
         let end = tile.lod_end[lod as usize];
         let work = &mut self.work;
         let missing = (end as usize).saturating_sub(work.gathered.len());
@@ -239,18 +239,18 @@ impl Block {
         }
         while work.cursor < end {
             let i = work.cursor as usize;
-            let sample = tile.texels[i];
+            let texel = tile.texels[i];
             if work.gathered.len() <= i {
                 work.gathered.push(Gathered::default());
             }
-            let receiver = atlas.receiver(&atlas.gather, &c.light.sides.backs, sample as usize);
+            let receiver = atlas.receiver(&atlas.gather, &c.light.sides.backs, texel);
             while work.gathered[i].rays < rounds * ROUND as u32 {
                 if limit.reached() {
                     return false;
                 }
                 let before = work.gathered[i];
                 let round = (before.rays as usize) / ROUND;
-                let seed = combine(c.gather_seed, sample);
+                let seed = combine(c.gather_seed, texel.seed());
                 let rays = work.gathered[i].add_round(&atlas.scene, &lookup, &receiver, &c.samples, round, seed);
                 work.note_deviation(&before, i);
                 limit.traced.fetch_add(rays, Relaxed);
@@ -314,9 +314,9 @@ impl Block {
     pub fn work_on_coarse(&mut self, c: &Context, tile: &Tile, limit: &Limit) -> bool {
         let (atlas, mut rays) = (&c.map.atlas, 0);
         let samples = c.direct_samples.min(COARSE_SAMPLES);
-        let value = |&s: &u32| {
-            let receiver = atlas.receiver(&atlas.gather, &c.light.sides.backs, s as usize);
-            c.light.direct.irradiance(&receiver, samples, combine(c.direct_seed, s), &mut rays)
+        let value = |&texel: &GatherTexel| {
+            let receiver = atlas.receiver(&atlas.gather, &c.light.sides.backs, texel);
+            c.light.direct.irradiance(&receiver, samples, combine(c.direct_seed, texel.seed()), &mut rays)
         };
         let values = try_collect(tile.texels[..tile.lod_end[0] as usize].iter().map(value), "coarse direct light");
         let Some(values) = limit.granted(values) else { return false };
@@ -411,18 +411,16 @@ impl BlockWork {
     }
 }
 
-/// The sample of a texel of the light map; `None` if the texel is not the block's.
-pub(super) fn owns(c: &Context, tile: &Tile, x: i32, y: i32) -> Option<u32> {
+/// The texel of the light map at a column and row of a block's page; `None` if it is not the block's.
+pub(super) fn owns(c: &Context, tile: &Tile, x: i32, y: i32) -> Option<LightTexel> {
     let a = &c.map.atlas;
-    let sample = a.map.at(tile.placement, x, y);
-    if sample == NONE || a.map.placement_of(&a.charts, sample as usize) != tile.placement {
-        return None;
-    }
-    let at = a.gather.layout.texel_coord(tile.placement, a.texel_local(tile.placement, sample as usize));
+    let at = a.map.at(tile.placement, x, y);
+    let texel = at.filter(|&texel| a.map.placement_of(&a.charts, texel) == tile.placement)?;
+    let at = a.gather.layout.texel_coord(tile.placement, a.texel_local(tile.placement, texel));
     // Includes one texel around the block's own, so that rounding leaves no gaps between blocks.
     let own = tile.rect.grown(1);
     let (gx, gy) = (at[0].floor() as i32, at[1].floor() as i32);
-    (gx >= own.x0 && gx < own.x1 && gy >= own.y0 && gy < own.y1).then_some(sample)
+    (gx >= own.x0 && gx < own.x1 && gy >= own.y0 && gy < own.y1).then_some(texel)
 }
 
 /// Direct light of a texel of the light map; `None` if the texel is not the block's; infinite if it is inside a solid.
@@ -435,14 +433,14 @@ fn direct_texel(
     points: &mut TilePoints,
     rays: &mut u64,
 ) -> Option<Vec3> {
-    let (a, sample) = (&c.map.atlas, owns(c, tile, x, y)?);
+    let (a, texel) = (&c.map.atlas, owns(c, tile, x, y)?);
     let backs = &c.light.sides.backs;
-    let receiver = a.receiver(&a.map, backs, sample as usize);
+    let receiver = a.receiver(&a.map, backs, texel);
     let texels =
         TexelLight { areas: a.areas(&a.map), direct: &c.light.direct, samples: c.direct_samples, seed: c.direct_seed };
     // Light without penumbrae of texels that are needed as neighbours too is computed once per tile.
     let known = work.tile.rect.grown(1);
-    let mut sharp_at = |s: usize| {
+    let mut sharp_at = |s: LightTexel| {
         let (x, y) = a.map.position(s);
         let i = (y - known.y0) as usize * known.width() + (x - known.x0) as usize;
         let sharp = &mut work.sharp[i];
@@ -451,11 +449,10 @@ fn direct_texel(
         }
         *sharp
     };
-    let sample = sample as usize;
-    let sharp = sharp_at(sample);
-    let variation = texels.varies(sample, sharp, sharp_at);
-    let back = a.is_back(&a.map, backs, sample);
+    let sharp = sharp_at(texel);
+    let variation = texels.varies(texel, sharp, sharp_at);
+    let back = a.is_back(&a.map, backs, texel);
     let mut light = Vec3::ZERO;
-    texels.irradiance(&[Averaged { sample, back, receiver, sharp, variation }], points, rays, |_, e| light = e);
+    texels.irradiance(&[Averaged { texel, back, receiver, sharp, variation }], points, rays, |_, e| light = e);
     Some(light)
 }

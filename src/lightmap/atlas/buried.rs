@@ -12,17 +12,17 @@
 
 use super::chart_map::ChartMap;
 use super::charts::Charts;
+use super::ids::{Map, PlacementId, TexelId, TexelRange};
 use super::seen::Seen;
 use super::texels::TexelSample;
 use crate::base::error::Result;
 use crate::base::memory::{try_append, try_collect, try_par_collect, try_push, try_vec};
 use crate::base::progress::Stage;
 use crate::base::sampling::{cosine_around, sobol_2d};
-use crate::scene::{NONE, Scene};
+use crate::scene::Scene;
 use crate::trace::{RawHit, Ray};
 use glam::{Mat2, Vec2, Vec3};
 use rayon::prelude::*;
-use std::ops::Range;
 
 /// Maximum number of rays that test a point.
 const RAYS: u32 = 16;
@@ -63,84 +63,96 @@ impl Search<'_> {
     /// (empty: none) and the number of rays. If `by_parts`, samples of texels with another point that can be seen are
     /// moved to that point instead; in placements without any visible sample this is done in any case. Advances `stage`
     /// by one per placement. To be called on the device's threads.
-    pub fn move_buried(&self, map: &mut ChartMap, by_parts: bool, stage: &Stage) -> Result<(Vec<bool>, u64)> {
-        let of_placement = |placement: u32| {
-            let found = self.in_placement(map, placement, by_parts, stage)?;
+    pub fn move_buried<M: Map>(
+        &self,
+        map: &mut ChartMap<M>,
+        by_parts: bool,
+        stage: &Stage,
+    ) -> Result<(Vec<bool>, u64)> {
+        let of_placement = |placement: usize| {
+            let found = self.in_placement(map, PlacementId::new(placement), by_parts, stage)?;
             stage.advance(1)?;
             Ok(found)
         };
-        let placements = 0..map.layout.placements.len() as u32;
+        let placements = 0..map.layout.placements.len();
         let mut found = try_par_collect(placements.into_par_iter().map(of_placement), BURIED)?;
         if let Some(failed) = found.iter_mut().find(|f| f.is_err()) {
             return Err(std::mem::replace(failed, Ok(Found::default())).err().expect("it failed"));
         }
         let found = || found.iter().flatten();
         let rays = found().map(|f| f.rays).sum();
-        for &(sample, point) in found().flat_map(|f| &f.seen_parts) {
-            map.texels.samples[sample as usize] = point;
+        for &(texel, point) in found().flat_map(|f| &f.seen_parts) {
+            map.texels.samples[texel.index()] = point;
         }
         if found().all(|f| f.moved.is_empty()) {
             return Ok((Vec::new(), rays));
         }
         let mut is_moved = try_vec(map.len(), BURIED)?;
-        for &(sample, to) in found().flat_map(|f| &f.moved) {
-            let to = map.texels.samples[to as usize];
-            let texel = &mut map.texels.samples[sample as usize];
-            (texel.triangle, texel.u, texel.v) = (to.triangle, to.u, to.v);
-            is_moved[sample as usize] = true;
+        for &(texel, to) in found().flat_map(|f| &f.moved) {
+            let to = map[to];
+            let sample = &mut map.texels.samples[texel.index()];
+            (sample.triangle, sample.u, sample.v) = (to.triangle, to.u, to.v);
+            is_moved[texel.index()] = true;
         }
         Ok((is_moved, rays))
     }
 
-    fn in_placement(&self, map: &ChartMap, placement: u32, by_parts: bool, stage: &Stage) -> Result<Found> {
+    fn in_placement<M: Map>(
+        &self,
+        map: &ChartMap<M>,
+        placement: PlacementId,
+        by_parts: bool,
+        stage: &Stage,
+    ) -> Result<Found<M>> {
         let mut found = Found::default();
         let chart = map.layout.chart_of(placement);
         let is_back = match map.layout.is_back(placement) {
             true => true,
-            false if !self.charts.charts[chart as usize].two_sided || map.layout.back(chart).is_some() => false,
+            false if !self.charts[chart].two_sided || map.layout.back(chart).is_some() => false,
             // The bake chooses the side if open places do not decide it.
             false => match self.seen.shows_back(chart) {
                 Some(back) => back,
                 None => return Ok(found),
             },
         };
-        let samples = map.samples_of(placement);
+        let texels = map.texels_of(placement);
+        let indices = texels.indices();
         let mut buried = Vec::new();
-        for first in samples.clone().step_by(BLOCK) {
+        for first in indices.clone().step_by(BLOCK) {
             stage.advance(0)?;
-            let points = &map.texels.samples[first..samples.end.min(first + BLOCK)];
+            let points = &map.texels.samples[first..indices.end.min(first + BLOCK)];
             let are_buried = self.are_buried(points, first as u32, is_back, &mut found.rays);
             for (i, _) in are_buried.iter().take(points.len()).enumerate().filter(|(_, is)| **is) {
-                try_push(&mut buried, (first + i) as u32, BURIED)?;
+                try_push(&mut buried, TexelId::new(first + i), BURIED)?;
             }
         }
-        if by_parts || buried.len() == samples.len() {
-            self.find_seen_parts(map, placement, is_back, &samples, &mut buried, &mut found, stage)?;
+        if by_parts || buried.len() == texels.len() {
+            self.find_seen_parts(map, placement, is_back, &texels, &mut buried, &mut found, stage)?;
         }
-        if !buried.is_empty() && buried.len() < samples.len() {
-            found.moved = nearest_seen(map, placement, samples, buried, stage)?;
+        if !buried.is_empty() && buried.len() < texels.len() {
+            found.moved = nearest_seen(map, placement, texels, buried, stage)?;
         }
         Ok(found)
     }
 
     /// Removes the texels from `buried` that have another point that can be seen, and adds them to `found` with this
     /// point.
-    fn find_seen_parts(
+    fn find_seen_parts<M: Map>(
         &self,
-        map: &ChartMap,
-        placement: u32,
+        map: &ChartMap<M>,
+        placement: PlacementId,
         back: bool,
-        samples: &Range<usize>,
-        buried: &mut Vec<u32>,
-        found: &mut Found,
+        texels: &TexelRange<M>,
+        buried: &mut Vec<TexelId<M>>,
+        found: &mut Found<M>,
         stage: &Stage,
     ) -> Result<()> {
         if buried.is_empty() {
             return Ok(());
         }
-        let mut is_buried = try_vec(samples.len(), BURIED)?;
+        let mut is_buried = try_vec(texels.len(), BURIED)?;
         let mut result = Ok(());
-        buried.iter().for_each(|&s| is_buried[s as usize - samples.start] = true);
+        buried.iter().for_each(|&s| is_buried[texels.place(s)] = true);
         buried.retain(|&s| {
             // Up to 64 rays.
             result = result.clone().and_then(|()| stage.check());
@@ -148,13 +160,12 @@ impl Search<'_> {
                 return true;
             }
             // A texel surrounded by buried ones is taken to have no visible point.
-            let is_at_border = around(map.position(s as usize)).any(|(x, y)| {
+            let is_at_border = around(map.position(s)).any(|(x, y)| {
                 let neighbour = map.at(placement, x, y);
-                !samples.contains(&(neighbour as usize)) || !is_buried[neighbour as usize - samples.start]
+                neighbour.is_none_or(|n| !texels.contains(n) || !is_buried[texels.place(n)])
             });
-            let points =
-                if is_at_border { points_of_texel(self.charts, map, placement, s as usize) } else { Vec::new() };
-            let mut is_buried = |point: &TexelSample| self.are_buried(&[*point], s, back, &mut found.rays)[0];
+            let points = if is_at_border { points_of_texel(self.charts, map, placement, s) } else { Vec::new() };
+            let mut is_buried = |point: &TexelSample| self.are_buried(&[*point], s.seed(), back, &mut found.rays)[0];
             let seen = points.into_iter().find(|point| !is_buried(point));
             if let Some(point) = seen {
                 result = try_push(&mut found.seen_parts, (s, point), BURIED);
@@ -212,7 +223,7 @@ impl Search<'_> {
         if !hit.front && !material.two_sided && !material.transmits() {
             return Sight::Back;
         }
-        let chart = self.charts.chart_of[hit.triangle as usize];
+        let chart = self.charts.chart_of(hit.triangle);
         if hit.t <= self.near || self.seen.is_hidden(chart, hit.front) { Sight::Covered } else { Sight::Open }
     }
 }
@@ -240,24 +251,29 @@ struct Undecided {
 }
 
 #[derive(Default)]
-struct Found {
+struct Found<M: Map> {
     /// Buried texels, each with the visible one whose sample it takes.
-    moved: Vec<(u32, u32)>,
+    moved: Vec<(TexelId<M>, TexelId<M>)>,
     /// Texels that can be seen at another point than their sample, with that point.
-    seen_parts: Vec<(u32, TexelSample)>,
+    seen_parts: Vec<(TexelId<M>, TexelSample)>,
     rays: u64,
 }
 
 /// Returns some points of the part of the sample's triangle in its texel.
-fn points_of_texel(charts: &Charts, map: &ChartMap, placement: u32, sample: usize) -> Vec<TexelSample> {
-    let texel = map.texels.samples[sample];
-    let place = |u, v| Vec2::from(map.layout.texel_coord(placement, charts.local(texel.triangle, u, v)));
+fn points_of_texel<M: Map>(
+    charts: &Charts,
+    map: &ChartMap<M>,
+    placement: PlacementId,
+    texel: TexelId<M>,
+) -> Vec<TexelSample> {
+    let sample = map[texel];
+    let place = |u, v| Vec2::from(map.layout.texel_coord(placement, charts.local(sample.triangle, u, v)));
     let origin = place(0.0, 0.0);
     let weights = Mat2::from_cols(place(1.0, 0.0) - origin, place(0.0, 1.0) - origin).inverse();
-    let corner = Vec2::new(f32::from(texel.x), f32::from(texel.y)) - origin;
-    let point = |i| weights * (corner + Vec2::from(sobol_2d(i, sample as u32)));
+    let corner = Vec2::new(f32::from(sample.x), f32::from(sample.y)) - origin;
+    let point = |i| weights * (corner + Vec2::from(sobol_2d(i, texel.seed())));
     let points = (0..POINT_TRIES).map(point).filter(|w| w.min_element() >= 0.0 && w.x + w.y <= 1.0);
-    points.map(|w| TexelSample { u: w.x, v: w.y, ..texel }).take(POINTS).collect()
+    points.map(|w| TexelSample { u: w.x, v: w.y, ..sample }).take(POINTS).collect()
 }
 
 /// A texel and its eight neighbours.
@@ -266,37 +282,35 @@ fn around((x, y): (i32, i32)) -> impl Iterator<Item = (i32, i32)> {
 }
 
 /// Finds the nearest visible texels to those `buried`, ring by ring.
-fn nearest_seen(
-    map: &ChartMap,
-    placement: u32,
-    samples: Range<usize>,
-    buried: Vec<u32>,
+fn nearest_seen<M: Map>(
+    map: &ChartMap<M>,
+    placement: PlacementId,
+    texels: TexelRange<M>,
+    buried: Vec<TexelId<M>>,
     stage: &Stage,
-) -> Result<Vec<(u32, u32)>> {
-    let local = |s: u32| s as usize - samples.start;
-    let mut to: Vec<u32> = try_collect(samples.clone().map(|s| s as u32), BURIED)?;
-    buried.iter().for_each(|&s| to[local(s)] = NONE);
+) -> Result<Vec<(TexelId<M>, TexelId<M>)>> {
+    let mut to: Vec<Option<TexelId<M>>> = try_collect(texels.clone().map(Some), BURIED)?;
+    buried.iter().for_each(|&s| to[texels.place(s)] = None);
     let (mut missing, mut moved) = (buried, Vec::new());
     for _ in 0..MAX_ROUNDS {
         stage.check()?;
-        let nearest = |&s: &u32| -> Option<(u32, u32)> {
-            let (ox, oy) = map.position(s as usize);
+        let nearest = |&s: &TexelId<M>| -> Option<(TexelId<M>, TexelId<M>)> {
+            let (ox, oy) = map.position(s);
             let known = around((ox, oy)).filter_map(|(x, y)| {
-                let neighbour = map.at(placement, x, y);
                 // The window of given charts may contain another chart.
-                let is_own = neighbour != NONE && samples.contains(&(neighbour as usize));
-                let known = is_own.then(|| to[local(neighbour)]).filter(|&t| t != NONE)?;
-                let (kx, ky) = map.position(known as usize);
+                let neighbour = map.at(placement, x, y).filter(|&n| texels.contains(n))?;
+                let known = to[texels.place(neighbour)]?;
+                let (kx, ky) = map.position(known);
                 Some(((kx - ox).pow(2) + (ky - oy).pow(2), known))
             });
             known.min().map(|(_, known)| (s, known))
         };
-        let ring: Vec<(u32, u32)> = try_collect(missing.iter().filter_map(nearest), BURIED)?;
+        let ring: Vec<(TexelId<M>, TexelId<M>)> = try_collect(missing.iter().filter_map(nearest), BURIED)?;
         if ring.is_empty() {
             break;
         }
-        ring.iter().for_each(|&(s, known)| to[local(s)] = known);
-        missing.retain(|&s| to[local(s)] == NONE);
+        ring.iter().for_each(|&(s, known)| to[texels.place(s)] = Some(known));
+        missing.retain(|&s| to[texels.place(s)].is_none());
         try_append(&mut moved, &ring, BURIED)?;
     }
     Ok(moved)
@@ -305,6 +319,7 @@ fn nearest_seen(
 #[cfg(test)]
 mod tests {
     use crate::base::progress::Progress;
+    use crate::lightmap::atlas::ids::PlacementId;
     use crate::lightmap::{Lightmap, LightmapDesc};
     use crate::scene::shapes::MeshBuilder;
     use crate::scene::{Light, Material, SceneData};
@@ -328,8 +343,8 @@ mod tests {
     fn counted(lightmap: &Lightmap, is_covered: impl Fn(Vec3) -> bool) -> [usize; 2] {
         let atlas = lightmap.atlas();
         let mut n = [0; 2];
-        for placement in 0..atlas.map.layout.placements.len() as u32 {
-            for s in atlas.map.samples_of(placement) {
+        for placement in (0..atlas.map.layout.placements.len()).map(PlacementId::new) {
+            for s in atlas.map.texels_of(placement) {
                 if atlas.map.is_back(s) {
                     continue;
                 }
@@ -344,7 +359,7 @@ mod tests {
                     is_in.then(|| p + (q - p) * w.x + (r - p) * w.y)
                 });
                 if place.is_some_and(&is_covered) {
-                    n[usize::from(atlas.buried.get(s) == Some(&true))] += 1;
+                    n[usize::from(atlas.buried.get(s.index()) == Some(&true))] += 1;
                 }
             }
         }
@@ -375,7 +390,7 @@ mod tests {
             let [_, elsewhere] = counted(&lightmap, |p| !below(-0.05)(p));
             assert_eq!(elsewhere, 0);
             let atlas = lightmap.atlas();
-            for s in (0..atlas.map.len()).filter(|&s| atlas.buried[s]) {
+            for s in atlas.map.all().filter(|s| atlas.buried[s.index()]) {
                 let p = atlas.map.surface(&atlas.scene, s).0;
                 assert!(!below(0.0)(p) && below(-0.11)(p) || p.y < 0.0, "{p}");
             }
@@ -422,12 +437,13 @@ mod tests {
         let desc = LightmapDesc { texels_per_unit: 20.0, ..Default::default() };
         let lightmap = Lightmap::create(&data.committed(), &desc, &Progress::none()).unwrap();
         let atlas = lightmap.atlas();
-        let wall = atlas.charts.chart_of[0];
+        let wall = atlas.charts.chart_of(0);
         let back = atlas.map.layout.back(wall).unwrap();
-        let buried = |placement: u32| atlas.map.samples_of(placement).filter(|&s| atlas.buried[s]).count();
-        assert_eq!(buried(wall), 0);
+        let poster = PlacementId::front_of(atlas.charts.chart_of(2));
+        let buried = |placement| atlas.map.texels_of(placement).filter(|s| atlas.buried[s.index()]).count();
+        assert_eq!(buried(PlacementId::front_of(wall)), 0);
         // 32 × 32 texels lie behind it.
         assert!((900..1100).contains(&buried(back)), "{}", buried(back));
-        assert_eq!(lightmap.info().buried_texels, (buried(back) + buried(atlas.charts.chart_of[2])) as u64);
+        assert_eq!(lightmap.info().buried_texels, (buried(back) + buried(poster)) as u64);
     }
 }

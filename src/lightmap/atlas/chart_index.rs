@@ -5,6 +5,7 @@
 
 use super::charts::Charts;
 use super::flat_triangle::Flat;
+use super::ids::ChartId;
 use super::texels::TexelSample;
 use crate::base::error::Result;
 use crate::base::memory::{Reservation, try_vec, try_with_capacity};
@@ -46,9 +47,9 @@ struct Grid {
 }
 
 impl Grid {
-    fn new(charts: &Charts, chart: u32) -> Result<Grid> {
+    fn new(charts: &Charts, chart: ChartId) -> Result<Grid> {
         let triangles = charts.triangles_of(chart);
-        let size = Vec2::from(charts.charts[chart as usize].size);
+        let size = Vec2::from(charts[chart].size);
         if triangles.len() <= SMALL || !(size.min_element() > 0.0) || !size.is_finite() {
             return Ok(Grid::default());
         }
@@ -127,8 +128,8 @@ impl ChartIndex {
         let mut grids: Vec<Grid> = try_with_capacity(charts.charts.len(), "the index of the charts")?;
         grids.resize_with(charts.charts.len(), Grid::default);
         device.install(|| {
-            (0..charts.charts.len() as u32).into_par_iter().zip(&mut grids).try_for_each(|(chart, grid)| {
-                *grid = Grid::new(charts, chart)?;
+            grids.par_iter_mut().enumerate().try_for_each(|(chart, grid)| {
+                *grid = Grid::new(charts, ChartId::new(chart))?;
                 Ok(())
             })
         })?;
@@ -143,12 +144,12 @@ impl ChartIndex {
 
     /// Returns the point of a chart at local coordinates, `None` outside of its triangles. If triangles overlap,
     /// `first` is preferred, then the lowest number.
-    pub(crate) fn locate(&self, charts: &Charts, chart: u32, local: Vec2, first: u32) -> Option<TexelSample> {
+    pub(crate) fn locate(&self, charts: &Charts, chart: ChartId, local: Vec2, first: u32) -> Option<TexelSample> {
         let inside = |t: u32| {
             let [u, v] = weights(charts.corners[t as usize], local)?;
             Some(TexelSample { triangle: t, u, v, ..Default::default() })
         };
-        let grid = &self.grids[chart as usize];
+        let grid = &self.grids[chart.index()];
         let triangles = if grid.columns > 0 { grid.around(local) } else { charts.triangles_of(chart) };
         inside(first).or_else(|| triangles.iter().take(MAX_TESTS).find_map(|&t| inside(t)))
     }
@@ -184,8 +185,8 @@ mod tests {
             let index = ChartIndex::new(scene.device(), &charts).unwrap();
             let mut gridded = 0;
             for t in (0..scene.triangle_count()).step_by(7).filter(|&t| scene.is_valid(t)) {
-                let chart = charts.chart_of[t as usize];
-                gridded += (index.grids[chart as usize].columns > 0) as u32;
+                let chart = charts.chart_of(t);
+                gridded += (index.grids[chart.index()].columns > 0) as u32;
                 for i in 0..4 {
                     let [u, v] = uniform_triangle(sobol_2d(i, t));
                     let local = Vec2::from(charts.local(t, u, v));
@@ -195,7 +196,7 @@ mod tests {
                     let place = Vec2::from(charts.local(found.triangle, found.u, found.v));
                     assert!(place.distance(local) < 1e-4 * (1.0 + local.length()), "{place} {local}");
                 }
-                let outside = Vec2::from(charts.charts[chart as usize].size) * 1.01 + 0.01;
+                let outside = Vec2::from(charts[chart].size) * 1.01 + 0.01;
                 assert!(index.locate(&charts, chart, outside, t).is_none());
             }
             assert!(gridded > 0 || name == "cornell", "no chart of {name} has a grid");

@@ -1,6 +1,7 @@
 //! A map of one resolution: the layout of the charts in it, and its texels.
 
 use super::charts::Charts;
+use super::ids::{Map, PlacementId, TexelId, TexelRange};
 use super::layout::Layout;
 use super::texels::{TexelMap, TexelSample};
 use crate::base::error::Result;
@@ -9,22 +10,34 @@ use crate::direct::Receiver;
 use crate::scene::{NONE, Scene};
 use crate::trace::offset::SurfacePoint;
 use glam::Vec3;
-use std::ops::Range;
+use std::marker::PhantomData;
+use std::ops::Index;
 
-/// Layout and texels of the light map, the gather map or the radiance map.
-pub(crate) struct ChartMap {
+/// Layout and texels of map `M`: the light map, the gather map or the radiance map. Indexed by texels, it returns the
+/// sample of each.
+pub(crate) struct ChartMap<M: Map> {
     pub layout: Layout,
     pub texels: TexelMap,
-    /// First sample of the separate texels for backs.
-    pub back_start: usize,
+    /// First of the separate texels for backs.
+    pub back_start: TexelId<M>,
+    of: PhantomData<M>,
 }
 
-impl ChartMap {
+impl<M: Map> Index<TexelId<M>> for ChartMap<M> {
+    type Output = TexelSample;
+
+    #[inline]
+    fn index(&self, texel: TexelId<M>) -> &TexelSample {
+        &self.texels.samples[texel.index()]
+    }
+}
+
+impl<M: Map> ChartMap<M> {
     pub(crate) fn new(scene: &Scene, charts: &Charts, layout: Layout, stage: &Stage) -> Result<Self> {
         let texels = TexelMap::build(scene, charts, &layout, stage)?;
         let fronts = layout.placements.len() - layout.back_of.len();
-        let back_start = texels.chart_start[fronts] as usize;
-        Ok(ChartMap { layout, texels, back_start })
+        let back_start = TexelId::new(texels.chart_start[fronts] as usize);
+        Ok(ChartMap { layout, texels, back_start, of: PhantomData })
     }
 
     /// Returns the number of texels that show a surface.
@@ -36,68 +49,81 @@ impl ChartMap {
         self.texels.bytes() + size_of_val(&self.layout.placements[..])
     }
 
-    /// Returns column and row of a sample in its page.
+    /// Returns all texels.
+    pub(crate) fn all(&self) -> TexelRange<M> {
+        TexelId::range(0..self.len())
+    }
+
+    /// Returns column and row of a texel in its page.
     #[inline]
-    pub(crate) fn position(&self, sample: usize) -> (i32, i32) {
-        let t = &self.texels.samples[sample];
+    pub(crate) fn position(&self, texel: TexelId<M>) -> (i32, i32) {
+        let t = &self[texel];
         (t.x as i32, t.y as i32)
     }
 
-    /// Returns the samples of a placement.
-    pub(crate) fn samples_of(&self, placement: u32) -> Range<usize> {
+    /// Returns the texels of a placement.
+    pub(crate) fn texels_of(&self, placement: PlacementId) -> TexelRange<M> {
         let r = self.texels.samples_of(placement);
-        r.start as usize..r.end as usize
+        TexelId::range(r.start as usize..r.end as usize)
     }
 
-    /// Returns the sample of a placement at a column and row, [`NONE`] if there is none.
+    /// Returns the texel at a column and row of a placement's page, if it is covered and lies in the placement's
+    /// rectangle.
     #[inline]
-    pub(crate) fn at(&self, placement: u32, x: i32, y: i32) -> u32 {
-        if x < 0 || y < 0 { NONE } else { self.texels.texel_index(placement, x as u32, y as u32) }
+    pub(crate) fn at(&self, placement: PlacementId, x: i32, y: i32) -> Option<TexelId<M>> {
+        if x < 0 || y < 0 {
+            return None;
+        }
+        covered(self.texels.texel_index(placement, x as u32, y as u32))
     }
 
-    /// Returns the sample nearest to a point of a placed chart; `None` if the placement has no texel (a given chart
+    /// Returns the texel nearest to a point of a placed chart; `None` if the placement has no texel (a given chart
     /// that others cover).
     #[inline]
-    pub(crate) fn nearest(&self, placement: u32, local: [f32; 2]) -> Option<u32> {
-        let sample = self.texels.nearest(placement, self.layout.texel_coord(placement, local));
-        (sample != NONE).then_some(sample)
+    pub(crate) fn nearest(&self, placement: PlacementId, local: [f32; 2]) -> Option<TexelId<M>> {
+        covered(self.texels.nearest(placement, self.layout.texel_coord(placement, local)))
     }
 
-    /// Calls `visit` with the samples to interpolate between and their weights, which sum to 1; not
+    /// Calls `visit` with the texels to interpolate between and their weights, which sum to 1; not
     /// at all if the placement has no texel.
     #[inline(always)] // sums stay in registers: reading live light takes 69 ns per texel, otherwise 80
-    pub(crate) fn bilinear(&self, placement: u32, local: [f32; 2], mut visit: impl FnMut(usize, f32)) {
+    pub(crate) fn bilinear(&self, placement: PlacementId, local: [f32; 2], mut visit: impl FnMut(TexelId<M>, f32)) {
         let b = self.texels.bilinear(placement, self.layout.texel_coord(placement, local));
         for (s, w) in b.samples.into_iter().zip(b.weights) {
-            if w > 0.0 && s != NONE {
-                visit(s as usize, w);
+            if let Some(texel) = covered(s).filter(|_| w > 0.0) {
+                visit(texel, w);
             }
         }
     }
 
-    /// Returns the point of a sample, and one side of it as a receiver.
-    pub(crate) fn receiver(&self, scene: &Scene, sample: usize, back: bool) -> (SurfacePoint, Receiver) {
-        receiver_of(scene, &self.texels.samples[sample], back)
+    /// Returns the point of a texel's sample, and one side of it as a receiver.
+    pub(crate) fn receiver(&self, scene: &Scene, texel: TexelId<M>, back: bool) -> (SurfacePoint, Receiver) {
+        receiver_of(scene, &self[texel], back)
     }
 
-    /// Whether a sample is one of the separate texels for backs.
+    /// Whether a texel is one of the separate texels for backs.
     #[inline]
-    pub(crate) fn is_back(&self, sample: usize) -> bool {
-        sample >= self.back_start
+    pub(crate) fn is_back(&self, texel: TexelId<M>) -> bool {
+        texel >= self.back_start
     }
 
-    /// Returns the placement of a sample.
+    /// Returns the placement of a texel.
     #[inline]
-    pub(crate) fn placement_of(&self, charts: &Charts, sample: usize) -> u32 {
-        let chart = charts.chart_of[self.texels.samples[sample].triangle as usize];
-        if self.is_back(sample) { self.layout.place_of(chart, false) } else { chart }
+    pub(crate) fn placement_of(&self, charts: &Charts, texel: TexelId<M>) -> PlacementId {
+        self.layout.place_of(charts.chart_of(self[texel].triangle), !self.is_back(texel))
     }
 
-    /// Returns position and normal of a sample.
-    pub(crate) fn surface(&self, scene: &Scene, sample: usize) -> (Vec3, Vec3) {
-        let t = &self.texels.samples[sample];
+    /// Returns position and normal of a texel's sample.
+    pub(crate) fn surface(&self, scene: &Scene, texel: TexelId<M>) -> (Vec3, Vec3) {
+        let t = &self[texel];
         (t.position(scene), t.shading_normal(scene))
     }
+}
+
+/// Returns the texel of an entry of an index of texels; `None` where there is none.
+#[inline]
+fn covered<M: Map>(entry: u32) -> Option<TexelId<M>> {
+    (entry != NONE).then(|| TexelId::new(entry as usize))
 }
 
 /// Returns a point of a triangle, and its front or back as a receiver.

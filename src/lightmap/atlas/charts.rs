@@ -3,6 +3,7 @@
 //! Charts come from the caller's UVs where those are usable, else from `super::unwrap`. They do not depend on texels:
 //! their coordinates are in scene units, and each map packs them at its own density ([`super::layout`]).
 
+use super::ids::ChartId;
 pub use super::pieces::Given;
 use super::pieces::{CHARTS, Groups, Piece, connected, float_key, surface_kind};
 use super::unwrap;
@@ -10,10 +11,10 @@ use crate::base::error::{Error, Result, invalid_argument};
 use crate::base::memory::{try_collect, try_filled, try_push, try_with_capacity};
 use crate::base::progress::{Progress, Stage};
 use crate::device::LogLevel;
-use crate::scene::{LightmapUvs, Mesh, NONE, Scene};
+use crate::scene::{LightmapUvs, Mesh, Scene};
 use glam::{DVec2, Vec2};
 use std::collections::BTreeMap;
-use std::ops::Range;
+use std::ops::{Index, Range};
 use std::time::Instant;
 
 /// Maximum number of texels in all pages of a map. Samples and indices of this many take 10 GB.
@@ -63,17 +64,26 @@ pub struct UvReport {
     pub seconds: f64,
 }
 
-/// All charts of a scene. Those with given placement come first, ordered by page.
+/// All charts of a scene, indexed by [`ChartId`]. Those with given placement come first, ordered by page.
 #[derive(Clone, Debug, Default, PartialEq)]
 pub struct Charts {
     /// The charts, by number.
     pub charts: Vec<Chart>,
     /// Global triangle numbers, chart by chart, ascending in each.
     pub triangles: Vec<u32>,
-    /// Chart of each global triangle, [`crate::scene::NONE`] for degenerate ones.
-    pub chart_of: Vec<u32>,
+    /// Chart of each global triangle, [`ChartId::NONE`] for degenerate ones.
+    pub of_triangles: Vec<ChartId>,
     /// Local coordinates of the corners of each global triangle.
     pub corners: Vec<[[f32; 2]; 3]>,
+}
+
+impl Index<ChartId> for Charts {
+    type Output = Chart;
+
+    #[inline]
+    fn index(&self, chart: ChartId) -> &Chart {
+        &self.charts[chart.index()]
+    }
 }
 
 impl Charts {
@@ -123,12 +133,23 @@ impl Charts {
 
     /// Returns the size in bytes.
     pub fn bytes(&self) -> usize {
-        self.corners.len() * 24 + (self.triangles.len() + self.chart_of.len()) * 4 + size_of_val(&self.charts[..])
+        self.corners.len() * 24 + (self.triangles.len() + self.of_triangles.len()) * 4 + size_of_val(&self.charts[..])
+    }
+
+    /// Returns the numbers of all charts.
+    pub fn ids(&self) -> impl ExactSizeIterator<Item = ChartId> + use<> {
+        (0..self.charts.len()).map(ChartId::new)
+    }
+
+    /// Returns the chart of a global triangle, [`ChartId::NONE`] for degenerate ones.
+    #[inline]
+    pub fn chart_of(&self, triangle: u32) -> ChartId {
+        self.of_triangles[triangle as usize]
     }
 
     /// Returns the global triangle numbers of a chart, ascending.
-    pub fn triangles_of(&self, chart: u32) -> &[u32] {
-        let Range { start, end } = self.charts[chart as usize].triangles;
+    pub fn triangles_of(&self, chart: ChartId) -> &[u32] {
+        let Range { start, end } = self[chart].triangles;
         &self.triangles[start as usize..end as usize]
     }
 
@@ -144,7 +165,7 @@ impl Charts {
         let mut charts = Charts {
             charts: try_with_capacity(pieces.len(), CHARTS)?,
             triangles: try_with_capacity(pieces.iter().map(|p| p.triangles.len()).sum(), CHARTS)?,
-            chart_of: try_filled(total, NONE, CHARTS)?,
+            of_triangles: try_filled(total, ChartId::NONE, CHARTS)?,
             corners: try_filled(total, [[0.0; 2]; 3], CHARTS)?,
         };
         for piece in pieces {
@@ -153,7 +174,7 @@ impl Charts {
             let first = charts.triangles.len() as u32;
             let mut area = 0.0;
             for (&t, corners) in piece.triangles.iter().zip(&piece.corners) {
-                charts.chart_of[t as usize] = charts.charts.len() as u32;
+                charts.of_triangles[t as usize] = ChartId::new(charts.charts.len());
                 charts.corners[t as usize] = corners.map(|c| (Vec2::from_array(c) - lower).to_array());
                 area += triangle_area(scene, t);
             }

@@ -9,11 +9,12 @@
 //! rectangles: 12 instead of 10 for Sponza's light map, 25 instead of 11 for its radiance map.
 
 use super::charts::{Chart, Charts, MAX_TEXELS, padded_extent};
+use super::ids::{ChartId, PlacementId};
 use super::pieces::Given;
 use crate::base::error::{Error, Result, invalid_argument};
 use crate::base::memory::{try_collect, try_filled, try_with_capacity};
 use crate::base::progress::Progress;
-use crate::scene::NONE;
+use std::ops::Index;
 
 /// Name of the buffers in error messages.
 const LAYOUT: &str = "the layout of the charts";
@@ -56,7 +57,7 @@ impl Placement {
     }
 }
 
-/// Placements of all charts in the square pages of a map.
+/// Placements of all charts in the square pages of a map; indexed by [`PlacementId`].
 #[derive(Clone, Debug, PartialEq)]
 pub struct Layout {
     /// Width and height of a page in texels.
@@ -68,13 +69,22 @@ pub struct Layout {
     /// Placements: one per chart, by chart number, then one per back side.
     pub placements: Vec<Placement>,
     /// Charts of the back sides: placement `charts.len() + k` is the back of chart `back_of[k]`.
-    pub back_of: Vec<u32>,
+    pub back_of: Vec<ChartId>,
     /// Number of placements by the caller, which come first, ordered by page.
     pub given: u32,
     /// Charts reduced in density because they would not fit a page.
     pub reduced: u32,
-    /// Placement of each chart's back, [`NONE`] if it has none. Empty without back sides.
-    backs: Vec<u32>,
+    /// Placement of each chart's back, [`PlacementId::NONE`] if it has none. Empty without back sides.
+    backs: Vec<PlacementId>,
+}
+
+impl Index<PlacementId> for Layout {
+    type Output = Placement;
+
+    #[inline]
+    fn index(&self, placement: PlacementId) -> &Placement {
+        &self.placements[placement.index()]
+    }
 }
 
 impl Layout {
@@ -90,7 +100,7 @@ impl Layout {
         page_size: u32,
         padding: u32,
         honour_given: bool,
-        with_backs: &[u32],
+        with_backs: &[ChartId],
         progress: &Progress,
     ) -> Result<Layout> {
         let max_extent = padded_extent(page_size, padding)?;
@@ -115,12 +125,12 @@ impl Layout {
             layout.push(chart, max_extent, padding);
         }
         if !with_backs.is_empty() {
-            layout.backs = try_filled(charts.len(), NONE, LAYOUT)?;
+            layout.backs = try_filled(charts.len(), PlacementId::NONE, LAYOUT)?;
             layout.back_of = try_with_capacity(with_backs.len(), LAYOUT)?;
             for &c in with_backs {
-                layout.backs[c as usize] = layout.placements.len() as u32;
+                layout.backs[c.index()] = PlacementId::new(layout.placements.len());
                 layout.back_of.push(c);
-                layout.push(&charts[c as usize], max_extent, padding);
+                layout.push(&charts[c.index()], max_extent, padding);
             }
         }
         layout.check_size(first_page)?;
@@ -132,39 +142,40 @@ impl Layout {
 
     /// Returns the chart that a placement shows.
     #[inline]
-    pub fn chart_of(&self, placement: u32) -> u32 {
+    pub fn chart_of(&self, placement: PlacementId) -> ChartId {
         let charts = self.placements.len() - self.back_of.len();
-        if (placement as usize) < charts { placement } else { self.back_of[placement as usize - charts] }
+        let place = placement.index();
+        if place < charts { ChartId::new(place) } else { self.back_of[place - charts] }
     }
 
     /// Whether a placement shows the back of its chart.
     #[inline]
-    pub fn is_back(&self, placement: u32) -> bool {
-        placement as usize >= self.placements.len() - self.back_of.len()
+    pub fn is_back(&self, placement: PlacementId) -> bool {
+        placement.index() >= self.placements.len() - self.back_of.len()
     }
 
     /// Returns the placement of a chart's back side, if the layout has one.
     #[inline]
-    pub fn back(&self, chart: u32) -> Option<u32> {
-        self.backs.get(chart as usize).copied().filter(|&p| p != NONE)
+    pub fn back(&self, chart: ChartId) -> Option<PlacementId> {
+        self.backs.get(chart.index()).copied().filter(|&p| p != PlacementId::NONE)
     }
 
     /// Returns the placement for exactly this side of a chart, if the layout has one.
     #[inline]
-    pub fn side(&self, chart: u32, front: bool) -> Option<u32> {
-        if front { Some(chart) } else { self.back(chart) }
+    pub fn side(&self, chart: ChartId, front: bool) -> Option<PlacementId> {
+        if front { Some(PlacementId::front_of(chart)) } else { self.back(chart) }
     }
 
     /// Returns the placement that shows a side of a chart: a back without a separate placement shares the front's.
     #[inline]
-    pub fn place_of(&self, chart: u32, front: bool) -> u32 {
-        if front { chart } else { self.back(chart).unwrap_or(chart) }
+    pub fn place_of(&self, chart: ChartId, front: bool) -> PlacementId {
+        self.side(chart, front).unwrap_or(PlacementId::front_of(chart))
     }
 
     /// Returns the texel coordinate of a point of a placed chart.
     #[inline]
-    pub fn texel_coord(&self, placement: u32, local: [f32; 2]) -> [f32; 2] {
-        self.placements[placement as usize].texel_coord(local)
+    pub fn texel_coord(&self, placement: PlacementId, local: [f32; 2]) -> [f32; 2] {
+        self[placement].texel_coord(local)
     }
 
     /// Returns the number of texels in all pages.
@@ -346,9 +357,9 @@ mod tests {
     /// In their page, apart from each other, each containing its chart and the padding around it.
     fn check(charts: &Charts, layout: &Layout, padding: u32) {
         let size = layout.page_size;
-        for (n, p) in layout.placements.iter().enumerate() {
+        for (id, p) in (0..).map(PlacementId::new).zip(&layout.placements) {
             assert!(p.page < layout.page_count && (p.x + p.w) as u32 <= size && (p.y + p.h) as u32 <= size);
-            let chart = &charts.charts[layout.chart_of(n as u32) as usize];
+            let chart = &charts[layout.chart_of(id)];
             let (lower, upper) = (p.texel_coord([0.0; 2]), p.texel_coord(chart.size));
             for (axis, first, count) in [(0, p.x, p.w), (1, p.y, p.h)] {
                 assert!(lower[axis] >= first as f32 + padding as f32, "{p:?}");
@@ -371,12 +382,13 @@ mod tests {
         ) {
             let charts = charts_of(&sizes);
             // All of them, or every third.
-            let backs: Vec<u32> = (0..sizes.len() as u32).step_by(if all { 1 } else { 3 }).filter(|_| back).collect();
+            let step = if all { 1 } else { 3 };
+            let backs: Vec<ChartId> = charts.ids().step_by(step).filter(|_| back).collect();
             let layout = Layout::pack(&charts, density, 1 << page, padding, false, &backs, &Progress::none()).unwrap();
             check(&charts, &layout, padding);
             prop_assert_eq!(&layout, &Layout::pack(&charts, density, 1 << page, padding, false, &backs, &Progress::none()).unwrap());
             prop_assert_eq!(layout.placements.len(), sizes.len() + backs.len());
-            for c in 0..sizes.len() as u32 {
+            for c in charts.ids() {
                 let back = backs.contains(&c).then_some((c, true));
                 prop_assert_eq!(layout.back(c).map(|p| (layout.chart_of(p), layout.is_back(p))), back);
             }
@@ -441,7 +453,7 @@ mod tests {
         assert_eq!((layout.given, layout.page_count), (1, 4));
         let p = layout.placements[0];
         assert_eq!((p.page, p.x, p.y, p.w, p.h), (2, 16, 32, 33, 17));
-        assert_eq!(layout.texel_coord(0, [4.0, 2.0]), [48.0, 48.0]);
+        assert_eq!(layout.placements[0].texel_coord([4.0, 2.0]), [48.0, 48.0]);
         assert_eq!(layout.placements[1].page, 3);
         let repacked = Layout::pack(&charts, 1.0, 64, 0, false, &[], &Progress::none()).unwrap();
         assert_eq!((repacked.given, repacked.page_count), (0, 1));

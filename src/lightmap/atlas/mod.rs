@@ -5,6 +5,7 @@ pub(crate) mod chart_index;
 pub(crate) mod chart_map;
 pub mod charts;
 pub(crate) mod flat_triangle;
+pub mod ids;
 pub mod layout;
 pub(crate) mod pieces;
 mod planar;
@@ -21,6 +22,7 @@ use crate::scene::Scene;
 use chart_index::ChartIndex;
 use chart_map::ChartMap;
 use charts::Charts;
+use ids::{GatherMap, GatherTexel, LightMap, LightTexel, PlacementId, RadianceMap, ShownMap, TexelId};
 use seen::Seen;
 use std::sync::Arc;
 
@@ -29,9 +31,9 @@ pub(crate) struct Atlas {
     pub scene: Arc<Scene>,
     pub charts: Charts,
     pub index: ChartIndex,
-    pub map: ChartMap,
-    pub gather: ChartMap,
-    pub radiance: ChartMap,
+    pub map: ChartMap<LightMap>,
+    pub gather: ChartMap<GatherMap>,
+    pub radiance: ChartMap<RadianceMap>,
     pub padding: u32,
     pub info: LightmapInfo,
     pub seen: Seen,
@@ -41,34 +43,34 @@ pub(crate) struct Atlas {
 }
 
 impl Atlas {
-    /// Whether a sample of the light map or the gather map shows the back: as a separate texel for the back, or because
-    /// of `backs` (per chart; empty: fronts).
-    pub(crate) fn is_back(&self, map: &ChartMap, backs: &[bool], sample: usize) -> bool {
-        let chart = self.charts.chart_of[map.texels.samples[sample].triangle as usize];
-        map.is_back(sample) || backs.get(chart as usize).is_some_and(|&b| b)
+    /// Whether a texel shows the back: as a separate texel for the back, or because of `backs` (per chart; empty:
+    /// fronts).
+    pub(crate) fn is_back<M: ShownMap>(&self, map: &ChartMap<M>, backs: &[bool], texel: TexelId<M>) -> bool {
+        let chart = self.charts.chart_of(map[texel].triangle);
+        map.is_back(texel) || backs.get(chart.index()).is_some_and(|&b| b)
     }
 
-    /// Returns a sample of the light map or the gather map as a receiver, on the side that it shows.
-    pub(crate) fn receiver(&self, map: &ChartMap, backs: &[bool], sample: usize) -> Receiver {
-        map.receiver(&self.scene, sample, self.is_back(map, backs, sample)).1
+    /// Returns the sample of a texel as a receiver, on the side that it shows.
+    pub(crate) fn receiver<M: ShownMap>(&self, map: &ChartMap<M>, backs: &[bool], texel: TexelId<M>) -> Receiver {
+        map.receiver(&self.scene, texel, self.is_back(map, backs, texel)).1
     }
 
     /// Returns the local coordinates of a texel of the light map in its chart. For a buried texel, these are not those
     /// of its sample, which lies in another texel.
-    pub(crate) fn texel_local(&self, placement: u32, sample: usize) -> [f32; 2] {
-        let t = &self.map.texels.samples[sample];
-        match self.buried.get(sample) {
-            Some(true) => self.map.layout.placements[placement as usize].local([t.x, t.y].map(|c| f32::from(c) + 0.5)),
+    pub(crate) fn texel_local(&self, placement: PlacementId, texel: LightTexel) -> [f32; 2] {
+        let t = &self.map[texel];
+        match self.buried.get(texel.index()) {
+            Some(true) => self.map.layout[placement].local([t.x, t.y].map(|c| f32::from(c) + 0.5)),
             _ => self.charts.local(t.triangle, t.u, t.v),
         }
     }
 
-    /// Calls `visit` with the gather texels around a sample of the light map and their bilinear weights.
+    /// Calls `visit` with the gather texels around a texel of the light map and their bilinear weights.
     #[inline]
-    pub(crate) fn gather_around(&self, sample: usize, visit: impl FnMut(usize, f32)) {
-        let t = &self.map.texels.samples[sample];
+    pub(crate) fn gather_around(&self, texel: LightTexel, visit: impl FnMut(GatherTexel, f32)) {
+        let t = &self.map[texel];
         // The gather map has the light map's placements.
-        let placement = self.map.placement_of(&self.charts, sample);
+        let placement = self.map.placement_of(&self.charts, texel);
         self.gather.bilinear(placement, self.charts.local(t.triangle, t.u, t.v), visit);
     }
 }

@@ -6,11 +6,12 @@
 
 use super::chart_map::ChartMap;
 use super::charts::Charts;
+use super::ids::{ChartId, PlacementId, RadianceMap, TexelId};
 use crate::base::error::Result;
 use crate::base::memory::try_collect;
 use crate::base::progress::Stage;
 use crate::base::sampling::{combine, cosine_around, mix, uniform, uniform_sphere};
-use crate::scene::{Light, NONE, Scene};
+use crate::scene::{Light, Scene};
 use crate::trace::{PACKET_SIZE, Packet, RawHit, Ray};
 use glam::Vec3;
 use rayon::prelude::*;
@@ -66,7 +67,7 @@ impl Seen {
     pub(crate) fn count(
         scene: &Scene,
         charts: &Charts,
-        radiance: &ChartMap,
+        radiance: &ChartMap<RadianceMap>,
         texel: f32,
         stage: &Stage,
     ) -> Result<Seen> {
@@ -81,7 +82,7 @@ impl Seen {
             let mut traced = 0;
             if let Some((position, first)) = look.open_place(number, &mut traced) {
                 look.around(position, &first, number, &mut traced, |chart, side| {
-                    counters[chart][side].fetch_add(1, Relaxed);
+                    counters[chart.index()][side].fetch_add(1, Relaxed);
                 });
                 places.fetch_add(1, Relaxed);
             }
@@ -93,7 +94,7 @@ impl Seen {
         let total: u64 = counts.iter().flatten().map(|&n| u64::from(n)).sum();
         let per_texel = total as f64 / radiance.len().max(1) as f64;
         let hidden = |(chart, of_chart): (usize, &[u32; 2])| {
-            let expected = radiance.samples_of(chart as u32).len() as f64 * per_texel;
+            let expected = radiance.texels_of(PlacementId::new(chart)).len() as f64 * per_texel;
             of_chart.map(|n| expected >= LEAST_EXPECTED && f64::from(n) < HIDDEN * expected)
         };
         let hidden = try_collect(counts.iter().enumerate().map(hidden), COUNTS)?;
@@ -101,7 +102,7 @@ impl Seen {
     }
 
     /// Returns the number of steps by which [`count`](Self::count) advances its stage.
-    pub(crate) fn work(radiance: &ChartMap) -> u64 {
+    pub(crate) fn work(radiance: &ChartMap<RadianceMap>) -> u64 {
         match radiance.layout.back_of.len() {
             0 => 0,
             _ => (TRIES_PER_TEXEL * radiance.len()).clamp(LEAST_TRIES, MOST_TRIES) as u64,
@@ -109,14 +110,14 @@ impl Seen {
     }
 
     /// Whether a side of a chart can hardly be seen from any open place.
-    pub(crate) fn is_hidden(&self, chart: u32, front: bool) -> bool {
-        self.hidden.get(chart as usize).is_some_and(|hidden| hidden[usize::from(!front)])
+    pub(crate) fn is_hidden(&self, chart: ChartId, front: bool) -> bool {
+        self.hidden.get(chart.index()).is_some_and(|hidden| hidden[usize::from(!front)])
     }
 
     /// Returns `true` if the back of a two-sided chart is seen and its front hardly ever, `false` if it is the other
     /// way round, and `None` otherwise.
-    pub(crate) fn shows_back(&self, chart: u32) -> Option<bool> {
-        let [front, back] = self.counts.get(chart as usize).copied().unwrap_or_default();
+    pub(crate) fn shows_back(&self, chart: ChartId) -> Option<bool> {
+        let [front, back] = self.counts.get(chart.index()).copied().unwrap_or_default();
         match front.max(back) {
             0 => None,
             most if most >= CLEARLY.saturating_mul(front.min(back)) => Some(back > front),
@@ -141,7 +142,7 @@ pub(in crate::lightmap) fn is_outdoors(scene: &Scene) -> bool {
 struct Look<'a> {
     scene: &'a Scene,
     charts: &'a Charts,
-    radiance: &'a ChartMap,
+    radiance: &'a ChartMap<RadianceMap>,
     room: f32,
     outdoors: bool,
 }
@@ -151,7 +152,8 @@ impl Look<'_> {
     /// there.
     fn open_place(&self, number: u32, rays: &mut u64) -> Option<(Vec3, [RawHit; PACKET_SIZE])> {
         let sample = (u64::from(mix(number)) * self.radiance.len() as u64) >> 32;
-        let (_, from) = self.radiance.receiver(self.scene, sample as usize, self.radiance.is_back(sample as usize));
+        let texel = TexelId::new(sample as usize);
+        let (_, from) = self.radiance.receiver(self.scene, texel, self.radiance.is_back(texel));
         let random = |dimension| uniform(number, dimension, 0);
         let direction = cosine_around(from.geometric, [random(0), random(1)]);
         let hit = self.scene.intersect_raw(&Ray::new(from.origin, direction));
@@ -197,13 +199,13 @@ impl Look<'_> {
         first: &[RawHit; PACKET_SIZE],
         number: u32,
         rays: &mut u64,
-        mut see: impl FnMut(usize, usize),
+        mut see: impl FnMut(ChartId, usize),
     ) {
         let mut see_all = |hits: &[RawHit; PACKET_SIZE]| {
             for hit in hits.iter().filter(|hit| !hit.is_miss()) {
-                let chart = self.charts.chart_of[hit.triangle as usize];
-                if chart != NONE {
-                    see(chart as usize, usize::from(!hit.front));
+                let chart = self.charts.chart_of(hit.triangle);
+                if chart != ChartId::NONE {
+                    see(chart, usize::from(!hit.front));
                 }
             }
         };
@@ -245,9 +247,9 @@ mod tests {
         let of_mesh = |mesh: u32| {
             let (mut counts, mut hidden) = ([0; 2], [false; 2]);
             let first = atlas.scene.first_triangle(mesh);
-            for chart in (first..first + 12).map(|t| atlas.charts.chart_of[t as usize]) {
+            for chart in (first..first + 12).map(|t| atlas.charts.chart_of(t)) {
                 for side in [0, 1] {
-                    counts[side] += atlas.seen.counts[chart as usize][side];
+                    counts[side] += atlas.seen.counts[chart.index()][side];
                     hidden[side] |= atlas.seen.is_hidden(chart, side == 0);
                 }
             }

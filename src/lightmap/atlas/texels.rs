@@ -13,6 +13,7 @@ mod padding;
 
 use super::charts::Charts;
 use super::flat_triangle::Flat;
+use super::ids::PlacementId;
 use super::layout::Layout;
 use crate::base::error::{Error, Result};
 use crate::base::memory::{Reservation, try_collect, try_push, try_to_vec, try_vec, try_with_capacity};
@@ -157,29 +158,29 @@ impl TexelMap {
     }
 
     /// Returns the placement of a sample: the chart's number, or the placement of its back.
-    pub fn placement_of(&self, sample: u32) -> u32 {
-        self.chart_start.partition_point(|&first| first <= sample) as u32 - 1
+    pub fn placement_of(&self, sample: u32) -> PlacementId {
+        PlacementId::new(self.chart_start.partition_point(|&first| first <= sample) - 1)
     }
 
     /// Returns the samples of a placement.
     #[inline]
-    pub fn samples_of(&self, placement: u32) -> Range<u32> {
-        self.chart_start[placement as usize]..self.chart_start[placement as usize + 1]
+    pub fn samples_of(&self, placement: PlacementId) -> Range<u32> {
+        self.chart_start[placement.index()]..self.chart_start[placement.index() + 1]
     }
 
     /// Returns the sample of a texel (x, y) of the page, [`NONE`] if it lies outside the placement's rectangle or is
     /// not covered. Among given charts it may be the sample of another chart.
     #[inline]
-    pub fn texel_index(&self, placement: u32, x: u32, y: u32) -> u32 {
-        let w = &self.windows[placement as usize];
+    pub fn texel_index(&self, placement: PlacementId, x: u32, y: u32) -> u32 {
+        let w = &self.windows[placement.index()];
         let (x, y) = (x.wrapping_sub(w.x as u32), y.wrapping_sub(w.y as u32));
         if x < w.w as u32 && y < w.h as u32 { self.index[w.at(x, y)] } else { NONE }
     }
 
     /// Returns the sample nearest to a texel coordinate of the placement's page.
     #[inline]
-    pub fn nearest(&self, placement: u32, coord: [f32; 2]) -> u32 {
-        let w = &self.windows[placement as usize];
+    pub fn nearest(&self, placement: PlacementId, coord: [f32; 2]) -> u32 {
+        let w = &self.windows[placement.index()];
         let (x, y) = (w.column(coord[0]), w.row(coord[1]));
         let sample = self.index[w.at(x, y)];
         if sample != NONE { sample } else { self.search(w, x, y) }
@@ -188,8 +189,8 @@ impl TexelMap {
     /// Returns up to four samples around a texel coordinate of the placement's page. The weight of texels without a
     /// sample, and of those outside the placement's rectangle, is shared by the others.
     #[inline]
-    pub fn bilinear(&self, placement: u32, coord: [f32; 2]) -> Bilinear {
-        let w = &self.windows[placement as usize];
+    pub fn bilinear(&self, placement: PlacementId, coord: [f32; 2]) -> Bilinear {
+        let w = &self.windows[placement.index()];
         let (cx, cy) = (coord[0] - 0.5, coord[1] - 0.5);
         let (x0, y0) = (floor(cx), floor(cy));
         let (fx, fy) = (cx - x0, cy - y0);
@@ -325,16 +326,18 @@ impl Job<'_, '_, '_> {
     /// Returns the triangles of a group as slots of [`Charts::triangles`]. They are contiguous: a group is one chart or
     /// some of the given charts, which come first.
     fn slots(&self, group: &Group) -> Range<u32> {
-        let chart = |placement| &self.charts.charts[self.layout.chart_of(placement) as usize].triangles;
-        chart(group.placements.start).start..chart(group.placements.end - 1).end
+        let of_place = |place: u32| &self.charts[self.layout.chart_of(PlacementId::new(place as usize))].triangles;
+        of_place(group.placements.start).start..of_place(group.placements.end - 1).end
     }
 
     /// Returns the corners of a slot's triangle in texels of the group's window.
     fn flat_triangle(&self, group: &Group, slot: u32) -> Flat {
         let triangle = self.charts.triangles[slot as usize];
-        let placement =
-            if group.placements.len() == 1 { group.placements.start } else { self.charts.chart_of[triangle as usize] };
-        let p = &self.layout.placements[placement as usize];
+        let placement = match group.placements.len() {
+            1 => PlacementId::new(group.placements.start as usize),
+            _ => PlacementId::front_of(self.charts.chart_of(triangle)),
+        };
+        let p = &self.layout[placement];
         let origin = DVec2::new(group.window.x as f64, group.window.y as f64);
         let [offset, scale] = [p.offset, p.scale].map(|a| DVec2::new(a[0] as f64, a[1] as f64));
         Flat(self.charts.corners[triangle as usize].map(|[s, t]| {
@@ -450,8 +453,8 @@ fn placement_in_group(job: &Job, group: &Group, slot: u32) -> usize {
     if group.placements.len() == 1 {
         return 0;
     }
-    let chart = job.charts.chart_of[job.charts.triangles[slot as usize] as usize];
-    (chart - group.placements.start) as usize
+    let chart = job.charts.chart_of(job.charts.triangles[slot as usize]);
+    PlacementId::front_of(chart).index() - group.placements.start as usize
 }
 
 /// Claims the free texels whose centre a triangle covers; returns the number of those that were claimed before.

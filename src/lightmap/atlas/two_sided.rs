@@ -16,6 +16,7 @@
 
 use super::Atlas;
 use super::chart_map::ChartMap;
+use super::ids::{ChartId, PlacementId, RadianceMap, RadianceTexel};
 use super::seen::Seen;
 use crate::base::error::Result;
 use crate::base::memory::{try_collect, try_par_collect};
@@ -55,19 +56,23 @@ const PLACES: usize = 64;
 const RAYS: u32 = 4;
 
 /// Decides for each chart without separate texels for its back whether the back is baked; empty if no chart has a back.
-/// `light` returns how much light a sample of the radiance map gets (any unit). To be called on the device's threads.
+/// `light` returns how much light a texel of the radiance map gets (any unit). To be called on the device's threads.
 /// Its time is part of the whole bake's; its rays are not counted in any stage.
-pub(crate) fn backs(atlas: &Atlas, light: impl Fn(usize) -> f32 + Sync, progress: &Progress) -> Result<Vec<bool>> {
+pub(crate) fn backs(
+    atlas: &Atlas,
+    light: impl Fn(RadianceTexel) -> f32 + Sync,
+    progress: &Progress,
+) -> Result<Vec<bool>> {
     let (scene, radiance) = (&atlas.scene, &atlas.radiance);
     if radiance.layout.back_of.is_empty() {
         return Ok(Vec::new());
     }
-    let lit = |placement: u32| {
-        let samples = radiance.samples_of(placement);
-        let n = samples.len().max(1) as f64;
-        samples.map(|s| light(s) as f64).sum::<f64>() / n
+    let lit = |placement: PlacementId| {
+        let texels = radiance.texels_of(placement);
+        let n = texels.len().max(1) as f64;
+        texels.map(|s| light(s) as f64).sum::<f64>() / n
     };
-    let is_back = |chart: u32| {
+    let is_back = |chart: ChartId| {
         // The result is discarded after a cancel.
         if progress.is_cancelled() {
             return false;
@@ -75,11 +80,12 @@ pub(crate) fn backs(atlas: &Atlas, light: impl Fn(usize) -> f32 + Sync, progress
         let Some(back) = radiance.layout.back(chart).filter(|_| atlas.map.layout.back(chart).is_none()) else {
             return false;
         };
-        let [of_front, of_back] = [chart, back].map(|placement| view(scene, radiance, placement));
-        if of_front.is_in_the_open() && lit(chart) > BRIGHTER * lit(back) {
+        let front = PlacementId::front_of(chart);
+        let [of_front, of_back] = [front, back].map(|placement| view(scene, radiance, placement));
+        if of_front.is_in_the_open() && lit(front) > BRIGHTER * lit(back) {
             return false;
         }
-        if of_back.is_in_the_open() && lit(back) > BRIGHTER * BETTER * lit(chart) {
+        if of_back.is_in_the_open() && lit(back) > BRIGHTER * BETTER * lit(front) {
             return true;
         }
         if let Some(is_back) = atlas.seen.shows_back(chart) {
@@ -88,20 +94,25 @@ pub(crate) fn backs(atlas: &Atlas, light: impl Fn(usize) -> f32 + Sync, progress
         if of_front.is_covered(scene) != of_back.is_covered(scene) {
             return of_front.is_covered(scene);
         }
-        of_back.distance * lit(back).cbrt() > BETTER * of_front.distance * lit(chart).cbrt()
+        of_back.distance * lit(back).cbrt() > BETTER * of_front.distance * lit(front).cbrt()
     };
     let charts = (0..atlas.charts.charts.len()).into_par_iter();
-    let backs = try_par_collect(charts.map(|chart| is_back(chart as u32)), "the sides of charts")?;
+    let backs = try_par_collect(charts.map(|chart| is_back(ChartId::new(chart))), "the sides of charts")?;
     progress.check()?;
     Ok(backs)
 }
 
 /// Returns those of the given two-sided charts whose sides can both be seen, ascending. Charts that gain least per
 /// texel are left out as long as at most [`MISSING`] of all rays from open places end on sides that are not shown.
-pub(crate) fn seen_from_both(seen: &Seen, radiance: &ChartMap, charts: &[u32]) -> Result<Vec<u32>> {
-    let missing = |chart: u32| seen.counts[chart as usize].into_iter().min().unwrap_or(0);
+pub(crate) fn seen_from_both(
+    seen: &Seen,
+    radiance: &ChartMap<RadianceMap>,
+    charts: &[ChartId],
+) -> Result<Vec<ChartId>> {
+    let missing = |chart: ChartId| seen.counts[chart.index()].into_iter().min().unwrap_or(0);
     let mut both = try_collect(charts.iter().copied().filter(|&chart| missing(chart) > 0), BOTH)?;
-    let per_texel = |chart: u32| f64::from(missing(chart)) / radiance.samples_of(chart).len().max(1) as f64;
+    let texels = |chart| radiance.texels_of(PlacementId::front_of(chart)).len().max(1);
+    let per_texel = |chart: ChartId| f64::from(missing(chart)) / texels(chart) as f64;
     both.sort_unstable_by(|&a, &b| per_texel(a).total_cmp(&per_texel(b)).then(a.cmp(&b)));
     let all: u64 = seen.counts.iter().flatten().map(|&n| u64::from(n)).sum();
     let mut left = (MISSING * all as f64) as u64;
@@ -143,16 +154,17 @@ impl View {
     }
 }
 
-fn view(scene: &Scene, radiance: &ChartMap, placement: u32) -> View {
+fn view(scene: &Scene, radiance: &ChartMap<RadianceMap>, placement: PlacementId) -> View {
     let far = FAR * scene.diagonal();
-    let samples = radiance.samples_of(placement);
-    let places = samples.clone().step_by(samples.len().div_ceil(PLACES).max(1));
+    let texels = radiance.texels_of(placement);
+    let step = texels.len().div_ceil(PLACES).max(1);
+    let places = texels.step_by(step);
     let rays = places.len().max(1) as f64 * f64::from(RAYS);
     let mut view = View { distance: 0.0, void: 0.0 };
-    for sample in places {
-        let (_, receiver) = radiance.receiver(scene, sample, radiance.is_back(sample));
+    for texel in places {
+        let (_, receiver) = radiance.receiver(scene, texel, radiance.is_back(texel));
         for i in 0..RAYS {
-            let d = cosine_around(receiver.geometric, sobol_2d(i, sample as u32));
+            let d = cosine_around(receiver.geometric, sobol_2d(i, texel.seed()));
             let hit = scene.intersect_raw(&Ray::new(receiver.origin, d));
             view.distance += f64::from(if hit.is_miss() { VOID * far } else { hit.t.min(far) }) / rays;
             view.void += f64::from(u8::from(hit.is_miss())) / rays;
@@ -193,14 +205,14 @@ mod tests {
         data.add_light(Light::Point { position: Vec3::splat(1.0), intensity: [1.0; 3] }).unwrap();
         let lightmap = lightmap(data, false);
         let atlas = lightmap.atlas();
-        let light = |s: usize| {
+        let light = |s: RadianceTexel| {
             let (point, receiver) = atlas.radiance.receiver(&atlas.scene, s, atlas.radiance.is_back(s));
             let inwards = receiver.geometric.dot(point.position) < 0.0;
             lights[usize::from(inwards)]
         };
         let of_chart = backs(atlas, light, &Progress::none()).unwrap();
         // The first triangles of the room and of the box.
-        [0, 12].map(|t| of_chart[atlas.charts.chart_of[t] as usize]).to_vec()
+        [0, 12].map(|t| of_chart[atlas.charts.chart_of(t).index()]).to_vec()
     }
 
     #[test]
@@ -231,8 +243,8 @@ mod tests {
         }
         let lightmap = lightmap(data, false);
         let atlas = lightmap.atlas();
-        let light = |s: usize| if atlas.radiance.is_back(s) { back } else { front };
-        backs(atlas, light, &Progress::none()).unwrap()[atlas.charts.chart_of[0] as usize]
+        let light = |s: RadianceTexel| if atlas.radiance.is_back(s) { back } else { front };
+        backs(atlas, light, &Progress::none()).unwrap()[atlas.charts.chart_of(0).index()]
     }
 
     /// Whether charts of hollow things in the open, with fronts outside or inside, show their backs.
@@ -243,7 +255,7 @@ mod tests {
         data.add_mesh(builder.finish()).unwrap();
         let lightmap = lightmap(data, false);
         let atlas = lightmap.atlas();
-        let is_outer = |s: usize| atlas.radiance.is_back(s) == inward;
+        let is_outer = |s: RadianceTexel| atlas.radiance.is_back(s) == inward;
         backs(atlas, |s| lights[usize::from(!is_outer(s))], &Progress::none()).unwrap()[0]
     }
 
@@ -313,17 +325,20 @@ mod tests {
         data.add_mesh(builder.finish()).unwrap();
         let lightmap = lightmap(data, true);
         let atlas = lightmap.atlas();
-        let wall = atlas.charts.chart_of[0];
-        for map in [&atlas.map, &atlas.gather] {
-            assert_eq!(map.layout.back_of, [wall], "the insides of the boxes and the outside of the room see nothing");
+        let wall = atlas.charts.chart_of(0);
+        for layout in [&atlas.map.layout, &atlas.gather.layout] {
+            assert_eq!(layout.back_of, [wall], "the insides of the boxes and the outside of the room see nothing");
         }
         let back = atlas.map.layout.back(wall).unwrap();
-        assert_eq!(atlas.map.samples_of(back), atlas.map.back_start..atlas.map.len());
+        assert_eq!(atlas.map.texels_of(back).indices(), atlas.map.back_start.index()..atlas.map.len());
         let info = lightmap.info();
-        assert_eq!((info.both_sided_charts, info.back_texels), (1, atlas.map.samples_of(wall).len() as u64));
+        assert_eq!(
+            (info.both_sided_charts, info.back_texels),
+            (1, atlas.map.texels_of(PlacementId::front_of(wall)).len() as u64)
+        );
         // A chart with two places never turns over.
         let light = |s| if atlas.radiance.is_back(s) { 1e6 } else { 1.0 };
-        assert!(!backs(atlas, light, &Progress::none()).unwrap()[wall as usize]);
+        assert!(!backs(atlas, light, &Progress::none()).unwrap()[wall.index()]);
         for both_sides in [false, true] {
             let cancel = Progress::new(|_, stage| stage != "sides");
             let desc = LightmapDesc { texels_per_unit: 8.0, both_sides, ..Default::default() };

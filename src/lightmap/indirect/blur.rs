@@ -7,7 +7,7 @@ use crate::base::progress::{Progress, Stage};
 use crate::device::Device;
 use crate::lightmap::atlas::chart_map::ChartMap;
 use crate::lightmap::atlas::charts::Charts;
-use crate::scene::NONE;
+use crate::lightmap::atlas::ids::{GatherMap, GatherTexel};
 use glam::Vec3;
 use rayon::prelude::*;
 
@@ -29,7 +29,7 @@ const FILLED: &str = "the texels to be filled";
 /// Difference of two texels, in standard deviations of their noise, up to which they are taken for equally lit.
 const LIKE: f32 = 2.0;
 
-/// Inputs of a blur, by sample of the map.
+/// Inputs of a blur, by texel of the gather map.
 #[derive(Clone, Copy)]
 pub(crate) struct Texels<'a> {
     pub values: &'a [Vec3],
@@ -49,7 +49,7 @@ pub(crate) struct Texels<'a> {
 pub(crate) fn blur(
     device: &Device,
     charts: &Charts,
-    map: &ChartMap,
+    map: &ChartMap<GatherMap>,
     texels: Texels,
     radius: u32,
     out: &mut [Vec3],
@@ -61,9 +61,11 @@ pub(crate) fn blur(
             let mut window = Window::new(radius);
             for (i, out) in out.iter_mut().enumerate() {
                 stage.check()?;
-                let sample = block * BLOCK + i;
-                *out =
-                    if texels.valid[sample] { window.blur(charts, map, sample, texels) } else { texels.values[sample] };
+                let i = block * BLOCK + i;
+                *out = match texels.valid[i] {
+                    true => window.blur(charts, map, GatherTexel::new(i), texels),
+                    false => texels.values[i],
+                };
             }
             stage.advance(out.len() as u64)
         })
@@ -88,11 +90,18 @@ impl Window {
     }
 
     /// Returns the blurred value of one valid texel.
-    pub(crate) fn blur(&mut self, charts: &Charts, map: &ChartMap, sample: usize, texels: Texels) -> Vec3 {
+    pub(crate) fn blur(
+        &mut self,
+        charts: &Charts,
+        map: &ChartMap<GatherMap>,
+        texel: GatherTexel,
+        texels: Texels,
+    ) -> Vec3 {
         let Texels { values, variances, valid, normals } = texels;
-        let (brightness, variance) = (values[sample].element_sum(), variances[sample]);
-        let (x, y) = map.position(sample);
-        let placement = map.placement_of(charts, sample);
+        let own = texel.index();
+        let (brightness, variance) = (values[own].element_sum(), variances[own]);
+        let (x, y) = map.position(texel);
+        let placement = map.placement_of(charts, texel);
         self.seen = [0; MAX_WINDOW];
         self.queue.clear();
         self.visit(0, 0);
@@ -101,18 +110,16 @@ impl Window {
         while next < self.queue.len() {
             let (dx, dy) = self.queue[next];
             next += 1;
-            let s = map.at(placement, x + dx, y + dy);
-            if s == NONE || !valid[s as usize] {
+            let Some(s) = map.at(placement, x + dx, y + dy).map(GatherTexel::index).filter(|&s| valid[s]) else {
                 continue;
-            }
+            };
             // Charts may bend, and texels with other normals receive other light.
-            let bend = normals[sample].dot(normals[s as usize]).max(0.0);
+            let bend = normals[own].dot(normals[s]).max(0.0);
             let bend = bend * bend * bend * bend;
-            let s = s as usize;
             let deviation = (variance + variances[s]).sqrt() + f32::MIN_POSITIVE;
             let difference = (values[s].element_sum() - brightness) / (LIKE * deviation);
             // The difference is not a number if light overflows.
-            let like = if s == sample { 1.0 } else { (-0.5 * difference * difference).exp().max(0.0) };
+            let like = if s == own { 1.0 } else { (-0.5 * difference * difference).exp().max(0.0) };
             let w = self.weights[(dx * dx + dy * dy) as usize] * bend * like;
             sum += w * values[s];
             total += w;
@@ -134,20 +141,20 @@ impl Window {
     }
 }
 
-/// Fills missing texels: each gets the mean of its known or already filled neighbours in the chart, ring by ring.
+/// Fills missing texels of the gather map: each gets the mean of its known or already filled neighbours in the chart, ring by ring.
 /// Charts without a known texel are left unchanged. The result depends on the known texels alone, not on the values of
 /// missing ones.
 pub(crate) struct Filling {
     known: Vec<bool>,
-    missing: Vec<u32>,
+    missing: Vec<GatherTexel>,
     /// Buffer for one ring, large enough for all missing texels.
-    ring: Vec<(u32, Vec3)>,
+    ring: Vec<(GatherTexel, Vec3)>,
 }
 
 impl Filling {
     /// Prepares to fill the `missing` ones of `n` texels from the `known` ones. Filling itself allocates no memory.
     pub(crate) fn new(n: usize, known: impl Fn(usize) -> bool, missing: impl Fn(usize) -> bool) -> Result<Filling> {
-        let missing = try_collect((0..n).filter(|&i| missing(i)).map(|i| i as u32), FILLED)?;
+        let missing = try_collect((0..n).filter(|&i| missing(i)).map(GatherTexel::new), FILLED)?;
         let ring = try_with_capacity(missing.len(), FILLED)?;
         let known = if missing.is_empty() { Vec::new() } else { try_collect((0..n).map(known), FILLED)? };
         Ok(Filling { known, missing, ring })
@@ -157,7 +164,7 @@ impl Filling {
     pub(crate) fn fill(
         mut self,
         charts: &Charts,
-        map: &ChartMap,
+        map: &ChartMap<GatherMap>,
         values: &mut [Vec3],
         progress: &Progress,
     ) -> Result<()> {
@@ -165,33 +172,38 @@ impl Filling {
             self.ring.clear();
             for part in self.missing.chunks(BLOCK) {
                 progress.check()?;
-                let mean = |&i: &u32| Some((i, neighbours(charts, map, i, values, &self.known)?));
+                let mean = |&i: &GatherTexel| Some((i, neighbours(charts, map, i, values, &self.known)?));
                 self.ring.extend(part.iter().filter_map(mean));
             }
             if self.ring.is_empty() {
                 break;
             }
             for &(i, v) in &self.ring {
-                values[i as usize] = v;
-                self.known[i as usize] = true;
+                values[i.index()] = v;
+                self.known[i.index()] = true;
             }
             let known = &self.known;
-            self.missing.retain(|&i| !known[i as usize]);
+            self.missing.retain(|i| !known[i.index()]);
         }
         Ok(())
     }
 }
 
 /// Returns the mean of the known neighbours of a texel in its chart.
-fn neighbours(charts: &Charts, map: &ChartMap, sample: u32, values: &[Vec3], known: &[bool]) -> Option<Vec3> {
-    let (x, y) = map.position(sample as usize);
-    let placement = map.placement_of(charts, sample as usize);
+fn neighbours(
+    charts: &Charts,
+    map: &ChartMap<GatherMap>,
+    texel: GatherTexel,
+    values: &[Vec3],
+    known: &[bool],
+) -> Option<Vec3> {
+    let (x, y) = map.position(texel);
+    let placement = map.placement_of(charts, texel);
     let (mut sum, mut n) = (Vec3::ZERO, 0.0);
     for dy in -1..=1 {
         for dx in -1..=1 {
-            let s = map.at(placement, x + dx, y + dy);
-            if s != NONE && known[s as usize] {
-                sum += values[s as usize];
+            if let Some(s) = map.at(placement, x + dx, y + dy).map(GatherTexel::index).filter(|&s| known[s]) {
+                sum += values[s];
                 n += 1.0;
             }
         }

@@ -17,6 +17,7 @@ use crate::direct::Receiver;
 use crate::direct::many_lights::ManyLights;
 use crate::direct::shadow_rays::ShadowRays;
 use crate::lightmap::atlas::chart_map::ChartMap;
+use crate::lightmap::atlas::ids::{PlacementId, RadianceMap};
 use glam::Vec3;
 
 /// Gather rays see the full radiance of a texel if they are shorter than the square root of this many times its area.
@@ -52,7 +53,13 @@ impl Bright {
 
     /// Returns the part of the `radiance` of a texel of the radiance map that a gather ray sees from a `distance`.
     #[inline]
-    pub(crate) fn seen(&self, radiance: Vec3, map: &ChartMap, placement: u32, distance: f32) -> Vec3 {
+    pub(crate) fn seen(
+        &self,
+        radiance: Vec3,
+        map: &ChartMap<RadianceMap>,
+        placement: PlacementId,
+        distance: f32,
+    ) -> Vec3 {
         let sum = radiance.element_sum();
         if self.patches.is_none() || sum <= self.limit || distance * distance <= near2(map, placement) {
             return radiance;
@@ -97,7 +104,7 @@ impl Unoccluded {
 
 /// Returns the square of the distance up to which gather rays see the full radiance of a placement's texels.
 #[inline]
-pub(in crate::lightmap) fn near2(map: &ChartMap, placement: u32) -> f32 {
-    let [x, y] = map.layout.placements[placement as usize].scale;
+pub(in crate::lightmap) fn near2(map: &ChartMap<RadianceMap>, placement: PlacementId) -> f32 {
+    let [x, y] = map.layout[placement].scale;
     NEAR / (x * y)
 }

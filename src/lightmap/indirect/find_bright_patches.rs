@@ -3,7 +3,7 @@
 
 use super::bright_patches::{Bright, near2};
 use super::gather::Gathered;
-use super::radiance_map::{Radiance, RadianceMap};
+use super::radiance_map::{Radiance, RadianceLookup};
 use super::sample_set::{ROUND, SampleSet};
 use crate::base::error::Result;
 use crate::base::memory::{try_append, try_collect, try_par_collect, try_par_collect_ok, try_par_gather, try_push};
@@ -11,7 +11,7 @@ use crate::base::progress::Progress;
 use crate::base::sampling::{combine, cosine_around, sobol_2d, uniform};
 use crate::direct::many_lights::{ManyLights, Patch};
 use crate::lightmap::atlas::Atlas;
-use crate::scene::NONE;
+use crate::lightmap::atlas::ids::{ChartId, PlacementId, RadianceTexel};
 use crate::trace::Ray;
 use crate::trace::offset::{SurfacePoint, offset_ray_origin};
 use glam::{Mat2, Vec2, Vec3};
@@ -104,8 +104,8 @@ pub(crate) fn again(atlas: &Atlas, values: &[Vec3], limit: f32, shadow_rays: u32
 const TEXELS: &str = "lit texels that are looked from";
 
 /// Returns about `count` of the lit texels of a radiance map, at regular intervals.
-fn lit_texels(values: &[Vec3], count: usize) -> Result<Vec<usize>> {
-    let lit = || (0..values.len()).filter(|&s| values[s] != Vec3::ZERO);
+fn lit_texels(values: &[Vec3], count: usize) -> Result<Vec<RadianceTexel>> {
+    let lit = || RadianceTexel::range(0..values.len()).filter(|s| values[s.index()] != Vec3::ZERO);
     let step = (lit().count() / count).max(1);
     try_collect(lit().skip(step / 2).step_by(step), TEXELS)
 }
@@ -113,14 +113,14 @@ fn lit_texels(values: &[Vec3], count: usize) -> Result<Vec<usize>> {
 /// Traces rounds of gather rays from texels all over the lit surfaces and returns their means and variances, summed
 /// over the channels.
 fn trials(atlas: &Atlas, radiance: &Radiance, rays: &mut u64, progress: &Progress) -> Result<Vec<(f32, f32)>> {
-    let lookup = RadianceMap::new(&atlas.charts, &atlas.radiance, radiance);
+    let lookup = RadianceLookup::new(&atlas.charts, &atlas.radiance, radiance);
     let samples = SampleSet::new(ROUND as u32, 0);
-    let at = |&sample: &usize| {
+    let at = |&texel: &RadianceTexel| {
         progress.check()?;
-        let (_, receiver) = atlas.radiance.receiver(&atlas.scene, sample, atlas.radiance.is_back(sample));
+        let (_, receiver) = atlas.radiance.receiver(&atlas.scene, texel, atlas.radiance.is_back(texel));
         let mut traced = 0;
         let round = |i: u32| {
-            let (mut gathered, seed) = (Gathered::default(), combine(sample as u32, i));
+            let (mut gathered, seed) = (Gathered::default(), combine(texel.seed(), i));
             traced += gathered.add_round(&atlas.scene, &lookup, &receiver, &samples, 0, seed);
             gathered.irradiance().element_sum()
         };
@@ -149,15 +149,15 @@ fn pays(with: &[(f32, f32)], without: &[(f32, f32)]) -> bool {
 /// not zero.
 fn seen_by_gather_rays(atlas: &Atlas, radiance: &Radiance, rays: &mut u64, progress: &Progress) -> Result<Vec<f32>> {
     let (scene, map, values) = (&atlas.scene, &atlas.radiance, &radiance.values);
-    let lookup = RadianceMap::new(&atlas.charts, map, radiance);
+    let lookup = RadianceLookup::new(&atlas.charts, map, radiance);
     let lit = lit_texels(values, VIEWS)?;
     *rays += lit.len() as u64 * u64::from(RAYS);
-    let from = |&sample: &usize| {
+    let from = |&texel: &RadianceTexel| {
         progress.check()?;
-        let (_, receiver) = map.receiver(scene, sample, map.is_back(sample));
+        let (_, receiver) = map.receiver(scene, texel, map.is_back(texel));
         let lookup = &lookup;
         let along = move |i: u32| {
-            let d = cosine_around(receiver.geometric, sobol_2d(i, sample as u32));
+            let d = cosine_around(receiver.geometric, sobol_2d(i, texel.seed()));
             let hit = scene.intersect_raw(&Ray::new(receiver.origin, d));
             if hit.is_miss() {
                 return None;
@@ -176,10 +176,10 @@ fn seen_by_gather_rays(atlas: &Atlas, radiance: &Radiance, rays: &mut u64, progr
 
 /// A grid point on a bright texel, on the side that the texel shows.
 struct Place {
-    texel: u32,
+    texel: RadianceTexel,
     /// Number among the points of all texels.
     number: u32,
-    placement: u32,
+    placement: PlacementId,
     /// Area of the surface around the point.
     area: f32,
     position: Vec3,
@@ -197,7 +197,8 @@ fn patches(
 ) -> Result<Vec<Patch>> {
     let count = values.iter().filter(|v| v.element_sum() > limit).count();
     let chance = (most as f32 / count.max(1) as f32).min(1.0);
-    let is_light = |texel: usize| values[texel].element_sum() > limit && uniform(texel as u32, 0, 0) < chance;
+    let is_light =
+        |texel: RadianceTexel| values[texel.index()].element_sum() > limit && uniform(texel.seed(), 0, 0) < chance;
     let [fewest, most_along_axis] = PLACES_ALONG_AXIS;
     let along_axis = ((PLACES / count.clamp(1, most.max(1))).isqrt() as u32).clamp(fewest, most_along_axis);
     let traced = AtomicU64::new(0);
@@ -206,13 +207,13 @@ fn patches(
     places.sort_unstable_by_key(|p| (p.texel, p.number));
     let patch = |of_texel: &[Place]| {
         let area: f32 = of_texel.iter().map(|p| p.area).sum();
-        let mut at = area * uniform(of_texel[0].texel, 1, 0);
+        let mut at = area * uniform(of_texel[0].texel.seed(), 1, 0);
         let chosen = of_texel.iter().find(|p| {
             at -= p.area;
             at < 0.0
         });
         let Place { texel, placement, position, normal, .. } = *chosen.unwrap_or(&of_texel[0]);
-        let radiance = values[texel as usize];
+        let radiance = values[texel.index()];
         let flux = radiance * ((1.0 - limit / radiance.element_sum()) * area / chance);
         Patch { position, normal, flux, near2: near2(&atlas.radiance, placement) }
     };
@@ -224,16 +225,16 @@ fn patches(
 fn places(
     atlas: &Atlas,
     along_axis: u32,
-    is_light: impl Fn(usize) -> bool + Sync,
+    is_light: impl Fn(RadianceTexel) -> bool + Sync,
     rays: &AtomicU64,
     progress: &Progress,
 ) -> Result<Vec<Place>> {
     let (scene, charts, map) = (&atlas.scene, &atlas.charts, &atlas.radiance);
     let placements = (0..map.layout.placements.len()).into_par_iter();
-    let has_lights = placements.map(|p| map.samples_of(p as u32).any(&is_light));
+    let has_lights = placements.map(|p| map.texels_of(PlacementId::new(p)).any(&is_light));
     let has_lights = try_par_collect(has_lights, "bright patches")?;
     let on_side = |t: u32, front: bool| -> Vec<Place> {
-        let placement = map.layout.side(charts.chart_of[t as usize], front).filter(|&p| has_lights[p as usize]);
+        let placement = map.layout.side(charts.chart_of(t), front).filter(|&p| has_lights[p.index()]);
         let Some(placement) = placement else { return Vec::new() };
         let [a, b, c] = scene.corners(t);
         let area = 0.5 * (b - a).cross(c - a).length();
@@ -250,7 +251,7 @@ fn places(
             let w = weights * (p - a2);
             let (u, v) = (w.x.max(0.0), w.y.max(0.0));
             let texel = map.nearest(placement, charts.local(t, u, v))?;
-            if !is_light(texel as usize) {
+            if !is_light(texel) {
                 return None;
             }
             let point = SurfacePoint::new([a, b, c], u, v, scene);
@@ -268,7 +269,7 @@ fn places(
     let mut places = try_par_gather(triangles.div_ceil(TRIANGLES) as usize, "bright patches", |part, out| {
         progress.check()?;
         let first = part as u32 * TRIANGLES;
-        for t in (first..triangles.min(first + TRIANGLES)).filter(|&t| charts.chart_of[t as usize] != NONE) {
+        for t in (first..triangles.min(first + TRIANGLES)).filter(|&t| charts.chart_of(t) != ChartId::NONE) {
             for place in [true, false].into_iter().flat_map(|front| on_side(t, front)) {
                 try_push(out, place, "bright patches")?;
             }
@@ -338,14 +339,14 @@ mod tests {
     /// Means of irradiance at every hundredth gather texel over `rounds` rounds, and their mean variance for one round.
     fn gathered(lightmap: &Lightmap, radiance: &Radiance, rounds: usize) -> (Vec<Vec3>, f64) {
         let atlas = lightmap.atlas();
-        let lookup = RadianceMap::new(&atlas.charts, &atlas.radiance, radiance);
+        let lookup = RadianceLookup::new(&atlas.charts, &atlas.radiance, radiance);
         let samples = SampleSet::new(64 * rounds as u32, 3);
         let (mut means, mut variance) = (Vec::new(), 0.0);
-        for sample in (0..atlas.gather.len()).step_by(100) {
-            let receiver = atlas.receiver(&atlas.gather, &baked(lightmap).backs, sample);
+        for texel in atlas.gather.all().step_by(100) {
+            let receiver = atlas.receiver(&atlas.gather, &baked(lightmap).backs, texel);
             let each = (0..rounds).map(|round| {
                 let mut g = Gathered::default();
-                g.add_round(&atlas.scene, &lookup, &receiver, &samples, round, sample as u32);
+                g.add_round(&atlas.scene, &lookup, &receiver, &samples, round, texel.seed());
                 g.irradiance()
             });
             let each: Vec<Vec3> = each.collect();
@@ -382,7 +383,7 @@ mod tests {
         let values = &baked(&lightmap).radiance.values;
         let limit = 0.05 * values.iter().map(|v| v.element_sum()).fold(0.0, f32::max);
         let (atlas, scene) = (lightmap.atlas(), &lightmap.atlas().scene);
-        let lookup = RadianceMap::new(&atlas.charts, &atlas.radiance, &baked(&lightmap).radiance);
+        let lookup = RadianceLookup::new(&atlas.charts, &atlas.radiance, &baked(&lightmap).radiance);
         let of_triangle = |t: u32| {
             let [a, b, c] = scene.corners(t);
             let beyond = |i: u32| {

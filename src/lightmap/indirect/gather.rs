@@ -11,7 +11,7 @@
 //! docs/experiments.md#adaptive-and-guided-gather-rays.
 
 use super::bright_patches::Unoccluded;
-use super::radiance_map::RadianceMap;
+use super::radiance_map::RadianceLookup;
 use super::sample_set::{ROUND, SampleSet};
 use crate::base::error::Result;
 use crate::base::memory::try_filled;
@@ -65,7 +65,7 @@ impl Gathered {
     pub(crate) fn add_round(
         &mut self,
         scene: &Scene,
-        radiance: &RadianceMap,
+        radiance: &RadianceLookup,
         receiver: &Receiver,
         samples: &SampleSet,
         round: usize,
@@ -94,7 +94,7 @@ impl Gathered {
     fn add(
         &mut self,
         scene: &Scene,
-        radiance: &RadianceMap,
+        radiance: &RadianceLookup,
         receiver: &Receiver,
         rays: &[Ray],
         hits: &[RawHit],
@@ -163,7 +163,7 @@ impl Tile {
     pub(crate) fn add_round(
         &mut self,
         scene: &Scene,
-        radiance: &RadianceMap,
+        radiance: &RadianceLookup,
         texels: &mut [TileTexel],
         samples: &SampleSet,
         round: usize,
@@ -216,7 +216,7 @@ fn aim(receiver: &Receiver, points: &[[u32; 2]], seed: u32, rays: &mut [Ray]) {
 
 /// Returns the reflected radiance along a ray from transmissive sheets and from the surface behind them.
 #[cold]
-fn through(scene: &Scene, radiance: &RadianceMap, ray: &Ray, crossings: &mut Vec<Crossing>) -> Vec3 {
+fn through(scene: &Scene, radiance: &RadianceLookup, ray: &Ray, crossings: &mut Vec<Crossing>) -> Vec3 {
     let behind = scene.intersect_through(ray, crossings);
     let (mut sum, mut part) = (Vec3::ZERO, Vec3::ONE);
     for c in crossings.iter() {

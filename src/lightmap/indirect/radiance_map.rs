@@ -21,6 +21,7 @@ use crate::base::scratch::Scratch;
 use crate::device::Device;
 use crate::lightmap::atlas::chart_map::ChartMap;
 use crate::lightmap::atlas::charts::Charts;
+use crate::lightmap::atlas::ids::{ChartId, Map, PerTexel, PlacementId, RadianceMap, RadianceTexel, TexelId};
 use crate::lightmap::atlas::texels::TexelSample;
 use crate::lightmap::texel_light::{Look, TexelAreas, TexelLight, TilePoints};
 use crate::lightmap::tiles::{TILE, in_order, texels_per_tile};
@@ -37,9 +38,9 @@ use std::sync::atomic::{AtomicU64, Ordering::Relaxed};
 const BLOCK: usize = 1024;
 
 /// Reflected radiance per texel, with the charts and the map that a look-up needs.
-pub(crate) struct RadianceMap<'a> {
+pub(crate) struct RadianceLookup<'a> {
     charts: &'a Charts,
-    map: &'a ChartMap,
+    map: &'a ChartMap<RadianceMap>,
     radiance: &'a Radiance,
 }
 
@@ -50,9 +51,9 @@ pub(crate) struct Radiance {
     pub bright: Bright,
 }
 
-impl<'a> RadianceMap<'a> {
-    pub(crate) fn new(charts: &'a Charts, map: &'a ChartMap, radiance: &'a Radiance) -> Self {
-        RadianceMap { charts, map, radiance }
+impl<'a> RadianceLookup<'a> {
+    pub(crate) fn new(charts: &'a Charts, map: &'a ChartMap<RadianceMap>, radiance: &'a Radiance) -> Self {
+        RadianceLookup { charts, map, radiance }
     }
 
     /// Returns the radiance reflected towards a ray at its hit; `None` on the back of a one-sided surface.
@@ -75,20 +76,20 @@ impl<'a> RadianceMap<'a> {
 
     /// Returns placement and radiance at a hit.
     #[inline]
-    fn met(&self, hit: &RawHit) -> Option<(u32, Vec3)> {
-        let chart = self.charts.chart_of[hit.triangle as usize];
-        if chart == NONE {
-            return Some((NONE, Vec3::ZERO));
+    fn met(&self, hit: &RawHit) -> Option<(PlacementId, Vec3)> {
+        let chart = self.charts.chart_of(hit.triangle);
+        if chart == ChartId::NONE {
+            return Some((PlacementId::NONE, Vec3::ZERO));
         }
         let placement = self.map.layout.side(chart, hit.front)?;
-        let sample = self.map.nearest(placement, self.charts.local(hit.triangle, hit.u, hit.v))?;
-        Some((placement, self.radiance.values[sample as usize]))
+        let texel = self.map.nearest(placement, self.charts.local(hit.triangle, hit.u, hit.v))?;
+        Some((placement, self.radiance.values[texel.index()]))
     }
 }
 
 /// Inputs of the stage.
 pub(crate) struct RadianceInput<'a> {
-    pub light: TexelLight<'a>,
+    pub light: TexelLight<'a, RadianceMap>,
     /// Photons that have been reflected at least once; `None`: their light is left out.
     pub photons: Option<&'a PhotonMap>,
 }
@@ -108,10 +109,10 @@ pub(crate) fn bake(device: &Device, input: &RadianceInput, values: &mut [Vec3], 
         looks.par_chunks_mut(BLOCK).enumerate().try_for_each(|(block, out)| {
             let (mut traced, first) = (0, block * BLOCK);
             let mut tile = tiles.take(|| TilePoints::new(TILE))?;
-            for samples in in_order(map, first..first + out.len())?.chunks(per_tile) {
+            for texels in in_order(map, first..first + out.len())?.chunks(per_tile) {
                 stage.check()?;
-                let place = |i: usize| samples[i] as usize - first;
-                input.light.first_look(samples, &mut tile, &mut traced, |i, look| out[place(i)] = look);
+                let place = |i: usize| texels[i].index() - first;
+                input.light.first_look(texels, &mut tile, &mut traced, |i, look| out[place(i)] = look);
             }
             rays.fetch_add(traced, Relaxed);
             stage.advance(out.len() as u64)
@@ -120,10 +121,10 @@ pub(crate) fn bake(device: &Device, input: &RadianceInput, values: &mut [Vec3], 
             let (mut traced, first) = (0, block * BLOCK);
             let make = || Ok(RadianceTile { points: TilePoints::new(TILE)?, discs: Discs::new(TILE)? });
             let mut room = rooms.take(make)?;
-            for samples in in_order(map, first..first + out.len())?.chunks(per_tile) {
+            for texels in in_order(map, first..first + out.len())?.chunks(per_tile) {
                 stage.check()?;
-                let place = |i: usize| samples[i] as usize - first;
-                room.radiance(input, &looks, samples, &mut traced, |i, value| out[place(i)] = value);
+                let place = |i: usize| texels[i].index() - first;
+                room.radiance(input, PerTexel::new(&looks), texels, &mut traced, |i, value| out[place(i)] = value);
             }
             rays.fetch_add(traced, Relaxed);
             stage.advance(out.len() as u64)
@@ -143,8 +144,8 @@ impl RadianceTile {
     fn radiance(
         &mut self,
         input: &RadianceInput,
-        looks: &[Look],
-        samples: &[u32],
+        looks: PerTexel<RadianceMap, Look>,
+        texels: &[RadianceTexel],
         rays: &mut u64,
         mut out: impl FnMut(usize, Vec3),
     ) {
@@ -153,23 +154,22 @@ impl RadianceTile {
         // The places in the tile of texels that reflect light, and of those that need more points.
         let (mut reflecting, mut reflecting_count) = ([0; TILE], 0);
         let (mut looked_at, mut looked_at_count) = ([0; TILE], 0);
-        for (i, &sample) in samples.iter().enumerate() {
-            let sample = sample as usize;
-            albedos[i] = albedo(areas, sample);
+        for (i, &texel) in texels.iter().enumerate() {
+            albedos[i] = albedo(areas, texel);
             if albedos[i] != Vec3::ZERO {
-                sums[i] = looks[sample].irradiance;
+                sums[i] = looks[texel].irradiance;
                 reflecting[reflecting_count] = i;
                 reflecting_count += 1;
-                if light.needs_closer_look(sample, |s| &looks[s]) {
+                if light.needs_closer_look(texel, looks) {
                     looked_at[looked_at_count] = i;
                     looked_at_count += 1;
                 }
             }
         }
         let (reflecting, looked_at) = (&reflecting[..reflecting_count], &looked_at[..looked_at_count]);
-        let mut closer = [0; TILE];
+        let mut closer = [RadianceTexel::default(); TILE];
         let closer = &mut closer[..looked_at.len()];
-        closer.iter_mut().zip(looked_at).for_each(|(sample, &i)| *sample = samples[i]);
+        closer.iter_mut().zip(looked_at).for_each(|(texel, &i)| *texel = texels[i]);
         let at = |t: &TexelSample| areas.scene.albedo(t.triangle, t.u, t.v);
         light.closer_look(closer, &mut self.points, at, rays, |k, e| {
             if let Some(e) = e {
@@ -178,13 +178,13 @@ impl RadianceTile {
         });
         if let Some(photons) = input.photons {
             let disc = |&i: &usize| {
-                let sample = samples[i] as usize;
-                let (point, receiver) = areas.map.receiver(areas.scene, sample, areas.map.is_back(sample));
-                (point.position, receiver.geometric, combine(light.seed, sample as u32))
+                let texel = texels[i];
+                let (point, receiver) = areas.map.receiver(areas.scene, texel, areas.map.is_back(texel));
+                (point.position, receiver.geometric, combine(light.seed, texel.seed()))
             };
             self.discs.irradiance(photons, reflecting.iter().map(disc), rays, |k, e| sums[reflecting[k]] += e);
         }
-        for i in 0..samples.len() {
+        for i in 0..texels.len() {
             out(i, albedos[i] * sums[i] / PI);
         }
     }
@@ -194,24 +194,24 @@ impl RadianceTile {
 const MAX_LOOKUPS: u32 = 256;
 
 /// Returns the albedo of a texel of a map.
-pub(crate) fn albedo(areas: &TexelAreas, sample: usize) -> Vec3 {
+pub(crate) fn albedo<M: Map>(areas: &TexelAreas<M>, texel: TexelId<M>) -> Vec3 {
     let TexelAreas { scene, charts, map, .. } = *areas;
-    let texel = &map.texels.samples[sample];
-    let point = || scene.albedo(texel.triangle, texel.u, texel.v);
-    let material = scene.material(texel.triangle);
+    let sample = &map[texel];
+    let point = || scene.albedo(sample.triangle, sample.u, sample.v);
+    let material = scene.material(sample.triangle);
     if !scene.uses().textures || material.albedo_texture == NONE {
         return Vec3::from(material.albedo);
     }
-    let (mesh, triangle) = scene.locate(texel.triangle);
+    let (mesh, triangle) = scene.locate(sample.triangle);
     let mesh = &scene.meshes()[mesh as usize];
     let uv = |w: Vec2| mesh.texture_coordinates(triangle as usize, w.x, w.y).unwrap_or_default();
     // Weights of corners 1 and 2 as a function of texel coordinates in the map.
-    let placement = map.texels.placement_of(sample as u32);
-    let place = |u, v| Vec2::from(map.layout.texel_coord(placement, charts.local(texel.triangle, u, v)));
+    let placement = map.placement_of(charts, texel);
+    let place = |u, v| Vec2::from(map.layout.texel_coord(placement, charts.local(sample.triangle, u, v)));
     let origin = place(0.0, 0.0);
     let weights = Mat2::from_cols(place(1.0, 0.0) - origin, place(0.0, 1.0) - origin).inverse();
     let Some(texture) = scene.textures().get(material.albedo_texture as usize) else { return point() };
-    let (x, y) = map.position(sample);
+    let (x, y) = map.position(texel);
     let corner = weights * (Vec2::new(x as f32, y as f32) - origin);
     let size = |edge: Vec2| ((uv(edge) - uv(Vec2::ZERO)) * texture.size()).length();
     let texels = size(weights.x_axis).max(1.0) * size(weights.y_axis).max(1.0);
@@ -221,8 +221,8 @@ pub(crate) fn albedo(areas: &TexelAreas, sample: usize) -> Vec3 {
     let count = (4.0 * texels).min(MAX_LOOKUPS as f32) as u32;
     let (mut sum, mut seen) = (Vec3::ZERO, 0);
     for i in 0..count {
-        let w = corner + weights * Vec2::from(sobol_2d(i, sample as u32));
-        if w.min_element() >= 0.0 && w.x + w.y <= 1.0 && !scene.is_hole(texel.triangle, w.x, w.y) {
+        let w = corner + weights * Vec2::from(sobol_2d(i, texel.seed()));
+        if w.min_element() >= 0.0 && w.x + w.y <= 1.0 && !scene.is_hole(sample.triangle, w.x, w.y) {
             sum += scene.albedo_at(material, || Some(uv(w)));
             seen += 1;
         }

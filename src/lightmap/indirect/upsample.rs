@@ -12,7 +12,7 @@
 
 use super::gather::{Gathered, Tile, TileTexel};
 use super::narrow_gaps::is_in_gap;
-use super::radiance_map::RadianceMap;
+use super::radiance_map::RadianceLookup;
 use super::sample_set::SampleSet;
 use super::upsample_visibility::{self, TEXELS_PER_CHECK};
 use crate::base::error::Result;
@@ -24,10 +24,13 @@ use crate::base::sampling::combine;
 use crate::base::scratch::Scratch;
 use crate::lightmap::atlas::Atlas;
 use crate::lightmap::atlas::chart_map::ChartMap;
+use crate::lightmap::atlas::ids::{
+    GatherMap, GatherTexel, LightMap, LightTexel, Map, PerTexel, PlacementId, ShownMap, TexelId,
+};
 use crate::lightmap::tiles::TILE;
-use crate::scene::NONE;
 use glam::Vec3;
 use rayon::prelude::*;
+use std::marker::PhantomData;
 use std::ops::Range;
 use std::sync::atomic::{AtomicU64, Ordering::Relaxed};
 
@@ -48,18 +51,18 @@ const RADIUS: i32 = 2;
 #[derive(Default)]
 pub(crate) struct Upsampling {
     /// Gather texels in narrow gaps.
-    gather_gaps: Bits,
+    gather_gaps: TexelSet<GatherMap>,
     /// Texels of the light map in narrow gaps. Only texels with at least one gather texel in a gap around them are
     /// tested.
-    map_gaps: Bits,
+    map_gaps: TexelSet<LightMap>,
     /// Texels of the light map that are in `walls`.
-    walled: Bits,
+    walled: TexelSet<LightMap>,
     /// Pairs of a texel of the light map and one of the gather map that a wall or a crease separates, in ascending
     /// order; never all gather texels around a texel.
-    walls: Vec<(u32, u32)>,
-    is_alone: Bits,
+    walls: Vec<(LightTexel, GatherTexel)>,
+    is_alone: TexelSet<LightMap>,
     /// Texels of the light map with a fallback gather, in ascending order.
-    alone: Vec<u32>,
+    alone: Vec<LightTexel>,
     /// Number of rays traced to find the constraints.
     pub rays: u64,
     _memory: Option<Reservation>,
@@ -70,7 +73,7 @@ pub(crate) type OwnLight = Vec<Option<Vec3>>;
 
 /// Inputs of fallback gathers.
 pub(crate) struct OwnRays<'a> {
-    pub radiance: RadianceMap<'a>,
+    pub radiance: RadianceLookup<'a>,
     /// Sample set, of which the first round is used.
     pub samples: &'a SampleSet,
     pub seed: u32,
@@ -79,9 +82,9 @@ pub(crate) struct OwnRays<'a> {
 impl Upsampling {
     /// Finds the constraints for some `placements` of an atlas. `backs` says which charts without separate texels for
     /// their backs show the back. Advances `stage` by one per placement.
-    pub(crate) fn find(atlas: &Atlas, placements: Range<u32>, backs: &[bool], stage: &Stage) -> Result<Upsampling> {
-        let of_placement = |placement: u32| {
-            let found = Found::in_placement(atlas, backs, placement, stage)?;
+    pub(crate) fn find(atlas: &Atlas, placements: Range<usize>, backs: &[bool], stage: &Stage) -> Result<Upsampling> {
+        let of_placement = |placement: usize| {
+            let found = Found::in_placement(atlas, backs, PlacementId::new(placement), stage)?;
             stage.advance(1)?;
             Ok(found)
         };
@@ -89,21 +92,21 @@ impl Upsampling {
         let first = placements.start;
         let found = device.install(|| {
             try_par_gather(placements.len(), SHOWN, |i, out: &mut Vec<Found>| {
-                try_push(out, of_placement(first + i as u32)?, SHOWN)
+                try_push(out, of_placement(first + i)?, SHOWN)
             })
         })?;
         stage.check()?;
-        let gather_gaps = Bits::new(found.iter().flat_map(|f| &f.gather_gaps), atlas.gather.len())?;
-        let map_gaps = Bits::new(found.iter().flat_map(|f| &f.map_gaps), atlas.map.len())?;
+        let gather_gaps = TexelSet::new(found.iter().flat_map(|f| &f.gather_gaps), atlas.gather.len())?;
+        let map_gaps = TexelSet::new(found.iter().flat_map(|f| &f.map_gaps), atlas.map.len())?;
         let walls = try_collect(found.iter().flat_map(|f| &f.walls).copied(), SHOWN)?;
-        let walled = Bits::new(walls.iter().map(|(sample, _)| sample), atlas.map.len())?;
+        let walled = TexelSet::new(walls.iter().map(|(texel, _)| texel), atlas.map.len())?;
         stage.check()?;
         let alone = try_collect(found.iter().flat_map(|f| &f.alone).copied(), SHOWN)?;
-        let is_alone = Bits::new(alone.iter(), atlas.map.len())?;
+        let is_alone = TexelSet::new(alone.iter(), atlas.map.len())?;
         let rays = found.iter().map(|f| f.rays).sum();
-        let bits: usize = [&gather_gaps, &map_gaps, &walled, &is_alone].into_iter().map(Bits::bytes).sum();
+        let bits: usize = [&map_gaps, &walled, &is_alone].into_iter().map(TexelSet::bytes).sum();
         let own = alone.len() * size_of::<Option<Vec3>>();
-        let bytes = bits + size_of_val(&walls[..]) + size_of_val(&alone[..]) + own;
+        let bytes = gather_gaps.bytes() + bits + size_of_val(&walls[..]) + size_of_val(&alone[..]) + own;
         let memory = device.memory().reserve(bytes, SHOWN)?;
         Ok(Upsampling { gather_gaps, map_gaps, walled, walls, is_alone, alone, rays, _memory: Some(memory) })
     }
@@ -143,29 +146,34 @@ impl Upsampling {
         2 * self.alone.len() as u64
     }
 
-    /// Interpolates a gather map's `values` at a sample of the light map, or returns the light of its fallback gather
+    /// Interpolates a gather map's `values` at a texel of the light map, or returns the light of its fallback gather
     /// from `own` ([`OwnLight`]).
     #[inline]
-    pub(crate) fn at(&self, atlas: &Atlas, values: &[Vec3], own: &[Option<Vec3>], sample: usize) -> Vec3 {
-        if self.is_alone.has(sample)
-            && let Ok(i) = self.alone.binary_search(&(sample as u32))
+    pub(crate) fn at(
+        &self,
+        atlas: &Atlas,
+        values: PerTexel<GatherMap, Vec3>,
+        own: &[Option<Vec3>],
+        texel: LightTexel,
+    ) -> Vec3 {
+        if self.is_alone.has(texel)
+            && let Ok(i) = self.alone.binary_search(&texel)
             && let Some(irradiance) = own[i]
         {
             return irradiance;
         }
         let mut all = Vec3::ZERO;
         if self.is_plain() {
-            atlas.gather_around(sample, |s, w| all += w * values[s]);
+            atlas.gather_around(texel, |s, w| all += w * values[s]);
             return all;
         }
         // Sums over gather texels that are joined and alike, and over those that are joined, which serve if there are
         // none of the first kind.
         let mut sums = [(Vec3::ZERO, 0.0, true); 2];
-        atlas.gather_around(sample, |s, w| {
+        atlas.gather_around(texel, |s, w| {
             all += w * values[s];
-            let is_joined = !self.are_apart(sample, s);
-            for ((sum, part, is_all), counts) in
-                sums.iter_mut().zip([is_joined && self.are_alike(sample, s), is_joined])
+            let is_joined = !self.are_apart(texel, s);
+            for ((sum, part, is_all), counts) in sums.iter_mut().zip([is_joined && self.are_alike(texel, s), is_joined])
             {
                 if counts {
                     (*sum, *part) = (*sum + w * values[s], *part + w);
@@ -184,13 +192,13 @@ impl Upsampling {
 
     /// Whether a texel of the light map and one of the gather map both lie in narrow gaps, or neither does.
     #[inline]
-    fn are_alike(&self, map: usize, gather: usize) -> bool {
+    fn are_alike(&self, map: LightTexel, gather: GatherTexel) -> bool {
         self.map_gaps.has(map) == self.gather_gaps.has(gather)
     }
 
     #[inline]
-    fn are_apart(&self, map: usize, gather: usize) -> bool {
-        self.walled.has(map) && self.walls.binary_search(&(map as u32, gather as u32)).is_ok()
+    fn are_apart(&self, map: LightTexel, gather: GatherTexel) -> bool {
+        self.walled.has(map) && self.walls.binary_search(&(map, gather)).is_ok()
     }
 
     /// Whether there are no constraints other than fallback gathers.
@@ -202,18 +210,16 @@ impl Upsampling {
     /// Returns the mean of fallback gather `i` and those within [`RADIUS`] in the same chart, weighted by how far they
     /// face the same way. (There is no test for thin walls between them.)
     fn blurred(&self, atlas: &Atlas, own: &[Own], i: usize) -> Option<Vec3> {
-        let (sample, normal) = (self.alone[i] as usize, own[i].normal);
+        let (texel, normal) = (self.alone[i], own[i].normal);
         own[i].irradiance?;
-        let (x, y) = atlas.map.position(sample);
-        let placement = atlas.map.placement_of(&atlas.charts, sample);
-        let of_placement = atlas.map.samples_of(placement);
+        let (x, y) = atlas.map.position(texel);
+        let placement = atlas.map.placement_of(&atlas.charts, texel);
+        let of_placement = atlas.map.texels_of(placement);
         let (mut sum, mut total) = (Vec3::ZERO, 0.0);
         for (dx, dy) in (-RADIUS..=RADIUS).flat_map(|dy| (-RADIUS..=RADIUS).map(move |dx| (dx, dy))) {
-            let s = atlas.map.at(placement, x + dx, y + dy);
             // The window of given charts may contain another chart, which other shards bake.
-            if s == NONE || !of_placement.contains(&(s as usize)) || !self.is_alone.has(s as usize) {
-                continue;
-            }
+            let s = atlas.map.at(placement, x + dx, y + dy).filter(|&s| of_placement.contains(s));
+            let Some(s) = s.filter(|&s| self.is_alone.has(s)) else { continue };
             if let Ok(k) = self.alone.binary_search(&s)
                 && let Some(irradiance) = own[k].irradiance
             {
@@ -238,14 +244,14 @@ fn gather_for(
     atlas: &Atlas,
     backs: &[bool],
     own: &OwnRays,
-    texels: &[u32],
+    texels: &[LightTexel],
     out: &mut [Own],
     tile: &mut Tile,
     stage: &Stage,
 ) -> Result<u64> {
-    let texel = |&sample: &u32| TileTexel {
-        receiver: atlas.receiver(&atlas.map, backs, sample as usize),
-        seed: combine(own.seed, sample),
+    let texel = |&texel: &LightTexel| TileTexel {
+        receiver: atlas.receiver(&atlas.map, backs, texel),
+        seed: combine(own.seed, texel.seed()),
         gathered: Gathered::default(),
     };
     let mut rays = 0;
@@ -264,56 +270,52 @@ fn gather_for(
 /// Interpolation constraints of one placement.
 #[derive(Default)]
 struct Found {
-    gather_gaps: Vec<u32>,
-    map_gaps: Vec<u32>,
-    walls: Vec<(u32, u32)>,
-    alone: Vec<u32>,
+    gather_gaps: Vec<GatherTexel>,
+    map_gaps: Vec<LightTexel>,
+    walls: Vec<(LightTexel, GatherTexel)>,
+    alone: Vec<LightTexel>,
     rays: u64,
 }
 
 impl Found {
-    fn in_placement(atlas: &Atlas, backs: &[bool], placement: u32, stage: &Stage) -> Result<Found> {
+    fn in_placement(atlas: &Atlas, backs: &[bool], placement: PlacementId, stage: &Stage) -> Result<Found> {
         let (gather, map) = (&atlas.gather, &atlas.map);
         let mut found = Found::default();
         let apart = upsample_visibility::between(atlas, placement, backs, stage, &mut found.rays)?;
-        let scale = gather.layout.placements[placement as usize].scale;
-        let texel = 1.0 / scale[0].min(scale[1]);
-        let mut is_in_gap = |map: &ChartMap, sample: usize| {
-            let receiver = atlas.receiver(map, backs, sample);
-            is_in_gap(&atlas.scene, &receiver, texel, sample as u32, &mut found.rays)
-        };
-        let of_gather = gather.samples_of(placement);
+        let scale = gather.layout[placement].scale;
+        let width = 1.0 / scale[0].min(scale[1]);
+        let of_gather = gather.texels_of(placement);
         let mut gaps: Vec<bool> = try_with_capacity(of_gather.len(), SHOWN)?;
-        for (i, sample) in of_gather.clone().enumerate() {
+        for (i, texel) in of_gather.clone().enumerate() {
             if i % TEXELS_PER_CHECK == 0 {
                 stage.check()?;
             }
-            gaps.push(is_in_gap(gather, sample));
+            gaps.push(is_texel_in_gap(atlas, gather, backs, texel, width, &mut found.rays));
         }
-        let in_gaps = of_gather.clone().filter(|s| gaps[s - of_gather.start]).map(|s| s as u32);
+        let in_gaps = of_gather.clone().filter(|&s| gaps[of_gather.place(s)]);
         found.gather_gaps = try_collect(in_gaps, SHOWN)?;
         let mut end = 0;
-        for (i, sample) in map.samples_of(placement).enumerate() {
+        for (i, texel) in map.texels_of(placement).enumerate() {
             if i % TEXELS_PER_CHECK == 0 {
                 stage.check()?;
             }
-            let (begin, this) = (end, sample as u32);
-            end += apart[begin..].iter().take_while(|(s, _)| *s == this).count();
+            let begin = end;
+            end += apart[begin..].iter().take_while(|(s, _)| *s == texel).count();
             let apart = &apart[begin..end];
             if apart.is_empty() && found.gather_gaps.is_empty() {
                 continue;
             }
             let (mut n, mut has_gap, mut sees_open) = (0, false, false);
-            atlas.gather_around(sample, |s, _| {
-                let is_gap = gaps[s - of_gather.start];
+            atlas.gather_around(texel, |s, _| {
+                let is_gap = gaps[of_gather.place(s)];
                 n += 1;
                 has_gap |= is_gap;
-                sees_open |= !is_gap && !apart.contains(&(this, s as u32));
+                sees_open |= !is_gap && !apart.contains(&(texel, s));
             });
-            if has_gap && is_in_gap(map, sample) {
-                try_push(&mut found.map_gaps, this, SHOWN)?;
+            if has_gap && is_texel_in_gap(atlas, map, backs, texel, width, &mut found.rays) {
+                try_push(&mut found.map_gaps, texel, SHOWN)?;
             } else if !sees_open && n > 0 {
-                try_push(&mut found.alone, this, SHOWN)?;
+                try_push(&mut found.alone, texel, SHOWN)?;
             }
             if apart.len() < n {
                 try_append(&mut found.walls, apart, SHOWN)?;
@@ -323,26 +325,40 @@ impl Found {
     }
 }
 
-/// A bit per sample; empty if all are 0.
-#[derive(Default)]
-struct Bits {
-    words: Vec<u64>,
+/// Whether a texel lies in a gap less wide than a gather texel, whose `width` is given.
+fn is_texel_in_gap<M: ShownMap>(
+    atlas: &Atlas,
+    map: &ChartMap<M>,
+    backs: &[bool],
+    texel: TexelId<M>,
+    width: f32,
+    rays: &mut u64,
+) -> bool {
+    is_in_gap(&atlas.scene, &atlas.receiver(map, backs, texel), width, texel.seed(), rays)
 }
 
-impl Bits {
-    fn new<'a>(ones: impl Iterator<Item = &'a u32>, n: usize) -> Result<Bits> {
+/// Texels of map `M`, a bit for each; no bits if there are none.
+#[derive(Default)]
+struct TexelSet<M: Map> {
+    words: Vec<u64>,
+    of: PhantomData<M>,
+}
+
+impl<M: Map> TexelSet<M> {
+    fn new<'a>(texels: impl Iterator<Item = &'a TexelId<M>>, n: usize) -> Result<TexelSet<M>> {
         let mut words = Vec::new();
-        for &i in ones {
+        for i in texels.map(|texel| texel.index()) {
             if words.is_empty() {
                 words = try_vec(n.div_ceil(64), SHOWN)?;
             }
-            words[i as usize / 64] |= 1 << (i % 64);
+            words[i / 64] |= 1 << (i % 64);
         }
-        Ok(Bits { words })
+        Ok(TexelSet { words, of: PhantomData })
     }
 
     #[inline]
-    fn has(&self, i: usize) -> bool {
+    fn has(&self, texel: TexelId<M>) -> bool {
+        let i = texel.index();
         self.words.get(i / 64).is_some_and(|word| word >> (i % 64) & 1 != 0)
     }
 
@@ -355,6 +371,7 @@ impl Bits {
 pub(super) mod tests {
     use super::*;
     use crate::base::progress::Progress;
+    use crate::lightmap::atlas::ids::RadianceTexel;
     use crate::lightmap::indirect::radiance_map::Radiance;
     use crate::lightmap::{Lightmap, LightmapDesc};
     use crate::scene::shapes::MeshBuilder;
@@ -382,18 +399,18 @@ pub(super) mod tests {
     }
 
     /// Upsampling of some placements.
-    pub(crate) fn find(atlas: &Atlas, placements: Range<u32>, backs: &[bool]) -> Upsampling {
+    pub(crate) fn find(atlas: &Atlas, placements: Range<usize>, backs: &[bool]) -> Upsampling {
         let progress = Progress::none();
         let stage = progress.stage("upsampling", 0.0, 1.0, placements.len() as u64);
         Upsampling::find(atlas, placements, backs, &stage).unwrap()
     }
 
     /// What texels gather for themselves where each texel of the radiance map sends out its own radiance; and the rays.
-    fn own_light(atlas: &Atlas, upsampling: &Upsampling, radiance: impl Fn(usize) -> f32) -> (OwnLight, u64) {
-        let values = (0..atlas.radiance.len()).map(|s| Vec3::splat(radiance(s))).collect();
+    fn own_light(atlas: &Atlas, upsampling: &Upsampling, radiance: impl Fn(RadianceTexel) -> f32) -> (OwnLight, u64) {
+        let values = atlas.radiance.all().map(|s| Vec3::splat(radiance(s))).collect();
         let radiance = Radiance { values, ..Default::default() };
         let rays = OwnRays {
-            radiance: RadianceMap::new(&atlas.charts, &atlas.radiance, &radiance),
+            radiance: RadianceLookup::new(&atlas.charts, &atlas.radiance, &radiance),
             samples: &SampleSet::new(OWN_RAYS, 0),
             seed: 0,
         };
@@ -411,25 +428,25 @@ pub(super) mod tests {
     fn what_lies_below_a_sheet_is_in_a_gap_and_what_lies_beside_it_is_not() {
         let lightmap = plank();
         let atlas = lightmap.atlas();
-        let [floor, top, bottom] = [0, 2, 4].map(|t| atlas.charts.chart_of[t]);
+        let [floor, top, bottom] = [0, 2, 4].map(|t| PlacementId::front_of(atlas.charts.chart_of(t)));
         let gaps = find(atlas, 0..3, &[]);
-        for s in atlas.gather.samples_of(floor) {
+        for s in atlas.gather.texels_of(floor) {
             let x = atlas.gather.surface(&atlas.scene, s).0.x;
             assert!(gaps.gather_gaps.has(s) == (x < 0.0) || x.abs() < 0.05, "gather texel at {x}");
         }
         // Near the edge of the plank a ray more or less gets out.
-        let x = |s: usize| atlas.map.surface(&atlas.scene, s).0.x;
-        let below: Vec<usize> = atlas.map.samples_of(floor).filter(|&s| x(s) > -0.1 && x(s) < -0.05).collect();
+        let x = |s: LightTexel| atlas.map.surface(&atlas.scene, s).0.x;
+        let below: Vec<LightTexel> = atlas.map.texels_of(floor).filter(|&s| x(s) > -0.1 && x(s) < -0.05).collect();
         let found = below.iter().filter(|s| gaps.map_gaps.has(**s)).count();
         assert!(below.len() >= 80 && found > below.len() / 2, "{found} of {}", below.len());
-        assert_eq!(atlas.map.samples_of(floor).filter(|&s| x(s) > 0.0 && gaps.map_gaps.has(s)).count(), 0);
-        assert!(atlas.gather.samples_of(top).all(|s| !gaps.gather_gaps.has(s)));
-        assert_eq!(atlas.map.samples_of(top).filter(|&s| gaps.map_gaps.has(s)).count(), 0);
-        let is_inner = |s: &usize| {
+        assert_eq!(atlas.map.texels_of(floor).filter(|&s| x(s) > 0.0 && gaps.map_gaps.has(s)).count(), 0);
+        assert!(atlas.gather.texels_of(top).all(|s| !gaps.gather_gaps.has(s)));
+        assert_eq!(atlas.map.texels_of(top).filter(|&s| gaps.map_gaps.has(s)).count(), 0);
+        let is_inner = |s: &GatherTexel| {
             let p = atlas.gather.surface(&atlas.scene, *s).0;
             p.x > -1.8 && p.x < -0.2 && p.y.abs() < 1.8
         };
-        assert!(atlas.gather.samples_of(bottom).filter(is_inner).all(|s| gaps.gather_gaps.has(s)));
+        assert!(atlas.gather.texels_of(bottom).filter(is_inner).all(|s| gaps.gather_gaps.has(s)));
     }
 
     #[test]
@@ -437,17 +454,18 @@ pub(super) mod tests {
         let lightmap = plank();
         let atlas = lightmap.atlas();
         let gaps = find(atlas, 0..3, &[]);
-        let light = |s: usize| if gaps.gather_gaps.has(s) { Vec3::ZERO } else { Vec3::ONE };
-        let values: Vec<Vec3> = (0..atlas.gather.len()).map(light).collect();
+        let light = |s: GatherTexel| if gaps.gather_gaps.has(s) { Vec3::ZERO } else { Vec3::ONE };
+        let values: Vec<Vec3> = atlas.gather.all().map(light).collect();
+        let values = PerTexel::new(&values);
         let mut mixed = 0;
-        for s in 0..atlas.map.len() {
+        for s in atlas.map.all() {
             let (mut around, mut alike) = (0, 0);
             atlas.gather_around(s, |g, _| {
                 around += 1;
                 alike += u32::from(gaps.are_alike(s, g));
             });
-            let shown = gaps.at(atlas, &values, &dark(&gaps), s);
-            let plain = Upsampling::default().at(atlas, &values, &[], s);
+            let shown = gaps.at(atlas, values, &dark(&gaps), s);
+            let plain = Upsampling::default().at(atlas, values, &[], s);
             let expected =
                 if alike > 0 && alike < around { Vec3::splat(!gaps.map_gaps.has(s) as u32 as f32) } else { plain };
             // Beside the plank, with gather texels below it alone.
@@ -458,8 +476,8 @@ pub(super) mod tests {
         assert!(mixed > 100, "{mixed} texels between light and dark");
         // Without gaps nothing is held.
         let none = find(atlas, 1..1, &[]);
-        let bytes = |u: &Upsampling| [&u.gather_gaps, &u.map_gaps, &u.walled, &u.is_alone].map(Bits::bytes);
-        assert!(none.is_plain() && none.alone.is_empty() && bytes(&none) == [0; 4]);
+        let bits = [&none.map_gaps, &none.walled, &none.is_alone].map(TexelSet::bytes);
+        assert!(none.is_plain() && none.alone.is_empty() && none.gather_gaps.bytes() == 0 && bits == [0; 3]);
     }
 
     /// Of gather texels around a texel, one lies in a gap and all others are behind walls, or the other way around.
@@ -467,26 +485,27 @@ pub(super) mod tests {
     fn what_a_texel_sees_goes_before_what_is_like_it() {
         let lightmap = plank();
         let atlas = lightmap.atlas();
-        let sample = atlas.map.samples_of(atlas.charts.chart_of[0]).nth(100 * 320 + 234).unwrap();
+        let floor = PlacementId::front_of(atlas.charts.chart_of(0));
+        let this = atlas.map.texels_of(floor).nth(100 * 320 + 234).unwrap();
         let mut around = Vec::new();
-        atlas.gather_around(sample, |s, _| around.push(s as u32));
+        atlas.gather_around(this, |s, _| around.push(s));
         around.sort_unstable();
         assert_eq!(around.len(), 4);
         let (one, others) = (&around[..1], &around[1..]);
-        let light = |s: usize| if one.contains(&(s as u32)) { Vec3::ZERO } else { Vec3::ONE };
-        let values: Vec<Vec3> = (0..atlas.gather.len()).map(light).collect();
-        let this = sample as u32;
-        let shown = |in_gap: &[u32], behind_walls: &[u32], own: &[Option<Vec3>]| {
+        let light = |s: GatherTexel| if one.contains(&s) { Vec3::ZERO } else { Vec3::ONE };
+        let values: Vec<Vec3> = atlas.gather.all().map(light).collect();
+        let values = PerTexel::new(&values);
+        let shown = |in_gap: &[LightTexel], behind_walls: &[GatherTexel], own: &[Option<Vec3>]| {
             let upsampling = Upsampling {
-                gather_gaps: Bits::new(one.iter(), atlas.gather.len()).unwrap(),
-                map_gaps: Bits::new(in_gap.iter(), atlas.map.len()).unwrap(),
-                walled: Bits::new([this].iter(), atlas.map.len()).unwrap(),
+                gather_gaps: TexelSet::new(one.iter(), atlas.gather.len()).unwrap(),
+                map_gaps: TexelSet::new(in_gap.iter(), atlas.map.len()).unwrap(),
+                walled: TexelSet::new([this].iter(), atlas.map.len()).unwrap(),
                 walls: behind_walls.iter().map(|&s| (this, s)).collect(),
-                is_alone: Bits::new(own.iter().map(|_| &this), atlas.map.len()).unwrap(),
+                is_alone: TexelSet::new(own.iter().map(|_| &this), atlas.map.len()).unwrap(),
                 alone: own.iter().map(|_| this).collect(),
                 ..Default::default()
             };
-            upsampling.at(atlas, &values, own, sample).x
+            upsampling.at(atlas, values, own, this).x
         };
         assert_eq!((shown(&[this], others, &[]), shown(&[], others, &[])), (0.0, 0.0));
         assert!((shown(&[this], one, &[]) - 1.0).abs() < 1e-6 && (shown(&[], one, &[]) - 1.0).abs() < 1e-6);
@@ -527,15 +546,18 @@ pub(super) mod tests {
     fn narrow_faces_gather_for_themselves() {
         let lightmap = folded(&[&[[-2.0, 0.0], [0.013, 0.0], [0.013, 0.06], [2.0, 0.06]]]);
         let atlas = lightmap.atlas();
-        let is_on_face = |map: &ChartMap, s: &usize| map.surface(&atlas.scene, *s).1.x.abs() > 0.5;
-        assert_eq!(atlas.gather.samples_of(0).filter(|s| is_on_face(&atlas.gather, s)).count(), 0);
+        fn is_on_face<M: Map>(atlas: &Atlas, map: &ChartMap<M>, texel: TexelId<M>) -> bool {
+            map.surface(&atlas.scene, texel).1.x.abs() > 0.5
+        }
+        let only = PlacementId::new(0);
+        assert_eq!(atlas.gather.texels_of(only).filter(|&s| is_on_face(atlas, &atlas.gather, s)).count(), 0);
         let upsampling = find(atlas, 0..1, &[]);
         let (own, rays) = own_light(atlas, &upsampling, |_| 1.0);
         let dark = vec![Vec3::ZERO; atlas.gather.len()];
         let (mut on_face, mut elsewhere) = (0, 0);
-        for s in atlas.map.samples_of(0) {
-            let shown = upsampling.at(atlas, &dark, &own, s).x;
-            if is_on_face(&atlas.map, &s) {
+        for s in atlas.map.texels_of(only) {
+            let shown = upsampling.at(atlas, PerTexel::new(&dark), &own, s).x;
+            if is_on_face(atlas, &atlas.map, s) {
                 assert!((shown - std::f32::consts::PI).abs() < 1e-5, "{shown} on the face");
                 on_face += 1;
             } else {
@@ -553,13 +575,15 @@ pub(super) mod tests {
         let lightmap = folded(&[&[[-2.0, -0.06], [-0.3, -0.06], [-0.3, 0.0]], &face]);
         let atlas = lightmap.atlas();
         assert_eq!(atlas.map.layout.given, 2);
-        let at = |s: u32| (atlas.map.position(s as usize), atlas.map.placement_of(&atlas.charts, s as usize));
+        let at = |s| (atlas.map.position(s), atlas.map.placement_of(&atlas.charts, s).index());
         let both = find(atlas, 0..2, &[]).alone;
-        let beside =
-            |&((x, y), placement): &((i32, i32), u32)| placement == 0 && both.iter().any(|&s| at(s) == ((x + 1, y), 1));
+        let beside = |&((x, y), placement): &((i32, i32), usize)| {
+            placement == 0 && both.iter().any(|&s| at(s) == ((x + 1, y), 1))
+        };
         assert!(both.iter().map(|&s| at(s)).filter(beside).count() > 50);
         // Unequal rays, so that what is blurred shows whom with.
-        let own = |placements: Range<u32>| own_light(atlas, &find(atlas, placements, &[]), |s| (s % 7) as f32).0;
+        let own =
+            |placements: Range<usize>| own_light(atlas, &find(atlas, placements, &[]), |s| (s.index() % 7) as f32).0;
         assert_eq!(own(0..2), [own(0..1), own(1..2)].concat());
     }
 }

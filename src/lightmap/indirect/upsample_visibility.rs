@@ -12,7 +12,8 @@ use crate::base::error::{Error, Result};
 use crate::base::memory::{try_push, try_with_capacity};
 use crate::base::progress::Stage;
 use crate::lightmap::atlas::Atlas;
-use crate::scene::NONE;
+use crate::lightmap::atlas::chart_map::ChartMap;
+use crate::lightmap::atlas::ids::{GatherTexel, LightTexel, PlacementId, ShownMap, TexelId};
 use crate::trace::Ray;
 use glam::Vec3;
 use std::collections::HashMap;
@@ -36,32 +37,35 @@ struct Eye {
     normal: Vec3,
 }
 
+impl Eye {
+    fn at<M: ShownMap>(atlas: &Atlas, map: &ChartMap<M>, backs: &[bool], texel: TexelId<M>, above: f32) -> Eye {
+        let receiver = atlas.receiver(map, backs, texel);
+        Eye { position: receiver.origin + receiver.geometric * above, normal: receiver.normal }
+    }
+}
+
 /// Returns the pairs of texels of a placement in the light map and in the gather map between which there is a wall or a
 /// crease, in ascending order. `backs` says which charts without separate texels for their backs show the back. Adds
 /// the rays traced to `rays`; `stage` may cancel.
 pub(in crate::lightmap) fn between(
     atlas: &Atlas,
-    placement: u32,
+    placement: PlacementId,
     backs: &[bool],
     stage: &Stage,
     rays: &mut u64,
-) -> Result<Vec<(u32, u32)>> {
+) -> Result<Vec<(LightTexel, GatherTexel)>> {
     let (gather, map) = (&atlas.gather, &atlas.map);
-    let scale = gather.layout.placements[placement as usize].scale;
+    let scale = gather.layout[placement].scale;
     let above = ABOVE / scale[0].min(scale[1]);
-    let eye = |map, sample: usize| -> Eye {
-        let receiver = atlas.receiver(map, backs, sample);
-        Eye { position: receiver.origin + receiver.geometric * above, normal: receiver.normal }
-    };
-    let own = gather.samples_of(placement);
+    let own = gather.texels_of(placement);
     let mut eyes: Vec<Eye> = try_with_capacity(own.len(), WALLS)?;
-    for (i, sample) in own.clone().enumerate() {
+    for (i, texel) in own.clone().enumerate() {
         if i % TEXELS_PER_CHECK == 0 {
             stage.check()?;
         }
-        eyes.push(eye(gather, sample));
+        eyes.push(Eye::at(atlas, gather, backs, texel, above));
     }
-    let eye_of = |s: u32| eyes[s as usize - own.start];
+    let eye_of = |s: GatherTexel| eyes[own.place(s)];
     let mut are_apart = |a: Eye, b: Eye| {
         if a.normal.dot(b.normal) < CREASE {
             return true;
@@ -69,22 +73,22 @@ pub(in crate::lightmap) fn between(
         *rays += 1;
         atlas.scene.occluded(&Ray::new(a.position, b.position - a.position).within(0.0, 1.0))
     };
-    let mut split: HashMap<[u32; 4], bool> = HashMap::new();
+    let mut split: HashMap<[GatherTexel; 4], bool> = HashMap::new();
     let mut found = Vec::new();
-    for (i, sample) in map.samples_of(placement).enumerate() {
+    for (i, texel) in map.texels_of(placement).enumerate() {
         if i % TEXELS_PER_CHECK == 0 {
             stage.check()?;
         }
-        let (mut around, mut n) = ([NONE; 4], 0);
-        atlas.gather_around(sample, |s, _| {
-            around[n] = s as u32;
+        let (mut around, mut n) = ([GatherTexel::NONE; 4], 0);
+        atlas.gather_around(texel, |s, _| {
+            around[n] = s;
             n += 1;
         });
         if n == 0 {
             continue;
         }
         around[..n].sort_unstable();
-        let from = eye(map, sample);
+        let from = Eye::at(atlas, map, backs, texel, above);
         split.try_reserve(1).map_err(|e| Error::OutOfMemory(format!("{WALLS}: {e}")))?;
         // Most groups of gather texels surround many texels, and are on one side. A group of a single gather texel, as
         // on narrow charts, says nothing about the texel.
@@ -94,11 +98,11 @@ pub(in crate::lightmap) fn between(
         });
         if is_split {
             for &s in around[..n].iter().filter(|&&s| are_apart(from, eye_of(s))) {
-                try_push(&mut found, (sample as u32, s), WALLS)?;
+                try_push(&mut found, (texel, s), WALLS)?;
             }
         } else if from.normal.dot(eye_of(around[0]).normal) < CREASE {
             for &s in &around[..n] {
-                try_push(&mut found, (sample as u32, s), WALLS)?;
+                try_push(&mut found, (texel, s), WALLS)?;
             }
         }
     }
@@ -108,7 +112,9 @@ pub(in crate::lightmap) fn between(
 #[cfg(test)]
 mod tests {
     use crate::base::progress::Progress;
+    use crate::lightmap::atlas::Atlas;
     use crate::lightmap::atlas::chart_map::ChartMap;
+    use crate::lightmap::atlas::ids::{LightTexel, Map, PerTexel, PlacementId, TexelId};
     use crate::lightmap::indirect::upsample::tests::{dark, find};
     use crate::lightmap::{Lightmap, LightmapDesc};
     use crate::scene::shapes::MeshBuilder;
@@ -135,14 +141,17 @@ mod tests {
     fn mixed(lightmap: &Lightmap, edge: f32, skip: impl Fn(f32) -> bool) -> (usize, bool) {
         let atlas = lightmap.atlas();
         let upsampling = find(atlas, 0..1, &[]);
-        let x = |map: &ChartMap, s: usize| map.surface(&atlas.scene, s).0.x;
-        let light = |s: usize| Vec3::splat(f32::from(u8::from(x(&atlas.gather, s) < edge)));
-        let values: Vec<Vec3> = (0..atlas.gather.len()).map(light).collect();
-        let is_mixed = |s: &usize| {
-            let shown = upsampling.at(atlas, &values, &dark(&upsampling), *s).x;
-            !skip(x(&atlas.map, *s)) && shown > 0.01 && shown < 0.99
+        fn x<M: Map>(atlas: &Atlas, map: &ChartMap<M>, texel: TexelId<M>) -> f32 {
+            map.surface(&atlas.scene, texel).0.x
+        }
+        let light = |s| Vec3::splat(f32::from(u8::from(x(atlas, &atlas.gather, s) < edge)));
+        let values: Vec<Vec3> = atlas.gather.all().map(light).collect();
+        let is_mixed = |s: &LightTexel| {
+            let shown = upsampling.at(atlas, PerTexel::new(&values), &dark(&upsampling), *s).x;
+            !skip(x(atlas, &atlas.map, *s)) && shown > 0.01 && shown < 0.99
         };
-        (atlas.map.samples_of(atlas.charts.chart_of[0]).filter(is_mixed).count(), !upsampling.is_plain())
+        let only = PlacementId::front_of(atlas.charts.chart_of(0));
+        (atlas.map.texels_of(only).filter(is_mixed).count(), !upsampling.is_plain())
     }
 
     #[test]

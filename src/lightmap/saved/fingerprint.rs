@@ -4,6 +4,7 @@
 use crate::lightmap::BakeParams;
 use crate::lightmap::atlas::Atlas;
 use crate::lightmap::atlas::chart_map::ChartMap;
+use crate::lightmap::atlas::ids::Map;
 use crate::scene::{Light, MeshMaterials, Scene};
 use bytemuck::{Pod, Zeroable};
 use std::fmt::Debug;
@@ -193,15 +194,15 @@ fn materials(scene: &Scene) -> u32 {
 fn layout(atlas: &Atlas) -> u32 {
     let mut sum = crc32fast::Hasher::new();
     sum.update(&atlas.padding.to_ne_bytes());
-    sum.update(bytemuck::cast_slice(&atlas.charts.chart_of));
+    sum.update(bytemuck::cast_slice(&atlas.charts.of_triangles));
     sum.update(bytemuck::cast_slice(&atlas.charts.corners));
-    for map in [&atlas.map, &atlas.gather, &atlas.radiance] {
-        of_map(map, &mut sum);
-    }
+    of_map(&atlas.map, &mut sum);
+    of_map(&atlas.gather, &mut sum);
+    of_map(&atlas.radiance, &mut sum);
     sum.finalize()
 }
 
-fn of_map(map: &ChartMap, sum: &mut crc32fast::Hasher) {
+fn of_map<M: Map>(map: &ChartMap<M>, sum: &mut crc32fast::Hasher) {
     let layout = &map.layout;
     sum.update(bytemuck::cast_slice(&[layout.page_size, layout.page_count, layout.given]));
     sum.update(bytemuck::cast_slice(&layout.back_of));

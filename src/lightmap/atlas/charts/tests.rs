@@ -70,13 +70,13 @@ fn charts_of(scene: &Scene, density: f32) -> (Charts, UvReport) {
 /// area, and packed texels have one owner.
 fn check(scene: &Scene, charts: &Charts) {
     let mut seen = vec![false; scene.triangle_count() as usize];
-    for (n, chart) in charts.charts.iter().enumerate() {
-        let triangles = charts.triangles_of(n as u32);
+    for (id, chart) in charts.ids().zip(&charts.charts) {
+        let triangles = charts.triangles_of(id);
         assert!(!triangles.is_empty() && triangles.is_sorted());
         let mut area = 0.0;
         for &t in triangles {
             assert!(!std::mem::replace(&mut seen[t as usize], true));
-            assert_eq!(charts.chart_of[t as usize], n as u32);
+            assert_eq!(charts.chart_of(t), id);
             assert_eq!(scene.material(t).two_sided, chart.two_sided);
             for c in charts.corners[t as usize] {
                 assert!((0..2).all(|k| c[k] >= 0.0 && c[k] <= chart.size[k]), "{c:?} in a chart of {:?}", chart.size);
@@ -87,7 +87,7 @@ fn check(scene: &Scene, charts: &Charts) {
     }
     for t in 0..scene.triangle_count() {
         assert_eq!(seen[t as usize], scene.is_valid(t), "triangle {t}");
-        assert_eq!(charts.chart_of[t as usize] == NONE, !scene.is_valid(t));
+        assert_eq!(charts.chart_of(t) == ChartId::NONE, !scene.is_valid(t));
     }
     let density = automatic_density(scene, 256, 1.0);
     let layout = Layout::pack(charts, density, 256, 1, false, &[], &Progress::none()).unwrap();
@@ -173,7 +173,7 @@ fn given_uvs_come_back() {
     assert_eq!((layout.page_count, layout.placements[0].page), (4, 3));
     for (t, i) in scene.meshes()[0].indices.iter().enumerate() {
         for k in 0..3 {
-            let coord = Vec2::from_array(layout.texel_coord(0, charts.corners[t][k]));
+            let coord = Vec2::from_array(layout.placements[0].texel_coord(charts.corners[t][k]));
             assert!((coord / 256.0).distance(uvs[i[k] as usize]) < 1e-6);
         }
     }

@@ -5,6 +5,7 @@ use crate::base::error::Error;
 use crate::base::progress::Progress;
 use crate::lightmap::atlas::charts::Chart;
 use crate::lightmap::atlas::charts::tests::{grid, map_of, quad, scene_of, scene_on};
+use crate::lightmap::atlas::ids::ChartId;
 use crate::lightmap::atlas::pieces::Given;
 use crate::scene::Mesh;
 use proptest::prelude::*;
@@ -106,13 +107,13 @@ proptest! {
         let (scene, charts) = crumpled(seed);
         let layout = Layout::pack(&charts, density, 64, padding, false, &[], &Progress::none()).unwrap();
         let map = map_of(&scene, &charts, &layout);
-        for p in 0..layout.placements.len() as u32 {
+        for p in (0..layout.placements.len()).map(PlacementId::new) {
             let mut last = None;
             for s in map.samples_of(p) {
                 let t = map.samples[s as usize];
                 prop_assert!(last < Some((t.y, t.x)), "samples are ordered by row and column");
                 last = Some((t.y, t.x));
-                prop_assert_eq!(charts.chart_of[t.triangle as usize], p);
+                prop_assert_eq!(PlacementId::front_of(charts.chart_of(t.triangle)), p);
                 prop_assert_eq!(map.texel_index(p, t.x as u32, t.y as u32), s);
                 prop_assert_eq!(map.placement_of(s), p);
                 prop_assert!(t.u >= 0.0 && t.v >= 0.0 && t.u + t.v <= 1.0 + 1e-6);
@@ -130,8 +131,9 @@ proptest! {
         let layout = Layout::pack(&charts, density, 64, 0, false, &[], &Progress::none()).unwrap();
         let map = map_of(&scene, &charts, &layout);
         let (u, v) = if u + v > 1.0 { (1.0 - u, 1.0 - v) } else { (u, v) };
-        let p = charts.chart_of[triangle as usize];
-        prop_assume!(p != NONE);
+        let chart = charts.chart_of(triangle);
+        prop_assume!(chart != ChartId::NONE);
+        let p = PlacementId::front_of(chart);
         let coord = layout.texel_coord(p, charts.local(triangle, u, v));
         let nearest = map.samples[map.nearest(p, coord) as usize];
         prop_assert!((nearest.x as f32 + 0.5 - coord[0]).abs() < 0.501 && (nearest.y as f32 + 0.5 - coord[1]).abs() < 0.501);
@@ -169,7 +171,7 @@ proptest! {
             Chart { triangles: 0..1, given: given(corner, size), ..charts.charts[0].clone() },
             Chart { triangles: 1..2, given: given([0.4, 0.3], [0.3, 0.5]), ..charts.charts[0].clone() },
         ];
-        charts.chart_of = vec![0, 1];
+        charts.of_triangles = [0, 1].map(ChartId::new).to_vec();
         let layout = Layout::pack(&charts, 1.0, 32, 2, true, &[], &Progress::none()).unwrap();
         let map = map_of(&scene, &charts, &layout);
         let area = PageArea { columns: x0..(x0 + w).min(32), rows: y0..(y0 + h).min(32) };
@@ -204,7 +206,8 @@ fn expected(map: &TexelMap, layout: &Layout, page: u32, area: &PageArea, padding
             let inside = (p.x as i32..(p.x + p.w) as i32).contains(&x) && (p.y as i32..(p.y + p.h) as i32).contains(&y);
             p.page == page && (inside || n < layout.given as usize)
         };
-        let samples = (0..layout.placements.len()).filter(|&n| owns(n)).flat_map(|n| map.samples_of(n as u32));
+        let samples =
+            (0..layout.placements.len()).filter(|&n| owns(n)).flat_map(|n| map.samples_of(PlacementId::new(n)));
         let near = samples.filter(|&s| offset(s).0.max(offset(s).1) <= padding);
         let best = near.min_by_key(|&s| (offset(s).0.pow(2) + offset(s).1.pow(2), s));
         out.push(best.unwrap_or(NONE));
@@ -229,7 +232,7 @@ fn unit_quad() -> (std::sync::Arc<Scene>, Charts) {
     let charts = Charts {
         charts: vec![Chart { triangles: 0..2, size: [1.0; 2], area: 1.0, two_sided: false, given: None }],
         triangles: vec![0, 1],
-        chart_of: vec![0, 0],
+        of_triangles: vec![ChartId::new(0); 2],
         corners: vec![[[0.0, 0.0], [1.0, 0.0], [1.0, 1.0]], [[0.0, 0.0], [1.0, 1.0], [0.0, 1.0]]],
     };
     (scene, charts)
@@ -258,7 +261,7 @@ fn a_chart_smaller_than_a_texel_has_one() {
         let layout = Layout::pack(&charts, density, 16, 0, false, &[], &Progress::none()).unwrap();
         let map = map_of(&scene, &charts, &layout);
         assert_eq!(map.samples.len(), 1);
-        assert_eq!(map.bilinear(0, [-1e30, f32::NAN]).samples, [0; 4]);
+        assert_eq!(map.bilinear(PlacementId::new(0), [-1e30, f32::NAN]).samples, [0; 4]);
     }
 }
 
@@ -286,17 +289,18 @@ fn of_overlapping_given_triangles_the_first_one_wins_and_texels_are_counted() {
     let given = Some(Given { page: 0, offset: [0.0; 2], scale: [1.0; 2] });
     let chart = |t: u32| Chart { triangles: t..t + 1, given, ..charts.charts[0].clone() };
     charts.charts = vec![chart(0), chart(1)];
-    charts.chart_of = vec![0, 1];
+    charts.of_triangles = [0, 1].map(ChartId::new).to_vec();
     // The second lies on the first, and on a part of the page that is its own.
     charts.corners[1] = [[0.0, 0.0], [1.0, 0.0], [0.0, 1.0]];
     let layout = Layout::pack(&charts, 1.0, 8, 2, true, &[], &Progress::none()).unwrap();
     let map = map_of(&scene, &charts, &layout);
     // The right triangle x ≥ y has 36 centres; x + y ≤ 8 has 36 too; both have 20, of which those
     // strictly inside both are counted.
-    assert_eq!(map.samples_of(0).len(), 36);
+    let [first, second] = [0, 1].map(PlacementId::new);
+    assert_eq!(map.samples_of(first).len(), 36);
     assert!((6..=20).contains(&map.overlapping_texels), "{}", map.overlapping_texels);
-    assert_eq!(map.samples[map.texel_index(1, 3, 0) as usize].triangle, 0);
-    assert_eq!(map.samples[map.texel_index(1, 0, 3) as usize].triangle, 1);
+    assert_eq!(map.samples[map.texel_index(second, 3, 0) as usize].triangle, 0);
+    assert_eq!(map.samples[map.texel_index(second, 0, 3) as usize].triangle, 1);
     let mut texels: Vec<_> = map.samples.iter().map(|s| (s.x, s.y)).collect();
     texels.sort_unstable();
     texels.dedup();
@@ -306,11 +310,12 @@ fn of_overlapping_given_triangles_the_first_one_wins_and_texels_are_counted() {
 #[test]
 fn back_sides_have_the_same_texels_elsewhere() {
     let (scene, charts) = unit_quad();
-    let layout = Layout::pack(&charts, 4.0, 16, 0, false, &[0], &Progress::none()).unwrap();
+    let chart = ChartId::new(0);
+    let layout = Layout::pack(&charts, 4.0, 16, 0, false, &[chart], &Progress::none()).unwrap();
     let map = map_of(&scene, &charts, &layout);
-    let back = layout.back(0).unwrap();
-    assert_eq!(map.samples_of(0).len(), map.samples_of(back).len());
-    for (f, b) in map.samples_of(0).zip(map.samples_of(back)) {
+    let (front, back) = (PlacementId::front_of(chart), layout.back(chart).unwrap());
+    assert_eq!(map.samples_of(front).len(), map.samples_of(back).len());
+    for (f, b) in map.samples_of(front).zip(map.samples_of(back)) {
         let (f, b) = (map.samples[f as usize], map.samples[b as usize]);
         assert_eq!((f.triangle, f.u, f.v), (b.triangle, b.u, b.v));
     }
