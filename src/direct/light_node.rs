@@ -3,7 +3,7 @@
 //!
 //! No product and sum are fused, so that the importance has the same bits on every instruction set.
 
-use crate::simd::{self, Eight, Isa, Lanes, Mask, Simd, entry_point, isa_features};
+use crate::simd::{self, Eight, Lanes, Mask, Simd};
 use glam::Vec3;
 use std::f32::consts::PI;
 
@@ -129,49 +129,21 @@ fn less(cosine: f32, by_cos: f32, by_sin: f32) -> f32 {
 /// Kernel that computes the importance of the nodes `names` of a tree for a receiver, given its position and normal.
 pub(super) type ImportanceFn = fn(&[Node], &[u32], [Vec3; 2], &mut [f32]);
 
-/// The kernel of an ISA; the portable one if the machine cannot run `isa`.
-pub(super) fn kernel(isa: Isa) -> ImportanceFn {
-    match isa {
-        #[cfg(target_arch = "x86_64")]
-        Isa::Avx2 if isa.is_available() => avx2::checked,
-        #[cfg(target_arch = "x86_64")]
-        Isa::Avx512 if isa.is_available() => avx512::checked,
-        _ => portable::checked,
+simd::kernel! {
+    /// Returns the kernel of an ISA; the portable one if the machine cannot run `isa`.
+    pub(super) fn kernel -> ImportanceFn;
+
+    fn all<S>(nodes: &[Node], names: &[u32], receiver: [Vec3; 2], out: &mut [f32]) {
+        for (names, out) in names.chunks(8).zip(out.chunks_mut(8)) {
+            let mut eight = [&nodes[names[0] as usize]; 8];
+            for (node, &name) in eight.iter_mut().zip(names) {
+                *node = &nodes[name as usize];
+            }
+            let values = importances::<S>(&eight, receiver).to_array();
+            out.copy_from_slice(&values[..out.len()]);
+        }
     }
 }
-
-macro_rules! kernel {
-    ($module:ident, $isa:ident) => {
-        mod $module {
-            use super::*;
-
-            isa_features! { $isa => entry_point! {
-                fn all(nodes: &[Node], names: &[u32], receiver: [Vec3; 2], out: &mut [f32]) {
-                    for (names, out) in names.chunks(8).zip(out.chunks_mut(8)) {
-                        let mut eight = [&nodes[names[0] as usize]; 8];
-                        for (node, &name) in eight.iter_mut().zip(names) {
-                            *node = &nodes[name as usize];
-                        }
-                        let values = importances::<simd::$isa>(&eight, receiver).to_array();
-                        out.copy_from_slice(&values[..out.len()]);
-                    }
-                }
-            } }
-
-            /// Reached only through [`kernel`], which has checked that the machine has the ISA.
-            pub(super) fn checked(nodes: &[Node], names: &[u32], receiver: [Vec3; 2], out: &mut [f32]) {
-                // SAFETY: see above.
-                unsafe { all(nodes, names, receiver, out) }
-            }
-        }
-    };
-}
-
-kernel!(portable, Portable);
-#[cfg(target_arch = "x86_64")]
-kernel!(avx2, Avx2);
-#[cfg(target_arch = "x86_64")]
-kernel!(avx512, Avx512);
 
 /// Eight floats of each of eight nodes, from the float `first` on, which is at most 4: component by component.
 ///
@@ -235,6 +207,7 @@ unsafe fn importances<S: Simd>(n: &[&Node; 8], [position, normal]: [Vec3; 2]) ->
 mod tests {
     use super::*;
     use crate::base::sampling::{uniform, uniform_sphere};
+    use crate::simd::Isa;
 
     #[test]
     fn importance_has_the_same_bits_on_every_instruction_set_and_one_by_one() {

@@ -13,7 +13,7 @@
 
 use super::cylinder::{Cylinder, SAME_SURFACE};
 use super::grid::Grid;
-use crate::simd::{self, Isa, Lanes, Mask, Simd, entry_point, isa_features};
+use crate::simd::{self, Lanes, Mask, Simd};
 use glam::Vec3;
 
 /// Number of vectors summed in f32 before their sums are added in f64: bounds the rounding error to 2⁻¹⁹ while most
@@ -23,44 +23,16 @@ const FLUSH: usize = 64;
 /// Kernel that computes estimates at as many points as all three slices (positions, normals, results) have.
 pub(super) type EstimateFn = fn(&Grid, &Cylinder, &[[f32; 3]], &[[f32; 3]], &mut [[f32; 3]]);
 
-/// The kernel of an ISA; the portable one if the machine cannot run `isa`.
-pub(super) fn kernel(isa: Isa) -> EstimateFn {
-    match isa {
-        #[cfg(target_arch = "x86_64")]
-        Isa::Avx2 if isa.is_available() => avx2::checked,
-        #[cfg(target_arch = "x86_64")]
-        Isa::Avx512 if isa.is_available() => avx512::checked,
-        _ => portable::checked,
+simd::kernel! {
+    /// Returns the kernel of an ISA; the portable one if the machine cannot run `isa`.
+    pub(super) fn kernel -> EstimateFn;
+
+    fn many<S>(g: &Grid, c: &Cylinder, p: &[[f32; 3]], n: &[[f32; 3]], out: &mut [[f32; 3]]) {
+        for ((p, n), out) in p.iter().zip(n).zip(out) {
+            *out = estimate::<S>(g, c, Vec3::from_array(*p), Vec3::from_array(*n));
+        }
     }
 }
-
-macro_rules! kernel {
-    ($module:ident, $isa:ident) => {
-        mod $module {
-            use super::*;
-
-            isa_features! { $isa => entry_point! {
-                fn many(g: &Grid, c: &Cylinder, p: &[[f32; 3]], n: &[[f32; 3]], out: &mut [[f32; 3]]) {
-                    for ((p, n), out) in p.iter().zip(n).zip(out) {
-                        *out = estimate::<simd::$isa>(g, c, Vec3::from_array(*p), Vec3::from_array(*n));
-                    }
-                }
-            } }
-
-            /// Reached only through [`kernel`], which has checked that the machine has the ISA.
-            pub(super) fn checked(g: &Grid, c: &Cylinder, p: &[[f32; 3]], n: &[[f32; 3]], out: &mut [[f32; 3]]) {
-                // SAFETY: see above.
-                unsafe { many(g, c, p, n, out) }
-            }
-        }
-    };
-}
-
-kernel!(portable, Portable);
-#[cfg(target_arch = "x86_64")]
-kernel!(avx2, Avx2);
-#[cfg(target_arch = "x86_64")]
-kernel!(avx512, Avx512);
 
 /// Lane numbers.
 static IOTA: [f32; 8] = [0.0, 1.0, 2.0, 3.0, 4.0, 5.0, 6.0, 7.0];
@@ -190,6 +162,7 @@ mod tests {
     use crate::base::progress::Progress;
     use crate::base::sampling::{sobol_2d, uniform, uniform_sphere};
     use crate::photon::trace::{Account, StoredPhoton, Traced};
+    use crate::simd::Isa;
     use std::f64::consts::PI;
     use std::sync::Arc;
 
