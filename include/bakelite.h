@@ -2081,7 +2081,7 @@ typedef struct bk_camera {
   float fov_y;
 } bk_camera;
 
-/// Limits of an update. With both limits 0 nothing is traced.
+/// Limits of an update. With time and rays 0 nothing is traced.
 typedef struct bk_budget {
   /// Size of this structure in bytes, set by bk_budget_init.
   uint32_t struct_size;
@@ -2090,6 +2090,13 @@ typedef struct bk_budget {
   /// Limit of the number of rays; 0: none. A round of 64 rays that has begun is finished.
   /// Default: 0.
   uint64_t rays;
+  /// Maximum size in bytes of the texels in the rectangles that bk_live_dirty_rects fetches until
+  /// the next update, 8 bytes per texel (BK_FORMAT_RGBA16F), at least 1024; 0: no limit. Set it so
+  /// that no frame reads and uploads more than it has time for, also after the start and after a
+  /// change of light: surfaces in view whose light has changed most come first, the others in later
+  /// updates. The time that bk_live_read takes for that many texels is then kept free within
+  /// `milliseconds`, up to half of it; if reading takes longer, fewer bytes come. Default: 0.
+  uint64_t max_dirty_bytes;
 } bk_budget;
 
 /// Numbers about an update, and the state after it.
@@ -2118,6 +2125,11 @@ typedef struct bk_live_stats {
   uint64_t bytes;
   /// Size in bytes that the live object would have with all LODs in use everywhere.
   uint64_t bytes_full;
+  /// Size in bytes of the texels in the rectangles that bk_live_dirty_rects fetches now, 8 bytes
+  /// per texel.
+  uint64_t dirty_bytes;
+  /// Size in bytes of the changed texels that bk_budget.max_dirty_bytes leaves to later updates.
+  uint64_t dirty_bytes_left;
 } bk_live_stats;
 
 /// Geometry of the light map grid.
@@ -2232,7 +2244,8 @@ bk_result bk_live_update(bk_live *live,
                          bk_live_stats *out);
 
 /// Fetches rectangles of texels whose shown light has changed since they were last fetched, padding
-/// around charts included. Rectangles are merged where that adds few texels.
+/// around charts included. Rectangles are merged where that adds few texels, and are at most as many
+/// as the last update's bk_budget.max_dirty_bytes allows.
 ///
 /// @param live  live object
 /// @param out  receives at most `capacity` rectangles, aligned to 4 bytes; may be NULL if

@@ -538,7 +538,7 @@ public:
         LiveStats stats;
         return detail::finish(bk_live_update(get(), &camera, &budget, &stats), stats);
     }
-    /// All rectangles that have changed since they were last fetched.
+    /// The rectangles that have changed since they were last fetched, as far as the last update's budget lets them out.
     Result<std::vector<bk_rect>> dirty_rects() {
         std::vector<bk_rect> rects;
         bk_result code = BK_OK;

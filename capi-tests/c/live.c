@@ -189,7 +189,7 @@ static void bad_input(bk_scene *scene, bk_lightmap *lightmap) {
     bk_live_stats_init(&stats);
     bk_cell_info_init(&info);
     bk_budget_init(&budget);
-    CHECK(budget.milliseconds == 4.0f && budget.rays == 0);
+    CHECK(budget.milliseconds == 4.0f && budget.rays == 0 && budget.max_dirty_bytes == 0);
     nan3[0] = nan3[1] = nan3[2] = NAN;
 
     CHECK_ERROR(bk_live_create(NULL, &params, NULL, NULL, &live), refused, "lightmap");
@@ -247,8 +247,12 @@ static void bad_input(bk_scene *scene, bk_lightmap *lightmap) {
     budget.milliseconds = NAN;
     CHECK_ERROR(bk_live_update(live, &good, &budget, &stats), refused, "milliseconds");
     budget.milliseconds = 0.0f;
+    budget.max_dirty_bytes = 1023;
+    CHECK_ERROR(bk_live_update(live, &good, &budget, &stats), refused, "max_dirty_bytes is 1023");
+    budget.max_dirty_bytes = 0;
     CHECK_OK(bk_live_update(live, &good, &budget, &stats));
     CHECK(stats.rays == 0 && stats.blocks_changed == 0);
+    CHECK(stats.dirty_bytes == (uint64_t)8 * PAGE * PAGE * page_count(lightmap) && stats.dirty_bytes_left == 0);
 
     CHECK_ERROR(bk_live_dirty_rects(live, rects, 4, NULL), refused, "count");
     CHECK_ERROR(bk_live_dirty_rects(live, NULL, 4, &count), refused, "out");
@@ -474,6 +478,67 @@ static void soak(bk_scene *scene, bk_lightmap *lightmap, int updates, struct acc
     bk_live_release(live);
 }
 
+/* Reads what an update gives out into a copy of the pages; returns its bytes. */
+static uint64_t refresh(bk_live *live, float *copy) {
+    bk_rect rects[16];
+    uint64_t bytes = 0;
+    size_t count, i;
+    do {
+        CHECK_OK(bk_live_dirty_rects(live, rects, 16, &count));
+        for (i = 0; i < count; i++) {
+            const bk_rect *r = &rects[i];
+            float *first = copy + 3 * (((size_t)r->page * PAGE + r->y) * PAGE + r->x);
+            CHECK_OK(bk_live_read(live, r->page, r->lod, BK_FORMAT_RGB32F, r, first, PAGE * 3 * sizeof(float)));
+            bytes += (uint64_t)8 * r->width * r->height;
+        }
+    } while (count == 16);
+    return bytes;
+}
+
+/* With a limit of bytes per update: it is kept, also when the light changes, and all comes in the end. */
+static void limited(bk_scene *scene, bk_lightmap *lightmap, uint32_t background) {
+    bk_live *live = NULL;
+    bk_live_params params = quick();
+    bk_live_stats stats;
+    bk_budget budget;
+    uint32_t pages = page_count(lightmap), page;
+    size_t floats = (size_t)3 * PAGE * PAGE;
+    float *copy = (float *)malloc(pages * floats * sizeof *copy);
+    float *now = (float *)malloc(floats * sizeof *now);
+    int i;
+    CHECK(copy != NULL && now != NULL);
+    if (copy == NULL || now == NULL) return;
+    memset(copy, 0x7f, pages * floats * sizeof *copy);
+    params.background = background;
+    CHECK_OK(bk_live_create(lightmap, &params, NULL, NULL, &live));
+    bk_live_stats_init(&stats);
+    bk_budget_init(&budget);
+    budget.milliseconds = 0.0f;
+    budget.rays = 20000;
+    budget.max_dirty_bytes = 40000;
+    for (i = 0; i <= 150 || stats.dirty_bytes_left > 0; i++) {
+        bk_camera camera = camera_at(i);
+        uint64_t bytes;
+        if (i == 50) switch_light(scene, live, 0, 1.0f);
+        if (i == 100) switch_light(scene, live, 0, 5.0f);
+        if (i == 150) {
+            finish(live);
+            budget.rays = 0;
+        }
+        CHECK_OK(bk_live_update(live, &camera, &budget, &stats));
+        bytes = refresh(live, copy);
+        CHECK(bytes == stats.dirty_bytes && bytes <= budget.max_dirty_bytes);
+        CHECK(bytes > 0 || stats.dirty_bytes_left == 0);
+    }
+    for (page = 0; page < pages; page++) {
+        CHECK_OK(bk_live_read(live, page, 2, BK_FORMAT_RGB32F, NULL, now, 0));
+        CHECK(memcmp(now, copy + page * floats, floats * sizeof *now) == 0);
+    }
+    bk_live_release(live);
+    free(copy);
+    free(now);
+}
+
 int main(int argc, char **argv) {
     struct accounts accounts = {PTHREAD_MUTEX_INITIALIZER, 0};
     int updates = argc > 2 ? atoi(argv[2]) : 2000;
@@ -495,6 +560,8 @@ int main(int argc, char **argv) {
     lights_out(scene, lightmap);
     two_threads(lightmap);
     save_and_restore(lightmap);
+    limited(scene, lightmap, 0);
+    limited(scene, lightmap, 1);
     soak(scene, lightmap, updates, &accounts);
     bk_lightmap_release(lightmap);
     bk_scene_release(scene);

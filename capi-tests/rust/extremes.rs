@@ -329,7 +329,7 @@ fn run(device: &Arc<Device>, case: u64, ran: &mut Ran) {
         let fov_y = draw.pick(&[1.0, 1e-6, 3.1, 0.0, f32::NAN]);
         let camera = LiveCamera { position, forward, up, fov_y, width: draw.pick(&[64, 1, 0]), height: 48 };
         for rays in [5_000, 1] {
-            allowed("update", live.update(&camera, &Budget { milliseconds: 0.0, rays }));
+            allowed("update", live.update(&camera, &Budget { milliseconds: 0.0, rays, max_dirty_bytes: 0 }));
         }
         let rect = PageRect { page: 0, x: 0, y: 0, width: map.info().width, height: map.info().height };
         if let Some(light) = allowed("read", live.read(&rect, live.params().lod_count - 1, true)) {

@@ -9,7 +9,7 @@ use bakelite::{Device, DeviceOptions, Error, Material, Mesh, Progress, Scene, Sc
 use glam::{Vec2, Vec3};
 use std::f32::consts::PI;
 
-const RAYS: Budget = Budget { milliseconds: 0.0, rays: 200_000 };
+const RAYS: Budget = Budget { milliseconds: 0.0, rays: 200_000, max_dirty_bytes: 0 };
 
 /// A light map of a built-in scene, not baked.
 fn unbaked(name: &str, threads: usize, texels_per_unit: f32) -> Lightmap {
@@ -58,7 +58,9 @@ fn finish(live: &mut Live) -> LiveStats {
         }
     }
     // What was promoted last is still fading in.
-    while live.update(&camera(0), &Budget { milliseconds: 1000.0, rays: 0 }).unwrap().blocks_changed > 0 {}
+    while live.update(&camera(0), &Budget { milliseconds: 1000.0, rays: 0, max_dirty_bytes: 0 }).unwrap().blocks_changed
+        > 0
+    {}
     stats
 }
 
@@ -321,7 +323,7 @@ fn what_changes_is_covered_by_dirty_rectangles_and_is_never_negative() {
         let mut copy = pages(&live, &lightmap);
         live.take_dirty(usize::MAX).unwrap();
         for i in 0..40 {
-            live.update(&camera(i), &Budget { milliseconds: 0.0, rays: 30_000 }).unwrap();
+            live.update(&camera(i), &Budget { milliseconds: 0.0, rays: 30_000, max_dirty_bytes: 0 }).unwrap();
             while let Some(r) = live.take_dirty(1).unwrap().pop() {
                 let values = live.read(&r, live.params().lod_count - 1, true).unwrap();
                 for (k, v) in values.into_iter().enumerate() {
@@ -337,6 +339,88 @@ fn what_changes_is_covered_by_dirty_rectangles_and_is_never_negative() {
     }
 }
 
+/// An application's copy of the pages, refreshed by what it is given after each update.
+struct Copied {
+    pages: Vec<[f32; 3]>,
+    size: u32,
+}
+
+impl Copied {
+    /// Reads the rectangles that are given out, and returns their bytes and their number.
+    fn refresh(&mut self, live: &mut Live) -> (u64, usize) {
+        let (lod, mut bytes) = (live.params().lod_count - 1, 0);
+        let rects = live.take_dirty(usize::MAX).unwrap();
+        for r in &rects {
+            bytes += 8 * r.width as u64 * r.height as u64;
+            for (k, v) in (0..).zip(live.read(r, lod, true).unwrap()) {
+                let (x, y) = (r.x + k % r.width, r.y + k / r.width);
+                self.pages[(r.page * self.size * self.size + y * self.size + x) as usize] = v;
+            }
+        }
+        assert!(live.take_dirty(1).unwrap().is_empty(), "more came than was announced");
+        (bytes, rects.len())
+    }
+}
+
+/// With a limit of bytes an application has what it has without one, a little later, and never more at a time: with and
+/// without work between updates, after a change of light and after a restored state.
+#[test]
+fn no_update_gives_out_more_bytes_than_its_limit_and_all_comes_in_the_end() {
+    for (mode, background, limit) in
+        [(Mode::View, false, 20_000), (Mode::Position, true, 50_000), (Mode::Uniform, false, 1024)]
+    {
+        let lightmap = unbaked("cornell", 2, 40.0);
+        let (scene, info) = (lightmap.scene().clone(), lightmap.info());
+        let (original, size) = (scene.lights()[0], info.width);
+        let params = LiveParams { background, max_rounds: 1, ..params(mode) };
+        let mut live = Live::new(&lightmap, &params, &Progress::none()).unwrap();
+        // A copy of which no texel is right.
+        let unread = vec![[-1.0; 3]; (info.page_count * size * size) as usize];
+        let mut copy = Copied { pages: unread, size };
+        let path = std::env::temp_dir().join(format!("bakelite-limit-{}-{limit}", std::process::id()));
+        let (mut updates, mut rects, mut left) = (0, 0, u64::MAX);
+        let mut step = |live: &mut Live, copy: &mut Copied, rays: u64| {
+            let budget = Budget { milliseconds: 0.0, rays, max_dirty_bytes: limit };
+            let stats = live.update(&camera(updates), &budget).unwrap();
+            assert!(stats.dirty_bytes <= limit, "{mode:?}: {}", stats.dirty_bytes);
+            assert!(stats.dirty_bytes > 0 || stats.dirty_bytes_left == 0, "{mode:?}: nothing comes");
+            let (bytes, count) = copy.refresh(live);
+            assert_eq!(bytes, stats.dirty_bytes, "{mode:?}");
+            (updates, rects, left) = (updates + 1, rects.max(count), stats.dirty_bytes_left);
+            left
+        };
+        for i in 0..60 {
+            match i {
+                20 => {
+                    live.save(&path, &Progress::none()).unwrap();
+                    let Light::Rect { position, edge_u, edge_v, radiance } = original else { panic!() };
+                    let radiance = radiance.map(|r| 0.5 * r);
+                    scene.set_light(0, Light::Rect { position, edge_u, edge_v, radiance }).unwrap();
+                    live.light_changed(0).unwrap();
+                }
+                40 => {
+                    scene.set_light(0, original).unwrap();
+                    live.light_changed(0).unwrap();
+                    live.finish_relighting().unwrap();
+                    live.restore(&path, &Progress::none()).unwrap();
+                }
+                _ => {}
+            }
+            step(&mut live, &mut copy, 30_000);
+        }
+        finish(&mut live);
+        live.pause(true).unwrap();
+        // Nothing is traced any more: what is left comes, bit for bit.
+        while step(&mut live, &mut copy, 0) > 0 {}
+        let now = pages(&live, &lightmap);
+        let stale = (0..now.len()).filter(|&i| now[i] != copy.pages[i]).count();
+        assert_eq!(stale, 0, "{mode:?}: texels that never came");
+        assert!(rects <= 256, "{mode:?}: {rects} rectangles at once");
+        scene.set_light(0, original).unwrap();
+        std::fs::remove_file(&path).unwrap();
+    }
+}
+
 #[test]
 fn cells_are_promoted_near_the_camera_first() {
     let lightmap = unbaked("cornell", 2, 60.0);
@@ -349,7 +433,10 @@ fn cells_are_promoted_near_the_camera_first() {
     assert!(lowest * 10 > occupied * 9, "{lowest} of {occupied}");
     let (mut promoted, mut last) = (0, lods);
     while promoted < 20 {
-        promoted += live.update(&camera(0), &Budget { milliseconds: 0.0, rays: 20_000 }).unwrap().cells_promoted;
+        promoted += live
+            .update(&camera(0), &Budget { milliseconds: 0.0, rays: 20_000, max_dirty_bytes: 0 })
+            .unwrap()
+            .cells_promoted;
         let (_, lods) = live.cell_lods().unwrap();
         assert!(lods.iter().zip(&last).all(|(now, before)| now >= before), "no cell falls back");
         last = lods;
@@ -364,7 +451,7 @@ fn work_between_updates_ends_with_the_bits_of_a_bake_and_can_be_paused() {
     let mut lightmap = unbaked("cornell", 2, 60.0);
     let params = LiveParams { background: true, ..params(Mode::Position) };
     let mut live = Live::new(&lightmap, &params, &Progress::none()).unwrap();
-    let little = Budget { milliseconds: 0.0, rays: 64 };
+    let little = Budget { milliseconds: 0.0, rays: 64, max_dirty_bytes: 0 };
     let mut behind_the_back = 0;
     for i in 0..100_000 {
         let stats = live.update(&camera(i), &little).unwrap();
@@ -382,7 +469,9 @@ fn work_between_updates_ends_with_the_bits_of_a_bake_and_can_be_paused() {
         std::thread::sleep(std::time::Duration::from_micros(500));
     }
     assert!(behind_the_back > 100_000, "{behind_the_back}");
-    while live.update(&camera(0), &Budget { milliseconds: 1000.0, rays: 0 }).unwrap().blocks_changed > 0 {}
+    while live.update(&camera(0), &Budget { milliseconds: 1000.0, rays: 0, max_dirty_bytes: 0 }).unwrap().blocks_changed
+        > 0
+    {}
     assert_same_as_bake(&live, &mut lightmap, "in the background");
 }
 
@@ -395,8 +484,8 @@ fn errors_of_blocks_that_are_worked_on_between_updates_count() {
         Live::new(&lightmap, &params, &Progress::none()).unwrap()
     };
     let (mut alone, mut live) = (create(false), create(true));
-    let little = Budget { milliseconds: 0.0, rays: 64 };
-    let nothing = Budget { milliseconds: 0.0, rays: 0 };
+    let little = Budget { milliseconds: 0.0, rays: 64, max_dirty_bytes: 0 };
+    let nothing = Budget { milliseconds: 0.0, rays: 0, max_dirty_bytes: 0 };
     // The first update leaves all blocks alike; the pool then takes the most urgent ones away.
     let (at_home, away) = (alone.update(&camera(0), &little).unwrap(), live.update(&camera(0), &little).unwrap());
     assert!(at_home.visible_error > 0.2, "{at_home:?}");
@@ -468,7 +557,7 @@ fn no_file_with_a_right_checksum_brings_light_that_cannot_be() {
     let lightmap = unbaked("cornell", 2, 16.0);
     let mut live = Live::new(&lightmap, &params(Mode::Position), &Progress::none()).unwrap();
     for i in 0..8 {
-        live.update(&camera(i), &Budget { milliseconds: 0.0, rays: 20_000 }).unwrap();
+        live.update(&camera(i), &Budget { milliseconds: 0.0, rays: 20_000, max_dirty_bytes: 0 }).unwrap();
     }
     let path = std::env::temp_dir().join(format!("bakelite-mutated-{}", std::process::id()));
     live.save(&path, &Progress::none()).unwrap();
@@ -509,7 +598,7 @@ fn no_file_with_a_right_checksum_brings_light_that_cannot_be() {
                     }
                 }
                 if taken % 16 == 0 {
-                    other.update(&camera(turn), &Budget { milliseconds: 0.0, rays: 1000 }).unwrap();
+                    other.update(&camera(turn), &Budget { milliseconds: 0.0, rays: 1000, max_dirty_bytes: 0 }).unwrap();
                 }
                 other.restore_bytes(&whole, "whole", &Progress::none()).unwrap();
                 taken += 1;
@@ -634,10 +723,10 @@ fn bad_cameras_and_budgets_are_refused_and_change_nothing() {
         assert!(matches!(&e, Error::InvalidArgument(m) if m.contains("camera")), "{e}");
     }
     for milliseconds in [-1.0, f32::NAN, f32::INFINITY] {
-        let e = live.update(&good, &Budget { milliseconds, rays: 0 }).unwrap_err();
+        let e = live.update(&good, &Budget { milliseconds, rays: 0, max_dirty_bytes: 0 }).unwrap_err();
         assert!(e.to_string().contains("milliseconds"), "{e}");
     }
-    let stats = live.update(&good, &Budget { milliseconds: 0.0, rays: 0 }).unwrap();
+    let stats = live.update(&good, &Budget { milliseconds: 0.0, rays: 0, max_dirty_bytes: 0 }).unwrap();
     assert_eq!((stats.rays, stats.blocks_changed), (0, 0));
     assert_eq!((live.sums().unwrap(), pages(&live, &lightmap)), before);
     assert!(live.take_dirty(8).unwrap().is_empty());

@@ -457,7 +457,7 @@ fn refine(live: &mut Live, numbers: Range<i64>, turns: u32) -> u32 {
         // What nobody sees is finished too, in time: the camera turns.
         let angle = turn as f32;
         let camera = LiveCamera { forward: Vec3::new(angle.cos(), angle.sin(), -0.5), ..camera };
-        let updated = live.update(&camera, &Budget { milliseconds: 0.0, rays: 40_000 });
+        let updated = live.update(&camera, &Budget { milliseconds: 0.0, rays: 40_000, max_dirty_bytes: 0 });
         let paused = live.pause(true).and(live.pause(false));
         let failed = numbers.contains(&number) && ALLOCATIONS_LEFT.swap(-1, SeqCst) < 0;
         let result = updated.and_then(|stats| paused.map(|()| stats));

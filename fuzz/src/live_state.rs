@@ -18,7 +18,7 @@ impl LiveState {
     pub fn of_room() -> LiveState {
         let params = LiveParams { photon_count: 2000, max_rounds: 3, ..Default::default() };
         let mut live = Live::new(&room::lightmap(), &params, &Progress::none()).expect("a live object");
-        live.update(&camera(), &Budget { milliseconds: 0.0, rays: 20_000 }).expect("an update");
+        live.update(&camera(), &Budget { milliseconds: 0.0, rays: 20_000, max_dirty_bytes: 0 }).expect("an update");
         let path = std::env::temp_dir().join(format!("bakelite-live-state-{}", std::process::id()));
         live.save(&path, &Progress::none()).expect("a state");
         let state = std::fs::read(&path).expect("a file");
@@ -50,7 +50,7 @@ impl LiveState {
                 let light = live.read(&page, lod, true).expect("light");
                 assert!(light.iter().flatten().all(|c| c.is_finite() && *c >= 0.0));
             }
-            live.update(&camera(), &Budget { milliseconds: 0.0, rays: 500 }).expect("an update");
+            live.update(&camera(), &Budget { milliseconds: 0.0, rays: 500, max_dirty_bytes: 0 }).expect("an update");
             live.restore_bytes(state, "state", &Progress::none()).expect("the true state");
         }
     }

@@ -5,6 +5,7 @@ pub(crate) mod callback;
 pub mod error;
 pub mod files;
 pub(crate) mod float_state;
+pub(crate) mod gate;
 pub mod geometry;
 pub mod memory;
 pub mod progress;

@@ -7,9 +7,10 @@
 //! that way reports whenever it counts, on the thread that counts.
 
 use crate::base::error::{Error, Result};
+use crate::base::gate::Gate;
 use std::collections::VecDeque;
 use std::sync::atomic::{AtomicBool, AtomicU32, AtomicU64, Ordering::Relaxed};
-use std::sync::{Condvar, Mutex, MutexGuard, PoisonError};
+use std::sync::{Arc, Condvar, Mutex, MutexGuard, PoisonError};
 use std::time::{Duration, Instant};
 
 /// Called with the fraction done in [0, 1] and the stage's name; `false` cancels.
@@ -116,6 +117,8 @@ impl Reporter<'_> {
 pub struct Progress<'a> {
     reporter: Option<Reporter<'a>>,
     cancelled: AtomicBool,
+    /// Where the work waits for something more urgent.
+    gate: Option<Arc<Gate>>,
 }
 
 impl<'a> Progress<'a> {
@@ -129,7 +132,12 @@ impl<'a> Progress<'a> {
             fraction: AtomicU32::new(0),
             attended: AtomicBool::new(false),
         };
-        Progress { reporter: Some(reporter), cancelled: AtomicBool::new(false) }
+        Progress { reporter: Some(reporter), ..Progress::default() }
+    }
+
+    /// The same progress of work that waits at `gate` whenever it counts or checks.
+    pub(crate) fn waiting_at(self, gate: Arc<Gate>) -> Self {
+        Progress { gate: Some(gate), ..self }
     }
 
     /// Makes a progress that reports to nobody and is never cancelled.
@@ -172,6 +180,9 @@ impl<'a> Progress<'a> {
     }
 
     fn count(&self, fraction: f32) {
+        if let Some(gate) = &self.gate {
+            gate.pass();
+        }
         let Some(reporter) = &self.reporter else { return };
         if fraction > 0.0 {
             reporter.fraction.fetch_max(fraction.to_bits(), Relaxed);

@@ -218,7 +218,7 @@ pub unsafe extern "C" fn bk_camera_init(camera: *mut bk_camera) {
     unsafe { init(camera) }
 }
 
-/// Limits of an update. With both limits 0 nothing is traced.
+/// Limits of an update. With time and rays 0 nothing is traced.
 #[repr(C)]
 #[derive(Clone, Copy)]
 pub struct bk_budget {
@@ -229,12 +229,20 @@ pub struct bk_budget {
     /// Limit of the number of rays; 0: none. A round of 64 rays that has begun is finished.
     /// Default: 0.
     pub rays: u64,
+    /// Maximum size in bytes of the texels in the rectangles that bk_live_dirty_rects fetches until
+    /// the next update, 8 bytes per texel (BK_FORMAT_RGBA16F), at least 1024; 0: no limit. Set it so
+    /// that no frame reads and uploads more than it has time for, also after the start and after a
+    /// change of light: surfaces in view whose light has changed most come first, the others in later
+    /// updates. The time that bk_live_read takes for that many texels is then kept free within
+    /// `milliseconds`, up to half of it; if reading takes longer, fewer bytes come. Default: 0.
+    pub max_dirty_bytes: u64,
 }
 
 sized_struct!(bk_budget, defaults: bk_budget {
     struct_size: size_of::<bk_budget>() as u32,
     milliseconds: 4.0,
     rays: 0,
+    max_dirty_bytes: 0,
 });
 
 /// Sets `struct_size` and fills in the defaults.
@@ -274,6 +282,11 @@ pub struct bk_live_stats {
     pub bytes: u64,
     /// Size in bytes that the live object would have with all LODs in use everywhere.
     pub bytes_full: u64,
+    /// Size in bytes of the texels in the rectangles that bk_live_dirty_rects fetches now, 8 bytes
+    /// per texel.
+    pub dirty_bytes: u64,
+    /// Size in bytes of the changed texels that bk_budget.max_dirty_bytes leaves to later updates.
+    pub dirty_bytes_left: u64,
 }
 
 sized_struct!(bk_live_stats, defaults: stats(&Default::default()));
@@ -292,6 +305,8 @@ fn stats(s: &LiveStats) -> bk_live_stats {
         blocks_changed: s.blocks_changed,
         bytes: s.bytes,
         bytes_full: s.bytes_full,
+        dirty_bytes: s.dirty_bytes,
+        dirty_bytes_left: s.dirty_bytes_left,
     }
 }
 
@@ -459,7 +474,7 @@ pub unsafe extern "C" fn bk_live_update(
             width: c.width,
             height: c.height,
         };
-        let budget = Budget { milliseconds: b.milliseconds, rays: b.rays };
+        let budget = Budget { milliseconds: b.milliseconds, rays: b.rays, max_dirty_bytes: 0 };
         let done = live.change(|l| l.update(&camera, &budget))?;
         if let Some(out) = out {
             out.write(stats(&done));
@@ -469,7 +484,8 @@ pub unsafe extern "C" fn bk_live_update(
 }
 
 /// Fetches rectangles of texels whose shown light has changed since they were last fetched, padding
-/// around charts included. Rectangles are merged where that adds few texels.
+/// around charts included. Rectangles are merged where that adds few texels, and are at most as many
+/// as the last update's bk_budget.max_dirty_bytes allows.
 ///
 /// @param live  live object
 /// @param out  receives at most `capacity` rectangles, aligned to 4 bytes; may be NULL if

@@ -56,6 +56,10 @@ impl Rect {
         Rect { x0: self.x0 - by, y0: self.y0 - by, x1: self.x1 + by, y1: self.y1 + by }
     }
 
+    pub fn times(&self, factor: i32) -> Rect {
+        Rect { x0: self.x0 * factor, y0: self.y0 * factor, x1: self.x1 * factor, y1: self.y1 * factor }
+    }
+
     pub fn clipped(&self, to: &Rect) -> Rect {
         Rect { x0: self.x0.max(to.x0), y0: self.y0.max(to.y0), x1: self.x1.min(to.x1), y1: self.y1.min(to.y1) }
     }

@@ -5,7 +5,7 @@ use super::cells::{Grid, Promotion};
 use super::choose::Chooser;
 use super::dirty::Dirty;
 use super::display::Display;
-use super::readback::ChartBins;
+use super::readback::{ChartBins, ReadingTime};
 use super::relight::{Illumination, Relight};
 use super::visibility::Visibility;
 use super::work::{Context, Limit};
@@ -54,12 +54,14 @@ impl Live {
         let bins = ChartBins::new(&map)?;
         let chooser = Chooser::new(&map, &grid)?;
         let promotion = Promotion::new(&map.tiles, &grid)?;
+        let dirty = Dirty::all(atlas.info.page_count, atlas.map.layout.page_size, map.tiles.len())?;
         let fixed = map.bytes()
             + display.bytes()
             + grid.bytes()
             + promotion.bytes()
             + bins.bytes()
             + chooser.bytes()
+            + dirty.bytes()
             + light.radiance.values.len() * size_of::<Vec3>()
             // Marks, visible blocks, and the queues of blocks that wait to be shown or fade.
             + map.tiles.len() * 21;
@@ -71,14 +73,17 @@ impl Live {
         waiting.try_reserve_exact(blocks.len()).map_err(|_| Error::OutOfMemory("the queue of blocks".into()))?;
         Ok(Live {
             visibility: Visibility::new(blocks.len())?,
-            dirty: Dirty::all(atlas.info.page_count, atlas.map.layout.page_size)?,
+            dirty,
+            reading: ReadingTime::new(),
+            choosing_seconds: 0.0,
+            last_dirty_bytes: 0,
             is_waiting: try_vec(blocks.len(), "the queue of blocks")?,
             waiting,
             fading: try_with_capacity(blocks.len(), "the queue of blocks")?,
             still_fading: try_with_capacity(blocks.len(), "the queue of blocks")?,
             bytes_full: (fixed + full) as u64,
             params: *params,
-            relight: Relight::default(),
+            relight: Relight::beside(atlas.scene.device().num_threads()),
             background: None,
             paused: false,
             refresh_seconds: 1e-4,

@@ -114,12 +114,27 @@ fn compute_values<B: Copy + Sync>(
     });
 }
 
-/// The values that [`compute_values`] has computed for the first `blocks` blocks.
-fn computed(values: &[NewValue], slot: usize, blocks: usize) -> impl Iterator<Item = NewValue> {
-    values
-        .chunks(slot)
-        .take(blocks)
-        .flat_map(|of_block| of_block.iter().copied().take_while(|v| v.0 != GatherTexel::NONE))
+/// The values that [`compute_values`] has computed, by block.
+fn computed<'a>(
+    values: &'a [NewValue],
+    slot: usize,
+    blocks: &'a [u32],
+) -> impl Iterator<Item = (u32, impl Iterator<Item = NewValue> + 'a)> {
+    let of_block =
+        values.chunks(slot).map(|of_block| of_block.iter().copied().take_while(|v| v.0 != GatherTexel::NONE));
+    blocks.iter().copied().zip(of_block)
+}
+
+/// Replaces values; returns by how much the new ones differ, relative to the sum of both: 0 to 1.
+fn replace(of: &mut [Vec3], values: impl Iterator<Item = NewValue>) -> f32 {
+    let (mut change, mut sum) = (0.0, 0.0);
+    for (texel, value) in values {
+        let old = std::mem::replace(&mut of[texel.index()], value);
+        change += (value - old).abs().element_sum();
+        sum += (value + old).element_sum();
+    }
+    // Sums that overflow make 1 of it.
+    if sum > 0.0 { (change / sum).min(1.0) } else { 0.0 }
 }
 
 /// Buffer for the new values of one block.
@@ -135,11 +150,14 @@ impl Slot<'_> {
     }
 }
 
-/// A change of the shown light: a rectangle of a page of the light map.
-#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+/// A change of the shown light of a block: a rectangle of a page of the light map.
+#[derive(Clone, Copy, Debug, PartialEq)]
 pub(super) struct Changed {
     pub page: u32,
     pub rect: Rect,
+    pub block: u32,
+    /// How much it has changed, 0 to 1.
+    pub amount: f32,
 }
 
 impl Display {
@@ -266,7 +284,7 @@ impl Display {
         // after the other.
         for some in all.chunks(BLOCKS_AT_ONCE) {
             compute_values(values, BLOCK_TEXELS, some, |b, slot| self.interpolate_block(map, b, slot));
-            for (texel, value) in computed(values, BLOCK_TEXELS, some.len()) {
+            for (texel, value) in computed(values, BLOCK_TEXELS, some).flat_map(|of_block| of_block.1) {
                 self.plain[texel.index()] = value;
                 self.variances[texel.index()] = f32::INFINITY;
             }
@@ -282,7 +300,7 @@ impl Display {
         // Only texels that can be seen are read, and these are not filled.
         for some in to_fill.chunks(BLOCKS_AT_ONCE) {
             compute_values(values, BLOCK_TEXELS, some, |b, slot| self.fill(map, b, slot));
-            for (texel, value) in computed(values, BLOCK_TEXELS, some.len()) {
+            for (texel, value) in computed(values, BLOCK_TEXELS, some).flat_map(|of_block| of_block.1) {
                 self.plain[texel.index()] = value;
             }
         }
@@ -305,13 +323,12 @@ impl Display {
                 let texels = rect.texels().filter(is_still).filter_map(at);
                 texels.for_each(|s| slot.put(s, self.blurred(map, &mut window, s)));
             });
-            for (texel, value) in computed(values, slot_size, some.len()) {
-                self.shown[texel.index()] = value;
+            for (block, values) in computed(values, slot_size, some) {
+                let amount = replace(&mut self.shown, values);
+                let (page, rect) = self.widest_rect(map, block);
+                note(Changed { page, rect, block, amount });
             }
         }
-        // A texel of the light map interpolates between four texels of the gather map.
-        let changes = all.iter().map(|&b| grown(b)).map(|(p, rect)| in_light_map(map, p, &rect.grown(1)));
-        changes.for_each(&mut note);
         self.scratch = scratch;
     }
 
@@ -367,13 +384,13 @@ impl Display {
         let mut scratch = std::mem::take(&mut self.scratch);
         for some in blocks.chunks(BLOCKS_AT_ONCE) {
             compute_values(&mut scratch.values, BLOCK_TEXELS, some, |b, slot| self.fade_block(map, b, slot));
-            for (texel, value) in computed(&scratch.values, BLOCK_TEXELS, some.len()) {
-                self.shown[texel.index()] = value;
+            for (b, values) in computed(&scratch.values, BLOCK_TEXELS, some) {
+                let amount = replace(&mut self.shown, values);
+                note(self.changed(map, b, amount));
             }
         }
         self.scratch = scratch;
         blocks.iter().for_each(|&b| self.fades[b as usize] -= 1);
-        blocks.iter().for_each(|&b| note(self.block_rect(map, b)));
     }
 
     fn fade_block(&self, map: &BlockMap, b: u32, slot: &mut Slot) {
@@ -501,11 +518,11 @@ impl Display {
         all.dedup();
         for some in all.chunks(BLOCKS_AT_ONCE) {
             compute_values(values, BLOCK_TEXELS, some, |b, slot| self.interpolate_coarse(map, b, slot));
-            for (texel, value) in computed(values, BLOCK_TEXELS, some.len()) {
-                self.coarse[texel.index()] = value;
+            for (b, values) in computed(values, BLOCK_TEXELS, some) {
+                let amount = replace(&mut self.coarse, values);
+                note(self.changed(map, b, amount));
             }
         }
-        all.iter().for_each(|&b| note(self.block_rect(map, b)));
         self.scratch = scratch;
     }
 
@@ -528,7 +545,8 @@ impl Display {
         self.tile_epochs[b as usize] = self.epoch;
         let grown = tile.bytes() as isize;
         let old = self.tiles[b as usize].replace(Arc::new(tile));
-        (self.block_rect(map, b), grown - old.map_or(0, |t| t.bytes() as isize))
+        // Shadows are the most visible of all changes.
+        (self.changed(map, b, 1.0), grown - old.map_or(0, |t| t.bytes() as isize))
     }
 
     /// Direct light of a block at full resolution, and whether it was computed under the current lights.
@@ -536,10 +554,19 @@ impl Display {
         self.tiles[b as usize].as_deref().map(|t| (t, self.tile_epochs[b as usize] == self.epoch))
     }
 
-    /// The part of the light map that shows a block.
-    fn block_rect(&self, map: &BlockMap, b: u32) -> Changed {
-        let tile = &map.tiles[b as usize];
-        in_light_map(map, tile.placement, &tile.rect.grown(1))
+    /// A change of the part of the light map that shows a block.
+    fn changed(&self, map: &BlockMap, block: u32, amount: f32) -> Changed {
+        let tile = &map.tiles[block as usize];
+        let (page, rect) = in_light_map(map, tile.placement, &tile.rect.grown(1));
+        Changed { page, rect, block, amount }
+    }
+
+    /// The page and the part of it that a change of a block's light may change: within the blur's radius, and one texel
+    /// more, as a texel of the light map interpolates between four texels of the gather map.
+    pub fn widest_rect(&self, map: &BlockMap, block: u32) -> (u32, Rect) {
+        let tile = &map.tiles[block as usize];
+        let rect = tile.rect.grown(self.blur).clipped(&own_rect(map, tile.placement));
+        in_light_map(map, tile.placement, &rect.grown(1))
     }
 
     /// Fills a block's texels that cannot be seen with the mean of their neighbours, ring by ring from those that can.
@@ -651,7 +678,7 @@ fn own_rect(map: &BlockMap, placement: PlacementId) -> Rect {
 
 /// The rectangle of the light map that shows a rectangle of a placement's gather texels, the padding around it
 /// included.
-fn in_light_map(map: &BlockMap, placement: PlacementId, rect: &Rect) -> Changed {
+fn in_light_map(map: &BlockMap, placement: PlacementId, rect: &Rect) -> (u32, Rect) {
     let layout = &map.atlas.map.layout;
     let padding = map.atlas.padding as i32;
     let place = &layout[placement];
@@ -661,5 +688,5 @@ fn in_light_map(map: &BlockMap, placement: PlacementId, rect: &Rect) -> Changed 
     let size = layout.page_size as i32;
     let page = Rect { x0: 0, y0: 0, x1: size, y1: size };
     let rect = map.shown_in_light_map(placement, rect).grown(padding).clipped(&shown).clipped(&page);
-    Changed { page: place.page, rect }
+    (place.page, rect)
 }

@@ -45,7 +45,7 @@ use choose::{Choice, Chooser};
 use dirty::Dirty;
 use display::Display;
 use glam::Vec3;
-use readback::ChartBins;
+use readback::{ChartBins, ReadingTime};
 use relight::Relight;
 use std::collections::VecDeque;
 use std::sync::{Arc, Mutex};
@@ -83,6 +83,11 @@ pub struct Live {
     visibility: Visibility,
     chooser: Chooser,
     dirty: Dirty,
+    reading: ReadingTime,
+    /// Recent duration in seconds of choosing the rectangles that are given out.
+    choosing_seconds: f64,
+    /// Bytes that the last update gave out.
+    last_dirty_bytes: u64,
     /// Queue of blocks whose shown light must be refreshed.
     waiting: VecDeque<u32>,
     is_waiting: Vec<bool>,
@@ -128,15 +133,22 @@ impl Live {
         camera.validate()?;
         budget.validate()?;
         let mut stats = LiveStats::default();
+        let _way = self.relight.make_way();
         let device = self.device();
+        let seconds = budget.milliseconds as f64 * 1e-3;
+        let end = (seconds > 0.0).then(|| start + Duration::from_secs_f64(seconds));
         let result = self.collect(&mut stats).and_then(|()| {
             self.take_new_light()?;
             if !budget.is_nothing() {
+                let spare = Duration::from_secs_f64(self.choosing_seconds + self.reading_seconds(budget));
+                let end = end.map(|e| e.checked_sub(spare).unwrap_or(start));
                 // Enters the pool once per update: each entry takes as long as a hundred rays.
-                device.install(|| self.spend(start, camera, budget, &mut stats))?;
+                device.install(|| self.spend(end, camera, budget, &mut stats))?;
             }
-            self.start_background(camera)
+            Ok(())
         });
+        self.give_out(budget, end);
+        let result = result.and_then(|()| self.start_background(camera));
         self.total_rays += stats.rays;
         result?;
         self.describe(&mut stats);
@@ -145,9 +157,14 @@ impl Live {
     }
 
     /// Works until the budget is used up. It must be called in the pool.
-    fn spend(&mut self, start: Instant, camera: &LiveCamera, budget: &Budget, stats: &mut LiveStats) -> Result<()> {
+    fn spend(
+        &mut self,
+        end: Option<Instant>,
+        camera: &LiveCamera,
+        budget: &Budget,
+        stats: &mut LiveStats,
+    ) -> Result<()> {
         let seconds = budget.milliseconds as f64 * 1e-3;
-        let end = (seconds > 0.0).then(|| start + Duration::from_secs_f64(seconds));
         let most_rays = [budget.rays, self.params.rays_per_update as u64].into_iter().filter(|&r| r > 0).min();
         let most_rays = most_rays.unwrap_or(u64::MAX);
         stats.rays += self.visibility.look(&self.context.map, camera);
@@ -287,6 +304,8 @@ impl Live {
         }
         stats.finished = self.chooser.finished();
         stats.total_rays = self.total_rays;
+        stats.dirty_bytes = self.dirty.bytes_out();
+        stats.dirty_bytes_left = self.dirty.bytes_left();
         stats.bytes = (self.fixed as isize + self.held).max(0) as u64;
         stats.bytes_full = self.bytes_full;
     }

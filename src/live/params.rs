@@ -1,6 +1,7 @@
 //! Parameters of live updates, and the numbers that they report.
 
 use super::MAX_LODS;
+use super::dirty::LEAST_BYTES;
 use crate::base::error::{Result, invalid_argument};
 use crate::lightmap::BakeParams;
 use crate::lightmap::indirect::blur::MAX_BLUR_RADIUS;
@@ -88,13 +89,16 @@ pub struct LiveCamera {
     pub height: u32,
 }
 
-/// Limits of an update. If both are 0, nothing is traced.
-#[derive(Clone, Copy, Debug, PartialEq)]
+/// Limits of an update. If time and rays are 0, nothing is traced.
+#[derive(Clone, Copy, Debug, Default, PartialEq)]
 pub struct Budget {
     /// Time limit in milliseconds; 0: none.
     pub milliseconds: f32,
     /// Limit of the number of rays; 0: none.
     pub rays: u64,
+    /// Limit of the bytes of texels, 8 per texel, in the rectangles that can be taken after the update, 1,024 at least; 0:
+    /// none.
+    pub max_dirty_bytes: u64,
 }
 
 /// Numbers about an update, and the state after it.
@@ -118,6 +122,10 @@ pub struct LiveStats {
     pub cells_promoted: u32,
     /// Number of blocks whose shown light changed.
     pub blocks_changed: u32,
+    /// Bytes of the texels, 8 per texel, in the rectangles that can be taken now.
+    pub dirty_bytes: u64,
+    /// Bytes of the changed texels that are kept for later updates.
+    pub dirty_bytes_left: u64,
     /// Size of the live object in bytes.
     pub bytes: u64,
     /// Size in bytes with all LODs in use everywhere.
@@ -183,6 +191,10 @@ impl Budget {
     pub(super) fn validate(&self) -> Result<()> {
         if !(self.milliseconds >= 0.0 && self.milliseconds.is_finite()) {
             return invalid_argument!("the budget is {} milliseconds, not a finite number ≥ 0", self.milliseconds);
+        }
+        if self.max_dirty_bytes != 0 && self.max_dirty_bytes < LEAST_BYTES {
+            let bytes = self.max_dirty_bytes;
+            return invalid_argument!("max_dirty_bytes is {bytes}, neither 0 nor at least {LEAST_BYTES}");
         }
         Ok(())
     }

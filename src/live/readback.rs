@@ -4,12 +4,14 @@ use super::blocks::{BlockMap, Rect};
 use super::display::Display;
 use super::lists::Lists;
 use super::{CellInfo, Live, NO_LOD, PageRect};
-use crate::base::error::{Result, invalid_argument};
-use crate::base::memory::{try_append, try_vec, try_with_capacity};
+use crate::base::error::{Error, Result, invalid_argument};
+use crate::base::memory::{try_append, try_vec};
 use crate::lightmap::atlas::ids::LightTexel;
 use crate::lightmap::atlas::texels::PageArea;
 use glam::Vec3;
 use rayon::prelude::*;
+use std::sync::atomic::{AtomicU32, Ordering::Relaxed};
+use std::time::{Duration, Instant};
 
 /// Side of a bin in texels. (16 is no faster: the time goes into the search for the nearest texel in the padding.)
 const BIN: i32 = 64;
@@ -67,6 +69,27 @@ fn overlapping(side: i32, page: u32, area: &PageArea) -> impl Iterator<Item = us
         .map(move |(i, j)| (page as usize * side as usize + j as usize) * side as usize + i as usize)
 }
 
+/// Recent time of reading a texel of the shown light, in seconds: the bits of an `f32`. Reads may run side by side.
+pub(super) struct ReadingTime(AtomicU32);
+
+impl ReadingTime {
+    pub fn new() -> ReadingTime {
+        ReadingTime(AtomicU32::new(2e-7f32.to_bits()))
+    }
+
+    pub fn per_texel(&self) -> f64 {
+        f32::from_bits(self.0.load(Relaxed)) as f64
+    }
+
+    fn note(&self, texels: usize, time: Duration) {
+        // Of few texels the call takes longer than the texels.
+        if texels >= 256 {
+            let (old, new) = (self.per_texel(), time.as_secs_f64() / texels as f64);
+            self.0.store(((old + 0.1 * (new - old)) as f32).to_bits(), Relaxed);
+        }
+    }
+}
+
 impl Live {
     /// Irradiance shown in a rectangle of a page, row by row; `with_direct` false: indirect light alone. Texels around
     /// charts repeat the chart's nearest texel, up to the padding. `lod` below the highest: reads the light as it would
@@ -87,6 +110,7 @@ impl Live {
         if r.area() == 0 {
             return Ok(out);
         }
+        let start = Instant::now();
         let is_lower = lod + 1 < self.params.lod_count;
         let lower = is_lower.then(|| self.display.lowered(&self.context.map, lod as u8)).transpose()?;
         let display = lower.as_ref().unwrap_or(&self.display);
@@ -100,6 +124,9 @@ impl Live {
         } else {
             let device = atlas.scene.device();
             device.install(|| out.par_chunks_mut(r.width() * ROWS).enumerate().try_for_each(compose))?;
+        }
+        if !is_lower {
+            self.reading.note(r.area(), start.elapsed());
         }
         Ok(out)
     }
@@ -125,20 +152,29 @@ impl Live {
     /// Removes and returns up to `capacity` rectangles whose shown light has changed since they were last taken. At
     /// first these are all pages.
     pub fn take_dirty(&mut self, capacity: usize) -> Result<Vec<PageRect>> {
-        let mut all = try_with_capacity(capacity.min(self.dirty.len()), "the list of changes")?;
-        self.take_each_dirty(capacity, |rect| all.push(rect));
+        let mut all = Vec::new();
+        while all.len() < capacity {
+            // Makes room before it takes a rectangle, so that none is lost.
+            if all.len() == all.capacity() && all.try_reserve(1).is_err() {
+                if all.is_empty() {
+                    return Err(Error::OutOfMemory("the list of changes".into()));
+                }
+                break;
+            }
+            let count = all.len();
+            self.take_each_dirty(1, |rect| all.push(rect));
+            if all.len() == count {
+                break;
+            }
+        }
         Ok(all)
     }
 
     /// Does the work of [`take_dirty`](Self::take_dirty), but passes the rectangles to `put` one by one.
     pub fn take_each_dirty(&mut self, capacity: usize, mut put: impl FnMut(PageRect)) {
-        let size = self.page_size() as i32;
-        let page = Rect { x0: 0, y0: 0, x1: size, y1: size };
-        let padding = self.context.map.atlas.padding as i32;
-        self.dirty.take(capacity, |number, rect| {
-            let r = rect.grown(padding).clipped(&page);
+        self.dirty.take(capacity, |page, r| {
             let (width, height) = (r.width() as u32, r.height() as u32);
-            put(PageRect { page: number, x: r.x0 as u32, y: r.y0 as u32, width, height });
+            put(PageRect { page, x: r.x0 as u32, y: r.y0 as u32, width, height });
         });
     }
 

@@ -8,6 +8,7 @@
 
 use super::Live;
 use crate::base::error::{Error, Result, invalid_argument};
+use crate::base::gate::{Closed, Gate};
 use crate::base::memory::{try_collect, try_vec};
 use crate::base::progress::Progress;
 use crate::device::{Device, DeviceOptions};
@@ -133,6 +134,9 @@ pub(super) struct Relight {
     /// Device with one thread, created at the first renewal.
     device: Option<Arc<Device>>,
     running: Option<Running>,
+    /// Where the thread waits during updates, if there is no core for it beside the threads of these: it would take their
+    /// time slices.
+    gate: Option<Arc<Gate>>,
     /// Whether the lights changed while a renewal under older ones was under way, or while on hold.
     again: bool,
     on_hold: bool,
@@ -148,6 +152,20 @@ struct Running {
 }
 
 impl Relight {
+    /// Relighting beside updates on `threads` threads.
+    pub fn beside(threads: usize) -> Relight {
+        let cores = std::thread::available_parallelism().map_or(usize::MAX, |n| n.get());
+        let mut relight = Relight::default();
+        relight.gate = (threads >= cores).then(Arc::default);
+        relight
+    }
+
+    /// Keeps the thread waiting, if it should, until the result is dropped.
+    pub fn make_way(&self) -> Option<Closed> {
+        let gate = self.gate.as_ref().filter(|_| self.running.is_some());
+        gate.map(|gate| gate.close())
+    }
+
     /// Begins a renewal, or makes another one follow the one under way. The quick part of the latter is always
     /// finished: lights that move all the time are followed in steps. It keeps the shown `sides`.
     pub fn start(&mut self, atlas: &Arc<Atlas>, params: &BakeParams, sides: &Arc<Sides>) -> Result<()> {
@@ -171,6 +189,7 @@ impl Relight {
         let cancel = Arc::new(AtomicBool::new(false));
         let abandon = Arc::new(AtomicBool::new(false));
         let (cancelled, abandoned) = (cancel.clone(), abandon.clone());
+        let gate = self.gate.clone();
         let compute = move |params: &BakeParams, sides: Option<Arc<Sides>>, progress: &Progress| {
             let result = catch_unwind(AssertUnwindSafe(|| {
                 illuminate(&atlas, params, &DirectLight::try_new(&atlas.scene)?, sides, progress)
@@ -180,8 +199,14 @@ impl Relight {
         device.spawn(move || {
             let quick = BakeParams { photon_count: params.photon_count.div_ceil(QUICK_PART), ..params };
             // Nobody receives the result when the live object is gone.
-            let _ = sender.send(compute(&quick, Some(shown), &Progress::new(|_, _| !abandoned.load(Relaxed))));
-            let _ = sender.send(compute(&params, None, &Progress::new(|_, _| !cancelled.load(Relaxed))));
+            let waiting = |progress: Progress<'static>| match gate.clone() {
+                Some(gate) => progress.waiting_at(gate),
+                None => progress,
+            };
+            let progress = waiting(Progress::new(move |_, _| !abandoned.load(Relaxed)));
+            let _ = sender.send(compute(&quick, Some(shown), &progress));
+            let progress = waiting(Progress::new(move |_, _| !cancelled.load(Relaxed)));
+            let _ = sender.send(compute(&params, None, &progress));
         });
         self.device = Some(device);
         self.running = Some(Running { results: Mutex::new(results), cancel, abandon });

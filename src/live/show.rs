@@ -1,12 +1,16 @@
 //! Shows computed light: blocks that wait for the display, and blocks that fade from one LOD to the next.
 
-use super::{Live, LiveStats, Mode, PASS};
+use super::dirty::{LEAST_BYTES, TEXEL_BYTES};
+use super::{Budget, Live, LiveStats, Mode, PASS};
 use std::time::Instant;
+
+/// Part of the time budget that is kept free at most for reading what an update gives out.
+const MOST_READING: f64 = 0.5;
 
 impl Live {
     /// Records the progress of all blocks, and that all pages have changed.
     pub(super) fn note_all_shown(&mut self) {
-        self.dirty.mark_all(self.page_size());
+        self.dirty.mark_all();
         self.promotion.count(&self.context.map.tiles, self.blocks.status());
         self.chooser.note_all(&self.context, self.blocks.status());
     }
@@ -96,5 +100,31 @@ impl Live {
         }
         self.fading.drain(..shown);
         self.fading.append(rest);
+    }
+
+    /// Time to be kept free for reading what an update gives out, in seconds: of as much as it may give out, if there is
+    /// a limit, and at most half of the budget.
+    pub(super) fn reading_seconds(&self, budget: &Budget) -> f64 {
+        let expected = (self.dirty.bytes_left() + self.last_dirty_bytes).min(budget.max_dirty_bytes);
+        let seconds = (expected / TEXEL_BYTES) as f64 * self.reading.per_texel();
+        seconds.min(MOST_READING * budget.milliseconds as f64 * 1e-3)
+    }
+
+    /// Gives out rectangles of changed texels, at most as many bytes as the budget allows and, if there is a limit, as
+    /// can be read until `end`, or in the time that was kept free for that.
+    pub(super) fn give_out(&mut self, budget: &Budget, end: Option<Instant>) {
+        let start = Instant::now();
+        let most = budget.max_dirty_bytes;
+        let limit = (most > 0).then(|| {
+            let Some(end) = end else { return most };
+            let left = end.saturating_duration_since(start).as_secs_f64().max(self.reading_seconds(budget));
+            let readable = (left / self.reading.per_texel()) as u64 * TEXEL_BYTES;
+            readable.clamp(LEAST_BYTES, most)
+        });
+        let (visibility, display, map) = (&self.visibility, &self.display, &self.context.map);
+        let seen = visibility.seen.iter().map(|&b| (visibility.mark(b), b));
+        self.dirty.give_out(limit, seen, |b| display.widest_rect(map, b));
+        self.last_dirty_bytes = self.dirty.bytes_out();
+        self.choosing_seconds += 0.2 * (start.elapsed().as_secs_f64() - self.choosing_seconds);
     }
 }

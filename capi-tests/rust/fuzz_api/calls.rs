@@ -764,6 +764,7 @@ fn live_update(w: &W, s: &mut Source) {
     let mut budget = defaults!(bk_budget, bk_budget_init);
     budget.milliseconds = [0.0, 0.5, 2.0][s.below(3)];
     budget.rays = if s.one_in(2) { 0 } else { s.below(5000) as u64 };
+    budget.max_dirty_bytes = [0, 0, 1024, 20_000][s.below(4)];
     s.mutate(&mut budget);
     // Seconds of work are no news.
     if budget.milliseconds.is_finite() && budget.milliseconds > 5.0 {
@@ -778,6 +779,9 @@ fn live_update(w: &W, s: &mut Source) {
         check_light("bk_live_update", &[stats.visible_error, stats.milliseconds]);
         if !parts.iter().all(|p| (0.0..=1.0).contains(p)) || stats.light_pending > 1 {
             broken(&format!("an update is finished to {parts:?}, light pending {}", stats.light_pending));
+        }
+        if budget.max_dirty_bytes > 0 && stats.dirty_bytes > budget.max_dirty_bytes {
+            broken(&format!("an update gives out {} bytes, more than {}", stats.dirty_bytes, budget.max_dirty_bytes));
         }
     }
 }

@@ -61,9 +61,22 @@ pub struct LiveFlags {
     /// Most time per curve of errors
     #[arg(long, value_name = "F", help_heading = "Report live", default_value_t = 20.0, value_parser = values::positive)]
     pub seconds: f64,
-    /// Updates per time budget, of 1, 2, 4 and 8 ms; 0: budgets are not measured
+    /// Updates per time budget; 0: budgets are not measured
     #[arg(long, value_name = "N", help_heading = "Report live", default_value_t = 10_000)]
     pub updates: u32,
+    /// Time budgets in ms
+    #[arg(long, value_name = "F,...", help_heading = "Report live", value_delimiter = ',',
+          default_values_t = [1.0, 2.0, 4.0, 8.0], value_parser = values::positive)]
+    pub budgets: Vec<f64>,
+    /// Most KB of texels that an update gives out; 0: no limit
+    #[arg(long, value_name = "N,...", help_heading = "Report live", value_delimiter = ',', default_values_t = [0])]
+    pub dirty_kb: Vec<u32>,
+    /// Milliseconds from one update to the next, in which a program would do something else; 0: updates follow at once
+    #[arg(long, value_name = "F", help_heading = "Report live", default_value_t = 0.0, value_parser = values::not_negative)]
+    pub frame_ms: f64,
+    /// Leaves out errors against time, and the references that they need
+    #[arg(long, help_heading = "Report live")]
+    pub no_errors: bool,
     /// Levels of detail
     #[arg(long, value_name = "N", help_heading = "Report live", default_value_t = 3,
           value_parser = clap::value_parser!(u32).range(1..=4))]

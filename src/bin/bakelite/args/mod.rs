@@ -151,6 +151,13 @@ pub struct ReportArgs {
     pub seconds: f64,
     /// Live: updates per time budget; 0: budgets are not measured.
     pub updates: u32,
+    /// Live: time budgets in milliseconds, and most KB of texels that an update gives out (0: no limit).
+    pub budgets_ms: Vec<f32>,
+    pub dirty_kb: Vec<u32>,
+    /// Live: milliseconds from one update to the next.
+    pub frame_ms: f64,
+    /// Live: whether errors are followed.
+    pub errors: bool,
     /// Live: parameters of the updates.
     pub live: LiveParams,
     /// Quality: points at which light is compared.
@@ -219,7 +226,15 @@ fn command_of(line: CommandLine) -> Result<Command, String> {
             if live.promote > live.rounds {
                 return Err(format!("--promote is {}, more than --rounds {}", live.promote, live.rounds));
             }
-            let mut args = ReportArgs { seconds: live.seconds, updates: live.updates, ..report_args(live.flags)? };
+            let mut args = ReportArgs {
+                seconds: live.seconds,
+                updates: live.updates,
+                budgets_ms: live.budgets.iter().map(|&b| b as f32).collect(),
+                dirty_kb: live.dirty_kb,
+                frame_ms: live.frame_ms,
+                errors: !live.no_errors,
+                ..report_args(live.flags)?
+            };
             let bake = &args.bake.params;
             args.live = LiveParams {
                 lod_count: live.lods,
@@ -255,6 +270,10 @@ fn report_args(flags: Flags) -> Result<ReportArgs, String> {
         bake: bake_args(flags)?,
         seconds: 0.0,
         updates: 0,
+        budgets_ms: Vec::new(),
+        dirty_kb: Vec::new(),
+        frame_ms: 0.0,
+        errors: true,
         live: LiveParams::default(),
         points: 0,
         seeds: 0,

@@ -75,6 +75,14 @@ pub fn positive(value: &str) -> Result<f64, String> {
     }
 }
 
+/// A finite number that is not negative.
+pub fn not_negative(value: &str) -> Result<f64, String> {
+    match number(value)? {
+        s if s >= 0.0 && f64::is_finite(s) => Ok(s),
+        _ => Err("not a finite number of at least 0".into()),
+    }
+}
+
 /// The name of a built-in scene or of a file that has one of the known endings.
 pub fn scene(value: &str) -> Result<String, String> {
     if is_scene(value) {

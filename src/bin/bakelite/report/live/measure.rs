@@ -194,7 +194,7 @@ impl Watch<'_> {
     ) -> Result<ModeRun> {
         let start = Instant::now();
         let mut live = Live::new(lightmap, params, &Progress::none())?;
-        let first = live.update(&self.camera, &Budget { milliseconds: 0.0, rays: 0 })?;
+        let first = live.update(&self.camera, &Budget { milliseconds: 0.0, rays: 0, max_dirty_bytes: 0 })?;
         let (from_nothing, mut last) = self.follow(&mut live, first, start, 0, before)?;
         let mut after_move = None;
         if let Some((moved, reference)) = after {
@@ -245,7 +245,7 @@ impl Watch<'_> {
             if is_over {
                 return Ok((points, stats));
             }
-            stats = live.update(&self.camera, &Budget { milliseconds: FOLLOW_MS, rays: 0 })?;
+            stats = live.update(&self.camera, &Budget { milliseconds: FOLLOW_MS, rays: 0, max_dirty_bytes: 0 })?;
             let is_idle = stats.visible_finished == 1.0 && stats.blocks_changed == 0 && !stats.light_pending;
             idle = if is_idle { idle + 1 } else { 0 };
         }
@@ -290,12 +290,17 @@ pub struct Frame {
     pub rects: usize,
     pub texels: u64,
     pub read_ms: f64,
+    /// It follows a change of light, or the start.
+    pub is_new: bool,
 }
 
-/// Updates with one time budget.
+/// Updates with one time budget and one limit of bytes.
 pub struct Walk {
     pub threads: usize,
     pub budget_ms: f32,
+    pub dirty_kb: u32,
+    /// Creating the live object, in seconds.
+    pub create_seconds: f64,
     pub frames: Vec<Frame>,
     /// The longest call of `light_changed`.
     pub change_ms: f64,
@@ -315,34 +320,42 @@ fn walked(camera: &LiveCamera, radius: f32, i: u32) -> LiveCamera {
     }
 }
 
-/// Walks through the scene with one budget. `params` should ask for so many rounds that work remains;
-/// lights that change see to that too.
+/// Walks through the scene with one budget, of milliseconds and of KB to be read (0: no limit), in frames of `frame_ms`.
+/// `params` should ask for
+/// so many rounds that work remains; lights that change see to that too.
 pub fn walk(
     lightmap: &Lightmap,
     params: &LiveParams,
     camera: &LiveCamera,
-    budget_ms: f32,
+    (budget_ms, dirty_kb): (f32, u32),
     updates: u32,
+    frame_ms: f64,
 ) -> Result<Walk> {
     let scene = lightmap.scene();
     let radius = 0.01 * scene.diagonal();
+    let start = Instant::now();
     let mut live = Live::new(lightmap, params, &Progress::none())?;
-    // The first upload is that of everything.
-    live.take_dirty(usize::MAX).unwrap();
-    let mut walk = Walk { threads: scene.device().num_threads(), budget_ms, frames: Vec::new(), change_ms: 0.0 };
+    let create_seconds = start.elapsed().as_secs_f64();
+    let threads = scene.device().num_threads();
+    let mut walk = Walk { threads, budget_ms, dirty_kb, create_seconds, frames: Vec::new(), change_ms: 0.0 };
+    let mut next_frame = Instant::now();
     for i in 0..updates {
+        std::thread::sleep(next_frame.saturating_duration_since(Instant::now()));
+        next_frame = Instant::now() + Duration::from_secs_f64(1e-3 * frame_ms);
+        let mut is_new = i == 0;
         if i % CHANGE_INTERVAL == CHANGE_INTERVAL - 1 && !scene.lights().is_empty() {
             let start = Instant::now();
+            is_new = true;
             live.light_changed(0)?;
             walk.change_ms = walk.change_ms.max(start.elapsed().as_secs_f64() * 1e3);
         }
         let camera = walked(camera, radius, i);
-        let budget = Budget { milliseconds: budget_ms, rays: 0 };
+        let budget = Budget { milliseconds: budget_ms, rays: 0, max_dirty_bytes: 1000 * dirty_kb as u64 };
         let start = Instant::now();
         let stats = live.update(&camera, &budget)?;
         let used_ms = start.elapsed().as_secs_f64() * 1e3;
         let start = Instant::now();
-        let dirty = live.take_dirty(usize::MAX).unwrap();
+        let dirty = live.take_dirty(usize::MAX)?;
         for rect in &dirty {
             std::hint::black_box(live.read(rect, live.params().lod_count - 1, true)?);
         }
@@ -353,6 +366,7 @@ pub fn walk(
             rects: dirty.len(),
             texels: dirty.iter().map(|r| r.width as u64 * r.height as u64).sum(),
             read_ms: start.elapsed().as_secs_f64() * 1e3,
+            is_new,
         });
     }
     Ok(walk)

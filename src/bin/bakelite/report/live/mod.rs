@@ -7,6 +7,7 @@ use crate::files;
 use crate::job::Job;
 use crate::pictures::percent;
 use crate::plot::curves::{Plot, Series};
+use crate::stages::Stage;
 use bakelite::lightmap::{BakeParams, Lightmap};
 use bakelite::live::LiveParams;
 use bakelite::scene::Camera;
@@ -23,8 +24,6 @@ const REFERENCE_RAYS: u32 = 4096;
 
 /// Rounds on walks, so many that work remains.
 const WALK_ROUNDS: u32 = 1024;
-
-const BUDGETS_MS: [f32; 4] = [1.0, 2.0, 4.0, 8.0];
 
 const THREADS: [usize; 2] = [1, 2];
 
@@ -43,10 +42,13 @@ struct Phase {
 }
 
 /// All that is measured.
+#[derive(Default)]
 struct Measured {
     phases: Vec<Phase>,
     runs: Vec<ModeRun>,
     walks: Vec<Walk>,
+    /// What loading and laying out took.
+    stages: Vec<Stage>,
     /// What was done to light 0.
     change: Option<String>,
     seen: usize,
@@ -57,10 +59,12 @@ pub fn run(args: &ReportArgs) -> Result<()> {
     files::make_folder(&args.bake.out)?;
     let mut job = Job::new(&args.bake);
     let mut lightmap = job.unbaked()?;
-    let (mut measured, camera) = errors(&job, args, &mut lightmap)?;
+    let (mut measured, camera) =
+        if args.errors { errors(&job, args, &mut lightmap)? } else { (Measured::default(), job.camera(&lightmap)) };
     if args.updates > 0 {
-        measured.walks = walks(&job, args, &camera)?;
+        measured.walks = walks(&job, args, &lightmap, &camera)?;
     }
+    measured.stages = std::mem::take(&mut job.stages);
     let mut names = Vec::new();
     let mut save = |name: String, text: &str| {
         let path = args.bake.out.join(&name);
@@ -68,7 +72,9 @@ pub fn run(args: &ReportArgs) -> Result<()> {
         files::write_text(&path, text)
     };
     save("live.md".into(), &markdown(args, &lightmap, &camera, &measured))?;
-    save("live-errors.csv".into(), &errors_csv(&measured.phases))?;
+    if args.errors {
+        save("live-errors.csv".into(), &errors_csv(&measured.phases))?;
+    }
     if args.updates > 0 {
         save("live-updates.csv".into(), &updates_csv(&measured.walks))?;
     }
@@ -134,20 +140,23 @@ fn errors(job: &Job, args: &ReportArgs, lightmap: &mut Lightmap) -> Result<(Meas
         }
         runs.push(run);
     }
-    Ok((Measured { phases, runs, walks: Vec::new(), change, seen: seen.count() }, camera))
+    Ok((Measured { phases, runs, change, seen: seen.count(), ..Default::default() }, camera))
 }
 
-/// Walks with all budgets, in fresh states, on one thread and on two.
-fn walks(job: &Job, args: &ReportArgs, camera: &Camera) -> Result<Vec<Walk>> {
+/// Walks with all budgets, in fresh states, on one thread and on two, or on as many as were asked for.
+fn walks(job: &Job, args: &ReportArgs, lightmap: &Lightmap, camera: &Camera) -> Result<Vec<Walk>> {
     let mut walks = Vec::new();
-    for threads in THREADS {
+    let given = [args.bake.threads];
+    for &threads in if given == [0] { &THREADS[..] } else { &given[..] } {
         // Threads belong to the device, and so does the scene.
         let again = BakeArgs { threads, quiet: true, ..args.bake.clone() };
-        let lightmap = Job::new(&again).unbaked()?;
+        let other = if given == [0] { Some(Job::new(&again).unbaked()?) } else { None };
+        let lightmap = other.as_ref().unwrap_or(lightmap);
         let params = LiveParams { max_rounds: WALK_ROUNDS, ..args.live };
-        for budget in BUDGETS_MS {
-            job.bars.say(&format!("{} updates of {budget} ms, threads: {threads}", args.updates));
-            walks.push(walk(&lightmap, &params, &live_camera(camera, aspect(&args.bake)), budget, args.updates)?);
+        for (&budget, &kb) in args.budgets_ms.iter().flat_map(|b| args.dirty_kb.iter().map(move |kb| (b, kb))) {
+            job.bars.say(&format!("{} updates of {budget} ms and {kb} KB, threads: {threads}", args.updates));
+            let camera = live_camera(camera, aspect(&args.bake));
+            walks.push(walk(lightmap, &params, &camera, (budget, kb), args.updates, args.frame_ms)?);
         }
     }
     Ok(walks)
@@ -188,14 +197,16 @@ fn errors_csv(phases: &[Phase]) -> String {
 }
 
 fn updates_csv(walks: &[Walk]) -> String {
-    let mut out =
-        String::from("threads,budget_ms,update,used_ms,relighting,work_left,dirty_rects,dirty_bytes,read_ms\n");
+    let mut out = String::from(
+        "threads,budget_ms,limit_kb,update,used_ms,relighting,work_left,dirty_rects,dirty_bytes,read_ms\n",
+    );
     for walk in walks {
         for (i, f) in walk.frames.iter().enumerate() {
             let (threads, budget, bytes) = (walk.threads, walk.budget_ms, f.texels * TEXEL_BYTES);
             let (relighting, work) = (f.relighting as u8, f.has_work as u8);
-            let (used, rects, read) = (f.used_ms, f.rects, f.read_ms);
-            let _ = writeln!(out, "{threads},{budget},{i},{used:.4},{relighting},{work},{rects},{bytes},{read:.4}");
+            let (used, rects, read, kb) = (f.used_ms, f.rects, f.read_ms, walk.dirty_kb);
+            let _ =
+                writeln!(out, "{threads},{budget},{kb},{i},{used:.4},{relighting},{work},{rects},{bytes},{read:.4}");
         }
     }
     out
@@ -212,6 +223,7 @@ fn spread(values: impl Iterator<Item = f64>, digits: usize) -> String {
 
 fn markdown(args: &ReportArgs, lightmap: &Lightmap, camera: &Camera, measured: &Measured) -> String {
     let mut out = introduction(args, lightmap, camera, measured);
+    first_light(&mut out, measured);
     for phase in &measured.phases {
         let _ = writeln!(out, "## {}\n", phase.title);
         if let (true, Some(change)) = (phase.name == "moved", &measured.change) {
@@ -224,13 +236,15 @@ fn markdown(args: &ReportArgs, lightmap: &Lightmap, camera: &Camera, measured: &
         }
         errors_table(&mut out, phase);
     }
-    if measured.change.is_none() {
+    if args.errors && measured.change.is_none() {
         out.push_str("## After a light has moved\n\nNot measured: the scene has no lights but emissive materials.\n\n");
     }
     if !measured.walks.is_empty() {
         walk_tables(&mut out, args, &measured.walks);
     }
-    memory_table(&mut out, &measured.runs);
+    if args.errors {
+        memory_table(&mut out, &measured.runs);
+    }
     out
 }
 
@@ -282,6 +296,24 @@ fn introduction(args: &ReportArgs, lightmap: &Lightmap, camera: &Camera, measure
     )
 }
 
+/// What it takes until the first light is shown.
+fn first_light(out: &mut String, measured: &Measured) {
+    out.push_str("## First light\n\n| | s |\n|---|---|\n");
+    let mut total = 0.0;
+    let mut row = |name: &str, seconds: f64| {
+        total += seconds;
+        let _ = writeln!(out, "| {name} | {seconds:.3} |");
+    };
+    measured.stages.iter().for_each(|s| row(s.name, s.seconds));
+    if let Some(walk) = measured.walks.first() {
+        row("photons, radiance map, lowest level of detail", walk.create_seconds);
+        if let Some(frame) = walk.frames.first() {
+            row("first update and reading", 1e-3 * (frame.used_ms + frame.read_ms));
+        }
+    }
+    let _ = writeln!(out, "| all | {total:.3} |\n");
+}
+
 fn errors_table(out: &mut String, phase: &Phase) {
     let goals = GOALS.map(|g| format!("to {:.0}%", 100.0 * g));
     let _ = writeln!(out, "| | {} | {} | first error | last error |", goals[0], goals[1]);
@@ -318,8 +350,10 @@ fn walk_tables(out: &mut String, args: &ReportArgs, walks: &[Walk]) {
             "No light changes.".into()
         },
     );
-    out.push_str("| threads | budget | p50 | p99 | max | in need | p50 | p99 | max | calm | p50 | p99 | max |\n");
-    out.push_str("|---|---|---|---|---|---|---|---|---|---|---|---|---|\n");
+    out.push_str(
+        "| threads | budget | limit | p50 | p99 | max | in need | p50 | p99 | max | calm | p50 | p99 | max |\n",
+    );
+    out.push_str("|---|---|---|---|---|---|---|---|---|---|---|---|---|---|\n");
     for walk in walks {
         let over = |f: &Frame| f.used_ms - walk.budget_ms as f64;
         let cells = |of: &dyn Fn(&&Frame) -> bool| {
@@ -329,7 +363,22 @@ fn walk_tables(out: &mut String, args: &ReportArgs, walks: &[Walk]) {
         };
         let all = spread(walk.frames.iter().map(over), 3);
         let (need, calm) = (cells(&|f| f.has_work && over(f) > 0.0), cells(&|f| !f.relighting));
-        let _ = writeln!(out, "| {} | {} ms | {all} | {need} | {calm} |", walk.threads, walk.budget_ms);
+        let _ = writeln!(out, "| {} | {all} | {need} | {calm} |", title_of(walk));
+    }
+    let _ = writeln!(
+        out,
+        "\n## Frames\n\nUpdate and reading of what it gives out, in ms: in the first frame, in the slowest of the frames in which \
+         a light has changed (with `light_changed`), in all; and their overshoot of the budget.\n"
+    );
+    out.push_str("| threads | budget | limit | first | change | p50 | p99 | max | overshoot p50 | p99 | max |\n");
+    out.push_str("|---|---|---|---|---|---|---|---|---|---|---|\n");
+    for walk in walks {
+        let whole = |f: &Frame| f.used_ms + f.read_ms;
+        let first = walk.frames.first().map_or(0.0, whole);
+        let changed = walk.frames.iter().skip(1).filter(|f| f.is_new).map(whole).fold(0.0, f64::max) + walk.change_ms;
+        let all = spread(walk.frames.iter().map(whole), 2);
+        let over = spread(walk.frames.iter().map(|f| whole(f) - walk.budget_ms as f64), 2);
+        let _ = writeln!(out, "| {} | {first:.2} | {changed:.2} | {all} | {over} |", title_of(walk));
     }
     let _ = writeln!(
         out,
@@ -337,16 +386,24 @@ fn walk_tables(out: &mut String, args: &ReportArgs, walks: &[Walk]) {
          Dirty rectangles after each of these updates, the bytes of their texels as RGBA of half floats, and the time \
          that `read` takes for all of them.\n"
     );
-    out.push_str("| threads | budget | rectangles p50 | p99 | max | KB p50 | p99 | max | read ms p50 | p99 | max |\n");
-    out.push_str("|---|---|---|---|---|---|---|---|---|---|---|\n");
+    out.push_str(
+        "| threads | budget | limit | rectangles p50 | p99 | max | KB p50 | p99 | max | read ms p50 | p99 | max |\n",
+    );
+    out.push_str("|---|---|---|---|---|---|---|---|---|---|---|---|\n");
     for walk in walks {
         let frames = || walk.frames.iter();
         let rects = spread(frames().map(|f| f.rects as f64), 0);
         let bytes = spread(frames().map(|f| (f.texels * TEXEL_BYTES) as f64 * 1e-3), 1);
         let read = spread(frames().map(|f| f.read_ms), 3);
-        let _ = writeln!(out, "| {} | {} ms | {rects} | {bytes} | {read} |", walk.threads, walk.budget_ms);
+        let _ = writeln!(out, "| {} | {rects} | {bytes} | {read} |", title_of(walk));
     }
     out.push('\n');
+}
+
+/// Threads, budget and limit of a walk, as cells of a table.
+fn title_of(walk: &Walk) -> String {
+    let limit = if walk.dirty_kb == 0 { "none".into() } else { format!("{} KB", walk.dirty_kb) };
+    format!("{} | {} ms | {limit}", walk.threads, walk.budget_ms)
 }
 
 fn memory_table(out: &mut String, runs: &[ModeRun]) {
