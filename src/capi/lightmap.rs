@@ -11,13 +11,13 @@
 //! Cost: see bk_lightmap_create; the other functions copy their results.
 
 use super::args::{OutStruct, SizedStruct, init, read_bool, read_struct, sized_struct, slice_mut, write};
-use super::device::{bk_progress_fn, progress, refuse_in_callback};
+use super::device::{bk_progress_fn, call_with_file, progress, refuse_in_callback};
 use super::error::{bk_result, call, call_or};
 use super::handles::{create, hold, object, release, retain};
 use super::scene::bk_scene;
 use crate::base::error::{Error, Result};
 use crate::lightmap::{Lightmap, LightmapDesc, LightmapInfo, MeshUvs};
-use std::ffi::c_void;
+use std::ffi::{c_char, c_void};
 use std::sync::{Arc, RwLock, TryLockError};
 
 /// Handle of a light map: a layout and, once baked, light.
@@ -151,18 +151,105 @@ pub unsafe extern "C" fn bk_lightmap_create(
         // Its geometry as of now: it may be refitted meanwhile.
         let scene = Arc::clone(&*hold(scene, "scene")?.committed()?);
         scene.device().check_process()?;
-        let d: bk_lightmap_desc = if desc.is_null() { SizedStruct::defaults() } else { read_struct(desc, "desc")? };
-        let desc = LightmapDesc {
-            texels_per_unit: d.texels_per_unit,
-            page_size: d.page_size,
-            padding: d.padding,
-            gather_divisor: d.gather_divisor,
-            radiance_divisor: d.radiance_divisor,
-            both_sides: read_bool(d.both_sides, "both_sides")?,
-        };
+        let desc = core_desc(desc)?;
         let lightmap = Lightmap::create(&scene, &desc, &self::progress(progress, user))?;
         write(out, create(bk_lightmap { lightmap: RwLock::new(lightmap) }), "out")
     })
+}
+
+/// # Safety
+/// `desc` is NULL or the caller's structure.
+unsafe fn core_desc(desc: *const bk_lightmap_desc) -> Result<LightmapDesc> {
+    // SAFETY: by contract.
+    let read = || unsafe { read_struct(desc, "desc") };
+    let d: bk_lightmap_desc = if desc.is_null() { SizedStruct::defaults() } else { read()? };
+    Ok(LightmapDesc {
+        texels_per_unit: d.texels_per_unit,
+        page_size: d.page_size,
+        padding: d.padding,
+        gather_divisor: d.gather_divisor,
+        radiance_divisor: d.radiance_divisor,
+        both_sides: read_bool(d.both_sides, "both_sides")?,
+    })
+}
+
+/// Saves charts and texels of a light map, but no light, to be loaded by bk_lightmap_load_layout
+/// where the same scene is lit again.
+///
+/// Experimental: another version of the library may refuse the file.
+///
+/// Cost: a part of a second for a million texels.
+///
+/// @param lightmap  light map, baked or not
+/// @param path  name of the file, which is replaced as a whole or not at all; UTF-8
+/// @param progress,user  progress callback and its pointer; may be NULL
+/// @retval BK_ERROR_INVALID_STATE  the light map is being baked
+/// @retval BK_ERROR_OUT_OF_MEMORY  a buffer does not fit
+/// @retval BK_ERROR_IO  the file cannot be written; bk_last_error names it
+/// @retval BK_ERROR_CANCELLED  the progress callback returned 0
+#[unsafe(no_mangle)]
+pub unsafe extern "C" fn bk_lightmap_save_layout(
+    lightmap: *const bk_lightmap,
+    path: *const c_char,
+    progress: bk_progress_fn,
+    user: *mut c_void,
+) -> bk_result {
+    // SAFETY: a handle or NULL; path is the caller's, or NULL.
+    unsafe {
+        call_with_file((lightmap, "lightmap"), (path, "path"), |lightmap, path| {
+            lightmap.read(|l| l.save_layout(path.as_ref(), &self::progress(progress, user)))
+        })
+    }
+}
+
+/// Creates the light map whose layout bk_lightmap_save_layout wrote, as bk_lightmap_create would,
+/// with the same bits, without unwrapping.
+///
+/// If the file is refused, create the light map anew and save its layout.
+///
+/// Files from untrusted sources are safe to load: every number is checked. Charts may lie anywhere
+/// on their pages, though.
+///
+/// Experimental: another version of the library may refuse the file.
+///
+/// Cost: a part of a second for a million triangles.
+///
+/// @param scene  committed scene, kept alive by the light map
+/// @param desc  parameters with which the light map was created; NULL for the defaults
+/// @param path  name of the file; UTF-8
+/// @param progress,user  progress callback and its pointer; may be NULL
+/// @param out  receives the light map, which the caller releases with bk_lightmap_release; NULL on
+///   failure
+/// @retval BK_ERROR_INVALID_ARGUMENT  a field of `desc` is out of its range, or the file is of another
+///   scene, other parameters, another version of the library or instruction set (AVX2 and AVX-512
+///   count as one), or with sun or sky instead of without; bk_last_error says which
+/// @retval BK_ERROR_INVALID_STATE  the scene is not committed or is being refitted
+/// @retval BK_ERROR_IO  the file cannot be read, is damaged, or is another kind of file;
+///   bk_last_error names it
+/// @retval BK_ERROR_OUT_OF_MEMORY  the light map does not fit or the memory callback refuses
+/// @retval BK_ERROR_CANCELLED  the progress callback returned 0
+#[unsafe(no_mangle)]
+pub unsafe extern "C" fn bk_lightmap_load_layout(
+    scene: *const bk_scene,
+    desc: *const bk_lightmap_desc,
+    path: *const c_char,
+    progress: bk_progress_fn,
+    user: *mut c_void,
+    out: *mut *mut bk_lightmap,
+) -> bk_result {
+    // SAFETY: desc, path and out are the caller's, or NULL.
+    unsafe {
+        if let Err(e) = write(out, std::ptr::null_mut(), "out") {
+            return call(|| Err(e));
+        }
+        call_with_file((scene, "scene"), (path, "path"), |scene, path| {
+            let scene = Arc::clone(&*scene.committed()?);
+            scene.device().check_process()?;
+            let desc = core_desc(desc)?;
+            let lightmap = Lightmap::load_layout(&scene, &desc, path.as_ref(), &self::progress(progress, user))?;
+            write(out, create(bk_lightmap { lightmap: RwLock::new(lightmap) }), "out")
+        })
+    }
 }
 
 /// Adds one reference.

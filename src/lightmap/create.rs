@@ -5,7 +5,8 @@ use super::atlas::buried::Search;
 use super::atlas::chart_index::ChartIndex;
 use super::atlas::chart_map::ChartMap;
 use super::atlas::charts::{Charts, automatic_density};
-use super::atlas::ids::{ChartId, GatherMap, LightMap, RadianceMap};
+use super::atlas::ids::{ChartId, GatherMap, LightMap, Map, RadianceMap};
+use super::atlas::known::{Known, Patch};
 use super::atlas::layout::Layout;
 use super::atlas::seen::{self, Seen};
 use super::atlas::texels::TexelMap;
@@ -14,7 +15,7 @@ use super::plan::Plan;
 use super::{BakeParams, Lightmap, LightmapDesc, LightmapInfo};
 use crate::base::error::Result;
 use crate::base::memory::try_collect;
-use crate::base::progress::Progress;
+use crate::base::progress::{Progress, Stage};
 use crate::device::LogLevel;
 use crate::direct::DirectLight;
 use crate::scene::Scene;
@@ -35,21 +36,31 @@ impl Lightmap {
     /// Creates a light map: unwraps meshes without usable UVs, lays out the pages and maps texels to triangles.
     pub fn create(scene: &Arc<Scene>, desc: &LightmapDesc, progress: &Progress) -> Result<Lightmap> {
         desc.validate()?;
-        scene.device().run(progress, || Self::lay_out(scene, desc, progress))
+        scene.device().run(progress, || Self::lay_out(scene, desc, None, progress))
     }
 
-    fn lay_out(scene: &Arc<Scene>, desc: &LightmapDesc, progress: &Progress) -> Result<Lightmap> {
+    /// Creates a light map whose description is checked. What is `known` is not searched for.
+    pub(super) fn lay_out(
+        scene: &Arc<Scene>,
+        desc: &LightmapDesc,
+        mut known: Option<Known>,
+        progress: &Progress,
+    ) -> Result<Lightmap> {
         let start = Instant::now();
+        let is_outdoors = seen::is_outdoors(scene);
         let density = match desc.texels_per_unit {
             0.0 => automatic_density(scene, desc.page_size, AUTOMATIC_PAGES),
             d => d,
         };
-        let (charts, mut uvs) = Charts::of_scene(scene, density, desc.page_size, desc.padding, progress)?;
+        let (charts, mut uvs) = match &mut known {
+            Some(known) => (std::mem::take(&mut known.charts), known.uvs),
+            None => Charts::of_scene(scene, density, desc.page_size, desc.padding, progress)?,
+        };
         let unwrap_seconds = start.elapsed().as_secs_f64();
         let two_sided: Vec<ChartId> =
             try_collect(charts.ids().filter(|&c| charts[c].two_sided), "the two-sided charts")?;
         let Maps { map, gather, radiance, seen, with_backs, buried, sight_rays } =
-            Maps::lay_out(scene, desc, &charts, &two_sided, density, progress)?;
+            Maps::lay_out(scene, desc, &charts, &two_sided, density, known.as_mut(), progress)?;
         uvs.overlapping_texels = map.texels.overlapping_texels;
         uvs.reduced_charts = map.layout.reduced;
         let index = ChartIndex::new(scene.device(), &charts)?;
@@ -83,9 +94,36 @@ impl Lightmap {
             Plan::new(scene, &direct, &BakeParams::default(), !two_sided.is_empty(), uvs.unwrapped_charts > 0);
         plan.note_sides(&info);
         let scene = scene.clone();
-        let padding = desc.padding;
-        let atlas = Atlas { scene, charts, index, map, gather, radiance, padding, info, seen, buried, _memory: memory };
+        let atlas = Atlas {
+            scene,
+            charts,
+            index,
+            map,
+            gather,
+            radiance,
+            padding: desc.padding,
+            desc: *desc,
+            is_outdoors,
+            info,
+            seen,
+            buried,
+            _memory: memory,
+        };
         Ok(Lightmap { atlas: Arc::new(atlas), plan, light: None })
+    }
+}
+
+impl Lightmap {
+    /// Finds the texels that show other points than their places have, by making them anew: they are not kept, as few
+    /// light maps are saved.
+    pub(super) fn patches(&self, progress: &Progress) -> Result<[Vec<Patch>; 3]> {
+        fn of<M: Map>(a: &Atlas, map: &ChartMap<M>, buried: &[bool], stage: &Stage) -> Result<Vec<Patch>> {
+            Patch::all(map, &ChartMap::new(&a.scene, &a.charts, map.layout.clone(), stage)?, buried)
+        }
+        let a = &self.atlas;
+        let layouts = [&a.map.layout, &a.gather.layout, &a.radiance.layout];
+        let stage = &progress.stage("texels", 0.0, 0.5, layouts.into_iter().map(TexelMap::work).sum());
+        Ok([of(a, &a.map, &a.buried, stage)?, of(a, &a.gather, &[], stage)?, of(a, &a.radiance, &[], stage)?])
     }
 }
 
@@ -111,6 +149,7 @@ impl Maps {
         charts: &Charts,
         two_sided: &[ChartId],
         density: f32,
+        known: Option<&mut Known>,
         progress: &Progress,
     ) -> Result<Maps> {
         let pack = |divisor: u32, padding: u32, given: bool, with_backs: &[ChartId]| {
@@ -122,7 +161,11 @@ impl Maps {
         let mut radiance = ChartMap::new(scene, charts, radiance, &stage)?;
         let texel = 1.0 / density;
         let stage = progress.stage("sides", 0.6, 0.65, Seen::work(&radiance));
-        let seen = scene.device().install(|| Seen::count(scene, charts, &radiance, texel, &stage))?;
+        let mut known = known;
+        let seen = match &mut known {
+            Some(known) => std::mem::take(&mut known.seen),
+            None => scene.device().install(|| Seen::count(scene, charts, &radiance, texel, &stage))?,
+        };
         let with_backs =
             if desc.both_sides { two_sided::seen_from_both(&seen, &radiance, two_sided)? } else { Vec::new() };
         let map = pack(1, desc.padding, true, &with_backs)?;
@@ -130,6 +173,13 @@ impl Maps {
         let stage = progress.stage("texels", 0.65, 0.8, TexelMap::work(&map) + TexelMap::work(&gather));
         let mut map = ChartMap::new(scene, charts, map, &stage)?;
         let mut gather = ChartMap::new(scene, charts, gather, &stage)?;
+        if let Some(known) = known {
+            let buried = known.patch(0, charts, &mut map)?;
+            known.patch(1, charts, &mut gather)?;
+            known.patch(2, charts, &mut radiance)?;
+            let sight_rays = known.sight_rays;
+            return Ok(Maps { map, gather, radiance, seen, with_backs, buried, sight_rays });
+        }
         let placements = [&map.layout, &gather.layout, &radiance.layout].map(|layout| layout.placements.len() as u64);
         let stage = progress.stage("buried texels", 0.8, 1.0, placements.iter().sum());
         let near = texel.min(seen::ROOM * scene.diagonal());

@@ -74,7 +74,7 @@ impl Live {
         Ok(Live {
             visibility: Visibility::new(blocks.len())?,
             dirty,
-            reading: ReadingTime::new(),
+            reading: ReadingTime::default(),
             choosing_seconds: 0.0,
             last_dirty_bytes: 0,
             is_waiting: try_vec(blocks.len(), "the queue of blocks")?,

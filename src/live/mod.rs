@@ -134,6 +134,7 @@ impl Live {
         budget.validate()?;
         let mut stats = LiveStats::default();
         let _way = self.relight.make_way();
+        self.reading.settle();
         let device = self.device();
         let seconds = budget.milliseconds as f64 * 1e-3;
         let end = (seconds > 0.0).then(|| start + Duration::from_secs_f64(seconds));

@@ -10,7 +10,7 @@ use crate::lightmap::atlas::ids::LightTexel;
 use crate::lightmap::atlas::texels::PageArea;
 use glam::Vec3;
 use rayon::prelude::*;
-use std::sync::atomic::{AtomicU32, Ordering::Relaxed};
+use std::sync::atomic::{AtomicU64, Ordering::Relaxed};
 use std::time::{Duration, Instant};
 
 /// Side of a bin in texels. (16 is no faster: the time goes into the search for the nearest texel in the padding.)
@@ -69,24 +69,37 @@ fn overlapping(side: i32, page: u32, area: &PageArea) -> impl Iterator<Item = us
         .map(move |(i, j)| (page as usize * side as usize + j as usize) * side as usize + i as usize)
 }
 
-/// Recent time of reading a texel of the shown light, in seconds: the bits of an `f32`. Reads may run side by side.
-pub(super) struct ReadingTime(AtomicU32);
+/// Recent time of reading a texel of the shown light.
+#[derive(Default)]
+pub(super) struct ReadingTime {
+    /// Nanoseconds and texels of the reads since the last update. Reads may run side by side.
+    nanoseconds: AtomicU64,
+    texels: AtomicU64,
+    per_texel: f64,
+}
 
 impl ReadingTime {
-    pub fn new() -> ReadingTime {
-        ReadingTime(AtomicU32::new(2e-7f32.to_bits()))
+    /// Time in seconds of a texel, small rectangles included.
+    pub fn per_texel(&self) -> f64 {
+        if self.per_texel > 0.0 { self.per_texel } else { 2e-7 }
     }
 
-    pub fn per_texel(&self) -> f64 {
-        f32::from_bits(self.0.load(Relaxed)) as f64
+    /// Takes the reads since the last update into account. Slow ones count at once, fast ones by and by: time that is
+    /// kept free in vain is less harm than a frame that is late.
+    pub fn settle(&mut self) {
+        let (nanoseconds, texels) = (std::mem::take(self.nanoseconds.get_mut()), std::mem::take(self.texels.get_mut()));
+        // Of few texels the call takes longer than the texels.
+        if texels >= 1024 {
+            let (old, new) = (self.per_texel(), 1e-9 * nanoseconds as f64 / texels as f64);
+            // One read that had to wait for something says nothing about the next.
+            let new = new.min(4.0 * old);
+            self.per_texel = old + if new > old { 0.5 } else { 0.02 } * (new - old);
+        }
     }
 
     fn note(&self, texels: usize, time: Duration) {
-        // Of few texels the call takes longer than the texels.
-        if texels >= 256 {
-            let (old, new) = (self.per_texel(), time.as_secs_f64() / texels as f64);
-            self.0.store(((old + 0.1 * (new - old)) as f32).to_bits(), Relaxed);
-        }
+        self.nanoseconds.fetch_add(time.as_nanos() as u64, Relaxed);
+        self.texels.fetch_add(texels as u64, Relaxed);
     }
 }
 

@@ -114,7 +114,18 @@ impl<'a> Job<'a> {
 
     fn layout(&mut self, scene: &Arc<Scene>) -> Result<Lightmap> {
         let start = Instant::now();
-        let lightmap = self.bars.show("charts", |p| Lightmap::create(scene, &self.args.desc, p))?;
+        let desc = &self.args.desc;
+        let lightmap = match &self.args.layout {
+            Some(path) if path.exists() => self.bars.show("charts", |p| Lightmap::load_layout(scene, desc, path, p))?,
+            to => {
+                let lightmap = self.bars.show("charts", |p| Lightmap::create(scene, desc, p))?;
+                if let Some(path) = to {
+                    self.bars.show("layout", |p| lightmap.save_layout(path, p))?;
+                    self.files.push(path.clone());
+                }
+                lightmap
+            }
+        };
         self.stage("charts and texels", start).bytes = lightmap.info().bytes;
         Ok(lightmap)
     }

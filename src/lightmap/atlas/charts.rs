@@ -147,6 +147,11 @@ impl Charts {
         self.of_triangles[triangle as usize]
     }
 
+    /// Returns the chart of what may be a global triangle; `None` if there is no such triangle, or it has no chart.
+    pub(in crate::lightmap) fn find(&self, triangle: u32) -> Option<ChartId> {
+        self.of_triangles.get(triangle as usize).copied().filter(|&chart| chart != ChartId::NONE)
+    }
+
     /// Returns the global triangle numbers of a chart, ascending.
     pub fn triangles_of(&self, chart: ChartId) -> &[u32] {
         let Range { start, end } = self[chart].triangles;
@@ -160,7 +165,8 @@ impl Charts {
         (a * (1.0 - u - v) + b * u + c * v).to_array()
     }
 
-    fn assemble(scene: &Scene, pieces: Vec<Piece>, stage: &Stage) -> Result<Charts> {
+    /// Makes charts of pieces: those with given placement first, ordered by page.
+    pub(in crate::lightmap) fn assemble(scene: &Scene, pieces: Vec<Piece>, stage: &Stage) -> Result<Charts> {
         let total = scene.triangle_count() as usize;
         let mut charts = Charts {
             charts: try_with_capacity(pieces.len(), CHARTS)?,

@@ -6,6 +6,7 @@ pub(crate) mod chart_map;
 pub mod charts;
 pub(crate) mod flat_triangle;
 pub mod ids;
+pub(in crate::lightmap) mod known;
 pub mod layout;
 pub(crate) mod pieces;
 mod planar;
@@ -15,7 +16,7 @@ pub(crate) mod two_sided;
 mod unwrap;
 mod welded;
 
-use super::LightmapInfo;
+use super::{LightmapDesc, LightmapInfo};
 use crate::base::memory::Reservation;
 use crate::direct::Receiver;
 use crate::scene::Scene;
@@ -35,6 +36,9 @@ pub(crate) struct Atlas {
     pub gather: ChartMap<GatherMap>,
     pub radiance: ChartMap<RadianceMap>,
     pub padding: u32,
+    /// What the light map was created with: its description, and whether a sun or a sky shone.
+    pub(in crate::lightmap) desc: LightmapDesc,
+    pub(in crate::lightmap) is_outdoors: bool,
     pub info: LightmapInfo,
     pub seen: Seen,
     /// Whether each texel of the light map is buried, with the sample point of another one. Empty if none is.

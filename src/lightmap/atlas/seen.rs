@@ -56,7 +56,7 @@ pub(crate) struct Seen {
     /// Numbers of rays that hit the front and the back of each chart. Empty if no chart is two-sided.
     pub counts: Vec<[u32; 2]>,
     /// Whether the front and the back of each chart are hidden: hardly any ray hit them.
-    hidden: Vec<[bool; 2]>,
+    pub hidden: Vec<[bool; 2]>,
     pub places: u64,
     pub rays: u64,
 }

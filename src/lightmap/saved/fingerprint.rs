@@ -53,6 +53,15 @@ pub(super) struct Fingerprint {
     stitch: u32,
 }
 
+/// Returns the library's version, as in files.
+pub(super) fn version() -> [u8; 16] {
+    let mut version = [0; 16];
+    let text = env!("CARGO_PKG_VERSION").as_bytes();
+    let length = text.len().min(version.len());
+    version[..length].copy_from_slice(&text[..length]);
+    version
+}
+
 impl Fingerprint {
     /// Makes the fingerprint of the bake of a range of texels ((0, 0): any).
     pub fn new(atlas: &Atlas, origin: &Origin, [texel_begin, texel_end]: [u64; 2]) -> Fingerprint {
@@ -70,12 +79,8 @@ impl Fingerprint {
             texel_end: _,
             stitch,
         } = origin.params;
-        let mut version = [0; 16];
-        let text = env!("CARGO_PKG_VERSION").as_bytes();
-        let length = text.len().min(version.len());
-        version[..length].copy_from_slice(&text[..length]);
         Fingerprint {
-            version,
+            version: version(),
             is_fused: atlas.scene.device().isa().is_fused().into(),
             reserved: 0,
             geometry: geometry(&atlas.scene),
@@ -160,7 +165,8 @@ fn text_sum(values: &(impl Debug + ?Sized)) -> u32 {
     crc32fast::hash(format!("{values:?}").as_bytes())
 }
 
-fn geometry(scene: &Scene) -> u32 {
+/// Computes the checksum of all meshes but for their light map UVs.
+pub(super) fn geometry(scene: &Scene) -> u32 {
     let mut sum = crc32fast::Hasher::new();
     for mesh in scene.meshes() {
         sum.update(bytemuck::cast_slice(&mesh.positions));
@@ -176,7 +182,7 @@ fn geometry(scene: &Scene) -> u32 {
 }
 
 /// Computes the checksum of materials, textures and the images of skies.
-fn materials(scene: &Scene) -> u32 {
+pub(super) fn materials(scene: &Scene) -> u32 {
     let mut sum = crc32fast::Hasher::new();
     sum.update(&text_sum(scene.materials()).to_ne_bytes());
     for texture in scene.textures() {

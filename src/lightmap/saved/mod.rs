@@ -1,15 +1,18 @@
 //! Baked light on disk: results, which can be loaded into a light map and may be parts of a bake that several machines
-//! share, and checkpoints, from which a bake continues after its process has ended.
+//! share, and checkpoints, from which a bake continues after its process has ended. And layouts, from which a light map
+//! is made without unwrapping anew.
 //!
 //! | file | what it does |
 //! |---|---|
 //! | `records` | the container: tagged records, each with checksums |
 //! | `fingerprint` | what a file must agree with: scene, lights, layout, parameters |
+//! | `layout` | charts and texels of a light map |
 //! | `result` | saving and loading the light of a light map |
 //! | `checkpoint` | the progress of a bake: written as it goes on, read when it starts again |
 
 pub(crate) mod checkpoint;
 pub(super) mod fingerprint;
+mod layout;
 mod records;
 mod result;
 

@@ -405,3 +405,114 @@ fn a_result_with_more_light_than_can_be_is_refused() {
         assert!(matches!(load(&mut lightmap(1), &file.0), Err(Error::Io(_))), "{tag:?}");
     }
 }
+
+fn scene_of(name: &str, isa: Option<Isa>) -> std::sync::Arc<Scene> {
+    let device = Device::new(DeviceOptions { num_threads: 2, isa, ..Default::default() }).unwrap();
+    let mut data = builtin(name).unwrap();
+    data.add_light(lamp(0.5)).unwrap();
+    Scene::commit(&device, data, &BuildOptions::default(), &Progress::none()).map_err(|e| e.1).unwrap()
+}
+
+fn coarse() -> LightmapDesc {
+    LightmapDesc { texels_per_unit: 4.0, page_size: 128, ..Default::default() }
+}
+
+#[test]
+fn a_layout_comes_back_with_all_its_bits() {
+    for name in ["cornell", "atrium"] {
+        let scene = scene_of(name, None);
+        let desc = LightmapDesc { texels_per_unit: if name == "cornell" { 40.0 } else { 4.0 }, ..coarse() };
+        let made = Lightmap::create(&scene, &desc, &Progress::none()).unwrap();
+        let place = Place::new();
+        made.save_layout(&place.0, &Progress::none()).unwrap();
+        let loaded = Lightmap::load_layout(&scene, &desc, &place.0, &Progress::none()).unwrap();
+        let (a, b) = (made.atlas(), loaded.atlas());
+        assert_eq!(a.charts, b.charts, "{name}");
+        for (a, b) in [(&a.map, &b.map), (&a.gather, &b.gather), (&a.radiance, &b.radiance)] {
+            assert_eq!(a.layout, b.layout, "{name}");
+            assert!(a.texels.samples == b.texels.samples && a.texels.chart_start == b.texels.chart_start, "{name}");
+        }
+        assert!(a.buried == b.buried && a.seen.counts == b.seen.counts && a.seen.hidden == b.seen.hidden, "{name}");
+        assert!(a.buried.iter().any(|&b| b), "{name} has no buried texels to test");
+        let numbers = |l: &Lightmap| {
+            let mut info = l.info();
+            (info.unwrap_seconds, info.uvs.seconds) = (0.0, 0.0);
+            format!("{info:?}")
+        };
+        assert_eq!(numbers(&made), numbers(&loaded), "{name}");
+        let again = Place::new();
+        loaded.save_layout(&again.0, &Progress::none()).unwrap();
+        assert!(place.bytes() == again.bytes(), "{name}");
+    }
+}
+
+#[test]
+fn a_layout_of_something_else_is_refused_by_name() {
+    let (scene, place) = (scene_of("cornell", None), Place::new());
+    let desc = LightmapDesc { texels_per_unit: 20.0, ..coarse() };
+    Lightmap::create(&scene, &desc, &Progress::none()).unwrap().save_layout(&place.0, &Progress::none()).unwrap();
+    let refused = |scene: &std::sync::Arc<Scene>, desc: &LightmapDesc, differences: &str| match Lightmap::load_layout(
+        scene,
+        desc,
+        &place.0,
+        &Progress::none(),
+    ) {
+        Err(Error::InvalidArgument(text)) => assert!(text.ends_with(differences), "{text}"),
+        Err(e) => panic!("{e}"),
+        Ok(_) => panic!("{differences}: not refused"),
+    };
+    refused(&scene, &LightmapDesc { padding: 3, ..desc }, "differs in padding (2, here 3)");
+    refused(&scene_of("atrium", None), &desc, "differs in the scene's geometry, the scene's materials");
+    let sun = Light::Directional { direction: glam::Vec3::NEG_Y, irradiance: [1.0; 3], angular_radius: 0.0 };
+    scene.set_light(1, sun).unwrap();
+    refused(&scene, &desc, "differs in whether a sun or a sky shines");
+    scene.set_light(1, lamp(0.1)).unwrap();
+    Lightmap::load_layout(&scene, &desc, &place.0, &Progress::none()).unwrap();
+    let result = Lightmap::load_layout(&scene, &desc, &place.0, &Progress::new(|_, _| false));
+    assert!(matches!(result, Err(Error::Cancelled)));
+    let other = lightmap(1);
+    std::fs::write(&place.0, b"BKLIGHT0").unwrap();
+    assert!(matches!(
+        Lightmap::load_layout(other.scene(), &desc, &place.0, &Progress::none()),
+        Err(Error::Io(text)) if text.contains("is no layout of a light map")
+    ));
+}
+
+/// With right checksums, too, no number leads out of a buffer: each file is refused, or a light map that can be read.
+#[test]
+fn damaged_layouts_are_refused_or_harmless() {
+    let (scene, place) = (scene_of("cornell", None), Place::new());
+    let desc = LightmapDesc { texels_per_unit: 20.0, ..coarse() };
+    Lightmap::create(&scene, &desc, &Progress::none()).unwrap().save_layout(&place.0, &Progress::none()).unwrap();
+    let bytes = place.bytes();
+    let load = |bytes: &[u8]| Lightmap::load_layout(&scene, &desc, &Place::of(bytes).0, &Progress::none());
+    for i in 0..200 {
+        let mut flipped = bytes.clone();
+        flipped[i * bytes.len() / 200] ^= 1 << (i % 8);
+        assert!(matches!(load(&flipped), Err(Error::Io(_))), "{i}");
+        assert!(load(&bytes[..i * bytes.len() / 200]).is_err());
+    }
+    let mut records = Records::new(&bytes[records::MAGIC.len()..], bytes.len() as u64);
+    let mut all = Vec::new();
+    while let Next::Record(tag, content) = records.next().unwrap() {
+        all.push((tag, content));
+    }
+    let mut refusals = 0;
+    for i in 0..1000u32 {
+        let random = |n: u32, below: usize| (crate::base::sampling::mix(4 * i + n) as usize) % below;
+        let mut changed = all.clone();
+        let (_, content) = &mut changed[random(0, all.len() - 1)];
+        let at = random(1, content.len() / 4) * 4;
+        let extremes = [0, 1, u32::MAX, f32::NAN.to_bits(), f32::MAX.to_bits(), 1 << random(3, 32)];
+        content[at..at + 4].copy_from_slice(&extremes[random(2, extremes.len())].to_ne_bytes());
+        let mut file = records::MAGIC.to_vec();
+        changed.iter().for_each(|(tag, content)| records::append(&mut file, *tag, &[content]).unwrap());
+        match load(&file) {
+            Err(e) => {
+                refusals += usize::from(matches!(e, Error::Io(_) | Error::InvalidArgument(_) | Error::OutOfMemory(_)))
+            }
+            Ok(lightmap) => drop((0..lightmap.info().page_count).map(|p| lightmap.read(p, Layer::Position)).last()),
+        }
+    }
+    assert!(refusals > 500, "{refusals}");
+}

@@ -210,6 +210,9 @@ pub struct LightmapFlags {
     #[arg(long, value_name = "N", default_value_t = LightmapDesc::default().padding,
           value_parser = of(|d: &mut LightmapDesc, v| d.padding = v))]
     pub padding: u32,
+    /// Charts and texels from this file; if it does not exist, they are found and written to it
+    #[arg(long, value_name = "FILE")]
+    pub layout: Option<PathBuf>,
     /// Light map texels per gather map texel and axis
     #[arg(long, value_name = "N", default_value_t = LightmapDesc::default().gather_divisor,
           value_parser = of(|d: &mut LightmapDesc, v| d.gather_divisor = v))]
