@@ -1484,6 +1484,60 @@ bk_result bk_lightmap_create(const bk_scene *scene,
                              void *user,
                              bk_lightmap **out);
 
+/// Saves charts and texels of a light map, but no light, to be loaded by bk_lightmap_load_layout
+/// where the same scene is lit again.
+///
+/// Experimental: another version of the library may refuse the file.
+///
+/// Cost: a part of a second for a million texels.
+///
+/// @param lightmap  light map, baked or not
+/// @param path  name of the file, which is replaced as a whole or not at all; UTF-8
+/// @param progress,user  progress callback and its pointer; may be NULL
+/// @retval BK_ERROR_INVALID_STATE  the light map is being baked
+/// @retval BK_ERROR_OUT_OF_MEMORY  a buffer does not fit
+/// @retval BK_ERROR_IO  the file cannot be written; bk_last_error names it
+/// @retval BK_ERROR_CANCELLED  the progress callback returned 0
+BK_EXPERIMENTAL
+bk_result bk_lightmap_save_layout(const bk_lightmap *lightmap,
+                                  const char *path,
+                                  bk_progress_fn progress,
+                                  void *user);
+
+/// Creates the light map whose layout bk_lightmap_save_layout wrote, as bk_lightmap_create would,
+/// with the same bits, without unwrapping.
+///
+/// If the file is refused, create the light map anew and save its layout.
+///
+/// Files from untrusted sources are safe to load: every number is checked. Charts may lie anywhere
+/// on their pages, though.
+///
+/// Experimental: another version of the library may refuse the file.
+///
+/// Cost: a part of a second for a million triangles.
+///
+/// @param scene  committed scene, kept alive by the light map
+/// @param desc  parameters with which the light map was created; NULL for the defaults
+/// @param path  name of the file; UTF-8
+/// @param progress,user  progress callback and its pointer; may be NULL
+/// @param out  receives the light map, which the caller releases with bk_lightmap_release; NULL on
+///   failure
+/// @retval BK_ERROR_INVALID_ARGUMENT  a field of `desc` is out of its range, or the file is of another
+///   scene, other parameters, another version of the library or instruction set (AVX2 and AVX-512
+///   count as one), or with sun or sky instead of without; bk_last_error says which
+/// @retval BK_ERROR_INVALID_STATE  the scene is not committed or is being refitted
+/// @retval BK_ERROR_IO  the file cannot be read, is damaged, or is another kind of file;
+///   bk_last_error names it
+/// @retval BK_ERROR_OUT_OF_MEMORY  the light map does not fit or the memory callback refuses
+/// @retval BK_ERROR_CANCELLED  the progress callback returned 0
+BK_EXPERIMENTAL
+bk_result bk_lightmap_load_layout(const bk_scene *scene,
+                                  const bk_lightmap_desc *desc,
+                                  const char *path,
+                                  bk_progress_fn progress,
+                                  void *user,
+                                  bk_lightmap **out);
+
 /// Adds one reference.
 ///
 /// @param lightmap  NULL is ignored

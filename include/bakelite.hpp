@@ -467,6 +467,19 @@ public:
         Lightmap map(out);
         return detail::finish(progress.after(code), std::move(map));
     }
+    /// The light map whose layout was saved: as from `create`, without unwrapping.
+    static Result<Lightmap> load_layout(const Scene &scene, const std::string &path, const LightmapDesc &desc = {},
+                                        const Progress &progress = {}) {
+        bk_lightmap *out = nullptr;
+        const bk_result code =
+            bk_lightmap_load_layout(scene.get(), &desc, path.c_str(), progress.function(), progress.user(), &out);
+        Lightmap map(out);
+        return detail::finish(progress.after(code), std::move(map));
+    }
+    Result<void> save_layout(const std::string &path, const Progress &progress = {}) const {
+        return detail::finish(
+            progress.after(bk_lightmap_save_layout(get(), path.c_str(), progress.function(), progress.user())));
+    }
     Result<LightmapInfo> info() const {
         LightmapInfo info;
         return detail::finish(bk_lightmap_get_info(get(), &info), info);

@@ -205,6 +205,44 @@ static int32_t cancel(void *user, float fraction, const char *stage) {
     return 0;
 }
 
+static void layouts_come_back(bk_device *device, const char *folder) {
+    bk_scene *scene = room(device, 0.75f), *darker = room(device, 0.5f);
+    bk_lightmap *made = lightmap_of(scene, 2), *loaded = NULL;
+    bk_bake_params params = quick();
+    const bk_result refused = BK_ERROR_INVALID_ARGUMENT;
+    bk_lightmap_desc desc;
+    char path[1024];
+    FILE *file;
+
+    bk_lightmap_desc_init(&desc);
+    desc.page_size = PAGE;
+    desc.padding = 2;
+    snprintf(path, sizeof path, "%slayout", folder);
+    CHECK_OK(bk_lightmap_save_layout(made, path, NULL, NULL));
+    CHECK_OK(bk_lightmap_load_layout(scene, &desc, path, NULL, NULL, &loaded));
+    CHECK_OK(bk_bake(made, &params, NULL, NULL, NULL));
+    CHECK_OK(bk_bake(loaded, &params, NULL, NULL, NULL));
+    CHECK(same_light(made, loaded));
+    bk_lightmap_release(loaded);
+
+    CHECK_ERROR(bk_lightmap_save_layout(NULL, path, NULL, NULL), refused, "lightmap is NULL");
+    CHECK_ERROR(bk_lightmap_save_layout(made, NULL, NULL, NULL), refused, "path is NULL");
+    CHECK_ERROR(bk_lightmap_load_layout(NULL, &desc, path, NULL, NULL, &loaded), refused, "scene is NULL");
+    CHECK_ERROR(bk_lightmap_load_layout(scene, &desc, path, NULL, NULL, NULL), refused, "out is NULL");
+    CHECK_ERROR(bk_lightmap_load_layout(scene, &desc, NULL, NULL, NULL, &loaded), refused, "path is NULL");
+    CHECK(loaded == NULL);
+    CHECK_ERROR(bk_lightmap_load_layout(scene, NULL, path, NULL, NULL, &loaded), refused, "page_size");
+    CHECK_ERROR(bk_lightmap_load_layout(darker, &desc, path, NULL, NULL, &loaded), refused, "the scene's materials");
+    CHECK_ERROR(bk_lightmap_load_layout(scene, &desc, path, cancel, NULL, &loaded), BK_ERROR_CANCELLED, "");
+    file = fopen(path, "r+b");
+    CHECK(file != NULL && fseek(file, 300, SEEK_SET) == 0 && fputs("damage", file) >= 0);
+    if (file) fclose(file);
+    CHECK_ERROR(bk_lightmap_load_layout(scene, &desc, path, NULL, NULL, &loaded), BK_ERROR_IO, "is damaged");
+    bk_lightmap_release(made);
+    bk_scene_release(scene);
+    bk_scene_release(darker);
+}
+
 static void shards_come_back_as_one_bake(bk_device *device, const char *folder) {
     bk_scene *scene = room(device, 0.75f), *darker = room(device, 0.5f);
     bk_lightmap *whole = lightmap_of(scene, 2), *shard = lightmap_of(scene, 2), *all = lightmap_of(scene, 2);
@@ -297,6 +335,7 @@ int main(int argc, char **argv) {
     CHECK_OK(bk_device_create(NULL, &device));
     edges_of_given_charts_are_not_dark(device);
     validity_tells_covered_filled_and_empty(device);
+    layouts_come_back(device, argv[1]);
     shards_come_back_as_one_bake(device, argv[1]);
     a_cancelled_bake_goes_on_from_its_checkpoint(device, argv[1]);
     bk_device_release(device);

@@ -182,10 +182,11 @@ void LiveLight::switch_light() {
     check(bk_live_light_changed(live.get(), first_light));
 }
 
-bk_live_stats LiveLight::update(const bk_camera &camera, float milliseconds) {
+bk_live_stats LiveLight::update(const bk_camera &camera, float milliseconds, uint64_t max_dirty_bytes) {
     bk_budget budget;
     bk_budget_init(&budget);
     budget.milliseconds = mode == Mode::off ? 0 : milliseconds; // 0, and no number of rays: nothing is traced
+    budget.max_dirty_bytes = max_dirty_bytes;
     bk_live_stats stats;
     bk_live_stats_init(&stats);
     check(bk_live_update(live.get(), &camera, &budget, &stats));

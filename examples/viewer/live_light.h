@@ -46,7 +46,8 @@ public:
     void switch_light();
     bool is_switched_off() const { return switched_off; }
     // Makes the light map better, where this camera makes worthwhile, for about so long.
-    bk_live_stats update(const bk_camera &camera, float milliseconds);
+    // At most so many bytes of texels are to be uploaded afterwards; 0: any number.
+    bk_live_stats update(const bk_camera &camera, float milliseconds, uint64_t max_dirty_bytes);
     // What of the light map is another than at the last call: use() gets rectangles and their texels,
     // four half floats each. Without `direct`, only light that came by way of other surfaces. After about
     // so many milliseconds the rest is left to the next call.

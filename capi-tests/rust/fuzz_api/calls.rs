@@ -562,9 +562,17 @@ fn lightmap(w: &W, s: &mut Source) {
     }
     let mut out = std::ptr::dangling_mut();
     let watched = Watched::new(w, s);
-    let result = ask!(bk_lightmap_create(scene.p(), &desc, Some(progress), watched.user(), &mut out));
-    watched.end("bk_lightmap_create", result);
-    check_created("bk_lightmap_create", result, out.cast());
+    let (name, result) = if s.one_in(4) {
+        let from = path(w, s, "layout");
+        let result =
+            ask!(bk_lightmap_load_layout(scene.p(), &desc, from.as_ptr(), Some(progress), watched.user(), &mut out));
+        ("bk_lightmap_load_layout", result)
+    } else {
+        let result = ask!(bk_lightmap_create(scene.p(), &desc, Some(progress), watched.user(), &mut out));
+        ("bk_lightmap_create", result)
+    };
+    watched.end(name, result);
+    check_created(name, result, out.cast());
     if result == BK_OK {
         w.add(Handle::new(out, Kind::Lightmap, scene.life()));
     }
@@ -709,7 +717,11 @@ fn save(w: &W, s: &mut Source) {
     };
     let format = if s.one_in(6) { s.integer() } else { 1 + s.below(3) as u32 };
     let watched = Watched::new(w, s);
-    let result = match s.below(3) {
+    let result = match s.below(4) {
+        3 => {
+            let to = path(w, s, "layout");
+            ask!(bk_lightmap_save_layout(lightmap.p(), to.as_ptr(), Some(progress), watched.user()))
+        }
         0 => ask!(bk_lightmap_save(lightmap.p(), prefix.as_ptr(), format, Some(progress), watched.user())),
         1 => {
             let to = path(w, s, "result");

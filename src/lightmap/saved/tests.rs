@@ -462,7 +462,7 @@ fn a_layout_of_something_else_is_refused_by_name() {
         Ok(_) => panic!("{differences}: not refused"),
     };
     refused(&scene, &LightmapDesc { padding: 3, ..desc }, "differs in padding (2, here 3)");
-    refused(&scene_of("atrium", None), &desc, "differs in the scene's geometry, the scene's materials");
+    refused(&scene_of("atrium", None), &desc, "the scene's geometry, the light map UVs, the scene's materials");
     let sun = Light::Directional { direction: glam::Vec3::NEG_Y, irradiance: [1.0; 3], angular_radius: 0.0 };
     scene.set_light(1, sun).unwrap();
     refused(&scene, &desc, "differs in whether a sun or a sky shines");
