@@ -299,8 +299,8 @@ pub struct Walk {
     pub threads: usize,
     pub budget_ms: f32,
     pub dirty_kb: u32,
-    /// Creating the live object, in seconds.
-    pub create_seconds: f64,
+    /// Creating the live object: stages with their seconds.
+    pub create: Vec<(String, f64)>,
     pub frames: Vec<Frame>,
     /// The longest call of `light_changed`.
     pub change_ms: f64,
@@ -320,6 +320,21 @@ fn walked(camera: &LiveCamera, radius: f32, i: u32) -> LiveCamera {
     }
 }
 
+/// Creates a live object; returns it with the stages of that and their seconds.
+fn create(lightmap: &Lightmap, params: &LiveParams) -> Result<(Live, Vec<(String, f64)>)> {
+    let mut stages: Vec<(String, Instant)> = Vec::new();
+    let note = |_: f32, name: &str| {
+        if stages.last().is_none_or(|s| s.0 != name) {
+            stages.push((name.to_owned(), Instant::now()));
+        }
+        true
+    };
+    let live = Live::new(lightmap, params, &Progress::new(note))?;
+    let ends = stages.iter().skip(1).map(|s| s.1).chain([Instant::now()]).collect::<Vec<_>>();
+    let seconds = |(s, end): (&(String, Instant), Instant)| (s.0.clone(), (end - s.1).as_secs_f64());
+    Ok((live, stages.iter().zip(ends).map(seconds).collect()))
+}
+
 /// Walks through the scene with one budget, of milliseconds and of KB to be read (0: no limit), in frames of `frame_ms`.
 /// `params` should ask for
 /// so many rounds that work remains; lights that change see to that too.
@@ -333,11 +348,9 @@ pub fn walk(
 ) -> Result<Walk> {
     let scene = lightmap.scene();
     let radius = 0.01 * scene.diagonal();
-    let start = Instant::now();
-    let mut live = Live::new(lightmap, params, &Progress::none())?;
-    let create_seconds = start.elapsed().as_secs_f64();
+    let (mut live, create) = create(lightmap, params)?;
     let threads = scene.device().num_threads();
-    let mut walk = Walk { threads, budget_ms, dirty_kb, create_seconds, frames: Vec::new(), change_ms: 0.0 };
+    let mut walk = Walk { threads, budget_ms, dirty_kb, create, frames: Vec::new(), change_ms: 0.0 };
     let mut next_frame = Instant::now();
     for i in 0..updates {
         std::thread::sleep(next_frame.saturating_duration_since(Instant::now()));

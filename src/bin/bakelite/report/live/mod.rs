@@ -306,7 +306,7 @@ fn first_light(out: &mut String, measured: &Measured) {
     };
     measured.stages.iter().for_each(|s| row(s.name, s.seconds));
     if let Some(walk) = measured.walks.first() {
-        row("photons, radiance map, lowest level of detail", walk.create_seconds);
+        walk.create.iter().for_each(|(name, seconds)| row(name, *seconds));
         if let Some(frame) = walk.frames.first() {
             row("first update and reading", 1e-3 * (frame.used_ms + frame.read_ms));
         }
