@@ -303,7 +303,7 @@ fn read(scene: &Scene, desc: &LightmapDesc, path: &Path, progress: &Progress) ->
 /// Appends the items of a record; returns their number, `None` if there are more than `all` then.
 fn append<T: Pod>(content: &[u8], all: u64, items: &mut Vec<T>) -> Result<Option<usize>> {
     let count = content.len() / size_of::<T>();
-    if content.len() % size_of::<T>() != 0 || count > RUN || (items.len() + count) as u64 > all {
+    if !content.len().is_multiple_of(size_of::<T>()) || count > RUN || (items.len() + count) as u64 > all {
         return Ok(None);
     }
     for item in content.chunks_exact(size_of::<T>()) {
