@@ -13,7 +13,7 @@ use super::layout::SAH_DEPTH;
 use super::partings::{best_parting, halve, leaf_cost, part_few};
 use super::references::{Box4, Extent, Range4, Reference, References, area_scale};
 use crate::base::error::Result;
-use crate::base::memory::{try_zeroed, try_zeroed_as_needed};
+use crate::base::memory::{try_collect, try_par_collect, try_push, try_zeroed, try_zeroed_as_needed};
 use crate::base::progress::Progress;
 #[cfg(target_arch = "x86_64")]
 use crate::simd::Isa;
@@ -23,6 +23,9 @@ use rayon::prelude::*;
 /// Subtrees of more triangles than this are built as separate tasks.
 pub(super) const PARALLEL_SUBTREE: usize = 4096;
 
+/// Name of these buffers in error messages.
+const TREE: &str = "the binary tree";
+
 /// Number of references that are partitioned at a time, so that those in between stay in the cache.
 const BLOCK: usize = 1 << 10;
 
@@ -31,43 +34,56 @@ type Scratch = Box<[Reference; BLOCK]>;
 
 /// Moves the references left of a split, `middle` in number, before the others. Returns the bounds of the centres of
 /// both sides.
-fn partition(refs: &mut [Reference], middle: usize, map: &BinMap, split: &Split, scratch: &mut Scratch) -> [Range4; 2] {
-    let join = |[a, b]: [Range4; 2], [c, d]: [Range4; 2]| [a.join(c), b.join(d)];
+fn partition(
+    refs: &mut [Reference],
+    middle: usize,
+    map: &BinMap,
+    split: &Split,
+    scratch: &mut Scratch,
+) -> Result<[Range4; 2]> {
     if refs.len() <= BLOCK {
-        return partition_block(refs, map, split, scratch).1;
+        return Ok(partition_block(refs, map, split, scratch).1);
     }
     // First within blocks, then between them.
-    let (counts, ranges): (Vec<usize>, Vec<[Range4; 2]>) = if in_parallel(refs.len()) {
+    let parted = if in_parallel(refs.len()) {
         let blocks = refs.par_chunks_mut(BLOCK).with_min_len(BLOCKS_PER_THREAD);
         let new_scratch = || on_heap(Reference::default());
-        blocks.map_init(new_scratch, |scratch, block| partition_block(block, map, split, scratch)).unzip()
+        try_par_collect(
+            blocks.map_init(new_scratch, |scratch, block| partition_block(block, map, split, scratch)),
+            TREE,
+        )?
     } else {
-        refs.chunks_mut(BLOCK).map(|block| partition_block(block, map, split, scratch)).unzip()
+        try_collect(refs.chunks_mut(BLOCK).map(|block| partition_block(block, map, split, scratch)), TREE)?
     };
-    swap_misplaced(refs, middle, &counts);
-    ranges.into_iter().fold([Range4::EMPTY; 2], join)
+    swap_misplaced(refs, middle, &parted)?;
+    Ok(parted.iter().fold([Range4::EMPTY; 2], |[a, b], &(_, [c, d])| [a.join(c), b.join(d)]))
 }
 
 /// Number of blocks that a thread takes at a time.
 const BLOCKS_PER_THREAD: usize = 8;
 
-/// Swaps the right references below `middle` with the left ones above, given the number of left ones in each block,
-/// which come first in it. There are equally many.
-fn swap_misplaced(refs: &mut [Reference], middle: usize, counts: &[usize]) {
+/// Swaps the right references below `middle` with the left ones above, given what [`partition_block`] returned for each
+/// block. There are equally many.
+fn swap_misplaced(refs: &mut [Reference], middle: usize, parted: &[(usize, [Range4; 2])]) -> Result<()> {
     let parallel = in_parallel(refs.len());
     let (low, high) = refs.split_at_mut(middle);
     let (mut low, mut high) = (Runs::new(low, 0), Runs::new(high, middle));
     let mut pairs = Vec::new();
     let (mut rights, mut lefts) = (Default::default(), Default::default());
-    let mut from_low = counts.iter().enumerate().map(|(i, &n)| i * BLOCK + n..(i + 1) * BLOCK);
-    let mut from_high = counts.iter().enumerate().map(|(i, &n)| i * BLOCK..i * BLOCK + n);
+    let mut from_low = parted.iter().enumerate().map(|(i, &(n, _))| i * BLOCK + n..(i + 1) * BLOCK);
+    let mut from_high = parted.iter().enumerate().map(|(i, &(n, _))| i * BLOCK..i * BLOCK + n);
     while let (Some(a), Some(b)) = (low.next(&mut rights, &mut from_low), high.next(&mut lefts, &mut from_high)) {
         let n = a.len().min(b.len());
         let ((a, rest_a), (b, rest_b)) = (a.split_at_mut(n), b.split_at_mut(n));
         (rights, lefts) = (rest_a, rest_b);
-        if parallel { pairs.push((a, b)) } else { a.swap_with_slice(b) }
+        if parallel {
+            try_push(&mut pairs, (a, b), TREE)?;
+        } else {
+            a.swap_with_slice(b);
+        }
     }
     pairs.into_par_iter().with_min_len(BLOCKS_PER_THREAD).for_each(|(a, b)| a.swap_with_slice(b));
+    Ok(())
 }
 
 /// What is left of one side of a range, whose misplaced runs are taken off in order.
@@ -224,10 +240,17 @@ struct Builder<'a, 'p> {
 
 impl Builder<'_, '_> {
     /// Builds the subtree over `refs`.
-    fn build(&self, refs: &mut [Reference], slots: &mut Slots, extent: Extent, depth: usize, work: &mut Work) {
+    fn build(
+        &self,
+        refs: &mut [Reference],
+        slots: &mut Slots,
+        extent: Extent,
+        depth: usize,
+        work: &mut Work,
+    ) -> Result<()> {
         let n = refs.len();
         if n == 1 {
-            return slots.leaf(refs, &extent.boxes);
+            return Ok(slots.leaf(refs, &extent.boxes));
         }
         let may_be_leaf = n <= self.options.max_leaf as usize;
         if n <= 4 && depth < SAH_DEPTH {
@@ -239,30 +262,37 @@ impl Builder<'_, '_> {
             work.bins.fill(refs, &map);
             if let Some(split) = work.bins.best_split(&map, scale) {
                 if may_be_leaf && leaf_cost(&extent.boxes, scale, n) <= split.cost {
-                    return slots.leaf(refs, &extent.boxes);
+                    return Ok(slots.leaf(refs, &extent.boxes));
                 }
                 let (middle, boxes) = work.bins.sides(&map, &split);
-                let centres = partition(refs, middle, &map, &split, &mut work.scratch);
+                let centres = partition(refs, middle, &map, &split, &mut work.scratch)?;
                 let extents = [0, 1].map(|i| Extent { boxes: boxes[i], centres: centres[i] });
                 return self.children(refs, slots, extent, extents, middle, depth, work);
             }
         }
         if may_be_leaf {
-            return slots.leaf(refs, &extent.boxes);
+            return Ok(slots.leaf(refs, &extent.boxes));
         }
         // All centres are equal, or the node is too deep.
         let middle = halve(refs, &extent);
         let extents = [Extent::of(&refs[..middle]), Extent::of(&refs[middle..])];
-        self.children(refs, slots, extent, extents, middle, depth, work);
+        self.children(refs, slots, extent, extents, middle, depth, work)
     }
 
     /// Builds the subtree over two to four triangles by trying every partition.
-    fn few(&self, refs: &mut [Reference], slots: &mut Slots, extent: Extent, depth: usize, work: &mut Work) {
+    fn few(
+        &self,
+        refs: &mut [Reference],
+        slots: &mut Slots,
+        extent: Extent,
+        depth: usize,
+        work: &mut Work,
+    ) -> Result<()> {
         sort_few(refs);
         let scale = area_scale(&extent.boxes);
         let (cost, parting) = best_parting(refs, scale);
         if refs.len() <= self.options.max_leaf as usize && leaf_cost(&extent.boxes, scale, refs.len()) <= cost {
-            return slots.leaf(refs, &extent.boxes);
+            return Ok(slots.leaf(refs, &extent.boxes));
         }
         let middle = part_few(refs, parting);
         // The centres of so few are not needed, unless the node is too deep.
@@ -270,7 +300,7 @@ impl Builder<'_, '_> {
             let boxes = refs.iter().fold(Box4::EMPTY, |b, r| b.join(r.0));
             Extent { boxes, centres: extent.centres }
         });
-        self.children(refs, slots, extent, extents, middle, depth, work);
+        self.children(refs, slots, extent, extents, middle, depth, work)
     }
 
     /// Builds an inner node and its children, over the first `middle` of `refs` and the others.
@@ -283,22 +313,25 @@ impl Builder<'_, '_> {
         middle: usize,
         depth: usize,
         work: &mut Work,
-    ) {
+    ) -> Result<()> {
         let parallel = refs.len() > PARALLEL_SUBTREE;
         let (left_refs, right_refs) = refs.split_at_mut(middle);
         let node = slots.node(&extent.boxes, 0, 0);
         if !parallel {
-            self.build(left_refs, slots, left_extent, depth + 1, work);
+            self.build(left_refs, slots, left_extent, depth + 1, work)?;
             slots.nodes[node].index = slots.base + slots.used as u32;
-            self.build(right_refs, slots, right_extent, depth + 1, work);
-        } else if !self.progress.is_cancelled() {
+            return self.build(right_refs, slots, right_extent, depth + 1, work);
+        }
+        if !self.progress.is_cancelled() {
             slots.nodes[node].index = slots.base + 2 * middle as u32;
             let [mut left, mut right] = slots.split(middle);
-            rayon::join(
+            let (left, right) = rayon::join(
                 || self.build(left_refs, &mut left, left_extent, depth + 1, work),
                 || self.build(right_refs, &mut right, right_extent, depth + 1, &mut Work::new()),
             );
+            left.and(right)?;
         }
+        Ok(())
     }
 }
 
@@ -328,10 +361,10 @@ impl BinaryBvh {
     pub(super) fn of(references: References, options: &BuildOptions, progress: &Progress) -> Result<BinaryBvh> {
         let References { mut refs, extent } = references;
         let n = refs.len();
-        let mut nodes = try_zeroed_as_needed::<BinaryNode>(2 * n - 1, "the binary tree")?;
-        let mut triangles = try_zeroed::<u32>(n, "the binary tree")?;
+        let mut nodes = try_zeroed_as_needed::<BinaryNode>(2 * n - 1, TREE)?;
+        let mut triangles = try_zeroed::<u32>(n, TREE)?;
         let mut slots = Slots { nodes: &mut nodes, base: 0, used: 0, triangles: &mut triangles, first: 0, filled: 0 };
-        Builder { options, progress }.build(&mut refs, &mut slots, extent, 0, &mut Work::new());
+        Builder { options, progress }.build(&mut refs, &mut slots, extent, 0, &mut Work::new())?;
         progress.check()?;
         Ok(BinaryBvh { nodes, triangles })
     }

@@ -13,7 +13,7 @@ use super::light_node::Bounds;
 use super::light_tree::{LIGHT_TREE, LightTree};
 use super::point_light::point_light;
 use super::receiver::Receiver;
-use super::shadow_rays::{ShadowRays, shadow_ray};
+use super::shadow_rays::{Candidate, Choice, ShadowRays, shadow_ray};
 use crate::base::error::Result;
 use crate::base::memory::try_collect;
 use crate::base::sampling::{combine, sobol_2d};
@@ -64,12 +64,6 @@ pub(crate) struct ManyLights {
     tree: LightTree,
 }
 
-/// A point on a light, and its unoccluded light divided by the probability of the candidate.
-struct Candidate {
-    target: Vec3,
-    light: Vec3,
-}
-
 impl ManyLights {
     /// Makes the set of point and spot lights that shine, and of area lights.
     pub(crate) fn new(isa: Isa, points: &[Light], areas: &[AreaLight]) -> Result<ManyLights> {
@@ -98,32 +92,20 @@ impl ManyLights {
     /// Pushes up to `n` shadow rays, whose sum is the irradiance without bias. Returns the unoccluded irradiance by the
     /// same samples, summed over the channels.
     pub(crate) fn push(&self, receiver: &Receiver, n: u32, seed: u32, shadow: &mut ShadowRays) -> f32 {
-        let candidates = self.candidates(receiver, n * CANDIDATES, seed);
-        let total: f32 = candidates.iter().map(|c| c.light.element_sum()).sum();
-        if !(total > 0.0 && total.is_finite()) {
-            return 0.0;
-        }
-        let mut at = sobol_2d(0, combine(seed, 3))[0] - 1.0;
-        for c in &candidates {
-            let due = c.light.element_sum() / total * n as f32;
-            at += due;
-            if due >= 1.0 {
-                shadow.push(shadow_ray(receiver, c.target), c.light);
-                // The share beyond whole rays does not shift the others' probabilities.
-                at -= due;
-            } else if at >= 0.0 {
-                shadow.push(shadow_ray(receiver, c.target), c.light / due);
-                at -= 1.0;
-            }
-        }
+        let mut choice = std::mem::take(shadow.choice);
+        self.find_candidates(receiver, n * CANDIDATES, seed, &mut choice);
+        let total = push_some(receiver, n, seed, &choice.candidates, shadow);
+        *shadow.choice = choice;
         total
     }
 
-    fn candidates(&self, receiver: &Receiver, n: u32, seed: u32) -> Vec<Candidate> {
-        let mut candidates = Vec::with_capacity(n as usize);
+    /// Finds `n` candidates at most.
+    fn find_candidates(&self, receiver: &Receiver, n: u32, seed: u32, choice: &mut Choice) {
+        let Choice { descent, candidates } = choice;
+        candidates.clear();
         let offset = sobol_2d(0, combine(seed, 1))[0];
         let mut next = 0;
-        self.tree.sample((receiver.origin, receiver.normal), n, offset, |light, due, count| {
+        self.tree.sample((receiver.origin, receiver.normal), n, offset, descent, |light, due, count| {
             // A light that is due several candidates gets that number rounded down or up and divides its light among
             // them.
             let share = 1.0 / if due >= 1.0 { count as f32 } else { due };
@@ -150,8 +132,29 @@ impl ManyLights {
                 }
             }
         });
-        candidates
     }
+}
+
+/// Pushes the shadow rays to about `n` of some candidates, systematically, and returns the light of all.
+fn push_some(receiver: &Receiver, n: u32, seed: u32, candidates: &[Candidate], shadow: &mut ShadowRays) -> f32 {
+    let total: f32 = candidates.iter().map(|c| c.light.element_sum()).sum();
+    if !(total > 0.0 && total.is_finite()) {
+        return 0.0;
+    }
+    let mut at = sobol_2d(0, combine(seed, 3))[0] - 1.0;
+    for c in candidates {
+        let due = c.light.element_sum() / total * n as f32;
+        at += due;
+        if due >= 1.0 {
+            shadow.push(shadow_ray(receiver, c.target), c.light);
+            // The share beyond whole rays does not shift the others' probabilities.
+            at -= due;
+        } else if at >= 0.0 {
+            shadow.push(shadow_ray(receiver, c.target), c.light / due);
+            at -= 1.0;
+        }
+    }
+    total
 }
 
 fn bounds(source: &Source) -> Bounds {

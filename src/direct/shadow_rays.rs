@@ -3,6 +3,7 @@
 //! Those of a tile of texels go down the tree as a [stream](crate::trace). The light that arrives is added up per slot in
 //! the order of the rays, whatever is traced together: a point has the same bits alone and in a tile.
 
+use super::light_tree::Descent;
 use super::receiver::Receiver;
 use crate::base::error::Result;
 use crate::base::memory::try_filled;
@@ -37,12 +38,26 @@ pub(crate) struct Carried {
     slot: u32,
 }
 
+/// A point on a light that may get a shadow ray, and its unoccluded light divided by the probability of the candidate.
+pub(crate) struct Candidate {
+    pub(crate) target: Vec3,
+    pub(crate) light: Vec3,
+}
+
+/// Lists by which shadow rays are chosen among many lights, which keep their room for the next point.
+#[derive(Default)]
+pub(crate) struct Choice {
+    pub(crate) descent: Descent,
+    pub(crate) candidates: Vec<Candidate>,
+}
+
 /// Room for the shadow rays of points: in arrays on the stack for one point, in vectors for tiles.
 pub(crate) struct Room<R, C, O, V> {
     rays: R,
     carried: C,
     occluded: O,
     visible: V,
+    choice: Choice,
 }
 
 /// Room for one point.
@@ -60,6 +75,7 @@ impl PointRoom {
             carried: [Carried::default(); TOGETHER],
             occluded: [0; TOGETHER],
             visible: [Vec3::ZERO; KINDS],
+            choice: Choice::default(),
         }
     }
 }
@@ -74,6 +90,7 @@ impl TileRoom {
             carried: try_filled(most, Carried::default(), what)?,
             occluded: try_filled(most, 0, what)?,
             visible: try_filled(slots, Vec3::ZERO, what)?,
+            choice: Choice::default(),
         })
     }
 }
@@ -89,6 +106,7 @@ impl<R: AsMut<[Ray]>, C: AsMut<[Carried]>, O: AsMut<[u8]>, V: AsMut<[Vec3]>> Roo
             carried: self.carried.as_mut(),
             occluded: self.occluded.as_mut(),
             visible,
+            choice: &mut self.choice,
             count: 0,
             traced: 0,
             slot: 0,
@@ -104,6 +122,7 @@ pub(crate) struct ShadowRays<'a> {
     occluded: &'a mut [u8],
     /// Light that has arrived, by slot.
     visible: &'a mut [Vec3],
+    pub(crate) choice: &'a mut Choice,
     count: usize,
     traced: u64,
     /// The sum that the next rays belong to.

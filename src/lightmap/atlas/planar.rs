@@ -132,16 +132,16 @@ fn doubled_area([a, b, c]: [DVec3; 3]) -> DVec3 {
 /// their `border`, which has the starts of all border edges.
 fn turn_upright(triangles: &mut [[DVec2; 3]], border: &mut [DVec2]) -> Result<()> {
     let hull = convex_hull(border)?;
-    let edges = (0..hull.len()).map(|i| hull[(i + 1) % hull.len()] - hull[i]);
-    let mut edges: Vec<DVec2> = try_collect(edges, CHARTS)?;
-    edges.sort_unstable_by(|a, b| b.length_squared().total_cmp(&a.length_squared()));
+    let edges = (0..hull.len()).map(|i| (i, hull[(i + 1) % hull.len()] - hull[i]));
+    let mut edges: Vec<(usize, DVec2)> = try_collect(edges, CHARTS)?;
+    edges.sort_unstable_by(|(i, a), (j, b)| b.length_squared().total_cmp(&a.length_squared()).then(i.cmp(j)));
     let turned = |x: DVec2, p: DVec2| DVec2::new(x.dot(p), x.perp_dot(p));
     let box_area = |x: DVec2| {
         let points = || hull.iter().map(|&p| turned(x, p));
         let size = points().fold(DVec2::NEG_INFINITY, DVec2::max) - points().fold(DVec2::INFINITY, DVec2::min);
         size.x * size.y
     };
-    let tried = edges.into_iter().take(EDGES_TRIED).filter_map(DVec2::try_normalize).map(|x| (box_area(x), x));
+    let tried = edges.into_iter().take(EDGES_TRIED).filter_map(|(_, e)| e.try_normalize()).map(|x| (box_area(x), x));
     let best = tried.fold((f64::INFINITY, DVec2::X), |m, t| if t.0 < m.0 { t } else { m }).1;
     triangles.iter_mut().for_each(|t| *t = t.map(|p| turned(best, p)));
     Ok(())
