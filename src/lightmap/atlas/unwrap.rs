@@ -151,7 +151,7 @@ fn unwrap_part(geometry: &Geometry, scene: &Scene, stage: &Stage) -> Result<Vec<
     use crate::base::error::Error;
     use crate::device::LogLevel;
     let all = try_filled(geometry.triangles.len(), true, CHARTS)?;
-    match charts_of_part(geometry, stage) {
+    match charts_of_part(geometry, longest_component(geometry, stage)?, stage) {
         Ok((mut pieces, left)) => {
             for piece in planar_pieces(geometry, &left, stage)? {
                 try_push(&mut pieces, piece, CHARTS)?;
@@ -172,10 +172,30 @@ fn unwrap_part(geometry: &Geometry, scene: &Scene, stage: &Stage) -> Result<Vec<
     }
 }
 
-/// Returns the charts that `uvunwrap` makes of a part, and flags for the triangles without one (too thin for its
+/// Returns the longest diagonal of the boxes around a part's connected components.
+#[cfg(feature = "unwrap")]
+fn longest_component(geometry: &Geometry, stage: &Stage) -> Result<f64> {
+    let count = geometry.triangles.len();
+    let keys = geometry.indices.iter().zip(0..).flat_map(|(corners, t)| corners.map(|v| (v, t)));
+    let component_of = connected(count, try_collect(keys, CHARTS)?, stage)?;
+    let mut boxes = try_filled(count, [DVec3::INFINITY, DVec3::NEG_INFINITY], CHARTS)?;
+    for (t, &component) in component_of.iter().enumerate() {
+        let [lower, upper] = &mut boxes[component as usize];
+        for corner in geometry.corners(t) {
+            (*lower, *upper) = (lower.min(corner), upper.max(corner));
+        }
+    }
+    Ok(boxes.iter().map(|[lower, upper]| (*upper - *lower).length()).filter(|d| d.is_finite()).fold(0.0, f64::max))
+}
+
+/// Returns the charts that `uvunwrap` makes of a part whose components are no longer than `longest`, and flags for the triangles without one (too thin for its
 /// single-precision UVs).
 #[cfg(feature = "unwrap")]
-fn charts_of_part(geometry: &Geometry, stage: &Stage) -> std::result::Result<(Vec<Piece>, Vec<bool>), uvunwrap::Error> {
+fn charts_of_part(
+    geometry: &Geometry,
+    longest: f64,
+    stage: &Stage,
+) -> std::result::Result<(Vec<Piece>, Vec<bool>), uvunwrap::Error> {
     // Positions are normalised, so that huge, tiny and far-off parts lose no precision.
     let lower = geometry.positions.iter().fold(DVec3::INFINITY, |m, &p| m.min(p));
     let upper = geometry.positions.iter().fold(DVec3::NEG_INFINITY, |m, &p| m.max(p));
@@ -188,30 +208,39 @@ fn charts_of_part(geometry: &Geometry, stage: &Stage) -> std::result::Result<(Ve
             0.5 * (b - a).cross(c - a).length()
         })
         .sum();
-    // Only the page's size matters of its packing, since UVs are relative to it.
+    // Only the pages' size matters of their packing, since UVs are relative to it.
     let density = (PACKING_TEXELS / area).sqrt().min(MAX_PACKING_DENSITY) as f32;
     let mesh = uvunwrap::MeshInput {
         face_materials: Some(&geometry.kinds),
         ..uvunwrap::MeshInput::new(&positions, geometry.indices.as_flattened())
     };
-    let options = uvunwrap::Options {
+    let page_size = (CHART_EXTENT * longest / size * density as f64).max(PACKING_TEXELS.sqrt()).ceil() as u32;
+    let options = |page_size| uvunwrap::Options {
         max_chart_angle: MAX_CHART_ANGLE,
         max_area_distortion: MAX_AREA_DISTORTION,
-        density: uvunwrap::Density::Fixed { texels_per_unit: density, page_size: None },
+        density: uvunwrap::Density::Fixed { texels_per_unit: density, page_size },
         padding: 0,
         allow_rotation: false,
         packing: uvunwrap::Packing::Fast,
         ..Default::default()
     };
-    let atlas = uvunwrap::generate_with_progress(&[mesh], &options, |_| stage.check().is_ok())?;
+    let unwrap = |page_size| uvunwrap::generate_with_progress(&[mesh], &options(page_size), |_| stage.check().is_ok());
+    let atlas = match unwrap(Some(page_size)) {
+        Err(uvunwrap::Error::ChartTooLarge { .. }) => unwrap(None)?,
+        result => result?,
+    };
     Ok(read_charts(geometry, &atlas, size / density as f64))
 }
 
-/// Number of texels of the page that `uvunwrap` packs a part into: few, since its packing takes time and is discarded
+/// Number of texels that `uvunwrap` packs a part into: few, since its packing takes time and is discarded
 /// (San Miguel took 21 s of processor time with 512², 14.5 s with 128²). Not fewer, since charts take at least a texel
 /// and UVs are rounded to single precision of the whole page.
 #[cfg(feature = "unwrap")]
 const PACKING_TEXELS: f64 = 128.0 * 128.0;
+/// Width of the pages that charts are packed into, in diagonals of the largest component: as normals of a chart lie
+/// within [`MAX_CHART_ANGLE`] of its own, hardly any chart is larger. (Without a given width the packing tries seven.)
+#[cfg(feature = "unwrap")]
+const CHART_EXTENT: f64 = 2.0;
 /// Maximum number of texels that a part's diagonal may take in that page, for parts with hardly any area.
 #[cfg(feature = "unwrap")]
 const MAX_PACKING_DENSITY: f64 = 65536.0;
