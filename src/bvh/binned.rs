@@ -250,7 +250,8 @@ impl Builder<'_, '_> {
     ) -> Result<()> {
         let n = refs.len();
         if n == 1 {
-            return Ok(slots.leaf(refs, &extent.boxes));
+            slots.leaf(refs, &extent.boxes);
+            return Ok(());
         }
         let may_be_leaf = n <= self.options.max_leaf as usize;
         if n <= 4 && depth < SAH_DEPTH {
@@ -262,7 +263,8 @@ impl Builder<'_, '_> {
             work.bins.fill(refs, &map);
             if let Some(split) = work.bins.best_split(&map, scale) {
                 if may_be_leaf && leaf_cost(&extent.boxes, scale, n) <= split.cost {
-                    return Ok(slots.leaf(refs, &extent.boxes));
+                    slots.leaf(refs, &extent.boxes);
+                    return Ok(());
                 }
                 let (middle, boxes) = work.bins.sides(&map, &split);
                 let centres = partition(refs, middle, &map, &split, &mut work.scratch)?;
@@ -271,7 +273,8 @@ impl Builder<'_, '_> {
             }
         }
         if may_be_leaf {
-            return Ok(slots.leaf(refs, &extent.boxes));
+            slots.leaf(refs, &extent.boxes);
+            return Ok(());
         }
         // All centres are equal, or the node is too deep.
         let middle = halve(refs, &extent);
@@ -292,7 +295,8 @@ impl Builder<'_, '_> {
         let scale = area_scale(&extent.boxes);
         let (cost, parting) = best_parting(refs, scale);
         if refs.len() <= self.options.max_leaf as usize && leaf_cost(&extent.boxes, scale, refs.len()) <= cost {
-            return Ok(slots.leaf(refs, &extent.boxes));
+            slots.leaf(refs, &extent.boxes);
+            return Ok(());
         }
         let middle = part_few(refs, parting);
         // The centres of so few are not needed, unless the node is too deep.

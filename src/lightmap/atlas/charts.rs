@@ -108,8 +108,10 @@ impl Charts {
         let total = scene.triangle_count();
         let stage = progress.stage("unwrap", 0.0, 0.5, total as u64 + 1);
         // Memory of pieces and charts, which exist at the same time, and of the meshes that are unwrapped.
-        let per_triangle = 2 * Self::BYTES_PER_TRIANGLE + unwrap::BYTES_PER_TRIANGLE;
-        let _memory = scene.device().memory().reserve(total as usize * per_triangle, "the charts")?;
+        let vertices = scene.meshes().iter().map(|m| m.positions.len()).sum();
+        let bytes = 2 * Self::BYTES_PER_TRIANGLE * total as usize
+            + unwrap::bytes(total as usize, vertices, scene.device().num_threads());
+        let _memory = scene.device().memory().reserve(bytes, CHARTS)?;
         let (charts, mut report) = scene.device().install(|| {
             let mut report = UvReport::default();
             let (mut pieces, rest) = given_pieces(scene, page_size, &mut report, &stage)?;

@@ -23,8 +23,10 @@ pub(super) struct Geometry {
 }
 
 impl Geometry {
-    /// Upper bound of the bytes that a triangle takes, with its neighbours and while these are found.
-    pub(super) const BYTES_PER_TRIANGLE: usize = 4 + 12 + 24 + 24 + 4 + 12 + 48;
+    /// Bytes that a triangle takes.
+    pub(super) const BYTES_PER_TRIANGLE: usize = 4 + 12 + 24 + 4;
+    /// Bytes that a vertex takes. (Welding takes 20 more, but nothing else is there yet.)
+    pub(super) const BYTES_PER_VERTEX: usize = 24;
 
     /// Welds `triangles`, which are most of the valid ones of one mesh (global numbers, ascending).
     pub(super) fn of(scene: &Scene, triangles: &[u32], stage: &Stage) -> Result<Geometry> {
