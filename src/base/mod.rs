@@ -11,3 +11,4 @@ pub mod memory;
 pub mod progress;
 pub mod sampling;
 pub(crate) mod scratch;
+pub(crate) mod sort;

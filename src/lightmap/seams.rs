@@ -28,6 +28,7 @@ use crate::base::memory::{
     Reservation, try_collect, try_par_collect, try_par_filter, try_par_gather, try_push, try_to_vec, try_vec,
 };
 use crate::base::progress::{Progress, Stage};
+use crate::base::sort::sort;
 use crate::scene::NONE;
 use glam::{Vec2, Vec3, Vec3A};
 use rayon::prelude::*;
@@ -286,7 +287,7 @@ impl Job<'_, '_, '_> {
             }
         });
         self.stage.advance(0)?;
-        sides.par_sort_unstable();
+        sort(&mut sides, &|| self.stage.check())?;
         self.stage.advance(0)?;
         // If three or more triangles share an edge, another surface stands on this one, and light need not continue
         // below it. (The rare edges that share a hash are skipped too.)
@@ -306,7 +307,7 @@ impl Job<'_, '_, '_> {
             Ok(())
         })?;
         // Sorted, since neighbours in the scene use the same texels.
-        edges.par_sort_unstable();
+        sort(&mut edges, &|| self.stage.check())?;
         Ok(edges)
     }
 

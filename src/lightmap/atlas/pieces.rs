@@ -3,8 +3,8 @@
 use crate::base::error::Result;
 use crate::base::memory::{try_collect, try_filled, try_push};
 use crate::base::progress::Stage;
+use crate::base::sort::sort;
 use crate::scene::{Material, NONE};
-use rayon::prelude::*;
 
 /// Name of the buffers in error messages.
 pub(in crate::lightmap) const CHARTS: &str = "the charts";
@@ -47,7 +47,7 @@ pub(in crate::lightmap) fn connected<K: Ord + Send>(
     mut keys: Vec<(K, u32)>,
     stage: &Stage,
 ) -> Result<Vec<u32>> {
-    keys.par_sort_unstable();
+    sort(&mut keys, &|| stage.check())?;
     let mut parent = try_collect(0..count as u32, CHARTS)?;
     for (i, pair) in keys.windows(2).enumerate() {
         if i % ITEMS_PER_CHECK == 0 {

@@ -4,6 +4,7 @@ use super::pieces::{CHARTS, ITEMS_PER_CHECK, float_key, surface_kind};
 use crate::base::error::Result;
 use crate::base::memory::{try_collect, try_filled, try_par_collect, try_to_vec, try_with_capacity};
 use crate::base::progress::Stage;
+use crate::base::sort::sort;
 use crate::scene::{NONE, Scene};
 use glam::DVec3;
 use rayon::prelude::*;
@@ -44,8 +45,7 @@ impl Geometry {
         let used = (0..mesh.positions.len() as u32).filter(|&v| welded[v as usize] == 0);
         let mut order = try_collect(used.map(|v| (key(v), v)), CHARTS)?;
         stage.check()?;
-        order.par_sort_unstable();
-        stage.check()?;
+        sort(&mut order, &|| stage.check())?;
         let mut positions = try_with_capacity(order.len(), CHARTS)?;
         for same in order.chunk_by(|a, b| a.0 == b.0) {
             same.iter().for_each(|&(_, v)| welded[v as usize] = positions.len() as u32);
@@ -101,7 +101,7 @@ impl Geometry {
                 edges.push(((u64::from(a.min(b)) << 32) | u64::from(a.max(b)), t as u32, k as u8, a < b));
             }
         }
-        edges.par_sort_unstable();
+        sort(&mut edges, &|| stage.check())?;
         let mut neighbours = try_filled(self.indices.len(), [NONE; 3], CHARTS)?;
         for (i, same) in edges.chunk_by(|a, b| a.0 == b.0).enumerate() {
             if i % ITEMS_PER_CHECK == 0 {
