@@ -44,7 +44,6 @@ impl Geometry {
         let key = |v: u32| mesh.positions[v as usize].to_array().map(float_key);
         let used = (0..mesh.positions.len() as u32).filter(|&v| welded[v as usize] == 0);
         let mut order = try_collect(used.map(|v| (key(v), v)), CHARTS)?;
-        stage.check()?;
         sort(&mut order, &|| stage.check())?;
         let mut positions = try_with_capacity(order.len(), CHARTS)?;
         for same in order.chunk_by(|a, b| a.0 == b.0) {
