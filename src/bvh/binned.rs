@@ -30,7 +30,22 @@ const TREE: &str = "the binary tree";
 const BLOCK: usize = 1 << 10;
 
 /// Room for those references of a block that belong to the right.
-type Scratch = Box<[Reference; BLOCK]>;
+struct Scratch {
+    refs: Box<[Reference; BLOCK]>,
+    /// Whether the CPU has AVX2, by which parting has the same result.
+    #[cfg(target_arch = "x86_64")]
+    has_avx2: bool,
+}
+
+impl Scratch {
+    fn new() -> Scratch {
+        Scratch {
+            refs: on_heap(Reference::default()),
+            #[cfg(target_arch = "x86_64")]
+            has_avx2: Isa::Avx2.is_available(),
+        }
+    }
+}
 
 /// Moves the references left of a split, `middle` in number, before the others. Returns the bounds of the centres of
 /// both sides.
@@ -47,9 +62,8 @@ fn partition(
     // First within blocks, then between them.
     let parted = if in_parallel(refs.len()) {
         let blocks = refs.par_chunks_mut(BLOCK).with_min_len(BLOCKS_PER_THREAD);
-        let new_scratch = || on_heap(Reference::default());
         try_par_collect(
-            blocks.map_init(new_scratch, |scratch, block| partition_block(block, map, split, scratch)),
+            blocks.map_init(Scratch::new, |scratch, block| partition_block(block, map, split, scratch)),
             TREE,
         )?
     } else {
@@ -120,9 +134,9 @@ impl<'a> Runs<'a> {
 fn partition_block(refs: &mut [Reference], map: &BinMap, split: &Split, scratch: &mut Scratch) -> (usize, [Range4; 2]) {
     let side = map.side(split);
     #[cfg(target_arch = "x86_64")]
-    if Isa::Avx2.is_available() {
+    if scratch.has_avx2 {
         // SAFETY: the CPU has AVX2.
-        return unsafe { partition_block_avx2(refs, &side, scratch) };
+        return unsafe { partition_block_avx2(refs, &side, &mut scratch.refs) };
     }
     let [mut low, mut high] = [Range4::EMPTY; 2];
     let (mut l, mut r) = (0, 0);
@@ -132,19 +146,19 @@ fn partition_block(refs: &mut [Reference], map: &BinMap, split: &Split, scratch:
         let reference = refs[i];
         let is_left = side.is_left(&reference);
         refs[l] = reference;
-        scratch[r] = reference;
+        scratch.refs[r] = reference;
         l += usize::from(is_left);
         r += usize::from(!is_left);
         if is_left { low.grow(reference.centre()) } else { high.grow(reference.centre()) }
     }
-    refs[l..].copy_from_slice(&scratch[..r]);
+    refs[l..].copy_from_slice(&scratch.refs[..r]);
     (l, [low, high])
 }
 
 /// The same with each reference in one register.
 #[cfg(target_arch = "x86_64")]
 #[target_feature(enable = "avx2")]
-fn partition_block_avx2(refs: &mut [Reference], side: &Side, scratch: &mut Scratch) -> (usize, [Range4; 2]) {
+fn partition_block_avx2(refs: &mut [Reference], side: &Side, scratch: &mut [Reference; BLOCK]) -> (usize, [Range4; 2]) {
     use std::arch::x86_64::*;
     let n = refs.len().min(BLOCK);
     let (from, to) = (refs.as_mut_ptr().cast::<f32>(), scratch.as_mut_ptr().cast::<f32>());
@@ -229,7 +243,7 @@ struct Work {
 
 impl Work {
     fn new() -> Work {
-        Work { bins: Bins::new(), scratch: on_heap(Reference::default()) }
+        Work { bins: Bins::new(), scratch: Scratch::new() }
     }
 }
 

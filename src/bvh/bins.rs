@@ -41,7 +41,8 @@ impl BinMap {
         Side { axis, origin: self.origin[axis], scale: self.scale[axis], first_right: split.bin as f32 }
     }
 
-    /// Bins of a reference.
+    /// Bins of a reference. No centre is NaN: valid triangles have finite corners. On an axis on which the centres are
+    /// equal, or so close that the quotient would overflow, the scale is 0, and all are in the first bin.
     #[inline(always)]
     pub(super) fn indices(&self, r: &Reference) -> [usize; 3] {
         let b = ((r.centre() - self.origin) * self.scale).min(self.last);

@@ -7,10 +7,12 @@ mod bins;
 mod collapse;
 pub(crate) mod compact;
 mod compact_refit;
+mod cut;
 pub(crate) mod layout;
 mod partings;
 mod references;
 mod refit;
+mod slabs;
 mod spatial;
 
 pub use binary::{BinaryBvh, BinaryNode};

@@ -128,7 +128,7 @@ struct Stack {
 const BOTTOM: usize = WIDTH;
 
 /// The order of lanes that keeps them as they are.
-const IN_ORDER: [u32; WIDTH] = [0, 1, 2, 3, 4, 5, 6, 7];
+static IN_ORDER: [u32; WIDTH] = [0, 1, 2, 3, 4, 5, 6, 7];
 
 impl Stack {
     /// Pushes the children of a node that are set in `mask`, far ones first; `ANY`: in the node's own order if that is
