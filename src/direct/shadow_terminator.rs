@@ -52,7 +52,7 @@ pub(crate) fn raised(
 #[cfg(test)]
 mod tests {
     use super::*;
-    use crate::scene::shapes::MeshBuilder;
+    use crate::scene::demo::shapes::MeshBuilder;
     use crate::scene::{Material, Mesh, SceneData};
     use std::sync::Arc;
 

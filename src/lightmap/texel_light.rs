@@ -519,7 +519,7 @@ mod tests {
     use super::super::{BakeParams, Lightmap, LightmapDesc};
     use super::*;
     use crate::base::progress::Progress;
-    use crate::scene::shapes::MeshBuilder;
+    use crate::scene::demo::shapes::MeshBuilder;
     use crate::scene::{Light, Material, SceneData, builtin};
     use std::sync::Arc;
 

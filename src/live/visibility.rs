@@ -132,7 +132,7 @@ mod tests {
     use crate::base::progress::Progress;
     use crate::lightmap::atlas::ids::PlacementId;
     use crate::lightmap::{Lightmap, LightmapDesc};
-    use crate::scene::shapes::MeshBuilder;
+    use crate::scene::demo::shapes::MeshBuilder;
     use crate::scene::{Material, SceneData};
     use crate::trace::Ray;
 

@@ -262,7 +262,7 @@ mod tests {
     use super::*;
     use crate::base::progress::Progress;
     use crate::photon::PhotonParams;
-    use crate::scene::shapes::MeshBuilder;
+    use crate::scene::demo::shapes::MeshBuilder;
     use crate::scene::{Light, Material, SceneData};
 
     fn square(add: impl Fn(&mut MeshBuilder, u32)) -> PhotonMap {

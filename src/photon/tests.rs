@@ -198,7 +198,7 @@ fn a_ball_under_a_white_sky_absorbs_what_its_surface_gets() {
     // It is convex: nothing is reflected onto it, and every point gets π times the radiance.
     let mut data = SceneData::new();
     data.add_material(grey(0.6)).unwrap();
-    let mut builder = crate::scene::shapes::MeshBuilder::new();
+    let mut builder = crate::scene::demo::shapes::MeshBuilder::new();
     builder.sphere(Vec3::splat(3.0), 1.0, 4, 0);
     let mesh = builder.finish();
     let area: f64 = (0..mesh.indices.len())

@@ -482,7 +482,7 @@ impl Account {
 #[cfg(test)]
 mod tests {
     use super::*;
-    use crate::scene::shapes::MeshBuilder;
+    use crate::scene::demo::shapes::MeshBuilder;
     use crate::scene::{Material, SceneData};
 
     /// A hall on a field, with a hole in its roof, under `lights`.

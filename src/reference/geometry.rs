@@ -409,7 +409,7 @@ fn partition(range: &mut [Triangle], first: impl Fn(&Triangle) -> bool) -> usize
 mod tests {
     use super::super::Random;
     use super::*;
-    use crate::scene::shapes::MeshBuilder;
+    use crate::scene::demo::shapes::MeshBuilder;
     use proptest::prelude::*;
 
     fn soup(corners: &[[Vec3; 3]]) -> Geometry {

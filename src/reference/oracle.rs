@@ -168,7 +168,7 @@ fn line_distance(edge_function: f64, direction: DVec3, edge: DVec3) -> f64 {
 mod tests {
     use super::super::Random;
     use super::*;
-    use crate::scene::shapes::MeshBuilder;
+    use crate::scene::demo::shapes::MeshBuilder;
     use glam::Vec3;
 
     /// Two stacked squares at z = 0 (triangles 0 and 1) and z = 1 (2 and 3), seen from above.

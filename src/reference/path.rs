@@ -363,7 +363,7 @@ impl View {
 mod tests {
     use super::*;
     use crate::device::DeviceOptions;
-    use crate::scene::shapes::MeshBuilder;
+    use crate::scene::demo::shapes::MeshBuilder;
     use crate::scene::{MeshMaterials, builtin};
 
     const UP: SurfacePoint = SurfacePoint { position: DVec3::ZERO, normal: DVec3::Z };

@@ -1,11 +1,10 @@
 //! Scenes: the caller's description ([`SceneData`]), checked as it is added, and the committed form that the kernels
 //! work on ([`Scene`]), compact and immutable.
 
-mod atrium;
 mod build;
-mod builtin;
 mod camera;
 mod committed;
+pub(crate) mod demo;
 mod emitters;
 mod environment;
 mod light;
@@ -13,14 +12,13 @@ mod material;
 mod mesh;
 pub(crate) mod precision;
 mod refit;
-mod rooms;
-pub mod shapes;
 mod texture;
 
 pub use crate::base::geometry::{MAX_COORDINATE, NONE, is_valid_triangle, unit_normal};
-pub use builtin::{BUILTIN_NAMES, builtin, builtin_camera, is_builtin};
 pub use camera::Camera;
 pub use committed::{Scene, SceneStats};
+pub use demo::builtin::{BUILTIN_NAMES, builtin, builtin_camera, is_builtin};
+pub use demo::shapes;
 pub use emitters::Emitter;
 pub use environment::{Environment, MAX_ENVIRONMENT_SIZE, Sky};
 pub use light::Light;

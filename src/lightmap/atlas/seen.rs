@@ -220,7 +220,7 @@ impl Look<'_> {
 mod tests {
     use crate::base::progress::Progress;
     use crate::lightmap::{Lightmap, LightmapDesc};
-    use crate::scene::shapes::MeshBuilder;
+    use crate::scene::demo::shapes::MeshBuilder;
     use crate::scene::{Material, SceneData};
     use glam::Vec3;
 

@@ -177,7 +177,7 @@ fn view(scene: &Scene, radiance: &ChartMap<RadianceMap>, placement: PlacementId)
 mod tests {
     use super::*;
     use crate::lightmap::{Lightmap, LightmapDesc};
-    use crate::scene::shapes::MeshBuilder;
+    use crate::scene::demo::shapes::MeshBuilder;
     use crate::scene::{Light, Material, NONE, SceneData};
     use glam::Vec3;
 

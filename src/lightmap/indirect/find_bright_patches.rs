@@ -310,7 +310,7 @@ mod tests {
     use crate::lightmap::indirect::sample_set::SampleSet;
     use crate::lightmap::plan::left_out;
     use crate::lightmap::{BakeParams, Light as Baked, Lightmap, LightmapDesc};
-    use crate::scene::shapes::MeshBuilder;
+    use crate::scene::demo::shapes::MeshBuilder;
     use crate::scene::{Light, Material, SceneData, builtin};
     use crate::trace::RawHit;
 

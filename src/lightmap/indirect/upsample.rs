@@ -374,7 +374,7 @@ pub(super) mod tests {
     use crate::lightmap::atlas::ids::RadianceTexel;
     use crate::lightmap::indirect::radiance_map::Radiance;
     use crate::lightmap::{Lightmap, LightmapDesc};
-    use crate::scene::shapes::MeshBuilder;
+    use crate::scene::demo::shapes::MeshBuilder;
     use crate::scene::{Light, LightmapUvs, Material, SceneData};
     use glam::{Vec2, Vec3};
 

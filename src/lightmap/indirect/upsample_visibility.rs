@@ -117,7 +117,7 @@ mod tests {
     use crate::lightmap::atlas::ids::{LightTexel, Map, PerTexel, PlacementId, TexelId};
     use crate::lightmap::indirect::upsample::tests::{dark, find};
     use crate::lightmap::{Lightmap, LightmapDesc};
-    use crate::scene::shapes::MeshBuilder;
+    use crate::scene::demo::shapes::MeshBuilder;
     use crate::scene::{LightmapUvs, Material, SceneData};
     use glam::{Vec2, Vec3};
 

@@ -2,7 +2,7 @@ use super::solver::STIFFNESS;
 use super::*;
 use crate::device::{Device, DeviceOptions};
 use crate::lightmap::{Layer, LightmapDesc};
-use crate::scene::shapes::MeshBuilder;
+use crate::scene::demo::shapes::MeshBuilder;
 use crate::scene::{LightmapUvs, Material, Mesh, MeshMaterials, Scene, SceneData};
 use glam::DVec3;
 use std::f32::consts::FRAC_PI_6;

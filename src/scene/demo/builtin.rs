@@ -1,11 +1,13 @@
 //! Scenes made by code, for tests, examples and first steps.
 
 use super::atrium::{atrium, atrium_camera};
-use super::camera::Camera;
 use super::rooms::{furniture, furniture_camera, partition, partition_camera};
 use super::shapes::MeshBuilder;
-use super::{Light, Material, SceneData};
 use crate::base::error::{Result, invalid_argument};
+use crate::scene::SceneData;
+use crate::scene::camera::Camera;
+use crate::scene::light::Light;
+use crate::scene::material::Material;
 use glam::Vec3;
 
 /// The names that [`builtin`] knows.
@@ -166,9 +168,10 @@ fn sealed() -> Result<SceneData> {
 
 #[cfg(test)]
 mod tests {
-    use super::super::shapes::enclosed_volume;
-    use super::super::{Mesh, Scene};
     use super::*;
+    use crate::scene::committed::Scene;
+    use crate::scene::demo::shapes::enclosed_volume;
+    use crate::scene::mesh::Mesh;
     use std::sync::Arc;
 
     fn commit(name: &str) -> Arc<Scene> {

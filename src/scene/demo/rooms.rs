@@ -1,9 +1,11 @@
 //! Small rooms for measurements of light, each with one difficulty. Units are metres, y is up.
 
-use super::camera::Camera;
 use super::shapes::MeshBuilder;
-use super::{Light, Material, SceneData};
 use crate::base::error::Result;
+use crate::scene::SceneData;
+use crate::scene::camera::Camera;
+use crate::scene::light::Light;
+use crate::scene::material::Material;
 use glam::Vec3;
 
 /// Makes a room with a lamp at its ceiling, and things that are closed boxes in it.

@@ -4,7 +4,7 @@
 //! so that a closed shape becomes a closed mesh: every edge is used by two triangles, once in each
 //! direction. Quads are given counter-clockwise as seen from their front.
 
-use super::{Mesh, MeshMaterials};
+use crate::scene::mesh::{Mesh, MeshMaterials};
 use glam::{DVec3, Vec3};
 use std::collections::HashMap;
 use std::f64::consts::{PI, TAU};
