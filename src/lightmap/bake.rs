@@ -1,22 +1,22 @@
-//! The bake: stages in order, each with its share of progress, time and memory.
+//! The bake: stages in order, each with its share of progress, time and memory. Those that live updates have, too, are in
+//! [`stages`].
 //!
 //! The file is long because it has every stage once, in order: this order is what a reader looks for here.
 
 use super::atlas::Atlas;
-use super::atlas::ids::{GatherTexel, LightMap, LightTexel, PerTexel, RadianceTexel};
-use super::atlas::two_sided;
+use super::atlas::fill::Filling;
+use super::atlas::ids::{GatherTexel, LightMap, LightTexel, PerTexel};
 use super::indirect::blur;
-use super::indirect::blur::Filling;
-use super::indirect::bright_patches::Bright;
-use super::indirect::find_bright_patches;
 use super::indirect::gather::{Gathered, Tile, TileTexel};
-use super::indirect::radiance_map::{self, Radiance, RadianceInput, RadianceLookup};
+use super::indirect::radiance_map::{Radiance, RadianceLookup};
 use super::indirect::sample_set::SampleSet;
-use super::indirect::upsample::{OWN_RAYS, OwnLight, OwnRays, Upsampling};
+use super::indirect::upsample::{OwnLight, Upsampling};
 use super::plan::{Plan, left_out};
 use super::saved::checkpoint::Checkpoint;
 use super::seams::Stitch;
-use super::texel_light::{Averaged, TexelLight, TilePoints, Variation};
+use super::stages::{self, Inputs, purpose};
+use super::texel_light::averages::{Averaged, Variation};
+use super::texel_light::{TexelLight, TilePoints};
 use super::tiles::{TILE, in_order, texels_per_tile};
 use super::{BakeParams, BakeStats, CheckpointParams, Light, Lightmap, Origin, StageStats, TexelState};
 use crate::base::error::{Error, Result, invalid_argument};
@@ -25,7 +25,6 @@ use crate::base::progress::{Progress, Stage};
 use crate::base::sampling::{combine, purpose_seed};
 use crate::base::scratch::Scratch;
 use crate::direct::DirectLight;
-use crate::photon::{PhotonMap, PhotonParams};
 use crate::scene::Scene;
 use glam::Vec3;
 use rayon::prelude::*;
@@ -42,27 +41,6 @@ const GATHER_BYTES: usize = 3 * size_of::<Vec3>() + size_of::<f32>() + size_of::
 
 /// Bytes per light map texel while a bake runs: direct and indirect light, state, variation of direct light.
 const TEXEL_BYTES: usize = 2 * size_of::<Vec3>() + size_of::<TexelState>() + size_of::<Variation>();
-
-/// Purposes of the random numbers of a bake.
-pub(crate) mod purpose {
-    pub const RADIANCE: u32 = 1;
-    pub const GATHER_SET: u32 = 2;
-    pub const GATHER: u32 = 3;
-    pub const DIRECT: u32 = 4;
-    pub const OWN: u32 = 5;
-}
-
-/// Lower bound of the automatic search radius of photons in texels of the radiance map: the discs around its samples
-/// then leave no photon out.
-const RADIUS_TEXELS: f32 = 0.75;
-
-/// Maximum number of photons kept: the larger of a fixed number and a number per texel of the radiance map. Of more,
-/// every n-th is kept, with n times the power.
-const MOST_STORED: u64 = 1 << 24;
-const STORED_PER_TEXEL: u64 = 256;
-
-/// Divisor of `direct_samples` in the radiance map, which is coarser than the light map.
-const RADIANCE_SAMPLE_DIVISOR: u32 = 4;
 
 impl Lightmap {
     /// Runs the pipeline. After an error or a cancel, the light of earlier bakes is unchanged.
@@ -171,15 +149,15 @@ impl Lightmap {
 }
 
 /// Inputs of one bake in progress.
-pub(crate) struct Bake<'a, 'p> {
-    pub atlas: &'a Atlas,
-    pub params: &'a BakeParams,
-    pub plan: &'a Plan,
-    pub direct: &'a DirectLight,
-    /// Samples of the light map to bake.
-    pub range: Range<usize>,
-    pub progress: &'a Progress<'p>,
-    pub checkpoint: Option<&'a Checkpoint<'a>>,
+struct Bake<'a, 'p> {
+    atlas: &'a Atlas,
+    params: &'a BakeParams,
+    plan: &'a Plan,
+    direct: &'a DirectLight,
+    /// Texels of the light map to bake.
+    range: Range<usize>,
+    progress: &'a Progress<'p>,
+    checkpoint: Option<&'a Checkpoint<'a>>,
 }
 
 /// The gather map after blur and filling.
@@ -189,7 +167,7 @@ struct Indirect {
     own: OwnLight,
 }
 
-impl Bake<'_, '_> {
+impl<'p> Bake<'_, 'p> {
     fn run(&self) -> Result<(Light, BakeStats)> {
         let start = Instant::now();
         let mut stats = BakeStats::default();
@@ -218,22 +196,48 @@ impl Bake<'_, '_> {
         Ok((light, stats))
     }
 
+    /// Returns the inputs of the stages that live updates have, too.
+    fn inputs(&self) -> Inputs<'_, 'p> {
+        Inputs { atlas: self.atlas, direct: self.direct, params: self.params, progress: self.progress }
+    }
+
     /// Computes the radiance map, or reads it from the checkpoint; empty if the plan leaves indirect light out.
-    pub(crate) fn illuminate(&self, stats: &mut BakeStats) -> Result<Radiance> {
-        if !self.plan.runs(left_out::INDIRECT) {
-            return Ok(Radiance::default());
-        }
-        if let Some(c) = self.checkpoint
-            && let Some(radiance) = self.atlas.scene.device().install(|| c.radiance(self.atlas))?
-        {
+    fn illuminate(&self, stats: &mut BakeStats) -> Result<Radiance> {
+        let Some(c) = self.checkpoint.filter(|_| self.plan.runs(left_out::INDIRECT)) else {
+            return stages::illuminate(&self.inputs(), self.plan, stats);
+        };
+        if let Some(radiance) = self.atlas.scene.device().install(|| c.radiance(self.atlas))? {
             return Ok(radiance);
         }
-        let photons = if self.plan.runs(left_out::PHOTONS) { Some(self.photons(stats)?) } else { None };
-        let radiance = self.radiance(photons.as_ref(), stats)?;
-        if let Some(c) = self.checkpoint {
-            c.keep_radiance(&radiance);
-        }
+        let radiance = stages::illuminate(&self.inputs(), self.plan, stats)?;
+        c.keep_radiance(&radiance);
         Ok(radiance)
+    }
+
+    /// Decides which charts show their backs, or reads it from the checkpoint.
+    fn backs(&self, radiance: &[Vec3]) -> Result<Vec<bool>> {
+        let charts = self.atlas.charts.charts.len();
+        if let Some(backs) = self.checkpoint.map(|c| c.backs(charts)).transpose()?.flatten() {
+            return Ok(backs);
+        }
+        let backs = stages::backs(&self.inputs(), radiance)?;
+        if let Some(c) = self.checkpoint {
+            c.keep_backs(&backs);
+        }
+        Ok(backs)
+    }
+
+    /// Traces the fallback gathers, or reads their light from the checkpoint. Returns it and the number of rays.
+    fn own_light(&self, radiance: &Radiance, backs: &[bool], upsampling: &Upsampling) -> Result<(OwnLight, u64)> {
+        let texels = upsampling.own_work() as usize / 2;
+        if let Some(own) = self.checkpoint.map(|c| c.own_light(texels)).transpose()?.flatten() {
+            return Ok((own, 0));
+        }
+        let own = stages::own_light(&self.inputs(), radiance, backs, upsampling)?;
+        if let Some(c) = self.checkpoint {
+            c.keep_own_light(&own.0);
+        }
+        Ok(own)
     }
 
     /// Announces the buffers of all stages but the photon map, which announces its own.
@@ -252,70 +256,6 @@ impl Bake<'_, '_> {
         l.scene.device().memory().reserve(bytes, "the bake's buffers")
     }
 
-    fn photons(&self, stats: &mut BakeStats) -> Result<PhotonMap> {
-        let start = Instant::now();
-        let params = PhotonParams {
-            photon_count: self.params.photon_count,
-            max_bounces: self.params.max_bounces,
-            radius: self.params.radius,
-            seed: self.params.seed,
-            memory_budget: self.params.memory_budget,
-            store_direct: false,
-            // The quotient is infinite if the density is nearly 0.
-            least_radius: (RADIUS_TEXELS / self.atlas.radiance.layout.density).min(f32::MAX),
-            most_stored: MOST_STORED.max(STORED_PER_TEXEL * self.atlas.radiance.len() as u64),
-            ..Default::default()
-        };
-        let map = PhotonMap::trace_within(&self.atlas.scene, &params, self.progress, 0.0, 0.2)?;
-        let s = map.stats();
-        stats.photons = StageStats { seconds: start.elapsed().as_secs_f64(), rays: s.rays, bytes: map.bytes() as u64 };
-        (stats.photons_emitted, stats.photons_stored) = (s.emitted, s.stored);
-        Ok(map)
-    }
-
-    fn radiance(&self, photons: Option<&PhotonMap>, stats: &mut BakeStats) -> Result<Radiance> {
-        let start = Instant::now();
-        let l = self.atlas;
-        let stage = self.progress.stage("radiance", 0.2, 0.3, 2 * l.radiance.len() as u64);
-        let mut values = try_vec(l.radiance.len(), "the radiance map")?;
-        let light = TexelLight {
-            areas: l.areas(&l.radiance),
-            direct: self.direct,
-            samples: self.params.direct_samples.div_ceil(RADIANCE_SAMPLE_DIVISOR),
-            seed: purpose_seed(self.params.seed, purpose::RADIANCE),
-        };
-        let input = RadianceInput { light, photons };
-        let mut rays = radiance_map::bake(l.scene.device(), &input, &mut values, &stage)?;
-        let mut radiance = Radiance { values, bright: Bright::default() };
-        l.scene.device().install(|| find_bright_patches::find(l, &mut radiance, &mut rays, self.progress))?;
-        let bytes = (radiance.values.len() * size_of::<Vec3>() + l.radiance.bytes()) as u64;
-        stats.radiance = StageStats { seconds: start.elapsed().as_secs_f64(), rays, bytes };
-        Ok(radiance)
-    }
-
-    /// Decides for each two-sided chart without separate texels for its back whether the back is baked. With the
-    /// radiance map of [`illuminate`](Self::illuminate), this is all that lighting texels needs.
-    pub(crate) fn backs(&self, radiance: &[Vec3]) -> Result<Vec<bool>> {
-        let l = self.atlas;
-        if let Some(backs) = self.checkpoint.map(|c| c.backs(l.charts.charts.len())).transpose()?.flatten() {
-            return Ok(backs);
-        }
-        // Without indirect light there is no radiance map: direct light decides.
-        let light = |texel: RadianceTexel| match radiance.get(texel.index()) {
-            Some(radiance) => radiance.element_sum(),
-            None => {
-                let (_, receiver) = l.radiance.receiver(&l.scene, texel, l.radiance.is_back(texel));
-                let seed = combine(self.params.seed as u32, texel.seed());
-                self.direct.irradiance(&receiver, 1, seed, &mut 0).element_sum()
-            }
-        };
-        let backs = l.scene.device().install(|| two_sided::backs(l, light, self.progress))?;
-        if let Some(c) = self.checkpoint {
-            c.keep_backs(&backs);
-        }
-        Ok(backs)
-    }
-
     /// Gathers indirect light, fills and blurs it. Only placements that the range touches are gathered.
     fn gather(&self, radiance: &Radiance, backs: &[bool], stats: &mut BakeStats) -> Result<Indirect> {
         let start = Instant::now();
@@ -325,7 +265,7 @@ impl Bake<'_, '_> {
         let placements = placement_of(self.range.start)..placement_of(self.range.end - 1) + 1;
         let starts = &l.gather.texels.chart_start;
         let needed = starts[placements.start] as usize..starts[placements.end] as usize;
-        let upsampling = self.upsampling(backs, placements)?;
+        let upsampling = stages::upsampling(&self.inputs(), backs, placements)?;
         let (own, own_rays) = self.own_light(radiance, backs, &upsampling)?;
         let lookup = RadianceLookup::new(&l.charts, &l.radiance, radiance);
         let samples = SampleSet::new(self.params.gather_rays, purpose_seed(self.params.seed, purpose::GATHER_SET));
@@ -392,39 +332,6 @@ impl Bake<'_, '_> {
         let bytes = (n * GATHER_BYTES + l.gather.bytes()) as u64;
         stats.gather = StageStats { seconds: start.elapsed().as_secs_f64(), rays: rays.into_inner(), bytes };
         Ok(Indirect { irradiance, upsampling, own })
-    }
-
-    /// Finds how texels of the light map interpolate between gather texels, for some placements.
-    pub(crate) fn upsampling(&self, backs: &[bool], placements: Range<usize>) -> Result<Upsampling> {
-        let stage = self.progress.stage("upsampling", 0.3, 0.315, placements.len() as u64);
-        Upsampling::find(self.atlas, placements, backs, &stage)
-    }
-
-    /// Traces the fallback gathers of texels without a valid gather texel around them. Returns their light and the
-    /// number of rays.
-    pub(crate) fn own_light(
-        &self,
-        radiance: &Radiance,
-        backs: &[bool],
-        upsampling: &Upsampling,
-    ) -> Result<(OwnLight, u64)> {
-        let l = self.atlas;
-        let texels = upsampling.own_work() as usize / 2;
-        if let Some(own) = self.checkpoint.map(|c| c.own_light(texels)).transpose()?.flatten() {
-            return Ok((own, 0));
-        }
-        let count = self.params.gather_rays.min(OWN_RAYS);
-        let rays = OwnRays {
-            radiance: RadianceLookup::new(&l.charts, &l.radiance, radiance),
-            samples: &SampleSet::new(count, purpose_seed(self.params.seed, purpose::GATHER_SET)),
-            seed: purpose_seed(self.params.seed, purpose::OWN),
-        };
-        let stage = self.progress.stage("own light", 0.315, 0.32, upsampling.own_work());
-        let own = upsampling.own_light(l, backs, &rays, &stage)?;
-        if let Some(c) = self.checkpoint {
-            c.keep_own_light(&own.0);
-        }
-        Ok(own)
     }
 
     /// Computes direct light and interpolates indirect light for every texel of the range.

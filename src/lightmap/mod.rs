@@ -12,6 +12,7 @@ pub mod plan;
 mod readback;
 pub(crate) mod saved;
 mod seams;
+pub(crate) mod stages;
 pub(crate) mod texel_light;
 pub(crate) mod tiles;
 

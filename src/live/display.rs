@@ -9,6 +9,7 @@ use super::relight::Illumination;
 use super::{SHOWN_AT_ONCE, in_parts};
 use crate::base::error::{Error, Result};
 use crate::base::memory::{try_filled, try_to_vec, try_vec, try_with_capacity};
+use crate::lightmap::atlas::fill::mean_around;
 use crate::lightmap::atlas::ids::{GatherTexel, LightTexel, PerTexel, PlacementId};
 use crate::lightmap::indirect::blur::{Texels, Window};
 use glam::Vec3;
@@ -589,23 +590,15 @@ impl Display {
                 if filled_by > 0 {
                     continue;
                 }
-                let (x, y) = map.atlas.gather.position(s);
-                let (mut sum, mut n) = (Vec3::ZERO, 0.0);
-                for (nx, ny) in (-1..=1).flat_map(|dy| (-1..=1).map(move |dx| (x + dx, y + dy))) {
-                    let Some(t) = map.atlas.gather.at(tile.placement, nx, ny) else { continue };
-                    let value = if self.visible[t.index()] {
-                        Some(self.plain[t.index()])
-                    } else {
-                        let known = missing.binary_search_by_key(&t, |m| m.0).ok().map(|i| missing[i]);
-                        known.filter(|m| (1..ring).contains(&m.1)).map(|m| m.2)
-                    };
-                    if let Some(value) = value {
-                        sum += value;
-                        n += 1.0;
+                let value = |t: GatherTexel| {
+                    if self.visible[t.index()] {
+                        return Some(self.plain[t.index()]);
                     }
-                }
-                if n > 0.0 {
-                    missing[i] = (s, ring, sum / n);
+                    let known = missing.binary_search_by_key(&t, |m| m.0).ok().map(|i| missing[i]);
+                    known.filter(|m| (1..ring).contains(&m.1)).map(|m| m.2)
+                };
+                if let Some(mean) = mean_around(&map.atlas.gather, tile.placement, s, value) {
+                    missing[i] = (s, ring, mean);
                     is_empty = false;
                 }
             }

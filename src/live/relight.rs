@@ -14,10 +14,10 @@ use crate::base::progress::Progress;
 use crate::device::{Device, DeviceOptions};
 use crate::direct::DirectLight;
 use crate::lightmap::atlas::Atlas;
-use crate::lightmap::bake::Bake;
 use crate::lightmap::indirect::radiance_map::Radiance;
 use crate::lightmap::indirect::upsample::{OwnLight, Upsampling};
 use crate::lightmap::plan::{Plan, left_out};
+use crate::lightmap::stages::{self, Inputs};
 use crate::lightmap::{BakeParams, BakeStats};
 use glam::Vec3;
 use std::panic::{AssertUnwindSafe, catch_unwind};
@@ -72,21 +72,23 @@ fn illuminate(
 ) -> Result<Indirect> {
     let two_sided = !atlas.radiance.layout.back_of.is_empty();
     let plan = Plan::new(&atlas.scene, direct, params, two_sided, false);
-    let bake = Bake { atlas, params, plan: &plan, direct, range: 0..atlas.map.len(), progress, checkpoint: None };
-    let radiance = bake.illuminate(&mut BakeStats::default())?;
+    let inputs = Inputs { atlas, direct, params, progress };
+    let radiance = stages::illuminate(&inputs, &plan, &mut BakeStats::default())?;
     let has_indirect = plan.runs(left_out::INDIRECT);
     let sides = match sides {
         Some(sides) => sides,
         None => {
-            let backs = bake.backs(&radiance.values)?;
+            let backs = stages::backs(&inputs, &radiance.values)?;
             let placements = if has_indirect { atlas.map.layout.placements.len() } else { 0 };
-            let upsampling = bake.upsampling(&backs, 0..placements)?;
+            let upsampling = stages::upsampling(&inputs, &backs, 0..placements)?;
             Arc::new(Sides { backs, upsampling })
         }
     };
     // Without indirect light there is no radiance map to look up.
-    let own =
-        if has_indirect { bake.own_light(&radiance, &sides.backs, &sides.upsampling)?.0 } else { OwnLight::new() };
+    let own = match has_indirect {
+        true => stages::own_light(&inputs, &radiance, &sides.backs, &sides.upsampling)?.0,
+        false => OwnLight::new(),
+    };
     Ok(Indirect { radiance, sides, own, has_indirect })
 }
 

@@ -12,11 +12,12 @@
 
 use super::chart_map::ChartMap;
 use super::charts::Charts;
+use super::fill::{Hole, around};
 use super::ids::{Map, PlacementId, TexelId, TexelRange};
 use super::seen::Seen;
 use super::texels::TexelSample;
 use crate::base::error::Result;
-use crate::base::memory::{try_append, try_collect, try_par_collect, try_push, try_vec};
+use crate::base::memory::{try_collect, try_par_collect, try_push, try_vec, try_with_capacity};
 use crate::base::progress::Stage;
 use crate::base::sampling::{cosine_around, sobol_2d};
 use crate::scene::Scene;
@@ -42,9 +43,6 @@ const POINT_TRIES: u32 = 32;
 
 /// Number of points that are tested together.
 const BLOCK: usize = 256;
-
-/// Maximum number of rounds of filling: samples farther than this many texels from all visible ones are not moved.
-const MAX_ROUNDS: usize = 64;
 
 const BURIED: &str = "which texels are buried";
 
@@ -276,11 +274,6 @@ fn points_of_texel<M: Map>(
     points.map(|w| TexelSample { u: w.x, v: w.y, ..sample }).take(POINTS).collect()
 }
 
-/// A texel and its eight neighbours.
-fn around((x, y): (i32, i32)) -> impl Iterator<Item = (i32, i32)> {
-    (0..9).map(move |i| (x + i % 3 - 1, y + i / 3 - 1))
-}
-
 /// Finds the nearest visible texels to those `buried`, ring by ring.
 fn nearest_seen<M: Map>(
     map: &ChartMap<M>,
@@ -291,28 +284,27 @@ fn nearest_seen<M: Map>(
 ) -> Result<Vec<(TexelId<M>, TexelId<M>)>> {
     let mut to: Vec<Option<TexelId<M>>> = try_collect(texels.clone().map(Some), BURIED)?;
     buried.iter().for_each(|&s| to[texels.place(s)] = None);
-    let (mut missing, mut moved) = (buried, Vec::new());
-    for _ in 0..MAX_ROUNDS {
-        stage.check()?;
-        let nearest = |&s: &TexelId<M>| -> Option<(TexelId<M>, TexelId<M>)> {
-            let (ox, oy) = map.position(s);
-            let known = around((ox, oy)).filter_map(|(x, y)| {
-                // The window of given charts may contain another chart.
-                let neighbour = map.at(placement, x, y).filter(|&n| texels.contains(n))?;
-                let known = to[texels.place(neighbour)]?;
-                let (kx, ky) = map.position(known);
-                Some(((kx - ox).pow(2) + (ky - oy).pow(2), known))
-            });
-            known.min().map(|(_, known)| (s, known))
-        };
-        let ring: Vec<(TexelId<M>, TexelId<M>)> = try_collect(missing.iter().filter_map(nearest), BURIED)?;
-        if ring.is_empty() {
-            break;
-        }
-        ring.iter().for_each(|&(s, known)| to[texels.place(s)] = Some(known));
-        missing.retain(|&s| to[texels.place(s)].is_none());
-        try_append(&mut moved, &ring, BURIED)?;
-    }
+    let mut moved = try_with_capacity(buried.len(), BURIED)?;
+    let nearest = |to: &Vec<Option<TexelId<M>>>, texel: TexelId<M>| {
+        let (ox, oy) = map.position(texel);
+        let known = around((ox, oy)).filter_map(|(x, y)| {
+            // The window of given charts may contain another chart.
+            let neighbour = map.at(placement, x, y).filter(|&n| texels.contains(n))?;
+            let known = to[texels.place(neighbour)]?;
+            let (kx, ky) = map.position(known);
+            Some(((kx - ox).pow(2) + (ky - oy).pow(2), known))
+        });
+        known.min().map(|(_, known)| known)
+    };
+    Hole::new(buried)?.fill(
+        &mut to,
+        || stage.check(),
+        nearest,
+        |to, texel, known| {
+            to[texels.place(texel)] = Some(known);
+            moved.push((texel, known));
+        },
+    )?;
     Ok(moved)
 }
 

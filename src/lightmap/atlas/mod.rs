@@ -4,6 +4,7 @@ pub(crate) mod buried;
 pub(crate) mod chart_index;
 pub(crate) mod chart_map;
 pub mod charts;
+pub(crate) mod fill;
 pub(crate) mod flat_triangle;
 pub mod ids;
 pub(in crate::lightmap) mod known;

@@ -1,9 +1,7 @@
-//! Filters over the texels of a map: a blur of the gather map (thesis 3.2.5) that stays inside charts and does not
-//! cross walls, and the filling of texels that cannot be seen.
+//! Blur of the gather map (thesis 3.2.5) that stays inside charts and does not cross walls.
 
 use crate::base::error::Result;
-use crate::base::memory::{try_collect, try_with_capacity};
-use crate::base::progress::{Progress, Stage};
+use crate::base::progress::Stage;
 use crate::device::Device;
 use crate::lightmap::atlas::chart_map::ChartMap;
 use crate::lightmap::atlas::charts::Charts;
@@ -19,12 +17,6 @@ const MAX_WINDOW: usize = 2 * MAX_BLUR_RADIUS as usize + 1;
 
 /// Number of texels that a thread processes at a time.
 const BLOCK: usize = 1024;
-
-/// Maximum number of rounds of filling: a hidden region wider than twice this many texels stays partly unfilled.
-const MAX_FILL_ROUNDS: usize = 64;
-
-/// Name of the buffers in error messages.
-const FILLED: &str = "the texels to be filled";
 
 /// Difference of two texels, in standard deviations of their noise, up to which they are taken for equally lit.
 const LIKE: f32 = 2.0;
@@ -139,74 +131,4 @@ impl Window {
             self.queue.push((dx, dy));
         }
     }
-}
-
-/// Fills missing texels of the gather map: each gets the mean of its known or already filled neighbours in the chart, ring by ring.
-/// Charts without a known texel are left unchanged. The result depends on the known texels alone, not on the values of
-/// missing ones.
-pub(crate) struct Filling {
-    known: Vec<bool>,
-    missing: Vec<GatherTexel>,
-    /// Buffer for one ring, large enough for all missing texels.
-    ring: Vec<(GatherTexel, Vec3)>,
-}
-
-impl Filling {
-    /// Prepares to fill the `missing` ones of `n` texels from the `known` ones. Filling itself allocates no memory.
-    pub(crate) fn new(n: usize, known: impl Fn(usize) -> bool, missing: impl Fn(usize) -> bool) -> Result<Filling> {
-        let missing = try_collect((0..n).filter(|&i| missing(i)).map(GatherTexel::new), FILLED)?;
-        let ring = try_with_capacity(missing.len(), FILLED)?;
-        let known = if missing.is_empty() { Vec::new() } else { try_collect((0..n).map(known), FILLED)? };
-        Ok(Filling { known, missing, ring })
-    }
-
-    /// Fills the texels. Fails only on a cancel, with part of the texels filled.
-    pub(crate) fn fill(
-        mut self,
-        charts: &Charts,
-        map: &ChartMap<GatherMap>,
-        values: &mut [Vec3],
-        progress: &Progress,
-    ) -> Result<()> {
-        for _ in 0..MAX_FILL_ROUNDS {
-            self.ring.clear();
-            for part in self.missing.chunks(BLOCK) {
-                progress.check()?;
-                let mean = |&i: &GatherTexel| Some((i, neighbours(charts, map, i, values, &self.known)?));
-                self.ring.extend(part.iter().filter_map(mean));
-            }
-            if self.ring.is_empty() {
-                break;
-            }
-            for &(i, v) in &self.ring {
-                values[i.index()] = v;
-                self.known[i.index()] = true;
-            }
-            let known = &self.known;
-            self.missing.retain(|i| !known[i.index()]);
-        }
-        Ok(())
-    }
-}
-
-/// Returns the mean of the known neighbours of a texel in its chart.
-fn neighbours(
-    charts: &Charts,
-    map: &ChartMap<GatherMap>,
-    texel: GatherTexel,
-    values: &[Vec3],
-    known: &[bool],
-) -> Option<Vec3> {
-    let (x, y) = map.position(texel);
-    let placement = map.placement_of(charts, texel);
-    let (mut sum, mut n) = (Vec3::ZERO, 0.0);
-    for dy in -1..=1 {
-        for dx in -1..=1 {
-            if let Some(s) = map.at(placement, x + dx, y + dy).map(GatherTexel::index).filter(|&s| known[s]) {
-                sum += values[s];
-                n += 1.0;
-            }
-        }
-    }
-    (n > 0.0).then(|| sum / n)
 }

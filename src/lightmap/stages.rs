@@ -1,0 +1,147 @@
+//! Stages that a bake and live updates share, as functions of their [`Inputs`]: photons and radiance map, the sides that
+//! are shown, how texels interpolate, and fallback gathers.
+
+use super::atlas::Atlas;
+use super::atlas::ids::RadianceTexel;
+use super::atlas::two_sided;
+use super::indirect::bright_patches::Bright;
+use super::indirect::find_bright_patches;
+use super::indirect::radiance_map::{self, Radiance, RadianceInput, RadianceLookup};
+use super::indirect::sample_set::SampleSet;
+use super::indirect::upsample::{OWN_RAYS, OwnLight, OwnRays, Upsampling};
+use super::plan::{Plan, left_out};
+use super::texel_light::TexelLight;
+use super::{BakeParams, BakeStats, StageStats};
+use crate::base::error::Result;
+use crate::base::memory::try_vec;
+use crate::base::progress::Progress;
+use crate::base::sampling::{combine, purpose_seed};
+use crate::direct::DirectLight;
+use crate::photon::{PhotonMap, PhotonParams};
+use glam::Vec3;
+use std::ops::Range;
+use std::time::Instant;
+
+/// Purposes of the random numbers of a bake.
+pub(crate) mod purpose {
+    pub const RADIANCE: u32 = 1;
+    pub const GATHER_SET: u32 = 2;
+    pub const GATHER: u32 = 3;
+    pub const DIRECT: u32 = 4;
+    pub const OWN: u32 = 5;
+}
+
+/// Lower bound of the automatic search radius of photons in texels of the radiance map: the discs around its samples
+/// then leave no photon out.
+const RADIUS_TEXELS: f32 = 0.75;
+
+/// Maximum number of photons kept: the larger of a fixed number and a number per texel of the radiance map. Of more,
+/// every n-th is kept, with n times the power.
+const MOST_STORED: u64 = 1 << 24;
+const STORED_PER_TEXEL: u64 = 256;
+
+/// Divisor of `direct_samples` in the radiance map, which is coarser than the light map.
+const RADIANCE_SAMPLE_DIVISOR: u32 = 4;
+
+/// Inputs of all stages.
+#[derive(Clone, Copy)]
+pub(crate) struct Inputs<'a, 'p> {
+    pub atlas: &'a Atlas,
+    pub direct: &'a DirectLight,
+    pub params: &'a BakeParams,
+    pub progress: &'a Progress<'p>,
+}
+
+/// Computes the radiance map; empty if the plan leaves indirect light out.
+pub(crate) fn illuminate(inputs: &Inputs, plan: &Plan, stats: &mut BakeStats) -> Result<Radiance> {
+    if !plan.runs(left_out::INDIRECT) {
+        return Ok(Radiance::default());
+    }
+    let photons = if plan.runs(left_out::PHOTONS) { Some(photons(inputs, stats)?) } else { None };
+    radiance(inputs, photons.as_ref(), stats)
+}
+
+fn photons(inputs: &Inputs, stats: &mut BakeStats) -> Result<PhotonMap> {
+    let start = Instant::now();
+    let Inputs { atlas, params, progress, .. } = *inputs;
+    let params = PhotonParams {
+        photon_count: params.photon_count,
+        max_bounces: params.max_bounces,
+        radius: params.radius,
+        seed: params.seed,
+        memory_budget: params.memory_budget,
+        store_direct: false,
+        // The quotient is infinite if the density is nearly 0.
+        least_radius: (RADIUS_TEXELS / atlas.radiance.layout.density).min(f32::MAX),
+        most_stored: MOST_STORED.max(STORED_PER_TEXEL * atlas.radiance.len() as u64),
+        ..Default::default()
+    };
+    let map = PhotonMap::trace_within(&atlas.scene, &params, progress, 0.0, 0.2)?;
+    let s = map.stats();
+    stats.photons = StageStats { seconds: start.elapsed().as_secs_f64(), rays: s.rays, bytes: map.bytes() as u64 };
+    (stats.photons_emitted, stats.photons_stored) = (s.emitted, s.stored);
+    Ok(map)
+}
+
+fn radiance(inputs: &Inputs, photons: Option<&PhotonMap>, stats: &mut BakeStats) -> Result<Radiance> {
+    let start = Instant::now();
+    let Inputs { atlas, direct, params, progress } = *inputs;
+    let device = atlas.scene.device();
+    let stage = progress.stage("radiance", 0.2, 0.3, 2 * atlas.radiance.len() as u64);
+    let mut values = try_vec(atlas.radiance.len(), "the radiance map")?;
+    let light = TexelLight {
+        areas: atlas.areas(&atlas.radiance),
+        direct,
+        samples: params.direct_samples.div_ceil(RADIANCE_SAMPLE_DIVISOR),
+        seed: purpose_seed(params.seed, purpose::RADIANCE),
+    };
+    let input = RadianceInput { light, photons };
+    let mut rays = radiance_map::bake(device, &input, &mut values, &stage)?;
+    let mut radiance = Radiance { values, bright: Bright::default() };
+    device.install(|| find_bright_patches::find(atlas, &mut radiance, &mut rays, progress))?;
+    let bytes = (radiance.values.len() * size_of::<Vec3>() + atlas.radiance.bytes()) as u64;
+    stats.radiance = StageStats { seconds: start.elapsed().as_secs_f64(), rays, bytes };
+    Ok(radiance)
+}
+
+/// Decides for each two-sided chart without separate texels for its back whether the back is baked. With the radiance
+/// map of [`illuminate`], this is all that lighting texels needs.
+pub(crate) fn backs(inputs: &Inputs, radiance: &[Vec3]) -> Result<Vec<bool>> {
+    let Inputs { atlas, direct, params, progress } = *inputs;
+    let map = &atlas.radiance;
+    // Without indirect light there is no radiance map: direct light decides.
+    let light = |texel: RadianceTexel| match radiance.get(texel.index()) {
+        Some(radiance) => radiance.element_sum(),
+        None => {
+            let (_, receiver) = map.receiver(&atlas.scene, texel, map.is_back(texel));
+            let seed = combine(params.seed as u32, texel.seed());
+            direct.irradiance(&receiver, 1, seed, &mut 0).element_sum()
+        }
+    };
+    atlas.scene.device().install(|| two_sided::backs(atlas, light, progress))
+}
+
+/// Finds how texels of the light map interpolate between gather texels, for a range of placements.
+pub(crate) fn upsampling(inputs: &Inputs, backs: &[bool], placements: Range<usize>) -> Result<Upsampling> {
+    let stage = inputs.progress.stage("upsampling", 0.3, 0.315, placements.len() as u64);
+    Upsampling::find(inputs.atlas, placements, backs, &stage)
+}
+
+/// Traces the fallback gathers of texels without a valid gather texel around them. Returns their light and the number
+/// of rays.
+pub(crate) fn own_light(
+    inputs: &Inputs,
+    radiance: &Radiance,
+    backs: &[bool],
+    upsampling: &Upsampling,
+) -> Result<(OwnLight, u64)> {
+    let Inputs { atlas, params, progress, .. } = *inputs;
+    let count = params.gather_rays.min(OWN_RAYS);
+    let rays = OwnRays {
+        radiance: RadianceLookup::new(&atlas.charts, &atlas.radiance, radiance),
+        samples: &SampleSet::new(count, purpose_seed(params.seed, purpose::GATHER_SET)),
+        seed: purpose_seed(params.seed, purpose::OWN),
+    };
+    let stage = progress.stage("own light", 0.315, 0.32, upsampling.own_work());
+    upsampling.own_light(atlas, backs, &rays, &stage)
+}

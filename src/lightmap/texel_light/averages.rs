@@ -1,0 +1,192 @@
+//! Direct light of texels of the light map: light without penumbrae at their samples, whether it varies, and averages of
+//! points.
+
+use super::{AROUND, FEW, MAX_POINTS, Point, TexelLight, TilePoints, Wanted, add_to, differ, vary};
+use crate::base::sampling::combine;
+use crate::direct::Receiver;
+use crate::direct::direct_light::{Lights, PointLight};
+use crate::direct::shadow_rays::KINDS;
+use crate::lightmap::atlas::ids::{LightMap, LightTexel};
+use crate::lightmap::tiles::TILE;
+use crate::scene::Scene;
+use crate::trace::Ray;
+use glam::Vec3;
+
+/// Light of two texels or points differs if the difference is more than this fraction of the greater.
+const DIFFERENCE: f32 = 0.15;
+
+/// Height of lines of sight above the surface they run along, as a fraction of their length: it clears curved surfaces.
+const RAISED: f32 = 0.25;
+
+/// A texel whose direct light is to be averaged.
+#[derive(Clone, Copy)]
+pub(crate) struct Averaged {
+    pub texel: LightTexel,
+    pub back: bool,
+    /// The texel's sample.
+    pub receiver: Receiver,
+    /// The light of its sample without penumbrae.
+    pub sharp: Vec3,
+    pub variation: Variation,
+}
+
+/// Whether light without penumbrae varies in a texel.
+#[derive(Clone, Copy, Debug, Default, PartialEq, Eq)]
+pub(crate) enum Variation {
+    #[default]
+    None,
+    /// Not known: the texel is at the border of its chart.
+    Unknown,
+    Some,
+}
+
+impl TexelLight<'_, LightMap> {
+    /// Computes light without penumbrae at the sample itself.
+    pub(crate) fn sharp(&self, receiver: &Receiver, rays: &mut u64) -> Vec3 {
+        if !self.direct.has_sharp() {
+            return Vec3::ZERO;
+        }
+        self.direct.at_point(receiver, Lights::Sharp, 0, 0, rays).sharp
+    }
+
+    /// Computes light without penumbrae at samples: at most [`MAX_POINTS`] times as many as `tile` has room for texels.
+    pub(crate) fn sharp_of_tile(
+        &self,
+        receivers: impl Iterator<Item = Receiver>,
+        tile: &mut TilePoints,
+        rays: &mut u64,
+        mut out: impl FnMut(usize, Vec3),
+    ) {
+        let mut shadow = tile.room.begin(self.areas.scene);
+        let mut count = 0;
+        for receiver in receivers {
+            shadow.slot = KINDS * count;
+            self.direct.push(&receiver, 0, Lights::Sharp, 0, 0, &mut shadow);
+            count += 1;
+        }
+        let mut light = PointLight::default();
+        for (i, sums) in shadow.finish(rays).chunks_exact(KINDS).take(count).enumerate() {
+            light.take(sums);
+            out(i, light.sharp);
+        }
+    }
+
+    /// Whether light without penumbrae varies in a texel, judged by its neighbours: `sharp` is the texel's own light,
+    /// and `of` returns a neighbour's.
+    pub(crate) fn varies(&self, texel: LightTexel, sharp: Vec3, mut of: impl FnMut(LightTexel) -> Vec3) -> Variation {
+        if !self.direct.has_sharp() {
+            return Variation::None;
+        }
+        let mut variation = Variation::None;
+        for (dx, dy) in AROUND {
+            match self.areas.neighbour(texel, dx, dy) {
+                Some(s) if differ(sharp, of(s), DIFFERENCE) => return Variation::Some,
+                // Diagonal neighbours are missed at every second edge.
+                None if dx == 0 || dy == 0 => variation = Variation::Unknown,
+                _ => {}
+            }
+        }
+        variation
+    }
+
+    /// Computes the direct light of the texels of a tile.
+    pub(crate) fn irradiance(
+        &self,
+        texels: &[Averaged],
+        tile: &mut TilePoints,
+        rays: &mut u64,
+        mut out: impl FnMut(usize, Vec3),
+    ) {
+        let soft = self.direct.has_soft();
+        let lights_of = |variation| match (variation, soft) {
+            (Variation::None, false) => None,
+            (Variation::None, true) => Some(Lights::Soft),
+            (_, false) => Some(Lights::Sharp),
+            (_, true) => Some(Lights::All),
+        };
+        let few = |variation| if variation == Variation::Some { MAX_POINTS as u32 } else { FEW };
+        let wanted = |place: usize, t: &Averaged, numbers| {
+            let lights = lights_of(t.variation)?;
+            Some(Wanted { place, texel: t.texel, back: t.back, numbers, lights })
+        };
+        let first = texels.iter().enumerate().filter_map(|(i, t)| wanted(i, t, 0..few(t.variation)));
+        tile.clear();
+        tile.light(self, first, rays);
+        let mut goes_on = [false; TILE];
+        for (i, (t, goes_on)) in texels.iter().zip(&mut goes_on).enumerate() {
+            let points = tile.of(i);
+            *goes_on = few(t.variation) == FEW
+                && (has_penumbra(points)
+                    || (t.variation == Variation::Unknown && vary(points, PointLight::narrow, DIFFERENCE)));
+        }
+        let more = texels.iter().enumerate().filter(|(i, _)| goes_on[*i]);
+        tile.light(self, more.filter_map(|(i, t)| wanted(i, t, FEW..MAX_POINTS as u32)), rays);
+        for (i, t) in texels.iter().enumerate() {
+            let e = match lights_of(t.variation) {
+                Some(_) => self.average(t, tile.of_mut(i), goes_on[i], rays),
+                None => t.sharp,
+            };
+            out(i, e);
+        }
+    }
+
+    /// Averages the light of a texel's points; `goes_on`: more than the first few have been lit.
+    fn average(&self, t: &Averaged, points: &mut [Point], goes_on: bool, rays: &mut u64) -> Vec3 {
+        let (scene, sharp) = (self.areas.scene, t.sharp);
+        let points = match t.variation {
+            Variation::None => points,
+            _ => without_other_rooms(points, scene, &t.receiver, sharp, rays),
+        };
+        let mut sum = PointLight::default();
+        let n = add_to(points, scene, &mut sum, |_| Vec3::ONE, rays);
+        if n == Vec3::ZERO {
+            // All points miss a small part of a chart: its sample alone is lit.
+            let seed = combine(self.seed, t.texel.seed());
+            return sharp + self.direct.at_point(&t.receiver, Lights::Soft, self.samples, seed, rays).value();
+        }
+        let is_even = t.variation == Variation::Unknown
+            && !goes_on
+            && !points.iter().any(|p| differ(p.light.sharp, sharp, DIFFERENCE));
+        if is_even {
+            // The sample lies in the middle of the chart's part in the texel, whereas the few points lie anywhere in
+            // it.
+            sum.sharp = sharp * n;
+        }
+        let e = sum.value() / n;
+        if t.variation == Variation::None { sharp + e } else { e }
+    }
+}
+
+/// Whether another surface stands between two points of a surface.
+fn is_hidden(scene: &Scene, a: &Receiver, b: &Receiver, rays: &mut u64) -> bool {
+    let raise = RAISED * a.origin.distance(b.origin);
+    let (from, to) = (a.origin + raise * a.geometric, b.origin + raise * b.geometric);
+    *rays += 1;
+    scene.occluded(&Ray::new(from, to - from).within(0.0, 1.0))
+}
+
+/// Whether some point lies in the penumbra of a disc.
+fn has_penumbra(points: &[Point]) -> bool {
+    points.iter().any(|p| p.light.is_in_a_penumbra_of_discs()) || vary(points, PointLight::of_discs, DIFFERENCE)
+}
+
+/// Returns the points that are seen from the texel's sample, `own`, whose light without penumbrae is `sharp`. Points with
+/// the same light are kept without a test.
+fn without_other_rooms<'p>(
+    points: &'p mut [Point],
+    scene: &Scene,
+    own: &Receiver,
+    sharp: Vec3,
+    rays: &mut u64,
+) -> &'p mut [Point] {
+    let mut kept = 0;
+    for i in 0..points.len() {
+        let point = points[i];
+        if differ(point.light.sharp, sharp, DIFFERENCE) && is_hidden(scene, own, &point.receiver, rays) {
+            continue;
+        }
+        points[kept] = point;
+        kept += 1;
+    }
+    &mut points[..kept]
+}

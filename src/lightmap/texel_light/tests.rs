@@ -1,0 +1,157 @@
+//! Tests of the direct light of texels.
+
+use super::*;
+use crate::base::progress::Progress;
+use crate::lightmap::{BakeParams, Lightmap, LightmapDesc};
+use crate::scene::demo::shapes::MeshBuilder;
+use crate::scene::{Light, Material, SceneData, builtin};
+use std::sync::Arc;
+
+fn created(scene: &Arc<Scene>, texels_per_unit: f32) -> Lightmap {
+    let desc = LightmapDesc { texels_per_unit, page_size: 512, both_sides: false, ..Default::default() };
+    Lightmap::create(scene, &desc, &Progress::none()).unwrap()
+}
+
+#[test]
+fn points_of_a_texel_lie_in_it_and_on_its_chart() {
+    let scene = builtin("atrium").unwrap().committed();
+    let map = created(&scene, 5.0);
+    let atlas = map.atlas();
+    let areas = atlas.areas(&atlas.radiance);
+    let (mut found, mut other_triangles) = (0, 0);
+    for sample in atlas.radiance.all().step_by(11) {
+        let own = atlas.radiance[sample];
+        let placement = atlas.radiance.placement_of(&atlas.charts, sample);
+        for number in 0..16 {
+            let Some(p) = areas.point(sample, number, 3) else { continue };
+            assert_eq!(atlas.charts.chart_of(p.triangle), atlas.charts.chart_of(own.triangle));
+            let at = atlas.radiance.layout.texel_coord(placement, atlas.charts.local(p.triangle, p.u, p.v));
+            let within = Vec2::from(at) - Vec2::new(own.x as f32, own.y as f32);
+            assert!(within.min_element() > -0.01 && within.max_element() < 1.01, "{within}");
+            found += 1;
+            other_triangles += (p.triangle != own.triangle) as u32;
+        }
+    }
+    assert!(found > 1000 && other_triangles > 100, "{found} points, {other_triangles} on other triangles");
+}
+
+/// A floor below a roof that ends at x = `edge`, or has a slit there, `slit` wide, under the sun at the zenith.
+fn under_a_roof(edge: f32, slit: f32, angular_radius: f32) -> Arc<Scene> {
+    let mut data = SceneData::new();
+    let m = data.add_material(Material { albedo: [0.5; 3], two_sided: true, ..Default::default() }).unwrap();
+    let mut builder = MeshBuilder::new();
+    let p = |x: f32, y: f32, z: f32| Vec3::new(x, y, z);
+    builder.quad(p(0.0, 0.0, 0.0), p(4.0, 0.0, 0.0), p(4.0, 4.0, 0.0), p(0.0, 4.0, 0.0), m);
+    let mut roof = |x0: f32, x1: f32| {
+        builder.quad(p(x0, -1.0, 1.0), p(x1, -1.0, 1.0), p(x1, 5.0, 1.0), p(x0, 5.0, 1.0), m);
+    };
+    roof(edge, 5.0);
+    if slit > 0.0 {
+        roof(-1.0, edge - slit);
+    }
+    data.add_mesh(builder.finish()).unwrap();
+    let direction = -Vec3::Z;
+    data.add_light(Light::Directional { direction, irradiance: [2.0; 3], angular_radius }).unwrap();
+    data.committed()
+}
+
+#[test]
+fn a_texel_that_a_shadow_edge_crosses_has_the_part_of_the_light_that_falls_on_it() {
+    for angular_radius in [0.0, 0.004] {
+        for edge in [1.93, 2.0, 2.07] {
+            let scene = under_a_roof(edge, 0.0, angular_radius);
+            let mut map = created(&scene, 4.0);
+            let params = BakeParams { gather_rays: 0, ..Default::default() };
+            map.bake(&params, &Progress::none()).unwrap();
+            let (atlas, light) = (map.atlas(), map.light.as_ref().unwrap());
+            let (mut crossed, mut sum, mut expected) = (0, 0.0, 0.0);
+            for (sample, direct) in light.direct.iter().enumerate() {
+                let t = &atlas.map.texels.samples[sample];
+                let x = t.position(&scene);
+                if x.z > 0.5 {
+                    continue;
+                }
+                let part = ((edge - x.x) * 4.0 + 0.5).clamp(0.0, 1.0);
+                assert!((direct.x / 2.0 - part).abs() < 0.1, "edge {edge}: {} at {x}, not {part}", direct.x / 2.0);
+                crossed += (part > 0.0 && part < 1.0) as u32;
+                sum += direct.x / 2.0;
+                expected += part;
+            }
+            assert!(crossed > 10 || edge == 2.0, "{crossed} texels are crossed by the edge at {edge}");
+            assert!((sum / expected - 1.0).abs() < 2e-3, "{sum} instead of {expected}");
+        }
+    }
+}
+
+#[test]
+fn a_floor_that_goes_on_below_a_block_has_no_dark_rim_around_it() {
+    let mut data = SceneData::new();
+    let m = data.add_material(Material { albedo: [0.5; 3], ..Default::default() }).unwrap();
+    let mut builder = MeshBuilder::new();
+    let p = |x: f32, y: f32| Vec3::new(x, y, 0.0);
+    builder.quad(p(0.0, 0.0), p(4.0, 0.0), p(4.0, 4.0), p(0.0, 4.0), m);
+    builder.box_(Vec3::new(1.0, 1.0, -1.0), Vec3::new(2.1, 2.1, 1.0), false, m);
+    data.add_mesh(builder.finish()).unwrap();
+    let (direction, irradiance) = (-Vec3::Z, [2.0; 3]);
+    data.add_light(Light::Directional { direction, irradiance, angular_radius: 0.0 }).unwrap();
+    let scene = data.committed();
+    let mut map = created(&scene, 4.0);
+    map.bake(&BakeParams { gather_rays: 0, ..Default::default() }, &Progress::none()).unwrap();
+    let (atlas, light) = (map.atlas(), map.light.as_ref().unwrap());
+    let floor = |s: &usize| {
+        let t = &atlas.map.texels.samples[*s];
+        t.geometric_normal(&scene).z > 0.9 && t.position(&scene).z.abs() < 1e-3
+    };
+    let lit: Vec<f32> = (0..light.direct.len()).filter(floor).map(|s| light.direct[s].x).collect();
+    assert!(lit.len() > 200 && lit.iter().all(|e| (e - 2.0).abs() < 1e-4), "{lit:?}");
+}
+
+#[test]
+fn the_sun_does_not_leak_below_a_wall_into_the_texels_of_a_dark_room() {
+    for wall in [2.03, 2.2] {
+        let mut data = SceneData::new();
+        let m = data.add_material(Material { albedo: [0.5; 3], two_sided: true, ..Default::default() }).unwrap();
+        let mut builder = MeshBuilder::new();
+        let p = Vec3::new;
+        builder.quad(p(0.0, 0.0, 0.0), p(4.0, 0.0, 0.0), p(4.0, 4.0, 0.0), p(0.0, 4.0, 0.0), m);
+        builder.quad(p(wall, -9.0, 0.0), p(wall, 9.0, 0.0), p(wall, 9.0, 9.0), p(wall, -9.0, 9.0), m);
+        data.add_mesh(builder.finish()).unwrap();
+        let (direction, irradiance) = (p(-1.0, 0.0, -1.0).normalize(), [2.0; 3]);
+        data.add_light(Light::Directional { direction, irradiance, angular_radius: 0.0 }).unwrap();
+        let scene = data.committed();
+        let mut map = created(&scene, 4.0);
+        map.bake(&BakeParams { gather_rays: 0, ..Default::default() }, &Progress::none()).unwrap();
+        let (atlas, light) = (map.atlas(), map.light.as_ref().unwrap());
+        let mut lit = 0;
+        for (t, e) in atlas.map.texels.samples.iter().zip(&light.direct) {
+            let at = t.position(&scene);
+            if scene.normal(t.triangle).z > 0.9 {
+                let expected = if at.x > wall { std::f32::consts::SQRT_2 } else { 0.0 };
+                assert!((e.x - expected).abs() < 1e-4, "{} at {at}, wall at {wall}", e.x);
+                lit += (expected > 0.0) as u32;
+            }
+        }
+        assert!(lit > 100);
+    }
+}
+
+#[test]
+fn the_radiance_map_has_the_energy_of_a_patch_of_sun_smaller_than_its_texels() {
+    for (edge, angular_radius) in [(1.63, 0.0), (2.11, 0.0), (2.38, 0.0), (2.11, 0.004)] {
+        let scene = under_a_roof(edge, 0.1, angular_radius);
+        let map = created(&scene, 10.0);
+        let atlas = map.atlas();
+        let direct = DirectLight::new(&scene);
+        let light = TexelLight { areas: atlas.areas(&atlas.radiance), direct: &direct, samples: 4, seed: 5 };
+        let input = crate::lightmap::indirect::radiance_map::RadianceInput { light, photons: None };
+        let mut values = vec![Vec3::ZERO; atlas.radiance.len()];
+        let progress = Progress::none();
+        let stage = progress.stage("radiance", 0.0, 1.0, 1);
+        crate::lightmap::indirect::radiance_map::bake(scene.device(), &input, &mut values, &stage).unwrap();
+        // Texels are 0.4 wide, and 10 of them have the floor's width. Per metre of the slit:
+        let on_floor = |s: &usize| atlas.radiance.texels.samples[*s].position(&scene).z.abs() < 0.5;
+        let sum: f32 = (0..values.len()).filter(on_floor).map(|s| values[s].x * 0.16).sum();
+        let energy = sum * std::f32::consts::PI / 0.5 / 4.0;
+        assert!((energy / (2.0 * 0.1) - 1.0).abs() < 0.03, "{energy} instead of 0.2, edge {edge}");
+    }
+}
