@@ -1,5 +1,5 @@
-//! Gather rays of tiles of neighbouring texels and of one origin: as streams, and in packets whose rays are traced one by
-//! one; shadow rays of tiles to a lamp: as streams, and by one call each.
+//! Gather rays of tiles of neighbouring texels and of one origin: as streams, and in packets whose rays are traced one
+//! by one; shadow rays of tiles to a lamp: as streams, and by one call each.
 //!
 //!     cargo bench --features io --bench tiles -- SCENE... [ISA...] [8x8x64... lamp]
 //!
@@ -40,7 +40,8 @@ fn packets(scene: &Scene, rays: &[Ray], out: &mut [RawHit]) {
     }
 }
 
-/// Alternating runs over all tiles. Returns the time of the second way and the ratio of the first to it, medians of six.
+/// Alternating runs over all tiles. Returns the time of the second way and the ratio of the first to it, medians of
+/// six.
 fn compare(tiles: &[Vec<Ray>], mut first: impl FnMut(&[Ray]), mut second: impl FnMut(&[Ray])) -> (f64, f64) {
     let (mut ratios, mut times) = (vec![], vec![]);
     for round in 0..7 {

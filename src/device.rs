@@ -142,8 +142,8 @@ impl Device {
         result.expect("the work has been done, or it has unwound")
     }
 
-    /// Does the work of [`install`](Self::install). Compiled once: when rayon's part of it was compiled for each caller, the
-    /// library had 9 % more code and took 10 % longer to compile.
+    /// Does the work of [`install`](Self::install). Compiled once: when rayon's part of it was compiled for each
+    /// caller, the library had 9 % more code and took 10 % longer to compile.
     fn install_work(&self, work: Work) {
         if callback::is_running() {
             return on_extra_thread(work);

@@ -1,8 +1,8 @@
 //! Each module (floor) of the library imports only from those above it in docs/architecture.md, and no
 //! two folders or files import each other in a circle. Nor do those of the command line.
 //!
-//! Paths that begin with `crate::` or `super::` are looked at, tests apart. What `lib.rs` re-exports is for users of the
-//! library: inside, imports name the module that an item is defined in.
+//! Paths that begin with `crate::` or `super::` are looked at, tests apart. What `lib.rs` re-exports is for users of
+//! the library: inside, imports name the module that an item is defined in.
 
 use std::collections::{BTreeMap, BTreeSet};
 use std::path::{Path, PathBuf};
@@ -270,7 +270,8 @@ fn the_parser_sees_what_it_is_for() {
     };
     let of = |f: &File| paths(f).into_iter().map(|p| p.join("::")).collect::<Vec<_>>();
     let text = "use crate::live::{self, Live, save::{A, B}};\nuse super::x::Y;\nlet a = crate::trace::offset(1);\n\
-                #[cfg(test)]\nfn t() {\n    crate::capi::no()\n}\n// crate::io\n#[cfg(test)]\nmod tests { use crate::io; }";
+                #[cfg(test)]\nfn t() {\n    crate::capi::no()\n}\n// crate::io\n\
+                #[cfg(test)]\nmod tests { use crate::io; }";
     let expected = ["lightmap::x::Y", "live::Live", "live::save::A", "live::save::B", "live::self", "trace::offset"];
     assert_eq!(of(&file("lightmap::bake", text)), expected);
     assert_eq!([floor(&["scene".into(), "x".into()]), floor(&["Scene".into()])], [Some(4), None]);

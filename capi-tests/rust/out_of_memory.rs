@@ -330,8 +330,8 @@ fn small_lightmap(device: &Arc<Device>) -> Lightmap {
     Lightmap::create(&scene, &desc, &none).unwrap()
 }
 
-/// Traces streams on all threads. Each keeps the memory that it takes for them; without, rays are traced one by one, so that
-/// no call fails for it.
+/// Traces streams on all threads. Each keeps the memory that it takes for them; without, rays are traced one by one, so
+/// that no call fails for it.
 fn trace_streams(scene: &Scene) {
     let up = |i: usize| Ray::new(Vec3::splat(0.1), Vec3::new((i % 7) as f32 - 3.0, (i % 5) as f32 - 2.5, 1.0));
     let rays: Vec<Ray> = (0..1 << 18).map(up).collect();

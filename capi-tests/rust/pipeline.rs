@@ -565,7 +565,8 @@ fn cancel_at_each_report(mut call: impl FnMut(&Progress) -> Result<(), Error>) -
     for last in 0.. {
         let (mut reports, mut stage) = (0, String::new());
         let result = call(&Progress::new(|_, name| {
-            // It comes only if the threads are slow to begin the first stage, so that it would be counted in some calls.
+            // It comes only if the threads are slow to begin the first stage, so that it would be counted in some
+            // calls.
             if name == "start" {
                 return true;
             }

@@ -1,5 +1,5 @@
-//! What the fuzz targets share. Its files are also those of `capi-tests/rust/damaged_files.rs`, a short run with the stable
-//! toolchain.
+//! What the fuzz targets share. Its files are also those of `capi-tests/rust/damaged_files.rs`, a short run with the
+//! stable toolchain.
 
 pub mod damaged_files;
 pub mod live_state;

@@ -11,7 +11,8 @@ use std::io::{self, ErrorKind, Read, Write};
 use std::path::{Path, PathBuf};
 
 /// Number of bytes between two flushes to disk, between which a call can end. A slow disk takes 13 ms for so many, and
-/// 40 ms for four times as many, in which it would write a third faster; several threads that flush wait for each other.
+/// 40 ms for four times as many, in which it would write a third faster; several threads that flush wait for each
+/// other.
 const SYNC_BYTES: usize = 1 << 20;
 
 /// Opens a regular file to read. Fails for folders, devices, FIFOs and sockets, and never waits for one of them: the

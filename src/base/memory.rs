@@ -148,8 +148,8 @@ pub fn try_zeroed<T: bytemuck::Zeroable>(len: usize, what: &str) -> Result<Vec<T
     Ok(v)
 }
 
-/// Makes a `Vec` of `len` zeros of which large parts may never be written: in small pages, as untouched ones then take no
-/// memory.
+/// Makes a `Vec` of `len` zeros of which large parts may never be written: in small pages, as untouched ones then take
+/// no memory.
 pub fn try_zeroed_as_needed<T: bytemuck::Zeroable>(len: usize, what: &str) -> Result<Vec<T>> {
     bytemuck::allocation::try_zeroed_vec(len).map_err(|_| too_large::<T>(len, what))
 }

@@ -1,5 +1,5 @@
-//! Working memory of the tasks of a parallel loop, which they hand on to one another: as much is made as tasks run at a time,
-//! instead of once per task.
+//! Working memory of the tasks of a parallel loop, which they hand on to one another: as much is made as tasks run at a
+//! time, instead of once per task.
 
 use crate::base::error::Result;
 use std::ops::{Deref, DerefMut};

@@ -50,8 +50,8 @@ impl BinMap {
     }
 }
 
-/// Determines the sides of a split by the same arithmetic as [`BinMap::indices`]: what is less than a whole number is so
-/// rounded down, too, and the last bin is never on the left.
+/// Determines the sides of a split by the same arithmetic as [`BinMap::indices`]: what is less than a whole number is
+/// so rounded down, too, and the last bin is never on the left.
 pub(super) struct Side {
     pub(super) axis: usize,
     pub(super) origin: f32,
@@ -190,8 +190,8 @@ impl Bins {
             let b = _mm_slli_epi32::<SHIFT>(_mm_cvttps_epi32(b));
             let offsets = [_mm_extract_epi32::<0>(b), _mm_extract_epi32::<1>(b), _mm_extract_epi32::<2>(b)];
             for (axis, offset) in offsets.into_iter().enumerate() {
-                // SAFETY: 0 ≤ bin ≤ `last`, whatever the reference; a map has at most as many bins as there are here. Boxes
-                // are aligned as above.
+                // SAFETY: 0 ≤ bin ≤ `last`, whatever the reference; a map has at most as many bins as there are here.
+                // Boxes are aligned as above.
                 unsafe {
                     let bin = bins.byte_add(offset as u32 as usize);
                     let p = (&raw mut (*bin).boxes[axis]).cast();

@@ -3,9 +3,10 @@
 //! area is opened first. (The best choice, by dynamic programming as in Ylitie, Karras and Laine 2017, makes
 //! rays visit 1 to 3 % fewer nodes and takes a sixth of the whole build's time.)
 //!
-//! Children come in the order in which rays to any hit should visit them, from last to first: the one with the largest area
-//! for its triangles is visited first, since it ends most rays for its cost. (Embree sorts by numbers of primitives. Visited
-//! by distance, as for closest hits, occlusion took 1.3 to 2 times as long: docs/experiments.md#order-of-children.)
+//! Children come in the order in which rays to any hit should visit them, from last to first: the one with the largest
+//! area for its triangles is visited first, since it ends most rays for its cost. (Embree sorts by numbers of
+//! primitives. Visited by distance, as for closest hits, occlusion took 1.3 to 2 times as long:
+//! docs/experiments.md#order-of-children.)
 
 use super::binary::{BinaryBvh, BinaryNode};
 use super::compact::{self, Compact, CompactNode};

@@ -1,6 +1,6 @@
-//! Slabs of equal width in a node's box, and the plane between two of them at which a [spatial split](super::spatial) costs
-//! least. What a triangle has in each slab is estimated in f32: planes are chosen by it, and boxes of references come from
-//! [`cut`](super::cut).
+//! Slabs of equal width in a node's box, and the plane between two of them at which a [spatial split](super::spatial)
+//! costs least. What a triangle has in each slab is estimated in f32: planes are chosen by it, and boxes of references
+//! come from [`cut`](super::cut).
 
 use super::binned::PARALLEL_SUBTREE;
 use super::bins::{in_parallel, on_heap};
@@ -60,8 +60,8 @@ impl Grid {
         let last = Vec4::splat(self.slabs as f32 - 1.0);
         [-b.neg_lower, b.upper].map(|corner| {
             let slab = ((corner - lower) * scale).max(Vec4::ZERO).min(last);
-            // SAFETY: 0 ≤ slab < SLABS. No lane is NaN: corners are finite, as those of valid triangles are, and so is the
-            // scale.
+            // SAFETY: 0 ≤ slab < SLABS. No lane is NaN: corners are finite, as those of valid triangles are, and so is
+            // the scale.
             [slab.x, slab.y, slab.z].map(|x| unsafe { x.to_int_unchecked() })
         })
     }

@@ -104,8 +104,8 @@ impl Piece {
         }
     }
 
-    /// Writes the subtree to slots of its own, which are in number as many as its [`size`](Self::size) says and the first
-    /// of which have these numbers.
+    /// Writes the subtree to slots of its own, which are in number as many as its [`size`](Self::size) says and the
+    /// first of which have these numbers.
     fn write(self, nodes: &mut [BinaryNode], triangles: &mut [u32], first_node: u32, first_triangle: u32) {
         match self {
             Piece::Flat(f) => {

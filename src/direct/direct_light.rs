@@ -267,8 +267,8 @@ impl DirectLight {
         light
     }
 
-    /// Pushes the shadow rays of a point, for the [`KINDS`](super::shadow_rays::KINDS) slots from the current one on. It
-    /// is point `number` of those that share `seed`: their samples of a light are stratified together. Returns the
+    /// Pushes the shadow rays of a point, for the [`KINDS`](super::shadow_rays::KINDS) slots from the current one on.
+    /// It is point `number` of those that share `seed`: their samples of a light are stratified together. Returns the
     /// point's light, which is to [take](PointLight::take) what arrives in these slots. `samples`: per point, as in
     /// [`irradiance`](Self::irradiance).
     pub(crate) fn push(

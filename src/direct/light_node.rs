@@ -1,5 +1,5 @@
-//! Nodes of the [light tree](super::light_tree), and their importance for a receiver, eight nodes at a time (Conty Estevez
-//! and Kulla 2018, section 4.3).
+//! Nodes of the [light tree](super::light_tree), and their importance for a receiver, eight nodes at a time (Conty
+//! Estevez and Kulla 2018, section 4.3).
 //!
 //! No product and sum are fused, so that the importance has the same bits on every instruction set.
 

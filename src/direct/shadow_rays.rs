@@ -1,7 +1,7 @@
 //! Shadow rays, collected and traced together, with the unoccluded light of each.
 //!
-//! Those of a tile of texels go down the tree as a [stream](crate::trace). The light that arrives is added up per slot in
-//! the order of the rays, whatever is traced together: a point has the same bits alone and in a tile.
+//! Those of a tile of texels go down the tree as a [stream](crate::trace). The light that arrives is added up per slot
+//! in the order of the rays, whatever is traced together: a point has the same bits alone and in a tile.
 
 use super::light_tree::Descent;
 use super::receiver::Receiver;
@@ -20,8 +20,8 @@ pub(crate) fn shadow_ray(receiver: &Receiver, target: Vec3) -> Ray {
     Ray::new(receiver.shadow_origin, target - receiver.shadow_origin).within(0.0, 1.0 - LIGHT_MARGIN)
 }
 
-/// Number of shadow rays of one point that are traced together. (Direct light of the living room, 20 texels/m: 1.4 s; one
-/// by one 2.15 s.)
+/// Number of shadow rays of one point that are traced together. (Direct light of the living room, 20 texels/m: 1.4 s;
+/// one by one 2.15 s.)
 const TOGETHER: usize = 32;
 
 /// Maximum number of shadow rays of a tile that are traced together, and the minimum that are worth a stream.

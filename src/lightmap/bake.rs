@@ -1,5 +1,5 @@
-//! The bake: stages in order, each with its share of progress, time and memory. Those that live updates have, too, are in
-//! [`stages`].
+//! The bake: stages in order, each with its share of progress, time and memory. Those that live updates have, too, are
+//! in [`stages`].
 //!
 //! The file is long because it has every stage once, in order: this order is what a reader looks for here.
 
@@ -453,8 +453,8 @@ impl<'p> Bake<'_, 'p> {
                 let mut tile = tiles.take(|| TilePoints::new(TILE))?;
                 let mut of_tile = try_with_capacity(TILE, "the texels of a tile")?;
                 let mut order = in_order(&l.map, first..first + direct.len())?;
-                // The others have their light. (Direct light of Sponza in the sun, 12 texels/m: 0.85 of the time with their
-                // receivers.)
+                // The others have their light. (Direct light of Sponza in the sun, 12 texels/m: 0.85 of the time with
+                // their receivers.)
                 order.retain(|t| self.direct.has_soft() || variations[t.index() - first] != Variation::None);
                 for some in order.chunks(texels_per_tile(texels.samples)) {
                     self.progress.check()?;

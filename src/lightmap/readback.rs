@@ -141,7 +141,8 @@ impl Lightmap {
         l.to_array()
     }
 
-    /// Composes a page from values of texels. `fill` turns the value of the nearest covered texel into that of a texel within
+    /// Composes a page from values of texels. `fill` turns the value of the nearest covered texel into that of a texel
+    /// within
     /// `padding` of a chart.
     fn page<T: Copy + Default>(
         &self,

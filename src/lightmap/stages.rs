@@ -1,5 +1,5 @@
-//! Stages that a bake and live updates share, as functions of their [`Inputs`]: photons and radiance map, the sides that
-//! are shown, how texels interpolate, and fallback gathers.
+//! Stages that a bake and live updates share, as functions of their [`Inputs`]: photons and radiance map, the sides
+//! that are shown, how texels interpolate, and fallback gathers.
 
 use super::atlas::Atlas;
 use super::atlas::ids::RadianceTexel;

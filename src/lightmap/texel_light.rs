@@ -1,5 +1,6 @@
 //! Direct light of a texel: an average over the part of the chart that the texel covers. This file has the points of
-//! texels and their light; [`averages`] what texels of the light map make of it, and [`looks`] those of the radiance map.
+//! texels and their light; [`averages`] what texels of the light map make of it, and [`looks`] those of the radiance
+//! map.
 //!
 //! A point sample at the texel's centre turns every shadow edge into stairs, and misses or exaggerates light that falls
 //! on less than a texel. Averages are taken where they matter:
@@ -14,8 +15,8 @@
 //! would leak in.
 //!
 //! The data used of neighbours is a function of their numbers alone, so that shards of a bake and tiles of live
-//! updates, which recompute it, have the same bits. The shadow rays of a [tile](super::tiles) are traced together, which
-//! changes no bit.
+//! updates, which recompute it, have the same bits. The shadow rays of a [tile](super::tiles) are traced together,
+//! which changes no bit.
 
 pub(crate) mod averages;
 pub(crate) mod looks;

@@ -12,8 +12,8 @@ use std::ops::Range;
 /// Maximum number of texels of a tile.
 pub(crate) const TILE: usize = 64;
 
-/// Number of texels to a tile, given the samples of direct light of each: [`TILE`] unless they are so many that a cancel
-/// would wait for a tile too long.
+/// Number of texels to a tile, given the samples of direct light of each: [`TILE`] unless they are so many that a
+/// cancel would wait for a tile too long.
 pub(crate) fn texels_per_tile(samples: u32) -> usize {
     const SAMPLES: usize = 4096;
     (SAMPLES / samples.max(1) as usize).clamp(1, TILE)

@@ -11,8 +11,8 @@
 //! are exactly 1. (Pieces of all surfaces in a grid of their own, summed as photons are, left more bias in a furnished
 //! room – 1.4 % of the median point instead of 0.5 % – and were three times as many there as photons.)
 //!
-//! The discs of a tile of texels trace their rays together, as [streams](crate::trace), step by step: a disc has the same
-//! bits alone and in a tile.
+//! The discs of a tile of texels trace their rays together, as [streams](crate::trace), step by step: a disc has the
+//! same bits alone and in a tile.
 
 use super::PhotonMap;
 use super::cylinder::SAME_SURFACE;
@@ -80,8 +80,8 @@ impl Discs {
         })
     }
 
-    /// Computes the irradiance at points (position, normal, seed) from the photons and the surface that are visible from
-    /// each. Adds the rays traced to `rays`.
+    /// Computes the irradiance at points (position, normal, seed) from the photons and the surface that are visible
+    /// from each. Adds the rays traced to `rays`.
     pub(crate) fn irradiance(
         &mut self,
         map: &PhotonMap,
@@ -152,8 +152,8 @@ impl Discs {
         }
     }
 
-    /// Probes of the given numbers find where there is visible surface in each disc that `goes_on`: rays down from points at
-    /// the apex's height, and lines of sight from surfaces that they find, if these face as the normal does.
+    /// Probes of the given numbers find where there is visible surface in each disc that `goes_on`: rays down from
+    /// points at the apex's height, and lines of sight from surfaces that they find, if these face as the normal does.
     fn probe(&mut self, map: &PhotonMap, numbers: Range<u32>, goes_on: impl Fn(&Disc) -> bool, rays: &mut u64) {
         let (scene, height, radius) = (map.scene(), half_height(map), map.cylinder.radius);
         self.clear_rays();

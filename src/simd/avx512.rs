@@ -35,8 +35,8 @@ impl Simd for Avx512Vbmi2 {
     #[inline(always)]
     unsafe fn pick(masks: *const u8, numbers: *const u16, count: usize, bit: u32, out: *mut u16) -> usize {
         let mut n = 0;
-        // SAFETY: the caller vouches for masks and numbers up to the next multiple of 32, and for `out`, of which no more
-        // than `count` numbers have been taken when 32 more are written.
+        // SAFETY: the caller vouches for masks and numbers up to the next multiple of 32, and for `out`, of which no
+        // more than `count` numbers have been taken when 32 more are written.
         unsafe {
             let bit = _mm256_set1_epi8(1 << bit);
             for first in (0..count).step_by(32) {

@@ -21,12 +21,14 @@ use std::sync::OnceLock;
 mod avx2;
 #[cfg(target_arch = "x86_64")]
 mod avx512;
+mod kernel;
 mod portable;
 
 #[cfg(target_arch = "x86_64")]
 pub(crate) use avx2::Avx2;
 #[cfg(target_arch = "x86_64")]
 pub(crate) use avx512::{Avx512, Avx512Vbmi2};
+pub(crate) use kernel::kernel;
 pub(crate) use portable::Portable;
 
 /// Calls the macro `$then` with the CPU features of an ISA in brackets, followed by `$args`.
@@ -67,47 +69,6 @@ macro_rules! entry_point {
     };
 }
 pub(crate) use entry_point;
-
-/// Defines a kernel of a single function, and the function `$pick` that returns its entry point for an ISA: the
-/// portable one if the machine cannot run the ISA. In the body, `$lanes` are the ISA's vectors; it may call whatever
-/// needs nothing but the ISA.
-macro_rules! kernel {
-    ($(#[$doc:meta])* $visible:vis fn $pick:ident -> $pointer:ty;
-        fn $name:ident<$lanes:ident>($($arg:ident: $type:ty),*) $body:block
-    ) => {
-        $(#[$doc])*
-        $visible fn $pick(isa: $crate::simd::Isa) -> $pointer {
-            match isa {
-                #[cfg(target_arch = "x86_64")]
-                $crate::simd::Isa::Avx2 if isa.is_available() => avx2::checked,
-                #[cfg(target_arch = "x86_64")]
-                $crate::simd::Isa::Avx512 if isa.is_available() => avx512::checked,
-                _ => portable::checked,
-            }
-        }
-
-        $crate::simd::kernel! { @portable Portable $name $lanes ($($arg: $type),*) $body }
-        #[cfg(target_arch = "x86_64")]
-        $crate::simd::kernel! { @avx2 Avx2 $name $lanes ($($arg: $type),*) $body }
-        #[cfg(target_arch = "x86_64")]
-        $crate::simd::kernel! { @avx512 Avx512 $name $lanes ($($arg: $type),*) $body }
-    };
-    (@$module:ident $isa:ident $name:ident $lanes:ident ($($arg:ident: $type:ty),*) $body:block) => {
-        mod $module {
-            use super::*;
-            use $crate::simd::{entry_point, isa_features, $isa as $lanes};
-
-            isa_features! { $isa => entry_point! { fn $name($($arg: $type),*) $body } }
-
-            /// Returned only where the machine has the ISA.
-            pub(super) fn checked($($arg: $type),*) {
-                // SAFETY: see above.
-                unsafe { $name($($arg),*) }
-            }
-        }
-    };
-}
-pub(crate) use kernel;
 
 /// Whether the CPU has all of the features.
 #[cfg(all(target_arch = "x86_64", not(miri)))]
@@ -207,9 +168,9 @@ pub(crate) trait Simd: Copy {
     /// Writes those of `count` numbers whose mask byte has the bit `bit`, in their order, to `out`; returns how many.
     ///
     /// # Safety
-    /// The CPU must have the ISA. `masks` must be valid for reading `count` bytes, rounded up to a multiple of 32, of which
-    /// those from `count` on are 0; `numbers` for reading, and `out` for writing, `count` numbers rounded up likewise. `out`
-    /// may overlap what lies behind the `count` numbers.
+    /// The CPU must have the ISA. `masks` must be valid for reading `count` bytes, rounded up to a multiple of 32, of
+    /// which those from `count` on are 0; `numbers` for reading, and `out` for writing, `count` numbers rounded up
+    /// likewise. `out` may overlap what lies behind the `count` numbers.
     unsafe fn pick(masks: *const u8, numbers: *const u16, count: usize, bit: u32, out: *mut u16) -> usize;
 }
 

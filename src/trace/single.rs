@@ -164,8 +164,8 @@ impl Stack {
     /// The entry that lies under `above` others.
     ///
     /// # Safety
-    /// `above` must be below [`BOTTOM`] - 1, and at most one of the lowest [`BOTTOM`] entries must have been popped since
-    /// the count was set.
+    /// `above` must be below [`BOTTOM`] - 1, and at most one of the lowest [`BOTTOM`] entries must have been popped
+    /// since the count was set.
     #[inline(always)]
     unsafe fn peek(&self, above: usize) -> ChildRef {
         // SAFETY: entries below `count` have been written.
@@ -357,8 +357,8 @@ pub(super) unsafe fn one_of<S: Simd, T: Tree, A: Accept, const ANY: bool>(
                 walk.visit_leaf::<S, T, A, ANY>(tree, accept);
             } else {
                 walk.visit_node::<S, T, true, ANY>(tree);
-                // Prefetches what is next, before it is known to be a node or a leaf, and two entries that follow. (One entry
-                // alone takes 1 to 3 % more time; more are no faster: docs/experiments.md#single-rays.)
+                // Prefetches what is next, before it is known to be a node or a leaf, and two entries that follow. (One
+                // entry alone takes 1 to 3 % more time; more are no faster: docs/experiments.md#single-rays.)
                 tree.prefetch(walk.current);
                 tree.prefetch(walk.stack.peek(0));
                 tree.prefetch(walk.stack.peek(1));

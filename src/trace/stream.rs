@@ -11,9 +11,9 @@
 //!     leaf:  test each ray of the list against the triangles, two rays at a time
 //! ```
 //!
-//! A ray is in as many lists as it hits boxes, and leaves them on its own: unlike a packet, a list holds no ray that misses.
-//! What a node or a leaf costs beside its tests (fetching it, waiting for it, guessing what comes next) is paid once per
-//! list.
+//! A ray is in as many lists as it hits boxes, and leaves them on its own: unlike a packet, a list holds no ray that
+//! misses. What a node or a leaf costs beside its tests (fetching it, waiting for it, guessing what comes next) is paid
+//! once per list.
 //!
 //! Hits are those of [`single`](super::single), bit for bit: boxes and triangles are tested by the same arithmetic, and
 //! which of a leaf's hits is the closest does not depend on the order of visits. Rays that need special treatment in a
@@ -30,8 +30,8 @@ use std::mem::MaybeUninit;
 /// Minimum number of rays of an octant that go down the tree as lists.
 const LEAST: usize = 24;
 
-/// Traces rays to their closest hits, or with `ANY` to any hit, whose result says only whether there is one. `done` receives
-/// the hits by the number of the ray, in any order.
+/// Traces rays to their closest hits, or with `ANY` to any hit, whose result says only whether there is one. `done`
+/// receives the hits by the number of the ray, in any order.
 ///
 /// # Safety
 /// The CPU must have the ISA.
@@ -104,8 +104,8 @@ impl<T: Tree> Traversal<'_, T> {
         let mut depth = 1;
         while depth > 0 {
             depth -= 1;
-            // SAFETY: entries below `depth` have been written; children of the tree are its nodes and leaves; the builder
-            // bounds the tree's depth so that there is room on the stack (see `STACK_SIZE`).
+            // SAFETY: entries below `depth` have been written; children of the tree are its nodes and leaves; the
+            // builder bounds the tree's depth so that there is room on the stack (see `STACK_SIZE`).
             unsafe {
                 let mut entry = stack.get_unchecked(depth).assume_init();
                 if ANY {
@@ -151,8 +151,8 @@ impl<T: Tree> Traversal<'_, T> {
     unsafe fn visit_node<S: Simd, const ANY: bool>(&mut self, entry: Entry, stack: *mut Entry) -> usize {
         let (start, count) = (entry.start as usize, entry.count as usize);
         let room = &mut *self.room;
-        // SAFETY: a list's numbers are below the number of slabs that were set up, and the list lies within `numbers`. There
-        // are as many masks as rays, rounded up to 32, and more.
+        // SAFETY: a list's numbers are below the number of slabs that were set up, and the list lies within `numbers`.
+        // There are as many masks as rays, rounded up to 32, and more.
         unsafe {
             let node = self.tree.node(entry.child);
             let boxes = ChildBoxes::new::<S, T>(node, self.group.octant);
@@ -178,8 +178,8 @@ impl<T: Tree> Traversal<'_, T> {
             }
             let mut names = MaybeUninit::uninit();
             let (names, order) = (T::names(node, &mut names), T::order(node));
-            // The nearest child is visited as soon as the lists have been made. (All lines of all children before, instead of
-            // the first of each with its list: 1 to 4 % faster.)
+            // The nearest child is visited as soon as the lists have been made. (All lines of all children before,
+            // instead of the first of each with its list: 1 to 4 % faster.)
             let mut children = met;
             while children != 0 {
                 let child = names.add(children.trailing_zeros() as usize).cast::<ChildRef>().read();
@@ -188,7 +188,8 @@ impl<T: Tree> Traversal<'_, T> {
             }
             let mut pushed = 0;
             for place in 0..T::WIDTH {
-                // (By worth, shadow rays of tiles to a lamp are 1.45 times as fast in Sponza, 1.3 times in the living room.)
+                // (By worth, shadow rays of tiles to a lamp are 1.45 times as fast in Sponza, 1.3 times in the living
+                // room.)
                 let lane = match ANY && T::IS_BY_WORTH {
                     true => place as u32,
                     false => order.add(place).read() >> (3 * self.group.octant) & 7,

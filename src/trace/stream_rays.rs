@@ -1,5 +1,5 @@
-//! Rays of a [stream](super::stream), prepared for its tests: sorted by octant and by the longest axis of their directions,
-//! then set up eight at a time.
+//! Rays of a [stream](super::stream), prepared for its tests: sorted by octant and by the longest axis of their
+//! directions, then set up eight at a time.
 
 use super::tree::{BEYOND, FARTHEST_ORIGIN, OFFSET_ERROR, STEEP, Tree};
 use super::triangle::{AXES, GRAZING, Shear, barycentrics};
@@ -298,8 +298,8 @@ pub(super) unsafe fn sort<S: Simd>(rays: &[Ray], room: &mut Room) -> [usize; SPE
     starts
 }
 
-/// Keys of eight rays, as numbers. Special are rays that cannot hit anything, those whose direction has to be scaled, and
-/// those that take the slower box test.
+/// Keys of eight rays, as numbers. Special are rays that cannot hit anything, those whose direction has to be scaled,
+/// and those that take the slower box test.
 ///
 /// # Safety
 /// The CPU must have the ISA.

@@ -67,8 +67,8 @@ pub(super) trait Leaf {
     /// Whether [`counts`](Self::counts) is always true.
     const ALWAYS_COUNTS: bool;
 
-    /// Rows of the corners as in [`Mbvh`](crate::bvh::Mbvh), for which `room` may serve as a buffer; they can be read as
-    /// long as the leaf and `room` live.
+    /// Rows of the corners as in [`Mbvh`](crate::bvh::Mbvh), for which `room` may serve as a buffer; they can be read
+    /// as long as the leaf and `room` live.
     fn rows(&self, room: &mut MaybeUninit<LeafRows>) -> *const f32;
 
     /// Number of triangles.

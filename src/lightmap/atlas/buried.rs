@@ -173,8 +173,8 @@ impl Search<'_> {
         result
     }
 
-    /// Which of at most [`BLOCK`] points, in texels from `first` on, are buried. Rays come in rounds of one per point that
-    /// is undecided, which are traced as streams: neighbours look the same ways.
+    /// Which of at most [`BLOCK`] points, in texels from `first` on, are buried. Rays come in rounds of one per point
+    /// that is undecided, which are traced as streams: neighbours look the same ways.
     fn are_buried(&self, points: &[TexelSample], first: u32, back: bool, rays: &mut u64) -> [bool; BLOCK] {
         let mut undecided: [Undecided; BLOCK] = std::array::from_fn(|i| {
             let Some(point) = points.get(i) else { return Undecided::default() };

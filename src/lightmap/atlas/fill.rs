@@ -1,5 +1,5 @@
-//! Filling of holes ring by ring: missing texels beside known ones get a value from these, then the texels beside those,
-//! and so on. The result depends on the known texels alone, not on what missing ones held.
+//! Filling of holes ring by ring: missing texels beside known ones get a value from these, then the texels beside
+//! those, and so on. The result depends on the known texels alone, not on what missing ones held.
 
 use super::chart_map::ChartMap;
 use super::charts::Charts;

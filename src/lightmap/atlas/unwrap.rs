@@ -1,9 +1,9 @@
 //! Unwrapping by parts, in parallel, for triangles without usable UVs (thesis 3.2.3).
 //!
-//! Flat regions between creases are projected ([`planar`](super::planar)). The other triangles are grouped into parts of
-//! bounded size, each part is unwrapped separately by the crate `uvunwrap` (region growing, LSCM refined as rigidly as
-//! possible), and only its charts are kept: packing is done by the layout. The parts depend on the mesh alone, so the
-//! charts do not depend on the number of threads.
+//! Flat regions between creases are projected ([`planar`](super::planar)). The other triangles are grouped into parts
+//! of bounded size, each part is unwrapped separately by the crate `uvunwrap` (region growing, LSCM refined as rigidly
+//! as possible), and only its charts are kept: packing is done by the layout. The parts depend on the mesh alone, so
+//! the charts do not depend on the number of threads.
 //!
 //! Without the feature `unwrap`, and for triangles that the crate cannot unwrap, charts are single triangles and pairs
 //! of nearly coplanar triangles, projected on their plane: poor, but valid by construction.

@@ -67,7 +67,8 @@ impl Bright {
         radiance * (self.limit / sum)
     }
 
-    /// Pushes the shadow rays of a round of `gather_rays`, whose sum is the irradiance by the radiance beyond the limit.
+    /// Pushes the shadow rays of a round of `gather_rays`, whose sum is the irradiance by the radiance beyond the
+    /// limit.
     pub(crate) fn push(
         &self,
         receiver: &Receiver,

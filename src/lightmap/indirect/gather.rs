@@ -4,8 +4,8 @@
 //! Rays come in rounds of 64, so that a texel can be refined at any time: its sum over k rounds has
 //! the same bits however they were spread over bakes and live updates. The sample set is made once:
 //! the Sobol sequence, in each round sorted along a Morton curve. Each texel shifts it digitally (XOR), which keeps the
-//! stratification. The rays of neighbouring texels pass the tree together as a [stream](crate::trace), and so do their shadow
-//! rays to bright patches.
+//! stratification. The rays of neighbouring texels pass the tree together as a [stream](crate::trace), and so do their
+//! shadow rays to bright patches.
 //!
 //! Tried, and not worth it: more rays where their variance is largest, and rays guided by photons; see
 //! docs/experiments.md#adaptive-and-guided-gather-rays.
@@ -89,8 +89,8 @@ impl Gathered {
         traced
     }
 
-    /// Adds the radiance seen by one round of rays from a receiver, and that of bright patches: what has arrived from them,
-    /// and what they would send if nothing occluded it.
+    /// Adds the radiance seen by one round of rays from a receiver, and that of bright patches: what has arrived from
+    /// them, and what they would send if nothing occluded it.
     fn add(
         &mut self,
         scene: &Scene,
@@ -142,8 +142,8 @@ pub(crate) struct TileTexel {
     pub gathered: Gathered,
 }
 
-/// Rounds of rays from neighbouring texels, which are traced together as a stream: the light of a texel has the bits that it
-/// has when gathered alone.
+/// Rounds of rays from neighbouring texels, which are traced together as a stream: the light of a texel has the bits
+/// that it has when gathered alone.
 pub(crate) struct Tile {
     rays: Vec<Ray>,
     hits: Vec<RawHit>,

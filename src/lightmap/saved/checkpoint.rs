@@ -3,9 +3,9 @@
 //! The file holds records (`super::records`): `CKPT` with the fingerprint of the bake, then finished work in the order
 //! in which threads finish it: `RADI` (runs of the radiance map), `RDNE` (bright patches; the radiance map is
 //! complete), `BACK` (the sides that are shown), `OWNL` (fallback gathers), `GAT2` (blocks of the gather map), `DRC2`
-//! (blocks of direct light; `GATH` and `DRCT` were smaller ones). All of it is independent of the number of threads and the
-//! order, so missing work is done again and gives the same bits. Photons, upsampling, blur and seams are not kept: they
-//! take a small part of a bake.
+//! (blocks of direct light; `GATH` and `DRCT` were smaller ones). All of it is independent of the number of threads and
+//! the order, so missing work is done again and gives the same bits. Photons, upsampling, blur and seams are not kept:
+//! they take a small part of a bake.
 //!
 //! Records are only ever appended. If the process is killed, at most the last of them is incomplete; after a power
 //! failure, data that was not flushed may be incomplete or zero. Either is cut off.

@@ -1,5 +1,5 @@
-//! Direct light of texels of the light map: light without penumbrae at their samples, whether it varies, and averages of
-//! points.
+//! Direct light of texels of the light map: light without penumbrae at their samples, whether it varies, and averages
+//! of points.
 
 use super::{AROUND, FEW, MAX_POINTS, Point, TexelLight, TilePoints, Wanted, add_to, differ, vary};
 use crate::base::sampling::combine;
@@ -170,8 +170,8 @@ fn has_penumbra(points: &[Point]) -> bool {
     points.iter().any(|p| p.light.is_in_a_penumbra_of_discs()) || vary(points, PointLight::of_discs, DIFFERENCE)
 }
 
-/// Returns the points that are seen from the texel's sample, `own`, whose light without penumbrae is `sharp`. Points with
-/// the same light are kept without a test.
+/// Returns the points that are seen from the texel's sample, `own`, whose light without penumbrae is `sharp`. Points
+/// with the same light are kept without a test.
 fn without_other_rooms<'p>(
     points: &'p mut [Point],
     scene: &Scene,

@@ -70,8 +70,8 @@ impl TexelLight<'_, RadianceMap> {
             })
     }
 
-    /// Computes direct light of texels of the radiance map by 16 or 64 points, weighted by their albedos; `None` if none of
-    /// them lies on the chart.
+    /// Computes direct light of texels of the radiance map by 16 or 64 points, weighted by their albedos; `None` if
+    /// none of them lies on the chart.
     pub(crate) fn closer_look(
         &self,
         texels: &[RadianceTexel],

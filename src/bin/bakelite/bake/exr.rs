@@ -73,14 +73,15 @@ fn write<'i, C: WritableChannels<'i>>(image: &'i Image<Layer<C>>) -> Result<Vec<
     Ok(file)
 }
 
-/// Sorts the attributes of a file's header by name. `exr` keeps them in a hash map and writes them in any order; equal bakes
-/// shall make equal files.
+/// Sorts the attributes of a file's header by name. `exr` keeps them in a hash map and writes them in any order; equal
+/// bakes shall make equal files.
 fn sort_attributes(file: &mut [u8]) {
     // Magic number and version.
     const BEGIN: usize = 8;
     let mut attributes: Vec<Vec<u8>> = Vec::new();
     let mut at = BEGIN;
-    // Each is a name, a type, both with a zero at the end, the number of bytes, and these; an empty name ends the header.
+    // Each is a name, a type, both with a zero at the end, the number of bytes, and these; an empty name ends the
+    // header.
     while file.get(at).is_some_and(|&byte| byte != 0) {
         let end_of_text = |from: usize| file[from..].iter().position(|&byte| byte == 0).map(|n| from + n + 1);
         let Some(size_at) = end_of_text(at).and_then(end_of_text) else { return };
