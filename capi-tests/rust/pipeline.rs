@@ -160,6 +160,27 @@ fn the_cornell_box_agrees_with_the_path_tracer_to_three_percent_without_bias() {
     assert!(bias.abs() <= 0.0065, "the bias is {bias}");
 }
 
+/// Without photons the radiance map lacks all light that is reflected more than once.
+#[test]
+fn paths_from_all_hits_have_no_bias_though_the_radiance_map_lacks_light() {
+    let scene = commit("cornell", &device(0, None));
+    let desc = LightmapDesc { page_size: 256, gather_divisor: 2, ..Default::default() };
+    let mut map = Lightmap::create(&scene, &desc, &Progress::none()).unwrap();
+    let reference = cornell_reference();
+    let expected: Vec<[f64; 3]> = reference.iter().map(|(_, e)| e.indirect).collect();
+    let mut bias = |near_hits: f32| {
+        let params = BakeParams { near_hits, photon_count: 0, ..Default::default() };
+        map.bake(&params, &Progress::none()).unwrap();
+        let baked: Vec<[f64; 3]> = reference.iter().map(|(place, _)| place.sample(&map, Layer::Indirect)).collect();
+        mean(&baked) / mean(&expected) - 1.0
+    };
+    let (all, near, none) = (bias(f32::INFINITY), bias(2.0), bias(0.0));
+    println!("bias with paths from all hits {all:.4}, near ones {near:.4}, none {none:.4}");
+    assert!(all.abs() < 0.01, "{all}");
+    // Paths bring back what is missing where they go.
+    assert!(none < -0.3 && near > none + 0.01, "{near} {none}");
+}
+
 /// Modelled rooms often have their fronts outside, and two-sided materials so that nobody minds.
 #[test]
 fn a_two_sided_room_turned_inside_out_has_the_same_light() {

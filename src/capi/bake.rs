@@ -107,6 +107,12 @@ pub struct bk_bake_params {
     /// per estimate, and blurs the light behind furniture; half of the automatic one has 1.5 times
     /// the error in the Cornell box. Default: 0.
     pub radius: f32,
+    /// Distance, in texels of the radiance map, up to which the light reflected where a gather ray
+    /// hits is computed by a short path instead of looked up, 0 to infinity; 0: never. Corners, gaps
+    /// behind furniture and contacts are right without finer maps for it. Raise it, with more gather
+    /// rays, where nothing may be blurred; INFINITY makes path tracing of it, whose error falls as
+    /// far as one pays for it, with 8 times the noise of the default. Default: 2.
+    pub near_hits: f32,
     /// Radius of the gather map's blur in texels of the gather map, at most 16; 0: no blur. Lower
     /// it to 1 or 0, with more gather rays, where contact shadows matter; it costs little time. 4
     /// blurs more than it smooths. Default: 2.
@@ -164,6 +170,7 @@ sized_struct!(bk_bake_params, defaults: {
         photon_count: p.photon_count,
         gather_rays: p.gather_rays,
         radius: p.radius,
+        near_hits: p.near_hits,
         blur_radius: p.blur_radius,
         direct_samples: p.direct_samples,
         seed: p.seed,
@@ -315,6 +322,7 @@ pub unsafe extern "C" fn bk_bake(
             max_bounces: p.max_bounces,
             gather_rays: p.gather_rays,
             radius: p.radius,
+            near_hits: p.near_hits,
             blur_radius: p.blur_radius,
             direct_samples: p.direct_samples,
             seed: p.seed,

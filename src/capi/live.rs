@@ -104,6 +104,9 @@ pub struct bk_live_params {
     /// blurred. Lower it to 1 or 0 where contact shadows matter and noise at the beginning does
     /// not; it costs time when texels are shown. Default: 2.
     pub blur: u32,
+    /// Distance, in texels of the radiance map, up to which light is computed where gather rays hit,
+    /// see bk_bake_params. Default: 2.
+    pub near_hits: f32,
     /// Edge of a grid cell in scene units, finite and >= 0; 0: a sixteenth of the scene's longest
     /// side. A grid of more than 2^24 cells is refused. Lower it for finer decisions in
     /// BK_LIVE_POSITION; more cells take more time per update to sort. Default: 0.
@@ -142,6 +145,7 @@ sized_struct!(bk_live_params, defaults: {
         max_bounces: p.max_bounces,
         direct_samples: p.direct_samples,
         radius: p.radius,
+        near_hits: p.near_hits,
         background: p.background as u32,
     }
 });
@@ -175,6 +179,7 @@ fn core_params(p: &bk_live_params) -> Result<LiveParams> {
         max_bounces: p.max_bounces,
         direct_samples: p.direct_samples,
         radius: p.radius,
+        near_hits: p.near_hits,
         background: read_bool(p.background, "background")?,
     })
 }

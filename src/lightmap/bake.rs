@@ -8,7 +8,7 @@ use super::atlas::fill::Filling;
 use super::atlas::ids::{GatherTexel, LightMap, LightTexel, PerTexel};
 use super::indirect::blur;
 use super::indirect::gather::{Gathered, Tile, TileTexel};
-use super::indirect::radiance_map::{Radiance, RadianceLookup};
+use super::indirect::radiance_map::Radiance;
 use super::indirect::sample_set::SampleSet;
 use super::indirect::upsample::{OwnLight, Upsampling};
 use super::plan::{Plan, left_out};
@@ -267,7 +267,7 @@ impl<'p> Bake<'_, 'p> {
         let needed = starts[placements.start] as usize..starts[placements.end] as usize;
         let upsampling = stages::upsampling(&self.inputs(), backs, placements)?;
         let (own, own_rays) = self.own_light(radiance, backs, &upsampling)?;
-        let lookup = RadianceLookup::new(&l.charts, &l.radiance, radiance);
+        let lookup = self.inputs().lookup(radiance);
         let samples = SampleSet::new(self.params.gather_rays, purpose_seed(self.params.seed, purpose::GATHER_SET));
         let seed = purpose_seed(self.params.seed, purpose::GATHER);
         let stage = self.progress.stage("gather", 0.32, 0.6, needed.len() as u64);

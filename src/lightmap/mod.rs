@@ -117,6 +117,10 @@ pub struct BakeParams {
     /// Search radius of photons in scene units, finite; 0: from the photons' density, and at least three quarters of a
     /// texel of the radiance map, so that no photon lies between the discs of the estimates.
     pub radius: f32,
+    /// Distance, in texels of the radiance map, up to which the light reflected where a gather ray hits is computed by a
+    /// short path instead of looked up: 0 (never) to infinity (always: path tracing, whose error has no floor but that of
+    /// the gather map's texels).
+    pub near_hits: f32,
     /// Radius of the gather map's blur in gather texels; 0: none.
     pub blur_radius: u32,
     /// Number of shadow rays per light map texel and area light or disc of a directional light. More than four area
@@ -145,6 +149,7 @@ impl Default for BakeParams {
             max_bounces: 0,
             gather_rays: 64,
             radius: 0.0,
+            near_hits: 2.0,
             blur_radius: 2,
             direct_samples: 16,
             seed: 0,
@@ -326,6 +331,9 @@ impl BakeParams {
         }
         if self.gather_rays > 1 << 16 {
             return invalid_argument!("gather_rays is {}, more than 65536", self.gather_rays);
+        }
+        if !(self.near_hits >= 0.0) {
+            return invalid_argument!("near_hits is {}, not a number ≥ 0", self.near_hits);
         }
         if self.blur_radius > blur::MAX_BLUR_RADIUS {
             return invalid_argument!("blur_radius is {}, more than {}", self.blur_radius, blur::MAX_BLUR_RADIUS);

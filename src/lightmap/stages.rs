@@ -6,6 +6,7 @@ use super::atlas::ids::RadianceTexel;
 use super::atlas::two_sided;
 use super::indirect::bright_patches::Bright;
 use super::indirect::find_bright_patches;
+use super::indirect::near_hits::NearHits;
 use super::indirect::radiance_map::{self, Radiance, RadianceInput, RadianceLookup};
 use super::indirect::sample_set::SampleSet;
 use super::indirect::upsample::{OWN_RAYS, OwnLight, OwnRays, Upsampling};
@@ -50,6 +51,14 @@ pub(crate) struct Inputs<'a, 'p> {
     pub direct: &'a DirectLight,
     pub params: &'a BakeParams,
     pub progress: &'a Progress<'p>,
+}
+
+impl<'a> Inputs<'a, '_> {
+    /// What gather rays see where they hit.
+    pub(crate) fn lookup(&self, radiance: &'a Radiance) -> RadianceLookup<'a> {
+        let near = NearHits { direct: self.direct, texels: self.params.near_hits };
+        RadianceLookup::new(&self.atlas.charts, &self.atlas.radiance, radiance).but_near(near)
+    }
 }
 
 /// Computes the radiance map; empty if the plan leaves indirect light out.
@@ -98,7 +107,10 @@ fn radiance(inputs: &Inputs, photons: Option<&PhotonMap>, stats: &mut BakeStats)
     let input = RadianceInput { light, photons };
     let mut rays = radiance_map::bake(device, &input, &mut values, &stage)?;
     let mut radiance = Radiance { values, bright: Bright::default() };
-    device.install(|| find_bright_patches::find(atlas, &mut radiance, &mut rays, progress))?;
+    // Paths from all hits look nothing up, and so find bright patches by their own shadow rays.
+    if params.near_hits < f32::INFINITY {
+        device.install(|| find_bright_patches::find(atlas, &mut radiance, &mut rays, progress))?;
+    }
     let bytes = (radiance.values.len() * size_of::<Vec3>() + atlas.radiance.bytes()) as u64;
     stats.radiance = StageStats { seconds: start.elapsed().as_secs_f64(), rays, bytes };
     Ok(radiance)
@@ -138,7 +150,7 @@ pub(crate) fn own_light(
     let Inputs { atlas, params, progress, .. } = *inputs;
     let count = params.gather_rays.min(OWN_RAYS);
     let rays = OwnRays {
-        radiance: RadianceLookup::new(&atlas.charts, &atlas.radiance, radiance),
+        radiance: inputs.lookup(radiance),
         samples: &SampleSet::new(count, purpose_seed(params.seed, purpose::GATHER_SET)),
         seed: purpose_seed(params.seed, purpose::OWN),
     };

@@ -96,6 +96,7 @@ impl Live {
                 map: Arc::new(map),
                 samples: Arc::new(SampleSet::new(bake.gather_rays, purpose_seed(params.seed, purpose::GATHER_SET))),
                 gather_seed: purpose_seed(params.seed, purpose::GATHER),
+                near_hits: params.near_hits,
                 direct_seed: purpose_seed(params.seed, purpose::DIRECT),
                 direct_samples: params.direct_samples,
                 direct_rays: light.direct.rays_per_point(params.direct_samples),

@@ -47,6 +47,8 @@ pub struct LiveParams {
     pub direct_samples: u32,
     /// Search radius of photons in scene units, as in a bake.
     pub radius: f32,
+    /// Distance up to which hits of gather rays are near, as in a bake.
+    pub near_hits: f32,
     /// Whether the device's threads go on working between updates.
     pub background: bool,
 }
@@ -67,6 +69,7 @@ impl Default for LiveParams {
             max_bounces: bake.max_bounces,
             direct_samples: bake.direct_samples,
             radius: bake.radius,
+            near_hits: bake.near_hits,
             background: false,
         }
     }
@@ -173,6 +176,7 @@ impl LiveParams {
             max_bounces: self.max_bounces,
             gather_rays: self.max_rounds * ROUND as u32,
             radius: self.radius,
+            near_hits: self.near_hits,
             blur_radius: self.blur,
             direct_samples: self.direct_samples,
             seed: self.seed,

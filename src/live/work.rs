@@ -10,6 +10,7 @@ use crate::base::memory::{try_collect, try_filled};
 use crate::base::sampling::combine;
 use crate::lightmap::atlas::ids::{GatherTexel, LightTexel};
 use crate::lightmap::indirect::gather::Gathered;
+use crate::lightmap::indirect::near_hits::NearHits;
 use crate::lightmap::indirect::radiance_map::RadianceLookup;
 use crate::lightmap::indirect::sample_set::{ROUND, SampleSet};
 use crate::lightmap::texel_light::averages::Averaged;
@@ -40,6 +41,8 @@ pub(super) struct Context {
     pub light: Arc<Illumination>,
     pub samples: Arc<SampleSet>,
     pub gather_seed: u32,
+    /// Distance up to which hits of gather rays are near: [`NearHits::texels`].
+    pub near_hits: f32,
     pub direct_seed: u32,
     pub direct_samples: u32,
     /// Approximate number of rays that direct light at a point takes.
@@ -230,7 +233,8 @@ impl Block {
             return false;
         }
         let atlas = &c.map.atlas;
-        let lookup = RadianceLookup::new(&atlas.charts, &atlas.radiance, &c.light.radiance);
+        let near = NearHits { direct: &c.light.direct, texels: c.near_hits };
+        let lookup = RadianceLookup::new(&atlas.charts, &atlas.radiance, &c.light.radiance).but_near(near);
         let end = tile.lod_end[lod as usize];
         let work = &mut self.work;
         let missing = (end as usize).saturating_sub(work.gathered.len());

@@ -128,6 +128,17 @@ fn covered<M: Map>(entry: u32) -> Option<TexelId<M>> {
 
 /// Returns a point of a triangle, and its front or back as a receiver.
 pub(in crate::lightmap) fn receiver_of(scene: &Scene, t: &TexelSample, back: bool) -> (SurfacePoint, Receiver) {
+    receiver_at(scene, t.triangle, [t.u, t.v], back)
+}
+
+/// Returns a point of a triangle by its barycentric weights, and its front or back as a receiver.
+pub(in crate::lightmap) fn receiver_at(
+    scene: &Scene,
+    triangle: u32,
+    [u, v]: [f32; 2],
+    back: bool,
+) -> (SurfacePoint, Receiver) {
+    let t = &TexelSample { x: 0, y: 0, triangle, u, v };
     let point = SurfacePoint::new(scene.corners(t.triangle), t.u, t.v, scene);
     let (mesh, triangle) = scene.locate(t.triangle);
     let mesh = &scene.meshes()[mesh as usize];

@@ -44,7 +44,8 @@ pub(crate) struct Gathered {
 impl Gathered {
     /// Returns the indirect irradiance, W/m².
     pub(crate) fn irradiance(&self) -> Vec3 {
-        self.sum * (PI / self.rays as f32)
+        // Paths from near hits on bright patches may subtract more than other rays bring.
+        (self.sum * (PI / self.rays as f32)).max(Vec3::ZERO)
     }
 
     /// Returns the variance of the [`irradiance`](Self::irradiance)'s sum over the channels, from the spread of the
@@ -85,7 +86,7 @@ impl Gathered {
             bright.1 = radiance.bright().push(receiver, rays.len(), seed_of_round(seed, round), &mut shadow);
             bright.0 = shadow.finish(&mut traced)[0];
         }
-        self.add(scene, radiance, receiver, rays, &hits, bright);
+        self.add(scene, radiance, receiver, seed_of_round(seed, round), rays, &hits, bright, &mut traced);
         traced
     }
 
@@ -96,13 +97,15 @@ impl Gathered {
         scene: &Scene,
         radiance: &RadianceLookup,
         receiver: &Receiver,
+        seed: u32,
         rays: &[Ray],
         hits: &[RawHit],
         (arrived, unoccluded): (Vec3, Unoccluded),
+        traced: &mut u64,
     ) {
         let (mut sum, mut squares) = (Vec3::ZERO, 0.0);
         let (transmits, mut crossings) = (scene.uses().transmission, Vec::new());
-        for (ray, hit) in rays.iter().zip(hits) {
+        for (i, (ray, hit)) in (0..).zip(rays.iter().zip(hits)) {
             if hit.is_miss() {
                 continue;
             }
@@ -111,10 +114,10 @@ impl Gathered {
             if Vec3::from(ray.direction).dot(receiver.geometric) <= 0.0 {
                 continue;
             }
-            let mut seen = radiance.seen(hit);
-            if transmits && scene.material(hit.triangle).transmits() {
-                seen = Some(through(scene, radiance, ray, &mut crossings));
-            }
+            let seen = match transmits && scene.material(hit.triangle).transmits() {
+                true => Some(through(scene, radiance, ray, &mut crossings)),
+                false => radiance.towards(scene, hit, combine(seed, 64 + i), traced),
+            };
             match seen {
                 Some(l) => {
                     sum += l;
@@ -187,7 +190,8 @@ impl Tile {
         let bright = shadow.finish(&mut traced).iter().copied().zip(unoccluded);
         let rays = self.rays[..count].chunks(points.len()).zip(self.hits.chunks(points.len()));
         for ((texel, (rays, hits)), bright) in texels.iter_mut().zip(rays).zip(bright) {
-            texel.gathered.add(scene, radiance, &texel.receiver, rays, hits, bright);
+            let seed = seed_of_round(texel.seed, round);
+            texel.gathered.add(scene, radiance, &texel.receiver, seed, rays, hits, bright, &mut traced);
         }
         traced
     }

@@ -5,6 +5,7 @@ pub(crate) mod bright_patches;
 pub(crate) mod find_bright_patches;
 pub(crate) mod gather;
 mod narrow_gaps;
+pub(crate) mod near_hits;
 pub(crate) mod radiance_map;
 pub(crate) mod sample_set;
 pub(crate) mod upsample;

@@ -13,6 +13,7 @@
 //! Tried: look-ups that interpolate, and a radius per texel; see docs/experiments.md#look-ups-in-the-radiance-map.
 
 use super::bright_patches::Bright;
+use super::near_hits::NearHits;
 use crate::base::error::Result;
 use crate::base::memory::try_vec;
 use crate::base::progress::Stage;
@@ -43,6 +44,7 @@ pub(crate) struct RadianceLookup<'a> {
     charts: &'a Charts,
     map: &'a ChartMap<RadianceMap>,
     radiance: &'a Radiance,
+    near: Option<NearHits<'a>>,
 }
 
 /// Reflected radiance per texel, front sides first; W/(m²·sr).
@@ -54,7 +56,26 @@ pub(crate) struct Radiance {
 
 impl<'a> RadianceLookup<'a> {
     pub(crate) fn new(charts: &'a Charts, map: &'a ChartMap<RadianceMap>, radiance: &'a Radiance) -> Self {
-        RadianceLookup { charts, map, radiance }
+        RadianceLookup { charts, map, radiance, near: None }
+    }
+
+    /// Looks nothing up where gather rays hit nearby: [`NearHits`].
+    pub(crate) fn but_near(self, near: NearHits<'a>) -> Self {
+        RadianceLookup { near: (near.texels > 0.0).then_some(near), ..self }
+    }
+
+    pub(super) fn near(&self) -> Option<&NearHits<'a>> {
+        self.near.as_ref()
+    }
+
+    pub(super) fn map(&self) -> &ChartMap<RadianceMap> {
+        self.map
+    }
+
+    /// Returns the area of a placement's texels in the scene.
+    pub(super) fn texel_area(&self, placement: PlacementId) -> f32 {
+        let [x, y] = self.map.layout[placement].scale;
+        1.0 / (x * y)
     }
 
     /// Returns the radiance reflected towards a ray at its hit; `None` on the back of a one-sided surface.
@@ -77,7 +98,7 @@ impl<'a> RadianceLookup<'a> {
 
     /// Returns placement and radiance at a hit.
     #[inline]
-    fn met(&self, hit: &RawHit) -> Option<(PlacementId, Vec3)> {
+    pub(super) fn met(&self, hit: &RawHit) -> Option<(PlacementId, Vec3)> {
         let chart = self.charts.chart_of(hit.triangle);
         if chart == ChartId::NONE {
             return Some((PlacementId::NONE, Vec3::ZERO));

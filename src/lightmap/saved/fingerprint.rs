@@ -34,12 +34,12 @@ pub(super) struct Fingerprint {
     /// Whether the ISA fuses multiplications and additions: all ISAs that do give the same bits, portable kernels give
     /// others.
     is_fused: u32,
-    reserved: u32,
     /// Checksum of the geometry, followed by those of materials, lights and layout.
     geometry: u32,
     materials: u32,
     lights: u32,
     layout: u32,
+    near_hits: f32,
     photon_count: u64,
     seed: u64,
     /// First texel of the bake of a checkpoint; 0 in results, which may hold any texels.
@@ -71,6 +71,7 @@ impl Fingerprint {
             max_bounces,
             gather_rays,
             radius,
+            near_hits,
             blur_radius,
             direct_samples,
             seed,
@@ -82,7 +83,6 @@ impl Fingerprint {
         Fingerprint {
             version: version(),
             is_fused: atlas.scene.device().isa().is_fused().into(),
-            reserved: 0,
             geometry: geometry(&atlas.scene),
             materials: materials(&atlas.scene),
             lights: origin.lights,
@@ -94,6 +94,7 @@ impl Fingerprint {
             max_bounces,
             gather_rays,
             radius,
+            near_hits,
             blur_radius,
             direct_samples,
             stitch: stitch.into(),
@@ -107,6 +108,7 @@ impl Fingerprint {
             max_bounces: self.max_bounces,
             gather_rays: self.gather_rays,
             radius: self.radius,
+            near_hits: self.near_hits,
             blur_radius: self.blur_radius,
             direct_samples: self.direct_samples,
             seed: self.seed,
@@ -150,6 +152,7 @@ impl Fingerprint {
         compare(&mut all, "max_bounces", self.max_bounces, needed.max_bounces);
         compare(&mut all, "gather_rays", self.gather_rays, needed.gather_rays);
         compare(&mut all, "radius", self.radius, needed.radius);
+        compare(&mut all, "near_hits", self.near_hits, needed.near_hits);
         compare(&mut all, "blur_radius", self.blur_radius, needed.blur_radius);
         compare(&mut all, "direct_samples", self.direct_samples, needed.direct_samples);
         compare(&mut all, "seed", self.seed, needed.seed);

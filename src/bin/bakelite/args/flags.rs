@@ -245,6 +245,10 @@ pub struct BakeFlags {
     #[arg(long, value_name = "F", default_value_t = BakeParams::default().radius,
           value_parser = of(|p: &mut BakeParams, v| p.radius = v))]
     pub radius: f32,
+    /// Radiance map texels up to which hits of gather rays go on as paths; inf: always
+    #[arg(long, value_name = "F", default_value_t = BakeParams::default().near_hits,
+          value_parser = of(|p: &mut BakeParams, v| p.near_hits = v))]
+    pub near_hits: f32,
     /// Blur radius in gather map texels
     #[arg(long, value_name = "N", default_value_t = BakeParams::default().blur_radius,
           value_parser = of(|p: &mut BakeParams, v| p.blur_radius = v))]

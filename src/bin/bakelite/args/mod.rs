@@ -249,6 +249,7 @@ fn command_of(line: CommandLine) -> Result<Command, String> {
                 max_bounces: bake.max_bounces,
                 direct_samples: bake.direct_samples,
                 radius: bake.radius,
+                near_hits: bake.near_hits,
                 ..Default::default()
             };
             Command::ReportLive(Box::new(args))
@@ -304,6 +305,7 @@ fn bake_args(f: Flags) -> Result<BakeArgs, String> {
         max_bounces: f.bake.bounces,
         gather_rays: f.bake.gather_rays,
         radius: f.bake.radius,
+        near_hits: f.bake.near_hits,
         blur_radius: f.bake.blur,
         direct_samples: f.bake.direct_samples,
         seed: f.bake.seed,

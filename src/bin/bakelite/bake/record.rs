@@ -78,6 +78,7 @@ fn parameters(args: &BakeArgs) -> Value {
         "bounces": p.max_bounces,
         "gather_rays": p.gather_rays,
         "radius": p.radius,
+        "near_hits": p.near_hits,
         "blur": p.blur_radius,
         "direct_samples": p.direct_samples,
         "seed": p.seed,

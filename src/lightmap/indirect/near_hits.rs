@@ -1,0 +1,106 @@
+//! Radiance where gather rays hit nearby: computed by short paths, for the radiance map is too coarse there (a secondary final
+//! gather, Christensen, *Faster Photon Map Global Illumination*, 1999; paths that end in a cache where they are long enough, Müller
+//! et al., *Real-time Neural Radiance Caching*, 2021).
+//!
+//! A texel of the radiance map shows one average. A gather ray that is long sees many texels' worth of averages; one that is
+//! short, as in corners, in gaps behind furniture and under mouldings, would see a single one. So where a ray hits nearer
+//! than a few texels of the map, the light reflected there is sampled: direct light by shadow rays, indirect light by one more
+//! ray, which looks up the radiance map in turn unless its hit is near as well.
+
+use super::radiance_map::RadianceLookup;
+use crate::base::sampling::{combine, cosine_around, uniform};
+use crate::direct::DirectLight;
+use crate::direct::shadow_rays::PointRoom;
+use crate::lightmap::atlas::chart_map::receiver_at;
+use crate::lightmap::atlas::ids::PlacementId;
+use crate::scene::Scene;
+use crate::trace::{RawHit, Ray};
+use glam::Vec3;
+use std::f32::consts::PI;
+
+/// Maximum number of vertices of a path; the last one looks up the map.
+const VERTICES: u32 = 32;
+
+/// Vertices after which paths end by Russian roulette.
+const SURE: u32 = 3;
+
+/// Which hits are near, and what lights them.
+#[derive(Clone, Copy)]
+pub(crate) struct NearHits<'a> {
+    pub direct: &'a DirectLight,
+    /// Distance up to which a hit is near, in texels of the radiance map.
+    pub texels: f32,
+}
+
+impl RadianceLookup<'_> {
+    /// Whether a hit at a distance is near.
+    #[inline]
+    fn is_near(&self, near: &NearHits, placement: PlacementId, distance: f32) -> bool {
+        placement != PlacementId::NONE && distance * distance < near.texels * near.texels * self.texel_area(placement)
+    }
+
+    /// Returns the radiance reflected towards a gather ray at its hit, as [`seen`](Self::seen) does, but computed where the
+    /// hit is near. `seed` is the ray's own. Adds the rays traced to `rays`.
+    #[inline]
+    pub(crate) fn towards(&self, scene: &Scene, hit: &RawHit, seed: u32, rays: &mut u64) -> Option<Vec3> {
+        let (placement, cached) = self.met(hit)?;
+        let seen = self.bright().seen(cached, self.map(), placement, hit.t);
+        match self.near() {
+            // The bright part, which gather rays leave to shadow rays, is that of the map.
+            Some(near) if self.is_near(near, placement, hit.t) => {
+                let computed = self.computed(near, scene, hit, seed, rays);
+                Some(if seen == cached { computed } else { seen + computed - cached })
+            }
+            _ => Some(seen),
+        }
+    }
+
+    /// Estimates the radiance reflected at a hit.
+    #[inline(never)]
+    fn computed(&self, near: &NearHits, scene: &Scene, hit: &RawHit, seed: u32, rays: &mut u64) -> Vec3 {
+        let (mut sum, mut throughput) = (Vec3::ZERO, Vec3::ONE);
+        let mut hit = *hit;
+        for vertex in 0..VERTICES {
+            let own = |purpose: u32| combine(seed, 4 * vertex + purpose);
+            throughput *= scene.albedo(hit.triangle, hit.u, hit.v);
+            if vertex >= SURE {
+                let going_on = throughput.max_element().min(1.0);
+                if uniform(0, 0, own(0)) >= going_on {
+                    break;
+                }
+                throughput /= going_on;
+            }
+            if throughput == Vec3::ZERO {
+                break;
+            }
+            let (_, receiver) = receiver_at(scene, hit.triangle, [hit.u, hit.v], !hit.front);
+            sum += throughput * near.direct.unbiased(&receiver, 1, own(1), rays) / PI;
+            if self.bright().len() > 0 {
+                let mut room = PointRoom::new();
+                let mut shadow = room.begin(scene);
+                self.bright().push(&receiver, 1, own(2), &mut shadow);
+                sum += throughput * shadow.finish(rays)[0] / PI;
+            }
+            let direction = cosine_around(receiver.normal, [uniform(0, 1, own(3)), uniform(0, 2, own(3))]);
+            if direction.dot(receiver.geometric) <= 0.0 {
+                break;
+            }
+            let next = scene.intersect_raw(&Ray::new(receiver.origin, direction));
+            *rays += 1;
+            if next.is_miss() {
+                break;
+            }
+            let Some((placement, cached)) = self.met(&next) else { break };
+            sum += throughput * self.bright().seen(cached, self.map(), placement, next.t);
+            if !self.is_near(near, placement, next.t) {
+                break;
+            }
+            sum -= throughput * cached;
+            if vertex + 1 == VERTICES {
+                sum += throughput * cached;
+            }
+            hit = next;
+        }
+        sum
+    }
+}
