@@ -1703,10 +1703,11 @@ typedef struct bk_bake_params {
   /// the error in the Cornell box. Default: 0.
   float radius;
   /// Distance, in texels of the radiance map, up to which the light reflected where a gather ray
-  /// hits is computed by a short path instead of looked up, 0 to infinity; 0: never. Corners, gaps
-  /// behind furniture and contacts are right without finer maps for it. Raise it, with more gather
-  /// rays, where nothing may be blurred; INFINITY makes path tracing of it, whose error falls as
-  /// far as one pays for it, with 8 times the noise of the default. Default: 2.
+  /// hits is computed by a short path instead of looked up, 0 to infinity; 0: never. Set it to 1
+  /// for final light, where corners, gaps behind furniture and contacts matter: a fifth to a half
+  /// more time. INFINITY makes path tracing of it: whatever the radiance map blurs or lacks does
+  /// not matter, and the error falls as long as `gather_rays` are raised, from several times the
+  /// noise. Default: 0.
   float near_hits;
   /// Radius of the gather map's blur in texels of the gather map, at most 16; 0: no blur. Lower
   /// it to 1 or 0, with more gather rays, where contact shadows matter; it costs little time. 4
@@ -2102,7 +2103,7 @@ typedef struct bk_live_params {
   /// not; it costs time when texels are shown. Default: 2.
   uint32_t blur;
   /// Distance, in texels of the radiance map, up to which light is computed where gather rays hit,
-  /// see bk_bake_params. Default: 2.
+  /// see bk_bake_params. Default: 0.
   float near_hits;
   /// Edge of a grid cell in scene units, finite and >= 0; 0: a sixteenth of the scene's longest
   /// side. A grid of more than 2^24 cells is refused. Lower it for finer decisions in

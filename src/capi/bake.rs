@@ -108,10 +108,11 @@ pub struct bk_bake_params {
     /// the error in the Cornell box. Default: 0.
     pub radius: f32,
     /// Distance, in texels of the radiance map, up to which the light reflected where a gather ray
-    /// hits is computed by a short path instead of looked up, 0 to infinity; 0: never. Corners, gaps
-    /// behind furniture and contacts are right without finer maps for it. Raise it, with more gather
-    /// rays, where nothing may be blurred; INFINITY makes path tracing of it, whose error falls as
-    /// far as one pays for it, with 8 times the noise of the default. Default: 2.
+    /// hits is computed by a short path instead of looked up, 0 to infinity; 0: never. Set it to 1
+    /// for final light, where corners, gaps behind furniture and contacts matter: a fifth to a half
+    /// more time. INFINITY makes path tracing of it: whatever the radiance map blurs or lacks does
+    /// not matter, and the error falls as long as `gather_rays` are raised, from several times the
+    /// noise. Default: 0.
     pub near_hits: f32,
     /// Radius of the gather map's blur in texels of the gather map, at most 16; 0: no blur. Lower
     /// it to 1 or 0, with more gather rays, where contact shadows matter; it costs little time. 4

@@ -105,7 +105,7 @@ pub struct bk_live_params {
     /// not; it costs time when texels are shown. Default: 2.
     pub blur: u32,
     /// Distance, in texels of the radiance map, up to which light is computed where gather rays hit,
-    /// see bk_bake_params. Default: 2.
+    /// see bk_bake_params. Default: 0.
     pub near_hits: f32,
     /// Edge of a grid cell in scene units, finite and >= 0; 0: a sixteenth of the scene's longest
     /// side. A grid of more than 2^24 cells is refused. Lower it for finer decisions in
@@ -479,7 +479,7 @@ pub unsafe extern "C" fn bk_live_update(
             width: c.width,
             height: c.height,
         };
-        let budget = Budget { milliseconds: b.milliseconds, rays: b.rays, max_dirty_bytes: 0 };
+        let budget = Budget { milliseconds: b.milliseconds, rays: b.rays, max_dirty_bytes: b.max_dirty_bytes };
         let done = live.change(|l| l.update(&camera, &budget))?;
         if let Some(out) = out {
             out.write(stats(&done));

@@ -149,7 +149,7 @@ impl Default for BakeParams {
             max_bounces: 0,
             gather_rays: 64,
             radius: 0.0,
-            near_hits: 2.0,
+            near_hits: 0.0,
             blur_radius: 2,
             direct_samples: 16,
             seed: 0,

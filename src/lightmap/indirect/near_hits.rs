@@ -1,11 +1,12 @@
-//! Radiance where gather rays hit nearby: computed by short paths, for the radiance map is too coarse there (a secondary final
-//! gather, Christensen, *Faster Photon Map Global Illumination*, 1999; paths that end in a cache where they are long enough, Müller
-//! et al., *Real-time Neural Radiance Caching*, 2021).
+//! Radiance where gather rays hit nearby: computed by short paths, since the radiance map is too coarse there (Jensen, *Global
+//! Illumination using Photon Maps*, 1996, section 4: the accurate estimate of radiance serves where a ray is short).
 //!
-//! A texel of the radiance map shows one average. A gather ray that is long sees many texels' worth of averages; one that is
-//! short, as in corners, in gaps behind furniture and under mouldings, would see a single one. So where a ray hits nearer
-//! than a few texels of the map, the light reflected there is sampled: direct light by shadow rays, indirect light by one more
-//! ray, which looks up the radiance map in turn unless its hit is near as well.
+//! A texel of the radiance map shows one average. Rays that are long see many texels at once; one that is short, as in
+//! corners, in gaps behind furniture and under mouldings, sees a single one. So where a ray hits nearer than some texels
+//! of the map, the light reflected there is sampled: direct light by shadow rays, indirect light by one more ray, which
+//! looks up the radiance map. If all hits are near, paths go on until Russian roulette ends them.
+//!
+//! What they are worth and cost: docs/accuracy.md#near-hits.
 
 use super::radiance_map::RadianceLookup;
 use crate::base::sampling::{combine, cosine_around, uniform};
@@ -18,8 +19,12 @@ use crate::trace::{RawHit, Ray};
 use glam::Vec3;
 use std::f32::consts::PI;
 
-/// Maximum number of vertices of a path; the last one looks up the map.
-const VERTICES: u32 = 32;
+/// Maximum number of vertices of a path from a near hit; the last one looks up the map. (In narrow cavities all hits are
+/// near.)
+const VERTICES: u32 = 2;
+
+/// The same if all hits are near.
+const MOST_VERTICES: u32 = 64;
 
 /// Vertices after which paths end by Russian roulette.
 const SURE: u32 = 3;
@@ -60,7 +65,8 @@ impl RadianceLookup<'_> {
     fn computed(&self, near: &NearHits, scene: &Scene, hit: &RawHit, seed: u32, rays: &mut u64) -> Vec3 {
         let (mut sum, mut throughput) = (Vec3::ZERO, Vec3::ONE);
         let mut hit = *hit;
-        for vertex in 0..VERTICES {
+        let vertices = if near.texels.is_finite() { VERTICES } else { MOST_VERTICES };
+        for vertex in 0..vertices {
             let own = |purpose: u32| combine(seed, 4 * vertex + purpose);
             throughput *= scene.albedo(hit.triangle, hit.u, hit.v);
             if vertex >= SURE {
@@ -92,13 +98,10 @@ impl RadianceLookup<'_> {
             }
             let Some((placement, cached)) = self.met(&next) else { break };
             sum += throughput * self.bright().seen(cached, self.map(), placement, next.t);
-            if !self.is_near(near, placement, next.t) {
+            if !self.is_near(near, placement, next.t) || vertex + 1 == vertices {
                 break;
             }
             sum -= throughput * cached;
-            if vertex + 1 == VERTICES {
-                sum += throughput * cached;
-            }
             hit = next;
         }
         sum
