@@ -6,7 +6,7 @@ use super::atlas::ids::RadianceTexel;
 use super::atlas::two_sided;
 use super::indirect::bright_patches::Bright;
 use super::indirect::find_bright_patches;
-use super::indirect::near_hits::NearHits;
+use super::indirect::near_hits::{HitRadiance, NearHits};
 use super::indirect::radiance_map::{self, Radiance, RadianceInput, RadianceLookup};
 use super::indirect::sample_set::SampleSet;
 use super::indirect::upsample::{OWN_RAYS, OwnLight, OwnRays, Upsampling};
@@ -55,9 +55,9 @@ pub(crate) struct Inputs<'a, 'p> {
 
 impl<'a> Inputs<'a, '_> {
     /// What gather rays see where they hit.
-    pub(crate) fn lookup(&self, radiance: &'a Radiance) -> RadianceLookup<'a> {
+    pub(crate) fn lookup(&self, radiance: &'a Radiance) -> HitRadiance<'a> {
         let near = NearHits { direct: self.direct, texels: self.params.near_hits };
-        RadianceLookup::new(&self.atlas.charts, &self.atlas.radiance, radiance).but_near(near)
+        HitRadiance::new(RadianceLookup::new(&self.atlas.charts, &self.atlas.radiance, radiance), near)
     }
 }
 

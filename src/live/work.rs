@@ -10,7 +10,7 @@ use crate::base::memory::{try_collect, try_filled};
 use crate::base::sampling::combine;
 use crate::lightmap::atlas::ids::{GatherTexel, LightTexel};
 use crate::lightmap::indirect::gather::Gathered;
-use crate::lightmap::indirect::near_hits::NearHits;
+use crate::lightmap::indirect::near_hits::{HitRadiance, NearHits};
 use crate::lightmap::indirect::radiance_map::RadianceLookup;
 use crate::lightmap::indirect::sample_set::{ROUND, SampleSet};
 use crate::lightmap::texel_light::averages::Averaged;
@@ -234,7 +234,8 @@ impl Block {
         }
         let atlas = &c.map.atlas;
         let near = NearHits { direct: &c.light.direct, texels: c.near_hits };
-        let lookup = RadianceLookup::new(&atlas.charts, &atlas.radiance, &c.light.radiance).but_near(near);
+        let map = RadianceLookup::new(&atlas.charts, &atlas.radiance, &c.light.radiance);
+        let lookup = HitRadiance::new(map, near);
         let end = tile.lod_end[lod as usize];
         let work = &mut self.work;
         let missing = (end as usize).saturating_sub(work.gathered.len());

@@ -3,6 +3,7 @@
 
 use super::bright_patches::{Bright, near2};
 use super::gather::Gathered;
+use super::near_hits::HitRadiance;
 use super::radiance_map::{Radiance, RadianceLookup};
 use super::sample_set::{ROUND, SampleSet};
 use crate::base::error::Result;
@@ -113,7 +114,7 @@ fn lit_texels(values: &[Vec3], count: usize) -> Result<Vec<RadianceTexel>> {
 /// Traces rounds of gather rays from texels all over the lit surfaces and returns their means and variances, summed
 /// over the channels.
 fn trials(atlas: &Atlas, radiance: &Radiance, rays: &mut u64, progress: &Progress) -> Result<Vec<(f32, f32)>> {
-    let lookup = RadianceLookup::new(&atlas.charts, &atlas.radiance, radiance);
+    let lookup = HitRadiance::of_map(RadianceLookup::new(&atlas.charts, &atlas.radiance, radiance));
     let samples = SampleSet::new(ROUND as u32, 0);
     let at = |&texel: &RadianceTexel| {
         progress.check()?;
@@ -339,7 +340,7 @@ mod tests {
     /// Means of irradiance at every hundredth gather texel over `rounds` rounds, and their mean variance for one round.
     fn gathered(lightmap: &Lightmap, radiance: &Radiance, rounds: usize) -> (Vec<Vec3>, f64) {
         let atlas = lightmap.atlas();
-        let lookup = RadianceLookup::new(&atlas.charts, &atlas.radiance, radiance);
+        let lookup = HitRadiance::of_map(RadianceLookup::new(&atlas.charts, &atlas.radiance, radiance));
         let samples = SampleSet::new(64 * rounds as u32, 3);
         let (mut means, mut variance) = (Vec::new(), 0.0);
         for texel in atlas.gather.all().step_by(100) {

@@ -11,7 +11,7 @@
 //! docs/experiments.md#adaptive-and-guided-gather-rays.
 
 use super::bright_patches::Unoccluded;
-use super::radiance_map::RadianceLookup;
+use super::near_hits::HitRadiance;
 use super::sample_set::{ROUND, SampleSet};
 use crate::base::error::Result;
 use crate::base::memory::try_filled;
@@ -66,7 +66,7 @@ impl Gathered {
     pub(crate) fn add_round(
         &mut self,
         scene: &Scene,
-        radiance: &RadianceLookup,
+        radiance: &HitRadiance,
         receiver: &Receiver,
         samples: &SampleSet,
         round: usize,
@@ -80,10 +80,10 @@ impl Gathered {
         scene.intersect_stream(rays, &mut hits);
         let mut traced = rays.len() as u64;
         let mut bright = (Vec3::ZERO, Unoccluded::default());
-        if radiance.bright().len() > 0 {
+        if radiance.map.bright().len() > 0 {
             let mut room = PointRoom::new();
             let mut shadow = room.begin(scene);
-            bright.1 = radiance.bright().push(receiver, rays.len(), seed_of_round(seed, round), &mut shadow);
+            bright.1 = radiance.map.bright().push(receiver, rays.len(), seed_of_round(seed, round), &mut shadow);
             bright.0 = shadow.finish(&mut traced)[0];
         }
         self.add(scene, radiance, receiver, seed_of_round(seed, round), rays, &hits, bright, &mut traced);
@@ -95,7 +95,7 @@ impl Gathered {
     fn add(
         &mut self,
         scene: &Scene,
-        radiance: &RadianceLookup,
+        radiance: &HitRadiance,
         receiver: &Receiver,
         seed: u32,
         rays: &[Ray],
@@ -126,7 +126,7 @@ impl Gathered {
                 None => self.backs += 1,
             }
         }
-        if radiance.bright().len() > 0 {
+        if radiance.map.bright().len() > 0 {
             let scale = rays.len() as f32 / PI;
             sum += arrived * scale;
             squares += unoccluded.variance(arrived) * scale * scale;
@@ -166,7 +166,7 @@ impl Tile {
     pub(crate) fn add_round(
         &mut self,
         scene: &Scene,
-        radiance: &RadianceLookup,
+        radiance: &HitRadiance,
         texels: &mut [TileTexel],
         samples: &SampleSet,
         round: usize,
@@ -180,11 +180,11 @@ impl Tile {
         let mut traced = count as u64;
         let mut unoccluded = [Unoccluded::default(); TILE];
         let mut shadow = self.shadow.begin(scene);
-        if radiance.bright().len() > 0 {
+        if radiance.map.bright().len() > 0 {
             for (slot, (texel, unoccluded)) in texels.iter().zip(&mut unoccluded).enumerate() {
                 shadow.slot = slot;
                 let seed = seed_of_round(texel.seed, round);
-                *unoccluded = radiance.bright().push(&texel.receiver, points.len(), seed, &mut shadow);
+                *unoccluded = radiance.map.bright().push(&texel.receiver, points.len(), seed, &mut shadow);
             }
         }
         let bright = shadow.finish(&mut traced).iter().copied().zip(unoccluded);
@@ -220,14 +220,14 @@ fn aim(receiver: &Receiver, points: &[[u32; 2]], seed: u32, rays: &mut [Ray]) {
 
 /// Returns the reflected radiance along a ray from transmissive sheets and from the surface behind them.
 #[cold]
-fn through(scene: &Scene, radiance: &RadianceLookup, ray: &Ray, crossings: &mut Vec<Crossing>) -> Vec3 {
+fn through(scene: &Scene, radiance: &HitRadiance, ray: &Ray, crossings: &mut Vec<Crossing>) -> Vec3 {
     let behind = scene.intersect_through(ray, crossings);
     let (mut sum, mut part) = (Vec3::ZERO, Vec3::ONE);
     for c in crossings.iter() {
-        sum += part * radiance.seen(&c.hit).unwrap_or_default();
+        sum += part * radiance.map.seen(&c.hit).unwrap_or_default();
         part *= Vec3::from(scene.material(c.hit.triangle).transmission);
     }
-    if behind.is_miss() { sum } else { sum + part * radiance.seen(&behind).unwrap_or_default() }
+    if behind.is_miss() { sum } else { sum + part * radiance.map.seen(&behind).unwrap_or_default() }
 }
 
 #[cfg(test)]

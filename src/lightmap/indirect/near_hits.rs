@@ -37,20 +37,39 @@ pub(crate) struct NearHits<'a> {
     pub texels: f32,
 }
 
-impl RadianceLookup<'_> {
+/// What gather rays see where they hit.
+pub(crate) struct HitRadiance<'a> {
+    pub map: RadianceLookup<'a>,
+    near: Option<NearHits<'a>>,
+}
+
+impl<'a> HitRadiance<'a> {
+    /// Looks up a map, but where gather rays hit nearby.
+    pub(crate) fn new(map: RadianceLookup<'a>, near: NearHits<'a>) -> Self {
+        HitRadiance { map, near: (near.texels > 0.0).then_some(near) }
+    }
+
+    /// Looks up a map everywhere.
+    pub(crate) fn of_map(map: RadianceLookup<'a>) -> Self {
+        HitRadiance { map, near: None }
+    }
+}
+
+impl HitRadiance<'_> {
     /// Whether a hit at a distance is near.
     #[inline]
     fn is_near(&self, near: &NearHits, placement: PlacementId, distance: f32) -> bool {
-        placement != PlacementId::NONE && distance * distance < near.texels * near.texels * self.texel_area(placement)
+        placement != PlacementId::NONE
+            && distance * distance < near.texels * near.texels * self.map.texel_area(placement)
     }
 
-    /// Returns the radiance reflected towards a gather ray at its hit, as [`seen`](Self::seen) does, but computed where the
+    /// Returns the radiance reflected towards a gather ray at its hit, as [`RadianceLookup::seen`] does, but computed where the
     /// hit is near. `seed` is the ray's own. Adds the rays traced to `rays`.
     #[inline]
     pub(crate) fn towards(&self, scene: &Scene, hit: &RawHit, seed: u32, rays: &mut u64) -> Option<Vec3> {
-        let (placement, cached) = self.met(hit)?;
-        let seen = self.bright().seen(cached, self.map(), placement, hit.t);
-        match self.near() {
+        let (placement, cached) = self.map.met(hit)?;
+        let seen = self.map.bright().seen(cached, self.map.map(), placement, hit.t);
+        match &self.near {
             // The bright part, which gather rays leave to shadow rays, is that of the map.
             Some(near) if self.is_near(near, placement, hit.t) => {
                 let computed = self.computed(near, scene, hit, seed, rays);
@@ -81,10 +100,10 @@ impl RadianceLookup<'_> {
             }
             let (_, receiver) = receiver_at(scene, hit.triangle, [hit.u, hit.v], !hit.front);
             sum += throughput * near.direct.unbiased(&receiver, 1, own(1), rays) / PI;
-            if self.bright().len() > 0 {
+            if self.map.bright().len() > 0 {
                 let mut room = PointRoom::new();
                 let mut shadow = room.begin(scene);
-                self.bright().push(&receiver, 1, own(2), &mut shadow);
+                self.map.bright().push(&receiver, 1, own(2), &mut shadow);
                 sum += throughput * shadow.finish(rays)[0] / PI;
             }
             let direction = cosine_around(receiver.normal, [uniform(0, 1, own(3)), uniform(0, 2, own(3))]);
@@ -96,8 +115,8 @@ impl RadianceLookup<'_> {
             if next.is_miss() {
                 break;
             }
-            let Some((placement, cached)) = self.met(&next) else { break };
-            sum += throughput * self.bright().seen(cached, self.map(), placement, next.t);
+            let Some((placement, cached)) = self.map.met(&next) else { break };
+            sum += throughput * self.map.bright().seen(cached, self.map.map(), placement, next.t);
             if !self.is_near(near, placement, next.t) || vertex + 1 == vertices {
                 break;
             }

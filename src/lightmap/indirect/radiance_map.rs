@@ -13,7 +13,6 @@
 //! Tried: look-ups that interpolate, and a radius per texel; see docs/experiments.md#look-ups-in-the-radiance-map.
 
 use super::bright_patches::Bright;
-use super::near_hits::NearHits;
 use crate::base::error::Result;
 use crate::base::memory::try_vec;
 use crate::base::progress::Stage;
@@ -44,7 +43,6 @@ pub(crate) struct RadianceLookup<'a> {
     charts: &'a Charts,
     map: &'a ChartMap<RadianceMap>,
     radiance: &'a Radiance,
-    near: Option<NearHits<'a>>,
 }
 
 /// Reflected radiance per texel, front sides first; W/(m²·sr).
@@ -56,18 +54,10 @@ pub(crate) struct Radiance {
 
 impl<'a> RadianceLookup<'a> {
     pub(crate) fn new(charts: &'a Charts, map: &'a ChartMap<RadianceMap>, radiance: &'a Radiance) -> Self {
-        RadianceLookup { charts, map, radiance, near: None }
+        RadianceLookup { charts, map, radiance }
     }
 
-    /// Looks nothing up where gather rays hit nearby: [`NearHits`].
-    pub(crate) fn but_near(self, near: NearHits<'a>) -> Self {
-        RadianceLookup { near: (near.texels > 0.0).then_some(near), ..self }
-    }
-
-    pub(super) fn near(&self) -> Option<&NearHits<'a>> {
-        self.near.as_ref()
-    }
-
+    /// Returns the map that is looked up.
     pub(super) fn map(&self) -> &ChartMap<RadianceMap> {
         self.map
     }

@@ -12,7 +12,7 @@
 
 use super::gather::{Gathered, Tile, TileTexel};
 use super::narrow_gaps::is_in_gap;
-use super::radiance_map::RadianceLookup;
+use super::near_hits::HitRadiance;
 use super::sample_set::SampleSet;
 use super::upsample_visibility::{self, TEXELS_PER_CHECK};
 use crate::base::error::Result;
@@ -73,7 +73,7 @@ pub(crate) type OwnLight = Vec<Option<Vec3>>;
 
 /// Inputs of fallback gathers.
 pub(crate) struct OwnRays<'a> {
-    pub radiance: RadianceLookup<'a>,
+    pub radiance: HitRadiance<'a>,
     /// Sample set, of which the first round is used.
     pub samples: &'a SampleSet,
     pub seed: u32,
@@ -372,7 +372,7 @@ pub(super) mod tests {
     use super::*;
     use crate::base::progress::Progress;
     use crate::lightmap::atlas::ids::RadianceTexel;
-    use crate::lightmap::indirect::radiance_map::Radiance;
+    use crate::lightmap::indirect::radiance_map::{Radiance, RadianceLookup};
     use crate::lightmap::{Lightmap, LightmapDesc};
     use crate::scene::demo::shapes::MeshBuilder;
     use crate::scene::{Light, LightmapUvs, Material, SceneData};
@@ -410,7 +410,7 @@ pub(super) mod tests {
         let values = atlas.radiance.all().map(|s| Vec3::splat(radiance(s))).collect();
         let radiance = Radiance { values, ..Default::default() };
         let rays = OwnRays {
-            radiance: RadianceLookup::new(&atlas.charts, &atlas.radiance, &radiance),
+            radiance: HitRadiance::of_map(RadianceLookup::new(&atlas.charts, &atlas.radiance, &radiance)),
             samples: &SampleSet::new(OWN_RAYS, 0),
             seed: 0,
         };

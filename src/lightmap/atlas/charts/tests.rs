@@ -245,7 +245,8 @@ fn the_number_of_threads_does_not_change_the_charts() {
 
 #[test]
 fn a_cancel_stops_the_unwrapping() {
-    let scene = scene_of(grid(60, 60, |x, y| (x * y % 5) as f32));
+    // So large that there are many reports, of which there are no more than a hundred per second.
+    let scene = scene_of(grid(250, 250, |x, y| (x * y % 5) as f32));
     let mut reports = 0;
     let progress = Progress::new(|_, _| {
         reports += 1;
