@@ -1,13 +1,14 @@
-//! Primary, incoherent and gather rays through the binary tree, the 4-wide and the 8-wide one, and as streams: the rays of the
-//! thesis's tables 4.1 to 4.3.
+//! Primary, incoherent and gather rays through the binary tree, the 4-wide and the 8-wide one, and as streams: the rays
+//! of the thesis's tables 4.1 to 4.3.
 //!
 //!     cargo bench --features io,reference --bench widths -- SCENE... [ISA...]
 //!
-//! One thread; every way traces the same rays, by turns; medians of five rounds, in million rays per second. Primary rays are
-//! those of a pinhole (90 degrees, in tiles of 4 × 4 pixels), incoherent ones go from points of triangles taken at random into the hemisphere
-//! (4.1.2), gather rays come from tiles of 8 × 8 texels, 64 each, at places that are uniform over the surface, and, 256 and
-//! 32 each, from single places. Hits that are not those of single rays in the 8-wide tree are counted: of the binary tree, whose triangle
-//! test has other arithmetic, by the triangle, else by all bits.
+//! One thread; every way traces the same rays, by turns; medians of five rounds, in million rays per second. Primary
+//! rays are those of a pinhole (90 degrees, in tiles of 4 × 4 pixels), incoherent ones go from points of triangles taken
+//! at random into the hemisphere (4.1.2), gather rays come from tiles of 8 × 8 texels, 64 each, at places that are
+//! uniform over the surface, and, 256 and 32 each, from single places. Hits that are not those of single rays in the
+//! 8-wide tree are counted: of the binary tree, whose triangle test has other arithmetic, by the triangle, else by all
+//! bits.
 
 mod common;
 
@@ -132,6 +133,10 @@ fn main() {
                 ("gather 256", tiles(400, 1, 256)),
                 ("gather 32", tiles(3200, 1, 32)),
             ];
+            let hit_by = |rays: &[Ray]| {
+                let hits = rays.iter().filter(|ray| !scene.intersect_raw(ray).is_miss()).count();
+                format!("{:.0} %", 100.0 * hits as f64 / rays.len() as f64)
+            };
             let rates = kinds.each_ref().map(|(_, rays)| trees.rates(rays));
             println!(
                 "\n{}, {} triangles, {}; 4-wide nodes {}, 8-wide nodes {}\n",
@@ -147,7 +152,8 @@ fn main() {
                 println!("| {name} |{}", rates.map(|kind| format!(" {:.2} |", kind[way].0)).concat());
             }
             let differ = |kind: &[(f64, usize); WAYS.len()]| kind.map(|way| way.1.to_string()).join(", ");
-            println!("\nhits that differ, by way: {}", rates.each_ref().map(differ).join("; "));
+            println!("\nrays that hit: {}", kinds.each_ref().map(|(_, rays)| hit_by(rays)).join("; "));
+            println!("hits that differ, by way: {}", rates.each_ref().map(differ).join("; "));
         }
     }
 }
