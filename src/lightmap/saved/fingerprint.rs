@@ -62,6 +62,13 @@ pub(super) fn version() -> [u8; 16] {
     version
 }
 
+/// Adds a line to `all` if a parameter of a file differs from the one that is needed.
+pub(super) fn compare<T: PartialEq + Debug>(all: &mut Vec<String>, name: &str, file: T, needed: T) {
+    if file != needed {
+        all.push(format!("{name} ({file:?}, here {needed:?})"));
+    }
+}
+
 impl Fingerprint {
     /// Makes the fingerprint of the bake of a range of texels ((0, 0): any).
     pub fn new(atlas: &Atlas, origin: &Origin, [texel_begin, texel_end]: [u64; 2]) -> Fingerprint {
@@ -143,11 +150,6 @@ impl Fingerprint {
             ("the light map's layout", self.layout, needed.layout),
         ];
         all.extend(sums.iter().filter(|s| s.1 != s.2).map(|s| s.0.to_owned()));
-        fn compare<T: PartialEq + Debug>(all: &mut Vec<String>, name: &str, file: T, here: T) {
-            if file != here {
-                all.push(format!("{name} ({file:?}, here {here:?})"));
-            }
-        }
         compare(&mut all, "photon_count", self.photon_count, needed.photon_count);
         compare(&mut all, "max_bounces", self.max_bounces, needed.max_bounces);
         compare(&mut all, "gather_rays", self.gather_rays, needed.gather_rays);

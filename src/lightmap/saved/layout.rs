@@ -5,8 +5,8 @@
 //! `TRIS` (their triangles with local coordinates), `SEEN` (which sides are seen), `PTCH` (texels that show other points,
 //! by map), `DONE`. Every number is checked before it is used.
 
-use super::fingerprint;
-use super::records::{self, MAGIC, Next, Tag, take_one};
+use super::fingerprint::{self, compare};
+use super::records::{self, MAGIC, Next, RUN, Tag, take_one};
 use super::{damaged, unreadable};
 use crate::base::error::{Error, Result};
 use crate::base::files;
@@ -19,7 +19,6 @@ use crate::lightmap::atlas::seen::{Seen, is_outdoors};
 use crate::lightmap::{Lightmap, LightmapDesc};
 use crate::scene::Scene;
 use bytemuck::{Pod, Zeroable};
-use std::fmt::Debug;
 use std::io::BufReader;
 use std::path::Path;
 use std::sync::Arc;
@@ -30,9 +29,6 @@ const TRIANGLES: Tag = *b"TRIS";
 const SEEN: Tag = *b"SEEN";
 const PATCHES: Tag = *b"PTCH";
 const DONE: Tag = *b"DONE";
-
-/// Number of items of a record.
-const RUN: usize = 1 << 14;
 
 /// Name of the buffers in error messages.
 const LAYOUT: &str = "the layout of a light map";
@@ -132,11 +128,6 @@ impl Origin {
             ("the scene's materials", self.materials == needed.materials),
         ];
         all.extend(sums.iter().filter(|s| !s.1).map(|s| s.0.to_owned()));
-        fn compare<T: PartialEq + Debug>(all: &mut Vec<String>, name: &str, file: T, here: T) {
-            if file != here {
-                all.push(format!("{name} ({file:?}, here {here:?})"));
-            }
-        }
         compare(&mut all, "texels_per_unit", self.texels_per_unit, needed.texels_per_unit);
         compare(&mut all, "page_size", self.page_size, needed.page_size);
         compare(&mut all, "padding", self.padding, needed.padding);

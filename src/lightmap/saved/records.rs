@@ -19,6 +19,9 @@ use crate::base::error::{Error, Result};
 use std::io::{self, ErrorKind, Read, Seek, SeekFrom};
 use std::path::Path;
 
+/// Maximum number of items, such as texels, that files keep in a record.
+pub(super) const RUN: usize = 1 << 14;
+
 /// Magic number at the start of every file; its last byte is the version of the format. Numbers are stored in the
 /// machine's byte order, so files of machines with the other byte order have another magic number.
 pub(super) const MAGIC: [u8; 8] = if cfg!(target_endian = "little") { *b"BKLIGHT1" } else { *b"1THGILKB" };

@@ -6,7 +6,7 @@
 //! assembled from several results have the bits of one bake.
 
 use super::fingerprint::Fingerprint;
-use super::records::{self, MAGIC, Next, Records, Tag, take, take_one};
+use super::records::{self, MAGIC, Next, RUN, Records, Tag, take, take_one};
 use super::{damaged, foreign, unreadable};
 use crate::base::error::{Error, Result};
 use crate::base::files;
@@ -29,9 +29,6 @@ const BACKS: Tag = *b"BACK";
 const RADIANCE: Tag = *b"RADI";
 const TEXELS: Tag = *b"TEXL";
 const DONE: Tag = *b"DONE";
-
-/// Number of texels of a record.
-const RUN: usize = 1 << 14;
 
 /// The content of the first record.
 #[derive(Clone, Copy, Pod, Zeroable)]
