@@ -284,7 +284,9 @@ fn view_based_updates_finish_what_the_camera_sees() {
 #[test]
 fn after_a_light_has_changed_the_updates_end_with_the_bits_of_a_bake_under_it() {
     let mut lightmap = unbaked("cornell", 2, 60.0);
-    let mut live = Live::new(&lightmap, &params(Mode::Position), &Progress::none()).unwrap();
+    // Near hits see direct light, which changes before indirect light does.
+    let params = LiveParams { near_hits: 1.0, ..params(Mode::Position) };
+    let mut live = Live::new(&lightmap, &params, &Progress::none()).unwrap();
     finish(&mut live);
     let before = pages(&live, &lightmap);
     let scene = lightmap.scene().clone();
@@ -449,7 +451,7 @@ fn cells_are_promoted_near_the_camera_first() {
 #[test]
 fn work_between_updates_ends_with_the_bits_of_a_bake_and_can_be_paused() {
     let mut lightmap = unbaked("cornell", 2, 60.0);
-    let params = LiveParams { background: true, ..params(Mode::Position) };
+    let params = LiveParams { background: true, near_hits: 1.0, ..params(Mode::Position) };
     let mut live = Live::new(&lightmap, &params, &Progress::none()).unwrap();
     let little = Budget { milliseconds: 0.0, rays: 64, max_dirty_bytes: 0 };
     let mut behind_the_back = 0;

@@ -119,7 +119,7 @@ pub struct BakeParams {
     pub radius: f32,
     /// Distance, in texels of the radiance map, up to which the light reflected where a gather ray hits is computed by a
     /// short path instead of looked up: 0 (never) to infinity (always: path tracing, whose error has no floor but that of
-    /// the gather map's texels).
+    /// the gather map's texels, and for which `photon_count` may be 0). Through transmissive sheets radiance is looked up.
     pub near_hits: f32,
     /// Radius of the gather map's blur in gather texels; 0: none.
     pub blur_radius: u32,

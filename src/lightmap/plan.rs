@@ -163,7 +163,9 @@ impl Plan {
         }
         self.run("radiance map");
         self.run(&format!("gather map, {} rays per texel", params.gather_rays));
-        if params.near_hits > 0.0 {
+        if params.near_hits == f32::INFINITY {
+            self.run("paths from all hits of gather rays");
+        } else if params.near_hits > 0.0 {
             self.run(&format!("paths from hits of gather rays nearer than {} radiance texels", params.near_hits));
         }
         if two_sided {

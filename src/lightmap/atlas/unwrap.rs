@@ -200,8 +200,8 @@ fn longest_component(geometry: &Geometry, stage: &Stage) -> Result<f64> {
     Ok(boxes.iter().map(|[lower, upper]| (*upper - *lower).length()).filter(|d| d.is_finite()).fold(0.0, f64::max))
 }
 
-/// Returns the charts that `uvunwrap` makes of a part whose components are no longer than `longest`, and flags for the triangles without one (too thin for its
-/// single-precision UVs).
+/// Returns the charts that `uvunwrap` makes of a part whose components are no longer than `longest`, and flags for the
+/// triangles without one (too thin for its single-precision UVs).
 #[cfg(feature = "unwrap")]
 fn charts_of_part(
     geometry: &Geometry,
@@ -249,6 +249,7 @@ fn charts_of_part(
 /// and UVs are rounded to single precision of the whole page.
 #[cfg(feature = "unwrap")]
 const PACKING_TEXELS: f64 = 128.0 * 128.0;
+
 /// Width of the pages that charts are packed into, in diagonals of the largest component: as normals of a chart lie
 /// within [`MAX_CHART_ANGLE`] of its own, hardly any chart is larger. (Without a given width the packing tries seven.)
 #[cfg(feature = "unwrap")]

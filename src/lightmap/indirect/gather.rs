@@ -20,7 +20,6 @@ use crate::direct::Receiver;
 use crate::direct::shadow_rays::{PointRoom, TileRoom};
 use crate::lightmap::tiles::TILE;
 use crate::scene::Scene;
-use crate::trace::filter::Crossing;
 use crate::trace::{RawHit, Ray};
 use glam::Vec3;
 use std::f32::consts::PI;
@@ -80,10 +79,10 @@ impl Gathered {
         scene.intersect_stream(rays, &mut hits);
         let mut traced = rays.len() as u64;
         let mut bright = (Vec3::ZERO, Unoccluded::default());
-        if radiance.map.bright().len() > 0 {
+        if radiance.lookup.bright().len() > 0 {
             let mut room = PointRoom::new();
             let mut shadow = room.begin(scene);
-            bright.1 = radiance.map.bright().push(receiver, rays.len(), seed_of_round(seed, round), &mut shadow);
+            bright.1 = radiance.lookup.bright().push(receiver, rays.len(), seed_of_round(seed, round), &mut shadow);
             bright.0 = shadow.finish(&mut traced)[0];
         }
         self.add(scene, radiance, receiver, seed_of_round(seed, round), rays, &hits, bright, &mut traced);
@@ -115,7 +114,7 @@ impl Gathered {
                 continue;
             }
             let seen = match transmits && scene.material(hit.triangle).transmits() {
-                true => Some(through(scene, radiance, ray, &mut crossings)),
+                true => Some(radiance.lookup.through(scene, ray, &mut crossings)),
                 false => radiance.towards(scene, hit, combine(seed, 64 + i), traced),
             };
             match seen {
@@ -126,7 +125,7 @@ impl Gathered {
                 None => self.backs += 1,
             }
         }
-        if radiance.map.bright().len() > 0 {
+        if radiance.lookup.bright().len() > 0 {
             let scale = rays.len() as f32 / PI;
             sum += arrived * scale;
             squares += unoccluded.variance(arrived) * scale * scale;
@@ -180,11 +179,11 @@ impl Tile {
         let mut traced = count as u64;
         let mut unoccluded = [Unoccluded::default(); TILE];
         let mut shadow = self.shadow.begin(scene);
-        if radiance.map.bright().len() > 0 {
+        if radiance.lookup.bright().len() > 0 {
             for (slot, (texel, unoccluded)) in texels.iter().zip(&mut unoccluded).enumerate() {
                 shadow.slot = slot;
                 let seed = seed_of_round(texel.seed, round);
-                *unoccluded = radiance.map.bright().push(&texel.receiver, points.len(), seed, &mut shadow);
+                *unoccluded = radiance.lookup.bright().push(&texel.receiver, points.len(), seed, &mut shadow);
             }
         }
         let bright = shadow.finish(&mut traced).iter().copied().zip(unoccluded);
@@ -216,18 +215,6 @@ fn aim(receiver: &Receiver, points: &[[u32; 2]], seed: u32, rays: &mut [Ray]) {
         let z = (1.0 - x * x - y * y).max(0.0).sqrt();
         *ray = Ray::new(receiver.origin, x * tangent + y * bitangent + z * receiver.normal);
     }
-}
-
-/// Returns the reflected radiance along a ray from transmissive sheets and from the surface behind them.
-#[cold]
-fn through(scene: &Scene, radiance: &HitRadiance, ray: &Ray, crossings: &mut Vec<Crossing>) -> Vec3 {
-    let behind = scene.intersect_through(ray, crossings);
-    let (mut sum, mut part) = (Vec3::ZERO, Vec3::ONE);
-    for c in crossings.iter() {
-        sum += part * radiance.map.seen(&c.hit).unwrap_or_default();
-        part *= Vec3::from(scene.material(c.hit.triangle).transmission);
-    }
-    if behind.is_miss() { sum } else { sum + part * radiance.map.seen(&behind).unwrap_or_default() }
 }
 
 #[cfg(test)]

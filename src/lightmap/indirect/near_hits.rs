@@ -1,10 +1,11 @@
-//! Radiance where gather rays hit nearby: computed by short paths, since the radiance map is too coarse there (Jensen, *Global
-//! Illumination using Photon Maps*, 1996, section 4: the accurate estimate of radiance serves where a ray is short).
+//! Radiance where gather rays hit nearby: computed by short paths, since the radiance map is too coarse there. (Jensen,
+//! *Global Illumination using Photon Maps*, 1996, computes radiance accurately where a ray is short.)
 //!
 //! A texel of the radiance map shows one average. Rays that are long see many texels at once; one that is short, as in
 //! corners, in gaps behind furniture and under mouldings, sees a single one. So where a ray hits nearer than some texels
 //! of the map, the light reflected there is sampled: direct light by shadow rays, indirect light by one more ray, which
-//! looks up the radiance map. If all hits are near, paths go on until Russian roulette ends them.
+//! looks up the radiance map. If all hits are near, paths go on until Russian roulette ends them. What is seen through
+//! transmissive sheets is always looked up.
 //!
 //! What they are worth and cost: docs/accuracy.md#near-hits.
 
@@ -19,8 +20,8 @@ use crate::trace::{RawHit, Ray};
 use glam::Vec3;
 use std::f32::consts::PI;
 
-/// Maximum number of vertices of a path from a near hit; the last one looks up the map. (In narrow cavities all hits are
-/// near.)
+/// Maximum number of vertices of a path from a near hit; the last one looks up the map. (In narrow cavities all hits
+/// are near, and longer paths take twice the extra time: docs/experiments.md#near-hits.)
 const VERTICES: u32 = 2;
 
 /// The same if all hits are near.
@@ -39,19 +40,19 @@ pub(crate) struct NearHits<'a> {
 
 /// What gather rays see where they hit.
 pub(crate) struct HitRadiance<'a> {
-    pub map: RadianceLookup<'a>,
+    pub lookup: RadianceLookup<'a>,
     near: Option<NearHits<'a>>,
 }
 
 impl<'a> HitRadiance<'a> {
-    /// Looks up a map, but where gather rays hit nearby.
-    pub(crate) fn new(map: RadianceLookup<'a>, near: NearHits<'a>) -> Self {
-        HitRadiance { map, near: (near.texels > 0.0).then_some(near) }
+    /// Looks up the radiance map, but where gather rays hit nearby.
+    pub(crate) fn new(lookup: RadianceLookup<'a>, near: NearHits<'a>) -> Self {
+        HitRadiance { lookup, near: (near.texels > 0.0).then_some(near) }
     }
 
-    /// Looks up a map everywhere.
-    pub(crate) fn of_map(map: RadianceLookup<'a>) -> Self {
-        HitRadiance { map, near: None }
+    /// Looks up the radiance map everywhere.
+    pub(crate) fn of_map(lookup: RadianceLookup<'a>) -> Self {
+        HitRadiance { lookup, near: None }
     }
 }
 
@@ -60,15 +61,15 @@ impl HitRadiance<'_> {
     #[inline]
     fn is_near(&self, near: &NearHits, placement: PlacementId, distance: f32) -> bool {
         placement != PlacementId::NONE
-            && distance * distance < near.texels * near.texels * self.map.texel_area(placement)
+            && distance * distance < near.texels * near.texels * self.lookup.texel_area(placement)
     }
 
-    /// Returns the radiance reflected towards a gather ray at its hit, as [`RadianceLookup::seen`] does, but computed where the
-    /// hit is near. `seed` is the ray's own. Adds the rays traced to `rays`.
+    /// Returns the radiance reflected towards a gather ray at its hit, as [`RadianceLookup::seen`] does, but computed
+    /// where the hit is near. `seed` is the ray's own. Adds the rays traced to `rays`.
     #[inline]
     pub(crate) fn towards(&self, scene: &Scene, hit: &RawHit, seed: u32, rays: &mut u64) -> Option<Vec3> {
-        let (placement, cached) = self.map.met(hit)?;
-        let seen = self.map.bright().seen(cached, self.map.map(), placement, hit.t);
+        let (placement, cached) = self.lookup.met(hit)?;
+        let seen = self.lookup.bright().seen(cached, self.lookup.map(), placement, hit.t);
         match &self.near {
             // The bright part, which gather rays leave to shadow rays, is that of the map.
             Some(near) if self.is_near(near, placement, hit.t) => {
@@ -100,23 +101,28 @@ impl HitRadiance<'_> {
             }
             let (_, receiver) = receiver_at(scene, hit.triangle, [hit.u, hit.v], !hit.front);
             sum += throughput * near.direct.unbiased(&receiver, 1, own(1), rays) / PI;
-            if self.map.bright().len() > 0 {
+            if self.lookup.bright().len() > 0 {
                 let mut room = PointRoom::new();
                 let mut shadow = room.begin(scene);
-                self.map.bright().push(&receiver, 1, own(2), &mut shadow);
+                self.lookup.bright().push(&receiver, 1, own(2), &mut shadow);
                 sum += throughput * shadow.finish(rays)[0] / PI;
             }
             let direction = cosine_around(receiver.normal, [uniform(0, 1, own(3)), uniform(0, 2, own(3))]);
             if direction.dot(receiver.geometric) <= 0.0 {
                 break;
             }
-            let next = scene.intersect_raw(&Ray::new(receiver.origin, direction));
+            let ray = Ray::new(receiver.origin, direction);
+            let next = scene.intersect_raw(&ray);
             *rays += 1;
             if next.is_miss() {
                 break;
             }
-            let Some((placement, cached)) = self.map.met(&next) else { break };
-            sum += throughput * self.map.bright().seen(cached, self.map.map(), placement, next.t);
+            if scene.uses().transmission && scene.material(next.triangle).transmits() {
+                sum += throughput * self.lookup.through(scene, &ray, &mut Vec::new());
+                break;
+            }
+            let Some((placement, cached)) = self.lookup.met(&next) else { break };
+            sum += throughput * self.lookup.bright().seen(cached, self.lookup.map(), placement, next.t);
             if !self.is_near(near, placement, next.t) || vertex + 1 == vertices {
                 break;
             }

@@ -28,8 +28,9 @@ use crate::lightmap::texel_light::{TexelAreas, TexelLight, TilePoints};
 use crate::lightmap::tiles::{TILE, in_order, texels_per_tile};
 use crate::photon::PhotonMap;
 use crate::photon::coverage::Discs;
-use crate::scene::NONE;
-use crate::trace::RawHit;
+use crate::scene::{NONE, Scene};
+use crate::trace::filter::Crossing;
+use crate::trace::{RawHit, Ray};
 use glam::{Mat2, Vec2, Vec3};
 use rayon::prelude::*;
 use std::f32::consts::PI;
@@ -79,6 +80,19 @@ impl<'a> RadianceLookup<'a> {
     pub(crate) fn seen(&self, hit: &RawHit) -> Option<Vec3> {
         let (placement, radiance) = self.met(hit)?;
         Some(self.radiance.bright.seen(radiance, self.map, placement, hit.t))
+    }
+
+    /// Returns the radiance that a gather ray sees of transmissive sheets and of the surface behind them. `crossings` is a
+    /// buffer.
+    #[cold]
+    pub(super) fn through(&self, scene: &Scene, ray: &Ray, crossings: &mut Vec<Crossing>) -> Vec3 {
+        let behind = scene.intersect_through(ray, crossings);
+        let (mut sum, mut part) = (Vec3::ZERO, Vec3::ONE);
+        for c in crossings.iter() {
+            sum += part * self.seen(&c.hit).unwrap_or_default();
+            part *= Vec3::from(scene.material(c.hit.triangle).transmission);
+        }
+        if behind.is_miss() { sum } else { sum + part * self.seen(&behind).unwrap_or_default() }
     }
 
     /// Returns the bright patches, whose full radiance gather rays do not see.
