@@ -31,9 +31,9 @@ macro_rules! kernel {
 
             isa_features! { $isa => entry_point! { fn $name($($arg: $type),*) $body } }
 
-            /// Returned only where the machine has the ISA.
+            /// Calls the entry point. Safe, as it leaves the module through `the function that picks it` alone.
             pub(super) fn checked($($arg: $type),*) {
-                // SAFETY: see above.
+                // SAFETY: it is picked only after `is_available` has said that the machine has the ISA.
                 unsafe { $name($($arg),*) }
             }
         }

@@ -256,21 +256,30 @@ fn introduction(args: &ReportArgs, lightmap: &Lightmap, camera: &Camera, measure
         0.0 => "cells of the automatic size".into(),
         size => format!("cells of {size}"),
     };
+    let errors = match args.errors {
+        true => format!(
+            "Errors are those of irradiance as shown, direct and indirect: the root of the sum of squared differences \
+             over the sum of the reference's squares, at the texels that {seen} of {rays} primary rays hit. The \
+             reference is a bake with {REFERENCE_RAYS} gather rays and otherwise the same parameters, blur and photons \
+             included: what is left is the noise of gathering. As its first rays are those of the others, errors are \
+             slightly too small, by about an eighth with {last} rays. Rays are those for gathering, for direct light \
+             and, in live updates, for what the camera sees; those of photons and radiance map are left out. The time \
+             of live updates includes that of creating the live state but not that of measuring errors. They end when \
+             all that is seen is finished, or after {seconds} s.\n\n",
+            seen = measured.seen,
+            rays = ray_count(aspect(&args.bake)),
+            last = args.live.max_rounds * 64,
+            seconds = args.seconds,
+        ),
+        false => String::new(),
+    };
     format!(
         "# Live updates: {}\n\n\
          {triangles} triangles, {texels} texels ({gather} of them gather) on {pages} pages of {width} × {height}; \
          {lights} lights, {emitters} emissive triangles; {photons} photons, {samples} shadow rays per area light, \
          blur {blur}, seed {seed}; threads: {threads}, {isa}. Camera at {position}, looking at {target}.\n\n\
-         Errors are those of irradiance as shown, direct and indirect: the root of the sum of squared differences over \
-         the sum of the reference's squares, at the texels that {seen} of {rays} primary rays hit. The \
-         reference is a bake with {REFERENCE_RAYS} gather rays and otherwise the same parameters, blur and photons \
-         included: what is left is the noise of gathering. As its first rays are those of the others, errors are \
-         slightly too small, by about an eighth with {last} rays. Rays are those for gathering, for direct light \
-         and, in live updates, for what the camera sees; those of photons and radiance map are left out. Live updates \
-         are of {FOLLOW_MS} ms, with at most {rounds} rounds of 64 rays per texel, {lods} levels of detail, cells that show the next after \
-         {promote} rounds, and {cells}; their time includes that of \
-         creating the live state but not that of measuring errors. They end when all that is seen is finished, or \
-         after {seconds} s.\n\n",
+         Live updates are of {FOLLOW_MS} ms, with at most {rounds} rounds of 64 rays per texel, {lods} levels of detail, \
+         cells that show the next after {promote} rounds, and {cells}.\n\n{errors}",
         args.bake.title(),
         triangles = scene.stats().triangles,
         texels = info.texels,
@@ -286,13 +295,9 @@ fn introduction(args: &ReportArgs, lightmap: &Lightmap, camera: &Camera, measure
         seed = params.seed,
         threads = device.num_threads(),
         isa = device.isa().name(),
-        seen = measured.seen,
-        last = args.live.max_rounds * 64,
         rounds = args.live.max_rounds,
         lods = args.live.lod_count,
         promote = args.live.promote_threshold,
-        seconds = args.seconds,
-        rays = ray_count(aspect(&args.bake)),
     )
 }
 
