@@ -1671,6 +1671,10 @@ bk_result bk_lightmap_mesh_back_uvs(const bk_lightmap *lightmap,
 /// them.
 #define BK_LEFT_OUT_BRIGHT_PATCHES 32768
 
+/// Bit of left_out: light by direction, as bk_bake_params.directional_indirect and directional_direct
+/// are 0.
+#define BK_LEFT_OUT_DIRECTIONAL 65536
+
 /// Parameters of bk_bake.
 ///
 /// Measured curves of these fields: docs/accuracy.md, "Which knobs have a curve".
@@ -1756,6 +1760,14 @@ typedef struct bk_bake_params {
   /// cannot be written later, for example because the disk is full, the bake continues and logs a
   /// warning, and the file stays readable. See bk_bake for errors, which leave the file as it is.
   const char *checkpoint;
+  /// 1: compute light that was reflected by other surfaces by direction too (SH L1), for surfaces
+  /// with normal maps. Reading starts at BK_LAYER_L0. It comes from the same rays; in memory it
+  /// takes 48 bytes per texel of the light map, during the bake 48 more and 96 per texel of the
+  /// gather map. Live updates do not have it. Default: 0.
+  uint32_t directional_indirect;
+  /// 1: the same for light that comes straight from lights. With both, the layers hold the sum.
+  /// Set only `directional_indirect` where the application draws the lights itself. Default: 0.
+  uint32_t directional_direct;
 } bk_bake_params;
 
 /// Numbers about one stage of a bake.
@@ -1905,6 +1917,36 @@ BK_API size_t bk_plan_describe(const bk_lightmap *lightmap, char *dst, size_t ca
 /// BK_NONE where there is none. BK_FORMAT_R32U.
 #define BK_LAYER_TRIANGLE 7
 
+/// Layer: mean radiance over the sphere, of which the half below the surface is dark, in W/(m2 sr),
+/// of the light that bk_bake_params.directional_indirect and directional_direct asked for:
+/// 1 / (4 pi) times the integral of radiance. RGB. The guide ("Normal maps") has shader code.
+#define BK_LAYER_L0 8
+
+/// Layer: the same mean of radiance times the x coordinate of the direction it comes from, in the
+/// axes of the scene, in W/(m2 sr): -L0 to L0. RGB.
+#define BK_LAYER_L1X 9
+
+/// Layer: the same for y. RGB.
+#define BK_LAYER_L1Y 10
+
+/// Layer: the same for z. RGB.
+#define BK_LAYER_L1Z 11
+
+/// Layer: L1X / L0, -1 to 1; 0 where there is no light. RGB, or BK_FORMAT_RGBA8 as 0.5 + 0.5 times
+/// the ratio.
+#define BK_LAYER_RATIO_X 12
+
+/// Layer: L1Y / L0. RGB or BK_FORMAT_RGBA8.
+#define BK_LAYER_RATIO_Y 13
+
+/// Layer: L1Z / L0. RGB or BK_FORMAT_RGBA8.
+#define BK_LAYER_RATIO_Z 14
+
+/// Layer: dominant direction, L1 / L0 of the sum of the channels: a vector (x, y, z) towards the
+/// light whose length is 1 if all comes from one direction and 0.5 under a uniform sky. RGB or
+/// BK_FORMAT_RGBA8.
+#define BK_LAYER_DIRECTION 15
+
 /// Format: three floats, 12 bytes per texel.
 #define BK_FORMAT_RGB32F 1
 
@@ -1917,11 +1959,15 @@ BK_API size_t bk_plan_describe(const bk_lightmap *lightmap, char *dst, size_t ca
 /// Format: one uint32_t, 4 bytes per texel.
 #define BK_FORMAT_R32U 4
 
+/// Format: four bytes, each 255 times a value from 0 to 1, for layers of ratios. Alpha is 255.
+#define BK_FORMAT_RGBA8 5
+
 /// Kind of file: float images of the light layers, PREFIXpageN-LAYER.exr with LAYER one of
-/// combined, indirect, direct, radiance.
+/// combined, indirect, direct, radiance; with light by direction also l0, ratio-x, ratio-y, ratio-z.
 #define BK_FILE_EXR 1
 
-/// Kind of file: tone-mapped 8-bit images of the light layers for viewing, PREFIXpageN-LAYER.png.
+/// Kind of file: tone-mapped 8-bit images of the light layers for viewing, PREFIXpageN-LAYER.png;
+/// with light by direction also its ratios, as in BK_FORMAT_RGBA8.
 #define BK_FILE_PNG 2
 
 /// Kind of file: the scene with its light map for viewers and engines, PREFIXscene.glb (glTF 2.0).
@@ -1941,15 +1987,16 @@ BK_API size_t bk_plan_describe(const bk_lightmap *lightmap, char *dst, size_t ca
 ///
 /// @param lightmap  light map; baked, if the layer holds light
 /// @param page  number of the page
-/// @param layer  one of the BK_LAYER values; COMBINED, INDIRECT, DIRECT and RADIANCE hold light
+/// @param layer  one of the BK_LAYER values; COMBINED, INDIRECT, DIRECT, RADIANCE and those from L0 on
+///   hold light
 /// @param format  one of the BK_FORMAT values that the layer allows
 /// @param dst  receives bk_lightmap_info.height rows of bk_lightmap_info.width texels; needs no
 ///   alignment
 /// @param row_stride  distance between rows in bytes, at least the bytes of a row; 0: packed
 /// @retval BK_ERROR_INVALID_ARGUMENT  page or layer does not exist, the format does not suit the
 ///   layer, or `row_stride` is too small
-/// @retval BK_ERROR_INVALID_STATE  the layer holds light and there was no bake, or the light map is
-///   being baked
+/// @retval BK_ERROR_INVALID_STATE  the layer holds light and there was no bake, or none that
+///   asked for light by direction for layers from L0 on, or the light map is being baked
 /// @retval BK_ERROR_OUT_OF_MEMORY  a page does not fit
 BK_API
 bk_result bk_lightmap_read(const bk_lightmap *lightmap,

@@ -293,6 +293,12 @@ static void struct_sizes(bk_device *device) {
     bake = quick_bake();
     bake.stitch = 3;
     CHECK_ERROR(bk_bake(lightmap, &bake, NULL, NULL, NULL), ARGUMENT, "stitch is 3, not 0 or 1");
+    bake.stitch = 1;
+    bake.directional_indirect = 2;
+    CHECK_ERROR(bk_bake(lightmap, &bake, NULL, NULL, NULL), ARGUMENT, "directional_indirect is 2, not 0 or 1");
+    bake.directional_indirect = 0;
+    bake.directional_direct = 5;
+    CHECK_ERROR(bk_bake(lightmap, &bake, NULL, NULL, NULL), ARGUMENT, "directional_direct is 5, not 0 or 1");
     bake = quick_bake();
     bk_bake_stats_init(&bake_stats);
     bake_stats.struct_size = 9999;

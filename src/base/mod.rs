@@ -2,6 +2,7 @@
 //! that call or are called.
 
 pub(crate) mod callback;
+pub(crate) mod directional;
 pub mod error;
 pub mod files;
 pub(crate) mod float_state;

@@ -15,7 +15,7 @@ use super::error::{bk_result, call, call_or};
 use super::handles::{hold, object};
 use super::lightmap::bk_lightmap;
 use crate::lightmap::plan::left_out;
-use crate::lightmap::{BakeParams, BakeStats, CheckpointParams, StageStats};
+use crate::lightmap::{BakeParams, BakeStats, CheckpointParams, StageStats, directional};
 use std::ffi::{c_char, c_void};
 
 /// Bit of left_out: indirect light with photons, radiance map and gather map.
@@ -53,6 +53,9 @@ pub const BK_LEFT_OUT_SEAMS: u32 = 16384;
 /// Bit of left_out: sampling of bright patches of surfaces as lights, as gather rays find most of
 /// them.
 pub const BK_LEFT_OUT_BRIGHT_PATCHES: u32 = 32768;
+/// Bit of left_out: light by direction, as bk_bake_params.directional_indirect and directional_direct
+/// are 0.
+pub const BK_LEFT_OUT_DIRECTIONAL: u32 = 65536;
 
 // The numbers are literal for the header's sake.
 const _: () = assert!(
@@ -72,6 +75,7 @@ const _: () = assert!(
         && BK_LEFT_OUT_MANY_LIGHTS == left_out::MANY_LIGHTS
         && BK_LEFT_OUT_SEAMS == left_out::SEAMS
         && BK_LEFT_OUT_BRIGHT_PATCHES == left_out::BRIGHT_PATCHES
+        && BK_LEFT_OUT_DIRECTIONAL == left_out::DIRECTIONAL
 );
 
 /// Parameters of bk_bake.
@@ -161,6 +165,14 @@ pub struct bk_bake_params {
     /// cannot be written later, for example because the disk is full, the bake continues and logs a
     /// warning, and the file stays readable. See bk_bake for errors, which leave the file as it is.
     pub checkpoint: *const c_char,
+    /// 1: compute light that was reflected by other surfaces by direction too (SH L1), for surfaces
+    /// with normal maps. Reading starts at BK_LAYER_L0. It comes from the same rays; in memory it
+    /// takes 48 bytes per texel of the light map, during the bake 48 more and 96 per texel of the
+    /// gather map. Live updates do not have it. Default: 0.
+    pub directional_indirect: u32,
+    /// 1: the same for light that comes straight from lights. With both, the layers hold the sum.
+    /// Set only `directional_indirect` where the application draws the lights itself. Default: 0.
+    pub directional_direct: u32,
 }
 
 sized_struct!(bk_bake_params, defaults: {
@@ -181,6 +193,8 @@ sized_struct!(bk_bake_params, defaults: {
         stitch: p.stitch as u32,
         checkpoint_seconds: CheckpointParams::new("").seconds as f32,
         checkpoint: std::ptr::null(),
+        directional_indirect: p.directional & directional::INDIRECT,
+        directional_direct: (p.directional & directional::DIRECT != 0) as u32,
     }
 });
 
@@ -318,6 +332,9 @@ pub unsafe extern "C" fn bk_bake(
         let lightmap = hold(lightmap, "lightmap")?;
         let p: bk_bake_params = if params.is_null() { SizedStruct::defaults() } else { read_struct(params, "params")? };
         let out = OutStruct::optional(out, "out")?;
+        let bit = |asks: bool, bit| if asks { bit } else { 0 };
+        let directional = bit(read_bool(p.directional_indirect, "directional_indirect")?, directional::INDIRECT)
+            | bit(read_bool(p.directional_direct, "directional_direct")?, directional::DIRECT);
         let params = BakeParams {
             photon_count: p.photon_count,
             max_bounces: p.max_bounces,
@@ -331,6 +348,7 @@ pub unsafe extern "C" fn bk_bake(
             texel_begin: p.texel_begin,
             texel_end: p.texel_end,
             stitch: read_bool(p.stitch, "stitch")?,
+            directional,
         };
         let checkpoint = match p.checkpoint.is_null() {
             true => None,

@@ -13,7 +13,7 @@ use super::lightmap::bk_lightmap;
 use crate::base::error::{Error, Result, invalid_argument};
 use crate::base::memory::try_with_capacity;
 use crate::base::progress::Progress;
-use crate::lightmap::{Layer, LayerData, Lightmap};
+use crate::lightmap::{Layer, LayerData, Lightmap, packed_ratio};
 use half::f16;
 use half::slice::HalfFloatSliceExt;
 use std::ffi::{c_char, c_void};
@@ -39,6 +39,28 @@ pub const BK_LAYER_NORMAL: u32 = 6;
 /// Layer: number of the triangle that covers the texel, counted through all meshes in their order;
 /// BK_NONE where there is none. BK_FORMAT_R32U.
 pub const BK_LAYER_TRIANGLE: u32 = 7;
+/// Layer: mean radiance over the sphere, of which the half below the surface is dark, in W/(m2 sr),
+/// of the light that bk_bake_params.directional_indirect and directional_direct asked for:
+/// 1 / (4 pi) times the integral of radiance. RGB. The guide ("Normal maps") has shader code.
+pub const BK_LAYER_L0: u32 = 8;
+/// Layer: the same mean of radiance times the x coordinate of the direction it comes from, in the
+/// axes of the scene, in W/(m2 sr): -L0 to L0. RGB.
+pub const BK_LAYER_L1X: u32 = 9;
+/// Layer: the same for y. RGB.
+pub const BK_LAYER_L1Y: u32 = 10;
+/// Layer: the same for z. RGB.
+pub const BK_LAYER_L1Z: u32 = 11;
+/// Layer: L1X / L0, -1 to 1; 0 where there is no light. RGB, or BK_FORMAT_RGBA8 as 0.5 + 0.5 times
+/// the ratio.
+pub const BK_LAYER_RATIO_X: u32 = 12;
+/// Layer: L1Y / L0. RGB or BK_FORMAT_RGBA8.
+pub const BK_LAYER_RATIO_Y: u32 = 13;
+/// Layer: L1Z / L0. RGB or BK_FORMAT_RGBA8.
+pub const BK_LAYER_RATIO_Z: u32 = 14;
+/// Layer: dominant direction, L1 / L0 of the sum of the channels: a vector (x, y, z) towards the
+/// light whose length is 1 if all comes from one direction and 0.5 under a uniform sky. RGB or
+/// BK_FORMAT_RGBA8.
+pub const BK_LAYER_DIRECTION: u32 = 15;
 
 /// Format: three floats, 12 bytes per texel.
 pub const BK_FORMAT_RGB32F: u32 = 1;
@@ -48,6 +70,8 @@ pub const BK_FORMAT_RGBA16F: u32 = 2;
 pub const BK_FORMAT_R32F: u32 = 3;
 /// Format: one uint32_t, 4 bytes per texel.
 pub const BK_FORMAT_R32U: u32 = 4;
+/// Format: four bytes, each 255 times a value from 0 to 1, for layers of ratios. Alpha is 255.
+pub const BK_FORMAT_RGBA8: u32 = 5;
 
 /// Copies one layer of one page.
 ///
@@ -55,15 +79,16 @@ pub const BK_FORMAT_R32U: u32 = 4;
 ///
 /// @param lightmap  light map; baked, if the layer holds light
 /// @param page  number of the page
-/// @param layer  one of the BK_LAYER values; COMBINED, INDIRECT, DIRECT and RADIANCE hold light
+/// @param layer  one of the BK_LAYER values; COMBINED, INDIRECT, DIRECT, RADIANCE and those from L0 on
+///   hold light
 /// @param format  one of the BK_FORMAT values that the layer allows
 /// @param dst  receives bk_lightmap_info.height rows of bk_lightmap_info.width texels; needs no
 ///   alignment
 /// @param row_stride  distance between rows in bytes, at least the bytes of a row; 0: packed
 /// @retval BK_ERROR_INVALID_ARGUMENT  page or layer does not exist, the format does not suit the
 ///   layer, or `row_stride` is too small
-/// @retval BK_ERROR_INVALID_STATE  the layer holds light and there was no bake, or the light map is
-///   being baked
+/// @retval BK_ERROR_INVALID_STATE  the layer holds light and there was no bake, or none that
+///   asked for light by direction for layers from L0 on, or the light map is being baked
 /// @retval BK_ERROR_OUT_OF_MEMORY  a page does not fit
 #[unsafe(no_mangle)]
 pub unsafe extern "C" fn bk_lightmap_read(
@@ -87,7 +112,7 @@ pub unsafe extern "C" fn bk_lightmap_read(
         if stride < packed {
             return invalid_argument!("row_stride is {row_stride}, less than the {packed} bytes of a row");
         }
-        let bytes = encode(&data, format)?.ok_or_else(|| {
+        let bytes = encode(&data, layer.is_ratio(), format)?.ok_or_else(|| {
             Error::InvalidArgument(format!("format is {format}, which does not suit the layer {layer:?}"))
         })?;
         if bytes.len() != packed * info.height as usize {
@@ -123,7 +148,7 @@ pub(super) unsafe fn copy_rgb(
     stride: usize,
 ) -> Result<()> {
     let bytes = LayerData::Rgb(texels);
-    let bytes = encode(&bytes, format)?
+    let bytes = encode(&bytes, false, format)?
         .ok_or_else(|| Error::InvalidArgument(format!("format is {format}, not one of the formats of light")))?;
     if width > 0 {
         // SAFETY: by contract.
@@ -142,6 +167,14 @@ fn core_layer(layer: u32) -> Result<Layer> {
         BK_LAYER_POSITION => Layer::Position,
         BK_LAYER_NORMAL => Layer::Normal,
         BK_LAYER_TRIANGLE => Layer::Triangle,
+        BK_LAYER_L0 => Layer::L0,
+        BK_LAYER_L1X => Layer::L1X,
+        BK_LAYER_L1Y => Layer::L1Y,
+        BK_LAYER_L1Z => Layer::L1Z,
+        BK_LAYER_RATIO_X => Layer::RatioX,
+        BK_LAYER_RATIO_Y => Layer::RatioY,
+        BK_LAYER_RATIO_Z => Layer::RatioZ,
+        BK_LAYER_DIRECTION => Layer::Direction,
         other => return invalid_argument!("layer is {other}, not one of the BK_LAYER values"),
     })
 }
@@ -150,19 +183,25 @@ pub(super) fn texel_bytes(format: u32) -> Result<usize> {
     Ok(match format {
         BK_FORMAT_RGB32F => 12,
         BK_FORMAT_RGBA16F => 8,
-        BK_FORMAT_R32F | BK_FORMAT_R32U => 4,
+        BK_FORMAT_R32F | BK_FORMAT_R32U | BK_FORMAT_RGBA8 => 4,
         other => return invalid_argument!("format is {other}, not one of the BK_FORMAT values"),
     })
 }
 
-/// The texels of a layer in a format, or `None` if the format does not suit it.
-fn encode(data: &LayerData, format: u32) -> Result<Option<std::borrow::Cow<'_, [u8]>>> {
+/// The texels of a layer, of ratios or not, in a format, or `None` if the format does not suit it.
+fn encode(data: &LayerData, is_ratio: bool, format: u32) -> Result<Option<std::borrow::Cow<'_, [u8]>>> {
     Ok(match (data, format) {
         (LayerData::Rgb(rgb), BK_FORMAT_RGB32F) => Some(bytemuck::cast_slice(rgb).into()),
         (LayerData::Rgb(rgb), BK_FORMAT_RGBA16F) => {
             let half = |&[r, g, b]: &[f32; 3]| half_bits([r, g, b, 1.0]);
             let mut bytes = try_with_capacity(8 * rgb.len(), "a page")?;
             bytes.extend(rgb.iter().flat_map(|t| bytemuck::cast::<[u16; 4], [u8; 8]>(half(t))));
+            Some(bytes.into())
+        }
+        (LayerData::Rgb(rgb), BK_FORMAT_RGBA8) if is_ratio => {
+            let mut bytes = try_with_capacity(4 * rgb.len(), "a page")?;
+            let bytes_of = |t: &[f32; 3]| t.map(packed_ratio);
+            bytes.extend(rgb.iter().map(bytes_of).flat_map(|[r, g, b]| [r, g, b, 255]));
             Some(bytes.into())
         }
         (LayerData::Scalar(v), BK_FORMAT_R32F) => Some(bytemuck::cast_slice(v).into()),
@@ -181,9 +220,10 @@ fn half_bits(values: [f32; 4]) -> [u16; 4] {
 }
 
 /// Kind of file: float images of the light layers, PREFIXpageN-LAYER.exr with LAYER one of
-/// combined, indirect, direct, radiance.
+/// combined, indirect, direct, radiance; with light by direction also l0, ratio-x, ratio-y, ratio-z.
 pub const BK_FILE_EXR: u32 = 1;
-/// Kind of file: tone-mapped 8-bit images of the light layers for viewing, PREFIXpageN-LAYER.png.
+/// Kind of file: tone-mapped 8-bit images of the light layers for viewing, PREFIXpageN-LAYER.png;
+/// with light by direction also its ratios, as in BK_FORMAT_RGBA8.
 pub const BK_FILE_PNG: u32 = 2;
 /// Kind of file: the scene with its light map for viewers and engines, PREFIXscene.glb (glTF 2.0).
 ///
@@ -354,10 +394,14 @@ mod tests {
 
     #[test]
     fn a_format_that_does_not_suit_the_layer_is_none() {
-        assert_eq!(encode(&LayerData::Rgb(vec![[1.0; 3]]), BK_FORMAT_R32F), Ok(None));
-        assert_eq!(encode(&LayerData::Integer(vec![1]), BK_FORMAT_R32F), Ok(None));
+        assert_eq!(encode(&LayerData::Rgb(vec![[1.0; 3]]), false, BK_FORMAT_R32F), Ok(None));
+        assert_eq!(encode(&LayerData::Integer(vec![1]), false, BK_FORMAT_R32F), Ok(None));
+        assert_eq!(encode(&LayerData::Rgb(vec![[1.0; 3]]), false, BK_FORMAT_RGBA8), Ok(None));
         let rgb = LayerData::Rgb(vec![[1.0, 0.5, 0.0]]);
-        let half = encode(&rgb, BK_FORMAT_RGBA16F).unwrap().unwrap();
+        let half = encode(&rgb, false, BK_FORMAT_RGBA16F).unwrap().unwrap();
         assert_eq!(*half, *bytemuck::cast_slice::<u16, u8>(&[0x3c00, 0x3800, 0, 0x3c00]));
+        let ratios = LayerData::Rgb(vec![[-1.0, 0.0, 0.5]]);
+        let bytes = encode(&ratios, true, BK_FORMAT_RGBA8).unwrap().unwrap();
+        assert_eq!(*bytes, [0, 128, 191, 255]);
     }
 }

@@ -14,8 +14,9 @@ use super::light_tree::LIGHT_TREE;
 use super::many_lights::ManyLights;
 use super::point_light::push_one;
 use super::receiver::Receiver;
-use super::shadow_rays::{PointRoom, ShadowRays, shadow_ray};
+use super::shadow_rays::{KINDS, PointRoom, ShadowRays, shadow_ray};
 use super::sun_sky::{Disc, push_sky};
+use crate::base::directional::Directional;
 use crate::base::error::Result;
 use crate::base::memory::try_collect;
 use crate::base::sampling::{combine, sobol_2d};
@@ -91,6 +92,15 @@ impl PointLight {
     /// The irradiance, or the sum of irradiances.
     pub(crate) fn value(&self) -> Vec3 {
         self.sharp + self.sampled + self.discs.value() + self.areas.value()
+    }
+
+    /// Light by direction, from what has arrived in the slots: weighted as the irradiance is, if that is a sum.
+    pub(crate) fn by_direction(&self, [sharp, sampled, discs, areas]: &[Directional; KINDS]) -> Directional {
+        let scale = |ratio: &Ratio| {
+            let (value, visible) = (ratio.value(), ratio.visible);
+            Vec3::select(visible.cmpgt(Vec3::ZERO), value / visible, Vec3::ZERO)
+        };
+        *sharp + *sampled + discs.scaled(scale(&self.discs)) + areas.scaled(scale(&self.areas))
     }
 
     /// Irradiance from lights whose shadows have narrow penumbrae or none.
@@ -267,6 +277,24 @@ impl DirectLight {
         light
     }
 
+    /// Does the work of [`at_point`](Self::at_point), and returns the light by direction too.
+    pub(crate) fn at_point_by_direction(
+        &self,
+        receiver: &Receiver,
+        lights: Lights,
+        samples: u32,
+        seed: u32,
+        rays: &mut u64,
+    ) -> (PointLight, Directional) {
+        let mut room = PointRoom::by_direction();
+        let mut shadow = room.begin(&self.scene);
+        let mut light = self.push(receiver, 0, lights, samples, seed, &mut shadow);
+        let (sums, directed) = shadow.finish_by_direction(rays);
+        light.take(sums);
+        let kinds = std::array::from_fn(|kind| directed[kind]);
+        (light, light.by_direction(&kinds))
+    }
+
     /// Pushes the shadow rays of a point, for the [`KINDS`](super::shadow_rays::KINDS) slots from the current one on.
     /// It is point `number` of those that share `seed`: their samples of a light are stratified together. Returns the
     /// point's light, which is to [take](PointLight::take) what arrives in these slots. `samples`: per point, as in
@@ -281,6 +309,7 @@ impl DirectLight {
         shadow: &mut ShadowRays,
     ) -> PointLight {
         let mut out = PointLight::default();
+        shadow.normal = receiver.normal;
         if lights != Lights::Soft {
             self.each.iter().for_each(|light| push_one(light, receiver, shadow));
         }

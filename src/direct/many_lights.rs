@@ -92,6 +92,7 @@ impl ManyLights {
     /// Pushes up to `n` shadow rays, whose sum is the irradiance without bias. Returns the unoccluded irradiance by the
     /// same samples, summed over the channels.
     pub(crate) fn push(&self, receiver: &Receiver, n: u32, seed: u32, shadow: &mut ShadowRays) -> f32 {
+        shadow.normal = receiver.normal;
         let mut choice = std::mem::take(shadow.choice);
         self.find_candidates(receiver, n * CANDIDATES, seed, &mut choice);
         let total = push_some(receiver, n, seed, &choice.candidates, shadow);

@@ -5,6 +5,7 @@
 
 use super::light_tree::Descent;
 use super::receiver::Receiver;
+use crate::base::directional::Directional;
 use crate::base::error::Result;
 use crate::base::memory::try_filled;
 use crate::scene::Scene;
@@ -58,6 +59,14 @@ pub(crate) struct Room<R, C, O, V> {
     occluded: O,
     visible: V,
     choice: Choice,
+    /// `None`: nobody asks for light by direction.
+    directed: Option<Directed>,
+}
+
+/// Light by direction: that of each ray if nothing occludes it, and what has arrived, by slot.
+struct Directed {
+    carried: Vec<Directional>,
+    visible: Vec<Directional>,
 }
 
 /// Room for one point.
@@ -76,7 +85,15 @@ impl PointRoom {
             occluded: [0; TOGETHER],
             visible: [Vec3::ZERO; KINDS],
             choice: Choice::default(),
+            directed: None,
         }
+    }
+
+    /// Makes room for light by direction too. (A KiB and a half, for few points.)
+    pub(crate) fn by_direction() -> Self {
+        let nothing = Directional::default();
+        let directed = Directed { carried: vec![nothing; TOGETHER], visible: vec![nothing; KINDS] };
+        Room { directed: Some(directed), ..Self::new() }
     }
 }
 
@@ -91,7 +108,16 @@ impl TileRoom {
             occluded: try_filled(most, 0, what)?,
             visible: try_filled(slots, Vec3::ZERO, what)?,
             choice: Choice::default(),
+            directed: None,
         })
+    }
+
+    /// Allocates room for light by direction too.
+    pub(crate) fn by_direction(self) -> Result<Self> {
+        let (what, nothing) = ("the shadow rays of a tile", Directional::default());
+        let carried = try_filled(self.rays.len(), nothing, what)?;
+        let directed = Directed { carried, visible: try_filled(self.visible.len(), nothing, what)? };
+        Ok(Room { directed: Some(directed), ..self })
     }
 }
 
@@ -100,6 +126,9 @@ impl<R: AsMut<[Ray]>, C: AsMut<[Carried]>, O: AsMut<[u8]>, V: AsMut<[Vec3]>> Roo
     pub(crate) fn begin<'a>(&'a mut self, scene: &'a Scene) -> ShadowRays<'a> {
         let visible = self.visible.as_mut();
         visible.fill(Vec3::ZERO);
+        if let Some(directed) = &mut self.directed {
+            directed.visible.fill(Directional::default());
+        }
         ShadowRays {
             scene,
             rays: self.rays.as_mut(),
@@ -110,6 +139,8 @@ impl<R: AsMut<[Ray]>, C: AsMut<[Carried]>, O: AsMut<[u8]>, V: AsMut<[Vec3]>> Roo
             count: 0,
             traced: 0,
             slot: 0,
+            normal: Vec3::ZERO,
+            directed: self.directed.as_mut(),
         }
     }
 }
@@ -127,6 +158,9 @@ pub(crate) struct ShadowRays<'a> {
     traced: u64,
     /// The sum that the next rays belong to.
     pub(crate) slot: usize,
+    /// Unit normal of the receiver of the next rays.
+    pub(super) normal: Vec3,
+    directed: Option<&'a mut Directed>,
 }
 
 impl ShadowRays<'_> {
@@ -136,7 +170,19 @@ impl ShadowRays<'_> {
         }
         self.rays[self.count] = ray;
         self.carried[self.count] = Carried { light, slot: self.slot as u32 };
+        if self.directed.is_some() {
+            self.carry_by_direction(&ray, light);
+        }
         self.count += 1;
+    }
+
+    /// Notes the direction of a ray that is being pushed. (Out of line: inlined, it slows down those who do not ask.)
+    #[inline(never)]
+    fn carry_by_direction(&mut self, ray: &Ray, light: Vec3) {
+        if let Some(directed) = &mut self.directed {
+            let direction = Vec3::from(ray.direction).normalize_or_zero();
+            directed.carried[self.count] = Directional::of(light, direction, direction.dot(self.normal));
+        }
     }
 
     /// Pushes the ray to a point light. It ends as far before the light as rays start from surfaces: a light may lie on
@@ -151,8 +197,12 @@ impl ShadowRays<'_> {
         let scene = self.scene;
         let (rays, carried) = (&self.rays[..self.count], &self.carried[..self.count]);
         if scene.uses().transmission {
-            for (ray, c) in rays.iter().zip(carried) {
-                self.visible[c.slot as usize] += c.light * scene.transmittance(ray);
+            for (i, (ray, c)) in rays.iter().zip(carried).enumerate() {
+                let passed = scene.transmittance(ray);
+                self.visible[c.slot as usize] += c.light * passed;
+                if let Some(d) = &mut self.directed {
+                    d.visible[c.slot as usize] += d.carried[i].scaled(passed);
+                }
             }
         } else {
             let occluded = &mut self.occluded[..self.count];
@@ -160,8 +210,13 @@ impl ShadowRays<'_> {
                 true => scene.occluded_stream(rays, occluded),
                 false => scene.occluded_block(rays, occluded),
             }
-            for (c, _) in carried.iter().zip(occluded).filter(|(_, occluded)| **occluded == 0) {
+            for (c, _) in carried.iter().zip(&*occluded).filter(|(_, occluded)| **occluded == 0) {
                 self.visible[c.slot as usize] += c.light;
+            }
+            if let Some(d) = &mut self.directed {
+                for (i, (c, _)) in carried.iter().zip(&*occluded).enumerate().filter(|(_, (_, o))| **o == 0) {
+                    d.visible[c.slot as usize] += d.carried[i];
+                }
             }
         }
         self.traced += self.count as u64;
@@ -170,8 +225,13 @@ impl ShadowRays<'_> {
 
     /// Traces the remaining rays and returns the light that has arrived, by slot; adds the rays traced to `rays`.
     pub(crate) fn finish(&mut self, rays: &mut u64) -> &[Vec3] {
+        self.finish_by_direction(rays).0
+    }
+
+    /// Does the work of [`finish`](Self::finish), and returns the light by direction too; empty if there is no room for it.
+    pub(crate) fn finish_by_direction(&mut self, rays: &mut u64) -> (&[Vec3], &[Directional]) {
         self.trace();
         *rays += std::mem::take(&mut self.traced);
-        self.visible
+        (self.visible, self.directed.as_ref().map_or(&[], |d| &d.visible))
     }
 }

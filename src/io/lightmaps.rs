@@ -7,7 +7,7 @@ use super::source::Advance;
 use crate::base::error::{Error, Result};
 use crate::base::memory::{Reservation, try_collect_ok, try_vec};
 use crate::base::progress::Progress;
-use crate::lightmap::{Layer, LayerData, Lightmap};
+use crate::lightmap::{Layer, LayerData, Lightmap, packed_ratio};
 use rayon::prelude::*;
 use std::f32::consts::PI;
 use std::path::{Path, PathBuf};
@@ -19,6 +19,10 @@ const LAYERS: [(Layer, &str); 4] = [
     (Layer::Direct, "direct"),
     (Layer::Radiance, "radiance"),
 ];
+
+/// Layers of light by direction, of light maps that have it. PNG shows the ratios alone, as 0.5 plus half of the value.
+const DIRECTIONAL: [(Layer, &str); 4] =
+    [(Layer::L0, "l0"), (Layer::RatioX, "ratio-x"), (Layer::RatioY, "ratio-y"), (Layer::RatioZ, "ratio-z")];
 
 /// One exposure for all pages (see [`auto_exposure`](super::image::auto_exposure)), from the texels that are lit.
 pub fn exposure(lightmap: &Lightmap) -> Result<f32> {
@@ -39,11 +43,16 @@ pub fn exposure(lightmap: &Lightmap) -> Result<f32> {
 pub fn write_exr_pages(lightmap: &Lightmap, prefix: &str, progress: &Progress) -> Result<Vec<PathBuf>> {
     let info = lightmap.info();
     lightmap.scene().device().run(progress, || {
-        each_page(lightmap, progress, |page, layer, name, advance| {
-            let path = PathBuf::from(format!("{prefix}page{page}-{name}.exr"));
-            write_exr_with(&path, info.width, info.height, &rgb(lightmap, page, layer)?, advance)?;
-            Ok(path)
-        })
+        each_page(
+            lightmap,
+            |_| true,
+            progress,
+            |page, layer, name, advance| {
+                let path = PathBuf::from(format!("{prefix}page{page}-{name}.exr"));
+                write_exr_with(&path, info.width, info.height, &rgb(lightmap, page, layer)?, advance)?;
+                Ok(path)
+            },
+        )
     })
 }
 
@@ -58,14 +67,22 @@ pub fn write_png_pages(
     let info = lightmap.info();
     lightmap.scene().device().run(progress, || {
         let exposure = exposure.map_or_else(|| self::exposure(lightmap), Ok)?;
-        each_page(lightmap, progress, |page, layer, name, advance| {
-            let path = PathBuf::from(format!("{prefix}page{page}-{name}.png"));
-            // Radiance is albedo/π times irradiance: π brings it to the brightness of the others.
-            let exposure = if layer == Layer::Radiance { exposure * PI } else { exposure };
-            let pixels = tone_mapped(lightmap, page, layer, exposure)?;
-            write_png_with(&path, info.width, info.height, &pixels, advance)?;
-            Ok(path)
-        })
+        each_page(
+            lightmap,
+            |layer| layer != Layer::L0,
+            progress,
+            |page, layer, name, advance| {
+                let path = PathBuf::from(format!("{prefix}page{page}-{name}.png"));
+                // Radiance is albedo/π times irradiance: π brings it to the brightness of the others.
+                let exposure = if layer == Layer::Radiance { exposure * PI } else { exposure };
+                let pixels = match layer.is_ratio() {
+                    true => packed(lightmap, page, layer)?,
+                    false => tone_mapped(lightmap, page, layer, exposure)?,
+                };
+                write_png_with(&path, info.width, info.height, &pixels, advance)?;
+                Ok(path)
+            },
+        )
     })
 }
 
@@ -101,14 +118,18 @@ fn encoder_memory(lightmap: &Lightmap) -> Result<Reservation> {
     lightmap.scene().device().memory().reserve(bytes, "a page being encoded")
 }
 
-/// Runs `write` for each light layer of each page, in parallel.
+/// Runs `write` for each light layer of each page that is wanted, in parallel.
 fn each_page(
     lightmap: &Lightmap,
+    is_wanted: impl Fn(Layer) -> bool,
     progress: &Progress,
     write: impl Fn(u32, Layer, &str, Advance) -> Result<PathBuf> + Sync,
 ) -> Result<Vec<PathBuf>> {
-    let jobs: Vec<(u32, Layer, &str)> =
-        (0..lightmap.info().page_count).flat_map(|page| LAYERS.map(|(layer, name)| (page, layer, name))).collect();
+    let directional = if lightmap.has_directional() { &DIRECTIONAL[..] } else { &[] };
+    let layers = || LAYERS.iter().chain(directional).filter(|(layer, _)| is_wanted(*layer));
+    let jobs: Vec<(u32, Layer, &str)> = (0..lightmap.info().page_count)
+        .flat_map(|page| layers().map(move |&(layer, name)| (page, layer, name)))
+        .collect();
     let stage = progress.stage("pages", 0.0, 1.0, jobs.len() as u64);
     let written = jobs.par_iter().map(|&(page, layer, name)| {
         stage.advance(0)?;
@@ -126,6 +147,14 @@ fn rgb(lightmap: &Lightmap, page: u32, layer: Layer) -> Result<Vec<[f32; 3]>> {
         LayerData::Rgb(pixels) => Ok(pixels),
         _ => Err(Error::Internal(format!("layer {layer:?} is not RGB"))),
     }
+}
+
+/// A layer of ratios, −1 to 1, as bytes.
+fn packed(lightmap: &Lightmap, page: u32, layer: Layer) -> Result<Vec<[u8; 3]>> {
+    let pixels = rgb(lightmap, page, layer)?;
+    let mut bytes = try_vec::<[u8; 3]>(pixels.len(), "a page being encoded")?;
+    bytes.iter_mut().zip(&pixels).for_each(|(to, from)| *to = from.map(packed_ratio));
+    Ok(bytes)
 }
 
 fn tone_mapped(lightmap: &Lightmap, page: u32, layer: Layer, exposure: f32) -> Result<Vec<[u8; 3]>> {

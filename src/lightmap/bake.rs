@@ -10,15 +10,16 @@ use super::indirect::blur;
 use super::indirect::gather::{Gathered, Tile, TileTexel};
 use super::indirect::radiance_map::Radiance;
 use super::indirect::sample_set::SampleSet;
-use super::indirect::upsample::{OwnLight, Upsampling};
+use super::indirect::upsample::{Upsampling, parts};
 use super::plan::{Plan, left_out};
 use super::saved::checkpoint::Checkpoint;
 use super::seams::Stitch;
-use super::stages::{self, Inputs, purpose};
+use super::stages::{self, Inputs, Own, purpose};
 use super::texel_light::averages::{Averaged, Variation};
 use super::texel_light::{TexelLight, TilePoints};
 use super::tiles::{TILE, in_order, texels_per_tile};
-use super::{BakeParams, BakeStats, CheckpointParams, Light, Lightmap, Origin, StageStats, TexelState};
+use super::{BakeParams, BakeStats, CheckpointParams, Light, Lightmap, Origin, StageStats, TexelState, directional};
+use crate::base::directional::Directional;
 use crate::base::error::{Error, Result, invalid_argument};
 use crate::base::memory::{try_filled, try_vec, try_with_capacity};
 use crate::base::progress::{Progress, Stage};
@@ -41,6 +42,10 @@ const GATHER_BYTES: usize = 3 * size_of::<Vec3>() + size_of::<f32>() + size_of::
 
 /// Bytes per light map texel while a bake runs: direct and indirect light, state, variation of direct light.
 const TEXEL_BYTES: usize = 2 * size_of::<Vec3>() + size_of::<TexelState>() + size_of::<Variation>();
+
+/// Bytes of light by direction, if it is asked for: per gather texel plain and blurred, and per light map texel direct
+/// light and the result.
+const DIRECTIONAL_BYTES: usize = 2 * size_of::<Directional>();
 
 impl Lightmap {
     /// Runs the pipeline. After an error or a cancel, the light of earlier bakes is unchanged.
@@ -132,6 +137,13 @@ impl Lightmap {
                 }
                 old.direct[range.clone()].copy_from_slice(&new.direct[range.clone()]);
                 old.indirect[range.clone()].copy_from_slice(&new.indirect[range.clone()]);
+                if old.directional.len() == new.directional.len() {
+                    let of_range = range.start.min(new.directional.len())..range.end.min(new.directional.len());
+                    old.directional[of_range.clone()].copy_from_slice(&new.directional[of_range]);
+                } else {
+                    // Bakes that differ in what they were asked for: the light by direction of the last one stays.
+                    (old.directional, old._memory) = (new.directional, new._memory);
+                }
                 old.state[range.clone()].copy_from_slice(&new.state[range]);
                 old.radiance = new.radiance;
                 old.backs = new.backs;
@@ -163,8 +175,10 @@ struct Bake<'a, 'p> {
 /// The gather map after blur and filling.
 struct Indirect {
     irradiance: Vec<Vec3>,
+    /// Light by direction; empty if nobody asks for it.
+    directional: Vec<Directional>,
     upsampling: Upsampling,
-    own: OwnLight,
+    own: Own,
 }
 
 impl<'p> Bake<'_, 'p> {
@@ -183,6 +197,7 @@ impl<'p> Bake<'_, 'p> {
         let mut light = Light {
             direct: try_vec(n, "direct light")?,
             indirect: try_vec(n, "indirect light")?,
+            directional: try_vec(if self.params.directional == 0 { 0 } else { n }, "light by direction")?,
             state: try_vec(n, "validity")?,
             radiance,
             backs,
@@ -227,15 +242,22 @@ impl<'p> Bake<'_, 'p> {
         Ok(backs)
     }
 
-    /// Traces the fallback gathers, or reads their light from the checkpoint. Returns it and the number of rays.
-    fn own_light(&self, radiance: &Radiance, backs: &[bool], upsampling: &Upsampling) -> Result<(OwnLight, u64)> {
+    /// Traces the fallback gathers, or reads their light from the checkpoint.
+    fn own_light(&self, radiance: &Radiance, backs: &[bool], upsampling: &Upsampling) -> Result<Own> {
         let texels = upsampling.own_work() as usize / 2;
-        if let Some(own) = self.checkpoint.map(|c| c.own_light(texels)).transpose()?.flatten() {
-            return Ok((own, 0));
+        let asks = self.asks(directional::INDIRECT);
+        if let Some(c) = self.checkpoint
+            && let Some(light) = c.own_light(texels)?
+            && let Some(directional) = if asks { c.own_directional(&light)? } else { Some(Vec::new()) }
+        {
+            return Ok(Own { light, directional, rays: 0 });
         }
-        let own = stages::own_light(&self.inputs(), radiance, backs, upsampling)?;
+        let own = stages::own_light(&self.inputs(), radiance, backs, upsampling, asks)?;
         if let Some(c) = self.checkpoint {
-            c.keep_own_light(&own.0);
+            if asks {
+                c.keep_own_directional(&own.directional);
+            }
+            c.keep_own_light(&own.light);
         }
         Ok(own)
     }
@@ -244,6 +266,12 @@ impl<'p> Bake<'_, 'p> {
     fn reserve(&self) -> Result<crate::base::memory::Reservation> {
         let l = self.atlas;
         let mut bytes = l.map.len() * TEXEL_BYTES;
+        if self.params.directional != 0 {
+            bytes += l.map.len() * DIRECTIONAL_BYTES;
+        }
+        if self.asks(directional::INDIRECT) {
+            bytes += l.gather.len() * DIRECTIONAL_BYTES;
+        }
         if self.plan.runs(left_out::INDIRECT) {
             bytes += l.radiance.len() * 12 + l.gather.len() * GATHER_BYTES;
         }
@@ -256,6 +284,12 @@ impl<'p> Bake<'_, 'p> {
         l.scene.device().memory().reserve(bytes, "the bake's buffers")
     }
 
+    /// Whether some light is computed and asked for by direction, given by a bit of [`directional`].
+    fn asks(&self, bit: u32) -> bool {
+        let stage = if bit == directional::INDIRECT { left_out::INDIRECT } else { left_out::DIRECT };
+        self.params.directional & bit != 0 && self.plan.runs(stage)
+    }
+
     /// Gathers indirect light, fills and blurs it. Only placements that the range touches are gathered.
     fn gather(&self, radiance: &Radiance, backs: &[bool], stats: &mut BakeStats) -> Result<Indirect> {
         let start = Instant::now();
@@ -266,7 +300,7 @@ impl<'p> Bake<'_, 'p> {
         let starts = &l.gather.texels.chart_start;
         let needed = starts[placements.start] as usize..starts[placements.end] as usize;
         let upsampling = stages::upsampling(&self.inputs(), backs, placements)?;
-        let (own, own_rays) = self.own_light(radiance, backs, &upsampling)?;
+        let own = self.own_light(radiance, backs, &upsampling)?;
         let lookup = self.inputs().lookup(radiance);
         let samples = SampleSet::new(self.params.gather_rays, purpose_seed(self.params.seed, purpose::GATHER_SET));
         let seed = purpose_seed(self.params.seed, purpose::GATHER);
@@ -276,29 +310,35 @@ impl<'p> Bake<'_, 'p> {
         let mut normals: Vec<Vec3> = try_vec(n, "the gather map's normals")?;
         let mut variances: Vec<f32> = try_vec(n, "the gather map's variance")?;
         let mut valid: Vec<bool> = try_vec(n, "the gather map's validity")?;
-        let rays = AtomicU64::new(upsampling.rays + own_rays);
+        let asks = self.asks(directional::INDIRECT);
+        let mut directional: Vec<Directional> = try_vec(if asks { n } else { 0 }, "the gather map by direction")?;
+        let (new_tile, nothing) = (if asks { Tile::by_direction } else { Tile::new }, asks.then(Directional::default));
+        let rays = AtomicU64::new(upsampling.rays + own.rays);
         let tiles = Scratch::new();
         device.install(|| {
             let values = irradiance[needed.clone()].par_chunks_mut(BLOCK);
             let normals = normals[needed.clone()].par_chunks_mut(BLOCK);
             let variances = variances[needed.clone()].par_chunks_mut(BLOCK);
             let valid = valid[needed.clone()].par_chunks_mut(BLOCK);
-            let blocks = values.zip(normals).zip(variances).zip(valid).enumerate();
-            blocks.try_for_each(|(block, (((values, normals), variances), valid))| {
-                if self.checkpoint.is_some_and(|c| c.gathered(block, values, variances, valid)) {
+            let directional = directional.get_mut(needed.clone()).unwrap_or_default();
+            let directional = parts(directional, BLOCK, needed.len())?;
+            let blocks = values.zip(normals).zip(variances).zip(valid).zip(directional).enumerate();
+            blocks.try_for_each(|(block, ((((values, normals), variances), valid), directional))| {
+                if self.checkpoint.is_some_and(|c| c.gathered(block, values, variances, valid, directional)) {
                     for (i, normal) in normals.iter_mut().enumerate() {
                         let texel = GatherTexel::new(needed.start + block * BLOCK + i);
                         *normal = l.receiver(&l.gather, backs, texel).normal;
                     }
                     return stage.advance(values.len() as u64);
                 }
-                let (mut traced, mut tile) = (0, tiles.take(Tile::new)?);
+                let (mut traced, mut tile) = (0, tiles.take(new_tile)?);
                 let first = needed.start + block * BLOCK;
                 for texels_of_tile in in_order(&l.gather, first..first + values.len())?.chunks(TILE) {
                     let texel = |&texel: &GatherTexel| TileTexel {
                         receiver: l.receiver(&l.gather, backs, texel),
                         seed: combine(seed, texel.seed()),
                         gathered: Gathered::default(),
+                        directional: nothing,
                     };
                     let mut texels: Vec<_> = texels_of_tile.iter().map(texel).collect();
                     for round in 0..samples.rounds() {
@@ -306,14 +346,17 @@ impl<'p> Bake<'_, 'p> {
                         self.progress.check()?;
                         traced += tile.add_round(&l.scene, &lookup, &mut texels, &samples, round);
                     }
-                    for (texel, TileTexel { receiver, gathered, .. }) in texels_of_tile.iter().zip(&texels) {
-                        let i = texel.index() - first;
+                    for (texel, of_texel) in texels_of_tile.iter().zip(&texels) {
+                        let (i, TileTexel { receiver, gathered, .. }) = (texel.index() - first, of_texel);
                         (values[i], normals[i]) = (gathered.irradiance(), receiver.normal);
                         (variances[i], valid[i]) = (gathered.variance(), gathered.is_visible());
+                        if let Some(directional) = directional.get_mut(i) {
+                            *directional = of_texel.directional();
+                        }
                     }
                 }
                 if let Some(c) = self.checkpoint {
-                    c.keep_gathered(block, values, variances, valid);
+                    c.keep_gathered(block, values, variances, valid, directional);
                 }
                 rays.fetch_add(traced, Relaxed);
                 stage.advance(values.len() as u64)
@@ -321,17 +364,27 @@ impl<'p> Bake<'_, 'p> {
         })?;
         let is_hidden = |i: usize| needed.contains(&i) && !valid[i];
         Filling::new(n, |i| valid[i], is_hidden)?.fill(&l.charts, &l.gather, &mut irradiance, self.progress)?;
+        if asks {
+            let filling = Filling::new(n, |i| valid[i], is_hidden)?;
+            filling.fill(&l.charts, &l.gather, &mut directional, self.progress)?;
+        }
         if self.plan.runs(left_out::BLUR) {
             let stage = self.progress.stage("blur", 0.6, 0.65, n as u64);
             let mut blurred = try_vec(n, "the blurred gather map")?;
             let radius = self.params.blur_radius;
             let texels = blur::Texels { values: &irradiance, variances: &variances, valid: &valid, normals: &normals };
             blur::blur(device, &l.charts, &l.gather, texels, radius, &mut blurred, &stage)?;
+            if asks {
+                let mut out = try_vec(n, "the blurred gather map by direction")?;
+                let from = &directional[..];
+                blur::blur_directional(device, &l.charts, &l.gather, (texels, from), radius, &mut out, self.progress)?;
+                directional = out;
+            }
             irradiance = blurred;
         }
-        let bytes = (n * GATHER_BYTES + l.gather.bytes()) as u64;
+        let bytes = (n * GATHER_BYTES + directional.len() * DIRECTIONAL_BYTES + l.gather.bytes()) as u64;
         stats.gather = StageStats { seconds: start.elapsed().as_secs_f64(), rays: rays.into_inner(), bytes };
-        Ok(Indirect { irradiance, upsampling, own })
+        Ok(Indirect { irradiance, directional, upsampling, own })
     }
 
     /// Computes direct light and interpolates indirect light for every texel of the range.
@@ -352,20 +405,34 @@ impl<'p> Bake<'_, 'p> {
         // Blocks whose light is in the checkpoint.
         let mut known = try_filled(range.len().div_ceil(BLOCK), false, "blocks of texels")?;
         let tiles = Scratch::new();
+        let asks = self.asks(directional::DIRECT);
+        let new_tile = if asks { TilePoints::by_direction } else { TilePoints::new };
+        // Direct light by direction, which is averaged before it is added to the rest.
+        let mut directed: Vec<Directional> = try_vec(if asks { range.len() } else { 0 }, "direct light by direction")?;
         scene.device().install(|| {
             let direct = light.direct[range.clone()].par_chunks_mut(BLOCK).zip(&mut known);
             let indirect_out = light.indirect[range.clone()].par_chunks_mut(BLOCK);
             let state = light.state[range.clone()].par_chunks_mut(BLOCK);
-            direct.zip(indirect_out).zip(state).enumerate().try_for_each(|(block, (((direct, known), ind), state))| {
+            let directional = light.directional.get_mut(range.clone()).unwrap_or_default();
+            let directional = parts(directional, BLOCK, range.len())?;
+            let directional = directional.into_par_iter().zip(parts(&mut directed, BLOCK, range.len())?);
+            let blocks = direct.zip(indirect_out).zip(state).zip(directional).enumerate();
+            blocks.try_for_each(|(block, ((((direct, known), ind), state), (directional, directed)))| {
                 let mut traced = 0;
                 let first = range.start + block * BLOCK;
                 if let Some(indirect) = indirect {
                     let irradiance = PerTexel::new(&indirect.irradiance);
-                    for (texel, ind) in LightTexel::range(first..first + ind.len()).zip(ind) {
-                        *ind = indirect.upsampling.at(l, irradiance, &indirect.own, texel);
+                    for (texel, ind) in LightTexel::range(first..first + ind.len()).zip(&mut *ind) {
+                        *ind = indirect.upsampling.at(l, irradiance, &indirect.own.light, texel);
+                    }
+                    if !indirect.directional.is_empty() {
+                        let from = PerTexel::new(&indirect.directional);
+                        for (texel, out) in LightTexel::range(first..first + ind.len()).zip(directional) {
+                            *out = indirect.upsampling.at(l, from, &indirect.own.directional, texel);
+                        }
                     }
                 }
-                *known = self.checkpoint.is_some_and(|c| c.lit(block, direct, state));
+                *known = self.checkpoint.is_some_and(|c| c.lit(block, direct, state, directed));
                 if *known {
                     return stage.advance(direct.len() as u64);
                 }
@@ -376,24 +443,32 @@ impl<'p> Bake<'_, 'p> {
                     };
                 }
                 if self.plan.runs(left_out::DIRECT) && self.direct.has_sharp() {
-                    let mut tile = tiles.take(|| TilePoints::new(TILE))?;
+                    let mut tile = tiles.take(|| new_tile(TILE))?;
                     for of_tile in in_order(&l.map, first..first + direct.len())?.chunks(4 * TILE) {
                         self.progress.check()?;
                         let receivers = of_tile.iter().map(|&texel| l.receiver(&l.map, backs, texel));
                         let place = |i: usize| of_tile[i].index() - first;
-                        texels.sharp_of_tile(receivers, &mut tile, &mut traced, |i, sharp| direct[place(i)] = sharp);
+                        texels.sharp_of_tile(receivers, &mut tile, &mut traced, |i, sharp, by_direction| {
+                            direct[place(i)] = sharp;
+                            if let Some((directed, by_direction)) = directed.get_mut(place(i)).zip(by_direction) {
+                                *directed = *by_direction;
+                            }
+                        });
                     }
                 }
                 if let Some(c) = self.checkpoint.filter(|_| !self.plan.runs(left_out::DIRECT)) {
-                    c.keep_lit(block, direct, state);
+                    c.keep_lit(block, direct, state, directed);
                 }
                 rays.fetch_add(traced, Relaxed);
                 stage.advance(direct.len() as u64)
             })
         })?;
         if self.plan.runs(left_out::DIRECT) {
-            let traced = self.average_direct(&texels, backs, &known, &mut light.direct, &light.state, &stage)?;
+            let direct = (&mut light.direct[..], &mut directed[..]);
+            let traced = self.average_direct(&texels, backs, &known, direct, &light.state, &stage)?;
             rays.fetch_add(traced, Relaxed);
+            let sums = light.directional.get_mut(range).unwrap_or_default();
+            sums.iter_mut().zip(&directed).for_each(|(sum, &directed)| *sum += directed);
         }
         stats.direct = StageStats {
             seconds: start.elapsed().as_secs_f64(),
@@ -420,7 +495,7 @@ impl<'p> Bake<'_, 'p> {
         texels: &TexelLight<LightMap>,
         backs: &[bool],
         known: &[bool],
-        direct: &mut [Vec3],
+        (direct, directed): (&mut [Vec3], &mut [Directional]),
         state: &[TexelState],
         stage: &Stage,
     ) -> Result<u64> {
@@ -428,6 +503,7 @@ impl<'p> Bake<'_, 'p> {
         let rays = AtomicU64::new(0);
         let mut variations: Vec<Variation> = try_vec(range.len(), "where direct light varies")?;
         let tiles = Scratch::new();
+        let new_tile = if directed.is_empty() { TilePoints::new } else { TilePoints::by_direction };
         l.scene.device().install(|| {
             let sharp = &direct[..];
             variations.par_chunks_mut(BLOCK).enumerate().for_each(|(block, out)| {
@@ -444,13 +520,13 @@ impl<'p> Bake<'_, 'p> {
                 rays.fetch_add(traced, Relaxed);
             });
             let blocks = direct[range.clone()].par_chunks_mut(BLOCK).zip(state[range.clone()].par_chunks(BLOCK));
-            let blocks = blocks.zip(variations.par_chunks(BLOCK)).enumerate();
-            blocks.try_for_each(|(block, ((direct, state), variations))| {
+            let blocks = blocks.zip(variations.par_chunks(BLOCK)).zip(parts(directed, BLOCK, range.len())?).enumerate();
+            blocks.try_for_each(|(block, (((direct, state), variations), directed))| {
                 if known[block] {
                     return stage.advance(direct.len() as u64);
                 }
                 let (mut traced, first) = (0, range.start + block * BLOCK);
-                let mut tile = tiles.take(|| TilePoints::new(TILE))?;
+                let mut tile = tiles.take(|| new_tile(TILE))?;
                 let mut of_tile = try_with_capacity(TILE, "the texels of a tile")?;
                 let mut order = in_order(&l.map, first..first + direct.len())?;
                 // The others have their light. (Direct light of Sponza in the sun, 12 texels/m: 0.85 of the time with
@@ -464,13 +540,19 @@ impl<'p> Bake<'_, 'p> {
                         back: l.is_back(&l.map, backs, texel),
                         receiver: l.receiver(&l.map, backs, texel),
                         sharp: direct[texel.index() - first],
+                        sharp_directional: directed.get(texel.index() - first).copied().unwrap_or_default(),
                         variation: variations[texel.index() - first],
                     }));
                     let place = |i: usize| some[i].index() - first;
-                    texels.irradiance(&of_tile, &mut tile, &mut traced, |i, e| direct[place(i)] = e);
+                    texels.irradiance(&of_tile, &mut tile, &mut traced, |i, e, by_direction| {
+                        direct[place(i)] = e;
+                        if let Some(directed) = directed.get_mut(place(i)) {
+                            *directed = *by_direction;
+                        }
+                    });
                 }
                 if let Some(c) = self.checkpoint {
-                    c.keep_lit(block, direct, state);
+                    c.keep_lit(block, direct, state, directed);
                 }
                 rays.fetch_add(traced, Relaxed);
                 stage.advance(direct.len() as u64)

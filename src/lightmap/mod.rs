@@ -8,6 +8,7 @@ pub mod atlas;
 pub(crate) mod bake;
 mod create;
 pub mod indirect;
+pub mod normal_maps;
 pub mod plan;
 mod readback;
 pub(crate) mod saved;
@@ -16,6 +17,7 @@ pub(crate) mod stages;
 pub(crate) mod texel_light;
 pub(crate) mod tiles;
 
+use crate::base::directional::Directional;
 use crate::base::error::{Result, invalid_argument};
 use crate::base::memory::Reservation;
 use crate::photon::MAX_PHOTONS;
@@ -140,6 +142,17 @@ pub struct BakeParams {
     /// so that both sides look the same under bilinear filtering, once all texels are baked. Live updates do not
     /// stitch: [`LiveParams::bake`](crate::live::LiveParams::bake) says `false`.
     pub stitch: bool,
+    /// Bits of [`directional`]: which light is computed by direction too (SH L1, for normal maps), as [`Layer::L0`] and
+    /// the layers after it. 0: none, which takes no time and no memory.
+    pub directional: u32,
+}
+
+/// Bits of [`BakeParams::directional`].
+pub mod directional {
+    /// Light that was reflected by other surfaces.
+    pub const INDIRECT: u32 = 1 << 0;
+    /// Light that comes straight from lights.
+    pub const DIRECT: u32 = 1 << 1;
 }
 
 impl Default for BakeParams {
@@ -157,6 +170,7 @@ impl Default for BakeParams {
             texel_begin: 0,
             texel_end: 0,
             stitch: true,
+            directional: 0,
         }
     }
 }
@@ -232,6 +246,42 @@ pub enum Layer {
     Normal = 6,
     /// Global triangle number (u32), [`crate::scene::NONE`] where there is none.
     Triangle = 7,
+    /// Mean radiance over the sphere, of which the half below the surface is dark, of the light that
+    /// [`BakeParams::directional`] asks for: 1 / 4π · ∫ L dω (RGB, W/(m²·sr)).
+    L0 = 8,
+    /// The same mean of radiance times the x coordinate of its direction, 1 / 4π · ∫ L ω dω, ≥ −L0 and ≤ L0 (RGB,
+    /// W/(m²·sr)). Directions are those of the scene.
+    L1X = 9,
+    /// The same for y.
+    L1Y = 10,
+    /// The same for z.
+    L1Z = 11,
+    /// [`L1X`](Self::L1X) / [`L0`](Self::L0), −1 to 1; 0 where there is no light (RGB).
+    RatioX = 12,
+    /// The same for y.
+    RatioY = 13,
+    /// The same for z.
+    RatioZ = 14,
+    /// Dominant direction: L1 / L0 of the sum of the channels, a vector in the scene whose length is 1 if all light comes
+    /// from one direction (x, y, z).
+    Direction = 15,
+}
+
+impl Layer {
+    /// Whether the layer holds light that a bake computes.
+    pub fn is_light(self) -> bool {
+        !matches!(self, Layer::Validity | Layer::Position | Layer::Normal | Layer::Triangle)
+    }
+
+    /// Whether the values are ratios, −1 to 1.
+    pub fn is_ratio(self) -> bool {
+        matches!(self, Layer::RatioX | Layer::RatioY | Layer::RatioZ | Layer::Direction)
+    }
+}
+
+/// Packs a value of a [layer of ratios](Layer::is_ratio) into a byte: 255 times 0.5 plus half of it.
+pub fn packed_ratio(ratio: f32) -> u8 {
+    (127.5 + 127.5 * ratio).round().clamp(0.0, 255.0) as u8
 }
 
 /// The content of one layer of one page, row-major, row 0 at v = 0.
@@ -275,6 +325,8 @@ impl TexelState {
 struct Light {
     direct: Vec<Vec3>,
     indirect: Vec<Vec3>,
+    /// The light by direction that the bake was asked for; empty if none was.
+    directional: Vec<Directional>,
     state: Vec<TexelState>,
     /// Reflected radiance, by sample of the radiance map. Empty if the bake left it out.
     radiance: Radiance,
@@ -344,6 +396,9 @@ impl BakeParams {
         if self.texel_end != 0 && self.texel_end <= self.texel_begin {
             return invalid_argument!("the texels {} to {} are none", self.texel_begin, self.texel_end);
         }
+        if self.directional & !(directional::INDIRECT | directional::DIRECT) != 0 {
+            return invalid_argument!("directional is {:#x}, which has unknown bits", self.directional);
+        }
         Ok(())
     }
 }
@@ -362,6 +417,11 @@ impl Lightmap {
     /// Returns numbers about layout and texels.
     pub fn info(&self) -> LightmapInfo {
         self.atlas.info
+    }
+
+    /// Whether a bake was asked for light by direction.
+    pub fn has_directional(&self) -> bool {
+        self.light.as_ref().is_some_and(|l| !l.directional.is_empty())
     }
 
     /// Describes the plan of the last bake (before the first: of a bake with default parameters): what runs, and what

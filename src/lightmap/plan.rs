@@ -2,7 +2,8 @@
 
 use super::indirect::bright_patches::Bright;
 use super::indirect::sample_set::ROUND;
-use super::{BakeParams, LightmapInfo};
+use super::{BakeParams, LightmapInfo, directional};
+use crate::base::directional::Directional;
 use crate::direct::DirectLight;
 use crate::scene::{Light, Scene};
 
@@ -40,6 +41,8 @@ pub mod left_out {
     pub const SEAMS: u32 = 1 << 14;
     /// No bright patches as lights: gather rays find most of the bright texels.
     pub const BRIGHT_PATCHES: u32 = 1 << 15;
+    /// No light by direction (SH L1): nobody asks for it.
+    pub const DIRECTIONAL: u32 = 1 << 16;
 }
 
 /// Stages and features that a bake of a scene runs.
@@ -109,7 +112,19 @@ impl Plan {
             plan.run("interpolation of shading normals");
         }
         plan.materials(scene);
+        plan.directional(params);
         plan
+    }
+
+    /// Adds a line on light by direction.
+    fn directional(&mut self, params: &BakeParams) {
+        let of = match params.directional {
+            0 => return self.leave_out(left_out::DIRECTIONAL, "light by direction (SH L1)", "directional is 0"),
+            directional::INDIRECT => "indirect light",
+            directional::DIRECT => "direct light",
+            _ => "all light",
+        };
+        self.run(&format!("{of} by direction (SH L1), {} bytes per texel", size_of::<Directional>()));
     }
 
     /// Adds the features that materials need.

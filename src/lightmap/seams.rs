@@ -23,6 +23,7 @@ use super::atlas::pieces::float_key;
 use super::atlas::texels::TexelSample;
 use super::plan::{Plan, left_out};
 use super::{BakeParams, BakeStats, Light, Lightmap, TexelState};
+use crate::base::directional::Directional;
 use crate::base::error::{Error, Result};
 use crate::base::memory::{
     Reservation, try_collect, try_par_collect, try_par_filter, try_par_gather, try_push, try_to_vec, try_vec,
@@ -58,21 +59,32 @@ pub(crate) struct Stitch {
     texels: Vec<u32>,
     direct: Vec<Vec3>,
     indirect: Vec<Vec3>,
+    /// Empty if there is no light by direction.
+    directional: Vec<Directional>,
     _memory: Reservation,
 }
 
 impl Stitch {
     /// Undoes the stitching in a copy of the stitched light.
     pub(super) fn copy_former(&self, light: &mut Light) {
-        self.former_of(&(0..light.direct.len()), &mut light.direct, &mut light.indirect);
+        self.former_of(&(0..light.direct.len()), &mut light.direct, &mut light.indirect, &mut light.directional);
     }
 
     /// Undoes the stitching in a copy of the light of a range of texels.
-    pub(super) fn former_of(&self, range: &Range<usize>, direct: &mut [Vec3], indirect: &mut [Vec3]) {
+    pub(super) fn former_of(
+        &self,
+        range: &Range<usize>,
+        direct: &mut [Vec3],
+        indirect: &mut [Vec3],
+        directional: &mut [Directional],
+    ) {
         let first = self.texels.partition_point(|&t| (t as usize) < range.start);
         for i in (first..self.texels.len()).take_while(|&i| (self.texels[i] as usize) < range.end) {
             let at = self.texels[i] as usize - range.start;
             (direct[at], indirect[at]) = (self.direct[i], self.indirect[i]);
+            if let Some((to, from)) = directional.get_mut(at).zip(self.directional.get(i)) {
+                *to = *from;
+            }
         }
     }
 
@@ -81,6 +93,9 @@ impl Stitch {
         for (i, &texel) in self.texels.iter().enumerate() {
             std::mem::swap(&mut self.direct[i], &mut light.direct[texel as usize]);
             std::mem::swap(&mut self.indirect[i], &mut light.indirect[texel as usize]);
+            if let Some((here, there)) = self.directional.get_mut(i).zip(light.directional.get_mut(texel as usize)) {
+                std::mem::swap(here, there);
+            }
         }
     }
 }
@@ -151,6 +166,16 @@ impl View<'_> {
             Some((before, i)) => [before.direct[i], before.indirect[i]],
             None => [source.direct[sample], source.indirect[sample]],
         }
+    }
+
+    /// Returns the light by direction of a sample before stitching.
+    fn directional(&self, sample: usize) -> Directional {
+        let source = self.source(sample);
+        let stitched = source.stitch.as_ref().and_then(|s| {
+            let i = s.texels.binary_search(&(sample as u32)).ok()?;
+            s.directional.get(i)
+        });
+        stitched.or(source.directional.get(sample)).copied().unwrap_or_default()
     }
 
     /// Whether the indirect light of both sides of a point is of the same order.
@@ -241,7 +266,8 @@ impl Job<'_, '_, '_> {
         self.stage.advance(0)?;
         let texels = number(&mut points, self.atlas.map.len(), self.stage)?;
         let n = texels.len();
-        let memory = self.reserve(n * 2 * size_of::<Vec3>(), "the light of the seams' texels")?;
+        let directional = if view.new.directional.is_empty() { 0 } else { size_of::<Directional>() };
+        let memory = self.reserve(n * (2 * size_of::<Vec3>() + directional), "the light of the seams' texels")?;
         let _vectors = self.reserve(n * 8 * size_of::<Vec3A>(), "the seams' vectors")?;
         let system = System::new(points, n, self.stage)?;
         let light = try_par_collect(texels.par_iter().map(|&t| view.light(t as usize)), POINTS)?;
@@ -250,7 +276,7 @@ impl Job<'_, '_, '_> {
         let mut after = [try_to_vec(&before[0], POINTS)?, try_to_vec(&before[1], POINTS)?];
         for (layer, bit) in [left_out::DIRECT, left_out::INDIRECT].into_iter().enumerate() {
             if plan.runs(bit) {
-                system.solve(&before[layer], &mut after[layer], self.stage)?;
+                system.solve(&before[layer], &mut after[layer], 0.0, self.stage)?;
             }
         }
         stats.seam_points = system.points.len() as u64;
@@ -260,7 +286,29 @@ impl Job<'_, '_, '_> {
         let layer = |layer: usize| try_collect(after[layer].iter().map(|&v| Vec3::from(v)), POINTS);
         let (direct, indirect) = (layer(0)?, layer(1)?);
         stats.seam_rms_after = system.relative_rms(&combine(&mut after));
-        Ok(Some((Stitch { texels, direct, indirect, _memory: memory }, [edges.len() as u64, unlike.into_inner()])))
+        let directional = match directional {
+            0 => Vec::new(),
+            _ => self.directional(&system, view, &texels)?,
+        };
+        let stitch = Stitch { texels, direct, indirect, directional, _memory: memory };
+        Ok(Some((stitch, [edges.len() as u64, unlike.into_inner()])))
+    }
+
+    /// Returns the stitched light by direction, of which each coefficient is a layer.
+    fn directional(&self, system: &System, view: &View, texels: &[u32]) -> Result<Vec<Directional>> {
+        let of = |t: &u32| view.directional(*t as usize);
+        let mut stitched = try_par_collect(texels.par_iter().map(of), POINTS)?;
+        for k in 0..4 {
+            let part = |d: &Directional| Vec3A::from(if k == 0 { d.l0 } else { d.l1[k - 1] });
+            let before = try_par_collect(stitched.par_iter().map(part), POINTS)?;
+            let mut after = try_to_vec(&before, POINTS)?;
+            system.solve(&before, &mut after, if k == 0 { 0.0 } else { f32::MIN }, self.stage)?;
+            for (d, after) in stitched.iter_mut().zip(after) {
+                *(if k == 0 { &mut d.l0 } else { &mut d.l1[k - 1] }) = after.into();
+            }
+        }
+        stitched.par_iter_mut().for_each(|d| *d = d.valid());
+        Ok(stitched)
     }
 
     fn reserve(&self, bytes: usize, what: &str) -> Result<Reservation> {

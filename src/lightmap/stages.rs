@@ -9,7 +9,7 @@ use super::indirect::find_bright_patches;
 use super::indirect::near_hits::{HitRadiance, NearHits};
 use super::indirect::radiance_map::{self, Radiance, RadianceInput, RadianceLookup};
 use super::indirect::sample_set::SampleSet;
-use super::indirect::upsample::{OWN_RAYS, OwnLight, OwnRays, Upsampling};
+use super::indirect::upsample::{OWN_RAYS, OwnDirectional, OwnLight, OwnRays, Upsampling};
 use super::plan::{Plan, left_out};
 use super::texel_light::TexelLight;
 use super::{BakeParams, BakeStats, StageStats};
@@ -139,21 +139,31 @@ pub(crate) fn upsampling(inputs: &Inputs, backs: &[bool], placements: Range<usiz
     Upsampling::find(inputs.atlas, placements, backs, &stage)
 }
 
-/// Traces the fallback gathers of texels without a valid gather texel around them. Returns their light and the number
-/// of rays.
+/// Light of fallback gathers, and the number of their rays.
+pub(crate) struct Own {
+    pub light: OwnLight,
+    pub directional: OwnDirectional,
+    pub rays: u64,
+}
+
+/// Traces the fallback gathers of texels without a valid gather texel around them. `directional`: whether light by
+/// direction is asked for.
 pub(crate) fn own_light(
     inputs: &Inputs,
     radiance: &Radiance,
     backs: &[bool],
     upsampling: &Upsampling,
-) -> Result<(OwnLight, u64)> {
+    directional: bool,
+) -> Result<Own> {
     let Inputs { atlas, params, progress, .. } = *inputs;
     let count = params.gather_rays.min(OWN_RAYS);
     let rays = OwnRays {
         radiance: inputs.lookup(radiance),
         samples: &SampleSet::new(count, purpose_seed(params.seed, purpose::GATHER_SET)),
         seed: purpose_seed(params.seed, purpose::OWN),
+        directional,
     };
     let stage = progress.stage("own light", 0.315, 0.32, upsampling.own_work());
-    upsampling.own_light(atlas, backs, &rays, &stage)
+    let (light, directional, rays) = upsampling.own_light(atlas, backs, &rays, &stage)?;
+    Ok(Own { light, directional, rays })
 }

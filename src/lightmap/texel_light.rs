@@ -27,6 +27,7 @@ use super::atlas::chart_map::{ChartMap, receiver_of};
 use super::atlas::charts::Charts;
 use super::atlas::ids::{Map, TexelId};
 use super::atlas::texels::TexelSample;
+use crate::base::directional::Directional;
 use crate::base::error::Result;
 use crate::base::memory::{try_filled, try_with_capacity};
 use crate::base::sampling::{combine, orthonormal_basis, sobol_2d};
@@ -105,6 +106,8 @@ struct Point {
     on: TexelSample,
     receiver: Receiver,
     light: PointLight,
+    /// Number of the point in its tile.
+    place: u32,
 }
 
 /// Points of the texels of a tile, up to [`MAX_POINTS`] of each at a time.
@@ -115,6 +118,8 @@ pub(crate) struct TilePoints {
     /// Points whose light has not arrived yet.
     pending: Vec<u32>,
     room: TileRoom,
+    /// Light by direction that has arrived at each point, by kind; empty if nobody asks for it.
+    directional: Vec<[Directional; KINDS]>,
 }
 
 /// Points of a texel that are to be lit.
@@ -139,14 +144,22 @@ impl TilePoints {
             shadow_origin: Vec3::ZERO,
             raised: false,
         };
-        let point = Point { on: TexelSample::default(), receiver, light: PointLight::default() };
+        let point = Point { on: TexelSample::default(), receiver, light: PointLight::default(), place: 0 };
         let points = texels * MAX_POINTS;
         Ok(TilePoints {
             points: try_filled(points, point, what)?,
             counts: try_filled(texels, 0, what)?,
             pending: try_with_capacity(points, what)?,
             room: TileRoom::new(KINDS * points, points)?,
+            directional: Vec::new(),
         })
+    }
+
+    /// Allocates room for the points of a tile and their light by direction.
+    pub(crate) fn by_direction(texels: usize) -> Result<TilePoints> {
+        let tile = TilePoints::new(texels)?;
+        let directional = try_filled(tile.points.len(), [Directional::default(); KINDS], "the points of a tile")?;
+        Ok(TilePoints { room: tile.room.by_direction()?, directional, ..tile })
     }
 
     fn clear(&mut self) {
@@ -157,8 +170,9 @@ impl TilePoints {
         &self.points[place * MAX_POINTS..][..self.counts[place]]
     }
 
-    fn of_mut(&mut self, place: usize) -> &mut [Point] {
-        &mut self.points[place * MAX_POINTS..][..self.counts[place]]
+    /// Returns the points of a texel, and the light by direction of all points of the tile.
+    fn of_mut(&mut self, place: usize) -> (&mut [Point], &[[Directional; KINDS]]) {
+        (&mut self.points[place * MAX_POINTS..][..self.counts[place]], &self.directional)
     }
 
     /// Lights the wanted points that lie on their charts, and adds them to those of their texels.
@@ -176,15 +190,18 @@ impl TilePoints {
                 let (count, at) = (self.counts[place], place * MAX_POINTS + self.counts[place]);
                 shadow.slot = KINDS * at;
                 let light = by.direct.push(&receiver, (count - first) as u32, lights, samples, of_round, &mut shadow);
-                self.points[at] = Point { on, receiver, light };
+                self.points[at] = Point { on, receiver, light, place: at as u32 };
                 self.pending.push(at as u32);
                 self.counts[place] += 1;
             }
         }
-        let arrived = shadow.finish(rays);
+        let (arrived, directed) = shadow.finish_by_direction(rays);
         for &place in &self.pending {
             let place = place as usize;
             self.points[place].light.take(&arrived[KINDS * place..][..KINDS]);
+            if let Some(of_point) = self.directional.get_mut(place) {
+                of_point.copy_from_slice(&directed[KINDS * place..][..KINDS]);
+            }
         }
     }
 }
@@ -226,7 +243,7 @@ fn add_to(
 ) -> Vec3 {
     let is_lit = points.iter().any(|p| !p.light.is_dark());
     let mut n = Vec3::ZERO;
-    for Point { on, receiver, light } in points {
+    for Point { on, receiver, light, .. } in points {
         if is_lit && light.is_dark() && is_buried(scene, receiver.origin, receiver.geometric, rays) {
             continue;
         }

@@ -86,7 +86,7 @@ fn illuminate(
     };
     // Without indirect light there is no radiance map to look up.
     let own = match has_indirect {
-        true => stages::own_light(&inputs, &radiance, &sides.backs, &sides.upsampling)?.0,
+        true => stages::own_light(&inputs, &radiance, &sides.backs, &sides.upsampling, false)?.light,
         false => OwnLight::new(),
     };
     Ok(Indirect { radiance, sides, own, has_indirect })

@@ -5,6 +5,7 @@
 
 use super::blocks::{Block, BlockMap, BlockStatus, BlockWork, DirectTile, DirectWork, Tile};
 use super::relight::Illumination;
+use crate::base::directional::Directional;
 use crate::base::error::{Error, Result};
 use crate::base::memory::{try_collect, try_filled};
 use crate::base::sampling::combine;
@@ -459,6 +460,8 @@ fn direct_texel(
     let variation = texels.varies(texel, sharp, sharp_at);
     let back = a.is_back(&a.map, backs, texel);
     let mut light = Vec3::ZERO;
-    texels.irradiance(&[Averaged { texel, back, receiver, sharp, variation }], points, rays, |_, e| light = e);
+    let sharp_directional = Directional::default();
+    let averaged = Averaged { texel, back, receiver, sharp, sharp_directional, variation };
+    texels.irradiance(&[averaged], points, rays, |_, e, _| light = e);
     Some(light)
 }

@@ -135,9 +135,21 @@ impl PathTracer {
     /// estimates, each stratified k × k in the first direction and the place on area lights.
     /// `stream` is a number that differs between points with the same seed.
     pub fn irradiance(&self, point: &SurfacePoint, samples: u32, seed: u64, stream: u64) -> Irradiance {
+        self.irradiance_on(point, point.normal, samples, seed, stream)
+    }
+
+    /// Irradiance at a point for another unit `normal`, as of a normal map. No light comes from below the surface.
+    pub fn irradiance_on(
+        &self,
+        point: &SurfacePoint,
+        normal: DVec3,
+        samples: u32,
+        seed: u64,
+        stream: u64,
+    ) -> Irradiance {
         let k = (samples / BATCHES).isqrt().max(1);
         let mut random = Random::new(seed, stream);
-        let batches: [Split; BATCHES as usize] = std::array::from_fn(|_| self.batch(point, k, &mut random));
+        let batches: [Split; BATCHES as usize] = std::array::from_fn(|_| self.batch(point, normal, k, &mut random));
         let n = BATCHES as f64;
         let direct = batches.iter().map(|b| b.direct).sum::<DVec3>() / n;
         let indirect = batches.iter().map(|b| b.indirect).sum::<DVec3>() / n;
@@ -159,23 +171,40 @@ impl PathTracer {
         seed: u64,
         progress: &Progress,
     ) -> Result<Vec<Irradiance>> {
+        let normals: Vec<DVec3> = points.iter().map(|p| p.normal).collect();
+        self.irradiance_many_on(device, points, &normals, samples, seed, progress)
+    }
+
+    /// [`irradiance_on`](Self::irradiance_on) at many points, each with its normal, on the device's threads.
+    pub fn irradiance_many_on(
+        &self,
+        device: &Device,
+        points: &[SurfacePoint],
+        normals: &[DVec3],
+        samples: u32,
+        seed: u64,
+        progress: &Progress,
+    ) -> Result<Vec<Irradiance>> {
         let stage = progress.stage("reference", 0.0, 1.0, points.len() as u64);
-        let one = |(i, point): (usize, &SurfacePoint)| {
-            let result = self.irradiance(point, samples, seed, i as u64);
+        let one = |(i, (point, &normal)): (usize, (&SurfacePoint, &DVec3))| {
+            let result = self.irradiance_on(point, normal, samples, seed, i as u64);
             stage.advance(1).map(|()| result)
         };
-        device.run(progress, || points.par_iter().enumerate().map(one).collect())
+        device.run(progress, || points.par_iter().zip(normals).enumerate().map(one).collect())
     }
 
     /// One estimate of irradiance from `k` × `k` samples.
-    fn batch(&self, point: &SurfacePoint, k: u32, random: &mut Random) -> Split {
+    fn batch(&self, point: &SurfacePoint, normal: DVec3, k: u32, random: &mut Random) -> Split {
         let origin = point.position + point.normal * self.offset;
         let mut sum = Split::default();
         for cell in 0..k * k {
             let (x, y) = (cell % k, cell / k);
             let square = random.cell(x, y, k);
-            sum.direct += self.direct(origin, point.normal, square, random);
-            let (direction, cosine) = cosine_direction(point.normal, random.cell(x, y, k));
+            sum.direct += self.direct(origin, [normal, point.normal], square, random);
+            let (direction, cosine) = cosine_direction(normal, random.cell(x, y, k));
+            if direction.dot(point.normal) <= 0.0 {
+                continue;
+            }
             let incident = self.incident(origin, direction, Some(cosine / PI), random);
             sum.direct += incident.direct * PI;
             sum.indirect += incident.indirect * PI;
@@ -191,9 +220,12 @@ impl PathTracer {
     }
 
     /// Irradiance by one light sample, weighted against directions sampled by cosine. `point` is
-    /// already off the surface.
-    fn direct(&self, point: DVec3, normal: DVec3, square: [f64; 2], random: &mut Random) -> DVec3 {
+    /// already off the surface, whose normal is the second one.
+    fn direct(&self, point: DVec3, [normal, surface]: [DVec3; 2], square: [f64; 2], random: &mut Random) -> DVec3 {
         let Some(light) = self.lights.propose(point, normal, square, random) else { return DVec3::ZERO };
+        if light.direction.dot(surface) <= 0.0 {
+            return DVec3::ZERO;
+        }
         let shadow = Ray64 { tmax: light.distance - self.offset, ..Ray64::new(point, light.direction) };
         light.irradiance * self.surfaces.transmittance(&self.geometry, &shadow)
     }
@@ -236,7 +268,7 @@ impl PathTracer {
                 break;
             }
             let square = random.square();
-            result.indirect += throughput * self.direct(point.position, point.normal, square, random) / PI;
+            result.indirect += throughput * self.direct(point.position, [point.normal; 2], square, random) / PI;
             let survival = (throughput.max_element() * ROULETTE).min(1.0);
             if random.uniform() >= survival {
                 break;

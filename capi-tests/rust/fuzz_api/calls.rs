@@ -619,6 +619,8 @@ fn bake_params(w: &W, s: &mut Source) -> bk_bake_params {
     params.blur_radius = s.below(3) as u32;
     params.max_bounces = s.below(3) as u32;
     params.stitch = s.below(2) as u32;
+    params.directional_indirect = s.below(2) as u32;
+    params.directional_direct = s.below(2) as u32;
     params.seed = s.next();
     params
 }
@@ -658,12 +660,13 @@ fn read(w: &W, s: &mut Source) {
     let Some(lightmap) = w.pick(Kind::Lightmap, s) else { return };
     let Some(info) = info(&lightmap) else { return };
     let page = if s.one_in(10) { s.index() } else { s.below(info.page_count as usize) as u32 };
-    let layer = if s.one_in(20) { s.integer() } else { s.below(8) as u32 };
+    let layer = if s.one_in(20) { s.integer() } else { s.below(16) as u32 };
     let format = match layer {
         _ if s.one_in(10) => s.integer(),
         0..=3 => 1 + s.below(2) as u32,
         BK_LAYER_VALIDITY => BK_FORMAT_R32F,
         BK_LAYER_TRIANGLE => BK_FORMAT_R32U,
+        BK_LAYER_RATIO_X..=BK_LAYER_DIRECTION if s.one_in(2) => BK_FORMAT_RGBA8,
         _ => BK_FORMAT_RGB32F,
     };
     let row = info.width as usize * texel_bytes(format);
@@ -678,6 +681,12 @@ fn read(w: &W, s: &mut Source) {
     let result = ask!(bk_lightmap_read(lightmap.p(), page, layer, format, p, stride));
     if result == BK_OK && stride == 0 && format == BK_FORMAT_RGB32F && layer <= BK_LAYER_RADIANCE {
         check_light("bk_lightmap_read", &floats(&dst[1..]));
+    }
+    if result == BK_OK && stride == 0 && format == BK_FORMAT_RGB32F && layer >= BK_LAYER_RATIO_X {
+        let values = floats(&dst[1..]);
+        if let Some(v) = values.iter().find(|v| !(v.abs() <= 1.001)) {
+            broken(&format!("a ratio of light by direction is {v}"));
+        }
     }
     if result == BK_OK && stride == 0 && layer == BK_LAYER_VALIDITY {
         let validity = floats(&dst[1..]);

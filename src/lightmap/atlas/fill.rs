@@ -4,10 +4,10 @@
 use super::chart_map::ChartMap;
 use super::charts::Charts;
 use super::ids::{GatherMap, GatherTexel, Map, PlacementId, TexelId};
+use crate::base::directional::Linear;
 use crate::base::error::Result;
 use crate::base::memory::{try_collect, try_with_capacity};
 use crate::base::progress::Progress;
-use glam::Vec3;
 
 /// Maximum number of rings: a hole wider than twice this many texels stays partly unfilled.
 const MAX_RINGS: usize = 64;
@@ -63,13 +63,13 @@ impl<M: Map, T> Hole<M, T> {
 
 /// Returns the mean of the values that a texel and its neighbours in a placement have.
 #[inline]
-pub(crate) fn mean_around<M: Map>(
+pub(crate) fn mean_around<M: Map, T: Linear>(
     map: &ChartMap<M>,
     placement: PlacementId,
     texel: TexelId<M>,
-    value: impl Fn(TexelId<M>) -> Option<Vec3>,
-) -> Option<Vec3> {
-    let (mut sum, mut n) = (Vec3::ZERO, 0.0);
+    value: impl Fn(TexelId<M>) -> Option<T>,
+) -> Option<T> {
+    let (mut sum, mut n) = (T::default(), 0.0);
     for (x, y) in around(map.position(texel)) {
         if let Some(value) = map.at(placement, x, y).and_then(&value) {
             sum += value;
@@ -80,15 +80,15 @@ pub(crate) fn mean_around<M: Map>(
 }
 
 /// Light of texels of the gather map that cannot be seen, from those that can.
-pub(crate) struct Filling {
+pub(crate) struct Filling<T> {
     known: Vec<bool>,
-    hole: Hole<GatherMap, Vec3>,
+    hole: Hole<GatherMap, T>,
 }
 
-impl Filling {
+impl<T: Linear> Filling<T> {
     /// Prepares to fill the `missing` ones of `n` texels from the `known` ones: each gets the mean of its known
     /// neighbours in the chart. Charts without a known texel are left unchanged. Filling allocates no memory.
-    pub(crate) fn new(n: usize, known: impl Fn(usize) -> bool, missing: impl Fn(usize) -> bool) -> Result<Filling> {
+    pub(crate) fn new(n: usize, known: impl Fn(usize) -> bool, missing: impl Fn(usize) -> bool) -> Result<Self> {
         let missing = try_collect((0..n).filter(|&i| missing(i)).map(GatherTexel::new), FILLED)?;
         let known = if missing.is_empty() { Vec::new() } else { try_collect((0..n).map(known), FILLED)? };
         Ok(Filling { known, hole: Hole::new(missing)? })
@@ -99,10 +99,10 @@ impl Filling {
         self,
         charts: &Charts,
         map: &ChartMap<GatherMap>,
-        values: &mut [Vec3],
+        values: &mut [T],
         progress: &Progress,
     ) -> Result<()> {
-        let mean = |(known, values): &(Vec<bool>, &mut [Vec3]), texel: GatherTexel| {
+        let mean = |(known, values): &(Vec<bool>, &mut [T]), texel: GatherTexel| {
             let value = |near: GatherTexel| known[near.index()].then(|| values[near.index()]);
             mean_around(map, map.placement_of(charts, texel), texel, value)
         };

@@ -1,7 +1,8 @@
 //! Blur of the gather map (thesis 3.2.5) that stays inside charts and does not cross walls.
 
+use crate::base::directional::{Directional, Linear};
 use crate::base::error::Result;
-use crate::base::progress::Stage;
+use crate::base::progress::{Progress, Stage};
 use crate::device::Device;
 use crate::lightmap::atlas::chart_map::ChartMap;
 use crate::lightmap::atlas::charts::Charts;
@@ -64,6 +65,32 @@ pub(crate) fn blur(
     })
 }
 
+/// Blurs light by direction with the weights of [`blur`].
+pub(crate) fn blur_directional(
+    device: &Device,
+    charts: &Charts,
+    map: &ChartMap<GatherMap>,
+    (texels, values): (Texels, &[Directional]),
+    radius: u32,
+    out: &mut [Directional],
+    progress: &Progress,
+) -> Result<()> {
+    let radius = radius.min(MAX_BLUR_RADIUS) as i32;
+    device.install(|| {
+        out.par_chunks_mut(BLOCK).enumerate().try_for_each(|(block, out)| {
+            let mut window = Window::new(radius);
+            progress.check()?;
+            for (i, out) in (block * BLOCK..).zip(out.iter_mut()) {
+                *out = match texels.valid[i] {
+                    true => window.blur_of(charts, map, GatherTexel::new(i), texels, values),
+                    false => values[i],
+                };
+            }
+            Ok(())
+        })
+    })
+}
+
 /// Scratch space for one texel's neighbourhood.
 pub(crate) struct Window {
     radius: i32,
@@ -89,6 +116,18 @@ impl Window {
         texel: GatherTexel,
         texels: Texels,
     ) -> Vec3 {
+        self.blur_of(charts, map, texel, texels, texels.values)
+    }
+
+    /// Returns the mean of `of`, by texel, with the weights with which one valid texel is blurred.
+    fn blur_of<T: Linear>(
+        &mut self,
+        charts: &Charts,
+        map: &ChartMap<GatherMap>,
+        texel: GatherTexel,
+        texels: Texels,
+        of: &[T],
+    ) -> T {
         let Texels { values, variances, valid, normals } = texels;
         let own = texel.index();
         let (brightness, variance) = (values[own].element_sum(), variances[own]);
@@ -97,7 +136,7 @@ impl Window {
         self.seen = [0; MAX_WINDOW];
         self.queue.clear();
         self.visit(0, 0);
-        let (mut sum, mut total) = (Vec3::ZERO, 0.0);
+        let (mut sum, mut total) = (T::default(), 0.0);
         let mut next = 0;
         while next < self.queue.len() {
             let (dx, dy) = self.queue[next];
@@ -113,7 +152,7 @@ impl Window {
             // The difference is not a number if light overflows.
             let like = if s == own { 1.0 } else { (-0.5 * difference * difference).exp().max(0.0) };
             let w = self.weights[(dx * dx + dy * dy) as usize] * bend * like;
-            sum += w * values[s];
+            sum += of[s] * w;
             total += w;
             for (nx, ny) in [(dx - 1, dy), (dx + 1, dy), (dx, dy - 1), (dx, dy + 1)] {
                 if nx.abs() <= self.radius && ny.abs() <= self.radius {

@@ -13,6 +13,7 @@
 use super::bright_patches::Unoccluded;
 use super::near_hits::HitRadiance;
 use super::sample_set::{ROUND, SampleSet};
+use crate::base::directional::Directional;
 use crate::base::error::Result;
 use crate::base::memory::try_filled;
 use crate::base::sampling::{combine, concentric_disc, orthonormal_basis, unit_float};
@@ -44,7 +45,12 @@ impl Gathered {
     /// Returns the indirect irradiance, W/m².
     pub(crate) fn irradiance(&self) -> Vec3 {
         // Paths from near hits on bright patches may subtract more than other rays bring.
-        (self.sum * (PI / self.rays as f32)).max(Vec3::ZERO)
+        (self.sum * self.weight()).max(Vec3::ZERO)
+    }
+
+    /// Returns the weight of a ray's radiance in the irradiance.
+    fn weight(&self) -> f32 {
+        PI / self.rays as f32
     }
 
     /// Returns the variance of the [`irradiance`](Self::irradiance)'s sum over the channels, from the spread of the
@@ -85,12 +91,13 @@ impl Gathered {
             bright.1 = radiance.lookup.bright().push(receiver, rays.len(), seed_of_round(seed, round), &mut shadow);
             bright.0 = shadow.finish(&mut traced)[0];
         }
-        self.add(scene, radiance, receiver, seed_of_round(seed, round), rays, &hits, bright, &mut traced);
+        self.add(scene, radiance, receiver, seed_of_round(seed, round), rays, &hits, bright, None, &mut traced);
         traced
     }
 
     /// Adds the radiance seen by one round of rays from a receiver, and that of bright patches: what has arrived from
-    /// them, and what they would send if nothing occluded it.
+    /// them, and what they would send if nothing occluded it. `directional`: a sum of the light by direction, and what of
+    /// it has arrived from bright patches.
     fn add(
         &mut self,
         scene: &Scene,
@@ -100,6 +107,7 @@ impl Gathered {
         rays: &[Ray],
         hits: &[RawHit],
         (arrived, unoccluded): (Vec3, Unoccluded),
+        mut directional: Option<(&mut Directional, Directional)>,
         traced: &mut u64,
     ) {
         let (mut sum, mut squares) = (Vec3::ZERO, 0.0);
@@ -121,6 +129,10 @@ impl Gathered {
                 Some(l) => {
                     sum += l;
                     squares += l.element_sum() * l.element_sum();
+                    if let Some((directional, _)) = &mut directional {
+                        let direction = Vec3::from(ray.direction);
+                        **directional += Directional::of(l, direction, direction.dot(receiver.normal));
+                    }
                 }
                 None => self.backs += 1,
             }
@@ -129,6 +141,9 @@ impl Gathered {
             let scale = rays.len() as f32 / PI;
             sum += arrived * scale;
             squares += unoccluded.variance(arrived) * scale * scale;
+            if let Some((directional, arrived)) = directional {
+                *directional += arrived * scale;
+            }
         }
         self.sum += sum;
         self.squares += squares;
@@ -142,6 +157,17 @@ pub(crate) struct TileTexel {
     /// The texel's own seed.
     pub seed: u32,
     pub gathered: Gathered,
+    /// Sum of the light by direction, weighted as [`Gathered::sum`]; `None`: nobody asks for it. Only a tile that has
+    /// room for it adds to it.
+    pub directional: Option<Directional>,
+}
+
+impl TileTexel {
+    /// Returns the indirect light by direction; nothing if nobody asked for it.
+    pub(crate) fn directional(&self) -> Directional {
+        // Paths from near hits on bright patches may subtract more than other rays bring.
+        (self.directional.unwrap_or_default() * self.gathered.weight()).valid()
+    }
 }
 
 /// Rounds of rays from neighbouring texels, which are traced together as a stream: the light of a texel has the bits
@@ -159,6 +185,12 @@ impl Tile {
         let ray = Ray::new(Vec3::ZERO, Vec3::ZERO);
         let (rays, hits) = (try_filled(TILE * ROUND, ray, what)?, try_filled(TILE * ROUND, RawHit::MISS, what)?);
         Ok(Tile { rays, hits, shadow: TileRoom::new(TILE, TILE * ROUND)? })
+    }
+
+    /// Allocates room for [`TILE`] texels and their light by direction.
+    pub(crate) fn by_direction() -> Result<Tile> {
+        let tile = Tile::new()?;
+        Ok(Tile { shadow: tile.shadow.by_direction()?, ..tile })
     }
 
     /// Adds one round of rays from each of at most [`TILE`] texels. Returns the rays traced.
@@ -186,11 +218,12 @@ impl Tile {
                 *unoccluded = radiance.lookup.bright().push(&texel.receiver, points.len(), seed, &mut shadow);
             }
         }
-        let bright = shadow.finish(&mut traced).iter().copied().zip(unoccluded);
+        let (bright, directed) = shadow.finish_by_direction(&mut traced);
         let rays = self.rays[..count].chunks(points.len()).zip(self.hits.chunks(points.len()));
-        for ((texel, (rays, hits)), bright) in texels.iter_mut().zip(rays).zip(bright) {
-            let seed = seed_of_round(texel.seed, round);
-            texel.gathered.add(scene, radiance, &texel.receiver, seed, rays, hits, bright, &mut traced);
+        for (slot, (texel, (rays, hits))) in texels.iter_mut().zip(rays).enumerate() {
+            let directional = texel.directional.as_mut().zip(directed.get(slot).copied());
+            let (seed, bright) = (seed_of_round(texel.seed, round), (bright[slot], unoccluded[slot]));
+            texel.gathered.add(scene, radiance, &texel.receiver, seed, rays, hits, bright, directional, &mut traced);
         }
         traced
     }

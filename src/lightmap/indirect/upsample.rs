@@ -15,6 +15,7 @@ use super::narrow_gaps::is_in_gap;
 use super::near_hits::HitRadiance;
 use super::sample_set::SampleSet;
 use super::upsample_visibility::{self, TEXELS_PER_CHECK};
+use crate::base::directional::{Directional, Linear};
 use crate::base::error::Result;
 use crate::base::memory::{
     Reservation, try_append, try_collect, try_filled, try_par_gather, try_push, try_vec, try_with_capacity,
@@ -71,12 +72,17 @@ pub(crate) struct Upsampling {
 /// Indirect irradiance of the fallback gathers of an [`Upsampling`], in its order; `None` inside solids.
 pub(crate) type OwnLight = Vec<Option<Vec3>>;
 
+/// Indirect light by direction of the fallback gathers; empty if nobody asks for it.
+pub(crate) type OwnDirectional = Vec<Option<Directional>>;
+
 /// Inputs of fallback gathers.
 pub(crate) struct OwnRays<'a> {
     pub radiance: HitRadiance<'a>,
     /// Sample set, of which the first round is used.
     pub samples: &'a SampleSet,
     pub seed: u32,
+    /// Whether light by direction is asked for.
+    pub directional: bool,
 }
 
 impl Upsampling {
@@ -111,7 +117,7 @@ impl Upsampling {
         Ok(Upsampling { gather_gaps, map_gaps, walled, walls, is_alone, alone, rays, _memory: Some(memory) })
     }
 
-    /// Traces the fallback gathers. Returns their light and the number of rays. Advances `stage` by
+    /// Traces the fallback gathers. Returns their light, that by direction, and the number of rays. Advances `stage` by
     /// [`own_work`](Self::own_work).
     pub(crate) fn own_light(
         &self,
@@ -119,26 +125,40 @@ impl Upsampling {
         backs: &[bool],
         rays: &OwnRays,
         stage: &Stage,
-    ) -> Result<(OwnLight, u64)> {
+    ) -> Result<(OwnLight, OwnDirectional, u64)> {
+        let (what, n) = ("texels on their own", self.alone.len());
         let traced = AtomicU64::new(0);
         let nothing = Own { irradiance: None, normal: Vec3::ZERO };
-        let mut own = try_filled(self.alone.len(), nothing, "texels on their own")?;
-        let mut light: OwnLight = try_filled(self.alone.len(), None, "texels on their own")?;
+        let mut own = try_filled(n, nothing, what)?;
+        let mut light: OwnLight = try_filled(n, None, what)?;
+        let n = if rays.directional { n } else { 0 };
+        let mut directional: Vec<Directional> = try_vec(n, what)?;
+        let mut blurred: OwnDirectional = try_filled(n, None, what)?;
         let tiles = Scratch::new();
+        let new_tile = if rays.directional { Tile::by_direction } else { Tile::new };
         atlas.scene.device().install(|| {
-            own.par_chunks_mut(BLOCK).zip(self.alone.par_chunks(BLOCK)).try_for_each(|(own, texels)| {
-                let mut tile = tiles.take(Tile::new)?;
-                traced.fetch_add(gather_for(atlas, backs, rays, texels, own, &mut tile, stage)?, Relaxed);
-                stage.advance(texels.len() as u64)
-            })?;
+            let blocks = own.par_chunks_mut(BLOCK).zip(self.alone.par_chunks(BLOCK));
+            blocks.zip(parts(&mut directional, BLOCK, self.alone.len())?).try_for_each(
+                |((own, texels), directional)| {
+                    let mut tile = tiles.take(new_tile)?;
+                    traced.fetch_add(
+                        gather_for(atlas, backs, rays, texels, (own, directional), &mut tile, stage)?,
+                        Relaxed,
+                    );
+                    stage.advance(texels.len() as u64)
+                },
+            )?;
+            blurred.par_iter_mut().enumerate().with_min_len(BLOCK).for_each(|(i, blurred)| {
+                *blurred = self.blurred(atlas, &own, |k| directional[k], i);
+            });
             light.par_chunks_mut(BLOCK).enumerate().try_for_each(|(block, light)| {
                 for (i, light) in (block * BLOCK..).zip(light.iter_mut()) {
-                    *light = self.blurred(atlas, &own, i);
+                    *light = self.blurred(atlas, &own, |k| own[k].irradiance.unwrap_or_default(), i);
                 }
                 stage.advance(light.len() as u64)
             })
         })?;
-        Ok((light, traced.into_inner()))
+        Ok((light, blurred, traced.into_inner()))
     }
 
     /// Returns the number of steps of [`own_light`](Self::own_light).
@@ -149,34 +169,35 @@ impl Upsampling {
     /// Interpolates a gather map's `values` at a texel of the light map, or returns the light of its fallback gather
     /// from `own` ([`OwnLight`]).
     #[inline]
-    pub(crate) fn at(
+    pub(crate) fn at<T: Linear>(
         &self,
         atlas: &Atlas,
-        values: PerTexel<GatherMap, Vec3>,
-        own: &[Option<Vec3>],
+        values: PerTexel<GatherMap, T>,
+        own: &[Option<T>],
         texel: LightTexel,
-    ) -> Vec3 {
+    ) -> T {
         if self.is_alone.has(texel)
             && let Ok(i) = self.alone.binary_search(&texel)
             && let Some(irradiance) = own[i]
         {
             return irradiance;
         }
-        let mut all = Vec3::ZERO;
+        let mut all = T::default();
         if self.is_plain() {
-            atlas.gather_around(texel, |s, w| all += w * values[s]);
+            atlas.gather_around(texel, |s, w| all += values[s] * w);
             return all;
         }
         // Sums over gather texels that are joined and alike, and over those that are joined, which serve if there are
         // none of the first kind.
-        let mut sums = [(Vec3::ZERO, 0.0, true); 2];
+        let mut sums = [(T::default(), 0.0, true); 2];
         atlas.gather_around(texel, |s, w| {
-            all += w * values[s];
+            all += values[s] * w;
             let is_joined = !self.are_apart(texel, s);
             for ((sum, part, is_all), counts) in sums.iter_mut().zip([is_joined && self.are_alike(texel, s), is_joined])
             {
                 if counts {
-                    (*sum, *part) = (*sum + w * values[s], *part + w);
+                    *sum += values[s] * w;
+                    *part += w;
                 } else {
                     *is_all = false;
                 }
@@ -207,28 +228,37 @@ impl Upsampling {
         self.gather_gaps.words.is_empty() && self.walls.is_empty()
     }
 
-    /// Returns the mean of fallback gather `i` and those within [`RADIUS`] in the same chart, weighted by how far they
+    /// Returns the mean `value` of fallback gather `i` and those within [`RADIUS`] in the same chart, weighted by how far they
     /// face the same way. (There is no test for thin walls between them.)
-    fn blurred(&self, atlas: &Atlas, own: &[Own], i: usize) -> Option<Vec3> {
+    fn blurred<T: Linear>(&self, atlas: &Atlas, own: &[Own], value: impl Fn(usize) -> T, i: usize) -> Option<T> {
         let (texel, normal) = (self.alone[i], own[i].normal);
         own[i].irradiance?;
         let (x, y) = atlas.map.position(texel);
         let placement = atlas.map.placement_of(&atlas.charts, texel);
         let of_placement = atlas.map.texels_of(placement);
-        let (mut sum, mut total) = (Vec3::ZERO, 0.0);
+        let (mut sum, mut total) = (T::default(), 0.0);
         for (dx, dy) in (-RADIUS..=RADIUS).flat_map(|dy| (-RADIUS..=RADIUS).map(move |dx| (dx, dy))) {
             // The window of given charts may contain another chart, which other shards bake.
             let s = atlas.map.at(placement, x + dx, y + dy).filter(|&s| of_placement.contains(s));
             let Some(s) = s.filter(|&s| self.is_alone.has(s)) else { continue };
             if let Ok(k) = self.alone.binary_search(&s)
-                && let Some(irradiance) = own[k].irradiance
+                && own[k].irradiance.is_some()
             {
                 let weight = normal.dot(own[k].normal).max(0.0).powi(4);
-                (sum, total) = (sum + weight * irradiance, total + weight);
+                sum += value(k) * weight;
+                total += weight;
             }
         }
-        if total > 0.0 { Some(sum / total) } else { own[i].irradiance }
+        if total > 0.0 { Some(sum / total) } else { Some(value(i)) }
     }
+}
+
+/// Cuts `values`, one for each of `count` texels or none at all, into parts of `size` texels.
+pub(in crate::lightmap) fn parts<T>(values: &mut [T], size: usize, count: usize) -> Result<Vec<&mut [T]>> {
+    let mut parts: Vec<&mut [T]> = try_with_capacity(count.div_ceil(size), "parts of a map")?;
+    parts.extend(values.chunks_mut(size));
+    parts.resize_with(count.div_ceil(size), Default::default);
+    Ok(parts)
 }
 
 /// Result of a fallback gather before the blur.
@@ -245,7 +275,7 @@ fn gather_for(
     backs: &[bool],
     own: &OwnRays,
     texels: &[LightTexel],
-    out: &mut [Own],
+    (out, directional): (&mut [Own], &mut [Directional]),
     tile: &mut Tile,
     stage: &Stage,
 ) -> Result<u64> {
@@ -253,15 +283,19 @@ fn gather_for(
         receiver: atlas.receiver(&atlas.map, backs, texel),
         seed: combine(own.seed, texel.seed()),
         gathered: Gathered::default(),
+        directional: own.directional.then(Directional::default),
     };
     let mut rays = 0;
-    for (texels, out) in texels.chunks(TILE).zip(out.chunks_mut(TILE)) {
+    for (number, (texels, out)) in texels.chunks(TILE).zip(out.chunks_mut(TILE)).enumerate() {
         stage.check()?;
         let mut texels: Vec<_> = texels.iter().map(texel).collect();
         rays += tile.add_round(&atlas.scene, &own.radiance, &mut texels, own.samples, 0);
         for (TileTexel { receiver, gathered, .. }, out) in texels.iter().zip(out) {
             let irradiance = gathered.is_visible().then(|| gathered.irradiance());
             *out = Own { irradiance, normal: receiver.normal };
+        }
+        for (texel, out) in texels.iter().zip(directional.iter_mut().skip(number * TILE)) {
+            *out = texel.directional();
         }
     }
     Ok(rays)
@@ -413,10 +447,12 @@ pub(super) mod tests {
             radiance: HitRadiance::of_map(RadianceLookup::new(&atlas.charts, &atlas.radiance, &radiance)),
             samples: &SampleSet::new(OWN_RAYS, 0),
             seed: 0,
+            directional: false,
         };
         let progress = Progress::none();
         let stage = progress.stage("own light", 0.0, 1.0, upsampling.own_work());
-        upsampling.own_light(atlas, &[], &rays, &stage).unwrap()
+        let (light, _, rays) = upsampling.own_light(atlas, &[], &rays, &stage).unwrap();
+        (light, rays)
     }
 
     /// No light of their own.

@@ -3,9 +3,9 @@
 //! The file holds records (`super::records`): `CKPT` with the fingerprint of the bake, then finished work in the order
 //! in which threads finish it: `RADI` (runs of the radiance map), `RDNE` (bright patches; the radiance map is
 //! complete), `BACK` (the sides that are shown), `OWNL` (fallback gathers), `GAT2` (blocks of the gather map), `DRC2`
-//! (blocks of direct light; `GATH` and `DRCT` were smaller ones). All of it is independent of the number of threads and
-//! the order, so missing work is done again and gives the same bits. Photons, upsampling, blur and seams are not kept:
-//! they take a small part of a bake.
+//! (blocks of direct light; `GATH` and `DRCT` were smaller ones), and `OWND`, `GATD` and `DRCD` for light by direction.
+//! All of it is independent of the number of threads and the order, so missing work is done again and gives the same
+//! bits. Photons, upsampling, blur and seams are not kept: they take a small part of a bake.
 //!
 //! Records are only ever appended. If the process is killed, at most the last of them is incomplete; after a power
 //! failure, data that was not flushed may be incomplete or zero. Either is cut off.
@@ -14,6 +14,7 @@ use super::fingerprint::{Fingerprint, Origin};
 use super::records::{self, MAGIC, Next, Tag, take, take_one};
 use super::result::is_light;
 use super::{damaged, foreign, unreadable};
+use crate::base::directional::Directional;
 use crate::base::error::{Error, Result, invalid_argument};
 use crate::base::memory::{try_collect, try_vec};
 use crate::device::{Device, LogLevel};
@@ -21,7 +22,7 @@ use crate::lightmap::TexelState;
 use crate::lightmap::atlas::Atlas;
 use crate::lightmap::indirect::find_bright_patches::{self, MAX_SHADOW_RAYS};
 use crate::lightmap::indirect::radiance_map::Radiance;
-use crate::lightmap::indirect::upsample::OwnLight;
+use crate::lightmap::indirect::upsample::{OwnDirectional, OwnLight};
 use glam::Vec3;
 use std::collections::HashMap;
 use std::fs::{File, OpenOptions, TryLockError};
@@ -37,6 +38,9 @@ const BACKS: Tag = *b"BACK";
 const OWN: Tag = *b"OWNL";
 const GATHER: Tag = *b"GAT2";
 const DIRECT: Tag = *b"DRC2";
+const OWN_DIRECTIONAL: Tag = *b"OWND";
+const GATHER_DIRECTIONAL: Tag = *b"GATD";
+const DIRECT_DIRECTIONAL: Tag = *b"DRCD";
 
 /// Number of texels of the radiance map in a record.
 const RUN: usize = 1 << 14;
@@ -244,9 +248,50 @@ impl<'a> Checkpoint<'a> {
         }
     }
 
+    /// Returns the light by direction of `count` fallback gathers from an earlier run, which has light where `light` has.
+    pub fn own_directional(&self, light: &OwnLight) -> Result<Option<OwnDirectional>> {
+        let mut values: Vec<Directional> = try_vec(light.len(), "light of a checkpoint")?;
+        if !self.directional(OWN_DIRECTIONAL, 0, &mut values) {
+            return Ok(None);
+        }
+        let known = light.iter().zip(values).map(|(light, d)| light.map(|_| d));
+        try_collect(known, "light of a checkpoint").map(Some)
+    }
+
+    pub fn keep_own_directional(&self, light: &OwnDirectional) {
+        match try_collect(light.iter().map(|v| v.unwrap_or_default()), "light of a checkpoint") {
+            Ok(values) => self.keep(OWN_DIRECTIONAL, 0, &[bytemuck::cast_slice(&values)]),
+            Err(e) => self.warn(&e),
+        }
+    }
+
+    /// Fills in the light by direction of a block if an earlier run has finished it; returns whether it has. `values` may
+    /// be empty: then there is nothing to fill in.
+    fn directional(&self, tag: Tag, block: usize, values: &mut [Directional]) -> bool {
+        if values.is_empty() {
+            return true;
+        }
+        let Some(content) = self.take(tag, block as u64) else { return false };
+        let fits = content.len() == size_of_val(values) && take(&mut &content[..], values).is_some();
+        fits && values.iter().all(Directional::is_possible)
+    }
+
+    fn keep_directional(&self, tag: Tag, block: usize, values: &[Directional]) {
+        if !values.is_empty() {
+            self.keep(tag, block as u64, &[bytemuck::cast_slice(values)]);
+        }
+    }
+
     /// Fills in a block of the gather map (irradiance, variance and validity of each texel) if an earlier run has
     /// finished it; returns whether it has.
-    pub fn gathered(&self, block: usize, values: &mut [Vec3], variances: &mut [f32], valid: &mut [bool]) -> bool {
+    pub fn gathered(
+        &self,
+        block: usize,
+        values: &mut [Vec3],
+        variances: &mut [f32],
+        valid: &mut [bool],
+        directional: &mut [Directional],
+    ) -> bool {
         let read = || {
             let content = self.take(GATHER, block as u64)?;
             let mut rest = &content[..];
@@ -258,20 +303,37 @@ impl<'a> Checkpoint<'a> {
             fits.then(|| (light, spread, rest.to_vec()))
         };
         let Some((light, spread, flags)) = read() else { return false };
+        if !self.directional(GATHER_DIRECTIONAL, block, directional) {
+            return false;
+        }
         values.copy_from_slice(&light);
         variances.copy_from_slice(&spread);
         valid.iter_mut().zip(flags).for_each(|(valid, flag)| *valid = flag != 0);
         true
     }
 
-    pub fn keep_gathered(&self, block: usize, values: &[Vec3], variances: &[f32], valid: &[bool]) {
+    pub fn keep_gathered(
+        &self,
+        block: usize,
+        values: &[Vec3],
+        variances: &[f32],
+        valid: &[bool],
+        directional: &[Directional],
+    ) {
+        self.keep_directional(GATHER_DIRECTIONAL, block, directional);
         let parts = [bytemuck::cast_slice(values), bytemuck::cast_slice(variances), bytemuck::cast_slice(valid)];
         self.keep(GATHER, block as u64, &parts);
     }
 
     /// Fills in a block of direct light and the state of its texels if an earlier run has finished it; returns whether
     /// it has.
-    pub(in crate::lightmap) fn lit(&self, block: usize, direct: &mut [Vec3], state: &mut [TexelState]) -> bool {
+    pub(in crate::lightmap) fn lit(
+        &self,
+        block: usize,
+        direct: &mut [Vec3],
+        state: &mut [TexelState],
+        directional: &mut [Directional],
+    ) -> bool {
         let read = || {
             let content = self.take(DIRECT, block as u64)?;
             let mut rest = &content[..];
@@ -282,12 +344,22 @@ impl<'a> Checkpoint<'a> {
             fits.then_some((light, states))
         };
         let Some((light, states)) = read() else { return false };
+        if !self.directional(DIRECT_DIRECTIONAL, block, directional) {
+            return false;
+        }
         direct.copy_from_slice(&light);
         state.copy_from_slice(&states);
         true
     }
 
-    pub(in crate::lightmap) fn keep_lit(&self, block: usize, direct: &[Vec3], state: &[TexelState]) {
+    pub(in crate::lightmap) fn keep_lit(
+        &self,
+        block: usize,
+        direct: &[Vec3],
+        state: &[TexelState],
+        directional: &[Directional],
+    ) {
+        self.keep_directional(DIRECT_DIRECTIONAL, block, directional);
         let states: Vec<u8> = state.iter().map(|s| s.to_byte()).collect();
         self.keep(DIRECT, block as u64, &[bytemuck::cast_slice(direct), &states]);
     }

@@ -50,7 +50,8 @@ pub(super) struct Fingerprint {
     radius: f32,
     blur_radius: u32,
     direct_samples: u32,
-    stitch: u32,
+    stitch: u16,
+    directional: u16,
 }
 
 /// Returns the library's version, as in files.
@@ -86,6 +87,7 @@ impl Fingerprint {
             texel_begin: _,
             texel_end: _,
             stitch,
+            directional,
         } = origin.params;
         Fingerprint {
             version: version(),
@@ -105,6 +107,8 @@ impl Fingerprint {
             blur_radius,
             direct_samples,
             stitch: stitch.into(),
+            // All bits of it are named in `lightmap::directional`, and checked.
+            directional: directional as u16,
         }
     }
 
@@ -123,6 +127,7 @@ impl Fingerprint {
             texel_begin: 0,
             texel_end: 0,
             stitch: self.stitch != 0,
+            directional: self.directional.into(),
         }
     }
 
@@ -159,6 +164,7 @@ impl Fingerprint {
         compare(&mut all, "direct_samples", self.direct_samples, needed.direct_samples);
         compare(&mut all, "seed", self.seed, needed.seed);
         compare(&mut all, "stitch", self.stitch, needed.stitch);
+        compare(&mut all, "directional", self.directional, needed.directional);
         compare(&mut all, "texel_begin", self.texel_begin, needed.texel_begin);
         compare(&mut all, "texel_end", self.texel_end, needed.texel_end);
         (!all.is_empty()).then(|| all.join(", "))

@@ -1,13 +1,15 @@
 //! Results: saving the light of all baked texels of a light map to a file, and loading it.
 //!
 //! A file holds records (`super::records`): `RSLT` with fingerprint and counts, `PLAN`, `BACK` (the sides that are
-//! shown), `RADI` (the radiance map, in runs), `TEXL` (direct and indirect light and state of runs of texels), `DONE`.
+//! shown), `RADI` (the radiance map, in runs), `TEXL` (direct and indirect light and state of runs of texels), each
+//! followed by `DIRL` (their light by direction) if that was asked for, `DONE`.
 //! Light is saved as it was before seams were stitched. Loading the last texels stitches anew, so that light maps
 //! assembled from several results have the bits of one bake.
 
 use super::fingerprint::Fingerprint;
 use super::records::{self, MAGIC, Next, RUN, Records, Tag, take, take_one};
 use super::{damaged, foreign, unreadable};
+use crate::base::directional::Directional;
 use crate::base::error::{Error, Result};
 use crate::base::files;
 use crate::base::memory::{try_collect, try_push, try_to_vec, try_vec, try_with_capacity};
@@ -28,6 +30,7 @@ const PLAN: Tag = *b"PLAN";
 const BACKS: Tag = *b"BACK";
 const RADIANCE: Tag = *b"RADI";
 const TEXELS: Tag = *b"TEXL";
+const DIRECTIONAL: Tag = *b"DIRL";
 const DONE: Tag = *b"DONE";
 
 /// The content of the first record.
@@ -110,12 +113,15 @@ impl Lightmap {
         let mut file = Loading::open(path, self)?;
         let texels = self.atlas.map.len();
         let memory = self.atlas.scene.device().memory();
-        let bytes = texels * 25 + file.head.radiance as usize * size_of::<Vec3>();
-        let memory = memory.reserve(bytes, "the result of a bake")?;
         let origin = file.head.fingerprint.origin();
+        let directional = if origin.params.directional == 0 { 0 } else { texels };
+        let bytes =
+            texels * 25 + directional * size_of::<Directional>() + file.head.radiance as usize * size_of::<Vec3>();
+        let memory = memory.reserve(bytes, "the result of a bake")?;
         let mut light = Light {
             direct: try_vec(texels, "direct light")?,
             indirect: try_vec(texels, "indirect light")?,
+            directional: try_vec(directional, "light by direction")?,
             state: try_vec(texels, "validity")?,
             radiance: Radiance::default(),
             backs: Vec::new(),
@@ -135,6 +141,7 @@ impl Lightmap {
             }
             light.direct.copy_from_slice(&old.direct);
             light.indirect.copy_from_slice(&old.indirect);
+            light.directional.copy_from_slice(&old.directional);
             light.state.copy_from_slice(&old.state);
             if let Some(stitch) = &old.stitch {
                 stitch.copy_former(&mut light);
@@ -160,14 +167,20 @@ fn runs(state: &[TexelState]) -> Result<Vec<Range<usize>>> {
 fn append_texels(light: &Light, run: Range<usize>, out: &mut Vec<u8>) -> Result<()> {
     let copy = |of: &[Vec3]| try_to_vec(&of[run.clone()], "texels to be saved");
     let (mut direct, mut indirect) = (copy(&light.direct)?, copy(&light.indirect)?);
+    let directional = light.directional.get(run.clone()).unwrap_or_default();
+    let mut directional = try_to_vec(directional, "texels to be saved")?;
     if let Some(stitch) = &light.stitch {
-        stitch.former_of(&run, &mut direct, &mut indirect);
+        stitch.former_of(&run, &mut direct, &mut indirect, &mut directional);
     }
     let states = try_collect(light.state[run.clone()].iter().map(|s| s.to_byte()), "texels to be saved")?;
     let place = [run.start as u64, run.len() as u64];
     let parts =
         [bytemuck::cast_slice(&place), bytemuck::cast_slice(&direct), bytemuck::cast_slice(&indirect), &states[..]];
-    records::append(out, TEXELS, &parts)
+    records::append(out, TEXELS, &parts)?;
+    if directional.is_empty() {
+        return Ok(());
+    }
+    records::append(out, DIRECTIONAL, &[bytemuck::cast_slice(&place), bytemuck::cast_slice(&directional)])
 }
 
 /// Whether all values are possible for light.
@@ -208,7 +221,7 @@ impl<'a> Loading<'a> {
     /// Reads all records after the first.
     fn read_into(&mut self, light: &mut Light, charts: usize, progress: &Progress) -> Result<()> {
         let stage = progress.stage("loading", 0.0, 1.0, self.head.radiance + self.head.texels);
-        let mut texels = 0;
+        let (mut texels, mut directional) = (0, 0);
         light.radiance = Radiance { values: Vec::new(), bright: Bright::default() };
         light.radiance.values = try_with_capacity(self.head.radiance as usize, "the radiance map of a result")?;
         loop {
@@ -223,12 +236,17 @@ impl<'a> Loading<'a> {
                 BACKS => read_backs(&content, charts)?.map(|backs| light.backs = backs).map(|()| 0),
                 RADIANCE => read_radiance(&content, self.head.radiance as usize, &mut light.radiance.values),
                 TEXELS => read_texels(&content, light).inspect(|&n| texels += n as u64),
+                DIRECTIONAL => read_directional(&content, light).inspect(|&n| directional += n as u64).map(|_| 0),
                 DONE => break,
                 _ => None,
             };
             stage.advance(read.ok_or_else(|| damaged(self.path))? as u64)?;
         }
-        if texels != self.head.texels || light.radiance.values.len() as u64 != self.head.radiance {
+        let asked = if light.directional.is_empty() { 0 } else { self.head.texels };
+        if texels != self.head.texels
+            || directional != asked
+            || light.radiance.values.len() as u64 != self.head.radiance
+        {
             return Err(damaged(self.path));
         }
         Ok(())
@@ -251,6 +269,14 @@ fn read_radiance(mut content: &[u8], all: usize, values: &mut Vec<Vec3>) -> Opti
     values.resize(first + count, Vec3::ZERO);
     take(&mut content, &mut values[first..])?;
     (content.is_empty() && is_light(&values[first..])).then_some(count)
+}
+
+/// Reads the light by direction of a run of texels; returns its length.
+fn read_directional(mut content: &[u8], light: &mut Light) -> Option<usize> {
+    let [first, count] = take_one::<[u64; 2]>(&mut content)?.map(|n| n as usize);
+    let values = light.directional.get_mut(first..first.checked_add(count)?)?;
+    take(&mut content, values)?;
+    (content.is_empty() && values.iter().all(Directional::is_possible)).then_some(count)
 }
 
 /// Reads a run of texels; returns its length. If it is refused, some texels may have been written.

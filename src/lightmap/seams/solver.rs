@@ -84,8 +84,9 @@ impl System {
         });
     }
 
-    /// Solves by conjugate gradients, starting at `before`, for each channel separately. Light stays ≥ 0.
-    pub(super) fn solve(&self, before: &[Vec3A], x: &mut [Vec3A], stage: &Stage) -> Result<()> {
+    /// Solves by conjugate gradients, starting at `before`, for each channel separately. Values are at `least` what is
+    /// given.
+    pub(super) fn solve(&self, before: &[Vec3A], x: &mut [Vec3A], least: f32, stage: &Stage) -> Result<()> {
         let mut differences = try_filled(self.points.len(), Vec3A::ZERO, POINTS)?;
         let mut q = try_filled(before.len(), Vec3A::ZERO, POINTS)?;
         self.differences(before, &mut differences);
@@ -112,7 +113,7 @@ impl System {
             rr = next;
         }
         for (x, &before) in x.iter_mut().zip(before) {
-            *x = if x.is_finite() { x.max(Vec3A::ZERO) } else { before };
+            *x = if x.is_finite() { x.max(Vec3A::splat(least)) } else { before };
         }
         Ok(())
     }

@@ -274,7 +274,7 @@ fn backs_are_stitched_to_the_sides_that_go_on_in_them() {
 fn solve(points: Vec<Point>, texels: usize, before: &[Vec3A], x: &mut [Vec3A]) {
     let progress = Progress::none();
     let stage = progress.stage("seams", 0.0, 1.0, 1);
-    System::new(points, texels, &stage).unwrap().solve(before, x, &stage).unwrap();
+    System::new(points, texels, &stage).unwrap().solve(before, x, 0.0, &stage).unwrap();
 }
 
 /// On the edge of a spotlight's cone, where least squares alone would go below zero.

@@ -2,6 +2,7 @@
 //! of points.
 
 use super::{AROUND, FEW, MAX_POINTS, Point, TexelLight, TilePoints, Wanted, add_to, differ, vary};
+use crate::base::directional::Directional;
 use crate::base::sampling::combine;
 use crate::direct::Receiver;
 use crate::direct::direct_light::{Lights, PointLight};
@@ -25,8 +26,9 @@ pub(crate) struct Averaged {
     pub back: bool,
     /// The texel's sample.
     pub receiver: Receiver,
-    /// The light of its sample without penumbrae.
+    /// The light of its sample without penumbrae, and that light by direction.
     pub sharp: Vec3,
+    pub sharp_directional: Directional,
     pub variation: Variation,
 }
 
@@ -55,7 +57,7 @@ impl TexelLight<'_, LightMap> {
         receivers: impl Iterator<Item = Receiver>,
         tile: &mut TilePoints,
         rays: &mut u64,
-        mut out: impl FnMut(usize, Vec3),
+        mut out: impl FnMut(usize, Vec3, Option<&Directional>),
     ) {
         let mut shadow = tile.room.begin(self.areas.scene);
         let mut count = 0;
@@ -65,9 +67,10 @@ impl TexelLight<'_, LightMap> {
             count += 1;
         }
         let mut light = PointLight::default();
-        for (i, sums) in shadow.finish(rays).chunks_exact(KINDS).take(count).enumerate() {
+        let (arrived, directed) = shadow.finish_by_direction(rays);
+        for (i, sums) in arrived.chunks_exact(KINDS).take(count).enumerate() {
             light.take(sums);
-            out(i, light.sharp);
+            out(i, light.sharp, directed.get(KINDS * i));
         }
     }
 
@@ -89,13 +92,14 @@ impl TexelLight<'_, LightMap> {
         variation
     }
 
-    /// Computes the direct light of the texels of a tile.
+    /// Computes the direct light of the texels of a tile, and that light by direction, which is 0 if nobody asks for
+    /// it.
     pub(crate) fn irradiance(
         &self,
         texels: &[Averaged],
         tile: &mut TilePoints,
         rays: &mut u64,
-        mut out: impl FnMut(usize, Vec3),
+        mut out: impl FnMut(usize, Vec3, &Directional),
     ) {
         let soft = self.direct.has_soft();
         let lights_of = |variation| match (variation, soft) {
@@ -122,16 +126,25 @@ impl TexelLight<'_, LightMap> {
         let more = texels.iter().enumerate().filter(|(i, _)| goes_on[*i]);
         tile.light(self, more.filter_map(|(i, t)| wanted(i, t, FEW..MAX_POINTS as u32)), rays);
         for (i, t) in texels.iter().enumerate() {
+            let mut directional = t.sharp_directional;
             let e = match lights_of(t.variation) {
-                Some(_) => self.average(t, tile.of_mut(i), goes_on[i], rays),
+                Some(_) => self.average(t, tile.of_mut(i), goes_on[i], &mut directional, rays),
                 None => t.sharp,
             };
-            out(i, e);
+            out(i, e, &directional);
         }
     }
 
-    /// Averages the light of a texel's points; `goes_on`: more than the first few have been lit.
-    fn average(&self, t: &Averaged, points: &mut [Point], goes_on: bool, rays: &mut u64) -> Vec3 {
+    /// Averages the light of a texel's points; `goes_on`: more than the first few have been lit. If light by direction
+    /// is asked for, `out` receives it.
+    fn average(
+        &self,
+        t: &Averaged,
+        (points, directional): (&mut [Point], &[[Directional; KINDS]]),
+        goes_on: bool,
+        out: &mut Directional,
+        rays: &mut u64,
+    ) -> Vec3 {
         let (scene, sharp) = (self.areas.scene, t.sharp);
         let points = match t.variation {
             Variation::None => points,
@@ -142,7 +155,12 @@ impl TexelLight<'_, LightMap> {
         if n == Vec3::ZERO {
             // All points miss a small part of a chart: its sample alone is lit.
             let seed = combine(self.seed, t.texel.seed());
-            return sharp + self.direct.at_point(&t.receiver, Lights::Soft, self.samples, seed, rays).value();
+            if directional.is_empty() {
+                return sharp + self.direct.at_point(&t.receiver, Lights::Soft, self.samples, seed, rays).value();
+            }
+            let soft = self.direct.at_point_by_direction(&t.receiver, Lights::Soft, self.samples, seed, rays);
+            *out = t.sharp_directional + soft.1;
+            return sharp + soft.0.value();
         }
         let is_even = t.variation == Variation::Unknown
             && !goes_on
@@ -153,8 +171,32 @@ impl TexelLight<'_, LightMap> {
             sum.sharp = sharp * n;
         }
         let e = sum.value() / n;
+        if !directional.is_empty() {
+            *out = average_by_direction(t, points, directional, (&sum, n.x), is_even);
+        }
         if t.variation == Variation::None { sharp + e } else { e }
     }
+}
+
+/// Averages the light by direction of a texel's points. `sum`: their light, and the number of those that count.
+#[inline(never)]
+fn average_by_direction(
+    t: &Averaged,
+    points: &[Point],
+    directional: &[[Directional; KINDS]],
+    (sum, n): (&PointLight, f32),
+    is_even: bool,
+) -> Directional {
+    // Points inside of solids, which do not count, have none.
+    let mut kinds = [Directional::default(); KINDS];
+    for point in points {
+        kinds.iter_mut().zip(directional[point.place as usize]).for_each(|(sum, of_point)| *sum += of_point);
+    }
+    if is_even {
+        kinds[0] = t.sharp_directional * n;
+    }
+    let average = sum.by_direction(&kinds) / n;
+    if t.variation == Variation::None { t.sharp_directional + average } else { average }
 }
 
 /// Whether another surface stands between two points of a surface.

@@ -47,7 +47,7 @@ impl TexelLight<'_, RadianceMap> {
                 let seed = combine(self.seed, texel.seed());
                 let (on, receiver) = (map[texel], map.receiver(scene, texel, map.is_back(texel)).1);
                 let light = self.direct.at_point(&receiver, Lights::All, self.samples, seed, rays);
-                n = add_to(&[Point { on, receiver, light }], scene, &mut sum, |_| Vec3::ONE, rays);
+                n = add_to(&[Point { on, receiver, light, place: 0 }], scene, &mut sum, |_| Vec3::ONE, rays);
             }
             let varies =
                 vary(points, PointLight::narrow, DIFFERENCE) || vary(points, PointLight::unoccluded_areas, DIFFERENCE);
