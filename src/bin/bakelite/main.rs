@@ -38,6 +38,7 @@ fn main() -> ExitCode {
         Ok(Command::ReportLive(report)) => report::live::run(&report),
         Ok(Command::ReportMemory(args)) => report::memory::run(&args),
         Ok(Command::ReportPipeline(args)) => report::pipeline::run(&args),
+        Ok(Command::ReportDirectional(report)) => report::quality::directional::run(&report),
         Ok(Command::ReportQuality(report)) => report::quality::run(&report),
         Ok(Command::ReportStability(args)) => report::stability::run(&args),
         // Help and the version, too.

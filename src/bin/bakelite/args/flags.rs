@@ -41,6 +41,8 @@ pub enum Verb {
 pub enum Report {
     /// How long each call is silent, and how soon it ends when it is cancelled
     Cancel(Box<Flags>),
+    /// Light by direction under a normal map: error beside irradiance alone, time and memory
+    Directional(Box<DirectionalFlags>),
     /// Live updates: error against time and rays, budgets, traffic, memory
     Live(Box<LiveFlags>),
     /// The scene's memory, default and compact, and what that costs rays
@@ -132,6 +134,22 @@ pub struct QualityFlags {
     #[arg(long, value_name = "A,B,..", value_delimiter = ',', default_values = KNOBS, hide_default_value = true,
           value_parser = PossibleValuesParser::new(KNOBS.into_iter().chain(["none"])))]
     pub knobs: Vec<String>,
+    #[command(flatten)]
+    pub flags: Flags,
+}
+
+#[derive(Args)]
+#[command(next_help_heading = "Report directional")]
+pub struct DirectionalFlags {
+    /// Points at which light is compared
+    #[arg(long, value_name = "N", default_value_t = 400, value_parser = clap::value_parser!(u32).range(1..))]
+    pub points: u32,
+    /// Paths per point of the path traced reference, for each angle of the normal map
+    #[arg(long, value_name = "N", default_value_t = 4096, value_parser = clap::value_parser!(u32).range(1..))]
+    pub paths: u32,
+    /// Bakes with and without light by direction, of which the median times are given
+    #[arg(long, value_name = "N", default_value_t = 3, value_parser = clap::value_parser!(u64).range(1..))]
+    pub runs: u64,
     #[command(flatten)]
     pub flags: Flags,
 }
@@ -264,6 +282,10 @@ pub struct BakeFlags {
     /// Leave the seams between charts as they are
     #[arg(long)]
     pub no_stitch: bool,
+    /// Which light to compute by direction too, for normal maps; its layers are then written as well
+    #[arg(long, value_name = "LIGHT", default_value = "none",
+          value_parser = ["none", "indirect", "direct", "all"])]
+    pub directional: String,
 }
 
 #[derive(Args)]

@@ -13,7 +13,7 @@ mod values;
 use bakelite::Isa;
 use bakelite::bvh::{BuildOptions, BuildQuality};
 use bakelite::io::LoadOptions;
-use bakelite::lightmap::{BakeParams, Layer, LightmapDesc};
+use bakelite::lightmap::{BakeParams, Layer, LightmapDesc, directional};
 use bakelite::live::LiveParams;
 use bakelite::scene::{Camera, is_builtin};
 use clap::error::ErrorKind;
@@ -28,6 +28,7 @@ pub use values::GivenLight;
 pub enum Command {
     Bake(Box<BakeArgs>),
     ReportCancel(Box<BakeArgs>),
+    ReportDirectional(Box<ReportArgs>),
     ReportLive(Box<ReportArgs>),
     ReportMemory(Box<BakeArgs>),
     ReportPipeline(Box<BakeArgs>),
@@ -52,7 +53,7 @@ const fn layer(name: &'static str, layer: Layer, unit: &'static str, is_light: b
 }
 
 /// The layers of which images make sense, those that are written unless others are asked for first.
-pub const LAYERS: [NamedLayer; 7] = [
+pub const LAYERS: [NamedLayer; 15] = [
     layer("combined", Layer::Combined, "W/m2", true),
     layer("indirect", Layer::Indirect, "W/m2", true),
     layer("direct", Layer::Direct, "W/m2", true),
@@ -60,7 +61,19 @@ pub const LAYERS: [NamedLayer; 7] = [
     layer("validity", Layer::Validity, "", false),
     layer("position", Layer::Position, "scene units", false),
     layer("normal", Layer::Normal, "", false),
+    layer("l0", Layer::L0, "W/(m2 sr)", false),
+    layer("l1x", Layer::L1X, "W/(m2 sr)", false),
+    layer("l1y", Layer::L1Y, "W/(m2 sr)", false),
+    layer("l1z", Layer::L1Z, "W/(m2 sr)", false),
+    layer("ratio-x", Layer::RatioX, "", false),
+    layer("ratio-y", Layer::RatioY, "", false),
+    layer("ratio-z", Layer::RatioZ, "", false),
+    layer("direction", Layer::Direction, "", false),
 ];
+
+/// The layers that are written unless others are asked for, and those that come with light by direction.
+pub const DEFAULT_LAYERS: [&str; 4] = ["combined", "indirect", "direct", "radiance"];
+const DIRECTIONAL_LAYERS: [&str; 4] = ["l0", "ratio-x", "ratio-y", "ratio-z"];
 
 /// The kinds of files that a bake writes.
 #[derive(Clone, Copy, Debug, Default, PartialEq)]
@@ -223,6 +236,12 @@ fn command_of(line: CommandLine) -> Result<Command, String> {
         Verb::Report(Report::Memory(flags)) => Command::ReportMemory(boxed(flags)?),
         Verb::Report(Report::Pipeline(flags)) => Command::ReportPipeline(boxed(flags)?),
         Verb::Report(Report::Stability(flags)) => Command::ReportStability(boxed(flags)?),
+        Verb::Report(Report::Directional(d)) => Command::ReportDirectional(Box::new(ReportArgs {
+            points: d.points as usize,
+            paths: d.paths,
+            seeds: d.runs,
+            ..report_args(d.flags)?
+        })),
         Verb::Report(Report::Live(live)) => {
             if live.promote > live.rounds {
                 return Err(format!("--promote is {}, more than --rounds {}", live.promote, live.rounds));
@@ -300,6 +319,12 @@ fn bake_args(f: Flags) -> Result<BakeArgs, String> {
     };
     // Each value is in its range; together they may still not be.
     desc.validate().map_err(|e| format!("--padding {} with --page-size {}: {e}", desc.padding, desc.page_size))?;
+    let bits = match f.bake.directional.as_str() {
+        "indirect" => directional::INDIRECT,
+        "direct" => directional::DIRECT,
+        "all" => directional::INDIRECT | directional::DIRECT,
+        _ => 0,
+    };
     let params = BakeParams {
         photon_count: f.bake.photons,
         max_bounces: f.bake.bounces,
@@ -310,6 +335,7 @@ fn bake_args(f: Flags) -> Result<BakeArgs, String> {
         direct_samples: f.bake.direct_samples,
         seed: f.bake.seed,
         stitch: !f.bake.no_stitch,
+        directional: bits,
         ..Default::default()
     };
     let build = BuildOptions {
@@ -325,12 +351,21 @@ fn bake_args(f: Flags) -> Result<BakeArgs, String> {
     if formats.exr && formats.exr_half {
         return Err("--format has exr and exr-half, which would be the same files".into());
     }
-    let layers: Vec<NamedLayer> =
-        LAYERS.into_iter().filter(|l| f.output.layers.iter().any(|name| name == l.name)).collect();
+    let mut asked: Vec<&str> = f.output.layers.iter().map(String::as_str).collect();
+    let has_floats = formats.exr || formats.exr_half;
+    if asked == DEFAULT_LAYERS && bits != 0 && has_floats {
+        asked.extend(DIRECTIONAL_LAYERS);
+    }
+    let layers: Vec<NamedLayer> = LAYERS.into_iter().filter(|l| asked.contains(&l.name)).collect();
+    let by_direction = |l: &&NamedLayer| l.layer as u32 >= Layer::L0 as u32;
+    if let Some(layer) = layers.iter().find(by_direction)
+        && bits == 0
+    {
+        return Err(format!("--layers has {}, for which there is --directional", layer.name));
+    }
     if let Some(layer) = layers.iter().find(|l| !l.is_light)
         && formats.png
-        && !formats.exr
-        && !formats.exr_half
+        && !has_floats
     {
         return Err(format!("--layers has {}, which no PNG can show: --format exr", layer.name));
     }

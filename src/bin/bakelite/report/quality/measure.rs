@@ -69,8 +69,7 @@ impl Points {
     /// Chooses `count` points of surfaces that are seen from places that can be reached from `camera` and from the
     /// lamps, on whatever side, and path traces the reference there, with `paths` in f64 per point.
     pub fn new(lightmap: &Lightmap, camera: &Camera, count: usize, paths: u32, progress: &Progress) -> Result<Points> {
-        let mut points = Points::default();
-        points.choose(lightmap, camera, count)?;
+        let mut points = Points::chosen(lightmap, camera, count)?;
         let scene = lightmap.scene();
         let tracer = PathTracer::new(scene);
         let surface: Vec<SurfacePoint> = (0..points.on.len())
@@ -84,6 +83,15 @@ impl Points {
             points.indirect[half] = e.iter().map(|e| e.indirect).collect();
             points.all[half] = e.iter().map(|e| e.total()).collect();
         }
+        Ok(points)
+    }
+
+    /// Chooses points, without a reference.
+    pub fn chosen(lightmap: &Lightmap, camera: &Camera, count: usize) -> Result<Points> {
+        let mut points = Points::default();
+        points.choose(lightmap, camera, count)?;
+        let none = || std::array::from_fn(|_| vec![[0.0; 3]; points.len()]);
+        (points.indirect, points.all) = (none(), none());
         Ok(points)
     }
 

@@ -1,6 +1,7 @@
 //! `bakelite report quality`: error of the light against run time, for every knob of a bake, for path
 //! tracing each texel with the same kernels, and for the photon map alone.
 
+pub mod directional;
 mod measure;
 mod places;
 mod ssim;
