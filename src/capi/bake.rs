@@ -167,10 +167,11 @@ pub struct bk_bake_params {
     pub checkpoint: *const c_char,
     /// 1: compute light that was reflected by other surfaces by direction too (SH L1), for surfaces
     /// with normal maps. Reading starts at BK_LAYER_L0. It comes from the same rays; in memory it
-    /// takes 48 bytes per texel of the light map, during the bake 48 more and 96 per texel of the
-    /// gather map. Live updates do not have it. Default: 0.
+    /// takes 48 bytes per texel of the light map, and during the bake 96 per texel of the gather
+    /// map. Live updates do not have it. Default: 0.
     pub directional_indirect: u32,
-    /// 1: the same for light that comes straight from lights. With both, the layers hold the sum.
+    /// 1: the same for light that comes straight from lights, for 48 bytes more per texel of the light
+    /// map during the bake. With both, the layers hold the sum.
     /// Set only `directional_indirect` where the application draws the lights itself. Default: 0.
     pub directional_direct: u32,
 }

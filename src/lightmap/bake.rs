@@ -43,8 +43,7 @@ const GATHER_BYTES: usize = 3 * size_of::<Vec3>() + size_of::<f32>() + size_of::
 /// Bytes per light map texel while a bake runs: direct and indirect light, state, variation of direct light.
 const TEXEL_BYTES: usize = 2 * size_of::<Vec3>() + size_of::<TexelState>() + size_of::<Variation>();
 
-/// Bytes of light by direction, if it is asked for: per gather texel plain and blurred, and per light map texel direct
-/// light and the result.
+/// Bytes of light by direction per gather texel, if it is asked for: plain and blurred.
 const DIRECTIONAL_BYTES: usize = 2 * size_of::<Directional>();
 
 impl Lightmap {
@@ -267,7 +266,9 @@ impl<'p> Bake<'_, 'p> {
         let l = self.atlas;
         let mut bytes = l.map.len() * TEXEL_BYTES;
         if self.params.directional != 0 {
-            bytes += l.map.len() * DIRECTIONAL_BYTES;
+            // The sum of both kinds of light, and direct light before it is added.
+            let arrays = 1 + usize::from(self.asks(directional::DIRECT));
+            bytes += l.map.len() * arrays * size_of::<Directional>();
         }
         if self.asks(directional::INDIRECT) {
             bytes += l.gather.len() * DIRECTIONAL_BYTES;

@@ -164,6 +164,7 @@ mod tests {
         max_bounces: 0,
         gather_rays: 64,
         radius: 0.0,
+        near_hits: 1.0,
         blur_radius: 2,
         direct_samples: 16,
         seed: 3,
