@@ -1675,6 +1675,20 @@ bk_result bk_lightmap_mesh_back_uvs(const bk_lightmap *lightmap,
 /// are 0.
 #define BK_LEFT_OUT_DIRECTIONAL 65536
 
+/// Quality: a look within a fraction of the default's time. Indirect light is coarse, penumbrae are
+/// noisy.
+#define BK_QUALITY_PREVIEW 0
+
+/// Quality: the defaults.
+#define BK_QUALITY_MEDIUM 1
+
+/// Quality: final light. Finer maps; corners, gaps and contacts are computed instead of looked up.
+#define BK_QUALITY_HIGH 2
+
+/// Quality: paths from every texel, without blur, in 4 passes, to compare others with. No error of
+/// it stays if `passes` is raised or `target_error` set.
+#define BK_QUALITY_REFERENCE 3
+
 /// Parameters of bk_bake.
 ///
 /// Measured curves of these fields: docs/accuracy.md, "Which knobs have a curve".
@@ -1769,6 +1783,17 @@ typedef struct bk_bake_params {
   /// map during the bake. With both, the layers hold the sum.
   /// Set only `directional_indirect` where the application draws the lights itself. Default: 0.
   uint32_t directional_direct;
+  /// Number of passes, 1 to 4096: whole bakes with different random numbers, whose mean is the
+  /// light. n of them take n times as long and have 1/n of the noise's variance, that of photons
+  /// included. From two on, BK_LAYER_ERROR and bk_bake_stats.error estimate the noise that is
+  /// left, and the bake takes 49 bytes more per texel of the light map. A checkpoint grows with
+  /// each pass. Default: 1.
+  uint32_t passes;
+  /// If > 0, there are as many passes as it takes, at least 4 and `passes` and at most 4096, until
+  /// bk_bake_stats.error is no larger; for bakes of all texels only. 0.05 is a good preview, 0.01
+  /// is hard to see. Errors by blur and coarse maps are not noise and stay: see near_hits,
+  /// blur_radius and bk_lightmap_params.gather_divisor, or bk_quality_init. Default: 0.
+  float target_error;
 } bk_bake_params;
 
 /// Numbers about one stage of a bake.
@@ -1819,12 +1844,31 @@ typedef struct bk_bake_stats {
   double seam_rms_after;
   /// Duration of finding and stitching seams, in seconds.
   double seam_seconds;
+  /// Estimated relative error of the irradiance, as far as it is noise: the root of the mean over
+  /// texels and channels of its variance by its square; texels darker than a tenth of the mean
+  /// count as if they were so bright. 0 after a single pass, which gives no estimate.
+  double error;
+  /// Number of passes, each of which the other numbers sum up.
+  uint64_t passes;
 } bk_bake_stats;
 
 /// Sets `struct_size` and fills in the defaults.
 ///
 /// @param params  structure to fill in; NULL is ignored
 BK_API void bk_bake_params_init(bk_bake_params *params);
+
+/// Sets the fields that trade error for time to those of a quality, and leaves all others: density,
+/// seed, budget and so on. Measured error and time: docs/accuracy.md, "Qualities".
+///
+/// bk_lightmap_desc: `gather_divisor`, `radiance_divisor`. bk_bake_params: `photon_count`,
+/// `gather_rays`, `near_hits`, `blur_radius`, `direct_samples`, `passes`.
+///
+/// @param quality  one of the BK_QUALITY values
+/// @param desc  structure that bk_lightmap_desc_init has filled in; may be NULL
+/// @param params  structure that bk_bake_params_init has filled in; may be NULL
+/// @retval BK_ERROR_INVALID_ARGUMENT  there is no such quality, or a `struct_size` is wrong; nothing
+///   is set
+BK_API bk_result bk_quality_set(uint32_t quality, bk_lightmap_desc *desc, bk_bake_params *params);
 
 /// Sets `struct_size` and clears the other fields.
 ///
@@ -1948,6 +1992,10 @@ BK_API size_t bk_plan_describe(const bk_lightmap *lightmap, char *dst, size_t ca
 /// BK_FORMAT_RGBA8.
 #define BK_LAYER_DIRECTION 15
 
+/// Layer: standard error of the irradiance in COMBINED, in W/m2: the noise that is left after a bake
+/// of several passes (bk_bake_params.passes), estimated from as many values. RGB.
+#define BK_LAYER_ERROR 16
+
 /// Format: three floats, 12 bytes per texel.
 #define BK_FORMAT_RGB32F 1
 
@@ -1997,7 +2045,8 @@ BK_API size_t bk_plan_describe(const bk_lightmap *lightmap, char *dst, size_t ca
 /// @retval BK_ERROR_INVALID_ARGUMENT  page or layer does not exist, the format does not suit the
 ///   layer, or `row_stride` is too small
 /// @retval BK_ERROR_INVALID_STATE  the layer holds light and there was no bake, or none that
-///   asked for light by direction for layers from L0 on, or the light map is being baked
+///   asked for light by direction (layers from L0 to DIRECTION) or had several passes (ERROR), or
+///   the light map is being baked
 /// @retval BK_ERROR_OUT_OF_MEMORY  a page does not fit
 BK_API
 bk_result bk_lightmap_read(const bk_lightmap *lightmap,

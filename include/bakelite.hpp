@@ -457,6 +457,11 @@ struct MeshUvs {
     std::vector<std::uint32_t> pages;
 };
 
+/// Sets the fields that trade error for time to those of a quality (one of the BK_QUALITY values).
+inline Result<void> set_quality(std::uint32_t quality, LightmapDesc &desc, BakeParams &params) {
+    return detail::finish(bk_quality_set(quality, &desc, &params));
+}
+
 /// A light map: its layout and, once baked, light.
 class Lightmap : public Handle<bk_lightmap, bk_lightmap_retain, bk_lightmap_release> {
 public:

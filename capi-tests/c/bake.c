@@ -295,10 +295,12 @@ static void bake(const bk_scene *scene, const char *prefix) {
     bk_lightmap *lightmap = NULL;
     bk_lightmap_desc desc;
     bk_lightmap_info info;
-    bk_bake_params params;
+    bk_bake_params params, several;
     bk_bake_stats stats;
     struct progress p = progress_until(-1.0f);
     float *first, *second;
+    double sum, error;
+    size_t i;
 
     bk_lightmap_desc_init(&desc);
     desc.page_size = PAGE;
@@ -342,8 +344,32 @@ static void bake(const bk_scene *scene, const char *prefix) {
     CHECK_OK(bk_bake(lightmap, &params, NULL, NULL, NULL));
     second = read_rgb(lightmap, BK_LAYER_COMBINED);
     CHECK(memcmp(first, second, sizeof(float) * 3 * PAGE * PAGE) == 0);
+    CHECK(stats.passes == 1 && stats.error == 0.0);
+    CHECK_ERROR(bk_lightmap_read(lightmap, 0, BK_LAYER_ERROR, BK_FORMAT_RGB32F, second, 0), BK_ERROR_INVALID_STATE,
+                "one pass");
     free(first);
     free(second);
+
+    /* Of several passes the error is known, and a quality leaves the seed as it is. */
+    several = params;
+    several.seed = 9;
+    CHECK_OK(bk_quality_set(BK_QUALITY_PREVIEW, NULL, &several));
+    CHECK(several.seed == 9 && several.gather_rays < params.gather_rays && several.direct_samples > 0);
+    several.photon_count = 20000;
+    several.passes = 3;
+    CHECK_OK(bk_bake(lightmap, &several, NULL, NULL, &stats));
+    CHECK(stats.passes == 3 && stats.error > 0.0 && stats.error < 1.0 && stats.photons_emitted == 60000);
+    first = read_rgb(lightmap, BK_LAYER_COMBINED);
+    second = read_rgb(lightmap, BK_LAYER_ERROR);
+    for (i = 0, sum = 0.0, error = 0.0; i < 3 * PAGE * PAGE; ++i) {
+        CHECK(second[i] >= 0.0f);
+        sum += first[i];
+        error += second[i];
+    }
+    CHECK(error > 0.0 && error < 0.2 * sum);
+    free(first);
+    free(second);
+    CHECK_OK(bk_bake(lightmap, &params, NULL, NULL, &stats));
 
     CHECK_OK(bk_lightmap_save(lightmap, prefix, BK_FILE_EXR, NULL, NULL));
     CHECK(file_exists(prefix, "page0-combined.exr") && file_exists(prefix, "page0-radiance.exr"));

@@ -129,6 +129,11 @@ static void bake(const Scene &scene) {
     CHECK_FAILS(map.read(0), BK_ERROR_INVALID_STATE, "bake");
     CHECK_FAILS(map.bake({}, [](float, const char *) { return false; }), BK_ERROR_CANCELLED, "");
     int calls = 0;
+    LightmapDesc fine;
+    BakeParams good;
+    VALUE(set_quality(BK_QUALITY_HIGH, fine, good));
+    CHECK(fine.gather_divisor < LightmapDesc().gather_divisor && good.gather_rays > BakeParams().gather_rays);
+    CHECK_FAILS(set_quality(77, fine, good), BK_ERROR_INVALID_ARGUMENT, "quality is 77");
     const BakeStats stats = VALUE(map.bake({}, [&calls](float, const char *) { return ++calls > 0; }));
     CHECK(calls > 0 && stats.seconds > 0);
     const LightmapInfo info = VALUE(map.info());

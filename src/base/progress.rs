@@ -119,6 +119,8 @@ pub struct Progress<'a> {
     cancelled: AtomicBool,
     /// Where the work waits for something more urgent.
     gate: Option<Arc<Gate>>,
+    /// Part of the bar that stages to come share; `None`: all of it.
+    part: Mutex<Option<(f32, f32)>>,
 }
 
 impl<'a> Progress<'a> {
@@ -157,9 +159,16 @@ impl<'a> Progress<'a> {
         if self.is_cancelled() { Err(Error::Cancelled) } else { Ok(()) }
     }
 
+    /// Gives stages to come a part of the bar, as if it were the whole: for work that is done several times.
+    pub(crate) fn set_part(&self, begin: f32, end: f32) {
+        *self.part.lock().unwrap_or_else(PoisonError::into_inner) = Some((begin, end));
+    }
+
     /// Starts a stage of `total` work items that covers `[from, to]` of the bar, and reports its
     /// start (so that a callback sees every stage).
     pub fn stage<'p>(&'p self, name: &'static str, from: f32, to: f32, total: u64) -> Stage<'p, 'a> {
+        let (begin, end) = self.part.lock().unwrap_or_else(PoisonError::into_inner).unwrap_or((0.0, 1.0));
+        let [from, to] = [from, to].map(|at| if (begin, end) == (0.0, 1.0) { at } else { begin + (end - begin) * at });
         let stage = Stage { progress: self, name, from, to, total: total.max(1), done: AtomicU64::new(0) };
         self.start(name, from);
         stage

@@ -13,9 +13,11 @@ use super::args::{OutStruct, SizedStruct, init, read_bool, read_struct, sized_st
 use super::device::{bk_progress_fn, progress, refuse_in_callback};
 use super::error::{bk_result, call, call_or};
 use super::handles::{hold, object};
-use super::lightmap::bk_lightmap;
+use super::lightmap::{bk_lightmap, bk_lightmap_desc};
+use crate::base::error::invalid_argument;
 use crate::lightmap::plan::left_out;
-use crate::lightmap::{BakeParams, BakeStats, CheckpointParams, StageStats, directional};
+use crate::lightmap::quality::Quality;
+use crate::lightmap::{BakeParams, BakeStats, CheckpointParams, LightmapDesc, StageStats, directional};
 use std::ffi::{c_char, c_void};
 
 /// Bit of left_out: indirect light with photons, radiance map and gather map.
@@ -174,6 +176,17 @@ pub struct bk_bake_params {
     /// map during the bake. With both, the layers hold the sum.
     /// Set only `directional_indirect` where the application draws the lights itself. Default: 0.
     pub directional_direct: u32,
+    /// Number of passes, 1 to 4096: whole bakes with different random numbers, whose mean is the
+    /// light. n of them take n times as long and have 1/n of the noise's variance, that of photons
+    /// included. From two on, BK_LAYER_ERROR and bk_bake_stats.error estimate the noise that is
+    /// left, and the bake takes 49 bytes more per texel of the light map. A checkpoint grows with
+    /// each pass. Default: 1.
+    pub passes: u32,
+    /// If > 0, there are as many passes as it takes, at least 4 and `passes` and at most 4096, until
+    /// bk_bake_stats.error is no larger; for bakes of all texels only. 0.05 is a good preview, 0.01
+    /// is hard to see. Errors by blur and coarse maps are not noise and stay: see near_hits,
+    /// blur_radius and bk_lightmap_params.gather_divisor, or bk_quality_init. Default: 0.
+    pub target_error: f32,
 }
 
 sized_struct!(bk_bake_params, defaults: {
@@ -196,6 +209,8 @@ sized_struct!(bk_bake_params, defaults: {
         checkpoint: std::ptr::null(),
         directional_indirect: p.directional & directional::INDIRECT,
         directional_direct: (p.directional & directional::DIRECT != 0) as u32,
+        passes: p.passes,
+        target_error: p.target_error,
     }
 });
 
@@ -206,6 +221,61 @@ sized_struct!(bk_bake_params, defaults: {
 pub unsafe extern "C" fn bk_bake_params_init(params: *mut bk_bake_params) {
     // SAFETY: the caller's structure, or NULL.
     unsafe { init(params) }
+}
+
+/// Quality: a look within a fraction of the default's time. Indirect light is coarse, penumbrae are
+/// noisy.
+pub const BK_QUALITY_PREVIEW: u32 = 0;
+/// Quality: the defaults.
+pub const BK_QUALITY_MEDIUM: u32 = 1;
+/// Quality: final light. Finer maps; corners, gaps and contacts are computed instead of looked up.
+pub const BK_QUALITY_HIGH: u32 = 2;
+/// Quality: paths from every texel, without blur, in 4 passes, to compare others with. No error of
+/// it stays if `passes` is raised or `target_error` set.
+pub const BK_QUALITY_REFERENCE: u32 = 3;
+
+/// Sets the fields that trade error for time to those of a quality, and leaves all others: density,
+/// seed, budget and so on. Measured error and time: docs/accuracy.md, "Qualities".
+///
+/// bk_lightmap_desc: `gather_divisor`, `radiance_divisor`. bk_bake_params: `photon_count`,
+/// `gather_rays`, `near_hits`, `blur_radius`, `direct_samples`, `passes`.
+///
+/// @param quality  one of the BK_QUALITY values
+/// @param desc  structure that bk_lightmap_desc_init has filled in; may be NULL
+/// @param params  structure that bk_bake_params_init has filled in; may be NULL
+/// @retval BK_ERROR_INVALID_ARGUMENT  there is no such quality, or a `struct_size` is wrong; nothing
+///   is set
+#[unsafe(no_mangle)]
+pub unsafe extern "C" fn bk_quality_set(
+    quality: u32,
+    desc: *mut bk_lightmap_desc,
+    params: *mut bk_bake_params,
+) -> bk_result {
+    // SAFETY: the structures are the caller's, or NULL.
+    call(|| unsafe {
+        let Some(&(quality, _)) = Quality::ALL.get(quality as usize) else {
+            return invalid_argument!("quality is {quality}, not one of the BK_QUALITY values");
+        };
+        let (desc_out, params_out) = (OutStruct::optional(desc, "desc")?, OutStruct::optional(params, "params")?);
+        if let Some(out) = desc_out {
+            let (mut d, mut new) = (read_struct(desc, "desc")?, LightmapDesc::default());
+            quality.set_desc(&mut new);
+            (d.gather_divisor, d.radiance_divisor) = (new.gather_divisor, new.radiance_divisor);
+            out.write(d);
+        }
+        if let Some(out) = params_out {
+            let (mut p, mut new) = (read_struct(params, "params")?, BakeParams::default());
+            quality.set_params(&mut new);
+            p.photon_count = new.photon_count;
+            p.gather_rays = new.gather_rays;
+            p.near_hits = new.near_hits;
+            p.blur_radius = new.blur_radius;
+            p.direct_samples = new.direct_samples;
+            p.passes = new.passes;
+            out.write(p);
+        }
+        Ok(())
+    })
 }
 
 /// Numbers about one stage of a bake.
@@ -260,6 +330,12 @@ pub struct bk_bake_stats {
     pub seam_rms_after: f64,
     /// Duration of finding and stitching seams, in seconds.
     pub seam_seconds: f64,
+    /// Estimated relative error of the irradiance, as far as it is noise: the root of the mean over
+    /// texels and channels of its variance by its square; texels darker than a tenth of the mean
+    /// count as if they were so bright. 0 after a single pass, which gives no estimate.
+    pub error: f64,
+    /// Number of passes, each of which the other numbers sum up.
+    pub passes: u64,
 }
 
 sized_struct!(bk_bake_stats, defaults: stats(&Default::default()));
@@ -283,6 +359,8 @@ fn stats(s: &BakeStats) -> bk_bake_stats {
         seam_rms_before: s.seam_rms_before,
         seam_rms_after: s.seam_rms_after,
         seam_seconds: s.seam_seconds,
+        error: s.error,
+        passes: s.passes.into(),
     }
 }
 
@@ -350,6 +428,8 @@ pub unsafe extern "C" fn bk_bake(
             texel_end: p.texel_end,
             stitch: read_bool(p.stitch, "stitch")?,
             directional,
+            passes: p.passes,
+            target_error: p.target_error,
         };
         let checkpoint = match p.checkpoint.is_null() {
             true => None,

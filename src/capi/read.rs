@@ -61,6 +61,9 @@ pub const BK_LAYER_RATIO_Z: u32 = 14;
 /// light whose length is 1 if all comes from one direction and 0.5 under a uniform sky. RGB or
 /// BK_FORMAT_RGBA8.
 pub const BK_LAYER_DIRECTION: u32 = 15;
+/// Layer: standard error of the irradiance in COMBINED, in W/m2: the noise that is left after a bake
+/// of several passes (bk_bake_params.passes), estimated from as many values. RGB.
+pub const BK_LAYER_ERROR: u32 = 16;
 
 /// Format: three floats, 12 bytes per texel.
 pub const BK_FORMAT_RGB32F: u32 = 1;
@@ -88,7 +91,8 @@ pub const BK_FORMAT_RGBA8: u32 = 5;
 /// @retval BK_ERROR_INVALID_ARGUMENT  page or layer does not exist, the format does not suit the
 ///   layer, or `row_stride` is too small
 /// @retval BK_ERROR_INVALID_STATE  the layer holds light and there was no bake, or none that
-///   asked for light by direction for layers from L0 on, or the light map is being baked
+///   asked for light by direction (layers from L0 to DIRECTION) or had several passes (ERROR), or
+///   the light map is being baked
 /// @retval BK_ERROR_OUT_OF_MEMORY  a page does not fit
 #[unsafe(no_mangle)]
 pub unsafe extern "C" fn bk_lightmap_read(
@@ -175,6 +179,7 @@ fn core_layer(layer: u32) -> Result<Layer> {
         BK_LAYER_RATIO_Y => Layer::RatioY,
         BK_LAYER_RATIO_Z => Layer::RatioZ,
         BK_LAYER_DIRECTION => Layer::Direction,
+        BK_LAYER_ERROR => Layer::Error,
         other => return invalid_argument!("layer is {other}, not one of the BK_LAYER values"),
     })
 }

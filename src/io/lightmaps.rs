@@ -24,6 +24,9 @@ const LAYERS: [(Layer, &str); 4] = [
 const DIRECTIONAL: [(Layer, &str); 4] =
     [(Layer::L0, "l0"), (Layer::RatioX, "ratio-x"), (Layer::RatioY, "ratio-y"), (Layer::RatioZ, "ratio-z")];
 
+/// Error of light maps of several passes; PNG does not show it.
+const ERROR: [(Layer, &str); 1] = [(Layer::Error, "error")];
+
 /// One exposure for all pages (see [`auto_exposure`](super::image::auto_exposure)), from the texels that are lit.
 pub fn exposure(lightmap: &Lightmap) -> Result<f32> {
     let mut account = Account::new(lightmap.scene().device().memory())?;
@@ -69,7 +72,7 @@ pub fn write_png_pages(
         let exposure = exposure.map_or_else(|| self::exposure(lightmap), Ok)?;
         each_page(
             lightmap,
-            |layer| layer != Layer::L0,
+            |layer| !matches!(layer, Layer::L0 | Layer::Error),
             progress,
             |page, layer, name, advance| {
                 let path = PathBuf::from(format!("{prefix}page{page}-{name}.png"));
@@ -126,7 +129,8 @@ fn each_page(
     write: impl Fn(u32, Layer, &str, Advance) -> Result<PathBuf> + Sync,
 ) -> Result<Vec<PathBuf>> {
     let directional = if lightmap.has_directional() { &DIRECTIONAL[..] } else { &[] };
-    let layers = || LAYERS.iter().chain(directional).filter(|(layer, _)| is_wanted(*layer));
+    let error = if lightmap.has_error() { &ERROR[..] } else { &[] };
+    let layers = || LAYERS.iter().chain(directional).chain(error).filter(|(layer, _)| is_wanted(*layer));
     let jobs: Vec<(u32, Layer, &str)> = (0..lightmap.info().page_count)
         .flat_map(|page| layers().map(move |&(layer, name)| (page, layer, name)))
         .collect();

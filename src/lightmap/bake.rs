@@ -11,6 +11,7 @@ use super::indirect::gather::{Gathered, Tile, TileTexel};
 use super::indirect::radiance_map::Radiance;
 use super::indirect::sample_set::SampleSet;
 use super::indirect::upsample::{Upsampling, parts};
+use super::passes::{self, Passes};
 use super::plan::{Plan, left_out};
 use super::saved::checkpoint::Checkpoint;
 use super::seams::Stitch;
@@ -21,7 +22,7 @@ use super::tiles::{TILE, in_order, texels_per_tile};
 use super::{BakeParams, BakeStats, CheckpointParams, Light, Lightmap, Origin, StageStats, TexelState, directional};
 use crate::base::directional::Directional;
 use crate::base::error::{Error, Result, invalid_argument};
-use crate::base::memory::{try_filled, try_vec, try_with_capacity};
+use crate::base::memory::{try_filled, try_to_vec, try_vec, try_with_capacity};
 use crate::base::progress::{Progress, Stage};
 use crate::base::sampling::{combine, purpose_seed};
 use crate::base::scratch::Scratch;
@@ -77,6 +78,12 @@ impl Lightmap {
             );
         }
         let end = if params.texel_end == 0 { total } else { params.texel_end };
+        if params.target_error > 0.0 && end - params.texel_begin < total {
+            return invalid_argument!(
+                "target_error asks for all texels, and these are {} to {end}",
+                params.texel_begin
+            );
+        }
         let origin = Origin::new(params, &self.atlas.scene.lights());
         let direct = self.atlas.scene.device().install(|| DirectLight::try_new(&self.atlas.scene))?;
         let two_sided = !self.atlas.radiance.layout.back_of.is_empty();
@@ -94,8 +101,7 @@ impl Lightmap {
                 None => None,
             };
             let checkpoint = checkpoint.as_ref();
-            let (mut light, mut stats) =
-                Bake { atlas, params, plan: &plan, direct, range: range.clone(), progress, checkpoint }.run()?;
+            let (mut light, mut stats) = self.passes(params, &plan, direct, &range, checkpoint, progress)?;
             stats.back_charts = light.backs.iter().filter(|&&b| b).count() as u64;
             plan.note_back_charts(stats.back_charts);
             plan.note_bright(&light.radiance.bright);
@@ -126,6 +132,45 @@ impl Lightmap {
         Ok(stats)
     }
 
+    /// Bakes in as many passes as the parameters ask for.
+    fn passes(
+        &self,
+        params: &BakeParams,
+        plan: &Plan,
+        direct: &DirectLight,
+        range: &Range<usize>,
+        checkpoint: Option<&Checkpoint>,
+        progress: &Progress,
+    ) -> Result<(Light, BakeStats)> {
+        let run = |pass: u32, backs: Option<&[bool]>| {
+            let params = &passes::params_of(params, pass);
+            if let Some(c) = checkpoint {
+                c.begin_pass(pass);
+            }
+            let (atlas, range) = (&self.atlas, range.clone());
+            Bake { atlas, params, plan, direct, range, progress, checkpoint, known_backs: backs }.run()
+        };
+        if params.passes == 1 && params.target_error == 0.0 {
+            return run(0, None);
+        }
+        let device = self.atlas.scene.device();
+        let mut needed = params.passes.max(2);
+        progress.set_part(0.0, 1.0 / needed as f32);
+        let (light, stats) = run(0, None)?;
+        let mut all = Passes::begin(device, light, stats, range)?;
+        loop {
+            needed = device.install(|| all.needed(params, range));
+            if all.count >= needed {
+                progress.set_part(0.0, 1.0);
+                return device.install(|| all.finish(range));
+            }
+            progress.set_part(all.count as f32 / needed as f32, (all.count + 1) as f32 / needed as f32);
+            // All passes show the same sides.
+            let (light, stats) = run(all.count, Some(&all.light.backs))?;
+            device.install(|| all.add(&light, &stats, range));
+        }
+    }
+
     /// Stores the new light of a range of samples. Seams are stitched anew: whatever the shards, the last one leaves
     /// the bits of a whole bake.
     pub(super) fn store(&mut self, new: Light, range: Range<usize>, stitch: Option<Stitch>) {
@@ -142,6 +187,12 @@ impl Lightmap {
                 } else {
                     // Bakes that differ in what they were asked for: the light by direction of the last one stays.
                     (old.directional, old._memory) = (new.directional, new._memory);
+                }
+                if old.error.len() == new.error.len() {
+                    let of_range = range.start.min(new.error.len())..range.end.min(new.error.len());
+                    old.error[of_range.clone()].copy_from_slice(&new.error[of_range]);
+                } else {
+                    old.error = new.error;
                 }
                 old.state[range.clone()].copy_from_slice(&new.state[range]);
                 old.radiance = new.radiance;
@@ -169,6 +220,8 @@ struct Bake<'a, 'p> {
     range: Range<usize>,
     progress: &'a Progress<'p>,
     checkpoint: Option<&'a Checkpoint<'a>>,
+    /// The charts that show their backs, if an earlier pass has decided it.
+    known_backs: Option<&'a [bool]>,
 }
 
 /// The gather map after blur and filling.
@@ -197,6 +250,7 @@ impl<'p> Bake<'_, 'p> {
             direct: try_vec(n, "direct light")?,
             indirect: try_vec(n, "indirect light")?,
             directional: try_vec(if self.params.directional == 0 { 0 } else { n }, "light by direction")?,
+            error: Vec::new(),
             state: try_vec(n, "validity")?,
             radiance,
             backs,
@@ -231,6 +285,9 @@ impl<'p> Bake<'_, 'p> {
     /// Decides which charts show their backs, or reads it from the checkpoint.
     fn backs(&self, radiance: &[Vec3]) -> Result<Vec<bool>> {
         let charts = self.atlas.charts.charts.len();
+        if let Some(backs) = self.known_backs {
+            return try_to_vec(backs, "the sides of charts");
+        }
         if let Some(backs) = self.checkpoint.map(|c| c.backs(charts)).transpose()?.flatten() {
             return Ok(backs);
         }

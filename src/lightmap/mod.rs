@@ -9,7 +9,9 @@ pub(crate) mod bake;
 mod create;
 pub mod indirect;
 pub mod normal_maps;
+pub(crate) mod passes;
 pub mod plan;
+pub mod quality;
 mod readback;
 pub(crate) mod saved;
 mod seams;
@@ -145,6 +147,13 @@ pub struct BakeParams {
     /// Bits of [`directional`]: which light is computed by direction too (SH L1, for normal maps), as [`Layer::L0`] and
     /// the layers after it. 0: none, which takes no time and no memory.
     pub directional: u32,
+    /// Number of passes, 1 to 4096: bakes with different random numbers whose mean is the light. n of them take n times
+    /// as long and have 1/n of the noise's variance. From two on, [`Layer::Error`] and [`BakeStats::error`] tell the
+    /// noise that is left.
+    pub passes: u32,
+    /// If not 0, there are as many passes as it takes (at least four and [`passes`](Self::passes), at most 4096) until
+    /// [`BakeStats::error`] is no larger: finite, ≥ 0. For bakes of all texels only.
+    pub target_error: f32,
 }
 
 /// Bits of [`BakeParams::directional`].
@@ -171,6 +180,8 @@ impl Default for BakeParams {
             texel_end: 0,
             stitch: true,
             directional: 0,
+            passes: 1,
+            target_error: 0.0,
         }
     }
 }
@@ -222,6 +233,12 @@ pub struct BakeStats {
     pub seam_rms_after: f64,
     /// Duration of finding and stitching seams, in seconds.
     pub seam_seconds: f64,
+    /// Number of passes.
+    pub passes: u32,
+    /// Estimated relative error of the mean of several passes, as far as it is noise: the root of the mean over texels
+    /// and channels of variance by squared irradiance; texels darker than a tenth of the mean count as if they were so
+    /// bright. 0 after a single pass, which does not tell.
+    pub error: f64,
 }
 
 /// Layers of a light map that can be read.
@@ -265,6 +282,9 @@ pub enum Layer {
     /// Dominant direction: L1 / L0 of the sum of the channels, a vector in the scene whose length is 1 if all light comes
     /// from one direction (x, y, z).
     Direction = 15,
+    /// Standard error of the combined irradiance of a bake of several [passes](BakeParams::passes), before the stitching
+    /// of seams (RGB, W/m²). It is an estimate from as many values as there were passes.
+    Error = 16,
 }
 
 impl Layer {
@@ -296,7 +316,7 @@ pub enum LayerData {
 }
 
 /// State of a texel after bakes.
-#[derive(Clone, Copy, Debug, Default, PartialEq, Eq)]
+#[derive(Clone, Copy, Debug, Default, PartialEq, Eq, PartialOrd, Ord)]
 enum TexelState {
     /// The texel is not part of any bake yet.
     #[default]
@@ -327,6 +347,8 @@ struct Light {
     indirect: Vec<Vec3>,
     /// The light by direction that the bake was asked for; empty if none was.
     directional: Vec<Directional>,
+    /// Standard error of the sum of direct and indirect light; empty after a single pass.
+    error: Vec<Vec3>,
     state: Vec<TexelState>,
     /// Reflected radiance, by sample of the radiance map. Empty if the bake left it out.
     radiance: Radiance,
@@ -399,6 +421,12 @@ impl BakeParams {
         if self.directional & !(directional::INDIRECT | directional::DIRECT) != 0 {
             return invalid_argument!("directional is {:#x}, which has unknown bits", self.directional);
         }
+        if !(1..=passes::MAX_PASSES).contains(&self.passes) {
+            return invalid_argument!("passes is {}, outside 1 to {}", self.passes, passes::MAX_PASSES);
+        }
+        if !(self.target_error >= 0.0 && self.target_error.is_finite()) {
+            return invalid_argument!("target_error is {}, not a finite number ≥ 0", self.target_error);
+        }
         Ok(())
     }
 }
@@ -422,6 +450,11 @@ impl Lightmap {
     /// Whether a bake was asked for light by direction.
     pub fn has_directional(&self) -> bool {
         self.light.as_ref().is_some_and(|l| !l.directional.is_empty())
+    }
+
+    /// Whether a bake had several passes, which tell the error of the light.
+    pub fn has_error(&self) -> bool {
+        self.light.as_ref().is_some_and(|l| !l.error.is_empty())
     }
 
     /// Describes the plan of the last bake (before the first: of a bake with default parameters): what runs, and what

@@ -173,6 +173,8 @@ mod tests {
         texel_end: 0,
         stitch: true,
         directional: ALL,
+        passes: 1,
+        target_error: 0.0,
     };
 
     #[test]

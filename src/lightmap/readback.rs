@@ -107,6 +107,15 @@ impl Lightmap {
                 let light = self.light()?;
                 self.page_of_light(page, |s| self.radiance_at(light, s))
             }
+            Layer::Error => {
+                let light = self.light()?;
+                if light.error.is_empty() {
+                    return Err(Error::InvalidState(
+                        "the light map was baked in one pass, which tells no error".into(),
+                    ));
+                }
+                self.page_of_light(page, |s| light.error[s.index()].to_array())
+            }
             Layer::L0
             | Layer::L1X
             | Layer::L1Y

@@ -621,7 +621,18 @@ fn bake_params(w: &W, s: &mut Source) -> bk_bake_params {
     params.stitch = s.below(2) as u32;
     params.directional_indirect = s.below(2) as u32;
     params.directional_direct = s.below(2) as u32;
+    params.passes = 1 + s.below(3) as u32;
+    params.target_error = if s.one_in(4) { 10.0 } else { 0.0 };
     params.seed = s.next();
+    if s.one_in(8) {
+        let quality = if s.one_in(4) { s.integer() } else { s.below(2) as u32 };
+        let result = ask!(bk_quality_set(quality, null_mut(), &mut params));
+        if (result == BK_OK) != (quality < 4) {
+            broken(&format!("bk_quality_set of {quality} gave {result}"));
+        }
+        params.photon_count = params.photon_count.min(2000);
+        params.gather_rays = params.gather_rays.min(16);
+    }
     params
 }
 
@@ -633,6 +644,11 @@ fn bake(w: &W, s: &mut Source) {
         params.texel_end = s.below(200) as u64;
     }
     s.mutate(&mut params);
+    // Thousands of passes are allowed, and take as long.
+    params.passes = if params.passes <= 4096 { params.passes.min(5) } else { params.passes };
+    if params.target_error > 0.0 && params.target_error.is_finite() {
+        params.target_error = params.target_error.max(10.0);
+    }
     // The one pointer among them.
     let checkpoint = path(w, s, "checkpoint");
     params.checkpoint = if s.one_in(4) { checkpoint.as_ptr() } else { null() };
@@ -660,7 +676,7 @@ fn read(w: &W, s: &mut Source) {
     let Some(lightmap) = w.pick(Kind::Lightmap, s) else { return };
     let Some(info) = info(&lightmap) else { return };
     let page = if s.one_in(10) { s.index() } else { s.below(info.page_count as usize) as u32 };
-    let layer = if s.one_in(20) { s.integer() } else { s.below(16) as u32 };
+    let layer = if s.one_in(20) { s.integer() } else { s.below(17) as u32 };
     let format = match layer {
         _ if s.one_in(10) => s.integer(),
         0..=3 => 1 + s.below(2) as u32,
@@ -682,7 +698,11 @@ fn read(w: &W, s: &mut Source) {
     if result == BK_OK && stride == 0 && format == BK_FORMAT_RGB32F && layer <= BK_LAYER_RADIANCE {
         check_light("bk_lightmap_read", &floats(&dst[1..]));
     }
-    if result == BK_OK && stride == 0 && format == BK_FORMAT_RGB32F && layer >= BK_LAYER_RATIO_X {
+    let is_ratio = (BK_LAYER_RATIO_X..=BK_LAYER_DIRECTION).contains(&layer);
+    if result == BK_OK && stride == 0 && format == BK_FORMAT_RGB32F && layer == BK_LAYER_ERROR {
+        check_light("bk_lightmap_read", &floats(&dst[1..]));
+    }
+    if result == BK_OK && stride == 0 && format == BK_FORMAT_RGB32F && is_ratio {
         let values = floats(&dst[1..]);
         if let Some(v) = values.iter().find(|v| !(v.abs() <= 1.001)) {
             broken(&format!("a ratio of light by direction is {v}"));

@@ -5,7 +5,8 @@
 //! complete), `BACK` (the sides that are shown), `OWNL` (fallback gathers), `GAT2` (blocks of the gather map), `DRC2`
 //! (blocks of direct light; `GATH` and `DRCT` were smaller ones), and `OWND`, `GATD` and `DRCD` for light by direction.
 //! All of it is independent of the number of threads and the order, so missing work is done again and gives the same
-//! bits. Photons, upsampling, blur and seams are not kept: they take a small part of a bake.
+//! bits. Photons, upsampling, blur and seams are not kept: they take a small part of a bake. The numbers of blocks hold
+//! the pass that they belong to.
 //!
 //! Records are only ever appended. If the process is killed, at most the last of them is incomplete; after a power
 //! failure, data that was not flushed may be incomplete or zero. Either is cut off.
@@ -28,6 +29,7 @@ use std::collections::HashMap;
 use std::fs::{File, OpenOptions, TryLockError};
 use std::io::{BufReader, Read, Seek, SeekFrom, Write};
 use std::path::{Path, PathBuf};
+use std::sync::atomic::{AtomicU32, Ordering::Relaxed};
 use std::sync::{Mutex, MutexGuard};
 use std::time::{Duration, Instant};
 
@@ -44,6 +46,9 @@ const DIRECT_DIRECTIONAL: Tag = *b"DRCD";
 
 /// Number of texels of the radiance map in a record.
 const RUN: usize = 1 << 14;
+
+/// Place of the number of a pass in the numbers of records: there are fewer than 2^40 blocks of texels.
+const PASS_SHIFT: u32 = 40;
 
 /// File of a checkpoint, and how often a bake writes to it.
 #[derive(Clone, Debug, PartialEq)]
@@ -80,6 +85,8 @@ pub(crate) struct Checkpoint<'a> {
     pending: Mutex<Pending>,
     /// Finished work of earlier runs, by kind and number.
     done: Mutex<HashMap<(Tag, u64), Vec<u8>>>,
+    /// The pass in progress, which is part of the numbers.
+    pass: AtomicU32,
 }
 
 /// Records that are still to be written.
@@ -184,6 +191,7 @@ impl<'a> Checkpoint<'a> {
             file: Mutex::new(output),
             pending: Mutex::new(Pending { bytes: Vec::new(), since: Instant::now() }),
             done: Mutex::new(done),
+            pass: AtomicU32::new(0),
         })
     }
 
@@ -364,12 +372,22 @@ impl<'a> Checkpoint<'a> {
         self.keep(DIRECT, block as u64, &[bytemuck::cast_slice(direct), &states]);
     }
 
+    /// Tells that work of another pass follows.
+    pub fn begin_pass(&self, pass: u32) {
+        self.pass.store(pass, Relaxed);
+    }
+
+    /// Returns the number of a record of the pass in progress.
+    fn in_pass(&self, number: u64) -> u64 {
+        number | u64::from(self.pass.load(Relaxed)) << PASS_SHIFT
+    }
+
     fn take(&self, tag: Tag, number: u64) -> Option<Vec<u8>> {
-        lock(&self.done).remove(&(tag, number))
+        lock(&self.done).remove(&(tag, self.in_pass(number)))
     }
 
     fn keep(&self, tag: Tag, number: u64, parts: &[&[u8]]) {
-        let number = number.to_ne_bytes();
+        let number = self.in_pass(number).to_ne_bytes();
         let all: Vec<&[u8]> = [&number[..]].into_iter().chain(parts.iter().copied()).collect();
         let bytes = {
             let mut pending = lock(&self.pending);

@@ -52,6 +52,8 @@ pub(super) struct Fingerprint {
     direct_samples: u32,
     stitch: u16,
     directional: u16,
+    passes: u32,
+    target_error: f32,
 }
 
 /// Returns the library's version, as in files.
@@ -88,6 +90,8 @@ impl Fingerprint {
             texel_end: _,
             stitch,
             directional,
+            passes,
+            target_error,
         } = origin.params;
         Fingerprint {
             version: version(),
@@ -109,6 +113,8 @@ impl Fingerprint {
             stitch: stitch.into(),
             // All bits of it are named in `lightmap::directional`, and checked.
             directional: directional as u16,
+            passes,
+            target_error,
         }
     }
 
@@ -128,6 +134,8 @@ impl Fingerprint {
             texel_end: 0,
             stitch: self.stitch != 0,
             directional: self.directional.into(),
+            passes: self.passes,
+            target_error: self.target_error,
         }
     }
 
@@ -165,6 +173,8 @@ impl Fingerprint {
         compare(&mut all, "seed", self.seed, needed.seed);
         compare(&mut all, "stitch", self.stitch, needed.stitch);
         compare(&mut all, "directional", self.directional, needed.directional);
+        compare(&mut all, "passes", self.passes, needed.passes);
+        compare(&mut all, "target_error", self.target_error, needed.target_error);
         compare(&mut all, "texel_begin", self.texel_begin, needed.texel_begin);
         compare(&mut all, "texel_end", self.texel_end, needed.texel_end);
         (!all.is_empty()).then(|| all.join(", "))

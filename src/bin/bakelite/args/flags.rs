@@ -3,6 +3,7 @@
 use super::values::{self, GivenLight, of};
 use bakelite::Isa;
 use bakelite::bvh::{BuildOptions, BuildQuality};
+use bakelite::lightmap::quality::Quality;
 use bakelite::lightmap::{BakeParams, LightmapDesc};
 use bakelite::scene::Camera;
 use clap::builder::PossibleValuesParser;
@@ -56,6 +57,23 @@ pub enum Report {
     Stability(Box<Flags>),
 }
 
+impl Verb {
+    /// The flags that all commands have.
+    pub fn flags(&mut self) -> &mut Flags {
+        match self {
+            Verb::Bake(flags) => flags,
+            Verb::Report(report) => match report {
+                Report::Cancel(flags) | Report::Memory(flags) | Report::Pipeline(flags) | Report::Stability(flags) => {
+                    flags
+                }
+                Report::Directional(of_report) => &mut of_report.flags,
+                Report::Live(of_report) => &mut of_report.flags,
+                Report::Quality(of_report) => &mut of_report.flags,
+            },
+        }
+    }
+}
+
 #[derive(Args)]
 pub struct LiveFlags {
     #[command(flatten)]
@@ -100,12 +118,13 @@ pub struct LiveFlags {
 }
 
 /// What a report of quality varies.
-pub const KNOBS: [&str; 9] = [
+pub const KNOBS: [&str; 10] = [
     "gather-rays",
     "photons",
     "radius",
     "blur",
     "direct-samples",
+    "passes",
     "gather-divisor",
     "radiance-divisor",
     "path-tracing",
@@ -217,6 +236,10 @@ pub struct LightFlags {
 #[derive(Args)]
 #[command(next_help_heading = "Light map")]
 pub struct LightmapFlags {
+    /// Sets divisors, photons, rays, hits, blur, samples and passes that are not given themselves
+    #[arg(long, value_name = "NAME", default_value = "medium",
+          value_parser = PossibleValuesParser::new(Quality::ALL.map(|(_, name)| name)))]
+    pub quality: String,
     /// Density; 0: about one page [default: 0; the atrium: 30]
     #[arg(long, value_name = "F", value_parser = of(|d: &mut LightmapDesc, v| d.texels_per_unit = v))]
     pub texels_per_unit: Option<f32>,
@@ -286,6 +309,14 @@ pub struct BakeFlags {
     #[arg(long, value_name = "LIGHT", default_value = "none",
           value_parser = ["none", "indirect", "direct", "all"])]
     pub directional: String,
+    /// Bakes with different random numbers, whose mean is the light; from two on their error is told
+    #[arg(long, value_name = "N", default_value_t = BakeParams::default().passes,
+          value_parser = of(|p: &mut BakeParams, v| p.passes = v))]
+    pub passes: u32,
+    /// As many passes as it takes until the estimated relative error, as far as it is noise, is F or less; 0: `--passes`
+    #[arg(long, value_name = "F", default_value_t = BakeParams::default().target_error,
+          value_parser = of(|p: &mut BakeParams, v| p.target_error = v))]
+    pub target_error: f32,
 }
 
 #[derive(Args)]

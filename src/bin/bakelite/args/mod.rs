@@ -13,10 +13,12 @@ mod values;
 use bakelite::Isa;
 use bakelite::bvh::{BuildOptions, BuildQuality};
 use bakelite::io::LoadOptions;
+use bakelite::lightmap::quality::Quality;
 use bakelite::lightmap::{BakeParams, Layer, LightmapDesc, directional};
 use bakelite::live::LiveParams;
 use bakelite::scene::{Camera, is_builtin};
 use clap::error::ErrorKind;
+use clap::parser::ValueSource;
 use clap::{CommandFactory, FromArgMatches};
 use flags::{CommandLine, Flags, Report, Verb};
 use glam::Vec3;
@@ -53,7 +55,7 @@ const fn layer(name: &'static str, layer: Layer, unit: &'static str, is_light: b
 }
 
 /// The layers of which images make sense, those that are written unless others are asked for first.
-pub const LAYERS: [NamedLayer; 15] = [
+pub const LAYERS: [NamedLayer; 16] = [
     layer("combined", Layer::Combined, "W/m2", true),
     layer("indirect", Layer::Indirect, "W/m2", true),
     layer("direct", Layer::Direct, "W/m2", true),
@@ -69,6 +71,7 @@ pub const LAYERS: [NamedLayer; 15] = [
     layer("ratio-y", Layer::RatioY, "", false),
     layer("ratio-z", Layer::RatioZ, "", false),
     layer("direction", Layer::Direction, "", false),
+    layer("error", Layer::Error, "W/m2", false),
 ];
 
 /// The layers that are written unless others are asked for, and those that come with light by direction.
@@ -212,8 +215,37 @@ pub fn parse(args: impl IntoIterator<Item = OsString>) -> Result<Command, clap::
     }
     args.insert(0, "bakelite".into());
     let mut command = command();
-    let line = CommandLine::from_arg_matches(&command.try_get_matches_from_mut(args)?)?;
+    let matches = command.try_get_matches_from_mut(args)?;
+    let mut line = CommandLine::from_arg_matches(&matches)?;
+    let mut of_command = &matches;
+    while let Some((_, deeper)) = of_command.subcommand() {
+        of_command = deeper;
+    }
+    let is_given = |id: &str| of_command.value_source(id) == Some(ValueSource::CommandLine);
+    set_quality(line.verb.flags(), &is_given);
     command_of(line).map_err(|e| command.error(ErrorKind::ValueValidation, e))
+}
+
+/// Sets the flags of the quality that was asked for, but for those that are given themselves.
+fn set_quality(flags: &mut Flags, is_given: &dyn Fn(&str) -> bool) {
+    let Some((quality, _)) = Quality::ALL.into_iter().find(|(_, name)| *name == flags.lightmap.quality) else { return };
+    let (mut desc, mut params) = (LightmapDesc::default(), BakeParams::default());
+    quality.set_desc(&mut desc);
+    quality.set_params(&mut params);
+    fn set<T>(flag: &mut T, value: T, is_given: bool) {
+        if !is_given {
+            *flag = value;
+        }
+    }
+    let (map, bake) = (&mut flags.lightmap, &mut flags.bake);
+    set(&mut map.gather_divisor, desc.gather_divisor, is_given("gather_divisor"));
+    set(&mut map.radiance_divisor, desc.radiance_divisor, is_given("radiance_divisor"));
+    set(&mut bake.photons, params.photon_count, is_given("photons"));
+    set(&mut bake.gather_rays, params.gather_rays, is_given("gather_rays"));
+    set(&mut bake.near_hits, params.near_hits, is_given("near_hits"));
+    set(&mut bake.blur, params.blur_radius, is_given("blur"));
+    set(&mut bake.direct_samples, params.direct_samples, is_given("direct_samples"));
+    set(&mut bake.passes, params.passes, is_given("passes"));
 }
 
 /// The whole command line. Negative numbers are values everywhere, so that errors say which flag has them.
@@ -336,6 +368,8 @@ fn bake_args(f: Flags) -> Result<BakeArgs, String> {
         seed: f.bake.seed,
         stitch: !f.bake.no_stitch,
         directional: bits,
+        passes: f.bake.passes,
+        target_error: f.bake.target_error,
         ..Default::default()
     };
     let build = BuildOptions {
@@ -356,14 +390,21 @@ fn bake_args(f: Flags) -> Result<BakeArgs, String> {
     if asked == DEFAULT_LAYERS && bits != 0 && has_floats {
         asked.extend(DIRECTIONAL_LAYERS);
     }
+    let has_error = params.passes > 1 || params.target_error > 0.0;
+    if asked.starts_with(&DEFAULT_LAYERS) && has_error && has_floats {
+        asked.push("error");
+    }
     let layers: Vec<NamedLayer> = LAYERS.into_iter().filter(|l| asked.contains(&l.name)).collect();
-    let by_direction = |l: &&NamedLayer| l.layer as u32 >= Layer::L0 as u32;
+    let by_direction = |l: &&NamedLayer| (Layer::L0 as u32..=Layer::Direction as u32).contains(&(l.layer as u32));
     if let Some(layer) = layers.iter().find(by_direction)
         && bits == 0
     {
         return Err(format!("--layers has {}, for which there is --directional", layer.name));
     }
-    if let Some(layer) = layers.iter().find(|l| !l.is_light)
+    if layers.iter().any(|l| l.layer == Layer::Error) && !has_error {
+        return Err("--layers has error, which takes --passes of 2 or more, or --target-error".into());
+    }
+    if let Some(layer) = layers.iter().find(|l| !l.is_light && (l.layer != Layer::Error || !has_error))
         && formats.png
         && !has_floats
     {

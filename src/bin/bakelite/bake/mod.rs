@@ -132,6 +132,10 @@ impl Job<'_> {
         );
         println!("{}", stages::table(&self.stages, seconds));
         println!("{}", lightmap.plan_text());
+        if bake.passes > 1 {
+            let (passes, error) = (bake.passes, pictures::percent(bake.error));
+            println!("The light is the mean of {passes} passes; estimated noise that is left: {error} (RMS).\n");
+        }
         if bake.seam_points > 0 {
             println!(
                 "Both sides of stitched edges differ by {} of the light there (RMS), before by {}.\n",

@@ -44,6 +44,8 @@ pub fn json(run: &Run) -> Value {
             "peak_bytes": run.bake.peak_bytes,
             "left_out": run.bake.left_out,
             "back_charts": run.bake.back_charts,
+            "passes": run.bake.passes,
+            "error": run.bake.error,
             "seams": {
                 "points": run.bake.seam_points,
                 "rms_before": run.bake.seam_rms_before,
@@ -83,6 +85,8 @@ fn parameters(args: &BakeArgs) -> Value {
         "direct_samples": p.direct_samples,
         "seed": p.seed,
         "stitch": p.stitch,
+        "passes": p.passes,
+        "target_error": p.target_error,
         "threads": args.threads,
         "isa": args.isa.map_or("auto", |i| i.name()),
         "bins": args.build.bins,

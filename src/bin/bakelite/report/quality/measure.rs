@@ -263,6 +263,16 @@ fn bilinear(texels: &[[f32; 3]], size: usize, at: [f32; 2]) -> [f64; 3] {
     std::array::from_fn(|k| (a[k] * (1.0 - fx) + b[k] * fx) * (1.0 - fy) + (c[k] * (1.0 - fx) + d[k] * fx) * fy)
 }
 
+/// Mean over points and channels of the square of an error by the square of the reference, weighted as in [`Errors::mse`].
+pub fn relative_square(error: &Values, [a, b]: &[Values; 2]) -> f64 {
+    let reference = |i: usize, c: usize| 0.5 * (a[i][c] + b[i][c]);
+    let values = || (0..error.len()).flat_map(|i| (0..3).map(move |c| (i, c)));
+    let count = 3.0 * error.len() as f64;
+    let mean = values().map(|(i, c)| reference(i, c)).sum::<f64>() / count;
+    let least = (DARK * mean).powi(2);
+    values().map(|(i, c)| error[i][c].powi(2) / (reference(i, c).powi(2) + least)).sum::<f64>() / count
+}
+
 /// Errors of several runs against the two halves of a reference. The squared error of x is estimated by
 /// (x − a)(x − b) from the halves a and b: as their noise is independent, the noise of the reference is not
 /// part of it.

@@ -19,7 +19,7 @@ use bakelite::photon::{PhotonMap, PhotonParams};
 use bakelite::trace::PACKET_SIZE;
 use bakelite::trace::offset::SurfacePoint;
 use bakelite::{Error, Progress, Result};
-use measure::{Errors, Points, Values, errors};
+use measure::{Errors, Points, Values, errors, relative_square};
 use std::fmt::{Display, Write};
 use std::time::Instant;
 use texel_paths::TexelPaths;
@@ -33,6 +33,7 @@ const BLURS: [u32; 4] = [0, 1, 2, 4];
 const GATHER_DIVISORS: [u32; 4] = [1, 2, 4, 8];
 const RADIANCE_DIVISORS: [u32; 4] = [2, 4, 8, 16];
 const DIRECT_SAMPLES: [u32; 3] = [4, 16, 64];
+const PASSES: [u32; 4] = [2, 4, 8, 16];
 /// Rounds of [`PACKET_SIZE`] paths per texel.
 const PATH_ROUNDS: [u32; 5] = [1, 2, 4, 8, 16];
 /// Pixels across the view that is compared.
@@ -56,6 +57,8 @@ struct Row {
     direct: Option<Errors>,
     /// Structural similarity of a view with the path traced one, where the view can be rendered.
     ssim: Option<f64>,
+    /// Relative MSE that the bake itself estimates at the points, if it had several passes.
+    estimated: Option<f64>,
 }
 
 /// Runs the report.
@@ -135,6 +138,7 @@ impl Measure<'_> {
         if DirectLight::new(lightmap.scene()).area_light_count() > 0 {
             self.sweep(job, lightmap, "direct-samples", DIRECT_SAMPLES, |_, p, n| p.direct_samples = n)?;
         }
+        self.sweep(job, lightmap, "passes", PASSES, |_, p, n| p.passes = n)?;
         self.sweep(job, lightmap, "gather-divisor", GATHER_DIVISORS, |d, _, n| d.gather_divisor = n)?;
         self.sweep(job, lightmap, "radiance-divisor", RADIANCE_DIVISORS, |d, _, n| d.radiance_divisor = n)
     }
@@ -182,7 +186,7 @@ impl Measure<'_> {
     ) -> Result<()> {
         job.bars.say(&format!("{series} {value}"));
         let (mut indirect, mut direct, mut all) = (Vec::new(), Vec::new(), Vec::new());
-        let (mut seconds, mut ssim) = (Vec::new(), Some(0.0));
+        let (mut seconds, mut ssim, mut estimated) = (Vec::new(), Some(0.0), None);
         for seed in 0..self.args.seeds {
             let params = BakeParams { seed: params.seed + seed, ..*params };
             seconds.push(lightmap.bake(&params, &Progress::none())?.seconds);
@@ -191,6 +195,10 @@ impl Measure<'_> {
             all.push(self.points.of_bake(lightmap, Layer::Combined)?);
             let one = self.view.map(|view| view.of_bake(lightmap)).transpose()?.flatten();
             ssim = ssim.zip(one).map(|(sum, one)| sum + one / self.args.seeds as f64);
+            if lightmap.has_error() {
+                let of_seed = relative_square(&self.points.of_bake(lightmap, Layer::Error)?, &self.points.all);
+                *estimated.get_or_insert(0.0) += of_seed / self.args.seeds as f64;
+            }
         }
         self.rows.push(Row {
             series: series.to_owned(),
@@ -200,6 +208,7 @@ impl Measure<'_> {
             all: Some(errors(&all, &self.points.all)),
             direct: Some(errors(&direct, &self.points.direct())),
             ssim,
+            estimated,
         });
         Ok(())
     }
@@ -230,6 +239,7 @@ impl Measure<'_> {
                 all: None,
                 direct: None,
                 ssim: None,
+                estimated: None,
             });
         }
         Ok(())
@@ -262,6 +272,7 @@ impl Measure<'_> {
                 all: None,
                 direct: None,
                 ssim: None,
+                estimated: None,
             });
         }
         Ok(())
@@ -320,15 +331,16 @@ fn seconds(s: f64) -> String {
 
 fn csv(rows: &[Row]) -> String {
     let mut out = String::from(
-        "series,value,seconds,indirect_mse,variance,bias2,mean,uncertainty,indirect_mse_to_mean,all_mse,all_mse_to_mean,ssim\n",
+        "series,value,seconds,indirect_mse,variance,bias2,mean,uncertainty,indirect_mse_to_mean,all_mse,all_mse_to_mean,ssim,estimated\n",
     );
     for r in rows {
         let e = &r.indirect;
         let all = r.all.map_or(",".into(), |a| format!("{:.6e},{:.6e}", a.mse, a.to_mean));
         let ssim = r.ssim.map_or(String::new(), |s| format!("{s:.6}"));
+        let estimated = r.estimated.map_or(String::new(), |e| format!("{e:.6e}"));
         let _ = writeln!(
             out,
-            "{},{},{:.4},{:.6e},{:.6e},{:.6e},{:.6},{:.6e},{:.6e},{all},{ssim}",
+            "{},{},{:.4},{:.6e},{:.6e},{:.6e},{:.6},{:.6e},{:.6e},{all},{ssim},{estimated}",
             r.series, r.value, r.seconds, e.mse, e.variance, e.bias2, e.mean, e.uncertainty, e.to_mean
         );
     }
@@ -395,7 +407,7 @@ fn introduction(
          of the differences from its two halves. {others} more points, {part:.1} % of all that were seen, lie on sides \
          that the light map does not show, and are left out. But worst is the relative MSE without the worst hundredth of \
          the points; Σ the sum of the light baked by that of the reference. Noise is what differs between {seeds} seeds, bias what \
-         does not; MSE = noise² + bias². ± is one standard error of the MSE, from the points chosen. Seconds are those \
+         does not; MSE = noise² + bias². Estimated noise² is what a bake of several passes itself says of all light at these points. ± is one standard error of the MSE, from the points chosen. Seconds are those \
          of the bake, without charts; of path tracing and photons alone those at the points compared, scaled to \
          all.\n\n",
         args.bake.title(),
@@ -450,8 +462,8 @@ fn add_times(out: &mut String, rows: &[Row]) {
 fn add_settings(out: &mut String, rows: &[Row]) {
     out.push_str(
         "\n![error against time](quality.svg)\n\n## All settings\n\n\
-         | | | seconds | RMS | relative MSE | ± | but worst | noise² | bias² | Σ | to mean | direct light: MSE | but worst | Σ | all light: MSE | but worst | Σ | SSIM |\n\
-         |---|---|---|---|---|---|---|---|---|---|---|---|---|---|---|---|---|---|\n",
+         | | | seconds | RMS | relative MSE | ± | but worst | noise² | bias² | Σ | to mean | direct light: MSE | but worst | Σ | all light: MSE | but worst | Σ | SSIM | estimated noise² |\n\
+         |---|---|---|---|---|---|---|---|---|---|---|---|---|---|---|---|---|---|---|\n",
     );
     for r in rows {
         let e = &r.indirect;
@@ -460,7 +472,7 @@ fn add_settings(out: &mut String, rows: &[Row]) {
         });
         let _ = writeln!(
             out,
-            "| {} | {} | {:.2} | {:.2} % | {:.1e} | {:.0e} | {:.1e} | {:.1e} | {:.1e} | {:.3} | {:.1e} | {direct} | {all} | {} |",
+            "| {} | {} | {:.2} | {:.2} % | {:.1e} | {:.0e} | {:.1e} | {:.1e} | {:.1e} | {:.3} | {:.1e} | {direct} | {all} | {} | {} |",
             r.series,
             r.value,
             r.seconds,
@@ -473,6 +485,7 @@ fn add_settings(out: &mut String, rows: &[Row]) {
             1.0 + e.mean,
             e.to_mean,
             likeness(r.ssim),
+            r.estimated.map_or("–".into(), |e| format!("{e:.1e}")),
         );
     }
 }
@@ -488,7 +501,16 @@ mod tests {
 
     fn row(seconds: f64, mse: f64, bias2: f64) -> Row {
         let indirect = Errors { mse, bias2, variance: mse - bias2, ..Default::default() };
-        Row { series: "s".into(), value: String::new(), seconds, indirect, all: None, direct: None, ssim: None }
+        Row {
+            series: "s".into(),
+            value: String::new(),
+            seconds,
+            indirect,
+            all: None,
+            direct: None,
+            ssim: None,
+            estimated: None,
+        }
     }
 
     #[test]
