@@ -354,7 +354,7 @@ static void bake(const bk_scene *scene, const char *prefix) {
     several = params;
     several.seed = 9;
     CHECK_OK(bk_quality_set(BK_QUALITY_PREVIEW, NULL, &several));
-    CHECK(several.seed == 9 && several.gather_rays < params.gather_rays && several.direct_samples > 0);
+    CHECK(several.seed == 9 && several.direct_samples < params.direct_samples && several.passes == 1);
     several.photon_count = 20000;
     several.passes = 3;
     CHECK_OK(bk_bake(lightmap, &several, NULL, NULL, &stats));

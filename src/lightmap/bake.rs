@@ -151,7 +151,8 @@ impl Lightmap {
             Bake { atlas, params, plan, direct, range, progress, checkpoint, known_backs: backs }.run()
         };
         if params.passes == 1 && params.target_error == 0.0 {
-            return run(0, None);
+            let (light, stats) = run(0, None)?;
+            return Ok((light, BakeStats { passes: 1, ..stats }));
         }
         let device = self.atlas.scene.device();
         let mut needed = params.passes.max(2);
