@@ -1406,6 +1406,16 @@ typedef struct bk_lightmap_desc {
   /// both sides of a sheet: backs took 6 % of the texels in a living room and 23 % in Sponza.
   /// Default: 1.
   uint32_t both_sides;
+  /// Number of boxes in `seen_from`, at most 4096. Default: 0.
+  uint32_t seen_from_count;
+  /// From where the scene is looked at: boxes of six floats each, the least and the greatest
+  /// coordinates, the same for a point; copied by the call. Charts that cannot be seen from there
+  /// have a single texel each, and their light costs next to nothing. They still reflect light.
+  /// Charts with light map coordinates of the caller keep their texels. Set it where the camera
+  /// stays in some rooms or on paths: in closed rooms half of the texels and more are never seen.
+  /// bk_lightmap_info.unseen_charts and spared_texels count them. NULL: from anywhere. Default:
+  /// NULL.
+  const float *seen_from;
 } bk_lightmap_desc;
 
 /// Numbers about the layout of a light map.
@@ -1450,6 +1460,10 @@ typedef struct bk_lightmap_info {
   double unwrap_seconds;
   /// Number of texels that belong to backs: the last ones of `texels`.
   uint64_t back_texels;
+  /// Number of charts that cannot be seen from bk_lightmap_desc.seen_from.
+  uint64_t unseen_charts;
+  /// Number of texels that they would have had, roughly.
+  uint64_t spared_texels;
 } bk_lightmap_info;
 
 /// Sets `struct_size` and fills in the defaults.

@@ -6,7 +6,7 @@
 //! other numbers of cases than 300 with BAKELITE_CASES=number.
 
 use bakelite::bvh::BuildOptions;
-use bakelite::lightmap::{BakeParams, Layer, LayerData, Lightmap, LightmapDesc};
+use bakelite::lightmap::{BakeParams, Layer, LayerData, Lightmap, LightmapDesc, Region};
 use bakelite::live::{Budget, Live, LiveCamera, LiveParams, Mode, PageRect};
 use bakelite::photon::{PhotonMap, PhotonParams};
 use bakelite::reference::Random;
@@ -159,7 +159,13 @@ impl Draw {
             gather_divisor: self.pick(&[1, 2, 3, 64]),
             radiance_divisor: self.pick(&[1, 2, 5, 64]),
             both_sides: self.one_in(2),
+            seen_from: Vec::new(),
         };
+        if self.one_in(4) {
+            let lower = self.point(1.0);
+            let size = self.pick(&[0.0, 1.0, 1e6, f32::NAN, -1.0]);
+            desc.seen_from.push(Region { lower, upper: lower + size });
+        }
         match self.below(20) {
             0 => desc.page_size = self.pick(&[0, 15, 20_000, u32::MAX]),
             1 => desc.padding = self.pick(&[0, 16, 64, u32::MAX]),

@@ -10,13 +10,13 @@
 //!
 //! Cost: see bk_lightmap_create; the other functions copy their results.
 
-use super::args::{OutStruct, SizedStruct, init, read_bool, read_struct, sized_struct, slice_mut, write};
+use super::args::{OutStruct, SizedStruct, init, read_bool, read_strided, read_struct, sized_struct, slice_mut, write};
 use super::device::{bk_progress_fn, call_with_file, progress, refuse_in_callback};
 use super::error::{bk_result, call, call_or};
 use super::handles::{create, hold, object, release, retain};
 use super::scene::bk_scene;
-use crate::base::error::{Error, Result};
-use crate::lightmap::{Lightmap, LightmapDesc, LightmapInfo, MeshUvs};
+use crate::base::error::{Error, Result, invalid_argument};
+use crate::lightmap::{Lightmap, LightmapDesc, LightmapInfo, MAX_REGIONS, MeshUvs};
 use std::ffi::{c_char, c_void};
 use std::sync::{Arc, RwLock, TryLockError};
 
@@ -92,6 +92,16 @@ pub struct bk_lightmap_desc {
     /// both sides of a sheet: backs took 6 % of the texels in a living room and 23 % in Sponza.
     /// Default: 1.
     pub both_sides: u32,
+    /// Number of boxes in `seen_from`, at most 4096. Default: 0.
+    pub seen_from_count: u32,
+    /// From where the scene is looked at: boxes of six floats each, the least and the greatest
+    /// coordinates, the same for a point; copied by the call. Charts that cannot be seen from there
+    /// have a single texel each, and their light costs next to nothing. They still reflect light.
+    /// Charts with light map coordinates of the caller keep their texels. Set it where the camera
+    /// stays in some rooms or on paths: in closed rooms half of the texels and more are never seen.
+    /// bk_lightmap_info.unseen_charts and spared_texels count them. NULL: from anywhere. Default:
+    /// NULL.
+    pub seen_from: *const f32,
 }
 
 sized_struct!(bk_lightmap_desc, defaults: {
@@ -104,6 +114,8 @@ sized_struct!(bk_lightmap_desc, defaults: {
         gather_divisor: d.gather_divisor,
         radiance_divisor: d.radiance_divisor,
         both_sides: d.both_sides as u32,
+        seen_from_count: 0,
+        seen_from: std::ptr::null(),
     }
 });
 
@@ -163,6 +175,11 @@ unsafe fn core_desc(desc: *const bk_lightmap_desc) -> Result<LightmapDesc> {
     // SAFETY: by contract.
     let read = || unsafe { read_struct(desc, "desc") };
     let d: bk_lightmap_desc = if desc.is_null() { SizedStruct::defaults() } else { read()? };
+    if d.seen_from_count as usize > MAX_REGIONS {
+        return invalid_argument!("seen_from_count is {}, more than {MAX_REGIONS}", d.seen_from_count);
+    }
+    // SAFETY: by contract the boxes are there to be read.
+    let seen_from = unsafe { read_strided(d.seen_from, 0, d.seen_from_count as usize, "seen_from") }?;
     Ok(LightmapDesc {
         texels_per_unit: d.texels_per_unit,
         page_size: d.page_size,
@@ -170,6 +187,7 @@ unsafe fn core_desc(desc: *const bk_lightmap_desc) -> Result<LightmapDesc> {
         gather_divisor: d.gather_divisor,
         radiance_divisor: d.radiance_divisor,
         both_sides: read_bool(d.both_sides, "both_sides")?,
+        seen_from,
     })
 }
 
@@ -317,6 +335,10 @@ pub struct bk_lightmap_info {
     pub unwrap_seconds: f64,
     /// Number of texels that belong to backs: the last ones of `texels`.
     pub back_texels: u64,
+    /// Number of charts that cannot be seen from bk_lightmap_desc.seen_from.
+    pub unseen_charts: u64,
+    /// Number of texels that they would have had, roughly.
+    pub spared_texels: u64,
 }
 
 sized_struct!(bk_lightmap_info, defaults: info(&Default::default()));
@@ -342,6 +364,8 @@ fn info(i: &LightmapInfo) -> bk_lightmap_info {
         uv_overlapping_texels: i.uvs.overlapping_texels,
         unwrap_seconds: i.unwrap_seconds,
         back_texels: i.back_texels,
+        unseen_charts: i.unseen_charts.into(),
+        spared_texels: i.spared_texels,
     }
 }
 

@@ -9,6 +9,7 @@ use super::atlas::ids::{ChartId, GatherMap, LightMap, Map, RadianceMap};
 use super::atlas::known::{Known, Patch};
 use super::atlas::layout::Layout;
 use super::atlas::seen::{self, Seen};
+use super::atlas::seen_from;
 use super::atlas::texels::TexelMap;
 use super::atlas::two_sided;
 use super::plan::Plan;
@@ -82,6 +83,8 @@ impl Lightmap {
             back_texels: (map.len() - map.back_start.index()) as u64,
             buried_texels: buried.iter().filter(|&&b| b).count() as u64,
             open_places: seen.places,
+            unseen_charts: seen.unseen.iter().filter(|&&unseen| unseen).count() as u32,
+            spared_texels: map.layout.spared,
             sight_rays,
         };
         let memory = scene.device().memory().reserve(own_bytes, "the charts")?;
@@ -102,7 +105,7 @@ impl Lightmap {
             gather,
             radiance,
             padding: desc.padding,
-            desc: *desc,
+            desc: desc.clone(),
             is_outdoors,
             info,
             seen,
@@ -152,24 +155,31 @@ impl Maps {
         known: Option<&mut Known>,
         progress: &Progress,
     ) -> Result<Maps> {
-        let pack = |divisor: u32, padding: u32, given: bool, with_backs: &[ChartId]| {
+        let pack = |divisor: u32, padding: u32, given: bool, with_backs: &[ChartId], unseen: &[bool]| {
             let page_size = if divisor == 1 { desc.page_size } else { (desc.page_size / divisor).max(MIN_PAGE_SIZE) };
-            Layout::pack(charts, density / divisor as f32, page_size, padding, given, with_backs, progress)
+            Layout::pack(charts, density / divisor as f32, page_size, padding, given, with_backs, unseen, progress)
         };
-        let radiance = pack(desc.radiance_divisor, 0, false, two_sided)?;
+        let radiance = pack(desc.radiance_divisor, 0, false, two_sided, &[])?;
         let stage = progress.stage("texels", 0.5, 0.6, TexelMap::work(&radiance));
         let mut radiance = ChartMap::new(scene, charts, radiance, &stage)?;
         let texel = 1.0 / density;
-        let stage = progress.stage("sides", 0.6, 0.65, Seen::work(&radiance));
+        let stage =
+            progress.stage("sides", 0.6, 0.65, Seen::work(&radiance) + seen_from::work(charts, &desc.seen_from));
         let mut known = known;
         let seen = match &mut known {
             Some(known) => std::mem::take(&mut known.seen),
-            None => scene.device().install(|| Seen::count(scene, charts, &radiance, texel, &stage))?,
+            None => scene.device().install(|| {
+                let mut seen = Seen::count(scene, charts, &radiance, texel, &stage)?;
+                if !desc.seen_from.is_empty() {
+                    seen_from::look(scene, charts, &radiance, &desc.seen_from, &stage, &mut seen)?;
+                }
+                Ok(seen)
+            })?,
         };
         let with_backs =
             if desc.both_sides { two_sided::seen_from_both(&seen, &radiance, two_sided)? } else { Vec::new() };
-        let map = pack(1, desc.padding, true, &with_backs)?;
-        let gather = pack(desc.gather_divisor, 0, false, &with_backs)?;
+        let map = pack(1, desc.padding, true, &with_backs, &seen.unseen)?;
+        let gather = pack(desc.gather_divisor, 0, false, &with_backs, &seen.unseen)?;
         let stage = progress.stage("texels", 0.65, 0.8, TexelMap::work(&map) + TexelMap::work(&gather));
         let mut map = ChartMap::new(scene, charts, map, &stage)?;
         let mut gather = ChartMap::new(scene, charts, gather, &stage)?;

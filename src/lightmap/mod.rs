@@ -26,6 +26,7 @@ use crate::photon::MAX_PHOTONS;
 use crate::scene::Scene;
 use atlas::Atlas;
 use atlas::charts::MAX_PAGE_SIZE;
+use bytemuck::{Pod, Zeroable};
 use glam::Vec3;
 use indirect::blur;
 use indirect::radiance_map::Radiance;
@@ -35,8 +36,18 @@ pub use saved::CheckpointParams;
 use saved::fingerprint::Origin;
 use std::sync::Arc;
 
+/// A box from which the scene is looked at; a point if its corners are the same.
+#[derive(Clone, Copy, Debug, PartialEq, Pod, Zeroable)]
+#[repr(C)]
+pub struct Region {
+    /// Least coordinates, in scene units.
+    pub lower: Vec3,
+    /// Greatest coordinates.
+    pub upper: Vec3,
+}
+
 /// Parameters of a light map's layout.
-#[derive(Clone, Copy, Debug, PartialEq)]
+#[derive(Clone, Debug, PartialEq)]
 pub struct LightmapDesc {
     /// Density of unwrapped charts in texels per scene unit; 0: chosen so that the scene fills about one page.
     pub texels_per_unit: f32,
@@ -53,7 +64,14 @@ pub struct LightmapDesc {
     /// count if a directional light or a sky shines when the light map is created. Without separate texels, a chart
     /// shows the side that can be seen, or the one that the bake chooses.
     pub both_sides: bool,
+    /// From where the scene is looked at: charts that cannot be seen from there have a single texel each, and sides that
+    /// cannot have none. They still reflect light. Charts with the caller's own UVs keep their texels. Empty: from
+    /// anywhere.
+    pub seen_from: Vec<Region>,
 }
+
+/// Maximum number of regions in [`LightmapDesc::seen_from`].
+pub const MAX_REGIONS: usize = 4096;
 
 impl Default for LightmapDesc {
     fn default() -> Self {
@@ -64,6 +82,7 @@ impl Default for LightmapDesc {
             gather_divisor: 4,
             radiance_divisor: 4,
             both_sides: true,
+            seen_from: Vec::new(),
         }
     }
 }
@@ -103,8 +122,12 @@ pub struct LightmapInfo {
     /// Number of open places from which rays were traced to find the sides that can be seen. 0 if no material is
     /// two-sided.
     pub open_places: u64,
-    /// Number of rays traced from open places and to find buried texels.
+    /// Number of rays traced from open places, from where the scene is looked at, and to find buried texels.
     pub sight_rays: u64,
+    /// Number of charts that cannot be seen from [`LightmapDesc::seen_from`].
+    pub unseen_charts: u32,
+    /// Number of texels that they would have had, roughly.
+    pub spared_texels: u64,
 }
 
 /// Parameters of a bake.
@@ -385,6 +408,14 @@ impl LightmapDesc {
         for (name, d) in [("gather_divisor", self.gather_divisor), ("radiance_divisor", self.radiance_divisor)] {
             if !(1..=64).contains(&d) {
                 return invalid_argument!("{name} is {d}, outside 1 to 64");
+            }
+        }
+        if self.seen_from.len() > MAX_REGIONS {
+            return invalid_argument!("seen_from has {} regions, more than {MAX_REGIONS}", self.seen_from.len());
+        }
+        for (i, Region { lower, upper }) in self.seen_from.iter().enumerate() {
+            if !(lower.is_finite() && upper.is_finite() && lower.cmple(*upper).all()) {
+                return invalid_argument!("region {i} of seen_from is {lower} to {upper}, not finite and ascending");
             }
         }
         Ok(())

@@ -209,6 +209,12 @@ impl Plan {
                 info.buried_texels, info.texels
             ));
         }
+        if info.unseen_charts > 0 {
+            self.run(&format!(
+                "a single texel for each of {} charts that cannot be seen from the regions given, about {} texels less",
+                info.unseen_charts, info.spared_texels
+            ));
+        }
         if info.both_sided_charts > 0 {
             self.run(&format!(
                 "separate texels for the backs of {} two-sided charts: {} of {}",

@@ -557,6 +557,17 @@ fn lightmap(w: &W, s: &mut Source) {
     (desc.gather_divisor, desc.radiance_divisor) = (1 + s.below(4) as u32, 1 + s.below(4) as u32);
     desc.both_sides = s.below(2) as u32;
     s.mutate(&mut desc);
+    // The one pointer among them.
+    let mut boxes = [0.0f32; 12];
+    boxes.fill_with(|| if s.one_in(9) { s.float() } else { s.unit() });
+    if s.one_in(2) {
+        boxes[3..6].iter_mut().chain(&mut boxes[9..12]).for_each(|upper| *upper += 1.0);
+    }
+    desc.seen_from = if s.one_in(3) { boxes.as_ptr() } else { null() };
+    desc.seen_from_count = if s.one_in(20) && desc.seen_from.is_null() { s.integer() } else { s.below(3) as u32 };
+    if desc.seen_from.is_null() && !s.one_in(10) {
+        desc.seen_from_count = 0;
+    }
     if (129..=16_384).contains(&desc.page_size) {
         desc.page_size = 128;
     }

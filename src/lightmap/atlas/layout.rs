@@ -74,6 +74,8 @@ pub struct Layout {
     pub given: u32,
     /// Charts reduced in density because they would not fit a page.
     pub reduced: u32,
+    /// Texels that unseen charts would have had, but for the one that they have, padding not counted.
+    pub spared: u64,
     /// Placement of each chart's back, [`PlacementId::NONE`] if it has none. Empty without back sides.
     backs: Vec<PlacementId>,
 }
@@ -93,7 +95,7 @@ impl Layout {
     ///
     /// If `honour_given`, the charts that the caller placed stay where they are, and the others go to further pages.
     /// The charts of `with_backs`, ascending, get a second placement for their backs. A chart too long for a page is
-    /// shown at a lower density along that axis. `OutOfMemory` if the pages would hold more than [`MAX_TEXELS`].
+    /// shown at a lower density along that axis, and one that is `unseen` (empty: none is) in a single texel. `OutOfMemory` if the pages would hold more than [`MAX_TEXELS`].
     pub fn pack(
         charts: &Charts,
         density: f32,
@@ -101,6 +103,7 @@ impl Layout {
         padding: u32,
         honour_given: bool,
         with_backs: &[ChartId],
+        unseen: &[bool],
         progress: &Progress,
     ) -> Result<Layout> {
         let max_extent = padded_extent(page_size, padding)?;
@@ -117,12 +120,13 @@ impl Layout {
             back_of: Vec::new(),
             given: given as u32,
             reduced: 0,
+            spared: 0,
             backs: Vec::new(),
         };
         layout.placements.extend(charts[..given].iter().filter_map(|c| Some(given_placement(c, &c.given?, page_size))));
         let first_page = layout.placements.iter().map(|p| p.page + 1).max().unwrap_or(0);
-        for chart in &charts[given..] {
-            layout.push(chart, max_extent, padding);
+        for (c, chart) in charts.iter().enumerate().skip(given) {
+            layout.push(chart, max_extent, padding, unseen.get(c).is_some_and(|&unseen| unseen));
         }
         if !with_backs.is_empty() {
             layout.backs = try_filled(charts.len(), PlacementId::NONE, LAYOUT)?;
@@ -130,7 +134,7 @@ impl Layout {
             for &c in with_backs {
                 layout.backs[c.index()] = PlacementId::new(layout.placements.len());
                 layout.back_of.push(c);
-                layout.push(&charts[c.index()], max_extent, padding);
+                layout.push(&charts[c.index()], max_extent, padding, false);
             }
         }
         layout.check_size(first_page)?;
@@ -192,24 +196,27 @@ impl Layout {
     }
 
     /// Adds a chart, long side along x, whose position is found later.
-    fn push(&mut self, chart: &Chart, max_extent: u32, padding: u32) {
+    fn push(&mut self, chart: &Chart, max_extent: u32, padding: u32, unseen: bool) {
         let swap = chart.size[1] > chart.size[0];
         let size = if swap { [chart.size[1], chart.size[0]] } else { chart.size };
         // Margin for rounding: coordinates in the page are exact to an ulp of the page's size, and a chart must not
         // touch the next texel by that much.
         let slack = self.page_size as f64 / (1 << 20) as f64;
-        let mut reduced = false;
+        let (mut reduced, mut spared) = (false, 1);
         let [(w, sx, ox), (h, sy, oy)] = size.map(|s| {
             let wanted = s as f64 * self.density as f64;
             let texels = (wanted - 4.0 * slack).ceil().clamp(1.0, max_extent as f64);
+            spared *= texels as u64;
+            let texels = if unseen { 1.0 } else { texels };
             let fitting = texels - 2.0 * slack;
-            reduced |= wanted > max_extent as f64 + 1.0;
+            reduced |= !unseen && wanted > max_extent as f64 + 1.0;
             let scale = if wanted > fitting { fitting / s as f64 } else { self.density as f64 };
             // The chart is centred, so that the centres of border texels lie in it if possible.
             let margin = 0.5 * (texels - scale * s as f64);
             (texels as u16 + 2 * padding as u16, scale as f32, (margin + padding as f64) as f32)
         });
         self.reduced += reduced as u32;
+        self.spared += if unseen { spared - 1 } else { 0 };
         self.placements.push(Placement { page: 0, x: 0, y: 0, w, h, swap, scale: [sx, sy], offset: [ox, oy] });
     }
 
@@ -384,9 +391,9 @@ mod tests {
             // All of them, or every third.
             let step = if all { 1 } else { 3 };
             let backs: Vec<ChartId> = charts.ids().step_by(step).filter(|_| back).collect();
-            let layout = Layout::pack(&charts, density, 1 << page, padding, false, &backs, &Progress::none()).unwrap();
+            let layout = Layout::pack(&charts, density, 1 << page, padding, false, &backs, &[], &Progress::none()).unwrap();
             check(&charts, &layout, padding);
-            prop_assert_eq!(&layout, &Layout::pack(&charts, density, 1 << page, padding, false, &backs, &Progress::none()).unwrap());
+            prop_assert_eq!(&layout, &Layout::pack(&charts, density, 1 << page, padding, false, &backs, &[], &Progress::none()).unwrap());
             prop_assert_eq!(layout.placements.len(), sizes.len() + backs.len());
             for c in charts.ids() {
                 let back = backs.contains(&c).then_some((c, true));
@@ -403,7 +410,7 @@ mod tests {
             0.05 / (0.002 + bits as f32 / (1u32 << 24) as f32)
         };
         let charts = charts_of(&(0..20_000).map(|i| [size(i, 0), size(i, 1)]).collect::<Vec<_>>());
-        let layout = Layout::pack(&charts, 60.0, 1024, 2, false, &[], &Progress::none()).unwrap();
+        let layout = Layout::pack(&charts, 60.0, 1024, 2, false, &[], &[], &Progress::none()).unwrap();
         check(&charts, &layout, 2);
         assert!(layout.page_count >= 8, "{} pages are too few to say", layout.page_count);
         assert!(layout.utilisation() > 0.85, "{}", layout.utilisation());
@@ -412,7 +419,7 @@ mod tests {
     #[test]
     fn a_chart_longer_than_a_page_is_reduced_along_that_axis_alone() {
         let charts = charts_of(&[[1000.0, 3.0], [2.0, 2.0]]);
-        let layout = Layout::pack(&charts, 1.0, 64, 2, false, &[], &Progress::none()).unwrap();
+        let layout = Layout::pack(&charts, 1.0, 64, 2, false, &[], &[], &Progress::none()).unwrap();
         check(&charts, &layout, 2);
         assert_eq!(layout.reduced, 1);
         let p = &layout.placements[0];
@@ -422,12 +429,12 @@ mod tests {
     #[test]
     fn gigantic_requests_are_refused_before_they_are_packed() {
         let charts = charts_of(&vec![[1.0, 1.0]; 10_000]);
-        let e = Layout::pack(&charts, 1e4, 16384, 2, false, &[], &Progress::none()).err().unwrap();
+        let e = Layout::pack(&charts, 1e4, 16384, 2, false, &[], &[], &Progress::none()).err().unwrap();
         assert!(matches!(&e, Error::OutOfMemory(s) if s.contains("10000 charts at 10000 texels per unit")), "{e}");
         let given = Given { page: 5000, offset: [0.0; 2], scale: [1.0; 2] };
         let mut far = charts_of(&[[1.0, 1.0]]);
         far.charts[0].given = Some(given);
-        let e = Layout::pack(&far, 1.0, 1024, 2, true, &[], &Progress::none()).err().unwrap();
+        let e = Layout::pack(&far, 1.0, 1024, 2, true, &[], &[], &Progress::none()).err().unwrap();
         assert!(matches!(e, Error::OutOfMemory(_)), "{e}");
     }
 
@@ -435,7 +442,10 @@ mod tests {
     fn impossible_arguments_are_refused_by_name() {
         let charts = charts_of(&[[1.0, 1.0]]);
         let error = |density, page_size, padding| {
-            Layout::pack(&charts, density, page_size, padding, false, &[], &Progress::none()).err().unwrap().to_string()
+            Layout::pack(&charts, density, page_size, padding, false, &[], &[], &Progress::none())
+                .err()
+                .unwrap()
+                .to_string()
         };
         assert!(error(0.0, 64, 2).contains("density is 0"));
         assert!(error(f32::INFINITY, 64, 2).contains("density is inf"));
@@ -449,13 +459,13 @@ mod tests {
     fn given_charts_stay_and_others_go_to_further_pages() {
         let mut charts = charts_of(&[[4.0, 2.0], [1.0, 1.0]]);
         charts.charts[0].given = Some(Given { page: 2, offset: [0.25, 0.5], scale: [0.125, 0.125] });
-        let layout = Layout::pack(&charts, 1.0, 64, 2, true, &[], &Progress::none()).unwrap();
+        let layout = Layout::pack(&charts, 1.0, 64, 2, true, &[], &[], &Progress::none()).unwrap();
         assert_eq!((layout.given, layout.page_count), (1, 4));
         let p = layout.placements[0];
         assert_eq!((p.page, p.x, p.y, p.w, p.h), (2, 16, 32, 33, 17));
         assert_eq!(layout.placements[0].texel_coord([4.0, 2.0]), [48.0, 48.0]);
         assert_eq!(layout.placements[1].page, 3);
-        let repacked = Layout::pack(&charts, 1.0, 64, 0, false, &[], &Progress::none()).unwrap();
+        let repacked = Layout::pack(&charts, 1.0, 64, 0, false, &[], &[], &Progress::none()).unwrap();
         assert_eq!((repacked.given, repacked.page_count), (0, 1));
     }
 }

@@ -12,6 +12,7 @@ pub mod layout;
 pub(crate) mod pieces;
 mod planar;
 pub(crate) mod seen;
+pub(crate) mod seen_from;
 pub mod texels;
 pub(crate) mod two_sided;
 mod unwrap;

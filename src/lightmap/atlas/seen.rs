@@ -31,7 +31,7 @@ pub(in crate::lightmap) const ROOM: f32 = 0.01;
 const ROOM_TEXELS: f32 = 4.0;
 
 /// Maximum fraction of the hits of rays from an open place that lie on backs of one-sided surfaces.
-const BACKS: f32 = 0.05;
+pub(super) const BACKS: f32 = 0.05;
 
 /// Minimum fraction of the rays from an open place indoors that end on surfaces.
 const ENCLOSED: f32 = 0.5;
@@ -48,7 +48,7 @@ const LEAST_EXPECTED: f64 = 8.0;
 /// A side that gets less than this fraction of the expected rays is hidden.
 const HIDDEN: f64 = 0.02;
 
-const COUNTS: &str = "which sides of charts are seen";
+pub(super) const COUNTS: &str = "which sides of charts are seen";
 
 /// Counts of how often the sides of charts are seen.
 #[derive(Default)]
@@ -57,6 +57,9 @@ pub(crate) struct Seen {
     pub counts: Vec<[u32; 2]>,
     /// Whether the front and the back of each chart are hidden: hardly any ray hit them.
     pub hidden: Vec<[bool; 2]>,
+    /// Charts that cannot be seen from where the scene is looked at ([`look`](super::seen_from::look)); empty if nobody
+    /// said from where.
+    pub unseen: Vec<bool>,
     pub places: u64,
     pub rays: u64,
 }
@@ -98,7 +101,7 @@ impl Seen {
             of_chart.map(|n| expected >= LEAST_EXPECTED && f64::from(n) < HIDDEN * expected)
         };
         let hidden = try_collect(counts.iter().enumerate().map(hidden), COUNTS)?;
-        Ok(Seen { counts, hidden, places: places.into_inner(), rays: rays.into_inner() })
+        Ok(Seen { counts, hidden, unseen: Vec::new(), places: places.into_inner(), rays: rays.into_inner() })
     }
 
     /// Returns the number of steps by which [`count`](Self::count) advances its stage.
@@ -126,7 +129,7 @@ impl Seen {
     }
 
     pub(crate) fn bytes(&self) -> usize {
-        size_of_val(&self.counts[..]) + size_of_val(&self.hidden[..])
+        size_of_val(&self.counts[..]) + size_of_val(&self.hidden[..]) + self.unseen.len()
     }
 }
 

@@ -51,7 +51,8 @@ struct Origin {
     gather_divisor: u32,
     radiance_divisor: u32,
     both_sides: u32,
-    reserved: u32,
+    /// Checksum of the regions from which the scene is looked at.
+    seen_from: u32,
 }
 
 /// The content of the first record.
@@ -93,12 +94,22 @@ struct SavedTriangle {
 struct SavedSides {
     counts: [u32; 2],
     hidden: [u32; 2],
+    /// Whether the chart cannot be seen from where the scene is looked at.
+    unseen: u32,
 }
 
 impl Origin {
     fn new(scene: &Scene, desc: &LightmapDesc, is_outdoors: bool) -> Origin {
         // All fields are named, since parameters that are added must be compared here, too.
-        let LightmapDesc { texels_per_unit, page_size, padding, gather_divisor, radiance_divisor, both_sides } = *desc;
+        let LightmapDesc {
+            texels_per_unit,
+            page_size,
+            padding,
+            gather_divisor,
+            radiance_divisor,
+            both_sides,
+            ref seen_from,
+        } = *desc;
         Origin {
             version: fingerprint::version(),
             is_fused: scene.device().isa().is_fused().into(),
@@ -112,7 +123,7 @@ impl Origin {
             gather_divisor,
             radiance_divisor,
             both_sides: both_sides.into(),
-            reserved: 0,
+            seen_from: crc32fast::hash(bytemuck::cast_slice(seen_from)),
         }
     }
 
@@ -126,6 +137,7 @@ impl Origin {
             ("the scene's geometry", self.geometry == needed.geometry),
             ("the light map UVs", self.uvs == needed.uvs),
             ("the scene's materials", self.materials == needed.materials),
+            ("from where it is seen", self.seen_from == needed.seen_from),
         ];
         all.extend(sums.iter().filter(|s| !s.1).map(|s| s.0.to_owned()));
         compare(&mut all, "texels_per_unit", self.texels_per_unit, needed.texels_per_unit);
@@ -204,9 +216,13 @@ impl Lightmap {
                 records::append(&mut out, TRIANGLES, &[bytemuck::cast_slice(&try_collect(saved, LAYOUT)?)])?;
                 write(&mut out, run.len())?;
             }
-            for (counts, hidden) in seen.counts.chunks(RUN).zip(seen.hidden.chunks(RUN)) {
-                let saved = counts.iter().zip(hidden);
-                let saved = saved.map(|(&counts, hidden)| SavedSides { counts, hidden: hidden.map(u32::from) });
+            for (run, (counts, hidden)) in seen.counts.chunks(RUN).zip(seen.hidden.chunks(RUN)).enumerate() {
+                let unseen = |i: usize| seen.unseen.get(run * RUN + i).is_some_and(|&unseen| unseen).into();
+                let saved = counts.iter().zip(hidden).enumerate().map(|(i, (&counts, hidden))| SavedSides {
+                    counts,
+                    hidden: hidden.map(u32::from),
+                    unseen: unseen(i),
+                });
                 records::append(&mut out, SEEN, &[bytemuck::cast_slice(&try_collect(saved, LAYOUT)?)])?;
                 write(&mut out, counts.len())?;
             }
@@ -364,13 +380,18 @@ fn known(
     };
     let stage = progress.stage("charts", 0.4, 0.5, 1);
     let charts = Charts::assemble(scene, pieces, &stage)?;
-    let sides = if charts.charts.iter().any(|c| c.two_sided) { charts.charts.len() } else { 0 };
+    let looks = !desc.seen_from.is_empty();
+    let sides = if looks || charts.charts.iter().any(|c| c.two_sided) { charts.charts.len() } else { 0 };
     if !rest.is_empty() || content.seen.len() != sides {
         return Err(damaged(path));
     }
     let seen = Seen {
         counts: try_collect(content.seen.iter().map(|s| s.counts), LAYOUT)?,
         hidden: try_collect(content.seen.iter().map(|s| s.hidden.map(|h| h != 0)), LAYOUT)?,
+        unseen: match looks {
+            true => try_collect(content.seen.iter().map(|s| s.unseen != 0), LAYOUT)?,
+            false => Vec::new(),
+        },
         places: head.places,
         rays: head.rays,
     };

@@ -8,9 +8,10 @@ use crate::bvh::BuildOptions;
 use crate::device::{Device, DeviceOptions};
 use crate::lightmap::atlas::chart_map::ChartMap;
 use crate::lightmap::atlas::ids::Map;
-use crate::lightmap::{BakeParams, CheckpointParams, Layer, LayerData, Lightmap, LightmapDesc};
+use crate::lightmap::{BakeParams, CheckpointParams, Layer, LayerData, Lightmap, LightmapDesc, Region};
 use crate::scene::{Light, Scene, builtin};
 use crate::simd::Isa;
+use glam::Vec3;
 use std::path::{Path, PathBuf};
 use std::sync::atomic::{AtomicU32, Ordering::Relaxed};
 
@@ -421,9 +422,12 @@ fn coarse() -> LightmapDesc {
 
 #[test]
 fn a_layout_comes_back_with_all_its_bits() {
-    for name in ["cornell", "atrium"] {
+    let above = Region { lower: Vec3::new(0.4, 0.9, 0.4), upper: Vec3::new(0.6, 0.95, 0.6) };
+    for (name, texels_per_unit, seen_from) in
+        [("cornell", 40.0, vec![]), ("atrium", 4.0, vec![]), ("cornell", 40.0, vec![above])]
+    {
         let scene = scene_of(name, None);
-        let desc = LightmapDesc { texels_per_unit: if name == "cornell" { 40.0 } else { 4.0 }, ..coarse() };
+        let desc = LightmapDesc { texels_per_unit, seen_from, ..coarse() };
         let made = Lightmap::create(&scene, &desc, &Progress::none()).unwrap();
         let place = Place::new();
         made.save_layout(&place.0, &Progress::none()).unwrap();
@@ -437,6 +441,7 @@ fn a_layout_comes_back_with_all_its_bits() {
         assert_same(&a.map, &b.map, name);
         assert_same(&a.gather, &b.gather, name);
         assert_same(&a.radiance, &b.radiance, name);
+        assert!(a.seen.unseen == b.seen.unseen && a.seen.unseen.contains(&true) != desc.seen_from.is_empty(), "{name}");
         assert!(a.buried == b.buried && a.seen.counts == b.seen.counts && a.seen.hidden == b.seen.hidden, "{name}");
         assert!(a.buried.iter().any(|&b| b), "{name} has no buried texels to test");
         let numbers = |l: &Lightmap| {
@@ -466,7 +471,9 @@ fn a_layout_of_something_else_is_refused_by_name() {
         Err(e) => panic!("{e}"),
         Ok(_) => panic!("{differences}: not refused"),
     };
-    refused(&scene, &LightmapDesc { padding: 3, ..desc }, "differs in padding (2, here 3)");
+    let seen_from = vec![Region { lower: Vec3::ZERO, upper: Vec3::ONE }];
+    refused(&scene, &LightmapDesc { seen_from, ..desc.clone() }, "differs in from where it is seen");
+    refused(&scene, &LightmapDesc { padding: 3, ..desc.clone() }, "differs in padding (2, here 3)");
     refused(&scene_of("atrium", None), &desc, "the scene's geometry, the light map UVs, the scene's materials");
     let sun = Light::Directional { direction: glam::Vec3::NEG_Y, irradiance: [1.0; 3], angular_radius: 0.0 };
     scene.set_light(1, sun).unwrap();

@@ -4,7 +4,7 @@ use super::values::{self, GivenLight, of};
 use bakelite::Isa;
 use bakelite::bvh::{BuildOptions, BuildQuality};
 use bakelite::lightmap::quality::Quality;
-use bakelite::lightmap::{BakeParams, LightmapDesc};
+use bakelite::lightmap::{BakeParams, LightmapDesc, Region};
 use bakelite::scene::Camera;
 use clap::builder::PossibleValuesParser;
 use clap::{Args, Parser, Subcommand};
@@ -262,6 +262,9 @@ pub struct LightmapFlags {
     #[arg(long, value_name = "N", default_value_t = LightmapDesc::default().radiance_divisor,
           value_parser = of(|d: &mut LightmapDesc, v| d.radiance_divisor = v))]
     pub radiance_divisor: u32,
+    /// From where the scene is looked at, a point or a box; may be repeated. What cannot be seen from there gets hardly any texels
+    #[arg(long, value_name = "X,Y,Z[:X,Y,Z]", value_parser = values::region)]
+    pub seen_from: Vec<Region>,
     /// One side of each two-sided chart, also where both are seen
     #[arg(long)]
     pub one_side: bool,

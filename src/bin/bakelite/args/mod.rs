@@ -348,6 +348,7 @@ fn bake_args(f: Flags) -> Result<BakeArgs, String> {
         gather_divisor: f.lightmap.gather_divisor,
         radiance_divisor: f.lightmap.radiance_divisor,
         both_sides: !f.lightmap.one_side,
+        seen_from: f.lightmap.seen_from,
     };
     // Each value is in its range; together they may still not be.
     desc.validate().map_err(|e| format!("--padding {} with --page-size {}: {e}", desc.padding, desc.page_size))?;

@@ -2,7 +2,7 @@
 
 use bakelite::Light;
 use bakelite::bvh::BuildOptions;
-use bakelite::lightmap::{BakeParams, CheckpointParams, LightmapDesc};
+use bakelite::lightmap::{BakeParams, CheckpointParams, LightmapDesc, Region};
 use bakelite::scene::{Camera, NONE, is_builtin};
 use glam::Vec3;
 use std::path::{Path, PathBuf};
@@ -115,6 +115,20 @@ fn tuple<const N: usize>(what: &str, value: &str) -> Result<[f32; N], String> {
         let form = if N == 2 { "a,b" } else { "a,b,c" };
         format!("the {what} {value:?} is not {N} numbers {form}")
     })
+}
+
+/// A point, or a box by its least and greatest coordinates.
+pub fn region(value: &str) -> Result<Region, String> {
+    let corners: Vec<[f32; 3]> = value.split(':').map(|corner| tuple("corner", corner)).collect::<Result<_, _>>()?;
+    let [lower, upper] = match corners[..] {
+        [point] => [point; 2],
+        [lower, upper] => [lower, upper],
+        _ => return Err(format!("the region {value:?} is not a point x,y,z or a box x,y,z:x,y,z")),
+    };
+    let region = Region { lower: lower.into(), upper: upper.into() };
+    let desc = LightmapDesc { seen_from: vec![region], ..LightmapDesc::default() };
+    desc.validate().map_err(|_| format!("the region {value:?} is not finite, or its corners do not ascend"))?;
+    Ok(region)
 }
 
 /// A light.

@@ -76,6 +76,7 @@ fn parameters(args: &BakeArgs) -> Value {
         "gather_divisor": d.gather_divisor,
         "radiance_divisor": d.radiance_divisor,
         "both_sides": d.both_sides,
+        "seen_from": d.seen_from.iter().map(|r| [r.lower.to_array(), r.upper.to_array()]).collect::<Vec<_>>(),
         "photons": p.photon_count,
         "bounces": p.max_bounces,
         "gather_rays": p.gather_rays,

@@ -90,7 +90,7 @@ fn check(scene: &Scene, charts: &Charts) {
         assert_eq!(charts.chart_of(t) == ChartId::NONE, !scene.is_valid(t));
     }
     let density = automatic_density(scene, 256, 1.0);
-    let layout = Layout::pack(charts, density, 256, 1, false, &[], &Progress::none()).unwrap();
+    let layout = Layout::pack(charts, density, 256, 1, false, &[], &[], &Progress::none()).unwrap();
     assert_eq!(map_of(scene, charts, &layout).overlapping_texels, 0);
 }
 
@@ -169,7 +169,7 @@ fn given_uvs_come_back() {
     let (charts, report) = charts_of(&scene, 4.0);
     assert_eq!((report.given_charts, report.unwrapped_charts), (1, 0));
     check(&scene, &charts);
-    let layout = Layout::pack(&charts, 4.0, 256, 2, true, &[], &Progress::none()).unwrap();
+    let layout = Layout::pack(&charts, 4.0, 256, 2, true, &[], &[], &Progress::none()).unwrap();
     assert_eq!((layout.page_count, layout.placements[0].page), (4, 3));
     for (t, i) in scene.meshes()[0].indices.iter().enumerate() {
         for k in 0..3 {
@@ -324,7 +324,7 @@ fn a_real_level_keeps_its_own_pages() {
     let (charts, report) = Charts::of_scene(&scene, 0.5, 1024, 2, &Progress::none()).unwrap();
     assert!(report.given_charts > 1000, "{report:?}");
     assert_eq!((report.out_of_range, report.overlapping), (0, 0));
-    let layout = Layout::pack(&charts, 0.5, 1024, 2, true, &[], &Progress::none()).unwrap();
+    let layout = Layout::pack(&charts, 0.5, 1024, 2, true, &[], &[], &Progress::none()).unwrap();
     let pages = layout.placements[..layout.given as usize].iter().map(|p| p.page).max();
     assert_eq!(pages, Some(5));
     let map = map_of(&scene, &charts, &layout);

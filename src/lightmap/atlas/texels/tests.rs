@@ -105,7 +105,7 @@ proptest! {
     #[test]
     fn samples_lie_in_their_texel_and_on_their_chart(seed in any::<u64>(), density in 0.3f32..6.0, padding in 0u32..3) {
         let (scene, charts) = crumpled(seed);
-        let layout = Layout::pack(&charts, density, 64, padding, false, &[], &Progress::none()).unwrap();
+        let layout = Layout::pack(&charts, density, 64, padding, false, &[], &[], &Progress::none()).unwrap();
         let map = map_of(&scene, &charts, &layout);
         for p in (0..layout.placements.len()).map(PlacementId::new) {
             let mut last = None;
@@ -128,7 +128,7 @@ proptest! {
         seed in any::<u64>(), density in 0.1f32..6.0, triangle in 0u32..72, u in 0.0f32..1.0, v in 0.0f32..1.0
     ) {
         let (scene, charts) = crumpled(seed);
-        let layout = Layout::pack(&charts, density, 64, 0, false, &[], &Progress::none()).unwrap();
+        let layout = Layout::pack(&charts, density, 64, 0, false, &[], &[], &Progress::none()).unwrap();
         let map = map_of(&scene, &charts, &layout);
         let (u, v) = if u + v > 1.0 { (1.0 - u, 1.0 - v) } else { (u, v) };
         let chart = charts.chart_of(triangle);
@@ -152,7 +152,7 @@ proptest! {
         seed in any::<u64>(), padding in 1u32..5, x0 in 0i32..64, y0 in 0i32..64, w in 1i32..64, h in 1i32..64
     ) {
         let (scene, charts) = crumpled(seed);
-        let layout = Layout::pack(&charts, 2.0, 64, 4, false, &[], &Progress::none()).unwrap();
+        let layout = Layout::pack(&charts, 2.0, 64, 4, false, &[], &[], &Progress::none()).unwrap();
         let map = map_of(&scene, &charts, &layout);
         let area = PageArea { columns: x0..(x0 + w).min(64), rows: y0..(y0 + h).min(64) };
         for page in 0..layout.page_count {
@@ -172,7 +172,7 @@ proptest! {
             Chart { triangles: 1..2, given: given([0.4, 0.3], [0.3, 0.5]), ..charts.charts[0].clone() },
         ];
         charts.of_triangles = [0, 1].map(ChartId::new).to_vec();
-        let layout = Layout::pack(&charts, 1.0, 32, 2, true, &[], &Progress::none()).unwrap();
+        let layout = Layout::pack(&charts, 1.0, 32, 2, true, &[], &[], &Progress::none()).unwrap();
         let map = map_of(&scene, &charts, &layout);
         let area = PageArea { columns: x0..(x0 + w).min(32), rows: y0..(y0 + h).min(32) };
         let found = shown(&map, 0, &area, padding);
@@ -241,7 +241,7 @@ fn unit_quad() -> (std::sync::Arc<Scene>, Charts) {
 #[test]
 fn centres_on_a_shared_edge_go_to_the_lower_triangle_and_none_is_lost() {
     let (scene, charts) = unit_quad();
-    let mut layout = Layout::pack(&charts, 8.0, 16, 0, false, &[], &Progress::none()).unwrap();
+    let mut layout = Layout::pack(&charts, 8.0, 16, 0, false, &[], &[], &Progress::none()).unwrap();
     // Exactly on texels, so that the diagonal passes through centres.
     (layout.placements[0].offset, layout.placements[0].scale) = ([0.0; 2], [8.0; 2]);
     let map = map_of(&scene, &charts, &layout);
@@ -258,7 +258,7 @@ fn centres_on_a_shared_edge_go_to_the_lower_triangle_and_none_is_lost() {
 fn a_chart_smaller_than_a_texel_has_one() {
     let (scene, charts) = unit_quad();
     for density in [1e-6, 0.01, 0.9] {
-        let layout = Layout::pack(&charts, density, 16, 0, false, &[], &Progress::none()).unwrap();
+        let layout = Layout::pack(&charts, density, 16, 0, false, &[], &[], &Progress::none()).unwrap();
         let map = map_of(&scene, &charts, &layout);
         assert_eq!(map.samples.len(), 1);
         assert_eq!(map.bilinear(PlacementId::new(0), [-1e30, f32::NAN]).samples, [0; 4]);
@@ -292,7 +292,7 @@ fn of_overlapping_given_triangles_the_first_one_wins_and_texels_are_counted() {
     charts.of_triangles = [0, 1].map(ChartId::new).to_vec();
     // The second lies on the first, and on a part of the page that is its own.
     charts.corners[1] = [[0.0, 0.0], [1.0, 0.0], [0.0, 1.0]];
-    let layout = Layout::pack(&charts, 1.0, 8, 2, true, &[], &Progress::none()).unwrap();
+    let layout = Layout::pack(&charts, 1.0, 8, 2, true, &[], &[], &Progress::none()).unwrap();
     let map = map_of(&scene, &charts, &layout);
     // The right triangle x ≥ y has 36 centres; x + y ≤ 8 has 36 too; both have 20, of which those
     // strictly inside both are counted.
@@ -311,7 +311,7 @@ fn of_overlapping_given_triangles_the_first_one_wins_and_texels_are_counted() {
 fn back_sides_have_the_same_texels_elsewhere() {
     let (scene, charts) = unit_quad();
     let chart = ChartId::new(0);
-    let layout = Layout::pack(&charts, 4.0, 16, 0, false, &[chart], &Progress::none()).unwrap();
+    let layout = Layout::pack(&charts, 4.0, 16, 0, false, &[chart], &[], &Progress::none()).unwrap();
     let map = map_of(&scene, &charts, &layout);
     let (front, back) = (PlacementId::front_of(chart), layout.back(chart).unwrap());
     assert_eq!(map.samples_of(front).len(), map.samples_of(back).len());
@@ -324,7 +324,7 @@ fn back_sides_have_the_same_texels_elsewhere() {
 #[test]
 fn a_map_without_charts_is_empty() {
     let (scene, _) = unit_quad();
-    let layout = Layout::pack(&Charts::default(), 1.0, 16, 2, true, &[], &Progress::none()).unwrap();
+    let layout = Layout::pack(&Charts::default(), 1.0, 16, 2, true, &[], &[], &Progress::none()).unwrap();
     let map = map_of(&scene, &Charts::default(), &layout);
     assert_eq!((map.samples.len(), layout.page_count), (0, 0));
     assert_eq!(map.group_count(), 0);
@@ -335,7 +335,7 @@ fn the_number_of_threads_does_not_change_the_texels() {
     let maps = [1, 2, 7].map(|threads| {
         let scene = scene_on(threads, grid(40, 40, |x, y| ((x * y) % 7) as f32 * 0.3));
         let charts = Charts::of_scene(&scene, 3.0, 64, 2, &Progress::none()).unwrap().0;
-        let layout = Layout::pack(&charts, 3.0, 64, 2, false, &[], &Progress::none()).unwrap();
+        let layout = Layout::pack(&charts, 3.0, 64, 2, false, &[], &[], &Progress::none()).unwrap();
         let map = map_of(&scene, &charts, &layout);
         (charts, layout, map.samples, map.chart_start, map.index)
     });
@@ -356,7 +356,7 @@ fn normals_come_from_the_mesh_unless_they_face_away() {
 #[test]
 fn a_cancel_stops_the_mapping() {
     let (scene, charts) = unit_quad();
-    let layout = Layout::pack(&charts, 8.0, 16, 0, false, &[], &Progress::none()).unwrap();
+    let layout = Layout::pack(&charts, 8.0, 16, 0, false, &[], &[], &Progress::none()).unwrap();
     let progress = Progress::new(|_, _| false);
     let stage = progress.stage("texels", 0.0, 1.0, TexelMap::work(&layout));
     assert_eq!(TexelMap::build(&scene, &charts, &layout, &stage).err(), Some(Error::Cancelled));

@@ -155,9 +155,9 @@ impl Measure<'_> {
         if !self.varies(knob) {
             return Ok(());
         }
-        let given = self.args.bake.desc;
+        let given = self.args.bake.desc.clone();
         for value in values {
-            let (mut desc, mut params) = (given, self.args.bake.params);
+            let (mut desc, mut params) = (given.clone(), self.args.bake.params);
             set(&mut desc, &mut params, value);
             // (Of whole numbers all digits are shown.)
             let (series, value) = (knob.replace('-', " "), format!("{value:.4}"));
