@@ -166,9 +166,9 @@ impl Eye<'_> {
 mod tests {
     use crate::base::progress::Progress;
     use crate::lightmap::atlas::ids::ChartId;
-    use crate::lightmap::{Lightmap, LightmapDesc, Region};
+    use crate::lightmap::{BakeParams, Lightmap, LightmapDesc, Region};
     use crate::scene::demo::shapes::MeshBuilder;
-    use crate::scene::{Material, SceneData};
+    use crate::scene::{Light, Material, SceneData};
     use glam::Vec3;
 
     /// Two rooms without a door between them, side by side, with a table in each.
@@ -184,8 +184,41 @@ mod tests {
             b.box_(p(x + 1.0, 0.7, 1.0), p(x + 2.0, 0.8, 2.0), false, m);
             data.add_mesh(b.finish()).unwrap();
         }
+        for x in [2.0, 7.0] {
+            data.add_light(Light::Point { position: Vec3::new(x, 2.0, 3.0), intensity: [30.0; 3] }).unwrap();
+        }
         let desc = LightmapDesc { texels_per_unit: 20.0, seen_from, ..Default::default() };
         Lightmap::create(&data.committed(), &desc, &Progress::none()).unwrap()
+    }
+
+    #[test]
+    fn what_is_seen_has_the_light_that_it_has_otherwise() {
+        let region = Region { lower: Vec3::new(0.2, 0.9, 0.2), upper: Vec3::new(3.8, 2.9, 3.8) };
+        let light = |seen_from: Vec<Region>| {
+            let mut map = rooms(seen_from, false);
+            let params = BakeParams { photon_count: 100_000, ..Default::default() };
+            map.bake(&params, &Progress::none()).unwrap();
+            map
+        };
+        let (all, some) = (light(Vec::new()), light(vec![region]));
+        let mean = |map: &Lightmap, t: u32| {
+            let atlas = map.atlas();
+            let texels = atlas.map.texels_of(atlas.map.layout.place_of(atlas.charts.chart_of(t), true));
+            let (n, of) = (texels.len(), map.light().unwrap());
+            (texels.map(|s| (of.direct[s.index()] + of.indirect[s.index()]).x).sum::<f32>() / n as f32, n)
+        };
+        let unseen = &some.atlas().seen.unseen;
+        for t in (0..24).filter(|&t| !unseen[some.atlas().charts.chart_of(t).index()]) {
+            let ((a, n), (b, _)) = (mean(&all, t), mean(&some, t));
+            // Edges of the table have a handful of gather texels, and their noise.
+            let tolerance = if n >= 100 { 0.01 } else { 0.05 };
+            assert!((a - b).abs() < tolerance * a, "triangle {t}, {n} texels: {b} for {a}");
+        }
+        // Even the few texels of the other room have its light, roughly.
+        for t in 24..36 {
+            let (a, b) = (mean(&all, t).0, mean(&some, t).0);
+            assert!((a - b).abs() < a, "triangle {t}: {b} for {a}");
+        }
     }
 
     #[test]
