@@ -6,12 +6,15 @@
 //! of one descent per sample with splitting, all samples descend together: they are spaced systematically, (k +
 //! offset)/n, on the unit interval, each node divides its part of the interval among its children by importance, and
 //! children that no sample falls on are skipped. This spreads the samples evenly over the tree, and its upper nodes are
-//! visited once for all of them. The nodes of a level that samples fall on are weighed eight at a time.
+//! visited once for all of them.
+//!
+//! A binary tree is collapsed to nodes of eight children, which are weighed at a time: fewer levels, each of which
+//! divides by what it knows better. (MEASURED)
 
-use super::light_node::{Bounds, ImportanceFn, Node, kernel};
+use super::light_node::{Bounds, Node, WIDTH};
 use crate::base::error::Result;
-use crate::base::memory::{try_collect, try_with_capacity};
-use crate::simd::Isa;
+use crate::base::memory::{try_collect, try_push, try_with_capacity};
+use crate::simd::{self, Isa};
 use glam::Vec3;
 
 /// Name of these buffers in error messages.
@@ -26,20 +29,40 @@ const HALVE_FROM: u32 = 40;
 /// Light tree over some of the lights of a scene, ready to be sampled.
 pub(crate) struct LightTree {
     nodes: Vec<Node>,
-    importances: ImportanceFn,
+    descend: DescendFn,
 }
 
-/// Part of the unit interval, times the number of samples, that falls on a node.
+/// A node of the binary tree; the left child of an inner node follows it.
+struct Binary {
+    bounds: Bounds,
+    /// Right child; for a leaf, the complement of its light's number.
+    right: u32,
+}
+
+/// Whether a child is the complement of a light's number.
+#[inline]
+fn is_light(child: u32) -> bool {
+    child > i32::MAX as u32
+}
+
+/// Part of the interval from -`offset` to the number of samples less `offset` that falls on a node. Samples lie at
+/// integers: the first in the part, and the end of those in it.
 #[derive(Clone, Copy)]
 struct Part {
     node: u32,
-    /// The node's right child, or what a leaf has in its place.
-    right: u32,
     from: f64,
     to: f64,
-    /// Number of samples below `from`, and below `to`. (Kept, with `right`, and not found again at each look, gathering in
-    /// Sponza with bright patches takes 0.93 of the time.)
-    below: [f64; 2],
+    first: f64,
+    end: f64,
+}
+
+/// A light that samples fall on.
+#[derive(Clone, Copy)]
+struct Sampled {
+    light: u32,
+    /// Number of samples, and the number that is expected.
+    count: u32,
+    due: f32,
 }
 
 /// Lists of a descent, which keep their room for the next one.
@@ -47,52 +70,30 @@ struct Part {
 pub(crate) struct Descent {
     level: Vec<Part>,
     next: Vec<Part>,
-    children: Vec<u32>,
-    importances: Vec<f32>,
-}
-
-impl Part {
-    fn is_leaf(&self) -> bool {
-        self.right > i32::MAX as u32
-    }
+    importances: Vec<[f32; WIDTH]>,
+    lights: Vec<Sampled>,
 }
 
 impl LightTree {
     /// Builds the tree over the lights whose power is greater than 0, to be sampled by the kernels of an ISA.
     pub(crate) fn new(isa: Isa, lights: &[Bounds]) -> Result<LightTree> {
-        let nodes = try_with_capacity((2 * lights.len()).saturating_sub(1), LIGHT_TREE)?;
-        let mut tree = LightTree { nodes, importances: kernel(isa) };
         // Powers are taken as parts of the whole: those of large scenes would overflow when multiplied by squared
         // lengths.
         let whole = lights.iter().map(|l| f64::from(l.power)).sum::<f64>();
         let part = |l: &Bounds| Bounds { power: (f64::from(l.power) / whole) as f32, ..*l };
         let mut numbered = try_collect((0u32..).zip(lights.iter().map(part)), LIGHT_TREE)?;
+        let mut nodes = Vec::new();
         if !lights.is_empty() {
             let mut later = try_with_capacity(lights.len(), LIGHT_TREE)?;
-            tree.build(&mut numbered, 0, &mut later);
+            let mut binary = try_with_capacity(2 * lights.len() - 1, LIGHT_TREE)?;
+            build(&mut binary, &mut numbered, 0, &mut later);
+            collapse(&binary, 0, &mut nodes)?;
         }
-        Ok(tree)
+        Ok(LightTree { nodes, descend: kernel(isa) })
     }
 
     pub(crate) fn bytes(&self) -> usize {
         size_of_val(&self.nodes[..])
-    }
-
-    /// Builds the subtree over `lights`. `later` has capacity for all lights.
-    fn build(&mut self, lights: &mut [(u32, Bounds)], depth: u32, later: &mut Vec<(u32, Bounds)>) -> Bounds {
-        if let [(light, bounds)] = lights {
-            self.nodes.push(Node::new(bounds, !*light));
-            return *bounds;
-        }
-        let middle = split(lights, depth, later);
-        let (left, right) = lights.split_at_mut(middle);
-        let place = self.nodes.len();
-        self.nodes.push(Node::new(&left[0].1, 0));
-        let left = self.build(left, depth + 1, later);
-        let second = self.nodes.len() as u32;
-        let both = left.union(&self.build(right, depth + 1, later));
-        self.nodes[place] = Node::new(&both, second);
-        both
     }
 
     /// Calls `visit` with each light that gets any of `n` systematic samples: its number, its expected number of
@@ -106,60 +107,120 @@ impl LightTree {
         descent: &mut Descent,
         mut visit: impl FnMut(usize, f32, u32),
     ) {
-        if self.nodes.is_empty() {
-            return;
+        (self.descend)(&self.nodes, [position, normal], (n, offset), descent);
+        for sampled in &descent.lights {
+            visit(sampled.light as usize, sampled.due, sampled.count);
         }
-        let below = |x: f64| ceil(x - offset as f64);
-        let right_of = |node: u32| self.nodes[node as usize].right;
-        // The parts of a level in order; each but the root's has a sample. (Eight at a time, level by level, a round of
-        // gather rays with 45,000 bright patches takes 0.43 of the time of descents one after the other.)
-        let Descent { level, next, children, importances } = descent;
-        let (from, to) = (0.0, n as f64);
-        level.clear();
-        level.push(Part { node: 0, right: right_of(0), from, to, below: [below(from), below(to)] });
-        loop {
-            children.clear();
-            children.extend(level.iter().filter(|p| !p.is_leaf()).flat_map(|p| [p.node + 1, p.right]));
-            if children.is_empty() {
-                break;
+    }
+}
+
+/// Kernel that lists the lights that samples fall on, given the position and the normal of a receiver, the number of
+/// samples and their offset.
+type DescendFn = fn(&[Node], [Vec3; 2], (u32, f32), &mut Descent);
+
+simd::kernel! {
+    /// Returns the kernel of an ISA; the portable one if the machine cannot run `isa`.
+    fn kernel -> DescendFn;
+
+    fn descend<S>(nodes: &[Node], receiver: [Vec3; 2], samples: (u32, f32), descent: &mut Descent) {
+        let (n, offset) = samples;
+        let Descent { level, next, importances, lights } = descent;
+        (level.clear(), lights.clear());
+        let (from, to) = (-f64::from(offset), f64::from(n) - f64::from(offset));
+        if !nodes.is_empty() {
+            level.push(Part { node: 0, from, to, first: ceil(from), end: ceil(to) });
+        }
+        while !level.is_empty() {
+            // In a loop of its own, so that what waits for roots and for memory overlaps.
+            importances.resize(level.len(), [0.0; WIDTH]);
+            for (part, out) in level.iter().zip(importances.iter_mut()) {
+                *out = nodes[part.node as usize].importances::<S>(receiver);
             }
-            importances.resize(children.len(), 0.0);
-            (self.importances)(&self.nodes, children, [position, normal], importances);
-            let mut weights = importances.chunks_exact(2);
             next.clear();
-            for part in &*level {
-                if part.is_leaf() {
-                    next.push(*part);
-                    continue;
-                }
-                let Some(weights) = weights.next() else { break };
-                let (l, r) = (weights[0] as f64, weights[1] as f64);
-                if !(l + r > 0.0) {
-                    continue;
-                }
-                let Part { node, right, from, to, below: [first, end] } = *part;
-                let middle = if r == 0.0 { to } else { from + (to - from) * (l / (l + r)) };
-                let half = below(middle);
-                if half > first {
-                    next.push(Part {
-                        node: node + 1,
-                        right: right_of(node + 1),
-                        from,
-                        to: middle,
-                        below: [first, half],
-                    });
-                }
-                if end > half {
-                    next.push(Part { node: right, right: right_of(right), from: middle, to, below: [half, end] });
-                }
+            for (part, importances) in level.iter().zip(importances.iter()) {
+                divide(&nodes[part.node as usize], importances, part, next, lights);
+            }
+            for part in &*next {
+                nodes[part.node as usize].prefetch();
             }
             std::mem::swap(level, next);
         }
-        for part in &*level {
-            let [first, end] = part.below;
-            visit(!part.right as usize, (part.to - part.from) as f32, (end - first) as u32);
-        }
     }
+}
+
+/// Divides a part of the interval among the children of its node by their importances.
+#[inline(always)]
+fn divide(node: &Node, importances: &[f32; WIDTH], part: &Part, next: &mut Vec<Part>, lights: &mut Vec<Sampled>) {
+    let mut ends = [0.0; WIDTH];
+    let mut sum = 0.0;
+    for (end, importance) in ends.iter_mut().zip(importances) {
+        sum += f64::from(*importance);
+        *end = sum;
+    }
+    if !(sum > 0.0 && sum < f64::INFINITY) {
+        return;
+    }
+    let scale = (part.to - part.from) / sum;
+    for end in &mut ends {
+        *end = part.from + *end * scale;
+    }
+    let mut sample = part.first;
+    while sample < part.end {
+        let mut child = ends.iter().map(|&end| usize::from(end <= sample)).sum::<usize>();
+        let mut end = ceil(ends[child.min(WIDTH - 1)]).min(part.end);
+        if child == WIDTH {
+            // The last sample, and rounding.
+            (child, end) = (importances.iter().rposition(|&i| i > 0.0).unwrap_or(0), part.end);
+        }
+        let (from, to) = (if child == 0 { part.from } else { ends[child - 1] }, ends[child]);
+        match node.children[child] {
+            light if is_light(light) => {
+                lights.push(Sampled { light: !light, count: (end - sample) as u32, due: (to - from) as f32 });
+            }
+            node => next.push(Part { node, from, to, first: sample, end }),
+        }
+        sample = end;
+    }
+}
+
+/// Builds the binary tree over `lights` into `nodes`, which has capacity for it. `later` has capacity for all lights.
+fn build(nodes: &mut Vec<Binary>, lights: &mut [(u32, Bounds)], depth: u32, later: &mut Vec<(u32, Bounds)>) -> Bounds {
+    if let [(light, bounds)] = lights {
+        nodes.push(Binary { bounds: *bounds, right: !*light });
+        return *bounds;
+    }
+    let middle = split(lights, depth, later);
+    let (left, right) = lights.split_at_mut(middle);
+    let place = nodes.len();
+    nodes.push(Binary { bounds: left[0].1, right: 0 });
+    let left = build(nodes, left, depth + 1, later);
+    let second = nodes.len() as u32;
+    let both = left.union(&build(nodes, right, depth + 1, later));
+    nodes[place] = Binary { bounds: both, right: second };
+    both
+}
+
+/// Makes a node of what lies below a node of the binary tree, and the nodes below it. Returns its number. Those children
+/// are opened whose lights are spread most.
+fn collapse(binary: &[Binary], root: u32, nodes: &mut Vec<Node>) -> Result<u32> {
+    let (mut children, mut count) = ([root; WIDTH], 1);
+    let of = |child: u32| &binary[child as usize];
+    while count < WIDTH {
+        let inner = (0..count).filter(|&i| !is_light(of(children[i]).right));
+        let widest = inner.max_by(|&a, &b| of(children[a]).bounds.cost().total_cmp(&of(children[b]).bounds.cost()));
+        let Some(i) = widest else { break };
+        children.copy_within(i..count, i + 1);
+        children[i + 1] = of(children[i]).right;
+        children[i] += 1;
+        count += 1;
+    }
+    let place = nodes.len();
+    try_push(nodes, Node::new(children[..count].iter().map(|&c| &of(c).bounds)), LIGHT_TREE)?;
+    for (i, &child) in children[..count].iter().enumerate() {
+        let right = of(child).right;
+        nodes[place].children[i] = if is_light(right) { right } else { collapse(binary, child, nodes)? };
+    }
+    Ok(place as u32)
 }
 
 /// Reorders at least two lights and returns the index at which to split them.
@@ -240,6 +301,7 @@ fn ceil(x: f64) -> f64 {
 
 #[cfg(test)]
 mod tests {
+    use super::super::light_node::importance;
     use super::*;
     use crate::base::sampling::{uniform, uniform_sphere};
     use std::f32::consts::PI;
@@ -291,7 +353,7 @@ mod tests {
             for (light, b) in lights.iter().enumerate() {
                 assert!((sampled[light] - due[light]).abs() < 1e-3, "{} {}", sampled[light], due[light]);
                 // (What is due less often than once in all rounds may not be seen.)
-                if Node::new(b, 0).importance(position, normal) > 3e-4 * b.power {
+                if importance(b, position, normal) > 3e-4 * b.power {
                     assert!(due[light] > 0.0, "light {light} at {i}");
                 }
             }
@@ -302,13 +364,12 @@ mod tests {
     fn what_cannot_contribute_has_no_importance() {
         let b =
             Bounds { lower: Vec3::ZERO, upper: Vec3::ZERO, axis: Vec3::Z, spread: 0.0, reach: PI / 2.0, power: 1.0 };
-        let node = Node::new(&b, 0);
-        assert_eq!(node.importance(Vec3::new(0.5, 0.0, -1.0), Vec3::Z), 0.0, "behind an area light");
-        assert_eq!(node.importance(Vec3::new(0.5, 0.0, 1.0), Vec3::Z), 0.0, "below the horizon");
-        assert!((node.importance(Vec3::Z * 2.0, -Vec3::Z) - 0.25).abs() < 1e-6);
-        let spot = Node::new(&Bounds { spread: 0.3, reach: 0.0, ..b }, 0);
-        assert_eq!(spot.importance(Vec3::new(0.32, 0.0, 1.0), -Vec3::Z), 0.0, "outside a cone");
-        assert!(spot.importance(Vec3::new(0.28, 0.0, 1.0), -Vec3::Z) > 0.85);
+        assert_eq!(importance(&b, Vec3::new(0.5, 0.0, -1.0), Vec3::Z), 0.0, "behind an area light");
+        assert_eq!(importance(&b, Vec3::new(0.5, 0.0, 1.0), Vec3::Z), 0.0, "below the horizon");
+        assert!((importance(&b, Vec3::Z * 2.0, -Vec3::Z) - 0.25).abs() < 1e-6);
+        let spot = Bounds { spread: 0.3, reach: 0.0, ..b };
+        assert_eq!(importance(&spot, Vec3::new(0.32, 0.0, 1.0), -Vec3::Z), 0.0, "outside a cone");
+        assert!(importance(&spot, Vec3::new(0.28, 0.0, 1.0), -Vec3::Z) > 0.85);
     }
 
     #[test]
@@ -342,6 +403,5 @@ mod tests {
             &mut descent,
             |_, _, _| panic!(),
         );
-        assert_eq!(size_of::<Node>(), 48);
     }
 }
