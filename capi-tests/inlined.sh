@@ -12,8 +12,8 @@ allowed='RaySetup::make_slow|Bundle::accurate|triangle::accurate_distance|single
 allowed+='|stream_rays::Room::(take|give_back|leave_alone)|stream::Traversal<T>::leave_alone'
 allowed+='|CompactLeaf::outer_box|<bakelite::trace::filter::Filter as bakelite::trace::filter::Accept>::accepts'
 # Entry points: src/trace/kernels.rs (streams on AVX-512 with and without VBMI2), src/photon/estimate.rs and
-# src/direct/light_node.rs, of each ISA.
-entry='bakelite::(trace::kernels|photon::estimate|direct::light_node)::(portable|avx2|avx512|vbmi2)(_streams)?::'
+# src/direct/light_tree.rs, of each ISA.
+entry='bakelite::(trace::kernels|photon::estimate|direct::light_tree)::(portable|avx2|avx512|vbmi2)(_streams)?::'
 # Fewer than these were not all found: 13 kernels of rays, one of photons and one of lights, 3 ISAs, and 4 with VBMI2.
 least=49
 

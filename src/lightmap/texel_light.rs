@@ -80,12 +80,14 @@ impl<M: Map> TexelAreas<'_, M> {
         (!self.scene.is_hole(point.triangle, point.u, point.v)).then_some(point)
     }
 
-    /// Returns the texel at an offset of columns and rows in the same placement, if there is one.
-    fn neighbour(&self, texel: TexelId<M>, dx: i32, dy: i32) -> Option<TexelId<M>> {
+    /// Returns the texels [around](AROUND) a texel in the same placement, where there are any.
+    fn neighbours(&self, texel: TexelId<M>) -> impl Iterator<Item = Option<TexelId<M>>> {
         let placement = self.map.placement_of(self.charts, texel);
         let (x, y) = self.map.position(texel);
-        let near = self.map.at(placement, x + dx, y + dy)?;
-        (self.map.placement_of(self.charts, near) == placement).then_some(near)
+        AROUND.into_iter().map(move |(dx, dy)| {
+            let near = self.map.at(placement, x + dx, y + dy)?;
+            (self.map.placement_of(self.charts, near) == placement).then_some(near)
+        })
     }
 }
 

@@ -26,16 +26,20 @@ const WIDTH_BITS: u16 = 3;
 /// them, or of a few times as many, are tiles.
 pub(crate) fn in_order<M: Map>(map: &ChartMap<M>, range: Range<usize>) -> Result<Vec<TexelId<M>>> {
     let mut order: Vec<TexelId<M>> = try_with_capacity(range.len(), "the order of texels")?;
+    let mut keys: Vec<u64> = try_with_capacity(range.len(), "the order of texels")?;
     let mut begin = range.start;
     while begin < range.end {
         let placement = map.texels.placement_of(begin as u32);
         let end = map.texels_of(placement).indices().end.min(range.end);
-        let first = order.len();
-        order.extend(TexelId::range(begin..end));
-        order[first..].sort_unstable_by_key(|&s| {
+        // (Keys computed once and not at each comparison: KEYS.)
+        keys.clear();
+        keys.extend(TexelId::<M>::range(begin..end).map(|s| {
             let texel = &map[s];
-            (texel.y >> WIDTH_BITS, texel.x >> WIDTH_BITS, s)
-        });
+            let (x, y) = (u64::from(texel.x >> WIDTH_BITS), u64::from(texel.y >> WIDTH_BITS));
+            (y << 16 | x) << 32 | s.index() as u64
+        }));
+        keys.sort_unstable();
+        order.extend(keys.iter().map(|&key| TexelId::new(key as u32 as usize)));
         begin = end;
     }
     Ok(order)

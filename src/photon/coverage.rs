@@ -16,6 +16,7 @@
 
 use super::PhotonMap;
 use super::cylinder::SAME_SURFACE;
+use super::noted::Noted;
 use crate::base::error::Result;
 use crate::base::memory::{try_filled, try_with_capacity};
 use crate::base::sampling::{concentric_disc, orthonormal_basis, sobol_2d};
@@ -40,6 +41,7 @@ const FIRST: u32 = 8;
 /// Discs around the points of a tile, whose rays are traced together.
 pub(crate) struct Discs {
     discs: Vec<Disc>,
+    noted: Noted,
     rays: Vec<Ray>,
     /// The disc that each ray is for, and what it carries.
     carried: Vec<(u32, Vec3)>,
@@ -54,6 +56,9 @@ struct Disc {
     normal: Vec3,
     seed: u32,
     estimate: Vec3,
+    /// Photons of the estimate that may be looked at, and how many there are.
+    photons: [u32; PROBES as usize],
+    photon_count: usize,
     /// Point above the position, in the cylinder of the estimate, and in the same room.
     apex: Vec3,
     /// Height of the apex above the position.
@@ -73,6 +78,7 @@ impl Discs {
         let (what, rays) = ("the discs of a tile", most * PROBES as usize);
         Ok(Discs {
             discs: try_with_capacity(most, what)?,
+            noted: Noted::new(),
             rays: try_with_capacity(rays, what)?,
             carried: try_with_capacity(rays, what)?,
             hits: try_filled(rays, RawHit::MISS, what)?,
@@ -90,7 +96,8 @@ impl Discs {
         mut out: impl FnMut(usize, Vec3),
     ) {
         self.discs.clear();
-        self.discs.extend(points.map(|(position, normal, seed)| Disc::new(map, position, normal, seed)));
+        let noted = &mut self.noted;
+        self.discs.extend(points.map(|(position, normal, seed)| Disc::new(map, position, normal, seed, noted)));
         self.find_apexes(map, rays);
         self.look_at_photons(map, 0..FIRST as usize, |_| true, rays);
         self.look_at_photons(map, FIRST as usize..PROBES as usize, |d| d.some_are_hidden, rays);
@@ -128,17 +135,14 @@ impl Discs {
         let vector = |columns: &[&[f32]; 3], i: usize| Vec3::new(columns[0][i], columns[1][i], columns[2][i]);
         self.clear_rays();
         for (k, disc) in (0..).zip(&self.discs).filter(|(_, d)| d.is_lit() && goes_on(d)) {
-            let mut number = 0;
-            map.grid.spread(&map.grid.search(disc.position, disc.normal, cylinder), disc.seed, |i| {
-                let Some(weight) = cylinder.weight(&photons, i, disc.position, disc.normal) else { return true };
-                if numbers.contains(&number) {
-                    let (point, facing) = (vector(&photons.position, i), vector(&photons.normal, i));
-                    self.rays.push(line_of_sight(map, point, facing, disc.apex));
-                    self.carried.push((k, weight * vector(&photons.power, i)));
-                }
-                number += 1;
-                number < numbers.end
-            });
+            let photons_of = &disc.photons[..disc.photon_count];
+            for &i in photons_of.iter().take(numbers.end).skip(numbers.start) {
+                let i = i as usize;
+                let Some(weight) = cylinder.weight(&photons, i, disc.position, disc.normal) else { continue };
+                let (point, facing) = (vector(&photons.position, i), vector(&photons.normal, i));
+                self.rays.push(line_of_sight(map, point, facing, disc.apex));
+                self.carried.push((k, weight * vector(&photons.power, i)));
+            }
         }
         self.trace_lines_of_sight(map, rays);
         for (&(k, power), &occluded) in self.carried.iter().zip(&self.occluded) {
@@ -205,12 +209,17 @@ impl Discs {
 }
 
 impl Disc {
-    fn new(map: &PhotonMap, position: Vec3, normal: Vec3, seed: u32) -> Disc {
+    fn new(map: &PhotonMap, position: Vec3, normal: Vec3, seed: u32, noted: &mut Noted) -> Disc {
+        let estimate = Vec3::from(map.estimate_and_note(position, normal, noted));
+        let mut photons = [0; PROBES as usize];
+        let photon_count = noted.spread(seed, &mut photons);
         Disc {
             position,
             normal,
             seed,
-            estimate: Vec3::from(map.estimate(position, normal)),
+            estimate,
+            photons,
+            photon_count,
             apex: position,
             up: 0.0,
             all_light: Vec3::ZERO,
@@ -290,7 +299,8 @@ mod tests {
     /// A disc at a point by each seed, as if there were light.
     fn discs_at(map: &PhotonMap, position: Vec3, normal: Vec3, seeds: Range<u32>) -> Discs {
         let mut discs = Discs::new(seeds.len()).unwrap();
-        let lit = |seed| Disc { estimate: Vec3::ONE, ..Disc::new(map, position, normal, seed) };
+        let mut noted = Noted::new();
+        let lit = |seed| Disc { estimate: Vec3::ONE, ..Disc::new(map, position, normal, seed, &mut noted) };
         discs.discs.extend(seeds.map(lit));
         discs.find_apexes(map, &mut 0);
         discs
@@ -375,11 +385,18 @@ mod tests {
             }
         }
         assert!((9..=PROBES).contains(&count) && seen > 0.0 && seen < all, "{count}: {seen} of {all}");
-        let (mut discs, mut rays) = (discs_at(&map, position, Vec3::Z, 3..4), 0);
-        discs.look_at_photons(&map, 0..FIRST as usize, |_| true, &mut rays);
-        discs.look_at_photons(&map, FIRST as usize..PROBES as usize, |d| d.some_are_hidden, &mut rays);
-        assert!((discs.discs[0].light().x - seen / all).abs() < 1e-5);
-        assert_eq!(rays, u64::from(count));
+        // Unless the first that a disc looks at are all on its side of the wall.
+        let mut noticed = 0;
+        for seed in 0..16 {
+            let (mut discs, mut rays) = (discs_at(&map, position, Vec3::Z, seed..seed + 1), 0);
+            discs.look_at_photons(&map, 0..FIRST as usize, |_| true, &mut rays);
+            discs.look_at_photons(&map, FIRST as usize..PROBES as usize, |d| d.some_are_hidden, &mut rays);
+            let (disc, light) = (&discs.discs[0], discs.discs[0].light().x);
+            let expected = if disc.some_are_hidden { (seen / all, count) } else { (1.0, FIRST) };
+            assert!((light - expected.0).abs() < 1e-5 && rays == u64::from(expected.1), "{light}, {rays} rays");
+            noticed += u32::from(disc.some_are_hidden);
+        }
+        assert!(noticed >= 12, "{noticed}");
     }
 
     #[test]

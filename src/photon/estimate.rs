@@ -13,6 +13,7 @@
 
 use super::cylinder::{Cylinder, SAME_SURFACE};
 use super::grid::Grid;
+use super::noted::Noted;
 use crate::simd::{self, Lanes, Mask, Simd};
 use glam::Vec3;
 
@@ -20,16 +21,20 @@ use glam::Vec3;
 /// estimates do that once.
 const FLUSH: usize = 64;
 
-/// Kernel that computes estimates at as many points as all three slices (positions, normals, results) have.
-pub(super) type EstimateFn = fn(&Grid, &Cylinder, &[[f32; 3]], &[[f32; 3]], &mut [[f32; 3]]);
+/// Kernel that computes estimates at as many points as all three slices (positions, normals, results) have, and may note
+/// the photons that count.
+pub(super) type EstimateFn = fn(&Grid, &Cylinder, &[[f32; 3]], &[[f32; 3]], &mut [[f32; 3]], Option<&mut Noted>);
 
 simd::kernel! {
     /// Returns the kernel of an ISA; the portable one if the machine cannot run `isa`.
     pub(super) fn kernel -> EstimateFn;
 
-    fn many<S>(g: &Grid, c: &Cylinder, p: &[[f32; 3]], n: &[[f32; 3]], out: &mut [[f32; 3]]) {
+    fn many<S>(
+        g: &Grid, c: &Cylinder, p: &[[f32; 3]], n: &[[f32; 3]], out: &mut [[f32; 3]], noted: Option<&mut Noted>
+    ) {
+        let mut noted = noted;
         for ((p, n), out) in p.iter().zip(n).zip(out) {
-            *out = estimate::<S>(g, c, Vec3::from_array(*p), Vec3::from_array(*n));
+            *out = estimate::<S>(g, c, Vec3::from_array(*p), Vec3::from_array(*n), &mut noted);
         }
     }
 }
@@ -84,7 +89,13 @@ impl<L: Lanes> V3<L> {
 /// # Safety
 /// The CPU must have the ISA.
 #[inline(always)]
-unsafe fn estimate<S: Simd>(grid: &Grid, cylinder: &Cylinder, position: Vec3, normal: Vec3) -> [f32; 3] {
+unsafe fn estimate<S: Simd>(
+    grid: &Grid,
+    cylinder: &Cylinder,
+    position: Vec3,
+    normal: Vec3,
+    noted: &mut Option<&mut Noted>,
+) -> [f32; 3] {
     // SAFETY: the caller vouches for the ISA. Rows are runs of photons, and
     // from each photon's place a full vector can be read in every column.
     unsafe {
@@ -118,6 +129,9 @@ unsafe fn estimate<S: Simd>(grid: &Grid, cylinder: &Cylinder, position: Vec3, no
                         let travel = V3::load(&columns, 3, i).dot(n);
                         let facing = V3::load(&columns, 9, i).dot(n);
                         let counts = inside.and(travel.lt(zero)).and(same_surface.le(facing));
+                        if let Some(noted) = noted {
+                            noted.note(i, counts.bits());
+                        }
                         let filter = one - radial2.max(zero).sqrt() * inverse_k;
                         let weight = S::F8::select(counts, filter, zero);
                         let power = V3::<S::F8>::load(&columns, 6, i);
@@ -175,7 +189,7 @@ mod tests {
 
     fn run(isa: Isa, grid: &Grid, cylinder: &Cylinder, p: Vec3, n: Vec3) -> [f32; 3] {
         let mut out = [[0.0; 3]];
-        kernel(isa)(grid, cylinder, &[p.to_array()], &[n.to_array()], &mut out);
+        kernel(isa)(grid, cylinder, &[p.to_array()], &[n.to_array()], &mut out, None);
         out[0]
     }
 
@@ -261,7 +275,7 @@ mod tests {
         let (position, normal) = (Vec3::new(0.5, 0.4, 0.1), Vec3::new(0.1, 0.2, 1.0).normalize());
         let (grid, cylinder) = (grid_of(&photons, 0.3), Cylinder::new(0.3, 0.25, 1.1));
         let mut e = [[0.0; 3]];
-        kernel(Isa::Portable)(&grid, &cylinder, &[position.to_array()], &[normal.to_array()], &mut e);
+        kernel(Isa::Portable)(&grid, &cylinder, &[position.to_array()], &[normal.to_array()], &mut e, None);
         let view = grid.photons.view();
         let weight = |i| cylinder.weight(&view, i, position, normal).unwrap_or(0.0);
         let sum: f64 = (0..photons.len()).map(|i| f64::from(weight(i) * view.power[0][i])).sum();

@@ -19,7 +19,6 @@ use crate::base::memory::{Reservation, try_par_collect_ok, try_to_vec, try_vec, 
 use crate::base::progress::{Progress, Stage};
 use glam::{DVec3, Vec3};
 use rayon::prelude::*;
-use std::ops::Range;
 
 /// Cell size as a fraction of the search radius.
 const CELL_SIZE: f64 = 0.5;
@@ -145,22 +144,6 @@ impl Grid {
         Ok((Grid { photons: Photons { columns, len }, frame, starts }, memory))
     }
 
-    /// Calls `visit` with the photons in all rows that a cylinder may overlap, each far from those before, until it
-    /// returns false or all have been visited.
-    pub(super) fn spread(&self, search: &Search, seed: u32, mut visit: impl FnMut(usize) -> bool) {
-        let rows = (search.z.0..search.z.1).flat_map(|z| (search.y.0..search.y.1).map(move |y| (y, z)));
-        let runs: Vec<Range<usize>> =
-            rows.map(|(y, z)| self.row(search, y, z)).map(|(first, end)| first..end).collect();
-        let total = runs.iter().map(Range::len).sum();
-        let stride = spreading_stride(total);
-        let places = (0..total).map(|k| (seed as usize + k * stride) % total);
-        for photon in places.filter_map(|place| runs.iter().cloned().flatten().nth(place)) {
-            if !visit(photon) {
-                return;
-            }
-        }
-    }
-
     /// Bytes held.
     pub(super) fn bytes(&self) -> usize {
         self.photons.columns.iter().map(|c| c.len() * 4).sum::<usize>() + self.starts.len() * 4
@@ -221,19 +204,6 @@ impl Grid {
         let (first, end) = (low.max(0.0) as usize, high.min(last) as usize + 1);
         (self.starts[row + first] as usize, self.starts[row + end] as usize)
     }
-}
-
-/// A stride that visits all `total` indices, wherever it starts, each far from the ones before: near the golden
-/// section.
-fn spreading_stride(total: usize) -> usize {
-    let gcd = |mut a: usize, mut b: usize| {
-        while b > 0 {
-            (a, b) = (b, a % b);
-        }
-        a
-    };
-    let golden = (0.618_034 * total as f64) as usize;
-    (golden.max(1)..).find(|&s| gcd(s, total) == 1).unwrap_or(1)
 }
 
 /// A cylinder in units of cells, slightly enlarged, and the rows that it may overlap.

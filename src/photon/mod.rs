@@ -17,6 +17,7 @@ mod emission;
 mod estimate;
 mod grid;
 mod guide;
+mod noted;
 mod radius;
 mod spot;
 mod trace;
@@ -30,6 +31,7 @@ use cylinder::Cylinder;
 use estimate::EstimateFn;
 use glam::Vec3;
 use grid::Grid;
+use noted::Noted;
 use rayon::prelude::*;
 use std::sync::{Arc, OnceLock};
 use std::time::Instant;
@@ -326,7 +328,16 @@ impl PhotonMap {
 
     /// [`estimate`](Self::estimate) for as many points as all three slices have, on this thread.
     pub fn estimate_block(&self, positions: &[[f32; 3]], normals: &[[f32; 3]], out: &mut [[f32; 3]]) {
-        (self.kernel)(&self.grid, &self.cylinder, positions, normals, out);
+        (self.kernel)(&self.grid, &self.cylinder, positions, normals, out, None);
+    }
+
+    /// [`estimate`](Self::estimate), with some of the photons that count.
+    fn estimate_and_note(&self, position: Vec3, normal: Vec3, noted: &mut Noted) -> [f32; 3] {
+        let mut out = [[0.0; 3]];
+        let (position, normal) = (&[position.to_array()], &[normal.to_array()]);
+        noted.clear();
+        (self.kernel)(&self.grid, &self.cylinder, position, normal, &mut out, Some(noted));
+        out[0]
     }
 
     /// The stored photons as the kernels see them, without a copy.

@@ -74,6 +74,8 @@ pub(in crate::lightmap) fn between(
         atlas.scene.occluded(&Ray::new(a.position, b.position - a.position).within(0.0, 1.0))
     };
     let mut split: HashMap<[GatherTexel; 4], bool> = HashMap::new();
+    // Texels in a row have the same group, several at a time.
+    let mut last = ([GatherTexel::NONE; 4], false);
     let mut found = Vec::new();
     for (i, texel) in map.texels_of(placement).enumerate() {
         if i % TEXELS_PER_CHECK == 0 {
@@ -89,14 +91,17 @@ pub(in crate::lightmap) fn between(
         }
         around[..n].sort_unstable();
         let from = Eye::at(atlas, map, backs, texel, above);
-        split.try_reserve(1).map_err(|e| Error::OutOfMemory(format!("{WALLS}: {e}")))?;
-        // Most groups of gather texels surround many texels, and are on one side. A group of a single gather texel, as
-        // on narrow charts, says nothing about the texel.
-        let is_split = *split.entry(around).or_insert_with(|| {
-            let mut pairs = (1..n).flat_map(|i| (0..i).map(move |j| (i, j)));
-            around[0] == around[n - 1] || pairs.any(|(i, j)| are_apart(eye_of(around[i]), eye_of(around[j])))
-        });
-        if is_split {
+        if last.0 != around {
+            split.try_reserve(1).map_err(|e| Error::OutOfMemory(format!("{WALLS}: {e}")))?;
+            // Most groups of gather texels surround many texels, and are on one side. A group of a single gather texel,
+            // as on narrow charts, says nothing about the texel.
+            let is_split = *split.entry(around).or_insert_with(|| {
+                let mut pairs = (1..n).flat_map(|i| (0..i).map(move |j| (i, j)));
+                around[0] == around[n - 1] || pairs.any(|(i, j)| are_apart(eye_of(around[i]), eye_of(around[j])))
+            });
+            last = (around, is_split);
+        }
+        if last.1 {
             for &s in around[..n].iter().filter(|&&s| are_apart(from, eye_of(s))) {
                 try_push(&mut found, (texel, s), WALLS)?;
             }

@@ -81,8 +81,8 @@ impl TexelLight<'_, LightMap> {
             return Variation::None;
         }
         let mut variation = Variation::None;
-        for (dx, dy) in AROUND {
-            match self.areas.neighbour(texel, dx, dy) {
+        for ((dx, dy), near) in AROUND.into_iter().zip(self.areas.neighbours(texel)) {
+            match near {
                 Some(s) if differ(sharp, of(s), DIFFERENCE) => return Variation::Some,
                 // Diagonal neighbours are missed at every second edge.
                 None if dx == 0 || dy == 0 => variation = Variation::Unknown,

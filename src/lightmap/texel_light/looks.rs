@@ -1,6 +1,6 @@
 //! Direct light of texels of the radiance map: a first look by a few points, and a closer one where it varies.
 
-use super::{AROUND, FEW, MAX_POINTS, Point, TexelLight, TilePoints, Wanted, add_to, differ, vary};
+use super::{FEW, MAX_POINTS, Point, TexelLight, TilePoints, Wanted, add_to, differ, vary};
 use crate::base::sampling::combine;
 use crate::direct::direct_light::{Lights, PointLight};
 use crate::lightmap::atlas::ids::{PerTexel, RadianceMap, RadianceTexel};
@@ -64,10 +64,7 @@ impl TexelLight<'_, RadianceMap> {
     pub(crate) fn needs_closer_look(&self, texel: RadianceTexel, looks: PerTexel<RadianceMap, Look>) -> bool {
         let look = &looks[texel];
         look.varies
-            || AROUND.into_iter().any(|(dx, dy)| {
-                let near = self.areas.neighbour(texel, dx, dy);
-                near.is_some_and(|near| differ(look.narrow, looks[near].narrow, DIFFERENCE))
-            })
+            || self.areas.neighbours(texel).flatten().any(|near| differ(look.narrow, looks[near].narrow, DIFFERENCE))
     }
 
     /// Computes direct light of texels of the radiance map by 16 or 64 points, weighted by their albedos; `None` if
