@@ -364,6 +364,50 @@ impl Copied {
     }
 }
 
+/// New indirect light changes at once what texels gather for themselves, and the sides of charts.
+#[test]
+fn what_a_change_of_light_changes_is_dirty() {
+    for (what, lightmap) in [("atrium", unbaked("atrium", 2, 3.0)), ("shelf", with_shelf(2, false))] {
+        let mut live = Live::new(&lightmap, &params(Mode::Position), &Progress::none()).unwrap();
+        let mut copied = Copied { pages: pages(&live, &lightmap), size: lightmap.info().width };
+        live.take_dirty(usize::MAX).unwrap();
+        let mut check = |live: &mut Live, when: &str| {
+            copied.refresh(live);
+            let now = pages(live, &lightmap);
+            let stale = (0..now.len()).filter(|&i| now[i] != copied.pages[i]).count();
+            assert_eq!(stale, 0, "{what}, {when}: texels that changed outside of all rectangles");
+        };
+        for i in 0..3 {
+            live.update(&camera(i), &RAYS).unwrap();
+            check(&mut live, "before");
+        }
+        for power in [0.3, 2.0] {
+            let light = match lightmap.scene().lights()[0] {
+                Light::Point { position, intensity } => {
+                    Light::Point { position, intensity: intensity.map(|i| power * i) }
+                }
+                Light::Rect { position, edge_u, edge_v, radiance } => {
+                    // Above the shelf first, then below it.
+                    let position = Vec3 { y: if power < 1.0 { 5.0 } else { 3.0 }, ..position };
+                    Light::Rect { position, edge_u, edge_v, radiance }
+                }
+                other => panic!("{other:?}"),
+            };
+            lightmap.scene().set_light(0, light).unwrap();
+            live.light_changed(0).unwrap();
+            check(&mut live, "when the light changes");
+            live.update(&camera(0), &RAYS).unwrap();
+            check(&mut live, "before there is new indirect light");
+            live.finish_relighting().unwrap();
+            check(&mut live, "when there is new indirect light");
+            for i in 0..3 {
+                live.update(&camera(i), &RAYS).unwrap();
+                check(&mut live, "after");
+            }
+        }
+    }
+}
+
 /// With a limit of bytes an application has what it has without one, a little later, and never more at a time: with and
 /// without work between updates, after a change of light and after a restored state.
 #[test]

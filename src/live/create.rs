@@ -1,6 +1,6 @@
 //! Creates live objects: photons and radiance map, and the texels of the lowest LOD.
 
-use super::blocks::{Block, BlockMap, Blocks, Tile};
+use super::blocks::{Block, BlockMap, Blocks, Rect, Tile};
 use super::cells::{Grid, Promotion};
 use super::choose::Chooser;
 use super::dirty::Dirty;
@@ -63,12 +63,14 @@ impl Live {
             + chooser.bytes()
             + dirty.bytes()
             + light.radiance.values.len() * size_of::<Vec3>()
-            // Marks, visible blocks, and the queues of blocks that wait to be shown or fade.
-            + map.tiles.len() * 21;
+            // Marks, visible blocks, the queues of blocks that wait to be shown or fade, and rectangles.
+            + map.tiles.len() * (21 + size_of::<Rect>());
         let memory = atlas.scene.device().memory().reserve(fixed, "the live state")?;
         let all_of = |t: &Tile| t.texels.len() * size_of::<Gathered>() + t.map_texels as usize * size_of::<Vec3>();
         let full: usize = map.tiles.iter().map(all_of).sum();
         let blocks = Blocks::new(map.tiles.len())?;
+        let mut alone = try_vec(blocks.len(), "texels on their own")?;
+        Display::find_alone(&map, &light.sides, &mut alone);
         let mut waiting = VecDeque::new();
         waiting.try_reserve_exact(blocks.len()).map_err(|_| Error::OutOfMemory("the queue of blocks".into()))?;
         Ok(Live {
@@ -77,6 +79,7 @@ impl Live {
             reading: ReadingTime::default(),
             choosing_seconds: 0.0,
             last_dirty_bytes: 0,
+            alone,
             is_waiting: try_vec(blocks.len(), "the queue of blocks")?,
             waiting,
             fading: try_with_capacity(blocks.len(), "the queue of blocks")?,

@@ -5,7 +5,7 @@
 //! The file is long because the shown light has one owner: indirect light, fades and direct light are written here alone.
 
 use super::blocks::{BLOCK_TEXELS, BlockMap, Blocks, DirectTile, Rect, TILE};
-use super::relight::Illumination;
+use super::relight::{Illumination, Sides};
 use super::{SHOWN_AT_ONCE, in_parts};
 use crate::base::error::{Error, Result};
 use crate::base::memory::{try_filled, try_to_vec, try_vec, try_with_capacity};
@@ -522,9 +522,21 @@ impl Display {
             for (b, values) in computed(values, BLOCK_TEXELS, some) {
                 let amount = replace(&mut self.coarse, values);
                 note(self.changed(map, b, amount));
+                self.keep_correction(map, b);
             }
         }
         self.scratch = scratch;
+    }
+
+    /// A tile that is current is not corrected, nor when the next epoch begins: what has changed around it since is no
+    /// change of light.
+    fn keep_correction(&mut self, map: &BlockMap, b: u32) {
+        let is_current = self.direct_tile(b).is_some_and(|(_, is_current)| is_current);
+        if is_current && !self.coarse_of_tile.is_empty() {
+            for &s in &map.tiles[b as usize].texels {
+                self.coarse_of_tile[s.index()] = self.coarse[s.index()];
+            }
+        }
     }
 
     /// Interpolates the coarse direct light of a block's texels above the lowest LOD.
@@ -538,14 +550,10 @@ impl Display {
     /// Takes over the direct light of a block at full resolution; returns the rectangle that changes, and by how many
     /// bytes the display has grown.
     pub fn take_direct(&mut self, map: &BlockMap, b: u32, tile: DirectTile) -> (Changed, isize) {
-        if !self.coarse_of_tile.is_empty() {
-            for &s in &map.tiles[b as usize].texels {
-                self.coarse_of_tile[s.index()] = self.coarse[s.index()];
-            }
-        }
         self.tile_epochs[b as usize] = self.epoch;
         let grown = tile.bytes() as isize;
         let old = self.tiles[b as usize].replace(Arc::new(tile));
+        self.keep_correction(map, b);
         // Shadows are the most visible of all changes.
         (self.changed(map, b, 1.0), grown - old.map_or(0, |t| t.bytes() as isize))
     }
@@ -560,6 +568,21 @@ impl Display {
         let tile = &map.tiles[block as usize];
         let (page, rect) = in_light_map(map, tile.placement, &tile.rect.grown(1));
         Changed { page, rect, block, amount }
+    }
+
+    /// Puts the rectangle of a block's texels that gather for themselves, in the light map, into its place in `rects`: it
+    /// is empty where there are none. These texels change at once when indirect light does.
+    pub fn find_alone(map: &BlockMap, sides: &Sides, rects: &mut [Rect]) {
+        rects.fill(Rect::default());
+        let atlas = &map.atlas;
+        for &texel in sides.upsampling.alone() {
+            let placement = atlas.map.placement_of(&atlas.charts, texel);
+            let at = atlas.gather.layout.texel_coord(placement, atlas.texel_local(placement, texel));
+            let rect = &mut rects[map.block_at(placement, at[0] as i32, at[1] as i32) as usize];
+            let (x, y) = atlas.map.position(texel);
+            let own = Rect { x0: x, y0: y, x1: x + 1, y1: y + 1 };
+            *rect = if rect.area() == 0 { own } else { rect.union(&own) };
+        }
     }
 
     /// The page and the part of it that a change of a block's light may change: within the blur's radius, and one texel

@@ -39,7 +39,7 @@ use crate::lightmap::BakeParams;
 use crate::lightmap::indirect::gather::Gathered;
 use crate::scene::{Light, Scene};
 use batch::{Background, Batch, Item};
-use blocks::{BlockStatus, Blocks};
+use blocks::{BlockStatus, Blocks, Rect};
 use cells::{Grid, Promotion};
 use choose::{Choice, Chooser};
 use dirty::Dirty;
@@ -88,6 +88,8 @@ pub struct Live {
     choosing_seconds: f64,
     /// Bytes that the last update gave out.
     last_dirty_bytes: u64,
+    /// Rectangle of each block's texels that gather for themselves, in the light map.
+    alone: Vec<Rect>,
     /// Queue of blocks whose shown light must be refreshed.
     waiting: VecDeque<u32>,
     is_waiting: Vec<bool>,

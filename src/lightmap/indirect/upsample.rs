@@ -166,6 +166,11 @@ impl Upsampling {
         2 * self.alone.len() as u64
     }
 
+    /// Returns the texels with a fallback gather, in ascending order.
+    pub(crate) fn alone(&self) -> &[LightTexel] {
+        &self.alone
+    }
+
     /// Interpolates a gather map's `values` at a texel of the light map, or returns the light of its fallback gather
     /// from `own` ([`OwnLight`]).
     #[inline]
