@@ -140,17 +140,19 @@ impl Live {
         let device = self.device();
         let seconds = budget.milliseconds as f64 * 1e-3;
         let end = (seconds > 0.0).then(|| start + Duration::from_secs_f64(seconds));
+        let mut kept = 0.0;
         let result = self.collect(&mut stats).and_then(|()| {
             self.take_new_light()?;
             if !budget.is_nothing() {
-                let spare = Duration::from_secs_f64(self.choosing_seconds + self.reading_seconds(budget));
+                kept = self.reading_seconds(budget);
+                let spare = Duration::from_secs_f64(self.choosing_seconds + kept);
                 let end = end.map(|e| e.checked_sub(spare).unwrap_or(start));
                 // Enters the pool once per update: each entry takes as long as a hundred rays.
                 device.install(|| self.spend(end, camera, budget, &mut stats))?;
             }
             Ok(())
         });
-        self.give_out(budget, end);
+        self.give_out(budget, end, kept);
         let result = result.and_then(|()| self.start_background(camera));
         self.total_rays += stats.rays;
         result?;

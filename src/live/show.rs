@@ -111,13 +111,14 @@ impl Live {
     }
 
     /// Gives out rectangles of changed texels, at most as many bytes as the budget allows and, if there is a limit, as
-    /// can be read until `end`, or in the time that was kept free for that.
-    pub(super) fn give_out(&mut self, budget: &Budget, end: Option<Instant>) {
+    /// can be read until `end`, or in the time in seconds that was `kept` free for that. (What changed while nothing was
+    /// expected to comes with the next update: read with what changed, it overran 4 ms by 1.0 ms at p99 in Sponza.)
+    pub(super) fn give_out(&mut self, budget: &Budget, end: Option<Instant>, kept: f64) {
         let start = Instant::now();
         let most = budget.max_dirty_bytes;
         let limit = (most > 0).then(|| {
             let Some(end) = end else { return most };
-            let left = end.saturating_duration_since(start).as_secs_f64().max(self.reading_seconds(budget));
+            let left = end.saturating_duration_since(start).as_secs_f64().max(kept);
             let readable = (left / self.reading.per_texel()) as u64 * TEXEL_BYTES;
             readable.clamp(LEAST_BYTES, most)
         });
