@@ -48,7 +48,8 @@ class LightDesc(Structure):
 
 class LightmapDesc(Structure):
     _fields_ = [("struct_size", c_uint32), ("texels_per_unit", c_float), ("page_size", c_uint32), ("padding", c_uint32),
-                ("gather_divisor", c_uint32), ("radiance_divisor", c_uint32), ("both_sides", c_uint32)]
+                ("gather_divisor", c_uint32), ("radiance_divisor", c_uint32), ("both_sides", c_uint32),
+                ("seen_from_count", c_uint32), ("seen_from", c_void_p)]
 
 
 class LightmapInfo(Structure):
@@ -57,7 +58,8 @@ class LightmapInfo(Structure):
                 ("reduced_charts", c_uint32), ("both_sided_charts", c_uint32), ("texels_per_unit", c_float),
                 ("texels", c_uint64), ("gather_texels", c_uint64), ("radiance_texels", c_uint64), ("bytes", c_uint64),
                 ("uv_out_of_range", c_uint64), ("uv_degenerate", c_uint64), ("uv_overlapping_texels", c_uint64),
-                ("unwrap_seconds", ctypes.c_double), ("back_texels", c_uint64)]
+                ("unwrap_seconds", ctypes.c_double), ("back_texels", c_uint64), ("unseen_charts", c_uint64),
+                ("spared_texels", c_uint64)]
 
 
 PROGRESS = ctypes.CFUNCTYPE(c_int32, c_void_p, c_float, c_char_p)
