@@ -142,13 +142,14 @@ impl Lightmap {
         checkpoint: Option<&Checkpoint>,
         progress: &Progress,
     ) -> Result<(Light, BakeStats)> {
-        let run = |pass: u32, backs: Option<&[bool]>| {
+        let run = |pass: u32, all: Option<&Passes>| {
             let params = &passes::params_of(params, pass);
             if let Some(c) = checkpoint {
                 c.begin_pass(pass);
             }
             let (atlas, range) = (&self.atlas, range.clone());
-            Bake { atlas, params, plan, direct, range, progress, checkpoint, known_backs: backs }.run()
+            let (known_backs, held) = (all.map(|all| &all.light.backs[..]), all.map_or(0, Passes::bytes));
+            Bake { atlas, params, plan, direct, range, progress, checkpoint, known_backs, held }.run()
         };
         if params.passes == 1 && params.target_error == 0.0 {
             let (light, stats) = run(0, None)?;
@@ -167,7 +168,7 @@ impl Lightmap {
             }
             progress.set_part(all.count as f32 / needed as f32, (all.count + 1) as f32 / needed as f32);
             // All passes show the same sides.
-            let (light, stats) = run(all.count, Some(&all.light.backs))?;
+            let (light, stats) = run(all.count, Some(&all))?;
             device.install(|| all.add(&light, &stats, range));
         }
     }
@@ -223,6 +224,8 @@ struct Bake<'a, 'p> {
     checkpoint: Option<&'a Checkpoint<'a>>,
     /// The charts that show their backs, if an earlier pass has decided it.
     known_backs: Option<&'a [bool]>,
+    /// Bytes that earlier passes hold.
+    held: usize,
 }
 
 /// The gather map after blur and filling.
@@ -261,6 +264,9 @@ impl<'p> Bake<'_, 'p> {
             _memory: memory,
         };
         self.compose(scene, indirect.as_ref(), &mut light, &mut stats)?;
+        drop(indirect);
+        let bytes = light.bytes();
+        light._memory.shrink(bytes);
         stats.seconds = start.elapsed().as_secs_f64();
         Ok((light, stats))
     }
@@ -334,9 +340,10 @@ impl<'p> Bake<'_, 'p> {
         if self.plan.runs(left_out::INDIRECT) {
             bytes += l.radiance.len() * 12 + l.gather.len() * GATHER_BYTES;
         }
-        if self.params.memory_budget != 0 && bytes as u64 > self.params.memory_budget {
+        let all = bytes + self.held;
+        if self.params.memory_budget != 0 && all as u64 > self.params.memory_budget {
             return Err(Error::OutOfMemory(format!(
-                "the bake's buffers take {bytes} bytes, more than memory_budget {}",
+                "the bake's buffers take {all} bytes, more than memory_budget {}",
                 self.params.memory_budget
             )));
         }

@@ -386,6 +386,19 @@ struct Light {
     _memory: Reservation,
 }
 
+impl Light {
+    /// Returns the size of the buffers.
+    fn bytes(&self) -> usize {
+        size_of_val(&self.direct[..])
+            + size_of_val(&self.indirect[..])
+            + size_of_val(&self.directional[..])
+            + size_of_val(&self.error[..])
+            + size_of_val(&self.state[..])
+            + size_of_val(&self.radiance.values[..])
+            + self.backs.len()
+    }
+}
+
 /// Light maps of a scene: layout, texels and, after [`bake`](Lightmap::bake), light.
 pub struct Lightmap {
     atlas: Arc<Atlas>,

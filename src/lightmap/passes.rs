@@ -53,6 +53,11 @@ impl Passes {
         Ok(Passes { light, stats, count: 1, squares: try_vec(range.len(), "the spread of passes")?, _memory })
     }
 
+    /// Returns the size of the buffers.
+    pub fn bytes(&self) -> usize {
+        self.light.bytes() + size_of_val(&self.squares[..])
+    }
+
     /// Adds a pass (Welford's update of mean and squared differences).
     pub fn add(&mut self, new: &Light, stats: &BakeStats, range: &Range<usize>) {
         self.count += 1;
@@ -133,6 +138,7 @@ impl Passes {
         self.stats.passes = self.count;
         if self.count > 1 {
             self.stats.error = self.error(range);
+            self.light._memory.grow(self.light.direct.len() * size_of::<Vec3>(), "the error of texels")?;
             self.light.error = try_vec(self.light.direct.len(), "the error of texels")?;
             // Squares of the strongest light are infinite.
             let most = Vec3::splat(MOST_LIGHT);
