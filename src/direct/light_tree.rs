@@ -9,7 +9,8 @@
 //! visited once for all of them.
 //!
 //! A binary tree is collapsed to nodes of eight children, which are weighed at a time: fewer levels, each of which
-//! divides by what it knows better. (MEASURED)
+//! divides by what it knows better. (46,000 bright patches of Sponza: 0.44 of the time that a binary tree took, whose
+//! nodes were weighed eight at a time too, and no more noise: docs/experiments.md#many-lights.)
 
 use super::light_node::{Bounds, Node, WIDTH};
 use crate::base::error::Result;
