@@ -126,7 +126,8 @@ simd::kernel! {
     fn descend<S>(nodes: &[Node], receiver: [Vec3; 2], samples: (u32, f32), descent: &mut Descent) {
         let (n, offset) = samples;
         let Descent { level, next, importances, lights } = descent;
-        (level.clear(), lights.clear());
+        level.clear();
+        lights.clear();
         let (from, to) = (-f64::from(offset), f64::from(n) - f64::from(offset));
         if !nodes.is_empty() {
             level.push(Part { node: 0, from, to, first: ceil(from), end: ceil(to) });

@@ -7,7 +7,6 @@
 //! them, Sponza showed 8 % error for a second): sides change with all photons only.
 
 use super::Live;
-use super::display::{Changed, Display};
 use crate::base::error::{Error, Result, invalid_argument};
 use crate::base::gate::{Closed, Gate};
 use crate::base::memory::{try_collect, try_vec};
@@ -318,27 +317,6 @@ impl Live {
         self.mark_new_light(&before);
         self.chooser.note_all(&self.context, self.blocks.status());
         Ok(())
-    }
-
-    /// Marks what new indirect light changes at once: what texels gather for themselves, and all of charts that show
-    /// their other side.
-    fn mark_new_light(&mut self, before: &Illumination) {
-        let (map, light) = (self.context.map.clone(), self.context.light.clone());
-        let (old, new) = (&before.sides.backs, &light.sides.backs);
-        if old != new {
-            Display::find_alone(&map, &light.sides, &mut self.alone);
-        }
-        for (b, tile) in (0u32..).zip(&map.tiles) {
-            let chart = map.atlas.gather.layout.chart_of(tile.placement).index();
-            let (page, widest) = self.display.widest_rect(&map, b);
-            let alone = self.alone[b as usize];
-            if old.get(chart) != new.get(chart) {
-                self.dirty.add(Changed { page, rect: widest, block: b, amount: 1.0 });
-            } else if alone.area() > 0 {
-                let rect = alone.grown(map.atlas.padding as i32);
-                self.dirty.add(Changed { page, rect, block: b, amount: 0.5 });
-            }
-        }
     }
 
     /// Keeps the direct light of charts whose sides have not changed valid: new indirect light may turn other charts

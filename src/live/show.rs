@@ -1,6 +1,8 @@
 //! Shows computed light: blocks that wait for the display, and blocks that fade from one LOD to the next.
 
 use super::dirty::{LEAST_BYTES, TEXEL_BYTES};
+use super::display::{Changed, Display};
+use super::relight::Illumination;
 use super::{Budget, Live, LiveStats, Mode, PASS};
 use std::time::Instant;
 
@@ -13,6 +15,27 @@ impl Live {
         self.dirty.mark_all();
         self.promotion.count(&self.context.map.tiles, self.blocks.status());
         self.chooser.note_all(&self.context, self.blocks.status());
+    }
+
+    /// Marks what new indirect light changes at once: what texels gather for themselves, and all of charts that show
+    /// their other side.
+    pub(super) fn mark_new_light(&mut self, before: &Illumination) {
+        let (map, light) = (self.context.map.clone(), self.context.light.clone());
+        let (old, new) = (&before.sides.backs, &light.sides.backs);
+        if old != new {
+            Display::find_alone(&map, &light.sides, &mut self.alone);
+        }
+        for (b, tile) in (0u32..).zip(&map.tiles) {
+            let chart = map.atlas.gather.layout.chart_of(tile.placement).index();
+            let (page, widest) = self.display.widest_rect(&map, b);
+            let alone = self.alone[b as usize];
+            if old.get(chart) != new.get(chart) {
+                self.dirty.add(Changed { page, rect: widest, block: b, amount: 1.0 });
+            } else if alone.area() > 0 {
+                let rect = alone.grown(map.atlas.padding as i32);
+                self.dirty.add(Changed { page, rect, block: b, amount: 0.5 });
+            }
+        }
     }
 
     /// Shows a block that completed a step: at once, or, in position-based mode, together with its cell.

@@ -561,7 +561,7 @@ fn lightmap(w: &W, s: &mut Source) {
     let mut boxes = [0.0f32; 12];
     boxes.fill_with(|| if s.one_in(9) { s.float() } else { s.unit() });
     if s.one_in(2) {
-        boxes[3..6].iter_mut().chain(&mut boxes[9..12]).for_each(|upper| *upper += 1.0);
+        [3, 4, 5, 9, 10, 11].into_iter().for_each(|upper| boxes[upper] += 1.0);
     }
     desc.seen_from = if s.one_in(3) { boxes.as_ptr() } else { null() };
     desc.seen_from_count = if s.one_in(20) && desc.seen_from.is_null() { s.integer() } else { s.below(3) as u32 };
