@@ -24,6 +24,9 @@
 // several threads want a quiet machine. Embree gets its rays ready in its own layout and keeps its results in its own
 // packets: only the copy into the structure that it traces is timed. Both sides run with denormals flushed to zero.
 //
+// If CMake knows BAKELITE_TINYBVH_DIR, the folder of tiny_bvh.h, tinybvh's trees trace the same rays too, one by one: as
+// AVX2 code, whatever --isa says, with its own triangle test, which is not watertight.
+//
 // "default", "high" and "robust" are Embree's scenes of default quality, with RTC_BUILD_QUALITY_HIGH, and with
 // RTC_SCENE_FLAG_ROBUST. Commits are compared like with like: its high with our BK_BUILD_QUALITY_HIGH, the others with
 // our default; ratios of bytes and SAH cost are ours to Embree's, the less the better.
@@ -31,16 +34,18 @@
 // Disagreements are counted against Embree's robust rtcIntersect1 or rtcOccluded1; judge.h says by which classes. After
 // a real one, for which the oracle agrees with Embree, the exit code is 1.
 //
-// | file   | what                                          |
-// |--------|-----------------------------------------------|
-// | scene  | one scene on both sides                       |
-// | rays   | the kinds of rays, and the ways to trace them |
-// | judge  | disagreements                                 |
-// | build  | time, memory and SAH cost of commits          |
-// | report | CSV and Markdown                              |
+// | file    | what                                          |
+// |---------|-----------------------------------------------|
+// | scene   | one scene on both sides                       |
+// | rays    | the kinds of rays, and the ways to trace them |
+// | judge   | disagreements                                 |
+// | tinybvh | other ray tracers                             |
+// | build   | time, memory and SAH cost of commits          |
+// | report  | CSV and Markdown                              |
 
 #include "build.h"
 #include "report.h"
+#include "tinybvh.h"
 
 #include <atomic>
 #include <cstdlib>
@@ -267,16 +272,54 @@ size_t run_kind(Kind &k, const Scene &s, const EmbreeScenes &embree, const Optio
     return c.of[Real];
 }
 
+// Runs a peer on one kind of ray, prints its lines and adds its rows. What its hits differ in from ours is counted, not
+// judged: ours have been judged against Embree's.
+void run_peer(const Kind &k, Peer &peer, const Options &o, Row row, std::vector<Row> &rows) {
+    const size_t count = k.rays.rays.size();
+    peer.prepare(k);
+    for (const unsigned threads : o.threads) {
+        std::vector<double> our_times;
+        const EmbreeRun way = [&peer](RTCScene, size_t begin, size_t end) { peer.run(begin, end); };
+        const Rate r = compare(k, way, nullptr, threads, o.pairs, our_times);
+        size_t hits = 0, distances = 0;
+        for (size_t i = 0; i < count; i++) {
+            const bool ours = k.occlusion ? k.occluded[i] != 0 : k.hits[i].triangle != BK_NONE;
+            if (ours != peer.is_hit(i)) {
+                hits++;
+            } else if (!k.occlusion && ours && std::abs(peer.t(i) / k.hits[i].t - 1) > 1e-4f) {
+                distances++;
+            }
+        }
+        row.what = k.name;
+        row.unit = "Mrays/s";
+        row.threads = threads;
+        row.way = peer.name();
+        row.mode = PEER;
+        row.ours = double(count) / median(our_times) * 1e-6;
+        row.embree = r.mrays;
+        row.fastest = r.fastest;
+        row.ratio = r.ratio;
+        rows.push_back(row);
+        std::fprintf(o.text(), "  %-32s %8.3f %7.2fx   %u thread%s; hit or miss differs: %zu, t by 1e-4: %zu\n",
+                     row.way.c_str(), row.embree, row.ratio, threads, threads == 1 ? "" : "s", hits, distances);
+    }
+}
+
 size_t run_rays(const Scene &s, const Setup &setup, const Options &o, const Row &row, std::vector<Row> &rows) {
     const EmbreeScenes embree(s, setup);
     std::fprintf(o.text(), "%-34s", ("Mrays/s, our " + row.build + " build").c_str());
-    for (const char *mode : MODE_NAMES) std::fprintf(o.text(), " %17s  ", (std::string("Embree ") + mode).c_str());
+    for (int mode = 0; mode < MODES; mode++) {
+        std::fprintf(o.text(), " %17s  ", (std::string("Embree ") + MODE_NAMES[mode]).c_str());
+    }
     std::fprintf(o.text(), "\n");
+    const std::vector<std::unique_ptr<Peer>> others = peers(s);
     size_t real = 0;
     for (size_t kind = 0; kind < KINDS; kind++) {
         Kind k;
         make_kind(k, kind, s, o.rays, o.seed);
         real += run_kind(k, s, embree, o, row, rows);
+        for (const std::unique_ptr<Peer> &peer : others) run_peer(k, *peer, o, row, rows);
+        if (!others.empty()) std::fprintf(o.text(), "\n");
     }
     return real;
 }

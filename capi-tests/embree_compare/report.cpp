@@ -56,6 +56,30 @@ const Row *best(const std::vector<Row> &rows, const std::string &at, const std::
     return found;
 }
 
+// Ours and those of each peer, if there are any.
+void print_peers(std::FILE *out, const std::vector<Row> &rows, const std::vector<std::string> &lines) {
+    std::vector<std::string> names;
+    for (const Row &r : rows) {
+        if (r.mode == PEER && std::find(names.begin(), names.end(), r.way) == names.end()) names.push_back(r.way);
+    }
+    for (const std::string &name : names) {
+        std::string head = PLACE_HEAD, rule = PLACE_RULE;
+        for (const char *kind : KIND_NAMES) head += std::string(" ") + kind + " |", rule += "---|";
+        std::fprintf(out, "\nMrays/s of %s, and ours to them.\n\n%s\n%s\n", name.c_str(), head.c_str(), rule.c_str());
+        for (const std::string &at : lines) {
+            std::string line = at;
+            for (const char *kind : KIND_NAMES) {
+                const auto is_it = [&](const Row &r) {
+                    return r.mode == PEER && r.way == name && r.what == kind && place(r) == at;
+                };
+                const auto r = std::find_if(rows.begin(), rows.end(), is_it);
+                line += " " + (r == rows.end() ? "" : number(r->embree, 2) + ", " + number(r->ratio, 2)) + " |";
+            }
+            std::fprintf(out, "%s\n", line.c_str());
+        }
+    }
+}
+
 void print_rays(std::FILE *out, const std::vector<Row> &rows) {
     const std::vector<std::string> lines = places(rows, "Mrays/s");
     if (lines.empty()) return;
@@ -84,6 +108,7 @@ void print_rays(std::FILE *out, const std::vector<Row> &rows) {
         }
         std::fprintf(out, "%s\n", line.c_str());
     }
+    print_peers(out, rows, lines);
     Counts sum;
     size_t rays = 0;
     std::vector<std::string> seen;

@@ -8,9 +8,9 @@
 
 #include <utility>
 
-// How Embree builds: its default, RTC_BUILD_QUALITY_HIGH, RTC_SCENE_FLAG_ROBUST.
-enum Mode { DEFAULT, HIGH, ROBUST, MODES };
-inline const char *const MODE_NAMES[MODES] = {"default", "high", "robust"};
+// How Embree builds: its default, RTC_BUILD_QUALITY_HIGH, RTC_SCENE_FLAG_ROBUST. Rows of a peer are not Embree's.
+enum Mode { DEFAULT, HIGH, ROBUST, MODES, PEER = MODES };
+inline const char *const MODE_NAMES[] = {"default", "high", "robust", "peer"};
 
 // What both sides are to use.
 struct Setup {
