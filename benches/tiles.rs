@@ -12,6 +12,7 @@ mod common;
 
 use bakelite::bvh::BuildOptions;
 use bakelite::io::load;
+use bakelite::sampling::uniform;
 use bakelite::trace::{PACKET_SIZE, Packet, RawHit, Ray};
 use bakelite::{Device, DeviceOptions, Isa, Progress, Scene, SceneData};
 use common::{areas, median, tile};
@@ -59,8 +60,9 @@ fn compare(tiles: &[Vec<Ray>], mut first: impl FnMut(&[Ray]), mut second: impl F
     (median(times), median(ratios))
 }
 
-/// Shadow rays of tiles of 16 × 16 texels to points off other surfaces.
-fn shadows(scene: &Scene, areas: &[f32], spacing: f32, label: &str) {
+/// Shadow rays of tiles of 16 × 16 texels to points off other surfaces, or to random places in cubes there, of a size in
+/// tiles.
+fn shadows(scene: &Scene, areas: &[f32], spacing: f32, size: f32, label: &str) {
     let tiles: Vec<Vec<Ray>> = (0..1500)
         .map(|i| {
             let lamp = {
@@ -68,7 +70,12 @@ fn shadows(scene: &Scene, areas: &[f32], spacing: f32, label: &str) {
                 Vec3::from(r.origin) + 0.5 * Vec3::from(r.direction)
             };
             let texels = tile(scene, areas, i, 16, 1, spacing);
-            texels.iter().map(|r| Ray::new(r.origin.into(), lamp - Vec3::from(r.origin)).within(0.0, 1.0)).collect()
+            let ray = |(k, r): (usize, &Ray)| {
+                let at = |dimension: u32| uniform(256 * i + k as u32, dimension, 7) - 0.5;
+                let end = lamp + 16.0 * spacing * size * Vec3::new(at(0), at(1), at(2));
+                Ray::new(r.origin.into(), end - Vec3::from(r.origin)).within(0.0, 1.0)
+            };
+            texels.iter().enumerate().map(ray).collect()
         })
         .collect();
     let (mut a, mut b) = (vec![0; 256], vec![0; 256]);
@@ -113,7 +120,9 @@ fn main() {
                 format!("{} {} {kind}", Path::new(file).file_stem().unwrap().to_string_lossy(), isa.name())
             };
             if is_wanted(LAMP, &is_kind) {
-                shadows(&scene, &areas, spacing, &label(LAMP));
+                for size in [0.0, 0.25, 1.0, 4.0] {
+                    shadows(&scene, &areas, spacing, size, &label(&format!("{LAMP} {size}")));
+                }
             }
             for (side, per_texel) in KINDS.into_iter().filter(|&kind| is_wanted(&name_of(kind), &is_kind)) {
                 let n = (400_000 / (side * side * per_texel)).max(8);

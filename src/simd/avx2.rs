@@ -18,6 +18,15 @@ impl Simd for Avx2 {
         // SAFETY: forwarded.
         unsafe { pick(masks, numbers, count, bit, out) }
     }
+
+    #[inline(always)]
+    unsafe fn column(masks: &[u8; 32], bit: u32) -> u32 {
+        // SAFETY: the caller vouches for the ISA.
+        unsafe {
+            let shift = _mm_cvtsi32_si128(7 - bit as i32);
+            _mm256_movemask_epi8(_mm256_sll_epi16(_mm256_loadu_si256(masks.as_ptr().cast()), shift)) as u32
+        }
+    }
 }
 
 /// [`Simd::pick`]: the bits of 32 masks by `vpmovmskb`, then eight numbers at a time by a table of shuffles.

@@ -20,6 +20,12 @@ impl Simd for Avx512 {
         // SAFETY: forwarded.
         unsafe { pick(masks, numbers, count, bit, out) }
     }
+
+    #[inline(always)]
+    unsafe fn column(masks: &[u8; 32], bit: u32) -> u32 {
+        // SAFETY: the caller vouches for the ISA.
+        unsafe { _mm256_test_epi8_mask(_mm256_loadu_si256(masks.as_ptr().cast()), _mm256_set1_epi8(1 << bit)) }
+    }
 }
 
 /// [`Avx512`] with VBMI2, by which streams make their lists.
@@ -47,6 +53,12 @@ impl Simd for Avx512Vbmi2 {
             }
         }
         n
+    }
+
+    #[inline(always)]
+    unsafe fn column(masks: &[u8; 32], bit: u32) -> u32 {
+        // SAFETY: the caller vouches for the ISA.
+        unsafe { _mm256_test_epi8_mask(_mm256_loadu_si256(masks.as_ptr().cast()), _mm256_set1_epi8(1 << bit)) }
     }
 }
 

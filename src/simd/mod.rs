@@ -172,6 +172,12 @@ pub(crate) trait Simd: Copy {
     /// which those from `count` on are 0; `numbers` for reading, and `out` for writing, `count` numbers rounded up
     /// likewise. `out` may overlap what lies behind the `count` numbers.
     unsafe fn pick(masks: *const u8, numbers: *const u16, count: usize, bit: u32, out: *mut u16) -> usize;
+
+    /// Which of 32 mask bytes have the bit `bit`: bit i for the i-th.
+    ///
+    /// # Safety
+    /// The CPU must have the ISA.
+    unsafe fn column(masks: &[u8; 32], bit: u32) -> u32;
 }
 
 /// Asks for the cache line at `p`, which need not be valid.

@@ -27,6 +27,11 @@ impl Simd for Portable {
         }
         n
     }
+
+    #[inline(always)]
+    unsafe fn column(masks: &[u8; 32], bit: u32) -> u32 {
+        masks.iter().enumerate().fold(0, |set, (i, mask)| set | u32::from(mask >> bit & 1) << i)
+    }
 }
 
 #[derive(Clone, Copy)]

@@ -5,6 +5,7 @@
 //! every ISA agree on coincident triangles.
 
 pub mod baseline;
+mod beams;
 mod compact;
 pub(crate) mod filter;
 #[cfg(any(test, feature = "reference"))]

@@ -15,6 +15,8 @@
 //! misses. What a node or a leaf costs beside its tests (fetching it, waiting for it, guessing what comes next) is paid
 //! once per list.
 //!
+//! Rays to any hit that go the same way are faster in packs: [`beams`].
+//!
 //! Hits are those of [`single`](super::single), bit for bit: boxes and triangles are tested by the same arithmetic, and
 //! which of a leaf's hits is the closest does not depend on the order of visits. Rays that need special treatment in a
 //! test, rays of octants that few rays have, and rays whose lists find no room are traced one by one.
@@ -22,7 +24,8 @@
 use super::stream_rays::{ChildBoxes, Group, MAX_RAYS, Room, sort};
 use super::tree::{Leaf, RaySetup, Tree, beyond};
 use super::triangle::{Projected, V3, accurate_distance};
-use super::{RawHit, Ray, single};
+use super::{RawHit, Ray, beams, single};
+use crate::base::geometry::NONE;
 use crate::bvh::layout::{ChildRef, STACK_SIZE};
 use crate::simd::{Eight, Lanes, Mask, Simd};
 use std::mem::MaybeUninit;
@@ -54,6 +57,18 @@ pub(super) unsafe fn stream<S: Simd, T: Tree, const ANY: bool>(
             if group.len() < LEAST {
                 room.leave_alone(group.begin()..group.end());
                 continue;
+            }
+            if ANY && let Some(tree) = tree.whole() {
+                let Room { order, shafts, packs, .. } = &mut *room;
+                let number = |place: usize| order[group.begin() + place] as usize;
+                let done = |place: usize, is_hit: bool| {
+                    let triangle = if is_hit { 0 } else { NONE };
+                    done(first + number(place), RawHit { triangle, ..RawHit::MISS });
+                };
+                // SAFETY: forwarded.
+                if unsafe { beams::trace::<S>(tree, &group, |place| &rays[number(place)], shafts, packs, done) } {
+                    continue;
+                }
             }
             // SAFETY: the rays of the group have been sorted into it; the caller vouches for the ISA.
             unsafe {

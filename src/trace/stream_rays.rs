@@ -1,6 +1,7 @@
 //! Rays of a [stream](super::stream), prepared for its tests: sorted by octant and by the longest axis of their
 //! directions, then set up eight at a time.
 
+use super::beams::{self, Pack, Shaft};
 use super::tree::{BEYOND, FARTHEST_ORIGIN, OFFSET_ERROR, STEEP, Tree};
 use super::triangle::{AXES, GRAZING, Shear, barycentrics};
 use super::{RawHit, Ray};
@@ -101,8 +102,8 @@ impl Group {
 
 /// The planes of a node's children that rays of an octant reach first and last, by axis.
 pub(super) struct ChildBoxes<L> {
-    near: [L; 3],
-    far: [L; 3],
+    pub near: [L; 3],
+    pub far: [L; 3],
 }
 
 impl<L: Lanes> ChildBoxes<L> {
@@ -159,6 +160,9 @@ pub(super) struct Room {
     /// Rays of a group.
     pub slabs: Vec<Slab>,
     pub targets: Vec<Target>,
+    /// Rays of a group in packs.
+    pub shafts: Vec<Shaft>,
+    pub packs: Vec<Pack>,
     /// Boxes that the rays of a list hit, bit i for child i.
     pub masks: Vec<u8>,
     /// Lists of numbers of rays within the group.
@@ -191,6 +195,8 @@ impl Room {
             order: zeros(MAX_RAYS + 8)?,
             slabs: zeros(MAX_RAYS)?,
             targets: zeros(MAX_RAYS)?,
+            shafts: zeros(MAX_RAYS / beams::SIZE + 3)?,
+            packs: zeros(beams::PACKS)?,
             masks: zeros(MAX_RAYS + 64)?,
             numbers: zeros(NUMBERS)?,
             alone: {
@@ -273,16 +279,17 @@ impl Room {
 #[inline(always)]
 pub(super) unsafe fn sort<S: Simd>(rays: &[Ray], room: &mut Room) -> [usize; SPECIAL + 2] {
     let mut counts = [0usize; SPECIAL + 1];
-    for (rays, keys) in rays.chunks(8).zip(room.keys.chunks_mut(8)) {
+    for (rays, keys) in rays.chunks(8).zip(room.keys.chunks_exact_mut(8)) {
         let ray = |i: usize| std::ptr::from_ref(&rays[i.min(rays.len() - 1)]).cast::<f32>();
         // SAFETY: a ray is eight floats. The caller vouches for the ISA.
         let found = unsafe {
             let load = |i: usize| S::F8::load(ray(i));
             keys_of::<S::F8>([load(0), load(1), load(2), load(3), load(4), load(5), load(6), load(7)])
         };
-        for (key, &found) in keys.iter_mut().zip(&found).take(rays.len()) {
-            *key = found as u8;
-            counts[found as usize] += 1;
+        keys.copy_from_slice(&found);
+        match is_uniform(found) {
+            true => counts[found[0] as usize] += rays.len(),
+            false => found.iter().take(rays.len()).for_each(|&key| counts[key as usize] += 1),
         }
     }
     let mut starts = [0; SPECIAL + 2];
@@ -290,21 +297,35 @@ pub(super) unsafe fn sort<S: Simd>(rays: &[Ray], room: &mut Room) -> [usize; SPE
         starts[key + 1] = starts[key] + counts[key];
     }
     let mut next = starts;
-    for (i, &key) in room.keys[..rays.len()].iter().enumerate() {
-        let place = &mut next[key as usize];
-        room.order[*place] = i as u16;
-        *place += 1;
+    for (i, keys) in room.keys[..rays.len()].chunks(8).enumerate() {
+        let numbers = (8 * i as u16..).take(keys.len());
+        if keys.try_into().is_ok_and(is_uniform) {
+            let place = &mut next[keys[0] as usize];
+            room.order[*place..*place + 8].iter_mut().zip(numbers).for_each(|(order, number)| *order = number);
+            *place += 8;
+            continue;
+        }
+        for (&key, number) in keys.iter().zip(numbers) {
+            let place = &mut next[key as usize];
+            room.order[*place] = number;
+            *place += 1;
+        }
     }
     starts
 }
 
-/// Keys of eight rays, as numbers. Special are rays that cannot hit anything, those whose direction has to be scaled,
+/// Whether eight keys are the same, as they are of most rays that go to a lamp.
+fn is_uniform(keys: [u8; 8]) -> bool {
+    u64::from_ne_bytes(keys) == u64::from_ne_bytes([keys[0]; 8])
+}
+
+/// Keys of eight rays. Special are rays that cannot hit anything, those whose direction has to be scaled,
 /// and those that take the slower box test.
 ///
 /// # Safety
 /// The CPU must have the ISA.
 #[inline(always)]
-unsafe fn keys_of<L: Eight>(rays: [L; 8]) -> [f32; 16] {
+unsafe fn keys_of<L: Eight>(rays: [L; 8]) -> [u8; 8] {
     let [ox, oy, oz, tmin, dx, dy, dz, tmax] = L::transpose(rays);
     // SAFETY: the caller vouches for the ISA.
     let splat = |x: f32| unsafe { L::splat(x) };
@@ -327,7 +348,8 @@ unsafe fn keys_of<L: Eight>(rays: [L; 8]) -> [f32; 16] {
     let octant = part(dx.lt(zero), 3.0) + part(dy.lt(zero), 6.0) + part(dz.lt(zero), 12.0);
     let is_x = y.lt(x).and(z.lt(x));
     let axis = L::select(is_x, zero, L::select(z.lt(y), splat(1.0), splat(2.0)));
-    L::select(is_ordinary, octant + axis, splat(SPECIAL as f32)).to_array()
+    let keys = L::select(is_ordinary, octant + axis, splat(SPECIAL as f32)).to_array();
+    std::array::from_fn(|i| keys[i] as u8)
 }
 
 /// Slabs and targets of eight rays with the same [axes](Shear::axes), as halves of eight floats.

@@ -113,6 +113,40 @@ fn rays_that_streams_leave_alone_have_their_hits() {
     }
 }
 
+/// Shadow rays from texels around a place to lamps: straight above it, so that several octants and axes meet in a tile, at an
+/// angle, near it and far off, with other ends; to lights of a size; and all of that far from the coordinates' origin.
+#[test]
+fn shadow_rays_of_tiles_have_the_hits_of_single_rays() {
+    for shift in [Vec3::ZERO, Vec3::new(1000.0, -300.0, 7e4)] {
+        let triangles: Vec<_> = soup(3000, 0.1, 21).into_iter().map(|t| t.map(|v| v + shift)).collect();
+        for scene in scenes(&triangles, 4) {
+            let (mut hit, mut count) = (0, 0);
+            for seed in 0..24u32 {
+                let place = 0.8 * point(seed, 0, 31);
+                let n = [17, 256, 700, 1500][seed as usize % 4];
+                let extent = [0.02, 0.1, 0.3][seed as usize / 4 % 3];
+                let size = [0.0, 0.0, 0.05, 0.5][seed as usize / 3 % 4];
+                let lamp = match seed % 3 {
+                    0 => place + 0.6 * Vec3::Y,
+                    1 => 2.0 * point(seed, 3, 31),
+                    _ => place + 40.0 * point(seed, 3, 31),
+                };
+                let ray = |i: u32| {
+                    let flat = Vec3::new(1.0, 0.0, 1.0);
+                    let origin = place + extent * flat * point(i, 0, seed) + shift;
+                    let end = lamp + size * point(i, 3, seed) + shift;
+                    let (tmin, tmax) = [(0.0, 1.0), (0.0, 0.999), (0.1, 0.6), (-0.5, 1.0)][seed as usize / 6];
+                    Ray::new(origin, end - origin).within(tmin, tmax)
+                };
+                let rays: Vec<Ray> = (0..n).map(ray).collect();
+                hit += assert_same(&scene, &rays, &format!("lamp {seed}"));
+                count += rays.len();
+            }
+            assert!(hit > count / 10 && hit < count - count / 10, "{hit} of {count}");
+        }
+    }
+}
+
 #[test]
 fn groups_of_rays_from_scattered_places_have_the_hits_of_single_rays() {
     for scene in scenes(&soup(3000, 0.1, 6), 4) {

@@ -6,6 +6,7 @@
 
 use super::Ray;
 use super::triangle::{Projected, Shear};
+use crate::bvh::Mbvh;
 use crate::bvh::layout::{ChildRef, LEAF_PAD, LEAF_STRIDE, MAX_LEAF, WIDTH};
 use crate::simd::{Compress, Four, Lanes, Mask, Simd};
 use glam::Vec3;
@@ -53,6 +54,11 @@ pub(super) trait Tree {
 
     /// Order of the children by octant, as [`Node::order`].
     fn order(node: &Self::Node) -> *const u32;
+
+    /// The tree itself if it is the full one of scenes.
+    fn whole(&self) -> Option<&Mbvh> {
+        None
+    }
 
     /// # Safety
     /// The CPU must have the ISA, and `leaf` must be a leaf of this tree.

@@ -148,6 +148,25 @@ impl<L: Lanes> Projected<L> {
         zero.le(u.min(v).min(w)).or(u.max(v).max(w).le(zero))
     }
 
+    /// Masks of the lanes in which the [`accurate_distance`] is sure to be between `tmin` and `tmax`, which are not
+    /// negative, and of those in which it is sure not to be: where all corners are by more than rounding, along the ray's
+    /// longest axis, of which `back` is the component of [`Shear::back`]. That distance is clamped to between theirs.
+    ///
+    /// # Safety
+    /// The CPU must have the ISA.
+    #[inline(always)]
+    pub(super) unsafe fn depths(&self, back: L, tmin: L, tmax: L) -> (L::Mask, L::Mask) {
+        // SAFETY: the caller vouches for the ISA.
+        let splat = |x: f32| unsafe { L::splat(x) };
+        let reciprocal = splat(1.0).div(back);
+        let [a, b, c] = self.corners.map(|corner| corner.z * reciprocal);
+        let (least, most) = (a.min(b).min(c), a.max(b).max(c));
+        // (Of negative ones the margins go the wrong way, but these are beyond tmin anyway.)
+        let (low, high) = (splat(1.0 - 1e-6), splat(1.0 + 1e-6));
+        let within = tmin.lt(low * least).and((high * most).lt(tmax));
+        (within, (high * most).lt(tmin).or(tmax.lt(low * least)))
+    }
+
     /// Distances to the planes, and a mask of the lanes where these are accurate. They are not on thin triangles, whose
     /// normal is rounded, where the ray grazes the plane, and where areas are too small for f32: see
     /// [`accurate_distance`].

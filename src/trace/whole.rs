@@ -7,7 +7,7 @@ use crate::simd::{Four, Lanes, Simd};
 use std::mem::MaybeUninit;
 
 macro_rules! tree {
-    ($width:literal, $lanes:ident) => {
+    ($width:literal, $lanes:ident, $whole:expr) => {
         impl Tree for Mbvh<$width> {
             type Node = Node<$width>;
             type Leaf<'a> = Rows;
@@ -52,6 +52,11 @@ macro_rules! tree {
             }
 
             #[inline(always)]
+            fn whole(&self) -> Option<&Mbvh> {
+                $whole(self)
+            }
+
+            #[inline(always)]
             unsafe fn leaf<S: Simd>(&self, leaf: ChildRef) -> Rows {
                 // SAFETY: forwarded.
                 Rows { rows: unsafe { self.leaf(leaf) }, count: leaf.leaf_count() }
@@ -60,9 +65,9 @@ macro_rules! tree {
     };
 }
 
-tree!(8, F8);
+tree!(8, F8, Some);
 #[cfg(any(test, feature = "reference"))]
-tree!(4, F4);
+tree!(4, F4, |_| None);
 
 /// A leaf of an [`Mbvh`].
 pub(super) struct Rows {
