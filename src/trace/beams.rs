@@ -1,6 +1,6 @@
-//! Beams: rays of a [stream](super::stream) to any hit that go the same way, as shadow rays of a tile to a lamp do, pass
-//! the tree in packs of sixteen (packets of shadow rays: Wald et al., *Interactive Rendering with Coherent Ray Tracing*,
-//! 2001; what encloses them: Haines and Wallace, *Shaft Culling for Efficient Ray-Cast Radiosity*, 1991).
+//! Beams: rays of a [stream](super::stream) to any hit that go the same way, as shadow rays of a tile to a lamp do,
+//! pass the tree in packs of sixteen (packets of shadow rays: Wald et al., *Interactive Rendering with Coherent Ray
+//! Tracing*, 2001; what encloses them: Haines and Wallace, *Shaft Culling for Efficient Ray-Cast Radiosity*, 1991).
 //!
 //! ```text
 //! push (root, the packs of an octant)
@@ -10,10 +10,10 @@
 //!     leaf:  for each pack, find the rays that hit the leaf's box, and test them against one triangle after another
 //! ```
 //!
-//! A shaft encloses the ways of a pack's rays, from origins to ends. All go the same way along each axis. So what bounds
-//! them, at a fraction of the way, are straight lines from the outermost origin to the outermost end, and they are in a
-//! box from where the leading line enters it to where the trailing one leaves it: the test of a ray, whose slopes are
-//! others for near planes and for far ones. A pack costs at a node what a ray costs in a list.
+//! A shaft encloses the ways of a pack's rays, from origins to ends. All go the same way along each axis. So what
+//! bounds them, at a fraction of the way, are straight lines from the outermost origin to the outermost end, and they
+//! are in a box from where the leading line enters it to where the trailing one leaves it: the test of a ray, whose
+//! slopes are others for near planes and for far ones. A pack costs at a node what a ray costs in a list.
 //!
 //! Answers are those of [`single`](super::single), bit for bit. A triangle counts for rays that hit the box of its leaf
 //! by the arithmetic of single rays. As rounding is monotonic, such rays hit all boxes around it; and so does the
@@ -36,16 +36,16 @@ pub(super) const SIZE: usize = 16;
 /// Number of packs that go down the tree together.
 pub(super) const PACKS: usize = 32;
 
-/// By how much a shaft is wider than its rays, as a part of the largest coordinate: more than the errors of a ray's test of
-/// a plane ([`OFFSET_ERROR`], and the rounding of its fused sum) and of a shaft's test.
+/// By how much a shaft is wider than its rays, as a part of the largest coordinate: more than the errors of a ray's
+/// test of a plane ([`OFFSET_ERROR`], and the rounding of its fused sum) and of a shaft's test.
 const MARGIN: f32 = 32.0 * EPSILON;
 
 /// Greatest extent of a pack's origins and ends, as a fraction of its length, at which it is worth a shaft.
 const WIDEST: f32 = 1.0;
 
-/// Number of leaves per pack after which a trial of packs ends, and the number of rays per test of a leaf that must have hit
-/// its box until then and from then on. (Rays to a light as large as their tile are 1.02 to 1.05 times as fast as in lists;
-/// without the trial 0.24 to 0.57 times. Those to one of four times the size 0.9 to 0.96 times.)
+/// Number of leaves per pack after which a trial of packs ends, and the number of rays per test of a leaf that must have
+/// hit its box until then and from then on. (Rays to a light as large as their tile are 1.02 to 1.05 times as fast as in
+/// lists; without the trial 0.24 to 0.57 times. Those to one of four times the size 0.9 to 0.96 times.)
 const TRIAL: u32 = 4;
 const LEAST_MET: u32 = 2;
 
@@ -71,7 +71,8 @@ pub(super) struct Pack {
     left: u32,
 }
 
-/// What encloses the rays of a pack: the fraction of the way at which a line is in a plane is reciprocal · plane + offset.
+/// What encloses the rays of a pack: the fraction of the way at which a line is in a plane is reciprocal · plane +
+/// offset.
 #[derive(Clone, Copy, Zeroable)]
 #[repr(C, align(64))]
 pub(super) struct Shaft {
@@ -95,8 +96,8 @@ struct Entry {
     lane: u32,
 }
 
-/// Traces the rays of a group to any hit in packs, if that is worth it; else returns false. `done` receives the places of
-/// the rays in the group, and whether they hit anything. `ray` tells rays by their places.
+/// Traces the rays of a group to any hit in packs, if that is worth it; else returns false. `done` receives the places
+/// of the rays in the group, and whether they hit anything. `ray` tells rays by their places.
 ///
 /// # Safety
 /// The CPU must have the ISA.
@@ -273,8 +274,8 @@ impl Pack {
         }
     }
 
-    /// Tests as many rays as there are lanes, from `first` on, against the box of a leaf, given by its near and far planes,
-    /// and against its triangles. Returns how many of those that have no hit yet hit the box.
+    /// Tests as many rays as there are lanes, from `first` on, against the box of a leaf, given by its near and far
+    /// planes, and against its triangles. Returns how many of those that have no hit yet hit the box.
     ///
     /// # Safety
     /// The CPU must have the ISA; `rows` must be those of a leaf of `count` triangles.

@@ -113,8 +113,9 @@ fn rays_that_streams_leave_alone_have_their_hits() {
     }
 }
 
-/// Shadow rays from texels around a place to lamps: straight above it, so that several octants and axes meet in a tile, at an
-/// angle, near it and far off, with other ends; to lights of a size; and all of that far from the coordinates' origin.
+/// Shadow rays from texels around a place to lamps: straight above it, so that several octants and axes meet in a tile,
+/// at an angle, near it and far off, with other ends; to lights of a size; and all of that far from the coordinates'
+/// origin.
 #[test]
 fn shadow_rays_of_tiles_have_the_hits_of_single_rays() {
     for shift in [Vec3::ZERO, Vec3::new(1000.0, -300.0, 7e4)] {
