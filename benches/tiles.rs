@@ -60,8 +60,8 @@ fn compare(tiles: &[Vec<Ray>], mut first: impl FnMut(&[Ray]), mut second: impl F
     (median(times), median(ratios))
 }
 
-/// Shadow rays of tiles of 16 × 16 texels to points off other surfaces, or to random places in cubes there, of a size in
-/// tiles.
+/// Shadow rays of tiles of 16 × 16 texels to points off other surfaces, or to random places in cubes there, of a size
+/// in tiles.
 fn shadows(scene: &Scene, areas: &[f32], spacing: f32, size: f32, label: &str) {
     let tiles: Vec<Vec<Ray>> = (0..1500)
         .map(|i| {

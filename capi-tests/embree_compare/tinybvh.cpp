@@ -42,8 +42,9 @@ template <typename Tree> class TinyBvh : public Peer {
             const bk_ray &r = k.rays.rays[i];
             const Vec3d d = load(r.direction), o = load(r.origin) + d * r.tmin;
             const double far = (double(r.tmax) - r.tmin) * length(d);
-            rays[i] = tinybvh::Ray({float(o.x), float(o.y), float(o.z)}, {r.direction[0], r.direction[1], r.direction[2]},
-                                   float(std::min(far, double(BVH_FAR))));
+            const tinybvh::bvhvec3 origin(float(o.x), float(o.y), float(o.z));
+            const tinybvh::bvhvec3 direction(r.direction[0], r.direction[1], r.direction[2]);
+            rays[i] = tinybvh::Ray(origin, direction, float(std::min(far, double(BVH_FAR))));
             factors[i] = float(1 / length(d));
             offsets[i] = r.tmin;
         }

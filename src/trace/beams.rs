@@ -43,9 +43,9 @@ const MARGIN: f32 = 32.0 * EPSILON;
 /// Greatest extent of a pack's origins and ends, as a fraction of its length, at which it is worth a shaft.
 const WIDEST: f32 = 1.0;
 
-/// Number of leaves per pack after which a trial of packs ends, and the number of rays per test of a leaf that must have
-/// hit its box until then and from then on. (Rays to a light as large as their tile are 1.02 to 1.05 times as fast as in
-/// lists; without the trial 0.24 to 0.57 times. Those to one of four times the size 0.9 to 0.96 times.)
+/// Number of leaves per pack after which a trial of packs ends, and the number of rays per test of a leaf that must
+/// have hit its box until then and from then on. (Rays to a light as large as their tile are 1.02 to 1.05 times as fast
+/// as in lists; without the trial 0.24 to 0.57 times. Those to one of four times the size 0.9 to 0.96 times.)
 const TRIAL: u32 = 4;
 const LEAST_MET: u32 = 2;
 

@@ -149,8 +149,9 @@ impl<L: Lanes> Projected<L> {
     }
 
     /// Masks of the lanes in which the [`accurate_distance`] is sure to be between `tmin` and `tmax`, which are not
-    /// negative, and of those in which it is sure not to be: where all corners are by more than rounding, along the ray's
-    /// longest axis, of which `back` is the component of [`Shear::back`]. That distance is clamped to between theirs.
+    /// negative, and of those in which it is sure not to be: where all corners are by more than rounding, along the
+    /// ray's longest axis, of which `back` is the component of [`Shear::back`]. That distance is clamped to between
+    /// theirs.
     ///
     /// # Safety
     /// The CPU must have the ISA.
