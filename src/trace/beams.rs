@@ -20,7 +20,7 @@
 //! shaft, since it is wider than its rays by more than rounding ([`MARGIN`]).
 
 use super::Ray;
-use super::stream_rays::{ChildBoxes, Group};
+use super::groups::{ChildBoxes, Group};
 use super::tree::{BEYOND, EPSILON, FARTHEST_ORIGIN, OFFSET_ERROR, Tree, beyond};
 use super::triangle::{GRAZING, Projected, Shear, V3, accurate_distance};
 use crate::bvh::Mbvh;

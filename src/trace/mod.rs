@@ -11,6 +11,7 @@ pub(crate) mod filter;
 #[cfg(any(test, feature = "reference"))]
 pub mod four_wide;
 mod gather;
+mod groups;
 mod kernels;
 pub mod offset;
 mod packet;

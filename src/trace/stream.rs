@@ -21,7 +21,8 @@
 //! which of a leaf's hits is the closest does not depend on the order of visits. Rays that need special treatment in a
 //! test, rays of octants that few rays have, and rays whose lists find no room are traced one by one.
 
-use super::stream_rays::{ChildBoxes, Group, MAX_RAYS, Room, sort};
+use super::groups::{ChildBoxes, Group};
+use super::stream_rays::{MAX_RAYS, Room, sort};
 use super::tree::{Leaf, RaySetup, Tree, beyond};
 use super::triangle::{Projected, V3, accurate_distance};
 use super::{RawHit, Ray, beams, single};
@@ -55,12 +56,12 @@ pub(super) unsafe fn stream<S: Simd, T: Tree, const ANY: bool>(
         for octant in 0..8 {
             let group = Group::new(octant, &starts);
             if group.len() < LEAST {
-                room.leave_alone(group.begin()..group.end());
+                room.leave_alone(group.begin..group.end());
                 continue;
             }
             if ANY && let Some(tree) = tree.whole() {
                 let Room { order, shafts, packs, .. } = &mut *room;
-                let number = |place: usize| order[group.begin() + place] as usize;
+                let number = |place: usize| order[group.begin + place] as usize;
                 let done = |place: usize, is_hit: bool| {
                     let triangle = if is_hit { 0 } else { NONE };
                     done(first + number(place), RawHit { triangle, ..RawHit::MISS });
@@ -233,7 +234,7 @@ impl<T: Tree> Traversal<'_, T> {
                 slab.limit = f32::NEG_INFINITY;
                 self.room.targets[i].t = f32::NEG_INFINITY;
                 self.room.targets[i].is_alone = 1;
-                self.room.alone.push(self.room.order[self.group.begin() + i]);
+                self.room.alone.push(self.room.order[self.group.begin + i]);
             }
         }
     }
@@ -366,7 +367,7 @@ impl<T: Tree> Traversal<'_, T> {
                 }
                 let slab = &mut *self.room.slabs.as_mut_ptr().add(number);
                 if !T::Leaf::ALWAYS_COUNTS {
-                    let ray = &self.rays[self.room.order[self.group.begin() + number] as usize];
+                    let ray = &self.rays[self.room.order[self.group.begin + number] as usize];
                     let setup = RaySetup::new::<T>(ray.origin, ray.direction, ray.tmin);
                     if !leaf.counts::<S>(triangle, &setup, slab.limit) {
                         continue;

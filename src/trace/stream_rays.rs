@@ -2,8 +2,9 @@
 //! directions, then set up eight at a time.
 
 use super::beams::{self, Pack, Shaft};
-use super::tree::{BEYOND, FARTHEST_ORIGIN, OFFSET_ERROR, STEEP, Tree};
-use super::triangle::{AXES, GRAZING, Shear, barycentrics};
+use super::groups::{ChildBoxes, Group};
+use super::tree::{BEYOND, FARTHEST_ORIGIN, OFFSET_ERROR, STEEP};
+use super::triangle::{GRAZING, Shear, barycentrics};
 use super::{RawHit, Ray};
 use crate::base::geometry::NONE;
 use crate::simd::{Eight, Lanes, Mask, Simd};
@@ -66,69 +67,7 @@ impl Target {
     }
 }
 
-/// The rays of one octant.
-pub(super) struct Group {
-    /// Bit a: component a of the directions is negative.
-    pub octant: usize,
-    /// Place of the first ray in the stream's order.
-    begin: usize,
-    /// Where rays with the longest axis x, y and z begin in the group, and where they end.
-    pub runs: [usize; 4],
-}
-
-impl Group {
-    pub(super) fn new(octant: usize, starts: &[usize; SPECIAL + 2]) -> Group {
-        let begin = starts[3 * octant];
-        Group { octant, begin, runs: std::array::from_fn(|axis| starts[3 * octant + axis] - begin) }
-    }
-
-    pub(super) fn begin(&self) -> usize {
-        self.begin
-    }
-
-    pub(super) fn end(&self) -> usize {
-        self.begin + self.len()
-    }
-
-    pub(super) fn len(&self) -> usize {
-        self.runs[3]
-    }
-
-    /// [`Shear::axes`] of rays whose longest axis is `axis`.
-    pub(super) fn axes(&self, axis: usize) -> &'static [u32; 3] {
-        &AXES[if self.octant >> axis & 1 != 0 { axis + 3 } else { axis }]
-    }
-}
-
-/// The planes of a node's children that rays of an octant reach first and last, by axis.
-pub(super) struct ChildBoxes<L> {
-    pub near: [L; 3],
-    pub far: [L; 3],
-}
-
 impl<L: Lanes> ChildBoxes<L> {
-    /// # Safety
-    /// The CPU must have the ISA.
-    #[inline(always)]
-    pub(super) unsafe fn new<S: Simd, T: Tree<Lanes<S> = L>>(node: &T::Node, octant: usize) -> Self {
-        let row = |a: usize, far: bool| T::ROW * (a as u32 + if (octant >> a & 1 != 0) != far { 3 } else { 0 });
-        // SAFETY: forwarded; rows are those of the axes.
-        unsafe {
-            ChildBoxes {
-                near: [
-                    T::planes::<S>(node, 0, row(0, false)),
-                    T::planes::<S>(node, 1, row(1, false)),
-                    T::planes::<S>(node, 2, row(2, false)),
-                ],
-                far: [
-                    T::planes::<S>(node, 0, row(0, true)),
-                    T::planes::<S>(node, 1, row(1, true)),
-                    T::planes::<S>(node, 2, row(2, true)),
-                ],
-            }
-        }
-    }
-
     /// Mask of the boxes that a ray intersects, by the arithmetic of [`RaySetup::boxes`](super::tree::RaySetup::boxes).
     ///
     /// # Safety
@@ -257,7 +196,7 @@ impl Room {
     /// Passes the hits of a group's rays on, with the rays' numbers. `ANY`: a hit says only that there is one.
     #[inline(always)]
     pub(super) fn report<const ANY: bool>(&self, group: &Group, mut done: impl FnMut(usize, RawHit)) {
-        for (target, &number) in self.targets.iter().zip(&self.order[group.begin()..group.end()]) {
+        for (target, &number) in self.targets.iter().zip(&self.order[group.begin..group.end()]) {
             if target.is_alone != 0 {
                 continue;
             }
