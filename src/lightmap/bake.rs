@@ -435,15 +435,14 @@ impl<'p> Bake<'_, 'p> {
             filling.fill(&l.charts, &l.gather, &mut directional, self.progress)?;
         }
         if self.plan.runs(left_out::BLUR) {
-            let stage = self.progress.stage("blur", 0.6, 0.65, n as u64);
+            let stage = self.progress.stage("blur", 0.6, 0.65, if asks { 2 * n as u64 } else { n as u64 });
             let mut blurred = try_vec(n, "the blurred gather map")?;
             let radius = self.params.blur_radius;
             let texels = blur::Texels { values: &irradiance, variances: &variances, valid: &valid, normals: &normals };
-            blur::blur(device, &l.charts, &l.gather, texels, radius, &mut blurred, &stage)?;
+            blur::blur(device, &l.charts, &l.gather, (texels, &irradiance), radius, &mut blurred, &stage)?;
             if asks {
                 let mut out = try_vec(n, "the blurred gather map by direction")?;
-                let from = &directional[..];
-                blur::blur_directional(device, &l.charts, &l.gather, (texels, from), radius, &mut out, self.progress)?;
+                blur::blur(device, &l.charts, &l.gather, (texels, &directional), radius, &mut out, &stage)?;
                 directional = out;
             }
             irradiance = blurred;

@@ -1,8 +1,8 @@
 //! Blur of the gather map (thesis 3.2.5) that stays inside charts and does not cross walls.
 
-use crate::base::directional::{Directional, Linear};
+use crate::base::directional::Linear;
 use crate::base::error::Result;
-use crate::base::progress::{Progress, Stage};
+use crate::base::progress::Stage;
 use crate::device::Device;
 use crate::lightmap::atlas::chart_map::ChartMap;
 use crate::lightmap::atlas::charts::Charts;
@@ -38,14 +38,15 @@ pub(crate) struct Texels<'a> {
 /// variance as in Rousselle, Knaus and Zwicker, *Adaptive rendering with non-local means filtering*, 2012). Shadows of
 /// indirect light therefore stay sharp where there is little noise, and the blur's bias vanishes with the noise. A
 /// texel takes part only if a path of valid texels of the same chart, within the square, leads to it: light on one side
-/// of a wall that stands on the chart does not cross the hidden texels below the wall.
-pub(crate) fn blur(
+/// of a wall that stands on the chart does not cross the hidden texels below the wall. What is blurred so is `of`, by
+/// texel: the irradiance itself, or light by direction.
+pub(crate) fn blur<T: Linear>(
     device: &Device,
     charts: &Charts,
     map: &ChartMap<GatherMap>,
-    texels: Texels,
+    (texels, of): (Texels, &[T]),
     radius: u32,
-    out: &mut [Vec3],
+    out: &mut [T],
     stage: &Stage,
 ) -> Result<()> {
     let radius = radius.min(MAX_BLUR_RADIUS) as i32;
@@ -56,37 +57,11 @@ pub(crate) fn blur(
                 stage.check()?;
                 let i = block * BLOCK + i;
                 *out = match texels.valid[i] {
-                    true => window.blur(charts, map, GatherTexel::new(i), texels),
-                    false => texels.values[i],
+                    true => window.blur_of(charts, map, GatherTexel::new(i), texels, of),
+                    false => of[i],
                 };
             }
             stage.advance(out.len() as u64)
-        })
-    })
-}
-
-/// Blurs light by direction with the weights of [`blur`].
-pub(crate) fn blur_directional(
-    device: &Device,
-    charts: &Charts,
-    map: &ChartMap<GatherMap>,
-    (texels, values): (Texels, &[Directional]),
-    radius: u32,
-    out: &mut [Directional],
-    progress: &Progress,
-) -> Result<()> {
-    let radius = radius.min(MAX_BLUR_RADIUS) as i32;
-    device.install(|| {
-        out.par_chunks_mut(BLOCK).enumerate().try_for_each(|(block, out)| {
-            let mut window = Window::new(radius);
-            progress.check()?;
-            for (i, out) in (block * BLOCK..).zip(out.iter_mut()) {
-                *out = match texels.valid[i] {
-                    true => window.blur_of(charts, map, GatherTexel::new(i), texels, values),
-                    false => values[i],
-                };
-            }
-            Ok(())
         })
     })
 }
