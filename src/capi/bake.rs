@@ -334,7 +334,7 @@ pub struct bk_bake_stats {
     /// texels and channels of its variance by its square; texels darker than a tenth of the mean
     /// count as if they were so bright. 0 after a single pass, which gives no estimate.
     pub error: f64,
-    /// Number of passes, each of which the other numbers sum up.
+    /// Number of passes. Seconds, rays and photons above are sums over them.
     pub passes: u64,
 }
 

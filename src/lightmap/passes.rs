@@ -91,11 +91,8 @@ impl Passes {
     }
 
     /// Estimates the relative error of the mean over all passes: the root of the mean over texels and channels of
-    /// variance by squared light. Infinite after one pass.
-    pub fn error(&self, range: &Range<usize>) -> f64 {
-        if self.count < 2 {
-            return f64::INFINITY;
-        }
+    /// variance by squared light. There must have been several.
+    fn error(&self, range: &Range<usize>) -> f64 {
         let light = &self.light;
         let all = |i: usize| (light.direct[range.start + i] + light.indirect[range.start + i]).as_dvec3();
         // Sums of blocks are added in order: the same bits on any number of threads.
@@ -123,29 +120,29 @@ impl Passes {
             return params.passes;
         }
         let (least, target) = (params.passes.max(LEAST), f64::from(params.target_error));
-        let error = self.error(range);
-        let more = if error > target { self.count + 1 } else { self.count };
         if self.count < least {
             return least;
         }
+        let error = self.error(range);
+        if error <= target {
+            return self.count;
+        }
         // The variance falls in proportion to the passes.
         let forecast = f64::from(self.count) * (error / target).powi(2);
-        more.max(if error > target { forecast.min(f64::from(MAX_PASSES)) as u32 } else { 0 }).min(MAX_PASSES)
+        (forecast as u32).max(self.count + 1).min(MAX_PASSES)
     }
 
-    /// Ends the passes: returns the mean light, with its standard error if there were several passes.
+    /// Returns the mean light of several passes, with its standard error.
     pub fn finish(mut self, range: &Range<usize>) -> Result<(Light, BakeStats)> {
         self.stats.passes = self.count;
-        if self.count > 1 {
-            self.stats.error = self.error(range);
-            self.light._memory.grow(self.light.direct.len() * size_of::<Vec3>(), "the error of texels")?;
-            self.light.error = try_vec(self.light.direct.len(), "the error of texels")?;
-            // Squares of the strongest light are infinite.
-            let most = Vec3::splat(MOST_LIGHT);
-            let scale = 1.0 / (self.count as f32 * (self.count - 1) as f32);
-            let error = self.light.error[range.clone()].par_iter_mut().zip(&self.squares);
-            error.with_min_len(BLOCK).for_each(|(error, &squares)| *error = (squares * scale).map(f32::sqrt).min(most));
-        }
+        self.stats.error = self.error(range);
+        self.light._memory.grow(self.light.direct.len() * size_of::<Vec3>(), "the error of texels")?;
+        self.light.error = try_vec(self.light.direct.len(), "the error of texels")?;
+        // Squares of the strongest light are infinite.
+        let most = Vec3::splat(MOST_LIGHT);
+        let scale = 1.0 / (self.count as f32 * (self.count - 1) as f32);
+        let error = self.light.error[range.clone()].par_iter_mut().zip(&self.squares);
+        error.with_min_len(BLOCK).for_each(|(error, &squares)| *error = (squares * scale).map(f32::sqrt).min(most));
         Ok((self.light, self.stats))
     }
 }
