@@ -34,6 +34,7 @@ const LOOKS: u32 = 16;
 /// Part of the way to a surface on which rays that look at it end before it.
 const SHORT: f32 = 1e-3;
 
+/// Purpose of the random numbers.
 const PURPOSE: u32 = 0x5ee0;
 
 /// Replaces the counts of `seen` by those from the `regions`, and finds the unseen charts. Advances `stage` by
@@ -54,7 +55,7 @@ pub(crate) fn look(
         rays.fetch_add(u64::from(RAYS), Relaxed);
         stage.advance(1)
     })?;
-    charts.ids().collect::<Vec<ChartId>>().into_par_iter().try_for_each(|chart| {
+    (0..charts.charts.len()).into_par_iter().map(ChartId::new).try_for_each(|chart| {
         let counts = &counters[chart.index()];
         for side in [0, 1] {
             if counts[side].load(Relaxed) == 0 && eye.is_seen(chart, side == 0, &rays) {
@@ -120,7 +121,7 @@ impl Eye<'_> {
         }
     }
 
-    /// Whether a hit lies on a side that is drawn.
+    /// Whether a hit lies on a side that is drawn: not on the back of a one-sided surface.
     fn shows(&self, hit: &RawHit) -> bool {
         hit.front || self.scene.material(hit.triangle).two_sided
     }
