@@ -1,6 +1,8 @@
 //! Scenes made by code, for tests, examples and first steps.
 
 use super::atrium::{atrium, atrium_camera};
+use super::hall::{hall, hall_camera};
+use super::menger::{menger, menger_camera};
 use super::rooms::{furniture, furniture_camera, partition, partition_camera};
 use super::shapes::MeshBuilder;
 use crate::base::error::{Result, invalid_argument};
@@ -9,6 +11,7 @@ use crate::scene::camera::Camera;
 use crate::scene::light::Light;
 use crate::scene::material::Material;
 use glam::Vec3;
+use std::str::FromStr;
 
 /// The names that [`builtin`] knows.
 pub const BUILTIN_NAMES: &[&str] = &["cornell", "furnace", "sealed", "atrium", "furniture", "partition"];
@@ -26,10 +29,13 @@ pub const BUILTIN_NAMES: &[&str] = &["cornell", "furnace", "sealed", "atrium", "
 ///   them that leaves a gap, and a lamp in one. Both for measurements of the light.
 /// - `atrium`: two floors around a court, columns, arches, drapes; a rect light and a sun.
 ///
-/// Two more are for measurements, and not among [`BUILTIN_NAMES`]:
+/// Four more are for measurements, and not among [`BUILTIN_NAMES`]:
 ///
 /// - `furnace:ALBEDO`: the furnace with another albedo, at least 0 and less than 1.
 /// - `slit`: a closed white room, 6 × 3 × 4, with a slit 20 cm wide across its ceiling, through which the sun shines.
+/// - `hall:TRIANGLES`: a hall, 40 × 12 × 20, of about so many triangles, at least 20,000: half of them on flat walls and a
+///   coffered ceiling (mesh 0), half on 18 fluted columns; four rect lights.
+/// - `menger:LEVEL`: the Menger sponge of a level up to 6 in the unit cube, two triangles for each square, in the sun.
 pub fn builtin(name: &str) -> Result<SceneData> {
     match name {
         "cornell" => cornell(),
@@ -43,13 +49,24 @@ pub fn builtin(name: &str) -> Result<SceneData> {
             Ok(albedo) if (0.0..1.0).contains(&albedo) => furnace(albedo),
             _ => invalid_argument!("{name:?} names no albedo of a furnace from 0 to less than 1"),
         },
+        _ if name.starts_with("hall:") => hall(number(name)?),
+        _ if name.starts_with("menger:") => menger(number(name)?),
         _ => invalid_argument!("there is no built-in scene {name:?}; there are {}", BUILTIN_NAMES.join(", ")),
+    }
+}
+
+/// The number after the colon of a name.
+fn number<T: FromStr>(name: &str) -> Result<T> {
+    match name.split_once(':').and_then(|(_, number)| number.parse().ok()) {
+        Some(number) => Ok(number),
+        None => invalid_argument!("the built-in scene {name:?} has no number after its colon"),
     }
 }
 
 /// Whether [`builtin`] knows a name, those for measurements included.
 pub fn is_builtin(name: &str) -> bool {
-    BUILTIN_NAMES.contains(&name) || name == "slit" || name.starts_with("furnace:")
+    let sized = ["furnace:", "hall:", "menger:"];
+    BUILTIN_NAMES.contains(&name) || name == "slit" || sized.iter().any(|family| name.starts_with(family))
 }
 
 /// The camera for the pictures of a built-in scene.
@@ -63,6 +80,8 @@ pub fn builtin_camera(name: &str) -> Option<Camera> {
         "atrium" => Some(atrium_camera()),
         "furniture" => Some(furniture_camera()),
         "partition" => Some(partition_camera()),
+        _ if name.starts_with("hall:") => Some(hall_camera()),
+        _ if name.starts_with("menger:") => Some(menger_camera()),
         "slit" => looking(Vec3::new(0.5, 1.6, 0.5), Vec3::new(3.5, 0.8, 2.5), 1.2),
         _ => None,
     }
@@ -214,6 +233,7 @@ mod tests {
     fn a_furnace_has_the_albedo_asked_for_and_the_slit_room_a_front_towards_everything() {
         assert_eq!(builtin("furnace:0.98").unwrap().materials()[0].albedo, [0.98; 3]);
         assert!(builtin("furnace:1").unwrap_err().to_string().contains("furnace:1"));
+        assert!(builtin("hall:many").unwrap_err().to_string().contains("hall:many"));
         let slit = commit("slit");
         for t in 0..slit.triangle_count() {
             assert!(slit.normal(t).dot(Vec3::new(3.0, 1.5, 2.0) - slit.corners(t)[0]) > 0.5, "triangle {t}");

@@ -2,5 +2,8 @@
 
 mod atrium;
 pub(super) mod builtin;
+mod hall;
+mod lattice;
+mod menger;
 mod rooms;
 pub mod shapes;
