@@ -8,7 +8,7 @@ pub use super::pieces::Given;
 use super::pieces::{CHARTS, Groups, Piece, connected, float_key, surface_kind};
 use super::unwrap;
 use crate::base::error::{Error, Result, invalid_argument};
-use crate::base::memory::{try_collect, try_filled, try_push, try_with_capacity};
+use crate::base::memory::{try_collect, try_filled, try_push, try_with_capacity, try_zeroed_as_needed};
 use crate::base::progress::{Progress, Stage};
 use crate::device::LogLevel;
 use crate::scene::{LightmapUvs, Mesh, Scene};
@@ -174,7 +174,8 @@ impl Charts {
             charts: try_with_capacity(pieces.len(), CHARTS)?,
             triangles: try_with_capacity(pieces.iter().map(|p| p.triangles.len()).sum(), CHARTS)?,
             of_triangles: try_filled(total, ChartId::NONE, CHARTS)?,
-            corners: try_filled(total, [[0.0; 2]; 3], CHARTS)?,
+            // Untouched until a piece is moved there, which is then freed.
+            corners: try_zeroed_as_needed(total, CHARTS)?,
         };
         for piece in pieces {
             stage.check()?;

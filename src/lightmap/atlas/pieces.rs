@@ -65,6 +65,34 @@ pub(in crate::lightmap) fn connected<K: Ord + Send>(
     Ok(parent)
 }
 
+/// Finds connected items as [`connected`] does, where the keys of an item are three of `vertices` vertices: in linear
+/// time.
+pub(in crate::lightmap) fn connected_by_vertices(
+    items: impl ExactSizeIterator<Item = [u32; 3]>,
+    vertices: usize,
+    stage: &Stage,
+) -> Result<Vec<u32>> {
+    let mut parent = try_collect(0..items.len() as u32, CHARTS)?;
+    let mut first_at = try_filled(vertices, NONE, CHARTS)?;
+    for (i, corners) in (0..).zip(items) {
+        if i as usize % ITEMS_PER_CHECK == 0 {
+            stage.check()?;
+        }
+        for v in corners {
+            let first = &mut first_at[v as usize];
+            if *first == NONE {
+                *first = i;
+            }
+            let (a, b) = (root(&mut parent, *first), root(&mut parent, i));
+            parent[a.max(b) as usize] = a.min(b);
+        }
+    }
+    for i in 0..parent.len() as u32 {
+        parent[i as usize] = root(&mut parent, i);
+    }
+    Ok(parent)
+}
+
 /// Number of items between two checks for a cancel.
 pub(in crate::lightmap) const ITEMS_PER_CHECK: usize = 1 << 14;
 

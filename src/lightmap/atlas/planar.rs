@@ -7,7 +7,7 @@
 use super::pieces::{CHARTS, ITEMS_PER_CHECK, Piece};
 use super::welded::Geometry;
 use crate::base::error::Result;
-use crate::base::memory::{try_collect, try_filled, try_push};
+use crate::base::memory::{try_collect, try_filled, try_push, try_with_capacity};
 use crate::base::progress::Stage;
 use crate::scene::NONE;
 use glam::{DVec2, DVec3};
@@ -31,15 +31,36 @@ const TOUCH: f64 = 1e-6;
 const CELLS_PER_TRIANGLE: usize = 16;
 const TESTS_PER_TRIANGLE: usize = 128;
 
+/// Flat regions, ordered by their lowest triangles, which come first in each.
+pub(super) struct Regions {
+    members: Vec<u32>,
+    /// Where each region begins in `members`, and where the last one ends.
+    starts: Vec<u32>,
+}
+
+impl Regions {
+    /// Bytes per triangle, if each is a region.
+    pub(super) const BYTES_PER_TRIANGLE: usize = 4 + 4 + 1;
+
+    pub(super) fn len(&self) -> usize {
+        self.starts.len() - 1
+    }
+
+    pub(super) fn get(&self, region: usize) -> &[u32] {
+        &self.members[self.starts[region] as usize..self.starts[region + 1] as usize]
+    }
+}
+
 /// Finds the flat regions of `triangles` (ascending): connected triangles with nearly equal normals.
 pub(super) fn flat_regions(
     geometry: &Geometry,
     neighbours: &[[u32; 3]],
     triangles: &[u32],
     stage: &Stage,
-) -> Result<Vec<Vec<u32>>> {
+) -> Result<Regions> {
     let mut taken = try_filled(geometry.indices.len(), false, CHARTS)?;
-    let mut regions = Vec::new();
+    let mut members: Vec<u32> = try_with_capacity(triangles.len(), CHARTS)?;
+    let mut starts = Vec::new();
     for (i, &seed) in triangles.iter().enumerate() {
         if i % ITEMS_PER_CHECK == 0 {
             stage.check()?;
@@ -47,8 +68,9 @@ pub(super) fn flat_regions(
         if std::mem::replace(&mut taken[seed as usize], true) {
             continue;
         }
-        let mut members = vec![seed];
-        let mut next = 0;
+        let mut next = members.len();
+        try_push(&mut starts, next as u32, CHARTS)?;
+        try_push(&mut members, seed, CHARTS)?;
         while let Some(&t) = members.get(next) {
             next += 1;
             if next % ITEMS_PER_CHECK == 0 {
@@ -61,9 +83,9 @@ pub(super) fn flat_regions(
                 }
             }
         }
-        try_push(&mut regions, members, CHARTS)?;
     }
-    Ok(regions)
+    try_push(&mut starts, members.len() as u32, CHARTS)?;
+    Ok(Regions { members, starts })
 }
 
 /// Makes a chart of a flat region; `None` if it must not be one: it has neighbours that a chart may reach, or overlaps
@@ -222,10 +244,10 @@ impl Cells {
             [c.x as usize, c.y as usize]
         };
         let mut starts = try_filled(columns * cells.y as usize + 1, 0u32, CHARTS)?;
-        let ranges = triangles.iter().map(|[a, b, c]| [cell(a.min(*b).min(*c)), cell(a.max(*b).max(*c))]);
-        let ranges = try_collect(ranges, CHARTS)?;
+        // Computed twice: kept, they take 32 bytes per triangle.
+        let ranges = || triangles.iter().map(|[a, b, c]| [cell(a.min(*b).min(*c)), cell(a.max(*b).max(*c))]);
         let mut total = 0;
-        for (i, [from, to]) in ranges.iter().enumerate() {
+        for (i, [from, to]) in ranges().enumerate() {
             if i % ITEMS_PER_CHECK == 0 {
                 stage.check()?;
             }
@@ -243,7 +265,7 @@ impl Cells {
             *s = sum;
         }
         let mut items = try_filled(total, 0u32, CHARTS)?;
-        for (i, [from, to]) in ranges.iter().enumerate() {
+        for (i, [from, to]) in ranges().enumerate() {
             if i % ITEMS_PER_CHECK == 0 {
                 stage.check()?;
             }
@@ -312,7 +334,8 @@ fn planar_piece(geometry: &Geometry, triangle: usize, partner: Option<usize>) ->
     let longest = (0..3)
         .map(|k| [ends[k], ends[(k + 1) % 3]])
         .filter(|&e| !inner(e))
-        .map(|e| geometry.positions[e[1] as usize] - geometry.positions[e[0] as usize])
+        .map(|e| e.map(|v| geometry.positions[v as usize].as_dvec3()))
+        .map(|[start, end]| end - start)
         .max_by(|a, b| a.length_squared().total_cmp(&b.length_squared()));
     let x =
         longest.map_or(DVec3::ZERO, |e| e.reject_from_normalized(normal)).normalize_or(normal.any_orthonormal_vector());
@@ -405,8 +428,8 @@ mod tests {
             let geometry = Geometry::of(&scene, &all, &stage).unwrap();
             let neighbours = geometry.neighbours(&stage).unwrap();
             let regions = flat_regions(&geometry, &neighbours, &all, &stage).unwrap();
-            let piece = |r: &Vec<u32>| flat_piece(&geometry, &neighbours, r, &stage).unwrap();
-            regions.iter().filter_map(piece).map(|p| p.triangles.len()).collect::<Vec<_>>()
+            let piece = |r| flat_piece(&geometry, &neighbours, regions.get(r), &stage).unwrap();
+            (0..regions.len()).filter_map(piece).map(|p| p.triangles.len()).collect::<Vec<_>>()
         };
         assert_eq!(pieces_at(0.0), [64]);
         assert_eq!(pieces_at(0.5), [0; 0]);

@@ -8,8 +8,8 @@
 //! Without the feature `unwrap`, and for triangles that the crate cannot unwrap, charts are single triangles and pairs
 //! of nearly coplanar triangles, projected on their plane: poor, but valid by construction.
 
-use super::pieces::{CHARTS, Groups, Piece, connected};
-use super::planar::{flat_piece, flat_regions, planar_pieces};
+use super::pieces::{CHARTS, Groups, Piece, connected_by_vertices};
+use super::planar::{Regions, flat_piece, flat_regions, planar_pieces};
 use super::welded::Geometry;
 use crate::base::error::Result;
 use crate::base::memory::{try_append, try_collect, try_filled, try_par_gather, try_push, try_with_capacity};
@@ -24,17 +24,17 @@ const PART_TRIANGLES: usize = 30_000;
 /// Number of flat regions that a thread takes at a time.
 const REGIONS_PER_JOB: usize = 256;
 
-/// Bytes per triangle of the neighbours and, after the edges by which they are found, of the flat regions: one of each
-/// triangle at worst, with its number in an allocation of its own.
-const BYTES_OF_REGIONS: usize = 12 + 4 + 24 + 32;
+/// Bytes per triangle of the flat regions, and of what is cut into parts: the component and the middle of each region.
+const BYTES_OF_REGIONS: usize = Regions::BYTES_PER_TRIANGLE + 4 + 32;
 
 /// Bytes per triangle of a part that is being unwrapped. (Measured: some 275 in the bunny, whose parts are all curved.)
 const BYTES_IN_PART: usize = 300;
 
 /// Estimates the bytes that unwrapping takes on a number of threads, without the pieces that it makes.
 pub(in crate::lightmap) fn bytes(triangles: usize, vertices: usize, threads: usize) -> usize {
-    triangles * (Geometry::BYTES_PER_TRIANGLE + BYTES_OF_REGIONS)
-        + vertices.min(3 * triangles) * Geometry::BYTES_PER_VERTEX
+    let [of_triangle, of_vertex] = Geometry::BYTES_OF_NEIGHBOURS;
+    triangles * (Geometry::BYTES_PER_TRIANGLE + of_triangle + BYTES_OF_REGIONS)
+        + vertices.min(3 * triangles) * (Geometry::BYTES_PER_VERTEX + of_vertex)
         + triangles.min(threads * PART_TRIANGLES) * BYTES_IN_PART
 }
 
@@ -58,7 +58,7 @@ fn unwrap_mesh(scene: &Scene, triangles: &[u32], stage: &Stage) -> Result<Vec<Pi
         stage.check()?;
         let mut done = 0;
         for region in i * REGIONS_PER_JOB..regions.len().min((i + 1) * REGIONS_PER_JOB) {
-            if let Some(piece) = flat_piece(&geometry, &neighbours, &regions[region], stage)? {
+            if let Some(piece) = flat_piece(&geometry, &neighbours, regions.get(region), stage)? {
                 done += piece.triangles.len();
                 try_push(out, (region, piece), CHARTS)?;
             }
@@ -67,7 +67,7 @@ fn unwrap_mesh(scene: &Scene, triangles: &[u32], stage: &Stage) -> Result<Vec<Pi
     })?;
     let mut rest = try_filled(triangles.len(), true, CHARTS)?;
     for (region, _) in &flat {
-        regions[*region].iter().for_each(|&t| rest[t as usize] = false);
+        regions.get(*region).iter().for_each(|&t| rest[t as usize] = false);
     }
     drop(regions);
     let rest = try_collect(all.into_iter().filter(|&t| rest[t as usize]), CHARTS)?;
@@ -89,21 +89,15 @@ fn parts(geometry: &Geometry, neighbours: &[[u32; 3]], triangles: &[u32], stage:
     if triangles.is_empty() {
         return Ok(Vec::new());
     }
-    let mut keys = try_with_capacity(3 * triangles.len(), CHARTS)?;
-    keys.extend(triangles.iter().zip(0..).flat_map(|(&t, i)| geometry.indices[t as usize].map(|v| (v, i))));
     let mut parts = Vec::new();
     let mut open: Vec<u32> = Vec::new();
-    stage.check()?;
-    let components = Groups::new(&connected(triangles.len(), keys, stage)?, stage)?;
+    let corners = triangles.iter().map(|&t| geometry.indices[t as usize]);
+    let components = Groups::new(&connected_by_vertices(corners, geometry.positions.len(), stage)?, stage)?;
     for component in components.iter() {
         let component = try_collect(component.iter().map(|&i| triangles[i as usize]), CHARTS)?;
         if component.len() > PART_TRIANGLES {
-            let mut regions = Vec::new();
-            for region in flat_regions(geometry, neighbours, &component, stage)? {
-                let sum: DVec3 = region.iter().flat_map(|&t| geometry.corners(t as usize)).sum();
-                try_push(&mut regions, (sum / (3 * region.len()) as f64, region), CHARTS)?;
-            }
-            parts.append(&mut cut(regions, stage)?);
+            let regions = flat_regions(geometry, neighbours, &component, stage)?;
+            parts.append(&mut cut(geometry, &regions, stage)?);
             continue;
         }
         if open.len() + component.len() > PART_TRIANGLES {
@@ -120,35 +114,38 @@ fn parts(geometry: &Geometry, neighbours: &[[u32; 3]], triangles: &[u32], stage:
     Ok(parts)
 }
 
-/// A flat region, preceded by its middle.
-type Region = (DVec3, Vec<u32>);
-
 /// Halves regions in space, along the longest side, until no part is too large.
-fn cut(regions: Vec<Region>, stage: &Stage) -> Result<Vec<Vec<u32>>> {
+fn cut(geometry: &Geometry, regions: &Regions, stage: &Stage) -> Result<Vec<Vec<u32>>> {
+    let middle = |region: usize| {
+        let members = regions.get(region);
+        let sum: DVec3 = members.iter().flat_map(|&t| geometry.corners(t as usize)).sum();
+        (sum / (3 * members.len()) as f64, region as u32)
+    };
+    let mut middles = try_collect((0..regions.len()).map(middle), CHARTS)?;
+    let size = |r: &(DVec3, u32)| regions.get(r.1 as usize).len();
     let mut parts = Vec::new();
-    let mut stack = vec![regions];
-    while let Some(mut regions) = stack.pop() {
-        let total: usize = regions.iter().map(|r| r.1.len()).sum();
-        if total <= PART_TRIANGLES || regions.len() == 1 {
+    let mut stack = vec![&mut middles[..]];
+    while let Some(some) = stack.pop() {
+        let total: usize = some.iter().map(size).sum();
+        if total <= PART_TRIANGLES || some.len() == 1 {
             let mut part = try_with_capacity(total, CHARTS)?;
-            regions.iter().for_each(|r| part.extend_from_slice(&r.1));
+            some.iter().for_each(|r| part.extend_from_slice(regions.get(r.1 as usize)));
             parts.push(part);
             continue;
         }
-        let lower = regions.iter().fold(DVec3::INFINITY, |m, r| m.min(r.0));
-        let upper = regions.iter().fold(DVec3::NEG_INFINITY, |m, r| m.max(r.0));
+        let lower = some.iter().fold(DVec3::INFINITY, |m, r| m.min(r.0));
+        let upper = some.iter().fold(DVec3::NEG_INFINITY, |m, r| m.max(r.0));
         let axis = (upper - lower).max_position();
         stage.check()?;
-        regions.sort_unstable_by(|a, b| a.0[axis].total_cmp(&b.0[axis]).then(a.1[0].cmp(&b.1[0])));
+        some.sort_unstable_by(|a, b| a.0[axis].total_cmp(&b.0[axis]).then(a.1.cmp(&b.1)));
         let mut seen = 0;
-        let half = regions.iter().position(|r| {
-            seen += r.1.len();
+        let half = some.iter().position(|r| {
+            seen += size(r);
             seen * 2 >= total
         });
-        let half = half.unwrap_or(0).clamp(1, regions.len() - 1);
-        let mut upper_half = try_with_capacity(regions.len() - half, CHARTS)?;
-        upper_half.extend(regions.drain(half..));
-        stack.extend([upper_half, regions]);
+        let half = half.unwrap_or(0).clamp(1, some.len() - 1);
+        let (lower_half, upper_half) = some.split_at_mut(half);
+        stack.extend([upper_half, lower_half]);
     }
     Ok(parts)
 }
@@ -188,8 +185,7 @@ fn unwrap_part(geometry: &Geometry, scene: &Scene, stage: &Stage) -> Result<Vec<
 #[cfg(feature = "unwrap")]
 fn longest_component(geometry: &Geometry, stage: &Stage) -> Result<f64> {
     let count = geometry.triangles.len();
-    let keys = geometry.indices.iter().zip(0..).flat_map(|(corners, t)| corners.map(|v| (v, t)));
-    let component_of = connected(count, try_collect(keys, CHARTS)?, stage)?;
+    let component_of = connected_by_vertices(geometry.indices.iter().copied(), geometry.positions.len(), stage)?;
     let mut boxes = try_filled(count, [DVec3::INFINITY, DVec3::NEG_INFINITY], CHARTS)?;
     for (t, &component) in component_of.iter().enumerate() {
         let [lower, upper] = &mut boxes[component as usize];
@@ -209,11 +205,10 @@ fn charts_of_part(
     stage: &Stage,
 ) -> std::result::Result<(Vec<Piece>, Vec<bool>), uvunwrap::Error> {
     // Positions are normalised, so that huge, tiny and far-off parts lose no precision.
-    let lower = geometry.positions.iter().fold(DVec3::INFINITY, |m, &p| m.min(p));
-    let upper = geometry.positions.iter().fold(DVec3::NEG_INFINITY, |m, &p| m.max(p));
+    let points = || geometry.positions.iter().map(|p| p.as_dvec3());
+    let (lower, upper) = (points().fold(DVec3::INFINITY, DVec3::min), points().fold(DVec3::NEG_INFINITY, DVec3::max));
     let (middle, size) = (0.5 * (lower + upper), (upper - lower).length());
-    let positions: Vec<[f32; 3]> =
-        geometry.positions.iter().map(|&p| ((p - middle) / size).as_vec3().to_array()).collect();
+    let positions: Vec<[f32; 3]> = points().map(|p| ((p - middle) / size).as_vec3().to_array()).collect();
     let area: f64 = (0..geometry.triangles.len())
         .map(|t| {
             let [a, b, c] = geometry.corners(t).map(|p| p / size);

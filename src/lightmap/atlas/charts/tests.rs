@@ -3,6 +3,7 @@
 use super::*;
 use crate::device::{Device, DeviceOptions};
 use crate::lightmap::atlas::layout::Layout;
+use crate::lightmap::atlas::pieces::connected_by_vertices;
 use crate::lightmap::atlas::texels::TexelMap;
 use crate::scene::Material;
 use crate::scene::{MeshMaterials, SceneData};
@@ -286,6 +287,17 @@ proptest! {
     fn garbage_gets_valid_charts(mesh in garbage()) {
         let scene = scene_on(1, mesh);
         check(&scene, &charts_of(&scene, 8.0).0);
+    }
+
+    #[test]
+    fn items_that_share_vertices_are_connected_as_by_keys(
+        items in prop::collection::vec([0u32..30, 0u32..30, 0u32..30], 1..40),
+    ) {
+        let progress = Progress::none();
+        let stage = progress.stage("unwrap", 0.0, 1.0, 1);
+        let keys = items.iter().zip(0..).flat_map(|(corners, i)| corners.map(|v| (v, i))).collect();
+        let expected = connected(items.len(), keys, &stage).unwrap();
+        prop_assert_eq!(connected_by_vertices(items.into_iter(), 30, &stage).unwrap(), expected);
     }
 
     #[test]
