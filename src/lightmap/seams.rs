@@ -15,11 +15,11 @@
 //! Edges are compared by the positions of their ends: T-junctions, where a vertex lies inside another triangle's edge,
 //! are not found.
 
+mod sides;
 mod solver;
 
 use super::atlas::Atlas;
 use super::atlas::ids::{ChartId, PlacementId};
-use super::atlas::pieces::float_key;
 use super::atlas::texels::TexelSample;
 use super::plan::{Plan, left_out};
 use super::{BakeParams, BakeStats, Light, Lightmap, TexelState};
@@ -33,6 +33,7 @@ use crate::base::sort::sort;
 use crate::scene::NONE;
 use glam::{Vec2, Vec3, Vec3A};
 use rayon::prelude::*;
+use sides::{Side, shared_edges};
 use solver::{CHUNK, POINTS, Point, System};
 use std::ops::Range;
 use std::sync::atomic::{AtomicU64, Ordering::Relaxed};
@@ -196,34 +197,6 @@ impl View<'_> {
     }
 }
 
-/// An edge of a triangle in one of its placements: three times the triangle's global number, plus the number of the
-/// corner that the edge starts at (triangle numbers have 28 bits), plus [`SECOND`] in the placement of a back.
-#[derive(Clone, Copy, Debug, Default, PartialEq, Eq, PartialOrd, Ord)]
-struct Side(u32);
-
-const SECOND: u32 = 1 << 31;
-
-impl Side {
-    fn triangle(self) -> u32 {
-        (self.0 & !SECOND) / 3
-    }
-
-    /// Returns the number of the triangle's corner that the edge starts at.
-    fn corner(self) -> usize {
-        ((self.0 & !SECOND) % 3) as usize
-    }
-
-    fn is_second(self) -> bool {
-        self.0 & SECOND != 0
-    }
-
-    /// Returns the edge's start and end among values of the triangle's corners.
-    fn ends<T: Copy>(self, corners: [T; 3]) -> [T; 2] {
-        let k = self.corner();
-        [corners[k], corners[(k + 1) % 3]]
-    }
-}
-
 struct Job<'a, 'p, 'c> {
     atlas: &'a Atlas,
     /// Whether the back is shown, for each chart without separate texels for it; empty: all show fronts.
@@ -324,35 +297,11 @@ impl Job<'_, '_, '_> {
     /// Finds the edges that are cut open, each with its two sides.
     fn edges(&self) -> Result<Vec<[Side; 2]>> {
         let (scene, triangles) = (&self.atlas.scene, &self.atlas.charts.triangles[..]);
-        let n = 3 * triangles.len();
-        let _memory = self.reserve(n * size_of::<(u64, Side)>(), "the edges of the charts")?;
-        let mut sides: Vec<(u64, Side)> = try_vec(n, "the edges of the charts")?;
-        sides.par_chunks_mut(3).zip(triangles).with_min_len(CHUNK).for_each(|(sides, &t)| {
-            let corners = scene.corners(t);
-            for (side, k) in sides.iter_mut().zip(0..) {
-                let s = Side(3 * t + k);
-                *side = (hash(s.ends(corners)), s);
-            }
-        });
-        self.stage.advance(0)?;
-        sort(&mut sides, &|| self.stage.check())?;
-        self.stage.advance(0)?;
-        // If three or more triangles share an edge, another surface stands on this one, and light need not continue
-        // below it. (The rare edges that share a hash are skipped too.)
-        let mut edges = try_par_gather(n.div_ceil(CHUNK), "the seams", |part, out| {
-            self.stage.check()?;
-            // Edges whose first entry is in this part.
-            let starts = |i: usize| i == 0 || sides[i - 1].0 != sides[i].0;
-            for i in (part * CHUNK..n.min((part + 1) * CHUNK)).filter(|&i| starts(i)) {
-                let same = sides[i..].iter().take(3).take_while(|s| s.0 == sides[i].0).count();
-                if same == 2 {
-                    let places = self.in_places([sides[i].1, sides[i + 1].1]);
-                    for edge in places.filter(|&edge| self.is_seam(edge)) {
-                        try_push(out, edge, "the seams")?;
-                    }
-                }
-            }
-            Ok(())
+        let bytes = sides::bytes(triangles.len(), scene.device().num_threads());
+        let _memory = self.reserve(bytes, "the edges of the charts")?;
+        let mut edges = shared_edges(scene, triangles, self.stage, |edge, out| {
+            let places = self.in_places(edge);
+            places.filter(|&edge| self.is_seam(edge)).try_for_each(|edge| try_push(out, edge, "the seams"))
         })?;
         // Sorted, since neighbours in the scene use the same texels.
         sort(&mut edges, &|| self.stage.check())?;
@@ -366,7 +315,7 @@ impl Job<'_, '_, '_> {
     /// Returns the edge in all pairs of placements of its two triangles.
     fn in_places(&self, edge: [Side; 2]) -> impl Iterator<Item = [Side; 2]> + use<> {
         let [a, b] = edge.map(|side| {
-            let second = self.atlas.map.layout.back(self.chart(side)).map(|_| Side(side.0 | SECOND));
+            let second = self.atlas.map.layout.back(self.chart(side)).map(|_| side.second());
             [Some(side), second].into_iter().flatten()
         });
         a.flat_map(move |a| b.clone().map(move |b| [a, b]))
@@ -456,16 +405,6 @@ impl Job<'_, '_, '_> {
             point
         })
     }
-}
-
-/// Hashes an edge, with the same result for both directions.
-fn hash(ends: [Vec3; 2]) -> u64 {
-    let [a, b] = ends.map(|p| p.to_array().map(float_key));
-    let (low, high) = if a < b { (a, b) } else { (b, a) };
-    low.into_iter().chain(high).fold(0, |h: u64, x| {
-        let h = (h ^ x as u64).wrapping_mul(0x9e37_79b9_7f4a_7c15);
-        h ^ h >> 29
-    })
 }
 
 /// Whether the two sides of a point use different texels, or the same ones with different weights. (Charts that the
