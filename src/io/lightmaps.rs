@@ -1,11 +1,11 @@
 //! Baked light maps as files: pages layer by layer as EXR or PNG, or the lit scene as GLB.
 
 use super::account::Account;
-use super::glb::{GlbLightmap, GlbMesh, prepare_glb};
+use super::glb::prepare_glb;
 use super::image::{encode_png, exposure_of, luminance, tone_map, write_exr_with, write_png_with};
 use super::source::Advance;
 use crate::base::error::{Error, Result};
-use crate::base::memory::{Reservation, try_collect_ok, try_vec};
+use crate::base::memory::{Reservation, try_vec};
 use crate::base::progress::Progress;
 use crate::lightmap::{Layer, LayerData, Lightmap, packed_ratio};
 use rayon::prelude::*;
@@ -96,9 +96,6 @@ pub fn write_scene(lightmap: &Lightmap, path: &Path, exposure: Option<f32>, prog
     let new = lightmap.scene().device().run(progress, || {
         let stage = progress.stage("scene with light map", 0.0, 1.0, u64::from(info.page_count) + 2);
         let exposure = exposure.map_or_else(|| self::exposure(lightmap), Ok)?;
-        let meshes = (0..lightmap.scene().meshes().len() as u32)
-            .map(|mesh| stage.advance(0).and_then(|()| GlbMesh::of(lightmap, mesh)));
-        let meshes = try_collect_ok(meshes, "the meshes")?;
         let page = |page| {
             let _encoder = encoder_memory(lightmap)?;
             let pixels = tone_mapped(lightmap, page, Layer::Combined, exposure)?;
@@ -107,9 +104,8 @@ pub fn write_scene(lightmap: &Lightmap, path: &Path, exposure: Option<f32>, prog
             stage.advance(1)?;
             Ok(file)
         };
-        let pages = (0..info.page_count).into_par_iter().map(page).collect::<Result<_>>()?;
-        let glb = GlbLightmap { meshes, pages, exposure };
-        prepare_glb(path, lightmap.scene(), &glb, &|parts| stage.advance(parts))
+        let pages = (0..info.page_count).into_par_iter().map(page).collect::<Result<Vec<_>>>()?;
+        prepare_glb(path, lightmap.scene(), lightmap, &pages, exposure, &|parts| stage.advance(parts))
     })?;
     new.finish()
 }

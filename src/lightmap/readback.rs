@@ -59,23 +59,25 @@ impl Lightmap {
         let first = self.atlas.scene.first_triangle(mesh);
         let mut uvs = try_with_capacity(m.indices.len(), "the UVs of a mesh")?;
         let mut pages = try_with_capacity(m.indices.len(), "the UVs of a mesh")?;
-        let scale = 1.0 / self.atlas.map.layout.page_size as f32;
         for t in first..first + m.indices.len() as u32 {
-            let chart = self.atlas.charts.chart_of(t);
-            if chart == ChartId::NONE {
-                uvs.push([[0.0; 2]; 3]);
-                pages.push(NONE);
-                continue;
-            }
-            let placement = self.atlas.map.layout.place_of(chart, front);
-            let corners = self.atlas.charts.corners[t as usize];
-            // Rounding of placements may go beyond the page by some 1e-9.
-            uvs.push(
-                corners.map(|c| self.atlas.map.layout.texel_coord(placement, c).map(|x| (x * scale).clamp(0.0, 1.0))),
-            );
-            pages.push(self.atlas.map.layout[placement].page);
+            let (corners, page) = self.triangle_uvs(t, front);
+            uvs.push(corners);
+            pages.push(page);
         }
         Ok((uvs, pages))
+    }
+
+    /// Returns light map UVs and page of a side of a global triangle, as [`mesh_uvs`](Self::mesh_uvs) does.
+    pub(crate) fn triangle_uvs(&self, triangle: u32, front: bool) -> ([[f32; 2]; 3], u32) {
+        let (layout, chart) = (&self.atlas.map.layout, self.atlas.charts.chart_of(triangle));
+        if chart == ChartId::NONE {
+            return ([[0.0; 2]; 3], NONE);
+        }
+        let placement = layout.place_of(chart, front);
+        let scale = 1.0 / layout.page_size as f32;
+        // Rounding of placements may go beyond the page by some 1e-9.
+        let uv = |c| layout.texel_coord(placement, c).map(|x| (x * scale).clamp(0.0, 1.0));
+        (self.atlas.charts.corners[triangle as usize].map(uv), layout[placement].page)
     }
 
     pub(super) fn light(&self) -> Result<&Light> {
@@ -224,7 +226,7 @@ impl Lightmap {
     }
 
     /// Whether the back of a global triangle has separate texels.
-    fn has_both_sides(&self, triangle: u32) -> bool {
+    pub(crate) fn has_both_sides(&self, triangle: u32) -> bool {
         self.atlas.map.layout.back(self.atlas.charts.chart_of(triangle)).is_some()
     }
 

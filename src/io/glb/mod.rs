@@ -1,6 +1,6 @@
 //! A scene with its light maps as one GLB file (glTF 2.0, binary), for viewers and engines.
 //!
-//! Each pair of light map page and material is a primitive. `TEXCOORD_0` holds the mesh's first texture coordinates,
+//! Each pair of light map page and material is a primitive, or several if it has millions of triangles. `TEXCOORD_0` holds the mesh's first texture coordinates,
 //! or zeros; `TEXCOORD_1` those of the light map. glTF has no slot for light maps, so it depends on the material where
 //! the page goes:
 //! - A material without a texture is unlit (`KHR_materials_unlit`): `baseColorFactor` is the albedo,
@@ -34,12 +34,44 @@ use super::image::encode_png;
 use super::source::Advance;
 use crate::base::error::{Error, Result, invalid_argument};
 use crate::base::files;
-use crate::base::memory::{try_append, try_collect};
+use crate::base::memory::try_append;
 use crate::lightmap::Lightmap;
 use crate::scene::{Material, NONE, Scene};
 use file::{File, LIGHTMAP_SAMPLER, TEXTURE_SAMPLER};
 use primitives::{Primitive, group};
 use std::path::Path;
+
+/// Where the sides of triangles lie in a light map.
+pub(super) trait Places {
+    /// Returns the light map coordinates of the corners of a triangle's front, by its mesh, its number in it and its
+    /// global number, and its page; [`NONE`]: it has no chart.
+    fn front(&self, mesh: u32, triangle: u32, global: u32) -> ([[f32; 2]; 3], u32);
+    /// Returns the same of its back, if that has a place of its own, with the corners in the order of the front.
+    fn back(&self, mesh: u32, triangle: u32, global: u32) -> Option<([[f32; 2]; 3], u32)>;
+}
+
+impl Places for Lightmap {
+    fn front(&self, _: u32, _: u32, global: u32) -> ([[f32; 2]; 3], u32) {
+        self.triangle_uvs(global, true)
+    }
+
+    fn back(&self, _: u32, _: u32, global: u32) -> Option<([[f32; 2]; 3], u32)> {
+        self.has_both_sides(global).then(|| self.triangle_uvs(global, false))
+    }
+}
+
+impl Places for GlbLightmap {
+    fn front(&self, mesh: u32, triangle: u32, _: u32) -> ([[f32; 2]; 3], u32) {
+        let mesh = &self.meshes[mesh as usize];
+        (mesh.corner_uvs[triangle as usize], mesh.pages[triangle as usize])
+    }
+
+    fn back(&self, mesh: u32, triangle: u32, _: u32) -> Option<([[f32; 2]; 3], u32)> {
+        let backs = &self.meshes[mesh as usize].backs;
+        let back = backs.binary_search_by_key(&triangle, |back| back.triangle).ok()?;
+        Some((backs[back].corner_uvs, backs[back].page))
+    }
+}
 
 /// Light map coordinates of one mesh.
 #[derive(Clone, Debug, Default, PartialEq)]
@@ -48,7 +80,7 @@ pub struct GlbMesh {
     pub corner_uvs: Vec<[[f32; 2]; 3]>,
     /// Page of each triangle; [`NONE`]: it has no chart.
     pub pages: Vec<u32>,
-    /// Triangles whose backs have places of their own.
+    /// Triangles whose backs have places of their own, ascending.
     pub backs: Vec<GlbBack>,
 }
 
@@ -61,17 +93,6 @@ pub struct GlbBack {
     pub corner_uvs: [[f32; 2]; 3],
     /// Number of the page.
     pub page: u32,
-}
-
-impl GlbMesh {
-    /// The coordinates of a mesh of a light map.
-    pub fn of(lightmap: &Lightmap, mesh: u32) -> Result<GlbMesh> {
-        let (corner_uvs, pages) = lightmap.mesh_uvs(mesh)?;
-        let ((back_uvs, back_pages), own) = lightmap.mesh_back_uvs(mesh)?;
-        let back = |t: usize| GlbBack { triangle: t as u32, corner_uvs: back_uvs[t], page: back_pages[t] };
-        let backs = try_collect((0..own.len()).filter(|&t| own[t]).map(back), "the backs of a mesh")?;
-        Ok(GlbMesh { corner_uvs, pages, backs })
-    }
 }
 
 /// The light maps of a scene.
@@ -87,7 +108,8 @@ pub struct GlbLightmap {
 
 /// Writes `scene` and its light maps to the file `path`, which is replaced as a whole.
 pub fn write_glb(path: &Path, scene: &Scene, lightmap: &GlbLightmap) -> Result<()> {
-    prepare_glb(path, scene, lightmap, &|_| Ok(()))?.finish()
+    check(scene, lightmap)?;
+    prepare_glb(path, scene, lightmap, &lightmap.pages, lightmap.exposure, &|_| Ok(()))?.finish()
 }
 
 /// Same as `write_glb` up to [`finish`](files::Replacement::finish), with reports: `advance` is called with each of 2
@@ -95,11 +117,13 @@ pub fn write_glb(path: &Path, scene: &Scene, lightmap: &GlbLightmap) -> Result<(
 pub(super) fn prepare_glb(
     path: &Path,
     scene: &Scene,
-    lightmap: &GlbLightmap,
+    places: &impl Places,
+    pages: &[Vec<u8>],
+    exposure: f32,
     advance: Advance,
 ) -> Result<files::Replacement> {
     let mut account = Account::new(scene.device().memory())?;
-    let (json, binary) = parts(scene, lightmap, &mut account, advance)?;
+    let (json, binary) = parts(scene, places, pages, exposure, MOST_TRIANGLES, &mut account, advance)?;
     let headers = headers(&json, &binary)?;
     advance(1)?;
     let new = files::prepare(path, |file| {
@@ -114,8 +138,10 @@ pub(super) fn prepare_glb(
 
 /// The bytes of the file that [`write_glb`] writes.
 pub fn encode_glb(scene: &Scene, lightmap: &GlbLightmap) -> Result<Vec<u8>> {
+    check(scene, lightmap)?;
     let mut account = Account::new(scene.device().memory())?;
-    let (json, binary) = parts(scene, lightmap, &mut account, &|_| Ok(()))?;
+    let (pages, exposure) = (&lightmap.pages, lightmap.exposure);
+    let (json, binary) = parts(scene, lightmap, pages, exposure, MOST_TRIANGLES, &mut account, &|_| Ok(()))?;
     let headers = headers(&json, &binary)?;
     let mut file = Vec::new();
     for part in [&headers[0][..], &json, &headers[1], &binary] {
@@ -124,19 +150,32 @@ pub fn encode_glb(scene: &Scene, lightmap: &GlbLightmap) -> Result<Vec<u8>> {
     Ok(file)
 }
 
-/// The two chunks of the file, without their headers.
-fn parts(scene: &Scene, lightmap: &GlbLightmap, account: &mut Account, advance: Advance) -> Result<(Vec<u8>, Vec<u8>)> {
-    check(scene, lightmap)?;
+/// Maximum number of triangles of a primitive: what is looked up while it is made stays small. Further ones go into
+/// another primitive of the same material.
+const MOST_TRIANGLES: usize = 1 << 20;
+
+/// The two chunks of the file, without their headers. `most`: maximum number of triangles of a primitive.
+fn parts(
+    scene: &Scene,
+    places: &impl Places,
+    pages: &[Vec<u8>],
+    exposure: f32,
+    most: usize,
+    account: &mut Account,
+    advance: Advance,
+) -> Result<(Vec<u8>, Vec<u8>)> {
     let mut file = File::new(account);
-    for (key, triangles) in group(scene, lightmap, file.account)? {
-        advance(0)?;
-        let primitive = Primitive::new(scene, &triangles, key.normals, file.account, advance)?;
+    for (key, sides) in group(scene, places, file.account, advance)? {
         let material = scene.materials()[key.material as usize];
         let material = Material { two_sided: material.two_sided && !key.one_sided, ..material };
-        let textures = lightmap.pages.len();
-        file.add_primitive(&primitive, key.page, &material, textures)?;
+        for some in sides.chunks(most) {
+            let mut held = Account::new(scene.device().memory())?;
+            let primitive = Primitive::new(scene, places, some, key.normals, &mut held, advance)?;
+            file.add_primitive(&primitive, key.page, &material, pages.len())?;
+        }
+        file.account.give_back(size_of_val(&sides[..]));
     }
-    for (page, png) in lightmap.pages.iter().enumerate() {
+    for (page, png) in pages.iter().enumerate() {
         file.add_image(png, &format!("light map page {page}"), LIGHTMAP_SAMPLER)?;
     }
     for number in file.take_own_textures() {
@@ -147,7 +186,6 @@ fn parts(scene: &Scene, lightmap: &GlbLightmap, account: &mut Account, advance: 
         file.account.give_back(2 * texture.bytes());
         file.add_image(&png, &format!("texture {number}"), TEXTURE_SAMPLER)?;
     }
-    let exposure = lightmap.exposure;
     Ok((file.json(exposure), file.binary))
 }
 

@@ -1,6 +1,6 @@
 //! The triangles of each pair of light map page and material, with their own vertices.
 
-use super::GlbLightmap;
+use super::Places;
 use crate::base::error::Result;
 use crate::io::account::Account;
 use crate::io::source::Advance;
@@ -8,14 +8,11 @@ use crate::scene::Scene;
 use glam::{Vec2, Vec3};
 use std::collections::{BTreeMap, HashMap};
 
-/// A side of a triangle to write.
-pub(super) struct Triangle {
-    mesh: u32,
-    /// Vertices and light map coordinates of its corners, in the order in which the side is a front.
-    vertices: [u32; 3],
-    corner_uvs: [[f32; 2]; 3],
-    is_back: bool,
-}
+/// A side of a triangle to write: its global number (28 bits), and [`BACK`].
+#[derive(Clone, Copy)]
+pub(super) struct Side(u32);
+
+const BACK: u32 = 1 << 31;
 
 /// The properties that all triangles of a primitive share.
 #[derive(Clone, Copy, Eq, Ord, PartialEq, PartialOrd)]
@@ -28,32 +25,32 @@ pub(super) struct Key {
     pub normals: bool,
 }
 
-/// The valid triangles of each primitive.
+/// The sides of valid triangles of each page and material.
 pub(super) fn group(
     scene: &Scene,
-    lightmap: &GlbLightmap,
+    places: &impl Places,
     account: &mut Account,
-) -> Result<BTreeMap<Key, Vec<Triangle>>> {
+    advance: Advance,
+) -> Result<BTreeMap<Key, Vec<Side>>> {
     let mut groups = BTreeMap::<Key, Vec<_>>::new();
-    for (m, (mesh, uvs)) in (0..).zip(scene.meshes().iter().zip(&lightmap.meshes)) {
+    for (m, mesh) in (0..).zip(scene.meshes()) {
         let first = scene.first_triangle(m);
-        let mut backs = uvs.backs.iter().peekable();
-        for t in 0..mesh.indices.len() {
-            let back = backs.next_if(|back| back.triangle as usize == t);
-            if !scene.is_valid(first + t as u32) {
+        let normals = !mesh.normals.is_empty();
+        for t in 0..mesh.indices.len() as u32 {
+            if t.is_multiple_of(1 << 14) {
+                advance(0)?;
+            }
+            if !scene.is_valid(first + t) {
                 continue;
             }
-            let vertices = mesh.indices[t];
-            let mut add = |page, vertices, corner_uvs, is_back| {
-                let (material, normals) = (mesh.material(t), !mesh.normals.is_empty());
-                let key = Key { page, material, one_sided: back.is_some(), normals };
-                let triangle = Triangle { mesh: m, vertices, corner_uvs, is_back };
-                account.push(groups.entry(key).or_default(), triangle, "the triangles")
+            let back = places.back(m, t, first + t);
+            let mut add = |page, side| {
+                let key = Key { page, material: mesh.material(t as usize), one_sided: back.is_some(), normals };
+                account.push(groups.entry(key).or_default(), Side(side), "the triangles")
             };
-            add(uvs.pages[t], vertices, uvs.corner_uvs[t], false)?;
-            if let Some(back) = back {
-                let turn = [0, 2, 1];
-                add(back.page, turn.map(|i| vertices[i]), turn.map(|i| back.corner_uvs[i]), true)?;
+            add(places.front(m, t, first + t).1, first + t)?;
+            if let Some((_, page)) = back {
+                add(page, (first + t) | BACK)?;
             }
         }
     }
@@ -74,20 +71,29 @@ pub(super) struct Primitive {
 impl Primitive {
     pub(super) fn new(
         scene: &Scene,
-        triangles: &[Triangle],
+        places: &impl Places,
+        sides: &[Side],
         normals: bool,
         account: &mut Account,
         advance: Advance,
     ) -> Result<Self> {
-        let mut result = Primitive { indices: account.list(3 * triangles.len(), "the corners")?, ..Default::default() };
+        let mut result = Primitive { indices: account.list(3 * sides.len(), "the corners")?, ..Default::default() };
         let mut vertex_of = HashMap::<(u32, u32, [u32; 2], bool), u32>::new();
-        for (i, t) in triangles.iter().enumerate() {
+        for (i, &Side(side)) in sides.iter().enumerate() {
             if i.is_multiple_of(1 << 14) {
                 advance(0)?;
             }
-            let mesh = &scene.meshes()[t.mesh as usize];
-            for (&v, &lightmap_uv) in t.vertices.iter().zip(&t.corner_uvs) {
-                let key = (t.mesh, v, lightmap_uv.map(f32::to_bits), t.is_back);
+            let (global, is_back) = (side & !BACK, side & BACK != 0);
+            let (m, t) = scene.locate(global);
+            let mesh = &scene.meshes()[m as usize];
+            let (corner_uvs, _) = match is_back {
+                true => places.back(m, t, global).unwrap_or_default(),
+                false => places.front(m, t, global),
+            };
+            // A back is turned round, so that it is a front.
+            let order = if is_back { [0, 2, 1] } else { [0, 1, 2] };
+            for (v, lightmap_uv) in order.map(|k| (mesh.indices[t as usize][k], corner_uvs[k])) {
+                let key = (m, v, lightmap_uv.map(f32::to_bits), is_back);
                 if let Some(vertex) = vertex_of.get(&key) {
                     result.indices.push(*vertex);
                     continue;
@@ -98,7 +104,7 @@ impl Primitive {
                 account.push(&mut result.positions, mesh.positions[v as usize], "the vertices")?;
                 if normals {
                     let normal = mesh.normals[v as usize].normalize_or(Vec3::Y);
-                    let normal = if t.is_back { -normal } else { normal };
+                    let normal = if is_back { -normal } else { normal };
                     account.push(&mut result.normals, normal, "the normals")?;
                 }
                 let uv = mesh.uvs.get(v as usize).copied().filter(|uv| uv.is_finite()).unwrap_or_default();

@@ -292,6 +292,22 @@ fn a_seam_in_the_light_map_splits_vertices() {
 }
 
 #[test]
+fn primitives_of_too_many_triangles_are_several() {
+    let (scene, lightmap) = scene_and_lightmap();
+    let counts = |most: usize| -> Vec<u64> {
+        let mut account = Account::new(scene.device().memory()).unwrap();
+        let (pages, exposure) = (&lightmap.pages, lightmap.exposure);
+        let (json, _) = parts(&scene, &lightmap, pages, exposure, most, &mut account, &|_| Ok(())).unwrap();
+        let json: Value = serde_json::from_slice(&json).unwrap();
+        let primitives = json["meshes"][0]["primitives"].as_array().unwrap();
+        let count = |p: &Value| json["accessors"][p["indices"].as_u64().unwrap() as usize]["count"].as_u64().unwrap();
+        primitives.iter().map(count).collect()
+    };
+    assert_eq!(counts(MOST_TRIANGLES), [6, 3, 3, 3]);
+    assert_eq!(counts(1), [3, 3, 3, 3, 3]);
+}
+
+#[test]
 fn light_maps_of_other_scenes_are_refused() {
     let (scene, lightmap) = scene_and_lightmap();
     let message = |change: fn(&mut GlbLightmap)| {
