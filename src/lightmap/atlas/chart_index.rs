@@ -1,7 +1,7 @@
 //! Point location in charts: finds the triangle that a point of a chart's plane belongs to.
 //!
-//! Every chart of more than a few triangles has a uniform grid of about as many cells over its local coordinates; a
-//! cell lists the triangles that overlap it. All maps share the index, whatever their resolution.
+//! Every chart of more than a few triangles has a uniform grid over its local coordinates; a cell lists the triangles
+//! that overlap it. All maps share the index, whatever their resolution.
 
 use super::charts::Charts;
 use super::flat_triangle::Flat;
@@ -15,6 +15,10 @@ use rayon::prelude::*;
 
 /// Maximum number of triangles of a chart without a grid: all of them are tested.
 const SMALL: usize = 4;
+
+/// Mean number of triangles whose area a cell has: with 1 the index of a finely divided wall takes 20 bytes per
+/// triangle, with 4 about 10.
+const TRIANGLES_PER_CELL: usize = 4;
 
 /// A grid is made coarser until its cells list at most this many triangles per triangle of the chart.
 const ENTRIES_PER_TRIANGLE: usize = 8;
@@ -53,7 +57,7 @@ impl Grid {
         if triangles.len() <= SMALL || !(size.min_element() > 0.0) || !size.is_finite() {
             return Ok(Grid::default());
         }
-        let mut cells = triangles.len();
+        let mut cells = triangles.len().div_ceil(TRIANGLES_PER_CELL);
         loop {
             let columns = (cells as f64 * size.x as f64 / size.y as f64).sqrt().clamp(1.0, cells as f64) as u32;
             let rows = (cells as u32 / columns).max(1);

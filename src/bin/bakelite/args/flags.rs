@@ -53,6 +53,8 @@ pub enum Report {
     /// Error of the light and likeness of a view against run time, for every knob of a bake, path tracing and photons
     /// alone
     Quality(Box<QualityFlags>),
+    /// Time, memory and rates of rays against the number of triangles, with fitted exponents
+    Scaling(Box<ScalingFlags>),
     /// Stiff and extreme cases, each against what is known of it (SCENE: its energy balance too)
     Stability(Box<Flags>),
 }
@@ -69,6 +71,7 @@ impl Verb {
                 Report::Directional(of_report) => &mut of_report.flags,
                 Report::Live(of_report) => &mut of_report.flags,
                 Report::Quality(of_report) => &mut of_report.flags,
+                Report::Scaling(of_report) => &mut of_report.flags,
             },
         }
     }
@@ -153,6 +156,16 @@ pub struct QualityFlags {
     #[arg(long, value_name = "A,B,..", value_delimiter = ',', default_values = KNOBS, hide_default_value = true,
           value_parser = PossibleValuesParser::new(KNOBS.into_iter().chain(["none"])))]
     pub knobs: Vec<String>,
+    #[command(flatten)]
+    pub flags: Flags,
+}
+
+#[derive(Args)]
+pub struct ScalingFlags {
+    /// Scenes by ascending number of triangles; SCENE is not used
+    #[arg(long, value_name = "A,B,..", help_heading = "Report scaling", value_delimiter = ',', value_parser = values::scene,
+          default_values = ["hall:100000", "hall:300000", "hall:1000000"])]
+    pub scenes: Vec<String>,
     #[command(flatten)]
     pub flags: Flags,
 }

@@ -35,6 +35,7 @@ pub enum Command {
     ReportMemory(Box<BakeArgs>),
     ReportPipeline(Box<BakeArgs>),
     ReportQuality(Box<ReportArgs>),
+    ReportScaling(Box<ReportArgs>),
     ReportStability(Box<BakeArgs>),
 }
 
@@ -189,6 +190,8 @@ pub struct ReportArgs {
     pub view_paths: u32,
     /// Quality: what to vary, of [`flags::KNOBS`].
     pub knobs: Vec<String>,
+    /// Scaling: what is baked, one after another.
+    pub scenes: Vec<String>,
 }
 
 /// Light map texels per metre of the atrium unless a density is given: it takes so many to show the
@@ -305,6 +308,9 @@ fn command_of(line: CommandLine) -> Result<Command, String> {
             };
             Command::ReportLive(Box::new(args))
         }
+        Verb::Report(Report::Scaling(scaling)) => {
+            Command::ReportScaling(Box::new(ReportArgs { scenes: scaling.scenes, ..report_args(scaling.flags)? }))
+        }
         Verb::Report(Report::Quality(quality)) => Command::ReportQuality(Box::new(ReportArgs {
             points: quality.points as usize,
             seeds: quality.seeds,
@@ -334,6 +340,7 @@ fn report_args(flags: Flags) -> Result<ReportArgs, String> {
         reference: None,
         view_paths: 0,
         knobs: Vec::new(),
+        scenes: Vec::new(),
     })
 }
 

@@ -1,8 +1,9 @@
 //! What the measurements of several reports share.
 
 use bakelite::lightmap::{Layer, LayerData, Lightmap};
-use bakelite::sampling::mix;
-use bakelite::{Error, Result};
+use bakelite::sampling::{combine, cosine_around, mix, uniform, uniform_triangle};
+use bakelite::trace::Ray;
+use bakelite::{Error, Result, Scene};
 use glam::Vec3;
 
 /// The middle one of some values; of an even number the upper one.
@@ -14,6 +15,22 @@ pub fn median(mut values: Vec<f64>) -> f64 {
 /// One of `all` by a number whose neighbours choose others.
 pub fn pick<T: Copy>(all: &[T], number: u32) -> T {
     all[((mix(number) as u64 * all.len() as u64) >> 32) as usize]
+}
+
+/// Rays from random points on random triangles over the hemisphere, `per_point` from each.
+pub fn surface_rays(scene: &Scene, rays: u32, per_point: u32) -> Vec<Ray> {
+    let any = (0..).map(|i| (i, ((mix(i) as u64 * scene.triangle_count() as u64) >> 32) as u32));
+    let valid = any.filter(|&(_, t)| scene.is_valid(t)).take((rays / per_point) as usize);
+    let of_point = |(i, t): (u32, u32)| {
+        let [u, v] = uniform_triangle([uniform(i, 0, 1), uniform(i, 1, 1)]);
+        let (normal, [a, b, c]) = (scene.normal(t), scene.corners(t));
+        let ray = move |k: u32| {
+            let n = if k == 0 { i } else { combine(i, k) };
+            Ray::new(a + u * (b - a) + v * (c - a), cosine_around(normal, [uniform(n, 2, 1), uniform(n, 3, 1)]))
+        };
+        (0..per_point).map(ray)
+    };
+    valid.flat_map(of_point).collect()
 }
 
 /// Positions and normals of all texels that are not inside solids: at least one.

@@ -3,9 +3,8 @@
 
 use crate::args::BakeArgs;
 use crate::job::Job;
-use crate::report::measure::median;
+use crate::report::measure::{median, surface_rays};
 use bakelite::bvh::BuildOptions;
-use bakelite::sampling::{cosine_around, mix, uniform, uniform_triangle};
 use bakelite::trace::{Hit, Ray};
 use bakelite::{Result, Scene};
 use std::time::Instant;
@@ -26,7 +25,7 @@ pub fn run(args: &BakeArgs) -> Result<()> {
         job.commit_on(&device, data.clone(), &BuildOptions { compact, ..args.build })
     };
     let scenes = [commit(false)?, commit(true)?];
-    let rays = rays(&scenes[0]);
+    let rays = surface_rays(&scenes[0], RAYS, 1);
     let ratios = rates(&scenes, &rays)?;
     let [default, compact] = scenes.each_ref().map(|s| bytes(s));
     let both = |i: usize| format!("{:.1} / {:.1}", default[i], compact[i]);
@@ -52,20 +51,6 @@ fn bytes(scene: &Scene) -> [f64; 7] {
     let others = stats.bytes - stats.bvh_bytes - positions - indices;
     let peak = scene.device().memory().peak() as u64;
     [stats.node_bytes, leaves, positions, indices, others, stats.bytes, peak].map(|b| b as f64 / stats.triangles as f64)
-}
-
-/// Rays from random points on random triangles, over the hemisphere.
-fn rays(scene: &Scene) -> Vec<Ray> {
-    let any = (0..).map(|i| (i, ((mix(i) as u64 * scene.triangle_count() as u64) >> 32) as u32));
-    let valid = any.filter(|&(_, t)| scene.is_valid(t)).take(RAYS as usize);
-    let ray = |(i, t): (u32, u32)| {
-        let corners = scene.corners(t);
-        let [u, v] = uniform_triangle([uniform(i, 0, 1), uniform(i, 1, 1)]);
-        let (normal, [a, b, c]) = (scene.normal(t), corners);
-        let d = cosine_around(normal, [uniform(i, 2, 1), uniform(i, 3, 1)]);
-        Ray::new(a + u * (b - a) + v * (c - a), d)
-    };
-    valid.map(ray).collect()
 }
 
 /// Rate of the second scene over that of the first, of closest hits and of occlusion: medians of pairs.

@@ -7,6 +7,7 @@
 //! | `memory` | a scene's memory by part, and what little of it costs rays |
 //! | `pipeline` | the stages of a bake, and what bounds each |
 //! | `quality` | error of the light against run time |
+//! | `scaling` | time, memory and rates of rays against the number of triangles |
 //! | `stability` | stiff and extreme cases against what is known of them |
 //! | `measure` | what they share |
 
@@ -16,4 +17,5 @@ mod measure;
 pub mod memory;
 pub mod pipeline;
 pub mod quality;
+pub mod scaling;
 pub mod stability;

@@ -1,0 +1,194 @@
+//! `bakelite report scaling`: seconds and bytes of the stages of a bake, and rates of rays, against the number of
+//! triangles, with the exponents of the powers that fit them (least squares of logarithms).
+//!
+//! The thesis's Appendix A found that the time of a ray grows as triangles to the power of 1/8 (single rays and random
+//! ones), 1/7 (packets) and 1/5 (photons).
+
+use crate::args::{BakeArgs, ReportArgs};
+use crate::files;
+use crate::job::Job;
+use crate::pictures::PrimaryRays;
+use crate::plot::curves::{Plot, Series};
+use crate::report::measure::{median, surface_rays};
+use bakelite::lightmap::Lightmap;
+use bakelite::scene::builtin_camera;
+use bakelite::trace::{Hit, Ray};
+use bakelite::{Result, Scene};
+use std::fmt::Write;
+use std::time::Instant;
+
+/// Rays of each kind that are timed together.
+const RAYS: u32 = 1 << 16;
+
+/// Rays from each point, of streams.
+const RAYS_PER_POINT: u32 = 256;
+
+/// Times that they are timed, of which the median counts.
+const RUNS: usize = 5;
+
+/// Width and height of the view of primary rays, each pixel of which has four.
+const VIEW: usize = 128;
+
+/// What is measured: names, and whether they grow with the scene, or are rates that fall.
+const STAGES: [&str; 8] =
+    ["tree", "charts and texels", "photons", "radiance map", "gather map", "direct light", "seams", "all"];
+const BYTES: [&str; 5] = ["scene", "building", "light map", "charting", "baking"];
+const RATES: [&str; 3] = ["single random", "streams of 256", "primary"];
+
+/// One scene's measurements.
+struct Row {
+    scene: String,
+    triangles: f64,
+    texels: u64,
+    seconds: [f64; STAGES.len()],
+    /// Announced per triangle: what the scene holds, and at most while it is built; the same of the light map; at most
+    /// while it is baked.
+    bytes: [f64; BYTES.len()],
+    /// Millions per second, on one thread.
+    rates: [f64; RATES.len()],
+}
+
+/// Prints the tables in Markdown, and writes `scaling.csv` and plots.
+pub fn run(args: &ReportArgs) -> Result<()> {
+    files::make_folder(&args.bake.out)?;
+    let mut rows = Vec::new();
+    for scene in &args.scenes {
+        rows.push(measure(&BakeArgs { scene: scene.clone(), ..args.bake.clone() })?);
+    }
+    table("seconds", &STAGES, &rows, |r| &r.seconds);
+    table("bytes per triangle", &BYTES, &rows, |r| &r.bytes);
+    table("million rays per second, one thread", &RATES, &rows, |r| &r.rates);
+    let path = |name: &str| args.bake.out.join(name);
+    files::write_text(&path("scaling.csv"), &csv(&rows))?;
+    let plot = |file: &str, y_label, names: &[&str], of: fn(&Row) -> &[f64]| {
+        let series = names.iter().enumerate().map(|(i, &name)| Series { name, points: points(&rows, i, of) });
+        let plot = Plot { title: "Scaling", x_label: "triangles", y_label, series: series.collect() };
+        files::write_text(&path(file), &plot.svg())
+    };
+    plot("scaling-seconds.svg", "seconds", &STAGES, |r| &r.seconds)?;
+    plot("scaling-bytes.svg", "bytes per triangle", &BYTES, |r| &r.bytes)?;
+    plot("scaling-rays.svg", "million rays per second", &RATES, |r| &r.rates)
+}
+
+fn measure(args: &BakeArgs) -> Result<Row> {
+    let mut job = Job::new(args);
+    let data = job.load()?;
+    let device = job.device()?;
+    let memory = device.memory().clone();
+    let start = Instant::now();
+    memory.reset_peak();
+    let scene = job.commit_on(&device, data, &args.build)?;
+    let (tree, building) = (start.elapsed().as_secs_f64(), memory.peak());
+    let rates = rates(args, &scene)?;
+    memory.reset_peak();
+    let start = Instant::now();
+    let mut lightmap = job.bars.show("charts", |p| Lightmap::create(&scene, &args.desc, p))?;
+    let (charts, charting) = (start.elapsed().as_secs_f64(), memory.peak());
+    memory.reset_peak();
+    let stats = job.bars.show("bake", |p| lightmap.bake(&args.params, p))?;
+    let baking = memory.peak();
+    let mut seconds = [tree, charts, 0.0, 0.0, 0.0, 0.0, stats.seam_seconds, 0.0];
+    let stages = [stats.photons, stats.radiance, stats.gather, stats.direct];
+    seconds[2..6].iter_mut().zip(stages).for_each(|(to, stage)| *to = stage.seconds);
+    seconds[7] = tree + charts + stats.seconds;
+    let (triangles, info) = (scene.stats().triangles as f64, lightmap.info());
+    let bytes = [scene.stats().bytes as i64, building, info.bytes as i64, charting, baking];
+    Ok(Row {
+        scene: args.title(),
+        triangles,
+        texels: info.texels,
+        seconds,
+        bytes: bytes.map(|bytes| bytes as f64 / triangles),
+        rates,
+    })
+}
+
+/// Rates of rays one by one from random points, of streams from random points, and of primary rays if the scene has a
+/// camera.
+fn rates(args: &BakeArgs, scene: &Scene) -> Result<[f64; RATES.len()]> {
+    let random = surface_rays(scene, RAYS, 1);
+    let streams = surface_rays(scene, RAYS, RAYS_PER_POINT);
+    let mut primary = Vec::new();
+    if let Some(camera) = args.camera.or(builtin_camera(&args.scene)) {
+        let view = PrimaryRays::new(&camera, VIEW, VIEW);
+        primary = (0..VIEW * VIEW).flat_map(|pixel| view.of_pixel(pixel % VIEW, pixel / VIEW)).collect();
+    }
+    let mut hits = vec![Hit::MISS; random.len().max(primary.len())];
+    let mut many = |rays: &[Ray]| scene.intersect_many(rays, false, &mut hits[..rays.len()]);
+    let one_by_one = || {
+        std::hint::black_box(random.iter().filter(|ray| scene.intersect(ray).t.is_finite()).count());
+        Ok(())
+    };
+    Ok([
+        rate(random.len(), one_by_one)?,
+        rate(streams.len(), || many(&streams))?,
+        rate(primary.len(), || many(&primary))?,
+    ])
+}
+
+/// Median rate in millions per second; 0 without rays.
+fn rate(rays: usize, mut trace: impl FnMut() -> Result<()>) -> Result<f64> {
+    let mut rates = Vec::new();
+    for _ in 0..RUNS {
+        let start = Instant::now();
+        trace()?;
+        rates.push(rays as f64 * 1e-6 / start.elapsed().as_secs_f64().max(f64::MIN_POSITIVE));
+    }
+    Ok(median(rates))
+}
+
+fn points(rows: &[Row], column: usize, of: impl Fn(&Row) -> &[f64]) -> Vec<[f64; 2]> {
+    rows.iter().map(|r| [r.triangles, of(r)[column]]).collect()
+}
+
+/// The exponent b of the power a · x^b that fits points best, by least squares of logarithms. `None` if that is
+/// undefined: fewer than two different x, or a y that is not above 0.
+fn exponent(points: &[[f64; 2]]) -> Option<f64> {
+    let logs: Vec<[f64; 2]> = points.iter().map(|p| p.map(f64::ln)).collect();
+    let n = logs.len() as f64;
+    let mean = [0, 1].map(|i| logs.iter().map(|l| l[i]).sum::<f64>() / n);
+    let moment = |i: usize| logs.iter().map(|l| (l[0] - mean[0]) * (l[i] - mean[i])).sum::<f64>();
+    let exponent = moment(1) / moment(0);
+    exponent.is_finite().then_some(exponent)
+}
+
+fn table(title: &str, names: &[&str], rows: &[Row], of: impl Fn(&Row) -> &[f64]) {
+    println!("\n{title}\n\n| scene | triangles | texels | {} |", names.join(" | "));
+    println!("|---|---|---|{}", "---|".repeat(names.len()));
+    for row in rows {
+        let values: Vec<String> = of(row).iter().map(|v| format!("{v:.2}")).collect();
+        println!("| {} | {} | {} | {} |", row.scene, row.triangles, row.texels, values.join(" | "));
+    }
+    let exponents = (0..names.len()).map(|i| exponent(&points(rows, i, &of)));
+    let exponents: Vec<String> = exponents.map(|e| e.map_or("".into(), |e| format!("{e:+.3}"))).collect();
+    println!("| exponent | | | {} |", exponents.join(" | "));
+}
+
+fn csv(rows: &[Row]) -> String {
+    let names = |prefix: &str, names: &[&str]| names.iter().map(|n| format!(",{prefix} {n}")).collect::<String>();
+    let mut out = "scene,triangles,texels".to_owned();
+    out += &(names("seconds", &STAGES) + &names("bytes per triangle", &BYTES) + &names("Mrays/s", &RATES) + "\n");
+    for row in rows {
+        let _ = write!(out, "{},{},{}", row.scene, row.triangles, row.texels);
+        for value in row.seconds.iter().chain(&row.bytes).chain(&row.rates) {
+            let _ = write!(out, ",{value}");
+        }
+        out.push('\n');
+    }
+    out
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn powers_have_their_exponents() {
+        let of = |power: f64| [1e3, 2e4, 5e6].map(|x: f64| [x, 7.0 * x.powf(power)]);
+        for power in [1.0, 0.125, -0.3] {
+            assert!((exponent(&of(power)).unwrap() - power).abs() < 1e-9);
+        }
+        assert_eq!(exponent(&[[1e3, 2.0]]), None);
+        assert_eq!(exponent(&[[1e3, 2.0], [2e3, 0.0]]), None);
+    }
+}
