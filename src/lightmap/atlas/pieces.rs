@@ -75,7 +75,7 @@ pub(in crate::lightmap) fn connected_by_vertices(
     let mut parent = try_collect(0..items.len() as u32, CHARTS)?;
     let mut first_at = try_filled(vertices, NONE, CHARTS)?;
     for (i, corners) in (0..).zip(items) {
-        if i as usize % ITEMS_PER_CHECK == 0 {
+        if (i as usize).is_multiple_of(ITEMS_PER_CHECK) {
             stage.check()?;
         }
         for v in corners {

@@ -73,7 +73,7 @@ pub(super) fn flat_regions(
         try_push(&mut members, seed, CHARTS)?;
         while let Some(&t) = members.get(next) {
             next += 1;
-            if next % ITEMS_PER_CHECK == 0 {
+            if next.is_multiple_of(ITEMS_PER_CHECK) {
                 stage.check()?;
             }
             for n in neighbours[t as usize] {

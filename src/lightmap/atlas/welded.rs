@@ -103,7 +103,7 @@ impl Geometry {
         let count = 3 * self.indices.len() as u32;
         let mut starts = try_filled(self.positions.len() + 1, 0u32, CHARTS)?;
         for edge in 0..count {
-            if edge as usize % ITEMS_PER_CHECK == 0 {
+            if (edge as usize).is_multiple_of(ITEMS_PER_CHECK) {
                 stage.check()?;
             }
             starts[lower(edge) as usize] += 1;
@@ -115,7 +115,7 @@ impl Geometry {
         }
         let mut edges = try_filled(count as usize, 0u32, CHARTS)?;
         for edge in (0..count).rev() {
-            if edge as usize % ITEMS_PER_CHECK == 0 {
+            if (edge as usize).is_multiple_of(ITEMS_PER_CHECK) {
                 stage.check()?;
             }
             let start = &mut starts[lower(edge) as usize];
