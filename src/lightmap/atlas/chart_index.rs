@@ -16,8 +16,9 @@ use rayon::prelude::*;
 /// Maximum number of triangles of a chart without a grid: all of them are tested.
 const SMALL: usize = 4;
 
-/// Charts of more triangles than this have [`MANY_PER_CELL`] triangles' area in a cell, others one triangle's: the index
-/// takes some 9 bytes less per triangle of theirs. (With as many in smaller charts, direct light in the living room took 3 % longer.)
+/// Charts of more triangles than this have the area of [`MANY_PER_CELL`] triangles in a cell, others that of one: the
+/// index takes some 9 bytes less per triangle of theirs. (With as many in smaller charts, direct light in the living
+/// room took 3 % longer.)
 const MANY: usize = 1 << 14;
 const MANY_PER_CELL: usize = 4;
 
