@@ -1,8 +1,8 @@
 //! A scene with its light maps as one GLB file (glTF 2.0, binary), for viewers and engines.
 //!
-//! Each pair of light map page and material is a primitive, or several if it has millions of triangles. `TEXCOORD_0` holds the mesh's first texture coordinates,
-//! or zeros; `TEXCOORD_1` those of the light map. glTF has no slot for light maps, so it depends on the material where
-//! the page goes:
+//! Each pair of light map page and material is a primitive, or several if it has millions of triangles. `TEXCOORD_0`
+//! holds the mesh's first texture coordinates, or zeros; `TEXCOORD_1` those of the light map. glTF has no slot for light
+//! maps, so it depends on the material where the page goes:
 //! - A material without a texture is unlit (`KHR_materials_unlit`): `baseColorFactor` is the albedo,
 //!   `baseColorTexture` the page on `TEXCOORD_1`. A viewer multiplies the two, so it shows albedo × E × exposure, bent
 //!   by the shoulder of [`crate::io::image::tone_map`]: what an eye at the surface sees, albedo/π · E, up to a

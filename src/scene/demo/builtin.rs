@@ -33,8 +33,8 @@ pub const BUILTIN_NAMES: &[&str] = &["cornell", "furnace", "sealed", "atrium", "
 ///
 /// - `furnace:ALBEDO`: the furnace with another albedo, at least 0 and less than 1.
 /// - `slit`: a closed white room, 6 × 3 × 4, with a slit 20 cm wide across its ceiling, through which the sun shines.
-/// - `hall:TRIANGLES`: a hall, 40 × 12 × 20, of about so many triangles, at least 20,000: half of them on flat walls and a
-///   coffered ceiling (mesh 0), half on 18 fluted columns; four rect lights.
+/// - `hall:TRIANGLES`: a hall, 40 × 12 × 20, of about so many triangles, at least 20,000: half of them on flat walls
+///   and a coffered ceiling (mesh 0), half on 18 fluted columns; four rect lights.
 /// - `menger:LEVEL`: the Menger sponge of a level up to 6 in the unit cube, two triangles for each square, in the sun.
 pub fn builtin(name: &str) -> Result<SceneData> {
     match name {

@@ -189,8 +189,8 @@ pub struct DirectionalFlags {
 // Flags of all commands. (A doc comment would be what the commands are about.)
 #[derive(Args)]
 pub struct Flags {
-    /// A file (.obj, .ply, .gltf, .glb) or a built-in scene (atrium, cornell, furnace; to measure massive scenes hall:TRIANGLES
-    /// and menger:LEVEL) [default: atrium]
+    /// A file (.obj, .ply, .gltf, .glb) or a built-in scene (atrium, cornell, furnace; to measure massive scenes
+    /// hall:TRIANGLES and menger:LEVEL) [default: atrium]
     #[arg(value_parser = values::scene)]
     pub scene: Option<String>,
     /// The same
