@@ -61,7 +61,7 @@ fn compare(tiles: &[Vec<Ray>], mut first: impl FnMut(&[Ray]), mut second: impl F
 }
 
 /// Shadow rays of tiles of 16 × 16 texels to points off other surfaces, or to random places in cubes there, of a size
-/// in tiles.
+/// in tiles, or all in one direction if that is infinite.
 fn shadows(scene: &Scene, areas: &[f32], spacing: f32, size: f32, label: &str) {
     let tiles: Vec<Vec<Ray>> = (0..1500)
         .map(|i| {
@@ -70,7 +70,11 @@ fn shadows(scene: &Scene, areas: &[f32], spacing: f32, size: f32, label: &str) {
                 Vec3::from(r.origin) + 0.5 * Vec3::from(r.direction)
             };
             let texels = tile(scene, areas, i, 16, 1, spacing);
+            let to_sun = Vec3::from(texels[0].direction);
             let ray = |(k, r): (usize, &Ray)| {
+                if size == f32::INFINITY {
+                    return Ray::new(r.origin.into(), to_sun);
+                }
                 let at = |dimension: u32| uniform(256 * i + k as u32, dimension, 7) - 0.5;
                 let end = lamp + 16.0 * spacing * size * Vec3::new(at(0), at(1), at(2));
                 Ray::new(r.origin.into(), end - Vec3::from(r.origin)).within(0.0, 1.0)
@@ -120,7 +124,7 @@ fn main() {
                 format!("{} {} {kind}", Path::new(file).file_stem().unwrap().to_string_lossy(), isa.name())
             };
             if is_wanted(LAMP, &is_kind) {
-                for size in [0.0, 0.25, 1.0, 4.0] {
+                for size in [0.0, 0.25, 1.0, 4.0, f32::INFINITY] {
                     shadows(&scene, &areas, spacing, size, &label(&format!("{LAMP} {size}")));
                 }
             }

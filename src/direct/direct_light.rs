@@ -311,7 +311,10 @@ impl DirectLight {
         let mut out = PointLight::default();
         shadow.normal = receiver.normal;
         if lights != Lights::Soft {
-            self.each.iter().for_each(|light| push_one(light, receiver, shadow));
+            for (i, light) in self.each.iter().enumerate() {
+                shadow.light = 1 + i;
+                push_one(light, receiver, shadow);
+            }
         }
         if lights != Lights::Sharp && samples > 0 {
             self.push_soft(receiver, number, samples, seed, shadow, &mut out);
@@ -332,6 +335,7 @@ impl DirectLight {
         // The sequences of skies and many lights begin anew at every point.
         let own = if number == 0 { seed } else { combine(seed, 64 + number) };
         shadow.slot += 1;
+        shadow.light = 0;
         if let Some(many) = &self.many {
             many.push(receiver, samples * MAX_LIGHTS_SAMPLED as u32, own, shadow);
         }
@@ -341,11 +345,13 @@ impl DirectLight {
         }
         shadow.slot += 1;
         for (i, disc) in (0..).zip(&self.discs) {
+            shadow.light = 1 + self.each.len() + i as usize;
             let (total, light) = disc.push(receiver, number * samples, samples, combine(seed, 16 + i), shadow);
             out.discs.total += total;
             out.discs.samples += light;
         }
         shadow.slot += 1;
+        shadow.light = 0;
         if !self.areas.is_empty() {
             (out.areas.total, out.areas.samples) = self.push_areas(receiver, number, samples, seed, shadow);
         }

@@ -22,8 +22,13 @@ use crate::simd::Isa;
 use glam::Vec3;
 use std::f32::consts::{FRAC_PI_2, PI};
 
-/// Number of candidates per shadow ray.
+/// Number of candidates per shadow ray to lights.
 const CANDIDATES: u32 = 8;
+
+/// Number of candidates per shadow ray to patches: the tree knows nearly all about a patch, and shadow rays of tiles
+/// cost no more than candidates do. (Less noise in less time than with four times the candidates and half the rays:
+/// docs/experiments.md#bright-patches-as-lights.)
+const CANDIDATES_OF_PATCHES: u32 = 2;
 
 #[derive(Clone, Copy)]
 enum Source {
@@ -62,23 +67,25 @@ impl Patch {
 pub(crate) struct ManyLights {
     sources: Vec<Source>,
     tree: LightTree,
+    /// Number of candidates per shadow ray.
+    candidates: u32,
 }
 
 impl ManyLights {
     /// Makes the set of point and spot lights that shine, and of area lights.
     pub(crate) fn new(isa: Isa, points: &[Light], areas: &[AreaLight]) -> Result<ManyLights> {
         let sources = points.iter().map(|&p| Source::Point(p)).chain(areas.iter().map(|&a| Source::Area(a)));
-        ManyLights::of(isa, try_collect(sources, LIGHT_TREE)?)
+        ManyLights::of(isa, try_collect(sources, LIGHT_TREE)?, CANDIDATES)
     }
 
     /// Makes the set of small parts of surfaces.
     pub(crate) fn of_patches(isa: Isa, patches: Vec<Patch>) -> Result<ManyLights> {
-        ManyLights::of(isa, try_collect(patches.into_iter().map(Source::Patch), LIGHT_TREE)?)
+        ManyLights::of(isa, try_collect(patches.into_iter().map(Source::Patch), LIGHT_TREE)?, CANDIDATES_OF_PATCHES)
     }
 
-    fn of(isa: Isa, sources: Vec<Source>) -> Result<ManyLights> {
+    fn of(isa: Isa, sources: Vec<Source>, candidates: u32) -> Result<ManyLights> {
         let bounds = try_collect(sources.iter().map(bounds), LIGHT_TREE)?;
-        Ok(ManyLights { tree: LightTree::new(isa, &bounds)?, sources })
+        Ok(ManyLights { tree: LightTree::new(isa, &bounds)?, sources, candidates })
     }
 
     pub(crate) fn bytes(&self) -> usize {
@@ -94,7 +101,7 @@ impl ManyLights {
     pub(crate) fn push(&self, receiver: &Receiver, n: u32, seed: u32, shadow: &mut ShadowRays) -> f32 {
         shadow.normal = receiver.normal;
         let mut choice = std::mem::take(shadow.choice);
-        self.find_candidates(receiver, n * CANDIDATES, seed, &mut choice);
+        self.find_candidates(receiver, n * self.candidates, seed, &mut choice);
         let total = push_some(receiver, n, seed, &choice.candidates, shadow);
         *shadow.choice = choice;
         total

@@ -59,8 +59,53 @@ pub(crate) struct Room<R, C, O, V> {
     occluded: O,
     visible: V,
     choice: Choice,
+    /// `None`: rays are too few to be traced light by light.
+    by_light: Option<ByLight>,
     /// `None`: nobody asks for light by direction.
     directed: Option<Directed>,
+}
+
+/// Shadow rays in the order of the lights that they go to: those to one light go the same way, and pass the tree
+/// together faster (six lamps in a level: in
+/// 0.53 of the time).
+struct ByLight {
+    /// Number of the light that each ray goes to.
+    numbers: Vec<u8>,
+    /// Numbers of the rays, by light.
+    order: Vec<u16>,
+    rays: Vec<Ray>,
+    occluded: Vec<u8>,
+}
+
+impl ByLight {
+    /// Traces rays as [`Scene::occluded_stream`] does.
+    fn trace(&mut self, scene: &Scene, rays: &[Ray], occluded: &mut [u8]) {
+        let count = rays.len();
+        let numbers = &self.numbers[..count];
+        let mut ends = [0; 1 << u8::BITS];
+        numbers.iter().for_each(|&light| ends[light as usize] += 1);
+        if ends[numbers[0] as usize] == count {
+            return scene.occluded_stream(rays, occluded);
+        }
+        let mut sum = 0;
+        for end in &mut ends {
+            (sum, *end) = (sum + *end, sum);
+        }
+        for (i, &light) in numbers.iter().enumerate() {
+            let place = &mut ends[light as usize];
+            (self.order[*place], self.rays[*place]) = (i as u16, rays[i]);
+            *place += 1;
+        }
+        let mut begin = 0;
+        for end in ends {
+            // Rays to lights that few go to are traced with those to the next.
+            if end - begin >= LEAST_STREAM || end == count && begin < end {
+                scene.occluded_stream(&self.rays[begin..end], &mut self.occluded[begin..end]);
+                begin = end;
+            }
+        }
+        self.order[..count].iter().zip(&self.occluded).for_each(|(&i, &o)| occluded[i as usize] = o);
+    }
 }
 
 /// Light by direction: that of each ray if nothing occludes it, and what has arrived, by slot.
@@ -85,6 +130,7 @@ impl PointRoom {
             occluded: [0; TOGETHER],
             visible: [Vec3::ZERO; KINDS],
             choice: Choice::default(),
+            by_light: None,
             directed: None,
         }
     }
@@ -108,6 +154,12 @@ impl TileRoom {
             occluded: try_filled(most, 0, what)?,
             visible: try_filled(slots, Vec3::ZERO, what)?,
             choice: Choice::default(),
+            by_light: Some(ByLight {
+                numbers: try_filled(most, 0, what)?,
+                order: try_filled(most, 0, what)?,
+                rays: try_filled(most, NOTHING, what)?,
+                occluded: try_filled(most, 0, what)?,
+            }),
             directed: None,
         })
     }
@@ -139,7 +191,9 @@ impl<R: AsMut<[Ray]>, C: AsMut<[Carried]>, O: AsMut<[u8]>, V: AsMut<[Vec3]>> Roo
             count: 0,
             traced: 0,
             slot: 0,
+            light: 0,
             normal: Vec3::ZERO,
+            by_light: self.by_light.as_mut(),
             directed: self.directed.as_mut(),
         }
     }
@@ -158,8 +212,12 @@ pub(crate) struct ShadowRays<'a> {
     traced: u64,
     /// The sum that the next rays belong to.
     pub(crate) slot: usize,
+    /// Number of the light that the next rays go to, all in about one direction; 0 if they do not. (Area lights apart:
+    /// 1.1 times the time of their rays in the living room.) Lights from [`u8::MAX`] on count as one.
+    pub(super) light: usize,
     /// Unit normal of the receiver of the next rays.
     pub(super) normal: Vec3,
+    by_light: Option<&'a mut ByLight>,
     directed: Option<&'a mut Directed>,
 }
 
@@ -170,6 +228,9 @@ impl ShadowRays<'_> {
         }
         self.rays[self.count] = ray;
         self.carried[self.count] = Carried { light, slot: self.slot as u32 };
+        if let Some(by_light) = &mut self.by_light {
+            by_light.numbers[self.count] = self.light.min(u8::MAX as usize) as u8;
+        }
         if self.directed.is_some() {
             self.carry_by_direction(&ray, light);
         }
@@ -206,9 +267,10 @@ impl ShadowRays<'_> {
             }
         } else {
             let occluded = &mut self.occluded[..self.count];
-            match self.count >= LEAST_STREAM {
-                true => scene.occluded_stream(rays, occluded),
-                false => scene.occluded_block(rays, occluded),
+            match &mut self.by_light {
+                _ if self.count < LEAST_STREAM => scene.occluded_block(rays, occluded),
+                Some(by_light) => by_light.trace(scene, rays, occluded),
+                None => scene.occluded_stream(rays, occluded),
             }
             for (c, _) in carried.iter().zip(&*occluded).filter(|(_, occluded)| **occluded == 0) {
                 self.visible[c.slot as usize] += c.light;

@@ -84,9 +84,10 @@ impl<M: Map> TexelAreas<'_, M> {
     fn neighbours(&self, texel: TexelId<M>) -> impl Iterator<Item = Option<TexelId<M>>> {
         let placement = self.map.placement_of(self.charts, texel);
         let (x, y) = self.map.position(texel);
+        let own = self.map.texels_of(placement);
         AROUND.into_iter().map(move |(dx, dy)| {
-            let near = self.map.at(placement, x + dx, y + dy)?;
-            (self.map.placement_of(self.charts, near) == placement).then_some(near)
+            // (Texels are numbered by placement. Asked for its own placement, a neighbour would be read.)
+            self.map.at(placement, x + dx, y + dy).filter(|&near| own.contains(near))
         })
     }
 }

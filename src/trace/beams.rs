@@ -111,12 +111,14 @@ pub(super) unsafe fn trace<'a, S: Simd>(
     mut done: impl FnMut(usize, bool),
 ) -> bool {
     let (mut count, mut narrow) = (0, 0);
+    // SAFETY: forwarded.
+    let exit = unsafe { Exit::<S>::new(tree, group.octant) };
     for axis in 0..3 {
         for first in (group.runs[axis]..group.runs[axis + 1]).step_by(SIZE) {
             let rays = first..group.runs[axis + 1].min(first + SIZE);
             let length = rays.len() as u32;
             // SAFETY: forwarded.
-            let Some((shaft, is_narrow)) = (unsafe { Shaft::new::<S>(rays.map(&ray), group.octant) }) else {
+            let Some((shaft, is_narrow)) = (unsafe { Shaft::new::<S>(rays.map(&ray), group.octant, &exit) }) else {
                 return false;
             };
             shafts[count] = Shaft { first: first as u32, count: length, axis: axis as u32, ..shaft };
@@ -151,13 +153,58 @@ pub(super) unsafe fn trace<'a, S: Simd>(
     true
 }
 
+/// Where rays of an octant leave the scene: what bounds rays to infinity, as those to a sun.
+struct Exit<S: Simd> {
+    /// The last planes that such rays reach, by axis.
+    far: S::F4,
+    /// Signs of the directions.
+    sign: S::F4,
+    /// What planes are moved outwards by.
+    margin: S::F4,
+}
+
+impl<S: Simd> Exit<S> {
+    /// # Safety
+    /// The CPU must have the ISA.
+    #[inline(always)]
+    unsafe fn new(tree: &Mbvh, octant: usize) -> Self {
+        let (lower, upper) = tree.bounds();
+        let most = lower.abs().max(upper.abs()).max_element();
+        let of = |up: [f32; 3], down: [f32; 3]| {
+            let [x, y, z] = from_fn(|a| if octant >> a & 1 != 0 { down[a] } else { up[a] });
+            // SAFETY: four floats are read. The caller vouches for the ISA.
+            unsafe { S::F4::load([x, y, z, 0.0].as_ptr()) }
+        };
+        let (far, sign) = (of(upper.into(), lower.into()), of([1.0; 3], [-1.0; 3]));
+        // SAFETY: the caller vouches for the ISA.
+        Exit { far, sign, margin: unsafe { S::F4::splat(MARGIN * most) } }
+    }
+
+    /// The distance at which a ray has left the scene, by more than rounding.
+    ///
+    /// # Safety
+    /// The CPU must have the ISA.
+    #[inline(always)]
+    unsafe fn distance(&self, origin: S::F4, direction: S::F4) -> f32 {
+        // SAFETY: the caller vouches for the ISA.
+        let (zero, margin) = unsafe { (S::F4::splat(0.0), S::F4::splat(MARGIN)) };
+        let way = ((self.far - origin) * self.sign).max(zero) + self.margin + margin * origin.max(zero - origin);
+        let t = way.div(direction * self.sign).to_array();
+        t[0].min(t[1]).min(t[2])
+    }
+}
+
 impl Shaft {
     /// The shaft around rays of an octant, and whether it is narrow; `None` if there cannot be one.
     ///
     /// # Safety
     /// The CPU must have the ISA.
     #[inline(always)]
-    unsafe fn new<'a, S: Simd>(rays: impl Iterator<Item = &'a Ray>, octant: usize) -> Option<(Shaft, bool)> {
+    unsafe fn new<'a, S: Simd>(
+        rays: impl Iterator<Item = &'a Ray>,
+        octant: usize,
+        exit: &Exit<S>,
+    ) -> Option<(Shaft, bool)> {
         // SAFETY: the caller vouches for the ISA; a ray is eight floats.
         unsafe {
             let splat = |x: f32| S::F4::splat(x);
@@ -166,8 +213,9 @@ impl Shaft {
             let [mut first_high, mut last_high] = [zero - infinite; 2];
             for ray in rays {
                 let p = std::ptr::from_ref(ray).cast::<f32>();
-                let first = S::F4::load(p);
-                let last = S::F4::load(p.add(4)).mul_add(splat(beyond(ray.tmax)), first);
+                let (first, direction) = (S::F4::load(p), S::F4::load(p.add(4)));
+                let end = if ray.tmax == f32::INFINITY { exit.distance(first, direction) } else { beyond(ray.tmax) };
+                let last = direction.mul_add(splat(end), first);
                 (first_low, first_high) = (first_low.min(first), first_high.max(first));
                 (last_low, last_high) = (last_low.min(last), last_high.max(last));
             }

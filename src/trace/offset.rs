@@ -48,21 +48,31 @@ impl SurfacePoint {
         let (edge_u, edge_v) = (b - a, c - a);
         let cross = edge_u.cross(edge_v);
         let twice_area = cross.length();
+        let normal = (cross / twice_area).as_vec3();
         let (u, v) = (u as f64, v as f64);
         let position = a + edge_u * u + edge_v * v;
-        let lengths = [(c - b).length(), edge_v.length(), edge_u.length()];
-        let inradius = twice_area / (lengths[0] + lengths[1] + lengths[2]);
         let rounded = position.as_vec3();
         let epsilon = ray_epsilon(rounded, scene) as f64;
-        let distance = (EDGE_DISTANCE * epsilon).min(0.5 * inradius);
         let weights = [1.0 - u - v, u, v];
+        let edges = [c - b, edge_v, edge_u];
+        // Nearly all points are so far from all edges that neither lengths nor the inradius matter: no roots.
+        let is_far = |i: usize| {
+            let (height, far) = (weights[i] * twice_area, EDGE_DISTANCE * epsilon);
+            height > 0.0 && height * height >= (1.0 + 1e-9) * far * far * edges[i].length_squared()
+        };
+        if is_far(0) && is_far(1) && is_far(2) {
+            return SurfacePoint { position: rounded, normal, interior: rounded };
+        }
+        let lengths = edges.map(DVec3::length);
+        let inradius = twice_area / (lengths[0] + lengths[1] + lengths[2]);
+        let distance = (EDGE_DISTANCE * epsilon).min(0.5 * inradius);
         let interior = if (0..3).all(|i| weights[i] * twice_area >= distance * lengths[i]) {
             rounded
         } else {
             let target = nearest_on_inner_triangle(corners, lengths, distance / inradius, position);
             (position + (target - position).clamp_length_max(MAX_MOVE * epsilon)).as_vec3()
         };
-        SurfacePoint { position: rounded, normal: (cross / twice_area).as_vec3(), interior }
+        SurfacePoint { position: rounded, normal, interior }
     }
 }
 

@@ -45,7 +45,7 @@ const LEAST: f32 = 0.1;
 
 /// Number of shadow rays per round of gather rays, to be multiplied by the patches' fraction of the light; at least one
 /// is traced.
-pub(crate) const MAX_SHADOW_RAYS: u32 = 16;
+pub(crate) const MAX_SHADOW_RAYS: u32 = 32;
 
 /// Maximum number of texels that become lights. Of more, about this many are chosen at random and weighted up.
 const MAX_PATCHES: usize = 1 << 16;
