@@ -297,3 +297,40 @@ impl ShadowRays<'_> {
         (self.visible, self.directed.as_ref().map_or(&[], |d| &d.visible))
     }
 }
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use crate::base::sampling::uniform;
+    use crate::scene::builtin;
+
+    #[test]
+    fn rays_that_are_traced_light_by_light_bring_what_they_bring_one_by_one() {
+        let scene = builtin("atrium").unwrap().committed();
+        let (lower, upper) = scene.bounds();
+        let point = |i: u32, of: u32| {
+            lower + (upper - lower) * Vec3::new(uniform(i, 0, of), uniform(i, 1, of), uniform(i, 2, of))
+        };
+        // More rays than are traced at a time, to a few lights and to one that few go to; some slots get several.
+        let light = |i: u32| if i.is_multiple_of(500) { 300 } else { (i % 5) as usize };
+        let rays = (0..3000).map(|i| {
+            let origin = point(i % 7, 2) + 0.01 * point(i, 3);
+            (i, Ray::new(origin, point(light(i) as u32, 4) - origin).within(0.0, 0.999))
+        });
+        let mut room = TileRoom::new(1000, 3000).unwrap();
+        let mut shadow = room.begin(&scene);
+        let (mut expected, mut traced, mut lit) = (vec![Vec3::ZERO; 1000], 0, 0);
+        for (i, ray) in rays {
+            let carried = Vec3::splat(uniform(i, 5, 5));
+            (shadow.slot, shadow.light) = (i as usize % 1000, light(i));
+            shadow.push(ray, carried);
+            if !scene.occluded(&ray) {
+                expected[i as usize % 1000] += carried;
+                lit += 1;
+            }
+        }
+        assert_eq!(shadow.finish(&mut traced), expected);
+        assert_eq!(traced, 3000);
+        assert!(lit > 200 && lit < 2800, "{lit}");
+    }
+}

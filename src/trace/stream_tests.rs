@@ -148,6 +148,31 @@ fn shadow_rays_of_tiles_have_the_hits_of_single_rays() {
     }
 }
 
+/// Shadow rays of tiles to a sun, from within the scene and from outside of it; in some tiles some of them end.
+#[test]
+fn parallel_rays_to_infinity_have_the_hits_of_single_rays() {
+    for shift in [Vec3::ZERO, Vec3::new(1000.0, -300.0, 7e4)] {
+        let triangles: Vec<_> = soup(3000, 0.1, 21).into_iter().map(|t| t.map(|v| v + shift)).collect();
+        for scene in scenes(&triangles, 4) {
+            let (mut hit, mut count) = (0, 0);
+            for seed in 0..24u32 {
+                let place = [0.8, 2.0][seed as usize % 2] * point(seed, 0, 31) + shift;
+                let to_sun = point(seed, 3, 31) * [1.0, 1e-3, 1e4][seed as usize / 2 % 3];
+                let ray = |i: u32| {
+                    let flat = Vec3::new(1.0, 0.0, 1.0);
+                    let ray = Ray::new(place + [0.05, 0.4][seed as usize / 6 % 2] * flat * point(i, 0, seed), to_sun);
+                    let ends = seed % 4 == 3 && i % 3 == 0;
+                    if ends { ray.within(0.0, 0.3 / to_sun.length()) } else { ray }
+                };
+                let rays: Vec<Ray> = (0..[100, 1000][seed as usize / 12]).map(ray).collect();
+                hit += assert_same(&scene, &rays, &format!("sun {seed}"));
+                count += rays.len();
+            }
+            assert!(hit > count / 10 && hit < count - count / 10, "{hit} of {count}");
+        }
+    }
+}
+
 #[test]
 fn groups_of_rays_from_scattered_places_have_the_hits_of_single_rays() {
     for scene in scenes(&soup(3000, 0.1, 6), 4) {
