@@ -55,8 +55,8 @@ impl SurfacePoint {
         let epsilon = ray_epsilon(rounded, scene) as f64;
         let weights = [1.0 - u - v, u, v];
         let edges = [c - b, edge_v, edge_u];
-        // Nearly all points are so far from all edges that neither lengths nor the inradius matter: no roots. (Direct light
-        // of Sponza at 31.5 texels/m takes 0.95 of the time.)
+        // Nearly all points are so far from all edges that neither lengths nor the inradius matter: no roots. (Direct
+        // light of Sponza at 31.5 texels/m takes 0.95 of the time.)
         let is_far = |i: usize| {
             let (height, far) = (weights[i] * twice_area, EDGE_DISTANCE * epsilon);
             height > 0.0 && height * height >= (1.0 + 1e-9) * far * far * edges[i].length_squared()
