@@ -1722,7 +1722,8 @@ typedef struct bk_bake_params {
   /// Number of rays per texel of the gather map, at most 65536; 0: no indirect light. Each 64
   /// rays are accompanied by up to 16 shadow rays to bright patches of surfaces, where there are
   /// any (BK_LEFT_OUT_BRIGHT_PATCHES). Light map texels for which none of the gather texels
-  /// around is a valid source of interpolation (1 to 3 %) trace up to 16 gather rays themselves.
+  /// around is a valid source of interpolation (1 to 3 %), and those beyond
+  /// `interpolation_error`, trace rays themselves: a quarter as many, at least 16, at most 64.
   /// Raise it to 256 for final light: noise falls with its root, the time of the gather map grows
   /// in proportion; 16 suffices for a preview. Default: 64.
   uint32_t gather_rays;
@@ -1808,6 +1809,14 @@ typedef struct bk_bake_params {
   /// is hard to see. Errors by blur and coarse maps are not noise and stay: see near_hits,
   /// blur_radius and bk_lightmap_params.gather_divisor, or bk_quality_init. Default: 0.
   float target_error;
+  /// Estimated error of interpolation between texels of the gather map above which texels of the
+  /// light map trace rays themselves, as in corners, behind furniture and under arches; > 0,
+  /// INFINITY: only where there is nothing to interpolate. It is the width of a gather texel by
+  /// the harmonic mean distance of the surfaces that it sees, plus 4 times the root of 1 − cos of
+  /// the angle between normals (after Ward, Rubinstein and Clear 1988). 0.5 for final light;
+  /// INFINITY for a preview, or where a scene is open and flat. Half the error of a furnished
+  /// room for a tenth more time: docs/accuracy.md, "Interpolation error". Default: 1.
+  float interpolation_error;
 } bk_bake_params;
 
 /// Numbers about one stage of a bake.
@@ -1875,7 +1884,7 @@ BK_API void bk_bake_params_init(bk_bake_params *params);
 /// seed, budget and so on. Measured error and time: docs/accuracy.md, "Qualities".
 ///
 /// bk_lightmap_desc: `gather_divisor`, `radiance_divisor`. bk_bake_params: `photon_count`,
-/// `gather_rays`, `near_hits`, `blur_radius`, `direct_samples`, `passes`.
+/// `gather_rays`, `near_hits`, `interpolation_error`, `blur_radius`, `direct_samples`, `passes`.
 ///
 /// @param quality  one of the BK_QUALITY values
 /// @param desc  structure that bk_lightmap_desc_init has filled in; may be NULL
@@ -2236,6 +2245,10 @@ typedef struct bk_live_params {
   /// saw. 0: they rest. Set it to 1 where the application leaves cores idle between updates:
   /// light converges sooner, and the cores are busy all the time. Default: 0.
   uint32_t background;
+  /// Estimated error of interpolation above which texels trace rays themselves, see
+  /// bk_bake_params. These rays come before the first light and before that of new lights. Set it
+  /// to 1 for the texels of a default bake. Default: INFINITY.
+  float interpolation_error;
 } bk_live_params;
 
 /// A perspective camera.

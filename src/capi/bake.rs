@@ -101,7 +101,8 @@ pub struct bk_bake_params {
     /// Number of rays per texel of the gather map, at most 65536; 0: no indirect light. Each 64
     /// rays are accompanied by up to 16 shadow rays to bright patches of surfaces, where there are
     /// any (BK_LEFT_OUT_BRIGHT_PATCHES). Light map texels for which none of the gather texels
-    /// around is a valid source of interpolation (1 to 3 %) trace up to 16 gather rays themselves.
+    /// around is a valid source of interpolation (1 to 3 %), and those beyond
+    /// `interpolation_error`, trace `own_rays` themselves.
     /// Raise it to 256 for final light: noise falls with its root, the time of the gather map grows
     /// in proportion; 16 suffices for a preview. Default: 64.
     pub gather_rays: u32,
@@ -187,6 +188,18 @@ pub struct bk_bake_params {
     /// is hard to see. Errors by blur and coarse maps are not noise and stay: see near_hits,
     /// blur_radius and bk_lightmap_params.gather_divisor, or bk_quality_init. Default: 0.
     pub target_error: f32,
+    /// Estimated error of interpolation between texels of the gather map above which texels of the
+    /// light map trace rays themselves, as in corners, behind furniture and under arches; > 0,
+    /// INFINITY: only where there is nothing to interpolate. It is the width of a gather texel by
+    /// the harmonic mean distance of the surfaces that it sees, plus 4 times the root of 1 − cos of
+    /// the angle between normals (after Ward, Rubinstein and Clear 1988). 0.5 for final light;
+    /// INFINITY for a preview, or where a scene is open and flat. Half the error of a furnished
+    /// room for a tenth more time: docs/accuracy.md, "Interpolation error". Default: 1.
+    pub interpolation_error: f32,
+    /// Number of rays of texels of the light map that trace rays themselves, at most 64, and no more
+    /// than `gather_rays`; 0: a quarter of `gather_rays`, at least 16. Raise it to 64 where texels
+    /// are small and noise shows in corners: these texels take so many times as long. Default: 0.
+    pub own_rays: u32,
 }
 
 sized_struct!(bk_bake_params, defaults: {
@@ -198,6 +211,8 @@ sized_struct!(bk_bake_params, defaults: {
         gather_rays: p.gather_rays,
         radius: p.radius,
         near_hits: p.near_hits,
+        interpolation_error: p.interpolation_error,
+        own_rays: p.own_rays,
         blur_radius: p.blur_radius,
         direct_samples: p.direct_samples,
         seed: p.seed,
@@ -238,7 +253,7 @@ pub const BK_QUALITY_REFERENCE: u32 = 3;
 /// seed, budget and so on. Measured error and time: docs/accuracy.md, "Qualities".
 ///
 /// bk_lightmap_desc: `gather_divisor`, `radiance_divisor`. bk_bake_params: `photon_count`,
-/// `gather_rays`, `near_hits`, `blur_radius`, `direct_samples`, `passes`.
+/// `gather_rays`, `near_hits`, `interpolation_error`, `blur_radius`, `direct_samples`, `passes`.
 ///
 /// @param quality  one of the BK_QUALITY values
 /// @param desc  structure that bk_lightmap_desc_init has filled in; may be NULL
@@ -269,6 +284,7 @@ pub unsafe extern "C" fn bk_quality_set(
             p.photon_count = new.photon_count;
             p.gather_rays = new.gather_rays;
             p.near_hits = new.near_hits;
+            p.interpolation_error = new.interpolation_error;
             p.blur_radius = new.blur_radius;
             p.direct_samples = new.direct_samples;
             p.passes = new.passes;
@@ -420,6 +436,8 @@ pub unsafe extern "C" fn bk_bake(
             gather_rays: p.gather_rays,
             radius: p.radius,
             near_hits: p.near_hits,
+            interpolation_error: p.interpolation_error,
+            own_rays: p.own_rays,
             blur_radius: p.blur_radius,
             direct_samples: p.direct_samples,
             seed: p.seed,

@@ -127,6 +127,10 @@ pub struct bk_live_params {
     /// saw. 0: they rest. Set it to 1 where the application leaves cores idle between updates:
     /// light converges sooner, and the cores are busy all the time. Default: 0.
     pub background: u32,
+    /// Estimated error of interpolation above which texels trace rays themselves, see
+    /// bk_bake_params. These rays come before the first light and before that of new lights. Set it
+    /// to 1 for the texels of a default bake. Default: INFINITY.
+    pub interpolation_error: f32,
 }
 
 sized_struct!(bk_live_params, defaults: {
@@ -146,6 +150,7 @@ sized_struct!(bk_live_params, defaults: {
         direct_samples: p.direct_samples,
         radius: p.radius,
         near_hits: p.near_hits,
+        interpolation_error: p.interpolation_error,
         background: p.background as u32,
     }
 });
@@ -180,6 +185,7 @@ fn core_params(p: &bk_live_params) -> Result<LiveParams> {
         direct_samples: p.direct_samples,
         radius: p.radius,
         near_hits: p.near_hits,
+        interpolation_error: p.interpolation_error,
         background: read_bool(p.background, "background")?,
     })
 }

@@ -30,6 +30,7 @@ use bytemuck::{Pod, Zeroable};
 use glam::Vec3;
 use indirect::blur;
 use indirect::radiance_map::Radiance;
+use indirect::sample_set::ROUND;
 use plan::Plan;
 pub use readback::MeshUvs;
 pub use saved::CheckpointParams;
@@ -139,7 +140,7 @@ pub struct BakeParams {
     pub max_bounces: u32,
     /// Number of rays per gather map texel; 0: no indirect light. Each 64 rays are accompanied by up to 16 shadow rays
     /// to bright patches of surfaces, where there are any. Light map texels for which none of the gather texels around
-    /// is a valid source of interpolation (1 to 3 %) trace up to 16 gather rays themselves.
+    /// is a valid source of interpolation (1 to 3 %), and those beyond `interpolation_error`, trace rays themselves.
     pub gather_rays: u32,
     /// Search radius of photons in scene units, finite; 0: from the photons' density, and at least three quarters of a
     /// texel of the radiance map, so that no photon lies between the discs of the estimates.
@@ -148,6 +149,14 @@ pub struct BakeParams {
     /// short path instead of looked up: 0 (never) to infinity (always: path tracing, whose error has no floor but that of
     /// the gather map's texels, and for which `photon_count` may be 0). Through transmissive sheets radiance is looked up.
     pub near_hits: f32,
+    /// Estimated error of interpolation between gather texels above which texels of the light map trace rays themselves
+    /// (`own_rays`): > 0, infinity: never but where there is nothing to interpolate. It is
+    /// the width of a gather texel divided by the harmonic mean distance of what it sees, plus 4 √(1 − cos) of the angle
+    /// between normals: the split-sphere model (Ward, Rubinstein and Clear 1988), with weights of its own.
+    pub interpolation_error: f32,
+    /// Number of rays of texels of the light map that trace rays themselves, at most 64 and at most `gather_rays`; 0: a
+    /// quarter of `gather_rays`, at least 16.
+    pub own_rays: u32,
     /// Radius of the gather map's blur in gather texels; 0: none.
     pub blur_radius: u32,
     /// Number of shadow rays per light map texel and area light or disc of a directional light. More than four area
@@ -195,6 +204,8 @@ impl Default for BakeParams {
             gather_rays: 64,
             radius: 0.0,
             near_hits: 0.0,
+            interpolation_error: 1.0,
+            own_rays: 0,
             blur_radius: 2,
             direct_samples: 16,
             seed: 0,
@@ -452,6 +463,12 @@ impl BakeParams {
         }
         if !(self.near_hits >= 0.0) {
             return invalid_argument!("near_hits is {}, not a number ≥ 0", self.near_hits);
+        }
+        if self.own_rays > ROUND as u32 {
+            return invalid_argument!("own_rays is {}, more than {ROUND}", self.own_rays);
+        }
+        if !(self.interpolation_error > 0.0) {
+            return invalid_argument!("interpolation_error is {}, not a number > 0", self.interpolation_error);
         }
         if self.blur_radius > blur::MAX_BLUR_RADIUS {
             return invalid_argument!("blur_radius is {}, more than {}", self.blur_radius, blur::MAX_BLUR_RADIUS);

@@ -165,6 +165,8 @@ mod tests {
         gather_rays: 64,
         radius: 0.0,
         near_hits: 1.0,
+        interpolation_error: 1.0,
+        own_rays: 0,
         blur_radius: 2,
         direct_samples: 16,
         seed: 3,

@@ -189,6 +189,8 @@ mod tests {
         gather_rays: 32,
         radius: 0.0,
         near_hits: 0.0,
+        interpolation_error: 1.0,
+        own_rays: 0,
         blur_radius: 2,
         direct_samples: 8,
         seed: 3,

@@ -183,6 +183,10 @@ impl Plan {
         } else if params.near_hits > 0.0 {
             self.run(&format!("paths from hits of gather rays nearer than {} radiance texels", params.near_hits));
         }
+        if params.interpolation_error < f32::INFINITY {
+            let most = params.interpolation_error;
+            self.run(&format!("rays from texels where the gather map is too coarse: by an error of more than {most}"));
+        }
         if two_sided {
             self.run("radiance of back sides of two-sided materials");
         } else {

@@ -8,8 +8,8 @@ use super::indirect::bright_patches::Bright;
 use super::indirect::find_bright_patches;
 use super::indirect::near_hits::{HitRadiance, NearHits};
 use super::indirect::radiance_map::{self, Radiance, RadianceInput, RadianceLookup};
-use super::indirect::sample_set::SampleSet;
-use super::indirect::upsample::{OWN_RAYS, OwnDirectional, OwnLight, OwnRays, Upsampling};
+use super::indirect::sample_set::{ROUND, SampleSet};
+use super::indirect::upsample::{OWN_PART, OWN_RAYS, OwnDirectional, OwnLight, OwnRays, Upsampling};
 use super::plan::{Plan, left_out};
 use super::texel_light::TexelLight;
 use super::{BakeParams, BakeStats, StageStats};
@@ -136,7 +136,7 @@ pub(crate) fn backs(inputs: &Inputs, radiance: &[Vec3]) -> Result<Vec<bool>> {
 /// Finds how texels of the light map interpolate between gather texels, for a range of placements.
 pub(crate) fn upsampling(inputs: &Inputs, backs: &[bool], placements: Range<usize>) -> Result<Upsampling> {
     let stage = inputs.progress.stage("upsampling", 0.3, 0.315, placements.len() as u64);
-    Upsampling::find(inputs.atlas, placements, backs, &stage)
+    Upsampling::find(inputs.atlas, placements, backs, inputs.params.interpolation_error, &stage)
 }
 
 /// Light of fallback gathers, and the number of their rays.
@@ -156,7 +156,8 @@ pub(crate) fn own_light(
     directional: bool,
 ) -> Result<Own> {
     let Inputs { atlas, params, progress, .. } = *inputs;
-    let count = params.gather_rays.min(OWN_RAYS);
+    let automatic = (params.gather_rays / OWN_PART).clamp(OWN_RAYS, ROUND as u32);
+    let count = if params.own_rays == 0 { automatic } else { params.own_rays }.min(params.gather_rays);
     let rays = OwnRays {
         radiance: inputs.lookup(radiance),
         samples: &SampleSet::new(count, purpose_seed(params.seed, purpose::GATHER_SET)),

@@ -49,6 +49,9 @@ pub struct LiveParams {
     pub radius: f32,
     /// Distance up to which hits of gather rays are near, as in a bake.
     pub near_hits: f32,
+    /// Estimated error of interpolation above which texels trace rays themselves, as in a bake. Infinity by default: those
+    /// rays come before the first light.
+    pub interpolation_error: f32,
     /// Whether the device's threads go on working between updates.
     pub background: bool,
 }
@@ -70,6 +73,7 @@ impl Default for LiveParams {
             direct_samples: bake.direct_samples,
             radius: bake.radius,
             near_hits: bake.near_hits,
+            interpolation_error: f32::INFINITY,
             background: false,
         }
     }
@@ -177,6 +181,7 @@ impl LiveParams {
             gather_rays: self.max_rounds * ROUND as u32,
             radius: self.radius,
             near_hits: self.near_hits,
+            interpolation_error: self.interpolation_error,
             blur_radius: self.blur,
             direct_samples: self.direct_samples,
             seed: self.seed,

@@ -6,7 +6,7 @@ use crate::base::progress::Stage;
 use crate::device::Device;
 use crate::lightmap::atlas::chart_map::ChartMap;
 use crate::lightmap::atlas::charts::Charts;
-use crate::lightmap::atlas::ids::{GatherMap, GatherTexel};
+use crate::lightmap::atlas::ids::{GatherMap, GatherTexel, Map, TexelId};
 use glam::Vec3;
 use rayon::prelude::*;
 
@@ -32,6 +32,22 @@ pub(crate) struct Texels<'a> {
     pub normals: &'a [Vec3],
 }
 
+impl Texels<'_> {
+    fn get(&self, texel: GatherTexel) -> Option<Noisy> {
+        let i = texel.index();
+        self.valid[i].then(|| Noisy { value: self.values[i], variance: self.variances[i], normal: self.normals[i] })
+    }
+}
+
+/// Light of a texel before the blur.
+#[derive(Clone, Copy)]
+pub(super) struct Noisy {
+    pub value: Vec3,
+    /// Variance of the value's sum over the channels; infinite if unknown.
+    pub variance: f32,
+    pub normal: Vec3,
+}
+
 /// Blurs each valid texel over the valid texels within a square of `radius`, by a Gaussian that leaves out texels that
 /// differ by more than noise: the weight falls with the difference of two texels by the standard deviation of that
 /// difference (the range filter of Tomasi and Manduchi, *Bilateral filtering*, 1998, its width from the samples'
@@ -55,11 +71,8 @@ pub(crate) fn blur<T: Linear>(
             let mut window = Window::new(radius);
             for (i, out) in out.iter_mut().enumerate() {
                 stage.check()?;
-                let i = block * BLOCK + i;
-                *out = match texels.valid[i] {
-                    true => window.blur_of(charts, map, GatherTexel::new(i), texels, of),
-                    false => of[i],
-                };
+                let texel = GatherTexel::new(block * BLOCK + i);
+                *out = window.mean(charts, map, texel, |s| texels.get(s), |s| of[s.index()]);
             }
             stage.advance(out.len() as u64)
         })
@@ -91,21 +104,21 @@ impl Window {
         texel: GatherTexel,
         texels: Texels,
     ) -> Vec3 {
-        self.blur_of(charts, map, texel, texels, texels.values)
+        self.mean(charts, map, texel, |s| texels.get(s), |s| texels.values[s.index()])
     }
 
-    /// Returns the mean of `of`, by texel, with the weights with which one valid texel is blurred.
-    fn blur_of<T: Linear>(
+    /// Returns the mean of `of` with the weights with which one valid texel is blurred. `get`: the values by which weights
+    /// are chosen, where there are any.
+    pub(super) fn mean<M: Map, T: Linear>(
         &mut self,
         charts: &Charts,
-        map: &ChartMap<GatherMap>,
-        texel: GatherTexel,
-        texels: Texels,
-        of: &[T],
+        map: &ChartMap<M>,
+        texel: TexelId<M>,
+        get: impl Fn(TexelId<M>) -> Option<Noisy>,
+        of: impl Fn(TexelId<M>) -> T,
     ) -> T {
-        let Texels { values, variances, valid, normals } = texels;
-        let own = texel.index();
-        let (brightness, variance) = (values[own].element_sum(), variances[own]);
+        let Some(own) = get(texel) else { return of(texel) };
+        let brightness = own.value.element_sum();
         let (x, y) = map.position(texel);
         let placement = map.placement_of(charts, texel);
         self.seen = [0; MAX_WINDOW];
@@ -116,18 +129,17 @@ impl Window {
         while next < self.queue.len() {
             let (dx, dy) = self.queue[next];
             next += 1;
-            let Some(s) = map.at(placement, x + dx, y + dy).map(GatherTexel::index).filter(|&s| valid[s]) else {
-                continue;
-            };
+            let Some(s) = map.at(placement, x + dx, y + dy) else { continue };
+            let Some(other) = get(s) else { continue };
             // Charts may bend, and texels with other normals receive other light.
-            let bend = normals[own].dot(normals[s]).max(0.0);
+            let bend = own.normal.dot(other.normal).max(0.0);
             let bend = bend * bend * bend * bend;
-            let deviation = (variance + variances[s]).sqrt() + f32::MIN_POSITIVE;
-            let difference = (values[s].element_sum() - brightness) / (LIKE * deviation);
+            let deviation = (own.variance + other.variance).sqrt() + f32::MIN_POSITIVE;
+            let difference = (other.value.element_sum() - brightness) / (LIKE * deviation);
             // The difference is not a number if light overflows.
-            let like = if s == own { 1.0 } else { (-0.5 * difference * difference).exp().max(0.0) };
+            let like = if s == texel { 1.0 } else { (-0.5 * difference * difference).exp().max(0.0) };
             let w = self.weights[(dx * dx + dy * dy) as usize] * bend * like;
-            sum += of[s] * w;
+            sum += of(s) * w;
             total += w;
             for (nx, ny) in [(dx - 1, dy), (dx + 1, dy), (dx, dy - 1), (dx, dy + 1)] {
                 if nx.abs() <= self.radius && ny.abs() <= self.radius {

@@ -13,10 +13,10 @@ use crate::scene::Scene;
 use crate::trace::Ray;
 
 /// Maximum number of rays that test whether a texel is in a gap.
-const PROBES: u32 = 16;
+pub(super) const PROBES: u32 = 16;
 
 /// Minimum number of these rays that get further than a gather texel outside of gaps.
-const AWAY: u32 = 2;
+pub(super) const AWAY: u32 = 2;
 
 /// Whether all but at most one of the rays from a texel hit a surface within `distance`, the width of a gather texel.
 /// Adds the rays traced to `rays`.

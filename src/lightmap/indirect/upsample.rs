@@ -6,14 +6,19 @@
 //! crease](super::upsample_visibility); if there are none, the class does not matter, and if all are behind walls or
 //! creases, these do not matter either. A texel that is not in a known narrow gap and has no valid gather texel around
 //! it outside gaps, as on a narrow face of a moulding, gets a fallback gather: it traces a few rays itself, and the
-//! result is averaged with those of such texels nearby.
+//! result is averaged with those of such texels nearby, as far as they do not differ by more than noise. So does a texel
+//! where interpolation is [estimated](super::interpolation_error) to be wrong, as in corners and under arches: the
+//! density of the rays adapts to the scene.
 //!
 //! Measured: docs/experiments.md#fallback-gather.
 
+use super::blur::{Noisy, Window};
 use super::gather::{Gathered, Tile, TileTexel};
+use super::interpolation_error::{Surroundings, surroundings};
 use super::narrow_gaps::is_in_gap;
 use super::near_hits::HitRadiance;
 use super::sample_set::SampleSet;
+use super::texel_set::TexelSet;
 use super::upsample_visibility::{self, TEXELS_PER_CHECK};
 use crate::base::directional::{Directional, Linear};
 use crate::base::error::Result;
@@ -26,12 +31,11 @@ use crate::base::scratch::Scratch;
 use crate::lightmap::atlas::Atlas;
 use crate::lightmap::atlas::chart_map::ChartMap;
 use crate::lightmap::atlas::ids::{
-    GatherMap, GatherTexel, LightMap, LightTexel, Map, PerTexel, PlacementId, ShownMap, TexelId,
+    GatherMap, GatherTexel, LightMap, LightTexel, PerTexel, PlacementId, ShownMap, TexelId,
 };
 use crate::lightmap::tiles::TILE;
 use glam::Vec3;
 use rayon::prelude::*;
-use std::marker::PhantomData;
 use std::ops::Range;
 use std::sync::atomic::{AtomicU64, Ordering::Relaxed};
 
@@ -41,10 +45,12 @@ const SHOWN: &str = "what the light map shows of the gather map";
 /// Number of fallback gathers that a thread computes at a time.
 const BLOCK: usize = 4 * TILE;
 
-/// Maximum number of rays of a fallback gather.
+/// Number of rays of a fallback gather, if it is not given: as many as a gather texel has, divided by this, but at least so
+/// many, and no more than a gather texel has or than there are in a round. (With 32 or 64 instead of 16 a furnished room has the same error.)
+pub(in crate::lightmap) const OWN_PART: u32 = 4;
 pub(in crate::lightmap) const OWN_RAYS: u32 = 16;
 
-/// Radius of the blur of fallback gathers, in texels of the light map.
+/// Radius of the blur of fallback gathers, in texels of the light map. (3 is no better.)
 const RADIUS: i32 = 2;
 
 /// Interpolation constraints of the light map's texels. They depend on the scene and the sides that are shown, not on
@@ -87,10 +93,17 @@ pub(crate) struct OwnRays<'a> {
 
 impl Upsampling {
     /// Finds the constraints for some `placements` of an atlas. `backs` says which charts without separate texels for
-    /// their backs show the back. Advances `stage` by one per placement.
-    pub(crate) fn find(atlas: &Atlas, placements: Range<usize>, backs: &[bool], stage: &Stage) -> Result<Upsampling> {
+    /// their backs show the back. Where the estimated error of interpolation is more than `most_error`, texels gather
+    /// for themselves. Advances `stage` by one per placement.
+    pub(crate) fn find(
+        atlas: &Atlas,
+        placements: Range<usize>,
+        backs: &[bool],
+        most_error: f32,
+        stage: &Stage,
+    ) -> Result<Upsampling> {
         let of_placement = |placement: usize| {
-            let found = Found::in_placement(atlas, backs, PlacementId::new(placement), stage)?;
+            let found = Found::in_placement(atlas, backs, PlacementId::new(placement), most_error, stage)?;
             stage.advance(1)?;
             Ok(found)
         };
@@ -102,13 +115,13 @@ impl Upsampling {
             })
         })?;
         stage.check()?;
-        let gather_gaps = TexelSet::new(found.iter().flat_map(|f| &f.gather_gaps), atlas.gather.len())?;
-        let map_gaps = TexelSet::new(found.iter().flat_map(|f| &f.map_gaps), atlas.map.len())?;
+        let gather_gaps = TexelSet::new(found.iter().flat_map(|f| &f.gather_gaps), atlas.gather.len(), SHOWN)?;
+        let map_gaps = TexelSet::new(found.iter().flat_map(|f| &f.map_gaps), atlas.map.len(), SHOWN)?;
         let walls = try_collect(found.iter().flat_map(|f| &f.walls).copied(), SHOWN)?;
-        let walled = TexelSet::new(walls.iter().map(|(texel, _)| texel), atlas.map.len())?;
+        let walled = TexelSet::new(walls.iter().map(|(texel, _)| texel), atlas.map.len(), SHOWN)?;
         stage.check()?;
         let alone = try_collect(found.iter().flat_map(|f| &f.alone).copied(), SHOWN)?;
-        let is_alone = TexelSet::new(alone.iter(), atlas.map.len())?;
+        let is_alone = TexelSet::new(alone.iter(), atlas.map.len(), SHOWN)?;
         let rays = found.iter().map(|f| f.rays).sum();
         let bits: usize = [&map_gaps, &walled, &is_alone].into_iter().map(TexelSet::bytes).sum();
         let own = alone.len() * size_of::<Option<Vec3>>();
@@ -128,8 +141,9 @@ impl Upsampling {
     ) -> Result<(OwnLight, OwnDirectional, u64)> {
         let (what, n) = ("texels on their own", self.alone.len());
         let traced = AtomicU64::new(0);
-        let nothing = Own { irradiance: None, normal: Vec3::ZERO };
+        let nothing = Own { light: None };
         let mut own = try_filled(n, nothing, what)?;
+        let _memory = atlas.scene.device().memory().reserve(size_of_val(&own[..]), what)?;
         let mut light: OwnLight = try_filled(n, None, what)?;
         let n = if rays.directional { n } else { 0 };
         let mut directional: Vec<Directional> = try_vec(n, what)?;
@@ -148,12 +162,17 @@ impl Upsampling {
                     stage.advance(texels.len() as u64)
                 },
             )?;
-            blurred.par_iter_mut().enumerate().with_min_len(BLOCK).for_each(|(i, blurred)| {
-                *blurred = self.blurred(atlas, &own, |k| directional[k], i);
+            blurred.par_chunks_mut(BLOCK).enumerate().for_each(|(block, blurred)| {
+                let mut window = Window::new(RADIUS);
+                for (i, blurred) in (block * BLOCK..).zip(blurred) {
+                    *blurred = self.blurred(atlas, &mut window, &own, |k| directional[k], i);
+                }
             });
             light.par_chunks_mut(BLOCK).enumerate().try_for_each(|(block, light)| {
+                let mut window = Window::new(RADIUS);
+                let value = |k: usize| own[k].light.map_or(Vec3::ZERO, |l| l.value);
                 for (i, light) in (block * BLOCK..).zip(light.iter_mut()) {
-                    *light = self.blurred(atlas, &own, |k| own[k].irradiance.unwrap_or_default(), i);
+                    *light = self.blurred(atlas, &mut window, &own, value, i);
                 }
                 stage.advance(light.len() as u64)
             })
@@ -181,10 +200,7 @@ impl Upsampling {
         own: &[Option<T>],
         texel: LightTexel,
     ) -> T {
-        if self.is_alone.has(texel)
-            && let Ok(i) = self.alone.binary_search(&texel)
-            && let Some(irradiance) = own[i]
-        {
+        if let Some(irradiance) = self.is_alone.rank(texel).and_then(|i| own[i]) {
             return irradiance;
         }
         let mut all = T::default();
@@ -230,31 +246,26 @@ impl Upsampling {
     /// Whether there are no constraints other than fallback gathers.
     #[inline]
     pub(in crate::lightmap) fn is_plain(&self) -> bool {
-        self.gather_gaps.words.is_empty() && self.walls.is_empty()
+        self.gather_gaps.is_empty() && self.walls.is_empty()
     }
 
-    /// Returns the mean `value` of fallback gather `i` and those within [`RADIUS`] in the same chart, weighted by how far they
-    /// face the same way. (There is no test for thin walls between them.)
-    fn blurred<T: Linear>(&self, atlas: &Atlas, own: &[Own], value: impl Fn(usize) -> T, i: usize) -> Option<T> {
-        let (texel, normal) = (self.alone[i], own[i].normal);
-        own[i].irradiance?;
-        let (x, y) = atlas.map.position(texel);
+    /// Returns the mean `value` of fallback gather `i` and those around it in the same chart that are like it.
+    fn blurred<T: Linear>(
+        &self,
+        atlas: &Atlas,
+        window: &mut Window,
+        own: &[Own],
+        value: impl Fn(usize) -> T,
+        i: usize,
+    ) -> Option<T> {
+        let texel = self.alone[i];
+        own[i].light?;
         let placement = atlas.map.placement_of(&atlas.charts, texel);
         let of_placement = atlas.map.texels_of(placement);
-        let (mut sum, mut total) = (T::default(), 0.0);
-        for (dx, dy) in (-RADIUS..=RADIUS).flat_map(|dy| (-RADIUS..=RADIUS).map(move |dx| (dx, dy))) {
-            // The window of given charts may contain another chart, which other shards bake.
-            let s = atlas.map.at(placement, x + dx, y + dy).filter(|&s| of_placement.contains(s));
-            let Some(s) = s.filter(|&s| self.is_alone.has(s)) else { continue };
-            if let Ok(k) = self.alone.binary_search(&s)
-                && own[k].irradiance.is_some()
-            {
-                let weight = normal.dot(own[k].normal).max(0.0).powi(4);
-                sum += value(k) * weight;
-                total += weight;
-            }
-        }
-        if total > 0.0 { Some(sum / total) } else { Some(value(i)) }
+        // The window of given charts may contain another chart, which other shards bake.
+        let place = |s: LightTexel| self.is_alone.rank(s).filter(|_| of_placement.contains(s));
+        let get = |s| place(s).and_then(|k| own[k].light);
+        Some(window.mean(&atlas.charts, &atlas.map, texel, get, |s| place(s).map_or(T::default(), &value)))
     }
 }
 
@@ -266,12 +277,10 @@ pub(in crate::lightmap) fn parts<T>(values: &mut [T], size: usize, count: usize)
     Ok(parts)
 }
 
-/// Result of a fallback gather before the blur.
+/// Result of a fallback gather before the blur; `None` inside a solid.
 #[derive(Clone, Copy)]
 struct Own {
-    /// `None` inside a solid.
-    irradiance: Option<Vec3>,
-    normal: Vec3,
+    light: Option<Noisy>,
 }
 
 /// Traces the fallback gathers of some texels of the light map and returns the number of rays.
@@ -296,8 +305,9 @@ fn gather_for(
         let mut texels: Vec<_> = texels.iter().map(texel).collect();
         rays += tile.add_round(&atlas.scene, &own.radiance, &mut texels, own.samples, 0);
         for (TileTexel { receiver, gathered, .. }, out) in texels.iter().zip(out) {
-            let irradiance = gathered.is_visible().then(|| gathered.irradiance());
-            *out = Own { irradiance, normal: receiver.normal };
+            let noisy =
+                || Noisy { value: gathered.irradiance(), variance: gathered.variance(), normal: receiver.normal };
+            *out = Own { light: gathered.is_visible().then(noisy) };
         }
         for (texel, out) in texels.iter().zip(directional.iter_mut().skip(number * TILE)) {
             *out = texel.directional();
@@ -317,21 +327,27 @@ struct Found {
 }
 
 impl Found {
-    fn in_placement(atlas: &Atlas, backs: &[bool], placement: PlacementId, stage: &Stage) -> Result<Found> {
+    fn in_placement(
+        atlas: &Atlas,
+        backs: &[bool],
+        placement: PlacementId,
+        most_error: f32,
+        stage: &Stage,
+    ) -> Result<Found> {
         let (gather, map) = (&atlas.gather, &atlas.map);
         let mut found = Found::default();
         let apart = upsample_visibility::between(atlas, placement, backs, stage, &mut found.rays)?;
         let scale = gather.layout[placement].scale;
         let width = 1.0 / scale[0].min(scale[1]);
         let of_gather = gather.texels_of(placement);
-        let mut gaps: Vec<bool> = try_with_capacity(of_gather.len(), SHOWN)?;
-        for (i, texel) in of_gather.clone().enumerate() {
-            if i % TEXELS_PER_CHECK == 0 {
-                stage.check()?;
-            }
-            gaps.push(is_texel_in_gap(atlas, gather, backs, texel, width, &mut found.rays));
-        }
-        let in_gaps = of_gather.clone().filter(|&s| gaps[of_gather.place(s)]);
+        // At the light map's own density there is little to interpolate.
+        let most_error = if scale == map.layout[placement].scale { f32::INFINITY } else { most_error };
+        let refines = most_error < f32::INFINITY;
+        let around = match refines {
+            true => surroundings(atlas, placement, backs, width, stage, &mut found.rays)?,
+            false => gaps(atlas, placement, backs, width, stage, &mut found.rays)?,
+        };
+        let in_gaps = of_gather.clone().filter(|&s| around[of_gather.place(s)].is_gap);
         found.gather_gaps = try_collect(in_gaps, SHOWN)?;
         let mut end = 0;
         for (i, texel) in map.texels_of(placement).enumerate() {
@@ -341,19 +357,24 @@ impl Found {
             let begin = end;
             end += apart[begin..].iter().take_while(|(s, _)| *s == texel).count();
             let apart = &apart[begin..end];
-            if apart.is_empty() && found.gather_gaps.is_empty() {
+            if apart.is_empty() && found.gather_gaps.is_empty() && !refines {
                 continue;
             }
-            let (mut n, mut has_gap, mut sees_open) = (0, false, false);
-            atlas.gather_around(texel, |s, _| {
-                let is_gap = gaps[of_gather.place(s)];
+            let normal = if refines { map.surface(&atlas.scene, texel).1 } else { Vec3::ZERO };
+            let (mut n, mut has_gap, mut sees_open, mut error) = (0, false, false, 0.0);
+            atlas.gather_around(texel, |s, w| {
+                let around = &around[of_gather.place(s)];
                 n += 1;
-                has_gap |= is_gap;
-                sees_open |= !is_gap && !apart.contains(&(texel, s));
+                has_gap |= around.is_gap;
+                sees_open |= !around.is_gap && !apart.contains(&(texel, s));
+                if refines {
+                    error += w * around.error_at(normal);
+                }
             });
-            if has_gap && is_texel_in_gap(atlas, map, backs, texel, width, &mut found.rays) {
+            let is_wrong = error > most_error;
+            if has_gap && !is_wrong && is_texel_in_gap(atlas, map, backs, texel, width, &mut found.rays) {
                 try_push(&mut found.map_gaps, texel, SHOWN)?;
-            } else if !sees_open && n > 0 {
+            } else if (!sees_open || is_wrong) && n > 0 {
                 try_push(&mut found.alone, texel, SHOWN)?;
             }
             if apart.len() < n {
@@ -362,6 +383,26 @@ impl Found {
         }
         Ok(found)
     }
+}
+
+/// Finds the gather texels of a placement that lie in narrow gaps, and nothing else about them.
+fn gaps(
+    atlas: &Atlas,
+    placement: PlacementId,
+    backs: &[bool],
+    width: f32,
+    stage: &Stage,
+    rays: &mut u64,
+) -> Result<Vec<Surroundings>> {
+    let of_placement = atlas.gather.texels_of(placement);
+    let mut found = try_with_capacity(of_placement.len(), SHOWN)?;
+    for (i, texel) in of_placement.enumerate() {
+        if i % TEXELS_PER_CHECK == 0 {
+            stage.check()?;
+        }
+        found.push(Surroundings::unknown(is_texel_in_gap(atlas, &atlas.gather, backs, texel, width, rays)));
+    }
+    Ok(found)
 }
 
 /// Whether a texel lies in a gap less wide than a gather texel, whose `width` is given.
@@ -376,46 +417,17 @@ fn is_texel_in_gap<M: ShownMap>(
     is_in_gap(&atlas.scene, &atlas.receiver(map, backs, texel), width, texel.seed(), rays)
 }
 
-/// Texels of map `M`, a bit for each; no bits if there are none.
-#[derive(Default)]
-struct TexelSet<M: Map> {
-    words: Vec<u64>,
-    of: PhantomData<M>,
-}
-
-impl<M: Map> TexelSet<M> {
-    fn new<'a>(texels: impl Iterator<Item = &'a TexelId<M>>, n: usize) -> Result<TexelSet<M>> {
-        let mut words = Vec::new();
-        for i in texels.map(|texel| texel.index()) {
-            if words.is_empty() {
-                words = try_vec(n.div_ceil(64), SHOWN)?;
-            }
-            words[i / 64] |= 1 << (i % 64);
-        }
-        Ok(TexelSet { words, of: PhantomData })
-    }
-
-    #[inline]
-    fn has(&self, texel: TexelId<M>) -> bool {
-        let i = texel.index();
-        self.words.get(i / 64).is_some_and(|word| word >> (i % 64) & 1 != 0)
-    }
-
-    fn bytes(&self) -> usize {
-        size_of_val(&self.words[..])
-    }
-}
-
 #[cfg(test)]
 pub(super) mod tests {
     use super::*;
     use crate::base::progress::Progress;
-    use crate::lightmap::atlas::ids::RadianceTexel;
+    use crate::lightmap::atlas::ids::{Map, RadianceTexel};
     use crate::lightmap::indirect::radiance_map::{Radiance, RadianceLookup};
     use crate::lightmap::{Lightmap, LightmapDesc};
     use crate::scene::demo::shapes::MeshBuilder;
     use crate::scene::{Light, LightmapUvs, Material, SceneData};
     use glam::{Vec2, Vec3};
+    use std::f32::consts::FRAC_PI_2;
 
     /// A floor from −2 to 2 m, and the top and the bottom of a plank 1 cm above it where x < 0: too far away for its
     /// texels to be buried.
@@ -441,7 +453,7 @@ pub(super) mod tests {
     pub(crate) fn find(atlas: &Atlas, placements: Range<usize>, backs: &[bool]) -> Upsampling {
         let progress = Progress::none();
         let stage = progress.stage("upsampling", 0.0, 1.0, placements.len() as u64);
-        Upsampling::find(atlas, placements, backs, &stage).unwrap()
+        Upsampling::find(atlas, placements, backs, f32::INFINITY, &stage).unwrap()
     }
 
     /// What texels gather for themselves where each texel of the radiance map sends out its own radiance; and the rays.
@@ -538,11 +550,11 @@ pub(super) mod tests {
         let values = PerTexel::new(&values);
         let shown = |in_gap: &[LightTexel], behind_walls: &[GatherTexel], own: &[Option<Vec3>]| {
             let upsampling = Upsampling {
-                gather_gaps: TexelSet::new(one.iter(), atlas.gather.len()).unwrap(),
-                map_gaps: TexelSet::new(in_gap.iter(), atlas.map.len()).unwrap(),
-                walled: TexelSet::new([this].iter(), atlas.map.len()).unwrap(),
+                gather_gaps: TexelSet::new(one.iter(), atlas.gather.len(), SHOWN).unwrap(),
+                map_gaps: TexelSet::new(in_gap.iter(), atlas.map.len(), SHOWN).unwrap(),
+                walled: TexelSet::new([this].iter(), atlas.map.len(), SHOWN).unwrap(),
                 walls: behind_walls.iter().map(|&s| (this, s)).collect(),
-                is_alone: TexelSet::new(own.iter().map(|_| &this), atlas.map.len()).unwrap(),
+                is_alone: TexelSet::new(own.iter().map(|_| &this), atlas.map.len(), SHOWN).unwrap(),
                 alone: own.iter().map(|_| this).collect(),
                 ..Default::default()
             };
@@ -626,5 +638,31 @@ pub(super) mod tests {
         let own =
             |placements: Range<usize>| own_light(atlas, &find(atlas, placements, &[]), |s| (s.index() % 7) as f32).0;
         assert_eq!(own(0..2), [own(0..1), own(1..2)].concat());
+    }
+
+    /// A floor that ends at a wall, and a quarter of a barrel.
+    #[test]
+    fn texels_gather_for_themselves_where_surfaces_are_near_or_bend() {
+        let arch: Vec<[f32; 2]> =
+            (0..=8).map(|i| (i as f32 / 8.0 * FRAC_PI_2).sin_cos()).map(|(x, z)| [0.8 * x - 4.0, 0.8 * z]).collect();
+        let lightmap = folded(&[&[[-1.5, 0.0], [0.5, 0.0], [0.5, 1.0]], &arch]);
+        let atlas = lightmap.atlas();
+        let progress = Progress::none();
+        let stage = progress.stage("upsampling", 0.0, 1.0, 4);
+        let alone = |most_error| Upsampling::find(atlas, 0..2, &[], most_error, &stage).unwrap().alone;
+        let (few, many) = (alone(f32::INFINITY), alone(0.2));
+        assert!(few.iter().all(|s| many.binary_search(s).is_ok()) && many.len() > 2 * few.len());
+        let part = |placement: usize, is_there: &dyn Fn(Vec3) -> bool| {
+            let texels = atlas.map.texels_of(PlacementId::new(placement));
+            let there: Vec<_> = texels.filter(|&s| is_there(atlas.map.surface(&atlas.scene, s).0)).collect();
+            there.iter().filter(|s| many.binary_search(s).is_ok()).count() as f32 / there.len() as f32
+        };
+        let is_between = |p: Vec3, from: f32, to: f32| p.z < 0.01 && p.x > from && p.x < to && p.y.abs() < 1.5;
+        let (near, far) = (part(0, &|p| is_between(p, 0.42, 0.48)), part(0, &|p| is_between(p, -1.3, -0.8)));
+        let bent = part(1, &|_| true);
+        assert!(
+            near > 0.95 && far < 0.05 && bent > 0.5,
+            "{near} near, {far} far from the wall, {bent} of what is bent"
+        );
     }
 }

@@ -54,6 +54,8 @@ pub(super) struct Fingerprint {
     directional: u16,
     passes: u32,
     target_error: f32,
+    interpolation_error: f32,
+    own_rays: u32,
 }
 
 /// Returns the library's version, as in files.
@@ -82,6 +84,8 @@ impl Fingerprint {
             gather_rays,
             radius,
             near_hits,
+            interpolation_error,
+            own_rays,
             blur_radius,
             direct_samples,
             seed,
@@ -115,6 +119,8 @@ impl Fingerprint {
             directional: directional as u16,
             passes,
             target_error,
+            interpolation_error,
+            own_rays,
         }
     }
 
@@ -126,6 +132,8 @@ impl Fingerprint {
             gather_rays: self.gather_rays,
             radius: self.radius,
             near_hits: self.near_hits,
+            interpolation_error: self.interpolation_error,
+            own_rays: self.own_rays,
             blur_radius: self.blur_radius,
             direct_samples: self.direct_samples,
             seed: self.seed,
@@ -168,6 +176,8 @@ impl Fingerprint {
         compare(&mut all, "gather_rays", self.gather_rays, needed.gather_rays);
         compare(&mut all, "radius", self.radius, needed.radius);
         compare(&mut all, "near_hits", self.near_hits, needed.near_hits);
+        compare(&mut all, "interpolation_error", self.interpolation_error, needed.interpolation_error);
+        compare(&mut all, "own_rays", self.own_rays, needed.own_rays);
         compare(&mut all, "blur_radius", self.blur_radius, needed.blur_radius);
         compare(&mut all, "direct_samples", self.direct_samples, needed.direct_samples);
         compare(&mut all, "seed", self.seed, needed.seed);

@@ -307,6 +307,14 @@ pub struct BakeFlags {
     #[arg(long, value_name = "F", default_value_t = BakeParams::default().near_hits,
           value_parser = of(|p: &mut BakeParams, v| p.near_hits = v))]
     pub near_hits: f32,
+    /// Estimated error of interpolation above which texels gather for themselves; inf: never
+    #[arg(long, value_name = "F", default_value_t = BakeParams::default().interpolation_error,
+          value_parser = of(|p: &mut BakeParams, v| p.interpolation_error = v))]
+    pub interpolation_error: f32,
+    /// Rays of texels that gather for themselves; 0: a quarter of a gather texel's, at least 16
+    #[arg(long, value_name = "N", default_value_t = BakeParams::default().own_rays,
+          value_parser = of(|p: &mut BakeParams, v| p.own_rays = v))]
+    pub own_rays: u32,
     /// Blur radius in gather map texels
     #[arg(long, value_name = "N", default_value_t = BakeParams::default().blur_radius,
           value_parser = of(|p: &mut BakeParams, v| p.blur_radius = v))]

@@ -82,6 +82,8 @@ fn parameters(args: &BakeArgs) -> Value {
         "gather_rays": p.gather_rays,
         "radius": p.radius,
         "near_hits": p.near_hits,
+        "interpolation_error": p.interpolation_error,
+        "own_rays": p.own_rays,
         "blur": p.blur_radius,
         "direct_samples": p.direct_samples,
         "seed": p.seed,
