@@ -1723,7 +1723,7 @@ typedef struct bk_bake_params {
   /// rays are accompanied by up to 16 shadow rays to bright patches of surfaces, where there are
   /// any (BK_LEFT_OUT_BRIGHT_PATCHES). Light map texels for which none of the gather texels
   /// around is a valid source of interpolation (1 to 3 %), and those beyond
-  /// `interpolation_error`, trace rays themselves: a quarter as many, at least 16, at most 64.
+  /// `interpolation_error`, trace `own_rays` themselves.
   /// Raise it to 256 for final light: noise falls with its root, the time of the gather map grows
   /// in proportion; 16 suffices for a preview. Default: 64.
   uint32_t gather_rays;
@@ -1817,6 +1817,10 @@ typedef struct bk_bake_params {
   /// INFINITY for a preview, or where a scene is open and flat. Half the error of a furnished
   /// room for a tenth more time: docs/accuracy.md, "Interpolation error". Default: 1.
   float interpolation_error;
+  /// Number of rays of texels of the light map that trace rays themselves, at most 64, and no more
+  /// than `gather_rays`; 0: a quarter of `gather_rays`, at least 16. Raise it to 64 where texels
+  /// are small and noise shows in corners: these texels take so many times as long. Default: 0.
+  uint32_t own_rays;
 } bk_bake_params;
 
 /// Numbers about one stage of a bake.
@@ -2249,6 +2253,9 @@ typedef struct bk_live_params {
   /// bk_bake_params. These rays come before the first light and before that of new lights. Set it
   /// to 1 for the texels of a default bake. Default: INFINITY.
   float interpolation_error;
+  /// Number of rays of texels of the light map that trace rays themselves, see bk_bake_params; 0: a
+  /// quarter of `max_rounds` * 64, at least 16, at most 64. Default: 16.
+  uint32_t own_rays;
 } bk_live_params;
 
 /// A perspective camera.

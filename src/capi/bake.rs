@@ -99,7 +99,7 @@ pub struct bk_bake_params {
     /// Cornell box. Default: 1,000,000.
     pub photon_count: u64,
     /// Number of rays per texel of the gather map, at most 65536; 0: no indirect light. Each 64
-    /// rays are accompanied by up to 16 shadow rays to bright patches of surfaces, where there are
+    /// rays are accompanied by up to 32 shadow rays to bright patches of surfaces, where there are
     /// any (BK_LEFT_OUT_BRIGHT_PATCHES). Light map texels for which none of the gather texels
     /// around is a valid source of interpolation (1 to 3 %), and those beyond
     /// `interpolation_error`, trace `own_rays` themselves.

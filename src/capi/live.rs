@@ -131,6 +131,9 @@ pub struct bk_live_params {
     /// bk_bake_params. These rays come before the first light and before that of new lights. Set it
     /// to 1 for the texels of a default bake. Default: INFINITY.
     pub interpolation_error: f32,
+    /// Number of rays of texels of the light map that trace rays themselves, see bk_bake_params; 0: a
+    /// quarter of `max_rounds` * 64, at least 16, at most 64. Default: 16.
+    pub own_rays: u32,
 }
 
 sized_struct!(bk_live_params, defaults: {
@@ -151,6 +154,7 @@ sized_struct!(bk_live_params, defaults: {
         radius: p.radius,
         near_hits: p.near_hits,
         interpolation_error: p.interpolation_error,
+        own_rays: p.own_rays,
         background: p.background as u32,
     }
 });
@@ -186,6 +190,7 @@ fn core_params(p: &bk_live_params) -> Result<LiveParams> {
         radius: p.radius,
         near_hits: p.near_hits,
         interpolation_error: p.interpolation_error,
+        own_rays: p.own_rays,
         background: read_bool(p.background, "background")?,
     })
 }

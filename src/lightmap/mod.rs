@@ -138,7 +138,7 @@ pub struct BakeParams {
     pub photon_count: u64,
     /// Maximum number of reflections of light before it reaches a texel; 0: Russian roulette alone decides.
     pub max_bounces: u32,
-    /// Number of rays per gather map texel; 0: no indirect light. Each 64 rays are accompanied by up to 16 shadow rays
+    /// Number of rays per gather map texel; 0: no indirect light. Each 64 rays are accompanied by up to 32 shadow rays
     /// to bright patches of surfaces, where there are any. Light map texels for which none of the gather texels around
     /// is a valid source of interpolation (1 to 3 %), and those beyond `interpolation_error`, trace rays themselves.
     pub gather_rays: u32,

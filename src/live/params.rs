@@ -6,6 +6,7 @@ use crate::base::error::{Result, invalid_argument};
 use crate::lightmap::BakeParams;
 use crate::lightmap::indirect::blur::MAX_BLUR_RADIUS;
 use crate::lightmap::indirect::sample_set::ROUND;
+use crate::lightmap::indirect::upsample::OWN_RAYS;
 use glam::Vec3;
 
 /// The choice of blocks that updates work on.
@@ -52,6 +53,8 @@ pub struct LiveParams {
     /// Estimated error of interpolation above which texels trace rays themselves, as in a bake. Infinity by default: those
     /// rays come before the first light.
     pub interpolation_error: f32,
+    /// Number of rays of such texels, as in a bake.
+    pub own_rays: u32,
     /// Whether the device's threads go on working between updates.
     pub background: bool,
 }
@@ -74,6 +77,7 @@ impl Default for LiveParams {
             radius: bake.radius,
             near_hits: bake.near_hits,
             interpolation_error: f32::INFINITY,
+            own_rays: OWN_RAYS,
             background: false,
         }
     }
@@ -182,6 +186,7 @@ impl LiveParams {
             radius: self.radius,
             near_hits: self.near_hits,
             interpolation_error: self.interpolation_error,
+            own_rays: self.own_rays,
             blur_radius: self.blur,
             direct_samples: self.direct_samples,
             seed: self.seed,

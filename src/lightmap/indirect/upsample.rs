@@ -48,7 +48,7 @@ const BLOCK: usize = 4 * TILE;
 /// Number of rays of a fallback gather, if it is not given: as many as a gather texel has, divided by this, but at least so
 /// many, and no more than a gather texel has or than there are in a round. (With 32 or 64 instead of 16 a furnished room has the same error.)
 pub(in crate::lightmap) const OWN_PART: u32 = 4;
-pub(in crate::lightmap) const OWN_RAYS: u32 = 16;
+pub(crate) const OWN_RAYS: u32 = 16;
 
 /// Radius of the blur of fallback gathers, in texels of the light map. (3 is no better.)
 const RADIUS: i32 = 2;
