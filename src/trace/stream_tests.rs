@@ -161,7 +161,7 @@ fn parallel_rays_to_infinity_have_the_hits_of_single_rays() {
                 let ray = |i: u32| {
                     let flat = Vec3::new(1.0, 0.0, 1.0);
                     let ray = Ray::new(place + [0.05, 0.4][seed as usize / 6 % 2] * flat * point(i, 0, seed), to_sun);
-                    let ends = seed % 4 == 3 && i % 3 == 0;
+                    let ends = seed % 4 == 3 && i.is_multiple_of(3);
                     if ends { ray.within(0.0, 0.3 / to_sun.length()) } else { ray }
                 };
                 let rays: Vec<Ray> = (0..[100, 1000][seed as usize / 12]).map(ray).collect();
