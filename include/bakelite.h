@@ -1720,7 +1720,7 @@ typedef struct bk_bake_params {
   /// Cornell box. Default: 1,000,000.
   uint64_t photon_count;
   /// Number of rays per texel of the gather map, at most 65536; 0: no indirect light. Each 64
-  /// rays are accompanied by up to 16 shadow rays to bright patches of surfaces, where there are
+  /// rays are accompanied by up to 32 shadow rays to bright patches of surfaces, where there are
   /// any (BK_LEFT_OUT_BRIGHT_PATCHES). Light map texels for which none of the gather texels
   /// around is a valid source of interpolation (1 to 3 %), and those beyond
   /// `interpolation_error`, trace `own_rays` themselves.
@@ -1815,7 +1815,8 @@ typedef struct bk_bake_params {
   /// the harmonic mean distance of the surfaces that it sees, plus 4 times the root of 1 − cos of
   /// the angle between normals (after Ward, Rubinstein and Clear 1988). 0.5 for final light;
   /// INFINITY for a preview, or where a scene is open and flat. Half the error of a furnished
-  /// room for a tenth more time: docs/accuracy.md, "Interpolation error". Default: 1.
+  /// room for a tenth more time, in other
+  /// scenes up to a quarter: docs/accuracy.md, "Interpolation error". Default: 1.
   float interpolation_error;
   /// Number of rays of texels of the light map that trace rays themselves, at most 64, and no more
   /// than `gather_rays`; 0: a quarter of `gather_rays`, at least 16. Raise it to 64 where texels
