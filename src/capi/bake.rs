@@ -193,9 +193,9 @@ pub struct bk_bake_params {
     /// INFINITY: only where there is nothing to interpolate. It is the width of a gather texel by
     /// the harmonic mean distance of the surfaces that it sees, plus 4 times the root of 1 − cos of
     /// the angle between normals (after Ward, Rubinstein and Clear 1988). 0.5 for final light;
-    /// INFINITY for a preview, or where a scene is open and flat. Half the error of a furnished
-    /// room for a tenth more time, in other
-    /// scenes up to a quarter: docs/accuracy.md, "Interpolation error". Default: 1.
+    /// INFINITY for a preview, or where a scene is open and flat. 1 halves the error of a furnished
+    /// room for a tenth more time, and takes up to a quarter more elsewhere: docs/accuracy.md,
+    /// "Interpolation error". Default: 1.
     pub interpolation_error: f32,
     /// Number of rays of texels of the light map that trace rays themselves, at most 64, and no more
     /// than `gather_rays`; 0: a quarter of `gather_rays`, at least 16. Raise it to 64 where texels
