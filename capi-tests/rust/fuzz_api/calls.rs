@@ -627,7 +627,7 @@ fn bake_params(w: &W, s: &mut Source) -> bk_bake_params {
     params.gather_rays = [0, 1, 7, 64][s.below(4)];
     params.direct_samples = 1 + s.below(3) as u32;
     params.near_hits = [0.0, 2.0, 2.0, 9.0, f32::INFINITY][s.below(5)];
-    params.own_rays = [0, 1, 64, 65][s.below(4)];
+    params.own_rays = [0, 1, 64][s.below(3)];
     params.interpolation_error = [0.5, 1.0, f32::INFINITY][s.below(3)];
     params.blur_radius = s.below(3) as u32;
     params.max_bounces = s.below(3) as u32;

@@ -644,7 +644,7 @@ pub(super) mod tests {
     #[test]
     fn texels_gather_for_themselves_where_surfaces_are_near_or_bend() {
         let arch: Vec<[f32; 2]> =
-            (0..=8).map(|i| (i as f32 / 8.0 * FRAC_PI_2).sin_cos()).map(|(x, z)| [0.8 * x - 4.0, 0.8 * z]).collect();
+            (0..=8).map(|i| (i as f32 / 8.0 * FRAC_PI_2).sin_cos()).map(|(x, z)| [0.4 * x - 4.0, 0.4 * z]).collect();
         let lightmap = folded(&[&[[-1.5, 0.0], [0.5, 0.0], [0.5, 1.0]], &arch]);
         let atlas = lightmap.atlas();
         let progress = Progress::none();

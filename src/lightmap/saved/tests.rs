@@ -381,7 +381,7 @@ fn a_checkpoint_with_numbers_of_shadow_rays_that_no_bake_has_is_not_believed() {
     let whole = bits(&bake(2, &params()));
     let place = Place::new();
     bake_until(2, &place, 2.0).unwrap();
-    for shadow_rays in [0, 17u32] {
+    for shadow_rays in [0, 33u32] {
         let file = with_records(&place.bytes(), |tag, content| match tag {
             b"RDNE" => {
                 content[8..12].copy_from_slice(&1e-3f32.to_ne_bytes());
