@@ -1807,7 +1807,7 @@ typedef struct bk_bake_params {
   /// If > 0, there are as many passes as it takes, at least 4 and `passes` and at most 4096, until
   /// bk_bake_stats.error is no larger; for bakes of all texels only. 0.05 is a good preview, 0.01
   /// is hard to see. Errors by blur and coarse maps are not noise and stay: see near_hits,
-  /// blur_radius and bk_lightmap_params.gather_divisor, or bk_quality_init. Default: 0.
+  /// blur_radius and bk_lightmap_desc.gather_divisor, or bk_quality_set. Default: 0.
   float target_error;
   /// Estimated error of interpolation between texels of the gather map above which texels of the
   /// light map trace rays themselves, as in corners, behind furniture and under arches; > 0,
