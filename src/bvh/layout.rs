@@ -185,6 +185,12 @@ pub struct Mbvh<const W: usize = WIDTH> {
 }
 
 impl<const W: usize> Mbvh<W> {
+    /// Returns a tree of nothing, which no ray hits.
+    pub(crate) fn nothing() -> Self {
+        let bounds = (Vec3::INFINITY, Vec3::NEG_INFINITY);
+        Mbvh { nodes: vec![Node::EMPTY], leaves: vec![0.0; LEAF_PAD], bounds }
+    }
+
     /// Copies the tree; fails if there is not enough memory.
     pub(super) fn try_clone(&self) -> Result<Self> {
         let what = "a copy of the tree";
@@ -209,6 +215,9 @@ impl<const W: usize> Mbvh<W> {
     /// Surface area heuristic cost: expected number of nodes plus triangles that a ray through the bounds is tested
     /// against. It is computed from the current boxes, so a refit changes it.
     pub fn sah_cost(&self) -> f32 {
+        if !self.bounds.0.cmple(self.bounds.1).all() {
+            return 0.0;
+        }
         let root_area = half_area(self.bounds.0, self.bounds.1);
         // Sums are taken by chunks, so that they do not depend on the number of threads.
         let chunks: Vec<f64> =

@@ -8,6 +8,7 @@ mod collapse;
 pub(crate) mod compact;
 mod compact_refit;
 mod cut;
+pub(crate) mod instances;
 pub(crate) mod layout;
 mod partings;
 mod references;
@@ -20,6 +21,7 @@ pub(crate) use collapse::outwards;
 pub(crate) use compact::Compact;
 pub use layout::{ChildRef, Mbvh, Node};
 pub(crate) use references::References;
+pub(crate) use refit::refit as refit_whole;
 
 use crate::base::error::{Result, invalid_argument};
 use crate::base::progress::Progress;
@@ -115,6 +117,11 @@ pub(crate) enum Tree {
 }
 
 impl Tree {
+    /// A tree of nothing.
+    pub(crate) fn nothing() -> Self {
+        Tree::Whole(Mbvh::nothing())
+    }
+
     /// Lower and upper corner of the box around all triangles.
     pub(crate) fn bounds(&self) -> (Vec3, Vec3) {
         match self {

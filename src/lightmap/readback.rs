@@ -39,27 +39,63 @@ impl Lightmap {
     /// Returns the light map UV in [0, 1] of each corner, and the page of each triangle of `mesh`. Triangles without
     /// texels (degenerate ones) have page [`NONE`] and UVs 0.
     pub fn mesh_uvs(&self, mesh: u32) -> Result<MeshUvs> {
-        self.uvs_of(mesh, true)
+        self.object_uvs(self.object_of_mesh(mesh)?)
+    }
+
+    /// Returns what [`mesh_uvs`](Self::mesh_uvs) returns, of an instance: each has a place of its own in the light map.
+    pub fn instance_uvs(&self, instance: u32) -> Result<MeshUvs> {
+        self.object_uvs(self.object_of_instance(instance)?)
     }
 
     /// Returns UVs and pages for the backs of `mesh`'s triangles, and for each triangle whether its back has separate
     /// texels. Backs without separate texels share those of the front.
     pub fn mesh_back_uvs(&self, mesh: u32) -> Result<(MeshUvs, Vec<bool>)> {
-        let uvs = self.uvs_of(mesh, false)?;
-        let first = self.atlas.scene.first_triangle(mesh);
-        let own = (first..first + uvs.1.len() as u32).map(|t| self.has_both_sides(t));
+        self.object_back_uvs(self.object_of_mesh(mesh)?)
+    }
+
+    /// Returns what [`mesh_back_uvs`](Self::mesh_back_uvs) returns, of an instance.
+    pub fn instance_back_uvs(&self, instance: u32) -> Result<(MeshUvs, Vec<bool>)> {
+        self.object_back_uvs(self.object_of_instance(instance)?)
+    }
+
+    fn object_of_mesh(&self, mesh: u32) -> Result<u32> {
+        let scene = &self.atlas.scene;
+        let count = scene.meshes().len();
+        if mesh as usize >= count {
+            return invalid_argument!("mesh {mesh} does not exist, the scene has {count}");
+        }
+        if scene.is_instanced(mesh) {
+            return invalid_argument!("mesh {mesh} stands in the scene through its instances: ask for theirs");
+        }
+        Ok(mesh)
+    }
+
+    fn object_of_instance(&self, instance: u32) -> Result<u32> {
+        let count = self.atlas.scene.instances().len();
+        if instance as usize >= count {
+            return invalid_argument!("instance {instance} does not exist, the scene has {count}");
+        }
+        Ok(self.atlas.scene.object_of_instance(instance))
+    }
+
+    /// Returns what [`mesh_uvs`](Self::mesh_uvs) returns, of an [object](crate::scene::Object) that exists.
+    pub fn object_uvs(&self, object: u32) -> Result<MeshUvs> {
+        self.uvs_of(object, true)
+    }
+
+    /// Returns what [`mesh_back_uvs`](Self::mesh_back_uvs) returns, of an [object](crate::scene::Object) that exists.
+    pub fn object_back_uvs(&self, object: u32) -> Result<(MeshUvs, Vec<bool>)> {
+        let uvs = self.uvs_of(object, false)?;
+        let own = self.atlas.scene.triangles_of(object).map(|t| self.has_both_sides(t));
         let own = try_collect(own, "the UVs of a mesh")?;
         Ok((uvs, own))
     }
 
-    fn uvs_of(&self, mesh: u32, front: bool) -> Result<MeshUvs> {
-        let Some(m) = self.atlas.scene.meshes().get(mesh as usize) else {
-            return invalid_argument!("mesh {mesh} does not exist, the scene has {}", self.atlas.scene.meshes().len());
-        };
-        let first = self.atlas.scene.first_triangle(mesh);
-        let mut uvs = try_with_capacity(m.indices.len(), "the UVs of a mesh")?;
-        let mut pages = try_with_capacity(m.indices.len(), "the UVs of a mesh")?;
-        for t in first..first + m.indices.len() as u32 {
+    fn uvs_of(&self, object: u32, front: bool) -> Result<MeshUvs> {
+        let triangles = self.atlas.scene.triangles_of(object);
+        let mut uvs = try_with_capacity(triangles.len(), "the UVs of a mesh")?;
+        let mut pages = try_with_capacity(triangles.len(), "the UVs of a mesh")?;
+        for t in triangles {
             let (corners, page) = self.triangle_uvs(t, front);
             uvs.push(corners);
             pages.push(page);

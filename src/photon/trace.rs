@@ -333,12 +333,13 @@ impl<'a> Tracer<'a> {
         if hit.is_miss() {
             return Surface::NOTHING;
         }
-        let (mesh, triangle) = self.scene.locate(hit.triangle);
-        let mesh = &self.scene.meshes()[mesh as usize];
+        let (object, triangle) = self.scene.locate(hit.triangle);
+        let object = self.scene.object(object);
+        let mesh = object.mesh();
         let material = mesh.material(triangle as usize);
         let uv = || mesh.texture_coordinates(triangle as usize, hit.u, hit.v);
         Surface {
-            corners: mesh.corners(triangle as usize),
+            corners: object.corners(triangle),
             weights: [hit.u, hit.v],
             front: hit.front,
             material,

@@ -91,12 +91,12 @@ pub struct PathTracer {
 impl PathTracer {
     /// Prepares a committed scene, with its present lights.
     pub fn new(scene: &Scene) -> Self {
-        Self::from_parts(scene.meshes(), scene.materials(), scene.textures(), scene.environments(), &scene.lights())
+        Self::from_parts(&scene.flattened(), scene.materials(), scene.textures(), scene.environments(), &scene.lights())
     }
 
     /// Prepares a scene that has not been committed.
     pub fn from_data(data: &SceneData) -> Self {
-        Self::from_parts(data.meshes(), data.materials(), data.textures(), data.environments(), data.lights())
+        Self::from_parts(&data.flattened(), data.materials(), data.textures(), data.environments(), data.lights())
     }
 
     fn from_parts(

@@ -1,12 +1,14 @@
 //! Commit: checks the triangles, builds the acceleration structure and records which features the scene uses.
 
-use super::committed::{SceneStats, Uses, mesh_of};
+use super::committed::{SceneStats, Uses, object_of};
 use super::emitters::{EMITTERS, add_emitters, emissive_triangles};
+use super::instance_trees;
 use super::precision::too_few_digits;
 use super::{Emitter, Material, MeshMaterials, NONE, Scene, SceneData, is_valid_triangle};
 use crate::base::error::{Error, Result};
 use crate::base::memory::{Reservation, try_par_filter, try_with_capacity};
 use crate::base::progress::Progress;
+use crate::bvh::instances::Instances;
 use crate::bvh::{self, BuildOptions, References, Tree};
 use crate::device::{Device, LogLevel};
 use glam::Vec3;
@@ -87,55 +89,67 @@ impl Scene {
             return Err(Error::InvalidState("the scene has no triangles".into()));
         }
         let stage = progress.stage("bvh", 0.0, 1.0, 1);
-        let mut first_triangle = try_with_capacity(data.meshes.len() + 1, "the scene")?;
-        let mut next = 0;
-        for mesh in &data.meshes {
-            first_triangle.push(next as u32);
-            next += mesh.indices.len();
-        }
-        first_triangle.push(next as u32);
-        let corners = |t: u32| {
-            let mesh = mesh_of(&first_triangle, t);
-            data.meshes[mesh].corners((t - first_triangle[mesh]) as usize)
-        };
+        let first_triangle = data.first_triangles()?;
+        // The trees of meshes with instances come first: they take less memory than what is built beside them.
         let meshes = data.bytes();
-        let mut memory = device.memory().reserve(meshes + bvh::estimated_bytes(total, options), "the scene")?;
-        let references = device.install(|| References::of_valid(total, &corners, is_valid_triangle, progress))?;
+        let own = data.own_triangles;
+        let estimate = bvh::estimated_bytes(own, options) + instance_trees::estimated_bytes(data, options);
+        let mut memory = device.memory().reserve(meshes + estimate, "the scene")?;
+        let instances = device.install(|| instance_trees::build(data, &first_triangle, options, progress))?;
+        let corners = |t: u32| {
+            let object = object_of(&first_triangle, t);
+            data.object(object as u32).corners(t - first_triangle[object])
+        };
+        let references = device.install(|| References::of_valid(own, &corners, is_valid_triangle, progress))?;
         progress.check()?;
-        if references.len() == 0 {
+        if references.len() == 0 && !instances.as_ref().is_some_and(|i| i.trees.iter().any(|t| t.is_hit())) {
             return Err(Error::InvalidState(format!(
                 "all {total} triangles of the scene are degenerate or not finite"
             )));
         }
-        let skipped: Vec<u32> = if references.len() == total {
+        let skipped: Vec<u32> = if references.len() == own {
             Vec::new()
         } else {
             let is_skipped = |t| !is_valid_triangle(corners(t));
-            device.install(|| try_par_filter(total, "the triangles that are skipped", is_skipped))?
+            device.install(|| try_par_filter(own, "the triangles that are skipped", is_skipped))?
         };
-        if !skipped.is_empty() {
+        let skipped_of_instances: usize = instances.iter().flat_map(|i| &i.trees).map(|t| t.skipped.len()).sum();
+        let all_skipped = skipped.len() + skipped_of_instances;
+        if all_skipped > 0 {
             device.log(
                 LogLevel::Warning,
-                &format!("{} of {total} triangles are degenerate or not finite and were skipped", skipped.len()),
+                &format!("{all_skipped} of {total} triangles are degenerate or not finite and were skipped"),
             );
         }
-        let (tree, sah_cost) =
-            device.install(|| bvh::build(&corners, references, &first_triangle, options, progress))?;
+        let (tree, sah_cost) = match references.len() {
+            0 => (Tree::nothing(), 0.0),
+            _ => {
+                let own = &first_triangle[..=data.meshes.len()];
+                device.install(|| bvh::build(&corners, references, own, options, progress))?
+            }
+        };
         progress.check()?;
 
         let mut emitters = try_with_capacity(emissive_triangles(data), EMITTERS)?;
-        add_emitters(data, &first_triangle, &skipped, &mut emitters);
+        let is_skipped = |object: u32, t: u32| {
+            let first = first_triangle[object as usize];
+            instance_trees::is_skipped(data, &skipped, instances.as_ref(), object, t, first)
+        };
+        add_emitters(data, &first_triangle, is_skipped, &mut emitters);
         stage.advance(1)?;
-        let bytes = tree.bytes() + meshes;
-        memory.shrink(bytes);
-        let bounds = tree.bounds();
         let wide_sah_cost = device.install(|| tree.sah_cost());
+        let trees = || [&tree].into_iter().chain(instances.iter().flat_map(|i| i.trees.iter().map(|t| &t.tree)));
+        let top = instances.as_ref().map_or(0, |i| i.top.node_count());
+        let bvh_bytes = tree.bytes() + instances.as_ref().map_or(0, Instances::bytes);
+        let bytes = bvh_bytes + meshes;
+        memory.shrink(bytes);
         let stats = SceneStats {
             triangles: total as u64,
-            skipped_degenerate: skipped.len() as u64,
-            nodes: tree.node_count() as u64,
-            bvh_bytes: tree.bytes() as u64,
-            node_bytes: tree.node_bytes() as u64,
+            skipped_degenerate: all_skipped as u64,
+            nodes: (trees().map(Tree::node_count).sum::<usize>() + top) as u64,
+            bvh_bytes: bvh_bytes as u64,
+            node_bytes: trees().map(Tree::node_bytes).sum::<usize>() as u64
+                + instances.as_ref().map_or(0, |i| size_of_val(&i.top.nodes[..]) as u64),
             bytes: bytes as u64,
             sah_cost,
             build_seconds: start.elapsed().as_secs_f64(),
@@ -143,7 +157,11 @@ impl Scene {
             refits: 0,
             refit_seconds: 0.0,
         };
-        Ok(Parts { emitters, first_triangle, bounds, tree, skipped, uses: Uses::of(data), stats, memory })
+        let (lower, upper) = tree.bounds();
+        let (low, high) = instances.as_ref().map_or((lower, upper), |i| i.top.bounds());
+        let bounds = (lower.min(low), upper.max(high));
+        let instances = instances.map(Box::new);
+        Ok(Parts { emitters, first_triangle, bounds, tree, skipped, instances, uses: Uses::of(data), stats, memory })
     }
 }
 
@@ -153,6 +171,7 @@ struct Parts {
     bounds: (Vec3, Vec3),
     tree: Tree,
     skipped: Vec<u32>,
+    instances: Option<Box<Instances>>,
     uses: Uses,
     stats: SceneStats,
     memory: Reservation,
@@ -160,9 +179,22 @@ struct Parts {
 
 impl Parts {
     fn into_scene(self, device: Arc<Device>, data: SceneData) -> Scene {
-        let Parts { emitters, first_triangle, bounds, tree, skipped, uses, stats, memory } = self;
+        let Parts { emitters, first_triangle, bounds, tree, skipped, instances, uses, stats, memory } = self;
         let lights = Arc::new(RwLock::new(Arc::new(data.lights.clone())));
-        Scene { device, data, lights, emitters, first_triangle, bounds, tree, skipped, uses, stats, _memory: memory }
+        Scene {
+            device,
+            data,
+            lights,
+            emitters,
+            first_triangle,
+            bounds,
+            tree,
+            skipped,
+            instances,
+            uses,
+            stats,
+            _memory: memory,
+        }
     }
 }
 

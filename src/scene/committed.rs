@@ -1,24 +1,29 @@
 //! The committed scene: its contents, and access to its parts by number.
 
+use super::instance_trees;
 use super::{
-    Emitter, Environment, Light, MAX_ALBEDO, Material, Mesh, SceneData, Sky, Texture, is_valid_triangle, unit_normal,
+    Emitter, Environment, Instance, Light, MAX_ALBEDO, Material, Mesh, Object, SceneData, Sky, Texture,
+    is_valid_triangle, unit_normal,
 };
 use crate::base::error::{Result, invalid_argument};
 use crate::base::memory::Reservation;
 use crate::bvh::Tree;
+use crate::bvh::instances::Instances;
 use crate::device::Device;
 use glam::{Vec2, Vec3};
+use std::borrow::Cow;
+use std::ops::Range;
 use std::sync::{Arc, RwLock};
 
 /// Statistics of a committed scene.
 #[derive(Clone, Copy, Debug, Default)]
 pub struct SceneStats {
-    /// Number of triangles in all meshes.
+    /// Number of triangles, those of every instance counted.
     pub triangles: u64,
     /// Number of triangles that were degenerate or not finite at the commit, or are since a refit: they are not in the
-    /// tree, or in it and never hit.
+    /// tree, or in it and never hit. Those of a mesh with instances are counted once.
     pub skipped_degenerate: u64,
-    /// Number of 8-wide nodes.
+    /// Number of 8-wide nodes, of all trees.
     pub nodes: u64,
     /// Size of the acceleration structure in bytes.
     pub bvh_bytes: u64,
@@ -26,12 +31,12 @@ pub struct SceneStats {
     pub node_bytes: u64,
     /// Size of the whole committed scene in bytes.
     pub bytes: u64,
-    /// Surface area heuristic cost of the binary tree, traversal and intersection costing 1 each. A refit does not
-    /// change it.
+    /// Surface area heuristic cost of the binary tree of the meshes without instances, traversal and intersection
+    /// costing 1 each; 0 if all have some. A refit does not change it.
     pub sah_cost: f32,
     /// Wall time of the build.
     pub build_seconds: f64,
-    /// Surface area heuristic cost of the current 8-wide tree, 1 per node and per triangle: compared with its value
+    /// Surface area heuristic cost of the current 8-wide tree of the meshes without instances, 1 per node and per triangle: compared with its value
     /// after the commit, it shows how much quality a refitted tree has lost.
     pub wide_sah_cost: f32,
     /// Number of refits since the commit.
@@ -47,12 +52,15 @@ pub struct Scene {
     /// Lights, shared by a scene and all copies that refits make of it: light maps keep following them.
     pub(super) lights: Arc<RwLock<Arc<Vec<Light>>>>,
     pub(super) emitters: Vec<Emitter>,
-    /// First global triangle number per mesh, and the total at the end.
+    /// First global triangle number per object, and the total at the end.
     pub(super) first_triangle: Vec<u32>,
     pub(super) bounds: (Vec3, Vec3),
+    /// Tree of the meshes without instances.
     pub(super) tree: Tree,
-    /// Triangles that are not in the tree, ascending.
+    /// Triangles that are not in that tree, ascending.
     pub(super) skipped: Vec<u32>,
+    /// Trees of meshes with instances; `None` if there are none.
+    pub(super) instances: Option<Box<Instances>>,
     pub(super) uses: Uses,
     pub(super) stats: SceneStats,
     pub(super) _memory: Reservation,
@@ -80,6 +88,43 @@ impl Scene {
     /// The meshes, by number.
     pub fn meshes(&self) -> &[Mesh] {
         &self.data.meshes
+    }
+
+    /// The instances, by number.
+    pub fn instances(&self) -> &[Instance] {
+        self.data.instances()
+    }
+
+    /// The objects as meshes: see [`SceneData::flattened`].
+    pub fn flattened(&self) -> Cow<'_, [Mesh]> {
+        self.data.flattened()
+    }
+
+    /// Number of [objects](Object).
+    pub fn object_count(&self) -> u32 {
+        self.first_triangle.len() as u32 - 1
+    }
+
+    /// Object number `number`, which must exist.
+    #[inline]
+    pub fn object(&self, number: u32) -> Object<'_> {
+        self.data.object(number)
+    }
+
+    /// The global numbers of an object's triangles.
+    #[inline]
+    pub fn triangles_of(&self, object: u32) -> Range<u32> {
+        self.first_triangle[object as usize]..self.first_triangle[object as usize + 1]
+    }
+
+    /// Whether a mesh has instances, and stands nowhere else.
+    pub fn is_instanced(&self, mesh: u32) -> bool {
+        self.data.is_instanced(mesh)
+    }
+
+    /// The number of the object that an instance is.
+    pub fn object_of_instance(&self, instance: u32) -> u32 {
+        self.data.meshes.len() as u32 + instance
     }
 
     /// The materials, by number.
@@ -148,34 +193,41 @@ impl Scene {
         &self.stats
     }
 
-    /// Number of triangles in all meshes; global triangle numbers are below it.
+    /// Number of triangles of all objects; global triangle numbers are below it.
     pub fn triangle_count(&self) -> u32 {
         *self.first_triangle.last().expect("never empty")
     }
 
-    /// The mesh and the triangle in it of a global triangle number.
+    /// The number of the [object](Object), and the triangle in its mesh, of a global triangle number.
     #[inline]
     pub fn locate(&self, triangle: u32) -> (u32, u32) {
-        let mesh = mesh_of(&self.first_triangle, triangle);
-        (mesh as u32, triangle - self.first_triangle[mesh])
+        let object = object_of(&self.first_triangle, triangle);
+        (object as u32, triangle - self.first_triangle[object])
     }
 
-    /// The global number of a mesh's first triangle.
-    pub fn first_triangle(&self, mesh: u32) -> u32 {
-        self.first_triangle[mesh as usize]
+    /// The global number of an object's first triangle.
+    pub fn first_triangle(&self, object: u32) -> u32 {
+        self.first_triangle[object as usize]
     }
 
     /// The corners of a triangle by its global number.
     #[inline]
     pub fn corners(&self, triangle: u32) -> [Vec3; 3] {
-        let (m, t) = self.locate(triangle);
-        self.data.meshes[m as usize].corners(t as usize)
+        let (o, t) = self.locate(triangle);
+        self.object(o).corners(t)
     }
 
     /// Whether a triangle, by its global number, is valid (not skipped by the build, and not made degenerate by a
     /// refit).
     pub fn is_valid(&self, triangle: u32) -> bool {
-        is_valid_triangle(self.corners(triangle)) && self.skipped.binary_search(&triangle).is_err()
+        let (o, t) = self.locate(triangle);
+        is_valid_triangle(self.object(o).corners(t)) && !self.is_skipped(o, t)
+    }
+
+    /// Whether a triangle of an object is in no tree.
+    pub(super) fn is_skipped(&self, object: u32, triangle: u32) -> bool {
+        let first = self.first_triangle(object);
+        instance_trees::is_skipped(&self.data, &self.skipped, self.instance_trees(), object, triangle, first)
     }
 
     /// The material of a triangle by its global number.
@@ -187,16 +239,16 @@ impl Scene {
     /// The material number of a triangle by its global number.
     #[inline]
     pub fn material_id(&self, triangle: u32) -> u32 {
-        let (m, t) = self.locate(triangle);
-        self.data.meshes[m as usize].material(t as usize)
+        let (o, t) = self.locate(triangle);
+        self.object(o).mesh().material(t as usize)
     }
 
     /// Diffuse reflectance at a point of a triangle, given by its global number, with weights `u` and `v` of its
     /// corners 1 and 2: the material's, multiplied with its texture.
     #[inline]
     pub fn albedo(&self, triangle: u32, u: f32, v: f32) -> Vec3 {
-        let (m, t) = self.locate(triangle);
-        let mesh = &self.data.meshes[m as usize];
+        let (o, t) = self.locate(triangle);
+        let mesh = self.object(o).mesh();
         let material = &self.data.materials[mesh.material(t as usize) as usize];
         self.albedo_at(material, || mesh.texture_coordinates(t as usize, u, v))
     }
@@ -218,8 +270,8 @@ impl Scene {
         if self.uses.holes.is_empty() {
             return false;
         }
-        let (m, t) = self.locate(triangle);
-        let mesh = &self.data.meshes[m as usize];
+        let (o, t) = self.locate(triangle);
+        let mesh = self.object(o).mesh();
         let id = mesh.material(t as usize) as usize;
         if !self.uses.holes[id] {
             return false;
@@ -237,15 +289,23 @@ impl Scene {
     pub fn normal(&self, triangle: u32) -> Vec3 {
         unit_normal(self.corners(triangle))
     }
-    /// The acceleration structure, with the first global triangle number per mesh and the total at the end.
+
+    /// The tree of the meshes without instances, with the first global triangle number per object and the total at
+    /// the end.
     #[inline]
     pub(crate) fn acceleration(&self) -> (&Tree, &[u32]) {
         (&self.tree, &self.first_triangle)
     }
+
+    /// The trees of meshes with instances, if there are any.
+    #[inline]
+    pub(crate) fn instance_trees(&self) -> Option<&Instances> {
+        self.instances.as_deref()
+    }
 }
 
-/// The mesh of a global triangle number, given the first triangle of each mesh.
+/// The object of a global triangle number, given the first triangle of each.
 #[inline]
-pub(super) fn mesh_of(first_triangle: &[u32], triangle: u32) -> usize {
+pub(super) fn object_of(first_triangle: &[u32], triangle: u32) -> usize {
     first_triangle.partition_point(|&first| first <= triangle) - 1
 }

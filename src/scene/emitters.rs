@@ -35,21 +35,34 @@ pub(super) fn emissive_triangles(data: &SceneData) -> usize {
         MeshMaterials::One(_) => mesh.indices.len(),
         MeshMaterials::PerTriangle(materials) => materials.iter().filter(|&&m| emits(m)).count(),
     };
-    data.meshes.iter().map(of_mesh).sum()
+    let own = (0..).zip(&data.meshes).filter(|&(m, _)| !data.is_instanced(m)).map(|(_, mesh)| of_mesh(mesh));
+    let of_instances = data.instances.iter().map(|i| of_mesh(&data.meshes[i.mesh as usize]));
+    own.chain(of_instances).sum()
 }
 
-/// Adds the emissive triangles that are valid and not `skipped`.
-pub(super) fn add_emitters(data: &SceneData, first_triangle: &[u32], skipped: &[u32], emitters: &mut Vec<Emitter>) {
-    for (m, mesh) in data.meshes.iter().enumerate() {
-        if let MeshMaterials::One(material) = mesh.materials
+/// Adds the emissive triangles that are valid and not skipped: `is_skipped` is asked with an object and a triangle of
+/// its mesh. `first_triangle`: of each object, and the total at the end.
+pub(super) fn add_emitters(
+    data: &SceneData,
+    first_triangle: &[u32],
+    is_skipped: impl Fn(u32, u32) -> bool,
+    emitters: &mut Vec<Emitter>,
+) {
+    for (number, ends) in (0..).zip(first_triangle.windows(2)) {
+        let object = data.object(number);
+        if let MeshMaterials::One(material) = object.mesh().materials
             && !data.materials[material as usize].is_emissive()
         {
             continue;
         }
-        for t in 0..mesh.indices.len() {
-            let (material, id) = (&data.materials[mesh.material(t) as usize], first_triangle[m] + t as u32);
-            if material.is_emissive() && is_valid_triangle(mesh.corners(t)) && skipped.binary_search(&id).is_err() {
-                emitters.push(emitter(id, mesh.corners(t), material));
+        for t in 0..ends[1] - ends[0] {
+            let material = &data.materials[object.mesh().material(t as usize) as usize];
+            if !material.is_emissive() {
+                continue;
+            }
+            let corners = object.corners(t);
+            if is_valid_triangle(corners) && !is_skipped(number, t) {
+                emitters.push(emitter(ends[0] + t, corners, material));
             }
         }
     }

@@ -7,6 +7,8 @@ mod committed;
 pub(crate) mod demo;
 mod emitters;
 mod environment;
+mod instance;
+mod instance_trees;
 mod light;
 mod material;
 mod mesh;
@@ -21,6 +23,7 @@ pub use demo::builtin::{BUILTIN_NAMES, builtin, builtin_camera, is_builtin};
 pub use demo::shapes;
 pub use emitters::Emitter;
 pub use environment::{Environment, MAX_ENVIRONMENT_SIZE, Sky};
+pub use instance::{Instance, Object};
 pub use light::Light;
 pub use material::{MAX_ALBEDO, Material};
 pub use mesh::{LightmapUvs, Mesh, MeshMaterials};
@@ -28,10 +31,15 @@ pub use texture::{MAX_TEXTURE_SIZE, Texture};
 
 use crate::base::error::{Error, Result, invalid_argument};
 use crate::base::memory::{try_to_vec, try_with_capacity};
+use std::borrow::Cow;
 use std::sync::Arc;
 
-/// Maximum number of triangles in a scene: leaf references hold 28 bits.
+/// Maximum number of triangles in a mesh, and in all meshes without instances together: leaf references hold 28 bits.
 pub const MAX_TRIANGLES: usize = 1 << 28;
+
+/// Maximum number of triangles in a scene, those of every instance counted: global numbers have 32 bits, and the last
+/// one is [`NONE`].
+pub const MAX_PLACED_TRIANGLES: usize = u32::MAX as usize - 1;
 
 /// Maximum irradiance in W/m², to which each light is clamped: that of a light of 10¹² at a distance of 10⁻⁹. Sums of
 /// thousands of such values are still finite.
@@ -44,8 +52,13 @@ pub(crate) const MOST_LIGHT: f32 = 1e37;
 #[derive(Clone, Debug, Default)]
 pub struct SceneData {
     meshes: Vec<Mesh>,
-    /// Number of triangles of all meshes.
-    triangles: usize,
+    instances: Vec<Instance>,
+    /// Whether each mesh has instances; shorter than the meshes where none follows.
+    has_instances: Vec<bool>,
+    /// Number of triangles of all meshes without instances.
+    own_triangles: usize,
+    /// Number of triangles of all instances.
+    instance_triangles: usize,
     materials: Vec<Material>,
     lights: Vec<Light>,
     /// Textures, shared by the copies that refits make.
@@ -78,9 +91,29 @@ impl SceneData {
     pub fn add_mesh(&mut self, mut mesh: Mesh) -> Result<u32> {
         mesh.validate(self.materials.len())?;
         mesh.shrink_to_fit();
-        self.triangles = self.triangles_with(mesh.indices.len())?;
+        let own = self.own_triangles + mesh.indices.len();
+        self.check_triangles(own, self.instance_triangles)?;
+        self.own_triangles = own;
         self.meshes.push(mesh);
         Ok(self.meshes.len() as u32 - 1)
+    }
+
+    /// Adds an instance and returns its number. Its mesh must have been added before, and is where its instances are
+    /// from the first one on.
+    pub fn add_instance(&mut self, instance: Instance) -> Result<u32> {
+        instance.validate(self.meshes.len())?;
+        let mesh = instance.mesh as usize;
+        let triangles = self.meshes[mesh].indices.len();
+        let own = self.own_triangles - if self.is_instanced(instance.mesh) { 0 } else { triangles };
+        self.check_triangles(own, self.instance_triangles + triangles)?;
+        self.own_triangles = own;
+        self.instance_triangles += triangles;
+        if self.has_instances.len() <= mesh {
+            self.has_instances.resize(mesh + 1, false);
+        }
+        self.has_instances[mesh] = true;
+        self.instances.push(instance);
+        Ok(self.instances.len() as u32 - 1)
     }
 
     /// Adds a light and returns its number.
@@ -100,7 +133,10 @@ impl SceneData {
     /// Appends everything in `other`; its material, texture and environment numbers are shifted. A refusal changes
     /// nothing here.
     pub fn append(&mut self, mut other: SceneData) -> Result<()> {
-        self.triangles = self.triangles_with(other.triangles)?;
+        let (own, placed) =
+            (self.own_triangles + other.own_triangles, self.instance_triangles + other.instance_triangles);
+        self.check_triangles(own, placed)?;
+        (self.own_triangles, self.instance_triangles) = (own, placed);
         let shift = self.materials.len() as u32;
         for mesh in &mut other.meshes {
             match &mut mesh.materials {
@@ -121,6 +157,12 @@ impl SceneData {
             }
         }
         self.environments.append(&mut other.environments);
+        if !other.instances.is_empty() {
+            self.has_instances.resize(self.meshes.len(), false);
+            self.has_instances.append(&mut other.has_instances);
+            other.instances.iter_mut().for_each(|i| i.mesh += self.meshes.len() as u32);
+            self.instances.append(&mut other.instances);
+        }
         self.meshes.append(&mut other.meshes);
         self.materials.append(&mut other.materials);
         self.lights.append(&mut other.lights);
@@ -149,7 +191,10 @@ impl SceneData {
         let what = "a copy of the scene";
         Ok(SceneData {
             meshes,
-            triangles: self.triangles,
+            instances: try_to_vec(&self.instances, what)?,
+            has_instances: try_to_vec(&self.has_instances, what)?,
+            own_triangles: self.own_triangles,
+            instance_triangles: self.instance_triangles,
             materials: try_to_vec(materials, what)?,
             lights: try_to_vec(lights, what)?,
             textures: try_to_vec(textures, what)?,
@@ -164,14 +209,66 @@ impl SceneData {
         self.mesh_bytes() + textures + environments
     }
 
-    /// Size of the arrays of meshes in bytes.
+    /// Size of the arrays of meshes and instances in bytes.
     pub(crate) fn mesh_bytes(&self) -> usize {
-        self.meshes.iter().map(Mesh::bytes).sum()
+        self.meshes.iter().map(Mesh::bytes).sum::<usize>() + size_of_val(&self.instances[..])
     }
 
     /// The meshes, by number.
     pub fn meshes(&self) -> &[Mesh] {
         &self.meshes
+    }
+
+    /// The instances, by number.
+    pub fn instances(&self) -> &[Instance] {
+        &self.instances
+    }
+
+    /// Whether a mesh has instances.
+    pub(crate) fn is_instanced(&self, mesh: u32) -> bool {
+        self.has_instances.get(mesh as usize).is_some_and(|&has| has)
+    }
+
+    /// Object number `number`, which must exist: see [`Object`].
+    #[inline]
+    pub(crate) fn object(&self, number: u32) -> Object<'_> {
+        match self.meshes.get(number as usize) {
+            Some(mesh) => Object::new(mesh, None),
+            None => {
+                let instance = &self.instances[number as usize - self.meshes.len()];
+                Object::new(&self.meshes[instance.mesh as usize], Some(&instance.transform))
+            }
+        }
+    }
+
+    /// The first global triangle number of each object, and the total at the end.
+    pub(crate) fn first_triangles(&self) -> Result<Vec<u32>> {
+        let mut first = try_with_capacity(self.meshes.len() + self.instances.len() + 1, "the scene")?;
+        let mut next = 0;
+        for (m, mesh) in (0..).zip(&self.meshes) {
+            first.push(next);
+            next += if self.is_instanced(m) { 0 } else { mesh.indices.len() as u32 };
+        }
+        for instance in &self.instances {
+            first.push(next);
+            next += self.meshes[instance.mesh as usize].indices.len() as u32;
+        }
+        first.push(next);
+        Ok(first)
+    }
+
+    /// The [objects](Object), by number, as meshes: those with instances without triangles.
+    pub fn flattened(&self) -> Cow<'_, [Mesh]> {
+        if self.instances.is_empty() {
+            return Cow::Borrowed(&self.meshes);
+        }
+        let own = (0..).zip(&self.meshes).map(|(m, mesh)| match self.is_instanced(m) {
+            true => Mesh::default(),
+            false => mesh.clone(),
+        });
+        let first_instance = self.meshes.len() as u32;
+        let flat = |object| self.object(object).flattened();
+        Cow::Owned(own.chain((first_instance..first_instance + self.instances.len() as u32).map(flat)).collect())
     }
 
     /// The materials, by number.
@@ -194,18 +291,23 @@ impl SceneData {
         &self.environments
     }
 
-    /// Number of triangles in all meshes, degenerate ones included.
+    /// Number of triangles in the scene, those of every instance counted and degenerate ones included.
     pub fn triangle_count(&self) -> usize {
-        self.triangles
+        self.own_triangles + self.instance_triangles
     }
 
-    /// Number of triangles after `more` are added.
-    fn triangles_with(&self, more: usize) -> Result<usize> {
-        let total = self.triangles + more;
-        if total > MAX_TRIANGLES {
-            return invalid_argument!("the scene would have {total} triangles, more than {MAX_TRIANGLES}");
+    /// Checks numbers of triangles of meshes without instances and of instances.
+    fn check_triangles(&self, own: usize, of_instances: usize) -> Result<()> {
+        if own > MAX_TRIANGLES {
+            return invalid_argument!(
+                "the scene would have {own} triangles without instances, more than {MAX_TRIANGLES}"
+            );
         }
-        Ok(total)
+        if own + of_instances > MAX_PLACED_TRIANGLES {
+            let total = own + of_instances;
+            return invalid_argument!("the scene would have {total} triangles, more than {MAX_PLACED_TRIANGLES}");
+        }
+        Ok(())
     }
 }
 

@@ -1,13 +1,14 @@
 //! Refits: vertices move, the tree keeps its topology, and all data that depend on positions are updated.
 
-use super::committed::mesh_of;
+use super::committed::object_of;
 use super::emitters::{EMITTERS, add_emitters, emissive_triangles};
-use super::{Emitter, Scene, is_valid_triangle};
+use super::instance_trees;
+use super::{Emitter, Instance, Scene, is_valid_triangle};
 use crate::base::error::{Error, Result, invalid_argument};
 use crate::base::memory::{try_to_vec, try_with_capacity};
 use crate::bvh;
 use crate::device::LogLevel;
-use glam::Vec3;
+use glam::{Affine3A, Vec3};
 use rayon::prelude::*;
 use std::collections::HashMap;
 use std::sync::Arc;
@@ -34,16 +35,29 @@ impl Scene {
     /// strict and gets a degenerate triangle or a vertex that is not finite; if no triangle would be left that
     /// a ray can hit; or if memory is refused.
     pub fn refit(scene: &mut Arc<Scene>, moved: &[(u32, &[Vec3])]) -> Result<()> {
+        Self::refit_with(scene, moved, &[])
+    }
+
+    /// Moves vertices as [`refit`](Self::refit) does, and instances: `placed` names them with their new transforms.
+    pub fn refit_with(scene: &mut Arc<Scene>, moved: &[(u32, &[Vec3])], placed: &[(u32, Affine3A)]) -> Result<()> {
         let start = Instant::now();
         for &(mesh, positions) in moved {
             scene.check_positions(mesh, positions)?;
+        }
+        for &(instance, transform) in placed {
+            scene.check_transform(instance, transform)?;
         }
         if !scene.any_left(moved) {
             return Err(Error::InvalidState("all triangles of the scene would be degenerate or not finite".into()));
         }
         // All memory is allocated before anything changes.
         let emitters = try_with_capacity(emissive_triangles(&scene.data), EMITTERS)?;
-        let room = scene.tree.room_to_refit()?;
+        let own = scene.tree.room_to_refit()?;
+        let trees = scene.instances.iter().flat_map(|i| &i.trees);
+        let mut rooms = try_with_capacity(trees.clone().count(), COPY)?;
+        for tree in trees {
+            rooms.push(tree.tree.room_to_refit()?);
+        }
         if Arc::get_mut(scene).is_none() {
             *scene = Arc::new(scene.copy()?);
         }
@@ -52,7 +66,10 @@ impl Scene {
         for &(mesh, positions) in moved {
             scene.data.meshes[mesh as usize].positions.copy_from_slice(positions);
         }
-        device.install(|| scene.follow_positions(emitters, room));
+        for &(instance, transform) in placed {
+            scene.data.instances[instance as usize].transform = transform;
+        }
+        device.install(|| scene.follow_positions(emitters, own, rooms));
         scene.stats.refits += 1;
         scene.stats.refit_seconds = start.elapsed().as_secs_f64();
         Ok(())
@@ -67,36 +84,60 @@ impl Scene {
         }
     }
 
+    /// Checks whether [`refit_with`](Self::refit_with) accepts this transform of an instance.
+    pub fn check_transform(&self, instance: u32, transform: Affine3A) -> Result<()> {
+        match self.data.instances.get(instance as usize) {
+            None => {
+                invalid_argument!("instance {instance} does not exist, the scene has {}", self.data.instances.len())
+            }
+            Some(i) => Instance { transform, ..*i }.validate(self.data.meshes.len()),
+        }
+    }
+
     /// Whether any triangle of the tree can be hit after vertices have moved.
     fn any_left(&self, moved: &[(u32, &[Vec3])]) -> bool {
         let new: HashMap<u32, &[Vec3]> = moved.iter().copied().collect();
-        (0..).zip(self.meshes()).zip(&self.first_triangle).any(|((m, mesh), &first)| {
+        let instances = (self.meshes().len() as u32..).zip(&self.data.instances);
+        let some_instance: HashMap<u32, u32> = instances.map(|(object, i)| (i.mesh, object)).collect();
+        (0..).zip(self.meshes()).any(|(m, mesh)| {
             let positions = new.get(&m).copied().unwrap_or(&mesh.positions);
-            (first..).zip(&mesh.indices).any(|(t, i)| {
-                is_valid_triangle(i.map(|i| positions[i as usize])) && self.skipped.binary_search(&t).is_err()
-            })
+            let object = some_instance.get(&m).copied().unwrap_or(m);
+            (0..)
+                .zip(&mesh.indices)
+                .any(|(t, i)| is_valid_triangle(i.map(|i| positions[i as usize])) && !self.is_skipped(object, t))
         })
     }
 
-    /// Updates all data that depend on positions. `emitters` has capacity for all there may be.
-    fn follow_positions(&mut self, mut emitters: Vec<Emitter>, room: bvh::RefitRoom) {
-        let (first, meshes) = (&self.first_triangle, &self.data.meshes);
+    /// Updates all data that depend on positions. `emitters` has capacity for all there may be; the rooms are those of
+    /// the tree of meshes without instances and of the trees of the others.
+    fn follow_positions(&mut self, mut emitters: Vec<Emitter>, own: bvh::RefitRoom, rooms: Vec<bvh::RefitRoom>) {
+        let (first, data) = (&self.first_triangle, &self.data);
         let corners = |t: u32| {
-            let m = mesh_of(first, t);
-            meshes[m].corners((t - first[m]) as usize)
+            let object = object_of(first, t);
+            data.object(object as u32).corners(t - first[object])
         };
-        self.tree.refit(&corners, room);
-        let total = self.stats.triangles as u32;
+        let own_triangles = data.own_triangles as u32;
+        if own_triangles > self.skipped.len() as u32 {
+            self.tree.refit(&corners, own);
+        }
+        let mut gone = 0;
+        if let Some(instances) = self.instances.as_deref_mut() {
+            gone += instance_trees::refit(data, instances, rooms);
+        }
         let is_gone = |&t: &u32| !is_valid_triangle(corners(t)) && self.skipped.binary_search(&t).is_err();
-        let gone = (0..total).into_par_iter().filter(is_gone).count();
+        gone += (0..own_triangles).into_par_iter().filter(is_gone).count();
+        let skipped_of_instances: usize = self.instances.iter().flat_map(|i| &i.trees).map(|t| t.skipped.len()).sum();
         if gone > 0 {
+            let total = self.stats.triangles;
             let message = format!("{gone} of {total} triangles are degenerate or not finite after the refit");
             self.device.log(LogLevel::Warning, &message);
         }
-        self.bounds = self.tree.bounds();
-        add_emitters(&self.data, &self.first_triangle, &self.skipped, &mut emitters);
+        let (lower, upper) = self.tree.bounds();
+        let (low, high) = self.instances.as_ref().map_or((lower, upper), |i| i.top.bounds());
+        self.bounds = (lower.min(low), upper.max(high));
+        add_emitters(&self.data, &self.first_triangle, |o, t| self.is_skipped(o, t), &mut emitters);
         self.emitters = emitters;
-        self.stats.skipped_degenerate = (self.skipped.len() + gone) as u64;
+        self.stats.skipped_degenerate = (self.skipped.len() + skipped_of_instances + gone) as u64;
         self.stats.wide_sah_cost = self.tree.sah_cost();
         self.warn_of_few_digits();
     }
@@ -104,7 +145,8 @@ impl Scene {
     /// Copies the scene; the lights are shared.
     fn copy(&self) -> Result<Scene> {
         // Textures and environments are shared.
-        let bytes = self.tree.bytes() + self.data.mesh_bytes();
+        let of_instances = self.instances.as_ref().map_or(0, |i| i.bytes());
+        let bytes = self.tree.bytes() + of_instances + self.data.mesh_bytes();
         let memory = self.device.memory().reserve(bytes, COPY)?;
         Ok(Scene {
             device: self.device.clone(),
@@ -115,6 +157,10 @@ impl Scene {
             bounds: self.bounds,
             tree: self.tree.try_clone()?,
             skipped: try_to_vec(&self.skipped, COPY)?,
+            instances: match &self.instances {
+                Some(instances) => Some(Box::new(instances.try_clone()?)),
+                None => None,
+            },
             uses: self.uses.clone(),
             stats: self.stats,
             _memory: memory,

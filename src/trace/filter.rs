@@ -41,6 +41,8 @@ pub(crate) struct Crossing {
 pub(crate) struct Filter<'a> {
     pub(super) scene: &'a Scene,
     pub(super) crossings: Option<&'a mut Vec<Crossing>>,
+    /// What is added to the numbers of triangles in the tree to give global ones.
+    pub(super) first_triangle: u32,
 }
 
 impl Accept for Filter<'_> {
@@ -51,6 +53,7 @@ impl Accept for Filter<'_> {
         let sum = u + v + w;
         let on_edge = u == 0.0 || v == 0.0 || w == 0.0;
         let (u, v) = barycentrics(u, v, sum);
+        let triangle = self.first_triangle + triangle;
         if self.scene.is_hole(triangle, u, v) {
             return false;
         }

@@ -5,8 +5,11 @@
 
 use super::compact::View;
 use super::filter::Filter;
+use super::single::Walk;
+use super::tree::{Leaf, Tree};
 use super::{PACKET_SIZE, Packet, RawHit, Ray, gather, packet, single, stream};
-use crate::bvh::Mbvh;
+use crate::base::geometry::NONE;
+use crate::bvh::{ChildRef, Mbvh};
 use crate::device::Device;
 use crate::simd::{self, Isa, entry_point, isa_features};
 use glam::Vec3;
@@ -26,6 +29,7 @@ pub(crate) struct Kernels {
     /// Closest hit and any hit, among those that a filter accepts.
     filtered: [unsafe fn(&Mbvh, &Ray, &mut Filter) -> RawHit; 2],
     compact_filtered: [unsafe fn(&View, &Ray, &mut Filter) -> RawHit; 2],
+    next_box: unsafe fn(&Mbvh, &mut Walk, f32) -> u32,
 }
 
 /// Kernels of streams. On AVX-512 there are two of each: with VBMI2 and without.
@@ -135,6 +139,15 @@ macro_rules! table {
                 }
             } }
 
+            isa_features! { $isa => entry_point! {
+                fn next_box(boxes: &Mbvh, walk: &mut Walk, tmax: f32) -> u32 {
+                    match walk.next_leaf::<S, _>(boxes, tmax) {
+                        ChildRef::EMPTY => NONE,
+                        leaf => Tree::leaf::<S>(boxes, leaf).number(0),
+                    }
+                }
+            } }
+
             pub(super) const TABLE: Kernels = Kernels {
                 intersect,
                 intersect_block,
@@ -146,6 +159,7 @@ macro_rules! table {
                 compact_occluded,
                 filtered: [filtered::<false>, filtered::<true>],
                 compact_filtered: [compact_filtered::<false>, compact_filtered::<true>],
+                next_box,
             };
         }
         static $name: Kernels = $module::TABLE;
@@ -282,5 +296,13 @@ impl Kernels {
     pub(crate) fn compact_filtered<const ANY: bool>(&self, tree: &View, ray: &Ray, filter: &mut Filter) -> RawHit {
         // SAFETY: see `intersect`.
         unsafe { (self.compact_filtered[ANY as usize])(tree, ray, filter) }
+    }
+
+    /// Number of the next box that a ray meets before `tmax`, nearest first; [`NONE`] after the last. `walk` must have
+    /// been begun, and go through these boxes alone.
+    #[inline]
+    pub(super) fn next_box(&self, boxes: &Mbvh, walk: &mut Walk, tmax: f32) -> u32 {
+        // SAFETY: see `intersect`.
+        unsafe { (self.next_box)(boxes, walk, tmax) }
     }
 }

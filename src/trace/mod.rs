@@ -12,6 +12,7 @@ pub(crate) mod filter;
 pub mod four_wide;
 mod gather;
 mod groups;
+mod instances;
 mod kernels;
 pub mod offset;
 mod packet;
@@ -28,6 +29,8 @@ mod whole;
 pub(crate) use kernels::Kernels;
 pub use ray::{Hit, PACKET_SIZE, Packet, RawHit, Ray};
 
+#[cfg(test)]
+mod instance_tests;
 #[cfg(test)]
 mod stream_tests;
 #[cfg(test)]

@@ -60,7 +60,7 @@ impl Scene {
         if !self.filtered::<true>(ray, Some(&mut crossings)).is_miss() {
             return Vec3::ZERO;
         }
-        self.tidy(&mut crossings, ray, &RawHit::MISS);
+        self.tidy(&mut crossings, &RawHit::MISS);
         crossings.iter().map(|c| Vec3::from(self.material(c.hit.triangle).transmission)).product()
     }
 
@@ -68,24 +68,38 @@ impl Scene {
     pub(crate) fn intersect_through(&self, ray: &Ray, crossings: &mut Vec<Crossing>) -> RawHit {
         crossings.clear();
         let hit = self.filtered::<false>(ray, Some(crossings));
-        self.tidy(crossings, ray, &hit);
+        self.tidy(crossings, &hit);
         hit
     }
 
     /// The closest hit (`ANY`: any hit) that counts, found by tracing the ray from its beginning.
     #[cold]
     fn filtered<const ANY: bool>(&self, ray: &Ray, crossings: Option<&mut Vec<Crossing>>) -> RawHit {
-        let (kernels, mut filter) = (self.kernels(), Filter { scene: self, crossings });
-        match self.tree() {
-            TreeView::Whole(tree) => kernels.filtered::<ANY>(tree, ray, &mut filter),
-            TreeView::Compact(tree) => kernels.compact_filtered::<ANY>(&tree, ray, &mut filter),
+        let mut filter = Filter { scene: self, crossings, first_triangle: 0 };
+        let hit = self.filtered_in::<ANY>(self.tree(), ray, &mut filter);
+        match self.instance_trees() {
+            Some(instances) if !ANY || hit.is_miss() => self.meet_filtered::<ANY>(instances, ray, hit, &mut filter),
+            _ => hit,
         }
     }
 
+    /// The closest hit (`ANY`: any hit) in one tree that counts.
+    pub(super) fn filtered_in<const ANY: bool>(&self, tree: TreeView, ray: &Ray, filter: &mut Filter) -> RawHit {
+        let before = filter.crossings.as_ref().map_or(0, |c| c.len());
+        let hit = match tree {
+            TreeView::Whole(tree) => self.kernels().filtered::<ANY>(tree, ray, filter),
+            TreeView::Compact(tree) => self.kernels().compact_filtered::<ANY>(&tree, ray, filter),
+        };
+        if let Some(crossings) = &mut filter.crossings {
+            // The kernels' unit is the direction's length but for a power of two.
+            let scale = direction_scale(ray).unwrap_or(1.0);
+            crossings[before..].iter_mut().for_each(|c| c.hit.t *= scale);
+        }
+        hit
+    }
+
     /// Sorts crossings, and removes those that lie behind `hit` and those that are counted twice.
-    fn tidy(&self, crossings: &mut Vec<Crossing>, ray: &Ray, hit: &RawHit) {
-        let scale = direction_scale(ray).unwrap_or(1.0);
-        crossings.iter_mut().for_each(|c| c.hit.t *= scale);
+    fn tidy(&self, crossings: &mut Vec<Crossing>, hit: &RawHit) {
         let before = |c: &Crossing| c.hit.t < hit.t || (c.hit.t == hit.t && c.hit.triangle < hit.triangle);
         crossings.retain(before);
         crossings.sort_unstable_by(|a, b| a.hit.t.total_cmp(&b.hit.t).then(a.hit.triangle.cmp(&b.hit.triangle)));

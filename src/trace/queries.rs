@@ -8,6 +8,7 @@ use super::{Hit, Kernels, PACKET_SIZE, Packet, RawHit, Ray};
 use crate::base::error::{Result, invalid_argument};
 use crate::base::geometry::NONE;
 use crate::base::memory::try_filled;
+use crate::bvh::instances::{Instances, MeshTree};
 use crate::bvh::{Mbvh, Tree};
 use crate::scene::Scene;
 use crate::simd::Isa;
@@ -63,7 +64,22 @@ impl Scene {
             Tree::Compact(tree) => {
                 // SAFETY: the tree was built of these meshes, which `SceneData` has validated; refits change
                 // positions alone.
-                TreeView::Compact(unsafe { View::new(tree, self.meshes(), first_triangle) })
+                TreeView::Compact(unsafe { View::new(tree, self.meshes(), &first_triangle[..=self.meshes().len()]) })
+            }
+        }
+    }
+
+    /// The tree of a mesh with instances, for kernels.
+    #[inline]
+    pub(super) fn tree_of<'a>(&'a self, instances: &'a Instances, tree: u32) -> TreeView<'a> {
+        let MeshTree { mesh, range, tree, .. } = &instances.trees[tree as usize];
+        match tree {
+            Tree::Whole(tree) => TreeView::Whole(tree),
+            Tree::Compact(tree) => {
+                // SAFETY: as above, with triangles by their number in this mesh.
+                TreeView::Compact(unsafe {
+                    View::new(tree, std::slice::from_ref(&self.meshes()[*mesh as usize]), range)
+                })
             }
         }
     }
@@ -79,25 +95,36 @@ impl Scene {
         if hit.triangle == NONE {
             return Hit::MISS;
         }
-        let (mesh, triangle) = self.locate(hit.triangle);
-        Hit { t: hit.t, u: hit.u, v: hit.v, triangle, mesh, instance: NONE }
+        let (object, triangle) = self.locate(hit.triangle);
+        let (mesh, instance) = self.mesh_and_instance(object);
+        Hit { t: hit.t, u: hit.u, v: hit.v, triangle, mesh, instance }
     }
 
-    /// Converts many hits as `to_hit`. Neighbours mostly hit the same mesh, which is then looked up once.
+    /// The mesh of an object, and the instance that it is; [`NONE`]: it is none.
+    #[inline]
+    fn mesh_and_instance(&self, object: u32) -> (u32, u32) {
+        match object.checked_sub(self.meshes().len() as u32) {
+            None => (object, NONE),
+            Some(instance) => (self.instances()[instance as usize].mesh, instance),
+        }
+    }
+
+    /// Converts many hits as `to_hit`. Neighbours mostly hit the same object, which is then looked up once.
     pub(crate) fn to_hits(&self, hits: &[RawHit], out: &mut [Hit]) {
         let first_triangle = self.acceleration().1;
-        let (mut mesh, mut begin, mut end) = (0, 0, 0);
+        let (mut mesh, mut instance, mut begin, mut end) = (0, NONE, 0, 0);
         for (out, hit) in out.iter_mut().zip(hits) {
             if hit.triangle == NONE {
                 *out = Hit::MISS;
                 continue;
             }
             if !(begin..end).contains(&hit.triangle) {
-                mesh = self.locate(hit.triangle).0;
-                begin = first_triangle[mesh as usize];
-                end = first_triangle.get(mesh as usize + 1).copied().unwrap_or(u32::MAX);
+                let object = self.locate(hit.triangle).0;
+                (mesh, instance) = self.mesh_and_instance(object);
+                begin = first_triangle[object as usize];
+                end = first_triangle.get(object as usize + 1).copied().unwrap_or(u32::MAX);
             }
-            *out = Hit { t: hit.t, u: hit.u, v: hit.v, triangle: hit.triangle - begin, mesh, instance: NONE };
+            *out = Hit { t: hit.t, u: hit.u, v: hit.v, triangle: hit.triangle - begin, mesh, instance };
         }
     }
 
@@ -258,6 +285,12 @@ impl Scene {
                 self.kernels().compact_intersect(&tree, &rays[..count], out);
             }
         }
+        if let Some(instances) = self.instance_trees() {
+            let ray = |i: usize| Ray::new(origin, Vec3::new(packet.x[i], packet.y[i], packet.z[i])).within(tmin, tmax);
+            let rays: [Ray; PACKET_SIZE] = std::array::from_fn(ray);
+            let count = packet.count.min(PACKET_SIZE);
+            self.meet_instances(instances, &rays[..count], &mut out[..count]);
+        }
         if self.has_holes() {
             self.leave_holes_of_packet(origin, packet, tmin, tmax, out);
         }
@@ -274,6 +307,9 @@ impl Scene {
                 hit[0]
             }
         }];
+        if let Some(instances) = self.instance_trees() {
+            self.meet_instances(instances, std::slice::from_ref(ray), &mut hit);
+        }
         if self.has_holes() {
             self.leave_holes(std::slice::from_ref(ray), &mut hit);
         }
@@ -293,14 +329,17 @@ impl Scene {
     /// Whether anything lies on the ray, cut-outs included.
     #[inline]
     pub(super) fn anything_on(&self, ray: &Ray) -> bool {
+        let mut occluded = [0];
         match self.tree() {
-            TreeView::Whole(tree) => self.kernels().occluded(tree, ray),
+            TreeView::Whole(tree) => occluded[0] = self.kernels().occluded(tree, ray) as u8,
             TreeView::Compact(tree) => {
-                let mut occluded = [0];
                 self.kernels().compact_occluded(&tree, std::slice::from_ref(ray), &mut occluded);
-                occluded[0] != 0
             }
         }
+        if let Some(instances) = self.instance_trees() {
+            self.meet_instances(instances, std::slice::from_ref(ray), &mut occluded);
+        }
+        occluded[0] != 0
     }
 
     /// Closest hits of as many rays as both slices have.
@@ -308,6 +347,10 @@ impl Scene {
         match self.tree() {
             TreeView::Whole(tree) => self.kernels().intersect_block(tree, rays, out),
             TreeView::Compact(tree) => self.kernels().compact_intersect(&tree, rays, out),
+        }
+        if let Some(instances) = self.instance_trees() {
+            let n = rays.len().min(out.len());
+            self.meet_instances(instances, &rays[..n], &mut out[..n]);
         }
         if self.has_holes() {
             self.leave_holes(rays, out);
@@ -321,6 +364,10 @@ impl Scene {
             TreeView::Whole(tree) => self.kernels().stream(tree, rays, out),
             TreeView::Compact(tree) => self.kernels().compact_stream(&tree, rays, out),
         }
+        if let Some(instances) = self.instance_trees() {
+            let n = rays.len().min(out.len());
+            self.meet_instances(instances, &rays[..n], &mut out[..n]);
+        }
         if self.has_holes() {
             self.leave_holes(rays, out);
         }
@@ -332,6 +379,10 @@ impl Scene {
             TreeView::Whole(tree) => self.kernels().stream_occluded(tree, rays, out),
             TreeView::Compact(tree) => self.kernels().compact_stream_occluded(&tree, rays, out),
         }
+        if let Some(instances) = self.instance_trees() {
+            let n = rays.len().min(out.len());
+            self.meet_instances(instances, &rays[..n], &mut out[..n]);
+        }
         if self.has_holes() {
             self.look_through_holes(rays, out);
         }
@@ -342,6 +393,10 @@ impl Scene {
         match self.tree() {
             TreeView::Whole(tree) => self.kernels().occluded_block(tree, rays, out),
             TreeView::Compact(tree) => self.kernels().compact_occluded(&tree, rays, out),
+        }
+        if let Some(instances) = self.instance_trees() {
+            let n = rays.len().min(out.len());
+            self.meet_instances(instances, &rays[..n], &mut out[..n]);
         }
         if self.has_holes() {
             self.look_through_holes(rays, out);

@@ -209,7 +209,7 @@ impl Stack {
 }
 
 /// Traversal state of a ray.
-struct Walk {
+pub(super) struct Walk {
     ray: RaySetup,
     best: Best,
     /// Conservative tmax: boxes that begin behind it are not entered.
@@ -227,7 +227,7 @@ impl Walk {
     /// Begins the traversal of a ray in `place`; returns whether there is anything to traverse: some rays cannot hit
     /// anything.
     #[inline(always)]
-    fn begin<T: Tree>(place: &mut MaybeUninit<Walk>, ray: &Ray, number: usize) -> bool {
+    pub(super) fn begin<T: Tree>(place: &mut MaybeUninit<Walk>, ray: &Ray, number: usize) -> bool {
         let Some(scale) = direction_scale(ray) else { return false };
         let (mut d, mut tmin, mut tmax) = (ray.direction, ray.tmin, ray.tmax);
         if scale != 1.0 {
@@ -312,6 +312,30 @@ impl Walk {
                 }
             }
             self.current = self.stack.pop();
+        }
+        self.current
+    }
+
+    /// Goes on to the next leaf that begins before `tmax`, which is in lengths of the ray's direction and falls from
+    /// call to call; nearest first. Returns [`ChildRef::EMPTY`] after the last one.
+    ///
+    /// # Safety
+    /// The CPU must have the ISA; the walk must have been begun in `tree`, and only this function have been called.
+    #[inline(always)]
+    pub(super) unsafe fn next_leaf<S: Simd, T: Tree>(&mut self, tree: &T, tmax: f32) -> ChildRef {
+        let limit = beyond(tmax / self.scale);
+        // SAFETY: forwarded.
+        unsafe {
+            if limit < self.limit {
+                self.limit = limit;
+                self.stack.cut::<S>(limit);
+            }
+            if self.current.is_leaf() {
+                self.current = self.stack.pop();
+            }
+            while self.current != ChildRef::EMPTY && !self.current.is_leaf() {
+                self.visit_node::<S, T, true, false>(tree);
+            }
         }
         self.current
     }

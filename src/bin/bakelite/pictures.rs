@@ -191,9 +191,10 @@ pub struct Seen {
 
 /// A hit as a point that receives light, on the side that was hit, with its interpolated normal.
 pub fn receiver(scene: &Scene, hit: &RawHit) -> Receiver {
-    let (mesh, triangle) = scene.locate(hit.triangle);
-    let mesh = &scene.meshes()[mesh as usize];
-    let normal = |corner: usize| mesh.normals[mesh.indices[triangle as usize][corner] as usize];
+    let (object, triangle) = scene.locate(hit.triangle);
+    let object = scene.object(object);
+    let mesh = object.mesh();
+    let normal = |corner: usize| object.normal(mesh.indices[triangle as usize][corner]);
     let interpolated = || (normal(0) * (1.0 - hit.u - hit.v) + normal(1) * hit.u + normal(2) * hit.v).try_normalize();
     let shading = if mesh.normals.is_empty() { None } else { interpolated() };
     let point = SurfacePoint::new(scene.corners(hit.triangle), hit.u, hit.v, scene);

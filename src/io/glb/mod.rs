@@ -43,11 +43,11 @@ use std::path::Path;
 
 /// Where the sides of triangles lie in a light map.
 pub(super) trait Places {
-    /// Returns the light map coordinates of the corners of a triangle's front, by its mesh, its number in it and its
+    /// Returns the light map coordinates of the corners of a triangle's front, by its object, its number in it and its
     /// global number, and its page; [`NONE`]: it has no chart.
-    fn front(&self, mesh: u32, triangle: u32, global: u32) -> ([[f32; 2]; 3], u32);
+    fn front(&self, object: u32, triangle: u32, global: u32) -> ([[f32; 2]; 3], u32);
     /// Returns the same of its back, if that has a place of its own, with the corners in the order of the front.
-    fn back(&self, mesh: u32, triangle: u32, global: u32) -> Option<([[f32; 2]; 3], u32)>;
+    fn back(&self, object: u32, triangle: u32, global: u32) -> Option<([[f32; 2]; 3], u32)>;
 }
 
 impl Places for Lightmap {
@@ -190,13 +190,13 @@ fn parts(
 }
 
 fn check(scene: &Scene, lightmap: &GlbLightmap) -> Result<()> {
-    let meshes = scene.meshes();
-    if lightmap.meshes.len() != meshes.len() {
-        return invalid_argument!("light map UVs of {} meshes for {}", lightmap.meshes.len(), meshes.len());
+    let count = scene.object_count();
+    if lightmap.meshes.len() != count as usize {
+        return invalid_argument!("light map UVs of {} meshes for {count}", lightmap.meshes.len());
     }
     let page_count = lightmap.pages.len();
-    for (m, (uvs, mesh)) in lightmap.meshes.iter().zip(meshes).enumerate() {
-        let triangles = mesh.indices.len();
+    for (m, uvs) in (0..).zip(&lightmap.meshes) {
+        let triangles = scene.triangles_of(m).len();
         if uvs.corner_uvs.len() != triangles || uvs.pages.len() != triangles {
             let (corners, pages) = (uvs.corner_uvs.len(), uvs.pages.len());
             return invalid_argument!("mesh {m} has {triangles} triangles, {corners} light map UVs, {pages} pages");

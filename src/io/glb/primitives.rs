@@ -33,10 +33,11 @@ pub(super) fn group(
     advance: Advance,
 ) -> Result<BTreeMap<Key, Vec<Side>>> {
     let mut groups = BTreeMap::<Key, Vec<_>>::new();
-    for (m, mesh) in (0..).zip(scene.meshes()) {
-        let first = scene.first_triangle(m);
+    for m in 0..scene.object_count() {
+        let (mesh, triangles) = (scene.object(m).mesh(), scene.triangles_of(m));
+        let first = triangles.start;
         let normals = !mesh.normals.is_empty();
-        for t in 0..mesh.indices.len() as u32 {
+        for t in 0..triangles.len() as u32 {
             if t.is_multiple_of(1 << 14) {
                 advance(0)?;
             }
@@ -85,7 +86,8 @@ impl Primitive {
             }
             let (global, is_back) = (side & !BACK, side & BACK != 0);
             let (m, t) = scene.locate(global);
-            let mesh = &scene.meshes()[m as usize];
+            let object = scene.object(m);
+            let mesh = object.mesh();
             let (corner_uvs, _) = match is_back {
                 true => places.back(m, t, global).unwrap_or_default(),
                 false => places.front(m, t, global),
@@ -101,9 +103,9 @@ impl Primitive {
                 let vertex = result.positions.len() as u32;
                 account.make_room_in_map(&mut vertex_of, "the vertices")?;
                 vertex_of.insert(key, vertex);
-                account.push(&mut result.positions, mesh.positions[v as usize], "the vertices")?;
+                account.push(&mut result.positions, object.position(v), "the vertices")?;
                 if normals {
-                    let normal = mesh.normals[v as usize].normalize_or(Vec3::Y);
+                    let normal = object.normal(v).normalize_or(Vec3::Y);
                     let normal = if is_back { -normal } else { normal };
                     account.push(&mut result.normals, normal, "the normals")?;
                 }

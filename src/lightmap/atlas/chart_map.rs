@@ -140,14 +140,15 @@ pub(in crate::lightmap) fn receiver_at(
 ) -> (SurfacePoint, Receiver) {
     let t = &TexelSample { x: 0, y: 0, triangle, u, v };
     let point = SurfacePoint::new(scene.corners(t.triangle), t.u, t.v, scene);
-    let (mesh, triangle) = scene.locate(t.triangle);
-    let mesh = &scene.meshes()[mesh as usize];
+    let (object, triangle) = scene.locate(t.triangle);
+    let object = scene.object(object);
+    let mesh = object.mesh();
     if mesh.normals.is_empty() {
         let receiver = Receiver::new(scene, &point, None, back);
         return (point, receiver);
     }
     let receiver = Receiver::new(scene, &point, Some(t.shading_normal(scene)), back);
-    let normals = mesh.indices[triangle as usize].map(|i| mesh.normals[i as usize]);
-    let receiver = receiver.smooth(scene, mesh.corners(triangle as usize), normals, [t.u, t.v]);
+    let normals = mesh.indices[triangle as usize].map(|i| object.normal(i));
+    let receiver = receiver.smooth(scene, object.corners(triangle), normals, [t.u, t.v]);
     (point, receiver)
 }

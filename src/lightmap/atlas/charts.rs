@@ -108,7 +108,7 @@ impl Charts {
         let total = scene.triangle_count();
         let stage = progress.stage("unwrap", 0.0, 0.5, total as u64 + 1);
         // Memory of pieces and charts, which exist at the same time, and of the meshes that are unwrapped.
-        let vertices = scene.meshes().iter().map(|m| m.positions.len()).sum();
+        let vertices = (0..scene.object_count()).map(|o| scene.object(o).mesh().positions.len()).sum();
         let bytes = 2 * Self::BYTES_PER_TRIANGLE * total as usize
             + unwrap::bytes(total as usize, vertices, scene.device().num_threads());
         let _memory = scene.device().memory().reserve(bytes, CHARTS)?;
@@ -203,11 +203,10 @@ impl Charts {
 
 /// Returns the area of all valid triangles, in squared scene units.
 pub fn surface_area(scene: &Scene) -> f64 {
-    let areas = |m: usize, mesh: &Mesh| -> f64 {
-        let first = scene.first_triangle(m as u32);
-        (first..first + mesh.indices.len() as u32).filter(|&t| scene.is_valid(t)).map(|t| triangle_area(scene, t)).sum()
+    let area = |object: u32| -> f64 {
+        scene.triangles_of(object).filter(|&t| scene.is_valid(t)).map(|t| triangle_area(scene, t)).sum()
     };
-    scene.meshes().iter().enumerate().map(|(m, mesh)| areas(m, mesh)).sum()
+    (0..scene.object_count()).map(area).sum()
 }
 
 /// Returns the density in texels per scene unit at which the scene's surface fills about `pages` pages, two thirds of
@@ -308,11 +307,13 @@ fn given_pieces(scene: &Scene, page_size: u32, report: &mut UvReport, stage: &St
     let mut rest = Vec::new();
     let mut usable = Vec::new();
     let mut cover = BTreeMap::<u32, f64>::new();
-    for (m, mesh) in scene.meshes().iter().enumerate() {
-        let first = scene.first_triangle(m as u32);
-        for t in (0..mesh.indices.len()).filter(|&t| scene.is_valid(first + t as u32)) {
+    for m in 0..scene.object_count() {
+        let (object, triangles) = (scene.object(m), scene.triangles_of(m));
+        let (mesh, first) = (object.mesh(), triangles.start);
+        for t in (0..triangles.len()).filter(|&t| scene.is_valid(first + t as u32)) {
             stage.check()?;
-            let Some(lightmap) = &mesh.lightmap else {
+            // The instances of a mesh would all have the same place.
+            let Some(lightmap) = mesh.lightmap.as_ref().filter(|_| !object.is_instance()) else {
                 try_push(&mut rest, first + t as u32, CHARTS)?;
                 continue;
             };
@@ -349,7 +350,7 @@ fn given_pieces(scene: &Scene, page_size: u32, report: &mut UvReport, stage: &St
     Ok((pieces, rest))
 }
 
-fn given_page(lightmap: &LightmapUvs, mesh: usize, triangle: usize, page_size: u32) -> Result<u32> {
+fn given_page(lightmap: &LightmapUvs, mesh: u32, triangle: usize, page_size: u32) -> Result<u32> {
     let page = lightmap.pages.get(triangle).copied().unwrap_or(0);
     let limit = MAX_TEXELS / (page_size as u64).pow(2);
     if page as u64 >= limit {
@@ -373,7 +374,7 @@ fn uv_area(mesh: &Mesh, lightmap: &LightmapUvs, triangle: usize, page_size: u32)
 
 /// Returns the pieces of one mesh: its `triangles` with usable UVs and their pages, connected through equal vertices.
 fn islands(scene: &Scene, triangles: &[(u32, u32)], stage: &Stage) -> Result<Vec<Piece>> {
-    let mesh = &scene.meshes()[scene.locate(triangles[0].0).0 as usize];
+    let mesh = scene.object(scene.locate(triangles[0].0).0).mesh();
     let uvs = &mesh.lightmap.as_ref().expect("the mesh has UVs").uvs;
     let corner = |t: u32, k: usize| mesh.indices[scene.locate(t).1 as usize][k] as usize;
     let mut keys = try_with_capacity(triangles.len() * 3, CHARTS)?;

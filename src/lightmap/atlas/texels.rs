@@ -59,12 +59,13 @@ impl TexelSample {
     /// the front, else the geometric normal.
     pub fn shading_normal(&self, scene: &Scene) -> Vec3 {
         let geometric = self.geometric_normal(scene);
-        let (mesh, triangle) = scene.locate(self.triangle);
-        let mesh = &scene.meshes()[mesh as usize];
+        let (object, triangle) = scene.locate(self.triangle);
+        let object = scene.object(object);
+        let mesh = object.mesh();
         if mesh.normals.is_empty() {
             return geometric;
         }
-        let [a, b, c] = mesh.indices[triangle as usize].map(|i| mesh.normals[i as usize].as_dvec3());
+        let [a, b, c] = mesh.indices[triangle as usize].map(|i| object.normal(i).as_dvec3());
         let (u, v) = (self.u as f64, self.v as f64);
         let normal = (a * (1.0 - u - v) + b * u + c * v).normalize_or_zero().as_vec3();
         if normal.dot(geometric) > 0.0 { normal } else { geometric }

@@ -31,10 +31,11 @@ impl Geometry {
     /// Bytes per triangle and per vertex that finding neighbours takes, the neighbours included.
     pub(super) const BYTES_OF_NEIGHBOURS: [usize; 2] = [12 + 12, 4];
 
-    /// Welds `triangles`, which are most of the valid ones of one mesh (global numbers, ascending).
+    /// Welds `triangles`, which are most of the valid ones of one object (global numbers, ascending).
     pub(super) fn of(scene: &Scene, triangles: &[u32], stage: &Stage) -> Result<Geometry> {
-        let (m, _) = scene.locate(triangles[0]);
-        let (mesh, first) = (&scene.meshes()[m as usize], scene.first_triangle(m));
+        let (number, _) = scene.locate(triangles[0]);
+        let (object, first) = (scene.object(number), scene.first_triangle(number));
+        let mesh = object.mesh();
         let corners = |t: u32| mesh.indices[(t - first) as usize];
         let mut welded = try_filled(mesh.positions.len(), NONE, CHARTS)?;
         for (i, &t) in triangles.iter().enumerate() {
@@ -43,19 +44,19 @@ impl Geometry {
             }
             corners(t).into_iter().for_each(|v| welded[v as usize] = 0);
         }
-        let key = |v: u32| mesh.positions[v as usize].to_array().map(float_key);
+        let key = |v: u32| object.position(v).to_array().map(float_key);
         let used = (0..mesh.positions.len() as u32).filter(|&v| welded[v as usize] == 0);
         let mut order = try_collect(used.map(|v| (key(v), v)), CHARTS)?;
         sort(&mut order, &|| stage.check())?;
         let mut positions = try_with_capacity(order.len(), CHARTS)?;
         for same in order.chunk_by(|a, b| a.0 == b.0) {
             same.iter().for_each(|&(_, v)| welded[v as usize] = positions.len() as u32);
-            positions.push(mesh.positions[same[0].1 as usize]);
+            positions.push(object.position(same[0].1));
         }
         drop(order);
         stage.check()?;
         let normal = |&t: &u32| {
-            let [a, b, c] = corners(t).map(|v| mesh.positions[v as usize].as_dvec3());
+            let [a, b, c] = object.corners(t - first).map(|c| c.as_dvec3());
             (b - a).cross(c - a).normalize_or_zero()
         };
         let kind = |&t: &u32| surface_kind(&scene.materials()[mesh.material((t - first) as usize) as usize]);

@@ -228,8 +228,8 @@ pub(crate) fn albedo<M: Map>(areas: &TexelAreas<M>, texel: TexelId<M>) -> Vec3 {
     if !scene.uses().textures || material.albedo_texture == NONE {
         return Vec3::from(material.albedo);
     }
-    let (mesh, triangle) = scene.locate(sample.triangle);
-    let mesh = &scene.meshes()[mesh as usize];
+    let (object, triangle) = scene.locate(sample.triangle);
+    let mesh = scene.object(object).mesh();
     let uv = |w: Vec2| mesh.texture_coordinates(triangle as usize, w.x, w.y).unwrap_or_default();
     // Weights of corners 1 and 2 as a function of texel coordinates in the map.
     let placement = map.placement_of(charts, texel);

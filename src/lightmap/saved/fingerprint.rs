@@ -209,6 +209,10 @@ pub(super) fn geometry(scene: &Scene) -> u32 {
             MeshMaterials::PerTriangle(materials) => sum.update(bytemuck::cast_slice(materials)),
         }
     }
+    for instance in scene.instances() {
+        sum.update(&instance.mesh.to_ne_bytes());
+        sum.update(bytemuck::cast_slice(&instance.transform.to_cols_array()));
+    }
     sum.finalize()
 }
 

@@ -48,8 +48,8 @@ impl Seen {
         let scene = lightmap.scene();
         let rows = ray_count(aspect) / COLUMNS;
         let rays = PrimaryRays::new(camera, COLUMNS, rows);
-        let uvs = (0..scene.meshes().len() as u32)
-            .map(|m| Ok([lightmap.mesh_back_uvs(m)?.0, lightmap.mesh_uvs(m)?]))
+        let uvs = (0..scene.object_count())
+            .map(|o| Ok([lightmap.object_back_uvs(o)?.0, lightmap.object_uvs(o)?]))
             .collect::<Result<Vec<_>>>()?;
         let size = lightmap.info().width;
         let mut texels = Vec::new();
@@ -58,8 +58,8 @@ impl Seen {
             if hit.is_miss() || !lightmap.shows(hit.triangle, hit.front) {
                 continue;
             }
-            let (mesh, triangle) = scene.locate(hit.triangle);
-            let (corners, pages) = &uvs[mesh as usize][usize::from(hit.front)];
+            let (object, triangle) = scene.locate(hit.triangle);
+            let (corners, pages) = &uvs[object as usize][usize::from(hit.front)];
             let (corners, page) = (&corners[triangle as usize], pages[triangle as usize]);
             if page == NONE {
                 continue;

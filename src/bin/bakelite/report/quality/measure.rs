@@ -214,11 +214,11 @@ impl Points {
         let mut uvs: BTreeMap<u32, [MeshUvs; 2]> = BTreeMap::new();
         let mut at: Vec<Option<(u32, [f32; 2])>> = Vec::new();
         for &(t, front, u, v) in &self.on {
-            let (mesh, triangle) = scene.locate(t);
-            if let Entry::Vacant(entry) = uvs.entry(mesh) {
-                entry.insert([lightmap.mesh_back_uvs(mesh)?.0, lightmap.mesh_uvs(mesh)?]);
+            let (object, triangle) = scene.locate(t);
+            if let Entry::Vacant(entry) = uvs.entry(object) {
+                entry.insert([lightmap.object_back_uvs(object)?.0, lightmap.object_uvs(object)?]);
             }
-            let (corners, pages) = &uvs[&mesh][usize::from(front)];
+            let (corners, pages) = &uvs[&object][usize::from(front)];
             let [a, b, c] = corners[triangle as usize].map(Vec2::from);
             let page = pages[triangle as usize];
             at.push((page != NONE).then(|| (page, ((a + (b - a) * u + (c - a) * v) * size as f32 - 0.5).to_array())));

@@ -111,7 +111,8 @@ impl TexelPaths {
         if hit.triangle == NONE {
             return None;
         }
-        let triangle = self.scene.first_triangle(hit.mesh) + hit.triangle;
+        let object = if hit.instance == NONE { hit.mesh } else { self.scene.object_of_instance(hit.instance) };
+        let triangle = self.scene.first_triangle(object) + hit.triangle;
         let material = self.scene.material(triangle);
         let point = SurfacePoint::new(self.scene.corners(triangle), hit.u, hit.v, &self.scene);
         let back = path.direction.dot(point.normal) > 0.0;

@@ -1,0 +1,109 @@
+//! Two-level trees: each mesh with instances has a tree of its own, in its coordinates, and the boxes of all instances
+//! are the leaves of another (Wald, Benthin and Slusallek, *Distributed Interactive Ray Tracing of Dynamic Scenes*,
+//! 2003). A ray that meets the box of an instance goes through the tree of its mesh, in that one's coordinates.
+
+use super::layout::Mbvh;
+use super::{BuildOptions, BuildQuality, References, Tree, build_binary, collapse};
+use crate::base::error::Result;
+use crate::base::memory::{try_collect, try_push, try_to_vec};
+use crate::base::progress::Progress;
+use glam::{Mat3A, Vec3, Vec3A};
+
+/// The trees of a scene's instances.
+pub(crate) struct Instances {
+    /// Tree over the boxes of instances; its leaves hold their numbers, one each.
+    pub top: Mbvh,
+    /// The meshes that have instances.
+    pub trees: Vec<MeshTree>,
+    /// The instances, by number.
+    pub placed: Vec<PlacedTree>,
+}
+
+/// The tree of a mesh that has instances, with triangles by their number in the mesh.
+pub(crate) struct MeshTree {
+    /// Number of the mesh.
+    pub mesh: u32,
+    /// 0 and the number of triangles.
+    pub range: [u32; 2],
+    pub tree: Tree,
+    /// Triangles that are not in the tree, ascending.
+    pub skipped: Vec<u32>,
+}
+
+/// An instance as rays meet it.
+#[derive(Clone, Copy)]
+pub(crate) struct PlacedTree {
+    /// Map of vectors to the mesh's coordinates.
+    pub to_mesh: Mat3A,
+    /// Where the mesh's origin lies.
+    pub origin: Vec3A,
+    /// Index of the tree.
+    pub tree: u32,
+    /// Global number of the first triangle.
+    pub first_triangle: u32,
+}
+
+/// Distance by which the boxes of instances are larger than those of their triangles, as a fraction of their
+/// coordinates and extents: some ten roundings, for what transforming a ray moves it by.
+const MARGIN: f32 = 1e-6;
+
+/// Returns the box around the image of another, moved outwards. A box that is not finite, of a mesh that cannot be hit,
+/// gives one that no ray meets.
+pub(crate) fn placed_box((lower, upper): (Vec3, Vec3), place: impl Fn(Vec3) -> Vec3) -> (Vec3, Vec3) {
+    let corner = |i: usize| place(Vec3::from_array([0, 1, 2].map(|a| [lower, upper][i >> a & 1][a])));
+    let (mut low, mut high) = (Vec3::INFINITY, Vec3::NEG_INFINITY);
+    for c in (0..8).map(corner) {
+        (low, high) = (low.min(c), high.max(c));
+    }
+    let margin = MARGIN * ((high - low).max_element() + low.abs().max(high.abs()).max_element());
+    (low - margin, high + margin)
+}
+
+impl Instances {
+    /// Returns a triangle with this box.
+    pub(crate) fn corners_of_box((lower, upper): (Vec3, Vec3)) -> [Vec3; 3] {
+        [lower, Vec3::new(upper.x, upper.y, lower.z), Vec3::new(lower.x, upper.y, upper.z)]
+    }
+
+    /// Builds the tree over the boxes of instances.
+    pub(crate) fn top_of(boxes: &[(Vec3, Vec3)], progress: &Progress) -> Result<Mbvh> {
+        let corners = |i: u32| Self::corners_of_box(boxes[i as usize]);
+        let options = BuildOptions { max_leaf: 1, quality: BuildQuality::Default, ..Default::default() };
+        let met = |(i, b): (u32, &(Vec3, Vec3))| b.0.cmple(b.1).all().then_some(i);
+        let ids = try_collect((0..).zip(boxes).filter_map(met), "the tree of instances")?;
+        if ids.is_empty() {
+            return Ok(Mbvh::nothing());
+        }
+        let binary = build_binary(&corners, References::of(&ids, &corners)?, &options, progress)?;
+        collapse::collapse(&binary, &corners, progress)
+    }
+
+    /// Returns the size in bytes.
+    pub(crate) fn bytes(&self) -> usize {
+        let trees: usize = self.trees.iter().map(|t| t.tree.bytes() + size_of_val(&t.skipped[..])).sum();
+        trees + self.top.bytes() + size_of_val(&self.placed[..])
+    }
+
+    /// Copies the trees; fails if there is not enough memory.
+    pub(crate) fn try_clone(&self) -> Result<Instances> {
+        let what = "a copy of the trees of instances";
+        let mut trees = Vec::new();
+        for t in &self.trees {
+            let copy = MeshTree {
+                mesh: t.mesh,
+                range: t.range,
+                tree: t.tree.try_clone()?,
+                skipped: try_to_vec(&t.skipped, what)?,
+            };
+            try_push(&mut trees, copy, what)?;
+        }
+        Ok(Instances { top: self.top.try_clone()?, trees, placed: try_to_vec(&self.placed, what)? })
+    }
+}
+
+impl MeshTree {
+    /// Whether any ray can hit the mesh.
+    pub(crate) fn is_hit(&self) -> bool {
+        self.range[1] as usize > self.skipped.len()
+    }
+}

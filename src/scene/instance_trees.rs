@@ -1,0 +1,125 @@
+//! The trees of a scene's instances: built at the commit, and after refits.
+
+use super::{Instance, SceneData, is_valid_triangle};
+use crate::base::error::Result;
+use crate::base::memory::{try_collect, try_par_collect, try_par_filter, try_par_gather};
+use crate::base::progress::Progress;
+use crate::bvh::instances::{Instances, MeshTree, PlacedTree, placed_box};
+use crate::bvh::{self, BuildOptions, References, RefitRoom, Tree};
+use glam::Vec3;
+use rayon::prelude::*;
+
+/// Name of this memory in error messages.
+const TREES: &str = "the trees of instances";
+
+/// The numbers of meshes that have instances.
+fn instanced(data: &SceneData) -> impl Iterator<Item = u32> {
+    (0..data.meshes.len() as u32).filter(|&m| data.is_instanced(m))
+}
+
+/// Upper bound of the trees' size together with the builder's working memory.
+pub(super) fn estimated_bytes(data: &SceneData, options: &BuildOptions) -> usize {
+    let triangles: usize = instanced(data).map(|m| data.meshes[m as usize].indices.len()).sum();
+    let top = BuildOptions { compact: false, ..*options };
+    let per_instance = size_of::<PlacedTree>() + 24;
+    let instances = data.instances.len();
+    bvh::estimated_bytes(triangles, options) + bvh::estimated_bytes(instances, &top) + instances * per_instance
+}
+
+/// Builds the trees; `None` if the scene has no instances.
+pub(super) fn build(
+    data: &SceneData,
+    first_triangle: &[u32],
+    options: &BuildOptions,
+    progress: &Progress,
+) -> Result<Option<Instances>> {
+    if data.instances.is_empty() {
+        return Ok(None);
+    }
+    let meshes = try_collect(instanced(data), TREES)?;
+    let trees = try_par_gather(meshes.len(), TREES, |i, out: &mut Vec<MeshTree>| {
+        out.push(tree_of(data, meshes[i], options, progress)?);
+        Ok(())
+    })?;
+    let tree_of = |mesh: u32| trees.binary_search_by_key(&mesh, |t| t.mesh).expect("a mesh with instances has a tree");
+    let first = &first_triangle[data.meshes.len()..];
+    let place = |(instance, &first_triangle): (&Instance, &u32)| PlacedTree {
+        to_mesh: instance.to_mesh(),
+        origin: instance.transform.translation,
+        tree: tree_of(instance.mesh) as u32,
+        first_triangle,
+    };
+    let placed = try_collect(data.instances.iter().zip(first).map(place), TREES)?;
+    let of_instance = |i: usize| box_of(data, &trees, &placed, i);
+    let boxes = try_par_collect((0..placed.len()).into_par_iter().map(of_instance), TREES)?;
+    let top = Instances::top_of(&boxes, progress)?;
+    Ok(Some(Instances { top, trees, placed }))
+}
+
+/// Refits the trees after vertices and instances have moved; `rooms` are those of the meshes' trees. Returns how many
+/// triangles can no longer be hit.
+pub(super) fn refit(data: &SceneData, instances: &mut Instances, rooms: Vec<RefitRoom>) -> usize {
+    let of_tree = |(t, room): (&mut MeshTree, RefitRoom)| {
+        if !t.is_hit() {
+            return 0;
+        }
+        let mesh = &data.meshes[t.mesh as usize];
+        let corners = |i: u32| mesh.corners(i as usize);
+        t.tree.refit(&corners, room);
+        let is_gone = |&i: &u32| !is_valid_triangle(corners(i)) && t.skipped.binary_search(&i).is_err();
+        (0..t.range[1]).into_par_iter().filter(is_gone).count()
+    };
+    let gone = instances.trees.par_iter_mut().zip(rooms).map(of_tree).sum();
+    for (at, instance) in instances.placed.iter_mut().zip(&data.instances) {
+        (at.to_mesh, at.origin) = (instance.to_mesh(), instance.transform.translation);
+    }
+    let Instances { top, trees, placed } = instances;
+    let corners = |i: u32| Instances::corners_of_box(box_of(data, trees, placed, i as usize));
+    if top.bounds().0.is_finite() {
+        bvh::refit_whole(top, &corners);
+    }
+    gone
+}
+
+/// The box of an instance in the scene.
+fn box_of(data: &SceneData, trees: &[MeshTree], placed: &[PlacedTree], instance: usize) -> (Vec3, Vec3) {
+    let transform = &data.instances[instance].transform;
+    placed_box(trees[placed[instance].tree as usize].tree.bounds(), |p| super::instance::placed(transform, p))
+}
+
+fn tree_of(data: &SceneData, number: u32, options: &BuildOptions, progress: &Progress) -> Result<MeshTree> {
+    let mesh = &data.meshes[number as usize];
+    let total = mesh.indices.len();
+    let corners = |t: u32| mesh.corners(t as usize);
+    let references = References::of_valid(total, &corners, is_valid_triangle, progress)?;
+    progress.check()?;
+    let skipped = match references.len() == total {
+        true => Vec::new(),
+        false => try_par_filter(total, TREES, |t| !is_valid_triangle(corners(t)))?,
+    };
+    let range = [0, total as u32];
+    let tree = match references.len() {
+        0 => Tree::nothing(),
+        _ => bvh::build(&corners, references, &range, options, progress)?.0,
+    };
+    Ok(MeshTree { mesh: number, range, tree, skipped })
+}
+
+/// Whether a triangle of an object is in no tree: `own` are the skipped triangles of meshes without instances, by their
+/// global number.
+pub(super) fn is_skipped(
+    data: &SceneData,
+    own: &[u32],
+    instances: Option<&Instances>,
+    object: u32,
+    triangle: u32,
+    first: u32,
+) -> bool {
+    match (object as usize).checked_sub(data.meshes.len()) {
+        None => own.binary_search(&(first + triangle)).is_ok(),
+        Some(instance) => instances.is_some_and(|i| {
+            let tree = &i.trees[i.placed[instance].tree as usize];
+            tree.skipped.binary_search(&triangle).is_ok()
+        }),
+    }
+}
