@@ -74,6 +74,72 @@ static bk_scene_stats stats_of(const bk_scene *scene) {
     return stats;
 }
 
+/* The floor as two instances, one of them turned upside down at z = 1, which then moves. */
+static void test_instances(bk_device *device) {
+    static const float AT_0[12] = {1, 0, 0, 0, 1, 0, 0, 0, 1, 0, 0, 0};
+    static const float AT_1[12] = {1, 0, 0, 0, -1, 0, 0, 0, -1, 0, 1, 1};
+    static const float MIRROR[12] = {1, 0, 0, 0, 1, 0, 0, 0, -1, 0, 0, 0};
+    float at[12], back[12], uvs[2][12], none[12];
+    uint32_t id = 7, mesh = 7, pages[2][2];
+    uint8_t separate[2];
+    bk_scene *scene = NULL;
+    bk_lightmap *lightmap = NULL;
+    bk_lightmap_desc desc;
+    bk_material_desc material;
+    bk_mesh_desc floor;
+    bk_ray ray = {{0.3f, 0.4f, 0.125f}, 0.0f, {0, 0, 1}, INFINITY};
+    bk_hit hit;
+    CHECK_OK(bk_scene_create(device, &scene));
+    bk_material_desc_init(&material);
+    CHECK_OK(bk_scene_add_material(scene, &material, NULL));
+    bk_mesh_desc_init(&floor);
+    floor.positions = SQUARE[0];
+    floor.vertex_count = 4;
+    floor.indices = UP[0];
+    floor.triangle_count = 2;
+    CHECK_OK(bk_scene_add_mesh(scene, &floor, NULL));
+    CHECK_ERROR(bk_scene_add_instance(scene, 1, AT_0, &id), ARGUMENT, "mesh 1");
+    CHECK_ERROR(bk_scene_add_instance(scene, 0, MIRROR, &id), ARGUMENT, "mirrors");
+    CHECK_ERROR(bk_scene_add_instance(scene, 0, NULL, &id), ARGUMENT, "transform");
+    CHECK(bk_scene_instance_count(scene) == 0);
+    CHECK_OK(bk_scene_add_instance(scene, 0, AT_0, NULL));
+    CHECK_OK(bk_scene_add_instance(scene, 0, AT_1, &id));
+    CHECK(id == 1 && bk_scene_instance_count(scene) == 2);
+    CHECK_ERROR(bk_instance_set_transform(scene, 0, AT_0), STATE, "not committed");
+    CHECK_OK(bk_scene_commit(scene, NULL, NULL));
+    CHECK_ERROR(bk_scene_add_instance(scene, 0, AT_0, NULL), STATE, "instances can be added no more");
+    CHECK_OK(bk_scene_get_instance(scene, 1, &mesh, back));
+    CHECK(mesh == 0 && memcmp(back, AT_1, sizeof back) == 0);
+    CHECK_ERROR(bk_scene_get_instance(scene, 2, &mesh, back), ARGUMENT, "instance 2");
+
+    bk_intersect(scene, &ray, &hit);
+    CHECK(hit.t == 0.875f && hit.mesh == 0 && hit.instance == 1 && height(scene) == hit.t);
+    ray.direction[2] = -1;
+    bk_intersect(scene, &ray, &hit);
+    CHECK(hit.t == 0.125f && hit.mesh == 0 && hit.instance == 0);
+
+    bk_lightmap_desc_init(&desc);
+    desc.texels_per_unit = 8;
+    CHECK_OK(bk_lightmap_create(scene, &desc, NULL, NULL, &lightmap));
+    CHECK_ERROR(bk_lightmap_mesh_uvs(lightmap, 0, none, NULL), ARGUMENT, "instances");
+    CHECK_ERROR(bk_lightmap_instance_uvs(lightmap, 2, none, NULL), ARGUMENT, "instance 2");
+    CHECK_OK(bk_lightmap_instance_uvs(lightmap, 0, uvs[0], pages[0]));
+    CHECK_OK(bk_lightmap_instance_back_uvs(lightmap, 1, uvs[1], pages[1], separate));
+    CHECK(pages[0][0] == 0 && pages[1][1] == 0 && separate[0] == 0);
+    CHECK(memcmp(uvs[0], uvs[1], sizeof uvs[0]) != 0);
+    bk_lightmap_release(lightmap);
+
+    memcpy(at, AT_1, sizeof at);
+    at[11] = 2;
+    CHECK_ERROR(bk_instance_set_transform(scene, 2, at), ARGUMENT, "instance 2");
+    CHECK_ERROR(bk_instance_set_transform(scene, 1, MIRROR), ARGUMENT, "mirrors");
+    CHECK_OK(bk_instance_set_transform(scene, 1, at));
+    CHECK(height(scene) == 0.875f);
+    CHECK_OK(bk_scene_refit(scene));
+    CHECK(height(scene) == 1.875f && stats_of(scene).triangles == 4);
+    bk_scene_release(scene);
+}
+
 static void test_use(bk_device *device) {
     bk_scene *scene = committed_scene(device, 0);
     bk_scene_stats before = stats_of(scene), after;
@@ -213,6 +279,7 @@ int main(void) {
     bk_device_desc_init(&desc);
     desc.num_threads = 2;
     CHECK_OK(bk_device_create(&desc, &device));
+    test_instances(device);
     test_use(device);
     test_old_lightmaps(device);
     test_bad_input(device);

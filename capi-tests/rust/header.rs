@@ -11,8 +11,21 @@ use cbindgen::{
 use std::path::Path;
 
 /// The sections of the header, in order.
-const SECTIONS: [&str; 12] =
-    ["error", "device", "scene", "textures", "meshes", "lights", "rays", "photons", "lightmap", "bake", "read", "live"];
+const SECTIONS: [&str; 13] = [
+    "error",
+    "device",
+    "scene",
+    "textures",
+    "meshes",
+    "instances",
+    "lights",
+    "rays",
+    "photons",
+    "lightmap",
+    "bake",
+    "read",
+    "live",
+];
 
 const HEAD: &str = "\
 /**

@@ -7,10 +7,10 @@ use bakelite::lightmap::{BakeParams, Layer, LayerData, Lightmap, LightmapDesc};
 use bakelite::photon::{PhotonMap, PhotonParams};
 use bakelite::reference::{Irradiance, PathTracer, Random, SurfacePoint};
 use bakelite::scene::shapes::MeshBuilder;
-use bakelite::scene::{Environment, builtin};
+use bakelite::scene::{Environment, Instance, builtin};
 use bakelite::trace::Ray;
 use bakelite::{Device, DeviceOptions, Error, Isa, Light, Material, Progress, Scene, SceneData};
-use glam::Vec3;
+use glam::{Affine3A, Quat, Vec3};
 use std::f64::consts::PI;
 use std::sync::{Arc, OnceLock};
 use std::time::Instant;
@@ -314,6 +314,71 @@ fn backs_have_uvs_positions_and_normals_of_their_own() {
     assert_ne!(one.shows(0, true), one.shows(0, false));
     assert_eq!(one.sample(Layer::Combined, 0, true, 0.3, 0.3), one.sample(Layer::Combined, 0, false, 0.3, 0.3));
     assert_eq!(one.info().texels + map.info().back_texels, map.info().texels);
+}
+
+/// A closed white room with a lamp, and balls in it that are instances of one mesh, or copies of it.
+fn room_of_balls(threads: usize, copies: bool) -> Arc<Scene> {
+    let mut data = SceneData::new();
+    let white = data.add_material(Material { albedo: [0.7; 3], ..Default::default() }).unwrap();
+    let red = data.add_material(Material { albedo: [0.6, 0.1, 0.1], ..Default::default() }).unwrap();
+    let mut room = MeshBuilder::new();
+    room.box_(Vec3::ZERO, Vec3::new(4.0, 3.0, 4.0), true, white);
+    data.add_mesh(room.finish()).unwrap();
+    let mut ball = MeshBuilder::new();
+    ball.sphere(Vec3::ZERO, 0.5, 3, red);
+    let mesh = data.add_mesh(ball.finish()).unwrap();
+    for i in 0..5 {
+        let place = Vec3::new(0.8 + 0.6 * i as f32, 0.5 + 0.4 * (i % 3) as f32, 0.9 + 1.1 * (i % 2) as f32);
+        let scale = if i == 4 { Vec3::new(1.2, 0.6, 1.0) } else { Vec3::splat(0.5 + 0.2 * i as f32) };
+        let turn = Quat::from_rotation_z(0.7 * i as f32);
+        let transform = Affine3A::from_scale_rotation_translation(scale, turn, place);
+        data.add_instance(Instance { mesh, transform }).unwrap();
+    }
+    let lamp = Light::Point { position: Vec3::new(2.0, 2.7, 2.0), intensity: [3.0; 3] };
+    if copies {
+        let mut flat = SceneData::new();
+        data.materials().iter().for_each(|m| _ = flat.add_material(*m).unwrap());
+        data.flattened().iter().for_each(|m| _ = flat.add_mesh(m.clone()).unwrap());
+        data = flat;
+    }
+    data.add_light(lamp).unwrap();
+    Scene::commit(&device(threads, None), data, &BuildOptions::default(), &Progress::none()).map_err(|e| e.1).unwrap()
+}
+
+#[test]
+fn instances_have_the_light_of_copies_each_its_own() {
+    let desc = LightmapDesc { texels_per_unit: 16.0, ..Default::default() };
+    let bake = |threads, copies| {
+        let mut map = Lightmap::create(&room_of_balls(threads, copies), &desc, &Progress::none()).unwrap();
+        map.bake(&BakeParams::default(), &Progress::none()).unwrap();
+        map
+    };
+    let (instances, copies) = (bake(2, false), bake(2, true));
+    assert_same_bits(&bits(&instances), &bits(&bake(1, false)), "one thread");
+    let scene = instances.scene();
+    assert_eq!((scene.instances().len(), copies.scene().instances().len()), (5, 0));
+    let (mut random, mut squares, mut sum) = (Random::new(4, 0), 0.0, 0.0);
+    let mut on_balls = 0;
+    for _ in 0..2000 {
+        let place = Place::random(scene, &mut random);
+        let [a, b] = [&instances, &copies].map(|map| place.sample(map, Layer::Combined));
+        squares += (a[0] - b[0]).powi(2);
+        sum += b[0];
+        on_balls += u32::from(scene.locate(place.triangle).0 > 1);
+    }
+    let error = (squares / 2000.0).sqrt() / (sum / 2000.0);
+    println!("instances against copies: {:.2} % RMS, {on_balls} of 2000 points on balls", 100.0 * error);
+    // Their charts differ, and so do noise and blur: as much as two seeds of one scene do (2 %).
+    assert!(error < 0.04 && on_balls > 200, "{error}");
+    let tracer = PathTracer::new(scene);
+    let (mut light, mut truth) = (0.0, 0.0);
+    for _ in 0..100 {
+        let place = Place::random_on(scene.first_triangle(2) + (900.0 * random.uniform()) as u32, &mut random);
+        light += place.sample(&instances, Layer::Combined)[0];
+        truth += tracer.irradiance(&place.point(scene), 512, 0, 5).total()[0];
+    }
+    println!("light of the first ball: {light:.2}, by paths {truth:.2}");
+    assert!((light / truth - 1.0).abs() < 0.04, "{light} {truth}");
 }
 
 /// The Cornell box, whose front is open, in the light of a sky with an image and of a low sun with a disc.

@@ -402,7 +402,7 @@ pub unsafe extern "C" fn bk_lightmap_get_info(lightmap: *const bk_lightmap, out:
 ///   to 4 bytes; may be NULL
 /// @param out_page_per_triangle  receives the page of each triangle, BK_NONE for triangles without
 ///   texels, aligned to 4 bytes; may be NULL
-/// @retval BK_ERROR_INVALID_ARGUMENT  there is no such mesh
+/// @retval BK_ERROR_INVALID_ARGUMENT  there is no such mesh, or it has instances
 /// @retval BK_ERROR_INVALID_STATE  the light map is being baked
 /// @retval BK_ERROR_OUT_OF_MEMORY  a copy does not fit
 #[unsafe(no_mangle)]
@@ -433,7 +433,7 @@ pub unsafe extern "C" fn bk_lightmap_mesh_uvs(
 ///   texels, aligned to 4 bytes; may be NULL
 /// @param out_separate_per_triangle  receives one byte per triangle: 1 if the back has separate
 ///   texels, else 0; may be NULL
-/// @retval BK_ERROR_INVALID_ARGUMENT  there is no such mesh
+/// @retval BK_ERROR_INVALID_ARGUMENT  there is no such mesh, or it has instances
 /// @retval BK_ERROR_INVALID_STATE  the light map is being baked
 /// @retval BK_ERROR_OUT_OF_MEMORY  a copy does not fit
 #[unsafe(no_mangle)]
@@ -446,14 +446,84 @@ pub unsafe extern "C" fn bk_lightmap_mesh_back_uvs(
 ) -> bk_result {
     // SAFETY: the arrays are the caller's, or NULL.
     call(|| unsafe {
-        let (uvs, own) = object!(lightmap).read(|l| l.mesh_back_uvs(mesh))?;
-        copy_uvs(&uvs, out_corner_uvs, out_page_per_triangle)?;
-        if !out_separate_per_triangle.is_null() {
-            let out = slice_mut(out_separate_per_triangle, own.len(), "out_separate_per_triangle", &[])?;
-            out.iter_mut().zip(own).for_each(|(out, own)| *out = own.into());
-        }
-        Ok(())
+        let backs = object!(lightmap).read(|l| l.mesh_back_uvs(mesh))?;
+        copy_back_uvs(&backs, out_corner_uvs, out_page_per_triangle, out_separate_per_triangle)
     })
+}
+
+/// Copies the light map coordinates of the triangles of an instance.
+///
+/// @param lightmap  any light map
+/// @param instance  number of the instance
+/// @param out_corner_uvs  receives u and v in [0, 1] of each corner, 6 floats per triangle of its
+///   mesh, aligned to 4 bytes; may be NULL
+/// @param out_page_per_triangle  receives the page of each triangle, BK_NONE for triangles without
+///   texels, aligned to 4 bytes; may be NULL
+/// @retval BK_ERROR_INVALID_ARGUMENT  there is no such instance
+/// @retval BK_ERROR_INVALID_STATE  the light map is being baked
+/// @retval BK_ERROR_OUT_OF_MEMORY  a copy does not fit
+#[unsafe(no_mangle)]
+pub unsafe extern "C" fn bk_lightmap_instance_uvs(
+    lightmap: *const bk_lightmap,
+    instance: u32,
+    out_corner_uvs: *mut f32,
+    out_page_per_triangle: *mut u32,
+) -> bk_result {
+    // SAFETY: the arrays are the caller's, or NULL.
+    call(|| unsafe {
+        let uvs = object!(lightmap).read(|l| l.instance_uvs(instance))?;
+        copy_uvs(&uvs, out_corner_uvs, out_page_per_triangle)
+    })
+}
+
+/// Copies the light map coordinates of the backs of the triangles of an instance, as
+/// bk_lightmap_mesh_back_uvs does for a mesh.
+///
+/// @param lightmap  any light map
+/// @param instance  number of the instance
+/// @param out_corner_uvs  receives u and v in [0, 1] of each corner, 6 floats per triangle of its
+///   mesh, aligned to 4 bytes; may be NULL
+/// @param out_page_per_triangle  receives the page of each triangle, BK_NONE for triangles without
+///   texels, aligned to 4 bytes; may be NULL
+/// @param out_separate_per_triangle  receives one byte per triangle: 1 if the back has separate
+///   texels, else 0; may be NULL
+/// @retval BK_ERROR_INVALID_ARGUMENT  there is no such instance
+/// @retval BK_ERROR_INVALID_STATE  the light map is being baked
+/// @retval BK_ERROR_OUT_OF_MEMORY  a copy does not fit
+#[unsafe(no_mangle)]
+pub unsafe extern "C" fn bk_lightmap_instance_back_uvs(
+    lightmap: *const bk_lightmap,
+    instance: u32,
+    out_corner_uvs: *mut f32,
+    out_page_per_triangle: *mut u32,
+    out_separate_per_triangle: *mut u8,
+) -> bk_result {
+    // SAFETY: the arrays are the caller's, or NULL.
+    call(|| unsafe {
+        let backs = object!(lightmap).read(|l| l.instance_back_uvs(instance))?;
+        copy_back_uvs(&backs, out_corner_uvs, out_page_per_triangle, out_separate_per_triangle)
+    })
+}
+
+/// Copies what is known of backs where it is wanted.
+///
+/// # Safety
+/// Each array is NULL or valid for writing as many elements.
+unsafe fn copy_back_uvs(
+    (uvs, own): &(MeshUvs, Vec<bool>),
+    out_corner_uvs: *mut f32,
+    out_pages: *mut u32,
+    out_separate: *mut u8,
+) -> Result<()> {
+    // SAFETY: by contract.
+    unsafe {
+        copy_uvs(uvs, out_corner_uvs, out_pages)?;
+        if !out_separate.is_null() {
+            let out = slice_mut(out_separate, own.len(), "out_separate_per_triangle", &[])?;
+            out.iter_mut().zip(own).for_each(|(out, &own)| *out = own.into());
+        }
+    }
+    Ok(())
 }
 
 /// Copies corner UVs and pages where they are wanted.

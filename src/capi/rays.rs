@@ -55,7 +55,7 @@ pub struct bk_hit {
     pub triangle: u32,
     /// Number of the mesh.
     pub mesh: u32,
-    /// Number of the instance: always BK_NONE, as scenes have no instances yet.
+    /// Number of the instance; BK_NONE if the mesh has none.
     pub instance: u32,
 }
 

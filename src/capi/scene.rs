@@ -29,7 +29,7 @@ use crate::base::progress::Progress;
 use crate::bvh::{BuildOptions, BuildQuality};
 use crate::device::Device;
 use crate::scene::{Scene, SceneData, builtin};
-use glam::Vec3;
+use glam::{Affine3A, Vec3};
 use std::collections::BTreeMap;
 use std::ffi::{c_char, c_void};
 use std::sync::{Arc, Mutex, OnceLock, TryLockError};
@@ -48,6 +48,8 @@ struct Changes {
     description: Option<Description>,
     /// By mesh, the positions that the next refit gives it.
     moved: BTreeMap<u32, Vec<Vec3>>,
+    /// By instance, the transform that the next refit gives it.
+    placed: BTreeMap<u32, Affine3A>,
 }
 
 #[derive(Default)]
@@ -134,6 +136,15 @@ impl bk_scene {
         })
     }
 
+    /// Keeps a transform for the next refit.
+    pub(super) fn set_transform(&self, instance: u32, transform: Affine3A) -> Result<()> {
+        self.with_changes(|changes| {
+            self.committed()?.check_transform(instance, transform)?;
+            changes.placed.insert(instance, transform);
+            Ok(())
+        })
+    }
+
     /// Reads something that the scene has in either state.
     pub(super) fn either<R>(
         &self,
@@ -170,7 +181,8 @@ pub unsafe extern "C" fn bk_scene_create(device: *mut bk_device, out: *mut *mut 
     call(|| unsafe {
         write(out, std::ptr::null_mut(), "out")?;
         let device = object!(device).device().clone();
-        let changes = Changes { description: Some(Description::default()), moved: BTreeMap::new() };
+        let changes =
+            Changes { description: Some(Description::default()), moved: BTreeMap::new(), placed: BTreeMap::new() };
         write(out, create(bk_scene { device, committed: OnceLock::new(), changes: Mutex::new(changes) }), "out")
     })
 }
@@ -216,7 +228,7 @@ pub struct bk_load_info {
     pub first_light: u32,
     /// Number of materials with a reflectance outside [0, 0.98], which was clamped to that range.
     pub clamped_albedos: u32,
-    /// Number of triangles added, degenerate ones included.
+    /// Number of triangles added, those of every instance counted and degenerate ones included.
     pub triangles: u64,
     /// Duration of the call in seconds.
     pub seconds: f64,
@@ -225,6 +237,11 @@ pub struct bk_load_info {
     pub textures: u32,
     /// Number of the first texture added; the others follow it.
     pub first_texture: u32,
+    /// Number of instances added, of meshes of at least 1,000 triangles that stand in several
+    /// places.
+    pub instances: u32,
+    /// Number of the first instance added; the others follow it.
+    pub first_instance: u32,
 }
 
 sized_struct!(bk_load_info, defaults: bk_load_info {
@@ -240,6 +257,8 @@ sized_struct!(bk_load_info, defaults: bk_load_info {
     seconds: 0.0,
     textures: 0,
     first_texture: 0,
+    instances: 0,
+    first_instance: 0,
 });
 
 /// Sets `struct_size` and clears the other fields.
@@ -354,11 +373,16 @@ pub unsafe extern "C" fn bk_scene_load_file(
         let info = scene.describe("files can be loaded", |d| {
             let mut loaded = SceneData::new();
             let info = load_file(&scene.device, &mut loaded, path, &params, base, &progress)?;
-            let first =
-                [d.data.meshes().len(), d.data.materials().len(), d.data.lights().len(), d.data.textures().len()];
+            let first = [
+                d.data.meshes().len(),
+                d.data.materials().len(),
+                d.data.lights().len(),
+                d.data.textures().len(),
+                d.data.instances().len(),
+            ];
             d.append(loaded, &scene.device)?;
-            let [first_mesh, first_material, first_light, first_texture] = first.map(|n| n as u32);
-            Ok(bk_load_info { first_mesh, first_material, first_light, first_texture, ..info })
+            let [first_mesh, first_material, first_light, first_texture, first_instance] = first.map(|n| n as u32);
+            Ok(bk_load_info { first_mesh, first_material, first_light, first_texture, first_instance, ..info })
         })?;
         if let Some(out) = out {
             out.write(info);
@@ -402,6 +426,8 @@ fn load_file(
         seconds: i.seconds,
         textures: i.textures,
         first_texture,
+        instances: i.instances,
+        first_instance: 0,
         struct_size: 0,
     })
 }
@@ -607,12 +633,13 @@ pub unsafe extern "C" fn bk_scene_refit(scene: *mut bk_scene) -> bk_result {
         scene.device.check_process()?;
         let shared = scene.shared()?;
         scene.with_changes(|changes| {
-            if changes.moved.is_empty() {
+            if changes.moved.is_empty() && changes.placed.is_empty() {
                 return Ok(());
             }
             let moved: Vec<(u32, &[Vec3])> = changes.moved.iter().map(|(mesh, p)| (*mesh, &p[..])).collect();
-            shared.write(|scene| Scene::refit(scene, &moved))??;
-            changes.moved = BTreeMap::new();
+            let placed: Vec<(u32, Affine3A)> = changes.placed.iter().map(|(&i, &t)| (i, t)).collect();
+            shared.write(|scene| Scene::refit_with(scene, &moved, &placed))??;
+            (changes.moved, changes.placed) = (BTreeMap::new(), BTreeMap::new());
             Ok(())
         })
     })

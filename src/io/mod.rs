@@ -32,7 +32,7 @@ mod texture;
 use crate::base::error::{Error, Result};
 use crate::base::memory::MemoryMonitor;
 use crate::base::progress::Progress;
-use crate::scene::{MAX_ALBEDO, MAX_COORDINATE, MAX_TRIANGLES, Material, Mesh, NONE, SceneData, Texture};
+use crate::scene::{Instance, MAX_ALBEDO, MAX_COORDINATE, MAX_TRIANGLES, Material, Mesh, NONE, SceneData, Texture};
 use account::Account;
 use glam::Vec3;
 use source::{Advance, Attempt, Files, Opened, Source, read_error};
@@ -55,7 +55,9 @@ pub const DEFAULT_ALBEDO: f32 = 0.5;
 pub struct LoadInfo {
     /// Number of meshes added.
     pub meshes: u32,
-    /// Number of triangles added, degenerate ones included.
+    /// Number of instances added.
+    pub instances: u32,
+    /// Number of triangles added, those of every instance counted and degenerate ones included.
     pub triangles: u64,
     /// Number of vertices added.
     pub vertices: u64,
@@ -229,6 +231,10 @@ impl<'s> Import<'s> {
         self.scene.add_mesh(mesh).map(|_| ()).map_err(|e| self.rename(e))
     }
 
+    fn add_instance(&mut self, instance: Instance) -> Result<()> {
+        self.scene.add_instance(instance).map(|_| ()).map_err(|e| self.rename(e))
+    }
+
     /// Turns a refusal of the scene into an error that names the file.
     fn rename(&self, e: Error) -> Error {
         match e {
@@ -249,6 +255,7 @@ impl<'s> Import<'s> {
     fn finish(self, data: &mut SceneData) -> Result<LoadInfo> {
         let Import { mut info, scene, account, .. } = self;
         info.meshes = scene.meshes().len() as u32;
+        info.instances = scene.instances().len() as u32;
         info.triangles = scene.triangle_count() as u64;
         info.vertices = scene.meshes().iter().map(|m| m.positions.len() as u64).sum();
         info.materials = scene.materials().len() as u32;

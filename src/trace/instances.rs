@@ -32,8 +32,8 @@ pub(super) trait Answer: Copy {
     /// How far the ray goes on; `None` if its answer cannot change.
     fn tmax(&self, ray: &Ray) -> Option<f32>;
 
-    /// Traces rays through the tree of a mesh.
-    fn trace(scene: &Scene, tree: TreeView, rays: &[Ray], out: &mut [Self]);
+    /// Traces rays through the tree of a mesh; `alike`: as a stream if there are enough.
+    fn trace(scene: &Scene, tree: TreeView, rays: &[Ray], alike: bool, out: &mut [Self]);
 
     /// Adds what a ray has found in an instance.
     fn add(&mut self, found: Self, first_triangle: u32);
@@ -47,13 +47,13 @@ impl Answer for RawHit {
         Some(if self.is_miss() { ray.tmax } else { self.t })
     }
 
-    fn trace(scene: &Scene, tree: TreeView, rays: &[Ray], out: &mut [RawHit]) {
-        let kernels = scene.kernels();
+    fn trace(scene: &Scene, tree: TreeView, rays: &[Ray], alike: bool, out: &mut [RawHit]) {
+        let (kernels, as_stream) = (scene.kernels(), alike && rays.len() >= LEAST_STREAM);
         match (tree, rays) {
             (TreeView::Whole(tree), [ray]) => out[0] = kernels.intersect(tree, ray),
-            (TreeView::Whole(tree), _) if rays.len() < LEAST_STREAM => kernels.intersect_block(tree, rays, out),
+            (TreeView::Whole(tree), _) if !as_stream => kernels.intersect_block(tree, rays, out),
             (TreeView::Whole(tree), _) => kernels.stream(tree, rays, out),
-            (TreeView::Compact(tree), _) if rays.len() < LEAST_STREAM => kernels.compact_intersect(&tree, rays, out),
+            (TreeView::Compact(tree), _) if !as_stream => kernels.compact_intersect(&tree, rays, out),
             (TreeView::Compact(tree), _) => kernels.compact_stream(&tree, rays, out),
         }
     }
@@ -79,13 +79,13 @@ impl Answer for u8 {
         (*self == 0).then_some(ray.tmax)
     }
 
-    fn trace(scene: &Scene, tree: TreeView, rays: &[Ray], out: &mut [u8]) {
-        let kernels = scene.kernels();
+    fn trace(scene: &Scene, tree: TreeView, rays: &[Ray], alike: bool, out: &mut [u8]) {
+        let (kernels, as_stream) = (scene.kernels(), alike && rays.len() >= LEAST_STREAM);
         match (tree, rays) {
             (TreeView::Whole(tree), [ray]) => out[0] = kernels.occluded(tree, ray) as u8,
-            (TreeView::Whole(tree), _) if rays.len() < LEAST_STREAM => kernels.occluded_block(tree, rays, out),
+            (TreeView::Whole(tree), _) if !as_stream => kernels.occluded_block(tree, rays, out),
             (TreeView::Whole(tree), _) => kernels.stream_occluded(tree, rays, out),
-            (TreeView::Compact(tree), _) if rays.len() < LEAST_STREAM => kernels.compact_occluded(&tree, rays, out),
+            (TreeView::Compact(tree), _) if !as_stream => kernels.compact_occluded(&tree, rays, out),
             (TreeView::Compact(tree), _) => kernels.compact_stream_occluded(&tree, rays, out),
         }
     }
@@ -118,8 +118,15 @@ thread_local! {
 }
 
 impl Scene {
-    /// Adds what rays find in instances to `answers`, which hold what they find elsewhere.
-    pub(super) fn meet_instances<A: Answer>(&self, instances: &Instances, rays: &[Ray], answers: &mut [A]) {
+    /// Adds what rays find in instances to `answers`, which hold what they find elsewhere; `alike`: whether the rays are
+    /// those of a stream.
+    pub(super) fn meet_instances<A: Answer>(
+        &self,
+        instances: &Instances,
+        rays: &[Ray],
+        alike: bool,
+        answers: &mut [A],
+    ) {
         if let ([ray], [answer]) = (rays, &mut *answers) {
             return self.meet_one_by_one(instances, ray, answer);
         }
@@ -133,7 +140,7 @@ impl Scene {
             && room.rays.try_reserve(size).is_ok();
         if has_room {
             for (rays, answers) in rays.chunks(BATCH).zip(answers.chunks_mut(BATCH)) {
-                self.meet_by_turns(instances, rays, answers, &mut room);
+                self.meet_by_turns(instances, rays, alike, answers, &mut room);
             }
         } else {
             rays.iter().zip(answers).for_each(|(ray, answer)| self.meet_one_by_one(instances, ray, answer));
@@ -156,13 +163,20 @@ impl Scene {
             }
             let at = &instances.placed[instance as usize];
             let mut found = [A::MISS];
-            A::trace(self, self.tree_of(instances, at.tree), &[to_mesh(at, ray, tmax)], &mut found);
+            A::trace(self, self.tree_of(instances, at.tree), &[to_mesh(at, ray, tmax)], false, &mut found);
             answer.add(found[0], at.first_triangle);
         }
     }
 
     /// `room` has capacity for as many rays.
-    fn meet_by_turns<A: Answer>(&self, instances: &Instances, rays: &[Ray], answers: &mut [A], room: &mut Room) {
+    fn meet_by_turns<A: Answer>(
+        &self,
+        instances: &Instances,
+        rays: &[Ray],
+        alike: bool,
+        answers: &mut [A],
+        room: &mut Room,
+    ) {
         let kernels = self.kernels();
         let Room { walks, visits, rays: turned } = room;
         let walks = &mut walks.spare_capacity_mut()[..rays.len()];
@@ -197,7 +211,7 @@ impl Scene {
                 turned.extend(at_one.iter().map(ray));
                 let found = &mut found[..turned.len()];
                 found.fill(A::MISS);
-                A::trace(self, self.tree_of(instances, at.tree), turned, found);
+                A::trace(self, self.tree_of(instances, at.tree), turned, alike, found);
                 for (&visit, &found) in at_one.iter().zip(&*found) {
                     answers[visit as u32 as usize].add(found, at.first_triangle);
                 }

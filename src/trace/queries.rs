@@ -289,7 +289,7 @@ impl Scene {
             let ray = |i: usize| Ray::new(origin, Vec3::new(packet.x[i], packet.y[i], packet.z[i])).within(tmin, tmax);
             let rays: [Ray; PACKET_SIZE] = std::array::from_fn(ray);
             let count = packet.count.min(PACKET_SIZE);
-            self.meet_instances(instances, &rays[..count], &mut out[..count]);
+            self.meet_instances(instances, &rays[..count], false, &mut out[..count]);
         }
         if self.has_holes() {
             self.leave_holes_of_packet(origin, packet, tmin, tmax, out);
@@ -308,7 +308,7 @@ impl Scene {
             }
         }];
         if let Some(instances) = self.instance_trees() {
-            self.meet_instances(instances, std::slice::from_ref(ray), &mut hit);
+            self.meet_instances(instances, std::slice::from_ref(ray), false, &mut hit);
         }
         if self.has_holes() {
             self.leave_holes(std::slice::from_ref(ray), &mut hit);
@@ -337,7 +337,7 @@ impl Scene {
             }
         }
         if let Some(instances) = self.instance_trees() {
-            self.meet_instances(instances, std::slice::from_ref(ray), &mut occluded);
+            self.meet_instances(instances, std::slice::from_ref(ray), false, &mut occluded);
         }
         occluded[0] != 0
     }
@@ -350,7 +350,7 @@ impl Scene {
         }
         if let Some(instances) = self.instance_trees() {
             let n = rays.len().min(out.len());
-            self.meet_instances(instances, &rays[..n], &mut out[..n]);
+            self.meet_instances(instances, &rays[..n], false, &mut out[..n]);
         }
         if self.has_holes() {
             self.leave_holes(rays, out);
@@ -366,7 +366,7 @@ impl Scene {
         }
         if let Some(instances) = self.instance_trees() {
             let n = rays.len().min(out.len());
-            self.meet_instances(instances, &rays[..n], &mut out[..n]);
+            self.meet_instances(instances, &rays[..n], true, &mut out[..n]);
         }
         if self.has_holes() {
             self.leave_holes(rays, out);
@@ -381,7 +381,7 @@ impl Scene {
         }
         if let Some(instances) = self.instance_trees() {
             let n = rays.len().min(out.len());
-            self.meet_instances(instances, &rays[..n], &mut out[..n]);
+            self.meet_instances(instances, &rays[..n], true, &mut out[..n]);
         }
         if self.has_holes() {
             self.look_through_holes(rays, out);
@@ -396,7 +396,7 @@ impl Scene {
         }
         if let Some(instances) = self.instance_trees() {
             let n = rays.len().min(out.len());
-            self.meet_instances(instances, &rays[..n], &mut out[..n]);
+            self.meet_instances(instances, &rays[..n], false, &mut out[..n]);
         }
         if self.has_holes() {
             self.look_through_holes(rays, out);

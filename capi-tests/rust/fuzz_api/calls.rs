@@ -5,6 +5,7 @@ use crate::world::*;
 use bakelite::capi::bake::*;
 use bakelite::capi::device::*;
 use bakelite::capi::error::*;
+use bakelite::capi::instances::*;
 use bakelite::capi::lightmap::*;
 use bakelite::capi::lights::*;
 use bakelite::capi::live::*;
@@ -38,7 +39,8 @@ pub fn any(w: &W, s: &mut Source) {
         1..=4 => create_scene(w, s),
         5..=6 => load_scene(w, s),
         7..=10 => material(w, s),
-        11..=17 => mesh(w, s),
+        11..=16 => drop(mesh(w, s)),
+        17 => instances(w, s),
         18..=19 => image(w, s),
         20..=23 => light(w, s),
         24..=30 => commit(w, s),
@@ -299,6 +301,29 @@ fn add_mesh(scene: &Handle, s: &mut Source, hostile: bool) -> bk_result {
     result
 }
 
+/// Mostly one that is accepted: axes that are nearly perpendicular.
+fn transform(s: &mut Source) -> [f32; 12] {
+    let mut columns = [1.0, 0.0, 0.0, 0.0, 1.0, 0.0, 0.0, 0.0, 1.0, 0.0, 0.0, 0.0];
+    columns[..9].iter_mut().for_each(|x| *x += 0.2 * (s.unit() - 0.5));
+    columns[9..].copy_from_slice(&s.point());
+    if s.one_in(8) {
+        columns[s.below(12)] = s.float();
+    }
+    columns
+}
+
+fn instances(w: &W, s: &mut Source) {
+    let Some(scene) = scene(w, s) else { return };
+    for _ in 0..1 + s.below(3) {
+        let (mesh, transform) = (s.index(), transform(s));
+        let mut id = 0;
+        let result = ask!(bk_scene_add_instance(scene.p(), mesh, transform.as_ptr(), &mut id));
+        if result == BK_OK && id >= bk!(bk_scene_instance_count(scene.p())) {
+            broken("an instance's number is not below their count");
+        }
+    }
+}
+
 fn image(w: &W, s: &mut Source) {
     let Some(scene) = scene(w, s) else { return };
     let texels: Vec<f32> = (0..3 * 64).map(|_| if s.one_in(300) { s.float() } else { s.unit() }).collect();
@@ -373,6 +398,17 @@ fn refit(w: &W, s: &mut Source) {
         let count = if s.one_in(20) { s.below(n + 1) } else { n };
         let stride = if s.one_in(20) { s.below(12) } else { 0 };
         ask!(bk_mesh_set_positions(scene.p(), mesh, positions.as_ptr().cast(), count, stride));
+    }
+    if s.one_in(2) {
+        let transform = transform(s);
+        let instance = s.index();
+        ask!(bk_instance_set_transform(scene.p(), instance, transform.as_ptr()));
+        let (mut mesh, mut back) = (7, [0f32; 12]);
+        if ask!(bk_scene_get_instance(scene.p(), instance, &mut mesh, back.as_mut_ptr())) == BK_OK
+            && mesh >= bk!(bk_scene_mesh_count(scene.p()))
+        {
+            broken("an instance names a mesh that does not exist");
+        }
     }
     ask!(bk_scene_refit(scene.p()));
 }
@@ -606,11 +642,12 @@ fn lightmap_numbers(w: &W, s: &mut Source) {
     let (mut uvs, mut pages, mut own) = (vec![f32::NAN; 6 * 4096], vec![7u32; 4096], vec![7u8; 4096]);
     let mesh = s.index();
     let (uvs_p, pages_p) = (uvs.as_mut_ptr(), if s.one_in(3) { null_mut() } else { pages.as_mut_ptr() });
-    let result = if s.one_in(2) {
-        ask!(bk_lightmap_mesh_uvs(lightmap.p(), mesh, uvs_p, pages_p))
-    } else {
-        let own = if s.one_in(3) { null_mut() } else { own.as_mut_ptr() };
-        ask!(bk_lightmap_mesh_back_uvs(lightmap.p(), mesh, uvs_p, pages_p, own))
+    let own = if s.one_in(3) { null_mut() } else { own.as_mut_ptr() };
+    let result = match s.below(4) {
+        0 => ask!(bk_lightmap_mesh_uvs(lightmap.p(), mesh, uvs_p, pages_p)),
+        1 => ask!(bk_lightmap_mesh_back_uvs(lightmap.p(), mesh, uvs_p, pages_p, own)),
+        2 => ask!(bk_lightmap_instance_uvs(lightmap.p(), mesh, uvs_p, pages_p)),
+        _ => ask!(bk_lightmap_instance_back_uvs(lightmap.p(), mesh, uvs_p, pages_p, own)),
     };
     let is_wrong = |uv: &&f32| !(0.0..=1.0).contains(*uv);
     if result == BK_OK

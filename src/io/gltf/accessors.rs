@@ -120,7 +120,8 @@ impl<'i> Reader<'i, '_> {
     /// An accessor of `N` components each. Values are converted when they are asked for: a primitive may use few of
     /// very many.
     pub(super) fn column<const N: usize>(&mut self, accessor: &gltf::Accessor) -> Result<Column<'i, N>> {
-        if accessor.dimensions() != if N == 2 { Dimensions::Vec2 } else { Dimensions::Vec3 } {
+        let dimensions = [Dimensions::Vec2, Dimensions::Vec3, Dimensions::Vec4][N - 2];
+        if accessor.dimensions() != dimensions {
             return self.malformed(format_args!("accessor {} is not of {N}-vectors", accessor.index()));
         }
         let (data_type, normalized) = (accessor.data_type(), accessor.normalized());

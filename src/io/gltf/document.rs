@@ -12,8 +12,8 @@ use std::collections::BTreeSet;
 use std::io::BufReader;
 
 /// Required extensions that may be ignored, since they change no shapes.
-const HARMLESS_EXTENSIONS: [&str; 5] =
-    ["KHR_materials_", "KHR_texture_", "EXT_texture_", "KHR_mesh_quantization", "KHR_xmp"];
+const HARMLESS_EXTENSIONS: [&str; 6] =
+    ["KHR_materials_", "KHR_texture_", "EXT_texture_", "KHR_mesh_quantization", "KHR_xmp", "EXT_mesh_gpu_instancing"];
 
 /// The JSON of a file and its binary chunk, without copies.
 pub(super) fn split<'b>(import: &Import, bytes: &'b [u8]) -> Result<(&'b [u8], Option<&'b [u8]>)> {

@@ -1,4 +1,5 @@
-//! glTF 2.0 and GLB: the triangles of the default scene with node transforms applied.
+//! glTF 2.0 and GLB: the triangles of the default scene with node transforms applied. Large meshes that several nodes
+//! show, or one with `EXT_mesh_gpu_instancing`, become meshes with instances, unless a transform mirrors.
 //!
 //! - Albedo is `baseColorFactor` × `baseColorTexture` (metalness is ignored), emission is `emissiveFactor` ×
 //!   `KHR_materials_emissive_strength` without its texture, sidedness is `doubleSided`.
@@ -24,6 +25,7 @@
 //! | `accessors` | typed values in buffers, with all bounds checked |
 //! | `materials` | materials and images |
 //! | `meshes` | primitives as meshes |
+//! | `instances` | places of meshes, and which of them are instances |
 //!
 //! The crate `gltf` reads the JSON; accessors are read here, because the crate's readers trust sizes
 //! in the file.
@@ -31,6 +33,7 @@
 mod accessors;
 mod buffers;
 mod document;
+mod instances;
 mod materials;
 mod meshes;
 #[cfg(test)]
@@ -65,6 +68,7 @@ pub(super) fn load(import: &mut Import, opened: Opened) -> Result<()> {
         images: HashMap::new(),
         pages: materials::lightmap_pages(&document),
         mesh_uses: vec![0; document.meshes().len()],
+        shared: HashMap::new(),
         sorted: HashSet::new(),
         number: Vec::new(),
         triangles: 0,
@@ -76,18 +80,24 @@ pub(super) fn load(import: &mut Import, opened: Opened) -> Result<()> {
         import,
     };
     let placed = document::place_nodes(reader.import, &document)?;
-    for mesh in placed.iter().filter_map(|(node, _)| node.mesh()) {
-        reader.mesh_uses[mesh.index()] += 1;
-    }
+    let mut shown = reader.import.account.list(placed.len(), "the nodes")?;
     for (node, transform) in &placed {
         if let Some(light) = node.light() {
             reader.add_light(&light, transform)?;
         }
-        for primitive in node.mesh().iter().flat_map(|mesh| mesh.primitives()) {
-            let mesh = node.mesh().map_or(0, |mesh| mesh.index());
-            reader.place = format!("mesh {mesh}, primitive {}", primitive.index());
-            reader.import.check()?;
-            reader.add_primitive(&primitive, transform, reader.mesh_uses[mesh] == 1)?;
+        if let Some(mesh) = node.mesh() {
+            let places = reader.places(node, transform)?;
+            reader.mesh_uses[mesh.index()] += places.len();
+            shown.push((mesh, places));
+        }
+    }
+    for (mesh, places) in &shown {
+        for transform in places {
+            for primitive in mesh.primitives() {
+                reader.place = format!("mesh {}, primitive {}", mesh.index(), primitive.index());
+                reader.import.check()?;
+                reader.add_placed(mesh.index(), &primitive, transform)?;
+            }
         }
     }
     reader.warn();
@@ -110,8 +120,10 @@ struct Reader<'i, 's> {
     /// The scene's texture by the file's image; [`NONE`] if it cannot be read.
     images: HashMap<usize, u32>,
     pages: HashMap<usize, u32>,
-    /// Number of nodes that show each mesh.
-    mesh_uses: Vec<u32>,
+    /// Number of places where each mesh stands.
+    mesh_uses: Vec<usize>,
+    /// The scene's mesh of a mesh and primitive that has instances; `None`: it is invisible.
+    shared: HashMap<(usize, usize), Option<u32>>,
     /// Sparse accessors whose indices were found to increase.
     sorted: HashSet<usize>,
     /// New numbers of vertices, [`NONE`] between primitives: many may share one large vertex buffer.

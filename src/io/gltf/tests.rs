@@ -4,7 +4,7 @@ use crate::base::error::Error;
 use crate::io::tests::{Folder, albedos, corners, load_bytes, load_path, refusal};
 use crate::scene::{Light, NONE};
 use base64::Engine;
-use glam::{Vec2, Vec3};
+use glam::{Affine3A, Vec2, Vec3};
 use serde_json::{Value, json};
 use std::f32::consts::FRAC_1_SQRT_2;
 
@@ -353,6 +353,83 @@ fn a_mesh_that_appears_twice_has_no_unique_coordinates() {
     assert_eq!(scene.meshes().len(), 2);
     assert!(!info.has_lightmap_uvs);
     assert_eq!(info.warnings, ["1 meshes appear several times, so their TEXCOORD_1 is not unique and was left out"]);
+}
+
+/// The sample with a finely divided square in place of its own as mesh 0, shown by nodes as `nodes` says, with more
+/// accessors of floats behind the square's.
+fn divided(nodes: Value, more: &[(&str, Vec<f32>)]) -> Vec<u8> {
+    const N: usize = 24;
+    let mut sample = sample();
+    let mut binary = Vec::new();
+    let mut views = Vec::new();
+    let mut accessors = Vec::new();
+    let mut add = |bytes: Vec<u8>, kind: &str, component: u32, count: usize| {
+        views.push(json!({ "buffer": 0, "byteOffset": binary.len(), "byteLength": bytes.len() }));
+        let mut accessor =
+            json!({ "bufferView": views.len() - 1, "componentType": component, "count": count, "type": kind });
+        if accessors.is_empty() {
+            (accessor["min"], accessor["max"]) = (json!([0, 0, 0]), json!([N, N, 0]));
+        }
+        accessors.push(accessor);
+        binary.extend(bytes);
+    };
+    let points = (0..=N).flat_map(|j| (0..=N).map(move |i| [i as f32, j as f32, 0.0]));
+    add(points.flatten().flat_map(f32::to_le_bytes).collect(), "VEC3", 5126, (N + 1) * (N + 1));
+    let at = |i: usize, j: usize| (j * (N + 1) + i) as u32;
+    let cell = |i, j| [at(i, j), at(i + 1, j), at(i + 1, j + 1), at(i, j), at(i + 1, j + 1), at(i, j + 1)];
+    let corners = (0..N).flat_map(|j| (0..N).flat_map(move |i| cell(i, j)));
+    add(corners.flat_map(u32::to_le_bytes).collect(), "SCALAR", 5125, 6 * N * N);
+    for (kind, values) in more {
+        let width = kind[3..].parse::<usize>().unwrap();
+        add(values.iter().flat_map(|v| v.to_le_bytes()).collect(), kind, 5126, values.len() / width);
+    }
+    sample.root["buffers"][0]["byteLength"] = binary.len().into();
+    (sample.root["bufferViews"], sample.root["accessors"]) = (views.into(), accessors.into());
+    sample.root["meshes"] = json!([{ "primitives": [{ "attributes": { "POSITION": 0 }, "indices": 1 }] }]);
+    sample.root["scenes"] = json!([{ "nodes": (0..nodes.as_array().unwrap().len()).collect::<Vec<_>>() }]);
+    sample.root["nodes"] = nodes;
+    sample.binary = binary;
+    sample.glb()
+}
+
+#[test]
+fn large_meshes_in_several_places_become_instances() {
+    let nodes = json!([
+        { "mesh": 0 },
+        { "mesh": 0, "translation": [1, 2, 3], "scale": [2, 2, 2] },
+        { "mesh": 0, "scale": [-1, 1, 1] },
+    ]);
+    let (scene, info) = load_bytes("a.glb", divided(nodes, &[])).unwrap();
+    assert_eq!((info.meshes, info.instances, info.triangles), (2, 2, 3 * 1152));
+    let instances = scene.instances();
+    assert_eq!((instances[0].mesh, instances[0].transform), (0, Affine3A::IDENTITY));
+    let p = instances[1].transform.transform_point3(scene.meshes()[0].positions[1]);
+    assert_eq!((instances[1].mesh, p), (0, Vec3::new(3.0, 2.0, 3.0)));
+    assert_eq!(scene.meshes()[1].positions[1], Vec3::new(-1.0, 0.0, 0.0), "a mirrored one is a mesh of its own");
+}
+
+#[test]
+fn gpu_instancing_gives_places_of_a_node() {
+    let extension = |attributes: Value| {
+        json!([{ "mesh": 0, "translation": [0, 0, 10],
+            "extensions": { "EXT_mesh_gpu_instancing": { "attributes": attributes } } }])
+    };
+    let half = 0.5f32.sqrt();
+    let values = [
+        ("VEC3", vec![1.0, 0.0, 0.0, 5.0, 0.0, 0.0]),
+        ("VEC4", vec![0.0, 0.0, 0.0, 1.0, 0.0, 0.0, half, half]),
+        ("VEC3", vec![1.0; 3]),
+    ];
+    let nodes = extension(json!({ "TRANSLATION": 2, "ROTATION": 3 }));
+    let (scene, info) = load_bytes("a.glb", divided(nodes, &values)).unwrap();
+    assert_eq!((info.meshes, info.instances, info.triangles), (1, 2, 2 * 1152));
+    let of = |i: usize| scene.instances()[i].transform.transform_point3(scene.meshes()[0].positions[1]);
+    assert!(of(0).distance(Vec3::new(2.0, 0.0, 10.0)) < 1e-6 && of(1).distance(Vec3::new(5.0, 1.0, 10.0)) < 1e-6);
+
+    let of = |attributes| refusal("a.glb", divided(extension(attributes), &values));
+    assert!(of(json!({ "TRANSLATION": 2, "SCALE": 4 })).contains("different counts"));
+    assert!(of(json!({ "TRANSLATION": 77 })).contains("TRANSLATION names no accessor"));
+    assert!(of(json!({ "ROTATION": 2 })).contains("is not of 4-vectors"));
 }
 
 #[test]

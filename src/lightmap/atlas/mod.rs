@@ -1,5 +1,6 @@
 //! The atlas: charts and texels of a scene, the side of its chart that each texel shows, and which texels can be seen.
 
+mod alike;
 pub(crate) mod buried;
 pub(crate) mod chart_index;
 pub(crate) mod chart_map;

@@ -1,6 +1,7 @@
 //! Scenes made by code, for tests, examples and first steps.
 
 use super::atrium::{atrium, atrium_camera};
+use super::colonnade::{colonnade, colonnade_camera};
 use super::hall::{hall, hall_camera};
 use super::menger::{menger, menger_camera};
 use super::rooms::{furniture, furniture_camera, partition, partition_camera};
@@ -29,12 +30,14 @@ pub const BUILTIN_NAMES: &[&str] = &["cornell", "furnace", "sealed", "atrium", "
 ///   them that leaves a gap, and a lamp in one. Both for measurements of the light.
 /// - `atrium`: two floors around a court, columns, arches, drapes; a rect light and a sun.
 ///
-/// Four more are for measurements, and not among [`BUILTIN_NAMES`]:
+/// More are for measurements, and not among [`BUILTIN_NAMES`]:
 ///
 /// - `furnace:ALBEDO`: the furnace with another albedo, at least 0 and less than 1.
 /// - `slit`: a closed white room, 6 × 3 × 4, with a slit 20 cm wide across its ceiling, through which the sun shines.
 /// - `hall:TRIANGLES`: a hall, 40 × 12 × 20, of about so many triangles, at least 20,000: half of them on flat walls
 ///   and a coffered ceiling (mesh 0), half on 18 fluted columns; four rect lights.
+/// - `colonnade:TRIANGLES`: a grove of fluted columns under the sky, of about so many triangles, at least 100,000: all
+///   columns are instances of one (mesh 1). `colonnade-copies:TRIANGLES`: the same, each a mesh.
 /// - `menger:LEVEL`: the Menger sponge of a level up to 6 in the unit cube, two triangles for each square, in the sun.
 pub fn builtin(name: &str) -> Result<SceneData> {
     match name {
@@ -50,6 +53,8 @@ pub fn builtin(name: &str) -> Result<SceneData> {
             _ => invalid_argument!("{name:?} names no albedo of a furnace from 0 to less than 1"),
         },
         _ if name.starts_with("hall:") => hall(number(name)?),
+        _ if name.starts_with("colonnade:") => colonnade(number(name)?, false),
+        _ if name.starts_with("colonnade-copies:") => colonnade(number(name)?, true),
         _ if name.starts_with("menger:") => menger(number(name)?),
         _ => invalid_argument!("there is no built-in scene {name:?}; there are {}", BUILTIN_NAMES.join(", ")),
     }
@@ -65,7 +70,7 @@ fn number<T: FromStr>(name: &str) -> Result<T> {
 
 /// Whether [`builtin`] knows a name, those for measurements included.
 pub fn is_builtin(name: &str) -> bool {
-    let sized = ["furnace:", "hall:", "menger:"];
+    let sized = ["furnace:", "hall:", "colonnade:", "colonnade-copies:", "menger:"];
     BUILTIN_NAMES.contains(&name) || name == "slit" || sized.iter().any(|family| name.starts_with(family))
 }
 
@@ -81,6 +86,7 @@ pub fn builtin_camera(name: &str) -> Option<Camera> {
         "furniture" => Some(furniture_camera()),
         "partition" => Some(partition_camera()),
         _ if name.starts_with("hall:") => Some(hall_camera()),
+        _ if name.starts_with("colonnade") => Some(colonnade_camera()),
         _ if name.starts_with("menger:") => Some(menger_camera()),
         "slit" => looking(Vec3::new(0.5, 1.6, 0.5), Vec3::new(3.5, 0.8, 2.5), 1.2),
         _ => None,

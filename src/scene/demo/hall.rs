@@ -6,12 +6,13 @@ use crate::base::error::{Result, invalid_argument};
 use crate::scene::camera::Camera;
 use crate::scene::light::Light;
 use crate::scene::material::Material;
+use crate::scene::mesh::Mesh;
 use crate::scene::{MAX_TRIANGLES, SceneData};
 use glam::{UVec3, Vec3};
 use std::f32::consts::TAU;
 
 /// Length, height and width in metres.
-const SIZE: UVec3 = UVec3::new(40, 12, 20);
+pub(super) const SIZE: UVec3 = UVec3::new(40, 12, 20);
 
 /// Columns in both rows, 4 m from one another.
 const COLUMNS: [u32; 2] = [9, 2];
@@ -43,17 +44,10 @@ pub(super) fn hall(triangles: usize) -> Result<SceneData> {
     scene.add_mesh(room((SIZE * per_metre).to_array(), plaster, place)?)?;
 
     let of_column = (triangles - scene.triangle_count()) / (COLUMNS[0] * COLUMNS[1]) as usize;
-    let cells = column_cells(of_column);
     for row in 0..COLUMNS[1] {
         for n in 0..COLUMNS[0] {
             let foot = Vec3::new(4.0 * (n + 1) as f32, 0.0, 6.0 + 8.0 * row as f32);
-            let head = foot + SIZE.y as f32 * Vec3::Y;
-            scene.add_mesh(lathe(cells, [foot, head], stone, |i, j| {
-                let (angle, height) = (i as f32 / cells[0] as f32, j as f32 / cells[1] as f32);
-                let radius = column_radius(angle, SIZE.y as f32 * height);
-                let (sin, cos) = (TAU * angle).sin_cos();
-                foot + Vec3::new(radius * cos, SIZE.y as f32 * height, radius * sin)
-            })?)?;
+            scene.add_mesh(column(of_column, foot, stone)?)?;
         }
     }
     for x in [8.0, 16.0, 24.0, 32.0] {
@@ -62,6 +56,17 @@ pub(super) fn hall(triangles: usize) -> Result<SceneData> {
         scene.add_light(Light::Rect { position, edge_u, edge_v, radiance: [20.0, 18.0, 15.0] })?;
     }
     Ok(scene)
+}
+
+/// Makes a column of about `triangles` triangles.
+pub(super) fn column(triangles: usize, foot: Vec3, material: u32) -> Result<Mesh> {
+    let (cells, head) = (column_cells(triangles), foot + SIZE.y as f32 * Vec3::Y);
+    lathe(cells, [foot, head], material, |i, j| {
+        let (angle, height) = (i as f32 / cells[0] as f32, j as f32 / cells[1] as f32);
+        let radius = column_radius(angle, SIZE.y as f32 * height);
+        let (sin, cos) = (TAU * angle).sin_cos();
+        foot + Vec3::new(radius * cos, SIZE.y as f32 * height, radius * sin)
+    })
 }
 
 /// Height of the ceiling above its beams, which divide it into coffers of 2 m with slanting sides.

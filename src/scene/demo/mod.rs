@@ -2,6 +2,7 @@
 
 mod atrium;
 pub(super) mod builtin;
+mod colonnade;
 mod hall;
 mod lattice;
 mod menger;

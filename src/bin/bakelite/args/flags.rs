@@ -166,6 +166,9 @@ pub struct ScalingFlags {
     #[arg(long, value_name = "A,B,..", help_heading = "Report scaling", value_delimiter = ',', value_parser = values::scene,
           default_values = ["hall:100000", "hall:300000", "hall:1000000"])]
     pub scenes: Vec<String>,
+    /// Measure trees and rays alone, and no light maps
+    #[arg(long, help_heading = "Report scaling")]
+    pub rays_only: bool,
     #[command(flatten)]
     pub flags: Flags,
 }
@@ -190,7 +193,7 @@ pub struct DirectionalFlags {
 #[derive(Args)]
 pub struct Flags {
     /// A file (.obj, .ply, .gltf, .glb) or a built-in scene (atrium, cornell, furnace; to measure massive scenes
-    /// hall:TRIANGLES and menger:LEVEL) [default: atrium]
+    /// hall:TRIANGLES, colonnade:TRIANGLES and menger:LEVEL) [default: atrium]
     #[arg(value_parser = values::scene)]
     pub scene: Option<String>,
     /// The same

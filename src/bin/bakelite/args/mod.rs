@@ -192,6 +192,8 @@ pub struct ReportArgs {
     pub knobs: Vec<String>,
     /// Scaling: what is baked, one after another.
     pub scenes: Vec<String>,
+    /// Scaling: whether light maps are left out.
+    pub rays_only: bool,
 }
 
 /// Light map texels per metre of the atrium unless a density is given: it takes so many to show the
@@ -310,7 +312,8 @@ fn command_of(line: CommandLine) -> Result<Command, String> {
             Command::ReportLive(Box::new(args))
         }
         Verb::Report(Report::Scaling(scaling)) => {
-            Command::ReportScaling(Box::new(ReportArgs { scenes: scaling.scenes, ..report_args(scaling.flags)? }))
+            let (scenes, rays_only) = (scaling.scenes, scaling.rays_only);
+            Command::ReportScaling(Box::new(ReportArgs { scenes, rays_only, ..report_args(scaling.flags)? }))
         }
         Verb::Report(Report::Quality(quality)) => Command::ReportQuality(Box::new(ReportArgs {
             points: quality.points as usize,
@@ -342,6 +345,7 @@ fn report_args(flags: Flags) -> Result<ReportArgs, String> {
         view_paths: 0,
         knobs: Vec::new(),
         scenes: Vec::new(),
+        rays_only: false,
     })
 }
 

@@ -52,7 +52,7 @@ pub fn run(args: &ReportArgs) -> Result<()> {
     files::make_folder(&args.bake.out)?;
     let mut rows = Vec::new();
     for scene in &args.scenes {
-        rows.push(measure(&BakeArgs { scene: scene.clone(), ..args.bake.clone() })?);
+        rows.push(measure(&BakeArgs { scene: scene.clone(), ..args.bake.clone() }, args.rays_only)?);
     }
     table("seconds", &STAGES, &rows, |r| &r.seconds);
     table("bytes per triangle", &BYTES, &rows, |r| &r.bytes);
@@ -69,7 +69,7 @@ pub fn run(args: &ReportArgs) -> Result<()> {
     plot("scaling-rays.svg", "million rays per second", &RATES, |r| &r.rates)
 }
 
-fn measure(args: &BakeArgs) -> Result<Row> {
+fn measure(args: &BakeArgs, rays_only: bool) -> Result<Row> {
     let mut job = Job::new(args);
     let data = job.load()?;
     let device = job.device()?;
@@ -79,6 +79,18 @@ fn measure(args: &BakeArgs) -> Result<Row> {
     let scene = job.commit_on(&device, data, &args.build)?;
     let (tree, building) = (start.elapsed().as_secs_f64(), memory.peak());
     let rates = rates(args, &scene)?;
+    let triangles = scene.stats().triangles as f64;
+    let mut row = Row {
+        scene: args.title(),
+        triangles,
+        texels: 0,
+        seconds: [tree, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, tree],
+        bytes: [scene.stats().bytes as i64, building, 0, 0, 0].map(|bytes| bytes as f64 / triangles),
+        rates,
+    };
+    if rays_only {
+        return Ok(row);
+    }
     memory.reset_peak();
     let start = Instant::now();
     let mut lightmap = job.bars.show("charts", |p| Lightmap::create(&scene, &args.desc, p))?;
@@ -86,20 +98,15 @@ fn measure(args: &BakeArgs) -> Result<Row> {
     memory.reset_peak();
     let stats = job.bars.show("bake", |p| lightmap.bake(&args.params, p))?;
     let baking = memory.peak();
-    let mut seconds = [tree, charts, 0.0, 0.0, 0.0, 0.0, stats.seam_seconds, 0.0];
     let stages = [stats.photons, stats.radiance, stats.gather, stats.direct];
-    seconds[2..6].iter_mut().zip(stages).for_each(|(to, stage)| *to = stage.seconds);
-    seconds[7] = tree + charts + stats.seconds;
-    let (triangles, info) = (scene.stats().triangles as f64, lightmap.info());
-    let bytes = [scene.stats().bytes as i64, building, info.bytes as i64, charting, baking];
-    Ok(Row {
-        scene: args.title(),
-        triangles,
-        texels: info.texels,
-        seconds,
-        bytes: bytes.map(|bytes| bytes as f64 / triangles),
-        rates,
-    })
+    row.seconds[1] = charts;
+    row.seconds[2..6].iter_mut().zip(stages).for_each(|(to, stage)| *to = stage.seconds);
+    row.seconds[6] = stats.seam_seconds;
+    row.seconds[7] = tree + charts + stats.seconds;
+    let of_map = [lightmap.info().bytes as i64, charting, baking];
+    row.bytes[2..].iter_mut().zip(of_map).for_each(|(to, bytes)| *to = bytes as f64 / triangles);
+    row.texels = lightmap.info().texels;
+    Ok(row)
 }
 
 /// Rates of rays one by one from random points, of streams from random points, and of primary rays if the scene has a

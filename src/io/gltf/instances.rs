@@ -1,0 +1,88 @@
+//! Where the meshes of nodes stand: once per node, or as often as `EXT_mesh_gpu_instancing` says; and which of them
+//! become instances.
+
+use super::Reader;
+use crate::base::error::Result;
+use crate::scene::Instance;
+use glam::{Affine3A, DMat4, DQuat, Quat, Vec3};
+
+/// Least number of triangles of a primitive that becomes a mesh with instances if it stands in several places. (Rays
+/// are faster through copies than through instances of small meshes: docs/performance.md.)
+const LEAST_TRIANGLES: usize = 1000;
+
+const EXTENSION: &str = "EXT_mesh_gpu_instancing";
+
+impl Reader<'_, '_> {
+    /// The transforms of a node's mesh to the world.
+    pub(super) fn places(&mut self, node: &gltf::Node, transform: &DMat4) -> Result<Vec<DMat4>> {
+        let Some(extension) = node.extension_value(EXTENSION) else {
+            let mut one = self.import.account.list(1, "the nodes")?;
+            one.push(*transform);
+            return Ok(one);
+        };
+        self.place = format!("{EXTENSION} of node {}", node.index());
+        let accessor = |name: &str| match extension.get("attributes").and_then(|a| a.get(name)) {
+            None => Ok(None),
+            Some(number) => match number.as_u64().and_then(|n| self.document.accessors().nth(n as usize)) {
+                None => self.malformed(format_args!("{name} names no accessor")),
+                accessor => Ok(accessor),
+            },
+        };
+        let [translation, rotation, scale] = [accessor("TRANSLATION")?, accessor("ROTATION")?, accessor("SCALE")?];
+        let counts = [&translation, &rotation, &scale].map(|a| a.as_ref().map(|a| a.count()));
+        let count = counts.iter().flatten().next().copied().unwrap_or(0);
+        if counts.iter().flatten().any(|&c| c != count) {
+            return self.malformed("its attributes have different counts");
+        }
+        let translation = translation.map(|a| self.column::<3>(&a)).transpose()?;
+        let rotation = rotation.map(|a| self.column::<4>(&a)).transpose()?;
+        let scale = scale.map(|a| self.column::<3>(&a)).transpose()?;
+        let mut places = self.import.account.list(count, "the nodes")?;
+        for i in 0..count as u32 {
+            if i as usize % super::PART == 0 {
+                self.import.check()?;
+            }
+            let turn = rotation.as_ref().map_or(Quat::IDENTITY, |r| Quat::from_array(r.get(i)));
+            let place = DMat4::from_scale_rotation_translation(
+                scale.as_ref().map_or(Vec3::ONE, |s| s.get(i).into()).as_dvec3(),
+                if turn.length_squared() > 0.0 { turn.as_dquat().normalize() } else { DQuat::IDENTITY },
+                translation.as_ref().map_or(Vec3::ZERO, |t| t.get(i).into()).as_dvec3(),
+            );
+            places.push(transform * place);
+        }
+        Ok(places)
+    }
+
+    /// Adds a primitive where it stands: as an instance if it stands in several places, is large enough and its
+    /// transform can be that of one, else as a mesh.
+    pub(super) fn add_placed(&mut self, mesh: usize, primitive: &gltf::Primitive, transform: &DMat4) -> Result<()> {
+        let is_unique = self.mesh_uses[mesh] == 1;
+        let corners = match primitive.indices() {
+            Some(indices) => indices.count(),
+            None => primitive.get(&gltf::Semantic::Positions).map_or(0, |a| a.count()),
+        };
+        let m = transform.to_cols_array_2d().map(|column| column.map(|x| x as f32));
+        let transform_of_instance = Affine3A::from_cols_array_2d(&m.map(|[x, y, z, _]| [x, y, z]));
+        let may_be = |mesh| Instance { mesh, transform: transform_of_instance }.validate(mesh as usize + 1).is_ok();
+        if is_unique || corners < 3 * LEAST_TRIANGLES || !may_be(0) {
+            return self.add_primitive(primitive, transform, is_unique);
+        }
+        let key = (mesh, primitive.index());
+        let number = match self.shared.get(&key) {
+            Some(&number) => number,
+            None => {
+                let number = self.import.scene.meshes().len() as u32;
+                self.add_primitive(primitive, &DMat4::IDENTITY, false)?;
+                // It may be invisible.
+                let number = ((self.import.scene.meshes().len() as u32) > number).then_some(number);
+                self.import.account.make_room_in_map(&mut self.shared, "the meshes with instances")?;
+                self.shared.insert(key, number);
+                number
+            }
+        };
+        match number {
+            Some(mesh) => self.import.add_instance(Instance { mesh, transform: transform_of_instance }),
+            None => Ok(()),
+        }
+    }
+}
