@@ -353,6 +353,12 @@ public:
     Result<std::uint32_t> add_environment(const TextureDesc &desc) { return add(bk_scene_add_environment, desc); }
     Result<std::uint32_t> add_material(const MaterialDesc &desc) { return add(bk_scene_add_material, desc); }
     Result<std::uint32_t> add_mesh(const MeshDesc &desc) { return add(bk_scene_add_mesh, desc); }
+    /// `transform`: images of the x, y and z axis, then the translation.
+    Result<std::uint32_t> add_instance(std::uint32_t mesh, const float (&transform)[12]) {
+        std::uint32_t id = 0;
+        const bk_result code = bk_scene_add_instance(get(), mesh, transform, &id);
+        return detail::finish(code, id);
+    }
     Result<std::uint32_t> add_light(const LightDesc &desc) { return add(bk_scene_add_light, desc); }
     Result<void> set_light(std::uint32_t id, const LightDesc &desc) {
         return detail::finish(bk_scene_set_light(get(), id, &desc));
@@ -364,6 +370,9 @@ public:
     Result<void> set_positions(std::uint32_t mesh, Vectors<3> vertices) {
         return detail::finish(
             bk_mesh_set_positions(get(), mesh, vertices.data(), vertices.count(), vertices.stride()));
+    }
+    Result<void> set_transform(std::uint32_t instance, const float (&transform)[12]) {
+        return detail::finish(bk_instance_set_transform(get(), instance, transform));
     }
     Result<void> refit() { return detail::finish(bk_scene_refit(get())); }
 
@@ -509,6 +518,20 @@ public:
             uvs.corners.resize(6 * view.triangle_count);
             uvs.pages.resize(view.triangle_count);
             code = bk_lightmap_mesh_uvs(get(), mesh, uvs.corners.data(), uvs.pages.data());
+        }
+        return detail::finish(code, std::move(uvs));
+    }
+    Result<MeshUvs> instance_uvs(const Scene &scene, std::uint32_t instance) const {
+        std::uint32_t mesh = 0;
+        MeshView view;
+        bk_result code = bk_scene_get_instance(scene.get(), instance, &mesh, nullptr);
+        if (code == BK_OK)
+            code = bk_scene_get_mesh(scene.get(), mesh, &view);
+        MeshUvs uvs;
+        if (code == BK_OK) {
+            uvs.corners.resize(6 * view.triangle_count);
+            uvs.pages.resize(view.triangle_count);
+            code = bk_lightmap_instance_uvs(get(), instance, uvs.corners.data(), uvs.pages.data());
         }
         return detail::finish(code, std::move(uvs));
     }

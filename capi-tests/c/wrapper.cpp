@@ -186,6 +186,23 @@ static void exceptions(const Device &device) {
 }
 #endif
 
+static void instances(const Device &device) {
+    const float at[12] = {1, 0, 0, 0, 1, 0, 0, 0, 1, 0, 0.25f, 0}, higher[12] = {1, 0, 0, 0, 1, 0, 0, 0, 1, 0, 0.5f, 0};
+    Scene scene = floor_with_lamp(device);
+    CHECK(VALUE(scene.add_instance(0, at)) == 0);
+    VALUE(scene.commit());
+    const auto height = [&] { return scene.intersect({{1, 1, 1}, 0, {0, -1, 0}, INFINITY}); };
+    CHECK(height().t == 0.75f && height().instance == 0 && height().mesh == 0);
+    LightmapDesc desc;
+    desc.texels_per_unit = 4;
+    const Lightmap map = VALUE(Lightmap::create(scene, desc));
+    CHECK(VALUE(map.instance_uvs(scene, 0)).pages.size() == 2);
+    CHECK_FAILS(map.mesh_uvs(scene, 0), BK_ERROR_INVALID_ARGUMENT, "instances");
+    VALUE(scene.set_transform(0, higher));
+    VALUE(scene.refit());
+    CHECK(height().t == 0.5f);
+}
+
 int main() {
     DeviceDesc desc;
     desc.num_threads = 2;
@@ -209,6 +226,7 @@ int main() {
     VALUE(scene.set_positions(0, raised));
     VALUE(scene.refit());
     CHECK(scene.intersect({{1, 1, 1}, 0, {0, -1, 0}, INFINITY}).t == 0.5f);
+    instances(device);
 #ifndef BAKELITE_NO_EXCEPTIONS
     exceptions(device);
 #endif
