@@ -436,13 +436,13 @@ typedef struct bk_build_params {
 typedef struct bk_scene_stats {
   /// Size of this structure in bytes, set by bk_scene_stats_init.
   uint32_t struct_size;
-  /// Surface area heuristic cost of the binary tree after the commit, a relative number: 1 per
-  /// traversal step and per intersection.
+  /// Surface area heuristic cost of the binary tree of the meshes without instances after the
+  /// commit, a relative number: 1 per traversal step and per intersection.
   float sah_cost;
-  /// Number of triangles in all meshes.
+  /// Number of triangles, those of every instance counted.
   uint64_t triangles;
   /// Number of triangles that are degenerate or not finite, at the commit or since
-  /// bk_scene_refit, and are not hit.
+  /// bk_scene_refit, and are not hit; those of a mesh with instances count once.
   uint64_t skipped_degenerate;
   /// Number of 8-wide nodes of the acceleration structure.
   uint64_t nodes;
@@ -452,9 +452,9 @@ typedef struct bk_scene_stats {
   uint64_t bytes;
   /// Duration of the build in seconds.
   double build_seconds;
-  /// Surface area heuristic cost of the 8-wide tree in its present shape, a relative number: 1
-  /// for each node and each triangle that a random ray is expected to visit. Compare it with its
-  /// value after the commit.
+  /// Surface area heuristic cost of the 8-wide tree of the same meshes in its present shape, a
+  /// relative number: 1 for each node and each triangle that a random ray is expected to visit.
+  /// Compare it with its value after the commit.
   float wide_sah_cost;
   /// Number of calls of bk_scene_refit that moved something.
   uint32_t refits;
@@ -567,8 +567,8 @@ BK_API bk_result bk_scene_set_build(bk_scene *scene, const bk_build_params *para
 /// @retval BK_ERROR_CANCELLED  the progress callback returned 0
 BK_API bk_result bk_scene_commit(bk_scene *scene, bk_progress_fn progress, void *user);
 
-/// Applies the positions that bk_mesh_set_positions has set since the last refit; does nothing if
-/// there are none.
+/// Applies the positions that bk_mesh_set_positions and the transforms that
+/// bk_instance_set_transform has set since the last refit; does nothing if there are none.
 ///
 /// Queries then hit the moved triangles; geometric normals, light of emissive triangles, bounds and
 /// statistics follow. The acceleration structure keeps its shape and gets new boxes. It serves well
@@ -1565,6 +1565,7 @@ BK_API void bk_lightmap_desc_init(bk_lightmap_desc *desc);
 /// @retval BK_ERROR_INVALID_STATE  the scene is not committed or is being refitted
 /// @retval BK_ERROR_OUT_OF_MEMORY  there would be more than 2^29 texels, they do not fit, or the
 ///   memory callback refuses
+/// @retval BK_ERROR_UNSUPPORTED  the scene has more than 2^28 triangles, those of instances counted
 /// @retval BK_ERROR_CANCELLED  the progress callback returned 0
 BK_API
 bk_result bk_lightmap_create(const bk_scene *scene,
@@ -1618,6 +1619,7 @@ bk_result bk_lightmap_save_layout(const bk_lightmap *lightmap,
 /// @retval BK_ERROR_IO  the file cannot be read, is damaged, or is another kind of file;
 ///   bk_last_error names it
 /// @retval BK_ERROR_OUT_OF_MEMORY  the light map does not fit or the memory callback refuses
+/// @retval BK_ERROR_UNSUPPORTED  the scene has more than 2^28 triangles, those of instances counted
 /// @retval BK_ERROR_CANCELLED  the progress callback returned 0
 BK_EXPERIMENTAL
 bk_result bk_lightmap_load_layout(const bk_scene *scene,

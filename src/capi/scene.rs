@@ -601,8 +601,8 @@ pub unsafe extern "C" fn bk_scene_commit(
     })
 }
 
-/// Applies the positions that bk_mesh_set_positions has set since the last refit; does nothing if
-/// there are none.
+/// Applies the positions that bk_mesh_set_positions and the transforms that
+/// bk_instance_set_transform has set since the last refit; does nothing if there are none.
 ///
 /// Queries then hit the moved triangles; geometric normals, light of emissive triangles, bounds and
 /// statistics follow. The acceleration structure keeps its shape and gets new boxes. It serves well
@@ -651,13 +651,13 @@ pub unsafe extern "C" fn bk_scene_refit(scene: *mut bk_scene) -> bk_result {
 pub struct bk_scene_stats {
     /// Size of this structure in bytes, set by bk_scene_stats_init.
     pub struct_size: u32,
-    /// Surface area heuristic cost of the binary tree after the commit, a relative number: 1 per
-    /// traversal step and per intersection.
+    /// Surface area heuristic cost of the binary tree of the meshes without instances after the
+    /// commit, a relative number: 1 per traversal step and per intersection.
     pub sah_cost: f32,
-    /// Number of triangles in all meshes.
+    /// Number of triangles, those of every instance counted.
     pub triangles: u64,
     /// Number of triangles that are degenerate or not finite, at the commit or since
-    /// bk_scene_refit, and are not hit.
+    /// bk_scene_refit, and are not hit; those of a mesh with instances count once.
     pub skipped_degenerate: u64,
     /// Number of 8-wide nodes of the acceleration structure.
     pub nodes: u64,
@@ -667,9 +667,9 @@ pub struct bk_scene_stats {
     pub bytes: u64,
     /// Duration of the build in seconds.
     pub build_seconds: f64,
-    /// Surface area heuristic cost of the 8-wide tree in its present shape, a relative number: 1
-    /// for each node and each triangle that a random ray is expected to visit. Compare it with its
-    /// value after the commit.
+    /// Surface area heuristic cost of the 8-wide tree of the same meshes in its present shape, a
+    /// relative number: 1 for each node and each triangle that a random ray is expected to visit.
+    /// Compare it with its value after the commit.
     pub wide_sah_cost: f32,
     /// Number of calls of bk_scene_refit that moved something.
     pub refits: u32,

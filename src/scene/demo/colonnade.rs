@@ -44,7 +44,7 @@ pub(super) fn colonnade(triangles: usize, copies: bool) -> Result<SceneData> {
     for i in 0..side * side {
         let foot = Vec3::new((i % side) as f32 + 0.5, 0.0, (i / side) as f32 + 0.5) * STEP;
         let turn = Quat::from_rotation_y(TAU * uniform(i, 0, 1));
-        let scale = Vec3::new(1.0, 0.5 + 0.5 * uniform(i, 1, 1), 1.0) * (0.8 + 0.4 * uniform(i, 2, 1));
+        let scale = Vec3::splat(0.6 + 0.6 * uniform(i, 1, 1));
         let transform = Affine3A::from_scale_rotation_translation(scale, turn, foot);
         if copies {
             let mut mesh = mesh.clone();
