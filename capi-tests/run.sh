@@ -26,6 +26,7 @@ command -v python3 >/dev/null || need+=(python3)
 /usr/bin/python3 -c 'import numpy' 2>/dev/null || need+=(python3-numpy)
 command -v doxygen >/dev/null || need+=(doxygen)
 [ -e /usr/include/embree3/rtcore.h ] || need+=(libembree-dev)
+command -v mpirun >/dev/null || need+=(libopenmpi-dev openmpi-bin)
 # The viewer, and a screen and OpenGL in software to test it with.
 [ -e /usr/include/GLFW/glfw3.h ] || need+=(libglfw3-dev)
 [ -e /usr/include/GL/glcorearb.h ] || need+=(libgl-dev)

@@ -1,0 +1,200 @@
+/*
+ * One bake on many machines: each rank bakes a part of the texels, rank 0 brings the parts together.
+ *
+ *     mpicc -O2 bake_mpi.c -lbakelite -lm -o bake_mpi
+ *     mpirun -n 4 --enable-recovery bake_mpi FOLDER SCENE [TEXELS_PER_UNIT [THREADS]]
+ *
+ * FOLDER is one that all ranks see; SCENE is a built-in scene or a file, which gets a sun. Rank 0 unwraps and writes the
+ * layout; the others load it. Each rank writes the light of its texels to FOLDER/part-K-of-N.light. When all are there,
+ * rank 0 writes pages to FOLDER/page...exr, which have the bits of a bake on one machine.
+ *
+ * Parts that are in the folder are not baked again: started anew after an interruption, the bake goes on with what is
+ * missing. A rank that is lost (its beat stands still for STALL seconds) is replaced by rank 0, if mpirun lets the others
+ * go on (Open MPI: --enable-recovery). All ranks trace all photons: see docs/guide.md, "Results, shards and checkpoints".
+ */
+#include <bakelite.h>
+#include <math.h>
+#include <mpi.h>
+#include <stdio.h>
+#include <stdlib.h>
+#include <string.h>
+#include <time.h>
+
+/* Seconds without a sign of life after which a rank counts as lost; the environment variable BAKE_MPI_STALL. */
+static double stall = 30.0;
+
+enum { BEAT, STATE, CELLS }; /* what rank 0 keeps of each rank */
+enum { WORKING, LAID_OUT, DONE, ENDED, ENDED_WITHOUT_SOME };
+
+static MPI_Win board;
+static int rank, size;
+
+static void tell(int cell, int value)
+{
+    MPI_Win_lock(MPI_LOCK_SHARED, 0, 0, board);
+    MPI_Accumulate(&value, 1, MPI_INT, 0, CELLS * rank + cell, 1, MPI_INT, cell == BEAT ? MPI_SUM : MPI_REPLACE, board);
+    MPI_Win_unlock(0, board);
+}
+
+/* A sign of life, twice a second at most. Called by the thread that called the library. */
+static int32_t progress(void *user, float fraction, const char *stage)
+{
+    static double last;
+    double now = MPI_Wtime();
+    (void)user, (void)fraction, (void)stage;
+    if (now - last > 0.5) {
+        last = now;
+        tell(BEAT, 1);
+    }
+    return 1;
+}
+
+static void check(bk_result result, const char *what)
+{
+    if (result != BK_OK) {
+        fprintf(stderr, "rank %d: %s: %s\n", rank, what, bk_last_error());
+        MPI_Abort(MPI_COMM_WORLD, 1);
+    }
+}
+
+static void part_name(char *out, size_t capacity, const char *folder, int part)
+{
+    snprintf(out, capacity, "%s/part-%d-of-%d.light", folder, part, size);
+}
+
+/* Bakes a part and writes it, unless the folder has it. */
+static void bake_part(bk_lightmap *map, const char *folder, int part)
+{
+    char name[4096];
+    bk_bake_params params;
+    bk_lightmap_info info;
+    part_name(name, sizeof name, folder, part);
+    if (bk_lightmap_load_result(map, name, progress, NULL) == BK_OK) {
+        return;
+    }
+    bk_lightmap_info_init(&info);
+    check(bk_lightmap_get_info(map, &info), "light map");
+    bk_bake_params_init(&params);
+    params.texel_begin = info.texels * (uint64_t)part / (uint64_t)size;
+    params.texel_end = info.texels * (uint64_t)(part + 1) / (uint64_t)size;
+    check(bk_bake(map, &params, progress, NULL, NULL), "bake");
+    check(bk_lightmap_save_result(map, name, progress, NULL), "part");
+}
+
+/* Waits until a rank's state is at least this; returns it, or WORKING if the rank is lost (never of rank 0). */
+static int wait_for(int other, int state)
+{
+    static const struct timespec pause = {0, 50000000};
+    int cells[CELLS], beat = -1;
+    double since = MPI_Wtime();
+    for (;;) {
+        MPI_Win_lock(MPI_LOCK_SHARED, 0, 0, board);
+        MPI_Get(cells, CELLS, MPI_INT, 0, CELLS * other, CELLS, MPI_INT, board);
+        MPI_Win_unlock(0, board);
+        if (cells[STATE] >= state) {
+            return cells[STATE];
+        }
+        if (other == 0 || cells[BEAT] != beat) {
+            beat = cells[BEAT];
+            since = MPI_Wtime();
+        } else if (MPI_Wtime() - since > stall) {
+            return WORKING;
+        }
+        nanosleep(&pause, NULL);
+    }
+}
+
+static bk_scene *load(bk_device *device, const char *name)
+{
+    bk_scene *scene = NULL;
+    check(bk_scene_create(device, &scene), "scene");
+    if (bk_scene_load_builtin(scene, name) != BK_OK) {
+        bk_light_desc sun;
+        check(bk_scene_load_file(scene, name, NULL, progress, NULL, NULL), "scene");
+        bk_light_desc_init(&sun);
+        sun.type = BK_LIGHT_DIRECTIONAL;
+        sun.direction[0] = 0.3f, sun.direction[1] = -1.0f, sun.direction[2] = 0.2f;
+        sun.color[0] = 20.0f, sun.color[1] = 18.0f, sun.color[2] = 15.0f; /* W/m2 */
+        check(bk_scene_add_light(scene, &sun, NULL), "sun");
+    }
+    check(bk_scene_commit(scene, progress, NULL), "commit");
+    return scene;
+}
+
+int main(int argc, char **argv)
+{
+    bk_device_desc desc;
+    bk_lightmap_desc layout;
+    bk_device *device = NULL;
+    bk_scene *scene = NULL;
+    bk_lightmap *map = NULL;
+    char name[4096];
+    int *cells = NULL, lost = 0, part;
+    MPI_Init(&argc, &argv);
+    MPI_Comm_rank(MPI_COMM_WORLD, &rank);
+    MPI_Comm_size(MPI_COMM_WORLD, &size);
+    if (argc < 3) {
+        fprintf(stderr, "usage: mpirun -n RANKS bake_mpi FOLDER SCENE [TEXELS_PER_UNIT [THREADS]]\n");
+        MPI_Abort(MPI_COMM_WORLD, 2);
+    }
+    if (getenv("BAKE_MPI_STALL")) {
+        stall = atof(getenv("BAKE_MPI_STALL"));
+    }
+    MPI_Win_allocate(rank == 0 ? (MPI_Aint)(CELLS * size * (int)sizeof(int)) : 0, sizeof(int), MPI_INFO_NULL,
+                     MPI_COMM_WORLD, &cells, &board);
+    if (rank == 0) {
+        memset(cells, 0, CELLS * (size_t)size * sizeof(int));
+    }
+    MPI_Barrier(MPI_COMM_WORLD);
+
+    bk_device_desc_init(&desc);
+    desc.num_threads = argc > 4 ? (uint32_t)atoi(argv[4]) : 0;
+    check(bk_device_create(&desc, &device), "device");
+    scene = load(device, argv[2]);
+    bk_lightmap_desc_init(&layout);
+    layout.texels_per_unit = argc > 3 ? (float)atof(argv[3]) : 0.0f;
+    snprintf(name, sizeof name, "%s/layout.bklay", argv[1]);
+    if (rank == 0) {
+        if (bk_lightmap_load_layout(scene, &layout, name, progress, NULL, &map) != BK_OK) {
+            check(bk_lightmap_create(scene, &layout, progress, NULL, &map), "light map");
+            check(bk_lightmap_save_layout(map, name, progress, NULL), "layout");
+        }
+        tell(STATE, LAID_OUT);
+    } else {
+        wait_for(0, LAID_OUT);
+        check(bk_lightmap_load_layout(scene, &layout, name, progress, NULL, &map), "layout");
+    }
+
+    bake_part(map, argv[1], rank);
+    if (rank != 0) {
+        tell(STATE, DONE);
+    }
+    for (part = 1; rank == 0 && part < size; part++) {
+        if (wait_for(part, DONE) != WORKING) {
+            part_name(name, sizeof name, argv[1], part);
+            check(bk_lightmap_load_result(map, name, progress, NULL), "part");
+        } else {
+            fprintf(stderr, "rank %d is lost; rank 0 bakes its part\n", part);
+            lost = 1;
+            bake_part(map, argv[1], part);
+        }
+    }
+    if (rank == 0) {
+        snprintf(name, sizeof name, "%s/", argv[1]);
+        check(bk_lightmap_save(map, name, BK_FILE_EXR, progress, NULL), "pages");
+        printf("baked by %d ranks\n", size);
+        tell(STATE, lost ? ENDED_WITHOUT_SOME : ENDED);
+    } else {
+        lost = wait_for(0, ENDED) == ENDED_WITHOUT_SOME;
+    }
+    bk_lightmap_release(map);
+    bk_scene_release(scene);
+    bk_device_release(device);
+    if (lost) {
+        fflush(stdout);
+        _Exit(0); /* MPI_Finalize would wait for the lost rank. */
+    }
+    MPI_Win_free(&board);
+    MPI_Finalize();
+    return 0;
+}
