@@ -2,6 +2,7 @@
 //! refuse, and budgets for single calls.
 
 use crate::base::error::{Error, Result};
+use crate::base::parallel::one_by_one;
 use rayon::prelude::*;
 use std::sync::Arc;
 use std::sync::atomic::{AtomicI64, Ordering::SeqCst};
@@ -207,12 +208,12 @@ pub fn try_collect_ok<T>(values: impl IntoIterator<Item = Result<T>>, what: &str
 }
 
 /// Collects the items of a parallel iterator of known length, in order, or returns the first of its errors. (All items
-/// are computed: work that can be cancelled must check for that itself.)
+/// are computed: work that can be cancelled must check for that itself.) Each item should take long.
 pub fn try_par_collect_ok<T: Send>(
     values: impl IndexedParallelIterator<Item = Result<T>>,
     what: &str,
 ) -> Result<Vec<T>> {
-    try_collect_ok(try_par_collect(values, what)?, what)
+    try_collect_ok(try_par_collect(one_by_one(values), what)?, what)
 }
 
 /// Calls `part` with each of the numbers below `parts`, in parallel, and concatenates the items that it adds to its
@@ -226,7 +227,7 @@ pub fn try_par_gather<T: Send>(
         let mut of_part = Vec::new();
         part(i, &mut of_part).map(|()| of_part)
     };
-    let found = try_par_collect((0..parts).into_par_iter().map(one), what)?;
+    let found = try_par_collect(one_by_one((0..parts).into_par_iter().map(one)), what)?;
     let total = found.iter().map(|f| f.as_ref().map_or(0, Vec::len)).sum();
     let mut all = try_with_capacity(total, what)?;
     for of_part in found {

@@ -9,6 +9,7 @@ pub(crate) mod float_state;
 pub(crate) mod gate;
 pub mod geometry;
 pub mod memory;
+pub(crate) mod parallel;
 pub mod progress;
 pub mod sampling;
 pub(crate) mod scratch;

@@ -6,6 +6,7 @@ use super::image::{encode_png, exposure_of, luminance, tone_map, write_exr_with,
 use super::source::Advance;
 use crate::base::error::{Error, Result};
 use crate::base::memory::{Reservation, try_vec};
+use crate::base::parallel::one_by_one;
 use crate::base::progress::Progress;
 use crate::lightmap::{Layer, LayerData, Lightmap, packed_ratio};
 use rayon::prelude::*;
@@ -131,7 +132,7 @@ fn each_page(
         .flat_map(|page| layers().map(move |&(layer, name)| (page, layer, name)))
         .collect();
     let stage = progress.stage("pages", 0.0, 1.0, jobs.len() as u64);
-    let written = jobs.par_iter().map(|&(page, layer, name)| {
+    let written = one_by_one(jobs.par_iter()).map(|&(page, layer, name)| {
         stage.advance(0)?;
         let _encoder = encoder_memory(lightmap)?;
         let path = write(page, layer, name, &|parts| stage.advance(parts))?;

@@ -22,7 +22,8 @@ use super::tiles::{TILE, in_order, texels_per_tile};
 use super::{BakeParams, BakeStats, CheckpointParams, Light, Lightmap, Origin, StageStats, TexelState, directional};
 use crate::base::directional::Directional;
 use crate::base::error::{Error, Result, invalid_argument};
-use crate::base::memory::{try_filled, try_to_vec, try_vec, try_with_capacity};
+use crate::base::memory::{try_filled, try_to_vec, try_vec, try_with_capacity, try_zeroed};
+use crate::base::parallel::one_by_one;
 use crate::base::progress::{Progress, Stage};
 use crate::base::sampling::{combine, purpose_seed};
 use crate::base::scratch::Scratch;
@@ -251,8 +252,8 @@ impl<'p> Bake<'_, 'p> {
         }
         let n = self.atlas.map.len();
         let mut light = Light {
-            direct: try_vec(n, "direct light")?,
-            indirect: try_vec(n, "indirect light")?,
+            direct: try_zeroed(n, "direct light")?,
+            indirect: try_zeroed(n, "indirect light")?,
             directional: try_vec(if self.params.directional == 0 { 0 } else { n }, "light by direction")?,
             error: Vec::new(),
             state: try_vec(n, "validity")?,
@@ -372,9 +373,9 @@ impl<'p> Bake<'_, 'p> {
         let seed = purpose_seed(self.params.seed, purpose::GATHER);
         let stage = self.progress.stage("gather", 0.32, 0.6, needed.len() as u64);
         let n = l.gather.len();
-        let mut irradiance: Vec<Vec3> = try_vec(n, "the gather map")?;
-        let mut normals: Vec<Vec3> = try_vec(n, "the gather map's normals")?;
-        let mut variances: Vec<f32> = try_vec(n, "the gather map's variance")?;
+        let mut irradiance: Vec<Vec3> = try_zeroed(n, "the gather map")?;
+        let mut normals: Vec<Vec3> = try_zeroed(n, "the gather map's normals")?;
+        let mut variances: Vec<f32> = try_zeroed(n, "the gather map's variance")?;
         let mut valid: Vec<bool> = try_vec(n, "the gather map's validity")?;
         let asks = self.asks(directional::INDIRECT);
         let mut directional: Vec<Directional> = try_vec(if asks { n } else { 0 }, "the gather map by direction")?;
@@ -389,7 +390,7 @@ impl<'p> Bake<'_, 'p> {
             let directional = directional.get_mut(needed.clone()).unwrap_or_default();
             let directional = parts(directional, BLOCK, needed.len())?;
             let blocks = values.zip(normals).zip(variances).zip(valid).zip(directional).enumerate();
-            blocks.try_for_each(|(block, ((((values, normals), variances), valid), directional))| {
+            one_by_one(blocks).try_for_each(|(block, ((((values, normals), variances), valid), directional))| {
                 if self.checkpoint.is_some_and(|c| c.gathered(block, values, variances, valid, directional)) {
                     for (i, normal) in normals.iter_mut().enumerate() {
                         let texel = GatherTexel::new(needed.start + block * BLOCK + i);
@@ -482,7 +483,7 @@ impl<'p> Bake<'_, 'p> {
             let directional = parts(directional, BLOCK, range.len())?;
             let directional = directional.into_par_iter().zip(parts(&mut directed, BLOCK, range.len())?);
             let blocks = direct.zip(indirect_out).zip(state).zip(directional).enumerate();
-            blocks.try_for_each(|(block, ((((direct, known), ind), state), (directional, directed)))| {
+            one_by_one(blocks).try_for_each(|(block, ((((direct, known), ind), state), (directional, directed)))| {
                 let mut traced = 0;
                 let first = range.start + block * BLOCK;
                 if let Some(indirect) = indirect {
@@ -571,7 +572,7 @@ impl<'p> Bake<'_, 'p> {
         let new_tile = if directed.is_empty() { TilePoints::new } else { TilePoints::by_direction };
         l.scene.device().install(|| {
             let sharp = &direct[..];
-            variations.par_chunks_mut(BLOCK).enumerate().for_each(|(block, out)| {
+            one_by_one(variations.par_chunks_mut(BLOCK).enumerate()).for_each(|(block, out)| {
                 let mut traced = 0;
                 for (i, variation) in out.iter_mut().enumerate().filter(|_| !known[block]) {
                     let texel = LightTexel::new(range.start + block * BLOCK + i);
@@ -586,7 +587,7 @@ impl<'p> Bake<'_, 'p> {
             });
             let blocks = direct[range.clone()].par_chunks_mut(BLOCK).zip(state[range.clone()].par_chunks(BLOCK));
             let blocks = blocks.zip(variations.par_chunks(BLOCK)).zip(parts(directed, BLOCK, range.len())?).enumerate();
-            blocks.try_for_each(|(block, (((direct, state), variations), directed))| {
+            one_by_one(blocks).try_for_each(|(block, (((direct, state), variations), directed))| {
                 if known[block] {
                     return stage.advance(direct.len() as u64);
                 }

@@ -12,6 +12,7 @@ use super::work::{Context, Limit};
 use super::{Live, LiveParams, in_parts};
 use crate::base::error::{Error, Result};
 use crate::base::memory::{try_vec, try_with_capacity};
+use crate::base::parallel::one_by_one;
 use crate::base::progress::Progress;
 use crate::base::sampling::purpose_seed;
 use crate::lightmap::Lightmap;
@@ -125,7 +126,7 @@ impl Live {
         let limit = Limit::new(None, u64::MAX);
         let context = self.context.clone();
         let top = context.map.top();
-        self.blocks.par_iter_mut().zip(&context.map.tiles).try_for_each(|((status, home), tile)| {
+        one_by_one(self.blocks.par_iter_mut().zip(&context.map.tiles)).try_for_each(|((status, home), tile)| {
             if !tile.texels.is_empty()
                 && let Some(work) = home.take()
             {

@@ -18,6 +18,7 @@ use super::seen::Seen;
 use super::texels::TexelSample;
 use crate::base::error::Result;
 use crate::base::memory::{try_collect, try_par_collect, try_push, try_vec, try_with_capacity};
+use crate::base::parallel::one_by_one;
 use crate::base::progress::Stage;
 use crate::base::sampling::{cosine_around, sobol_2d};
 use crate::scene::Scene;
@@ -73,7 +74,7 @@ impl Search<'_> {
             Ok(found)
         };
         let placements = 0..map.layout.placements.len();
-        let mut found = try_par_collect(placements.into_par_iter().map(of_placement), BURIED)?;
+        let mut found = try_par_collect(one_by_one(placements.into_par_iter().map(of_placement)), BURIED)?;
         if let Some(failed) = found.iter_mut().find(|f| f.is_err()) {
             return Err(std::mem::replace(failed, Ok(Found::default())).err().expect("it failed"));
         }

@@ -9,6 +9,7 @@ use super::ids::ChartId;
 use super::texels::TexelSample;
 use crate::base::error::Result;
 use crate::base::memory::{Reservation, try_vec, try_with_capacity};
+use crate::base::parallel::one_by_one;
 use crate::device::Device;
 use glam::{DVec2, Vec2};
 use rayon::prelude::*;
@@ -134,7 +135,7 @@ impl ChartIndex {
         let mut grids: Vec<Grid> = try_with_capacity(charts.charts.len(), "the index of the charts")?;
         grids.resize_with(charts.charts.len(), Grid::default);
         device.install(|| {
-            grids.par_iter_mut().enumerate().try_for_each(|(chart, grid)| {
+            one_by_one(grids.par_iter_mut().enumerate()).try_for_each(|(chart, grid)| {
                 *grid = Grid::new(charts, ChartId::new(chart))?;
                 Ok(())
             })

@@ -17,6 +17,7 @@ use super::ids::PlacementId;
 use super::layout::Layout;
 use crate::base::error::{Error, Result};
 use crate::base::memory::{Reservation, try_collect, try_push, try_to_vec, try_vec, try_with_capacity};
+use crate::base::parallel::one_by_one;
 use crate::base::progress::Stage;
 use crate::scene::{NONE, Scene};
 use glam::{DVec2, Vec3};
@@ -283,7 +284,7 @@ impl TexelMap {
         let sizes = group_sizes(&self.groups, &self.chart_start);
         let owners = split(&mut self.index, self.groups.iter().map(Group::texels))?;
         let samples = split(&mut self.samples, sizes)?;
-        self.groups.par_iter().zip(owners).zip(samples).try_for_each(|((group, owners), samples)| {
+        one_by_one(self.groups.par_iter().zip(owners).zip(samples)).try_for_each(|((group, owners), samples)| {
             sample_group(job, group, &self.chart_start, owners, samples)?;
             job.stage.advance(group.placements.len() as u64)
         })

@@ -20,6 +20,7 @@ use super::ids::{ChartId, PlacementId, RadianceMap, RadianceTexel};
 use super::seen::Seen;
 use crate::base::error::Result;
 use crate::base::memory::{try_collect, try_par_collect};
+use crate::base::parallel::one_by_one;
 use crate::base::progress::Progress;
 use crate::base::sampling::{cosine_around, sobol_2d};
 use crate::scene::Scene;
@@ -97,7 +98,7 @@ pub(crate) fn backs(
         of_back.distance * lit(back).cbrt() > BETTER * of_front.distance * lit(front).cbrt()
     };
     let charts = (0..atlas.charts.charts.len()).into_par_iter();
-    let backs = try_par_collect(charts.map(|chart| is_back(ChartId::new(chart))), "the sides of charts")?;
+    let backs = try_par_collect(one_by_one(charts.map(|chart| is_back(ChartId::new(chart)))), "the sides of charts")?;
     progress.check()?;
     Ok(backs)
 }

@@ -25,6 +25,7 @@ use crate::base::error::Result;
 use crate::base::memory::{
     Reservation, try_append, try_collect, try_filled, try_par_gather, try_push, try_vec, try_with_capacity,
 };
+use crate::base::parallel::one_by_one;
 use crate::base::progress::Stage;
 use crate::base::sampling::combine;
 use crate::base::scratch::Scratch;
@@ -152,7 +153,7 @@ impl Upsampling {
         let new_tile = if rays.directional { Tile::by_direction } else { Tile::new };
         atlas.scene.device().install(|| {
             let blocks = own.par_chunks_mut(BLOCK).zip(self.alone.par_chunks(BLOCK));
-            blocks.zip(parts(&mut directional, BLOCK, self.alone.len())?).try_for_each(
+            one_by_one(blocks.zip(parts(&mut directional, BLOCK, self.alone.len())?)).try_for_each(
                 |((own, texels), directional)| {
                     let mut tile = tiles.take(new_tile)?;
                     traced.fetch_add(
@@ -162,13 +163,13 @@ impl Upsampling {
                     stage.advance(texels.len() as u64)
                 },
             )?;
-            blurred.par_chunks_mut(BLOCK).enumerate().for_each(|(block, blurred)| {
+            one_by_one(blurred.par_chunks_mut(BLOCK).enumerate()).for_each(|(block, blurred)| {
                 let mut window = Window::new(RADIUS);
                 for (i, blurred) in (block * BLOCK..).zip(blurred) {
                     *blurred = self.blurred(atlas, &mut window, &own, |k| directional[k], i);
                 }
             });
-            light.par_chunks_mut(BLOCK).enumerate().try_for_each(|(block, light)| {
+            one_by_one(light.par_chunks_mut(BLOCK).enumerate()).try_for_each(|(block, light)| {
                 let mut window = Window::new(RADIUS);
                 let value = |k: usize| own[k].light.map_or(Vec3::ZERO, |l| l.value);
                 for (i, light) in (block * BLOCK..).zip(light.iter_mut()) {
