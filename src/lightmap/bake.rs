@@ -400,7 +400,7 @@ impl<'p> Bake<'_, 'p> {
                 }
                 let (mut traced, mut tile) = (0, tiles.take(new_tile)?);
                 let first = needed.start + block * BLOCK;
-                for texels_of_tile in in_order(&l.gather, first..first + values.len())?.chunks(TILE) {
+                for texels_of_tile in in_order(&l.gather, first..first + values.len())?.chunks(Tile::texels(&samples)) {
                     let texel = |&texel: &GatherTexel| TileTexel {
                         receiver: l.receiver(&l.gather, backs, texel),
                         seed: combine(seed, texel.seed()),

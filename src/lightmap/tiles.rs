@@ -33,14 +33,33 @@ pub(crate) fn in_order<M: Map>(map: &ChartMap<M>, range: Range<usize>) -> Result
         let end = map.texels_of(placement).indices().end.min(range.end);
         // (Keys made once and not at each comparison: a third of the time.)
         keys.clear();
-        keys.extend(TexelId::<M>::range(begin..end).map(|s| {
-            let texel = &map[s];
-            let (x, y) = (u64::from(texel.x >> WIDTH_BITS), u64::from(texel.y >> WIDTH_BITS));
-            (y << 16 | x) << 32 | s.index() as u64
-        }));
+        keys.extend(TexelId::<M>::range(begin..end).map(|s| key(map, s, s.index())));
         keys.sort_unstable();
         order.extend(keys.iter().map(|&key| TexelId::new(key as u32 as usize)));
         begin = end;
     }
     Ok(order)
+}
+
+/// Returns the places of some texels, which ascend, in the same order.
+pub(crate) fn places_in_order<M: Map>(map: &ChartMap<M>, texels: &[TexelId<M>]) -> Result<Vec<u32>> {
+    let mut order: Vec<u32> = try_with_capacity(texels.len(), "the order of texels")?;
+    let mut keys: Vec<u64> = try_with_capacity(texels.len(), "the order of texels")?;
+    while order.len() < texels.len() {
+        let begin = order.len();
+        let of_placement = map.texels_of(map.texels.placement_of(texels[begin].index() as u32));
+        let rest = texels[begin..].iter().enumerate().take_while(|(_, s)| of_placement.contains(**s));
+        keys.clear();
+        keys.extend(rest.map(|(i, &s)| key(map, s, begin + i)));
+        keys.sort_unstable();
+        order.extend(keys.iter().map(|&key| key as u32));
+    }
+    Ok(order)
+}
+
+/// Returns the number by which texels of a placement are sorted: their square, and a number of their own.
+fn key<M: Map>(map: &ChartMap<M>, texel: TexelId<M>, number: usize) -> u64 {
+    let t = &map[texel];
+    let (x, y) = (u64::from(t.x >> WIDTH_BITS), u64::from(t.y >> WIDTH_BITS));
+    (y << 16 | x) << 32 | number as u64
 }

@@ -28,6 +28,9 @@ use std::f32::consts::PI;
 /// Fraction of rays that may hit backs of one-sided surfaces; a texel with more lies inside a solid.
 const MAX_BACK_FACES: f32 = 0.5;
 
+/// Maximum number of texels whose rounds are traced together, if these have few rays.
+const MOST_TEXELS: usize = 4 * TILE;
+
 /// Sums that a texel has gathered so far.
 #[derive(Clone, Copy, Debug, Default, PartialEq)]
 pub(crate) struct Gathered {
@@ -179,21 +182,28 @@ pub(crate) struct Tile {
 }
 
 impl Tile {
-    /// Allocates room for [`TILE`] texels.
+    /// Allocates room for as many texels as [`texels`](Self::texels) returns.
     pub(crate) fn new() -> Result<Tile> {
         let what = "the gather rays of a tile";
         let ray = Ray::new(Vec3::ZERO, Vec3::ZERO);
         let (rays, hits) = (try_filled(TILE * ROUND, ray, what)?, try_filled(TILE * ROUND, RawHit::MISS, what)?);
-        Ok(Tile { rays, hits, shadow: TileRoom::new(TILE, TILE * ROUND)? })
+        Ok(Tile { rays, hits, shadow: TileRoom::new(MOST_TEXELS, TILE * ROUND)? })
     }
 
-    /// Allocates room for [`TILE`] texels and their light by direction.
+    /// Allocates room for the texels of a tile and their light by direction.
     pub(crate) fn by_direction() -> Result<Tile> {
         let tile = Tile::new()?;
         Ok(Tile { shadow: tile.shadow.by_direction()?, ..tile })
     }
 
-    /// Adds one round of rays from each of at most [`TILE`] texels. Returns the rays traced.
+    /// Returns the maximum number of texels of a tile: [`TILE`], or more if their rounds have fewer rays than others, since
+    /// long streams are faster.
+    pub(crate) fn texels(samples: &SampleSet) -> usize {
+        let rays = samples.points().len().clamp(1, ROUND);
+        (TILE * ROUND / rays).min(MOST_TEXELS)
+    }
+
+    /// Adds one round of rays from each of at most [`texels`](Self::texels) texels. Returns the rays traced.
     pub(crate) fn add_round(
         &mut self,
         scene: &Scene,
@@ -209,7 +219,7 @@ impl Tile {
         }
         scene.intersect_stream(&self.rays[..count], &mut self.hits);
         let mut traced = count as u64;
-        let mut unoccluded = [Unoccluded::default(); TILE];
+        let mut unoccluded = [Unoccluded::default(); MOST_TEXELS];
         let mut shadow = self.shadow.begin(scene);
         if radiance.lookup.bright().len() > 0 {
             for (slot, (texel, unoccluded)) in texels.iter().zip(&mut unoccluded).enumerate() {

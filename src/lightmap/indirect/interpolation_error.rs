@@ -12,7 +12,7 @@ use crate::base::progress::Stage;
 use crate::base::sampling::{cosine_around, sobol_2d};
 use crate::lightmap::atlas::Atlas;
 use crate::lightmap::atlas::ids::PlacementId;
-use crate::lightmap::tiles::TILE;
+use crate::lightmap::tiles::{TILE, in_order};
 use crate::trace::{RawHit, Ray};
 use glam::Vec3;
 
@@ -24,6 +24,9 @@ const BEND: f32 = 4.0;
 const MOST: f32 = 4.0;
 
 const WHAT: &str = "what surrounds gather texels";
+
+/// Number of texels whose probes are traced together.
+const TEXELS: usize = 4 * TILE;
 
 /// What surrounds a gather texel.
 #[derive(Clone, Copy)]
@@ -58,28 +61,26 @@ pub(super) fn surroundings(
     rays: &mut u64,
 ) -> Result<Vec<Surroundings>> {
     let of_placement = atlas.gather.texels_of(placement);
-    let mut found = try_with_capacity(of_placement.len(), WHAT)?;
-    let count = TILE.min(of_placement.len()) * PROBES as usize;
+    let mut found = try_filled(of_placement.len(), Surroundings::unknown(false), WHAT)?;
+    let count = TEXELS.min(of_placement.len()) * PROBES as usize;
     let mut probes: Vec<Ray> = try_with_capacity(count, WHAT)?;
     let mut hits = try_filled(count, RawHit::MISS, WHAT)?;
-    let mut texels = of_placement.clone();
-    while found.len() < of_placement.len() {
+    for texels in in_order(&atlas.gather, of_placement.indices())?.chunks(TEXELS) {
         stage.check()?;
         probes.clear();
-        for texel in texels.by_ref().take(TILE) {
+        for &texel in texels {
             let receiver = atlas.receiver(&atlas.gather, backs, texel);
             let ray = |i| Ray::new(receiver.origin, cosine_around(receiver.normal, sobol_2d(i, texel.seed())));
             probes.extend((0..PROBES).map(ray));
         }
         atlas.scene.intersect_stream(&probes, &mut hits);
         *rays += probes.len() as u64;
-        for hits in hits[..probes.len()].chunks(PROBES as usize) {
+        for (&texel, hits) in texels.iter().zip(hits.chunks(PROBES as usize)) {
             let distances = hits.iter().map(|hit| if hit.is_miss() { f32::INFINITY } else { hit.t });
             let away = distances.clone().filter(|&t| t > width).count();
             let nearness = distances.map(|t| (width / t).min(MOST)).sum::<f32>() / PROBES as f32;
-            let texel = of_placement.clone().nth(found.len());
-            let normal = texel.map_or(Vec3::ZERO, |texel| atlas.gather.surface(&atlas.scene, texel).1);
-            found.push(Surroundings { is_gap: away < AWAY as usize, nearness, normal });
+            let normal = atlas.gather.surface(&atlas.scene, texel).1;
+            found[of_placement.place(texel)] = Surroundings { is_gap: away < AWAY as usize, nearness, normal };
         }
     }
     Ok(found)

@@ -34,7 +34,7 @@ use crate::lightmap::atlas::chart_map::ChartMap;
 use crate::lightmap::atlas::ids::{
     GatherMap, GatherTexel, LightMap, LightTexel, PerTexel, PlacementId, ShownMap, TexelId,
 };
-use crate::lightmap::tiles::TILE;
+use crate::lightmap::tiles::places_in_order;
 use glam::Vec3;
 use rayon::prelude::*;
 use std::ops::Range;
@@ -43,8 +43,10 @@ use std::sync::atomic::{AtomicU64, Ordering::Relaxed};
 /// Name of the buffers in error messages.
 const SHOWN: &str = "what the light map shows of the gather map";
 
-/// Number of fallback gathers that a thread computes at a time.
-const BLOCK: usize = 4 * TILE;
+/// Number of fallback gathers that a thread computes at a time, and the number whose blur it does: enough for several
+/// squares of texels beside each other in wide charts.
+const BLOCK: usize = 4096;
+const BLURRED: usize = 256;
 
 /// Number of rays of a fallback gather, if it is not given: as many as a gather texel has, divided by this, but at least so
 /// many, and no more than a gather texel has or than there are in a round. (With 32 or 64 instead of 16 a furnished room has the same error.)
@@ -163,16 +165,16 @@ impl Upsampling {
                     stage.advance(texels.len() as u64)
                 },
             )?;
-            one_by_one(blurred.par_chunks_mut(BLOCK).enumerate()).for_each(|(block, blurred)| {
+            one_by_one(blurred.par_chunks_mut(BLURRED).enumerate()).for_each(|(block, blurred)| {
                 let mut window = Window::new(RADIUS);
-                for (i, blurred) in (block * BLOCK..).zip(blurred) {
+                for (i, blurred) in (block * BLURRED..).zip(blurred) {
                     *blurred = self.blurred(atlas, &mut window, &own, |k| directional[k], i);
                 }
             });
-            one_by_one(light.par_chunks_mut(BLOCK).enumerate()).try_for_each(|(block, light)| {
+            one_by_one(light.par_chunks_mut(BLURRED).enumerate()).try_for_each(|(block, light)| {
                 let mut window = Window::new(RADIUS);
                 let value = |k: usize| own[k].light.map_or(Vec3::ZERO, |l| l.value);
-                for (i, light) in (block * BLOCK..).zip(light.iter_mut()) {
+                for (i, light) in (block * BLURRED..).zip(light.iter_mut()) {
                     *light = self.blurred(atlas, &mut window, &own, value, i);
                 }
                 stage.advance(light.len() as u64)
@@ -294,24 +296,25 @@ fn gather_for(
     tile: &mut Tile,
     stage: &Stage,
 ) -> Result<u64> {
-    let texel = |&texel: &LightTexel| TileTexel {
-        receiver: atlas.receiver(&atlas.map, backs, texel),
-        seed: combine(own.seed, texel.seed()),
+    let texel = |&place: &u32| TileTexel {
+        receiver: atlas.receiver(&atlas.map, backs, texels[place as usize]),
+        seed: combine(own.seed, texels[place as usize].seed()),
         gathered: Gathered::default(),
         directional: own.directional.then(Directional::default),
     };
     let mut rays = 0;
-    for (number, (texels, out)) in texels.chunks(TILE).zip(out.chunks_mut(TILE)).enumerate() {
+    for places in places_in_order(&atlas.map, texels)?.chunks(Tile::texels(own.samples)) {
         stage.check()?;
-        let mut texels: Vec<_> = texels.iter().map(texel).collect();
-        rays += tile.add_round(&atlas.scene, &own.radiance, &mut texels, own.samples, 0);
-        for (TileTexel { receiver, gathered, .. }, out) in texels.iter().zip(out) {
+        let mut of_tile: Vec<_> = places.iter().map(texel).collect();
+        rays += tile.add_round(&atlas.scene, &own.radiance, &mut of_tile, own.samples, 0);
+        for (&place, texel) in places.iter().zip(&of_tile) {
+            let TileTexel { receiver, gathered, .. } = texel;
             let noisy =
                 || Noisy { value: gathered.irradiance(), variance: gathered.variance(), normal: receiver.normal };
-            *out = Own { light: gathered.is_visible().then(noisy) };
-        }
-        for (texel, out) in texels.iter().zip(directional.iter_mut().skip(number * TILE)) {
-            *out = texel.directional();
+            out[place as usize] = Own { light: gathered.is_visible().then(noisy) };
+            if let Some(out) = directional.get_mut(place as usize) {
+                *out = texel.directional();
+            }
         }
     }
     Ok(rays)
