@@ -9,6 +9,7 @@ mod narrow_gaps;
 pub(crate) mod near_hits;
 pub(crate) mod radiance_map;
 pub(crate) mod sample_set;
+mod sights;
 mod texel_set;
 pub(crate) mod upsample;
 mod upsample_visibility;

@@ -7,10 +7,18 @@
 //!
 //! Measured, with alternatives that were tried: docs/experiments.md#narrow-gaps.
 
+use super::sights::Sights;
+use crate::base::error::Result;
+use crate::base::memory::{try_filled, try_with_capacity};
+use crate::base::progress::Stage;
 use crate::base::sampling::{cosine_around, sobol_2d};
 use crate::direct::Receiver;
-use crate::scene::Scene;
+use crate::lightmap::atlas::Atlas;
+use crate::lightmap::atlas::chart_map::ChartMap;
+use crate::lightmap::atlas::ids::{ShownMap, TexelId};
+use crate::lightmap::tiles::TILE;
 use crate::trace::Ray;
+use std::ops::Range;
 
 /// Maximum number of rays that test whether a texel is in a gap.
 pub(super) const PROBES: u32 = 16;
@@ -18,23 +26,46 @@ pub(super) const PROBES: u32 = 16;
 /// Minimum number of these rays that get further than a gather texel outside of gaps.
 pub(super) const AWAY: u32 = 2;
 
-/// Whether all but at most one of the rays from a texel hit a surface within `distance`, the width of a gather texel.
-/// Adds the rays traced to `rays`.
-pub(in crate::lightmap) fn is_in_gap(
-    scene: &Scene,
-    receiver: &Receiver,
+/// Rays that are traced together; texels of which enough have got away by then get no more. Most need two.
+const ROUNDS: [Range<u32>; 4] = [0..2, 2..4, 4..8, 8..PROBES];
+
+/// Number of texels whose rays are traced together.
+const TEXELS: usize = 4 * TILE;
+
+/// Name of the buffers in error messages.
+const GAPS: &str = "texels in narrow gaps";
+
+/// Says of each of some texels whether all but at most one of its rays hit a surface within `distance`, the width of a
+/// gather texel. Adds the rays traced to `rays`; `stage` may cancel.
+pub(super) fn are_in_gaps<M: ShownMap>(
+    atlas: &Atlas,
+    map: &ChartMap<M>,
+    backs: &[bool],
+    texels: &[TexelId<M>],
     distance: f32,
-    seed: u32,
+    stage: &Stage,
     rays: &mut u64,
-) -> bool {
-    let mut away = 0;
-    for i in 0..PROBES {
-        let d = cosine_around(receiver.normal, sobol_2d(i, seed));
-        *rays += 1;
-        away += u32::from(!scene.occluded(&Ray::new(receiver.origin, d).within(0.0, distance)));
-        if away == AWAY {
-            return false;
+) -> Result<Vec<bool>> {
+    let mut are = try_filled(texels.len(), false, GAPS)?;
+    let most = TEXELS.min(texels.len());
+    let mut receivers: Vec<Receiver> = try_with_capacity(most, GAPS)?;
+    let mut away = try_filled(most, 0, GAPS)?;
+    let mut sights = Sights::default();
+    for (texels, are) in texels.chunks(TEXELS).zip(are.chunks_mut(TEXELS)) {
+        receivers.clear();
+        receivers.extend(texels.iter().map(|&texel| atlas.receiver(map, backs, texel)));
+        away.fill(0);
+        for round in ROUNDS {
+            stage.check()?;
+            for i in (0..texels.len()).filter(|&i| away[i] < AWAY) {
+                for k in round.clone() {
+                    let direction = cosine_around(receivers[i].normal, sobol_2d(k, texels[i].seed()));
+                    sights.push(Ray::new(receivers[i].origin, direction).within(0.0, distance), i as u32)?;
+                }
+            }
+            sights.trace(&atlas.scene, rays, |i, is_occluded| away[i as usize] += u32::from(!is_occluded))?;
         }
+        are.iter_mut().zip(&away).for_each(|(is, &away)| *is = away < AWAY);
     }
-    true
+    Ok(are)
 }

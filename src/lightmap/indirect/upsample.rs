@@ -15,11 +15,11 @@
 use super::blur::{Noisy, Window};
 use super::gather::{Gathered, Tile, TileTexel};
 use super::interpolation_error::{Surroundings, surroundings};
-use super::narrow_gaps::is_in_gap;
+use super::narrow_gaps::are_in_gaps;
 use super::near_hits::HitRadiance;
 use super::sample_set::SampleSet;
 use super::texel_set::TexelSet;
-use super::upsample_visibility::{self, TEXELS_PER_CHECK};
+use super::upsample_visibility::{self, LastNormal, TEXELS_PER_CHECK};
 use crate::base::directional::{Directional, Linear};
 use crate::base::error::Result;
 use crate::base::memory::{
@@ -30,10 +30,7 @@ use crate::base::progress::Stage;
 use crate::base::sampling::combine;
 use crate::base::scratch::Scratch;
 use crate::lightmap::atlas::Atlas;
-use crate::lightmap::atlas::chart_map::ChartMap;
-use crate::lightmap::atlas::ids::{
-    GatherMap, GatherTexel, LightMap, LightTexel, PerTexel, PlacementId, ShownMap, TexelId,
-};
+use crate::lightmap::atlas::ids::{GatherMap, GatherTexel, LightMap, LightTexel, PerTexel, PlacementId};
 use crate::lightmap::tiles::places_in_order;
 use glam::Vec3;
 use rayon::prelude::*;
@@ -349,11 +346,18 @@ impl Found {
         let refines = most_error < f32::INFINITY;
         let around = match refines {
             true => surroundings(atlas, placement, backs, width, stage, &mut found.rays)?,
-            false => gaps(atlas, placement, backs, width, stage, &mut found.rays)?,
+            false => {
+                let texels = try_collect(of_gather.clone(), SHOWN)?;
+                let gaps = are_in_gaps(atlas, gather, backs, &texels, width, stage, &mut found.rays)?;
+                try_collect(gaps.into_iter().map(Surroundings::unknown), SHOWN)?
+            }
         };
         let in_gaps = of_gather.clone().filter(|&s| around[of_gather.place(s)].is_gap);
         found.gather_gaps = try_collect(in_gaps, SHOWN)?;
         let mut end = 0;
+        let mut normals = LastNormal::default();
+        // Texels that may lie in narrow gaps, and those that gather for themselves unless they do.
+        let (mut maybe_in_gaps, mut maybe_alone) = (Vec::new(), Vec::new());
         for (i, texel) in map.texels_of(placement).enumerate() {
             if i % TEXELS_PER_CHECK == 0 {
                 stage.check()?;
@@ -364,7 +368,11 @@ impl Found {
             if apart.is_empty() && found.gather_gaps.is_empty() && !refines {
                 continue;
             }
-            let normal = if refines { map.surface(&atlas.scene, texel).1 } else { Vec3::ZERO };
+            let sample = &map[texel];
+            let normal = match refines {
+                true => normals.of(&atlas.scene, sample.triangle, || sample.shading_normal(&atlas.scene)),
+                false => Vec3::ZERO,
+            };
             let (mut n, mut has_gap, mut sees_open, mut error) = (0, false, false, 0.0);
             atlas.gather_around(texel, |s, w| {
                 let around = &around[of_gather.place(s)];
@@ -376,56 +384,31 @@ impl Found {
                 }
             });
             let is_wrong = error > most_error;
-            if has_gap && !is_wrong && is_texel_in_gap(atlas, map, backs, texel, width, &mut found.rays) {
-                try_push(&mut found.map_gaps, texel, SHOWN)?;
-            } else if (!sees_open || is_wrong) && n > 0 {
-                try_push(&mut found.alone, texel, SHOWN)?;
+            if has_gap && !is_wrong {
+                try_push(&mut maybe_in_gaps, texel, SHOWN)?;
+            }
+            if (!sees_open || is_wrong) && n > 0 {
+                try_push(&mut maybe_alone, texel, SHOWN)?;
             }
             if apart.len() < n {
                 try_append(&mut found.walls, apart, SHOWN)?;
             }
         }
+        let gaps = are_in_gaps(atlas, map, backs, &maybe_in_gaps, width, stage, &mut found.rays)?;
+        let in_gaps = maybe_in_gaps.iter().zip(gaps).filter_map(|(&texel, is)| is.then_some(texel));
+        found.map_gaps = try_collect(in_gaps, SHOWN)?;
+        maybe_alone.retain(|texel| found.map_gaps.binary_search(texel).is_err());
+        found.alone = maybe_alone;
         Ok(found)
     }
-}
-
-/// Finds the gather texels of a placement that lie in narrow gaps, and nothing else about them.
-fn gaps(
-    atlas: &Atlas,
-    placement: PlacementId,
-    backs: &[bool],
-    width: f32,
-    stage: &Stage,
-    rays: &mut u64,
-) -> Result<Vec<Surroundings>> {
-    let of_placement = atlas.gather.texels_of(placement);
-    let mut found = try_with_capacity(of_placement.len(), SHOWN)?;
-    for (i, texel) in of_placement.enumerate() {
-        if i % TEXELS_PER_CHECK == 0 {
-            stage.check()?;
-        }
-        found.push(Surroundings::unknown(is_texel_in_gap(atlas, &atlas.gather, backs, texel, width, rays)));
-    }
-    Ok(found)
-}
-
-/// Whether a texel lies in a gap less wide than a gather texel, whose `width` is given.
-fn is_texel_in_gap<M: ShownMap>(
-    atlas: &Atlas,
-    map: &ChartMap<M>,
-    backs: &[bool],
-    texel: TexelId<M>,
-    width: f32,
-    rays: &mut u64,
-) -> bool {
-    is_in_gap(&atlas.scene, &atlas.receiver(map, backs, texel), width, texel.seed(), rays)
 }
 
 #[cfg(test)]
 pub(super) mod tests {
     use super::*;
     use crate::base::progress::Progress;
-    use crate::lightmap::atlas::ids::{Map, RadianceTexel};
+    use crate::lightmap::atlas::chart_map::ChartMap;
+    use crate::lightmap::atlas::ids::{Map, RadianceTexel, TexelId};
     use crate::lightmap::indirect::radiance_map::{Radiance, RadianceLookup};
     use crate::lightmap::{Lightmap, LightmapDesc};
     use crate::scene::demo::shapes::MeshBuilder;

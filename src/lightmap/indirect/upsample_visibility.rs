@@ -8,15 +8,16 @@
 //!
 //! Measured: docs/experiments.md#walls-and-creases.
 
-use crate::base::error::{Error, Result};
-use crate::base::memory::{try_push, try_with_capacity};
+use super::sights::Sights;
+use crate::base::error::Result;
+use crate::base::memory::{try_filled, try_push, try_with_capacity};
 use crate::base::progress::Stage;
 use crate::lightmap::atlas::Atlas;
 use crate::lightmap::atlas::chart_map::ChartMap;
-use crate::lightmap::atlas::ids::{GatherTexel, LightTexel, PlacementId, ShownMap, TexelId};
+use crate::lightmap::atlas::ids::{GatherTexel, LightMap, LightTexel, PlacementId, ShownMap, TexelId, TexelRange};
+use crate::scene::{NONE, Scene};
 use crate::trace::Ray;
 use glam::Vec3;
-use std::collections::HashMap;
 
 /// Number of texels of a placement between two checks for a cancel.
 pub(in crate::lightmap) const TEXELS_PER_CHECK: usize = 64;
@@ -26,6 +27,9 @@ const ABOVE: f32 = 0.125;
 
 /// Cosine of the angle between normals below which two texels lie on different sides of a crease.
 const CREASE: f32 = 0.8;
+
+/// Number of pairs of texels that are decided together.
+const PAIRS: usize = 4096;
 
 /// Name of the buffers in error messages.
 const WALLS: &str = "texels behind walls";
@@ -41,6 +45,10 @@ impl Eye {
     fn at<M: ShownMap>(atlas: &Atlas, map: &ChartMap<M>, backs: &[bool], texel: TexelId<M>, above: f32) -> Eye {
         let receiver = atlas.receiver(map, backs, texel);
         Eye { position: receiver.origin + receiver.geometric * above, normal: receiver.normal }
+    }
+
+    fn ray_to(self, other: Eye) -> Ray {
+        Ray::new(self.position, other.position - self.position).within(0.0, 1.0)
     }
 }
 
@@ -66,52 +74,156 @@ pub(in crate::lightmap) fn between(
         eyes.push(Eye::at(atlas, gather, backs, texel, above));
     }
     let eye_of = |s: GatherTexel| eyes[own.place(s)];
-    let mut are_apart = |a: Eye, b: Eye| {
-        if a.normal.dot(b.normal) < CREASE {
-            return true;
+    let mut groups = Groups::find(atlas, placement, stage)?;
+    let mut sights = Sights::default();
+    for i in 0..groups.all.len() {
+        let Group { around, is_split } = &mut groups.all[i];
+        let around = in_use(around);
+        // Most groups of gather texels surround many texels, and are on one side. A group of a single gather texel, as
+        // on narrow charts, says nothing about the texel.
+        let pairs =
+            || (1..around.len()).flat_map(|i| (0..i).map(move |j| [i, j])).map(|of| of.map(|i| eye_of(around[i])));
+        *is_split = around[0] == around[around.len() - 1] || pairs().any(|[a, b]| are_across(a, b));
+        if !*is_split {
+            pairs().try_for_each(|[a, b]| sights.push(a.ray_to(b), i as u32))?;
         }
-        *rays += 1;
-        atlas.scene.occluded(&Ray::new(a.position, b.position - a.position).within(0.0, 1.0))
-    };
-    let mut split: HashMap<[GatherTexel; 4], bool> = HashMap::new();
-    // Texels in a row have the same group, several at a time.
-    let mut last = ([GatherTexel::NONE; 4], false);
-    let mut found = Vec::new();
-    for (i, texel) in map.texels_of(placement).enumerate() {
-        if i % TEXELS_PER_CHECK == 0 {
+        if sights.is_full() || i + 1 == groups.all.len() {
             stage.check()?;
-        }
-        let (mut around, mut n) = ([GatherTexel::NONE; 4], 0);
-        atlas.gather_around(texel, |s, _| {
-            around[n] = s;
-            n += 1;
-        });
-        if n == 0 {
-            continue;
-        }
-        around[..n].sort_unstable();
-        let from = Eye::at(atlas, map, backs, texel, above);
-        if last.0 != around {
-            split.try_reserve(1).map_err(|e| Error::OutOfMemory(format!("{WALLS}: {e}")))?;
-            // Most groups of gather texels surround many texels, and are on one side. A group of a single gather texel,
-            // as on narrow charts, says nothing about the texel.
-            let is_split = *split.entry(around).or_insert_with(|| {
-                let mut pairs = (1..n).flat_map(|i| (0..i).map(move |j| (i, j)));
-                around[0] == around[n - 1] || pairs.any(|(i, j)| are_apart(eye_of(around[i]), eye_of(around[j])))
-            });
-            last = (around, is_split);
-        }
-        if last.1 {
-            for &s in around[..n].iter().filter(|&&s| are_apart(from, eye_of(s))) {
-                try_push(&mut found, (texel, s), WALLS)?;
-            }
-        } else if from.normal.dot(eye_of(around[0]).normal) < CREASE {
-            for &s in &around[..n] {
-                try_push(&mut found, (texel, s), WALLS)?;
-            }
+            sights.trace(&atlas.scene, rays, |i, is_hidden| groups.all[i as usize].is_split |= is_hidden)?;
         }
     }
+    let mut normals = LastNormal::default();
+    // Pairs of which some are not known to be apart before the lines of sight are traced.
+    let mut pairs: Vec<(LightTexel, GatherTexel, bool)> = Vec::new();
+    let mut found = Vec::new();
+    let mut flush = |pairs: &mut Vec<(LightTexel, GatherTexel, bool)>, sights: &mut Sights| {
+        stage.check()?;
+        sights.trace(&atlas.scene, rays, |i, is_hidden| pairs[i as usize].2 |= is_hidden)?;
+        let apart = pairs.iter().filter(|(.., are_apart)| *are_apart);
+        apart.into_iter().try_for_each(|&(texel, s, _)| try_push(&mut found, (texel, s), WALLS))?;
+        pairs.clear();
+        Ok(())
+    };
+    let of_map = map.texels_of(placement);
+    for (texels, group) in groups.runs(&of_map) {
+        let around = in_use(&group.around);
+        for texel in texels {
+            if group.is_split {
+                let from = Eye::at(atlas, map, backs, texel, above);
+                for &s in around {
+                    let are_apart = are_across(from, eye_of(s));
+                    if !are_apart {
+                        sights.push(from.ray_to(eye_of(s)), pairs.len() as u32)?;
+                    }
+                    try_push(&mut pairs, (texel, s, are_apart), WALLS)?;
+                }
+            } else {
+                let normal = normals.of(&atlas.scene, map[texel].triangle, || atlas.receiver(map, backs, texel).normal);
+                if normal.dot(eye_of(around[0]).normal) < CREASE {
+                    around.iter().try_for_each(|&s| try_push(&mut pairs, (texel, s, true), WALLS))?;
+                }
+            }
+        }
+        if pairs.len() >= PAIRS {
+            flush(&mut pairs, &mut sights)?;
+        }
+    }
+    flush(&mut pairs, &mut sights)?;
     Ok(found)
+}
+
+/// Whether a crease lies between two texels.
+fn are_across(a: Eye, b: Eye) -> bool {
+    a.normal.dot(b.normal) < CREASE
+}
+
+/// The gather texels around texels of the light map.
+struct Group {
+    /// In ascending order; the rest, if there are fewer, is [`GatherTexel::NONE`].
+    around: [GatherTexel; 4],
+    /// Whether something separates some of them.
+    is_split: bool,
+}
+
+/// Returns the gather texels of a group.
+fn in_use(around: &[GatherTexel; 4]) -> &[GatherTexel] {
+    &around[..around.iter().filter(|&&s| s != GatherTexel::NONE).count()]
+}
+
+/// The groups of a placement. (Some are there several times.)
+struct Groups {
+    all: Vec<Group>,
+    /// The first of consecutive texels with the same group, as its place in the placement, and the group; the number of
+    /// groups stands for none.
+    begins: Vec<[u32; 2]>,
+}
+
+impl Groups {
+    fn find(atlas: &Atlas, placement: PlacementId, stage: &Stage) -> Result<Groups> {
+        let own = atlas.gather.texels_of(placement);
+        // The last group that begins with each gather texel.
+        let mut last_of = try_filled(own.len(), NONE, WALLS)?;
+        let mut groups = Groups { all: Vec::new(), begins: Vec::new() };
+        let mut last = None;
+        for (i, texel) in atlas.map.texels_of(placement).enumerate() {
+            if i % TEXELS_PER_CHECK == 0 {
+                stage.check()?;
+            }
+            let (mut around, mut n) = ([GatherTexel::NONE; 4], 0);
+            atlas.gather_around(texel, |s, _| {
+                around[n] = s;
+                n += 1;
+            });
+            around.sort_unstable();
+            if last == Some(around) {
+                continue;
+            }
+            last = Some(around);
+            let group = match n {
+                0 => NONE,
+                _ => {
+                    let last_of = &mut last_of[own.place(around[0])];
+                    if groups.all.get(*last_of as usize).is_none_or(|group| group.around != around) {
+                        *last_of = groups.all.len() as u32;
+                        try_push(&mut groups.all, Group { around, is_split: false }, WALLS)?;
+                    }
+                    *last_of
+                }
+            };
+            try_push(&mut groups.begins, [i as u32, group], WALLS)?;
+        }
+        Ok(groups)
+    }
+
+    /// Returns the texels of the placement that have a group, run by run.
+    fn runs<'a>(&'a self, texels: &'a TexelRange<LightMap>) -> impl Iterator<Item = (TexelRange<LightMap>, &'a Group)> {
+        let first = texels.indices().start;
+        let ends = self.begins.iter().skip(1).map(|[begin, _]| *begin as usize).chain([texels.len()]);
+        let runs = self.begins.iter().zip(ends);
+        runs.filter_map(move |(&[begin, group], end)| {
+            Some((TexelId::range(first + begin as usize..first + end), self.all.get(group as usize)?))
+        })
+    }
+}
+
+/// The normal of a triangle, for texels that follow one another in it.
+#[derive(Default)]
+pub(super) struct LastNormal {
+    /// `None`: normals vary in it.
+    triangle: Option<u32>,
+    normal: Vec3,
+}
+
+impl LastNormal {
+    /// Returns the normal of a texel in a triangle, which `compute` returns. All texels are of one placement.
+    #[inline]
+    pub fn of(&mut self, scene: &Scene, triangle: u32, compute: impl FnOnce() -> Vec3) -> Vec3 {
+        if self.triangle != Some(triangle) {
+            let is_flat = scene.meshes()[scene.locate(triangle).0 as usize].normals.is_empty();
+            *self = LastNormal { triangle: is_flat.then_some(triangle), normal: compute() };
+        }
+        self.normal
+    }
 }
 
 #[cfg(test)]
