@@ -40,6 +40,9 @@ pub(crate) enum AreaSampler {
         parts: [SphericalTriangle; 2],
         share: f32,
         solid_angle: f32,
+        /// The plane of the light: a normal, of any length, and the product of it and of the way to the plane.
+        normal: DVec3,
+        distance: f64,
     },
 }
 
@@ -120,7 +123,9 @@ impl AreaLight {
             return AreaSampler::Area;
         }
         let share = (first.solid_angle() / both) as f32;
-        AreaSampler::SolidAngle { parts: [first, second], share, solid_angle: both as f32 }
+        let normal = u.cross(v);
+        let (parts, solid_angle, distance) = ([first, second], both as f32, c.dot(normal));
+        AreaSampler::SolidAngle { parts, share, solid_angle, normal, distance }
     }
 
     /// Samples a point on the light; returns it with its weight: irradiance for radiance 1 divided by the density of
@@ -132,23 +137,17 @@ impl AreaLight {
                 let point = self.corner + u * self.edge_u + v * self.edge_v;
                 (point, self.geometry_term(receiver, point) * self.area)
             }
-            AreaSampler::SolidAngle { parts, share, solid_angle } => {
+            AreaSampler::SolidAngle { parts, share, solid_angle, normal, distance } => {
                 let direction = if self.triangle || u[0] < *share {
                     parts[0].sample([if self.triangle { u[0] } else { u[0] / share }, u[1]])
                 } else {
                     parts[1].sample([(u[0] - share) / (1.0 - share), u[1]])
                 };
                 let weight = (direction.dot(receiver.normal.as_dvec3()) as f32).max(0.0) * solid_angle;
-                (self.along(receiver.origin, direction), weight)
+                let point = receiver.origin.as_dvec3() + direction * (distance / direction.dot(*normal));
+                (point.as_vec3(), weight)
             }
         }
-    }
-
-    /// The point of the light's plane in a given direction.
-    fn along(&self, origin: Vec3, direction: DVec3) -> Vec3 {
-        let (origin, normal) = (origin.as_dvec3(), self.edge_u.as_dvec3().cross(self.edge_v.as_dvec3()));
-        let t = (self.corner.as_dvec3() - origin).dot(normal) / direction.dot(normal);
-        (origin + direction * t).as_vec3()
     }
 
     /// cos cos'/d² between a point of the light and a receiver: irradiance per area for radiance 1.

@@ -14,7 +14,7 @@
 
 use super::light_node::{Bounds, Node, WIDTH};
 use crate::base::error::Result;
-use crate::base::memory::{try_collect, try_push, try_with_capacity};
+use crate::base::memory::{try_collect, try_filled, try_push, try_to_vec};
 use crate::simd::{self, Isa};
 use glam::Vec3;
 
@@ -27,6 +27,9 @@ const BINS: usize = 12;
 /// From this depth on nodes are halved, so that the tree is never deeper than some 70 nodes.
 const HALVE_FROM: u32 = 40;
 
+/// Number of lights from which the two parts of a node are built in parallel.
+const IN_PARALLEL: usize = 1024;
+
 /// Light tree over some of the lights of a scene, ready to be sampled.
 pub(crate) struct LightTree {
     nodes: Vec<Node>,
@@ -34,6 +37,7 @@ pub(crate) struct LightTree {
 }
 
 /// A node of the binary tree; the left child of an inner node follows it.
+#[derive(Clone, Copy)]
 struct Binary {
     bounds: Bounds,
     /// Right child; for a leaf, the complement of its light's number.
@@ -85,9 +89,10 @@ impl LightTree {
         let mut numbered = try_collect((0u32..).zip(lights.iter().map(part)), LIGHT_TREE)?;
         let mut nodes = Vec::new();
         if !lights.is_empty() {
-            let mut later = try_with_capacity(lights.len(), LIGHT_TREE)?;
-            let mut binary = try_with_capacity(2 * lights.len() - 1, LIGHT_TREE)?;
-            build(&mut binary, &mut numbered, 0, &mut later);
+            let mut later = try_to_vec(&numbered, LIGHT_TREE)?;
+            let leaf = Binary { bounds: numbered[0].1, right: 0 };
+            let mut binary = try_filled(2 * lights.len() - 1, leaf, LIGHT_TREE)?;
+            build(&mut binary, 0, &mut numbered, 0, &mut later);
             collapse(&binary, 0, &mut nodes)?;
         }
         Ok(LightTree { nodes, descend: kernel(isa) })
@@ -185,20 +190,35 @@ fn divide(node: &Node, importances: &[f32; WIDTH], part: &Part, next: &mut Vec<P
     }
 }
 
-/// Builds the binary tree over `lights` into `nodes`, which has capacity for it. `later` has capacity for all lights.
-fn build(nodes: &mut Vec<Binary>, lights: &mut [(u32, Bounds)], depth: u32, later: &mut Vec<(u32, Bounds)>) -> Bounds {
+/// Builds the binary tree over `lights` into `nodes`, which has as many places as it takes; `place` is the number of the
+/// first. `later` is scratch memory for as many lights.
+fn build(
+    nodes: &mut [Binary],
+    place: u32,
+    lights: &mut [(u32, Bounds)],
+    depth: u32,
+    later: &mut [(u32, Bounds)],
+) -> Bounds {
     if let [(light, bounds)] = lights {
-        nodes.push(Binary { bounds: *bounds, right: !*light });
+        nodes[0] = Binary { bounds: *bounds, right: !*light };
         return *bounds;
     }
     let middle = split(lights, depth, later);
     let (left, right) = lights.split_at_mut(middle);
-    let place = nodes.len();
-    nodes.push(Binary { bounds: left[0].1, right: 0 });
-    let left = build(nodes, left, depth + 1, later);
-    let second = nodes.len() as u32;
-    let both = left.union(&build(nodes, right, depth + 1, later));
-    nodes[place] = Binary { bounds: both, right: second };
+    let (later_left, later_right) = later.split_at_mut(middle);
+    // A tree over n lights has 2 n - 1 nodes.
+    let (node, below) = nodes.split_at_mut(1);
+    let (left_nodes, right_nodes) = below.split_at_mut(2 * middle - 1);
+    let (second, is_large) = (place + 2 * middle as u32, left.len() + right.len() >= IN_PARALLEL);
+    let mut left = || build(left_nodes, place + 1, left, depth + 1, later_left);
+    let mut right = || build(right_nodes, second, right, depth + 1, later_right);
+    // Outside of a pool, rayon would make one of its own.
+    let (left, right) = match is_large && rayon::current_thread_index().is_some() {
+        true => rayon::join(left, right),
+        false => (left(), right()),
+    };
+    let both = left.union(&right);
+    node[0] = Binary { bounds: both, right: second };
     both
 }
 
@@ -226,7 +246,7 @@ fn collapse(binary: &[Binary], root: u32, nodes: &mut Vec<Node>) -> Result<u32> 
 }
 
 /// Reorders at least two lights and returns the index at which to split them.
-fn split(lights: &mut [(u32, Bounds)], depth: u32, later: &mut Vec<(u32, Bounds)>) -> usize {
+fn split(lights: &mut [(u32, Bounds)], depth: u32, later: &mut [(u32, Bounds)]) -> usize {
     let half = lights.len() / 2;
     let centre = |b: &Bounds| 0.5 * (b.lower + b.upper);
     let (mut lower, mut upper) = (Vec3::INFINITY, Vec3::NEG_INFINITY);
@@ -276,9 +296,8 @@ fn split(lights: &mut [(u32, Bounds)], depth: u32, later: &mut Vec<(u32, Bounds)
 }
 
 /// Moves the values that `is_first` accepts to the front, and returns their number; the order within both groups is
-/// kept. `later` has capacity for the others.
-fn partition<T: Copy>(values: &mut [T], is_first: impl Fn(&T) -> bool, later: &mut Vec<T>) -> usize {
-    later.clear();
+/// kept. `later` is scratch memory for as many.
+fn partition<T: Copy>(values: &mut [T], is_first: impl Fn(&T) -> bool, later: &mut [T]) -> usize {
     let mut first = 0;
     for i in 0..values.len() {
         let value = values[i];
@@ -286,10 +305,11 @@ fn partition<T: Copy>(values: &mut [T], is_first: impl Fn(&T) -> bool, later: &m
             values[first] = value;
             first += 1;
         } else {
-            later.push(value);
+            later[i - first] = value;
         }
     }
-    values[first..].copy_from_slice(later);
+    let rest = &mut values[first..];
+    rest.copy_from_slice(&later[..rest.len()]);
     first
 }
 
@@ -378,8 +398,7 @@ mod tests {
     fn partitions_are_stable_sorts() {
         let values: Vec<(u32, u32)> = (0..1000).map(|i| (crate::base::sampling::mix(i) % 7, i)).collect();
         for from in 0..=7 {
-            let (mut sorted, mut parted, mut later) =
-                (values.clone(), values.clone(), Vec::with_capacity(values.len()));
+            let (mut sorted, mut parted, mut later) = (values.clone(), values.clone(), values.clone());
             sorted.sort_by_key(|v| v.0 >= from);
             let first = partition(&mut parted, |v| v.0 < from, &mut later);
             assert_eq!((parted, first), (sorted, values.iter().filter(|v| v.0 < from).count()));

@@ -11,7 +11,8 @@ use glam::DVec3;
 pub(crate) struct SphericalTriangle {
     a: DVec3,
     b: DVec3,
-    c: DVec3,
+    /// Unit direction at `a` towards the third corner.
+    towards_c: DVec3,
     /// Angle at `a`, its sine and cosine.
     alpha: f64,
     sin_alpha: f64,
@@ -34,10 +35,13 @@ impl SphericalTriangle {
         let [a, b, c] = corners.map(DVec3::normalize_or_zero);
         let solid_angle = solid_angle([a, b, c]);
         let (to_b, to_c) = (b.reject_from_normalized(a), c.reject_from_normalized(a));
-        let alpha = to_b.cross(to_c).length().atan2(to_b.dot(to_c));
-        let (sin_alpha, cos_alpha) = alpha.sin_cos();
+        let (sine, cosine) = (to_b.cross(to_c).length(), to_b.dot(to_c));
+        let (alpha, length) = (sine.atan2(cosine), (sine * sine + cosine * cosine).sqrt());
+        let (sin_alpha, cos_alpha) = (sine / length, cosine / length);
+        // False for NaN, as of corners in the same direction.
         let valid = solid_angle > 0.0 && sin_alpha > 0.0 && (a.length_squared() * b.length_squared()) > 0.0;
-        valid.then(|| SphericalTriangle { a, b, c, alpha, sin_alpha, cos_alpha, cos_ab: a.dot(b), solid_angle })
+        let towards_c = to_c.normalize_or_zero();
+        valid.then(|| SphericalTriangle { a, b, towards_c, alpha, sin_alpha, cos_alpha, cos_ab: a.dot(b), solid_angle })
     }
 
     /// Solid angle in steradians.
@@ -53,16 +57,17 @@ impl SphericalTriangle {
         let cos_side = ((q * t - p * s) * self.cos_alpha - q) / ((q * s + p * t) * self.sin_alpha);
         // Rounding may leave 0/0 at u₀ = 0.
         let cos_side = if cos_side.is_nan() { 1.0 } else { cos_side.clamp(-1.0, 1.0) };
-        let corner = towards(self.a, self.c, cos_side);
+        let corner = at_cosine(self.a, self.towards_c, cos_side);
         // The direction lies on the arc from b to that corner.
-        towards(self.b, corner, 1.0 - u[1] as f64 * (1.0 - corner.dot(self.b)))
+        let between = corner.dot(self.b);
+        let towards_corner = (corner - self.b * between).normalize_or_zero();
+        at_cosine(self.b, towards_corner, 1.0 - u[1] as f64 * (1.0 - between))
     }
 }
 
-/// The direction on the arc from `from` to `to` at the angle from `from` whose cosine is `cosine`.
-fn towards(from: DVec3, to: DVec3, cosine: f64) -> DVec3 {
-    let across = to.reject_from_normalized(from).normalize_or_zero();
-    from * cosine + across * (1.0 - cosine * cosine).max(0.0).sqrt()
+/// The direction on the arc that begins at `from` with the unit direction `towards`, at the angle whose cosine is `cosine`.
+fn at_cosine(from: DVec3, towards: DVec3, cosine: f64) -> DVec3 {
+    from * cosine + towards * (1.0 - cosine * cosine).max(0.0).sqrt()
 }
 
 #[cfg(test)]

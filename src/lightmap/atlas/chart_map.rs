@@ -139,16 +139,16 @@ pub(in crate::lightmap) fn receiver_at(
     back: bool,
 ) -> (SurfacePoint, Receiver) {
     let t = &TexelSample { x: 0, y: 0, triangle, u, v };
-    let point = SurfacePoint::new(scene.corners(t.triangle), t.u, t.v, scene);
-    let (object, triangle) = scene.locate(t.triangle);
+    let (object, triangle) = scene.locate(triangle);
     let object = scene.object(object);
-    let mesh = object.mesh();
+    let (mesh, corners) = (object.mesh(), object.corners(triangle));
+    let point = SurfacePoint::new(corners, t.u, t.v, scene);
     if mesh.normals.is_empty() {
         let receiver = Receiver::new(scene, &point, None, back);
         return (point, receiver);
     }
-    let receiver = Receiver::new(scene, &point, Some(t.shading_normal(scene)), back);
+    let receiver = Receiver::new(scene, &point, Some(t.normal_in(object, triangle, corners)), back);
     let normals = mesh.indices[triangle as usize].map(|i| object.normal(i));
-    let receiver = receiver.smooth(scene, object.corners(triangle), normals, [t.u, t.v]);
+    let receiver = receiver.smooth(scene, corners, normals, [t.u, t.v]);
     (point, receiver)
 }

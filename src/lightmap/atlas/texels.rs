@@ -16,10 +16,11 @@ use super::flat_triangle::Flat;
 use super::ids::PlacementId;
 use super::layout::Layout;
 use crate::base::error::{Error, Result};
+use crate::base::geometry::unit_normal;
 use crate::base::memory::{Reservation, try_collect, try_push, try_to_vec, try_vec, try_with_capacity};
 use crate::base::parallel::one_by_one;
 use crate::base::progress::Stage;
-use crate::scene::{NONE, Scene};
+use crate::scene::{Object, NONE, Scene};
 use glam::{DVec2, Vec3};
 pub(crate) use padding::PageArea;
 use rayon::prelude::*;
@@ -59,9 +60,15 @@ impl TexelSample {
     /// Returns the unit shading normal of the front side: interpolated if the mesh has normals and the result points to
     /// the front, else the geometric normal.
     pub fn shading_normal(&self, scene: &Scene) -> Vec3 {
-        let geometric = self.geometric_normal(scene);
         let (object, triangle) = scene.locate(self.triangle);
         let object = scene.object(object);
+        self.normal_in(object, triangle, object.corners(triangle))
+    }
+
+    /// Does the work of [`shading_normal`](Self::shading_normal), given the triangle and its corners.
+    #[inline]
+    pub(super) fn normal_in(&self, object: Object, triangle: u32, corners: [Vec3; 3]) -> Vec3 {
+        let geometric = unit_normal(corners);
         let mesh = object.mesh();
         if mesh.normals.is_empty() {
             return geometric;
