@@ -57,8 +57,8 @@ struct Part {
     node: u32,
     from: f64,
     to: f64,
-    first: f64,
-    end: f64,
+    first: i32,
+    end: i32,
 }
 
 /// A light that samples fall on.
@@ -171,10 +171,12 @@ fn divide(node: &Node, importances: &[f32; WIDTH], part: &Part, next: &mut Vec<P
     for end in &mut ends {
         *end = part.from + *end * scale;
     }
+    // The first sample after each child. (All at once, in lanes: descents take 0.93 of the time.)
+    let after = ends.map(|end| ceil(end).min(part.end));
     let mut sample = part.first;
     while sample < part.end {
-        let mut child = ends.iter().map(|&end| usize::from(end <= sample)).sum::<usize>();
-        let mut end = ceil(ends[child.min(WIDTH - 1)]).min(part.end);
+        let mut child = after.iter().map(|&after| usize::from(after <= sample)).sum::<usize>();
+        let mut end = after[child.min(WIDTH - 1)];
         if child == WIDTH {
             // The last sample, and rounding.
             (child, end) = (importances.iter().rposition(|&i| i > 0.0).unwrap_or(0), part.end);
@@ -313,12 +315,14 @@ fn partition<T: Copy>(values: &mut [T], is_first: impl Fn(&T) -> bool, later: &m
     first
 }
 
-/// Rounds up. (`f64::ceil` is a call into the C library, as SSE4.1 is not assumed: gathering in Sponza with 45,000
-/// bright patches takes 4 % longer with it.)
-#[inline]
-fn ceil(x: f64) -> f64 {
-    let towards_zero = x as i64 as f64;
-    if towards_zero < x { towards_zero + 1.0 } else { towards_zero }
+/// Rounds up; for numbers of samples. (`f64::ceil` is a call into the C library, as SSE4.1 is not assumed: gathering in
+/// Sponza with 45,000 bright patches takes 4 % longer with it.)
+#[inline(always)]
+fn ceil(x: f64) -> i32 {
+    // 1.5 · 2^52: in a sum with it, the lowest bits are an integer.
+    const TO_INTEGER: f64 = 6_755_399_441_055_744.0;
+    let sum = x + TO_INTEGER;
+    sum.to_bits() as i32 + i32::from(sum - TO_INTEGER < x)
 }
 
 #[cfg(test)]
