@@ -175,7 +175,7 @@ fn divide(node: &Node, importances: &[f32; WIDTH], part: &Part, next: &mut Vec<P
     let after = ends.map(|end| ceil(end).min(part.end));
     let mut sample = part.first;
     while sample < part.end {
-        let mut child = after.iter().map(|&after| usize::from(after <= sample)).sum::<usize>();
+        let mut child = after.iter().map(|&after| i32::from(after <= sample)).sum::<i32>() as usize;
         let mut end = after[child.min(WIDTH - 1)];
         if child == WIDTH {
             // The last sample, and rounding.

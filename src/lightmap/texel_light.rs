@@ -35,12 +35,15 @@ use crate::direct::Receiver;
 use crate::direct::direct_light::{DirectLight, Lights, PointLight};
 use crate::direct::shadow_rays::{KINDS, TileRoom};
 use crate::scene::Scene;
-use crate::trace::Ray;
+use crate::trace::{RawHit, Ray};
 use glam::{Vec2, Vec3};
 use std::ops::Range;
 
 /// Maximum number of points of a texel that are lit together.
 const MAX_POINTS: usize = 16;
+
+/// Number of rays straight up that are worth a stream.
+const LEAST_STREAM: usize = 32;
 
 /// Number of points in a texel in which light is not known to vary.
 const FEW: u32 = 4;
@@ -111,6 +114,8 @@ struct Point {
     light: PointLight,
     /// Number of the point in its tile.
     place: u32,
+    /// Whether the ray straight up may hit the back of a one-sided surface.
+    may_be_buried: bool,
 }
 
 /// Points of the texels of a tile, up to [`MAX_POINTS`] of each at a time.
@@ -118,8 +123,10 @@ pub(crate) struct TilePoints {
     points: Vec<Point>,
     /// Number of points of each texel.
     counts: Vec<usize>,
-    /// Points whose light has not arrived yet.
+    /// Points whose light has not arrived yet, or whose rays straight up have not been traced.
     pending: Vec<u32>,
+    rays_up: Vec<Ray>,
+    hits_up: Vec<RawHit>,
     room: TileRoom,
     /// Light by direction that has arrived at each point, by kind; empty if nobody asks for it.
     directional: Vec<[Directional; KINDS]>,
@@ -147,12 +154,15 @@ impl TilePoints {
             shadow_origin: Vec3::ZERO,
             raised: false,
         };
-        let point = Point { on: TexelSample::default(), receiver, light: PointLight::default(), place: 0 };
+        let point =
+            Point { on: TexelSample::default(), receiver, light: PointLight::default(), place: 0, may_be_buried: true };
         let points = texels * MAX_POINTS;
         Ok(TilePoints {
             points: try_filled(points, point, what)?,
             counts: try_filled(texels, 0, what)?,
             pending: try_with_capacity(points, what)?,
+            rays_up: try_with_capacity(points, what)?,
+            hits_up: try_filled(points, RawHit::MISS, what)?,
             room: TileRoom::new(KINDS * points, points)?,
             directional: Vec::new(),
         })
@@ -178,6 +188,32 @@ impl TilePoints {
         (&mut self.points[place * MAX_POINTS..][..self.counts[place]], &self.directional)
     }
 
+    /// Traces the rays straight up from unlit points beside lit ones, in the first `texels` of the tile, which tell that
+    /// nearly none of them is [buried](is_buried).
+    fn look_up(&mut self, texels: usize, scene: &Scene, rays: &mut u64) {
+        self.pending.clear();
+        self.rays_up.clear();
+        for (i, &count) in self.counts[..texels].iter().enumerate() {
+            let points = i * MAX_POINTS..i * MAX_POINTS + count;
+            if self.points[points.clone()].iter().all(|p| p.light.is_dark()) {
+                continue;
+            }
+            for place in points.filter(|&place| self.points[place].light.is_dark()) {
+                let Receiver { origin, geometric, .. } = self.points[place].receiver;
+                self.rays_up.push(Ray::new(origin, geometric));
+                self.pending.push(place as u32);
+            }
+        }
+        match self.rays_up.len() < LEAST_STREAM {
+            true => scene.intersect_block(&self.rays_up, &mut self.hits_up),
+            false => scene.intersect_stream(&self.rays_up, &mut self.hits_up),
+        }
+        *rays += self.rays_up.len() as u64;
+        for (&place, hit) in self.pending.iter().zip(&self.hits_up) {
+            self.points[place as usize].may_be_buried = is_back(scene, hit);
+        }
+    }
+
     /// Lights the wanted points that lie on their charts, and adds them to those of their texels.
     fn light<M: Map>(&mut self, by: &TexelLight<M>, wanted: impl Iterator<Item = Wanted<M>>, rays: &mut u64) {
         let scene = by.areas.scene;
@@ -193,7 +229,7 @@ impl TilePoints {
                 let (count, at) = (self.counts[place], place * MAX_POINTS + self.counts[place]);
                 shadow.slot = KINDS * at;
                 let light = by.direct.push(&receiver, (count - first) as u32, lights, samples, of_round, &mut shadow);
-                self.points[at] = Point { on, receiver, light, place: at as u32 };
+                self.points[at] = Point { on, receiver, light, place: at as u32, may_be_buried: true };
                 self.pending.push(at as u32);
                 self.counts[place] += 1;
             }
@@ -216,18 +252,24 @@ fn differ(a: Vec3, b: Vec3, part: f32) -> bool {
     (a - b).abs().max_element() > part * a.max_element().max(b.max_element())
 }
 
+/// Whether a hit is on the back of a one-sided surface.
+fn is_back(scene: &Scene, hit: &RawHit) -> bool {
+    !hit.is_miss() && !hit.front && {
+        let material = scene.material(hit.triangle);
+        !material.two_sided && !material.transmits()
+    }
+}
+
 /// Whether a point lies inside a solid: the rays straight up and to four sides all hit backs of one-sided surfaces.
 /// (The ray straight up alone may hit the back of a single sheet, such as a table top, below which there is light.)
-fn is_buried(scene: &Scene, origin: Vec3, normal: Vec3, rays: &mut u64) -> bool {
-    let (x, y) = orthonormal_basis(normal);
-    [Vec3::ZERO, x, -x, y, -y].into_iter().all(|aside| {
-        *rays += 1;
-        let hit = scene.intersect_raw(&Ray::new(origin, normal + aside));
-        !hit.is_miss() && !hit.front && {
-            let material = scene.material(hit.triangle);
-            !material.two_sided && !material.transmits()
-        }
-    })
+fn is_buried(scene: &Scene, point: &Point, rays: &mut u64) -> bool {
+    let Receiver { origin, geometric, .. } = point.receiver;
+    let (x, y) = orthonormal_basis(geometric);
+    point.may_be_buried
+        && [Vec3::ZERO, x, -x, y, -y].into_iter().all(|aside| {
+            *rays += 1;
+            is_back(scene, &scene.intersect_raw(&Ray::new(origin, geometric + aside)))
+        })
 }
 
 /// Whether a part of the light of points differs between them.
@@ -246,8 +288,9 @@ fn add_to(
 ) -> Vec3 {
     let is_lit = points.iter().any(|p| !p.light.is_dark());
     let mut n = Vec3::ZERO;
-    for Point { on, receiver, light, .. } in points {
-        if is_lit && light.is_dark() && is_buried(scene, receiver.origin, receiver.geometric, rays) {
+    for point in points {
+        let Point { on, light, .. } = point;
+        if is_lit && light.is_dark() && is_buried(scene, point, rays) {
             continue;
         }
         let weight = weight(on);

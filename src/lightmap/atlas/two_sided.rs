@@ -24,7 +24,8 @@ use crate::base::parallel::one_by_one;
 use crate::base::progress::Progress;
 use crate::base::sampling::{cosine_around, sobol_2d};
 use crate::scene::Scene;
-use crate::trace::Ray;
+use crate::trace::{RawHit, Ray};
+use glam::Vec3;
 use rayon::prelude::*;
 
 /// Factor by which the back must be better than the front to be shown, if both sides are covered or neither is. The
@@ -54,7 +55,7 @@ const SOMETHING: f32 = 0.1;
 
 /// Maximum number of points per side of a chart from which rays start, and number of rays from each.
 const PLACES: usize = 64;
-const RAYS: u32 = 4;
+const RAYS: usize = 4;
 
 /// Decides for each chart without separate texels for its back whether the back is baked; empty if no chart has a back.
 /// `light` returns how much light a texel of the radiance map gets (any unit). To be called on the device's threads.
@@ -160,16 +161,21 @@ fn view(scene: &Scene, radiance: &ChartMap<RadianceMap>, placement: PlacementId)
     let texels = radiance.texels_of(placement);
     let step = texels.len().div_ceil(PLACES).max(1);
     let places = texels.step_by(step);
-    let rays = places.len().max(1) as f64 * f64::from(RAYS);
-    let mut view = View { distance: 0.0, void: 0.0 };
-    for texel in places {
+    let mut rays = [Ray::new(Vec3::ZERO, Vec3::ZERO); PLACES * RAYS];
+    let mut hits = [RawHit::MISS; PLACES * RAYS];
+    let rays = &mut rays[..places.len() * RAYS];
+    for (texel, rays) in places.zip(rays.chunks_mut(RAYS)) {
         let (_, receiver) = radiance.receiver(scene, texel, radiance.is_back(texel));
-        for i in 0..RAYS {
-            let d = cosine_around(receiver.geometric, sobol_2d(i, texel.seed()));
-            let hit = scene.intersect_raw(&Ray::new(receiver.origin, d));
-            view.distance += f64::from(if hit.is_miss() { VOID * far } else { hit.t.min(far) }) / rays;
-            view.void += f64::from(u8::from(hit.is_miss())) / rays;
+        for (i, ray) in rays.iter_mut().enumerate() {
+            *ray = Ray::new(receiver.origin, cosine_around(receiver.geometric, sobol_2d(i as u32, texel.seed())));
         }
+    }
+    scene.intersect_stream(rays, &mut hits);
+    let count = rays.len().max(RAYS) as f64;
+    let mut view = View { distance: 0.0, void: 0.0 };
+    for hit in &hits[..rays.len()] {
+        view.distance += f64::from(if hit.is_miss() { VOID * far } else { hit.t.min(far) }) / count;
+        view.void += f64::from(u8::from(hit.is_miss())) / count;
     }
     view
 }

@@ -125,6 +125,7 @@ impl TexelLight<'_, LightMap> {
         }
         let more = texels.iter().enumerate().filter(|(i, _)| goes_on[*i]);
         tile.light(self, more.filter_map(|(i, t)| wanted(i, t, FEW..MAX_POINTS as u32)), rays);
+        tile.look_up(texels.len(), self.areas.scene, rays);
         for (i, t) in texels.iter().enumerate() {
             let mut directional = t.sharp_directional;
             let e = match lights_of(t.variation) {

@@ -40,6 +40,7 @@ impl TexelLight<'_, RadianceMap> {
         let (scene, map) = (self.areas.scene, self.areas.map);
         tile.clear();
         tile.light(self, texels.iter().enumerate().map(|(i, &texel)| self.all_of(i, texel, 0..FEW)), rays);
+        tile.look_up(texels.len(), scene, rays);
         for (i, &texel) in texels.iter().enumerate() {
             let (mut sum, points) = (PointLight::default(), tile.of(i));
             let mut n = add_to(points, scene, &mut sum, |_| Vec3::ONE, rays);
@@ -47,7 +48,13 @@ impl TexelLight<'_, RadianceMap> {
                 let seed = combine(self.seed, texel.seed());
                 let (on, receiver) = (map[texel], map.receiver(scene, texel, map.is_back(texel)).1);
                 let light = self.direct.at_point(&receiver, Lights::All, self.samples, seed, rays);
-                n = add_to(&[Point { on, receiver, light, place: 0 }], scene, &mut sum, |_| Vec3::ONE, rays);
+                n = add_to(
+                    &[Point { on, receiver, light, place: 0, may_be_buried: true }],
+                    scene,
+                    &mut sum,
+                    |_| Vec3::ONE,
+                    rays,
+                );
             }
             let varies =
                 vary(points, PointLight::narrow, DIFFERENCE) || vary(points, PointLight::unoccluded_areas, DIFFERENCE);
@@ -87,6 +94,7 @@ impl TexelLight<'_, RadianceMap> {
             let wanted = texels.iter().enumerate().filter(|(i, _)| has_spikes[*i]);
             tile.clear();
             tile.light(self, wanted.map(|(i, &texel)| self.all_of(i, texel, numbers.clone())), rays);
+            tile.look_up(texels.len(), scene, rays);
             for i in (0..texels.len()).filter(|&i| has_spikes[i]) {
                 weights[i] += add_to(tile.of(i), scene, &mut sums[i], weight, rays);
             }
