@@ -29,6 +29,14 @@ pub(crate) fn raised(
     geometric: Vec3,
     origin: Vec3,
 ) -> Option<Vec3> {
+    // A point rises by no more than an edge times what the normals lean: by nothing in flat walls that have normals.
+    let leaning = normals.iter().map(|n| (*n - geometric).length_squared()).fold(0.0, f32::max);
+    let [a, b, c] = corners;
+    let longest = (b - a).length_squared().max((c - a).length_squared()).max((c - b).length_squared());
+    let rounding = 1e-14;
+    if 2.0 * (leaning + rounding) * longest <= (0.5 * ray_epsilon(origin, scene)).powi(2) {
+        return None;
+    }
     let weights = [1.0 - u as f64 - v as f64, u as f64, v as f64];
     let corners = corners.map(|c| c.as_dvec3());
     let point: DVec3 = corners.iter().zip(weights).map(|(c, w)| *c * w).sum();

@@ -41,7 +41,7 @@ pub(crate) fn in_order<M: Map>(map: &ChartMap<M>, range: Range<usize>) -> Result
     Ok(order)
 }
 
-/// Returns the places of some texels, which ascend, in the same order.
+/// Returns the places of some texels, of which those of a placement follow one another, in the same order.
 pub(crate) fn places_in_order<M: Map>(map: &ChartMap<M>, texels: &[TexelId<M>]) -> Result<Vec<u32>> {
     let mut order: Vec<u32> = try_with_capacity(texels.len(), "the order of texels")?;
     let mut keys: Vec<u64> = try_with_capacity(texels.len(), "the order of texels")?;

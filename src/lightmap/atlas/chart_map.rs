@@ -7,7 +7,7 @@ use super::texels::{TexelMap, TexelSample};
 use crate::base::error::Result;
 use crate::base::progress::Stage;
 use crate::direct::Receiver;
-use crate::scene::{NONE, Scene};
+use crate::scene::{Mesh, NONE, Scene};
 use crate::trace::offset::SurfacePoint;
 use glam::Vec3;
 use std::marker::PhantomData;
@@ -147,8 +147,21 @@ pub(in crate::lightmap) fn receiver_at(
         let receiver = Receiver::new(scene, &point, None, back);
         return (point, receiver);
     }
-    let receiver = Receiver::new(scene, &point, Some(t.normal_in(object, triangle, corners)), back);
-    let normals = mesh.indices[triangle as usize].map(|i| object.normal(i));
-    let receiver = receiver.smooth(scene, corners, normals, [t.u, t.v]);
+    let receiver = smooth_receiver(scene, (object, triangle, corners), t, &point, back);
     (point, receiver)
+}
+
+/// Returns a point of a triangle of a mesh with normals as a receiver. (Apart, as the registers that it takes make flat
+/// ones slower.)
+#[inline(never)]
+fn smooth_receiver(
+    scene: &Scene,
+    (object, triangle, corners): (Object, u32, [Vec3; 3]),
+    t: &TexelSample,
+    point: &SurfacePoint,
+    back: bool,
+) -> Receiver {
+    let receiver = Receiver::new(scene, point, Some(t.normal_in(object, triangle, corners)), back);
+    let normals = object.mesh().indices[triangle as usize].map(|i| object.normal(i));
+    receiver.smooth(scene, corners, normals, [t.u, t.v])
 }

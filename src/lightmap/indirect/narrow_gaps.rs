@@ -16,7 +16,7 @@ use crate::direct::Receiver;
 use crate::lightmap::atlas::Atlas;
 use crate::lightmap::atlas::chart_map::ChartMap;
 use crate::lightmap::atlas::ids::{ShownMap, TexelId};
-use crate::lightmap::tiles::TILE;
+use crate::lightmap::tiles::{TILE, places_in_order};
 use crate::trace::Ray;
 use std::ops::Range;
 
@@ -51,21 +51,22 @@ pub(super) fn are_in_gaps<M: ShownMap>(
     let mut receivers: Vec<Receiver> = try_with_capacity(most, GAPS)?;
     let mut away = try_filled(most, 0, GAPS)?;
     let mut sights = Sights::default();
-    for (texels, are) in texels.chunks(TEXELS).zip(are.chunks_mut(TEXELS)) {
+    for places in places_in_order(map, texels)?.chunks(TEXELS) {
+        let texel = |i: usize| texels[places[i] as usize];
         receivers.clear();
-        receivers.extend(texels.iter().map(|&texel| atlas.receiver(map, backs, texel)));
+        receivers.extend((0..places.len()).map(|i| atlas.receiver(map, backs, texel(i))));
         away.fill(0);
         for round in ROUNDS {
             stage.check()?;
-            for i in (0..texels.len()).filter(|&i| away[i] < AWAY) {
+            for i in (0..places.len()).filter(|&i| away[i] < AWAY) {
                 for k in round.clone() {
-                    let direction = cosine_around(receivers[i].normal, sobol_2d(k, texels[i].seed()));
+                    let direction = cosine_around(receivers[i].normal, sobol_2d(k, texel(i).seed()));
                     sights.push(Ray::new(receivers[i].origin, direction).within(0.0, distance), i as u32)?;
                 }
             }
             sights.trace(&atlas.scene, rays, |i, is_occluded| away[i as usize] += u32::from(!is_occluded))?;
         }
-        are.iter_mut().zip(&away).for_each(|(is, &away)| *is = away < AWAY);
+        places.iter().zip(&away).for_each(|(&place, &away)| are[place as usize] = away < AWAY);
     }
     Ok(are)
 }

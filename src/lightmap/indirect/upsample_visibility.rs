@@ -10,11 +10,12 @@
 
 use super::sights::Sights;
 use crate::base::error::Result;
-use crate::base::memory::{try_filled, try_push, try_with_capacity};
+use crate::base::memory::{try_collect, try_filled, try_push, try_with_capacity};
 use crate::base::progress::Stage;
 use crate::lightmap::atlas::Atlas;
 use crate::lightmap::atlas::chart_map::ChartMap;
 use crate::lightmap::atlas::ids::{GatherTexel, LightMap, LightTexel, PlacementId, ShownMap, TexelId, TexelRange};
+use crate::lightmap::tiles::places_in_order;
 use crate::scene::{NONE, Scene};
 use crate::trace::Ray;
 use glam::Vec3;
@@ -76,7 +77,9 @@ pub(in crate::lightmap) fn between(
     let eye_of = |s: GatherTexel| eyes[own.place(s)];
     let mut groups = Groups::find(atlas, placement, stage)?;
     let mut sights = Sights::default();
-    for i in 0..groups.all.len() {
+    let firsts: Vec<GatherTexel> = try_collect(groups.all.iter().map(|group| group.around[0]), WALLS)?;
+    let order = places_in_order(gather, &firsts)?;
+    for (number, i) in order.iter().map(|&i| i as usize).enumerate() {
         let Group { around, is_split } = &mut groups.all[i];
         let around = in_use(around);
         // Most groups of gather texels surround many texels, and are on one side. A group of a single gather texel, as
@@ -87,7 +90,7 @@ pub(in crate::lightmap) fn between(
         if !*is_split {
             pairs().try_for_each(|[a, b]| sights.push(a.ray_to(b), i as u32))?;
         }
-        if sights.is_full() || i + 1 == groups.all.len() {
+        if sights.is_full() || number + 1 == order.len() {
             stage.check()?;
             sights.trace(&atlas.scene, rays, |i, is_hidden| groups.all[i as usize].is_split |= is_hidden)?;
         }
@@ -219,7 +222,7 @@ impl LastNormal {
     #[inline]
     pub fn of(&mut self, scene: &Scene, triangle: u32, compute: impl FnOnce() -> Vec3) -> Vec3 {
         if self.triangle != Some(triangle) {
-            let is_flat = scene.meshes()[scene.locate(triangle).0 as usize].normals.is_empty();
+            let is_flat = scene.object(scene.locate(triangle).0).mesh().normals.is_empty();
             *self = LastNormal { triangle: is_flat.then_some(triangle), normal: compute() };
         }
         self.normal
