@@ -7,7 +7,7 @@ use super::texels::{TexelMap, TexelSample};
 use crate::base::error::Result;
 use crate::base::progress::Stage;
 use crate::direct::Receiver;
-use crate::scene::{Mesh, NONE, Scene};
+use crate::scene::{NONE, Object, Scene};
 use crate::trace::offset::SurfacePoint;
 use glam::Vec3;
 use std::marker::PhantomData;

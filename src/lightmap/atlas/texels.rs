@@ -20,7 +20,7 @@ use crate::base::geometry::unit_normal;
 use crate::base::memory::{Reservation, try_collect, try_push, try_to_vec, try_vec, try_with_capacity};
 use crate::base::parallel::one_by_one;
 use crate::base::progress::Stage;
-use crate::scene::{Object, NONE, Scene};
+use crate::scene::{NONE, Object, Scene};
 use glam::{DVec2, Vec3};
 pub(crate) use padding::PageArea;
 use rayon::prelude::*;
