@@ -1907,7 +1907,7 @@ typedef struct bk_bake_params {
   /// 1: compute light that was reflected by other surfaces by direction too (SH L1), for surfaces
   /// with normal maps. Reading starts at BK_LAYER_L0. It comes from the same rays; in memory it
   /// takes 48 bytes per texel of the light map, and during the bake 96 per texel of the gather
-  /// map. Live updates do not have it. Default: 0.
+  /// map. bk_live_params has the same fields. Default: 0.
   uint32_t directional_indirect;
   /// 1: the same for light that comes straight from lights, for 48 bytes more per texel of the light
   /// map during the bake. With both, the layers hold the sum.
@@ -2306,10 +2306,6 @@ bk_result bk_lightmap_load_result(bk_lightmap *lightmap,
 /// Mode: refine anywhere, at random, for comparison.
 #define BK_LIVE_UNIFORM 2
 
-/// Flag added to the format of bk_live_read: leave out direct light, for applications that shade it
-/// themselves.
-#define BK_FORMAT_INDIRECT_ONLY 256
-
 /// Handle of a live object.
 typedef struct bk_live bk_live;
 
@@ -2372,6 +2368,13 @@ typedef struct bk_live_params {
   /// Number of rays of texels of the light map that trace rays themselves, see bk_bake_params; 0: a
   /// quarter of `max_rounds` * 64, at least 16, at most 64. Default: 16.
   uint32_t own_rays;
+  /// 1: compute light that was reflected by other surfaces by direction too, as
+  /// bk_bake_params.directional_indirect does. It takes 7 bytes more per texel of the light map.
+  /// Default: 0.
+  uint32_t directional_indirect;
+  /// 1: the same for light that comes straight from lights, for 48 bytes more per texel of the light
+  /// map. With both, the layers hold the sum. Default: 0.
+  uint32_t directional_direct;
 } bk_live_params;
 
 /// A perspective camera.
@@ -2571,27 +2574,33 @@ bk_result bk_live_dirty_rects(bk_live *live,
                               size_t capacity,
                               size_t *count);
 
-/// Copies the shown irradiance, in W/m2, of a rectangle of a page.
+/// Copies the shown light of a rectangle of a page.
 ///
-/// Cost: about 0.2 microseconds per texel; more for an LOD below the highest.
+/// Cost: about 0.2 microseconds per texel; more for layers of light by direction and for an LOD below
+/// the highest.
 ///
 /// @param live  live object
 /// @param page  number of the page
 /// @param lod  lod_count - 1 for the light as shown; less for the light as it would be shown if no
 ///   texel were above that LOD
-/// @param format  BK_FORMAT_RGB32F or BK_FORMAT_RGBA16F, with or without BK_FORMAT_INDIRECT_ONLY
+/// @param layer  BK_LAYER_COMBINED, INDIRECT or DIRECT; or one from BK_LAYER_L0 to DIRECTION, of a live
+///   object that was created with `directional_indirect` or `directional_direct`
+/// @param format  BK_FORMAT_RGB32F or BK_FORMAT_RGBA16F; for ratios and DIRECTION also BK_FORMAT_RGBA8
 /// @param rect  `x`, `y`, `width` and `height` of the rectangle; its `page` and `lod` are ignored.
 ///   NULL: the whole page
 /// @param dst  receives the rectangle's rows; needs no alignment
 /// @param row_stride  distance between rows in bytes, at least the bytes of a row; 0: packed
-/// @retval BK_ERROR_INVALID_ARGUMENT  page, LOD or format does not exist, the rectangle is not
-///   within the page, or `row_stride` is too small
-/// @retval BK_ERROR_INVALID_STATE  another call is changing the live object
+/// @retval BK_ERROR_INVALID_ARGUMENT  page, LOD, layer or format does not exist, the layer is another
+///   one, the format does not suit it, the rectangle is not within the page, or `row_stride` is too
+///   small
+/// @retval BK_ERROR_INVALID_STATE  another call is changing the live object, or it was created without
+///   light by direction
 /// @retval BK_ERROR_OUT_OF_MEMORY  the rectangle does not fit
 BK_API
 bk_result bk_live_read(const bk_live *live,
                        uint32_t page,
                        uint32_t lod,
+                       uint32_t layer,
                        uint32_t format,
                        const bk_rect *rect,
                        void *dst,

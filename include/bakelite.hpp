@@ -592,12 +592,12 @@ public:
         rects.resize(fetched);
         return detail::finish(code, std::move(rects));
     }
-    /// A rectangle into memory of the caller's, rows packed, `format` RGB32F or RGBA16F.
-    Result<void> read(const bk_rect &rect, std::uint32_t format, Span<std::byte> out) const {
-        const std::size_t bytes = (format & ~std::uint32_t(BK_FORMAT_INDIRECT_ONLY)) == BK_FORMAT_RGB32F ? 12 : 8;
+    /// A rectangle of a layer into memory of the caller's, rows packed, `format` RGB32F, RGBA16F or RGBA8.
+    Result<void> read(const bk_rect &rect, std::uint32_t layer, std::uint32_t format, Span<std::byte> out) const {
+        const std::size_t bytes = format == BK_FORMAT_RGB32F ? 12 : format == BK_FORMAT_RGBA16F ? 8 : 4;
         if (out.size() != bytes * rect.width * rect.height)
             return detail::finish(BK_ERROR_INVALID_ARGUMENT, "the memory is not as large as the rectangle");
-        return detail::finish(bk_live_read(get(), rect.page, rect.lod, format, &rect, out.data(), 0));
+        return detail::finish(bk_live_read(get(), rect.page, rect.lod, layer, format, &rect, out.data(), 0));
     }
     Result<void> light_changed(std::uint32_t light) { return detail::finish(bk_live_light_changed(get(), light)); }
     Result<void> pause(bool paused) { return detail::finish(bk_live_pause(get(), paused)); }

@@ -136,7 +136,7 @@ static double energy(bk_live *live, uint32_t pages) {
     uint32_t page;
     int i, wrong = 0;
     for (page = 0; page < pages; page++) {
-        CHECK_OK(bk_live_read(live, page, 2, BK_FORMAT_RGB32F, NULL, texels, 0));
+        CHECK_OK(bk_live_read(live, page, 2, BK_LAYER_COMBINED, BK_FORMAT_RGB32F, NULL, texels, 0));
         for (i = 0; i < PAGE * PAGE; i++) {
             const float *t = texels[i];
             wrong += !(t[0] >= 0.0f && t[1] >= 0.0f && t[2] >= 0.0f && t[0] + t[1] + t[2] < FLT_MAX);
@@ -263,18 +263,22 @@ static void bad_input(bk_scene *scene, bk_lightmap *lightmap) {
 
     memset(&rect, 0, sizeof rect);
     rect.width = rect.height = 4;
-    CHECK_OK(bk_live_read(live, 0, 2, BK_FORMAT_RGB32F, &rect, texels, 0));
-    CHECK_OK(bk_live_read(live, 0, 0, BK_FORMAT_RGBA16F | BK_FORMAT_INDIRECT_ONLY, &rect, texels, 40));
-    CHECK_ERROR(bk_live_read(live, 0, 2, BK_FORMAT_RGB32F, &rect, NULL, 0), refused, "dst");
-    CHECK_ERROR(bk_live_read(live, 0, 3, BK_FORMAT_RGB32F, &rect, texels, 0), refused, "lod is 3");
-    CHECK_ERROR(bk_live_read(live, pages, 2, BK_FORMAT_RGB32F, &rect, texels, 0), refused, "pages");
-    CHECK_ERROR(bk_live_read(live, 0, 2, BK_FORMAT_R32U, &rect, texels, 0), refused, "format");
-    CHECK_ERROR(bk_live_read(live, 0, 2, 99, &rect, texels, 0), refused, "format");
-    CHECK_ERROR(bk_live_read(live, 0, 2, BK_FORMAT_RGB32F, &rect, texels, 47), refused, "row_stride is 47");
+    CHECK_OK(bk_live_read(live, 0, 2, BK_LAYER_COMBINED, BK_FORMAT_RGB32F, &rect, texels, 0));
+    CHECK_OK(bk_live_read(live, 0, 0, BK_LAYER_INDIRECT, BK_FORMAT_RGBA16F, &rect, texels, 40));
+    CHECK_ERROR(bk_live_read(live, 0, 2, BK_LAYER_COMBINED, BK_FORMAT_RGB32F, &rect, NULL, 0), refused, "dst");
+    CHECK_ERROR(bk_live_read(live, 0, 3, BK_LAYER_COMBINED, BK_FORMAT_RGB32F, &rect, texels, 0), refused, "lod is 3");
+    CHECK_ERROR(bk_live_read(live, pages, 2, BK_LAYER_COMBINED, BK_FORMAT_RGB32F, &rect, texels, 0), refused, "pages");
+    CHECK_ERROR(bk_live_read(live, 0, 2, BK_LAYER_COMBINED, BK_FORMAT_R32U, &rect, texels, 0), refused, "format");
+    CHECK_ERROR(bk_live_read(live, 0, 2, BK_LAYER_COMBINED, 99, &rect, texels, 0), refused, "format");
+    CHECK_ERROR(bk_live_read(live, 0, 2, BK_LAYER_NORMAL, BK_FORMAT_RGB32F, &rect, texels, 0), refused, "layer is Normal");
+    CHECK_ERROR(bk_live_read(live, 0, 2, 99, BK_FORMAT_RGB32F, &rect, texels, 0), refused, "layer is 99");
+    CHECK_ERROR(bk_live_read(live, 0, 2, BK_LAYER_L0, BK_FORMAT_RGB32F, &rect, texels, 0), BK_ERROR_INVALID_STATE,
+                "without light by direction");
+    CHECK_ERROR(bk_live_read(live, 0, 2, BK_LAYER_COMBINED, BK_FORMAT_RGB32F, &rect, texels, 47), refused, "row_stride is 47");
     rect.x = PAGE - 3;
-    CHECK_ERROR(bk_live_read(live, 0, 2, BK_FORMAT_RGB32F, &rect, texels, 0), refused, "not within");
+    CHECK_ERROR(bk_live_read(live, 0, 2, BK_LAYER_COMBINED, BK_FORMAT_RGB32F, &rect, texels, 0), refused, "not within");
     rect.x = UINT32_MAX;
-    CHECK_ERROR(bk_live_read(live, 0, 2, BK_FORMAT_RGB32F, &rect, texels, 0), refused, "not within");
+    CHECK_ERROR(bk_live_read(live, 0, 2, BK_LAYER_COMBINED, BK_FORMAT_RGB32F, &rect, texels, 0), refused, "not within");
 
     CHECK_OK(bk_live_cell_lods(live, &info, NULL, 0));
     CHECK(info.dimensions[0] * info.dimensions[1] * info.dimensions[2] > 1 && info.cell_size > 0.0f);
@@ -488,7 +492,7 @@ static uint64_t refresh(bk_live *live, float *copy) {
         for (i = 0; i < count; i++) {
             const bk_rect *r = &rects[i];
             float *first = copy + 3 * (((size_t)r->page * PAGE + r->y) * PAGE + r->x);
-            CHECK_OK(bk_live_read(live, r->page, r->lod, BK_FORMAT_RGB32F, r, first, PAGE * 3 * sizeof(float)));
+            CHECK_OK(bk_live_read(live, r->page, r->lod, BK_LAYER_COMBINED, BK_FORMAT_RGB32F, r, first, PAGE * 3 * sizeof(float)));
             bytes += (uint64_t)8 * r->width * r->height;
         }
     } while (count == 16);
@@ -531,7 +535,7 @@ static void limited(bk_scene *scene, bk_lightmap *lightmap, uint32_t background)
         CHECK(bytes > 0 || stats.dirty_bytes_left == 0);
     }
     for (page = 0; page < pages; page++) {
-        CHECK_OK(bk_live_read(live, page, 2, BK_FORMAT_RGB32F, NULL, now, 0));
+        CHECK_OK(bk_live_read(live, page, 2, BK_LAYER_COMBINED, BK_FORMAT_RGB32F, NULL, now, 0));
         CHECK(memcmp(now, copy + page * floats, floats * sizeof *now) == 0);
     }
     bk_live_release(live);

@@ -354,7 +354,7 @@ static double energy(bk_live *live) {
     static float texels[256 * 256 * 3];
     double sum = 0.0;
     size_t i;
-    CHECK_OK(bk_live_read(live, 0, 2, BK_FORMAT_RGB32F, NULL, texels, 0));
+    CHECK_OK(bk_live_read(live, 0, 2, BK_LAYER_COMBINED, BK_FORMAT_RGB32F, NULL, texels, 0));
     for (i = 0; i < 256 * 256 * 3; i++) sum += texels[i];
     return sum;
 }

@@ -109,7 +109,7 @@ static void *reader(void *user) {
         bk_cell_info info;
         bk_result result;
         bk_cell_info_init(&info);
-        result = bk_live_read(r->live, 0, 2, BK_FORMAT_RGB32F, NULL, texels, 0);
+        result = bk_live_read(r->live, 0, 2, BK_LAYER_COMBINED, BK_FORMAT_RGB32F, NULL, texels, 0);
         for (i = 0; result == BK_OK && i < PAGE * PAGE * 3; i++) wrong += !(texels[i] >= 0.0f && texels[i] < 1e6f);
         bk_live_cell_lods(r->live, &info, NULL, 0);
         pthread_mutex_lock(&r->lock);

@@ -218,7 +218,7 @@ static int32_t read_in_callback(void *user, float fraction, const char *stage) {
     reader->entered_again += reader->inside;
     reader->inside = 1;
     if (bk_lightmap_read(reader->other, 0, BK_LAYER_COMBINED, BK_FORMAT_RGB32F, reader->texels, 0) != BK_OK ||
-        bk_live_read(reader->live, 0, BK_LAYER_COMBINED, BK_FORMAT_RGB32F, 0, reader->texels, 0) != BK_OK) {
+        bk_live_read(reader->live, 0, 0, BK_LAYER_COMBINED, BK_FORMAT_RGB32F, 0, reader->texels, 0) != BK_OK) {
         reader->failed++;
     }
     reader->inside = 0;
@@ -397,7 +397,7 @@ static void no_thread_is_started_but_those_of_devices(void) {
     bk_camera_init(&camera);
     camera.position[2] = 3.0f;
     CHECK_OK(bk_live_update(live, &camera, NULL, NULL));
-    CHECK_OK(bk_live_read(live, 0, BK_LAYER_COMBINED, BK_FORMAT_RGB32F, 0, texels, 0));
+    CHECK_OK(bk_live_read(live, 0, 0, BK_LAYER_COMBINED, BK_FORMAT_RGB32F, 0, texels, 0));
     snprintf(path, sizeof path, "%sruntime.live", folder);
     CHECK_OK(bk_live_save(live, path, NULL, NULL));
     CHECK_OK(bk_live_restore(live, path, NULL, NULL));

@@ -113,7 +113,7 @@ int main(int argc, char **argv) {
         while (count == 4) {
             CHECK_OK(bk_live_dirty_rects(live, rects, 4, &count));
         }
-        CHECK_OK(bk_live_read(live, 0, params.lod_count - 1, BK_FORMAT_RGB32F, NULL, texels, 0));
+        CHECK_OK(bk_live_read(live, 0, params.lod_count - 1, BK_LAYER_COMBINED, BK_FORMAT_RGB32F, NULL, texels, 0));
         snprintf(path, sizeof path, "%slive", folder);
         CHECK_OK(bk_live_save(live, path, progress, &reports));
         CHECK_OK(bk_live_restore(live, path, progress, &reports));

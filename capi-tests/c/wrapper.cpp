@@ -156,7 +156,7 @@ static void bake(const Scene &scene) {
     const std::vector<bk_rect> rects = VALUE(live.dirty_rects());
     CHECK(!rects.empty() && VALUE(live.dirty_rects()).empty());
     std::vector<std::byte> texels(std::size_t(12) * rects[0].width * rects[0].height);
-    VALUE(live.read(rects[0], BK_FORMAT_RGB32F, texels));
+    VALUE(live.read(rects[0], BK_LAYER_COMBINED, BK_FORMAT_RGB32F, texels));
 }
 
 static void photons(const Scene &scene) {

@@ -229,6 +229,7 @@ impl Draw {
             photon_count: self.count(&[0, 1], 1e3) as u64,
             direct_samples: self.pick(&[1, 4]),
             radius: if self.one_in(2) { 0.0 } else { self.log(-37.9, 38.0) },
+            directional: self.pick(&[0, 0, 1, 3]),
             ..Default::default()
         };
         match self.below(12) {
@@ -340,7 +341,7 @@ fn run(device: &Arc<Device>, case: u64, ran: &mut Ran) {
             allowed("update", live.update(&camera, &Budget { milliseconds: 0.0, rays, max_dirty_bytes: 0 }));
         }
         let rect = PageRect { page: 0, x: 0, y: 0, width: map.info().width, height: map.info().height };
-        if let Some(light) = allowed("read", live.read(&rect, live.params().lod_count - 1, true)) {
+        if let Some(light) = allowed("read", live.read(&rect, live.params().lod_count - 1, Layer::Combined)) {
             assert!(is_sound(&light), "live light {:?}", light.iter().find(|t| !is_sound(&[**t])));
         }
         ran.lives += 1;

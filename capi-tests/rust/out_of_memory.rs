@@ -348,10 +348,12 @@ fn live(lightmap: &Lightmap, path: &Path) {
     let mut live = fail_all("live", || Live::new(lightmap, &params, &none));
     let page = PageRect { page: 0, x: 0, y: 0, width: lightmap.info().width, height: lightmap.info().height };
     let top = params.lod_count - 1;
-    let read = |live: &Live, lod| live.read(&page, lod, true).unwrap();
+    let read = |live: &Live, lod| live.read(&page, lod, Layer::Combined).unwrap();
     for lod in [top, 0] {
         let expected = read(&live, lod);
-        assert!(fail_each("reading live light", &ALLOCATIONS_LEFT, || live.read(&page, lod, true)) == expected);
+        assert!(
+            fail_each("reading live light", &ALLOCATIONS_LEFT, || live.read(&page, lod, Layer::Combined)) == expected
+        );
     }
 
     let mut expected = Live::new(lightmap, &params, &none).unwrap();

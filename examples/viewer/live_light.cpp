@@ -195,8 +195,8 @@ bk_live_stats LiveLight::update(const bk_camera &camera, float milliseconds, uin
 
 void LiveLight::read(const bk_rect &rect, bool direct, const Use &use) {
     texels.resize(size_t(rect.width) * rect.height * TEXEL_BYTES);
-    const uint32_t format = BK_FORMAT_RGBA16F | (direct ? 0 : BK_FORMAT_INDIRECT_ONLY);
-    check(bk_live_read(live.get(), rect.page, rect.lod, format, &rect, texels.data(), 0));
+    const uint32_t layer = direct ? BK_LAYER_COMBINED : BK_LAYER_INDIRECT;
+    check(bk_live_read(live.get(), rect.page, rect.lod, layer, BK_FORMAT_RGBA16F, &rect, texels.data(), 0));
     use(rect, texels.data());
 }
 

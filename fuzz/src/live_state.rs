@@ -3,6 +3,7 @@
 
 use crate::room::{self, PAGE};
 use bakelite::Progress;
+use bakelite::lightmap::Layer;
 use bakelite::live::{Budget, Live, LiveCamera, LiveParams, PageRect};
 
 /// Bytes that stay as they are: what kind of file it is, and of which scene.
@@ -47,7 +48,7 @@ impl LiveState {
         if live.restore_bytes(&content, "input", &Progress::none()).is_ok() {
             let page = PageRect { page: 0, x: 0, y: 0, width: PAGE, height: PAGE };
             for lod in 0..live.params().lod_count {
-                let light = live.read(&page, lod, true).expect("light");
+                let light = live.read(&page, lod, Layer::Combined).expect("light");
                 assert!(light.iter().flatten().all(|c| c.is_finite() && *c >= 0.0));
             }
             live.update(&camera(), &Budget { milliseconds: 0.0, rays: 500, max_dirty_bytes: 0 }).expect("an update");

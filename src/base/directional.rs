@@ -12,7 +12,7 @@
 use bytemuck::{Pod, Zeroable};
 use glam::Vec3;
 use std::f32::consts::PI;
-use std::ops::{Add, AddAssign, Div, Mul};
+use std::ops::{Add, AddAssign, Div, Mul, Sub};
 
 /// Cosine of the angle from the normal beyond which directions count as at that angle.
 const HORIZON: f32 = 0.1;
@@ -71,6 +71,14 @@ impl Add for Directional {
         let [x, y, z] = self.l1;
         let [a, b, c] = other.l1;
         Directional { l0: self.l0 + other.l0, l1: [x + a, y + b, z + c] }
+    }
+}
+
+impl Sub for Directional {
+    type Output = Directional;
+
+    fn sub(self, other: Directional) -> Directional {
+        self + other * -1.0
     }
 }
 

@@ -14,7 +14,7 @@ use super::device::{bk_progress_fn, progress, refuse_in_callback};
 use super::error::{bk_result, call, call_or};
 use super::handles::{hold, object};
 use super::lightmap::{bk_lightmap, bk_lightmap_desc};
-use crate::base::error::invalid_argument;
+use crate::base::error::{Result, invalid_argument};
 use crate::lightmap::plan::left_out;
 use crate::lightmap::quality::Quality;
 use crate::lightmap::{BakeParams, BakeStats, CheckpointParams, LightmapDesc, StageStats, directional};
@@ -171,7 +171,7 @@ pub struct bk_bake_params {
     /// 1: compute light that was reflected by other surfaces by direction too (SH L1), for surfaces
     /// with normal maps. Reading starts at BK_LAYER_L0. It comes from the same rays; in memory it
     /// takes 48 bytes per texel of the light map, and during the bake 96 per texel of the gather
-    /// map. Live updates do not have it. Default: 0.
+    /// map. bk_live_params has the same fields. Default: 0.
     pub directional_indirect: u32,
     /// 1: the same for light that comes straight from lights, for 48 bytes more per texel of the light
     /// map during the bake. With both, the layers hold the sum.
@@ -390,6 +390,13 @@ pub unsafe extern "C" fn bk_bake_stats_init(stats: *mut bk_bake_stats) {
     unsafe { init(stats) }
 }
 
+/// Returns the bits of [`directional`] that two fields ask for.
+pub(super) fn read_directional(indirect: u32, direct: u32) -> Result<u32> {
+    let bit = |asks: bool, bit| if asks { bit } else { 0 };
+    Ok(bit(read_bool(indirect, "directional_indirect")?, directional::INDIRECT)
+        | bit(read_bool(direct, "directional_direct")?, directional::DIRECT))
+}
+
 /// Bakes a light map: computes the light of all texels, or of a range, on the device's threads.
 ///
 /// Can be called again, with other lights or parameters. The same scene, lights, light map,
@@ -428,9 +435,7 @@ pub unsafe extern "C" fn bk_bake(
         let lightmap = hold(lightmap, "lightmap")?;
         let p: bk_bake_params = if params.is_null() { SizedStruct::defaults() } else { read_struct(params, "params")? };
         let out = OutStruct::optional(out, "out")?;
-        let bit = |asks: bool, bit| if asks { bit } else { 0 };
-        let directional = bit(read_bool(p.directional_indirect, "directional_indirect")?, directional::INDIRECT)
-            | bit(read_bool(p.directional_direct, "directional_direct")?, directional::DIRECT);
+        let directional = read_directional(p.directional_indirect, p.directional_direct)?;
         let params = BakeParams {
             photon_count: p.photon_count,
             max_bounces: p.max_bounces,

@@ -15,12 +15,14 @@
 // The file is long because a section of the header is one file, and a third of it the text for the C reader.
 
 use super::args::{OutStruct, SizedStruct, init, read_bool, read_struct, read_vec3, sized_struct, slice_mut, write};
+use super::bake::read_directional;
 use super::device::{bk_progress_fn, call_with_file, progress as report_to, refuse_in_callback};
 use super::error::{BK_NONE, bk_result, call, call_or};
 use super::handles::{create, hold, is_null, object, release, retain};
 use super::lightmap::bk_lightmap;
-use super::read::{copy_rgb, texel_bytes};
+use super::read::{copy_rgb, core_layer, texel_bytes};
 use crate::base::error::{Error, Result, invalid_argument};
+use crate::lightmap::directional;
 use crate::live::{Budget, CellInfo, Live, LiveCamera, LiveParams, LiveStats, Mode, PageRect};
 use glam::Vec3;
 use std::ffi::{c_char, c_void};
@@ -33,10 +35,6 @@ pub const BK_LIVE_VIEW: u32 = 0;
 pub const BK_LIVE_POSITION: u32 = 1;
 /// Mode: refine anywhere, at random, for comparison.
 pub const BK_LIVE_UNIFORM: u32 = 2;
-
-/// Flag added to the format of bk_live_read: leave out direct light, for applications that shade it
-/// themselves.
-pub const BK_FORMAT_INDIRECT_ONLY: u32 = 0x100;
 
 /// Handle of a live object.
 pub struct bk_live {
@@ -134,6 +132,13 @@ pub struct bk_live_params {
     /// Number of rays of texels of the light map that trace rays themselves, see bk_bake_params; 0: a
     /// quarter of `max_rounds` * 64, at least 16, at most 64. Default: 16.
     pub own_rays: u32,
+    /// 1: compute light that was reflected by other surfaces by direction too, as
+    /// bk_bake_params.directional_indirect does. It takes 7 bytes more per texel of the light map.
+    /// Default: 0.
+    pub directional_indirect: u32,
+    /// 1: the same for light that comes straight from lights, for 48 bytes more per texel of the light
+    /// map. With both, the layers hold the sum. Default: 0.
+    pub directional_direct: u32,
 }
 
 sized_struct!(bk_live_params, defaults: {
@@ -156,6 +161,8 @@ sized_struct!(bk_live_params, defaults: {
         interpolation_error: p.interpolation_error,
         own_rays: p.own_rays,
         background: p.background as u32,
+        directional_indirect: u32::from(p.directional & directional::INDIRECT != 0),
+        directional_direct: u32::from(p.directional & directional::DIRECT != 0),
     }
 });
 
@@ -192,6 +199,7 @@ fn core_params(p: &bk_live_params) -> Result<LiveParams> {
         interpolation_error: p.interpolation_error,
         own_rays: p.own_rays,
         background: read_bool(p.background, "background")?,
+        directional: read_directional(p.directional_indirect, p.directional_direct)?,
     })
 }
 
@@ -536,28 +544,34 @@ pub unsafe extern "C" fn bk_live_dirty_rects(
     })
 }
 
-/// Copies the shown irradiance, in W/m2, of a rectangle of a page.
+/// Copies the shown light of a rectangle of a page.
 ///
-/// Cost: about 0.2 microseconds per texel; more for an LOD below the highest.
+/// Cost: about 0.2 microseconds per texel; more for layers of light by direction and for an LOD below
+/// the highest.
 ///
 /// @param live  live object
 /// @param page  number of the page
 /// @param lod  lod_count - 1 for the light as shown; less for the light as it would be shown if no
 ///   texel were above that LOD
-/// @param format  BK_FORMAT_RGB32F or BK_FORMAT_RGBA16F, with or without BK_FORMAT_INDIRECT_ONLY
+/// @param layer  BK_LAYER_COMBINED, INDIRECT or DIRECT; or one from BK_LAYER_L0 to DIRECTION, of a live
+///   object that was created with `directional_indirect` or `directional_direct`
+/// @param format  BK_FORMAT_RGB32F or BK_FORMAT_RGBA16F; for ratios and DIRECTION also BK_FORMAT_RGBA8
 /// @param rect  `x`, `y`, `width` and `height` of the rectangle; its `page` and `lod` are ignored.
 ///   NULL: the whole page
 /// @param dst  receives the rectangle's rows; needs no alignment
 /// @param row_stride  distance between rows in bytes, at least the bytes of a row; 0: packed
-/// @retval BK_ERROR_INVALID_ARGUMENT  page, LOD or format does not exist, the rectangle is not
-///   within the page, or `row_stride` is too small
-/// @retval BK_ERROR_INVALID_STATE  another call is changing the live object
+/// @retval BK_ERROR_INVALID_ARGUMENT  page, LOD, layer or format does not exist, the layer is another
+///   one, the format does not suit it, the rectangle is not within the page, or `row_stride` is too
+///   small
+/// @retval BK_ERROR_INVALID_STATE  another call is changing the live object, or it was created without
+///   light by direction
 /// @retval BK_ERROR_OUT_OF_MEMORY  the rectangle does not fit
 #[unsafe(no_mangle)]
 pub unsafe extern "C" fn bk_live_read(
     live: *const bk_live,
     page: u32,
     lod: u32,
+    layer: u32,
     format: u32,
     rect: *const bk_rect,
     dst: *mut c_void,
@@ -568,8 +582,7 @@ pub unsafe extern "C" fn bk_live_read(
         if dst.is_null() {
             return Err(is_null("dst"));
         }
-        let with_direct = format & BK_FORMAT_INDIRECT_ONLY == 0;
-        let format = format & !BK_FORMAT_INDIRECT_ONLY;
+        let layer = core_layer(layer)?;
         let texel = texel_bytes(format)?;
         // SAFETY: the caller's rectangle, or NULL.
         let rect = unsafe { rect.as_ref() };
@@ -587,9 +600,9 @@ pub unsafe extern "C" fn bk_live_read(
             if stride < packed {
                 return invalid_argument!("row_stride is {row_stride}, less than the {packed} bytes of a row");
             }
-            let texels = l.read(&rect, lod, with_direct)?;
+            let texels = l.read(&rect, lod, layer)?;
             // SAFETY: the caller has room for the rectangle's rows, `stride` bytes apart.
-            unsafe { copy_rgb(texels, format, rect.width as usize, dst, stride) }
+            unsafe { copy_rgb(texels, layer, format, rect.width as usize, dst, stride) }
         })
     })
 }

@@ -116,9 +116,7 @@ pub unsafe extern "C" fn bk_lightmap_read(
         if stride < packed {
             return invalid_argument!("row_stride is {row_stride}, less than the {packed} bytes of a row");
         }
-        let bytes = encode(&data, layer.is_ratio(), format)?.ok_or_else(|| {
-            Error::InvalidArgument(format!("format is {format}, which does not suit the layer {layer:?}"))
-        })?;
+        let bytes = encode(&data, layer.is_ratio(), format)?.ok_or_else(|| unsuitable(format, layer))?;
         if bytes.len() != packed * info.height as usize {
             return Err(Error::Internal(format!("page {page} has {} bytes in layer {layer:?}", bytes.len())));
         }
@@ -140,20 +138,20 @@ unsafe fn copy_rows(bytes: &[u8], packed: usize, dst: *mut c_void, stride: usize
     }
 }
 
-/// Copies RGB texels, `width` per row, in a format of theirs.
+/// Copies RGB texels of a layer, `width` per row, in a format of theirs.
 ///
 /// # Safety
 /// `dst` has room for all rows of texels, `stride` bytes apart.
 pub(super) unsafe fn copy_rgb(
     texels: Vec<[f32; 3]>,
+    layer: Layer,
     format: u32,
     width: usize,
     dst: *mut c_void,
     stride: usize,
 ) -> Result<()> {
     let bytes = LayerData::Rgb(texels);
-    let bytes = encode(&bytes, false, format)?
-        .ok_or_else(|| Error::InvalidArgument(format!("format is {format}, not one of the formats of light")))?;
+    let bytes = encode(&bytes, layer.is_ratio(), format)?.ok_or_else(|| unsuitable(format, layer))?;
     if width > 0 {
         // SAFETY: by contract.
         unsafe { copy_rows(&bytes, width * texel_bytes(format)?, dst, stride) };
@@ -161,7 +159,11 @@ pub(super) unsafe fn copy_rgb(
     Ok(())
 }
 
-fn core_layer(layer: u32) -> Result<Layer> {
+fn unsuitable(format: u32, layer: Layer) -> Error {
+    Error::InvalidArgument(format!("format is {format}, which does not suit the layer {layer:?}"))
+}
+
+pub(super) fn core_layer(layer: u32) -> Result<Layer> {
     Ok(match layer {
         BK_LAYER_COMBINED => Layer::Combined,
         BK_LAYER_INDIRECT => Layer::Indirect,

@@ -322,9 +322,30 @@ pub enum Layer {
 }
 
 impl Layer {
+    /// Returns what the layer holds of light by direction; 0 if that is nothing.
+    pub(crate) fn of_directional(self, d: &Directional) -> Vec3 {
+        let ratio = |l1: Vec3, l0: Vec3| Vec3::select(l0.cmpgt(Vec3::ZERO), l1 / l0, Vec3::ZERO);
+        match self {
+            Layer::L0 => d.l0,
+            Layer::L1X => d.l1[0],
+            Layer::L1Y => d.l1[1],
+            Layer::L1Z => d.l1[2],
+            Layer::RatioX => ratio(d.l1[0], d.l0),
+            Layer::RatioY => ratio(d.l1[1], d.l0),
+            Layer::RatioZ => ratio(d.l1[2], d.l0),
+            Layer::Direction => ratio(d.l1.map(Vec3::element_sum).into(), Vec3::splat(d.l0.element_sum())),
+            _ => Vec3::ZERO,
+        }
+    }
+
     /// Whether the layer holds light that a bake computes.
     pub fn is_light(self) -> bool {
         !matches!(self, Layer::Validity | Layer::Position | Layer::Normal | Layer::Triangle)
+    }
+
+    /// Whether the layer holds light by direction.
+    pub fn is_directional(self) -> bool {
+        self.is_ratio() || matches!(self, Layer::L0 | Layer::L1X | Layer::L1Y | Layer::L1Z)
     }
 
     /// Whether the values are ratios, −1 to 1.

@@ -5,7 +5,6 @@ use super::atlas::texels::PageArea;
 use super::indirect::radiance_map;
 use super::indirect::radiance_map::RadianceLookup;
 use super::{Layer, LayerData, Light, Lightmap, TexelState};
-use crate::base::directional::Directional;
 use crate::base::error::{Error, Result, invalid_argument};
 use crate::base::memory::{try_collect, try_vec, try_with_capacity};
 use crate::direct::DirectLight;
@@ -18,22 +17,6 @@ const FILLED: f32 = 0.5;
 
 /// UVs of the corners of each triangle, and its page.
 pub type MeshUvs = (Vec<[[f32; 2]; 3]>, Vec<u32>);
-
-/// Returns what a layer holds of light by direction; 0 if that is nothing.
-fn part_of(d: &Directional, layer: Layer) -> Vec3 {
-    let ratio = |l1: Vec3, l0: Vec3| Vec3::select(l0.cmpgt(Vec3::ZERO), l1 / l0, Vec3::ZERO);
-    match layer {
-        Layer::L0 => d.l0,
-        Layer::L1X => d.l1[0],
-        Layer::L1Y => d.l1[1],
-        Layer::L1Z => d.l1[2],
-        Layer::RatioX => ratio(d.l1[0], d.l0),
-        Layer::RatioY => ratio(d.l1[1], d.l0),
-        Layer::RatioZ => ratio(d.l1[2], d.l0),
-        Layer::Direction => ratio(d.l1.map(Vec3::element_sum).into(), Vec3::splat(d.l0.element_sum())),
-        _ => Vec3::ZERO,
-    }
-}
 
 impl Lightmap {
     /// Returns the light map UV in [0, 1] of each corner, and the page of each triangle of `mesh`. Triangles without
@@ -166,7 +149,7 @@ impl Lightmap {
                 if light.directional.is_empty() {
                     return Err(Error::InvalidState("the light map was baked without light by direction".into()));
                 }
-                self.page_of_light(page, |s| part_of(&light.directional[s.index()], layer).to_array())
+                self.page_of_light(page, |s| layer.of_directional(&light.directional[s.index()]).to_array())
             }
             Layer::Validity => {
                 let padding = self.atlas.padding;
@@ -289,7 +272,7 @@ impl Lightmap {
             Layer::Direct => light.direct[s.index()],
             Layer::Indirect => light.indirect[s.index()],
             Layer::Radiance => self.radiance_at(light, s).into(),
-            _ => light.directional.get(s.index()).map_or(Vec3::ZERO, |d| part_of(d, layer)),
+            _ => light.directional.get(s.index()).map_or(Vec3::ZERO, |d| layer.of_directional(d)),
         };
         let mut sum = Vec3::ZERO;
         let placement = self.atlas.map.layout.place_of(chart, front);

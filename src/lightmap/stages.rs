@@ -140,6 +140,7 @@ pub(crate) fn upsampling(inputs: &Inputs, backs: &[bool], placements: Range<usiz
 }
 
 /// Light of fallback gathers, and the number of their rays.
+#[derive(Default)]
 pub(crate) struct Own {
     pub light: OwnLight,
     pub directional: OwnDirectional,

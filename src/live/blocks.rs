@@ -5,6 +5,7 @@
 //! resolution); the texels of a lower LOD are among those of the next, so that no ray is lost when
 //! the detail grows, and what two LODs share at the border of two blocks has one value.
 
+use crate::base::directional::Directional;
 use crate::base::error::Result;
 use crate::base::memory::{try_collect, try_to_vec, try_vec, try_with_capacity};
 use crate::base::progress::Progress;
@@ -85,6 +86,8 @@ pub(super) struct DirectTile {
     pub rect: Rect,
     /// Light row by row; only the values of the block's own texels are meaningful.
     pub values: Box<[Vec3]>,
+    /// The same by direction; empty if nobody asks for it.
+    pub directional: Box<[Directional]>,
 }
 
 /// The constant part of a block.
@@ -137,11 +140,13 @@ pub(super) struct DirectWork {
     /// Light without penumbrae at the samples of the tile and of one more row and column on each side; NaN where it has
     /// not been computed yet.
     pub sharp: Box<[Vec3]>,
+    /// The same by direction; empty if nobody asks for it.
+    pub sharp_directional: Box<[Directional]>,
 }
 
 impl DirectWork {
     pub fn bytes(&self) -> usize {
-        self.tile.bytes() + size_of_val(&self.sharp[..])
+        self.tile.bytes() + size_of_val(&self.sharp[..]) + size_of_val(&self.sharp_directional[..])
     }
 }
 
@@ -151,14 +156,18 @@ impl DirectWork {
 pub(super) struct BlockWork {
     /// Sums gathered by the texels that have been worked on so far.
     pub gathered: Vec<Gathered>,
+    /// Sums of their light by direction; empty if nobody asks for it.
+    pub directional: Vec<Directional>,
     /// Light of an earlier epoch, by texel, that fades out while new rays come in; may be empty.
     pub prior: Box<[Vec3]>,
+    pub prior_directional: Box<[Directional]>,
     /// The next texel of the step under way.
     pub cursor: u16,
     pub direct: Option<DirectWork>,
     /// Finished light on its way to the display: coarse direct light of the lowest LOD's texels, and
     /// direct light at full resolution.
     pub new_coarse: Box<[Vec3]>,
+    pub new_coarse_directional: Box<[Directional]>,
     pub new_direct: Option<DirectTile>,
     /// Sum of squared deviations of the rounds from the mean so far, summed over the channels, and their number.
     pub deviations: f32,
@@ -250,7 +259,7 @@ impl Blocks {
 
 impl DirectTile {
     pub fn bytes(&self) -> usize {
-        self.values.len() * size_of::<Vec3>()
+        size_of_val(&self.values[..]) + size_of_val(&self.directional[..])
     }
 }
 
@@ -265,7 +274,9 @@ impl BlockWork {
     /// Bytes held, without the structure itself.
     pub fn bytes(&self) -> usize {
         self.gathered.capacity() * size_of::<Gathered>()
-            + self.prior.len() * size_of::<Vec3>()
+            + self.directional.capacity() * size_of::<Directional>()
+            + size_of_val(&self.prior[..])
+            + size_of_val(&self.prior_directional[..])
             + self.direct.as_ref().map_or(0, DirectWork::bytes)
     }
 }
@@ -402,6 +413,11 @@ impl BlockMap {
         let rows = (end - first) as i32 / columns.max(1);
         let (i, j) = (((x - ox) / TILE).clamp(0, columns - 1), ((y - oy) / TILE).clamp(0, rows - 1));
         first + (j * columns + i) as u32
+    }
+
+    /// The rectangle of a placement in the gather map.
+    pub fn own_rect(&self, placement: PlacementId) -> Rect {
+        Rect::of(&self.atlas.gather.layout[placement])
     }
 
     /// The blocks of a placement.

@@ -16,7 +16,6 @@ use crate::base::parallel::one_by_one;
 use crate::base::progress::Progress;
 use crate::base::sampling::purpose_seed;
 use crate::lightmap::Lightmap;
-use crate::lightmap::indirect::gather::Gathered;
 use crate::lightmap::indirect::sample_set::SampleSet;
 use crate::lightmap::stages::purpose;
 use glam::Vec3;
@@ -50,7 +49,7 @@ impl Live {
         let lights = atlas.scene.lights();
         let light = Illumination::new(atlas, &bake, progress)?;
         progress.check()?;
-        let display = Display::new(&map, params.blur)?;
+        let display = Display::new(&map, params.blur, params.directional != 0)?;
         progress.check()?;
         let bins = ChartBins::new(&map)?;
         let chooser = Chooser::new(&map, &grid)?;
@@ -67,7 +66,8 @@ impl Live {
             // Marks, visible blocks, the queues of blocks that wait to be shown or fade, and rectangles.
             + map.tiles.len() * (21 + size_of::<Rect>());
         let memory = atlas.scene.device().memory().reserve(fixed, "the live state")?;
-        let all_of = |t: &Tile| t.texels.len() * size_of::<Gathered>() + t.map_texels as usize * size_of::<Vec3>();
+        let all_of =
+            |t: &Tile| t.texels.len() * params.gathered_bytes() + t.map_texels as usize * params.direct_bytes();
         let full: usize = map.tiles.iter().map(all_of).sum();
         let blocks = Blocks::new(map.tiles.len())?;
         let mut alone = try_vec(blocks.len(), "texels on their own")?;
@@ -103,6 +103,7 @@ impl Live {
                 near_hits: params.near_hits,
                 direct_seed: purpose_seed(params.seed, purpose::DIRECT),
                 direct_samples: params.direct_samples,
+                directional: params.directional,
                 direct_rays: light.direct.rays_per_point(params.direct_samples),
                 dim: 0.0,
                 promote_threshold: params.promote_threshold,

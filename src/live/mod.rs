@@ -25,6 +25,7 @@ mod readback;
 mod relight;
 mod save;
 mod show;
+mod shown_layer;
 mod visibility;
 mod work;
 
@@ -36,7 +37,6 @@ use crate::base::error::Result;
 use crate::base::memory::Reservation;
 use crate::device::Device;
 use crate::lightmap::BakeParams;
-use crate::lightmap::indirect::gather::Gathered;
 use crate::scene::{Light, Scene};
 use batch::{Background, Batch, Item};
 use blocks::{BlockStatus, Blocks, Rect};
@@ -44,7 +44,6 @@ use cells::{Grid, Promotion};
 use choose::{Choice, Chooser};
 use dirty::Dirty;
 use display::Display;
-use glam::Vec3;
 use readback::{ChartBins, ReadingTime};
 use relight::Relight;
 use std::collections::VecDeque;
@@ -258,8 +257,8 @@ impl Live {
         let growth = |&b: &u32| {
             let tile = &self.context.map.tiles[b as usize];
             // Direct light under way is held beside the shown one.
-            tile.texels.len() * (size_of::<Gathered>() + size_of::<Vec3>())
-                + 2 * tile.map_texels as usize * size_of::<Vec3>()
+            tile.texels.len() * (self.params.gathered_bytes() + self.params.shown_bytes())
+                + 2 * tile.map_texels as usize * self.params.direct_bytes()
         };
         self.reserve(chosen.iter().map(growth).sum())
     }

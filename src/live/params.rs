@@ -2,11 +2,13 @@
 
 use super::MAX_LODS;
 use super::dirty::LEAST_BYTES;
+use crate::base::directional::Directional;
 use crate::base::error::{Result, invalid_argument};
-use crate::lightmap::BakeParams;
 use crate::lightmap::indirect::blur::MAX_BLUR_RADIUS;
+use crate::lightmap::indirect::gather::Gathered;
 use crate::lightmap::indirect::sample_set::ROUND;
 use crate::lightmap::indirect::upsample::OWN_RAYS;
+use crate::lightmap::{BakeParams, directional};
 use glam::Vec3;
 
 /// The choice of blocks that updates work on.
@@ -57,6 +59,8 @@ pub struct LiveParams {
     pub own_rays: u32,
     /// Whether the device's threads go on working between updates.
     pub background: bool,
+    /// Bits of [`directional`]: the light that is computed by direction too, as in a bake.
+    pub directional: u32,
 }
 
 impl Default for LiveParams {
@@ -79,6 +83,7 @@ impl Default for LiveParams {
             interpolation_error: f32::INFINITY,
             own_rays: OWN_RAYS,
             background: false,
+            directional: bake.directional,
         }
     }
 }
@@ -190,10 +195,32 @@ impl LiveParams {
             blur_radius: self.blur,
             direct_samples: self.direct_samples,
             seed: self.seed,
+            directional: self.directional,
             // Shown light changes block by block, and each block is shown as it is.
             stitch: false,
             ..Default::default()
         }
+    }
+}
+
+impl LiveParams {
+    /// Bytes of a gather texel's sums.
+    pub(super) fn gathered_bytes(&self) -> usize {
+        size_of::<Gathered>() + self.by_direction(directional::INDIRECT)
+    }
+
+    /// Bytes of a gather texel's light of before a change.
+    pub(super) fn shown_bytes(&self) -> usize {
+        size_of::<Vec3>() + self.by_direction(directional::INDIRECT)
+    }
+
+    /// Bytes of a light map texel's direct light.
+    pub(super) fn direct_bytes(&self) -> usize {
+        size_of::<Vec3>() + self.by_direction(directional::DIRECT)
+    }
+
+    fn by_direction(&self, bit: u32) -> usize {
+        if self.directional & bit != 0 { size_of::<Directional>() } else { 0 }
     }
 }
 

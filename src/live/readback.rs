@@ -8,6 +8,7 @@ use crate::base::error::{Error, Result, invalid_argument};
 use crate::base::memory::{try_append, try_vec};
 use crate::lightmap::atlas::ids::LightTexel;
 use crate::lightmap::atlas::texels::PageArea;
+use crate::lightmap::{Layer, directional};
 use glam::Vec3;
 use rayon::prelude::*;
 use std::sync::atomic::{AtomicU64, Ordering::Relaxed};
@@ -69,6 +70,14 @@ fn overlapping(side: i32, page: u32, area: &PageArea) -> impl Iterator<Item = us
         .map(move |(i, j)| (page as usize * side as usize + j as usize) * side as usize + i as usize)
 }
 
+/// What is read of the shown light: parts of the irradiance, by bits of [`directional`], or a layer of light by
+/// direction.
+#[derive(Clone, Copy)]
+enum Shown {
+    Irradiance(u32),
+    ByDirection(Layer),
+}
+
 /// Recent time of reading a texel of the shown light.
 #[derive(Default)]
 pub(super) struct ReadingTime {
@@ -104,10 +113,11 @@ impl ReadingTime {
 }
 
 impl Live {
-    /// Irradiance shown in a rectangle of a page, row by row; `with_direct` false: indirect light alone. Texels around
-    /// charts repeat the chart's nearest texel, up to the padding. `lod` below the highest: reads the light as it would
-    /// be shown if no block were above it (slow).
-    pub fn read(&self, rect: &PageRect, lod: u32, with_direct: bool) -> Result<Vec<[f32; 3]>> {
+    /// Light shown in a rectangle of a page, row by row: combined, indirect or direct irradiance, or a layer of light by
+    /// direction, if that was asked for. Texels around charts repeat the chart's nearest texel, up to the padding. `lod`
+    /// below the highest: reads the light as it would be shown if no block were above it (slow).
+    pub fn read(&self, rect: &PageRect, lod: u32, layer: Layer) -> Result<Vec<[f32; 3]>> {
+        let layer = self.shown(layer)?;
         let atlas = &self.context.map.atlas;
         let size = self.page_size();
         let (right, bottom) = (rect.x as u64 + rect.width as u64, rect.y as u64 + rect.height as u64);
@@ -130,7 +140,7 @@ impl Live {
         let compose = |(i, out): (usize, &mut [[f32; 3]])| {
             let y0 = r.y0 + (i * ROWS) as i32;
             let rows = Rect { y0, y1: (y0 + ROWS as i32).min(r.y1), ..r };
-            self.compose(display, rect.page, &rows, with_direct, out)
+            self.compose(display, rect.page, &rows, layer, out)
         };
         if r.area() < SMALL {
             out.chunks_mut(r.width() * ROWS).enumerate().try_for_each(compose)?;
@@ -144,20 +154,38 @@ impl Live {
         Ok(out)
     }
 
-    fn compose(
-        &self,
-        display: &Display,
-        page: u32,
-        rows: &Rect,
-        with_direct: bool,
-        out: &mut [[f32; 3]],
-    ) -> Result<()> {
+    /// Whether a layer is shown, and how.
+    fn shown(&self, layer: Layer) -> Result<Shown> {
+        match layer {
+            Layer::Combined => Ok(Shown::Irradiance(directional::INDIRECT | directional::DIRECT)),
+            Layer::Indirect => Ok(Shown::Irradiance(directional::INDIRECT)),
+            Layer::Direct => Ok(Shown::Irradiance(directional::DIRECT)),
+            _ if !layer.is_directional() => invalid_argument!("layer is {layer:?}, which live updates do not show"),
+            _ if !self.display.has_directional() => {
+                Err(Error::InvalidState("the live object was created without light by direction".into()))
+            }
+            _ => Ok(Shown::ByDirection(layer)),
+        }
+    }
+
+    fn compose(&self, display: &Display, page: u32, rows: &Rect, layer: Shown, out: &mut [[f32; 3]]) -> Result<()> {
         let (map, light) = (&self.context.map, &*self.context.light);
         let atlas = &map.atlas;
         let area = PageArea { columns: rows.x0..rows.x1, rows: rows.y0..rows.y1 };
         let groups = self.bins.groups(page, &area)?.into_iter().map(|g| g as usize);
-        let value = |i: u32| display.irradiance(map, light, LightTexel::new(i as usize), with_direct).to_array();
-        atlas.map.texels.compose(groups, &area, atlas.padding, out, value, |v| v)
+        let texels = &atlas.map.texels;
+        let texel = |i: u32| LightTexel::new(i as usize);
+        match layer {
+            Shown::Irradiance(parts) => {
+                let value = |i| display.irradiance(map, light, texel(i), parts).to_array();
+                texels.compose(groups, &area, atlas.padding, out, value, |v| v)
+            }
+            Shown::ByDirection(layer) => {
+                let parts = self.params.directional;
+                let value = |i| layer.of_directional(&display.directional(map, light, texel(i), parts)).to_array();
+                texels.compose(groups, &area, atlas.padding, out, value, |v| v)
+            }
+        }
     }
 }
 

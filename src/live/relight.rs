@@ -15,11 +15,10 @@ use crate::device::{Device, DeviceOptions};
 use crate::direct::DirectLight;
 use crate::lightmap::atlas::Atlas;
 use crate::lightmap::indirect::radiance_map::Radiance;
-use crate::lightmap::indirect::upsample::{OwnLight, Upsampling};
+use crate::lightmap::indirect::upsample::{OwnDirectional, OwnLight, Upsampling};
 use crate::lightmap::plan::{Plan, left_out};
-use crate::lightmap::stages::{self, Inputs};
-use crate::lightmap::{BakeParams, BakeStats};
-use glam::Vec3;
+use crate::lightmap::stages::{self, Inputs, Own};
+use crate::lightmap::{BakeParams, BakeStats, directional};
 use std::panic::{AssertUnwindSafe, catch_unwind};
 use std::sync::atomic::{AtomicBool, Ordering::Relaxed};
 use std::sync::mpsc::{Receiver, TryRecvError, channel};
@@ -47,6 +46,7 @@ pub(super) struct Illumination {
     pub sides: Arc<Sides>,
     /// Light of the texels that gather for themselves, as no gather texel can be interpolated for them.
     pub own: Arc<OwnLight>,
+    pub own_directional: Arc<OwnDirectional>,
     /// Whether there is any indirect light, or ever was.
     pub has_indirect: bool,
     /// Epochs of direct and indirect light: they change with the data.
@@ -58,7 +58,7 @@ pub(super) struct Illumination {
 pub(super) struct Indirect {
     radiance: Radiance,
     sides: Arc<Sides>,
-    own: OwnLight,
+    own: Own,
     has_indirect: bool,
 }
 
@@ -86,8 +86,11 @@ fn illuminate(
     };
     // Without indirect light there is no radiance map to look up.
     let own = match has_indirect {
-        true => stages::own_light(&inputs, &radiance, &sides.backs, &sides.upsampling, false)?.light,
-        false => OwnLight::new(),
+        true => {
+            let asks = params.directional & directional::INDIRECT != 0;
+            stages::own_light(&inputs, &radiance, &sides.backs, &sides.upsampling, asks)?
+        }
+        false => Own::default(),
     };
     Ok(Indirect { radiance, sides, own, has_indirect })
 }
@@ -101,7 +104,8 @@ impl Illumination {
             direct: Arc::new(direct),
             radiance: Arc::new(i.radiance),
             sides: i.sides,
-            own: Arc::new(i.own),
+            own: Arc::new(i.own.light),
+            own_directional: Arc::new(i.own.directional),
             has_indirect: i.has_indirect,
             direct_epoch: 1,
             indirect_epoch: 1,
@@ -117,17 +121,23 @@ impl Illumination {
                 // Other sides are shown: their direct light differs too.
                 light.direct_epoch += 1;
             }
-            (light.sides, light.own) = (new.sides, Arc::new(new.own));
+            (light.sides, light.own) = (new.sides, Arc::new(new.own.light));
+            light.own_directional = Arc::new(new.own.directional);
             light.has_indirect = true;
         } else {
             // All lights have gone dark: the shown light fades to black, on the shown sides.
             let values = try_vec(self.radiance.values.len(), "the radiance map")?;
             light.radiance = Arc::new(Radiance { values, ..Default::default() });
-            let own = self.own.iter().map(|own| own.map(|_| Vec3::ZERO));
-            light.own = Arc::new(try_collect(own, "texels on their own")?);
+            light.own = Arc::new(darkened(&self.own)?);
+            light.own_directional = Arc::new(darkened(&self.own_directional)?);
         }
         Ok(light)
     }
+}
+
+/// The light of texels that gather for themselves when all is dark.
+fn darkened<T: Default>(own: &[Option<T>]) -> Result<Vec<Option<T>>> {
+    try_collect(own.iter().map(|own| own.as_ref().map(|_| T::default())), "texels on their own")
 }
 
 /// Renews indirect light on a thread of its own.
@@ -383,8 +393,10 @@ impl Live {
 #[cfg(test)]
 mod tests {
     use super::*;
+    use crate::base::directional::Directional;
     use crate::lightmap::{Lightmap, LightmapDesc};
     use crate::scene::{Light, builtin};
+    use glam::Vec3;
 
     #[test]
     fn few_photons_turn_no_sides_over() {
@@ -397,14 +409,15 @@ mod tests {
             radiance: Arc::new(plain(Vec3::ZERO)),
             sides: shown.clone(),
             own: Arc::new(vec![Some(Vec3::X), None]),
+            own_directional: Arc::new(vec![Some(Directional::of(Vec3::X, Vec3::Y, 1.0)), None]),
             has_indirect: true,
             direct_epoch: 1,
             indirect_epoch: 1,
         };
-        let new = |sides: &Arc<Sides>, own: OwnLight| Indirect {
+        let new = |sides: &Arc<Sides>, light: OwnLight| Indirect {
             radiance: plain(Vec3::ONE),
             sides: sides.clone(),
-            own,
+            own: Own { directional: vec![Some(Directional::default()); light.len()], light, rays: 0 },
             has_indirect: true,
         };
         let quick = before.renewed(new(&shown, vec![Some(Vec3::Y), None])).unwrap();
@@ -416,6 +429,9 @@ mod tests {
         // Texels that gather for themselves must not go on shining.
         let dark = quick.renewed(Indirect { has_indirect: false, ..new(&sides([true, true]), Vec::new()) }).unwrap();
         assert_eq!((&dark.sides.backs, &dark.own[..]), (&shown.backs, &[Some(Vec3::ZERO), None][..]));
+        assert_eq!(before.renewed(new(&shown, Vec::new())).unwrap().own_directional.len(), 0);
+        let gone_dark = before.renewed(Indirect { has_indirect: false, ..new(&shown, Vec::new()) }).unwrap();
+        assert_eq!(gone_dark.own_directional[..], [Some(Directional::default()), None]);
     }
 
     /// The result of a renewal with few photons fits the shown sides, whatever sides are found later.
@@ -438,9 +454,9 @@ mod tests {
         };
         let mut results = renewals();
         let last = results.pop().unwrap();
-        assert!(!Arc::ptr_eq(&last.sides, &light.sides) && last.own == *light.own);
+        assert!(!Arc::ptr_eq(&last.sides, &light.sides) && last.own.light == *light.own);
         if let Some(quick) = results.first() {
-            assert!(Arc::ptr_eq(&quick.sides, &light.sides) && quick.own != *light.own);
+            assert!(Arc::ptr_eq(&quick.sides, &light.sides) && quick.own.light != *light.own);
         }
         // All lights go out.
         for id in 0..scene.lights().len() as u32 {

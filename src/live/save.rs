@@ -8,10 +8,12 @@ use super::blocks::{Block, BlockStatus, BlockWork, Blocks, DirectTile, Tile};
 use super::display::Display;
 use super::work::owns;
 use super::{Live, in_parts};
+use crate::base::directional::Directional;
 use crate::base::error::{Error, Result, invalid_argument};
 use crate::base::files;
 use crate::base::memory::{try_vec, try_with_capacity};
 use crate::base::progress::Progress;
+use crate::lightmap::directional;
 use crate::lightmap::indirect::gather::Gathered;
 use crate::lightmap::indirect::sample_set::ROUND;
 use crate::scene::MOST_LIGHT;
@@ -20,14 +22,15 @@ use std::fmt::Write;
 use std::io::Read;
 use std::path::Path;
 
-const MAGIC: [u8; 8] = *b"BKLIVE3\0";
+const MAGIC: [u8; 8] = *b"BKLIVE4\0";
 
 /// Size in bytes of magic, fingerprint and number of blocks.
 const HEAD: usize = 24;
 
-/// Size in bytes of a block without its texels, and of a gathered texel.
+/// Size in bytes of a block without its texels, of a gathered texel, and of light by direction.
 const BLOCK_BYTES: usize = 18;
 const TEXEL_BYTES: usize = 24;
+const DIRECTIONAL_BYTES: usize = size_of::<Directional>();
 
 /// Number of bytes that are read, hashed or written between two progress reports.
 const PIECE: usize = 1 << 18;
@@ -61,7 +64,7 @@ impl std::fmt::Write for Hash {
 struct Saved {
     block: Block,
     shown: u8,
-    direct: Option<Box<[Vec3]>>,
+    direct: Option<DirectTile>,
 }
 
 /// Reason for which a part of a file is rejected.
@@ -134,7 +137,7 @@ impl Live {
 
     /// Makes display and blocks from the saved ones: the part of restoring that can fail.
     fn restored(&mut self, saved: Vec<Saved>, progress: &Progress) -> Result<(Display, Blocks)> {
-        let direct = |s: &Saved| s.direct.as_ref().map_or(0, |d| size_of_val(&d[..]));
+        let direct = |s: &Saved| s.direct.as_ref().map_or(0, DirectTile::bytes);
         let held: usize = saved.iter().map(|s| s.block.work.bytes() + direct(s)).sum();
         // Old and new state are held at the same time.
         self.reserve(held + self.display.bytes())?;
@@ -156,13 +159,11 @@ impl Live {
             block.status.direct_mean = old.direct_mean;
             block.status.direct_epoch = old.direct_epoch;
             block.status.indirect_epoch = context.light.indirect_epoch;
-            if let Some(values) = saved.direct
+            if let Some(tile) = saved.direct
                 && block.status.changes_behind(context) == 0
             {
                 block.status.direct_epoch = context.light.direct_epoch;
-                let tile = &context.map.tiles[b as usize];
-                let rect = context.map.rect_in_light_map(tile.placement, &tile.rect);
-                display.take_direct(&context.map, b, DirectTile { rect, values });
+                display.take_direct(&context.map, b, tile);
             }
             block.note_error(context.map.top());
             display.lods[b as usize] = saved.shown;
@@ -200,6 +201,7 @@ impl Live {
             p.max_rounds as u64,
             p.seed,
             p.direct_samples as u64,
+            p.directional as u64,
         ] {
             h.word(n);
         }
@@ -226,7 +228,8 @@ impl Live {
             (status, block) = (BlockStatus::default(), &fresh);
         }
         let tile = self.display.direct_tile(b).filter(|t| t.1).map(|t| t.0);
-        let bytes = BLOCK_BYTES + block.gathered.len() * TEXEL_BYTES + tile.map_or(0, |t| t.bytes());
+        let texels = block.gathered.len() * TEXEL_BYTES + block.directional.len() * DIRECTIONAL_BYTES;
+        let bytes = BLOCK_BYTES + texels + tile.map_or(0, |t| t.bytes());
         out.try_reserve(bytes).map_err(|_| Error::OutOfMemory(format!("{SAVED} needs {bytes} bytes for a block")))?;
         out.extend([status.fresh_lod, self.display.lods[b as usize].min(status.fresh_lod)]);
         for n in [status.rounds, block.gathered.len() as u16] {
@@ -240,10 +243,12 @@ impl Live {
             out.extend(g.backs.to_le_bytes());
             out.extend(g.squares.to_le_bytes());
         }
+        write_directional(&block.directional, out);
         out.extend(tile.map_or(0, |t| t.values.len() as u32).to_le_bytes());
         for v in tile.iter().flat_map(|t| t.values.iter()) {
             v.to_array().iter().for_each(|c| out.extend(c.to_le_bytes()));
         }
+        write_directional(tile.map_or(&[], |t| &t.directional), out);
         Ok(())
     }
 
@@ -276,8 +281,9 @@ impl Live {
     /// Maximum size in bytes of a saved state of this object.
     fn most_bytes(&self) -> u64 {
         let map = &self.context.map;
-        let direct = |t: &Tile| map.rect_in_light_map(t.placement, &t.rect).area() * size_of::<Vec3>();
-        let block = |t: &Tile| (BLOCK_BYTES + t.texels.len() * TEXEL_BYTES + direct(t)) as u64;
+        let direct = |t: &Tile| map.rect_in_light_map(t.placement, &t.rect).area() * self.params.direct_bytes();
+        let texel = TEXEL_BYTES + if self.context.asks(directional::INDIRECT) { DIRECTIONAL_BYTES } else { 0 };
+        let block = |t: &Tile| (BLOCK_BYTES + t.texels.len() * texel + direct(t)) as u64;
         (HEAD + size_of::<u64>()) as u64 + map.tiles.iter().map(block).sum::<u64>()
     }
 
@@ -347,12 +353,26 @@ impl Live {
         for i in 0..count {
             gathered.push(from.gathered(least(i)..=most_rounds * ROUND as u32)?);
         }
+        let count = if self.context.asks(directional::INDIRECT) { count } else { 0 };
+        let mut by_direction = try_with_capacity(count, SAVED)?;
+        for _ in 0..count {
+            // A sum need not be possible light: what near hits subtract may be more than what others bring.
+            let sum = from.directional()?;
+            check(is_bounded(&sum), NO_LIGHT)?;
+            by_direction.push(sum);
+        }
         let direct = self.read_direct(tile, from)?;
         // The step under way begins again; texels that already have its rays are skipped.
         Ok(Saved {
             block: Block {
                 status: BlockStatus { lod, fresh_lod: lod, rounds, ..Default::default() },
-                work: BlockWork { gathered, deviations, deviation_count, ..Default::default() },
+                work: BlockWork {
+                    gathered,
+                    directional: by_direction,
+                    deviations,
+                    deviation_count,
+                    ..Default::default()
+                },
             },
             shown,
             direct,
@@ -360,7 +380,7 @@ impl Live {
     }
 
     /// Reads direct light at full resolution: light where the block has texels, NaN elsewhere.
-    fn read_direct(&self, tile: &Tile, from: &mut Reader) -> Field<Option<Box<[Vec3]>>> {
+    fn read_direct(&self, tile: &Tile, from: &mut Reader) -> Field<Option<DirectTile>> {
         let rect = self.context.map.rect_in_light_map(tile.placement, &tile.rect);
         let count = from.u32()? as usize;
         if count == 0 {
@@ -378,7 +398,17 @@ impl Live {
             check(is_light(value), NO_LIGHT)?;
             values.push(value);
         }
-        Ok(Some(values.into_boxed_slice()))
+        let count = if self.context.asks(directional::DIRECT) { count } else { 0 };
+        let mut by_direction = try_with_capacity(count, SAVED)?;
+        for value in &values[..count] {
+            let light = from.directional()?;
+            let is_light = is_bounded(&light) && light.l0.cmpge(Vec3::ZERO).all();
+            let is_right = if value.is_nan() { !light.l0.is_finite() } else { is_light };
+            check(is_right, NO_LIGHT)?;
+            by_direction.push(light);
+        }
+        let (values, directional) = (values.into_boxed_slice(), by_direction.into_boxed_slice());
+        Ok(Some(DirectTile { rect, values, directional }))
     }
 }
 
@@ -393,6 +423,16 @@ fn not_saved(name: &str) -> Error {
 
 fn is_light(v: Vec3) -> bool {
     v.cmpge(Vec3::ZERO).all() && v.cmple(Vec3::splat(MOST_LIGHT)).all()
+}
+
+fn is_bounded(light: &Directional) -> bool {
+    let bounded = |v: &Vec3| v.abs().cmple(Vec3::splat(MOST_LIGHT)).all();
+    bounded(&light.l0) && light.l1.iter().all(bounded)
+}
+
+fn write_directional(light: &[Directional], out: &mut Vec<u8>) {
+    let vectors = light.iter().flat_map(|d| [d.l0, d.l1[0], d.l1[1], d.l1[2]]);
+    vectors.flat_map(|v| v.to_array()).for_each(|c| out.extend(c.to_le_bytes()));
 }
 
 fn check(is_possible: bool, what: &'static str) -> Field<()> {
@@ -429,6 +469,10 @@ impl Reader<'_> {
 
     fn vec3(&mut self) -> Field<Vec3> {
         Ok(Vec3::new(self.f32()?, self.f32()?, self.f32()?))
+    }
+
+    fn directional(&mut self) -> Field<Directional> {
+        Ok(Directional { l0: self.vec3()?, l1: [self.vec3()?, self.vec3()?, self.vec3()?] })
     }
 
     /// Reads the sums of a texel, whose number of rays must be in `rays`.

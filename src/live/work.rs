@@ -5,11 +5,14 @@
 
 use super::blocks::{Block, BlockMap, BlockStatus, BlockWork, DirectTile, DirectWork, Tile};
 use super::relight::Illumination;
+use super::shown_layer::Shown;
 use crate::base::directional::Directional;
 use crate::base::error::{Error, Result};
-use crate::base::memory::{try_collect, try_filled};
+use crate::base::memory::{try_collect, try_filled, try_with_capacity};
 use crate::base::sampling::combine;
+use crate::direct::direct_light::Lights;
 use crate::lightmap::atlas::ids::{GatherTexel, LightTexel};
+use crate::lightmap::directional;
 use crate::lightmap::indirect::gather::Gathered;
 use crate::lightmap::indirect::near_hits::{HitRadiance, NearHits};
 use crate::lightmap::indirect::radiance_map::RadianceLookup;
@@ -46,12 +49,21 @@ pub(super) struct Context {
     pub near_hits: f32,
     pub direct_seed: u32,
     pub direct_samples: u32,
+    /// Bits of [`directional`]: the light that is computed by direction too.
+    pub directional: u32,
     /// Approximate number of rays that direct light at a point takes.
     pub direct_rays: f32,
     /// Light below which a texel counts as dark: a small part of the scene's mean.
     pub dim: f32,
     pub promote_threshold: u32,
     pub max_rounds: u32,
+}
+
+impl Context {
+    /// Whether some light is asked for by direction, given by a bit of [`directional`].
+    pub fn asks(&self, bit: u32) -> bool {
+        self.directional & bit != 0
+    }
 }
 
 /// Kind of work that a block can do next.
@@ -240,7 +252,10 @@ impl Block {
         let end = tile.lod_end[lod as usize];
         let work = &mut self.work;
         let missing = (end as usize).saturating_sub(work.gathered.len());
-        if work.gathered.try_reserve_exact(missing).is_err() {
+        let by_direction = if c.asks(directional::INDIRECT) { missing } else { 0 };
+        if work.gathered.try_reserve_exact(missing).is_err()
+            || work.directional.try_reserve_exact(by_direction).is_err()
+        {
             limit.out_of_memory.store(true, Relaxed);
             return false;
         }
@@ -249,6 +264,9 @@ impl Block {
             let texel = tile.texels[i];
             if work.gathered.len() <= i {
                 work.gathered.push(Gathered::default());
+                if c.asks(directional::INDIRECT) {
+                    work.directional.push(Directional::default());
+                }
             }
             let receiver = atlas.receiver(&atlas.gather, &c.light.sides.backs, texel);
             while work.gathered[i].rays < rounds * ROUND as u32 {
@@ -258,7 +276,9 @@ impl Block {
                 let before = work.gathered[i];
                 let round = (before.rays as usize) / ROUND;
                 let seed = combine(c.gather_seed, texel.seed());
-                let rays = work.gathered[i].add_round(&atlas.scene, &lookup, &receiver, &c.samples, round, seed);
+                let (gathered, sum) = (&mut work.gathered[i], work.directional.get_mut(i));
+                let rays =
+                    gathered.add_round_by_direction(&atlas.scene, &lookup, &receiver, &c.samples, round, seed, sum);
                 work.note_deviation(&before, i);
                 limit.traced.fetch_add(rays, Relaxed);
             }
@@ -270,7 +290,7 @@ impl Block {
         self.status.rounds = rounds as u16;
         if self.status.target(c).is_none() {
             // A single round would leave the prior some weight for ever.
-            self.work.prior = Box::default();
+            self.work.drop_prior();
         }
         self.note_error(c.map.top());
         true
@@ -280,10 +300,16 @@ impl Block {
     fn begin_epoch(&mut self, tile: &Tile, epoch: u32) -> Result<()> {
         let work = &mut self.work;
         if !work.gathered.is_empty() {
-            let known = (0..tile.texels.len()).map(|i| work.estimate(i).unwrap_or(Vec3::NAN));
-            work.prior = try_collect(known, "light of before a change")?.into_boxed_slice();
+            let (what, all) = ("light of before a change", 0..tile.texels.len());
+            let known = all.clone().map(|i| work.estimate(i).unwrap_or(Shown::UNKNOWN));
+            let prior = try_collect(known, what)?.into_boxed_slice();
+            let all = if work.directional.is_empty() { 0..0 } else { all };
+            let by_direction = all.map(|i| work.directional(i).unwrap_or(Shown::UNKNOWN));
+            work.prior_directional = try_collect(by_direction, what)?.into_boxed_slice();
+            work.prior = prior;
         }
         work.gathered.clear();
+        work.directional.clear();
         work.cursor = 0;
         (work.deviations, work.deviation_count) = (0.0, 0);
         let status = &mut self.status;
@@ -321,12 +347,22 @@ impl Block {
     pub fn work_on_coarse(&mut self, c: &Context, tile: &Tile, limit: &Limit) -> bool {
         let (atlas, mut rays) = (&c.map.atlas, 0);
         let samples = c.direct_samples.min(COARSE_SAMPLES);
+        let (texels, what) = (&tile.texels[..tile.lod_end[0] as usize], "coarse direct light");
+        let count = if c.asks(directional::DIRECT) { texels.len() } else { 0 };
+        let Some(mut by_direction) = limit.granted(try_with_capacity(count, what)) else { return false };
         let value = |&texel: &GatherTexel| {
             let receiver = atlas.receiver(&atlas.gather, &c.light.sides.backs, texel);
-            c.light.direct.irradiance(&receiver, samples, combine(c.direct_seed, texel.seed()), &mut rays)
+            let (direct, seed) = (&c.light.direct, combine(c.direct_seed, texel.seed()));
+            if count == 0 {
+                return direct.irradiance(&receiver, samples, seed, &mut rays);
+            }
+            let light = direct.at_point_by_direction(&receiver, Lights::All, samples, seed, &mut rays);
+            by_direction.push(light.1);
+            light.0.value()
         };
-        let values = try_collect(tile.texels[..tile.lod_end[0] as usize].iter().map(value), "coarse direct light");
+        let values = try_collect(texels.iter().map(value), what);
         let Some(values) = limit.granted(values) else { return false };
+        self.work.new_coarse_directional = by_direction.into_boxed_slice();
         let sum: f32 = values.iter().map(|v| v.element_sum()).sum();
         self.status.direct_mean = sum / values.len().max(1) as f32;
         self.status.coarse_epoch = c.light.direct_epoch;
@@ -341,13 +377,15 @@ impl Block {
         let begin = || {
             let rect = c.map.rect_in_light_map(of.placement, &of.rect);
             // Vertices far away can make a block as large as a page.
-            let unknown = |area| limit.granted(try_filled(area, Vec3::NAN, "direct light")).map(Vec::into_boxed_slice);
-            let tile = DirectTile { rect, values: unknown(rect.area())? };
-            let sharp = unknown(rect.grown(1).area())?;
-            Some(DirectWork { tile, next: 0, epoch: c.light.direct_epoch, sharp })
+            let (area, around) = (rect.area(), rect.grown(1).area());
+            let asked = usize::from(c.asks(directional::DIRECT));
+            let tile = DirectTile { rect, values: unknown(area, limit)?, directional: unknown(asked * area, limit)? };
+            let (sharp, sharp_directional) = (unknown(around, limit)?, unknown(asked * around, limit)?);
+            Some(DirectWork { tile, next: 0, epoch: c.light.direct_epoch, sharp, sharp_directional })
         };
         let Some(mut direct) = under_way.or_else(begin) else { return false };
-        let Some(mut points) = limit.granted(TilePoints::new(1)) else {
+        let points = if c.asks(directional::DIRECT) { TilePoints::by_direction(1) } else { TilePoints::new(1) };
+        let Some(mut points) = limit.granted(points) else {
             self.work.direct = Some(direct);
             return false;
         };
@@ -360,8 +398,11 @@ impl Block {
             let at = direct.next as usize;
             let (x, y) = (corner.0 + (at % width) as i32, corner.1 + (at / width) as i32);
             let mut rays = 0;
-            if let Some(value) = direct_texel(c, of, x, y, &mut direct, &mut points, &mut rays) {
+            if let Some((value, by_direction)) = direct_texel(c, of, x, y, &mut direct, &mut points, &mut rays) {
                 direct.tile.values[at] = value;
+                if let Some(here) = direct.tile.directional.get_mut(at) {
+                    *here = by_direction;
+                }
             }
             limit.traced.fetch_add(rays, Relaxed);
             direct.next += 1;
@@ -375,13 +416,24 @@ impl Block {
 impl BlockWork {
     /// Estimate of the light of texel `i`: from its own rays, with the prior's light fading while these are few.
     pub fn estimate(&self, i: usize) -> Option<Vec3> {
-        let prior = self.prior.get(i).copied().filter(|p| p.is_finite());
+        self.with_prior(i, &self.prior, |g| g.irradiance())
+    }
+
+    /// Estimate of the light of texel `i` by direction; `None` also if nobody asks for it.
+    pub fn directional(&self, i: usize) -> Option<Directional> {
+        let own = |g: &Gathered| g.directional(self.directional.get(i).copied().unwrap_or_default());
+        let asked = !self.directional.is_empty() || !self.prior_directional.is_empty();
+        asked.then(|| self.with_prior(i, &self.prior_directional, own)).flatten()
+    }
+
+    fn with_prior<T: Shown>(&self, i: usize, prior: &[T], own: impl Fn(&Gathered) -> T) -> Option<T> {
+        let prior = prior.get(i).copied().filter(T::is_known);
         let Some(g) = self.gathered.get(i).filter(|g| g.rays > 0) else { return prior };
-        let Some(prior) = prior else { return Some(g.irradiance()) };
+        let Some(prior) = prior else { return Some(own(g)) };
         // The prior loses its weight within two rounds.
         let n = g.rays as f32 / ROUND as f32;
         let weight = PRIOR_WEIGHT * (2.0 - n).max(0.0);
-        Some((prior * weight + g.irradiance() * n) / (weight + n))
+        Some((prior * weight + own(g) * n) / (weight + n))
     }
 
     /// Variance of the light that texel `i` has gathered, infinite before it has gathered any.
@@ -402,8 +454,12 @@ impl BlockWork {
     /// Drops the prior when it has no weight left: when a step of the second round has been completed.
     pub fn drop_faded_prior(&mut self, status: &BlockStatus) {
         if status.rounds >= 2 && self.cursor == 0 {
-            self.prior = Box::default();
+            self.drop_prior();
         }
+    }
+
+    fn drop_prior(&mut self) {
+        (self.prior, self.prior_directional) = (Box::default(), Box::default());
     }
 
     /// Records how far a round lies from the mean of the rounds before it (Welford 1962).
@@ -430,7 +486,13 @@ pub(super) fn owns(c: &Context, tile: &Tile, x: i32, y: i32) -> Option<LightTexe
     (gx >= own.x0 && gx < own.x1 && gy >= own.y0 && gy < own.y1).then_some(texel)
 }
 
-/// Direct light of a texel of the light map; `None` if the texel is not the block's; infinite if it is inside a solid.
+/// Makes room for direct light of texels, of which nothing is known yet.
+fn unknown<T: Shown>(texels: usize, limit: &Limit) -> Option<Box<[T]>> {
+    limit.granted(try_filled(texels, T::UNKNOWN, "direct light")).map(Vec::into_boxed_slice)
+}
+
+/// Direct light of a texel of the light map, and that light by direction if it is asked for; `None` if the texel is not
+/// the block's; infinite if it is inside a solid.
 fn direct_texel(
     c: &Context,
     tile: &Tile,
@@ -439,7 +501,7 @@ fn direct_texel(
     work: &mut DirectWork,
     points: &mut TilePoints,
     rays: &mut u64,
-) -> Option<Vec3> {
+) -> Option<(Vec3, Directional)> {
     let (a, texel) = (&c.map.atlas, owns(c, tile, x, y)?);
     let backs = &c.light.sides.backs;
     let receiver = a.receiver(&a.map, backs, texel);
@@ -451,17 +513,21 @@ fn direct_texel(
         let (x, y) = a.map.position(s);
         let i = (y - known.y0) as usize * known.width() + (x - known.x0) as usize;
         let sharp = &mut work.sharp[i];
+        let directional = work.sharp_directional.get_mut(i);
         if sharp.x.is_nan() {
-            *sharp = texels.sharp(&a.receiver(&a.map, backs, s), rays);
+            let receiver = a.receiver(&a.map, backs, s);
+            match directional {
+                Some(directional) => (*sharp, *directional) = texels.sharp_by_direction(&receiver, rays),
+                None => *sharp = texels.sharp(&receiver, rays),
+            }
         }
-        *sharp
+        (*sharp, work.sharp_directional.get(i).copied().unwrap_or_default())
     };
-    let sharp = sharp_at(texel);
-    let variation = texels.varies(texel, sharp, sharp_at);
+    let (sharp, sharp_directional) = sharp_at(texel);
+    let variation = texels.varies(texel, sharp, |s| sharp_at(s).0);
     let back = a.is_back(&a.map, backs, texel);
-    let mut light = Vec3::ZERO;
-    let sharp_directional = Directional::default();
+    let mut light = (Vec3::ZERO, Directional::default());
     let averaged = Averaged { texel, back, receiver, sharp, sharp_directional, variation };
-    texels.irradiance(&[averaged], points, rays, |_, e, _| light = e);
+    texels.irradiance(&[averaged], points, rays, |_, e, by_direction| light = (e, *by_direction));
     Some(light)
 }

@@ -824,6 +824,8 @@ fn live(w: &W, s: &mut Source) {
     params.max_rounds = 1 + s.below(3) as u32;
     params.direct_samples = 1 + s.below(2) as u32;
     params.background = s.one_in(3) as u32;
+    params.directional_indirect = s.one_in(3) as u32;
+    params.directional_direct = s.one_in(3) as u32;
     params.cell_size = if s.one_in(4) { s.unit() } else { 0.0 };
     s.mutate(&mut params);
     if (2001..=1 << 32).contains(&params.photon_count) {
@@ -936,15 +938,16 @@ fn live_read(live: &Handle, s: &mut Source) {
     }
     let format = match s.below(12) {
         0 => s.integer(),
-        n => 1 + n as u32 % 2 + [0, BK_FORMAT_INDIRECT_ONLY][n / 6],
+        n => 1 + n as u32 % 2,
     };
+    let layer = if s.one_in(8) { s.integer() } else { s.below(17) as u32 };
     let (whole, stride) = (s.one_in(4), if s.one_in(8) { s.below(400) } else { 0 });
     // Pages are at most 128 texels wide.
     let rows = if whole { 128 } else { 16 };
     let mut dst = vec![0u8; rows * (rows * 12).max(stride)];
     let (rect, lod, page) = (if whole { null() } else { &raw const rect }, s.index(), s.index());
-    let result = ask!(bk_live_read(live.p(), page, lod, format, rect, dst.as_mut_ptr().cast(), stride));
-    if result == BK_OK && format & 0xff == BK_FORMAT_RGB32F && stride == 0 {
+    let result = ask!(bk_live_read(live.p(), page, lod, layer, format, rect, dst.as_mut_ptr().cast(), stride));
+    if result == BK_OK && format == BK_FORMAT_RGB32F && stride == 0 && layer <= BK_LAYER_L0 {
         check_light("bk_live_read", &floats(&dst));
     }
 }

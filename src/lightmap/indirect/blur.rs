@@ -97,15 +97,16 @@ impl Window {
         Window { radius, weights, seen: [0; MAX_WINDOW], queue: Vec::new() }
     }
 
-    /// Returns the blurred value of one valid texel.
-    pub(crate) fn blur(
+    /// Returns the blurred value of one valid texel; as in [`blur`], of `of`.
+    pub(crate) fn blur<T: Linear>(
         &mut self,
         charts: &Charts,
         map: &ChartMap<GatherMap>,
         texel: GatherTexel,
         texels: Texels,
-    ) -> Vec3 {
-        self.mean(charts, map, texel, |s| texels.get(s), |s| texels.values[s.index()])
+        of: &[T],
+    ) -> T {
+        self.mean(charts, map, texel, |s| texels.get(s), |s| of[s.index()])
     }
 
     /// Returns the mean of `of` with the weights with which one valid texel is blurred. `get`: the values by which weights

@@ -70,6 +70,12 @@ impl Gathered {
         self.backs as f32 <= MAX_BACK_FACES * self.rays as f32
     }
 
+    /// Returns the indirect light by direction from its `sum`, weighted as [`sum`](Self::sum) is.
+    pub(crate) fn directional(&self, sum: Directional) -> Directional {
+        // Paths from near hits on bright patches may subtract more than other rays bring.
+        (sum * self.weight()).valid()
+    }
+
     /// Adds one round of rays from a receiver; `seed` is the texel's own. Returns the rays traced.
     pub(crate) fn add_round(
         &mut self,
@@ -80,6 +86,20 @@ impl Gathered {
         round: usize,
         seed: u32,
     ) -> u64 {
+        self.add_round_by_direction(scene, radiance, receiver, samples, round, seed, None)
+    }
+
+    /// Does the work of [`add_round`](Self::add_round); `directional`: a sum that the light by direction is added to.
+    pub(crate) fn add_round_by_direction(
+        &mut self,
+        scene: &Scene,
+        radiance: &HitRadiance,
+        receiver: &Receiver,
+        samples: &SampleSet,
+        round: usize,
+        seed: u32,
+        directional: Option<&mut Directional>,
+    ) -> u64 {
         let mut rays = [Ray::new(Vec3::ZERO, Vec3::ZERO); ROUND];
         let mut hits = [RawHit::MISS; ROUND];
         let points = points_of(samples, round);
@@ -87,14 +107,16 @@ impl Gathered {
         aim(receiver, points, seed, rays);
         scene.intersect_stream(rays, &mut hits);
         let mut traced = rays.len() as u64;
-        let mut bright = (Vec3::ZERO, Unoccluded::default());
+        let (mut bright, mut arrived) = ((Vec3::ZERO, Unoccluded::default()), Directional::default());
         if radiance.lookup.bright().len() > 0 {
-            let mut room = PointRoom::new();
+            let mut room = if directional.is_some() { PointRoom::by_direction() } else { PointRoom::new() };
             let mut shadow = room.begin(scene);
             bright.1 = radiance.lookup.bright().push(receiver, rays.len(), seed_of_round(seed, round), &mut shadow);
-            bright.0 = shadow.finish(&mut traced)[0];
+            let (sums, directed) = shadow.finish_by_direction(&mut traced);
+            (bright.0, arrived) = (sums[0], directed.first().copied().unwrap_or_default());
         }
-        self.add(scene, radiance, receiver, seed_of_round(seed, round), rays, &hits, bright, None, &mut traced);
+        let directional = directional.map(|sum| (sum, arrived));
+        self.add(scene, radiance, receiver, seed_of_round(seed, round), rays, &hits, bright, directional, &mut traced);
         traced
     }
 
@@ -168,8 +190,7 @@ pub(crate) struct TileTexel {
 impl TileTexel {
     /// Returns the indirect light by direction; nothing if nobody asked for it.
     pub(crate) fn directional(&self) -> Directional {
-        // Paths from near hits on bright patches may subtract more than other rays bring.
-        (self.directional.unwrap_or_default() * self.gathered.weight()).valid()
+        self.gathered.directional(self.directional.unwrap_or_default())
     }
 }
 

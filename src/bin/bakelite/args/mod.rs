@@ -307,6 +307,7 @@ fn command_of(line: CommandLine) -> Result<Command, String> {
                 direct_samples: bake.direct_samples,
                 radius: bake.radius,
                 near_hits: bake.near_hits,
+                directional: bake.directional,
                 ..Default::default()
             };
             Command::ReportLive(Box::new(args))

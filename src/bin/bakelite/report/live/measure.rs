@@ -99,7 +99,7 @@ impl Seen {
     fn of_live(&self, live: &Live) -> Result<Vec<[f32; 3]>> {
         let lod = live.params().lod_count - 1;
         let texel = |&[page, y, x]: &[u32; 3]| {
-            let texel = live.read(&PageRect { page, x, y, width: 1, height: 1 }, lod, true)?;
+            let texel = live.read(&PageRect { page, x, y, width: 1, height: 1 }, lod, Layer::Combined)?;
             Ok(texel[0])
         };
         self.texels.iter().map(texel).collect()
@@ -370,7 +370,7 @@ pub fn walk(
         let start = Instant::now();
         let dirty = live.take_dirty(usize::MAX)?;
         for rect in &dirty {
-            std::hint::black_box(live.read(rect, live.params().lod_count - 1, true)?);
+            std::hint::black_box(live.read(rect, live.params().lod_count - 1, Layer::Combined)?);
         }
         walk.frames.push(Frame {
             used_ms,
