@@ -1916,8 +1916,9 @@ typedef struct bk_bake_params {
   /// Number of passes, 1 to 4096: whole bakes with different random numbers, whose mean is the
   /// light. n of them take n times as long and have 1/n of the noise's variance, that of photons
   /// included. From two on, BK_LAYER_ERROR and bk_bake_stats.error estimate the noise that is
-  /// left, and the bake takes 49 bytes more per texel of the light map. A checkpoint grows with
-  /// each pass. Default: 1.
+  /// left, and light can be read from two halves of the passes, for denoisers
+  /// (BK_LAYER_FIRST_HALF). The bake takes 61 bytes more per texel of the light map, 36 of which
+  /// stay. A checkpoint grows with each pass. Default: 1.
   uint32_t passes;
   /// If > 0, there are as many passes as it takes, at least 4 and `passes` and at most 4096, until
   /// bk_bake_stats.error is no larger; for bakes of all texels only. 0.05 is a good preview, 0.01
@@ -2139,6 +2140,19 @@ BK_API size_t bk_plan_describe(const bk_lightmap *lightmap, char *dst, size_t ca
 /// of several passes (bk_bake_params.passes), estimated from as many values. RGB.
 #define BK_LAYER_ERROR 16
 
+/// Layer: number of the chart whose light the texel holds or, in the padding around the chart,
+/// repeats; separate texels of a chart's back have another number. BK_NONE where there is none. A
+/// filter that stays within texels of one number crosses no border of a chart. BK_FORMAT_R32U.
+#define BK_LAYER_CHART 17
+
+/// Flag added to BK_LAYER_COMBINED, INDIRECT or DIRECT: from half of the passes of the bake alone, the
+/// first pass and every second one after it. The two halves have independent noise, and their mean
+/// is the layer. For denoisers; see the guide ("Denoising").
+#define BK_LAYER_FIRST_HALF 256
+
+/// Flag added to BK_LAYER_COMBINED, INDIRECT or DIRECT: from the other half of the passes.
+#define BK_LAYER_SECOND_HALF 512
+
 /// Format: three floats, 12 bytes per texel.
 #define BK_FORMAT_RGB32F 1
 
@@ -2179,8 +2193,8 @@ BK_API size_t bk_plan_describe(const bk_lightmap *lightmap, char *dst, size_t ca
 ///
 /// @param lightmap  light map; baked, if the layer holds light
 /// @param page  number of the page
-/// @param layer  one of the BK_LAYER values; COMBINED, INDIRECT, DIRECT, RADIANCE and those from L0 on
-///   hold light
+/// @param layer  one of the BK_LAYER values; COMBINED, INDIRECT, DIRECT, RADIANCE and those from L0 to
+///   ERROR hold light. COMBINED, INDIRECT and DIRECT with or without one of the flags of halves
 /// @param format  one of the BK_FORMAT values that the layer allows
 /// @param dst  receives bk_lightmap_info.height rows of bk_lightmap_info.width texels; needs no
 ///   alignment
@@ -2188,8 +2202,8 @@ BK_API size_t bk_plan_describe(const bk_lightmap *lightmap, char *dst, size_t ca
 /// @retval BK_ERROR_INVALID_ARGUMENT  page or layer does not exist, the format does not suit the
 ///   layer, or `row_stride` is too small
 /// @retval BK_ERROR_INVALID_STATE  the layer holds light and there was no bake, or none that
-///   asked for light by direction (layers from L0 to DIRECTION) or had several passes (ERROR), or
-///   the light map is being baked
+///   asked for light by direction (layers from L0 to DIRECTION) or had several passes (ERROR and
+///   halves), or the light map is being baked
 /// @retval BK_ERROR_OUT_OF_MEMORY  a page does not fit
 BK_API
 bk_result bk_lightmap_read(const bk_lightmap *lightmap,
@@ -2198,6 +2212,40 @@ bk_result bk_lightmap_read(const bk_lightmap *lightmap,
                            uint32_t format,
                            void *dst,
                            size_t row_stride);
+
+/// Replaces layers of a baked light map by light of the caller's, for example by denoised light. All
+/// that reads, samples, saves or writes the light map uses it from then on, until the next bake.
+///
+/// Values of texels with validity 1 are taken (BK_LAYER_VALIDITY); others, as in the padding, are
+/// ignored: texels inside of solids get the new light of the texel that they repeat. Seams are
+/// stitched anew, if the bake stitched them. BK_LAYER_RADIANCE and BK_LAYER_ERROR stay those of the
+/// bake, and halves differ by as much as before. A call that fails changes nothing.
+///
+/// Cost: copying the texels, and bk_bake_stats.seam_seconds.
+///
+/// @param lightmap  light map of which all texels are baked
+/// @param layers  layers to replace, each once: BK_LAYER_DIRECT, BK_LAYER_INDIRECT and, after a bake with
+///   light by direction, BK_LAYER_L0, BK_LAYER_L1X, BK_LAYER_L1Y and BK_LAYER_L1Z; where L1 is longer
+///   than L0, it is shortened
+/// @param layer_count  number of elements of `layers`
+/// @param format  BK_FORMAT_RGB32F or BK_FORMAT_RGBA16F, whose alpha is ignored
+/// @param texels  for each of `layers`, its pages one after the other, each of them
+///   bk_lightmap_info.height packed rows; finite, up to 1e30, and >= 0 but for L1; needs no alignment
+/// @param progress,user  progress callback and its pointer; may be NULL
+/// @retval BK_ERROR_INVALID_ARGUMENT  a layer cannot be written or comes twice, the format is another
+///   one, or a value is none of light; bk_last_error names the texel
+/// @retval BK_ERROR_INVALID_STATE  not all texels are baked, there was no light by direction, or
+///   another call is using the light map
+/// @retval BK_ERROR_OUT_OF_MEMORY  a copy of the light does not fit
+/// @retval BK_ERROR_CANCELLED  the progress callback returned 0
+BK_API
+bk_result bk_lightmap_write(bk_lightmap *lightmap,
+                            const uint32_t *layers,
+                            size_t layer_count,
+                            uint32_t format,
+                            const void *texels,
+                            bk_progress_fn progress,
+                            void *user);
 
 /// Writes a baked light map to files.
 ///

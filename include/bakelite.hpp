@@ -559,6 +559,17 @@ public:
             return detail::finish(BK_ERROR_INVALID_ARGUMENT, "the memory is not as large as a page of this format");
         return detail::finish(bk_lightmap_read(get(), page, layer, format, out.data(), 0));
     }
+    /// Replaces layers; `texels` holds all pages of the first, then those of the next, three floats per texel.
+    Result<void> write(Span<const std::uint32_t> layers, Span<const float> texels, const Progress &progress = {}) {
+        LightmapInfo info;
+        const bk_result code = bk_lightmap_get_info(get(), &info);
+        if (code != BK_OK)
+            return detail::finish(code);
+        if (texels.size() != layers.size() * info.page_count * info.width * info.height * 3)
+            return detail::finish(BK_ERROR_INVALID_ARGUMENT, "the memory is not as large as the pages of these layers");
+        return detail::finish(progress.after(bk_lightmap_write(get(), layers.data(), layers.size(), BK_FORMAT_RGB32F,
+                                                               texels.data(), progress.function(), progress.user())));
+    }
     Result<void> save(const std::string &prefix, std::uint32_t file_format, const Progress &progress = {}) const {
         return detail::finish(progress.after(
             bk_lightmap_save(get(), prefix.c_str(), file_format, progress.function(), progress.user())));

@@ -326,6 +326,108 @@ static void a_cancelled_bake_goes_on_from_its_checkpoint(bk_device *device, cons
     bk_scene_release(scene);
 }
 
+/* The smallest of denoisers: the mean over 9 x 9 texels of the same chart. */
+static void smooth(const float *from, const uint32_t *charts, const float *validity, float *to) {
+    int x, y, dx, dy, c;
+    for (y = 0; y < PAGE; y++) {
+        for (x = 0; x < PAGE; x++) {
+            int at = y * PAGE + x, n = 0;
+            to[3 * at] = to[3 * at + 1] = to[3 * at + 2] = 0.0f;
+            for (dy = -4; dy <= 4; dy++) {
+                for (dx = -4; dx <= 4; dx++) {
+                    const int near = at + dy * PAGE + dx;
+                    if (x + dx < 0 || x + dx >= PAGE || y + dy < 0 || y + dy >= PAGE) continue;
+                    if (charts[near] != charts[at] || validity[near] != 1.0f) continue;
+                    for (c = 0; c < 3; c++) to[3 * at + c] += from[3 * near + c];
+                    n++;
+                }
+            }
+            for (c = 0; c < 3; c++) to[3 * at + c] = n > 0 ? to[3 * at + c] / (float)n : NAN;
+        }
+    }
+}
+
+/* The root of the mean square of relative differences of covered texels. */
+static double difference(const float *a, const float *b, const float *validity) {
+    double sum = 0.0, n = 0.0;
+    int i;
+    for (i = 0; i < PAGE * PAGE; i++) {
+        if (validity[i] == 1.0f) {
+            double relative = (double)a[3 * i] / (double)b[3 * i] - 1.0;
+            sum += relative * relative, n += 1.0;
+        }
+    }
+    return sqrt(sum / n);
+}
+
+static void denoised_light_is_handed_back(bk_device *device) {
+    static const uint32_t HALVES[2] = {BK_LAYER_FIRST_HALF, BK_LAYER_SECOND_HALF};
+    const bk_result refused = BK_ERROR_INVALID_ARGUMENT;
+    const uint32_t indirect = BK_LAYER_INDIRECT, twice[2] = {BK_LAYER_DIRECT, BK_LAYER_DIRECT};
+    bk_scene *scene = room(device, 0.8f);
+    bk_lightmap *lightmap = lightmap_of(scene, 2);
+    bk_bake_params params = quick();
+    uint32_t *charts = (uint32_t *)malloc(sizeof(uint32_t) * PAGE * PAGE);
+    float *out = (float *)malloc(sizeof(float) * 3 * PAGE * PAGE);
+    uint16_t *halves = (uint16_t *)calloc(8 * PAGE * PAGE, sizeof(uint16_t));
+    float *truth, *noisy, *half[2], *validity, *now;
+    double before, after;
+    int i;
+
+    CHECK_ERROR(bk_lightmap_write(lightmap, &indirect, 1, BK_FORMAT_RGB32F, out, NULL, NULL), BK_ERROR_INVALID_STATE,
+                "has not been baked");
+    params.blur_radius = 0;
+    params.gather_rays = 4096;
+    params.photon_count = 200000;
+    CHECK_OK(bk_bake(lightmap, &params, NULL, NULL, NULL));
+    truth = read_rgb(lightmap, BK_LAYER_INDIRECT);
+    CHECK_ERROR(bk_lightmap_read(lightmap, 0, BK_LAYER_INDIRECT | BK_LAYER_FIRST_HALF, BK_FORMAT_RGB32F, out, 0),
+                BK_ERROR_INVALID_STATE, "one pass");
+    params.gather_rays = 1;
+    params.passes = 2;
+    CHECK_OK(bk_bake(lightmap, &params, NULL, NULL, NULL));
+    noisy = read_rgb(lightmap, BK_LAYER_INDIRECT);
+    validity = read_validity(lightmap);
+    CHECK_OK(bk_lightmap_read(lightmap, 0, BK_LAYER_CHART, BK_FORMAT_R32U, charts, 0));
+    for (i = 0; i < PAGE * PAGE; i++) CHECK((charts[i] == BK_NONE) == (validity[i] == 0.0f));
+    for (i = 0; i < 2; i++) half[i] = read_rgb(lightmap, BK_LAYER_INDIRECT | HALVES[i]);
+    for (i = 0; i < 3 * PAGE * PAGE; i++) {
+        CHECK(fabs((double)(half[0][i] + half[1][i] - 2.0f * noisy[i])) <= 1e-4 * (double)noisy[i] + 1e-6);
+    }
+    /* Each half has twice the variance of the light, and so has their difference twice that of a half. */
+    before = difference(noisy, truth, validity);
+    after = difference(half[0], half[1], validity);
+    CHECK(before > 0.01 && after > 1.5 * before && after < 3.0 * before);
+    CHECK_ERROR(bk_lightmap_read(lightmap, 0, BK_LAYER_RADIANCE | BK_LAYER_FIRST_HALF, BK_FORMAT_RGB32F, out, 0), refused,
+                "no halves");
+    CHECK_ERROR(bk_lightmap_read(lightmap, 0, BK_LAYER_DIRECT | 0x300, BK_FORMAT_RGB32F, out, 0), refused, "both halves");
+
+    smooth(noisy, charts, validity, out);
+    CHECK_OK(bk_lightmap_write(lightmap, &indirect, 1, BK_FORMAT_RGB32F, out, NULL, NULL));
+    now = read_rgb(lightmap, BK_LAYER_INDIRECT);
+    after = difference(now, truth, validity);
+    CHECK(after < 0.7 * before);
+    for (i = 0; i < 3 * PAGE * PAGE; i++) {
+        if (validity[i / 3] == 1.0f && now[i] != out[i]) CHECK(0);
+    }
+    CHECK_OK(bk_lightmap_write(lightmap, &indirect, 1, BK_FORMAT_RGBA16F, halves, NULL, NULL));
+    free(now);
+    now = read_rgb(lightmap, BK_LAYER_INDIRECT);
+    for (i = 0; i < 3 * PAGE * PAGE; i++) CHECK(now[i] == 0.0f);
+    CHECK_OK(bk_lightmap_write(lightmap, NULL, 0, BK_FORMAT_RGB32F, NULL, NULL, NULL));
+    CHECK_ERROR(bk_lightmap_write(NULL, &indirect, 1, BK_FORMAT_RGB32F, out, NULL, NULL), refused, "lightmap");
+    CHECK_ERROR(bk_lightmap_write(lightmap, NULL, 1, BK_FORMAT_RGB32F, out, NULL, NULL), refused, "layers");
+    CHECK_ERROR(bk_lightmap_write(lightmap, &indirect, 1, BK_FORMAT_RGB32F, NULL, NULL, NULL), refused, "texels");
+    CHECK_ERROR(bk_lightmap_write(lightmap, &indirect, 1, BK_FORMAT_R32F, out, NULL, NULL), refused, "format is 3");
+    CHECK_ERROR(bk_lightmap_write(lightmap, twice, 2, BK_FORMAT_RGBA16F, halves, NULL, NULL), refused, "as an earlier one");
+    for (i = 0; i < 3 * PAGE * PAGE; i++) out[i] = -1.0f;
+    CHECK_ERROR(bk_lightmap_write(lightmap, &indirect, 1, BK_FORMAT_RGB32F, out, NULL, NULL), refused, "at texel");
+
+    free(truth), free(noisy), free(half[0]), free(half[1]), free(validity), free(now), free(charts), free(out), free(halves);
+    bk_lightmap_release(lightmap);
+    bk_scene_release(scene);
+}
+
 int main(int argc, char **argv) {
     bk_device *device = NULL;
     if (argc != 2) {
@@ -335,6 +437,7 @@ int main(int argc, char **argv) {
     CHECK_OK(bk_device_create(NULL, &device));
     edges_of_given_charts_are_not_dark(device);
     validity_tells_covered_filled_and_empty(device);
+    denoised_light_is_handed_back(device);
     layouts_come_back(device, argv[1]);
     shards_come_back_as_one_bake(device, argv[1]);
     a_cancelled_bake_goes_on_from_its_checkpoint(device, argv[1]);

@@ -141,6 +141,10 @@ static void bake(const Scene &scene) {
     const std::vector<float> light = VALUE(map.read(0));
     CHECK(light.size() == 3 * 65 * 65);
     CHECK(std::fabs(light[3 * (32 * 65 + 32)] - 0.25f) < 0.25e-3f);
+    const std::array<std::uint32_t, 1> direct{BK_LAYER_DIRECT};
+    VALUE(map.write(direct, VALUE(map.read(0, BK_LAYER_DIRECT))));
+    CHECK(VALUE(map.read(0)) == light);
+    CHECK_FAILS(map.write(direct, Span<const float>(light.data(), 3)), BK_ERROR_INVALID_ARGUMENT, "pages of these layers");
     std::vector<std::byte> halves(8 * 65 * 65);
     VALUE(map.read(0, BK_LAYER_COMBINED, BK_FORMAT_RGBA16F, halves));
     halves.pop_back();

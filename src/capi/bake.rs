@@ -180,8 +180,9 @@ pub struct bk_bake_params {
     /// Number of passes, 1 to 4096: whole bakes with different random numbers, whose mean is the
     /// light. n of them take n times as long and have 1/n of the noise's variance, that of photons
     /// included. From two on, BK_LAYER_ERROR and bk_bake_stats.error estimate the noise that is
-    /// left, and the bake takes 49 bytes more per texel of the light map. A checkpoint grows with
-    /// each pass. Default: 1.
+    /// left, and light can be read from two halves of the passes, for denoisers
+    /// (BK_LAYER_FIRST_HALF). The bake takes 61 bytes more per texel of the light map, 36 of which
+    /// stay. A checkpoint grows with each pass. Default: 1.
     pub passes: u32,
     /// If > 0, there are as many passes as it takes, at least 4 and `passes` and at most 4096, until
     /// bk_bake_stats.error is no larger; for bakes of all texels only. 0.05 is a good preview, 0.01

@@ -6,14 +6,15 @@
 //! Cost: reading copies a page, in up to 0.2 s per million texels; writing files takes the time of
 //! compression and of the disk.
 
-use super::device::{bk_progress_fn, call_with_file, progress};
+use super::args::slice;
+use super::device::{bk_progress_fn, call_with_file, progress, refuse_in_callback};
 use super::error::{bk_result, call};
-use super::handles::{is_null, object};
+use super::handles::{hold, is_null, object};
 use super::lightmap::bk_lightmap;
 use crate::base::error::{Error, Result, invalid_argument};
-use crate::base::memory::try_with_capacity;
+use crate::base::memory::{try_collect, try_with_capacity};
 use crate::base::progress::Progress;
-use crate::lightmap::{Layer, LayerData, Lightmap, packed_ratio};
+use crate::lightmap::{Half, Layer, LayerData, Lightmap, packed_ratio};
 use half::f16;
 use half::slice::HalfFloatSliceExt;
 use std::ffi::{c_char, c_void};
@@ -64,6 +65,17 @@ pub const BK_LAYER_DIRECTION: u32 = 15;
 /// Layer: standard error of the irradiance in COMBINED, in W/m2: the noise that is left after a bake
 /// of several passes (bk_bake_params.passes), estimated from as many values. RGB.
 pub const BK_LAYER_ERROR: u32 = 16;
+/// Layer: number of the chart whose light the texel holds or, in the padding around the chart,
+/// repeats; separate texels of a chart's back have another number. BK_NONE where there is none. A
+/// filter that stays within texels of one number crosses no border of a chart. BK_FORMAT_R32U.
+pub const BK_LAYER_CHART: u32 = 17;
+
+/// Flag added to BK_LAYER_COMBINED, INDIRECT or DIRECT: from half of the passes of the bake alone, the
+/// first pass and every second one after it. The two halves have independent noise, and their mean
+/// is the layer. For denoisers; see the guide ("Denoising").
+pub const BK_LAYER_FIRST_HALF: u32 = 0x100;
+/// Flag added to BK_LAYER_COMBINED, INDIRECT or DIRECT: from the other half of the passes.
+pub const BK_LAYER_SECOND_HALF: u32 = 0x200;
 
 /// Format: three floats, 12 bytes per texel.
 pub const BK_FORMAT_RGB32F: u32 = 1;
@@ -82,8 +94,8 @@ pub const BK_FORMAT_RGBA8: u32 = 5;
 ///
 /// @param lightmap  light map; baked, if the layer holds light
 /// @param page  number of the page
-/// @param layer  one of the BK_LAYER values; COMBINED, INDIRECT, DIRECT, RADIANCE and those from L0 on
-///   hold light
+/// @param layer  one of the BK_LAYER values; COMBINED, INDIRECT, DIRECT, RADIANCE and those from L0 to
+///   ERROR hold light. COMBINED, INDIRECT and DIRECT with or without one of the flags of halves
 /// @param format  one of the BK_FORMAT values that the layer allows
 /// @param dst  receives bk_lightmap_info.height rows of bk_lightmap_info.width texels; needs no
 ///   alignment
@@ -91,8 +103,8 @@ pub const BK_FORMAT_RGBA8: u32 = 5;
 /// @retval BK_ERROR_INVALID_ARGUMENT  page or layer does not exist, the format does not suit the
 ///   layer, or `row_stride` is too small
 /// @retval BK_ERROR_INVALID_STATE  the layer holds light and there was no bake, or none that
-///   asked for light by direction (layers from L0 to DIRECTION) or had several passes (ERROR), or
-///   the light map is being baked
+///   asked for light by direction (layers from L0 to DIRECTION) or had several passes (ERROR and
+///   halves), or the light map is being baked
 /// @retval BK_ERROR_OUT_OF_MEMORY  a page does not fit
 #[unsafe(no_mangle)]
 pub unsafe extern "C" fn bk_lightmap_read(
@@ -108,9 +120,15 @@ pub unsafe extern "C" fn bk_lightmap_read(
         if dst.is_null() {
             return Err(is_null("dst"));
         }
-        let layer = core_layer(layer)?;
+        let (layer, half) = half_of(layer)?;
         let texel = texel_bytes(format)?;
-        let (info, data) = lightmap.read(|l| Ok((l.info(), l.read(page, layer)?)))?;
+        let (info, data) = lightmap.read(|l| {
+            let data = match half {
+                Some(half) => l.read_half(page, layer, half)?,
+                None => l.read(page, layer)?,
+            };
+            Ok((l.info(), data))
+        })?;
         let packed = info.width as usize * texel;
         let stride = if row_stride == 0 { packed } else { row_stride };
         if stride < packed {
@@ -159,6 +177,90 @@ pub(super) unsafe fn copy_rgb(
     Ok(())
 }
 
+/// Replaces layers of a baked light map by light of the caller's, for example by denoised light. All
+/// that reads, samples, saves or writes the light map uses it from then on, until the next bake.
+///
+/// Values of texels with validity 1 are taken (BK_LAYER_VALIDITY); others, as in the padding, are
+/// ignored: texels inside of solids get the new light of the texel that they repeat. Seams are
+/// stitched anew, if the bake stitched them. BK_LAYER_RADIANCE and BK_LAYER_ERROR stay those of the
+/// bake, and halves differ by as much as before. A call that fails changes nothing.
+///
+/// Cost: copying the texels, and bk_bake_stats.seam_seconds.
+///
+/// @param lightmap  light map of which all texels are baked
+/// @param layers  layers to replace, each once: BK_LAYER_DIRECT, BK_LAYER_INDIRECT and, after a bake with
+///   light by direction, BK_LAYER_L0, BK_LAYER_L1X, BK_LAYER_L1Y and BK_LAYER_L1Z; where L1 is longer
+///   than L0, it is shortened
+/// @param layer_count  number of elements of `layers`
+/// @param format  BK_FORMAT_RGB32F or BK_FORMAT_RGBA16F, whose alpha is ignored
+/// @param texels  for each of `layers`, its pages one after the other, each of them
+///   bk_lightmap_info.height packed rows; finite, up to 1e30, and >= 0 but for L1; needs no alignment
+/// @param progress,user  progress callback and its pointer; may be NULL
+/// @retval BK_ERROR_INVALID_ARGUMENT  a layer cannot be written or comes twice, the format is another
+///   one, or a value is none of light; bk_last_error names the texel
+/// @retval BK_ERROR_INVALID_STATE  not all texels are baked, there was no light by direction, or
+///   another call is using the light map
+/// @retval BK_ERROR_OUT_OF_MEMORY  a copy of the light does not fit
+/// @retval BK_ERROR_CANCELLED  the progress callback returned 0
+#[unsafe(no_mangle)]
+pub unsafe extern "C" fn bk_lightmap_write(
+    lightmap: *mut bk_lightmap,
+    layers: *const u32,
+    layer_count: usize,
+    format: u32,
+    texels: *const c_void,
+    progress: bk_progress_fn,
+    user: *mut c_void,
+) -> bk_result {
+    call(|| {
+        refuse_in_callback()?;
+        // SAFETY: a handle, or NULL.
+        let lightmap = unsafe { hold(lightmap, "lightmap") }?;
+        // SAFETY: the caller's array, or NULL.
+        let layers = unsafe { slice(layers, layer_count, "layers") }?;
+        let layers = try_collect(layers.iter().map(|&layer| core_layer(layer)), "layers")?;
+        let layers = layers.into_iter().collect::<Result<Vec<Layer>>>()?;
+        if format != BK_FORMAT_RGB32F && format != BK_FORMAT_RGBA16F {
+            return invalid_argument!("format is {format}, neither BK_FORMAT_RGB32F nor BK_FORMAT_RGBA16F");
+        }
+        let texel = texel_bytes(format)?;
+        lightmap.change(|l| {
+            let info = l.info();
+            let [pages, width, height] = [info.page_count, info.width, info.height].map(|n| n as usize);
+            let bytes = (pages * width * height * texel).checked_mul(layers.len());
+            let Some(bytes) = bytes.filter(|&b| isize::try_from(b).is_ok()) else {
+                return invalid_argument!("layer_count is {layer_count}, of which no memory holds the texels");
+            };
+            // SAFETY: the caller's array of so many bytes, or NULL.
+            let bytes = unsafe { slice(texels.cast::<u8>(), bytes, "texels") }?;
+            let value = |layer: usize, page: u32, x: u32, y: u32| {
+                let at = ((layer * pages + page as usize) * height + y as usize) * width + x as usize;
+                decode(&bytes[at * texel..][..texel])
+            };
+            l.write(&layers, value, &self::progress(progress, user))
+        })
+    })
+}
+
+/// Red, green and blue of a texel: of three floats, or of four halves.
+fn decode(texel: &[u8]) -> [f32; 3] {
+    std::array::from_fn(|c| match texel.len() {
+        12 => bytemuck::pod_read_unaligned(&texel[4 * c..][..4]),
+        _ => f16::from_bits(bytemuck::pod_read_unaligned(&texel[2 * c..][..2])).to_f32(),
+    })
+}
+
+/// The layer, and the half of the passes that a flag names.
+fn half_of(layer: u32) -> Result<(Layer, Option<Half>)> {
+    let half = match layer & (BK_LAYER_FIRST_HALF | BK_LAYER_SECOND_HALF) {
+        0 => return Ok((core_layer(layer)?, None)),
+        BK_LAYER_FIRST_HALF => Half::First,
+        BK_LAYER_SECOND_HALF => Half::Second,
+        _ => return invalid_argument!("layer is {layer}, which has the flags of both halves"),
+    };
+    Ok((core_layer(layer & 0xff)?, Some(half)))
+}
+
 fn unsuitable(format: u32, layer: Layer) -> Error {
     Error::InvalidArgument(format!("format is {format}, which does not suit the layer {layer:?}"))
 }
@@ -182,6 +284,7 @@ pub(super) fn core_layer(layer: u32) -> Result<Layer> {
         BK_LAYER_RATIO_Z => Layer::RatioZ,
         BK_LAYER_DIRECTION => Layer::Direction,
         BK_LAYER_ERROR => Layer::Error,
+        BK_LAYER_CHART => Layer::Chart,
         other => return invalid_argument!("layer is {other}, not one of the BK_LAYER values"),
     })
 }

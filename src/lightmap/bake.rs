@@ -160,12 +160,12 @@ impl Lightmap {
         let mut needed = params.passes.max(2);
         progress.set_part(0.0, 1.0 / needed as f32);
         let (light, stats) = run(0, None)?;
-        let mut all = Passes::begin(device, light, stats, range)?;
+        let mut all = Passes::begin(light, stats, range)?;
         loop {
             needed = device.install(|| all.needed(params, range));
             if all.count >= needed {
                 progress.set_part(0.0, 1.0);
-                return device.install(|| all.finish(range));
+                return Ok(device.install(|| all.finish(range)));
             }
             progress.set_part(all.count as f32 / needed as f32, (all.count + 1) as f32 / needed as f32);
             // All passes show the same sides.
@@ -191,11 +191,11 @@ impl Lightmap {
                     // Bakes that differ in what they were asked for: the light by direction of the last one stays.
                     (old.directional, old._memory) = (new.directional, new._memory);
                 }
-                if old.error.len() == new.error.len() {
-                    let of_range = range.start.min(new.error.len())..range.end.min(new.error.len());
-                    old.error[of_range.clone()].copy_from_slice(&new.error[of_range]);
+                if old.spread.len() == new.spread.len() {
+                    let of_range = range.start.min(new.spread.len())..range.end.min(new.spread.len());
+                    old.spread[of_range.clone()].copy_from_slice(&new.spread[of_range]);
                 } else {
-                    old.error = new.error;
+                    old.spread = new.spread;
                 }
                 old.state[range.clone()].copy_from_slice(&new.state[range]);
                 old.radiance = new.radiance;
@@ -255,7 +255,7 @@ impl<'p> Bake<'_, 'p> {
             direct: try_zeroed(n, "direct light")?,
             indirect: try_zeroed(n, "indirect light")?,
             directional: try_vec(if self.params.directional == 0 { 0 } else { n }, "light by direction")?,
-            error: Vec::new(),
+            spread: Vec::new(),
             state: try_vec(n, "validity")?,
             radiance,
             backs,

@@ -18,6 +18,7 @@ mod seams;
 pub(crate) mod stages;
 pub(crate) mod texel_light;
 pub(crate) mod tiles;
+mod write;
 
 use crate::base::directional::Directional;
 use crate::base::error::{Result, invalid_argument};
@@ -319,6 +320,18 @@ pub enum Layer {
     /// Standard error of the combined irradiance of a bake of several [passes](BakeParams::passes), before the stitching
     /// of seams (RGB, W/m²). It is an estimate from as many values as there were passes.
     Error = 16,
+    /// Number of the chart whose light a texel holds or, in the padding, repeats; a number of its own for the texels of a
+    /// chart's back (u32). [`crate::scene::NONE`] where there is none.
+    Chart = 17,
+}
+
+/// Half of the passes of a bake: light whose noise is independent of that of the other half.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub enum Half {
+    /// The first pass and every second one after it.
+    First,
+    /// The others.
+    Second,
 }
 
 impl Layer {
@@ -340,7 +353,7 @@ impl Layer {
 
     /// Whether the layer holds light that a bake computes.
     pub fn is_light(self) -> bool {
-        !matches!(self, Layer::Validity | Layer::Position | Layer::Normal | Layer::Triangle)
+        !matches!(self, Layer::Validity | Layer::Position | Layer::Normal | Layer::Triangle | Layer::Chart)
     }
 
     /// Whether the layer holds light by direction.
@@ -396,14 +409,24 @@ impl TexelState {
     }
 }
 
+/// What several passes tell of the light of a texel.
+#[derive(Clone, Copy, Debug, Default, PartialEq, Pod, Zeroable)]
+#[repr(C)]
+struct Spread {
+    /// Standard error of the sum of direct and indirect light.
+    error: Vec3,
+    /// Direct and indirect light of every second pass, from the first one on, less that of the others.
+    difference: [Vec3; 2],
+}
+
 /// Light of the texels after a bake, by sample of the light map.
 struct Light {
     direct: Vec<Vec3>,
     indirect: Vec<Vec3>,
     /// The light by direction that the bake was asked for; empty if none was.
     directional: Vec<Directional>,
-    /// Standard error of the sum of direct and indirect light; empty after a single pass.
-    error: Vec<Vec3>,
+    /// What several passes tell of the light; empty after a single one.
+    spread: Vec<Spread>,
     state: Vec<TexelState>,
     /// Reflected radiance, by sample of the radiance map. Empty if the bake left it out.
     radiance: Radiance,
@@ -424,7 +447,7 @@ impl Light {
         size_of_val(&self.direct[..])
             + size_of_val(&self.indirect[..])
             + size_of_val(&self.directional[..])
-            + size_of_val(&self.error[..])
+            + size_of_val(&self.spread[..])
             + size_of_val(&self.state[..])
             + size_of_val(&self.radiance.values[..])
             + self.backs.len()
@@ -536,7 +559,7 @@ impl Lightmap {
 
     /// Whether a bake had several passes, which tell the error of the light.
     pub fn has_error(&self) -> bool {
-        self.light.as_ref().is_some_and(|l| !l.error.is_empty())
+        self.light.as_ref().is_some_and(|l| !l.spread.is_empty())
     }
 
     /// Describes the plan of the last bake (before the first: of a bake with default parameters): what runs, and what

@@ -6,11 +6,10 @@
 //! gather rays hit nearby) is not part of it; [`BakeParams::near_hits`] and the light map's divisors lessen that.
 //! How far the estimate is right: docs/accuracy.md#estimated-error.
 
-use super::{BakeParams, BakeStats, Light, StageStats};
+use super::{BakeParams, BakeStats, Light, Spread, StageStats};
 use crate::base::directional::Directional;
 use crate::base::error::Result;
-use crate::base::memory::{Reservation, try_vec};
-use crate::device::Device;
+use crate::base::memory::try_vec;
 use crate::scene::MOST_LIGHT;
 use glam::Vec3;
 use rayon::prelude::*;
@@ -38,36 +37,42 @@ pub(super) fn params_of(params: &BakeParams, pass: u32) -> BakeParams {
 
 /// Light of the passes so far.
 pub(super) struct Passes {
+    /// Mean light. Its [`Spread`]s hold, until the end, the sum over the passes of squared differences from the mean in
+    /// place of the error, and that of the light of every second pass less that of the others in place of the difference.
     pub light: Light,
     pub stats: BakeStats,
     pub count: u32,
-    /// Sum over the passes of squared differences from the mean, by texel of the range and channel.
-    squares: Vec<Vec3>,
-    _memory: Reservation,
 }
 
 impl Passes {
     /// Begins with the first pass, of some texels of the light map.
-    pub fn begin(device: &Device, light: Light, stats: BakeStats, range: &Range<usize>) -> Result<Passes> {
-        let _memory = device.memory().reserve(range.len() * size_of::<Vec3>(), "the spread of passes")?;
-        Ok(Passes { light, stats, count: 1, squares: try_vec(range.len(), "the spread of passes")?, _memory })
+    pub fn begin(mut light: Light, stats: BakeStats, range: &Range<usize>) -> Result<Passes> {
+        let what = "the spread of passes";
+        light._memory.grow(light.direct.len() * size_of::<Spread>(), what)?;
+        light.spread = try_vec(light.direct.len(), what)?;
+        for i in range.clone() {
+            light.spread[i].difference = [light.direct[i], light.indirect[i]];
+        }
+        Ok(Passes { light, stats, count: 1 })
     }
 
     /// Returns the size of the buffers.
     pub fn bytes(&self) -> usize {
-        self.light.bytes() + size_of_val(&self.squares[..])
+        self.light.bytes()
     }
 
     /// Adds a pass (Welford's update of mean and squared differences).
     pub fn add(&mut self, new: &Light, stats: &BakeStats, range: &Range<usize>) {
         self.count += 1;
+        let sign = if self.count.is_multiple_of(2) { -1.0 } else { 1.0 };
         let part = 1.0 / self.count as f32;
         let mix = |mean: &mut Vec3, new: Vec3| *mean += (new - *mean) * part;
         let old = &mut self.light;
         let light =
             old.direct[range.clone()].par_chunks_mut(BLOCK).zip(old.indirect[range.clone()].par_chunks_mut(BLOCK));
-        let states = old.state[range.clone()].par_chunks_mut(BLOCK).zip(self.squares.par_chunks_mut(BLOCK));
-        light.zip(states).enumerate().for_each(|(block, ((direct, indirect), (state, squares)))| {
+        let states = old.state[range.clone()].par_chunks_mut(BLOCK);
+        let states = states.zip(old.spread[range.clone()].par_chunks_mut(BLOCK));
+        light.zip(states).enumerate().for_each(|(block, ((direct, indirect), (state, spread)))| {
             let first = range.start + block * BLOCK;
             for (i, s) in (first..).zip(0..direct.len()) {
                 let all = new.direct[i] + new.indirect[i];
@@ -75,7 +80,10 @@ impl Passes {
                 mix(&mut direct[s], new.direct[i]);
                 mix(&mut indirect[s], new.indirect[i]);
                 // Both differences have the same sign but for rounding.
-                squares[s] += (before * (all - (direct[s] + indirect[s]))).max(Vec3::ZERO);
+                let spread = &mut spread[s];
+                spread.error += (before * (all - (direct[s] + indirect[s]))).max(Vec3::ZERO);
+                let sums = spread.difference.iter_mut().zip([new.direct[i], new.indirect[i]]);
+                sums.for_each(|(sum, new)| *sum += new * sign);
                 state[s] = state[s].max(new.state[i]);
             }
         });
@@ -97,17 +105,17 @@ impl Passes {
         let all = |i: usize| (light.direct[range.start + i] + light.indirect[range.start + i]).as_dvec3();
         // Sums of blocks are added in order: the same bits on any number of threads.
         let sum = |of: &(dyn Fn(usize) -> f64 + Sync)| -> f64 {
-            let blocks = (0..self.squares.len().div_ceil(BLOCK)).into_par_iter();
-            let of_block = |b: usize| (b * BLOCK..self.squares.len().min((b + 1) * BLOCK)).map(of).sum();
+            let blocks = (0..range.len().div_ceil(BLOCK)).into_par_iter();
+            let of_block = |b: usize| (b * BLOCK..range.len().min((b + 1) * BLOCK)).map(of).sum();
             blocks.map(of_block).collect::<Vec<f64>>().iter().sum()
         };
-        let values = 3.0 * self.squares.len().max(1) as f64;
+        let values = 3.0 * range.len().max(1) as f64;
         let mean = sum(&|i| all(i).element_sum()) / values;
         let least = (DARK * mean).powi(2);
         let passes = f64::from(self.count);
         let squares = sum(&|i| {
             let weight = (all(i) * all(i) + least).recip();
-            let relative = self.squares[i].as_dvec3() * weight;
+            let relative = light.spread[range.start + i].error.as_dvec3() * weight;
             // Where all is dark there is no error.
             if least > 0.0 { relative.element_sum() } else { 0.0 }
         });
@@ -132,18 +140,26 @@ impl Passes {
         (forecast as u32).max(self.count + 1).min(MAX_PASSES)
     }
 
-    /// Returns the mean light of several passes, with its standard error.
-    pub fn finish(mut self, range: &Range<usize>) -> Result<(Light, BakeStats)> {
+    /// Returns the mean light of several passes, with its standard error and the difference of its halves.
+    pub fn finish(mut self, range: &Range<usize>) -> (Light, BakeStats) {
         self.stats.passes = self.count;
         self.stats.error = self.error(range);
-        self.light._memory.grow(self.light.direct.len() * size_of::<Vec3>(), "the error of texels")?;
-        self.light.error = try_vec(self.light.direct.len(), "the error of texels")?;
         // Squares of the strongest light are infinite.
         let most = Vec3::splat(MOST_LIGHT);
-        let scale = 1.0 / (self.count as f32 * (self.count - 1) as f32);
-        let error = self.light.error[range.clone()].par_iter_mut().zip(&self.squares);
-        error.with_min_len(BLOCK).for_each(|(error, &squares)| *error = (squares * scale).map(f32::sqrt).min(most));
-        Ok((self.light, self.stats))
+        let n = self.count as f32;
+        let scale = 1.0 / (n * (n - 1.0));
+        // The passes of both halves; the sums of their light follow from the mean of all and the difference.
+        let (a, b) = (self.count.div_ceil(2) as f32, (self.count / 2) as f32);
+        let (of_mean, of_difference) = (0.5 * n * (1.0 / a - 1.0 / b), 0.5 * (1.0 / a + 1.0 / b));
+        let Light { direct, indirect, spread, .. } = &mut self.light;
+        let light = direct[range.clone()].par_iter().zip(&indirect[range.clone()]);
+        spread[range.clone()].par_iter_mut().zip(light).with_min_len(BLOCK).for_each(|(spread, (direct, indirect))| {
+            spread.error = (spread.error * scale).map(f32::sqrt).min(most);
+            for (difference, mean) in spread.difference.iter_mut().zip([direct, indirect]) {
+                *difference = (*difference * of_difference + *mean * of_mean).clamp(-most, most);
+            }
+        });
+        (self.light, self.stats)
     }
 }
 
@@ -215,7 +231,9 @@ mod tests {
     fn bits(map: &Lightmap) -> Vec<u32> {
         let light = map.light.as_ref().unwrap();
         let directional = light.directional.iter().flat_map(|d| [d.l0, d.l1[0], d.l1[1], d.l1[2]]);
-        let all = light.direct.iter().chain(&light.indirect).chain(&light.error).copied().chain(directional);
+        let all = light.direct.iter().chain(&light.indirect).copied().chain(directional);
+        let of_passes = |s: &Spread| [s.error, s.difference[0], s.difference[1]];
+        let all = all.chain(light.spread.iter().flat_map(of_passes));
         all.flat_map(|v| v.to_array()).map(f32::to_bits).collect()
     }
 
@@ -233,7 +251,7 @@ mod tests {
         assert!(matches!(not_told, Err(Error::InvalidState(_))), "{not_told:?}");
         let stats = bake(&mut map, &PARAMS);
         assert_eq!((stats.passes, stats.photons_emitted), (3, 60_000));
-        let (mean, error) = (light(&map), &map.light.as_ref().unwrap().error);
+        let (mean, spread) = (light(&map), &map.light.as_ref().unwrap().spread);
         let mut relative = 0.0;
         let all = mean.iter().map(|m| m.element_sum() as f64).sum::<f64>() / (3 * mean.len()) as f64;
         for (i, &m) in mean.iter().enumerate() {
@@ -241,8 +259,13 @@ mod tests {
             assert!((m - expected).abs().cmple(1e-5 * expected + 1e-7).all(), "{m} for {expected}");
             let squares = bakes.iter().map(|b| (b[i] - expected) * (b[i] - expected)).sum::<Vec3>();
             let expected = (squares / 6.0).map(f32::sqrt);
-            assert!((error[i] - expected).abs().cmple(1e-3 * expected + 1e-4 * m).all(), "{} for {expected}", error[i]);
-            let (e, m) = (error[i].as_dvec3(), m.as_dvec3());
+            let Spread { error, difference: [direct, indirect] } = spread[i];
+            assert!((error - expected).abs().cmple(1e-3 * expected + 1e-4 * m).all(), "{error} for {expected}");
+            // Passes 1 and 3, and pass 2.
+            let halves = (bakes[0][i] + bakes[2][i]) / 2.0 - bakes[1][i];
+            let wrong = (direct + indirect - halves).abs();
+            assert!(wrong.cmple(1e-4 * m + 1e-6).all(), "{direct} + {indirect} for {halves}");
+            let (e, m) = (error.as_dvec3(), m.as_dvec3());
             relative += (e * e / (m * m + (0.1 * all).powi(2))).element_sum();
         }
         let relative = (relative / (3 * mean.len()) as f64).sqrt();

@@ -4,7 +4,7 @@ use super::atlas::ids::{ChartId, LightTexel};
 use super::atlas::texels::PageArea;
 use super::indirect::radiance_map;
 use super::indirect::radiance_map::RadianceLookup;
-use super::{Layer, LayerData, Light, Lightmap, TexelState};
+use super::{Half, Layer, LayerData, Light, Lightmap, Spread, TexelState};
 use crate::base::error::{Error, Result, invalid_argument};
 use crate::base::memory::{try_collect, try_vec, try_with_capacity};
 use crate::direct::DirectLight;
@@ -17,6 +17,17 @@ const FILLED: f32 = 0.5;
 
 /// UVs of the corners of each triangle, and its page.
 pub type MeshUvs = (Vec<[[f32; 2]; 3]>, Vec<u32>);
+
+impl Light {
+    /// What several passes tell of the light.
+    fn spread(&self) -> Result<&[Spread]> {
+        if self.spread.is_empty() {
+            let what = "the light map was baked in one pass, which tells no error and has no halves";
+            return Err(Error::InvalidState(what.into()));
+        }
+        Ok(&self.spread)
+    }
+}
 
 impl Lightmap {
     /// Returns the light map UV in [0, 1] of each corner, and the page of each triangle of `mesh`. Triangles without
@@ -130,12 +141,8 @@ impl Lightmap {
             }
             Layer::Error => {
                 let light = self.light()?;
-                if light.error.is_empty() {
-                    return Err(Error::InvalidState(
-                        "the light map was baked in one pass, which tells no error".into(),
-                    ));
-                }
-                self.page_of_light(page, |s| light.error[s.index()].to_array())
+                let spread = light.spread()?;
+                self.page_of_light(page, |s| spread[s.index()].error.to_array())
             }
             Layer::L0
             | Layer::L1X
@@ -167,10 +174,37 @@ impl Lightmap {
                 };
                 Ok(LayerData::Rgb(self.page_of_samples(page, [0.0; 3], normal)?))
             }
+            Layer::Chart => {
+                let chart = |s| map.placement_of(&self.atlas.charts, s).index() as u32;
+                Ok(LayerData::Integer(self.page(page, NONE, self.atlas.padding, chart, |v| v)?))
+            }
             Layer::Triangle => {
                 let triangle = |s: LightTexel| map[s].triangle;
                 Ok(LayerData::Integer(self.page_of_samples(page, NONE, triangle)?))
             }
+        }
+    }
+
+    /// Returns combined, direct or indirect light of one page from half of the passes of the last bake: the light, plus or
+    /// minus half of what the halves differ by. (Of an odd number of passes, halves so made have a little of each other's
+    /// noise.) `InvalidState` after a bake in one pass.
+    pub fn read_half(&self, page: u32, layer: Layer, half: Half) -> Result<LayerData> {
+        if page >= self.atlas.info.page_count {
+            return invalid_argument!("page is {page}, the light map has {}", self.atlas.info.page_count);
+        }
+        let light = self.light()?;
+        let spread = light.spread()?;
+        let sign = if half == Half::First { 0.5 } else { -0.5 };
+        let of = |mean: Vec3, difference: Vec3| (mean + difference * sign).max(Vec3::ZERO).to_array();
+        let parts = |s: LightTexel| (light.direct[s.index()], light.indirect[s.index()], spread[s.index()].difference);
+        match layer {
+            Layer::Combined => self.page_of_light(page, |s| {
+                let (direct, indirect, differences) = parts(s);
+                of(direct + indirect, differences[0] + differences[1])
+            }),
+            Layer::Direct => self.page_of_light(page, |s| of(parts(s).0, parts(s).2[0])),
+            Layer::Indirect => self.page_of_light(page, |s| of(parts(s).1, parts(s).2[1])),
+            _ => invalid_argument!("layer is {layer:?}, of which there are no halves"),
         }
     }
 

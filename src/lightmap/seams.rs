@@ -89,6 +89,13 @@ impl Stitch {
         }
     }
 
+    /// Undoes the stitching in a copy of the stitched light by direction.
+    pub(super) fn former_directional(&self, directional: &mut [Directional]) {
+        for (&texel, former) in self.texels.iter().zip(&self.directional) {
+            directional[texel as usize] = *former;
+        }
+    }
+
     /// Swaps the light of the stitched texels in the light map with the light held here.
     pub(super) fn swap(&mut self, light: &mut Light) {
         for (i, &texel) in self.texels.iter().enumerate() {

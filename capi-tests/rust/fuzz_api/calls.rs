@@ -722,16 +722,31 @@ fn floats(bytes: &[u8]) -> Vec<f32> {
     bytes.chunks_exact(4).map(|b| f32::from_le_bytes([b[0], b[1], b[2], b[3]])).collect()
 }
 
+fn write(lightmap: &Handle, info: &bk_lightmap_info, s: &mut Source) {
+    let layers: Vec<u32> =
+        (0..s.below(4)).map(|_| if s.one_in(10) { s.integer() } else { s.below(12) as u32 }).collect();
+    let format = if s.one_in(10) { s.integer() } else { 1 + s.below(2) as u32 };
+    let (pages, size) = (info.page_count as usize, info.width as usize * info.height as usize);
+    let value = if s.one_in(4) { s.float() } else { s.unit() };
+    let texels = vec![value; 3 * layers.len() * pages * size];
+    let p = texels.as_ptr().cast::<c_void>();
+    ask!(bk_lightmap_write(lightmap.p(), layers.as_ptr(), layers.len(), format, p, None, null_mut()));
+}
+
 fn read(w: &W, s: &mut Source) {
     let Some(lightmap) = w.pick(Kind::Lightmap, s) else { return };
     let Some(info) = info(&lightmap) else { return };
     let page = if s.one_in(10) { s.index() } else { s.below(info.page_count as usize) as u32 };
-    let layer = if s.one_in(20) { s.integer() } else { s.below(17) as u32 };
+    if s.one_in(8) {
+        return write(&lightmap, &info, s);
+    }
+    let half = if s.one_in(8) { BK_LAYER_FIRST_HALF << s.below(2) } else { 0 };
+    let layer = if s.one_in(20) { s.integer() } else { half | s.below(18) as u32 };
     let format = match layer {
         _ if s.one_in(10) => s.integer(),
         0..=3 => 1 + s.below(2) as u32,
         BK_LAYER_VALIDITY => BK_FORMAT_R32F,
-        BK_LAYER_TRIANGLE => BK_FORMAT_R32U,
+        BK_LAYER_TRIANGLE | BK_LAYER_CHART => BK_FORMAT_R32U,
         BK_LAYER_RATIO_X..=BK_LAYER_DIRECTION if s.one_in(2) => BK_FORMAT_RGBA8,
         _ => BK_FORMAT_RGB32F,
     };
@@ -1029,6 +1044,7 @@ fn null_handles(s: &mut Source) {
             failed(ask!(bk_bake(null_mut(), null(), None, null_mut(), null_mut())));
             failed(ask!(bk_lightmap_read(null(), 0, 0, 1, null_mut(), 0)));
             failed(ask!(bk_lightmap_save(null(), null(), 1, None, null_mut())));
+            failed(ask!(bk_lightmap_write(null_mut(), null(), 0, 1, null(), None, null_mut())));
             failed(ask!(bk_live_create(null_mut(), null(), None, null_mut(), words.as_mut_ptr().cast())));
             failed(ask!(bk_live_update(null_mut(), null(), null(), null_mut())));
             failed(ask!(bk_live_save(null_mut(), null(), None, null_mut())));

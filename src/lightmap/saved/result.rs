@@ -2,7 +2,7 @@
 //!
 //! A file holds records (`super::records`): `RSLT` with fingerprint and counts, `PLAN`, `BACK` (the sides that are
 //! shown), `RADI` (the radiance map, in runs), `TEXL` (direct and indirect light and state of runs of texels), each
-//! followed by `DIRL` (their light by direction) if that was asked for and `ERRL` (the error of their light) after
+//! followed by `DIRL` (their light by direction) if that was asked for and `SPRD` (error and halves of their light) after
 //! several passes, `DONE`.
 //! Light is saved as it was before seams were stitched. Loading the last texels stitches anew, so that light maps
 //! assembled from several results have the bits of one bake.
@@ -18,7 +18,7 @@ use crate::base::progress::Progress;
 use crate::lightmap::indirect::bright_patches::Bright;
 use crate::lightmap::indirect::radiance_map::Radiance;
 use crate::lightmap::plan::Plan;
-use crate::lightmap::{BakeStats, Light, Lightmap, TexelState};
+use crate::lightmap::{BakeStats, Light, Lightmap, Spread, TexelState};
 use crate::scene::MOST_LIGHT;
 use bytemuck::{Pod, Zeroable};
 use glam::Vec3;
@@ -32,7 +32,7 @@ const BACKS: Tag = *b"BACK";
 const RADIANCE: Tag = *b"RADI";
 const TEXELS: Tag = *b"TEXL";
 const DIRECTIONAL: Tag = *b"DIRL";
-const ERROR: Tag = *b"ERRL";
+const SPREAD: Tag = *b"SPRD";
 const DONE: Tag = *b"DONE";
 
 /// The content of the first record.
@@ -117,16 +117,17 @@ impl Lightmap {
         let memory = self.atlas.scene.device().memory();
         let origin = file.head.fingerprint.origin();
         let directional = if origin.params.directional == 0 { 0 } else { texels };
-        let error = if origin.params.passes > 1 || origin.params.target_error > 0.0 { texels } else { 0 };
+        let spread = if origin.params.passes > 1 || origin.params.target_error > 0.0 { texels } else { 0 };
         let bytes = texels * 25
             + directional * size_of::<Directional>()
-            + (error + file.head.radiance as usize) * size_of::<Vec3>();
+            + spread * size_of::<Spread>()
+            + file.head.radiance as usize * size_of::<Vec3>();
         let memory = memory.reserve(bytes, "the result of a bake")?;
         let mut light = Light {
             direct: try_vec(texels, "direct light")?,
             indirect: try_vec(texels, "indirect light")?,
             directional: try_vec(directional, "light by direction")?,
-            error: try_vec(error, "the error of texels")?,
+            spread: try_vec(spread, "the spread of passes")?,
             state: try_vec(texels, "validity")?,
             radiance: Radiance::default(),
             backs: Vec::new(),
@@ -147,7 +148,7 @@ impl Lightmap {
             light.direct.copy_from_slice(&old.direct);
             light.indirect.copy_from_slice(&old.indirect);
             light.directional.copy_from_slice(&old.directional);
-            light.error.copy_from_slice(&old.error);
+            light.spread.copy_from_slice(&old.spread);
             light.state.copy_from_slice(&old.state);
             if let Some(stitch) = &old.stitch {
                 stitch.copy_former(&mut light);
@@ -186,8 +187,8 @@ fn append_texels(light: &Light, run: Range<usize>, out: &mut Vec<u8>) -> Result<
     if !directional.is_empty() {
         records::append(out, DIRECTIONAL, &[bytemuck::cast_slice(&place), bytemuck::cast_slice(&directional)])?;
     }
-    match light.error.get(run) {
-        Some(error) => records::append(out, ERROR, &[bytemuck::cast_slice(&place), bytemuck::cast_slice(error)]),
+    match light.spread.get(run) {
+        Some(spread) => records::append(out, SPREAD, &[bytemuck::cast_slice(&place), bytemuck::cast_slice(spread)]),
         None => Ok(()),
     }
 }
@@ -230,7 +231,7 @@ impl<'a> Loading<'a> {
     /// Reads all records after the first.
     fn read_into(&mut self, light: &mut Light, charts: usize, progress: &Progress) -> Result<()> {
         let stage = progress.stage("loading", 0.0, 1.0, self.head.radiance + self.head.texels);
-        let (mut texels, mut directional, mut error) = (0, 0, 0);
+        let (mut texels, mut directional, mut spread) = (0, 0, 0);
         light.radiance = Radiance { values: Vec::new(), bright: Bright::default() };
         light.radiance.values = try_with_capacity(self.head.radiance as usize, "the radiance map of a result")?;
         loop {
@@ -246,7 +247,7 @@ impl<'a> Loading<'a> {
                 RADIANCE => read_radiance(&content, self.head.radiance as usize, &mut light.radiance.values),
                 TEXELS => read_texels(&content, light).inspect(|&n| texels += n as u64),
                 DIRECTIONAL => read_directional(&content, light).inspect(|&n| directional += n as u64).map(|_| 0),
-                ERROR => read_error(&content, light).inspect(|&n| error += n as u64).map(|_| 0),
+                SPREAD => read_spread(&content, light).inspect(|&n| spread += n as u64).map(|_| 0),
                 DONE => break,
                 _ => None,
             };
@@ -255,7 +256,7 @@ impl<'a> Loading<'a> {
         let asked = |is_empty| if is_empty { 0 } else { self.head.texels };
         if texels != self.head.texels
             || directional != asked(light.directional.is_empty())
-            || error != asked(light.error.is_empty())
+            || spread != asked(light.spread.is_empty())
             || light.radiance.values.len() as u64 != self.head.radiance
         {
             return Err(damaged(self.path));
@@ -290,12 +291,13 @@ fn read_directional(mut content: &[u8], light: &mut Light) -> Option<usize> {
     (content.is_empty() && values.iter().all(Directional::is_possible)).then_some(count)
 }
 
-/// Reads the error of a run of texels; returns its length.
-fn read_error(mut content: &[u8], light: &mut Light) -> Option<usize> {
+/// Reads error and halves of a run of texels; returns its length.
+fn read_spread(mut content: &[u8], light: &mut Light) -> Option<usize> {
     let [first, count] = take_one::<[u64; 2]>(&mut content)?.map(|n| n as usize);
-    let values = light.error.get_mut(first..first.checked_add(count)?)?;
+    let values = light.spread.get_mut(first..first.checked_add(count)?)?;
     take(&mut content, values)?;
-    (content.is_empty() && is_light(values)).then_some(count)
+    let is_possible = |s: &Spread| is_light(&[s.error]) && is_light(&s.difference.map(Vec3::abs));
+    (content.is_empty() && values.iter().all(is_possible)).then_some(count)
 }
 
 /// Reads a run of texels; returns its length. If it is refused, some texels may have been written.
