@@ -1,5 +1,5 @@
 #!/usr/bin/env python3
-"""examples/bake.py against what is known of its scene.
+"""examples/bake.py and denoise.py against what is known of their scenes.
 
     BAKELITE_LIBRARY=libbakelite.so bake_py.py FOLDER/
 """
@@ -16,6 +16,7 @@ EXAMPLES = os.path.join(os.path.dirname(os.path.abspath(__file__)), "..", "examp
 sys.path.insert(0, EXAMPLES)
 sys.dont_write_bytecode = True
 import bake  # noqa: E402
+import denoise  # noqa: E402
 
 
 def structures():
@@ -25,7 +26,7 @@ def structures():
     kinds = {"uint32_t": ctypes.c_uint32, "uint64_t": ctypes.c_uint64, "size_t": ctypes.c_size_t, "float": ctypes.c_float,
              "double": ctypes.c_double}
     compared = 0
-    for name, declared in vars(bake).items():
+    for name, declared in [*vars(bake).items(), *vars(denoise).items()]:
         if not (isinstance(declared, type) and issubclass(declared, ctypes.Structure) and declared is not ctypes.Structure):
             continue
         c_name = "bk" + re.sub(r"([A-Z])", lambda m: "_" + m[1].lower(), name)
@@ -36,7 +37,7 @@ def structures():
             expected.append((field, kind * int(length) if length else kind))
         assert declared._fields_ == expected, f"{name} is not {c_name}: {declared._fields_}, {expected}"
         compared += 1
-    assert compared == 5, compared
+    assert compared == 6, compared
 
 
 def main(out):
@@ -76,7 +77,13 @@ def main(out):
             assert "7" in str(error) or "99" in str(error), error
         else:
             raise AssertionError("a wrong mesh was accepted")
-    print("bake.py: passed")
+
+    # Denoised light is nearer to the truth.
+    command = [sys.executable, os.path.join(EXAMPLES, "denoise.py"), "--texels", "128"]
+    told = subprocess.run(command, check=True, capture_output=True, text=True).stdout
+    before, after = map(float, re.findall(r"0\.\d+", told))
+    assert 0 < after < 0.75 * before, told
+    print("bake.py, denoise.py: passed")
 
 
 main(sys.argv[1])

@@ -129,6 +129,106 @@ fn blocks_of_c_compile_without_a_warning() {
     assert!(count > 10, "there are only {count} blocks of C and C++");
 }
 
+/// What C++ lacks to take a function in GLSL for one of its own.
+#[cfg(unix)]
+const GLSL: &str = "\
+#include <cmath>
+#include <cstdio>
+struct vec3 { float x, y, z; };
+static vec3 operator+(vec3 a, vec3 b) { return {a.x + b.x, a.y + b.y, a.z + b.z}; }
+static vec3 operator-(vec3 a, vec3 b) { return {a.x - b.x, a.y - b.y, a.z - b.z}; }
+static vec3 operator*(vec3 a, vec3 b) { return {a.x * b.x, a.y * b.y, a.z * b.z}; }
+static vec3 operator/(vec3 a, vec3 b) { return {a.x / b.x, a.y / b.y, a.z / b.z}; }
+static vec3 all(float f) { return {f, f, f}; }
+static vec3 operator*(float f, vec3 a) { return all(f) * a; }
+static vec3 operator/(vec3 a, float f) { return a / all(f); }
+static vec3 operator-(float f, vec3 a) { return all(f) - a; }
+static vec3 operator-(vec3 a, float f) { return a - all(f); }
+static float dot(vec3 a, vec3 b) { return a.x * b.x + a.y * b.y + a.z * b.z; }
+static float length(vec3 a) { return std::sqrt(dot(a, a)); }
+static float max(float a, float b) { return a > b ? a : b; }
+static vec3 max(vec3 a, float f) { return {max(a.x, f), max(a.y, f), max(a.z, f)}; }
+static float clamp(float a, float low, float high) { return a < low ? low : a > high ? high : a; }
+static vec3 clamp(vec3 a, float l, float h) { return {clamp(a.x, l, h), clamp(a.y, l, h), clamp(a.z, l, h)}; }
+static vec3 sqrt(vec3 a) { return {std::sqrt(a.x), std::sqrt(a.y), std::sqrt(a.z)}; }
+";
+
+/// Reads three vectors E, L0, L1 and the normals, and writes what the three functions of the shader make of them; ratios
+/// and directions go the way through 8 bits.
+#[cfg(unix)]
+const SHADES: &str = "\
+static vec3 read() { vec3 v; if (std::scanf(\"%f %f %f\", &v.x, &v.y, &v.z) != 3) throw 1; return v; }
+static void write(vec3 v) { std::printf(\"%.9g %.9g %.9g\\n\", v.x, v.y, v.z); }
+int main() {
+    int count;
+    for (std::scanf(\"%d\", &count); count > 0; count--) {
+        const vec3 E = read(), L0 = read(), x = read(), y = read(), z = read(), n = read(), m = read();
+        const vec3 r = read(), s = read(), t = read(), d = read();
+        write(irradiance_on(E, L0, x, y, z, n, m));
+        write(irradiance_on_ratios(E, L0, r / 255.0f, s / 255.0f, t / 255.0f, n, m));
+        write(irradiance_on_direction(E, d / 255.0f, n, m));
+    }
+}
+";
+
+/// The shader, taken for C++, gives what the function in Rust gives; the guide shows it as it is.
+#[cfg(unix)]
+#[test]
+fn the_shader_for_normal_maps_is_the_function_of_the_library() {
+    use bakelite::lightmap::normal_maps::irradiance_on;
+    use bakelite::lightmap::packed_ratio;
+    use bakelite::sampling::{uniform, uniform_sphere};
+    use glam::Vec3;
+    use std::io::Write;
+    use std::process::Stdio;
+    let shader = read(Path::new("examples/light_by_direction.glsl"));
+    let shown = blocks(&read(Path::new("docs/guide.md")), "glsl");
+    let shown = shown.iter().find(|b| b.1.contains("irradiance_on(")).expect("the guide shows the shader");
+    assert!(shader.contains(&shown.1), "the guide shows another shader than the file has");
+    let folder = PathBuf::from(env!("CARGO_TARGET_TMPDIR")).join("snippets");
+    std::fs::create_dir_all(&folder).unwrap();
+    let (source, program) = (folder.join("shader.cpp"), folder.join("shader"));
+    std::fs::write(&source, format!("{GLSL}{shader}{SHADES}")).unwrap();
+    let compiler = std::env::var("CXX").unwrap_or("c++".into());
+    let result = Command::new(&compiler).args(["-std=c++17", "-O1", "-o"]).arg(&program).arg(&source).output().unwrap();
+    assert!(result.status.success(), "{}", String::from_utf8_lossy(&result.stderr));
+
+    let (mut input, mut expected) = (String::from("500\n"), Vec::new());
+    for i in 0..500 {
+        let random = |k| Vec3::new(uniform(i, k, 0), uniform(i, k, 1), uniform(i, k, 2));
+        let sphere = |k| uniform_sphere([uniform(i, k, 3), uniform(i, k, 4)]);
+        let (e, l0, n) = (5.0 * random(0), random(1), sphere(2));
+        let m = (n + 0.7 * uniform(i, 3, 0) * sphere(4)).normalize();
+        let direction = (n + sphere(5)).normalize_or_zero() * uniform(i, 6, 0);
+        let l1 = [0, 1, 2].map(|axis| l0 * (direction[axis] + 0.1 * (random(7)[axis] - 0.5)));
+        // Bytes as the library writes them, and as a texture gives them.
+        let bytes = |v: Vec3| v.to_array().map(packed_ratio);
+        let unpacked = |b: [u8; 3]| Vec3::from(b.map(|b| f32::from(b) / 127.5 - 1.0));
+        let ratios = l1.map(|x| bytes(x / l0.max(Vec3::splat(1e-12))));
+        let d = bytes(direction);
+        for v in [e, l0, l1[0], l1[1], l1[2], n, m] {
+            input += &format!("{} {} {}\n", v.x, v.y, v.z);
+        }
+        for [r, g, b] in ratios.into_iter().chain([d]) {
+            input += &format!("{r} {g} {b}\n");
+        }
+        expected.push(irradiance_on(e, l0, l1, n, m));
+        expected.push(irradiance_on(e, l0, ratios.map(|r| unpacked(r) * l0), n, m));
+        let towards = unpacked(d);
+        let l0 = e / (4.0 * std::f32::consts::PI * towards.dot(n).max(0.1));
+        expected.push(irradiance_on(e, l0, towards.to_array().map(|x| x * l0), n, m));
+    }
+    let mut run = Command::new(&program).stdin(Stdio::piped()).stdout(Stdio::piped()).spawn().unwrap();
+    let mut stdin = run.stdin.take().unwrap();
+    std::thread::spawn(move || stdin.write_all(input.as_bytes()).unwrap());
+    let output = String::from_utf8(run.wait_with_output().unwrap().stdout).unwrap();
+    let shaded: Vec<f32> = output.split_whitespace().map(|word| word.parse().unwrap()).collect();
+    assert_eq!(shaded.len(), 3 * expected.len());
+    for (i, (got, expected)) in shaded.chunks_exact(3).map(Vec3::from_slice).zip(&expected).enumerate() {
+        assert!(expected.is_finite() && (got - *expected).abs().max_element() < 2e-4, "{i}: {got} for {expected}");
+    }
+}
+
 /// Where GitHub puts the headings of a text: in lower case, without punctuation, with hyphens for spaces.
 fn anchors(text: &str) -> HashSet<String> {
     let mut fenced = false;
