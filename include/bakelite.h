@@ -2417,11 +2417,12 @@ typedef struct bk_live_params {
   /// quarter of `max_rounds` * 64, at least 16, at most 64. Default: 16.
   uint32_t own_rays;
   /// 1: compute light that was reflected by other surfaces by direction too, as
-  /// bk_bake_params.directional_indirect does. It takes 7 bytes more per texel of the light map.
+  /// bk_bake_params.directional_indirect does. It takes 240 bytes more per texel of the gather map, half
+  /// as much again once a light has changed, and a fifth more time until light is finished.
   /// Default: 0.
   uint32_t directional_indirect;
-  /// 1: the same for light that comes straight from lights, for 48 bytes more per texel of the light
-  /// map. With both, the layers hold the sum. Default: 0.
+  /// 1: the same for light that comes straight from lights, for 48 bytes more per texel of the tiles
+  /// of the light map, which overlap, about 120 per texel of the light map. With both, the layers hold the sum. Default: 0.
   uint32_t directional_direct;
 } bk_live_params;
 
