@@ -137,8 +137,9 @@ pub struct bk_live_params {
     /// as much again once a light has changed, and a fifth more time until light is finished.
     /// Default: 0.
     pub directional_indirect: u32,
-    /// 1: the same for light that comes straight from lights, for 48 bytes more per texel of the tiles
-    /// of the light map, which overlap, about 120 per texel of the light map. With both, the layers hold the sum. Default: 0.
+    /// 1: the same for light that comes straight from lights, for about 120 bytes more per texel of the
+    /// light map (48 per texel of tiles, which overlap). With both, the layers hold the sum.
+    /// Default: 0.
     pub directional_direct: u32,
 }
 

@@ -44,9 +44,9 @@ impl Lightmap {
     /// Replaces `layers` of light: `value` returns the new value of a layer, by its place in the list, at a page, column
     /// and row. It is asked for texels that are [valid](Layer::Validity) only. Layers: [`Layer::Direct`],
     /// [`Layer::Indirect`] and, after a bake with light by direction, [`Layer::L0`] and [`Layer::L1X`] to
-    /// [`Layer::L1Z`], where |L1| is reduced to L0 if it is more. Values must be finite and at most 1e30, ≥ 0 but for L1. All texels must have been
-    /// baked. [`Layer::Radiance`], [`Layer::Error`] and what [halves](super::Half) differ by stay those of the bake. A
-    /// call that fails changes nothing.
+    /// [`Layer::L1Z`], where L1 that is longer than L0 is shortened. Values must be finite and at most 1e30, and ≥ 0 but
+    /// for L1. All texels must have been baked. [`Layer::Radiance`], [`Layer::Error`] and the difference of
+    /// [halves](super::Half) stay those of the bake. A call that fails changes nothing.
     pub fn write(
         &mut self,
         layers: &[Layer],
