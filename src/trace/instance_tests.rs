@@ -90,8 +90,8 @@ fn rays(seed: u32) -> Vec<Ray> {
             1 => Vec3::splat(-2.0) + 0.1 * vector(i, 2, seed),
             _ => 4.0 * vector(i, 2, seed),
         };
-        let ray = Ray::new(origin, direction(i) * if i % 11 == 0 { 1e-9 } else { 1.0 });
-        if i % 7 == 0 { ray.within(0.5, 4.0) } else { ray }
+        let ray = Ray::new(origin, direction(i) * if i.is_multiple_of(11) { 1e-9 } else { 1.0 });
+        if i.is_multiple_of(7) { ray.within(0.5, 4.0) } else { ray }
     };
     let mut rays: Vec<Ray> = (0..2400).map(ray).collect();
     rays.sort_by_key(|r| r.origin[1].to_bits());
@@ -148,7 +148,7 @@ fn all_queries_give_the_same_bits() {
         assert!(any == occluded, "{isa:?}");
         scene.occluded_block(&rays, &mut any);
         assert!(any == occluded, "{isa:?}");
-        assert!(any.iter().zip(&single).all(|(&any, hit)| (any == 1) == !hit.is_miss()));
+        assert!(any.iter().zip(&single).all(|(&any, hit)| (any == 1) != hit.is_miss()));
 
         let mut many = vec![Hit::MISS; rays.len()];
         scene.intersect_many(&rays, true, &mut many).unwrap();

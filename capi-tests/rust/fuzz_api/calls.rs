@@ -39,7 +39,7 @@ pub fn any(w: &W, s: &mut Source) {
         1..=4 => create_scene(w, s),
         5..=6 => load_scene(w, s),
         7..=10 => material(w, s),
-        11..=16 => drop(mesh(w, s)),
+        11..=16 => mesh(w, s),
         17 => instances(w, s),
         18..=19 => image(w, s),
         20..=23 => light(w, s),

@@ -39,7 +39,7 @@ impl Reader<'_, '_> {
         let scale = scale.map(|a| self.column::<3>(&a)).transpose()?;
         let mut places = self.import.account.list(count, "the nodes")?;
         for i in 0..count as u32 {
-            if i as usize % super::PART == 0 {
+            if (i as usize).is_multiple_of(super::PART) {
                 self.import.check()?;
             }
             let turn = rotation.as_ref().map_or(Quat::IDENTITY, |r| Quat::from_array(r.get(i)));

@@ -54,7 +54,7 @@ pub(super) fn colonnade(triangles: usize, copies: bool) -> Result<SceneData> {
             scene.add_instance(Instance { mesh: number, transform })?;
         }
     }
-    scene.add_light(Light::Sky { radiance: [0.6, 0.8, 1.0], environment: NONE, up: Vec3::Y.into(), rotation: 0.0 })?;
+    scene.add_light(Light::Sky { radiance: [0.6, 0.8, 1.0], environment: NONE, up: Vec3::Y, rotation: 0.0 })?;
     let direction = Vec3::new(0.5, -0.7, 0.3).normalize();
     scene.add_light(Light::Directional { direction, irradiance: [6.0, 5.4, 4.4], angular_radius: 0.005 })?;
     Ok(scene)
