@@ -62,21 +62,24 @@ static void part_name(char *out, size_t capacity, const char *folder, int part)
     snprintf(out, capacity, "%s/part-%d-of-%d.light", folder, part, size);
 }
 
-/* Bakes a part and writes it, unless the folder has it. */
+/* Bakes a part and writes it, or loads it if the folder has it. */
 static void bake_part(bk_lightmap *map, const char *folder, int part)
 {
     char name[4096];
     bk_bake_params params;
     bk_lightmap_info info;
-    part_name(name, sizeof name, folder, part);
-    if (bk_lightmap_load_result(map, name, progress, NULL) == BK_OK) {
-        return;
-    }
     bk_lightmap_info_init(&info);
     check(bk_lightmap_get_info(map, &info), "light map");
     bk_bake_params_init(&params);
     params.texel_begin = info.texels * (uint64_t)part / (uint64_t)size;
     params.texel_end = info.texels * (uint64_t)(part + 1) / (uint64_t)size;
+    part_name(name, sizeof name, folder, part);
+    if (params.texel_begin == params.texel_end) {
+        return; /* There are fewer texels than ranks. */
+    }
+    if (bk_lightmap_load_result(map, name, progress, NULL) == BK_OK) {
+        return;
+    }
     check(bk_bake(map, &params, progress, NULL, NULL), "bake");
     check(bk_lightmap_save_result(map, name, progress, NULL), "part");
 }
@@ -89,7 +92,7 @@ static int wait_for(int other, int state)
     double since = MPI_Wtime();
     for (;;) {
         MPI_Win_lock(MPI_LOCK_SHARED, 0, 0, board);
-        MPI_Get(cells, CELLS, MPI_INT, 0, CELLS * other, CELLS, MPI_INT, board);
+        MPI_Get_accumulate(NULL, 0, MPI_INT, cells, CELLS, MPI_INT, 0, CELLS * other, CELLS, MPI_INT, MPI_NO_OP, board);
         MPI_Win_unlock(0, board);
         if (cells[STATE] >= state) {
             return cells[STATE];
@@ -129,8 +132,8 @@ int main(int argc, char **argv)
     bk_scene *scene = NULL;
     bk_lightmap *map = NULL;
     char name[4096];
-    int *cells = NULL, lost = 0, part;
-    MPI_Init(&argc, &argv);
+    int *cells = NULL, lost = 0, part, provided;
+    MPI_Init_thread(&argc, &argv, MPI_THREAD_FUNNELED, &provided);
     MPI_Comm_rank(MPI_COMM_WORLD, &rank);
     MPI_Comm_size(MPI_COMM_WORLD, &size);
     if (argc < 3) {
@@ -143,7 +146,9 @@ int main(int argc, char **argv)
     MPI_Win_allocate(rank == 0 ? (MPI_Aint)(CELLS * size * (int)sizeof(int)) : 0, sizeof(int), MPI_INFO_NULL,
                      MPI_COMM_WORLD, &cells, &board);
     if (rank == 0) {
+        MPI_Win_lock(MPI_LOCK_EXCLUSIVE, 0, 0, board);
         memset(cells, 0, CELLS * (size_t)size * sizeof(int));
+        MPI_Win_unlock(0, board);
     }
     MPI_Barrier(MPI_COMM_WORLD);
 
@@ -170,14 +175,11 @@ int main(int argc, char **argv)
         tell(STATE, DONE);
     }
     for (part = 1; rank == 0 && part < size; part++) {
-        if (wait_for(part, DONE) != WORKING) {
-            part_name(name, sizeof name, argv[1], part);
-            check(bk_lightmap_load_result(map, name, progress, NULL), "part");
-        } else {
+        if (wait_for(part, DONE) == WORKING) {
             fprintf(stderr, "rank %d is lost; rank 0 bakes its part\n", part);
             lost = 1;
-            bake_part(map, argv[1], part);
         }
+        bake_part(map, argv[1], part);
     }
     if (rank == 0) {
         snprintf(name, sizeof name, "%s/", argv[1]);

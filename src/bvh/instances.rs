@@ -5,6 +5,7 @@
 use super::layout::Mbvh;
 use super::{BuildOptions, BuildQuality, References, Tree, build_binary, collapse};
 use crate::base::error::Result;
+use crate::base::geometry::is_valid_triangle;
 use crate::base::memory::{try_collect, try_push, try_to_vec};
 use crate::base::progress::Progress;
 use glam::{Mat3A, Vec3, Vec3A};
@@ -28,6 +29,8 @@ pub(crate) struct MeshTree {
     pub tree: Tree,
     /// Triangles that are not in the tree, ascending.
     pub skipped: Vec<u32>,
+    /// Number of the others that cannot be hit since a refit.
+    pub gone: usize,
 }
 
 /// An instance as rays meet it.
@@ -47,15 +50,15 @@ pub(crate) struct PlacedTree {
 /// coordinates and extents: some ten roundings, for what transforming a ray moves it by.
 const MARGIN: f32 = 1e-6;
 
-/// Returns the box around the image of another, moved outwards. A box that is not finite, of a mesh that cannot be hit,
-/// gives one that no ray meets.
-pub(crate) fn placed_box((lower, upper): (Vec3, Vec3), place: impl Fn(Vec3) -> Vec3) -> (Vec3, Vec3) {
+/// Returns the box around the image of another, moved outwards; `reach`: the largest coordinate that placing a corner
+/// goes through. A box that is not finite, of a mesh that cannot be hit, gives one that no ray meets.
+pub(crate) fn placed_box((lower, upper): (Vec3, Vec3), reach: f32, place: impl Fn(Vec3) -> Vec3) -> (Vec3, Vec3) {
     let corner = |i: usize| place(Vec3::from_array([0, 1, 2].map(|a| [lower, upper][i >> a & 1][a])));
     let (mut low, mut high) = (Vec3::INFINITY, Vec3::NEG_INFINITY);
     for c in (0..8).map(corner) {
         (low, high) = (low.min(c), high.max(c));
     }
-    let margin = MARGIN * ((high - low).max_element() + low.abs().max(high.abs()).max_element());
+    let margin = MARGIN * ((high - low).max_element() + low.abs().max(high.abs()).max_element().max(reach));
     (low - margin, high + margin)
 }
 
@@ -69,7 +72,8 @@ impl Instances {
     pub(crate) fn top_of(boxes: &[(Vec3, Vec3)], progress: &Progress) -> Result<Mbvh> {
         let corners = |i: u32| Self::corners_of_box(boxes[i as usize]);
         let options = BuildOptions { max_leaf: 1, quality: BuildQuality::Default, ..Default::default() };
-        let met = |(i, b): (u32, &(Vec3, Vec3))| b.0.cmple(b.1).all().then_some(i);
+        // Boxes beyond the greatest coordinate are not met, as triangles there are not.
+        let met = |(i, _): (u32, &(Vec3, Vec3))| is_valid_triangle(corners(i)).then_some(i);
         let ids = try_collect((0..).zip(boxes).filter_map(met), "the tree of instances")?;
         if ids.is_empty() {
             return Ok(Mbvh::nothing());
@@ -94,6 +98,7 @@ impl Instances {
                 range: t.range,
                 tree: t.tree.try_clone()?,
                 skipped: try_to_vec(&t.skipped, what)?,
+                gone: t.gone,
             };
             try_push(&mut trees, copy, what)?;
         }

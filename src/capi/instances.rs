@@ -36,9 +36,10 @@ unsafe fn read_transform(transform: *const f32) -> Result<Affine3A> {
 /// @param transform  12 floats: where the mesh's axes and origin lie in the scene, in scene units
 /// @param out_id  receives the number of the instance, as hits report it: the first is 0; may be NULL
 /// @retval BK_ERROR_INVALID_ARGUMENT  there is no such mesh; the transform is not finite, mirrors or
-///   cannot be inverted; or there would be more than 4,294,967,294 triangles
+///   cannot be inverted; or there would be more than 4,294,967,294 triangles or 268,435,454
+///   instances
 /// @retval BK_ERROR_INVALID_STATE  the scene is committed or another thread is changing it
-/// @retval BK_ERROR_OUT_OF_MEMORY  the memory callback refuses
+/// @retval BK_ERROR_OUT_OF_MEMORY  the list of instances does not fit (the commit announces it)
 #[unsafe(no_mangle)]
 pub unsafe extern "C" fn bk_scene_add_instance(
     scene: *mut bk_scene,

@@ -371,6 +371,11 @@ impl<'a> Tracer<'a> {
             return None;
         }
         let point = SurfacePoint::new(surface.corners, surface.weights[0], surface.weights[1], self.scene);
+        if !point.normal.is_finite() {
+            // A triangle that is one in its mesh, but vanishes where an instance places it.
+            tally.absorbed += power;
+            return None;
+        }
         let direction = Vec3::from_array(ray.direction);
         let normal = if surface.front { point.normal } else { -point.normal };
         if !is_black && (path.bounces > 0 || self.store_direct) {

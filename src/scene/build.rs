@@ -94,7 +94,12 @@ impl Scene {
         let meshes = data.bytes();
         let own = data.own_triangles;
         let estimate = bvh::estimated_bytes(own, options) + instance_trees::estimated_bytes(data, options);
-        let mut memory = device.memory().reserve(meshes + estimate, "the scene")?;
+        // What there is of each triangle of an instance, and not of each of a mesh alone.
+        let of_instances = match data.instances.is_empty() {
+            true => 0,
+            false => emissive_triangles(data) * size_of::<Emitter>() + size_of_val(&first_triangle[..]),
+        };
+        let mut memory = device.memory().reserve(meshes + of_instances + estimate, "the scene")?;
         let instances = device.install(|| instance_trees::build(data, &first_triangle, options, progress))?;
         let corners = |t: u32| {
             let object = object_of(&first_triangle, t);
@@ -141,7 +146,7 @@ impl Scene {
         let trees = || [&tree].into_iter().chain(instances.iter().flat_map(|i| i.trees.iter().map(|t| &t.tree)));
         let top = instances.as_ref().map_or(0, |i| i.top.node_count());
         let bvh_bytes = tree.bytes() + instances.as_ref().map_or(0, Instances::bytes);
-        let bytes = bvh_bytes + meshes;
+        let bytes = bvh_bytes + meshes + of_instances;
         memory.shrink(bytes);
         let stats = SceneStats {
             triangles: total as u64,
@@ -160,8 +165,21 @@ impl Scene {
         let (lower, upper) = tree.bounds();
         let (low, high) = instances.as_ref().map_or((lower, upper), |i| i.top.bounds());
         let bounds = (lower.min(low), upper.max(high));
+        let reach = instances.as_ref().map_or(0.0, |i| instance_trees::reach(data, i));
+        let extent = (bounds.1 - bounds.0).length().max(reach);
         let instances = instances.map(Box::new);
-        Ok(Parts { emitters, first_triangle, bounds, tree, skipped, instances, uses: Uses::of(data), stats, memory })
+        Ok(Parts {
+            emitters,
+            first_triangle,
+            bounds,
+            extent,
+            tree,
+            skipped,
+            instances,
+            uses: Uses::of(data),
+            stats,
+            memory,
+        })
     }
 }
 
@@ -169,6 +187,7 @@ struct Parts {
     emitters: Vec<Emitter>,
     first_triangle: Vec<u32>,
     bounds: (Vec3, Vec3),
+    extent: f32,
     tree: Tree,
     skipped: Vec<u32>,
     instances: Option<Box<Instances>>,
@@ -179,7 +198,7 @@ struct Parts {
 
 impl Parts {
     fn into_scene(self, device: Arc<Device>, data: SceneData) -> Scene {
-        let Parts { emitters, first_triangle, bounds, tree, skipped, instances, uses, stats, memory } = self;
+        let Parts { emitters, first_triangle, bounds, extent, tree, skipped, instances, uses, stats, memory } = self;
         let lights = Arc::new(RwLock::new(Arc::new(data.lights.clone())));
         Scene {
             device,
@@ -188,6 +207,7 @@ impl Parts {
             emitters,
             first_triangle,
             bounds,
+            extent,
             tree,
             skipped,
             instances,

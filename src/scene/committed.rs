@@ -55,6 +55,8 @@ pub struct Scene {
     /// First global triangle number per object, and the total at the end.
     pub(super) first_triangle: Vec<u32>,
     pub(super) bounds: (Vec3, Vec3),
+    /// Length of the bounding box's diagonal, or the largest coordinate that placing instances goes through, if that is more.
+    pub(super) extent: f32,
     /// Tree of the meshes without instances.
     pub(super) tree: Tree,
     /// Triangles that are not in that tree, ascending.
@@ -178,7 +180,7 @@ impl Scene {
         &self.emitters
     }
 
-    /// Lower and upper corner of the bounding box of all valid triangles.
+    /// Lower and upper corner of the bounding box of all valid triangles; for instances, of the boxes around their meshes'.
     pub fn bounds(&self) -> (Vec3, Vec3) {
         self.bounds
     }
@@ -186,6 +188,12 @@ impl Scene {
     /// Length of the bounding box's diagonal.
     pub fn diagonal(&self) -> f32 {
         (self.bounds.1 - self.bounds.0).length()
+    }
+
+    /// The magnitude of coordinates, beside that of a point itself, that the precision of rays follows.
+    #[inline]
+    pub(super) fn extent(&self) -> f32 {
+        self.extent
     }
 
     /// Statistics of the scene.
@@ -222,6 +230,18 @@ impl Scene {
     pub fn is_valid(&self, triangle: u32) -> bool {
         let (o, t) = self.locate(triangle);
         is_valid_triangle(self.object(o).corners(t)) && !self.is_skipped(o, t)
+    }
+
+    /// Whether a triangle of a mesh, whether that has instances or not, is in no tree.
+    pub(super) fn is_skipped_in_mesh(&self, mesh: u32, triangle: u32) -> bool {
+        let of_instances = || {
+            let trees = &self.instance_trees()?.trees;
+            trees.binary_search_by_key(&mesh, |t| t.mesh).ok().map(|i| &trees[i])
+        };
+        match of_instances() {
+            Some(tree) => tree.skipped.binary_search(&triangle).is_ok(),
+            None => self.is_skipped(mesh, triangle),
+        }
     }
 
     /// Whether a triangle of an object is in no tree.

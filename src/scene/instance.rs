@@ -42,6 +42,13 @@ impl Instance {
         Ok(())
     }
 
+    /// Returns the largest coordinate that placing a point of a box of the mesh goes through.
+    pub(super) fn reach(&self, (lower, upper): (Vec3, Vec3)) -> f32 {
+        let (m, far) = (&self.transform.matrix3, Vec3A::from(lower.abs().max(upper.abs())));
+        let terms = m.x_axis.abs() * far.x + m.y_axis.abs() * far.y + m.z_axis.abs() * far.z;
+        (terms + self.transform.translation.abs()).max_element()
+    }
+
     /// Returns the map of vectors from the scene's coordinates to those of the mesh.
     pub(crate) fn to_mesh(self) -> Mat3A {
         let Affine3A { matrix3: m, .. } = self.transform;

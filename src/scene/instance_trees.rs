@@ -56,18 +56,24 @@ pub(super) fn build(
     Ok(Some(Instances { top, trees, placed }))
 }
 
-/// Refits the trees after vertices and instances have moved; `rooms` are those of the meshes' trees. Returns how many
-/// triangles can no longer be hit.
-pub(super) fn refit(data: &SceneData, instances: &mut Instances, rooms: Vec<RefitRoom>) -> usize {
+/// Refits the trees after vertices of meshes and instances have moved; `rooms` are those of the meshes' trees. Returns
+/// how many triangles can no longer be hit.
+pub(super) fn refit(
+    data: &SceneData,
+    instances: &mut Instances,
+    rooms: Vec<RefitRoom>,
+    has_moved: impl Fn(u32) -> bool + Sync,
+) -> usize {
     let of_tree = |(t, room): (&mut MeshTree, RefitRoom)| {
-        if !t.is_hit() {
-            return 0;
+        if !t.is_hit() || !has_moved(t.mesh) {
+            return t.gone;
         }
         let mesh = &data.meshes[t.mesh as usize];
         let corners = |i: u32| mesh.corners(i as usize);
         t.tree.refit(&corners, room);
         let is_gone = |&i: &u32| !is_valid_triangle(corners(i)) && t.skipped.binary_search(&i).is_err();
-        (0..t.range[1]).into_par_iter().filter(is_gone).count()
+        t.gone = (0..t.range[1]).into_par_iter().filter(is_gone).count();
+        t.gone
     };
     let gone = instances.trees.par_iter_mut().zip(rooms).map(of_tree).sum();
     for (at, instance) in instances.placed.iter_mut().zip(&data.instances) {
@@ -75,16 +81,21 @@ pub(super) fn refit(data: &SceneData, instances: &mut Instances, rooms: Vec<Refi
     }
     let Instances { top, trees, placed } = instances;
     let corners = |i: u32| Instances::corners_of_box(box_of(data, trees, placed, i as usize));
-    if top.bounds().0.is_finite() {
-        bvh::refit_whole(top, &corners);
-    }
+    bvh::refit_whole(top, &corners);
     gone
 }
 
 /// The box of an instance in the scene.
 fn box_of(data: &SceneData, trees: &[MeshTree], placed: &[PlacedTree], instance: usize) -> (Vec3, Vec3) {
-    let transform = &data.instances[instance].transform;
-    placed_box(trees[placed[instance].tree as usize].tree.bounds(), |p| super::instance::placed(transform, p))
+    let place = &data.instances[instance];
+    let bounds = trees[placed[instance].tree as usize].tree.bounds();
+    placed_box(bounds, place.reach(bounds), |p| super::instance::placed(&place.transform, p))
+}
+
+/// The largest coordinate that placing a point of any instance goes through: rays are as precise as that.
+pub(super) fn reach(data: &SceneData, instances: &Instances) -> f32 {
+    let of_instance = |(i, at): (&Instance, &PlacedTree)| i.reach(instances.trees[at.tree as usize].tree.bounds());
+    data.instances.iter().zip(&instances.placed).map(of_instance).filter(|r| r.is_finite()).fold(0.0, f32::max)
 }
 
 fn tree_of(data: &SceneData, number: u32, options: &BuildOptions, progress: &Progress) -> Result<MeshTree> {
@@ -102,7 +113,7 @@ fn tree_of(data: &SceneData, number: u32, options: &BuildOptions, progress: &Pro
         0 => Tree::nothing(),
         _ => bvh::build(&corners, references, &range, options, progress)?.0,
     };
-    Ok(MeshTree { mesh: number, range, tree, skipped })
+    Ok(MeshTree { mesh: number, range, tree, skipped, gone: 0 })
 }
 
 /// Whether a triangle of an object is in no tree: `own` are the skipped triangles of meshes without instances, by their

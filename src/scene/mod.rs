@@ -30,12 +30,15 @@ pub use mesh::{LightmapUvs, Mesh, MeshMaterials};
 pub use texture::{MAX_TEXTURE_SIZE, Texture};
 
 use crate::base::error::{Error, Result, invalid_argument};
-use crate::base::memory::{try_to_vec, try_with_capacity};
+use crate::base::memory::{try_push, try_to_vec, try_with_capacity};
 use std::borrow::Cow;
 use std::sync::Arc;
 
 /// Maximum number of triangles in a mesh, and in all meshes without instances together: leaf references hold 28 bits.
 pub const MAX_TRIANGLES: usize = 1 << 28;
+
+/// Maximum number of instances: the boxes of instances are leaves, too.
+pub const MAX_INSTANCES: usize = MAX_TRIANGLES - 2;
 
 /// Maximum number of triangles in a scene, those of every instance counted: global numbers have 32 bits, and the last
 /// one is [`NONE`].
@@ -106,13 +109,16 @@ impl SceneData {
         let triangles = self.meshes[mesh].indices.len();
         let own = self.own_triangles - if self.is_instanced(instance.mesh) { 0 } else { triangles };
         self.check_triangles(own, self.instance_triangles + triangles)?;
+        Self::check_instances(self.meshes.len(), self.instances.len() + 1)?;
+        let more = (mesh + 1).saturating_sub(self.has_instances.len());
+        if self.has_instances.try_reserve(more).is_err() {
+            return Err(Error::OutOfMemory("there is no room for another instance".into()));
+        }
+        try_push(&mut self.instances, instance, "the instances")?;
+        self.has_instances.resize(self.has_instances.len() + more, false);
+        self.has_instances[mesh] = true;
         self.own_triangles = own;
         self.instance_triangles += triangles;
-        if self.has_instances.len() <= mesh {
-            self.has_instances.resize(mesh + 1, false);
-        }
-        self.has_instances[mesh] = true;
-        self.instances.push(instance);
         Ok(self.instances.len() as u32 - 1)
     }
 
@@ -136,6 +142,7 @@ impl SceneData {
         let (own, placed) =
             (self.own_triangles + other.own_triangles, self.instance_triangles + other.instance_triangles);
         self.check_triangles(own, placed)?;
+        Self::check_instances(self.meshes.len() + other.meshes.len(), self.instances.len() + other.instances.len())?;
         (self.own_triangles, self.instance_triangles) = (own, placed);
         let shift = self.materials.len() as u32;
         for mesh in &mut other.meshes {
@@ -294,6 +301,14 @@ impl SceneData {
     /// Number of triangles in the scene, those of every instance counted and degenerate ones included.
     pub fn triangle_count(&self) -> usize {
         self.own_triangles + self.instance_triangles
+    }
+
+    /// Checks that objects can be numbered.
+    fn check_instances(meshes: usize, instances: usize) -> Result<()> {
+        if instances > MAX_INSTANCES || meshes + instances >= u32::MAX as usize {
+            return invalid_argument!("the scene would have {instances} instances, more than {MAX_INSTANCES}");
+        }
+        Ok(())
     }
 
     /// Checks numbers of triangles of meshes without instances and of instances.

@@ -10,7 +10,7 @@ use crate::bvh;
 use crate::device::LogLevel;
 use glam::{Affine3A, Vec3};
 use rayon::prelude::*;
-use std::collections::HashMap;
+use std::collections::{HashMap, HashSet};
 use std::sync::Arc;
 use std::time::Instant;
 
@@ -69,7 +69,9 @@ impl Scene {
         for &(instance, transform) in placed {
             scene.data.instances[instance as usize].transform = transform;
         }
-        device.install(|| scene.follow_positions(emitters, own, rooms));
+        let moved: HashSet<u32> = moved.iter().map(|m| m.0).collect();
+        let has_moved = |mesh: u32| moved.contains(&mesh);
+        device.install(|| scene.follow_positions(emitters, own, rooms, has_moved));
         scene.stats.refits += 1;
         scene.stats.refit_seconds = start.elapsed().as_secs_f64();
         Ok(())
@@ -97,32 +99,36 @@ impl Scene {
     /// Whether any triangle of the tree can be hit after vertices have moved.
     fn any_left(&self, moved: &[(u32, &[Vec3])]) -> bool {
         let new: HashMap<u32, &[Vec3]> = moved.iter().copied().collect();
-        let instances = (self.meshes().len() as u32..).zip(&self.data.instances);
-        let some_instance: HashMap<u32, u32> = instances.map(|(object, i)| (i.mesh, object)).collect();
         (0..).zip(self.meshes()).any(|(m, mesh)| {
             let positions = new.get(&m).copied().unwrap_or(&mesh.positions);
-            let object = some_instance.get(&m).copied().unwrap_or(m);
             (0..)
                 .zip(&mesh.indices)
-                .any(|(t, i)| is_valid_triangle(i.map(|i| positions[i as usize])) && !self.is_skipped(object, t))
+                .any(|(t, i)| is_valid_triangle(i.map(|i| positions[i as usize])) && !self.is_skipped_in_mesh(m, t))
         })
     }
 
     /// Updates all data that depend on positions. `emitters` has capacity for all there may be; the rooms are those of
     /// the tree of meshes without instances and of the trees of the others.
-    fn follow_positions(&mut self, mut emitters: Vec<Emitter>, own: bvh::RefitRoom, rooms: Vec<bvh::RefitRoom>) {
+    fn follow_positions(
+        &mut self,
+        mut emitters: Vec<Emitter>,
+        own: bvh::RefitRoom,
+        rooms: Vec<bvh::RefitRoom>,
+        has_moved: impl Fn(u32) -> bool + Sync,
+    ) {
         let (first, data) = (&self.first_triangle, &self.data);
         let corners = |t: u32| {
             let object = object_of(first, t);
             data.object(object as u32).corners(t - first[object])
         };
         let own_triangles = data.own_triangles as u32;
-        if own_triangles > self.skipped.len() as u32 {
+        let has_own_moved = (0..data.meshes.len() as u32).any(|m| !data.is_instanced(m) && has_moved(m));
+        if has_own_moved && own_triangles > self.skipped.len() as u32 {
             self.tree.refit(&corners, own);
         }
         let mut gone = 0;
         if let Some(instances) = self.instances.as_deref_mut() {
-            gone += instance_trees::refit(data, instances, rooms);
+            gone += instance_trees::refit(data, instances, rooms, &has_moved);
         }
         let is_gone = |&t: &u32| !is_valid_triangle(corners(t)) && self.skipped.binary_search(&t).is_err();
         gone += (0..own_triangles).into_par_iter().filter(is_gone).count();
@@ -135,6 +141,8 @@ impl Scene {
         let (lower, upper) = self.tree.bounds();
         let (low, high) = self.instances.as_ref().map_or((lower, upper), |i| i.top.bounds());
         self.bounds = (lower.min(low), upper.max(high));
+        let reach = self.instances.as_deref().map_or(0.0, |i| instance_trees::reach(&self.data, i));
+        self.extent = (self.bounds.1 - self.bounds.0).length().max(reach);
         add_emitters(&self.data, &self.first_triangle, |o, t| self.is_skipped(o, t), &mut emitters);
         self.emitters = emitters;
         self.stats.skipped_degenerate = (self.skipped.len() + skipped_of_instances + gone) as u64;
@@ -155,6 +163,7 @@ impl Scene {
             emitters: Vec::new(),
             first_triangle: try_to_vec(&self.first_triangle, COPY)?,
             bounds: self.bounds,
+            extent: self.extent,
             tree: self.tree.try_clone()?,
             skipped: try_to_vec(&self.skipped, COPY)?,
             instances: match &self.instances {

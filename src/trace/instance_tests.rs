@@ -4,6 +4,7 @@ use crate::bvh::{BuildOptions, BuildQuality};
 use crate::device::{Device, DeviceOptions};
 use crate::scene::{Instance, Material, Mesh, MeshMaterials, NONE, Scene, SceneData, Texture};
 use crate::simd::Isa;
+use crate::trace::offset::{SurfacePoint, offset_ray_origin};
 use crate::trace::{Hit, PACKET_SIZE, Packet, RawHit, Ray};
 use glam::{Affine3A, Quat, Vec2, Vec3};
 use std::sync::Arc;
@@ -132,10 +133,16 @@ fn instances_are_hit_where_copies_of_their_mesh_are() {
 
 #[test]
 fn all_queries_give_the_same_bits() {
-    let (data, rays) = (data(7, false), rays(9));
+    for only_instances in [false, true] {
+        all_queries_agree(&data(7, only_instances));
+    }
+}
+
+fn all_queries_agree(data: &SceneData) {
+    let rays = rays(9);
     let mut expected: Option<Vec<RawHit>> = None;
     for (isa, build) in builds() {
-        let scene = commit(isa, build, &data);
+        let scene = commit(isa, build, data);
         let single: Vec<RawHit> = rays.iter().map(|r| scene.intersect_raw(r)).collect();
         let occluded: Vec<u8> = rays.iter().map(|r| scene.occluded(r) as u8).collect();
         let mut hits = vec![RawHit::MISS; rays.len()];
@@ -215,6 +222,64 @@ fn instances_that_move_are_hit_where_they_are_then() {
         let differing = rays.iter().filter(|r| bits(&scene.intersect_raw(r)) != bits(&anew.intersect_raw(r))).count();
         assert!(differing <= if build.quality == BuildQuality::High { 2 } else { 0 }, "{isa:?} {build:?}: {differing}");
         assert!(scene.bounds().0.distance(anew.bounds().0) < 1e-5);
+    }
+}
+
+#[test]
+fn instances_that_vanish_come_back_and_unmoved_trees_stay() {
+    let rays = rays(12);
+    for (isa, build) in builds() {
+        let described = data(3, false);
+        let mut scene = commit(isa, build, &described);
+        let before: Vec<_> = rays.iter().map(|r| scene.intersect_raw(r)).collect();
+        let nowhere: Vec<Vec<Vec3>> =
+            described.meshes()[2..].iter().map(|m| vec![Vec3::ZERO; m.positions.len()]).collect();
+        let gone: Vec<(u32, &[Vec3])> = (2..).zip(&nowhere).map(|(m, p)| (m, &p[..])).collect();
+        Scene::refit(&mut scene, &gone).unwrap();
+        assert!(rays.iter().all(|r| scene.to_hit(scene.intersect_raw(r)).instance == NONE));
+        assert!(scene.bounds().0.is_finite() && scene.bounds().1.is_finite());
+        assert_eq!(scene.stats().skipped_degenerate, 80 + 40 + 40);
+        let back: Vec<(u32, &[Vec3])> =
+            (2..).zip(&described.meshes()[2..]).map(|(m, p)| (m, &p.positions[..])).collect();
+        Scene::refit(&mut scene, &back).unwrap();
+        assert_eq!(scene.stats().skipped_degenerate, 3);
+        let after = rays.iter().map(|r| scene.intersect_raw(r));
+        let differing = after.zip(&before).filter(|(a, b)| a != *b).count();
+        assert!(differing <= if build.quality == BuildQuality::High { 2 } else { 0 }, "{isa:?} {build:?}: {differing}");
+    }
+}
+
+/// The largest coordinate that placing an instance goes through bounds the precision of its surface.
+#[test]
+fn rays_from_instances_do_not_hit_them_again_however_far_their_mesh_is_from_its_origin() {
+    for far in [0.0, 1e2, 1e4, 1e5] {
+        let offset = far * Vec3::new(1.0, -0.7, 0.9);
+        let mut data = SceneData::new();
+        let material = data.add_material(Material::default()).unwrap();
+        let mut mesh = soup(200, 21, material);
+        mesh.positions.iter_mut().for_each(|p| *p += offset);
+        let mesh = data.add_mesh(mesh).unwrap();
+        for i in 0..4 {
+            let turn = Affine3A::from_quat(transform(i, 5).to_scale_rotation_translation().1);
+            let back = Affine3A::from_translation(3.0 * vector(i, 3, 4) - turn.transform_vector3(offset));
+            data.add_instance(Instance { mesh, transform: back * turn }).unwrap();
+        }
+        let scene = commit(Isa::Portable, BuildOptions::default(), &data);
+        let mut tested = 0;
+        for (i, ray) in (0..).zip(rays(13)) {
+            let hit = scene.intersect_raw(&ray);
+            let corners = if hit.is_miss() { continue } else { scene.corners(hit.triangle) };
+            let point = SurfacePoint::new(corners, hit.u, hit.v, &scene);
+            let away = uniform_sphere([uniform(i, 40, 1), uniform(i, 41, 1)]);
+            let side = point.normal * if away.dot(point.normal) > 0.0 { 1.0 } else { -1.0 };
+            if away.dot(side) < 0.1 {
+                continue;
+            }
+            let next = scene.intersect_raw(&Ray::new(offset_ray_origin(point.interior, side, &scene), away));
+            assert!(next.triangle != hit.triangle, "{far}: t = {}", next.t);
+            tested += 1;
+        }
+        assert!(tested > 50, "{far}: {tested}");
     }
 }
 

@@ -29,6 +29,9 @@ const LEAST_STREAM: usize = 16;
 pub(super) trait Answer: Copy {
     const MISS: Self;
 
+    /// The buffer of answers in a room.
+    fn buffer(room: &mut Buffers) -> &mut Vec<Self>;
+
     /// How far the ray goes on; `None` if its answer cannot change.
     fn tmax(&self, ray: &Ray) -> Option<f32>;
 
@@ -41,6 +44,10 @@ pub(super) trait Answer: Copy {
 
 impl Answer for RawHit {
     const MISS: RawHit = RawHit::MISS;
+
+    fn buffer(room: &mut Buffers) -> &mut Vec<RawHit> {
+        &mut room.hits
+    }
 
     #[inline]
     fn tmax(&self, ray: &Ray) -> Option<f32> {
@@ -73,6 +80,10 @@ impl Answer for RawHit {
 /// Whether anything lies on a ray: 1 or 0.
 impl Answer for u8 {
     const MISS: u8 = 0;
+
+    fn buffer(room: &mut Buffers) -> &mut Vec<u8> {
+        &mut room.occluded
+    }
 
     #[inline]
     fn tmax(&self, ray: &Ray) -> Option<f32> {
@@ -111,10 +122,21 @@ struct Room {
     /// The instance that a ray waits at, above the number of the ray.
     visits: Vec<u64>,
     rays: Vec<Ray>,
+    found: Buffers,
+}
+
+/// Answers of the rays at one instance.
+#[derive(Default)]
+pub(super) struct Buffers {
+    hits: Vec<RawHit>,
+    occluded: Vec<u8>,
 }
 
 thread_local! {
-    static ROOM: Cell<Room> = const { Cell::new(Room { walks: Vec::new(), visits: Vec::new(), rays: Vec::new() }) };
+    static ROOM: Cell<Room> = const {
+        let found = Buffers { hits: Vec::new(), occluded: Vec::new() };
+        Cell::new(Room { walks: Vec::new(), visits: Vec::new(), rays: Vec::new(), found })
+    };
 }
 
 impl Scene {
@@ -137,7 +159,8 @@ impl Scene {
         room.rays.clear();
         let has_room = room.walks.try_reserve_exact(size).is_ok()
             && room.visits.try_reserve(size).is_ok()
-            && room.rays.try_reserve(size).is_ok();
+            && room.rays.try_reserve(size).is_ok()
+            && A::buffer(&mut room.found).try_reserve(size).is_ok();
         if has_room {
             for (rays, answers) in rays.chunks(BATCH).zip(answers.chunks_mut(BATCH)) {
                 self.meet_by_turns(instances, rays, alike, answers, &mut room);
@@ -178,9 +201,9 @@ impl Scene {
         room: &mut Room,
     ) {
         let kernels = self.kernels();
-        let Room { walks, visits, rays: turned } = room;
+        let Room { walks, visits, rays: turned, found } = room;
+        let found = A::buffer(found);
         let walks = &mut walks.spare_capacity_mut()[..rays.len()];
-        let mut found = [A::MISS; BATCH];
         visits.clear();
         for (r, ((ray, answer), place)) in rays.iter().zip(&*answers).zip(&mut *walks).enumerate() {
             if answer.tmax(ray).is_some() && Walk::begin::<Mbvh>(place, ray, r) {
@@ -209,8 +232,8 @@ impl Scene {
                 };
                 turned.clear();
                 turned.extend(at_one.iter().map(ray));
-                let found = &mut found[..turned.len()];
-                found.fill(A::MISS);
+                found.clear();
+                found.resize(turned.len(), A::MISS);
                 A::trace(self, self.tree_of(instances, at.tree), turned, alike, found);
                 for (&visit, &found) in at_one.iter().zip(&*found) {
                     answers[visit as u32 as usize].add(found, at.first_triangle);

@@ -36,7 +36,7 @@ use crate::base::error::{Error, Result, invalid_argument};
 use crate::base::files;
 use crate::base::memory::try_append;
 use crate::lightmap::Lightmap;
-use crate::scene::{Material, NONE, Scene};
+use crate::scene::{MAX_TRIANGLES, Material, NONE, Scene};
 use file::{File, LIGHTMAP_SAMPLER, TEXTURE_SAMPLER};
 use primitives::{Primitive, group};
 use std::path::Path;
@@ -190,6 +190,10 @@ fn parts(
 }
 
 fn check(scene: &Scene, lightmap: &GlbLightmap) -> Result<()> {
+    // Sides of triangles have one bit more than their numbers (primitives.rs).
+    if scene.triangle_count() as usize > MAX_TRIANGLES {
+        return Err(Error::Unsupported(format!("a GLB file of {} triangles", scene.triangle_count())));
+    }
     let count = scene.object_count();
     if lightmap.meshes.len() != count as usize {
         return invalid_argument!("light map UVs of {} meshes for {count}", lightmap.meshes.len());

@@ -4,7 +4,7 @@
 use super::Reader;
 use crate::base::error::Result;
 use crate::scene::Instance;
-use glam::{Affine3A, DMat4, DQuat, Quat, Vec3};
+use glam::{Affine3A, DMat4, Quat, Vec3};
 
 /// Least number of triangles of a primitive that becomes a mesh with instances if it stands in several places. (Rays
 /// are faster through copies than through instances of small meshes: docs/performance.md.)
@@ -12,28 +12,43 @@ const LEAST_TRIANGLES: usize = 1000;
 
 const EXTENSION: &str = "EXT_mesh_gpu_instancing";
 
-impl Reader<'_, '_> {
+impl<'i> Reader<'i, '_> {
+    /// The accessors of translations, rotations and scales that `EXT_mesh_gpu_instancing` gives a node, and the number of
+    /// its places; `None` without the extension.
+    fn attributes(&mut self, node: &gltf::Node) -> Result<Option<([Option<gltf::Accessor<'i>>; 3], usize)>> {
+        let Some(extension) = node.extension_value(EXTENSION) else { return Ok(None) };
+        self.place = format!("{EXTENSION} of node {}", node.index());
+        let attributes = extension.get("attributes").and_then(|a| a.as_object());
+        let document = self.document;
+        let find = |name: &str, number: &serde_json::Value| {
+            let found = number.as_u64().and_then(|n| document.accessors().nth(usize::try_from(n).ok()?));
+            found.map_or_else(|| self.malformed(format_args!("{name} names no accessor")), Ok)
+        };
+        let (mut known, mut count) = ([None, None, None], None);
+        for (name, number) in attributes.into_iter().flatten() {
+            let accessor = find(name, number)?;
+            if *count.get_or_insert(accessor.count()) != accessor.count() {
+                return self.malformed("its attributes have different counts");
+            }
+            if let Some(i) = ["TRANSLATION", "ROTATION", "SCALE"].iter().position(|n| n == name) {
+                known[i] = Some(accessor);
+            }
+        }
+        Ok(Some((known, count.unwrap_or(0))))
+    }
+
+    /// The number of places where a node's mesh stands.
+    pub(super) fn count_places(&mut self, node: &gltf::Node) -> Result<usize> {
+        Ok(self.attributes(node)?.map_or(1, |(_, count)| count))
+    }
+
     /// The transforms of a node's mesh to the world.
     pub(super) fn places(&mut self, node: &gltf::Node, transform: &DMat4) -> Result<Vec<DMat4>> {
-        let Some(extension) = node.extension_value(EXTENSION) else {
+        let Some(([translation, rotation, scale], count)) = self.attributes(node)? else {
             let mut one = self.import.account.list(1, "the nodes")?;
             one.push(*transform);
             return Ok(one);
         };
-        self.place = format!("{EXTENSION} of node {}", node.index());
-        let accessor = |name: &str| match extension.get("attributes").and_then(|a| a.get(name)) {
-            None => Ok(None),
-            Some(number) => match number.as_u64().and_then(|n| self.document.accessors().nth(n as usize)) {
-                None => self.malformed(format_args!("{name} names no accessor")),
-                accessor => Ok(accessor),
-            },
-        };
-        let [translation, rotation, scale] = [accessor("TRANSLATION")?, accessor("ROTATION")?, accessor("SCALE")?];
-        let counts = [&translation, &rotation, &scale].map(|a| a.as_ref().map(|a| a.count()));
-        let count = counts.iter().flatten().next().copied().unwrap_or(0);
-        if counts.iter().flatten().any(|&c| c != count) {
-            return self.malformed("its attributes have different counts");
-        }
         let translation = translation.map(|a| self.column::<3>(&a)).transpose()?;
         let rotation = rotation.map(|a| self.column::<4>(&a)).transpose()?;
         let scale = scale.map(|a| self.column::<3>(&a)).transpose()?;
@@ -42,10 +57,14 @@ impl Reader<'_, '_> {
             if (i as usize).is_multiple_of(super::PART) {
                 self.import.check()?;
             }
-            let turn = rotation.as_ref().map_or(Quat::IDENTITY, |r| Quat::from_array(r.get(i)));
+            let turn = rotation.as_ref().map_or(Quat::IDENTITY, |r| Quat::from_array(r.get(i))).as_dquat();
+            let length = turn.length();
+            if !(length > 0.0 && length.is_finite()) {
+                return self.malformed(format_args!("rotation {i} is {turn}, no rotation"));
+            }
             let place = DMat4::from_scale_rotation_translation(
                 scale.as_ref().map_or(Vec3::ONE, |s| s.get(i).into()).as_dvec3(),
-                if turn.length_squared() > 0.0 { turn.as_dquat().normalize() } else { DQuat::IDENTITY },
+                turn.normalize(),
                 translation.as_ref().map_or(Vec3::ZERO, |t| t.get(i).into()).as_dvec3(),
             );
             places.push(transform * place);

@@ -80,25 +80,25 @@ pub(super) fn load(import: &mut Import, opened: Opened) -> Result<()> {
         import,
     };
     let placed = document::place_nodes(reader.import, &document)?;
-    let mut shown = reader.import.account.list(placed.len(), "the nodes")?;
     for (node, transform) in &placed {
         if let Some(light) = node.light() {
             reader.add_light(&light, transform)?;
         }
         if let Some(mesh) = node.mesh() {
-            let places = reader.places(node, transform)?;
-            reader.mesh_uses[mesh.index()] += places.len();
-            shown.push((mesh, places));
+            reader.mesh_uses[mesh.index()] += reader.count_places(node)?;
         }
     }
-    for (mesh, places) in &shown {
-        for transform in places {
+    for (node, transform) in &placed {
+        let Some(mesh) = node.mesh() else { continue };
+        let places = reader.places(node, transform)?;
+        for transform in &places {
             for primitive in mesh.primitives() {
                 reader.place = format!("mesh {}, primitive {}", mesh.index(), primitive.index());
                 reader.import.check()?;
                 reader.add_placed(mesh.index(), &primitive, transform)?;
             }
         }
+        reader.import.account.give_back(size_of_val(&places[..]));
     }
     reader.warn();
     if import.scene.triangle_count() == 0 {

@@ -6,10 +6,9 @@
 
 use super::pieces::{CHARTS, Piece};
 use crate::base::error::Result;
-use crate::base::memory::{try_collect, try_with_capacity};
+use crate::base::memory::{try_collect, try_push, try_with_capacity};
 use crate::scene::Scene;
 use glam::{DMat3, DVec3};
-use std::collections::HashMap;
 
 /// Which object's pieces an object gets, and the factor of their lengths.
 #[derive(Clone, Copy, Debug, PartialEq)]
@@ -28,7 +27,7 @@ const MOST_COMPARED: usize = 16;
 /// Finds the sources of objects, given by their valid triangles (global numbers, ascending).
 pub(super) fn sources(scene: &Scene, of_objects: &[&[u32]]) -> Result<Vec<Source>> {
     let mut sources = try_with_capacity(of_objects.len(), CHARTS)?;
-    let mut known: HashMap<u32, Vec<(usize, f64, [DVec3; 2])>> = HashMap::new();
+    let mut known: Vec<Vec<(usize, f64, [DVec3; 2])>> = try_collect(scene.meshes().iter().map(|_| Vec::new()), CHARTS)?;
     for (index, triangles) in of_objects.iter().enumerate() {
         let own = Source { index, factor: 1.0 };
         let object = scene.locate(triangles[0]).0;
@@ -38,7 +37,7 @@ pub(super) fn sources(scene: &Scene, of_objects: &[&[u32]]) -> Result<Vec<Source
         };
         let instance = scene.instances()[instance as usize];
         let (length, shape) = shape(instance.transform.matrix3.into());
-        let others = known.entry(instance.mesh).or_default();
+        let others = &mut known[instance.mesh as usize];
         let is_alike = |&&(other, _, its): &&(usize, f64, [DVec3; 2])| {
             let same_triangles = || {
                 let [a, b] = [of_objects[other], triangles].map(|t| (t, scene.first_triangle(scene.locate(t[0]).0)));
@@ -49,7 +48,7 @@ pub(super) fn sources(scene: &Scene, of_objects: &[&[u32]]) -> Result<Vec<Source
         match others.iter().rev().take(MOST_COMPARED).find(is_alike) {
             Some(&(index, of_source, _)) => sources.push(Source { index, factor: (length / of_source) as f32 }),
             None => {
-                others.push((index, length, shape));
+                try_push(others, (index, length, shape), CHARTS)?;
                 sources.push(own);
             }
         }
