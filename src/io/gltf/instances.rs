@@ -3,8 +3,13 @@
 
 use super::Reader;
 use crate::base::error::Result;
+use crate::io::Import;
+use crate::io::source::Checked;
 use crate::scene::Instance;
 use glam::{Affine3A, DMat4, Quat, Vec3};
+use serde_json::{Map, Value};
+use std::collections::HashMap;
+use std::io::BufReader;
 
 /// Least number of triangles of a primitive that becomes a mesh with instances if it stands in several places. (Rays
 /// are faster through copies than through instances of small meshes: docs/performance.md.)
@@ -12,20 +17,47 @@ const LEAST_TRIANGLES: usize = 1000;
 
 const EXTENSION: &str = "EXT_mesh_gpu_instancing";
 
+/// Accessors by attribute.
+pub(super) type Attributes = Map<String, Value>;
+
+/// What the extension says, by node. (The crate `gltf` could keep all unknown extensions of all objects, with half a
+/// megabyte of code.)
+pub(super) fn attributes_of_nodes(import: &mut Import, json: &[u8]) -> Result<HashMap<usize, Attributes>> {
+    let mut found = HashMap::new();
+    if !json.windows(EXTENSION.len()).any(|w| w == EXTENSION.as_bytes()) {
+        return Ok(found);
+    }
+    // As in `document::parse`.
+    let estimate = json.len().saturating_mul(4);
+    import.account.hold(estimate, "the JSON of the scene")?;
+    let reader = BufReader::new(Checked::new(json, import.advance));
+    let mut root: Value = serde_json::from_reader(reader).map_err(|e| import.error(e))?;
+    for (n, node) in root.get_mut("nodes").and_then(Value::as_array_mut).into_iter().flatten().enumerate() {
+        let Some(extension) = node.get_mut("extensions").and_then(|e| e.get_mut(EXTENSION)) else { continue };
+        let attributes = extension.get_mut("attributes").map(Value::take);
+        import.account.make_room_in_map(&mut found, "the nodes")?;
+        found.insert(n, if let Some(Value::Object(attributes)) = attributes { attributes } else { Map::new() });
+    }
+    drop(root);
+    import.account.give_back(estimate);
+    Ok(found)
+}
+
 impl<'i> Reader<'i, '_> {
     /// The accessors of translations, rotations and scales that `EXT_mesh_gpu_instancing` gives a node, and the number of
     /// its places; `None` without the extension.
     fn attributes(&mut self, node: &gltf::Node) -> Result<Option<([Option<gltf::Accessor<'i>>; 3], usize)>> {
-        let Some(extension) = node.extension_value(EXTENSION) else { return Ok(None) };
+        if !self.instancing.contains_key(&node.index()) {
+            return Ok(None);
+        }
         self.place = format!("{EXTENSION} of node {}", node.index());
-        let attributes = extension.get("attributes").and_then(|a| a.as_object());
         let document = self.document;
-        let find = |name: &str, number: &serde_json::Value| {
+        let find = |name: &str, number: &Value| {
             let found = number.as_u64().and_then(|n| document.accessors().nth(usize::try_from(n).ok()?));
             found.map_or_else(|| self.malformed(format_args!("{name} names no accessor")), Ok)
         };
         let (mut known, mut count) = ([None, None, None], None);
-        for (name, number) in attributes.into_iter().flatten() {
+        for (name, number) in self.instancing.get(&node.index()).into_iter().flatten() {
             let accessor = find(name, number)?;
             if *count.get_or_insert(accessor.count()) != accessor.count() {
                 return self.malformed("its attributes have different counts");

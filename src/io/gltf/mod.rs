@@ -55,6 +55,7 @@ pub(super) fn load(import: &mut Import, opened: Opened) -> Result<()> {
     let bytes = import.read_opened(opened)?;
     let (json, blob) = document::split(import, &bytes)?;
     let mut text = Text::new(import, json)?;
+    let instancing = instances::attributes_of_nodes(import, &text.short)?;
     let document = document::parse(import, &mut text)?;
     let mut buffers = import.account.list(document.buffers().len(), "the buffers")?;
     for buffer in document.buffers() {
@@ -68,6 +69,7 @@ pub(super) fn load(import: &mut Import, opened: Opened) -> Result<()> {
         images: HashMap::new(),
         pages: materials::lightmap_pages(&document),
         mesh_uses: vec![0; document.meshes().len()],
+        instancing,
         shared: HashMap::new(),
         sorted: HashSet::new(),
         number: Vec::new(),
@@ -122,6 +124,8 @@ struct Reader<'i, 's> {
     pages: HashMap<usize, u32>,
     /// Number of places where each mesh stands.
     mesh_uses: Vec<usize>,
+    /// What `EXT_mesh_gpu_instancing` says of nodes.
+    instancing: HashMap<usize, instances::Attributes>,
     /// The scene's mesh of a mesh and primitive that has instances; `None`: it is invisible.
     shared: HashMap<(usize, usize), Option<u32>>,
     /// Sparse accessors whose indices were found to increase.
