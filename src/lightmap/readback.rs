@@ -265,6 +265,11 @@ impl Lightmap {
 
     /// Composes a page of light, in which the padding repeats the nearest sample.
     fn page_of_light(&self, page: u32, value: impl Fn(LightTexel) -> [f32; 3]) -> Result<LayerData> {
+        self.page_of_any(page, &value)
+    }
+
+    /// Does the work of [`page_of_light`](Self::page_of_light), compiled once for all layers.
+    fn page_of_any(&self, page: u32, value: &dyn Fn(LightTexel) -> [f32; 3]) -> Result<LayerData> {
         Ok(LayerData::Rgb(self.page(page, [0.0; 3], self.atlas.padding, value, |v| v)?))
     }
 
