@@ -82,6 +82,11 @@ impl Instances {
         collapse::collapse(&binary, &corners, progress)
     }
 
+    /// Returns the number of triangles that are in no tree, those of each mesh once.
+    pub(crate) fn skipped(&self) -> usize {
+        self.trees.iter().map(|t| t.skipped.len()).sum()
+    }
+
     /// Returns the size in bytes.
     pub(crate) fn bytes(&self) -> usize {
         let trees: usize = self.trees.iter().map(|t| t.tree.bytes() + size_of_val(&t.skipped[..])).sum();

@@ -90,7 +90,6 @@ impl Scene {
         }
         let stage = progress.stage("bvh", 0.0, 1.0, 1);
         let first_triangle = data.first_triangles()?;
-        // The trees of meshes with instances come first: they take less memory than what is built beside them.
         let meshes = data.bytes();
         let own = data.own_triangles;
         let estimate = bvh::estimated_bytes(own, options) + instance_trees::estimated_bytes(data, options);
@@ -118,8 +117,7 @@ impl Scene {
             let is_skipped = |t| !is_valid_triangle(corners(t));
             device.install(|| try_par_filter(own, "the triangles that are skipped", is_skipped))?
         };
-        let skipped_of_instances: usize = instances.iter().flat_map(|i| &i.trees).map(|t| t.skipped.len()).sum();
-        let all_skipped = skipped.len() + skipped_of_instances;
+        let all_skipped = skipped.len() + instances.as_ref().map_or(0, Instances::skipped);
         if all_skipped > 0 {
             device.log(
                 LogLevel::Warning,
@@ -162,11 +160,7 @@ impl Scene {
             refits: 0,
             refit_seconds: 0.0,
         };
-        let (lower, upper) = tree.bounds();
-        let (low, high) = instances.as_ref().map_or((lower, upper), |i| i.top.bounds());
-        let bounds = (lower.min(low), upper.max(high));
-        let reach = instances.as_ref().map_or(0.0, |i| instance_trees::reach(data, i));
-        let extent = (bounds.1 - bounds.0).length().max(reach);
+        let (bounds, extent) = instance_trees::bounds_and_extent(data, &tree, instances.as_ref());
         let instances = instances.map(Box::new);
         Ok(Parts {
             emitters,

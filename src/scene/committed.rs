@@ -36,8 +36,8 @@ pub struct SceneStats {
     pub sah_cost: f32,
     /// Wall time of the build.
     pub build_seconds: f64,
-    /// Surface area heuristic cost of the current 8-wide tree of the meshes without instances, 1 per node and per triangle: compared with its value
-    /// after the commit, it shows how much quality a refitted tree has lost.
+    /// Surface area heuristic cost of the current 8-wide tree of the meshes without instances, 1 per node and per
+    /// triangle: compared with its value after the commit, it shows how much quality a refitted tree has lost.
     pub wide_sah_cost: f32,
     /// Number of refits since the commit.
     pub refits: u32,
@@ -55,7 +55,8 @@ pub struct Scene {
     /// First global triangle number per object, and the total at the end.
     pub(super) first_triangle: Vec<u32>,
     pub(super) bounds: (Vec3, Vec3),
-    /// Length of the bounding box's diagonal, or the largest coordinate that placing instances goes through, if that is more.
+    /// Length of the bounding box's diagonal, or the largest coordinate that placing instances goes through, if that is
+    /// more: the precision of rays follows it, beside the point where they start.
     pub(super) extent: f32,
     /// Tree of the meshes without instances.
     pub(super) tree: Tree,
@@ -188,12 +189,6 @@ impl Scene {
     /// Length of the bounding box's diagonal.
     pub fn diagonal(&self) -> f32 {
         (self.bounds.1 - self.bounds.0).length()
-    }
-
-    /// The magnitude of coordinates, beside that of a point itself, that the precision of rays follows.
-    #[inline]
-    pub(super) fn extent(&self) -> f32 {
-        self.extent
     }
 
     /// Statistics of the scene.

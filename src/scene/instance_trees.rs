@@ -92,10 +92,19 @@ fn box_of(data: &SceneData, trees: &[MeshTree], placed: &[PlacedTree], instance:
     placed_box(bounds, place.reach(bounds), |p| super::instance::placed(&place.transform, p))
 }
 
-/// The largest coordinate that placing a point of any instance goes through: rays are as precise as that.
-pub(super) fn reach(data: &SceneData, instances: &Instances) -> f32 {
-    let of_instance = |(i, at): (&Instance, &PlacedTree)| i.reach(instances.trees[at.tree as usize].tree.bounds());
-    data.instances.iter().zip(&instances.placed).map(of_instance).filter(|r| r.is_finite()).fold(0.0, f32::max)
+/// Returns the box around a scene whose meshes without instances have the tree `own`, and its
+/// `extent`.
+pub(super) fn bounds_and_extent(data: &SceneData, own: &Tree, instances: Option<&Instances>) -> ((Vec3, Vec3), f32) {
+    let (mut lower, mut upper) = own.bounds();
+    let mut reach = 0.0;
+    if let Some(instances) = instances {
+        let (low, high) = instances.top.bounds();
+        (lower, upper) = (lower.min(low), upper.max(high));
+        let of_instance = |(i, at): (&Instance, &PlacedTree)| i.reach(instances.trees[at.tree as usize].tree.bounds());
+        let all = data.instances.iter().zip(&instances.placed).map(of_instance);
+        reach = all.filter(|r| r.is_finite()).fold(0.0, f32::max);
+    }
+    ((lower, upper), (upper - lower).length().max(reach))
 }
 
 fn tree_of(data: &SceneData, number: u32, options: &BuildOptions, progress: &Progress) -> Result<MeshTree> {

@@ -101,8 +101,8 @@ impl SceneData {
         Ok(self.meshes.len() as u32 - 1)
     }
 
-    /// Adds an instance and returns its number. Its mesh must have been added before, and is where its instances are
-    /// from the first one on.
+    /// Adds an instance and returns its number. Its mesh must have been added before; from its first instance on it stands
+    /// where its instances do, and nowhere else.
     pub fn add_instance(&mut self, instance: Instance) -> Result<u32> {
         instance.validate(self.meshes.len())?;
         let mesh = instance.mesh as usize;

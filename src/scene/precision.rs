@@ -12,7 +12,7 @@ const STEPS: f32 = 32.0 / (1 << 24) as f32;
 /// Distance in scene units by which [`offset_ray_origin`](crate::trace::offset::offset_ray_origin) moves a point.
 #[inline]
 pub fn ray_epsilon(position: Vec3, scene: &Scene) -> f32 {
-    STEPS * position.abs().max_element().max(scene.extent())
+    STEPS * position.abs().max_element().max(scene.extent)
 }
 
 /// Returns a warning if rays start further above the scene's surfaces than a `part` of `size`, a length that the caller

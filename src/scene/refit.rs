@@ -7,6 +7,7 @@ use super::{Emitter, Instance, Scene, is_valid_triangle};
 use crate::base::error::{Error, Result, invalid_argument};
 use crate::base::memory::{try_to_vec, try_with_capacity};
 use crate::bvh;
+use crate::bvh::instances::Instances;
 use crate::device::LogLevel;
 use glam::{Affine3A, Vec3};
 use rayon::prelude::*;
@@ -132,20 +133,17 @@ impl Scene {
         }
         let is_gone = |&t: &u32| !is_valid_triangle(corners(t)) && self.skipped.binary_search(&t).is_err();
         gone += (0..own_triangles).into_par_iter().filter(is_gone).count();
-        let skipped_of_instances: usize = self.instances.iter().flat_map(|i| &i.trees).map(|t| t.skipped.len()).sum();
         if gone > 0 {
             let total = self.stats.triangles;
             let message = format!("{gone} of {total} triangles are degenerate or not finite after the refit");
             self.device.log(LogLevel::Warning, &message);
         }
-        let (lower, upper) = self.tree.bounds();
-        let (low, high) = self.instances.as_ref().map_or((lower, upper), |i| i.top.bounds());
-        self.bounds = (lower.min(low), upper.max(high));
-        let reach = self.instances.as_deref().map_or(0.0, |i| instance_trees::reach(&self.data, i));
-        self.extent = (self.bounds.1 - self.bounds.0).length().max(reach);
+        (self.bounds, self.extent) =
+            instance_trees::bounds_and_extent(&self.data, &self.tree, self.instances.as_deref());
         add_emitters(&self.data, &self.first_triangle, |o, t| self.is_skipped(o, t), &mut emitters);
         self.emitters = emitters;
-        self.stats.skipped_degenerate = (self.skipped.len() + skipped_of_instances + gone) as u64;
+        self.stats.skipped_degenerate =
+            (self.skipped.len() + self.instances.as_deref().map_or(0, Instances::skipped) + gone) as u64;
         self.stats.wide_sah_cost = self.tree.sah_cost();
         self.warn_of_few_digits();
     }

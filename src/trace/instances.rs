@@ -140,15 +140,17 @@ thread_local! {
 }
 
 impl Scene {
-    /// Adds what rays find in instances to `answers`, which hold what they find elsewhere; `alike`: whether the rays are
-    /// those of a stream.
-    pub(super) fn meet_instances<A: Answer>(
-        &self,
-        instances: &Instances,
-        rays: &[Ray],
-        alike: bool,
-        answers: &mut [A],
-    ) {
+    /// Adds what rays find in instances, if there are any, to `answers`, which hold what they find elsewhere: as many as
+    /// both slices have. `alike`: whether the rays are those of a stream.
+    #[inline]
+    pub(super) fn meet_instances<A: Answer>(&self, rays: &[Ray], alike: bool, answers: &mut [A]) {
+        if let Some(instances) = self.instance_trees() {
+            let n = rays.len().min(answers.len());
+            self.meet_all(instances, &rays[..n], alike, &mut answers[..n]);
+        }
+    }
+
+    fn meet_all<A: Answer>(&self, instances: &Instances, rays: &[Ray], alike: bool, answers: &mut [A]) {
         if let ([ray], [answer]) = (rays, &mut *answers) {
             return self.meet_one_by_one(instances, ray, answer);
         }

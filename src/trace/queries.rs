@@ -285,11 +285,11 @@ impl Scene {
                 self.kernels().compact_intersect(&tree, &rays[..count], out);
             }
         }
-        if let Some(instances) = self.instance_trees() {
+        if self.instance_trees().is_some() {
             let ray = |i: usize| Ray::new(origin, Vec3::new(packet.x[i], packet.y[i], packet.z[i])).within(tmin, tmax);
             let rays: [Ray; PACKET_SIZE] = std::array::from_fn(ray);
             let count = packet.count.min(PACKET_SIZE);
-            self.meet_instances(instances, &rays[..count], false, &mut out[..count]);
+            self.meet_instances(&rays[..count], false, out);
         }
         if self.has_holes() {
             self.leave_holes_of_packet(origin, packet, tmin, tmax, out);
@@ -307,9 +307,7 @@ impl Scene {
                 hit[0]
             }
         }];
-        if let Some(instances) = self.instance_trees() {
-            self.meet_instances(instances, std::slice::from_ref(ray), false, &mut hit);
-        }
+        self.meet_instances(std::slice::from_ref(ray), false, &mut hit);
         if self.has_holes() {
             self.leave_holes(std::slice::from_ref(ray), &mut hit);
         }
@@ -336,9 +334,7 @@ impl Scene {
                 self.kernels().compact_occluded(&tree, std::slice::from_ref(ray), &mut occluded);
             }
         }
-        if let Some(instances) = self.instance_trees() {
-            self.meet_instances(instances, std::slice::from_ref(ray), false, &mut occluded);
-        }
+        self.meet_instances(std::slice::from_ref(ray), false, &mut occluded);
         occluded[0] != 0
     }
 
@@ -348,10 +344,7 @@ impl Scene {
             TreeView::Whole(tree) => self.kernels().intersect_block(tree, rays, out),
             TreeView::Compact(tree) => self.kernels().compact_intersect(&tree, rays, out),
         }
-        if let Some(instances) = self.instance_trees() {
-            let n = rays.len().min(out.len());
-            self.meet_instances(instances, &rays[..n], false, &mut out[..n]);
-        }
+        self.meet_instances(rays, false, out);
         if self.has_holes() {
             self.leave_holes(rays, out);
         }
@@ -364,10 +357,7 @@ impl Scene {
             TreeView::Whole(tree) => self.kernels().stream(tree, rays, out),
             TreeView::Compact(tree) => self.kernels().compact_stream(&tree, rays, out),
         }
-        if let Some(instances) = self.instance_trees() {
-            let n = rays.len().min(out.len());
-            self.meet_instances(instances, &rays[..n], true, &mut out[..n]);
-        }
+        self.meet_instances(rays, true, out);
         if self.has_holes() {
             self.leave_holes(rays, out);
         }
@@ -379,10 +369,7 @@ impl Scene {
             TreeView::Whole(tree) => self.kernels().stream_occluded(tree, rays, out),
             TreeView::Compact(tree) => self.kernels().compact_stream_occluded(&tree, rays, out),
         }
-        if let Some(instances) = self.instance_trees() {
-            let n = rays.len().min(out.len());
-            self.meet_instances(instances, &rays[..n], true, &mut out[..n]);
-        }
+        self.meet_instances(rays, true, out);
         if self.has_holes() {
             self.look_through_holes(rays, out);
         }
@@ -394,10 +381,7 @@ impl Scene {
             TreeView::Whole(tree) => self.kernels().occluded_block(tree, rays, out),
             TreeView::Compact(tree) => self.kernels().compact_occluded(&tree, rays, out),
         }
-        if let Some(instances) = self.instance_trees() {
-            let n = rays.len().min(out.len());
-            self.meet_instances(instances, &rays[..n], false, &mut out[..n]);
-        }
+        self.meet_instances(rays, false, out);
         if self.has_holes() {
             self.look_through_holes(rays, out);
         }
