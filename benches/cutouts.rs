@@ -42,10 +42,10 @@ fn leaves(material: u32) -> Mesh {
         let (x, y) = uniform_sphere([uniform(i, 3, 1), uniform(i, 4, 1)]).any_orthonormal_pair();
         let first = mesh.positions.len() as u32;
         for [u, v] in [[0.0, 0.0], [1.0, 0.0], [1.0, 1.0], [0.0, 1.0]] {
-            mesh.positions.push(place + SIDE * ((u - 0.5) * x + (v - 0.5) * y));
-            mesh.uvs.push(Vec2::new(u, v));
+            mesh.positions.as_vec().push(place + SIDE * ((u - 0.5) * x + (v - 0.5) * y));
+            mesh.uvs.as_vec().push(Vec2::new(u, v));
         }
-        mesh.indices.extend([[first, first + 1, first + 2], [first, first + 2, first + 3]]);
+        mesh.indices.as_vec().extend([[first, first + 1, first + 2], [first, first + 2, first + 3]]);
     }
     mesh
 }

@@ -3,7 +3,7 @@
 //!     cargo bench --bench describe
 
 use bakelite::bvh::BuildOptions;
-use bakelite::{Device, DeviceOptions, Light, Material, Mesh, Progress, Scene, SceneData};
+use bakelite::{Array, Device, DeviceOptions, Light, Material, Mesh, Progress, Scene, SceneData};
 use criterion::{BatchSize, BenchmarkId, Criterion, Throughput, criterion_group, criterion_main};
 use glam::Vec3;
 use std::sync::Arc;
@@ -13,7 +13,11 @@ const COUNTS: [u32; 3] = [5_000, 20_000, 80_000];
 /// A mesh of one triangle at a place of its own.
 fn mesh(i: u32) -> Mesh {
     let corner = Vec3::new((i % 300) as f32, (i / 300) as f32, 0.0);
-    Mesh { positions: vec![corner, corner + Vec3::X, corner + Vec3::Y], indices: vec![[0, 1, 2]], ..Default::default() }
+    Mesh {
+        positions: vec![corner, corner + Vec3::X, corner + Vec3::Y].into(),
+        indices: vec![[0, 1, 2]].into(),
+        ..Default::default()
+    }
 }
 
 fn described(count: u32) -> SceneData {
@@ -50,7 +54,7 @@ fn describe(c: &mut Criterion) {
         });
         group.bench_function(BenchmarkId::new("refit", count), |b| {
             let mut scene = committed(described(count), &device, 0);
-            let positions: Vec<Vec<Vec3>> = (0..count).map(|i| mesh(i).positions).collect();
+            let positions: Vec<Array<Vec3>> = (0..count).map(|i| mesh(i).positions).collect();
             let moved: Vec<(u32, &[Vec3])> = (0..count).zip(positions.iter().map(|p| &p[..])).collect();
             b.iter(|| Scene::refit(&mut scene, &moved).unwrap());
         });

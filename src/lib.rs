@@ -52,6 +52,7 @@ pub mod scene;
 pub(crate) mod simd;
 pub mod trace;
 
+pub use base::array::Array;
 pub use base::{error, files, memory, progress, sampling};
 pub use device::{Device, DeviceOptions};
 pub use error::{Error, Result};

@@ -111,13 +111,13 @@ fn room_with_uvs(gap: f32) -> SceneData {
     let mut uvs = Vec::new();
     for (cell, face) in faces.into_iter().enumerate() {
         let first = mesh.positions.len() as u32;
-        mesh.positions.extend(face.map(corner));
-        mesh.indices.extend([[first, first + 1, first + 2], [first, first + 2, first + 3]]);
+        mesh.positions.as_vec().extend(face.map(corner));
+        mesh.indices.as_vec().extend([[first, first + 1, first + 2], [first, first + 2, first + 3]]);
         let (u, v) = ((cell % 3) as f32 / 3.0, (cell / 3) as f32 / 2.0);
         let (u0, u1, v0, v1) = (u + gap, u + 1.0 / 3.0 - gap, v + gap, v + 0.5 - gap);
         uvs.extend([[u0, v0], [u1, v0], [u1, v1], [u0, v1]].map(Vec2::from));
     }
-    mesh.lightmap = Some(LightmapUvs { uvs, pages: Vec::new() });
+    mesh.lightmap = Some(LightmapUvs { uvs: uvs.into(), pages: Vec::new().into() });
     let position = Vec3::new(1.5, 2.99, 2.0);
     let light = Light::Rect { position, edge_u: Vec3::X, edge_v: Vec3::Z, radiance: [10.0; 3] };
     let mut data = SceneData::new();
@@ -204,7 +204,8 @@ fn a_carpet_in_the_cornell_box_ends_with_the_bits_of_a_bake() {
     let material = data.add_material(Material { two_sided: true, ..Default::default() }).unwrap();
     let corners = [[0.1, 0.1], [0.1, 0.3], [0.4, 0.3], [0.4, 0.1]].map(|[x, z]| Vec3::new(x, 0.004, z));
     let (indices, materials) = (vec![[0, 1, 2], [0, 2, 3]], MeshMaterials::One(material));
-    data.add_mesh(Mesh { positions: corners.into(), indices, materials, ..Default::default() }).unwrap();
+    data.add_mesh(Mesh { positions: corners.into(), indices: indices.into(), materials, ..Default::default() })
+        .unwrap();
     let mut lightmap = unbaked_of(data, 2, 60.0);
     let mut live = Live::new(&lightmap, &params(Mode::Uniform), &Progress::none()).unwrap();
     assert_eq!(finish(&mut live).finished, 1.0);
@@ -219,7 +220,8 @@ fn below_a_one_sided_sheet_updates_end_with_the_bits_of_a_bake() {
     // Its front faces up.
     let positions = [[0.1, 0.1], [0.1, 0.25], [0.4, 0.25], [0.4, 0.1]].map(|[x, z]| Vec3::new(x, 0.4, z));
     let (indices, materials) = (vec![[0, 1, 2], [0, 2, 3]], MeshMaterials::One(material));
-    data.add_mesh(Mesh { positions: positions.into(), indices, materials, ..Default::default() }).unwrap();
+    data.add_mesh(Mesh { positions: positions.into(), indices: indices.into(), materials, ..Default::default() })
+        .unwrap();
     let mut lightmap = unbaked_of(data, 2, 60.0);
     let mut live = Live::new(&lightmap, &params(Mode::Position), &Progress::none()).unwrap();
     assert_eq!(finish(&mut live).finished, 1.0);
@@ -233,7 +235,8 @@ fn with_shelf(threads: usize, both_sides: bool) -> Lightmap {
     for (right, y) in [(3.6, 3.6), (2.0, 3.604)] {
         let corners = [[0.8, 0.8], [right, 0.8], [right, 3.2], [0.8, 3.2]].map(|[x, z]| Vec3::new(x, y, z));
         let (indices, materials) = (vec![[0, 1, 2], [0, 2, 3]], MeshMaterials::One(material));
-        data.add_mesh(Mesh { positions: corners.into(), indices, materials, ..Default::default() }).unwrap();
+        data.add_mesh(Mesh { positions: corners.into(), indices: indices.into(), materials, ..Default::default() })
+            .unwrap();
     }
     let device = Device::new(DeviceOptions { num_threads: threads, ..Default::default() }).unwrap();
     let scene = Scene::commit(&device, data, &BuildOptions::default(), &Progress::none()).map_err(|e| e.1).unwrap();

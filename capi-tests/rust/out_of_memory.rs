@@ -134,17 +134,17 @@ fn description(side: usize) -> Result<SceneData> {
     let height = |x: f32, y: f32| 0.05 * (9.0 * x).sin() * (7.0 * y).cos();
     let mut mesh = Mesh {
         positions: (0..vertices).map(place).map(|[x, y]| Vec3::new(x, y, height(x, y))).collect(),
-        normals: vec![Vec3::Z; vertices],
-        uvs: vec![Vec2::ZERO; vertices],
+        normals: vec![Vec3::Z; vertices].into(),
+        uvs: vec![Vec2::ZERO; vertices].into(),
         lightmap: Some(LightmapUvs {
             uvs: (0..vertices).map(|i| Vec2::from(place(i)) * 0.98 + 0.01).collect(),
-            pages: vec![0; 2 * side * side],
+            pages: vec![0; 2 * side * side].into(),
         }),
         ..Default::default()
     };
     for i in (0..side * side).map(|i| (i / side * (side + 1) + i % side) as u32) {
         let up = side as u32 + 1;
-        mesh.indices.extend([[i, i + 1, i + up + 1], [i, i + up + 1, i + up]]);
+        mesh.indices.as_vec().extend([[i, i + 1, i + up + 1], [i, i + up + 1, i + up]]);
     }
     let triangles = mesh.indices.len();
     mesh.materials =
@@ -152,11 +152,11 @@ fn description(side: usize) -> Result<SceneData> {
     data.add_mesh(mesh)?;
     let corner = |x: f32, y: f32| Vec3::new(x, y, 0.6);
     data.add_mesh(Mesh {
-        positions: vec![corner(0.1, 0.1), corner(0.1, 0.9), corner(0.9, 0.9), corner(0.9, 0.1)],
-        indices: vec![[0, 1, 2], [0, 2, 3]],
+        positions: vec![corner(0.1, 0.1), corner(0.1, 0.9), corner(0.9, 0.9), corner(0.9, 0.1)].into(),
+        indices: vec![[0, 1, 2], [0, 2, 3]].into(),
         lightmap: Some(LightmapUvs {
-            uvs: [[0.1, 0.1], [0.1, 0.9], [0.9, 0.9], [0.9, 0.1]].map(Vec2::from).to_vec(),
-            pages: vec![1; 2],
+            uvs: [[0.1, 0.1], [0.1, 0.9], [0.9, 0.9], [0.9, 0.1]].map(Vec2::from).to_vec().into(),
+            pages: vec![1; 2].into(),
         }),
         materials: MeshMaterials::One(white),
         ..Default::default()

@@ -17,9 +17,9 @@ pub fn lightmap() -> Lightmap {
         let corners = [[0.0, 0.0], [1.0, 0.0], [1.0, 1.0], [0.0, 1.0]];
         let uvs = corners.map(|[x, y]| [left + 0.4 * x, 0.05 + 0.9 * y].into()).to_vec();
         let mesh = Mesh {
-            positions: corners.map(|[x, y]: [f32; 2]| [2.0 * x - 1.0, 2.0 * y - 1.0, z].into()).to_vec(),
-            indices: vec![[0, 1, 2], [0, 2, 3]],
-            lightmap: Some(LightmapUvs { uvs, pages: Vec::new() }),
+            positions: corners.map(|[x, y]: [f32; 2]| [2.0 * x - 1.0, 2.0 * y - 1.0, z].into()).to_vec().into(),
+            indices: vec![[0, 1, 2], [0, 2, 3]].into(),
+            lightmap: Some(LightmapUvs { uvs: uvs.into(), pages: Vec::new().into() }),
             materials: MeshMaterials::One(material),
             ..Default::default()
         };

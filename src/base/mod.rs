@@ -1,6 +1,7 @@
 //! Common basis of all modules: errors, progress, memory accounts, files, samples, geometry, and the state of threads
 //! that call or are called.
 
+pub mod array;
 pub(crate) mod callback;
 pub(crate) mod directional;
 pub mod error;

@@ -107,7 +107,7 @@ pub(super) fn collapse_compact(binary: &BinaryBvh, meshes: &[u32], progress: &Pr
         }
     }
     try_append(&mut triangles, &[compact::LAST | compact::GONE; compact::PAD], "the tree")?;
-    Compact::new(nodes, triangles, (root.lower, root.upper), meshes)
+    Compact::new(nodes.into(), triangles.into(), (root.lower, root.upper), meshes)
 }
 
 /// Collapses a binary tree to one of `W` children per node.
@@ -143,7 +143,7 @@ pub(super) fn collapse<const W: usize>(
         }
         Ok(())
     })?;
-    Ok(Mbvh { nodes, leaves, bounds: (root.lower, root.upper) })
+    Ok(Mbvh { nodes: nodes.into(), leaves: leaves.into(), bounds: (root.lower, root.upper) })
 }
 
 /// Number of nodes whose leaves a thread fills at a time.

@@ -6,6 +6,7 @@
 //! [`Node`]: so the box test is that of full nodes and as conservative.
 
 use super::layout::{ChildRef, Node, WIDTH};
+use crate::base::array::Array;
 use crate::base::error::Result;
 use crate::base::geometry::half_area;
 use crate::base::memory::{try_collect, try_to_vec};
@@ -172,6 +173,12 @@ impl CompactNode {
         self.children().filter(|(_, c)| !c.is_leaf())
     }
 
+    /// What takes the places of missing children.
+    pub(super) fn missing(&self) -> impl Iterator<Item = ChildRef> + use<> {
+        let (present, names) = (self.present, self.names());
+        (0..WIDTH).filter(move |i| present >> i & 1 == 0).map(move |i| ChildRef::from_bits(names[i]))
+    }
+
     /// Lower and upper corner of the box of child `i` as rays test it.
     fn decoded(&self, i: usize) -> [Vec3; 2] {
         [&self.lower, &self.upper].map(|rows| {
@@ -225,10 +232,10 @@ const BLOCK: u32 = 1 << 8;
 
 /// The tree of [`CompactNode`]s. Node 0 is the root.
 pub(crate) struct Compact {
-    pub(super) nodes: Vec<CompactNode>,
+    pub(crate) nodes: Array<CompactNode>,
     /// Global triangle numbers, leaf by leaf, with the flags [`LAST`] and [`GONE`]; [`PAD`] more entries follow the
     /// last leaf.
-    pub(super) triangles: Vec<u32>,
+    pub(crate) triangles: Array<u32>,
     pub(super) bounds: (Vec3, Vec3),
     /// The mesh of every 256th triangle.
     blocks: Vec<u32>,
@@ -239,16 +246,17 @@ impl Compact {
     pub(super) fn try_clone(&self) -> Result<Compact> {
         let what = "a copy of the tree";
         Ok(Compact {
-            nodes: try_to_vec(&self.nodes, what)?,
-            triangles: try_to_vec(&self.triangles, what)?,
+            nodes: try_to_vec(&self.nodes, what)?.into(),
+            triangles: try_to_vec(&self.triangles, what)?.into(),
             bounds: self.bounds,
             blocks: try_to_vec(&self.blocks, what)?,
         })
     }
 
-    pub(super) fn new(
-        nodes: Vec<CompactNode>,
-        triangles: Vec<u32>,
+    /// Makes a tree of its arrays; `meshes`: the first triangle of each mesh, and the number of all triangles at the end.
+    pub(crate) fn new(
+        nodes: Array<CompactNode>,
+        triangles: Array<u32>,
         bounds: (Vec3, Vec3),
         meshes: &[u32],
     ) -> Result<Compact> {
@@ -437,7 +445,7 @@ mod tests {
     fn the_mesh_of_a_triangle_is_in_its_range() {
         // Meshes of 0, 1, 300, 3, 0, 2000 and 1 triangles.
         let firsts = [0, 0, 1, 301, 304, 304, 2304, 2305];
-        let tree = Compact::new(Vec::new(), Vec::new(), (Vec3::ZERO, Vec3::ZERO), &firsts).unwrap();
+        let tree = Compact::new(Vec::new().into(), Vec::new().into(), (Vec3::ZERO, Vec3::ZERO), &firsts).unwrap();
         for t in 0..2305 {
             let mesh = firsts.partition_point(|&first| first <= t) as u32 - 1;
             // SAFETY: a triangle of the meshes that the tree was built of.

@@ -120,7 +120,7 @@ mod tests {
     }
 
     fn bits(tree: &Compact) -> (Vec<u8>, Vec<u32>, (Vec3, Vec3)) {
-        (bytemuck::cast_slice(&tree.nodes).to_vec(), tree.triangles.clone(), tree.bounds)
+        (bytemuck::cast_slice(&tree.nodes).to_vec(), tree.triangles.to_vec(), tree.bounds)
     }
 
     #[test]

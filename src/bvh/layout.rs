@@ -1,5 +1,6 @@
 //! Memory layout of the 8-wide tree, and of trees of other widths.
 
+use crate::base::array::Array;
 use crate::base::error::Result;
 use crate::base::geometry::half_area;
 use crate::base::memory::try_to_vec;
@@ -108,6 +109,12 @@ pub struct Node<const W: usize = WIDTH> {
     pub order: [u32; W],
 }
 
+// SAFETY: numbers without gaps between them, whatever their width; all bits are possible. (The alignment is not more than
+// the size of 8 children, of which files have nodes.)
+unsafe impl Zeroable for Node<WIDTH> {}
+// SAFETY: as above.
+unsafe impl Pod for Node<WIDTH> {}
+
 impl<const W: usize> Node<W> {
     pub(crate) const EMPTY: Self = Node {
         lower: [[f32::INFINITY; W]; 3],
@@ -179,8 +186,8 @@ pub(crate) const LEAF_STRIDE: usize = 10;
 /// masked. That keeps leaves at 40 bytes per triangle with no transposition (padding every leaf to
 /// four triangles would take about twice that).
 pub struct Mbvh<const W: usize = WIDTH> {
-    pub(crate) nodes: Vec<Node<W>>,
-    pub(crate) leaves: Vec<f32>,
+    pub(crate) nodes: Array<Node<W>>,
+    pub(crate) leaves: Array<f32>,
     pub(crate) bounds: (Vec3, Vec3),
 }
 
@@ -188,13 +195,17 @@ impl<const W: usize> Mbvh<W> {
     /// Returns a tree of nothing, which no ray hits.
     pub(crate) fn nothing() -> Self {
         let bounds = (Vec3::INFINITY, Vec3::NEG_INFINITY);
-        Mbvh { nodes: vec![Node::EMPTY], leaves: vec![0.0; LEAF_PAD], bounds }
+        Mbvh { nodes: vec![Node::EMPTY].into(), leaves: vec![0.0; LEAF_PAD].into(), bounds }
     }
 
     /// Copies the tree; fails if there is not enough memory.
     pub(super) fn try_clone(&self) -> Result<Self> {
         let what = "a copy of the tree";
-        Ok(Mbvh { nodes: try_to_vec(&self.nodes, what)?, leaves: try_to_vec(&self.leaves, what)?, bounds: self.bounds })
+        Ok(Mbvh {
+            nodes: try_to_vec(&self.nodes, what)?.into(),
+            leaves: try_to_vec(&self.leaves, what)?.into(),
+            bounds: self.bounds,
+        })
     }
 
     /// Lower and upper corner of the box around all triangles.

@@ -4,6 +4,7 @@
 mod binary;
 mod binned;
 mod bins;
+mod check;
 mod collapse;
 pub(crate) mod compact;
 mod compact_refit;

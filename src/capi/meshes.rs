@@ -274,22 +274,24 @@ unsafe fn read_mesh(d: &bk_mesh_desc) -> Result<Mesh> {
     // SAFETY: by contract; optional arrays may be NULL.
     unsafe {
         Ok(Mesh {
-            positions: read_strided::<Vec3>(d.positions, d.position_stride, vertices, "positions")?,
-            indices: read_strided::<[u32; 3]>(d.indices, 0, triangles, "indices")?,
-            normals: read_optional::<Vec3>(d.normals, d.normal_stride, vertices, "normals")?,
-            uvs: read_optional::<Vec2>(d.uvs, d.uv_stride, vertices, "uvs")?,
+            positions: read_strided::<Vec3>(d.positions, d.position_stride, vertices, "positions")?.into(),
+            indices: read_strided::<[u32; 3]>(d.indices, 0, triangles, "indices")?.into(),
+            normals: read_optional::<Vec3>(d.normals, d.normal_stride, vertices, "normals")?.into(),
+            uvs: read_optional::<Vec2>(d.uvs, d.uv_stride, vertices, "uvs")?.into(),
             lightmap: if d.lightmap_uvs.is_null() {
                 None
             } else {
                 Some(LightmapUvs {
-                    uvs: read_strided::<Vec2>(d.lightmap_uvs, d.lightmap_uv_stride, vertices, "lightmap_uvs")?,
-                    pages: read_optional::<u32>(d.lightmap_page, 0, triangles, "lightmap_page")?,
+                    uvs: read_strided::<Vec2>(d.lightmap_uvs, d.lightmap_uv_stride, vertices, "lightmap_uvs")?.into(),
+                    pages: read_optional::<u32>(d.lightmap_page, 0, triangles, "lightmap_page")?.into(),
                 })
             },
             materials: if d.triangle_materials.is_null() {
                 MeshMaterials::One(d.material)
             } else {
-                MeshMaterials::PerTriangle(read_strided(d.triangle_materials, 0, triangles, "triangle_materials")?)
+                MeshMaterials::PerTriangle(
+                    read_strided(d.triangle_materials, 0, triangles, "triangle_materials")?.into(),
+                )
             },
             strict: d.flags & BK_MESH_STRICT != 0,
         })

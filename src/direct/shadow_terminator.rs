@@ -68,7 +68,12 @@ mod tests {
     fn scene(roof: Option<f32>) -> Arc<Scene> {
         let mut data = SceneData::new();
         data.add_material(Material::default()).unwrap();
-        data.add_mesh(Mesh { positions: CORNERS.to_vec(), indices: vec![[0, 1, 2]], ..Default::default() }).unwrap();
+        data.add_mesh(Mesh {
+            positions: CORNERS.to_vec().into(),
+            indices: vec![[0, 1, 2]].into(),
+            ..Default::default()
+        })
+        .unwrap();
         if let Some(y) = roof {
             let mut mesh = MeshBuilder::new();
             let [a, b, c] = CORNERS.map(|c| c + Vec3::Y * y);

@@ -166,22 +166,22 @@ fn read_vertices(
     let has = |name: &str| element.properties.contains_key(name);
     let normals = NORMAL_NAMES.into_iter().all(has);
     let uvs = (has("s") && has("t")) || (has("u") && has("v"));
-    import.account.make_room(&mut mesh.positions, element.count, "the vertices")?;
-    import.account.make_room(&mut mesh.normals, if normals { element.count } else { 0 }, "the normals")?;
-    import.account.make_room(&mut mesh.uvs, if uvs { element.count } else { 0 }, "the texture coordinates")?;
+    import.account.make_room(&mut mesh.positions.as_vec(), element.count, "the vertices")?;
+    import.account.make_room(&mut mesh.normals.as_vec(), if normals { element.count } else { 0 }, "the normals")?;
+    import.account.make_room(&mut mesh.uvs.as_vec(), if uvs { element.count } else { 0 }, "the texture coordinates")?;
     body.each::<Vertex>(import, source, element, |import, i, vertex| {
         if !is_valid_position(vertex.position) {
             return Err(import.error(format_args!("vertex {i} is {}, not finite or out of range", vertex.position)));
         }
-        mesh.positions.push(vertex.position);
+        mesh.positions.as_vec().push(vertex.position);
         if normals {
-            mesh.normals.push(vertex.normal.as_dvec3().normalize_or_zero().as_vec3());
+            mesh.normals.as_vec().push(vertex.normal.as_dvec3().normalize_or_zero().as_vec3());
         }
         if uvs {
             if !vertex.uv.is_finite() {
                 return Err(import.error(format_args!("vertex {i} has the texture coordinates {}", vertex.uv)));
             }
-            mesh.uvs.push(vertex.uv);
+            mesh.uvs.as_vec().push(vertex.uv);
         }
         Ok(())
     })
@@ -194,7 +194,7 @@ fn read_faces(
     element: &ElementDef,
     mesh: &mut Mesh,
 ) -> Result<()> {
-    import.account.make_room(&mut mesh.indices, element.count, "the triangles")?;
+    import.account.make_room(&mut mesh.indices.as_vec(), element.count, "the triangles")?;
     body.each::<Face>(import, source, element, |import, i, face| {
         let corners = &face.corners;
         if let Some(negative) = face.signed.iter().find(|v| **v < 0) {
@@ -209,7 +209,7 @@ fn read_faces(
         let mut fan = corners.iter().copied().chain(signed);
         let (Some(first), Some(mut previous)) = (fan.next(), fan.next()) else { return Ok(()) };
         for next in fan {
-            import.account.push(&mut mesh.indices, [first, previous, next], "the triangles")?;
+            import.account.push(&mut mesh.indices.as_vec(), [first, previous, next], "the triangles")?;
             previous = next;
         }
         import.check_triangle_count(mesh.indices.len())

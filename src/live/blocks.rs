@@ -516,7 +516,13 @@ mod tests {
             let material = data.add_material(Material { two_sided: true, ..Default::default() }).unwrap();
             let positions = vec![Vec3::ZERO, Vec3::new(far, 0.3, 0.0), Vec3::new(0.1, 1.0, 0.2), Vec3::ONE];
             let (indices, materials) = (vec![[0, 1, 2], [1, 3, 2]], MeshMaterials::One(material));
-            data.add_mesh(Mesh { positions, indices, materials, ..Default::default() }).unwrap();
+            data.add_mesh(Mesh {
+                positions: positions.into(),
+                indices: indices.into(),
+                materials,
+                ..Default::default()
+            })
+            .unwrap();
             let scene = data.committed();
             let desc = LightmapDesc { page_size: 64, ..Default::default() };
             let lightmap = Lightmap::create(&scene, &desc, &Progress::none()).unwrap();

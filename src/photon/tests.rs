@@ -31,7 +31,8 @@ pub(super) fn add_box(data: &mut SceneData, material: u32, lower: Vec3, upper: V
         indices.iter_mut().for_each(|t| t.swap(1, 2));
     }
     let positions = (0..8).map(corner).collect();
-    let mesh = Mesh { positions, indices, materials: MeshMaterials::One(material), ..Default::default() };
+    let mesh =
+        Mesh { positions, indices: indices.into(), materials: MeshMaterials::One(material), ..Default::default() };
     data.add_mesh(mesh).unwrap();
 }
 
@@ -134,7 +135,12 @@ fn the_sun_gives_a_plane_its_irradiance() {
     let mut data = SceneData::new();
     data.add_material(grey(0.3)).unwrap();
     let positions = vec![Vec3::ZERO, Vec3::X, Vec3::X + Vec3::Y, Vec3::Y];
-    data.add_mesh(Mesh { positions, indices: vec![[0, 1, 2], [0, 2, 3]], ..Default::default() }).unwrap();
+    data.add_mesh(Mesh {
+        positions: positions.into(),
+        indices: vec![[0, 1, 2], [0, 2, 3]].into(),
+        ..Default::default()
+    })
+    .unwrap();
     let direction = Vec3::new(0.3, 0.5, -0.8);
     data.add_light(Light::Directional { direction, irradiance: [1.0, 5.0, 0.0], angular_radius: 0.0 }).unwrap();
     let map = trace(&data.committed(), PhotonParams { photon_count: 200_000, radius: 0.04, ..Default::default() });
@@ -157,7 +163,12 @@ fn square_under(add: impl FnOnce(&mut SceneData) -> Light) -> Arc<Scene> {
     let mut data = SceneData::new();
     data.add_material(grey(0.3)).unwrap();
     let positions = vec![Vec3::ZERO, Vec3::X, Vec3::X + Vec3::Y, Vec3::Y];
-    data.add_mesh(Mesh { positions, indices: vec![[0, 1, 2], [0, 2, 3]], ..Default::default() }).unwrap();
+    data.add_mesh(Mesh {
+        positions: positions.into(),
+        indices: vec![[0, 1, 2], [0, 2, 3]].into(),
+        ..Default::default()
+    })
+    .unwrap();
     let light = add(&mut data);
     data.add_light(light).unwrap();
     data.committed()
@@ -258,7 +269,13 @@ fn two_sided_emitters_light_both_sides_with_double_power() {
     add_box(&mut data, 0, Vec3::ZERO, Vec3::ONE, true);
     let positions = [(0.4, 0.4), (0.6, 0.4), (0.4, 0.6)].map(|(x, y)| Vec3::new(x, y, 0.5)).to_vec();
     let materials = MeshMaterials::One(lamp);
-    data.add_mesh(Mesh { positions, indices: vec![[0, 1, 2]], materials, ..Default::default() }).unwrap();
+    data.add_mesh(Mesh {
+        positions: positions.into(),
+        indices: vec![[0, 1, 2]].into(),
+        materials,
+        ..Default::default()
+    })
+    .unwrap();
     let map = trace(&data.committed(), PhotonParams { photon_count: 100_000, radius: 0.1, ..Default::default() });
     assert_close(map.stats().emitted_power[0], 2.0 * PI * 2.0 * 0.02, 1e-5);
     let photons = map.columns();
@@ -410,7 +427,7 @@ fn no_light_leaves_a_closed_room_with_sharp_corners() {
     let positions = vec![Vec3::ZERO, Vec3::new(3.0, 0.1, 0.2), Vec3::new(1.0, 2.7, 0.0), Vec3::new(1.3, 1.0, 0.35)];
     let indices = vec![[0, 2, 1], [0, 1, 3], [1, 2, 3], [2, 0, 3]];
     let inside = positions.iter().sum::<Vec3>() / 4.0;
-    data.add_mesh(Mesh { positions, indices, ..Default::default() }).unwrap();
+    data.add_mesh(Mesh { positions: positions.into(), indices: indices.into(), ..Default::default() }).unwrap();
     data.add_light(Light::Point { position: inside, intensity: [1.0; 3] }).unwrap();
     let stats = trace(&data.committed(), PhotonParams { photon_count: 100_000, ..Default::default() }).stats();
     assert!(stats.rays > 1_500_000);

@@ -415,7 +415,7 @@ mod tests {
     fn soup(corners: &[[Vec3; 3]]) -> Geometry {
         let positions = corners.concat();
         let indices = (0..corners.len() as u32).map(|t| [3 * t, 3 * t + 1, 3 * t + 2]).collect();
-        Geometry::new(&[Mesh { positions, indices, ..Default::default() }])
+        Geometry::new(&[Mesh { positions: positions.into(), indices, ..Default::default() }])
     }
 
     /// Points on a coarse grid: many coincident and axis-parallel things.

@@ -670,8 +670,8 @@ mod tests {
         let m = data.add_material(material(0.5, 1.0, true)).unwrap();
         let p = |x: f32, y: f32| Vec3::new(x, 0.0, y);
         let mesh = Mesh {
-            positions: vec![p(0.0, 0.0), p(9.0, 0.0), p(9.0, 9.0), p(0.0, 9.0)],
-            indices: vec![[0, 1, 2], [0, 2, 3]],
+            positions: vec![p(0.0, 0.0), p(9.0, 0.0), p(9.0, 9.0), p(0.0, 9.0)].into(),
+            indices: vec![[0, 1, 2], [0, 2, 3]].into(),
             materials: MeshMaterials::One(m),
             ..Default::default()
         };

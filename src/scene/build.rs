@@ -93,12 +93,8 @@ impl Scene {
         let meshes = data.bytes();
         let own = data.own_triangles;
         let estimate = bvh::estimated_bytes(own, options) + instance_trees::estimated_bytes(data, options);
-        // What there is of each triangle of an instance, and not of each of a mesh alone.
-        let of_instances = match data.instances.is_empty() {
-            true => 0,
-            false => emissive_triangles(data) * size_of::<Emitter>() + size_of_val(&first_triangle[..]),
-        };
-        let mut memory = device.memory().reserve(meshes + of_instances + estimate, "the scene")?;
+        let of_instances = bytes_of_instances(data, &first_triangle);
+        let memory = device.memory().reserve(meshes + of_instances + estimate, "the scene")?;
         let instances = device.install(|| instance_trees::build(data, &first_triangle, options, progress))?;
         let corners = |t: u32| {
             let object = object_of(&first_triangle, t);
@@ -133,51 +129,30 @@ impl Scene {
         };
         progress.check()?;
 
-        let mut emitters = try_with_capacity(emissive_triangles(data), EMITTERS)?;
-        let is_skipped = |object: u32, t: u32| {
-            let first = first_triangle[object as usize];
-            instance_trees::is_skipped(data, &skipped, instances.as_ref(), object, t, first)
-        };
-        add_emitters(data, &first_triangle, is_skipped, &mut emitters);
         stage.advance(1)?;
-        let wide_sah_cost = device.install(|| tree.sah_cost());
-        let trees = || [&tree].into_iter().chain(instances.iter().flat_map(|i| i.trees.iter().map(|t| &t.tree)));
-        let top = instances.as_ref().map_or(0, |i| i.top.node_count());
-        let bvh_bytes = tree.bytes() + instances.as_ref().map_or(0, Instances::bytes);
-        let bytes = bvh_bytes + meshes + of_instances;
-        memory.shrink(bytes);
-        let stats = SceneStats {
-            triangles: total as u64,
-            skipped_degenerate: all_skipped as u64,
-            nodes: (trees().map(Tree::node_count).sum::<usize>() + top) as u64,
-            bvh_bytes: bvh_bytes as u64,
-            node_bytes: trees().map(Tree::node_bytes).sum::<usize>() as u64
-                + instances.as_ref().map_or(0, |i| size_of_val(&i.top.nodes[..]) as u64),
-            bytes: bytes as u64,
-            sah_cost,
-            build_seconds: start.elapsed().as_secs_f64(),
-            wide_sah_cost,
-            refits: 0,
-            refit_seconds: 0.0,
-        };
-        let (bounds, extent) = instance_trees::bounds_and_extent(data, &tree, instances.as_ref());
-        let instances = instances.map(Box::new);
-        Ok(Parts {
-            emitters,
-            first_triangle,
-            bounds,
-            extent,
-            tree,
-            skipped,
-            instances,
-            uses: Uses::of(data),
-            stats,
-            memory,
-        })
+        device.install(|| Parts::of(data, Built { first_triangle, tree, skipped, instances, sah_cost }, memory, start))
     }
 }
 
-struct Parts {
+/// Size of what there is of each triangle of an instance, and not of each of a mesh alone.
+pub(super) fn bytes_of_instances(data: &SceneData, first_triangle: &[u32]) -> usize {
+    match data.instances.is_empty() {
+        true => 0,
+        false => emissive_triangles(data) * size_of::<Emitter>() + size_of_val(first_triangle),
+    }
+}
+
+/// What takes the time of a commit.
+pub(super) struct Built {
+    pub first_triangle: Vec<u32>,
+    pub tree: Tree,
+    pub skipped: Vec<u32>,
+    pub instances: Option<Instances>,
+    pub sah_cost: f32,
+}
+
+/// A committed scene without what it consists of.
+pub(super) struct Parts {
     emitters: Vec<Emitter>,
     first_triangle: Vec<u32>,
     bounds: (Vec3, Vec3),
@@ -186,12 +161,48 @@ struct Parts {
     skipped: Vec<u32>,
     instances: Option<Box<Instances>>,
     uses: Uses,
-    stats: SceneStats,
+    pub stats: SceneStats,
     memory: Reservation,
 }
 
 impl Parts {
-    fn into_scene(self, device: Arc<Device>, data: SceneData) -> Scene {
+    /// Computes what follows from the description and the trees. To be called on the device's threads. `memory` holds what
+    /// has been announced for the scene, of which what it takes is kept.
+    pub(super) fn of(data: &SceneData, built: Built, mut memory: Reservation, start: Instant) -> Result<Parts> {
+        let Built { first_triangle, tree, skipped, instances, sah_cost } = built;
+        let mut emitters = try_with_capacity(emissive_triangles(data), EMITTERS)?;
+        let is_skipped = |object: u32, t: u32| {
+            let first = first_triangle[object as usize];
+            instance_trees::is_skipped(data, &skipped, instances.as_ref(), object, t, first)
+        };
+        add_emitters(data, &first_triangle, is_skipped, &mut emitters);
+        let trees = || [&tree].into_iter().chain(instances.iter().flat_map(|i| i.trees.iter().map(|t| &t.tree)));
+        let top = instances.as_ref().map_or(0, |i| i.top.node_count());
+        let bvh_bytes = tree.bytes() + instances.as_ref().map_or(0, Instances::bytes);
+        let bytes = bvh_bytes + data.bytes() + bytes_of_instances(data, &first_triangle);
+        memory.shrink(bytes);
+        let stats = SceneStats {
+            triangles: data.triangle_count() as u64,
+            skipped_degenerate: (skipped.len() + instances.as_ref().map_or(0, Instances::skipped)) as u64,
+            nodes: (trees().map(Tree::node_count).sum::<usize>() + top) as u64,
+            bvh_bytes: bvh_bytes as u64,
+            node_bytes: trees().map(Tree::node_bytes).sum::<usize>() as u64
+                + instances.as_ref().map_or(0, |i| size_of_val(&i.top.nodes[..]) as u64),
+            bytes: bytes as u64,
+            mapped_bytes: 0,
+            sah_cost,
+            build_seconds: start.elapsed().as_secs_f64(),
+            wide_sah_cost: tree.sah_cost(),
+            refits: 0,
+            refit_seconds: 0.0,
+        };
+        let (bounds, extent) = instance_trees::bounds_and_extent(data, &tree, instances.as_ref());
+        let instances = instances.map(Box::new);
+        let uses = Uses::of(data);
+        Ok(Parts { emitters, first_triangle, bounds, extent, tree, skipped, instances, uses, stats, memory })
+    }
+
+    pub(super) fn into_scene(self, device: Arc<Device>, data: SceneData) -> Scene {
         let Parts { emitters, first_triangle, bounds, extent, tree, skipped, instances, uses, stats, memory } = self;
         let lights = Arc::new(RwLock::new(Arc::new(data.lights.clone())));
         Scene {
@@ -238,7 +249,7 @@ mod tests {
         data.add_light(light).unwrap();
         let mesh = |positions: Vec<Vec3>, material| Mesh {
             indices: (0..positions.len() as u32 / 3).map(|i| [3 * i, 3 * i + 1, 3 * i + 2]).collect(),
-            positions,
+            positions: positions.into(),
             materials: MeshMaterials::One(material),
             ..Default::default()
         };
@@ -256,8 +267,8 @@ mod tests {
         let texture = Texture { width: 1, height: 1, rgba8: vec![[255, 128, 128, 255]] };
         let albedo_texture = data.add_texture(texture).unwrap();
         data.add_material(Material { albedo: [1.0, 1.0, 0.5], albedo_texture, ..Default::default() }).unwrap();
-        let plain = Mesh { positions: FLOOR.to_vec(), indices: vec![[0, 1, 2]], ..Default::default() };
-        data.add_mesh(Mesh { uvs: vec![Vec2::ZERO; 3], ..plain.clone() }).unwrap();
+        let plain = Mesh { positions: FLOOR.to_vec().into(), indices: vec![[0, 1, 2]].into(), ..Default::default() };
+        data.add_mesh(Mesh { uvs: vec![Vec2::ZERO; 3].into(), ..plain.clone() }).unwrap();
         data.add_mesh(plain).unwrap();
         let scene = data.committed();
         // ((128/255 + 0.055) / 1.055)^2.4.
@@ -271,7 +282,7 @@ mod tests {
         let device = Device::new(DeviceOptions { num_threads: 1, ..Default::default() }).unwrap();
         let mut data = SceneData::new();
         data.add_material(Material::default()).unwrap();
-        let mesh = || Mesh { positions: FLOOR.to_vec(), indices: vec![[0, 1, 2]], ..Default::default() };
+        let mesh = || Mesh { positions: FLOOR.to_vec().into(), indices: vec![[0, 1, 2]].into(), ..Default::default() };
         data.add_mesh(mesh()).unwrap();
         let commit = |data, progress: &Progress| {
             Scene::commit(&device, data, &BuildOptions::default(), progress).map_err(Box::new)
@@ -304,7 +315,8 @@ mod tests {
             let mut data = SceneData::new();
             data.add_material(Material::default()).unwrap();
             let positions = FLOOR.map(|c| c + Vec3::splat(offset)).to_vec();
-            data.add_mesh(Mesh { positions, indices: vec![[0, 1, 2]], ..Default::default() }).unwrap();
+            data.add_mesh(Mesh { positions: positions.into(), indices: vec![[0, 1, 2]].into(), ..Default::default() })
+                .unwrap();
             Scene::commit(&device, data, &BuildOptions::default(), &Progress::none()).map_err(|e| e.1).unwrap();
             messages.lock().unwrap().clone()
         };

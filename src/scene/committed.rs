@@ -31,6 +31,9 @@ pub struct SceneStats {
     pub node_bytes: u64,
     /// Size of the whole committed scene in bytes.
     pub bytes: u64,
+    /// Bytes of those that are in a mapped file (see [`OpenOptions`](super::OpenOptions)) and not in memory, but for what
+    /// the system keeps there as long as it has room.
+    pub mapped_bytes: u64,
     /// Surface area heuristic cost of the binary tree of the meshes without instances, traversal and intersection
     /// costing 1 each; 0 if all have some. A refit does not change it.
     pub sah_cost: f32,

@@ -174,9 +174,9 @@ mod tests {
     #[test]
     fn normals_stay_perpendicular_to_their_surface() {
         let mesh = Mesh {
-            positions: vec![Vec3::ZERO, Vec3::X, Vec3::new(0.0, 1.0, 1.0)],
-            indices: vec![[0, 1, 2]],
-            normals: vec![Vec3::new(0.0, -3.0, 3.0); 3],
+            positions: vec![Vec3::ZERO, Vec3::X, Vec3::new(0.0, 1.0, 1.0)].into(),
+            indices: vec![[0, 1, 2]].into(),
+            normals: vec![Vec3::new(0.0, -3.0, 3.0); 3].into(),
             ..Default::default()
         };
         let t = Affine3A::from_scale_rotation_translation(

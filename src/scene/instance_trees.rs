@@ -13,17 +13,21 @@ use rayon::prelude::*;
 const TREES: &str = "the trees of instances";
 
 /// The numbers of meshes that have instances.
-fn instanced(data: &SceneData) -> impl Iterator<Item = u32> {
+pub(super) fn instanced(data: &SceneData) -> impl Iterator<Item = u32> {
     (0..data.meshes.len() as u32).filter(|&m| data.is_instanced(m))
 }
 
 /// Upper bound of the trees' size together with the builder's working memory.
 pub(super) fn estimated_bytes(data: &SceneData, options: &BuildOptions) -> usize {
     let triangles: usize = instanced(data).map(|m| data.meshes[m as usize].indices.len()).sum();
+    bvh::estimated_bytes(triangles, options) + estimated_bytes_of_places(data.instances.len(), options)
+}
+
+/// Upper bound of the size of what there is of each instance, together with the builder's working memory.
+pub(super) fn estimated_bytes_of_places(instances: usize, options: &BuildOptions) -> usize {
     let top = BuildOptions { compact: false, ..*options };
     let per_instance = size_of::<PlacedTree>() + 24;
-    let instances = data.instances.len();
-    bvh::estimated_bytes(triangles, options) + bvh::estimated_bytes(instances, &top) + instances * per_instance
+    bvh::estimated_bytes(instances, &top) + instances * per_instance
 }
 
 /// Builds the trees; `None` if the scene has no instances.
@@ -41,6 +45,16 @@ pub(super) fn build(
         out.push(tree_of(data, meshes[i], options, progress)?);
         Ok(())
     })?;
+    place(data, first_triangle, trees, progress).map(Some)
+}
+
+/// Builds the tree over the boxes of instances; `trees`: those of all meshes that have some, by number.
+pub(super) fn place(
+    data: &SceneData,
+    first_triangle: &[u32],
+    trees: Vec<MeshTree>,
+    progress: &Progress,
+) -> Result<Instances> {
     let tree_of = |mesh: u32| trees.binary_search_by_key(&mesh, |t| t.mesh).expect("a mesh with instances has a tree");
     let first = &first_triangle[data.meshes.len()..];
     let place = |(instance, &first_triangle): (&Instance, &u32)| PlacedTree {
@@ -53,7 +67,7 @@ pub(super) fn build(
     let of_instance = |i: usize| box_of(data, &trees, &placed, i);
     let boxes = try_par_collect((0..placed.len()).into_par_iter().map(of_instance), TREES)?;
     let top = Instances::top_of(&boxes, progress)?;
-    Ok(Some(Instances { top, trees, placed }))
+    Ok(Instances { top, trees, placed })
 }
 
 /// Refits the trees after vertices of meshes and instances have moved; `rooms` are those of the meshes' trees. Returns

@@ -1,6 +1,7 @@
 //! Triangle meshes as given by the caller.
 
 use super::MAX_TRIANGLES;
+use crate::base::array::Array;
 use crate::base::error::{Result, invalid_argument};
 use crate::base::geometry::is_valid_triangle;
 use crate::base::memory::try_to_vec;
@@ -12,7 +13,7 @@ pub enum MeshMaterials {
     /// One material for the whole mesh.
     One(u32),
     /// One material per triangle.
-    PerTriangle(Vec<u32>),
+    PerTriangle(Array<u32>),
 }
 
 /// Light map coordinates given by the caller.
@@ -20,22 +21,22 @@ pub enum MeshMaterials {
 pub struct LightmapUvs {
     /// One coordinate pair per vertex. They should be unique and in [0, 1]; triangles that violate this are counted and
     /// reported when the light map is created, and repaired by unwrapping.
-    pub uvs: Vec<Vec2>,
+    pub uvs: Array<Vec2>,
     /// Page per triangle; empty: all on page 0.
-    pub pages: Vec<u32>,
+    pub pages: Array<u32>,
 }
 
 /// An indexed triangle mesh, counter-clockwise front faces.
 #[derive(Clone, Debug, PartialEq)]
 pub struct Mesh {
     /// Vertex positions.
-    pub positions: Vec<Vec3>,
+    pub positions: Array<Vec3>,
     /// Three vertices per triangle.
-    pub indices: Vec<[u32; 3]>,
+    pub indices: Array<[u32; 3]>,
     /// Shading normals, one per vertex, or empty: the geometric normal is used.
-    pub normals: Vec<Vec3>,
+    pub normals: Array<Vec3>,
     /// First texture coordinates, one per vertex, or empty.
-    pub uvs: Vec<Vec2>,
+    pub uvs: Array<Vec2>,
     /// The caller's light map coordinates, if any.
     pub lightmap: Option<LightmapUvs>,
     /// Materials by number.
@@ -48,10 +49,10 @@ pub struct Mesh {
 impl Default for Mesh {
     fn default() -> Self {
         Mesh {
-            positions: Vec::new(),
-            indices: Vec::new(),
-            normals: Vec::new(),
-            uvs: Vec::new(),
+            positions: Array::default(),
+            indices: Array::default(),
+            normals: Array::default(),
+            uvs: Array::default(),
             lightmap: None,
             materials: MeshMaterials::One(0),
             strict: false,
@@ -110,17 +111,20 @@ impl Mesh {
     pub(super) fn try_clone(&self) -> Result<Mesh> {
         let what = "a copy of a mesh";
         Ok(Mesh {
-            positions: try_to_vec(&self.positions, what)?,
-            indices: try_to_vec(&self.indices, what)?,
-            normals: try_to_vec(&self.normals, what)?,
-            uvs: try_to_vec(&self.uvs, what)?,
+            positions: try_to_vec(&self.positions, what)?.into(),
+            indices: try_to_vec(&self.indices, what)?.into(),
+            normals: try_to_vec(&self.normals, what)?.into(),
+            uvs: try_to_vec(&self.uvs, what)?.into(),
             lightmap: match &self.lightmap {
-                Some(l) => Some(LightmapUvs { uvs: try_to_vec(&l.uvs, what)?, pages: try_to_vec(&l.pages, what)? }),
+                Some(l) => Some(LightmapUvs {
+                    uvs: try_to_vec(&l.uvs, what)?.into(),
+                    pages: try_to_vec(&l.pages, what)?.into(),
+                }),
                 None => None,
             },
             materials: match &self.materials {
                 MeshMaterials::One(m) => MeshMaterials::One(*m),
-                MeshMaterials::PerTriangle(m) => MeshMaterials::PerTriangle(try_to_vec(m, what)?),
+                MeshMaterials::PerTriangle(m) => MeshMaterials::PerTriangle(try_to_vec(m, what)?.into()),
             },
             strict: self.strict,
         })

@@ -14,6 +14,7 @@ mod material;
 mod mesh;
 pub(crate) mod precision;
 mod refit;
+mod saved;
 mod texture;
 
 pub use crate::base::geometry::{MAX_COORDINATE, NONE, is_valid_triangle, unit_normal};
@@ -27,6 +28,7 @@ pub use instance::{Instance, Object};
 pub use light::Light;
 pub use material::{MAX_ALBEDO, Material};
 pub use mesh::{LightmapUvs, Mesh, MeshMaterials};
+pub use saved::OpenOptions;
 pub use texture::{MAX_TEXTURE_SIZE, Texture};
 
 use crate::base::error::{Error, Result, invalid_argument};

@@ -314,7 +314,7 @@ mod tests {
         data.add_material(Material::default()).unwrap();
         for part in [&triangles[..first], &triangles[first..]] {
             let indices = (0..part.len() as u32).map(|i| [3 * i, 3 * i + 1, 3 * i + 2]).collect();
-            data.add_mesh(Mesh { positions: part.concat(), indices, ..Default::default() }).unwrap();
+            data.add_mesh(Mesh { positions: part.concat().into(), indices, ..Default::default() }).unwrap();
         }
         Scene::commit(device, data, build, &Progress::none()).ok()
     }
@@ -355,7 +355,7 @@ mod tests {
                 for size in [1usize, 0, 3, 700, 0, 5].into_iter().cycle() {
                     let (part, others) = rest.split_at(size.min(rest.len()));
                     let indices = (0..part.len() as u32).map(|i| [3 * i, 3 * i + 1, 3 * i + 2]).collect();
-                    data.add_mesh(Mesh { positions: part.concat(), indices, ..Default::default() }).unwrap();
+                    data.add_mesh(Mesh { positions: part.concat().into(), indices, ..Default::default() }).unwrap();
                     rest = others;
                     if rest.is_empty() {
                         break;

@@ -210,8 +210,8 @@ fn instances_that_move_are_hit_where_they_are_then() {
         }
         moved.materials().iter().for_each(|m| _ = other.add_material(*m).unwrap());
         for (m, mesh) in moved.meshes().iter().enumerate() {
-            let positions = if m == 3 { positions.clone() } else { mesh.positions.clone() };
-            other.add_mesh(Mesh { positions, ..mesh.clone() }).unwrap();
+            let positions = if m == 3 { positions.clone() } else { mesh.positions.to_vec() };
+            other.add_mesh(Mesh { positions: positions.into(), ..mesh.clone() }).unwrap();
         }
         for (i, instance) in (0..).zip(moved.instances()) {
             let transform = places.iter().find(|p| p.0 == i).map_or(instance.transform, |p| p.1);

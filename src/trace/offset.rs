@@ -105,7 +105,12 @@ mod tests {
     fn one_triangle(corners: [Vec3; 3]) -> Arc<Scene> {
         let mut data = SceneData::new();
         data.add_material(Material::default()).unwrap();
-        data.add_mesh(Mesh { positions: corners.to_vec(), indices: vec![[0, 1, 2]], ..Default::default() }).unwrap();
+        data.add_mesh(Mesh {
+            positions: corners.to_vec().into(),
+            indices: vec![[0, 1, 2]].into(),
+            ..Default::default()
+        })
+        .unwrap();
         data.committed()
     }
 

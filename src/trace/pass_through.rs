@@ -170,8 +170,8 @@ mod tests {
         let positions = [[-1.0, -1.0], [1.0, -1.0], [1.0, 1.0], [-1.0, 1.0]].map(|[x, y]| Vec3::new(x, y, z));
         Mesh {
             uvs: positions.iter().map(|p| p.truncate()).collect(),
-            positions: positions.to_vec(),
-            indices: vec![[0, 1, 2], [0, 2, 3]],
+            positions: positions.to_vec().into(),
+            indices: vec![[0, 1, 2], [0, 2, 3]].into(),
             materials: MeshMaterials::One(material),
             ..Default::default()
         }

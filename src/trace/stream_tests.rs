@@ -30,7 +30,7 @@ fn scenes(triangles: &[[Vec3; 3]], max_leaf: u32) -> Vec<Arc<Scene>> {
             let mut data = SceneData::new();
             data.add_material(Material::default()).unwrap();
             let indices = (0..triangles.len() as u32).map(|i| [3 * i, 3 * i + 1, 3 * i + 2]).collect();
-            data.add_mesh(Mesh { positions: triangles.concat(), indices, ..Default::default() }).unwrap();
+            data.add_mesh(Mesh { positions: triangles.concat().into(), indices, ..Default::default() }).unwrap();
             let options = BuildOptions { max_leaf, compact, ..Default::default() };
             all.push(Scene::commit(&device, data, &options, &Progress::none()).map_err(|e| e.1).unwrap());
         }

@@ -17,7 +17,7 @@ fn scene(isa: Isa, triangles: &[[Vec3; 3]], max_leaf: u32) -> Arc<Scene> {
     data.add_material(Material::default()).unwrap();
     let positions: Vec<Vec3> = triangles.iter().flatten().copied().collect();
     let indices = (0..triangles.len() as u32).map(|i| [3 * i, 3 * i + 1, 3 * i + 2]).collect();
-    data.add_mesh(Mesh { positions, indices, ..Default::default() }).unwrap();
+    data.add_mesh(Mesh { positions: positions.into(), indices, ..Default::default() }).unwrap();
     let options = crate::bvh::BuildOptions { max_leaf, ..Default::default() };
     Scene::commit(&device, data, &options, &Progress::none()).map_err(|e| e.1).unwrap()
 }

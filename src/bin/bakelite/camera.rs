@@ -194,8 +194,13 @@ mod tests {
         let material = data.add_material(Material { two_sided: true, ..Default::default() }).unwrap();
         let positions = vec![Vec3::ZERO, Vec3::X, Vec3::Y, Vec3::Z];
         let indices = vec![[0, 2, 1], [0, 1, 3], [0, 3, 2], [1, 2, 3]];
-        data.add_mesh(Mesh { positions, indices, materials: MeshMaterials::One(material), ..Default::default() })
-            .unwrap();
+        data.add_mesh(Mesh {
+            positions: positions.into(),
+            indices: indices.into(),
+            materials: MeshMaterials::One(material),
+            ..Default::default()
+        })
+        .unwrap();
         data.add_light(Light::Directional {
             direction: Vec3::new(-1.0, -0.1, -0.2),
             irradiance: [1.0; 3],

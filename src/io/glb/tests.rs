@@ -22,16 +22,16 @@ fn scene_and_lightmap() -> (Arc<Scene>, GlbLightmap) {
     let positions: Vec<Vec3> = (0..4).map(|i| Vec3::new((i & 1) as f32 * 1.1, (i >> 1) as f32 * 0.7, -0.3)).collect();
     data.add_mesh(Mesh {
         uvs: positions.iter().map(|p| p.truncate() * 3.0).collect(),
-        positions: positions.clone(),
-        indices: vec![[0, 1, 2], [1, 3, 2], [1, 3, 2]],
-        materials: MeshMaterials::PerTriangle(vec![0, 0, 1]),
+        positions: positions.clone().into(),
+        indices: vec![[0, 1, 2], [1, 3, 2], [1, 3, 2]].into(),
+        materials: MeshMaterials::PerTriangle(vec![0, 0, 1].into()),
         ..Default::default()
     })
     .unwrap();
     data.add_mesh(Mesh {
         positions: positions.iter().map(|p| *p + Vec3::Z).collect(),
-        indices: vec![[0, 1, 2], [1, 1, 2], [1, 3, 2]],
-        materials: MeshMaterials::PerTriangle(vec![2, 0, 0]),
+        indices: vec![[0, 1, 2], [1, 1, 2], [1, 3, 2]].into(),
+        materials: MeshMaterials::PerTriangle(vec![2, 0, 0].into()),
         ..Default::default()
     })
     .unwrap();
@@ -151,10 +151,10 @@ fn textured() -> (Arc<Scene>, GlbLightmap) {
     let material = Material { albedo: [0.5; 3], albedo_texture, alpha_cutoff: 0.25, ..Default::default() };
     data.add_material(Material { two_sided: true, ..material }).unwrap();
     data.add_mesh(Mesh {
-        positions: vec![Vec3::ZERO, Vec3::X, Vec3::Y],
-        indices: vec![[0, 1, 2]],
-        normals: vec![Vec3::new(0.0, 0.6, 0.8); 3],
-        uvs: vec![Vec2::ZERO, Vec2::new(7.0, 0.0), Vec2::new(0.0, -3.0)],
+        positions: vec![Vec3::ZERO, Vec3::X, Vec3::Y].into(),
+        indices: vec![[0, 1, 2]].into(),
+        normals: vec![Vec3::new(0.0, 0.6, 0.8); 3].into(),
+        uvs: vec![Vec2::ZERO, Vec2::new(7.0, 0.0), Vec2::new(0.0, -3.0)].into(),
         ..Default::default()
     })
     .unwrap();

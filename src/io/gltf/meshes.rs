@@ -42,7 +42,7 @@ impl Reader<'_, '_> {
             indices.iter_mut().for_each(|t| t.swap(1, 2));
         }
         let used = self.keep_used(&mut indices, vertices)?;
-        let mut mesh = Mesh { indices, positions: self.room(&used)?, ..Default::default() };
+        let mut mesh = Mesh { indices: indices.into(), positions: self.room(&used)?.into(), ..Default::default() };
         for part in used.chunks(PART) {
             self.import.check()?;
             for &v in part {
@@ -50,11 +50,11 @@ impl Reader<'_, '_> {
                 if !is_valid_position(position) {
                     return self.malformed(format_args!("vertex {v} is {position}, not finite or out of range"));
                 }
-                mesh.positions.push(position);
+                mesh.positions.as_vec().push(position);
             }
         }
-        mesh.normals = self.normals(primitive, transform, &used, vertices)?;
-        mesh.uvs = self.uvs(primitive, 0, &used, vertices)?;
+        mesh.normals = self.normals(primitive, transform, &used, vertices)?.into();
+        mesh.uvs = self.uvs(primitive, 0, &used, vertices)?.into();
         let material = primitive.material();
         let lightmap_uvs = if unique { self.uvs(primitive, 1, &used, vertices)? } else { Vec::new() };
         self.import.account.give_back(4 * used.capacity());
@@ -65,7 +65,7 @@ impl Reader<'_, '_> {
                 pages = self.import.account.list(mesh.indices.len(), "the light map pages")?;
                 pages.resize(mesh.indices.len(), page);
             }
-            mesh.lightmap = Some(LightmapUvs { uvs: lightmap_uvs, pages });
+            mesh.lightmap = Some(LightmapUvs { uvs: lightmap_uvs.into(), pages: pages.into() });
         }
         let material = self.material(&material)?;
         if material == NONE {

@@ -308,7 +308,7 @@ impl<'a, 's> Reader<'a, 's> {
         for corner in &corners[2..] {
             let next = self.vertex(*corner)?;
             let account = &mut self.import.account;
-            account.push(&mut self.mesh.indices, [first, previous, next], "the triangles")?;
+            account.push(&mut self.mesh.indices.as_vec(), [first, previous, next], "the triangles")?;
             account.push(&mut self.triangle_names, self.name, "the triangles")?;
             if kind.lightmap {
                 account.push(&mut self.pages, page, "the triangles")?;
@@ -328,12 +328,12 @@ impl<'a, 's> Reader<'a, 's> {
         let (account, mesh) = (&mut self.import.account, &mut self.mesh);
         account.make_room_in_map(&mut self.vertex_of, "the vertices")?;
         let vertex = mesh.positions.len() as u32;
-        account.push(&mut mesh.positions, self.positions[v as usize], "the vertices")?;
+        account.push(&mut mesh.positions.as_vec(), self.positions[v as usize], "the vertices")?;
         if uvs || lightmap {
-            account.push(&mut mesh.uvs, self.uvs[vt as usize], "the texture coordinates")?;
+            account.push(&mut mesh.uvs.as_vec(), self.uvs[vt as usize], "the texture coordinates")?;
         }
         if normals {
-            account.push(&mut mesh.normals, self.normals[vn as usize], "the normals")?;
+            account.push(&mut mesh.normals.as_vec(), self.normals[vn as usize], "the normals")?;
         }
         self.vertex_of.insert(key, vertex);
         Ok(vertex)
@@ -353,7 +353,7 @@ impl<'a, 's> Reader<'a, 's> {
             return Ok(());
         }
         if self.kind.lightmap {
-            mesh.lightmap = Some(LightmapUvs { uvs: std::mem::take(&mut mesh.uvs), pages });
+            mesh.lightmap = Some(LightmapUvs { uvs: std::mem::take(&mut mesh.uvs), pages: pages.into() });
         }
         self.import.account.push(&mut self.done, (mesh, names), "the meshes")
     }
@@ -369,7 +369,7 @@ impl<'a, 's> Reader<'a, 's> {
             names.iter_mut().for_each(|name| *name = materials[*name as usize]);
             mesh.materials = match names.iter().all(|m| *m == names[0]) {
                 true => MeshMaterials::One(names[0]),
-                false => MeshMaterials::PerTriangle(names),
+                false => MeshMaterials::PerTriangle(names.into()),
             };
             self.import.add_mesh(mesh)?;
         }

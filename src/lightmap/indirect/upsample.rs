@@ -570,7 +570,8 @@ pub(super) mod tests {
             let mut mesh = builder.finish();
             let along = |p: &Vec3| (p.x - profile[0][0]).abs() + (p.z - profile[0][1]).abs();
             let unfolded = |p: &Vec3| Vec2::new(start + 0.2 * along(p), 0.2 * p.y + 0.5);
-            mesh.lightmap = Some(LightmapUvs { uvs: mesh.positions.iter().map(unfolded).collect(), pages: Vec::new() });
+            mesh.lightmap =
+                Some(LightmapUvs { uvs: mesh.positions.iter().map(unfolded).collect(), pages: Vec::new().into() });
             start = mesh.positions.iter().map(|p| unfolded(p).x).fold(0.0, f32::max);
             data.add_mesh(mesh).unwrap();
         }

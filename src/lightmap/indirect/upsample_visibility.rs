@@ -296,7 +296,8 @@ mod tests {
             });
             let mut mesh = builder.finish();
             let unfolded = |p: &Vec3| Vec2::new(if p.x > 0.0 { p.x / cos } else { p.x }, p.y) * 0.2 + 0.5;
-            mesh.lightmap = Some(LightmapUvs { uvs: mesh.positions.iter().map(unfolded).collect(), pages: Vec::new() });
+            mesh.lightmap =
+                Some(LightmapUvs { uvs: mesh.positions.iter().map(unfolded).collect(), pages: Vec::new().into() });
             data.add_mesh(mesh).unwrap();
             let desc = LightmapDesc { texels_per_unit: 20.0, gather_divisor: 4, ..Default::default() };
             let lightmap = Lightmap::create(&data.committed(), &desc, &Progress::none()).unwrap();

@@ -28,9 +28,9 @@ fn quad(corners: [Vec3; 4], centre: Vec2, angle: f32) -> Mesh {
     let uvs = [[-1.0, -1.0], [1.0, -1.0], [1.0, 1.0], [-1.0, 1.0]]
         .map(|c| centre + Vec2::from_angle(angle).rotate(0.15 * Vec2::from_array(c)));
     Mesh {
-        positions: corners.to_vec(),
-        indices: vec![[0, 1, 2], [0, 2, 3]],
-        lightmap: Some(LightmapUvs { uvs: uvs.to_vec(), pages: Vec::new() }),
+        positions: corners.to_vec().into(),
+        indices: vec![[0, 1, 2], [0, 2, 3]].into(),
+        lightmap: Some(LightmapUvs { uvs: uvs.to_vec().into(), pages: Vec::new().into() }),
         ..Default::default()
     }
 }

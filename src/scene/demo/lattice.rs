@@ -34,7 +34,12 @@ impl Counted {
 
     pub(super) fn finish(self, material: u32) -> Mesh {
         let Counted { positions, indices } = self;
-        Mesh { positions, indices, materials: MeshMaterials::One(material), ..Default::default() }
+        Mesh {
+            positions: positions.into(),
+            indices: indices.into(),
+            materials: MeshMaterials::One(material),
+            ..Default::default()
+        }
     }
 }
 

@@ -53,8 +53,8 @@ fn has_cell(cell: IVec3, side: i32) -> bool {
 fn sponge(level: u32) -> Result<Mesh> {
     let side = 3i32.pow(level);
     let points = side as usize + 1;
-    let mut mesh = Mesh { materials: MeshMaterials::One(0), ..Default::default() };
-    mesh.indices = try_with_capacity(menger_triangles(level), SPONGE)?;
+    let mut positions = Vec::new();
+    let mut indices = try_with_capacity(menger_triangles(level), SPONGE)?;
     // Vertices of the planes below and above a layer.
     let mut planes = [try_filled(points * points, NONE, SPONGE)?, try_filled(points * points, NONE, SPONGE)?];
     for z in 0..side {
@@ -73,8 +73,8 @@ fn sponge(level: u32) -> Result<Mesh> {
                     let point = cell + along + IVec3::AXES[(axis + 1) % 3] * u + IVec3::AXES[(axis + 2) % 3] * v;
                     let vertex = &mut planes[(point.z - z) as usize][point.y as usize * points + point.x as usize];
                     if *vertex == NONE {
-                        *vertex = mesh.positions.len() as u32;
-                        try_push(&mut mesh.positions, point.as_vec3() / side as f32, SPONGE)?;
+                        *vertex = positions.len() as u32;
+                        try_push(&mut positions, point.as_vec3() / side as f32, SPONGE)?;
                     }
                     *corner = *vertex;
                 }
@@ -82,13 +82,18 @@ fn sponge(level: u32) -> Result<Mesh> {
                     corners.reverse();
                 }
                 let [a, b, c, d] = corners;
-                mesh.indices.extend([[a, b, c], [a, c, d]]);
+                indices.extend([[a, b, c], [a, c, d]]);
             }
         }
         planes.swap(0, 1);
         planes[1].fill(NONE);
     }
-    Ok(mesh)
+    Ok(Mesh {
+        positions: positions.into(),
+        indices: indices.into(),
+        materials: MeshMaterials::One(0),
+        ..Default::default()
+    })
 }
 
 pub(super) fn menger_camera() -> Camera {

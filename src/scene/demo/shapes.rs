@@ -28,9 +28,9 @@ impl MeshBuilder {
     /// The mesh. Its materials are those that the shapes were given.
     pub fn finish(self) -> Mesh {
         Mesh {
-            positions: self.positions,
-            indices: self.indices,
-            materials: MeshMaterials::PerTriangle(self.materials),
+            positions: self.positions.into(),
+            indices: self.indices.into(),
+            materials: MeshMaterials::PerTriangle(self.materials.into()),
             ..Default::default()
         }
     }

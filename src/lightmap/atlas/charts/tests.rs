@@ -35,8 +35,8 @@ pub(in crate::lightmap) fn map_of(scene: &Scene, charts: &Charts, layout: &Layou
 pub(in crate::lightmap) fn quad() -> Mesh {
     let corner = |x, y| Vec3::new(x, y, 0.0);
     Mesh {
-        positions: vec![corner(0.0, 0.0), corner(1.0, 0.0), corner(1.0, 1.0), corner(0.0, 1.0)],
-        indices: vec![[0, 1, 2], [0, 2, 3]],
+        positions: vec![corner(0.0, 0.0), corner(1.0, 0.0), corner(1.0, 1.0), corner(0.0, 1.0)].into(),
+        indices: vec![[0, 1, 2], [0, 2, 3]].into(),
         ..Default::default()
     }
 }
@@ -46,21 +46,21 @@ pub(in crate::lightmap) fn grid(w: usize, h: usize, height: impl Fn(usize, usize
     let mut mesh = Mesh::default();
     for y in 0..=h {
         for x in 0..=w {
-            mesh.positions.push(Vec3::new(x as f32, y as f32, height(x, y)));
+            mesh.positions.as_vec().push(Vec3::new(x as f32, y as f32, height(x, y)));
         }
     }
     for y in 0..h {
         for x in 0..w {
             let i = (y * (w + 1) + x) as u32;
             let above = i + w as u32 + 1;
-            mesh.indices.extend([[i, i + 1, above + 1], [i, above + 1, above]]);
+            mesh.indices.as_vec().extend([[i, i + 1, above + 1], [i, above + 1, above]]);
         }
     }
     mesh
 }
 
 fn with_uvs(mesh: Mesh, uvs: Vec<Vec2>, pages: Vec<u32>) -> Mesh {
-    Mesh { lightmap: Some(LightmapUvs { uvs, pages }), ..mesh }
+    Mesh { lightmap: Some(LightmapUvs { uvs: uvs.into(), pages: pages.into() }), ..mesh }
 }
 
 fn charts_of(scene: &Scene, density: f32) -> (Charts, UvReport) {
@@ -104,9 +104,11 @@ fn stretch(scene: &Scene, charts: &Charts, triangle: u32) -> f64 {
 #[test]
 fn a_cube_has_a_chart_per_side_in_true_size() {
     let mut mesh = Mesh::default();
-    mesh.positions.extend((0..8).map(|i| Vec3::new((i & 1) as f32, (i >> 1 & 1) as f32, (i >> 2) as f32) * 3.0));
+    mesh.positions
+        .as_vec()
+        .extend((0..8).map(|i| Vec3::new((i & 1) as f32, (i >> 1 & 1) as f32, (i >> 2) as f32) * 3.0));
     for [a, b, c, d] in [[0, 1, 3, 2], [4, 6, 7, 5], [0, 4, 5, 1], [2, 3, 7, 6], [0, 2, 6, 4], [1, 5, 7, 3]] {
-        mesh.indices.extend([[a, b, c], [a, c, d]]);
+        mesh.indices.as_vec().extend([[a, b, c], [a, c, d]]);
     }
     let scene = scene_of(mesh);
     let (charts, report) = charts_of(&scene, 10.0);
@@ -205,7 +207,7 @@ fn uvs_that_cannot_be_unique_are_unwrapped() {
     let positions: Vec<Vec3> = mesh.indices.iter().flatten().map(|&i| mesh.positions[i as usize]).collect();
     let indices = (0..6).map(|t| [3 * t, 3 * t + 1, 3 * t + 2]).collect();
     let uvs = [[0, 0], [1, 0], [1, 1], [0, 0], [1, 1], [0, 1]].map(|c| Vec2::new(c[0] as f32, c[1] as f32)).repeat(3);
-    let scene = scene_of(with_uvs(Mesh { positions, indices, ..Default::default() }, uvs, vec![]));
+    let scene = scene_of(with_uvs(Mesh { positions: positions.into(), indices, ..Default::default() }, uvs, vec![]));
     let (charts, report) = charts_of(&scene, 4.0);
     assert_eq!((report.overlapping, report.given_charts), (6, 0));
     check(&scene, &charts);
@@ -229,7 +231,7 @@ fn absurd_densities_and_pages_are_refused_by_name() {
 
 #[test]
 fn a_single_triangle_is_a_chart() {
-    let scene = scene_of(Mesh { indices: vec![[0, 1, 2]], ..quad() });
+    let scene = scene_of(Mesh { indices: vec![[0, 1, 2]].into(), ..quad() });
     let (charts, _) = charts_of(&scene, 4.0);
     assert_eq!(charts.charts.len(), 1);
     check(&scene, &charts);
@@ -262,22 +264,22 @@ fn garbage() -> impl Strategy<Value = Mesh> {
     let corner = (0..3u8, 0..3u8, 0..3u8, 0..8u8);
     let triangle = [corner.clone(), corner.clone(), corner];
     prop::collection::vec(triangle, 1..40).prop_map(|triangles| {
-        let mut mesh = Mesh { materials: MeshMaterials::PerTriangle(Vec::new()), ..Default::default() };
+        let mut mesh = Mesh { materials: MeshMaterials::PerTriangle(Vec::new().into()), ..Default::default() };
         for (t, triangle) in triangles.into_iter().enumerate() {
             let first = mesh.positions.len() as u32;
-            mesh.indices.push([first, first + 1, first + 2]);
+            mesh.indices.as_vec().push([first, first + 1, first + 2]);
             for (x, y, z, off) in triangle {
                 let off = if off == 0 { 1e-6 } else { 0.0 };
-                mesh.positions.push(Vec3::new(x as f32 + off, y as f32, z as f32 - off));
+                mesh.positions.as_vec().push(Vec3::new(x as f32 + off, y as f32, z as f32 - off));
             }
             let MeshMaterials::PerTriangle(materials) = &mut mesh.materials else { unreachable!() };
-            materials.push(u32::from(t % 5 == 0));
+            materials.as_vec().push(u32::from(t % 5 == 0));
         }
         // A scene needs one valid triangle.
-        mesh.indices.push([0, 1, 2].map(|i| mesh.positions.len() as u32 + i));
-        mesh.positions.extend([Vec3::ZERO, Vec3::X, Vec3::Y]);
+        mesh.indices.as_vec().push([0, 1, 2].map(|i| mesh.positions.len() as u32 + i));
+        mesh.positions.as_vec().extend([Vec3::ZERO, Vec3::X, Vec3::Y]);
         let MeshMaterials::PerTriangle(materials) = &mut mesh.materials else { unreachable!() };
-        materials.push(0);
+        materials.as_vec().push(0);
         mesh
     })
 }

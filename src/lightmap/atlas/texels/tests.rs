@@ -345,7 +345,7 @@ fn the_number_of_threads_does_not_change_the_texels() {
 #[test]
 fn normals_come_from_the_mesh_unless_they_face_away() {
     let up = Vec3::new(0.6, 0.0, 0.8);
-    let scene = scene_of(Mesh { normals: vec![up, up, up, -up], ..quad() });
+    let scene = scene_of(Mesh { normals: vec![up, up, up, -up].into(), ..quad() });
     let front = TexelSample { triangle: 0, u: 0.25, v: 0.25, ..Default::default() };
     assert!(front.shading_normal(&scene).distance(up) < 1e-6);
     assert!(front.position(&scene).distance(Vec3::new(0.5, 0.25, 0.0)) < 1e-6);

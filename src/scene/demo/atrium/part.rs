@@ -165,10 +165,10 @@ impl Part {
 
     pub(super) fn into_mesh(self) -> Mesh {
         Mesh {
-            positions: self.positions,
-            normals: self.normals,
-            indices: self.indices,
-            materials: MeshMaterials::PerTriangle(self.materials),
+            positions: self.positions.into(),
+            normals: self.normals.into(),
+            indices: self.indices.into(),
+            materials: MeshMaterials::PerTriangle(self.materials.into()),
             strict: true,
             ..Default::default()
         }

@@ -36,7 +36,11 @@ fn tiny_scenes(lab: &Lab, rows: &mut Vec<Row>) -> Result<()> {
     let one = |corners: [Vec3; 3]| -> Result<SceneData> {
         let mut data = SceneData::new();
         data.add_material(Material::default())?;
-        data.add_mesh(Mesh { positions: corners.to_vec(), indices: vec![[0, 1, 2]], ..Default::default() })?;
+        data.add_mesh(Mesh {
+            positions: corners.to_vec().into(),
+            indices: vec![[0, 1, 2]].into(),
+            ..Default::default()
+        })?;
         data.add_light(Light::Directional { direction: Vec3::NEG_Y, irradiance: [1.0; 3], angular_radius: 0.0 })?;
         Ok(data)
     };
