@@ -81,7 +81,7 @@ fn trees(c: &mut Criterion) {
                 );
             });
         }
-        let positions: Vec<Vec<Vec3>> = scene.meshes().iter().map(|m| m.positions.clone()).collect();
+        let positions: Vec<Vec<Vec3>> = scene.meshes().iter().map(|m| m.positions.to_vec()).collect();
         let moved: Vec<(u32, &[Vec3])> = positions.iter().enumerate().map(|(m, p)| (m as u32, &p[..])).collect();
         group.bench_function(BenchmarkId::new("refit", isa.name()), |b| {
             b.iter(|| Scene::refit(&mut scene, &moved).expect("refit"));

@@ -49,7 +49,7 @@ cd "$OLDPWD"
 # ---- The documents ----
 
 pages='index:README.md guide:docs/guide.md install:docs/install.md performance:docs/performance.md accuracy:docs/accuracy.md
-    architecture:docs/architecture.md robustness:docs/robustness.md experiments:docs/experiments.md
+    architecture:docs/architecture.md robustness:docs/robustness.md experiments:docs/experiments.md scene_file:docs/scene_file.md
     contributing:CONTRIBUTING.md security:SECURITY.md changelog:CHANGELOG.md'
 {
     echo '<nav>'

@@ -260,6 +260,12 @@ typedef struct bk_device_desc {
   /// Pointer passed to `log` and `memory`; must stay valid until the device and all that was made
   /// from it are gone. Default: NULL.
   void *user;
+  /// Folder in which the unwraps of light maps are kept by their content, for the next light map
+  /// and the next run of the program: parts of meshes that are as they were are not unwrapped
+  /// again. It is made if needed; files in it may be deleted at any time. It should be writable for
+  /// this user only: files are checked, but charts that somebody else put there would be used.
+  /// UTF-8; NULL: none are kept. Default: NULL.
+  const char *cache_folder;
 } bk_device_desc;
 
 /// Reports the progress of a call, and can cancel it.
@@ -344,11 +350,6 @@ BK_API uint32_t bk_device_num_threads(const bk_device *device);
  */
 /* ============================================================================================== */
 
-/// Flag of bk_load_params: files that the scene file names may lie in any folder. Use it for scenes
-/// of trusted authors only: such a scene can find out which files exist, and can show their texels
-/// in its light.
-#define BK_LOAD_ANY_FOLDER 1
-
 /// Build quality: binned surface area heuristic.
 #define BK_BUILD_QUALITY_DEFAULT 0
 
@@ -360,57 +361,6 @@ BK_API uint32_t bk_device_num_threads(const bk_device *device);
 
 /// Handle of a scene, described or committed.
 typedef struct bk_scene bk_scene;
-
-/// Numbers about a file that was loaded.
-typedef struct bk_load_info {
-  /// Size of this structure in bytes, set by bk_load_info_init.
-  uint32_t struct_size;
-  /// Number of meshes added.
-  uint32_t meshes;
-  /// Number of the first mesh added; the others follow it.
-  uint32_t first_mesh;
-  /// Number of materials added.
-  uint32_t materials;
-  /// Number of the first material added; the others follow it.
-  uint32_t first_material;
-  /// Number of lights added, emissive materials not counted.
-  uint32_t lights;
-  /// Number of the first light added; the others follow it.
-  uint32_t first_light;
-  /// Number of materials with a reflectance outside [0, 0.98], which was clamped to that range.
-  uint32_t clamped_albedos;
-  /// Number of triangles added, those of every instance counted and degenerate ones included.
-  uint64_t triangles;
-  /// Duration of the call in seconds.
-  double seconds;
-  /// Number of textures added. An image that cannot be read is left out, with a warning in the
-  /// log.
-  uint32_t textures;
-  /// Number of the first texture added; the others follow it.
-  uint32_t first_texture;
-  /// Number of instances added, of meshes of at least 1,000 triangles that stand in several
-  /// places.
-  uint32_t instances;
-  /// Number of the first instance added; the others follow it.
-  uint32_t first_instance;
-} bk_load_info;
-
-/// Limits of bk_scene_load_file: which files it may read, and how much of them.
-typedef struct bk_load_params {
-  /// Size of this structure in bytes, set by bk_load_params_init.
-  uint32_t struct_size;
-  /// BK_LOAD_ANY_FOLDER or 0. Default: 0.
-  uint32_t flags;
-  /// Folder in or below which all files must lie that the scene file names (material libraries,
-  /// images, buffers), symbolic links resolved. UTF-8; NULL: the folder of the scene file.
-  /// Default: NULL.
-  const char *base_folder;
-  /// Limit in bytes for all decoded images together, 4 per texel, checked before an image is
-  /// decoded. (Decoding takes up to 8 more bytes per texel of the image.) Default: 2 GiB.
-  uint64_t max_texture_bytes;
-  /// Limit in bytes for all files together, the scene file included. Default: 16 GiB.
-  uint64_t max_file_bytes;
-} bk_load_params;
 
 /// Parameters of the acceleration structure.
 typedef struct bk_build_params {
@@ -450,7 +400,7 @@ typedef struct bk_scene_stats {
   uint64_t bvh_bytes;
   /// Size of the whole committed scene in bytes.
   uint64_t bytes;
-  /// Duration of the build in seconds.
+  /// Duration of the build, or of opening the file, in seconds.
   double build_seconds;
   /// Surface area heuristic cost of the 8-wide tree of the same meshes in its present shape, a
   /// relative number: 1 for each node and each triangle that a random ray is expected to visit.
@@ -460,6 +410,9 @@ typedef struct bk_scene_stats {
   uint32_t refits;
   /// Duration of the last of these calls in seconds; 0 if there was none.
   double refit_seconds;
+  /// Number of `bytes` that are in a mapped scene file (bk_scene_open) instead of in memory, as far
+  /// as the system does not keep them there because it has room.
+  uint64_t mapped_bytes;
 } bk_scene_stats;
 
 /// Creates an empty scene.
@@ -478,61 +431,6 @@ BK_API void bk_scene_retain(bk_scene *scene);
 ///
 /// @param scene  NULL is ignored
 BK_API void bk_scene_release(bk_scene *scene);
-
-/// Sets `struct_size` and clears the other fields.
-///
-/// @param info  structure to fill in; NULL is ignored
-BK_API void bk_load_info_init(bk_load_info *info);
-
-/// Sets `struct_size` and fills in the defaults.
-///
-/// @param params  structure to fill in; NULL is ignored
-BK_API void bk_load_params_init(bk_load_params *params);
-
-/// Loads a scene file and adds its meshes, materials with their textures (PNG and JPEG), and
-/// lights.
-///
-/// Only regular files are read, never devices, FIFOs or sockets. A material library or an image
-/// that cannot be read, or that lies where `params` allows none, is left out with a warning in the
-/// log; a buffer of a glTF file that cannot be read is an error. bk_scene_get_mesh,
-/// bk_scene_get_material, bk_scene_get_texture and bk_scene_get_light read the loaded objects back.
-///
-/// Files from untrusted sources are safe to load, within the limits of `params`: malformed content
-/// gives an error, or is left out with a warning.
-///
-/// Cost: 0.2 (PLY) to 2 s (OBJ) per million triangles, on one thread, and the decoding of images.
-///
-/// @param scene  scene that is not committed
-/// @param path  name of a file that ends in .obj (with its .mtl), .ply, .gltf or .glb; UTF-8
-/// @param params  limits; NULL for the defaults
-/// @param progress,user  progress callback and its pointer; may be NULL
-/// @param out  receives the numbers of the objects added; may be NULL
-/// @retval BK_ERROR_IO  a file cannot be read or is malformed; bk_last_error names it
-/// @retval BK_ERROR_UNSUPPORTED  the kind of file is unknown, the file requires an extension of
-///   glTF that is not supported, or the library was built without files
-/// @retval BK_ERROR_OUT_OF_MEMORY  a limit of `params` is exceeded, the memory callback refuses, or
-///   memory runs out
-/// @retval BK_ERROR_CANCELLED  the progress callback returned 0
-/// @retval BK_ERROR_INVALID_STATE  the scene is committed or another thread is changing it
-BK_API
-bk_result bk_scene_load_file(bk_scene *scene,
-                             const char *path,
-                             const bk_load_params *params,
-                             bk_progress_fn progress,
-                             void *user,
-                             bk_load_info *out);
-
-/// Adds a built-in scene with its lights.
-///
-/// Cost: less than 0.1 s.
-///
-/// @param scene  scene that is not committed
-/// @param name  "cornell" (the Cornell box), "furnace" (a closed, glowing cube) or "atrium" (a
-///   two-floor court in the sun)
-/// @retval BK_ERROR_INVALID_ARGUMENT  there is no such scene
-/// @retval BK_ERROR_INVALID_STATE  the scene is committed or another thread is changing it
-/// @retval BK_ERROR_OUT_OF_MEMORY  the memory callback refuses
-BK_API bk_result bk_scene_load_builtin(bk_scene *scene, const char *name);
 
 /// Sets `struct_size` and fills in the defaults.
 ///
@@ -611,6 +509,197 @@ BK_API bk_result bk_scene_get_stats(const bk_scene *scene, bk_scene_stats *out);
 /// @param upper  receives the largest x, y and z, in scene units
 /// @retval BK_ERROR_INVALID_STATE  the scene is not committed or is being refitted
 BK_API bk_result bk_scene_bounds(const bk_scene *scene, float lower[3], float upper[3]);
+
+/** @} */
+
+/* ============================================================================================== */
+/**
+ * @defgroup files Scene files
+ *
+ * Scenes come from files of other programs (OBJ, PLY, glTF), which are added to a description, and
+ * from files that bk_scene_save has written: those hold a committed scene with its acceleration
+ * structure, and are opened instead of described and committed.
+ *
+ * Thread safety: as for scenes.
+ *
+ * Cost: functions that are not described otherwise take less than a microsecond.
+ *
+ * @{
+ */
+/* ============================================================================================== */
+
+/// Flag of bk_load_params: files that the scene file names may lie in any folder. Use it for scenes
+/// of trusted authors only: such a scene can find out which files exist, and can show their texels
+/// in its light.
+#define BK_LOAD_ANY_FOLDER 1
+
+/// Numbers about a file that was loaded.
+typedef struct bk_load_info {
+  /// Size of this structure in bytes, set by bk_load_info_init.
+  uint32_t struct_size;
+  /// Number of meshes added.
+  uint32_t meshes;
+  /// Number of the first mesh added; the others follow it.
+  uint32_t first_mesh;
+  /// Number of materials added.
+  uint32_t materials;
+  /// Number of the first material added; the others follow it.
+  uint32_t first_material;
+  /// Number of lights added, emissive materials not counted.
+  uint32_t lights;
+  /// Number of the first light added; the others follow it.
+  uint32_t first_light;
+  /// Number of materials with a reflectance outside [0, 0.98], which was clamped to that range.
+  uint32_t clamped_albedos;
+  /// Number of triangles added, those of every instance counted and degenerate ones included.
+  uint64_t triangles;
+  /// Duration of the call in seconds.
+  double seconds;
+  /// Number of textures added. An image that cannot be read is left out, with a warning in the
+  /// log.
+  uint32_t textures;
+  /// Number of the first texture added; the others follow it.
+  uint32_t first_texture;
+  /// Number of instances added, of meshes of at least 1,000 triangles that stand in several
+  /// places.
+  uint32_t instances;
+  /// Number of the first instance added; the others follow it.
+  uint32_t first_instance;
+} bk_load_info;
+
+/// Limits of bk_scene_load_file: which files it may read, and how much of them.
+typedef struct bk_load_params {
+  /// Size of this structure in bytes, set by bk_load_params_init.
+  uint32_t struct_size;
+  /// BK_LOAD_ANY_FOLDER or 0. Default: 0.
+  uint32_t flags;
+  /// Folder in or below which all files must lie that the scene file names (material libraries,
+  /// images, buffers), symbolic links resolved. UTF-8; NULL: the folder of the scene file.
+  /// Default: NULL.
+  const char *base_folder;
+  /// Limit in bytes for all decoded images together, 4 per texel, checked before an image is
+  /// decoded. (Decoding takes up to 8 more bytes per texel of the image.) Default: 2 GiB.
+  uint64_t max_texture_bytes;
+  /// Limit in bytes for all files together, the scene file included. Default: 16 GiB.
+  uint64_t max_file_bytes;
+} bk_load_params;
+
+/// How bk_scene_open opens a file.
+typedef struct bk_open_params {
+  /// Size of this structure in bytes, set by bk_open_params_init.
+  uint32_t struct_size;
+  /// 1: the file is mapped and takes the place of memory. Parts are read when they are needed, and
+  /// the system drops them when it needs the memory, so that a scene may be larger than it. Pages
+  /// that a refit changes stay in memory. While the scene lives, the file must not be changed in
+  /// place or cut short: that would be as if somebody wrote to the process's memory. (bk_scene_save
+  /// under its name is fine: it makes a new file.) 0: the file is read to memory; rays are
+  /// somewhat faster, because memory can have large pages. Default: 1.
+  uint32_t map;
+} bk_open_params;
+
+/// Sets `struct_size` and clears the other fields.
+///
+/// @param info  structure to fill in; NULL is ignored
+BK_API void bk_load_info_init(bk_load_info *info);
+
+/// Sets `struct_size` and fills in the defaults.
+///
+/// @param params  structure to fill in; NULL is ignored
+BK_API void bk_load_params_init(bk_load_params *params);
+
+/// Loads a scene file and adds its meshes, materials with their textures (PNG and JPEG), and
+/// lights.
+///
+/// Only regular files are read, never devices, FIFOs or sockets. A material library or an image
+/// that cannot be read, or that lies where `params` allows none, is left out with a warning in the
+/// log; a buffer of a glTF file that cannot be read is an error. bk_scene_get_mesh,
+/// bk_scene_get_material, bk_scene_get_texture and bk_scene_get_light read the loaded objects back.
+///
+/// Files from untrusted sources are safe to load, within the limits of `params`: malformed content
+/// gives an error, or is left out with a warning.
+///
+/// Cost: 0.2 (PLY) to 2 s (OBJ) per million triangles, on one thread, and the decoding of images.
+///
+/// @param scene  scene that is not committed
+/// @param path  name of a file that ends in .obj (with its .mtl), .ply, .gltf or .glb; UTF-8
+/// @param params  limits; NULL for the defaults
+/// @param progress,user  progress callback and its pointer; may be NULL
+/// @param out  receives the numbers of the objects added; may be NULL
+/// @retval BK_ERROR_IO  a file cannot be read or is malformed; bk_last_error names it
+/// @retval BK_ERROR_UNSUPPORTED  the kind of file is unknown, the file requires an extension of
+///   glTF that is not supported, or the library was built without files
+/// @retval BK_ERROR_OUT_OF_MEMORY  a limit of `params` is exceeded, the memory callback refuses, or
+///   memory runs out
+/// @retval BK_ERROR_CANCELLED  the progress callback returned 0
+/// @retval BK_ERROR_INVALID_STATE  the scene is committed or another thread is changing it
+BK_API
+bk_result bk_scene_load_file(bk_scene *scene,
+                             const char *path,
+                             const bk_load_params *params,
+                             bk_progress_fn progress,
+                             void *user,
+                             bk_load_info *out);
+
+/// Adds a built-in scene with its lights.
+///
+/// Cost: less than 0.1 s.
+///
+/// @param scene  scene that is not committed
+/// @param name  "cornell" (the Cornell box), "furnace" (a closed, glowing cube) or "atrium" (a
+///   two-floor court in the sun)
+/// @retval BK_ERROR_INVALID_ARGUMENT  there is no such scene
+/// @retval BK_ERROR_INVALID_STATE  the scene is committed or another thread is changing it
+/// @retval BK_ERROR_OUT_OF_MEMORY  the memory callback refuses
+BK_API bk_result bk_scene_load_builtin(bk_scene *scene, const char *name);
+
+/// Writes a committed scene to a file, which is replaced as a whole, for bk_scene_open: meshes,
+/// instances, materials, textures, environments, lights as they are now, and the acceleration
+/// structure with the refits that were made. If the call fails, the old file is as it was.
+///
+/// The format is described in the manual (docs/scene_file.md). Files are for machines of the same
+/// order of bytes, and for this version of the format.
+///
+/// Cost: 60 to 110 bytes per triangle to write, half of that for a compact structure, with textures.
+///
+/// @param scene  committed scene
+/// @param path  name of the file; UTF-8
+/// @param progress,user  progress callback and its pointer; may be NULL
+/// @retval BK_ERROR_IO  the file cannot be written
+/// @retval BK_ERROR_INVALID_STATE  the scene is not committed or is being refitted
+/// @retval BK_ERROR_CANCELLED  the progress callback returned 0
+BK_API bk_result bk_scene_save(bk_scene *scene, const char *path, bk_progress_fn progress, void *user);
+
+/// Sets `struct_size` and fills in the defaults.
+///
+/// @param params  structure to fill in; NULL is ignored
+BK_API void bk_open_params_init(bk_open_params *params);
+
+/// Loads a scene that bk_scene_save has written. It is committed then, with the hits and the light,
+/// bit for bit, of the scene that was saved; numbers of meshes, materials and so on are the same.
+/// Nothing is built.
+///
+/// Files from untrusted sources are safe to open as long as nobody changes them meanwhile: a file
+/// that is damaged, or of another version, gives an error.
+///
+/// Cost: all of the file is read once, to check it: some 0.1 s per million triangles if the system
+/// has it in its cache. A mapped scene takes no memory but for textures, skies, emissive triangles
+/// and instances.
+///
+/// @param scene  scene to which nothing has been added
+/// @param path  name of the file; UTF-8
+/// @param params  NULL for the defaults
+/// @param progress,user  progress callback and its pointer; may be NULL
+/// @retval BK_ERROR_IO  the file cannot be read, is damaged, or is no scene file of this version
+/// @retval BK_ERROR_INVALID_STATE  the scene is committed, something has been added to it, or
+///   another thread is changing it
+/// @retval BK_ERROR_OUT_OF_MEMORY  the memory callback refuses, or memory runs out
+/// @retval BK_ERROR_CANCELLED  the progress callback returned 0
+BK_API
+bk_result bk_scene_open(bk_scene *scene,
+                        const char *path,
+                        const bk_open_params *params,
+                        bk_progress_fn progress,
+                        void *user);
 
 /** @} */
 

@@ -191,6 +191,7 @@ private:
     }
 BAKELITE_STRUCT(DeviceDesc, bk_device_desc);
 BAKELITE_STRUCT(LoadParams, bk_load_params);
+BAKELITE_STRUCT(OpenParams, bk_open_params);
 BAKELITE_STRUCT(LoadInfo, bk_load_info);
 BAKELITE_STRUCT(BuildParams, bk_build_params);
 BAKELITE_STRUCT(SceneStats, bk_scene_stats);
@@ -366,6 +367,14 @@ public:
     Result<void> set_build(const BuildParams &params) { return detail::finish(bk_scene_set_build(get(), &params)); }
     Result<void> commit(const Progress &progress = {}) {
         return detail::finish(progress.after(bk_scene_commit(get(), progress.function(), progress.user())));
+    }
+    Result<void> save(const std::string &path, const Progress &progress = {}) const {
+        return detail::finish(progress.after(bk_scene_save(get(), path.c_str(), progress.function(), progress.user())));
+    }
+    /// Instead of a description and commit().
+    Result<void> open(const std::string &path, const OpenParams &params = {}, const Progress &progress = {}) {
+        return detail::finish(
+            progress.after(bk_scene_open(get(), path.c_str(), &params, progress.function(), progress.user())));
     }
     Result<void> set_positions(std::uint32_t mesh, Vectors<3> vertices) {
         return detail::finish(

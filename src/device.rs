@@ -8,6 +8,7 @@ use crate::base::{callback, float_state};
 use crate::simd::{Isa, LIMIT_VARIABLE};
 use std::cell::Cell;
 use std::io::Write;
+use std::path::{Path, PathBuf};
 use std::sync::Arc;
 use std::thread::JoinHandle;
 
@@ -56,6 +57,9 @@ pub struct DeviceOptions {
     pub log: Option<Box<LogFn>>,
     /// Called before large allocations.
     pub memory: Option<Box<MemoryFn>>,
+    /// Folder in which unwraps are kept by their content, for the next light map and the next run; it is made if needed.
+    /// `None`: none are kept.
+    pub cache_folder: Option<PathBuf>,
 }
 
 /// Threads, kernels and accounts that scenes and bakes share.
@@ -69,6 +73,7 @@ pub struct Device {
     isa: Isa,
     log: Option<Box<LogFn>>,
     memory: Arc<MemoryMonitor>,
+    cache_folder: Option<PathBuf>,
     /// Id of the process in which the threads were started.
     process: u32,
 }
@@ -99,6 +104,7 @@ impl Device {
             isa,
             log: options.log.or_else(|| log_to(std::io::stderr, &std::env::var(LOG_VARIABLE).ok()?)),
             memory: Arc::new(MemoryMonitor::new(options.memory)),
+            cache_folder: options.cache_folder,
             process: std::process::id(),
         };
         device.log_info(|| {
@@ -216,6 +222,11 @@ impl Device {
         if self.log.is_some() {
             self.log(LogLevel::Info, &message());
         }
+    }
+
+    /// See [`DeviceOptions::cache_folder`].
+    pub fn cache_folder(&self) -> Option<&Path> {
+        self.cache_folder.as_deref()
     }
 
     /// The memory accounts.

@@ -13,6 +13,8 @@ mod live_state;
 mod room;
 #[path = "../../fuzz/src/saved.rs"]
 mod saved;
+#[path = "../../fuzz/src/scene_file.rs"]
+mod scene_file;
 #[path = "../../fuzz/src/seeds.rs"]
 mod seeds;
 

@@ -11,10 +11,11 @@ use cbindgen::{
 use std::path::Path;
 
 /// The sections of the header, in order.
-const SECTIONS: [&str; 13] = [
+const SECTIONS: [&str; 14] = [
     "error",
     "device",
     "scene",
+    "files",
     "textures",
     "meshes",
     "instances",

@@ -508,7 +508,7 @@ fn refit(scene: Arc<Scene>, what: &str) {
         // As a copy again.
         copy = scene.clone();
         let result = Scene::refit(&mut copy, &[(0, &moved)]);
-        let kept = if result.is_ok() { &moved } else { &old };
+        let kept = if result.is_ok() { &moved[..] } else { &old[..] };
         assert!(copy.meshes()[0].positions == *kept && scene.meshes()[0].positions == old);
         result
     });

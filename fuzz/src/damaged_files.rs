@@ -2,6 +2,7 @@
 
 use crate::live_state::LiveState;
 use crate::saved::Saved;
+use crate::scene_file::SceneFile;
 use bakelite::scene::{SceneData, is_valid_triangle};
 use bakelite::{Error, Progress, io};
 use std::path::{Path, PathBuf};
@@ -11,6 +12,7 @@ const TRIANGLES: &str = "mtllib a.mtl\nv 0 0 0\nv 1 0 0\nv 0 1 0\nvt 0 0\nusemtl
     f 1/1 2/1 3/1\nusemtl cut\nf 1/1 2/1 3/1\n";
 
 static RESULT: LazyLock<Mutex<Saved>> = LazyLock::new(|| Mutex::new(Saved::result()));
+static SCENE: LazyLock<Mutex<SceneFile>> = LazyLock::new(|| Mutex::new(SceneFile::of_room(folder())));
 static LIVE_STATE: LazyLock<Mutex<LiveState>> = LazyLock::new(|| Mutex::new(LiveState::of_room()));
 static CHECKPOINT: LazyLock<Mutex<Saved>> = LazyLock::new(|| Mutex::new(Saved::checkpoint()));
 
@@ -52,6 +54,7 @@ pub fn read(target: &str, bytes: &[u8]) {
             load(&folder().join("triangles.obj"));
         }
         "live_restore" => LIVE_STATE.lock().expect("no earlier panic").restore(bytes),
+        "scene_file" => SCENE.lock().expect("no earlier panic").open(bytes),
         "saved_result" => RESULT.lock().expect("no earlier panic").load(bytes),
         "checkpoint" => CHECKPOINT.lock().expect("no earlier panic").resume(bytes),
         _ => match io::image::read_environment(&write("sky")) {

@@ -5,4 +5,5 @@ pub mod damaged_files;
 pub mod live_state;
 pub mod room;
 pub mod saved;
+pub mod scene_file;
 pub mod seeds;

@@ -8,8 +8,21 @@ use image::{ExtendedColorType as Color, ImageEncoder, Rgb};
 use std::io::Cursor;
 
 /// The targets: kinds of files.
-pub const TARGETS: [&str; 12] =
-    ["obj", "mtl", "ply", "gltf", "glb", "png", "jpeg", "hdr", "exr", "saved_result", "checkpoint", "live_restore"];
+pub const TARGETS: [&str; 13] = [
+    "obj",
+    "mtl",
+    "ply",
+    "gltf",
+    "glb",
+    "png",
+    "jpeg",
+    "hdr",
+    "exr",
+    "scene_file",
+    "saved_result",
+    "checkpoint",
+    "live_restore",
+];
 
 /// Valid files, each with its target, and changes to saved ones.
 pub fn seeds() -> Vec<(&'static str, Vec<u8>)> {
@@ -30,6 +43,7 @@ pub fn seeds() -> Vec<(&'static str, Vec<u8>)> {
     all.extend([Color::L8, Color::Rgb8].map(|color| ("jpeg", jpeg(color))));
     all.extend([("hdr", hdr(2)), ("hdr", hdr(16)), ("exr", exr())]);
     all.extend(["saved_result", "checkpoint"].into_iter().flat_map(|target| changes().map(move |c| (target, c))));
+    all.extend(scene_changes().map(|c| ("scene_file", c)));
     all.extend(live_changes().map(|c| ("live_restore", c)));
     all
 }
@@ -38,6 +52,14 @@ pub fn seeds() -> Vec<(&'static str, Vec<u8>)> {
 fn changes() -> impl Iterator<Item = Vec<u8>> {
     let to = |record: u8| (0..8).map(move |what| [&[record, 64 + what, 9, 0][..], &[0xff; 8]].concat());
     [Vec::new()].into_iter().chain((0..8).flat_map(to))
+}
+
+/// A word of zeros, ones or one more at places throughout both files (see `scene_file`), and no changes.
+fn scene_changes() -> impl Iterator<Item = Vec<u8>> {
+    let at = |i: u32| {
+        [0, 1, u32::MAX].map(|new: u32| [&[i as u8][..], &(97 * i).to_le_bytes(), &new.to_le_bytes()].concat())
+    };
+    [vec![0], vec![1]].into_iter().chain((0..200).flat_map(at))
 }
 
 /// Four bytes of ones, zeros and a negative number at places throughout a live state (see `live_state`), and none.

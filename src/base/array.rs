@@ -107,6 +107,12 @@ impl<T> From<Vec<T>> for Array<T> {
     }
 }
 
+impl<T, const N: usize> From<[T; N]> for Array<T> {
+    fn from(values: [T; N]) -> Self {
+        Vec::from(values).into()
+    }
+}
+
 impl<T> From<Array<T>> for Vec<T> {
     /// Without a copy, unless the elements lie in a mapped file.
     fn from(array: Array<T>) -> Self {

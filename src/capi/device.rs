@@ -130,6 +130,12 @@ pub struct bk_device_desc {
     /// Pointer passed to `log` and `memory`; must stay valid until the device and all that was made
     /// from it are gone. Default: NULL.
     pub user: *mut c_void,
+    /// Folder in which the unwraps of light maps are kept by their content, for the next light map
+    /// and the next run of the program: parts of meshes that are as they were are not unwrapped
+    /// again. It is made if needed; files in it may be deleted at any time. It should be writable for
+    /// this user only: files are checked, but charts that somebody else put there would be used.
+    /// UTF-8; NULL: none are kept. Default: NULL.
+    pub cache_folder: *const c_char,
 }
 
 sized_struct!(bk_device_desc, defaults: bk_device_desc {
@@ -139,6 +145,7 @@ sized_struct!(bk_device_desc, defaults: bk_device_desc {
     log: None,
     memory: None,
     user: std::ptr::null_mut(),
+    cache_folder: std::ptr::null(),
 });
 
 /// Sets `struct_size` and fills in the defaults.
@@ -212,7 +219,9 @@ pub unsafe extern "C" fn bk_device_num_threads(device: *const bk_device) -> u32 
     call_or(0, || Ok(object!(device).device.num_threads() as u32))
 }
 
-fn options(desc: bk_device_desc) -> Result<DeviceOptions> {
+/// # Safety
+/// `cache_folder` is NULL or a text.
+unsafe fn options(desc: bk_device_desc) -> Result<DeviceOptions> {
     let isa = match desc.isa {
         BK_ISA_AUTO => None,
         BK_ISA_PORTABLE => Some(Isa::Portable),
@@ -231,6 +240,10 @@ fn options(desc: bk_device_desc) -> Result<DeviceOptions> {
     if let Some(memory) = desc.memory {
         // SAFETY: as above.
         options.memory = Some(Box::new(move |bytes| unsafe { memory(user.get(), bytes) != 0 }));
+    }
+    if !desc.cache_folder.is_null() {
+        // SAFETY: by contract.
+        options.cache_folder = Some(unsafe { text(desc.cache_folder, "cache_folder") }?.into());
     }
     Ok(options)
 }

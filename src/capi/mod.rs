@@ -1,6 +1,6 @@
 //! The C ABI behind `include/bakelite.h`: handles, checks, errors and callbacks, and no algorithms.
 //!
-//! One file per section of the header, in its order: [`error`], [`device`], [`scene`], [`textures`], [`meshes`],
+//! One file per section of the header, in its order: [`error`], [`device`], [`scene`], [`files`], [`textures`], [`meshes`],
 //! [`instances`], [`lights`], [`rays`], [`photons`], [`lightmap`], [`bake`], [`read`], [`live`]. cbindgen makes the
 //! header from exactly these files (`capi-tests/rust/header.rs`); their `//!` heads become the sections'
 //! heads and every public item's documentation becomes the manual, so both are written for the C
@@ -24,6 +24,7 @@ mod shared;
 pub mod bake;
 pub mod device;
 pub mod error;
+pub mod files;
 pub mod instances;
 pub mod lightmap;
 pub mod lights;

@@ -16,27 +16,24 @@
 //! Cost: functions that are not described otherwise take less than a microsecond beside copying
 //! their input.
 
-// The file is long because a section of the header is one file, and a third of it the text for the C reader.
-
-use super::args::{OutStruct, SizedStruct, check_flags, init, read_bool, read_struct, sized_struct, text, write};
+use super::args::{OutStruct, init, read_bool, read_struct, sized_struct, write};
 use super::device::{bk_device, bk_progress_fn, progress, refuse_in_callback};
 use super::error::{bk_result, call, call_or};
 use super::handles::{create, hold, object, release, retain};
 use super::shared::{Reading, Shared};
 use crate::base::error::{Error, Result, invalid_argument};
 use crate::base::memory::{Reservation, try_push};
-use crate::base::progress::Progress;
 use crate::bvh::{BuildOptions, BuildQuality};
 use crate::device::Device;
-use crate::scene::{Scene, SceneData, builtin};
+use crate::scene::{Scene, SceneData};
 use glam::{Affine3A, Vec3};
 use std::collections::BTreeMap;
-use std::ffi::{c_char, c_void};
+use std::ffi::c_void;
 use std::sync::{Arc, Mutex, OnceLock, TryLockError};
 
 /// Handle of a scene, described or committed.
 pub struct bk_scene {
-    device: Arc<Device>,
+    pub(super) device: Arc<Device>,
     /// Set once by the commit.
     committed: OnceLock<Shared<Arc<Scene>>>,
     /// State that changes before and after the commit. Only ever tried, never waited for.
@@ -62,7 +59,7 @@ pub(super) struct Description {
 
 impl Description {
     /// Adds all of another scene.
-    fn append(&mut self, other: SceneData, device: &Device) -> Result<()> {
+    pub(super) fn append(&mut self, other: SceneData, device: &Device) -> Result<()> {
         let reservation = device.memory().reserve(other.bytes(), "the scene's description")?;
         self.data.append(other)?;
         try_push(&mut self.announced, reservation, "the scene's description")
@@ -92,6 +89,25 @@ impl bk_scene {
             let added = add(&mut description.data, read()?)?;
             try_push(&mut description.announced, reservation, "the scene's description")?;
             Ok(added)
+        })
+    }
+
+    /// Becomes the committed scene that `open` makes, if nothing has been described.
+    pub(super) fn open(&self, open: impl FnOnce(&Arc<Device>) -> Result<Arc<Scene>>) -> Result<()> {
+        self.with_description(|slot| {
+            match slot {
+                None => return Err(Error::InvalidState("the scene is committed already".into())),
+                Some(d) if !d.data.is_empty() => {
+                    return Err(Error::InvalidState(
+                        "the scene is not empty: a scene file is opened as a whole".into(),
+                    ));
+                }
+                Some(_) => {}
+            }
+            // Nothing was committed before.
+            let _ = self.committed.set(Shared::new(open(&self.device)?));
+            *slot = None;
+            Ok(())
         })
     }
 
@@ -205,263 +221,6 @@ pub unsafe extern "C" fn bk_scene_release(scene: *mut bk_scene) {
     call_or((), || unsafe {
         release(scene);
         Ok(())
-    })
-}
-
-/// Numbers about a file that was loaded.
-#[repr(C)]
-#[derive(Clone, Copy)]
-pub struct bk_load_info {
-    /// Size of this structure in bytes, set by bk_load_info_init.
-    pub struct_size: u32,
-    /// Number of meshes added.
-    pub meshes: u32,
-    /// Number of the first mesh added; the others follow it.
-    pub first_mesh: u32,
-    /// Number of materials added.
-    pub materials: u32,
-    /// Number of the first material added; the others follow it.
-    pub first_material: u32,
-    /// Number of lights added, emissive materials not counted.
-    pub lights: u32,
-    /// Number of the first light added; the others follow it.
-    pub first_light: u32,
-    /// Number of materials with a reflectance outside [0, 0.98], which was clamped to that range.
-    pub clamped_albedos: u32,
-    /// Number of triangles added, those of every instance counted and degenerate ones included.
-    pub triangles: u64,
-    /// Duration of the call in seconds.
-    pub seconds: f64,
-    /// Number of textures added. An image that cannot be read is left out, with a warning in the
-    /// log.
-    pub textures: u32,
-    /// Number of the first texture added; the others follow it.
-    pub first_texture: u32,
-    /// Number of instances added, of meshes of at least 1,000 triangles that stand in several
-    /// places.
-    pub instances: u32,
-    /// Number of the first instance added; the others follow it.
-    pub first_instance: u32,
-}
-
-sized_struct!(bk_load_info, defaults: bk_load_info {
-    struct_size: size_of::<bk_load_info>() as u32,
-    meshes: 0,
-    first_mesh: 0,
-    materials: 0,
-    first_material: 0,
-    lights: 0,
-    first_light: 0,
-    clamped_albedos: 0,
-    triangles: 0,
-    seconds: 0.0,
-    textures: 0,
-    first_texture: 0,
-    instances: 0,
-    first_instance: 0,
-});
-
-/// Sets `struct_size` and clears the other fields.
-///
-/// @param info  structure to fill in; NULL is ignored
-#[unsafe(no_mangle)]
-pub unsafe extern "C" fn bk_load_info_init(info: *mut bk_load_info) {
-    // SAFETY: the caller's structure, or NULL.
-    unsafe { init(info) }
-}
-
-/// Flag of bk_load_params: files that the scene file names may lie in any folder. Use it for scenes
-/// of trusted authors only: such a scene can find out which files exist, and can show their texels
-/// in its light.
-pub const BK_LOAD_ANY_FOLDER: u32 = 1;
-
-/// Limits of bk_scene_load_file: which files it may read, and how much of them.
-#[repr(C)]
-#[derive(Clone, Copy)]
-pub struct bk_load_params {
-    /// Size of this structure in bytes, set by bk_load_params_init.
-    pub struct_size: u32,
-    /// BK_LOAD_ANY_FOLDER or 0. Default: 0.
-    pub flags: u32,
-    /// Folder in or below which all files must lie that the scene file names (material libraries,
-    /// images, buffers), symbolic links resolved. UTF-8; NULL: the folder of the scene file.
-    /// Default: NULL.
-    pub base_folder: *const c_char,
-    /// Limit in bytes for all decoded images together, 4 per texel, checked before an image is
-    /// decoded. (Decoding takes up to 8 more bytes per texel of the image.) Default: 2 GiB.
-    pub max_texture_bytes: u64,
-    /// Limit in bytes for all files together, the scene file included. Default: 16 GiB.
-    pub max_file_bytes: u64,
-}
-
-#[cfg(feature = "io")]
-fn default_limits() -> [u64; 2] {
-    let options = crate::io::LoadOptions::default();
-    [options.max_texture_bytes, options.max_file_bytes]
-}
-
-#[cfg(not(feature = "io"))]
-fn default_limits() -> [u64; 2] {
-    [0; 2]
-}
-
-sized_struct!(bk_load_params, defaults: {
-    let [max_texture_bytes, max_file_bytes] = default_limits();
-    bk_load_params {
-        struct_size: size_of::<bk_load_params>() as u32,
-        flags: 0,
-        base_folder: std::ptr::null(),
-        max_texture_bytes,
-        max_file_bytes,
-    }
-});
-
-/// Sets `struct_size` and fills in the defaults.
-///
-/// @param params  structure to fill in; NULL is ignored
-#[unsafe(no_mangle)]
-pub unsafe extern "C" fn bk_load_params_init(params: *mut bk_load_params) {
-    // SAFETY: the caller's structure, or NULL.
-    unsafe { init(params) }
-}
-
-/// Loads a scene file and adds its meshes, materials with their textures (PNG and JPEG), and
-/// lights.
-///
-/// Only regular files are read, never devices, FIFOs or sockets. A material library or an image
-/// that cannot be read, or that lies where `params` allows none, is left out with a warning in the
-/// log; a buffer of a glTF file that cannot be read is an error. bk_scene_get_mesh,
-/// bk_scene_get_material, bk_scene_get_texture and bk_scene_get_light read the loaded objects back.
-///
-/// Files from untrusted sources are safe to load, within the limits of `params`: malformed content
-/// gives an error, or is left out with a warning.
-///
-/// Cost: 0.2 (PLY) to 2 s (OBJ) per million triangles, on one thread, and the decoding of images.
-///
-/// @param scene  scene that is not committed
-/// @param path  name of a file that ends in .obj (with its .mtl), .ply, .gltf or .glb; UTF-8
-/// @param params  limits; NULL for the defaults
-/// @param progress,user  progress callback and its pointer; may be NULL
-/// @param out  receives the numbers of the objects added; may be NULL
-/// @retval BK_ERROR_IO  a file cannot be read or is malformed; bk_last_error names it
-/// @retval BK_ERROR_UNSUPPORTED  the kind of file is unknown, the file requires an extension of
-///   glTF that is not supported, or the library was built without files
-/// @retval BK_ERROR_OUT_OF_MEMORY  a limit of `params` is exceeded, the memory callback refuses, or
-///   memory runs out
-/// @retval BK_ERROR_CANCELLED  the progress callback returned 0
-/// @retval BK_ERROR_INVALID_STATE  the scene is committed or another thread is changing it
-#[unsafe(no_mangle)]
-pub unsafe extern "C" fn bk_scene_load_file(
-    scene: *mut bk_scene,
-    path: *const c_char,
-    params: *const bk_load_params,
-    progress: bk_progress_fn,
-    user: *mut c_void,
-    out: *mut bk_load_info,
-) -> bk_result {
-    // SAFETY: path, params and out are the caller's, or NULL.
-    call(|| unsafe {
-        refuse_in_callback()?;
-        let scene = hold(scene, "scene")?;
-        let path = text(path, "path")?;
-        let params = if params.is_null() { bk_load_params::defaults() } else { read_struct(params, "params")? };
-        check_flags(params.flags, BK_LOAD_ANY_FOLDER, "flags")?;
-        scene.device.check_process()?;
-        let base = if params.base_folder.is_null() { None } else { Some(text(params.base_folder, "base_folder")?) };
-        let out = OutStruct::optional(out, "out")?;
-        let progress = self::progress(progress, user);
-        let info = scene.describe("files can be loaded", |d| {
-            let mut loaded = SceneData::new();
-            let info = load_file(&scene.device, &mut loaded, path, &params, base, &progress)?;
-            let first = [
-                d.data.meshes().len(),
-                d.data.materials().len(),
-                d.data.lights().len(),
-                d.data.textures().len(),
-                d.data.instances().len(),
-            ];
-            d.append(loaded, &scene.device)?;
-            let [first_mesh, first_material, first_light, first_texture, first_instance] = first.map(|n| n as u32);
-            Ok(bk_load_info { first_mesh, first_material, first_light, first_texture, first_instance, ..info })
-        })?;
-        if let Some(out) = out {
-            out.write(info);
-        }
-        Ok(())
-    })
-}
-
-#[cfg(feature = "io")]
-fn load_file(
-    device: &Device,
-    data: &mut SceneData,
-    path: &str,
-    params: &bk_load_params,
-    base_folder: Option<&str>,
-    progress: &Progress,
-) -> Result<bk_load_info> {
-    let options = crate::io::LoadOptions {
-        base_folder: base_folder.map(Into::into),
-        any_folder: params.flags & BK_LOAD_ANY_FOLDER != 0,
-        max_file_bytes: params.max_file_bytes,
-        max_texture_bytes: params.max_texture_bytes,
-        memory: device.memory().clone(),
-    };
-    let (first_mesh, first_material) = (data.meshes().len() as u32, data.materials().len() as u32);
-    let (first_light, first_texture) = (data.lights().len() as u32, data.textures().len() as u32);
-    // The thread that called makes the reports meanwhile.
-    let i = device.run(progress, || crate::io::load_with(path.as_ref(), &options, progress, data))?;
-    for warning in &i.warnings {
-        device.log(crate::device::LogLevel::Warning, warning);
-    }
-    Ok(bk_load_info {
-        meshes: i.meshes,
-        first_mesh,
-        materials: i.materials,
-        first_material,
-        lights: i.lights,
-        first_light,
-        clamped_albedos: i.albedos_clamped,
-        triangles: i.triangles,
-        seconds: i.seconds,
-        textures: i.textures,
-        first_texture,
-        instances: i.instances,
-        first_instance: 0,
-        struct_size: 0,
-    })
-}
-
-#[cfg(not(feature = "io"))]
-fn load_file(
-    _: &Device,
-    _: &mut SceneData,
-    path: &str,
-    _: &bk_load_params,
-    _: Option<&str>,
-    _: &Progress,
-) -> Result<bk_load_info> {
-    Err(Error::Unsupported(format!("the library was built without files and cannot read {path}")))
-}
-
-/// Adds a built-in scene with its lights.
-///
-/// Cost: less than 0.1 s.
-///
-/// @param scene  scene that is not committed
-/// @param name  "cornell" (the Cornell box), "furnace" (a closed, glowing cube) or "atrium" (a
-///   two-floor court in the sun)
-/// @retval BK_ERROR_INVALID_ARGUMENT  there is no such scene
-/// @retval BK_ERROR_INVALID_STATE  the scene is committed or another thread is changing it
-/// @retval BK_ERROR_OUT_OF_MEMORY  the memory callback refuses
-#[unsafe(no_mangle)]
-pub unsafe extern "C" fn bk_scene_load_builtin(scene: *mut bk_scene, name: *const c_char) -> bk_result {
-    call(|| {
-        // SAFETY: a handle or NULL. The memory callback may release it.
-        let scene = unsafe { hold(scene, "scene") }?;
-        // SAFETY: name is the caller's, or NULL.
-        let name = unsafe { text(name, "name") }?;
-        scene.describe("scenes can be loaded", |d| d.append(builtin(name)?, &scene.device))
     })
 }
 
@@ -665,7 +424,7 @@ pub struct bk_scene_stats {
     pub bvh_bytes: u64,
     /// Size of the whole committed scene in bytes.
     pub bytes: u64,
-    /// Duration of the build in seconds.
+    /// Duration of the build, or of opening the file, in seconds.
     pub build_seconds: f64,
     /// Surface area heuristic cost of the 8-wide tree of the same meshes in its present shape, a
     /// relative number: 1 for each node and each triangle that a random ray is expected to visit.
@@ -675,6 +434,9 @@ pub struct bk_scene_stats {
     pub refits: u32,
     /// Duration of the last of these calls in seconds; 0 if there was none.
     pub refit_seconds: f64,
+    /// Number of `bytes` that are in a mapped scene file (bk_scene_open) instead of in memory, as far
+    /// as the system does not keep them there because it has room.
+    pub mapped_bytes: u64,
 }
 
 sized_struct!(bk_scene_stats, defaults: stats(&Default::default()));
@@ -692,6 +454,7 @@ fn stats(s: &crate::scene::SceneStats) -> bk_scene_stats {
         wide_sah_cost: s.wide_sah_cost,
         refits: s.refits,
         refit_seconds: s.refit_seconds,
+        mapped_bytes: s.mapped_bytes,
     }
 }
 

@@ -211,6 +211,12 @@ impl SceneData {
         })
     }
 
+    /// Whether nothing has been added.
+    pub fn is_empty(&self) -> bool {
+        let SceneData { meshes, materials, lights, textures, environments, .. } = self;
+        meshes.is_empty() && materials.is_empty() && lights.is_empty() && textures.is_empty() && environments.is_empty()
+    }
+
     /// Size of the arrays of meshes, textures and environments in bytes.
     pub fn bytes(&self) -> usize {
         let textures: usize = self.textures.iter().map(|t| t.bytes()).sum();

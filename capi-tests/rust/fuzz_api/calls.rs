@@ -5,6 +5,7 @@ use crate::world::*;
 use bakelite::capi::bake::*;
 use bakelite::capi::device::*;
 use bakelite::capi::error::*;
+use bakelite::capi::files::*;
 use bakelite::capi::instances::*;
 use bakelite::capi::lightmap::*;
 use bakelite::capi::lights::*;
@@ -37,7 +38,8 @@ pub fn any(w: &W, s: &mut Source) {
     match s.below(100) {
         0 => create_device(w, s),
         1..=4 => create_scene(w, s),
-        5..=6 => load_scene(w, s),
+        5 => load_scene(w, s),
+        6 => scene_files(w, s),
         7..=10 => material(w, s),
         11..=16 => mesh(w, s),
         17 => instances(w, s),
@@ -192,6 +194,36 @@ const FILES: [(&str, &[u8]); 4] = [
     ("a.ply", b"ply\nformat ascii 1.0\nelement vertex 4\nproperty float x\nproperty float y\nproperty float z\nelement face 2\nproperty list uchar int vertex_indices\nend_header\n0 0 0\n1 0 0\n0 1 0\n1 1 0\n3 0 1 2\n3 1 3 2\n"),
     ("a.gltf", br#"{"asset":{"version":"2.0"},"scene":0,"scenes":[{"nodes":[0]}],"nodes":[{"mesh":0}],"meshes":[{"primitives":[{"attributes":{"POSITION":0}}]}],"accessors":[{"bufferView":0,"componentType":5126,"count":3,"type":"VEC3","min":[0,0,0],"max":[1,1,0]}],"bufferViews":[{"buffer":0,"byteLength":36}],"buffers":[{"byteLength":36,"uri":"data:application/octet-stream;base64,AAAAAAAAAAAAAAAAAACAPwAAAAAAAAAAAAAAAAAAgD8AAAAA"}]}"#),
 ];
+
+/// Scenes are saved under a few names, and opened from them and from files with bytes changed.
+fn scene_files(w: &W, s: &mut Source) {
+    let Some(scene) = scene(w, s) else { return };
+    let path = format!("{}/{}.scene", w.folder, s.below(3));
+    let name = c_text(&path);
+    let watched = Watched::new(w, s);
+    if s.one_in(2) {
+        let result = ask!(bk_scene_save(scene.p(), name.as_ptr(), Some(progress), watched.user()));
+        return watched.end("bk_scene_save", result);
+    }
+    let changed = format!("{path}-changed");
+    let name = match std::fs::read(&path) {
+        Ok(mut bytes) if s.one_in(3) && !bytes.is_empty() => {
+            let at = s.below(bytes.len());
+            bytes[at] ^= 1 << s.below(8);
+            // A new file: scenes may have the old one mapped.
+            let _ = std::fs::remove_file(&changed);
+            std::fs::write(&changed, bytes).expect("the temporary folder can be written");
+            c_text(&changed)
+        }
+        _ => name,
+    };
+    let mut params = defaults!(bk_open_params, bk_open_params_init);
+    params.map = if s.one_in(8) { s.integer() } else { s.below(2) as u32 };
+    params.struct_size = if s.one_in(20) { s.integer() } else { params.struct_size };
+    let params = if s.one_in(3) { null() } else { &raw const params };
+    let result = ask!(bk_scene_open(scene.p(), name.as_ptr(), params, Some(progress), watched.user()));
+    watched.end("bk_scene_open", result);
+}
 
 fn material(w: &W, s: &mut Source) {
     let Some(scene) = scene(w, s) else { return };
@@ -1019,6 +1051,8 @@ fn null_handles(s: &mut Source) {
             failed(ask!(bk_scene_create(null_mut(), words.as_mut_ptr().cast())));
             failed(ask!(bk_scene_commit(null_mut(), None, null_mut())));
             failed(ask!(bk_scene_refit(null_mut())));
+            failed(ask!(bk_scene_save(null_mut(), c"x".as_ptr(), None, null_mut())));
+            failed(ask!(bk_scene_open(null_mut(), c"x".as_ptr(), null(), None, null_mut())));
             failed(ask!(bk_scene_bounds(null(), null_mut(), null_mut())));
             failed(ask!(bk_mesh_set_positions(null_mut(), 0, null(), 0, 0)));
             if bk!(bk_scene_mesh_count(null())) + bk!(bk_scene_light_count(null())) > 0 {

@@ -1,13 +1,13 @@
 //! The steps that bakes and reports share: from the arguments to a scene, a light map and its light.
 
-use crate::args::BakeArgs;
+use crate::args::{BakeArgs, is_scene_file};
 use crate::camera;
 use crate::progress_bar::Bars;
 use crate::stages::Stage;
 use bakelite::bvh::BuildOptions;
 use bakelite::device::LogLevel;
 use bakelite::lightmap::{BakeStats, CheckpointParams, Lightmap};
-use bakelite::scene::{Camera, builtin, builtin_camera, is_builtin};
+use bakelite::scene::{Camera, OpenOptions, builtin, builtin_camera, is_builtin};
 use bakelite::{Device, DeviceOptions, Error, Light, Progress, Result, Scene, SceneData};
 use std::path::{Path, PathBuf};
 use std::sync::Arc;
@@ -35,9 +35,40 @@ impl<'a> Job<'a> {
 
     /// The light map of the scene, without light.
     pub fn unbaked(&mut self) -> Result<Lightmap> {
-        let data = self.load()?;
-        let scene = self.commit(data)?;
+        let device = self.device()?;
+        let scene = self.scene_on(&device)?;
         self.layout(&scene)
+    }
+
+    /// The committed scene: opened if it is a file of one, otherwise loaded and committed; saved if that is asked for.
+    pub fn scene_on(&mut self, device: &Arc<Device>) -> Result<Arc<Scene>> {
+        let scene = if is_scene_file(&self.args.scene) {
+            self.open_on(device)?
+        } else {
+            let data = self.load()?;
+            self.commit_on(device, data, &self.args.build)?
+        };
+        if let Some(path) = &self.args.save_scene {
+            let start = Instant::now();
+            self.bars.show("save scene", |p| scene.save(path, p))?;
+            self.files.push(path.clone());
+            self.stage("save scene", start);
+        }
+        Ok(scene)
+    }
+
+    fn open_on(&mut self, device: &Arc<Device>) -> Result<Arc<Scene>> {
+        if !self.args.lights.is_empty() {
+            let name = &self.args.scene;
+            return Err(Error::InvalidArgument(format!(
+                "{name} has the lights that it was saved with; --light adds none"
+            )));
+        }
+        let start = Instant::now();
+        let (path, options) = (Path::new(&self.args.scene), OpenOptions { map: !self.args.read_scene });
+        let scene = self.bars.show("open", |p| Scene::open(device, path, &options, p))?;
+        self.stage("open", start).bytes = scene.stats().bytes;
+        Ok(scene)
     }
 
     /// Reads or makes the scene and adds the lights of the command line.
@@ -82,12 +113,6 @@ impl<'a> Job<'a> {
         Ok(data)
     }
 
-    /// Commits the scene on a device of its own.
-    fn commit(&mut self, data: SceneData) -> Result<Arc<Scene>> {
-        let device = self.device()?;
-        self.commit_on(&device, data, &self.args.build)
-    }
-
     /// Commits the scene and notes what its tree took.
     pub fn commit_on(&mut self, device: &Arc<Device>, data: SceneData, build: &BuildOptions) -> Result<Arc<Scene>> {
         let start = Instant::now();
@@ -109,6 +134,7 @@ impl<'a> Job<'a> {
             isa: self.args.isa,
             log: Some(Box::new(log)),
             memory: None,
+            cache_folder: self.args.cache.clone(),
         })
     }
 
@@ -198,6 +224,19 @@ impl<'a> Job<'a> {
         self.stages.push(Stage { name, seconds: start.elapsed().as_secs_f64(), ..Default::default() });
         &mut self.stages[at]
     }
+}
+
+/// `bakelite commit`: builds a scene's tree and writes both to a file.
+pub fn commit(args: &BakeArgs) -> Result<()> {
+    let (mut job, start) = (Job::new(args), Instant::now());
+    let device = job.device()?;
+    let scene = job.scene_on(&device)?;
+    if !args.quiet {
+        let stats = scene.stats();
+        println!("{}: {} triangles, {} bytes in memory", args.title(), stats.triangles, stats.bytes);
+        print!("{}", crate::stages::table(&job.stages, start.elapsed().as_secs_f64()));
+    }
+    Ok(())
 }
 
 /// The library's error, with its limits called by their flags.

@@ -34,6 +34,7 @@ const USAGE: u8 = 2;
 fn main() -> ExitCode {
     let result = match args::parse(std::env::args_os().skip(1)) {
         Ok(Command::Bake(bake)) => bake::run(&bake),
+        Ok(Command::Commit(args)) => job::commit(&args),
         Ok(Command::ReportCancel(args)) => report::cancel::run(&args),
         Ok(Command::ReportLive(report)) => report::live::run(&report),
         Ok(Command::ReportMemory(args)) => report::memory::run(&args),

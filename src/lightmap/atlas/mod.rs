@@ -17,6 +17,8 @@ pub(crate) mod seen_from;
 pub mod texels;
 pub(crate) mod two_sided;
 mod unwrap;
+#[cfg(feature = "unwrap")]
+mod unwrap_cache;
 mod welded;
 
 use super::{LightmapDesc, LightmapInfo};

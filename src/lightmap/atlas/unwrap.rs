@@ -173,26 +173,36 @@ fn unwrap_part(geometry: &Geometry, _: &Scene, stage: &Stage) -> Result<Vec<Piec
 
 #[cfg(feature = "unwrap")]
 fn unwrap_part(geometry: &Geometry, scene: &Scene, stage: &Stage) -> Result<Vec<Piece>> {
+    use super::unwrap_cache::Entry;
     use crate::base::error::Error;
     use crate::device::LogLevel;
-    let all = try_filled(geometry.triangles.len(), true, CHARTS)?;
+    let (device, numbers) = (scene.device(), &geometry.triangles);
+    let known = Entry::of(device, geometry)?;
+    if let Some(entry) = &known
+        && let Some(pieces) = entry.load(numbers)?
+    {
+        return Ok(pieces);
+    }
     match charts_of_part(geometry, longest_component(geometry, stage)?, stage) {
         Ok((mut pieces, left)) => {
             for piece in planar_pieces(geometry, &left, stage)? {
                 try_push(&mut pieces, piece, CHARTS)?;
             }
+            if let Some(entry) = known {
+                entry.save(&pieces, numbers, device);
+            }
             Ok(pieces)
         }
         Err(uvunwrap::Error::Cancelled) => Err(Error::Cancelled),
         Err(e) => {
-            let (count, first) = (geometry.triangles.len(), geometry.triangles[0]);
-            scene.device().log(
+            let (count, first) = (numbers.len(), numbers[0]);
+            device.log(
                 LogLevel::Warning,
                 &format!(
                     "{count} triangles from triangle {first} on could not be unwrapped and get planar charts: {e}"
                 ),
             );
-            planar_pieces(geometry, &all, stage)
+            planar_pieces(geometry, &try_filled(count, true, CHARTS)?, stage)
         }
     }
 }

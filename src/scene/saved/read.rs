@@ -137,6 +137,12 @@ impl File {
             }
         }
         progress.check()?;
+        // Rays need a page here and a page there. (Systems that read 8 MB around each would read little else where the scene
+        // does not fit into memory.)
+        #[cfg(unix)]
+        if options.map {
+            let _ = map.advise(memmap2::Advice::Random);
+        }
         Ok(File { map: Arc::new(Mapping::new(map)), table, is_mapped: options.map, memory })
     }
 

@@ -315,7 +315,7 @@ fn what_lies_elsewhere_or_twice_is_refused() {
         |_, entries| entries[1].kind = 0,
         |_, entries| entries[1].bytes = u64::MAX,
         |_, entries| entries.last_mut().unwrap().bytes += 4096,
-        |_, entries| drop(entries.remove(2)),
+        |_, entries| _ = entries.remove(2),
         |content, entries| {
             let e = entries.iter().find(|e| e.kind == Kind::Trees as u32).unwrap();
             let at = e.offset as usize + std::mem::offset_of!(SavedTree, nodes);

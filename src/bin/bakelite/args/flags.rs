@@ -33,6 +33,8 @@ const EXAMPLES: &str = "Examples:
 pub enum Verb {
     /// Bakes the light of a scene into light maps
     Bake(Box<Flags>),
+    /// Builds a scene's tree and writes both to --save-scene, to be given as SCENE then
+    Commit(Box<Flags>),
     /// Measures instead, and writes tables, plots and CSV
     #[command(subcommand)]
     Report(Report),
@@ -63,7 +65,7 @@ impl Verb {
     /// The flags that all commands have.
     pub fn flags(&mut self) -> &mut Flags {
         match self {
-            Verb::Bake(flags) => flags,
+            Verb::Bake(flags) | Verb::Commit(flags) => flags,
             Verb::Report(report) => match report {
                 Report::Cancel(flags) | Report::Memory(flags) | Report::Pipeline(flags) | Report::Stability(flags) => {
                     flags
@@ -192,7 +194,7 @@ pub struct DirectionalFlags {
 // Flags of all commands. (A doc comment would be what the commands are about.)
 #[derive(Args)]
 pub struct Flags {
-    /// A file (.obj, .ply, .gltf, .glb) or a built-in scene (atrium, cornell, furnace; to measure massive scenes
+    /// A file (.obj, .ply, .gltf, .glb; .bkscene: see --save-scene) or a built-in scene (atrium, cornell, furnace; to measure massive scenes
     /// hall:TRIANGLES, colonnade:TRIANGLES and menger:LEVEL) [default: atrium]
     #[arg(value_parser = values::scene)]
     pub scene: Option<String>,
@@ -232,6 +234,13 @@ pub struct FileFlags {
     /// Most MiB of all its files
     #[arg(long, value_name = "N", default_value_t = 16 << 10)]
     pub max_file_mb: u64,
+    /// Write the scene with its lights and its tree to FILE.bkscene, which is mapped instead of built when it is given as
+    /// SCENE
+    #[arg(long, value_name = "FILE", value_parser = values::scene_file)]
+    pub save_scene: Option<PathBuf>,
+    /// Read SCENE.bkscene to memory instead of mapping it
+    #[arg(long)]
+    pub read_scene: bool,
 }
 
 const LIGHTS: &str = "A light, added to those of the scene; may be repeated
@@ -271,6 +280,9 @@ pub struct LightmapFlags {
     /// Charts and texels from this file; if it does not exist, they are found and written to it
     #[arg(long, value_name = "FILE")]
     pub layout: Option<PathBuf>,
+    /// Keep unwraps in DIR by their content, so that parts that have not changed are not unwrapped again
+    #[arg(long, value_name = "DIR")]
+    pub cache: Option<PathBuf>,
     /// Light map texels per gather map texel and axis
     #[arg(long, value_name = "N", default_value_t = LightmapDesc::default().gather_divisor,
           value_parser = of(|d: &mut LightmapDesc, v| d.gather_divisor = v))]

@@ -24,11 +24,12 @@ use flags::{CommandLine, Flags, Report, Verb};
 use glam::Vec3;
 use std::ffi::OsString;
 use std::path::{Path, PathBuf};
-pub use values::GivenLight;
+pub use values::{GivenLight, is_scene_file};
 
 /// What to do.
 pub enum Command {
     Bake(Box<BakeArgs>),
+    Commit(Box<BakeArgs>),
     ReportCancel(Box<BakeArgs>),
     ReportDirectional(Box<ReportArgs>),
     ReportLive(Box<ReportArgs>),
@@ -104,9 +105,12 @@ pub struct BakeArgs {
     pub any_folder: bool,
     pub max_texture_mb: u64,
     pub max_file_mb: u64,
+    pub save_scene: Option<PathBuf>,
+    pub read_scene: bool,
     pub lights: Vec<GivenLight>,
     pub desc: LightmapDesc,
     pub layout: Option<PathBuf>,
+    pub cache: Option<PathBuf>,
     pub params: BakeParams,
     pub build: BuildOptions,
     pub threads: usize,
@@ -270,6 +274,12 @@ fn command_of(line: CommandLine) -> Result<Command, String> {
     let boxed = |flags: Box<Flags>| bake_args(*flags).map(Box::new);
     Ok(match line.verb {
         Verb::Bake(flags) => Command::Bake(boxed(flags)?),
+        Verb::Commit(flags) => {
+            if flags.file.save_scene.is_none() {
+                return Err("--save-scene is missing: where the scene is written to".into());
+            }
+            Command::Commit(boxed(flags)?)
+        }
         Verb::Report(Report::Cancel(flags)) => Command::ReportCancel(boxed(flags)?),
         Verb::Report(Report::Memory(flags)) => Command::ReportMemory(boxed(flags)?),
         Verb::Report(Report::Pipeline(flags)) => Command::ReportPipeline(boxed(flags)?),
@@ -434,9 +444,12 @@ fn bake_args(f: Flags) -> Result<BakeArgs, String> {
         any_folder: f.file.any_folder,
         max_texture_mb: f.file.max_texture_mb,
         max_file_mb: f.file.max_file_mb,
+        save_scene: f.file.save_scene,
+        read_scene: f.file.read_scene,
         lights: f.lights.light,
         desc,
         layout: f.lightmap.layout,
+        cache: f.lightmap.cache,
         params,
         build,
         threads: f.machine.threads,

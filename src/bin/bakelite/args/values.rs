@@ -99,6 +99,16 @@ pub fn is_scene(value: &str) -> bool {
     is_builtin(value) || value.contains(['.', '/', '\\']) || Path::new(value).exists()
 }
 
+/// A file that holds a committed scene.
+pub fn scene_file(value: &str) -> Result<PathBuf, String> {
+    if is_scene_file(value) { Ok(value.into()) } else { Err("its name does not end in .bkscene".into()) }
+}
+
+/// Whether this is the name of a file that holds a committed scene.
+pub fn is_scene_file(name: &str) -> bool {
+    Path::new(name).extension().is_some_and(|e| e.eq_ignore_ascii_case("bkscene"))
+}
+
 /// Which part of the texels, counted from 0, and of how many.
 pub fn shard(value: &str) -> Result<[u64; 2], String> {
     let parts: Option<(u64, u64)> = value.split_once('/').and_then(|(i, n)| Some((i.parse().ok()?, n.parse().ok()?)));

@@ -134,7 +134,7 @@ impl<'a> Lab<'a> {
             }
         };
         let options =
-            DeviceOptions { num_threads: args.threads, isa: args.isa, log: Some(Box::new(log)), memory: None };
+            DeviceOptions { num_threads: args.threads, isa: args.isa, log: Some(Box::new(log)), ..Default::default() };
         Ok(Lab { args, device: Device::new(options)?, quick, warnings })
     }
 

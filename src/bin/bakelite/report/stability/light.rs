@@ -267,7 +267,7 @@ fn light_in_solid(lab: &Lab, rows: &mut Vec<Row>) -> Result<()> {
 
 /// Light beyond what half floats hold is clamped to 65504 when read as such, by way of the C API.
 fn half_floats(lab: &Lab, rows: &mut Vec<Row>) -> Result<()> {
-    use bakelite::capi::{bake, device, lightmap, lights, read, scene};
+    use bakelite::capi::{bake, device, files, lightmap, lights, read, scene};
     let radiances: Vec<f32> = lab.some(&[1e-9, 1.0, 1e6, 1e12]);
     for radiance in radiances {
         let (mut d, mut s, mut l) = (std::ptr::null_mut(), std::ptr::null_mut(), std::ptr::null_mut());
@@ -288,7 +288,7 @@ fn half_floats(lab: &Lab, rows: &mut Vec<Row>) -> Result<()> {
             let results = [
                 device::bk_device_create(std::ptr::null(), &mut d),
                 scene::bk_scene_create(d, &mut s),
-                scene::bk_scene_load_builtin(s, c"cornell".as_ptr()),
+                files::bk_scene_load_builtin(s, c"cornell".as_ptr()),
                 lights::bk_scene_set_light(s, 0, &light),
                 scene::bk_scene_commit(s, None, std::ptr::null_mut()),
                 lightmap::bk_lightmap_create(s, &desc, None, std::ptr::null_mut(), &mut l),
