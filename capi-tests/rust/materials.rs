@@ -39,7 +39,7 @@ fn sheet(corner: Vec3, edge_u: Vec3, edge_v: Vec3, repeats: f32, material: u32) 
     Mesh {
         positions: places.iter().map(|p| corner + edge_u * p.x + edge_v * p.y).collect(),
         uvs: places.iter().map(|p| *p * repeats).collect(),
-        indices: vec![[0, 1, 2], [0, 2, 3]],
+        indices: vec![[0, 1, 2], [0, 2, 3]].into(),
         materials: MeshMaterials::One(material),
         ..Default::default()
     }
@@ -150,7 +150,7 @@ fn a_chequered_floor_colors_the_walls_as_in_the_path_tracer() {
                 other.add_material(*m).unwrap();
             }
             for mesh in data.meshes() {
-                other.add_mesh(Mesh { uvs: Vec::new(), ..mesh.clone() }).unwrap();
+                other.add_mesh(Mesh { uvs: Vec::new().into(), ..mesh.clone() }).unwrap();
             }
             lamp(&mut other, Vec3::new(0.8, 1.1, 1.1));
             data = other;

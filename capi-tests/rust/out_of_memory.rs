@@ -13,7 +13,7 @@ use bakelite::io::{LoadOptions, load_with};
 use bakelite::lightmap::{BakeParams, CheckpointParams, Layer, LayerData, Lightmap, LightmapDesc};
 use bakelite::live::{Budget, Live, LiveCamera, LiveParams, Mode, PageRect};
 use bakelite::photon::{PhotonMap, PhotonParams};
-use bakelite::scene::{LightmapUvs, MeshMaterials};
+use bakelite::scene::{LightmapUvs, MeshMaterials, OpenOptions};
 use bakelite::trace::Ray;
 use bakelite::{Device, DeviceOptions, Error, Light, Material, Mesh, Progress, Result, Scene, SceneData};
 use glam::{Vec2, Vec3};
@@ -218,6 +218,7 @@ fn every_large_allocation_and_every_request_may_fail_and_nothing_is_lost() {
             });
             assert_eq!(committed.stats().triangles, 2 * (SIDE * SIDE) as u64 + 2);
             refit(committed.clone(), &format!("refit, {quality:?}, compact: {compact}"));
+            scene_file(&committed, &folder.join("ground.bkscene"));
             scene.get_or_insert(committed);
         }
     }
@@ -497,6 +498,17 @@ fn load(device: &Device, path: &Path) {
         assert_eq!(read.meshes().iter().map(|m| m.indices.len()).sum::<usize>(), mesh.indices.len());
         Ok(())
     });
+}
+
+/// Saves the scene, which takes no memory to speak of, and opens it, mapped and read, which is announced and takes none from
+/// `malloc`.
+fn scene_file(scene: &Scene, path: &Path) {
+    scene.save(path, &Progress::none()).unwrap();
+    for map in [true, false] {
+        let open = || Scene::open(scene.device(), path, &OpenOptions { map }, &Progress::none());
+        let opened = fail_each("open a scene, monitor", &REQUESTS_LEFT, open);
+        assert_eq!(opened.stats().triangles, scene.stats().triangles);
+    }
 }
 
 /// Refits of a scene and of a copy of it, which others hold.

@@ -4,8 +4,8 @@
  *     mpicc -O2 bake_mpi.c -lbakelite -lm -o bake_mpi
  *     mpirun -n 4 --enable-recovery bake_mpi FOLDER SCENE [TEXELS_PER_UNIT [THREADS]]
  *
- * FOLDER is one that all ranks see; SCENE is a built-in scene or a file, which gets a sun. Rank 0 unwraps and writes the
- * layout; the others load it. Each rank writes the light of its texels to FOLDER/part-K-of-N.light. When all are there,
+ * FOLDER is one that all ranks see; SCENE is a built-in scene or a file, which gets a sun. Rank 0 builds and unwraps the
+ * scene, and writes scene and layout; the others map and load them (ranks of one machine share the memory of the scene). Each rank writes the light of its texels to FOLDER/part-K-of-N.light. When all are there,
  * rank 0 writes pages to FOLDER/page...exr, which have the bits of a bake on one machine.
  *
  * Parts that are in the folder are not baked again: started anew after an interruption, the bake goes on with what is
@@ -124,6 +124,15 @@ static bk_scene *load(bk_device *device, const char *name)
     return scene;
 }
 
+/* The scene that rank 0 has written. */
+static bk_scene *open_scene(bk_device *device, const char *name)
+{
+    bk_scene *scene = NULL;
+    check(bk_scene_create(device, &scene), "scene");
+    check(bk_scene_open(scene, name, NULL, progress, NULL), "scene");
+    return scene;
+}
+
 int main(int argc, char **argv)
 {
     bk_device_desc desc;
@@ -131,7 +140,7 @@ int main(int argc, char **argv)
     bk_device *device = NULL;
     bk_scene *scene = NULL;
     bk_lightmap *map = NULL;
-    char name[4096];
+    char name[4096], scene_name[4096];
     int *cells = NULL, lost = 0, part, provided;
     MPI_Init_thread(&argc, &argv, MPI_THREAD_FUNNELED, &provided);
     MPI_Comm_rank(MPI_COMM_WORLD, &rank);
@@ -155,11 +164,15 @@ int main(int argc, char **argv)
     bk_device_desc_init(&desc);
     desc.num_threads = argc > 4 ? (uint32_t)atoi(argv[4]) : 0;
     check(bk_device_create(&desc, &device), "device");
-    scene = load(device, argv[2]);
     bk_lightmap_desc_init(&layout);
     layout.texels_per_unit = argc > 3 ? (float)atof(argv[3]) : 0.0f;
     snprintf(name, sizeof name, "%s/layout.bklay", argv[1]);
+    snprintf(scene_name, sizeof scene_name, "%s/scene.bkscene", argv[1]);
     if (rank == 0) {
+        scene = load(device, argv[2]);
+        if (size > 1) {
+            check(bk_scene_save(scene, scene_name, progress, NULL), "scene file");
+        }
         if (bk_lightmap_load_layout(scene, &layout, name, progress, NULL, &map) != BK_OK) {
             check(bk_lightmap_create(scene, &layout, progress, NULL, &map), "light map");
             check(bk_lightmap_save_layout(map, name, progress, NULL), "layout");
@@ -167,6 +180,7 @@ int main(int argc, char **argv)
         tell(STATE, LAID_OUT);
     } else {
         wait_for(0, LAID_OUT);
+        scene = open_scene(device, scene_name);
         check(bk_lightmap_load_layout(scene, &layout, name, progress, NULL, &map), "layout");
     }
 

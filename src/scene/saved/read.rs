@@ -8,7 +8,7 @@ use crate::base::array::{Array, Mapping};
 use crate::base::error::{Error, Result};
 use crate::base::files;
 use crate::base::geometry::NONE;
-use crate::base::memory::{Reservation, prefer_large_pages, try_collect, try_to_vec};
+use crate::base::memory::{Reservation, prefer_large_pages, try_collect, try_to_vec, try_with_capacity};
 use crate::base::progress::Progress;
 use crate::bvh::instances::MeshTree;
 use crate::bvh::{BuildOptions, Compact, Mbvh, Tree};
@@ -186,7 +186,7 @@ impl File {
         let own = trees.next().filter(|t| t.mesh == NONE).ok_or_else(missing)?;
         let ranges = &first_triangle[..=data.meshes.len()];
         let (tree, skipped) = arrays.next(own, ranges).map_err(what)?.ok_or_else(missing)?;
-        let mut of_meshes = Vec::new();
+        let mut of_meshes = try_with_capacity(instance_trees::instanced(&data).count(), FILE)?;
         for mesh in instance_trees::instanced(&data) {
             let saved = trees.next().filter(|t| t.mesh == mesh).ok_or_else(missing)?;
             let range = [0, data.meshes[mesh as usize].indices.len() as u32];
@@ -274,47 +274,68 @@ impl File {
     }
 
     fn meshes(&self, data: &mut SceneData) -> Result<Option<()>> {
-        let read = || {
-            let mut positions = self.section::<Vec3>(Kind::Positions)?;
-            let mut indices = self.section::<[u32; 3]>(Kind::Indices)?;
-            let mut normals = self.section::<Vec3>(Kind::Normals)?;
-            let mut uvs = self.section::<Vec2>(Kind::Uvs)?;
-            let mut lightmap_uvs = self.section::<Vec2>(Kind::LightmapUvs)?;
-            let mut pages = self.section::<u32>(Kind::LightmapPages)?;
-            let mut materials = self.section::<u32>(Kind::TriangleMaterials)?;
-            let mut mesh = |m: &SavedMesh| {
-                let has = |flag: u32, count: u64| if m.flags & flag != 0 { count } else { 0 };
-                Some(Mesh {
-                    positions: positions.take(m.vertices)?,
-                    indices: indices.take(m.triangles)?,
-                    normals: normals.take(has(HAS_NORMALS, m.vertices))?,
-                    uvs: uvs.take(has(HAS_UVS, m.vertices))?,
-                    lightmap: match m.flags & HAS_LIGHTMAP_UVS {
-                        0 => None,
-                        _ => Some(LightmapUvs {
-                            uvs: lightmap_uvs.take(m.vertices)?,
-                            pages: pages.take(has(HAS_LIGHTMAP_PAGES, m.triangles))?,
-                        }),
-                    },
-                    materials: match m.flags & HAS_TRIANGLE_MATERIALS {
-                        0 => MeshMaterials::One(m.material),
-                        _ => MeshMaterials::PerTriangle(materials.take(m.triangles)?),
-                    },
-                    // Vertices may have left their places since they were checked.
-                    strict: false,
-                })
-            };
-            let meshes = self.records::<SavedMesh>(Kind::Meshes)?;
-            let all: Option<Vec<_>> = meshes.iter().map(|m| Some((mesh(m)?, m.flags & IS_STRICT != 0))).collect();
-            let left = [positions.left, indices.left, normals.left, uvs.left, lightmap_uvs.left, pages.left];
-            all.filter(|_| left == [0; 6] && materials.left == 0)
+        let sections = || {
+            Some(Meshes {
+                meshes: self.records(Kind::Meshes)?,
+                positions: self.section(Kind::Positions)?,
+                indices: self.section(Kind::Indices)?,
+                normals: self.section(Kind::Normals)?,
+                uvs: self.section(Kind::Uvs)?,
+                lightmap_uvs: self.section(Kind::LightmapUvs)?,
+                pages: self.section(Kind::LightmapPages)?,
+                materials: self.section(Kind::TriangleMaterials)?,
+            })
         };
-        let Some(meshes) = read() else { return Ok(None) };
-        for (mesh, strict) in meshes {
+        let Some(mut sections) = sections() else { return Ok(None) };
+        for m in std::mem::take(&mut sections.meshes).iter() {
+            let Some(mesh) = sections.next(m) else { return Ok(None) };
             let number = data.add_mesh(mesh)?;
-            data.meshes[number as usize].strict = strict;
+            data.meshes[number as usize].strict = m.flags & IS_STRICT != 0;
         }
-        Ok(Some(()))
+        Ok(sections.are_used_up().then_some(()))
+    }
+}
+
+/// What is left of the sections of meshes.
+struct Meshes<'a> {
+    meshes: Array<SavedMesh>,
+    positions: Section<'a, Vec3>,
+    indices: Section<'a, [u32; 3]>,
+    normals: Section<'a, Vec3>,
+    uvs: Section<'a, Vec2>,
+    lightmap_uvs: Section<'a, Vec2>,
+    pages: Section<'a, u32>,
+    materials: Section<'a, u32>,
+}
+
+impl Meshes<'_> {
+    /// Takes the next mesh; `None` if there is not so much left.
+    fn next(&mut self, m: &SavedMesh) -> Option<Mesh> {
+        let has = |flag: u32, count: u64| if m.flags & flag != 0 { count } else { 0 };
+        Some(Mesh {
+            positions: self.positions.take(m.vertices)?,
+            indices: self.indices.take(m.triangles)?,
+            normals: self.normals.take(has(HAS_NORMALS, m.vertices))?,
+            uvs: self.uvs.take(has(HAS_UVS, m.vertices))?,
+            lightmap: match m.flags & HAS_LIGHTMAP_UVS {
+                0 => None,
+                _ => Some(LightmapUvs {
+                    uvs: self.lightmap_uvs.take(m.vertices)?,
+                    pages: self.pages.take(has(HAS_LIGHTMAP_PAGES, m.triangles))?,
+                }),
+            },
+            materials: match m.flags & HAS_TRIANGLE_MATERIALS {
+                0 => MeshMaterials::One(m.material),
+                _ => MeshMaterials::PerTriangle(self.materials.take(m.triangles)?),
+            },
+            // Vertices may have left their places since they were checked.
+            strict: false,
+        })
+    }
+
+    fn are_used_up(&self) -> bool {
+        let of_vertices = [self.positions.left, self.normals.left, self.uvs.left, self.lightmap_uvs.left];
+        of_vertices == [0; 4] && [self.indices.left, self.pages.left, self.materials.left] == [0; 3]
     }
 }
 
