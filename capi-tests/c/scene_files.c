@@ -186,6 +186,9 @@ static void what_is_refused(void) {
     CHECK_ERROR(bk_scene_open(scene, file_name, NULL, NULL, NULL), STATE, "not empty");
     CHECK_OK(bk_scene_commit(scene, NULL, NULL));
     CHECK_ERROR(bk_scene_save(scene, "/nowhere/at/all", NULL, NULL), IO, "/nowhere/at/all");
+#ifdef __linux__
+    CHECK_ERROR(bk_scene_save(scene, "/dev/full", NULL, NULL), IO, "/dev/full");
+#endif
     bk_scene_release(scene);
     bk_device_release(device);
     bk_device_desc_init(&desc);
