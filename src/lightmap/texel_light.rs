@@ -84,7 +84,7 @@ impl<M: Map> TexelAreas<'_, M> {
     }
 
     /// Returns the texels [around](AROUND) a texel in the same placement, where there are any.
-    fn neighbours(&self, texel: TexelId<M>) -> impl Iterator<Item = Option<TexelId<M>>> {
+    pub(crate) fn neighbours(&self, texel: TexelId<M>) -> impl Iterator<Item = Option<TexelId<M>>> {
         let placement = self.map.placement_of(self.charts, texel);
         let (x, y) = self.map.position(texel);
         let own = self.map.texels_of(placement);
@@ -211,6 +211,32 @@ impl TilePoints {
         *rays += self.rays_up.len() as u64;
         for (&place, hit) in self.pending.iter().zip(&self.hits_up) {
             self.points[place as usize].may_be_buried = is_back(scene, hit);
+        }
+    }
+
+    /// Computes direct light at receivers with seeds of their own, at most [`MAX_POINTS`] times as many as there is room
+    /// for texels. `out` gets the light of each, and that by direction as far as there is room for it.
+    pub(crate) fn light_at(
+        &mut self,
+        direct: &DirectLight,
+        scene: &Scene,
+        samples: u32,
+        receivers: impl Iterator<Item = (Receiver, u32)>,
+        rays: &mut u64,
+        mut out: impl FnMut(&PointLight, Option<&[Directional; KINDS]>),
+    ) {
+        let mut shadow = self.room.begin(scene);
+        let mut count = 0;
+        for (receiver, seed) in receivers {
+            shadow.slot = KINDS * count;
+            self.points[count].light = direct.push(&receiver, 0, Lights::All, samples, seed, &mut shadow);
+            count += 1;
+        }
+        let (arrived, directed) = shadow.finish_by_direction(rays);
+        let mut directed = directed.as_chunks().0.iter();
+        for (point, sums) in self.points[..count].iter_mut().zip(arrived.chunks_exact(KINDS)) {
+            point.light.take(sums);
+            out(&point.light, directed.next());
         }
     }
 

@@ -2,13 +2,16 @@
 
 use super::batch::{Background, Batch};
 use super::choose::Choice;
-use super::work::Limit;
+use super::limit::Limit;
 use super::{Live, LiveCamera, LiveStats};
 use crate::base::error::Result;
 use std::time::Duration;
 
 /// Maximum number of blocks that are worked on between two updates.
 const BACKGROUND_BLOCKS: usize = 256;
+
+/// Number of texels whose rays are traced together between two updates: the next update waits for these.
+const TOGETHER: usize = 16;
 
 impl Live {
     /// Lets the thread pool continue with the blocks that the camera saw last.
@@ -30,7 +33,7 @@ impl Live {
         }
         self.reserve_for(&chosen)?;
         let most_rays = Some(self.params.rays_per_update as u64).filter(|&r| r > 0).unwrap_or(u64::MAX);
-        let limit = Limit::new(None, most_rays);
+        let limit = Limit::new(None, most_rays, TOGETHER);
         let batch = Batch::new(self.context.clone(), &mut self.blocks, &chosen, step, limit, Duration::ZERO)?;
         self.background = Some(Background::start(batch, &self.device()));
         Ok(())

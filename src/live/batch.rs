@@ -2,14 +2,15 @@
 //! into the batch and taken back from it, so that nothing is locked that anybody else reads.
 
 use super::blocks::{Block, Blocks};
-use super::work::{Context, Done, Limit, Step};
+use super::limit::Limit;
+use super::work::{Context, Done, Step};
 use crate::base::error::{Error, Result};
 use crate::base::memory::try_with_capacity;
 use crate::device::Device;
 use std::panic::{AssertUnwindSafe, catch_unwind};
 use std::sync::atomic::{AtomicBool, AtomicUsize, Ordering::Relaxed};
 use std::sync::{Arc, Condvar, Mutex, MutexGuard};
-use std::time::{Duration, Instant};
+use std::time::Duration;
 
 /// A block while it is in a batch.
 pub(super) struct Item {
@@ -80,14 +81,15 @@ impl Batch {
     fn work(&self) {
         // A panic must not cross into the pool, where it would abort.
         let result = catch_unwind(AssertUnwindSafe(|| {
+            let Some(mut room) = self.limit.granted(self.context.room()) else { return };
             while let Some(item) = self.items.get(self.next.fetch_add(1, Relaxed)) {
                 let showing = self.showing * self.completed.load(Relaxed) as u32;
-                if self.limit.reached() || self.limit.deadline.is_some_and(|d| Instant::now() + showing >= d) {
+                if self.limit.reached_after(showing) {
                     break;
                 }
                 let mut item = item.lock().unwrap_or_else(|e| e.into_inner());
                 let tile = &self.context.map.tiles[item.number as usize];
-                item.done = item.block.work(&self.context, tile, self.step, &self.limit);
+                item.done = item.block.work(&self.context, tile, self.step, &mut room, &self.limit);
                 self.completed.fetch_add(item.done.any() as usize, Relaxed);
             }
         }));
@@ -102,7 +104,7 @@ impl Batch {
         } else {
             self.limit.check_memory()
         };
-        (self.items, self.limit.traced.into_inner(), result)
+        (self.items, self.limit.traced(), result)
     }
 }
 
@@ -145,11 +147,11 @@ impl Background {
     }
 
     /// Stops the work and takes the blocks back. Waits for threads that are at work, each of which finishes its current
-    /// texel, and calls no callback meanwhile; afterwards no thread holds a reference to the batch.
+    /// texels, and calls no callback meanwhile; afterwards no thread holds a reference to the batch.
     pub fn finish(self) -> Outcome {
         let mut inside = self.door.inside();
         let Some(batch) = inside.batch.take() else { return (Vec::new(), 0, Ok(())) };
-        batch.limit.stopped.store(true, Relaxed);
+        batch.limit.stop();
         while inside.active > 0 {
             inside = self.door.idle.wait(inside).unwrap_or_else(|e| e.into_inner());
         }

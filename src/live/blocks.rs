@@ -216,9 +216,12 @@ impl Blocks {
         self.status.len()
     }
 
-    /// Iterates over all blocks, for threads that work on them in place.
-    pub fn par_iter_mut(&mut self) -> impl IndexedParallelIterator<Item = (&mut BlockStatus, &mut Option<BlockWork>)> {
-        self.status.par_iter_mut().zip(&mut self.work)
+    /// Iterates over all blocks, so many at a time, for threads that work on them in place.
+    pub fn par_chunks_mut(
+        &mut self,
+        size: usize,
+    ) -> impl IndexedParallelIterator<Item = (&mut [BlockStatus], &mut [Option<BlockWork>])> {
+        self.status.par_chunks_mut(size).zip(self.work.par_chunks_mut(size))
     }
 
     /// Progress of the blocks, by number.

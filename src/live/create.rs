@@ -5,10 +5,12 @@ use super::cells::{Grid, Promotion};
 use super::choose::Chooser;
 use super::dirty::Dirty;
 use super::display::Display;
+use super::limit::Limit;
 use super::readback::{ChartBins, ReadingTime};
 use super::relight::{Illumination, Relight};
+use super::room::{Room, Rooms};
 use super::visibility::Visibility;
-use super::work::{Context, Limit};
+use super::work::Context;
 use super::{Live, LiveParams, in_parts};
 use crate::base::error::{Error, Result};
 use crate::base::memory::{try_vec, try_with_capacity};
@@ -25,6 +27,9 @@ use std::sync::Arc;
 
 /// Light below this part of the scene's mean counts as dark.
 const DIM: f32 = 0.02;
+
+/// Number of blocks whose lowest LOD is computed together.
+const TOGETHER: usize = 16;
 
 impl Live {
     /// Computes the lowest LOD of all texels, under the scene's current lights. `lightmap` need not be baked and is not
@@ -108,6 +113,7 @@ impl Live {
                 dim: 0.0,
                 promote_threshold: params.promote_threshold,
                 max_rounds: params.max_rounds,
+                rooms: Arc::new(Rooms::new()),
                 light: Arc::new(light),
             },
             lights,
@@ -124,28 +130,41 @@ impl Live {
     /// Computes the lowest LOD everywhere. It must be called in the pool.
     pub(super) fn start(&mut self, progress: &Progress) -> Result<()> {
         let stage = progress.stage("lowest LOD", 0.5, 0.9, self.blocks.len() as u64);
-        let limit = Limit::new(None, u64::MAX);
+        let (limit, top) = (Limit::new(None, u64::MAX, Room::TEXELS), self.context.map.top());
         let context = self.context.clone();
-        let top = context.map.top();
-        one_by_one(self.blocks.par_iter_mut().zip(&context.map.tiles)).try_for_each(|((status, home), tile)| {
-            if !tile.texels.is_empty()
-                && let Some(work) = home.take()
-            {
-                let mut block = Block { status: *status, work };
-                block.work_on_coarse(&context, tile, &limit);
-                block.work_on_indirect(&context, tile, &limit);
+        let blocks = self.blocks.par_chunks_mut(TOGETHER).zip(context.map.tiles.par_chunks(TOGETHER));
+        one_by_one(blocks).try_for_each(|((status, homes), tiles)| {
+            let mut room = context.room()?;
+            let mut blocks = try_with_capacity(tiles.len(), "blocks to be worked on")?;
+            for ((status, home), tile) in status.iter().zip(&mut *homes).zip(tiles) {
+                if !tile.texels.is_empty()
+                    && let Some(work) = home.take()
+                {
+                    blocks.push((Block { status: *status, work }, tile));
+                }
+            }
+            Block::coarse_of_all(&context, &mut blocks, &mut room, &limit);
+            Block::first_indirect(&context, &mut blocks, &mut room, &limit);
+            for (block, tile) in &mut blocks {
                 // One or two texels that lie hidden inside something, or against it, are no evidence about the others.
                 while block.status.lod < top
                     && tile.lod_end[block.status.lod as usize] <= 2
                     && !block.work.sees_light()
-                    && block.work_on_indirect(&context, tile, &limit)
+                    && block.work_on_indirect(&context, tile, &mut room, &limit)
                 {}
-                (*status, *home) = (block.status, Some(block.work));
+            }
+            let mut blocks = blocks.into_iter();
+            for ((status, home), tile) in status.iter_mut().zip(homes).zip(tiles) {
+                if !tile.texels.is_empty()
+                    && let Some((block, _)) = blocks.next()
+                {
+                    (*status, *home) = (block.status, Some(block.work));
+                }
             }
             limit.check_memory()?;
-            stage.advance(1)
+            stage.advance(tiles.len() as u64)
         })?;
-        self.total_rays += limit.traced.into_inner();
+        self.total_rays += limit.traced();
         let sum: f64 = self.blocks.status().iter().map(|b| (b.mean + b.direct_mean) as f64).sum();
         self.context.dim = DIM * (sum / self.blocks.len() as f64) as f32;
         self.held = self.blocks.bytes() as isize;

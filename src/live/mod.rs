@@ -19,15 +19,18 @@ mod choose;
 mod create;
 mod dirty;
 mod display;
+mod limit;
 mod lists;
 mod params;
 mod readback;
 mod relight;
+mod room;
 mod save;
 mod show;
 mod shown_layer;
 mod visibility;
 mod work;
+mod work_on_direct;
 
 pub use blocks::MAX_LODS;
 pub use cells::{CellInfo, NO_LOD};
@@ -44,13 +47,15 @@ use cells::{Grid, Promotion};
 use choose::{Choice, Chooser};
 use dirty::Dirty;
 use display::Display;
+use limit::Limit;
 use readback::{ChartBins, ReadingTime};
 use relight::Relight;
+use room::Room;
 use std::collections::VecDeque;
 use std::sync::{Arc, Mutex};
 use std::time::{Duration, Instant};
 use visibility::Visibility;
-use work::{Context, Limit, Step};
+use work::{Context, Step};
 
 /// Number of blocks that one pass of an update works on. With more, their light would be shown later; with fewer,
 /// threads would be without work at the end of a pass.
@@ -196,7 +201,7 @@ impl Live {
             }
             let spare = Duration::from_secs_f64(seconds * SPARE);
             let deadline = end.map(|e| e.checked_sub(spare).unwrap_or(e));
-            traced += self.work_on(&chosen, step, Limit::new(deadline, most_rays - traced), stats)?;
+            traced += self.work_on(&chosen, step, Limit::new(deadline, most_rays - traced, Room::TEXELS), stats)?;
         }
         self.show_waiting(end, stats);
         Ok(())

@@ -6,7 +6,7 @@
 
 use super::blocks::{Block, BlockStatus, BlockWork, Blocks, DirectTile, Tile};
 use super::display::Display;
-use super::work::owns;
+use super::work_on_direct::owns;
 use super::{Live, in_parts};
 use crate::base::directional::Directional;
 use crate::base::error::{Error, Result, invalid_argument};

@@ -1,31 +1,28 @@
 //! Work on one block, in steps: coarse direct light; a few rays of indirect light if that is of an earlier epoch; then
 //! whichever reduces more error per ray: direct light at full resolution, the texels of the next LOD, or another round
-//! of 64 rays for all. Work can stop after any texel and continue later; the sums of a texel depend on its number of
-//! rounds alone, so they have the bits of a bake with as many rays.
+//! of 64 rays for all. Rays of texels that follow one another are traced together, a few texels or many by the time that
+//! is left, and work can stop after any of them and continue later; the sums of a texel depend on its number of rounds
+//! alone, so they have the bits of a bake with as many rays.
 
-use super::blocks::{Block, BlockMap, BlockStatus, BlockWork, DirectTile, DirectWork, Tile};
+use super::blocks::{Block, BlockMap, BlockStatus, BlockWork, Tile};
+use super::limit::Limit;
 use super::relight::Illumination;
+use super::room::{Room, Rooms};
 use super::shown_layer::Shown;
 use crate::base::directional::Directional;
-use crate::base::error::{Error, Result};
-use crate::base::memory::{try_collect, try_filled, try_with_capacity};
+use crate::base::error::Result;
+use crate::base::memory::try_collect;
 use crate::base::sampling::combine;
-use crate::direct::direct_light::Lights;
-use crate::lightmap::atlas::ids::{GatherTexel, LightTexel};
+use crate::base::scratch::Taken;
 use crate::lightmap::directional;
-use crate::lightmap::indirect::gather::Gathered;
+use crate::lightmap::indirect::gather::{Gathered, TileTexel};
 use crate::lightmap::indirect::near_hits::{HitRadiance, NearHits};
 use crate::lightmap::indirect::radiance_map::RadianceLookup;
 use crate::lightmap::indirect::sample_set::{ROUND, SampleSet};
-use crate::lightmap::texel_light::averages::Averaged;
-use crate::lightmap::texel_light::{TexelLight, TilePoints};
 use glam::Vec3;
+use std::ops::Range;
 use std::sync::Arc;
-use std::sync::atomic::{AtomicBool, AtomicU64, Ordering::Relaxed};
 use std::time::Instant;
-
-/// Maximum number of shadow rays per area light for coarse direct light.
-const COARSE_SAMPLES: u32 = 4;
 
 /// Gain of rays under new light.
 const OLD_LIGHT: f32 = 1e30;
@@ -57,12 +54,26 @@ pub(super) struct Context {
     pub dim: f32,
     pub promote_threshold: u32,
     pub max_rounds: u32,
+    /// Working memory of the threads.
+    pub rooms: Arc<Rooms>,
 }
 
 impl Context {
     /// Whether some light is asked for by direction, given by a bit of [`directional`].
     pub fn asks(&self, bit: u32) -> bool {
         self.directional & bit != 0
+    }
+
+    /// Working memory for one thread.
+    pub fn room(&self) -> Result<Taken<'_, Room>> {
+        self.rooms.take(|| Room::new([directional::INDIRECT, directional::DIRECT].map(|bit| self.asks(bit))))
+    }
+
+    /// What gather rays see where they hit.
+    fn lookup(&self) -> HitRadiance<'_> {
+        let (atlas, light) = (&self.map.atlas, &self.light);
+        let map = RadianceLookup::new(&atlas.charts, &atlas.radiance, &light.radiance);
+        HitRadiance::new(map, NearHits { direct: &light.direct, texels: self.near_hits })
     }
 }
 
@@ -71,50 +82,6 @@ impl Context {
 pub(super) enum Kind {
     Direct,
     Indirect,
-}
-
-/// Conditions that end the work of an update.
-pub(super) struct Limit {
-    pub deadline: Option<Instant>,
-    /// Number of rays that may be traced; `u64::MAX`: any number.
-    pub rays: u64,
-    pub traced: AtomicU64,
-    /// Set to get the work back.
-    pub stopped: AtomicBool,
-    /// Set when memory for the work could not be allocated.
-    pub out_of_memory: AtomicBool,
-}
-
-impl Limit {
-    pub fn new(deadline: Option<Instant>, rays: u64) -> Limit {
-        Limit {
-            deadline,
-            rays,
-            traced: AtomicU64::new(0),
-            stopped: AtomicBool::new(false),
-            out_of_memory: AtomicBool::new(false),
-        }
-    }
-
-    /// Returns an error if memory for the work could not be allocated.
-    pub fn check_memory(&self) -> Result<()> {
-        if self.out_of_memory.load(Relaxed) {
-            return Err(Error::OutOfMemory("the light of a block of texels".into()));
-        }
-        Ok(())
-    }
-
-    /// Unwraps the result of an allocation; records a failure.
-    fn granted<T>(&self, result: Result<T>) -> Option<T> {
-        result.inspect_err(|_| self.out_of_memory.store(true, Relaxed)).ok()
-    }
-
-    /// Whether the limit has been reached; asked before every texel.
-    pub fn reached(&self) -> bool {
-        self.stopped.load(Relaxed)
-            || self.traced.load(Relaxed) >= self.rays
-            || self.deadline.is_some_and(|d| Instant::now() >= d)
-    }
 }
 
 /// Amount of work to be done on a block.
@@ -213,13 +180,13 @@ impl BlockStatus {
 
 impl Block {
     /// Works until a step is completed or the limit is reached.
-    pub fn work(&mut self, c: &Context, tile: &Tile, step: Step, limit: &Limit) -> Done {
+    pub fn work(&mut self, c: &Context, tile: &Tile, step: Step, room: &mut Room, limit: &Limit) -> Done {
         let mut done = Done::default();
         if tile.texels.is_empty() {
             return done;
         }
         if self.status.changes_behind(c) > 0 {
-            done.coarse = self.work_on_coarse(c, tile, limit);
+            done.coarse = self.work_on_coarse(c, tile, room, limit);
             if !done.coarse {
                 return done;
             }
@@ -230,61 +197,104 @@ impl Block {
             Step::Next => self.status.next(c, tile).map(|n| n.0),
         };
         match kind {
-            Some(Kind::Direct) => done.direct = self.work_on_direct(c, tile, limit),
-            Some(Kind::Indirect) => done.indirect = self.work_on_indirect(c, tile, limit),
+            Some(Kind::Direct) => done.direct = self.work_on_direct(c, tile, room, limit),
+            Some(Kind::Indirect) => done.indirect = self.work_on_indirect(c, tile, room, limit),
             None => {}
         }
         done
     }
 
     /// Does one step of indirect light; returns whether it was completed.
-    pub fn work_on_indirect(&mut self, c: &Context, tile: &Tile, limit: &Limit) -> bool {
-        let Some((lod, rounds)) = self.status.target(c) else { return false };
-        if self.status.indirect_epoch != c.light.indirect_epoch
-            && limit.granted(self.begin_epoch(tile, c.light.indirect_epoch)).is_none()
-        {
-            return false;
+    pub fn work_on_indirect(&mut self, c: &Context, tile: &Tile, room: &mut Room, limit: &Limit) -> bool {
+        let Some((lod, rounds)) = self.begin_step(c, tile, limit) else { return false };
+        let (end, rays) = (tile.lod_end[lod as usize] as usize, rounds * ROUND as u32);
+        let lookup = c.lookup();
+        while (self.work.cursor as usize) < end {
+            let first = self.work.cursor as usize;
+            let known = self.work.rays(first);
+            if known >= rays {
+                // It is of a lower LOD, or its rays were traced before the work was saved.
+                self.work.cursor += 1;
+                continue;
+            }
+            if limit.reached() {
+                return false;
+            }
+            let most = room.gather_pace.texels(limit, ROUND as u64);
+            let count = (first..end).take(most).take_while(|&i| self.work.rays(i) == known).count();
+            let begun = Instant::now();
+            room.texels.clear();
+            self.work.take_texels(c, tile, first..first + count, &mut room.texels);
+            let round = known as usize / ROUND;
+            let traced = room.gather.add_round(&c.map.atlas.scene, &lookup, &mut room.texels, &c.samples, round);
+            self.work.put_texels(first, &room.texels);
+            room.gather_pace.note(begun, count);
+            limit.add(traced);
         }
-        let atlas = &c.map.atlas;
-        let near = NearHits { direct: &c.light.direct, texels: c.near_hits };
-        let map = RadianceLookup::new(&atlas.charts, &atlas.radiance, &c.light.radiance);
-        let lookup = HitRadiance::new(map, near);
-        let end = tile.lod_end[lod as usize];
+        self.end_step(c, lod, rounds);
+        true
+    }
+
+    /// Does the first step of indirect light of blocks that have none, together.
+    pub fn first_indirect(c: &Context, blocks: &mut [(Block, &Tile)], room: &mut Room, limit: &Limit) {
+        let lookup = c.lookup();
+        let mut step = None;
+        for (block, tile) in &mut *blocks {
+            step = block.begin_step(c, tile, limit);
+            if step.is_none() {
+                return;
+            }
+        }
+        let Some((lod, rounds)) = step else { return };
+        for round in 0..rounds as usize {
+            let mut from = 0;
+            while from < blocks.len() {
+                // As many blocks as have room in a tile.
+                room.texels.clear();
+                let mut to = from;
+                while let Some((block, tile)) = blocks.get(to) {
+                    let count = tile.lod_end[lod as usize] as usize;
+                    if to > from && room.texels.len() + count > Room::TEXELS {
+                        break;
+                    }
+                    block.work.take_texels(c, tile, 0..count, &mut room.texels);
+                    to += 1;
+                }
+                limit.add(room.gather.add_round(&c.map.atlas.scene, &lookup, &mut room.texels, &c.samples, round));
+                let mut texels = &room.texels[..];
+                for (block, tile) in &mut blocks[from..to] {
+                    let (own, others) = texels.split_at(tile.lod_end[lod as usize] as usize);
+                    block.work.put_texels(0, own);
+                    texels = others;
+                }
+                from = to;
+            }
+        }
+        blocks.iter_mut().for_each(|(block, _)| block.end_step(c, lod, rounds));
+    }
+
+    /// Begins a step of indirect light, or goes on with one. Returns the LOD and the number of rounds that it works
+    /// towards; `None` if nothing is left to do, or if there is no memory for it.
+    fn begin_step(&mut self, c: &Context, tile: &Tile, limit: &Limit) -> Option<(u8, u32)> {
+        let (lod, rounds) = self.status.target(c)?;
+        if self.status.indirect_epoch != c.light.indirect_epoch {
+            limit.granted(self.begin_epoch(tile, c.light.indirect_epoch))?;
+        }
         let work = &mut self.work;
-        let missing = (end as usize).saturating_sub(work.gathered.len());
+        let missing = (tile.lod_end[lod as usize] as usize).saturating_sub(work.gathered.len());
         let by_direction = if c.asks(directional::INDIRECT) { missing } else { 0 };
         if work.gathered.try_reserve_exact(missing).is_err()
             || work.directional.try_reserve_exact(by_direction).is_err()
         {
-            limit.out_of_memory.store(true, Relaxed);
-            return false;
+            limit.note_out_of_memory();
+            return None;
         }
-        while work.cursor < end {
-            let i = work.cursor as usize;
-            let texel = tile.texels[i];
-            if work.gathered.len() <= i {
-                work.gathered.push(Gathered::default());
-                if c.asks(directional::INDIRECT) {
-                    work.directional.push(Directional::default());
-                }
-            }
-            let receiver = atlas.receiver(&atlas.gather, &c.light.sides.backs, texel);
-            while work.gathered[i].rays < rounds * ROUND as u32 {
-                if limit.reached() {
-                    return false;
-                }
-                let before = work.gathered[i];
-                let round = (before.rays as usize) / ROUND;
-                let seed = combine(c.gather_seed, texel.seed());
-                let (gathered, sum) = (&mut work.gathered[i], work.directional.get_mut(i));
-                let rays =
-                    gathered.add_round_by_direction(&atlas.scene, &lookup, &receiver, &c.samples, round, seed, sum);
-                work.note_deviation(&before, i);
-                limit.traced.fetch_add(rays, Relaxed);
-            }
-            work.cursor += 1;
-        }
-        work.cursor = 0;
+        Some((lod, rounds))
+    }
+
+    /// Records that all texels of a step have its rays.
+    fn end_step(&mut self, c: &Context, lod: u8, rounds: u32) {
+        self.work.cursor = 0;
         self.status.fresh_lod = lod;
         self.status.lod = self.status.lod.max(lod);
         self.status.rounds = rounds as u16;
@@ -293,7 +303,6 @@ impl Block {
             self.work.drop_prior();
         }
         self.note_error(c.map.top());
-        true
     }
 
     /// Keeps the current light as a prior and starts over. An error changes nothing.
@@ -342,78 +351,40 @@ impl Block {
         // The square of light beyond 1e19 overflows a float.
         self.status.error = if error.is_finite() { error } else { 1.0 };
     }
-
-    /// Computes direct light of the lowest LOD's texels; returns whether there was memory for it.
-    pub fn work_on_coarse(&mut self, c: &Context, tile: &Tile, limit: &Limit) -> bool {
-        let (atlas, mut rays) = (&c.map.atlas, 0);
-        let samples = c.direct_samples.min(COARSE_SAMPLES);
-        let (texels, what) = (&tile.texels[..tile.lod_end[0] as usize], "coarse direct light");
-        let count = if c.asks(directional::DIRECT) { texels.len() } else { 0 };
-        let Some(mut by_direction) = limit.granted(try_with_capacity(count, what)) else { return false };
-        let value = |&texel: &GatherTexel| {
-            let receiver = atlas.receiver(&atlas.gather, &c.light.sides.backs, texel);
-            let (direct, seed) = (&c.light.direct, combine(c.direct_seed, texel.seed()));
-            if count == 0 {
-                return direct.irradiance(&receiver, samples, seed, &mut rays);
-            }
-            let light = direct.at_point_by_direction(&receiver, Lights::All, samples, seed, &mut rays);
-            by_direction.push(light.1);
-            light.0.value()
-        };
-        let values = try_collect(texels.iter().map(value), what);
-        let Some(values) = limit.granted(values) else { return false };
-        self.work.new_coarse_directional = by_direction.into_boxed_slice();
-        let sum: f32 = values.iter().map(|v| v.element_sum()).sum();
-        self.status.direct_mean = sum / values.len().max(1) as f32;
-        self.status.coarse_epoch = c.light.direct_epoch;
-        self.work.new_coarse = values.into_boxed_slice();
-        limit.traced.fetch_add(rays, Relaxed);
-        true
-    }
-
-    /// Computes direct light of the block's light map texels; returns whether it was completed.
-    fn work_on_direct(&mut self, c: &Context, of: &Tile, limit: &Limit) -> bool {
-        let under_way = self.work.direct.take().filter(|w| w.epoch == c.light.direct_epoch);
-        let begin = || {
-            let rect = c.map.rect_in_light_map(of.placement, &of.rect);
-            // Vertices far away can make a block as large as a page.
-            let (area, around) = (rect.area(), rect.grown(1).area());
-            let asked = usize::from(c.asks(directional::DIRECT));
-            let tile = DirectTile { rect, values: unknown(area, limit)?, directional: unknown(asked * area, limit)? };
-            let (sharp, sharp_directional) = (unknown(around, limit)?, unknown(asked * around, limit)?);
-            Some(DirectWork { tile, next: 0, epoch: c.light.direct_epoch, sharp, sharp_directional })
-        };
-        let Some(mut direct) = under_way.or_else(begin) else { return false };
-        let points = if c.asks(directional::DIRECT) { TilePoints::by_direction(1) } else { TilePoints::new(1) };
-        let Some(mut points) = limit.granted(points) else {
-            self.work.direct = Some(direct);
-            return false;
-        };
-        let (width, corner) = (direct.tile.rect.width().max(1), (direct.tile.rect.x0, direct.tile.rect.y0));
-        while (direct.next as usize) < direct.tile.values.len() {
-            if limit.reached() {
-                self.work.direct = Some(direct);
-                return false;
-            }
-            let at = direct.next as usize;
-            let (x, y) = (corner.0 + (at % width) as i32, corner.1 + (at / width) as i32);
-            let mut rays = 0;
-            if let Some((value, by_direction)) = direct_texel(c, of, x, y, &mut direct, &mut points, &mut rays) {
-                direct.tile.values[at] = value;
-                if let Some(here) = direct.tile.directional.get_mut(at) {
-                    *here = by_direction;
-                }
-            }
-            limit.traced.fetch_add(rays, Relaxed);
-            direct.next += 1;
-        }
-        self.status.direct_epoch = direct.epoch;
-        self.work.new_direct = Some(direct.tile);
-        true
-    }
 }
 
 impl BlockWork {
+    /// Number of gather rays of texel `i`.
+    fn rays(&self, i: usize) -> u32 {
+        self.gathered.get(i).map_or(0, |g| g.rays)
+    }
+
+    /// Appends texels with what they have gathered so far.
+    fn take_texels(&self, c: &Context, tile: &Tile, texels: Range<usize>, out: &mut Vec<TileTexel>) {
+        let (atlas, asks) = (&c.map.atlas, c.asks(directional::INDIRECT));
+        out.extend(texels.map(|i| TileTexel {
+            receiver: atlas.receiver(&atlas.gather, &c.light.sides.backs, tile.texels[i]),
+            seed: combine(c.gather_seed, tile.texels[i].seed()),
+            gathered: self.gathered.get(i).copied().unwrap_or_default(),
+            directional: asks.then(|| self.directional.get(i).copied().unwrap_or_default()),
+        }));
+    }
+
+    /// Takes over what the texels from the `first` on have gathered.
+    fn put_texels(&mut self, first: usize, texels: &[TileTexel]) {
+        for (i, texel) in (first..).zip(texels) {
+            if self.gathered.len() <= i {
+                self.gathered.push(Gathered::default());
+                self.directional.extend(texel.directional.map(|_| Directional::default()));
+            }
+            let before = std::mem::replace(&mut self.gathered[i], texel.gathered);
+            if let (Some(sum), Some(new)) = (self.directional.get_mut(i), texel.directional) {
+                *sum = new;
+            }
+            self.note_deviation(&before, i);
+        }
+    }
+
     /// Estimate of the light of texel `i`: from its own rays, with the prior's light fading while these are few.
     pub fn estimate(&self, i: usize) -> Option<Vec3> {
         self.with_prior(i, &self.prior, |g| g.irradiance())
@@ -472,62 +443,4 @@ impl BlockWork {
             self.deviation_count += 1;
         }
     }
-}
-
-/// The texel of the light map at a column and row of a block's page; `None` if it is not the block's.
-pub(super) fn owns(c: &Context, tile: &Tile, x: i32, y: i32) -> Option<LightTexel> {
-    let a = &c.map.atlas;
-    let at = a.map.at(tile.placement, x, y);
-    let texel = at.filter(|&texel| a.map.placement_of(&a.charts, texel) == tile.placement)?;
-    let at = a.gather.layout.texel_coord(tile.placement, a.texel_local(tile.placement, texel));
-    // Includes one texel around the block's own, so that rounding leaves no gaps between blocks.
-    let own = tile.rect.grown(1);
-    let (gx, gy) = (at[0].floor() as i32, at[1].floor() as i32);
-    (gx >= own.x0 && gx < own.x1 && gy >= own.y0 && gy < own.y1).then_some(texel)
-}
-
-/// Makes room for direct light of texels, of which nothing is known yet.
-fn unknown<T: Shown>(texels: usize, limit: &Limit) -> Option<Box<[T]>> {
-    limit.granted(try_filled(texels, T::UNKNOWN, "direct light")).map(Vec::into_boxed_slice)
-}
-
-/// Direct light of a texel of the light map, and that light by direction if it is asked for; `None` if the texel is not
-/// the block's; infinite if it is inside a solid.
-fn direct_texel(
-    c: &Context,
-    tile: &Tile,
-    x: i32,
-    y: i32,
-    work: &mut DirectWork,
-    points: &mut TilePoints,
-    rays: &mut u64,
-) -> Option<(Vec3, Directional)> {
-    let (a, texel) = (&c.map.atlas, owns(c, tile, x, y)?);
-    let backs = &c.light.sides.backs;
-    let receiver = a.receiver(&a.map, backs, texel);
-    let texels =
-        TexelLight { areas: a.areas(&a.map), direct: &c.light.direct, samples: c.direct_samples, seed: c.direct_seed };
-    // Light without penumbrae of texels that are needed as neighbours too is computed once per tile.
-    let known = work.tile.rect.grown(1);
-    let mut sharp_at = |s: LightTexel| {
-        let (x, y) = a.map.position(s);
-        let i = (y - known.y0) as usize * known.width() + (x - known.x0) as usize;
-        let sharp = &mut work.sharp[i];
-        let directional = work.sharp_directional.get_mut(i);
-        if sharp.x.is_nan() {
-            let receiver = a.receiver(&a.map, backs, s);
-            match directional {
-                Some(directional) => (*sharp, *directional) = texels.sharp_by_direction(&receiver, rays),
-                None => *sharp = texels.sharp(&receiver, rays),
-            }
-        }
-        (*sharp, work.sharp_directional.get(i).copied().unwrap_or_default())
-    };
-    let (sharp, sharp_directional) = sharp_at(texel);
-    let variation = texels.varies(texel, sharp, |s| sharp_at(s).0);
-    let back = a.is_back(&a.map, backs, texel);
-    let mut light = (Vec3::ZERO, Directional::default());
-    let averaged = Averaged { texel, back, receiver, sharp, sharp_directional, variation };
-    texels.irradiance(&[averaged], points, rays, |_, e, by_direction| light = (e, *by_direction));
-    Some(light)
 }

@@ -86,20 +86,6 @@ impl Gathered {
         round: usize,
         seed: u32,
     ) -> u64 {
-        self.add_round_by_direction(scene, radiance, receiver, samples, round, seed, None)
-    }
-
-    /// Does the work of [`add_round`](Self::add_round); `directional`: a sum that the light by direction is added to.
-    pub(crate) fn add_round_by_direction(
-        &mut self,
-        scene: &Scene,
-        radiance: &HitRadiance,
-        receiver: &Receiver,
-        samples: &SampleSet,
-        round: usize,
-        seed: u32,
-        directional: Option<&mut Directional>,
-    ) -> u64 {
         let mut rays = [Ray::new(Vec3::ZERO, Vec3::ZERO); ROUND];
         let mut hits = [RawHit::MISS; ROUND];
         let points = points_of(samples, round);
@@ -107,16 +93,14 @@ impl Gathered {
         aim(receiver, points, seed, rays);
         scene.intersect_stream(rays, &mut hits);
         let mut traced = rays.len() as u64;
-        let (mut bright, mut arrived) = ((Vec3::ZERO, Unoccluded::default()), Directional::default());
+        let mut bright = (Vec3::ZERO, Unoccluded::default());
         if radiance.lookup.bright().len() > 0 {
-            let mut room = if directional.is_some() { PointRoom::by_direction() } else { PointRoom::new() };
+            let mut room = PointRoom::new();
             let mut shadow = room.begin(scene);
             bright.1 = radiance.lookup.bright().push(receiver, rays.len(), seed_of_round(seed, round), &mut shadow);
-            let (sums, directed) = shadow.finish_by_direction(&mut traced);
-            (bright.0, arrived) = (sums[0], directed.first().copied().unwrap_or_default());
+            bright.0 = shadow.finish(&mut traced)[0];
         }
-        let directional = directional.map(|sum| (sum, arrived));
-        self.add(scene, radiance, receiver, seed_of_round(seed, round), rays, &hits, bright, directional, &mut traced);
+        self.add(scene, radiance, receiver, seed_of_round(seed, round), rays, &hits, bright, None, &mut traced);
         traced
     }
 

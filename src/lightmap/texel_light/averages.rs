@@ -51,15 +51,6 @@ impl TexelLight<'_, LightMap> {
         self.direct.at_point(receiver, Lights::Sharp, 0, 0, rays).sharp
     }
 
-    /// Does the work of [`sharp`](Self::sharp), and returns the light by direction too.
-    pub(crate) fn sharp_by_direction(&self, receiver: &Receiver, rays: &mut u64) -> (Vec3, Directional) {
-        if !self.direct.has_sharp() {
-            return Default::default();
-        }
-        let (light, directional) = self.direct.at_point_by_direction(receiver, Lights::Sharp, 0, 0, rays);
-        (light.sharp, directional)
-    }
-
     /// Computes light without penumbrae at samples: at most [`MAX_POINTS`] times as many as `tile` has room for texels.
     pub(crate) fn sharp_of_tile(
         &self,
