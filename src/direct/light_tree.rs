@@ -102,7 +102,8 @@ impl LightTree {
         size_of_val(&self.nodes[..])
     }
 
-    /// Calls `visit` with each light that gets any of `n` systematic samples: its number, its expected number of
+    /// Calls `visit` with each light that gets any of `n` systematic samples, and before that `prefetch` with all of their
+    /// numbers. `visit` gets a light's number, its expected number of
     /// samples (n times its probability) and its actual number, which is the former rounded down or up. `offset` is in
     /// [0, 1). Lights that can contribute have a probability greater than 0.
     pub(crate) fn sample(
@@ -111,9 +112,11 @@ impl LightTree {
         n: u32,
         offset: f32,
         descent: &mut Descent,
+        prefetch: impl Fn(usize),
         mut visit: impl FnMut(usize, f32, u32),
     ) {
         (self.descend)(&self.nodes, [position, normal], (n, offset), descent);
+        descent.lights.iter().for_each(|sampled| prefetch(sampled.light as usize));
         for sampled in &descent.lights {
             visit(sampled.light as usize, sampled.due, sampled.count);
         }
@@ -172,23 +175,31 @@ fn divide(node: &Node, importances: &[f32; WIDTH], part: &Part, next: &mut Vec<P
         *end = part.from + *end * scale;
     }
     // The first sample after each child. (All at once, in lanes: descents take 0.93 of the time.)
-    let after = ends.map(|end| ceil(end).min(part.end));
-    let mut sample = part.first;
-    while sample < part.end {
-        let mut child = after.iter().map(|&after| i32::from(after <= sample)).sum::<i32>() as usize;
-        let mut end = after[child.min(WIDTH - 1)];
-        if child == WIDTH {
-            // The last sample, and rounding.
-            (child, end) = (importances.iter().rposition(|&i| i > 0.0).unwrap_or(0), part.end);
-        }
+    let after = ends.map(|end| ceil(end).min(part.end).max(part.first));
+    let mut before = [part.first; WIDTH];
+    before[1..].copy_from_slice(&after[..WIDTH - 1]);
+    // Children that samples fall on. (To look for the child of each sample takes longer.)
+    let mut filled = 0u32;
+    for child in 0..WIDTH {
+        filled |= u32::from(before[child] < after[child]) << child;
+    }
+    let mut add = |child: usize, first: i32, end: i32| {
         let (from, to) = (if child == 0 { part.from } else { ends[child - 1] }, ends[child]);
         match node.children[child] {
             light if is_light(light) => {
-                lights.push(Sampled { light: !light, count: (end - sample) as u32, due: (to - from) as f32 });
+                lights.push(Sampled { light: !light, count: (end - first) as u32, due: (to - from) as f32 });
             }
-            node => next.push(Part { node, from, to, first: sample, end }),
+            node => next.push(Part { node, from, to, first, end }),
         }
-        sample = end;
+    };
+    while filled != 0 {
+        let child = filled.trailing_zeros() as usize;
+        filled &= filled - 1;
+        add(child, before[child], after[child]);
+    }
+    if after[WIDTH - 1] < part.end {
+        // The last sample, and rounding.
+        add(importances.iter().rposition(|&i| i > 0.0).unwrap_or(0), after[WIDTH - 1], part.end);
     }
 }
 
@@ -367,6 +378,7 @@ mod tests {
                     n,
                     (round as f32 + 0.5) / rounds as f32,
                     &mut descent,
+                    |_| (),
                     |light, d, count| {
                         due[light] = d;
                         sampled[light] += count as f32 / rounds as f32;
@@ -418,6 +430,7 @@ mod tests {
             50,
             0.5,
             &mut descent,
+            |_| (),
             |_, _, count| seen += count,
         );
         assert!(seen == 50 || seen == 0);
@@ -426,6 +439,7 @@ mod tests {
             50,
             0.5,
             &mut descent,
+            |_| (),
             |_, _, _| panic!(),
         );
     }

@@ -18,7 +18,7 @@ use crate::base::error::Result;
 use crate::base::memory::try_collect;
 use crate::base::sampling::{combine, sobol_2d};
 use crate::scene::Light;
-use crate::simd::Isa;
+use crate::simd::{self, Isa};
 use glam::Vec3;
 use std::f32::consts::{FRAC_PI_2, PI};
 
@@ -35,7 +35,12 @@ enum Source {
     /// A point or spot light.
     Point(Light),
     Area(AreaLight),
-    Patch(Patch),
+}
+
+/// Lights of a set. Patches are so many that other lights' size would not fit the caches.
+enum Sources {
+    Lights(Vec<Source>),
+    Patches(Vec<Patch>),
 }
 
 /// A small part of a surface, as a light.
@@ -65,7 +70,7 @@ impl Patch {
 
 /// Lights that are sampled because they are many.
 pub(crate) struct ManyLights {
-    sources: Vec<Source>,
+    sources: Sources,
     tree: LightTree,
     /// Number of candidates per shadow ray.
     candidates: u32,
@@ -75,25 +80,35 @@ impl ManyLights {
     /// Makes the set of point and spot lights that shine, and of area lights.
     pub(crate) fn new(isa: Isa, points: &[Light], areas: &[AreaLight]) -> Result<ManyLights> {
         let sources = points.iter().map(|&p| Source::Point(p)).chain(areas.iter().map(|&a| Source::Area(a)));
-        ManyLights::of(isa, try_collect(sources, LIGHT_TREE)?, CANDIDATES)
+        ManyLights::of(isa, Sources::Lights(try_collect(sources, LIGHT_TREE)?), CANDIDATES)
     }
 
     /// Makes the set of small parts of surfaces.
     pub(crate) fn of_patches(isa: Isa, patches: Vec<Patch>) -> Result<ManyLights> {
-        ManyLights::of(isa, try_collect(patches.into_iter().map(Source::Patch), LIGHT_TREE)?, CANDIDATES_OF_PATCHES)
+        ManyLights::of(isa, Sources::Patches(patches), CANDIDATES_OF_PATCHES)
     }
 
-    fn of(isa: Isa, sources: Vec<Source>, candidates: u32) -> Result<ManyLights> {
-        let bounds = try_collect(sources.iter().map(bounds), LIGHT_TREE)?;
+    fn of(isa: Isa, sources: Sources, candidates: u32) -> Result<ManyLights> {
+        let bounds = match &sources {
+            Sources::Lights(lights) => try_collect(lights.iter().map(bounds), LIGHT_TREE)?,
+            Sources::Patches(patches) => try_collect(patches.iter().map(bounds_of_patch), LIGHT_TREE)?,
+        };
         Ok(ManyLights { tree: LightTree::new(isa, &bounds)?, sources, candidates })
     }
 
     pub(crate) fn bytes(&self) -> usize {
-        size_of_val(&self.sources[..]) + self.tree.bytes()
+        let sources = match &self.sources {
+            Sources::Lights(lights) => size_of_val(&lights[..]),
+            Sources::Patches(patches) => size_of_val(&patches[..]),
+        };
+        sources + self.tree.bytes()
     }
 
     pub(crate) fn len(&self) -> usize {
-        self.sources.len()
+        match &self.sources {
+            Sources::Lights(lights) => lights.len(),
+            Sources::Patches(patches) => patches.len(),
+        }
     }
 
     /// Pushes up to `n` shadow rays, whose sum is the irradiance without bias. Returns the unoccluded irradiance by the
@@ -113,33 +128,49 @@ impl ManyLights {
         candidates.clear();
         let offset = sobol_2d(0, combine(seed, 1))[0];
         let mut next = 0;
-        self.tree.sample((receiver.origin, receiver.normal), n, offset, descent, |light, due, count| {
-            // A light that is due several candidates gets that number rounded down or up and divides its light among
-            // them.
-            let share = 1.0 / if due >= 1.0 { count as f32 } else { due };
-            match &self.sources[light] {
-                Source::Point(light) => {
-                    if let Some((target, light)) = point_light(light, receiver) {
-                        candidates.push(Candidate { target, light: light * (share * count as f32) });
+        let at = (receiver.origin, receiver.normal);
+        // A light that is due several candidates gets that number rounded down or up and divides its light among them.
+        let share_of = |due: f32, count: u32| 1.0 / if due >= 1.0 { count as f32 } else { due };
+        let lights = match &self.sources {
+            Sources::Lights(lights) => lights,
+            Sources::Patches(patches) => {
+                let prefetch = |i: usize| simd::prefetch(&patches[i]);
+                self.tree.sample(at, n, offset, descent, prefetch, |i, due, count| {
+                    if let Some(light) = patches[i].light(receiver) {
+                        let light = light * (share_of(due, count) * count as f32);
+                        candidates.push(Candidate { target: patches[i].position, light });
                     }
-                }
-                Source::Patch(patch) => {
-                    if let Some(light) = patch.light(receiver) {
-                        candidates.push(Candidate { target: patch.position, light: light * (share * count as f32) });
+                });
+                return;
+            }
+        };
+        self.tree.sample(
+            at,
+            n,
+            offset,
+            descent,
+            |_| (),
+            |light, due, count| {
+                let share = share_of(due, count);
+                match &lights[light] {
+                    Source::Point(light) => {
+                        if let Some((target, light)) = point_light(light, receiver) {
+                            candidates.push(Candidate { target, light: light * (share * count as f32) });
+                        }
                     }
-                }
-                Source::Area(area) => {
-                    let Some(sampler) = area.sampler(receiver) else { return };
-                    for _ in 0..count {
-                        let (target, weight) = area.sample(&sampler, receiver, sobol_2d(next, combine(seed, 2)));
-                        next += 1;
-                        if weight > 0.0 && weight.is_finite() {
-                            candidates.push(Candidate { target, light: area.radiance * (weight * share) });
+                    Source::Area(area) => {
+                        let Some(sampler) = area.sampler(receiver) else { return };
+                        for _ in 0..count {
+                            let (target, weight) = area.sample(&sampler, receiver, sobol_2d(next, combine(seed, 2)));
+                            next += 1;
+                            if weight > 0.0 && weight.is_finite() {
+                                candidates.push(Candidate { target, light: area.radiance * (weight * share) });
+                            }
                         }
                     }
                 }
-            }
-        });
+            },
+        );
     }
 }
 
@@ -179,17 +210,15 @@ fn bounds(source: &Source) -> Bounds {
             Bounds { power: Vec3::from(intensity).element_sum(), ..everywhere(position) }
         }
         Source::Point(_) => unreachable!("only point and spot lights are made points"),
-        Source::Patch(p) => Bounds {
-            axis: p.normal,
-            spread: 0.0,
-            reach: FRAC_PI_2,
-            power: p.flux.element_sum(),
-            ..everywhere(p.position)
-        },
         Source::Area(a) => {
             let (lower, upper) = a.bounds();
             let spread = if a.two_sided { PI } else { 0.0 };
             Bounds { lower, upper, axis: a.normal, spread, reach: FRAC_PI_2, power: a.radiance.element_sum() * a.area }
         }
     }
+}
+
+fn bounds_of_patch(p: &Patch) -> Bounds {
+    let power = p.flux.element_sum();
+    Bounds { lower: p.position, upper: p.position, axis: p.normal, spread: 0.0, reach: FRAC_PI_2, power }
 }

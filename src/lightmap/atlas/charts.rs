@@ -12,6 +12,7 @@ use crate::base::memory::{try_collect, try_filled, try_push, try_with_capacity, 
 use crate::base::progress::{Progress, Stage};
 use crate::device::LogLevel;
 use crate::scene::{LightmapUvs, Mesh, Scene};
+use crate::simd::prefetch;
 use glam::{DVec2, Vec2};
 use std::collections::BTreeMap;
 use std::ops::{Index, Range};
@@ -147,6 +148,17 @@ impl Charts {
     #[inline]
     pub fn chart_of(&self, triangle: u32) -> ChartId {
         self.of_triangles[triangle as usize]
+    }
+
+    /// Asks for a triangle's chart and corners.
+    #[inline]
+    pub(in crate::lightmap) fn prefetch(&self, triangle: u32) {
+        if let (Some(chart), Some(corners)) =
+            (self.of_triangles.get(triangle as usize), self.corners.get(triangle as usize))
+        {
+            prefetch(chart);
+            prefetch(corners);
+        }
     }
 
     /// Returns the chart of what may be a global triangle; `None` if there is no such triangle, or it has no chart.

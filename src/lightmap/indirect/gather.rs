@@ -121,7 +121,14 @@ impl Gathered {
     ) {
         let (mut sum, mut squares) = (Vec3::ZERO, 0.0);
         let (transmits, mut crossings) = (scene.uses().transmission, Vec::new());
-        for (i, (ray, hit)) in (0..).zip(rays.iter().zip(hits)) {
+        // Places are found before they are read, for all rays: what each waits for overlaps. (Gathering in Sponza in the
+        // sun: look-ups take half of the time.)
+        let mut places = [None; ROUND];
+        hits.iter().filter(|hit| !hit.is_miss()).for_each(|hit| radiance.lookup.prefetch_hit(hit));
+        for (place, hit) in places.iter_mut().zip(hits).filter(|(_, hit)| !hit.is_miss()) {
+            *place = radiance.lookup.find(hit).inspect(|place| radiance.lookup.prefetch(place));
+        }
+        for (i, ((ray, hit), place)) in (0..).zip(rays.iter().zip(hits).zip(&places)) {
             if hit.is_miss() {
                 continue;
             }
@@ -132,7 +139,7 @@ impl Gathered {
             }
             let seen = match transmits && scene.material(hit.triangle).transmits() {
                 true => Some(radiance.lookup.through(scene, ray, &mut crossings)),
-                false => radiance.towards(scene, hit, combine(seed, 64 + i), traced),
+                false => place.map(|place| radiance.towards(scene, hit, &place, combine(seed, 64 + i), traced)),
             };
             match seen {
                 Some(l) => {

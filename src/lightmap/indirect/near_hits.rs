@@ -9,7 +9,7 @@
 //!
 //! What they are worth and cost: docs/accuracy.md#near-hits.
 
-use super::radiance_map::RadianceLookup;
+use super::radiance_map::{Place, RadianceLookup};
 use crate::base::sampling::{combine, cosine_around, uniform};
 use crate::direct::DirectLight;
 use crate::direct::shadow_rays::PointRoom;
@@ -64,19 +64,20 @@ impl HitRadiance<'_> {
             && distance * distance < near.texels * near.texels * self.lookup.texel_area(placement)
     }
 
-    /// Returns the radiance reflected towards a gather ray at its hit, as [`RadianceLookup::seen`] does, but computed
-    /// where the hit is near. `seed` is the ray's own. Adds the rays traced to `rays`.
+    /// Returns the radiance reflected towards a gather ray at its hit, whose place in the map is given, as
+    /// [`RadianceLookup::seen`] does, but computed where the hit is near. `seed` is the ray's own. Adds the rays traced to
+    /// `rays`.
     #[inline]
-    pub(crate) fn towards(&self, scene: &Scene, hit: &RawHit, seed: u32, rays: &mut u64) -> Option<Vec3> {
-        let (placement, cached) = self.lookup.met(hit)?;
+    pub(super) fn towards(&self, scene: &Scene, hit: &RawHit, place: &Place, seed: u32, rays: &mut u64) -> Vec3 {
+        let (placement, cached) = self.lookup.at(place);
         let seen = self.lookup.bright().seen(cached, self.lookup.map(), placement, hit.t);
         match &self.near {
             // The bright part, which gather rays leave to shadow rays, is that of the map.
             Some(near) if self.is_near(near, placement, hit.t) => {
                 let computed = self.computed(near, scene, hit, seed, rays);
-                Some(if seen == cached { computed } else { seen + computed - cached })
+                if seen == cached { computed } else { seen + computed - cached }
             }
-            _ => Some(seen),
+            _ => seen,
         }
     }
 

@@ -30,6 +30,7 @@ use crate::lightmap::tiles::{TILE, in_order, texels_per_tile};
 use crate::photon::PhotonMap;
 use crate::photon::coverage::Discs;
 use crate::scene::{NONE, Scene};
+use crate::simd::prefetch;
 use crate::trace::filter::Crossing;
 use crate::trace::{RawHit, Ray};
 use glam::{Mat2, Vec2, Vec3};
@@ -104,14 +105,48 @@ impl<'a> RadianceLookup<'a> {
     /// Returns placement and radiance at a hit.
     #[inline]
     pub(super) fn met(&self, hit: &RawHit) -> Option<(PlacementId, Vec3)> {
+        Some(self.at(&self.find(hit)?))
+    }
+
+    /// Finds where the map has a hit; `None` on the back of a one-sided surface.
+    #[inline]
+    pub(super) fn find(&self, hit: &RawHit) -> Option<Place> {
         let chart = self.charts.chart_of(hit.triangle);
         if chart == ChartId::NONE {
-            return Some((PlacementId::NONE, Vec3::ZERO));
+            return Some(Place { placement: PlacementId::NONE, texel: NONE });
         }
         let placement = self.map.layout.side(chart, hit.front)?;
         let texel = self.map.nearest(placement, self.charts.local(hit.triangle, hit.u, hit.v))?;
-        Some((placement, self.radiance.values[texel.index()]))
+        Some(Place { placement, texel: texel.index() as u32 })
     }
+
+    /// Asks for what is read to find a hit.
+    #[inline]
+    pub(super) fn prefetch_hit(&self, hit: &RawHit) {
+        self.charts.prefetch(hit.triangle);
+    }
+
+    /// Asks for the radiance at a place.
+    #[inline]
+    pub(super) fn prefetch(&self, place: &Place) {
+        if let Some(value) = self.radiance.values.get(place.texel as usize) {
+            prefetch(value);
+        }
+    }
+
+    /// Returns placement and radiance at a place.
+    #[inline]
+    pub(super) fn at(&self, place: &Place) -> (PlacementId, Vec3) {
+        let value = if place.texel == NONE { Vec3::ZERO } else { self.radiance.values[place.texel as usize] };
+        (place.placement, value)
+    }
+}
+
+/// A place in the radiance map; no texel where a surface has no chart.
+#[derive(Clone, Copy)]
+pub(super) struct Place {
+    placement: PlacementId,
+    texel: u32,
 }
 
 /// Inputs of the stage.
