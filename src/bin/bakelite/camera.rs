@@ -1,10 +1,12 @@
 //! A view for scenes that come without one.
 //!
 //! Candidate eyes are spread over the scene's bounds, at heights where people stand. An eye is
-//! inside if most rays from it meet something, on the front where materials are one-sided. From each
-//! inside eye the level directions with the longest free views over lit surfaces are scored by the
-//! mean of length times light in a bundle of rays as wide as the picture; the best view with some
-//! air round the eye wins. If no inside eye sees light, the scene is an object: it is looked at from
+//! inside if most rays from it meet something, on the front where materials are one-sided, and there
+//! is a level floor below. From each inside eye the level directions with the longest free views over
+//! lit surfaces are scored by the mean of length times light in a bundle of rays as wide as the
+//! picture, and by how many kinds of surface these meet: a bare wall is nothing to look at. The best
+//! view with some air round the eye and little open sky wins. If no inside eye sees light, or the eye
+//! is in a hollow object that is far brighter outside, the scene is an object: it is looked at from
 //! outside, from where most of it is lit.
 
 use bakelite::Scene;
@@ -25,28 +27,50 @@ const DIRECTIONS: u32 = 24;
 const SIDES: u32 = 16;
 /// An inside eye sees at least this part of the probes end on something.
 const ENCLOSED: f32 = 0.6;
+/// The floor is level and at most so far below, as a part of the scene's diagonal.
+const LEVEL: f32 = 0.9;
+const STANDING: f32 = 0.1;
+/// Length that counts half as much as the longest, as a part of the diagonal: a view is more than its far end.
+const FAR: f32 = 0.1;
+/// Half of the angles that a picture covers, across and upwards, in rays of the bundle from its middle.
+const ACROSS: i32 = 4;
+const UPWARDS: i32 = 2;
+/// Angle between two of them.
+const STEP: f32 = 0.18;
 /// A view shows at least this much light, where 1 is all surfaces far brighter than the usual.
 const LIT: f32 = 0.25;
+/// A hollow object shows this part of its surface from behind to an eye inside, and is this many times brighter outside.
+const TURNED_OUT: f32 = 0.95;
+const BRIGHTER: f32 = 5.0;
 /// Vertical field of view.
 const FOV: f32 = 60.0;
 
 /// A view of a baked scene, whose up axis is the unit vector `up`. Depends on scene and light alone.
 pub fn choose(lightmap: &Lightmap, up: Vec3) -> Camera {
     let scene = &**lightmap.scene();
-    let eyes: Vec<(Vec3, f32)> = (0..EYES)
+    let eyes: Vec<(Vec3, (f32, f32))> = (0..EYES)
         .map(|i| candidate(scene, up, i))
+        .filter(|&eye| stands(scene, up, eye))
         .filter_map(|eye| clearance(scene, eye).map(|air| (eye, air)))
         .collect();
     let light = Brightness::new(lightmap, eyes.iter().map(|&(eye, _)| eye));
-    let views = eyes.iter().map(|&(eye, air)| {
+    let views = eyes.iter().map(|&(eye, (air, enclosed))| {
         let (direction, score, lit) = best_view(scene, up, eye, &light);
         // Air counts up to 5 % of the diagonal: enough not to stare at a pillar.
         let air = (air / (0.05 * scene.diagonal())).min(1.0);
-        (score * air, lit, eye, direction)
+        (score * air * enclosed, lit, eye, direction)
     });
-    match views.filter(|v| v.1 >= LIT).max_by(|a, b| a.0.total_cmp(&b.0)) {
-        Some((_, _, eye, direction)) => Camera { position: eye, target: eye + direction, up, fov_y: FOV.to_radians() },
-        None => outside(scene, up, &light),
+    let best = views.filter(|v| v.1 >= LIT).max_by(|a, b| a.0.total_cmp(&b.0));
+    let from_outside = outside(scene, up, &light);
+    let is_room = |eye: Vec3| {
+        let (brightness, backs) = light.around(eye);
+        backs < TURNED_OUT || light.seen_from(&from_outside) < BRIGHTER * brightness
+    };
+    match best {
+        Some((_, _, eye, direction)) if is_room(eye) => {
+            Camera { position: eye, target: eye + direction, up, fov_y: FOV.to_radians() }
+        }
+        _ => from_outside,
     }
 }
 
@@ -81,6 +105,30 @@ impl<'a> Brightness<'a> {
         Some((e.iter().sum::<f32>() / 3.0, hit.t))
     }
 
+    /// Mean irradiance around an eye, and the part of the surfaces there that it sees from behind.
+    fn around(&self, eye: Vec3) -> (f32, f32) {
+        let (mut sum, mut count, mut backs) = (0.0, 0, 0);
+        for i in 0..PROBES {
+            let ray = Ray::new(eye, uniform_sphere(sobol_2d(i, 1)));
+            if let Some((e, _)) = self.irradiance(&ray) {
+                sum += e;
+                count += 1;
+                backs += u32::from(!self.lightmap.scene().intersect_raw(&ray).front);
+            }
+        }
+        let count = count.max(1) as f32;
+        (sum / count, backs as f32 / count)
+    }
+
+    /// Mean irradiance of what a camera outside sees.
+    fn seen_from(&self, camera: &Camera) -> f32 {
+        let scene = self.lightmap.scene();
+        let to = |k| camera.target + 0.25 * scene.diagonal() * uniform_sphere(sobol_2d(k, 1));
+        let rays = (0..PROBES).map(|k| Ray::new(camera.position, to(k) - camera.position));
+        let seen: Vec<f32> = rays.filter_map(|ray| self.irradiance(&ray).map(|s| s.0)).collect();
+        seen.iter().sum::<f32>() / seen.len().max(1) as f32
+    }
+
     /// 0 for a dark surface, 1/2 for a usual one, up to 1 for a bright one; and how far it is.
     fn lit(&self, ray: &Ray) -> Option<(f32, f32)> {
         self.irradiance(ray).map(|(e, t)| (if e > 0.0 { e / (e + self.usual) } else { 0.0 }, t))
@@ -98,8 +146,19 @@ fn candidate(scene: &Scene, up: Vec3, i: u32) -> Vec3 {
     lower + (upper - lower) * t
 }
 
-/// Distance to the nearest surface that probes find; `None` if the eye is not inside.
-fn clearance(scene: &Scene, eye: Vec3) -> Option<f32> {
+/// Whether somebody can stand there.
+fn stands(scene: &Scene, up: Vec3, eye: Vec3) -> bool {
+    let (x, body) = (up.any_orthonormal_vector(), 0.01 * scene.diagonal());
+    let y = up.cross(x);
+    [Vec3::ZERO, x, -x, y, -y].into_iter().all(|aside| {
+        let floor = scene.intersect_raw(&Ray::new(eye + body * aside, -up).within(0.0, STANDING * scene.diagonal()));
+        !floor.is_miss() && scene.normal(floor.triangle).dot(up).abs() > LEVEL
+    })
+}
+
+/// Distance to the nearest surface that probes find, and a weight by how many find any, from 0 for half of them to 1;
+/// `None` if the eye is not inside.
+fn clearance(scene: &Scene, eye: Vec3) -> Option<(f32, f32)> {
     let (mut hits, mut backs, mut nearest) = (0, 0, f32::INFINITY);
     for i in 0..PROBES {
         let direction = uniform_sphere(sobol_2d(i, 1));
@@ -112,26 +171,37 @@ fn clearance(scene: &Scene, eye: Vec3) -> Option<f32> {
         nearest = nearest.min(hit.t);
     }
     let inside = hits as f32 >= ENCLOSED * PROBES as f32 && backs * 20 <= hits;
-    (inside && nearest > 0.01 * scene.diagonal()).then_some(nearest)
+    let enclosed = 2.0 * hits as f32 / PROBES as f32 - 1.0;
+    (inside && nearest > 0.01 * scene.diagonal()).then_some((nearest, enclosed * enclosed))
 }
 
 /// The level direction in which a bundle of rays gets farthest over lit surfaces: the direction, the
-/// mean of length times light, and the mean light.
+/// mean of length (up to a limit) times light, as far as it has variety, and the mean light.
 fn best_view(scene: &Scene, up: Vec3, eye: Vec3, light: &Brightness) -> (Vec3, f32, f32) {
     let level = up.any_orthonormal_vector();
-    let far = scene.diagonal();
+    let far = FAR * scene.diagonal();
+    let count = ((2 * ACROSS + 1) * (2 * UPWARDS + 1)) as f32;
     let score = |azimuth: f32| -> (Vec3, f32, f32) {
         let forward = Quat::from_axis_angle(up, azimuth) * level;
         let (mut score, mut lit) = (0.0, 0.0);
-        for i in 0..15 {
-            let turned = Quat::from_axis_angle(up, ((i % 5) as f32 - 2.0) * 0.2) * forward;
-            let direction = (turned + up * ((i / 5) as f32 - 1.0) * 0.2).normalize();
+        // A ray's kind of surface: which way it faces, and how far away it is, in halves of octaves.
+        let mut kinds = Vec::new();
+        for (across, upwards) in (-ACROSS..=ACROSS).flat_map(|a| (-UPWARDS..=UPWARDS).map(move |u| (a, u))) {
+            let turned = Quat::from_axis_angle(up, across as f32 * STEP) * forward;
+            let direction = (turned + up * (upwards as f32 * STEP)).normalize();
             // Into the open is nothing to look at.
-            let (l, t) = light.lit(&Ray::new(eye, direction)).unwrap_or((LIT, 0.1 * far));
-            score += l * t.min(far) / 15.0;
-            lit += l / 15.0;
+            let ray = Ray::new(eye, direction);
+            let (l, t) = light.lit(&ray).unwrap_or((LIT, 0.0));
+            score += l * t / (t + far) / count;
+            lit += l / count;
+            if t > 0.0 {
+                let normal = scene.normal(scene.intersect_raw(&ray).triangle);
+                kinds.push(((2.0 * (t / far).log2()) as i32, (2.0 * normal).round().as_ivec3().to_array()));
+            }
         }
-        (forward, score, lit)
+        kinds.sort_unstable();
+        kinds.dedup();
+        (forward, score * kinds.len() as f32 / count, lit)
     };
     let views = (0..DIRECTIONS).map(|i| score(TAU * i as f32 / DIRECTIONS as f32));
     views.max_by(|a, b| a.1.total_cmp(&b.1)).unwrap_or((level, 0.0, 0.0))
