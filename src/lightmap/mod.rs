@@ -456,7 +456,7 @@ impl Light {
 
 /// Light maps of a scene: layout, texels and, after [`bake`](Lightmap::bake), light.
 pub struct Lightmap {
-    atlas: Arc<Atlas>,
+    pub(in crate::lightmap) atlas: Arc<Atlas>,
     plan: Plan,
     light: Option<Light>,
 }

@@ -12,7 +12,8 @@
 //!
 //! Points lie on the chart: each on whichever triangle of the chart covers it, with that triangle's normals. Points
 //! inside solids, in cut-outs, or behind a wall that stands on the texel do not count: the light of the other room
-//! would leak in.
+//! would leak in. If all points lie inside solids, as in a texel of which a strip looks out from under a block, the
+//! texel's sample alone is lit.
 //!
 //! The data used of neighbours is a function of their numbers alone, so that shards of a bake and tiles of live
 //! updates, which recompute it, have the same bits. The shadow rays of a [tile](super::tiles) are traced together,
@@ -26,6 +27,7 @@ use super::atlas::chart_index::ChartIndex;
 use super::atlas::chart_map::{ChartMap, receiver_of};
 use super::atlas::charts::Charts;
 use super::atlas::ids::{Map, TexelId};
+use super::atlas::seen::Seen;
 use super::atlas::texels::TexelSample;
 use crate::base::directional::Directional;
 use crate::base::error::Result;
@@ -54,13 +56,14 @@ pub(crate) struct TexelAreas<'a, M: Map> {
     pub scene: &'a Scene,
     pub charts: &'a Charts,
     pub index: &'a ChartIndex,
+    pub seen: &'a Seen,
     pub map: &'a ChartMap<M>,
 }
 
 impl Atlas {
     /// Returns the texels of one of the maps as areas.
     pub(crate) fn areas<'a, M: Map>(&'a self, map: &'a ChartMap<M>) -> TexelAreas<'a, M> {
-        TexelAreas { scene: &self.scene, charts: &self.charts, index: &self.index, map }
+        TexelAreas { scene: &self.scene, charts: &self.charts, index: &self.index, seen: &self.seen, map }
     }
 }
 
@@ -81,6 +84,55 @@ impl<M: Map> TexelAreas<'_, M> {
         let chart = self.charts.chart_of(own.triangle);
         let point = self.index.locate(self.charts, chart, local.into(), own.triangle)?;
         (!self.scene.is_hole(point.triangle, point.u, point.v)).then_some(point)
+    }
+
+    /// Whether a hit is on a surface from inside a solid: on the back of a one-sided surface, or on a side that is seen
+    /// from no open place.
+    fn is_inner(&self, hit: &RawHit) -> bool {
+        !hit.is_miss()
+            && (self.seen.is_hidden(self.charts.chart_of(hit.triangle), hit.front)
+                || !hit.front && {
+                    let material = self.scene.material(hit.triangle);
+                    !material.two_sided && !material.transmits()
+                })
+    }
+
+    /// Whether a point lies inside a solid: the rays straight up and to four sides all hit its surface from inside.
+    /// (The ray straight up alone may hit the back of a single sheet, such as a table top, below which there is light.)
+    fn is_buried(&self, point: &Point, rays: &mut u64) -> bool {
+        let Receiver { origin, geometric, .. } = point.receiver;
+        let (x, y) = orthonormal_basis(geometric);
+        point.may_be_buried
+            && [Vec3::ZERO, x, -x, y, -y].into_iter().all(|aside| {
+                *rays += 1;
+                self.is_inner(&self.scene.intersect_raw(&Ray::new(origin, geometric + aside)))
+            })
+    }
+
+    /// Adds the light of the points that are not inside of solids, by their weights; returns the sum of the weights.
+    /// Only unlit points are tested; if all are unlit, the first one for all.
+    fn add_to(
+        &self,
+        points: &[Point],
+        sum: &mut PointLight,
+        weight: impl Fn(&TexelSample) -> Vec3,
+        rays: &mut u64,
+    ) -> Vec3 {
+        let is_lit = points.iter().any(|p| !p.light.is_dark());
+        if !is_lit && points.first().is_some_and(|p| self.is_buried(p, rays)) {
+            return Vec3::ZERO;
+        }
+        let mut n = Vec3::ZERO;
+        for point in points {
+            let Point { on, light, .. } = point;
+            if is_lit && light.is_dark() && self.is_buried(point, rays) {
+                continue;
+            }
+            let weight = weight(on);
+            sum.add(light, weight);
+            n += weight;
+        }
+        n
     }
 
     /// Returns the texels [around](AROUND) a texel in the same placement, where there are any.
@@ -189,28 +241,28 @@ impl TilePoints {
     }
 
     /// Traces the rays straight up from unlit points beside lit ones, in the first `texels` of the tile, which tell that
-    /// nearly none of them is [buried](is_buried).
-    fn look_up(&mut self, texels: usize, scene: &Scene, rays: &mut u64) {
+    /// nearly none of them is [buried](TexelAreas::is_buried). Of texels without any lit point the first point tells
+    /// it for all.
+    fn look_up<M: Map>(&mut self, texels: usize, areas: &TexelAreas<M>, rays: &mut u64) {
         self.pending.clear();
         self.rays_up.clear();
         for (i, &count) in self.counts[..texels].iter().enumerate() {
             let points = i * MAX_POINTS..i * MAX_POINTS + count;
-            if self.points[points.clone()].iter().all(|p| p.light.is_dark()) {
-                continue;
-            }
-            for place in points.filter(|&place| self.points[place].light.is_dark()) {
+            let all_are_dark = self.points[points.clone()].iter().all(|p| p.light.is_dark());
+            let few = if all_are_dark { 1 } else { count };
+            for place in points.filter(|&place| self.points[place].light.is_dark()).take(few) {
                 let Receiver { origin, geometric, .. } = self.points[place].receiver;
                 self.rays_up.push(Ray::new(origin, geometric));
                 self.pending.push(place as u32);
             }
         }
         match self.rays_up.len() < LEAST_STREAM {
-            true => scene.intersect_block(&self.rays_up, &mut self.hits_up),
-            false => scene.intersect_stream(&self.rays_up, &mut self.hits_up),
+            true => areas.scene.intersect_block(&self.rays_up, &mut self.hits_up),
+            false => areas.scene.intersect_stream(&self.rays_up, &mut self.hits_up),
         }
         *rays += self.rays_up.len() as u64;
         for (&place, hit) in self.pending.iter().zip(&self.hits_up) {
-            self.points[place as usize].may_be_buried = is_back(scene, hit);
+            self.points[place as usize].may_be_buried = areas.is_inner(hit);
         }
     }
 
@@ -278,52 +330,9 @@ fn differ(a: Vec3, b: Vec3, part: f32) -> bool {
     (a - b).abs().max_element() > part * a.max_element().max(b.max_element())
 }
 
-/// Whether a hit is on the back of a one-sided surface.
-fn is_back(scene: &Scene, hit: &RawHit) -> bool {
-    !hit.is_miss() && !hit.front && {
-        let material = scene.material(hit.triangle);
-        !material.two_sided && !material.transmits()
-    }
-}
-
-/// Whether a point lies inside a solid: the rays straight up and to four sides all hit backs of one-sided surfaces.
-/// (The ray straight up alone may hit the back of a single sheet, such as a table top, below which there is light.)
-fn is_buried(scene: &Scene, point: &Point, rays: &mut u64) -> bool {
-    let Receiver { origin, geometric, .. } = point.receiver;
-    let (x, y) = orthonormal_basis(geometric);
-    point.may_be_buried
-        && [Vec3::ZERO, x, -x, y, -y].into_iter().all(|aside| {
-            *rays += 1;
-            is_back(scene, &scene.intersect_raw(&Ray::new(origin, geometric + aside)))
-        })
-}
-
 /// Whether a part of the light of points differs between them.
 fn vary(points: &[Point], what: impl Fn(&PointLight) -> Vec3, part: f32) -> bool {
     points.iter().any(|p| differ(what(&p.light), what(&points[0].light), part))
-}
-
-/// Adds the light of the points that are not inside of solids, by their weights; returns the sum of the weights. Only
-/// unlit points beside lit ones are tested, since others make no difference.
-fn add_to(
-    points: &[Point],
-    scene: &Scene,
-    sum: &mut PointLight,
-    weight: impl Fn(&TexelSample) -> Vec3,
-    rays: &mut u64,
-) -> Vec3 {
-    let is_lit = points.iter().any(|p| !p.light.is_dark());
-    let mut n = Vec3::ZERO;
-    for point in points {
-        let Point { on, light, .. } = point;
-        if is_lit && light.is_dark() && is_buried(scene, point, rays) {
-            continue;
-        }
-        let weight = weight(on);
-        sum.add(light, weight);
-        n += weight;
-    }
-    n
 }
 
 #[cfg(test)]

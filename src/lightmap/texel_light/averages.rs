@@ -1,7 +1,7 @@
 //! Direct light of texels of the light map: light without penumbrae at their samples, whether it varies, and averages
 //! of points.
 
-use super::{AROUND, FEW, MAX_POINTS, Point, TexelLight, TilePoints, Wanted, add_to, differ, vary};
+use super::{AROUND, FEW, MAX_POINTS, Point, TexelLight, TilePoints, Wanted, differ, vary};
 use crate::base::directional::Directional;
 use crate::base::sampling::combine;
 use crate::direct::Receiver;
@@ -125,7 +125,7 @@ impl TexelLight<'_, LightMap> {
         }
         let more = texels.iter().enumerate().filter(|(i, _)| goes_on[*i]);
         tile.light(self, more.filter_map(|(i, t)| wanted(i, t, FEW..MAX_POINTS as u32)), rays);
-        tile.look_up(texels.len(), self.areas.scene, rays);
+        tile.look_up(texels.len(), &self.areas, rays);
         for (i, t) in texels.iter().enumerate() {
             let mut directional = t.sharp_directional;
             let e = match lights_of(t.variation) {
@@ -152,9 +152,9 @@ impl TexelLight<'_, LightMap> {
             _ => without_other_rooms(points, scene, &t.receiver, sharp, rays),
         };
         let mut sum = PointLight::default();
-        let n = add_to(points, scene, &mut sum, |_| Vec3::ONE, rays);
+        let n = self.areas.add_to(points, &mut sum, |_| Vec3::ONE, rays);
         if n == Vec3::ZERO {
-            // All points miss a small part of a chart: its sample alone is lit.
+            // All points miss a small part of a chart, or lie inside solids: the sample alone is lit.
             let seed = combine(self.seed, t.texel.seed());
             if directional.is_empty() {
                 return sharp + self.direct.at_point(&t.receiver, Lights::Soft, self.samples, seed, rays).value();

@@ -1,6 +1,6 @@
 //! Direct light of texels of the radiance map: a first look by a few points, and a closer one where it varies.
 
-use super::{FEW, MAX_POINTS, Point, TexelLight, TilePoints, Wanted, add_to, differ, vary};
+use super::{FEW, MAX_POINTS, Point, TexelLight, TilePoints, Wanted, differ, vary};
 use crate::base::sampling::combine;
 use crate::direct::direct_light::{Lights, PointLight};
 use crate::lightmap::atlas::ids::{PerTexel, RadianceMap, RadianceTexel};
@@ -40,21 +40,18 @@ impl TexelLight<'_, RadianceMap> {
         let (scene, map) = (self.areas.scene, self.areas.map);
         tile.clear();
         tile.light(self, texels.iter().enumerate().map(|(i, &texel)| self.all_of(i, texel, 0..FEW)), rays);
-        tile.look_up(texels.len(), scene, rays);
+        tile.look_up(texels.len(), &self.areas, rays);
         for (i, &texel) in texels.iter().enumerate() {
             let (mut sum, points) = (PointLight::default(), tile.of(i));
-            let mut n = add_to(points, scene, &mut sum, |_| Vec3::ONE, rays);
-            if points.is_empty() {
+            let mut n = self.areas.add_to(points, &mut sum, |_| Vec3::ONE, rays);
+            let missing = (points.len() as f32 - n.x).max(if n == Vec3::ZERO { 1.0 } else { 0.0 });
+            if missing > 0.0 {
+                // Few rays are left: those of the points inside solids go from the sample.
                 let seed = combine(self.seed, texel.seed());
-                let (on, receiver) = (map[texel], map.receiver(scene, texel, map.is_back(texel)).1);
+                let receiver = map.receiver(scene, texel, map.is_back(texel)).1;
                 let light = self.direct.at_point(&receiver, Lights::All, self.samples, seed, rays);
-                n = add_to(
-                    &[Point { on, receiver, light, place: 0, may_be_buried: true }],
-                    scene,
-                    &mut sum,
-                    |_| Vec3::ONE,
-                    rays,
-                );
+                sum.add(&light, Vec3::splat(missing));
+                n += missing;
             }
             let varies =
                 vary(points, PointLight::narrow, DIFFERENCE) || vary(points, PointLight::unoccluded_areas, DIFFERENCE);
@@ -84,7 +81,6 @@ impl TexelLight<'_, RadianceMap> {
         rays: &mut u64,
         mut out: impl FnMut(usize, Option<Vec3>),
     ) {
-        let scene = self.areas.scene;
         let weight = |t: &TexelSample| albedo(t).max(Vec3::splat(f32::MIN_POSITIVE));
         let (mut sums, mut weights) = ([PointLight::default(); TILE], [Vec3::ZERO; TILE]);
         // Texels that go on after the first round of points.
@@ -94,9 +90,9 @@ impl TexelLight<'_, RadianceMap> {
             let wanted = texels.iter().enumerate().filter(|(i, _)| has_spikes[*i]);
             tile.clear();
             tile.light(self, wanted.map(|(i, &texel)| self.all_of(i, texel, numbers.clone())), rays);
-            tile.look_up(texels.len(), scene, rays);
+            tile.look_up(texels.len(), &self.areas, rays);
             for i in (0..texels.len()).filter(|&i| has_spikes[i]) {
-                weights[i] += add_to(tile.of(i), scene, &mut sums[i], weight, rays);
+                weights[i] += self.areas.add_to(tile.of(i), &mut sums[i], weight, rays);
             }
             if begin == 0 {
                 for (i, has_spikes) in has_spikes.iter_mut().enumerate() {

@@ -2,6 +2,7 @@
 
 use super::*;
 use crate::base::progress::Progress;
+use crate::direct::direct_light::DirectLight;
 use crate::lightmap::{BakeParams, Lightmap, LightmapDesc};
 use crate::scene::demo::shapes::MeshBuilder;
 use crate::scene::{Light, Material, SceneData, builtin};
@@ -154,4 +155,30 @@ fn the_radiance_map_has_the_energy_of_a_patch_of_sun_smaller_than_its_texels() {
         let energy = sum * std::f32::consts::PI / 0.5 / 4.0;
         assert!((energy / (2.0 * 0.1) - 1.0).abs() < 0.03, "{energy} instead of 0.2, edge {edge}");
     }
+}
+
+/// Texels of the floor of a box with two blocks on it, of which strips look out from under the blocks.
+#[test]
+fn what_lies_under_a_block_does_not_darken_texels_beside_it() {
+    let scene = builtin("cornell").unwrap().committed();
+    let lightmap = created(&scene, 40.0);
+    let atlas = lightmap.atlas();
+    let direct = DirectLight::new(&scene);
+    let light = TexelLight { areas: atlas.areas(&atlas.radiance), direct: &direct, samples: 16, seed: 3 };
+    let (mut dark, mut lit) = (0, 0);
+    for texel in atlas.radiance.all() {
+        let (point, receiver) = atlas.radiance.receiver(&scene, texel, false);
+        if point.position.y > 0.01 {
+            continue;
+        }
+        let own = direct.irradiance(&receiver, 16, 5, &mut 0);
+        let mut tile = TilePoints::new(1).unwrap();
+        light.first_look(&[texel], &mut tile, &mut 0, |_, look| {
+            if own.x > 0.1 && look.irradiance.x < 0.2 * own.x {
+                dark += 1;
+            }
+            lit += u32::from(own.x > 0.1);
+        });
+    }
+    assert!(lit > 1000 && dark == 0, "{dark} of {lit}");
 }
