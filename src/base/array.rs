@@ -28,8 +28,8 @@ impl Mapping {
     }
 }
 
-/// A slice that owns its memory: all of an allocation, as a `Vec` without its methods to grow, or a part of a [`Mapping`].
-/// To read, neither is slower than a slice.
+/// A slice that owns its memory: all of an allocation, as a `Vec` without its methods to grow, or a part of a file that
+/// is mapped. To read, neither is slower than a slice.
 pub struct Array<T> {
     start: NonNull<T>,
     len: usize,
