@@ -4,10 +4,10 @@
 //! inside if most rays from it meet something, on the front where materials are one-sided, and there
 //! is a level floor below. From each inside eye the level directions with the longest free views over
 //! lit surfaces are scored by the mean of length times light in a bundle of rays as wide as the
-//! picture, and by how many kinds of surface these meet: a bare wall is nothing to look at. The best
-//! view with some air round the eye and little open sky wins. If no inside eye sees light, or the eye
-//! is in a hollow object that is far brighter outside, the scene is an object: it is looked at from
-//! outside, from where most of it is lit.
+//! picture, by how far its middle goes, and by how many kinds of surface these meet: a bare wall is
+//! nothing to look at. The best view with some air round the eye and little open sky wins. If no
+//! inside eye sees light, or the eye is in a hollow object that is far brighter outside, the scene is
+//! an object: it is looked at from outside, from where most of it is lit.
 
 use bakelite::Scene;
 use bakelite::lightmap::{Layer, Lightmap};
@@ -183,7 +183,7 @@ fn best_view(scene: &Scene, up: Vec3, eye: Vec3, light: &Brightness) -> (Vec3, f
     let count = ((2 * ACROSS + 1) * (2 * UPWARDS + 1)) as f32;
     let score = |azimuth: f32| -> (Vec3, f32, f32) {
         let forward = Quat::from_axis_angle(up, azimuth) * level;
-        let (mut score, mut lit) = (0.0, 0.0);
+        let (mut score, mut lit, mut middle) = (0.0, 0.0, 0.0);
         // A ray's kind of surface: which way it faces, and how far away it is, in halves of octaves.
         let mut kinds = Vec::new();
         for (across, upwards) in (-ACROSS..=ACROSS).flat_map(|a| (-UPWARDS..=UPWARDS).map(move |u| (a, u))) {
@@ -193,6 +193,8 @@ fn best_view(scene: &Scene, up: Vec3, eye: Vec3, light: &Brightness) -> (Vec3, f
             let ray = Ray::new(eye, direction);
             let (l, t) = light.lit(&ray).unwrap_or((LIT, 0.0));
             score += l * t / (t + far) / count;
+            // What is in the middle is looked at: not a pillar just in front.
+            middle += if across.abs() <= 1 && upwards.abs() <= 1 { t / (t + far) } else { 0.0 };
             lit += l / count;
             if t > 0.0 {
                 let normal = scene.normal(scene.intersect_raw(&ray).triangle);
@@ -201,7 +203,7 @@ fn best_view(scene: &Scene, up: Vec3, eye: Vec3, light: &Brightness) -> (Vec3, f
         }
         kinds.sort_unstable();
         kinds.dedup();
-        (forward, score * kinds.len() as f32 / count, lit)
+        (forward, score * middle * kinds.len() as f32 / count, lit)
     };
     let views = (0..DIRECTIONS).map(|i| score(TAU * i as f32 / DIRECTIONS as f32));
     views.max_by(|a, b| a.1.total_cmp(&b.1)).unwrap_or((level, 0.0, 0.0))
