@@ -84,7 +84,7 @@ static void trace(const bk_scene *scene, bk_hit hits[RAYS]) {
         ray->tmax = INFINITY;
     }
     memset(hits, 0, RAYS * sizeof hits[0]);
-    CHECK_OK(bk_intersect_many(scene, rays, hits, RAYS, 0));
+    CHECK_OK(bk_intersect_many(scene, rays, RAYS, 0, hits));
 }
 
 static float *baked(const bk_scene *scene, float *pixels) {
