@@ -350,7 +350,9 @@ fn instances(w: &W, s: &mut Source) {
         let (mesh, transform) = (s.index(), transform(s));
         let mut id = 0;
         let result = ask!(bk_scene_add_instance(scene.p(), mesh, transform.as_ptr(), &mut id));
-        if result == BK_OK && id >= bk!(bk_scene_instance_count(scene.p())) {
+        // 0: another thread has begun to commit the scene, or to load a file.
+        let count = bk!(bk_scene_instance_count(scene.p()));
+        if result == BK_OK && count > 0 && id >= count {
             broken("an instance's number is not below their count");
         }
     }
