@@ -16,7 +16,7 @@ use crate::base::error::Result;
 use crate::base::memory::{try_append, try_collect, try_filled, try_par_gather, try_push, try_with_capacity};
 use crate::base::progress::Stage;
 use crate::scene::Scene;
-use glam::{DVec2, DVec3};
+use glam::DVec3;
 
 /// Maximum number of triangles in a part, unless they are one flat region. Large enough that few charts are cut at part
 /// borders, small enough that parts keep many threads busy and a cancel is seen in time.
@@ -288,14 +288,14 @@ const MAX_AREA_DISTORTION: f32 = 2.0;
 /// Reads the charts of an atlas whose texels are `texel` scene units wide.
 #[cfg(feature = "unwrap")]
 fn read_charts(geometry: &Geometry, atlas: &uvunwrap::Atlas, texel: f64) -> (Vec<Piece>, Vec<bool>) {
-    let unit = DVec2::new(atlas.width as f64, atlas.height as f64) * texel;
+    let unit = glam::DVec2::new(atlas.width as f64, atlas.height as f64) * texel;
     let empty = || Piece { triangles: Vec::new(), corners: Vec::new(), given: None };
     let mut pieces: Vec<Piece> = (0..atlas.chart_count).map(|_| empty()).collect();
     let mut left = vec![false; geometry.triangles.len()];
     let mesh = &atlas.meshes[0];
     for (t, corners) in mesh.indices.chunks_exact(3).enumerate() {
         let corners = [0, 1, 2].map(|k| mesh.vertices[corners[k] as usize]);
-        let local = corners.map(|v| DVec2::from_array(v.uv.map(f64::from)) * unit);
+        let local = corners.map(|v| glam::DVec2::from_array(v.uv.map(f64::from)) * unit);
         let [a, b, c] = local;
         // Triangles without a chart are degenerate in UV space, at a point of some chart.
         match corners[0].chart {
