@@ -47,7 +47,7 @@ impl Entry {
         Ok(Some(Entry { path, part, triangles: indices.len(), farthest }))
     }
 
-    /// Returns the part's charts and marks their triangles, if they are known; `numbers` are the global ones.
+    /// Returns the charts of the part, whose triangles have these global numbers; `None` if they are not known.
     pub fn load(&self, numbers: &[u32]) -> Result<Option<Vec<Piece>>> {
         // Per triangle a chart of its own at most: its size, its number and its corners.
         let most = self.part.len() + 4 + self.triangles * (4 + 4 + 24) + 4;

@@ -207,7 +207,8 @@ impl File {
         }) {
             return Err(damaged(path, "a tree in it is none"));
         }
-        let gone = own.gone as usize + of_meshes.iter().map(|t| t.gone).sum::<usize>();
+        let own_gone = own.gone.min(data.own_triangles as u64) as usize;
+        let gone = own_gone + of_meshes.iter().map(|t| t.gone).sum::<usize>();
         let instances = match of_meshes.is_empty() {
             true => None,
             false => Some(instance_trees::place(&data, &first_triangle, of_meshes, &Progress::none())?),
