@@ -132,6 +132,7 @@ impl Entry {
 #[cfg(test)]
 mod tests {
     use super::*;
+    use crate::base::files::Folder;
     use crate::base::progress::Progress;
     use crate::bvh::BuildOptions;
     use crate::device::DeviceOptions;
@@ -143,27 +144,8 @@ mod tests {
     use std::path::Path;
     use std::sync::Arc;
 
-    /// A folder of one test, removed at its end.
-    struct Folder(PathBuf);
-
-    impl Folder {
-        fn new(name: &str) -> Folder {
-            let path = std::env::temp_dir().join(format!("bakelite-cache-{}-{name}", std::process::id()));
-            let _ = std::fs::remove_dir_all(&path);
-            Folder(path)
-        }
-
-        fn files(&self) -> Vec<PathBuf> {
-            let mut files: Vec<_> = std::fs::read_dir(&self.0).unwrap().map(|e| e.unwrap().path()).collect();
-            files.sort();
-            files
-        }
-    }
-
-    impl Drop for Folder {
-        fn drop(&mut self) {
-            let _ = std::fs::remove_dir_all(&self.0);
-        }
+    fn files(folder: &Folder) -> Vec<PathBuf> {
+        folder.names().iter().map(|name| folder.0.join(name)).collect()
     }
 
     fn ground(shift: f32) -> Mesh {
@@ -189,25 +171,25 @@ mod tests {
 
     #[test]
     fn what_has_not_changed_is_not_unwrapped_again() {
-        let folder = Folder::new("same");
+        let folder = Folder::new("unwraps-same");
         let without = charts(None, 50.0).0;
         assert!(charts(Some(&folder.0), 50.0).0 == without, "a first run");
-        let files = folder.files();
+        let first = files(&folder);
         let times =
             |files: &[PathBuf]| files.iter().map(|f| f.metadata().unwrap().modified().unwrap()).collect::<Vec<_>>();
-        let written = times(&files);
-        assert_eq!(files.len(), 2);
-        assert!(charts(Some(&folder.0), 50.0).0 == without && times(&folder.files()) == written, "a second run");
+        let written = times(&first);
+        assert_eq!(first.len(), 2);
+        assert!(charts(Some(&folder.0), 50.0).0 == without && times(&files(&folder)) == written, "a second run");
         // One of two has moved.
         assert!(charts(Some(&folder.0), 60.0).0 == charts(None, 60.0).0);
-        assert!(folder.files().len() == 3 && times(&files) == written);
+        assert!(files(&folder).len() == 3 && times(&first) == written);
     }
 
     #[test]
     fn damaged_files_count_as_missing_and_are_made_anew() {
-        let folder = Folder::new("damaged");
+        let folder = Folder::new("unwraps-damaged");
         let without = charts(Some(&folder.0), 50.0).0;
-        for path in folder.files() {
+        for path in files(&folder) {
             let whole = std::fs::read(&path).unwrap();
             let changes: [fn(&mut Vec<u8>); 6] = [
                 |f| f.clear(),
@@ -231,7 +213,7 @@ mod tests {
 
     #[test]
     fn charts_that_cannot_be_are_refused_though_the_checksum_fits() {
-        let folder = Folder::new("forged");
+        let folder = Folder::new("unwraps-forged");
         let (_, scene) = charts(Some(&folder.0), 50.0);
         let numbers: Vec<u32> = (0..scene.triangle_count() / 2).collect();
         let progress = Progress::none();
@@ -269,9 +251,9 @@ mod tests {
 
     #[test]
     fn a_folder_that_cannot_be_made_is_no_error() {
-        let folder = Folder::new("file");
-        std::fs::write(&folder.0, "a file").unwrap();
-        assert!(charts(Some(&folder.0.join("x")), 50.0).0 == charts(None, 50.0).0);
-        std::fs::remove_file(&folder.0).unwrap();
+        let folder = Folder::new("unwraps-file");
+        let file = folder.0.join("file");
+        std::fs::write(&file, "a file").unwrap();
+        assert!(charts(Some(&file.join("x")), 50.0).0 == charts(None, 50.0).0);
     }
 }
