@@ -478,7 +478,7 @@ BK_API bk_result bk_scene_commit(bk_scene *scene, bk_progress_fn progress, void 
 /// Triangles that become degenerate or not finite are not hit while they are; those that were so at
 /// the commit are never hit. Light maps, photon maps and live objects that were made before keep
 /// the old geometry (the scene is copied if there are any, else changed in place) and still follow
-/// the scene's lights. Pointers from bk_scene_get_mesh become invalid.
+/// the scene's lights; bk_lightmap_follow updates a light map. Pointers from bk_scene_get_mesh become invalid.
 ///
 /// Cost: a tenth to a fifth of the time of a commit, on the device's threads; if there is a copy,
 /// more.
@@ -488,7 +488,8 @@ BK_API bk_result bk_scene_commit(bk_scene *scene, bk_progress_fn progress, void 
 ///   be hit, or another thread queries or changes the scene; the positions wait for the next refit
 /// @retval BK_ERROR_OUT_OF_MEMORY  the memory callback refuses the copy; the positions wait for the
 ///   next refit
-BK_API bk_result bk_scene_refit(bk_scene *scene);
+BK_API
+bk_result bk_scene_refit(bk_scene *scene);
 
 /// Sets `struct_size` and clears the other fields.
 ///
@@ -1640,7 +1641,8 @@ BK_API void bk_lightmap_desc_init(bk_lightmap_desc *desc);
 /// Creates a light map of a committed scene: meshes with light map coordinates keep them, the
 /// others are unwrapped, and texels are mapped to triangles, on the device's threads.
 ///
-/// The light map keeps the geometry of the scene as it is now, and follows its lights. Logs a
+/// The light map keeps the geometry of the scene as it is now until bk_lightmap_follow, and follows
+/// its lights. Logs a
 /// warning if the scene lies so far from the origin that rays start more than a quarter of a texel
 /// above surfaces (32 rounding steps of its coordinates).
 ///
@@ -1664,6 +1666,32 @@ bk_result bk_lightmap_create(const bk_scene *scene,
                              bk_progress_fn progress,
                              void *user,
                              bk_lightmap **out);
+
+/// Updates a light map to the geometry of its scene after bk_scene_refit. Charts, pages and UVs
+/// stay as they are, and so do an engine's vertex buffers. Without this call the light map keeps
+/// the old geometry.
+///
+/// Buried texels are searched again around moved surfaces; the sides of two-sided surfaces that
+/// have texels, and the density of texels, stay as they were at bk_lightmap_create. The light stays
+/// until the next bake; bk_bake_changed bakes it where it has changed. Until then the light map
+/// keeps the scene in both states in memory. Live objects made before keep the old geometry.
+///
+/// Cost: half a second per million texels and thread. Does nothing if the light map has the state
+/// of the scene already.
+///
+/// @param lightmap  any light map of the scene
+/// @param scene  the scene from which the light map was created, after a refit
+/// @param progress,user  progress callback and its pointer; may be NULL
+/// @retval BK_ERROR_INVALID_ARGUMENT  the light map is of another scene
+/// @retval BK_ERROR_INVALID_STATE  the scene is being refitted, or another call is using the light
+///   map
+/// @retval BK_ERROR_OUT_OF_MEMORY  the texels do not fit, or the memory callback refuses
+/// @retval BK_ERROR_CANCELLED  the progress callback returned 0
+BK_API
+bk_result bk_lightmap_follow(bk_lightmap *lightmap,
+                             const bk_scene *scene,
+                             bk_progress_fn progress,
+                             void *user);
 
 /// Saves charts and texels of a light map, but no light, to be loaded by bk_lightmap_load_layout
 /// where the same scene is lit again.
@@ -2085,6 +2113,8 @@ typedef struct bk_bake_stats {
   double error;
   /// Number of passes. Seconds, rays and photons above are sums over them.
   uint64_t passes;
+  /// Number of texels that kept all of their light; 0 unless bk_bake_changed baked.
+  uint64_t kept_texels;
 } bk_bake_stats;
 
 /// Sets `struct_size` and fills in the defaults.
@@ -2140,6 +2170,42 @@ bk_result bk_bake(bk_lightmap *lightmap,
                   bk_progress_fn progress,
                   void *user,
                   bk_bake_stats *out);
+
+/// Bakes a light map again where its light has changed, after lights were set (bk_scene_set_light)
+/// or the scene has moved (bk_lightmap_follow).
+///
+/// Photons and the radiance map are made anew. Indirect light is computed again around moved
+/// surfaces, and where probes find it changed: rays from one or two texels of every 8 x 8 texels of
+/// the gather map, traced in the scene before and after. Direct light is computed again where a
+/// moved surface lies, or lay, in the way to a light, and everywhere if a light was set or an
+/// emissive surface moved. These texels get the bits that bk_bake gives them; the others keep their
+/// light. If there is no light yet, or the last bake had other parameters, everything is baked.
+/// bk_bake_stats.kept_texels and bk_plan_describe report how much was kept.
+///
+/// Each call may leave an error of `keep_error`, and these errors add up: use bk_bake for final
+/// light.
+///
+/// Cost: photons, radiance map and seams as in a bake; of the other stages the part that changed.
+/// Measured: docs/performance.md, "Edits".
+///
+/// @param lightmap  any light map
+/// @param params  parameters of the last bake, without a range of texels, checkpoint and
+///   target_error; NULL for the defaults
+/// @param keep_error  change of light below which texels keep it, as a fraction of their irradiance
+///   or, if that is more, of a tenth of the mean irradiance; finite, >= 0. 0.03 is hard to see
+/// @param progress,user  progress callback and its pointer; may be NULL
+/// @param out  receives numbers about the bake; may be NULL
+/// @retval BK_ERROR_INVALID_ARGUMENT  `keep_error` or a field of `params` is out of its range
+/// @retval BK_ERROR_INVALID_STATE  another call is using the light map
+/// @retval BK_ERROR_OUT_OF_MEMORY  `memory_budget` is exceeded or the memory callback refuses
+/// @retval BK_ERROR_CANCELLED  the progress callback returned 0
+BK_API
+bk_result bk_bake_changed(bk_lightmap *lightmap,
+                          const bk_bake_params *params,
+                          float keep_error,
+                          bk_progress_fn progress,
+                          void *user,
+                          bk_bake_stats *out);
 
 /// Writes a text about the last bake, one line per stage: whether it ran or was left out, and why.
 /// Before the first bake the text is about a bake with default parameters.

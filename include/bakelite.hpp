@@ -512,6 +512,18 @@ public:
         const bk_result code = bk_bake(get(), &params, progress.function(), progress.user(), &stats);
         return detail::finish(progress.after(code), stats);
     }
+    /// Updates the geometry after a refit of the scene; charts and UVs stay.
+    Result<void> follow(const Scene &scene, const Progress &progress = {}) {
+        return detail::finish(
+            progress.after(bk_lightmap_follow(get(), scene.get(), progress.function(), progress.user())));
+    }
+    /// Bakes what has changed since the last bake, which had the same parameters.
+    Result<BakeStats> bake_changed(const BakeParams &params, float keep_error, const Progress &progress = {}) {
+        BakeStats stats;
+        const bk_result code =
+            bk_bake_changed(get(), &params, keep_error, progress.function(), progress.user(), &stats);
+        return detail::finish(progress.after(code), stats);
+    }
     /// The plan of the last bake as text.
     std::string plan() const {
         std::string text(bk_plan_describe(get(), nullptr, 0), '\0');

@@ -151,6 +151,9 @@ static void bake(const Scene &scene) {
     CHECK_FAILS(map.read(0, BK_LAYER_COMBINED, BK_FORMAT_RGBA16F, halves), BK_ERROR_INVALID_ARGUMENT, "page of this format");
     const MeshUvs uvs = VALUE(map.mesh_uvs(scene, 0));
     CHECK(uvs.corners.size() == 12 && uvs.pages.size() == 2 && uvs.pages[1] == 0);
+    VALUE(map.follow(scene));
+    CHECK_FAILS(map.bake_changed({}, -1), BK_ERROR_INVALID_ARGUMENT, "keep_error");
+    VALUE(map.bake_changed({}, 0.1f));
     CHECK(map.plan().find("direct") != std::string::npos && map.plan().back() != '\0');
 
     Live live = VALUE(Live::create(map));

@@ -354,6 +354,8 @@ pub struct bk_bake_stats {
     pub error: f64,
     /// Number of passes. Seconds, rays and photons above are sums over them.
     pub passes: u64,
+    /// Number of texels that kept all of their light; 0 unless bk_bake_changed baked.
+    pub kept_texels: u64,
 }
 
 sized_struct!(bk_bake_stats, defaults: stats(&Default::default()));
@@ -379,6 +381,7 @@ fn stats(s: &BakeStats) -> bk_bake_stats {
         seam_seconds: s.seam_seconds,
         error: s.error,
         passes: s.passes.into(),
+        kept_texels: s.kept_texels,
     }
 }
 
@@ -434,35 +437,8 @@ pub unsafe extern "C" fn bk_bake(
     call(|| unsafe {
         refuse_in_callback()?;
         let lightmap = hold(lightmap, "lightmap")?;
-        let p: bk_bake_params = if params.is_null() { SizedStruct::defaults() } else { read_struct(params, "params")? };
+        let (params, checkpoint) = core_params(params)?;
         let out = OutStruct::optional(out, "out")?;
-        let directional = read_directional(p.directional_indirect, p.directional_direct)?;
-        let params = BakeParams {
-            photon_count: p.photon_count,
-            max_bounces: p.max_bounces,
-            gather_rays: p.gather_rays,
-            radius: p.radius,
-            near_hits: p.near_hits,
-            interpolation_error: p.interpolation_error,
-            own_rays: p.own_rays,
-            blur_radius: p.blur_radius,
-            direct_samples: p.direct_samples,
-            seed: p.seed,
-            memory_budget: p.memory_budget,
-            texel_begin: p.texel_begin,
-            texel_end: p.texel_end,
-            stitch: read_bool(p.stitch, "stitch")?,
-            directional,
-            passes: p.passes,
-            target_error: p.target_error,
-        };
-        let checkpoint = match p.checkpoint.is_null() {
-            true => None,
-            false => Some(CheckpointParams {
-                path: text(p.checkpoint, "checkpoint")?.into(),
-                seconds: p.checkpoint_seconds.into(),
-            }),
-        };
         let progress = self::progress(progress, user);
         let done = lightmap.change(|l| l.bake_with(&params, checkpoint.as_ref(), &progress))?;
         if let Some(out) = out {
@@ -470,6 +446,98 @@ pub unsafe extern "C" fn bk_bake(
         }
         Ok(())
     })
+}
+
+/// Bakes a light map again where its light has changed, after lights were set (bk_scene_set_light)
+/// or the scene has moved (bk_lightmap_follow).
+///
+/// Photons and the radiance map are made anew. Indirect light is computed again around moved
+/// surfaces, and where probes find it changed: rays from one or two texels of every 8 x 8 texels of
+/// the gather map, traced in the scene before and after. Direct light is computed again where a
+/// moved surface lies, or lay, in the way to a light, and everywhere if a light was set or an
+/// emissive surface moved. These texels get the bits that bk_bake gives them; the others keep their
+/// light. If there is no light yet, or the last bake had other parameters, everything is baked.
+/// bk_bake_stats.kept_texels and bk_plan_describe report how much was kept.
+///
+/// Each call may leave an error of `keep_error`, and these errors add up: use bk_bake for final
+/// light.
+///
+/// Cost: photons, radiance map and seams as in a bake; of the other stages the part that changed.
+/// Measured: docs/performance.md, "Edits".
+///
+/// @param lightmap  any light map
+/// @param params  parameters of the last bake, without a range of texels, checkpoint and
+///   target_error; NULL for the defaults
+/// @param keep_error  change of light below which texels keep it, as a fraction of their irradiance
+///   or, if that is more, of a tenth of the mean irradiance; finite, >= 0. 0.03 is hard to see
+/// @param progress,user  progress callback and its pointer; may be NULL
+/// @param out  receives numbers about the bake; may be NULL
+/// @retval BK_ERROR_INVALID_ARGUMENT  `keep_error` or a field of `params` is out of its range
+/// @retval BK_ERROR_INVALID_STATE  another call is using the light map
+/// @retval BK_ERROR_OUT_OF_MEMORY  `memory_budget` is exceeded or the memory callback refuses
+/// @retval BK_ERROR_CANCELLED  the progress callback returned 0
+#[unsafe(no_mangle)]
+pub unsafe extern "C" fn bk_bake_changed(
+    lightmap: *mut bk_lightmap,
+    params: *const bk_bake_params,
+    keep_error: f32,
+    progress: bk_progress_fn,
+    user: *mut c_void,
+    out: *mut bk_bake_stats,
+) -> bk_result {
+    // SAFETY: params and out are the caller's, or NULL.
+    call(|| unsafe {
+        refuse_in_callback()?;
+        let lightmap = hold(lightmap, "lightmap")?;
+        let (params, checkpoint) = core_params(params)?;
+        if checkpoint.is_some() {
+            return invalid_argument!("checkpoint is not NULL: bk_bake_changed has none");
+        }
+        let out = OutStruct::optional(out, "out")?;
+        let progress = self::progress(progress, user);
+        let done = lightmap.change(|l| l.bake_changed(&params, keep_error, &progress))?;
+        if let Some(out) = out {
+            out.write(stats(&done));
+        }
+        Ok(())
+    })
+}
+
+/// # Safety
+/// `params` is NULL or the caller's structure.
+unsafe fn core_params(params: *const bk_bake_params) -> Result<(BakeParams, Option<CheckpointParams>)> {
+    // SAFETY: by contract.
+    let read = || unsafe { read_struct(params, "params") };
+    let p: bk_bake_params = if params.is_null() { SizedStruct::defaults() } else { read()? };
+    let directional = read_directional(p.directional_indirect, p.directional_direct)?;
+    let params = BakeParams {
+        photon_count: p.photon_count,
+        max_bounces: p.max_bounces,
+        gather_rays: p.gather_rays,
+        radius: p.radius,
+        near_hits: p.near_hits,
+        interpolation_error: p.interpolation_error,
+        own_rays: p.own_rays,
+        blur_radius: p.blur_radius,
+        direct_samples: p.direct_samples,
+        seed: p.seed,
+        memory_budget: p.memory_budget,
+        texel_begin: p.texel_begin,
+        texel_end: p.texel_end,
+        stitch: read_bool(p.stitch, "stitch")?,
+        directional,
+        passes: p.passes,
+        target_error: p.target_error,
+    };
+    let checkpoint = match p.checkpoint.is_null() {
+        true => None,
+        // SAFETY: by contract a text.
+        false => Some(CheckpointParams {
+            path: unsafe { text(p.checkpoint, "checkpoint") }?.into(),
+            seconds: p.checkpoint_seconds.into(),
+        }),
+    };
+    Ok((params, checkpoint))
 }
 
 /// Writes a text about the last bake, one line per stage: whether it ran or was left out, and why.

@@ -131,7 +131,8 @@ pub unsafe extern "C" fn bk_lightmap_desc_init(desc: *mut bk_lightmap_desc) {
 /// Creates a light map of a committed scene: meshes with light map coordinates keep them, the
 /// others are unwrapped, and texels are mapped to triangles, on the device's threads.
 ///
-/// The light map keeps the geometry of the scene as it is now, and follows its lights. Logs a
+/// The light map keeps the geometry of the scene as it is now until bk_lightmap_follow, and follows
+/// its lights. Logs a
 /// warning if the scene lies so far from the origin that rays start more than a quarter of a texel
 /// above surfaces (32 rounding steps of its coordinates).
 ///
@@ -167,6 +168,42 @@ pub unsafe extern "C" fn bk_lightmap_create(
         let desc = core_desc(desc)?;
         let lightmap = Lightmap::create(&scene, &desc, &self::progress(progress, user))?;
         write(out, create(bk_lightmap { lightmap: RwLock::new(lightmap) }), "out")
+    })
+}
+
+/// Updates a light map to the geometry of its scene after bk_scene_refit. Charts, pages and UVs
+/// stay as they are, and so do an engine's vertex buffers. Without this call the light map keeps
+/// the old geometry.
+///
+/// Buried texels are searched again around moved surfaces; the sides of two-sided surfaces that
+/// have texels, and the density of texels, stay as they were at bk_lightmap_create. The light stays
+/// until the next bake; bk_bake_changed bakes it where it has changed. Until then the light map
+/// keeps the scene in both states in memory. Live objects made before keep the old geometry.
+///
+/// Cost: half a second per million texels and thread. Does nothing if the light map has the state
+/// of the scene already.
+///
+/// @param lightmap  any light map of the scene
+/// @param scene  the scene from which the light map was created, after a refit
+/// @param progress,user  progress callback and its pointer; may be NULL
+/// @retval BK_ERROR_INVALID_ARGUMENT  the light map is of another scene
+/// @retval BK_ERROR_INVALID_STATE  the scene is being refitted, or another call is using the light
+///   map
+/// @retval BK_ERROR_OUT_OF_MEMORY  the texels do not fit, or the memory callback refuses
+/// @retval BK_ERROR_CANCELLED  the progress callback returned 0
+#[unsafe(no_mangle)]
+pub unsafe extern "C" fn bk_lightmap_follow(
+    lightmap: *mut bk_lightmap,
+    scene: *const bk_scene,
+    progress: bk_progress_fn,
+    user: *mut c_void,
+) -> bk_result {
+    // SAFETY: handles, or NULL.
+    call(|| unsafe {
+        refuse_in_callback()?;
+        let lightmap = hold(lightmap, "lightmap")?;
+        let scene = Arc::clone(&*hold(scene, "scene")?.committed()?);
+        lightmap.change(|l| l.follow(&scene, &self::progress(progress, user)))
     })
 }
 

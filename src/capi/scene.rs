@@ -373,7 +373,7 @@ pub unsafe extern "C" fn bk_scene_commit(
 /// Triangles that become degenerate or not finite are not hit while they are; those that were so at
 /// the commit are never hit. Light maps, photon maps and live objects that were made before keep
 /// the old geometry (the scene is copied if there are any, else changed in place) and still follow
-/// the scene's lights. Pointers from bk_scene_get_mesh become invalid.
+/// the scene's lights; bk_lightmap_follow updates a light map. Pointers from bk_scene_get_mesh become invalid.
 ///
 /// Cost: a tenth to a fifth of the time of a commit, on the device's threads; if there is a copy,
 /// more.

@@ -6,11 +6,13 @@
 use super::atlas::Atlas;
 use super::atlas::fill::Filling;
 use super::atlas::ids::{GatherTexel, LightMap, LightTexel, PerTexel};
+use super::changed::{self, Before, Redo};
 use super::indirect::blur;
 use super::indirect::gather::{Gathered, Tile, TileTexel};
 use super::indirect::radiance_map::Radiance;
 use super::indirect::sample_set::SampleSet;
-use super::indirect::upsample::{Upsampling, parts};
+use super::indirect::upsample::{Asked, Upsampling, parts};
+use super::moved::Moved;
 use super::passes::{self, Passes};
 use super::plan::{Plan, left_out};
 use super::saved::checkpoint::Checkpoint;
@@ -32,8 +34,8 @@ use crate::scene::Scene;
 use glam::Vec3;
 use rayon::prelude::*;
 use std::ops::Range;
-use std::sync::Arc;
 use std::sync::atomic::{AtomicU64, Ordering::Relaxed};
+use std::sync::{Arc, OnceLock};
 use std::time::Instant;
 
 /// Texels handed to a thread at a time.
@@ -54,6 +56,25 @@ impl Lightmap {
         self.bake_with(params, None, progress)
     }
 
+    /// Bakes again after lights were [set](Scene::set_light) or the scene [has moved](Lightmap::follow). Texels whose light
+    /// has changed by less than `keep_error` (finite, ≥ 0), as far as probes tell, keep it; it is relative to their light
+    /// or, if that is more, to a tenth of the mean light. All others get the bits of [`bake`](Self::bake).
+    ///
+    /// `params` are those of the last bake, for all texels and without a target error. If others were used, or there is
+    /// no light yet, all is baked. Many small changes that are each let stand add up: now and then bake from nothing.
+    pub fn bake_changed(&mut self, params: &BakeParams, keep_error: f32, progress: &Progress) -> Result<BakeStats> {
+        params.validate()?;
+        if !(keep_error >= 0.0 && keep_error.is_finite()) {
+            return invalid_argument!("keep_error is {keep_error}, not a finite number ≥ 0");
+        }
+        let total = self.atlas.map.len() as u64;
+        if params.target_error > 0.0 || params.texel_begin > 0 || !(params.texel_end == 0 || params.texel_end == total)
+        {
+            return invalid_argument!("a bake of changes is of all texels and has no target_error");
+        }
+        self.bake_all(params, None, Some(keep_error), progress)
+    }
+
     /// Runs the pipeline and keeps finished work in a file. A later call with the same scene, lights, layout and
     /// parameters continues from it, whatever ended this one; the light has the bits of an uninterrupted bake. The
     /// statistics cover the work of this call only.
@@ -70,6 +91,17 @@ impl Lightmap {
     ) -> Result<BakeStats> {
         params.validate()?;
         checkpoint.map_or(Ok(()), CheckpointParams::validate)?;
+        self.bake_all(params, checkpoint, None, progress)
+    }
+
+    /// Bakes with checked parameters, anew or, given the difference of light that is let stand, what has changed.
+    fn bake_all(
+        &mut self,
+        params: &BakeParams,
+        checkpoint: Option<&CheckpointParams>,
+        keep_error: Option<f32>,
+        progress: &Progress,
+    ) -> Result<BakeStats> {
         let total = self.atlas.map.len() as u64;
         if params.texel_begin > total || params.texel_end > total {
             return invalid_argument!(
@@ -101,11 +133,19 @@ impl Lightmap {
                 Some(c) => Some(Checkpoint::open(c, atlas, &origin, [range.start as u64, range.end as u64])?),
                 None => None,
             };
-            let checkpoint = checkpoint.as_ref();
-            let (mut light, mut stats) = self.passes(params, &plan, direct, &range, checkpoint, progress)?;
+            let before = match keep_error {
+                Some(keep_error) => self.before(params, &plan, &origin, keep_error)?,
+                None => None,
+            };
+            let from = From { checkpoint: checkpoint.as_ref(), before: before.as_ref() };
+            let (mut light, mut stats) = self.passes(params, &plan, direct, &range, from, progress)?;
             stats.back_charts = light.backs.iter().filter(|&&b| b).count() as u64;
             plan.note_back_charts(stats.back_charts);
             plan.note_bright(&light.radiance.bright);
+            if let Some((before, redo)) = before.as_ref().and_then(|b| Some((b, b.redo.get()?))) {
+                stats.kept_texels = redo.kept();
+                plan.note_kept(stats.kept_texels, range.len() as u64, before.keep_error);
+            }
             light.plan = plan.clone();
             light.origin = Some(origin);
             let stitch = self.stitch(&light, &range, params, &mut plan, &mut stats, progress)?;
@@ -133,6 +173,17 @@ impl Lightmap {
         Ok(stats)
     }
 
+    /// Returns the light from before a change, if a bake with these parameters can keep any of it.
+    fn before(&self, params: &BakeParams, plan: &Plan, origin: &Origin, keep_error: f32) -> Result<Option<Before<'_>>> {
+        let Some(light) = self.light.as_ref().filter(|light| changed::can_keep(light, params, plan)) else {
+            return Ok(None);
+        };
+        let atlas = self.before.as_ref().unwrap_or(&self.atlas);
+        let moved = Moved::between(&atlas.scene, &self.atlas.scene, &self.atlas.charts)?;
+        let has_other_lights = !light.origin.is_some_and(|of_light| of_light.has_lights_of(origin));
+        Ok(Some(Before { atlas, light, moved, has_other_lights, keep_error, redo: OnceLock::new() }))
+    }
+
     /// Bakes in as many passes as the parameters ask for.
     fn passes(
         &self,
@@ -140,9 +191,10 @@ impl Lightmap {
         plan: &Plan,
         direct: &DirectLight,
         range: &Range<usize>,
-        checkpoint: Option<&Checkpoint>,
+        from: From,
         progress: &Progress,
     ) -> Result<(Light, BakeStats)> {
+        let From { checkpoint, before } = from;
         let run = |pass: u32, all: Option<&Passes>| {
             let params = &passes::params_of(params, pass);
             if let Some(c) = checkpoint {
@@ -150,7 +202,7 @@ impl Lightmap {
             }
             let (atlas, range) = (&self.atlas, range.clone());
             let (known_backs, held) = (all.map(|all| &all.light.backs[..]), all.map_or(0, Passes::bytes));
-            Bake { atlas, params, plan, direct, range, progress, checkpoint, known_backs, held }.run()
+            Bake { atlas, params, plan, direct, range, progress, checkpoint, before, known_backs, held }.run()
         };
         if params.passes == 1 && params.target_error == 0.0 {
             let (light, stats) = run(0, None)?;
@@ -165,7 +217,11 @@ impl Lightmap {
             needed = device.install(|| all.needed(params, range));
             if all.count >= needed {
                 progress.set_part(0.0, 1.0);
-                return Ok(device.install(|| all.finish(range)));
+                let (mut light, stats) = device.install(|| all.finish(range));
+                if let Some(before) = before {
+                    before.keep_spread(&mut light);
+                }
+                return Ok((light, stats));
             }
             progress.set_part(all.count as f32 / needed as f32, (all.count + 1) as f32 / needed as f32);
             // All passes show the same sides.
@@ -177,8 +233,9 @@ impl Lightmap {
     /// Stores the new light of a range of samples. Seams are stitched anew: whatever the shards, the last one leaves
     /// the bits of a whole bake.
     pub(super) fn store(&mut self, new: Light, range: Range<usize>, stitch: Option<Stitch>) {
+        let is_current = self.before.is_none();
         match &mut self.light {
-            Some(old) if range.len() < self.atlas.map.len() => {
+            Some(old) if range.len() < self.atlas.map.len() && is_current => {
                 if let Some(mut before) = old.stitch.take() {
                     before.swap(old);
                 }
@@ -205,12 +262,20 @@ impl Lightmap {
             }
             light => *light = Some(new),
         }
+        self.before = None;
         let Some(light) = &mut self.light else { return };
         if let Some(mut stitch) = stitch {
             stitch.swap(light);
             light.stitch = Some(stitch);
         }
     }
+}
+
+/// Where light comes from that need not be computed.
+#[derive(Clone, Copy)]
+struct From<'a> {
+    checkpoint: Option<&'a Checkpoint<'a>>,
+    before: Option<&'a Before<'a>>,
 }
 
 /// Inputs of one bake in progress.
@@ -223,6 +288,8 @@ struct Bake<'a, 'p> {
     range: Range<usize>,
     progress: &'a Progress<'p>,
     checkpoint: Option<&'a Checkpoint<'a>>,
+    /// Light from before a change, of which some is kept.
+    before: Option<&'a Before<'a>>,
     /// The charts that show their backs, if an earlier pass has decided it.
     known_backs: Option<&'a [bool]>,
     /// Bytes that earlier passes hold.
@@ -247,8 +314,12 @@ impl<'p> Bake<'_, 'p> {
         let mut indirect = None;
         let radiance = self.illuminate(&mut stats)?;
         let backs = self.backs(&radiance.values)?;
+        let redo = match self.before {
+            Some(before) => Some(self.redo(before, &radiance, &backs)?),
+            None => None,
+        };
         if self.plan.runs(left_out::INDIRECT) {
-            indirect = Some(self.gather(&radiance, &backs, &mut stats)?);
+            indirect = Some(self.gather(&radiance, &backs, redo, &mut stats)?);
         }
         let n = self.atlas.map.len();
         let mut light = Light {
@@ -264,7 +335,10 @@ impl<'p> Bake<'_, 'p> {
             plan: Plan::default(),
             _memory: memory,
         };
-        self.compose(scene, indirect.as_ref(), &mut light, &mut stats)?;
+        if let Some((before, redo)) = self.before.zip(redo) {
+            before.keep(redo, &mut light);
+        }
+        self.compose(scene, indirect.as_ref(), redo, &mut light, &mut stats)?;
         drop(indirect);
         let bytes = light.bytes();
         light._memory.shrink(bytes);
@@ -275,6 +349,17 @@ impl<'p> Bake<'_, 'p> {
     /// Returns the inputs of the stages that live updates have, too.
     fn inputs(&self) -> Inputs<'_, 'p> {
         Inputs { atlas: self.atlas, direct: self.direct, params: self.params, progress: self.progress }
+    }
+
+    /// Returns what is computed anew, which the first pass decides.
+    fn redo<'b>(&self, before: &'b Before, radiance: &Radiance, backs: &[bool]) -> Result<&'b Redo> {
+        if let Some(redo) = before.redo.get() {
+            return Ok(redo);
+        }
+        let (atlas, params, plan) = (self.atlas, self.params, self.plan);
+        let find = || Redo::find(before, atlas, params, plan, (radiance, backs), self.progress);
+        let redo = atlas.scene.device().install(find)?;
+        Ok(before.redo.get_or_init(|| redo))
     }
 
     /// Computes the radiance map, or reads it from the checkpoint; empty if the plan leaves indirect light out.
@@ -358,7 +443,13 @@ impl<'p> Bake<'_, 'p> {
     }
 
     /// Gathers indirect light, fills and blurs it. Only placements that the range touches are gathered.
-    fn gather(&self, radiance: &Radiance, backs: &[bool], stats: &mut BakeStats) -> Result<Indirect> {
+    fn gather(
+        &self,
+        radiance: &Radiance,
+        backs: &[bool],
+        redo: Option<&Redo>,
+        stats: &mut BakeStats,
+    ) -> Result<Indirect> {
         let start = Instant::now();
         let l = self.atlas;
         let device = l.scene.device();
@@ -366,7 +457,9 @@ impl<'p> Bake<'_, 'p> {
         let placements = placement_of(self.range.start)..placement_of(self.range.end - 1) + 1;
         let starts = &l.gather.texels.chart_start;
         let needed = starts[placements.start] as usize..starts[placements.end] as usize;
-        let upsampling = stages::upsampling(&self.inputs(), backs, placements)?;
+        let asked = redo.map_or(Asked::default(), Redo::asked);
+        let is_needed = |texel: usize| redo.is_none_or(|redo| redo.gather[texel]);
+        let upsampling = stages::upsampling(&self.inputs(), backs, placements, asked)?;
         let own = self.own_light(radiance, backs, &upsampling)?;
         let lookup = self.inputs().lookup(radiance);
         let samples = SampleSet::new(self.params.gather_rays, purpose_seed(self.params.seed, purpose::GATHER_SET));
@@ -380,7 +473,8 @@ impl<'p> Bake<'_, 'p> {
         let asks = self.asks(directional::INDIRECT);
         let mut directional: Vec<Directional> = try_vec(if asks { n } else { 0 }, "the gather map by direction")?;
         let (new_tile, nothing) = (if asks { Tile::by_direction } else { Tile::new }, asks.then(Directional::default));
-        let rays = AtomicU64::new(upsampling.rays + own.rays);
+        let of_probes = redo.map_or(0, |redo| redo.rays);
+        let rays = AtomicU64::new(upsampling.rays + own.rays + of_probes);
         let tiles = Scratch::new();
         device.install(|| {
             let values = irradiance[needed.clone()].par_chunks_mut(BLOCK);
@@ -400,7 +494,9 @@ impl<'p> Bake<'_, 'p> {
                 }
                 let (mut traced, mut tile) = (0, tiles.take(new_tile)?);
                 let first = needed.start + block * BLOCK;
-                for texels_of_tile in in_order(&l.gather, first..first + values.len())?.chunks(Tile::texels(&samples)) {
+                let mut order = in_order(&l.gather, first..first + values.len())?;
+                order.retain(|texel| is_needed(texel.index()));
+                for texels_of_tile in order.chunks(Tile::texels(&samples)) {
                     let texel = |&texel: &GatherTexel| TileTexel {
                         receiver: l.receiver(&l.gather, backs, texel),
                         seed: combine(seed, texel.seed()),
@@ -429,7 +525,7 @@ impl<'p> Bake<'_, 'p> {
                 stage.advance(values.len() as u64)
             })
         })?;
-        let is_hidden = |i: usize| needed.contains(&i) && !valid[i];
+        let is_hidden = |i: usize| needed.contains(&i) && is_needed(i) && !valid[i];
         Filling::new(n, |i| valid[i], is_hidden)?.fill(&l.charts, &l.gather, &mut irradiance, self.progress)?;
         if asks {
             let filling = Filling::new(n, |i| valid[i], is_hidden)?;
@@ -458,6 +554,7 @@ impl<'p> Bake<'_, 'p> {
         &self,
         scene: &Arc<Scene>,
         indirect: Option<&Indirect>,
+        redo: Option<&Redo>,
         light: &mut Light,
         stats: &mut BakeStats,
     ) -> Result<()> {
@@ -471,6 +568,8 @@ impl<'p> Bake<'_, 'p> {
         // Blocks whose light is in the checkpoint.
         let mut known = try_filled(range.len().div_ceil(BLOCK), false, "blocks of texels")?;
         let tiles = Scratch::new();
+        let has_new_indirect = |texel: usize| redo.is_none_or(|redo| redo.indirect[texel]);
+        let has_new_direct = |texel: usize| redo.is_none_or(|redo| redo.direct[texel]);
         let asks = self.asks(directional::DIRECT);
         let new_tile = if asks { TilePoints::by_direction } else { TilePoints::new };
         // Direct light by direction, which is averaged before it is added to the rest.
@@ -486,14 +585,17 @@ impl<'p> Bake<'_, 'p> {
             one_by_one(blocks).try_for_each(|(block, ((((direct, known), ind), state), (directional, directed)))| {
                 let mut traced = 0;
                 let first = range.start + block * BLOCK;
+                let ind_count = ind.len();
                 if let Some(indirect) = indirect {
                     let irradiance = PerTexel::new(&indirect.irradiance);
-                    for (texel, ind) in LightTexel::range(first..first + ind.len()).zip(&mut *ind) {
+                    let texels = || LightTexel::range(first..first + ind_count);
+                    for (texel, ind) in texels().zip(&mut *ind).filter(|(texel, _)| has_new_indirect(texel.index())) {
                         *ind = indirect.upsampling.at(l, irradiance, &indirect.own.light, texel);
                     }
                     if !indirect.directional.is_empty() {
                         let from = PerTexel::new(&indirect.directional);
-                        for (texel, out) in LightTexel::range(first..first + ind.len()).zip(directional) {
+                        let of_texels = texels().zip(directional);
+                        for (texel, out) in of_texels.filter(|(texel, _)| has_new_indirect(texel.index())) {
                             *out = indirect.upsampling.at(l, from, &indirect.own.directional, texel);
                         }
                     }
@@ -510,7 +612,9 @@ impl<'p> Bake<'_, 'p> {
                 }
                 if self.plan.runs(left_out::DIRECT) && self.direct.has_sharp() {
                     let mut tile = tiles.take(|| new_tile(TILE))?;
-                    for of_tile in in_order(&l.map, first..first + direct.len())?.chunks(4 * TILE) {
+                    let mut order = in_order(&l.map, first..first + direct.len())?;
+                    order.retain(|texel| has_new_direct(texel.index()));
+                    for of_tile in order.chunks(4 * TILE) {
                         self.progress.check()?;
                         let receivers = of_tile.iter().map(|&texel| l.receiver(&l.map, backs, texel));
                         let place = |i: usize| of_tile[i].index() - first;
@@ -531,7 +635,7 @@ impl<'p> Bake<'_, 'p> {
         })?;
         if self.plan.runs(left_out::DIRECT) {
             let direct = (&mut light.direct[..], &mut directed[..]);
-            let traced = self.average_direct(&texels, backs, &known, direct, &light.state, &stage)?;
+            let traced = self.average_direct(&texels, backs, (&known, redo), direct, &light.state, &stage)?;
             rays.fetch_add(traced, Relaxed);
             let sums = light.directional.get_mut(range).unwrap_or_default();
             sums.iter_mut().zip(&directed).for_each(|(sum, &directed)| *sum += directed);
@@ -560,12 +664,13 @@ impl<'p> Bake<'_, 'p> {
         &self,
         texels: &TexelLight<LightMap>,
         backs: &[bool],
-        known: &[bool],
+        (known, redo): (&[bool], Option<&Redo>),
         (direct, directed): (&mut [Vec3], &mut [Directional]),
         state: &[TexelState],
         stage: &Stage,
     ) -> Result<u64> {
         let (l, range) = (self.atlas, self.range.clone());
+        let is_new = |texel: usize| redo.is_none_or(|redo| redo.direct[texel]);
         let rays = AtomicU64::new(0);
         let mut variations: Vec<Variation> = try_vec(range.len(), "where direct light varies")?;
         let tiles = Scratch::new();
@@ -574,10 +679,12 @@ impl<'p> Bake<'_, 'p> {
             let sharp = &direct[..];
             one_by_one(variations.par_chunks_mut(BLOCK).enumerate()).for_each(|(block, out)| {
                 let mut traced = 0;
-                for (i, variation) in out.iter_mut().enumerate().filter(|_| !known[block]) {
-                    let texel = LightTexel::new(range.start + block * BLOCK + i);
-                    // Neighbours that another shard bakes, or that a checkpoint has, are computed here too.
-                    let is_here = |i: usize| range.contains(&i) && !known[(i - range.start) / BLOCK];
+                let first = range.start + block * BLOCK;
+                for (i, variation) in out.iter_mut().enumerate().filter(|(i, _)| !known[block] && is_new(first + i)) {
+                    let texel = LightTexel::new(first + i);
+                    // Neighbours that another shard bakes, that a checkpoint has or that keep their light are computed
+                    // here too.
+                    let is_here = |i: usize| range.contains(&i) && !known[(i - range.start) / BLOCK] && is_new(i);
                     *variation = texels.varies(texel, sharp[texel.index()], |near| match is_here(near.index()) {
                         true => sharp[near.index()],
                         false => texels.sharp(&l.receiver(&l.map, backs, near), &mut traced),
@@ -597,7 +704,10 @@ impl<'p> Bake<'_, 'p> {
                 let mut order = in_order(&l.map, first..first + direct.len())?;
                 // The others have their light. (Direct light of Sponza in the sun, 12 texels/m: 0.85 of the time with
                 // their receivers.)
-                order.retain(|t| self.direct.has_soft() || variations[t.index() - first] != Variation::None);
+                order.retain(|t| {
+                    let varies = self.direct.has_soft() || variations[t.index() - first] != Variation::None;
+                    varies && is_new(t.index())
+                });
                 for some in order.chunks(texels_per_tile(texels.samples)) {
                     self.progress.check()?;
                     of_tile.clear();

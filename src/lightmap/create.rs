@@ -105,8 +105,8 @@ impl Lightmap {
         let scene = scene.clone();
         let atlas = Atlas {
             scene,
-            charts,
-            index,
+            charts: Arc::new(charts),
+            index: Arc::new(index),
             map,
             gather,
             radiance,
@@ -114,11 +114,11 @@ impl Lightmap {
             desc: desc.clone(),
             is_outdoors,
             info,
-            seen,
+            seen: Arc::new(seen),
             buried,
-            _memory: memory,
+            _memory: Arc::new(memory),
         };
-        Ok(Lightmap { atlas: Arc::new(atlas), plan, light: None })
+        Ok(Lightmap { atlas: Arc::new(atlas), plan, light: None, before: None })
     }
 }
 
@@ -199,7 +199,7 @@ impl Maps {
         let placements = [&map.layout, &gather.layout, &radiance.layout].map(|layout| layout.placements.len() as u64);
         let stage = progress.stage("buried texels", 0.8, 1.0, placements.iter().sum());
         let near = texel.min(seen::ROOM * scene.diagonal());
-        let search = Search { scene, charts, seen: &seen, near };
+        let search = Search { scene, charts, seen: &seen, near, only: None };
         // The visible part of a mostly buried texel is a strip along the surface that covers it, often darker than its
         // surroundings. Gather texels are larger and would spread that darkness as a rim.
         let (buried, rays) = scene.device().install(|| {

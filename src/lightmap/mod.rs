@@ -6,8 +6,11 @@
 
 pub mod atlas;
 pub(crate) mod bake;
+mod changed;
 mod create;
+mod follow;
 pub mod indirect;
+mod moved;
 pub mod normal_maps;
 pub(crate) mod passes;
 pub mod plan;
@@ -268,6 +271,8 @@ pub struct BakeStats {
     pub seam_rms_after: f64,
     /// Duration of finding and stitching seams, in seconds.
     pub seam_seconds: f64,
+    /// Number of texels that kept all of their light, in a bake of what [has changed](Lightmap::bake_changed).
+    pub kept_texels: u64,
     /// Number of passes.
     pub passes: u32,
     /// Estimated relative error of the mean of several passes, as far as it is noise: the root of the mean over texels
@@ -459,6 +464,8 @@ pub struct Lightmap {
     pub(in crate::lightmap) atlas: Arc<Atlas>,
     plan: Plan,
     light: Option<Light>,
+    /// The atlas that the light was baked for, if the scene has moved since.
+    before: Option<Arc<Atlas>>,
 }
 
 impl LightmapDesc {
@@ -545,6 +552,11 @@ impl Lightmap {
     /// Returns charts and texels of the three maps.
     pub(crate) fn atlas(&self) -> &Arc<Atlas> {
         &self.atlas
+    }
+
+    /// Returns the light, unless it is of the scene before it moved.
+    fn current_light(&self) -> Option<&Light> {
+        self.light.as_ref().filter(|_| self.before.is_none())
     }
 
     /// Returns numbers about layout and texels.

@@ -262,6 +262,13 @@ impl Plan {
         self.run(&format!("stitching of seams at {edges} edges of smooth surfaces{but}"));
     }
 
+    /// Adds a line on light that is kept.
+    pub(crate) fn note_kept(&mut self, kept: u64, all: u64, keep_error: f32) {
+        self.lines.push(format!(
+            "left out: light of {kept} of {all} texels (it has changed by less than {keep_error} since the last bake)"
+        ));
+    }
+
     /// Adds a line on why nothing was stitched.
     pub(crate) fn leave_out_seams(&mut self, why: &str) {
         self.leave_out(left_out::SEAMS, "stitching of seams", why);

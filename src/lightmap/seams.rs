@@ -89,6 +89,22 @@ impl Stitch {
         }
     }
 
+    /// Undoes the stitching in a copy of direct light, and of indirect light and light by direction, of some texels each.
+    pub(super) fn former_where(&self, light: &mut Light, of: impl Fn(usize) -> (bool, bool)) {
+        for (i, texel) in self.texels.iter().map(|&t| t as usize).enumerate() {
+            let (direct, indirect) = of(texel);
+            if direct {
+                light.direct[texel] = self.direct[i];
+            }
+            if indirect {
+                light.indirect[texel] = self.indirect[i];
+                if let Some((to, from)) = light.directional.get_mut(texel).zip(self.directional.get(i)) {
+                    *to = *from;
+                }
+            }
+        }
+    }
+
     /// Undoes the stitching in a copy of the stitched light by direction.
     pub(super) fn former_directional(&self, directional: &mut [Directional]) {
         for (&texel, former) in self.texels.iter().zip(&self.directional) {
@@ -122,7 +138,7 @@ impl Lightmap {
         progress: &Progress,
     ) -> Result<Option<Stitch>> {
         let start = Instant::now();
-        let view = View { new, range, old: self.light.as_ref() };
+        let view = View { new, range, old: self.current_light() };
         let dark = !plan.runs(left_out::DIRECT) && !plan.runs(left_out::INDIRECT);
         let why = if !params.stitch {
             "stitch is 0"

@@ -9,7 +9,7 @@ use super::indirect::find_bright_patches;
 use super::indirect::near_hits::{HitRadiance, NearHits};
 use super::indirect::radiance_map::{self, Radiance, RadianceInput, RadianceLookup};
 use super::indirect::sample_set::{ROUND, SampleSet};
-use super::indirect::upsample::{OWN_PART, OWN_RAYS, OwnDirectional, OwnLight, OwnRays, Upsampling};
+use super::indirect::upsample::{Asked, OWN_PART, OWN_RAYS, OwnDirectional, OwnLight, OwnRays, Upsampling};
 use super::plan::{Plan, left_out};
 use super::texel_light::TexelLight;
 use super::{BakeParams, BakeStats, StageStats};
@@ -30,6 +30,7 @@ pub(crate) mod purpose {
     pub const GATHER: u32 = 3;
     pub const DIRECT: u32 = 4;
     pub const OWN: u32 = 5;
+    pub const PROBE: u32 = 6;
 }
 
 /// Lower bound of the automatic search radius of photons in texels of the radiance map: the discs around its samples
@@ -133,10 +134,16 @@ pub(crate) fn backs(inputs: &Inputs, radiance: &[Vec3]) -> Result<Vec<bool>> {
     atlas.scene.device().install(|| two_sided::backs(atlas, light, progress))
 }
 
-/// Finds how texels of the light map interpolate between gather texels, for a range of placements.
-pub(crate) fn upsampling(inputs: &Inputs, backs: &[bool], placements: Range<usize>) -> Result<Upsampling> {
+/// Finds how texels of the light map interpolate between gather texels, for a range of placements and those that are
+/// `asked` for.
+pub(crate) fn upsampling(
+    inputs: &Inputs,
+    backs: &[bool],
+    placements: Range<usize>,
+    asked: Asked,
+) -> Result<Upsampling> {
     let stage = inputs.progress.stage("upsampling", 0.3, 0.315, placements.len() as u64);
-    Upsampling::find(inputs.atlas, placements, backs, inputs.params.interpolation_error, &stage)
+    Upsampling::find(inputs.atlas, placements, backs, inputs.params.interpolation_error, asked, &stage)
 }
 
 /// Light of fallback gathers, and the number of their rays.

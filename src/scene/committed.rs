@@ -128,6 +128,11 @@ impl Scene {
         self.data.is_instanced(mesh)
     }
 
+    /// Whether `other` is this scene in another state: as it was before refits, or is after them.
+    pub(crate) fn is_state_of(&self, other: &Scene) -> bool {
+        Arc::ptr_eq(&self.lights, &other.lights)
+    }
+
     /// The number of the object that an instance is.
     pub fn object_of_instance(&self, instance: u32) -> u32 {
         self.data.meshes.len() as u32 + instance

@@ -118,6 +118,15 @@ impl<'a> Object<'a> {
         }
     }
 
+    /// Whether another state of the object stands in the same place, bit for bit.
+    pub(crate) fn stands_as(&self, other: &Object) -> bool {
+        let bits = |o: &Object| o.transform.map(|t| t.to_cols_array().map(f32::to_bits));
+        let (here, there) = (&self.mesh.positions[..], &other.mesh.positions[..]);
+        bits(self) == bits(other)
+            && (std::ptr::eq(here, there)
+                || bytemuck::cast_slice::<_, u32>(here) == bytemuck::cast_slice::<_, u32>(there))
+    }
+
     /// The object as a mesh that stands where it does.
     pub fn flattened(&self) -> Mesh {
         let mut mesh = self.mesh.clone();

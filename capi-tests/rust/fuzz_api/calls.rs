@@ -53,7 +53,8 @@ pub fn any(w: &W, s: &mut Source) {
         59..=62 => photon_numbers(w, s),
         63..=65 => lightmap(w, s),
         66..=68 => lightmap_numbers(w, s),
-        69..=70 => bake(w, s),
+        69 => bake(w, s),
+        70 => edit(w, s),
         71..=76 => read(w, s),
         77 => save(w, s),
         78..=80 => live(w, s),
@@ -743,6 +744,30 @@ fn bake(w: &W, s: &mut Source) {
     watched.end("bk_bake", result);
 }
 
+/// A light map that follows a scene, and what changed is baked.
+fn edit(w: &W, s: &mut Source) {
+    let Some(lightmap) = w.pick(Kind::Lightmap, s) else { return };
+    let mut params = bake_params(w, s);
+    if !s.one_in(4) {
+        (params.target_error, params.passes) = (0.0, params.passes.min(2));
+        // Otherwise there is light of other parameters, and all is baked.
+        ask!(bk_bake(lightmap.p(), &params, None, null_mut(), null_mut()));
+    }
+    if let Some(scene) = w.pick(Kind::Scene, s) {
+        let watched = Watched::new(w, s);
+        let result = ask!(bk_lightmap_follow(lightmap.p(), scene.p(), Some(progress), watched.user()));
+        watched.end("bk_lightmap_follow", result);
+    }
+    let keep_error = [0.0, 0.03, 1.0, -1.0, f32::NAN, f32::INFINITY][s.below(6)];
+    let watched = Watched::new(w, s);
+    let mut stats = defaults!(bk_bake_stats, bk_bake_stats_init);
+    let result = ask!(bk_bake_changed(lightmap.p(), &params, keep_error, Some(progress), watched.user(), &mut stats));
+    watched.end("bk_bake_changed", result);
+    if result == BK_OK && !keep_error.is_finite() {
+        broken("a keep_error that is not finite is accepted");
+    }
+}
+
 /// Bytes of a texel of a format, if it is one.
 fn texel_bytes(format: u32) -> usize {
     match format & 0xff {
@@ -1078,6 +1103,8 @@ fn null_handles(s: &mut Source) {
         _ => {
             failed(ask!(bk_lightmap_create(null(), null(), None, null_mut(), words.as_mut_ptr().cast())));
             failed(ask!(bk_bake(null_mut(), null(), None, null_mut(), null_mut())));
+            failed(ask!(bk_bake_changed(null_mut(), null(), 0.0, None, null_mut(), null_mut())));
+            failed(ask!(bk_lightmap_follow(null_mut(), null(), None, null_mut())));
             failed(ask!(bk_lightmap_read(null(), 0, 0, 1, null_mut(), 0)));
             failed(ask!(bk_lightmap_save(null(), null(), 1, None, null_mut())));
             failed(ask!(bk_lightmap_write(null_mut(), null(), 0, 1, null(), None, null_mut())));

@@ -138,7 +138,7 @@ impl<'a> Job<'a> {
         })
     }
 
-    fn layout(&mut self, scene: &Arc<Scene>) -> Result<Lightmap> {
+    pub fn layout(&mut self, scene: &Arc<Scene>) -> Result<Lightmap> {
         let start = Instant::now();
         let desc = &self.args.desc;
         let lightmap = match &self.args.layout {

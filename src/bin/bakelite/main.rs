@@ -36,6 +36,7 @@ fn main() -> ExitCode {
         Ok(Command::Bake(bake)) => bake::run(&bake),
         Ok(Command::Commit(args)) => job::commit(&args),
         Ok(Command::ReportCancel(args)) => report::cancel::run(&args),
+        Ok(Command::ReportEdits(report)) => report::edits::run(&report),
         Ok(Command::ReportLive(report)) => report::live::run(&report),
         Ok(Command::ReportMemory(args)) => report::memory::run(&args),
         Ok(Command::ReportPipeline(args)) => report::pipeline::run(&args),

@@ -55,6 +55,8 @@ pub(in crate::lightmap) struct Search<'a> {
     pub seen: &'a Seen,
     /// Distance up to which surfaces cover a texel, at most the width of a texel of the light map.
     pub near: f32,
+    /// Whether each chart is searched; `None`: all are.
+    pub only: Option<&'a [bool]>,
 }
 
 impl Search<'_> {
@@ -105,6 +107,9 @@ impl Search<'_> {
     ) -> Result<Found<M>> {
         let mut found = Found::default();
         let chart = map.layout.chart_of(placement);
+        if self.only.is_some_and(|only| !only[chart.index()]) {
+            return Ok(found);
+        }
         let is_back = match map.layout.is_back(placement) {
             true => true,
             false if !self.charts[chart].two_sided || map.layout.back(chart).is_some() => false,

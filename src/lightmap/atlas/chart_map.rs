@@ -40,6 +40,18 @@ impl<M: Map> ChartMap<M> {
         Ok(ChartMap { layout, texels, back_start, of: PhantomData })
     }
 
+    /// Copies the map, with the samples of placements that are `anew` as [`new`](Self::new) makes them.
+    pub(in crate::lightmap) fn copied(
+        &self,
+        scene: &Scene,
+        charts: &Charts,
+        anew: impl Fn(PlacementId) -> bool + Sync,
+        stage: &Stage,
+    ) -> Result<Self> {
+        let texels = self.texels.copied(scene, charts, &self.layout, anew, stage)?;
+        Ok(ChartMap { layout: self.layout.clone(), texels, back_start: self.back_start, of: PhantomData })
+    }
+
     /// Returns the number of texels that show a surface.
     pub(crate) fn len(&self) -> usize {
         self.texels.samples.len()

@@ -35,8 +35,11 @@ use std::sync::Arc;
 /// Charts and texels of a scene: all of a light map but its light. Immutable, and shared with live updates.
 pub(crate) struct Atlas {
     pub scene: Arc<Scene>,
-    pub charts: Charts,
-    pub index: ChartIndex,
+    /// Charts and their index are shared with the atlases of the scene in other states ([`follow`]).
+    ///
+    /// [`follow`]: crate::lightmap::Lightmap::follow
+    pub charts: Arc<Charts>,
+    pub index: Arc<ChartIndex>,
     pub map: ChartMap<LightMap>,
     pub gather: ChartMap<GatherMap>,
     pub radiance: ChartMap<RadianceMap>,
@@ -45,10 +48,10 @@ pub(crate) struct Atlas {
     pub(in crate::lightmap) desc: LightmapDesc,
     pub(in crate::lightmap) is_outdoors: bool,
     pub info: LightmapInfo,
-    pub seen: Seen,
+    pub seen: Arc<Seen>,
     /// Whether each texel of the light map is buried, with the sample point of another one. Empty if none is.
     pub buried: Vec<bool>,
-    pub(in crate::lightmap) _memory: Reservation,
+    pub(in crate::lightmap) _memory: Arc<Reservation>,
 }
 
 impl Atlas {

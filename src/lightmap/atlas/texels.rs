@@ -161,6 +161,45 @@ impl TexelMap {
         Ok(map)
     }
 
+    /// Copies the map, but makes the samples of placements that are `anew` as [`build`](Self::build) does, whatever has
+    /// become of them since, and perhaps of others on the same page. Advances `stage` by one per placement.
+    pub(in crate::lightmap) fn copied(
+        &self,
+        scene: &Scene,
+        charts: &Charts,
+        layout: &Layout,
+        anew: impl Fn(PlacementId) -> bool + Sync,
+        stage: &Stage,
+    ) -> Result<TexelMap> {
+        let mut map = TexelMap {
+            _memory: vec![scene.device().memory().reserve(self.bytes(), "the texel samples")?],
+            samples: try_to_vec(&self.samples, "the texel samples")?,
+            chart_start: try_to_vec(&self.chart_start, INDEX)?,
+            overlapping_texels: self.overlapping_texels,
+            windows: try_to_vec(&self.windows, INDEX)?,
+            index: try_to_vec(&self.index, INDEX)?,
+            groups: try_to_vec(&self.groups, INDEX)?,
+        };
+        let job = Job { charts, layout, stage };
+        let sizes = group_sizes(&map.groups, &map.chart_start);
+        let owners = split(&mut map.index, map.groups.iter().map(Group::texels))?;
+        let samples = split(&mut map.samples, sizes)?;
+        let (groups, chart_start) = (&map.groups, &map.chart_start);
+        scene.device().install(|| {
+            let groups = groups.par_iter().zip(owners).zip(samples);
+            groups.try_for_each_init(Vec::new, |scratch, ((group, owners), samples)| {
+                let mut placements = group.placements.clone().map(|p| PlacementId::new(p as usize));
+                if placements.any(&anew) {
+                    let mut counts = try_vec(group.placements.len(), INDEX)?;
+                    cover_group(&job, group, owners, scratch, &mut counts)?;
+                    sample_group(&job, group, chart_start, owners, samples)?;
+                }
+                stage.advance(group.placements.len() as u64)
+            })
+        })?;
+        Ok(map)
+    }
+
     /// Returns the number of steps by which building a map of `layout` advances its stage.
     pub fn work(layout: &Layout) -> u64 {
         2 * layout.placements.len() as u64

@@ -313,7 +313,8 @@ mod tests {
         let chart = lightmap.atlas().charts.chart_of(12);
         let mut shown = |counts: [u32; 2], hidden: [bool; 2], lights: [f32; 2]| {
             let atlas = Arc::get_mut(&mut lightmap.atlas).unwrap();
-            (atlas.seen.counts[chart.index()], atlas.seen.hidden[chart.index()]) = (counts, hidden);
+            let seen = Arc::get_mut(&mut atlas.seen).unwrap();
+            (seen.counts[chart.index()], seen.hidden[chart.index()]) = (counts, hidden);
             let light = |s| lights[usize::from(lightmap.atlas.radiance.is_back(s))];
             backs(&lightmap.atlas, light, &Progress::none()).unwrap()[chart.index()]
         };

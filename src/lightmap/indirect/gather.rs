@@ -67,7 +67,7 @@ impl Gathered {
 
     /// Whether the texel can be seen at all.
     pub(crate) fn is_visible(&self) -> bool {
-        self.backs as f32 <= MAX_BACK_FACES * self.rays as f32
+        is_visible(self.backs, self.rays)
     }
 
     /// Returns the indirect light by direction from its `sum`, weighted as [`sum`](Self::sum) is.
@@ -251,18 +251,23 @@ impl Tile {
     }
 }
 
+/// Whether a texel can be seen at all, given how many of its rays hit the back of a one-sided surface.
+pub(super) fn is_visible(backs: u32, rays: u32) -> bool {
+    backs as f32 <= MAX_BACK_FACES * rays as f32
+}
+
 /// Seed of a round of a texel with a seed of its own.
 fn seed_of_round(seed: u32, round: usize) -> u32 {
     combine(seed, 16 + round as u32)
 }
 
 /// The sample points of a round.
-fn points_of(samples: &SampleSet, round: usize) -> &[[u32; 2]] {
+pub(super) fn points_of(samples: &SampleSet, round: usize) -> &[[u32; 2]] {
     &samples.points()[round * ROUND..samples.points().len().min((round + 1) * ROUND)]
 }
 
 /// Aims a ray from a receiver at each point of a round; `seed` is the texel's own.
-fn aim(receiver: &Receiver, points: &[[u32; 2]], seed: u32, rays: &mut [Ray]) {
+pub(super) fn aim(receiver: &Receiver, points: &[[u32; 2]], seed: u32, rays: &mut [Ray]) {
     let shift = [combine(seed, 1), combine(seed, 2)];
     let (tangent, bitangent) = orthonormal_basis(receiver.normal);
     for (ray, p) in rays.iter_mut().zip(points) {

@@ -7,6 +7,7 @@ pub(crate) mod gather;
 mod interpolation_error;
 mod narrow_gaps;
 pub(crate) mod near_hits;
+pub(in crate::lightmap) mod probes;
 pub(crate) mod radiance_map;
 pub(crate) mod sample_set;
 mod sights;

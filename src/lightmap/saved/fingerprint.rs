@@ -20,9 +20,22 @@ pub(in crate::lightmap) struct Origin {
 impl Origin {
     /// Makes the origin of a bake under the present `lights`, whatever texels it bakes.
     pub fn new(params: &BakeParams, lights: &[Light]) -> Origin {
-        // None of these parameters changes any bit of a texel.
-        let params = BakeParams { texel_begin: 0, texel_end: 0, memory_budget: 0, ..*params };
-        Origin { params, lights: text_sum(lights) }
+        Origin { params: Self::compared(params), lights: text_sum(lights) }
+    }
+
+    /// Returns parameters without those that change no bit of a texel.
+    fn compared(params: &BakeParams) -> BakeParams {
+        BakeParams { texel_begin: 0, texel_end: 0, memory_budget: 0, ..*params }
+    }
+
+    /// Whether the bake had these parameters.
+    pub fn has_params(&self, params: &BakeParams) -> bool {
+        self.params == Self::compared(params)
+    }
+
+    /// Whether another bake had the same lights.
+    pub fn has_lights_of(&self, other: &Origin) -> bool {
+        self.lights == other.lights
     }
 }
 

@@ -50,9 +50,13 @@ struct Head {
 
 impl Lightmap {
     /// Writes the light of all texels that have been baked so far to a file, which is replaced as a whole. Fails
-    /// with `InvalidState` before a bake, or if bakes with different parameters or lights filled the texels.
+    /// with `InvalidState` before a bake, if the scene has moved since, or if bakes with different parameters or lights
+    /// filled the texels.
     pub fn save_result(&self, path: &Path, progress: &Progress) -> Result<()> {
         let light = self.light()?;
+        if self.before.is_some() {
+            return Err(Error::InvalidState("the scene has moved since the light was baked: bake first".into()));
+        }
         let Some(origin) = &light.origin else {
             return Err(Error::InvalidState(
                 "the light map holds light of bakes that differ in parameters or lights, which are no one result"
@@ -136,7 +140,7 @@ impl Lightmap {
             plan: Plan::default(),
             _memory: memory,
         };
-        if let Some(old) = self.light.as_ref().filter(|_| (file.head.texels as usize) < texels) {
+        if let Some(old) = self.current_light().filter(|_| (file.head.texels as usize) < texels) {
             if old.origin != Some(origin) {
                 return Err(Error::InvalidState(format!(
                     "{} holds {} of {texels} texels, and the light map holds light of another bake, with other \

@@ -46,6 +46,8 @@ pub enum Report {
     Cancel(Box<Flags>),
     /// Light by direction under a normal map: error beside irradiance alone, time and memory
     Directional(Box<DirectionalFlags>),
+    /// Seconds to right light after an object has moved, and the difference from a bake from nothing
+    Edits(Box<EditsFlags>),
     /// Live updates: error against time and rays, budgets, traffic, memory
     Live(Box<LiveFlags>),
     /// The scene's memory, default and compact, and what that costs rays
@@ -71,12 +73,23 @@ impl Verb {
                     flags
                 }
                 Report::Directional(of_report) => &mut of_report.flags,
+                Report::Edits(of_report) => &mut of_report.flags,
                 Report::Live(of_report) => &mut of_report.flags,
                 Report::Quality(of_report) => &mut of_report.flags,
                 Report::Scaling(of_report) => &mut of_report.flags,
             },
         }
     }
+}
+
+#[derive(Args)]
+pub struct EditsFlags {
+    /// Objects that move, one after another
+    #[arg(long, value_name = "N", help_heading = "Report edits", default_value_t = 3,
+          value_parser = clap::value_parser!(u64).range(1..))]
+    pub objects: u64,
+    #[command(flatten)]
+    pub flags: Flags,
 }
 
 #[derive(Args)]

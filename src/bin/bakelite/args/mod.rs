@@ -36,6 +36,7 @@ pub enum Command {
     ReportMemory(Box<BakeArgs>),
     ReportPipeline(Box<BakeArgs>),
     ReportQuality(Box<ReportArgs>),
+    ReportEdits(Box<ReportArgs>),
     ReportScaling(Box<ReportArgs>),
     ReportStability(Box<BakeArgs>),
 }
@@ -184,7 +185,7 @@ pub struct ReportArgs {
     pub live: LiveParams,
     /// Quality: points at which light is compared.
     pub points: usize,
-    /// Quality: bakes per setting.
+    /// Quality: bakes per setting. Edits: objects that move.
     pub seeds: u64,
     /// Quality: paths per point of the reference.
     pub paths: u32,
@@ -321,6 +322,9 @@ fn command_of(line: CommandLine) -> Result<Command, String> {
                 ..Default::default()
             };
             Command::ReportLive(Box::new(args))
+        }
+        Verb::Report(Report::Edits(edits)) => {
+            Command::ReportEdits(Box::new(ReportArgs { seeds: edits.objects, ..report_args(edits.flags)? }))
         }
         Verb::Report(Report::Scaling(scaling)) => {
             let (scenes, rays_only) = (scaling.scenes, scaling.rays_only);

@@ -1,0 +1,166 @@
+/*
+ * Edits: a light map follows its scene, and bakes again what has changed.
+ *
+ *     edits
+ */
+#include "check.h"
+
+#include <math.h>
+#include <stdlib.h>
+
+/* A room of 6 x 6 x 3 with a lamp, and a block that stands on its floor. Boxes of 8 vertices. */
+static void box(const float lower[3], const float upper[3], float out[8][3]) {
+    int i, axis;
+    for (i = 0; i < 8; i++) {
+        for (axis = 0; axis < 3; axis++) {
+            out[i][axis] = (i >> axis & 1) ? upper[axis] : lower[axis];
+        }
+    }
+}
+
+static const uint32_t OUTWARD[12][3] = {{0, 2, 1}, {1, 2, 3}, {4, 5, 6}, {5, 7, 6}, {0, 1, 4}, {1, 5, 4},
+                                        {2, 6, 3}, {3, 6, 7}, {0, 4, 2}, {2, 4, 6}, {1, 3, 5}, {3, 7, 5}};
+
+static bk_scene *room(bk_device *device) {
+    static const float low[3] = {0, 0, 0}, high[3] = {6, 6, 3}, from[3] = {1, 1, 0}, to[3] = {1.5f, 1.5f, 0.8f};
+    float walls[8][3], block[8][3];
+    uint32_t inward[12][3];
+    bk_scene *scene = NULL;
+    bk_material_desc material;
+    bk_mesh_desc mesh;
+    bk_light_desc light;
+    int i;
+    for (i = 0; i < 12; i++) {
+        inward[i][0] = OUTWARD[i][0], inward[i][1] = OUTWARD[i][2], inward[i][2] = OUTWARD[i][1];
+    }
+    box(low, high, walls);
+    box(from, to, block);
+    CHECK_OK(bk_scene_create(device, &scene));
+    bk_material_desc_init(&material);
+    CHECK_OK(bk_scene_add_material(scene, &material, NULL));
+    bk_mesh_desc_init(&mesh);
+    mesh.positions = walls[0];
+    mesh.vertex_count = 8;
+    mesh.indices = inward[0];
+    mesh.triangle_count = 12;
+    CHECK_OK(bk_scene_add_mesh(scene, &mesh, NULL));
+    mesh.positions = block[0];
+    mesh.indices = OUTWARD[0];
+    CHECK_OK(bk_scene_add_mesh(scene, &mesh, NULL));
+    bk_light_desc_init(&light);
+    light.type = BK_LIGHT_POINT;
+    light.position[0] = light.position[1] = 3;
+    light.position[2] = 2.5f;
+    light.color[0] = light.color[1] = light.color[2] = 10;
+    CHECK_OK(bk_scene_add_light(scene, &light, NULL));
+    CHECK_OK(bk_scene_commit(scene, NULL, NULL));
+    return scene;
+}
+
+static void move_block(bk_scene *scene, float x) {
+    const float lower[3] = {x, 1, 0}, upper[3] = {x + 0.5f, 1.5f, 0.8f};
+    float block[8][3];
+    box(lower, upper, block);
+    CHECK_OK(bk_mesh_set_positions(scene, 1, block[0], 8, 0));
+    CHECK_OK(bk_scene_refit(scene));
+}
+
+/* The combined light of page 0; the caller frees it. */
+static float *light_of(const bk_lightmap *map, size_t *count) {
+    bk_lightmap_info info;
+    float *page;
+    bk_lightmap_info_init(&info);
+    CHECK_OK(bk_lightmap_get_info(map, &info));
+    *count = (size_t)info.width * info.height * 3;
+    page = malloc(*count * sizeof *page);
+    CHECK_OK(bk_lightmap_read(map, 0, BK_LAYER_COMBINED, BK_FORMAT_RGB32F, page, *count * sizeof *page));
+    return page;
+}
+
+static double difference(const float *a, const float *b, size_t count) {
+    double sum = 0, all = 0;
+    size_t i;
+    for (i = 0; i < count; i++) {
+        sum += fabs((double)a[i] - b[i]);
+        all += b[i];
+    }
+    return sum / all;
+}
+
+int main(void) {
+    bk_device *device = NULL;
+    bk_scene *scene, *other;
+    bk_lightmap *map = NULL;
+    bk_lightmap_desc desc;
+    bk_lightmap_info before, after;
+    bk_bake_params params;
+    bk_bake_stats stats;
+    float *old, *kept, *changed, *fresh;
+    size_t count = 0;
+    char plan[8192];
+    CHECK_OK(bk_device_create(NULL, &device));
+    scene = room(device);
+    other = room(device);
+    bk_lightmap_desc_init(&desc);
+    desc.texels_per_unit = 16;
+    CHECK_OK(bk_lightmap_create(scene, &desc, NULL, NULL, &map));
+    bk_lightmap_info_init(&before);
+    CHECK_OK(bk_lightmap_get_info(map, &before));
+    bk_bake_params_init(&params);
+    params.photon_count = 50000;
+    params.stitch = 0;
+    bk_bake_stats_init(&stats);
+
+    /* Without light all is baked; again, nothing is. */
+    CHECK_OK(bk_bake_changed(map, &params, 0.05f, NULL, NULL, &stats));
+    CHECK(stats.kept_texels == 0);
+    old = light_of(map, &count);
+    CHECK_OK(bk_bake_changed(map, &params, 0.05f, NULL, NULL, &stats));
+    CHECK(stats.kept_texels == before.texels);
+    kept = light_of(map, &count);
+    CHECK(memcmp(old, kept, count * sizeof *old) == 0);
+
+    /* Pages stay, and so does the light until it is baked. */
+    move_block(scene, 2.0f);
+    CHECK_OK(bk_lightmap_follow(map, scene, NULL, NULL));
+    CHECK_OK(bk_lightmap_follow(map, scene, NULL, NULL));
+    bk_lightmap_info_init(&after);
+    CHECK_OK(bk_lightmap_get_info(map, &after));
+    CHECK(after.texels == before.texels && after.page_count == before.page_count && after.width == before.width);
+    free(kept);
+    kept = light_of(map, &count);
+    CHECK_OK(bk_bake_changed(map, &params, 0.03f, NULL, NULL, &stats));
+    changed = light_of(map, &count);
+    CHECK(stats.kept_texels > before.texels / 10 && stats.kept_texels < before.texels);
+    CHECK(bk_plan_describe(map, plan, sizeof plan) > 0 && strstr(plan, "left out: light of") != NULL);
+    CHECK_OK(bk_bake(map, &params, NULL, NULL, &stats));
+    CHECK(stats.kept_texels == 0);
+    fresh = light_of(map, &count);
+    CHECK(difference(old, kept, count) < 0.01);
+    CHECK(difference(changed, fresh, count) < 0.005);
+    CHECK(difference(old, fresh, count) > 4 * difference(changed, fresh, count));
+
+    /* Refused, and nothing lost. */
+    CHECK_ERROR(bk_lightmap_follow(map, other, NULL, NULL), BK_ERROR_INVALID_ARGUMENT, "another scene");
+    CHECK_ERROR(bk_lightmap_follow(map, NULL, NULL, NULL), BK_ERROR_INVALID_ARGUMENT, "scene");
+    CHECK_ERROR(bk_lightmap_follow(NULL, scene, NULL, NULL), BK_ERROR_INVALID_ARGUMENT, "lightmap");
+    CHECK_ERROR(bk_bake_changed(map, &params, -1.0f, NULL, NULL, NULL), BK_ERROR_INVALID_ARGUMENT, "keep_error");
+    CHECK_ERROR(bk_bake_changed(map, &params, NAN, NULL, NULL, NULL), BK_ERROR_INVALID_ARGUMENT, "keep_error");
+    params.checkpoint = "no-checkpoint";
+    CHECK_ERROR(bk_bake_changed(map, &params, 0.03f, NULL, NULL, NULL), BK_ERROR_INVALID_ARGUMENT, "checkpoint");
+    params.checkpoint = NULL;
+    params.texel_end = 5;
+    CHECK_ERROR(bk_bake_changed(map, &params, 0.03f, NULL, NULL, NULL), BK_ERROR_INVALID_ARGUMENT, "all texels");
+    params.texel_end = 0;
+    /* Other parameters: all is baked. */
+    params.gather_rays = 32;
+    CHECK_OK(bk_bake_changed(map, &params, 10.0f, NULL, NULL, &stats));
+    CHECK(stats.kept_texels == 0);
+
+    free(old), free(kept), free(changed), free(fresh);
+    bk_lightmap_release(map);
+    bk_scene_release(scene);
+    bk_scene_release(other);
+    bk_device_release(device);
+    return check_report("edits");
+}

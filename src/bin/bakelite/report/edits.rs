@@ -1,0 +1,203 @@
+//! `bakelite report edits`: an object of a scene moves; seconds to right light by baking what has changed, beside a bake
+//! from nothing, and the difference of the two.
+//!
+//! Objects are pieces whose triangles hang together. Some are chosen at random among those of a size that a person
+//! would move, and move by their own size across the floor.
+
+use crate::args::ReportArgs;
+use crate::job::Job;
+use bakelite::lightmap::{BakeParams, Layer, LayerData, Lightmap};
+use bakelite::{Error, Progress, Result, Scene};
+use glam::{Quat, Vec3};
+use std::collections::HashMap;
+use std::sync::Arc;
+use std::time::Instant;
+
+/// Sizes of objects that move, as fractions of the scene's diagonal.
+const SIZES: std::ops::Range<f32> = 0.01..0.1;
+
+/// Differences of light that are let stand.
+const KEEP_ERRORS: [f32; 3] = [0.01, 0.03, 0.1];
+
+/// Texels darker than this part of the mean light count as if they were so bright.
+const DARK: f64 = 0.1;
+
+/// Passes of the light that errors are told by.
+const PASSES: u32 = 8;
+
+/// A piece of a mesh.
+struct Piece {
+    mesh: u32,
+    vertices: Vec<u32>,
+    triangles: usize,
+    size: f32,
+}
+
+/// Prints a table in Markdown.
+pub fn run(args: &ReportArgs) -> Result<()> {
+    let mut job = Job::new(&args.bake);
+    let device = job.device()?;
+    let mut scene = job.scene_on(&device)?;
+    let (params, progress) = (args.bake.params, Progress::none());
+    let start = Instant::now();
+    let mut map = job.layout(&scene)?;
+    println!("charts and texels: {:.2} s, {} texels", start.elapsed().as_secs_f64(), map.info().texels);
+    let pieces = chosen(&scene, args.seeds as usize, params.seed);
+    if pieces.is_empty() {
+        return Err(Error::InvalidArgument("the scene has no object of a size to be moved".into()));
+    }
+    let path = std::env::temp_dir().join(format!("bakelite-edits-{}", std::process::id()));
+    map.bake(&params, &progress)?;
+    map.save_result(&path, &progress)?;
+    println!(
+        "| triangles moved | size | refit, s | follow, s | keep_error | what changed, s | from nothing, s | kept | difference from the bake from nothing: mean | of a hundredth more than | error: what changed | from nothing | old light |"
+    );
+    println!("|---|---|---|---|---|---|---|---|---|---|---|---|---|");
+    for (number, piece) in pieces.iter().enumerate() {
+        let here = scene.meshes()[piece.mesh as usize].positions.to_vec();
+        let angle = Quat::from_axis_angle(args.bake.up.normalize(), number as f32 * 2.4);
+        let by = angle * args.bake.up.any_orthonormal_vector() * piece.size;
+        let mut there = here.clone();
+        piece.vertices.iter().for_each(|&v| there[v as usize] += by);
+        let old = light(&map)?;
+        let refit = move_to(&mut scene, piece.mesh, &there)?;
+        let start = Instant::now();
+        map.follow(&scene, &progress)?;
+        let follow = start.elapsed().as_secs_f64();
+        let from_nothing = map.bake(&params, &progress)?;
+        let from_nothing_light = light(&map)?;
+        let reference = BakeParams { seed: params.seed + 1, passes: PASSES, ..params };
+        map.bake(&reference, &progress)?;
+        let right = light(&map)?;
+        let noise = difference(&from_nothing_light, &right);
+        let stale = difference(&old, &right);
+        for keep_error in KEEP_ERRORS {
+            move_to(&mut scene, piece.mesh, &here)?;
+            map.follow(&scene, &progress)?;
+            map.load_result(&path, &progress)?;
+            move_to(&mut scene, piece.mesh, &there)?;
+            map.follow(&scene, &progress)?;
+            let stats = map.bake_changed(&params, keep_error, &progress)?;
+            let new = light(&map)?;
+            let (changed, error) = (difference(&new, &from_nothing_light), difference(&new, &right));
+            println!(
+                "| {} | {:.2} | {refit:.3} | {follow:.2} | {keep_error} | {:.2} (photons {:.2}, radiance {:.2}, gather {:.2}, direct {:.2}) | {:.2} | {:.1} % | {:.2e} | {:.2e} | {:.2e} | {:.2e} | {:.2e} |",
+                piece.triangles,
+                piece.size,
+                stats.seconds,
+                stats.photons.seconds,
+                stats.radiance.seconds,
+                stats.gather.seconds,
+                stats.direct.seconds,
+                from_nothing.seconds,
+                100.0 * stats.kept_texels as f64 / map.info().texels as f64,
+                changed.0,
+                changed.1,
+                error.0,
+                noise.0,
+                stale.0,
+            );
+        }
+        move_to(&mut scene, piece.mesh, &here)?;
+        map.follow(&scene, &progress)?;
+        map.load_result(&path, &progress)?;
+    }
+    std::fs::remove_file(&path).map_err(|e| Error::Io(e.to_string()))
+}
+
+/// Moves a mesh; returns the seconds.
+fn move_to(scene: &mut Arc<Scene>, mesh: u32, positions: &[Vec3]) -> Result<f64> {
+    let start = Instant::now();
+    Scene::refit(scene, &[(mesh, positions)])?;
+    Ok(start.elapsed().as_secs_f64())
+}
+
+/// The combined light of all covered texels, page by page.
+fn light(map: &Lightmap) -> Result<Vec<Vec3>> {
+    let mut all = Vec::new();
+    for page in 0..map.info().page_count {
+        let (LayerData::Rgb(light), LayerData::Scalar(valid)) =
+            (map.read(page, Layer::Combined)?, map.read(page, Layer::Validity)?)
+        else {
+            return Err(Error::Internal("layers of another type".into()));
+        };
+        all.extend(light.into_iter().zip(valid).filter(|(_, valid)| *valid == 1.0).map(|(light, _)| Vec3::from(light)));
+    }
+    Ok(all)
+}
+
+/// Relative difference of two lights: the mean over texels, and what a hundredth of them exceeds.
+fn difference(light: &[Vec3], right: &[Vec3]) -> (f64, f64) {
+    let sum = |v: &Vec3| f64::from(v.element_sum());
+    let dark = DARK * right.iter().map(sum).sum::<f64>() / right.len().max(1) as f64;
+    let of_texel = |(a, b): (&Vec3, &Vec3)| sum(&(*a - *b).abs()) / sum(b).max(dark);
+    // Texels that are covered in one state alone are few; the order of the others is the same if there are none.
+    let mut all: Vec<f64> = light.iter().zip(right).map(of_texel).collect();
+    let mean = all.iter().sum::<f64>() / all.len().max(1) as f64;
+    all.sort_unstable_by(f64::total_cmp);
+    (mean, all.get(all.len() * 99 / 100).copied().unwrap_or(0.0))
+}
+
+/// Chooses pieces at random.
+fn chosen(scene: &Scene, count: usize, seed: u64) -> Vec<Piece> {
+    let sizes = SIZES.start * scene.diagonal()..SIZES.end * scene.diagonal();
+    let mut all: Vec<Piece> = (0..scene.meshes().len() as u32).flat_map(|mesh| pieces(scene, mesh)).collect();
+    all.retain(|piece| sizes.contains(&piece.size) && piece.triangles > 1);
+    let mut random = seed.wrapping_mul(0x9e37_79b9_7f4a_7c15) ^ 0x2545_f491_4f6c_dd1d;
+    let mut pieces = Vec::new();
+    while pieces.len() < count && !all.is_empty() {
+        random = random.wrapping_mul(6364136223846793005).wrapping_add(1442695040888963407);
+        pieces.push(all.swap_remove((random >> 33) as usize % all.len()));
+    }
+    pieces
+}
+
+/// Takes a mesh apart into pieces whose triangles share positions.
+fn pieces(scene: &Scene, mesh: u32) -> Vec<Piece> {
+    let m = &scene.meshes()[mesh as usize];
+    if scene.is_instanced(mesh) {
+        return Vec::new();
+    }
+    let mut places = HashMap::new();
+    let place: Vec<u32> = m
+        .positions
+        .iter()
+        .enumerate()
+        .map(|(i, p)| *places.entry(p.to_array().map(f32::to_bits)).or_insert(i as u32))
+        .collect();
+    let mut parent: Vec<u32> = (0..place.len() as u32).collect();
+    fn root(parent: &mut [u32], mut i: u32) -> u32 {
+        while parent[i as usize] != i {
+            parent[i as usize] = parent[parent[i as usize] as usize];
+            i = parent[i as usize];
+        }
+        i
+    }
+    for corners in &m.indices[..] {
+        let [a, b, c] = corners.map(|i| root(&mut parent, place[i as usize]));
+        parent[b as usize] = a;
+        let c = root(&mut parent, c);
+        parent[c as usize] = root(&mut parent, a);
+    }
+    let mut of_roots: HashMap<u32, (Vec<u32>, usize)> = HashMap::new();
+    for (i, &at) in place.iter().enumerate() {
+        of_roots.entry(root(&mut parent, at)).or_default().0.push(i as u32);
+    }
+    for corners in &m.indices[..] {
+        let root = root(&mut parent, place[corners[0] as usize]);
+        if let Some(piece) = of_roots.get_mut(&root) {
+            piece.1 += 1;
+        }
+    }
+    let mut pieces: Vec<Piece> = of_roots
+        .into_values()
+        .map(|(vertices, triangles)| {
+            let positions = || vertices.iter().map(|&v| m.positions[v as usize]);
+            let lower = positions().fold(Vec3::INFINITY, Vec3::min);
+            let upper = positions().fold(Vec3::NEG_INFINITY, Vec3::max);
+            Piece { mesh, size: (upper - lower).length(), triangles, vertices }
+        })
+        .collect();
+    pieces.sort_by_key(|piece| piece.vertices[0]);
+    pieces
+}

@@ -1,0 +1,249 @@
+//! What moved between two states of a scene: charts, and boxes around where they were and where they are.
+
+use super::atlas::charts::Charts;
+use super::atlas::ids::ChartId;
+use crate::base::error::Result;
+use crate::base::geometry::is_valid_triangle;
+use crate::base::memory::{try_push, try_vec};
+use crate::scene::Scene;
+use glam::Vec3;
+
+/// Maximum number of boxes; those whose union adds least are merged until there are so few.
+const MOST_BOXES: usize = 32;
+
+/// Boxes that are merged in pairs at most; of more, neighbours in the order of objects are merged first, since trying all
+/// pairs takes the square of their number.
+const MOST_PAIRED: usize = 256;
+
+const MOVED: &str = "what has moved";
+
+/// A box with sides along the axes.
+#[derive(Clone, Copy, Debug, PartialEq)]
+pub(super) struct Bounds {
+    pub lower: Vec3,
+    pub upper: Vec3,
+}
+
+impl Bounds {
+    pub const EMPTY: Bounds = Bounds { lower: Vec3::splat(f32::INFINITY), upper: Vec3::splat(f32::NEG_INFINITY) };
+
+    pub fn is_empty(&self) -> bool {
+        !self.lower.cmple(self.upper).all()
+    }
+
+    pub fn add(&mut self, point: Vec3) {
+        (self.lower, self.upper) = (self.lower.min(point), self.upper.max(point));
+    }
+
+    pub fn with(&self, other: &Bounds) -> Bounds {
+        Bounds { lower: self.lower.min(other.lower), upper: self.upper.max(other.upper) }
+    }
+
+    /// Returns the box with every side moved outwards.
+    pub fn grown(&self, by: f32) -> Bounds {
+        Bounds { lower: self.lower - by, upper: self.upper + by }
+    }
+
+    pub fn overlaps(&self, other: &Bounds) -> bool {
+        self.lower.cmple(other.upper).all() && other.lower.cmple(self.upper).all()
+    }
+
+    /// Returns the area of the six sides.
+    pub fn area(&self) -> f32 {
+        let d = (self.upper - self.lower).max(Vec3::ZERO);
+        2.0 * (d.x * d.y + d.y * d.z + d.z * d.x)
+    }
+
+    /// Returns the length of the diagonal.
+    pub fn diagonal(&self) -> f32 {
+        (self.upper - self.lower).length()
+    }
+
+    /// Returns the distance to another box, 0 if they overlap.
+    pub fn distance(&self, other: &Bounds) -> f32 {
+        (other.lower - self.upper).max(self.lower - other.upper).max(Vec3::ZERO).length()
+    }
+
+    /// Whether another box is met on the way from this one, while its sides move by `lower` and `upper` times the way,
+    /// from 0 to `end`. With the sides of a second box at 1, that is the convex hull of both: it consists of the boxes
+    /// between them.
+    pub fn sweeps(&self, lower: Vec3, upper: Vec3, end: f32, other: &Bounds) -> bool {
+        let (mut near, mut far) = (0.0f32, end);
+        // Where value + slope · t ≤ limit.
+        let mut bound = |value: f32, slope: f32, limit: f32| {
+            if slope > 0.0 {
+                far = far.min((limit - value) / slope);
+            } else if slope < 0.0 {
+                near = near.max((limit - value) / slope);
+            } else if value > limit {
+                far = -1.0;
+            }
+        };
+        for axis in 0..3 {
+            bound(self.lower[axis], lower[axis], other.upper[axis]);
+            bound(-self.upper[axis], -upper[axis], -other.lower[axis]);
+        }
+        near <= far
+    }
+
+    /// Whether the part of a ray up to `end` times its direction meets the box (slab test).
+    pub fn is_hit(&self, origin: Vec3, direction: Vec3, end: f32) -> bool {
+        let (mut near, mut far) = (0.0f32, end);
+        for axis in 0..3 {
+            let (o, d, low, high) = (origin[axis], direction[axis], self.lower[axis], self.upper[axis]);
+            if d == 0.0 {
+                if o < low || o > high {
+                    return false;
+                }
+                continue;
+            }
+            let (a, b) = ((low - o) / d, (high - o) / d);
+            (near, far) = (near.max(a.min(b)), far.min(a.max(b)));
+        }
+        near <= far
+    }
+}
+
+/// What moved between two states of a scene.
+pub(super) struct Moved {
+    /// Whether each chart has a corner that moved.
+    charts: Vec<bool>,
+    /// Boxes around the triangles that moved, before and after; few, and none of them empty.
+    pub boxes: Vec<Bounds>,
+    /// Whether an emissive triangle moved.
+    pub emits: bool,
+}
+
+impl Moved {
+    /// Compares two states of a scene, whose charts are the same.
+    pub fn between(old: &Scene, new: &Scene, charts: &Charts) -> Result<Moved> {
+        let mut moved = Moved { charts: try_vec(charts.charts.len(), MOVED)?, boxes: Vec::new(), emits: false };
+        if std::ptr::eq(old, new) {
+            return Ok(moved);
+        }
+        for number in 0..new.object_count() {
+            let (before, after) = (old.object(number), new.object(number));
+            if before.stands_as(&after) {
+                continue;
+            }
+            let mut boxes = [Bounds::EMPTY; 2];
+            let first = new.first_triangle(number);
+            for triangle in new.triangles_of(number) {
+                let corners = [&before, &after].map(|object| object.corners(triangle - first));
+                if corners[0].map(|c| c.to_array().map(f32::to_bits))
+                    == corners[1].map(|c| c.to_array().map(f32::to_bits))
+                {
+                    continue;
+                }
+                if let Some(chart) = charts.find(triangle) {
+                    moved.charts[chart.index()] = true;
+                }
+                moved.emits |= new.material(triangle).is_emissive();
+                for (bounds, corners) in boxes.iter_mut().zip(corners).filter(|(_, c)| is_valid_triangle(*c)) {
+                    corners.into_iter().for_each(|corner| bounds.add(corner));
+                }
+            }
+            for bounds in boxes.into_iter().filter(|bounds| !bounds.is_empty()) {
+                try_push(&mut moved.boxes, bounds, MOVED)?;
+            }
+        }
+        moved.boxes = merged(moved.boxes, MOST_BOXES);
+        Ok(moved)
+    }
+
+    /// Whether a corner of a chart moved.
+    pub fn has(&self, chart: ChartId) -> bool {
+        self.charts[chart.index()]
+    }
+}
+
+/// Merges boxes until there are at most `most`, at least 1.
+pub(super) fn merged(mut boxes: Vec<Bounds>, most: usize) -> Vec<Bounds> {
+    while boxes.len() > MOST_PAIRED {
+        for i in 0..boxes.len() / 2 {
+            boxes[i] = boxes[2 * i].with(&boxes[2 * i + 1]);
+        }
+        let half = boxes.len() / 2;
+        if boxes.len() % 2 == 1 {
+            boxes[half] = boxes[2 * half];
+        }
+        boxes.truncate(boxes.len().div_ceil(2));
+    }
+    while boxes.len() > most {
+        let mut best = (f32::INFINITY, 0, 1);
+        for i in 0..boxes.len() {
+            for j in i + 1..boxes.len() {
+                let more = boxes[i].with(&boxes[j]).area() - boxes[i].area() - boxes[j].area();
+                if more < best.0 {
+                    best = (more, i, j);
+                }
+            }
+        }
+        let (_, i, j) = best;
+        boxes[i] = boxes[i].with(&boxes[j]);
+        boxes.swap_remove(j);
+    }
+    boxes
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use crate::base::sampling::uniform;
+
+    fn unit_box(at: Vec3) -> Bounds {
+        Bounds { lower: at, upper: at + 1.0 }
+    }
+
+    #[test]
+    fn a_box_is_hit_by_what_passes_through_it_alone() {
+        let bounds = unit_box(Vec3::ONE);
+        let to = |target: Vec3, end| bounds.is_hit(Vec3::ZERO, target, end);
+        assert!(to(Vec3::splat(3.0), 1.0) && !to(Vec3::splat(0.9), 1.0) && !to(-Vec3::splat(3.0), 1.0));
+        assert!(!to(Vec3::new(3.0, 0.5, 3.0), 1.0) && to(Vec3::ONE, f32::INFINITY));
+        // Along an axis, beside the box and through it.
+        assert!(!bounds.is_hit(Vec3::new(0.0, 0.5, 1.5), Vec3::X, f32::INFINITY));
+        assert!(bounds.is_hit(Vec3::new(0.0, 1.5, 1.5), Vec3::X, f32::INFINITY));
+        assert!(bounds.is_hit(bounds.lower + 0.5, Vec3::X, 0.0));
+    }
+
+    #[test]
+    fn a_sweep_meets_what_lies_in_the_hull_of_two_boxes() {
+        let (from, to) = (unit_box(Vec3::ZERO), Bounds { lower: Vec3::splat(8.0), upper: Vec3::new(12.0, 10.0, 9.0) });
+        let meets = |other: &Bounds| from.sweeps(to.lower - from.lower, to.upper - from.upper, 1.0, other);
+        // Points of the hull, and points far from it by its definition: the nearest of many in it.
+        for i in 0..2000u32 {
+            let random = |k| uniform(i, k, 7);
+            let at = Vec3::new(14.0 * random(0), 14.0 * random(1), 14.0 * random(2)) - 1.0;
+            let other = Bounds { lower: at, upper: at + 0.5 * random(3) };
+            let is_met = (0..=400).any(|t| {
+                let t = t as f32 / 400.0;
+                let between = Bounds { lower: from.lower.lerp(to.lower, t), upper: from.upper.lerp(to.upper, t) };
+                between.grown(0.02).overlaps(&other)
+            });
+            let is_met_surely = (0..=400).any(|t| {
+                let t = t as f32 / 400.0;
+                let between = Bounds { lower: from.lower.lerp(to.lower, t), upper: from.upper.lerp(to.upper, t) };
+                between.overlaps(&other)
+            });
+            assert!(meets(&other) <= is_met && meets(&other) >= is_met_surely, "{other:?}");
+        }
+        // Towards infinity, within a spread.
+        let sun =
+            |other: Bounds| from.sweeps(Vec3::new(-0.1, -0.1, 1.0), Vec3::new(0.1, 0.1, 1.0), f32::INFINITY, &other);
+        assert!(sun(unit_box(Vec3::new(5.0, 0.0, 100.0))) && !sun(unit_box(Vec3::new(12.0, 0.0, 100.0))));
+        assert!(!sun(unit_box(Vec3::new(0.0, 0.0, -3.0))));
+    }
+
+    #[test]
+    fn merged_boxes_are_few_and_hold_all() {
+        for count in [0, 3, 32, 33, 257, 1000] {
+            let all: Vec<Bounds> =
+                (0..count).map(|i| unit_box(Vec3::new(i as f32 * 1.5, (i % 7) as f32, 0.0))).collect();
+            let few = merged(all.clone(), MOST_BOXES);
+            assert!(few.len() <= MOST_BOXES && (count > MOST_BOXES || few == all));
+            let holds = |small: &Bounds| few.iter().any(|large| large.with(small) == *large);
+            assert!(all.iter().all(holds), "{count}");
+        }
+    }
+}
