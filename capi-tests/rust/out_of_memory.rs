@@ -261,8 +261,27 @@ fn every_large_allocation_and_every_request_may_fail_and_nothing_is_lost() {
     load(&device, &folder.join("ground.obj"));
     std::fs::remove_dir_all(&folder).unwrap();
 
+    LARGE.store(128 << 10, SeqCst);
+    edits(&scene, &mut lightmap, &whole);
     drop((lightmap, scene));
     assert_eq!(ANNOUNCED.load(SeqCst), 0, "bytes announced, but not given back");
+}
+
+/// A vertex moves, and the light map follows.
+fn edits(scene: &Arc<Scene>, lightmap: &mut Lightmap, params: &BakeParams) {
+    let none = Progress::none();
+    let mut moved = scene.meshes()[0].positions.to_vec();
+    for left in [&ALLOCATIONS_LEFT, &REQUESTS_LEFT] {
+        let mut state = scene.clone();
+        moved[1].z += 0.01;
+        Scene::refit(&mut state, &[(0, &moved)]).unwrap();
+        let (texels, light) = (lightmap.info().texels, bits(lightmap));
+        fail_each("following a scene", left, || lightmap.follow(&state, &none));
+        assert_eq!((lightmap.info().texels, bits(lightmap)), (texels, light));
+    }
+    // After the first that succeeds there is nothing left to bake, but all is looked at.
+    let stats = fail_all("bake of changes", || lightmap.bake_changed(params, 0.03, &none));
+    assert!(stats.kept_texels > 0);
 }
 
 /// Saves and loads the light map's result, and saves its pages. (EXR files are left out: the

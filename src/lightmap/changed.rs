@@ -47,7 +47,7 @@ const PROBED_TEXELS: u32 = 256;
 
 /// Part of the light of a surface, by a bound of its form factor, from which on what moved may cast shadows and reflect
 /// light that differ within a cell, whatever the probes find.
-const NEAR: f32 = 0.04;
+const NEAR: f32 = 0.15;
 
 /// Texels darker than this part of the mean light count as if they were so bright.
 const DARK: f32 = 0.1;
@@ -335,7 +335,7 @@ impl Source {
 /// most half of its surface is seen, and all of it as if facing the surface.
 fn part_of_light(from: &Bounds, moved: &Bounds) -> f32 {
     let d = from.distance(moved);
-    0.5 * moved.area() / (PI * d * d)
+    if d > 0.0 { 0.5 * moved.area() / (PI * d * d) } else { f32::INFINITY }
 }
 
 struct Job<'a, 'p> {
