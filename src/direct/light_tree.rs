@@ -176,8 +176,7 @@ fn divide(node: &Node, importances: &[f32; WIDTH], part: &Part, next: &mut Vec<P
     }
     // The first sample after each child. (All at once, in lanes: descents take 0.93 of the time.)
     let after = ends.map(|end| ceil(end).min(part.end).max(part.first));
-    let mut before = [part.first; WIDTH];
-    before[1..].copy_from_slice(&after[..WIDTH - 1]);
+    let before: [i32; WIDTH] = std::array::from_fn(|child| if child == 0 { part.first } else { after[child - 1] });
     // Children that samples fall on. (To look for the child of each sample takes longer.)
     let mut filled = 0u32;
     for child in 0..WIDTH {

@@ -496,9 +496,10 @@ impl<'p> Bake<'_, 'p> {
                 let first = needed.start + block * BLOCK;
                 let mut order = in_order(&l.gather, first..first + values.len())?;
                 order.retain(|texel| is_needed(texel.index()));
+                let mut receiver = l.receivers(&l.gather, backs);
                 for texels_of_tile in order.chunks(Tile::texels(&samples)) {
                     let texel = |&texel: &GatherTexel| TileTexel {
-                        receiver: l.receiver(&l.gather, backs, texel),
+                        receiver: receiver(texel),
                         seed: combine(seed, texel.seed()),
                         gathered: Gathered::default(),
                         directional: nothing,
@@ -614,9 +615,10 @@ impl<'p> Bake<'_, 'p> {
                     let mut tile = tiles.take(|| new_tile(TILE))?;
                     let mut order = in_order(&l.map, first..first + direct.len())?;
                     order.retain(|texel| has_new_direct(texel.index()));
+                    let mut receiver = l.receivers(&l.map, backs);
                     for of_tile in order.chunks(4 * TILE) {
                         self.progress.check()?;
-                        let receivers = of_tile.iter().map(|&texel| l.receiver(&l.map, backs, texel));
+                        let receivers = of_tile.iter().map(|&texel| receiver(texel));
                         let place = |i: usize| of_tile[i].index() - first;
                         texels.sharp_of_tile(receivers, &mut tile, &mut traced, |i, sharp, by_direction| {
                             direct[place(i)] = sharp;
@@ -708,13 +710,14 @@ impl<'p> Bake<'_, 'p> {
                     let varies = self.direct.has_soft() || variations[t.index() - first] != Variation::None;
                     varies && is_new(t.index())
                 });
+                let mut receiver = l.receivers(&l.map, backs);
                 for some in order.chunks(texels_per_tile(texels.samples)) {
                     self.progress.check()?;
                     of_tile.clear();
                     of_tile.extend(some.iter().map(|&texel| Averaged {
                         texel,
                         back: l.is_back(&l.map, backs, texel),
-                        receiver: l.receiver(&l.map, backs, texel),
+                        receiver: receiver(texel),
                         sharp: direct[texel.index() - first],
                         sharp_directional: directed.get(texel.index() - first).copied().unwrap_or_default(),
                         variation: variations[texel.index() - first],

@@ -24,7 +24,7 @@ pub(crate) mod looks;
 
 use super::atlas::Atlas;
 use super::atlas::chart_index::ChartIndex;
-use super::atlas::chart_map::{ChartMap, receiver_of};
+use super::atlas::chart_map::{ChartMap, Receivers};
 use super::atlas::charts::Charts;
 use super::atlas::ids::{Map, TexelId};
 use super::atlas::seen::Seen;
@@ -136,14 +136,9 @@ impl<M: Map> TexelAreas<'_, M> {
     }
 
     /// Returns the texels [around](AROUND) a texel in the same placement, where there are any.
-    pub(crate) fn neighbours(&self, texel: TexelId<M>) -> impl Iterator<Item = Option<TexelId<M>>> {
-        let placement = self.map.placement_of(self.charts, texel);
-        let (x, y) = self.map.position(texel);
-        let own = self.map.texels_of(placement);
-        AROUND.into_iter().map(move |(dx, dy)| {
-            // (Texels are numbered by placement. Asked for its own placement, a neighbour would be read.)
-            self.map.at(placement, x + dx, y + dy).filter(|&near| own.contains(near))
-        })
+    #[inline]
+    pub(crate) fn neighbours(&self, texel: TexelId<M>) -> [Option<TexelId<M>>; AROUND.len()] {
+        self.map.around(self.map.placement_of(self.charts, texel), texel, AROUND)
     }
 }
 
@@ -295,7 +290,7 @@ impl TilePoints {
     /// Lights the wanted points that lie on their charts, and adds them to those of their texels.
     fn light<M: Map>(&mut self, by: &TexelLight<M>, wanted: impl Iterator<Item = Wanted<M>>, rays: &mut u64) {
         let scene = by.areas.scene;
-        let mut shadow = self.room.begin(scene);
+        let (mut shadow, mut receivers) = (self.room.begin(scene), Receivers::new(scene));
         self.pending.clear();
         for Wanted { place, texel, back, numbers, lights } in wanted {
             let samples = by.samples.div_ceil(numbers.len() as u32);
@@ -303,7 +298,7 @@ impl TilePoints {
             let of_round = combine(seed, numbers.start);
             for number in numbers {
                 let Some(on) = by.areas.point(texel, number, seed) else { continue };
-                let receiver = receiver_of(scene, &on, back).1;
+                let receiver = receivers.of(&on, back);
                 let (count, at) = (self.counts[place], place * MAX_POINTS + self.counts[place]);
                 shadow.slot = KINDS * at;
                 let light = by.direct.push(&receiver, (count - first) as u32, lights, samples, of_round, &mut shadow);

@@ -188,7 +188,7 @@ impl DirectWork {
         let Room { points, own, sharp, .. } = room;
         sharp.clear();
         for &texel in &*own {
-            for near in [texel].into_iter().chain(lit.areas.neighbours(texel).flatten()) {
+            for near in [texel].into_iter().chain(lit.areas.neighbours(texel).into_iter().flatten()) {
                 let place = self.place(c, near);
                 if self.sharp[place].x.is_nan() {
                     // It is listed once.

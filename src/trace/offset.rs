@@ -39,16 +39,38 @@ pub struct SurfacePoint {
     pub interior: Vec3,
 }
 
+/// A triangle, with what all of its points share.
+#[derive(Clone, Copy)]
+pub(crate) struct Facet {
+    corners: [DVec3; 3],
+    twice_area: f64,
+    normal: Vec3,
+}
+
 impl SurfacePoint {
     /// The point of a triangle with barycentric weights `u` and `v` of vertices 1 and 2.
     #[inline]
     pub fn new(corners: [Vec3; 3], u: f32, v: f32, scene: &Scene) -> SurfacePoint {
+        Facet::new(corners).point(u, v, scene)
+    }
+}
+
+impl Facet {
+    #[inline]
+    pub fn new(corners: [Vec3; 3]) -> Facet {
         let corners = corners.map(|c| c.as_dvec3());
         let [a, b, c] = corners;
-        let (edge_u, edge_v) = (b - a, c - a);
-        let cross = edge_u.cross(edge_v);
+        let cross = (b - a).cross(c - a);
         let twice_area = cross.length();
-        let normal = (cross / twice_area).as_vec3();
+        Facet { corners, twice_area, normal: (cross / twice_area).as_vec3() }
+    }
+
+    /// The point with barycentric weights `u` and `v` of vertices 1 and 2.
+    #[inline]
+    pub fn point(&self, u: f32, v: f32, scene: &Scene) -> SurfacePoint {
+        let Facet { corners, twice_area, normal } = *self;
+        let [a, b, c] = corners;
+        let (edge_u, edge_v) = (b - a, c - a);
         let (u, v) = (u as f64, v as f64);
         let position = a + edge_u * u + edge_v * v;
         let rounded = position.as_vec3();

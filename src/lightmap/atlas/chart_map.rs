@@ -8,7 +8,7 @@ use crate::base::error::Result;
 use crate::base::progress::Stage;
 use crate::direct::Receiver;
 use crate::scene::{NONE, Object, Scene};
-use crate::trace::offset::SurfacePoint;
+use crate::trace::offset::{Facet, SurfacePoint};
 use glam::Vec3;
 use std::marker::PhantomData;
 use std::ops::Index;
@@ -89,6 +89,20 @@ impl<M: Map> ChartMap<M> {
         covered(self.texels.texel_index(placement, x as u32, y as u32))
     }
 
+    /// Returns the texels at some offsets from a texel of a placement, as far as they are covered and of the same placement.
+    #[inline]
+    pub(crate) fn around<const N: usize>(
+        &self,
+        placement: PlacementId,
+        texel: TexelId<M>,
+        offsets: [(i32, i32); N],
+    ) -> [Option<TexelId<M>>; N] {
+        let (x, y) = self.position(texel);
+        let own = self.texels.samples_of(placement);
+        let found = self.texels.around(placement, x, y, offsets);
+        found.map(|s| covered(s).filter(|_| own.contains(&s)))
+    }
+
     /// Returns the texel nearest to a point of a placed chart; `None` if the placement has no texel (a given chart
     /// that others cover).
     #[inline]
@@ -141,6 +155,38 @@ fn covered<M: Map>(entry: u32) -> Option<TexelId<M>> {
 /// Returns a point of a triangle, and its front or back as a receiver.
 pub(in crate::lightmap) fn receiver_of(scene: &Scene, t: &TexelSample, back: bool) -> (SurfacePoint, Receiver) {
     receiver_at(scene, t.triangle, [t.u, t.v], back)
+}
+
+/// Makes receivers of texels, many of which follow one another in a triangle: what its points share is computed once.
+pub(in crate::lightmap) struct Receivers<'a> {
+    scene: &'a Scene,
+    /// The last triangle of a mesh without normals.
+    last: Option<(u32, Facet)>,
+}
+
+impl<'a> Receivers<'a> {
+    pub fn new(scene: &'a Scene) -> Receivers<'a> {
+        Receivers { scene, last: None }
+    }
+
+    /// Returns the receiver of [`receiver_of`].
+    #[inline]
+    pub fn of(&mut self, t: &TexelSample, back: bool) -> Receiver {
+        let facet = match self.last {
+            Some((triangle, facet)) if triangle == t.triangle => facet,
+            _ => {
+                let (object, triangle) = self.scene.locate(t.triangle);
+                let object = self.scene.object(object);
+                if !object.mesh().normals.is_empty() {
+                    return receiver_of(self.scene, t, back).1;
+                }
+                let facet = Facet::new(object.corners(triangle));
+                self.last = Some((t.triangle, facet));
+                facet
+            }
+        };
+        Receiver::new(self.scene, &facet.point(t.u, t.v, self.scene), None, back)
+    }
 }
 
 /// Returns a point of a triangle by its barycentric weights, and its front or back as a receiver.

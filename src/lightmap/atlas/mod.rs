@@ -26,7 +26,7 @@ use crate::base::memory::Reservation;
 use crate::direct::Receiver;
 use crate::scene::Scene;
 use chart_index::ChartIndex;
-use chart_map::ChartMap;
+use chart_map::{ChartMap, Receivers};
 use charts::Charts;
 use ids::{GatherMap, GatherTexel, LightMap, LightTexel, PlacementId, RadianceMap, ShownMap, TexelId};
 use seen::Seen;
@@ -65,6 +65,16 @@ impl Atlas {
     /// Returns the sample of a texel as a receiver, on the side that it shows.
     pub(crate) fn receiver<M: ShownMap>(&self, map: &ChartMap<M>, backs: &[bool], texel: TexelId<M>) -> Receiver {
         map.receiver(&self.scene, texel, self.is_back(map, backs, texel)).1
+    }
+
+    /// Returns what makes [`receiver`](Self::receiver)s of texels that mostly follow one another in a triangle.
+    pub(crate) fn receivers<'a, M: ShownMap>(
+        &'a self,
+        map: &'a ChartMap<M>,
+        backs: &'a [bool],
+    ) -> impl FnMut(TexelId<M>) -> Receiver + 'a {
+        let mut receivers = Receivers::new(&self.scene);
+        move |texel| receivers.of(&map[texel], self.is_back(map, backs, texel))
     }
 
     /// Returns the local coordinates of a texel of the light map in its chart. For a buried texel, these are not those

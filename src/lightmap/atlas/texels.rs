@@ -21,6 +21,7 @@ use crate::base::memory::{Reservation, try_collect, try_push, try_to_vec, try_ve
 use crate::base::parallel::one_by_one;
 use crate::base::progress::Stage;
 use crate::scene::{NONE, Object, Scene};
+use crate::simd::prefetch;
 use glam::{DVec2, Vec3};
 pub(crate) use padding::PageArea;
 use rayon::prelude::*;
@@ -225,13 +226,48 @@ impl TexelMap {
         if x < w.w as u32 && y < w.h as u32 { self.index[w.at(x, y)] } else { NONE }
     }
 
+    /// Returns the samples of the texels at some offsets from (x, y), as [`texel_index`](Self::texel_index) does.
+    #[inline(always)] // 1.5 times as fast: the window stays in registers, and the offsets are constants
+    pub fn around<const N: usize>(&self, placement: PlacementId, x: i32, y: i32, offsets: [(i32, i32); N]) -> [u32; N] {
+        let w = &self.windows[placement.index()];
+        let (x, y) = (x - i32::from(w.x), y - i32::from(w.y));
+        offsets.map(|(dx, dy)| {
+            let (x, y) = ((x + dx) as u32, (y + dy) as u32);
+            if x < u32::from(w.w) && y < u32::from(w.h) { self.index[w.at(x, y)] } else { NONE }
+        })
+    }
+
     /// Returns the sample nearest to a texel coordinate of the placement's page.
     #[inline]
     pub fn nearest(&self, placement: PlacementId, coord: [f32; 2]) -> u32 {
+        self.nearest_of(placement, self.entry(placement, coord))
+    }
+
+    /// Returns the entry in the index that [`nearest_of`](Self::nearest_of) reads for a texel coordinate.
+    #[inline]
+    pub fn entry(&self, placement: PlacementId, coord: [f32; 2]) -> usize {
         let w = &self.windows[placement.index()];
-        let (x, y) = (w.column(coord[0]), w.row(coord[1]));
-        let sample = self.index[w.at(x, y)];
-        if sample != NONE { sample } else { self.search(w, x, y) }
+        w.at(w.column(coord[0]), w.row(coord[1]))
+    }
+
+    /// Asks for an entry of the index.
+    #[inline]
+    pub fn prefetch(&self, entry: usize) {
+        if let Some(entry) = self.index.get(entry) {
+            prefetch(entry);
+        }
+    }
+
+    /// Returns the sample nearest to an [`entry`](Self::entry) of a placement.
+    #[inline]
+    pub fn nearest_of(&self, placement: PlacementId, entry: usize) -> u32 {
+        let sample = self.index[entry];
+        if sample != NONE {
+            return sample;
+        }
+        let w = &self.windows[placement.index()];
+        let place = (entry - w.start as usize) as u32;
+        self.search(w, place % u32::from(w.w), place / u32::from(w.w))
     }
 
     /// Returns up to four samples around a texel coordinate of the placement's page. The weight of texels without a

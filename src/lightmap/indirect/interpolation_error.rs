@@ -65,11 +65,12 @@ pub(super) fn surroundings(
     let count = TEXELS.min(of_placement.len()) * PROBES as usize;
     let mut probes: Vec<Ray> = try_with_capacity(count, WHAT)?;
     let mut hits = try_filled(count, RawHit::MISS, WHAT)?;
+    let mut receiver = atlas.receivers(&atlas.gather, backs);
     for texels in in_order(&atlas.gather, of_placement.indices())?.chunks(TEXELS) {
         stage.check()?;
         probes.clear();
         for &texel in texels {
-            let receiver = atlas.receiver(&atlas.gather, backs, texel);
+            let receiver = receiver(texel);
             let ray = |i| Ray::new(receiver.origin, cosine_around(receiver.normal, sobol_2d(i, texel.seed())));
             probes.extend((0..PROBES).map(ray));
         }

@@ -110,28 +110,43 @@ impl<'a> RadianceLookup<'a> {
 
     /// Finds where the map has a hit; `None` on the back of a one-sided surface.
     #[inline]
-    pub(super) fn find(&self, hit: &RawHit) -> Option<Place> {
+    fn find(&self, hit: &RawHit) -> Option<Place> {
+        self.place(&self.entry(hit)?)
+    }
+
+    /// Begins to find where the map has a hit, and asks for what [`place`](Self::place) reads; `None` on the back of a
+    /// one-sided surface.
+    #[inline]
+    pub(super) fn entry(&self, hit: &RawHit) -> Option<Entry> {
         let chart = self.charts.chart_of(hit.triangle);
         if chart == ChartId::NONE {
-            return Some(Place { placement: PlacementId::NONE, texel: NONE });
+            return Some(Entry { placement: PlacementId::NONE, number: 0 });
         }
         let placement = self.map.layout.side(chart, hit.front)?;
-        let texel = self.map.nearest(placement, self.charts.local(hit.triangle, hit.u, hit.v))?;
-        Some(Place { placement, texel: texel.index() as u32 })
+        let local = self.charts.local(hit.triangle, hit.u, hit.v);
+        let number = self.map.texels.entry(placement, self.map.layout.texel_coord(placement, local));
+        self.map.texels.prefetch(number);
+        Some(Entry { placement, number })
+    }
+
+    /// Finds a place, and asks for its radiance; `None` if its placement has no texel.
+    #[inline]
+    pub(super) fn place(&self, entry: &Entry) -> Option<Place> {
+        let &Entry { placement, number } = entry;
+        if placement == PlacementId::NONE {
+            return Some(Place { placement, texel: NONE });
+        }
+        let texel = self.map.texels.nearest_of(placement, number);
+        if let Some(value) = self.radiance.values.get(texel as usize) {
+            prefetch(value);
+        }
+        (texel != NONE).then_some(Place { placement, texel })
     }
 
     /// Asks for what is read to find a hit.
     #[inline]
     pub(super) fn prefetch_hit(&self, hit: &RawHit) {
         self.charts.prefetch(hit.triangle);
-    }
-
-    /// Asks for the radiance at a place.
-    #[inline]
-    pub(super) fn prefetch(&self, place: &Place) {
-        if let Some(value) = self.radiance.values.get(place.texel as usize) {
-            prefetch(value);
-        }
     }
 
     /// Returns placement and radiance at a place.
@@ -147,6 +162,13 @@ impl<'a> RadianceLookup<'a> {
 pub(super) struct Place {
     placement: PlacementId,
     texel: u32,
+}
+
+/// An entry of the map's index; no placement where a surface has no chart.
+#[derive(Clone, Copy)]
+pub(super) struct Entry {
+    placement: PlacementId,
+    number: usize,
 }
 
 /// Inputs of the stage.

@@ -310,8 +310,9 @@ fn gather_for(
     tile: &mut Tile,
     stage: &Stage,
 ) -> Result<u64> {
-    let texel = |&place: &u32| TileTexel {
-        receiver: atlas.receiver(&atlas.map, backs, texels[place as usize]),
+    let mut receiver = atlas.receivers(&atlas.map, backs);
+    let mut texel = |&place: &u32| TileTexel {
+        receiver: receiver(texels[place as usize]),
         seed: combine(own.seed, texels[place as usize].seed()),
         gathered: Gathered::default(),
         directional: own.directional.then(Directional::default),
@@ -319,7 +320,7 @@ fn gather_for(
     let mut rays = 0;
     for places in places_in_order(&atlas.map, texels)?.chunks(Tile::texels(own.samples)) {
         stage.check()?;
-        let mut of_tile: Vec<_> = places.iter().map(texel).collect();
+        let mut of_tile: Vec<_> = places.iter().map(&mut texel).collect();
         rays += tile.add_round(&atlas.scene, &own.radiance, &mut of_tile, own.samples, 0);
         for (&place, texel) in places.iter().zip(&of_tile) {
             let TileTexel { receiver, gathered, .. } = texel;

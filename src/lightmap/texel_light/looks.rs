@@ -68,7 +68,12 @@ impl TexelLight<'_, RadianceMap> {
     pub(crate) fn needs_closer_look(&self, texel: RadianceTexel, looks: PerTexel<RadianceMap, Look>) -> bool {
         let look = &looks[texel];
         look.varies
-            || self.areas.neighbours(texel).flatten().any(|near| differ(look.narrow, looks[near].narrow, DIFFERENCE))
+            || self
+                .areas
+                .neighbours(texel)
+                .into_iter()
+                .flatten()
+                .any(|near| differ(look.narrow, looks[near].narrow, DIFFERENCE))
     }
 
     /// Computes direct light of texels of the radiance map by 16 or 64 points, weighted by their albedos; `None` if

@@ -116,6 +116,10 @@ proptest! {
                 prop_assert_eq!(PlacementId::front_of(charts.chart_of(t.triangle)), p);
                 prop_assert_eq!(map.texel_index(p, t.x as u32, t.y as u32), s);
                 prop_assert_eq!(map.placement_of(s), p);
+                let offsets = [(0, 0), (-1, 0), (1, 1), (0, -2)];
+                let (x, y) = (i32::from(t.x), i32::from(t.y));
+                let one_by_one = offsets.map(|(dx, dy)| map.texel_index(p, (x + dx) as u32, (y + dy) as u32));
+                prop_assert_eq!(map.around(p, x, y, offsets), one_by_one);
                 prop_assert!(t.u >= 0.0 && t.v >= 0.0 && t.u + t.v <= 1.0 + 1e-6);
                 let [x, y] = layout.texel_coord(p, charts.local(t.triangle, t.u, t.v));
                 prop_assert!((x - t.x as f32 - 0.5).abs() < 0.5001 && (y - t.y as f32 - 0.5).abs() < 0.5001);
