@@ -7,6 +7,7 @@ pub(crate) mod directional;
 pub mod error;
 pub mod files;
 pub(crate) mod float_state;
+pub(crate) mod functions;
 pub(crate) mod gate;
 pub mod geometry;
 pub mod memory;

@@ -7,6 +7,7 @@
 //! JCGT 2020, with the Laine-Karras permutation). Pairs of dimensions are (0,2)-sequences; further
 //! pairs are padded with their own shuffle of the index (Burley, section 5).
 
+use super::functions::sin_cos;
 use glam::Vec3;
 use std::f32::consts::{PI, TAU};
 
@@ -102,8 +103,10 @@ pub fn concentric_disc(u: [f32; 2]) -> [f32; 2] {
     if a == 0.0 && b == 0.0 {
         return [0.0, 0.0];
     }
-    let (r, phi) = if a.abs() > b.abs() { (a, PI / 4.0 * (b / a)) } else { (b, PI / 2.0 - PI / 4.0 * (a / b)) };
-    [r * phi.cos(), r * phi.sin()]
+    let is_wide = a.abs() > b.abs();
+    let (r, other) = if is_wide { (a, b) } else { (b, a) };
+    let (sin, cos) = sin_cos(PI / 4.0 * (other / r));
+    if is_wide { [r * cos, r * sin] } else { [r * sin, r * cos] }
 }
 
 /// Maps the unit square to the unit sphere, uniformly.

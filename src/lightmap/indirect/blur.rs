@@ -2,6 +2,7 @@
 
 use crate::base::directional::Linear;
 use crate::base::error::Result;
+use crate::base::functions::exp_of_negative;
 use crate::base::parallel::one_by_one;
 use crate::base::progress::Stage;
 use crate::device::Device;
@@ -139,7 +140,7 @@ impl Window {
             let deviation = (own.variance + other.variance).sqrt() + f32::MIN_POSITIVE;
             let difference = (other.value.element_sum() - brightness) / (LIKE * deviation);
             // The difference is not a number if light overflows.
-            let like = if s == texel { 1.0 } else { (-0.5 * difference * difference).exp().max(0.0) };
+            let like = if s == texel { 1.0 } else { exp_of_negative(-0.5 * difference * difference) };
             let w = self.weights[(dx * dx + dy * dy) as usize] * bend * like;
             sum += of(s) * w;
             total += w;
