@@ -1978,7 +1978,9 @@ typedef struct bk_bake_params {
   float near_hits;
   /// Radius of the gather map's blur in texels of the gather map, at most 16; 0: no blur. Lower
   /// it to 1 or 0, with more gather rays, where contact shadows matter; it costs little time. 4
-  /// blurs more than it smooths. Default: 2.
+  /// blurs more than it smooths. With 0 the noise of direct light from skies, area lights and many
+  /// lights stays, too, which is averaged over up to 9 × 9 texels of the light map otherwise, as
+  /// far as they differ by no more than noise. Default: 2.
   uint32_t blur_radius;
   /// Number of shadow rays per light map texel and area light or disc of a directional light, 1
   /// to 4096. More than four area lights share four times as many rays; a sky takes four times as
@@ -2539,9 +2541,10 @@ typedef struct bk_live_params {
   /// Maximum number of rays that an update traces, whatever its budget; 0: no limit. Set it where
   /// the work per frame must not depend on the speed of the machine, as in tests. Default: 0.
   uint32_t rays_per_update;
-  /// Radius of a blur for display, in texels of the gather map, 0 to 16; accumulated light is not
-  /// blurred. Lower it to 1 or 0 where contact shadows matter and noise at the beginning does
-  /// not; it costs time when texels are shown. Default: 2.
+  /// Radius of a blur for display, in texels of the gather map, 0 to 16; accumulated indirect light
+  /// is not blurred. With 0 noisy direct light is not blurred either, as in a bake. Lower it to 1
+  /// or 0 where contact shadows matter and noise at the beginning does not; it costs time when
+  /// texels are shown. Default: 2.
   uint32_t blur;
   /// Distance, in texels of the radiance map, up to which light is computed where gather rays hit,
   /// see bk_bake_params. Default: 0.

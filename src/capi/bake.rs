@@ -123,7 +123,9 @@ pub struct bk_bake_params {
     pub near_hits: f32,
     /// Radius of the gather map's blur in texels of the gather map, at most 16; 0: no blur. Lower
     /// it to 1 or 0, with more gather rays, where contact shadows matter; it costs little time. 4
-    /// blurs more than it smooths. Default: 2.
+    /// blurs more than it smooths. With 0 the noise of direct light from skies, area lights and many
+    /// lights stays, too, which is averaged over up to 9 × 9 texels of the light map otherwise, as
+    /// far as they differ by no more than noise. Default: 2.
     pub blur_radius: u32,
     /// Number of shadow rays per light map texel and area light or disc of a directional light, 1
     /// to 4096. More than four area lights share four times as many rays; a sky takes four times as

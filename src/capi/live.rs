@@ -98,9 +98,10 @@ pub struct bk_live_params {
     /// Maximum number of rays that an update traces, whatever its budget; 0: no limit. Set it where
     /// the work per frame must not depend on the speed of the machine, as in tests. Default: 0.
     pub rays_per_update: u32,
-    /// Radius of a blur for display, in texels of the gather map, 0 to 16; accumulated light is not
-    /// blurred. Lower it to 1 or 0 where contact shadows matter and noise at the beginning does
-    /// not; it costs time when texels are shown. Default: 2.
+    /// Radius of a blur for display, in texels of the gather map, 0 to 16; accumulated indirect light
+    /// is not blurred. With 0 noisy direct light is not blurred either, as in a bake. Lower it to 1
+    /// or 0 where contact shadows matter and noise at the beginning does not; it costs time when
+    /// texels are shown. Default: 2.
     pub blur: u32,
     /// Distance, in texels of the radiance map, up to which light is computed where gather rays hit,
     /// see bk_bake_params. Default: 0.

@@ -48,6 +48,8 @@ struct Ratio {
     total: Vec3,
     visible: Vec3,
     samples: Vec3,
+    /// Number of rays.
+    rays: u32,
 }
 
 /// Direct light at a point, or a weighted sum over points.
@@ -66,6 +68,7 @@ impl Ratio {
         self.total += weight * other.total;
         self.visible += weight * other.visible;
         self.samples += weight * other.samples;
+        self.rays += other.rays;
     }
 
     fn value(&self) -> Vec3 {
@@ -111,6 +114,20 @@ impl PointLight {
     /// Irradiance from discs, as estimated by their samples.
     pub(crate) fn of_discs(&self) -> Vec3 {
         self.discs.visible
+    }
+
+    /// Irradiance of skies and of many lights, summed over the channels.
+    pub(crate) fn sampled(&self) -> f32 {
+        self.sampled.element_sum()
+    }
+
+    /// Returns the number of rays to area lights, and the variance of their irradiance, summed over the channels, if each
+    /// ray brought the same or nothing, at random.
+    pub(crate) fn variance_of_areas(&self) -> (u32, f32) {
+        let Ratio { total, visible, samples, rays } = self.areas;
+        let (total, visible, samples) = (total.element_sum(), visible.element_sum(), samples.element_sum());
+        let part = if samples > 0.0 { (visible / samples).min(1.0) } else { 0.0 };
+        (rays, total * total * part * (1.0 - part) / rays.saturating_sub(1).max(1) as f32)
     }
 
     /// Unoccluded irradiance from area lights.
@@ -261,6 +278,11 @@ impl DirectLight {
         !self.areas.is_empty() || self.many.is_some() || !self.discs.is_empty() || !self.skies.is_empty()
     }
 
+    /// Whether there are lights with wide penumbrae, which are sampled.
+    pub(crate) fn has_wide(&self) -> bool {
+        !self.areas.is_empty() || self.many.is_some() || !self.skies.is_empty()
+    }
+
     /// Direct light at one point. `samples`: as in [`irradiance`](Self::irradiance).
     pub(crate) fn at_point(
         &self,
@@ -353,12 +375,13 @@ impl DirectLight {
         shadow.slot += 1;
         shadow.light = 0;
         if !self.areas.is_empty() {
-            (out.areas.total, out.areas.samples) = self.push_areas(receiver, number, samples, seed, shadow);
+            (out.areas.total, out.areas.samples, out.areas.rays) =
+                self.push_areas(receiver, number, samples, seed, shadow);
         }
     }
 
     /// Pushes the shadow rays to few area lights. Returns their exact unoccluded irradiance, and the unoccluded sum of
-    /// all samples.
+    /// all samples, and the number of rays.
     fn push_areas(
         &self,
         receiver: &Receiver,
@@ -366,7 +389,7 @@ impl DirectLight {
         samples: u32,
         seed: u32,
         shadow: &mut ShadowRays,
-    ) -> (Vec3, Vec3) {
+    ) -> (Vec3, Vec3, u32) {
         let mut unoccluded = [0.0f32; MAX_EXACT];
         let (mut total, mut importance, mut shining) = (Vec3::ZERO, 0.0f32, 0);
         for (e, area) in unoccluded.iter_mut().zip(&self.areas) {
@@ -376,7 +399,7 @@ impl DirectLight {
             shining += (*e > 0.0) as usize;
         }
         if !(importance > 0.0) {
-            return (Vec3::ZERO, Vec3::ZERO);
+            return (Vec3::ZERO, Vec3::ZERO, 0);
         }
         let n = samples as usize * shining.min(MAX_LIGHTS_SAMPLED);
         let mut brought = Vec3::ZERO;
@@ -404,7 +427,7 @@ impl DirectLight {
             brought += weight * area.radiance;
             shadow.push(shadow_ray(receiver, point), weight * area.radiance);
         }
-        (total, brought)
+        (total, brought, n as u32)
     }
 
     /// Emitted radiance of a front (or back) of a triangle.

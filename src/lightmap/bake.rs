@@ -7,6 +7,7 @@ use super::atlas::Atlas;
 use super::atlas::fill::Filling;
 use super::atlas::ids::{GatherTexel, LightMap, LightTexel, PerTexel};
 use super::changed::{self, Before, Redo};
+use super::direct_blur;
 use super::indirect::blur;
 use super::indirect::gather::{Gathered, Tile, TileTexel};
 use super::indirect::radiance_map::Radiance;
@@ -133,10 +134,14 @@ impl Lightmap {
                 Some(c) => Some(Checkpoint::open(c, atlas, &origin, [range.start as u64, range.end as u64])?),
                 None => None,
             };
-            let before = match keep_error {
+            let mut before = match keep_error {
                 Some(keep_error) => self.before(params, &plan, &origin, keep_error)?,
                 None => None,
             };
+            if let Some(before) = before.as_mut().filter(|_| direct_blur::is_needed(direct, params, &plan)) {
+                // The blur needs all direct light from before it.
+                before.has_all_direct_anew = true;
+            }
             let from = From { checkpoint: checkpoint.as_ref(), before: before.as_ref() };
             let (mut light, mut stats) = self.passes(params, &plan, direct, &range, from, progress)?;
             stats.back_charts = light.backs.iter().filter(|&&b| b).count() as u64;
@@ -180,8 +185,9 @@ impl Lightmap {
         };
         let atlas = self.before.as_ref().unwrap_or(&self.atlas);
         let moved = Moved::between(&atlas.scene, &self.atlas.scene, &self.atlas.charts)?;
-        let has_other_lights = !light.origin.is_some_and(|of_light| of_light.has_lights_of(origin));
-        Ok(Some(Before { atlas, light, moved, has_other_lights, keep_error, redo: OnceLock::new() }))
+        let has_all_direct_anew = !light.origin.is_some_and(|of_light| of_light.has_lights_of(origin));
+        let redo = OnceLock::new();
+        Ok(Some(Before { atlas, light, moved, has_all_direct_anew, keep_error, redo }))
     }
 
     /// Bakes in as many passes as the parameters ask for.
@@ -420,6 +426,9 @@ impl<'p> Bake<'_, 'p> {
             let arrays = 1 + usize::from(self.asks(directional::DIRECT));
             bytes += l.map.len() * arrays * size_of::<Directional>();
         }
+        if self.blurs_direct() {
+            bytes += l.map.len() * direct_blur::TEXEL_BYTES;
+        }
         if self.asks(directional::INDIRECT) {
             bytes += l.gather.len() * DIRECTIONAL_BYTES;
         }
@@ -561,9 +570,11 @@ impl<'p> Bake<'_, 'p> {
     ) -> Result<()> {
         let start = Instant::now();
         let l = self.atlas;
-        let stage = self.progress.stage("direct", 0.65, 1.0, 2 * self.range.len() as u64);
+        // Whose direct light is needed.
+        let range = if self.blurs_direct() { direct_blur::needed(l, &self.range) } else { self.range.clone() };
+        let blurred = if self.blurs_direct() { self.range.len() } else { 0 };
+        let stage = self.progress.stage("direct", 0.65, 1.0, (2 * range.len() + blurred) as u64);
         let rays = AtomicU64::new(0);
-        let range = self.range.clone();
         let backs = &light.backs[..];
         let texels = self.texel_light();
         // Blocks whose light is in the checkpoint.
@@ -575,6 +586,8 @@ impl<'p> Bake<'_, 'p> {
         let new_tile = if asks { TilePoints::by_direction } else { TilePoints::new };
         // Direct light by direction, which is averaged before it is added to the rest.
         let mut directed: Vec<Directional> = try_vec(if asks { range.len() } else { 0 }, "direct light by direction")?;
+        let noises = if self.blurs_direct() { range.len() } else { 0 };
+        let mut variances: Vec<f32> = try_vec(noises, "the variance of direct light")?;
         scene.device().install(|| {
             let direct = light.direct[range.clone()].par_chunks_mut(BLOCK).zip(&mut known);
             let indirect_out = light.indirect[range.clone()].par_chunks_mut(BLOCK);
@@ -582,8 +595,10 @@ impl<'p> Bake<'_, 'p> {
             let directional = light.directional.get_mut(range.clone()).unwrap_or_default();
             let directional = parts(directional, BLOCK, range.len())?;
             let directional = directional.into_par_iter().zip(parts(&mut directed, BLOCK, range.len())?);
-            let blocks = direct.zip(indirect_out).zip(state).zip(directional).enumerate();
-            one_by_one(blocks).try_for_each(|(block, ((((direct, known), ind), state), (directional, directed)))| {
+            let noises = parts(&mut variances, BLOCK, range.len())?;
+            let blocks = direct.zip(indirect_out).zip(state).zip(directional.zip(noises)).enumerate();
+            one_by_one(blocks).try_for_each(|(block, ((((direct, known), ind), state), rest))| {
+                let ((directional, directed), variances) = rest;
                 let mut traced = 0;
                 let first = range.start + block * BLOCK;
                 let ind_count = ind.len();
@@ -601,7 +616,7 @@ impl<'p> Bake<'_, 'p> {
                         }
                     }
                 }
-                *known = self.checkpoint.is_some_and(|c| c.lit(block, direct, state, directed));
+                *known = self.checkpoint.is_some_and(|c| c.lit(block, direct, variances, state, directed));
                 if *known {
                     return stage.advance(direct.len() as u64);
                 }
@@ -629,18 +644,26 @@ impl<'p> Bake<'_, 'p> {
                     }
                 }
                 if let Some(c) = self.checkpoint.filter(|_| !self.plan.runs(left_out::DIRECT)) {
-                    c.keep_lit(block, direct, state, directed);
+                    c.keep_lit(block, direct, variances, state, directed);
                 }
                 rays.fetch_add(traced, Relaxed);
                 stage.advance(direct.len() as u64)
             })
         })?;
         if self.plan.runs(left_out::DIRECT) {
-            let direct = (&mut light.direct[..], &mut directed[..]);
-            let traced = self.average_direct(&texels, backs, (&known, redo), direct, &light.state, &stage)?;
+            let direct = (&mut light.direct[..], &mut directed[..], &mut variances[..]);
+            let traced = self.average_direct(&texels, backs, (&known, redo), &range, direct, &light.state, &stage)?;
             rays.fetch_add(traced, Relaxed);
-            let sums = light.directional.get_mut(range).unwrap_or_default();
+            if self.blurs_direct() {
+                direct_blur::blur(l, &range, &self.range, &variances, &mut light.direct, &mut directed, &stage)?;
+            }
+            let sums = light.directional.get_mut(range.clone()).unwrap_or_default();
             sums.iter_mut().zip(&directed).for_each(|(sum, &directed)| *sum += directed);
+        }
+        // Beside the range only what the blur needs was computed.
+        for i in range.filter(|i| !self.range.contains(i)) {
+            (light.direct[i], light.indirect[i], light.state[i]) = (Vec3::ZERO, Vec3::ZERO, TexelState::default());
+            light.directional.get_mut(i).map(|d| *d = Directional::default());
         }
         stats.direct = StageStats {
             seconds: start.elapsed().as_secs_f64(),
@@ -648,6 +671,11 @@ impl<'p> Bake<'_, 'p> {
             bytes: (l.map.len() * TEXEL_BYTES + l.map.bytes()) as u64,
         };
         Ok(())
+    }
+
+    /// Whether direct light has noise to blur.
+    fn blurs_direct(&self) -> bool {
+        direct_blur::is_needed(self.direct, self.params, self.plan)
     }
 
     /// Returns the computation of direct light for the light map's texels.
@@ -660,18 +688,19 @@ impl<'p> Bake<'_, 'p> {
         }
     }
 
-    /// Replaces direct light without penumbrae at the samples of the range by all direct light, averaged over texels.
-    /// Returns the number of rays.
+    /// Replaces direct light without penumbrae at the samples of a range by all direct light, averaged over texels, and
+    /// finds its variance if there is room for it. Returns the number of rays.
     fn average_direct(
         &self,
         texels: &TexelLight<LightMap>,
         backs: &[bool],
         (known, redo): (&[bool], Option<&Redo>),
-        (direct, directed): (&mut [Vec3], &mut [Directional]),
+        range: &Range<usize>,
+        (direct, directed, variances): (&mut [Vec3], &mut [Directional], &mut [f32]),
         state: &[TexelState],
         stage: &Stage,
     ) -> Result<u64> {
-        let (l, range) = (self.atlas, self.range.clone());
+        let l = self.atlas;
         let is_new = |texel: usize| redo.is_none_or(|redo| redo.direct[texel]);
         let rays = AtomicU64::new(0);
         let mut variations: Vec<Variation> = try_vec(range.len(), "where direct light varies")?;
@@ -695,8 +724,9 @@ impl<'p> Bake<'_, 'p> {
                 rays.fetch_add(traced, Relaxed);
             });
             let blocks = direct[range.clone()].par_chunks_mut(BLOCK).zip(state[range.clone()].par_chunks(BLOCK));
-            let blocks = blocks.zip(variations.par_chunks(BLOCK)).zip(parts(directed, BLOCK, range.len())?).enumerate();
-            one_by_one(blocks).try_for_each(|(block, (((direct, state), variations), directed))| {
+            let sums = parts(directed, BLOCK, range.len())?.into_par_iter().zip(parts(variances, BLOCK, range.len())?);
+            let blocks = blocks.zip(variations.par_chunks(BLOCK)).zip(sums).enumerate();
+            one_by_one(blocks).try_for_each(|(block, (((direct, state), variations), (directed, variances)))| {
                 if known[block] {
                     return stage.advance(direct.len() as u64);
                 }
@@ -723,15 +753,18 @@ impl<'p> Bake<'_, 'p> {
                         variation: variations[texel.index() - first],
                     }));
                     let place = |i: usize| some[i].index() - first;
-                    texels.irradiance(&of_tile, &mut tile, &mut traced, |i, e, by_direction| {
+                    texels.irradiance(&of_tile, &mut tile, &mut traced, |i, e, variance, by_direction| {
                         direct[place(i)] = e;
+                        if let Some(of_texel) = variances.get_mut(place(i)) {
+                            *of_texel = variance;
+                        }
                         if let Some(directed) = directed.get_mut(place(i)) {
                             *directed = *by_direction;
                         }
                     });
                 }
                 if let Some(c) = self.checkpoint {
-                    c.keep_lit(block, direct, state, directed);
+                    c.keep_lit(block, direct, variances, state, directed);
                 }
                 rays.fetch_add(traced, Relaxed);
                 stage.advance(direct.len() as u64)

@@ -86,8 +86,8 @@ pub(super) struct Before<'a> {
     pub atlas: &'a Atlas,
     pub light: &'a Light,
     pub moved: Moved,
-    /// Whether a light was set since.
-    pub has_other_lights: bool,
+    /// Whether all direct light is computed anew: a light was set since, or noise is blurred.
+    pub has_all_direct_anew: bool,
     /// Relative difference of light that is let stand.
     pub keep_error: f32,
     /// What is computed anew, once that is known.
@@ -157,7 +157,7 @@ impl Redo {
         } else {
             rays = job.probe(&mut states, radiance)?;
         }
-        let all_direct = before.has_other_lights || before.moved.emits || !plan.runs(left_out::DIRECT);
+        let all_direct = before.has_all_direct_anew || before.moved.emits || !plan.runs(left_out::DIRECT);
         // Light by direction is the sum of both kinds, and the spread of passes is of that: both are made anew together.
         if params.directional != 0 || params.passes > 1 {
             states.iter_mut().for_each(|cell| cell.is_new |= all_direct || cell.is_shadowed);

@@ -8,6 +8,7 @@ pub mod atlas;
 pub(crate) mod bake;
 mod changed;
 mod create;
+pub(crate) mod direct_blur;
 mod follow;
 pub mod indirect;
 mod moved;
@@ -161,7 +162,8 @@ pub struct BakeParams {
     /// Number of rays of texels of the light map that trace rays themselves, at most 64 and at most `gather_rays`; 0: a
     /// quarter of `gather_rays`, at least 16.
     pub own_rays: u32,
-    /// Radius of the gather map's blur in gather texels; 0: none.
+    /// Radius of the gather map's blur in gather texels; 0: none, and direct light from skies, area lights and many lights
+    /// is not blurred where it is noisy either.
     pub blur_radius: u32,
     /// Number of shadow rays per light map texel and area light or disc of a directional light. More than four area
     /// lights share four times as many rays by their unoccluded light; a sky takes four times as many, and many lights

@@ -133,20 +133,40 @@ pub(super) struct BlockStatus {
 #[derive(Debug)]
 pub(super) struct DirectWork {
     pub tile: DirectTile,
-    /// The next texel of the tile.
+    /// Light before the [blur](crate::lightmap::direct_blur), of the tile and the texels around it that the blur needs;
+    /// `None` if it has no noise.
+    pub before: Option<NoisyTile>,
+    /// The next texel of the tile that is lit first, and the next of the block's own to be blurred.
     pub next: u32,
+    pub next_blurred: u32,
     /// Epoch of the lights under which it is computed.
     pub epoch: u32,
-    /// Light without penumbrae at the samples of the tile and of one more row and column on each side; NaN where it has
-    /// not been computed yet.
+    /// Light without penumbrae at the samples of the tile that is lit first and of one more row and column on each side;
+    /// NaN where it has not been computed yet.
     pub sharp: Box<[Vec3]>,
     /// The same by direction; empty if nobody asks for it.
     pub sharp_directional: Box<[Directional]>,
 }
 
+/// Direct light before the blur, and its variance.
+#[derive(Debug)]
+pub(super) struct NoisyTile {
+    pub tile: DirectTile,
+    pub variances: Box<[f32]>,
+}
+
 impl DirectWork {
+    /// The tile whose texels are lit first.
+    pub fn lit(&mut self) -> &mut DirectTile {
+        match &mut self.before {
+            Some(before) => &mut before.tile,
+            None => &mut self.tile,
+        }
+    }
+
     pub fn bytes(&self) -> usize {
-        self.tile.bytes() + size_of_val(&self.sharp[..]) + size_of_val(&self.sharp_directional[..])
+        let before = self.before.as_ref().map_or(0, |b| b.tile.bytes() + size_of_val(&b.variances[..]));
+        before + self.tile.bytes() + size_of_val(&self.sharp[..]) + size_of_val(&self.sharp_directional[..])
     }
 }
 

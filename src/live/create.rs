@@ -108,6 +108,7 @@ impl Live {
                 near_hits: params.near_hits,
                 direct_seed: purpose_seed(params.seed, purpose::DIRECT),
                 direct_samples: params.direct_samples,
+                blurs: params.blur > 0,
                 directional: params.directional,
                 direct_rays: light.direct.rays_per_point(params.direct_samples),
                 dim: 0.0,

@@ -36,7 +36,8 @@ pub struct LiveParams {
     pub max_rounds: u32,
     /// Maximum number of rays per update, whatever its budget; 0: no limit.
     pub rays_per_update: u32,
-    /// Radius of a blur for display, in gather texels; accumulated light is not blurred.
+    /// Radius of a blur for display, in gather texels; accumulated indirect light is not blurred. With 0 noisy direct light
+    /// is not blurred either.
     pub blur: u32,
     /// Edge of a grid cell in scene units; 0: a sixteenth of the scene's longest side.
     pub cell_size: f32,

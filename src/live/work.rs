@@ -46,6 +46,8 @@ pub(super) struct Context {
     pub near_hits: f32,
     pub direct_seed: u32,
     pub direct_samples: u32,
+    /// Whether noise of direct light is blurred.
+    pub blurs: bool,
     /// Bits of [`directional`]: the light that is computed by direction too.
     pub directional: u32,
     /// Approximate number of rays that direct light at a point takes.

@@ -1,7 +1,7 @@
 //! Work on the direct light of a block: coarse, at the gather texels of the lowest LOD, and at full resolution, at the
 //! texels of the light map, with the bits of a bake.
 
-use super::blocks::{Block, DirectTile, DirectWork, Tile};
+use super::blocks::{Block, DirectTile, DirectWork, NoisyTile, Rect, Tile};
 use super::limit::Limit;
 use super::room::Room;
 use super::shown_layer::Shown;
@@ -10,6 +10,7 @@ use crate::base::directional::Directional;
 use crate::base::memory::{try_filled, try_to_vec};
 use crate::base::sampling::combine;
 use crate::lightmap::atlas::ids::{GatherTexel, LightMap, LightTexel};
+use crate::lightmap::direct_blur::{self, DirectBlur};
 use crate::lightmap::directional;
 use crate::lightmap::texel_light::TexelLight;
 use crate::lightmap::texel_light::averages::Averaged;
@@ -21,6 +22,10 @@ const COARSE_SAMPLES: u32 = 4;
 
 /// Maximum number of places in a block's rectangle that are searched for its texels before the limit is looked at again.
 const SEARCHED: usize = 1024;
+
+/// Number of places of a block's rectangle that are blurred before the limit is looked at again: about a tenth of a
+/// millisecond.
+const BLURRED: usize = 128;
 
 impl Block {
     /// Computes direct light of the lowest LOD's texels; returns whether there was memory for it.
@@ -69,19 +74,37 @@ impl Block {
     pub fn work_on_direct(&mut self, c: &Context, of: &Tile, room: &mut Room, limit: &Limit) -> bool {
         let under_way = self.work.direct.take().filter(|w| w.epoch == c.light.direct_epoch);
         let begin = || {
-            let rect = c.map.rect_in_light_map(of.placement, &of.rect);
             // Vertices far away can make a block as large as a page.
-            let (area, around) = (rect.area(), rect.grown(1).area());
+            let rect = c.map.rect_in_light_map(of.placement, &of.rect);
             let asked = usize::from(c.asks(directional::DIRECT));
-            let tile = DirectTile { rect, values: unknown(area, limit)?, directional: unknown(asked * area, limit)? };
+            let new = |rect: Rect| {
+                let (values, directional) = (unknown(rect.area(), limit)?, unknown(asked * rect.area(), limit)?);
+                Some(DirectTile { rect, values, directional })
+            };
+            let (mut lit, mut before) = (rect, None);
+            if c.blurs && c.light.direct.has_wide() {
+                lit = rect.grown(direct_blur::RADIUS);
+                let variances = limit.granted(try_filled(lit.area(), 0.0, "direct light"))?.into_boxed_slice();
+                before = Some(NoisyTile { tile: new(lit)?, variances });
+            }
+            let around = lit.grown(1).area();
             let (sharp, sharp_directional) = (unknown(around, limit)?, unknown(asked * around, limit)?);
-            Some(DirectWork { tile, next: 0, epoch: c.light.direct_epoch, sharp, sharp_directional })
+            let (tile, epoch) = (new(rect)?, c.light.direct_epoch);
+            Some(DirectWork { tile, before, next: 0, next_blurred: 0, epoch, sharp, sharp_directional })
         };
         let Some(mut direct) = under_way.or_else(begin) else { return false };
-        while (direct.next as usize) < direct.tile.values.len() {
+        loop {
+            let is_lit = direct.next as usize == direct.lit().values.len();
+            if is_lit && direct.is_blurred() {
+                break;
+            }
             if limit.reached() {
                 self.work.direct = Some(direct);
                 return false;
+            }
+            if is_lit {
+                direct.blur_texels(c, of);
+                continue;
             }
             let begun = Instant::now();
             let count = room.direct_pace.texels(limit, c.direct_rays.max(1.0) as u64);
@@ -131,7 +154,9 @@ fn coarse_light<'a>(c: &Context, texels: impl IntoIterator<Item = &'a GatherTexe
 impl DirectWork {
     /// Computes the light of the next texels, up to `count` of the block's own; returns the number of those.
     fn add_texels(&mut self, c: &Context, of: &Tile, count: usize, room: &mut Room, limit: &Limit) -> usize {
-        let (rect, mut rays) = (self.tile.rect, 0);
+        let (is_blurred_later, mut rays) = (self.before.is_some(), 0);
+        let DirectTile { rect, values, .. } = self.lit();
+        let (rect, area) = (*rect, values.len());
         let a = &c.map.atlas;
         let backs = &c.light.sides.backs;
         let lit = TexelLight {
@@ -145,11 +170,12 @@ impl DirectWork {
         places.clear();
         own.clear();
         let width = rect.width().max(1);
-        let end = self.tile.values.len().min(self.next as usize + SEARCHED);
+        let end = area.min(self.next as usize + SEARCHED);
         while (self.next as usize) < end && own.len() < count.min(Room::TEXELS) {
             let at = self.next as usize;
             let (x, y) = (rect.x0 + (at % width) as i32, rect.y0 + (at / width) as i32);
-            if let Some(texel) = owns(c, of, x, y) {
+            let texel = if is_blurred_later { texel_at(c, of, x, y) } else { owns(c, of, x, y) };
+            if let Some(texel) = texel {
                 own.push(texel);
                 places.push(at as u32);
             }
@@ -170,16 +196,55 @@ impl DirectWork {
                 variation: lit.varies(texel, sharp, |s| self.sharp_at(c, s).0),
             }
         }));
-        let DirectTile { values, directional, .. } = &mut self.tile;
-        lit.irradiance(averaged, points, &mut rays, |i, e, by_direction| {
+        let (tile, variances) = match &mut self.before {
+            Some(before) => (&mut before.tile, &mut before.variances[..]),
+            None => (&mut self.tile, Default::default()),
+        };
+        let DirectTile { values, directional, .. } = tile;
+        lit.irradiance(averaged, points, &mut rays, |i, e, variance, by_direction| {
             let place = places[i] as usize;
             values[place] = e;
+            if let Some(here) = variances.get_mut(place) {
+                *here = variance;
+            }
             if let Some(here) = directional.get_mut(place) {
                 *here = *by_direction;
             }
         });
         limit.add(rays);
         own.len()
+    }
+
+    /// Whether all of the block's own texels have their light.
+    fn is_blurred(&self) -> bool {
+        self.before.is_none() || self.next_blurred as usize == self.tile.values.len()
+    }
+
+    /// Blurs the next places of the block's rectangle.
+    fn blur_texels(&mut self, c: &Context, of: &Tile) {
+        let Some(before) = &self.before else { return };
+        let (rect, known) = (self.tile.rect, before.tile.rect);
+        let mut blur = DirectBlur::new(&c.map.atlas);
+        let place = |texel: LightTexel| {
+            let (x, y) = c.map.atlas.map.position(texel);
+            (y - known.y0) as usize * known.width() + (x - known.x0) as usize
+        };
+        let noisy = |texel: LightTexel| {
+            let i = place(texel);
+            let light = before.tile.values[i];
+            light.is_known().then_some((light, before.variances[i]))
+        };
+        let (from, width) = (self.next_blurred as usize, rect.width().max(1));
+        let end = self.tile.values.len().min(from + BLURRED);
+        for at in from..end {
+            let (x, y) = (rect.x0 + (at % width) as i32, rect.y0 + (at / width) as i32);
+            let Some(texel) = owns(c, of, x, y) else { continue };
+            self.tile.values[at] = blur.mean(texel, noisy, |s| before.tile.values[place(s)]);
+            if let Some(here) = self.tile.directional.get_mut(at) {
+                *here = blur.mean(texel, noisy, |s| before.tile.directional[place(s)]);
+            }
+        }
+        self.next_blurred = end as u32;
     }
 
     /// Computes light without penumbrae of the texels in the room and of those around them, as far as it is not known.
@@ -218,16 +283,23 @@ impl DirectWork {
 
     /// Place in [`sharp`](Self::sharp) of one of the block's texels, or one beside them.
     fn place(&self, c: &Context, texel: LightTexel) -> usize {
-        let ((x, y), known) = (c.map.atlas.map.position(texel), self.tile.rect.grown(1));
+        let lit = self.before.as_ref().map_or(self.tile.rect, |before| before.tile.rect);
+        let ((x, y), known) = (c.map.atlas.map.position(texel), lit.grown(1));
         (y - known.y0) as usize * known.width() + (x - known.x0) as usize
     }
+}
+
+/// The texel of the light map at a column and row of a block's page; `None` if it is not of the block's placement.
+fn texel_at(c: &Context, tile: &Tile, x: i32, y: i32) -> Option<LightTexel> {
+    let a = &c.map.atlas;
+    let at = a.map.at(tile.placement, x, y);
+    at.filter(|&texel| a.map.placement_of(&a.charts, texel) == tile.placement)
 }
 
 /// The texel of the light map at a column and row of a block's page; `None` if it is not the block's.
 pub(super) fn owns(c: &Context, tile: &Tile, x: i32, y: i32) -> Option<LightTexel> {
     let a = &c.map.atlas;
-    let at = a.map.at(tile.placement, x, y);
-    let texel = at.filter(|&texel| a.map.placement_of(&a.charts, texel) == tile.placement)?;
+    let texel = texel_at(c, tile, x, y)?;
     let at = a.gather.layout.texel_coord(tile.placement, a.texel_local(tile.placement, texel));
     // Includes one texel around the block's own, so that rounding leaves no gaps between blocks.
     let own = tile.rect.grown(1);

@@ -43,7 +43,7 @@ impl Texels<'_> {
 
 /// Light of a texel before the blur.
 #[derive(Clone, Copy)]
-pub(super) struct Noisy {
+pub(in crate::lightmap) struct Noisy {
     pub value: Vec3,
     /// Variance of the value's sum over the channels; infinite if unknown.
     pub variance: f32,
@@ -112,7 +112,7 @@ impl Window {
 
     /// Returns the mean of `of` with the weights with which one valid texel is blurred. `get`: the values by which weights
     /// are chosen, where there are any.
-    pub(super) fn mean<M: Map, T: Linear>(
+    pub(in crate::lightmap) fn mean<M: Map, T: Linear>(
         &mut self,
         charts: &Charts,
         map: &ChartMap<M>,

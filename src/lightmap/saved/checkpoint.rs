@@ -339,6 +339,7 @@ impl<'a> Checkpoint<'a> {
         &self,
         block: usize,
         direct: &mut [Vec3],
+        variances: &mut [f32],
         state: &mut [TexelState],
         directional: &mut [Directional],
     ) -> bool {
@@ -347,15 +348,18 @@ impl<'a> Checkpoint<'a> {
             let mut rest = &content[..];
             let mut light = vec![Vec3::ZERO; direct.len()];
             take(&mut rest, &mut light)?;
+            let mut noises = vec![0.0; variances.len()];
+            take(&mut rest, &mut noises)?;
             let states = rest.iter().map(|&b| TexelState::from_byte(b)).collect::<Option<Vec<_>>>()?;
             let fits = states.len() == direct.len() && is_light(&light) && !states.contains(&TexelState::Unbaked);
-            fits.then_some((light, states))
+            fits.then_some((light, noises, states))
         };
-        let Some((light, states)) = read() else { return false };
+        let Some((light, noises, states)) = read() else { return false };
         if !self.directional(DIRECT_DIRECTIONAL, block, directional) {
             return false;
         }
         direct.copy_from_slice(&light);
+        variances.copy_from_slice(&noises);
         state.copy_from_slice(&states);
         true
     }
@@ -364,12 +368,13 @@ impl<'a> Checkpoint<'a> {
         &self,
         block: usize,
         direct: &[Vec3],
+        variances: &[f32],
         state: &[TexelState],
         directional: &[Directional],
     ) {
         self.keep_directional(DIRECT_DIRECTIONAL, block, directional);
         let states: Vec<u8> = state.iter().map(|s| s.to_byte()).collect();
-        self.keep(DIRECT, block as u64, &[bytemuck::cast_slice(direct), &states]);
+        self.keep(DIRECT, block as u64, &[bytemuck::cast_slice(direct), bytemuck::cast_slice(variances), &states]);
     }
 
     /// Tells that work of another pass follows.

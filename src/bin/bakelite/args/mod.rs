@@ -233,7 +233,7 @@ pub fn parse(args: impl IntoIterator<Item = OsString>) -> Result<Command, clap::
     }
     let is_given = |id: &str| of_command.value_source(id) == Some(ValueSource::CommandLine);
     set_quality(line.verb.flags(), &is_given);
-    command_of(line).map_err(|e| command.error(ErrorKind::ValueValidation, e))
+    command_of(line, &is_given).map_err(|e| command.error(ErrorKind::ValueValidation, e))
 }
 
 /// Sets the flags of the quality that was asked for, but for those that are given themselves.
@@ -271,7 +271,7 @@ fn command() -> clap::Command {
     negative_numbers(CommandLine::command())
 }
 
-fn command_of(line: CommandLine) -> Result<Command, String> {
+fn command_of(line: CommandLine, is_given: &dyn Fn(&str) -> bool) -> Result<Command, String> {
     let boxed = |flags: Box<Flags>| bake_args(*flags).map(Box::new);
     Ok(match line.verb {
         Verb::Bake(flags) => Command::Bake(boxed(flags)?),
@@ -321,6 +321,13 @@ fn command_of(line: CommandLine) -> Result<Command, String> {
                 directional: bake.directional,
                 ..Default::default()
             };
+            // Live updates have defaults of their own.
+            if is_given("interpolation_error") {
+                args.live.interpolation_error = bake.interpolation_error;
+            }
+            if is_given("own_rays") && bake.own_rays > 0 {
+                args.live.own_rays = bake.own_rays;
+            }
             Command::ReportLive(Box::new(args))
         }
         Verb::Report(Report::Edits(edits)) => {

@@ -204,3 +204,14 @@ fn errors_name_the_flag_and_the_value() {
         }
     }
 }
+
+#[test]
+fn live_updates_refine_by_interpolation_error_if_that_is_given() {
+    let live = |line: &str| match parse(words(line)) {
+        Ok(Command::ReportLive(args)) => (args.live.interpolation_error, args.live.own_rays),
+        _ => panic!("{line} is no report of live updates"),
+    };
+    let default = LiveParams::default();
+    assert_eq!(live("report live"), (default.interpolation_error, default.own_rays));
+    assert_eq!(live("report live --interpolation-error 0.5 --own-rays 32"), (0.5, 32));
+}
