@@ -119,6 +119,10 @@ impl Search<'_> {
                 None => return Ok(found),
             },
         };
+        // Nobody sees a hidden side, and all of its texels would be tested by all rays.
+        if self.seen.is_hidden(chart, !is_back) {
+            return Ok(found);
+        }
         let texels = map.texels_of(placement);
         let indices = texels.indices();
         let mut buried = Vec::new();

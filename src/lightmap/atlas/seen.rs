@@ -2,9 +2,11 @@
 //!
 //! An open place lies between two surfaces, or before one in scenes under a sun or a sky, with free space around it,
 //! and not inside a solid. Random rays from such places hit a side about as often as somebody who walks about in the
-//! scene sees it. Light does not matter, since lamps may be switched on later.
+//! scene sees it. How bright a lamp is does not matter, since lamps may be switched on later, but from an open place
+//! light can be reached: closed boxes of two-sided surfaces, as files describe furniture, steps and walls, would be open
+//! inside otherwise, and the dark there would show as rims where they stand on a floor.
 
-use super::chart_map::ChartMap;
+use super::chart_map::{ChartMap, receiver_at};
 use super::charts::Charts;
 use super::ids::{ChartId, PlacementId, RadianceMap, TexelId};
 use crate::base::error::Result;
@@ -26,10 +28,18 @@ const MOST_TRIES: usize = 1 << 14;
 /// Number of packets of rays from an open place. The first decides whether the place is open.
 const PACKETS: u32 = 4;
 
+/// Number of random walks from a place that look for light, and of their vertices. (Twice as many: the same sides, and three
+/// times the time.)
+const WALKS: u32 = 4;
+const VERTICES: u32 = 8;
+
 /// Free space around an open place: the smaller of this fraction of the scene's diagonal and this many texels of the
 /// light map.
 pub(in crate::lightmap) const ROOM: f32 = 0.01;
 const ROOM_TEXELS: f32 = 4.0;
+
+/// Part of the way to a lamp that must be free: it may lie in a wall or a housing.
+const NEARLY: f32 = 0.999;
 
 /// Maximum fraction of the hits of rays from an open place that lie on backs of one-sided surfaces.
 pub(super) const BACKS: f32 = 0.05;
@@ -79,7 +89,9 @@ impl Seen {
             return Ok(Seen::default());
         }
         let room = (ROOM * scene.diagonal()).min(ROOM_TEXELS * texel);
-        let look = Look { scene, charts, radiance, room, outdoors: is_outdoors(scene) };
+        let lights = scene.lights();
+        let is_lit = !lights.is_empty() || !scene.emitters().is_empty();
+        let look = Look { scene, charts, radiance, room, outdoors: is_outdoors(scene), lights: &lights, is_lit };
         let counters: Vec<[AtomicU32; 2]> = try_collect(charts.charts.iter().map(|_| Default::default()), COUNTS)?;
         let (places, rays) = (AtomicU64::new(0), AtomicU64::new(0));
         one_by_one((0..Self::work(radiance) as u32).into_par_iter()).try_for_each(|number| {
@@ -149,6 +161,9 @@ struct Look<'a> {
     radiance: &'a ChartMap<RadianceMap>,
     room: f32,
     outdoors: bool,
+    lights: &'a [Light],
+    /// Whether anything shines or may shine.
+    is_lit: bool,
 }
 
 impl Look<'_> {
@@ -181,7 +196,53 @@ impl Look<'_> {
             backs += f32::from(u8::from(!hit.front && !self.scene.material(hit.triangle).two_sided));
         }
         let is_enclosed = self.outdoors || met >= ENCLOSED * PACKET_SIZE as f32;
-        (is_enclosed && backs <= BACKS * met).then_some((position, hits))
+        let is_open =
+            is_enclosed && backs <= BACKS * met && (!self.is_lit || self.reaches_light(position, number, rays));
+        is_open.then_some((position, hits))
+    }
+
+    /// Whether a random walk from a place finds light: a lamp, which may be switched off, the sun or the sky, or a surface
+    /// that emits.
+    fn reaches_light(&self, place: Vec3, number: u32, rays: &mut u64) -> bool {
+        (0..WALKS).any(|walk| {
+            let random = |vertex: u32, dimension| uniform(WALKS * vertex + walk, dimension, combine(number, 2));
+            let mut at = place;
+            let mut direction = uniform_sphere([random(0, 0), random(0, 1)]);
+            for vertex in 1..=VERTICES {
+                if self.sees_light(at, random(vertex, 2), rays) {
+                    return true;
+                }
+                let ray = Ray::new(at, direction);
+                let hit = self.scene.intersect_raw(&ray);
+                *rays += 1;
+                if hit.is_miss() {
+                    return self.outdoors;
+                }
+                let material = self.scene.material(hit.triangle);
+                if material.is_emissive() {
+                    return true;
+                }
+                let passes = material.transmits() && random(vertex, 3) < 0.5;
+                let (_, receiver) = receiver_at(self.scene, hit.triangle, [hit.u, hit.v], hit.front == passes);
+                at = receiver.origin;
+                direction = cosine_around(receiver.geometric, [random(vertex, 0), random(vertex, 1)]);
+            }
+            false
+        })
+    }
+
+    /// Whether nothing lies between a point and a random light.
+    fn sees_light(&self, at: Vec3, random: f32, rays: &mut u64) -> bool {
+        let to = |lamp: Vec3| Ray::new(at, lamp - at).within(0.0, NEARLY);
+        let ray = match self.lights.get((random * self.lights.len() as f32) as usize) {
+            Some(&(Light::Point { position, .. } | Light::Spot { position, .. })) => to(position),
+            Some(&Light::Rect { position, edge_u, edge_v, .. }) => to(position + 0.5 * (edge_u + edge_v)),
+            Some(&Light::Directional { direction, .. }) => Ray::new(at, -direction),
+            // Walks find the sky where they leave the scene.
+            Some(Light::Sky { .. }) | None => return false,
+        };
+        *rays += 1;
+        !self.scene.occluded(&ray)
     }
 
     /// Traces packet `k` of rays from a place in all directions.
@@ -225,7 +286,7 @@ mod tests {
     use crate::base::progress::Progress;
     use crate::lightmap::{Lightmap, LightmapDesc};
     use crate::scene::demo::shapes::MeshBuilder;
-    use crate::scene::{Material, SceneData};
+    use crate::scene::{Light, Material, SceneData};
     use glam::Vec3;
 
     /// Rays that saw the fronts and the backs of a mesh, and whether some fronts and some backs are hidden.
@@ -275,5 +336,35 @@ mod tests {
         let both =
             atlas.map.layout.back_of.iter().all(|&c| (first..first + 12).contains(&atlas.charts.triangles_of(c)[0]));
         assert!(both && info.both_sided_charts > 0, "the wardrobe alone has two places");
+    }
+
+    /// Two closed boxes in a room of sheets, all lamps switched off.
+    #[test]
+    fn closed_boxes_without_a_lamp_are_not_open() {
+        let mut data = SceneData::new();
+        let m = data.add_material(Material { two_sided: true, ..Default::default() }).unwrap();
+        let p = Vec3::new;
+        for [lower, upper] in [
+            [p(0.0, 0.0, 0.0), p(4.0, 3.0, 4.0)],
+            [p(0.5, 0.0, 0.5), p(1.5, 0.8, 1.5)],
+            [p(2.5, 0.0, 2.5), p(3.5, 2.0, 3.5)],
+        ] {
+            let mut b = MeshBuilder::new();
+            b.box_(lower, upper, false, m);
+            data.add_mesh(b.finish()).unwrap();
+        }
+        for position in [p(0.5, 2.5, 3.5), p(3.0, 1.8, 3.0)] {
+            data.add_light(Light::Point { position, intensity: [0.0; 3] }).unwrap();
+        }
+        let desc = LightmapDesc { texels_per_unit: 20.0, ..Default::default() };
+        let lightmap = Lightmap::create(&data.committed(), &desc, &Progress::none()).unwrap();
+        let atlas = lightmap.atlas();
+        let inside = |mesh: u32| {
+            let first = atlas.scene.first_triangle(mesh);
+            let charts = (first..first + 12).map(|t| atlas.charts.chart_of(t));
+            charts.map(|chart| atlas.seen.counts[chart.index()][1]).sum::<u32>()
+        };
+        let [room, box_, with_a_lamp] = [0, 1, 2].map(inside);
+        assert!(room > 1000 && box_ == 0 && with_a_lamp > 100, "{room}, {box_}, {with_a_lamp}");
     }
 }

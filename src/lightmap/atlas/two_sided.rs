@@ -329,13 +329,14 @@ mod tests {
         assert!(!wall_shows_back(true, 1.0, 1e6));
     }
 
-    /// The charts with two places of a box in the open, with `light`.
+    /// The charts with two places of a box in the open, with `light`, in which a lamp is switched off.
     fn both_sided_of_a_house(light: Light) -> u32 {
         let (mut data, m) = two_sided();
         let mut builder = MeshBuilder::new();
         builder.box_(Vec3::splat(-1.0), Vec3::splat(1.0), false, m);
         data.add_mesh(builder.finish()).unwrap();
         data.add_light(light).unwrap();
+        data.add_light(Light::Point { position: Vec3::ZERO, intensity: [0.0; 3] }).unwrap();
         lightmap(data, true).info().both_sided_charts
     }
 
