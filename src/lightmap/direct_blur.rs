@@ -221,7 +221,7 @@ mod tests {
         let sum = |of: &[f32]| of.iter().sum::<f32>() / truth.iter().sum::<f32>();
         let (before, after) = (error(&plain), error(&blurred));
         assert!(before > 0.2 && after < 0.35 * before, "{before} before the blur, {after} after it");
-        assert!((sum(&blurred) - 1.0).abs() < 0.02, "{}", sum(&blurred));
+        assert!((sum(&blurred) - 1.0).abs() < 0.03, "{}", sum(&blurred));
     }
 
     #[test]

@@ -21,7 +21,8 @@ const DIFFERENCE: f32 = 0.15;
 const STRATIFIED: f32 = 0.25;
 
 /// Factor of the variance of skies and many lights, of which few texels may have most light: the blur leaves these out of
-/// others' means. (With 1 a room with a window loses 2.6 % of its direct light, by what is left out.)
+/// others' means. (A room with a window loses 2.1 % of its direct light by
+/// what is left out; with 1, 2.6 %.)
 const SKEWED: f32 = 2.0;
 
 /// Height of lines of sight above the surface they run along, as a fraction of their length: it clears curved surfaces.
