@@ -327,8 +327,9 @@ mod tests {
     use crate::scene::{Light, Material, SceneData};
     use glam::{Mat2, Vec2, Vec3};
 
-    /// The light map of a room of 4 × 3 × 4 m, of sheets or of a solid's inside, with a closed box in it.
-    fn room(two_sided: bool, [lower, upper]: [Vec3; 2]) -> Lightmap {
+    /// The light map of a room of 4 × 3 × 4 m, of sheets or of a solid's inside, with a closed box in it and
+    /// a second lamp, which is off.
+    fn room(two_sided: bool, [lower, upper]: [Vec3; 2], unlit: Vec3) -> Lightmap {
         let mut data = SceneData::new();
         let m = data.add_material(Material { two_sided, ..Default::default() }).unwrap();
         for (lower, upper, inward) in [(Vec3::ZERO, Vec3::new(4.0, 3.0, 4.0), true), (lower, upper, false)] {
@@ -337,6 +338,7 @@ mod tests {
             data.add_mesh(builder.finish()).unwrap();
         }
         data.add_light(Light::Point { position: Vec3::new(2.0, 2.5, 3.5), intensity: [9.0; 3] }).unwrap();
+        data.add_light(Light::Point { position: unlit, intensity: [0.0; 3] }).unwrap();
         let desc = LightmapDesc { texels_per_unit: 20.0, ..Default::default() };
         Lightmap::create(&data.committed(), &desc, &Progress::none()).unwrap()
     }
@@ -372,7 +374,7 @@ mod tests {
     fn the_floor_below_a_box_is_buried_and_takes_its_light_from_beside_it() {
         let (lower, upper) = (Vec3::new(1.0, -0.1, 1.0), Vec3::new(1.6, 1.0, 1.6));
         for two_sided in [false, true] {
-            let lightmap = room(two_sided, [lower, upper]);
+            let lightmap = room(two_sided, [lower, upper], 0.5 * (lower + upper));
             let below = |margin: f32| {
                 move |p: Vec3| {
                     p.y < 0.01
@@ -402,7 +404,8 @@ mod tests {
     #[test]
     fn a_strip_of_floor_in_a_hollow_wall_of_sheets_is_buried() {
         let (lower, upper) = (Vec3::new(1.0, -0.01, -0.01), Vec3::new(1.08, 3.01, 4.01));
-        let lightmap = room(true, [lower, upper]);
+        // The part of the room behind the wall has a lamp, too.
+        let lightmap = room(true, [lower, upper], Vec3::new(0.5, 2.0, 2.0));
         let [seen, buried] = counted(&lightmap, |p| p.y < 0.01 && p.x > 1.02 && p.x < 1.06);
         // Some see the wall's ends.
         assert!(buried > 8 * seen && buried > 60, "{seen} {buried}");
@@ -413,7 +416,7 @@ mod tests {
     #[test]
     fn what_a_wardrobe_5_mm_off_the_wall_covers_is_buried_and_what_one_a_hand_off_covers_is_not() {
         for (gap, expected) in [(0.005, true), (0.15, false)] {
-            let lightmap = room(false, [Vec3::new(gap, 0.0, 1.0), Vec3::new(0.6, 2.0, 2.0)]);
+            let lightmap = room(false, [Vec3::new(gap, 0.0, 1.0), Vec3::new(0.6, 2.0, 2.0)], Vec3::ONE);
             let [seen, buried] =
                 counted(&lightmap, |p| p.x < 0.001 && p.y > 0.1 && p.y < 1.9 && p.z > 1.1 && p.z < 1.9);
             assert!(if expected { buried > 9 * seen } else { buried * 50 < seen }, "{gap}: {seen} {buried}");

@@ -28,8 +28,8 @@ const MOST_TRIES: usize = 1 << 14;
 /// Number of packets of rays from an open place. The first decides whether the place is open.
 const PACKETS: u32 = 4;
 
-/// Number of random walks from a place that look for light, and of their vertices. (Twice as many: the same sides, and three
-/// times the time.)
+/// Number of random walks from a place that look for light, and of their vertices. (With 8 walks Sponza has 35 charts with two
+/// sides, where it has none with 4, and three times the time.)
 const WALKS: u32 = 4;
 const VERTICES: u32 = 8;
 

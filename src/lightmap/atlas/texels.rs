@@ -227,7 +227,7 @@ impl TexelMap {
     }
 
     /// Returns the samples of the texels at some offsets from (x, y), as [`texel_index`](Self::texel_index) does.
-    #[inline(always)] // 1.5 times as fast: the window stays in registers, and the offsets are constants
+    #[inline(always)] // The window stays in registers, and the offsets are constants.
     pub fn around<const N: usize>(&self, placement: PlacementId, x: i32, y: i32, offsets: [(i32, i32); N]) -> [u32; N] {
         let w = &self.windows[placement.index()];
         let (x, y) = (x - i32::from(w.x), y - i32::from(w.y));
