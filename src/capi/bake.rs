@@ -506,7 +506,7 @@ pub unsafe extern "C" fn bk_bake_changed(
 }
 
 /// # Safety
-/// `params` is NULL or the caller's structure.
+/// `params` is NULL or the caller's structure, whose checkpoint is NULL or a text.
 unsafe fn core_params(params: *const bk_bake_params) -> Result<(BakeParams, Option<CheckpointParams>)> {
     // SAFETY: by contract.
     let read = || unsafe { read_struct(params, "params") };
@@ -533,11 +533,11 @@ unsafe fn core_params(params: *const bk_bake_params) -> Result<(BakeParams, Opti
     };
     let checkpoint = match p.checkpoint.is_null() {
         true => None,
-        // SAFETY: by contract a text.
-        false => Some(CheckpointParams {
-            path: unsafe { text(p.checkpoint, "checkpoint") }?.into(),
-            seconds: p.checkpoint_seconds.into(),
-        }),
+        false => {
+            // SAFETY: by contract a text.
+            let path = unsafe { text(p.checkpoint, "checkpoint") }?.into();
+            Some(CheckpointParams { path, seconds: p.checkpoint_seconds.into() })
+        }
     };
     Ok((params, checkpoint))
 }

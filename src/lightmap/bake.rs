@@ -25,7 +25,7 @@ use super::tiles::{TILE, in_order, texels_per_tile};
 use super::{BakeParams, BakeStats, CheckpointParams, Light, Lightmap, Origin, StageStats, TexelState, directional};
 use crate::base::directional::Directional;
 use crate::base::error::{Error, Result, invalid_argument};
-use crate::base::memory::{try_filled, try_to_vec, try_vec, try_with_capacity, try_zeroed};
+use crate::base::memory::{try_collect, try_filled, try_to_vec, try_vec, try_with_capacity, try_zeroed};
 use crate::base::parallel::one_by_one;
 use crate::base::progress::{Progress, Stage};
 use crate::base::sampling::{combine, purpose_seed};
@@ -134,14 +134,10 @@ impl Lightmap {
                 Some(c) => Some(Checkpoint::open(c, atlas, &origin, [range.start as u64, range.end as u64])?),
                 None => None,
             };
-            let mut before = match keep_error {
-                Some(keep_error) => self.before(params, &plan, &origin, keep_error)?,
+            let before = match keep_error {
+                Some(keep_error) => self.before(params, &plan, direct, &origin, keep_error)?,
                 None => None,
             };
-            if let Some(before) = before.as_mut().filter(|_| direct_blur::is_needed(direct, params, &plan)) {
-                // The blur needs all direct light from before it.
-                before.has_all_direct_anew = true;
-            }
             let from = From { checkpoint: checkpoint.as_ref(), before: before.as_ref() };
             let (mut light, mut stats) = self.passes(params, &plan, direct, &range, from, progress)?;
             stats.back_charts = light.backs.iter().filter(|&&b| b).count() as u64;
@@ -179,15 +175,23 @@ impl Lightmap {
     }
 
     /// Returns the light from before a change, if a bake with these parameters can keep any of it.
-    fn before(&self, params: &BakeParams, plan: &Plan, origin: &Origin, keep_error: f32) -> Result<Option<Before<'_>>> {
+    fn before(
+        &self,
+        params: &BakeParams,
+        plan: &Plan,
+        direct: &DirectLight,
+        origin: &Origin,
+        keep_error: f32,
+    ) -> Result<Option<Before<'_>>> {
         let Some(light) = self.light.as_ref().filter(|light| changed::can_keep(light, params, plan)) else {
             return Ok(None);
         };
         let atlas = self.before.as_ref().unwrap_or(&self.atlas);
         let moved = Moved::between(&atlas.scene, &self.atlas.scene, &self.atlas.charts)?;
-        let has_all_direct_anew = !light.origin.is_some_and(|of_light| of_light.has_lights_of(origin));
+        let has_other_lights = !light.origin.is_some_and(|of_light| of_light.has_lights_of(origin));
+        let blurs_direct = direct_blur::is_needed(direct, params, plan);
         let redo = OnceLock::new();
-        Ok(Some(Before { atlas, light, moved, has_all_direct_anew, keep_error, redo }))
+        Ok(Some(Before { atlas, light, moved, has_other_lights, blurs_direct, keep_error, redo }))
     }
 
     /// Bakes in as many passes as the parameters ask for.
@@ -581,7 +585,9 @@ impl<'p> Bake<'_, 'p> {
         let mut known = try_filled(range.len().div_ceil(BLOCK), false, "blocks of texels")?;
         let tiles = Scratch::new();
         let has_new_indirect = |texel: usize| redo.is_none_or(|redo| redo.indirect[texel]);
-        let has_new_direct = |texel: usize| redo.is_none_or(|redo| redo.direct[texel]);
+        let has_new_direct = |texel: usize| redo.is_none_or(|redo| redo.lit[texel]);
+        let lit_only = self.lit_only(redo, &light.direct)?;
+        lit_only.iter().for_each(|&(texel, _)| light.direct[texel as usize] = Vec3::ZERO);
         let asks = self.asks(directional::DIRECT);
         let new_tile = if asks { TilePoints::by_direction } else { TilePoints::new };
         // Direct light by direction, which is averaged before it is added to the rest.
@@ -655,7 +661,16 @@ impl<'p> Bake<'_, 'p> {
             let traced = self.average_direct(&texels, backs, (&known, redo), &range, direct, &light.state, &stage)?;
             rays.fetch_add(traced, Relaxed);
             if self.blurs_direct() {
-                direct_blur::blur(l, &range, &self.range, &variances, &mut light.direct, &mut directed, &stage)?;
+                let is_new = |texel: usize| redo.is_none_or(|redo| redo.direct[texel]);
+                let light = (&variances[..], &mut light.direct[..], &mut directed[..]);
+                direct_blur::blur(l, &range, &self.range, is_new, light, &stage)?;
+            }
+            for &(texel, before) in &lit_only {
+                light.direct[texel as usize] = before;
+                // Nothing is added to the sum that they keep.
+                if let Some(directed) = directed.get_mut(texel as usize - range.start) {
+                    *directed = Directional::default();
+                }
             }
             let sums = light.directional.get_mut(range.clone()).unwrap_or_default();
             sums.iter_mut().zip(&directed).for_each(|(sum, &directed)| *sum += directed);
@@ -663,7 +678,9 @@ impl<'p> Bake<'_, 'p> {
         // Beside the range only what the blur needs was computed.
         for i in range.filter(|i| !self.range.contains(i)) {
             (light.direct[i], light.indirect[i], light.state[i]) = (Vec3::ZERO, Vec3::ZERO, TexelState::default());
-            light.directional.get_mut(i).map(|d| *d = Directional::default());
+            if let Some(directional) = light.directional.get_mut(i) {
+                *directional = Directional::default();
+            }
         }
         stats.direct = StageStats {
             seconds: start.elapsed().as_secs_f64(),
@@ -671,6 +688,14 @@ impl<'p> Bake<'_, 'p> {
             bytes: (l.map.len() * TEXEL_BYTES + l.map.bytes()) as u64,
         };
         Ok(())
+    }
+
+    /// Returns the texels that keep their direct light although that of before the blur is computed for others, with what
+    /// they keep.
+    fn lit_only(&self, redo: Option<&Redo>, direct: &[Vec3]) -> Result<Vec<(u32, Vec3)>> {
+        let Some(redo) = redo.filter(|_| self.blurs_direct()) else { return Ok(Vec::new()) };
+        let texels = (0..direct.len()).filter(|&i| redo.lit[i] && !redo.direct[i]);
+        try_collect(texels.map(|i| (i as u32, direct[i])), "direct light that is kept")
     }
 
     /// Whether direct light has noise to blur.
@@ -701,7 +726,7 @@ impl<'p> Bake<'_, 'p> {
         stage: &Stage,
     ) -> Result<u64> {
         let l = self.atlas;
-        let is_new = |texel: usize| redo.is_none_or(|redo| redo.direct[texel]);
+        let is_new = |texel: usize| redo.is_none_or(|redo| redo.lit[texel]);
         let rays = AtomicU64::new(0);
         let mut variations: Vec<Variation> = try_vec(range.len(), "where direct light varies")?;
         let tiles = Scratch::new();

@@ -13,6 +13,7 @@
 
 use super::atlas::Atlas;
 use super::atlas::ids::{LightTexel, PlacementId};
+use super::direct_blur;
 use super::indirect::probes::{PROBE_RAYS, Probe, ProbeRays, State};
 use super::indirect::radiance_map::Radiance;
 use super::indirect::sample_set::SampleSet;
@@ -70,6 +71,8 @@ pub(super) struct Redo {
     pub indirect: Vec<bool>,
     /// The same for direct light.
     pub direct: Vec<bool>,
+    /// Texels whose direct light before its [blur](super::direct_blur) is needed for that.
+    pub lit: Vec<bool>,
     /// Texels of the light map that texels with new indirect light may be blurred with.
     pub around: Vec<bool>,
     /// Texels of the gather map that are needed for them.
@@ -86,8 +89,10 @@ pub(super) struct Before<'a> {
     pub atlas: &'a Atlas,
     pub light: &'a Light,
     pub moved: Moved,
-    /// Whether all direct light is computed anew: a light was set since, or noise is blurred.
-    pub has_all_direct_anew: bool,
+    /// Whether a light was set since.
+    pub has_other_lights: bool,
+    /// Whether direct light is blurred.
+    pub blurs_direct: bool,
     /// Relative difference of light that is let stand.
     pub keep_error: f32,
     /// What is computed anew, once that is known.
@@ -157,17 +162,18 @@ impl Redo {
         } else {
             rays = job.probe(&mut states, radiance)?;
         }
-        let all_direct = before.has_all_direct_anew || before.moved.emits || !plan.runs(left_out::DIRECT);
+        let all_direct = before.has_other_lights || before.moved.emits || !plan.runs(left_out::DIRECT);
         // Light by direction is the sum of both kinds, and the spread of passes is of that: both are made anew together.
         if params.directional != 0 || params.passes > 1 {
             states.iter_mut().for_each(|cell| cell.is_new |= all_direct || cell.is_shadowed);
             states.iter_mut().for_each(|cell| cell.is_shadowed &= !cell.is_new);
         }
         let n = atlas.map.len();
-        let bytes = 3 * n + atlas.gather.len() + cells.placements();
+        let bytes = 4 * n + atlas.gather.len() + cells.placements();
         let mut redo = Redo {
             indirect: try_vec(n, CHANGED)?,
             direct: try_vec(n, CHANGED)?,
+            lit: try_vec(n, CHANGED)?,
             around: try_vec(n, CHANGED)?,
             gather: try_vec(atlas.gather.len(), CHANGED)?,
             placements: try_vec(cells.placements(), CHANGED)?,
@@ -176,7 +182,7 @@ impl Redo {
         };
         // By placement, since texels are numbered by placement.
         let (mut indirect, mut direct) = (&mut redo.indirect[..], &mut redo.direct[..]);
-        let (mut around, mut gather) = (&mut redo.around[..], &mut redo.gather[..]);
+        let (mut lit, mut around, mut gather) = (&mut redo.lit[..], &mut redo.around[..], &mut redo.gather[..]);
         let mut parts = Vec::new();
         for (p, is_new) in redo.placements.iter_mut().enumerate() {
             let placement = PlacementId::new(p);
@@ -186,6 +192,7 @@ impl Redo {
                 is_new,
                 indirect: indirect.split_off_mut(..texels.len()).unwrap_or_default(),
                 direct: direct.split_off_mut(..texels.len()).unwrap_or_default(),
+                lit: lit.split_off_mut(..texels.len()).unwrap_or_default(),
                 around: around.split_off_mut(..texels.len()).unwrap_or_default(),
                 gather: gather.split_off_mut(..of_gather.len()).unwrap_or_default(),
             };
@@ -202,6 +209,7 @@ struct Part<'a> {
     is_new: &'a mut bool,
     indirect: &'a mut [bool],
     direct: &'a mut [bool],
+    lit: &'a mut [bool],
     around: &'a mut [bool],
     gather: &'a mut [bool],
 }
@@ -500,12 +508,36 @@ impl Job<'_, '_> {
                         || cuts.iter().any(|&(s, b)| self.sources[s as usize].is_cut(&around, &boxes[b as usize], part))
                 };
         }
+        self.mark_lit(placement, part.direct, part.lit);
         *part.is_new = part.around.iter().any(|&b| b);
         for (needed, texel) in part.gather.iter_mut().zip(atlas.gather.texels_of(placement)) {
             let (x, y) = atlas.gather.position(texel);
             *needed = is_needed([x as u32 - u32::from(rect.x), y as u32 - u32::from(rect.y)]);
         }
         Ok(())
+    }
+}
+
+impl Job<'_, '_> {
+    /// Marks the texels of a placement whose direct light is needed for that of those that get new direct light.
+    fn mark_lit(&self, placement: PlacementId, direct: &[bool], lit: &mut [bool]) {
+        lit.copy_from_slice(direct);
+        if !self.before.blurs_direct {
+            return;
+        }
+        let (map, texels) = (&self.atlas.map, self.atlas.map.texels_of(placement));
+        for texel in texels.clone().filter(|&texel| direct[texels.place(texel)]) {
+            let (x, y) = map.position(texel);
+            let near = |dx: i32, dy: i32| map.at(placement, x + dx, y + dy).filter(|&near| texels.contains(near));
+            let is_inner = |(dx, dy)| near(dx, dy).is_some_and(|near| direct[texels.place(near)]);
+            if [(-1, 0), (1, 0), (0, -1), (0, 1), (-1, -1), (1, -1), (-1, 1), (1, 1)].into_iter().all(is_inner) {
+                continue;
+            }
+            let side = -direct_blur::RADIUS..=direct_blur::RADIUS;
+            for near in side.clone().flat_map(|dy| side.clone().filter_map(move |dx| near(dx, dy))) {
+                lit[texels.place(near)] = true;
+            }
+        }
     }
 }
 
@@ -526,6 +558,10 @@ mod tests {
 
     /// Two rooms of 4 × 4 × 3 m with a door between them, a lamp in each, and a block in the first one: mesh 1.
     fn rooms() -> (Arc<Scene>, Lightmap) {
+        rooms_with(|x| Lamp::Point { position: Vec3::new(x, 1.9, 2.7), intensity: [5.0; 3] })
+    }
+
+    fn rooms_with(lamp: impl Fn(f32) -> Lamp) -> (Arc<Scene>, Lightmap) {
         let mut data = SceneData::new();
         let white = data.add_material(Material { albedo: [0.7; 3], ..Default::default() }).unwrap();
         let mut walls = MeshBuilder::new();
@@ -536,8 +572,7 @@ mod tests {
         block.box_(Vec3::new(0.6, 0.6, 0.0), Vec3::new(1.0, 1.0, 0.5), false, white);
         data.add_mesh(block.finish()).unwrap();
         for x in [2.0, 6.0] {
-            let light = Lamp::Point { position: Vec3::new(x, 1.9, 2.7), intensity: [5.0; 3] };
-            data.add_light(light).unwrap();
+            data.add_light(lamp(x)).unwrap();
         }
         let scene = data.committed();
         let desc = LightmapDesc { texels_per_unit: 24.0, page_size: 512, ..Default::default() };
@@ -562,9 +597,23 @@ mod tests {
     #[test]
     fn texels_keep_their_light_or_get_that_of_a_bake_from_nothing() {
         let none = Progress::none();
-        for (stitch, directional, passes) in [(false, 0, 1), (false, directional::INDIRECT, 2), (true, 0, 1)] {
+        let both = directional::INDIRECT | directional::DIRECT;
+        for (stitch, directional, passes, is_area) in [
+            (false, 0, 1, false),
+            (false, both, 2, false),
+            (true, 0, 1, false),
+            (false, 0, 1, true),
+            (false, both, 1, true),
+        ] {
             let params = BakeParams { stitch, directional, passes, ..params() };
-            let (mut scene, mut map) = rooms();
+            // The direct light of areas is blurred.
+            let area = |x| Lamp::Rect {
+                position: Vec3::new(x, 1.5, 2.9),
+                edge_u: Vec3::new(0.0, 1.0, 0.0),
+                edge_v: Vec3::new(1.0, 0.0, 0.0),
+                radiance: [5.0; 3],
+            };
+            let (mut scene, mut map) = if is_area { rooms_with(area) } else { rooms() };
             map.bake(&params, &none).unwrap();
             let old = light(&map);
             move_block(&mut scene, Vec3::new(0.3, 0.2, 0.0));
@@ -585,7 +634,7 @@ mod tests {
             for (kind, what) in ["direct", "indirect"].iter().enumerate() {
                 let differs = |i: usize, from: &[Vec<Vec3>; 2]| changed[kind][i] != from[kind][i];
                 let neither = (0..n).filter(|&i| differs(i, &old) && differs(i, &new)).count();
-                assert_eq!(neither, 0, "{what} light that is neither old nor new, {passes} passes");
+                assert_eq!(neither, 0, "{what} light that is neither old nor new, {passes} passes, areas: {is_area}");
                 // What is kept is much like what would be new; all of what was shadowed or lit is new.
                 let mean = new[kind].iter().map(|l| l.element_sum()).sum::<f32>() / n as f32;
                 let wrong = |i: &usize| (changed[kind][*i] - new[kind][*i]).abs().element_sum() / mean;
@@ -593,7 +642,7 @@ mod tests {
                 assert!(worst < 0.25, "{what} light is wrong by {worst} of the mean");
                 let old_worst =
                     (0..n).map(|i| (old[kind][i] - new[kind][i]).abs().element_sum() / mean).fold(0.0, f32::max);
-                assert!(old_worst > 0.25, "{what} light changed by {old_worst} only");
+                assert!(old_worst > 0.15, "{what} light changed by {old_worst} only");
             }
         }
     }

@@ -64,16 +64,15 @@ pub(crate) fn needed(atlas: &Atlas, range: &Range<usize>) -> Range<usize> {
     start..end
 }
 
-/// Blurs the direct light of the texels of `range`: `direct`, by texel, and `directed`, if it is asked for by direction, whose
-/// first texel and that of `variances` is the first of those that are `lit`. To be called on the device's threads.
-/// Advances `stage` by one per texel.
+/// Blurs the direct light of the texels of `range` that are new: `direct`, by texel, and `directed`, if it is asked for by
+/// direction, whose first texel and that of `variances` is the first of those that are `lit`. To be called on the device's
+/// threads. Advances `stage` by one per texel.
 pub(crate) fn blur(
     atlas: &Atlas,
     lit: &Range<usize>,
     range: &Range<usize>,
-    variances: &[f32],
-    direct: &mut [Vec3],
-    directed: &mut [Directional],
+    is_new: impl Fn(usize) -> bool + Sync,
+    (variances, direct, directed): (&[f32], &mut [Vec3], &mut [Directional]),
     stage: &Stage,
 ) -> Result<()> {
     let (what, n) = ("direct light before the blur", directed.len());
@@ -86,8 +85,9 @@ pub(crate) fn blur(
         let mut blur = DirectBlur::new(atlas);
         let place = |texel: LightTexel| texel.index() - lit.start;
         let noisy = |texel| Some((before[place(texel)], variances[place(texel)]));
-        for (i, out) in out.iter_mut().enumerate() {
-            let texel = LightTexel::new(range.start + block * BLOCK + i);
+        let first = range.start + block * BLOCK;
+        for (i, out) in out.iter_mut().enumerate().filter(|(i, _)| is_new(first + i)) {
+            let texel = LightTexel::new(first + i);
             *out = blur.mean(texel, noisy, |s| before[place(s)]);
             if let Some(out) = directed.get_mut(i) {
                 *out = blur.mean(texel, noisy, |s| before_directed[place(s)]);
