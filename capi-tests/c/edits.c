@@ -73,7 +73,7 @@ static float *light_of(const bk_lightmap *map, size_t *count) {
     CHECK_OK(bk_lightmap_get_info(map, &info));
     *count = (size_t)info.width * info.height * 3;
     page = malloc(*count * sizeof *page);
-    CHECK_OK(bk_lightmap_read(map, 0, BK_LAYER_COMBINED, BK_FORMAT_RGB32F, page, *count * sizeof *page));
+    CHECK_OK(bk_lightmap_read(map, 0, BK_LAYER_COMBINED, BK_FORMAT_RGB32F, page, 0));
     return page;
 }
 
