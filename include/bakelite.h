@@ -1683,8 +1683,8 @@ bk_result bk_lightmap_create(const bk_scene *scene,
 /// @param scene  the scene from which the light map was created, after a refit
 /// @param progress,user  progress callback and its pointer; may be NULL
 /// @retval BK_ERROR_INVALID_ARGUMENT  the light map is of another scene
-/// @retval BK_ERROR_INVALID_STATE  the scene is being refitted, or another call is using the light
-///   map
+/// @retval BK_ERROR_INVALID_STATE  a triangle with texels has become degenerate or not finite;
+///   bk_last_error names it. Or the scene is being refitted, or another call is using the light map
 /// @retval BK_ERROR_OUT_OF_MEMORY  the texels do not fit, or the memory callback refuses
 /// @retval BK_ERROR_CANCELLED  the progress callback returned 0
 BK_API

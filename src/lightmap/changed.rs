@@ -552,6 +552,7 @@ pub(super) fn can_keep(light: &Light, params: &BakeParams, plan: &Plan) -> bool 
 mod tests {
     use super::super::{Lightmap, LightmapDesc, directional};
     use super::*;
+    use crate::base::error::Error;
     use crate::scene::demo::shapes::MeshBuilder;
     use crate::scene::{Material, SceneData};
     use std::sync::Arc;
@@ -717,6 +718,29 @@ mod tests {
         assert_eq!(fresh.info().buried_texels, after);
         let samples = |map: &Lightmap| map.atlas.map.texels.samples.clone();
         assert!(samples(&fresh) == samples(&map));
+    }
+
+    #[test]
+    fn a_surface_that_is_gone_cannot_be_followed() {
+        let none = Progress::none();
+        for gone in [Vec3::splat(f32::NAN), Vec3::splat(1e13), Vec3::new(1.0, 1.0, 0.0)] {
+            let (mut scene, mut map) = rooms();
+            map.bake(&params(), &none).unwrap();
+            let before = light(&map);
+            // One vertex, or all in one place.
+            let moved: Vec<Vec3> = scene.meshes()[1]
+                .positions
+                .iter()
+                .enumerate()
+                .map(|(i, &p)| if i == 0 || gone.is_finite() { gone } else { p })
+                .collect();
+            Scene::refit(&mut scene, &[(1, &moved)]).unwrap();
+            let refused = map.follow(&scene, &none);
+            assert!(matches!(&refused, Err(Error::InvalidState(e)) if e.contains("mesh 1")), "{gone}: {refused:?}");
+            assert!(map.before.is_none() && light(&map) == before);
+            map.bake_changed(&params(), 0.1, &none).unwrap();
+            assert!(light(&map) == before);
+        }
     }
 
     #[test]

@@ -23,7 +23,8 @@ impl Lightmap {
     /// stay. Light that has been baked stays too, as it was, until the next bake:
     /// [`bake_changed`](Self::bake_changed) computes what the move changes.
     ///
-    /// Fails, and changes nothing, if `scene` is not a state of the light map's scene, without memory, or on a cancel.
+    /// Fails, and changes nothing, if `scene` is not a state of the light map's scene, if a triangle with texels is
+    /// degenerate or not finite in it, without memory, or on a cancel.
     pub fn follow(&mut self, scene: &Arc<Scene>, progress: &Progress) -> Result<()> {
         if Arc::ptr_eq(scene, &self.atlas.scene) {
             return Ok(());

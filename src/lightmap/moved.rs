@@ -2,7 +2,7 @@
 
 use super::atlas::charts::Charts;
 use super::atlas::ids::ChartId;
-use crate::base::error::Result;
+use crate::base::error::{Error, Result};
 use crate::base::geometry::is_valid_triangle;
 use crate::base::memory::{try_push, try_vec};
 use crate::scene::Scene;
@@ -115,7 +115,8 @@ pub(super) struct Moved {
 }
 
 impl Moved {
-    /// Compares two states of a scene, whose charts are the same.
+    /// Compares two states of a scene, whose charts are the same. `InvalidState` if a triangle of a chart has become
+    /// degenerate or not finite: it has no normal, and its texels no place.
     pub fn between(old: &Scene, new: &Scene, charts: &Charts) -> Result<Moved> {
         let mut moved = Moved { charts: try_vec(charts.charts.len(), MOVED)?, boxes: Vec::new(), emits: false };
         if std::ptr::eq(old, new) {
@@ -136,6 +137,9 @@ impl Moved {
                     continue;
                 }
                 if let Some(chart) = charts.find(triangle) {
+                    if !is_valid_triangle(corners[1]) {
+                        return Err(is_gone(new, number, triangle - first));
+                    }
                     moved.charts[chart.index()] = true;
                 }
                 moved.emits |= new.material(triangle).is_emissive();
@@ -155,6 +159,17 @@ impl Moved {
     pub fn has(&self, chart: ChartId) -> bool {
         self.charts[chart.index()]
     }
+}
+
+/// The error of a triangle that has texels but is a surface no more.
+fn is_gone(scene: &Scene, object: u32, triangle: u32) -> Error {
+    let object = match object.checked_sub(scene.meshes().len() as u32) {
+        None => format!("mesh {object}"),
+        Some(instance) => format!("instance {instance}"),
+    };
+    Error::InvalidState(format!(
+        "triangle {triangle} of {object} has texels, and is degenerate or not finite since the scene has moved"
+    ))
 }
 
 /// Merges boxes until there are at most `most`, at least 1.

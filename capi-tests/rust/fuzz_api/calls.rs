@@ -53,8 +53,8 @@ pub fn any(w: &W, s: &mut Source) {
         59..=62 => photon_numbers(w, s),
         63..=65 => lightmap(w, s),
         66..=68 => lightmap_numbers(w, s),
-        // `edit` is left out until light of NaN that seed 35 found is mended (docs/robustness.md).
-        69..=70 => bake(w, s),
+        69 => bake(w, s),
+        70 => edit(w, s),
         71..=76 => read(w, s),
         77 => save(w, s),
         78..=80 => live(w, s),
@@ -745,7 +745,6 @@ fn bake(w: &W, s: &mut Source) {
 }
 
 /// A light map that follows a scene, and what changed is baked.
-#[allow(dead_code)]
 fn edit(w: &W, s: &mut Source) {
     let Some(lightmap) = w.pick(Kind::Lightmap, s) else { return };
     let mut params = bake_params(w, s);
