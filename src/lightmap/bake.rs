@@ -3,31 +3,32 @@
 //!
 //! The file is long because it has every stage once, in order: this order is what a reader looks for here.
 
+mod direct;
+
 use super::atlas::Atlas;
 use super::atlas::fill::Filling;
-use super::atlas::ids::{GatherTexel, LightMap, LightTexel, PerTexel};
-use super::changed::{self, Before, Redo};
+use super::atlas::ids::{GatherTexel, LightTexel, PerTexel};
+use super::changed::{Before, Redo};
 use super::direct_blur;
 use super::indirect::blur;
 use super::indirect::gather::{Gathered, Tile, TileTexel};
 use super::indirect::radiance_map::Radiance;
 use super::indirect::sample_set::SampleSet;
-use super::indirect::upsample::{Asked, Upsampling, parts};
-use super::moved::Moved;
+use super::indirect::upsample::{Upsampling, parts};
 use super::passes::{self, Passes};
 use super::plan::{Plan, left_out};
 use super::saved::checkpoint::Checkpoint;
 use super::seams::Stitch;
 use super::stages::{self, Inputs, Own, purpose};
-use super::texel_light::averages::{Averaged, Variation};
-use super::texel_light::{TexelLight, TilePoints};
-use super::tiles::{TILE, in_order, texels_per_tile};
+use super::texel_light::TilePoints;
+use super::texel_light::averages::Variation;
+use super::tiles::{TILE, in_order};
 use super::{BakeParams, BakeStats, CheckpointParams, Light, Lightmap, Origin, StageStats, TexelState, directional};
 use crate::base::directional::Directional;
 use crate::base::error::{Error, Result, invalid_argument};
-use crate::base::memory::{try_collect, try_filled, try_to_vec, try_vec, try_with_capacity, try_zeroed};
+use crate::base::memory::{try_filled, try_to_vec, try_vec, try_zeroed};
 use crate::base::parallel::one_by_one;
-use crate::base::progress::{Progress, Stage};
+use crate::base::progress::Progress;
 use crate::base::sampling::{combine, purpose_seed};
 use crate::base::scratch::Scratch;
 use crate::direct::DirectLight;
@@ -35,8 +36,8 @@ use crate::scene::Scene;
 use glam::Vec3;
 use rayon::prelude::*;
 use std::ops::Range;
+use std::sync::Arc;
 use std::sync::atomic::{AtomicU64, Ordering::Relaxed};
-use std::sync::{Arc, OnceLock};
 use std::time::Instant;
 
 /// Texels handed to a thread at a time.
@@ -55,25 +56,6 @@ impl Lightmap {
     /// Runs the pipeline. After an error or a cancel, the light of earlier bakes is unchanged.
     pub fn bake(&mut self, params: &BakeParams, progress: &Progress) -> Result<BakeStats> {
         self.bake_with(params, None, progress)
-    }
-
-    /// Bakes again after lights were [set](Scene::set_light) or the scene [has moved](Lightmap::follow). Texels whose light
-    /// has changed by less than `keep_error` (finite, ≥ 0), as far as probes tell, keep it; it is relative to their light
-    /// or, if that is more, to a tenth of the mean light. All others get the bits of [`bake`](Self::bake).
-    ///
-    /// `params` are those of the last bake, for all texels and without a target error. If others were used, or there is
-    /// no light yet, all is baked. Many small changes that are each let stand add up: now and then bake from nothing.
-    pub fn bake_changed(&mut self, params: &BakeParams, keep_error: f32, progress: &Progress) -> Result<BakeStats> {
-        params.validate()?;
-        if !(keep_error >= 0.0 && keep_error.is_finite()) {
-            return invalid_argument!("keep_error is {keep_error}, not a finite number ≥ 0");
-        }
-        let total = self.atlas.map.len() as u64;
-        if params.target_error > 0.0 || params.texel_begin > 0 || !(params.texel_end == 0 || params.texel_end == total)
-        {
-            return invalid_argument!("a bake of changes is of all texels and has no target_error");
-        }
-        self.bake_all(params, None, Some(keep_error), progress)
     }
 
     /// Runs the pipeline and keeps finished work in a file. A later call with the same scene, lights, layout and
@@ -96,7 +78,7 @@ impl Lightmap {
     }
 
     /// Bakes with checked parameters, anew or, given the difference of light that is let stand, what has changed.
-    fn bake_all(
+    pub(super) fn bake_all(
         &mut self,
         params: &BakeParams,
         checkpoint: Option<&CheckpointParams>,
@@ -172,26 +154,6 @@ impl Lightmap {
             )
         });
         Ok(stats)
-    }
-
-    /// Returns the light from before a change, if a bake with these parameters can keep any of it.
-    fn before(
-        &self,
-        params: &BakeParams,
-        plan: &Plan,
-        direct: &DirectLight,
-        origin: &Origin,
-        keep_error: f32,
-    ) -> Result<Option<Before<'_>>> {
-        let Some(light) = self.light.as_ref().filter(|light| changed::can_keep(light, params, plan)) else {
-            return Ok(None);
-        };
-        let atlas = self.before.as_ref().unwrap_or(&self.atlas);
-        let moved = Moved::between(&atlas.scene, &self.atlas.scene, &self.atlas.charts)?;
-        let has_other_lights = !light.origin.is_some_and(|of_light| of_light.has_lights_of(origin));
-        let blurs_direct = direct_blur::is_needed(direct, params, plan);
-        let redo = OnceLock::new();
-        Ok(Some(Before { atlas, light, moved, has_other_lights, blurs_direct, keep_error, redo }))
     }
 
     /// Bakes in as many passes as the parameters ask for.
@@ -470,7 +432,7 @@ impl<'p> Bake<'_, 'p> {
         let placements = placement_of(self.range.start)..placement_of(self.range.end - 1) + 1;
         let starts = &l.gather.texels.chart_start;
         let needed = starts[placements.start] as usize..starts[placements.end] as usize;
-        let asked = redo.map_or(Asked::default(), Redo::asked);
+        let asked = redo.map(Redo::asked);
         let is_needed = |texel: usize| redo.is_none_or(|redo| redo.gather[texel]);
         let upsampling = stages::upsampling(&self.inputs(), backs, placements, asked)?;
         let own = self.own_light(radiance, backs, &upsampling)?;
@@ -607,10 +569,10 @@ impl<'p> Bake<'_, 'p> {
                 let ((directional, directed), variances) = rest;
                 let mut traced = 0;
                 let first = range.start + block * BLOCK;
-                let ind_count = ind.len();
                 if let Some(indirect) = indirect {
                     let irradiance = PerTexel::new(&indirect.irradiance);
-                    let texels = || LightTexel::range(first..first + ind_count);
+                    let end = first + ind.len();
+                    let texels = || LightTexel::range(first..end);
                     for (texel, ind) in texels().zip(&mut *ind).filter(|(texel, _)| has_new_indirect(texel.index())) {
                         *ind = indirect.upsampling.at(l, irradiance, &indirect.own.light, texel);
                     }
@@ -688,113 +650,5 @@ impl<'p> Bake<'_, 'p> {
             bytes: (l.map.len() * TEXEL_BYTES + l.map.bytes()) as u64,
         };
         Ok(())
-    }
-
-    /// Returns the texels that keep their direct light although that of before the blur is computed for others, with what
-    /// they keep.
-    fn lit_only(&self, redo: Option<&Redo>, direct: &[Vec3]) -> Result<Vec<(u32, Vec3)>> {
-        let Some(redo) = redo.filter(|_| self.blurs_direct()) else { return Ok(Vec::new()) };
-        let texels = (0..direct.len()).filter(|&i| redo.lit[i] && !redo.direct[i]);
-        try_collect(texels.map(|i| (i as u32, direct[i])), "direct light that is kept")
-    }
-
-    /// Whether direct light has noise to blur.
-    fn blurs_direct(&self) -> bool {
-        direct_blur::is_needed(self.direct, self.params, self.plan)
-    }
-
-    /// Returns the computation of direct light for the light map's texels.
-    fn texel_light(&self) -> TexelLight<'_, LightMap> {
-        TexelLight {
-            areas: self.atlas.areas(&self.atlas.map),
-            direct: self.direct,
-            samples: self.params.direct_samples,
-            seed: purpose_seed(self.params.seed, purpose::DIRECT),
-        }
-    }
-
-    /// Replaces direct light without penumbrae at the samples of a range by all direct light, averaged over texels, and
-    /// finds its variance if there is room for it. Returns the number of rays.
-    fn average_direct(
-        &self,
-        texels: &TexelLight<LightMap>,
-        backs: &[bool],
-        (known, redo): (&[bool], Option<&Redo>),
-        range: &Range<usize>,
-        (direct, directed, variances): (&mut [Vec3], &mut [Directional], &mut [f32]),
-        state: &[TexelState],
-        stage: &Stage,
-    ) -> Result<u64> {
-        let l = self.atlas;
-        let is_new = |texel: usize| redo.is_none_or(|redo| redo.lit[texel]);
-        let rays = AtomicU64::new(0);
-        let mut variations: Vec<Variation> = try_vec(range.len(), "where direct light varies")?;
-        let tiles = Scratch::new();
-        let new_tile = if directed.is_empty() { TilePoints::new } else { TilePoints::by_direction };
-        l.scene.device().install(|| {
-            let sharp = &direct[..];
-            one_by_one(variations.par_chunks_mut(BLOCK).enumerate()).for_each(|(block, out)| {
-                let mut traced = 0;
-                let first = range.start + block * BLOCK;
-                for (i, variation) in out.iter_mut().enumerate().filter(|(i, _)| !known[block] && is_new(first + i)) {
-                    let texel = LightTexel::new(first + i);
-                    // Neighbours that another shard bakes, that a checkpoint has or that keep their light are computed
-                    // here too.
-                    let is_here = |i: usize| range.contains(&i) && !known[(i - range.start) / BLOCK] && is_new(i);
-                    *variation = texels.varies(texel, sharp[texel.index()], |near| match is_here(near.index()) {
-                        true => sharp[near.index()],
-                        false => texels.sharp(&l.receiver(&l.map, backs, near), &mut traced),
-                    });
-                }
-                rays.fetch_add(traced, Relaxed);
-            });
-            let blocks = direct[range.clone()].par_chunks_mut(BLOCK).zip(state[range.clone()].par_chunks(BLOCK));
-            let sums = parts(directed, BLOCK, range.len())?.into_par_iter().zip(parts(variances, BLOCK, range.len())?);
-            let blocks = blocks.zip(variations.par_chunks(BLOCK)).zip(sums).enumerate();
-            one_by_one(blocks).try_for_each(|(block, (((direct, state), variations), (directed, variances)))| {
-                if known[block] {
-                    return stage.advance(direct.len() as u64);
-                }
-                let (mut traced, first) = (0, range.start + block * BLOCK);
-                let mut tile = tiles.take(|| new_tile(TILE))?;
-                let mut of_tile = try_with_capacity(TILE, "the texels of a tile")?;
-                let mut order = in_order(&l.map, first..first + direct.len())?;
-                // The others have their light. (Direct light of Sponza in the sun, 12 texels/m: 0.85 of the time with
-                // their receivers.)
-                order.retain(|t| {
-                    let varies = self.direct.has_soft() || variations[t.index() - first] != Variation::None;
-                    varies && is_new(t.index())
-                });
-                let mut receiver = l.receivers(&l.map, backs);
-                for some in order.chunks(texels_per_tile(texels.samples)) {
-                    self.progress.check()?;
-                    of_tile.clear();
-                    of_tile.extend(some.iter().map(|&texel| Averaged {
-                        texel,
-                        back: l.is_back(&l.map, backs, texel),
-                        receiver: receiver(texel),
-                        sharp: direct[texel.index() - first],
-                        sharp_directional: directed.get(texel.index() - first).copied().unwrap_or_default(),
-                        variation: variations[texel.index() - first],
-                    }));
-                    let place = |i: usize| some[i].index() - first;
-                    texels.irradiance(&of_tile, &mut tile, &mut traced, |i, e, variance, by_direction| {
-                        direct[place(i)] = e;
-                        if let Some(of_texel) = variances.get_mut(place(i)) {
-                            *of_texel = variance;
-                        }
-                        if let Some(directed) = directed.get_mut(place(i)) {
-                            *directed = *by_direction;
-                        }
-                    });
-                }
-                if let Some(c) = self.checkpoint {
-                    c.keep_lit(block, direct, variances, state, directed);
-                }
-                rays.fetch_add(traced, Relaxed);
-                stage.advance(direct.len() as u64)
-            })
-        })?;
-        Ok(rays.into_inner())
     }
 }

@@ -11,6 +11,8 @@
 //! their light. Those that are computed anew get the bits of a bake from nothing, as their random numbers, the radiance
 //! map and the texels around them are the same.
 
+mod sources;
+
 use super::atlas::Atlas;
 use super::atlas::ids::{LightTexel, PlacementId};
 use super::direct_blur;
@@ -18,23 +20,22 @@ use super::indirect::probes::{PROBE_RAYS, Probe, ProbeRays, State};
 use super::indirect::radiance_map::Radiance;
 use super::indirect::sample_set::SampleSet;
 use super::indirect::upsample::Asked;
-use super::moved::{Bounds, Moved, merged};
+use super::moved::{Bounds, Moved};
 use super::plan::{Plan, left_out};
 use super::stages::purpose;
 use super::tiles::TILE;
-use super::{BakeParams, Light, TexelState};
-use crate::base::error::Result;
+use super::{BakeParams, BakeStats, Light, Lightmap, Origin, TexelState};
+use crate::base::error::{Result, invalid_argument};
 use crate::base::memory::{
     Reservation, try_collect, try_filled, try_par_collect_ok, try_par_gather, try_push, try_vec,
 };
 use crate::base::progress::Progress;
 use crate::base::sampling::{mix, purpose_seed};
 use crate::base::scratch::Scratch;
-use crate::scene::{Light as Lamp, Scene};
+use crate::direct::DirectLight;
 use crate::trace::Ray;
-use glam::Vec3;
 use rayon::prelude::*;
-use std::f32::consts::PI;
+use sources::{Source, part_of_light};
 use std::sync::OnceLock;
 use std::sync::atomic::{AtomicU64, Ordering::Relaxed};
 
@@ -53,15 +54,9 @@ const NEAR: f32 = 0.15;
 /// Texels darker than this part of the mean light count as if they were so bright.
 const DARK: f32 = 0.1;
 
-/// Maximum number of boxes around emissive triangles.
-const MOST_EMITTERS: usize = 64;
-
 /// Number of pairs of a source and of what moved between it and a cell, beyond which all texels of the cell count as
 /// shadowed: testing each takes longer than its direct light.
 const MOST_CUTS: usize = 16;
-
-/// Radius in radians from which on the disc of a directional light counts as a sky.
-const WIDE: f32 = 0.5;
 
 const CHANGED: &str = "which light has changed";
 
@@ -82,6 +77,47 @@ pub(super) struct Redo {
     /// Number of rays of probes.
     pub rays: u64,
     _memory: Reservation,
+}
+
+impl Lightmap {
+    /// Bakes again after lights were [set](Scene::set_light) or the scene [has moved](Lightmap::follow). Texels whose light
+    /// has changed by less than `keep_error` (finite, ≥ 0), as far as probes tell, keep it; it is relative to their light
+    /// or, if that is more, to a tenth of the mean light. All others get the bits of [`bake`](Self::bake).
+    ///
+    /// `params` are those of the last bake, for all texels and without a target error. If others were used, or there is
+    /// no light yet, all is baked. Many small changes that are each let stand add up: now and then bake from nothing.
+    pub fn bake_changed(&mut self, params: &BakeParams, keep_error: f32, progress: &Progress) -> Result<BakeStats> {
+        params.validate()?;
+        if !(keep_error >= 0.0 && keep_error.is_finite()) {
+            return invalid_argument!("keep_error is {keep_error}, not a finite number ≥ 0");
+        }
+        let total = self.atlas.map.len() as u64;
+        if params.target_error > 0.0 || params.texel_begin > 0 || !(params.texel_end == 0 || params.texel_end == total)
+        {
+            return invalid_argument!("a bake of changes is of all texels and has no target_error");
+        }
+        self.bake_all(params, None, Some(keep_error), progress)
+    }
+
+    /// Returns the light from before a change, if a bake with these parameters can keep any of it.
+    pub(super) fn before(
+        &self,
+        params: &BakeParams,
+        plan: &Plan,
+        direct: &DirectLight,
+        origin: &Origin,
+        keep_error: f32,
+    ) -> Result<Option<Before<'_>>> {
+        let Some(light) = self.light.as_ref().filter(|light| can_keep(light, params, plan)) else {
+            return Ok(None);
+        };
+        let atlas = self.before.as_ref().unwrap_or(&self.atlas);
+        let moved = Moved::between(&atlas.scene, &self.atlas.scene, &self.atlas.charts)?;
+        let has_other_lights = !light.origin.is_some_and(|of_light| of_light.has_lights_of(origin));
+        let blurs_direct = direct_blur::is_needed(direct, params, plan);
+        let redo = OnceLock::new();
+        Ok(Some(Before { atlas, light, moved, has_other_lights, blurs_direct, keep_error, redo }))
+    }
 }
 
 /// The light of a light map before a change.
@@ -135,7 +171,7 @@ impl Before<'_> {
 impl Redo {
     /// Returns what is asked for of the interpolation.
     pub fn asked(&self) -> Asked<'_> {
-        Asked { placements: Some(&self.placements), alone: Some(&self.around) }
+        Asked { placements: &self.placements, alone: &self.around }
     }
 
     /// Returns how many texels keep all of their light.
@@ -154,7 +190,8 @@ impl Redo {
         progress: &Progress,
     ) -> Result<Redo> {
         let cells = Cells::new(atlas)?;
-        let job = Job { before, atlas, params, backs, cells: &cells, sources: sources(&atlas.scene)?, progress };
+        let job =
+            Job { before, atlas, params, backs, cells: &cells, sources: sources::sources(&atlas.scene)?, progress };
         let mut states = try_par_gather(cells.placements(), CHANGED, |p, out| job.look(PlacementId::new(p), out))?;
         let mut rays = 0;
         if !plan.runs(left_out::INDIRECT) {
@@ -282,68 +319,6 @@ impl Cell {
         let count = if self.texels < PROBED_TEXELS { 1 } else { PROBES };
         self.probes.into_iter().take(count).filter(|&texel| texel != LightTexel::NONE)
     }
-}
-
-/// Where light comes from.
-enum Source {
-    /// From a box, which may be a point.
-    Near(Bounds),
-    /// From infinitely far away, up to an angle with this tangent from a direction.
-    Far { direction: Vec3, spread: f32 },
-    /// From everywhere.
-    Sky,
-}
-
-/// Returns what gives direct light.
-fn sources(scene: &Scene) -> Result<Vec<Source>> {
-    let mut sources = Vec::new();
-    let around = |points: &[Vec3]| {
-        let mut bounds = Bounds::EMPTY;
-        points.iter().for_each(|&point| bounds.add(point));
-        bounds
-    };
-    for light in scene.lights().iter().filter(|light| light.color() != [0.0; 3]) {
-        let source = match *light {
-            Lamp::Point { position, .. } | Lamp::Spot { position, .. } => Source::Near(around(&[position])),
-            Lamp::Rect { position, edge_u, edge_v, .. } => {
-                Source::Near(around(&[Vec3::ZERO, edge_u, edge_v, edge_u + edge_v].map(|edge| position + edge)))
-            }
-            Lamp::Directional { angular_radius, .. } if angular_radius > WIDE => Source::Sky,
-            Lamp::Directional { direction, angular_radius, .. } => {
-                Source::Far { direction: -direction.normalize_or_zero(), spread: angular_radius.tan() }
-            }
-            Lamp::Sky { .. } => Source::Sky,
-        };
-        try_push(&mut sources, source, CHANGED)?;
-    }
-    let emitters =
-        scene.emitters().iter().map(|e| around(&[Vec3::ZERO, e.edge_u, e.edge_v].map(|edge| e.corner + edge)));
-    for bounds in merged(try_collect(emitters, CHANGED)?, MOST_EMITTERS) {
-        try_push(&mut sources, Source::Near(bounds), CHANGED)?;
-    }
-    Ok(sources)
-}
-
-impl Source {
-    /// Whether what moved may lie between points and the source. `part`: a bound of the part of the hemisphere that all
-    /// of it takes, and the part that matters.
-    fn is_cut(&self, points: &Bounds, moved: &Bounds, part: (f32, f32)) -> bool {
-        match *self {
-            Source::Near(end) => points.sweeps(end.lower - points.lower, end.upper - points.upper, 1.0, moved),
-            Source::Far { direction, spread } => {
-                // A unit vector of a cone differs from its axis by no more in any coordinate.
-                points.sweeps(direction - spread, direction + spread, f32::INFINITY, moved)
-            }
-            Source::Sky => part.0 > part.1,
-        }
-    }
-}
-
-/// Returns a bound of the part of the light of a surface in `from` that a box takes: of a convex body at distance d, at
-/// most half of its surface is seen, and all of it as if facing the surface.
-fn part_of_light(from: &Bounds, moved: &Bounds) -> f32 {
-    let d = from.distance(moved);
-    if d > 0.0 { 0.5 * moved.area() / (PI * d * d) } else { f32::INFINITY }
 }
 
 struct Job<'a, 'p> {
@@ -516,9 +491,7 @@ impl Job<'_, '_> {
         }
         Ok(())
     }
-}
 
-impl Job<'_, '_> {
     /// Marks the texels of a placement whose direct light is needed for that of those that get new direct light.
     fn mark_lit(&self, placement: PlacementId, direct: &[bool], lit: &mut [bool]) {
         lit.copy_from_slice(direct);
@@ -549,231 +522,4 @@ pub(super) fn can_keep(light: &Light, params: &BakeParams, plan: &Plan) -> bool 
 }
 
 #[cfg(test)]
-mod tests {
-    use super::super::{Lightmap, LightmapDesc, directional};
-    use super::*;
-    use crate::base::error::Error;
-    use crate::scene::demo::shapes::MeshBuilder;
-    use crate::scene::{Material, SceneData};
-    use std::sync::Arc;
-
-    /// Two rooms of 4 × 4 × 3 m with a door between them, a lamp in each, and a block in the first one: mesh 1.
-    fn rooms() -> (Arc<Scene>, Lightmap) {
-        rooms_with(|x| Lamp::Point { position: Vec3::new(x, 1.9, 2.7), intensity: [5.0; 3] })
-    }
-
-    fn rooms_with(lamp: impl Fn(f32) -> Lamp) -> (Arc<Scene>, Lightmap) {
-        let mut data = SceneData::new();
-        let white = data.add_material(Material { albedo: [0.7; 3], ..Default::default() }).unwrap();
-        let mut walls = MeshBuilder::new();
-        walls.box_(Vec3::ZERO, Vec3::new(8.0, 4.0, 3.0), true, white);
-        walls.box_(Vec3::new(3.9, 0.0, 0.0), Vec3::new(4.1, 2.8, 3.0), false, white);
-        data.add_mesh(walls.finish()).unwrap();
-        let mut block = MeshBuilder::new();
-        block.box_(Vec3::new(0.6, 0.6, 0.0), Vec3::new(1.0, 1.0, 0.5), false, white);
-        data.add_mesh(block.finish()).unwrap();
-        for x in [2.0, 6.0] {
-            data.add_light(lamp(x)).unwrap();
-        }
-        let scene = data.committed();
-        let desc = LightmapDesc { texels_per_unit: 24.0, page_size: 512, ..Default::default() };
-        let map = Lightmap::create(&scene, &desc, &Progress::none()).unwrap();
-        (scene, map)
-    }
-
-    fn params() -> BakeParams {
-        BakeParams { photon_count: 20_000, gather_rays: 16, stitch: false, seed: 4, ..Default::default() }
-    }
-
-    fn move_block(scene: &mut Arc<Scene>, by: Vec3) {
-        let moved: Vec<Vec3> = scene.meshes()[1].positions.iter().map(|&p| p + by).collect();
-        Scene::refit(scene, &[(1, &moved)]).unwrap();
-    }
-
-    fn light(map: &Lightmap) -> [Vec<Vec3>; 2] {
-        let light = map.light.as_ref().unwrap();
-        [light.direct.clone(), light.indirect.clone()]
-    }
-
-    #[test]
-    fn texels_keep_their_light_or_get_that_of_a_bake_from_nothing() {
-        let none = Progress::none();
-        let both = directional::INDIRECT | directional::DIRECT;
-        for (stitch, directional, passes, is_area) in [
-            (false, 0, 1, false),
-            (false, both, 2, false),
-            (true, 0, 1, false),
-            (false, 0, 1, true),
-            (false, both, 1, true),
-        ] {
-            let params = BakeParams { stitch, directional, passes, ..params() };
-            // The direct light of areas is blurred.
-            let area = |x| Lamp::Rect {
-                position: Vec3::new(x, 1.5, 2.9),
-                edge_u: Vec3::new(0.0, 1.0, 0.0),
-                edge_v: Vec3::new(1.0, 0.0, 0.0),
-                radiance: [5.0; 3],
-            };
-            let (mut scene, mut map) = if is_area { rooms_with(area) } else { rooms() };
-            map.bake(&params, &none).unwrap();
-            let old = light(&map);
-            move_block(&mut scene, Vec3::new(0.3, 0.2, 0.0));
-            map.follow(&scene, &none).unwrap();
-            assert!(light(&map) == old, "light stays until the next bake");
-            let stats = map.bake_changed(&params, 0.05, &none).unwrap();
-            let changed = light(&map);
-            map.bake(&params, &none).unwrap();
-            let new = light(&map);
-            let n = new[0].len();
-            let part = stats.kept_texels as f32 / n as f32;
-            assert!((0.3..0.97).contains(&part), "{part} kept");
-            assert!(stitch || map.plan_text().lines().all(|line| !line.contains("has changed by less")));
-            if stitch {
-                // Texels at seams take light of their neighbours, kept or not.
-                continue;
-            }
-            for (kind, what) in ["direct", "indirect"].iter().enumerate() {
-                let differs = |i: usize, from: &[Vec<Vec3>; 2]| changed[kind][i] != from[kind][i];
-                let neither = (0..n).filter(|&i| differs(i, &old) && differs(i, &new)).count();
-                assert_eq!(neither, 0, "{what} light that is neither old nor new, {passes} passes, areas: {is_area}");
-                // What is kept is much like what would be new; all of what was shadowed or lit is new.
-                let mean = new[kind].iter().map(|l| l.element_sum()).sum::<f32>() / n as f32;
-                let wrong = |i: &usize| (changed[kind][*i] - new[kind][*i]).abs().element_sum() / mean;
-                let worst = (0..n).map(|i| wrong(&i)).fold(0.0, f32::max);
-                assert!(worst < 0.25, "{what} light is wrong by {worst} of the mean");
-                let old_worst =
-                    (0..n).map(|i| (old[kind][i] - new[kind][i]).abs().element_sum() / mean).fold(0.0, f32::max);
-                assert!(old_worst > 0.15, "{what} light changed by {old_worst} only");
-            }
-        }
-    }
-
-    #[test]
-    fn nothing_changed_keeps_all_and_back_again_gives_the_same_light() {
-        let none = Progress::none();
-        let (mut scene, mut map) = rooms();
-        let params = params();
-        let first = map.bake_changed(&params, 0.1, &none).unwrap();
-        assert_eq!(first.kept_texels, 0, "there was no light");
-        let old = light(&map);
-        let again = map.bake_changed(&params, 0.0, &none).unwrap();
-        assert_eq!(again.kept_texels as usize, old[0].len());
-        assert!(light(&map) == old);
-        // With a difference of 0, all that changes is new: the way there and back ends where it began.
-        let there = Vec3::new(0.2, 0.1, 0.0);
-        for by in [there, -there] {
-            move_block(&mut scene, by);
-            map.follow(&scene, &none).unwrap();
-            map.bake_changed(&params, 0.0, &none).unwrap();
-        }
-        let (fresh_scene, mut fresh) = rooms();
-        drop(fresh_scene);
-        let moved_back = scene.meshes()[1].positions[0] - Vec3::new(0.6, 0.6, 0.0);
-        assert!(moved_back.length() < 1e-6);
-        fresh.bake(&params, &none).unwrap();
-        let (here, fresh) = (light(&map), light(&fresh));
-        let mean = fresh[1].iter().map(|l| l.element_sum()).sum::<f32>() / fresh[1].len() as f32;
-        let worst =
-            here[1].iter().zip(&fresh[1]).map(|(a, b)| (*a - *b).abs().element_sum() / mean).fold(0.0, f32::max);
-        assert!(worst < 0.05, "{worst}");
-    }
-
-    #[test]
-    fn a_light_that_is_set_is_seen_where_it_shines() {
-        let none = Progress::none();
-        let (scene, mut map) = rooms();
-        let params = params();
-        map.bake(&params, &none).unwrap();
-        let old = light(&map);
-        scene.set_light(0, Lamp::Point { position: Vec3::new(2.0, 1.9, 2.7), intensity: [10.0; 3] }).unwrap();
-        let stats = map.bake_changed(&params, 0.05, &none).unwrap();
-        let changed = light(&map);
-        assert_eq!(stats.kept_texels, 0, "direct light is always new");
-        map.bake(&params, &none).unwrap();
-        let new = light(&map);
-        assert!(changed[0] == new[0]);
-        let kept = (0..old[1].len()).filter(|&i| changed[1][i] == old[1][i]).count();
-        let renewed = (0..old[1].len()).filter(|&i| changed[1][i] == new[1][i]).count();
-        assert!(kept + renewed >= old[1].len() && renewed > old[1].len() / 3, "{kept} kept, {renewed} new");
-    }
-
-    #[test]
-    fn what_moved_uncovers_texels() {
-        let none = Progress::none();
-        let (mut scene, mut map) = rooms();
-        let buried = |map: &Lightmap| map.info().buried_texels;
-        // Below the block and below the wall between the rooms.
-        let before = buried(&map);
-        move_block(&mut scene, Vec3::new(0.0, 0.0, 1.0));
-        map.follow(&scene, &none).unwrap();
-        let in_the_air = buried(&map);
-        assert!(in_the_air + 50 < before && in_the_air > 0, "{in_the_air} after {before}");
-        move_block(&mut scene, Vec3::new(0.5, 0.0, -1.0));
-        map.follow(&scene, &none).unwrap();
-        let after = buried(&map);
-        assert!(after > in_the_air + 50, "{after} after {in_the_air}");
-        // As if made in this state.
-        let desc = map.atlas.desc.clone();
-        let fresh = Lightmap::create(&scene, &desc, &none).unwrap();
-        assert_eq!(fresh.info().buried_texels, after);
-        let samples = |map: &Lightmap| map.atlas.map.texels.samples.clone();
-        assert!(samples(&fresh) == samples(&map));
-    }
-
-    #[test]
-    fn a_surface_that_is_gone_cannot_be_followed() {
-        let none = Progress::none();
-        for gone in [Vec3::splat(f32::NAN), Vec3::splat(1e13), Vec3::new(1.0, 1.0, 0.0)] {
-            let (mut scene, mut map) = rooms();
-            map.bake(&params(), &none).unwrap();
-            let before = light(&map);
-            // One vertex, or all in one place.
-            let moved: Vec<Vec3> = scene.meshes()[1]
-                .positions
-                .iter()
-                .enumerate()
-                .map(|(i, &p)| if i == 0 || gone.is_finite() { gone } else { p })
-                .collect();
-            Scene::refit(&mut scene, &[(1, &moved)]).unwrap();
-            let refused = map.follow(&scene, &none);
-            assert!(matches!(&refused, Err(Error::InvalidState(e)) if e.contains("mesh 1")), "{gone}: {refused:?}");
-            assert!(map.before.is_none() && light(&map) == before);
-            map.bake_changed(&params(), 0.1, &none).unwrap();
-            assert!(light(&map) == before);
-        }
-    }
-
-    #[test]
-    fn wrong_use_is_refused_and_shards_after_a_move_begin_anew() {
-        let none = Progress::none();
-        let (mut scene, mut map) = rooms();
-        let (other, _) = rooms();
-        assert!(map.follow(&other, &none).is_err());
-        let params = params();
-        map.bake(&params, &none).unwrap();
-        for (bad, keep_error) in [
-            (params, f32::NAN),
-            (params, -0.1),
-            (BakeParams { target_error: 0.1, ..params }, 0.1),
-            (BakeParams { texel_begin: 1, ..params }, 0.1),
-        ] {
-            assert!(map.bake_changed(&bad, keep_error, &none).is_err());
-        }
-        let with_others = BakeParams { gather_rays: 8, ..params };
-        assert_eq!(map.bake_changed(&with_others, 1.0, &none).unwrap().kept_texels, 0);
-        move_block(&mut scene, Vec3::new(0.2, 0.0, 0.0));
-        map.follow(&scene, &none).unwrap();
-        let path = std::env::temp_dir().join(format!("bakelite-changed-{}", std::process::id()));
-        assert!(map.save_result(&path, &none).is_err(), "the light is of before the move");
-        let n = map.info().texels;
-        let cancelled = map.bake_changed(&with_others, 0.1, &Progress::new(|fraction, _| fraction < 0.25));
-        assert!(cancelled.is_err() && map.before.is_some());
-        map.bake(&BakeParams { texel_end: n / 2, ..params }, &none).unwrap();
-        let unbaked = map.light.as_ref().unwrap().state.iter().filter(|&&s| s == TexelState::Unbaked).count();
-        assert_eq!(unbaked as u64, n - n / 2);
-        map.bake(&BakeParams { texel_begin: n / 2, ..params }, &none).unwrap();
-        let shards = light(&map);
-        map.bake(&params, &none).unwrap();
-        assert!(light(&map) == shards);
-    }
-}
+mod tests;

@@ -68,7 +68,7 @@ pub(crate) struct Stitch {
 impl Stitch {
     /// Undoes the stitching in a copy of the stitched light.
     pub(super) fn copy_former(&self, light: &mut Light) {
-        self.former_of(&(0..light.direct.len()), &mut light.direct, &mut light.indirect, &mut light.directional);
+        self.former_where(light, |_| (true, true));
     }
 
     /// Undoes the stitching in a copy of the light of a range of texels.
@@ -89,7 +89,8 @@ impl Stitch {
         }
     }
 
-    /// Undoes the stitching in a copy of direct light, and of indirect light and light by direction, of some texels each.
+    /// Undoes the stitching in a copy of the stitched light of some texels: `of` returns for a texel whether in its direct
+    /// light, and whether in its indirect light and light by direction.
     pub(super) fn former_where(&self, light: &mut Light, of: impl Fn(usize) -> (bool, bool)) {
         for (i, texel) in self.texels.iter().map(|&t| t as usize).enumerate() {
             let (direct, indirect) = of(texel);

@@ -135,12 +135,12 @@ pub(crate) fn backs(inputs: &Inputs, radiance: &[Vec3]) -> Result<Vec<bool>> {
 }
 
 /// Finds how texels of the light map interpolate between gather texels, for a range of placements and those that are
-/// `asked` for.
+/// `asked` for (`None`: all).
 pub(crate) fn upsampling(
     inputs: &Inputs,
     backs: &[bool],
     placements: Range<usize>,
-    asked: Asked,
+    asked: Option<Asked>,
 ) -> Result<Upsampling> {
     let stage = inputs.progress.stage("upsampling", 0.3, 0.315, placements.len() as u64);
     Upsampling::find(inputs.atlas, placements, backs, inputs.params.interpolation_error, asked, &stage)

@@ -15,7 +15,7 @@ use crate::device::{Device, DeviceOptions};
 use crate::direct::DirectLight;
 use crate::lightmap::atlas::Atlas;
 use crate::lightmap::indirect::radiance_map::Radiance;
-use crate::lightmap::indirect::upsample::{Asked, OwnDirectional, OwnLight, Upsampling};
+use crate::lightmap::indirect::upsample::{OwnDirectional, OwnLight, Upsampling};
 use crate::lightmap::plan::{Plan, left_out};
 use crate::lightmap::stages::{self, Inputs, Own};
 use crate::lightmap::{BakeParams, BakeStats, directional};
@@ -80,7 +80,7 @@ fn illuminate(
         None => {
             let backs = stages::backs(&inputs, &radiance.values)?;
             let placements = if has_indirect { atlas.map.layout.placements.len() } else { 0 };
-            let upsampling = stages::upsampling(&inputs, &backs, 0..placements, Asked::default())?;
+            let upsampling = stages::upsampling(&inputs, &backs, 0..placements, None)?;
             Arc::new(Sides { backs, upsampling })
         }
     };

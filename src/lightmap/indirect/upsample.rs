@@ -91,35 +91,35 @@ pub(crate) struct OwnRays<'a> {
     pub directional: bool,
 }
 
-/// What is asked for of an [`Upsampling`], if that is not all.
-#[derive(Clone, Copy, Default)]
+/// What is asked for of an [`Upsampling`], where that is not all.
+#[derive(Clone, Copy)]
 pub(crate) struct Asked<'a> {
     /// Whether each placement is.
-    pub placements: Option<&'a [bool]>,
+    pub placements: &'a [bool],
     /// Whether the fallback gather of each texel of the light map is, if it has one.
-    pub alone: Option<&'a [bool]>,
+    pub alone: &'a [bool],
 }
 
 impl Upsampling {
     /// Finds the constraints for some `placements` of an atlas. `backs` says which charts without separate texels for
     /// their backs show the back. Where the estimated error of interpolation is more than `most_error`, texels gather
-    /// for themselves. What is not `asked` for is left out. Advances `stage` by one per placement.
+    /// for themselves. What is not `asked` for is left out (`None`: nothing is). Advances `stage` by one per placement.
     pub(crate) fn find(
         atlas: &Atlas,
         placements: Range<usize>,
         backs: &[bool],
         most_error: f32,
-        asked: Asked,
+        asked: Option<Asked>,
         stage: &Stage,
     ) -> Result<Upsampling> {
         let of_placement = |placement: usize| {
-            if asked.placements.is_some_and(|asked| !asked[placement]) {
+            if asked.is_some_and(|asked| !asked.placements[placement]) {
                 stage.advance(1)?;
                 return Ok(Found::default());
             }
             let mut found = Found::in_placement(atlas, backs, PlacementId::new(placement), most_error, stage)?;
-            if let Some(asked) = asked.alone {
-                found.alone.retain(|texel| asked[texel.index()]);
+            if let Some(asked) = asked {
+                found.alone.retain(|texel| asked.alone[texel.index()]);
             }
             stage.advance(1)?;
             Ok(found)
@@ -471,7 +471,7 @@ pub(super) mod tests {
     pub(crate) fn find(atlas: &Atlas, placements: Range<usize>, backs: &[bool]) -> Upsampling {
         let progress = Progress::none();
         let stage = progress.stage("upsampling", 0.0, 1.0, placements.len() as u64);
-        Upsampling::find(atlas, placements, backs, f32::INFINITY, Asked::default(), &stage).unwrap()
+        Upsampling::find(atlas, placements, backs, f32::INFINITY, None, &stage).unwrap()
     }
 
     /// What texels gather for themselves where each texel of the radiance map sends out its own radiance; and the rays.
@@ -668,8 +668,7 @@ pub(super) mod tests {
         let atlas = lightmap.atlas();
         let progress = Progress::none();
         let stage = progress.stage("upsampling", 0.0, 1.0, 4);
-        let alone =
-            |most_error| Upsampling::find(atlas, 0..2, &[], most_error, Asked::default(), &stage).unwrap().alone;
+        let alone = |most_error| Upsampling::find(atlas, 0..2, &[], most_error, None, &stage).unwrap().alone;
         let (few, many) = (alone(f32::INFINITY), alone(0.2));
         assert!(few.iter().all(|s| many.binary_search(s).is_ok()) && many.len() > 2 * few.len());
         let part = |placement: usize, is_there: &dyn Fn(Vec3) -> bool| {
@@ -709,7 +708,7 @@ pub(super) mod tests {
             let texels = atlas.gather.texels_of(PlacementId::new(placement));
             let only = placement..placement + 1;
             let alone = |most_error| {
-                let found = Upsampling::find(atlas, only.clone(), &[], most_error, Asked::default(), &stage);
+                let found = Upsampling::find(atlas, only.clone(), &[], most_error, None, &stage);
                 found.unwrap().alone.len()
             };
             // Some have nothing to interpolate.

@@ -21,8 +21,7 @@ const DIFFERENCE: f32 = 0.15;
 const STRATIFIED: f32 = 0.25;
 
 /// Factor of the variance of skies and many lights, of which few texels may have most light: the blur leaves these out of
-/// others' means. (A room with a window loses 2.1 % of its direct light by
-/// what is left out; with 1, 2.6 %.)
+/// others' means. (A room with a window loses 2.1 % of its direct light by what is left out; with 1, 2.6 %.)
 const SKEWED: f32 = 2.0;
 
 /// Height of lines of sight above the surface they run along, as a fraction of their length: it clears curved surfaces.
@@ -145,8 +144,8 @@ impl TexelLight<'_, LightMap> {
         }
     }
 
-    /// Averages the light of a texel's points, and returns its variance too; `goes_on`: more than the first few have been lit. If light by direction
-    /// is asked for, `out` receives it.
+    /// Averages the light of a texel's points, and returns its variance too; `goes_on`: more than the first few have been
+    /// lit. If light by direction is asked for, `out` receives it.
     fn average(
         &self,
         t: &Averaged,

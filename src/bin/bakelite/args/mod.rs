@@ -185,7 +185,9 @@ pub struct ReportArgs {
     pub live: LiveParams,
     /// Quality: points at which light is compared.
     pub points: usize,
-    /// Quality: bakes per setting. Edits: objects that move.
+    /// Edits: objects that move, one after another.
+    pub objects: usize,
+    /// Quality: bakes per setting.
     pub seeds: u64,
     /// Quality: paths per point of the reference.
     pub paths: u32,
@@ -331,7 +333,7 @@ fn command_of(line: CommandLine, is_given: &dyn Fn(&str) -> bool) -> Result<Comm
             Command::ReportLive(Box::new(args))
         }
         Verb::Report(Report::Edits(edits)) => {
-            Command::ReportEdits(Box::new(ReportArgs { seeds: edits.objects, ..report_args(edits.flags)? }))
+            Command::ReportEdits(Box::new(ReportArgs { objects: edits.objects as usize, ..report_args(edits.flags)? }))
         }
         Verb::Report(Report::Scaling(scaling)) => {
             let (scenes, rays_only) = (scaling.scenes, scaling.rays_only);
@@ -361,6 +363,7 @@ fn report_args(flags: Flags) -> Result<ReportArgs, String> {
         errors: true,
         live: LiveParams::default(),
         points: 0,
+        objects: 0,
         seeds: 0,
         paths: 0,
         reference: None,

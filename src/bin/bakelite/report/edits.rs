@@ -6,7 +6,9 @@
 
 use crate::args::ReportArgs;
 use crate::job::Job;
+use crate::report::measure::pick;
 use bakelite::lightmap::{BakeParams, Layer, LayerData, Lightmap};
+use bakelite::sampling::combine;
 use bakelite::{Error, Progress, Result, Scene};
 use glam::{Quat, Vec3};
 use std::collections::HashMap;
@@ -72,7 +74,7 @@ pub fn run(args: &ReportArgs) -> Result<()> {
     let start = Instant::now();
     let mut map = job.layout(&scene)?;
     println!("charts and texels: {:.2} s, {} texels", start.elapsed().as_secs_f64(), map.info().texels);
-    let pieces = chosen(&scene, args.seeds as usize, params.seed);
+    let pieces = chosen(&scene, args.objects, params.seed);
     if pieces.is_empty() {
         return Err(Error::InvalidArgument("the scene has no object of a size to be moved".into()));
     }
@@ -119,10 +121,10 @@ pub fn run(args: &ReportArgs) -> Result<()> {
                 time.text(),
                 whole.text(),
                 100.0 * stats.kept_texels as f64 / map.info().texels as f64,
-                changed.0,
-                error.0,
-                noise.0,
-                stale.0,
+                changed,
+                error,
+                noise,
+                stale,
             );
         }
         move_to(&mut scene, piece.mesh, &here)?;
@@ -139,8 +141,8 @@ fn move_to(scene: &mut Arc<Scene>, mesh: u32, positions: &[Vec3]) -> Result<f64>
     Ok(start.elapsed().as_secs_f64())
 }
 
-/// The combined light of all covered texels, page by page.
-fn light(map: &Lightmap) -> Result<Vec<Vec3>> {
+/// The combined light of all places of the pages; `None` where no texel shows light of its own.
+fn light(map: &Lightmap) -> Result<Vec<Option<Vec3>>> {
     let mut all = Vec::new();
     for page in 0..map.info().page_count {
         let (LayerData::Rgb(light), LayerData::Scalar(valid)) =
@@ -148,21 +150,18 @@ fn light(map: &Lightmap) -> Result<Vec<Vec3>> {
         else {
             return Err(Error::Internal("layers of another type".into()));
         };
-        all.extend(light.into_iter().zip(valid).filter(|(_, valid)| *valid == 1.0).map(|(light, _)| Vec3::from(light)));
+        all.extend(light.into_iter().zip(valid).map(|(light, valid)| (valid == 1.0).then_some(Vec3::from(light))));
     }
     Ok(all)
 }
 
-/// Relative difference of two lights: the mean over texels, and what a hundredth of them exceeds.
-fn difference(light: &[Vec3], right: &[Vec3]) -> (f64, f64) {
-    let sum = |v: &Vec3| f64::from(v.element_sum());
-    let dark = DARK * right.iter().map(sum).sum::<f64>() / right.len().max(1) as f64;
-    let of_texel = |(a, b): (&Vec3, &Vec3)| sum(&(*a - *b).abs()) / sum(b).max(dark);
-    // Texels that are covered in one state alone are few; the order of the others is the same if there are none.
-    let mut all: Vec<f64> = light.iter().zip(right).map(of_texel).collect();
-    let mean = all.iter().sum::<f64>() / all.len().max(1) as f64;
-    all.sort_unstable_by(f64::total_cmp);
-    (mean, all.get(all.len() * 99 / 100).copied().unwrap_or(0.0))
+/// Mean relative difference of two lights, over the texels that show light of their own in both.
+fn difference(light: &[Option<Vec3>], right: &[Option<Vec3>]) -> f64 {
+    let sum = |v: Vec3| f64::from(v.element_sum());
+    let both: Vec<[Vec3; 2]> = light.iter().zip(right).filter_map(|(a, b)| Some([(*a)?, (*b)?])).collect();
+    let n = both.len().max(1) as f64;
+    let dark = DARK * both.iter().map(|[_, b]| sum(*b)).sum::<f64>() / n;
+    both.iter().map(|[a, b]| sum((*a - *b).abs()) / sum(*b).max(dark)).sum::<f64>() / n
 }
 
 /// Chooses pieces at random.
@@ -170,13 +169,15 @@ fn chosen(scene: &Scene, count: usize, seed: u64) -> Vec<Piece> {
     let sizes = SIZES.start * scene.diagonal()..SIZES.end * scene.diagonal();
     let mut all: Vec<Piece> = (0..scene.meshes().len() as u32).flat_map(|mesh| pieces(scene, mesh)).collect();
     all.retain(|piece| sizes.contains(&piece.size) && piece.triangles > 1);
-    let mut random = seed.wrapping_mul(0x9e37_79b9_7f4a_7c15) ^ 0x2545_f491_4f6c_dd1d;
     let mut pieces = Vec::new();
-    while pieces.len() < count && !all.is_empty() {
-        random = random.wrapping_mul(6364136223846793005).wrapping_add(1442695040888963407);
-        pieces.push(all.swap_remove((random >> 33) as usize % all.len()));
+    let mut left: Vec<usize> = (0..all.len()).collect();
+    for number in 0..(count as u32).min(left.len() as u32) {
+        let chosen = pick(&left, combine(seed as u32, number));
+        left.retain(|&piece| piece != chosen);
+        pieces.push(chosen);
     }
-    pieces
+    let mut all: Vec<Option<Piece>> = all.into_iter().map(Some).collect();
+    pieces.into_iter().filter_map(|piece| all[piece].take()).collect()
 }
 
 /// Takes a mesh apart into pieces whose triangles share positions.

@@ -1,0 +1,226 @@
+use super::*;
+use crate::base::error::Error;
+use crate::lightmap::{Lightmap, LightmapDesc, directional};
+use crate::scene::demo::shapes::MeshBuilder;
+use crate::scene::{Light as Lamp, Material, Scene, SceneData};
+use glam::Vec3;
+use std::sync::Arc;
+
+/// Two rooms of 4 × 4 × 3 m with a door between them, a lamp in each, and a block in the first one: mesh 1.
+fn rooms() -> (Arc<Scene>, Lightmap) {
+    rooms_with(|x| Lamp::Point { position: Vec3::new(x, 1.9, 2.7), intensity: [5.0; 3] })
+}
+
+fn rooms_with(lamp: impl Fn(f32) -> Lamp) -> (Arc<Scene>, Lightmap) {
+    let mut data = SceneData::new();
+    let white = data.add_material(Material { albedo: [0.7; 3], ..Default::default() }).unwrap();
+    let mut walls = MeshBuilder::new();
+    walls.box_(Vec3::ZERO, Vec3::new(8.0, 4.0, 3.0), true, white);
+    walls.box_(Vec3::new(3.9, 0.0, 0.0), Vec3::new(4.1, 2.8, 3.0), false, white);
+    data.add_mesh(walls.finish()).unwrap();
+    let mut block = MeshBuilder::new();
+    block.box_(Vec3::new(0.6, 0.6, 0.0), Vec3::new(1.0, 1.0, 0.5), false, white);
+    data.add_mesh(block.finish()).unwrap();
+    for x in [2.0, 6.0] {
+        data.add_light(lamp(x)).unwrap();
+    }
+    let scene = data.committed();
+    let desc = LightmapDesc { texels_per_unit: 24.0, page_size: 512, ..Default::default() };
+    let map = Lightmap::create(&scene, &desc, &Progress::none()).unwrap();
+    (scene, map)
+}
+
+fn params() -> BakeParams {
+    BakeParams { photon_count: 20_000, gather_rays: 16, stitch: false, seed: 4, ..Default::default() }
+}
+
+fn move_block(scene: &mut Arc<Scene>, by: Vec3) {
+    let moved: Vec<Vec3> = scene.meshes()[1].positions.iter().map(|&p| p + by).collect();
+    Scene::refit(scene, &[(1, &moved)]).unwrap();
+}
+
+fn light(map: &Lightmap) -> [Vec<Vec3>; 2] {
+    let light = map.light.as_ref().unwrap();
+    [light.direct.clone(), light.indirect.clone()]
+}
+
+#[test]
+fn texels_keep_their_light_or_get_that_of_a_bake_from_nothing() {
+    let none = Progress::none();
+    let both = directional::INDIRECT | directional::DIRECT;
+    for (stitch, directional, passes, is_area) in [
+        (false, 0, 1, false),
+        (false, both, 2, false),
+        (true, 0, 1, false),
+        (false, 0, 1, true),
+        (false, both, 1, true),
+    ] {
+        let params = BakeParams { stitch, directional, passes, ..params() };
+        // The direct light of areas is blurred.
+        let area = |x| Lamp::Rect {
+            position: Vec3::new(x, 1.5, 2.9),
+            edge_u: Vec3::new(0.0, 1.0, 0.0),
+            edge_v: Vec3::new(1.0, 0.0, 0.0),
+            radiance: [5.0; 3],
+        };
+        let (mut scene, mut map) = if is_area { rooms_with(area) } else { rooms() };
+        map.bake(&params, &none).unwrap();
+        let old = light(&map);
+        move_block(&mut scene, Vec3::new(0.3, 0.2, 0.0));
+        map.follow(&scene, &none).unwrap();
+        assert!(light(&map) == old, "light stays until the next bake");
+        let stats = map.bake_changed(&params, 0.05, &none).unwrap();
+        let changed = light(&map);
+        map.bake(&params, &none).unwrap();
+        let new = light(&map);
+        let n = new[0].len();
+        let part = stats.kept_texels as f32 / n as f32;
+        assert!((0.3..0.97).contains(&part), "{part} kept");
+        assert!(stitch || map.plan_text().lines().all(|line| !line.contains("has changed by less")));
+        if stitch {
+            // Texels at seams take light of their neighbours, kept or not.
+            continue;
+        }
+        for (kind, what) in ["direct", "indirect"].iter().enumerate() {
+            let differs = |i: usize, from: &[Vec<Vec3>; 2]| changed[kind][i] != from[kind][i];
+            let neither = (0..n).filter(|&i| differs(i, &old) && differs(i, &new)).count();
+            assert_eq!(neither, 0, "{what} light that is neither old nor new, {passes} passes, areas: {is_area}");
+            // What is kept is much like what would be new; all of what was shadowed or lit is new.
+            let mean = new[kind].iter().map(|l| l.element_sum()).sum::<f32>() / n as f32;
+            let wrong = |i: &usize| (changed[kind][*i] - new[kind][*i]).abs().element_sum() / mean;
+            let worst = (0..n).map(|i| wrong(&i)).fold(0.0, f32::max);
+            assert!(worst < 0.25, "{what} light is wrong by {worst} of the mean");
+            let old_worst =
+                (0..n).map(|i| (old[kind][i] - new[kind][i]).abs().element_sum() / mean).fold(0.0, f32::max);
+            assert!(old_worst > 0.15, "{what} light changed by {old_worst} only");
+        }
+    }
+}
+
+#[test]
+fn nothing_changed_keeps_all_and_back_again_gives_the_same_light() {
+    let none = Progress::none();
+    let (mut scene, mut map) = rooms();
+    let params = params();
+    let first = map.bake_changed(&params, 0.1, &none).unwrap();
+    assert_eq!(first.kept_texels, 0, "there was no light");
+    let old = light(&map);
+    let again = map.bake_changed(&params, 0.0, &none).unwrap();
+    assert_eq!(again.kept_texels as usize, old[0].len());
+    assert!(light(&map) == old);
+    // With a difference of 0, all that changes is new: the way there and back ends where it began.
+    let there = Vec3::new(0.2, 0.1, 0.0);
+    for by in [there, -there] {
+        move_block(&mut scene, by);
+        map.follow(&scene, &none).unwrap();
+        map.bake_changed(&params, 0.0, &none).unwrap();
+    }
+    let (fresh_scene, mut fresh) = rooms();
+    drop(fresh_scene);
+    let moved_back = scene.meshes()[1].positions[0] - Vec3::new(0.6, 0.6, 0.0);
+    assert!(moved_back.length() < 1e-6);
+    fresh.bake(&params, &none).unwrap();
+    let (here, fresh) = (light(&map), light(&fresh));
+    let mean = fresh[1].iter().map(|l| l.element_sum()).sum::<f32>() / fresh[1].len() as f32;
+    let worst = here[1].iter().zip(&fresh[1]).map(|(a, b)| (*a - *b).abs().element_sum() / mean).fold(0.0, f32::max);
+    assert!(worst < 0.05, "{worst}");
+}
+
+#[test]
+fn a_light_that_is_set_is_seen_where_it_shines() {
+    let none = Progress::none();
+    let (scene, mut map) = rooms();
+    let params = params();
+    map.bake(&params, &none).unwrap();
+    let old = light(&map);
+    scene.set_light(0, Lamp::Point { position: Vec3::new(2.0, 1.9, 2.7), intensity: [10.0; 3] }).unwrap();
+    let stats = map.bake_changed(&params, 0.05, &none).unwrap();
+    let changed = light(&map);
+    assert_eq!(stats.kept_texels, 0, "direct light is always new");
+    map.bake(&params, &none).unwrap();
+    let new = light(&map);
+    assert!(changed[0] == new[0]);
+    let kept = (0..old[1].len()).filter(|&i| changed[1][i] == old[1][i]).count();
+    let renewed = (0..old[1].len()).filter(|&i| changed[1][i] == new[1][i]).count();
+    assert!(kept + renewed >= old[1].len() && renewed > old[1].len() / 3, "{kept} kept, {renewed} new");
+}
+
+#[test]
+fn what_moved_uncovers_texels() {
+    let none = Progress::none();
+    let (mut scene, mut map) = rooms();
+    let buried = |map: &Lightmap| map.info().buried_texels;
+    // Below the block and below the wall between the rooms.
+    let before = buried(&map);
+    move_block(&mut scene, Vec3::new(0.0, 0.0, 1.0));
+    map.follow(&scene, &none).unwrap();
+    let in_the_air = buried(&map);
+    assert!(in_the_air + 50 < before && in_the_air > 0, "{in_the_air} after {before}");
+    move_block(&mut scene, Vec3::new(0.5, 0.0, -1.0));
+    map.follow(&scene, &none).unwrap();
+    let after = buried(&map);
+    assert!(after > in_the_air + 50, "{after} after {in_the_air}");
+    // As if made in this state.
+    let desc = map.atlas.desc.clone();
+    let fresh = Lightmap::create(&scene, &desc, &none).unwrap();
+    assert_eq!(fresh.info().buried_texels, after);
+    let samples = |map: &Lightmap| map.atlas.map.texels.samples.clone();
+    assert!(samples(&fresh) == samples(&map));
+}
+
+#[test]
+fn a_surface_that_is_gone_cannot_be_followed() {
+    let none = Progress::none();
+    for gone in [Vec3::splat(f32::NAN), Vec3::splat(1e13), Vec3::new(1.0, 1.0, 0.0)] {
+        let (mut scene, mut map) = rooms();
+        map.bake(&params(), &none).unwrap();
+        let before = light(&map);
+        // One vertex, or all in one place.
+        let moved: Vec<Vec3> = scene.meshes()[1]
+            .positions
+            .iter()
+            .enumerate()
+            .map(|(i, &p)| if i == 0 || gone.is_finite() { gone } else { p })
+            .collect();
+        Scene::refit(&mut scene, &[(1, &moved)]).unwrap();
+        let refused = map.follow(&scene, &none);
+        assert!(matches!(&refused, Err(Error::InvalidState(e)) if e.contains("mesh 1")), "{gone}: {refused:?}");
+        assert!(map.before.is_none() && light(&map) == before);
+        map.bake_changed(&params(), 0.1, &none).unwrap();
+        assert!(light(&map) == before);
+    }
+}
+
+#[test]
+fn wrong_use_is_refused_and_shards_after_a_move_begin_anew() {
+    let none = Progress::none();
+    let (mut scene, mut map) = rooms();
+    let (other, _) = rooms();
+    assert!(map.follow(&other, &none).is_err());
+    let params = params();
+    map.bake(&params, &none).unwrap();
+    for (bad, keep_error) in [
+        (params, f32::NAN),
+        (params, -0.1),
+        (BakeParams { target_error: 0.1, ..params }, 0.1),
+        (BakeParams { texel_begin: 1, ..params }, 0.1),
+    ] {
+        assert!(map.bake_changed(&bad, keep_error, &none).is_err());
+    }
+    let with_others = BakeParams { gather_rays: 8, ..params };
+    assert_eq!(map.bake_changed(&with_others, 1.0, &none).unwrap().kept_texels, 0);
+    move_block(&mut scene, Vec3::new(0.2, 0.0, 0.0));
+    map.follow(&scene, &none).unwrap();
+    let path = std::env::temp_dir().join(format!("bakelite-changed-{}", std::process::id()));
+    assert!(map.save_result(&path, &none).is_err(), "the light is of before the move");
+    let n = map.info().texels;
+    let cancelled = map.bake_changed(&with_others, 0.1, &Progress::new(|fraction, _| fraction < 0.25));
+    assert!(cancelled.is_err() && map.before.is_some());
+    map.bake(&BakeParams { texel_end: n / 2, ..params }, &none).unwrap();
+    let unbaked = map.light.as_ref().unwrap().state.iter().filter(|&&s| s == TexelState::Unbaked).count();
+    assert_eq!(unbaked as u64, n - n / 2);
+    map.bake(&BakeParams { texel_begin: n / 2, ..params }, &none).unwrap();
+    let shards = light(&map);
+    map.bake(&params, &none).unwrap();
+    assert!(light(&map) == shards);
+}
