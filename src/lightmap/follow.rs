@@ -95,7 +95,7 @@ fn follow<M: Map>(
 ) -> Result<(ChartMap<M>, Vec<bool>)> {
     let layout = &old.layout;
     let is_searched = |placement| search.only.is_none_or(|only| only[layout.chart_of(placement).index()]);
-    let mut map = old.copied(search.scene, search.charts, is_searched, stage)?;
+    let mut map = old.copied(search.scene, search.charts, &is_searched, stage)?;
     let (mut buried, _) = search.scene.device().install(|| search.move_buried(&mut map, by_parts, stage))?;
     if buried.is_empty() && !was_buried.is_empty() {
         buried = try_vec(map.len(), "buried texels")?;

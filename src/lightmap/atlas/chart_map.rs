@@ -45,7 +45,7 @@ impl<M: Map> ChartMap<M> {
         &self,
         scene: &Scene,
         charts: &Charts,
-        anew: impl Fn(PlacementId) -> bool + Sync,
+        anew: &(dyn Fn(PlacementId) -> bool + Sync),
         stage: &Stage,
     ) -> Result<Self> {
         let texels = self.texels.copied(scene, charts, &self.layout, anew, stage)?;

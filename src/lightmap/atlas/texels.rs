@@ -169,7 +169,7 @@ impl TexelMap {
         scene: &Scene,
         charts: &Charts,
         layout: &Layout,
-        anew: impl Fn(PlacementId) -> bool + Sync,
+        anew: &(dyn Fn(PlacementId) -> bool + Sync),
         stage: &Stage,
     ) -> Result<TexelMap> {
         let mut map = TexelMap {
@@ -190,7 +190,7 @@ impl TexelMap {
             let groups = groups.par_iter().zip(owners).zip(samples);
             groups.try_for_each_init(Vec::new, |scratch, ((group, owners), samples)| {
                 let mut placements = group.placements.clone().map(|p| PlacementId::new(p as usize));
-                if placements.any(&anew) {
+                if placements.any(anew) {
                     let mut counts = try_vec(group.placements.len(), INDEX)?;
                     cover_group(&job, group, owners, scratch, &mut counts)?;
                     sample_group(&job, group, chart_start, owners, samples)?;

@@ -27,6 +27,12 @@ const DARK: f64 = 0.1;
 /// Passes of the light that errors are told by.
 const PASSES: u32 = 8;
 
+/// Relative difference of light from which on a texel counts as changed.
+const CLEARLY: f64 = 0.1;
+
+/// Light by place of the pages; `None` where no texel shows light of its own.
+type Light = Vec<Option<Vec3>>;
+
 /// A piece of a mesh.
 struct Piece {
     mesh: u32,
@@ -83,8 +89,8 @@ pub fn run(args: &ReportArgs) -> Result<()> {
     map.save_result(&path, &progress)?;
     println!("Seconds in brackets are the processor's, of all threads.\n");
     println!(
-        "| triangles moved | size | refit, follow, s | keep_error | what changed, s | from nothing, s | kept | difference of the two, \
-         mean | error: what changed | from nothing | old light |"
+        "| triangles moved | size | texels changed | refit, follow, s | keep_error | what changed, s | from nothing, s | kept | \
+         error, in these texels: what changed | from nothing | old light |"
     );
     println!("|---|---|---|---|---|---|---|---|---|---|---|");
     for (number, piece) in pieces.iter().enumerate() {
@@ -103,8 +109,13 @@ pub fn run(args: &ReportArgs) -> Result<()> {
         let reference = BakeParams { seed: params.seed + 1, passes: PASSES, ..params };
         map.bake(&reference, &progress)?;
         let right = light(&map)?;
-        let noise = difference(&from_nothing_light, &right);
-        let stale = difference(&old, &right);
+        // Where the light of both bakes with the same random numbers differs clearly, the move has changed it.
+        let changed = differences(&old, &from_nothing_light);
+        let changed: Vec<bool> = changed.into_iter().map(|d| d.is_some_and(|d| d > CLEARLY)).collect();
+        let (all, part) = (vec![true; changed.len()], changed.iter().filter(|&&c| c).count() as f64);
+        let part = 100.0 * part / map.info().texels as f64;
+        let errors = |light: &Light| [&all, &changed].map(|which| difference(light, &right, which));
+        let (noise, stale) = (errors(&from_nothing_light), errors(&old));
         for keep_error in KEEP_ERRORS {
             move_to(&mut scene, piece.mesh, &here)?;
             map.follow(&scene, &progress)?;
@@ -113,18 +124,18 @@ pub fn run(args: &ReportArgs) -> Result<()> {
             map.follow(&scene, &progress)?;
             let (stats, time) = Time::of(|| map.bake_changed(&params, keep_error, &progress))?;
             let new = light(&map)?;
-            let (changed, error) = (difference(&new, &from_nothing_light), difference(&new, &right));
+            let error = errors(&new);
+            let text = |[all, changed]: [f64; 2]| format!("{all:.2e}, {changed:.2e}");
             println!(
-                "| {} | {:.2} | {refit:.2}, {follow:.2} | {keep_error} | {} | {} | {:.1} % | {:.1e} | {:.2e} | {:.2e} | {:.2e} |",
+                "| {} | {:.2} | {part:.2} % | {refit:.2}, {follow:.2} | {keep_error} | {} | {} | {:.1} % | {} | {} | {} |",
                 piece.triangles,
                 piece.size,
                 time.text(),
                 whole.text(),
                 100.0 * stats.kept_texels as f64 / map.info().texels as f64,
-                changed,
-                error,
-                noise,
-                stale,
+                text(error),
+                text(noise),
+                text(stale),
             );
         }
         move_to(&mut scene, piece.mesh, &here)?;
@@ -141,8 +152,8 @@ fn move_to(scene: &mut Arc<Scene>, mesh: u32, positions: &[Vec3]) -> Result<f64>
     Ok(start.elapsed().as_secs_f64())
 }
 
-/// The combined light of all places of the pages; `None` where no texel shows light of its own.
-fn light(map: &Lightmap) -> Result<Vec<Option<Vec3>>> {
+/// The combined light of a light map.
+fn light(map: &Lightmap) -> Result<Light> {
     let mut all = Vec::new();
     for page in 0..map.info().page_count {
         let (LayerData::Rgb(light), LayerData::Scalar(valid)) =
@@ -155,13 +166,23 @@ fn light(map: &Lightmap) -> Result<Vec<Option<Vec3>>> {
     Ok(all)
 }
 
-/// Mean relative difference of two lights, over the texels that show light of their own in both.
-fn difference(light: &[Option<Vec3>], right: &[Option<Vec3>]) -> f64 {
+/// Mean relative difference of two lights, over the places that `counts` and where both show light of their own.
+fn difference(light: &Light, right: &Light, counts: &[bool]) -> f64 {
+    let all: Vec<f64> =
+        differences(light, right).into_iter().zip(counts).filter_map(|(d, c)| d.filter(|_| *c)).collect();
+    all.iter().sum::<f64>() / all.len().max(1) as f64
+}
+
+/// Relative differences of two lights, by place.
+fn differences(light: &Light, right: &Light) -> Vec<Option<f64>> {
     let sum = |v: Vec3| f64::from(v.element_sum());
-    let both: Vec<[Vec3; 2]> = light.iter().zip(right).filter_map(|(a, b)| Some([(*a)?, (*b)?])).collect();
-    let n = both.len().max(1) as f64;
-    let dark = DARK * both.iter().map(|[_, b]| sum(*b)).sum::<f64>() / n;
-    both.iter().map(|[a, b]| sum((*a - *b).abs()) / sum(*b).max(dark)).sum::<f64>() / n
+    let covered = right.iter().flatten().count().max(1) as f64;
+    let dark = DARK * right.iter().flatten().map(|v| sum(*v)).sum::<f64>() / covered;
+    let of_place = |(a, b): (&Option<Vec3>, &Option<Vec3>)| {
+        let (a, b) = ((*a)?, (*b)?);
+        Some(sum((a - b).abs()) / sum(b).max(dark))
+    };
+    light.iter().zip(right).map(of_place).collect()
 }
 
 /// Chooses pieces at random.
