@@ -80,9 +80,10 @@ pub(super) struct Redo {
 }
 
 impl Lightmap {
-    /// Bakes again after lights were [set](Scene::set_light) or the scene [has moved](Lightmap::follow). Texels whose light
-    /// has changed by less than `keep_error` (finite, ≥ 0), as far as probes tell, keep it; it is relative to their light
-    /// or, if that is more, to a tenth of the mean light. All others get the bits of [`bake`](Self::bake).
+    /// Bakes again after lights were [set](crate::scene::Scene::set_light) or the scene [has moved](Lightmap::follow).
+    /// Texels whose light has changed by less than `keep_error` (finite, ≥ 0), as far as probes tell, keep it; it is
+    /// relative to their light or, if that is more, to a tenth of the mean light. All others get the bits of
+    /// [`bake`](Self::bake).
     ///
     /// `params` are those of the last bake, for all texels and without a target error. If others were used, or there is
     /// no light yet, all is baked. Many small changes that are each let stand add up: now and then bake from nothing.
