@@ -148,7 +148,6 @@ pub unsafe extern "C" fn bk_lightmap_desc_init(desc: *mut bk_lightmap_desc) {
 /// @retval BK_ERROR_INVALID_STATE  the scene is not committed or is being refitted
 /// @retval BK_ERROR_OUT_OF_MEMORY  there would be more than 2^29 texels, they do not fit, or the
 ///   memory callback refuses
-/// @retval BK_ERROR_UNSUPPORTED  the scene has more than 2^28 triangles, those of instances counted
 /// @retval BK_ERROR_CANCELLED  the progress callback returned 0
 #[unsafe(no_mangle)]
 pub unsafe extern "C" fn bk_lightmap_create(
@@ -283,7 +282,6 @@ pub unsafe extern "C" fn bk_lightmap_save_layout(
 /// @retval BK_ERROR_IO  the file cannot be read, is damaged, or is another kind of file;
 ///   bk_last_error names it
 /// @retval BK_ERROR_OUT_OF_MEMORY  the light map does not fit or the memory callback refuses
-/// @retval BK_ERROR_UNSUPPORTED  the scene has more than 2^28 triangles, those of instances counted
 /// @retval BK_ERROR_CANCELLED  the progress callback returned 0
 #[unsafe(no_mangle)]
 pub unsafe extern "C" fn bk_lightmap_load_layout(

@@ -14,13 +14,13 @@ use super::atlas::texels::TexelMap;
 use super::atlas::two_sided;
 use super::plan::Plan;
 use super::{BakeParams, Lightmap, LightmapDesc, LightmapInfo};
-use crate::base::error::{Error, Result};
+use crate::base::error::Result;
 use crate::base::memory::try_collect;
 use crate::base::progress::{Progress, Stage};
 use crate::device::LogLevel;
 use crate::direct::DirectLight;
+use crate::scene::Scene;
 use crate::scene::precision::too_few_digits;
-use crate::scene::{MAX_TRIANGLES, Scene};
 use std::sync::Arc;
 use std::time::Instant;
 
@@ -48,15 +48,9 @@ impl Lightmap {
         progress: &Progress,
     ) -> Result<Lightmap> {
         let start = Instant::now();
-        if scene.triangle_count() as usize > MAX_TRIANGLES {
-            return Err(Error::Unsupported(format!(
-                "a light map of {} triangles, those of all instances: there can be {MAX_TRIANGLES}",
-                scene.triangle_count()
-            )));
-        }
         let is_outdoors = seen::is_outdoors(scene);
         let density = match desc.texels_per_unit {
-            0.0 => automatic_density(scene, desc.page_size, AUTOMATIC_PAGES),
+            0.0 => automatic_density(scene, desc.page_size, AUTOMATIC_PAGES)?,
             d => d,
         };
         let (charts, mut uvs) = match &mut known {

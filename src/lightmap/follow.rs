@@ -50,7 +50,7 @@ impl Atlas {
         let boxes: Vec<Bounds> = moved.boxes.iter().map(|bounds| bounds.grown(REACH * near)).collect();
         let is_near = |chart: ChartId| {
             let mut bounds = Bounds::EMPTY;
-            for &triangle in self.charts.triangles_of(chart) {
+            for triangle in self.charts.triangles_of(chart) {
                 let (object, of_object) = scene.locate(triangle);
                 scene.object(object).corners(of_object).into_iter().for_each(|corner| bounds.add(corner));
             }

@@ -107,7 +107,7 @@ impl Lightmap {
         let scale = 1.0 / layout.page_size as f32;
         // Rounding of placements may go beyond the page by some 1e-9.
         let uv = |c| layout.texel_coord(placement, c).map(|x| (x * scale).clamp(0.0, 1.0));
-        (self.atlas.charts.corners[triangle as usize].map(uv), layout[placement].page)
+        (self.atlas.charts.corners(triangle).map(uv), layout[placement].page)
     }
 
     pub(super) fn light(&self) -> Result<&Light> {

@@ -20,20 +20,22 @@ mod solver;
 
 use super::atlas::Atlas;
 use super::atlas::ids::{ChartId, PlacementId};
+use super::atlas::sheets::{Place, Sheet};
 use super::atlas::texels::TexelSample;
 use super::plan::{Plan, left_out};
 use super::{BakeParams, BakeStats, Light, Lightmap, TexelState};
 use crate::base::directional::Directional;
 use crate::base::error::{Error, Result};
 use crate::base::memory::{
-    Reservation, try_collect, try_par_collect, try_par_filter, try_par_gather, try_push, try_to_vec, try_vec,
+    Reservation, try_append, try_collect, try_par_collect, try_par_filter, try_par_gather, try_push, try_to_vec,
+    try_vec,
 };
 use crate::base::progress::{Progress, Stage};
 use crate::base::sort::sort;
 use crate::scene::NONE;
 use glam::{Vec2, Vec3, Vec3A};
 use rayon::prelude::*;
-use sides::{Side, shared_edges};
+use sides::{Side, Sides, for_each_edge};
 use solver::{CHUNK, POINTS, Point, System};
 use std::ops::Range;
 use std::sync::atomic::{AtomicU64, Ordering::Relaxed};
@@ -50,6 +52,9 @@ const CONTRAST: f32 = 4.0;
 
 /// Distance between the points of an edge, in texels: both sides are linear between texels, each in its own grid.
 const SPACING: f32 = 0.5;
+
+/// Name of the seams in error messages.
+const SEAMS: &str = "the seams";
 
 /// Number of edges whose points a thread computes at a time.
 const EDGES: usize = 64;
@@ -318,18 +323,71 @@ impl Job<'_, '_, '_> {
         self.atlas.scene.device().memory().reserve(bytes, what)
     }
 
-    /// Finds the edges that are cut open, each with its two sides.
+    /// Finds the edges that are cut open, each with its two sides. If three or more triangles share an edge, another
+    /// surface stands on this one, and light need not continue below it.
     fn edges(&self) -> Result<Vec<[Side; 2]>> {
-        let (scene, triangles) = (&self.atlas.scene, &self.atlas.charts.triangles[..]);
-        let bytes = sides::bytes(triangles.len(), scene.device().num_threads());
-        let _memory = self.reserve(bytes, "the edges of the charts")?;
-        let mut edges = shared_edges(scene, triangles, self.stage, |edge, out| {
-            let places = self.in_places(edge);
-            places.filter(|&edge| self.is_seam(edge)).try_for_each(|edge| try_push(out, edge, "the seams"))
+        let charts = &self.atlas.charts;
+        let (mut edges, mut others) = (Vec::new(), Vec::new());
+        for (number, sheet) in (0..).zip(&charts.shared) {
+            let [inside, alone] = self.edges_of(sheet)?;
+            let places = try_collect(charts.places.iter().filter(|place| place.sheet == number), SEAMS)?;
+            let shift = |place: &Place| place.first_triangle.wrapping_sub(sheet.first_triangle);
+            let found = try_par_gather(places.len(), SEAMS, |i, out| {
+                self.stage.check()?;
+                inside.iter().try_for_each(|edge| self.push_seams(edge.map(|side| side.shifted(shift(places[i]))), out))
+            })?;
+            try_append(&mut edges, &found, SEAMS)?;
+            for place in places {
+                others.try_reserve(2 * alone.len()).map_err(|e| Error::OutOfMemory(format!("{SEAMS}: {e}")))?;
+                others.extend(alone.iter().flatten().map(|side| side.shifted(shift(place))));
+            }
+        }
+        let sides = Sides { triangles: &charts.own.triangles, first_triangle: 0, others: &others };
+        let found = self.for_each_edge(&sides, &|same, out| match *same {
+            [(_, a), (_, b)] => self.push_seams([a, b], out),
+            _ => Ok(()),
         })?;
+        try_append(&mut edges, &found, SEAMS)?;
         // Sorted, since neighbours in the scene use the same texels.
         sort(&mut edges, &|| self.stage.check())?;
         Ok(edges)
+    }
+
+    /// Returns the edges between two triangles of a sheet that may be seams, and the sides that one triangle has alone
+    /// (twice each), all where the sheet was made.
+    fn edges_of(&self, sheet: &Sheet) -> Result<[Vec<[Side; 2]>; 2]> {
+        let sides = Sides { triangles: &sheet.triangles, first_triangle: sheet.first_triangle, others: &[] };
+        let found = self.for_each_edge(&sides, &|same, out| match *same {
+            [(_, a)] => try_push(out, [a, a], SEAMS),
+            [(_, a), (_, b)] if self.may_be_cut([a, b]) => try_push(out, [a, b], SEAMS),
+            _ => Ok(()),
+        })?;
+        let part = |alone: bool| try_collect(found.iter().copied().filter(|[a, b]| (a == b) == alone), SEAMS);
+        Ok([part(false)?, part(true)?])
+    }
+
+    fn for_each_edge<T: Send>(
+        &self,
+        sides: &Sides,
+        visit: &(dyn Fn(&[(u64, Side)], &mut Vec<T>) -> Result<()> + Sync),
+    ) -> Result<Vec<T>> {
+        let scene = &self.atlas.scene;
+        let _memory =
+            self.reserve(sides::bytes(sides.len(), scene.device().num_threads()), "the edges of the charts")?;
+        for_each_edge(scene, sides, self.stage, visit)
+    }
+
+    /// Adds the seams of an edge in all pairs of placements.
+    fn push_seams(&self, edge: [Side; 2], out: &mut Vec<[Side; 2]>) -> Result<()> {
+        self.in_places(edge).filter(|&edge| self.is_seam(edge)).try_for_each(|edge| try_push(out, edge, SEAMS))
+    }
+
+    /// Whether the two triangles of an edge have different charts, or it has different places in their chart, or the
+    /// chart has placements for both sides: else the light map continues across it in every instance.
+    fn may_be_cut(&self, edge: [Side; 2]) -> bool {
+        let [a, b] = edge;
+        let [at_a, at_b] = self.in_charts(edge);
+        self.chart(a) != self.chart(b) || self.atlas.charts[self.chart(a)].two_sided || at_a != at_b
     }
 
     fn chart(&self, side: Side) -> ChartId {
@@ -388,7 +446,7 @@ impl Job<'_, '_, '_> {
 
     /// Returns start and end of an edge in the charts of both sides.
     fn in_charts(&self, edge: [Side; 2]) -> [[Vec2; 2]; 2] {
-        let corners = |s: Side| s.ends(self.atlas.charts.corners[s.triangle() as usize].map(Vec2::from_array));
+        let corners = |s: Side| s.ends(self.atlas.charts.corners(s.triangle()).map(Vec2::from_array));
         let [a, [start, end]] = edge.map(corners);
         [a, if self.runs_back(edge) { [end, start] } else { [start, end] }]
     }

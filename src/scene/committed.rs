@@ -123,6 +123,11 @@ impl Scene {
         self.first_triangle[object as usize]..self.first_triangle[object as usize + 1]
     }
 
+    /// The global numbers of the triangles of all meshes without instances.
+    pub fn triangles_of_meshes(&self) -> Range<u32> {
+        0..self.first_triangle[self.data.meshes.len()]
+    }
+
     /// Whether a mesh has instances, and stands nowhere else.
     pub fn is_instanced(&self, mesh: u32) -> bool {
         self.data.is_instanced(mesh)

@@ -1,20 +1,20 @@
 //! Objects that are unwrapped alike: instances of one mesh whose transforms differ in rotation, translation and a factor
-//! of all lengths alone. One of them is unwrapped, and the others get its pieces.
+//! of all lengths alone. One of them is unwrapped, and the others get its sheet (`super::sheets`).
 //!
-//! Invariant: an isometry changes neither which regions are flat or smooth nor the angles of charts, and pieces have the
+//! Invariant: an isometry changes neither which regions are flat or smooth nor the angles of charts, and charts have the
 //! lengths of the surface.
 
-use super::pieces::{CHARTS, Piece};
+use super::pieces::CHARTS;
 use crate::base::error::Result;
 use crate::base::memory::{try_collect, try_push, try_with_capacity};
 use crate::scene::Scene;
 use glam::{DMat3, DVec3};
 
-/// Which object's pieces an object gets, and the factor of their lengths.
+/// Which instance's sheet an instance gets, and the factor of its lengths.
 #[derive(Clone, Copy, Debug, PartialEq)]
-pub(super) struct Source {
-    /// Index of the object, at most that of this one.
-    pub index: usize,
+pub(in crate::lightmap) struct Source {
+    /// Number of the instance, at most that of this one.
+    pub instance: u32,
     pub factor: f32,
 }
 
@@ -24,34 +24,29 @@ const SAME: f64 = 1e-5;
 /// Number of differently transformed instances of a mesh among which like ones are looked for.
 const MOST_COMPARED: usize = 16;
 
-/// Finds the sources of objects, given by their valid triangles (global numbers, ascending).
-pub(super) fn sources(scene: &Scene, of_objects: &[&[u32]]) -> Result<Vec<Source>> {
-    let mut sources = try_with_capacity(of_objects.len(), CHARTS)?;
-    let mut known: Vec<Vec<(usize, f64, [DVec3; 2])>> = try_collect(scene.meshes().iter().map(|_| Vec::new()), CHARTS)?;
-    for (index, triangles) in of_objects.iter().enumerate() {
-        let own = Source { index, factor: 1.0 };
-        let object = scene.locate(triangles[0]).0;
-        let Some(instance) = object.checked_sub(scene.meshes().len() as u32) else {
-            sources.push(own);
-            continue;
-        };
-        let instance = scene.instances()[instance as usize];
+/// Finds the source of each instance. `has_same` says whether the same triangles of two instances of a mesh are surfaces:
+/// placing them may round some to a line.
+pub(in crate::lightmap) fn sources(
+    scene: &Scene,
+    mut has_same: impl FnMut(u32, u32) -> Result<bool>,
+) -> Result<Vec<Source>> {
+    let mut sources = try_with_capacity(scene.instances().len(), CHARTS)?;
+    let mut known: Vec<Vec<(u32, f64, [DVec3; 2])>> = try_collect(scene.meshes().iter().map(|_| Vec::new()), CHARTS)?;
+    for (number, instance) in (0..).zip(scene.instances()) {
         let (length, shape) = shape(instance.transform.matrix3.into());
         let others = &mut known[instance.mesh as usize];
-        let is_alike = |&&(other, _, its): &&(usize, f64, [DVec3; 2])| {
-            let same_triangles = || {
-                let [a, b] = [of_objects[other], triangles].map(|t| (t, scene.first_triangle(scene.locate(t[0]).0)));
-                a.0.len() == b.0.len() && a.0.iter().zip(b.0).all(|(x, y)| x - a.1 == y - b.1)
-            };
-            (0..2).all(|i| (its[i] - shape[i]).abs().max_element() <= SAME) && same_triangles()
-        };
-        match others.iter().rev().take(MOST_COMPARED).find(is_alike) {
-            Some(&(index, of_source, _)) => sources.push(Source { index, factor: (length / of_source) as f32 }),
-            None => {
-                try_push(others, (index, length, shape), CHARTS)?;
-                sources.push(own);
+        let mut source = None;
+        for &(other, of_other, its) in others.iter().rev().take(MOST_COMPARED) {
+            let is_alike = (0..2).all(|i: usize| (its[i] - shape[i]).abs().max_element() <= SAME);
+            if is_alike && has_same(other, number)? {
+                source = Some(Source { instance: other, factor: (length / of_other) as f32 });
+                break;
             }
         }
+        if source.is_none() {
+            try_push(others, (number, length, shape), CHARTS)?;
+        }
+        sources.push(source.unwrap_or(Source { instance: number, factor: 1.0 }));
     }
     Ok(sources)
 }
@@ -64,19 +59,6 @@ fn shape(matrix: glam::Mat3) -> (f64, [DVec3; 2]) {
     let squares = DVec3::new(x.dot(x), y.dot(y), z.dot(z));
     let products = DVec3::new(x.dot(y), y.dot(z), z.dot(x));
     (length, [squares, products].map(|v| v / (length * length)))
-}
-
-/// Copies pieces to another object: `shift` is added to the numbers of triangles (modulo 2^32).
-pub(super) fn copy(pieces: &[Piece], shift: u32, factor: f32) -> Result<Vec<Piece>> {
-    let mut copies = try_with_capacity(pieces.len(), CHARTS)?;
-    for piece in pieces {
-        copies.push(Piece {
-            triangles: try_collect(piece.triangles.iter().map(|t| t.wrapping_add(shift)), CHARTS)?,
-            corners: try_collect(piece.corners.iter().map(|c| c.map(|uv| uv.map(|x| x * factor))), CHARTS)?,
-            given: None,
-        });
-    }
-    Ok(copies)
 }
 
 #[cfg(test)]
@@ -111,10 +93,8 @@ mod tests {
         let (even, flat) = (Vec3::ONE, Vec3::new(1.0, 0.5, 1.0));
         let scene =
             scene(&[at(even, 0.0, 0.0), at(2.0 * even, 1.0, 5.0), at(flat, 0.3, 9.0), at(3.0 * flat, 2.0, 20.0)]);
-        let objects: Vec<Vec<u32>> = (1..=4).map(|o| scene.triangles_of(o).collect()).collect();
-        let objects: Vec<&[u32]> = objects.iter().map(|o| &o[..]).collect();
-        let sources = sources(&scene, &objects).unwrap();
-        assert_eq!(sources.iter().map(|s| s.index).collect::<Vec<_>>(), [0, 0, 2, 2]);
+        let sources = sources(&scene, |_, _| Ok(true)).unwrap();
+        assert_eq!(sources.iter().map(|s| s.instance).collect::<Vec<_>>(), [0, 0, 2, 2]);
         let factors = sources.iter().map(|s| s.factor);
         assert!(factors.zip([1.0, 2.0, 1.0, 3.0]).all(|(a, b)| (a - b).abs() < 1e-5 * b), "{sources:?}");
     }

@@ -355,8 +355,8 @@ mod tests {
                 // The centre, wherever the texel's light is from.
                 let local = Vec2::from(atlas.texel_local(placement, s));
                 let chart = atlas.map.layout.chart_of(placement);
-                let place = atlas.charts.triangles_of(chart).iter().filter(|&&t| t < 12).find_map(|&t| {
-                    let [a, b, c] = atlas.charts.corners[t as usize].map(Vec2::from);
+                let place = atlas.charts.triangles_of(chart).filter(|&t| t < 12).find_map(|t| {
+                    let [a, b, c] = atlas.charts.corners(t).map(Vec2::from);
                     let w = Mat2::from_cols(b - a, c - a).inverse() * (local - a);
                     let [p, q, r] = atlas.scene.corners(t);
                     let is_in = w.min_element() > -1e-3 && w.x + w.y < 1.001;

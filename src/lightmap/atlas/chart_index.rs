@@ -3,16 +3,18 @@
 //! Every chart of more than a few triangles has a uniform grid over its local coordinates; a cell lists the triangles
 //! that overlap it. All maps share the index, whatever their resolution.
 
-use super::charts::Charts;
+use super::charts::{Chart, Charts};
 use super::flat_triangle::Flat;
 use super::ids::ChartId;
+use super::sheets::{Shape, Sheet};
 use super::texels::TexelSample;
 use crate::base::error::Result;
-use crate::base::memory::{Reservation, try_vec, try_with_capacity};
+use crate::base::memory::{Reservation, try_collect, try_vec, try_with_capacity};
 use crate::base::parallel::one_by_one;
 use crate::device::Device;
 use glam::{DVec2, Vec2};
 use rayon::prelude::*;
+use std::ops::Range;
 
 /// Maximum number of triangles of a chart without a grid: all of them are tested.
 const SMALL: usize = 4;
@@ -35,7 +37,7 @@ const TOLERANCE: f64 = 1e-6;
 
 /// Finds triangles of charts by local coordinates.
 pub(crate) struct ChartIndex {
-    /// Grids, by chart.
+    /// Grids, by chart of all sheets.
     grids: Vec<Grid>,
     _memory: Reservation,
 }
@@ -45,18 +47,18 @@ pub(crate) struct ChartIndex {
 struct Grid {
     columns: u32,
     rows: u32,
-    /// Cells per unit of local coordinates.
+    /// Cells per unit of the sheet's local coordinates.
     scale: Vec2,
     /// First entry of each cell, and the number of entries.
     start: Box<[u32]>,
-    /// Global triangle numbers, ascending in each cell.
+    /// Triangles by their numbers in the sheet, ascending in each cell.
     triangles: Box<[u32]>,
 }
 
 impl Grid {
-    fn new(charts: &Charts, chart: ChartId) -> Result<Grid> {
-        let triangles = charts.triangles_of(chart);
-        let size = Vec2::from(charts[chart].size);
+    fn new(sheet: &Sheet, chart: &Chart) -> Result<Grid> {
+        let triangles = &sheet.triangles[chart.triangles.start as usize..chart.triangles.end as usize];
+        let size = Vec2::from(chart.size);
         if triangles.len() <= SMALL || !(size.min_element() > 0.0) || !size.is_finite() {
             return Ok(Grid::default());
         }
@@ -66,7 +68,7 @@ impl Grid {
             let rows = (cells as u32 / columns).max(1);
             let scale = Vec2::new(columns as f32, rows as f32) / size;
             let limit = ENTRIES_PER_TRIANGLE * triangles.len();
-            if let Some(grid) = Grid::of_cells(charts, triangles, [columns, rows], scale, limit)? {
+            if let Some(grid) = Grid::of_cells(sheet, triangles, [columns, rows], scale, limit)? {
                 return Ok(grid);
             }
             if cells == 1 {
@@ -79,7 +81,7 @@ impl Grid {
 
     /// Makes a grid of given size; `None` if the cells would list more than `limit` triangles.
     fn of_cells(
-        charts: &Charts,
+        sheet: &Sheet,
         triangles: &[u32],
         [columns, rows]: [u32; 2],
         scale: Vec2,
@@ -89,7 +91,7 @@ impl Grid {
             return Ok(None);
         }
         let size = [columns as i64, rows as i64];
-        let flat = |t: u32| Flat(charts.corners[t as usize].map(|c| Vec2::from(c).as_dvec2() * scale.as_dvec2()));
+        let flat = |t: u32| Flat(sheet.corners[t as usize].map(|c| Vec2::from(c).as_dvec2() * scale.as_dvec2()));
         let what = "the index of a chart";
         let mut start: Vec<u32> = try_vec(columns as usize * rows as usize + 1, what)?;
         let mut entries = 0;
@@ -132,11 +134,13 @@ impl Grid {
 impl ChartIndex {
     /// Indexes all charts.
     pub(crate) fn new(device: &Device, charts: &Charts) -> Result<ChartIndex> {
-        let mut grids: Vec<Grid> = try_with_capacity(charts.charts.len(), "the index of the charts")?;
-        grids.resize_with(charts.charts.len(), Grid::default);
+        let shapes = charts.sheets().flat_map(|(sheet, charts)| charts.iter().map(move |chart| (sheet, chart)));
+        let shapes = try_collect(shapes, "the index of the charts")?;
+        let mut grids: Vec<Grid> = try_with_capacity(shapes.len(), "the index of the charts")?;
+        grids.resize_with(shapes.len(), Grid::default);
         device.install(|| {
-            one_by_one(grids.par_iter_mut().enumerate()).try_for_each(|(chart, grid)| {
-                *grid = Grid::new(charts, ChartId::new(chart))?;
+            one_by_one(grids.par_iter_mut().zip(shapes)).try_for_each(|(grid, (sheet, chart))| {
+                *grid = Grid::new(sheet, chart)?;
                 Ok(())
             })
         })?;
@@ -152,13 +156,17 @@ impl ChartIndex {
     /// Returns the point of a chart at local coordinates, `None` outside of its triangles. If triangles overlap,
     /// `first` is preferred, then the lowest number.
     pub(crate) fn locate(&self, charts: &Charts, chart: ChartId, local: Vec2, first: u32) -> Option<TexelSample> {
+        let Shape { sheet, first_triangle, factor, number } = charts.shape(chart);
+        let local = local / factor;
         let inside = |t: u32| {
-            let [u, v] = weights(charts.corners[t as usize], local)?;
-            Some(TexelSample { triangle: t, u, v, ..Default::default() })
+            let [u, v] = weights(sheet.corners[t as usize], local)?;
+            Some(TexelSample { triangle: first_triangle + t, u, v, ..Default::default() })
         };
-        let grid = &self.grids[chart.index()];
-        let triangles = if grid.columns > 0 { grid.around(local) } else { charts.triangles_of(chart) };
-        inside(first).or_else(|| triangles.iter().take(MAX_TESTS).find_map(|&t| inside(t)))
+        let grid = &self.grids[number];
+        let Range { start, end } = charts[chart].triangles;
+        let all = &sheet.triangles[start as usize..end as usize];
+        let triangles = if grid.columns > 0 { grid.around(local) } else { all };
+        inside(first - first_triangle).or_else(|| triangles.iter().take(MAX_TESTS).find_map(|&t| inside(t)))
     }
 }
 
@@ -198,7 +206,7 @@ mod tests {
                     let [u, v] = uniform_triangle(sobol_2d(i, t));
                     let local = Vec2::from(charts.local(t, u, v));
                     // By way of the grid alone: another triangle is named as the first.
-                    let other = charts.triangles_of(chart)[0];
+                    let other = charts.triangles_of(chart).next().unwrap();
                     let found = index.locate(&charts, chart, local, other).expect("a point of the chart");
                     let place = Vec2::from(charts.local(found.triangle, found.u, found.v));
                     assert!(place.distance(local) < 1e-4 * (1.0 + local.length()), "{place} {local}");

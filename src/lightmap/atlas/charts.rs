@@ -3,17 +3,20 @@
 //! Charts come from the caller's UVs where those are usable, else from `super::unwrap`. They do not depend on texels:
 //! their coordinates are in scene units, and each map packs them at its own density ([`super::layout`]).
 
+use super::alike::{self, Source};
 use super::ids::ChartId;
 pub use super::pieces::Given;
 use super::pieces::{CHARTS, Groups, Piece, connected, float_key, surface_kind};
+use super::sheets::{Place, Shape, Sheet, scaled};
 use super::unwrap;
 use crate::base::error::{Error, Result, invalid_argument};
-use crate::base::memory::{try_collect, try_filled, try_push, try_with_capacity, try_zeroed_as_needed};
+use crate::base::memory::{try_collect, try_push, try_with_capacity};
 use crate::base::progress::{Progress, Stage};
 use crate::device::LogLevel;
 use crate::scene::{LightmapUvs, Mesh, Scene};
 use crate::simd::prefetch;
 use glam::{DVec2, Vec2};
+use rayon::prelude::*;
 use std::collections::BTreeMap;
 use std::ops::{Index, Range};
 use std::time::Instant;
@@ -32,7 +35,7 @@ const MAX_PAGE_COVER: f64 = 2.0;
 /// A piece of surface with continuous texture coordinates.
 #[derive(Clone, Debug, PartialEq)]
 pub struct Chart {
-    /// Triangles of the chart, as a range of [`Charts::triangles`].
+    /// Triangles of the chart, as a range of its sheet's.
     pub triangles: Range<u32>,
     /// Extent of the chart's local coordinates, which start at (0, 0), in scene units.
     pub size: [f32; 2],
@@ -65,17 +68,18 @@ pub struct UvReport {
     pub seconds: f64,
 }
 
-/// All charts of a scene, indexed by [`ChartId`]. Those with given placement come first, ordered by page.
+/// All charts of a scene, indexed by [`ChartId`]: those of meshes, of which those with given placement come first,
+/// ordered by page, then those of instances.
 #[derive(Clone, Debug, Default, PartialEq)]
 pub struct Charts {
     /// The charts, by number.
     pub charts: Vec<Chart>,
-    /// Global triangle numbers, chart by chart, ascending in each.
-    pub triangles: Vec<u32>,
-    /// Chart of each global triangle, [`ChartId::NONE`] for degenerate ones.
-    pub of_triangles: Vec<ChartId>,
-    /// Local coordinates of the corners of each global triangle.
-    pub corners: Vec<[[f32; 2]; 3]>,
+    /// The meshes that stand in the scene themselves, with the global numbers of their triangles.
+    pub(in crate::lightmap) own: Sheet,
+    /// The sheets of instances.
+    pub(in crate::lightmap) shared: Vec<Sheet>,
+    /// The instances.
+    pub(in crate::lightmap) places: Vec<Place>,
 }
 
 impl Index<ChartId> for Charts {
@@ -105,25 +109,41 @@ impl Charts {
     ) -> Result<(Charts, UvReport)> {
         let start = Instant::now();
         let max_extent = padded_extent(page_size, padding)? as f64 / texels_per_unit as f64;
-        check_density(surface_area(scene), texels_per_unit)?;
-        let total = scene.triangle_count();
-        let stage = progress.stage("unwrap", 0.0, 0.5, total as u64 + 1);
+        check_density(surface_area(scene)?, texels_per_unit)?;
+        let stage = progress.stage("unwrap", 0.0, 0.5, scene.triangle_count() as u64 + 1);
+        let sources = alike::sources(scene, |a, b| same_triangles(scene, a, b, &stage))?;
+        let made = (0..).zip(&sources).filter(|(i, source)| source.instance == *i).map(|(i, _)| i);
+        let made: Vec<u32> = try_collect(made.map(|i: u32| scene.object_of_instance(i)), CHARTS)?;
         // Memory of pieces and charts, which exist at the same time, and of the meshes that are unwrapped.
-        let vertices = (0..scene.object_count()).map(|o| scene.object(o).mesh().positions.len()).sum();
-        let bytes = 2 * Self::BYTES_PER_TRIANGLE * total as usize
-            + unwrap::bytes(total as usize, vertices, scene.device().num_threads());
+        let objects = || (0..scene.meshes().len() as u32).chain(made.iter().copied());
+        let total: usize = objects().map(|o| scene.triangles_of(o).len()).sum();
+        let vertices = objects().map(|o| scene.object(o).mesh().positions.len()).sum();
+        let bytes = 2 * Self::BYTES_PER_TRIANGLE * total + unwrap::bytes(total, vertices, scene.device().num_threads());
         let _memory = scene.device().memory().reserve(bytes, CHARTS)?;
         let (charts, mut report) = scene.device().install(|| {
             let mut report = UvReport::default();
             let (mut pieces, rest) = given_pieces(scene, page_size, &mut report, &stage)?;
-            stage.advance(total as u64 - rest.len() as u64)?;
+            let own = scene.triangles_of_meshes();
+            stage.advance(own.len() as u64 - rest.len() as u64)?;
             report.given_charts = pieces.len() as u32;
             for piece in unwrap::unwrap(scene, &rest, &stage)? {
                 stage.check()?;
                 split_to_fit(piece, max_extent as f32, &mut pieces)?;
             }
-            report.unwrapped_charts = pieces.len() as u32 - report.given_charts;
-            Ok((Charts::assemble(scene, pieces, &stage)?, report))
+            for &object in &made {
+                let valid = try_collect(scene.triangles_of(object).filter(|&t| scene.is_valid(t)), CHARTS)?;
+                stage.advance((scene.triangles_of(object).len() - valid.len()) as u64)?;
+                // As small as the largest of the instances needs them.
+                let instance = object - scene.object_of_instance(0);
+                let largest = sources.iter().filter(|s| s.instance == instance).fold(1.0f32, |m, s| m.max(s.factor));
+                for piece in unwrap::unwrap(scene, &valid, &stage)? {
+                    stage.check()?;
+                    split_to_fit(piece, max_extent as f32 / largest, &mut pieces)?;
+                }
+            }
+            let charts = Charts::assemble(scene, pieces, &sources, &stage)?;
+            report.unwrapped_charts = charts.charts.len() as u32 - report.given_charts;
+            Ok((charts, report))
         })?;
         stage.advance(1)?;
         report.seconds = start.elapsed().as_secs_f64();
@@ -136,7 +156,9 @@ impl Charts {
 
     /// Returns the size in bytes.
     pub fn bytes(&self) -> usize {
-        self.corners.len() * 24 + (self.triangles.len() + self.of_triangles.len()) * 4 + size_of_val(&self.charts[..])
+        self.sheets().map(|(sheet, _)| sheet.bytes()).sum::<usize>()
+            + size_of_val(&self.charts[..])
+            + size_of_val(&self.places[..])
     }
 
     /// Returns the numbers of all charts.
@@ -147,14 +169,26 @@ impl Charts {
     /// Returns the chart of a global triangle, [`ChartId::NONE`] for degenerate ones.
     #[inline]
     pub fn chart_of(&self, triangle: u32) -> ChartId {
-        self.of_triangles[triangle as usize]
+        match self.own.of_triangles.get(triangle as usize) {
+            Some(&chart) => chart,
+            None => self.of_instance(triangle).expect("a triangle of the scene"),
+        }
+    }
+
+    /// Returns the chart of what may be a triangle of an instance; `None` if there is no such triangle.
+    fn of_instance(&self, triangle: u32) -> Option<ChartId> {
+        let (place, sheet, own) = self.place_of(triangle)?;
+        Some(match sheet.of_triangles[own as usize] {
+            ChartId::NONE => ChartId::NONE,
+            chart => ChartId::new(place.first_chart.index() + chart.index()),
+        })
     }
 
     /// Asks for a triangle's chart and corners.
     #[inline]
     pub(in crate::lightmap) fn prefetch(&self, triangle: u32) {
         if let (Some(chart), Some(corners)) =
-            (self.of_triangles.get(triangle as usize), self.corners.get(triangle as usize))
+            (self.own.of_triangles.get(triangle as usize), self.own.corners.get(triangle as usize))
         {
             prefetch(chart);
             prefetch(corners);
@@ -163,69 +197,115 @@ impl Charts {
 
     /// Returns the chart of what may be a global triangle; `None` if there is no such triangle, or it has no chart.
     pub(in crate::lightmap) fn find(&self, triangle: u32) -> Option<ChartId> {
-        self.of_triangles.get(triangle as usize).copied().filter(|&chart| chart != ChartId::NONE)
+        let own = self.own.of_triangles.get(triangle as usize).copied();
+        own.or_else(|| self.of_instance(triangle)).filter(|&chart| chart != ChartId::NONE)
     }
 
     /// Returns the global triangle numbers of a chart, ascending.
-    pub fn triangles_of(&self, chart: ChartId) -> &[u32] {
+    pub fn triangles_of(&self, chart: ChartId) -> impl ExactSizeIterator<Item = u32> + Clone + use<'_> {
         let Range { start, end } = self[chart].triangles;
-        &self.triangles[start as usize..end as usize]
+        let Shape { sheet, first_triangle, .. } = self.shape(chart);
+        sheet.triangles[start as usize..end as usize].iter().map(move |&t| first_triangle + t)
+    }
+
+    /// Returns the local coordinates of the corners of a global triangle.
+    #[inline]
+    pub fn corners(&self, triangle: u32) -> [[f32; 2]; 3] {
+        match self.own.corners.get(triangle as usize) {
+            Some(&corners) => corners,
+            None => self.corners_in_instance(triangle),
+        }
+    }
+
+    fn corners_in_instance(&self, triangle: u32) -> [[f32; 2]; 3] {
+        let (place, sheet, own) = self.place_of(triangle).expect("a triangle of the scene");
+        scaled(sheet.corners[own as usize], place.factor)
     }
 
     /// Returns the local coordinates of the point of a global triangle with weights `u` and `v` of its corners 1 and 2.
     #[inline]
     pub fn local(&self, triangle: u32, u: f32, v: f32) -> [f32; 2] {
-        let [a, b, c] = self.corners[triangle as usize].map(Vec2::from_array);
+        let [a, b, c] = self.corners(triangle).map(Vec2::from_array);
         (a * (1.0 - u - v) + b * u + c * v).to_array()
     }
 
-    /// Makes charts of pieces: those with given placement first, ordered by page.
-    pub(in crate::lightmap) fn assemble(scene: &Scene, pieces: Vec<Piece>, stage: &Stage) -> Result<Charts> {
-        let total = scene.triangle_count() as usize;
-        let mut charts = Charts {
-            charts: try_with_capacity(pieces.len(), CHARTS)?,
-            triangles: try_with_capacity(pieces.iter().map(|p| p.triangles.len()).sum(), CHARTS)?,
-            of_triangles: try_filled(total, ChartId::NONE, CHARTS)?,
-            // Untouched until a piece is moved there, which is then freed.
-            corners: try_zeroed_as_needed(total, CHARTS)?,
+    /// Makes charts of pieces with global triangle numbers: those of meshes, of which those with given placement come
+    /// first, ordered by page; then those of each instance that is its own source.
+    pub(in crate::lightmap) fn assemble(
+        scene: &Scene,
+        pieces: Vec<Piece>,
+        sources: &[Source],
+        stage: &Stage,
+    ) -> Result<Charts> {
+        let mut charts = Vec::new();
+        let mut pieces = pieces.into_iter().peekable();
+        let mut of_range = |range: Range<u32>, charts: &mut Vec<Chart>, first_shape: usize| {
+            let end = range.end;
+            let of_range = std::iter::from_fn(|| pieces.next_if(|piece| piece.triangles[0] < end));
+            Sheet::new(scene, range, of_range, charts, first_shape, stage)
         };
-        for piece in pieces {
+        let own = of_range(scene.triangles_of_meshes(), &mut charts, 0)?;
+        let mut shapes = charts.len();
+        let mut shared: Vec<Sheet> = Vec::new();
+        let mut places: Vec<Place> = try_with_capacity(sources.len(), CHARTS)?;
+        for (instance, source) in (0..).zip(sources) {
             stage.check()?;
-            let (lower, upper) = bounds(&piece.corners);
-            let first = charts.triangles.len() as u32;
-            let mut area = 0.0;
-            for (&t, corners) in piece.triangles.iter().zip(&piece.corners) {
-                charts.of_triangles[t as usize] = ChartId::new(charts.charts.len());
-                charts.corners[t as usize] = corners.map(|c| (Vec2::from_array(c) - lower).to_array());
-                area += triangle_area(scene, t);
+            let triangles = scene.triangles_of(scene.object_of_instance(instance));
+            let (first_triangle, first_chart) = (triangles.start, ChartId::new(charts.len()));
+            let sheet = if source.instance == instance {
+                try_push(&mut shared, of_range(triangles, &mut charts, shapes)?, CHARTS)?;
+                shapes += charts.len() - first_chart.index();
+                shared.len() as u32 - 1
+            } else {
+                let sheet = places[source.instance as usize].sheet;
+                for of_source in shared[sheet as usize].charts.clone() {
+                    let Chart { ref triangles, size, area, two_sided, given } = charts[of_source as usize];
+                    let (triangles, size) = (triangles.clone(), size.map(|x| x * source.factor));
+                    let area = area * source.factor * source.factor;
+                    try_push(&mut charts, Chart { triangles, size, area, two_sided, given }, CHARTS)?;
+                }
+                stage.advance(triangles.len() as u64)?;
+                sheet
+            };
+            places.push(Place { first_triangle, first_chart, sheet, factor: source.factor });
+            if charts.len() as u64 > MAX_TEXELS {
+                return Err(Error::OutOfMemory(format!("instances have more than {MAX_TEXELS} charts")));
             }
-            let two_sided = scene.material(piece.triangles[0]).two_sided;
-            charts.triangles.extend(&piece.triangles);
-            charts.charts.push(Chart {
-                triangles: first..charts.triangles.len() as u32,
-                size: (upper - lower).to_array(),
-                area: area as f32,
-                two_sided,
-                given: piece.given,
-            });
         }
-        Ok(charts)
+        Ok(Charts { charts, own, shared, places })
     }
 }
 
+/// Whether the same triangles of two instances of a mesh are valid.
+pub(in crate::lightmap) fn same_triangles(scene: &Scene, a: u32, b: u32, stage: &Stage) -> Result<bool> {
+    stage.check()?;
+    let [a, b] = [a, b].map(|instance| scene.triangles_of(scene.object_of_instance(instance)));
+    let same = |i: u32| scene.is_valid(a.start + i) == scene.is_valid(b.start + i);
+    Ok(scene.device().install(|| (0..a.len() as u32).into_par_iter().with_min_len(1 << 12).all(same)))
+}
+
 /// Returns the area of all valid triangles, in squared scene units.
-pub fn surface_area(scene: &Scene) -> f64 {
+pub fn surface_area(scene: &Scene) -> Result<f64> {
     let area = |object: u32| -> f64 {
         scene.triangles_of(object).filter(|&t| scene.is_valid(t)).map(|t| triangle_area(scene, t)).sum()
     };
-    (0..scene.object_count()).map(area).sum()
+    let of_meshes: f64 = (0..scene.meshes().len() as u32).map(area).sum();
+    let mut of_instances: Vec<f64> = try_with_capacity(scene.instances().len(), CHARTS)?;
+    for (instance, source) in (0..).zip(alike::sources(scene, |_, _| Ok(true))?) {
+        of_instances.push(if source.instance == instance {
+            area(scene.object_of_instance(instance))
+        } else {
+            of_instances[source.instance as usize] * f64::from(source.factor).powi(2)
+        });
+    }
+    Ok(of_meshes + of_instances.iter().sum::<f64>())
 }
 
 /// Returns the density in texels per scene unit at which the scene's surface fills about `pages` pages, two thirds of
 /// each page's texels being covered.
-pub fn automatic_density(scene: &Scene, page_size: u32, pages: f64) -> f32 {
+pub fn automatic_density(scene: &Scene, page_size: u32, pages: f64) -> Result<f32> {
     let texels = pages * (page_size as f64).powi(2) * 2.0 / 3.0;
-    ((texels / surface_area(scene)).sqrt() as f32).clamp(f32::MIN_POSITIVE, f32::MAX)
+    Ok(((texels / surface_area(scene)?).sqrt() as f32).clamp(f32::MIN_POSITIVE, f32::MAX))
 }
 
 /// Returns the area of a global triangle, in squared scene units.
@@ -314,18 +394,18 @@ fn split_to_fit(piece: Piece, max_extent: f32, out: &mut Vec<Piece>) -> Result<(
     Ok(())
 }
 
-/// Returns pieces from the caller's UVs, ordered by page, and the valid triangles to unwrap, ascending.
+/// Returns pieces from the caller's UVs, ordered by page, and the other valid triangles of meshes, ascending. (The UVs of an
+/// instanced mesh do not count: all its instances would have the same place.)
 fn given_pieces(scene: &Scene, page_size: u32, report: &mut UvReport, stage: &Stage) -> Result<(Vec<Piece>, Vec<u32>)> {
     let mut rest = Vec::new();
     let mut usable = Vec::new();
     let mut cover = BTreeMap::<u32, f64>::new();
-    for m in 0..scene.object_count() {
-        let (object, triangles) = (scene.object(m), scene.triangles_of(m));
-        let (mesh, first) = (object.mesh(), triangles.start);
+    for m in 0..scene.meshes().len() as u32 {
+        let triangles = scene.triangles_of(m);
+        let (mesh, first) = (scene.object(m).mesh(), triangles.start);
         for t in (0..triangles.len()).filter(|&t| scene.is_valid(first + t as u32)) {
             stage.check()?;
-            // The instances of a mesh would all have the same place.
-            let Some(lightmap) = mesh.lightmap.as_ref().filter(|_| !object.is_instance()) else {
+            let Some(lightmap) = &mesh.lightmap else {
                 try_push(&mut rest, first + t as u32, CHARTS)?;
                 continue;
             };

@@ -1,6 +1,6 @@
 //! The atlas: charts and texels of a scene, the side of its chart that each texel shows, and which texels can be seen.
 
-mod alike;
+pub(in crate::lightmap) mod alike;
 pub(crate) mod buried;
 pub(crate) mod chart_index;
 pub(crate) mod chart_map;
@@ -14,6 +14,7 @@ pub(crate) mod pieces;
 mod planar;
 pub(crate) mod seen;
 pub(crate) mod seen_from;
+pub(in crate::lightmap) mod sheets;
 pub mod texels;
 pub(crate) mod two_sided;
 mod unwrap;

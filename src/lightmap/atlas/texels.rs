@@ -15,6 +15,7 @@ use super::charts::Charts;
 use super::flat_triangle::Flat;
 use super::ids::PlacementId;
 use super::layout::Layout;
+use super::sheets::Shape;
 use crate::base::error::{Error, Result};
 use crate::base::geometry::unit_normal;
 use crate::base::memory::{Reservation, try_collect, try_push, try_to_vec, try_vec, try_with_capacity};
@@ -407,24 +408,51 @@ struct Job<'a, 'p, 'c> {
 }
 
 impl Job<'_, '_, '_> {
-    /// Returns the triangles of a group as slots of [`Charts::triangles`]. They are contiguous: a group is one chart or
-    /// some of the given charts, which come first.
-    fn slots(&self, group: &Group) -> Range<u32> {
-        let of_place = |place: u32| &self.charts[self.layout.chart_of(PlacementId::new(place as usize))].triangles;
-        of_place(group.placements.start).start..of_place(group.placements.end - 1).end
+    /// Returns what of the charts a group shows.
+    fn surface<'g>(&'g self, group: &'g Group) -> Surface<'g> {
+        let chart_at = |place: u32| self.layout.chart_of(PlacementId::new(place as usize));
+        let first = chart_at(group.placements.start);
+        let slots = self.charts[first].triangles.start..self.charts[chart_at(group.placements.end - 1)].triangles.end;
+        Surface { layout: self.layout, group, slots, shape: self.charts.shape(first) }
+    }
+}
+
+/// The surface that a group shows: one chart, or some of the given charts, which come first.
+struct Surface<'a> {
+    layout: &'a Layout,
+    group: &'a Group,
+    /// Triangles, by their places in the list of their sheet.
+    slots: Range<u32>,
+    shape: Shape<'a>,
+}
+
+impl Surface<'_> {
+    /// Returns the global number of a slot's triangle.
+    #[inline]
+    fn triangle(&self, slot: u32) -> u32 {
+        self.shape.first_triangle + self.shape.sheet.triangles[slot as usize]
+    }
+
+    /// Returns the place in the group's placements of the one that a slot belongs to.
+    #[inline]
+    fn placement(&self, slot: u32) -> usize {
+        if self.group.placements.len() == 1 {
+            return 0;
+        }
+        // Given charts are charts of meshes, whose sheet has the scene's numbers.
+        let chart = self.shape.sheet.of_triangles[self.shape.sheet.triangles[slot as usize] as usize];
+        PlacementId::front_of(chart).index() - self.group.placements.start as usize
     }
 
     /// Returns the corners of a slot's triangle in texels of the group's window.
-    fn flat_triangle(&self, group: &Group, slot: u32) -> Flat {
-        let triangle = self.charts.triangles[slot as usize];
-        let placement = match group.placements.len() {
-            1 => PlacementId::new(group.placements.start as usize),
-            _ => PlacementId::front_of(self.charts.chart_of(triangle)),
-        };
+    fn flat_triangle(&self, slot: u32) -> Flat {
+        let group = self.group;
+        let triangle = self.shape.sheet.triangles[slot as usize];
+        let placement = PlacementId::new(group.placements.start as usize + self.placement(slot));
         let p = &self.layout[placement];
         let origin = DVec2::new(group.window.x as f64, group.window.y as f64);
         let [offset, scale] = [p.offset, p.scale].map(|a| DVec2::new(a[0] as f64, a[1] as f64));
-        Flat(self.charts.corners[triangle as usize].map(|[s, t]| {
+        Flat(self.shape.corners(triangle).map(|[s, t]| {
             let local = if p.swap { DVec2::new(t as f64, s as f64) } else { DVec2::new(s as f64, t as f64) };
             offset + scale * local - origin
         }))
@@ -491,6 +519,7 @@ fn cover_group(
     counts: &mut [u32],
 ) -> Result<u64> {
     owners.fill(NONE);
+    let surface = job.surface(group);
     let size = [group.window.w as i64, group.window.h as i64];
     let mut overlapping = 0;
     let mut visited = 0;
@@ -502,16 +531,17 @@ fn cover_group(
         visited = 0;
         job.stage.check()
     };
-    for slot in job.slots(group) {
-        overlapping += cover_centres(&job.flat_triangle(group, slot), slot, size, owners);
-        check(job.flat_triangle(group, slot).box_texels(size))?;
+    for slot in surface.slots.clone() {
+        let flat = surface.flat_triangle(slot);
+        overlapping += cover_centres(&flat, slot, size, owners);
+        check(flat.box_texels(size))?;
     }
     // Squared distance of the nearest triangle to the centre, for texels whose centre is in none.
     scratch.clear();
     scratch.try_reserve(owners.len()).map_err(|e| Error::OutOfMemory(format!("{INDEX}: {e}")))?;
     scratch.resize(owners.len(), f64::INFINITY);
-    for slot in job.slots(group) {
-        let flat = job.flat_triangle(group, slot);
+    for slot in surface.slots.clone() {
+        let flat = surface.flat_triangle(slot);
         flat.for_each_touched(size, |x, y| {
             let i = (y * size[0] + x) as usize;
             if owners[i] == NONE || owners[i] & BORDER != 0 {
@@ -526,19 +556,9 @@ fn cover_group(
         check(flat.box_texels(size))?;
     }
     for &owner in owners.iter().filter(|&&o| o != NONE) {
-        counts[placement_in_group(job, group, owner & !BORDER)] += 1;
+        counts[surface.placement(owner & !BORDER)] += 1;
     }
     Ok(overlapping)
-}
-
-/// Returns the index in the group of the placement that a slot belongs to.
-#[inline]
-fn placement_in_group(job: &Job, group: &Group, slot: u32) -> usize {
-    if group.placements.len() == 1 {
-        return 0;
-    }
-    let chart = job.charts.chart_of(job.charts.triangles[slot as usize]);
-    PlacementId::front_of(chart).index() - group.placements.start as usize
 }
 
 /// Claims the free texels whose centre a triangle covers; returns the number of those that were claimed before.
@@ -573,6 +593,7 @@ fn sample_group(
     owners: &mut [u32],
     samples: &mut [TexelSample],
 ) -> Result<()> {
+    let surface = job.surface(group);
     let first = chart_start[group.placements.start as usize];
     let mut next = try_to_vec(&chart_start[group.placements.start as usize..group.placements.end as usize], INDEX)?;
     // Neighbouring texels mostly show the same triangle.
@@ -587,18 +608,18 @@ fn sample_group(
         let (x, y) = (i as u32 % group.window.w as u32, i as u32 / group.window.w as u32);
         let slot = *owner & !BORDER;
         if slot != last.0 {
-            last = (slot, job.flat_triangle(group, slot));
+            last = (slot, surface.flat_triangle(slot));
         }
         let point = match *owner & BORDER {
             0 => DVec2::new(x as f64 + 0.5, y as f64 + 0.5),
             _ => last.1.centroid_in_texel(x as i64, y as i64),
         };
         let [u, v] = last.1.weights(point);
-        let number = &mut next[placement_in_group(job, group, slot)];
+        let number = &mut next[surface.placement(slot)];
         samples[(*number - first) as usize] = TexelSample {
             x: group.window.x + x as u16,
             y: group.window.y + y as u16,
-            triangle: job.charts.triangles[slot as usize],
+            triangle: surface.triangle(slot),
             u: u as f32,
             v: v as f32,
         };

@@ -8,7 +8,6 @@
 //! Without the feature `unwrap`, and for triangles that the crate cannot unwrap, charts are single triangles and pairs
 //! of nearly coplanar triangles, projected on their plane: poor, but valid by construction.
 
-use super::alike::{self, Source};
 use super::pieces::{CHARTS, Groups, Piece, connected_by_vertices};
 use super::planar::{Regions, flat_piece, flat_regions, planar_pieces};
 use super::welded::Geometry;
@@ -39,29 +38,14 @@ pub(in crate::lightmap) fn bytes(triangles: usize, vertices: usize, threads: usi
         + triangles.min(threads * PART_TRIANGLES) * BYTES_IN_PART
 }
 
-/// Unwraps `triangles` (valid global numbers, ascending), those of [like](alike) instances once. Advances `stage` by one per triangle.
+/// Unwraps `triangles` (valid global numbers, ascending), object by object. Advances `stage` by one per triangle.
 pub(in crate::lightmap) fn unwrap(scene: &Scene, triangles: &[u32], stage: &Stage) -> Result<Vec<Piece>> {
     let of_objects = triangles.chunk_by(|&a, &b| scene.locate(a).0 == scene.locate(b).0);
     let of_objects = try_collect(of_objects, CHARTS)?;
-    if scene.instances().is_empty() {
-        return try_par_gather(of_objects.len(), CHARTS, |i, out| {
-            stage.check()?;
-            *out = unwrap_mesh(scene, of_objects[i], stage)?;
-            Ok(())
-        });
-    }
-    let sources = alike::sources(scene, &of_objects)?;
-    let unwrapped = try_par_gather(of_objects.len(), CHARTS, |i, out: &mut Vec<Vec<Piece>>| {
-        stage.check()?;
-        let pieces = if sources[i].index == i { unwrap_mesh(scene, of_objects[i], stage)? } else { Vec::new() };
-        try_push(out, pieces, CHARTS)
-    })?;
     try_par_gather(of_objects.len(), CHARTS, |i, out| {
         stage.check()?;
-        let Source { index, factor } = sources[i];
-        let first = |i: usize| scene.first_triangle(scene.locate(of_objects[i][0]).0);
-        *out = alike::copy(&unwrapped[index], first(i).wrapping_sub(first(index)), factor)?;
-        stage.advance(if index == i { 0 } else { of_objects[i].len() as u64 })
+        *out = unwrap_mesh(scene, of_objects[i], stage)?;
+        Ok(())
     })
 }
 

@@ -166,7 +166,7 @@ mod tests {
         let desc = LightmapDesc { texels_per_unit: 4.0, ..Default::default() };
         let lightmap = Lightmap::create(&scene, &desc, &Progress::none()).unwrap();
         let charts = &lightmap.atlas.charts;
-        (format!("{:?} {:?} {:?}", charts.charts, charts.triangles, charts.corners), scene)
+        (format!("{:?} {:?} {:?}", charts.charts, charts.own.triangles, charts.own.corners), scene)
     }
 
     #[test]

@@ -248,8 +248,13 @@ pub(super) fn materials(scene: &Scene) -> u32 {
 fn layout(atlas: &Atlas) -> u32 {
     let mut sum = crc32fast::Hasher::new();
     sum.update(&atlas.padding.to_ne_bytes());
-    sum.update(bytemuck::cast_slice(&atlas.charts.of_triangles));
-    sum.update(bytemuck::cast_slice(&atlas.charts.corners));
+    for (sheet, _) in atlas.charts.sheets() {
+        sum.update(bytemuck::cast_slice(&sheet.of_triangles));
+        sum.update(bytemuck::cast_slice(&sheet.corners));
+    }
+    for place in &atlas.charts.places {
+        sum.update(bytemuck::cast_slice(&[place.sheet, place.factor.to_bits()]));
+    }
     of_map(&atlas.map, &mut sum);
     of_map(&atlas.gather, &mut sum);
     of_map(&atlas.radiance, &mut sum);

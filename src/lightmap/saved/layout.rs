@@ -2,7 +2,7 @@
 //! the same light map without unwrapping or looking for buried texels.
 //!
 //! A file holds records (`super::records`): `LAYT` with what the light map was made of and counts, `CHRT` (charts, in runs),
-//! `TRIS` (their triangles with local coordinates), `SEEN` (which sides are seen), `PTCH` (texels that show other points,
+//! `TRIS` (their triangles with local coordinates; of instances that are unwrapped alike those of the first), `SEEN` (which sides are seen), `PTCH` (texels that show other points,
 //! by map), `DONE`. Every number is checked before it is used.
 
 use super::fingerprint::{self, compare};
@@ -10,12 +10,15 @@ use super::records::{self, MAGIC, Next, RUN, Tag, take_one};
 use super::{damaged, unreadable};
 use crate::base::error::{Error, Result};
 use crate::base::files;
-use crate::base::memory::{try_collect, try_push, try_vec, try_with_capacity};
+use crate::base::memory::{try_collect, try_push, try_with_capacity};
 use crate::base::progress::Progress;
-use crate::lightmap::atlas::charts::{Charts, Given, MAX_TEXELS, UvReport};
+use crate::lightmap::atlas::alike;
+use crate::lightmap::atlas::charts::{Charts, Given, MAX_TEXELS, UvReport, same_triangles};
+use crate::lightmap::atlas::ids::ChartId;
 use crate::lightmap::atlas::known::{Known, Patch};
 use crate::lightmap::atlas::pieces::Piece;
 use crate::lightmap::atlas::seen::{Seen, is_outdoors};
+use crate::lightmap::atlas::sheets::Sheet;
 use crate::lightmap::{Lightmap, LightmapDesc};
 use crate::scene::Scene;
 use bytemuck::{Pod, Zeroable};
@@ -176,8 +179,8 @@ impl Lightmap {
         let patches = self.patches(progress)?;
         let head = Head {
             origin: Origin::new(&self.atlas.scene, &self.atlas.desc, self.atlas.is_outdoors),
-            charts: charts.charts.len() as u64,
-            triangles: charts.triangles.len() as u64,
+            charts: charts.sheets().map(|(_, charts)| charts.len() as u64).sum(),
+            triangles: charts.sheets().map(|(sheet, _)| sheet.triangles.len() as u64).sum(),
             seen: seen.counts.len() as u64,
             patches: patches.each_ref().map(|p| p.len() as u64),
             places: seen.places,
@@ -196,7 +199,7 @@ impl Lightmap {
                 stage.advance(items as u64)
             };
             records::append(&mut out, HEAD, &[bytemuck::bytes_of(&head)])?;
-            for run in charts.charts.chunks(RUN) {
+            for run in charts.sheets().flat_map(|(_, charts)| charts.chunks(RUN)) {
                 let saved = run.iter().map(|c| {
                     let given = c.given.unwrap_or(Given { page: 0, offset: [0.0; 2], scale: [0.0; 2] });
                     let Given { page, offset, scale } = given;
@@ -211,8 +214,11 @@ impl Lightmap {
                 records::append(&mut out, CHARTS, &[bytemuck::cast_slice(&try_collect(saved, LAYOUT)?)])?;
                 write(&mut out, run.len())?;
             }
-            for run in charts.triangles.chunks(RUN) {
-                let saved = run.iter().map(|&t| SavedTriangle { triangle: t, corners: charts.corners[t as usize] });
+            let runs = charts.sheets().flat_map(|(sheet, _)| sheet.triangles.chunks(RUN).map(move |run| (sheet, run)));
+            for (sheet, run) in runs {
+                let saved = run
+                    .iter()
+                    .map(|&t| SavedTriangle { triangle: sheet.first_triangle + t, corners: sheet.corners[t as usize] });
                 records::append(&mut out, TRIANGLES, &[bytemuck::cast_slice(&try_collect(saved, LAYOUT)?)])?;
                 write(&mut out, run.len())?;
             }
@@ -277,11 +283,11 @@ fn read(scene: &Scene, desc: &LightmapDesc, path: &Path, progress: &Progress) ->
         )));
     }
     let triangles = u64::from(scene.triangle_count());
-    let fits = head.charts <= head.triangles && head.triangles <= triangles && head.seen <= head.charts;
+    let fits = head.charts <= head.triangles && head.triangles <= triangles && head.seen <= MAX_TEXELS;
     if !fits || head.patches.iter().any(|&p| p > MAX_TEXELS) {
         return Err(damaged(path));
     }
-    let bytes = triangles as usize * (2 * size_of::<SavedTriangle>() + Charts::BYTES_PER_TRIANGLE);
+    let bytes = head.triangles as usize * (2 * size_of::<SavedTriangle>() + Charts::BYTES_PER_TRIANGLE);
     let _memory = scene.device().memory().reserve(bytes, LAYOUT)?;
     let stage = progress.stage("loading", 0.0, 0.4, head.items());
     let mut content = Content::default();
@@ -335,31 +341,45 @@ fn known(
     progress: &Progress,
 ) -> Result<Known> {
     let pages = MAX_TEXELS / u64::from(desc.page_size).pow(2);
-    let mut pieces = try_with_capacity(content.charts.len(), LAYOUT)?;
-    let mut is_used: Vec<bool> = try_vec(scene.triangle_count() as usize, LAYOUT)?;
-    let (mut rest, mut last_page) = (&content.triangles[..], Some(0));
+    let mut pieces: Vec<Piece> = try_with_capacity(content.charts.len(), LAYOUT)?;
+    let stage = progress.stage("charts", 0.4, 0.5, u64::from(scene.triangle_count()));
+    let sources = alike::sources(scene, |a, b| same_triangles(scene, a, b, &stage))?;
+    let (mut rest, mut last_page, mut object) = (&content.triangles[..], Some(0), 0);
     for chart in &content.charts {
-        progress.check()?;
+        stage.check()?;
         let of_chart = rest.split_at_checked(chart.triangles as usize).filter(|s| !s.0.is_empty());
         let (triangles, others) = of_chart.ok_or_else(|| damaged(path))?;
         rest = others;
-        for t in triangles {
-            let used = is_used.get_mut(t.triangle as usize).filter(|_| scene.is_valid(t.triangle));
-            let is_new = used.is_some_and(|used| !std::mem::replace(used, true));
-            if !is_new || !t.corners.iter().flatten().all(|c| c.is_finite()) {
-                return Err(damaged(path));
-            }
+        // Charts of meshes come first, then those of instances that are their own sources.
+        let is_of_scene = |t: &SavedTriangle| {
+            t.triangle < scene.triangle_count()
+                && scene.is_valid(t.triangle)
+                && t.corners.iter().flatten().all(|c| c.is_finite())
+        };
+        if !triangles.iter().all(is_of_scene) || !triangles.is_sorted_by(|a, b| a.triangle < b.triangle) {
+            return Err(damaged(path));
         }
+        let meshes = scene.meshes().len() as u32;
+        let [first, last] = [&triangles[0], &triangles[triangles.len() - 1]].map(|t| {
+            let object = scene.locate(t.triangle).0;
+            object.checked_sub(meshes).map_or(0, |instance| instance + 1)
+        });
+        let has_sheet = first.checked_sub(1).is_none_or(|instance| sources[instance as usize].instance == instance);
+        if first != last || first < object || !has_sheet {
+            return Err(damaged(path));
+        }
+        object = first;
         let given =
             (chart.is_given != 0).then_some(Given { page: chart.page, offset: chart.offset, scale: chart.scale });
         // Given charts come first, ordered by page, and lie on their pages.
         let is_possible = given.is_none_or(|given| {
             let uv = |c: [f32; 2], i: usize| given.offset[i] + given.scale[i] * c[i];
-            last_page.is_some_and(|last| last <= given.page)
+            first == 0
+                && last_page.is_some_and(|last| last <= given.page)
                 && u64::from(given.page) < pages
                 && (0..2).all(|i| triangles.iter().flat_map(|t| t.corners).all(|c| (-1.0..=2.0).contains(&uv(c, i))))
         });
-        if !is_possible || !triangles.is_sorted_by_key(|t| t.triangle) {
+        if !is_possible {
             return Err(damaged(path));
         }
         last_page = given.map(|g| g.page);
@@ -370,16 +390,19 @@ fn known(
         });
     }
     let given_charts = pieces.iter().take_while(|p| p.given.is_some()).count() as u32;
+    let charts = Charts::assemble(scene, pieces, &sources, &stage)?;
+    let has_chart = |sheet: &Sheet| sheet.of_triangles.iter().filter(|&&chart| chart != ChartId::NONE).count();
+    if charts.sheets().any(|(sheet, _)| sheet.triangles.len() != has_chart(sheet)) {
+        return Err(damaged(path)); // A triangle is in two charts.
+    }
     let uvs = UvReport {
         given_charts,
-        unwrapped_charts: pieces.len() as u32 - given_charts,
+        unwrapped_charts: charts.charts.len() as u32 - given_charts,
         out_of_range: head.out_of_range,
         degenerate: head.degenerate,
         overlapping: head.overlapping,
         ..UvReport::default()
     };
-    let stage = progress.stage("charts", 0.4, 0.5, 1);
-    let charts = Charts::assemble(scene, pieces, &stage)?;
     let looks = !desc.seen_from.is_empty();
     let sides = if looks || charts.charts.iter().any(|c| c.two_sided) { charts.charts.len() } else { 0 };
     if !rest.is_empty() || content.seen.len() != sides {

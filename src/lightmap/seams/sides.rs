@@ -3,6 +3,9 @@
 //! Sides of triangles are put into the cells of a grid by the middles of their edges, counted first, and cells that
 //! follow one another along a space-filling curve (Morton 1966) are sorted together: in linear time, in parallel, in 4
 //! bytes per side, and with neighbours in memory close together.
+//!
+//! Instances that are unwrapped alike have the same edges inside, which are found once. Only the sides that one triangle of
+//! an instance has alone are compared with those of other objects.
 
 use crate::base::error::Result;
 use crate::base::memory::{try_collect, try_par_collect, try_par_gather, try_push};
@@ -16,20 +19,29 @@ use std::sync::atomic::AtomicU32;
 use std::sync::atomic::Ordering::Relaxed;
 
 /// An edge of a triangle in one of its placements: three times the triangle's global number, plus the number of the
-/// corner that the edge starts at (triangle numbers have 28 bits), plus [`SECOND`] in the placement of a back.
+/// corner that the edge starts at, plus [`SECOND`] in the placement of a back.
 #[derive(Clone, Copy, Debug, Default, PartialEq, Eq, PartialOrd, Ord)]
-pub(super) struct Side(u32);
+pub(super) struct Side(u64);
 
-const SECOND: u32 = 1 << 31;
+const SECOND: u64 = 1 << 63;
 
 impl Side {
+    fn new(triangle: u32, corner: u32) -> Side {
+        Side(3 * u64::from(triangle) + u64::from(corner))
+    }
+
+    /// Returns the same side of the triangle whose number is greater by `shift` (modulo 2^32).
+    pub(super) fn shifted(self, shift: u32) -> Side {
+        Side::new(self.triangle().wrapping_add(shift), self.corner() as u32)
+    }
+
     /// Returns the same side in the placement of the back.
     pub(super) fn second(self) -> Side {
         Side(self.0 | SECOND)
     }
 
     pub(super) fn triangle(self) -> u32 {
-        (self.0 & !SECOND) / 3
+        ((self.0 & !SECOND) / 3) as u32
     }
 
     /// Returns the number of the triangle's corner that the edge starts at.
@@ -60,10 +72,10 @@ const MAX_LEVEL: u32 = 8;
 /// Name of the buffers in error messages.
 const EDGES: &str = "the edges of the charts";
 
-/// Estimates the bytes that [`shared_edges`] takes, without what it returns.
-pub(super) fn bytes(triangles: usize, threads: usize) -> usize {
-    let cells = size_of::<u32>() << (3 * Cells::level(triangles));
-    3 * triangles * size_of::<Side>() + cells + threads * 2 * BUCKET * size_of::<(u64, Side)>()
+/// Estimates the bytes that [`for_each_edge`] takes for a number of sides, without what it returns.
+pub(super) fn bytes(sides: usize, threads: usize) -> usize {
+    let cells = size_of::<u32>() << (3 * Cells::level(sides));
+    sides * size_of::<u32>() + cells + threads * 2 * BUCKET * size_of::<(u64, Side)>()
 }
 
 /// The cells of a cubic grid, numbered along a space-filling curve.
@@ -77,13 +89,13 @@ struct Cells {
 impl Cells {
     /// Returns how often the grid is halved along each axis. A surface meets some 4^level of the 8^level cells: about
     /// four for each bucket.
-    fn level(triangles: usize) -> u32 {
-        let buckets = (3 * triangles).div_ceil(BUCKET).max(1);
+    fn level(sides: usize) -> u32 {
+        let buckets = sides.div_ceil(BUCKET).max(1);
         (1 + buckets.ilog2().div_ceil(2)).min(MAX_LEVEL)
     }
 
-    fn new(scene: &Scene, triangles: usize) -> Cells {
-        let ((lower, upper), level) = (scene.bounds(), Self::level(triangles));
+    fn new(scene: &Scene, sides: usize) -> Cells {
+        let ((lower, upper), level) = (scene.bounds(), Self::level(sides));
         Cells { lower, scale: (1 << level) as f32 / (upper - lower).max_element(), level }
     }
 
@@ -101,21 +113,41 @@ impl Cells {
     }
 }
 
-/// Calls `visit` with each edge that exactly two of some triangles share, and collects what it adds. If three or more
-/// share an edge, another surface stands on this one, and light need not continue below it. (The rare edges that share
-/// a hash are skipped too.)
-pub(super) fn shared_edges<T: Send>(
+/// Sides that are compared.
+pub(super) struct Sides<'a> {
+    /// Triangles, by their numbers less the first one's, of which all three sides are.
+    pub triangles: &'a [u32],
+    pub first_triangle: u32,
+    pub others: &'a [Side],
+}
+
+impl Sides<'_> {
+    pub(super) fn len(&self) -> usize {
+        3 * self.triangles.len() + self.others.len()
+    }
+
+    fn get(&self, index: usize) -> Side {
+        match self.triangles.get(index / 3) {
+            Some(&t) => Side::new(self.first_triangle + t, index as u32 % 3),
+            None => self.others[index - 3 * self.triangles.len()],
+        }
+    }
+}
+
+/// Calls `visit` with the sides of each edge, of which only the ends count, and collects what it adds. (The rare edges
+/// that share a hash are taken for one.)
+pub(super) fn for_each_edge<T: Send>(
     scene: &Scene,
-    triangles: &[u32],
+    sides: &Sides,
     stage: &Stage,
-    visit: impl Fn([Side; 2], &mut Vec<T>) -> Result<()> + Sync,
+    visit: &(dyn Fn(&[(u64, Side)], &mut Vec<T>) -> Result<()> + Sync),
 ) -> Result<Vec<T>> {
-    let cells = Cells::new(scene, triangles.len());
-    let each = |visit: &(dyn Fn(Side, usize) + Sync)| {
-        triangles.par_chunks(PART).try_for_each(|part| {
-            for &t in part {
-                let corners = scene.corners(t);
-                sides_of(t).into_iter().for_each(|side| visit(side, cells.of(side.ends(corners))));
+    let cells = Cells::new(scene, sides.len());
+    let each = |visit: &(dyn Fn(usize, usize) + Sync)| {
+        (0..sides.len().div_ceil(PART)).into_par_iter().try_for_each(|part| {
+            for index in part * PART..sides.len().min((part + 1) * PART) {
+                let side = sides.get(index);
+                visit(index, cells.of(side.ends(scene.corners(side.triangle()))));
             }
             stage.check()
         })
@@ -129,8 +161,8 @@ pub(super) fn shared_edges<T: Send>(
         *start.get_mut() = sum;
     }
     // Cells are filled from behind. The order in a cell depends on the threads, but not when it is sorted.
-    let sides = zeros(3 * triangles.len())?;
-    each(&|side, cell| sides[starts[cell].fetch_sub(1, Relaxed) as usize - 1].store(side.0, Relaxed))?;
+    let indices = zeros(sides.len())?;
+    each(&|index, cell| indices[starts[cell].fetch_sub(1, Relaxed) as usize - 1].store(index as u32, Relaxed))?;
     stage.check()?;
 
     let mut buckets: Vec<usize> = Vec::new();
@@ -142,24 +174,18 @@ pub(super) fn shared_edges<T: Send>(
     drop(starts);
     try_par_gather(buckets.len(), EDGES, |bucket, out| {
         stage.check()?;
-        let range = buckets[bucket]..buckets.get(bucket + 1).copied().unwrap_or(sides.len());
-        let hashed = sides[range].iter().map(|side| {
-            let side = Side(side.load(Relaxed));
+        let range = buckets[bucket]..buckets.get(bucket + 1).copied().unwrap_or(indices.len());
+        let hashed = indices[range].iter().map(|index| {
+            let side = sides.get(index.load(Relaxed) as usize);
             (hash(side.ends(scene.corners(side.triangle()))), side)
         });
         let mut hashed = try_collect(hashed, EDGES)?;
         sort(&mut hashed, &|| stage.check())?;
         for same in hashed.chunk_by(|a, b| a.0 == b.0) {
-            if let &[(_, a), (_, b)] = same {
-                visit([a, b], out)?;
-            }
+            visit(same, out)?;
         }
         Ok(())
     })
-}
-
-fn sides_of(triangle: u32) -> [Side; 3] {
-    [0, 1, 2].map(|k| Side(3 * triangle + k))
 }
 
 /// Hashes an edge, with the same result for both directions.
@@ -185,7 +211,7 @@ mod tests {
             let scene = builtin(name).unwrap().committed();
             let triangles: Vec<u32> = (0..scene.triangle_count()).filter(|&t| scene.is_valid(t)).collect();
             let mut sides = BTreeMap::<_, Vec<Side>>::new();
-            for side in triangles.iter().flat_map(|&t| sides_of(t)) {
+            for side in triangles.iter().flat_map(|&t| [0, 1, 2].map(|k| Side::new(t, k))) {
                 let mut ends = side.ends(scene.corners(side.triangle())).map(|p| p.to_array().map(float_key));
                 ends.sort_unstable();
                 sides.entry(ends).or_default().push(side);
@@ -193,7 +219,15 @@ mod tests {
             let mut expected: Vec<[Side; 2]> = sides.into_values().filter_map(|s| s.try_into().ok()).collect();
             let progress = Progress::none();
             let stage = progress.stage("seams", 0.0, 1.0, 1);
-            let mut found = shared_edges(&scene, &triangles, &stage, |edge, out| try_push(out, edge, "edges")).unwrap();
+            // Half as triangles, half as sides.
+            let (some, rest) = triangles.split_at(triangles.len() / 2);
+            let others: Vec<Side> = rest.iter().flat_map(|&t| [0, 1, 2].map(|k| Side::new(t, k))).collect();
+            let sides = Sides { triangles: some, first_triangle: 0, others: &others };
+            let mut found = for_each_edge(&scene, &sides, &stage, &|same, out| match *same {
+                [(_, a), (_, b)] => try_push(out, [a, b], "edges"),
+                _ => Ok(()),
+            })
+            .unwrap();
             expected.sort_unstable();
             found.sort_unstable();
             assert_eq!(found, expected, "{name}");

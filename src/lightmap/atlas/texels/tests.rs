@@ -7,6 +7,7 @@ use crate::lightmap::atlas::charts::Chart;
 use crate::lightmap::atlas::charts::tests::{grid, map_of, quad, scene_of, scene_on};
 use crate::lightmap::atlas::ids::ChartId;
 use crate::lightmap::atlas::pieces::Given;
+use crate::lightmap::atlas::sheets::Sheet;
 use crate::scene::Mesh;
 use proptest::prelude::*;
 
@@ -175,7 +176,7 @@ proptest! {
             Chart { triangles: 0..1, given: given(corner, size), ..charts.charts[0].clone() },
             Chart { triangles: 1..2, given: given([0.4, 0.3], [0.3, 0.5]), ..charts.charts[0].clone() },
         ];
-        charts.of_triangles = [0, 1].map(ChartId::new).to_vec();
+        charts.own.of_triangles = [0, 1].map(ChartId::new).to_vec();
         let layout = Layout::pack(&charts, 1.0, 32, 2, true, &[], &[], &Progress::none()).unwrap();
         let map = map_of(&scene, &charts, &layout);
         let area = PageArea { columns: x0..(x0 + w).min(32), rows: y0..(y0 + h).min(32) };
@@ -235,9 +236,13 @@ fn unit_quad() -> (std::sync::Arc<Scene>, Charts) {
     let scene = scene_of(quad());
     let charts = Charts {
         charts: vec![Chart { triangles: 0..2, size: [1.0; 2], area: 1.0, two_sided: false, given: None }],
-        triangles: vec![0, 1],
-        of_triangles: vec![ChartId::new(0); 2],
-        corners: vec![[[0.0, 0.0], [1.0, 0.0], [1.0, 1.0]], [[0.0, 0.0], [1.0, 1.0], [0.0, 1.0]]],
+        own: Sheet {
+            triangles: vec![0, 1],
+            of_triangles: vec![ChartId::new(0); 2],
+            corners: vec![[[0.0, 0.0], [1.0, 0.0], [1.0, 1.0]], [[0.0, 0.0], [1.0, 1.0], [0.0, 1.0]]],
+            ..Sheet::default()
+        },
+        ..Charts::default()
     };
     (scene, charts)
 }
@@ -293,9 +298,9 @@ fn of_overlapping_given_triangles_the_first_one_wins_and_texels_are_counted() {
     let given = Some(Given { page: 0, offset: [0.0; 2], scale: [1.0; 2] });
     let chart = |t: u32| Chart { triangles: t..t + 1, given, ..charts.charts[0].clone() };
     charts.charts = vec![chart(0), chart(1)];
-    charts.of_triangles = [0, 1].map(ChartId::new).to_vec();
+    charts.own.of_triangles = [0, 1].map(ChartId::new).to_vec();
     // The second lies on the first, and on a part of the page that is its own.
-    charts.corners[1] = [[0.0, 0.0], [1.0, 0.0], [0.0, 1.0]];
+    charts.own.corners[1] = [[0.0, 0.0], [1.0, 0.0], [0.0, 1.0]];
     let layout = Layout::pack(&charts, 1.0, 8, 2, true, &[], &[], &Progress::none()).unwrap();
     let map = map_of(&scene, &charts, &layout);
     // The right triangle x ≥ y has 36 centres; x + y ≤ 8 has 36 too; both have 20, of which those

@@ -1,0 +1,151 @@
+//! Sheets: unwrapped surfaces with numbers of triangles and charts of their own. The meshes that stand in the scene
+//! themselves are one sheet. An instance has the sheet of the first instance that is unwrapped [alike](super::alike), with
+//! a factor of its lengths: however many instances there are, their charts take memory and time once.
+
+use super::charts::{Chart, Charts};
+use super::ids::ChartId;
+use super::pieces::{CHARTS, Piece};
+use crate::base::error::Result;
+use crate::base::memory::{try_filled, try_push, try_with_capacity, try_zeroed_as_needed};
+use crate::base::progress::Stage;
+use crate::scene::Scene;
+use glam::Vec2;
+use std::ops::Range;
+
+/// An unwrapped surface.
+#[derive(Clone, Debug, Default, PartialEq)]
+pub(in crate::lightmap) struct Sheet {
+    /// Triangles by their numbers in the sheet, chart by chart, ascending in each.
+    pub triangles: Vec<u32>,
+    /// Number in the sheet of each triangle's chart, [`ChartId::NONE`] for degenerate ones.
+    pub of_triangles: Vec<ChartId>,
+    /// Local coordinates of the corners of each triangle, in units of the object that the sheet was made of.
+    pub corners: Vec<[[f32; 2]; 3]>,
+    /// Where the sheet was made: global number of its first triangle, and its charts among those of the scene.
+    pub first_triangle: u32,
+    pub charts: Range<u32>,
+    /// Number of its first chart among those of all sheets.
+    pub first_shape: u32,
+}
+
+/// Where a sheet stands in the scene: an instance.
+#[derive(Clone, Copy, Debug, PartialEq)]
+pub(in crate::lightmap) struct Place {
+    /// Global number of the first triangle.
+    pub first_triangle: u32,
+    pub first_chart: ChartId,
+    /// Index among [`Charts::shared`].
+    pub sheet: u32,
+    /// Scene units per unit of the sheet's local coordinates.
+    pub factor: f32,
+}
+
+/// A chart as it is in its sheet.
+pub(in crate::lightmap) struct Shape<'a> {
+    pub sheet: &'a Sheet,
+    /// Global number of the sheet's first triangle.
+    pub first_triangle: u32,
+    /// Scene units per unit of the sheet's local coordinates.
+    pub factor: f32,
+    /// Number among the charts of all sheets.
+    pub number: usize,
+}
+
+impl Sheet {
+    /// Makes a sheet of pieces, with global triangle numbers of `range`, and appends its charts to `charts`.
+    pub(super) fn new(
+        scene: &Scene,
+        range: Range<u32>,
+        pieces: impl Iterator<Item = Piece>,
+        charts: &mut Vec<Chart>,
+        first_shape: usize,
+        stage: &Stage,
+    ) -> Result<Sheet> {
+        let total = range.len();
+        let first_chart = charts.len();
+        let mut sheet = Sheet {
+            triangles: try_with_capacity(total, CHARTS)?,
+            of_triangles: try_filled(total, ChartId::NONE, CHARTS)?,
+            // Untouched until a piece is moved there, which is then freed.
+            corners: try_zeroed_as_needed(total, CHARTS)?,
+            first_triangle: range.start,
+            charts: first_chart as u32..first_chart as u32,
+            first_shape: first_shape as u32,
+        };
+        for piece in pieces {
+            stage.check()?;
+            let points = piece.corners.iter().flatten().map(|&p| Vec2::from_array(p));
+            let (lower, upper) =
+                points.fold((Vec2::INFINITY, Vec2::NEG_INFINITY), |(lo, hi), p| (lo.min(p), hi.max(p)));
+            let first = sheet.triangles.len() as u32;
+            let mut area = 0.0;
+            for (&t, corners) in piece.triangles.iter().zip(&piece.corners) {
+                let own = t - range.start;
+                sheet.of_triangles[own as usize] = ChartId::new(charts.len() - first_chart);
+                sheet.corners[own as usize] = corners.map(|c| (Vec2::from_array(c) - lower).to_array());
+                try_push(&mut sheet.triangles, own, CHARTS)?;
+                area += super::charts::triangle_area(scene, t);
+            }
+            let chart = Chart {
+                triangles: first..sheet.triangles.len() as u32,
+                size: (upper - lower).to_array(),
+                area: area as f32,
+                two_sided: scene.material(piece.triangles[0]).two_sided,
+                given: piece.given,
+            };
+            try_push(charts, chart, CHARTS)?;
+        }
+        sheet.charts.end = charts.len() as u32;
+        Ok(sheet)
+    }
+
+    pub(super) fn bytes(&self) -> usize {
+        self.corners.len() * 24 + (self.triangles.len() + self.of_triangles.len()) * 4
+    }
+}
+
+impl Shape<'_> {
+    /// Returns the local coordinates of the corners of a triangle of the sheet.
+    #[inline]
+    pub fn corners(&self, triangle: u32) -> [[f32; 2]; 3] {
+        scaled(self.sheet.corners[triangle as usize], self.factor)
+    }
+}
+
+/// Scales local coordinates by a factor. (By 1, bits stay.)
+#[inline]
+pub(super) fn scaled(corners: [[f32; 2]; 3], factor: f32) -> [[f32; 2]; 3] {
+    corners.map(|c| c.map(|x| x * factor))
+}
+
+impl Charts {
+    /// Number of charts of meshes that stand in the scene themselves, which come first.
+    pub(super) fn own_charts(&self) -> usize {
+        self.places.first().map_or(self.charts.len(), |place| place.first_chart.index())
+    }
+
+    /// Returns the chart of a triangle of an instance, and its sheet; `None` if there is no such triangle.
+    pub(super) fn place_of(&self, triangle: u32) -> Option<(&Place, &Sheet, u32)> {
+        let after = self.places.partition_point(|place| place.first_triangle <= triangle);
+        let place = self.places.get(after.checked_sub(1)?)?;
+        let (sheet, own) = (&self.shared[place.sheet as usize], triangle - place.first_triangle);
+        ((own as usize) < sheet.of_triangles.len()).then_some((place, sheet, own))
+    }
+
+    /// Returns a chart as it is in its sheet.
+    pub(in crate::lightmap) fn shape(&self, chart: ChartId) -> Shape<'_> {
+        if chart.index() < self.own_charts() {
+            return Shape { sheet: &self.own, first_triangle: 0, factor: 1.0, number: chart.index() };
+        }
+        let place = &self.places[self.places.partition_point(|place| place.first_chart <= chart) - 1];
+        let sheet = &self.shared[place.sheet as usize];
+        let number = sheet.first_shape as usize + chart.index() - place.first_chart.index();
+        Shape { sheet, first_triangle: place.first_triangle, factor: place.factor, number }
+    }
+
+    /// Returns all sheets, with their charts where they were made.
+    pub(in crate::lightmap) fn sheets(&self) -> impl Iterator<Item = (&Sheet, &[Chart])> {
+        let charts = |sheet: &Sheet| &self.charts[sheet.charts.start as usize..sheet.charts.end as usize];
+        std::iter::once(&self.own).chain(&self.shared).map(move |sheet| (sheet, charts(sheet)))
+    }
+}
