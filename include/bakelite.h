@@ -1658,7 +1658,6 @@ BK_API void bk_lightmap_desc_init(bk_lightmap_desc *desc);
 /// @retval BK_ERROR_INVALID_STATE  the scene is not committed or is being refitted
 /// @retval BK_ERROR_OUT_OF_MEMORY  there would be more than 2^29 texels, they do not fit, or the
 ///   memory callback refuses
-/// @retval BK_ERROR_UNSUPPORTED  the scene has more than 2^28 triangles, those of instances counted
 /// @retval BK_ERROR_CANCELLED  the progress callback returned 0
 BK_API
 bk_result bk_lightmap_create(const bk_scene *scene,
@@ -1738,7 +1737,6 @@ bk_result bk_lightmap_save_layout(const bk_lightmap *lightmap,
 /// @retval BK_ERROR_IO  the file cannot be read, is damaged, or is another kind of file;
 ///   bk_last_error names it
 /// @retval BK_ERROR_OUT_OF_MEMORY  the light map does not fit or the memory callback refuses
-/// @retval BK_ERROR_UNSUPPORTED  the scene has more than 2^28 triangles, those of instances counted
 /// @retval BK_ERROR_CANCELLED  the progress callback returned 0
 BK_EXPERIMENTAL
 bk_result bk_lightmap_load_layout(const bk_scene *scene,

@@ -56,8 +56,16 @@ const SPACING: f32 = 0.5;
 /// Name of the seams in error messages.
 const SEAMS: &str = "the seams";
 
+/// Points that stand for less than this length, in texels, and lie between the same texels become one: else memory and time
+/// of the solution grow with the triangles along seams.
+const SHORTEST: f32 = 0.125;
+
+/// Number of points before a short one that are looked at for one that it can join: along most seams the next edges in the
+/// mesh lie beside one another.
+const LOOK_BACK: usize = 16;
+
 /// Number of edges whose points a thread computes at a time.
-const EDGES: usize = 64;
+const EDGES: usize = 256;
 
 /// Stitched texels and their light: before the stitching or after it, whichever the light map does not hold.
 pub(crate) struct Stitch {
@@ -240,10 +248,7 @@ impl Job<'_, '_, '_> {
     fn run(&self, view: &View, plan: &Plan, stats: &mut BakeStats) -> Result<Option<(Stitch, [u64; 2])>> {
         let edges = self.edges()?;
         self.stage.advance(0)?;
-        let count: usize = edges.iter().map(|e| self.point_count(e)).sum();
-        let uses = 8 * size_of::<(u32, f32)>();
-        let bytes = count * (size_of::<Point>() + uses + size_of::<Vec3A>()) + self.atlas.map.len() * 4;
-        let _memory = self.reserve(bytes, "the seams' points")?;
+        let _edges = self.reserve(size_of_val(&edges[..]), SEAMS)?;
         let unlike = AtomicU64::new(0);
         let is_stitched = |p: &Point| {
             if !is_cut(p) || !p.texels.iter().all(|&t| view.is_valid(t as usize)) {
@@ -257,7 +262,11 @@ impl Job<'_, '_, '_> {
             self.stage.check()?;
             for e in &edges[part * EDGES..edges.len().min((part + 1) * EDGES)] {
                 for p in self.points(e).filter(&is_stitched) {
-                    try_push(out, p, POINTS)?;
+                    let joined = |before: &&mut Point| before.length < SHORTEST && before.texels == p.texels;
+                    match out.iter_mut().rev().take(LOOK_BACK).find(joined) {
+                        Some(before) if p.length < SHORTEST => before.join(&p),
+                        _ => try_push(out, p, POINTS)?,
+                    }
                 }
             }
             Ok(())
@@ -265,6 +274,11 @@ impl Job<'_, '_, '_> {
         if points.is_empty() {
             return Ok(None);
         }
+        let count = edges.len();
+        drop(edges);
+        let uses = 8 * size_of::<(u32, f32)>();
+        let bytes = points.len() * (size_of::<Point>() + uses + size_of::<Vec3A>()) + self.atlas.map.len() * 4;
+        let _memory = self.reserve(bytes, POINTS)?;
         self.stage.advance(0)?;
         let texels = number(&mut points, self.atlas.map.len(), self.stage)?;
         let n = texels.len();
@@ -293,7 +307,7 @@ impl Job<'_, '_, '_> {
             _ => self.directional(&system, view, &texels)?,
         };
         let stitch = Stitch { texels, direct, indirect, directional, _memory: memory };
-        Ok(Some((stitch, [edges.len() as u64, unlike.into_inner()])))
+        Ok(Some((stitch, [count as u64, unlike.into_inner()])))
     }
 
     /// Returns the stitched light by direction, of which each coefficient is a layer.
@@ -336,10 +350,14 @@ impl Job<'_, '_, '_> {
                 self.stage.check()?;
                 inside.iter().try_for_each(|edge| self.push_seams(edge.map(|side| side.shifted(shift(places[i]))), out))
             })?;
-            try_append(&mut edges, &found, SEAMS)?;
+            if edges.is_empty() {
+                edges = found;
+            } else {
+                try_append(&mut edges, &found, SEAMS)?;
+            }
             for place in places {
-                others.try_reserve(2 * alone.len()).map_err(|e| Error::OutOfMemory(format!("{SEAMS}: {e}")))?;
-                others.extend(alone.iter().flatten().map(|side| side.shifted(shift(place))));
+                others.try_reserve(alone.len()).map_err(|e| Error::OutOfMemory(format!("{SEAMS}: {e}")))?;
+                others.extend(alone.iter().map(|[side, _]| side.shifted(shift(place))));
             }
         }
         let sides = Sides { triangles: &charts.own.triangles, first_triangle: 0, others: &others };
@@ -379,7 +397,8 @@ impl Job<'_, '_, '_> {
 
     /// Adds the seams of an edge in all pairs of placements.
     fn push_seams(&self, edge: [Side; 2], out: &mut Vec<[Side; 2]>) -> Result<()> {
-        self.in_places(edge).filter(|&edge| self.is_seam(edge)).try_for_each(|edge| try_push(out, edge, SEAMS))
+        let mut seams = self.in_places(edge).filter(|&edge| self.is_seam(edge));
+        seams.try_for_each(|edge| try_push(out, edge, SEAMS))
     }
 
     /// Whether the two triangles of an edge have different charts, or it has different places in their chart, or the

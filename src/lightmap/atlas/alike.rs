@@ -65,7 +65,9 @@ fn shape(matrix: glam::Mat3) -> (f64, [DVec3; 2]) {
 mod tests {
     use super::*;
     use crate::base::progress::Progress;
-    use crate::lightmap::atlas::charts::triangle_area;
+    use crate::lightmap::atlas::chart_index::ChartIndex;
+    use crate::lightmap::atlas::charts::tests::check;
+    use crate::lightmap::atlas::charts::{Charts, triangle_area};
     use crate::lightmap::{Lightmap, LightmapDesc};
     use crate::scene::{Instance, Material, SceneData, shapes::MeshBuilder};
     use glam::{Affine3A, Quat, Vec3};
@@ -97,6 +99,25 @@ mod tests {
         assert_eq!(sources.iter().map(|s| s.instance).collect::<Vec<_>>(), [0, 0, 2, 2]);
         let factors = sources.iter().map(|s| s.factor);
         assert!(factors.zip([1.0, 2.0, 1.0, 3.0]).all(|(a, b)| (a - b).abs() < 1e-5 * b), "{sources:?}");
+    }
+
+    #[test]
+    fn charts_of_instances_are_whole_and_kept_once() {
+        let transforms = [at(Vec3::ONE, 0.0, 0.0), at(Vec3::splat(2.0), 1.0, 5.0), at(Vec3::splat(0.5), 2.5, -4.0)];
+        let scene = scene(&transforms);
+        let (charts, report) = Charts::of_scene(&scene, 4.0, 256, 2, &Progress::none()).unwrap();
+        check(&scene, &charts);
+        assert_eq!((charts.shared.len(), charts.places.len(), charts.charts.len() % 3), (1, 3, 0));
+        assert_eq!(report.unwrapped_charts as usize, charts.charts.len());
+        let one = Charts::of_scene(&self::scene(&transforms[..1]), 4.0, 256, 2, &Progress::none()).unwrap().0;
+        assert!(charts.bytes() < one.bytes() + 1000 * charts.places.len(), "{} {}", charts.bytes(), one.bytes());
+        // Points are found at their places.
+        let index = ChartIndex::new(scene.device(), &charts).unwrap();
+        for t in (0..scene.triangle_count()).step_by(7) {
+            let local = charts.local(t, 0.3, 0.3);
+            let found = index.locate(&charts, charts.chart_of(t), local.into(), t).unwrap();
+            assert!(found.triangle == t && (found.u - 0.3).abs() + (found.v - 0.3).abs() < 1e-4, "{t} {found:?}");
+        }
     }
 
     #[test]

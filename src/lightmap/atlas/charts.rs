@@ -10,6 +10,7 @@ use super::pieces::{CHARTS, Groups, Piece, connected, float_key, surface_kind};
 use super::sheets::{Place, Shape, Sheet, scaled};
 use super::unwrap;
 use crate::base::error::{Error, Result, invalid_argument};
+use crate::base::geometry::is_valid_triangle;
 use crate::base::memory::{try_collect, try_push, try_with_capacity};
 use crate::base::progress::{Progress, Stage};
 use crate::device::LogLevel;
@@ -279,9 +280,11 @@ impl Charts {
 /// Whether the same triangles of two instances of a mesh are valid.
 pub(in crate::lightmap) fn same_triangles(scene: &Scene, a: u32, b: u32, stage: &Stage) -> Result<bool> {
     stage.check()?;
-    let [a, b] = [a, b].map(|instance| scene.triangles_of(scene.object_of_instance(instance)));
-    let same = |i: u32| scene.is_valid(a.start + i) == scene.is_valid(b.start + i);
-    Ok(scene.device().install(|| (0..a.len() as u32).into_par_iter().with_min_len(1 << 12).all(same)))
+    let [a, b] = [a, b].map(|instance| scene.object(scene.object_of_instance(instance)));
+    let triangles = a.mesh().indices.len() as u32;
+    // What the build skips is the mesh's, and so the same.
+    let same = |i: u32| is_valid_triangle(a.corners(i)) == is_valid_triangle(b.corners(i));
+    Ok(scene.device().install(|| (0..triangles).into_par_iter().with_min_len(1 << 12).all(same)))
 }
 
 /// Returns the area of all valid triangles, in squared scene units.

@@ -22,6 +22,20 @@ impl Flat {
         (extent.x * extent.y) as u64
     }
 
+    /// Whether the triangle lies in at most four texels of a window of `size`, and all of them are `such`: few of the triangles
+    /// that are smaller than texels need a closer look.
+    pub(in crate::lightmap) fn lies_in_few(&self, size: [i64; 2], such: impl Fn(i64, i64) -> bool) -> bool {
+        let (lower, upper) = self.bounds();
+        let range = |from: f64, to: f64, size: i64| {
+            let first = (from.floor() as i64).clamp(0, size - 1);
+            first..=(to.floor() as i64).clamp(first, size - 1)
+        };
+        let (rows, columns) = (range(lower.y, upper.y, size[1]), range(lower.x, upper.x, size[0]));
+        rows.end() - rows.start() <= 1
+            && columns.end() - columns.start() <= 1
+            && rows.into_iter().all(|y| columns.clone().all(|x| such(x, y)))
+    }
+
     /// Returns the ends of the longest edge, as numbers of corners.
     pub(in crate::lightmap) fn longest_edge(&self) -> (usize, usize) {
         let length = |(i, j): (usize, usize)| self.0[i].distance_squared(self.0[j]);

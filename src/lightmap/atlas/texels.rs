@@ -536,15 +536,20 @@ fn cover_group(
         overlapping += cover_centres(&flat, slot, size, owners);
         check(flat.box_texels(size))?;
     }
+    // By a triangle that covers the centre.
+    let is_owned = |owner: u32| owner != NONE && owner & BORDER == 0;
     // Squared distance of the nearest triangle to the centre, for texels whose centre is in none.
     scratch.clear();
     scratch.try_reserve(owners.len()).map_err(|e| Error::OutOfMemory(format!("{INDEX}: {e}")))?;
     scratch.resize(owners.len(), f64::INFINITY);
     for slot in surface.slots.clone() {
         let flat = surface.flat_triangle(slot);
+        if flat.lies_in_few(size, |x, y| is_owned(owners[(y * size[0] + x) as usize])) {
+            continue;
+        }
         flat.for_each_touched(size, |x, y| {
             let i = (y * size[0] + x) as usize;
-            if owners[i] == NONE || owners[i] & BORDER != 0 {
+            if !is_owned(owners[i]) {
                 let distance = flat.nearest_in_texel(x, y).1;
                 // Rounding must not decide between triangles that share the nearest point.
                 if distance < scratch[i] - 1e-9 {

@@ -33,6 +33,9 @@ const SEEN: Tag = *b"SEEN";
 const PATCHES: Tag = *b"PTCH";
 const DONE: Tag = *b"DONE";
 
+/// Maximum extent of a chart, far more than one of valid triangles can have.
+const MAX_LENGTH: f32 = 1e30;
+
 /// Name of the buffers in error messages.
 const LAYOUT: &str = "the layout of a light map";
 
@@ -344,6 +347,8 @@ fn known(
     let mut pieces: Vec<Piece> = try_with_capacity(content.charts.len(), LAYOUT)?;
     let stage = progress.stage("charts", 0.4, 0.5, u64::from(scene.triangle_count()));
     let sources = alike::sources(scene, |a, b| same_triangles(scene, a, b, &stage))?;
+    // No local coordinates are longer than the surface is, wherever it stands.
+    let limit = sources.iter().fold(1.0f32, |m, s| m.max(s.factor)).recip() * MAX_LENGTH;
     let (mut rest, mut last_page, mut object) = (&content.triangles[..], Some(0), 0);
     for chart in &content.charts {
         stage.check()?;
@@ -354,7 +359,7 @@ fn known(
         let is_of_scene = |t: &SavedTriangle| {
             t.triangle < scene.triangle_count()
                 && scene.is_valid(t.triangle)
-                && t.corners.iter().flatten().all(|c| c.is_finite())
+                && t.corners.iter().flatten().all(|c| c.abs() <= limit)
         };
         if !triangles.iter().all(is_of_scene) || !triangles.is_sorted_by(|a, b| a.triangle < b.triangle) {
             return Err(damaged(path));

@@ -426,9 +426,12 @@ fn coarse() -> LightmapDesc {
 #[test]
 fn a_layout_comes_back_with_all_its_bits() {
     let above = Region { lower: Vec3::new(0.4, 0.9, 0.4), upper: Vec3::new(0.6, 0.95, 0.6) };
-    for (name, texels_per_unit, seen_from) in
-        [("cornell", 40.0, vec![]), ("atrium", 4.0, vec![]), ("cornell", 40.0, vec![above])]
-    {
+    for (name, texels_per_unit, seen_from) in [
+        ("cornell", 40.0, vec![]),
+        ("atrium", 4.0, vec![]),
+        ("cornell", 40.0, vec![above]),
+        ("colonnade:100000", 2.0, vec![]),
+    ] {
         let scene = scene_of(name, None);
         let desc = LightmapDesc { texels_per_unit, seen_from, ..coarse() };
         let made = Lightmap::create(&scene, &desc, &Progress::none()).unwrap();
@@ -496,16 +499,22 @@ fn a_layout_of_something_else_is_refused_by_name() {
 /// With right checksums, too, no number leads out of a buffer: each file is refused, or a light map that can be read.
 #[test]
 fn damaged_layouts_are_refused_or_harmless() {
-    let (scene, place) = (scene_of("cornell", None), Place::new());
-    let desc = LightmapDesc { texels_per_unit: 20.0, ..coarse() };
+    damage("cornell", 20.0, 1000);
+    damage("colonnade:100000", 0.5, 60);
+}
+
+fn damage(name: &str, texels_per_unit: f32, changes: u32) {
+    let (scene, place) = (scene_of(name, None), Place::new());
+    let desc = LightmapDesc { texels_per_unit, ..coarse() };
     Lightmap::create(&scene, &desc, &Progress::none()).unwrap().save_layout(&place.0, &Progress::none()).unwrap();
     let bytes = place.bytes();
     let load = |bytes: &[u8]| Lightmap::load_layout(&scene, &desc, &Place::of(bytes).0, &Progress::none());
-    for i in 0..200 {
+    let places = changes as usize / 5;
+    for i in 0..places {
         let mut flipped = bytes.clone();
-        flipped[i * bytes.len() / 200] ^= 1 << (i % 8);
+        flipped[i * bytes.len() / places] ^= 1 << (i % 8);
         assert!(matches!(load(&flipped), Err(Error::Io(_))), "{i}");
-        assert!(load(&bytes[..i * bytes.len() / 200]).is_err());
+        assert!(load(&bytes[..i * bytes.len() / places]).is_err());
     }
     let mut records = Records::new(&bytes[records::MAGIC.len()..], bytes.len() as u64);
     let mut all = Vec::new();
@@ -513,7 +522,7 @@ fn damaged_layouts_are_refused_or_harmless() {
         all.push((tag, content));
     }
     let mut refusals = 0;
-    for i in 0..1000u32 {
+    for i in 0..changes {
         let random = |n: u32, below: usize| (crate::base::sampling::mix(4 * i + n) as usize) % below;
         let mut changed = all.clone();
         let (_, content) = &mut changed[random(0, all.len() - 1)];
@@ -529,5 +538,5 @@ fn damaged_layouts_are_refused_or_harmless() {
             Ok(lightmap) => (0..lightmap.info().page_count).for_each(|p| drop(lightmap.read(p, Layer::Position))),
         }
     }
-    assert!(refusals > 500, "{refusals}");
+    assert!(refusals > changes as usize / 2, "{refusals}");
 }

@@ -34,6 +34,18 @@ pub(super) struct Point {
     pub(super) length: f32,
 }
 
+impl Point {
+    /// Makes one of this point and another one between the same texels.
+    pub(super) fn join(&mut self, other: &Point) {
+        let length = self.length + other.length;
+        if length > 0.0 {
+            let part = other.length / length;
+            self.weights = std::array::from_fn(|k| self.weights[k] + part * (other.weights[k] - self.weights[k]));
+        }
+        self.length = length;
+    }
+}
+
 /// The least squares problem: row i of J has the weights of texels at point i, times the square root of the point's
 /// length.
 pub(super) struct System {

@@ -3,8 +3,8 @@ use super::*;
 use crate::device::{Device, DeviceOptions};
 use crate::lightmap::{Layer, LightmapDesc};
 use crate::scene::demo::shapes::MeshBuilder;
-use crate::scene::{LightmapUvs, Material, Mesh, MeshMaterials, Scene, SceneData};
-use glam::DVec3;
+use crate::scene::{Instance, LightmapUvs, Material, Mesh, MeshMaterials, Scene, SceneData};
+use glam::{Affine3A, DVec3, Quat};
 use std::f32::consts::FRAC_PI_6;
 use std::sync::Arc;
 
@@ -138,6 +138,41 @@ fn what_lies_in_a_gap_is_not_stitched_to_what_does_not() {
     // But for some texels (34 of 138) whose samples lie before the curtain.
     assert!(open > 50 && 3 * covered < open, "{open} {covered}");
     assert!(text.contains("smooth surfaces, except "), "{text}");
+}
+
+#[test]
+fn seams_of_instances_are_those_of_copies_inside_and_between_them() {
+    let mut tile = MeshBuilder::new();
+    let corner = |x: f32, z: f32| Vec3::new(x, 0.0, z);
+    tile.grid_quad(corner(0.0, 0.0), corner(0.0, 1.0), corner(1.0, 1.0), corner(1.0, 0.0), 2, 2, 0);
+    let mut ball = MeshBuilder::new();
+    ball.sphere(Vec3::Y, 0.5, 3, 0);
+    // Three tiles in a row. Copies of balls may be unwrapped with other rounding.
+    for (mesh, difference) in [(tile.finish(), 0.0), (ball.finish(), 0.02)] {
+        let mut data = SceneData::new();
+        data.add_material(Material { albedo: [0.7; 3], ..Default::default() }).unwrap();
+        let mesh = data.add_mesh(mesh).unwrap();
+        for (x, scale) in [(0.0, 1.0), (1.0, 1.0), (2.0, 1.0), (7.0, 2.0)] {
+            let transform = Affine3A::from_scale_rotation_translation(Vec3::splat(scale), Quat::IDENTITY, x * Vec3::X);
+            data.add_instance(Instance { mesh, transform }).unwrap();
+        }
+        data.add_light(LAMP).unwrap();
+        let mut copies = SceneData::new();
+        copies.add_material(Material { albedo: [0.7; 3], ..Default::default() }).unwrap();
+        data.flattened().iter().for_each(|mesh| _ = copies.add_mesh(mesh.clone()).unwrap());
+        copies.add_light(LAMP).unwrap();
+        let [instances, copies] = [data, copies].map(|data| {
+            let mut map = lightmap(&data.committed());
+            let stats = bake(&mut map, &params(true));
+            assert!(stats.seam_rms_after < 0.2 * stats.seam_rms_before, "{stats:?}");
+            let text = map.plan_text();
+            let edges = text.split("seams at ").nth(1).and_then(|rest| rest.split(' ').next()).unwrap();
+            [edges.parse().unwrap(), stats.seam_points as f64]
+        });
+        for (a, b) in instances.into_iter().zip(copies) {
+            assert!((a - b).abs() <= difference * b, "{instances:?} {copies:?}");
+        }
+    }
 }
 
 #[test]

@@ -69,7 +69,7 @@ fn charts_of(scene: &Scene, density: f32) -> (Charts, UvReport) {
 
 /// Every valid triangle is in one chart, coordinates lie in the chart's extent, charts keep their
 /// area, and packed texels have one owner.
-fn check(scene: &Scene, charts: &Charts) {
+pub(in crate::lightmap) fn check(scene: &Scene, charts: &Charts) {
     let mut seen = vec![false; scene.triangle_count() as usize];
     for (id, chart) in charts.ids().zip(&charts.charts) {
         let triangles = charts.triangles_of(id);
