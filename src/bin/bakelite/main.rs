@@ -42,6 +42,7 @@ fn main() -> ExitCode {
         Ok(Command::ReportPipeline(args)) => report::pipeline::run(&args),
         Ok(Command::ReportDirectional(report)) => report::quality::directional::run(&report),
         Ok(Command::ReportQuality(report)) => report::quality::run(&report),
+        Ok(Command::ReportCoherence(report)) => report::coherence::run(&report),
         Ok(Command::ReportScaling(report)) => report::scaling::run(&report),
         Ok(Command::ReportStability(args)) => report::stability::run(&args),
         // Help and the version, too.

@@ -38,7 +38,8 @@ pub const BUILTIN_NAMES: &[&str] = &["cornell", "furnace", "sealed", "atrium", "
 ///   and a coffered ceiling (mesh 0), half on 18 fluted columns; four rect lights.
 /// - `colonnade:TRIANGLES`: a grove of fluted columns under the sky, of about so many triangles, at least 100,000: all
 ///   columns are instances of one (mesh 1). `colonnade-copies:TRIANGLES`: the same, each a mesh.
-/// - `menger:LEVEL`: the Menger sponge of a level up to 6 in the unit cube, two triangles for each square, in the sun.
+/// - `menger:LEVEL`: the Menger sponge of a level up to 6 in the unit cube, two triangles for each square, in the sun;
+///   `menger:LEVEL:PARTS` with PARTS² triangles in place of each.
 pub fn builtin(name: &str) -> Result<SceneData> {
     match name {
         "cornell" => cornell(),
@@ -55,16 +56,23 @@ pub fn builtin(name: &str) -> Result<SceneData> {
         _ if name.starts_with("hall:") => hall(number(name)?),
         _ if name.starts_with("colonnade:") => colonnade(number(name)?, false),
         _ if name.starts_with("colonnade-copies:") => colonnade(number(name)?, true),
-        _ if name.starts_with("menger:") => menger(number(name)?),
+        _ if name.starts_with("menger:") => {
+            let (level, parts) = name["menger:".len()..].split_once(':').unwrap_or((&name["menger:".len()..], "1"));
+            menger(parsed(name, level)?, parsed(name, parts)?)
+        }
         _ => invalid_argument!("there is no built-in scene {name:?}; there are {}", BUILTIN_NAMES.join(", ")),
     }
 }
 
 /// The number after the colon of a name.
 fn number<T: FromStr>(name: &str) -> Result<T> {
-    match name.split_once(':').and_then(|(_, number)| number.parse().ok()) {
-        Some(number) => Ok(number),
-        None => invalid_argument!("the built-in scene {name:?} has no number after its colon"),
+    parsed(name, name.split_once(':').map_or("", |(_, number)| number))
+}
+
+fn parsed<T: FromStr>(name: &str, number: &str) -> Result<T> {
+    match number.parse() {
+        Ok(number) => Ok(number),
+        Err(_) => invalid_argument!("the built-in scene {name:?} has no number after its colon"),
     }
 }
 

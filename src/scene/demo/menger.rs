@@ -7,7 +7,7 @@ use crate::scene::camera::Camera;
 use crate::scene::light::Light;
 use crate::scene::material::Material;
 use crate::scene::mesh::{Mesh, MeshMaterials};
-use crate::scene::{NONE, SceneData};
+use crate::scene::{MAX_TRIANGLES, NONE, SceneData};
 use glam::{IVec3, Vec3};
 
 const SPONGE: &str = "the Menger sponge";
@@ -15,14 +15,22 @@ const SPONGE: &str = "the Menger sponge";
 /// Maximum level: the next one has more triangles than a scene may have.
 const MAX_LEVEL: u32 = 6;
 
-/// Makes the sponge of a level in the unit cube, two triangles for each square, with a sun.
-pub(super) fn menger(level: u32) -> Result<SceneData> {
+/// Makes the sponge of a level in the unit cube, two triangles for each square, with a sun. Each triangle is divided into
+/// `parts`² (at least 1): the same surface of more triangles, as the thesis's Appendix A has it with powers of 2.
+pub(super) fn menger(level: u32, parts: u32) -> Result<SceneData> {
     if level > MAX_LEVEL {
         return invalid_argument!("a Menger sponge of level {level}, more than {MAX_LEVEL}");
     }
+    let triangles = (parts as usize).checked_pow(2).and_then(|n| n.checked_mul(menger_triangles(level)));
+    let Some(triangles) = triangles.filter(|n| (1..=MAX_TRIANGLES).contains(n)) else {
+        return invalid_argument!(
+            "a Menger sponge whose triangles are divided into {parts}²: more than {MAX_TRIANGLES}, or none"
+        );
+    };
     let mut scene = SceneData::new();
     scene.add_material(Material { albedo: [0.7; 3], ..Default::default() })?;
-    scene.add_mesh(sponge(level)?)?;
+    let sponge = sponge(level)?;
+    scene.add_mesh(if parts == 1 { sponge } else { divided(&sponge, parts, triangles)? })?;
     let direction = Vec3::new(-0.5, -0.8, -0.6).normalize();
     scene.add_light(Light::Directional { direction, irradiance: [10.0; 3], angular_radius: 0.0 })?;
     Ok(scene)
@@ -96,6 +104,33 @@ fn sponge(level: u32) -> Result<Mesh> {
     })
 }
 
+/// Divides each triangle of a mesh into `parts`². Points on an edge are the same from both sides, bit for bit.
+fn divided(mesh: &Mesh, parts: u32, triangles: usize) -> Result<Mesh> {
+    let per_triangle = ((parts + 1) * (parts + 2) / 2) as usize;
+    let mut positions = try_with_capacity(per_triangle * mesh.indices.len(), SPONGE)?;
+    let mut indices = try_with_capacity(triangles, SPONGE)?;
+    for t in 0..mesh.indices.len() {
+        let [a, b, c] = mesh.corners(t).map(Vec3::as_dvec3);
+        // Rows of points from the edge a b to the corner c.
+        for row in 0..=parts {
+            let first = positions.len() as u32;
+            for i in 0..=parts - row {
+                let point = (a * (parts - row - i) as f64 + b * i as f64 + c * row as f64) / parts as f64;
+                positions.push(point.as_vec3());
+            }
+            let next = first + parts - row + 1;
+            indices.extend((0..parts - row).map(|i| [first + i, first + i + 1, next + i]));
+            indices.extend((1..parts - row).map(|i| [first + i, next + i, next + i - 1]));
+        }
+    }
+    Ok(Mesh {
+        positions: positions.into(),
+        indices: indices.into(),
+        materials: MeshMaterials::One(0),
+        ..Default::default()
+    })
+}
+
 pub(super) fn menger_camera() -> Camera {
     Camera { position: Vec3::new(2.2, 1.5, 1.8), target: Vec3::splat(0.5), up: Vec3::Y, fov_y: 0.7 }
 }
@@ -125,9 +160,37 @@ mod tests {
     }
 
     #[test]
+    fn divided_sponges_are_closed_and_have_the_same_surface() {
+        let whole = sponge(2).unwrap();
+        for parts in 1..6 {
+            let mesh = divided(&whole, parts, whole.indices.len() * (parts * parts) as usize).unwrap();
+            assert_eq!(mesh.indices.len(), whole.indices.len() * (parts * parts) as usize);
+            let bits = |p: Vec3| p.to_array().map(f32::to_bits);
+            let sides = |t: usize| {
+                let [a, b, c] = mesh.corners(t).map(bits);
+                [(a, b), (b, c), (c, a)]
+            };
+            let mut edges: Vec<_> = (0..mesh.indices.len()).flat_map(sides).collect();
+            let mut reversed: Vec<_> = edges.iter().map(|&(a, b)| (b, a)).collect();
+            edges.sort_unstable();
+            reversed.sort_unstable();
+            assert!(edges == reversed, "{parts} is not closed");
+            let area = |mesh: &Mesh| -> f64 {
+                let of = |t: usize| {
+                    let [a, b, c] = mesh.corners(t).map(Vec3::as_dvec3);
+                    0.5 * (b - a).cross(c - a).length()
+                };
+                (0..mesh.indices.len()).map(of).sum()
+            };
+            assert!((area(&mesh) / area(&whole) - 1.0).abs() < 1e-6, "{parts}");
+        }
+    }
+
+    #[test]
     fn a_level_too_high_is_refused() {
         assert!(menger_triangles(MAX_LEVEL) <= crate::scene::MAX_TRIANGLES);
         assert!(menger_triangles(MAX_LEVEL + 1) > crate::scene::MAX_TRIANGLES);
-        assert!(menger(MAX_LEVEL + 1).is_err());
+        assert!(menger(MAX_LEVEL + 1, 1).is_err());
+        assert!(menger(MAX_LEVEL, 2).is_err() && menger(1, 0).is_err() && menger(1, u32::MAX).is_err());
     }
 }

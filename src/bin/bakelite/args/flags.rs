@@ -44,6 +44,8 @@ pub enum Verb {
 pub enum Report {
     /// How long each call is silent, and how soon it ends when it is cancelled
     Cancel(Box<Flags>),
+    /// Rates of rays by tree, way and coherence against the number of triangles, with fitted exponents
+    Coherence(Box<CoherenceFlags>),
     /// Light by direction under a normal map: error beside irradiance alone, time and memory
     Directional(Box<DirectionalFlags>),
     /// Seconds to right light after an object has moved, and the difference from a bake from nothing
@@ -72,6 +74,7 @@ impl Verb {
                 Report::Cancel(flags) | Report::Memory(flags) | Report::Pipeline(flags) | Report::Stability(flags) => {
                     flags
                 }
+                Report::Coherence(of_report) => &mut of_report.flags,
                 Report::Directional(of_report) => &mut of_report.flags,
                 Report::Edits(of_report) => &mut of_report.flags,
                 Report::Live(of_report) => &mut of_report.flags,
@@ -171,6 +174,16 @@ pub struct QualityFlags {
     #[arg(long, value_name = "A,B,..", value_delimiter = ',', default_values = KNOBS, hide_default_value = true,
           value_parser = PossibleValuesParser::new(KNOBS.into_iter().chain(["none"])))]
     pub knobs: Vec<String>,
+    #[command(flatten)]
+    pub flags: Flags,
+}
+
+#[derive(Args)]
+pub struct CoherenceFlags {
+    /// Scenes by ascending number of triangles; SCENE is not used
+    #[arg(long, value_name = "A,B,..", help_heading = "Report coherence", value_delimiter = ',', value_parser = values::scene,
+          default_values = ["menger:2:1", "menger:2:4", "menger:2:16"])]
+    pub scenes: Vec<String>,
     #[command(flatten)]
     pub flags: Flags,
 }

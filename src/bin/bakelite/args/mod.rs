@@ -37,6 +37,7 @@ pub enum Command {
     ReportPipeline(Box<BakeArgs>),
     ReportQuality(Box<ReportArgs>),
     ReportEdits(Box<ReportArgs>),
+    ReportCoherence(Box<ReportArgs>),
     ReportScaling(Box<ReportArgs>),
     ReportStability(Box<BakeArgs>),
 }
@@ -334,6 +335,10 @@ fn command_of(line: CommandLine, is_given: &dyn Fn(&str) -> bool) -> Result<Comm
         }
         Verb::Report(Report::Edits(edits)) => {
             Command::ReportEdits(Box::new(ReportArgs { objects: edits.objects as usize, ..report_args(edits.flags)? }))
+        }
+        Verb::Report(Report::Coherence(coherence)) => {
+            let scenes = coherence.scenes;
+            Command::ReportCoherence(Box::new(ReportArgs { scenes, ..report_args(coherence.flags)? }))
         }
         Verb::Report(Report::Scaling(scaling)) => {
             let (scenes, rays_only) = (scaling.scenes, scaling.rays_only);

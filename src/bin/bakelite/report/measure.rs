@@ -12,6 +12,17 @@ pub fn median(mut values: Vec<f64>) -> f64 {
     values[values.len() / 2]
 }
 
+/// The exponent b of the power a · x^b that fits points best, by least squares of logarithms. `None` if that is
+/// undefined: fewer than two different x, or a y that is not above 0.
+pub fn exponent(points: &[[f64; 2]]) -> Option<f64> {
+    let logs: Vec<[f64; 2]> = points.iter().map(|p| p.map(f64::ln)).collect();
+    let n = logs.len() as f64;
+    let mean = [0, 1].map(|i| logs.iter().map(|l| l[i]).sum::<f64>() / n);
+    let moment = |i: usize| logs.iter().map(|l| (l[0] - mean[0]) * (l[i] - mean[i])).sum::<f64>();
+    let exponent = moment(1) / moment(0);
+    exponent.is_finite().then_some(exponent)
+}
+
 /// One of `all` by a number whose neighbours choose others.
 pub fn pick<T: Copy>(all: &[T], number: u32) -> T {
     all[((mix(number) as u64 * all.len() as u64) >> 32) as usize]
@@ -48,5 +59,20 @@ pub fn visible_texels(lightmap: &Lightmap) -> Result<Vec<[Vec3; 2]>> {
     match texels.len() {
         0 => Err(Error::InvalidArgument("no texel of the scene can be seen".into())),
         _ => Ok(texels),
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn powers_have_their_exponents() {
+        let of = |power: f64| [1e3, 2e4, 5e6].map(|x: f64| [x, 7.0 * x.powf(power)]);
+        for power in [1.0, 0.125, -0.3] {
+            assert!((exponent(&of(power)).unwrap() - power).abs() < 1e-9);
+        }
+        assert_eq!(exponent(&[[1e3, 2.0]]), None);
+        assert_eq!(exponent(&[[1e3, 2.0], [2e3, 0.0]]), None);
     }
 }

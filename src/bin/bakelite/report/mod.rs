@@ -3,6 +3,7 @@
 //! | file | what it measures |
 //! |---|---|
 //! | `cancel` | how long calls are silent, and how soon they end when cancelled |
+//! | `coherence` | rates of rays by tree, way and coherence against the number of triangles |
 //! | `edits` | light after an object has moved: what changed, beside a bake from nothing |
 //! | `live` | live updates: error against time and rays, budgets, traffic |
 //! | `memory` | a scene's memory by part, and what little of it costs rays |
@@ -13,6 +14,7 @@
 //! | `measure` | what they share |
 
 pub mod cancel;
+pub mod coherence;
 pub mod edits;
 pub mod live;
 mod measure;

@@ -8,7 +8,7 @@ use crate::files;
 use crate::job::Job;
 use crate::pictures::PrimaryRays;
 use crate::plot::curves::{Plot, Series};
-use crate::report::measure::{median, surface_rays};
+use crate::report::measure::{exponent, median, surface_rays};
 use bakelite::lightmap::Lightmap;
 use bakelite::scene::builtin_camera;
 use bakelite::trace::{Hit, Ray};
@@ -145,17 +145,6 @@ fn points(rows: &[Row], column: usize, of: impl Fn(&Row) -> &[f64]) -> Vec<[f64;
     rows.iter().map(|r| [r.triangles, of(r)[column]]).collect()
 }
 
-/// The exponent b of the power a · x^b that fits points best, by least squares of logarithms. `None` if that is
-/// undefined: fewer than two different x, or a y that is not above 0.
-fn exponent(points: &[[f64; 2]]) -> Option<f64> {
-    let logs: Vec<[f64; 2]> = points.iter().map(|p| p.map(f64::ln)).collect();
-    let n = logs.len() as f64;
-    let mean = [0, 1].map(|i| logs.iter().map(|l| l[i]).sum::<f64>() / n);
-    let moment = |i: usize| logs.iter().map(|l| (l[0] - mean[0]) * (l[i] - mean[i])).sum::<f64>();
-    let exponent = moment(1) / moment(0);
-    exponent.is_finite().then_some(exponent)
-}
-
 fn table(title: &str, names: &[&str], rows: &[Row], of: impl Fn(&Row) -> &[f64]) {
     println!("\n{title}\n\n| scene | triangles | texels | {} |", names.join(" | "));
     println!("|---|---|---|{}", "---|".repeat(names.len()));
@@ -180,19 +169,4 @@ fn csv(rows: &[Row]) -> String {
         out.push('\n');
     }
     out
-}
-
-#[cfg(test)]
-mod tests {
-    use super::*;
-
-    #[test]
-    fn powers_have_their_exponents() {
-        let of = |power: f64| [1e3, 2e4, 5e6].map(|x: f64| [x, 7.0 * x.powf(power)]);
-        for power in [1.0, 0.125, -0.3] {
-            assert!((exponent(&of(power)).unwrap() - power).abs() < 1e-9);
-        }
-        assert_eq!(exponent(&[[1e3, 2.0]]), None);
-        assert_eq!(exponent(&[[1e3, 2.0], [2e3, 0.0]]), None);
-    }
 }
