@@ -416,6 +416,14 @@ fn a_camera_sees_what_its_rays_hit_alone() {
 }
 
 #[test]
+fn a_camera_before_triangles_finer_than_pixels_sees_what_its_rays_hit_alone() {
+    let triangles = sphere(Vec3::ZERO, 200, 160);
+    for side in [12, 40, 70] {
+        check_together(&triangles, &camera(Vec3::new(1.0, 2.0, 3.0), Vec3::new(-1.0, -2.0, -3.0), 0.3, side), "fine");
+    }
+}
+
+#[test]
 fn bundles_of_any_length_and_range_hit_what_rays_hit_alone() {
     let triangles = soup(2000, 0.1, 8);
     let rays = camera(Vec3::new(-2.0, -1.0, -0.7), Vec3::new(2.0, 1.0, 0.7), 0.25, 16);

@@ -3,6 +3,7 @@
 use crate::args::{BakeArgs, is_scene_file};
 use crate::camera;
 use crate::progress_bar::Bars;
+use crate::repeat::repeat;
 use crate::stages::Stage;
 use bakelite::bvh::BuildOptions;
 use bakelite::device::LogLevel;
@@ -96,6 +97,9 @@ impl<'a> Job<'a> {
             self.warnings = loaded.map_err(name_flags)?.warnings;
             data
         };
+        if self.args.repeat > 1 {
+            repeat(&mut data, self.args.repeat, self.args.instances)?;
+        }
         for given in &self.args.lights {
             let mut light = given.light;
             if let Light::Sky { environment, up, .. } = &mut light {

@@ -21,6 +21,7 @@ mod job;
 mod pictures;
 mod plot;
 mod progress_bar;
+mod repeat;
 mod report;
 mod stages;
 

@@ -267,6 +267,12 @@ pub struct FileFlags {
     /// Read SCENE.bkscene to memory instead of mapping it
     #[arg(long)]
     pub read_scene: bool,
+    /// Put the scene N times beside itself, in a square grid, to measure larger scenes; lights stay as they are
+    #[arg(long, value_name = "N", default_value_t = 1, value_parser = clap::value_parser!(u32).range(1..=1 << 20))]
+    pub repeat: u32,
+    /// As instances instead of copies
+    #[arg(long, requires = "repeat")]
+    pub instances: bool,
 }
 
 const LIGHTS: &str = "A light, added to those of the scene; may be repeated

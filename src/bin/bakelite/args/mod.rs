@@ -109,6 +109,9 @@ pub struct BakeArgs {
     pub max_file_mb: u64,
     pub save_scene: Option<PathBuf>,
     pub read_scene: bool,
+    /// How often the scene stands beside itself, and whether as instances.
+    pub repeat: u32,
+    pub instances: bool,
     pub lights: Vec<GivenLight>,
     pub desc: LightmapDesc,
     pub layout: Option<PathBuf>,
@@ -465,6 +468,8 @@ fn bake_args(f: Flags) -> Result<BakeArgs, String> {
         max_file_mb: f.file.max_file_mb,
         save_scene: f.file.save_scene,
         read_scene: f.file.read_scene,
+        repeat: f.file.repeat,
+        instances: f.file.instances,
         lights: f.lights.light,
         desc,
         layout: f.lightmap.layout,

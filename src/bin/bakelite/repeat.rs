@@ -1,0 +1,48 @@
+//! A scene beside itself many times, as in the thesis's tables 4.1 to 4.3, which measure scenes and multiples of them.
+
+use bakelite::scene::Instance;
+use bakelite::{Result, SceneData};
+use glam::{Affine3A, Vec3};
+
+/// Adds copies of all meshes, or makes instances of them, so that the scene stands `times` times in a square grid on the
+/// plane of x and z, each beside the next. Lights stay as they are.
+pub fn repeat(data: &mut SceneData, times: u32, as_instances: bool) -> Result<()> {
+    let points = || data.meshes().iter().flat_map(|mesh| mesh.positions.iter().copied());
+    let (lower, upper) = (points().fold(Vec3::INFINITY, Vec3::min), points().fold(Vec3::NEG_INFINITY, Vec3::max));
+    let columns = (times as f64).sqrt().ceil() as u32;
+    let place = |i: u32| (upper - lower) * Vec3::new((i % columns) as f32, 0.0, (i / columns) as f32);
+    for mesh in 0..data.meshes().len() as u32 {
+        for i in (0..times).filter(|&i| as_instances || i > 0) {
+            if as_instances {
+                data.add_instance(Instance { mesh, transform: Affine3A::from_translation(place(i)) })?;
+                continue;
+            }
+            let mut copy = data.meshes()[mesh as usize].clone();
+            copy.positions.as_vec().iter_mut().for_each(|p| *p += place(i));
+            data.add_mesh(copy)?;
+        }
+    }
+    Ok(())
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use bakelite::scene::builtin;
+
+    #[test]
+    fn copies_and_instances_stand_in_the_same_places() {
+        let once = builtin("cornell").unwrap();
+        let [copies, instances] = [false, true].map(|as_instances| {
+            let mut data = builtin("cornell").unwrap();
+            repeat(&mut data, 5, as_instances).unwrap();
+            assert_eq!(data.triangle_count(), 5 * once.triangle_count());
+            let mut points: Vec<[u32; 3]> = (data.flattened().iter())
+                .flat_map(|mesh| mesh.positions.iter().map(|p| p.to_array().map(f32::to_bits)).collect::<Vec<_>>())
+                .collect();
+            points.sort_unstable();
+            points
+        });
+        assert!(copies == instances);
+    }
+}
