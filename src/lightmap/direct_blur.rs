@@ -221,7 +221,9 @@ mod tests {
         let sum = |of: &[f32]| of.iter().sum::<f32>() / truth.iter().sum::<f32>();
         let (before, after) = (error(&plain), error(&blurred));
         assert!(before > 0.2 && after < 0.35 * before, "{before} before the blur, {after} after it");
-        assert!((sum(&blurred) - 1.0).abs() < 0.03, "{}", sum(&blurred));
+        // Against the same samples: against the truth, the error of the samples' own mean, 1 % here, counts too.
+        let kept = sum(&blurred) / sum(&plain);
+        assert!((kept - 1.0).abs() < 0.015, "{kept}");
     }
 
     #[test]
