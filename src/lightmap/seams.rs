@@ -384,11 +384,7 @@ impl Job<'_, '_, '_> {
         Ok([part(false)?, part(true)?])
     }
 
-    fn for_each_edge<T: Send>(
-        &self,
-        sides: &Sides,
-        visit: &(dyn Fn(&[(u64, Side)], &mut Vec<T>) -> Result<()> + Sync),
-    ) -> Result<Vec<T>> {
+    fn for_each_edge<T: Send>(&self, sides: &Sides, visit: &sides::Visit<'_, T>) -> Result<Vec<T>> {
         let scene = &self.atlas.scene;
         let _memory =
             self.reserve(sides::bytes(sides.len(), scene.device().num_threads()), "the edges of the charts")?;

@@ -159,12 +159,14 @@ impl Scene {
                     let end = rays.len().min(traced + if traced == 0 { TRIAL } else { 256 });
                     self.intersect_block(&rays[traced..end], &mut raw);
                     self.to_hits(&raw[..end - traced], &mut out[traced..end]);
-                    if traced == 0 && end < rays.len() && self.is_fine(&rays[..end], &raw[..end]) {
-                        if let Ok(mut raw) = try_filled(rays.len() - end, RawHit::MISS, "hits") {
-                            self.intersect_stream(&rays[end..], &mut raw);
-                            self.to_hits(&raw, &mut out[end..]);
-                            break;
-                        }
+                    if traced == 0
+                        && end < rays.len()
+                        && self.is_fine(&rays[..end], &raw[..end])
+                        && let Ok(mut raw) = try_filled(rays.len() - end, RawHit::MISS, "hits")
+                    {
+                        self.intersect_stream(&rays[end..], &mut raw);
+                        self.to_hits(&raw, &mut out[end..]);
+                        break;
                     }
                     traced = end;
                 }

@@ -134,13 +134,16 @@ impl Sides<'_> {
     }
 }
 
+/// What is done with the sides of an edge: may add to a list.
+pub(super) type Visit<'a, T> = dyn Fn(&[(u64, Side)], &mut Vec<T>) -> Result<()> + Sync + 'a;
+
 /// Calls `visit` with the sides of each edge, of which only the ends count, and collects what it adds. (The rare edges
 /// that share a hash are taken for one.)
 pub(super) fn for_each_edge<T: Send>(
     scene: &Scene,
     sides: &Sides,
     stage: &Stage,
-    visit: &(dyn Fn(&[(u64, Side)], &mut Vec<T>) -> Result<()> + Sync),
+    visit: &Visit<'_, T>,
 ) -> Result<Vec<T>> {
     let cells = Cells::new(scene, sides.len());
     let each = |visit: &(dyn Fn(usize, usize) + Sync)| {

@@ -52,7 +52,8 @@ struct Trees<'a> {
 pub fn run(args: &ReportArgs) -> Result<()> {
     files::make_folder(&args.bake.out)?;
     println!("caches of a core: {}; {} threads\n", caches(), args.bake.threads.max(1));
-    let (mut names, mut rows): (Vec<String>, Vec<(f64, f64, Vec<Vec<f64>>)>) = Default::default();
+    let mut names: Vec<String> = Vec::new();
+    let mut rows: Vec<(f64, f64, Vec<Vec<f64>>)> = Vec::new();
     for name in &args.scenes {
         let of_scene = BakeArgs { scene: name.clone(), ..args.bake.clone() };
         let mut job = Job::new(&of_scene);
