@@ -88,9 +88,7 @@ impl View<'_> {
         let shadow_seconds = start.elapsed().as_secs_f64();
 
         let start = Instant::now();
-        let composite = render(scene, &self.camera, size, seed, progress, "light map", |seen| {
-            Ok(self.lightmap.sample(Layer::Combined, seen.hit.triangle, seen.hit.front, seen.hit.u, seen.hit.v).into())
-        })?;
+        let composite = self.light_map(progress)?;
         let composite_seconds = start.elapsed().as_secs_f64();
 
         let missed = missed(scene, &self.camera, size);
@@ -107,6 +105,22 @@ impl View<'_> {
             width: self.width,
             background: background(scene, missed),
         })
+    }
+
+    /// What the light map alone shows.
+    fn light_map(&self, progress: &Progress) -> Result<Pixels> {
+        let size = [self.width, self.height];
+        render(self.lightmap.scene(), &self.camera, size, self.seed as u32, progress, "light map", |seen| {
+            Ok(self.lightmap.sample(Layer::Combined, seen.hit.triangle, seen.hit.front, seen.hit.u, seen.hit.v).into())
+        })
+    }
+
+    /// The same, tone mapped by itself, for a look without a reference.
+    pub fn light_map_alone(&self, progress: &Progress) -> Result<Vec<[u8; 3]>> {
+        let (scene, pixels) = (self.lightmap.scene(), self.light_map(progress)?);
+        let missed = missed(scene, &self.camera, [self.width, self.height]);
+        let exposure = auto_exposure(&pixels, |i| missed[i] == 0.0);
+        Ok(tone_mapped(&pixels, &background(scene, missed), exposure))
     }
 
     /// The reference as the mean of two independent halves, and these.

@@ -456,7 +456,8 @@ pub struct PictureFlags {
     /// Height of each
     #[arg(long, value_name = "N", default_value_t = 270, value_parser = clap::value_parser!(u32).range(1..=MAX_PICTURE))]
     pub height: u32,
-    /// Paths per pixel of the reference; 0: no pictures [default: 0; built-in scenes: 32]
+    /// Paths per pixel of the reference; 0: no pictures, but that of the light map alone if --camera is given [default: 0;
+    /// built-in scenes: 32]
     #[arg(long, value_name = "N")]
     pub reference_spp: Option<u32>,
 }

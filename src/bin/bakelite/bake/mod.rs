@@ -84,7 +84,8 @@ impl Job<'_> {
     }
 
     fn pictures(&mut self, lightmap: &Lightmap, camera: Camera) -> Result<Option<Pictures>> {
-        if self.args.reference_spp == 0 {
+        let has_reference = self.args.reference_spp > 0;
+        if !has_reference && self.args.camera.is_none() {
             return Ok(None);
         }
         let view = View {
@@ -95,6 +96,13 @@ impl Job<'_> {
             seed: self.args.params.seed,
             lightmap,
         };
+        if !has_reference {
+            let start = Instant::now();
+            let pixels = self.bars.show("picture", |p| view.light_map_alone(p))?;
+            self.stage("picture: light map", start);
+            self.write_picture("light-map", view.width, view.height, &pixels)?;
+            return Ok(None);
+        }
         let pictures = self.bars.show("pictures", |p| view.render(p))?;
         let names = ["picture: reference", "picture: shadow rays", "picture: light map"];
         for (name, seconds) in names.into_iter().zip(pictures.seconds) {
