@@ -54,20 +54,22 @@ pub(super) unsafe fn stream<S: Simd, T: Tree, const ANY: bool>(
         // SAFETY: forwarded.
         let starts = unsafe { sort::<S>(rays, &mut room) };
         for octant in 0..8 {
-            let group = Group::new(octant, &starts);
+            let mut group = Group::new(octant, &starts);
             if group.len() < LEAST {
                 room.leave_alone(group.begin..group.end());
                 continue;
             }
             if ANY && let Some(tree) = tree.whole() {
                 let Room { order, shafts, packs, .. } = &mut *room;
-                let number = |place: usize| order[group.begin + place] as usize;
-                let done = |place: usize, is_hit: bool| {
+                let order = &mut order[group.begin..group.begin + group.len()];
+                let done = |number: usize, is_hit: bool| {
                     let triangle = if is_hit { 0 } else { NONE };
-                    done(first + number(place), RawHit { triangle, ..RawHit::MISS });
+                    done(first + number, RawHit { triangle, ..RawHit::MISS });
                 };
                 // SAFETY: forwarded.
-                if unsafe { beams::trace::<S>(tree, &group, |place| &rays[number(place)], shafts, packs, done) } {
+                unsafe { beams::trace::<S>(tree, &mut group, rays, order, shafts, packs, done) };
+                if group.len() < LEAST {
+                    room.leave_alone(group.begin..group.end());
                     continue;
                 }
             }

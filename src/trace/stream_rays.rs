@@ -283,12 +283,23 @@ unsafe fn keys_of<L: Eight>(rays: [L; 8]) -> [u8; 8] {
         .and(is_number(x).and(is_number(y)).and(is_number(z)))
         .and(near(ox).and(near(oy)).and(near(oz)))
         .and(tmin.lt(tmax));
-    let part = |mask: L::Mask, value: f32| L::select(mask, splat(value), zero);
-    let octant = part(dx.lt(zero), 3.0) + part(dy.lt(zero), 6.0) + part(dz.lt(zero), 12.0);
     let is_x = y.lt(x).and(z.lt(x));
-    let axis = L::select(is_x, zero, L::select(z.lt(y), splat(1.0), splat(2.0)));
-    let keys = L::select(is_ordinary, octant + axis, splat(SPECIAL as f32)).to_array();
-    std::array::from_fn(|i| keys[i] as u8)
+    let bits = [dx.lt(zero), dy.lt(zero), dz.lt(zero), is_x, z.lt(y), is_ordinary].map(|mask| mask.bits());
+    if bits.iter().all(|&bits| bits == 0 || bits == 0xff) {
+        return [key_of(bits, 0); 8];
+    }
+    std::array::from_fn(|i| key_of(bits, i))
+}
+
+/// Key of ray i, of which bits i tell whether its direction is negative along x, y and z, whether x is its longest axis,
+/// whether it is longer along y than along z, and whether it is not special.
+#[inline(always)]
+fn key_of(bits: [u32; 6], i: usize) -> u8 {
+    let [x, y, z, is_x, is_y, is_ordinary] = bits.map(|bits| (bits >> i) as u8 & 1);
+    match is_ordinary {
+        0 => SPECIAL as u8,
+        _ => 3 * (x + 2 * y + 4 * z) + (1 - is_x) * (2 - is_y),
+    }
 }
 
 /// Slabs and targets of eight rays with the same [axes](Shear::axes), as halves of eight floats.

@@ -66,8 +66,9 @@ mod tests {
     use super::*;
     use crate::base::progress::Progress;
     use crate::lightmap::atlas::chart_index::ChartIndex;
+    use crate::lightmap::atlas::charts::Charts;
     use crate::lightmap::atlas::charts::tests::check;
-    use crate::lightmap::atlas::charts::{Charts, triangle_area};
+    use crate::lightmap::atlas::pieces::triangle_area;
     use crate::lightmap::{Lightmap, LightmapDesc};
     use crate::scene::{Instance, Material, SceneData, shapes::MeshBuilder};
     use glam::{Affine3A, Quat, Vec3};

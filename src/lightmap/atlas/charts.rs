@@ -6,7 +6,8 @@
 use super::alike::{self, Source};
 use super::ids::ChartId;
 pub use super::pieces::Given;
-use super::pieces::{CHARTS, Groups, Piece, connected, float_key, surface_kind};
+use super::pieces::{CHARTS, Groups, Piece, connected, float_key, surface_kind, triangle_area};
+pub use super::sheets::Chart;
 use super::sheets::{Place, Shape, Sheet, scaled};
 use super::unwrap;
 use crate::base::error::{Error, Result, invalid_argument};
@@ -32,21 +33,6 @@ pub const MAX_PAGE_SIZE: u32 = 16384;
 /// be unique (an engine's per-mesh UVs without page numbers, for instance), and the triangles are unwrapped instead. Up
 /// to this limit, overlaps are accepted and counted.
 const MAX_PAGE_COVER: f64 = 2.0;
-
-/// A piece of surface with continuous texture coordinates.
-#[derive(Clone, Debug, PartialEq)]
-pub struct Chart {
-    /// Triangles of the chart, as a range of its sheet's.
-    pub triangles: Range<u32>,
-    /// Extent of the chart's local coordinates, which start at (0, 0), in scene units.
-    pub size: [f32; 2],
-    /// Surface area, in squared scene units.
-    pub area: f32,
-    /// Whether the chart's material is two-sided.
-    pub two_sided: bool,
-    /// Placement in the light map by the caller's UVs, if any.
-    pub given: Option<Given>,
-}
 
 /// Numbers about the UVs of a scene.
 #[derive(Clone, Copy, Debug, Default, PartialEq)]
@@ -230,6 +216,36 @@ impl Charts {
         (a * (1.0 - u - v) + b * u + c * v).to_array()
     }
 
+    /// Number of charts of meshes that stand in the scene themselves, which come first.
+    pub(super) fn own_charts(&self) -> usize {
+        self.places.first().map_or(self.charts.len(), |place| place.first_chart.index())
+    }
+
+    /// Returns the chart of a triangle of an instance, and its sheet; `None` if there is no such triangle.
+    pub(super) fn place_of(&self, triangle: u32) -> Option<(&Place, &Sheet, u32)> {
+        let after = self.places.partition_point(|place| place.first_triangle <= triangle);
+        let place = self.places.get(after.checked_sub(1)?)?;
+        let (sheet, own) = (&self.shared[place.sheet as usize], triangle - place.first_triangle);
+        ((own as usize) < sheet.of_triangles.len()).then_some((place, sheet, own))
+    }
+
+    /// Returns a chart as it is in its sheet.
+    pub(in crate::lightmap) fn shape(&self, chart: ChartId) -> Shape<'_> {
+        if chart.index() < self.own_charts() {
+            return Shape { sheet: &self.own, first_triangle: 0, factor: 1.0, number: chart.index() };
+        }
+        let place = &self.places[self.places.partition_point(|place| place.first_chart <= chart) - 1];
+        let sheet = &self.shared[place.sheet as usize];
+        let number = sheet.first_shape as usize + chart.index() - place.first_chart.index();
+        Shape { sheet, first_triangle: place.first_triangle, factor: place.factor, number }
+    }
+
+    /// Returns all sheets, with their charts where they were made.
+    pub(in crate::lightmap) fn sheets(&self) -> impl Iterator<Item = (&Sheet, &[Chart])> {
+        let charts = |sheet: &Sheet| &self.charts[sheet.charts.start as usize..sheet.charts.end as usize];
+        std::iter::once(&self.own).chain(&self.shared).map(move |sheet| (sheet, charts(sheet)))
+    }
+
     /// Makes charts of pieces with global triangle numbers: those of meshes, of which those with given placement come
     /// first, ordered by page; then those of each instance that is its own source.
     pub(in crate::lightmap) fn assemble(
@@ -309,12 +325,6 @@ pub fn surface_area(scene: &Scene) -> Result<f64> {
 pub fn automatic_density(scene: &Scene, page_size: u32, pages: f64) -> Result<f32> {
     let texels = pages * (page_size as f64).powi(2) * 2.0 / 3.0;
     Ok(((texels / surface_area(scene)?).sqrt() as f32).clamp(f32::MIN_POSITIVE, f32::MAX))
-}
-
-/// Returns the area of a global triangle, in squared scene units.
-pub(in crate::lightmap) fn triangle_area(scene: &Scene, triangle: u32) -> f64 {
-    let [a, b, c] = scene.corners(triangle).map(|c| c.as_dvec3());
-    0.5 * (b - a).cross(c - a).length()
 }
 
 /// Returns the number of texels that a chart may take along an axis of a page; checks page size and padding.

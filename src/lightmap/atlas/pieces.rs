@@ -4,7 +4,7 @@ use crate::base::error::Result;
 use crate::base::memory::{try_collect, try_filled, try_push};
 use crate::base::progress::Stage;
 use crate::base::sort::sort;
-use crate::scene::{Material, NONE};
+use crate::scene::{Material, NONE, Scene};
 
 /// Name of the buffers in error messages.
 pub(in crate::lightmap) const CHARTS: &str = "the charts";
@@ -144,4 +144,10 @@ impl Groups {
     pub(in crate::lightmap) fn iter(&self) -> impl Iterator<Item = &[u32]> {
         self.starts.windows(2).map(|w| &self.items[w[0] as usize..w[1] as usize])
     }
+}
+
+/// Returns the area of a global triangle, in squared scene units.
+pub(in crate::lightmap) fn triangle_area(scene: &Scene, triangle: u32) -> f64 {
+    let [a, b, c] = scene.corners(triangle).map(|c| c.as_dvec3());
+    0.5 * (b - a).cross(c - a).length()
 }

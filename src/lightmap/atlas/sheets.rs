@@ -2,15 +2,29 @@
 //! themselves are one sheet. An instance has the sheet of the first instance that is unwrapped [alike](super::alike), with
 //! a factor of its lengths: however many instances there are, their charts take memory and time once.
 
-use super::charts::{Chart, Charts};
 use super::ids::ChartId;
-use super::pieces::{CHARTS, Piece};
+use super::pieces::{CHARTS, Given, Piece, triangle_area};
 use crate::base::error::Result;
 use crate::base::memory::{try_filled, try_push, try_with_capacity, try_zeroed_as_needed};
 use crate::base::progress::Stage;
 use crate::scene::Scene;
 use glam::Vec2;
 use std::ops::Range;
+
+/// A piece of surface with continuous texture coordinates.
+#[derive(Clone, Debug, PartialEq)]
+pub struct Chart {
+    /// Triangles of the chart, as a range of its sheet's.
+    pub triangles: Range<u32>,
+    /// Extent of the chart's local coordinates, which start at (0, 0), in scene units.
+    pub size: [f32; 2],
+    /// Surface area, in squared scene units.
+    pub area: f32,
+    /// Whether the chart's material is two-sided.
+    pub two_sided: bool,
+    /// Placement in the light map by the caller's UVs, if any.
+    pub given: Option<Given>,
+}
 
 /// An unwrapped surface.
 #[derive(Clone, Debug, Default, PartialEq)]
@@ -34,7 +48,7 @@ pub(in crate::lightmap) struct Place {
     /// Global number of the first triangle.
     pub first_triangle: u32,
     pub first_chart: ChartId,
-    /// Index among [`Charts::shared`].
+    /// Index among the sheets of instances.
     pub sheet: u32,
     /// Scene units per unit of the sheet's local coordinates.
     pub factor: f32,
@@ -84,7 +98,7 @@ impl Sheet {
                 sheet.of_triangles[own as usize] = ChartId::new(charts.len() - first_chart);
                 sheet.corners[own as usize] = corners.map(|c| (Vec2::from_array(c) - lower).to_array());
                 try_push(&mut sheet.triangles, own, CHARTS)?;
-                area += super::charts::triangle_area(scene, t);
+                area += triangle_area(scene, t);
             }
             let chart = Chart {
                 triangles: first..sheet.triangles.len() as u32,
@@ -116,36 +130,4 @@ impl Shape<'_> {
 #[inline]
 pub(super) fn scaled(corners: [[f32; 2]; 3], factor: f32) -> [[f32; 2]; 3] {
     corners.map(|c| c.map(|x| x * factor))
-}
-
-impl Charts {
-    /// Number of charts of meshes that stand in the scene themselves, which come first.
-    pub(super) fn own_charts(&self) -> usize {
-        self.places.first().map_or(self.charts.len(), |place| place.first_chart.index())
-    }
-
-    /// Returns the chart of a triangle of an instance, and its sheet; `None` if there is no such triangle.
-    pub(super) fn place_of(&self, triangle: u32) -> Option<(&Place, &Sheet, u32)> {
-        let after = self.places.partition_point(|place| place.first_triangle <= triangle);
-        let place = self.places.get(after.checked_sub(1)?)?;
-        let (sheet, own) = (&self.shared[place.sheet as usize], triangle - place.first_triangle);
-        ((own as usize) < sheet.of_triangles.len()).then_some((place, sheet, own))
-    }
-
-    /// Returns a chart as it is in its sheet.
-    pub(in crate::lightmap) fn shape(&self, chart: ChartId) -> Shape<'_> {
-        if chart.index() < self.own_charts() {
-            return Shape { sheet: &self.own, first_triangle: 0, factor: 1.0, number: chart.index() };
-        }
-        let place = &self.places[self.places.partition_point(|place| place.first_chart <= chart) - 1];
-        let sheet = &self.shared[place.sheet as usize];
-        let number = sheet.first_shape as usize + chart.index() - place.first_chart.index();
-        Shape { sheet, first_triangle: place.first_triangle, factor: place.factor, number }
-    }
-
-    /// Returns all sheets, with their charts where they were made.
-    pub(in crate::lightmap) fn sheets(&self) -> impl Iterator<Item = (&Sheet, &[Chart])> {
-        let charts = |sheet: &Sheet| &self.charts[sheet.charts.start as usize..sheet.charts.end as usize];
-        std::iter::once(&self.own).chain(&self.shared).map(move |sheet| (sheet, charts(sheet)))
-    }
 }
