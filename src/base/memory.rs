@@ -223,6 +223,15 @@ pub fn try_par_gather<T: Send>(
     what: &str,
     part: impl Fn(usize, &mut Vec<T>) -> Result<()> + Sync,
 ) -> Result<Vec<T>> {
+    par_gather(parts, what, &part)
+}
+
+/// Does the work of [`try_par_gather`], compiled once for all that gather a type.
+fn par_gather<T: Send>(
+    parts: usize,
+    what: &str,
+    part: &(dyn Fn(usize, &mut Vec<T>) -> Result<()> + Sync),
+) -> Result<Vec<T>> {
     let one = |i: usize| {
         let mut of_part = Vec::new();
         part(i, &mut of_part).map(|()| of_part)

@@ -26,10 +26,7 @@ const MOST_COMPARED: usize = 16;
 
 /// Finds the source of each instance. `has_same` says whether the same triangles of two instances of a mesh are surfaces:
 /// placing them may round some to a line.
-pub(in crate::lightmap) fn sources(
-    scene: &Scene,
-    mut has_same: impl FnMut(u32, u32) -> Result<bool>,
-) -> Result<Vec<Source>> {
+pub(in crate::lightmap) fn sources(scene: &Scene, has_same: &dyn Fn(u32, u32) -> Result<bool>) -> Result<Vec<Source>> {
     let mut sources = try_with_capacity(scene.instances().len(), CHARTS)?;
     let mut known: Vec<Vec<(u32, f64, [DVec3; 2])>> = try_collect(scene.meshes().iter().map(|_| Vec::new()), CHARTS)?;
     for (number, instance) in (0..).zip(scene.instances()) {
@@ -96,7 +93,7 @@ mod tests {
         let (even, flat) = (Vec3::ONE, Vec3::new(1.0, 0.5, 1.0));
         let scene =
             scene(&[at(even, 0.0, 0.0), at(2.0 * even, 1.0, 5.0), at(flat, 0.3, 9.0), at(3.0 * flat, 2.0, 20.0)]);
-        let sources = sources(&scene, |_, _| Ok(true)).unwrap();
+        let sources = sources(&scene, &|_, _| Ok(true)).unwrap();
         assert_eq!(sources.iter().map(|s| s.instance).collect::<Vec<_>>(), [0, 0, 2, 2]);
         let factors = sources.iter().map(|s| s.factor);
         assert!(factors.zip([1.0, 2.0, 1.0, 3.0]).all(|(a, b)| (a - b).abs() < 1e-5 * b), "{sources:?}");

@@ -98,7 +98,7 @@ impl Charts {
         let max_extent = padded_extent(page_size, padding)? as f64 / texels_per_unit as f64;
         check_density(surface_area(scene)?, texels_per_unit)?;
         let stage = progress.stage("unwrap", 0.0, 0.5, scene.triangle_count() as u64 + 1);
-        let sources = alike::sources(scene, |a, b| same_triangles(scene, a, b, &stage))?;
+        let sources = alike::sources(scene, &|a, b| same_triangles(scene, a, b, &stage))?;
         let made = (0..).zip(&sources).filter(|(i, source)| source.instance == *i).map(|(i, _)| i);
         let made: Vec<u32> = try_collect(made.map(|i: u32| scene.object_of_instance(i)), CHARTS)?;
         // Memory of pieces and charts, which exist at the same time, and of the meshes that are unwrapped.
@@ -310,7 +310,7 @@ pub fn surface_area(scene: &Scene) -> Result<f64> {
     };
     let of_meshes: f64 = (0..scene.meshes().len() as u32).map(area).sum();
     let mut of_instances: Vec<f64> = try_with_capacity(scene.instances().len(), CHARTS)?;
-    for (instance, source) in (0..).zip(alike::sources(scene, |_, _| Ok(true))?) {
+    for (instance, source) in (0..).zip(alike::sources(scene, &|_, _| Ok(true))?) {
         of_instances.push(if source.instance == instance {
             area(scene.object_of_instance(instance))
         } else {

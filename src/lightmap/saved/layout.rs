@@ -346,7 +346,7 @@ fn known(
     let pages = MAX_TEXELS / u64::from(desc.page_size).pow(2);
     let mut pieces: Vec<Piece> = try_with_capacity(content.charts.len(), LAYOUT)?;
     let stage = progress.stage("charts", 0.4, 0.5, u64::from(scene.triangle_count()));
-    let sources = alike::sources(scene, |a, b| same_triangles(scene, a, b, &stage))?;
+    let sources = alike::sources(scene, &|a, b| same_triangles(scene, a, b, &stage))?;
     // No local coordinates are longer than the surface is, wherever it stands.
     let limit = sources.iter().fold(1.0f32, |m, s| m.max(s.factor)).recip() * MAX_LENGTH;
     let (mut rest, mut last_page, mut object) = (&content.triangles[..], Some(0), 0);

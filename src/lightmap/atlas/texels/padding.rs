@@ -75,7 +75,7 @@ impl TexelMap {
         let (mut filled, mut outside) = (Vec::new(), HashMap::new());
         for group in groups {
             filled.clear();
-            self.shown(group, area, padding, |x, y, sample, is_covered| {
+            self.shown(group, area, padding, &mut |x, y, sample, is_covered| {
                 let Some(i) = area.index(x, y) else { return Ok(()) };
                 if is_covered {
                     out[i] = value(sample);
@@ -106,7 +106,7 @@ impl TexelMap {
         group: usize,
         area: &PageArea,
         padding: u32,
-        mut visit: impl FnMut(i32, i32, u32, bool) -> Result<()>,
+        visit: &mut dyn FnMut(i32, i32, u32, bool) -> Result<()>,
     ) -> Result<()> {
         let window = self.groups[group].area();
         let reach = padding as i32;
