@@ -65,6 +65,10 @@ impl<'a> Job<'a> {
                 "{name} has the lights that it was saved with; --light adds none"
             )));
         }
+        if self.args.repeat > 1 {
+            let name = &self.args.scene;
+            return Err(Error::InvalidArgument(format!("{name} is opened as it was saved; --repeat does not apply")));
+        }
         let start = Instant::now();
         let (path, options) = (Path::new(&self.args.scene), OpenOptions { map: !self.args.read_scene });
         let scene = self.bars.show("open", |p| Scene::open(device, path, &options, p))?;

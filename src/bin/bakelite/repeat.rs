@@ -1,12 +1,15 @@
 //! A scene beside itself many times, as in the thesis's tables 4.1 to 4.3, which measure scenes and multiples of them.
 
 use bakelite::scene::Instance;
-use bakelite::{Result, SceneData};
+use bakelite::{Error, Result, SceneData};
 use glam::{Affine3A, Vec3};
 
 /// Adds copies of all meshes, or makes instances of them, so that the scene stands `times` times in a square grid on the
-/// plane of x and z, each beside the next. Lights stay as they are.
+/// plane of x and z, each beside the next. Lights stay as they are. Fails if the scene has instances already.
 pub fn repeat(data: &mut SceneData, times: u32, as_instances: bool) -> Result<()> {
+    if !data.instances().is_empty() {
+        return Err(Error::InvalidArgument("--repeat: the scene has instances already".into()));
+    }
     let points = || data.meshes().iter().flat_map(|mesh| mesh.positions.iter().copied());
     let (lower, upper) = (points().fold(Vec3::INFINITY, Vec3::min), points().fold(Vec3::NEG_INFINITY, Vec3::max));
     let columns = (times as f64).sqrt().ceil() as u32;
@@ -44,5 +47,7 @@ mod tests {
             points
         });
         assert!(copies == instances);
+        let mut placed = builtin("colonnade:100000").unwrap();
+        assert!(repeat(&mut placed, 2, false).is_err());
     }
 }

@@ -6,9 +6,12 @@
 
 use super::pieces::CHARTS;
 use crate::base::error::Result;
+use crate::base::geometry::is_valid_triangle;
 use crate::base::memory::{try_collect, try_push, try_with_capacity};
+use crate::base::progress::Stage;
 use crate::scene::Scene;
 use glam::{DMat3, DVec3};
+use rayon::prelude::*;
 
 /// Which instance's sheet an instance gets, and the factor of its lengths.
 #[derive(Clone, Copy, Debug, PartialEq)]
@@ -24,9 +27,30 @@ const SAME: f64 = 1e-5;
 /// Number of differently transformed instances of a mesh among which like ones are looked for.
 const MOST_COMPARED: usize = 16;
 
-/// Finds the source of each instance. `has_same` says whether the same triangles of two instances of a mesh are surfaces:
-/// placing them may round some to a line.
-pub(in crate::lightmap) fn sources(scene: &Scene, has_same: &dyn Fn(u32, u32) -> Result<bool>) -> Result<Vec<Source>> {
+/// Finds the source of each instance: one whose triangles are surfaces where the instance's are, too. (Placing them may
+/// round some to a line.)
+pub(in crate::lightmap) fn sources(scene: &Scene, stage: &Stage) -> Result<Vec<Source>> {
+    find(scene, &|a, b| {
+        stage.check()?;
+        Ok(have_same_surfaces(scene, a, b))
+    })
+}
+
+/// Finds the source of each instance by transforms alone, for which no triangle is looked at.
+pub(in crate::lightmap) fn sources_by_transform(scene: &Scene) -> Result<Vec<Source>> {
+    find(scene, &|_, _| Ok(true))
+}
+
+/// Whether the same triangles of two instances of a mesh are valid. (What the build skips is the mesh's, and so the same.)
+fn have_same_surfaces(scene: &Scene, a: u32, b: u32) -> bool {
+    let [a, b] = [a, b].map(|instance| scene.object(scene.object_of_instance(instance)));
+    let triangles = a.mesh().indices.len() as u32;
+    let same = |t: u32| is_valid_triangle(a.corners(t)) == is_valid_triangle(b.corners(t));
+    scene.device().install(|| (0..triangles).into_par_iter().with_min_len(1 << 12).all(same))
+}
+
+/// Finds the source of each instance among those of its mesh with like transforms that `has_same` accepts.
+fn find(scene: &Scene, has_same: &dyn Fn(u32, u32) -> Result<bool>) -> Result<Vec<Source>> {
     let mut sources = try_with_capacity(scene.instances().len(), CHARTS)?;
     let mut known: Vec<Vec<(u32, f64, [DVec3; 2])>> = try_collect(scene.meshes().iter().map(|_| Vec::new()), CHARTS)?;
     for (number, instance) in (0..).zip(scene.instances()) {
@@ -93,7 +117,9 @@ mod tests {
         let (even, flat) = (Vec3::ONE, Vec3::new(1.0, 0.5, 1.0));
         let scene =
             scene(&[at(even, 0.0, 0.0), at(2.0 * even, 1.0, 5.0), at(flat, 0.3, 9.0), at(3.0 * flat, 2.0, 20.0)]);
-        let sources = sources(&scene, &|_, _| Ok(true)).unwrap();
+        let progress = Progress::none();
+        let sources = sources(&scene, &progress.stage("unwrap", 0.0, 1.0, 1)).unwrap();
+        assert_eq!(sources, sources_by_transform(&scene).unwrap());
         assert_eq!(sources.iter().map(|s| s.instance).collect::<Vec<_>>(), [0, 0, 2, 2]);
         let factors = sources.iter().map(|s| s.factor);
         assert!(factors.zip([1.0, 2.0, 1.0, 3.0]).all(|(a, b)| (a - b).abs() < 1e-5 * b), "{sources:?}");

@@ -11,14 +11,12 @@ pub use super::sheets::Chart;
 use super::sheets::{Place, Shape, Sheet, scaled};
 use super::unwrap;
 use crate::base::error::{Error, Result, invalid_argument};
-use crate::base::geometry::is_valid_triangle;
 use crate::base::memory::{try_collect, try_push, try_with_capacity};
 use crate::base::progress::{Progress, Stage};
 use crate::device::LogLevel;
 use crate::scene::{LightmapUvs, Mesh, Scene};
 use crate::simd::prefetch;
 use glam::{DVec2, Vec2};
-use rayon::prelude::*;
 use std::collections::BTreeMap;
 use std::ops::{Index, Range};
 use std::time::Instant;
@@ -98,7 +96,7 @@ impl Charts {
         let max_extent = padded_extent(page_size, padding)? as f64 / texels_per_unit as f64;
         check_density(surface_area(scene)?, texels_per_unit)?;
         let stage = progress.stage("unwrap", 0.0, 0.5, scene.triangle_count() as u64 + 1);
-        let sources = alike::sources(scene, &|a, b| same_triangles(scene, a, b, &stage))?;
+        let sources = alike::sources(scene, &stage)?;
         let made = (0..).zip(&sources).filter(|(i, source)| source.instance == *i).map(|(i, _)| i);
         let made: Vec<u32> = try_collect(made.map(|i: u32| scene.object_of_instance(i)), CHARTS)?;
         // Memory of pieces and charts, which exist at the same time, and of the meshes that are unwrapped.
@@ -171,7 +169,7 @@ impl Charts {
         })
     }
 
-    /// Asks for a triangle's chart and corners.
+    /// Asks for chart and corners of a triangle of a mesh. (Those of instances are found by a search first.)
     #[inline]
     pub(in crate::lightmap) fn prefetch(&self, triangle: u32) {
         if let (Some(chart), Some(corners)) =
@@ -293,16 +291,6 @@ impl Charts {
     }
 }
 
-/// Whether the same triangles of two instances of a mesh are valid.
-pub(in crate::lightmap) fn same_triangles(scene: &Scene, a: u32, b: u32, stage: &Stage) -> Result<bool> {
-    stage.check()?;
-    let [a, b] = [a, b].map(|instance| scene.object(scene.object_of_instance(instance)));
-    let triangles = a.mesh().indices.len() as u32;
-    // What the build skips is the mesh's, and so the same.
-    let same = |i: u32| is_valid_triangle(a.corners(i)) == is_valid_triangle(b.corners(i));
-    Ok(scene.device().install(|| (0..triangles).into_par_iter().with_min_len(1 << 12).all(same)))
-}
-
 /// Returns the area of all valid triangles, in squared scene units.
 pub fn surface_area(scene: &Scene) -> Result<f64> {
     let area = |object: u32| -> f64 {
@@ -310,7 +298,7 @@ pub fn surface_area(scene: &Scene) -> Result<f64> {
     };
     let of_meshes: f64 = (0..scene.meshes().len() as u32).map(area).sum();
     let mut of_instances: Vec<f64> = try_with_capacity(scene.instances().len(), CHARTS)?;
-    for (instance, source) in (0..).zip(alike::sources(scene, &|_, _| Ok(true))?) {
+    for (instance, source) in (0..).zip(alike::sources_by_transform(scene)?) {
         of_instances.push(if source.instance == instance {
             area(scene.object_of_instance(instance))
         } else {

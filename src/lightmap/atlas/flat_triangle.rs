@@ -22,8 +22,9 @@ impl Flat {
         (extent.x * extent.y) as u64
     }
 
-    /// Whether the triangle lies in at most four texels of a window of `size`, and all of them are `such`: few of the triangles
-    /// that are smaller than texels need a closer look.
+    /// Whether the triangle lies in at most four texels of a window of `size`, and all of them are `such`: few of the
+    /// triangles that are smaller than texels need a closer look. (With a cheaper comparison of instances, charts and texels
+    /// of 20 million took 3.5 instead of 4.2 s.)
     pub(in crate::lightmap) fn lies_in_few(&self, size: [i64; 2], such: impl Fn(i64, i64) -> bool) -> bool {
         let (lower, upper) = self.bounds();
         let range = |from: f64, to: f64, size: i64| {

@@ -2,8 +2,8 @@
 //! the same light map without unwrapping or looking for buried texels.
 //!
 //! A file holds records (`super::records`): `LAYT` with what the light map was made of and counts, `CHRT` (charts, in runs),
-//! `TRIS` (their triangles with local coordinates; of instances that are unwrapped alike those of the first), `SEEN` (which sides are seen), `PTCH` (texels that show other points,
-//! by map), `DONE`. Every number is checked before it is used.
+//! `TRIS` (their triangles with local coordinates; of instances that are unwrapped alike those of the first), `SEEN` (which
+//! sides are seen), `PTCH` (texels that show other points, by map), `DONE`. Every number is checked before it is used.
 
 use super::fingerprint::{self, compare};
 use super::records::{self, MAGIC, Next, RUN, Tag, take_one};
@@ -13,7 +13,7 @@ use crate::base::files;
 use crate::base::memory::{try_collect, try_push, try_with_capacity};
 use crate::base::progress::Progress;
 use crate::lightmap::atlas::alike;
-use crate::lightmap::atlas::charts::{Charts, Given, MAX_TEXELS, UvReport, same_triangles};
+use crate::lightmap::atlas::charts::{Charts, Given, MAX_TEXELS, UvReport};
 use crate::lightmap::atlas::ids::ChartId;
 use crate::lightmap::atlas::known::{Known, Patch};
 use crate::lightmap::atlas::pieces::Piece;
@@ -346,7 +346,7 @@ fn known(
     let pages = MAX_TEXELS / u64::from(desc.page_size).pow(2);
     let mut pieces: Vec<Piece> = try_with_capacity(content.charts.len(), LAYOUT)?;
     let stage = progress.stage("charts", 0.4, 0.5, u64::from(scene.triangle_count()));
-    let sources = alike::sources(scene, &|a, b| same_triangles(scene, a, b, &stage))?;
+    let sources = alike::sources(scene, &stage)?;
     // No local coordinates are longer than the surface is, wherever it stands.
     let limit = sources.iter().fold(1.0f32, |m, s| m.max(s.factor)).recip() * MAX_LENGTH;
     let (mut rest, mut last_page, mut object) = (&content.triangles[..], Some(0), 0);

@@ -48,7 +48,8 @@ struct Trees<'a> {
     others: Option<(Vec<[Vec3; 3]>, BinaryBvh, FourWide)>,
 }
 
-/// Prints a table in Markdown for each way, and writes `coherence.csv` and plots.
+/// Prints a table in Markdown for each way, and writes `coherence.csv` and plots. Rays are traced on one thread unless
+/// `--threads` asks for more.
 pub fn run(args: &ReportArgs) -> Result<()> {
     files::make_folder(&args.bake.out)?;
     println!("caches of a core: {}; {} threads\n", caches(), args.bake.threads.max(1));
@@ -100,7 +101,7 @@ fn kinds(args: &BakeArgs, scene: &Scene) -> Result<Vec<Kind>> {
         return Err(Error::InvalidArgument("the scene has no camera: give --camera".into()));
     };
     let view = PrimaryRays::new(&camera, VIEW, VIEW);
-    let pixel = |x: usize, y: usize| view.of_pixel(x, y).next().unwrap_or(Ray::new(Vec3::ZERO, Vec3::X));
+    let pixel = |x: usize, y: usize| view.of_pixel(x, y).next().expect("a pixel has rays");
     let squares = |side: usize| -> Vec<Ray> {
         let corner = |square: usize| [square % (VIEW / side) * side, square / (VIEW / side) * side];
         let of = |square: usize| (0..side * side).map(move |i| (corner(square), [i % side, i / side]));
