@@ -523,7 +523,7 @@ fn load(device: &Device, path: &Path) {
 fn scene_file(scene: &Scene, path: &Path) {
     scene.save(path, &Progress::none()).unwrap();
     for map in [true, false] {
-        let open = || Scene::open(scene.device(), path, &OpenOptions { map }, &Progress::none());
+        let open = || Scene::open(scene.device(), path, &OpenOptions { map, ..Default::default() }, &Progress::none());
         let opened = fail_each("open a scene, monitor", &REQUESTS_LEFT, open);
         assert_eq!(opened.stats().triangles, scene.stats().triangles);
     }

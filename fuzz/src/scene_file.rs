@@ -72,7 +72,7 @@ impl SceneFile {
         let _ = std::fs::remove_file(&self.input);
         let _ = seal(&mut file);
         std::fs::write(&self.input, &file).expect("a file");
-        let options = OpenOptions { map: which & 2 == 0 };
+        let options = OpenOptions { map: which & 2 == 0, ray_queues: which & 4 != 0 };
         let mut scene = match Scene::open(&self.device, &self.input, &options, &Progress::none()) {
             Ok(scene) => scene,
             Err(e) => return assert!(matches!(e, Error::Io(_) | Error::OutOfMemory(_)), "{e}"),

@@ -3,7 +3,7 @@
 use memmap2::MmapMut;
 use std::fmt;
 use std::mem::ManuallyDrop;
-use std::ops::{Deref, DerefMut};
+use std::ops::{Deref, DerefMut, Range};
 use std::ptr::NonNull;
 use std::sync::Arc;
 
@@ -13,7 +13,7 @@ pub(crate) struct Mapping {
     start: NonNull<u8>,
     bytes: usize,
     /// Unmaps on drop.
-    _map: MmapMut,
+    map: MmapMut,
 }
 
 // SAFETY: the mapping owns the memory, which only arrays refer to, each a part of its own.
@@ -24,7 +24,16 @@ unsafe impl Sync for Mapping {}
 impl Mapping {
     pub fn new(mut map: MmapMut) -> Mapping {
         let start = NonNull::new(map.as_mut_ptr()).expect("a slice has an address");
-        Mapping { start, bytes: map.len(), _map: map }
+        Mapping { start, bytes: map.len(), map }
+    }
+
+    /// Asks the system to read a part of the file now.
+    fn will_need(&self, offset: usize, bytes: usize) {
+        // (Without, pages come one by one, when they are touched.)
+        #[cfg(unix)]
+        let _ = self.map.advise_range(memmap2::Advice::WillNeed, offset, bytes);
+        #[cfg(not(unix))]
+        let _ = (&self.map, offset, bytes);
     }
 }
 
@@ -38,7 +47,7 @@ pub struct Array<T> {
 
 enum Owner {
     Vec { capacity: usize },
-    Mapping { _map: Arc<Mapping> },
+    Mapping { map: Arc<Mapping> },
 }
 
 // SAFETY: it owns its elements, as a `Vec` does.
@@ -56,7 +65,15 @@ impl<T> Array<T> {
         let end = len.checked_mul(size_of::<T>())?.checked_add(offset)?;
         // SAFETY: within the mapping or at its end.
         let start = (end <= map.bytes).then(|| unsafe { map.start.add(offset) }.cast::<T>())?;
-        start.is_aligned().then(|| Array { start, len, owner: Owner::Mapping { _map: map.clone() } })
+        start.is_aligned().then(|| Array { start, len, owner: Owner::Mapping { map: map.clone() } })
+    }
+
+    /// Asks the system to read these elements now, if they lie in a mapped file.
+    pub(crate) fn will_need(&self, elements: Range<usize>) {
+        let Owner::Mapping { map } = &self.owner else { return };
+        let elements = &self[elements];
+        let offset = elements.as_ptr().addr() - map.start.addr().get();
+        map.will_need(offset, size_of_val(elements));
     }
 
     /// Lends the elements as a `Vec`, to add some or to take some away. (Those of a mapped file are copied.)

@@ -173,6 +173,11 @@ impl CompactNode {
         self.children().filter(|(_, c)| !c.is_leaf())
     }
 
+    /// The children, with lower and upper corner of their boxes as rays test them.
+    pub(super) fn boxes(&self) -> impl Iterator<Item = (ChildRef, (Vec3, Vec3))> + '_ {
+        self.children().map(|(i, child)| (child, self.decoded(i).into()))
+    }
+
     /// What takes the places of missing children.
     pub(super) fn missing(&self) -> impl Iterator<Item = ChildRef> + use<> {
         let (present, names) = (self.present, self.names());

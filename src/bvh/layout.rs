@@ -43,6 +43,9 @@ impl ChildRef {
     /// No child.
     pub const EMPTY: ChildRef = ChildRef(u32::MAX);
 
+    /// The root of a tree.
+    pub(crate) const ROOT: ChildRef = ChildRef(0);
+
     pub(crate) fn node(index: usize) -> Self {
         debug_assert!(index < 1 << 31);
         ChildRef(index as u32)
@@ -216,6 +219,12 @@ impl<const W: usize> Mbvh<W> {
     /// Number of nodes.
     pub fn node_count(&self) -> usize {
         self.nodes.len()
+    }
+
+    /// Whether a child is a node of this tree.
+    #[inline]
+    pub(crate) fn has_node(&self, node: ChildRef) -> bool {
+        node.node_index() < self.nodes.len()
     }
 
     /// Size in bytes of nodes and leaves.

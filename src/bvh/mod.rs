@@ -12,6 +12,7 @@ mod cut;
 pub(crate) mod instances;
 pub(crate) mod layout;
 mod partings;
+pub(crate) mod parts;
 mod references;
 mod refit;
 mod slabs;

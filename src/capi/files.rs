@@ -323,11 +323,18 @@ pub struct bk_open_params {
     /// under its name is fine: it makes a new file.) 0: the file is read to memory; rays are
     /// somewhat faster, because memory can have large pages. Default: 1.
     pub map: u32,
+    /// 1: rays wait at parts of the tree until enough of them do, for scenes that are larger than
+    /// memory: a part is then read for many rays at once. The rays that a device's threads trace wait
+    /// together, so that its `num_threads` should be many more than there are cores, 64 for example.
+    /// Hits and light stay the same, bit for bit. Scenes that fit into memory take longer so. A refit
+    /// brings all of the scene to memory, and ends it. Default: 0.
+    pub ray_queues: u32,
 }
 
 sized_struct!(bk_open_params, defaults: bk_open_params {
     struct_size: size_of::<bk_open_params>() as u32,
     map: OpenOptions::default().map.into(),
+    ray_queues: OpenOptions::default().ray_queues.into(),
 });
 
 /// Sets `struct_size` and fills in the defaults.
@@ -373,7 +380,8 @@ pub unsafe extern "C" fn bk_scene_open(
         let scene = hold(scene, "scene")?;
         let path = text(path, "path")?;
         let params = if params.is_null() { bk_open_params::defaults() } else { read_struct(params, "params")? };
-        let options = OpenOptions { map: read_bool(params.map, "map")? };
+        let options =
+            OpenOptions { map: read_bool(params.map, "map")?, ray_queues: read_bool(params.ray_queues, "ray_queues")? };
         scene.device.check_process()?;
         scene.open(|device| Scene::open(device, path.as_ref(), &options, &self::progress(progress, user)))
     })

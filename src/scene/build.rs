@@ -216,6 +216,7 @@ impl Parts {
             tree,
             skipped,
             instances,
+            parts: None,
             uses,
             stats,
             _memory: memory,

@@ -1,6 +1,7 @@
 //! The committed scene: its contents, and access to its parts by number.
 
 use super::instance_trees;
+use super::waiting::WaitingRays;
 use super::{
     Emitter, Environment, Instance, Light, MAX_ALBEDO, Material, Mesh, Object, SceneData, Sky, Texture,
     is_valid_triangle, unit_normal,
@@ -67,6 +68,8 @@ pub struct Scene {
     pub(super) skipped: Vec<u32>,
     /// Trees of meshes with instances; `None` if there are none.
     pub(super) instances: Option<Box<Instances>>,
+    /// The tree in parts at which rays wait, if that was asked for.
+    pub(super) parts: Option<Box<WaitingRays>>,
     pub(super) uses: Uses,
     pub(super) stats: SceneStats,
     pub(super) _memory: Reservation,
@@ -323,6 +326,12 @@ impl Scene {
     #[inline]
     pub(crate) fn acceleration(&self) -> (&Tree, &[u32]) {
         (&self.tree, &self.first_triangle)
+    }
+
+    /// The same tree in parts at which rays wait, if that was asked for.
+    #[inline]
+    pub(crate) fn parts(&self) -> Option<&WaitingRays> {
+        self.parts.as_deref()
     }
 
     /// The trees of meshes with instances, if there are any.

@@ -16,6 +16,7 @@ pub(crate) mod precision;
 mod refit;
 mod saved;
 mod texture;
+pub(crate) mod waiting;
 
 pub use crate::base::geometry::{MAX_COORDINATE, NONE, is_valid_triangle, unit_normal};
 pub use camera::Camera;

@@ -168,6 +168,8 @@ impl Scene {
                 Some(instances) => Some(Box::new(instances.try_clone()?)),
                 None => None,
             },
+            // What a refit writes is in memory.
+            parts: None,
             uses: self.uses.clone(),
             stats: self.stats,
             _memory: memory,

@@ -109,6 +109,7 @@ struct Entry {
 #[inline(always)]
 pub(super) unsafe fn trace<S: Simd>(
     tree: &Mbvh,
+    root: ChildRef,
     group: &mut Group,
     rays: &[Ray],
     order: &mut [u16],
@@ -151,7 +152,7 @@ pub(super) unsafe fn trace<S: Simd>(
             unsafe { pack.set_up::<S>(group.axes(shaft.axis as usize), shaft.count) };
         }
         // SAFETY: forwarded.
-        let given_up = unsafe { Traversal { tree, shafts, packs: &mut *packs, octant: group.octant }.run::<S>() };
+        let given_up = unsafe { Traversal { tree, shafts, packs: &mut *packs, octant: group.octant }.run::<S>(root) };
         for (i, (pack, shaft)) in packs.iter().zip(shafts).enumerate() {
             let is_given_up = given_up >> i & 1 != 0;
             for i in 0..shaft.count {
@@ -472,10 +473,9 @@ impl Traversal<'_> {
     /// # Safety
     /// The CPU must have the ISA, and as many packs as there are shafts must have been set up.
     #[inline(always)]
-    unsafe fn run<S: Simd>(&mut self) -> u32 {
+    unsafe fn run<S: Simd>(&mut self, root: ChildRef) -> u32 {
         let mut given_up = 0;
         let mut stack = [const { MaybeUninit::<Entry>::uninit() }; STACK_SIZE];
-        let root = ChildRef::node(0);
         let mut left = u32::MAX >> (PACKS - self.shafts.len());
         stack[0].write(Entry { child: root, packs: left, parent: root, lane: 0 });
         let mut depth = 1;

@@ -33,6 +33,12 @@ impl<'a> View<'a> {
         View { tree, meshes, first_triangle }
     }
 
+    /// Whether a child is a node of this tree.
+    #[inline]
+    pub(crate) fn has_node(&self, node: ChildRef) -> bool {
+        node.node_index() < self.tree.nodes.len()
+    }
+
     /// The corners of a triangle.
     ///
     /// # Safety

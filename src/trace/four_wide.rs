@@ -6,7 +6,7 @@ use super::{RawHit, Ray, single, stream};
 use crate::base::error::{Result, invalid_argument};
 use crate::base::geometry::is_valid_triangle;
 use crate::base::progress::Progress;
-use crate::bvh::{self, BuildOptions, Mbvh, References};
+use crate::bvh::{self, BuildOptions, ChildRef, Mbvh, References};
 use crate::scene::Scene;
 use crate::simd::{self, Isa, entry_point, isa_features};
 
@@ -87,13 +87,13 @@ macro_rules! kernels {
             isa_features! { $isa => entry_point! {
                 fn many(tree: &Mbvh<4>, rays: &[Ray], out: &mut [RawHit]) {
                     let n = rays.len().min(out.len());
-                    single::many::<S, _, false>(tree, n, |i| rays[i], |i, hit| out[i] = hit)
+                    single::many::<S, _, false>(tree, ChildRef::ROOT, n, |i| rays[i], |i, hit| out[i] = hit)
                 }
             } }
             isa_features! { $isa => entry_point! {
                 fn streamed(tree: &Mbvh<4>, rays: &[Ray], out: &mut [RawHit]) {
                     let n = rays.len().min(out.len());
-                    stream::stream::<S, _, false>(tree, &rays[..n], |i, hit| out[i] = hit)
+                    stream::stream::<S, _, false>(tree, ChildRef::ROOT, &rays[..n], |i, hit| out[i] = hit)
                 }
             } }
 

@@ -6,7 +6,7 @@
 
 use super::single::many;
 use super::{PACKET_SIZE, Packet, RawHit, Ray};
-use crate::bvh::layout::Mbvh;
+use crate::bvh::layout::{ChildRef, Mbvh};
 use crate::simd::Simd;
 use glam::Vec3;
 
@@ -26,5 +26,5 @@ pub(super) unsafe fn gather<S: Simd>(
     let count = packet.count.min(PACKET_SIZE);
     let ray = |i: usize| Ray::new(origin, Vec3::new(packet.x[i], packet.y[i], packet.z[i])).within(tmin, tmax);
     // SAFETY: forwarded.
-    unsafe { many::<S, _, false>(bvh, count, ray, |i, hit| out[i] = hit) }
+    unsafe { many::<S, _, false>(bvh, ChildRef::ROOT, count, ray, |i, hit| out[i] = hit) }
 }

@@ -12,8 +12,8 @@ use super::queries::TreeView;
 use super::single::Walk;
 use super::{RawHit, Ray};
 use crate::base::geometry::NONE;
-use crate::bvh::Mbvh;
 use crate::bvh::instances::{Instances, PlacedTree};
+use crate::bvh::{ChildRef, Mbvh};
 use crate::scene::Scene;
 use glam::Vec3A;
 use std::cell::Cell;
@@ -35,8 +35,8 @@ pub(super) trait Answer: Copy {
     /// How far the ray goes on; `None` if its answer cannot change.
     fn tmax(&self, ray: &Ray) -> Option<f32>;
 
-    /// Traces rays through the tree of a mesh; `alike`: as a stream if there are enough.
-    fn trace(scene: &Scene, tree: TreeView, rays: &[Ray], alike: bool, out: &mut [Self]);
+    /// Traces rays through what is below a node of a tree; `alike`: as a stream if there are enough.
+    fn trace(scene: &Scene, tree: TreeView, root: ChildRef, rays: &[Ray], alike: bool, out: &mut [Self]);
 
     /// Adds what a ray has found in an instance.
     fn add(&mut self, found: Self, first_triangle: u32);
@@ -54,14 +54,14 @@ impl Answer for RawHit {
         Some(if self.is_miss() { ray.tmax } else { self.t })
     }
 
-    fn trace(scene: &Scene, tree: TreeView, rays: &[Ray], alike: bool, out: &mut [RawHit]) {
+    fn trace(scene: &Scene, tree: TreeView, root: ChildRef, rays: &[Ray], alike: bool, out: &mut [RawHit]) {
         let (kernels, as_stream) = (scene.kernels(), alike && rays.len() >= LEAST_STREAM);
         match (tree, rays) {
-            (TreeView::Whole(tree), [ray]) => out[0] = kernels.intersect(tree, ray),
-            (TreeView::Whole(tree), _) if !as_stream => kernels.intersect_block(tree, rays, out),
-            (TreeView::Whole(tree), _) => kernels.stream(tree, rays, out),
-            (TreeView::Compact(tree), _) if !as_stream => kernels.compact_intersect(&tree, rays, out),
-            (TreeView::Compact(tree), _) => kernels.compact_stream(&tree, rays, out),
+            (TreeView::Whole(tree), [ray]) if root == ChildRef::ROOT => out[0] = kernels.intersect(tree, ray),
+            (TreeView::Whole(tree), _) if !as_stream => kernels.intersect_block(tree, root, rays, out),
+            (TreeView::Whole(tree), _) => kernels.stream(tree, root, rays, out),
+            (TreeView::Compact(tree), _) if !as_stream => kernels.compact_intersect(&tree, root, rays, out),
+            (TreeView::Compact(tree), _) => kernels.compact_stream(&tree, root, rays, out),
         }
     }
 
@@ -90,14 +90,14 @@ impl Answer for u8 {
         (*self == 0).then_some(ray.tmax)
     }
 
-    fn trace(scene: &Scene, tree: TreeView, rays: &[Ray], alike: bool, out: &mut [u8]) {
+    fn trace(scene: &Scene, tree: TreeView, root: ChildRef, rays: &[Ray], alike: bool, out: &mut [u8]) {
         let (kernels, as_stream) = (scene.kernels(), alike && rays.len() >= LEAST_STREAM);
         match (tree, rays) {
-            (TreeView::Whole(tree), [ray]) => out[0] = kernels.occluded(tree, ray) as u8,
-            (TreeView::Whole(tree), _) if !as_stream => kernels.occluded_block(tree, rays, out),
-            (TreeView::Whole(tree), _) => kernels.stream_occluded(tree, rays, out),
-            (TreeView::Compact(tree), _) if !as_stream => kernels.compact_occluded(&tree, rays, out),
-            (TreeView::Compact(tree), _) => kernels.compact_stream_occluded(&tree, rays, out),
+            (TreeView::Whole(tree), [ray]) if root == ChildRef::ROOT => out[0] = kernels.occluded(tree, ray) as u8,
+            (TreeView::Whole(tree), _) if !as_stream => kernels.occluded_block(tree, root, rays, out),
+            (TreeView::Whole(tree), _) => kernels.stream_occluded(tree, root, rays, out),
+            (TreeView::Compact(tree), _) if !as_stream => kernels.compact_occluded(&tree, root, rays, out),
+            (TreeView::Compact(tree), _) => kernels.compact_stream_occluded(&tree, root, rays, out),
         }
     }
 
@@ -176,7 +176,7 @@ impl Scene {
     fn meet_one_by_one<A: Answer>(&self, instances: &Instances, ray: &Ray, answer: &mut A) {
         let kernels = self.kernels();
         let mut place = MaybeUninit::uninit();
-        if answer.tmax(ray).is_none() || !Walk::begin::<Mbvh>(&mut place, ray, 0) {
+        if answer.tmax(ray).is_none() || !Walk::begin::<Mbvh>(&mut place, ChildRef::ROOT, ray, 0) {
             return;
         }
         // SAFETY: it has begun.
@@ -188,7 +188,14 @@ impl Scene {
             }
             let at = &instances.placed[instance as usize];
             let mut found = [A::MISS];
-            A::trace(self, self.tree_of(instances, at.tree), &[to_mesh(at, ray, tmax)], false, &mut found);
+            A::trace(
+                self,
+                self.tree_of(instances, at.tree),
+                ChildRef::ROOT,
+                &[to_mesh(at, ray, tmax)],
+                false,
+                &mut found,
+            );
             answer.add(found[0], at.first_triangle);
         }
     }
@@ -208,7 +215,7 @@ impl Scene {
         let walks = &mut walks.spare_capacity_mut()[..rays.len()];
         visits.clear();
         for (r, ((ray, answer), place)) in rays.iter().zip(&*answers).zip(&mut *walks).enumerate() {
-            if answer.tmax(ray).is_some() && Walk::begin::<Mbvh>(place, ray, r) {
+            if answer.tmax(ray).is_some() && Walk::begin::<Mbvh>(place, ChildRef::ROOT, ray, r) {
                 visits.push(r as u64);
             }
         }
@@ -236,7 +243,7 @@ impl Scene {
                 turned.extend(at_one.iter().map(ray));
                 found.clear();
                 found.resize(turned.len(), A::MISS);
-                A::trace(self, self.tree_of(instances, at.tree), turned, alike, found);
+                A::trace(self, self.tree_of(instances, at.tree), ChildRef::ROOT, turned, alike, found);
                 for (&visit, &found) in at_one.iter().zip(&*found) {
                     answers[visit as u32 as usize].add(found, at.first_triangle);
                 }
@@ -254,7 +261,7 @@ impl Scene {
         filter: &mut Filter,
     ) -> RawHit {
         let mut place = MaybeUninit::uninit();
-        if !Walk::begin::<Mbvh>(&mut place, ray, 0) {
+        if !Walk::begin::<Mbvh>(&mut place, ChildRef::ROOT, ray, 0) {
             return best;
         }
         // SAFETY: it has begun.

@@ -18,15 +18,15 @@ use glam::Vec3;
 /// that makes the methods safe.
 pub(crate) struct Kernels {
     intersect: unsafe fn(&Mbvh, &Ray) -> RawHit,
-    intersect_block: unsafe fn(&Mbvh, &[Ray], &mut [RawHit]),
+    intersect_block: unsafe fn(&Mbvh, ChildRef, &[Ray], &mut [RawHit]),
     occluded: unsafe fn(&Mbvh, &Ray) -> bool,
-    occluded_block: unsafe fn(&Mbvh, &[Ray], &mut [u8]),
+    occluded_block: unsafe fn(&Mbvh, ChildRef, &[Ray], &mut [u8]),
     /// Without and with VBMI2. `None`: as blocks. (On the portable lanes, of four, lists save nothing: tiles 1.00, one
     /// origin 0.7 to 0.97 times as fast with SSE2; and they take 0.2 MB of the library.)
     streams: Option<[&'static Streams; 2]>,
     gather: unsafe fn(&Mbvh, Vec3, &Packet, f32, f32, &mut [RawHit; PACKET_SIZE]),
-    compact_intersect: unsafe fn(&View, &[Ray], &mut [RawHit]),
-    compact_occluded: unsafe fn(&View, &[Ray], &mut [u8]),
+    compact_intersect: unsafe fn(&View, ChildRef, &[Ray], &mut [RawHit]),
+    compact_occluded: unsafe fn(&View, ChildRef, &[Ray], &mut [u8]),
     /// Closest hit and any hit, among those that a filter accepts.
     filtered: [unsafe fn(&Mbvh, &Ray, &mut Filter) -> RawHit; 2],
     compact_filtered: [unsafe fn(&View, &Ray, &mut Filter) -> RawHit; 2],
@@ -36,10 +36,10 @@ pub(crate) struct Kernels {
 /// Kernels of streams. On AVX-512 there are two of each: with VBMI2 and without.
 #[derive(Clone, Copy)]
 struct Streams {
-    closest: unsafe fn(&Mbvh, &[Ray], &mut [RawHit]),
-    any: unsafe fn(&Mbvh, &[Ray], &mut [u8]),
-    compact_closest: unsafe fn(&View, &[Ray], &mut [RawHit]),
-    compact_any: unsafe fn(&View, &[Ray], &mut [u8]),
+    closest: unsafe fn(&Mbvh, ChildRef, &[Ray], &mut [RawHit]),
+    any: unsafe fn(&Mbvh, ChildRef, &[Ray], &mut [u8]),
+    compact_closest: unsafe fn(&View, ChildRef, &[Ray], &mut [RawHit]),
+    compact_any: unsafe fn(&View, ChildRef, &[Ray], &mut [u8]),
 }
 
 macro_rules! streams {
@@ -49,27 +49,27 @@ macro_rules! streams {
             use simd::$isa as S;
 
             isa_features! { $isa => entry_point! {
-                fn stream(bvh: &Mbvh, rays: &[Ray], out: &mut [RawHit]) {
+                fn stream(bvh: &Mbvh, root: ChildRef, rays: &[Ray], out: &mut [RawHit]) {
                     let n = rays.len().min(out.len());
-                    stream::stream::<S, _, false>(bvh, &rays[..n], |i, hit| out[i] = hit)
+                    stream::stream::<S, _, false>(bvh, root, &rays[..n], |i, hit| out[i] = hit)
                 }
             } }
             isa_features! { $isa => entry_point! {
-                fn stream_occluded(bvh: &Mbvh, rays: &[Ray], out: &mut [u8]) {
+                fn stream_occluded(bvh: &Mbvh, root: ChildRef, rays: &[Ray], out: &mut [u8]) {
                     let n = rays.len().min(out.len());
-                    stream::stream::<S, _, true>(bvh, &rays[..n], |i, hit| out[i] = !hit.is_miss() as u8)
+                    stream::stream::<S, _, true>(bvh, root, &rays[..n], |i, hit| out[i] = !hit.is_miss() as u8)
                 }
             } }
             isa_features! { $isa => entry_point! {
-                fn compact_stream(tree: &View, rays: &[Ray], out: &mut [RawHit]) {
+                fn compact_stream(tree: &View, root: ChildRef, rays: &[Ray], out: &mut [RawHit]) {
                     let n = rays.len().min(out.len());
-                    stream::stream::<S, _, false>(tree, &rays[..n], |i, hit| out[i] = hit)
+                    stream::stream::<S, _, false>(tree, root, &rays[..n], |i, hit| out[i] = hit)
                 }
             } }
             isa_features! { $isa => entry_point! {
-                fn compact_stream_occluded(tree: &View, rays: &[Ray], out: &mut [u8]) {
+                fn compact_stream_occluded(tree: &View, root: ChildRef, rays: &[Ray], out: &mut [u8]) {
                     let n = rays.len().min(out.len());
-                    stream::stream::<S, _, true>(tree, &rays[..n], |i, hit| out[i] = !hit.is_miss() as u8)
+                    stream::stream::<S, _, true>(tree, root, &rays[..n], |i, hit| out[i] = !hit.is_miss() as u8)
                 }
             } }
 
@@ -93,15 +93,15 @@ macro_rules! table {
                 fn intersect(bvh: &Mbvh, ray: &Ray) -> RawHit { single::one::<S, _, false>(bvh, ray) }
             } }
             isa_features! { $isa => entry_point! {
-                fn intersect_block(bvh: &Mbvh, rays: &[Ray], out: &mut [RawHit]) { packet::block::<S>(bvh, rays, out) }
+                fn intersect_block(bvh: &Mbvh, root: ChildRef, rays: &[Ray], out: &mut [RawHit]) { packet::block::<S>(bvh, root, rays, out) }
             } }
             isa_features! { $isa => entry_point! {
                 fn occluded(bvh: &Mbvh, ray: &Ray) -> bool { !single::one::<S, _, true>(bvh, ray).is_miss() }
             } }
             isa_features! { $isa => entry_point! {
-                fn occluded_block(bvh: &Mbvh, rays: &[Ray], out: &mut [u8]) {
+                fn occluded_block(bvh: &Mbvh, root: ChildRef, rays: &[Ray], out: &mut [u8]) {
                     let n = rays.len().min(out.len());
-                    single::many::<S, _, true>(bvh, n, |i| rays[i], |i, hit| out[i] = !hit.is_miss() as u8)
+                    single::many::<S, _, true>(bvh, root, n, |i| rays[i], |i, hit| out[i] = !hit.is_miss() as u8)
                 }
             } }
             isa_features! { $isa => entry_point! {
@@ -112,20 +112,20 @@ macro_rules! table {
                 }
             } }
             isa_features! { $isa => entry_point! {
-                fn compact_intersect(tree: &View, rays: &[Ray], out: &mut [RawHit]) {
+                fn compact_intersect(tree: &View, root: ChildRef, rays: &[Ray], out: &mut [RawHit]) {
                     let n = rays.len().min(out.len());
                     match rays {
-                        [ray] if n == 1 => out[0] = single::one::<S, _, false>(tree, ray),
-                        _ => single::many::<S, _, false>(tree, n, |i| rays[i], |i, hit| out[i] = hit),
+                        [ray] if n == 1 && root == ChildRef::ROOT => out[0] = single::one::<S, _, false>(tree, ray),
+                        _ => single::many::<S, _, false>(tree, root, n, |i| rays[i], |i, hit| out[i] = hit),
                     }
                 }
             } }
             isa_features! { $isa => entry_point! {
-                fn compact_occluded(tree: &View, rays: &[Ray], out: &mut [u8]) {
+                fn compact_occluded(tree: &View, root: ChildRef, rays: &[Ray], out: &mut [u8]) {
                     let n = rays.len().min(out.len());
                     match rays {
-                        [ray] if n == 1 => out[0] = !single::one::<S, _, true>(tree, ray).is_miss() as u8,
-                        _ => single::many::<S, _, true>(tree, n, |i| rays[i], |i, hit| out[i] = !hit.is_miss() as u8),
+                        [ray] if n == 1 && root == ChildRef::ROOT => out[0] = !single::one::<S, _, true>(tree, ray).is_miss() as u8,
+                        _ => single::many::<S, _, true>(tree, root, n, |i| rays[i], |i, hit| out[i] = !hit.is_miss() as u8),
                     }
                 }
             } }
@@ -220,10 +220,11 @@ impl Kernels {
         unsafe { (self.intersect)(bvh, ray) }
     }
 
-    /// Closest hits of as many rays as both slices have.
-    pub(crate) fn intersect_block(&self, bvh: &Mbvh, rays: &[Ray], out: &mut [RawHit]) {
-        // SAFETY: see `intersect`.
-        unsafe { (self.intersect_block)(bvh, rays, out) }
+    /// Closest hits of as many rays as both slices have below a node of the tree.
+    pub(crate) fn intersect_block(&self, bvh: &Mbvh, root: ChildRef, rays: &[Ray], out: &mut [RawHit]) {
+        assert!(bvh.has_node(root));
+        // SAFETY: see `intersect`; the root is a node.
+        unsafe { (self.intersect_block)(bvh, root, rays, out) }
     }
 
     /// Any hit.
@@ -233,34 +234,39 @@ impl Kernels {
         unsafe { (self.occluded)(bvh, ray) }
     }
 
-    /// Any hit of as many rays as both slices have: 1 or 0.
-    pub(crate) fn occluded_block(&self, bvh: &Mbvh, rays: &[Ray], out: &mut [u8]) {
-        // SAFETY: see `intersect`.
-        unsafe { (self.occluded_block)(bvh, rays, out) }
+    /// Any hit of as many rays as both slices have below a node: 1 or 0.
+    pub(crate) fn occluded_block(&self, bvh: &Mbvh, root: ChildRef, rays: &[Ray], out: &mut [u8]) {
+        assert!(bvh.has_node(root));
+        // SAFETY: see `intersect`; the root is a node.
+        unsafe { (self.occluded_block)(bvh, root, rays, out) }
     }
 
-    /// Closest hits of as many rays as both slices have, as a stream.
-    pub(crate) fn stream(&self, bvh: &Mbvh, rays: &[Ray], out: &mut [RawHit]) {
-        // SAFETY: see `intersect`.
-        unsafe { self.streams().map_or(self.intersect_block, |s| s.closest)(bvh, rays, out) }
+    /// Closest hits of as many rays as both slices have below a node, as a stream.
+    pub(crate) fn stream(&self, bvh: &Mbvh, root: ChildRef, rays: &[Ray], out: &mut [RawHit]) {
+        assert!(bvh.has_node(root));
+        // SAFETY: see `intersect`; the root is a node.
+        unsafe { self.streams().map_or(self.intersect_block, |s| s.closest)(bvh, root, rays, out) }
     }
 
-    /// Any hit of as many rays as both slices have, as a stream: 1 or 0.
-    pub(crate) fn stream_occluded(&self, bvh: &Mbvh, rays: &[Ray], out: &mut [u8]) {
-        // SAFETY: see `intersect`.
-        unsafe { self.streams().map_or(self.occluded_block, |s| s.any)(bvh, rays, out) }
+    /// Any hit of as many rays as both slices have below a node, as a stream: 1 or 0.
+    pub(crate) fn stream_occluded(&self, bvh: &Mbvh, root: ChildRef, rays: &[Ray], out: &mut [u8]) {
+        assert!(bvh.has_node(root));
+        // SAFETY: see `intersect`; the root is a node.
+        unsafe { self.streams().map_or(self.occluded_block, |s| s.any)(bvh, root, rays, out) }
     }
 
-    /// Closest hits of as many rays as both slices have, as a stream through a compact tree.
-    pub(crate) fn compact_stream(&self, tree: &View, rays: &[Ray], out: &mut [RawHit]) {
-        // SAFETY: see `intersect`.
-        unsafe { self.streams().map_or(self.compact_intersect, |s| s.compact_closest)(tree, rays, out) }
+    /// Closest hits of as many rays as both slices have, below a node of a compact tree, as a stream.
+    pub(crate) fn compact_stream(&self, tree: &View, root: ChildRef, rays: &[Ray], out: &mut [RawHit]) {
+        assert!(tree.has_node(root));
+        // SAFETY: see `intersect`; the root is a node.
+        unsafe { self.streams().map_or(self.compact_intersect, |s| s.compact_closest)(tree, root, rays, out) }
     }
 
-    /// Any hit of as many rays as both slices have, as a stream through a compact tree: 1 or 0.
-    pub(crate) fn compact_stream_occluded(&self, tree: &View, rays: &[Ray], out: &mut [u8]) {
-        // SAFETY: see `intersect`.
-        unsafe { self.streams().map_or(self.compact_occluded, |s| s.compact_any)(tree, rays, out) }
+    /// Any hit of as many rays as both slices have, below a node of a compact tree, as a stream: 1 or 0.
+    pub(crate) fn compact_stream_occluded(&self, tree: &View, root: ChildRef, rays: &[Ray], out: &mut [u8]) {
+        assert!(tree.has_node(root));
+        // SAFETY: see `intersect`; the root is a node.
+        unsafe { self.streams().map_or(self.compact_occluded, |s| s.compact_any)(tree, root, rays, out) }
     }
 
     /// Closest hits of a packet of rays from one origin.
@@ -278,16 +284,18 @@ impl Kernels {
         unsafe { (self.gather)(bvh, origin, packet, tmin, tmax, out) }
     }
 
-    /// Closest hits of as many rays as both slices have, in a compact tree.
-    pub(crate) fn compact_intersect(&self, tree: &View, rays: &[Ray], out: &mut [RawHit]) {
-        // SAFETY: see `intersect`.
-        unsafe { (self.compact_intersect)(tree, rays, out) }
+    /// Closest hits of as many rays as both slices have below a node of a compact tree.
+    pub(crate) fn compact_intersect(&self, tree: &View, root: ChildRef, rays: &[Ray], out: &mut [RawHit]) {
+        assert!(tree.has_node(root));
+        // SAFETY: see `intersect`; the root is a node.
+        unsafe { (self.compact_intersect)(tree, root, rays, out) }
     }
 
-    /// Any hit of as many rays as both slices have, in a compact tree: 1 or 0.
-    pub(crate) fn compact_occluded(&self, tree: &View, rays: &[Ray], out: &mut [u8]) {
-        // SAFETY: see `intersect`.
-        unsafe { (self.compact_occluded)(tree, rays, out) }
+    /// Any hit of as many rays as both slices have below a node of a compact tree: 1 or 0.
+    pub(crate) fn compact_occluded(&self, tree: &View, root: ChildRef, rays: &[Ray], out: &mut [u8]) {
+        assert!(tree.has_node(root));
+        // SAFETY: see `intersect`; the root is a node.
+        unsafe { (self.compact_occluded)(tree, root, rays, out) }
     }
 
     /// Closest hit (`ANY`: any hit) among those that a filter accepts.

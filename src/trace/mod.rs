@@ -24,6 +24,7 @@ mod stream;
 mod stream_rays;
 mod tree;
 mod triangle;
+mod waiting;
 mod whole;
 
 pub(crate) use kernels::Kernels;

@@ -39,12 +39,12 @@ const LEAST: usize = 12;
 /// Maximum difference of slopes against the longest axis in a bundle.
 const SPREAD: f32 = 0.4;
 
-/// Closest hits of as many rays as both slices have: bundles are traced together, other rays one by one.
+/// Closest hits of as many rays as both slices have below the node `root`: bundles are traced together, other rays one by one.
 ///
 /// # Safety
 /// The CPU must have the ISA.
 #[inline(always)]
-pub(super) unsafe fn block<S: Simd>(bvh: &Mbvh, rays: &[Ray], out: &mut [RawHit]) {
+pub(super) unsafe fn block<S: Simd>(bvh: &Mbvh, root: ChildRef, rays: &[Ray], out: &mut [RawHit]) {
     let n = rays.len().min(out.len());
     let (rays, out) = (&rays[..n], &mut out[..n]);
     let mut start = 0;
@@ -61,11 +61,11 @@ pub(super) unsafe fn block<S: Simd>(bvh: &Mbvh, rays: &[Ray], out: &mut [RawHit]
         if start < end {
             let (rays, out) = (&rays[start..end], &mut out[start..end]);
             // SAFETY: forwarded.
-            unsafe { single::many::<S, _, false>(bvh, rays.len(), |i| rays[i], |i, hit| out[i] = hit) }
+            unsafe { single::many::<S, _, false>(bvh, root, rays.len(), |i| rays[i], |i, hit| out[i] = hit) }
         }
         if length > 0 {
             // SAFETY: forwarded; `bundle` has said that these are one.
-            unsafe { trace::<S>(bvh, &rays[end..end + length], &mut out[end..end + length]) }
+            unsafe { trace::<S>(bvh, root, &rays[end..end + length], &mut out[end..end + length]) }
         }
         start = end + length;
     }
@@ -273,7 +273,7 @@ unsafe fn replace<L: Lanes>(column: &mut Column, g: usize, mask: L::Mask, x: L) 
 /// # Safety
 /// The CPU must have the ISA; [`bundle`] must have said that all `rays` are one.
 #[inline(always)]
-unsafe fn trace<S: Simd>(bvh: &Mbvh, rays: &[Ray], out: &mut [RawHit]) {
+unsafe fn trace<S: Simd>(bvh: &Mbvh, root: ChildRef, rays: &[Ray], out: &mut [RawHit]) {
     let mut place = MaybeUninit::uninit();
     // SAFETY: forwarded.
     let (rays, shared, mut frustum) = unsafe { begin::<S>(rays, &mut place) };
@@ -287,7 +287,7 @@ unsafe fn trace<S: Simd>(bvh: &Mbvh, rays: &[Ray], out: &mut [RawHit]) {
             (&raw mut (*stack).first).cast::<u8>(),
         )
     };
-    let (mut count, mut number, mut first) = (0, 0, 0);
+    let (mut count, mut number, mut first) = (0, root.node_index(), 0);
     loop {
         // SAFETY: `number` is the root's or comes from a node of this tree. The builder bounds the tree's depth so
         // that there is room for eight more children (see `STACK_SIZE`). The caller vouches for the ISA.

@@ -76,7 +76,7 @@ impl Scene {
     #[cold]
     fn filtered<const ANY: bool>(&self, ray: &Ray, crossings: Option<&mut Vec<Crossing>>) -> RawHit {
         let mut filter = Filter { scene: self, crossings, first_triangle: 0 };
-        let hit = self.filtered_in::<ANY>(self.tree(), ray, &mut filter);
+        let hit = self.filtered_in::<ANY>(self.whole_tree(), ray, &mut filter);
         match self.instance_trees() {
             Some(instances) if !ANY || hit.is_miss() => self.meet_filtered::<ANY>(instances, ray, hit, &mut filter),
             _ => hit,

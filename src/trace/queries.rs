@@ -9,7 +9,7 @@ use crate::base::error::{Result, invalid_argument};
 use crate::base::geometry::NONE;
 use crate::base::memory::try_filled;
 use crate::bvh::instances::{Instances, MeshTree};
-use crate::bvh::{Mbvh, Tree};
+use crate::bvh::{ChildRef, Mbvh, Tree};
 use crate::scene::Scene;
 use crate::simd::Isa;
 use glam::Vec3;
@@ -62,9 +62,18 @@ impl Scene {
         Kernels::of(self.device())
     }
 
-    /// The acceleration structure, for kernels.
+    /// The acceleration structure, for kernels; if it is [in parts](super::waiting), what lies near its root.
     #[inline]
     pub(super) fn tree(&self) -> TreeView<'_> {
+        match self.parts() {
+            None => self.whole_tree(),
+            Some(parts) => TreeView::Whole(&parts.tree.near_root),
+        }
+    }
+
+    /// The acceleration structure, for kernels.
+    #[inline]
+    pub(super) fn whole_tree(&self) -> TreeView<'_> {
         let (tree, first_triangle) = self.acceleration();
         match tree {
             Tree::Whole(tree) => TreeView::Whole(tree),
@@ -312,13 +321,14 @@ impl Scene {
                 let rays: [Ray; PACKET_SIZE] = std::array::from_fn(|i| {
                     Ray::new(origin, Vec3::new(packet.x[i], packet.y[i], packet.z[i])).within(tmin, tmax)
                 });
-                self.kernels().compact_intersect(&tree, &rays[..count], out);
+                self.kernels().compact_intersect(&tree, ChildRef::ROOT, &rays[..count], out);
             }
         }
-        if self.instance_trees().is_some() {
+        if self.instance_trees().is_some() || self.parts().is_some() {
             let ray = |i: usize| Ray::new(origin, Vec3::new(packet.x[i], packet.y[i], packet.z[i])).within(tmin, tmax);
             let rays: [Ray; PACKET_SIZE] = std::array::from_fn(ray);
             let count = packet.count.min(PACKET_SIZE);
+            self.meet_parts(&rays[..count], false, out);
             self.meet_instances(&rays[..count], false, out);
         }
         if self.has_holes() {
@@ -333,10 +343,11 @@ impl Scene {
             TreeView::Whole(tree) => self.kernels().intersect(tree, ray),
             TreeView::Compact(tree) => {
                 let mut hit = [RawHit::MISS];
-                self.kernels().compact_intersect(&tree, std::slice::from_ref(ray), &mut hit);
+                self.kernels().compact_intersect(&tree, ChildRef::ROOT, std::slice::from_ref(ray), &mut hit);
                 hit[0]
             }
         }];
+        self.meet_parts(std::slice::from_ref(ray), false, &mut hit);
         self.meet_instances(std::slice::from_ref(ray), false, &mut hit);
         if self.has_holes() {
             self.leave_holes(std::slice::from_ref(ray), &mut hit);
@@ -361,9 +372,10 @@ impl Scene {
         match self.tree() {
             TreeView::Whole(tree) => occluded[0] = self.kernels().occluded(tree, ray) as u8,
             TreeView::Compact(tree) => {
-                self.kernels().compact_occluded(&tree, std::slice::from_ref(ray), &mut occluded);
+                self.kernels().compact_occluded(&tree, ChildRef::ROOT, std::slice::from_ref(ray), &mut occluded);
             }
         }
+        self.meet_parts(std::slice::from_ref(ray), false, &mut occluded);
         self.meet_instances(std::slice::from_ref(ray), false, &mut occluded);
         occluded[0] != 0
     }
@@ -371,9 +383,10 @@ impl Scene {
     /// Closest hits of as many rays as both slices have.
     pub(crate) fn intersect_block(&self, rays: &[Ray], out: &mut [RawHit]) {
         match self.tree() {
-            TreeView::Whole(tree) => self.kernels().intersect_block(tree, rays, out),
-            TreeView::Compact(tree) => self.kernels().compact_intersect(&tree, rays, out),
+            TreeView::Whole(tree) => self.kernels().intersect_block(tree, ChildRef::ROOT, rays, out),
+            TreeView::Compact(tree) => self.kernels().compact_intersect(&tree, ChildRef::ROOT, rays, out),
         }
+        self.meet_parts(rays, false, out);
         self.meet_instances(rays, false, out);
         if self.has_holes() {
             self.leave_holes(rays, out);
@@ -384,9 +397,10 @@ impl Scene {
     /// those of [`intersect_raw`](Self::intersect_raw), bit for bit.
     pub fn intersect_stream(&self, rays: &[Ray], out: &mut [RawHit]) {
         match self.tree() {
-            TreeView::Whole(tree) => self.kernels().stream(tree, rays, out),
-            TreeView::Compact(tree) => self.kernels().compact_stream(&tree, rays, out),
+            TreeView::Whole(tree) => self.kernels().stream(tree, ChildRef::ROOT, rays, out),
+            TreeView::Compact(tree) => self.kernels().compact_stream(&tree, ChildRef::ROOT, rays, out),
         }
+        self.meet_parts(rays, true, out);
         self.meet_instances(rays, true, out);
         if self.has_holes() {
             self.leave_holes(rays, out);
@@ -396,9 +410,10 @@ impl Scene {
     /// Any hit of as many rays as both slices have, which start near one another, traced as a stream: 1 or 0.
     pub fn occluded_stream(&self, rays: &[Ray], out: &mut [u8]) {
         match self.tree() {
-            TreeView::Whole(tree) => self.kernels().stream_occluded(tree, rays, out),
-            TreeView::Compact(tree) => self.kernels().compact_stream_occluded(&tree, rays, out),
+            TreeView::Whole(tree) => self.kernels().stream_occluded(tree, ChildRef::ROOT, rays, out),
+            TreeView::Compact(tree) => self.kernels().compact_stream_occluded(&tree, ChildRef::ROOT, rays, out),
         }
+        self.meet_parts(rays, true, out);
         self.meet_instances(rays, true, out);
         if self.has_holes() {
             self.look_through_holes(rays, out);
@@ -408,9 +423,10 @@ impl Scene {
     /// Any hit of as many rays as both slices have: 1 or 0.
     pub(crate) fn occluded_block(&self, rays: &[Ray], out: &mut [u8]) {
         match self.tree() {
-            TreeView::Whole(tree) => self.kernels().occluded_block(tree, rays, out),
-            TreeView::Compact(tree) => self.kernels().compact_occluded(&tree, rays, out),
+            TreeView::Whole(tree) => self.kernels().occluded_block(tree, ChildRef::ROOT, rays, out),
+            TreeView::Compact(tree) => self.kernels().compact_occluded(&tree, ChildRef::ROOT, rays, out),
         }
+        self.meet_parts(rays, false, out);
         self.meet_instances(rays, false, out);
         if self.has_holes() {
             self.look_through_holes(rays, out);

@@ -227,7 +227,7 @@ impl Walk {
     /// Begins the traversal of a ray in `place`; returns whether there is anything to traverse: some rays cannot hit
     /// anything.
     #[inline(always)]
-    pub(super) fn begin<T: Tree>(place: &mut MaybeUninit<Walk>, ray: &Ray, number: usize) -> bool {
+    pub(super) fn begin<T: Tree>(place: &mut MaybeUninit<Walk>, root: ChildRef, ray: &Ray, number: usize) -> bool {
         let Some(scale) = direction_scale(ray) else { return false };
         let (mut d, mut tmin, mut tmax) = (ray.direction, ray.tmin, ray.tmax);
         if scale != 1.0 {
@@ -244,7 +244,7 @@ impl Walk {
             (&raw mut (*p).ray).write(RaySetup::new::<T>(ray.origin, d, tmin));
             (&raw mut (*p).best).write(Best::none(tmax));
             (&raw mut (*p).limit).write(beyond(tmax));
-            (&raw mut (*p).current).write(ChildRef::node(0));
+            (&raw mut (*p).current).write(root);
             (&raw mut (*p).scale).write(scale);
             (&raw mut (*p).number).write(number);
             (&raw mut (*p).stack.count).write(BOTTOM);
@@ -369,7 +369,7 @@ pub(super) unsafe fn one_of<S: Simd, T: Tree, A: Accept, const ANY: bool>(
     accept: &mut A,
 ) -> RawHit {
     let mut place = MaybeUninit::uninit();
-    if !Walk::begin::<T>(&mut place, ray, 0) {
+    if !Walk::begin::<T>(&mut place, ChildRef::ROOT, ray, 0) {
         return RawHit::MISS;
     }
     // SAFETY: it has begun.
@@ -419,7 +419,7 @@ fn give_room_back(room: Vec<Walk>) {
 /// Traversals that wait for the same kind of visit: one more than there can be, for a branch-free push.
 type Queue = [*mut Walk; FLIGHT + 1];
 
-/// Traces many rays, [`FLIGHT`] of them at a time: `ray` returns the rays from 0 to `count`, `done` receives their
+/// Traces many rays below the node `root`, [`FLIGHT`] of them at a time: `ray` returns the rays from 0 to `count`, `done` receives their
 /// hits, in any order.
 ///
 /// While one ray waits for memory, others go on; and visits of nodes and of leaves are done by turns
@@ -430,6 +430,7 @@ type Queue = [*mut Walk; FLIGHT + 1];
 #[inline(always)]
 pub(super) unsafe fn many<S: Simd, T: Tree, const ANY: bool>(
     tree: &T,
+    root: ChildRef,
     count: usize,
     ray: impl Fn(usize) -> Ray,
     mut done: impl FnMut(usize, RawHit),
@@ -450,7 +451,7 @@ pub(super) unsafe fn many<S: Simd, T: Tree, const ANY: bool>(
         while idle_count > 0 && next < count {
             // SAFETY: the queue's last entry, which names one of the places; nothing else refers to an idle one.
             let place = unsafe { &mut *(*idle.add(idle_count - 1)).cast() };
-            if Walk::begin::<T>(place, &ray(next), next) {
+            if Walk::begin::<T>(place, root, &ray(next), next) {
                 idle_count -= 1;
                 // SAFETY: the walk was idle, so that there is room among those at nodes.
                 unsafe { *at_nodes.add(node_count) = place.as_mut_ptr() };

@@ -34,7 +34,7 @@ use std::mem::MaybeUninit;
 /// Minimum number of rays of an octant that go down the tree as lists.
 const LEAST: usize = 24;
 
-/// Traces rays to their closest hits, or with `ANY` to any hit, whose result says only whether there is one. `done`
+/// Traces rays to their closest hits below the node `root`, or with `ANY` to any hit, whose result says only whether there is one. `done`
 /// receives the hits by the number of the ray, in any order.
 ///
 /// # Safety
@@ -42,12 +42,13 @@ const LEAST: usize = 24;
 #[inline(always)]
 pub(super) unsafe fn stream<S: Simd, T: Tree, const ANY: bool>(
     tree: &T,
+    root: ChildRef,
     rays: &[Ray],
     mut done: impl FnMut(usize, RawHit),
 ) {
     let Some(mut room) = Room::take() else {
         // SAFETY: forwarded.
-        return unsafe { single::many::<S, T, ANY>(tree, rays.len(), |i| rays[i], done) };
+        return unsafe { single::many::<S, T, ANY>(tree, root, rays.len(), |i| rays[i], done) };
     };
     for (chunk, rays) in rays.chunks(MAX_RAYS).enumerate() {
         let first = chunk * MAX_RAYS;
@@ -67,7 +68,7 @@ pub(super) unsafe fn stream<S: Simd, T: Tree, const ANY: bool>(
                     done(first + number, RawHit { triangle, ..RawHit::MISS });
                 };
                 // SAFETY: forwarded.
-                unsafe { beams::trace::<S>(tree, &mut group, rays, order, shafts, packs, done) };
+                unsafe { beams::trace::<S>(tree, root, &mut group, rays, order, shafts, packs, done) };
                 if group.len() < LEAST {
                     room.leave_alone(group.begin..group.end());
                     continue;
@@ -76,7 +77,7 @@ pub(super) unsafe fn stream<S: Simd, T: Tree, const ANY: bool>(
             // SAFETY: the rays of the group have been sorted into it; the caller vouches for the ISA.
             unsafe {
                 room.set_up::<S>(rays, &group);
-                Traversal { tree, rays, room: &mut room, group: &group }.run::<S, ANY>();
+                Traversal { tree, rays, room: &mut room, group: &group }.run::<S, ANY>(root);
             }
             room.report::<ANY>(&group, |i, hit| done(first + i, hit));
         }
@@ -84,7 +85,9 @@ pub(super) unsafe fn stream<S: Simd, T: Tree, const ANY: bool>(
         let alone = std::mem::take(&mut room.alone);
         let ray = |i: usize| rays[alone[i] as usize];
         // SAFETY: forwarded.
-        unsafe { single::many::<S, T, ANY>(tree, alone.len(), ray, |i, hit| done(first + alone[i] as usize, hit)) };
+        unsafe {
+            single::many::<S, T, ANY>(tree, root, alone.len(), ray, |i, hit| done(first + alone[i] as usize, hit))
+        };
         room.alone = alone;
         room.alone.clear();
     }
@@ -112,13 +115,13 @@ impl<T: Tree> Traversal<'_, T> {
     /// # Safety
     /// The CPU must have the ISA, and the rays of the group must have been set up.
     #[inline(always)]
-    unsafe fn run<S: Simd, const ANY: bool>(&mut self) {
+    unsafe fn run<S: Simd, const ANY: bool>(&mut self, root: ChildRef) {
         let mut stack = [const { MaybeUninit::<Entry>::uninit() }; STACK_SIZE];
         let all = self.group.len();
         for (i, number) in self.room.numbers[..all].iter_mut().enumerate() {
             *number = i as u16;
         }
-        stack[0].write(Entry { child: ChildRef::node(0), start: 0, count: all as u32 });
+        stack[0].write(Entry { child: root, start: 0, count: all as u32 });
         let mut depth = 1;
         while depth > 0 {
             depth -= 1;

@@ -70,7 +70,8 @@ impl<'a> Job<'a> {
             return Err(Error::InvalidArgument(format!("{name} is opened as it was saved; --repeat does not apply")));
         }
         let start = Instant::now();
-        let (path, options) = (Path::new(&self.args.scene), OpenOptions { map: !self.args.read_scene });
+        let options = OpenOptions { map: !self.args.read_scene, ray_queues: self.args.ray_queues };
+        let path = Path::new(&self.args.scene);
         let scene = self.bars.show("open", |p| Scene::open(device, path, &options, p))?;
         self.stage("open", start).bytes = scene.stats().bytes;
         Ok(scene)

@@ -14,6 +14,7 @@ use crate::bvh::instances::MeshTree;
 use crate::bvh::{BuildOptions, Compact, Mbvh, Tree};
 use crate::device::Device;
 use crate::scene::build::{Built, Parts, bytes_of_instances};
+use crate::scene::waiting::WaitingRays;
 use crate::scene::{
     Environment, Instance, LightmapUvs, Mesh, MeshMaterials, Scene, SceneData, Texture, instance_trees,
 };
@@ -34,11 +35,16 @@ pub struct OpenOptions {
     /// short (saving under its name is fine). Otherwise the file is read once, and rays are faster by what large pages
     /// bring. Default: true.
     pub map: bool,
+    /// Whether rays wait at parts of the tree until enough of them do, for scenes that are larger than memory: then a part
+    /// is read for many rays at once. Those that a device's threads trace wait together, so that it should have many more
+    /// threads than there are cores, 64 for example. Hits and light stay the same, bit for bit. Other scenes take longer so.
+    /// A refit brings all to memory, and ends it. Default: false.
+    pub ray_queues: bool,
 }
 
 impl Default for OpenOptions {
     fn default() -> Self {
-        OpenOptions { map: true }
+        OpenOptions { map: true, ray_queues: false }
     }
 }
 
@@ -58,7 +64,11 @@ impl Scene {
         let start = Instant::now();
         let scene = device.run(progress, || {
             let file = File::open(device, path, options, progress)?;
-            file.scene(device, path, start)
+            let mut scene = file.scene(device, path, start)?;
+            if options.ray_queues {
+                scene.parts = Some(Box::new(WaitingRays::of(&scene)?));
+            }
+            Ok(scene)
         })?;
         scene.warn_of_few_digits();
         device.log_info(|| {

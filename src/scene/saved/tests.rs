@@ -115,7 +115,7 @@ fn commit(device: &Arc<Device>, data: SceneData, options: &BuildOptions) -> Arc<
 }
 
 fn open(device: &Arc<Device>, path: &Path, map: bool) -> crate::Result<Arc<Scene>> {
-    Scene::open(device, path, &OpenOptions { map }, &Progress::none())
+    Scene::open(device, path, &OpenOptions { map, ..Default::default() }, &Progress::none())
 }
 
 #[test]

@@ -267,6 +267,9 @@ pub struct FileFlags {
     /// Read SCENE.bkscene to memory instead of mapping it
     #[arg(long)]
     pub read_scene: bool,
+    /// Let rays wait at parts of SCENE.bkscene, which is larger than memory, until enough of them do; best with --threads 64
+    #[arg(long)]
+    pub ray_queues: bool,
     /// Put the scene N times beside itself, in a square grid, to measure larger scenes; lights stay as they are
     #[arg(long, value_name = "N", default_value_t = 1, value_parser = clap::value_parser!(u32).range(1..=1 << 20))]
     pub repeat: u32,

@@ -109,6 +109,7 @@ pub struct BakeArgs {
     pub max_file_mb: u64,
     pub save_scene: Option<PathBuf>,
     pub read_scene: bool,
+    pub ray_queues: bool,
     /// How often the scene stands beside itself, and whether as instances.
     pub repeat: u32,
     pub instances: bool,
@@ -468,6 +469,7 @@ fn bake_args(f: Flags) -> Result<BakeArgs, String> {
         max_file_mb: f.file.max_file_mb,
         save_scene: f.file.save_scene,
         read_scene: f.file.read_scene,
+        ray_queues: f.file.ray_queues,
         repeat: f.file.repeat,
         instances: f.file.instances,
         lights: f.lights.light,
