@@ -236,7 +236,39 @@ impl Device {
 }
 
 /// Work that is called once. It keeps its own result.
-type Work<'a> = &'a mut (dyn FnMut() + Send);
+pub(crate) type Work<'a> = &'a mut (dyn FnMut() + Send);
+
+/// Threads beside those of a device, for work that waits most of the time. Dropping them joins them.
+pub(crate) struct ExtraThreads {
+    pool: Option<rayon::ThreadPool>,
+    threads: Vec<JoinHandle<()>>,
+}
+
+impl ExtraThreads {
+    /// Starts threads.
+    pub fn start(count: usize) -> Result<ExtraThreads> {
+        let begin = || {
+            float_state::set_on_own_thread();
+            // Work that is installed in the device runs on these threads.
+            APART.set(true);
+        };
+        let (pool, threads) = start_threads(count, |i| format!("bakelite-extra-{i}"), begin)
+            .map_err(|e| Error::OutOfMemory(format!("{count} more threads could not be started: {e}")))?;
+        Ok(ExtraThreads { pool: Some(pool), threads })
+    }
+
+    /// Does work on these threads, as [`Device::install`] does on the device's.
+    pub fn install(&self, work: Work) {
+        self.pool.as_ref().expect("there until dropped").install(work);
+    }
+}
+
+impl Drop for ExtraThreads {
+    fn drop(&mut self) {
+        drop(self.pool.take());
+        end(&mut self.threads);
+    }
+}
 
 /// A log that writes messages up to a level to a stream; `None` for an empty word. A message that cannot be written,
 /// because the stream is closed, is lost.
@@ -286,6 +318,25 @@ fn start_threads(
     }
 }
 
+/// Starts a thread that is in no pool.
+pub(crate) fn start_thread(name: String, work: impl FnOnce() + Send + 'static) -> Result<JoinHandle<()>> {
+    let work = || {
+        float_state::set_on_own_thread();
+        work();
+    };
+    own_thread(name).spawn(work).map_err(|e| Error::OutOfMemory(format!("a thread could not be started: {e}")))
+}
+
+/// Joins threads that are about to end.
+pub(crate) fn end(threads: &mut Vec<JoinHandle<()>>) {
+    // A callback may drop the last reference on one of the threads. It cannot join itself, nor
+    // the others, which end only after the job that it is in: they end on their own.
+    let this = std::thread::current().id();
+    if !threads.iter().any(|t| t.thread().id() == this) {
+        join(threads);
+    }
+}
+
 fn join(threads: &mut Vec<JoinHandle<()>>) {
     threads.drain(..).for_each(|t| drop(t.join()));
 }
@@ -332,13 +383,7 @@ impl Drop for Device {
             return;
         }
         drop(self.pool.take());
-        // A callback may drop the last reference on one of the threads. It cannot join itself, nor
-        // the others, which end only after the job that it is in: they end on their own.
-        let this = std::thread::current().id();
-        if self.threads.iter().any(|t| t.thread().id() == this) {
-            return;
-        }
-        join(&mut self.threads);
+        end(&mut self.threads);
     }
 }
 

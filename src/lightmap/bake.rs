@@ -121,7 +121,8 @@ impl Lightmap {
                 None => None,
             };
             let from = From { checkpoint: checkpoint.as_ref(), before: before.as_ref() };
-            let (mut light, mut stats) = self.passes(params, &plan, direct, &range, from, progress)?;
+            let passes = || self.passes(params, &plan, direct, &range, from, progress);
+            let (mut light, mut stats) = atlas.scene.install(passes)?;
             stats.back_charts = light.backs.iter().filter(|&&b| b).count() as u64;
             plan.note_back_charts(stats.back_charts);
             plan.note_bright(&light.radiance.bright);

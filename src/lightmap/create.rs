@@ -168,7 +168,7 @@ impl Maps {
         let mut known = known;
         let seen = match &mut known {
             Some(known) => std::mem::take(&mut known.seen),
-            None => scene.device().install(|| {
+            None => scene.install(|| {
                 let mut seen = Seen::count(scene, charts, &radiance, texel, &stage)?;
                 if !desc.seen_from.is_empty() {
                     seen_from::look(scene, charts, &radiance, &desc.seen_from, &stage, &mut seen)?;
@@ -196,7 +196,7 @@ impl Maps {
         let search = Search { scene, charts, seen: &seen, near, only: None };
         // The visible part of a mostly buried texel is a strip along the surface that covers it, often darker than its
         // surroundings. Gather texels are larger and would spread that darkness as a rim.
-        let (buried, rays) = scene.device().install(|| {
+        let (buried, rays) = scene.install(|| {
             let (_, of_radiance) = search.move_buried(&mut radiance, true, &stage)?;
             let (_, of_gather) = search.move_buried(&mut gather, false, &stage)?;
             let (buried, of_map) = search.move_buried(&mut map, true, &stage)?;

@@ -2,57 +2,71 @@
 //! Scenes with Memory-Coherent Ray Tracing*, 1997), so that a part of a scene that is larger than memory is read from disk
 //! for many rays at once.
 //!
-//! Threads that trace rays bring them in batches and wait; the rays of all batches that wait at one part are traced
-//! together, by one of these threads: always at the part where most wait. The more threads there are, the more rays wait.
+//! Threads that need hits bring rays in batches and wait for them. Other threads go from part to part, in the order of the
+//! file, and trace what waits there of all batches. There are many more of those that wait than there are cores, so that
+//! many rays wait; what each does between its batches is the same as ever.
 
 use super::Scene;
+use crate::base::callback;
 use crate::base::error::Result;
-use crate::base::memory::{Reservation, try_filled};
+use crate::base::memory::{Reservation, try_filled, try_with_capacity};
 use crate::bvh::parts::Parts;
+use crate::device::{self, ExtraThreads, Work};
+use std::ops::RangeInclusive;
 use std::sync::{Arc, Condvar, Mutex, MutexGuard, PoisonError};
+use std::thread::JoinHandle;
 use std::time::{Duration, Instant};
 
 /// Size of a part in bytes: of trees of any size some hundreds, but none so small that a disk reads it slowly, nor so large
 /// that few rays need much of it.
-const PART_BYTES: std::ops::RangeInclusive<usize> = 16 << 10..=8 << 20;
+const PART_BYTES: RangeInclusive<usize> = 16 << 10..=8 << 20;
 const PARTS: usize = 256;
 
-/// Number of rays for which a part is visited at once. For fewer, threads that are about to bring more are given
-/// [`QUIET`].
-const PLENTY: usize = 1 << 15;
-
-/// Time without a new batch after which nobody is about to bring one.
-const QUIET: Duration = Duration::from_millis(1);
+/// Threads that wait, per thread of the device, and the most in all.
+const THREADS: usize = 128;
+const MOST_THREADS: usize = 512;
 
 /// Number of rays from which on all of a part is read; the pages that fewer need are read one by one.
 const WORTH_READING: usize = 1 << 10;
 
 /// A batch of rays.
 pub(crate) trait Batch: Send + Sync {
-    /// Traces the rays that wait at a part, and calls `go_on` with the parts at which they wait then, and their numbers.
-    fn visit(&self, scene: &Scene, part: u32, go_on: &mut dyn FnMut(u32, usize));
+    /// Asks the system to read a part. Called only while rays of the batch wait.
+    fn prepare(&self, part: u32);
 
-    /// Whether no ray waits any more.
-    fn is_done(&self) -> bool;
+    /// Traces the rays that wait at a part, and calls `go_on` with the parts at which they wait then, and their numbers.
+    /// Called only while rays of the batch wait.
+    fn visit(&self, part: u32, go_on: &mut dyn FnMut(u32, usize));
 }
 
 /// The tree of a scene in parts, and the rays that wait there.
 pub(crate) struct WaitingRays {
     pub tree: Parts,
-    queues: Mutex<Queues>,
-    changed: Condvar,
-    /// Maximum number of parts that are visited at the same time: one per core, as far as there are threads.
-    most: usize,
+    queues: Arc<Queues>,
+    waiting: ExtraThreads,
+    tracing: Vec<JoinHandle<()>>,
     _memory: Reservation,
 }
 
+/// What waiting and tracing threads share.
 struct Queues {
+    state: Mutex<State>,
+    /// Rays have come, or the scene goes.
+    changed: Condvar,
+}
+
+struct State {
     /// By part.
     queues: Vec<Queue>,
-    /// Number of parts that are being visited.
-    visited: usize,
+    /// Number of rays that wait at all parts.
+    rays: usize,
+    /// The part after the last one that was visited.
+    next: usize,
     /// When the last batch came.
     last: Instant,
+    /// Mean time of the last visits.
+    visit: Duration,
+    is_over: bool,
 }
 
 /// What waits at a part.
@@ -62,11 +76,57 @@ struct Queue {
     rays: usize,
 }
 
-impl Queues {
+impl State {
     fn add(&mut self, batch: &Arc<dyn Batch>, part: u32, rays: usize) {
         let queue = &mut self.queues[part as usize];
         queue.batches.push(batch.clone());
         queue.rays += rays;
+        self.rays += rays;
+    }
+
+    /// The next part at which not much fewer rays wait than on average. (Where only few wait, more will come.)
+    fn next(&self) -> Option<usize> {
+        let parts = self.queues.iter().filter(|queue| queue.rays > 0).count();
+        let is_worth_it = |&part: &usize| self.queues[part].rays > 0 && 2 * parts * self.queues[part].rays >= self.rays;
+        (self.next..self.queues.len()).chain(0..self.next).find(is_worth_it)
+    }
+}
+
+impl Queues {
+    fn lock(&self) -> MutexGuard<'_, State> {
+        self.state.lock().unwrap_or_else(PoisonError::into_inner)
+    }
+
+    /// Traces what waits until the scene goes.
+    fn trace(&self) {
+        let mut state = self.lock();
+        while !state.is_over {
+            let Some(part) = state.next() else {
+                state = self.changed.wait(state).unwrap_or_else(PoisonError::into_inner);
+                continue;
+            };
+            // Threads that are about to bring more are given a quarter of the time that a visit takes.
+            let (since, quiet) = (state.last.elapsed(), state.visit / 4);
+            if since < quiet {
+                let waited = self.changed.wait_timeout(state, quiet - since);
+                state = waited.unwrap_or_else(PoisonError::into_inner).0;
+                continue;
+            }
+            let Queue { batches, rays } = std::mem::take(&mut state.queues[part]);
+            (state.next, state.rays) = (part + 1, state.rays - rays);
+            drop(state);
+            let start = Instant::now();
+            if rays >= WORTH_READING {
+                batches[0].prepare(part as u32);
+            }
+            let mut onward = Vec::new();
+            for batch in &batches {
+                batch.visit(part as u32, &mut |part, rays| onward.push((batch, part, rays)));
+            }
+            state = self.lock();
+            onward.into_iter().for_each(|(batch, part, rays)| state.add(batch, part, rays));
+            state.visit = (7 * state.visit + start.elapsed()) / 8;
+        }
     }
 }
 
@@ -79,52 +139,54 @@ impl WaitingRays {
         let count = tree.parts.len();
         let memory = scene.device().memory().reserve(tree.bytes() + count * size_of::<Queue>(), QUEUES)?;
         let queues = try_filled(count, Queue::default(), QUEUES)?;
-        let cores = std::thread::available_parallelism().map_or(1, |n| n.get());
-        Ok(WaitingRays {
+        let state = State { queues, rays: 0, next: 0, last: Instant::now(), visit: Duration::ZERO, is_over: false };
+        let threads = scene.device().num_threads();
+        let mut waiting = WaitingRays {
             tree,
-            queues: Mutex::new(Queues { queues, visited: 0, last: Instant::now() }),
-            changed: Condvar::new(),
-            most: cores.min(scene.device().num_threads()),
+            queues: Arc::new(Queues { state: Mutex::new(state), changed: Condvar::new() }),
+            waiting: ExtraThreads::start((THREADS * threads).min(MOST_THREADS))?,
+            tracing: try_with_capacity(threads, QUEUES)?,
             _memory: memory,
-        })
+        };
+        for i in 0..threads {
+            let queues = waiting.queues.clone();
+            waiting.tracing.push(device::start_thread(format!("bakelite-rays-{i}"), move || queues.trace())?);
+        }
+        Ok(waiting)
     }
 
-    fn lock(&self) -> MutexGuard<'_, Queues> {
-        self.queues.lock().unwrap_or_else(PoisonError::into_inner)
+    /// Brings a batch. `first`: the parts at which its rays wait at first, with their numbers. The batch must not go before
+    /// no ray waits any more.
+    pub(crate) fn bring(&self, batch: &Arc<dyn Batch>, first: impl Iterator<Item = (u32, usize)>) {
+        let mut state = self.queues.lock();
+        first.for_each(|(part, rays)| state.add(batch, part, rays));
+        state.last = Instant::now();
+        drop(state);
+        self.queues.changed.notify_one();
+    }
+}
+
+impl Drop for WaitingRays {
+    fn drop(&mut self) {
+        self.queues.lock().is_over = true;
+        self.queues.changed.notify_all();
+        device::end(&mut self.tracing);
+    }
+}
+
+impl Scene {
+    /// Runs `f` on the threads that trace the scene's rays: the device's or, where rays wait, others, which are many more.
+    pub(crate) fn install<R: Send>(&self, f: impl FnOnce() -> R + Send) -> R {
+        let (mut f, mut result) = (Some(f), None);
+        self.install_work(&mut || result = f.take().map(|f| f()));
+        result.expect("the work has been done, or it has unwound")
     }
 
-    /// Traces a batch to its end. `first`: the parts at which its rays wait at first, with their numbers.
-    pub(crate) fn trace(&self, scene: &Scene, batch: &Arc<dyn Batch>, first: impl Iterator<Item = (u32, usize)>) {
-        let mut queues = self.lock();
-        first.for_each(|(part, rays)| queues.add(batch, part, rays));
-        queues.last = Instant::now();
-        while !batch.is_done() {
-            let fullest = (0..).zip(&queues.queues).max_by_key(|(_, q)| q.rays);
-            let (part, rays) = fullest.map_or((0, 0), |(part, queue)| (part, queue.rays));
-            if rays == 0 || queues.visited >= self.most {
-                queues = self.changed.wait(queues).unwrap_or_else(PoisonError::into_inner);
-                continue;
-            }
-            let since = queues.last.elapsed();
-            if rays < PLENTY && since < QUIET {
-                let waited = self.changed.wait_timeout(queues, QUIET - since);
-                queues = waited.unwrap_or_else(PoisonError::into_inner).0;
-                continue;
-            }
-            let Queue { batches, .. } = std::mem::take(&mut queues.queues[part as usize]);
-            queues.visited += 1;
-            drop(queues);
-            if rays >= WORTH_READING {
-                scene.acceleration().0.will_need(&self.tree.parts[part as usize]);
-            }
-            let mut onward = Vec::new();
-            for batch in &batches {
-                batch.visit(scene, part, &mut |part, rays| onward.push((batch, part, rays)));
-            }
-            queues = self.lock();
-            onward.into_iter().for_each(|(batch, part, rays)| queues.add(batch, part, rays));
-            queues.visited -= 1;
-            self.changed.notify_all();
+    fn install_work(&self, work: Work) {
+        match self.parts() {
+            // What a callback asks for must not wait for threads that may be in it.
+            Some(parts) if !callback::is_running() => parts.waiting.install(work),
+            _ => self.device().install(|| work()),
         }
     }
 }

@@ -182,7 +182,7 @@ impl Scene {
             }
         };
         if parallel {
-            self.device().install(|| {
+            self.install(|| {
                 let size = block_size(rays.len());
                 rays.par_chunks(size).zip(out.par_chunks_mut(size)).for_each(|(r, o)| block(r, o));
             });
@@ -252,7 +252,7 @@ impl Scene {
             }
         };
         if parallel {
-            self.device().install(|| {
+            self.install(|| {
                 let size = block_size(rays.len());
                 rays.par_chunks(size).zip(out.par_chunks_mut(size)).for_each(|(r, o)| block(r, o));
             });
@@ -300,7 +300,7 @@ impl Scene {
             }
         };
         if parallel {
-            self.device().install(|| {
+            self.install(|| {
                 let size = block_size(directions.len());
                 directions.par_chunks(size).zip(out.par_chunks_mut(size)).for_each(|(d, o)| block(d, o));
             });

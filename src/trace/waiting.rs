@@ -11,19 +11,26 @@ use crate::bvh::{ChildRef, Mbvh};
 use crate::scene::Scene;
 use crate::scene::waiting::{self, WaitingRays};
 use std::mem::MaybeUninit;
-use std::sync::atomic::{AtomicUsize, Ordering};
-use std::sync::{Arc, Mutex, PoisonError};
+use std::sync::{Arc, Condvar, Mutex, MutexGuard, PoisonError};
 
 /// Least number of rays that wait; fewer are traced at once. (The pages that they need are read while other threads go on.)
 const LEAST: usize = 32;
 
 /// Rays that were given to a query together.
 struct Batch<A> {
+    /// The scene, which exists as long as rays wait.
+    scene: *const Scene,
     rays: Mutex<Rays<A>>,
-    /// Number of rays that wait at a part.
-    waiting: AtomicUsize,
+    /// No ray waits any more.
+    is_done: Condvar,
     alike: bool,
 }
+
+// SAFETY: the query that made the batch keeps the scene until no ray waits, and other threads use it no longer than that; a
+// scene can be used on any thread.
+unsafe impl<A: Send> Send for Batch<A> {}
+// SAFETY: as above; the rest is behind a mutex.
+unsafe impl<A: Send> Sync for Batch<A> {}
 
 struct Rays<A> {
     rays: Vec<Ray>,
@@ -36,6 +43,8 @@ struct Rays<A> {
     done: Vec<u32>,
     /// The part where each ray waits; [`NONE`]: nowhere any more.
     at: Vec<u32>,
+    /// Number of rays that wait.
+    waiting: usize,
 }
 
 impl<A: Answer> Rays<A> {
@@ -82,6 +91,7 @@ impl<A: Answer> Batch<A> {
             begin: with_capacity(rays.len() + 1)?,
             done: with_capacity(rays.len())?,
             at: with_capacity(rays.len())?,
+            waiting: 0,
         };
         all.done.resize(rays.len(), 0);
         all.at.resize(rays.len(), NONE);
@@ -104,11 +114,14 @@ impl<A: Answer> Batch<A> {
             }
         }
         all.begin.push(u32::try_from(all.parts.len()).ok()?);
-        let mut waiting = 0;
         for ray in 0..rays.len() {
-            waiting += usize::from(all.go_on(ray, &parts.tree.parts) != NONE);
+            all.waiting += usize::from(all.go_on(ray, &parts.tree.parts) != NONE);
         }
-        Some(Batch { rays: Mutex::new(all), waiting: AtomicUsize::new(waiting), alike })
+        Some(Batch { scene, rays: Mutex::new(all), is_done: Condvar::new(), alike })
+    }
+
+    fn lock(&self) -> MutexGuard<'_, Rays<A>> {
+        self.rays.lock().unwrap_or_else(PoisonError::into_inner)
     }
 }
 
@@ -135,9 +148,19 @@ fn count(mut parts: Vec<u32>, each: &mut dyn FnMut(u32, usize)) {
 }
 
 impl<A: Answer + Send + 'static> waiting::Batch for Batch<A> {
-    fn visit(&self, scene: &Scene, part: u32, go_on: &mut dyn FnMut(u32, usize)) {
+    fn prepare(&self, part: u32) {
+        // SAFETY: as rays wait, the scene is there.
+        let scene = unsafe { &*self.scene };
+        if let Some(parts) = scene.parts() {
+            scene.acceleration().0.will_need(&parts.tree.parts[part as usize]);
+        }
+    }
+
+    fn visit(&self, part: u32, go_on: &mut dyn FnMut(u32, usize)) {
+        // SAFETY: as rays wait, the scene is there.
+        let scene = unsafe { &*self.scene };
         let Some(parts) = scene.parts() else { return };
-        let mut all = self.rays.lock().unwrap_or_else(PoisonError::into_inner);
+        let mut all = self.lock();
         let here: Vec<u32> = (0..).zip(&all.at).filter(|(_, at)| **at == part).map(|(ray, _)| ray).collect();
         let turned = |&number: &u32| {
             let ray = all.rays[number as usize];
@@ -152,13 +175,11 @@ impl<A: Answer + Send + 'static> waiting::Batch for Batch<A> {
             all.answers[ray as usize].add(found, 0);
             next.push(all.go_on(ray as usize, &parts.tree.parts));
         }
-        let finished = next.iter().filter(|&&part| part == NONE).count();
-        self.waiting.fetch_sub(finished, Ordering::Release);
+        all.waiting -= next.iter().filter(|&&part| part == NONE).count();
         count(next, go_on);
-    }
-
-    fn is_done(&self) -> bool {
-        self.waiting.load(Ordering::Acquire) == 0
+        if all.waiting == 0 {
+            self.is_done.notify_all();
+        }
     }
 }
 
@@ -193,12 +214,14 @@ impl Scene {
         };
         let batch = Arc::new(batch);
         let mut first = Vec::new();
-        count(batch.rays.lock().unwrap_or_else(PoisonError::into_inner).at.clone(), &mut |part, n| {
-            first.push((part, n))
-        });
+        count(batch.lock().at.clone(), &mut |part, rays| first.push((part, rays)));
         let shared: Arc<dyn waiting::Batch> = batch.clone();
-        parts.trace(self, &shared, first.into_iter());
-        answers.copy_from_slice(&batch.rays.lock().unwrap_or_else(PoisonError::into_inner).answers);
+        parts.bring(&shared, first.into_iter());
+        let mut all = batch.lock();
+        while all.waiting > 0 {
+            all = batch.is_done.wait(all).unwrap_or_else(PoisonError::into_inner);
+        }
+        answers.copy_from_slice(&all.answers);
     }
 }
 
