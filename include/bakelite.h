@@ -266,6 +266,13 @@ typedef struct bk_device_desc {
   /// this user only: files are checked, but charts that somebody else put there would be used.
   /// UTF-8; NULL: none are kept. Default: NULL.
   const char *cache_folder;
+  /// Folder for files that take the place of memory for the charts of light maps, where scenes are
+  /// larger than it (see bk_open_params.ray_queues): some 50 bytes per triangle, three times that
+  /// while a light map is created. The folder must exist; the files have no names in it, and
+  /// their room is free again when the light map is gone, however the process ends. The library
+  /// never writes more to them than there is room on the disk. UTF-8; NULL: all is in memory.
+  /// Default: NULL.
+  const char *scratch_folder;
 } bk_device_desc;
 
 /// Reports the progress of a call, and can cancel it.
@@ -596,6 +603,12 @@ typedef struct bk_open_params {
   /// under its name is fine: it makes a new file.) 0: the file is read to memory; rays are
   /// somewhat faster, because memory can have large pages. Default: 1.
   uint32_t map;
+  /// 1: rays wait at parts of the tree until enough of them do, for scenes that are larger than
+  /// memory: a part is then read for many rays at once. The rays that a device's threads trace wait
+  /// together, so that its `num_threads` should be many more than there are cores, 64 for example.
+  /// Hits and light stay the same, bit for bit. Scenes that fit into memory take longer so. A refit
+  /// brings all of the scene to memory, and ends it. Default: 0.
+  uint32_t ray_queues;
 } bk_open_params;
 
 /// Sets `struct_size` and clears the other fields.

@@ -1,11 +1,14 @@
 //! The device: a thread pool of its own, the ISA chosen at run time, the
 //! log and the memory accounts.
 
+use crate::base::array::Array;
 use crate::base::error::{Error, Result, invalid_argument};
-use crate::base::memory::{MemoryFn, MemoryMonitor};
+use crate::base::memory::{MemoryFn, MemoryMonitor, try_zeroed_as_needed};
 use crate::base::progress::Progress;
+use crate::base::scratch_files::ScratchFiles;
 use crate::base::{callback, float_state};
 use crate::simd::{Isa, LIMIT_VARIABLE};
+use bytemuck::Pod;
 use std::cell::Cell;
 use std::io::Write;
 use std::path::{Path, PathBuf};
@@ -41,6 +44,9 @@ pub const MAX_THREADS: usize = 1024;
 /// takes memory.
 const STACK_BYTES: usize = 4 << 20;
 
+/// Size in bytes of the smallest array that is worth a place in a scratch file.
+const LEAST_IN_SCRATCH: usize = 1 << 12;
+
 /// Environment variable that shows log messages on standard error, see [`DeviceOptions::log`].
 const LOG_VARIABLE: &str = "BAKELITE_LOG";
 
@@ -60,6 +66,8 @@ pub struct DeviceOptions {
     /// Folder in which unwraps are kept by their content, for the next light map and the next run; it is made if needed.
     /// `None`: none are kept.
     pub cache_folder: Option<PathBuf>,
+    /// Folder for files that take the place of memory for the charts of light maps, where scenes are larger than it. The files have no names, and are gone with the light map. `None`: all is in memory.
+    pub scratch_folder: Option<PathBuf>,
 }
 
 /// Threads, kernels and accounts that scenes and bakes share.
@@ -74,6 +82,7 @@ pub struct Device {
     log: Option<Box<LogFn>>,
     memory: Arc<MemoryMonitor>,
     cache_folder: Option<PathBuf>,
+    scratch: Option<ScratchFiles>,
     /// Id of the process in which the threads were started.
     process: u32,
 }
@@ -105,6 +114,7 @@ impl Device {
             log: options.log.or_else(|| log_to(std::io::stderr, &std::env::var(LOG_VARIABLE).ok()?)),
             memory: Arc::new(MemoryMonitor::new(options.memory)),
             cache_folder: options.cache_folder,
+            scratch: options.scratch_folder.map(ScratchFiles::new),
             process: std::process::id(),
         };
         device.log_info(|| {
@@ -227,6 +237,32 @@ impl Device {
     /// See [`DeviceOptions::cache_folder`].
     pub fn cache_folder(&self) -> Option<&Path> {
         self.cache_folder.as_deref()
+    }
+
+    /// Makes an array of zeros that may be large: in a scratch file, if there is a folder for them. `what`: its name in error
+    /// messages.
+    pub(crate) fn zeroed<T: Pod>(&self, len: usize, what: &str) -> Result<Array<T>> {
+        match &self.scratch {
+            Some(files) if len * size_of::<T>() >= LEAST_IN_SCRATCH => files.zeroed(len),
+            _ => try_zeroed_as_needed(len, what).map(Array::from),
+        }
+    }
+
+    /// Copies the elements of a slice to an array that may be large, as [`zeroed`](Self::zeroed) makes it.
+    pub(crate) fn copy<T: Pod>(&self, values: &[T], what: &str) -> Result<Array<T>> {
+        let mut array = self.zeroed(values.len(), what)?;
+        array.copy_from_slice(values);
+        Ok(array)
+    }
+
+    /// Whether arrays that may be large lie in scratch files.
+    pub(crate) fn has_scratch(&self) -> bool {
+        self.scratch.is_some()
+    }
+
+    /// Number of bytes of memory that arrays made by [`zeroed`](Self::zeroed) take, which have `bytes` in all.
+    pub(crate) fn in_memory(&self, bytes: usize) -> usize {
+        if self.has_scratch() { 0 } else { bytes }
     }
 
     /// The memory accounts.

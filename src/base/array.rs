@@ -7,8 +7,9 @@ use std::ops::{Deref, DerefMut, Range};
 use std::ptr::NonNull;
 use std::sync::Arc;
 
-/// A file mapped to memory, private to the process: what is written to the memory is never written to the file. Pages are
-/// read when they are first touched, and the system may drop those that are unchanged.
+/// A file mapped to memory that nobody else changes: private to the process, so that what is written to the memory is never
+/// written to the file, or one without a name. Pages are read when they are first touched; the system may drop those that
+/// are unchanged, and write out the others of a file without a name.
 pub(crate) struct Mapping {
     start: NonNull<u8>,
     bytes: usize,
@@ -80,6 +81,14 @@ impl<T> Array<T> {
     pub fn as_vec(&mut self) -> impl DerefMut<Target = Vec<T>> {
         let elements = Vec::from(std::mem::take(self));
         Lent { array: self, elements }
+    }
+
+    /// Leaves the first `len` elements alone, if there are more; memory of the others is not freed.
+    pub(crate) fn truncate(&mut self, len: usize)
+    where
+        T: Copy,
+    {
+        self.len = self.len.min(len);
     }
 
     /// Frees unused capacity.

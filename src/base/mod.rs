@@ -15,4 +15,5 @@ pub(crate) mod parallel;
 pub mod progress;
 pub mod sampling;
 pub(crate) mod scratch;
+pub(crate) mod scratch_files;
 pub(crate) mod sort;

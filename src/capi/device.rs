@@ -136,6 +136,13 @@ pub struct bk_device_desc {
     /// this user only: files are checked, but charts that somebody else put there would be used.
     /// UTF-8; NULL: none are kept. Default: NULL.
     pub cache_folder: *const c_char,
+    /// Folder for files that take the place of memory for the charts of light maps, where scenes are
+    /// larger than it (see bk_open_params.ray_queues): some 50 bytes per triangle, three times that
+    /// while a light map is created. The folder must exist; the files have no names in it, and
+    /// their room is free again when the light map is gone, however the process ends. The library
+    /// never writes more to them than there is room on the disk. UTF-8; NULL: all is in memory.
+    /// Default: NULL.
+    pub scratch_folder: *const c_char,
 }
 
 sized_struct!(bk_device_desc, defaults: bk_device_desc {
@@ -146,6 +153,7 @@ sized_struct!(bk_device_desc, defaults: bk_device_desc {
     memory: None,
     user: std::ptr::null_mut(),
     cache_folder: std::ptr::null(),
+    scratch_folder: std::ptr::null(),
 });
 
 /// Sets `struct_size` and fills in the defaults.
@@ -220,7 +228,7 @@ pub unsafe extern "C" fn bk_device_num_threads(device: *const bk_device) -> u32 
 }
 
 /// # Safety
-/// `cache_folder` is NULL or a text.
+/// `cache_folder` and `scratch_folder` are NULL or texts.
 unsafe fn options(desc: bk_device_desc) -> Result<DeviceOptions> {
     let isa = match desc.isa {
         BK_ISA_AUTO => None,
@@ -244,6 +252,10 @@ unsafe fn options(desc: bk_device_desc) -> Result<DeviceOptions> {
     if !desc.cache_folder.is_null() {
         // SAFETY: by contract.
         options.cache_folder = Some(unsafe { text(desc.cache_folder, "cache_folder") }?.into());
+    }
+    if !desc.scratch_folder.is_null() {
+        // SAFETY: by contract.
+        options.scratch_folder = Some(unsafe { text(desc.scratch_folder, "scratch_folder") }?.into());
     }
     Ok(options)
 }

@@ -65,8 +65,9 @@ impl Lightmap {
         uvs.overlapping_texels = map.texels.overlapping_texels;
         uvs.reduced_charts = map.layout.reduced;
         let index = ChartIndex::new(scene.device(), &charts)?;
-        let own_bytes = charts.bytes() + seen.bytes() + buried.len();
-        let bytes = own_bytes + index.bytes() + map.bytes() + gather.bytes() + radiance.bytes();
+        let device = scene.device();
+        let own_bytes = device.in_memory(charts.bytes()) + seen.bytes() + buried.len();
+        let bytes = own_bytes + device.in_memory(index.bytes()) + map.bytes() + gather.bytes() + radiance.bytes();
         let info = LightmapInfo {
             page_count: map.layout.page_count,
             width: map.layout.page_size,

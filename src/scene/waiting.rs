@@ -26,6 +26,9 @@ const PARTS: usize = 256;
 const THREADS: usize = 128;
 const MOST_THREADS: usize = 512;
 
+/// Threads that trace what waits, per thread of the device: most of their time they wait for the disk.
+const TRACING: usize = 8;
+
 /// Number of rays from which on all of a part is read; the pages that fewer need are read one by one.
 const WORTH_READING: usize = 1 << 10;
 
@@ -145,10 +148,10 @@ impl WaitingRays {
             tree,
             queues: Arc::new(Queues { state: Mutex::new(state), changed: Condvar::new() }),
             waiting: ExtraThreads::start((THREADS * threads).min(MOST_THREADS))?,
-            tracing: try_with_capacity(threads, QUEUES)?,
+            tracing: try_with_capacity(TRACING * threads, QUEUES)?,
             _memory: memory,
         };
-        for i in 0..threads {
+        for i in 0..TRACING * threads {
             let queues = waiting.queues.clone();
             waiting.tracing.push(device::start_thread(format!("bakelite-rays-{i}"), move || queues.trace())?);
         }

@@ -220,6 +220,7 @@ fn scene_files(w: &W, s: &mut Source) {
     };
     let mut params = defaults!(bk_open_params, bk_open_params_init);
     params.map = if s.one_in(8) { s.integer() } else { s.below(2) as u32 };
+    params.ray_queues = if s.one_in(8) { s.integer() } else { s.below(2) as u32 };
     params.struct_size = if s.one_in(20) { s.integer() } else { params.struct_size };
     let params = if s.one_in(3) { null() } else { &raw const params };
     let result = ask!(bk_scene_open(scene.p(), name.as_ptr(), params, Some(progress), watched.user()));

@@ -144,6 +144,7 @@ impl<'a> Job<'a> {
             log: Some(Box::new(log)),
             memory: None,
             cache_folder: self.args.cache.clone(),
+            scratch_folder: self.args.scratch.clone(),
         })
     }
 

@@ -8,6 +8,7 @@ use super::flat_triangle::Flat;
 use super::ids::ChartId;
 use super::sheets::{Shape, Sheet};
 use super::texels::TexelSample;
+use crate::base::array::Array;
 use crate::base::error::Result;
 use crate::base::memory::{Reservation, try_collect, try_vec, try_with_capacity};
 use crate::base::parallel::one_by_one;
@@ -50,13 +51,13 @@ struct Grid {
     /// Cells per unit of the sheet's local coordinates.
     scale: Vec2,
     /// First entry of each cell, and the number of entries.
-    start: Box<[u32]>,
+    start: Array<u32>,
     /// Triangles by their numbers in the sheet, ascending in each cell.
-    triangles: Box<[u32]>,
+    triangles: Array<u32>,
 }
 
 impl Grid {
-    fn new(sheet: &Sheet, chart: &Chart) -> Result<Grid> {
+    fn new(device: &Device, sheet: &Sheet, chart: &Chart) -> Result<Grid> {
         let triangles = &sheet.triangles[chart.triangles.start as usize..chart.triangles.end as usize];
         let size = Vec2::from(chart.size);
         if triangles.len() <= SMALL || !(size.min_element() > 0.0) || !size.is_finite() {
@@ -68,7 +69,7 @@ impl Grid {
             let rows = (cells as u32 / columns).max(1);
             let scale = Vec2::new(columns as f32, rows as f32) / size;
             let limit = ENTRIES_PER_TRIANGLE * triangles.len();
-            if let Some(grid) = Grid::of_cells(sheet, triangles, [columns, rows], scale, limit)? {
+            if let Some(grid) = Grid::of_cells(device, sheet, triangles, [columns, rows], scale, limit)? {
                 return Ok(grid);
             }
             if cells == 1 {
@@ -81,6 +82,7 @@ impl Grid {
 
     /// Makes a grid of given size; `None` if the cells would list more than `limit` triangles.
     fn of_cells(
+        device: &Device,
         sheet: &Sheet,
         triangles: &[u32],
         [columns, rows]: [u32; 2],
@@ -116,7 +118,13 @@ impl Grid {
                 *next += 1;
             });
         }
-        Ok(Some(Grid { columns, rows, scale, start: start.into(), triangles: listed.into() }))
+        Ok(Some(Grid {
+            columns,
+            rows,
+            scale,
+            start: device.copy(&start, what)?,
+            triangles: device.copy(&listed, what)?,
+        }))
     }
 
     fn around(&self, local: Vec2) -> &[u32] {
@@ -140,11 +148,11 @@ impl ChartIndex {
         grids.resize_with(shapes.len(), Grid::default);
         device.install(|| {
             one_by_one(grids.par_iter_mut().zip(shapes)).try_for_each(|(grid, (sheet, chart))| {
-                *grid = Grid::new(sheet, chart)?;
+                *grid = Grid::new(device, sheet, chart)?;
                 Ok(())
             })
         })?;
-        let bytes = grids.iter().map(Grid::bytes).sum();
+        let bytes = device.in_memory(grids.iter().map(Grid::bytes).sum());
         Ok(ChartIndex { grids, _memory: device.memory().reserve(bytes, "the index of the charts")? })
     }
 

@@ -103,7 +103,8 @@ impl Charts {
         let objects = || (0..scene.meshes().len() as u32).chain(made.iter().copied());
         let total: usize = objects().map(|o| scene.triangles_of(o).len()).sum();
         let vertices = objects().map(|o| scene.object(o).mesh().positions.len()).sum();
-        let bytes = 2 * Self::BYTES_PER_TRIANGLE * total + unwrap::bytes(total, vertices, scene.device().num_threads());
+        let bytes = scene.device().in_memory(2 * Self::BYTES_PER_TRIANGLE * total)
+            + unwrap::bytes(total, vertices, scene.device().num_threads());
         let _memory = scene.device().memory().reserve(bytes, CHARTS)?;
         let (charts, mut report) = scene.device().install(|| {
             let mut report = UvReport::default();
@@ -377,7 +378,8 @@ fn split_to_fit(piece: Piece, max_extent: f32, out: &mut Vec<Piece>) -> Result<(
         let half = |low: bool| -> Result<Piece> {
             let kept = || piece.triangles.iter().zip(&piece.corners).filter(|(_, c)| is_low(c) == low);
             let triangles = try_collect(kept().map(|(&t, _)| t), CHARTS)?;
-            Ok(Piece { triangles, corners: try_collect(kept().map(|(_, &c)| c), CHARTS)?, given: None })
+            let corners = try_collect(kept().map(|(_, &c)| c), CHARTS)?;
+            Ok(Piece { triangles: triangles.into(), corners: corners.into(), given: None })
         };
         let halves = [half(true)?, half(false)?];
         let shrinks = |p: &Piece| {
@@ -502,8 +504,8 @@ fn given_piece(scene: &Scene, page: u32, triangles: Vec<u32>, uvs: &[[Vec2; 3]])
     let scale = (area / area_uv).sqrt();
     let local = |uv: Vec2| ((uv - lower).as_dvec2() * scale).as_vec2().to_array();
     Ok(Piece {
-        triangles,
-        corners: try_collect(uvs.iter().map(|t| t.map(local)), CHARTS)?,
+        triangles: triangles.into(),
+        corners: try_collect(uvs.iter().map(|t| t.map(local)), CHARTS)?.into(),
         given: Some(Given { page, offset: lower.to_array(), scale: [(1.0 / scale) as f32; 2] }),
     })
 }

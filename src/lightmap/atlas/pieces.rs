@@ -1,9 +1,11 @@
 //! Pieces of surface from which charts are made, and how they are connected.
 
+use crate::base::array::Array;
 use crate::base::error::Result;
 use crate::base::memory::{try_collect, try_filled, try_push};
 use crate::base::progress::Stage;
 use crate::base::sort::sort;
+use crate::device::Device;
 use crate::scene::{Material, NONE, Scene};
 
 /// Name of the buffers in error messages.
@@ -23,10 +25,24 @@ pub struct Given {
 /// A piece of surface that becomes a chart. Local coordinates need not start at (0, 0).
 pub(in crate::lightmap) struct Piece {
     /// Global triangle numbers, ascending.
-    pub triangles: Vec<u32>,
+    pub triangles: Array<u32>,
     /// Local coordinates of the corners, per entry of `triangles`.
-    pub corners: Vec<[[f32; 2]; 3]>,
+    pub corners: Array<[[f32; 2]; 3]>,
     pub given: Option<Given>,
+}
+
+impl Piece {
+    /// Moves the piece to where it takes no memory, if there is a folder for scratch files.
+    pub fn kept(self, device: &Device) -> Result<Piece> {
+        if !device.has_scratch() {
+            return Ok(self);
+        }
+        Ok(Piece {
+            triangles: device.copy(&self.triangles, CHARTS)?,
+            corners: device.copy(&self.corners, CHARTS)?,
+            given: self.given,
+        })
+    }
 }
 
 /// Returns the kind of surface of a material. Different kinds must not share a chart: two-sided and one-sided surfaces,

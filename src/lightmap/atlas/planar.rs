@@ -9,6 +9,7 @@ use super::welded::Geometry;
 use crate::base::error::Result;
 use crate::base::memory::{try_collect, try_filled, try_push, try_with_capacity};
 use crate::base::progress::Stage;
+use crate::device::Device;
 use crate::scene::NONE;
 use glam::{DVec2, DVec3};
 
@@ -140,8 +141,8 @@ pub(super) fn flat_piece(
         return Ok(None);
     }
     Ok(Some(Piece {
-        triangles: try_collect(members.iter().map(|&t| geometry.triangles[t as usize]), CHARTS)?,
-        corners: try_collect(flat.iter().map(|t| t.map(|p| p.as_vec2().to_array())), CHARTS)?,
+        triangles: try_collect(members.iter().map(|&t| geometry.triangles[t as usize]), CHARTS)?.into(),
+        corners: try_collect(flat.iter().map(|t| t.map(|p| p.as_vec2().to_array())), CHARTS)?.into(),
         given: None,
     }))
 }
@@ -295,11 +296,11 @@ fn overlap(a: &[DVec2; 3], b: &[DVec2; 3], touch: f64) -> bool {
 /// Makes charts for the triangles marked in `which`: pairs of nearly coplanar triangles, longest shared edges first,
 /// and single triangles. The triangles of a pair lie on different sides of their edge, so they do not overlap in
 /// projection.
-pub(super) fn planar_pieces(geometry: &Geometry, which: &[bool], stage: &Stage) -> Result<Vec<Piece>> {
+pub(super) fn planar_pieces(device: &Device, geometry: &Geometry, which: &[bool], stage: &Stage) -> Result<Vec<Piece>> {
     if !which.contains(&true) {
         return Ok(Vec::new());
     }
-    let neighbours = geometry.neighbours(stage)?;
+    let neighbours = geometry.neighbours(device, stage)?;
     let mut candidates = Vec::new();
     for t in (0..which.len()).filter(|&t| which[t]) {
         for (k, &n) in neighbours[t].iter().enumerate() {
@@ -362,8 +363,8 @@ mod tests {
         let stage = progress.stage("unwrap", 0.0, 1.0, 1);
         let triangles: Vec<u32> = (0..scene.triangle_count()).collect();
         let geometry = Geometry::of(&scene, &triangles, &stage).unwrap();
-        let pieces = planar_pieces(&geometry, &vec![true; geometry.triangles.len()], &stage).unwrap();
-        let mut triangles: Vec<u32> = pieces.iter().flat_map(|p| p.triangles.clone()).collect();
+        let pieces = planar_pieces(scene.device(), &geometry, &vec![true; geometry.triangles.len()], &stage).unwrap();
+        let mut triangles: Vec<u32> = pieces.iter().flat_map(|p| p.triangles.to_vec()).collect();
         triangles.sort_unstable();
         assert!(triangles.iter().copied().eq(0..scene.triangle_count()));
         // Nearly all pair up across a diagonal.
@@ -426,7 +427,7 @@ mod tests {
             let stage = progress.stage("unwrap", 0.0, 1.0, 1);
             let all: Vec<u32> = (0..scene.triangle_count()).collect();
             let geometry = Geometry::of(&scene, &all, &stage).unwrap();
-            let neighbours = geometry.neighbours(&stage).unwrap();
+            let neighbours = geometry.neighbours(scene.device(), &stage).unwrap();
             let regions = flat_regions(&geometry, &neighbours, &all, &stage).unwrap();
             let piece = |r| flat_piece(&geometry, &neighbours, regions.get(r), &stage).unwrap();
             (0..regions.len()).filter_map(piece).map(|p| p.triangles.len()).collect::<Vec<_>>()

@@ -4,8 +4,9 @@
 
 use super::ids::ChartId;
 use super::pieces::{CHARTS, Given, Piece, triangle_area};
+use crate::base::array::Array;
 use crate::base::error::Result;
-use crate::base::memory::{try_filled, try_push, try_with_capacity, try_zeroed_as_needed};
+use crate::base::memory::try_push;
 use crate::base::progress::Stage;
 use crate::scene::Scene;
 use glam::Vec2;
@@ -30,11 +31,11 @@ pub struct Chart {
 #[derive(Clone, Debug, Default, PartialEq)]
 pub(in crate::lightmap) struct Sheet {
     /// Triangles by their numbers in the sheet, chart by chart, ascending in each.
-    pub triangles: Vec<u32>,
+    pub triangles: Array<u32>,
     /// Number in the sheet of each triangle's chart, [`ChartId::NONE`] for degenerate ones.
-    pub of_triangles: Vec<ChartId>,
+    pub of_triangles: Array<ChartId>,
     /// Local coordinates of the corners of each triangle, in units of the object that the sheet was made of.
-    pub corners: Vec<[[f32; 2]; 3]>,
+    pub corners: Array<[[f32; 2]; 3]>,
     /// Where the sheet was made: global number of its first triangle, and its charts among those of the scene.
     pub first_triangle: u32,
     pub charts: Range<u32>,
@@ -75,33 +76,36 @@ impl Sheet {
         first_shape: usize,
         stage: &Stage,
     ) -> Result<Sheet> {
-        let total = range.len();
+        let (total, device) = (range.len(), scene.device());
         let first_chart = charts.len();
         let mut sheet = Sheet {
-            triangles: try_with_capacity(total, CHARTS)?,
-            of_triangles: try_filled(total, ChartId::NONE, CHARTS)?,
             // Untouched until a piece is moved there, which is then freed.
-            corners: try_zeroed_as_needed(total, CHARTS)?,
+            triangles: device.zeroed(total, CHARTS)?,
+            of_triangles: device.zeroed(total, CHARTS)?,
+            corners: device.zeroed(total, CHARTS)?,
             first_triangle: range.start,
             charts: first_chart as u32..first_chart as u32,
             first_shape: first_shape as u32,
         };
+        sheet.of_triangles.fill(ChartId::NONE);
+        let mut count = 0;
         for piece in pieces {
             stage.check()?;
             let points = piece.corners.iter().flatten().map(|&p| Vec2::from_array(p));
             let (lower, upper) =
                 points.fold((Vec2::INFINITY, Vec2::NEG_INFINITY), |(lo, hi), p| (lo.min(p), hi.max(p)));
-            let first = sheet.triangles.len() as u32;
+            let first = count as u32;
             let mut area = 0.0;
             for (&t, corners) in piece.triangles.iter().zip(&piece.corners) {
                 let own = t - range.start;
                 sheet.of_triangles[own as usize] = ChartId::new(charts.len() - first_chart);
                 sheet.corners[own as usize] = corners.map(|c| (Vec2::from_array(c) - lower).to_array());
-                try_push(&mut sheet.triangles, own, CHARTS)?;
+                sheet.triangles[count] = own;
+                count += 1;
                 area += triangle_area(scene, t);
             }
             let chart = Chart {
-                triangles: first..sheet.triangles.len() as u32,
+                triangles: first..count as u32,
                 size: (upper - lower).to_array(),
                 area: area as f32,
                 two_sided: scene.material(piece.triangles[0]).two_sided,
@@ -110,6 +114,7 @@ impl Sheet {
             try_push(charts, chart, CHARTS)?;
         }
         sheet.charts.end = charts.len() as u32;
+        sheet.triangles.truncate(count);
         Ok(sheet)
     }
 

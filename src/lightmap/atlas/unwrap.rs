@@ -51,7 +51,7 @@ pub(in crate::lightmap) fn unwrap(scene: &Scene, triangles: &[u32], stage: &Stag
 
 fn unwrap_mesh(scene: &Scene, triangles: &[u32], stage: &Stage) -> Result<Vec<Piece>> {
     let geometry = Geometry::of(scene, triangles, stage)?;
-    let neighbours = geometry.neighbours(stage)?;
+    let neighbours = geometry.neighbours(scene.device(), stage)?;
     let all = try_collect(0..triangles.len() as u32, CHARTS)?;
     let regions = flat_regions(&geometry, &neighbours, &all, stage)?;
     let flat = try_par_gather(regions.len().div_ceil(REGIONS_PER_JOB), CHARTS, |i, out| {
@@ -79,7 +79,9 @@ fn unwrap_mesh(scene: &Scene, triangles: &[u32], stage: &Stage) -> Result<Vec<Pi
         stage.advance(parts[i].len() as u64)
     })?;
     let mut pieces = try_with_capacity(flat.len() + curved.len(), CHARTS)?;
-    pieces.extend(flat.into_iter().map(|(_, piece)| piece).chain(curved));
+    for piece in flat.into_iter().map(|(_, piece)| piece).chain(curved) {
+        pieces.push(piece.kept(scene.device())?);
+    }
     Ok(pieces)
 }
 
@@ -151,8 +153,8 @@ fn cut(geometry: &Geometry, regions: &Regions, stage: &Stage) -> Result<Vec<Vec<
 }
 
 #[cfg(not(feature = "unwrap"))]
-fn unwrap_part(geometry: &Geometry, _: &Scene, stage: &Stage) -> Result<Vec<Piece>> {
-    planar_pieces(geometry, &try_filled(geometry.triangles.len(), true, CHARTS)?, stage)
+fn unwrap_part(geometry: &Geometry, scene: &Scene, stage: &Stage) -> Result<Vec<Piece>> {
+    planar_pieces(scene.device(), geometry, &try_filled(geometry.triangles.len(), true, CHARTS)?, stage)
 }
 
 #[cfg(feature = "unwrap")]
@@ -169,7 +171,7 @@ fn unwrap_part(geometry: &Geometry, scene: &Scene, stage: &Stage) -> Result<Vec<
     }
     match charts_of_part(geometry, longest_component(geometry, stage)?, stage) {
         Ok((mut pieces, left)) => {
-            for piece in planar_pieces(geometry, &left, stage)? {
+            for piece in planar_pieces(device, geometry, &left, stage)? {
                 try_push(&mut pieces, piece, CHARTS)?;
             }
             if let Some(entry) = known {
@@ -186,7 +188,7 @@ fn unwrap_part(geometry: &Geometry, scene: &Scene, stage: &Stage) -> Result<Vec<
                     "{count} triangles from triangle {first} on could not be unwrapped and get planar charts: {e}"
                 ),
             );
-            planar_pieces(geometry, &try_filled(count, true, CHARTS)?, stage)
+            planar_pieces(device, geometry, &try_filled(count, true, CHARTS)?, stage)
         }
     }
 }
@@ -273,8 +275,7 @@ const MAX_AREA_DISTORTION: f32 = 2.0;
 #[cfg(feature = "unwrap")]
 fn read_charts(geometry: &Geometry, atlas: &uvunwrap::Atlas, texel: f64) -> (Vec<Piece>, Vec<bool>) {
     let unit = glam::DVec2::new(atlas.width as f64, atlas.height as f64) * texel;
-    let empty = || Piece { triangles: Vec::new(), corners: Vec::new(), given: None };
-    let mut pieces: Vec<Piece> = (0..atlas.chart_count).map(|_| empty()).collect();
+    let mut charts = vec![(Vec::new(), Vec::new()); atlas.chart_count as usize];
     let mut left = vec![false; geometry.triangles.len()];
     let mesh = &atlas.meshes[0];
     for (t, corners) in mesh.indices.chunks_exact(3).enumerate() {
@@ -284,14 +285,18 @@ fn read_charts(geometry: &Geometry, atlas: &uvunwrap::Atlas, texel: f64) -> (Vec
         // Triangles without a chart are degenerate in UV space, at a point of some chart.
         match corners[0].chart {
             Some(chart) if (b - a).perp_dot(c - a) > 0.0 => {
-                pieces[chart as usize].triangles.push(geometry.triangles[t]);
-                pieces[chart as usize].corners.push(local.map(|p| p.as_vec2().to_array()));
+                let (triangles, corners) = &mut charts[chart as usize];
+                triangles.push(geometry.triangles[t]);
+                corners.push(local.map(|p| p.as_vec2().to_array()));
             }
             _ => left[t] = true,
         }
     }
-    pieces.retain(|p| !p.triangles.is_empty());
-    (pieces, left)
+    let piece = |(triangles, corners): (Vec<_>, Vec<_>)| {
+        let is_there = !triangles.is_empty();
+        is_there.then(|| Piece { triangles: triangles.into(), corners: corners.into(), given: None })
+    };
+    (charts.into_iter().filter_map(piece).collect(), left)
 }
 
 #[cfg(test)]
@@ -307,7 +312,7 @@ mod tests {
         let progress = Progress::none();
         let stage = progress.stage("unwrap", 0.0, 1.0, 1);
         let geometry = Geometry::of(&scene, &triangles, &stage).unwrap();
-        let neighbours = geometry.neighbours(&stage).unwrap();
+        let neighbours = geometry.neighbours(scene.device(), &stage).unwrap();
         let parts = parts(&geometry, &neighbours, &triangles, &stage).unwrap();
         assert!(parts.len() >= 3 && parts.iter().all(|p| p.len() <= PART_TRIANGLES && p.is_sorted()));
         let mut all = parts.concat();

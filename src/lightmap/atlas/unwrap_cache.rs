@@ -91,7 +91,7 @@ impl Entry {
                 return Ok(None);
             }
             let triangles = try_collect(triangles.iter().map(|&t| numbers[t as usize]), CHARTS)?;
-            pieces.push(Piece { triangles, corners, given: None });
+            pieces.push(Piece { triangles: triangles.into(), corners: corners.into(), given: None });
         }
         Ok(rest.is_empty().then_some(pieces))
     }
@@ -220,7 +220,7 @@ mod tests {
         let stage = progress.stage("unwrap", 0.0, 1.0, 1);
         let geometry = Geometry::of(&scene, &numbers, &stage).unwrap();
         let entry = Entry::of(scene.device(), &geometry).unwrap().unwrap();
-        let pieces = planar_pieces(&geometry, &vec![true; numbers.len()], &stage).unwrap();
+        let pieces = planar_pieces(scene.device(), &geometry, &vec![true; numbers.len()], &stage).unwrap();
         entry.save(&pieces, &numbers, scene.device());
         let loaded = entry.load(&numbers).unwrap().unwrap();
         let content =

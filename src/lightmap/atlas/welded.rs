@@ -1,26 +1,36 @@
 //! The triangles of a mesh with welded vertices, and which lie next to which.
 
 use super::pieces::{CHARTS, ITEMS_PER_CHECK, float_key, surface_kind};
+use crate::base::array::Array;
 use crate::base::error::Result;
-use crate::base::memory::{try_collect, try_filled, try_par_collect, try_to_vec, try_with_capacity};
+use crate::base::memory::{try_collect, try_filled, try_with_capacity};
 use crate::base::progress::Stage;
 use crate::base::sort::sort;
+use crate::device::Device;
 use crate::scene::{NONE, Scene};
+use bytemuck::Pod;
 use glam::{DVec3, Vec3};
 use rayon::prelude::*;
 
 /// Some triangles of one mesh with welded vertices.
 pub(super) struct Geometry {
     /// Global triangle numbers, ascending.
-    pub triangles: Vec<u32>,
+    pub triangles: Array<u32>,
     /// Vertices of each triangle; equal positions are one vertex.
-    pub indices: Vec<[u32; 3]>,
+    pub indices: Array<[u32; 3]>,
     /// Positions by ascending bits, x first, so that they do not depend on the order of the mesh's vertices.
-    pub positions: Vec<Vec3>,
+    pub positions: Array<Vec3>,
     /// Unit normals of the triangles.
-    pub normals: Vec<DVec3>,
+    pub normals: Array<DVec3>,
     /// Kind of surface of each triangle, see [`surface_kind`].
-    pub kinds: Vec<u32>,
+    pub kinds: Array<u32>,
+}
+
+/// Computes something of each triangle, in parallel.
+fn of_each<T: Pod + Send + Sync>(scene: &Scene, triangles: &[u32], f: impl Fn(&u32) -> T + Sync) -> Result<Array<T>> {
+    let mut all = scene.device().zeroed(triangles.len(), CHARTS)?;
+    all.par_iter_mut().zip(triangles).for_each(|(out, t)| *out = f(t));
+    Ok(all)
 }
 
 impl Geometry {
@@ -61,11 +71,11 @@ impl Geometry {
         };
         let kind = |&t: &u32| surface_kind(&scene.materials()[mesh.material((t - first) as usize) as usize]);
         Ok(Geometry {
-            indices: try_par_collect(triangles.par_iter().map(|&t| corners(t).map(|v| welded[v as usize])), CHARTS)?,
-            positions,
-            normals: try_par_collect(triangles.par_iter().map(normal), CHARTS)?,
-            kinds: try_par_collect(triangles.par_iter().map(kind), CHARTS)?,
-            triangles: try_to_vec(triangles, CHARTS)?,
+            indices: of_each(scene, triangles, |&t| corners(t).map(|v| welded[v as usize]))?,
+            positions: positions.into(),
+            normals: of_each(scene, triangles, normal)?,
+            kinds: of_each(scene, triangles, kind)?,
+            triangles: scene.device().copy(triangles, CHARTS)?,
         })
     }
 
@@ -79,11 +89,11 @@ impl Geometry {
         let place = |v: u32| used.binary_search(&v).unwrap_or_default() as u32;
         let of = |t: &u32| *t as usize;
         Ok(Geometry {
-            indices: try_collect(triangles.iter().map(|t| self.indices[of(t)].map(place)), CHARTS)?,
-            positions: try_collect(used.iter().map(|v| self.positions[of(v)]), CHARTS)?,
-            normals: try_collect(triangles.iter().map(|t| self.normals[of(t)]), CHARTS)?,
-            kinds: try_collect(triangles.iter().map(|t| self.kinds[of(t)]), CHARTS)?,
-            triangles: try_collect(triangles.iter().map(|t| self.triangles[of(t)]), CHARTS)?,
+            indices: try_collect(triangles.iter().map(|t| self.indices[of(t)].map(place)), CHARTS)?.into(),
+            positions: try_collect(used.iter().map(|v| self.positions[of(v)]), CHARTS)?.into(),
+            normals: try_collect(triangles.iter().map(|t| self.normals[of(t)]), CHARTS)?.into(),
+            kinds: try_collect(triangles.iter().map(|t| self.kinds[of(t)]), CHARTS)?.into(),
+            triangles: try_collect(triangles.iter().map(|t| self.triangles[of(t)]), CHARTS)?.into(),
         })
     }
 
@@ -93,7 +103,7 @@ impl Geometry {
 
     /// Returns the triangle across each edge (corners k and k + 1). It is [`NONE`] if there is none, if more than two
     /// triangles share the edge, if the winding differs, or if the materials must not share a chart.
-    pub(super) fn neighbours(&self, stage: &Stage) -> Result<Vec<[u32; 3]>> {
+    pub(super) fn neighbours(&self, device: &Device, stage: &Stage) -> Result<Array<[u32; 3]>> {
         let ends = |edge: u32| {
             let (i, k) = (self.indices[edge as usize / 3], edge as usize % 3);
             [i[k], i[(k + 1) % 3]]
@@ -114,7 +124,7 @@ impl Geometry {
             sum += *start;
             *start = sum;
         }
-        let mut edges = try_filled(count as usize, 0u32, CHARTS)?;
+        let mut edges: Array<u32> = device.zeroed(count as usize, CHARTS)?;
         for edge in (0..count).rev() {
             if (edge as usize).is_multiple_of(ITEMS_PER_CHECK) {
                 stage.check()?;
@@ -123,7 +133,8 @@ impl Geometry {
             *start -= 1;
             edges[*start as usize] = edge;
         }
-        let mut neighbours = try_filled(self.indices.len(), [NONE; 3], CHARTS)?;
+        let mut neighbours: Array<[u32; 3]> = device.zeroed(self.indices.len(), CHARTS)?;
+        neighbours.fill([NONE; 3]);
         for (vertex, range) in starts.windows(2).enumerate() {
             if vertex % ITEMS_PER_CHECK == 0 {
                 stage.check()?;

@@ -389,8 +389,8 @@ fn known(
         }
         last_page = given.map(|g| g.page);
         pieces.push(Piece {
-            triangles: try_collect(triangles.iter().map(|t| t.triangle), LAYOUT)?,
-            corners: try_collect(triangles.iter().map(|t| t.corners), LAYOUT)?,
+            triangles: try_collect(triangles.iter().map(|t| t.triangle), LAYOUT)?.into(),
+            corners: try_collect(triangles.iter().map(|t| t.corners), LAYOUT)?.into(),
             given,
         });
     }

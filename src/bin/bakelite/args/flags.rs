@@ -318,6 +318,9 @@ pub struct LightmapFlags {
     /// Keep unwraps in DIR by their content, so that parts that have not changed are not unwrapped again
     #[arg(long, value_name = "DIR")]
     pub cache: Option<PathBuf>,
+    /// Keep what charts have per triangle in files of this folder instead of memory, for scenes that are larger than it
+    #[arg(long, value_name = "FOLDER")]
+    pub scratch: Option<PathBuf>,
     /// Light map texels per gather map texel and axis
     #[arg(long, value_name = "N", default_value_t = LightmapDesc::default().gather_divisor,
           value_parser = of(|d: &mut LightmapDesc, v| d.gather_divisor = v))]

@@ -176,7 +176,7 @@ proptest! {
             Chart { triangles: 0..1, given: given(corner, size), ..charts.charts[0].clone() },
             Chart { triangles: 1..2, given: given([0.4, 0.3], [0.3, 0.5]), ..charts.charts[0].clone() },
         ];
-        charts.own.of_triangles = [0, 1].map(ChartId::new).to_vec();
+        charts.own.of_triangles = [0, 1].map(ChartId::new).into();
         let layout = Layout::pack(&charts, 1.0, 32, 2, true, &[], &[], &Progress::none()).unwrap();
         let map = map_of(&scene, &charts, &layout);
         let area = PageArea { columns: x0..(x0 + w).min(32), rows: y0..(y0 + h).min(32) };
@@ -237,9 +237,9 @@ fn unit_quad() -> (std::sync::Arc<Scene>, Charts) {
     let charts = Charts {
         charts: vec![Chart { triangles: 0..2, size: [1.0; 2], area: 1.0, two_sided: false, given: None }],
         own: Sheet {
-            triangles: vec![0, 1],
-            of_triangles: vec![ChartId::new(0); 2],
-            corners: vec![[[0.0, 0.0], [1.0, 0.0], [1.0, 1.0]], [[0.0, 0.0], [1.0, 1.0], [0.0, 1.0]]],
+            triangles: vec![0, 1].into(),
+            of_triangles: vec![ChartId::new(0); 2].into(),
+            corners: vec![[[0.0, 0.0], [1.0, 0.0], [1.0, 1.0]], [[0.0, 0.0], [1.0, 1.0], [0.0, 1.0]]].into(),
             ..Sheet::default()
         },
         ..Charts::default()
@@ -298,7 +298,7 @@ fn of_overlapping_given_triangles_the_first_one_wins_and_texels_are_counted() {
     let given = Some(Given { page: 0, offset: [0.0; 2], scale: [1.0; 2] });
     let chart = |t: u32| Chart { triangles: t..t + 1, given, ..charts.charts[0].clone() };
     charts.charts = vec![chart(0), chart(1)];
-    charts.own.of_triangles = [0, 1].map(ChartId::new).to_vec();
+    charts.own.of_triangles = [0, 1].map(ChartId::new).into();
     // The second lies on the first, and on a part of the page that is its own.
     charts.own.corners[1] = [[0.0, 0.0], [1.0, 0.0], [0.0, 1.0]];
     let layout = Layout::pack(&charts, 1.0, 8, 2, true, &[], &[], &Progress::none()).unwrap();

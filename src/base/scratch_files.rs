@@ -1,0 +1,123 @@
+//! Arrays in files instead of memory, for what is larger than it: the system writes out what has not been used for long, and
+//! reads it again when it is. The files have no names, so that they are gone with the arrays, however the process ends.
+
+use super::array::{Array, Mapping};
+use super::error::{Error, Result};
+use bytemuck::Pod;
+use memmap2::MmapMut;
+use std::fs::{File, OpenOptions};
+use std::path::{Path, PathBuf};
+use std::sync::atomic::{AtomicU64, Ordering};
+use std::sync::{Arc, Mutex, PoisonError};
+
+/// Size in bytes of a file that several arrays share, and of the largest of these.
+const SHARED: usize = 64 << 20;
+const LARGEST_IN_SHARED: usize = SHARED / 8;
+
+/// Arrays begin at multiples of this.
+const ALIGN: usize = 64;
+
+/// Arrays in files of a folder.
+pub(crate) struct ScratchFiles {
+    folder: PathBuf,
+    /// The file that is being filled, and how many bytes of it are taken.
+    shared: Mutex<Option<(Arc<Mapping>, usize)>>,
+}
+
+impl ScratchFiles {
+    pub fn new(folder: PathBuf) -> ScratchFiles {
+        ScratchFiles { folder, shared: Mutex::new(None) }
+    }
+
+    /// Makes an array of zeros. A file goes when all arrays in it are gone.
+    pub fn zeroed<T: Pod>(&self, len: usize) -> Result<Array<T>> {
+        let Some(bytes) = len.checked_mul(size_of::<T>()).filter(|&bytes| bytes <= isize::MAX as usize - SHARED) else {
+            return Err(Error::OutOfMemory(format!("an array of {len} elements is too large for a scratch file")));
+        };
+        if bytes == 0 {
+            return Ok(Array::default());
+        }
+        let (map, offset) = if bytes > LARGEST_IN_SHARED { (self.file(bytes)?, 0) } else { self.part(bytes)? };
+        // SAFETY: all bits are elements, and no other array gets this part of the file.
+        Ok(unsafe { Array::mapped(&map, offset, len) }.expect("it lies in the file, at a multiple of ALIGN"))
+    }
+
+    /// Takes a part of the file that is being filled.
+    fn part(&self, bytes: usize) -> Result<(Arc<Mapping>, usize)> {
+        let mut shared = self.shared.lock().unwrap_or_else(PoisonError::into_inner);
+        let (map, used) = match shared.take() {
+            Some((map, used)) if used + bytes <= SHARED => (map, used),
+            _ => (self.file(SHARED)?, 0),
+        };
+        *shared = Some((map.clone(), (used + bytes).next_multiple_of(ALIGN)));
+        Ok((map, used))
+    }
+
+    fn file(&self, bytes: usize) -> Result<Arc<Mapping>> {
+        let map = unnamed(&self.folder, bytes).and_then(|file| {
+            // SAFETY: the file has no name, so that nobody else can change it or cut it short.
+            unsafe { MmapMut::map_mut(&file) }
+        });
+        let fail =
+            |e| Error::Io(format!("cannot make a scratch file of {bytes} bytes in {}: {e}", self.folder.display()));
+        Ok(Arc::new(Mapping::new(map.map_err(fail)?)))
+    }
+}
+
+/// Makes a file without a name.
+fn unnamed(folder: &Path, bytes: usize) -> std::io::Result<File> {
+    static COUNT: AtomicU64 = AtomicU64::new(0);
+    let name = format!(".bakelite-scratch-{}-{}", std::process::id(), COUNT.fetch_add(1, Ordering::Relaxed));
+    let path = folder.join(name);
+    let file = OpenOptions::new().read(true).write(true).create_new(true).open(&path)?;
+    std::fs::remove_file(&path)?;
+    file.set_len(bytes as u64)?;
+    take_room(&file, bytes)?;
+    Ok(file)
+}
+
+/// Takes all the room on the disk now: where there is none later, a write to memory would end the process.
+#[cfg(target_os = "linux")]
+fn take_room(file: &File, bytes: usize) -> std::io::Result<()> {
+    use std::os::fd::AsRawFd;
+    // SAFETY: the file is open.
+    match unsafe { libc::posix_fallocate(file.as_raw_fd(), 0, bytes as libc::off_t) } {
+        0 => Ok(()),
+        e => Err(std::io::Error::from_raw_os_error(e)),
+    }
+}
+
+#[cfg(not(target_os = "linux"))]
+fn take_room(mut file: &File, bytes: usize) -> std::io::Result<()> {
+    use std::io::{Read, copy, repeat};
+    copy(&mut repeat(0).take(bytes as u64), &mut file).map(|_| ())
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn arrays_are_apart_and_leave_no_file() {
+        let folder = std::env::temp_dir().join(format!("bakelite-scratch-test-{}", std::process::id()));
+        std::fs::create_dir_all(&folder).unwrap();
+        let files = ScratchFiles::new(folder.clone());
+        let sizes =
+            [1, 1000, 0, 5 << 20, 1, 100_000, (20 << 20) + 3, 6 << 20, 6 << 20, 7 << 20, 7 << 20, 7 << 20, 7 << 20];
+        let mut arrays: Vec<Array<u8>> = sizes.iter().map(|&len| files.zeroed(len).unwrap()).collect();
+        let words: Array<[u64; 3]> = files.zeroed(7).unwrap();
+        assert_eq!(std::fs::read_dir(&folder).unwrap().count(), 0);
+        for (i, array) in arrays.iter_mut().enumerate() {
+            assert!(array.iter().all(|&b| b == 0));
+            array.fill(i as u8 + 1);
+        }
+        assert_eq!(words, vec![[0; 3]; 7]);
+        drop(files);
+        for (i, (array, len)) in arrays.iter().zip(sizes).enumerate() {
+            assert!(array.len() == len && array.iter().all(|&b| b == i as u8 + 1));
+        }
+        std::fs::remove_dir(&folder).unwrap();
+        let e = ScratchFiles::new(folder).zeroed::<u8>(1).unwrap_err().to_string();
+        assert!(e.contains("scratch file"), "{e}");
+    }
+}
