@@ -6,6 +6,7 @@
 //
 //     SCENE              a file (.obj .ply .gltf .glb) or a built-in name
 //     --only PART        rays or commits (default: both)
+//     --kinds LIST       as "one by one,tile to lamp": kinds of rays (default: all)
 //     --rays N           rays per kind (default 500000)
 //     --pairs P          pairs of runs per ratio (default 5)
 //     --seed S           of all random numbers (default 1)
@@ -62,6 +63,7 @@ struct Options {
     bool rays_too = true, commits_too = true, markdown = false, all_isas = false;
     size_t rays = 500000;
     std::vector<unsigned> threads = {1};
+    std::vector<size_t> kinds;
     std::vector<uint32_t> qualities = {BK_BUILD_QUALITY_DEFAULT};
     unsigned pairs = 5;
     uint64_t seed = 1;
@@ -98,8 +100,8 @@ uint32_t one_of(const char *const (&names)[N], const std::string &value, const s
 
 Options parse(int argc, char **argv) {
     const char *usage =
-        "usage: embree_compare SCENE... [--only rays|commits] [--rays N] [--pairs P] [--seed S] [--threads LIST]\n"
-        "    [--isa NAME|all] [--embree-isa NAME] [--build LIST] [--markdown] [--csv FILE]";
+        "usage: embree_compare SCENE... [--only rays|commits] [--kinds LIST] [--rays N] [--pairs P] [--seed S]\n"
+        "    [--threads LIST] [--isa NAME|all] [--embree-isa NAME] [--build LIST] [--markdown] [--csv FILE]";
     Options o;
     for (int i = 1; i < argc; i++) {
         const std::string arg = argv[i];
@@ -116,6 +118,8 @@ Options parse(int argc, char **argv) {
         if (arg == "--only") {
             if (value != "rays" && value != "commits") fail("--only wants rays or commits, not " + value);
             o.rays_too = value == "rays", o.commits_too = value == "commits";
+        } else if (arg == "--kinds") {
+            for (const std::string &kind : list(value)) o.kinds.push_back(one_of(KIND_NAMES, kind, arg));
         } else if (arg == "--rays") {
             o.rays = number(value, arg, STREAM, 100000000);
         } else if (arg == "--pairs") {
@@ -140,6 +144,9 @@ Options parse(int argc, char **argv) {
         }
     }
     if (o.scenes.empty()) fail(usage);
+    if (o.kinds.empty()) {
+        for (size_t kind = 0; kind < KINDS; kind++) o.kinds.push_back(kind);
+    }
     if (o.all_isas && !o.embree_isa.empty()) fail("--isa all chooses Embree's, too");
     return o;
 }
@@ -314,7 +321,7 @@ size_t run_rays(const Scene &s, const Setup &setup, const Options &o, const Row 
     std::fprintf(o.text(), "\n");
     const std::vector<std::unique_ptr<Peer>> others = peers(s);
     size_t real = 0;
-    for (size_t kind = 0; kind < KINDS; kind++) {
+    for (const size_t kind : o.kinds) {
         Kind k;
         make_kind(k, kind, s, o.rays, o.seed);
         real += run_kind(k, s, embree, o, row, rows);

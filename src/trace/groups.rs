@@ -32,8 +32,13 @@ impl Group {
 
     /// [`Shear::axes`] of rays whose longest axis is `axis`.
     pub(super) fn axes(&self, axis: usize) -> &'static [u32; 3] {
-        &AXES[if self.octant >> axis & 1 != 0 { axis + 3 } else { axis }]
+        axes_of(self.octant, axis)
     }
+}
+
+/// [`Shear::axes`] of rays of an octant whose longest axis is `axis`.
+pub(super) fn axes_of(octant: usize, axis: usize) -> &'static [u32; 3] {
+    &AXES[if octant >> axis & 1 != 0 { axis + 3 } else { axis }]
 }
 
 /// The planes of a node's children that rays of an octant reach first and last, by axis.

@@ -47,7 +47,7 @@ const TRIAL: usize = 64;
 /// are never slower with 38, with 28 and fewer they are for the narrowest packets.)
 const FINE: usize = 38;
 
-/// Number of pairs of rays that are looked at to tell bundles.
+/// Number of rays, and of pairs of rays, that are looked at to tell how rays go.
 const PAIRS: usize = 16;
 
 /// Number of rays that are handed to a thread at a time: some blocks per thread, but long streams.
@@ -206,7 +206,7 @@ impl Scene {
             return false;
         }
         let (mut lower, mut upper) = (Vec3::INFINITY, Vec3::NEG_INFINITY);
-        for ray in rays {
+        for ray in rays.iter().step_by(rays.len() / PAIRS) {
             let origin = Vec3::from(ray.origin);
             (lower, upper) = (lower.min(origin), upper.max(origin));
         }

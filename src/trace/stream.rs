@@ -22,7 +22,7 @@
 //! test, rays of octants that few rays have, and rays whose lists find no room are traced one by one.
 
 use super::groups::{ChildBoxes, Group};
-use super::stream_rays::{MAX_RAYS, Room, sort};
+use super::stream_rays::{MAX_RAYS, Room, sort, sort_rest};
 use super::tree::{Leaf, RaySetup, Tree, beyond};
 use super::triangle::{Projected, V3, accurate_distance};
 use super::{RawHit, Ray, beams, single};
@@ -52,27 +52,25 @@ pub(super) unsafe fn stream<S: Simd, T: Tree, const ANY: bool>(
     };
     for (chunk, rays) in rays.chunks(MAX_RAYS).enumerate() {
         let first = chunk * MAX_RAYS;
-        // SAFETY: forwarded.
-        let starts = unsafe { sort::<S>(rays, &mut room) };
-        for octant in 0..8 {
-            let mut group = Group::new(octant, &starts);
-            if group.len() < LEAST {
-                room.leave_alone(group.begin..group.end());
-                continue;
-            }
-            if ANY && let Some(tree) = tree.whole() {
-                let Room { order, shafts, packs, .. } = &mut *room;
-                let order = &mut order[group.begin..group.begin + group.len()];
+        let starts = match tree.whole() {
+            Some(tree) if ANY => {
+                let Room { keys, beams, rest, .. } = &mut *room;
                 let done = |number: usize, is_hit: bool| {
                     let triangle = if is_hit { 0 } else { NONE };
                     done(first + number, RawHit { triangle, ..RawHit::MISS });
                 };
                 // SAFETY: forwarded.
-                unsafe { beams::trace::<S>(tree, root, &mut group, rays, order, shafts, packs, done) };
-                if group.len() < LEAST {
-                    room.leave_alone(group.begin..group.end());
-                    continue;
-                }
+                unsafe { beams::trace::<S>(tree, root, rays, beams, keys, rest, done) };
+                sort_rest(&mut room)
+            }
+            // SAFETY: forwarded.
+            _ => unsafe { sort::<S>(rays, &mut room) },
+        };
+        for octant in 0..8 {
+            let group = Group::new(octant, &starts);
+            if group.len() < LEAST {
+                room.leave_alone(group.begin..group.end());
+                continue;
             }
             // SAFETY: the rays of the group have been sorted into it; the caller vouches for the ISA.
             unsafe {
@@ -81,7 +79,7 @@ pub(super) unsafe fn stream<S: Simd, T: Tree, const ANY: bool>(
             }
             room.report::<ANY>(&group, |i, hit| done(first + i, hit));
         }
-        room.leave_alone(starts[24]..rays.len());
+        room.leave_alone(starts[24]..starts[25]);
         let alone = std::mem::take(&mut room.alone);
         let ray = |i: usize| rays[alone[i] as usize];
         // SAFETY: forwarded.

@@ -1,13 +1,14 @@
 //! Rays of a [stream](super::stream), prepared for its tests: sorted by octant and by the longest axis of their
 //! directions, then set up eight at a time.
 
-use super::beams::{self, Pack, Shaft};
+use super::beams;
 use super::groups::{ChildBoxes, Group};
-use super::tree::{BEYOND, FARTHEST_ORIGIN, OFFSET_ERROR, STEEP};
+use super::ray_keys::{SPECIAL, is_uniform, keys_of};
+use super::tree::{BEYOND, OFFSET_ERROR};
 use super::triangle::{GRAZING, Shear, barycentrics};
 use super::{RawHit, Ray};
 use crate::base::geometry::NONE;
-use crate::simd::{Eight, Lanes, Mask, Simd};
+use crate::simd::{Eight, Lanes, Simd};
 use bytemuck::Zeroable;
 use std::cell::Cell;
 use std::ops::Range;
@@ -17,9 +18,6 @@ pub(super) const MAX_RAYS: usize = 4096;
 
 /// Room for numbers in lists. (Tiles in Sponza take up to some 20,000.)
 const NUMBERS: usize = 1 << 16;
-
-/// Key of rays that need special treatment in a test; the other keys are 3 · octant + axis.
-const SPECIAL: usize = 24;
 
 /// What the box test reads of a ray: see [`RaySetup`](super::tree::RaySetup).
 #[derive(Clone, Copy, Zeroable)]
@@ -93,15 +91,15 @@ impl<L: Lanes> ChildBoxes<L> {
 /// Working memory of streams: 0.7 MB per thread that traces any.
 pub(super) struct Room {
     /// Keys of the rays: 3 · octant + axis, or [`SPECIAL`].
-    keys: Vec<u8>,
+    pub keys: Vec<u8>,
     /// Numbers of the rays, by key.
     pub order: Vec<u16>,
     /// Rays of a group.
     pub slabs: Vec<Slab>,
     pub targets: Vec<Target>,
-    /// Rays of a group in packs.
-    pub shafts: Vec<Shaft>,
-    pub packs: Vec<Pack>,
+    /// Room of rays in packs, and the numbers of those that are left.
+    pub beams: beams::Room,
+    pub rest: Vec<u16>,
     /// Boxes that the rays of a list hit, bit i for child i.
     pub masks: Vec<u8>,
     /// Lists of numbers of rays within the group.
@@ -122,6 +120,11 @@ fn zeros<T: Zeroable + Clone>(count: usize) -> Option<Vec<T>> {
     Some(v)
 }
 
+fn emptied(mut v: Vec<u16>) -> Vec<u16> {
+    v.clear();
+    v
+}
+
 impl Room {
     /// Takes the thread's memory; `None` if there is not enough.
     #[inline(never)]
@@ -134,15 +137,11 @@ impl Room {
             order: zeros(MAX_RAYS + 8)?,
             slabs: zeros(MAX_RAYS)?,
             targets: zeros(MAX_RAYS)?,
-            shafts: zeros(MAX_RAYS / beams::SIZE + 3)?,
-            packs: zeros(beams::PACKS)?,
+            beams: beams::Room { shafts: zeros(beams::PACKS)?, packs: zeros(beams::PACKS)?, waiting: zeros(SPECIAL)? },
+            rest: emptied(zeros(MAX_RAYS)?),
             masks: zeros(MAX_RAYS + 64)?,
             numbers: zeros(NUMBERS)?,
-            alone: {
-                let mut alone = zeros(MAX_RAYS)?;
-                alone.clear();
-                alone
-            },
+            alone: emptied(zeros(MAX_RAYS)?),
         }))
     }
 
@@ -223,7 +222,8 @@ pub(super) unsafe fn sort<S: Simd>(rays: &[Ray], room: &mut Room) -> [usize; SPE
         // SAFETY: a ray is eight floats. The caller vouches for the ISA.
         let found = unsafe {
             let load = |i: usize| S::F8::load(ray(i));
-            keys_of::<S::F8>([load(0), load(1), load(2), load(3), load(4), load(5), load(6), load(7)])
+            let rows = [load(0), load(1), load(2), load(3), load(4), load(5), load(6), load(7)];
+            keys_of::<S::F8>(S::F8::transpose(rows))
         };
         keys.copy_from_slice(&found);
         match is_uniform(found) {
@@ -253,54 +253,23 @@ pub(super) unsafe fn sort<S: Simd>(rays: &[Ray], room: &mut Room) -> [usize; SPE
     starts
 }
 
-/// Whether eight keys are the same, as they are of most rays that go to a lamp.
-fn is_uniform(keys: [u8; 8]) -> bool {
-    u64::from_ne_bytes(keys) == u64::from_ne_bytes([keys[0]; 8])
-}
-
-/// Keys of eight rays. Special are rays that cannot hit anything, those whose direction has to be scaled,
-/// and those that take the slower box test.
-///
-/// # Safety
-/// The CPU must have the ISA.
-#[inline(always)]
-unsafe fn keys_of<L: Eight>(rays: [L; 8]) -> [u8; 8] {
-    let [ox, oy, oz, tmin, dx, dy, dz, tmax] = L::transpose(rays);
-    // SAFETY: the caller vouches for the ISA.
-    let splat = |x: f32| unsafe { L::splat(x) };
-    let zero = splat(0.0);
-    let abs = |x: L| x.max(zero - x);
-    let (x, y, z) = (abs(dx), abs(dy), abs(dz));
-    let largest = x.max(y).max(z);
-    let least = x.min(y).min(z);
-    // NaN is in none of these ranges: it is the greater and the lesser of itself and another only in one order.
-    let is_number = |v: L| v.le(v);
-    let near = |o: L| abs(o).le(splat(FARTHEST_ORIGIN)).and(is_number(o));
-    let is_ordinary = splat(1e-6)
-        .le(largest)
-        .and(largest.le(splat(1e6)))
-        .and((splat(STEEP) * largest).lt(least))
-        .and(is_number(x).and(is_number(y)).and(is_number(z)))
-        .and(near(ox).and(near(oy)).and(near(oz)))
-        .and(tmin.lt(tmax));
-    let is_x = y.lt(x).and(z.lt(x));
-    let bits = [dx.lt(zero), dy.lt(zero), dz.lt(zero), is_x, z.lt(y), is_ordinary].map(|mask| mask.bits());
-    if bits.iter().all(|&bits| bits == 0 || bits == 0xff) {
-        return [key_of(bits, 0); 8];
+/// Sorts what beams have left of the rays by their keys, as [`sort`] does.
+pub(super) fn sort_rest(room: &mut Room) -> [usize; SPECIAL + 2] {
+    let mut starts = [0; SPECIAL + 2];
+    for &number in &room.rest {
+        starts[room.keys[number as usize] as usize + 1] += 1;
     }
-    std::array::from_fn(|i| key_of(bits, i))
-}
-
-/// Key of ray i (from masks, which was measured together with packs given up one by one:
-/// docs/experiments.md#streams), of which bits i tell whether its direction is negative along x, y and z, whether x is its longest axis,
-/// whether it is longer along y than along z, and whether it is not special.
-#[inline(always)]
-fn key_of(bits: [u32; 6], i: usize) -> u8 {
-    let [x, y, z, is_x, is_y, is_ordinary] = bits.map(|bits| (bits >> i) as u8 & 1);
-    match is_ordinary {
-        0 => SPECIAL as u8,
-        _ => 3 * (x + 2 * y + 4 * z) + (1 - is_x) * (2 - is_y),
+    for key in 0..=SPECIAL {
+        starts[key + 1] += starts[key];
     }
+    let mut next = starts;
+    for &number in &room.rest {
+        let place = &mut next[room.keys[number as usize] as usize];
+        room.order[*place] = number;
+        *place += 1;
+    }
+    room.rest.clear();
+    starts
 }
 
 /// Slabs and targets of eight rays with the same [axes](Shear::axes), as halves of eight floats.
