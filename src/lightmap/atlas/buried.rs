@@ -8,7 +8,8 @@
 //! without further distinction.
 //!
 //! A texel is buried if, on the side that it shows, almost all rays end within about a texel, on backs of one-sided
-//! surfaces, or on sides that cannot be seen from any [open place](super::seen), or if most of them end on such backs.
+//! surfaces, or on sides that cannot be seen from any [open place](super::seen), or if most of them end on such backs, or,
+//! where no sun or sky shines, if all of them end on backs or leave the scene, as below the floor of a room of sheets.
 
 use super::chart_map::ChartMap;
 use super::charts::Charts;
@@ -33,6 +34,9 @@ const RAYS: u32 = 16;
 /// backs.
 const OPEN: u32 = 3;
 
+/// A texel whose rays all leave an indoor scene or end on backs is buried if one in this many ends on a back.
+const FEW_BACKS: u32 = 4;
+
 /// A texel is visible at once if its first ray ends in the open, farther away than this many times `near`: most texels
 /// need only one ray.
 const AT_ONCE: f32 = 4.0;
@@ -55,6 +59,8 @@ pub(in crate::lightmap) struct Search<'a> {
     pub seen: &'a Seen,
     /// Distance up to which surfaces cover a texel, at most the width of a texel of the light map.
     pub near: f32,
+    /// Whether a sun or a sky shines, so that people may stand where rays leave the scene.
+    pub outdoors: bool,
     /// Whether each chart is searched; `None`: all are.
     pub only: Option<&'a [bool]>,
 }
@@ -189,7 +195,7 @@ impl Search<'_> {
         let mut undecided: [Undecided; BLOCK] = std::array::from_fn(|i| {
             let Some(point) = points.get(i) else { return Undecided::default() };
             let (_, receiver) = super::chart_map::receiver_of(self.scene, point, back);
-            Undecided { number: i as u32, origin: receiver.origin, normal: receiver.geometric, open: 0, backs: 0 }
+            Undecided { number: i as u32, origin: receiver.origin, normal: receiver.geometric, ..Default::default() }
         });
         let mut probes = [Ray::new(Vec3::ZERO, Vec3::ZERO); BLOCK];
         let mut hits = [RawHit::MISS; BLOCK];
@@ -206,10 +212,11 @@ impl Search<'_> {
                 match self.seen_by(hit) {
                     Sight::Open if i == 0 && hit.t > AT_ONCE * self.near => continue,
                     Sight::Open => point.open += 1,
+                    Sight::Nothing => (point.open, point.nothing) = (point.open + 1, point.nothing + 1),
                     Sight::Back => point.backs += 1,
                     Sight::Covered => {}
                 }
-                if point.open < OPEN || point.backs > 0 {
+                if point.open < OPEN || point.backs > 0 || point.open == point.nothing {
                     undecided[kept] = point;
                     kept += 1;
                 }
@@ -218,14 +225,15 @@ impl Search<'_> {
         }
         let mut are_buried = [false; BLOCK];
         for point in &undecided[..count] {
-            are_buried[point.number as usize] = point.open < OPEN || 2 * point.backs > RAYS;
+            let sees_nothing = point.open == point.nothing && FEW_BACKS * point.backs >= RAYS;
+            are_buried[point.number as usize] = point.open < OPEN || 2 * point.backs > RAYS || sees_nothing;
         }
         are_buried
     }
 
     fn seen_by(&self, hit: &RawHit) -> Sight {
         if hit.is_miss() {
-            return Sight::Open;
+            return if self.outdoors { Sight::Open } else { Sight::Nothing };
         }
         let material = self.scene.material(hit.triangle);
         if !hit.front && !material.two_sided && !material.transmits() {
@@ -239,6 +247,8 @@ impl Search<'_> {
 /// Kind of end of a ray.
 enum Sight {
     Open,
+    /// Outside of a scene that has no outside.
+    Nothing,
     /// On the back of a one-sided surface.
     Back,
     /// Within a texel, or on a side that cannot be seen from any open place.
@@ -252,8 +262,9 @@ struct Undecided {
     number: u32,
     origin: Vec3,
     normal: Vec3,
-    /// Rays that ended in the open.
+    /// Rays that ended in the open, and those of them that left an indoor scene.
     open: u32,
+    nothing: u32,
     /// Rays that ended on backs.
     backs: u32,
 }
