@@ -1,9 +1,7 @@
 //! Direct light of texels of the light map: light without penumbrae at their samples, whether it varies, and averages
 //! of points.
 
-use super::{
-    AROUND, FEW, MAX_POINTS, Point, TexelLight, TilePoints, Wanted, add_points, differ, line_of_sight, vary,
-};
+use super::{AROUND, FEW, MAX_POINTS, Point, TexelLight, TilePoints, Wanted, add_points, differ, line_of_sight, vary};
 use crate::base::directional::Directional;
 use crate::base::sampling::combine;
 use crate::direct::Receiver;
