@@ -513,9 +513,10 @@ pub(super) mod tests {
     fn own_light(atlas: &Atlas, upsampling: &Upsampling, radiance: impl Fn(RadianceTexel) -> f32) -> (OwnLight, u64) {
         let values = atlas.radiance.all().map(|s| Vec3::splat(radiance(s))).collect();
         let radiance = Radiance { values, ..Default::default() };
+        let samples = SampleSet::new(OWN_RAYS, 0);
         let rays = OwnRays {
             radiance: HitRadiance::of_map(RadianceLookup::new(&atlas.charts, &atlas.radiance, &radiance)),
-            samples: [&SampleSet::new(OWN_RAYS, 0); 2],
+            samples: [&samples; 2],
             seed: 0,
             directional: false,
         };

@@ -41,7 +41,7 @@ impl TexelLight<'_, RadianceMap> {
         let sample = |i: usize| map.receiver(scene, texels[i], map.is_back(texels[i])).1;
         tile.clear();
         tile.light(self, texels.iter().enumerate().map(|(i, &texel)| self.all_of(i, texel, 0..FEW)), rays);
-        tile.find_buried(texels.len(), &self.areas, &sample, rays);
+        tile.find_buried(texels.len(), &self.areas, sample, rays);
         for (i, &texel) in texels.iter().enumerate() {
             let (mut sum, points) = (PointLight::default(), tile.of(i));
             let mut n = add_points(points, &mut sum, |_| Vec3::ONE);
@@ -97,7 +97,7 @@ impl TexelLight<'_, RadianceMap> {
             let wanted = texels.iter().enumerate().filter(|(i, _)| has_spikes[*i]);
             tile.clear();
             tile.light(self, wanted.map(|(i, &texel)| self.all_of(i, texel, numbers.clone())), rays);
-            tile.find_buried(texels.len(), &self.areas, &sample, rays);
+            tile.find_buried(texels.len(), &self.areas, sample, rays);
             for i in (0..texels.len()).filter(|&i| has_spikes[i]) {
                 weights[i] += add_points(tile.of(i), &mut sums[i], weight);
             }
