@@ -2068,7 +2068,7 @@ typedef struct bk_bake_params {
   float interpolation_error;
   /// Number of rays of texels of the light map that trace rays themselves, at most 64, and no more
   /// than `gather_rays`; 0: a quarter of `gather_rays`, at least 16. Those with few others beside
-  /// them have twice as many, the others half of them. Raise it to 64 where texels are small and
+  /// them have twice as many, within the same limits. Raise it to 64 where texels are small and
   /// noise shows in corners: these texels take so many times as long. Default: 0.
   uint32_t own_rays;
 } bk_bake_params;

@@ -13,7 +13,7 @@
 //! Points lie on the chart: each on whichever triangle of the chart covers it, with that triangle's normals. Points
 //! inside solids, in cut-outs, or behind a wall that stands on the texel do not count: the light of the other room
 //! would leak in. A point lies inside a solid if the way along the surface from there to the texel's sample, which can be
-//! seen, ends at the solid's surface from inside. If all points do, as in a texel of which a strip looks out from under a
+//! seen, or the ways straight up and to four sides end at the solid's surface from inside. If all points do, as in a texel of which a strip looks out from under a
 //! block, the texel's sample alone is lit.
 //!
 //! The data used of neighbours is a function of their numbers alone, so that shards of a bake and tiles of live
@@ -33,7 +33,7 @@ use super::atlas::texels::TexelSample;
 use crate::base::directional::Directional;
 use crate::base::error::Result;
 use crate::base::memory::{try_filled, try_with_capacity};
-use crate::base::sampling::{combine, sobol_2d};
+use crate::base::sampling::{combine, orthonormal_basis, sobol_2d};
 use crate::direct::Receiver;
 use crate::direct::direct_light::{DirectLight, Lights, PointLight};
 use crate::direct::shadow_rays::{KINDS, TileRoom};
@@ -96,6 +96,17 @@ impl<M: Map> TexelAreas<'_, M> {
                     let material = self.scene.material(hit.triangle);
                     !material.two_sided && !material.transmits()
                 })
+    }
+
+    /// Whether a point from which the ray straight up hits the surface of a solid from inside lies in it: rays to four sides do
+    /// so, too. (The ray straight up alone may hit the back of a single sheet, such as a table top, below which there is
+    /// light.)
+    fn is_enclosed(&self, receiver: &Receiver, rays: &mut u64) -> bool {
+        let (x, y) = orthonormal_basis(receiver.geometric);
+        [x, -x, y, -y].into_iter().all(|aside| {
+            *rays += 1;
+            self.is_inner(&self.scene.intersect_raw(&Ray::new(receiver.origin, receiver.geometric + aside)))
+        })
     }
 
     /// Returns the texels [around](AROUND) a texel in the same placement, where there are any.
@@ -225,7 +236,7 @@ impl TilePoints {
     }
 
     /// Traces the lines of sight from unlit points beside lit ones to the samples of their texels, for the first `texels` of
-    /// the tile, which tell which of them [lie inside solids](Point::is_buried). Of texels without any lit point the first
+    /// the tile, and those that are left straight up and to four sides, which tell which of them [lie inside solids](Point::is_buried). Of texels without any lit point the first
     /// point tells it for all.
     fn find_buried<M: Map>(
         &mut self,
@@ -247,14 +258,30 @@ impl TilePoints {
                 self.pending.push(place as u32);
             }
         }
+        self.trace_lines(areas, rays);
+        for (&place, hit) in self.pending.iter().zip(&self.line_hits) {
+            self.points[place as usize].is_buried = areas.is_inner(hit);
+        }
+        // A solid that something else covers on the way to the sample is found by what is around the point.
+        self.pending.retain(|&place| !self.points[place as usize].is_buried);
+        self.lines.clear();
+        for &place in &self.pending {
+            let Receiver { origin, geometric, .. } = self.points[place as usize].receiver;
+            self.lines.push(Ray::new(origin, geometric));
+        }
+        self.trace_lines(areas, rays);
+        for (&place, hit) in self.pending.iter().zip(&self.line_hits) {
+            let point = &mut self.points[place as usize];
+            point.is_buried = areas.is_inner(hit) && areas.is_enclosed(&point.receiver, rays);
+        }
+    }
+
+    fn trace_lines<M: Map>(&mut self, areas: &TexelAreas<M>, rays: &mut u64) {
         match self.lines.len() < LEAST_STREAM {
             true => areas.scene.intersect_block(&self.lines, &mut self.line_hits),
             false => areas.scene.intersect_stream(&self.lines, &mut self.line_hits),
         }
         *rays += self.lines.len() as u64;
-        for (&place, hit) in self.pending.iter().zip(&self.line_hits) {
-            self.points[place as usize].is_buried = areas.is_inner(hit);
-        }
     }
 
     /// Computes direct light at receivers with seeds of their own, at most [`MAX_POINTS`] times as many as there is room

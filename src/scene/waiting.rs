@@ -189,7 +189,7 @@ impl Scene {
         match self.parts() {
             // What a callback asks for must not wait for threads that may be in it.
             Some(parts) if !callback::is_running() => parts.waiting.install(work),
-            _ => self.device().install(|| work()),
+            _ => self.device().install(work),
         }
     }
 }

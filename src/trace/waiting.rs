@@ -263,7 +263,7 @@ mod tests {
         let ray = |i: u32| {
             let u = |k: u32| uniform(i, k, seed);
             // Some start at one place, and some are short.
-            let origin = if i % 4 == 0 { Vec3::splat(5.0) } else { 10.0 * Vec3::new(u(0), u(1), u(2)) };
+            let origin = if i.is_multiple_of(4) { Vec3::splat(5.0) } else { 10.0 * Vec3::new(u(0), u(1), u(2)) };
             let ray = Ray::new(origin, uniform_sphere([u(3), u(4)]) * (0.5 + u(5)));
             if i.is_multiple_of(7) { ray.within(0.01, 1.0) } else { ray }
         };

@@ -45,8 +45,8 @@ const SHOWN: &str = "what the light map shows of the gather map";
 const BLOCK: usize = 4096;
 const BLURRED: usize = 256;
 
-/// Number of rays of a fallback gather, if it is not given, before lone ones get more: as many as a gather texel has, divided by this, but at least so
-/// many, and no more than a gather texel has or than there are in a round. (With 32 or 64 instead of 16 a furnished room has the same error.)
+/// Number of rays of a fallback gather that is not lone, if it is not given: as many as a gather texel has, divided by this,
+/// but at least so many, and no more than a gather texel has or than there are in a round. (With 32 or 64 instead of 16 a furnished room has the same error.)
 pub(in crate::lightmap) const OWN_PART: u32 = 4;
 pub(crate) const OWN_RAYS: u32 = 16;
 
@@ -58,7 +58,7 @@ const RADIUS: i32 = 4;
 const STRATIFIED: f32 = 0.35;
 
 /// A fallback gather is lone if there are no more than `FEW`, itself counted, within `NEAR` texels, as on the edges of
-/// pilasters and ribs. There is little to blur it with, and it has twice the rays, the others half of them. (Sponza by two
+/// pilasters and ribs. There is little to blur it with, and it has twice the rays. (Sponza by two
 /// lamps: noise² 6.5e-3 → 5.5e-3 in the same time; with all rays alike, what is left shows as dots along edges.)
 const NEAR: i32 = 2;
 const FEW: usize = 12;
