@@ -3,7 +3,7 @@
 //! 2003). A ray that meets the box of an instance goes through the tree of its mesh, in that one's coordinates.
 
 use super::layout::Mbvh;
-use super::{BuildOptions, BuildQuality, References, Tree, build_binary, collapse};
+use super::{BuildOptions, BuildQuality, Tree, build_few};
 use crate::base::error::Result;
 use crate::base::geometry::is_valid_triangle;
 use crate::base::memory::{try_collect, try_push, try_to_vec};
@@ -75,11 +75,7 @@ impl Instances {
         // Boxes beyond the greatest coordinate are not met, as triangles there are not.
         let met = |(i, _): (u32, &(Vec3, Vec3))| is_valid_triangle(corners(i)).then_some(i);
         let ids = try_collect((0..).zip(boxes).filter_map(met), "the tree of instances")?;
-        if ids.is_empty() {
-            return Ok(Mbvh::nothing());
-        }
-        let binary = build_binary(&corners, References::of(&ids, &corners)?, &options, progress)?;
-        collapse::collapse(&binary, &corners, progress)
+        build_few(&corners, &ids, &options, progress)
     }
 
     /// Returns the number of triangles that are in no tree, those of each mesh once.

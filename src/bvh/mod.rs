@@ -219,6 +219,20 @@ pub(crate) fn build_four_wide(
     collapse::collapse(&build_binary(corners, references, options, progress)?, corners, progress)
 }
 
+/// Builds the tree over the triangles `numbers`, which are few beside those of a scene. (Compiled once.)
+fn build_few(
+    corners: &(dyn Fn(u32) -> [Vec3; 3] + Sync),
+    numbers: &[u32],
+    options: &BuildOptions,
+    progress: &Progress,
+) -> Result<Mbvh> {
+    if numbers.is_empty() {
+        return Ok(Mbvh::nothing());
+    }
+    let binary = build_binary(&corners, References::of(numbers, &corners)?, options, progress)?;
+    collapse::collapse(&binary, &corners, progress)
+}
+
 fn build_binary(
     corners: &(impl Fn(u32) -> [Vec3; 3] + Sync),
     references: References,
@@ -228,7 +242,9 @@ fn build_binary(
     options.validate()?;
     let binary = match options.quality {
         BuildQuality::Default => BinaryBvh::of(references, options, progress)?,
-        BuildQuality::High => BinaryBvh::spatial_of(references, corners, options, progress)?,
+        BuildQuality::High => {
+            BinaryBvh::spatial_of(references, corners as &(dyn Fn(u32) -> [Vec3; 3] + Sync), options, progress)?
+        }
     };
     progress.check()?;
     Ok(binary)

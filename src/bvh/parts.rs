@@ -6,7 +6,7 @@
 
 use super::instances::Instances;
 use super::layout::{ChildRef, LEAF_PAD, LEAF_STRIDE, Mbvh, Node, WIDTH};
-use super::{BuildOptions, Compact, References, Tree, build_binary, collapse, compact};
+use super::{BuildOptions, Compact, Tree, build_few, compact};
 use crate::base::error::Result;
 use crate::base::memory::{try_collect, try_push};
 use crate::base::progress::Progress;
@@ -38,7 +38,7 @@ const PARTS: &str = "the parts of a tree";
 
 impl Parts {
     /// Cuts a tree into parts of at most `bytes` bytes, but for nodes that have no smaller ones below them.
-    pub fn of(tree: &Tree, corners: &(impl Fn(u32) -> [Vec3; 3] + Sync), bytes: usize) -> Result<Parts> {
+    pub fn of(tree: &Tree, corners: &(dyn Fn(u32) -> [Vec3; 3] + Sync), bytes: usize) -> Result<Parts> {
         let (mut parts, mut near_root) = (Vec::new(), Vec::new());
         let whole =
             Part { root: ChildRef::ROOT, bounds: tree.bounds(), nodes: 1..tree.node_count(), slots: tree.slots() };
@@ -54,9 +54,10 @@ impl Parts {
             }
             // The subtrees of the children follow each other; the end of one is where the next begins.
             let (mut end, mut last_slot) = (part.nodes.end, part.slots.end);
-            let mut inner: Vec<_> = children.iter().filter(|c| !c.0.is_leaf()).collect();
-            inner.sort_unstable_by_key(|c| c.0.node_index());
-            for &&(root, bounds) in inner.iter().rev() {
+            let inner = || children.iter().filter(|c| !c.0.is_leaf());
+            let first = inner().map(|c| c.0.node_index()).min().unwrap_or_default();
+            for number in (first..first + inner().count()).rev() {
+                let Some(&(root, bounds)) = inner().find(|c| c.0.node_index() == number) else { continue };
                 let first = tree.children(root).iter().filter(|c| !c.0.is_leaf()).map(|c| c.0.node_index()).min();
                 let (nodes, slots) = (first.unwrap_or(end)..end, tree.first_slot(root)..last_slot);
                 (end, last_slot) = (nodes.start, slots.start);
@@ -68,14 +69,7 @@ impl Parts {
         // Spatial splits put a triangle into several leaves.
         near_root.sort_unstable();
         near_root.dedup();
-        let near_root = match near_root.is_empty() {
-            true => Mbvh::nothing(),
-            false => {
-                let references = References::of(&near_root, corners)?;
-                let binary = build_binary(corners, references, &BuildOptions::default(), &Progress::none())?;
-                collapse::collapse(&binary, corners, &Progress::none())?
-            }
-        };
+        let near_root = build_few(corners, &near_root, &BuildOptions::default(), &Progress::none())?;
         Ok(Parts { parts, top, near_root })
     }
 

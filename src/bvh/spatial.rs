@@ -132,8 +132,12 @@ impl Piece {
     }
 }
 
-struct Builder<'a, 'p, C> {
-    corners: &'a C,
+/// The corners of each triangle.
+type Corners<'a> = dyn Fn(u32) -> [Vec3; 3] + Sync + 'a;
+
+struct Builder<'a, 'p> {
+    /// (Not generic: with that the library had 90 kB more code.)
+    corners: &'a Corners<'a>,
     options: &'a BuildOptions,
     progress: &'a Progress<'p>,
     /// Half the root's area in f64, times α.
@@ -149,7 +153,7 @@ struct Sides {
     extra: [usize; 2],
 }
 
-impl<C: Fn(u32) -> [Vec3; 3] + Sync> Builder<'_, '_, C> {
+impl Builder<'_, '_> {
     /// Builds over `refs`, adding at most `extra` to them.
     fn build(&self, refs: Vec<Reference>, extent: Extent, extra: usize, depth: usize) -> Piece {
         if self.progress.is_cancelled() {
@@ -276,7 +280,7 @@ impl<C: Fn(u32) -> [Vec3; 3] + Sync> Builder<'_, '_, C> {
         let mut plane = None;
         if extra > 0 && overlap > self.least_overlap.max(OVERLAP * extent.boxes.half_area()) {
             let grid = Grid::new(&extent.boxes, n);
-            work.slabs.fill(refs, self.corners, &grid);
+            work.slabs.fill(refs, &self.corners, &grid);
             plane = work.slabs.best_plane(&grid, scale, n, extra).filter(|p| p.cost < cost);
             cost = plane.as_ref().map_or(cost, |p| p.cost);
         }
@@ -394,7 +398,7 @@ impl BinaryBvh {
     /// Builds the tree over at least one reference.
     pub(super) fn spatial_of(
         references: References,
-        corners: &(impl Fn(u32) -> [Vec3; 3] + Sync),
+        corners: &Corners,
         options: &BuildOptions,
         progress: &Progress,
     ) -> Result<BinaryBvh> {
