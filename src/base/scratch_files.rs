@@ -60,7 +60,12 @@ impl ScratchFiles {
         });
         let fail =
             |e| Error::Io(format!("cannot make a scratch file of {bytes} bytes in {}: {e}", self.folder.display()));
-        Ok(Arc::new(Mapping::new(map.map_err(fail)?)))
+        let map = map.map_err(fail)?;
+        // What rays hit lies here and there, and what the system reads around it drives out what is needed: a bake of 20
+        // million triangles in 1 GB of memory read 1.5 TB.
+        #[cfg(unix)]
+        let _ = map.advise(memmap2::Advice::Random);
+        Ok(Arc::new(Mapping::new(map)))
     }
 }
 
