@@ -604,10 +604,11 @@ typedef struct bk_open_params {
   /// somewhat faster, because memory can have large pages. Default: 1.
   uint32_t map;
   /// 1: rays wait at parts of the tree until enough of them do, for scenes that are larger than
-  /// memory: a part is then read for many rays at once. The rays that a device's threads trace wait
-  /// together, so that its `num_threads` should be many more than there are cores, 64 for example.
-  /// Hits and light stay the same, bit for bit. Scenes that fit into memory take longer so. A refit
-  /// brings all of the scene to memory, and ends it. Default: 0.
+  /// memory: a part is then read for many rays at once. The scene has threads of its own for that,
+  /// 128 per thread of the device but no more than 512 that bring rays, and no more than 64 that
+  /// trace them. Hits and light stay the same, bit for bit. Scenes that fit into memory take longer
+  /// so, and a cancel is noticed when the rays that wait have been traced. A refit brings all of the
+  /// scene to memory, and ends it. Default: 0.
   uint32_t ray_queues;
 } bk_open_params;
 

@@ -278,6 +278,8 @@ pub(crate) type Work<'a> = &'a mut (dyn FnMut() + Send);
 pub(crate) struct ExtraThreads {
     pool: Option<rayon::ThreadPool>,
     threads: Vec<JoinHandle<()>>,
+    /// Id of the process in which they were started.
+    process: u32,
 }
 
 impl ExtraThreads {
@@ -290,7 +292,7 @@ impl ExtraThreads {
         };
         let (pool, threads) = start_threads(count, |i| format!("bakelite-extra-{i}"), begin)
             .map_err(|e| Error::OutOfMemory(format!("{count} more threads could not be started: {e}")))?;
-        Ok(ExtraThreads { pool: Some(pool), threads })
+        Ok(ExtraThreads { pool: Some(pool), threads, process: std::process::id() })
     }
 
     /// Does work on these threads, as [`Device::install`] does on the device's.
@@ -301,6 +303,11 @@ impl ExtraThreads {
 
 impl Drop for ExtraThreads {
     fn drop(&mut self) {
+        if self.process != std::process::id() {
+            // As for a device after a fork.
+            std::mem::forget((self.pool.take(), std::mem::take(&mut self.threads)));
+            return;
+        }
         drop(self.pool.take());
         end(&mut self.threads);
     }

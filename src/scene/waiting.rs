@@ -26,8 +26,9 @@ const PARTS: usize = 256;
 const THREADS: usize = 128;
 const MOST_THREADS: usize = 512;
 
-/// Threads that trace what waits, per thread of the device: most of their time they wait for the disk.
+/// Threads that trace what waits, per thread of the device, and the most in all: most of their time they wait for the disk.
 const TRACING: usize = 8;
+const MOST_TRACING: usize = 64;
 
 /// Number of rays from which on all of a part is read; the pages that fewer need are read one by one.
 const WORTH_READING: usize = 1 << 10;
@@ -48,6 +49,8 @@ pub(crate) struct WaitingRays {
     queues: Arc<Queues>,
     waiting: ExtraThreads,
     tracing: Vec<JoinHandle<()>>,
+    /// Id of the process in which the threads were started.
+    process: u32,
     _memory: Reservation,
 }
 
@@ -144,14 +147,16 @@ impl WaitingRays {
         let queues = try_filled(count, Queue::default(), QUEUES)?;
         let state = State { queues, rays: 0, next: 0, last: Instant::now(), visit: Duration::ZERO, is_over: false };
         let threads = scene.device().num_threads();
+        let tracing = (TRACING * threads).min(MOST_TRACING);
         let mut waiting = WaitingRays {
             tree,
             queues: Arc::new(Queues { state: Mutex::new(state), changed: Condvar::new() }),
             waiting: ExtraThreads::start((THREADS * threads).min(MOST_THREADS))?,
-            tracing: try_with_capacity(TRACING * threads, QUEUES)?,
+            tracing: try_with_capacity(tracing, QUEUES)?,
+            process: std::process::id(),
             _memory: memory,
         };
-        for i in 0..TRACING * threads {
+        for i in 0..tracing {
             let queues = waiting.queues.clone();
             waiting.tracing.push(device::start_thread(format!("bakelite-rays-{i}"), move || queues.trace())?);
         }
@@ -171,6 +176,11 @@ impl WaitingRays {
 
 impl Drop for WaitingRays {
     fn drop(&mut self) {
+        if self.process != std::process::id() {
+            // After a fork the threads are not in this process, and may have held the lock.
+            std::mem::forget(std::mem::take(&mut self.tracing));
+            return;
+        }
         self.queues.lock().is_over = true;
         self.queues.changed.notify_all();
         device::end(&mut self.tracing);

@@ -267,7 +267,7 @@ pub struct FileFlags {
     /// Read SCENE.bkscene to memory instead of mapping it
     #[arg(long)]
     pub read_scene: bool,
-    /// Let rays wait at parts of SCENE.bkscene, which is larger than memory, until enough of them do; best with --threads 64
+    /// Let rays wait at parts of SCENE.bkscene, which is larger than memory, until enough of them do
     #[arg(long)]
     pub ray_queues: bool,
     /// Put the scene N times beside itself, in a square grid, to measure larger scenes; lights stay as they are
