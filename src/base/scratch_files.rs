@@ -62,7 +62,7 @@ impl ScratchFiles {
             |e| Error::Io(format!("cannot make a scratch file of {bytes} bytes in {}: {e}", self.folder.display()));
         let map = map.map_err(fail)?;
         // What rays hit lies here and there, and what the system reads around it drives out what is needed: a bake of 20
-        // million triangles in 1 GB of memory read 1.5 TB.
+        // million triangles in 1 GB of memory read 1.6 TB in 2,500 s, without 95 GB in 830 s.
         #[cfg(unix)]
         let _ = map.advise(memmap2::Advice::Random);
         Ok(Arc::new(Mapping::new(map)))
