@@ -8,8 +8,7 @@
 //! without further distinction.
 //!
 //! A texel is buried if, on the side that it shows, almost all rays end within about a texel, on backs of one-sided
-//! surfaces, or on sides that cannot be seen from any [open place](super::seen), or if most of them end on such backs, or,
-//! where no sun or sky shines, if all of them end on backs or leave the scene, as below the floor of a room of sheets.
+//! surfaces, or on sides that cannot be seen from any [open place](super::seen), or if most of them end on such backs.
 
 use super::chart_map::ChartMap;
 use super::charts::Charts;
@@ -34,9 +33,6 @@ const RAYS: u32 = 16;
 /// backs.
 const OPEN: u32 = 3;
 
-/// A texel whose rays all leave an indoor scene or end on backs is buried if one in this many ends on a back.
-const FEW_BACKS: u32 = 4;
-
 /// A texel is visible at once if its first ray ends in the open, farther away than this many times `near`: most texels
 /// need only one ray.
 const AT_ONCE: f32 = 4.0;
@@ -59,8 +55,6 @@ pub(in crate::lightmap) struct Search<'a> {
     pub seen: &'a Seen,
     /// Distance up to which surfaces cover a texel, at most the width of a texel of the light map.
     pub near: f32,
-    /// Whether a sun or a sky shines, so that people may stand where rays leave the scene.
-    pub outdoors: bool,
     /// Whether each chart is searched; `None`: all are.
     pub only: Option<&'a [bool]>,
 }
@@ -195,7 +189,7 @@ impl Search<'_> {
         let mut undecided: [Undecided; BLOCK] = std::array::from_fn(|i| {
             let Some(point) = points.get(i) else { return Undecided::default() };
             let (_, receiver) = super::chart_map::receiver_of(self.scene, point, back);
-            Undecided { number: i as u32, origin: receiver.origin, normal: receiver.geometric, ..Default::default() }
+            Undecided { number: i as u32, origin: receiver.origin, normal: receiver.geometric, open: 0, backs: 0 }
         });
         let mut probes = [Ray::new(Vec3::ZERO, Vec3::ZERO); BLOCK];
         let mut hits = [RawHit::MISS; BLOCK];
@@ -212,11 +206,10 @@ impl Search<'_> {
                 match self.seen_by(hit) {
                     Sight::Open if i == 0 && hit.t > AT_ONCE * self.near => continue,
                     Sight::Open => point.open += 1,
-                    Sight::Nothing => (point.open, point.nothing) = (point.open + 1, point.nothing + 1),
                     Sight::Back => point.backs += 1,
                     Sight::Covered => {}
                 }
-                if point.open < OPEN || point.backs > 0 || point.open == point.nothing {
+                if point.open < OPEN || point.backs > 0 {
                     undecided[kept] = point;
                     kept += 1;
                 }
@@ -225,15 +218,14 @@ impl Search<'_> {
         }
         let mut are_buried = [false; BLOCK];
         for point in &undecided[..count] {
-            let sees_nothing = point.open == point.nothing && FEW_BACKS * point.backs >= RAYS;
-            are_buried[point.number as usize] = point.open < OPEN || 2 * point.backs > RAYS || sees_nothing;
+            are_buried[point.number as usize] = point.open < OPEN || 2 * point.backs > RAYS;
         }
         are_buried
     }
 
     fn seen_by(&self, hit: &RawHit) -> Sight {
         if hit.is_miss() {
-            return if self.outdoors { Sight::Open } else { Sight::Nothing };
+            return Sight::Open;
         }
         let material = self.scene.material(hit.triangle);
         if !hit.front && !material.two_sided && !material.transmits() {
@@ -247,8 +239,6 @@ impl Search<'_> {
 /// Kind of end of a ray.
 enum Sight {
     Open,
-    /// Outside of a scene that has no outside.
-    Nothing,
     /// On the back of a one-sided surface.
     Back,
     /// Within a texel, or on a side that cannot be seen from any open place.
@@ -262,9 +252,8 @@ struct Undecided {
     number: u32,
     origin: Vec3,
     normal: Vec3,
-    /// Rays that ended in the open, and those of them that left an indoor scene.
+    /// Rays that ended in the open.
     open: u32,
-    nothing: u32,
     /// Rays that ended on backs.
     backs: u32,
 }
@@ -407,9 +396,7 @@ mod tests {
             let atlas = lightmap.atlas();
             for s in atlas.map.all().filter(|s| atlas.buried[s.index()]) {
                 let p = atlas.map.surface(&atlas.scene, s).0;
-                // Texels of the box's sides below the floor take the light of those above it.
-                let is_above_floor = p.y > 0.0 && p.y < 0.051;
-                assert!(!below(0.0)(p) && below(-0.11)(p) || is_above_floor || p.y < 0.0, "{p}");
+                assert!(!below(0.0)(p) && below(-0.11)(p) || p.y < 0.0, "{p}");
             }
         }
     }
