@@ -269,8 +269,8 @@ typedef struct bk_device_desc {
   /// Folder for files that take the place of memory for the charts of light maps, where scenes are
   /// larger than it (see bk_open_params.ray_queues): some 50 bytes per triangle, three times that
   /// while a light map is created. The folder must exist; the files have no names in it, and
-  /// their room is free again when the light map is gone, however the process ends. The library
-  /// never writes more to them than there is room on the disk. UTF-8; NULL: all is in memory.
+  /// their room is free again when the light map is gone (64 MB of it: when the device is), however
+  /// the process ends. The library never writes more to them than there is room on the disk. UTF-8; NULL: all is in memory.
   /// Default: NULL.
   const char *scratch_folder;
 } bk_device_desc;

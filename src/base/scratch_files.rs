@@ -29,7 +29,7 @@ impl ScratchFiles {
         ScratchFiles { folder, shared: Mutex::new(None) }
     }
 
-    /// Makes an array of zeros. A file goes when all arrays in it are gone.
+    /// Makes an array of zeros. A file goes when all arrays in it are gone, but the one that is being filled stays.
     pub fn zeroed<T: Pod>(&self, len: usize) -> Result<Array<T>> {
         let Some(bytes) = len.checked_mul(size_of::<T>()).filter(|&bytes| bytes <= isize::MAX as usize - SHARED) else {
             return Err(Error::OutOfMemory(format!("an array of {len} elements is too large for a scratch file")));

@@ -64,8 +64,8 @@ pub(super) struct Room {
     pub waiting: Vec<[u16; 2 * SIZE]>,
 }
 
-/// Traces rays to any hit below the node `root` in packs, as far as that is worth it: rays that follow one another and go the same way, and
-/// those of the others that do. `done` receives the numbers of these rays, and whether they hit anything; `keys` those of
+/// Traces rays to any hit below the node `root` in packs, as far as that is worth it: rays that follow one another and
+/// go the same way, and those of the others that do. `done` receives the numbers of these rays, and whether they hit anything; `keys` those of
 /// all rays, and `rest` the numbers of the rays that are left.
 ///
 /// # Safety

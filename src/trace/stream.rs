@@ -34,8 +34,8 @@ use std::mem::MaybeUninit;
 /// Minimum number of rays of an octant that go down the tree as lists.
 const LEAST: usize = 24;
 
-/// Traces rays to their closest hits below the node `root`, or with `ANY` to any hit, whose result says only whether there is one. `done`
-/// receives the hits by the number of the ray, in any order.
+/// Traces rays to their closest hits below the node `root`, or with `ANY` to any hit, whose result says only whether
+/// there is one. `done` receives the hits by the number of the ray, in any order.
 ///
 /// # Safety
 /// The CPU must have the ISA.

@@ -36,10 +36,10 @@ pub struct OpenOptions {
     /// bring. Default: true.
     pub map: bool,
     /// Whether rays wait at parts of the tree until enough of them do, for scenes that are larger than memory: then a part
-    /// is read for many rays at once. The scene has threads of its own for that, 128 per thread of the device but no more than 512
-    /// that bring rays, and no more than 64 that trace them. Hits and light stay the same, bit for bit. Other scenes take
-    /// longer so, and a cancel is noticed when the rays that wait have been traced. A refit brings all to memory, and ends
-    /// it. Default: false.
+    /// is read for many rays at once. The scene has threads of its own for that, 128 per thread of the device but no more
+    /// than 512 that bring rays, and no more than 64 that trace them. Hits and light stay the same, bit for bit. Other
+    /// scenes take longer so, and a cancel is noticed when the rays that wait have been traced. A refit brings all to
+    /// memory, and ends it. Default: false.
     pub ray_queues: bool,
 }
 
