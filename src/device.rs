@@ -1,19 +1,17 @@
-//! The device: a thread pool of its own, the ISA chosen at run time, the
-//! log and the memory accounts.
+//! The device: threads of its own, the ISA chosen at run time, the log and the memory accounts.
 
 use crate::base::array::Array;
+use crate::base::callback;
 use crate::base::error::{Error, Result, invalid_argument};
 use crate::base::memory::{MemoryFn, MemoryMonitor, try_zeroed_as_needed};
 use crate::base::progress::Progress;
 use crate::base::scratch_files::ScratchFiles;
-use crate::base::{callback, float_state};
+use crate::base::threads::{self, Threads, Work};
 use crate::simd::{Isa, LIMIT_VARIABLE};
 use bytemuck::Pod;
-use std::cell::Cell;
 use std::io::Write;
 use std::path::{Path, PathBuf};
 use std::sync::Arc;
-use std::thread::JoinHandle;
 
 /// Severity of a log message.
 #[derive(Clone, Copy, Debug, PartialEq, Eq, PartialOrd, Ord)]
@@ -30,19 +28,9 @@ pub enum LogLevel {
 /// Receives log messages, from any thread.
 pub type LogFn = dyn Fn(LogLevel, &str) + Send + Sync;
 
-thread_local! {
-    /// Set while a thread runs work given to [`Device::spawn`].
-    static APART: Cell<bool> = const { Cell::new(false) };
-}
-
 /// Maximum number of threads of a device: more than the logical cores of most machines, and few enough for the default
 /// limits of operating systems.
 pub const MAX_THREADS: usize = 1024;
-
-/// Stack size of a thread in bytes, whatever RUST_MIN_STACK says. Builds recurse by up to 76 levels of half a kilobyte,
-/// and a thread that waits for another takes up other work meanwhile, on top of its own. Only the part that is used
-/// takes memory.
-const STACK_BYTES: usize = 4 << 20;
 
 /// Size in bytes of the smallest array that is worth a place in a scratch file.
 const LEAST_IN_SCRATCH: usize = 1 << 12;
@@ -66,7 +54,8 @@ pub struct DeviceOptions {
     /// Folder in which unwraps are kept by their content, for the next light map and the next run; it is made if needed.
     /// `None`: none are kept.
     pub cache_folder: Option<PathBuf>,
-    /// Folder for files that take the place of memory for the charts of light maps, where scenes are larger than it. The files have no names, and are gone with the light map. `None`: all is in memory.
+    /// Folder for files that take the place of memory for the charts of light maps, where scenes are larger than it. The
+    /// files have no names, and are gone with the light map. `None`: all is in memory.
     pub scratch_folder: Option<PathBuf>,
 }
 
@@ -74,17 +63,13 @@ pub struct DeviceOptions {
 ///
 /// Dropping the device joins its threads.
 pub struct Device {
-    /// The thread pool; `Some` until the device is dropped.
-    pool: Option<rayon::ThreadPool>,
-    threads: Vec<JoinHandle<()>>,
+    threads: Threads,
     /// An ISA that this machine can run.
     isa: Isa,
     log: Option<Box<LogFn>>,
     memory: Arc<MemoryMonitor>,
     cache_folder: Option<PathBuf>,
     scratch: Option<ScratchFiles>,
-    /// Id of the process in which the threads were started.
-    process: u32,
 }
 
 impl Device {
@@ -105,17 +90,13 @@ impl Device {
             n => n,
         };
         let name = |i| format!("bakelite-{i}");
-        let (pool, threads) = start_threads(num_threads, name, float_state::set_on_own_thread)
-            .map_err(|e| Error::OutOfMemory(format!("the {num_threads} worker threads could not be started: {e}")))?;
         let device = Device {
-            pool: Some(pool),
-            threads,
+            threads: Threads::start(num_threads, name)?,
             isa,
             log: options.log.or_else(|| log_to(std::io::stderr, &std::env::var(LOG_VARIABLE).ok()?)),
             memory: Arc::new(MemoryMonitor::new(options.memory)),
             cache_folder: options.cache_folder,
             scratch: options.scratch_folder.map(ScratchFiles::new),
-            process: std::process::id(),
         };
         device.log_info(|| {
             format!("version {}, {num_threads} threads, instruction set {}", env!("CARGO_PKG_VERSION"), isa.name())
@@ -126,15 +107,11 @@ impl Device {
     /// Fails in a process that `fork` has made from the one in which the device was created: the threads are not in the
     /// new process, and waiting for them would never end.
     pub fn check_process(&self) -> Result<()> {
-        if self.is_forked() {
+        if self.threads.are_in_another_process() {
             let message = "the device was created before a fork, and its threads are not in this process";
             return Err(Error::InvalidState(message.into()));
         }
         Ok(())
-    }
-
-    fn is_forked(&self) -> bool {
-        self.process != std::process::id()
     }
 
     /// The ISA in use, which this machine can run.
@@ -145,7 +122,7 @@ impl Device {
 
     /// The number of worker threads.
     pub fn num_threads(&self) -> usize {
-        self.threads.len()
+        self.threads.pool().current_num_threads()
     }
 
     /// Runs `f` on the device's threads; rayon calls inside use them alone. When called in a callback, which may be on
@@ -162,15 +139,15 @@ impl Device {
     /// caller, the library had 9 % more code and took 10 % longer to compile.
     fn install_work(&self, work: Work) {
         if callback::is_running() {
-            return on_extra_thread(work);
+            return threads::on_extra_thread(work);
         }
-        if APART.get() {
+        if threads::is_apart() {
             return work();
         }
         if let Err(e) = self.check_process() {
             std::panic::resume_unwind(Box::new(e));
         }
-        self.pool.as_ref().expect("there until dropped").install(work)
+        self.threads.pool().install(work)
     }
 
     /// Runs `f` on the device's threads, as [`install`](Self::install) does, while the calling thread makes the reports
@@ -193,9 +170,9 @@ impl Device {
     }
 
     fn run_work(&self, progress: &Progress, work: Work) {
-        let pool = self.pool.as_ref().expect("there until dropped");
-        let is_busy = callback::is_running() || APART.get() || pool.current_thread_index().is_some();
-        if is_busy || self.is_forked() || !progress.wants_attendance() {
+        let pool = self.threads.pool();
+        let is_busy = callback::is_running() || threads::is_apart() || pool.current_thread_index().is_some();
+        if is_busy || self.threads.are_in_another_process() || !progress.wants_attendance() {
             return self.install_work(work);
         }
         pool.in_place_scope(|scope| {
@@ -212,12 +189,7 @@ impl Device {
     /// any device runs on this one's threads too: this is for long work in the background that must not keep the
     /// threads of another device from short work. `f` must not panic.
     pub(crate) fn spawn(&self, f: impl FnOnce() + Send + 'static) {
-        self.pool.as_ref().expect("there until dropped").spawn(|| {
-            // A thread that waits for a part of its work may run other work meanwhile.
-            let before = APART.replace(true);
-            f();
-            APART.set(before);
-        });
+        self.threads.pool().spawn(move || threads::apart(f));
     }
 
     /// Sends a message to the log callback.
@@ -271,48 +243,6 @@ impl Device {
     }
 }
 
-/// Work that is called once. It keeps its own result.
-pub(crate) type Work<'a> = &'a mut (dyn FnMut() + Send);
-
-/// Threads beside those of a device, for work that waits most of the time. Dropping them joins them.
-pub(crate) struct ExtraThreads {
-    pool: Option<rayon::ThreadPool>,
-    threads: Vec<JoinHandle<()>>,
-    /// Id of the process in which they were started.
-    process: u32,
-}
-
-impl ExtraThreads {
-    /// Starts threads.
-    pub fn start(count: usize) -> Result<ExtraThreads> {
-        let begin = || {
-            float_state::set_on_own_thread();
-            // Work that is installed in the device runs on these threads.
-            APART.set(true);
-        };
-        let (pool, threads) = start_threads(count, |i| format!("bakelite-extra-{i}"), begin)
-            .map_err(|e| Error::OutOfMemory(format!("{count} more threads could not be started: {e}")))?;
-        Ok(ExtraThreads { pool: Some(pool), threads, process: std::process::id() })
-    }
-
-    /// Does work on these threads, as [`Device::install`] does on the device's.
-    pub fn install(&self, work: Work) {
-        self.pool.as_ref().expect("there until dropped").install(work);
-    }
-}
-
-impl Drop for ExtraThreads {
-    fn drop(&mut self) {
-        if self.process != std::process::id() {
-            // As for a device after a fork.
-            std::mem::forget((self.pool.take(), std::mem::take(&mut self.threads)));
-            return;
-        }
-        drop(self.pool.take());
-        end(&mut self.threads);
-    }
-}
-
 /// A log that writes messages up to a level to a stream; `None` for an empty word. A message that cannot be written,
 /// because the stream is closed, is lost.
 fn log_to<W: Write>(stream: impl Fn() -> W + Send + Sync + 'static, level: &str) -> Option<Box<LogFn>> {
@@ -327,107 +257,6 @@ fn log_to<W: Write>(stream: impl Fn() -> W + Send + Sync + 'static, level: &str)
             drop(writeln!(stream(), "bakelite: {message}"));
         }
     }))
-}
-
-/// A thread with a stack of the library's choice.
-fn own_thread(name: String) -> std::thread::Builder {
-    std::thread::Builder::new().name(name).stack_size(STACK_BYTES)
-}
-
-/// Starts a pool whose threads begin with `begin`. If that fails, the threads that were started have ended.
-fn start_threads(
-    count: usize,
-    name: impl Fn(usize) -> String,
-    begin: fn(),
-) -> std::result::Result<(rayon::ThreadPool, Vec<JoinHandle<()>>), rayon::ThreadPoolBuildError> {
-    let mut threads = Vec::with_capacity(count);
-    let pool = rayon::ThreadPoolBuilder::new()
-        .num_threads(count)
-        .spawn_handler(|worker| {
-            threads.push(own_thread(name(worker.index())).spawn(move || {
-                begin();
-                worker.run();
-            })?);
-            Ok(())
-        })
-        .build();
-    match pool {
-        Ok(pool) => Ok((pool, threads)),
-        Err(e) => {
-            // The threads have been told to end.
-            join(&mut threads);
-            Err(e)
-        }
-    }
-}
-
-/// Starts a thread that is in no pool.
-pub(crate) fn start_thread(name: String, work: impl FnOnce() + Send + 'static) -> Result<JoinHandle<()>> {
-    let work = || {
-        float_state::set_on_own_thread();
-        work();
-    };
-    own_thread(name).spawn(work).map_err(|e| Error::OutOfMemory(format!("a thread could not be started: {e}")))
-}
-
-/// Joins threads that are about to end.
-pub(crate) fn end(threads: &mut Vec<JoinHandle<()>>) {
-    // A callback may drop the last reference on one of the threads. It cannot join itself, nor
-    // the others, which end only after the job that it is in: they end on their own.
-    let this = std::thread::current().id();
-    if !threads.iter().any(|t| t.thread().id() == this) {
-        join(threads);
-    }
-}
-
-fn join(threads: &mut Vec<JoinHandle<()>>) {
-    threads.drain(..).for_each(|t| drop(t.join()));
-}
-
-/// Runs `work` on a pool of one thread and waits without taking up other work. Unwinds with an [`Error`] if no thread
-/// can be started.
-fn on_extra_thread(work: Work) {
-    struct Joined(Vec<JoinHandle<()>>);
-    impl Drop for Joined {
-        fn drop(&mut self) {
-            join(&mut self.0);
-        }
-    }
-    let fail = |e: &dyn std::fmt::Display| -> ! {
-        let message = format!("a thread for work in a callback could not be started: {e}");
-        std::panic::resume_unwind(Box::new(Error::OutOfMemory(message)))
-    };
-    let begin = || {
-        float_state::set_on_own_thread();
-        // Work that it installs in any device runs on this thread.
-        APART.set(true);
-    };
-    let wait = || match start_threads(1, |_| "bakelite-extra".into(), begin) {
-        Ok((pool, threads)) => {
-            // The threads are joined when the pool has been dropped, also if `work` panics.
-            let _threads = Joined(threads);
-            let pool = pool;
-            pool.install(work)
-        }
-        Err(e) => fail(&e),
-    };
-    // A worker of a pool that waited for another pool would take up work of its own pool: so another thread waits.
-    std::thread::scope(|scope| match own_thread("bakelite-callback".into()).spawn_scoped(scope, wait) {
-        Ok(thread) => thread.join().unwrap_or_else(|payload| std::panic::resume_unwind(payload)),
-        Err(e) => fail(&e),
-    })
-}
-
-impl Drop for Device {
-    fn drop(&mut self) {
-        if self.is_forked() {
-            // In this process the threads can be neither ended nor joined.
-            std::mem::forget((self.pool.take(), std::mem::take(&mut self.threads)));
-            return;
-        }
-        drop(self.pool.take());
-        end(&mut self.threads);
-    }
 }
 
 #[cfg(test)]
@@ -454,8 +283,7 @@ mod tests {
     fn dropping_a_device_joins_its_threads() {
         let ended = Arc::new(AtomicU32::new(0));
         let device = Device::new(DeviceOptions { num_threads: 3, ..Default::default() }).unwrap();
-        let pool = device.pool.as_ref().unwrap();
-        pool.broadcast(|_| count_at_exit(&ended));
+        device.threads.pool().broadcast(|_| count_at_exit(&ended));
         drop(device);
         assert_eq!(ended.load(SeqCst), 3);
     }
@@ -465,7 +293,7 @@ mod tests {
         let device = Device::new(DeviceOptions { num_threads: 2, ..Default::default() }).unwrap();
         let (sender, receiver) = std::sync::mpsc::channel();
         let last = device.clone();
-        device.pool.as_ref().unwrap().spawn(move || {
+        device.threads.pool().spawn(move || {
             while Arc::strong_count(&last) > 1 {
                 std::thread::yield_now();
             }

@@ -197,6 +197,22 @@ fn floors_import_only_from_those_above_them() {
     assert!(through_lib.is_empty(), "imports of what lib.rs re-exports:\n{}", through_lib.join("\n"));
 }
 
+/// Lines of code in a file, without comments, blank lines and tests, from which on its head has to say why it is long.
+const LONG: usize = 500;
+
+#[test]
+fn long_files_say_why() {
+    for of in [Crate::Library, Crate::CommandLine] {
+        for file in files(of) {
+            let lines = file.text.lines().filter(|line| !line.trim().is_empty()).count();
+            let whole = std::fs::read_to_string(&file.path).unwrap();
+            let head: String = whole.lines().take_while(|line| line.starts_with("//!")).collect();
+            let is_explained = head.contains("The file is long because");
+            assert!(lines <= LONG || is_explained, "{} has {lines} lines of code", file.path.display());
+        }
+    }
+}
+
 /// Nodes that lie on a circle of edges.
 fn circles(edges: &BTreeMap<String, BTreeSet<String>>) -> Vec<String> {
     let reaches = |from: &String| {

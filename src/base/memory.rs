@@ -2,7 +2,7 @@
 //! refuse, and budgets for single calls.
 
 use crate::base::error::{Error, Result};
-use crate::base::parallel::one_by_one;
+use crate::base::parallel::{ParallelLoop, one_by_one};
 use rayon::prelude::*;
 use std::sync::Arc;
 use std::sync::atomic::{AtomicI64, Ordering::SeqCst};
@@ -192,8 +192,7 @@ pub fn try_collect<T>(values: impl IntoIterator<Item = T>, what: &str) -> Result
 /// Collects the items of a parallel iterator of known length, in order.
 pub fn try_par_collect<T: Send>(values: impl IndexedParallelIterator<Item = T>, what: &str) -> Result<Vec<T>> {
     let mut v = try_with_capacity(values.len(), what)?;
-    // This reserves nothing more if the capacity suffices.
-    values.collect_into_vec(&mut v);
+    values.collect_into_capacity(&mut v);
     Ok(v)
 }
 

@@ -17,3 +17,4 @@ pub mod sampling;
 pub(crate) mod scratch;
 pub(crate) mod scratch_files;
 pub(crate) mod sort;
+pub(crate) mod threads;

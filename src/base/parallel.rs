@@ -1,10 +1,208 @@
-//! Parallel loops over items that take long, and differently long.
+//! Parallel loops. Each of them becomes one loop of rayon's over the numbers of its parts, which is compiled once: rayon
+//! itself compiles its division of work among threads anew for every loop that it is given
+//! (docs/experiments.md#what-is-worth-optimising).
 
-use rayon::iter::{IndexedParallelIterator, MaxLen};
+use crate::base::error::{Error, Result};
+use rayon::iter::MaxLen;
+use rayon::iter::plumbing::{Producer, ProducerCallback};
+use rayon::prelude::*;
+use std::sync::{Mutex, OnceLock, PoisonError};
+
+/// Greatest number of parts of a loop: their list stays small (some 100 bytes each), and each part is little of the work.
+const PARTS: usize = 4096;
+
+/// Number of parts per thread, unless the iterator limits their lengths.
+const PARTS_PER_THREAD: usize = 32;
+
+/// Loops over the items of a parallel iterator, in any order.
+pub(crate) trait ParallelLoop: IndexedParallelIterator {
+    /// Calls `f` with each item.
+    fn each(self, f: impl Fn(Self::Item) + Sync) {
+        in_parts(self, &Each(f));
+    }
+
+    /// Calls `f` with each item. After an error the other items are left out as far as possible, and one of the errors is
+    /// returned.
+    fn try_each(self, f: impl Fn(Self::Item) -> Result<()> + Sync) -> Result<()> {
+        self.try_each_with(|| (), |(), item| f(item))
+    }
+
+    /// Calls `f` with each item, as [`try_each`](Self::try_each), and with a value that `new` makes for each part of the
+    /// loop: scratch memory.
+    fn try_each_with<S>(
+        self,
+        new: impl Fn() -> S + Sync,
+        f: impl Fn(&mut S, Self::Item) -> Result<()> + Sync,
+    ) -> Result<()> {
+        let work = TryEach { new, f, failed: OnceLock::new() };
+        in_parts(self, &work);
+        work.failed.into_inner().map_or(Ok(()), Err)
+    }
+
+    /// Collects the items in order.
+    fn collected(self) -> Vec<Self::Item> {
+        let mut items = Vec::with_capacity(self.len());
+        self.collect_into_capacity(&mut items);
+        items
+    }
+
+    /// Collects the items in order into an empty `Vec` whose capacity suffices.
+    fn collect_into_capacity(self, items: &mut Vec<Self::Item>) {
+        let len = self.len();
+        assert!(items.is_empty());
+        let places = items.spare_capacity_mut()[..len].par_iter_mut();
+        places.zip(self).each(|(place, item)| _ = place.write(item));
+        // SAFETY: the loop visits each of the `len` places once, and it returns only when all have been written.
+        unsafe { items.set_len(len) }
+    }
+}
+
+impl<I: IndexedParallelIterator> ParallelLoop for I {}
 
 /// Lets every thread that is idle take any item that no thread has begun. (By itself rayon cuts a loop into a few parts
 /// per thread, and halves only what another thread takes: on two threads the first quarter stays with the first thread,
 /// even if it takes as long as all the rest. Radiance map of Sponza in the sun: 3.4 → 2.4 s.)
 pub(crate) fn one_by_one<I: IndexedParallelIterator>(items: I) -> MaxLen<I> {
     items.with_max_len(1)
+}
+
+/// What a loop does with the items of one part.
+trait Work<T>: Sync {
+    fn of(&self, items: impl Iterator<Item = T>);
+}
+
+struct Each<F>(F);
+
+impl<T, F: Fn(T) + Sync> Work<T> for Each<F> {
+    fn of(&self, items: impl Iterator<Item = T>) {
+        items.for_each(&self.0);
+    }
+}
+
+struct TryEach<N, F> {
+    new: N,
+    f: F,
+    failed: OnceLock<Error>,
+}
+
+impl<T, S, N: Fn() -> S + Sync, F: Fn(&mut S, T) -> Result<()> + Sync> Work<T> for TryEach<N, F> {
+    fn of(&self, items: impl Iterator<Item = T>) {
+        let mut state = (self.new)();
+        for item in items {
+            if self.failed.get().is_some() {
+                return;
+            }
+            if let Err(error) = (self.f)(&mut state, item) {
+                // If another thread has failed, too, its error stays.
+                let _ = self.failed.set(error);
+            }
+        }
+    }
+}
+
+/// Divides the items into parts and does `work` with each of them.
+fn in_parts<I: IndexedParallelIterator>(items: I, work: &impl Work<I::Item>) {
+    let len = items.len();
+    if len > 0 {
+        items.with_producer(Parts { len, work });
+    }
+}
+
+struct Parts<'a, W> {
+    len: usize,
+    work: &'a W,
+}
+
+impl<T, W: Work<T>> ProducerCallback<T> for Parts<'_, W> {
+    type Output = ();
+
+    fn callback<P: Producer<Item = T>>(self, producer: P) {
+        let size = size_of_parts(self.len, producer.min_len(), producer.max_len());
+        let mut parts = Vec::new();
+        if parts.try_reserve_exact(self.len.div_ceil(size)).is_err() {
+            // There is no memory even for the list: the loop needs none on one thread.
+            return self.work.of(producer.into_iter());
+        }
+        let mut rest = producer;
+        for _ in 1..self.len.div_ceil(size) {
+            let (part, others) = rest.split_at(size);
+            parts.push(Mutex::new(Some(part)));
+            rest = others;
+        }
+        parts.push(Mutex::new(Some(rest)));
+        run(parts.len(), &|part| {
+            let part = parts[part].lock().unwrap_or_else(PoisonError::into_inner).take();
+            self.work.of(part.into_iter().flat_map(P::into_iter));
+        });
+    }
+}
+
+/// Returns how many items make a part of a loop over `len` items, parts being allowed to have `least` to `most`.
+fn size_of_parts(len: usize, least: usize, most: usize) -> usize {
+    let size = len.div_ceil(PARTS_PER_THREAD * rayon::current_num_threads()).min(most);
+    size.max(least).max(len.div_ceil(PARTS)).max(1)
+}
+
+/// Calls `part` with the numbers below `parts`, on all threads.
+fn run(parts: usize, part: &(dyn Fn(usize) + Sync)) {
+    match parts {
+        1 => part(0),
+        _ => (0..parts).into_par_iter().with_max_len(1).for_each(part),
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use std::sync::atomic::{AtomicUsize, Ordering::Relaxed};
+
+    #[test]
+    fn each_item_is_visited_once_whatever_the_parts() {
+        for len in [0, 1, 2, 63, 64, 65, 10_000, 2 * PARTS, 2 * PARTS + 1] {
+            for (least, most) in [(1, usize::MAX), (1, 1), (100, usize::MAX), (7, 9)] {
+                let mut visits = vec![0u32; len];
+                let items = visits.par_iter_mut().enumerate().with_min_len(least).with_max_len(most);
+                items.each(|(i, v)| *v += 1 + i as u32);
+                assert!(visits.iter().enumerate().all(|(i, &v)| v == 1 + i as u32), "{len} {least} {most}");
+            }
+        }
+    }
+
+    #[test]
+    fn parts_have_the_lengths_that_the_loop_asks_for() {
+        let threads = rayon::current_num_threads();
+        assert_eq!(size_of_parts(1000, 1, 1), 1);
+        assert_eq!(size_of_parts(3 * PARTS, 1, 1), 3);
+        assert_eq!(size_of_parts(10, 100, usize::MAX), 100);
+        assert_eq!(size_of_parts(64 * threads, 1, usize::MAX), 2);
+    }
+
+    #[test]
+    fn an_error_is_returned_and_ends_the_loop() {
+        let seen = AtomicUsize::new(0);
+        let error = one_by_one((0..PARTS).into_par_iter()).try_each(|i| {
+            seen.fetch_add(1, Relaxed);
+            if i == 0 { Err(Error::Cancelled) } else { Ok(()) }
+        });
+        assert_eq!(error, Err(Error::Cancelled));
+        // Nothing bounds what others do until the first thread has its turn, but each visits an item once.
+        assert!(seen.into_inner() <= PARTS);
+        assert_eq!((0..1000).into_par_iter().try_each(|_| Ok(())), Ok(()));
+    }
+
+    #[test]
+    fn scratch_is_made_for_each_part_and_used_by_all_its_items() {
+        let (made, used) = (AtomicUsize::new(0), AtomicUsize::new(0));
+        let new = || made.fetch_add(1, Relaxed);
+        (0..1000)
+            .into_par_iter()
+            .with_min_len(100)
+            .try_each_with(new, |_, _| {
+                used.fetch_add(1, Relaxed);
+                Ok(())
+            })
+            .unwrap();
+        assert!(made.into_inner() <= 10);
+        assert_eq!(used.into_inner(), 1000);
+    }
 }

@@ -1,6 +1,7 @@
 //! The binary tree, before it is collapsed to wide nodes.
 
 use crate::base::geometry::half_area;
+use crate::base::parallel::ParallelLoop;
 use bytemuck::Zeroable;
 use glam::Vec3;
 use rayon::prelude::*;
@@ -41,7 +42,7 @@ impl BinaryBvh {
             .nodes
             .par_chunks(1 << 14)
             .map(|nodes| nodes.iter().map(|n| f64::from(n.count.max(1)) * half_area(n.lower, n.upper)).sum())
-            .collect();
+            .collected();
         (chunks.iter().sum::<f64>() / root_area) as f32
     }
 

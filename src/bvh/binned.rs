@@ -13,7 +13,8 @@ use super::layout::SAH_DEPTH;
 use super::partings::{best_parting, halve, leaf_cost, part_few};
 use super::references::{Box4, Extent, Range4, Reference, References, area_scale};
 use crate::base::error::Result;
-use crate::base::memory::{try_collect, try_par_collect, try_push, try_zeroed, try_zeroed_as_needed};
+use crate::base::memory::{try_collect, try_filled, try_push, try_zeroed, try_zeroed_as_needed};
+use crate::base::parallel::ParallelLoop;
 use crate::base::progress::Progress;
 #[cfg(target_arch = "x86_64")]
 use crate::simd::Isa;
@@ -61,11 +62,13 @@ fn partition(
     }
     // First within blocks, then between them.
     let parted = if in_parallel(refs.len()) {
-        let blocks = refs.par_chunks_mut(BLOCK).with_min_len(BLOCKS_PER_THREAD);
-        try_par_collect(
-            blocks.map_init(Scratch::new, |scratch, block| partition_block(block, map, split, scratch)),
-            TREE,
-        )?
+        let mut parted = try_filled(refs.len().div_ceil(BLOCK), (0, [Range4::EMPTY; 2]), TREE)?;
+        let blocks = refs.par_chunks_mut(BLOCK).zip(&mut parted).with_min_len(BLOCKS_PER_THREAD);
+        blocks.try_each_with(Scratch::new, |scratch, (block, of_block)| {
+            *of_block = partition_block(block, map, split, scratch);
+            Ok(())
+        })?;
+        parted
     } else {
         try_collect(refs.chunks_mut(BLOCK).map(|block| partition_block(block, map, split, scratch)), TREE)?
     };
@@ -96,7 +99,7 @@ fn swap_misplaced(refs: &mut [Reference], middle: usize, parted: &[(usize, [Rang
             a.swap_with_slice(b);
         }
     }
-    pairs.into_par_iter().with_min_len(BLOCKS_PER_THREAD).for_each(|(a, b)| a.swap_with_slice(b));
+    pairs.into_par_iter().with_min_len(BLOCKS_PER_THREAD).each(|(a, b)| a.swap_with_slice(b));
     Ok(())
 }
 

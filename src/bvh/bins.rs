@@ -2,6 +2,7 @@
 
 use super::references::{Box4, Range4, Reference, half_areas};
 #[cfg(target_arch = "x86_64")]
+use crate::base::parallel::ParallelLoop;
 use crate::simd::Isa;
 use glam::Vec4;
 use rayon::prelude::*;
@@ -148,7 +149,7 @@ impl Bins {
                 bins.add(refs, map);
                 bins
             })
-            .collect();
+            .collected();
         for part in &parts {
             for b in 0..map.bins {
                 self.bins[b].add(&part.bins[b]);

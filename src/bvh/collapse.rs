@@ -14,6 +14,7 @@ use super::layout::{ChildRef, LEAF_PAD, LEAF_STRIDE, Mbvh, Node, WIDTH};
 use super::references::Box4;
 use crate::base::error::Result;
 use crate::base::memory::{try_append, try_par_collect, try_push, try_with_capacity, try_zeroed};
+use crate::base::parallel::ParallelLoop;
 use crate::base::progress::Progress;
 use glam::Vec3;
 use rayon::prelude::*;
@@ -132,7 +133,7 @@ pub(super) fn collapse<const W: usize>(
         jobs.push((part, rows));
         rest = others;
     }
-    jobs.into_par_iter().try_for_each(|(part, mut rows): (&[u32], &mut [f32])| {
+    jobs.into_par_iter().try_each(|(part, mut rows): (&[u32], &mut [f32])| {
         progress.check()?;
         for &i in part {
             for b in plans[i as usize].leaves(binary) {

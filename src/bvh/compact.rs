@@ -10,6 +10,7 @@ use crate::base::array::Array;
 use crate::base::error::Result;
 use crate::base::geometry::half_area;
 use crate::base::memory::{try_collect, try_to_vec};
+use crate::base::parallel::ParallelLoop;
 use bytemuck::{Pod, Zeroable};
 use glam::Vec3;
 use rayon::prelude::*;
@@ -350,7 +351,7 @@ impl Compact {
             };
             node.children().map(child).sum()
         };
-        let chunks: Vec<f64> = self.nodes.par_chunks(1 << 10).map(|nodes| nodes.iter().map(cost).sum()).collect();
+        let chunks: Vec<f64> = self.nodes.par_chunks(1 << 10).map(|nodes| nodes.iter().map(cost).sum()).collected();
         (1.0 + chunks.iter().sum::<f64>() / half_area(self.bounds.0, self.bounds.1)) as f32
     }
 }

@@ -11,6 +11,7 @@ use super::references::{Box4, triangle_box};
 use crate::base::error::Result;
 use crate::base::geometry::is_valid_triangle;
 use crate::base::memory::{try_filled, try_with_capacity};
+use crate::base::parallel::ParallelLoop;
 use glam::Vec3;
 use rayon::prelude::*;
 
@@ -53,13 +54,14 @@ impl Room {
 /// Refits the tree as [`super::refit::refit`] does.
 pub(super) fn refit(tree: &mut Compact, corners: &(impl Fn(u32) -> [Vec3; 3] + Sync), room: Room) {
     let end = tree.triangles.len() - PAD;
-    tree.triangles[..end].par_iter_mut().with_min_len(CHUNK).for_each(|t| {
+    tree.triangles[..end].par_iter_mut().with_min_len(CHUNK).each(|t| {
         *t = if is_valid_triangle(corners(*t & NUMBER)) { *t & !GONE } else { *t | GONE };
     });
     let Room { mut boxes, order, levels, mut done } = room;
     for level in levels.windows(2).rev().map(|w| &order[w[0]..w[1]]) {
         let work = level.par_iter().with_min_len(CHUNK);
-        work.map(|&i| refit_node(tree, i as usize, &boxes, corners)).collect_into_vec(&mut done);
+        done.clear();
+        work.map(|&i| refit_node(tree, i as usize, &boxes, corners)).collect_into_capacity(&mut done);
         for (&i, (node, bounds)) in level.iter().zip(&done) {
             (tree.nodes[i as usize], boxes[i as usize]) = (*node, *bounds);
         }

@@ -4,6 +4,7 @@ use crate::base::array::Array;
 use crate::base::error::Result;
 use crate::base::geometry::half_area;
 use crate::base::memory::try_to_vec;
+use crate::base::parallel::ParallelLoop;
 use crate::simd::prefetch;
 use bytemuck::{Pod, Zeroable};
 use glam::Vec3;
@@ -241,7 +242,7 @@ impl<const W: usize> Mbvh<W> {
         let root_area = half_area(self.bounds.0, self.bounds.1);
         // Sums are taken by chunks, so that they do not depend on the number of threads.
         let chunks: Vec<f64> =
-            self.nodes.par_chunks(1 << 10).map(|nodes| nodes.iter().map(Node::<W>::sah_cost).sum()).collect();
+            self.nodes.par_chunks(1 << 10).map(|nodes| nodes.iter().map(Node::<W>::sah_cost).sum()).collected();
         (1.0 + chunks.iter().sum::<f64>() / root_area) as f32
     }
 

@@ -9,6 +9,7 @@ use super::collapse::set_box;
 use super::layout::{ChildRef, LEAF_PAD, LEAF_STRIDE, Mbvh, Node, WIDTH};
 use super::references::{Box4, triangle_box};
 use crate::base::geometry::is_valid_triangle;
+use crate::base::parallel::ParallelLoop;
 use glam::Vec3;
 use rayon::prelude::*;
 
@@ -76,7 +77,7 @@ fn refit_node(node: &mut Node, part: Part, corners: &(impl Fn(u32) -> [Vec3; 3] 
         *below = refit_node(child, std::mem::take(part), corners);
     };
     if parallel {
-        shares[..inner].par_iter_mut().with_max_len(1).for_each(run);
+        shares[..inner].par_iter_mut().with_max_len(1).each(run);
     } else {
         shares[..inner].iter_mut().for_each(run);
     }

@@ -6,6 +6,7 @@ use super::binned::PARALLEL_SUBTREE;
 use super::bins::{in_parallel, on_heap};
 use super::partings::leaf_weight;
 use super::references::{Box4, Reference, half_areas};
+use crate::base::parallel::ParallelLoop;
 use glam::{Vec3, Vec4};
 use rayon::prelude::*;
 
@@ -163,7 +164,7 @@ impl Slabs {
                 slabs.add(refs, corners, grid);
                 slabs
             })
-            .collect();
+            .collected();
         for part in &parts {
             self.slabs.iter_mut().zip(part.slabs.iter()).for_each(|(s, p)| s.add(p));
         }

@@ -27,7 +27,7 @@ use super::{BakeParams, BakeStats, CheckpointParams, Light, Lightmap, Origin, St
 use crate::base::directional::Directional;
 use crate::base::error::{Error, Result, invalid_argument};
 use crate::base::memory::{try_filled, try_to_vec, try_vec, try_zeroed};
-use crate::base::parallel::one_by_one;
+use crate::base::parallel::{ParallelLoop, one_by_one};
 use crate::base::progress::Progress;
 use crate::base::sampling::{combine, purpose_seed};
 use crate::base::scratch::Scratch;
@@ -460,7 +460,7 @@ impl<'p> Bake<'_, 'p> {
             let directional = directional.get_mut(needed.clone()).unwrap_or_default();
             let directional = parts(directional, BLOCK, needed.len())?;
             let blocks = values.zip(normals).zip(variances).zip(valid).zip(directional).enumerate();
-            one_by_one(blocks).try_for_each(|(block, ((((values, normals), variances), valid), directional))| {
+            one_by_one(blocks).try_each(|(block, ((((values, normals), variances), valid), directional))| {
                 if self.checkpoint.is_some_and(|c| c.gathered(block, values, variances, valid, directional)) {
                     for (i, normal) in normals.iter_mut().enumerate() {
                         let texel = GatherTexel::new(needed.start + block * BLOCK + i);
@@ -566,7 +566,7 @@ impl<'p> Bake<'_, 'p> {
             let directional = directional.into_par_iter().zip(parts(&mut directed, BLOCK, range.len())?);
             let noises = parts(&mut variances, BLOCK, range.len())?;
             let blocks = direct.zip(indirect_out).zip(state).zip(directional.zip(noises)).enumerate();
-            one_by_one(blocks).try_for_each(|(block, ((((direct, known), ind), state), rest))| {
+            one_by_one(blocks).try_each(|(block, ((((direct, known), ind), state), rest))| {
                 let ((directional, directed), variances) = rest;
                 let mut traced = 0;
                 let first = range.start + block * BLOCK;

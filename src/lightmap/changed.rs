@@ -29,6 +29,7 @@ use crate::base::error::{Result, invalid_argument};
 use crate::base::memory::{
     Reservation, try_collect, try_filled, try_par_collect_ok, try_par_gather, try_push, try_vec,
 };
+use crate::base::parallel::ParallelLoop;
 use crate::base::progress::Progress;
 use crate::base::sampling::{mix, purpose_seed};
 use crate::base::scratch::Scratch;
@@ -236,7 +237,7 @@ impl Redo {
             };
             try_push(&mut parts, part, CHANGED)?;
         }
-        parts.into_par_iter().try_for_each(|part| job.mark(part, &states, all_direct))?;
+        parts.into_par_iter().try_each(|part| job.mark(part, &states, all_direct))?;
         Ok(redo)
     }
 }

@@ -20,7 +20,7 @@ use super::plan::{Plan, left_out};
 use crate::base::directional::{Directional, Linear};
 use crate::base::error::Result;
 use crate::base::memory::try_to_vec;
-use crate::base::parallel::one_by_one;
+use crate::base::parallel::{ParallelLoop, one_by_one};
 use crate::base::progress::Stage;
 use crate::direct::DirectLight;
 use glam::Vec3;
@@ -81,7 +81,7 @@ pub(crate) fn blur(
     let out = direct[range.clone()].par_chunks_mut(BLOCK);
     let own = if n == 0 { 0..0 } else { range.start - lit.start..range.end - lit.start };
     let out = out.zip(parts(&mut directed[own], BLOCK, range.len())?).enumerate();
-    one_by_one(out).try_for_each(|(block, (out, directed))| {
+    one_by_one(out).try_each(|(block, (out, directed))| {
         let mut blur = DirectBlur::new(atlas);
         let place = |texel: LightTexel| texel.index() - lit.start;
         let noisy = |texel| Some((before[place(texel)], variances[place(texel)]));

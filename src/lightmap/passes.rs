@@ -10,6 +10,7 @@ use super::{BakeParams, BakeStats, Light, Spread, StageStats};
 use crate::base::directional::Directional;
 use crate::base::error::Result;
 use crate::base::memory::try_vec;
+use crate::base::parallel::ParallelLoop;
 use crate::scene::MOST_LIGHT;
 use glam::Vec3;
 use rayon::prelude::*;
@@ -72,7 +73,7 @@ impl Passes {
             old.direct[range.clone()].par_chunks_mut(BLOCK).zip(old.indirect[range.clone()].par_chunks_mut(BLOCK));
         let states = old.state[range.clone()].par_chunks_mut(BLOCK);
         let states = states.zip(old.spread[range.clone()].par_chunks_mut(BLOCK));
-        light.zip(states).enumerate().for_each(|(block, ((direct, indirect), (state, spread)))| {
+        light.zip(states).enumerate().each(|(block, ((direct, indirect), (state, spread)))| {
             let first = range.start + block * BLOCK;
             for (i, s) in (first..).zip(0..direct.len()) {
                 let all = new.direct[i] + new.indirect[i];
@@ -91,10 +92,10 @@ impl Passes {
             |(mean, new): (&mut Directional, &Directional)| *mean = *mean * (1.0 - part) + *new * part;
         if !old.directional.is_empty() {
             let of_range = old.directional[range.clone()].par_iter_mut().zip(&new.directional[range.clone()]);
-            of_range.with_min_len(BLOCK).for_each(mix_directional);
+            of_range.with_min_len(BLOCK).each(mix_directional);
         }
         let radiance = old.radiance.values.par_iter_mut().zip(&new.radiance.values);
-        radiance.with_min_len(BLOCK).for_each(|(mean, &new)| mix(mean, new));
+        radiance.with_min_len(BLOCK).each(|(mean, &new)| mix(mean, new));
         add_stats(&mut self.stats, stats);
     }
 
@@ -107,7 +108,7 @@ impl Passes {
         let sum = |of: &(dyn Fn(usize) -> f64 + Sync)| -> f64 {
             let blocks = (0..range.len().div_ceil(BLOCK)).into_par_iter();
             let of_block = |b: usize| (b * BLOCK..range.len().min((b + 1) * BLOCK)).map(of).sum();
-            blocks.map(of_block).collect::<Vec<f64>>().iter().sum()
+            blocks.map(of_block).collected().iter().sum()
         };
         let values = 3.0 * range.len().max(1) as f64;
         let mean = sum(&|i| all(i).element_sum()) / values;
@@ -153,7 +154,7 @@ impl Passes {
         let (of_mean, of_difference) = (0.5 * n * (1.0 / a - 1.0 / b), 0.5 * (1.0 / a + 1.0 / b));
         let Light { direct, indirect, spread, .. } = &mut self.light;
         let light = direct[range.clone()].par_iter().zip(&indirect[range.clone()]);
-        spread[range.clone()].par_iter_mut().zip(light).with_min_len(BLOCK).for_each(|(spread, (direct, indirect))| {
+        spread[range.clone()].par_iter_mut().zip(light).with_min_len(BLOCK).each(|(spread, (direct, indirect))| {
             spread.error = (spread.error * scale).map(f32::sqrt).min(most);
             for (difference, mean) in spread.difference.iter_mut().zip([direct, indirect]) {
                 *difference = (*difference * of_difference + *mean * of_mean).clamp(-most, most);

@@ -30,6 +30,7 @@ use crate::base::memory::{
     Reservation, try_append, try_collect, try_par_collect, try_par_filter, try_par_gather, try_push, try_to_vec,
     try_vec,
 };
+use crate::base::parallel::ParallelLoop;
 use crate::base::progress::{Progress, Stage};
 use crate::base::sort::sort;
 use crate::scene::NONE;
@@ -323,7 +324,7 @@ impl Job<'_, '_, '_> {
                 *(if k == 0 { &mut d.l0 } else { &mut d.l1[k - 1] }) = after.into();
             }
         }
-        stitched.par_iter_mut().for_each(|d| *d = d.valid());
+        stitched.par_iter_mut().each(|d| *d = d.valid());
         Ok(stitched)
     }
 
@@ -523,7 +524,7 @@ fn number(points: &mut [Point], texels: usize, stage: &Stage) -> Result<Vec<u32>
     let used = try_par_filter(texels, POINTS, |t| number_of[t as usize] != NONE)?;
     stage.check()?;
     (0..).zip(&used).for_each(|(i, &t)| number_of[t as usize] = i);
-    points.par_iter_mut().for_each(|p| p.texels = p.texels.map(|t| number_of[t as usize]));
+    points.par_iter_mut().each(|p| p.texels = p.texels.map(|t| number_of[t as usize]));
     Ok(used)
 }
 

@@ -9,6 +9,7 @@ use super::{BakeParams, BakeStats, Layer, Light, Lightmap, TexelState};
 use crate::base::directional::Directional;
 use crate::base::error::{Error, Result, invalid_argument};
 use crate::base::memory::{try_collect, try_vec};
+use crate::base::parallel::ParallelLoop;
 use crate::base::progress::Progress;
 use crate::scene::MOST_LIGHT;
 use glam::Vec3;
@@ -118,7 +119,7 @@ impl Lightmap {
                 _ => return invalid_argument!("layer {place} is {layer:?}, which cannot be written"),
             };
             let mut values = try_vec(light.state.len(), "new light")?;
-            values.par_chunks_mut(BLOCK).enumerate().try_for_each(|(block, values)| {
+            values.par_chunks_mut(BLOCK).enumerate().try_each(|(block, values)| {
                 for (i, new) in (block * BLOCK..).zip(values.iter_mut()) {
                     let (page, x, y) = self.written_place(LightTexel::new(i));
                     *new = Vec3::from(value(place, page, x, y));
@@ -147,8 +148,11 @@ impl Lightmap {
             }
             new.directional.iter_mut().zip(values).for_each(|(d, v)| part(d, v));
         }
-        let is_wrong = |d: &&mut Directional| !d.is_possible();
-        new.directional.par_iter_mut().with_min_len(BLOCK).filter(is_wrong).for_each(|d| *d = d.valid());
+        new.directional.par_iter_mut().with_min_len(BLOCK).each(|d| {
+            if !d.is_possible() {
+                *d = d.valid();
+            }
+        });
         Ok(new)
     }
 

@@ -14,7 +14,7 @@ use super::work::Context;
 use super::{Live, LiveParams, in_parts};
 use crate::base::error::{Error, Result};
 use crate::base::memory::{try_vec, try_with_capacity};
-use crate::base::parallel::one_by_one;
+use crate::base::parallel::{ParallelLoop, one_by_one};
 use crate::base::progress::Progress;
 use crate::base::sampling::purpose_seed;
 use crate::lightmap::Lightmap;
@@ -134,7 +134,7 @@ impl Live {
         let (limit, top) = (Limit::new(None, u64::MAX, Room::TEXELS), self.context.map.top());
         let context = self.context.clone();
         let blocks = self.blocks.par_chunks_mut(TOGETHER).zip(context.map.tiles.par_chunks(TOGETHER));
-        one_by_one(blocks).try_for_each(|((status, homes), tiles)| {
+        one_by_one(blocks).try_each(|((status, homes), tiles)| {
             let mut room = context.room()?;
             let mut blocks = try_with_capacity(tiles.len(), "blocks to be worked on")?;
             for ((status, home), tile) in status.iter().zip(&mut *homes).zip(tiles) {

@@ -10,6 +10,7 @@ use super::{SHOWN_AT_ONCE, in_parts};
 use crate::base::directional::Directional;
 use crate::base::error::Result;
 use crate::base::memory::{try_vec, try_with_capacity};
+use crate::base::parallel::ParallelLoop;
 use crate::lightmap::atlas::ids::{GatherTexel, LightTexel, PerTexel, PlacementId};
 use crate::lightmap::directional;
 use glam::Vec3;
@@ -74,7 +75,7 @@ impl Display {
         let (n, blocks) = (atlas.gather.len(), map.tiles.len());
         let mut normals = try_vec(n, "the gather map's normals")?;
         atlas.scene.device().install(|| {
-            normals.par_iter_mut().enumerate().for_each(|(i, normal): (usize, &mut Vec3)| {
+            normals.par_iter_mut().enumerate().each(|(i, normal): (usize, &mut Vec3)| {
                 *normal = atlas.receiver(&atlas.gather, &[], GatherTexel::new(i)).normal;
             });
         });

@@ -6,6 +6,7 @@ use super::lists::Lists;
 use super::{CellInfo, Live, NO_LOD, PageRect};
 use crate::base::error::{Error, Result, invalid_argument};
 use crate::base::memory::{try_append, try_vec};
+use crate::base::parallel::ParallelLoop;
 use crate::lightmap::atlas::ids::LightTexel;
 use crate::lightmap::atlas::texels::PageArea;
 use crate::lightmap::{Layer, directional};
@@ -146,7 +147,7 @@ impl Live {
             out.chunks_mut(r.width() * ROWS).enumerate().try_for_each(compose)?;
         } else {
             let device = atlas.scene.device();
-            device.install(|| out.par_chunks_mut(r.width() * ROWS).enumerate().try_for_each(compose))?;
+            device.install(|| out.par_chunks_mut(r.width() * ROWS).enumerate().try_each(compose))?;
         }
         if !is_lower {
             self.reading.note(r.area(), start.elapsed());

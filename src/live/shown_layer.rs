@@ -5,6 +5,7 @@ use super::blocks::{BLOCK_TEXELS, BlockMap, TILE};
 use crate::base::directional::{Directional, Linear};
 use crate::base::error::{Error, Result};
 use crate::base::memory::{try_filled, try_to_vec, try_vec};
+use crate::base::parallel::ParallelLoop;
 use crate::lightmap::atlas::fill::mean_around;
 use crate::lightmap::atlas::ids::{GatherTexel, PlacementId};
 use crate::lightmap::indirect::blur::{Texels, Window};
@@ -326,7 +327,7 @@ impl<T: Shown> ShownLayer<T> {
         let mut values = std::mem::take(&mut self.values);
         for some in blocks.chunks(BLOCKS_AT_ONCE) {
             let layer = &*self;
-            values.par_chunks_mut(slot).zip(some).for_each(|(room, &b)| {
+            values.par_chunks_mut(slot).zip(some).each(|(room, &b)| {
                 let mut slot = Slot { room, used: 0 };
                 compute(layer, b, &mut slot);
                 if let Some(end) = slot.room.get_mut(slot.used) {

@@ -16,6 +16,7 @@ use super::cylinder::Cylinder;
 use super::trace::{StoredPhoton, Traced};
 use crate::base::error::{Error, Result};
 use crate::base::memory::{Reservation, try_par_collect_ok, try_to_vec, try_vec, try_with_capacity};
+use crate::base::parallel::ParallelLoop;
 use crate::base::progress::{Progress, Stage};
 use glam::{DVec3, Vec3};
 use rayon::prelude::*;
@@ -296,7 +297,7 @@ fn fill_ranges(
         first += len;
     }
     let per_part = (blocks.len() as u64).div_ceil(parts.len().max(1) as u64);
-    parts.into_par_iter().try_for_each(|part| {
+    parts.into_par_iter().try_each(|part| {
         stage.advance(per_part)?;
         fill_range(part, blocks, offsets, frame, ranges)
     })

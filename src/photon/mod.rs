@@ -24,6 +24,7 @@ mod trace;
 
 use crate::base::error::{Error, Result, invalid_argument};
 use crate::base::memory::{MemoryMonitor, Reservation, try_vec};
+use crate::base::parallel::ParallelLoop;
 use crate::base::progress::Progress;
 use crate::scene::Scene;
 use crate::trace::Ray;
@@ -319,7 +320,7 @@ impl PhotonMap {
         let stage = progress.stage("photon estimates", 0.0, 1.0, positions.len() as u64);
         let blocks = positions.par_chunks(BLOCK).zip(normals.par_chunks(BLOCK)).zip(out.par_chunks_mut(BLOCK));
         self.scene.device().run(progress, || {
-            blocks.try_for_each(|((positions, normals), out)| {
+            blocks.try_each(|((positions, normals), out)| {
                 self.estimate_block(positions, normals, out);
                 stage.advance(positions.len() as u64)
             })

@@ -10,8 +10,8 @@ use super::Scene;
 use crate::base::callback;
 use crate::base::error::Result;
 use crate::base::memory::{Reservation, try_filled, try_with_capacity};
+use crate::base::threads::{self, Threads, Work};
 use crate::bvh::parts::Parts;
-use crate::device::{self, ExtraThreads, Work};
 use std::ops::RangeInclusive;
 use std::sync::{Arc, Condvar, Mutex, MutexGuard, PoisonError};
 use std::thread::JoinHandle;
@@ -47,10 +47,8 @@ pub(crate) trait Batch: Send + Sync {
 pub(crate) struct WaitingRays {
     pub tree: Parts,
     queues: Arc<Queues>,
-    waiting: ExtraThreads,
+    waiting: Threads,
     tracing: Vec<JoinHandle<()>>,
-    /// Id of the process in which the threads were started.
-    process: u32,
     _memory: Reservation,
 }
 
@@ -151,14 +149,13 @@ impl WaitingRays {
         let mut waiting = WaitingRays {
             tree,
             queues: Arc::new(Queues { state: Mutex::new(state), changed: Condvar::new() }),
-            waiting: ExtraThreads::start((THREADS * threads).min(MOST_THREADS))?,
+            waiting: Threads::start_apart((THREADS * threads).min(MOST_THREADS), |i| format!("bakelite-extra-{i}"))?,
             tracing: try_with_capacity(tracing, QUEUES)?,
-            process: std::process::id(),
             _memory: memory,
         };
         for i in 0..tracing {
             let queues = waiting.queues.clone();
-            waiting.tracing.push(device::start_thread(format!("bakelite-rays-{i}"), move || queues.trace())?);
+            waiting.tracing.push(threads::start_one(format!("bakelite-rays-{i}"), move || queues.trace())?);
         }
         Ok(waiting)
     }
@@ -176,14 +173,14 @@ impl WaitingRays {
 
 impl Drop for WaitingRays {
     fn drop(&mut self) {
-        if self.process != std::process::id() {
+        if self.waiting.are_in_another_process() {
             // After a fork the threads are not in this process, and may have held the lock.
             std::mem::forget(std::mem::take(&mut self.tracing));
             return;
         }
         self.queues.lock().is_over = true;
         self.queues.changed.notify_all();
-        device::end(&mut self.tracing);
+        threads::end(&mut self.tracing);
     }
 }
 
@@ -198,7 +195,7 @@ impl Scene {
     fn install_work(&self, work: Work) {
         match self.parts() {
             // What a callback asks for must not wait for threads that may be in it.
-            Some(parts) if !callback::is_running() => parts.waiting.install(work),
+            Some(parts) if !callback::is_running() => parts.waiting.pool().install(work),
             _ => self.device().install(work),
         }
     }

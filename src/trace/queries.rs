@@ -8,6 +8,7 @@ use super::{Hit, Kernels, PACKET_SIZE, Packet, RawHit, Ray};
 use crate::base::error::{Result, invalid_argument};
 use crate::base::geometry::NONE;
 use crate::base::memory::try_filled;
+use crate::base::parallel::ParallelLoop;
 use crate::bvh::instances::{Instances, MeshTree};
 use crate::bvh::{ChildRef, Mbvh, Tree};
 use crate::scene::Scene;
@@ -184,7 +185,7 @@ impl Scene {
         if parallel {
             self.install(|| {
                 let size = block_size(rays.len());
-                rays.par_chunks(size).zip(out.par_chunks_mut(size)).for_each(|(r, o)| block(r, o));
+                rays.par_chunks(size).zip(out.par_chunks_mut(size)).each(|(r, o)| block(r, o));
             });
         } else {
             block(rays, out);
@@ -254,7 +255,7 @@ impl Scene {
         if parallel {
             self.install(|| {
                 let size = block_size(rays.len());
-                rays.par_chunks(size).zip(out.par_chunks_mut(size)).for_each(|(r, o)| block(r, o));
+                rays.par_chunks(size).zip(out.par_chunks_mut(size)).each(|(r, o)| block(r, o));
             });
         } else {
             block(rays, out);
@@ -302,7 +303,7 @@ impl Scene {
         if parallel {
             self.install(|| {
                 let size = block_size(directions.len());
-                directions.par_chunks(size).zip(out.par_chunks_mut(size)).for_each(|(d, o)| block(d, o));
+                directions.par_chunks(size).zip(out.par_chunks_mut(size)).each(|(d, o)| block(d, o));
             });
         } else {
             block(directions, out);

@@ -11,7 +11,7 @@ use super::texels::TexelSample;
 use crate::base::array::Array;
 use crate::base::error::Result;
 use crate::base::memory::{Reservation, try_collect, try_vec, try_with_capacity};
-use crate::base::parallel::one_by_one;
+use crate::base::parallel::{ParallelLoop, one_by_one};
 use crate::device::Device;
 use glam::{DVec2, Vec2};
 use rayon::prelude::*;
@@ -147,7 +147,7 @@ impl ChartIndex {
         let mut grids: Vec<Grid> = try_with_capacity(shapes.len(), "the index of the charts")?;
         grids.resize_with(shapes.len(), Grid::default);
         device.install(|| {
-            one_by_one(grids.par_iter_mut().zip(shapes)).try_for_each(|(grid, (sheet, chart))| {
+            one_by_one(grids.par_iter_mut().zip(shapes)).try_each(|(grid, (sheet, chart))| {
                 *grid = Grid::new(device, sheet, chart)?;
                 Ok(())
             })

@@ -11,7 +11,7 @@ use super::charts::Charts;
 use super::ids::{ChartId, PlacementId, RadianceMap, TexelId};
 use crate::base::error::Result;
 use crate::base::memory::try_collect;
-use crate::base::parallel::one_by_one;
+use crate::base::parallel::{ParallelLoop, one_by_one};
 use crate::base::progress::Stage;
 use crate::base::sampling::{combine, cosine_around, mix, uniform, uniform_sphere};
 use crate::scene::{Light, Scene};
@@ -94,7 +94,7 @@ impl Seen {
         let look = Look { scene, charts, radiance, room, outdoors: is_outdoors(scene), lights: &lights, is_lit };
         let counters: Vec<[AtomicU32; 2]> = try_collect(charts.charts.iter().map(|_| Default::default()), COUNTS)?;
         let (places, rays) = (AtomicU64::new(0), AtomicU64::new(0));
-        one_by_one((0..Self::work(radiance) as u32).into_par_iter()).try_for_each(|number| {
+        one_by_one((0..Self::work(radiance) as u32).into_par_iter()).try_each(|number| {
             let mut traced = 0;
             if let Some((position, first)) = look.open_place(number, &mut traced) {
                 look.around(position, &first, number, &mut traced, |chart, side| {

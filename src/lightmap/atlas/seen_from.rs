@@ -11,7 +11,7 @@ use super::ids::{ChartId, PlacementId, RadianceMap};
 use super::seen::{BACKS, COUNTS, Seen};
 use crate::base::error::Result;
 use crate::base::memory::try_collect;
-use crate::base::parallel::one_by_one;
+use crate::base::parallel::{ParallelLoop, one_by_one};
 use crate::base::progress::Stage;
 use crate::base::sampling::{combine, uniform, uniform_sphere};
 use crate::lightmap::Region;
@@ -51,12 +51,12 @@ pub(crate) fn look(
     let eye = Eye { scene, charts, radiance, regions };
     let counters: Vec<[AtomicU32; 2]> = try_collect(charts.charts.iter().map(|_| Default::default()), COUNTS)?;
     let rays = AtomicU64::new(0);
-    one_by_one((0..PLACES).into_par_iter()).try_for_each(|number| {
+    one_by_one((0..PLACES).into_par_iter()).try_each(|number| {
         eye.look_around(number, &counters);
         rays.fetch_add(u64::from(RAYS), Relaxed);
         stage.advance(1)
     })?;
-    one_by_one((0..charts.charts.len()).into_par_iter().map(ChartId::new)).try_for_each(|chart| {
+    one_by_one((0..charts.charts.len()).into_par_iter().map(ChartId::new)).try_each(|chart| {
         let counts = &counters[chart.index()];
         for side in [0, 1] {
             if counts[side].load(Relaxed) == 0 && eye.is_seen(chart, side == 0, &rays) {

@@ -4,6 +4,7 @@ use super::pieces::{CHARTS, ITEMS_PER_CHECK, float_key, surface_kind};
 use crate::base::array::Array;
 use crate::base::error::Result;
 use crate::base::memory::{try_collect, try_filled, try_with_capacity};
+use crate::base::parallel::ParallelLoop;
 use crate::base::progress::Stage;
 use crate::base::sort::sort;
 use crate::device::Device;
@@ -29,7 +30,7 @@ pub(super) struct Geometry {
 /// Computes something of each triangle, in parallel.
 fn of_each<T: Pod + Send + Sync>(scene: &Scene, triangles: &[u32], f: impl Fn(&u32) -> T + Sync) -> Result<Array<T>> {
     let mut all = scene.device().zeroed(triangles.len(), CHARTS)?;
-    all.par_iter_mut().zip(triangles).for_each(|(out, t)| *out = f(t));
+    all.par_iter_mut().zip(triangles).each(|(out, t)| *out = f(t));
     Ok(all)
 }
 

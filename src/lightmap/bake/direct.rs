@@ -4,7 +4,7 @@ use super::{BLOCK, Bake};
 use crate::base::directional::Directional;
 use crate::base::error::Result;
 use crate::base::memory::{try_collect, try_vec, try_with_capacity};
-use crate::base::parallel::one_by_one;
+use crate::base::parallel::{ParallelLoop, one_by_one};
 use crate::base::progress::Stage;
 use crate::base::sampling::purpose_seed;
 use crate::base::scratch::Scratch;
@@ -65,7 +65,7 @@ impl Bake<'_, '_> {
         let new_tile = if directed.is_empty() { TilePoints::new } else { TilePoints::by_direction };
         l.scene.device().install(|| {
             let sharp = &direct[..];
-            one_by_one(variations.par_chunks_mut(BLOCK).enumerate()).for_each(|(block, out)| {
+            one_by_one(variations.par_chunks_mut(BLOCK).enumerate()).each(|(block, out)| {
                 let mut traced = 0;
                 let first = range.start + block * BLOCK;
                 for (i, variation) in out.iter_mut().enumerate().filter(|(i, _)| !known[block] && is_new(first + i)) {
@@ -83,7 +83,7 @@ impl Bake<'_, '_> {
             let blocks = direct[range.clone()].par_chunks_mut(BLOCK).zip(state[range.clone()].par_chunks(BLOCK));
             let sums = parts(directed, BLOCK, range.len())?.into_par_iter().zip(parts(variances, BLOCK, range.len())?);
             let blocks = blocks.zip(variations.par_chunks(BLOCK)).zip(sums).enumerate();
-            one_by_one(blocks).try_for_each(|(block, (((direct, state), variations), (directed, variances)))| {
+            one_by_one(blocks).try_each(|(block, (((direct, state), variations), (directed, variances)))| {
                 if known[block] {
                     return stage.advance(direct.len() as u64);
                 }

@@ -3,7 +3,7 @@
 use crate::base::directional::Linear;
 use crate::base::error::Result;
 use crate::base::functions::exp_of_negative;
-use crate::base::parallel::one_by_one;
+use crate::base::parallel::{ParallelLoop, one_by_one};
 use crate::base::progress::Stage;
 use crate::device::Device;
 use crate::lightmap::atlas::chart_map::ChartMap;
@@ -69,7 +69,7 @@ pub(crate) fn blur<T: Linear>(
 ) -> Result<()> {
     let radius = radius.min(MAX_BLUR_RADIUS) as i32;
     device.install(|| {
-        one_by_one(out.par_chunks_mut(BLOCK).enumerate()).try_for_each(|(block, out)| {
+        one_by_one(out.par_chunks_mut(BLOCK).enumerate()).try_each(|(block, out)| {
             let mut window = Window::new(radius);
             for (i, out) in out.iter_mut().enumerate() {
                 stage.check()?;

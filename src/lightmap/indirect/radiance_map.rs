@@ -15,7 +15,7 @@
 use super::bright_patches::Bright;
 use crate::base::error::Result;
 use crate::base::memory::try_vec;
-use crate::base::parallel::one_by_one;
+use crate::base::parallel::{ParallelLoop, one_by_one};
 use crate::base::progress::Stage;
 use crate::base::sampling::{combine, sobol_2d};
 use crate::base::scratch::Scratch;
@@ -190,7 +190,7 @@ pub(crate) fn bake(device: &Device, input: &RadianceInput, values: &mut [Vec3], 
     let per_tile = texels_per_tile(input.light.samples);
     let (tiles, rooms) = (Scratch::new(), Scratch::new());
     device.install(|| {
-        one_by_one(looks.par_chunks_mut(BLOCK).enumerate()).try_for_each(|(block, out)| {
+        one_by_one(looks.par_chunks_mut(BLOCK).enumerate()).try_each(|(block, out)| {
             let (mut traced, first) = (0, block * BLOCK);
             let mut tile = tiles.take(|| TilePoints::new(TILE))?;
             for texels in in_order(map, first..first + out.len())?.chunks(per_tile) {
@@ -201,7 +201,7 @@ pub(crate) fn bake(device: &Device, input: &RadianceInput, values: &mut [Vec3], 
             rays.fetch_add(traced, Relaxed);
             stage.advance(out.len() as u64)
         })?;
-        one_by_one(values.par_chunks_mut(BLOCK).enumerate()).try_for_each(|(block, out)| {
+        one_by_one(values.par_chunks_mut(BLOCK).enumerate()).try_each(|(block, out)| {
             let (mut traced, first) = (0, block * BLOCK);
             let make = || Ok(RadianceTile { points: TilePoints::new(TILE)?, discs: Discs::new(TILE)? });
             let mut room = rooms.take(make)?;

@@ -25,7 +25,7 @@ use crate::base::error::Result;
 use crate::base::memory::{
     Reservation, try_append, try_collect, try_filled, try_par_gather, try_push, try_vec, try_with_capacity,
 };
-use crate::base::parallel::one_by_one;
+use crate::base::parallel::{ParallelLoop, one_by_one};
 use crate::base::progress::Stage;
 use crate::base::sampling::combine;
 use crate::base::scratch::Scratch;
@@ -169,7 +169,7 @@ impl Upsampling {
         let new_tile = if rays.directional { Tile::by_direction } else { Tile::new };
         atlas.scene.device().install(|| {
             let blocks = own.par_chunks_mut(BLOCK).zip(self.alone.par_chunks(BLOCK));
-            one_by_one(blocks.zip(parts(&mut directional, BLOCK, self.alone.len())?)).try_for_each(
+            one_by_one(blocks.zip(parts(&mut directional, BLOCK, self.alone.len())?)).try_each(
                 |((own, texels), directional)| {
                     let mut tile = tiles.take(new_tile)?;
                     traced.fetch_add(
@@ -179,13 +179,13 @@ impl Upsampling {
                     stage.advance(texels.len() as u64)
                 },
             )?;
-            one_by_one(blurred.par_chunks_mut(BLURRED).enumerate()).for_each(|(block, blurred)| {
+            one_by_one(blurred.par_chunks_mut(BLURRED).enumerate()).each(|(block, blurred)| {
                 let mut window = Window::new(RADIUS);
                 for (i, blurred) in (block * BLURRED..).zip(blurred) {
                     *blurred = self.blurred(atlas, &mut window, &own, |k| directional[k], i);
                 }
             });
-            one_by_one(light.par_chunks_mut(BLURRED).enumerate()).try_for_each(|(block, light)| {
+            one_by_one(light.par_chunks_mut(BLURRED).enumerate()).try_each(|(block, light)| {
                 let mut window = Window::new(RADIUS);
                 let value = |k: usize| own[k].light.map_or(Vec3::ZERO, |l| l.value);
                 for (i, light) in (block * BLURRED..).zip(light.iter_mut()) {

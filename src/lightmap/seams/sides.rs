@@ -9,6 +9,7 @@
 
 use crate::base::error::Result;
 use crate::base::memory::{try_collect, try_par_collect, try_par_gather, try_push};
+use crate::base::parallel::ParallelLoop;
 use crate::base::progress::Stage;
 use crate::base::sort::sort;
 use crate::lightmap::atlas::pieces::float_key;
@@ -147,7 +148,7 @@ pub(super) fn for_each_edge<T: Send>(
 ) -> Result<Vec<T>> {
     let cells = Cells::new(scene, sides.len());
     let each = |visit: &(dyn Fn(usize, usize) + Sync)| {
-        (0..sides.len().div_ceil(PART)).into_par_iter().try_for_each(|part| {
+        (0..sides.len().div_ceil(PART)).into_par_iter().try_each(|part| {
             for index in part * PART..sides.len().min((part + 1) * PART) {
                 let side = sides.get(index);
                 visit(index, cells.of(side.ends(scene.corners(side.triangle()))));

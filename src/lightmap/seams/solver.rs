@@ -2,6 +2,7 @@
 
 use crate::base::error::Result;
 use crate::base::memory::{try_filled, try_par_collect, try_to_vec, try_vec};
+use crate::base::parallel::ParallelLoop;
 use crate::base::progress::Stage;
 use glam::{DVec3, Vec3A};
 use rayon::prelude::*;
@@ -85,12 +86,12 @@ impl System {
     /// Computes A − B at every point.
     pub(super) fn differences(&self, x: &[Vec3A], out: &mut [Vec3A]) {
         let show = |p: &Point| (0..8).fold(Vec3A::ZERO, |sum, k| sum + p.weights[k] * x[p.texels[k] as usize]);
-        out.par_iter_mut().zip(&self.points).with_min_len(CHUNK).for_each(|(d, p)| *d = show(p));
+        out.par_iter_mut().zip(&self.points).with_min_len(CHUNK).each(|(d, p)| *d = show(p));
     }
 
     /// Computes JᵀJ x from the differences of x. (Sums are in the order of points, on any number of threads.)
     pub(super) fn pull(&self, differences: &[Vec3A], out: &mut [Vec3A]) {
-        out.par_iter_mut().enumerate().with_min_len(CHUNK).for_each(|(t, out)| {
+        out.par_iter_mut().enumerate().with_min_len(CHUNK).each(|(t, out)| {
             let uses = &self.uses[self.first_use[t]..self.first_use[t + 1]];
             *out = uses.iter().fold(Vec3A::ZERO, |sum, &(p, w)| sum + w * differences[p as usize]);
         });
@@ -115,13 +116,13 @@ impl System {
             }
             self.differences(&p, &mut differences);
             self.pull(&differences, &mut q);
-            q.par_iter_mut().zip(&p).with_min_len(CHUNK).for_each(|(q, &p)| *q += STIFFNESS * p);
+            q.par_iter_mut().zip(&p).with_min_len(CHUNK).each(|(q, &p)| *q += STIFFNESS * p);
             let step = ratio(rr, dot(&p, &q));
-            x.par_iter_mut().zip(&p).with_min_len(CHUNK).for_each(|(x, &p)| *x += step * p);
-            r.par_iter_mut().zip(&q).with_min_len(CHUNK).for_each(|(r, &q)| *r -= step * q);
+            x.par_iter_mut().zip(&p).with_min_len(CHUNK).each(|(x, &p)| *x += step * p);
+            r.par_iter_mut().zip(&q).with_min_len(CHUNK).each(|(r, &q)| *r -= step * q);
             let next = dot(&r, &r);
             let keep = ratio(next, rr);
-            p.par_iter_mut().zip(&r).with_min_len(CHUNK).for_each(|(p, &r)| *p = r + keep * *p);
+            p.par_iter_mut().zip(&r).with_min_len(CHUNK).each(|(p, &r)| *p = r + keep * *p);
             rr = next;
         }
         for (x, &before) in x.iter_mut().zip(before) {
@@ -153,7 +154,7 @@ fn dot(a: &[Vec3A], b: &[Vec3A]) -> DVec3 {
     let part = |(a, b): (&[Vec3A], &[Vec3A])| {
         a.iter().zip(b).fold(DVec3::ZERO, |sum, (a, b)| sum + a.as_dvec3() * b.as_dvec3())
     };
-    let parts: Vec<DVec3> = a.par_chunks(CHUNK).zip(b.par_chunks(CHUNK)).map(part).collect();
+    let parts: Vec<DVec3> = a.par_chunks(CHUNK).zip(b.par_chunks(CHUNK)).map(part).collected();
     parts.into_iter().sum()
 }
 

@@ -1,5 +1,7 @@
 //! Tests of the inverse mapping.
 
+use super::super::flat_triangle::Flat;
+use super::inverse_mapping::cover_centres;
 use super::*;
 use crate::base::error::Error;
 use crate::base::progress::Progress;
@@ -9,6 +11,7 @@ use crate::lightmap::atlas::ids::ChartId;
 use crate::lightmap::atlas::pieces::Given;
 use crate::lightmap::atlas::sheets::Sheet;
 use crate::scene::Mesh;
+use glam::DVec2;
 use proptest::prelude::*;
 
 const SIZE: [i64; 2] = [16, 12];
