@@ -37,8 +37,8 @@ const RAYS: u32 = 16;
 const OPEN: u32 = 3;
 
 /// A texel that no lamp shines on and whose rays all leave an indoor scene or end on backs is buried if one in this many
-/// ends on a back that is [near](NEARBY).
-const FEW_BACKS: u32 = 4;
+/// ends on a back that is [near](NEARBY): outside of a corner a quarter end on backs.
+const FEW_BACKS: u32 = 8;
 
 /// Backs up to this many times `near` away tell that a texel which sees nothing else lies below or behind a surface.
 const NEARBY: f32 = 4.0;
