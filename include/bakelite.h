@@ -2068,8 +2068,9 @@ typedef struct bk_bake_params {
   /// "Interpolation error". Default: 1.
   float interpolation_error;
   /// Number of rays of texels of the light map that trace rays themselves, at most 64, and no more
-  /// than `gather_rays`; 0: a quarter of `gather_rays`, at least 16. Raise it to 64 where texels
-  /// are small and noise shows in corners: these texels take so many times as long. Default: 0.
+  /// than `gather_rays`; 0: a quarter of `gather_rays`, at least 16. Those with few others beside
+  /// them have twice as many, within the same limits. Raise it to 64 where texels are small and
+  /// noise shows in corners: these texels take so many times as long. Default: 0.
   uint32_t own_rays;
 } bk_bake_params;
 

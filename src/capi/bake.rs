@@ -201,8 +201,9 @@ pub struct bk_bake_params {
     /// "Interpolation error". Default: 1.
     pub interpolation_error: f32,
     /// Number of rays of texels of the light map that trace rays themselves, at most 64, and no more
-    /// than `gather_rays`; 0: a quarter of `gather_rays`, at least 16. Raise it to 64 where texels
-    /// are small and noise shows in corners: these texels take so many times as long. Default: 0.
+    /// than `gather_rays`; 0: a quarter of `gather_rays`, at least 16. Those with few others beside
+    /// them have twice as many, within the same limits. Raise it to 64 where texels are small and
+    /// noise shows in corners: these texels take so many times as long. Default: 0.
     pub own_rays: u32,
 }
 

@@ -193,8 +193,8 @@ impl Maps {
         }
         let placements = [&map.layout, &gather.layout, &radiance.layout].map(|layout| layout.placements.len() as u64);
         let stage = progress.stage("buried texels", 0.8, 1.0, placements.iter().sum());
-        let near = texel.min(seen::ROOM * scene.diagonal());
-        let search = Search { scene, charts, seen: &seen, near, only: None };
+        let (near, outdoors) = (texel.min(seen::ROOM * scene.diagonal()), seen::is_outdoors(scene));
+        let search = Search { scene, charts, seen: &seen, near, outdoors, only: None };
         // The visible part of a mostly buried texel is a strip along the surface that covers it, often darker than its
         // surroundings. Gather texels are larger and would spread that darkness as a rim.
         let (buried, rays) = scene.install(|| {

@@ -57,7 +57,14 @@ impl Atlas {
             moved.has(chart) || boxes.iter().any(|moved| moved.overlaps(&bounds))
         };
         let charts = try_collect(self.charts.ids().map(is_near), "charts near what has moved")?;
-        let search = Search { scene, charts: &self.charts, seen: &self.seen, near, only: Some(&charts) };
+        let search = Search {
+            scene,
+            charts: &self.charts,
+            seen: &self.seen,
+            near,
+            outdoors: self.is_outdoors,
+            only: Some(&charts),
+        };
         let work = [&self.map.layout, &self.gather.layout, &self.radiance.layout]
             .map(|layout| 2 * layout.placements.len() as u64);
         let stage = progress.stage("texels", 0.0, 1.0, work.iter().sum());

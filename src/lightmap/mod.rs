@@ -160,7 +160,7 @@ pub struct BakeParams {
     /// between normals: the split-sphere model (Ward, Rubinstein and Clear 1988), with weights of its own.
     pub interpolation_error: f32,
     /// Number of rays of texels of the light map that trace rays themselves, at most 64 and at most `gather_rays`; 0: a
-    /// quarter of `gather_rays`, at least 16.
+    /// quarter of `gather_rays`, at least 16. Those with few others beside them have twice as many.
     pub own_rays: u32,
     /// Radius of the gather map's blur in gather texels; 0: none, and direct light from skies, area lights and many lights
     /// is not blurred where it is noisy either.

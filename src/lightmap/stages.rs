@@ -166,9 +166,10 @@ pub(crate) fn own_light(
     let Inputs { atlas, params, progress, .. } = *inputs;
     let automatic = (params.gather_rays / OWN_PART).clamp(OWN_RAYS, ROUND as u32);
     let count = if params.own_rays == 0 { automatic } else { params.own_rays }.min(params.gather_rays);
+    let set = |count| SampleSet::new(count, purpose_seed(params.seed, purpose::GATHER_SET));
     let rays = OwnRays {
         radiance: inputs.lookup(radiance),
-        samples: &SampleSet::new(count, purpose_seed(params.seed, purpose::GATHER_SET)),
+        samples: [&set(count), &set((2 * count).min(params.gather_rays).min(ROUND as u32))],
         seed: purpose_seed(params.seed, purpose::OWN),
         directional,
     };

@@ -12,8 +12,9 @@
 //!
 //! Points lie on the chart: each on whichever triangle of the chart covers it, with that triangle's normals. Points
 //! inside solids, in cut-outs, or behind a wall that stands on the texel do not count: the light of the other room
-//! would leak in. If all points lie inside solids, as in a texel of which a strip looks out from under a block, the
-//! texel's sample alone is lit.
+//! would leak in. A point lies inside a solid if the way along the surface from there to the texel's sample, which can be
+//! seen, or the ways straight up and to four sides end at the solid's surface from inside. If all points do, as in a texel of which a strip looks out from under a
+//! block, the texel's sample alone is lit.
 //!
 //! The data used of neighbours is a function of their numbers alone, so that shards of a bake and tiles of live
 //! updates, which recompute it, have the same bits. The shadow rays of a [tile](super::tiles) are traced together,
@@ -44,7 +45,7 @@ use std::ops::Range;
 /// Maximum number of points of a texel that are lit together.
 const MAX_POINTS: usize = 16;
 
-/// Number of rays straight up that are worth a stream.
+/// Number of lines of sight that are worth a stream.
 const LEAST_STREAM: usize = 32;
 
 /// Number of points in a texel in which light is not known to vary.
@@ -97,42 +98,15 @@ impl<M: Map> TexelAreas<'_, M> {
                 })
     }
 
-    /// Whether a point lies inside a solid: the rays straight up and to four sides all hit its surface from inside.
-    /// (The ray straight up alone may hit the back of a single sheet, such as a table top, below which there is light.)
-    fn is_buried(&self, point: &Point, rays: &mut u64) -> bool {
-        let Receiver { origin, geometric, .. } = point.receiver;
-        let (x, y) = orthonormal_basis(geometric);
-        point.may_be_buried
-            && [Vec3::ZERO, x, -x, y, -y].into_iter().all(|aside| {
-                *rays += 1;
-                self.is_inner(&self.scene.intersect_raw(&Ray::new(origin, geometric + aside)))
-            })
-    }
-
-    /// Adds the light of the points that are not inside of solids, by their weights; returns the sum of the weights.
-    /// Only unlit points are tested; if all are unlit, the first one for all.
-    fn add_to(
-        &self,
-        points: &[Point],
-        sum: &mut PointLight,
-        weight: impl Fn(&TexelSample) -> Vec3,
-        rays: &mut u64,
-    ) -> Vec3 {
-        let is_lit = points.iter().any(|p| !p.light.is_dark());
-        if !is_lit && points.first().is_some_and(|p| self.is_buried(p, rays)) {
-            return Vec3::ZERO;
-        }
-        let mut n = Vec3::ZERO;
-        for point in points {
-            let Point { on, light, .. } = point;
-            if is_lit && light.is_dark() && self.is_buried(point, rays) {
-                continue;
-            }
-            let weight = weight(on);
-            sum.add(light, weight);
-            n += weight;
-        }
-        n
+    /// Whether a point from which the ray straight up hits the surface of a solid from inside lies in it: rays to four sides do
+    /// so, too. (The ray straight up alone may hit the back of a single sheet, such as a table top, below which there is
+    /// light.)
+    fn is_enclosed(&self, receiver: &Receiver, rays: &mut u64) -> bool {
+        let (x, y) = orthonormal_basis(receiver.geometric);
+        [x, -x, y, -y].into_iter().all(|aside| {
+            *rays += 1;
+            self.is_inner(&self.scene.intersect_raw(&Ray::new(receiver.origin, receiver.geometric + aside)))
+        })
     }
 
     /// Returns the texels [around](AROUND) a texel in the same placement, where there are any.
@@ -161,8 +135,34 @@ struct Point {
     light: PointLight,
     /// Number of the point in its tile.
     place: u32,
-    /// Whether the ray straight up may hit the back of a one-sided surface.
-    may_be_buried: bool,
+    /// Whether it is known to lie inside a solid.
+    is_buried: bool,
+}
+
+/// Adds the light of the points that are not inside solids, by their weights; returns the sum of the weights. Only unlit
+/// points have been tested; if all are unlit, the first one tells it for all.
+fn add_points(points: &[Point], sum: &mut PointLight, weight: impl Fn(&TexelSample) -> Vec3) -> Vec3 {
+    let is_lit = points.iter().any(|p| !p.light.is_dark());
+    if !is_lit && points.first().is_some_and(|p| p.is_buried) {
+        return Vec3::ZERO;
+    }
+    let mut n = Vec3::ZERO;
+    for Point { on, light, .. } in points.iter().filter(|p| !p.is_buried) {
+        let weight = weight(on);
+        sum.add(light, weight);
+        n += weight;
+    }
+    n
+}
+
+/// Height of lines of sight above the surface they run along, as a fraction of their length: it clears curved surfaces.
+const RAISED: f32 = 0.25;
+
+/// Returns the ray along a surface from one of its points to another, which ends at a distance of 1.
+fn line_of_sight(a: &Receiver, b: &Receiver) -> Ray {
+    let raise = RAISED * a.origin.distance(b.origin);
+    let (from, to) = (a.origin + raise * a.geometric, b.origin + raise * b.geometric);
+    Ray::new(from, to - from).within(0.0, 1.0)
 }
 
 /// Points of the texels of a tile, up to [`MAX_POINTS`] of each at a time.
@@ -170,10 +170,10 @@ pub(crate) struct TilePoints {
     points: Vec<Point>,
     /// Number of points of each texel.
     counts: Vec<usize>,
-    /// Points whose light has not arrived yet, or whose rays straight up have not been traced.
+    /// Points whose light has not arrived yet, or whose lines of sight have not been traced.
     pending: Vec<u32>,
-    rays_up: Vec<Ray>,
-    hits_up: Vec<RawHit>,
+    lines: Vec<Ray>,
+    line_hits: Vec<RawHit>,
     room: TileRoom,
     /// Light by direction that has arrived at each point, by kind; empty if nobody asks for it.
     directional: Vec<[Directional; KINDS]>,
@@ -202,14 +202,14 @@ impl TilePoints {
             raised: false,
         };
         let point =
-            Point { on: TexelSample::default(), receiver, light: PointLight::default(), place: 0, may_be_buried: true };
+            Point { on: TexelSample::default(), receiver, light: PointLight::default(), place: 0, is_buried: false };
         let points = texels * MAX_POINTS;
         Ok(TilePoints {
             points: try_filled(points, point, what)?,
             counts: try_filled(texels, 0, what)?,
             pending: try_with_capacity(points, what)?,
-            rays_up: try_with_capacity(points, what)?,
-            hits_up: try_filled(points, RawHit::MISS, what)?,
+            lines: try_with_capacity(points, what)?,
+            line_hits: try_filled(points, RawHit::MISS, what)?,
             room: TileRoom::new(KINDS * points, points)?,
             directional: Vec::new(),
         })
@@ -235,30 +235,53 @@ impl TilePoints {
         (&mut self.points[place * MAX_POINTS..][..self.counts[place]], &self.directional)
     }
 
-    /// Traces the rays straight up from unlit points beside lit ones, in the first `texels` of the tile, which tell that
-    /// nearly none of them is [buried](TexelAreas::is_buried). Of texels without any lit point the first point tells
-    /// it for all.
-    fn look_up<M: Map>(&mut self, texels: usize, areas: &TexelAreas<M>, rays: &mut u64) {
+    /// Traces the lines of sight from unlit points beside lit ones to the samples of their texels, for the first `texels` of
+    /// the tile, and those that are left straight up and to four sides, which tell which of them [lie inside solids](Point::is_buried). Of texels without any lit point the first
+    /// point tells it for all.
+    fn find_buried<M: Map>(
+        &mut self,
+        texels: usize,
+        areas: &TexelAreas<M>,
+        sample: impl Fn(usize) -> Receiver,
+        rays: &mut u64,
+    ) {
         self.pending.clear();
-        self.rays_up.clear();
+        self.lines.clear();
         for (i, &count) in self.counts[..texels].iter().enumerate() {
             let points = i * MAX_POINTS..i * MAX_POINTS + count;
-            let all_are_dark = self.points[points.clone()].iter().all(|p| p.light.is_dark());
-            let few = if all_are_dark { 1 } else { count };
-            for place in points.filter(|&place| self.points[place].light.is_dark()).take(few) {
-                let Receiver { origin, geometric, .. } = self.points[place].receiver;
-                self.rays_up.push(Ray::new(origin, geometric));
+            let dark = |&place: &usize| self.points[place].light.is_dark();
+            let few = if points.clone().all(|place| dark(&place)) { 1 } else { count };
+            let mut to = None;
+            for place in points.filter(dark).take(few) {
+                let to = to.get_or_insert_with(|| sample(i));
+                self.lines.push(line_of_sight(&self.points[place].receiver, to));
                 self.pending.push(place as u32);
             }
         }
-        match self.rays_up.len() < LEAST_STREAM {
-            true => areas.scene.intersect_block(&self.rays_up, &mut self.hits_up),
-            false => areas.scene.intersect_stream(&self.rays_up, &mut self.hits_up),
+        self.trace_lines(areas, rays);
+        for (&place, hit) in self.pending.iter().zip(&self.line_hits) {
+            self.points[place as usize].is_buried = areas.is_inner(hit);
         }
-        *rays += self.rays_up.len() as u64;
-        for (&place, hit) in self.pending.iter().zip(&self.hits_up) {
-            self.points[place as usize].may_be_buried = areas.is_inner(hit);
+        // A solid that something else covers on the way to the sample is found by what is around the point.
+        self.pending.retain(|&place| !self.points[place as usize].is_buried);
+        self.lines.clear();
+        for &place in &self.pending {
+            let Receiver { origin, geometric, .. } = self.points[place as usize].receiver;
+            self.lines.push(Ray::new(origin, geometric));
         }
+        self.trace_lines(areas, rays);
+        for (&place, hit) in self.pending.iter().zip(&self.line_hits) {
+            let point = &mut self.points[place as usize];
+            point.is_buried = areas.is_inner(hit) && areas.is_enclosed(&point.receiver, rays);
+        }
+    }
+
+    fn trace_lines<M: Map>(&mut self, areas: &TexelAreas<M>, rays: &mut u64) {
+        match self.lines.len() < LEAST_STREAM {
+            true => areas.scene.intersect_block(&self.lines, &mut self.line_hits),
+            false => areas.scene.intersect_stream(&self.lines, &mut self.line_hits),
+        }
+        *rays += self.lines.len() as u64;
     }
 
     /// Computes direct light at receivers with seeds of their own, at most [`MAX_POINTS`] times as many as there is room
@@ -302,7 +325,7 @@ impl TilePoints {
                 let (count, at) = (self.counts[place], place * MAX_POINTS + self.counts[place]);
                 shadow.slot = KINDS * at;
                 let light = by.direct.push(&receiver, (count - first) as u32, lights, samples, of_round, &mut shadow);
-                self.points[at] = Point { on, receiver, light, place: at as u32, may_be_buried: true };
+                self.points[at] = Point { on, receiver, light, place: at as u32, is_buried: false };
                 self.pending.push(at as u32);
                 self.counts[place] += 1;
             }

@@ -8,13 +8,16 @@
 //! without further distinction.
 //!
 //! A texel is buried if, on the side that it shows, almost all rays end within about a texel, on backs of one-sided
-//! surfaces, or on sides that cannot be seen from any [open place](super::seen), or if most of them end on such backs.
+//! surfaces, or on sides that cannot be seen from any [open place](super::seen), or if most of them end on such backs, or,
+//! where no sun or sky shines, if all of them end on backs, some of them near, or leave the scene, and no lamp can be seen,
+//! as below the floor of a room of sheets. (A floor below a grate, or beside the back of a wall in the open, sees nothing
+//! else either, but from farther away or in the light of a lamp.)
 
 use super::chart_map::ChartMap;
 use super::charts::Charts;
 use super::fill::{Hole, around};
 use super::ids::{Map, PlacementId, TexelId, TexelRange};
-use super::seen::Seen;
+use super::seen::{self, Seen};
 use super::texels::TexelSample;
 use crate::base::error::Result;
 use crate::base::memory::{try_collect, try_par_collect, try_push, try_vec, try_with_capacity};
@@ -32,6 +35,16 @@ const RAYS: u32 = 16;
 /// Minimum number of rays that end in the open for a texel to be visible, unless more than half of all rays end on
 /// backs.
 const OPEN: u32 = 3;
+
+/// A texel that no lamp shines on and whose rays all leave an indoor scene or end on backs is buried if one in this many
+/// ends on a back that is [near](NEARBY): outside of a corner a quarter end on backs.
+const FEW_BACKS: u32 = 8;
+
+/// Backs up to this many times `near` away tell that a texel which sees nothing else lies below or behind a surface.
+const NEARBY: f32 = 4.0;
+
+/// Maximum number of lamps that are looked for.
+const LAMPS: usize = 64;
 
 /// A texel is visible at once if its first ray ends in the open, farther away than this many times `near`: most texels
 /// need only one ray.
@@ -55,6 +68,8 @@ pub(in crate::lightmap) struct Search<'a> {
     pub seen: &'a Seen,
     /// Distance up to which surfaces cover a texel, at most the width of a texel of the light map.
     pub near: f32,
+    /// Whether a sun or a sky shines, so that people may stand where rays leave the scene.
+    pub outdoors: bool,
     /// Whether each chart is searched; `None`: all are.
     pub only: Option<&'a [bool]>,
 }
@@ -189,7 +204,7 @@ impl Search<'_> {
         let mut undecided: [Undecided; BLOCK] = std::array::from_fn(|i| {
             let Some(point) = points.get(i) else { return Undecided::default() };
             let (_, receiver) = super::chart_map::receiver_of(self.scene, point, back);
-            Undecided { number: i as u32, origin: receiver.origin, normal: receiver.geometric, open: 0, backs: 0 }
+            Undecided { number: i as u32, origin: receiver.origin, normal: receiver.geometric, ..Default::default() }
         });
         let mut probes = [Ray::new(Vec3::ZERO, Vec3::ZERO); BLOCK];
         let mut hits = [RawHit::MISS; BLOCK];
@@ -206,10 +221,14 @@ impl Search<'_> {
                 match self.seen_by(hit) {
                     Sight::Open if i == 0 && hit.t > AT_ONCE * self.near => continue,
                     Sight::Open => point.open += 1,
-                    Sight::Back => point.backs += 1,
+                    Sight::Nothing => (point.open, point.nothing) = (point.open + 1, point.nothing + 1),
+                    Sight::Back => {
+                        point.backs += 1;
+                        point.near_backs += u32::from(hit.t <= NEARBY * self.near);
+                    }
                     Sight::Covered => {}
                 }
-                if point.open < OPEN || point.backs > 0 {
+                if point.open < OPEN || point.backs > 0 || point.open == point.nothing {
                     undecided[kept] = point;
                     kept += 1;
                 }
@@ -218,14 +237,29 @@ impl Search<'_> {
         }
         let mut are_buried = [false; BLOCK];
         for point in &undecided[..count] {
-            are_buried[point.number as usize] = point.open < OPEN || 2 * point.backs > RAYS;
+            let mut sees_nothing = || {
+                let is_behind = point.open == point.nothing && FEW_BACKS * point.near_backs >= RAYS;
+                is_behind && !self.sees_lamp(point.origin, point.normal, rays)
+            };
+            are_buried[point.number as usize] = point.open < OPEN || 2 * point.backs > RAYS || sees_nothing();
         }
         are_buried
     }
 
+    /// Whether a lamp, which may be switched off, can be seen from a point.
+    fn sees_lamp(&self, origin: Vec3, normal: Vec3, rays: &mut u64) -> bool {
+        let lights = self.scene.lights();
+        let few = lights.iter().step_by(lights.len().div_ceil(LAMPS).max(1));
+        few.filter_map(seen::middle_of).any(|lamp| {
+            let to = lamp - origin;
+            *rays += u64::from(to.dot(normal) > 0.0);
+            to.dot(normal) > 0.0 && !self.scene.occluded(&Ray::new(origin, to).within(0.0, seen::NEARLY))
+        })
+    }
+
     fn seen_by(&self, hit: &RawHit) -> Sight {
         if hit.is_miss() {
-            return Sight::Open;
+            return if self.outdoors { Sight::Open } else { Sight::Nothing };
         }
         let material = self.scene.material(hit.triangle);
         if !hit.front && !material.two_sided && !material.transmits() {
@@ -239,6 +273,8 @@ impl Search<'_> {
 /// Kind of end of a ray.
 enum Sight {
     Open,
+    /// Outside of a scene that has no outside.
+    Nothing,
     /// On the back of a one-sided surface.
     Back,
     /// Within a texel, or on a side that cannot be seen from any open place.
@@ -252,10 +288,12 @@ struct Undecided {
     number: u32,
     origin: Vec3,
     normal: Vec3,
-    /// Rays that ended in the open.
+    /// Rays that ended in the open, and those of them that left an indoor scene.
     open: u32,
-    /// Rays that ended on backs.
+    nothing: u32,
+    /// Rays that ended on backs, and those of them that ended nearby.
     backs: u32,
+    near_backs: u32,
 }
 
 #[derive(Default)]
@@ -396,7 +434,9 @@ mod tests {
             let atlas = lightmap.atlas();
             for s in atlas.map.all().filter(|s| atlas.buried[s.index()]) {
                 let p = atlas.map.surface(&atlas.scene, s).0;
-                assert!(!below(0.0)(p) && below(-0.11)(p) || p.y < 0.0, "{p}");
+                // Texels of the box's sides below the floor take the light of those above it.
+                let is_above_floor = p.y > 0.0 && p.y < 0.051;
+                assert!(!below(0.0)(p) && below(-0.11)(p) || is_above_floor || p.y < 0.0, "{p}");
             }
         }
     }
@@ -421,6 +461,36 @@ mod tests {
                 counted(&lightmap, |p| p.x < 0.001 && p.y > 0.1 && p.y < 1.9 && p.z > 1.1 && p.z < 1.9);
             assert!(if expected { buried > 9 * seen } else { buried * 50 < seen }, "{gap}: {seen} {buried}");
         }
+    }
+
+    /// Unit squares of one-sided surface, each by a corner and two edges, below a lamp in the open.
+    fn squares(squares: &[[Vec3; 3]], texels_per_unit: f32) -> Lightmap {
+        let mut data = SceneData::new();
+        let m = data.add_material(Material::default()).unwrap();
+        for &[at, u, v] in squares {
+            let mut builder = MeshBuilder::new();
+            builder.quad(at, at + u, at + u + v, at + v, m);
+            data.add_mesh(builder.finish()).unwrap();
+        }
+        data.add_light(Light::Point { position: Vec3::new(0.5, 0.9, 0.5), intensity: [1.0; 3] }).unwrap();
+        let desc = LightmapDesc { texels_per_unit, ..Default::default() };
+        Lightmap::create(&data.committed(), &desc, &Progress::none()).unwrap()
+    }
+
+    /// It sees nothing but the sheet's back and the void.
+    #[test]
+    fn a_floor_in_the_open_below_the_back_of_a_sheet_is_not_buried() {
+        let floor = [Vec3::ZERO, Vec3::Z, Vec3::X];
+        let sheet = [0.5 * Vec3::Y, Vec3::Z, 0.5 * Vec3::X];
+        assert_eq!(squares(&[floor, sheet], 32.0).info().buried_texels, 0);
+    }
+
+    /// It sees nothing but the wall's back, nearby, and the void, but the lamp shines on it.
+    #[test]
+    fn a_lit_floor_in_the_open_beside_the_back_of_a_wall_is_not_buried() {
+        let floor = [Vec3::ZERO, Vec3::Z, Vec3::X];
+        let wall = [Vec3::ZERO, Vec3::Z, Vec3::Y];
+        assert_eq!(squares(&[floor, wall], 40.0).info().buried_texels, 0);
     }
 
     /// A wall between two rooms, and a poster 5 mm behind a part of it.

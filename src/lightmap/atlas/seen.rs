@@ -39,7 +39,7 @@ pub(in crate::lightmap) const ROOM: f32 = 0.01;
 const ROOM_TEXELS: f32 = 4.0;
 
 /// Part of the way to a lamp that must be free: it may lie in a wall or a housing.
-const NEARLY: f32 = 0.999;
+pub(super) const NEARLY: f32 = 0.999;
 
 /// Maximum fraction of the hits of rays from an open place that lie on backs of one-sided surfaces.
 pub(super) const BACKS: f32 = 0.05;
@@ -154,6 +154,15 @@ pub(in crate::lightmap) fn is_outdoors(scene: &Scene) -> bool {
     lights.iter().any(shines)
 }
 
+/// Returns the place of a lamp, or its middle; `None`: it is infinitely far away.
+pub(super) fn middle_of(light: &Light) -> Option<Vec3> {
+    match *light {
+        Light::Point { position, .. } | Light::Spot { position, .. } => Some(position),
+        Light::Rect { position, edge_u, edge_v, .. } => Some(position + 0.5 * (edge_u + edge_v)),
+        Light::Directional { .. } | Light::Sky { .. } => None,
+    }
+}
+
 /// Inputs of the search for open places.
 struct Look<'a> {
     scene: &'a Scene,
@@ -234,12 +243,12 @@ impl Look<'_> {
     /// Whether nothing lies between a point and a random light.
     fn sees_light(&self, at: Vec3, random: f32, rays: &mut u64) -> bool {
         let to = |lamp: Vec3| Ray::new(at, lamp - at).within(0.0, NEARLY);
-        let ray = match self.lights.get((random * self.lights.len() as f32) as usize) {
-            Some(&(Light::Point { position, .. } | Light::Spot { position, .. })) => to(position),
-            Some(&Light::Rect { position, edge_u, edge_v, .. }) => to(position + 0.5 * (edge_u + edge_v)),
-            Some(&Light::Directional { direction, .. }) => Ray::new(at, -direction),
+        let Some(light) = self.lights.get((random * self.lights.len() as f32) as usize) else { return false };
+        let ray = match (light, middle_of(light)) {
+            (_, Some(lamp)) => to(lamp),
+            (&Light::Directional { direction, .. }, _) => Ray::new(at, -direction),
             // Walks find the sky where they leave the scene.
-            Some(Light::Sky { .. }) | None => return false,
+            _ => return false,
         };
         *rays += 1;
         !self.scene.occluded(&ray)

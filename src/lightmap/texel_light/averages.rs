@@ -1,7 +1,7 @@
 //! Direct light of texels of the light map: light without penumbrae at their samples, whether it varies, and averages
 //! of points.
 
-use super::{AROUND, FEW, MAX_POINTS, Point, TexelLight, TilePoints, Wanted, differ, vary};
+use super::{AROUND, FEW, MAX_POINTS, Point, TexelLight, TilePoints, Wanted, add_points, differ, line_of_sight, vary};
 use crate::base::directional::Directional;
 use crate::base::sampling::combine;
 use crate::direct::Receiver;
@@ -10,7 +10,6 @@ use crate::direct::shadow_rays::KINDS;
 use crate::lightmap::atlas::ids::{LightMap, LightTexel};
 use crate::lightmap::tiles::TILE;
 use crate::scene::Scene;
-use crate::trace::Ray;
 use glam::Vec3;
 
 /// Light of two texels or points differs if the difference is more than this fraction of the greater.
@@ -23,9 +22,6 @@ const STRATIFIED: f32 = 0.25;
 /// Factor of the variance of skies and many lights, of which few texels may have most light: the blur leaves these out of
 /// others' means. (A room with a window loses 2.1 % of its direct light by what is left out; with 1, 2.6 %.)
 const SKEWED: f32 = 2.0;
-
-/// Height of lines of sight above the surface they run along, as a fraction of their length: it clears curved surfaces.
-const RAISED: f32 = 0.25;
 
 /// A texel whose direct light is to be averaged.
 #[derive(Clone, Copy)]
@@ -133,7 +129,7 @@ impl TexelLight<'_, LightMap> {
         }
         let more = texels.iter().enumerate().filter(|(i, _)| goes_on[*i]);
         tile.light(self, more.filter_map(|(i, t)| wanted(i, t, FEW..MAX_POINTS as u32)), rays);
-        tile.look_up(texels.len(), &self.areas, rays);
+        tile.find_buried(texels.len(), &self.areas, |i| texels[i].receiver, rays);
         for (i, t) in texels.iter().enumerate() {
             let mut directional = t.sharp_directional;
             let (e, variance) = match lights_of(t.variation) {
@@ -160,7 +156,7 @@ impl TexelLight<'_, LightMap> {
             _ => without_other_rooms(points, scene, &t.receiver, sharp, rays),
         };
         let mut sum = PointLight::default();
-        let n = self.areas.add_to(points, &mut sum, |_| Vec3::ONE, rays);
+        let n = add_points(points, &mut sum, |_| Vec3::ONE);
         if n == Vec3::ZERO {
             // All points miss a small part of a chart, or lie inside solids: the sample alone is lit.
             let seed = combine(self.seed, t.texel.seed());
@@ -224,10 +220,8 @@ fn average_by_direction(
 
 /// Whether another surface stands between two points of a surface.
 fn is_hidden(scene: &Scene, a: &Receiver, b: &Receiver, rays: &mut u64) -> bool {
-    let raise = RAISED * a.origin.distance(b.origin);
-    let (from, to) = (a.origin + raise * a.geometric, b.origin + raise * b.geometric);
     *rays += 1;
-    scene.occluded(&Ray::new(from, to - from).within(0.0, 1.0))
+    scene.occluded(&line_of_sight(a, b))
 }
 
 /// Whether some point lies in the penumbra of a disc.

@@ -1,6 +1,6 @@
 //! Direct light of texels of the radiance map: a first look by a few points, and a closer one where it varies.
 
-use super::{FEW, MAX_POINTS, Point, TexelLight, TilePoints, Wanted, differ, vary};
+use super::{FEW, MAX_POINTS, Point, TexelLight, TilePoints, Wanted, add_points, differ, vary};
 use crate::base::sampling::combine;
 use crate::direct::direct_light::{Lights, PointLight};
 use crate::lightmap::atlas::ids::{PerTexel, RadianceMap, RadianceTexel};
@@ -38,18 +38,18 @@ impl TexelLight<'_, RadianceMap> {
         mut out: impl FnMut(usize, Look),
     ) {
         let (scene, map) = (self.areas.scene, self.areas.map);
+        let sample = |i: usize| map.receiver(scene, texels[i], map.is_back(texels[i])).1;
         tile.clear();
         tile.light(self, texels.iter().enumerate().map(|(i, &texel)| self.all_of(i, texel, 0..FEW)), rays);
-        tile.look_up(texels.len(), &self.areas, rays);
+        tile.find_buried(texels.len(), &self.areas, sample, rays);
         for (i, &texel) in texels.iter().enumerate() {
             let (mut sum, points) = (PointLight::default(), tile.of(i));
-            let mut n = self.areas.add_to(points, &mut sum, |_| Vec3::ONE, rays);
+            let mut n = add_points(points, &mut sum, |_| Vec3::ONE);
             let missing = (points.len() as f32 - n.x).max(if n == Vec3::ZERO { 1.0 } else { 0.0 });
             if missing > 0.0 {
                 // Few rays are left: those of the points inside solids go from the sample.
                 let seed = combine(self.seed, texel.seed());
-                let receiver = map.receiver(scene, texel, map.is_back(texel)).1;
-                let light = self.direct.at_point(&receiver, Lights::All, self.samples, seed, rays);
+                let light = self.direct.at_point(&sample(i), Lights::All, self.samples, seed, rays);
                 sum.add(&light, Vec3::splat(missing));
                 n += missing;
             }
@@ -86,6 +86,8 @@ impl TexelLight<'_, RadianceMap> {
         rays: &mut u64,
         mut out: impl FnMut(usize, Option<Vec3>),
     ) {
+        let (scene, map) = (self.areas.scene, self.areas.map);
+        let sample = |i: usize| map.receiver(scene, texels[i], map.is_back(texels[i])).1;
         let weight = |t: &TexelSample| albedo(t).max(Vec3::splat(f32::MIN_POSITIVE));
         let (mut sums, mut weights) = ([PointLight::default(); TILE], [Vec3::ZERO; TILE]);
         // Texels that go on after the first round of points.
@@ -95,9 +97,9 @@ impl TexelLight<'_, RadianceMap> {
             let wanted = texels.iter().enumerate().filter(|(i, _)| has_spikes[*i]);
             tile.clear();
             tile.light(self, wanted.map(|(i, &texel)| self.all_of(i, texel, numbers.clone())), rays);
-            tile.look_up(texels.len(), &self.areas, rays);
+            tile.find_buried(texels.len(), &self.areas, sample, rays);
             for i in (0..texels.len()).filter(|&i| has_spikes[i]) {
-                weights[i] += self.areas.add_to(tile.of(i), &mut sums[i], weight, rays);
+                weights[i] += add_points(tile.of(i), &mut sums[i], weight);
             }
             if begin == 0 {
                 for (i, has_spikes) in has_spikes.iter_mut().enumerate() {

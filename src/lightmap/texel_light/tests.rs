@@ -182,3 +182,29 @@ fn what_lies_under_a_block_does_not_darken_texels_beside_it() {
     }
     assert!(lit > 1000 && dark == 0, "{dark} of {lit}");
 }
+
+#[test]
+fn a_wall_that_reaches_into_floor_and_ceiling_has_no_dark_line_at_its_foot() {
+    let scene = builtin("partition").unwrap().committed();
+    let mut map = created(&scene, 40.0);
+    map.bake(&BakeParams { gather_rays: 0, ..Default::default() }, &Progress::none()).unwrap();
+    let (atlas, light) = (map.atlas(), map.light.as_ref().unwrap());
+    let (mut beside, mut away, mut on_wall) = ([0.0, 0.0], [0.0, 0.0], 0);
+    for (t, e) in atlas.map.texels.samples.iter().zip(&light.direct) {
+        let (at, normal) = (t.position(&scene), t.geometric_normal(&scene));
+        if normal.x < -0.9 && (at.x - 2.99).abs() < 1e-3 {
+            // What lies outside of the room takes its light from what can be seen.
+            assert!(at.min_element() > -1e-4 && at.y < 2.6001, "{at}");
+            on_wall += 1;
+        }
+        if normal.y > 0.9 && at.y.abs() < 1e-3 && at.x < 2.99 && at.z > 0.2 && at.z < 3.4 {
+            let sum = if at.x > 2.965 { &mut beside } else { &mut away };
+            if at.x > 2.89 {
+                *sum = [sum[0] + e.x, sum[1] + 1.0];
+            }
+        }
+    }
+    assert!(on_wall > 1000 && beside[1] > 100.0 && away[1] > 100.0, "{on_wall}, {beside:?}, {away:?}");
+    let ratio = beside[0] / beside[1] / (away[0] / away[1]);
+    assert!((0.96..1.01).contains(&ratio), "{ratio}");
+}
