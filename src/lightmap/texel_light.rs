@@ -44,7 +44,11 @@ use std::ops::Range;
 /// Maximum number of points of a texel that are lit together.
 const MAX_POINTS: usize = 16;
 
-/// Number of rays straight up that are worth a stream.
+/// Number of rays that tell whether a point lies inside a solid: straight up and to four sides. (The ray straight up alone
+/// may hit the back of a single sheet, such as a table top, below which there is light.)
+const PROBES: usize = 5;
+
+/// Number of these rays that are worth a stream.
 const LEAST_STREAM: usize = 32;
 
 /// Number of points in a texel in which light is not known to vary.
@@ -97,16 +101,14 @@ impl<M: Map> TexelAreas<'_, M> {
                 })
     }
 
-    /// Whether a point lies inside a solid: the rays straight up and to four sides all hit its surface from inside.
-    /// (The ray straight up alone may hit the back of a single sheet, such as a table top, below which there is light.)
+    /// Whether a point lies inside a solid: all of its [`PROBES`] hit its surface from inside.
     fn is_buried(&self, point: &Point, rays: &mut u64) -> bool {
-        let Receiver { origin, geometric, .. } = point.receiver;
-        let (x, y) = orthonormal_basis(geometric);
-        point.may_be_buried
-            && [Vec3::ZERO, x, -x, y, -y].into_iter().all(|aside| {
+        point.buried.unwrap_or_else(|| {
+            (0..PROBES).all(|number| {
                 *rays += 1;
-                self.is_inner(&self.scene.intersect_raw(&Ray::new(origin, geometric + aside)))
+                self.is_inner(&self.scene.intersect_raw(&probe(&point.receiver, number)))
             })
+        })
     }
 
     /// Adds the light of the points that are not inside of solids, by their weights; returns the sum of the weights.
@@ -161,8 +163,15 @@ struct Point {
     light: PointLight,
     /// Number of the point in its tile.
     place: u32,
-    /// Whether the ray straight up may hit the back of a one-sided surface.
-    may_be_buried: bool,
+    /// Whether it lies inside a solid, if that has been found out for the whole tile.
+    buried: Option<bool>,
+}
+
+/// Returns one of the rays that tell whether a point lies inside a solid.
+fn probe(receiver: &Receiver, number: usize) -> Ray {
+    let Receiver { origin, geometric, .. } = *receiver;
+    let (x, y) = orthonormal_basis(geometric);
+    Ray::new(origin, geometric + [Vec3::ZERO, x, -x, y, -y][number])
 }
 
 /// Points of the texels of a tile, up to [`MAX_POINTS`] of each at a time.
@@ -170,10 +179,10 @@ pub(crate) struct TilePoints {
     points: Vec<Point>,
     /// Number of points of each texel.
     counts: Vec<usize>,
-    /// Points whose light has not arrived yet, or whose rays straight up have not been traced.
+    /// Points whose light has not arrived yet, or which may lie inside solids.
     pending: Vec<u32>,
-    rays_up: Vec<Ray>,
-    hits_up: Vec<RawHit>,
+    probes: Vec<Ray>,
+    hits: Vec<RawHit>,
     room: TileRoom,
     /// Light by direction that has arrived at each point, by kind; empty if nobody asks for it.
     directional: Vec<[Directional; KINDS]>,
@@ -202,14 +211,14 @@ impl TilePoints {
             raised: false,
         };
         let point =
-            Point { on: TexelSample::default(), receiver, light: PointLight::default(), place: 0, may_be_buried: true };
+            Point { on: TexelSample::default(), receiver, light: PointLight::default(), place: 0, buried: None };
         let points = texels * MAX_POINTS;
         Ok(TilePoints {
             points: try_filled(points, point, what)?,
             counts: try_filled(texels, 0, what)?,
             pending: try_with_capacity(points, what)?,
-            rays_up: try_with_capacity(points, what)?,
-            hits_up: try_filled(points, RawHit::MISS, what)?,
+            probes: try_with_capacity(points, what)?,
+            hits: try_filled(points, RawHit::MISS, what)?,
             room: TileRoom::new(KINDS * points, points)?,
             directional: Vec::new(),
         })
@@ -235,29 +244,36 @@ impl TilePoints {
         (&mut self.points[place * MAX_POINTS..][..self.counts[place]], &self.directional)
     }
 
-    /// Traces the rays straight up from unlit points beside lit ones, in the first `texels` of the tile, which tell that
-    /// nearly none of them is [buried](TexelAreas::is_buried). Of texels without any lit point the first point tells
-    /// it for all.
+    /// Finds which unlit points beside lit ones lie [inside solids](TexelAreas::is_buried), in the first `texels` of the
+    /// tile. Of texels without any lit point the first point tells it for all.
     fn look_up<M: Map>(&mut self, texels: usize, areas: &TexelAreas<M>, rays: &mut u64) {
         self.pending.clear();
-        self.rays_up.clear();
         for (i, &count) in self.counts[..texels].iter().enumerate() {
             let points = i * MAX_POINTS..i * MAX_POINTS + count;
             let all_are_dark = self.points[points.clone()].iter().all(|p| p.light.is_dark());
             let few = if all_are_dark { 1 } else { count };
-            for place in points.filter(|&place| self.points[place].light.is_dark()).take(few) {
-                let Receiver { origin, geometric, .. } = self.points[place].receiver;
-                self.rays_up.push(Ray::new(origin, geometric));
-                self.pending.push(place as u32);
+            let dark = points.filter(|&place| self.points[place].light.is_dark()).take(few);
+            self.pending.extend(dark.map(|place| place as u32));
+        }
+        // The first ray decides for nearly all of them.
+        for number in 0..PROBES {
+            self.probes.clear();
+            self.probes.extend(self.pending.iter().map(|&place| probe(&self.points[place as usize].receiver, number)));
+            match self.probes.len() {
+                0 => break,
+                ..LEAST_STREAM => areas.scene.intersect_block(&self.probes, &mut self.hits),
+                _ => areas.scene.intersect_stream(&self.probes, &mut self.hits),
             }
-        }
-        match self.rays_up.len() < LEAST_STREAM {
-            true => areas.scene.intersect_block(&self.rays_up, &mut self.hits_up),
-            false => areas.scene.intersect_stream(&self.rays_up, &mut self.hits_up),
-        }
-        *rays += self.rays_up.len() as u64;
-        for (&place, hit) in self.pending.iter().zip(&self.hits_up) {
-            self.points[place as usize].may_be_buried = areas.is_inner(hit);
+            *rays += self.probes.len() as u64;
+            let mut hits = self.hits.iter();
+            self.pending.retain(|&place| {
+                let goes_on = hits.next().is_some_and(|hit| areas.is_inner(hit));
+                let is_last = number + 1 == PROBES;
+                if !goes_on || is_last {
+                    self.points[place as usize].buried = Some(goes_on);
+                }
+                goes_on
+            });
         }
     }
 
@@ -302,7 +318,7 @@ impl TilePoints {
                 let (count, at) = (self.counts[place], place * MAX_POINTS + self.counts[place]);
                 shadow.slot = KINDS * at;
                 let light = by.direct.push(&receiver, (count - first) as u32, lights, samples, of_round, &mut shadow);
-                self.points[at] = Point { on, receiver, light, place: at as u32, may_be_buried: true };
+                self.points[at] = Point { on, receiver, light, place: at as u32, buried: None };
                 self.pending.push(at as u32);
                 self.counts[place] += 1;
             }

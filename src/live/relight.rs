@@ -3,7 +3,7 @@
 //!
 //! Direct light follows at once. Indirect light needs new photons and a new radiance map, which one
 //! thread computes beside the updates: first with a sixteenth of the photons, so that the change is
-//! soon seen, then with all. So few photons cannot tell which side of a sheet is the lit one (with
+//! soon seen, then with all. After a first impression at the start, with all at once. So few photons cannot tell which side of a sheet is the lit one (with
 //! them, Sponza showed 8 % error for a second): sides change with all photons only.
 
 use super::Live;
@@ -33,8 +33,11 @@ const QUICK_PART: u64 = 16;
 pub(super) struct Sides {
     /// Per chart with one placement, whether its back is shown.
     pub backs: Vec<bool>,
-    /// Interpolation from the gather map to the light map for these sides; unconstrained without indirect light.
+    /// Interpolation from the gather map to the light map for these sides; unconstrained without indirect light, and in
+    /// first impressions.
     pub upsampling: Upsampling,
+    /// Whether this is a first impression.
+    pub is_first: bool,
 }
 
 /// Light as gathered and shown by texels.
@@ -81,7 +84,7 @@ fn illuminate(
             let backs = stages::backs(&inputs, &radiance.values)?;
             let placements = if has_indirect { atlas.map.layout.placements.len() } else { 0 };
             let upsampling = stages::upsampling(&inputs, &backs, 0..placements, None)?;
-            Arc::new(Sides { backs, upsampling })
+            Arc::new(Sides { backs, upsampling, is_first: false })
         }
     };
     // Without indirect light there is no radiance map to look up.
@@ -95,11 +98,30 @@ fn illuminate(
     Ok(Indirect { radiance, sides, own, has_indirect })
 }
 
+/// Computes a first impression of radiance map and sides. Texels neither gather for themselves nor know of walls between
+/// them and the gather texels around.
+fn illuminate_quickly(
+    atlas: &Atlas,
+    params: &BakeParams,
+    direct: &DirectLight,
+    progress: &Progress,
+) -> Result<Indirect> {
+    let plan = Plan::new(&atlas.scene, direct, params, !atlas.radiance.layout.back_of.is_empty(), false);
+    let inputs = Inputs { atlas, direct, params, progress };
+    let radiance = stages::illuminate_quickly(&inputs, &plan)?;
+    let backs = stages::backs(&inputs, &radiance.values)?;
+    let sides = Arc::new(Sides { backs, is_first: true, ..Default::default() });
+    Ok(Indirect { radiance, sides, own: Own::default(), has_indirect: plan.runs(left_out::INDIRECT) })
+}
+
 impl Illumination {
-    /// Computes the light of the scene's current lights, with all photons.
-    pub fn new(atlas: &Atlas, params: &BakeParams, progress: &Progress) -> Result<Illumination> {
+    /// Computes the light of the scene's current lights, with all photons, or a first impression of it.
+    pub fn new(atlas: &Atlas, params: &BakeParams, quick: bool, progress: &Progress) -> Result<Illumination> {
         let direct = DirectLight::try_new(&atlas.scene)?;
-        let i = illuminate(atlas, params, &direct, None, progress)?;
+        let i = match quick {
+            true => illuminate_quickly(atlas, params, &direct, progress)?,
+            false => illuminate(atlas, params, &direct, None, progress)?,
+        };
         Ok(Illumination {
             direct: Arc::new(direct),
             radiance: Arc::new(i.radiance),
@@ -188,6 +210,16 @@ impl Relight {
             self.again = true;
             return Ok(());
         }
+        self.begin(atlas, params, Some(sides.clone()))
+    }
+
+    /// Begins the computation with all photons that follows a first impression.
+    pub fn start_second(&mut self, atlas: &Arc<Atlas>, params: &BakeParams) -> Result<()> {
+        self.begin(atlas, params, None)
+    }
+
+    /// Begins a renewal; with a quick part if there are sides that this keeps.
+    fn begin(&mut self, atlas: &Arc<Atlas>, params: &BakeParams, shown: Option<Arc<Sides>>) -> Result<()> {
         let device = match &self.device {
             Some(device) => device.clone(),
             None => Device::new(DeviceOptions {
@@ -196,7 +228,7 @@ impl Relight {
                 ..Default::default()
             })?,
         };
-        let (atlas, params, shown) = (atlas.clone(), *params, sides.clone());
+        let (atlas, params) = (atlas.clone(), *params);
         let (sender, results) = channel();
         let cancel = Arc::new(AtomicBool::new(false));
         let abandon = Arc::new(AtomicBool::new(false));
@@ -216,7 +248,9 @@ impl Relight {
                 None => progress,
             };
             let progress = waiting(Progress::new(move |_, _| !abandoned.load(Relaxed)));
-            let _ = sender.send(compute(&quick, Some(shown), &progress));
+            if shown.is_some() {
+                let _ = sender.send(compute(&quick, shown, &progress));
+            }
             let progress = waiting(Progress::new(move |_, _| !cancelled.load(Relaxed)));
             let _ = sender.send(compute(&params, None, &progress));
         });
@@ -441,7 +475,7 @@ mod tests {
         let desc = LightmapDesc { texels_per_unit: 3.0, ..Default::default() };
         let lightmap = Lightmap::create(&scene, &desc, &Progress::none()).unwrap();
         let (atlas, params) = (lightmap.atlas(), BakeParams { photon_count: 20_000, ..Default::default() });
-        let light = Illumination::new(atlas, &params, &Progress::none()).unwrap();
+        let light = Illumination::new(atlas, &params, false, &Progress::none()).unwrap();
         assert!(light.own.iter().any(|own| own.is_some_and(|e| e != Vec3::ZERO)));
         let renewals = || {
             let (mut relight, mut results) = (Relight::default(), Vec::new());
