@@ -110,6 +110,13 @@ pub struct bk_live_params {
     /// side. A grid of more than 2^24 cells is refused. Lower it for finer decisions in
     /// BK_LIVE_POSITION; more cells take more time per update to sort. Default: 0.
     pub cell_size: f32,
+    /// 1: begin with a first impression of the light that was reflected by other surfaces: a quarter of
+    /// the photons, few points per texel of the radiance map, and light that may cross walls by a texel of
+    /// the gather map. All that a bake computes then follows on a thread of its own beside the updates,
+    /// while bk_live_stats.light_pending is 1, and replaces it: finished light is the same. Set it to 1
+    /// where the first picture must come soon on a machine of few cores (Sponza: 1.5 instead of 3.2 s
+    /// from nothing). States are saved and restored when nothing is pending. Default: 0.
+    pub quick_start: u32,
     /// Seed of all random numbers, see bk_bake_params. Default: 0.
     pub seed: u64,
     /// Number of photons to emit, see bk_bake_params. Lower it where bk_live_create and changes of
@@ -142,13 +149,6 @@ pub struct bk_live_params {
     /// light map (48 per texel of tiles, which overlap). With both, the layers hold the sum.
     /// Default: 0.
     pub directional_direct: u32,
-    /// 1: begin with a first impression of the light that was reflected by other surfaces: a quarter of
-    /// the photons, few points per texel of the radiance map, and light that may cross walls by a texel of
-    /// the gather map. All that a bake computes then follows on a thread of its own beside the updates,
-    /// while bk_live_stats.light_pending is 1, and replaces it: finished light is the same. Set it to 1
-    /// where the first picture must come soon on a machine of few cores (Sponza: 1.5 instead of 3.3 s
-    /// from nothing). States are saved and restored when nothing is pending. Default: 0.
-    pub quick_start: u32,
 }
 
 sized_struct!(bk_live_params, defaults: {
@@ -162,6 +162,7 @@ sized_struct!(bk_live_params, defaults: {
         rays_per_update: p.rays_per_update,
         blur: p.blur,
         cell_size: p.cell_size,
+        quick_start: p.quick_start as u32,
         seed: p.seed,
         photon_count: p.photon_count,
         max_bounces: p.max_bounces,
@@ -173,7 +174,6 @@ sized_struct!(bk_live_params, defaults: {
         background: p.background as u32,
         directional_indirect: u32::from(p.directional & directional::INDIRECT != 0),
         directional_direct: u32::from(p.directional & directional::DIRECT != 0),
-        quick_start: p.quick_start as u32,
     }
 });
 

@@ -2,7 +2,7 @@
 
 use super::dirty::{LEAST_BYTES, TEXEL_BYTES};
 use super::display::{Changed, Display};
-use super::relight::Illumination;
+use super::illumination::Illumination;
 use super::{Budget, Live, LiveStats, Mode, PASS};
 use std::time::Instant;
 

@@ -123,9 +123,8 @@ fn trials(
     rays: &mut u64,
     progress: &Progress,
 ) -> Result<[Vec<Trial>; 2]> {
-    let lookup = |bright| {
-        HitRadiance::of_map(RadianceLookup::new(&atlas.charts, &atlas.radiance, radiance).with(bright))
-    };
+    let lookup =
+        |bright| HitRadiance::of_map(RadianceLookup::new(&atlas.charts, &atlas.radiance, radiance).with(bright));
     let lookups = bright.map(lookup);
     let samples = SampleSet::new(ROUND as u32, 0);
     let at = |&texel: &RadianceTexel| {
