@@ -259,10 +259,9 @@ impl TilePoints {
         for number in 0..PROBES {
             self.probes.clear();
             self.probes.extend(self.pending.iter().map(|&place| probe(&self.points[place as usize].receiver, number)));
-            match self.probes.len() {
-                0 => break,
-                ..LEAST_STREAM => areas.scene.intersect_block(&self.probes, &mut self.hits),
-                _ => areas.scene.intersect_stream(&self.probes, &mut self.hits),
+            match self.probes.len() < LEAST_STREAM {
+                true => areas.scene.intersect_block(&self.probes, &mut self.hits),
+                false => areas.scene.intersect_stream(&self.probes, &mut self.hits),
             }
             *rays += self.probes.len() as u64;
             let mut hits = self.hits.iter();
