@@ -345,6 +345,25 @@ fn after_a_light_has_changed_the_updates_end_with_the_bits_of_a_bake_under_it() 
     assert!(e.ends_with("light 7 does not exist, the scene has 1"), "{e}");
 }
 
+/// A quick start shows light at once that is about that of a bake, and all is as without it once nothing is pending.
+#[test]
+fn after_a_quick_start_the_updates_end_with_the_bits_of_a_bake() {
+    for (name, directional) in [("cornell", 3), ("atrium", 0)] {
+        let mut lightmap = unbaked(name, 2, if name == "cornell" { 60.0 } else { 2.0 });
+        let params = LiveParams { quick_start: true, directional, ..params(Mode::Position) };
+        let mut live = Live::new(&lightmap, &params, &Progress::none()).unwrap();
+        let first = pages(&live, &lightmap);
+        let mean = |pages: &[[f32; 3]]| pages.iter().flatten().map(|&c| f64::from(c)).sum::<f64>();
+        assert!(live.update(&camera(0), &RAYS).unwrap().light_pending, "{name}");
+        live.finish_relighting().unwrap();
+        let stats = finish(&mut live);
+        assert_eq!((stats.finished, stats.light_pending), (1.0, false), "{name}");
+        assert_same_as_bake(&live, &mut lightmap, name);
+        let ratio = mean(&first) / mean(&pages(&live, &lightmap));
+        assert!((0.8..1.25).contains(&ratio), "{name}: the first light is {ratio} of the last");
+    }
+}
+
 #[test]
 fn what_changes_is_covered_by_dirty_rectangles_and_is_never_negative() {
     for mode in [Mode::View, Mode::Position, Mode::Uniform] {

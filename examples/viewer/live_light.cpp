@@ -165,6 +165,7 @@ void LiveLight::set_mode(Mode new_mode, const Progress *progress) {
     bk_live_params params;
     bk_live_params_init(&params);
     params.mode = wanted;
+    params.quick_start = 1; // somebody waits for the first picture
     bk_live *new_live = nullptr;
     live.reset();
     check(bk_live_create(lightmap.get(), &params, progress ? call_progress : nullptr, const_cast<Progress *>(progress),

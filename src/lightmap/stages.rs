@@ -42,6 +42,9 @@ const RADIUS_TEXELS: f32 = 0.75;
 const MOST_STORED: u64 = 1 << 24;
 const STORED_PER_TEXEL: u64 = 256;
 
+/// Divisor of the photon count in a first impression. (With a sixteenth the sides of sheets in Sponza are told wrongly.)
+const QUICK_PART: u64 = 4;
+
 /// Divisor of `direct_samples` in the radiance map, which is coarser than the light map.
 const RADIANCE_SAMPLE_DIVISOR: u32 = 4;
 
@@ -68,7 +71,20 @@ pub(crate) fn illuminate(inputs: &Inputs, plan: &Plan, stats: &mut BakeStats) ->
         return Ok(Radiance::default());
     }
     let photons = if plan.runs(left_out::PHOTONS) { Some(photons(inputs, stats)?) } else { None };
-    radiance(inputs, photons.as_ref(), stats)
+    radiance(inputs, photons.as_ref(), false, stats)
+}
+
+/// Computes a first impression of the radiance map, by a part of the photons, in a fraction of the time that
+/// [`illuminate`] takes; empty if the plan leaves indirect light out.
+pub(crate) fn illuminate_quickly(inputs: &Inputs, plan: &Plan) -> Result<Radiance> {
+    if !plan.runs(left_out::INDIRECT) {
+        return Ok(Radiance::default());
+    }
+    let stats = &mut BakeStats::default();
+    let few = BakeParams { photon_count: inputs.params.photon_count.div_ceil(QUICK_PART), ..*inputs.params };
+    let few = Inputs { params: &few, ..*inputs };
+    let photons = if plan.runs(left_out::PHOTONS) { Some(photons(&few, stats)?) } else { None };
+    radiance(inputs, photons.as_ref(), true, stats)
 }
 
 fn photons(inputs: &Inputs, stats: &mut BakeStats) -> Result<PhotonMap> {
@@ -93,7 +109,7 @@ fn photons(inputs: &Inputs, stats: &mut BakeStats) -> Result<PhotonMap> {
     Ok(map)
 }
 
-fn radiance(inputs: &Inputs, photons: Option<&PhotonMap>, stats: &mut BakeStats) -> Result<Radiance> {
+fn radiance(inputs: &Inputs, photons: Option<&PhotonMap>, quick: bool, stats: &mut BakeStats) -> Result<Radiance> {
     let start = Instant::now();
     let Inputs { atlas, direct, params, progress } = *inputs;
     let device = atlas.scene.device();
@@ -105,11 +121,11 @@ fn radiance(inputs: &Inputs, photons: Option<&PhotonMap>, stats: &mut BakeStats)
         samples: params.direct_samples.div_ceil(RADIANCE_SAMPLE_DIVISOR),
         seed: purpose_seed(params.seed, purpose::RADIANCE),
     };
-    let input = RadianceInput { light, photons };
+    let input = RadianceInput { light, photons, quick };
     let mut rays = radiance_map::bake(device, &input, &mut values, &stage)?;
     let mut radiance = Radiance { values, bright: Bright::default() };
     // Paths from all hits look nothing up, and so find bright patches by their own shadow rays.
-    if params.near_hits < f32::INFINITY {
+    if params.near_hits < f32::INFINITY && !quick {
         device.install(|| find_bright_patches::find(atlas, &mut radiance, &mut rays, progress))?;
     }
     let bytes = (radiance.values.len() * size_of::<Vec3>() + atlas.radiance.bytes()) as u64;

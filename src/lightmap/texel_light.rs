@@ -45,7 +45,11 @@ use std::ops::Range;
 /// Maximum number of points of a texel that are lit together.
 const MAX_POINTS: usize = 16;
 
-/// Number of lines of sight that are worth a stream.
+/// Number of rays that tell whether a point lies inside a solid: straight up and to four sides. (The ray straight up alone
+/// may hit the back of a single sheet, such as a table top, below which there is light.)
+const PROBES: usize = 5;
+
+/// Number of lines of sight, or of such rays, that are worth a stream.
 const LEAST_STREAM: usize = 32;
 
 /// Number of points in a texel in which light is not known to vary.
@@ -96,17 +100,6 @@ impl<M: Map> TexelAreas<'_, M> {
                     let material = self.scene.material(hit.triangle);
                     !material.two_sided && !material.transmits()
                 })
-    }
-
-    /// Whether a point from which the ray straight up hits the surface of a solid from inside lies in it: rays to four sides do
-    /// so, too. (The ray straight up alone may hit the back of a single sheet, such as a table top, below which there is
-    /// light.)
-    fn is_enclosed(&self, receiver: &Receiver, rays: &mut u64) -> bool {
-        let (x, y) = orthonormal_basis(receiver.geometric);
-        [x, -x, y, -y].into_iter().all(|aside| {
-            *rays += 1;
-            self.is_inner(&self.scene.intersect_raw(&Ray::new(receiver.origin, receiver.geometric + aside)))
-        })
     }
 
     /// Returns the texels [around](AROUND) a texel in the same placement, where there are any.
@@ -163,6 +156,13 @@ fn line_of_sight(a: &Receiver, b: &Receiver) -> Ray {
     let raise = RAISED * a.origin.distance(b.origin);
     let (from, to) = (a.origin + raise * a.geometric, b.origin + raise * b.geometric);
     Ray::new(from, to - from).within(0.0, 1.0)
+}
+
+/// Returns one of the rays that tell whether a point lies inside a solid.
+fn probe(receiver: &Receiver, number: usize) -> Ray {
+    let Receiver { origin, geometric, .. } = *receiver;
+    let (x, y) = orthonormal_basis(geometric);
+    Ray::new(origin, geometric + [Vec3::ZERO, x, -x, y, -y][number])
 }
 
 /// Points of the texels of a tile, up to [`MAX_POINTS`] of each at a time.
@@ -236,8 +236,8 @@ impl TilePoints {
     }
 
     /// Traces the lines of sight from unlit points beside lit ones to the samples of their texels, for the first `texels` of
-    /// the tile, and those that are left straight up and to four sides, which tell which of them [lie inside solids](Point::is_buried). Of texels without any lit point the first
-    /// point tells it for all.
+    /// the tile, and [rays](probe) from those that are left, which tell which of them [lie inside
+    /// solids](Point::is_buried). Of texels without any lit point the first point tells it for all.
     fn find_buried<M: Map>(
         &mut self,
         texels: usize,
@@ -264,15 +264,16 @@ impl TilePoints {
         }
         // A solid that something else covers on the way to the sample is found by what is around the point.
         self.pending.retain(|&place| !self.points[place as usize].is_buried);
-        self.lines.clear();
-        for &place in &self.pending {
-            let Receiver { origin, geometric, .. } = self.points[place as usize].receiver;
-            self.lines.push(Ray::new(origin, geometric));
+        // The first ray decides for nearly all of them.
+        for number in 0..PROBES {
+            self.lines.clear();
+            self.lines.extend(self.pending.iter().map(|&place| probe(&self.points[place as usize].receiver, number)));
+            self.trace_lines(areas, rays);
+            let mut hits = self.line_hits.iter();
+            self.pending.retain(|_| hits.next().is_some_and(|hit| areas.is_inner(hit)));
         }
-        self.trace_lines(areas, rays);
-        for (&place, hit) in self.pending.iter().zip(&self.line_hits) {
-            let point = &mut self.points[place as usize];
-            point.is_buried = areas.is_inner(hit) && areas.is_enclosed(&point.receiver, rays);
+        for &place in &self.pending {
+            self.points[place as usize].is_buried = true;
         }
     }
 

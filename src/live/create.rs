@@ -5,9 +5,10 @@ use super::cells::{Grid, Promotion};
 use super::choose::Chooser;
 use super::dirty::Dirty;
 use super::display::Display;
+use super::illumination::Illumination;
 use super::limit::Limit;
 use super::readback::{ChartBins, ReadingTime};
-use super::relight::{Illumination, Relight};
+use super::relight::Relight;
 use super::room::{Room, Rooms};
 use super::visibility::Visibility;
 use super::work::Context;
@@ -40,6 +41,10 @@ impl Live {
         device.run(progress, || {
             let mut live = Live::idle(lightmap, params, progress)?;
             live.start(progress)?;
+            if params.quick_start && live.context.light.has_indirect {
+                live.make_room_for_epochs()?;
+                live.relight.start_second(lightmap.atlas(), &live.bake)?;
+            }
             Ok(live)
         })
     }
@@ -52,7 +57,7 @@ impl Live {
         let (lower, upper) = atlas.scene.bounds();
         let grid = Grid::new(lower, upper, params.cell_size, &mut map.tiles)?;
         let lights = atlas.scene.lights();
-        let light = Illumination::new(atlas, &bake, progress)?;
+        let light = Illumination::new(atlas, &bake, params.quick_start, progress)?;
         progress.check()?;
         let display = Display::new(&map, params.blur, params.directional != 0)?;
         progress.check()?;

@@ -4,7 +4,7 @@
 //! the same weights ([`shown_layer`](super::shown_layer)).
 
 use super::blocks::{BLOCK_TEXELS, BlockMap, Blocks, DirectTile, Rect};
-use super::relight::{Illumination, Sides};
+use super::illumination::{Illumination, Sides};
 use super::shown_layer::{Shown, ShownLayer, Surface, copy_of, slot_size};
 use super::{SHOWN_AT_ONCE, in_parts};
 use crate::base::directional::Directional;

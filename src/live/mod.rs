@@ -19,6 +19,7 @@ mod choose;
 mod create;
 mod dirty;
 mod display;
+mod illumination;
 mod limit;
 mod lists;
 mod params;

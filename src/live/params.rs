@@ -58,6 +58,9 @@ pub struct LiveParams {
     pub interpolation_error: f32,
     /// Number of rays of such texels, as in a bake.
     pub own_rays: u32,
+    /// Whether the object begins with a first impression of indirect light, which is replaced by that of all photons when
+    /// this has been computed between updates.
+    pub quick_start: bool,
     /// Whether the device's threads go on working between updates.
     pub background: bool,
     /// Bits of [`directional`]: the light that is computed by direction too, as in a bake.
@@ -83,6 +86,7 @@ impl Default for LiveParams {
             near_hits: bake.near_hits,
             interpolation_error: f32::INFINITY,
             own_rays: OWN_RAYS,
+            quick_start: false,
             background: false,
             directional: bake.directional,
         }
@@ -121,7 +125,7 @@ pub struct Budget {
 /// Numbers about an update, and the state after it.
 #[derive(Clone, Copy, Debug, Default, PartialEq)]
 pub struct LiveStats {
-    /// Whether indirect light is being recomputed because a light has changed.
+    /// Whether indirect light is being recomputed because a light has changed, or after a quick start.
     pub light_pending: bool,
     /// Duration of the update in milliseconds.
     pub milliseconds: f32,

@@ -1,24 +1,19 @@
-//! The light that live updates show: lights, radiance map and sides of charts, and their renewal in the background when
-//! a light changes.
+//! Renewal of the light that live updates show, in the background: when a light changes, and after a quick start.
 //!
 //! Direct light follows at once. Indirect light needs new photons and a new radiance map, which one
 //! thread computes beside the updates: first with a sixteenth of the photons, so that the change is
-//! soon seen, then with all. So few photons cannot tell which side of a sheet is the lit one (with
-//! them, Sponza showed 8 % error for a second): sides change with all photons only.
+//! soon seen, then with all; after a quick start with all at once. So few photons cannot tell which side of a sheet is the
+//! lit one (with them, Sponza showed 8 % error for a second): sides change with all photons only.
 
 use super::Live;
+use super::illumination::{Illumination, Indirect, Sides, illuminate};
 use crate::base::error::{Error, Result, invalid_argument};
 use crate::base::gate::{Closed, Gate};
-use crate::base::memory::{try_collect, try_vec};
 use crate::base::progress::Progress;
 use crate::device::{Device, DeviceOptions};
 use crate::direct::DirectLight;
+use crate::lightmap::BakeParams;
 use crate::lightmap::atlas::Atlas;
-use crate::lightmap::indirect::radiance_map::Radiance;
-use crate::lightmap::indirect::upsample::{OwnDirectional, OwnLight, Upsampling};
-use crate::lightmap::plan::{Plan, left_out};
-use crate::lightmap::stages::{self, Inputs, Own};
-use crate::lightmap::{BakeParams, BakeStats, directional};
 use std::panic::{AssertUnwindSafe, catch_unwind};
 use std::sync::atomic::{AtomicBool, Ordering::Relaxed};
 use std::sync::mpsc::{Receiver, TryRecvError, channel};
@@ -27,118 +22,6 @@ use std::time::Duration;
 
 /// Divisor of the photon count in the first, quick renewal.
 const QUICK_PART: u64 = 16;
-
-/// The shown sides of charts.
-#[derive(Default)]
-pub(super) struct Sides {
-    /// Per chart with one placement, whether its back is shown.
-    pub backs: Vec<bool>,
-    /// Interpolation from the gather map to the light map for these sides; unconstrained without indirect light.
-    pub upsampling: Upsampling,
-}
-
-/// Light as gathered and shown by texels.
-#[derive(Clone)]
-pub(super) struct Illumination {
-    pub direct: Arc<DirectLight>,
-    /// The radiance map, by sample.
-    pub radiance: Arc<Radiance>,
-    pub sides: Arc<Sides>,
-    /// Light of the texels that gather for themselves, as no gather texel can be interpolated for them.
-    pub own: Arc<OwnLight>,
-    pub own_directional: Arc<OwnDirectional>,
-    /// Whether there is any indirect light, or ever was.
-    pub has_indirect: bool,
-    /// Epochs of direct and indirect light: they change with the data.
-    pub direct_epoch: u32,
-    pub indirect_epoch: u32,
-}
-
-/// New radiance map and sides; the sides may be those that were shown before.
-pub(super) struct Indirect {
-    radiance: Radiance,
-    sides: Arc<Sides>,
-    own: Own,
-    has_indirect: bool,
-}
-
-/// Computes radiance map and sides under the scene's current lights, or keeps `sides`.
-fn illuminate(
-    atlas: &Atlas,
-    params: &BakeParams,
-    direct: &DirectLight,
-    sides: Option<Arc<Sides>>,
-    progress: &Progress,
-) -> Result<Indirect> {
-    let two_sided = !atlas.radiance.layout.back_of.is_empty();
-    let plan = Plan::new(&atlas.scene, direct, params, two_sided, false);
-    let inputs = Inputs { atlas, direct, params, progress };
-    let radiance = stages::illuminate(&inputs, &plan, &mut BakeStats::default())?;
-    let has_indirect = plan.runs(left_out::INDIRECT);
-    let sides = match sides {
-        Some(sides) => sides,
-        None => {
-            let backs = stages::backs(&inputs, &radiance.values)?;
-            let placements = if has_indirect { atlas.map.layout.placements.len() } else { 0 };
-            let upsampling = stages::upsampling(&inputs, &backs, 0..placements, None)?;
-            Arc::new(Sides { backs, upsampling })
-        }
-    };
-    // Without indirect light there is no radiance map to look up.
-    let own = match has_indirect {
-        true => {
-            let asks = params.directional & directional::INDIRECT != 0;
-            stages::own_light(&inputs, &radiance, &sides.backs, &sides.upsampling, asks)?
-        }
-        false => Own::default(),
-    };
-    Ok(Indirect { radiance, sides, own, has_indirect })
-}
-
-impl Illumination {
-    /// Computes the light of the scene's current lights, with all photons.
-    pub fn new(atlas: &Atlas, params: &BakeParams, progress: &Progress) -> Result<Illumination> {
-        let direct = DirectLight::try_new(&atlas.scene)?;
-        let i = illuminate(atlas, params, &direct, None, progress)?;
-        Ok(Illumination {
-            direct: Arc::new(direct),
-            radiance: Arc::new(i.radiance),
-            sides: i.sides,
-            own: Arc::new(i.own.light),
-            own_directional: Arc::new(i.own.directional),
-            has_indirect: i.has_indirect,
-            direct_epoch: 1,
-            indirect_epoch: 1,
-        })
-    }
-
-    /// Makes a copy with new indirect light.
-    pub fn renewed(&self, new: Indirect) -> Result<Illumination> {
-        let mut light = Illumination { indirect_epoch: self.indirect_epoch + 1, ..self.clone() };
-        if new.has_indirect {
-            light.radiance = Arc::new(new.radiance);
-            if light.sides.backs != new.sides.backs {
-                // Other sides are shown: their direct light differs too.
-                light.direct_epoch += 1;
-            }
-            (light.sides, light.own) = (new.sides, Arc::new(new.own.light));
-            light.own_directional = Arc::new(new.own.directional);
-            light.has_indirect = true;
-        } else {
-            // All lights have gone dark: the shown light fades to black, on the shown sides.
-            let values = try_vec(self.radiance.values.len(), "the radiance map")?;
-            light.radiance = Arc::new(Radiance { values, ..Default::default() });
-            light.own = Arc::new(darkened(&self.own)?);
-            light.own_directional = Arc::new(darkened(&self.own_directional)?);
-        }
-        Ok(light)
-    }
-}
-
-/// The light of texels that gather for themselves when all is dark.
-fn darkened<T: Default>(own: &[Option<T>]) -> Result<Vec<Option<T>>> {
-    try_collect(own.iter().map(|own| own.as_ref().map(|_| T::default())), "texels on their own")
-}
 
 /// Renews indirect light on a thread of its own.
 #[derive(Default)]
@@ -188,6 +71,16 @@ impl Relight {
             self.again = true;
             return Ok(());
         }
+        self.begin(atlas, params, Some(sides.clone()))
+    }
+
+    /// Begins the computation with all photons that follows a first impression.
+    pub fn start_second(&mut self, atlas: &Arc<Atlas>, params: &BakeParams) -> Result<()> {
+        self.begin(atlas, params, None)
+    }
+
+    /// Begins a renewal; with a quick part if there are sides that this keeps.
+    fn begin(&mut self, atlas: &Arc<Atlas>, params: &BakeParams, shown: Option<Arc<Sides>>) -> Result<()> {
         let device = match &self.device {
             Some(device) => device.clone(),
             None => Device::new(DeviceOptions {
@@ -196,7 +89,7 @@ impl Relight {
                 ..Default::default()
             })?,
         };
-        let (atlas, params, shown) = (atlas.clone(), *params, sides.clone());
+        let (atlas, params) = (atlas.clone(), *params);
         let (sender, results) = channel();
         let cancel = Arc::new(AtomicBool::new(false));
         let abandon = Arc::new(AtomicBool::new(false));
@@ -216,7 +109,9 @@ impl Relight {
                 None => progress,
             };
             let progress = waiting(Progress::new(move |_, _| !abandoned.load(Relaxed)));
-            let _ = sender.send(compute(&quick, Some(shown), &progress));
+            if shown.is_some() {
+                let _ = sender.send(compute(&quick, shown, &progress));
+            }
             let progress = waiting(Progress::new(move |_, _| !cancelled.load(Relaxed)));
             let _ = sender.send(compute(&params, None, &progress));
         });
@@ -394,6 +289,9 @@ impl Live {
 mod tests {
     use super::*;
     use crate::base::directional::Directional;
+    use crate::lightmap::indirect::radiance_map::Radiance;
+    use crate::lightmap::indirect::upsample::OwnLight;
+    use crate::lightmap::stages::Own;
     use crate::lightmap::{Lightmap, LightmapDesc};
     use crate::scene::{Light, builtin};
     use glam::Vec3;
@@ -441,7 +339,7 @@ mod tests {
         let desc = LightmapDesc { texels_per_unit: 3.0, ..Default::default() };
         let lightmap = Lightmap::create(&scene, &desc, &Progress::none()).unwrap();
         let (atlas, params) = (lightmap.atlas(), BakeParams { photon_count: 20_000, ..Default::default() });
-        let light = Illumination::new(atlas, &params, &Progress::none()).unwrap();
+        let light = Illumination::new(atlas, &params, false, &Progress::none()).unwrap();
         assert!(light.own.iter().any(|own| own.is_some_and(|e| e != Vec3::ZERO)));
         let renewals = || {
             let (mut relight, mut results) = (Relight::default(), Vec::new());

@@ -2,7 +2,7 @@
 
 use super::dirty::{LEAST_BYTES, TEXEL_BYTES};
 use super::display::{Changed, Display};
-use super::relight::Illumination;
+use super::illumination::Illumination;
 use super::{Budget, Live, LiveStats, Mode, PASS};
 use std::time::Instant;
 
@@ -18,11 +18,12 @@ impl Live {
     }
 
     /// Marks what new indirect light changes at once: what texels gather for themselves, and all of charts that show
-    /// their other side.
+    /// their other side; all, after a first impression.
     pub(super) fn mark_new_light(&mut self, before: &Illumination) {
         let (map, light) = (self.context.map.clone(), self.context.light.clone());
         let (old, new) = (&before.sides.backs, &light.sides.backs);
-        if old != new {
+        let is_second = before.sides.is_first && !light.sides.is_first;
+        if old != new || is_second {
             Display::find_alone(&map, &light.sides, &mut self.alone);
         }
         for (b, tile) in (0u32..).zip(&map.tiles) {
@@ -31,6 +32,9 @@ impl Live {
             let alone = self.alone[b as usize];
             if old.get(chart) != new.get(chart) {
                 self.dirty.add(Changed { page, rect: widest, block: b, amount: 1.0 });
+            } else if is_second {
+                // From now on walls and gaps separate texels.
+                self.dirty.add(Changed { page, rect: widest, block: b, amount: 0.25 });
             } else if alone.area() > 0 {
                 let rect = alone.grown(map.atlas.padding as i32);
                 self.dirty.add(Changed { page, rect, block: b, amount: 0.5 });

@@ -5,8 +5,8 @@
 //! alone, so they have the bits of a bake with as many rays.
 
 use super::blocks::{Block, BlockMap, BlockStatus, BlockWork, Tile};
+use super::illumination::Illumination;
 use super::limit::Limit;
-use super::relight::Illumination;
 use super::room::{Room, Rooms};
 use super::shown_layer::Shown;
 use crate::base::directional::Directional;

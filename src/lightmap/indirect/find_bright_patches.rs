@@ -2,7 +2,7 @@
 //! reduce noise enough.
 
 use super::bright_patches::{Bright, near2};
-use super::gather::Gathered;
+use super::gather::{Gathered, Round};
 use super::near_hits::HitRadiance;
 use super::radiance_map::{Radiance, RadianceLookup};
 use super::sample_set::{ROUND, SampleSet};
@@ -82,10 +82,10 @@ pub(crate) fn find(atlas: &Atlas, radiance: &mut Radiance, rays: &mut u64, progr
     progress.check()?;
     let memory = atlas.scene.device().memory().reserve(patches.bytes(), "bright patches")?;
     let shadow_rays = ((MAX_SHADOW_RAYS as f32 * share).ceil() as u32).clamp(1, MAX_SHADOW_RAYS);
-    let without = trials(atlas, radiance, rays, progress)?;
-    radiance.bright = Bright { limit, patches: Some(patches), shadow_rays, _memory: Some(memory) };
-    if !pays(&trials(atlas, radiance, rays, progress)?, &without) {
-        radiance.bright = Bright::default();
+    let bright = Bright { limit, patches: Some(patches), shadow_rays, _memory: Some(memory) };
+    let [without, with] = trials(atlas, radiance, [&Bright::default(), &bright], rays, progress)?;
+    if pays(&with, &without) {
+        radiance.bright = bright;
     }
     Ok(())
 }
@@ -111,29 +111,48 @@ fn lit_texels(values: &[Vec3], count: usize) -> Result<Vec<RadianceTexel>> {
     try_collect(lit().skip(step / 2).step_by(step), TEXELS)
 }
 
-/// Traces rounds of gather rays from texels all over the lit surfaces and returns their means and variances, summed
-/// over the channels.
-fn trials(atlas: &Atlas, radiance: &Radiance, rays: &mut u64, progress: &Progress) -> Result<Vec<(f32, f32)>> {
-    let lookup = HitRadiance::of_map(RadianceLookup::new(&atlas.charts, &atlas.radiance, radiance));
+/// Mean and variance of the light that trials gather from a texel, summed over the channels.
+type Trial = (f32, f32);
+
+/// Traces rounds of gather rays from texels all over the lit surfaces and returns their light with each of the given sets
+/// of bright patches.
+fn trials(
+    atlas: &Atlas,
+    radiance: &Radiance,
+    bright: [&Bright; 2],
+    rays: &mut u64,
+    progress: &Progress,
+) -> Result<[Vec<Trial>; 2]> {
+    let lookup =
+        |bright| HitRadiance::of_map(RadianceLookup::new(&atlas.charts, &atlas.radiance, radiance).with(bright));
+    let lookups = bright.map(lookup);
     let samples = SampleSet::new(ROUND as u32, 0);
     let at = |&texel: &RadianceTexel| {
         progress.check()?;
         let (_, receiver) = atlas.radiance.receiver(&atlas.scene, texel, atlas.radiance.is_back(texel));
-        let mut traced = 0;
-        let round = |i: u32| {
-            let (mut gathered, seed) = (Gathered::default(), combine(texel.seed(), i));
-            traced += gathered.add_round(&atlas.scene, &lookup, &receiver, &samples, 0, seed);
-            gathered.irradiance().element_sum()
+        let (mut light, mut traced) = ([[0.0; ROUNDS as usize]; 2], 0);
+        for i in 0..ROUNDS {
+            // The rays do not depend on the patches.
+            let round = Round::trace(&atlas.scene, &receiver, &samples, 0, combine(texel.seed(), i));
+            traced += round.count as u64;
+            for (light, lookup) in light.iter_mut().zip(&lookups) {
+                let mut gathered = Gathered::default();
+                traced += gathered.add_traced(&atlas.scene, lookup, &receiver, &round);
+                light[i as usize] = gathered.irradiance().element_sum();
+            }
+        }
+        let trial = |light: [f32; ROUNDS as usize]| {
+            let mean = light.iter().sum::<f32>() / ROUNDS as f32;
+            let squares: f32 = light.iter().map(|e| (e - mean).powi(2)).sum();
+            (mean, squares / (ROUNDS - 1) as f32)
         };
-        let light: Vec<f32> = (0..ROUNDS).map(round).collect();
-        let mean = light.iter().sum::<f32>() / ROUNDS as f32;
-        let squares: f32 = light.iter().map(|e| (e - mean).powi(2)).sum();
-        Ok((mean, squares / (ROUNDS - 1) as f32, traced))
+        Ok((light.map(trial), traced))
     };
     let lit = lit_texels(&radiance.values, TRIALS)?;
-    let found: Vec<(f32, f32, u64)> = try_par_collect_ok(lit.par_iter().map(at), TEXELS)?;
-    *rays += found.iter().map(|f| f.2).sum::<u64>();
-    try_collect(found.into_iter().map(|(mean, variance, _)| (mean, variance)), TEXELS)
+    let found: Vec<([Trial; 2], u64)> = try_par_collect_ok(lit.par_iter().map(at), TEXELS)?;
+    *rays += found.iter().map(|f| f.1).sum::<u64>();
+    let of = |set: usize| try_collect(found.iter().map(|(trials, _)| trials[set]), TEXELS);
+    Ok([of(0)?, of(1)?])
 }
 
 /// Whether the relative variance of the trials is sufficiently less with patches than without.

@@ -77,6 +77,7 @@ impl Gathered {
     }
 
     /// Adds one round of rays from a receiver; `seed` is the texel's own. Returns the rays traced.
+    #[cfg(test)]
     pub(crate) fn add_round(
         &mut self,
         scene: &Scene,
@@ -86,21 +87,28 @@ impl Gathered {
         round: usize,
         seed: u32,
     ) -> u64 {
-        let mut rays = [Ray::new(Vec3::ZERO, Vec3::ZERO); ROUND];
-        let mut hits = [RawHit::MISS; ROUND];
-        let points = points_of(samples, round);
-        let rays = &mut rays[..points.len()];
-        aim(receiver, points, seed, rays);
-        scene.intersect_stream(rays, &mut hits);
-        let mut traced = rays.len() as u64;
+        let traced = Round::trace(scene, receiver, samples, round, seed);
+        traced.count as u64 + self.add_traced(scene, radiance, receiver, &traced)
+    }
+
+    /// Adds what rays have found that have been traced. Returns the number of further rays.
+    pub(super) fn add_traced(
+        &mut self,
+        scene: &Scene,
+        radiance: &HitRadiance,
+        receiver: &Receiver,
+        round: &Round,
+    ) -> u64 {
+        let &Round { ref rays, ref hits, count, seed } = round;
+        let (rays, mut traced) = (&rays[..count], 0);
         let mut bright = (Vec3::ZERO, Unoccluded::default());
         if radiance.lookup.bright().len() > 0 {
             let mut room = PointRoom::new();
             let mut shadow = room.begin(scene);
-            bright.1 = radiance.lookup.bright().push(receiver, rays.len(), seed_of_round(seed, round), &mut shadow);
+            bright.1 = radiance.lookup.bright().push(receiver, rays.len(), seed, &mut shadow);
             bright.0 = shadow.finish(&mut traced)[0];
         }
-        self.add(scene, radiance, receiver, seed_of_round(seed, round), rays, &hits, bright, None, &mut traced);
+        self.add(scene, radiance, receiver, seed, rays, hits, bright, None, &mut traced);
         traced
     }
 
@@ -167,6 +175,26 @@ impl Gathered {
         self.sum += sum;
         self.squares += squares;
         self.rays += rays.len() as u32;
+    }
+}
+
+/// The rays of one round from a receiver, with their hits.
+pub(super) struct Round {
+    rays: [Ray; ROUND],
+    hits: [RawHit; ROUND],
+    pub count: usize,
+    /// Seed of the round.
+    seed: u32,
+}
+
+impl Round {
+    /// Traces the rays; `seed` is the texel's own.
+    pub(super) fn trace(scene: &Scene, receiver: &Receiver, samples: &SampleSet, round: usize, seed: u32) -> Round {
+        let (mut rays, mut hits) = ([Ray::new(Vec3::ZERO, Vec3::ZERO); ROUND], [RawHit::MISS; ROUND]);
+        let points = points_of(samples, round);
+        aim(receiver, points, seed, &mut rays);
+        scene.intersect_stream(&rays[..points.len()], &mut hits);
+        Round { rays, hits, count: points.len(), seed: seed_of_round(seed, round) }
     }
 }
 

@@ -45,7 +45,8 @@ const BLOCK: usize = 1024;
 pub(crate) struct RadianceLookup<'a> {
     charts: &'a Charts,
     map: &'a ChartMap<RadianceMap>,
-    radiance: &'a Radiance,
+    values: &'a [Vec3],
+    bright: &'a Bright,
 }
 
 /// Reflected radiance per texel, front sides first; W/(m²·sr).
@@ -57,7 +58,12 @@ pub(crate) struct Radiance {
 
 impl<'a> RadianceLookup<'a> {
     pub(crate) fn new(charts: &'a Charts, map: &'a ChartMap<RadianceMap>, radiance: &'a Radiance) -> Self {
-        RadianceLookup { charts, map, radiance }
+        RadianceLookup { charts, map, values: &radiance.values, bright: &radiance.bright }
+    }
+
+    /// The same radiance with other bright patches.
+    pub(super) fn with(self, bright: &'a Bright) -> Self {
+        RadianceLookup { bright, ..self }
     }
 
     /// Returns the map that is looked up.
@@ -81,7 +87,7 @@ impl<'a> RadianceLookup<'a> {
     #[inline]
     pub(crate) fn seen(&self, hit: &RawHit) -> Option<Vec3> {
         let (placement, radiance) = self.met(hit)?;
-        Some(self.radiance.bright.seen(radiance, self.map, placement, hit.t))
+        Some(self.bright.seen(radiance, self.map, placement, hit.t))
     }
 
     /// Returns the radiance that a gather ray sees of transmissive sheets and of the surface behind them. `crossings` is a
@@ -99,7 +105,7 @@ impl<'a> RadianceLookup<'a> {
 
     /// Returns the bright patches, whose full radiance gather rays do not see.
     pub(crate) fn bright(&self) -> &Bright {
-        &self.radiance.bright
+        self.bright
     }
 
     /// Returns placement and radiance at a hit.
@@ -137,7 +143,7 @@ impl<'a> RadianceLookup<'a> {
             return Some(Place { placement, texel: NONE });
         }
         let texel = self.map.texels.nearest_of(placement, number);
-        if let Some(value) = self.radiance.values.get(texel as usize) {
+        if let Some(value) = self.values.get(texel as usize) {
             prefetch(value);
         }
         (texel != NONE).then_some(Place { placement, texel })
@@ -152,7 +158,7 @@ impl<'a> RadianceLookup<'a> {
     /// Returns placement and radiance at a place.
     #[inline]
     pub(super) fn at(&self, place: &Place) -> (PlacementId, Vec3) {
-        let value = if place.texel == NONE { Vec3::ZERO } else { self.radiance.values[place.texel as usize] };
+        let value = if place.texel == NONE { Vec3::ZERO } else { self.values[place.texel as usize] };
         (place.placement, value)
     }
 }
@@ -176,6 +182,8 @@ pub(crate) struct RadianceInput<'a> {
     pub light: TexelLight<'a, RadianceMap>,
     /// Photons that have been reflected at least once; `None`: their light is left out.
     pub photons: Option<&'a PhotonMap>,
+    /// Whether a first impression is enough: few points of each texel, and photons without a look at what hides them.
+    pub quick: bool,
 }
 
 /// Computes `values`, one per texel of the map; returns the number of rays. Advances `stage` by two per texel.
@@ -184,11 +192,15 @@ pub(crate) struct RadianceInput<'a> {
 /// those of neighbouring texels.
 pub(crate) fn bake(device: &Device, input: &RadianceInput, values: &mut [Vec3], stage: &Stage) -> Result<u64> {
     let rays = AtomicU64::new(0);
-    let mut looks: Vec<Look> = try_vec(values.len(), "direct light of the radiance map")?;
-    let _memory = device.memory().reserve(size_of_val(&looks[..]), "direct light of the radiance map")?;
     let map = input.light.areas.map;
     let per_tile = texels_per_tile(input.light.samples);
     let (tiles, rooms) = (Scratch::new(), Scratch::new());
+    if input.quick {
+        device.install(|| bake_quickly(input, values, &rays, stage))?;
+        return Ok(rays.into_inner());
+    }
+    let mut looks: Vec<Look> = try_vec(values.len(), "direct light of the radiance map")?;
+    let _memory = device.memory().reserve(size_of_val(&looks[..]), "direct light of the radiance map")?;
     device.install(|| {
         one_by_one(looks.par_chunks_mut(BLOCK).enumerate()).try_each(|(block, out)| {
             let (mut traced, first) = (0, block * BLOCK);
@@ -215,6 +227,30 @@ pub(crate) fn bake(device: &Device, input: &RadianceInput, values: &mut [Vec3], 
         })
     })?;
     Ok(rays.into_inner())
+}
+
+/// Computes a first impression of `values`.
+fn bake_quickly(input: &RadianceInput, values: &mut [Vec3], rays: &AtomicU64, stage: &Stage) -> Result<()> {
+    let (light, areas) = (&input.light, &input.light.areas);
+    let (per_tile, tiles) = (texels_per_tile(light.samples), Scratch::new());
+    one_by_one(values.par_chunks_mut(BLOCK).enumerate()).try_for_each(|(block, out)| {
+        let (mut traced, first) = (0, block * BLOCK);
+        let mut tile = tiles.take(|| TilePoints::new(TILE))?;
+        for texels in in_order(areas.map, first..first + out.len())?.chunks(per_tile) {
+            stage.check()?;
+            light.quick_look(texels, &mut tile, &mut traced, |i, irradiance| {
+                let texel = texels[i];
+                let albedo = albedo(areas, texel);
+                let reflected = input.photons.filter(|_| albedo != Vec3::ZERO).map_or(Vec3::ZERO, |photons| {
+                    let (point, receiver) = areas.map.receiver(areas.scene, texel, areas.map.is_back(texel));
+                    Vec3::from(photons.estimate(point.position, receiver.geometric))
+                });
+                out[texel.index() - first] = albedo * (irradiance + reflected) / PI;
+            });
+        }
+        rays.fetch_add(traced, Relaxed);
+        stage.advance(2 * out.len() as u64)
+    })
 }
 
 /// Working memory for a tile of the radiance map.

@@ -59,6 +59,24 @@ impl TexelLight<'_, RadianceMap> {
         }
     }
 
+    /// Computes direct light of a tile of the radiance map by few points, without tests of which lie inside solids and
+    /// without a closer look.
+    pub(crate) fn quick_look(
+        &self,
+        texels: &[RadianceTexel],
+        tile: &mut TilePoints,
+        rays: &mut u64,
+        mut out: impl FnMut(usize, Vec3),
+    ) {
+        tile.clear();
+        tile.light(self, texels.iter().enumerate().map(|(i, &texel)| self.all_of(i, texel, 0..FEW)), rays);
+        for i in 0..texels.len() {
+            let (mut sum, points) = (PointLight::default(), tile.of(i));
+            points.iter().for_each(|p| sum.add(&p.light, Vec3::ONE));
+            out(i, sum.value() / points.len().max(1) as f32);
+        }
+    }
+
     /// Points of a texel of the radiance map, to be lit by all lights.
     fn all_of(&self, place: usize, texel: RadianceTexel, numbers: Range<u32>) -> Wanted<RadianceMap> {
         Wanted { place, texel, back: self.areas.map.is_back(texel), numbers, lights: Lights::All }

@@ -118,6 +118,9 @@ pub struct LiveFlags {
     /// Leaves out errors against time, and the references that they need
     #[arg(long, help_heading = "Report live")]
     pub no_errors: bool,
+    /// Begins with a first impression of indirect light
+    #[arg(long, help_heading = "Report live")]
+    pub quick_start: bool,
     /// Levels of detail
     #[arg(long, value_name = "N", help_heading = "Report live", default_value_t = 3,
           value_parser = clap::value_parser!(u32).range(1..=4))]

@@ -327,6 +327,7 @@ fn command_of(line: CommandLine, is_given: &dyn Fn(&str) -> bool) -> Result<Comm
                 radius: bake.radius,
                 near_hits: bake.near_hits,
                 directional: bake.directional,
+                quick_start: live.quick_start,
                 ..Default::default()
             };
             // Live updates have defaults of their own.

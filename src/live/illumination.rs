@@ -1,0 +1,148 @@
+//! The light that live updates show: lights, radiance map and sides of charts, as a bake has them or, at a quick start, a
+//! first impression of them.
+
+use crate::base::error::Result;
+use crate::base::memory::{try_collect, try_vec};
+use crate::base::progress::Progress;
+use crate::direct::DirectLight;
+use crate::lightmap::atlas::Atlas;
+use crate::lightmap::indirect::radiance_map::Radiance;
+use crate::lightmap::indirect::upsample::{OwnDirectional, OwnLight, Upsampling};
+use crate::lightmap::plan::{Plan, left_out};
+use crate::lightmap::stages::{self, Inputs, Own};
+use crate::lightmap::{BakeParams, BakeStats, directional};
+use std::sync::Arc;
+
+/// The shown sides of charts.
+#[derive(Default)]
+pub(super) struct Sides {
+    /// Per chart with one placement, whether its back is shown.
+    pub backs: Vec<bool>,
+    /// Interpolation from the gather map to the light map for these sides; unconstrained without indirect light, and in
+    /// first impressions.
+    pub upsampling: Upsampling,
+    /// Whether this is a first impression.
+    pub is_first: bool,
+}
+
+/// Light as gathered and shown by texels.
+#[derive(Clone)]
+pub(super) struct Illumination {
+    pub direct: Arc<DirectLight>,
+    /// The radiance map, by sample.
+    pub radiance: Arc<Radiance>,
+    pub sides: Arc<Sides>,
+    /// Light of the texels that gather for themselves, as no gather texel can be interpolated for them.
+    pub own: Arc<OwnLight>,
+    pub own_directional: Arc<OwnDirectional>,
+    /// Whether there is any indirect light, or ever was.
+    pub has_indirect: bool,
+    /// Epochs of direct and indirect light: they change with the data.
+    pub direct_epoch: u32,
+    pub indirect_epoch: u32,
+}
+
+/// New radiance map and sides; the sides may be those that were shown before.
+pub(super) struct Indirect {
+    pub radiance: Radiance,
+    pub sides: Arc<Sides>,
+    pub own: Own,
+    pub has_indirect: bool,
+}
+
+/// Computes radiance map and sides under the scene's current lights, or keeps `sides`.
+pub(super) fn illuminate(
+    atlas: &Atlas,
+    params: &BakeParams,
+    direct: &DirectLight,
+    sides: Option<Arc<Sides>>,
+    progress: &Progress,
+) -> Result<Indirect> {
+    let two_sided = !atlas.radiance.layout.back_of.is_empty();
+    let plan = Plan::new(&atlas.scene, direct, params, two_sided, false);
+    let inputs = Inputs { atlas, direct, params, progress };
+    let radiance = stages::illuminate(&inputs, &plan, &mut BakeStats::default())?;
+    let has_indirect = plan.runs(left_out::INDIRECT);
+    let sides = match sides {
+        Some(sides) => sides,
+        None => {
+            let backs = stages::backs(&inputs, &radiance.values)?;
+            let placements = if has_indirect { atlas.map.layout.placements.len() } else { 0 };
+            let upsampling = stages::upsampling(&inputs, &backs, 0..placements, None)?;
+            Arc::new(Sides { backs, upsampling, is_first: false })
+        }
+    };
+    // Without indirect light there is no radiance map to look up.
+    let own = match has_indirect {
+        true => {
+            let asks = params.directional & directional::INDIRECT != 0;
+            stages::own_light(&inputs, &radiance, &sides.backs, &sides.upsampling, asks)?
+        }
+        false => Own::default(),
+    };
+    Ok(Indirect { radiance, sides, own, has_indirect })
+}
+
+/// Computes a first impression of radiance map and sides. Texels neither gather for themselves nor know of walls between
+/// them and the gather texels around.
+fn illuminate_quickly(
+    atlas: &Atlas,
+    params: &BakeParams,
+    direct: &DirectLight,
+    progress: &Progress,
+) -> Result<Indirect> {
+    let plan = Plan::new(&atlas.scene, direct, params, !atlas.radiance.layout.back_of.is_empty(), false);
+    let inputs = Inputs { atlas, direct, params, progress };
+    let radiance = stages::illuminate_quickly(&inputs, &plan)?;
+    let backs = stages::backs(&inputs, &radiance.values)?;
+    let sides = Arc::new(Sides { backs, is_first: true, ..Default::default() });
+    Ok(Indirect { radiance, sides, own: Own::default(), has_indirect: plan.runs(left_out::INDIRECT) })
+}
+
+impl Illumination {
+    /// Computes the light of the scene's current lights, with all photons, or a first impression of it.
+    pub fn new(atlas: &Atlas, params: &BakeParams, quick: bool, progress: &Progress) -> Result<Illumination> {
+        let direct = DirectLight::try_new(&atlas.scene)?;
+        let i = match quick {
+            true => illuminate_quickly(atlas, params, &direct, progress)?,
+            false => illuminate(atlas, params, &direct, None, progress)?,
+        };
+        Ok(Illumination {
+            direct: Arc::new(direct),
+            radiance: Arc::new(i.radiance),
+            sides: i.sides,
+            own: Arc::new(i.own.light),
+            own_directional: Arc::new(i.own.directional),
+            has_indirect: i.has_indirect,
+            direct_epoch: 1,
+            indirect_epoch: 1,
+        })
+    }
+
+    /// Makes a copy with new indirect light.
+    pub fn renewed(&self, new: Indirect) -> Result<Illumination> {
+        let mut light = Illumination { indirect_epoch: self.indirect_epoch + 1, ..self.clone() };
+        if new.has_indirect {
+            light.radiance = Arc::new(new.radiance);
+            if light.sides.backs != new.sides.backs {
+                // Other sides are shown: their direct light differs too.
+                light.direct_epoch += 1;
+            }
+            (light.sides, light.own) = (new.sides, Arc::new(new.own.light));
+            light.own_directional = Arc::new(new.own.directional);
+            light.has_indirect = true;
+        } else {
+            // All lights have gone dark: the shown light fades to black, on the shown sides.
+            let values = try_vec(self.radiance.values.len(), "the radiance map")?;
+            light.radiance = Arc::new(Radiance { values, ..Default::default() });
+            light.own = Arc::new(darkened(&self.own)?);
+            light.own_directional = Arc::new(darkened(&self.own_directional)?);
+        }
+        Ok(light)
+    }
+}
+
+/// The light of texels that gather for themselves when all is dark.
+fn darkened<T: Default>(own: &[Option<T>]) -> Result<Vec<Option<T>>> {
+    try_collect(own.iter().map(|own| own.as_ref().map(|_| T::default())), "texels on their own")
+}
