@@ -13,6 +13,7 @@ use crate::base::memory::{Reservation, try_filled, try_with_capacity};
 use crate::base::threads::{self, Threads, Work};
 use crate::bvh::parts::Parts;
 use std::ops::RangeInclusive;
+use std::panic::{AssertUnwindSafe, catch_unwind};
 use std::sync::{Arc, Condvar, Mutex, MutexGuard, PoisonError};
 use std::thread::JoinHandle;
 use std::time::{Duration, Instant};
@@ -41,6 +42,9 @@ pub(crate) trait Batch: Send + Sync {
     /// Traces the rays that wait at a part, and calls `go_on` with the parts at which they wait then, and their numbers.
     /// Called only while rays of the batch wait.
     fn visit(&self, part: u32, go_on: &mut dyn FnMut(u32, usize));
+
+    /// Ends the wait for the rays, as a visit has panicked: who waits panics, too.
+    fn fail(&self);
 }
 
 /// The tree of a scene in parts, and the rays that wait there.
@@ -125,7 +129,11 @@ impl Queues {
             }
             let mut onward = Vec::new();
             for batch in &batches {
-                batch.visit(part as u32, &mut |part, rays| onward.push((batch, part, rays)));
+                let mut go_on = |part, rays| onward.push((batch, part, rays));
+                // Nothing of a batch that has failed is read again.
+                if catch_unwind(AssertUnwindSafe(|| batch.visit(part as u32, &mut go_on))).is_err() {
+                    batch.fail();
+                }
             }
             state = self.lock();
             onward.into_iter().for_each(|(batch, part, rays)| state.add(batch, part, rays));

@@ -45,6 +45,8 @@ struct Rays<A> {
     at: Vec<u32>,
     /// Number of rays that wait.
     waiting: usize,
+    /// Whether a panic has ended the tracing.
+    has_failed: bool,
 }
 
 impl<A: Answer> Rays<A> {
@@ -92,6 +94,7 @@ impl<A: Answer> Batch<A> {
             done: with_capacity(rays.len())?,
             at: with_capacity(rays.len())?,
             waiting: 0,
+            has_failed: false,
         };
         all.done.resize(rays.len(), 0);
         all.at.resize(rays.len(), NONE);
@@ -149,7 +152,11 @@ fn count(mut parts: Vec<u32>, each: &mut dyn FnMut(u32, usize)) {
 
 impl<A: Answer + Send + 'static> waiting::Batch for Batch<A> {
     fn prepare(&self, part: u32) {
-        // SAFETY: as rays wait, the scene is there.
+        let all = self.lock();
+        if all.waiting == 0 {
+            return;
+        }
+        // SAFETY: rays wait, and the query can go on only when it has the lock: the scene is there.
         let scene = unsafe { &*self.scene };
         if let Some(parts) = scene.parts() {
             scene.acceleration().0.will_need(&parts.tree.parts[part as usize]);
@@ -157,10 +164,13 @@ impl<A: Answer + Send + 'static> waiting::Batch for Batch<A> {
     }
 
     fn visit(&self, part: u32, go_on: &mut dyn FnMut(u32, usize)) {
-        // SAFETY: as rays wait, the scene is there.
+        let mut all = self.lock();
+        if all.waiting == 0 {
+            return;
+        }
+        // SAFETY: as in `prepare`.
         let scene = unsafe { &*self.scene };
         let Some(parts) = scene.parts() else { return };
-        let mut all = self.lock();
         let here: Vec<u32> = (0..).zip(&all.at).filter(|(_, at)| **at == part).map(|(ray, _)| ray).collect();
         let turned = |&number: &u32| {
             let ray = all.rays[number as usize];
@@ -180,6 +190,12 @@ impl<A: Answer + Send + 'static> waiting::Batch for Batch<A> {
         if all.waiting == 0 {
             self.is_done.notify_all();
         }
+    }
+
+    fn fail(&self) {
+        let mut all = self.lock();
+        (all.waiting, all.has_failed) = (0, true);
+        self.is_done.notify_all();
     }
 }
 
@@ -221,6 +237,7 @@ impl Scene {
         while all.waiting > 0 {
             all = batch.is_done.wait(all).unwrap_or_else(PoisonError::into_inner);
         }
+        assert!(!all.has_failed, "a thread that traced these rays has panicked");
         answers.copy_from_slice(&all.answers);
     }
 }
@@ -304,6 +321,49 @@ mod tests {
         for (ray, hit) in rays.iter().zip(&expected).take(50) {
             assert_eq!((bits(&scene.intersect_raw(ray)), scene.occluded(ray)), (*hit, whole.occluded(ray)));
         }
+    }
+
+    /// A batch whose visits panic.
+    struct Broken(std::sync::mpsc::Sender<()>);
+
+    impl waiting::Batch for Broken {
+        fn prepare(&self, _: u32) {}
+
+        fn visit(&self, _: u32, _: &mut dyn FnMut(u32, usize)) {
+            panic!("as expected");
+        }
+
+        fn fail(&self) {
+            self.0.send(()).unwrap();
+        }
+    }
+
+    #[test]
+    fn a_panic_while_rays_are_traced_ends_the_wait_for_them_and_no_other() {
+        let path = std::env::temp_dir().join(format!("bakelite-broken-{}", std::process::id()));
+        let device = Device::new(DeviceOptions { num_threads: 1, ..Default::default() }).unwrap();
+        let options = BuildOptions::default();
+        let whole = Scene::commit(&device, data(), &options, &Progress::none()).map_err(|e| e.1).unwrap();
+        whole.save(&path, &Progress::none()).unwrap();
+        let open = OpenOptions { ray_queues: true, ..Default::default() };
+        let scene = Scene::open(&device, &path, &open, &Progress::none()).unwrap();
+        let (sender, failed) = std::sync::mpsc::channel();
+        let broken: Arc<dyn waiting::Batch> = Arc::new(Broken(sender));
+        // More panics than there are threads that trace.
+        for part in 0..100 {
+            scene.parts().unwrap().bring(&broken, std::iter::once((part % 4, 1)));
+            failed.recv_timeout(std::time::Duration::from_secs(60)).unwrap();
+        }
+        compare(&scene, &whole, 1);
+        // Once the wait is over, a batch does not touch its scene, which may be gone.
+        let rays = rays(2);
+        let answers = vec![RawHit::MISS; rays.len()];
+        let batch = Batch::new(&scene, scene.parts().unwrap(), &rays, false, &answers).unwrap();
+        waiting::Batch::fail(&batch);
+        drop((scene, broken));
+        waiting::Batch::visit(&batch, 0, &mut |_, _| panic!("visited"));
+        assert!(batch.lock().has_failed);
+        std::fs::remove_file(path).unwrap();
     }
 
     #[test]
