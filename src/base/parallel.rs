@@ -1,4 +1,4 @@
-//! Parallel loops. Each of them becomes one loop of rayon's over the numbers of its parts, which is compiled once: rayon
+//! Parallel loops. They are halved as rayon halves them, but all by one call of `rayon::join`, which is compiled once: rayon
 //! itself compiles its division of work among threads anew for every loop that it is given
 //! (docs/experiments.md#what-is-worth-optimising).
 
@@ -6,10 +6,7 @@ use crate::base::error::{Error, Result};
 use rayon::iter::MaxLen;
 use rayon::iter::plumbing::{Producer, ProducerCallback};
 use rayon::prelude::*;
-use std::sync::{Mutex, OnceLock, PoisonError};
-
-/// Greatest number of parts of a loop: their list stays small (some 100 bytes each), and each part is little of the work.
-const PARTS: usize = 4096;
+use std::sync::OnceLock;
 
 /// Number of parts per thread, unless the iterator limits their lengths.
 const PARTS_PER_THREAD: usize = 32;
@@ -118,37 +115,34 @@ impl<T, W: Work<T>> ProducerCallback<T> for Parts<'_, W> {
 
     fn callback<P: Producer<Item = T>>(self, producer: P) {
         let size = size_of_parts(self.len, producer.min_len(), producer.max_len());
-        let mut parts = Vec::new();
-        if parts.try_reserve_exact(self.len.div_ceil(size)).is_err() {
-            // There is no memory even for the list: the loop needs none on one thread.
-            return self.work.of(producer.into_iter());
-        }
-        let mut rest = producer;
-        for _ in 1..self.len.div_ceil(size) {
-            let (part, others) = rest.split_at(size);
-            parts.push(Mutex::new(Some(part)));
-            rest = others;
-        }
-        parts.push(Mutex::new(Some(rest)));
-        run(parts.len(), &|part| {
-            let part = parts[part].lock().unwrap_or_else(PoisonError::into_inner).take();
-            self.work.of(part.into_iter().flat_map(P::into_iter));
-        });
+        halve(producer, self.len, size, self.work);
     }
+}
+
+/// Does `work` with the items of `producer`, `len` in number, in parts of up to `size`: halved until they are that small.
+fn halve<P: Producer>(producer: P, len: usize, size: usize, work: &impl Work<P::Item>) {
+    if len <= size {
+        return work.of(producer.into_iter());
+    }
+    // Whole parts, so that none is much smaller than others.
+    let middle = (len.div_ceil(size) / 2) * size;
+    let (first, second) = producer.split_at(middle);
+    let (mut first, mut second) = (Some(first), Some(second));
+    join(&mut || first.take().into_iter().for_each(|half| halve(half, middle, size, work)), &mut || {
+        second.take().into_iter().for_each(|half| halve(half, len - middle, size, work))
+    });
+}
+
+/// Does both, in parallel if a thread is idle. Compiled once.
+#[inline(never)]
+fn join(first: &mut (dyn FnMut() + Send), second: &mut (dyn FnMut() + Send)) {
+    rayon::join(first, second);
 }
 
 /// Returns how many items make a part of a loop over `len` items, parts being allowed to have `least` to `most`.
 fn size_of_parts(len: usize, least: usize, most: usize) -> usize {
     let size = len.div_ceil(PARTS_PER_THREAD * rayon::current_num_threads()).min(most);
-    size.max(least).max(len.div_ceil(PARTS)).max(1)
-}
-
-/// Calls `part` with the numbers below `parts`, on all threads.
-fn run(parts: usize, part: &(dyn Fn(usize) + Sync)) {
-    match parts {
-        1 => part(0),
-        _ => (0..parts).into_par_iter().with_max_len(1).for_each(part),
-    }
+    size.max(least).max(1)
 }
 
 #[cfg(test)]
@@ -158,7 +152,7 @@ mod tests {
 
     #[test]
     fn each_item_is_visited_once_whatever_the_parts() {
-        for len in [0, 1, 2, 63, 64, 65, 10_000, 2 * PARTS, 2 * PARTS + 1] {
+        for len in [0, 1, 2, 3, 63, 64, 65, 10_000, 10_001] {
             for (least, most) in [(1, usize::MAX), (1, 1), (100, usize::MAX), (7, 9)] {
                 let mut visits = vec![0u32; len];
                 let items = visits.par_iter_mut().enumerate().with_min_len(least).with_max_len(most);
@@ -172,7 +166,6 @@ mod tests {
     fn parts_have_the_lengths_that_the_loop_asks_for() {
         let threads = rayon::current_num_threads();
         assert_eq!(size_of_parts(1000, 1, 1), 1);
-        assert_eq!(size_of_parts(3 * PARTS, 1, 1), 3);
         assert_eq!(size_of_parts(10, 100, usize::MAX), 100);
         assert_eq!(size_of_parts(64 * threads, 1, usize::MAX), 2);
     }
@@ -180,13 +173,13 @@ mod tests {
     #[test]
     fn an_error_is_returned_and_ends_the_loop() {
         let seen = AtomicUsize::new(0);
-        let error = one_by_one((0..PARTS).into_par_iter()).try_each(|i| {
+        let error = one_by_one((0..4096).into_par_iter()).try_each(|i| {
             seen.fetch_add(1, Relaxed);
             if i == 0 { Err(Error::Cancelled) } else { Ok(()) }
         });
         assert_eq!(error, Err(Error::Cancelled));
         // Nothing bounds what others do until the first thread has its turn, but each visits an item once.
-        assert!(seen.into_inner() <= PARTS);
+        assert!(seen.into_inner() <= 4096);
         assert_eq!((0..1000).into_par_iter().try_each(|_| Ok(())), Ok(()));
     }
 
