@@ -173,13 +173,16 @@ mod tests {
     #[test]
     fn an_error_is_returned_and_ends_the_loop() {
         let seen = AtomicUsize::new(0);
-        let error = one_by_one((0..4096).into_par_iter()).try_each(|i| {
-            seen.fetch_add(1, Relaxed);
-            if i == 0 { Err(Error::Cancelled) } else { Ok(()) }
-        });
-        assert_eq!(error, Err(Error::Cancelled));
-        // Nothing bounds what others do until the first thread has its turn, but each visits an item once.
-        assert!(seen.into_inner() <= 4096);
+        let fails_at_once = || {
+            one_by_one((0..4096).into_par_iter()).try_each(|_| {
+                seen.fetch_add(1, Relaxed);
+                Err(Error::Cancelled)
+            })
+        };
+        // On one thread, as other threads may begin an item before they can know of an error.
+        let pool = rayon::ThreadPoolBuilder::new().num_threads(1).build().unwrap();
+        assert_eq!(pool.install(fails_at_once), Err(Error::Cancelled));
+        assert_eq!(seen.into_inner(), 1);
         assert_eq!((0..1000).into_par_iter().try_each(|_| Ok(())), Ok(()));
     }
 
