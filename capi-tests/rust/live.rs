@@ -365,6 +365,23 @@ fn after_a_quick_start_the_updates_end_with_the_bits_of_a_bake() {
 }
 
 #[test]
+fn a_light_that_changes_during_a_quick_start_ends_with_the_bits_of_a_bake_under_it() {
+    let mut lightmap = unbaked("cornell", 2, 60.0);
+    let params = LiveParams { quick_start: true, ..params(Mode::Position) };
+    let mut live = Live::new(&lightmap, &params, &Progress::none()).unwrap();
+    let scene = lightmap.scene().clone();
+    let Light::Rect { position, edge_u, edge_v, radiance } = scene.lights()[0] else { panic!("another light") };
+    let radiance = [radiance[2], radiance[1] * 0.1, radiance[0]];
+    scene.set_light(0, Light::Rect { position, edge_u, edge_v, radiance }).unwrap();
+    assert!(live.update(&camera(0), &RAYS).unwrap().light_pending);
+    live.light_changed(0).unwrap();
+    live.finish_relighting().unwrap();
+    let stats = finish(&mut live);
+    assert_eq!((stats.finished, stats.light_pending), (1.0, false));
+    assert_same_as_bake(&live, &mut lightmap, "new light");
+}
+
+#[test]
 fn what_changes_is_covered_by_dirty_rectangles_and_is_never_negative() {
     for mode in [Mode::View, Mode::Position, Mode::Uniform] {
         let lightmap = unbaked("cornell", 2, 60.0);

@@ -115,7 +115,8 @@ pub struct bk_live_params {
     /// the gather map. All that a bake computes then follows on a thread of its own beside the updates,
     /// while bk_live_stats.light_pending is 1, and replaces it: finished light is the same. Set it to 1
     /// where the first picture must come soon on a machine of few cores (Sponza: 1.5 instead of 3.2 s
-    /// from nothing). States are saved and restored when nothing is pending. Default: 0.
+    /// from nothing); the update that replaces it may take longer than its budget (34 ms there, once).
+    /// States are saved and restored when nothing is pending. Default: 0.
     pub quick_start: u32,
     /// Seed of all random numbers, see bk_bake_params. Default: 0.
     pub seed: u64,

@@ -43,7 +43,7 @@ const MOST_STORED: u64 = 1 << 24;
 const STORED_PER_TEXEL: u64 = 256;
 
 /// Divisor of the photon count in a first impression. (With a sixteenth the sides of sheets in Sponza are told wrongly.)
-const QUICK_PART: u64 = 4;
+const FIRST_IMPRESSION_PART: u64 = 4;
 
 /// Divisor of `direct_samples` in the radiance map, which is coarser than the light map.
 const RADIANCE_SAMPLE_DIVISOR: u32 = 4;
@@ -81,7 +81,7 @@ pub(crate) fn illuminate_quickly(inputs: &Inputs, plan: &Plan) -> Result<Radianc
         return Ok(Radiance::default());
     }
     let stats = &mut BakeStats::default();
-    let few = BakeParams { photon_count: inputs.params.photon_count.div_ceil(QUICK_PART), ..*inputs.params };
+    let few = BakeParams { photon_count: inputs.params.photon_count.div_ceil(FIRST_IMPRESSION_PART), ..*inputs.params };
     let few = Inputs { params: &few, ..*inputs };
     let photons = if plan.runs(left_out::PHOTONS) { Some(photons(&few, stats)?) } else { None };
     radiance(inputs, photons.as_ref(), true, stats)

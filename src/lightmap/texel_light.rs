@@ -13,8 +13,8 @@
 //! Points lie on the chart: each on whichever triangle of the chart covers it, with that triangle's normals. Points
 //! inside solids, in cut-outs, or behind a wall that stands on the texel do not count: the light of the other room
 //! would leak in. A point lies inside a solid if the way along the surface from there to the texel's sample, which can be
-//! seen, or the ways straight up and to four sides end at the solid's surface from inside. If all points do, as in a texel of which a strip looks out from under a
-//! block, the texel's sample alone is lit.
+//! seen, or the ways straight up and to four sides end at the solid's surface from inside. If all points do, as in a
+//! texel of which a strip looks out from under a block, the texel's sample alone is lit.
 //!
 //! The data used of neighbours is a function of their numbers alone, so that shards of a bake and tiles of live
 //! updates, which recompute it, have the same bits. The shadow rays of a [tile](super::tiles) are traced together,

@@ -43,7 +43,7 @@ impl Live {
             live.start(progress)?;
             if params.quick_start && live.context.light.has_indirect {
                 live.make_room_for_epochs()?;
-                live.relight.start_second(lightmap.atlas(), &live.bake)?;
+                live.relight.follow_first_impression(lightmap.atlas(), &live.bake)?;
             }
             Ok(live)
         })

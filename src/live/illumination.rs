@@ -21,8 +21,7 @@ pub(super) struct Sides {
     /// Interpolation from the gather map to the light map for these sides; unconstrained without indirect light, and in
     /// first impressions.
     pub upsampling: Upsampling,
-    /// Whether this is a first impression.
-    pub is_first: bool,
+    pub is_first_impression: bool,
 }
 
 /// Light as gathered and shown by texels.
@@ -69,7 +68,7 @@ pub(super) fn illuminate(
             let backs = stages::backs(&inputs, &radiance.values)?;
             let placements = if has_indirect { atlas.map.layout.placements.len() } else { 0 };
             let upsampling = stages::upsampling(&inputs, &backs, 0..placements, None)?;
-            Arc::new(Sides { backs, upsampling, is_first: false })
+            Arc::new(Sides { backs, upsampling, is_first_impression: false })
         }
     };
     // Without indirect light there is no radiance map to look up.
@@ -95,7 +94,7 @@ fn illuminate_quickly(
     let inputs = Inputs { atlas, direct, params, progress };
     let radiance = stages::illuminate_quickly(&inputs, &plan)?;
     let backs = stages::backs(&inputs, &radiance.values)?;
-    let sides = Arc::new(Sides { backs, is_first: true, ..Default::default() });
+    let sides = Arc::new(Sides { backs, is_first_impression: true, ..Default::default() });
     Ok(Indirect { radiance, sides, own: Own::default(), has_indirect: plan.runs(left_out::INDIRECT) })
 }
 

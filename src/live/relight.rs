@@ -75,7 +75,7 @@ impl Relight {
     }
 
     /// Begins the computation with all photons that follows a first impression.
-    pub fn start_second(&mut self, atlas: &Arc<Atlas>, params: &BakeParams) -> Result<()> {
+    pub fn follow_first_impression(&mut self, atlas: &Arc<Atlas>, params: &BakeParams) -> Result<()> {
         self.begin(atlas, params, None)
     }
 

@@ -22,8 +22,8 @@ impl Live {
     pub(super) fn mark_new_light(&mut self, before: &Illumination) {
         let (map, light) = (self.context.map.clone(), self.context.light.clone());
         let (old, new) = (&before.sides.backs, &light.sides.backs);
-        let is_second = before.sides.is_first && !light.sides.is_first;
-        if old != new || is_second {
+        let was_first_impression = before.sides.is_first_impression && !light.sides.is_first_impression;
+        if old != new || was_first_impression {
             Display::find_alone(&map, &light.sides, &mut self.alone);
         }
         for (b, tile) in (0u32..).zip(&map.tiles) {
@@ -32,7 +32,7 @@ impl Live {
             let alone = self.alone[b as usize];
             if old.get(chart) != new.get(chart) {
                 self.dirty.add(Changed { page, rect: widest, block: b, amount: 1.0 });
-            } else if is_second {
+            } else if was_first_impression {
                 // From now on walls and gaps separate texels.
                 self.dirty.add(Changed { page, rect: widest, block: b, amount: 0.25 });
             } else if alone.area() > 0 {

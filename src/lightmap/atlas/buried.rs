@@ -246,7 +246,8 @@ impl Search<'_> {
         are_buried
     }
 
-    /// Whether a lamp, which may be switched off, can be seen from a point.
+    /// Whether a lamp, which may be switched off, can be seen from a point. (Like the [open places](super::seen) this holds for
+    /// the lamps of when the light map was created; it is not looked for again when they move.)
     fn sees_lamp(&self, origin: Vec3, normal: Vec3, rays: &mut u64) -> bool {
         let lights = self.scene.lights();
         let few = lights.iter().step_by(lights.len().div_ceil(LAMPS).max(1));

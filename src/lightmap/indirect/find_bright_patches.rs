@@ -366,7 +366,8 @@ mod tests {
             let receiver = atlas.receiver(&atlas.gather, &baked(lightmap).backs, texel);
             let each = (0..rounds).map(|round| {
                 let mut g = Gathered::default();
-                g.add_round(&atlas.scene, &lookup, &receiver, &samples, round, texel.seed());
+                let traced = Round::trace(&atlas.scene, &receiver, &samples, round, texel.seed());
+                g.add_traced(&atlas.scene, &lookup, &receiver, &traced);
                 g.irradiance()
             });
             let each: Vec<Vec3> = each.collect();

@@ -76,21 +76,6 @@ impl Gathered {
         (sum * self.weight()).valid()
     }
 
-    /// Adds one round of rays from a receiver; `seed` is the texel's own. Returns the rays traced.
-    #[cfg(test)]
-    pub(crate) fn add_round(
-        &mut self,
-        scene: &Scene,
-        radiance: &HitRadiance,
-        receiver: &Receiver,
-        samples: &SampleSet,
-        round: usize,
-        seed: u32,
-    ) -> u64 {
-        let traced = Round::trace(scene, receiver, samples, round, seed);
-        traced.count as u64 + self.add_traced(scene, radiance, receiver, &traced)
-    }
-
     /// Adds what rays have found that have been traced. Returns the number of further rays.
     pub(super) fn add_traced(
         &mut self,

@@ -192,13 +192,13 @@ pub(crate) struct RadianceInput<'a> {
 /// those of neighbouring texels.
 pub(crate) fn bake(device: &Device, input: &RadianceInput, values: &mut [Vec3], stage: &Stage) -> Result<u64> {
     let rays = AtomicU64::new(0);
-    let map = input.light.areas.map;
-    let per_tile = texels_per_tile(input.light.samples);
-    let (tiles, rooms) = (Scratch::new(), Scratch::new());
     if input.quick {
         device.install(|| bake_quickly(input, values, &rays, stage))?;
         return Ok(rays.into_inner());
     }
+    let map = input.light.areas.map;
+    let per_tile = texels_per_tile(input.light.samples);
+    let (tiles, rooms) = (Scratch::new(), Scratch::new());
     let mut looks: Vec<Look> = try_vec(values.len(), "direct light of the radiance map")?;
     let _memory = device.memory().reserve(size_of_val(&looks[..]), "direct light of the radiance map")?;
     device.install(|| {
@@ -233,7 +233,7 @@ pub(crate) fn bake(device: &Device, input: &RadianceInput, values: &mut [Vec3], 
 fn bake_quickly(input: &RadianceInput, values: &mut [Vec3], rays: &AtomicU64, stage: &Stage) -> Result<()> {
     let (light, areas) = (&input.light, &input.light.areas);
     let (per_tile, tiles) = (texels_per_tile(light.samples), Scratch::new());
-    one_by_one(values.par_chunks_mut(BLOCK).enumerate()).try_for_each(|(block, out)| {
+    one_by_one(values.par_chunks_mut(BLOCK).enumerate()).try_each(|(block, out)| {
         let (mut traced, first) = (0, block * BLOCK);
         let mut tile = tiles.take(|| TilePoints::new(TILE))?;
         for texels in in_order(areas.map, first..first + out.len())?.chunks(per_tile) {

@@ -45,16 +45,18 @@ const SHOWN: &str = "what the light map shows of the gather map";
 const BLOCK: usize = 4096;
 const BLURRED: usize = 256;
 
-/// Number of rays of a fallback gather that is not lone, if it is not given: as many as a gather texel has, divided by this,
-/// but at least so many, and no more than a gather texel has or than there are in a round. (With 32 or 64 instead of 16 a furnished room has the same error.)
+/// Number of rays of a fallback gather that is not [lone](FEW), if it is not given: as many as a gather texel has, divided by
+/// this, but at least so many, and no more than a gather texel has or than there are in a round. (With 32 or 64 instead of
+/// 16 a furnished room has the same error.)
 pub(in crate::lightmap) const OWN_PART: u32 = 4;
 pub(crate) const OWN_RAYS: u32 = 16;
 
 /// Radius of the blur of fallback gathers, in texels of the light map.
 const RADIUS: i32 = 4;
 
-/// Part of the variance of few rays that tells their noise from differences of light, since they are stratified. (With 1 the
-/// blur has a bias: a furnished room has 1.05 times the error of a radius of 2, with this part 0.94 times.)
+/// Factor on the estimated variance of a fallback gather when it is compared with others: its few rays are stratified, and
+/// vary less than independent ones, as which they are estimated. (With 1 the blur has a bias: a furnished room has 1.05
+/// times the error of a radius of 2, with this factor 0.94 times.)
 const STRATIFIED: f32 = 0.35;
 
 /// A fallback gather is lone if there are no more than `FEW`, itself counted, within `NEAR` texels, as on the edges of

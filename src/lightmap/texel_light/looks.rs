@@ -2,6 +2,7 @@
 
 use super::{FEW, MAX_POINTS, Point, TexelLight, TilePoints, Wanted, add_points, differ, vary};
 use crate::base::sampling::combine;
+use crate::direct::Receiver;
 use crate::direct::direct_light::{Lights, PointLight};
 use crate::lightmap::atlas::ids::{PerTexel, RadianceMap, RadianceTexel};
 use crate::lightmap::atlas::texels::TexelSample;
@@ -37,8 +38,7 @@ impl TexelLight<'_, RadianceMap> {
         rays: &mut u64,
         mut out: impl FnMut(usize, Look),
     ) {
-        let (scene, map) = (self.areas.scene, self.areas.map);
-        let sample = |i: usize| map.receiver(scene, texels[i], map.is_back(texels[i])).1;
+        let sample = |i: usize| self.sample(texels[i]);
         tile.clear();
         tile.light(self, texels.iter().enumerate().map(|(i, &texel)| self.all_of(i, texel, 0..FEW)), rays);
         tile.find_buried(texels.len(), &self.areas, sample, rays);
@@ -77,6 +77,12 @@ impl TexelLight<'_, RadianceMap> {
         }
     }
 
+    /// Returns the sample of a texel of the radiance map as a receiver.
+    fn sample(&self, texel: RadianceTexel) -> Receiver {
+        let map = self.areas.map;
+        map.receiver(self.areas.scene, texel, map.is_back(texel)).1
+    }
+
     /// Points of a texel of the radiance map, to be lit by all lights.
     fn all_of(&self, place: usize, texel: RadianceTexel, numbers: Range<u32>) -> Wanted<RadianceMap> {
         Wanted { place, texel, back: self.areas.map.is_back(texel), numbers, lights: Lights::All }
@@ -104,8 +110,7 @@ impl TexelLight<'_, RadianceMap> {
         rays: &mut u64,
         mut out: impl FnMut(usize, Option<Vec3>),
     ) {
-        let (scene, map) = (self.areas.scene, self.areas.map);
-        let sample = |i: usize| map.receiver(scene, texels[i], map.is_back(texels[i])).1;
+        let sample = |i: usize| self.sample(texels[i]);
         let weight = |t: &TexelSample| albedo(t).max(Vec3::splat(f32::MIN_POSITIVE));
         let (mut sums, mut weights) = ([PointLight::default(); TILE], [Vec3::ZERO; TILE]);
         // Texels that go on after the first round of points.
