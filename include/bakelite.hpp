@@ -632,6 +632,11 @@ public:
         return detail::finish(bk_live_read(get(), rect.page, rect.lod, layer, format, &rect, out.data(), 0));
     }
     Result<void> light_changed(std::uint32_t light) { return detail::finish(bk_live_light_changed(get(), light)); }
+    /// Follows the scene after the light map that it was created from has.
+    Result<void> follow(const Lightmap &map, float keep_error = 0.03f, const Progress &progress = {}) {
+        return detail::finish(
+            progress.after(bk_live_follow(get(), map.get(), keep_error, progress.function(), progress.user())));
+    }
     Result<void> pause(bool paused) { return detail::finish(bk_live_pause(get(), paused)); }
 };
 

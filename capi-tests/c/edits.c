@@ -65,6 +65,33 @@ static void move_block(bk_scene *scene, float x) {
     CHECK_OK(bk_scene_refit(scene));
 }
 
+/* Updates until all that is seen from above is finished. */
+static void finish(bk_live *live) {
+    bk_camera camera;
+    bk_budget budget;
+    bk_live_stats stats;
+    int i;
+    bk_camera_init(&camera);
+    bk_budget_init(&budget);
+    bk_live_stats_init(&stats);
+    budget.milliseconds = 100;
+    for (i = 0; i < 2000 && (i == 0 || stats.finished < 1 || stats.light_pending); i++) {
+        CHECK_OK(bk_live_update(live, &camera, &budget, &stats));
+    }
+    CHECK(stats.finished == 1 && !stats.light_pending);
+}
+
+/* The combined light of page 0 as live light shows it; the caller frees it. */
+static float *shown_by(const bk_live *live, const bk_lightmap *map) {
+    bk_lightmap_info info;
+    float *page;
+    bk_lightmap_info_init(&info);
+    CHECK_OK(bk_lightmap_get_info(map, &info));
+    page = malloc((size_t)info.width * info.height * 3 * sizeof *page);
+    CHECK_OK(bk_live_read(live, 0, 2, BK_LAYER_COMBINED, BK_FORMAT_RGB32F, NULL, page, 0));
+    return page;
+}
+
 /* The combined light of page 0; the caller frees it. */
 static float *light_of(const bk_lightmap *map, size_t *count) {
     bk_lightmap_info info;
@@ -95,7 +122,9 @@ int main(void) {
     bk_lightmap_info before, after;
     bk_bake_params params;
     bk_bake_stats stats;
-    float *old, *kept, *changed, *fresh;
+    bk_live *live = NULL;
+    bk_live_params live_params;
+    float *old, *kept, *changed, *fresh, *followed;
     size_t count = 0;
     char plan[8192];
     CHECK_OK(bk_device_create(NULL, &device));
@@ -157,7 +186,42 @@ int main(void) {
     CHECK_OK(bk_bake_changed(map, &params, 10.0f, NULL, NULL, &stats));
     CHECK(stats.kept_texels == 0);
 
-    free(old), free(kept), free(changed), free(fresh);
+    /* Live light follows. */
+    bk_live_params_init(&live_params);
+    live_params.mode = BK_LIVE_UNIFORM;
+    live_params.photon_count = 50000;
+    live_params.max_rounds = 1;
+    live_params.lod_count = 3;
+    CHECK_OK(bk_live_create(map, &live_params, NULL, NULL, &live));
+    finish(live);
+    free(old), free(fresh);
+    old = shown_by(live, map);
+    move_block(scene, 1.0f);
+    CHECK_OK(bk_live_follow(live, map, 0.03f, NULL, NULL));
+    CHECK_OK(bk_lightmap_follow(map, scene, NULL, NULL));
+    CHECK_ERROR(bk_live_follow(live, map, -0.5f, NULL, NULL), BK_ERROR_INVALID_ARGUMENT, "keep_error");
+    CHECK_ERROR(bk_live_follow(live, map, NAN, NULL, NULL), BK_ERROR_INVALID_ARGUMENT, "keep_error");
+    CHECK_ERROR(bk_live_follow(live, NULL, 0.03f, NULL, NULL), BK_ERROR_INVALID_ARGUMENT, "lightmap");
+    CHECK_ERROR(bk_live_follow(NULL, map, 0.03f, NULL, NULL), BK_ERROR_INVALID_ARGUMENT, "live");
+    CHECK_OK(bk_live_follow(live, map, 0.03f, NULL, NULL));
+    finish(live);
+    followed = shown_by(live, map);
+    bk_live_release(live);
+    CHECK_OK(bk_live_create(map, &live_params, NULL, NULL, &live));
+    finish(live);
+    fresh = shown_by(live, map);
+    CHECK(difference(followed, fresh, count) < 0.005);
+    CHECK(difference(old, fresh, count) > 4 * difference(followed, fresh, count));
+    /* One of another light map of the same scene. */
+    {
+        bk_lightmap *another = NULL;
+        CHECK_OK(bk_lightmap_create(scene, &desc, NULL, NULL, &another));
+        CHECK_ERROR(bk_live_follow(live, another, 0.03f, NULL, NULL), BK_ERROR_INVALID_ARGUMENT, "another light map");
+        bk_lightmap_release(another);
+    }
+    bk_live_release(live);
+
+    free(old), free(kept), free(changed), free(fresh), free(followed);
     bk_lightmap_release(map);
     bk_scene_release(scene);
     bk_scene_release(other);

@@ -177,7 +177,8 @@ pub unsafe extern "C" fn bk_lightmap_create(
 /// Buried texels are searched again around moved surfaces; the sides of two-sided surfaces that
 /// have texels, and the density of texels, stay as they were at bk_lightmap_create. The light stays
 /// until the next bake; bk_bake_changed bakes it where it has changed. Until then the light map
-/// keeps the scene in both states in memory. Live objects made before keep the old geometry.
+/// keeps the scene in both states in memory. bk_live_follow updates
+/// live objects.
 ///
 /// Cost: half a second per million texels and thread. Does nothing if the light map has the state
 /// of the scene already.

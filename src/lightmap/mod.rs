@@ -6,12 +6,12 @@
 
 pub mod atlas;
 pub(crate) mod bake;
-mod changed;
+pub(crate) mod changed;
 mod create;
 pub(crate) mod direct_blur;
 mod follow;
 pub mod indirect;
-mod moved;
+pub(crate) mod moved;
 pub mod normal_maps;
 pub(crate) mod passes;
 pub mod plan;

@@ -19,7 +19,7 @@ const MOVED: &str = "what has moved";
 
 /// A box with sides along the axes.
 #[derive(Clone, Copy, Debug, PartialEq)]
-pub(super) struct Bounds {
+pub(crate) struct Bounds {
     pub lower: Vec3,
     pub upper: Vec3,
 }
@@ -105,7 +105,7 @@ impl Bounds {
 }
 
 /// What moved between two states of a scene.
-pub(super) struct Moved {
+pub(crate) struct Moved {
     /// Whether each chart has a corner that moved.
     charts: Vec<bool>,
     /// Boxes around the triangles that moved, before and after; few, and none of them empty.

@@ -10,7 +10,7 @@ use crate::base::error::Result;
 use crate::base::memory::{try_collect, try_to_vec, try_vec, try_with_capacity};
 use crate::base::progress::Progress;
 use crate::lightmap::atlas::Atlas;
-use crate::lightmap::atlas::ids::{GatherTexel, PlacementId};
+use crate::lightmap::atlas::ids::{GatherTexel, LightTexel, PlacementId};
 use crate::lightmap::atlas::layout::Placement;
 use crate::lightmap::indirect::gather::Gathered;
 use glam::Vec3;
@@ -324,8 +324,8 @@ pub(super) struct BlockMap {
 }
 
 impl BlockMap {
-    /// Cuts the charts of an atlas into blocks. `lods`: 1 to [`MAX_LODS`].
-    pub fn new(atlas: &Arc<Atlas>, lods: u32, progress: &Progress) -> Result<BlockMap> {
+    /// Cuts the charts of an atlas into blocks. `lods`: 1 to [`MAX_LODS`]; `share`: the part of the progress that this is.
+    pub fn new(atlas: &Arc<Atlas>, lods: u32, share: f32, progress: &Progress) -> Result<BlockMap> {
         let top = (lods - 1) as u8;
         // The light map has as many placements, of the same sides of the same charts.
         let placements = &atlas.gather.layout.placements;
@@ -343,7 +343,7 @@ impl BlockMap {
         let count = placements.iter().map(tiles).sum();
         map.tiles = try_with_capacity(count, STATE)?;
         let mut texels = Vec::with_capacity(BLOCK_TEXELS);
-        let stage = progress.stage("blocks", 0.0, 0.02, count as u64);
+        let stage = progress.stage("blocks", 0.0, share, count as u64);
         for (number, p) in placements.iter().enumerate() {
             map.first.push(map.tiles.len() as u32);
             let (x, y, w, h) = (p.x as i32, p.y as i32, p.w as i32, p.h as i32);
@@ -436,6 +436,15 @@ impl BlockMap {
         let rows = (end - first) as i32 / columns.max(1);
         let (i, j) = (((x - ox) / TILE).clamp(0, columns - 1), ((y - oy) / TILE).clamp(0, rows - 1));
         first + (j * columns + i) as u32
+    }
+
+    /// The block that a texel of the light map lies in.
+    pub fn block_of(&self, texel: LightTexel) -> u32 {
+        let atlas = &self.atlas;
+        let placement = atlas.map.placement_of(&atlas.charts, texel);
+        // Coordinates are not negative, so truncation rounds down.
+        let at = atlas.gather.layout.texel_coord(placement, atlas.texel_local(placement, texel));
+        self.block_at(placement, at[0] as i32, at[1] as i32)
     }
 
     /// The rectangle of a placement in the gather map.
@@ -549,7 +558,7 @@ mod tests {
             let scene = data.committed();
             let desc = LightmapDesc { page_size: 64, ..Default::default() };
             let lightmap = Lightmap::create(&scene, &desc, &Progress::none()).unwrap();
-            let map = BlockMap::new(lightmap.atlas(), 3, &Progress::none()).unwrap();
+            let map = BlockMap::new(lightmap.atlas(), 3, 1.0, &Progress::none()).unwrap();
             assert!(!map.tiles.is_empty());
             for tile in &map.tiles {
                 let whole = Rect::of(&map.atlas.map.layout[tile.placement]);

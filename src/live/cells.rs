@@ -77,7 +77,11 @@ impl Grid {
         if cells.x as f64 * cells.y as f64 * cells.z as f64 > MAX_CELLS as f64 {
             return invalid_argument!("cell_size {cell_size} makes {cells} cells, more than {MAX_CELLS}");
         }
-        let info = CellInfo { origin: lower, cell_size, dimensions: cells.as_uvec3().to_array() };
+        Grid::with(CellInfo { origin: lower, cell_size, dimensions: cells.as_uvec3().to_array() }, tiles)
+    }
+
+    /// Assigns blocks to the cells of a grid; those outside of it to the nearest.
+    pub fn with(info: CellInfo, tiles: &mut [Tile]) -> Result<Grid> {
         tiles.iter_mut().filter(|t| !t.texels.is_empty()).for_each(|tile| tile.cell = info.cell(tile.centre));
         let blocks = Lists::new(info.cells(), "the cells of the grid", |add| {
             let with_texels = (0..).zip(tiles.iter()).filter(|(_, t)| !t.texels.is_empty());
@@ -129,6 +133,11 @@ impl Promotion {
 
     pub fn bytes(&self) -> usize {
         self.lods.len() + self.counts.len() * (size_of::<[u32; MAX_LODS]>() + 1)
+    }
+
+    /// The LOD that all blocks of a cell have reached.
+    pub fn common(&self, cell: u32) -> u8 {
+        self.common[cell as usize]
     }
 
     /// Counts all blocks anew.

@@ -53,7 +53,7 @@ impl Live {
     pub(super) fn idle(lightmap: &Lightmap, params: &LiveParams, progress: &Progress) -> Result<Live> {
         let atlas = lightmap.atlas();
         let bake = params.bake();
-        let mut map = BlockMap::new(atlas, params.lod_count, progress)?;
+        let mut map = BlockMap::new(atlas, params.lod_count, 0.02, progress)?;
         let (lower, upper) = atlas.scene.bounds();
         let grid = Grid::new(lower, upper, params.cell_size, &mut map.tiles)?;
         let lights = atlas.scene.lights();
@@ -91,6 +91,7 @@ impl Live {
             choosing_seconds: 0.0,
             last_dirty_bytes: 0,
             alone,
+            is_stale: Vec::new(),
             is_waiting: try_vec(blocks.len(), "the queue of blocks")?,
             waiting,
             fading: try_with_capacity(blocks.len(), "the queue of blocks")?,

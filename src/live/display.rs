@@ -73,12 +73,7 @@ impl Display {
     pub fn new(map: &BlockMap, blur: u32, by_direction: bool) -> Result<Display> {
         let atlas = &map.atlas;
         let (n, blocks) = (atlas.gather.len(), map.tiles.len());
-        let mut normals = try_vec(n, "the gather map's normals")?;
-        atlas.scene.device().install(|| {
-            normals.par_iter_mut().enumerate().each(|(i, normal): (usize, &mut Vec3)| {
-                *normal = atlas.receiver(&atlas.gather, &[], GatherTexel::new(i)).normal;
-            });
-        });
+        let normals = Display::normals(map)?;
         Ok(Display {
             irradiance: ShownLayer::new(n, blocks, blur as i32)?,
             directional: ShownLayer::new(if by_direction { n } else { 0 }, blocks, blur as i32)?,
@@ -89,6 +84,23 @@ impl Display {
             epoch: 0,
             scratch: Scratch::new()?,
         })
+    }
+
+    /// The normals of the gather map's texels.
+    pub fn normals(map: &BlockMap) -> Result<Vec<Vec3>> {
+        let atlas = &map.atlas;
+        let mut normals = try_vec(atlas.gather.len(), "the gather map's normals")?;
+        atlas.scene.device().install(|| {
+            normals.par_iter_mut().enumerate().each(|(i, normal): (usize, &mut Vec3)| {
+                *normal = atlas.receiver(&atlas.gather, &[], GatherTexel::new(i)).normal;
+            });
+        });
+        Ok(normals)
+    }
+
+    /// Takes over the normals of a scene that has moved, with which light is blurred from now on.
+    pub fn set_normals(&mut self, normals: Vec<Vec3>) {
+        self.on.normals = normals;
     }
 
     /// Copies the display; direct light at full resolution is shared.
@@ -324,9 +336,7 @@ impl Display {
         rects.fill(Rect::default());
         let atlas = &map.atlas;
         for &texel in sides.upsampling.alone() {
-            let placement = atlas.map.placement_of(&atlas.charts, texel);
-            let at = atlas.gather.layout.texel_coord(placement, atlas.texel_local(placement, texel));
-            let rect = &mut rects[map.block_at(placement, at[0] as i32, at[1] as i32) as usize];
+            let rect = &mut rects[map.block_of(texel) as usize];
             let (x, y) = atlas.map.position(texel);
             let own = Rect { x0: x, y0: y, x1: x + 1, y1: y + 1 };
             *rect = if rect.area() == 0 { own } else { rect.union(&own) };

@@ -47,9 +47,19 @@ pub(super) struct Indirect {
     pub sides: Arc<Sides>,
     pub own: Own,
     pub has_indirect: bool,
+    pub part: Part,
+    /// Blocks whose light a move does not change; empty: none.
+    pub kept: Vec<bool>,
 }
 
-/// Computes radiance map and sides under the scene's current lights, or keeps `sides`.
+/// Part of a renewal of indirect light: with few photons, or with all.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub(super) enum Part {
+    Quick,
+    Whole,
+}
+
+/// Computes radiance map and sides under the scene's current lights, or the quick part of that, which keeps `sides`.
 pub(super) fn illuminate(
     atlas: &Atlas,
     params: &BakeParams,
@@ -62,6 +72,7 @@ pub(super) fn illuminate(
     let inputs = Inputs { atlas, direct, params, progress };
     let radiance = stages::illuminate(&inputs, &plan, &mut BakeStats::default())?;
     let has_indirect = plan.runs(left_out::INDIRECT);
+    let part = if sides.is_some() { Part::Quick } else { Part::Whole };
     let sides = match sides {
         Some(sides) => sides,
         None => {
@@ -79,7 +90,7 @@ pub(super) fn illuminate(
         }
         false => Own::default(),
     };
-    Ok(Indirect { radiance, sides, own, has_indirect })
+    Ok(Indirect { radiance, sides, own, has_indirect, part, kept: Vec::new() })
 }
 
 /// Computes a first impression of radiance map and sides. Texels neither gather for themselves nor know of walls between
@@ -95,7 +106,8 @@ fn illuminate_quickly(
     let radiance = stages::illuminate_quickly(&inputs, &plan)?;
     let backs = stages::backs(&inputs, &radiance.values)?;
     let sides = Arc::new(Sides { backs, is_first_impression: true, ..Default::default() });
-    Ok(Indirect { radiance, sides, own: Own::default(), has_indirect: plan.runs(left_out::INDIRECT) })
+    let has_indirect = plan.runs(left_out::INDIRECT);
+    Ok(Indirect { radiance, sides, own: Own::default(), has_indirect, part: Part::Quick, kept: Vec::new() })
 }
 
 impl Illumination {

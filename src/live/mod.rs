@@ -19,6 +19,7 @@ mod choose;
 mod create;
 mod dirty;
 mod display;
+mod follow;
 mod illumination;
 mod limit;
 mod lists;
@@ -98,6 +99,9 @@ pub struct Live {
     /// Queue of blocks whose shown light must be refreshed.
     waiting: VecDeque<u32>,
     is_waiting: Vec<bool>,
+    /// By block, whether a move has changed its light, until indirect light with all photons has followed; empty before
+    /// the first move.
+    is_stale: Vec<bool>,
     /// Blocks that are fading, and a buffer for those that go on fading. Each has capacity for all blocks.
     fading: Vec<u32>,
     still_fading: Vec<u32>,

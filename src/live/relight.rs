@@ -1,4 +1,5 @@
-//! Renewal of the light that live updates show, in the background: when a light changes, and after a quick start.
+//! Renewal of the light that live updates show, in the background: when a light changes, when the scene has moved, and
+//! after a quick start.
 //!
 //! Direct light follows at once. Indirect light needs new photons and a new radiance map, which one
 //! thread computes beside the updates: first with a sixteenth of the photons, so that the change is
@@ -6,7 +7,9 @@
 //! lit one (with them, Sponza showed 8 % error for a second): sides change with all photons only.
 
 use super::Live;
-use super::illumination::{Illumination, Indirect, Sides, illuminate};
+use super::blocks::Tile;
+use super::follow::Following;
+use super::illumination::{Illumination, Indirect, Part, Sides, illuminate};
 use crate::base::error::{Error, Result, invalid_argument};
 use crate::base::gate::{Closed, Gate};
 use crate::base::progress::Progress;
@@ -32,12 +35,16 @@ pub(super) struct Relight {
     /// Where the thread waits during updates, if there is no core for it beside the threads of these: it would take their
     /// time slices.
     gate: Option<Arc<Gate>>,
-    /// Whether the lights changed while a renewal under older ones was under way, or while on hold.
+    /// Whether light changed while a renewal of before was under way, or while on hold.
     again: bool,
     on_hold: bool,
+    /// What renewals are compared with, if all that has changed is that the scene has moved.
+    pub following: Option<Following>,
 }
 
 struct Running {
+    /// The state of the scene whose light it computes.
+    atlas: Arc<Atlas>,
     /// Receives the results; disconnected when the renewal has ended.
     results: Mutex<Receiver<Result<Indirect>>>,
     /// Cancels the part with all photons; set when a light changes.
@@ -89,7 +96,7 @@ impl Relight {
                 ..Default::default()
             })?,
         };
-        let (atlas, params) = (atlas.clone(), *params);
+        let (of, params, following) = (atlas.clone(), *params, self.following.clone());
         let (sender, results) = channel();
         let cancel = Arc::new(AtomicBool::new(false));
         let abandon = Arc::new(AtomicBool::new(false));
@@ -97,7 +104,11 @@ impl Relight {
         let gate = self.gate.clone();
         let compute = move |params: &BakeParams, sides: Option<Arc<Sides>>, progress: &Progress| {
             let result = catch_unwind(AssertUnwindSafe(|| {
-                illuminate(&atlas, params, &DirectLight::try_new(&atlas.scene)?, sides, progress)
+                let mut new = illuminate(&of, params, &DirectLight::try_new(&of.scene)?, sides, progress)?;
+                if let (Part::Whole, Some(following)) = (new.part, &following) {
+                    new.kept = following.kept(&of, &new, params, progress)?;
+                }
+                Ok(new)
             }));
             result.unwrap_or_else(|_| Err(Error::Internal("relighting panicked".into())))
         };
@@ -116,7 +127,7 @@ impl Relight {
             let _ = sender.send(compute(&params, None, &progress));
         });
         self.device = Some(device);
-        self.running = Some(Running { results: Mutex::new(results), cancel, abandon });
+        self.running = Some(Running { atlas: atlas.clone(), results: Mutex::new(results), cancel, abandon });
         Ok(())
     }
 
@@ -156,6 +167,8 @@ impl Relight {
         let mut newest: Option<Indirect> = None;
         loop {
             match results.try_recv() {
+                // The scene has moved since: what it was compared with is out of date. Another one follows.
+                Ok(Ok(new)) if new.part == Part::Whole && !Arc::ptr_eq(&running.atlas, atlas) => {}
                 Ok(Ok(indirect)) => newest = Some(indirect),
                 // Cancelled because of another change of light.
                 Ok(Err(Error::Cancelled)) => {}
@@ -208,33 +221,39 @@ impl Live {
         if self.paused {
             return Ok(());
         }
-        let Some(new) = self.relight.poll(&self.context.map.atlas, &self.bake, &self.context.light.sides)? else {
+        let Some(mut new) = self.relight.poll(&self.context.map.atlas, &self.bake, &self.context.light.sides)? else {
             return Ok(());
         };
+        let (part, kept) = (new.part, std::mem::take(&mut new.kept));
+        let has_moved = part == Part::Whole && self.relight.following.is_some();
         let before = self.context.light.clone();
         let renewed = before.renewed(new).inspect_err(|_| self.relight.redo())?;
         self.context.light = Arc::new(renewed);
         self.display.begin_indirect_epoch();
+        self.keep_indirect(before.indirect_epoch, part, &kept);
         if self.context.light.direct_epoch != before.direct_epoch {
             self.display.begin_direct_epoch();
-            self.keep_direct_of_same_sides(&before);
+            let (map, backs) = (self.context.map.clone(), [before.sides.clone(), self.context.light.sides.clone()]);
+            // New indirect light may turn some charts over.
+            self.keep_direct(before.direct_epoch, |_, tile| {
+                let chart = map.atlas.gather.layout.chart_of(tile.placement).index();
+                backs[0].backs.get(chart) == backs[1].backs.get(chart)
+            });
         }
-        self.mark_new_light(&before);
+        self.mark_new_light(&before, has_moved);
         self.chooser.note_all(&self.context, self.blocks.status());
         Ok(())
     }
 
-    /// Keeps the direct light of charts whose sides have not changed valid: new indirect light may turn other charts
-    /// over.
-    pub(super) fn keep_direct_of_same_sides(&mut self, before: &Illumination) {
+    /// Keeps the direct light of an epoch valid in the present one, in blocks of which `is_same` says so.
+    pub(super) fn keep_direct(&mut self, before_epoch: u32, is_same: impl Fn(u32, &Tile) -> bool) {
         let light = self.context.light.clone();
         for (b, tile) in (0u32..).zip(&self.context.map.tiles) {
-            let chart = self.context.map.atlas.gather.layout.chart_of(tile.placement).index();
-            if before.sides.backs.get(chart) != light.sides.backs.get(chart) {
+            if !is_same(b, tile) {
                 continue;
             }
             let renew = |epoch: &mut u32| {
-                let is_good = *epoch == before.direct_epoch;
+                let is_good = *epoch == before_epoch;
                 *epoch = if is_good { light.direct_epoch } else { *epoch };
                 is_good
             };
@@ -261,7 +280,9 @@ impl Live {
         let direct = Arc::new(DirectLight::try_new(self.scene())?);
         self.collect_now()?;
         self.make_room_for_epochs()?;
-        self.relight.start(&self.context.map.atlas, &self.bake, &self.context.light.sides)?;
+        let following = self.relight.following.take();
+        let started = self.relight.start(&self.context.map.atlas, &self.bake, &self.context.light.sides);
+        started.inspect_err(|_| self.relight.following = following)?;
         // Nothing can fail from here on.
         self.display.begin_direct_epoch();
         self.lights = lights;
@@ -317,6 +338,8 @@ mod tests {
             sides: sides.clone(),
             own: Own { directional: vec![Some(Directional::default()); light.len()], light, rays: 0 },
             has_indirect: true,
+            part: Part::Whole,
+            kept: Vec::new(),
         };
         let quick = before.renewed(new(&shown, vec![Some(Vec3::Y), None])).unwrap();
         assert_eq!((quick.direct_epoch, quick.indirect_epoch, quick.radiance.values[0]), (1, 2, Vec3::ONE));

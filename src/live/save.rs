@@ -16,13 +16,14 @@ use crate::base::progress::Progress;
 use crate::lightmap::directional;
 use crate::lightmap::indirect::gather::Gathered;
 use crate::lightmap::indirect::sample_set::ROUND;
+use crate::lightmap::saved::fingerprint::geometry;
 use crate::scene::MOST_LIGHT;
 use glam::Vec3;
 use std::fmt::Write;
 use std::io::Read;
 use std::path::Path;
 
-const MAGIC: [u8; 8] = *b"BKLIVE4\0";
+const MAGIC: [u8; 8] = *b"BKLIVE5\0";
 
 /// Size in bytes of magic, fingerprint and number of blocks.
 const HEAD: usize = 24;
@@ -205,6 +206,7 @@ impl Live {
         ] {
             h.word(n);
         }
+        h.word(u64::from(geometry(&atlas.scene)));
         write!(h, "{:?}", self.lights).map_err(|_| Error::Internal("lights have no text".into()))?;
         for values in self.context.light.radiance.values.chunks(PIECE) {
             values.iter().flat_map(|v| v.to_array()).for_each(|c| h.word(c.to_bits() as u64));

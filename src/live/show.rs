@@ -4,6 +4,7 @@ use super::dirty::{LEAST_BYTES, TEXEL_BYTES};
 use super::display::{Changed, Display};
 use super::illumination::Illumination;
 use super::{Budget, Live, LiveStats, Mode, PASS};
+use std::sync::Arc;
 use std::time::Instant;
 
 /// Part of the time budget that is kept free at most for reading what an update gives out.
@@ -18,12 +19,12 @@ impl Live {
     }
 
     /// Marks what new indirect light changes at once: what texels gather for themselves, and all of charts that show
-    /// their other side; all, after a first impression.
-    pub(super) fn mark_new_light(&mut self, before: &Illumination) {
+    /// their other side; all, after a first impression; and, if the scene `has_moved`, blocks whose light that changes.
+    pub(super) fn mark_new_light(&mut self, before: &Illumination, has_moved: bool) {
         let (map, light) = (self.context.map.clone(), self.context.light.clone());
         let (old, new) = (&before.sides.backs, &light.sides.backs);
         let was_first_impression = before.sides.is_first_impression && !light.sides.is_first_impression;
-        if old != new || was_first_impression {
+        if !Arc::ptr_eq(&before.sides, &light.sides) {
             Display::find_alone(&map, &light.sides, &mut self.alone);
         }
         for (b, tile) in (0u32..).zip(&map.tiles) {
@@ -32,8 +33,8 @@ impl Live {
             let alone = self.alone[b as usize];
             if old.get(chart) != new.get(chart) {
                 self.dirty.add(Changed { page, rect: widest, block: b, amount: 1.0 });
-            } else if was_first_impression {
-                // From now on walls and gaps separate texels.
+            } else if was_first_impression || has_moved && self.status(b).has_old_light(&self.context) {
+                // Other walls and gaps separate texels from now on.
                 self.dirty.add(Changed { page, rect: widest, block: b, amount: 0.25 });
             } else if alone.area() > 0 {
                 let rect = alone.grown(map.atlas.padding as i32);
@@ -52,15 +53,24 @@ impl Live {
             self.wait(b);
         } else if let Some(common) = common {
             stats.cells_promoted += 1;
-            for i in 0..self.grid.blocks_of(cell).len() {
-                let b = self.grid.blocks_of(cell)[i];
-                self.display.lods[b as usize] = common;
-                if self.display.begin_fade(b) {
-                    self.fading.push(b);
-                }
-                self.wait(b);
-            }
+            self.show_cell(cell, common);
+            self.wait(b);
         } else if self.status(b).fresh_lod <= self.display.lods[b as usize] {
+            self.wait(b);
+        }
+    }
+
+    /// Lets all blocks of a cell that show less fade to a LOD that they all have.
+    pub(super) fn show_cell(&mut self, cell: u32, lod: u8) {
+        for i in 0..self.grid.blocks_of(cell).len() {
+            let b = self.grid.blocks_of(cell)[i];
+            if self.display.lods[b as usize] >= lod {
+                continue;
+            }
+            self.display.lods[b as usize] = lod;
+            if self.display.begin_fade(b) {
+                self.fading.push(b);
+            }
             self.wait(b);
         }
     }

@@ -149,7 +149,7 @@ mod tests {
         for both_sides in [true, false] {
             let desc = LightmapDesc { texels_per_unit: 16.0, both_sides, ..Default::default() };
             let lightmap = Lightmap::create(&scene, &desc, &Progress::none()).unwrap();
-            let map = BlockMap::new(lightmap.atlas(), 3, &Progress::none()).unwrap();
+            let map = BlockMap::new(lightmap.atlas(), 3, 1.0, &Progress::none()).unwrap();
             let chart = lightmap.atlas().charts.chart_of(0);
             let [above, below] = [1.0, -1.0].map(|z| {
                 let hit = scene.intersect_raw(&Ray::new(Vec3::new(0.3, 0.4, z), Vec3::Z * -z));

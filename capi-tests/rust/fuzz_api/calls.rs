@@ -745,7 +745,7 @@ fn bake(w: &W, s: &mut Source) {
     watched.end("bk_bake", result);
 }
 
-/// A light map that follows a scene, and what changed is baked.
+/// A light map that follows a scene, live light that follows it, and what changed is baked.
 fn edit(w: &W, s: &mut Source) {
     let Some(lightmap) = w.pick(Kind::Lightmap, s) else { return };
     let mut params = bake_params(w, s);
@@ -760,6 +760,11 @@ fn edit(w: &W, s: &mut Source) {
         watched.end("bk_lightmap_follow", result);
     }
     let keep_error = [0.0, 0.03, 1.0, -1.0, f32::NAN, f32::INFINITY][s.below(6)];
+    if let Some(live) = w.pick(Kind::Live, s) {
+        let watched = Watched::new(w, s);
+        let result = ask!(bk_live_follow(live.p(), lightmap.p(), keep_error, Some(progress), watched.user()));
+        watched.end("bk_live_follow", result);
+    }
     let watched = Watched::new(w, s);
     let mut stats = defaults!(bk_bake_stats, bk_bake_stats_init);
     let result = ask!(bk_bake_changed(lightmap.p(), &params, keep_error, Some(progress), watched.user(), &mut stats));
@@ -1106,6 +1111,7 @@ fn null_handles(s: &mut Source) {
             failed(ask!(bk_bake(null_mut(), null(), None, null_mut(), null_mut())));
             failed(ask!(bk_bake_changed(null_mut(), null(), 0.0, None, null_mut(), null_mut())));
             failed(ask!(bk_lightmap_follow(null_mut(), null(), None, null_mut())));
+            failed(ask!(bk_live_follow(null_mut(), null(), 0.0, None, null_mut())));
             failed(ask!(bk_lightmap_read(null(), 0, 0, 1, null_mut(), 0)));
             failed(ask!(bk_lightmap_save(null(), null(), 1, None, null_mut())));
             failed(ask!(bk_lightmap_write(null_mut(), null(), 0, 1, null(), None, null_mut())));

@@ -16,7 +16,7 @@ const WIDE: f32 = 0.5;
 const MOST_EMITTERS: usize = 64;
 
 /// Where light comes from.
-pub(super) enum Source {
+pub(in crate::lightmap) enum Source {
     /// From a box, which may be a point.
     Near(Bounds),
     /// From infinitely far away, up to an angle with this tangent from a direction.
@@ -26,7 +26,7 @@ pub(super) enum Source {
 }
 
 /// Returns what gives direct light.
-pub(super) fn sources(scene: &Scene) -> Result<Vec<Source>> {
+pub(in crate::lightmap) fn sources(scene: &Scene) -> Result<Vec<Source>> {
     let mut sources = Vec::new();
     let around = |points: &[Vec3]| {
         let mut bounds = Bounds::EMPTY;

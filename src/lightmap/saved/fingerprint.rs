@@ -210,7 +210,7 @@ fn text_sum(values: &(impl Debug + ?Sized)) -> u32 {
 }
 
 /// Computes the checksum of all meshes but for their light map UVs.
-pub(super) fn geometry(scene: &Scene) -> u32 {
+pub(crate) fn geometry(scene: &Scene) -> u32 {
     let mut sum = crc32fast::Hasher::new();
     for mesh in scene.meshes() {
         sum.update(bytemuck::cast_slice(&mesh.positions));

@@ -11,7 +11,7 @@
 //! | `checkpoint` | the progress of a bake: written as it goes on, read when it starts again |
 
 pub(crate) mod checkpoint;
-pub(super) mod fingerprint;
+pub(crate) mod fingerprint;
 mod layout;
 mod records;
 mod result;

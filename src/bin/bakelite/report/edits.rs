@@ -1,5 +1,5 @@
 //! `bakelite report edits`: an object of a scene moves; seconds to right light by baking what has changed, beside a bake
-//! from nothing, and the difference of the two.
+//! from nothing, and the difference of the two; and the same of live light that follows, beside live light made anew.
 //!
 //! Objects are pieces whose triangles hang together. Some are chosen at random among those of a size that a person
 //! would move, and move by their own size across the floor.
@@ -8,6 +8,7 @@ use crate::args::ReportArgs;
 use crate::job::Job;
 use crate::report::measure::pick;
 use bakelite::lightmap::{BakeParams, Layer, LayerData, Lightmap};
+use bakelite::live::{Budget, Live, LiveCamera, LiveParams, Mode, PageRect};
 use bakelite::sampling::combine;
 use bakelite::{Error, Progress, Result, Scene};
 use glam::{Quat, Vec3};
@@ -94,11 +95,7 @@ pub fn run(args: &ReportArgs) -> Result<()> {
     );
     println!("|---|---|---|---|---|---|---|---|---|---|---|");
     for (number, piece) in pieces.iter().enumerate() {
-        let here = scene.meshes()[piece.mesh as usize].positions.to_vec();
-        let angle = Quat::from_axis_angle(args.bake.up.normalize(), number as f32 * 2.4);
-        let by = angle * args.bake.up.any_orthonormal_vector() * piece.size;
-        let mut there = here.clone();
-        piece.vertices.iter().for_each(|&v| there[v as usize] += by);
+        let [here, there] = places(&scene, piece, number, args.bake.up);
         let old = light(&map)?;
         let refit = move_to(&mut scene, piece.mesh, &there)?;
         let start = Instant::now();
@@ -142,7 +139,108 @@ pub fn run(args: &ReportArgs) -> Result<()> {
         map.follow(&scene, &progress)?;
         map.load_result(&path, &progress)?;
     }
-    std::fs::remove_file(&path).map_err(|e| Error::Io(e.to_string()))
+    std::fs::remove_file(&path).map_err(|e| Error::Io(e.to_string()))?;
+    live_light(args, &mut scene, &mut map, &pieces)
+}
+
+/// Prints a table of live light that follows the pieces. Updates without a camera have no limit of time.
+fn live_light(args: &ReportArgs, scene: &mut Arc<Scene>, map: &mut Lightmap, pieces: &[Piece]) -> Result<()> {
+    let bake = args.bake.params;
+    let params = LiveParams {
+        mode: Mode::Uniform,
+        max_rounds: bake.gather_rays.div_ceil(64),
+        photon_count: bake.photon_count,
+        direct_samples: bake.direct_samples,
+        seed: bake.seed,
+        ..Default::default()
+    };
+    let progress = Progress::none();
+    let anew = |map: &Lightmap| {
+        Time::of(|| {
+            let mut live = Live::new(map, &params, &progress)?;
+            finish(&mut live)?;
+            Ok(live)
+        })
+    };
+    println!("\nLive light:\n");
+    println!(
+        "| triangles moved | size | refit, light map, live follow, s | keep_error | all gathered, s | made anew, s | kept | \
+         difference of indirect light | of direct light | of old light: indirect | direct |"
+    );
+    println!("|---|---|---|---|---|---|---|---|---|---|---|");
+    for (number, piece) in pieces.iter().enumerate() {
+        let [here, there] = places(scene, piece, number, args.bake.up);
+        for keep_error in KEEP_ERRORS {
+            let (mut live, _) = anew(map)?;
+            let before = live.sums()?;
+            let refit = move_to(scene, piece.mesh, &there)?;
+            let (_, of_map) = Time::of(|| map.follow(scene, &progress))?;
+            let old = [Layer::Indirect, Layer::Direct].map(|layer| shown(&live, map, layer));
+            let (_, of_live) = Time::of(|| live.follow(map, keep_error, &progress))?;
+            let (_, gathered) = Time::of(|| finish(&mut live))?;
+            let kept = live.sums()?.iter().zip(&before).filter(|(new, old)| new == old).count() as f64;
+            let (fresh, whole) = anew(map)?;
+            let mut differ = Vec::new();
+            for (layer, old) in [Layer::Indirect, Layer::Direct].into_iter().zip(old) {
+                let right = shown(&fresh, map, layer)?;
+                let all = vec![true; right.len()];
+                differ.push([shown(&live, map, layer)?, old?].map(|light| difference(&light, &right, &all)));
+            }
+            println!(
+                "| {} | {:.2} | {refit:.2}, {:.2}, {:.2} | {keep_error} | {} | {} | {:.1} % | {:.1e} | {:.1e} | {:.1e} | {:.1e} |",
+                piece.triangles,
+                piece.size,
+                of_map.seconds,
+                of_live.seconds,
+                gathered.text(),
+                whole.text(),
+                100.0 * kept / before.len() as f64,
+                differ[0][0],
+                differ[1][0],
+                differ[0][1],
+                differ[1][1],
+            );
+            move_to(scene, piece.mesh, &here)?;
+            map.follow(scene, &progress)?;
+        }
+    }
+    Ok(())
+}
+
+/// Updates live light until nothing is left to do.
+fn finish(live: &mut Live) -> Result<()> {
+    let camera = LiveCamera { position: Vec3::ZERO, forward: Vec3::X, up: Vec3::Z, fov_y: 1.0, width: 16, height: 16 };
+    let budget = Budget { milliseconds: 100.0, ..Default::default() };
+    loop {
+        let stats = live.update(&camera, &budget)?;
+        if stats.finished == 1.0 && !stats.light_pending {
+            return Ok(());
+        }
+    }
+}
+
+/// A layer of the light that live light shows.
+fn shown(live: &Live, map: &Lightmap, layer: Layer) -> Result<Light> {
+    let (info, lod) = (map.info(), live.params().lod_count - 1);
+    let mut all = Vec::new();
+    for page in 0..info.page_count {
+        let LayerData::Scalar(valid) = map.read(page, Layer::Validity)? else {
+            return Err(Error::Internal("a layer of another type".into()));
+        };
+        let light = live.read(&PageRect { page, x: 0, y: 0, width: info.width, height: info.height }, lod, layer)?;
+        all.extend(light.into_iter().zip(valid).map(|(light, valid)| (valid == 1.0).then_some(Vec3::from(light))));
+    }
+    Ok(all)
+}
+
+/// Positions of the mesh of a piece, before and after it has moved.
+fn places(scene: &Scene, piece: &Piece, number: usize, up: Vec3) -> [Vec<Vec3>; 2] {
+    let here = scene.meshes()[piece.mesh as usize].positions.to_vec();
+    let angle = Quat::from_axis_angle(up.normalize(), number as f32 * 2.4);
+    let by = angle * up.any_orthonormal_vector() * piece.size;
+    let mut there = here.clone();
+    piece.vertices.iter().for_each(|&v| there[v as usize] += by);
+    [here, there]
 }
 
 /// Moves a mesh; returns the seconds.

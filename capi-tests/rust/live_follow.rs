@@ -1,0 +1,265 @@
+//! Live light whose scene moves: it ends with the light of the moved scene, what a move does not change keeps its rays, and
+//! an application sees every change.
+
+use bakelite::bvh::BuildOptions;
+use bakelite::lightmap::{Layer, LayerData, Lightmap, LightmapDesc};
+use bakelite::live::{Budget, Live, LiveCamera, LiveParams, Mode, PageRect};
+use bakelite::scene::{Light, MeshMaterials};
+use bakelite::{Device, DeviceOptions, Error, Material, Mesh, Progress, Scene, SceneData};
+use glam::Vec3;
+use std::sync::Arc;
+use std::sync::atomic::{AtomicU32, Ordering::SeqCst};
+
+const RAYS: Budget = Budget { milliseconds: 0.0, rays: 200_000, max_dirty_bytes: 0 };
+
+/// A box of six faces, which point outwards or inwards.
+fn block(lower: Vec3, upper: Vec3, is_room: bool) -> Mesh {
+    let mut mesh = Mesh { materials: MeshMaterials::One(0), ..Default::default() };
+    let corner = |i: usize| {
+        let pick = |k: usize| if i >> k & 1 == 0 { lower[k] } else { upper[k] };
+        Vec3::new(pick(0), pick(1), pick(2))
+    };
+    for face in [[0, 2, 3, 1], [4, 5, 7, 6], [0, 1, 5, 4], [2, 6, 7, 3], [0, 4, 6, 2], [1, 3, 7, 5]] {
+        let first = mesh.positions.len() as u32;
+        mesh.positions.as_vec().extend(face.map(corner));
+        for [a, b, c] in [[0, 1, 2], [0, 2, 3]] {
+            let [b, c] = if is_room { [c, b] } else { [b, c] };
+            mesh.indices.as_vec().push([a, b, c].map(|i: u32| first + i));
+        }
+    }
+    mesh
+}
+
+fn lamp(x: f32, intensity: f32) -> Light {
+    Light::Point { position: Vec3::new(x, 1.9, 2.7), intensity: [intensity; 3] }
+}
+
+/// Two rooms of 4 × 4 × 3 m with a door between them, a lamp in each, and a block in the first one: mesh 2.
+fn rooms(threads: usize) -> (Arc<Scene>, Lightmap) {
+    let mut data = SceneData::new();
+    data.add_material(Material { albedo: [0.7; 3], ..Default::default() }).unwrap();
+    data.add_mesh(block(Vec3::ZERO, Vec3::new(8.0, 4.0, 3.0), true)).unwrap();
+    data.add_mesh(block(Vec3::new(3.9, 0.0, 0.0), Vec3::new(4.1, 2.8, 3.0), false)).unwrap();
+    data.add_mesh(block(Vec3::new(0.6, 0.6, 0.0), Vec3::new(1.1, 1.1, 0.6), false)).unwrap();
+    for x in [2.0, 6.0] {
+        data.add_light(lamp(x, 5.0)).unwrap();
+    }
+    let device = Device::new(DeviceOptions { num_threads: threads, ..Default::default() }).unwrap();
+    let scene = Scene::commit(&device, data, &BuildOptions::default(), &Progress::none()).map_err(|e| e.1).unwrap();
+    (scene.clone(), map_of(&scene))
+}
+
+fn map_of(scene: &Arc<Scene>) -> Lightmap {
+    let desc = LightmapDesc { texels_per_unit: 16.0, page_size: 512, ..Default::default() };
+    Lightmap::create(scene, &desc, &Progress::none()).unwrap()
+}
+
+fn move_block(scene: &mut Arc<Scene>, by: Vec3) {
+    let moved: Vec<Vec3> = scene.meshes()[2].positions.iter().map(|&p| p + by).collect();
+    Scene::refit(scene, &[(2, &moved)]).unwrap();
+}
+
+fn params(mode: Mode) -> LiveParams {
+    LiveParams { mode, max_rounds: 2, photon_count: 20_000, direct_samples: 4, seed: 5, ..Default::default() }
+}
+
+/// Looks around in one room and the other.
+fn camera(i: u32) -> LiveCamera {
+    let angle = i as f32 * 0.7;
+    LiveCamera {
+        position: Vec3::new(if i % 2 == 0 { 2.0 } else { 6.0 }, 2.0, 1.5),
+        forward: Vec3::new(angle.cos(), angle.sin(), 0.9 * (0.37 * angle).sin()),
+        up: Vec3::Z,
+        fov_y: 1.5,
+        width: 320,
+        height: 200,
+    }
+}
+
+fn finish(live: &mut Live) {
+    live.finish_relighting().unwrap();
+    let mut finished = 0.0;
+    for i in 0..20_000 {
+        finished = live.update(&camera(i), &RAYS).unwrap().finished;
+        if finished == 1.0 {
+            break;
+        }
+    }
+    assert_eq!(finished, 1.0);
+    let long = Budget { milliseconds: 1000.0, rays: 0, max_dirty_bytes: 0 };
+    while live.update(&camera(0), &long).unwrap().blocks_changed > 0 {}
+}
+
+fn pages(live: &Live, lightmap: &Lightmap, layer: Layer) -> Vec<[f32; 3]> {
+    let info = lightmap.info();
+    let rect = |page| PageRect { page, x: 0, y: 0, width: info.width, height: info.height };
+    (0..info.page_count).flat_map(|page| live.read(&rect(page), live.params().lod_count - 1, layer).unwrap()).collect()
+}
+
+/// Layers of light of a bake with as many rays, and which texels can be seen.
+fn baked(lightmap: &mut Lightmap, live: &Live, layer: Layer) -> (Vec<[f32; 3]>, Vec<bool>) {
+    lightmap.bake(&live.params().bake(), &Progress::none()).unwrap();
+    let (mut light, mut valid) = (Vec::new(), Vec::new());
+    for page in 0..lightmap.info().page_count {
+        match (lightmap.read(page, layer).unwrap(), lightmap.read(page, Layer::Validity).unwrap()) {
+            (LayerData::Rgb(values), LayerData::Scalar(v)) => {
+                light.extend(values);
+                valid.extend(v.iter().map(|&v| v == 1.0));
+            }
+            _ => unreachable!(),
+        }
+    }
+    (light, valid)
+}
+
+fn difference(a: [f32; 3], b: [f32; 3]) -> f32 {
+    (0..3).map(|k| (a[k] - b[k]).abs()).sum()
+}
+
+#[test]
+fn blocks_keep_their_rays_or_gather_the_light_of_the_moved_scene() {
+    for (mode, background) in [(Mode::Position, false), (Mode::Position, true), (Mode::Uniform, false)] {
+        let none = Progress::none();
+        let (mut scene, mut lightmap) = rooms(2);
+        let params = LiveParams { background, ..params(mode) };
+        let mut live = Live::new(&lightmap, &params, &none).unwrap();
+        finish(&mut live);
+        let before = live.sums().unwrap();
+        let old = [Layer::Direct, Layer::Indirect].map(|layer| pages(&live, &lightmap, layer));
+        move_block(&mut scene, Vec3::new(0.3, 0.2, 0.0));
+        lightmap.follow(&scene, &none).unwrap();
+        live.follow(&lightmap, 0.05, &none).unwrap();
+        assert!(Arc::ptr_eq(live.scene(), &scene));
+        finish(&mut live);
+        let after = live.sums().unwrap();
+        let mut fresh = Live::new(&lightmap, &params, &none).unwrap();
+        finish(&mut fresh);
+        let fresh_sums = fresh.sums().unwrap();
+        let n = after.len();
+        let neither = (0..n).filter(|&i| after[i] != before[i] && after[i] != fresh_sums[i]).count();
+        assert_eq!(neither, 0, "{mode:?}: texels of {n} with sums that are neither old nor new");
+        let kept = (0..n).filter(|&i| after[i] == before[i]).count();
+        assert!(kept > n / 4 && kept < n * 95 / 100, "{mode:?}: {kept} of {n} texels kept their rays");
+        for (layer, old) in [Layer::Direct, Layer::Indirect].into_iter().zip(old) {
+            let shown = pages(&live, &lightmap, layer);
+            let (right, valid) = baked(&mut lightmap, &live, layer);
+            let all: Vec<usize> = (0..right.len()).filter(|&i| valid[i]).collect();
+            let mean = all.iter().map(|&i| difference(right[i], [0.0; 3])).sum::<f32>() / all.len() as f32;
+            let worst = |of: &[[f32; 3]]| all.iter().map(|&i| difference(of[i], right[i])).fold(0.0, f32::max) / mean;
+            let (shown, old) = (worst(&shown), worst(&old));
+            assert!(shown < 0.15 && old > 0.25, "{mode:?}, {layer:?}: wrong by {shown} of the mean, before by {old}");
+        }
+    }
+}
+
+#[test]
+fn with_another_light_too_all_ends_with_the_bits_of_a_bake() {
+    let none = Progress::none();
+    let (mut scene, mut lightmap) = rooms(2);
+    let mut live = Live::new(&lightmap, &params(Mode::Position), &none).unwrap();
+    finish(&mut live);
+    move_block(&mut scene, Vec3::new(0.4, 0.1, 0.3));
+    scene.set_light(1, lamp(6.0, 9.0)).unwrap();
+    lightmap.follow(&scene, &none).unwrap();
+    live.follow(&lightmap, 0.05, &none).unwrap();
+    finish(&mut live);
+    for layer in [Layer::Combined, Layer::Direct, Layer::Indirect] {
+        let shown = pages(&live, &lightmap, layer);
+        let (right, valid) = baked(&mut lightmap, &live, layer);
+        let different = (0..right.len()).filter(|&i| valid[i] && shown[i] != right[i]).count();
+        assert_eq!(different, 0, "{layer:?}");
+    }
+}
+
+/// Moves follow one another, and changes of light come between them, before the light of any has come.
+#[test]
+fn moves_on_the_way_end_with_the_light_of_the_last() {
+    let none = Progress::none();
+    for (mode, light_changes) in [(Mode::Uniform, false), (Mode::Position, true)] {
+        let (mut scene, mut lightmap) = rooms(2);
+        let mut live = Live::new(&lightmap, &params(mode), &none).unwrap();
+        finish(&mut live);
+        let size = lightmap.info().width;
+        let mut copy = pages(&live, &lightmap, Layer::Combined);
+        live.take_dirty(usize::MAX).unwrap();
+        let mut check = |live: &mut Live, lightmap: &Lightmap| {
+            for r in live.take_dirty(usize::MAX).unwrap() {
+                for (k, v) in (0..).zip(live.read(&r, live.params().lod_count - 1, Layer::Combined).unwrap()) {
+                    let (x, y) = (r.x + k % r.width, r.y + k / r.width);
+                    copy[(r.page * size * size + y * size + x) as usize] = v;
+                }
+            }
+            let now = pages(live, lightmap, Layer::Combined);
+            let stale = (0..now.len()).filter(|&i| now[i] != copy[i]).count();
+            assert_eq!(stale, 0, "{mode:?}: texels that changed outside of all rectangles");
+        };
+        for i in 0..12u32 {
+            move_block(&mut scene, Vec3::new(0.15, 0.05, if i % 3 == 0 { 0.1 } else { 0.0 }));
+            lightmap.follow(&scene, &none).unwrap();
+            live.follow(&lightmap, 0.03, &none).unwrap();
+            check(&mut live, &lightmap);
+            if light_changes && i == 5 {
+                scene.set_light(0, lamp(2.0, 7.0)).unwrap();
+                live.light_changed(0).unwrap();
+            }
+            for j in 0..i % 4 {
+                live.update(&camera(i + j), &RAYS).unwrap();
+                check(&mut live, &lightmap);
+            }
+            if i % 5 == 4 {
+                live.finish_relighting().unwrap();
+                check(&mut live, &lightmap);
+            }
+        }
+        finish(&mut live);
+        check(&mut live, &lightmap);
+        for layer in [Layer::Direct, Layer::Indirect] {
+            let shown = pages(&live, &lightmap, layer);
+            let (right, valid) = baked(&mut lightmap, &live, layer);
+            let all: Vec<usize> = (0..right.len()).filter(|&i| valid[i]).collect();
+            let mean = all.iter().map(|&i| difference(right[i], [0.0; 3])).sum::<f32>() / all.len() as f32;
+            let worst = all.iter().map(|&i| difference(shown[i], right[i])).fold(0.0, f32::max) / mean;
+            assert!(worst < 0.25, "{mode:?}, {layer:?}: wrong by {worst} of the mean");
+        }
+    }
+}
+
+#[test]
+fn what_cannot_be_followed_changes_nothing() {
+    let none = Progress::none();
+    let (mut scene, mut lightmap) = rooms(2);
+    let mut live = Live::new(&lightmap, &params(Mode::Position), &none).unwrap();
+    for i in 0..5 {
+        live.update(&camera(i), &RAYS).unwrap();
+    }
+    let path = std::env::temp_dir().join(format!("bakelite-before-a-move-{}", std::process::id()));
+    live.save(&path, &none).unwrap();
+    live.follow(&lightmap, 0.1, &none).unwrap();
+    let state = (live.sums().unwrap(), pages(&live, &lightmap, Layer::Combined));
+    let other = map_of(&scene);
+    assert!(matches!(live.follow(&other, 0.1, &none), Err(Error::InvalidArgument(_))));
+    move_block(&mut scene, Vec3::new(0.3, 0.0, 0.0));
+    lightmap.follow(&scene, &none).unwrap();
+    for bad in [-1.0, f32::NAN, f32::INFINITY] {
+        assert!(matches!(live.follow(&lightmap, bad, &none), Err(Error::InvalidArgument(_))), "{bad}");
+    }
+    let mut cancelled = 0;
+    for n in 1..40 {
+        let calls = AtomicU32::new(0);
+        match live.follow(&lightmap, 0.1, &Progress::new(|_, _| calls.fetch_add(1, SeqCst) + 1 < n)) {
+            Err(Error::Cancelled) => cancelled += 1,
+            other => {
+                other.unwrap();
+                break;
+            }
+        }
+        assert!(!Arc::ptr_eq(live.scene(), &scene));
+        assert_eq!((live.sums().unwrap(), pages(&live, &lightmap, Layer::Combined)), state);
+    }
+    assert!(cancelled > 0);
+    assert!(Arc::ptr_eq(live.scene(), &scene));
+    // Its shadows are of where the block was.
+    assert!(matches!(live.restore(&path, &none), Err(Error::InvalidArgument(_))));
+    std::fs::remove_file(&path).unwrap();
+    finish(&mut live);
+}

@@ -1,0 +1,242 @@
+//! Lets live light follow its scene when vertices or instances have moved.
+//!
+//! Direct light is computed anew at once where what moved lies, or lay, between a block and a light. Indirect light needs
+//! new photons: they are traced beside the updates ([`relight`](super::relight)), first a sixteenth of them, whose light
+//! is gathered near what moved only, then all. With these, probes compare the light of every block with that from before
+//! the move, as a bake of changes does, and blocks that see no other light keep what they have gathered.
+
+use super::Live;
+use super::Mode;
+use super::blocks::{BlockMap, Rect};
+use super::cells::{Grid, Promotion};
+use super::choose::Chooser;
+use super::display::{Changed, Display};
+use super::illumination::{Illumination, Indirect, Part, Sides};
+use crate::base::error::{Result, invalid_argument};
+use crate::base::memory::{try_collect, try_filled};
+use crate::base::progress::Progress;
+use crate::direct::DirectLight;
+use crate::lightmap::atlas::Atlas;
+use crate::lightmap::changed::comparison::{Comparison, Side};
+use crate::lightmap::indirect::radiance_map::Radiance;
+use crate::lightmap::moved::Moved;
+use crate::lightmap::{BakeParams, Lightmap};
+use glam::Vec3;
+use std::sync::Arc;
+
+const MOVED: &str = "blocks whose light a move has changed";
+
+/// The light from before a move, with which that after it is compared.
+pub(super) struct Base {
+    map: Arc<BlockMap>,
+    radiance: Arc<Radiance>,
+    sides: Arc<Sides>,
+    /// Light of each block, by the sum of its channels, and its mean over the light map.
+    light: Vec<f32>,
+    mean: f32,
+}
+
+/// What a renewal of indirect light is compared with.
+#[derive(Clone)]
+pub(super) struct Following {
+    base: Arc<Base>,
+    /// Relative difference of light that is let stand.
+    keep_error: f32,
+}
+
+impl Following {
+    /// Finds the blocks whose indirect light stays as it was, under new light with all photons; none if it is dark.
+    pub fn kept(&self, atlas: &Atlas, new: &Indirect, params: &BakeParams, progress: &Progress) -> Result<Vec<bool>> {
+        if !new.has_indirect {
+            return Ok(Vec::new());
+        }
+        let base = &*self.base;
+        let old = &*base.map.atlas;
+        let moved = Moved::between(&old.scene, &atlas.scene, &atlas.charts)?;
+        let sides = [Side { atlas: old, backs: &base.sides.backs }, Side { atlas, backs: &new.sides.backs }];
+        let comparison = Comparison::new(sides, &moved, self.keep_error, progress)?;
+        let mut cells = comparison.cells()?;
+        let light = |texel| base.light[base.map.block_of(texel) as usize];
+        comparison.probe(&mut cells, [&base.radiance, &new.radiance], params, light, base.mean)?;
+        try_collect(cells.iter().map(|cell| !cell.is_new), MOVED)
+    }
+}
+
+/// The parts of a live object that depend on where things are, in another state of the scene.
+struct Place {
+    map: BlockMap,
+    normals: Vec<Vec3>,
+    grid: Grid,
+    promotion: Promotion,
+    chooser: Chooser,
+    direct: DirectLight,
+    /// By block, whether indirect light, and direct light, differs by the place of things alone.
+    differs: Vec<[bool; 2]>,
+    /// Whether an emissive triangle moved.
+    emits: bool,
+}
+
+impl Live {
+    /// Takes over another state of the scene, to which the light map that this object was made of has been updated
+    /// ([`Lightmap::follow`]). Blocks whose indirect light differs by less than `keep_error` (finite, ≥ 0; relative to
+    /// their light or, if that is more, to a tenth of the mean), as far as probes tell, keep it. If lights were set since
+    /// they were last taken over, all light is computed anew.
+    ///
+    /// A call that fails or is cancelled changes nothing.
+    pub fn follow(&mut self, lightmap: &Lightmap, keep_error: f32, progress: &Progress) -> Result<()> {
+        if !(keep_error >= 0.0 && keep_error.is_finite()) {
+            return invalid_argument!("keep_error is {keep_error}, not a finite number ≥ 0");
+        }
+        let (atlas, old) = (lightmap.atlas(), self.context.map.clone());
+        if Arc::ptr_eq(atlas, &old.atlas) {
+            return Ok(());
+        }
+        if !Arc::ptr_eq(&atlas.charts, &old.atlas.charts) {
+            return invalid_argument!("the live object is of another light map");
+        }
+        self.collect_now()?;
+        let place = self.device().run(progress, || self.place_in(atlas, keep_error, progress))?;
+        let lights = atlas.scene.lights();
+        let has_other_lights = lights != self.lights;
+        let following = match has_other_lights {
+            true => None,
+            false => self.following(keep_error)?,
+        };
+        self.make_room_for_epochs()?;
+        let former = std::mem::replace(&mut self.relight.following, following);
+        if let Err(e) = self.relight.start(atlas, &self.bake, &self.context.light.sides) {
+            self.relight.following = former;
+            return Err(e);
+        }
+        // Nothing can fail from here on.
+        self.move_to(place, has_other_lights);
+        self.lights = lights;
+        Ok(())
+    }
+
+    /// Computes what depends on where things are. To be called on the device's threads.
+    fn place_in(&mut self, atlas: &Arc<Atlas>, keep_error: f32, progress: &Progress) -> Result<Place> {
+        let old = &self.context.map;
+        let moved = Moved::between(&old.atlas.scene, &atlas.scene, &atlas.charts)?;
+        let mut map = BlockMap::new(atlas, self.params.lod_count, 0.5, progress)?;
+        let backs = &self.context.light.sides.backs;
+        let sides = [&*old.atlas, &**atlas].map(|atlas| Side { atlas, backs });
+        let cells = Comparison::new(sides, &moved, keep_error, progress)?.cells()?;
+        let grid = Grid::with(self.grid.info, &mut map.tiles)?;
+        let place = Place {
+            normals: Display::normals(&map)?,
+            promotion: Promotion::new(&map.tiles, &grid)?,
+            chooser: Chooser::new(&map, &grid)?,
+            direct: DirectLight::try_new(&atlas.scene)?,
+            differs: try_collect(cells.iter().map(|cell| [cell.is_new, cell.is_new || cell.is_shadowed]), MOVED)?,
+            emits: moved.emits,
+            map,
+            grid,
+        };
+        if self.is_stale.is_empty() {
+            let count = self.blocks.len();
+            self.reserve(count)?;
+            self.is_stale = try_filled(count, false, MOVED)?;
+            self.fixed += count;
+            self.bytes_full += count as u64;
+        }
+        Ok(place)
+    }
+
+    /// Returns what the light after a move is to be compared with: that from before the first move since all blocks had
+    /// the same; `None` if they have not.
+    fn following(&self, keep_error: f32) -> Result<Option<Following>> {
+        if let Some(following) = &self.relight.following {
+            let keep_error = keep_error.min(following.keep_error);
+            return Ok(Some(Following { keep_error, ..following.clone() }));
+        }
+        let light = &self.context.light;
+        if self.relight.is_pending() || !light.has_indirect || light.radiance.values.is_empty() {
+            return Ok(None);
+        }
+        let map = &self.context.map;
+        let of_blocks = try_collect(self.blocks.status().iter().map(|b| b.mean + b.direct_mean), MOVED)?;
+        let (mut sum, mut texels) = (0.0, 0.0);
+        for (light, tile) in of_blocks.iter().zip(&map.tiles) {
+            let n = f64::from(tile.map_texels);
+            (sum, texels) = (sum + f64::from(*light) * n, texels + n);
+        }
+        let mean = (sum / f64::max(texels, 1.0)) as f32;
+        let (radiance, sides) = (light.radiance.clone(), light.sides.clone());
+        let base = Base { map: map.clone(), radiance, sides, light: of_blocks, mean };
+        Ok(Some(Following { base: Arc::new(base), keep_error }))
+    }
+
+    fn move_to(&mut self, place: Place, has_other_lights: bool) {
+        let Place { map, normals, grid, promotion, chooser, direct, differs, emits } = place;
+        let (old, map) = (std::mem::replace(&mut self.context.map, Arc::new(map)), self.context.map.clone());
+        debug_assert_eq!((old.tiles.len(), differs.len()), (map.tiles.len(), map.tiles.len()));
+        (self.grid, self.promotion, self.chooser) = (grid, promotion, chooser);
+        self.display.set_normals(normals);
+        self.display.begin_direct_epoch();
+        let before = self.context.light.clone();
+        self.context.light = Arc::new(Illumination {
+            direct: Arc::new(direct),
+            direct_epoch: before.direct_epoch + 1,
+            ..(*before).clone()
+        });
+        if !has_other_lights && !emits {
+            self.keep_direct(before.direct_epoch, |b, _| !differs[b as usize][1]);
+        }
+        for (is_stale, [differs, _]) in self.is_stale.iter_mut().zip(&differs) {
+            *is_stale |= differs;
+        }
+        self.mark_moved_texels(&old);
+        self.promotion.count(&map.tiles, self.blocks.status());
+        self.show_cells();
+        self.chooser.note_all(&self.context, self.blocks.status());
+    }
+
+    /// Marks the texels of the light map whose samples have moved to another place in their charts: their light is that of
+    /// other texels.
+    fn mark_moved_texels(&mut self, old: &BlockMap) {
+        let map = self.context.map.clone();
+        let (new, old) = (&*map.atlas, &*old.atlas);
+        let size = new.map.layout.page_size as i32;
+        let whole = Rect { x0: 0, y0: 0, x1: size, y1: size };
+        let is_buried = |atlas: &Atlas, i: usize| atlas.buried.get(i).is_some_and(|&b| b);
+        for texel in new.map.all() {
+            let i = texel.index();
+            if new.map[texel] != old.map[texel] || is_buried(new, i) != is_buried(old, i) {
+                let (x, y) = new.map.position(texel);
+                let page = new.map.layout[new.map.placement_of(&new.charts, texel)].page;
+                let rect = Rect { x0: x, y0: y, x1: x + 1, y1: y + 1 }.grown(new.padding as i32).clipped(&whole);
+                self.dirty.add(Changed { page, rect, block: map.block_of(texel), amount: 0.5 });
+            }
+        }
+    }
+
+    /// Shows the LOD that all blocks of a cell have, after blocks came to other cells.
+    fn show_cells(&mut self) {
+        if self.params.mode != Mode::Position {
+            return;
+        }
+        for i in 0..self.grid.occupied.len() {
+            let cell = self.grid.occupied[i];
+            self.show_cell(cell, self.promotion.common(cell));
+        }
+    }
+
+    /// Lets blocks whose light a move does not change keep what they have gathered, although there is `new` light: with
+    /// few photons all but those near what moved, then those that probes have found.
+    pub(super) fn keep_indirect(&mut self, before_epoch: u32, part: Part, kept: &[bool]) {
+        let epoch = self.context.light.indirect_epoch;
+        if self.relight.following.is_some() {
+            for (b, status) in self.blocks.status_mut().iter_mut().enumerate() {
+                let is_kept = part == Part::Quick || kept.get(b).is_some_and(|&kept| kept);
+                if is_kept && !self.is_stale[b] && status.indirect_epoch == before_epoch {
+                    status.indirect_epoch = epoch;
+                }
+            }
+        }
+        if part == Part::Whole {
+            self.relight.following = None;
+            self.is_stale.fill(false);
+        }
+    }
+}
