@@ -7,8 +7,8 @@
 # c         AddressSanitizer with LeakSanitizer and UndefinedBehaviorSanitizer in every C and C++ program. They see
 #           the programs' own memory, what the library does to it by way of the C library, and all leaks. The library
 #           is the release build.
-# rust      The library too is compiled with AddressSanitizer (nightly toolchain): its small unit tests, a short run
-#           of fuzz_api, and the C programs against it.
+# rust      The library too is compiled with AddressSanitizer (nightly toolchain, clang): its small unit tests, a short
+#           run of fuzz_api, and the C programs against it. A quarter of an hour on two cores.
 # valgrind  Memcheck over a small whole pipeline in C, with the kernels that Valgrind knows (at most AVX2).
 # miri      Miri over the unit tests that need no large scene: lanes, handles, arguments, locks, samples
 #           (nightly toolchain with miri and rust-src). Under it the portable kernels alone are available.

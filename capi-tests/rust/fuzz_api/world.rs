@@ -333,10 +333,19 @@ impl World {
     }
 }
 
+/// Keeps what callbacks get until the process ends, since a wrong library could call them at any time. The list lets
+/// LeakSanitizer tell it from what the library leaks.
+fn kept<T: Send + Sync>(value: T) -> &'static T {
+    static KEPT: Mutex<Vec<usize>> = Mutex::new(Vec::new());
+    let value: &'static T = Box::leak(Box::new(value));
+    KEPT.lock().unwrap().push(std::ptr::from_ref(value) as usize);
+    value
+}
+
 /// An account for a device of `world`, and the pointer that its callbacks get.
 pub fn account(world: &Arc<World>, s: &mut Source) -> (&'static Account, Arc<DeviceLife>) {
     let refuse_every = if s.one_in(3) { 1 + s.below(30) as u64 } else { 0 };
-    let account: &'static Account = Box::leak(Box::new(Account {
+    let account = kept(Account {
         bytes: AtomicI64::new(0),
         asked: AtomicU64::new(0),
         refuse_every: AtomicU64::new(refuse_every),
@@ -344,7 +353,7 @@ pub fn account(world: &Arc<World>, s: &mut Source) -> (&'static Account, Arc<Dev
         released_inside: AtomicBool::new(false),
         seed: s.next(),
         world: Mutex::new(Some(Arc::downgrade(world))),
-    }));
+    });
     (account, Arc::new(DeviceLife(account)))
 }
 
@@ -417,7 +426,7 @@ pub struct Watched {
 
 impl Watched {
     pub fn new(world: &Arc<World>, s: &mut Source) -> &'static Watched {
-        Box::leak(Box::new(Watched {
+        kept(Watched {
             started: Instant::now(),
             limit: Duration::from_millis(if s.one_in(10) { 300 } else { 25 }),
             cancel_after: if s.one_in(4) { s.below(40) as u64 } else { u64::MAX },
@@ -428,7 +437,7 @@ impl Watched {
             over: AtomicBool::new(false),
             seed: s.next(),
             world: Mutex::new(Some(Arc::downgrade(world))),
-        }))
+        })
     }
 
     pub fn user(&'static self) -> *mut c_void {
