@@ -4,9 +4,9 @@
 use bakelite::bvh::BuildOptions;
 use bakelite::lightmap::{Layer, LayerData, Lightmap, LightmapDesc};
 use bakelite::live::{Budget, Live, LiveCamera, LiveParams, Mode, PageRect};
-use bakelite::scene::{Light, MeshMaterials};
+use bakelite::scene::{Instance, Light, MeshMaterials};
 use bakelite::{Device, DeviceOptions, Error, Material, Mesh, Progress, Scene, SceneData};
-use glam::Vec3;
+use glam::{Affine3A, Vec3};
 use std::sync::Arc;
 use std::sync::atomic::{AtomicU32, Ordering::SeqCst};
 
@@ -34,17 +34,21 @@ fn lamp(x: f32, intensity: f32) -> Light {
     Light::Point { position: Vec3::new(x, 1.9, 2.7), intensity: [intensity; 3] }
 }
 
-/// Two rooms of 4 × 4 × 3 m with a door between them, a lamp in each, and a block in the first one: mesh 2.
-fn rooms(threads: usize) -> (Arc<Scene>, Lightmap) {
+/// Two rooms of 4 × 4 × 3 m with a door between them, a lamp in each, and a block in the first one: mesh 2, or the instance
+/// of it.
+fn rooms(is_instance: bool) -> (Arc<Scene>, Lightmap) {
     let mut data = SceneData::new();
     data.add_material(Material { albedo: [0.7; 3], ..Default::default() }).unwrap();
     data.add_mesh(block(Vec3::ZERO, Vec3::new(8.0, 4.0, 3.0), true)).unwrap();
     data.add_mesh(block(Vec3::new(3.9, 0.0, 0.0), Vec3::new(4.1, 2.8, 3.0), false)).unwrap();
     data.add_mesh(block(Vec3::new(0.6, 0.6, 0.0), Vec3::new(1.1, 1.1, 0.6), false)).unwrap();
+    if is_instance {
+        data.add_instance(Instance { mesh: 2, transform: Affine3A::IDENTITY }).unwrap();
+    }
     for x in [2.0, 6.0] {
         data.add_light(lamp(x, 5.0)).unwrap();
     }
-    let device = Device::new(DeviceOptions { num_threads: threads, ..Default::default() }).unwrap();
+    let device = Device::new(DeviceOptions { num_threads: 2, ..Default::default() }).unwrap();
     let scene = Scene::commit(&device, data, &BuildOptions::default(), &Progress::none()).map_err(|e| e.1).unwrap();
     (scene.clone(), map_of(&scene))
 }
@@ -55,6 +59,10 @@ fn map_of(scene: &Arc<Scene>) -> Lightmap {
 }
 
 fn move_block(scene: &mut Arc<Scene>, by: Vec3) {
+    if let [instance] = scene.instances() {
+        let there = Affine3A::from_translation(by) * instance.transform;
+        return Scene::refit_with(scene, &[], &[(0, there)]).unwrap();
+    }
     let moved: Vec<Vec3> = scene.meshes()[2].positions.iter().map(|&p| p + by).collect();
     Scene::refit(scene, &[(2, &moved)]).unwrap();
 }
@@ -118,9 +126,11 @@ fn difference(a: [f32; 3], b: [f32; 3]) -> f32 {
 
 #[test]
 fn blocks_keep_their_rays_or_gather_the_light_of_the_moved_scene() {
-    for (mode, background) in [(Mode::Position, false), (Mode::Position, true), (Mode::Uniform, false)] {
+    for (mode, background, is_instance) in
+        [(Mode::Position, false, false), (Mode::Position, true, false), (Mode::Uniform, false, true)]
+    {
         let none = Progress::none();
-        let (mut scene, mut lightmap) = rooms(2);
+        let (mut scene, mut lightmap) = rooms(is_instance);
         let params = LiveParams { background, ..params(mode) };
         let mut live = Live::new(&lightmap, &params, &none).unwrap();
         finish(&mut live);
@@ -155,7 +165,7 @@ fn blocks_keep_their_rays_or_gather_the_light_of_the_moved_scene() {
 #[test]
 fn with_another_light_too_all_ends_with_the_bits_of_a_bake() {
     let none = Progress::none();
-    let (mut scene, mut lightmap) = rooms(2);
+    let (mut scene, mut lightmap) = rooms(false);
     let mut live = Live::new(&lightmap, &params(Mode::Position), &none).unwrap();
     finish(&mut live);
     move_block(&mut scene, Vec3::new(0.4, 0.1, 0.3));
@@ -176,7 +186,7 @@ fn with_another_light_too_all_ends_with_the_bits_of_a_bake() {
 fn moves_on_the_way_end_with_the_light_of_the_last() {
     let none = Progress::none();
     for (mode, light_changes) in [(Mode::Uniform, false), (Mode::Position, true)] {
-        let (mut scene, mut lightmap) = rooms(2);
+        let (mut scene, mut lightmap) = rooms(false);
         let mut live = Live::new(&lightmap, &params(mode), &none).unwrap();
         finish(&mut live);
         let size = lightmap.info().width;
@@ -227,7 +237,7 @@ fn moves_on_the_way_end_with_the_light_of_the_last() {
 #[test]
 fn what_cannot_be_followed_changes_nothing() {
     let none = Progress::none();
-    let (mut scene, mut lightmap) = rooms(2);
+    let (mut scene, mut lightmap) = rooms(false);
     let mut live = Live::new(&lightmap, &params(Mode::Position), &none).unwrap();
     for i in 0..5 {
         live.update(&camera(i), &RAYS).unwrap();

@@ -267,10 +267,14 @@ fn every_large_allocation_and_every_request_may_fail_and_nothing_is_lost() {
     assert_eq!(ANNOUNCED.load(SeqCst), 0, "bytes announced, but not given back");
 }
 
-/// A vertex moves, and the light map follows.
+/// A vertex moves, and the light map and live light follow.
 fn edits(scene: &Arc<Scene>, lightmap: &mut Lightmap, params: &BakeParams) {
     let none = Progress::none();
     let mut moved = scene.meshes()[0].positions.to_vec();
+    let live_params = LiveParams { lod_count: 2, max_rounds: 1, photon_count: 10_000, ..Default::default() };
+    let mut live = Live::new(lightmap, &live_params, &none).unwrap();
+    // What is computed beside the calls waits.
+    live.pause(true).unwrap();
     for left in [&ALLOCATIONS_LEFT, &REQUESTS_LEFT] {
         let mut state = scene.clone();
         moved[1].z += 0.01;
@@ -278,7 +282,10 @@ fn edits(scene: &Arc<Scene>, lightmap: &mut Lightmap, params: &BakeParams) {
         let (texels, light) = (lightmap.info().texels, bits(lightmap));
         fail_each("following a scene", left, || lightmap.follow(&state, &none));
         assert_eq!((lightmap.info().texels, bits(lightmap)), (texels, light));
+        fail_each("live light that follows", left, || live.follow(lightmap, 0.03, &none));
+        assert!(Arc::ptr_eq(live.scene(), &state));
     }
+    drop(live);
     // After the first that succeeds there is nothing left to bake, but all is looked at.
     let stats = fail_all("bake of changes", || lightmap.bake_changed(params, 0.03, &none));
     assert!(stats.kept_texels > 0);

@@ -13,7 +13,7 @@ use super::choose::Chooser;
 use super::display::{Changed, Display};
 use super::illumination::{Illumination, Indirect, Part, Sides};
 use crate::base::error::{Result, invalid_argument};
-use crate::base::memory::{try_collect, try_filled};
+use crate::base::memory::{Reservation, try_collect, try_filled};
 use crate::base::progress::Progress;
 use crate::direct::DirectLight;
 use crate::lightmap::atlas::Atlas;
@@ -34,6 +34,7 @@ pub(super) struct Base {
     /// Light of each block, by the sum of its channels, and its mean over the light map.
     light: Vec<f32>,
     mean: f32,
+    _memory: Reservation,
 }
 
 /// What a renewal of indirect light is compared with.
@@ -74,6 +75,8 @@ struct Place {
     differs: Vec<[bool; 2]>,
     /// Whether an emissive triangle moved.
     emits: bool,
+    /// Memory of both states.
+    _memory: Reservation,
 }
 
 impl Live {
@@ -117,6 +120,8 @@ impl Live {
     /// Computes what depends on where things are. To be called on the device's threads.
     fn place_in(&mut self, atlas: &Arc<Atlas>, keep_error: f32, progress: &Progress) -> Result<Place> {
         let old = &self.context.map;
+        let texels = old.atlas.gather.len() * size_of::<Vec3>();
+        let memory = old.atlas.scene.device().memory().reserve(old.bytes() + texels, MOVED)?;
         let moved = Moved::between(&old.atlas.scene, &atlas.scene, &atlas.charts)?;
         let mut map = BlockMap::new(atlas, self.params.lod_count, 0.5, progress)?;
         let backs = &self.context.light.sides.backs;
@@ -130,6 +135,7 @@ impl Live {
             direct: DirectLight::try_new(&atlas.scene)?,
             differs: try_collect(cells.iter().map(|cell| [cell.is_new, cell.is_new || cell.is_shadowed]), MOVED)?,
             emits: moved.emits,
+            _memory: memory,
             map,
             grid,
         };
@@ -163,12 +169,14 @@ impl Live {
         }
         let mean = (sum / f64::max(texels, 1.0)) as f32;
         let (radiance, sides) = (light.radiance.clone(), light.sides.clone());
-        let base = Base { map: map.clone(), radiance, sides, light: of_blocks, mean };
+        let bytes = map.bytes() + size_of_val(&radiance.values[..]) + size_of_val(&of_blocks[..]);
+        let memory = map.atlas.scene.device().memory().reserve(bytes, MOVED)?;
+        let base = Base { map: map.clone(), radiance, sides, light: of_blocks, mean, _memory: memory };
         Ok(Some(Following { base: Arc::new(base), keep_error }))
     }
 
     fn move_to(&mut self, place: Place, has_other_lights: bool) {
-        let Place { map, normals, grid, promotion, chooser, direct, differs, emits } = place;
+        let Place { map, normals, grid, promotion, chooser, direct, differs, emits, _memory } = place;
         let (old, map) = (std::mem::replace(&mut self.context.map, Arc::new(map)), self.context.map.clone());
         debug_assert_eq!((old.tiles.len(), differs.len()), (map.tiles.len(), map.tiles.len()));
         (self.grid, self.promotion, self.chooser) = (grid, promotion, chooser);

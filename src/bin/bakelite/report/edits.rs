@@ -14,7 +14,7 @@ use bakelite::{Error, Progress, Result, Scene};
 use glam::{Quat, Vec3};
 use std::collections::HashMap;
 use std::sync::Arc;
-use std::time::Instant;
+use std::time::{Duration, Instant};
 
 /// Sizes of objects that move, as fractions of the scene's diagonal.
 const SIZES: std::ops::Range<f32> = 0.01..0.1;
@@ -215,6 +215,10 @@ fn finish(live: &mut Live) -> Result<()> {
         let stats = live.update(&camera, &budget)?;
         if stats.finished == 1.0 && !stats.light_pending {
             return Ok(());
+        }
+        if stats.milliseconds < 5.0 {
+            // Photons are on their way, on a thread that waits during updates if there is no core for it.
+            std::thread::sleep(Duration::from_millis(5));
         }
     }
 }
