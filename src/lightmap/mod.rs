@@ -39,6 +39,7 @@ use indirect::sample_set::ROUND;
 use plan::Plan;
 pub use readback::MeshUvs;
 pub use saved::CheckpointParams;
+pub use saved::share::{ShareParams, ShareStage};
 use saved::fingerprint::Origin;
 use std::sync::Arc;
 
