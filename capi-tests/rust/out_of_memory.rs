@@ -10,7 +10,9 @@
 use bakelite::bvh::{BuildOptions, BuildQuality};
 use bakelite::io::lightmaps::{write_png_pages, write_scene};
 use bakelite::io::{LoadOptions, load_with};
-use bakelite::lightmap::{BakeParams, CheckpointParams, Layer, LayerData, Lightmap, LightmapDesc, ShareParams, ShareStage};
+use bakelite::lightmap::{
+    BakeParams, CheckpointParams, Layer, LayerData, Lightmap, LightmapDesc, ShareParams, ShareStage,
+};
 use bakelite::live::{Budget, Live, LiveCamera, LiveParams, Mode, PageRect};
 use bakelite::photon::{PhotonMap, PhotonParams};
 use bakelite::scene::{LightmapUvs, MeshMaterials, OpenOptions};
@@ -350,9 +352,7 @@ fn shares(lightmap: &mut Lightmap, folder: &Path, expected: u64) {
             });
         }
     }
-    fail_each("a bake from shares", &ALLOCATIONS_LEFT, || {
-        lightmap.bake_with_shares(params, Some(shares), None, &none)
-    });
+    fail_each("a bake from shares", &ALLOCATIONS_LEFT, || lightmap.bake_with_shares(params, Some(shares), None, &none));
     assert_eq!(bits(lightmap), expected);
 }
 

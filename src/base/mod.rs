@@ -19,3 +19,4 @@ pub(crate) mod scratch_files;
 pub(crate) mod share;
 pub(crate) mod sort;
 pub(crate) mod threads;
+pub(crate) mod watched_file;

@@ -127,6 +127,7 @@ impl Lightmap {
                 params.texel_begin
             );
         }
+        self.atlas.scene.check_file()?;
         let origin = Origin::new(params, &self.atlas.scene.lights());
         let direct = self.atlas.scene.device().install(|| DirectLight::try_new(&self.atlas.scene))?;
         let mut plan = self.planned(&direct, params);
@@ -158,6 +159,7 @@ impl Lightmap {
             light.plan = plan.clone();
             light.origin = Some(origin);
             let stitch = self.stitch(&light, &range, params, &mut plan, &mut stats, progress)?;
+            atlas.scene.check_file()?;
             Ok((light, stats, stitch))
         })?;
         stats.left_out = plan.left_out;

@@ -88,6 +88,7 @@ impl Lightmap {
             spared_texels: map.layout.spared,
             sight_rays,
         };
+        scene.check_file()?;
         let memory = scene.device().memory().reserve(own_bytes, "the charts")?;
         if let Some(message) = too_few_digits(scene, "texels", 1.0 / density, OFFSET_PART) {
             scene.device().log(LogLevel::Warning, &message);

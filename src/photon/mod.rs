@@ -264,6 +264,7 @@ impl PhotonMap {
                 radius::automatic(&traced.blocks, scene.diagonal(), PHOTONS_PER_DISC)?
                     .max(params.least_radius.min(scene.diagonal()))
             };
+            scene.check_file()?;
             let (grid, memory) = Grid::build(traced, radius, progress, (from, to))?;
             stats.grid_seconds = start.elapsed().as_secs_f64();
             Ok(PhotonMap {

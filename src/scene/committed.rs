@@ -8,6 +8,7 @@ use super::{
 };
 use crate::base::error::{Result, invalid_argument};
 use crate::base::memory::Reservation;
+use crate::base::watched_file::WatchedFile;
 use crate::bvh::Tree;
 use crate::bvh::instances::Instances;
 use crate::device::Device;
@@ -70,6 +71,8 @@ pub struct Scene {
     pub(super) instances: Option<Box<Instances>>,
     /// The tree in parts at which rays wait, if that was asked for.
     pub(super) parts: Option<Box<WaitingRays>>,
+    /// The file that the scene lies in, if it was mapped.
+    pub(super) file: Option<WatchedFile>,
     pub(super) uses: Uses,
     pub(super) stats: SceneStats,
     pub(super) _memory: Reservation,
@@ -92,6 +95,12 @@ impl Scene {
     /// The device of the scene.
     pub fn device(&self) -> &Arc<Device> {
         &self.device
+    }
+
+    /// Fails if the scene lies in a mapped file that somebody has changed since: nothing that was computed after that can
+    /// be believed.
+    pub(crate) fn check_file(&self) -> Result<()> {
+        self.file.as_ref().map_or(Ok(()), WatchedFile::check)
     }
 
     /// The meshes, by number.

@@ -55,7 +55,9 @@ impl ShareParams {
             return invalid_argument!("share_count is {}, outside 1 to {MAX_SHARES}", self.count);
         }
         if params.target_error > 0.0 {
-            return invalid_argument!("with target_error there are no shares: the number of passes is not known before");
+            return invalid_argument!(
+                "with target_error there are no shares: the number of passes is not known before"
+            );
         }
         Ok(())
     }
@@ -193,7 +195,8 @@ impl<'a> Shares<'a> {
         };
         let Which { stage, share, pass } = which;
         let share_count = self.params.count;
-        let head = Head { fingerprint: self.needed, stage: stage as u32, pass, share, share_count, emitted, stored, items };
+        let head =
+            Head { fingerprint: self.needed, stage: stage as u32, pass, share, share_count, emitted, stored, items };
         let stage = progress.stage("saving", 0.95, 1.0, items);
         let write = |file: &mut Replacement| {
             let mut out = MAGIC.to_vec();
@@ -315,6 +318,7 @@ impl Lightmap {
                     ShareStage::Photons => {
                         let traced = stages::share_of_photons(&inputs, number, &mut of_pass)?;
                         let counts = [of_pass.photons_emitted, of_pass.photons_stored, of_pass.photons_stored];
+                        scene.check_file()?;
                         shares.write(which, counts, &mut traced.runs(), progress)?;
                     }
                     ShareStage::Radiance => {
@@ -324,6 +328,7 @@ impl Lightmap {
                         let values = stages::share_of_radiance(&inputs, photons, number, &mut of_pass)?;
                         let counts = [of_pass.photons_emitted, of_pass.photons_stored, values.len() as u64];
                         let mut runs = values.chunks(RUN).map(bytemuck::cast_slice);
+                        scene.check_file()?;
                         shares.write(which, counts, &mut runs, progress)?;
                     }
                 }

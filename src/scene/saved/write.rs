@@ -19,7 +19,9 @@ impl Scene {
             let stage = progress.stage("saving", 0.0, 1.0, self.stats.bytes);
             files::prepare(path, |file| Writer { file, stage, at: 0, table: Vec::new() }.scene(self))
         };
-        self.device.run(progress, write)?.finish()
+        let new = self.device.run(progress, write)?;
+        self.check_file()?;
+        new.finish()
     }
 }
 

@@ -54,7 +54,13 @@ fn params() -> BakeParams {
     BakeParams { photon_count: 10_000, gather_rays: 16, direct_samples: 2, seed: 3, ..Default::default() }
 }
 
-fn compute(map: &Lightmap, params: &BakeParams, shares: &ShareParams, stage: ShareStage, share: u32) -> Result<BakeStats> {
+fn compute(
+    map: &Lightmap,
+    params: &BakeParams,
+    shares: &ShareParams,
+    stage: ShareStage,
+    share: u32,
+) -> Result<BakeStats> {
     map.bake_share(params, shares, stage, share, &Progress::none())
 }
 
@@ -101,7 +107,11 @@ fn each_pass_has_shares_of_its_own_and_a_checkpoint_keeps_what_was_read() {
     map.bake_with_shares(&params, Some(&shares), Some(&checkpoint), &Progress::none()).unwrap();
     assert_same(&map, &whole, "two passes");
     // The shares are needed no more.
-    folder.names().iter().filter(|n| n.ends_with("bkshare")).for_each(|n| std::fs::remove_file(folder.file(n)).unwrap());
+    folder
+        .names()
+        .iter()
+        .filter(|n| n.ends_with("bkshare"))
+        .for_each(|n| std::fs::remove_file(folder.file(n)).unwrap());
     map.bake_with_shares(&params, Some(&shares), Some(&checkpoint), &Progress::none()).unwrap();
     assert_same(&map, &whole, "from the checkpoint");
 }
@@ -255,11 +265,15 @@ fn foreign_shares_are_refused_by_name() {
 #[test]
 fn wrong_arguments_small_budgets_and_cancels_leave_no_file() {
     let (map, folder) = (lightmap(2), Folder::new());
-    let refused = |params: &BakeParams, count: u32, share: u32, what: &str| {
-        match compute(&map, params, &folder.shares(count), ShareStage::Photons, share) {
-            Err(Error::InvalidArgument(s) | Error::OutOfMemory(s)) => assert!(s.contains(what), "{s}"),
-            other => panic!("{other:?}"),
-        }
+    let refused = |params: &BakeParams, count: u32, share: u32, what: &str| match compute(
+        &map,
+        params,
+        &folder.shares(count),
+        ShareStage::Photons,
+        share,
+    ) {
+        Err(Error::InvalidArgument(s) | Error::OutOfMemory(s)) => assert!(s.contains(what), "{s}"),
+        other => panic!("{other:?}"),
     };
     refused(&params(), 0, 0, "share_count is 0");
     refused(&params(), MAX_SHARES + 1, 0, "share_count is 65537");
@@ -281,7 +295,9 @@ fn wrong_arguments_small_budgets_and_cancels_leave_no_file() {
             let cancelled = map.bake_share(&params(), &shares, stage, 0, &progress);
             // Small as it is, it may have been done before there were so many reports.
             match cancelled {
-                Err(Error::Cancelled) if reports.load(Relaxed) == 0 => assert!(folder.names().len() <= before.len() + 1),
+                Err(Error::Cancelled) if reports.load(Relaxed) == 0 => {
+                    assert!(folder.names().len() <= before.len() + 1)
+                }
                 Ok(_) => break,
                 other => panic!("{other:?}"),
             }
