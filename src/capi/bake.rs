@@ -524,9 +524,9 @@ pub const BK_SHARE_PHOTONS: u32 = 0;
 /// Stage of bk_bake_share: the radiance map, which needs the photons of all shares.
 pub const BK_SHARE_RADIANCE: u32 = 1;
 
-/// Computes one share of the photons or of the radiance map of a bake and writes it to a file, so
-/// that machines that bake some texels each (texel_begin and texel_end of bk_bake_params) need not
-/// each do all of what all texels depend on.
+/// Bakes one share of the photons or of the radiance map, on which all texels depend, and writes it
+/// to a file: machines that bake some texels each (texel_begin and texel_end of bk_bake_params) need
+/// not each trace all photons and fill the whole map.
 ///
 /// First all shares of photons are computed, on any machines and in any order; when they are there,
 /// all shares of the radiance map, each of which reads the photons of all; then all texels, with the
@@ -537,8 +537,8 @@ pub const BK_SHARE_RADIANCE: u32 = 1;
 /// The file of share K of N is `shares` followed by photons-K-of-N.bkshare or
 /// radiance-K-of-N.bkshare (and by -pass-P before .bkshare, from the second pass on). It is replaced
 /// as a whole or not at all. A whole file of the same share that is there already is kept, and the
-/// call then only reads it: after an interruption or the loss of a machine, the same calls go on
-/// with what is missing. Files may be copied between machines and renamed with another prefix. A
+/// call then only reads it: after an interruption or the loss of a machine, the same calls complete
+/// the work. Files may be copied between machines and renamed with another prefix. A
 /// photon takes 48 bytes in its file, a texel of the radiance map 12. Stages that the scene does not
 /// need write no file. Files from untrusted sources are safe to read: every number is checked, and
 /// light is finite and >= 0.
@@ -557,8 +557,8 @@ pub const BK_SHARE_RADIANCE: u32 = 1;
 /// @param stage  one of the BK_SHARE values
 /// @param share  number of the share, less than `share_count`
 /// @param progress,user  progress callback and its pointer; may be NULL
-/// @param out  receives numbers about photons and the radiance map, of which what was read has no
-///   rays; may be NULL
+/// @param out  receives numbers about photons and the radiance map, without rays where a file was
+///   read; may be NULL
 /// @retval BK_ERROR_INVALID_ARGUMENT  a field of `params` is out of its range, `shares` is NULL,
 ///   `target_error` is not 0, there is no such stage or share, or the photons of a share are of
 ///   another bake; bk_last_error says in which respect

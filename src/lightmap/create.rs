@@ -47,6 +47,7 @@ impl Lightmap {
         mut known: Option<Known>,
         progress: &Progress,
     ) -> Result<Lightmap> {
+        scene.check_file()?;
         let start = Instant::now();
         let is_outdoors = seen::is_outdoors(scene);
         let density = match desc.texels_per_unit {

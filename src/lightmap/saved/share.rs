@@ -294,6 +294,7 @@ impl Lightmap {
             return invalid_argument!("share is {share}, and there are {}", shares.count);
         }
         let (start, scene) = (Instant::now(), &self.atlas.scene);
+        scene.check_file()?;
         let origin = Origin::new(params, &scene.lights());
         let direct = scene.device().install(|| DirectLight::try_new(scene))?;
         let plan = self.planned(&direct, params);
