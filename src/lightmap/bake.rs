@@ -127,7 +127,6 @@ impl Lightmap {
                 params.texel_begin
             );
         }
-        self.atlas.scene.check_file()?;
         let origin = Origin::new(params, &self.atlas.scene.lights());
         let direct = self.atlas.scene.device().install(|| DirectLight::try_new(&self.atlas.scene))?;
         let mut plan = self.planned(&direct, params);
@@ -135,7 +134,7 @@ impl Lightmap {
         device.memory().reset_peak();
         let range = params.texel_begin as usize..end as usize;
         let count = range.len();
-        let (light, mut stats, stitch) = device.run(progress, || {
+        let work = || {
             let (atlas, direct, range) = (&self.atlas, &direct, range.clone());
             let checkpoint = match checkpoint {
                 Some(c) => Some(Checkpoint::open(c, atlas, &origin, [range.start as u64, range.end as u64])?),
@@ -159,9 +158,10 @@ impl Lightmap {
             light.plan = plan.clone();
             light.origin = Some(origin);
             let stitch = self.stitch(&light, &range, params, &mut plan, &mut stats, progress)?;
-            atlas.scene.check_file()?;
             Ok((light, stats, stitch))
-        })?;
+        };
+        let scene = &self.atlas.scene;
+        let (light, mut stats, stitch) = scene.while_unchanged(|| device.run(progress, work))?;
         stats.left_out = plan.left_out;
         stats.peak_bytes = device.memory().peak() as u64;
         self.plan = plan;

@@ -37,7 +37,8 @@ impl Lightmap {
     /// Creates a light map: unwraps meshes without usable UVs, lays out the pages and maps texels to triangles.
     pub fn create(scene: &Arc<Scene>, desc: &LightmapDesc, progress: &Progress) -> Result<Lightmap> {
         desc.validate()?;
-        scene.device().run(progress, || Self::lay_out(scene, desc, None, progress))
+        let lay_out = || Self::lay_out(scene, desc, None, progress);
+        scene.while_unchanged(|| scene.device().run(progress, lay_out))
     }
 
     /// Creates a light map whose description is checked. What is `known` is not searched for.
@@ -47,7 +48,6 @@ impl Lightmap {
         mut known: Option<Known>,
         progress: &Progress,
     ) -> Result<Lightmap> {
-        scene.check_file()?;
         let start = Instant::now();
         let is_outdoors = seen::is_outdoors(scene);
         let density = match desc.texels_per_unit {
@@ -89,7 +89,6 @@ impl Lightmap {
             spared_texels: map.layout.spared,
             sight_rays,
         };
-        scene.check_file()?;
         let memory = scene.device().memory().reserve(own_bytes, "the charts")?;
         if let Some(message) = too_few_digits(scene, "texels", 1.0 / density, OFFSET_PART) {
             scene.device().log(LogLevel::Warning, &message);

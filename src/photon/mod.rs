@@ -228,7 +228,8 @@ impl PhotonMap {
     /// `OutOfMemory` if `memory_budget` or the memory monitor refuses. Lights without power make an
     /// empty map.
     pub fn trace(scene: &Arc<Scene>, params: &PhotonParams, progress: &Progress) -> Result<PhotonMap> {
-        scene.device().run(progress, || Self::trace_within(scene, params, progress, 0.0, 1.0))
+        let trace = || Self::trace_within(scene, params, progress, 0.0, 1.0);
+        scene.while_unchanged(|| scene.device().run(progress, trace))
     }
 
     /// Does the work of `trace` as a part of a longer call: reports progress over `[from, to]` of the bar.
@@ -264,7 +265,6 @@ impl PhotonMap {
                 radius::automatic(&traced.blocks, scene.diagonal(), PHOTONS_PER_DISC)?
                     .max(params.least_radius.min(scene.diagonal()))
             };
-            scene.check_file()?;
             let (grid, memory) = Grid::build(traced, radius, progress, (from, to))?;
             stats.grid_seconds = start.elapsed().as_secs_f64();
             Ok(PhotonMap {

@@ -30,7 +30,6 @@ impl Traced {
         of_bar: (f32, f32),
     ) -> Result<Traced> {
         params.validate()?;
-        scene.check_file()?;
         let lights = scene.lights();
         if lights.is_empty() && scene.emitters().is_empty() {
             return Err(Error::InvalidState("the scene has no lights: add a light or a material with emission".into()));

@@ -15,6 +15,7 @@ use crate::device::Device;
 use glam::{Vec2, Vec3};
 use std::borrow::Cow;
 use std::ops::Range;
+use std::panic::{AssertUnwindSafe, catch_unwind, resume_unwind};
 use std::sync::{Arc, RwLock};
 
 /// Statistics of a committed scene.
@@ -101,6 +102,16 @@ impl Scene {
     /// be believed.
     pub(crate) fn check_file(&self) -> Result<()> {
         self.file.as_ref().map_or(Ok(()), WatchedFile::check)
+    }
+
+    /// Does work that reads the scene. If its mapped file is changed meanwhile, that is the error, whatever the work came to:
+    /// even panics, as of numbers that lead nowhere.
+    pub(crate) fn while_unchanged<R>(&self, work: impl FnOnce() -> Result<R>) -> Result<R> {
+        let Some(file) = &self.file else { return work() };
+        file.check()?;
+        let done = catch_unwind(AssertUnwindSafe(work));
+        file.check()?;
+        done.unwrap_or_else(|panic| resume_unwind(panic))
     }
 
     /// The meshes, by number.

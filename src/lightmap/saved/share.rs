@@ -294,7 +294,6 @@ impl Lightmap {
             return invalid_argument!("share is {share}, and there are {}", shares.count);
         }
         let (start, scene) = (Instant::now(), &self.atlas.scene);
-        scene.check_file()?;
         let origin = Origin::new(params, &scene.lights());
         let direct = scene.device().install(|| DirectLight::try_new(scene))?;
         let plan = self.planned(&direct, params);
@@ -337,7 +336,7 @@ impl Lightmap {
             }
             Ok(())
         };
-        scene.device().run(progress, || scene.install(work))?;
+        scene.while_unchanged(|| scene.device().run(progress, || scene.install(work)))?;
         stats.seconds = start.elapsed().as_secs_f64();
         Ok(stats)
     }
