@@ -139,9 +139,11 @@ static int wait_for(int other, int state)
 static void do_stage(int stage, bk_lightmap *map, const char *folder)
 {
     double begin = MPI_Wtime(), own;
+    clock_t processor = clock();
     int part;
     do_part(stage, map, folder, rank);
     own = MPI_Wtime() - begin;
+    processor = clock() - processor;
     if (rank != 0) {
         tell(STATE, stage);
     }
@@ -159,9 +161,9 @@ static void do_stage(int stage, bk_lightmap *map, const char *folder)
     } else if (rank != 0 && stage != TEXELS) {
         wait_for(0, stage);
     }
-    printf("rank %d: %s %.2f s, then waited or helped %.2f s\n", rank,
+    printf("rank %d: %s %.2f s (%.2f s of processors), then waited or helped %.2f s\n", rank,
            stage == PHOTONS ? "photons" : stage == RADIANCE ? "radiance map" : "texels", own,
-           MPI_Wtime() - begin - own);
+           (double)processor / CLOCKS_PER_SEC, MPI_Wtime() - begin - own);
 }
 
 static bk_scene *load(bk_device *device, const char *name)
