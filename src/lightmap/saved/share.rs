@@ -98,6 +98,12 @@ pub(in crate::lightmap) struct Shares<'a> {
     needed: Fingerprint,
 }
 
+/// What a file holds.
+enum Content<'a> {
+    Head(&'a Head),
+    Run(&'a [u8]),
+}
+
 /// The share, stage and pass of a file.
 #[derive(Clone, Copy)]
 struct Which {
@@ -137,28 +143,19 @@ impl<'a> Shares<'a> {
         Ok((records, head))
     }
 
-    /// Reads the file of a share: `begin` is given its head, and `add` each run, which it adds to `to`; `add` returns the
-    /// number of its items, or `None` if they are impossible. Advances `stage` by one.
-    fn read<T>(
-        &self,
-        which: Which,
-        stage: &Stage,
-        to: &mut T,
-        begin: &dyn Fn(&mut T, &Head) -> bool,
-        add: &dyn Fn(&mut T, &[u8]) -> Result<Option<usize>>,
-    ) -> Result<()> {
+    /// Reads the file of a share: `take` is given its head and each run, and returns the number of the items that it has
+    /// taken, or `None` if they are impossible. Advances `stage` by one.
+    fn read(&self, which: Which, stage: &Stage, take: &mut dyn FnMut(Content) -> Result<Option<usize>>) -> Result<()> {
         let path = &self.path(which);
         let (mut records, head) = self.open(which, path)?;
         let expected = if which.stage == ShareStage::Photons { PHOTONS } else { RADIANCE };
-        if !begin(to, &head) {
-            return Err(damaged(path));
-        }
+        take(Content::Head(&head))?.ok_or_else(|| damaged(path))?;
         let mut items = 0;
         loop {
             stage.check()?;
             match records.next().map_err(|e| unreadable(path, e))? {
                 Next::Record(tag, content) if tag == expected => {
-                    items += add(to, &content)?.ok_or_else(|| damaged(path))? as u64;
+                    items += take(Content::Run(&content))?.ok_or_else(|| damaged(path))? as u64;
                 }
                 Next::Record(DONE, _) if items == head.items => break,
                 _ => return Err(damaged(path)),
@@ -173,8 +170,11 @@ impl<'a> Shares<'a> {
     /// Whether the file of a share is there and whole, so that it need not be made again.
     fn is_there(&self, which: Which, stage: &Stage) -> Result<bool> {
         let item = if which.stage == ShareStage::Photons { Traced::ITEM } else { size_of::<Vec3>() };
-        let count = |_: &mut (), run: &[u8]| Ok(run.len().is_multiple_of(item).then_some(run.len() / item));
-        match self.read(which, stage, &mut (), &|_, _| true, &count) {
+        let mut count = |content: Content| match content {
+            Content::Head(_) => Ok(Some(0)),
+            Content::Run(run) => Ok(run.len().is_multiple_of(item).then_some(run.len() / item)),
+        };
+        match self.read(which, stage, &mut count) {
             Ok(()) => Ok(true),
             Err(Error::Cancelled) => Err(Error::Cancelled),
             Err(_) => Ok(false),
@@ -182,11 +182,11 @@ impl<'a> Shares<'a> {
     }
 
     /// Writes the file of a share.
-    fn write<'b>(
+    fn write(
         &self,
         which: Which,
         [emitted, stored, items]: [u64; 3],
-        runs: &mut dyn Iterator<Item = &'b [u8]>,
+        runs: &mut dyn Iterator<Item = &[u8]>,
         progress: &Progress,
     ) -> Result<()> {
         let (tag, item) = match which.stage {
@@ -218,13 +218,15 @@ impl<'a> Shares<'a> {
         let params = stages::photon_params(inputs);
         let mut photons = Traced::none(&self.atlas.scene, &params, 0);
         let stage = inputs.progress.stage("loading", 0.0, 0.2, self.params.count.into());
-        let begin = |photons: &mut Traced, head: &Head| {
-            photons.stats.emitted = head.emitted;
-            head.emitted <= params.photon_count
+        let mut take = |content: Content| match content {
+            Content::Head(head) => {
+                photons.stats.emitted = head.emitted;
+                Ok((head.emitted <= params.photon_count).then_some(0))
+            }
+            Content::Run(run) => photons.add(run),
         };
         for share in 0..self.params.count {
-            let which = Which { stage: ShareStage::Photons, share, pass };
-            self.read(which, &stage, &mut photons, &begin, &Traced::add)?;
+            self.read(Which { stage: ShareStage::Photons, share, pass }, &stage, &mut take)?;
         }
         Ok(photons)
     }
@@ -239,13 +241,14 @@ impl<'a> Shares<'a> {
         for number in 0..self.params.count {
             let range = radiance_map::share(&self.atlas.radiance, Share { number, count: self.params.count });
             let which = Which { stage: ShareStage::Radiance, share: number, pass };
-            let mut to = (std::mem::take(&mut values), 0, 0);
-            let begin = |to: &mut (Vec<Vec3>, u64, u64), head: &Head| {
-                (to.1, to.2) = (head.emitted, head.stored);
-                head.items == range.len() as u64
+            let mut take = |content: Content| match content {
+                Content::Head(head) => {
+                    (emitted, stored) = (head.emitted, head.stored);
+                    Ok((head.items == range.len() as u64).then_some(0))
+                }
+                Content::Run(run) => Ok(add_radiance(&mut values, run, all)),
             };
-            self.read(which, &stage, &mut to, &begin, &|(values, ..), run| Ok(add_radiance(values, run, all)))?;
-            (values, emitted, stored) = to;
+            self.read(which, &stage, &mut take)?;
         }
         if values.len() != all {
             return Err(damaged(&self.path(Which { stage: ShareStage::Radiance, share: 0, pass })));
