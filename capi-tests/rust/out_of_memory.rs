@@ -30,7 +30,7 @@ use std::sync::atomic::{AtomicI64, AtomicUsize, Ordering::SeqCst};
 /// more.
 static LARGE: AtomicUsize = AtomicUsize::new(128 << 10);
 
-/// For live objects and saved results: what grows with the number of blocks or texels takes more, although there are
+/// For live objects, saved results and shares: what grows with the number of blocks or texels takes more, although there are
 /// few.
 const LARGE_OF_LIVE: usize = 16 << 10;
 
@@ -201,7 +201,7 @@ fn every_large_allocation_and_every_request_may_fail_and_nothing_is_lost() {
     LARGE.store(large, SeqCst);
     let expected = checkpoints(&mut small, &folder.join("light.checkpoint"));
     results(&mut small, &folder, expected);
-    LARGE.store(LARGE_OF_RECORDS, SeqCst);
+    LARGE.store(LARGE_OF_LIVE, SeqCst);
     shares(&mut small, &folder, expected);
     LARGE.store(large, SeqCst);
     drop(small);

@@ -322,7 +322,7 @@ pub struct bk_open_params {
     /// place or cut short: that would be as if somebody wrote to the process's memory. (bk_scene_save
     /// under its name is fine: it makes a new file.) Bakes, light maps, photon maps, saves and refits
     /// notice it and fail with BK_ERROR_IO, and checkpoints hold nothing that was computed since; but
-    /// reading what was cut off ends the process (SIGBUS). 0: the file is read to memory; rays are
+    /// reading a part that was cut off ends the process (SIGBUS). 0: the file is read to memory; rays are
     /// somewhat faster, because memory can have large pages. Default: 1.
     pub map: u32,
     /// 1: rays wait at parts of the tree until enough of them do, for scenes that are larger than

@@ -36,7 +36,7 @@ const RADIANCE: Tag = *b"RADI";
 const DONE: Tag = *b"DONE";
 
 /// Maximum number of shares.
-pub const MAX_SHARES: u32 = 1 << 16;
+const MAX_SHARES: u32 = 1 << 16;
 
 /// Files of the shares of a bake.
 #[derive(Clone, Debug, PartialEq)]
@@ -44,7 +44,7 @@ pub struct ShareParams {
     /// What all names of files begin with: a folder with a slash, or more. They go on with `photons` or `radiance`,
     /// `-NUMBER-of-COUNT`, `-pass-NUMBER` from the second pass on, and `.bkshare`.
     pub prefix: PathBuf,
-    /// Number of shares, 1 to [`MAX_SHARES`].
+    /// Number of shares, 1 to 65,536.
     pub count: u32,
 }
 
@@ -130,8 +130,7 @@ impl<'a> Shares<'a> {
         let fail = |e| unreadable(path, e);
         let file = files::open(path).map_err(fail)?;
         let size = file.metadata().map_err(fail)?.len();
-        let (records, head): (_, Head) =
-            records::begin(BufReader::with_capacity(1 << 16, file), size, HEAD, path, "share of a bake")?;
+        let (records, head): (_, Head) = records::begin(BufReader::new(file), size, HEAD, path, "share of a bake")?;
         let mut all: Vec<String> = head.fingerprint.difference(&self.needed).into_iter().collect();
         compare(&mut all, "the stage", head.stage, which.stage as u32);
         compare(&mut all, "the pass", head.pass, which.pass);
