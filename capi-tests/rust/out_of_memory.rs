@@ -352,6 +352,7 @@ fn shares(lightmap: &mut Lightmap, folder: &Path, expected: u64) {
             });
         }
     }
+    LARGE.store(LARGE_OF_RECORDS, SeqCst);
     fail_each("a bake from shares", &ALLOCATIONS_LEFT, || lightmap.bake_with_shares(params, Some(shares), None, &none));
     assert_eq!(bits(lightmap), expected);
 }
