@@ -1,6 +1,6 @@
 #!/usr/bin/env bash
-# Bakes with 1, 2 and 4 ranks, with a rank that is killed, and once more after all were killed: the pages must have the
-# same bits.
+# Bakes with 1, 2 and 4 ranks, with a rank that is killed while photons are traced or texels baked, and once more after all
+# were killed: the pages must have the same bits.
 #
 #     capi-tests/mpi.sh BAKE_MPI FOLDER
 set -euo pipefail
@@ -25,32 +25,63 @@ for n in 1 2 4; do
     same 1 $n
 done
 
-# A rank is killed while it bakes: rank 0 bakes its part.
-mkdir "$out/whole" "$out/lost"
+# The process of rank 2 of the run in a folder, once it is there.
+victim_of() { # FOLDER
+    for _ in $(seq 600); do
+        pgrep -f "$bake_mpi $out/$1 " | while read -r pid; do
+            grep -qz '^OMPI_COMM_WORLD_RANK=2$' "/proc/$pid/environ" 2>/dev/null && echo "$pid"
+        done | head -1 | grep . && return
+        sleep 0.02
+    done
+    echo 'no rank to kill' >&2
+    exit 1
+}
+
+wait_for_file() { # FILE
+    for _ in $(seq 3000); do
+        [ -e "$1" ] && return
+        sleep 0.02
+    done
+    echo "$1 did not come" >&2
+    exit 1
+}
+
+must_be_whole() { # FOLDER
+    grep -q 'rank 2 is lost' "$out/$1.txt" || { echo 'nobody noticed that a rank was lost'; cat "$out/$1.txt"; exit 1; }
+    [ -e "$out/$1/page0-combined.exr" ] || { echo 'the bake was not completed'; cat "$out/$1.txt"; exit 1; }
+    same whole "$1"
+}
+
+mkdir "$out/whole" "$out/lost" "$out/photons"
 ranks whole 1 60
+
+# A rank is killed while photons are traced: it is stopped before it has traced any, and dies when another one has traced
+# its own. Rank 0 does its share of photons, of the radiance map and of texels.
+ranks photons 3 60 &
+running=$!
+victim=$(victim_of photons)
+# From then on it waits for the layout alone.
+wait_for_file "$out/photons/scene.bkscene"
+kill -STOP "$victim"
+wait_for_file "$out/photons/photons-1-of-3.bkshare"
+kill -9 "$victim"
+[ ! -e "$out/photons/photons-2-of-3.bkshare" ] || { echo 'a stopped rank traced photons'; exit 1; }
+wait $running || true
+must_be_whole photons
+
+# A rank is killed while it bakes its texels.
 ranks lost 3 60 &
 running=$!
-victim=
-for _ in $(seq 600); do
-    if [ -e "$out/lost/layout.bklay" ]; then
-        victim=$(pgrep -f "$bake_mpi $out/lost " | while read -r pid; do
-            grep -qz '^OMPI_COMM_WORLD_RANK=2$' "/proc/$pid/environ" 2>/dev/null && echo "$pid"
-        done | head -1) || true
-        [ -n "$victim" ] && break
-    fi
-    sleep 0.05
-done
-[ -n "$victim" ] || { echo 'no rank to kill'; exit 1; }
-sleep 0.2
+victim=$(victim_of lost)
+wait_for_file "$out/lost/radiance-2-of-3.bkshare"
 kill -9 "$victim"
 wait $running || true
-[ ! -e "$out/lost/page0-combined.exr" ] || same whole lost
-grep -q 'rank 2 is lost' "$out/lost.txt" || { echo 'nobody noticed that a rank was lost'; cat "$out/lost.txt"; exit 1; }
-[ -e "$out/lost/page0-combined.exr" ] || { echo 'the bake was not completed'; cat "$out/lost.txt"; exit 1; }
+must_be_whole lost
 
-# Begun anew after an interruption, a bake goes on with the parts that are missing.
+# Begun anew after an interruption, a bake goes on with what is missing; a damaged share is made again.
 mkdir "$out/again"
-cp "$out/lost/layout.bklay" "$out/lost"/part-[01]-of-3.light "$out/again/"
+cp "$out/lost/layout.bklay" "$out/lost"/part-[01]-of-3.light "$out/lost"/photons-[01]-of-3.bkshare "$out/again/"
+head -c 5000 "$out/lost/photons-2-of-3.bkshare" >"$out/again/photons-2-of-3.bkshare"
 before=$(cksum <"$out/again/part-1-of-3.light"; stat -c %i "$out/again/part-1-of-3.light")
 ranks again 3 60
 same whole again

@@ -600,7 +600,9 @@ typedef struct bk_open_params {
   /// the system drops them when it needs the memory, so that a scene may be larger than it. Pages
   /// that a refit changes stay in memory. While the scene lives, the file must not be changed in
   /// place or cut short: that would be as if somebody wrote to the process's memory. (bk_scene_save
-  /// under its name is fine: it makes a new file.) 0: the file is read to memory; rays are
+  /// under its name is fine: it makes a new file.) Bakes, light maps, photon maps, saves and refits
+  /// notice it and fail with BK_ERROR_IO, and checkpoints hold nothing that was computed since; but
+  /// reading a part that was cut off ends the process (SIGBUS). 0: the file is read to memory; rays are
   /// somewhat faster, because memory can have large pages. Default: 1.
   uint32_t map;
   /// 1: rays wait at parts of the tree until enough of them do, for scenes that are larger than
@@ -1950,6 +1952,12 @@ bk_result bk_lightmap_instance_back_uvs(const bk_lightmap *lightmap,
 /// it stays if `passes` is raised or `target_error` set.
 #define BK_QUALITY_REFERENCE 3
 
+/// Stage of bk_bake_share: tracing of photons.
+#define BK_SHARE_PHOTONS 0
+
+/// Stage of bk_bake_share: the radiance map, which needs the photons of all shares.
+#define BK_SHARE_RADIANCE 1
+
 /// Parameters of bk_bake.
 ///
 /// Measured curves of these fields: docs/accuracy.md, "Which knobs have a curve".
@@ -2073,6 +2081,14 @@ typedef struct bk_bake_params {
   /// them have twice as many, within the same limits. Raise it to 64 where texels are small and
   /// noise shows in corners: these texels take so many times as long. Default: 0.
   uint32_t own_rays;
+  /// Number of shares of bk_bake_share, 1 to 65,536; not read if `shares` is NULL. Default: 0.
+  uint32_t share_count;
+  /// Experimental: beginning of the names of the files that bk_bake_share writes, for example "out/"
+  /// for files in the folder out, which must exist; UTF-8. bk_bake then neither traces photons nor
+  /// fills the radiance map, but reads the radiance map of all shares from their files, and
+  /// photons and the radiance map of bk_bake_stats are without rays of the shares. May be NULL:
+  /// there are no shares. Default: NULL.
+  const char *shares;
 } bk_bake_params;
 
 /// Numbers about one stage of a bake.
@@ -2172,13 +2188,13 @@ BK_API void bk_bake_stats_init(bk_bake_stats *stats);
 /// @param params  parameters; NULL for the defaults
 /// @param progress,user  progress callback and its pointer; may be NULL
 /// @param out  receives numbers about the bake; may be NULL
-/// @retval BK_ERROR_INVALID_ARGUMENT  a field of `params` is out of its range, or the checkpoint is
-///   of another bake; bk_last_error says in which respect
+/// @retval BK_ERROR_INVALID_ARGUMENT  a field of `params` is out of its range, or the checkpoint or a
+///   share is of another bake; bk_last_error says in which respect
 /// @retval BK_ERROR_INVALID_STATE  another call is using the light map, or another bake the
 ///   checkpoint
 /// @retval BK_ERROR_OUT_OF_MEMORY  `memory_budget` is exceeded or the memory callback refuses
-/// @retval BK_ERROR_IO  the checkpoint is damaged, is another kind of file, or cannot be read or
-///   created
+/// @retval BK_ERROR_IO  the checkpoint or a share is damaged, is another kind of file, or cannot be
+///   read, or the checkpoint cannot be created
 /// @retval BK_ERROR_CANCELLED  the progress callback returned 0
 BK_API
 bk_result bk_bake(bk_lightmap *lightmap,
@@ -2205,7 +2221,7 @@ bk_result bk_bake(bk_lightmap *lightmap,
 /// Measured: docs/performance.md, "Edits".
 ///
 /// @param lightmap  any light map
-/// @param params  parameters of the last bake, without a range of texels, checkpoint and
+/// @param params  parameters of the last bake, without a range of texels, checkpoint, shares and
 ///   target_error; NULL for the defaults
 /// @param keep_error  change of light below which texels keep it, as a fraction of their irradiance
 ///   or, if that is more, of a tenth of the mean irradiance; finite, >= 0. 0.03 is hard to see
@@ -2222,6 +2238,58 @@ bk_result bk_bake_changed(bk_lightmap *lightmap,
                           bk_progress_fn progress,
                           void *user,
                           bk_bake_stats *out);
+
+/// Bakes one share of the photons or of the radiance map, on which all texels depend, and writes it
+/// to a file: machines that bake some texels each (texel_begin and texel_end of bk_bake_params) need
+/// not each trace all photons and fill the whole map.
+///
+/// First all shares of photons are computed, on any machines and in any order; when they are there,
+/// all shares of the radiance map, each of which reads the photons of all; then all texels, with the
+/// same `shares` and `share_count`. All other fields of `params` but `memory_budget`, the range of
+/// texels and the checkpoint must be the same in all these calls, and so must scene, lights and
+/// layout. The light has the bits of a bake without shares, whatever `share_count` is.
+///
+/// The file of share K of N is `shares` followed by photons-K-of-N.bkshare or
+/// radiance-K-of-N.bkshare (and by -pass-P before .bkshare, from the second pass on). It is replaced
+/// as a whole or not at all. A whole file of the same share that is there already is kept, and the
+/// call then only reads it: after an interruption or the loss of a machine, the same calls complete
+/// the work. Files may be copied between machines and renamed with another prefix. A
+/// photon takes 48 bytes in its file, a texel of the radiance map 12. Stages that the scene does not
+/// need write no file. Files from untrusted sources are safe to read: every number is checked, and
+/// light is finite and >= 0.
+///
+/// Any number of threads may compute shares of one light map at the same time, but not during a
+/// bake.
+///
+/// Cost: of photons and the radiance map in a bake the N-th part; beside it, a pilot of photons for
+/// each share of photons (see bk_bake_params.photon_count), and reading and sorting of all photons
+/// for each share of the radiance map. Measured: docs/performance.md, "Many machines".
+///
+/// Experimental: another version of the library may refuse the file.
+///
+/// @param lightmap  any light map
+/// @param params  parameters of the bake; not NULL, with `shares` and `share_count`
+/// @param stage  one of the BK_SHARE values
+/// @param share  number of the share, less than `share_count`
+/// @param progress,user  progress callback and its pointer; may be NULL
+/// @param out  receives numbers about photons and the radiance map, without rays where a file was
+///   read; may be NULL
+/// @retval BK_ERROR_INVALID_ARGUMENT  a field of `params` is out of its range, `shares` is NULL,
+///   `target_error` is not 0, there is no such stage or share, or the photons of a share are of
+///   another bake; bk_last_error says in which respect
+/// @retval BK_ERROR_INVALID_STATE  the light map is being baked
+/// @retval BK_ERROR_OUT_OF_MEMORY  `memory_budget` is exceeded or the memory callback refuses
+/// @retval BK_ERROR_IO  the photons of a share are missing, damaged or cannot be read, or the file
+///   cannot be written
+/// @retval BK_ERROR_CANCELLED  the progress callback returned 0
+BK_EXPERIMENTAL
+bk_result bk_bake_share(const bk_lightmap *lightmap,
+                        const bk_bake_params *params,
+                        uint32_t stage,
+                        uint32_t share,
+                        bk_progress_fn progress,
+                        void *user,
+                        bk_bake_stats *out);
 
 /// Writes a text about the last bake, one line per stage: whether it ran or was left out, and why.
 /// Before the first bake the text is about a bake with default parameters.

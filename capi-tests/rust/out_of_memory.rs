@@ -10,7 +10,9 @@
 use bakelite::bvh::{BuildOptions, BuildQuality};
 use bakelite::io::lightmaps::{write_png_pages, write_scene};
 use bakelite::io::{LoadOptions, load_with};
-use bakelite::lightmap::{BakeParams, CheckpointParams, Layer, LayerData, Lightmap, LightmapDesc};
+use bakelite::lightmap::{
+    BakeParams, CheckpointParams, Layer, LayerData, Lightmap, LightmapDesc, ShareParams, ShareStage,
+};
 use bakelite::live::{Budget, Live, LiveCamera, LiveParams, Mode, PageRect};
 use bakelite::photon::{PhotonMap, PhotonParams};
 use bakelite::scene::{LightmapUvs, MeshMaterials, OpenOptions};
@@ -28,7 +30,7 @@ use std::sync::atomic::{AtomicI64, AtomicUsize, Ordering::SeqCst};
 /// more.
 static LARGE: AtomicUsize = AtomicUsize::new(128 << 10);
 
-/// For live objects and saved results: what grows with the number of blocks or texels takes more, although there are
+/// For live objects, saved results and shares: what grows with the number of blocks or texels takes more, although there are
 /// few.
 const LARGE_OF_LIVE: usize = 16 << 10;
 
@@ -199,6 +201,8 @@ fn every_large_allocation_and_every_request_may_fail_and_nothing_is_lost() {
     LARGE.store(large, SeqCst);
     let expected = checkpoints(&mut small, &folder.join("light.checkpoint"));
     results(&mut small, &folder, expected);
+    LARGE.store(LARGE_OF_LIVE, SeqCst);
+    shares(&mut small, &folder, expected);
     LARGE.store(large, SeqCst);
     drop(small);
 
@@ -339,6 +343,25 @@ fn checkpoints(lightmap: &mut Lightmap, path: &Path) -> u64 {
     fail_each("bake that goes on", &ALLOCATIONS_LEFT, || lightmap.bake_with(params, Some(&checkpoint), &none));
     assert_eq!(bits(lightmap), expected);
     expected
+}
+
+/// Computes shares of photons and of the radiance map, and bakes from them.
+fn shares(lightmap: &mut Lightmap, folder: &Path, expected: u64) {
+    let none = Progress::none();
+    let params = &BakeParams { photon_count: 20_000, gather_rays: 4, direct_samples: 1, ..Default::default() };
+    let shares = &ShareParams { prefix: folder.join("share-"), count: 2 };
+    for (stage, name) in [(ShareStage::Photons, "photons"), (ShareStage::Radiance, "radiance")] {
+        for share in 0..2 {
+            // A file that is there would be kept.
+            let _ = std::fs::remove_file(folder.join(format!("share-{name}-{share}-of-2.bkshare")));
+            fail_each(&format!("a share of {name}"), &ALLOCATIONS_LEFT, || {
+                lightmap.bake_share(params, shares, stage, share, &none)
+            });
+        }
+    }
+    LARGE.store(LARGE_OF_RECORDS, SeqCst);
+    fail_each("a bake from shares", &ALLOCATIONS_LEFT, || lightmap.bake_with_shares(params, Some(shares), None, &none));
+    assert_eq!(bits(lightmap), expected);
 }
 
 /// A light map of a smaller ground without emissive triangles, of which there are so many in the other one that light

@@ -1,16 +1,19 @@
 /*
- * One bake on many machines: each rank bakes a part of the texels, rank 0 brings the parts together.
+ * One bake on many machines: each rank traces a share of the photons, fills a share of the radiance map and bakes a part
+ * of the texels; rank 0 brings the parts together.
  *
  *     mpicc -O2 bake_mpi.c -lbakelite -lm -o bake_mpi
  *     mpirun -n 4 --enable-recovery bake_mpi FOLDER SCENE [TEXELS_PER_UNIT [THREADS]]
  *
  * FOLDER is one that all ranks see; SCENE is a built-in scene or a file, which gets a sun. Rank 0 builds and unwraps the
- * scene, and writes scene and layout; the others map and load them (ranks of one machine share the memory of the scene). Each rank writes the light of its texels to FOLDER/part-K-of-N.light. When all are there,
- * rank 0 writes pages to FOLDER/page...exr, which have the bits of a bake on one machine.
+ * scene, and writes scene and layout; the others map and load them (ranks of one machine share the memory of the scene).
+ * Each rank writes its photons and its radiance to FOLDER/...bkshare, from where the others read them, and the light of its
+ * texels to FOLDER/part-K-of-N.light. When all are there, rank 0 writes pages to FOLDER/page...exr, which have the bits of
+ * a bake on one machine.
  *
- * Parts that are in the folder are not baked again: started anew after an interruption, the bake goes on with what is
- * missing. A rank that is lost (its beat stands still for STALL seconds) is replaced by rank 0, if mpirun lets the others
- * go on (Open MPI: --enable-recovery). All ranks trace all photons: see docs/guide.md, "Results, shards and checkpoints".
+ * What is in the folder is not computed again: started anew after an interruption, the bake goes on with what is missing.
+ * A rank that is lost (its beat stands still for STALL seconds) is replaced by rank 0, if mpirun lets the others go on
+ * (Open MPI: --enable-recovery). See docs/guide.md, "Results, shards and checkpoints".
  */
 #include <bakelite.h>
 #include <math.h>
@@ -24,10 +27,11 @@
 static double stall = 30.0;
 
 enum { BEAT, STATE, CELLS }; /* what rank 0 keeps of each rank */
-enum { WORKING, LAID_OUT, DONE, ENDED, ENDED_WITHOUT_SOME };
+enum { WORKING, LAID_OUT, PHOTONS, RADIANCE, TEXELS, ENDED, ENDED_WITHOUT_SOME };
 
 static MPI_Win board;
 static int rank, size;
+static int *is_lost; /* of each rank, as far as rank 0 knows */
 
 static void tell(int cell, int value)
 {
@@ -62,15 +66,24 @@ static void part_name(char *out, size_t capacity, const char *folder, int part)
     snprintf(out, capacity, "%s/part-%d-of-%d.light", folder, part, size);
 }
 
+/* The parameters of all shares and parts of the bake. One rank alone needs no shares. */
+static void set_params(bk_bake_params *params, char *shares, size_t capacity, const char *folder)
+{
+    bk_bake_params_init(params);
+    snprintf(shares, capacity, "%s/", folder);
+    params->shares = size > 1 ? shares : NULL;
+    params->share_count = (uint32_t)size;
+}
+
 /* Bakes a part and writes it, or loads it if the folder has it. */
 static void bake_part(bk_lightmap *map, const char *folder, int part)
 {
-    char name[4096];
+    char name[4096], shares[4096];
     bk_bake_params params;
     bk_lightmap_info info;
     bk_lightmap_info_init(&info);
     check(bk_lightmap_get_info(map, &info), "light map");
-    bk_bake_params_init(&params);
+    set_params(&params, shares, sizeof shares, folder);
     params.texel_begin = info.texels * (uint64_t)part / (uint64_t)size;
     params.texel_end = info.texels * (uint64_t)(part + 1) / (uint64_t)size;
     part_name(name, sizeof name, folder, part);
@@ -82,6 +95,20 @@ static void bake_part(bk_lightmap *map, const char *folder, int part)
     }
     check(bk_bake(map, &params, progress, NULL, NULL), "bake");
     check(bk_lightmap_save_result(map, name, progress, NULL), "part");
+}
+
+/* Does a part of a stage. */
+static void do_part(int stage, bk_lightmap *map, const char *folder, int part)
+{
+    char shares[4096];
+    bk_bake_params params;
+    if (stage == TEXELS) {
+        bake_part(map, folder, part);
+    } else if (size > 1) {
+        uint32_t what = stage == PHOTONS ? BK_SHARE_PHOTONS : BK_SHARE_RADIANCE;
+        set_params(&params, shares, sizeof shares, folder);
+        check(bk_bake_share(map, &params, what, (uint32_t)part, progress, NULL, NULL), "share");
+    }
 }
 
 /* Waits until a rank's state is at least this; returns it, or WORKING if the rank is lost (never of rank 0). */
@@ -105,6 +132,38 @@ static int wait_for(int other, int state)
         }
         nanosleep(&pause, NULL);
     }
+}
+
+/* Does this rank's part of a stage, and returns when those of all ranks are done (of texels, rank 0 alone waits). Rank 0
+   also does the parts of lost ranks, and gathers all texels. */
+static void do_stage(int stage, bk_lightmap *map, const char *folder)
+{
+    double begin = MPI_Wtime(), own;
+    clock_t processor = clock();
+    int part;
+    do_part(stage, map, folder, rank);
+    own = MPI_Wtime() - begin;
+    processor = clock() - processor;
+    if (rank != 0) {
+        tell(STATE, stage);
+    }
+    for (part = 1; rank == 0 && part < size; part++) {
+        if (!is_lost[part] && wait_for(part, stage) == WORKING) {
+            fprintf(stderr, "rank %d is lost; rank 0 does its part\n", part);
+            is_lost[part] = 1;
+        }
+        if (is_lost[part] || stage == TEXELS) {
+            do_part(stage, map, folder, part);
+        }
+    }
+    if (rank == 0 && stage != TEXELS) {
+        tell(STATE, stage);
+    } else if (rank != 0 && stage != TEXELS) {
+        wait_for(0, stage);
+    }
+    printf("rank %d: %s %.2f s (%.2f s of processors), then waited or helped %.2f s\n", rank,
+           stage == PHOTONS ? "photons" : stage == RADIANCE ? "radiance map" : "texels", own,
+           (double)processor / CLOCKS_PER_SEC, MPI_Wtime() - begin - own);
 }
 
 static bk_scene *load(bk_device *device, const char *name)
@@ -152,6 +211,10 @@ int main(int argc, char **argv)
     if (getenv("BAKE_MPI_STALL")) {
         stall = atof(getenv("BAKE_MPI_STALL"));
     }
+    is_lost = calloc((size_t)size, sizeof *is_lost);
+    if (!is_lost) {
+        MPI_Abort(MPI_COMM_WORLD, 1);
+    }
     MPI_Win_allocate(rank == 0 ? (MPI_Aint)(CELLS * size * (int)sizeof(int)) : 0, sizeof(int), MPI_INFO_NULL,
                      MPI_COMM_WORLD, &cells, &board);
     if (rank == 0) {
@@ -184,16 +247,11 @@ int main(int argc, char **argv)
         check(bk_lightmap_load_layout(scene, &layout, name, progress, NULL, &map), "layout");
     }
 
-    bake_part(map, argv[1], rank);
-    if (rank != 0) {
-        tell(STATE, DONE);
-    }
+    do_stage(PHOTONS, map, argv[1]);
+    do_stage(RADIANCE, map, argv[1]);
+    do_stage(TEXELS, map, argv[1]);
     for (part = 1; rank == 0 && part < size; part++) {
-        if (wait_for(part, DONE) == WORKING) {
-            fprintf(stderr, "rank %d is lost; rank 0 bakes its part\n", part);
-            lost = 1;
-        }
-        bake_part(map, argv[1], part);
+        lost |= is_lost[part];
     }
     if (rank == 0) {
         snprintf(name, sizeof name, "%s/", argv[1]);
@@ -206,6 +264,7 @@ int main(int argc, char **argv)
     bk_lightmap_release(map);
     bk_scene_release(scene);
     bk_device_release(device);
+    free(is_lost);
     if (lost) {
         fflush(stdout);
         _Exit(0); /* MPI_Finalize would wait for the lost rank. */

@@ -16,5 +16,7 @@ pub mod progress;
 pub mod sampling;
 pub(crate) mod scratch;
 pub(crate) mod scratch_files;
+pub(crate) mod share;
 pub(crate) mod sort;
 pub(crate) mod threads;
+pub(crate) mod watched_file;

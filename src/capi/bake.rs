@@ -17,7 +17,9 @@ use super::lightmap::{bk_lightmap, bk_lightmap_desc};
 use crate::base::error::{Result, invalid_argument};
 use crate::lightmap::plan::left_out;
 use crate::lightmap::quality::Quality;
-use crate::lightmap::{BakeParams, BakeStats, CheckpointParams, LightmapDesc, StageStats, directional};
+use crate::lightmap::{
+    BakeParams, BakeStats, CheckpointParams, Lightmap, LightmapDesc, ShareParams, ShareStage, StageStats, directional,
+};
 use std::ffi::{c_char, c_void};
 
 /// Bit of left_out: indirect light with photons, radiance map and gather map.
@@ -205,6 +207,14 @@ pub struct bk_bake_params {
     /// them have twice as many, within the same limits. Raise it to 64 where texels are small and
     /// noise shows in corners: these texels take so many times as long. Default: 0.
     pub own_rays: u32,
+    /// Number of shares of bk_bake_share, 1 to 65,536; not read if `shares` is NULL. Default: 0.
+    pub share_count: u32,
+    /// Experimental: beginning of the names of the files that bk_bake_share writes, for example "out/"
+    /// for files in the folder out, which must exist; UTF-8. bk_bake then neither traces photons nor
+    /// fills the radiance map, but reads the radiance map of all shares from their files, and
+    /// photons and the radiance map of bk_bake_stats are without rays of the shares. May be NULL:
+    /// there are no shares. Default: NULL.
+    pub shares: *const c_char,
 }
 
 sized_struct!(bk_bake_params, defaults: {
@@ -231,6 +241,8 @@ sized_struct!(bk_bake_params, defaults: {
         directional_direct: (p.directional & directional::DIRECT != 0) as u32,
         passes: p.passes,
         target_error: p.target_error,
+        share_count: 0,
+        shares: std::ptr::null(),
     }
 });
 
@@ -420,13 +432,13 @@ pub(super) fn read_directional(indirect: u32, direct: u32) -> Result<u32> {
 /// @param params  parameters; NULL for the defaults
 /// @param progress,user  progress callback and its pointer; may be NULL
 /// @param out  receives numbers about the bake; may be NULL
-/// @retval BK_ERROR_INVALID_ARGUMENT  a field of `params` is out of its range, or the checkpoint is
-///   of another bake; bk_last_error says in which respect
+/// @retval BK_ERROR_INVALID_ARGUMENT  a field of `params` is out of its range, or the checkpoint or a
+///   share is of another bake; bk_last_error says in which respect
 /// @retval BK_ERROR_INVALID_STATE  another call is using the light map, or another bake the
 ///   checkpoint
 /// @retval BK_ERROR_OUT_OF_MEMORY  `memory_budget` is exceeded or the memory callback refuses
-/// @retval BK_ERROR_IO  the checkpoint is damaged, is another kind of file, or cannot be read or
-///   created
+/// @retval BK_ERROR_IO  the checkpoint or a share is damaged, is another kind of file, or cannot be
+///   read, or the checkpoint cannot be created
 /// @retval BK_ERROR_CANCELLED  the progress callback returned 0
 #[unsafe(no_mangle)]
 pub unsafe extern "C" fn bk_bake(
@@ -440,10 +452,11 @@ pub unsafe extern "C" fn bk_bake(
     call(|| unsafe {
         refuse_in_callback()?;
         let lightmap = hold(lightmap, "lightmap")?;
-        let (params, checkpoint) = core_params(params)?;
+        let (params, checkpoint, shares) = core_params(params)?;
         let out = OutStruct::optional(out, "out")?;
         let progress = self::progress(progress, user);
-        let done = lightmap.change(|l| l.bake_with(&params, checkpoint.as_ref(), &progress))?;
+        let bake = |l: &mut Lightmap| l.bake_with_shares(&params, shares.as_ref(), checkpoint.as_ref(), &progress);
+        let done = lightmap.change(bake)?;
         if let Some(out) = out {
             out.write(stats(&done));
         }
@@ -469,7 +482,7 @@ pub unsafe extern "C" fn bk_bake(
 /// Measured: docs/performance.md, "Edits".
 ///
 /// @param lightmap  any light map
-/// @param params  parameters of the last bake, without a range of texels, checkpoint and
+/// @param params  parameters of the last bake, without a range of texels, checkpoint, shares and
 ///   target_error; NULL for the defaults
 /// @param keep_error  change of light below which texels keep it, as a fraction of their irradiance
 ///   or, if that is more, of a tenth of the mean irradiance; finite, >= 0. 0.03 is hard to see
@@ -492,9 +505,9 @@ pub unsafe extern "C" fn bk_bake_changed(
     call(|| unsafe {
         refuse_in_callback()?;
         let lightmap = hold(lightmap, "lightmap")?;
-        let (params, checkpoint) = core_params(params)?;
-        if checkpoint.is_some() {
-            return invalid_argument!("checkpoint is not NULL: bk_bake_changed has none");
+        let (params, checkpoint, shares) = core_params(params)?;
+        if checkpoint.is_some() || shares.is_some() {
+            return invalid_argument!("checkpoint or shares is not NULL: bk_bake_changed has none");
         }
         let out = OutStruct::optional(out, "out")?;
         let progress = self::progress(progress, user);
@@ -506,9 +519,94 @@ pub unsafe extern "C" fn bk_bake_changed(
     })
 }
 
+/// Stage of bk_bake_share: tracing of photons.
+pub const BK_SHARE_PHOTONS: u32 = 0;
+/// Stage of bk_bake_share: the radiance map, which needs the photons of all shares.
+pub const BK_SHARE_RADIANCE: u32 = 1;
+
+/// Bakes one share of the photons or of the radiance map, on which all texels depend, and writes it
+/// to a file: machines that bake some texels each (texel_begin and texel_end of bk_bake_params) need
+/// not each trace all photons and fill the whole map.
+///
+/// First all shares of photons are computed, on any machines and in any order; when they are there,
+/// all shares of the radiance map, each of which reads the photons of all; then all texels, with the
+/// same `shares` and `share_count`. All other fields of `params` but `memory_budget`, the range of
+/// texels and the checkpoint must be the same in all these calls, and so must scene, lights and
+/// layout. The light has the bits of a bake without shares, whatever `share_count` is.
+///
+/// The file of share K of N is `shares` followed by photons-K-of-N.bkshare or
+/// radiance-K-of-N.bkshare (and by -pass-P before .bkshare, from the second pass on). It is replaced
+/// as a whole or not at all. A whole file of the same share that is there already is kept, and the
+/// call then only reads it: after an interruption or the loss of a machine, the same calls complete
+/// the work. Files may be copied between machines and renamed with another prefix. A
+/// photon takes 48 bytes in its file, a texel of the radiance map 12. Stages that the scene does not
+/// need write no file. Files from untrusted sources are safe to read: every number is checked, and
+/// light is finite and >= 0.
+///
+/// Any number of threads may compute shares of one light map at the same time, but not during a
+/// bake.
+///
+/// Cost: of photons and the radiance map in a bake the N-th part; beside it, a pilot of photons for
+/// each share of photons (see bk_bake_params.photon_count), and reading and sorting of all photons
+/// for each share of the radiance map. Measured: docs/performance.md, "Many machines".
+///
+/// Experimental: another version of the library may refuse the file.
+///
+/// @param lightmap  any light map
+/// @param params  parameters of the bake; not NULL, with `shares` and `share_count`
+/// @param stage  one of the BK_SHARE values
+/// @param share  number of the share, less than `share_count`
+/// @param progress,user  progress callback and its pointer; may be NULL
+/// @param out  receives numbers about photons and the radiance map, without rays where a file was
+///   read; may be NULL
+/// @retval BK_ERROR_INVALID_ARGUMENT  a field of `params` is out of its range, `shares` is NULL,
+///   `target_error` is not 0, there is no such stage or share, or the photons of a share are of
+///   another bake; bk_last_error says in which respect
+/// @retval BK_ERROR_INVALID_STATE  the light map is being baked
+/// @retval BK_ERROR_OUT_OF_MEMORY  `memory_budget` is exceeded or the memory callback refuses
+/// @retval BK_ERROR_IO  the photons of a share are missing, damaged or cannot be read, or the file
+///   cannot be written
+/// @retval BK_ERROR_CANCELLED  the progress callback returned 0
+#[unsafe(no_mangle)]
+pub unsafe extern "C" fn bk_bake_share(
+    lightmap: *const bk_lightmap,
+    params: *const bk_bake_params,
+    stage: u32,
+    share: u32,
+    progress: bk_progress_fn,
+    user: *mut c_void,
+    out: *mut bk_bake_stats,
+) -> bk_result {
+    // SAFETY: params and out are the caller's, or NULL.
+    call(|| unsafe {
+        refuse_in_callback()?;
+        let lightmap = hold(lightmap, "lightmap")?;
+        let (params, _, shares) = core_params(params)?;
+        let Some(shares) = shares else { return invalid_argument!("shares is NULL") };
+        let stage = match stage {
+            BK_SHARE_PHOTONS => ShareStage::Photons,
+            BK_SHARE_RADIANCE => ShareStage::Radiance,
+            other => return invalid_argument!("stage is {other}, not one of the BK_SHARE values"),
+        };
+        let out = OutStruct::optional(out, "out")?;
+        let progress = self::progress(progress, user);
+        let done = lightmap.read(|l| {
+            l.scene().device().check_process()?;
+            l.bake_share(&params, &shares, stage, share, &progress)
+        })?;
+        if let Some(out) = out {
+            out.write(stats(&done));
+        }
+        Ok(())
+    })
+}
+
+/// What a caller's parameters say.
+type Params = (BakeParams, Option<CheckpointParams>, Option<ShareParams>);
+
 /// # Safety
-/// `params` is NULL or the caller's structure, whose checkpoint is NULL or a text.
-unsafe fn core_params(params: *const bk_bake_params) -> Result<(BakeParams, Option<CheckpointParams>)> {
+/// `params` is NULL or the caller's structure, whose checkpoint and shares are NULL or texts.
+unsafe fn core_params(params: *const bk_bake_params) -> Result<Params> {
     // SAFETY: by contract.
     let read = || unsafe { read_struct(params, "params") };
     let p: bk_bake_params = if params.is_null() { SizedStruct::defaults() } else { read()? };
@@ -540,7 +638,15 @@ unsafe fn core_params(params: *const bk_bake_params) -> Result<(BakeParams, Opti
             Some(CheckpointParams { path, seconds: p.checkpoint_seconds.into() })
         }
     };
-    Ok((params, checkpoint))
+    let shares = match p.shares.is_null() {
+        true => None,
+        false => {
+            // SAFETY: by contract a text.
+            let prefix = unsafe { text(p.shares, "shares") }?.into();
+            Some(ShareParams { prefix, count: p.share_count })
+        }
+    };
+    Ok((params, checkpoint, shares))
 }
 
 /// Writes a text about the last bake, one line per stage: whether it ran or was left out, and why.

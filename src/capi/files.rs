@@ -320,7 +320,9 @@ pub struct bk_open_params {
     /// the system drops them when it needs the memory, so that a scene may be larger than it. Pages
     /// that a refit changes stay in memory. While the scene lives, the file must not be changed in
     /// place or cut short: that would be as if somebody wrote to the process's memory. (bk_scene_save
-    /// under its name is fine: it makes a new file.) 0: the file is read to memory; rays are
+    /// under its name is fine: it makes a new file.) Bakes, light maps, photon maps, saves and refits
+    /// notice it and fail with BK_ERROR_IO, and checkpoints hold nothing that was computed since; but
+    /// reading a part that was cut off ends the process (SIGBUS). 0: the file is read to memory; rays are
     /// somewhat faster, because memory can have large pages. Default: 1.
     pub map: u32,
     /// 1: rays wait at parts of the tree until enough of them do, for scenes that are larger than

@@ -106,7 +106,9 @@ pub fn write_scene(lightmap: &Lightmap, path: &Path, exposure: Option<f32>, prog
             Ok(file)
         };
         let pages = (0..info.page_count).into_par_iter().map(page).collect::<Result<Vec<_>>>()?;
-        prepare_glb(path, lightmap.scene(), lightmap, &pages, exposure, &|parts| stage.advance(parts))
+        let new = prepare_glb(path, lightmap.scene(), lightmap, &pages, exposure, &|parts| stage.advance(parts))?;
+        lightmap.scene().check_file()?;
+        Ok(new)
     })?;
     new.finish()
 }

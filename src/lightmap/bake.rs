@@ -18,12 +18,15 @@ use super::indirect::upsample::{Upsampling, parts};
 use super::passes::{self, Passes};
 use super::plan::{Plan, left_out};
 use super::saved::checkpoint::Checkpoint;
+use super::saved::share::Shares;
 use super::seams::Stitch;
 use super::stages::{self, Inputs, Own, purpose};
 use super::texel_light::TilePoints;
 use super::texel_light::averages::Variation;
 use super::tiles::{TILE, in_order};
-use super::{BakeParams, BakeStats, CheckpointParams, Light, Lightmap, Origin, StageStats, TexelState, directional};
+use super::{
+    BakeParams, BakeStats, CheckpointParams, Light, Lightmap, Origin, ShareParams, StageStats, TexelState, directional,
+};
 use crate::base::directional::Directional;
 use crate::base::error::{Error, Result, invalid_argument};
 use crate::base::memory::{try_filled, try_to_vec, try_vec, try_zeroed};
@@ -72,15 +75,39 @@ impl Lightmap {
         checkpoint: Option<&CheckpointParams>,
         progress: &Progress,
     ) -> Result<BakeStats> {
+        self.bake_with_shares(params, None, checkpoint, progress)
+    }
+
+    /// Runs the pipeline without photons and the radiance map, which [`bake_share`](Self::bake_share) has computed with
+    /// the same parameters and lights: reads them from the files of all shares. `Io` if one is missing or damaged,
+    /// `InvalidArgument` if one is of another bake.
+    pub fn bake_with_shares(
+        &mut self,
+        params: &BakeParams,
+        shares: Option<&ShareParams>,
+        checkpoint: Option<&CheckpointParams>,
+        progress: &Progress,
+    ) -> Result<BakeStats> {
         params.validate()?;
+        shares.map_or(Ok(()), |shares| shares.validate(params))?;
         checkpoint.map_or(Ok(()), CheckpointParams::validate)?;
-        self.bake_all(params, checkpoint, None, progress)
+        self.bake_all(params, shares, checkpoint, None, progress)
+    }
+
+    /// Plans a bake.
+    pub(super) fn planned(&self, direct: &DirectLight, params: &BakeParams) -> Plan {
+        let two_sided = !self.atlas.radiance.layout.back_of.is_empty();
+        let mut plan =
+            Plan::new(&self.atlas.scene, direct, params, two_sided, self.atlas.info.uvs.unwrapped_charts > 0);
+        plan.note_sides(&self.atlas.info);
+        plan
     }
 
     /// Bakes with checked parameters, anew or, given the difference of light that is let stand, what has changed.
     pub(super) fn bake_all(
         &mut self,
         params: &BakeParams,
+        shares: Option<&ShareParams>,
         checkpoint: Option<&CheckpointParams>,
         keep_error: Option<f32>,
         progress: &Progress,
@@ -102,25 +129,23 @@ impl Lightmap {
         }
         let origin = Origin::new(params, &self.atlas.scene.lights());
         let direct = self.atlas.scene.device().install(|| DirectLight::try_new(&self.atlas.scene))?;
-        let two_sided = !self.atlas.radiance.layout.back_of.is_empty();
-        let mut plan =
-            Plan::new(&self.atlas.scene, &direct, params, two_sided, self.atlas.info.uvs.unwrapped_charts > 0);
-        plan.note_sides(&self.atlas.info);
+        let mut plan = self.planned(&direct, params);
         let device = self.atlas.scene.device().clone();
         device.memory().reset_peak();
         let range = params.texel_begin as usize..end as usize;
         let count = range.len();
-        let (light, mut stats, stitch) = device.run(progress, || {
+        let work = || {
             let (atlas, direct, range) = (&self.atlas, &direct, range.clone());
             let checkpoint = match checkpoint {
                 Some(c) => Some(Checkpoint::open(c, atlas, &origin, [range.start as u64, range.end as u64])?),
                 None => None,
             };
+            let shares = shares.map(|shares| Shares::new(shares, atlas, &origin));
             let before = match keep_error {
                 Some(keep_error) => self.before(params, &plan, direct, &origin, keep_error)?,
                 None => None,
             };
-            let from = From { checkpoint: checkpoint.as_ref(), before: before.as_ref() };
+            let from = From { shares: shares.as_ref(), checkpoint: checkpoint.as_ref(), before: before.as_ref() };
             let passes = || self.passes(params, &plan, direct, &range, from, progress);
             let (mut light, mut stats) = atlas.scene.install(passes)?;
             stats.back_charts = light.backs.iter().filter(|&&b| b).count() as u64;
@@ -134,7 +159,9 @@ impl Lightmap {
             light.origin = Some(origin);
             let stitch = self.stitch(&light, &range, params, &mut plan, &mut stats, progress)?;
             Ok((light, stats, stitch))
-        })?;
+        };
+        let scene = &self.atlas.scene;
+        let (light, mut stats, stitch) = scene.while_unchanged(|| device.run(progress, work))?;
         stats.left_out = plan.left_out;
         stats.peak_bytes = device.memory().peak() as u64;
         self.plan = plan;
@@ -167,7 +194,7 @@ impl Lightmap {
         from: From,
         progress: &Progress,
     ) -> Result<(Light, BakeStats)> {
-        let From { checkpoint, before } = from;
+        let From { checkpoint, before, .. } = from;
         let run = |pass: u32, all: Option<&Passes>| {
             let params = &passes::params_of(params, pass);
             if let Some(c) = checkpoint {
@@ -175,7 +202,7 @@ impl Lightmap {
             }
             let (atlas, range) = (&self.atlas, range.clone());
             let (known_backs, held) = (all.map(|all| &all.light.backs[..]), all.map_or(0, Passes::bytes));
-            Bake { atlas, params, plan, direct, range, progress, checkpoint, before, known_backs, held }.run()
+            Bake { atlas, params, plan, direct, range, progress, pass, from, known_backs, held }.run()
         };
         if params.passes == 1 && params.target_error == 0.0 {
             let (light, stats) = run(0, None)?;
@@ -247,7 +274,10 @@ impl Lightmap {
 /// Where light comes from that need not be computed.
 #[derive(Clone, Copy)]
 struct From<'a> {
+    /// Photons and radiance map.
+    shares: Option<&'a Shares<'a>>,
     checkpoint: Option<&'a Checkpoint<'a>>,
+    /// Light from before a change, of which some is kept.
     before: Option<&'a Before<'a>>,
 }
 
@@ -260,9 +290,8 @@ struct Bake<'a, 'p> {
     /// Texels of the light map to bake.
     range: Range<usize>,
     progress: &'a Progress<'p>,
-    checkpoint: Option<&'a Checkpoint<'a>>,
-    /// Light from before a change, of which some is kept.
-    before: Option<&'a Before<'a>>,
+    pass: u32,
+    from: From<'a>,
     /// The charts that show their backs, if an earlier pass has decided it.
     known_backs: Option<&'a [bool]>,
     /// Bytes that earlier passes hold.
@@ -287,7 +316,7 @@ impl<'p> Bake<'_, 'p> {
         let mut indirect = None;
         let radiance = self.illuminate(&mut stats)?;
         let backs = self.backs(&radiance.values)?;
-        let redo = match self.before {
+        let redo = match self.from.before {
             Some(before) => Some(self.redo(before, &radiance, &backs)?),
             None => None,
         };
@@ -308,7 +337,7 @@ impl<'p> Bake<'_, 'p> {
             plan: Plan::default(),
             _memory: memory,
         };
-        if let Some((before, redo)) = self.before.zip(redo) {
+        if let Some((before, redo)) = self.from.before.zip(redo) {
             before.keep(redo, &mut light);
         }
         self.compose(scene, indirect.as_ref(), redo, &mut light, &mut stats)?;
@@ -335,16 +364,24 @@ impl<'p> Bake<'_, 'p> {
         Ok(before.redo.get_or_init(|| redo))
     }
 
-    /// Computes the radiance map, or reads it from the checkpoint; empty if the plan leaves indirect light out.
+    /// Computes the radiance map, or reads it from the checkpoint or from the files of shares; empty if the plan leaves
+    /// indirect light out.
     fn illuminate(&self, stats: &mut BakeStats) -> Result<Radiance> {
-        let Some(c) = self.checkpoint.filter(|_| self.plan.runs(left_out::INDIRECT)) else {
-            return stages::illuminate(&self.inputs(), self.plan, stats);
-        };
-        if let Some(radiance) = self.atlas.scene.device().install(|| c.radiance(self.atlas))? {
+        if !self.plan.runs(left_out::INDIRECT) {
+            return Ok(Radiance::default());
+        }
+        if let Some(c) = self.from.checkpoint
+            && let Some(radiance) = self.atlas.scene.device().install(|| c.radiance(self.atlas))?
+        {
             return Ok(radiance);
         }
-        let radiance = stages::illuminate(&self.inputs(), self.plan, stats)?;
-        c.keep_radiance(&radiance);
+        let radiance = match self.from.shares {
+            Some(shares) => shares.radiance(&self.inputs(), self.pass, stats)?,
+            None => stages::illuminate(&self.inputs(), self.plan, stats)?,
+        };
+        if let Some(c) = self.from.checkpoint {
+            c.keep_radiance(&radiance);
+        }
         Ok(radiance)
     }
 
@@ -354,11 +391,11 @@ impl<'p> Bake<'_, 'p> {
         if let Some(backs) = self.known_backs {
             return try_to_vec(backs, "the sides of charts");
         }
-        if let Some(backs) = self.checkpoint.map(|c| c.backs(charts)).transpose()?.flatten() {
+        if let Some(backs) = self.from.checkpoint.map(|c| c.backs(charts)).transpose()?.flatten() {
             return Ok(backs);
         }
         let backs = stages::backs(&self.inputs(), radiance)?;
-        if let Some(c) = self.checkpoint {
+        if let Some(c) = self.from.checkpoint {
             c.keep_backs(&backs);
         }
         Ok(backs)
@@ -368,14 +405,14 @@ impl<'p> Bake<'_, 'p> {
     fn own_light(&self, radiance: &Radiance, backs: &[bool], upsampling: &Upsampling) -> Result<Own> {
         let texels = upsampling.own_work() as usize / 2;
         let asks = self.asks(directional::INDIRECT);
-        if let Some(c) = self.checkpoint
+        if let Some(c) = self.from.checkpoint
             && let Some(light) = c.own_light(texels)?
             && let Some(directional) = if asks { c.own_directional(&light)? } else { Some(Vec::new()) }
         {
             return Ok(Own { light, directional, rays: 0 });
         }
         let own = stages::own_light(&self.inputs(), radiance, backs, upsampling, asks)?;
-        if let Some(c) = self.checkpoint {
+        if let Some(c) = self.from.checkpoint {
             if asks {
                 c.keep_own_directional(&own.directional);
             }
@@ -461,7 +498,7 @@ impl<'p> Bake<'_, 'p> {
             let directional = parts(directional, BLOCK, needed.len())?;
             let blocks = values.zip(normals).zip(variances).zip(valid).zip(directional).enumerate();
             one_by_one(blocks).try_each(|(block, ((((values, normals), variances), valid), directional))| {
-                if self.checkpoint.is_some_and(|c| c.gathered(block, values, variances, valid, directional)) {
+                if self.from.checkpoint.is_some_and(|c| c.gathered(block, values, variances, valid, directional)) {
                     for (i, normal) in normals.iter_mut().enumerate() {
                         let texel = GatherTexel::new(needed.start + block * BLOCK + i);
                         *normal = l.receiver(&l.gather, backs, texel).normal;
@@ -495,7 +532,7 @@ impl<'p> Bake<'_, 'p> {
                         }
                     }
                 }
-                if let Some(c) = self.checkpoint {
+                if let Some(c) = self.from.checkpoint {
                     c.keep_gathered(block, values, variances, valid, directional);
                 }
                 rays.fetch_add(traced, Relaxed);
@@ -585,7 +622,7 @@ impl<'p> Bake<'_, 'p> {
                         }
                     }
                 }
-                *known = self.checkpoint.is_some_and(|c| c.lit(block, direct, variances, state, directed));
+                *known = self.from.checkpoint.is_some_and(|c| c.lit(block, direct, variances, state, directed));
                 if *known {
                     return stage.advance(direct.len() as u64);
                 }
@@ -612,7 +649,7 @@ impl<'p> Bake<'_, 'p> {
                         });
                     }
                 }
-                if let Some(c) = self.checkpoint.filter(|_| !self.plan.runs(left_out::DIRECT)) {
+                if let Some(c) = self.from.checkpoint.filter(|_| !self.plan.runs(left_out::DIRECT)) {
                     c.keep_lit(block, direct, variances, state, directed);
                 }
                 rays.fetch_add(traced, Relaxed);

@@ -68,7 +68,7 @@ impl Lightmap {
         {
             return invalid_argument!("a bake of changes is of all texels and has no target_error");
         }
-        self.bake_all(params, None, Some(keep_error), progress)
+        self.bake_all(params, None, None, Some(keep_error), progress)
     }
 
     /// Returns the light from before a change, if a bake with these parameters can keep any of it.

@@ -37,7 +37,8 @@ impl Lightmap {
     /// Creates a light map: unwraps meshes without usable UVs, lays out the pages and maps texels to triangles.
     pub fn create(scene: &Arc<Scene>, desc: &LightmapDesc, progress: &Progress) -> Result<Lightmap> {
         desc.validate()?;
-        scene.device().run(progress, || Self::lay_out(scene, desc, None, progress))
+        let lay_out = || Self::lay_out(scene, desc, None, progress);
+        scene.while_unchanged(|| scene.device().run(progress, lay_out))
     }
 
     /// Creates a light map whose description is checked. What is `known` is not searched for.

@@ -46,22 +46,7 @@ pub(crate) fn is_needed(direct: &DirectLight, params: &BakeParams, plan: &Plan) 
 
 /// Returns the texels whose light before the blur a range of texels needs.
 pub(crate) fn needed(atlas: &Atlas, range: &Range<usize>) -> Range<usize> {
-    let map = &atlas.map;
-    let placement = |i: usize| map.texels_of(map.placement_of(&atlas.charts, LightTexel::new(i))).indices();
-    // Texels of a placement are numbered row by row.
-    let row = |i: usize| map.position(LightTexel::new(i)).1;
-    let Range { mut start, mut end } = *range;
-    if start < end {
-        let (first, last) = (placement(start).start, placement(end - 1).end);
-        let (lowest, highest) = (row(start) - RADIUS, row(end - 1) + RADIUS);
-        while start > first && row(start - 1) >= lowest {
-            start -= 1;
-        }
-        while end < last && row(end) <= highest {
-            end += 1;
-        }
-    }
-    start..end
+    atlas.map.with_rows_around(range, RADIUS)
 }
 
 /// Blurs the direct light of the texels of `range` that are new: `direct`, by texel, and `directed`, if it is asked for by

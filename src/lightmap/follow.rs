@@ -33,6 +33,7 @@ impl Lightmap {
             return invalid_argument!("the light map is of another scene");
         }
         let atlas = scene.device().run(progress, || self.atlas.moved_to(scene, progress))?;
+        scene.check_file()?;
         let before = std::mem::replace(&mut self.atlas, Arc::new(atlas));
         if self.light.is_some() && self.before.is_none() {
             self.before = Some(before);

@@ -40,6 +40,7 @@ use plan::Plan;
 pub use readback::MeshUvs;
 pub use saved::CheckpointParams;
 use saved::fingerprint::Origin;
+pub use saved::share::{ShareParams, ShareStage};
 use std::sync::Arc;
 
 /// A box from which the scene is looked at; a point if its corners are the same.

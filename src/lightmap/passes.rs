@@ -165,7 +165,7 @@ impl Passes {
 }
 
 /// Adds the work of a pass to that of those before.
-fn add_stats(all: &mut BakeStats, pass: &BakeStats) {
+pub(super) fn add_stats(all: &mut BakeStats, pass: &BakeStats) {
     let add = |all: &mut StageStats, pass: &StageStats| {
         all.seconds += pass.seconds;
         all.rays += pass.rays;

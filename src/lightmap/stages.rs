@@ -17,8 +17,10 @@ use crate::base::error::Result;
 use crate::base::memory::try_vec;
 use crate::base::progress::Progress;
 use crate::base::sampling::{combine, purpose_seed};
+use crate::base::share::Share;
 use crate::direct::DirectLight;
-use crate::photon::{PhotonMap, PhotonParams};
+use crate::photon::trace::Traced;
+use crate::photon::{PhotonMap, PhotonParams, PhotonStats};
 use glam::Vec3;
 use std::ops::Range;
 use std::time::Instant;
@@ -74,6 +76,39 @@ pub(crate) fn illuminate(inputs: &Inputs, plan: &Plan, stats: &mut BakeStats) ->
     radiance(inputs, photons.as_ref(), false, stats)
 }
 
+/// Traces a share of the photons.
+pub(crate) fn share_of_photons(inputs: &Inputs, share: Share, stats: &mut BakeStats) -> Result<Traced> {
+    let Inputs { atlas, progress, .. } = *inputs;
+    let traced = Traced::trace(&atlas.scene, &photon_params(inputs), share, progress, (0.0, 0.8))?;
+    let PhotonStats { emitted, stored, rays, trace_seconds, .. } = traced.stats;
+    let bytes = traced.runs().map(<[u8]>::len).sum::<usize>() as u64;
+    stats.photons = StageStats { seconds: trace_seconds, rays, bytes };
+    (stats.photons_emitted, stats.photons_stored) = (emitted, stored);
+    Ok(traced)
+}
+
+/// Computes a share of the radiance map from the photons of all shares, or without any if the plan leaves them out.
+pub(crate) fn share_of_radiance(
+    inputs: &Inputs,
+    photons: Option<Traced>,
+    share: Share,
+    stats: &mut BakeStats,
+) -> Result<Vec<Vec3>> {
+    let Inputs { atlas, progress, .. } = *inputs;
+    let sorted = |photons| PhotonMap::of(&atlas.scene, &photon_params(inputs), photons, progress, 0.2, 0.25);
+    let photons = photons.map(sorted).transpose()?;
+    if let Some(photons) = &photons {
+        let s = photons.stats();
+        stats.photons = StageStats { seconds: s.grid_seconds, rays: 0, bytes: photons.bytes() as u64 };
+        (stats.photons_emitted, stats.photons_stored) = (s.emitted, s.stored);
+    }
+    let (start, range) = (Instant::now(), radiance_map::share(&atlas.radiance, share));
+    let (values, rays) = radiance_values(inputs, photons.as_ref(), range, false, (0.25, 0.95))?;
+    let bytes = size_of_val(&values[..]) as u64;
+    stats.radiance = StageStats { seconds: start.elapsed().as_secs_f64(), rays, bytes };
+    Ok(values)
+}
+
 /// Computes a first impression of the radiance map, by a part of the photons, in a fraction of the time that
 /// [`illuminate`] takes; empty if the plan leaves indirect light out.
 pub(crate) fn illuminate_quickly(inputs: &Inputs, plan: &Plan) -> Result<Radiance> {
@@ -87,10 +122,10 @@ pub(crate) fn illuminate_quickly(inputs: &Inputs, plan: &Plan) -> Result<Radianc
     radiance(inputs, photons.as_ref(), true, stats)
 }
 
-fn photons(inputs: &Inputs, stats: &mut BakeStats) -> Result<PhotonMap> {
-    let start = Instant::now();
-    let Inputs { atlas, params, progress, .. } = *inputs;
-    let params = PhotonParams {
+/// Parameters of the photons of a bake.
+pub(crate) fn photon_params(inputs: &Inputs) -> PhotonParams {
+    let Inputs { atlas, params, .. } = *inputs;
+    PhotonParams {
         photon_count: params.photon_count,
         max_bounces: params.max_bounces,
         radius: params.radius,
@@ -101,8 +136,12 @@ fn photons(inputs: &Inputs, stats: &mut BakeStats) -> Result<PhotonMap> {
         least_radius: (RADIUS_TEXELS / atlas.radiance.layout.density).min(f32::MAX),
         most_stored: MOST_STORED.max(STORED_PER_TEXEL * atlas.radiance.len() as u64),
         ..Default::default()
-    };
-    let map = PhotonMap::trace_within(&atlas.scene, &params, progress, 0.0, 0.2)?;
+    }
+}
+
+fn photons(inputs: &Inputs, stats: &mut BakeStats) -> Result<PhotonMap> {
+    let start = Instant::now();
+    let map = PhotonMap::trace_within(&inputs.atlas.scene, &photon_params(inputs), inputs.progress, 0.0, 0.2)?;
     let s = map.stats();
     stats.photons = StageStats { seconds: start.elapsed().as_secs_f64(), rays: s.rays, bytes: map.bytes() as u64 };
     (stats.photons_emitted, stats.photons_stored) = (s.emitted, s.stored);
@@ -111,10 +150,37 @@ fn photons(inputs: &Inputs, stats: &mut BakeStats) -> Result<PhotonMap> {
 
 fn radiance(inputs: &Inputs, photons: Option<&PhotonMap>, quick: bool, stats: &mut BakeStats) -> Result<Radiance> {
     let start = Instant::now();
+    let (values, mut rays) = radiance_values(inputs, photons, 0..inputs.atlas.radiance.len(), quick, (0.2, 0.3))?;
+    let mut radiance = Radiance { values, bright: Bright::default() };
+    if !quick {
+        find_bright(inputs, &mut radiance, &mut rays)?;
+    }
+    let bytes = (radiance.values.len() * size_of::<Vec3>() + inputs.atlas.radiance.bytes()) as u64;
+    stats.radiance = StageStats { seconds: start.elapsed().as_secs_f64(), rays, bytes };
+    Ok(radiance)
+}
+
+/// Finds the bright patches of a complete radiance map. Adds the rays traced to `rays`.
+pub(crate) fn find_bright(inputs: &Inputs, radiance: &mut Radiance, rays: &mut u64) -> Result<()> {
+    let Inputs { atlas, params, progress, .. } = *inputs;
+    // Paths from all hits look nothing up, and so find bright patches by their own shadow rays.
+    if params.near_hits < f32::INFINITY {
+        atlas.scene.device().install(|| find_bright_patches::find(atlas, radiance, rays, progress))?;
+    }
+    Ok(())
+}
+
+/// Computes a range of the radiance map; returns the number of rays, too.
+fn radiance_values(
+    inputs: &Inputs,
+    photons: Option<&PhotonMap>,
+    range: Range<usize>,
+    quick: bool,
+    (from, to): (f32, f32),
+) -> Result<(Vec<Vec3>, u64)> {
     let Inputs { atlas, direct, params, progress } = *inputs;
-    let device = atlas.scene.device();
-    let stage = progress.stage("radiance", 0.2, 0.3, 2 * atlas.radiance.len() as u64);
-    let mut values = try_vec(atlas.radiance.len(), "the radiance map")?;
+    let stage = progress.stage("radiance", from, to, radiance_map::work(&atlas.radiance, &range));
+    let mut values = try_vec(range.len(), "the radiance map")?;
     let light = TexelLight {
         areas: atlas.areas(&atlas.radiance),
         direct,
@@ -122,15 +188,8 @@ fn radiance(inputs: &Inputs, photons: Option<&PhotonMap>, quick: bool, stats: &m
         seed: purpose_seed(params.seed, purpose::RADIANCE),
     };
     let input = RadianceInput { light, photons, quick };
-    let mut rays = radiance_map::bake(device, &input, &mut values, &stage)?;
-    let mut radiance = Radiance { values, bright: Bright::default() };
-    // Paths from all hits look nothing up, and so find bright patches by their own shadow rays.
-    if params.near_hits < f32::INFINITY && !quick {
-        device.install(|| find_bright_patches::find(atlas, &mut radiance, &mut rays, progress))?;
-    }
-    let bytes = (radiance.values.len() * size_of::<Vec3>() + atlas.radiance.bytes()) as u64;
-    stats.radiance = StageStats { seconds: start.elapsed().as_secs_f64(), rays, bytes };
-    Ok(radiance)
+    let rays = radiance_map::bake(atlas.scene.device(), &input, range, &mut values, &stage)?;
+    Ok((values, rays))
 }
 
 /// Decides for each two-sided chart without separate texels for its back whether the back is baked. With the radiance

@@ -4,6 +4,7 @@
 //! |---|---|
 //! | `emission.rs`, `spot.rs` | lights by power, stratified positions and directions |
 //! | `trace.rs` | paths with Russian roulette, blocks of photons in parallel |
+//! | `share.rs` | photons that several machines trace |
 //! | `radius.rs` | the automatic search radius |
 //! | `grid.rs` | photons sorted into a uniform grid, one array per component |
 //! | `estimate.rs` | the irradiance estimate, over the lanes of each ISA |
@@ -19,13 +20,15 @@ mod grid;
 mod guide;
 mod noted;
 mod radius;
+mod share;
 mod spot;
-mod trace;
+pub(crate) mod trace;
 
-use crate::base::error::{Error, Result, invalid_argument};
+use crate::base::error::{Result, invalid_argument};
 use crate::base::memory::{MemoryMonitor, Reservation, try_vec};
 use crate::base::parallel::ParallelLoop;
 use crate::base::progress::Progress;
+use crate::base::share::Share;
 use crate::scene::Scene;
 use crate::trace::Ray;
 use cylinder::Cylinder;
@@ -36,6 +39,7 @@ use noted::Noted;
 use rayon::prelude::*;
 use std::sync::{Arc, OnceLock};
 use std::time::Instant;
+use trace::Traced;
 
 /// Maximum number of photons that can be emitted: their numbers are 32-bit.
 pub const MAX_PHOTONS: u64 = 1 << 32;
@@ -224,7 +228,8 @@ impl PhotonMap {
     /// `OutOfMemory` if `memory_budget` or the memory monitor refuses. Lights without power make an
     /// empty map.
     pub fn trace(scene: &Arc<Scene>, params: &PhotonParams, progress: &Progress) -> Result<PhotonMap> {
-        scene.device().run(progress, || Self::trace_within(scene, params, progress, 0.0, 1.0))
+        let trace = || Self::trace_within(scene, params, progress, 0.0, 1.0);
+        scene.while_unchanged(|| scene.device().run(progress, trace))
     }
 
     /// Does the work of `trace` as a part of a longer call: reports progress over `[from, to]` of the bar.
@@ -235,18 +240,24 @@ impl PhotonMap {
         from: f32,
         to: f32,
     ) -> Result<PhotonMap> {
-        params.validate()?;
-        let lights = scene.lights();
-        if lights.is_empty() && scene.emitters().is_empty() {
-            return Err(Error::InvalidState("the scene has no lights: add a light or a material with emission".into()));
-        }
         // Sorting is about a twentieth of the work.
         let split = from + 0.95 * (to - from);
+        let trace = || Traced::trace(scene, params, Share::ALL, progress, (from, split));
+        let traced = scene.device().install(trace)?;
+        Self::of(scene, params, traced, progress, split, to)
+    }
+
+    /// Sorts all photons, which have been traced with the same parameters; reports progress over `[from, to]` of the bar.
+    pub(crate) fn of(
+        scene: &Arc<Scene>,
+        params: &PhotonParams,
+        traced: Traced,
+        progress: &Progress,
+        from: f32,
+        to: f32,
+    ) -> Result<PhotonMap> {
         scene.device().install(|| {
-            let start = Instant::now();
-            let traced = trace::trace(scene, &lights, params, progress, (from, split))?;
             let mut stats = traced.stats;
-            stats.trace_seconds = start.elapsed().as_secs_f64();
             let start = Instant::now();
             let radius = if params.radius > 0.0 {
                 params.radius
@@ -254,7 +265,7 @@ impl PhotonMap {
                 radius::automatic(&traced.blocks, scene.diagonal(), PHOTONS_PER_DISC)?
                     .max(params.least_radius.min(scene.diagonal()))
             };
-            let (grid, memory) = Grid::build(traced, radius, progress, (split, to))?;
+            let (grid, memory) = Grid::build(traced, radius, progress, (from, to))?;
             stats.grid_seconds = start.elapsed().as_secs_f64();
             Ok(PhotonMap {
                 scene: scene.clone(),

@@ -1,6 +1,7 @@
 //! The photon map as physics, and its manners.
 
 use super::*;
+use crate::base::error::Error;
 use crate::base::sampling::sobol_2d;
 use crate::bvh::BuildOptions;
 use crate::device::{Device, DeviceOptions};

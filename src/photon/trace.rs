@@ -13,9 +13,11 @@ use crate::base::error::{Error, Result};
 use crate::base::memory::{MemoryMonitor, Reservation, try_collect, try_filled, try_par_collect_ok, try_with_capacity};
 use crate::base::progress::{Progress, Stage};
 use crate::base::sampling::{combine, cosine_around, purpose_seed, sobol_2d, sobol_2d_bits, uniform};
+use crate::base::share::Share;
 use crate::scene::{Light, NONE, Scene};
 use crate::trace::offset::{SurfacePoint, offset_ray_origin};
 use crate::trace::{RawHit, Ray};
+use bytemuck::{Pod, Zeroable};
 use glam::{DVec3, Vec3};
 use rayon::prelude::*;
 use std::sync::{Arc, Mutex};
@@ -57,7 +59,8 @@ const BOUNCE: u32 = 4;
 const STORED: u32 = u32::MAX;
 
 /// A photon on a surface.
-#[derive(Clone, Copy, Debug, Default, PartialEq)]
+#[derive(Clone, Copy, Debug, Default, PartialEq, Pod, Zeroable)]
+#[repr(C)]
 pub(super) struct StoredPhoton {
     pub(super) position: Vec3,
     /// Unit direction of travel.
@@ -71,26 +74,36 @@ pub(super) struct StoredPhoton {
 }
 
 /// Stored photons in order of blocks, within a block by bounce and number.
-pub(super) struct Traced {
+pub(crate) struct Traced {
     pub(super) blocks: Vec<Vec<StoredPhoton>>,
-    pub(super) stats: PhotonStats,
+    pub(crate) stats: PhotonStats,
     pub(super) memory: Account,
 }
 
-/// Traces all photons, reporting over `[from, to]` of the bar. Runs on the current rayon pool.
+impl StoredPhoton {
+    /// Whether these are numbers that a photon may have.
+    pub(super) fn is_possible(&self) -> bool {
+        let is_placed = self.position.is_finite() && self.direction.is_finite() && self.normal.is_finite();
+        is_placed && self.power.cmpge(Vec3::ZERO).all()
+    }
+}
+
+/// Traces a share of the photons, whole blocks, reporting over `[from, to]` of the bar. Runs on the current rayon pool.
 pub(super) fn trace(
     scene: &Arc<Scene>,
     lights: &[Light],
     params: &PhotonParams,
+    share: Share,
     progress: &Progress,
     (from, to): (f32, f32),
 ) -> Result<Traced> {
     let mut tracer = Tracer::guided(scene, lights, params)?;
     let count = tracer.emission.count();
     tracer.thin_out(params.most_stored)?;
-    let stage = progress.stage("photons", from, to, count.div_ceil(BLOCK));
+    let numbers = share.of(tracer.blocks().len());
+    let stage = progress.stage("photons", from, to, numbers.len() as u64);
     let memory = Account::new(scene.device().memory().clone(), params.memory_budget);
-    let traced = tracer.blocks().into_par_iter().map(|block| {
+    let traced = numbers.into_par_iter().map(|block| {
         stage.check()?;
         let result = tracer.block(block as u64, Some((&stage, &memory)), |_, _, _| ())?;
         stage.advance(1)?;
@@ -454,7 +467,7 @@ impl Account {
     }
 
     /// Counts `bytes` more, announcing them in large steps.
-    fn grow(&self, bytes: usize) -> Result<()> {
+    pub(super) fn grow(&self, bytes: usize) -> Result<()> {
         let mut state = self.state.lock().unwrap_or_else(|e| e.into_inner());
         state.used += bytes;
         self.check(state.used)?;

@@ -217,6 +217,7 @@ impl Parts {
             skipped,
             instances,
             parts: None,
+            file: None,
             uses,
             stats,
             _memory: memory,

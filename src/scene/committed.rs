@@ -8,12 +8,14 @@ use super::{
 };
 use crate::base::error::{Result, invalid_argument};
 use crate::base::memory::Reservation;
+use crate::base::watched_file::WatchedFile;
 use crate::bvh::Tree;
 use crate::bvh::instances::Instances;
 use crate::device::Device;
 use glam::{Vec2, Vec3};
 use std::borrow::Cow;
 use std::ops::Range;
+use std::panic::{AssertUnwindSafe, catch_unwind, resume_unwind};
 use std::sync::{Arc, RwLock};
 
 /// Statistics of a committed scene.
@@ -70,6 +72,8 @@ pub struct Scene {
     pub(super) instances: Option<Box<Instances>>,
     /// The tree in parts at which rays wait, if that was asked for.
     pub(super) parts: Option<Box<WaitingRays>>,
+    /// The file that the scene lies in, if it was mapped.
+    pub(super) file: Option<WatchedFile>,
     pub(super) uses: Uses,
     pub(super) stats: SceneStats,
     pub(super) _memory: Reservation,
@@ -92,6 +96,22 @@ impl Scene {
     /// The device of the scene.
     pub fn device(&self) -> &Arc<Device> {
         &self.device
+    }
+
+    /// Fails if the scene lies in a mapped file that somebody has changed since: nothing that was computed after that can
+    /// be believed.
+    pub(crate) fn check_file(&self) -> Result<()> {
+        self.file.as_ref().map_or(Ok(()), WatchedFile::check)
+    }
+
+    /// Does work that reads the scene. If its mapped file is changed meanwhile, that is the error, whatever the work came to:
+    /// even panics, as of numbers that lead nowhere.
+    pub(crate) fn while_unchanged<R>(&self, work: impl FnOnce() -> Result<R>) -> Result<R> {
+        let Some(file) = &self.file else { return work() };
+        file.check()?;
+        let done = catch_unwind(AssertUnwindSafe(work));
+        file.check()?;
+        done.unwrap_or_else(|panic| resume_unwind(panic))
     }
 
     /// The meshes, by number.

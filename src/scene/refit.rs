@@ -60,8 +60,11 @@ impl Scene {
             rooms.push(tree.tree.room_to_refit()?);
         }
         if Arc::get_mut(scene).is_none() {
-            *scene = Arc::new(scene.copy()?);
+            let copy = scene.copy()?;
+            scene.check_file()?;
+            *scene = Arc::new(copy);
         }
+        scene.check_file()?;
         let device = scene.device.clone();
         let scene = Arc::get_mut(scene).expect("a new Arc, or the only one");
         for &(mesh, positions) in moved {
@@ -170,6 +173,7 @@ impl Scene {
             },
             // What a refit writes is in memory.
             parts: None,
+            file: None,
             uses: self.uses.clone(),
             stats: self.stats,
             _memory: memory,

@@ -735,14 +735,36 @@ fn bake(w: &W, s: &mut Source) {
     if params.target_error > 0.0 && params.target_error.is_finite() {
         params.target_error = params.target_error.max(10.0);
     }
-    // The one pointer among them.
+    // The two pointers among them.
     let checkpoint = path(w, s, "checkpoint");
+    let shares = c_text(&[format!("{}/shares-{}-", w.folder, s.below(2)), "/nonexistent/f".into()][s.below(8) / 7]);
     params.checkpoint = if s.one_in(4) { checkpoint.as_ptr() } else { null() };
+    params.shares = if s.one_in(3) { shares.as_ptr() } else { null() };
+    if !params.shares.is_null() && !s.one_in(4) {
+        // More take as long.
+        params.share_count = 1 + s.below(3) as u32;
+        params.target_error = 0.0;
+        bake_shares(&lightmap, &params, w, s);
+    }
     let mut stats = defaults!(bk_bake_stats, bk_bake_stats_init);
     let out = if s.one_in(2) { &raw mut stats } else { null_mut() };
     let watched = Watched::new(w, s);
     let result = ask!(bk_bake(lightmap.p(), &params, Some(progress), watched.user(), out));
     watched.end("bk_bake", result);
+}
+
+/// Shares for a bake to read: all, or some.
+fn bake_shares(lightmap: &Handle, params: &bk_bake_params, w: &W, s: &mut Source) {
+    for stage in [BK_SHARE_PHOTONS, BK_SHARE_RADIANCE] {
+        for share in 0..params.share_count {
+            let (stage, share) = if s.one_in(12) { (s.integer(), s.integer()) } else { (stage, share) };
+            let mut stats = defaults!(bk_bake_stats, bk_bake_stats_init);
+            let out = if s.one_in(2) { &raw mut stats } else { null_mut() };
+            let watched = Watched::new(w, s);
+            let result = ask!(bk_bake_share(lightmap.p(), params, stage, share, Some(progress), watched.user(), out));
+            watched.end("bk_bake_share", result);
+        }
+    }
 }
 
 /// A light map that follows a scene, live light that follows it, and what changed is baked.
@@ -1110,6 +1132,7 @@ fn null_handles(s: &mut Source) {
             failed(ask!(bk_lightmap_create(null(), null(), None, null_mut(), words.as_mut_ptr().cast())));
             failed(ask!(bk_bake(null_mut(), null(), None, null_mut(), null_mut())));
             failed(ask!(bk_bake_changed(null_mut(), null(), 0.0, None, null_mut(), null_mut())));
+            failed(ask!(bk_bake_share(null(), null(), 0, 0, None, null_mut(), null_mut())));
             failed(ask!(bk_lightmap_follow(null_mut(), null(), None, null_mut())));
             failed(ask!(bk_live_follow(null_mut(), null(), 0.0, None, null_mut())));
             failed(ask!(bk_lightmap_read(null(), 0, 0, 1, null_mut(), 0)));

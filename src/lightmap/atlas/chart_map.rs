@@ -11,7 +11,7 @@ use crate::scene::{NONE, Object, Scene};
 use crate::trace::offset::{Facet, SurfacePoint};
 use glam::Vec3;
 use std::marker::PhantomData;
-use std::ops::Index;
+use std::ops::{Index, Range};
 
 /// Layout and texels of map `M`: the light map, the gather map or the radiance map. Indexed by texels, it returns the
 /// sample of each.
@@ -77,6 +77,25 @@ impl<M: Map> ChartMap<M> {
     pub(crate) fn texels_of(&self, placement: PlacementId) -> TexelRange<M> {
         let r = self.texels.samples_of(placement);
         TexelId::range(r.start as usize..r.end as usize)
+    }
+
+    /// Returns a range of texels with those beside it, up to a number of rows away, of the placements that it cuts.
+    pub(crate) fn with_rows_around(&self, range: &Range<usize>, rows: i32) -> Range<usize> {
+        let placement = |i: usize| self.texels_of(self.texels.placement_of(i as u32)).indices();
+        // Texels of a placement are numbered row by row.
+        let row = |i: usize| self.position(TexelId::new(i)).1;
+        let Range { mut start, mut end } = *range;
+        if start < end {
+            let (first, last) = (placement(start).start, placement(end - 1).end);
+            let (lowest, highest) = (row(start) - rows, row(end - 1) + rows);
+            while start > first && row(start - 1) >= lowest {
+                start -= 1;
+            }
+            while end < last && row(end) <= highest {
+                end += 1;
+            }
+        }
+        start..end
     }
 
     /// Returns the texel at a column and row of a placement's page, if it is covered and lies in the placement's

@@ -120,7 +120,7 @@ impl Bake<'_, '_> {
                         }
                     });
                 }
-                if let Some(c) = self.checkpoint {
+                if let Some(c) = self.from.checkpoint {
                     c.keep_lit(block, direct, variances, state, directed);
                 }
                 rays.fetch_add(traced, Relaxed);

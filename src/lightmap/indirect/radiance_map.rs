@@ -14,11 +14,12 @@
 
 use super::bright_patches::Bright;
 use crate::base::error::Result;
-use crate::base::memory::try_vec;
+use crate::base::memory::{try_zeroed, try_zeroed_as_needed};
 use crate::base::parallel::{ParallelLoop, one_by_one};
 use crate::base::progress::Stage;
 use crate::base::sampling::{combine, sobol_2d};
 use crate::base::scratch::Scratch;
+use crate::base::share::Share;
 use crate::device::Device;
 use crate::lightmap::atlas::chart_map::ChartMap;
 use crate::lightmap::atlas::charts::Charts;
@@ -36,6 +37,7 @@ use crate::trace::{RawHit, Ray};
 use glam::{Mat2, Vec2, Vec3};
 use rayon::prelude::*;
 use std::f32::consts::PI;
+use std::ops::Range;
 use std::sync::atomic::{AtomicU64, Ordering::Relaxed};
 
 /// Number of texels that a thread processes at a time.
@@ -186,11 +188,36 @@ pub(crate) struct RadianceInput<'a> {
     pub quick: bool,
 }
 
-/// Computes `values`, one per texel of the map; returns the number of rays. Advances `stage` by two per texel.
+/// Texels whose work of [`bake`] is done for a range of them: those of the first look, with the neighbours, and the range.
+pub(crate) fn work(map: &ChartMap<RadianceMap>, range: &Range<usize>) -> u64 {
+    (looked_at(map, range).len() + range.len()) as u64
+}
+
+/// The texels that get a first look for a range of texels, in whole blocks.
+fn looked_at(map: &ChartMap<RadianceMap>, range: &Range<usize>) -> Range<usize> {
+    // The neighbours of a texel are those of its row and the two beside it.
+    let Range { start, end } = map.with_rows_around(range, 1);
+    start / BLOCK * BLOCK..end.next_multiple_of(BLOCK).min(map.len())
+}
+
+/// The range of a share of the texels of a map: whole blocks.
+pub(crate) fn share(map: &ChartMap<RadianceMap>, share: Share) -> Range<usize> {
+    let Range { start, end } = share.of(map.len().div_ceil(BLOCK));
+    start * BLOCK..(end * BLOCK).min(map.len())
+}
+
+/// Computes `values` of a range of texels of the map, which begins with a block; returns the number of rays. Advances
+/// `stage` by [`work`].
 ///
 /// Direct light is averaged over texels: first by a few points each, then by more if it varies between those points or
 /// those of neighbouring texels.
-pub(crate) fn bake(device: &Device, input: &RadianceInput, values: &mut [Vec3], stage: &Stage) -> Result<u64> {
+pub(crate) fn bake(
+    device: &Device,
+    input: &RadianceInput,
+    range: Range<usize>,
+    values: &mut [Vec3],
+    stage: &Stage,
+) -> Result<u64> {
     let rays = AtomicU64::new(0);
     if input.quick {
         device.install(|| bake_quickly(input, values, &rays, stage))?;
@@ -199,11 +226,14 @@ pub(crate) fn bake(device: &Device, input: &RadianceInput, values: &mut [Vec3], 
     let map = input.light.areas.map;
     let per_tile = texels_per_tile(input.light.samples);
     let (tiles, rooms) = (Scratch::new(), Scratch::new());
-    let mut looks: Vec<Look> = try_vec(values.len(), "direct light of the radiance map")?;
-    let _memory = device.memory().reserve(size_of_val(&looks[..]), "direct light of the radiance map")?;
+    let (what, needed) = ("direct light of the radiance map", looked_at(map, &range));
+    // Of memory for all texels, what no texel of a share needs is never touched.
+    let zeroed = if needed.len() == map.len() { try_zeroed } else { try_zeroed_as_needed };
+    let mut looks: Vec<Look> = zeroed(map.len(), what)?;
+    let _memory = device.memory().reserve(needed.len() * size_of::<Look>(), what)?;
     device.install(|| {
-        one_by_one(looks.par_chunks_mut(BLOCK).enumerate()).try_each(|(block, out)| {
-            let (mut traced, first) = (0, block * BLOCK);
+        one_by_one(looks[needed.clone()].par_chunks_mut(BLOCK).enumerate()).try_each(|(block, out)| {
+            let (mut traced, first) = (0, needed.start + block * BLOCK);
             let mut tile = tiles.take(|| TilePoints::new(TILE))?;
             for texels in in_order(map, first..first + out.len())?.chunks(per_tile) {
                 stage.check()?;
@@ -214,7 +244,7 @@ pub(crate) fn bake(device: &Device, input: &RadianceInput, values: &mut [Vec3], 
             stage.advance(out.len() as u64)
         })?;
         one_by_one(values.par_chunks_mut(BLOCK).enumerate()).try_each(|(block, out)| {
-            let (mut traced, first) = (0, block * BLOCK);
+            let (mut traced, first) = (0, range.start + block * BLOCK);
             let make = || Ok(RadianceTile { points: TilePoints::new(TILE)?, discs: Discs::new(TILE)? });
             let mut room = rooms.take(make)?;
             for texels in in_order(map, first..first + out.len())?.chunks(per_tile) {

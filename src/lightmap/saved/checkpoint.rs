@@ -18,12 +18,13 @@ use super::{damaged, foreign, unreadable};
 use crate::base::directional::Directional;
 use crate::base::error::{Error, Result, invalid_argument};
 use crate::base::memory::{try_collect, try_vec};
-use crate::device::{Device, LogLevel};
+use crate::device::LogLevel;
 use crate::lightmap::TexelState;
 use crate::lightmap::atlas::Atlas;
 use crate::lightmap::indirect::find_bright_patches::{self, MAX_SHADOW_RAYS};
 use crate::lightmap::indirect::radiance_map::Radiance;
 use crate::lightmap::indirect::upsample::{OwnDirectional, OwnLight};
+use crate::scene::Scene;
 use glam::Vec3;
 use std::collections::HashMap;
 use std::fs::{File, OpenOptions, TryLockError};
@@ -78,7 +79,7 @@ impl CheckpointParams {
 
 /// The checkpoint of a bake in progress. Used from all threads.
 pub(crate) struct Checkpoint<'a> {
-    device: &'a Device,
+    scene: &'a Scene,
     path: PathBuf,
     interval: Duration,
     file: Mutex<Output<File>>,
@@ -185,7 +186,7 @@ impl<'a> Checkpoint<'a> {
         let mut output = Output::new(file, whole);
         output.cut().map_err(fail)?;
         Ok(Checkpoint {
-            device: atlas.scene.device(),
+            scene: &atlas.scene,
             path: path.clone(),
             interval: Duration::from_secs_f64(params.seconds),
             file: Mutex::new(output),
@@ -429,6 +430,11 @@ impl<'a> Checkpoint<'a> {
         if bytes.is_empty() {
             return;
         }
+        // What was computed from a changed file must not be kept.
+        if let Err(e) = self.scene.check_file() {
+            self.warn(&e);
+            return;
+        }
         let mut output = lock(&self.file);
         let had_failed = output.failed;
         if let Err(e) = output.append(bytes) {
@@ -444,7 +450,7 @@ impl<'a> Checkpoint<'a> {
     /// Logs that the checkpoint could not be written; the bake goes on.
     fn warn(&self, e: &dyn std::fmt::Display) {
         let message = format!("cannot write the checkpoint {}: {e}; the bake continues without", self.path.display());
-        self.device.log(LogLevel::Warning, &message);
+        self.scene.device().log(LogLevel::Warning, &message);
     }
 }
 

@@ -1,5 +1,5 @@
 //! Baked light on disk: results, which can be loaded into a light map and may be parts of a bake that several machines
-//! share, and checkpoints, from which a bake continues after its process has ended. And layouts, from which a light map
+//! share, the photons and radiance that all parts of it need, and checkpoints, from which a bake continues after its process has ended. And layouts, from which a light map
 //! is made without unwrapping anew.
 //!
 //! | file | what it does |
@@ -8,6 +8,7 @@
 //! | `fingerprint` | what a file must agree with: scene, lights, layout, parameters |
 //! | `layout` | charts and texels of a light map |
 //! | `result` | saving and loading the light of a light map |
+//! | `share` | photons and the radiance map, of which each of several machines computes a part |
 //! | `checkpoint` | the progress of a bake: written as it goes on, read when it starts again |
 
 pub(crate) mod checkpoint;
@@ -15,6 +16,7 @@ pub(crate) mod fingerprint;
 mod layout;
 mod records;
 mod result;
+pub(crate) mod share;
 
 pub use checkpoint::CheckpointParams;
 

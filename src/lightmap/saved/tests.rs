@@ -16,7 +16,7 @@ use std::path::{Path, PathBuf};
 use std::sync::atomic::{AtomicU32, Ordering::Relaxed};
 
 /// A file of its own, deleted in the end.
-struct Place(PathBuf);
+pub(super) struct Place(PathBuf);
 
 impl Place {
     fn new() -> Place {
@@ -27,6 +27,10 @@ impl Place {
 
     fn bytes(&self) -> Vec<u8> {
         std::fs::read(&self.0).unwrap()
+    }
+
+    pub(super) fn path(&self) -> &Path {
+        &self.0
     }
 
     fn of(bytes: &[u8]) -> Place {
@@ -42,7 +46,7 @@ impl Drop for Place {
     }
 }
 
-fn lightmap_with(threads: usize, texels_per_unit: f32) -> Lightmap {
+pub(super) fn lightmap_with(threads: usize, texels_per_unit: f32) -> Lightmap {
     lightmap_on(DeviceOptions { num_threads: threads, ..Default::default() }, texels_per_unit)
 }
 
@@ -55,7 +59,7 @@ fn lightmap_on(device: DeviceOptions, texels_per_unit: f32) -> Lightmap {
     Lightmap::create(&scene, &desc, &Progress::none()).unwrap()
 }
 
-fn lamp(intensity: f32) -> Light {
+pub(super) fn lamp(intensity: f32) -> Light {
     Light::Point { position: glam::Vec3::new(0.3, 0.3, 0.3), intensity: [intensity; 3] }
 }
 
@@ -75,7 +79,7 @@ fn bake(threads: usize, params: &BakeParams) -> Lightmap {
 }
 
 /// All that a light map shows.
-fn bits(map: &Lightmap) -> Vec<u32> {
+pub(super) fn bits(map: &Lightmap) -> Vec<u32> {
     let mut all = Vec::new();
     for page in 0..map.info().page_count {
         for layer in [Layer::Combined, Layer::Indirect, Layer::Direct, Layer::Radiance, Layer::Validity, Layer::Normal]
@@ -92,7 +96,7 @@ fn bits(map: &Lightmap) -> Vec<u32> {
 
 /// Says how many numbers differ, not which.
 #[track_caller]
-fn assert_same(a: &Lightmap, b: &Lightmap, what: &str) {
+pub(super) fn assert_same(a: &Lightmap, b: &Lightmap, what: &str) {
     let (a, b) = (bits(a), bits(b));
     let different: Vec<usize> = (0..a.len().max(b.len())).filter(|&i| a.get(i) != b.get(i)).collect();
     assert!(different.is_empty(), "{what}: {} of {} differ, first {}", different.len(), b.len(), different[0]);
@@ -369,7 +373,7 @@ fn a_foreign_or_used_checkpoint_is_refused_and_kept() {
 }
 
 /// A file with changed content and right checksums.
-fn with_records(bytes: &[u8], mut change: impl FnMut(&[u8; 4], &mut [u8])) -> Place {
+pub(super) fn with_records(bytes: &[u8], mut change: impl FnMut(&[u8; 4], &mut [u8])) -> Place {
     let mut file = records::MAGIC.to_vec();
     let mut from = Records::new(&bytes[file.len()..], bytes.len() as u64);
     while let Next::Record(tag, mut content) = from.next().unwrap() {

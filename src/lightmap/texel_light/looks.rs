@@ -7,6 +7,7 @@ use crate::direct::direct_light::{Lights, PointLight};
 use crate::lightmap::atlas::ids::{PerTexel, RadianceMap, RadianceTexel};
 use crate::lightmap::atlas::texels::TexelSample;
 use crate::lightmap::tiles::TILE;
+use bytemuck::Zeroable;
 use glam::Vec3;
 use std::ops::Range;
 
@@ -20,7 +21,7 @@ const MANY: u32 = 64;
 const SPIKE: f32 = 3.0;
 
 /// Result of the first look at a texel of the radiance map.
-#[derive(Clone, Copy, Debug, Default)]
+#[derive(Clone, Copy, Debug, Default, Zeroable)]
 pub(crate) struct Look {
     pub irradiance: Vec3,
     /// Light of sources with narrow penumbrae or none.

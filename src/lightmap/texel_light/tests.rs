@@ -148,7 +148,8 @@ fn the_radiance_map_has_the_energy_of_a_patch_of_sun_smaller_than_its_texels() {
         let mut values = vec![Vec3::ZERO; atlas.radiance.len()];
         let progress = Progress::none();
         let stage = progress.stage("radiance", 0.0, 1.0, 1);
-        crate::lightmap::indirect::radiance_map::bake(scene.device(), &input, &mut values, &stage).unwrap();
+        crate::lightmap::indirect::radiance_map::bake(scene.device(), &input, 0..values.len(), &mut values, &stage)
+            .unwrap();
         // Texels are 0.4 wide, and 10 of them have the floor's width. Per metre of the slit:
         let on_floor = |s: &usize| atlas.radiance.texels.samples[*s].position(&scene).z.abs() < 0.5;
         let sum: f32 = (0..values.len()).filter(on_floor).map(|s| values[s].x * 0.16).sum();

@@ -10,6 +10,7 @@ use crate::base::files;
 use crate::base::geometry::NONE;
 use crate::base::memory::{Reservation, prefer_large_pages, try_collect, try_to_vec, try_with_capacity};
 use crate::base::progress::Progress;
+use crate::base::watched_file::WatchedFile;
 use crate::bvh::instances::MeshTree;
 use crate::bvh::{BuildOptions, Compact, Mbvh, Tree};
 use crate::device::Device;
@@ -89,7 +90,8 @@ fn damaged(path: &Path, what: &str) -> Error {
 struct File {
     map: Arc<Mapping>,
     table: Vec<Entry>,
-    is_mapped: bool,
+    /// The file, if it is mapped.
+    mapped: Option<WatchedFile>,
     memory: Reservation,
 }
 
@@ -107,6 +109,12 @@ impl File {
             return Err(another_kind());
         }
         let bytes = usize::try_from(size).map_err(|_| damaged(path, "it is too large"))?;
+        // (As it is before it is checked.)
+        let watched = if options.map {
+            Some(file.try_clone().and_then(|f| WatchedFile::new(f, path)).map_err(fail)?)
+        } else {
+            None
+        };
         let memory = device.memory().reserve(if options.map { 0 } else { bytes }, FILE)?;
         let map = if options.map {
             // SAFETY: what `OpenOptions::map` asks of the caller. (Writes to a private map stay in memory.)
@@ -154,7 +162,7 @@ impl File {
         if options.map {
             let _ = map.advise(memmap2::Advice::Random);
         }
-        Ok(File { map: Arc::new(Mapping::new(map)), table, is_mapped: options.map, memory })
+        Ok(File { map: Arc::new(Mapping::new(map)), table, mapped: watched, memory })
     }
 
     /// Returns all elements of a section, which may be asked for once.
@@ -230,9 +238,11 @@ impl File {
         parts.stats.build_seconds = start.elapsed().as_secs_f64();
         let mut scene = parts.into_scene(device.clone(), data);
         let is_in_place = |e: &&Entry| IN_PLACE.iter().any(|&kind| kind as u32 == e.kind);
-        if self.is_mapped {
+        if self.mapped.is_some() {
             scene.stats.mapped_bytes = self.table.iter().filter(is_in_place).map(|e| e.bytes).sum();
         }
+        scene.file = self.mapped.take();
+        scene.check_file()?;
         Ok(scene)
     }
 

@@ -15,11 +15,14 @@ impl Scene {
     /// Writes the scene to a file, which is replaced as a whole, for [`open`](Scene::open): meshes, instances, materials,
     /// textures, environments, the lights as they are now, and the trees, refits included.
     pub fn save(&self, path: &Path, progress: &Progress) -> Result<()> {
+        self.check_file()?;
         let write = || {
             let stage = progress.stage("saving", 0.0, 1.0, self.stats.bytes);
             files::prepare(path, |file| Writer { file, stage, at: 0, table: Vec::new() }.scene(self))
         };
-        self.device.run(progress, write)?.finish()
+        let new = self.device.run(progress, write)?;
+        self.check_file()?;
+        new.finish()
     }
 }
 
