@@ -20,7 +20,7 @@ use rayon::prelude::*;
 use std::sync::atomic::{AtomicU64, Ordering::Relaxed};
 
 /// Limit of the radiance that gather rays see, as a multiple of its mean.
-const LIMIT: f32 = 2.0;
+const LIMIT: f32 = 4.0;
 
 /// Bright patches are not tried unless the limit reduces the mean square of the radiance that gather rays see below
 /// this fraction.
