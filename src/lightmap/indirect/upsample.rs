@@ -4,7 +4,7 @@
 //! A texel of the light map interpolates between those of the surrounding gather texels that are in the same class,
 //! inside or outside a [narrow gap](super::narrow_gaps), and are not behind a [wall or
 //! crease](super::upsample_visibility); if there are none, the class does not matter, and if all are behind walls or
-//! creases, these do not matter either. The more the surface bends towards one of them, the less it counts. A texel that is not in a known narrow gap and has no valid gather texel around
+//! creases, these do not matter either. A texel that is not in a known narrow gap and has no valid gather texel around
 //! it outside gaps, as on a narrow face of a moulding, gets a fallback gather: it traces a few rays itself, and the
 //! result is averaged with those of such texels nearby, as far as they do not differ by more than noise. So does a texel
 //! where interpolation is [estimated](super::interpolation_error) to be wrong, as in corners and under arches: the
@@ -14,7 +14,7 @@
 
 use super::blur::{Noisy, Window};
 use super::gather::{Gathered, Tile, TileTexel};
-use super::interpolation_error::{Surroundings, likeness, surroundings};
+use super::interpolation_error::{Surroundings, surroundings};
 use super::narrow_gaps::are_in_gaps;
 use super::near_hits::HitRadiance;
 use super::sample_set::SampleSet;
@@ -23,7 +23,7 @@ use super::upsample_visibility::{self, LastNormal, TEXELS_PER_CHECK};
 use crate::base::directional::{Directional, Linear};
 use crate::base::error::Result;
 use crate::base::memory::{
-    Reservation, try_append, try_collect, try_filled, try_par_gather, try_push, try_vec, try_with_capacity, try_zeroed,
+    Reservation, try_append, try_collect, try_filled, try_par_gather, try_push, try_vec, try_with_capacity,
 };
 use crate::base::parallel::{ParallelLoop, one_by_one};
 use crate::base::progress::Stage;
@@ -65,9 +65,6 @@ const STRATIFIED: f32 = 0.35;
 const NEAR: i32 = 2;
 const FEW: usize = 12;
 
-/// Cosine of the angle between normals below which a surface bends.
-const BENT: f32 = 0.9999;
-
 /// Interpolation constraints of the light map's texels. They depend on the scene and the sides that are shown, not on
 /// light.
 #[derive(Default)]
@@ -82,9 +79,6 @@ pub(crate) struct Upsampling {
     /// Pairs of a texel of the light map and one of the gather map that a wall or a crease separates, in ascending
     /// order; never all gather texels around a texel.
     walls: Vec<(LightTexel, GatherTexel)>,
-    /// Shading normal of each gather texel, by which it is weighted; zero in placements that do not bend. Empty if none
-    /// does.
-    normals: Vec<Vec3>,
     is_alone: TexelSet<LightMap>,
     /// Texels of the light map with a fallback gather, in ascending order.
     alone: Vec<LightTexel>,
@@ -156,12 +150,6 @@ impl Upsampling {
         let map_gaps = TexelSet::new(found.iter().flat_map(|f| &f.map_gaps), atlas.map.len(), SHOWN)?;
         let walls = try_collect(found.iter().flat_map(|f| &f.walls).copied(), SHOWN)?;
         let walled = TexelSet::new(walls.iter().map(|(texel, _)| texel), atlas.map.len(), SHOWN)?;
-        let bends = found.iter().any(|f| !f.normals.is_empty());
-        let mut normals: Vec<Vec3> = try_zeroed(if bends { atlas.gather.len() } else { 0 }, SHOWN)?;
-        for (placement, of_placement) in (first..).zip(&found).filter(|(_, f)| !f.normals.is_empty()) {
-            normals[atlas.gather.texels_of(PlacementId::new(placement)).indices()]
-                .copy_from_slice(&of_placement.normals);
-        }
         stage.check()?;
         let alone = try_collect(found.iter().flat_map(|f| &f.alone).copied(), SHOWN)?;
         let is_alone = TexelSet::new(alone.iter(), atlas.map.len(), SHOWN)?;
@@ -170,10 +158,8 @@ impl Upsampling {
         let bits: usize = [&map_gaps, &walled, &is_alone, &is_lone].into_iter().map(TexelSet::bytes).sum();
         let own = alone.len() * size_of::<Option<Vec3>>();
         let bytes = gather_gaps.bytes() + bits + size_of_val(&walls[..]) + size_of_val(&alone[..]) + own;
-        let bytes = bytes + size_of_val(&normals[..]);
         let memory = device.memory().reserve(bytes, SHOWN)?;
-        let _memory = Some(memory);
-        Ok(Upsampling { gather_gaps, map_gaps, walled, walls, normals, is_alone, alone, is_lone, rays, _memory })
+        Ok(Upsampling { gather_gaps, map_gaps, walled, walls, is_alone, alone, is_lone, rays, _memory: Some(memory) })
     }
 
     /// Traces the fallback gathers. Returns their light, that by direction, and the number of rays. Advances `stage` by
@@ -254,13 +240,11 @@ impl Upsampling {
             atlas.gather_around(texel, |s, w| all += values[s] * w);
             return all;
         }
-        let normal = self.normal_to_weigh_by(atlas, texel);
         // Sums over gather texels that are joined and alike, and over those that are joined, which serve if there are
         // none of the first kind.
-        let mut sums = [(T::default(), 0.0, normal.is_none()); 2];
+        let mut sums = [(T::default(), 0.0, true); 2];
         atlas.gather_around(texel, |s, w| {
             all += values[s] * w;
-            let w = normal.map_or(w, |normal| w * likeness(normal, self.normals[s.index()]));
             let is_joined = !self.are_apart(texel, s);
             for ((sum, part, is_all), counts) in sums.iter_mut().zip([is_joined && self.are_alike(texel, s), is_joined])
             {
@@ -280,18 +264,6 @@ impl Upsampling {
         }
     }
 
-    /// Returns the shading normal of a texel of the light map whose placement bends.
-    #[inline]
-    fn normal_to_weigh_by(&self, atlas: &Atlas, texel: LightTexel) -> Option<Vec3> {
-        if self.normals.is_empty() {
-            return None;
-        }
-        let placement = atlas.map.placement_of(&atlas.charts, texel);
-        let first = atlas.gather.texels_of(placement).indices().start;
-        let bends = self.normals.get(first).is_some_and(|&normal| normal != Vec3::ZERO);
-        bends.then(|| atlas.map[texel].shading_normal(&atlas.scene))
-    }
-
     /// Whether a texel of the light map and one of the gather map both lie in narrow gaps, or neither does.
     #[inline]
     fn are_alike(&self, map: LightTexel, gather: GatherTexel) -> bool {
@@ -306,7 +278,7 @@ impl Upsampling {
     /// Whether there are no constraints other than fallback gathers.
     #[inline]
     pub(in crate::lightmap) fn is_plain(&self) -> bool {
-        self.gather_gaps.is_empty() && self.walls.is_empty() && self.normals.is_empty()
+        self.gather_gaps.is_empty() && self.walls.is_empty()
     }
 
     /// Returns the mean `value` of fallback gather `i` and those around it in the same chart that are like it.
@@ -397,8 +369,6 @@ struct Found {
     gather_gaps: Vec<GatherTexel>,
     map_gaps: Vec<LightTexel>,
     walls: Vec<(LightTexel, GatherTexel)>,
-    /// Shading normals of the gather texels if the placement bends.
-    normals: Vec<Vec3>,
     alone: Vec<LightTexel>,
     lone: Vec<LightTexel>,
     rays: u64,
@@ -437,7 +407,6 @@ impl Found {
         let mut normals = LastNormal::default();
         // Texels that may lie in narrow gaps, and those that gather for themselves unless they do.
         let (mut maybe_in_gaps, mut maybe_alone) = (Vec::new(), Vec::new());
-        let mut bends = false;
         for (i, texel) in map.texels_of(placement).enumerate() {
             if i % TEXELS_PER_CHECK == 0 {
                 stage.check()?;
@@ -453,20 +422,17 @@ impl Found {
                 true => normals.of(&atlas.scene, sample.triangle, || sample.shading_normal(&atlas.scene)),
                 false => Vec3::ZERO,
             };
-            let (mut n, mut has_gap, mut sees_open, mut error, mut part) = (0, false, false, 0.0, 0.0);
+            let (mut n, mut has_gap, mut sees_open, mut error) = (0, false, false, 0.0);
             atlas.gather_around(texel, |s, w| {
                 let around = &around[of_gather.place(s)];
                 n += 1;
                 has_gap |= around.is_gap;
                 sees_open |= !around.is_gap && !apart.contains(&(texel, s));
                 if refines {
-                    bends |= normal.dot(around.normal) < BENT;
-                    let w = w * likeness(normal, around.normal);
                     error += w * around.error_at(normal);
-                    part += w;
                 }
             });
-            let is_wrong = error > most_error * part;
+            let is_wrong = error > most_error;
             if has_gap && !is_wrong {
                 try_push(&mut maybe_in_gaps, texel, SHOWN)?;
             }
@@ -488,9 +454,6 @@ impl Found {
                 square.filter_map(|(x, y)| map.at(placement, x, y)).filter(|n| maybe_alone.binary_search(n).is_ok());
             beside.take(FEW + 1).count() <= FEW
         };
-        if bends {
-            found.normals = try_collect(around.iter().map(|around| around.normal), SHOWN)?;
-        }
         found.lone = try_collect(maybe_alone.iter().copied().filter(|&texel| is_lone(texel)), SHOWN)?;
         found.alone = maybe_alone;
         Ok(found)
@@ -715,32 +678,6 @@ pub(super) mod tests {
         assert_eq!(rays, u64::from(OWN_RAYS) * own.len() as u64);
     }
 
-    /// A sheet with a fold of 34 degrees, less than a crease has.
-    #[test]
-    fn light_hardly_goes_around_folds() {
-        let (sin, cos) = 34.0f32.to_radians().sin_cos();
-        let lightmap = folded(&[&[[-2.0, 0.0], [0.013, 0.0], [0.013 + cos, sin]]]);
-        let atlas = lightmap.atlas();
-        let progress = Progress::none();
-        let stage = progress.stage("upsampling", 0.0, 1.0, 1);
-        let upsampling = Upsampling::find(atlas, 0..1, &[], 1e9, None, &stage).unwrap();
-        let is_level = |normal: Vec3| normal.z.abs() > 0.99;
-        let light = |s: GatherTexel| Vec3::splat(is_level(atlas.gather.surface(&atlas.scene, s).1) as u32 as f32);
-        let values: Vec<Vec3> = atlas.gather.all().map(light).collect();
-        let mut compared = 0;
-        for s in atlas.map.texels_of(PlacementId::new(0)) {
-            let mut sides = [false; 2];
-            atlas.gather_around(s, |g, w| sides[usize::from(values[g.index()] == Vec3::ZERO)] |= w > 0.1);
-            if sides == [true; 2] && !upsampling.is_alone.has(s) {
-                let shown = upsampling.at(atlas, PerTexel::new(&values), &dark(&upsampling), s).x;
-                let own = is_level(atlas.map.surface(&atlas.scene, s).1) as u32 as f32;
-                assert!((shown - own).abs() < 0.35, "{shown} instead of {own}");
-                compared += 1;
-            }
-        }
-        assert!(compared > 500, "{compared} texels beside the fold");
-    }
-
     /// Faces of two charts beside each other in the page: shards bake one without the other.
     #[test]
     fn what_texels_gather_is_blurred_within_their_chart() {
@@ -781,7 +718,7 @@ pub(super) mod tests {
         let (near, far) = (part(0, &|p| is_between(p, 0.42, 0.48)), part(0, &|p| is_between(p, -1.3, -0.8)));
         let bent = part(1, &|_| true);
         assert!(
-            near > 0.95 && far < 0.05 && bent > 0.3,
+            near > 0.95 && far < 0.05 && bent > 0.5,
             "{near} near, {far} far from the wall, {bent} of what is bent"
         );
     }
