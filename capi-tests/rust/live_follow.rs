@@ -75,7 +75,7 @@ fn params(mode: Mode) -> LiveParams {
 fn camera(i: u32) -> LiveCamera {
     let angle = i as f32 * 0.7;
     LiveCamera {
-        position: Vec3::new(if i % 2 == 0 { 2.0 } else { 6.0 }, 2.0, 1.5),
+        position: Vec3::new(if i.is_multiple_of(2) { 2.0 } else { 6.0 }, 2.0, 1.5),
         forward: Vec3::new(angle.cos(), angle.sin(), 0.9 * (0.37 * angle).sin()),
         up: Vec3::Z,
         fov_y: 1.5,
