@@ -7,6 +7,7 @@
 
 #include <math.h>
 #include <stdlib.h>
+#include <time.h>
 
 /* A room of 6 x 6 x 3 with a lamp, and a block that stands on its floor. Boxes of 8 vertices. */
 static void box(const float lower[3], const float upper[3], float out[8][3]) {
@@ -65,7 +66,7 @@ static void move_block(bk_scene *scene, float x) {
     CHECK_OK(bk_scene_refit(scene));
 }
 
-/* Updates until all that is seen from above is finished. */
+/* Updates until all is finished. */
 static void finish(bk_live *live) {
     bk_camera camera;
     bk_budget budget;
@@ -75,8 +76,13 @@ static void finish(bk_live *live) {
     bk_budget_init(&budget);
     bk_live_stats_init(&stats);
     budget.milliseconds = 100;
-    for (i = 0; i < 2000 && (i == 0 || stats.finished < 1 || stats.light_pending); i++) {
+    for (i = 0; i < 20000 && (i == 0 || stats.finished < 1 || stats.light_pending); i++) {
         CHECK_OK(bk_live_update(live, &camera, &budget, &stats));
+        if (stats.milliseconds < 5) {
+            /* Photons are on their way, on a thread that waits during updates. */
+            const struct timespec pause = {0, 5000000};
+            nanosleep(&pause, NULL);
+        }
     }
     CHECK(stats.finished == 1 && !stats.light_pending);
 }
