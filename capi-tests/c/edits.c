@@ -3,6 +3,7 @@
  *
  *     edits
  */
+#define _POSIX_C_SOURCE 200809L /* nanosleep */
 #include "check.h"
 
 #include <math.h>
