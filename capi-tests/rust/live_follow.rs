@@ -120,8 +120,18 @@ fn baked(lightmap: &mut Lightmap, live: &Live, layer: Layer) -> (Vec<[f32; 3]>, 
     (light, valid)
 }
 
-fn difference(a: [f32; 3], b: [f32; 3]) -> f32 {
-    (0..3).map(|k| (a[k] - b[k]).abs()).sum()
+/// Greatest difference from the right light, as a fraction of its mean over the texels that can be seen.
+fn worst(light: &[[f32; 3]], right: &[[f32; 3]], valid: &[bool]) -> f32 {
+    let difference = |a: [f32; 3], b: [f32; 3]| (0..3).map(|k| (a[k] - b[k]).abs()).sum::<f32>();
+    let seen = || (0..right.len()).filter(|&i| valid[i]);
+    let mean = seen().map(|i| difference(right[i], [0.0; 3])).sum::<f32>() / seen().count() as f32;
+    seen().map(|i| difference(light[i], right[i])).fold(0.0, f32::max) / mean
+}
+
+/// Direct light of points has no noise. What is kept of indirect light differs by `keep_error` at the few texels that are
+/// probed; others of their blocks may differ by somewhat more.
+fn most_error(layer: Layer, keep_error: f32) -> f32 {
+    if layer == Layer::Direct { 0.0 } else { 1.5 * keep_error }
 }
 
 #[test]
@@ -153,11 +163,9 @@ fn blocks_keep_their_rays_or_gather_the_light_of_the_moved_scene() {
         for (layer, old) in [Layer::Direct, Layer::Indirect].into_iter().zip(old) {
             let shown = pages(&live, &lightmap, layer);
             let (right, valid) = baked(&mut lightmap, &live, layer);
-            let all: Vec<usize> = (0..right.len()).filter(|&i| valid[i]).collect();
-            let mean = all.iter().map(|&i| difference(right[i], [0.0; 3])).sum::<f32>() / all.len() as f32;
-            let worst = |of: &[[f32; 3]]| all.iter().map(|&i| difference(of[i], right[i])).fold(0.0, f32::max) / mean;
-            let (shown, old) = (worst(&shown), worst(&old));
-            assert!(shown < 0.15 && old > 0.25, "{mode:?}, {layer:?}: wrong by {shown} of the mean, before by {old}");
+            let [shown, old] = [&shown, &old].map(|light| worst(light, &right, &valid));
+            let most = most_error(layer, 0.05);
+            assert!(shown <= most && old > 0.25, "{mode:?}, {layer:?}: wrong by {shown} of the mean, before by {old}");
         }
     }
 }
@@ -226,10 +234,8 @@ fn moves_on_the_way_end_with_the_light_of_the_last() {
         for layer in [Layer::Direct, Layer::Indirect] {
             let shown = pages(&live, &lightmap, layer);
             let (right, valid) = baked(&mut lightmap, &live, layer);
-            let all: Vec<usize> = (0..right.len()).filter(|&i| valid[i]).collect();
-            let mean = all.iter().map(|&i| difference(right[i], [0.0; 3])).sum::<f32>() / all.len() as f32;
-            let worst = all.iter().map(|&i| difference(shown[i], right[i])).fold(0.0, f32::max) / mean;
-            assert!(worst < 0.25, "{mode:?}, {layer:?}: wrong by {worst} of the mean");
+            let worst = worst(&shown, &right, &valid);
+            assert!(worst <= most_error(layer, 0.03), "{mode:?}, {layer:?}: wrong by {worst} of the mean");
         }
     }
 }

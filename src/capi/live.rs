@@ -703,8 +703,8 @@ pub unsafe extern "C" fn bk_live_light_changed(live: *mut bk_live, light: u32) -
 ///
 /// @param live  live object
 /// @param lightmap  the light map from which it was created, after bk_lightmap_follow
-/// @param keep_error  relative difference of indirect light that is let stand, finite and >= 0, as
-///   in bk_bake_changed: 0.03 is a good value, 0 computes all anew that differs at all
+/// @param keep_error  change of light below which blocks keep it, as a fraction of their light or, if
+///   that is more, of a tenth of the mean light; finite, >= 0. 0.03 is hard to see
 /// @param progress,user  progress callback and its pointer; may be NULL
 /// @retval BK_ERROR_INVALID_ARGUMENT  the live object was created from another light map, or
 ///   `keep_error` is out of its range

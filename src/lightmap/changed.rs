@@ -27,7 +27,7 @@ use crate::base::memory::{Reservation, try_filled, try_push, try_vec};
 use crate::base::parallel::ParallelLoop;
 use crate::base::progress::Progress;
 use crate::direct::DirectLight;
-use comparison::{CELL, CHANGED, Cell, Comparison, Side};
+use comparison::{CELL, CHANGED, Cell, Comparison, SceneState};
 use rayon::prelude::*;
 use std::sync::OnceLock;
 
@@ -161,24 +161,25 @@ impl Redo {
         (radiance, backs): (&Radiance, &[bool]),
         progress: &Progress,
     ) -> Result<Redo> {
-        let sides = [Side { atlas: before.atlas, backs: &before.light.backs }, Side { atlas, backs }];
-        let comparison = Comparison::new(sides, &before.moved, before.keep_error, progress)?;
-        let mut states = comparison.cells()?;
+        let old = SceneState { atlas: before.atlas, backs: &before.light.backs };
+        let states = [old, SceneState { atlas, backs }];
+        let comparison = Comparison::new(states, &before.moved, before.keep_error, progress)?;
+        let mut cells = comparison.cells()?;
         let mut rays = 0;
         if !plan.runs(left_out::INDIRECT) {
-            states.iter_mut().for_each(|cell| cell.is_new = true);
+            cells.iter_mut().for_each(|cell| cell.is_new = true);
         } else {
             let light = |texel: usize| (before.light.direct[texel] + before.light.indirect[texel]).element_sum();
             let texels = before.light.direct.len();
             let mean = ((0..texels).map(|i| f64::from(light(i))).sum::<f64>() / texels.max(1) as f64) as f32;
             let radiance = [&before.light.radiance, radiance];
-            rays = comparison.probe(&mut states, radiance, params, |texel| light(texel.index()), mean)?;
+            rays = comparison.probe(&mut cells, radiance, params, |texel| light(texel.index()), mean)?;
         }
         let all_direct = before.has_other_lights || before.moved.emits || !plan.runs(left_out::DIRECT);
         // Light by direction is the sum of both kinds, and the spread of passes is of that: both are made anew together.
         if params.directional != 0 || params.passes > 1 {
-            states.iter_mut().for_each(|cell| cell.is_new |= all_direct || cell.is_shadowed);
-            states.iter_mut().for_each(|cell| cell.is_shadowed &= !cell.is_new);
+            cells.iter_mut().for_each(|cell| cell.is_new |= all_direct || cell.is_shadowed);
+            cells.iter_mut().for_each(|cell| cell.is_shadowed &= !cell.is_new);
         }
         let n = atlas.map.len();
         let placements = atlas.gather.layout.placements.len();
@@ -212,7 +213,7 @@ impl Redo {
             try_push(&mut parts, part, CHANGED)?;
         }
         let job = Job { before, atlas, params, comparison };
-        parts.into_par_iter().try_each(|part| job.mark(part, &states, all_direct))?;
+        parts.into_par_iter().try_each(|part| job.mark(part, &cells, all_direct))?;
         Ok(redo)
     }
 }
@@ -238,11 +239,11 @@ struct Job<'a, 'p> {
 impl Job<'_, '_> {
     /// Marks the texels of a placement.
     fn mark(&self, part: Part, cells: &[Cell], all_direct: bool) -> Result<()> {
-        let Comparison { cells: places, progress, .. } = &self.comparison;
+        let Comparison { grid, progress, .. } = &self.comparison;
         progress.check()?;
         let (atlas, placement) = (self.atlas, part.placement);
-        let cells = &cells[places.first(placement)..];
-        let columns = places.columns(placement);
+        let cells = &cells[grid.first(placement)..];
+        let columns = grid.columns(placement);
         let is_new = |x: u32, y: u32| cells[(y / CELL * columns + x / CELL) as usize].is_new;
         // Blurred light reads texels so far away, and interpolation those beside them.
         let margin = self.params.blur_radius.max(1) + 1;
@@ -254,10 +255,10 @@ impl Job<'_, '_> {
             // The margin may be wider than a cell.
             (y0 / CELL..=y1 / CELL).any(|cy| (x0 / CELL..=x1 / CELL).any(|cx| is_new(cx * CELL, cy * CELL)))
         };
-        let mut cuts: Vec<Option<Vec<(u32, u32)>>> = try_filled(places.count(placement), None, CHANGED)?;
+        let mut cuts: Vec<Option<Vec<(u32, u32)>>> = try_filled(grid.count(placement), None, CHANGED)?;
         for (i, texel) in atlas.map.texels_of(placement).enumerate() {
-            let place = places.place(placement, texel);
-            let number = places.of(placement, texel);
+            let place = grid.place(placement, texel);
+            let number = grid.of(placement, texel);
             let cell = &cells[number];
             part.indirect[i] = cell.is_new;
             part.around[i] = is_needed(place);

@@ -324,8 +324,8 @@ pub(super) struct BlockMap {
 }
 
 impl BlockMap {
-    /// Cuts the charts of an atlas into blocks. `lods`: 1 to [`MAX_LODS`]; `share`: the part of the progress that this is.
-    pub fn new(atlas: &Arc<Atlas>, lods: u32, share: f32, progress: &Progress) -> Result<BlockMap> {
+    /// Cuts the charts of an atlas into blocks. `lods`: 1 to [`MAX_LODS`]; `end`: the progress when it is done.
+    pub fn new(atlas: &Arc<Atlas>, lods: u32, end: f32, progress: &Progress) -> Result<BlockMap> {
         let top = (lods - 1) as u8;
         // The light map has as many placements, of the same sides of the same charts.
         let placements = &atlas.gather.layout.placements;
@@ -343,7 +343,7 @@ impl BlockMap {
         let count = placements.iter().map(tiles).sum();
         map.tiles = try_with_capacity(count, STATE)?;
         let mut texels = Vec::with_capacity(BLOCK_TEXELS);
-        let stage = progress.stage("blocks", 0.0, share, count as u64);
+        let stage = progress.stage("blocks", 0.0, end, count as u64);
         for (number, p) in placements.iter().enumerate() {
             map.first.push(map.tiles.len() as u32);
             let (x, y, w, h) = (p.x as i32, p.y as i32, p.w as i32, p.h as i32);

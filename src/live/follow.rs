@@ -17,7 +17,7 @@ use crate::base::memory::{Reservation, try_collect, try_filled};
 use crate::base::progress::Progress;
 use crate::direct::DirectLight;
 use crate::lightmap::atlas::Atlas;
-use crate::lightmap::changed::comparison::{Comparison, Side};
+use crate::lightmap::changed::comparison::{Comparison, SceneState};
 use crate::lightmap::indirect::radiance_map::Radiance;
 use crate::lightmap::moved::Moved;
 use crate::lightmap::{BakeParams, Lightmap};
@@ -54,8 +54,9 @@ impl Following {
         let base = &*self.base;
         let old = &*base.map.atlas;
         let moved = Moved::between(&old.scene, &atlas.scene, &atlas.charts)?;
-        let sides = [Side { atlas: old, backs: &base.sides.backs }, Side { atlas, backs: &new.sides.backs }];
-        let comparison = Comparison::new(sides, &moved, self.keep_error, progress)?;
+        let old = SceneState { atlas: old, backs: &base.sides.backs };
+        let states = [old, SceneState { atlas, backs: &new.sides.backs }];
+        let comparison = Comparison::new(states, &moved, self.keep_error, progress)?;
         let mut cells = comparison.cells()?;
         let light = |texel| base.light[base.map.block_of(texel) as usize];
         comparison.probe(&mut cells, [&base.radiance, &new.radiance], params, light, base.mean)?;
@@ -71,7 +72,7 @@ struct Place {
     promotion: Promotion,
     chooser: Chooser,
     direct: DirectLight,
-    /// By block, whether indirect light, and direct light, differs by the place of things alone.
+    /// By block, whether indirect light and direct light are computed anew whatever probes find.
     differs: Vec<[bool; 2]>,
     /// Whether an emissive triangle moved.
     emits: bool,
@@ -81,8 +82,8 @@ struct Place {
 
 impl Live {
     /// Takes over another state of the scene, to which the light map that this object was made of has been updated
-    /// ([`Lightmap::follow`]). Blocks whose indirect light differs by less than `keep_error` (finite, ≥ 0; relative to
-    /// their light or, if that is more, to a tenth of the mean), as far as probes tell, keep it. If lights were set since
+    /// ([`Lightmap::follow`]). Blocks whose light differs by less than `keep_error` (finite, ≥ 0; relative to their light
+    /// or, if that is more, to a tenth of the mean), as far as probes tell, keep it. If lights were set since
     /// they were last taken over, all light is computed anew.
     ///
     /// A call that fails or is cancelled changes nothing.
@@ -125,8 +126,8 @@ impl Live {
         let moved = Moved::between(&old.atlas.scene, &atlas.scene, &atlas.charts)?;
         let mut map = BlockMap::new(atlas, self.params.lod_count, 0.5, progress)?;
         let backs = &self.context.light.sides.backs;
-        let sides = [&*old.atlas, &**atlas].map(|atlas| Side { atlas, backs });
-        let cells = Comparison::new(sides, &moved, keep_error, progress)?.cells()?;
+        let states = [&*old.atlas, &**atlas].map(|atlas| SceneState { atlas, backs });
+        let cells = Comparison::new(states, &moved, keep_error, progress)?.cells()?;
         let grid = Grid::with(self.grid.info, &mut map.tiles)?;
         let place = Place {
             normals: Display::normals(&map)?,
@@ -177,7 +178,8 @@ impl Live {
 
     fn move_to(&mut self, place: Place, has_other_lights: bool) {
         let Place { map, normals, grid, promotion, chooser, direct, differs, emits, _memory } = place;
-        let (old, map) = (std::mem::replace(&mut self.context.map, Arc::new(map)), self.context.map.clone());
+        let map = Arc::new(map);
+        let old = std::mem::replace(&mut self.context.map, map.clone());
         debug_assert_eq!((old.tiles.len(), differs.len()), (map.tiles.len(), map.tiles.len()));
         (self.grid, self.promotion, self.chooser) = (grid, promotion, chooser);
         self.display.set_normals(normals);
@@ -230,8 +232,8 @@ impl Live {
         }
     }
 
-    /// Lets blocks whose light a move does not change keep what they have gathered, although there is `new` light: with
-    /// few photons all but those near what moved, then those that probes have found.
+    /// Lets blocks whose light a move does not change keep what they have gathered under the light of an epoch, although
+    /// there is new light: of few photons all but those near what moved, of all photons those that probes have `kept`.
     pub(super) fn keep_indirect(&mut self, before_epoch: u32, part: Part, kept: &[bool]) {
         let epoch = self.context.light.indirect_epoch;
         if self.relight.following.is_some() {

@@ -42,14 +42,14 @@ pub(super) const MOST_CUTS: usize = 16;
 /// Name of these lists in error messages.
 pub(super) const CHANGED: &str = "which light has changed";
 
-/// Cells of all placements.
-pub(super) struct Cells<'a> {
+/// Where the cells of all placements lie.
+pub(super) struct CellGrid<'a> {
     atlas: &'a Atlas,
     /// First cell of each placement, and the number of cells at the end.
     first: Vec<u32>,
 }
 
-impl<'a> Cells<'a> {
+impl<'a> CellGrid<'a> {
     fn new(atlas: &'a Atlas) -> Result<Self> {
         let mut sum = 0;
         let sizes = atlas.gather.layout.placements.iter().map(|p| [p.w, p.h].map(|n| u32::from(n).div_ceil(CELL)));
@@ -57,7 +57,7 @@ impl<'a> Cells<'a> {
             sum += columns * rows;
             sum
         });
-        Ok(Cells { atlas, first: try_collect(std::iter::once(0).chain(ends), CHANGED)? })
+        Ok(CellGrid { atlas, first: try_collect(std::iter::once(0).chain(ends), CHANGED)? })
     }
 
     pub fn placements(&self) -> usize {
@@ -117,21 +117,21 @@ impl Cell {
     }
 }
 
-/// A state of the scene, and the sides of charts that it shows (empty: fronts).
+/// A state of a scene, and which charts show their backs (empty: none).
 #[derive(Clone, Copy)]
-pub(crate) struct Side<'a> {
+pub(crate) struct SceneState<'a> {
     pub atlas: &'a Atlas,
     pub backs: &'a [bool],
 }
 
 /// Two states of a scene that are compared.
 pub(crate) struct Comparison<'a, 'p> {
-    old: Side<'a>,
-    new: Side<'a>,
+    old: SceneState<'a>,
+    new: SceneState<'a>,
     pub(super) moved: &'a Moved,
     /// Relative difference of light that is let stand.
     keep_error: f32,
-    pub(super) cells: Cells<'a>,
+    pub(super) grid: CellGrid<'a>,
     /// What gives direct light in the new state.
     pub(super) sources: Vec<Source>,
     pub(super) progress: &'a Progress<'p>,
@@ -140,26 +140,27 @@ pub(crate) struct Comparison<'a, 'p> {
 impl<'a, 'p> Comparison<'a, 'p> {
     /// Prepares to compare two states between which `moved` moved.
     pub fn new(
-        [old, new]: [Side<'a>; 2],
+        [old, new]: [SceneState<'a>; 2],
         moved: &'a Moved,
         keep_error: f32,
         progress: &'a Progress<'p>,
     ) -> Result<Self> {
-        let (cells, sources) = (Cells::new(new.atlas)?, sources(&new.atlas.scene)?);
-        Ok(Comparison { old, new, moved, keep_error, cells, sources, progress })
+        let (grid, sources) = (CellGrid::new(new.atlas)?, sources(&new.atlas.scene)?);
+        Ok(Comparison { old, new, moved, keep_error, grid, sources, progress })
     }
 
-    /// Returns the cells by placement, row by row, and marks those whose light differs by the place of things alone. To be
-    /// called on the device's threads.
+    /// Returns the cells by placement, row by row: [new](Cell::is_new) are those whose surface moved or that are near what
+    /// moved, [shadowed](Cell::is_shadowed) those between which and a light something moved. To be called on the device's
+    /// threads.
     pub fn cells(&self) -> Result<Vec<Cell>> {
-        try_par_gather(self.cells.placements(), CHANGED, |p, out| self.look(PlacementId::new(p), out))
+        try_par_gather(self.grid.placements(), CHANGED, |p, out| self.look(PlacementId::new(p), out))
     }
 
     /// Appends the cells of a placement.
     fn look(&self, placement: PlacementId, out: &mut Vec<Cell>) -> Result<()> {
         self.progress.check()?;
         let (atlas, old, moved) = (self.new.atlas, self.old.atlas, self.moved);
-        let count = self.cells.count(placement);
+        let count = self.grid.count(placement);
         let chart = atlas.map.layout.chart_of(placement);
         let back = |backs: &[bool]| backs.get(chart.index()).is_some_and(|&b| b);
         let is_other_side = back(self.new.backs) != back(self.old.backs);
@@ -173,7 +174,7 @@ impl<'a, 'p> Comparison<'a, 'p> {
         };
         let mut cells = try_filled(count, nothing, CHANGED)?;
         for texel in atlas.map.texels_of(placement) {
-            let cell = &mut cells[self.cells.of(placement, texel)];
+            let cell = &mut cells[self.grid.of(placement, texel)];
             let (new, former) = (&atlas.map[texel], &old.map[texel]);
             cell.bounds.add(new.position(&atlas.scene));
             let is_buried = |atlas: &Atlas| atlas.buried.get(texel.index()).is_some_and(|&b| b);
