@@ -9,10 +9,10 @@
 #define _XOPEN_SOURCE 700
 #endif
 #include "check.h"
+#include "limit_files.h"
 #include <dirent.h>
 #include <signal.h>
 #include <stdlib.h>
-#include <sys/resource.h>
 #include <sys/socket.h>
 #include <sys/stat.h>
 #include <sys/types.h>
@@ -377,14 +377,6 @@ static int same_bytes(const char *name, const char *bytes, long size) {
     return same;
 }
 
-/* A disk that is full after `bytes` bytes of a file: every write beyond fails. */
-static void fill_disk(rlim_t bytes) {
-    struct rlimit r;
-    CHECK(getrlimit(RLIMIT_FSIZE, &r) == 0);
-    r.rlim_cur = bytes;
-    CHECK(setrlimit(RLIMIT_FSIZE, &r) == 0);
-}
-
 static void full_disks(bk_lightmap *lightmap, bk_lightmap *other) {
     static const char *names[] = {"save/page0-combined.exr", "save/page0-combined.png", "save/scene.glb"};
     uint32_t format;
@@ -400,9 +392,9 @@ static void full_disks(bk_lightmap *lightmap, bk_lightmap *other) {
         CHECK(old != NULL && size > 20);
         room[0] = 0, room[1] = 10, room[2] = size / 2;
         for (k = 0; old != NULL && k < 3; k++) {
-            fill_disk((rlim_t)room[k]);
+            limit_files((rlim_t)room[k]);
             CHECK_ERROR(bk_lightmap_save(other, at("save/"), format, NULL, NULL), BK_ERROR_IO, "save/");
-            fill_disk(RLIM_INFINITY);
+            limit_files(RLIM_INFINITY);
             CHECK(same_bytes(name, old, size));
             CHECK(!has_part("save"));
         }

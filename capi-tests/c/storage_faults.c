@@ -14,11 +14,11 @@
 #define _XOPEN_SOURCE 700
 #endif
 #include "check.h"
+#include "limit_files.h"
 #include <dirent.h>
 #include <fcntl.h>
 #include <signal.h>
 #include <stdlib.h>
-#include <sys/resource.h>
 #include <sys/stat.h>
 #include <sys/types.h>
 #include <sys/wait.h>
@@ -187,14 +187,6 @@ static int same_light(const bk_lightmap *a, const bk_lightmap *b) {
 }
 
 /* ---- Full disks ---- */
-
-/* A disk that is full after so many bytes of each file. */
-static void limit_files(rlim_t bytes) {
-    struct rlimit r;
-    CHECK(getrlimit(RLIMIT_FSIZE, &r) == 0);
-    r.rlim_cur = bytes;
-    CHECK(setrlimit(RLIMIT_FSIZE, &r) == 0);
-}
 
 /* Mounts a disk of so many bytes in the folder; whether that is allowed. */
 static int mounted(const char *path, const char *bytes) {
