@@ -524,6 +524,14 @@ public:
             bk_bake_changed(get(), &params, keep_error, progress.function(), progress.user(), &stats);
         return detail::finish(progress.after(code), stats);
     }
+    /// Bakes and keeps what it can of the light of an earlier light map, of a scene of which this one's is a revision.
+    Result<BakeStats> bake_changed_from(const Lightmap &earlier, const BakeParams &params, float keep_error,
+                                        const Progress &progress = {}) {
+        BakeStats stats;
+        const bk_result code = bk_bake_changed_from(get(), earlier.get(), &params, keep_error, progress.function(),
+                                                    progress.user(), &stats);
+        return detail::finish(progress.after(code), stats);
+    }
     /// The plan of the last bake as text.
     std::string plan() const {
         std::string text(bk_plan_describe(get(), nullptr, 0), '\0');

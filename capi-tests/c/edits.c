@@ -1,5 +1,5 @@
 /*
- * Edits: a light map follows its scene, and bakes again what has changed.
+ * Edits: a light map follows its scene, and bakes again what has changed; that of a new scene keeps an old one's light.
  *
  *     edits
  */
@@ -23,9 +23,10 @@ static void box(const float lower[3], const float upper[3], float out[8][3]) {
 static const uint32_t OUTWARD[12][3] = {{0, 2, 1}, {1, 2, 3}, {4, 5, 6}, {5, 7, 6}, {0, 1, 4}, {1, 5, 4},
                                         {2, 6, 3}, {3, 6, 7}, {0, 4, 2}, {2, 4, 6}, {1, 3, 5}, {3, 7, 5}};
 
-static bk_scene *room(bk_device *device) {
+static bk_scene *room_with(bk_device *device, int has_second_block) {
     static const float low[3] = {0, 0, 0}, high[3] = {6, 6, 3}, from[3] = {1, 1, 0}, to[3] = {1.5f, 1.5f, 0.8f};
-    float walls[8][3], block[8][3];
+    static const float second_from[3] = {4.5f, 5, 0}, second_to[3] = {5, 5.3f, 0.6f};
+    float walls[8][3], block[8][3], second[8][3];
     uint32_t inward[12][3];
     bk_scene *scene = NULL;
     bk_material_desc material;
@@ -49,6 +50,11 @@ static bk_scene *room(bk_device *device) {
     mesh.positions = block[0];
     mesh.indices = OUTWARD[0];
     CHECK_OK(bk_scene_add_mesh(scene, &mesh, NULL));
+    if (has_second_block) {
+        box(second_from, second_to, second);
+        mesh.positions = second[0];
+        CHECK_OK(bk_scene_add_mesh(scene, &mesh, NULL));
+    }
     bk_light_desc_init(&light);
     light.type = BK_LIGHT_POINT;
     light.position[0] = light.position[1] = 3;
@@ -58,6 +64,8 @@ static bk_scene *room(bk_device *device) {
     CHECK_OK(bk_scene_commit(scene, NULL, NULL));
     return scene;
 }
+
+static bk_scene *room(bk_device *device) { return room_with(device, 0); }
 
 static void move_block(bk_scene *scene, float x) {
     const float lower[3] = {x, 1, 0}, upper[3] = {x + 0.5f, 1.5f, 0.8f};
@@ -119,6 +127,64 @@ static double difference(const float *a, const float *b, size_t count) {
         all += b[i];
     }
     return sum / all;
+}
+
+/* A new scene has a block more: its light map keeps light of the old one's. */
+static void revise(bk_device *device, const bk_lightmap_desc *desc) {
+    bk_scene *scenes[2];
+    bk_lightmap *maps[2] = {NULL, NULL}, *another = NULL;
+    bk_lightmap_info info;
+    bk_bake_params params;
+    bk_bake_stats stats;
+    float *kept, *fresh, *again;
+    size_t count = 0;
+    int i;
+    bk_bake_params_init(&params);
+    params.photon_count = 50000;
+    bk_bake_stats_init(&stats);
+    for (i = 0; i < 2; i++) {
+        scenes[i] = room_with(device, i);
+        CHECK_OK(bk_lightmap_create(scenes[i], desc, NULL, NULL, &maps[i]));
+    }
+    /* Where there is no light to be kept, all is baked. */
+    CHECK_OK(bk_bake_changed_from(maps[1], maps[0], &params, 0.03f, NULL, NULL, &stats));
+    CHECK(stats.kept_texels == 0);
+    fresh = light_of(maps[1], &count);
+
+    CHECK_OK(bk_bake(maps[0], &params, NULL, NULL, NULL));
+    CHECK_OK(bk_lightmap_create(scenes[1], desc, NULL, NULL, &another));
+    bk_lightmap_info_init(&info);
+    CHECK_OK(bk_lightmap_get_info(another, &info));
+    CHECK_OK(bk_bake_changed_from(another, maps[0], &params, 0.03f, NULL, NULL, &stats));
+    CHECK(stats.kept_texels > info.texels / 10 && stats.kept_texels < info.texels);
+    kept = light_of(another, &count);
+    CHECK(difference(kept, fresh, count) < 0.005);
+
+    /* Refused, and nothing lost. */
+    CHECK_ERROR(bk_bake_changed_from(another, another, &params, 0.03f, NULL, NULL, NULL), BK_ERROR_INVALID_ARGUMENT,
+                "bk_bake_changed");
+    CHECK_ERROR(bk_bake_changed_from(another, NULL, &params, 0.03f, NULL, NULL, NULL), BK_ERROR_INVALID_ARGUMENT,
+                "earlier is NULL");
+    CHECK_ERROR(bk_bake_changed_from(NULL, maps[0], &params, 0.03f, NULL, NULL, NULL), BK_ERROR_INVALID_ARGUMENT,
+                "lightmap");
+    CHECK_ERROR(bk_bake_changed_from(another, maps[0], &params, NAN, NULL, NULL, NULL), BK_ERROR_INVALID_ARGUMENT,
+                "keep_error");
+    params.checkpoint = "no-checkpoint";
+    CHECK_ERROR(bk_bake_changed_from(another, maps[0], &params, 0.03f, NULL, NULL, NULL), BK_ERROR_INVALID_ARGUMENT,
+                "checkpoint");
+    params.checkpoint = NULL;
+    params.texel_begin = 5;
+    CHECK_ERROR(bk_bake_changed_from(another, maps[0], &params, 0.03f, NULL, NULL, NULL), BK_ERROR_INVALID_ARGUMENT,
+                "all texels");
+    again = light_of(another, &count);
+    CHECK(memcmp(kept, again, count * sizeof *kept) == 0);
+
+    free(kept), free(fresh), free(again);
+    for (i = 0; i < 2; i++) {
+        bk_lightmap_release(maps[i]);
+        bk_scene_release(scenes[i]);
+    }
+    bk_lightmap_release(another);
 }
 
 int main(void) {
@@ -192,6 +258,8 @@ int main(void) {
     params.gather_rays = 32;
     CHECK_OK(bk_bake_changed(map, &params, 10.0f, NULL, NULL, &stats));
     CHECK(stats.kept_texels == 0);
+
+    revise(device, &desc);
 
     /* Live light follows. */
     bk_live_params_init(&live_params);

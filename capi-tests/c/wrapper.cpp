@@ -154,6 +154,7 @@ static void bake(const Scene &scene) {
     VALUE(map.follow(scene));
     CHECK_FAILS(map.bake_changed({}, -1), BK_ERROR_INVALID_ARGUMENT, "keep_error");
     VALUE(map.bake_changed({}, 0.1f));
+    CHECK_FAILS(map.bake_changed_from(map, {}, 0.1f), BK_ERROR_INVALID_ARGUMENT, "earlier");
     CHECK(map.plan().find("direct") != std::string::npos && map.plan().back() != '\0');
 
     Live live = VALUE(Live::create(map));

@@ -266,13 +266,13 @@ fn every_large_allocation_and_every_request_may_fail_and_nothing_is_lost() {
     std::fs::remove_dir_all(&folder).unwrap();
 
     LARGE.store(128 << 10, SeqCst);
-    edits(&scene, &mut lightmap, &whole);
+    edits(&scene, &mut lightmap, &desc, &whole);
     drop((lightmap, scene));
     assert_eq!(ANNOUNCED.load(SeqCst), 0, "bytes announced, but not given back");
 }
 
 /// A vertex moves, and the light map and live light follow.
-fn edits(scene: &Arc<Scene>, lightmap: &mut Lightmap, params: &BakeParams) {
+fn edits(scene: &Arc<Scene>, lightmap: &mut Lightmap, desc: &LightmapDesc, params: &BakeParams) {
     let none = Progress::none();
     let mut moved = scene.meshes()[0].positions.to_vec();
     let live_params = LiveParams { lod_count: 2, max_rounds: 1, photon_count: 10_000, ..Default::default() };
@@ -292,6 +292,28 @@ fn edits(scene: &Arc<Scene>, lightmap: &mut Lightmap, params: &BakeParams) {
     drop(live);
     // After the first that succeeds there is nothing left to bake, but all is looked at.
     let stats = fail_all("bake of changes", || lightmap.bake_changed(params, 0.03, &none));
+    assert!(stats.kept_texels > 0);
+    // A light map of a scene with one mesh more keeps light, too.
+    let mut revision = SceneData::new();
+    for texture in scene.textures() {
+        revision.add_texture(texture.as_ref().clone()).unwrap();
+    }
+    for &material in scene.materials() {
+        revision.add_material(material).unwrap();
+    }
+    for &light in scene.lights().iter() {
+        revision.add_light(light).unwrap();
+    }
+    for mesh in scene.meshes() {
+        revision.add_mesh(mesh.clone()).unwrap();
+    }
+    let mut added = scene.meshes()[0].clone();
+    added.positions = added.positions.iter().map(|p| 0.05 * *p + 0.02).collect::<Vec<_>>().into();
+    revision.add_mesh(added).unwrap();
+    let device = scene.device();
+    let revision = Scene::commit(device, revision, &BuildOptions::default(), &none).map_err(|e| e.1).unwrap();
+    let mut revised = Lightmap::create(&revision, desc, &none).unwrap();
+    let stats = fail_all("light of another light map", || revised.bake_changed_from(lightmap, params, 0.03, &none));
     assert!(stats.kept_texels > 0);
 }
 

@@ -8,7 +8,7 @@ mod direct;
 use super::atlas::Atlas;
 use super::atlas::fill::Filling;
 use super::atlas::ids::{GatherTexel, LightTexel, PerTexel};
-use super::changed::{Before, Redo};
+use super::changed::{Before, Keep, Redo};
 use super::direct_blur;
 use super::indirect::blur;
 use super::indirect::gather::{Gathered, Tile, TileTexel};
@@ -103,13 +103,13 @@ impl Lightmap {
         plan
     }
 
-    /// Bakes with checked parameters, anew or, given the difference of light that is let stand, what has changed.
+    /// Bakes with checked parameters, anew or, given what may be kept, what has changed.
     pub(super) fn bake_all(
         &mut self,
         params: &BakeParams,
         shares: Option<&ShareParams>,
         checkpoint: Option<&CheckpointParams>,
-        keep_error: Option<f32>,
+        keep: Option<Keep>,
         progress: &Progress,
     ) -> Result<BakeStats> {
         let total = self.atlas.map.len() as u64;
@@ -141,8 +141,8 @@ impl Lightmap {
                 None => None,
             };
             let shares = shares.map(|shares| Shares::new(shares, atlas, &origin));
-            let before = match keep_error {
-                Some(keep_error) => self.before(params, &plan, direct, &origin, keep_error)?,
+            let before = match keep {
+                Some(keep) => self.before(params, &plan, direct, &origin, keep, progress)?,
                 None => None,
             };
             let from = From { shares: shares.as_ref(), checkpoint: checkpoint.as_ref(), before: before.as_ref() };

@@ -12,6 +12,7 @@
 //! map and the texels around them are the same.
 
 pub(crate) mod comparison;
+pub(crate) mod correspondence;
 mod sources;
 
 use super::atlas::Atlas;
@@ -28,6 +29,7 @@ use crate::base::parallel::ParallelLoop;
 use crate::base::progress::Progress;
 use crate::direct::DirectLight;
 use comparison::{CELL, CHANGED, Cell, Comparison, SceneState};
+use correspondence::Correspondence;
 use rayon::prelude::*;
 use std::sync::OnceLock;
 
@@ -58,7 +60,37 @@ impl Lightmap {
     ///
     /// `params` are those of the last bake, for all texels and without a target error. If others were used, or there is
     /// no light yet, all is baked. Many small changes that are each let stand add up: now and then bake from nothing.
+    /// With several passes the mean of their radiance maps is compared with that of the new first pass, so that texels
+    /// whose light did not change are kept only if `keep_error` is above that noise.
     pub fn bake_changed(&mut self, params: &BakeParams, keep_error: f32, progress: &Progress) -> Result<BakeStats> {
+        self.check_changed(params, keep_error)?;
+        self.bake_all(params, None, None, Some(Keep { keep_error, earlier: None }), progress)
+    }
+
+    /// Bakes and keeps light of an `earlier` light map, of a scene of which this light map's is a revision: texels of
+    /// meshes, or of triangles in them, that both scenes have keep the light that they had, like those of
+    /// [`bake_changed`](Self::bake_changed), to which this is what that is to a scene that has moved. For meshes that were
+    /// added, removed or edited.
+    ///
+    /// The same surfaces have the same texels if both light maps have the same `texels_per_unit`, which is not 0, the same
+    /// divisors, and the same charts; what is added should come after what was there before, since random numbers are by
+    /// the numbers of texels. What has other texels, or another material, is baked. If the light map has light
+    /// already, that is replaced.
+    pub fn bake_changed_from(
+        &mut self,
+        earlier: &Lightmap,
+        params: &BakeParams,
+        keep_error: f32,
+        progress: &Progress,
+    ) -> Result<BakeStats> {
+        self.check_changed(params, keep_error)?;
+        let scene = earlier.atlas.scene.clone();
+        let keep = Keep { keep_error, earlier: Some(earlier) };
+        scene.while_unchanged(|| self.bake_all(params, None, None, Some(keep), progress))
+    }
+
+    /// Checks the arguments of a bake that keeps light.
+    fn check_changed(&self, params: &BakeParams, keep_error: f32) -> Result<()> {
         params.validate()?;
         if !(keep_error >= 0.0 && keep_error.is_finite()) {
             return invalid_argument!("keep_error is {keep_error}, not a finite number ≥ 0");
@@ -68,34 +100,73 @@ impl Lightmap {
         {
             return invalid_argument!("a bake of changes is of all texels and has no target_error");
         }
-        self.bake_all(params, None, None, Some(keep_error), progress)
+        Ok(())
     }
 
     /// Returns the light from before a change, if a bake with these parameters can keep any of it.
-    pub(super) fn before(
-        &self,
+    pub(super) fn before<'a>(
+        &'a self,
         params: &BakeParams,
         plan: &Plan,
         direct: &DirectLight,
         origin: &Origin,
-        keep_error: f32,
-    ) -> Result<Option<Before<'_>>> {
-        let Some(light) = self.light.as_ref().filter(|light| can_keep(light, params, plan)) else {
+        keep: Keep<'a>,
+        progress: &Progress,
+    ) -> Result<Option<Before<'a>>> {
+        let of = keep.earlier.unwrap_or(self);
+        let Some(light) = of.light.as_ref().filter(|light| can_keep(light, params, plan)) else {
             return Ok(None);
         };
-        let atlas = self.before.as_ref().unwrap_or(&self.atlas);
-        let moved = Moved::between(&atlas.scene, &self.atlas.scene, &self.atlas.charts)?;
+        let atlas = of.before.as_ref().unwrap_or(&of.atlas);
+        let (former, moved) = match keep.earlier {
+            Some(_) => {
+                let (former, moved) = Correspondence::between(atlas, &self.atlas, progress)?;
+                (Some(former), moved)
+            }
+            None => (None, Moved::between(&atlas.scene, &self.atlas.scene, &self.atlas.charts)?),
+        };
+        let kept = match &former {
+            Some(former) => Kept::Carried(Box::new(former.carried(light, atlas, &self.atlas)?)),
+            None => Kept::InPlace(light),
+        };
         let has_other_lights = !light.origin.is_some_and(|of_light| of_light.has_lights_of(origin));
-        let blurs_direct = direct_blur::is_needed(direct, params, plan);
-        let redo = OnceLock::new();
-        Ok(Some(Before { atlas, light, moved, has_other_lights, blurs_direct, keep_error, redo }))
+        Ok(Some(Before {
+            atlas,
+            former,
+            radiance: &light.radiance,
+            kept,
+            moved,
+            has_other_lights,
+            blurs_direct: direct_blur::is_needed(direct, params, plan),
+            keep_error: keep.keep_error,
+            redo: OnceLock::new(),
+        }))
     }
+}
+
+/// Which light a bake may keep.
+#[derive(Clone, Copy)]
+pub(super) struct Keep<'a> {
+    /// Relative difference of light that is let stand.
+    pub keep_error: f32,
+    /// The light map that has it, if another one.
+    pub earlier: Option<&'a Lightmap>,
+}
+
+/// Light that may be kept, by texel of the light map.
+enum Kept<'a> {
+    InPlace(&'a Light),
+    /// From another light map, by [`Correspondence::carried`].
+    Carried(Box<Light>),
 }
 
 /// The light of a light map before a change.
 pub(super) struct Before<'a> {
     pub atlas: &'a Atlas,
-    pub light: &'a Light,
+    /// How its surfaces were numbered, if they are those of another scene.
+    former: Option<Correspondence>,
+    radiance: &'a Radiance,
+    kept: Kept<'a>,
     pub moved: Moved,
     /// Whether a light was set since.
     pub has_other_lights: bool,
@@ -108,9 +179,16 @@ pub(super) struct Before<'a> {
 }
 
 impl Before<'_> {
+    fn light(&self) -> &Light {
+        match &self.kept {
+            Kept::InPlace(light) => light,
+            Kept::Carried(light) => light,
+        }
+    }
+
     /// Copies what is kept into new light that is dark.
     pub fn keep(&self, redo: &Redo, new: &mut Light) {
-        let old = self.light;
+        let old = self.light();
         for (is_new, (new, old)) in redo.direct.iter().zip(new.direct.iter_mut().zip(&old.direct)) {
             if !is_new {
                 *new = *old;
@@ -133,7 +211,7 @@ impl Before<'_> {
     /// Copies the spread of passes where all light is kept.
     pub fn keep_spread(&self, new: &mut Light) {
         let Some(redo) = self.redo.get() else { return };
-        let spread = new.spread.iter_mut().zip(&self.light.spread);
+        let spread = new.spread.iter_mut().zip(&self.light().spread);
         for (_, (new, old)) in redo.indirect.iter().zip(spread).filter(|(is_new, _)| !**is_new) {
             *new = *old;
         }
@@ -161,18 +239,19 @@ impl Redo {
         (radiance, backs): (&Radiance, &[bool]),
         progress: &Progress,
     ) -> Result<Redo> {
-        let old = SceneState { atlas: before.atlas, backs: &before.light.backs };
-        let states = [old, SceneState { atlas, backs }];
+        let of_before = before.light();
+        let old = SceneState { atlas: before.atlas, backs: &of_before.backs, former: before.former.as_ref() };
+        let states = [old, SceneState { atlas, backs, former: None }];
         let comparison = Comparison::new(states, &before.moved, before.keep_error, progress)?;
         let mut cells = comparison.cells()?;
         let mut rays = 0;
         if !plan.runs(left_out::INDIRECT) {
             cells.iter_mut().for_each(|cell| cell.is_new = true);
         } else {
-            let light = |texel: usize| (before.light.direct[texel] + before.light.indirect[texel]).element_sum();
-            let texels = before.light.direct.len();
+            let light = |texel: usize| (of_before.direct[texel] + of_before.indirect[texel]).element_sum();
+            let texels = of_before.direct.len();
             let mean = ((0..texels).map(|i| f64::from(light(i))).sum::<f64>() / texels.max(1) as f64) as f32;
-            let radiance = [&before.light.radiance, radiance];
+            let radiance = [before.radiance, radiance];
             rays = comparison.probe(&mut cells, radiance, params, |texel| light(texel.index()), mean)?;
         }
         let all_direct = before.has_other_lights || before.moved.emits || !plan.runs(left_out::DIRECT);

@@ -115,10 +115,15 @@ pub(crate) struct Moved {
 }
 
 impl Moved {
+    /// `charts`: whether each chart has moved.
+    pub(super) fn new(charts: Vec<bool>, boxes: Vec<Bounds>, emits: bool) -> Moved {
+        Moved { charts, boxes: merged(boxes, MOST_BOXES), emits }
+    }
+
     /// Compares two states of a scene, whose charts are the same. `InvalidState` if a triangle of a chart has become
     /// degenerate or not finite: it has no normal, and its texels no place.
     pub fn between(old: &Scene, new: &Scene, charts: &Charts) -> Result<Moved> {
-        let mut moved = Moved { charts: try_vec(charts.charts.len(), MOVED)?, boxes: Vec::new(), emits: false };
+        let mut moved = Moved::new(try_vec(charts.charts.len(), MOVED)?, Vec::new(), false);
         if std::ptr::eq(old, new) {
             return Ok(moved);
         }

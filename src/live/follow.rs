@@ -54,8 +54,8 @@ impl Following {
         let base = &*self.base;
         let old = &*base.map.atlas;
         let moved = Moved::between(&old.scene, &atlas.scene, &atlas.charts)?;
-        let old = SceneState { atlas: old, backs: &base.sides.backs };
-        let states = [old, SceneState { atlas, backs: &new.sides.backs }];
+        let old = SceneState { atlas: old, backs: &base.sides.backs, former: None };
+        let states = [old, SceneState { atlas, backs: &new.sides.backs, former: None }];
         let comparison = Comparison::new(states, &moved, self.keep_error, progress)?;
         let mut cells = comparison.cells()?;
         let light = |texel| base.light[base.map.block_of(texel) as usize];
@@ -126,7 +126,7 @@ impl Live {
         let moved = Moved::between(&old.atlas.scene, &atlas.scene, &atlas.charts)?;
         let mut map = BlockMap::new(atlas, self.params.lod_count, 0.5, progress)?;
         let backs = &self.context.light.sides.backs;
-        let states = [&*old.atlas, &**atlas].map(|atlas| SceneState { atlas, backs });
+        let states = [&*old.atlas, &**atlas].map(|atlas| SceneState { atlas, backs, former: None });
         let cells = Comparison::new(states, &moved, keep_error, progress)?.cells()?;
         let grid = Grid::with(self.grid.info, &mut map.tiles)?;
         let place = Place {

@@ -794,6 +794,23 @@ fn edit(w: &W, s: &mut Source) {
     if result == BK_OK && !keep_error.is_finite() {
         broken("a keep_error that is not finite is accepted");
     }
+    if let Some(earlier) = w.pick(Kind::Lightmap, s) {
+        let watched = Watched::new(w, s);
+        let params = bake_params(w, s);
+        let result = ask!(bk_bake_changed_from(
+            lightmap.p(),
+            earlier.p(),
+            &params,
+            keep_error,
+            Some(progress),
+            watched.user(),
+            &mut stats
+        ));
+        watched.end("bk_bake_changed_from", result);
+        if result == BK_OK && (!keep_error.is_finite() || std::ptr::eq::<bk_lightmap>(lightmap.p(), earlier.p())) {
+            broken("light of a light map is kept by itself, or with a keep_error that is not finite");
+        }
+    }
 }
 
 /// Bytes of a texel of a format, if it is one.
@@ -1132,6 +1149,7 @@ fn null_handles(s: &mut Source) {
             failed(ask!(bk_lightmap_create(null(), null(), None, null_mut(), words.as_mut_ptr().cast())));
             failed(ask!(bk_bake(null_mut(), null(), None, null_mut(), null_mut())));
             failed(ask!(bk_bake_changed(null_mut(), null(), 0.0, None, null_mut(), null_mut())));
+            failed(ask!(bk_bake_changed_from(null_mut(), null(), null(), 0.0, None, null_mut(), null_mut())));
             failed(ask!(bk_bake_share(null(), null(), 0, 0, None, null_mut(), null_mut())));
             failed(ask!(bk_lightmap_follow(null_mut(), null(), None, null_mut())));
             failed(ask!(bk_live_follow(null_mut(), null(), 0.0, None, null_mut())));

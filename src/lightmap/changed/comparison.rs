@@ -1,6 +1,7 @@
 //! Compares two states of a scene, cell by cell, to tell where light may differ: for bakes after a change, and for live
 //! light that follows its scene. A cell is a square of 8 × 8 texels of the gather map.
 
+use super::correspondence::Correspondence;
 use super::sources::{Source, part_of_light, sources};
 use crate::base::error::Result;
 use crate::base::memory::{try_collect, try_filled, try_par_collect_ok, try_par_gather};
@@ -117,11 +118,23 @@ impl Cell {
     }
 }
 
-/// A state of a scene, and which charts show their backs (empty: none).
+/// A state of a scene, and which charts show their backs (empty: none), by their number in the new state.
 #[derive(Clone, Copy)]
 pub(crate) struct SceneState<'a> {
     pub atlas: &'a Atlas,
     pub backs: &'a [bool],
+    /// How this state's surfaces are numbered, if not as those of the new state.
+    pub former: Option<&'a Correspondence>,
+}
+
+impl SceneState<'_> {
+    /// Returns the number in this state of a texel of the new one, if it shows the same point.
+    fn texel(&self, new: &Atlas, placement: PlacementId, texel: LightTexel) -> Option<LightTexel> {
+        match self.former {
+            Some(former) => former.texel(self.atlas, new, placement, texel),
+            None => (new.map[texel] == self.atlas.map[texel]).then_some(texel),
+        }
+    }
 }
 
 /// Two states of a scene that are compared.
@@ -159,7 +172,7 @@ impl<'a, 'p> Comparison<'a, 'p> {
     /// Appends the cells of a placement.
     fn look(&self, placement: PlacementId, out: &mut Vec<Cell>) -> Result<()> {
         self.progress.check()?;
-        let (atlas, old, moved) = (self.new.atlas, self.old.atlas, self.moved);
+        let (atlas, moved) = (self.new.atlas, self.moved);
         let count = self.grid.count(placement);
         let chart = atlas.map.layout.chart_of(placement);
         let back = |backs: &[bool]| backs.get(chart.index()).is_some_and(|&b| b);
@@ -175,11 +188,11 @@ impl<'a, 'p> Comparison<'a, 'p> {
         let mut cells = try_filled(count, nothing, CHANGED)?;
         for texel in atlas.map.texels_of(placement) {
             let cell = &mut cells[self.grid.of(placement, texel)];
-            let (new, former) = (&atlas.map[texel], &old.map[texel]);
-            cell.bounds.add(new.position(&atlas.scene));
-            let is_buried = |atlas: &Atlas| atlas.buried.get(texel.index()).is_some_and(|&b| b);
-            cell.is_new |= new != former || is_buried(atlas) != is_buried(old);
-            if is_buried(atlas) {
+            cell.bounds.add(atlas.map[texel].position(&atlas.scene));
+            let is_buried = |atlas: &Atlas, texel: LightTexel| atlas.buried.get(texel.index()).is_some_and(|&b| b);
+            let former = self.old.texel(atlas, placement, texel);
+            cell.is_new |= former.is_none_or(|former| is_buried(atlas, texel) != is_buried(self.old.atlas, former));
+            if is_buried(atlas, texel) {
                 continue;
             }
             // Those with the smallest random numbers: some anywhere in the cell.
@@ -226,8 +239,8 @@ impl<'a, 'p> Comparison<'a, 'p> {
     ) -> Result<u64> {
         let probes = cells.iter().filter(|cell| !cell.is_new);
         let probes = try_collect(probes.flat_map(Cell::probes), CHANGED)?;
-        let [old, new] = [(self.old, radiance[0]), (self.new, radiance[1])]
-            .map(|(side, radiance)| State::new(side.atlas, side.backs, radiance));
+        let [old, new] =
+            [(self.old, radiance[0]), (self.new, radiance[1])].map(|(side, radiance)| State::new(side, radiance));
         let samples =
             SampleSet::new(params.gather_rays.min(PROBE_RAYS), purpose_seed(params.seed, purpose::GATHER_SET));
         let seed = purpose_seed(params.seed, purpose::PROBE);

@@ -2,7 +2,7 @@ use super::*;
 use crate::base::error::Error;
 use crate::lightmap::{Lightmap, LightmapDesc, directional};
 use crate::scene::demo::shapes::MeshBuilder;
-use crate::scene::{Light as Lamp, Material, Scene, SceneData};
+use crate::scene::{Light as Lamp, Material, Mesh, MeshMaterials, Scene, SceneData};
 use glam::Vec3;
 use std::sync::Arc;
 
@@ -223,4 +223,186 @@ fn wrong_use_is_refused_and_shards_after_a_move_begin_anew() {
     let shards = light(&map);
     map.bake(&params, &none).unwrap();
     assert!(light(&map) == shards);
+}
+
+/// The rooms with the meshes that `keep` names and, last, `more` boxes; `lamp` is the power of the first lamp.
+fn revised(keep: [bool; 2], more: &[Vec3], lamp: f32) -> (Arc<Scene>, Lightmap) {
+    let mut data = SceneData::new();
+    let white = data.add_material(Material { albedo: [0.7; 3], ..Default::default() }).unwrap();
+    if keep[0] {
+        let mut walls = MeshBuilder::new();
+        walls.box_(Vec3::ZERO, Vec3::new(8.0, 4.0, 3.0), true, white);
+        walls.box_(Vec3::new(3.9, 0.0, 0.0), Vec3::new(4.1, 2.8, 3.0), false, white);
+        data.add_mesh(walls.finish()).unwrap();
+    }
+    if keep[1] {
+        let mut block = MeshBuilder::new();
+        block.box_(Vec3::new(0.6, 0.6, 0.0), Vec3::new(1.0, 1.0, 0.5), false, white);
+        data.add_mesh(block.finish()).unwrap();
+    }
+    for &at in more {
+        let mut added = MeshBuilder::new();
+        added.box_(at, at + Vec3::new(0.4, 0.4, 0.6), false, white);
+        data.add_mesh(added.finish()).unwrap();
+    }
+    for (x, intensity) in [(2.0, lamp), (6.0, 5.0)] {
+        data.add_light(Lamp::Point { position: Vec3::new(x, 1.9, 2.7), intensity: [intensity; 3] }).unwrap();
+    }
+    let scene = data.committed();
+    let desc = LightmapDesc { texels_per_unit: 24.0, page_size: 512, ..Default::default() };
+    let map = Lightmap::create(&scene, &desc, &Progress::none()).unwrap();
+    (scene, map)
+}
+
+/// Bakes `map` with what it can keep of `earlier`, and from nothing; returns the kept part of its texels, and the worst
+/// differences of direct and indirect light, relative to their means.
+fn revise(earlier: &Lightmap, map: &mut Lightmap, params: &BakeParams, keep_error: f32) -> (f32, [f32; 2]) {
+    let none = Progress::none();
+    let stats = map.bake_changed_from(earlier, params, keep_error, &none).unwrap();
+    let kept = light(map);
+    map.bake(params, &none).unwrap();
+    let new = light(map);
+    let n = new[0].len() as f32;
+    let worst = [0, 1].map(|kind| {
+        let mean = new[kind].iter().map(|l| l.element_sum()).sum::<f32>() / n;
+        let difference = |(a, b): (&Vec3, &Vec3)| (*a - *b).abs().element_sum() / mean;
+        kept[kind].iter().zip(&new[kind]).map(difference).fold(0.0, f32::max)
+    });
+    (stats.kept_texels as f32 / n, worst)
+}
+
+#[test]
+fn a_new_light_map_keeps_light_where_meshes_were_added_and_removed() {
+    let none = Progress::none();
+    let params = params();
+    let (_, mut first) = revised([true, true], &[], 5.0);
+    first.bake(&params, &none).unwrap();
+    // The same scene once more: nothing is new.
+    let (_, mut same) = revised([true, true], &[], 5.0);
+    let (kept, worst) = revise(&first, &mut same, &params, 0.0);
+    assert_eq!((kept, worst), (1.0, [0.0; 2]));
+    // A box more in the first room: the second one keeps its light.
+    let (_, mut more) = revised([true, true], &[Vec3::new(2.4, 2.0, 0.0)], 5.0);
+    let (kept, worst) = revise(&first, &mut more, &params, 0.05);
+    assert!((0.3..0.95).contains(&kept), "{kept} kept");
+    assert_eq!(worst[0], 0.0, "direct light");
+    assert!(worst[1] < 0.25, "indirect light is wrong by {}", worst[1]);
+    // Without it again: where it stood, light is back.
+    let (_, mut less) = revised([true, true], &[], 5.0);
+    let (kept, worst) = revise(&more, &mut less, &params, 0.05);
+    assert!((0.3..0.95).contains(&kept), "{kept} kept");
+    assert!(worst[0] == 0.0 && worst[1] < 0.25, "{worst:?}");
+    // A mesh that others follow has gone: they have other numbers of triangles, charts and texels.
+    let at = Vec3::new(6.0, 2.0, 0.0);
+    let (_, mut three) = revised([true, true], &[at], 5.0);
+    three.bake(&params, &none).unwrap();
+    let (_, mut two) = revised([true, false], &[at], 5.0);
+    two.bake_changed_from(&three, &params, 0.05, &none)
+        .map(|stats| {
+            let kept = stats.kept_texels as f32 / two.info().texels as f32;
+            assert!((0.3..0.95).contains(&kept), "{kept} kept");
+        })
+        .unwrap();
+    let of_change = light(&two);
+    let [of_nothing, of_seed] = [params.seed, params.seed + 1].map(|seed| {
+        two.bake(&BakeParams { seed, ..params }, &none).unwrap();
+        light(&two)
+    });
+    // Random numbers are by the numbers of texels: what is kept has other noise, but no more than another seed brings.
+    let rms = |a: &[Vec3], b: &[Vec3]| {
+        a.iter().zip(b).map(|(a, b)| f64::from((*a - *b).length_squared())).sum::<f64>().sqrt()
+            / (a.len() as f64).sqrt()
+    };
+    let noise = rms(&of_nothing[1], &of_seed[1]);
+    let difference = rms(&of_change[1], &of_nothing[1]);
+    assert!(difference > 0.0 && difference < noise, "{difference} of {noise}");
+    // Direct light is the same but for rounding: other numbers order the same sums otherwise.
+    let worst = of_change[0].iter().zip(&of_nothing[0]).map(|(a, b)| (*a - *b).length() / b.length().max(1.0));
+    assert!(worst.fold(0.0, f32::max) < 1e-6);
+    // Another lamp: direct light is new everywhere.
+    let (_, mut lit) = revised([true, true], &[], 2.0);
+    let (kept, worst) = revise(&first, &mut lit, &params, 0.05);
+    assert_eq!((kept, worst[0]), (0.0, 0.0));
+}
+
+#[test]
+fn light_of_another_light_map_is_kept_with_stitched_seams_passes_and_light_by_direction() {
+    let none = Progress::none();
+    let directional = directional::INDIRECT | directional::DIRECT;
+    for params in
+        [BakeParams { stitch: true, ..params() }, BakeParams { stitch: true, directional, passes: 2, ..params() }]
+    {
+        let (_, mut first) = revised([true, true], &[], 5.0);
+        first.bake(&params, &none).unwrap();
+        let (_, mut same) = revised([true, true], &[], 5.0);
+        // Of several passes the mean radiance is kept, which is not quite the first pass's.
+        let keep_error = if params.passes > 1 { 0.1 } else { 0.0 };
+        let stats = same.bake_changed_from(&first, &params, keep_error, &none).unwrap();
+        let [a, b] = [&first, &same].map(|map| map.light.as_ref().unwrap());
+        let kept = stats.kept_texels as f32 / a.direct.len() as f32;
+        assert!(if params.passes > 1 { kept > 0.9 } else { kept == 1.0 }, "{kept} kept");
+        assert!(a.direct == b.direct && a.indirect == b.indirect && a.spread == b.spread);
+        assert!(a.directional == b.directional && a.state == b.state && a.backs == b.backs);
+        // Light kept twice is that of before.
+        let (_, mut again) = revised([true, true], &[], 5.0);
+        again.bake_changed_from(&same, &params, keep_error, &none).unwrap();
+        assert!(light(&again) == light(&first));
+    }
+}
+
+#[test]
+fn what_looks_other_is_baked() {
+    let none = Progress::none();
+    let params = params();
+    let (_, mut first) = revised([true, true], &[], 5.0);
+    first.bake(&params, &none).unwrap();
+    let desc = LightmapDesc { texels_per_unit: 24.0, page_size: 512, ..Default::default() };
+    let rebuilt = |change: &dyn Fn(&mut Vec<Mesh>)| {
+        let mut data = SceneData::new();
+        let (scene, _) = revised([true, true], &[], 5.0);
+        for albedo in [0.7, 0.1] {
+            data.add_material(Material { albedo: [albedo; 3], ..Default::default() }).unwrap();
+        }
+        let mut meshes = scene.meshes().to_vec();
+        change(&mut meshes);
+        for mesh in meshes {
+            data.add_mesh(mesh).unwrap();
+        }
+        for light in scene.lights().iter() {
+            data.add_light(*light).unwrap();
+        }
+        let scene = data.committed();
+        Lightmap::create(&scene, &desc, &none).unwrap()
+    };
+    let mut untouched = rebuilt(&|_| ());
+    assert_eq!(revise(&first, &mut untouched, &params, 0.0).0, 1.0);
+    // The block is dark: it and what it lights are baked, the second room is not.
+    let mut dark = rebuilt(&|meshes| meshes[1].materials = MeshMaterials::One(1));
+    let (kept, worst) = revise(&first, &mut dark, &params, 0.05);
+    assert!((0.3..0.97).contains(&kept) && worst[0] == 0.0 && worst[1] < 0.25, "{kept} {worst:?}");
+    // One mesh of both: triangles are matched one by one.
+    let mut joined = rebuilt(&|meshes| {
+        let block = meshes.pop().unwrap();
+        let walls = &mut meshes[0];
+        let first = walls.positions.len() as u32;
+        let joined = |a: &[Vec3], b: &[Vec3]| [a, b].concat();
+        walls.positions = joined(&walls.positions, &block.positions).into();
+        if !walls.normals.is_empty() {
+            walls.normals = joined(&walls.normals, &block.normals).into();
+        }
+        if !walls.uvs.is_empty() {
+            walls.uvs = [&walls.uvs[..], &block.uvs[..]].concat().into();
+        }
+        let moved: Vec<[u32; 3]> = block.indices.iter().map(|t| t.map(|i| i + first)).collect();
+        walls.indices = [&walls.indices[..], &moved[..]].concat().into();
+        walls.materials = MeshMaterials::One(0);
+    });
+    assert_eq!(revise(&first, &mut joined, &params, 0.0), (1.0, [0.0; 2]));
+    // Another density, or other parameters: nothing can be kept.
+    let finer = LightmapDesc { texels_per_unit: 30.0, ..desc.clone() };
+    let (scene, _) = revised([true, true], &[], 5.0);
+    let mut finer = Lightmap::create(&scene, &finer, &none).unwrap();
+    assert_eq!(revise(&first, &mut finer, &params, 0.05).0, 0.0);
+    let other = BakeParams { gather_rays: 32, ..params };
+    assert_eq!(revise(&first, &mut untouched, &other, 0.05).0, 0.0);
 }

@@ -9,6 +9,8 @@ use crate::base::memory::{try_filled, try_with_capacity};
 use crate::base::sampling::combine;
 use crate::lightmap::atlas::Atlas;
 use crate::lightmap::atlas::ids::LightTexel;
+use crate::lightmap::changed::comparison::SceneState;
+use crate::lightmap::changed::correspondence::Correspondence;
 use crate::lightmap::tiles::TILE;
 use crate::trace::{RawHit, Ray};
 use glam::Vec3;
@@ -19,11 +21,17 @@ pub(in crate::lightmap) struct State<'a> {
     atlas: &'a Atlas,
     backs: &'a [bool],
     lookup: RadianceLookup<'a>,
+    former: Option<&'a Correspondence>,
 }
 
 impl<'a> State<'a> {
-    pub fn new(atlas: &'a Atlas, backs: &'a [bool], radiance: &'a Radiance) -> Self {
-        State { atlas, backs, lookup: RadianceLookup::new(&atlas.charts, &atlas.radiance, radiance) }
+    pub fn new(SceneState { atlas, backs, former }: SceneState<'a>, radiance: &'a Radiance) -> Self {
+        State { atlas, backs, lookup: RadianceLookup::new(&atlas.charts, &atlas.radiance, radiance), former }
+    }
+
+    /// Returns the number in this state of a triangle that is in `new`; `None`: there was none.
+    fn triangle(&self, new: &State, triangle: u32) -> Option<u32> {
+        self.former.map_or(Some(triangle), |former| former.triangle(&new.atlas.scene, triangle))
     }
 }
 
@@ -86,11 +94,15 @@ impl ProbeRays {
         let (through, numbers, through_hits) = &mut self.through;
         through.clear();
         numbers.clear();
-        for (i, (ray, hit)) in (0..).zip(rays.iter().zip(&*new_hits)) {
+        for (i, (ray, hit)) in (0..).zip(rays.iter().zip(&mut old_hits[..count])) {
+            let former = if hit.is_miss() { Some(hit.triangle) } else { old.triangle(new, hit.triangle) };
             // A miss is infinitely far away.
-            if passes(ray, hit.t) {
-                through.push(*ray);
-                numbers.push(i);
+            match former.filter(|_| !passes(ray, hit.t)) {
+                Some(triangle) => hit.triangle = triangle,
+                None => {
+                    through.push(*ray);
+                    numbers.push(i);
+                }
             }
         }
         old.atlas.scene.intersect_stream(through, through_hits);

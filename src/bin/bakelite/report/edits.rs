@@ -1,8 +1,11 @@
 //! `bakelite report edits`: an object of a scene moves; seconds to right light by baking what has changed, beside a bake
-//! from nothing, and the difference of the two; and the same of live light that follows, beside live light made anew.
+//! from nothing, and the difference of the two; the same of live light that follows, beside live light made anew; and of
+//! scenes that are described anew, without the object and with it again.
 //!
 //! Objects are pieces whose triangles hang together. Some are chosen at random among those of a size that a person
 //! would move, and move by their own size across the floor.
+
+mod revisions;
 
 use crate::args::ReportArgs;
 use crate::job::Job;
@@ -140,7 +143,8 @@ pub fn run(args: &ReportArgs) -> Result<()> {
         map.load_result(&path, &progress)?;
     }
     std::fs::remove_file(&path).map_err(|e| Error::Io(e.to_string()))?;
-    live_light(args, &mut scene, &mut map, &pieces)
+    live_light(args, &mut scene, &mut map, &pieces)?;
+    revisions::run(args, &scene, &mut map, &pieces)
 }
 
 /// Prints a table of live light that follows the pieces. Updates without a camera have no limit of time.

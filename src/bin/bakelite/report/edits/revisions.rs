@@ -1,0 +1,114 @@
+//! The part of `bakelite report edits` about new scenes: an object is taken away and put back, each time by a scene that is
+//! described and committed anew, whose light map keeps light of the one before.
+
+use super::{CLEARLY, KEEP_ERRORS, Light, PASSES, Piece, Time, difference, differences, light};
+use crate::args::ReportArgs;
+use bakelite::lightmap::{BakeParams, Lightmap};
+use bakelite::scene::MeshMaterials;
+use bakelite::{Progress, Result, Scene, SceneData};
+use std::collections::HashSet;
+use std::sync::Arc;
+use std::time::Instant;
+
+/// A difference of light that lets all light stand which can be kept: only surfaces that are new are baked.
+const ALL: f32 = 1e9;
+
+/// Prints a table in Markdown. `map` is a light map of `scene`.
+pub fn run(args: &ReportArgs, scene: &Arc<Scene>, map: &mut Lightmap, pieces: &[Piece]) -> Result<()> {
+    println!("\nScenes described anew, without an object and with it again:\n");
+    println!(
+        "| triangles | size | | commit, charts and texels, s | texels changed | keep_error | what changed, s | from nothing, s | \
+         kept | error, in these texels: what changed | from nothing | old light |"
+    );
+    println!("|---|---|---|---|---|---|---|---|---|---|---|---|");
+    for piece in pieces {
+        map.bake(&args.bake.params, &Progress::none())?;
+        let mut less = revise(args, scene, map, Some(piece), piece)?;
+        less.bake(&args.bake.params, &Progress::none())?;
+        revise(args, scene, &less, None, piece)?;
+    }
+    Ok(())
+}
+
+/// Makes the scene without a piece, or as it is, and prints rows about its light map, which keeps light of `earlier`.
+fn revise(
+    args: &ReportArgs,
+    scene: &Arc<Scene>,
+    earlier: &Lightmap,
+    without: Option<&Piece>,
+    piece: &Piece,
+) -> Result<Lightmap> {
+    let (params, progress) = (args.bake.params, Progress::none());
+    let data = copy(scene, without)?;
+    let start = Instant::now();
+    let revised = Scene::commit(scene.device(), data, &args.bake.build, &progress).map_err(|(_, e)| e)?;
+    let mut map = Lightmap::create(&revised, &args.bake.desc, &progress)?;
+    let made = start.elapsed().as_secs_f64();
+    let (_, whole) = Time::of(|| map.bake(&params, &progress))?;
+    let from_nothing_light = light(&map)?;
+    map.bake(&BakeParams { seed: params.seed + 1, passes: PASSES, ..params }, &progress)?;
+    let right = light(&map)?;
+    map.bake_changed_from(earlier, &params, ALL, &progress)?;
+    let old = light(&map)?;
+    let changed = differences(&old, &from_nothing_light);
+    let changed: Vec<bool> = changed.into_iter().map(|d| d.is_some_and(|d| d > CLEARLY)).collect();
+    let (all, count) = (vec![true; changed.len()], changed.iter().filter(|&&c| c).count());
+    let texels = map.info().texels as f64;
+    let errors = |light: &Light| {
+        let [all, changed] = [&all, &changed].map(|which| difference(light, &right, which));
+        format!("{all:.2e}, {changed:.2e}")
+    };
+    for keep_error in KEEP_ERRORS {
+        let (stats, time) = Time::of(|| map.bake_changed_from(earlier, &params, keep_error, &progress))?;
+        println!(
+            "| {} | {:.2} | {} | {made:.2} | {:.2} % | {keep_error} | {} | {} | {:.1} % | {} | {} | {} |",
+            piece.triangles,
+            piece.size,
+            if without.is_some() { "taken away" } else { "put back" },
+            100.0 * count as f64 / texels,
+            time.text(),
+            whole.text(),
+            100.0 * stats.kept_texels as f64 / texels,
+            errors(&light(&map)?),
+            errors(&from_nothing_light),
+            errors(&old),
+        );
+    }
+    Ok(map)
+}
+
+/// The description of a scene, without the triangles of a piece.
+fn copy(scene: &Scene, without: Option<&Piece>) -> Result<SceneData> {
+    let mut data = SceneData::new();
+    for texture in scene.textures() {
+        data.add_texture(texture.as_ref().clone())?;
+    }
+    for &material in scene.materials() {
+        data.add_material(material)?;
+    }
+    for environment in scene.environments() {
+        data.add_environment(environment.as_ref().clone());
+    }
+    for &light in scene.lights().iter() {
+        data.add_light(light)?;
+    }
+    for (number, mesh) in (0..).zip(scene.meshes()) {
+        let mut mesh = mesh.clone();
+        if let Some(piece) = without.filter(|piece| piece.mesh == number) {
+            let gone: HashSet<u32> = piece.vertices.iter().copied().collect();
+            let stays: Vec<bool> = mesh.indices.iter().map(|corners| !gone.contains(&corners[0])).collect();
+            let mut flags = stays.iter();
+            let indices: Vec<_> = mesh.indices.iter().copied().filter(|_| flags.next() == Some(&true)).collect();
+            mesh.indices = indices.into();
+            if let MeshMaterials::PerTriangle(materials) = &mesh.materials {
+                let kept = materials.iter().zip(&stays).filter(|(_, stays)| **stays).map(|(&m, _)| m);
+                mesh.materials = MeshMaterials::PerTriangle(kept.collect::<Vec<_>>().into());
+            }
+        }
+        data.add_mesh(mesh)?;
+    }
+    for instance in scene.instances() {
+        data.add_instance(instance.clone())?;
+    }
+    Ok(data)
+}

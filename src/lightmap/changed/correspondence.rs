@@ -1,0 +1,393 @@
+//! Which surfaces of two scenes are the same, so that a light map of one keeps light of a light map of the other: after
+//! meshes were added, removed or edited.
+//!
+//! Objects of the same content in the same place are matched first, by hashes and then bit for bit. Of the others, single
+//! triangles are, since an edited mesh may have kept most of its own. What is left in either scene was removed or is new,
+//! and counts as [moved](Moved). Charts are matched whose triangles are, with the same coordinates in the chart, and with
+//! them their texels: these are numbered alike in a placement.
+
+use crate::base::directional::Directional;
+use crate::base::error::Result;
+use crate::base::geometry::is_valid_triangle;
+use crate::base::memory::{Reservation, try_collect, try_filled, try_push, try_vec};
+use crate::base::progress::Progress;
+use crate::lightmap::atlas::Atlas;
+use crate::lightmap::atlas::ids::{ChartId, LightTexel, PlacementId};
+use crate::lightmap::indirect::radiance_map::Radiance;
+use crate::lightmap::moved::{Bounds, Moved};
+use crate::lightmap::plan::Plan;
+use crate::lightmap::{Light, Spread};
+use crate::scene::{Material, NONE, Object, Scene, Texture};
+use glam::Vec3;
+use std::hash::{DefaultHasher, Hash, Hasher};
+
+/// Name of these lists in error messages.
+const MATCHED: &str = "what two scenes have in common";
+
+/// Bytes per triangle that is matched by itself: its number, hash, class, and links to others alike.
+const TRIANGLE_BYTES: usize = 36;
+
+/// The former numbers of an object's triangles.
+#[derive(Clone, Copy)]
+enum Former {
+    /// Those of an object whose first triangle this is.
+    Object(u32),
+    /// In the list of triangles, from this entry on.
+    Triangles(usize),
+}
+
+/// For the surfaces of a scene, the same ones of an earlier scene.
+pub(crate) struct Correspondence {
+    /// By object.
+    objects: Vec<Former>,
+    /// Former numbers of triangles that were matched by themselves; [`NONE`]: there was none.
+    triangles: Vec<u32>,
+    /// By placement of the light map, that of the same texels; [`PlacementId::NONE`]: there was none.
+    placements: Vec<PlacementId>,
+    _memory: Reservation,
+}
+
+impl Correspondence {
+    /// Matches the surfaces of two atlases; returns also what only one of them has.
+    pub fn between(old: &Atlas, new: &Atlas, progress: &Progress) -> Result<(Correspondence, Moved)> {
+        let scenes = [&*old.scene, &*new.scene];
+        let materials = Materials::of(scenes)?;
+        progress.check()?;
+        let counts = scenes.map(Scene::object_count);
+        let object = |i: usize| match (i as u32).checked_sub(counts[0]) {
+            None => Place { scene: scenes[0], materials: &materials.numbers[0], object: i as u32 },
+            Some(object) => Place { scene: scenes[1], materials: &materials.numbers[1], object },
+        };
+        let total = (counts[0] + counts[1]) as usize;
+        let of_objects = former(counts[0] as usize, total, |i| object(i).hash(), |i, j| object(i).is_same(&object(j)))?;
+        progress.check()?;
+        // The triangles of all other objects.
+        let is_taken = taken(&of_objects, counts[0] as usize)?;
+        let mut rest: [Vec<u32>; 2] = [Vec::new(), Vec::new()];
+        for number in (0..counts[0]).filter(|&number| !is_taken[number as usize]) {
+            for triangle in scenes[0].triangles_of(number) {
+                try_push(&mut rest[0], triangle, MATCHED)?;
+            }
+        }
+        let mut objects = try_vec(counts[1] as usize, MATCHED)?;
+        for (number, (out, &found)) in (0..).zip(objects.iter_mut().zip(&of_objects)) {
+            if found != NONE {
+                *out = Former::Object(scenes[0].first_triangle(found));
+                continue;
+            }
+            *out = Former::Triangles(rest[1].len());
+            for triangle in scenes[1].triangles_of(number) {
+                try_push(&mut rest[1], triangle, MATCHED)?;
+            }
+        }
+        let [before, after] = rest.each_ref().map(Vec::len);
+        let bytes = TRIANGLE_BYTES * (before + after);
+        let mut memory = new.scene.device().memory().reserve(bytes, MATCHED)?;
+        let triangle = |i: usize| match i.checked_sub(before) {
+            None => Corners::of(scenes[0], &materials.numbers[0], rest[0][i]),
+            Some(i) => Corners::of(scenes[1], &materials.numbers[1], rest[1][i]),
+        };
+        let hash = |i: usize| hash_of(&triangle(i));
+        let mut triangles = former(before, before + after, hash, |i, j| triangle(i) == triangle(j))?;
+        progress.check()?;
+        let are_taken = taken(&triangles, before)?;
+        let (mut boxes, mut emits) = (Vec::new(), false);
+        emits |= add_boxes(scenes[0], &rest[0], |i| are_taken[i], &mut boxes)?;
+        emits |= add_boxes(scenes[1], &rest[1], |i| triangles[i] != NONE, &mut boxes)?;
+        for former in triangles.iter_mut().filter(|former| **former != NONE) {
+            *former = rest[0][*former as usize];
+        }
+        memory.shrink(bytes - size_of_val(&triangles[..]));
+        let mut found = Correspondence { objects, triangles, placements: Vec::new(), _memory: memory };
+        let charts = try_collect(new.charts.ids().map(|chart| found.former_chart(old, new, chart)), MATCHED)?;
+        found.placements = try_collect(Self::former_placements(old, new, &charts), MATCHED)?;
+        let has_moved = charts.iter().map(|&chart| chart == ChartId::NONE);
+        let moved = Moved::new(try_collect(has_moved, MATCHED)?, boxes, emits);
+        Ok((found, moved))
+    }
+
+    /// Returns the former number of a triangle of the scene.
+    pub fn triangle(&self, scene: &Scene, triangle: u32) -> Option<u32> {
+        let (object, of_object) = scene.locate(triangle);
+        match self.objects[object as usize] {
+            Former::Object(first) => Some(first + of_object),
+            Former::Triangles(begin) => Some(self.triangles[begin + of_object as usize]).filter(|&t| t != NONE),
+        }
+    }
+
+    /// Returns the former number of a chart, [`ChartId::NONE`] if its triangles were another chart or none.
+    fn former_chart(&self, old: &Atlas, new: &Atlas, chart: ChartId) -> ChartId {
+        let former = |triangle| self.triangle(&new.scene, triangle);
+        let triangles = new.charts.triangles_of(chart);
+        let first = triangles.clone().next().and_then(former);
+        let Some(found) = first.and_then(|triangle| old.charts.find(triangle)) else { return ChartId::NONE };
+        let is_same = |triangle: u32| {
+            former(triangle).is_some_and(|former| {
+                old.charts.find(former) == Some(found) && old.charts.corners(former) == new.charts.corners(triangle)
+            })
+        };
+        let count = old.charts.triangles_of(found).len();
+        if triangles.len() == count && triangles.clone().all(is_same) { found } else { ChartId::NONE }
+    }
+
+    /// Yields the former placement of each placement, given the former charts.
+    fn former_placements<'a>(
+        old: &'a Atlas,
+        new: &'a Atlas,
+        charts: &'a [ChartId],
+    ) -> impl Iterator<Item = PlacementId> + use<'a> {
+        let layouts = [&old.map.layout, &new.map.layout];
+        (0..layouts[1].placements.len()).map(PlacementId::new).map(move |placement| {
+            let chart = charts[layouts[1].chart_of(placement).index()];
+            if chart == ChartId::NONE {
+                return PlacementId::NONE;
+            }
+            let former = layouts[0].side(chart, !layouts[1].is_back(placement));
+            let is_alike = |&p: &PlacementId| old.map.texels_of(p).len() == new.map.texels_of(placement).len();
+            former.filter(is_alike).unwrap_or(PlacementId::NONE)
+        })
+    }
+
+    /// Returns the former number of a texel of a placement, if it showed the same point.
+    pub fn texel(&self, old: &Atlas, new: &Atlas, placement: PlacementId, texel: LightTexel) -> Option<LightTexel> {
+        let former = self.placements[placement.index()];
+        if former == PlacementId::NONE {
+            return None;
+        }
+        let place = texel.index() - new.map.texels_of(placement).indices().start;
+        let former_texel = LightTexel::new(old.map.texels_of(former).indices().start + place);
+        let (here, there) = (&new.map[texel], &old.map[former_texel]);
+        let within = |x: u16, y: u16, rect: &crate::lightmap::atlas::layout::Placement| (x - rect.x, y - rect.y);
+        let is_same = within(here.x, here.y, &new.map.layout[placement])
+            == within(there.x, there.y, &old.map.layout[former])
+            && [here.u, here.v] == [there.u, there.v]
+            && self.triangle(&new.scene, here.triangle) == Some(there.triangle);
+        is_same.then_some(former_texel)
+    }
+
+    /// Copies light of the earlier atlas, as it was before seams were stitched, to the texels that are the same in the new
+    /// one; others are dark. Without radiance map and states of texels.
+    pub(in crate::lightmap) fn carried(&self, light: &Light, old: &Atlas, new: &Atlas) -> Result<Light> {
+        let n = new.map.len();
+        let of = |is_asked: bool| if is_asked { n } else { 0 };
+        let (directional, spread) = (of(!light.directional.is_empty()), of(!light.spread.is_empty()));
+        let bytes = n * 2 * size_of::<Vec3>() + directional * size_of::<Directional>() + spread * size_of::<Spread>();
+        let mut out = Light {
+            direct: try_vec(n, MATCHED)?,
+            indirect: try_vec(n, MATCHED)?,
+            directional: try_vec(directional, MATCHED)?,
+            spread: try_vec(spread, MATCHED)?,
+            state: Vec::new(),
+            radiance: Radiance::default(),
+            backs: try_vec(if light.backs.is_empty() { 0 } else { new.charts.charts.len() }, MATCHED)?,
+            stitch: None,
+            origin: light.origin,
+            plan: Plan::default(),
+            _memory: new.scene.device().memory().reserve(bytes, MATCHED)?,
+        };
+        for (p, &former) in self.placements.iter().enumerate().filter(|(_, former)| **former != PlacementId::NONE) {
+            let placement = PlacementId::new(p);
+            let (to, from) = (new.map.texels_of(placement).indices(), old.map.texels_of(former).indices());
+            let direct = &mut out.direct[to.clone()];
+            let indirect = &mut out.indirect[to.clone()];
+            direct.copy_from_slice(&light.direct[from.clone()]);
+            indirect.copy_from_slice(&light.indirect[from.clone()]);
+            let directional = out.directional.get_mut(to.clone()).unwrap_or_default();
+            directional.copy_from_slice(light.directional.get(from.clone()).unwrap_or_default());
+            if let Some(stitch) = &light.stitch {
+                stitch.former_of(&from, direct, indirect, directional);
+            }
+            let spread = out.spread.get_mut(to).unwrap_or_default();
+            spread.copy_from_slice(light.spread.get(from).unwrap_or_default());
+            let charts = [old.map.layout.chart_of(former), new.map.layout.chart_of(placement)];
+            if let Some((to, &from)) = out.backs.get_mut(charts[1].index()).zip(light.backs.get(charts[0].index())) {
+                *to = from;
+            }
+        }
+        Ok(out)
+    }
+}
+
+impl Default for Former {
+    fn default() -> Self {
+        Former::Triangles(0)
+    }
+}
+
+/// For each of the things from `olds` on, of `total`, the number of one before that is the same, each of which is given
+/// once; [`NONE`]: there is none. `hash` and `same` are by number.
+fn former(
+    olds: usize,
+    total: usize,
+    hash: impl Fn(usize) -> u64,
+    same: impl Fn(usize, usize) -> bool,
+) -> Result<Vec<u32>> {
+    let kinds = kinds(total, hash, same)?;
+    // Lists of what is the same, by its kind.
+    let mut first: Vec<u32> = try_filled(total, NONE, MATCHED)?;
+    let mut next: Vec<u32> = try_filled(olds, NONE, MATCHED)?;
+    for old in (0..olds).rev() {
+        next[old] = std::mem::replace(&mut first[kinds[old] as usize], old as u32);
+    }
+    let take = |&kind: &u32| match first[kind as usize] {
+        NONE => NONE,
+        old => {
+            first[kind as usize] = next[old as usize];
+            old
+        }
+    };
+    try_collect(kinds[olds..].iter().map(take), MATCHED)
+}
+
+/// Gives the same number to what is the same: that of the first of it.
+fn kinds(count: usize, hash: impl Fn(usize) -> u64, same: impl Fn(usize, usize) -> bool) -> Result<Vec<u32>> {
+    let mut order = try_collect((0..count).map(|i| (hash(i), i as u32)), MATCHED)?;
+    order.sort_unstable();
+    let mut kinds: Vec<u32> = try_vec(count, MATCHED)?;
+    for alike in order.chunk_by(|a, b| a.0 == b.0) {
+        for (k, &(_, i)) in alike.iter().enumerate() {
+            let is_first = |&j: &u32| kinds[j as usize] == j && same(j as usize, i as usize);
+            let first = alike[..k].iter().map(|&(_, j)| j).find(is_first).unwrap_or(i);
+            kinds[i as usize] = first;
+        }
+    }
+    Ok(kinds)
+}
+
+/// Whether each of `count` things is among those found.
+fn taken(found: &[u32], count: usize) -> Result<Vec<bool>> {
+    let mut taken: Vec<bool> = try_vec(count, MATCHED)?;
+    found.iter().filter(|&&i| i != NONE).for_each(|&i| taken[i as usize] = true);
+    Ok(taken)
+}
+
+/// Adds boxes around runs of triangles that have no counterpart; returns whether any of them emits light.
+fn add_boxes(
+    scene: &Scene,
+    triangles: &[u32],
+    has_counterpart: impl Fn(usize) -> bool,
+    boxes: &mut Vec<Bounds>,
+) -> Result<bool> {
+    let (mut emits, mut end) = (false, None);
+    for (_, &triangle) in triangles.iter().enumerate().filter(|(i, _)| !has_counterpart(*i)) {
+        let corners = scene.corners(triangle);
+        if !is_valid_triangle(corners) {
+            continue;
+        }
+        emits |= scene.material(triangle).is_emissive();
+        if end != Some(triangle) || boxes.is_empty() {
+            try_push(boxes, Bounds::EMPTY, MATCHED)?;
+        }
+        end = Some(triangle + 1);
+        let last = boxes.len() - 1;
+        corners.into_iter().for_each(|corner| boxes[last].add(corner));
+    }
+    Ok(emits)
+}
+
+/// Numbers of materials that are the same for the same content in both scenes.
+struct Materials {
+    numbers: [Vec<u32>; 2],
+}
+
+impl Materials {
+    fn of(scenes: [&Scene; 2]) -> Result<Materials> {
+        let counts = scenes.map(|scene| scene.textures().len());
+        let texture = |i: usize| match i.checked_sub(counts[0]) {
+            None => &scenes[0].textures()[i],
+            Some(i) => &scenes[1].textures()[i],
+        };
+        let hash = |i: usize| {
+            let Texture { width, height, ref rgba8 } = **texture(i);
+            hash_of(&(width, height, rgba8.as_flattened()))
+        };
+        let textures = kinds(counts[0] + counts[1], hash, |i, j| texture(i) == texture(j))?;
+        let texture_of = |side: usize, number: u32| match number {
+            NONE => NONE,
+            number => textures[[0, counts[0]][side] + number as usize],
+        };
+        let count = scenes[0].materials().len();
+        let material = |i: usize| {
+            let (side, i) = i.checked_sub(count).map_or((0, i), |i| (1, i));
+            let Material { albedo, emission, two_sided, albedo_texture, alpha_cutoff, transmission } =
+                scenes[side].materials()[i];
+            let colours = [albedo, emission, transmission].map(|c| c.map(f32::to_bits));
+            (colours, two_sided, texture_of(side, albedo_texture), alpha_cutoff.to_bits())
+        };
+        let total = count + scenes[1].materials().len();
+        let mut numbers = kinds(total, |i| hash_of(&material(i)), |i, j| material(i) == material(j))?;
+        let of_new = try_collect(numbers.drain(count..), MATCHED)?;
+        Ok(Materials { numbers: [numbers, of_new] })
+    }
+}
+
+/// An object of a scene, whose materials are numbered by content.
+struct Place<'a> {
+    scene: &'a Scene,
+    materials: &'a [u32],
+    object: u32,
+}
+
+impl Place<'_> {
+    fn object(&self) -> Object<'_> {
+        self.scene.object(self.object)
+    }
+
+    /// Yields the materials of the triangles that stand in the scene.
+    fn materials(&self) -> impl Iterator<Item = u32> {
+        self.scene.triangles_of(self.object).map(|t| self.materials[self.scene.material_id(t) as usize])
+    }
+
+    fn hash(&self) -> u64 {
+        let mut hasher = DefaultHasher::new();
+        let mesh = self.object().mesh();
+        bytemuck::cast_slice::<_, u32>(&mesh.positions[..]).hash(&mut hasher);
+        mesh.indices.as_flattened().hash(&mut hasher);
+        self.materials().for_each(|material| material.hash(&mut hasher));
+        hasher.finish()
+    }
+
+    fn is_same(&self, other: &Place) -> bool {
+        fn bits<T: bytemuck::NoUninit>(values: &[T]) -> &[u32] {
+            bytemuck::cast_slice(values)
+        }
+        let [here, there] = [self.object(), other.object()];
+        let (a, b) = (here.mesh(), there.mesh());
+        here.stands_as(&there)
+            && a.indices == b.indices
+            && bits(&a.normals[..]) == bits(&b.normals[..])
+            && bits(&a.uvs[..]) == bits(&b.uvs[..])
+            && self.materials().eq(other.materials())
+    }
+}
+
+/// All that makes a triangle look as it does, bit for bit.
+#[derive(Hash, PartialEq)]
+struct Corners {
+    positions: [[u32; 3]; 3],
+    normals: Option<[[u32; 3]; 3]>,
+    uvs: Option<[[u32; 2]; 3]>,
+    material: u32,
+}
+
+impl Corners {
+    fn of(scene: &Scene, materials: &[u32], triangle: u32) -> Corners {
+        let (number, of_object) = scene.locate(triangle);
+        let object = scene.object(number);
+        let mesh = object.mesh();
+        let vertices = mesh.indices[of_object as usize];
+        let bits = |v: Vec3| v.to_array().map(f32::to_bits);
+        Corners {
+            positions: object.corners(of_object).map(bits),
+            normals: (!mesh.normals.is_empty()).then(|| vertices.map(|v| bits(object.normal(v)))),
+            uvs: (!mesh.uvs.is_empty()).then(|| vertices.map(|v| mesh.uvs[v as usize].to_array().map(f32::to_bits))),
+            material: materials[scene.material_id(triangle) as usize],
+        }
+    }
+}
+
+fn hash_of(content: &impl Hash) -> u64 {
+    let mut hasher = DefaultHasher::new();
+    content.hash(&mut hasher);
+    hasher.finish()
+}
