@@ -521,8 +521,8 @@ pub unsafe extern "C" fn bk_bake_changed(
     })
 }
 
-/// Bakes a light map and keeps what it can of the light of an earlier one, of a scene of which this
-/// one's is a revision: after meshes were added, removed, edited, or given other materials.
+/// Bakes a light map and keeps light of an earlier one, of a scene of which this one's is a
+/// revision: after meshes were added, removed, edited, or given other materials.
 ///
 /// The new scene is described and committed like any other, and its light map made with the
 /// `texels_per_unit` (not 0), divisors and other fields of the earlier one, so that surfaces which
@@ -534,7 +534,7 @@ pub unsafe extern "C" fn bk_bake_changed(
 /// other parameters or has no surface in common with this one, everything is baked.
 ///
 /// Errors add up as in bk_bake_changed. A cache folder (bk_device_desc.cache_folder) saves the
-/// unwraps of what stays, too.
+/// unwraps of meshes that stay, too.
 ///
 /// Cost: as bk_bake_changed, and a few hundred bytes and a microsecond per triangle of objects that
 /// changed, less of those that did not; the earlier light is held a second time while it is baked.
@@ -547,7 +547,8 @@ pub unsafe extern "C" fn bk_bake_changed(
 /// @param earlier  another light map, of another scene or the same one, on any device
 /// @param params  parameters of the last bake of `earlier`, without a range of texels, checkpoint,
 ///   shares and target_error; NULL for the defaults
-/// @param keep_error  as in bk_bake_changed
+/// @param keep_error  change of light below which texels keep it, as a fraction, as in
+///   bk_bake_changed; finite, >= 0
 /// @param progress,user  progress callback and its pointer; may be NULL
 /// @param out  receives numbers about the bake; may be NULL
 /// @retval BK_ERROR_INVALID_ARGUMENT  `earlier` is `lightmap`, or `keep_error` or a field of

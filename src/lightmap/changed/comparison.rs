@@ -17,7 +17,7 @@ use crate::lightmap::indirect::sample_set::SampleSet;
 use crate::lightmap::moved::{Bounds, Moved};
 use crate::lightmap::stages::purpose;
 use crate::lightmap::tiles::TILE;
-use crate::trace::Ray;
+use crate::trace::{RawHit, Ray};
 use rayon::prelude::*;
 use std::sync::atomic::{AtomicU64, Ordering::Relaxed};
 
@@ -239,21 +239,30 @@ impl<'a, 'p> Comparison<'a, 'p> {
     ) -> Result<u64> {
         let probes = cells.iter().filter(|cell| !cell.is_new);
         let probes = try_collect(probes.flat_map(Cell::probes), CHANGED)?;
-        let [old, new] =
-            [(self.old, radiance[0]), (self.new, radiance[1])].map(|(side, radiance)| State::new(side, radiance));
+        let [old, new] = [(self.old, radiance[0]), (self.new, radiance[1])]
+            .map(|(s, radiance)| State::new(s.atlas, s.backs, radiance));
         let samples =
             SampleSet::new(params.gather_rays.min(PROBE_RAYS), purpose_seed(params.seed, purpose::GATHER_SET));
         let seed = purpose_seed(params.seed, purpose::PROBE);
         let dark = DARK * mean;
         let boxes = &self.moved.boxes;
-        let passes =
-            |ray: &Ray, t: f32| boxes.iter().any(|moved| moved.is_hit(ray.origin.into(), ray.direction.into(), t));
+        // What moved lies, in both states, in the boxes: a ray that passes none has the same hit in both. A miss is
+        // infinitely far away.
+        let former = |ray: &Ray, hit: &RawHit| {
+            let passes = |moved: &Bounds| moved.is_hit(ray.origin.into(), ray.direction.into(), hit.t);
+            let former = match self.old.former {
+                Some(former) if !hit.is_miss() => former.triangle(&self.new.atlas.scene, hit.triangle),
+                _ => Some(hit.triangle),
+            };
+            let triangle = former.filter(|_| !boxes.iter().any(passes))?;
+            Some(RawHit { triangle, ..*hit })
+        };
         let (rooms, rays) = (Scratch::new(), AtomicU64::new(0));
         let differ = |texels: &[LightTexel]| -> Result<Vec<bool>> {
             self.progress.check()?;
             let mut room = rooms.take(ProbeRays::new)?;
             let mut found = [[Probe::default(); 2]; TILE];
-            rays.fetch_add(room.gather([&old, &new], texels, &samples, seed, passes, &mut found), Relaxed);
+            rays.fetch_add(room.gather([&old, &new], texels, &samples, seed, former, &mut found), Relaxed);
             let differs = |(&texel, [old, new]): (&LightTexel, &[Probe; 2])| {
                 let difference = (new.irradiance - old.irradiance).abs().element_sum();
                 // What is not a number differs.

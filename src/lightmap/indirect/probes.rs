@@ -9,8 +9,6 @@ use crate::base::memory::{try_filled, try_with_capacity};
 use crate::base::sampling::combine;
 use crate::lightmap::atlas::Atlas;
 use crate::lightmap::atlas::ids::LightTexel;
-use crate::lightmap::changed::comparison::SceneState;
-use crate::lightmap::changed::correspondence::Correspondence;
 use crate::lightmap::tiles::TILE;
 use crate::trace::{RawHit, Ray};
 use glam::Vec3;
@@ -21,17 +19,11 @@ pub(in crate::lightmap) struct State<'a> {
     atlas: &'a Atlas,
     backs: &'a [bool],
     lookup: RadianceLookup<'a>,
-    former: Option<&'a Correspondence>,
 }
 
 impl<'a> State<'a> {
-    pub fn new(SceneState { atlas, backs, former }: SceneState<'a>, radiance: &'a Radiance) -> Self {
-        State { atlas, backs, lookup: RadianceLookup::new(&atlas.charts, &atlas.radiance, radiance), former }
-    }
-
-    /// Returns the number in this state of a triangle that is in `new`; `None`: there was none.
-    fn triangle(&self, new: &State, triangle: u32) -> Option<u32> {
-        self.former.map_or(Some(triangle), |former| former.triangle(&new.atlas.scene, triangle))
+    pub fn new(atlas: &'a Atlas, backs: &'a [bool], radiance: &'a Radiance) -> Self {
+        State { atlas, backs, lookup: RadianceLookup::new(&atlas.charts, &atlas.radiance, radiance) }
     }
 }
 
@@ -52,7 +44,7 @@ pub(in crate::lightmap) struct ProbeRays {
     rays: Vec<Ray>,
     /// Hits in the old and in the new state.
     hits: [Vec<RawHit>; 2],
-    /// Rays that pass through what has moved, their numbers and hits in the old state.
+    /// Rays that are traced in the old state, too, their numbers and hits in the old state.
     through: (Vec<Ray>, Vec<u32>, Vec<RawHit>),
 }
 
@@ -67,17 +59,17 @@ impl ProbeRays {
         })
     }
 
-    /// Gathers, in the old and the new state, what at most [`TILE`] texels see by the first of the `samples`' rays. What
-    /// moved lies, in both states, in boxes that `passes` tests a ray with, up to a distance: other rays have the same
-    /// hit in both. Bright patches count like other surfaces, since a ray that hits one has the same noise in both.
-    /// Returns the number of rays.
+    /// Gathers, in the old and the new state, what at most [`TILE`] texels see by the first of the `samples`' rays.
+    /// `former` gives a ray's hit in the old state if it follows from that in the new one; other rays are traced in both.
+    /// Bright patches count like other surfaces, since a ray that hits one has the same noise in both. Returns the number
+    /// of rays.
     pub fn gather(
         &mut self,
         [old, new]: [&State; 2],
         texels: &[LightTexel],
         samples: &SampleSet,
         seed: u32,
-        passes: impl Fn(&Ray, f32) -> bool,
+        former: impl Fn(&Ray, &RawHit) -> Option<RawHit>,
         out: &mut [[Probe; 2]; TILE],
     ) -> u64 {
         let points = points_of(samples, 0);
@@ -95,10 +87,8 @@ impl ProbeRays {
         through.clear();
         numbers.clear();
         for (i, (ray, hit)) in (0..).zip(rays.iter().zip(&mut old_hits[..count])) {
-            let former = if hit.is_miss() { Some(hit.triangle) } else { old.triangle(new, hit.triangle) };
-            // A miss is infinitely far away.
-            match former.filter(|_| !passes(ray, hit.t)) {
-                Some(triangle) => hit.triangle = triangle,
+            match former(ray, hit) {
+                Some(former) => *hit = former,
                 None => {
                     through.push(*ray);
                     numbers.push(i);
