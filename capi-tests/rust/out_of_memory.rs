@@ -307,8 +307,11 @@ fn edits(scene: &Arc<Scene>, lightmap: &mut Lightmap, desc: &LightmapDesc, param
     for mesh in scene.meshes() {
         revision.add_mesh(mesh.clone()).unwrap();
     }
-    let mut added = scene.meshes()[0].clone();
-    added.positions = added.positions.iter().map(|p| 0.05 * *p + 0.02).collect::<Vec<_>>().into();
+    let mut added = scene.meshes()[1].clone();
+    added.positions = added.positions.iter().map(|p| 0.05 * *p + Vec3::Z * 0.06).collect();
+    if let Some(lightmap) = &mut added.lightmap {
+        lightmap.pages = vec![2; 2].into();
+    }
     revision.add_mesh(added).unwrap();
     let device = scene.device();
     let revision = Scene::commit(device, revision, &BuildOptions::default(), &none).map_err(|e| e.1).unwrap();
