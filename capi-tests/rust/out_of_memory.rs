@@ -295,6 +295,7 @@ fn edits(scene: &Arc<Scene>, lightmap: &mut Lightmap, desc: &LightmapDesc, param
     assert!(stats.kept_texels > 0);
     // A light map of a scene with one mesh more keeps light, too.
     let mut revision = SceneData::new();
+    let scene = lightmap.scene();
     for texture in scene.textures() {
         revision.add_texture(texture.as_ref().clone()).unwrap();
     }

@@ -16,14 +16,14 @@
 use super::chart_map::ChartMap;
 use super::charts::Charts;
 use super::fill::{Hole, around};
-use super::ids::{Map, PlacementId, TexelId, TexelRange};
+use super::ids::{ChartId, Map, PlacementId, TexelId, TexelRange};
 use super::seen::{self, Seen};
 use super::texels::TexelSample;
 use crate::base::error::Result;
 use crate::base::memory::{try_collect, try_par_collect, try_push, try_vec, try_with_capacity};
 use crate::base::parallel::one_by_one;
 use crate::base::progress::Stage;
-use crate::base::sampling::{cosine_around, sobol_2d};
+use crate::base::sampling::{combine, cosine_around, sobol_2d};
 use crate::scene::Scene;
 use crate::trace::{RawHit, Ray};
 use glam::{Mat2, Vec2, Vec3};
@@ -140,17 +140,19 @@ impl Search<'_> {
         }
         let texels = map.texels_of(placement);
         let indices = texels.indices();
+        let seed = seed_of(self.scene, self.charts, chart);
         let mut buried = Vec::new();
         for first in indices.clone().step_by(BLOCK) {
             stage.advance(0)?;
             let points = &map.texels.samples[first..indices.end.min(first + BLOCK)];
-            let are_buried = self.are_buried(points, first as u32, is_back, &mut found.rays);
+            let seed = seed.wrapping_add((first - indices.start) as u32);
+            let are_buried = self.are_buried(points, seed, is_back, &mut found.rays);
             for (i, _) in are_buried.iter().take(points.len()).enumerate().filter(|(_, is)| **is) {
                 try_push(&mut buried, TexelId::new(first + i), BURIED)?;
             }
         }
         if by_parts || buried.len() == texels.len() {
-            self.find_seen_parts(map, placement, is_back, &texels, &mut buried, &mut found, stage)?;
+            self.find_seen_parts(map, placement, (seed, is_back), &texels, &mut buried, &mut found, stage)?;
         }
         if !buried.is_empty() && buried.len() < texels.len() {
             found.moved = nearest_seen(map, placement, texels, buried, stage)?;
@@ -164,7 +166,7 @@ impl Search<'_> {
         &self,
         map: &ChartMap<M>,
         placement: PlacementId,
-        back: bool,
+        (seed, back): (u32, bool),
         texels: &TexelRange<M>,
         buried: &mut Vec<TexelId<M>>,
         found: &mut Found<M>,
@@ -187,8 +189,9 @@ impl Search<'_> {
                 let neighbour = map.at(placement, x, y);
                 neighbour.is_none_or(|n| !texels.contains(n) || !is_buried[texels.place(n)])
             });
-            let points = if is_at_border { points_of_texel(self.charts, map, placement, s) } else { Vec::new() };
-            let mut is_buried = |point: &TexelSample| self.are_buried(&[*point], s.seed(), back, &mut found.rays)[0];
+            let seed = seed.wrapping_add(texels.place(s) as u32);
+            let points = if is_at_border { points_of_texel(self.charts, map, placement, s, seed) } else { Vec::new() };
+            let mut is_buried = |point: &TexelSample| self.are_buried(&[*point], seed, back, &mut found.rays)[0];
             let seen = points.into_iter().find(|point| !is_buried(point));
             if let Some(point) = seen {
                 result = try_push(&mut found.seen_parts, (s, point), BURIED);
@@ -198,9 +201,9 @@ impl Search<'_> {
         result
     }
 
-    /// Which of at most [`BLOCK`] points, in texels from `first` on, are buried. Rays come in rounds of one per point
+    /// Which of at most [`BLOCK`] points are buried; `seed` is the first one's, which the others' follow. Rays come in rounds of one per point
     /// that is undecided, which are traced as streams: neighbours look the same ways.
-    fn are_buried(&self, points: &[TexelSample], first: u32, back: bool, rays: &mut u64) -> [bool; BLOCK] {
+    fn are_buried(&self, points: &[TexelSample], seed: u32, back: bool, rays: &mut u64) -> [bool; BLOCK] {
         let mut undecided: [Undecided; BLOCK] = std::array::from_fn(|i| {
             let Some(point) = points.get(i) else { return Undecided::default() };
             let (_, receiver) = super::chart_map::receiver_of(self.scene, point, back);
@@ -211,7 +214,8 @@ impl Search<'_> {
         let mut count = points.len();
         for i in 0..RAYS {
             for (probe, point) in probes.iter_mut().zip(&undecided[..count]) {
-                *probe = Ray::new(point.origin, cosine_around(point.normal, sobol_2d(i, first + point.number)));
+                *probe =
+                    Ray::new(point.origin, cosine_around(point.normal, sobol_2d(i, seed.wrapping_add(point.number))));
             }
             self.scene.intersect_stream(&probes[..count], &mut hits);
             *rays += count as u64;
@@ -306,19 +310,28 @@ struct Found<M: Map> {
     rays: u64,
 }
 
+/// Returns the seed of a chart's first texel; others count on from there. It goes by where the chart lies and not by its
+/// number, so that in a scene with more or fewer meshes the same texels are found.
+fn seed_of(scene: &Scene, charts: &Charts, chart: ChartId) -> u32 {
+    let first = charts.triangles_of(chart).next();
+    let corners = first.map_or([Vec3::ZERO; 3], |triangle| scene.corners(triangle));
+    corners.iter().flat_map(|corner| corner.to_array()).fold(0, |seed, c| combine(seed, c.to_bits()))
+}
+
 /// Returns some points of the part of the sample's triangle in its texel.
 fn points_of_texel<M: Map>(
     charts: &Charts,
     map: &ChartMap<M>,
     placement: PlacementId,
     texel: TexelId<M>,
+    seed: u32,
 ) -> Vec<TexelSample> {
     let sample = map[texel];
     let place = |u, v| Vec2::from(map.layout.texel_coord(placement, charts.local(sample.triangle, u, v)));
     let origin = place(0.0, 0.0);
     let weights = Mat2::from_cols(place(1.0, 0.0) - origin, place(0.0, 1.0) - origin).inverse();
     let corner = Vec2::new(f32::from(sample.x), f32::from(sample.y)) - origin;
-    let point = |i| weights * (corner + Vec2::from(sobol_2d(i, texel.seed())));
+    let point = |i| weights * (corner + Vec2::from(sobol_2d(i, seed)));
     let points = (0..POINT_TRIES).map(point).filter(|w| w.min_element() >= 0.0 && w.x + w.y <= 1.0);
     points.map(|w| TexelSample { u: w.x, v: w.y, ..sample }).take(POINTS).collect()
 }

@@ -24,6 +24,10 @@ use std::hash::{DefaultHasher, Hash, Hasher};
 /// Name of these lists in error messages.
 const MATCHED: &str = "what two scenes have in common";
 
+/// Distance, in texels, up to which two points are the same: where charts lie on their pages depends on all of them, and
+/// rounding on where they lie.
+const SAME: f32 = 0.01;
+
 /// Bytes per triangle that is matched by itself: its number, hash, class, and links to others alike.
 const TRIANGLE_BYTES: usize = 36;
 
@@ -115,15 +119,19 @@ impl Correspondence {
         }
     }
 
-    /// Returns the former number of a chart, [`ChartId::NONE`] if its triangles were another chart or none.
+    /// Returns the former number of a chart, [`ChartId::NONE`] if none of its triangles was in one of as many triangles, or
+    /// lay elsewhere in it. (Of a chart of the caller's, single triangles may be new.)
     fn former_chart(&self, old: &Atlas, new: &Atlas, chart: ChartId) -> ChartId {
         let former = |triangle| self.triangle(&new.scene, triangle);
         let triangles = new.charts.triangles_of(chart);
-        let first = triangles.clone().next().and_then(former);
+        let first = triangles.clone().find_map(former);
         let Some(found) = first.and_then(|triangle| old.charts.find(triangle)) else { return ChartId::NONE };
+        let most = SAME / new.map.layout.density;
+        let is_near = |(a, b): (&[f32; 2], &[f32; 2])| (a[0] - b[0]).abs() <= most && (a[1] - b[1]).abs() <= most;
         let is_same = |triangle: u32| {
-            former(triangle).is_some_and(|former| {
-                old.charts.find(former) == Some(found) && old.charts.corners(former) == new.charts.corners(triangle)
+            former(triangle).is_none_or(|former| {
+                let corners = [old.charts.corners(former), new.charts.corners(triangle)];
+                old.charts.find(former) == Some(found) && corners[0].iter().zip(&corners[1]).all(is_near)
             })
         };
         let count = old.charts.triangles_of(found).len();
@@ -160,8 +168,8 @@ impl Correspondence {
         let within = |x: u16, y: u16, rect: &crate::lightmap::atlas::layout::Placement| (x - rect.x, y - rect.y);
         let is_same = within(here.x, here.y, &new.map.layout[placement])
             == within(there.x, there.y, &old.map.layout[former])
-            && [here.u, here.v] == [there.u, there.v]
-            && self.triangle(&new.scene, here.triangle) == Some(there.triangle);
+            && self.triangle(&new.scene, here.triangle) == Some(there.triangle)
+            && here.position(&new.scene).distance(there.position(&old.scene)) <= SAME / new.map.layout.density;
         is_same.then_some(former_texel)
     }
 
