@@ -13,6 +13,8 @@ use crate::base::memory::{Reservation, try_collect, try_filled, try_push, try_ve
 use crate::base::progress::Progress;
 use crate::lightmap::atlas::Atlas;
 use crate::lightmap::atlas::ids::{ChartId, LightTexel, PlacementId};
+use crate::lightmap::atlas::layout::Placement;
+use crate::lightmap::atlas::texels::TexelSample;
 use crate::lightmap::indirect::radiance_map::Radiance;
 use crate::lightmap::moved::{Bounds, Moved};
 use crate::lightmap::plan::Plan;
@@ -156,7 +158,8 @@ impl Correspondence {
         })
     }
 
-    /// Returns the former number of a texel of a placement, if it showed the same point.
+    /// Returns the former number of a texel of a placement, if it showed the same point, or neither shows one of its own,
+    /// being buried.
     pub fn texel(&self, old: &Atlas, new: &Atlas, placement: PlacementId, texel: LightTexel) -> Option<LightTexel> {
         let former = self.placements[placement.index()];
         if former == PlacementId::NONE {
@@ -165,12 +168,16 @@ impl Correspondence {
         let place = texel.index() - new.map.texels_of(placement).indices().start;
         let former_texel = LightTexel::new(old.map.texels_of(former).indices().start + place);
         let (here, there) = (&new.map[texel], &old.map[former_texel]);
-        let within = |x: u16, y: u16, rect: &crate::lightmap::atlas::layout::Placement| (x - rect.x, y - rect.y);
-        let is_same = within(here.x, here.y, &new.map.layout[placement])
-            == within(there.x, there.y, &old.map.layout[former])
-            && self.triangle(&new.scene, here.triangle) == Some(there.triangle)
-            && here.position(&new.scene).distance(there.position(&old.scene)) <= SAME / new.map.layout.density;
-        is_same.then_some(former_texel)
+        let within = |texel: &TexelSample, rect: &Placement| (texel.x - rect.x, texel.y - rect.y);
+        if within(here, &new.map.layout[placement]) != within(there, &old.map.layout[former]) {
+            return None;
+        }
+        let is_buried = |atlas: &Atlas, texel: LightTexel| atlas.buried.get(texel.index()).is_some_and(|&b| b);
+        let shows_same = || {
+            self.triangle(&new.scene, here.triangle) == Some(there.triangle)
+                && here.position(&new.scene).distance(there.position(&old.scene)) <= SAME / new.map.layout.density
+        };
+        (is_buried(new, texel) && is_buried(old, former_texel) || shows_same()).then_some(former_texel)
     }
 
     /// Copies light of the earlier atlas, as it was before seams were stitched, to the texels that are the same in the new
