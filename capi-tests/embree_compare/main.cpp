@@ -16,6 +16,7 @@
 //                        with the same one, that is SSE2, AVX2 or AVX-512
 //     --embree-isa NAME  sse2, sse4.2, avx, avx2, avx512 (default: its own choice, unless --isa is all)
 //     --build LIST       builds of ours that rays are traced on: default, high or both (default: default)
+//     --repeat LIST      as 1,4,12: each scene so many times, beside itself (default 1)
 //     --markdown         tables ready for a document, at the end; all other text goes to stderr
 //     --csv FILE         all figures
 //
@@ -65,6 +66,7 @@ struct Options {
     std::vector<unsigned> threads = {1};
     std::vector<size_t> kinds;
     std::vector<uint32_t> qualities = {BK_BUILD_QUALITY_DEFAULT};
+    std::vector<unsigned> repeats = {1};
     unsigned pairs = 5;
     uint64_t seed = 1;
     uint32_t isa = BK_ISA_AUTO;
@@ -101,7 +103,8 @@ uint32_t one_of(const char *const (&names)[N], const std::string &value, const s
 Options parse(int argc, char **argv) {
     const char *usage =
         "usage: embree_compare SCENE... [--only rays|commits] [--kinds LIST] [--rays N] [--pairs P] [--seed S]\n"
-        "    [--threads LIST] [--isa NAME|all] [--embree-isa NAME] [--build LIST] [--markdown] [--csv FILE]";
+        "    [--threads LIST] [--isa NAME|all] [--embree-isa NAME] [--build LIST] [--repeat LIST]\n"
+        "    [--markdown] [--csv FILE]";
     Options o;
     for (int i = 1; i < argc; i++) {
         const std::string arg = argv[i];
@@ -132,6 +135,9 @@ Options parse(int argc, char **argv) {
         } else if (arg == "--build") {
             o.qualities.clear();
             for (const std::string &q : list(value)) o.qualities.push_back(one_of(QUALITY_NAMES, q, arg));
+        } else if (arg == "--repeat") {
+            o.repeats.clear();
+            for (const std::string &n : list(value)) o.repeats.push_back(unsigned(number(n, arg, 1, 100000)));
         } else if (arg == "--isa") {
             o.all_isas = value == "all";
             if (!o.all_isas) o.isa = one_of(ISA_NAMES, value, arg);
@@ -382,13 +388,13 @@ size_t run_scene(const std::string &name, Setup setup, const Options &o, std::ve
         setup.quality = quality;
         const Scene s(name, setup);
         Row row;
-        row.scene = name;
+        row.scene = setup.times == 1 ? name : name + " x " + std::to_string(setup.times);
         row.isa = ISA_NAMES[bk_device_isa(s.device)];
         row.embree_isa = setup.embree_isa.empty() ? "best" : setup.embree_isa;
         row.build = QUALITY_NAMES[quality];
         if (first) {
             std::fprintf(o.text(), "%s: %llu triangles (%llu degenerate), Bakelite %s, Embree %d.%d.%d %s, %u pairs\n",
-                         name.c_str(), static_cast<unsigned long long>(s.stats.triangles),
+                         row.scene.c_str(), static_cast<unsigned long long>(s.stats.triangles),
                          static_cast<unsigned long long>(s.stats.skipped_degenerate), row.isa.c_str(),
                          RTC_VERSION_MAJOR, RTC_VERSION_MINOR, RTC_VERSION_PATCH, row.embree_isa.c_str(), o.pairs);
             if (o.commits_too) run_commits(s, setup, o, row, rows);
@@ -407,7 +413,12 @@ int main(int argc, char **argv) {
     std::vector<Row> rows;
     size_t real = 0;
     for (const std::string &scene : o.scenes) {
-        for (const Setup &setup : setups(o)) real += run_scene(scene, setup, o, rows);
+        for (Setup setup : setups(o)) {
+            for (const unsigned times : o.repeats) {
+                setup.times = times;
+                real += run_scene(scene, setup, o, rows);
+            }
+        }
     }
     if (!o.csv.empty()) write_csv(o.csv, rows);
     if (o.markdown) print_markdown(stdout, rows);

@@ -25,10 +25,11 @@ std::string number(double value, int digits) {
     return text;
 }
 
-// The file's name without its folder and ending.
+// The file's name without its folder and ending, and how often it stands beside itself.
 std::string short_name(const std::string &scene) {
     const size_t slash = scene.find_last_of("/\\"), start = slash == std::string::npos ? 0 : slash + 1;
-    return scene.substr(start, scene.find_last_of('.') - start);
+    const size_t end = scene.find_last_of('.'), times = scene.rfind(" x ");
+    return scene.substr(start, std::min(end, times) - start) + (times == std::string::npos ? "" : scene.substr(times));
 }
 
 // The first cells of a line: where and how something was measured.

@@ -1,6 +1,7 @@
 #include "scene.h"
 
 #include <chrono>
+#include <cmath>
 #include <cstdio>
 #include <cstdlib>
 #include <cstring>
@@ -104,6 +105,40 @@ RTCScene embree_scene(RTCDevice device, const Scene &s, Mode mode) {
     return scene;
 }
 
+// A scene in which a committed one stands `times` times in a square grid on the plane of x and z, each beside the next, as
+// `bakelite bake --repeat` places them.
+static bk_scene *repeated(bk_device *device, const bk_scene *once, unsigned times) {
+    bk_scene *scene;
+    check(bk_scene_create(device, &scene));
+    bk_material_desc material;
+    bk_material_desc_init(&material);
+    check(bk_scene_add_material(scene, &material, nullptr));
+    float lower[3], upper[3];
+    check(bk_scene_bounds(once, lower, upper));
+    const auto columns = unsigned(std::ceil(std::sqrt(double(times))));
+    std::vector<float> positions;
+    for (uint32_t m = 0; m < bk_scene_mesh_count(once); m++) {
+        bk_mesh_view mesh;
+        bk_mesh_view_init(&mesh);
+        check(bk_scene_get_mesh(once, m, &mesh));
+        for (unsigned copy = 0; copy < times; copy++) {
+            positions.assign(mesh.positions, mesh.positions + 3 * size_t(mesh.vertex_count));
+            for (size_t i = 0; i < positions.size(); i += 3) {
+                positions[i] += (upper[0] - lower[0]) * float(copy % columns);
+                positions[i + 2] += (upper[2] - lower[2]) * float(copy / columns);
+            }
+            bk_mesh_desc desc;
+            bk_mesh_desc_init(&desc);
+            desc.positions = positions.data();
+            desc.vertex_count = mesh.vertex_count;
+            desc.indices = mesh.indices;
+            desc.triangle_count = mesh.triangle_count;
+            check(bk_scene_add_mesh(scene, &desc, nullptr));
+        }
+    }
+    return scene;
+}
+
 Scene::Scene(const std::string &name, const Setup &setup) {
     // All rays are traced by threads of this program's own.
     device = our_device(setup, 1);
@@ -111,6 +146,12 @@ Scene::Scene(const std::string &name, const Setup &setup) {
     check(bk_scene_create(device, &scene));
     const bool file = name.find('.') != std::string::npos;
     check(file ? bk_scene_load_file(scene, name.c_str(), nullptr, nullptr, nullptr, nullptr) : bk_scene_load_builtin(scene, name.c_str()));
+    if (setup.times > 1) {
+        bk_scene *const once = scene;
+        check(bk_scene_commit(once, nullptr, nullptr));
+        scene = repeated(device, once, setup.times);
+        bk_scene_release(once);
+    }
     bk_build_params params;
     bk_build_params_init(&params);
     params.quality = setup.quality;

@@ -17,6 +17,7 @@ struct Setup {
     uint32_t isa = BK_ISA_AUTO;
     std::string embree_isa; // empty: its own choice
     uint32_t quality = BK_BUILD_QUALITY_DEFAULT;
+    unsigned times = 1; // how often the scene stands beside itself
 };
 
 inline const char *const ISA_NAMES[] = {"auto", "portable", "avx2", "avx512"};
