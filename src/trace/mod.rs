@@ -6,6 +6,7 @@
 
 pub mod baseline;
 mod beams;
+mod bundle;
 mod compact;
 pub(crate) mod filter;
 #[cfg(any(test, feature = "reference"))]

@@ -21,23 +21,15 @@
 //!
 //! The file is long because all of it is inlined into one entry point per instruction set.
 
+use super::bundle::{LEAST, SIZE, bundle, directions};
 use super::single;
-use super::tree::{BEYOND, EPSILON, FARTHEST_ORIGIN, OFFSET_ERROR, STEEP, beyond};
+use super::tree::{BEYOND, EPSILON, OFFSET_ERROR, beyond};
 use super::triangle::{GRAZING, Projected, Shear, V3, accurate_distance, barycentrics};
 use super::{RawHit, Ray};
 use crate::base::geometry::NONE;
 use crate::bvh::layout::{ChildRef, MAX_LEAF, Mbvh, Node, STACK_SIZE, WIDTH};
 use crate::simd::{Compress, Lanes, Mask, Simd};
 use std::mem::MaybeUninit;
-
-/// Maximum number of rays in a bundle. (In tiles of 4 × 4 pixels, 128 were no faster.)
-const SIZE: usize = 64;
-
-/// Minimum number of rays in a bundle; fewer are traced one by one.
-const LEAST: usize = 12;
-
-/// Maximum difference of slopes against the longest axis in a bundle.
-const SPREAD: f32 = 0.4;
 
 /// Closest hits of as many rays as both slices have below the node `root`: bundles are traced together, other rays one by one.
 ///
@@ -51,7 +43,8 @@ pub(super) unsafe fn block<S: Simd>(bvh: &Mbvh, root: ChildRef, rays: &[Ray], ou
     while start < n {
         let (mut end, mut length) = (start, 0);
         while end < n {
-            length = bundle(&rays[end..]);
+            // SAFETY: forwarded.
+            length = unsafe { bundle::<S>(&rays[end..]) };
             if length >= LEAST {
                 break;
             }
@@ -69,63 +62,6 @@ pub(super) unsafe fn block<S: Simd>(bvh: &Mbvh, root: ChildRef, rays: &[Ray], ou
         }
         start = end + length;
     }
-}
-
-/// The axis of the largest component of a direction; `None` if there are several such axes or the direction needs
-/// special treatment in a test.
-#[inline(always)]
-fn longest_axis(d: [f32; 3]) -> Option<usize> {
-    let [x, y, z] = d.map(f32::abs);
-    let (k, least) = if x > y && x > z {
-        (0, y.min(z))
-    } else if y > z && y > x {
-        (1, x.min(z))
-    } else if z > x && z > y {
-        (2, x.min(y))
-    } else {
-        return None;
-    };
-    let largest = d[k].abs();
-    ((1e-6..=1e6).contains(&largest) && least > STEEP * largest).then_some(k)
-}
-
-/// Number of rays, from the first, that make a bundle: they share origin and range, octant and longest axis of their
-/// directions, and nearly their slopes. It is 0 or 1 if there is no bundle.
-#[inline(always)]
-fn bundle(rays: &[Ray]) -> usize {
-    let first = &rays[0];
-    // Compares bits, all at once, without branches.
-    let differ = |a: f32, b: f32| a.to_bits() ^ b.to_bits();
-    let same = |r: &Ray| {
-        let origin = (0..3).fold(0, |sum, a| sum | differ(r.origin[a], first.origin[a]));
-        origin | differ(r.tmin, first.tmin) | differ(r.tmax, first.tmax) == 0
-    };
-    // Rejects most rays that are in no bundle at once.
-    if rays.len() < LEAST || !same(&rays[1]) || !(first.tmax > first.tmin) {
-        return 0;
-    }
-    let (Some(k), true) = (longest_axis(first.direction), first.origin.iter().all(|o| o.abs() <= FARTHEST_ORIGIN))
-    else {
-        return 0;
-    };
-    let (i, j) = ((k + 1) % 3, (k + 2) % 3);
-    let sign = first.direction.map(|d| 1f32.copysign(d));
-    let (mut least, mut most) = ([f32::INFINITY; 2], [0f32; 2]);
-    for (n, r) in rays.iter().take(SIZE).enumerate() {
-        let [x, y, z] = [r.direction[i] * sign[i], r.direction[j] * sign[j], r.direction[k] * sign[k]];
-        // The conditions of `longest_axis`, without branches, which took a tenth of the time; and the octant.
-        let is_alike = (x < z) & (y < z) & (x > STEEP * z) & (y > STEEP * z) & (1e-6..=1e6).contains(&z);
-        let inverse = 1.0 / z;
-        for (a, s) in [x * inverse, y * inverse].into_iter().enumerate() {
-            least[a] = if s < least[a] { s } else { least[a] };
-            most[a] = if s > most[a] { s } else { most[a] };
-        }
-        let is_narrow = (most[0] - least[0] <= SPREAD) & (most[1] - least[1] <= SPREAD);
-        if !(same(r) & is_alike & is_narrow) {
-            return n;
-        }
-    }
-    rays.len().min(SIZE)
 }
 
 /// A value per ray.
@@ -362,9 +298,18 @@ unsafe fn begin<'a, S: Simd>(rays: &[Ray], place: &'a mut MaybeUninit<Bundle>) -
         place.as_mut_ptr().write_bytes(0, 1);
         place.assume_init_mut()
     };
-    for i in 0..shared.groups * width {
-        let (d, limit) =
-            if i < rays.len() { (rays[i].direction, beyond(tmax)) } else { (direction, f32::NEG_INFINITY) };
+    let (eights, rest) = rays.as_chunks::<8>();
+    for (g, eight) in eights.iter().enumerate() {
+        // SAFETY: the caller vouches for the ISA; columns have room for as many eights.
+        unsafe {
+            let directions = directions::<S>(eight);
+            b.direction.iter_mut().zip(directions).for_each(|(column, d)| store(column, g, d));
+            store(&mut b.limit, g, S::F8::splat(beyond(tmax)));
+        }
+    }
+    for i in 8 * eights.len()..shared.groups * width {
+        let ray = rest.get(i - 8 * eights.len());
+        let (d, limit) = ray.map_or((direction, f32::NEG_INFINITY), |ray| (ray.direction, beyond(tmax)));
         (b.direction[0][i], b.direction[1][i], b.direction[2][i]) = (d[0], d[1], d[2]);
         b.limit[i] = limit;
     }
