@@ -61,7 +61,7 @@ impl Live {
     /// go on with the next update.
     pub fn pause(&mut self, paused: bool) -> Result<()> {
         self.paused = paused;
-        self.relight.hold(paused, &self.context.map.atlas, &self.bake, &self.context.light.sides)?;
+        self.relight.hold(paused, &self.context.map, &self.bake, &self.context.light.sides)?;
         self.collect_now()
     }
 }

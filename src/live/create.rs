@@ -43,7 +43,7 @@ impl Live {
             live.start(progress)?;
             if params.quick_start && live.context.light.has_indirect {
                 live.make_room_for_epochs()?;
-                live.relight.follow_first_impression(lightmap.atlas(), &live.bake)?;
+                live.relight.follow_first_impression(&live.context.map, &live.bake)?;
             }
             Ok(live)
         })
@@ -91,6 +91,7 @@ impl Live {
             choosing_seconds: 0.0,
             last_dirty_bytes: 0,
             alone,
+            marking: None,
             is_stale: Vec::new(),
             is_waiting: try_vec(blocks.len(), "the queue of blocks")?,
             waiting,

@@ -66,7 +66,7 @@ impl Following {
 
 /// The parts of a live object that depend on where things are, in another state of the scene.
 struct Place {
-    map: BlockMap,
+    map: Arc<BlockMap>,
     normals: Vec<Vec3>,
     grid: Grid,
     promotion: Promotion,
@@ -108,7 +108,7 @@ impl Live {
         };
         self.make_room_for_epochs()?;
         let former = std::mem::replace(&mut self.relight.following, following);
-        if let Err(e) = self.relight.start(atlas, &self.bake, &self.context.light.sides) {
+        if let Err(e) = self.relight.start(&place.map, &self.bake, &self.context.light.sides) {
             self.relight.following = former;
             return Err(e);
         }
@@ -137,7 +137,7 @@ impl Live {
             differs: try_collect(cells.iter().map(|cell| [cell.is_new, cell.is_new || cell.is_shadowed]), MOVED)?,
             emits: moved.emits,
             _memory: memory,
-            map,
+            map: Arc::new(map),
             grid,
         };
         if self.is_stale.is_empty() {
@@ -178,7 +178,6 @@ impl Live {
 
     fn move_to(&mut self, place: Place, has_other_lights: bool) {
         let Place { map, normals, grid, promotion, chooser, direct, differs, emits, _memory } = place;
-        let map = Arc::new(map);
         let old = std::mem::replace(&mut self.context.map, map.clone());
         debug_assert_eq!((old.tiles.len(), differs.len()), (map.tiles.len(), map.tiles.len()));
         (self.grid, self.promotion, self.chooser) = (grid, promotion, chooser);

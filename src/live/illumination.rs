@@ -1,6 +1,7 @@
 //! The light that live updates show: lights, radiance map and sides of charts, as a bake has them or, at a quick start, a
 //! first impression of them.
 
+use super::blocks::Rect;
 use crate::base::error::Result;
 use crate::base::memory::{try_collect, try_vec};
 use crate::base::progress::Progress;
@@ -50,6 +51,8 @@ pub(super) struct Indirect {
     pub part: Part,
     /// Blocks whose light a move does not change; empty: none.
     pub kept: Vec<bool>,
+    /// By block, the rectangle of the texels that gather for themselves; empty if the sides are those of before.
+    pub alone: Vec<Rect>,
 }
 
 /// Part of a renewal of indirect light: with few photons, or with all.
@@ -90,7 +93,7 @@ pub(super) fn illuminate(
         }
         false => Own::default(),
     };
-    Ok(Indirect { radiance, sides, own, has_indirect, part, kept: Vec::new() })
+    Ok(Indirect { radiance, sides, own, has_indirect, part, kept: Vec::new(), alone: Vec::new() })
 }
 
 /// Computes a first impression of radiance map and sides. Texels neither gather for themselves nor know of walls between
@@ -107,7 +110,8 @@ fn illuminate_quickly(
     let backs = stages::backs(&inputs, &radiance.values)?;
     let sides = Arc::new(Sides { backs, is_first_impression: true, ..Default::default() });
     let has_indirect = plan.runs(left_out::INDIRECT);
-    Ok(Indirect { radiance, sides, own: Own::default(), has_indirect, part: Part::Quick, kept: Vec::new() })
+    let (own, part) = (Own::default(), Part::Quick);
+    Ok(Indirect { radiance, sides, own, has_indirect, part, kept: Vec::new(), alone: Vec::new() })
 }
 
 impl Illumination {

@@ -53,6 +53,7 @@ use limit::Limit;
 use readback::{ChartBins, ReadingTime};
 use relight::Relight;
 use room::Room;
+use show::{MARKED_AT_ONCE, Marking};
 use std::collections::VecDeque;
 use std::sync::{Arc, Mutex};
 use std::time::{Duration, Instant};
@@ -96,6 +97,8 @@ pub struct Live {
     last_dirty_bytes: u64,
     /// Rectangle of each block's texels that gather for themselves, in the light map.
     alone: Vec<Rect>,
+    /// What new indirect light changes and is not marked yet.
+    marking: Option<Marking>,
     /// Queue of blocks whose shown light must be refreshed.
     waiting: VecDeque<u32>,
     is_waiting: Vec<bool>,
@@ -152,6 +155,7 @@ impl Live {
         let mut kept = 0.0;
         let result = self.collect(&mut stats).and_then(|()| {
             self.take_new_light()?;
+            self.mark_new_light(MARKED_AT_ONCE);
             if !budget.is_nothing() {
                 kept = self.reading_seconds(budget);
                 let spare = Duration::from_secs_f64(self.choosing_seconds + kept);
@@ -311,7 +315,7 @@ impl Live {
             done += if self.chooser.is_open(b) { 0.0 } else { mark };
             marks += mark;
         }
-        stats.light_pending = self.relight.is_pending();
+        stats.light_pending = self.is_light_pending();
         if marks > 0.0 {
             stats.visible_error = if light > 0.0 { (error / light).sqrt() as f32 } else { 0.0 };
             stats.visible_finished = done / marks;

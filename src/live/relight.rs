@@ -7,11 +7,14 @@
 //! lit one (with them, Sponza showed 8 % error for a second): sides change with all photons only.
 
 use super::Live;
-use super::blocks::Tile;
+use super::blocks::{BlockMap, Tile};
+use super::display::Display;
 use super::follow::Following;
 use super::illumination::{Illumination, Indirect, Part, Sides, illuminate};
+use super::show::Marking;
 use crate::base::error::{Error, Result, invalid_argument};
 use crate::base::gate::{Closed, Gate};
+use crate::base::memory::try_vec;
 use crate::base::progress::Progress;
 use crate::device::{Device, DeviceOptions};
 use crate::direct::DirectLight;
@@ -70,7 +73,7 @@ impl Relight {
 
     /// Begins a renewal, or makes another one follow the one under way. The quick part of the latter is always
     /// finished: lights that move all the time are followed in steps. It keeps the shown `sides`.
-    pub fn start(&mut self, atlas: &Arc<Atlas>, params: &BakeParams, sides: &Arc<Sides>) -> Result<()> {
+    pub fn start(&mut self, map: &Arc<BlockMap>, params: &BakeParams, sides: &Arc<Sides>) -> Result<()> {
         if let Some(running) = &self.running {
             running.cancel.store(true, Relaxed);
         }
@@ -78,25 +81,25 @@ impl Relight {
             self.again = true;
             return Ok(());
         }
-        self.begin(atlas, params, Some(sides.clone()))
+        self.begin(map, params, Some(sides.clone()))
     }
 
     /// Begins the computation with all photons that follows a first impression.
-    pub fn follow_first_impression(&mut self, atlas: &Arc<Atlas>, params: &BakeParams) -> Result<()> {
-        self.begin(atlas, params, None)
+    pub fn follow_first_impression(&mut self, map: &Arc<BlockMap>, params: &BakeParams) -> Result<()> {
+        self.begin(map, params, None)
     }
 
     /// Begins a renewal; with a quick part if there are sides that this keeps.
-    fn begin(&mut self, atlas: &Arc<Atlas>, params: &BakeParams, shown: Option<Arc<Sides>>) -> Result<()> {
+    fn begin(&mut self, map: &Arc<BlockMap>, params: &BakeParams, shown: Option<Arc<Sides>>) -> Result<()> {
         let device = match &self.device {
             Some(device) => device.clone(),
             None => Device::new(DeviceOptions {
                 num_threads: 1,
-                isa: Some(atlas.scene.device().isa()),
+                isa: Some(map.atlas.scene.device().isa()),
                 ..Default::default()
             })?,
         };
-        let (of, params, following) = (atlas.clone(), *params, self.following.clone());
+        let (of, params, following) = (map.clone(), *params, self.following.clone());
         let (sender, results) = channel();
         let cancel = Arc::new(AtomicBool::new(false));
         let abandon = Arc::new(AtomicBool::new(false));
@@ -104,9 +107,15 @@ impl Relight {
         let gate = self.gate.clone();
         let compute = move |params: &BakeParams, sides: Option<Arc<Sides>>, progress: &Progress| {
             let result = catch_unwind(AssertUnwindSafe(|| {
-                let mut new = illuminate(&of, params, &DirectLight::try_new(&of.scene)?, sides, progress)?;
-                if let (Part::Whole, Some(following)) = (new.part, &following) {
-                    new.kept = following.kept(&of, &new, params, progress)?;
+                let atlas = &of.atlas;
+                let mut new = illuminate(atlas, params, &DirectLight::try_new(&atlas.scene)?, sides, progress)?;
+                if new.part == Part::Whole {
+                    // Here, since it would take an update longer than it has.
+                    new.alone = try_vec(of.tiles.len(), "texels on their own")?;
+                    Display::find_alone(&of, &new.sides, &mut new.alone);
+                    if let Some(following) = &following {
+                        new.kept = following.kept(atlas, &new, params, progress)?;
+                    }
                 }
                 Ok(new)
             }));
@@ -127,7 +136,7 @@ impl Relight {
             let _ = sender.send(compute(&params, None, &progress));
         });
         self.device = Some(device);
-        self.running = Some(Running { atlas: atlas.clone(), results: Mutex::new(results), cancel, abandon });
+        self.running = Some(Running { atlas: map.atlas.clone(), results: Mutex::new(results), cancel, abandon });
         Ok(())
     }
 
@@ -142,7 +151,7 @@ impl Relight {
     }
 
     /// Stops a renewal; it begins again when the hold is over.
-    pub fn hold(&mut self, on_hold: bool, atlas: &Arc<Atlas>, params: &BakeParams, sides: &Arc<Sides>) -> Result<()> {
+    pub fn hold(&mut self, on_hold: bool, map: &Arc<BlockMap>, params: &BakeParams, sides: &Arc<Sides>) -> Result<()> {
         self.on_hold = on_hold;
         if on_hold {
             if let Some(running) = &self.running {
@@ -152,15 +161,15 @@ impl Relight {
             return Ok(());
         }
         if self.running.is_none() && std::mem::take(&mut self.again) {
-            self.start(atlas, params, sides)?;
+            self.start(map, params, sides)?;
         }
         Ok(())
     }
 
     /// Returns the newest finished result. Does not wait.
-    pub fn poll(&mut self, atlas: &Arc<Atlas>, params: &BakeParams, sides: &Arc<Sides>) -> Result<Option<Indirect>> {
+    pub fn poll(&mut self, map: &Arc<BlockMap>, params: &BakeParams, sides: &Arc<Sides>) -> Result<Option<Indirect>> {
         if self.running.is_none() && !self.on_hold && std::mem::take(&mut self.again) {
-            self.start(atlas, params, sides)?;
+            self.start(map, params, sides)?;
         }
         let Some(running) = &mut self.running else { return Ok(None) };
         let results = running.results.get_mut().unwrap_or_else(|e| e.into_inner());
@@ -168,7 +177,7 @@ impl Relight {
         loop {
             match results.try_recv() {
                 // The scene has moved since: what it was compared with is out of date. Another one follows.
-                Ok(Ok(new)) if new.part == Part::Whole && !Arc::ptr_eq(&running.atlas, atlas) => {}
+                Ok(Ok(new)) if new.part == Part::Whole && !Arc::ptr_eq(&running.atlas, &map.atlas) => {}
                 Ok(Ok(indirect)) => newest = Some(indirect),
                 // Cancelled because of another change of light.
                 Ok(Err(Error::Cancelled)) => {}
@@ -185,7 +194,7 @@ impl Relight {
                     if !self.on_hold && std::mem::take(&mut self.again) {
                         // Uses the sides that the caller will show.
                         let newer = newest.as_ref().filter(|new| new.has_indirect).map(|new| &new.sides);
-                        self.start(atlas, params, newer.unwrap_or(sides))?;
+                        self.start(map, params, newer.unwrap_or(sides))?;
                     }
                     break;
                 }
@@ -216,15 +225,15 @@ impl Drop for Relight {
 }
 
 impl Live {
-    /// Takes over new indirect light, if there is any.
+    /// Takes over new indirect light, if there is any, and all of what that before has changed is marked.
     pub(super) fn take_new_light(&mut self) -> Result<()> {
-        if self.paused {
+        if self.paused || self.marking.is_some() {
             return Ok(());
         }
-        let Some(mut new) = self.relight.poll(&self.context.map.atlas, &self.bake, &self.context.light.sides)? else {
+        let Some(mut new) = self.relight.poll(&self.context.map, &self.bake, &self.context.light.sides)? else {
             return Ok(());
         };
-        let (part, kept) = (new.part, std::mem::take(&mut new.kept));
+        let (part, kept, alone) = (new.part, std::mem::take(&mut new.kept), std::mem::take(&mut new.alone));
         let has_moved = part == Part::Whole && self.relight.following.is_some();
         let before = self.context.light.clone();
         let renewed = before.renewed(new).inspect_err(|_| self.relight.redo())?;
@@ -240,7 +249,10 @@ impl Live {
                 backs[0].backs.get(chart) == backs[1].backs.get(chart)
             });
         }
-        self.mark_new_light(&before, has_moved);
+        if !Arc::ptr_eq(&before.sides, &self.context.light.sides) {
+            self.alone = alone;
+        }
+        self.marking = Some(Marking::of(before.sides.clone(), has_moved));
         self.chooser.note_all(&self.context, self.blocks.status());
         Ok(())
     }
@@ -281,7 +293,7 @@ impl Live {
         self.collect_now()?;
         self.make_room_for_epochs()?;
         let following = self.relight.following.take();
-        let started = self.relight.start(&self.context.map.atlas, &self.bake, &self.context.light.sides);
+        let started = self.relight.start(&self.context.map, &self.bake, &self.context.light.sides);
         started.inspect_err(|_| self.relight.following = following)?;
         // Nothing can fail from here on.
         self.display.begin_direct_epoch();
@@ -295,11 +307,17 @@ impl Live {
         Ok(())
     }
 
+    /// Whether new indirect light is expected, or some of what it changes is not marked yet.
+    pub(super) fn is_light_pending(&self) -> bool {
+        self.relight.is_pending() || self.marking.is_some()
+    }
+
     /// Waits for indirect light that is being recomputed, and takes it over.
     pub fn finish_relighting(&mut self) -> Result<()> {
         self.collect_now()?;
-        while self.relight.is_pending() && !self.paused {
+        while self.is_light_pending() && !self.paused {
             self.take_new_light()?;
+            self.mark_new_light(usize::MAX);
             std::thread::sleep(Duration::from_millis(1));
         }
         Ok(())
@@ -314,6 +332,7 @@ mod tests {
     use crate::lightmap::indirect::upsample::OwnLight;
     use crate::lightmap::stages::Own;
     use crate::lightmap::{Lightmap, LightmapDesc};
+    use crate::live::LiveParams;
     use crate::scene::{Light, builtin};
     use glam::Vec3;
 
@@ -340,6 +359,7 @@ mod tests {
             has_indirect: true,
             part: Part::Whole,
             kept: Vec::new(),
+            alone: Vec::new(),
         };
         let quick = before.renewed(new(&shown, vec![Some(Vec3::Y), None])).unwrap();
         assert_eq!((quick.direct_epoch, quick.indirect_epoch, quick.radiance.values[0]), (1, 2, Vec3::ONE));
@@ -355,6 +375,35 @@ mod tests {
         assert_eq!(gone_dark.own_directional[..], [Some(Directional::default()), None]);
     }
 
+    #[test]
+    fn what_new_light_changes_is_marked_in_steps() {
+        let scene = builtin("cornell").unwrap().committed();
+        let desc = LightmapDesc { texels_per_unit: 200.0, ..Default::default() };
+        let lightmap = Lightmap::create(&scene, &desc, &Progress::none()).unwrap();
+        let params = LiveParams { quick_start: true, photon_count: 20_000, ..Default::default() };
+        let mut live = Live::new(&lightmap, &params, &Progress::none()).unwrap();
+        while live.dirty.bytes_left() > 0 {
+            live.dirty.take(usize::MAX, |_, _| ());
+        }
+        while live.marking.is_none() {
+            live.take_new_light().unwrap();
+            std::thread::sleep(Duration::from_millis(1));
+        }
+        assert!(!live.context.light.sides.is_first_impression && live.dirty.bytes_left() == 0);
+        let (blocks, mut steps, mut left) = (live.blocks.len(), 0, 0);
+        while live.marking.is_some() {
+            assert!(live.is_light_pending());
+            live.mark_new_light(7);
+            steps += 1;
+            assert!(live.dirty.bytes_left() >= left, "marks are lost");
+            left = live.dirty.bytes_left();
+        }
+        assert!(blocks > 70 && steps == blocks.div_ceil(7), "{blocks} blocks in {steps} steps");
+        // As after a restart, where all is marked at once.
+        live.dirty.mark_all();
+        assert!(10 * left > 9 * live.dirty.bytes_left(), "{left} of {} bytes", live.dirty.bytes_left());
+    }
+
     /// The result of a renewal with few photons fits the shown sides, whatever sides are found later.
     #[test]
     fn a_quick_renewal_keeps_the_sides_and_renews_what_texels_gather_for_themselves() {
@@ -362,13 +411,14 @@ mod tests {
         let desc = LightmapDesc { texels_per_unit: 3.0, ..Default::default() };
         let lightmap = Lightmap::create(&scene, &desc, &Progress::none()).unwrap();
         let (atlas, params) = (lightmap.atlas(), BakeParams { photon_count: 20_000, ..Default::default() });
+        let map = Arc::new(BlockMap::new(atlas, 3, 0.0, &Progress::none()).unwrap());
         let light = Illumination::new(atlas, &params, false, &Progress::none()).unwrap();
         assert!(light.own.iter().any(|own| own.is_some_and(|e| e != Vec3::ZERO)));
         let renewals = || {
             let (mut relight, mut results) = (Relight::default(), Vec::new());
-            relight.start(atlas, &params, &light.sides).unwrap();
+            relight.start(&map, &params, &light.sides).unwrap();
             while relight.is_pending() {
-                results.extend(relight.poll(atlas, &params, &light.sides).unwrap());
+                results.extend(relight.poll(&map, &params, &light.sides).unwrap());
                 std::thread::sleep(std::time::Duration::from_millis(1));
             }
             results

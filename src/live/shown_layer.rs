@@ -287,11 +287,16 @@ impl<T: Shown> ShownLayer<T> {
         missing(&self.old) + missing(&self.coarse_of_tile)
     }
 
-    /// Allocates the buffers of the next epochs of light, so that their beginning cannot fail.
+    /// Allocates the buffers of the next epochs of light, so that their beginning cannot fail, and touches their pages,
+    /// so that it does not take an update long.
     pub fn make_room_for_epochs(&mut self) -> Result<()> {
-        for copy in [&mut self.old, &mut self.coarse_of_tile] {
-            copy.try_reserve_exact(self.plain.len() - copy.len())
+        let texels = self.plain.len();
+        for copy in [&mut self.old, &mut self.coarse_of_tile].into_iter().filter(|copy| copy.capacity() < texels) {
+            let length = copy.len();
+            copy.try_reserve_exact(texels - length)
                 .map_err(|_| Error::OutOfMemory("light of before a change".into()))?;
+            copy.resize(texels, T::default());
+            copy.truncate(length);
         }
         Ok(())
     }
