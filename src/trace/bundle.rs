@@ -2,7 +2,7 @@
 
 use super::Ray;
 use super::tree::{FARTHEST_ORIGIN, STEEP};
-use crate::simd::{Eight, Lanes, Mask, Simd};
+use crate::simd::{self, Eight, Lanes, Mask, Simd};
 use std::array::from_fn;
 
 /// Maximum number of rays in a bundle. (In tiles of 4 × 4 pixels, 128 were no faster.)
@@ -147,9 +147,7 @@ unsafe fn eights<S: Simd>(rays: &[Ray], &Way { axes: [i, j, k], sign }: &Way) ->
             }
             n += 8;
         }
-        let least = least.map(|l| l.to_array()[..8].iter().fold(f32::INFINITY, |a, &b| a.min(b)));
-        let most = most.map(|m| m.to_array()[..8].iter().fold(0f32, |a, &b| a.max(b)));
-        (n, Slopes { least, most })
+        (n, Slopes { least: least.map(simd::least), most: most.map(simd::greatest) })
     }
 }
 

@@ -28,7 +28,7 @@ use super::triangle::{GRAZING, Projected, Shear, V3, accurate_distance, barycent
 use super::{RawHit, Ray};
 use crate::base::geometry::NONE;
 use crate::bvh::layout::{ChildRef, MAX_LEAF, Mbvh, Node, STACK_SIZE, WIDTH};
-use crate::simd::{Compress, Lanes, Mask, Simd};
+use crate::simd::{self, Compress, Lanes, Mask, Simd};
 use std::mem::MaybeUninit;
 
 /// Closest hits of as many rays as both slices have below the node `root`: bundles are traced together, other rays one by one.
@@ -320,11 +320,12 @@ unsafe fn begin<'a, S: Simd>(rays: &[Ray], place: &'a mut MaybeUninit<Bundle>) -
         let abs = |x: S::Packet| x.max(zero - x);
         let [i, j, k] = axes;
         let (mut least, mut most) = ([splat(f32::INFINITY); 3], [zero; 3]);
+        let (mut shortest, mut longest) = (splat(f32::INFINITY), zero);
         for g in 0..shared.groups {
             let d: [S::Packet; 3] = [lanes(&b.direction[0], g), lanes(&b.direction[1], g), lanes(&b.direction[2], g)];
             let length = abs(d[k]);
-            for a in 0..3 {
-                let r = splat(1.0).div(d[a]);
+            let reciprocal = d.map(|d| splat(1.0).div(d));
+            for (a, r) in reciprocal.into_iter().enumerate() {
                 let offset = splat(-origin[a]) * r;
                 let error = splat(OFFSET_ERROR) * abs(offset);
                 store(&mut b.reciprocal[a], g, r);
@@ -333,7 +334,8 @@ unsafe fn begin<'a, S: Simd>(rays: &[Ray], place: &'a mut MaybeUninit<Bundle>) -
                 let r = abs(r) * length;
                 (least[a], most[a]) = (least[a].min(r), most[a].max(r));
             }
-            let inverse = splat(-1.0).div(d[k]);
+            (shortest, longest) = (shortest.min(length), longest.max(length));
+            let inverse = zero - reciprocal[k];
             store(&mut b.shear[0], g, d[i] * inverse);
             store(&mut b.shear[1], g, d[j] * inverse);
             store(&mut b.grazing, g, splat(GRAZING) * (abs(d[0]) + abs(d[1]) + abs(d[2])));
@@ -344,11 +346,8 @@ unsafe fn begin<'a, S: Simd>(rays: &[Ray], place: &'a mut MaybeUninit<Bundle>) -
             store(&mut b.sum, g, splat(1.0));
             store(&mut b.triangle, g, splat(f32::from_bits(NONE)));
         }
-        let lengths = &b.length[..rays.len()];
-        let (shortest, longest) = lengths.iter().fold((f32::INFINITY, 0f32), |(a, b), &l| (a.min(l), b.max(l)));
-        let begin = tmin * if tmin < 0.0 { longest } else { shortest };
-        let least = [least[0].to_array(), least[1].to_array(), least[2].to_array()];
-        let most = [most[0].to_array(), most[1].to_array(), most[2].to_array()];
+        // (Lanes behind the last ray hold the first one.)
+        let begin = tmin * if tmin < 0.0 { simd::greatest(longest) } else { simd::least(shortest) };
         let sign = negative.map(|n| if n { -1.0 } else { 1.0 });
         // Larger than the margin for rounding of a single ray's test; all rays have that one.
         let margin = origin.map(|o| 16.0 * EPSILON * o.abs());
@@ -356,8 +355,8 @@ unsafe fn begin<'a, S: Simd>(rays: &[Ray], place: &'a mut MaybeUninit<Bundle>) -
             sign,
             near: [0, 1, 2].map(|a| -origin[a] * sign[a] - margin[a]),
             far: [0, 1, 2].map(|a| -origin[a] * sign[a] + margin[a]),
-            least: least.map(|r| r[..width].iter().fold(f32::INFINITY, |a, &b| a.min(b)) * (1.0 - SLACK)),
-            most: most.map(|r| r[..width].iter().fold(0f32, |a, &b| a.max(b)) * (1.0 + SLACK)),
+            least: least.map(|r| simd::least(r) * (1.0 - SLACK)),
+            most: most.map(|r| simd::greatest(r) * (1.0 + SLACK)),
             begin: begin - SLACK * begin.abs(),
             end: b.end::<S::Packet>(shared.groups),
         };
@@ -415,7 +414,7 @@ impl Bundle {
             for g in 0..groups {
                 end = end.max(lanes::<L>(&self.limit, g) * lanes(&self.length, g));
             }
-            end.to_array()[..L::WIDTH].iter().copied().fold(f32::NEG_INFINITY, f32::max)
+            simd::greatest(end)
         };
         end + SLACK * end.abs()
     }
