@@ -108,7 +108,7 @@ fn copy(scene: &Scene, without: Option<&Piece>) -> Result<SceneData> {
         data.add_mesh(mesh)?;
     }
     for instance in scene.instances() {
-        data.add_instance(instance.clone())?;
+        data.add_instance(*instance)?;
     }
     Ok(data)
 }
