@@ -536,7 +536,7 @@ pub unsafe extern "C" fn bk_bake_changed(
 /// Errors add up as in bk_bake_changed. A cache folder (bk_device_desc.cache_folder) saves the
 /// unwraps of meshes that stay, too.
 ///
-/// Cost: as bk_bake_changed, and a few hundred bytes and a microsecond per triangle of objects that
+/// Cost: as bk_bake_changed, and up to some 100 bytes and a microsecond per triangle of objects that
 /// changed, less of those that did not; the earlier light is held a second time while it is baked.
 /// Measured: docs/performance.md, "Edits".
 ///

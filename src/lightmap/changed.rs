@@ -120,7 +120,8 @@ impl Lightmap {
         let atlas = of.before.as_ref().unwrap_or(&of.atlas);
         let (former, moved) = match keep.earlier {
             Some(_) => {
-                let (former, moved) = Correspondence::between(atlas, &self.atlas, progress)?;
+                let match_surfaces = || Correspondence::between(atlas, &self.atlas, progress);
+                let (former, moved) = self.atlas.scene.device().install(match_surfaces)?;
                 (Some(former), moved)
             }
             None => (None, Moved::between(&atlas.scene, &self.atlas.scene, &self.atlas.charts)?),

@@ -285,13 +285,14 @@ fn a_new_light_map_keeps_light_where_meshes_were_added_and_removed() {
     let (_, mut more) = revised([true, true], &[Vec3::new(2.4, 2.0, 0.0)], 5.0);
     let (kept, worst) = revise(&first, &mut more, &params, 0.05);
     assert!((0.3..0.95).contains(&kept), "{kept} kept");
-    assert_eq!(worst[0], 0.0, "direct light");
+    // Charts lie elsewhere on their pages, and points of texels differ by rounding.
+    assert!(worst[0] < 1e-6, "direct light is wrong by {}", worst[0]);
     assert!(worst[1] < 0.25, "indirect light is wrong by {}", worst[1]);
     // Without it again: where it stood, light is back.
     let (_, mut less) = revised([true, true], &[], 5.0);
     let (kept, worst) = revise(&more, &mut less, &params, 0.05);
     assert!((0.3..0.95).contains(&kept), "{kept} kept");
-    assert!(worst[0] == 0.0 && worst[1] < 0.25, "{worst:?}");
+    assert!(worst[0] < 1e-6 && worst[1] < 0.25, "{worst:?}");
     // A mesh that others follow has gone: they have other numbers of triangles, charts and texels.
     let at = Vec3::new(6.0, 2.0, 0.0);
     let (_, mut three) = revised([true, true], &[at], 5.0);
@@ -379,7 +380,7 @@ fn what_looks_other_is_baked() {
     // The block is dark: it and what it lights are baked, the second room is not.
     let mut dark = rebuilt(&|meshes| meshes[1].materials = MeshMaterials::One(1));
     let (kept, worst) = revise(&first, &mut dark, &params, 0.05);
-    assert!((0.3..0.97).contains(&kept) && worst[0] == 0.0 && worst[1] < 0.25, "{kept} {worst:?}");
+    assert!((0.3..0.97).contains(&kept) && worst[0] < 1e-6 && worst[1] < 0.25, "{kept} {worst:?}");
     // One mesh of both: triangles are matched one by one.
     let mut joined = rebuilt(&|meshes| {
         let block = meshes.pop().unwrap();
