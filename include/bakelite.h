@@ -2245,9 +2245,9 @@ bk_result bk_bake_changed(bk_lightmap *lightmap,
 ///
 /// The new scene is described and committed like any other, and its light map made with the
 /// `texels_per_unit` (not 0), divisors and other fields of the earlier one, so that surfaces which
-/// both scenes have are given the same texels; of that, objects are found by content and place,
-/// then single triangles. Add new meshes after those that stay: random numbers go by the number of a
-/// texel, and light that is kept fits best where it is baked anew beside it. Light is compared and
+/// both scenes have are given the same texels. Surfaces are matched by content and place: whole
+/// objects first, then single triangles of the others. Add new meshes after those that stay: random
+/// numbers go by the number of a texel, so that more light is found unchanged. Light is compared and
 /// baked as bk_bake_changed does it; surfaces that only one of the scenes has count as moved. Light
 /// that the light map already has is replaced. If the earlier light map has no light, was baked with
 /// other parameters or has no surface in common with this one, everything is baked.

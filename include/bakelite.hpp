@@ -524,7 +524,7 @@ public:
             bk_bake_changed(get(), &params, keep_error, progress.function(), progress.user(), &stats);
         return detail::finish(progress.after(code), stats);
     }
-    /// Bakes and keeps what it can of the light of an earlier light map, of a scene of which this one's is a revision.
+    /// Bakes and keeps light of an earlier light map, of a scene of which this one's is a revision.
     Result<BakeStats> bake_changed_from(const Lightmap &earlier, const BakeParams &params, float keep_error,
                                         const Progress &progress = {}) {
         BakeStats stats;

@@ -507,10 +507,7 @@ pub unsafe extern "C" fn bk_bake_changed(
     call(|| unsafe {
         refuse_in_callback()?;
         let lightmap = hold(lightmap, "lightmap")?;
-        let (params, checkpoint, shares) = core_params(params)?;
-        if checkpoint.is_some() || shares.is_some() {
-            return invalid_argument!("checkpoint or shares is not NULL: bk_bake_changed has none");
-        }
+        let params = params_of_changes(params, "bk_bake_changed")?;
         let out = OutStruct::optional(out, "out")?;
         let progress = self::progress(progress, user);
         let done = lightmap.change(|l| l.bake_changed(&params, keep_error, &progress))?;
@@ -521,14 +518,27 @@ pub unsafe extern "C" fn bk_bake_changed(
     })
 }
 
+/// Reads the parameters of a bake of changes by a `function` of that name, which has neither a checkpoint nor shares.
+///
+/// # Safety
+/// As for [`core_params`].
+unsafe fn params_of_changes(params: *const bk_bake_params, function: &str) -> Result<BakeParams> {
+    // SAFETY: forwarded.
+    let (params, checkpoint, shares) = unsafe { core_params(params)? };
+    if checkpoint.is_some() || shares.is_some() {
+        return invalid_argument!("checkpoint or shares is not NULL: {function} has none");
+    }
+    Ok(params)
+}
+
 /// Bakes a light map and keeps light of an earlier one, of a scene of which this one's is a
 /// revision: after meshes were added, removed, edited, or given other materials.
 ///
 /// The new scene is described and committed like any other, and its light map made with the
 /// `texels_per_unit` (not 0), divisors and other fields of the earlier one, so that surfaces which
-/// both scenes have are given the same texels; of that, objects are found by content and place,
-/// then single triangles. Add new meshes after those that stay: random numbers go by the number of a
-/// texel, and light that is kept fits best where it is baked anew beside it. Light is compared and
+/// both scenes have are given the same texels. Surfaces are matched by content and place: whole
+/// objects first, then single triangles of the others. Add new meshes after those that stay: random
+/// numbers go by the number of a texel, so that more light is found unchanged. Light is compared and
 /// baked as bk_bake_changed does it; surfaces that only one of the scenes has count as moved. Light
 /// that the light map already has is replaced. If the earlier light map has no light, was baked with
 /// other parameters or has no surface in common with this one, everything is baked.
@@ -574,10 +584,7 @@ pub unsafe extern "C" fn bk_bake_changed_from(
         if Arc::ptr_eq(&lightmap, &earlier) {
             return invalid_argument!("earlier is the light map itself: bk_bake_changed keeps its light");
         }
-        let (params, checkpoint, shares) = core_params(params)?;
-        if checkpoint.is_some() || shares.is_some() {
-            return invalid_argument!("checkpoint or shares is not NULL: bk_bake_changed_from has none");
-        }
+        let params = params_of_changes(params, "bk_bake_changed_from")?;
         let out = OutStruct::optional(out, "out")?;
         let progress = self::progress(progress, user);
         let done = earlier

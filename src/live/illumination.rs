@@ -51,7 +51,8 @@ pub(super) struct Indirect {
     pub part: Part,
     /// Blocks whose light a move does not change; empty: none.
     pub kept: Vec<bool>,
-    /// By block, the rectangle of the texels that gather for themselves; empty if the sides are those of before.
+    /// By block, the rectangle of the texels that gather for themselves, which the thread that renews light finds; empty if
+    /// the sides are those of before.
     pub alone: Vec<Rect>,
 }
 
