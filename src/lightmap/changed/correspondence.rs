@@ -24,7 +24,7 @@ use crate::lightmap::{Light, Spread};
 use crate::scene::{Material, NONE, Object, Scene, Texture};
 use glam::Vec3;
 use rayon::prelude::*;
-use std::hash::{Hash, Hasher};
+use std::hash::{DefaultHasher, Hash, Hasher};
 
 /// Name of these lists in error messages.
 const MATCHED: &str = "what two scenes have in common";
@@ -387,7 +387,7 @@ impl Place<'_> {
     }
 
     fn hash(&self) -> u64 {
-        let mut hasher = Words::default();
+        let mut hasher = DefaultHasher::new();
         let mesh = self.object().mesh();
         bytemuck::cast_slice::<_, u32>(&mesh.positions[..]).hash(&mut hasher);
         mesh.indices.as_flattened().hash(&mut hasher);
@@ -434,27 +434,8 @@ impl Corners {
     }
 }
 
-/// Hashes by words of 64 bits. What has the same hash is compared: it need not be a good one.
-#[derive(Default)]
-struct Words(u64);
-
-impl Hasher for Words {
-    fn write(&mut self, bytes: &[u8]) {
-        let (words, rest) = bytes.as_chunks::<8>();
-        let mut last = [0; 8];
-        last[..rest.len()].copy_from_slice(rest);
-        for word in words.iter().chain([&last]) {
-            self.0 = (self.0.rotate_left(5) ^ u64::from_le_bytes(*word)).wrapping_mul(0x9e37_79b9_7f4a_7c15);
-        }
-    }
-
-    fn finish(&self) -> u64 {
-        self.0
-    }
-}
-
 fn hash_of(content: &impl Hash) -> u64 {
-    let mut hasher = Words::default();
+    let mut hasher = DefaultHasher::new();
     content.hash(&mut hasher);
     hasher.finish()
 }
