@@ -32,7 +32,7 @@ class BakeParams(ctypes.Structure):
                 ("seed", c_uint64), ("memory_budget", c_uint64), ("texel_begin", c_uint64), ("texel_end", c_uint64),
                 ("stitch", c_uint32), ("checkpoint_seconds", c_float), ("checkpoint", c_void_p),
                 ("directional_indirect", c_uint32), ("directional_direct", c_uint32), ("passes", c_uint32),
-                ("target_error", c_float), ("interpolation_error", c_float), ("own_rays", c_uint32),
+                ("target_error", c_float), ("interpolation_error", c_float), ("interpolation_contrast", c_float), ("own_rays", c_uint32),
                 ("share_count", c_uint32), ("shares", c_void_p)]
 
 

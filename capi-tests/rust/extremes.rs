@@ -184,6 +184,7 @@ impl Draw {
             gather_rays: self.count(&[0, 1, 31, 33, 64], 100.0),
             radius: if self.one_in(2) { 0.0 } else { self.log(-37.9, 38.0) },
             interpolation_error: self.pick(&[1e-3, 1.0, 1.0, f32::INFINITY]),
+            interpolation_contrast: self.pick(&[1e-3, 0.3, 0.3, f32::INFINITY]),
             near_hits: self.pick(&[0.0, 2.0, 2.0, 30.0, f32::INFINITY]),
             blur_radius: self.count(&[0, 1, 16], 16.0),
             direct_samples: self.count(&[1, 2], 20.0),

@@ -12,9 +12,10 @@ use super::changed::{Before, Keep, Redo};
 use super::direct_blur;
 use super::indirect::blur;
 use super::indirect::gather::{Gathered, Tile, TileTexel};
+use super::indirect::interpolation_contrast::GatherLight;
 use super::indirect::radiance_map::Radiance;
 use super::indirect::sample_set::SampleSet;
-use super::indirect::upsample::{Upsampling, parts};
+use super::indirect::upsample::Upsampling;
 use super::passes::{self, Passes};
 use super::plan::{Plan, left_out};
 use super::saved::checkpoint::Checkpoint;
@@ -29,7 +30,7 @@ use super::{
 };
 use crate::base::directional::Directional;
 use crate::base::error::{Error, Result, invalid_argument};
-use crate::base::memory::{try_filled, try_to_vec, try_vec, try_zeroed};
+use crate::base::memory::{try_filled, try_parts, try_to_vec, try_vec, try_zeroed};
 use crate::base::parallel::{ParallelLoop, one_by_one};
 use crate::base::progress::Progress;
 use crate::base::sampling::{combine, purpose_seed};
@@ -48,6 +49,9 @@ const BLOCK: usize = 1024;
 
 /// Bytes per gather texel while a bake runs: light, blurred light, normal, variance, validity.
 const GATHER_BYTES: usize = 3 * size_of::<Vec3>() + size_of::<f32>() + size_of::<bool>();
+
+/// Bytes more if the blurred light is compared: its variance.
+const COMPARED_BYTES: usize = size_of::<f32>();
 
 /// Bytes per light map texel while a bake runs: direct and indirect light, state, variation of direct light.
 const TEXEL_BYTES: usize = 2 * size_of::<Vec3>() + size_of::<TexelState>() + size_of::<Variation>();
@@ -411,7 +415,7 @@ impl<'p> Bake<'_, 'p> {
         {
             return Ok(Own { light, directional, rays: 0 });
         }
-        let own = stages::own_light(&self.inputs(), radiance, backs, upsampling, asks)?;
+        let own = stages::own_light(&self.inputs(), radiance, backs, upsampling, asks, (0.56, 0.65))?;
         if let Some(c) = self.from.checkpoint {
             if asks {
                 c.keep_own_directional(&own.directional);
@@ -437,7 +441,7 @@ impl<'p> Bake<'_, 'p> {
             bytes += l.gather.len() * DIRECTIONAL_BYTES;
         }
         if self.plan.runs(left_out::INDIRECT) {
-            bytes += l.radiance.len() * 12 + l.gather.len() * GATHER_BYTES;
+            bytes += l.radiance.len() * 12 + l.gather.len() * self.gather_bytes();
         }
         let all = bytes + self.held;
         if self.params.memory_budget != 0 && all as u64 > self.params.memory_budget {
@@ -447,6 +451,16 @@ impl<'p> Bake<'_, 'p> {
             )));
         }
         l.scene.device().memory().reserve(bytes, "the bake's buffers")
+    }
+
+    /// Returns the bytes per gather texel while this bake runs, without light by direction.
+    fn gather_bytes(&self) -> usize {
+        GATHER_BYTES + if self.compares() && self.plan.runs(left_out::BLUR) { COMPARED_BYTES } else { 0 }
+    }
+
+    /// Whether the light of gather texels tells which texels of the light map gather for themselves.
+    fn compares(&self) -> bool {
+        self.params.interpolation_contrast < f32::INFINITY
     }
 
     /// Whether some light is computed and asked for by direction, given by a bit of [`directional`].
@@ -472,12 +486,11 @@ impl<'p> Bake<'_, 'p> {
         let needed = starts[placements.start] as usize..starts[placements.end] as usize;
         let asked = redo.map(Redo::asked);
         let is_needed = |texel: usize| redo.is_none_or(|redo| redo.gather[texel]);
-        let upsampling = stages::upsampling(&self.inputs(), backs, placements, asked)?;
-        let own = self.own_light(radiance, backs, &upsampling)?;
+        let mut upsampling = stages::upsampling(&self.inputs(), backs, placements.clone(), asked)?;
         let lookup = self.inputs().lookup(radiance);
         let samples = SampleSet::new(self.params.gather_rays, purpose_seed(self.params.seed, purpose::GATHER_SET));
         let seed = purpose_seed(self.params.seed, purpose::GATHER);
-        let stage = self.progress.stage("gather", 0.32, 0.6, needed.len() as u64);
+        let stage = self.progress.stage("gather", 0.315, 0.53, needed.len() as u64);
         let n = l.gather.len();
         let mut irradiance: Vec<Vec3> = try_zeroed(n, "the gather map")?;
         let mut normals: Vec<Vec3> = try_zeroed(n, "the gather map's normals")?;
@@ -486,8 +499,7 @@ impl<'p> Bake<'_, 'p> {
         let asks = self.asks(directional::INDIRECT);
         let mut directional: Vec<Directional> = try_vec(if asks { n } else { 0 }, "the gather map by direction")?;
         let (new_tile, nothing) = (if asks { Tile::by_direction } else { Tile::new }, asks.then(Directional::default));
-        let of_probes = redo.map_or(0, |redo| redo.rays);
-        let rays = AtomicU64::new(upsampling.rays + own.rays + of_probes);
+        let rays = AtomicU64::new(upsampling.rays + redo.map_or(0, |redo| redo.rays));
         let tiles = Scratch::new();
         device.install(|| {
             let values = irradiance[needed.clone()].par_chunks_mut(BLOCK);
@@ -495,7 +507,7 @@ impl<'p> Bake<'_, 'p> {
             let variances = variances[needed.clone()].par_chunks_mut(BLOCK);
             let valid = valid[needed.clone()].par_chunks_mut(BLOCK);
             let directional = directional.get_mut(needed.clone()).unwrap_or_default();
-            let directional = parts(directional, BLOCK, needed.len())?;
+            let directional = try_parts(directional, BLOCK, needed.len())?;
             let blocks = values.zip(normals).zip(variances).zip(valid).zip(directional).enumerate();
             one_by_one(blocks).try_each(|(block, ((((values, normals), variances), valid), directional))| {
                 if self.from.checkpoint.is_some_and(|c| c.gathered(block, values, variances, valid, directional)) {
@@ -546,20 +558,31 @@ impl<'p> Bake<'_, 'p> {
             filling.fill(&l.charts, &l.gather, &mut directional, self.progress)?;
         }
         if self.plan.runs(left_out::BLUR) {
-            let stage = self.progress.stage("blur", 0.6, 0.65, if asks { 2 * n as u64 } else { n as u64 });
+            let stage = self.progress.stage("blur", 0.53, 0.55, if asks { 2 * n as u64 } else { n as u64 });
             let mut blurred = try_vec(n, "the blurred gather map")?;
+            let mut noises = try_vec(if self.compares() { n } else { 0 }, "the blurred gather map's variance")?;
             let radius = self.params.blur_radius;
             let texels = blur::Texels { values: &irradiance, variances: &variances, valid: &valid, normals: &normals };
-            blur::blur(device, &l.charts, &l.gather, (texels, &irradiance), radius, &mut blurred, &stage)?;
+            let out = (&mut blurred[..], &mut noises[..]);
+            blur::blur(device, &l.charts, &l.gather, (texels, &irradiance), radius, out, &stage)?;
             if asks {
                 let mut out = try_vec(n, "the blurred gather map by direction")?;
-                blur::blur(device, &l.charts, &l.gather, (texels, &directional), radius, &mut out, &stage)?;
+                blur::blur(device, &l.charts, &l.gather, (texels, &directional), radius, (&mut out, &mut []), &stage)?;
                 directional = out;
             }
-            irradiance = blurred;
+            (irradiance, variances) = (blurred, noises);
         }
-        let bytes = (n * GATHER_BYTES + directional.len() * DIRECTIONAL_BYTES + l.gather.bytes()) as u64;
-        stats.gather = StageStats { seconds: start.elapsed().as_secs_f64(), rays: rays.into_inner(), bytes };
+        if self.compares() {
+            let stage = self.progress.stage("contrast of the gather map", 0.55, 0.56, placements.len() as u64);
+            let light = GatherLight { irradiance: PerTexel::new(&irradiance), variances: PerTexel::new(&variances) };
+            let most = self.params.interpolation_contrast;
+            upsampling.add_where_light_differs(l, placements, backs, &light, most, asked, &stage)?;
+        }
+        drop((normals, variances, valid));
+        let own = self.own_light(radiance, backs, &upsampling)?;
+        let bytes = (n * self.gather_bytes() + directional.len() * DIRECTIONAL_BYTES + l.gather.bytes()) as u64;
+        let rays = rays.into_inner() + own.rays;
+        stats.gather = StageStats { seconds: start.elapsed().as_secs_f64(), rays, bytes };
         Ok(Indirect { irradiance, directional, upsampling, own })
     }
 
@@ -599,9 +622,9 @@ impl<'p> Bake<'_, 'p> {
             let indirect_out = light.indirect[range.clone()].par_chunks_mut(BLOCK);
             let state = light.state[range.clone()].par_chunks_mut(BLOCK);
             let directional = light.directional.get_mut(range.clone()).unwrap_or_default();
-            let directional = parts(directional, BLOCK, range.len())?;
-            let directional = directional.into_par_iter().zip(parts(&mut directed, BLOCK, range.len())?);
-            let noises = parts(&mut variances, BLOCK, range.len())?;
+            let directional = try_parts(directional, BLOCK, range.len())?;
+            let directional = directional.into_par_iter().zip(try_parts(&mut directed, BLOCK, range.len())?);
+            let noises = try_parts(&mut variances, BLOCK, range.len())?;
             let blocks = direct.zip(indirect_out).zip(state).zip(directional.zip(noises)).enumerate();
             one_by_one(blocks).try_each(|(block, ((((direct, known), ind), state), rest))| {
                 let ((directional, directed), variances) = rest;

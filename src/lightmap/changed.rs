@@ -19,7 +19,7 @@ use super::atlas::Atlas;
 use super::atlas::ids::PlacementId;
 use super::direct_blur;
 use super::indirect::radiance_map::Radiance;
-use super::indirect::upsample::Asked;
+use super::indirect::upsample::{Asked, REACH};
 use super::moved::Moved;
 use super::plan::{Plan, left_out};
 use super::{BakeParams, BakeStats, Light, Lightmap, Origin, TexelState};
@@ -326,10 +326,15 @@ impl Job<'_, '_> {
         let cells = &cells[grid.first(placement)..];
         let columns = grid.columns(placement);
         let is_new = |x: u32, y: u32| cells[(y / CELL * columns + x / CELL) as usize].is_new;
-        // Blurred light reads texels so far away, and interpolation those beside them.
-        let margin = self.params.blur_radius.max(1) + 1;
         let rect = &atlas.gather.layout[placement];
-        let is_needed = |[x, y]: [u32; 2]| {
+        // Fallback gathers read those around them.
+        let width = |axis: usize| atlas.gather.layout[placement].scale[axis] / atlas.map.layout[placement].scale[axis];
+        let of_own = (REACH as f32 * width(0).max(width(1))).ceil() as u32 + 1;
+        // Blurred light reads texels so far away, and interpolation those beside them: of texels with new light, or of all
+        // that may gather for themselves where the gather map tells whether they do.
+        let compares = self.params.interpolation_contrast < f32::INFINITY;
+        let of_gather = self.params.blur_radius.max(1) + 1 + if compares { of_own } else { 0 };
+        let is_needed = |[x, y]: [u32; 2], margin: u32| {
             let last = |i: u32, size: u16| (i + margin).min(u32::from(size) - 1);
             let [x0, y0] = [x, y].map(|i| i.saturating_sub(margin));
             let (x1, y1) = (last(x, rect.w), last(y, rect.h));
@@ -342,7 +347,7 @@ impl Job<'_, '_> {
             let number = grid.of(placement, texel);
             let cell = &cells[number];
             part.indirect[i] = cell.is_new;
-            part.around[i] = is_needed(place);
+            part.around[i] = is_needed(place, of_own);
             part.direct[i] = all_direct
                 || cell.is_new
                 || cell.is_shadowed && {
@@ -353,11 +358,11 @@ impl Job<'_, '_> {
                 };
         }
         self.mark_lit(placement, part.direct, part.lit);
-        *part.is_new = part.around.iter().any(|&b| b);
         for (needed, texel) in part.gather.iter_mut().zip(atlas.gather.texels_of(placement)) {
             let (x, y) = atlas.gather.position(texel);
-            *needed = is_needed([x as u32 - u32::from(rect.x), y as u32 - u32::from(rect.y)]);
+            *needed = is_needed([x as u32 - u32::from(rect.x), y as u32 - u32::from(rect.y)], of_gather);
         }
+        *part.is_new = part.around.iter().any(|&b| b) || part.gather.iter().any(|&b| b);
         Ok(())
     }
 

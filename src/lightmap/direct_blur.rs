@@ -15,11 +15,10 @@ use super::BakeParams;
 use super::atlas::Atlas;
 use super::atlas::ids::{LightTexel, PlacementId};
 use super::indirect::blur::{Noisy, Window};
-use super::indirect::upsample::parts;
 use super::plan::{Plan, left_out};
 use crate::base::directional::{Directional, Linear};
 use crate::base::error::Result;
-use crate::base::memory::try_to_vec;
+use crate::base::memory::{try_parts, try_to_vec};
 use crate::base::parallel::{ParallelLoop, one_by_one};
 use crate::base::progress::Stage;
 use crate::direct::DirectLight;
@@ -65,7 +64,7 @@ pub(crate) fn blur(
     let before_directed = try_to_vec(directed, what)?;
     let out = direct[range.clone()].par_chunks_mut(BLOCK);
     let own = if n == 0 { 0..0 } else { range.start - lit.start..range.end - lit.start };
-    let out = out.zip(parts(&mut directed[own], BLOCK, range.len())?).enumerate();
+    let out = out.zip(try_parts(&mut directed[own], BLOCK, range.len())?).enumerate();
     one_by_one(out).try_each(|(block, (out, directed))| {
         let mut blur = DirectBlur::new(atlas);
         let place = |texel: LightTexel| texel.index() - lit.start;

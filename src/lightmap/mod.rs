@@ -146,7 +146,8 @@ pub struct BakeParams {
     pub max_bounces: u32,
     /// Number of rays per gather map texel; 0: no indirect light. Each 64 rays are accompanied by up to 32 shadow rays
     /// to bright patches of surfaces, where there are any. Light map texels for which none of the gather texels around
-    /// is a valid source of interpolation (1 to 3 %), and those beyond `interpolation_error`, trace rays themselves.
+    /// is a valid source of interpolation (1 to 3 %), and those beyond `interpolation_error` or `interpolation_contrast`,
+    /// trace rays themselves.
     pub gather_rays: u32,
     /// Search radius of photons in scene units, finite; 0: from the photons' density, and at least three quarters of a
     /// texel of the radiance map, so that no photon lies between the discs of the estimates.
@@ -160,6 +161,11 @@ pub struct BakeParams {
     /// the width of a gather texel divided by the harmonic mean distance of what it sees, plus 4 √(1 − cos) of the angle
     /// between normals: the split-sphere model (Ward, Rubinstein and Clear 1988), with weights of its own.
     pub interpolation_error: f32,
+    /// RMS contrast of the gather texels between which a texel of the light map interpolates, beyond what is noise, above
+    /// which it traces rays itself (`own_rays`): > 0, infinity: never. That is the standard deviation of their light,
+    /// weighted as interpolation weighs it, divided by the mean. Where the gather map has the light map's density there
+    /// is nothing to compare.
+    pub interpolation_contrast: f32,
     /// Number of rays of texels of the light map that trace rays themselves, at most 64 and at most `gather_rays`; 0: a
     /// quarter of `gather_rays`, at least 16. Those with few others beside them have twice as many.
     pub own_rays: u32,
@@ -211,7 +217,8 @@ impl Default for BakeParams {
             gather_rays: 64,
             radius: 0.0,
             near_hits: 0.0,
-            interpolation_error: 1.0,
+            interpolation_error: 1.5,
+            interpolation_contrast: 0.15,
             own_rays: 0,
             blur_radius: 2,
             direct_samples: 16,
@@ -523,6 +530,9 @@ impl BakeParams {
         }
         if !(self.interpolation_error > 0.0) {
             return invalid_argument!("interpolation_error is {}, not a number > 0", self.interpolation_error);
+        }
+        if !(self.interpolation_contrast > 0.0) {
+            return invalid_argument!("interpolation_contrast is {}, not a number > 0", self.interpolation_contrast);
         }
         if self.blur_radius > blur::MAX_BLUR_RADIUS {
             return invalid_argument!("blur_radius is {}, more than {}", self.blur_radius, blur::MAX_BLUR_RADIUS);

@@ -166,6 +166,7 @@ mod tests {
         radius: 0.0,
         near_hits: 1.0,
         interpolation_error: 1.0,
+        interpolation_contrast: 0.15,
         own_rays: 0,
         blur_radius: 2,
         direct_samples: 16,

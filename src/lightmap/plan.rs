@@ -187,6 +187,10 @@ impl Plan {
             let most = params.interpolation_error;
             self.run(&format!("rays from texels where the gather map is too coarse: by an error of more than {most}"));
         }
+        if params.interpolation_contrast < f32::INFINITY {
+            let most = params.interpolation_contrast;
+            self.run(&format!("rays from texels where the gather map's light has a contrast of more than {most}"));
+        }
         if two_sided {
             self.run("radiance of back sides of two-sided materials");
         } else {

@@ -229,14 +229,15 @@ pub(crate) struct Own {
     pub rays: u64,
 }
 
-/// Traces the fallback gathers of texels without a valid gather texel around them. `directional`: whether light by
-/// direction is asked for.
+/// Traces the fallback gathers of an interpolation. `directional`: whether light by direction is asked for; `from`, `to`:
+/// the progress of the bake.
 pub(crate) fn own_light(
     inputs: &Inputs,
     radiance: &Radiance,
     backs: &[bool],
     upsampling: &Upsampling,
     directional: bool,
+    (from, to): (f32, f32),
 ) -> Result<Own> {
     let Inputs { atlas, params, progress, .. } = *inputs;
     let automatic = (params.gather_rays / OWN_PART).clamp(OWN_RAYS, ROUND as u32);
@@ -248,7 +249,7 @@ pub(crate) fn own_light(
         seed: purpose_seed(params.seed, purpose::OWN),
         directional,
     };
-    let stage = progress.stage("own light", 0.315, 0.32, upsampling.own_work());
+    let stage = progress.stage("own light", from, to, upsampling.own_work());
     let (light, directional, rays) = upsampling.own_light(atlas, backs, &rays, &stage)?;
     Ok(Own { light, directional, rays })
 }

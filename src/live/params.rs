@@ -53,8 +53,9 @@ pub struct LiveParams {
     pub radius: f32,
     /// Distance up to which hits of gather rays are near, as in a bake.
     pub near_hits: f32,
-    /// Estimated error of interpolation above which texels trace rays themselves, as in a bake. Infinity by default: those
-    /// rays come before the first light.
+    /// Estimated error of interpolation above which texels trace rays themselves, as in a bake with an
+    /// [`interpolation_contrast`](crate::lightmap::BakeParams::interpolation_contrast) of infinity: the gather map comes after
+    /// that choice. Infinity by default: those rays come before the first light.
     pub interpolation_error: f32,
     /// Number of rays of such texels, as in a bake.
     pub own_rays: u32,
@@ -196,6 +197,7 @@ impl LiveParams {
             radius: self.radius,
             near_hits: self.near_hits,
             interpolation_error: self.interpolation_error,
+            interpolation_contrast: f32::INFINITY,
             own_rays: self.own_rays,
             blur_radius: self.blur,
             direct_samples: self.direct_samples,

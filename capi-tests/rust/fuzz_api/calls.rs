@@ -702,6 +702,7 @@ fn bake_params(w: &W, s: &mut Source) -> bk_bake_params {
     params.near_hits = [0.0, 2.0, 2.0, 9.0, f32::INFINITY][s.below(5)];
     params.own_rays = [0, 1, 64][s.below(3)];
     params.interpolation_error = [0.5, 1.0, f32::INFINITY][s.below(3)];
+    params.interpolation_contrast = [0.1, 0.3, f32::INFINITY][s.below(3)];
     params.blur_radius = s.below(3) as u32;
     params.max_bounces = s.below(3) as u32;
     params.stitch = s.below(2) as u32;

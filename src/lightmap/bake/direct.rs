@@ -3,14 +3,13 @@
 use super::{BLOCK, Bake};
 use crate::base::directional::Directional;
 use crate::base::error::Result;
-use crate::base::memory::{try_collect, try_vec, try_with_capacity};
+use crate::base::memory::{try_collect, try_parts, try_vec, try_with_capacity};
 use crate::base::parallel::{ParallelLoop, one_by_one};
 use crate::base::progress::Stage;
 use crate::base::sampling::purpose_seed;
 use crate::base::scratch::Scratch;
 use crate::lightmap::atlas::ids::{LightMap, LightTexel};
 use crate::lightmap::changed::Redo;
-use crate::lightmap::indirect::upsample::parts;
 use crate::lightmap::stages::purpose;
 use crate::lightmap::texel_light::averages::{Averaged, Variation};
 use crate::lightmap::texel_light::{TexelLight, TilePoints};
@@ -81,7 +80,8 @@ impl Bake<'_, '_> {
                 rays.fetch_add(traced, Relaxed);
             });
             let blocks = direct[range.clone()].par_chunks_mut(BLOCK).zip(state[range.clone()].par_chunks(BLOCK));
-            let sums = parts(directed, BLOCK, range.len())?.into_par_iter().zip(parts(variances, BLOCK, range.len())?);
+            let sums =
+                try_parts(directed, BLOCK, range.len())?.into_par_iter().zip(try_parts(variances, BLOCK, range.len())?);
             let blocks = blocks.zip(variations.par_chunks(BLOCK)).zip(sums).enumerate();
             one_by_one(blocks).try_each(|(block, (((direct, state), variations), (directed, variances)))| {
                 if known[block] {

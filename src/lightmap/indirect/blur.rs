@@ -3,6 +3,7 @@
 use crate::base::directional::Linear;
 use crate::base::error::Result;
 use crate::base::functions::exp_of_negative;
+use crate::base::memory::try_parts;
 use crate::base::parallel::{ParallelLoop, one_by_one};
 use crate::base::progress::Stage;
 use crate::device::Device;
@@ -57,24 +58,30 @@ pub(in crate::lightmap) struct Noisy {
 /// indirect light therefore stay sharp where there is little noise, and the blur's bias vanishes with the noise. A
 /// texel takes part only if a path of valid texels of the same chart, within the square, leads to it: light on one side
 /// of a wall that stands on the chart does not cross the hidden texels below the wall. What is blurred so is `of`, by
-/// texel: the irradiance itself, or light by direction.
+/// texel: the irradiance itself, or light by direction. `variances`, unless it is empty, gets the variance of the blurred
+/// values' sums over the channels.
 pub(crate) fn blur<T: Linear>(
     device: &Device,
     charts: &Charts,
     map: &ChartMap<GatherMap>,
     (texels, of): (Texels, &[T]),
     radius: u32,
-    out: &mut [T],
+    (out, variances): (&mut [T], &mut [f32]),
     stage: &Stage,
 ) -> Result<()> {
     let radius = radius.min(MAX_BLUR_RADIUS) as i32;
+    let variances = try_parts(variances, BLOCK, out.len())?;
     device.install(|| {
-        one_by_one(out.par_chunks_mut(BLOCK).enumerate()).try_each(|(block, out)| {
+        one_by_one(out.par_chunks_mut(BLOCK).zip(variances).enumerate()).try_each(|(block, (out, variances))| {
             let mut window = Window::new(radius);
             for (i, out) in out.iter_mut().enumerate() {
                 stage.check()?;
                 let texel = GatherTexel::new(block * BLOCK + i);
-                *out = window.mean(charts, map, texel, |s| texels.get(s), |s| of[s.index()]);
+                let (mean, variance) = window.mean_of(charts, map, texel, |s| texels.get(s), |s| of[s.index()]);
+                *out = mean;
+                if let Some(out) = variances.get_mut(i) {
+                    *out = variance;
+                }
             }
             stage.advance(out.len() as u64)
         })
@@ -120,14 +127,27 @@ impl Window {
         get: impl Fn(TexelId<M>) -> Option<Noisy>,
         of: impl Fn(TexelId<M>) -> T,
     ) -> T {
-        let Some(own) = get(texel) else { return of(texel) };
+        self.mean_of(charts, map, texel, get, of).0
+    }
+
+    /// Returns [`mean`](Self::mean) and the variance that this mean of the values has, or 0 where there is no value.
+    #[inline]
+    fn mean_of<M: Map, T: Linear>(
+        &mut self,
+        charts: &Charts,
+        map: &ChartMap<M>,
+        texel: TexelId<M>,
+        get: impl Fn(TexelId<M>) -> Option<Noisy>,
+        of: impl Fn(TexelId<M>) -> T,
+    ) -> (T, f32) {
+        let Some(own) = get(texel) else { return (of(texel), 0.0) };
         let brightness = own.value.element_sum();
         let (x, y) = map.position(texel);
         let placement = map.placement_of(charts, texel);
         self.seen = [0; MAX_WINDOW];
         self.queue.clear();
         self.visit(0, 0);
-        let (mut sum, mut total) = (T::default(), 0.0);
+        let (mut sum, mut total, mut variance) = (T::default(), 0.0, 0.0);
         let mut next = 0;
         while next < self.queue.len() {
             let (dx, dy) = self.queue[next];
@@ -144,13 +164,14 @@ impl Window {
             let w = self.weights[(dx * dx + dy * dy) as usize] * bend * like;
             sum += of(s) * w;
             total += w;
+            variance += w * w * other.variance;
             for (nx, ny) in [(dx - 1, dy), (dx + 1, dy), (dx, dy - 1), (dx, dy + 1)] {
                 if nx.abs() <= self.radius && ny.abs() <= self.radius {
                     self.visit(nx, ny);
                 }
             }
         }
-        sum / total
+        (sum / total, variance / (total * total))
     }
 
     fn visit(&mut self, dx: i32, dy: i32) {

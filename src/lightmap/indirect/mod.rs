@@ -4,6 +4,7 @@ pub mod blur;
 pub(crate) mod bright_patches;
 pub(crate) mod find_bright_patches;
 pub(crate) mod gather;
+pub(in crate::lightmap) mod interpolation_contrast;
 mod interpolation_error;
 mod narrow_gaps;
 pub(crate) mod near_hits;

@@ -7,13 +7,14 @@
 //! creases, these do not matter either. A texel that is not in a known narrow gap and has no valid gather texel around
 //! it outside gaps, as on a narrow face of a moulding, gets a fallback gather: it traces a few rays itself, and the
 //! result is averaged with those of such texels nearby, as far as they do not differ by more than noise. So does a texel
-//! where interpolation is [estimated](super::interpolation_error) to be wrong, as in corners and under arches: the
-//! density of the rays adapts to the scene.
+//! where interpolation is [estimated](super::interpolation_error) to be wrong, as in corners and under arches, or where the
+//! light of the gather texels around [differs](super::interpolation_contrast): the density of the rays adapts to the scene.
 //!
 //! Measured: docs/experiments.md#fallback-gather.
 
 use super::blur::{Noisy, Window};
 use super::gather::{Gathered, Tile, TileTexel};
+use super::interpolation_contrast::GatherLight;
 use super::interpolation_error::{Surroundings, surroundings};
 use super::narrow_gaps::are_in_gaps;
 use super::near_hits::HitRadiance;
@@ -23,7 +24,7 @@ use super::upsample_visibility::{self, LastNormal, TEXELS_PER_CHECK};
 use crate::base::directional::{Directional, Linear};
 use crate::base::error::Result;
 use crate::base::memory::{
-    Reservation, try_append, try_collect, try_filled, try_par_gather, try_push, try_vec, try_with_capacity,
+    Reservation, try_append, try_collect, try_filled, try_par_gather, try_parts, try_push, try_vec, try_with_capacity,
 };
 use crate::base::parallel::{ParallelLoop, one_by_one};
 use crate::base::progress::Stage;
@@ -65,8 +66,12 @@ const STRATIFIED: f32 = 0.35;
 const NEAR: i32 = 2;
 const FEW: usize = 12;
 
-/// Interpolation constraints of the light map's texels. They depend on the scene and the sides that are shown, not on
-/// light.
+/// Distance in texels of the light map up to which fallback gathers change the light of others: those they are blurred
+/// with, and those that make these lone or not.
+pub(in crate::lightmap) const REACH: u32 = (RADIUS + NEAR) as u32;
+
+/// Interpolation constraints of the light map's texels. They depend on the scene and the sides that are shown, and not on
+/// light unless fallback gathers are [added](Self::add_where_light_differs) by it.
 #[derive(Default)]
 pub(crate) struct Upsampling {
     /// Gather texels in narrow gaps.
@@ -82,8 +87,6 @@ pub(crate) struct Upsampling {
     is_alone: TexelSet<LightMap>,
     /// Texels of the light map with a fallback gather, in ascending order.
     alone: Vec<LightTexel>,
-    /// Those that are lone.
-    is_lone: TexelSet<LightMap>,
     /// Number of rays traced to find the constraints.
     pub rays: u64,
     _memory: Option<Reservation>,
@@ -153,13 +156,61 @@ impl Upsampling {
         stage.check()?;
         let alone = try_collect(found.iter().flat_map(|f| &f.alone).copied(), SHOWN)?;
         let is_alone = TexelSet::new(alone.iter(), atlas.map.len(), SHOWN)?;
-        let is_lone = TexelSet::new(found.iter().flat_map(|f| &f.lone), atlas.map.len(), SHOWN)?;
         let rays = found.iter().map(|f| f.rays).sum();
-        let bits: usize = [&map_gaps, &walled, &is_alone, &is_lone].into_iter().map(TexelSet::bytes).sum();
-        let own = alone.len() * size_of::<Option<Vec3>>();
-        let bytes = gather_gaps.bytes() + bits + size_of_val(&walls[..]) + size_of_val(&alone[..]) + own;
-        let memory = device.memory().reserve(bytes, SHOWN)?;
-        Ok(Upsampling { gather_gaps, map_gaps, walled, walls, is_alone, alone, is_lone, rays, _memory: Some(memory) })
+        let mut found = Upsampling { gather_gaps, map_gaps, walled, walls, is_alone, alone, rays, _memory: None };
+        found._memory = Some(device.memory().reserve(found.bytes(), SHOWN)?);
+        Ok(found)
+    }
+
+    /// Returns the bytes held, and those of the [`OwnLight`].
+    fn bytes(&self) -> usize {
+        let bits: usize = [&self.map_gaps, &self.walled, &self.is_alone].into_iter().map(TexelSet::bytes).sum();
+        let own = self.alone.len() * size_of::<Option<Vec3>>();
+        self.gather_gaps.bytes() + bits + size_of_val(&self.walls[..]) + size_of_val(&self.alone[..]) + own
+    }
+
+    /// Adds fallback gathers where the light of the gather texels between which texels of some `placements` interpolate
+    /// has a [contrast](super::interpolation_contrast) of more than `most`. What is not `asked` for is left out (`None`:
+    /// nothing is). Advances `stage` by one per placement.
+    pub(crate) fn add_where_light_differs(
+        &mut self,
+        atlas: &Atlas,
+        placements: Range<usize>,
+        backs: &[bool],
+        light: &GatherLight,
+        most: f32,
+        asked: Option<Asked>,
+        stage: &Stage,
+    ) -> Result<()> {
+        let device = atlas.scene.device();
+        let first = placements.start;
+        let of_placement = |placement: usize, out: &mut Vec<LightTexel>| {
+            let placement = PlacementId::new(placement);
+            let is_asked = asked.is_none_or(|asked| asked.placements[placement.index()]);
+            let may_differ = is_asked && is_coarse(atlas, backs, placement);
+            for (i, texel) in atlas.map.texels_of(placement).enumerate() {
+                if i % TEXELS_PER_CHECK == 0 {
+                    stage.check()?;
+                }
+                let differs = || {
+                    may_differ
+                        && asked.is_none_or(|asked| asked.alone[texel.index()])
+                        && light.contrast_exceeds(most, self.sources(atlas, texel).iter())
+                };
+                if self.is_alone.has(texel) || differs() {
+                    try_push(out, texel, SHOWN)?;
+                }
+            }
+            stage.advance(1)
+        };
+        let alone =
+            device.install(|| try_par_gather(placements.len(), SHOWN, |i, out| of_placement(first + i, out)))?;
+        stage.check()?;
+        self.is_alone = TexelSet::new(alone.iter(), atlas.map.len(), SHOWN)?;
+        self.alone = alone;
+        self._memory = None;
+        self._memory = Some(device.memory().reserve(self.bytes(), SHOWN)?);
+        Ok(())
     }
 
     /// Traces the fallback gathers. Returns their light, that by direction, and the number of rays. Advances `stage` by
@@ -184,7 +235,7 @@ impl Upsampling {
         let new_tile = if rays.directional { Tile::by_direction } else { Tile::new };
         atlas.scene.device().install(|| {
             let blocks = own.par_chunks_mut(BLOCK).zip(self.alone.par_chunks(BLOCK));
-            one_by_one(blocks.zip(parts(&mut directional, BLOCK, self.alone.len())?)).try_each(
+            one_by_one(blocks.zip(try_parts(&mut directional, BLOCK, self.alone.len())?)).try_each(
                 |((own, texels), directional)| {
                     let mut tile = tiles.take(new_tile)?;
                     traced.fetch_add(
@@ -235,33 +286,37 @@ impl Upsampling {
         if let Some(irradiance) = self.is_alone.rank(texel).and_then(|i| own[i]) {
             return irradiance;
         }
-        let mut all = T::default();
-        if self.is_plain() {
-            atlas.gather_around(texel, |s, w| all += values[s] * w);
-            return all;
+        let sources = self.sources(atlas, texel);
+        let (mut sum, mut part) = (T::default(), 0.0);
+        for (s, w) in sources.iter() {
+            sum += values[s] * w;
+            part += w;
         }
-        // Sums over gather texels that are joined and alike, and over those that are joined, which serve if there are
-        // none of the first kind.
-        let mut sums = [(T::default(), 0.0, true); 2];
-        atlas.gather_around(texel, |s, w| {
-            all += values[s] * w;
-            let is_joined = !self.are_apart(texel, s);
-            for ((sum, part, is_all), counts) in sums.iter_mut().zip([is_joined && self.are_alike(texel, s), is_joined])
-            {
-                if counts {
-                    *sum += values[s] * w;
-                    *part += w;
-                } else {
-                    *is_all = false;
-                }
-            }
-        });
         // Weights need not add up to 1 exactly. If no gather texel is left out, the sum must not be divided by them: a
         // bake of some texels, among which there are no gaps or walls, gives the bits of a whole one.
-        match sums.into_iter().find(|(_, part, _)| *part > 0.0) {
-            Some((sum, part, false)) => sum / part,
-            _ => all,
+        if sources.are_all { sum } else { sum / part }
+    }
+
+    /// Returns the gather texels between which a texel of the light map interpolates: of those around, the ones that are
+    /// joined and alike, or else those that are joined, or else all.
+    #[inline]
+    fn sources(&self, atlas: &Atlas, texel: LightTexel) -> Sources {
+        let mut all = Sources { texels: [(GatherTexel::new(0), 0.0); 4], count: 0, are_all: true };
+        atlas.gather_around(texel, |s, w| all.push(s, w));
+        if self.is_plain() {
+            return all;
         }
+        let (mut joined, mut alike) = (all.none(), all.none());
+        for (s, w) in all.iter().filter(|&(s, _)| !self.are_apart(texel, s)) {
+            joined.push(s, w);
+            if self.are_alike(texel, s) {
+                alike.push(s, w);
+            }
+        }
+        let has_weight = |of: &Sources| of.iter().any(|(_, w)| w > 0.0);
+        let mut found = [alike, joined].into_iter().find(has_weight).unwrap_or(all);
+        found.are_all = found.count == all.count;
+        found
     }
 
     /// Whether a texel of the light map and one of the gather map both lie in narrow gaps, or neither does.
@@ -323,9 +378,14 @@ impl Upsampling {
         };
         let mut rays = 0;
         let mut places = places_in_order(&atlas.map, texels)?;
-        let is_lone = |place: u32| self.is_lone.has(texels[place as usize]);
-        let lone = try_collect(places.iter().copied().filter(|&place| is_lone(place)), "lone texels")?;
-        places.retain(|&place| !is_lone(place));
+        let mut lone = try_with_capacity(places.len(), "lone texels")?;
+        places.retain(|&place| {
+            let is_lone = self.is_lone(atlas, texels[place as usize]);
+            if is_lone {
+                lone.push(place);
+            }
+            !is_lone
+        });
         for (places, samples) in [places, lone].iter().zip(own.samples) {
             for places in places.chunks(Tile::texels(samples)) {
                 stage.check()?;
@@ -347,14 +407,45 @@ impl Upsampling {
         }
         Ok(rays)
     }
+
+    /// Whether a texel with a fallback gather is [lone](FEW).
+    fn is_lone(&self, atlas: &Atlas, texel: LightTexel) -> bool {
+        let map = &atlas.map;
+        let (x, y) = map.position(texel);
+        let placement = map.placement_of(&atlas.charts, texel);
+        // As for the blur.
+        let of_placement = map.texels_of(placement);
+        let square = (-NEAR..=NEAR).flat_map(|dy| (-NEAR..=NEAR).map(move |dx| (x + dx, y + dy)));
+        let beside = square.filter_map(|(x, y)| map.at(placement, x, y));
+        beside.filter(|&n| of_placement.contains(n) && self.is_alone.has(n)).take(FEW + 1).count() <= FEW
+    }
 }
 
-/// Cuts `values`, one for each of `count` texels or none at all, into parts of `size` texels.
-pub(in crate::lightmap) fn parts<T>(values: &mut [T], size: usize, count: usize) -> Result<Vec<&mut [T]>> {
-    let mut parts: Vec<&mut [T]> = try_with_capacity(count.div_ceil(size), "parts of a map")?;
-    parts.extend(values.chunks_mut(size));
-    parts.resize_with(count.div_ceil(size), Default::default);
-    Ok(parts)
+/// Gather texels between which a texel of the light map interpolates, and their weights.
+#[derive(Clone, Copy)]
+struct Sources {
+    texels: [(GatherTexel, f32); 4],
+    count: usize,
+    /// Whether these are all gather texels around.
+    are_all: bool,
+}
+
+impl Sources {
+    #[inline]
+    fn none(&self) -> Sources {
+        Sources { count: 0, ..*self }
+    }
+
+    #[inline]
+    fn push(&mut self, texel: GatherTexel, weight: f32) {
+        self.texels[self.count] = (texel, weight);
+        self.count += 1;
+    }
+
+    #[inline]
+    fn iter(&self) -> impl Iterator<Item = (GatherTexel, f32)> + Clone {
+        self.texels[..self.count].iter().copied()
+    }
 }
 
 /// Result of a fallback gather before the blur; `None` inside a solid.
@@ -370,7 +461,6 @@ struct Found {
     map_gaps: Vec<LightTexel>,
     walls: Vec<(LightTexel, GatherTexel)>,
     alone: Vec<LightTexel>,
-    lone: Vec<LightTexel>,
     rays: u64,
 }
 
@@ -388,10 +478,7 @@ impl Found {
         let scale = gather.layout[placement].scale;
         let width = 1.0 / scale[0].min(scale[1]);
         let of_gather = gather.texels_of(placement);
-        // At the light map's own density there is little to interpolate, and sides that no open place sees, as inside
-        // hollow walls, are not worth the rays.
-        let is_coarse = scale != map.layout[placement].scale && !is_hidden(atlas, backs, &of_gather);
-        let most_error = if is_coarse { most_error } else { f32::INFINITY };
+        let most_error = if is_coarse(atlas, backs, placement) { most_error } else { f32::INFINITY };
         let refines = most_error < f32::INFINITY;
         let around = match refines {
             true => surroundings(atlas, placement, backs, width, stage, &mut found.rays)?,
@@ -447,17 +534,17 @@ impl Found {
         let in_gaps = maybe_in_gaps.iter().zip(gaps).filter_map(|(&texel, is)| is.then_some(texel));
         found.map_gaps = try_collect(in_gaps, SHOWN)?;
         maybe_alone.retain(|texel| found.map_gaps.binary_search(texel).is_err());
-        let is_lone = |texel: LightTexel| {
-            let (x, y) = map.position(texel);
-            let square = (-NEAR..=NEAR).flat_map(|dy| (-NEAR..=NEAR).map(move |dx| (x + dx, y + dy)));
-            let beside =
-                square.filter_map(|(x, y)| map.at(placement, x, y)).filter(|n| maybe_alone.binary_search(n).is_ok());
-            beside.take(FEW + 1).count() <= FEW
-        };
-        found.lone = try_collect(maybe_alone.iter().copied().filter(|&texel| is_lone(texel)), SHOWN)?;
         found.alone = maybe_alone;
         Ok(found)
     }
+}
+
+/// Whether a placement is worth more than the gather map: at the light map's own density there is little to interpolate,
+/// and sides that no open place sees, as inside hollow walls, are not worth the rays.
+fn is_coarse(atlas: &Atlas, backs: &[bool], placement: PlacementId) -> bool {
+    let (gather, map) = (&atlas.gather, &atlas.map);
+    let has_detail = gather.layout[placement].scale != map.layout[placement].scale;
+    has_detail && !is_hidden(atlas, backs, &gather.texels_of(placement))
 }
 
 /// Whether the side that a placement's texels show can hardly be seen from any open place.
@@ -721,6 +808,45 @@ pub(super) mod tests {
             near > 0.95 && far < 0.05 && bent > 0.5,
             "{near} near, {far} far from the wall, {bent} of what is bent"
         );
+    }
+
+    /// Light that doubles across a line of the floor.
+    #[test]
+    fn texels_gather_for_themselves_where_light_differs_by_more_than_noise() {
+        let lightmap = plank();
+        let atlas = lightmap.atlas();
+        let x = |s| atlas.map.surface(&atlas.scene, s).0.x;
+        let floor = atlas.map.texels_of(PlacementId::front_of(atlas.charts.chart_of(0)));
+        let light = |s| Vec3::splat(if atlas.gather.surface(&atlas.scene, s).0.x < 1.0 { 1.0 } else { 2.0 });
+        let irradiance: Vec<Vec3> = atlas.gather.all().map(light).collect();
+        let progress = Progress::none();
+        let stage = progress.stage("contrast", 0.0, 1.0, 12);
+        let added = |noise: f32, asked: Option<Asked>| {
+            let variances = vec![noise; irradiance.len()];
+            let light = GatherLight { irradiance: PerTexel::new(&irradiance), variances: PerTexel::new(&variances) };
+            let mut found = find(atlas, 0..3, &[]);
+            let before = found.alone.clone();
+            found.add_where_light_differs(atlas, 0..3, &[], &light, 0.2, asked, &stage).unwrap();
+            assert!(found.alone.is_sorted() && before.iter().all(|s| found.alone.binary_search(s).is_ok()));
+            let ranks = found.alone.iter().map(|&s| found.is_alone.rank(s));
+            assert!(ranks.eq((0..found.alone.len()).map(Some)));
+            found.alone.retain(|s| before.binary_search(s).is_err());
+            found.alone
+        };
+        // Between gather texels 20 cm apart, at a part p of the way, contrast is √(p (1 − p)) / (1 + p).
+        let edge = added(0.0, None);
+        assert!(edge.iter().all(|&s| floor.contains(s) && (x(s) - 1.0).abs() < 0.1), "{}", edge.len());
+        let half_way: Vec<_> = floor.clone().filter(|&s| (x(s) - 1.0).abs() < 0.05).collect();
+        assert!(half_way.len() >= 7 * 320 && half_way.iter().all(|s| edge.binary_search(s).is_ok()));
+        // Variances of the sums of three channels: what is beyond the contrast is at most 9 · 0.164.
+        let few = added(1.0, None);
+        assert!(!few.is_empty() && few.len() < edge.len() && few.iter().all(|s| edge.binary_search(s).is_ok()));
+        assert!(added(1.5, None).is_empty());
+        // What nobody asks for has no rays.
+        let (some, none) = (vec![true; 3], vec![false; atlas.map.len()]);
+        assert!(added(0.0, Some(Asked { placements: &some, alone: &none })).is_empty());
+        let (none, all) = (vec![false; 3], vec![true; atlas.map.len()]);
+        assert!(added(0.0, Some(Asked { placements: &none, alone: &all })).is_empty());
     }
 
     /// A hollow wall of 4 cm in a room, both of two-sided surface, the fronts inside.

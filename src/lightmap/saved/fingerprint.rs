@@ -61,14 +61,15 @@ pub(super) struct Fingerprint {
     max_bounces: u32,
     gather_rays: u32,
     radius: f32,
-    blur_radius: u32,
+    blur_radius: u16,
+    own_rays: u16,
     direct_samples: u32,
     stitch: u16,
     directional: u16,
     passes: u32,
     target_error: f32,
     interpolation_error: f32,
-    own_rays: u32,
+    interpolation_contrast: f32,
 }
 
 /// Returns the library's version, as in files.
@@ -98,6 +99,7 @@ impl Fingerprint {
             radius,
             near_hits,
             interpolation_error,
+            interpolation_contrast,
             own_rays,
             blur_radius,
             direct_samples,
@@ -125,7 +127,9 @@ impl Fingerprint {
             gather_rays,
             radius,
             near_hits,
-            blur_radius,
+            // Checked parameters are far smaller.
+            blur_radius: blur_radius as u16,
+            own_rays: own_rays as u16,
             direct_samples,
             stitch: stitch.into(),
             // All bits of it are named in `lightmap::directional`, and checked.
@@ -133,7 +137,7 @@ impl Fingerprint {
             passes,
             target_error,
             interpolation_error,
-            own_rays,
+            interpolation_contrast,
         }
     }
 
@@ -146,8 +150,9 @@ impl Fingerprint {
             radius: self.radius,
             near_hits: self.near_hits,
             interpolation_error: self.interpolation_error,
-            own_rays: self.own_rays,
-            blur_radius: self.blur_radius,
+            interpolation_contrast: self.interpolation_contrast,
+            own_rays: self.own_rays.into(),
+            blur_radius: self.blur_radius.into(),
             direct_samples: self.direct_samples,
             seed: self.seed,
             memory_budget: 0,
@@ -190,6 +195,8 @@ impl Fingerprint {
         compare(&mut all, "radius", self.radius, needed.radius);
         compare(&mut all, "near_hits", self.near_hits, needed.near_hits);
         compare(&mut all, "interpolation_error", self.interpolation_error, needed.interpolation_error);
+        let [file, here] = [self, needed].map(|f| f.interpolation_contrast);
+        compare(&mut all, "interpolation_contrast", file, here);
         compare(&mut all, "own_rays", self.own_rays, needed.own_rays);
         compare(&mut all, "blur_radius", self.blur_radius, needed.blur_radius);
         compare(&mut all, "direct_samples", self.direct_samples, needed.direct_samples);

@@ -367,6 +367,10 @@ pub struct BakeFlags {
     #[arg(long, value_name = "F", default_value_t = BakeParams::default().interpolation_error,
           value_parser = of(|p: &mut BakeParams, v| p.interpolation_error = v))]
     pub interpolation_error: f32,
+    /// Contrast of the gather texels around above which texels gather for themselves; inf: never
+    #[arg(long, value_name = "F", default_value_t = BakeParams::default().interpolation_contrast,
+          value_parser = of(|p: &mut BakeParams, v| p.interpolation_contrast = v))]
+    pub interpolation_contrast: f32,
     /// Rays of texels that gather for themselves; 0: a quarter of a gather texel's, at least 16
     #[arg(long, value_name = "N", default_value_t = BakeParams::default().own_rays,
           value_parser = of(|p: &mut BakeParams, v| p.own_rays = v))]

@@ -83,6 +83,7 @@ fn parameters(args: &BakeArgs) -> Value {
         "radius": p.radius,
         "near_hits": p.near_hits,
         "interpolation_error": p.interpolation_error,
+        "interpolation_contrast": p.interpolation_contrast,
         "own_rays": p.own_rays,
         "blur": p.blur_radius,
         "direct_samples": p.direct_samples,
