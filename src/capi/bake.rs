@@ -200,13 +200,14 @@ pub struct bk_bake_params {
     /// the harmonic mean distance of the surfaces that it sees, plus 4 times the root of 1 − cos of
     /// the angle between normals (after Ward, Rubinstein and Clear 1988). 0.5 for final light;
     /// INFINITY for a preview, or where a scene is open and flat. Measured error and time:
-    /// docs/accuracy.md, "Interpolation error". Default: 1.5.
+    /// docs/accuracy.md, "Interpolation error". Default: 1.
     pub interpolation_error: f32,
     /// Contrast of the light of the texels of the gather map between which a texel of the light map
     /// interpolates, above which it traces rays itself, as at the edges of sunlit spots and of
     /// shadows of indirect light; > 0, INFINITY: never. It is the standard deviation of their light
-    /// divided by their mean, without the part that their noise explains. INFINITY for a preview;
-    /// measured error and time: docs/accuracy.md, "Interpolation contrast". Default: 0.15.
+    /// divided by their mean, without the part that their noise explains. 0.15 halves the error of a
+    /// sunlit atrium, and shows as specks on smooth walls unless `own_rays` is 64: docs/accuracy.md,
+    /// "Interpolation contrast". Default: INFINITY.
     pub interpolation_contrast: f32,
     /// Number of rays of texels of the light map that trace rays themselves, at most 64, and no more
     /// than `gather_rays`; 0: a quarter of `gather_rays`, at least 16. Those with few others beside

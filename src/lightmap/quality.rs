@@ -49,7 +49,7 @@ impl Quality {
                 let (error, blur) = ((d.interpolation_error, d.interpolation_contrast), d.blur_radius);
                 (d.photon_count, d.gather_rays, d.near_hits, error, blur, d.direct_samples, d.passes)
             }
-            Quality::High => (4_000_000, 128, 1.0, (0.5, 0.1), 1, 32, 1),
+            Quality::High => (4_000_000, 128, 1.0, (0.5, f32::INFINITY), 1, 32, 1),
             Quality::Reference => (0, 256, f32::INFINITY, (f32::INFINITY, f32::INFINITY), 0, 64, 4),
         };
         params.photon_count = photons;
