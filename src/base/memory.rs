@@ -255,7 +255,8 @@ pub fn try_par_filter(count: usize, what: &str, keep: impl Fn(u32) -> bool + Syn
 /// Number of candidates that [`try_par_filter`] gives to a thread at a time.
 const FILTER_PART: usize = 1 << 12;
 
-/// Cuts `values`, `count` of them or none at all, into parts of `size` texels.
+/// Cuts `values`, of which there are `count` or none at all, into parts of `size`. There are as many parts either way; they
+/// are empty if there are no values.
 pub(crate) fn try_parts<T>(values: &mut [T], size: usize, count: usize) -> Result<Vec<&mut [T]>> {
     let mut parts: Vec<&mut [T]> = try_with_capacity(count.div_ceil(size), "parts of values")?;
     parts.extend(values.chunks_mut(size));

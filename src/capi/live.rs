@@ -136,9 +136,8 @@ pub struct bk_live_params {
     pub background: u32,
     /// Estimated error of interpolation above which texels trace rays themselves, see
     /// bk_bake_params. These rays come before the first light and before that of new lights. Set it
-    /// to 1 for about as many texels as a default bake has; their light is that of a bake with
-    /// bk_bake_params.interpolation_contrast INFINITY, since the gather map of live updates comes
-    /// after that choice. Default: INFINITY.
+    /// to 1 for the texels of a default bake. There is no interpolation_contrast here: the gather map
+    /// of live updates comes after that choice. Default: INFINITY.
     pub interpolation_error: f32,
     /// Number of rays of texels of the light map that trace rays themselves, see bk_bake_params; 0: a
     /// quarter of `max_rounds` * 64, at least 16, at most 64. Default: 16.

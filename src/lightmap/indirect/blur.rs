@@ -77,7 +77,7 @@ pub(crate) fn blur<T: Linear>(
             for (i, out) in out.iter_mut().enumerate() {
                 stage.check()?;
                 let texel = GatherTexel::new(block * BLOCK + i);
-                let (mean, variance) = window.mean_of(charts, map, texel, |s| texels.get(s), |s| of[s.index()]);
+                let (mean, variance) = window.mean(charts, map, texel, |s| texels.get(s), |s| of[s.index()]);
                 *out = mean;
                 if let Some(out) = variances.get_mut(i) {
                     *out = variance;
@@ -114,25 +114,12 @@ impl Window {
         texels: Texels,
         of: &[T],
     ) -> T {
-        self.mean(charts, map, texel, |s| texels.get(s), |s| of[s.index()])
+        self.mean(charts, map, texel, |s| texels.get(s), |s| of[s.index()]).0
     }
 
-    /// Returns the mean of `of` with the weights with which one valid texel is blurred. `get`: the values by which weights
-    /// are chosen, where there are any.
+    /// Returns the mean of `of` with the weights with which one valid texel is blurred, and the variance of the same mean of
+    /// the values (0 where the texel has none). `get`: the values by which weights are chosen, where there are any.
     pub(in crate::lightmap) fn mean<M: Map, T: Linear>(
-        &mut self,
-        charts: &Charts,
-        map: &ChartMap<M>,
-        texel: TexelId<M>,
-        get: impl Fn(TexelId<M>) -> Option<Noisy>,
-        of: impl Fn(TexelId<M>) -> T,
-    ) -> T {
-        self.mean_of(charts, map, texel, get, of).0
-    }
-
-    /// Returns [`mean`](Self::mean) and the variance that this mean of the values has, or 0 where there is no value.
-    #[inline]
-    fn mean_of<M: Map, T: Linear>(
         &mut self,
         charts: &Charts,
         map: &ChartMap<M>,

@@ -355,7 +355,7 @@ impl Upsampling {
             let light = place(s).and_then(|k| own[k].light)?;
             Some(Noisy { variance: STRATIFIED * light.variance, ..light })
         };
-        Some(window.mean(&atlas.charts, &atlas.map, texel, get, |s| place(s).map_or(T::default(), &value)))
+        Some(window.mean(&atlas.charts, &atlas.map, texel, get, |s| place(s).map_or(T::default(), &value)).0)
     }
 
     /// Traces the fallback gathers of some texels of the light map and returns the number of rays.

@@ -262,7 +262,6 @@ fn set_quality(flags: &mut Flags, is_given: &dyn Fn(&str) -> bool) {
     set(&mut bake.gather_rays, params.gather_rays, is_given("gather_rays"));
     set(&mut bake.near_hits, params.near_hits, is_given("near_hits"));
     set(&mut bake.interpolation_error, params.interpolation_error, is_given("interpolation_error"));
-    set(&mut bake.interpolation_contrast, params.interpolation_contrast, is_given("interpolation_contrast"));
     set(&mut bake.blur, params.blur_radius, is_given("blur"));
     set(&mut bake.direct_samples, params.direct_samples, is_given("direct_samples"));
     set(&mut bake.passes, params.passes, is_given("passes"));
