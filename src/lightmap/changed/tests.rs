@@ -30,8 +30,10 @@ fn rooms_with(lamp: impl Fn(f32) -> Lamp) -> (Arc<Scene>, Lightmap) {
     (scene, map)
 }
 
+/// With all that chooses texels by the light around them, which what is made anew must read, too.
 fn params() -> BakeParams {
-    BakeParams { photon_count: 20_000, gather_rays: 16, stitch: false, seed: 4, ..Default::default() }
+    let (photon_count, interpolation_contrast) = (20_000, 0.15);
+    BakeParams { photon_count, interpolation_contrast, gather_rays: 16, stitch: false, seed: 4, ..Default::default() }
 }
 
 fn move_block(scene: &mut Arc<Scene>, by: Vec3) {

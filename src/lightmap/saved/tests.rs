@@ -69,7 +69,15 @@ fn lightmap(threads: usize) -> Lightmap {
 
 /// Bakes in a moment and runs every stage.
 fn params() -> BakeParams {
-    BakeParams { photon_count: 10_000, gather_rays: 16, direct_samples: 2, seed: 3, ..Default::default() }
+    let (photon_count, interpolation_contrast) = (10_000, 0.15);
+    BakeParams {
+        photon_count,
+        interpolation_contrast,
+        gather_rays: 16,
+        direct_samples: 2,
+        seed: 3,
+        ..Default::default()
+    }
 }
 
 fn bake(threads: usize, params: &BakeParams) -> Lightmap {
