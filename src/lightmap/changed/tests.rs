@@ -99,6 +99,29 @@ fn texels_keep_their_light_or_get_that_of_a_bake_from_nothing() {
     }
 }
 
+/// The light of gather texels beside what is made anew decides which texels gather for themselves. With a contrast of next to
+/// nothing, noise tips it.
+#[test]
+fn texels_chosen_by_contrast_get_the_light_of_a_bake_from_nothing() {
+    let none = Progress::none();
+    for (seed, blur_radius) in [(4, 2), (5, 2), (6, 1), (7, 4)] {
+        let params = BakeParams { seed, blur_radius, gather_rays: 64, interpolation_contrast: 1e-3, ..params() };
+        let (mut scene, mut map) = rooms();
+        map.bake(&params, &none).unwrap();
+        let old = light(&map);
+        move_block(&mut scene, Vec3::new(0.3, 0.2, 0.0));
+        map.follow(&scene, &none).unwrap();
+        map.bake_changed(&params, 0.05, &none).unwrap();
+        let changed = light(&map);
+        map.bake(&params, &none).unwrap();
+        let new = light(&map);
+        let indirect = changed[1].iter().zip(old[1].iter().zip(&new[1]));
+        let neither = indirect.clone().filter(|(changed, (old, new))| changed != old && changed != new).count();
+        let renewed = indirect.filter(|(changed, (old, new))| changed != old && changed == new).count();
+        assert!(neither == 0 && renewed > 1000, "{neither} of {renewed} are neither old nor new");
+    }
+}
+
 #[test]
 fn nothing_changed_keeps_all_and_back_again_gives_the_same_light() {
     let none = Progress::none();
