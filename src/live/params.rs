@@ -5,9 +5,9 @@ use super::dirty::LEAST_BYTES;
 use crate::base::directional::Directional;
 use crate::base::error::{Result, invalid_argument};
 use crate::lightmap::indirect::blur::MAX_BLUR_RADIUS;
+use crate::lightmap::indirect::fallback_gather::OWN_RAYS;
 use crate::lightmap::indirect::gather::Gathered;
 use crate::lightmap::indirect::sample_set::ROUND;
-use crate::lightmap::indirect::upsample::OWN_RAYS;
 use crate::lightmap::{BakeParams, directional};
 use glam::Vec3;
 

@@ -328,8 +328,8 @@ impl Live {
 mod tests {
     use super::*;
     use crate::base::directional::Directional;
+    use crate::lightmap::indirect::fallback_gather::OwnLight;
     use crate::lightmap::indirect::radiance_map::Radiance;
-    use crate::lightmap::indirect::upsample::OwnLight;
     use crate::lightmap::stages::Own;
     use crate::lightmap::{Lightmap, LightmapDesc};
     use crate::live::LiveParams;

@@ -2,6 +2,7 @@
 
 pub mod blur;
 pub(crate) mod bright_patches;
+pub(crate) mod fallback_gather;
 pub(crate) mod find_bright_patches;
 pub(crate) mod gather;
 pub(in crate::lightmap) mod interpolation_contrast;

@@ -5,70 +5,26 @@
 //! inside or outside a [narrow gap](super::narrow_gaps), and are not behind a [wall or
 //! crease](super::upsample_visibility); if there are none, the class does not matter, and if all are behind walls or
 //! creases, these do not matter either. A texel that is not in a known narrow gap and has no valid gather texel around
-//! it outside gaps, as on a narrow face of a moulding, gets a fallback gather: it traces a few rays itself, and the
-//! result is averaged with those of such texels nearby, as far as they do not differ by more than noise. So does a texel
+//! it outside gaps, as on a narrow face of a moulding, gets a [fallback gather](super::fallback_gather). So does a texel
 //! where interpolation is [estimated](super::interpolation_error) to be wrong, as in corners and under arches, or where the
 //! light of the gather texels around [differs](super::interpolation_contrast): the density of the rays adapts to the scene.
-//!
-//! Measured: docs/experiments.md#fallback-gather.
 
-use super::blur::{Noisy, Window};
-use super::gather::{Gathered, Tile, TileTexel};
 use super::interpolation_contrast::GatherLight;
 use super::interpolation_error::{Surroundings, surroundings};
 use super::narrow_gaps::are_in_gaps;
-use super::near_hits::HitRadiance;
-use super::sample_set::SampleSet;
 use super::texel_set::TexelSet;
 use super::upsample_visibility::{self, LastNormal, TEXELS_PER_CHECK};
-use crate::base::directional::{Directional, Linear};
+use crate::base::directional::Linear;
 use crate::base::error::Result;
-use crate::base::memory::{
-    Reservation, try_append, try_collect, try_filled, try_par_gather, try_parts, try_push, try_vec, try_with_capacity,
-};
-use crate::base::parallel::{ParallelLoop, one_by_one};
+use crate::base::memory::{Reservation, try_append, try_collect, try_par_gather, try_push};
 use crate::base::progress::Stage;
-use crate::base::sampling::combine;
-use crate::base::scratch::Scratch;
 use crate::lightmap::atlas::Atlas;
 use crate::lightmap::atlas::ids::{GatherMap, GatherTexel, LightMap, LightTexel, PerTexel, PlacementId, TexelRange};
-use crate::lightmap::tiles::places_in_order;
 use glam::Vec3;
-use rayon::prelude::*;
 use std::ops::Range;
-use std::sync::atomic::{AtomicU64, Ordering::Relaxed};
 
 /// Name of the buffers in error messages.
 const SHOWN: &str = "what the light map shows of the gather map";
-
-/// Number of fallback gathers that a thread computes at a time, and the number whose blur it does: enough for several
-/// squares of texels beside each other in wide charts.
-const BLOCK: usize = 4096;
-const BLURRED: usize = 256;
-
-/// Number of rays of a fallback gather that is not [lone](FEW), if it is not given: as many as a gather texel has, divided by
-/// this, but at least so many, and no more than a gather texel has or than there are in a round. (With 32 or 64 instead of
-/// 16 a furnished room has the same error.)
-pub(in crate::lightmap) const OWN_PART: u32 = 4;
-pub(crate) const OWN_RAYS: u32 = 16;
-
-/// Radius of the blur of fallback gathers, in texels of the light map.
-const RADIUS: i32 = 4;
-
-/// Factor on the estimated variance of a fallback gather when it is compared with others: its few rays are stratified, and
-/// vary less than independent ones, as which they are estimated. (With 1 the blur has a bias: a furnished room has 1.05
-/// times the error of a radius of 2, with this factor 0.94 times.)
-const STRATIFIED: f32 = 0.35;
-
-/// A fallback gather is lone if there are no more than `FEW`, itself counted, within `NEAR` texels, as on the edges of
-/// pilasters and ribs. There is little to blur it with, and it has twice the rays. (Sponza by two
-/// lamps: noise² 6.5e-3 → 5.5e-3 in the same time; with all rays alike, what is left shows as dots along edges.)
-const NEAR: i32 = 2;
-const FEW: usize = 12;
-
-/// Distance in texels of the light map up to which fallback gathers change the light of others: those they are blurred
-/// with, and those that make these lone or not.
-pub(in crate::lightmap) const REACH: u32 = (RADIUS + NEAR) as u32;
 
 /// Interpolation constraints of the light map's texels. They depend on the scene and the sides that are shown, and not on
 /// light unless fallback gathers are [added](Self::add_where_light_differs) by it.
@@ -84,28 +40,13 @@ pub(crate) struct Upsampling {
     /// Pairs of a texel of the light map and one of the gather map that a wall or a crease separates, in ascending
     /// order; never all gather texels around a texel.
     walls: Vec<(LightTexel, GatherTexel)>,
-    is_alone: TexelSet<LightMap>,
+    /// Texels of the light map that are in `alone`, by which their places there are found.
+    pub(super) is_alone: TexelSet<LightMap>,
     /// Texels of the light map with a fallback gather, in ascending order.
-    alone: Vec<LightTexel>,
+    pub(super) alone: Vec<LightTexel>,
     /// Number of rays traced to find the constraints.
     pub rays: u64,
     _memory: Option<Reservation>,
-}
-
-/// Indirect irradiance of the fallback gathers of an [`Upsampling`], in its order; `None` inside solids.
-pub(crate) type OwnLight = Vec<Option<Vec3>>;
-
-/// Indirect light by direction of the fallback gathers; empty if nobody asks for it.
-pub(crate) type OwnDirectional = Vec<Option<Directional>>;
-
-/// Inputs of fallback gathers.
-pub(crate) struct OwnRays<'a> {
-    pub radiance: HitRadiance<'a>,
-    /// Sample sets of texels and of lone ones, of which the first round is used.
-    pub samples: [&'a SampleSet; 2],
-    pub seed: u32,
-    /// Whether light by direction is asked for.
-    pub directional: bool,
 }
 
 /// What is asked for of an [`Upsampling`], where that is not all.
@@ -162,7 +103,7 @@ impl Upsampling {
         Ok(found)
     }
 
-    /// Returns the bytes held, and those of the [`OwnLight`].
+    /// Returns the bytes held, and those of the light of the [fallback gathers](super::fallback_gather).
     fn bytes(&self) -> usize {
         let bits: usize = [&self.map_gaps, &self.walled, &self.is_alone].into_iter().map(TexelSet::bytes).sum();
         let own = self.alone.len() * size_of::<Option<Vec3>>();
@@ -213,68 +154,13 @@ impl Upsampling {
         Ok(())
     }
 
-    /// Traces the fallback gathers. Returns their light, that by direction, and the number of rays. Advances `stage` by
-    /// [`own_work`](Self::own_work).
-    pub(crate) fn own_light(
-        &self,
-        atlas: &Atlas,
-        backs: &[bool],
-        rays: &OwnRays,
-        stage: &Stage,
-    ) -> Result<(OwnLight, OwnDirectional, u64)> {
-        let (what, n) = ("texels on their own", self.alone.len());
-        let traced = AtomicU64::new(0);
-        let nothing = Own { light: None };
-        let mut own = try_filled(n, nothing, what)?;
-        let _memory = atlas.scene.device().memory().reserve(size_of_val(&own[..]), what)?;
-        let mut light: OwnLight = try_filled(n, None, what)?;
-        let n = if rays.directional { n } else { 0 };
-        let mut directional: Vec<Directional> = try_vec(n, what)?;
-        let mut blurred: OwnDirectional = try_filled(n, None, what)?;
-        let tiles = Scratch::new();
-        let new_tile = if rays.directional { Tile::by_direction } else { Tile::new };
-        atlas.scene.device().install(|| {
-            let blocks = own.par_chunks_mut(BLOCK).zip(self.alone.par_chunks(BLOCK));
-            one_by_one(blocks.zip(try_parts(&mut directional, BLOCK, self.alone.len())?)).try_each(
-                |((own, texels), directional)| {
-                    let mut tile = tiles.take(new_tile)?;
-                    traced.fetch_add(
-                        self.gather_for(atlas, backs, rays, texels, (own, directional), &mut tile, stage)?,
-                        Relaxed,
-                    );
-                    stage.advance(texels.len() as u64)
-                },
-            )?;
-            one_by_one(blurred.par_chunks_mut(BLURRED).enumerate()).each(|(block, blurred)| {
-                let mut window = Window::new(RADIUS);
-                for (i, blurred) in (block * BLURRED..).zip(blurred) {
-                    *blurred = self.blurred(atlas, &mut window, &own, |k| directional[k], i);
-                }
-            });
-            one_by_one(light.par_chunks_mut(BLURRED).enumerate()).try_each(|(block, light)| {
-                let mut window = Window::new(RADIUS);
-                let value = |k: usize| own[k].light.map_or(Vec3::ZERO, |l| l.value);
-                for (i, light) in (block * BLURRED..).zip(light.iter_mut()) {
-                    *light = self.blurred(atlas, &mut window, &own, value, i);
-                }
-                stage.advance(light.len() as u64)
-            })
-        })?;
-        Ok((light, blurred, traced.into_inner()))
-    }
-
-    /// Returns the number of steps of [`own_light`](Self::own_light).
-    pub(crate) fn own_work(&self) -> u64 {
-        2 * self.alone.len() as u64
-    }
-
     /// Returns the texels with a fallback gather, in ascending order.
     pub(crate) fn alone(&self) -> &[LightTexel] {
         &self.alone
     }
 
     /// Interpolates a gather map's `values` at a texel of the light map, or returns the light of its fallback gather
-    /// from `own` ([`OwnLight`]).
+    /// from `own` ([`OwnLight`](super::fallback_gather::OwnLight)).
     #[inline]
     pub(crate) fn at<T: Linear>(
         &self,
@@ -335,90 +221,6 @@ impl Upsampling {
     pub(in crate::lightmap) fn is_plain(&self) -> bool {
         self.gather_gaps.is_empty() && self.walls.is_empty()
     }
-
-    /// Returns the mean `value` of fallback gather `i` and those around it in the same chart that are like it.
-    fn blurred<T: Linear>(
-        &self,
-        atlas: &Atlas,
-        window: &mut Window,
-        own: &[Own],
-        value: impl Fn(usize) -> T,
-        i: usize,
-    ) -> Option<T> {
-        let texel = self.alone[i];
-        own[i].light?;
-        let placement = atlas.map.placement_of(&atlas.charts, texel);
-        let of_placement = atlas.map.texels_of(placement);
-        // The window of given charts may contain another chart, which other shards bake.
-        let place = |s: LightTexel| self.is_alone.rank(s).filter(|_| of_placement.contains(s));
-        let get = |s| {
-            let light = place(s).and_then(|k| own[k].light)?;
-            Some(Noisy { variance: STRATIFIED * light.variance, ..light })
-        };
-        Some(window.mean(&atlas.charts, &atlas.map, texel, get, |s| place(s).map_or(T::default(), &value)).0)
-    }
-
-    /// Traces the fallback gathers of some texels of the light map and returns the number of rays.
-    fn gather_for(
-        &self,
-        atlas: &Atlas,
-        backs: &[bool],
-        own: &OwnRays,
-        texels: &[LightTexel],
-        (out, directional): (&mut [Own], &mut [Directional]),
-        tile: &mut Tile,
-        stage: &Stage,
-    ) -> Result<u64> {
-        let mut receiver = atlas.receivers(&atlas.map, backs);
-        let mut texel = |&place: &u32| TileTexel {
-            receiver: receiver(texels[place as usize]),
-            seed: combine(own.seed, texels[place as usize].seed()),
-            gathered: Gathered::default(),
-            directional: own.directional.then(Directional::default),
-        };
-        let mut rays = 0;
-        let mut places = places_in_order(&atlas.map, texels)?;
-        let mut lone = try_with_capacity(places.len(), "lone texels")?;
-        places.retain(|&place| {
-            let is_lone = self.is_lone(atlas, texels[place as usize]);
-            if is_lone {
-                lone.push(place);
-            }
-            !is_lone
-        });
-        for (places, samples) in [places, lone].iter().zip(own.samples) {
-            for places in places.chunks(Tile::texels(samples)) {
-                stage.check()?;
-                let mut of_tile: Vec<_> = places.iter().map(&mut texel).collect();
-                rays += tile.add_round(&atlas.scene, &own.radiance, &mut of_tile, samples, 0);
-                for (&place, texel) in places.iter().zip(&of_tile) {
-                    let TileTexel { receiver, gathered, .. } = texel;
-                    let noisy = || Noisy {
-                        value: gathered.irradiance(),
-                        variance: gathered.variance(),
-                        normal: receiver.normal,
-                    };
-                    out[place as usize] = Own { light: gathered.is_visible().then(noisy) };
-                    if let Some(out) = directional.get_mut(place as usize) {
-                        *out = texel.directional();
-                    }
-                }
-            }
-        }
-        Ok(rays)
-    }
-
-    /// Whether a texel with a fallback gather is [lone](FEW).
-    fn is_lone(&self, atlas: &Atlas, texel: LightTexel) -> bool {
-        let map = &atlas.map;
-        let (x, y) = map.position(texel);
-        let placement = map.placement_of(&atlas.charts, texel);
-        // As for the blur.
-        let of_placement = map.texels_of(placement);
-        let square = (-NEAR..=NEAR).flat_map(|dy| (-NEAR..=NEAR).map(move |dx| (x + dx, y + dy)));
-        let beside = square.filter_map(|(x, y)| map.at(placement, x, y));
-        beside.filter(|&n| of_placement.contains(n) && self.is_alone.has(n)).take(FEW + 1).count() <= FEW
-    }
 }
 
 /// Gather texels between which a texel of the light map interpolates, and their weights.
@@ -446,12 +248,6 @@ impl Sources {
     fn iter(&self) -> impl Iterator<Item = (GatherTexel, f32)> + Clone {
         self.texels[..self.count].iter().copied()
     }
-}
-
-/// Result of a fallback gather before the blur; `None` inside a solid.
-#[derive(Clone, Copy)]
-struct Own {
-    light: Option<Noisy>,
 }
 
 /// Interpolation constraints of one placement.
@@ -562,9 +358,6 @@ fn is_hidden(atlas: &Atlas, backs: &[bool], texels: &TexelRange<GatherMap>) -> b
 pub(super) mod tests {
     use super::*;
     use crate::base::progress::Progress;
-    use crate::lightmap::atlas::chart_map::ChartMap;
-    use crate::lightmap::atlas::ids::{Map, RadianceTexel, TexelId};
-    use crate::lightmap::indirect::radiance_map::{Radiance, RadianceLookup};
     use crate::lightmap::{Lightmap, LightmapDesc};
     use crate::scene::demo::shapes::MeshBuilder;
     use crate::scene::{Light, LightmapUvs, Material, SceneData};
@@ -598,25 +391,8 @@ pub(super) mod tests {
         Upsampling::find(atlas, placements, backs, f32::INFINITY, None, &stage).unwrap()
     }
 
-    /// What texels gather for themselves where each texel of the radiance map sends out its own radiance; and the rays.
-    fn own_light(atlas: &Atlas, upsampling: &Upsampling, radiance: impl Fn(RadianceTexel) -> f32) -> (OwnLight, u64) {
-        let values = atlas.radiance.all().map(|s| Vec3::splat(radiance(s))).collect();
-        let radiance = Radiance { values, ..Default::default() };
-        let samples = SampleSet::new(OWN_RAYS, 0);
-        let rays = OwnRays {
-            radiance: HitRadiance::of_map(RadianceLookup::new(&atlas.charts, &atlas.radiance, &radiance)),
-            samples: [&samples; 2],
-            seed: 0,
-            directional: false,
-        };
-        let progress = Progress::none();
-        let stage = progress.stage("own light", 0.0, 1.0, upsampling.own_work());
-        let (light, _, rays) = upsampling.own_light(atlas, &[], &rays, &stage).unwrap();
-        (light, rays)
-    }
-
     /// No light of their own.
-    pub(crate) fn dark(upsampling: &Upsampling) -> OwnLight {
+    pub(crate) fn dark(upsampling: &Upsampling) -> Vec<Option<Vec3>> {
         vec![Some(Vec3::ZERO); upsampling.alone.len()]
     }
 
@@ -712,7 +488,7 @@ pub(super) mod tests {
 
     /// Folded sheets 4 m long in a closed room, each along a profile of (x, z) that it is unfolded from, side by side
     /// in one page without a gap.
-    fn folded(profiles: &[&[[f32; 2]]]) -> Lightmap {
+    pub(crate) fn folded(profiles: &[&[[f32; 2]]]) -> Lightmap {
         let mut data = SceneData::new();
         let m = data.add_material(Material { two_sided: true, ..Default::default() }).unwrap();
         let mut start = 0.0;
@@ -736,52 +512,6 @@ pub(super) mod tests {
         data.add_mesh(room.finish()).unwrap();
         let desc = LightmapDesc { texels_per_unit: 50.0, gather_divisor: 8, ..Default::default() };
         Lightmap::create(&data.committed(), &desc, &Progress::none()).unwrap()
-    }
-
-    /// A face 60 mm high across a sheet: no gather texel is on it.
-    #[test]
-    fn narrow_faces_gather_for_themselves() {
-        let lightmap = folded(&[&[[-2.0, 0.0], [0.013, 0.0], [0.013, 0.06], [2.0, 0.06]]]);
-        let atlas = lightmap.atlas();
-        fn is_on_face<M: Map>(atlas: &Atlas, map: &ChartMap<M>, texel: TexelId<M>) -> bool {
-            map.surface(&atlas.scene, texel).1.x.abs() > 0.5
-        }
-        let only = PlacementId::new(0);
-        assert_eq!(atlas.gather.texels_of(only).filter(|&s| is_on_face(atlas, &atlas.gather, s)).count(), 0);
-        let upsampling = find(atlas, 0..1, &[]);
-        let (own, rays) = own_light(atlas, &upsampling, |_| 1.0);
-        let dark = vec![Vec3::ZERO; atlas.gather.len()];
-        let (mut on_face, mut elsewhere) = (0, 0);
-        for s in atlas.map.texels_of(only) {
-            let shown = upsampling.at(atlas, PerTexel::new(&dark), &own, s).x;
-            if is_on_face(atlas, &atlas.map, s) {
-                assert!((shown - std::f32::consts::PI).abs() < 1e-5, "{shown} on the face");
-                on_face += 1;
-            } else {
-                elsewhere += u32::from(shown != 0.0);
-            }
-        }
-        assert!(on_face >= 400 && elsewhere <= on_face / 4, "{on_face} and {elsewhere}");
-        assert_eq!(rays, u64::from(OWN_RAYS) * own.len() as u64);
-    }
-
-    /// Faces of two charts beside each other in the page: shards bake one without the other.
-    #[test]
-    fn what_texels_gather_is_blurred_within_their_chart() {
-        let face = [[0.0, 0.0], [0.0, 0.06], [2.0, 0.06]];
-        let lightmap = folded(&[&[[-2.0, -0.06], [-0.3, -0.06], [-0.3, 0.0]], &face]);
-        let atlas = lightmap.atlas();
-        assert_eq!(atlas.map.layout.given, 2);
-        let at = |s| (atlas.map.position(s), atlas.map.placement_of(&atlas.charts, s).index());
-        let both = find(atlas, 0..2, &[]).alone;
-        let beside = |&((x, y), placement): &((i32, i32), usize)| {
-            placement == 0 && both.iter().any(|&s| at(s) == ((x + 1, y), 1))
-        };
-        assert!(both.iter().map(|&s| at(s)).filter(beside).count() > 50);
-        // Unequal rays, so that what is blurred shows whom with.
-        let own =
-            |placements: Range<usize>| own_light(atlas, &find(atlas, placements, &[]), |s| (s.index() % 7) as f32).0;
-        assert_eq!(own(0..2), [own(0..1), own(1..2)].concat());
     }
 
     /// A floor that ends at a wall, and a quarter of a barrel.
