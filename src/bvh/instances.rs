@@ -2,7 +2,7 @@
 //! are the leaves of another (Wald, Benthin and Slusallek, *Distributed Interactive Ray Tracing of Dynamic Scenes*,
 //! 2003). A ray that meets the box of an instance goes through the tree of its mesh, in that one's coordinates.
 
-use super::layout::Mbvh;
+use super::layout::{ChildRef, LEAF_STRIDE, Mbvh};
 use super::{BuildOptions, BuildQuality, Tree, build_few};
 use crate::base::error::Result;
 use crate::base::geometry::is_valid_triangle;
@@ -76,6 +76,22 @@ impl Instances {
         let met = |(i, _): (u32, &(Vec3, Vec3))| is_valid_triangle(corners(i)).then_some(i);
         let ids = try_collect((0..).zip(boxes).filter_map(met), "the tree of instances")?;
         build_few(&corners, &ids, &options, progress)
+    }
+
+    /// Whether any ray can hit any instance.
+    pub(crate) fn are_hit(&self) -> bool {
+        let (lower, upper) = self.top.bounds();
+        lower.cmple(upper).all()
+    }
+
+    /// Returns the numbers of the instances in the tree over their boxes. Others are never met, wherever they move.
+    pub(crate) fn in_top(&self) -> impl Iterator<Item = u32> {
+        let leaves = self.top.nodes.iter().flat_map(|node| node.children);
+        let leaves = leaves.filter(|child| child.is_leaf() && *child != ChildRef::EMPTY);
+        leaves.flat_map(|leaf| {
+            let (count, first) = (leaf.leaf_count(), LEAF_STRIDE * leaf.leaf_slot());
+            self.top.leaves[first + 9 * count..][..count].iter().map(|number| number.to_bits())
+        })
     }
 
     /// Returns the number of triangles that are in no tree, those of each mesh once.

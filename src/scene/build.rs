@@ -6,6 +6,7 @@ use super::instance_trees;
 use super::precision::too_few_digits;
 use super::{Emitter, Material, MeshMaterials, NONE, Scene, SceneData, is_valid_triangle};
 use crate::base::error::{Error, Result};
+use crate::base::geometry::MAX_COORDINATE;
 use crate::base::memory::{Reservation, try_par_filter, try_with_capacity};
 use crate::base::progress::Progress;
 use crate::bvh::instances::Instances;
@@ -102,9 +103,9 @@ impl Scene {
         };
         let references = device.install(|| References::of_valid(own, &corners, is_valid_triangle, progress))?;
         progress.check()?;
-        if references.len() == 0 && !instances.as_ref().is_some_and(|i| i.trees.iter().any(|t| t.is_hit())) {
+        if references.len() == 0 && !instances.as_ref().is_some_and(Instances::are_hit) {
             return Err(Error::InvalidState(format!(
-                "all {total} triangles of the scene are degenerate or not finite"
+                "all {total} triangles of the scene are degenerate, not finite or beyond {MAX_COORDINATE:e} units"
             )));
         }
         let skipped: Vec<u32> = if references.len() == own {

@@ -64,7 +64,7 @@ pub(super) fn place(
         first_triangle,
     };
     let placed = try_collect(data.instances.iter().zip(first).map(place), TREES)?;
-    let of_instance = |i: usize| box_of(data, &trees, &placed, i);
+    let of_instance = |i: usize| box_of(&data.instances[i], trees[placed[i].tree as usize].tree.bounds());
     let boxes = try_par_collect((0..placed.len()).into_par_iter().map(of_instance), TREES)?;
     let top = Instances::top_of(&boxes, progress)?;
     Ok(Instances { top, trees, placed })
@@ -94,16 +94,17 @@ pub(super) fn refit(
         (at.to_mesh, at.origin) = (instance.to_mesh(), instance.transform.translation);
     }
     let Instances { top, trees, placed } = instances;
-    let corners = |i: u32| Instances::corners_of_box(box_of(data, trees, placed, i as usize));
+    let corners = |i: u32| {
+        let bounds = trees[placed[i as usize].tree as usize].tree.bounds();
+        Instances::corners_of_box(box_of(&data.instances[i as usize], bounds))
+    };
     bvh::refit_whole(top, &corners);
     gone
 }
 
-/// The box of an instance in the scene.
-fn box_of(data: &SceneData, trees: &[MeshTree], placed: &[PlacedTree], instance: usize) -> (Vec3, Vec3) {
-    let place = &data.instances[instance];
-    let bounds = trees[placed[instance].tree as usize].tree.bounds();
-    placed_box(bounds, place.reach(bounds), |p| super::instance::placed(&place.transform, p))
+/// The box in the scene of an instance of a mesh with given bounds.
+pub(super) fn box_of(instance: &Instance, bounds: (Vec3, Vec3)) -> (Vec3, Vec3) {
+    placed_box(bounds, instance.reach(bounds), |p| super::instance::placed(&instance.transform, p))
 }
 
 /// Returns the box around a scene whose meshes without instances have the tree `own`, and its

@@ -5,6 +5,7 @@ use super::emitters::{EMITTERS, add_emitters, emissive_triangles};
 use super::instance_trees;
 use super::{Emitter, Instance, Scene, is_valid_triangle};
 use crate::base::error::{Error, Result, invalid_argument};
+use crate::base::geometry::MAX_COORDINATE;
 use crate::base::memory::{try_to_vec, try_with_capacity};
 use crate::bvh;
 use crate::bvh::instances::Instances;
@@ -48,8 +49,10 @@ impl Scene {
         for &(instance, transform) in placed {
             scene.check_transform(instance, transform)?;
         }
-        if !scene.any_left(moved) {
-            return Err(Error::InvalidState("all triangles of the scene would be degenerate or not finite".into()));
+        if !scene.any_left(moved, placed) {
+            return Err(Error::InvalidState(format!(
+                "all triangles of the scene would be degenerate, not finite or beyond {MAX_COORDINATE:e} units"
+            )));
         }
         // All memory is allocated before anything changes.
         let emitters = try_with_capacity(emissive_triangles(&scene.data), EMITTERS)?;
@@ -100,14 +103,36 @@ impl Scene {
         }
     }
 
-    /// Whether any triangle of the tree can be hit after vertices have moved.
-    fn any_left(&self, moved: &[(u32, &[Vec3])]) -> bool {
+    /// Whether any triangle can be hit after vertices and instances have moved.
+    fn any_left(&self, moved: &[(u32, &[Vec3])], placed: &[(u32, Affine3A)]) -> bool {
         let new: HashMap<u32, &[Vec3]> = moved.iter().copied().collect();
-        (0..).zip(self.meshes()).any(|(m, mesh)| {
+        let left_of = |m: u32| {
+            let mesh = &self.meshes()[m as usize];
             let positions = new.get(&m).copied().unwrap_or(&mesh.positions);
-            (0..)
-                .zip(&mesh.indices)
-                .any(|(t, i)| is_valid_triangle(i.map(|i| positions[i as usize])) && !self.is_skipped_in_mesh(m, t))
+            let corners = move |i: &[u32; 3]| i.map(|i| positions[i as usize]);
+            let all = (0..).zip(&mesh.indices).map(move |(t, i)| (t, corners(i)));
+            all.filter(move |&(t, corners)| is_valid_triangle(corners) && !self.is_skipped_in_mesh(m, t))
+        };
+        let mut own = (0..self.meshes().len() as u32).filter(|&m| !self.data.is_instanced(m));
+        if own.any(|m| left_of(m).next().is_some()) {
+            return true;
+        }
+        let Some(instances) = self.instances.as_deref() else { return false };
+        // All of an instance may be beyond the greatest coordinate, as all of a mesh may.
+        let transforms: HashMap<u32, Affine3A> = placed.iter().copied().collect();
+        let mut boxes = HashMap::new();
+        instances.in_top().any(|i| {
+            let old = &self.data.instances[i as usize];
+            let instance = Instance { transform: transforms.get(&i).copied().unwrap_or(old.transform), ..*old };
+            let of_mesh = *boxes.entry(instance.mesh).or_insert_with(|| match new.contains_key(&instance.mesh) {
+                true => {
+                    left_of(instance.mesh).fold((Vec3::INFINITY, Vec3::NEG_INFINITY), |(low, high), (_, corners)| {
+                        corners.into_iter().fold((low, high), |(low, high), c| (low.min(c), high.max(c)))
+                    })
+                }
+                false => instances.trees[instances.placed[i as usize].tree as usize].tree.bounds(),
+            });
+            is_valid_triangle(Instances::corners_of_box(instance_trees::box_of(&instance, of_mesh)))
         })
     }
 

@@ -283,6 +283,44 @@ fn rays_from_instances_do_not_hit_them_again_however_far_their_mesh_is_from_its_
     }
 }
 
+/// Boxes of instances beyond the greatest coordinate are in no tree.
+#[test]
+fn scenes_of_which_nothing_can_be_hit_are_refused() {
+    let far = Affine3A::from_translation(Vec3::splat(1e12));
+    for (isa, build) in builds() {
+        let mut data = SceneData::new();
+        let material = data.add_material(Material::default()).unwrap();
+        let mesh = data.add_mesh(soup(20, 3, material)).unwrap();
+        data.add_instance(Instance { mesh, transform: far }).unwrap();
+        let device = Device::new(DeviceOptions { isa: Some(isa), num_threads: 1, ..Default::default() }).unwrap();
+        match Scene::commit(&device, data.clone(), &build, &Progress::none()) {
+            Ok(scene) => panic!("{isa:?} {build:?}: a scene with bounds {:?}", scene.bounds()),
+            Err((_, e)) => assert!(e.to_string().contains("beyond 1e12"), "{e}"),
+        }
+        // One that is met, which then goes where the other is, by its transform and by its mesh; and both at once back.
+        data.add_instance(Instance { mesh, transform: transform(1, 3) }).unwrap();
+        let mut scene = commit(isa, build, &data);
+        let at_end = vec![Vec3::splat(1e12); data.meshes()[0].positions.len()];
+        let positions = &data.meshes()[0].positions[..];
+        let gone: Vec<Vec3> = positions.iter().map(|&p| 0.5e12 * (p + 1.5)).collect();
+        let half = Affine3A::from_translation(Vec3::splat(0.9e12));
+        for (moved, placed) in [
+            (&[][..], &[(1, far)][..]),
+            (&[(0, &at_end[..])], &[]),
+            (&[(0, &gone[..])], &[(1, half)]),
+            // What no tree holds stays out wherever it goes.
+            (&[], &[(0, transform(1, 3)), (1, far)]),
+        ] {
+            let e = Scene::refit_with(&mut scene, moved, placed).expect_err(&format!("{isa:?} {build:?}")).to_string();
+            assert!(e.contains("beyond 1e12"), "{e}");
+            assert_eq!(scene.stats().refits, 0);
+        }
+        let small: Vec<Vec3> = positions.iter().map(|&p| 0.1 * p).collect();
+        Scene::refit_with(&mut scene, &[(0, &small)], &[(1, transform(2, 3))]).unwrap();
+        assert!(scene.bounds().0.cmple(scene.bounds().1).all());
+    }
+}
+
 #[test]
 fn refused_moves_of_instances_change_nothing() {
     let mut scene = commit(Isa::Portable, BuildOptions::default(), &data(2, false));
