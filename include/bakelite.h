@@ -2074,14 +2074,14 @@ typedef struct bk_bake_params {
   /// the angle between normals (after Ward, Rubinstein and Clear 1988). 0.5 for final light;
   /// INFINITY for a preview, or where a scene is open and flat. 1 halves the error of a furnished
   /// room for a tenth more time, and takes up to a quarter more elsewhere: docs/accuracy.md,
-  /// "Interpolation error". Default: 1.
+  /// "Interpolation error". Default: 1.5.
   float interpolation_error;
   /// Contrast of the light of the texels of the gather map between which a texel of the light map
   /// interpolates, above which it traces rays itself, as at the edges of sunlit spots and of
-  /// shadows of indirect light; > 0, INFINITY: never. It is the standard deviation of their light
-  /// divided by their mean, without the part that their noise explains. 0.15 halves the error of a
-  /// sunlit atrium, but shows as specks on smooth walls: docs/accuracy.md, "Interpolation
-  /// contrast". Default: INFINITY.
+  /// shadows of indirect light; > 0, INFINITY: never, as for a preview. It is the standard deviation
+  /// of their light divided by their mean, without the part that their noise explains. What such a
+  /// texel gathers counts as far as it differs from the interpolated light by more than noise:
+  /// docs/accuracy.md, "Interpolation contrast". Default: 0.15.
   float interpolation_contrast;
   /// Number of rays of texels of the light map that trace rays themselves, at most 64, and no more
   /// than `gather_rays`; 0: a quarter of `gather_rays`, at least 16. Those with few others beside
@@ -2166,7 +2166,8 @@ BK_API void bk_bake_params_init(bk_bake_params *params);
 /// seed, budget and so on. Measured error and time: docs/accuracy.md, "Qualities".
 ///
 /// bk_lightmap_desc: `gather_divisor`, `radiance_divisor`. bk_bake_params: `photon_count`,
-/// `gather_rays`, `near_hits`, `interpolation_error`, `blur_radius`, `direct_samples`, `passes`.
+/// `gather_rays`, `near_hits`, `interpolation_error`, `interpolation_contrast`, `blur_radius`,
+/// `direct_samples`, `passes`.
 ///
 /// @param quality  one of the BK_QUALITY values
 /// @param desc  structure that bk_lightmap_desc_init has filled in; may be NULL
@@ -2713,8 +2714,9 @@ typedef struct bk_live_params {
   uint32_t background;
   /// Estimated error of interpolation above which texels trace rays themselves, see
   /// bk_bake_params. These rays come before the first light and before that of new lights. Set it
-  /// to 1 for the texels of a default bake. There is no interpolation_contrast here: the gather map
-  /// of live updates comes after that choice. Default: INFINITY.
+  /// to 1.5 for those of a default bake. There is no interpolation_contrast here, as the gather map
+  /// of live updates comes after that choice: they end with the light of a bake whose
+  /// interpolation_contrast is INFINITY. Default: INFINITY.
   float interpolation_error;
   /// Number of rays of texels of the light map that trace rays themselves, see bk_bake_params; 0: a
   /// quarter of `max_rounds` * 64, at least 16, at most 64. Default: 16.

@@ -61,6 +61,7 @@ pub(crate) trait Linear:
 {
 }
 
+impl Linear for f32 {}
 impl Linear for Vec3 {}
 impl Linear for Directional {}
 

@@ -201,14 +201,14 @@ pub struct bk_bake_params {
     /// the angle between normals (after Ward, Rubinstein and Clear 1988). 0.5 for final light;
     /// INFINITY for a preview, or where a scene is open and flat. 1 halves the error of a furnished
     /// room for a tenth more time, and takes up to a quarter more elsewhere: docs/accuracy.md,
-    /// "Interpolation error". Default: 1.
+    /// "Interpolation error". Default: 1.5.
     pub interpolation_error: f32,
     /// Contrast of the light of the texels of the gather map between which a texel of the light map
     /// interpolates, above which it traces rays itself, as at the edges of sunlit spots and of
-    /// shadows of indirect light; > 0, INFINITY: never. It is the standard deviation of their light
-    /// divided by their mean, without the part that their noise explains. 0.15 halves the error of a
-    /// sunlit atrium, but shows as specks on smooth walls: docs/accuracy.md, "Interpolation
-    /// contrast". Default: INFINITY.
+    /// shadows of indirect light; > 0, INFINITY: never, as for a preview. It is the standard deviation
+    /// of their light divided by their mean, without the part that their noise explains. What such a
+    /// texel gathers counts as far as it differs from the interpolated light by more than noise:
+    /// docs/accuracy.md, "Interpolation contrast". Default: 0.15.
     pub interpolation_contrast: f32,
     /// Number of rays of texels of the light map that trace rays themselves, at most 64, and no more
     /// than `gather_rays`; 0: a quarter of `gather_rays`, at least 16. Those with few others beside
@@ -279,7 +279,8 @@ pub const BK_QUALITY_REFERENCE: u32 = 3;
 /// seed, budget and so on. Measured error and time: docs/accuracy.md, "Qualities".
 ///
 /// bk_lightmap_desc: `gather_divisor`, `radiance_divisor`. bk_bake_params: `photon_count`,
-/// `gather_rays`, `near_hits`, `interpolation_error`, `blur_radius`, `direct_samples`, `passes`.
+/// `gather_rays`, `near_hits`, `interpolation_error`, `interpolation_contrast`, `blur_radius`,
+/// `direct_samples`, `passes`.
 ///
 /// @param quality  one of the BK_QUALITY values
 /// @param desc  structure that bk_lightmap_desc_init has filled in; may be NULL
@@ -311,6 +312,7 @@ pub unsafe extern "C" fn bk_quality_set(
             p.gather_rays = new.gather_rays;
             p.near_hits = new.near_hits;
             p.interpolation_error = new.interpolation_error;
+            p.interpolation_contrast = new.interpolation_contrast;
             p.blur_radius = new.blur_radius;
             p.direct_samples = new.direct_samples;
             p.passes = new.passes;

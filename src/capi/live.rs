@@ -136,8 +136,9 @@ pub struct bk_live_params {
     pub background: u32,
     /// Estimated error of interpolation above which texels trace rays themselves, see
     /// bk_bake_params. These rays come before the first light and before that of new lights. Set it
-    /// to 1 for the texels of a default bake. There is no interpolation_contrast here: the gather map
-    /// of live updates comes after that choice. Default: INFINITY.
+    /// to 1.5 for those of a default bake. There is no interpolation_contrast here, as the gather map
+    /// of live updates comes after that choice: they end with the light of a bake whose
+    /// interpolation_contrast is INFINITY. Default: INFINITY.
     pub interpolation_error: f32,
     /// Number of rays of texels of the light map that trace rays themselves, see bk_bake_params; 0: a
     /// quarter of `max_rounds` * 64, at least 16, at most 64. Default: 16.

@@ -406,7 +406,13 @@ impl<'p> Bake<'_, 'p> {
     }
 
     /// Traces the fallback gathers, or reads their light from the checkpoint.
-    fn own_light(&self, radiance: &Radiance, backs: &[bool], upsampling: &Upsampling) -> Result<Own> {
+    fn own_light(
+        &self,
+        radiance: &Radiance,
+        backs: &[bool],
+        upsampling: &Upsampling,
+        gathered: Option<&GatherLight>,
+    ) -> Result<Own> {
         let texels = upsampling.own_work() as usize / 2;
         let asks = self.asks(directional::INDIRECT);
         if let Some(c) = self.from.checkpoint
@@ -415,7 +421,7 @@ impl<'p> Bake<'_, 'p> {
         {
             return Ok(Own { light, directional, rays: 0 });
         }
-        let own = stages::own_light(&self.inputs(), radiance, backs, upsampling, asks, (0.56, 0.65))?;
+        let own = stages::own_light(&self.inputs(), radiance, backs, upsampling, gathered, asks, (0.56, 0.65))?;
         if let Some(c) = self.from.checkpoint {
             if asks {
                 c.keep_own_directional(&own.directional);
@@ -557,6 +563,7 @@ impl<'p> Bake<'_, 'p> {
             let filling = Filling::new(n, |i| valid[i], is_hidden)?;
             filling.fill(&l.charts, &l.gather, &mut directional, self.progress)?;
         }
+        let mut blurred_variances = Vec::new();
         if self.plan.runs(left_out::BLUR) {
             let stage = self.progress.stage("blur", 0.53, 0.55, if asks { 2 * n as u64 } else { n as u64 });
             let mut blurred = try_vec(n, "the blurred gather map")?;
@@ -570,16 +577,24 @@ impl<'p> Bake<'_, 'p> {
                 blur::blur(device, &l.charts, &l.gather, (texels, &directional), radius, (&mut out, &mut []), &stage)?;
                 directional = out;
             }
-            (irradiance, variances) = (blurred, noises);
+            irradiance = blurred;
+            blurred_variances = noises;
         }
+        drop((normals, valid));
+        let unblurred = PerTexel::new(&variances);
+        let light = GatherLight {
+            irradiance: PerTexel::new(&irradiance),
+            variances: if blurred_variances.is_empty() { unblurred } else { PerTexel::new(&blurred_variances) },
+            unblurred,
+            rays: self.params.gather_rays,
+            directional: &directional,
+        };
         if self.compares() {
             let stage = self.progress.stage("contrast of the gather map", 0.55, 0.56, placements.len() as u64);
-            let light = GatherLight { irradiance: PerTexel::new(&irradiance), variances: PerTexel::new(&variances) };
             let most = self.params.interpolation_contrast;
             upsampling.add_where_light_differs(l, placements, backs, &light, most, asked, &stage)?;
         }
-        drop((normals, variances, valid));
-        let own = self.own_light(radiance, backs, &upsampling)?;
+        let own = self.own_light(radiance, backs, &upsampling, self.compares().then_some(&light))?;
         let bytes = (n * self.gather_bytes() + directional.len() * DIRECTIONAL_BYTES + l.gather.bytes()) as u64;
         let rays = rays.into_inner() + own.rays;
         stats.gather = StageStats { seconds: start.elapsed().as_secs_f64(), rays, bytes };

@@ -121,7 +121,7 @@ impl<'a> DirectBlur<'a> {
             let normal = if map[s].triangle == triangle { normal } else { map.surface(scene, s).1 };
             Some(Noisy { value, variance: variance.max(own), normal })
         };
-        self.window.mean(charts, map, texel, get, of).0
+        self.window.mean(charts, map, texel, get, of).value
     }
 
     /// Returns the mean variance of a texel and those beside it: that of a single texel is known from few points.

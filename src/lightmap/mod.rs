@@ -162,7 +162,8 @@ pub struct BakeParams {
     /// between normals: the split-sphere model (Ward, Rubinstein and Clear 1988), with weights of its own.
     pub interpolation_error: f32,
     /// RMS contrast of the gather texels between which a texel of the light map interpolates, beyond what is noise, above
-    /// which it traces rays itself (`own_rays`): > 0, infinity: never. That is the standard deviation of their light,
+    /// which it traces rays itself (`own_rays`): > 0, infinity: never. Their light counts only as far as it differs from the
+    /// interpolated one by more than noise. The contrast is the standard deviation of their light,
     /// weighted as interpolation weighs it, divided by the mean. Where the gather map has the light map's density there
     /// is nothing to compare.
     pub interpolation_contrast: f32,
@@ -217,8 +218,8 @@ impl Default for BakeParams {
             gather_rays: 64,
             radius: 0.0,
             near_hits: 0.0,
-            interpolation_error: 1.0,
-            interpolation_contrast: f32::INFINITY,
+            interpolation_error: 1.5,
+            interpolation_contrast: 0.15,
             own_rays: 0,
             blur_radius: 2,
             direct_samples: 16,

@@ -43,19 +43,21 @@ impl Quality {
     /// Sets photons, rays, blur and passes of a bake. All else stays.
     pub fn set_params(self, params: &mut BakeParams) {
         let d = BakeParams::default();
-        let (photons, gather, near_hits, error, blur, direct, passes) = match self {
-            Quality::Preview => (200_000, 32, 0.0, f32::INFINITY, 2, 4, 1),
+        const NEVER: f32 = f32::INFINITY;
+        let (photons, gather, near_hits, (error, contrast), blur, direct, passes) = match self {
+            Quality::Preview => (200_000, 32, 0.0, (NEVER, NEVER), 2, 4, 1),
             Quality::Medium => {
-                let (error, blur) = (d.interpolation_error, d.blur_radius);
-                (d.photon_count, d.gather_rays, d.near_hits, error, blur, d.direct_samples, d.passes)
+                let most = (d.interpolation_error, d.interpolation_contrast);
+                (d.photon_count, d.gather_rays, d.near_hits, most, d.blur_radius, d.direct_samples, d.passes)
             }
-            Quality::High => (4_000_000, 128, 1.0, 0.5, 1, 32, 1),
-            Quality::Reference => (0, 256, f32::INFINITY, f32::INFINITY, 0, 64, 4),
+            Quality::High => (4_000_000, 128, 1.0, (0.5, d.interpolation_contrast), 1, 32, 1),
+            Quality::Reference => (0, 256, f32::INFINITY, (NEVER, NEVER), 0, 64, 4),
         };
         params.photon_count = photons;
         params.gather_rays = gather;
         params.near_hits = near_hits;
         params.interpolation_error = error;
+        params.interpolation_contrast = contrast;
         params.blur_radius = blur;
         params.direct_samples = direct;
         params.passes = passes;

@@ -7,6 +7,7 @@ use super::atlas::two_sided;
 use super::indirect::bright_patches::Bright;
 use super::indirect::fallback_gather::{OWN_PART, OWN_RAYS, OwnDirectional, OwnLight, OwnRays};
 use super::indirect::find_bright_patches;
+use super::indirect::interpolation_contrast::GatherLight;
 use super::indirect::near_hits::{HitRadiance, NearHits};
 use super::indirect::radiance_map::{self, Radiance, RadianceInput, RadianceLookup};
 use super::indirect::sample_set::{ROUND, SampleSet};
@@ -230,13 +231,14 @@ pub(crate) struct Own {
     pub rays: u64,
 }
 
-/// Traces the fallback gathers of an interpolation. `directional`: whether light by direction is asked for; `from`, `to`:
-/// the progress of the bake.
+/// Traces the fallback gathers of an interpolation. `gathered`: the gather map, if its contrast has chosen some of them;
+/// `directional`: whether light by direction is asked for; `from`, `to`: the progress of the bake.
 pub(crate) fn own_light(
     inputs: &Inputs,
     radiance: &Radiance,
     backs: &[bool],
     upsampling: &Upsampling,
+    gathered: Option<&GatherLight>,
     directional: bool,
     (from, to): (f32, f32),
 ) -> Result<Own> {
@@ -249,6 +251,7 @@ pub(crate) fn own_light(
         samples: [&set(count), &set((2 * count).min(params.gather_rays).min(ROUND as u32))],
         seed: purpose_seed(params.seed, purpose::OWN),
         directional,
+        gathered,
     };
     let stage = progress.stage("own light", from, to, upsampling.own_work());
     let (light, directional, rays) = upsampling.own_light(atlas, backs, &rays, &stage)?;

@@ -91,7 +91,7 @@ pub(super) fn illuminate(
     let own = match has_indirect {
         true => {
             let asks = params.directional & directional::INDIRECT != 0;
-            stages::own_light(&inputs, &radiance, &sides.backs, &sides.upsampling, asks, (0.315, 0.32))?
+            stages::own_light(&inputs, &radiance, &sides.backs, &sides.upsampling, None, asks, (0.315, 0.32))?
         }
         false => Own::default(),
     };

@@ -77,15 +77,24 @@ pub(crate) fn blur<T: Linear>(
             for (i, out) in out.iter_mut().enumerate() {
                 stage.check()?;
                 let texel = GatherTexel::new(block * BLOCK + i);
-                let (mean, variance) = window.mean(charts, map, texel, |s| texels.get(s), |s| of[s.index()]);
-                *out = mean;
+                let mean = window.mean(charts, map, texel, |s| texels.get(s), |s| of[s.index()]);
+                *out = mean.value;
                 if let Some(out) = variances.get_mut(i) {
-                    *out = variance;
+                    *out = mean.variance;
                 }
             }
             stage.advance(out.len() as u64)
         })
     })
+}
+
+/// A weighted mean over texels.
+pub(in crate::lightmap) struct Mean<T> {
+    pub value: T,
+    /// Variance of the same mean of the values by which weights are chosen.
+    pub variance: f32,
+    /// The same if each of these had a variance of 1.
+    pub share: f32,
 }
 
 /// Scratch space for one texel's neighbourhood.
@@ -114,11 +123,11 @@ impl Window {
         texels: Texels,
         of: &[T],
     ) -> T {
-        self.mean(charts, map, texel, |s| texels.get(s), |s| of[s.index()]).0
+        self.mean(charts, map, texel, |s| texels.get(s), |s| of[s.index()]).value
     }
 
-    /// Returns the mean of `of` with the weights with which one valid texel is blurred, and the variance of the same mean of
-    /// the values (0 where the texel has none). `get`: the values by which weights are chosen, where there are any.
+    /// Returns the mean of `of` with the weights with which one valid texel is blurred; where the texel has no value, `of`
+    /// it alone, without noise. `get`: the values by which weights are chosen, where there are any.
     pub(in crate::lightmap) fn mean<M: Map, T: Linear>(
         &mut self,
         charts: &Charts,
@@ -126,15 +135,15 @@ impl Window {
         texel: TexelId<M>,
         get: impl Fn(TexelId<M>) -> Option<Noisy>,
         of: impl Fn(TexelId<M>) -> T,
-    ) -> (T, f32) {
-        let Some(own) = get(texel) else { return (of(texel), 0.0) };
+    ) -> Mean<T> {
+        let Some(own) = get(texel) else { return Mean { value: of(texel), variance: 0.0, share: 1.0 } };
         let brightness = own.value.element_sum();
         let (x, y) = map.position(texel);
         let placement = map.placement_of(charts, texel);
         self.seen = [0; MAX_WINDOW];
         self.queue.clear();
         self.visit(0, 0);
-        let (mut sum, mut total, mut variance) = (T::default(), 0.0, 0.0);
+        let (mut sum, mut total, mut variance, mut squares) = (T::default(), 0.0, 0.0, 0.0);
         let mut next = 0;
         while next < self.queue.len() {
             let (dx, dy) = self.queue[next];
@@ -152,13 +161,14 @@ impl Window {
             sum += of(s) * w;
             total += w;
             variance += w * w * other.variance;
+            squares += w * w;
             for (nx, ny) in [(dx - 1, dy), (dx + 1, dy), (dx, dy - 1), (dx, dy + 1)] {
                 if nx.abs() <= self.radius && ny.abs() <= self.radius {
                     self.visit(nx, ny);
                 }
             }
         }
-        (sum / total, variance / (total * total))
+        Mean { value: sum / total, variance: variance / (total * total), share: squares / (total * total) }
     }
 
     fn visit(&mut self, dx: i32, dy: i32) {

@@ -4,8 +4,9 @@
 //!
 //! Measured: docs/experiments.md#fallback-gather.
 
-use super::blur::{Noisy, Window};
+use super::blur::{Mean, Noisy, Window};
 use super::gather::{Gathered, Tile, TileTexel};
+use super::interpolation_contrast::{GatherLight, weight_of_own};
 use super::near_hits::HitRadiance;
 use super::sample_set::SampleSet;
 use super::upsample::Upsampling;
@@ -17,7 +18,7 @@ use crate::base::progress::Stage;
 use crate::base::sampling::combine;
 use crate::base::scratch::Scratch;
 use crate::lightmap::atlas::Atlas;
-use crate::lightmap::atlas::ids::LightTexel;
+use crate::lightmap::atlas::ids::{LightTexel, PerTexel};
 use crate::lightmap::tiles::places_in_order;
 use glam::Vec3;
 use rayon::prelude::*;
@@ -66,6 +67,8 @@ pub(crate) struct OwnRays<'a> {
     pub seed: u32,
     /// Whether light by direction is asked for.
     pub directional: bool,
+    /// The gather map, if its contrast has chosen some of the texels.
+    pub gathered: Option<&'a GatherLight<'a>>,
 }
 
 impl Upsampling {
@@ -80,13 +83,14 @@ impl Upsampling {
     ) -> Result<(OwnLight, OwnDirectional, u64)> {
         let (what, n) = ("texels on their own", self.alone.len());
         let traced = AtomicU64::new(0);
-        let nothing = Own { light: None };
+        let nothing = Own { light: None, rays: 0 };
         let mut own = try_filled(n, nothing, what)?;
         let _memory = atlas.scene.device().memory().reserve(size_of_val(&own[..]), what)?;
         let mut light: OwnLight = try_filled(n, None, what)?;
         let n = if rays.directional { n } else { 0 };
         let mut directional: Vec<Directional> = try_vec(n, what)?;
         let mut blurred: OwnDirectional = try_filled(n, None, what)?;
+        let mut weights = try_filled(n, 1.0, what)?;
         let tiles = Scratch::new();
         let new_tile = if rays.directional { Tile::by_direction } else { Tile::new };
         atlas.scene.device().install(|| {
@@ -101,20 +105,32 @@ impl Upsampling {
                     stage.advance(texels.len() as u64)
                 },
             )?;
+            let of_light = light.par_chunks_mut(BLURRED).zip(try_parts(&mut weights, BLURRED, self.alone.len())?);
+            one_by_one(of_light.enumerate()).try_each(|(block, (light, weights))| {
+                let mut window = Window::new(RADIUS);
+                let value = |k: usize| own[k].light.map_or(Vec3::ZERO, |l| l.value);
+                for (k, light) in light.iter_mut().enumerate() {
+                    let i = block * BLURRED + k;
+                    let Some(mean) = self.blurred(atlas, &mut window, &own, value, i) else { continue };
+                    let (weight, joined) = self.joined(atlas, rays.gathered, self.alone[i], &mean, own[i].rays);
+                    *light = Some(joined);
+                    if let Some(out) = weights.get_mut(k) {
+                        *out = weight;
+                    }
+                }
+                stage.advance(light.len() as u64)
+            })?;
             one_by_one(blurred.par_chunks_mut(BLURRED).enumerate()).each(|(block, blurred)| {
                 let mut window = Window::new(RADIUS);
                 for (i, blurred) in (block * BLURRED..).zip(blurred) {
-                    *blurred = self.blurred(atlas, &mut window, &own, |k| directional[k], i);
+                    let mean = self.blurred(atlas, &mut window, &own, |k| directional[k], i);
+                    let join = |mean: Mean<_>| {
+                        self.joined_directional(atlas, rays.gathered, self.alone[i], mean.value, weights[i])
+                    };
+                    *blurred = mean.map(join);
                 }
             });
-            one_by_one(light.par_chunks_mut(BLURRED).enumerate()).try_each(|(block, light)| {
-                let mut window = Window::new(RADIUS);
-                let value = |k: usize| own[k].light.map_or(Vec3::ZERO, |l| l.value);
-                for (i, light) in (block * BLURRED..).zip(light.iter_mut()) {
-                    *light = self.blurred(atlas, &mut window, &own, value, i);
-                }
-                stage.advance(light.len() as u64)
-            })
+            Ok(())
         })?;
         Ok((light, blurred, traced.into_inner()))
     }
@@ -132,7 +148,7 @@ impl Upsampling {
         own: &[Own],
         value: impl Fn(usize) -> T,
         i: usize,
-    ) -> Option<T> {
+    ) -> Option<Mean<T>> {
         let texel = self.alone[i];
         own[i].light?;
         let placement = atlas.map.placement_of(&atlas.charts, texel);
@@ -143,7 +159,42 @@ impl Upsampling {
             let light = place(s).and_then(|k| own[k].light)?;
             Some(Noisy { variance: STRATIFIED * light.variance, ..light })
         };
-        Some(window.mean(&atlas.charts, &atlas.map, texel, get, |s| place(s).map_or(T::default(), &value)).0)
+        Some(window.mean(&atlas.charts, &atlas.map, texel, get, |s| place(s).map_or(T::default(), &value)))
+    }
+
+    /// Returns what takes the place of the `mean` of the fallback gathers, of as many `rays` each, around a texel that has
+    /// one by the contrast of some `light` alone: the weight of the mean in one with what the texel interpolates, and the
+    /// weighted light. Other texels keep the mean.
+    fn joined(
+        &self,
+        atlas: &Atlas,
+        light: Option<&GatherLight>,
+        texel: LightTexel,
+        mean: &Mean<Vec3>,
+        rays: u32,
+    ) -> (f32, Vec3) {
+        let Some(light) = light.filter(|_| self.by_contrast.has(texel)) else { return (1.0, mean.value) };
+        let interpolated = self.interpolated(atlas, light.irradiance, texel);
+        // The rays of gather texels tell more of the noise than the texel's own, which may all have missed what is bright.
+        let of_gather_texels = self.interpolated(atlas, light.unblurred, texel);
+        let expected = STRATIFIED * of_gather_texels * (light.rays as f32 / rays as f32) * mean.share;
+        let weight = weight_of_own(mean.value, interpolated, mean.variance.max(expected));
+        (weight, interpolated.lerp(mean.value, weight))
+    }
+
+    /// Returns the same of light by direction, given the weight.
+    fn joined_directional(
+        &self,
+        atlas: &Atlas,
+        light: Option<&GatherLight>,
+        texel: LightTexel,
+        mean: Directional,
+        weight: f32,
+    ) -> Directional {
+        let Some(light) = light.filter(|_| weight < 1.0) else { return mean };
+        let mut joined = self.interpolated(atlas, PerTexel::new(light.directional), texel) * (1.0 - weight);
+        joined += mean * weight;
+        joined
     }
 
     /// Traces the fallback gathers of some texels of the light map and returns the number of rays.
@@ -186,7 +237,7 @@ impl Upsampling {
                         variance: gathered.variance(),
                         normal: receiver.normal,
                     };
-                    out[place as usize] = Own { light: gathered.is_visible().then(noisy) };
+                    out[place as usize] = Own { light: gathered.is_visible().then(noisy), rays: gathered.rays };
                     if let Some(out) = directional.get_mut(place as usize) {
                         *out = texel.directional();
                     }
@@ -213,6 +264,8 @@ impl Upsampling {
 #[derive(Clone, Copy)]
 struct Own {
     light: Option<Noisy>,
+    /// Number of its rays.
+    rays: u32,
 }
 
 #[cfg(test)]
@@ -222,7 +275,7 @@ mod tests {
     use crate::lightmap::atlas::chart_map::ChartMap;
     use crate::lightmap::atlas::ids::{Map, PerTexel, PlacementId, RadianceTexel, TexelId};
     use crate::lightmap::indirect::radiance_map::{Radiance, RadianceLookup};
-    use crate::lightmap::indirect::upsample::tests::{find, folded};
+    use crate::lightmap::indirect::upsample::tests::{find, folded, plank};
     use std::ops::Range;
 
     /// What texels gather for themselves where each texel of the radiance map sends out its own radiance; and the rays.
@@ -235,6 +288,7 @@ mod tests {
             samples: [&samples; 2],
             seed: 0,
             directional: false,
+            gathered: None,
         };
         let progress = Progress::none();
         let stage = progress.stage("own light", 0.0, 1.0, upsampling.own_work());
@@ -286,5 +340,59 @@ mod tests {
         let own =
             |placements: Range<usize>| own_light(atlas, &find(atlas, placements, &[]), |s| (s.index() % 7) as f32).0;
         assert_eq!(own(0..2), [own(0..1), own(1..2)].concat());
+    }
+
+    /// A gather map that is brighter on one side of a line of the floor than on the other, where all rays of the texels that
+    /// this chooses miss.
+    #[test]
+    fn texels_chosen_by_contrast_interpolate_where_noise_explains_what_they_gather() {
+        let lightmap = plank();
+        let atlas = lightmap.atlas();
+        let is_bright = |s| atlas.gather.surface(&atlas.scene, s).0.x > 1.0;
+        let light = |s| Vec3::splat(if is_bright(s) { 2.0 } else { 1.0 });
+        let irradiance: Vec<Vec3> = atlas.gather.all().map(light).collect();
+        let of_texel = |s| Directional::of(light(s), Vec3::Z, 1.0);
+        let directional: Vec<Directional> = atlas.gather.all().map(of_texel).collect();
+        let radiance = Radiance { values: vec![Vec3::ZERO; atlas.radiance.len()], ..Default::default() };
+        let (sure, samples, progress) = (vec![0.0; atlas.gather.len()], SampleSet::new(OWN_RAYS, 0), Progress::none());
+        let mut shown = [0.0, 1e9].map(|noise| {
+            let unblurred = vec![noise; atlas.gather.len()];
+            let gathered = GatherLight {
+                irradiance: PerTexel::new(&irradiance),
+                variances: PerTexel::new(&sure),
+                unblurred: PerTexel::new(&unblurred),
+                rays: 64,
+                directional: &directional,
+            };
+            let mut upsampling = find(atlas, 0..3, &[]);
+            let before = upsampling.alone.clone();
+            let stage = progress.stage("contrast", 0.0, 1.0, 3);
+            upsampling.add_where_light_differs(atlas, 0..3, &[], &gathered, 0.2, None, &stage).unwrap();
+            let rays = OwnRays {
+                radiance: HitRadiance::of_map(RadianceLookup::new(&atlas.charts, &atlas.radiance, &radiance)),
+                samples: [&samples; 2],
+                seed: 0,
+                directional: true,
+                gathered: Some(&gathered),
+            };
+            let stage = progress.stage("own light", 0.0, 1.0, upsampling.own_work());
+            let (own, own_directional, _) = upsampling.own_light(atlas, &[], &rays, &stage).unwrap();
+            let all = upsampling.alone.iter().zip(own.into_iter().zip(own_directional));
+            all.map(|(&texel, (light, directional))| {
+                let values = PerTexel::new(gathered.directional);
+                let between = upsampling.interpolated(atlas, gathered.irradiance, texel);
+                let between_directional = upsampling.interpolated(atlas, values, texel);
+                let is_added = before.binary_search(&texel).is_err();
+                let is_interpolated = (light, directional) == (Some(between), Some(between_directional));
+                let is_own = (light, directional) == (Some(Vec3::ZERO), Some(Directional::default()));
+                (is_added, is_interpolated, is_own)
+            })
+            .collect::<Vec<_>>()
+        });
+        assert!(shown[0].iter().filter(|s| s.0).count() > 7 * 320);
+        // What has no gather texel to interpolate between keeps its own light whatever the noise.
+        shown.iter_mut().for_each(|of| of.retain(|&(_, is_interpolated, is_own)| is_interpolated || is_own));
+        assert!(shown[0].iter().all(|s| s.2) && shown[1].iter().all(|s| s.1 == s.0 && s.2 != s.0));
+        assert_eq!(shown[0].len(), shown[1].len());
     }
 }

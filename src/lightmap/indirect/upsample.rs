@@ -44,6 +44,8 @@ pub(crate) struct Upsampling {
     pub(super) is_alone: TexelSet<LightMap>,
     /// Texels of the light map with a fallback gather, in ascending order.
     pub(super) alone: Vec<LightTexel>,
+    /// Those that have one by the [contrast](Self::add_where_light_differs) alone.
+    pub(super) by_contrast: TexelSet<LightMap>,
     /// Number of rays traced to find the constraints.
     pub rays: u64,
     _memory: Option<Reservation>,
@@ -98,14 +100,25 @@ impl Upsampling {
         let alone = try_collect(found.iter().flat_map(|f| &f.alone).copied(), SHOWN)?;
         let is_alone = TexelSet::new(alone.iter(), atlas.map.len(), SHOWN)?;
         let rays = found.iter().map(|f| f.rays).sum();
-        let mut found = Upsampling { gather_gaps, map_gaps, walled, walls, is_alone, alone, rays, _memory: None };
+        let mut found = Upsampling {
+            gather_gaps,
+            map_gaps,
+            walled,
+            walls,
+            is_alone,
+            alone,
+            by_contrast: TexelSet::default(),
+            rays,
+            _memory: None,
+        };
         found._memory = Some(device.memory().reserve(found.bytes(), SHOWN)?);
         Ok(found)
     }
 
     /// Returns the bytes held, and those of the light of the [fallback gathers](super::fallback_gather).
     fn bytes(&self) -> usize {
-        let bits: usize = [&self.map_gaps, &self.walled, &self.is_alone].into_iter().map(TexelSet::bytes).sum();
+        let bits: usize =
+            [&self.map_gaps, &self.walled, &self.is_alone, &self.by_contrast].map(TexelSet::bytes).iter().sum();
         let own = self.alone.len() * size_of::<Option<Vec3>>();
         self.gather_gaps.bytes() + bits + size_of_val(&self.walls[..]) + size_of_val(&self.alone[..]) + own
     }
@@ -147,6 +160,8 @@ impl Upsampling {
         let alone =
             device.install(|| try_par_gather(placements.len(), SHOWN, |i, out| of_placement(first + i, out)))?;
         stage.check()?;
+        let added = alone.iter().filter(|texel| !self.is_alone.has(**texel));
+        self.by_contrast = TexelSet::new(added, atlas.map.len(), SHOWN)?;
         self.is_alone = TexelSet::new(alone.iter(), atlas.map.len(), SHOWN)?;
         self.alone = alone;
         self._memory = None;
@@ -172,6 +187,17 @@ impl Upsampling {
         if let Some(irradiance) = self.is_alone.rank(texel).and_then(|i| own[i]) {
             return irradiance;
         }
+        self.interpolated(atlas, values, texel)
+    }
+
+    /// Interpolates a gather map's `values` at a texel of the light map, whether it has a fallback gather or not.
+    #[inline]
+    pub(super) fn interpolated<T: Linear>(
+        &self,
+        atlas: &Atlas,
+        values: PerTexel<GatherMap, T>,
+        texel: LightTexel,
+    ) -> T {
         let sources = self.sources(atlas, texel);
         let (mut sum, mut part) = (T::default(), 0.0);
         for (s, w) in sources.iter() {
@@ -366,7 +392,7 @@ pub(super) mod tests {
 
     /// A floor from −2 to 2 m, and the top and the bottom of a plank 1 cm above it where x < 0: too far away for its
     /// texels to be buried.
-    fn plank() -> Lightmap {
+    pub(crate) fn plank() -> Lightmap {
         let mut data = SceneData::new();
         let m = data.add_material(Material::default()).unwrap();
         for (right, z, up) in [(2.0, 0.0, true), (0.0, 0.02, true), (0.0, 0.01, false)] {
@@ -553,7 +579,9 @@ pub(super) mod tests {
         let stage = progress.stage("contrast", 0.0, 1.0, 12);
         let added = |noise: f32, asked: Option<Asked>| {
             let variances = vec![noise; irradiance.len()];
-            let light = GatherLight { irradiance: PerTexel::new(&irradiance), variances: PerTexel::new(&variances) };
+            let variances = PerTexel::new(&variances);
+            let irradiance = PerTexel::new(&irradiance);
+            let light = GatherLight { irradiance, variances, unblurred: variances, rays: 64, directional: &[] };
             let mut found = find(atlas, 0..3, &[]);
             let before = found.alone.clone();
             found.add_where_light_differs(atlas, 0..3, &[], &light, 0.2, asked, &stage).unwrap();
@@ -568,10 +596,10 @@ pub(super) mod tests {
         assert!(edge.iter().all(|&s| floor.contains(s) && (x(s) - 1.0).abs() < 0.1), "{}", edge.len());
         let half_way: Vec<_> = floor.clone().filter(|&s| (x(s) - 1.0).abs() < 0.05).collect();
         assert!(half_way.len() >= 7 * 320 && half_way.iter().all(|s| edge.binary_search(s).is_ok()));
-        // Variances of the sums of three channels: what is beyond the contrast is at most 9 · 0.164.
-        let few = added(1.0, None);
+        // Variances of the sums of three channels, times three: what is beyond the contrast is at most 9 · 0.164.
+        let few = added(0.33, None);
         assert!(!few.is_empty() && few.len() < edge.len() && few.iter().all(|s| edge.binary_search(s).is_ok()));
-        assert!(added(1.5, None).is_empty());
+        assert!(added(0.5, None).is_empty());
         // What nobody asks for has no rays.
         let (some, none) = (vec![true; 3], vec![false; atlas.map.len()]);
         assert!(added(0.0, Some(Asked { placements: &some, alone: &none })).is_empty());
