@@ -206,8 +206,8 @@ pub struct bk_bake_params {
     /// Contrast of the light of the texels of the gather map between which a texel of the light map
     /// interpolates, above which it traces rays itself, as at the edges of sunlit spots and of
     /// shadows of indirect light; > 0, INFINITY: never, as for a preview. It is the standard deviation
-    /// of their light divided by their mean, without the part that their noise explains. What such a
-    /// texel gathers counts as far as it differs from the interpolated light by more than noise:
+    /// of their light divided by their mean, without the part that their noise explains. The light that
+    /// such a texel gathers counts as far as it differs from the interpolated one by more than noise:
     /// docs/accuracy.md, "Interpolation contrast". Default: 0.15.
     pub interpolation_contrast: f32,
     /// Number of rays of texels of the light map that trace rays themselves, at most 64, and no more
