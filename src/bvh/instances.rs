@@ -2,7 +2,7 @@
 //! are the leaves of another (Wald, Benthin and Slusallek, *Distributed Interactive Ray Tracing of Dynamic Scenes*,
 //! 2003). A ray that meets the box of an instance goes through the tree of its mesh, in that one's coordinates.
 
-use super::layout::{ChildRef, LEAF_STRIDE, Mbvh};
+use super::layout::{ChildRef, Mbvh};
 use super::{BuildOptions, BuildQuality, Tree, build_few};
 use crate::base::error::Result;
 use crate::base::geometry::is_valid_triangle;
@@ -88,10 +88,7 @@ impl Instances {
     pub(crate) fn in_top(&self) -> impl Iterator<Item = u32> {
         let leaves = self.top.nodes.iter().flat_map(|node| node.children);
         let leaves = leaves.filter(|child| child.is_leaf() && *child != ChildRef::EMPTY);
-        leaves.flat_map(|leaf| {
-            let (count, first) = (leaf.leaf_count(), LEAF_STRIDE * leaf.leaf_slot());
-            self.top.leaves[first + 9 * count..][..count].iter().map(|number| number.to_bits())
-        })
+        leaves.flat_map(|leaf| self.top.leaf_triangles(leaf))
     }
 
     /// Returns the number of triangles that are in no tree, those of each mesh once.

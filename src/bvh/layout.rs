@@ -228,6 +228,12 @@ impl<const W: usize> Mbvh<W> {
         node.node_index() < self.nodes.len()
     }
 
+    /// Returns the numbers of the triangles of a leaf.
+    pub(crate) fn leaf_triangles(&self, leaf: ChildRef) -> impl Iterator<Item = u32> + '_ {
+        let (count, first) = (leaf.leaf_count(), LEAF_STRIDE * leaf.leaf_slot());
+        self.leaves[first + 9 * count..][..count].iter().map(|number| number.to_bits())
+    }
+
     /// Size in bytes of nodes and leaves.
     pub fn bytes(&self) -> usize {
         self.nodes.len() * size_of::<Node<W>>() + self.leaves.len() * size_of::<f32>()

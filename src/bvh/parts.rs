@@ -113,10 +113,7 @@ impl Tree {
     /// Appends the triangles of a leaf.
     fn triangles(&self, leaf: ChildRef, out: &mut Vec<u32>) {
         match self {
-            Tree::Whole(t) => {
-                let (first, count) = (LEAF_STRIDE * leaf.leaf_slot(), leaf.leaf_count());
-                out.extend(t.leaves[first + 9 * count..][..count].iter().map(|n| n.to_bits()));
-            }
+            Tree::Whole(t) => out.extend(t.leaf_triangles(leaf)),
             Tree::Compact(t) => out.extend(t.triangles_of(leaf)),
         }
     }

@@ -162,9 +162,9 @@ pub struct BakeParams {
     /// between normals: the split-sphere model (Ward, Rubinstein and Clear 1988), with weights of its own.
     pub interpolation_error: f32,
     /// RMS contrast of the gather texels between which a texel of the light map interpolates, beyond what is noise, above
-    /// which it traces rays itself (`own_rays`): > 0, infinity: never. Their light counts only as far as it differs from the
-    /// interpolated one by more than noise. The contrast is the standard deviation of their light,
-    /// weighted as interpolation weighs it, divided by the mean. Where the gather map has the light map's density there
+    /// which it traces rays itself (`own_rays`): > 0, infinity: never. The light that it gathers counts only as far as it
+    /// differs from the interpolated one by more than noise. The contrast is the standard deviation of the gather texels'
+    /// light, weighted as interpolation weighs it, divided by the mean. Where the gather map has the light map's density there
     /// is nothing to compare.
     pub interpolation_contrast: f32,
     /// Number of rays of texels of the light map that trace rays themselves, at most 64 and at most `gather_rays`; 0: a

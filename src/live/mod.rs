@@ -9,7 +9,8 @@
 //! of an LOD are among those of the next, and the texels between them are interpolated across cells.
 //!
 //! A texel's sums depend on its number of rounds alone. When all texels have k rounds they have the
-//! bits of a bake with 64 · k gather rays and without stitching, whatever the order of the updates.
+//! bits of a bake with 64 · k gather rays, without stitching and with an `interpolation_contrast` of infinity, whatever the
+//! order of the updates.
 
 mod background;
 mod batch;

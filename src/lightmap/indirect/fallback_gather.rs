@@ -18,7 +18,7 @@ use crate::base::progress::Stage;
 use crate::base::sampling::combine;
 use crate::base::scratch::Scratch;
 use crate::lightmap::atlas::Atlas;
-use crate::lightmap::atlas::ids::{LightTexel, PerTexel};
+use crate::lightmap::atlas::ids::{GatherMap, LightTexel, PerTexel};
 use crate::lightmap::tiles::places_in_order;
 use glam::Vec3;
 use rayon::prelude::*;
@@ -112,8 +112,9 @@ impl Upsampling {
                 for (k, light) in light.iter_mut().enumerate() {
                     let i = block * BLURRED + k;
                     let Some(mean) = self.blurred(atlas, &mut window, &own, value, i) else { continue };
-                    let (weight, joined) = self.joined(atlas, rays.gathered, self.alone[i], &mean, own[i].rays);
-                    *light = Some(joined);
+                    let weight = self.own_weight(atlas, rays.gathered, self.alone[i], &mean, own[i].rays);
+                    let gathered = rays.gathered.map(|g| g.irradiance);
+                    *light = Some(self.weighed(atlas, gathered, self.alone[i], mean.value, weight));
                     if let Some(out) = weights.get_mut(k) {
                         *out = weight;
                     }
@@ -124,10 +125,9 @@ impl Upsampling {
                 let mut window = Window::new(RADIUS);
                 for (i, blurred) in (block * BLURRED..).zip(blurred) {
                     let mean = self.blurred(atlas, &mut window, &own, |k| directional[k], i);
-                    let join = |mean: Mean<_>| {
-                        self.joined_directional(atlas, rays.gathered, self.alone[i], mean.value, weights[i])
-                    };
-                    *blurred = mean.map(join);
+                    let gathered = rays.gathered.map(|g| PerTexel::new(g.directional));
+                    let weigh = |mean: Mean<_>| self.weighed(atlas, gathered, self.alone[i], mean.value, weights[i]);
+                    *blurred = mean.map(weigh);
                 }
             });
             Ok(())
@@ -162,39 +162,38 @@ impl Upsampling {
         Some(window.mean(&atlas.charts, &atlas.map, texel, get, |s| place(s).map_or(T::default(), &value)))
     }
 
-    /// Returns what takes the place of the `mean` of the fallback gathers, of as many `rays` each, around a texel that has
-    /// one by the contrast of some `light` alone: the weight of the mean in one with what the texel interpolates, and the
-    /// weighted light. Other texels keep the mean.
-    fn joined(
+    /// Returns the weight of the blurred light of a fallback gather of as many `rays` against interpolated light: 1 unless the
+    /// contrast of the gather map alone has chosen the texel.
+    fn own_weight(
         &self,
         atlas: &Atlas,
-        light: Option<&GatherLight>,
+        gathered: Option<&GatherLight>,
         texel: LightTexel,
-        mean: &Mean<Vec3>,
+        blurred: &Mean<Vec3>,
         rays: u32,
-    ) -> (f32, Vec3) {
-        let Some(light) = light.filter(|_| self.by_contrast.has(texel)) else { return (1.0, mean.value) };
-        let interpolated = self.interpolated(atlas, light.irradiance, texel);
+    ) -> f32 {
+        let Some(gathered) = gathered.filter(|_| self.by_contrast.has(texel)) else { return 1.0 };
+        let interpolated = self.interpolated(atlas, gathered.irradiance, texel);
         // The rays of gather texels tell more of the noise than the texel's own, which may all have missed what is bright.
-        let of_gather_texels = self.interpolated(atlas, light.unblurred, texel);
-        let expected = STRATIFIED * of_gather_texels * (light.rays as f32 / rays as f32) * mean.share;
-        let weight = weight_of_own(mean.value, interpolated, mean.variance.max(expected));
-        (weight, interpolated.lerp(mean.value, weight))
+        let of_gather_texels = self.interpolated(atlas, gathered.unblurred, texel);
+        let expected = STRATIFIED * of_gather_texels * (gathered.rays as f32 / rays as f32) * blurred.share;
+        weight_of_own(blurred.value, interpolated, blurred.variance.max(expected))
     }
 
-    /// Returns the same of light by direction, given the weight.
-    fn joined_directional(
+    /// Returns the mean of a fallback gather's light, of a `weight`, and of what its texel interpolates of the `gathered` light,
+    /// which may be missing where the weight is 1.
+    fn weighed<T: Linear>(
         &self,
         atlas: &Atlas,
-        light: Option<&GatherLight>,
+        gathered: Option<PerTexel<GatherMap, T>>,
         texel: LightTexel,
-        mean: Directional,
+        own: T,
         weight: f32,
-    ) -> Directional {
-        let Some(light) = light.filter(|_| weight < 1.0) else { return mean };
-        let mut joined = self.interpolated(atlas, PerTexel::new(light.directional), texel) * (1.0 - weight);
-        joined += mean * weight;
-        joined
+    ) -> T {
+        let Some(gathered) = gathered.filter(|_| weight < 1.0) else { return own };
+        let mut mean = self.interpolated(atlas, gathered, texel) * (1.0 - weight);
+        mean += own * weight;
+        mean
     }
 
     /// Traces the fallback gathers of some texels of the light map and returns the number of rays.
@@ -355,7 +354,7 @@ mod tests {
         let directional: Vec<Directional> = atlas.gather.all().map(of_texel).collect();
         let radiance = Radiance { values: vec![Vec3::ZERO; atlas.radiance.len()], ..Default::default() };
         let (sure, samples, progress) = (vec![0.0; atlas.gather.len()], SampleSet::new(OWN_RAYS, 0), Progress::none());
-        let mut shown = [0.0, 1e9].map(|noise| {
+        let [sure_of, unsure] = [0.0, 1e9].map(|noise| {
             let unblurred = vec![noise; atlas.gather.len()];
             let gathered = GatherLight {
                 irradiance: PerTexel::new(&irradiance),
@@ -382,17 +381,16 @@ mod tests {
                 let values = PerTexel::new(gathered.directional);
                 let between = upsampling.interpolated(atlas, gathered.irradiance, texel);
                 let between_directional = upsampling.interpolated(atlas, values, texel);
-                let is_added = before.binary_search(&texel).is_err();
-                let is_interpolated = (light, directional) == (Some(between), Some(between_directional));
+                let interpolates = (light, directional) == (Some(between), Some(between_directional));
                 let is_own = (light, directional) == (Some(Vec3::ZERO), Some(Directional::default()));
-                (is_added, is_interpolated, is_own)
+                (before.binary_search(&texel).is_err(), interpolates, is_own)
             })
             .collect::<Vec<_>>()
         });
-        assert!(shown[0].iter().filter(|s| s.0).count() > 7 * 320);
-        // What has no gather texel to interpolate between keeps its own light whatever the noise.
-        shown.iter_mut().for_each(|of| of.retain(|&(_, is_interpolated, is_own)| is_interpolated || is_own));
-        assert!(shown[0].iter().all(|s| s.2) && shown[1].iter().all(|s| s.1 == s.0 && s.2 != s.0));
-        assert_eq!(shown[0].len(), shown[1].len());
+        let chosen = sure_of.iter().zip(&unsure).filter(|(texel, _)| texel.0);
+        assert!(chosen.clone().count() > 7 * 320);
+        assert!(chosen.clone().all(|(sure_of, unsure)| sure_of.2 && unsure.1 && !unsure.2));
+        // Those that geometry has chosen keep what they gather.
+        assert!(sure_of.iter().zip(&unsure).filter(|(texel, _)| !texel.0).all(|(a, b)| a == b));
     }
 }
