@@ -93,8 +93,6 @@ pub(in crate::lightmap) struct Mean<T> {
     pub value: T,
     /// Variance of the same mean of the values by which weights are chosen.
     pub variance: f32,
-    /// The same if each of these had a variance of 1.
-    pub share: f32,
 }
 
 /// Scratch space for one texel's neighbourhood.
@@ -136,14 +134,14 @@ impl Window {
         get: impl Fn(TexelId<M>) -> Option<Noisy>,
         of: impl Fn(TexelId<M>) -> T,
     ) -> Mean<T> {
-        let Some(own) = get(texel) else { return Mean { value: of(texel), variance: 0.0, share: 1.0 } };
+        let Some(own) = get(texel) else { return Mean { value: of(texel), variance: 0.0 } };
         let brightness = own.value.element_sum();
         let (x, y) = map.position(texel);
         let placement = map.placement_of(charts, texel);
         self.seen = [0; MAX_WINDOW];
         self.queue.clear();
         self.visit(0, 0);
-        let (mut sum, mut total, mut variance, mut squares) = (T::default(), 0.0, 0.0, 0.0);
+        let (mut sum, mut total, mut variance) = (T::default(), 0.0, 0.0);
         let mut next = 0;
         while next < self.queue.len() {
             let (dx, dy) = self.queue[next];
@@ -161,14 +159,13 @@ impl Window {
             sum += of(s) * w;
             total += w;
             variance += w * w * other.variance;
-            squares += w * w;
             for (nx, ny) in [(dx - 1, dy), (dx + 1, dy), (dx, dy - 1), (dx, dy + 1)] {
                 if nx.abs() <= self.radius && ny.abs() <= self.radius {
                     self.visit(nx, ny);
                 }
             }
         }
-        Mean { value: sum / total, variance: variance / (total * total), share: squares / (total * total) }
+        Mean { value: sum / total, variance: variance / (total * total) }
     }
 
     fn visit(&mut self, dx: i32, dy: i32) {

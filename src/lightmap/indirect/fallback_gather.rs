@@ -83,8 +83,7 @@ impl Upsampling {
     ) -> Result<(OwnLight, OwnDirectional, u64)> {
         let (what, n) = ("texels on their own", self.alone.len());
         let traced = AtomicU64::new(0);
-        let nothing = Own { light: None, rays: 0 };
-        let mut own = try_filled(n, nothing, what)?;
+        let mut own = try_filled(n, Own::default(), what)?;
         let _memory = atlas.scene.device().memory().reserve(size_of_val(&own[..]), what)?;
         let mut light: OwnLight = try_filled(n, None, what)?;
         let n = if rays.directional { n } else { 0 };
@@ -109,12 +108,15 @@ impl Upsampling {
             one_by_one(of_light.enumerate()).try_each(|(block, (light, weights))| {
                 let mut window = Window::new(RADIUS);
                 let value = |k: usize| own[k].light.map_or(Vec3::ZERO, |l| l.value);
+                let gathered = rays.gathered.map(|g| g.irradiance);
                 for (k, light) in light.iter_mut().enumerate() {
                     let i = block * BLURRED + k;
                     let Some(mean) = self.blurred(atlas, &mut window, &own, value, i) else { continue };
-                    let weight = self.own_weight(atlas, rays.gathered, self.alone[i], &mean, own[i].rays);
-                    let gathered = rays.gathered.map(|g| g.irradiance);
-                    *light = Some(self.weighed(atlas, gathered, self.alone[i], mean.value, weight));
+                    let texel = self.alone[i];
+                    let weight = gathered.filter(|_| self.by_contrast.has(texel)).map_or(1.0, |gathered| {
+                        weight_of_own(mean.value, self.interpolated(atlas, gathered, texel), mean.variance)
+                    });
+                    *light = Some(self.weighed(atlas, gathered, texel, mean.value, weight));
                     if let Some(out) = weights.get_mut(k) {
                         *out = weight;
                     }
@@ -126,8 +128,7 @@ impl Upsampling {
                 for (i, blurred) in (block * BLURRED..).zip(blurred) {
                     let mean = self.blurred(atlas, &mut window, &own, |k| directional[k], i);
                     let gathered = rays.gathered.map(|g| PerTexel::new(g.directional));
-                    let weigh = |mean: Mean<_>| self.weighed(atlas, gathered, self.alone[i], mean.value, weights[i]);
-                    *blurred = mean.map(weigh);
+                    *blurred = mean.map(|mean| self.weighed(atlas, gathered, self.alone[i], mean.value, weights[i]));
                 }
             });
             Ok(())
@@ -155,29 +156,12 @@ impl Upsampling {
         let of_placement = atlas.map.texels_of(placement);
         // The window of given charts may contain another chart, which other shards bake.
         let place = |s: LightTexel| self.is_alone.rank(s).filter(|_| of_placement.contains(s));
+        let differs = own[i].difference.is_some();
         let get = |s| {
-            let light = place(s).and_then(|k| own[k].light)?;
-            Some(Noisy { variance: STRATIFIED * light.variance, ..light })
+            let own = own[place(s)?];
+            if differs { own.difference } else { own.light }
         };
         Some(window.mean(&atlas.charts, &atlas.map, texel, get, |s| place(s).map_or(T::default(), &value)))
-    }
-
-    /// Returns the weight of the blurred light of a fallback gather of as many `rays` against interpolated light: 1 unless the
-    /// contrast of the gather map alone has chosen the texel.
-    fn own_weight(
-        &self,
-        atlas: &Atlas,
-        gathered: Option<&GatherLight>,
-        texel: LightTexel,
-        blurred: &Mean<Vec3>,
-        rays: u32,
-    ) -> f32 {
-        let Some(gathered) = gathered.filter(|_| self.by_contrast.has(texel)) else { return 1.0 };
-        let interpolated = self.interpolated(atlas, gathered.irradiance, texel);
-        // The rays of gather texels tell more of the noise than the texel's own, which may all have missed what is bright.
-        let of_gather_texels = self.interpolated(atlas, gathered.unblurred, texel);
-        let expected = STRATIFIED * of_gather_texels * (gathered.rays as f32 / rays as f32) * blurred.share;
-        weight_of_own(blurred.value, interpolated, blurred.variance.max(expected))
     }
 
     /// Returns the mean of a fallback gather's light, of a `weight`, and of what its texel interpolates of the `gathered` light,
@@ -194,6 +178,23 @@ impl Upsampling {
         let mut mean = self.interpolated(atlas, gathered, texel) * (1.0 - weight);
         mean += own * weight;
         mean
+    }
+
+    /// Returns the result of a fallback gather.
+    fn own(&self, atlas: &Atlas, gathered: Option<&GatherLight>, texel: LightTexel, traced: &TileTexel) -> Own {
+        let TileTexel { receiver, gathered: own, .. } = traced;
+        if !own.is_visible() {
+            return Own::default();
+        }
+        let light = Noisy { value: own.irradiance(), variance: STRATIFIED * own.variance(), normal: receiver.normal };
+        let difference = gathered.filter(|_| self.by_contrast.has(texel)).map(|gathered| {
+            // The rays of gather texels tell more of the noise than the texel's own, which may all have missed what is bright.
+            let of_gather_texels = self.interpolated(atlas, gathered.unblurred, texel);
+            let expected = of_gather_texels * (gathered.rays as f32 / own.rays as f32);
+            let value = light.value - self.interpolated(atlas, gathered.irradiance, texel);
+            Noisy { value, variance: own.variance().max(expected), ..light }
+        });
+        Own { light: Some(light), difference }
     }
 
     /// Traces the fallback gathers of some texels of the light map and returns the number of rays.
@@ -230,13 +231,7 @@ impl Upsampling {
                 let mut of_tile: Vec<_> = places.iter().map(&mut texel).collect();
                 rays += tile.add_round(&atlas.scene, &own.radiance, &mut of_tile, samples, 0);
                 for (&place, texel) in places.iter().zip(&of_tile) {
-                    let TileTexel { receiver, gathered, .. } = texel;
-                    let noisy = || Noisy {
-                        value: gathered.irradiance(),
-                        variance: gathered.variance(),
-                        normal: receiver.normal,
-                    };
-                    out[place as usize] = Own { light: gathered.is_visible().then(noisy), rays: gathered.rays };
+                    out[place as usize] = self.own(atlas, own.gathered, texels[place as usize], texel);
                     if let Some(out) = directional.get_mut(place as usize) {
                         *out = texel.directional();
                     }
@@ -259,12 +254,14 @@ impl Upsampling {
     }
 }
 
-/// Result of a fallback gather before the blur; `None` inside a solid.
-#[derive(Clone, Copy)]
+/// Result of a fallback gather before the blur. Others are averaged with it as far as one of the two is like theirs.
+#[derive(Clone, Copy, Default)]
 struct Own {
+    /// `None` inside a solid.
     light: Option<Noisy>,
-    /// Number of its rays.
-    rays: u32,
+    /// Difference from interpolated light, which changes less from texel to texel, where the contrast of the gather map alone
+    /// has chosen the texel.
+    difference: Option<Noisy>,
 }
 
 #[cfg(test)]
