@@ -6,7 +6,7 @@
 #
 # c         AddressSanitizer with LeakSanitizer and UndefinedBehaviorSanitizer in every C and C++ program. They see
 #           the programs' own memory, what the library does to it by way of the C library, and all leaks. The library
-#           is the release build.
+#           is the release build, or that in the folder BAKELITE_LIBRARY_DIR, with `io` and `unwrap`.
 # rust      The library too is compiled with AddressSanitizer (nightly toolchain, clang): its small unit tests, a short
 #           run of fuzz_api, and the C programs against it. A quarter of an hour on two cores.
 # valgrind  Memcheck over a small whole pipeline in C, with the kernels that Valgrind knows (at most AVX2).
@@ -62,8 +62,8 @@ shared() {
 
 c() {
     echo '== C and C++ programs under AddressSanitizer, LeakSanitizer and UndefinedBehaviorSanitizer'
-    shared
-    programs "$target/release" -fsanitize=address,undefined -fno-sanitize-recover=undefined
+    [ -n "${BAKELITE_LIBRARY_DIR:-}" ] || shared
+    programs "${BAKELITE_LIBRARY_DIR:-$target/release}" -fsanitize=address,undefined -fno-sanitize-recover=undefined
 }
 
 rust() {
