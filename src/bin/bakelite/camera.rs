@@ -1,7 +1,8 @@
 //! A view for scenes that come without one.
 //!
-//! Candidate eyes are spread over the scene's bounds, at heights where people stand. An eye is
-//! inside if most rays from it meet something, on the front where materials are one-sided, and there
+//! Candidate eyes are spread over the scene's bounds, at heights where people stand, and, if none of
+//! these has a view, above floors at any height. An eye is inside if most rays from it meet something,
+//! on the front where materials are one-sided and mostly on sides that the light map shows, and there
 //! is a level floor below. From each inside eye the level directions with the longest free views over
 //! lit surfaces are scored by the mean of length times light in a bundle of rays as wide as the
 //! picture, by how far its middle goes, and by how many kinds of surface these meet: a bare wall is
@@ -26,10 +27,14 @@ const DIRECTIONS: u32 = 24;
 /// Directions from which an object is tried.
 const SIDES: u32 = 16;
 /// An inside eye sees at least this part of the probes end on something.
-const ENCLOSED: f32 = 0.6;
+const ENCLOSED: f32 = 0.75;
+/// The light map shows at least this part of what an eye sees.
+const SHOWN: f32 = 0.8;
 /// The floor is level and at most so far below, as a part of the scene's diagonal.
 const LEVEL: f32 = 0.9;
 const STANDING: f32 = 0.1;
+/// How far above its floor an eye is that was put there, as a part of the diagonal.
+const EYE_HEIGHT: f32 = 0.02;
 /// Length that counts half as much as the longest, as a part of the diagonal: a view is more than its far end.
 const FAR: f32 = 0.1;
 /// Half of the angles that a picture covers, across and upwards, in rays of the bundle from its middle.
@@ -47,10 +52,17 @@ const FOV: f32 = 60.0;
 
 /// A view of a baked scene, whose up axis is the unit vector `up`. Depends on scene and light alone.
 pub fn choose(lightmap: &Lightmap, up: Vec3) -> Camera {
+    // The lower half of bounds that something far above widens has few floors.
+    let (camera, is_inside) = view(lightmap, up, candidate);
+    if is_inside { camera } else { view(lightmap, up, above_floor).0 }
+}
+
+/// The best view from the given candidates, or else from outside; and whether it is from inside.
+fn view(lightmap: &Lightmap, up: Vec3, candidate: fn(&Scene, Vec3, u32) -> Vec3) -> (Camera, bool) {
     let scene = &**lightmap.scene();
     let eyes: Vec<(Vec3, (f32, f32))> = (0..EYES)
         .map(|i| candidate(scene, up, i))
-        .filter(|&eye| stands(scene, up, eye))
+        .filter(|&eye| stands(scene, up, eye) && is_shown(lightmap, eye))
         .filter_map(|eye| clearance(scene, eye).map(|air| (eye, air)))
         .collect();
     let light = Brightness::new(lightmap, eyes.iter().map(|&(eye, _)| eye));
@@ -68,9 +80,9 @@ pub fn choose(lightmap: &Lightmap, up: Vec3) -> Camera {
     };
     match best {
         Some((_, _, eye, direction)) if is_room(eye) => {
-            Camera { position: eye, target: eye + direction, up, fov_y: FOV.to_radians() }
+            (Camera { position: eye, target: eye + direction, up, fov_y: FOV.to_radians() }, true)
         }
-        _ => from_outside,
+        _ => (from_outside, false),
     }
 }
 
@@ -137,9 +149,21 @@ impl<'a> Brightness<'a> {
 
 /// Eye number `i`: anywhere in plan, in the lower half by height.
 fn candidate(scene: &Scene, up: Vec3, i: u32) -> Vec3 {
+    within_bounds(scene, up, i, 0.1 + 0.4 * uniform(i, 2, 0))
+}
+
+/// Eye number `i`: anywhere in plan, above the next floor below any height.
+fn above_floor(scene: &Scene, up: Vec3, i: u32) -> Vec3 {
+    let from = within_bounds(scene, up, i, uniform(i, 2, 0));
+    let floor = scene.intersect_raw(&Ray::new(from, -up));
+    if floor.is_miss() { from } else { from + up * (EYE_HEIGHT * scene.diagonal() - floor.t) }
+}
+
+/// Place number `i` at a height from 0, the lowest of the bounds, to 1.
+fn within_bounds(scene: &Scene, up: Vec3, i: u32, height: f32) -> Vec3 {
     let (lower, upper) = scene.bounds();
     let [a, b] = sobol_2d(i, 0);
-    let plan = Vec3::new(a, b, 0.1 + 0.4 * uniform(i, 2, 0));
+    let plan = Vec3::new(a, b, height);
     // The third coordinate belongs to the up axis.
     let t = if up.x > 0.5 { Vec3::new(plan.z, plan.x, plan.y) } else { plan };
     let t = if up.y > 0.5 { Vec3::new(plan.x, plan.z, plan.y) } else { t };
@@ -154,6 +178,19 @@ fn stands(scene: &Scene, up: Vec3, eye: Vec3) -> bool {
         let floor = scene.intersect_raw(&Ray::new(eye + body * aside, -up).within(0.0, STANDING * scene.diagonal()));
         !floor.is_miss() && scene.normal(floor.triangle).dot(up).abs() > LEVEL
     })
+}
+
+/// Whether the light map shows most of what an eye sees, as it does not where nobody gets to, in hollow walls.
+fn is_shown(lightmap: &Lightmap, eye: Vec3) -> bool {
+    let hits = (0..PROBES)
+        .map(|i| lightmap.scene().intersect_raw(&Ray::new(eye, uniform_sphere(sobol_2d(i, 1)))))
+        .filter(|hit| !hit.is_miss());
+    let (mut count, mut shown) = (0, 0);
+    for hit in hits {
+        count += 1;
+        shown += u32::from(lightmap.shows(hit.triangle, hit.front));
+    }
+    shown as f32 >= SHOWN * count as f32
 }
 
 /// Distance to the nearest surface that probes find, and a weight by how many find any, from 0 for half of them to 1;
@@ -257,6 +294,24 @@ mod tests {
         assert!(scene.intersect_raw(&ray).t > 4.0);
         let light = Brightness::new(&lightmap, [camera.position].into_iter());
         assert!(best_view(scene, Vec3::Y, camera.position, &light).2 >= LIT);
+    }
+
+    /// The atrium, and a sheet high above it.
+    #[test]
+    fn something_far_above_does_not_move_the_view_out_of_the_room() {
+        let mut data = builtin("atrium").unwrap();
+        let material = data.add_material(Material::default()).unwrap();
+        let positions = [Vec3::ZERO, Vec3::X, Vec3::Z].map(|p| p + 30.0 * Vec3::Y);
+        data.add_mesh(Mesh {
+            positions: positions.to_vec().into(),
+            indices: vec![[0, 1, 2]].into(),
+            materials: MeshMaterials::One(material),
+            ..Default::default()
+        })
+        .unwrap();
+        let camera = choose(&baked(data, 4.0), Vec3::Y);
+        assert!(camera.position.x.abs() < 10.0 && camera.position.z.abs() < 5.8, "{camera:?}");
+        assert!(camera.position.y < 10.0, "{camera:?}");
     }
 
     /// A two-sided tetrahedron, which rays from within find closed, but dark.
