@@ -24,7 +24,8 @@ import sys
 import time
 from pathlib import Path
 
-import bpy
+import bpy  # Makes the next two importable.
+import addon_utils
 import mathutils
 import numpy as np
 import pyoidn
@@ -92,7 +93,7 @@ class Scene:
 
     def __init__(self, folder):
         corners, uvs, normals, materials = [], [], [], []
-        self.page_of_material, kinds = [], []
+        kinds = []
         pages = sorted(folder.glob("page*-normal.exr"), key=lambda p: int(p.name[4:].split("-")[0]))
         towards = [read_page(p) for p in pages]
         self.size = towards[0].shape[:2]
@@ -144,7 +145,7 @@ class Scene:
     def make(self):
         """The scene in Blender; the images that its faces are baked to."""
         bpy.ops.wm.read_factory_settings(use_empty=True)
-        __import__("addon_utils").enable("cycles")
+        addon_utils.enable("cycles")
         corners = self.corners.astype(np.float32)
         face = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
         face /= np.maximum(np.linalg.norm(face, axis=1, keepdims=True), 1e-30)
@@ -290,14 +291,15 @@ class Points:
         return squares.mean(), best.mean(), light.sum() / truth.sum()
 
 
+def scientific(value):
+    return f"{value:.1e}".replace("e-0", "e-").replace("e+00", "").replace("e+0", "e")
+
+
 def row(name, seconds, points, indirect, everything):
     texts = []
     for light, truth in ((indirect, points.indirect), (everything, points.all)):
-        if light is None:
-            texts += ["", ""]
-            continue
         mse, trimmed, sigma = points.error(light, truth)
-        texts += [f"{mse:.2g} ({trimmed:.2g})", f"{sigma:.3f}"]
+        texts += [f"{scientific(mse)} ({scientific(trimmed)})", f"{sigma:.3f}"]
     print(f"| {name} | {seconds} | " + " | ".join(texts) + " |", flush=True)
 
 

@@ -96,9 +96,8 @@ struct Brightness<'a> {
 impl<'a> Brightness<'a> {
     fn new(lightmap: &'a Lightmap, eyes: impl Iterator<Item = Vec3>) -> Self {
         let mut all = Brightness { lightmap, usual: 0.0 };
-        let probes = eyes.flat_map(|eye| (0..PROBES).map(move |i| Ray::new(eye, uniform_sphere(sobol_2d(i, 1)))));
         let mut seen: Vec<f32> =
-            probes.filter_map(|ray| all.irradiance(&ray).map(|s| s.0)).filter(|&e| e > 0.0).collect();
+            eyes.flat_map(probes).filter_map(|ray| all.irradiance(&ray).map(|s| s.0)).filter(|&e| e > 0.0).collect();
         seen.sort_unstable_by(f32::total_cmp);
         all.usual = seen.get(seen.len() / 2).copied().unwrap_or(0.0);
         all
@@ -120,8 +119,7 @@ impl<'a> Brightness<'a> {
     /// Mean irradiance around an eye, and the part of the surfaces there that it sees from behind.
     fn around(&self, eye: Vec3) -> (f32, f32) {
         let (mut sum, mut count, mut backs) = (0.0, 0, 0);
-        for i in 0..PROBES {
-            let ray = Ray::new(eye, uniform_sphere(sobol_2d(i, 1)));
+        for ray in probes(eye) {
             if let Some((e, _)) = self.irradiance(&ray) {
                 sum += e;
                 count += 1;
@@ -180,13 +178,15 @@ fn stands(scene: &Scene, up: Vec3, eye: Vec3) -> bool {
     })
 }
 
+/// Rays from an eye in all directions, which tell what surrounds it.
+fn probes(eye: Vec3) -> impl Iterator<Item = Ray> {
+    (0..PROBES).map(move |i| Ray::new(eye, uniform_sphere(sobol_2d(i, 1))))
+}
+
 /// Whether the light map shows most of what an eye sees, as it does not where nobody gets to, in hollow walls.
 fn is_shown(lightmap: &Lightmap, eye: Vec3) -> bool {
-    let hits = (0..PROBES)
-        .map(|i| lightmap.scene().intersect_raw(&Ray::new(eye, uniform_sphere(sobol_2d(i, 1)))))
-        .filter(|hit| !hit.is_miss());
     let (mut count, mut shown) = (0, 0);
-    for hit in hits {
+    for hit in probes(eye).map(|ray| lightmap.scene().intersect_raw(&ray)).filter(|hit| !hit.is_miss()) {
         count += 1;
         shown += u32::from(lightmap.shows(hit.triangle, hit.front));
     }
@@ -197,14 +197,13 @@ fn is_shown(lightmap: &Lightmap, eye: Vec3) -> bool {
 /// `None` if the eye is not inside.
 fn clearance(scene: &Scene, eye: Vec3) -> Option<(f32, f32)> {
     let (mut hits, mut backs, mut nearest) = (0, 0, f32::INFINITY);
-    for i in 0..PROBES {
-        let direction = uniform_sphere(sobol_2d(i, 1));
-        let hit = scene.intersect_raw(&Ray::new(eye, direction));
+    for ray in probes(eye) {
+        let hit = scene.intersect_raw(&ray);
         if hit.is_miss() {
             continue;
         }
         hits += 1;
-        backs += (!scene.material(hit.triangle).two_sided && scene.normal(hit.triangle).dot(direction) > 0.0) as u32;
+        backs += u32::from(!hit.front && !scene.material(hit.triangle).two_sided);
         nearest = nearest.min(hit.t);
     }
     let inside = hits as f32 >= ENCLOSED * PROBES as f32 && backs * 20 <= hits;
@@ -301,7 +300,7 @@ mod tests {
     fn something_far_above_does_not_move_the_view_out_of_the_room() {
         let mut data = builtin("atrium").unwrap();
         let material = data.add_material(Material::default()).unwrap();
-        let positions = [Vec3::ZERO, Vec3::X, Vec3::Z].map(|p| p + 30.0 * Vec3::Y);
+        let positions = [Vec3::ZERO, Vec3::X, Vec3::Z].map(|p| p + 120.0 * Vec3::Y);
         data.add_mesh(Mesh {
             positions: positions.to_vec().into(),
             indices: vec![[0, 1, 2]].into(),

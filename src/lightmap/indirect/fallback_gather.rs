@@ -113,7 +113,7 @@ impl Upsampling {
                     let i = block * BLURRED + k;
                     let Some(mean) = self.blurred(atlas, &mut window, &own, value, i) else { continue };
                     let texel = self.alone[i];
-                    let weight = gathered.filter(|_| self.by_contrast.has(texel)).map_or(1.0, |gathered| {
+                    let weight = own[i].difference.and(gathered).map_or(1.0, |gathered| {
                         weight_of_own(mean.value, self.interpolated(atlas, gathered, texel), mean.variance)
                     });
                     *light = Some(self.weighed(atlas, gathered, texel, mean.value, weight));
@@ -180,7 +180,7 @@ impl Upsampling {
         mean
     }
 
-    /// Returns the result of a fallback gather.
+    /// Returns what a texel's fallback gather has found, before the blur.
     fn own(&self, atlas: &Atlas, gathered: Option<&GatherLight>, texel: LightTexel, traced: &TileTexel) -> Own {
         let TileTexel { receiver, gathered: own, .. } = traced;
         if !own.is_visible() {
@@ -189,6 +189,7 @@ impl Upsampling {
         let light = Noisy { value: own.irradiance(), variance: STRATIFIED * own.variance(), normal: receiver.normal };
         let difference = gathered.filter(|_| self.by_contrast.has(texel)).map(|gathered| {
             // The rays of gather texels tell more of the noise than the texel's own, which may all have missed what is bright.
+            // (Of stratified variance, dapples stay: docs/experiments.md#light-that-differs-around-a-texel.)
             let of_gather_texels = self.interpolated(atlas, gathered.unblurred, texel);
             let expected = of_gather_texels * (gathered.rays as f32 / own.rays as f32);
             let value = light.value - self.interpolated(atlas, gathered.irradiance, texel);
@@ -254,7 +255,8 @@ impl Upsampling {
     }
 }
 
-/// Result of a fallback gather before the blur. Others are averaged with it as far as one of the two is like theirs.
+/// Result of a fallback gather before the blur: a texel that has a `difference` is averaged with those around it whose
+/// differences are like it, and any other with those whose `light` is.
 #[derive(Clone, Copy, Default)]
 struct Own {
     /// `None` inside a solid.
@@ -271,6 +273,7 @@ mod tests {
     use crate::lightmap::atlas::chart_map::ChartMap;
     use crate::lightmap::atlas::ids::{Map, PerTexel, PlacementId, RadianceTexel, TexelId};
     use crate::lightmap::indirect::radiance_map::{Radiance, RadianceLookup};
+    use crate::lightmap::indirect::texel_set::TexelSet;
     use crate::lightmap::indirect::upsample::tests::{find, folded, plank};
     use std::ops::Range;
 
@@ -317,6 +320,37 @@ mod tests {
         }
         assert!(on_face >= 400 && elsewhere <= on_face / 4, "{on_face} and {elsewhere}");
         assert_eq!(rays, u64::from(OWN_RAYS) * own.len() as u64);
+    }
+
+    /// Texels chosen by contrast, each of whose light is its own by far more than noise.
+    #[test]
+    fn light_is_averaged_where_its_differences_from_interpolation_are_alike() {
+        let lightmap = plank();
+        let atlas = lightmap.atlas();
+        let mut upsampling = find(atlas, 0..3, &[]);
+        let floor = atlas.map.texels_of(PlacementId::new(0)).collect::<Vec<_>>();
+        upsampling.is_alone = TexelSet::new(floor.iter(), atlas.map.len(), "test").unwrap();
+        upsampling.alone = floor;
+        let n = upsampling.alone.len();
+        let noisy = |value: f32| Some(Noisy { value: Vec3::splat(value), variance: 1e-6, normal: Vec3::Z });
+        let of = |difference: fn(usize) -> Option<f32>| -> Vec<Own> {
+            let own = |k: usize| Own { light: noisy((k % 7) as f32), difference: difference(k).and_then(noisy) };
+            (0..n).map(own).collect()
+        };
+        let changed = |own: &[Own]| {
+            let mut window = Window::new(RADIUS);
+            let value = |k: usize| (k % 7) as f32;
+            let differs = |&i: &usize| {
+                let mean = upsampling.blurred(atlas, &mut window, own, value, i).unwrap();
+                (mean.value - value(i)).abs() > 1e-3
+            };
+            (0..n).step_by(97).filter(differs).count()
+        };
+        let all = (0..n).step_by(97).count();
+        assert_eq!(changed(&of(|_| None)), 0);
+        assert_eq!(changed(&of(|k| Some((k % 7) as f32))), 0);
+        // Means of few texels may meet their middle's light.
+        assert!(changed(&of(|_| Some(0.5))) > all / 2);
     }
 
     /// Faces of two charts beside each other in the page: shards bake one without the other.

@@ -1,7 +1,7 @@
 //! Finds where interpolation between gather texels is wrong by their light: where it differs by more than its noise can
 //! explain, as beside a sunlit leaf, there is an edge or a gradient that the gather map is too coarse for. What texels there
-//! gather with their few rays is averaged over those that differ from interpolated light alike, and replaces this only as
-//! far as the two differ by more than noise.
+//! gather with their few rays is averaged over those nearby that differ alike from what they interpolate. The mean replaces
+//! the interpolated light only as far as the two differ by more than noise.
 //!
 //! The [geometric estimate](super::interpolation_error) knows how fast light may change, this one how fast it does. It
 //! needs the gather map, which live updates do not have before they choose texels.
@@ -11,8 +11,8 @@ use crate::lightmap::atlas::ids::{GatherMap, GatherTexel, PerTexel};
 use glam::Vec3;
 
 /// Factor on the noise that is subtracted from the contrast, and on that of the difference between what texels gather
-/// and what they interpolate: where few rays meet what is bright, their spread tells too little. (With 1, groups of a few
-/// texels stand out on smooth walls: docs/accuracy.md#interpolation-contrast.)
+/// and what they interpolate: where few rays meet what is bright, their spread tells too little. (With 1, and with what
+/// texels gather alone, groups of a few of them stood out on smooth walls: docs/accuracy.md#interpolation-contrast.)
 const SURE: f64 = 3.0;
 
 /// Light of the gather map.
