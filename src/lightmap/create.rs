@@ -59,13 +59,13 @@ impl Lightmap {
             None => Charts::of_scene(scene, density, desc.page_size, desc.padding, progress)?,
         };
         let unwrap_seconds = start.elapsed().as_secs_f64();
+        let index = ChartIndex::new(scene.device(), &charts)?;
         let two_sided: Vec<ChartId> =
             try_collect(charts.ids().filter(|&c| charts[c].two_sided), "the two-sided charts")?;
         let Maps { map, gather, radiance, seen, with_backs, buried, sight_rays } =
-            Maps::lay_out(scene, desc, &charts, &two_sided, density, known.as_mut(), progress)?;
+            Maps::lay_out(scene, desc, &charts, &index, &two_sided, density, known.as_mut(), progress)?;
         uvs.overlapping_texels = map.texels.overlapping_texels;
         uvs.reduced_charts = map.layout.reduced;
-        let index = ChartIndex::new(scene.device(), &charts)?;
         let device = scene.device();
         let own_bytes = device.in_memory(charts.bytes()) + seen.bytes() + buried.len();
         let bytes = own_bytes + device.in_memory(index.bytes()) + map.bytes() + gather.bytes() + radiance.bytes();
@@ -152,6 +152,7 @@ impl Maps {
         scene: &Arc<Scene>,
         desc: &LightmapDesc,
         charts: &Charts,
+        index: &ChartIndex,
         two_sided: &[ChartId],
         density: f32,
         known: Option<&mut Known>,
@@ -195,7 +196,7 @@ impl Maps {
         let placements = [&map.layout, &gather.layout, &radiance.layout].map(|layout| layout.placements.len() as u64);
         let stage = progress.stage("buried texels", 0.8, 1.0, placements.iter().sum());
         let (near, outdoors) = (texel.min(seen::ROOM * scene.diagonal()), seen::is_outdoors(scene));
-        let search = Search { scene, charts, seen: &seen, near, outdoors, only: None };
+        let search = Search { scene, charts, index, seen: &seen, near, outdoors, only: None };
         // The visible part of a mostly buried texel is a strip along the surface that covers it, often darker than its
         // surroundings. Gather texels are larger and would spread that darkness as a rim.
         let (buried, rays) = scene.install(|| {

@@ -61,6 +61,7 @@ impl Atlas {
         let search = Search {
             scene,
             charts: &self.charts,
+            index: &self.index,
             seen: &self.seen,
             near,
             outdoors: self.is_outdoors,
