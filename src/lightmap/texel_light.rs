@@ -84,10 +84,7 @@ impl<M: Map> TexelAreas<'_, M> {
         if within.min_element() < -0.01 || within.max_element() > 1.01 {
             return None;
         }
-        let [x, y] = sobol_2d(number, combine(seed, 32));
-        let local = placement.local([own.x as f32 + x, own.y as f32 + y]);
-        let chart = self.charts.chart_of(own.triangle);
-        let point = self.index.locate(self.charts, chart, local.into(), own.triangle)?;
+        let point = self.index.in_texel(self.charts, placement, own, sobol_2d(number, combine(seed, 32)))?;
         (!self.scene.is_hole(point.triangle, point.u, point.v)).then_some(point)
     }
 

@@ -5,10 +5,10 @@
 //! of a box. And where the disc reaches through a wall, light of the other room comes in. So short rays probe the disc:
 //! those along the normal find where the surface continues; others test whether the surface points they find, and the
 //! photons themselves, are visible from above the disc's centre. The estimate is multiplied by the part of its light
-//! that comes from visible photons, and divided by the part of the disc, weighted by the filter, where surface is
-//! visible (Jensen 2001, section 7.5, and Hey and Purgathofer, *Advanced Radiance Estimation for Photon Map Global
-//! Illumination*, 2002, divide by the area of the surfaces in the same spirit). Where all of the disc is visible both
-//! are exactly 1. (Pieces of all surfaces in a grid of their own, summed as photons are, left more bias in a furnished
+//! that comes from visible photons, and divided by the area of the visible surface as a part of the disc's, weighted by
+//! the filter (Jensen 2001, section 7.5, and Hey and Purgathofer, *Advanced Radiance Estimation for Photon Map Global
+//! Illumination*, 2002, divide by the area of the surfaces in the same spirit). Where all of the disc is visible and
+//! flat both are exactly 1. (Pieces of all surfaces in a grid of their own, summed as photons are, left more bias in a furnished
 //! room – 1.4 % of the median point instead of 0.5 % – and were three times as many there as photons.)
 //!
 //! The discs of a tile of texels trace their rays together, as [streams](crate::trace), step by step: a disc has the
@@ -26,8 +26,8 @@ use glam::{Vec2, Vec3};
 use std::ops::Range;
 
 /// Minimum of the visible part of a disc: estimates are raised by a factor of sixteen at most. On scraps of surface that
-/// hardly any photon hits, more would make single photons shine. (With a quarter, relief finer than discs loses 3 % of San
-/// Miguel's light: docs/experiments.md#narrow-surfaces-in-the-radiance-map.)
+/// hardly any photon hits, more would make single photons shine. (With a quarter, San Miguel, whose relief is finer than
+/// discs, has 2.5 % less light: docs/experiments.md#narrow-surfaces-in-the-radiance-map.)
 const LEAST: f32 = 1.0 / 16.0;
 
 /// Maximum number of photons of a disc that are tested. If there are no more, the visible part of their light is exact.
@@ -41,17 +41,17 @@ const FIRST: u32 = 8;
 /// scenes: docs/experiments.md#look-ups-in-the-radiance-map.)
 const PROBES: u32 = 16;
 
-/// Number of probes of discs of which no more than [`SMALL`] is visible surface: it is divided by, and a small part that is
-/// found by few probes would make the estimate too bright in the mean, as 1/x is convex.
+/// Number of probes of a disc if no more than [`SMALL`] of it is found to be visible surface. Estimates are divided by this
+/// part: the error of few probes would make them too bright in the mean, as 1/x is convex.
 const MOST_PROBES: u32 = 64;
 
-/// Visible part of a disc, by [`PROBES`] probes, up to which more follow. It lies between the half at an edge and the quarter in
-/// a corner, where these are sure to be told apart: at a limit, discs that are taken for more than they are would stay as they
-/// are, while others are corrected.
+/// Part of a disc that [`PROBES`] probes find, up to which more follow. Discs that are probed again only if too little was
+/// found of them have too large a part in the mean, so the limit lies where few discs do: between the half at an edge and the
+/// quarter in a corner. (With a half, edges were 1 to 3 % too dark.)
 const SMALL: f32 = 0.375;
 
-/// Cosine of the angle up to which surface counts as parallel to the disc (8 degrees, an error of half a percent at most), so that on
-/// smooth surface nearly all discs are whole after the first probes.
+/// Cosine of the angle up to which surface counts as parallel to the disc: 8 degrees, an error of half a percent at most.
+/// Nearly all discs on smooth surface are whole after the first probes then.
 const PARALLEL: f32 = 0.99;
 
 /// Discs around the points of a tile, whose rays are traced together.
@@ -83,10 +83,10 @@ struct Disc {
     all_light: Vec3,
     seen: Vec3,
     some_are_hidden: bool,
-    /// Weights of the probes, and of those that found visible surface.
+    /// Weights of the probes, and of those that found visible surface, which count more if it is inclined.
     all: f32,
     covered: f32,
-    /// Whether the first probes found little surface.
+    /// Whether the first [`PROBES`] probes found no more than [`SMALL`] of the disc.
     is_small: bool,
 }
 
@@ -213,8 +213,8 @@ impl Discs {
             if cosine >= SAME_SURFACE {
                 let point = Vec3::from(self.rays[i].origin) - hit.t * disc.normal;
                 self.rays[found] = line_of_sight(map, point, facing, disc.apex);
-                // Of inclined surface more lies in the disc's cylinder than the probe sees of it, by 1 / cosine, and of even
-                // light on it the part (1 + cosine) / 2 comes from above the disc, as the estimate's photons do.
+                // The area of inclined surface is 1 / cosine times what the probe sees of it. Photons on it count if they
+                // come from above the disc: the part (1 + cosine) / 2 of light that is the same from all directions.
                 let area = if cosine < PARALLEL { 0.5 * (1.0 + 1.0 / cosine) } else { 1.0 };
                 self.carried[found] = (carried.0, carried.1 * area);
                 found += 1;
@@ -281,8 +281,8 @@ impl Disc {
         if light == Vec3::ZERO { light } else { self.estimate * light / self.surface() }
     }
 
-    /// The part of the disc, weighted by the filter, where surface is visible; at least [`LEAST`], and more than 1
-    /// where much of it is inclined.
+    /// The area of visible surface as a part of the disc's, weighted by the filter: at least [`LEAST`], and more than 1 where
+    /// much of it is inclined.
     fn surface(&self) -> f32 {
         if self.covered == self.all { 1.0 } else { (self.covered / self.all).max(LEAST) }
     }

@@ -4,8 +4,8 @@
 //! Their light differs from that of the visible surface beside them, and bilinear filtering and interpolation would
 //! spread it there, as dark rims where walls meet or light that leaks below walls. Therefore the sample of each is
 //! moved to that of the nearest texel of its chart that can be seen, in the light map, the gather map and the radiance
-//! map alike, unless another point of the texel itself can be seen, in whatever triangle. Bakes and live updates use the moved samples
-//! without further distinction.
+//! map alike, unless another point of the texel itself can be seen, in whatever triangle of the chart. Bakes and live
+//! updates use the moved samples without further distinction.
 //!
 //! A texel is buried if, on the side that it shows, almost all rays end within about a texel, on backs of one-sided
 //! surfaces, or on sides that cannot be seen from any [open place](super::seen), or if most of them end on such backs, or,
@@ -27,7 +27,7 @@ use crate::base::progress::Stage;
 use crate::base::sampling::{combine, cosine_around, sobol_2d};
 use crate::scene::Scene;
 use crate::trace::{RawHit, Ray};
-use glam::{Vec2, Vec3};
+use glam::Vec3;
 use rayon::prelude::*;
 
 /// Maximum number of rays that test a point.
@@ -203,8 +203,8 @@ impl Search<'_> {
         result
     }
 
-    /// Returns some points of the chart in a texel, as many in other triangles as in that of its sample: where a chart folds, a
-    /// narrow one may be all of the texel that can be seen.
+    /// Returns some points of the chart in a texel, as many in other triangles as in that of its sample: where a chart folds,
+    /// one that is narrower than the texel may be all that can be seen of it.
     fn points_of_texel<M: Map>(
         &self,
         map: &ChartMap<M>,
@@ -212,21 +212,16 @@ impl Search<'_> {
         texel: TexelId<M>,
         seed: u32,
     ) -> Vec<TexelSample> {
-        let sample = map[texel];
-        let chart = map.layout.chart_of(placement);
-        let corner = Vec2::new(f32::from(sample.x), f32::from(sample.y));
-        let point = |i| {
-            let local = map.layout[placement].local((corner + Vec2::from(sobol_2d(i, seed))).into());
-            let found = self.index.locate(self.charts, chart, local.into(), sample.triangle)?;
-            Some(TexelSample { x: sample.x, y: sample.y, ..found })
-        };
+        let (placement, sample) = (&map.layout[placement], &map[texel]);
         let mut counts = [0; 2];
         let mut is_wanted = |point: &TexelSample| {
             let count = &mut counts[usize::from(point.triangle != sample.triangle)];
             *count += 1;
             *count <= POINTS
         };
-        (0..POINT_TRIES).filter_map(point).filter(|point| is_wanted(point)).collect()
+        let points =
+            (0..POINT_TRIES).filter_map(|i| self.index.in_texel(self.charts, placement, sample, sobol_2d(i, seed)));
+        points.filter(|point| is_wanted(point)).collect()
     }
 
     /// Which of at most [`BLOCK`] points are buried; `seed` is the first one's, which the others' follow. Rays come in rounds of one per point

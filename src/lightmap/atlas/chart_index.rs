@@ -6,6 +6,7 @@
 use super::charts::{Chart, Charts};
 use super::flat_triangle::Flat;
 use super::ids::ChartId;
+use super::layout::Placement;
 use super::sheets::{Shape, Sheet};
 use super::texels::TexelSample;
 use crate::base::array::Array;
@@ -175,6 +176,20 @@ impl ChartIndex {
         let all = &sheet.triangles[start as usize..end as usize];
         let triangles = if grid.columns > 0 { grid.around(local) } else { all };
         inside(first - first_triangle).or_else(|| triangles.iter().take(MAX_TESTS).find_map(|&t| inside(t)))
+    }
+
+    /// Returns the point of a sample's chart at a place in the sample's texel, (0, 0) to (1, 1); `None` outside of the chart's
+    /// triangles. `placement` is the sample's. If triangles overlap, the sample's is preferred.
+    pub(crate) fn in_texel(
+        &self,
+        charts: &Charts,
+        placement: &Placement,
+        sample: &TexelSample,
+        [x, y]: [f32; 2],
+    ) -> Option<TexelSample> {
+        let local = placement.local([f32::from(sample.x) + x, f32::from(sample.y) + y]);
+        let point = self.locate(charts, charts.chart_of(sample.triangle), local.into(), sample.triangle)?;
+        Some(TexelSample { x: sample.x, y: sample.y, ..point })
     }
 }
 
