@@ -531,7 +531,7 @@ impl<'p> Bake<'_, 'p> {
                 for texels_of_tile in order.chunks(Tile::texels(&samples)) {
                     let texel = |&texel: &GatherTexel| TileTexel {
                         receiver: receiver(texel),
-                        seed: combine(seed, texel.seed()),
+                        seed: combine(seed, l.gather.seed(texel)),
                         gathered: Gathered::default(),
                         directional: nothing,
                     };

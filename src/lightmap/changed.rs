@@ -74,9 +74,7 @@ impl Lightmap {
     /// added, removed or edited.
     ///
     /// The same surfaces have the same texels if both light maps have the same `texels_per_unit`, which is not 0, the same
-    /// divisors, and the same charts; meshes that are added should come after those that were there before, since random
-    /// numbers are by the numbers of texels, and more light is found unchanged. Surfaces with other texels, or another
-    /// material, are baked. If the light map has light
+    /// divisors, and the same charts. Surfaces with other texels, or another material, are baked. If the light map has light
     /// already, that is replaced.
     pub fn bake_changed_from(
         &mut self,

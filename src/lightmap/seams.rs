@@ -493,7 +493,7 @@ impl Job<'_, '_, '_> {
                 let local = locals[side][0].lerp(locals[side][1], s);
                 let mut at = 4 * side;
                 self.atlas.map.bilinear(self.placement(edge[side]), local.to_array(), |texel, weight| {
-                    (point.texels[at], point.weights[at]) = (texel.seed(), sign * weight);
+                    (point.texels[at], point.weights[at]) = (texel.index() as u32, sign * weight);
                     at += 1;
                 });
                 // Unused entries repeat a used texel, with weight 0.

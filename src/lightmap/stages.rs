@@ -204,7 +204,7 @@ pub(crate) fn backs(inputs: &Inputs, radiance: &[Vec3]) -> Result<Vec<bool>> {
         Some(radiance) => radiance.element_sum(),
         None => {
             let (_, receiver) = map.receiver(&atlas.scene, texel, map.is_back(texel));
-            let seed = combine(params.seed as u32, texel.seed());
+            let seed = combine(params.seed as u32, map.seed(texel));
             direct.irradiance(&receiver, 1, seed, &mut 0).element_sum()
         }
     };

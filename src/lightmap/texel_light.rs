@@ -315,7 +315,7 @@ impl TilePoints {
         self.pending.clear();
         for Wanted { place, texel, back, numbers, lights } in wanted {
             let samples = by.samples.div_ceil(numbers.len() as u32);
-            let (seed, first) = (combine(by.seed, texel.seed()), self.counts[place]);
+            let (seed, first) = (combine(by.seed, by.areas.map.seed(texel)), self.counts[place]);
             let of_round = combine(seed, numbers.start);
             for number in numbers {
                 let Some(on) = by.areas.point(texel, number, seed) else { continue };

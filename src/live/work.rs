@@ -366,7 +366,7 @@ impl BlockWork {
         let (atlas, asks) = (&c.map.atlas, c.asks(directional::INDIRECT));
         out.extend(texels.map(|i| TileTexel {
             receiver: atlas.receiver(&atlas.gather, &c.light.sides.backs, tile.texels[i]),
-            seed: combine(c.gather_seed, tile.texels[i].seed()),
+            seed: combine(c.gather_seed, atlas.gather.seed(tile.texels[i])),
             gathered: self.gathered.get(i).copied().unwrap_or_default(),
             directional: asks.then(|| self.directional.get(i).copied().unwrap_or_default()),
         }));

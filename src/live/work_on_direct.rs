@@ -130,7 +130,7 @@ impl Tile {
 fn coarse_light<'a>(c: &Context, texels: impl IntoIterator<Item = &'a GatherTexel>, room: &mut Room, limit: &Limit) {
     let atlas = &c.map.atlas;
     let point = |&texel: &GatherTexel| {
-        (atlas.receiver(&atlas.gather, &c.light.sides.backs, texel), combine(c.direct_seed, texel.seed()))
+        (atlas.receiver(&atlas.gather, &c.light.sides.backs, texel), combine(c.direct_seed, atlas.gather.seed(texel)))
     };
     let samples = c.direct_samples.min(COARSE_SAMPLES);
     let Room { points, coarse, coarse_directional, .. } = room;

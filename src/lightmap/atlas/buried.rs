@@ -17,14 +17,14 @@ use super::chart_index::ChartIndex;
 use super::chart_map::ChartMap;
 use super::charts::Charts;
 use super::fill::{Hole, around};
-use super::ids::{ChartId, Map, PlacementId, TexelId, TexelRange};
+use super::ids::{Map, PlacementId, TexelId, TexelRange};
 use super::seen::{self, Seen};
 use super::texels::TexelSample;
 use crate::base::error::Result;
 use crate::base::memory::{try_collect, try_par_collect, try_push, try_vec, try_with_capacity};
 use crate::base::parallel::one_by_one;
 use crate::base::progress::Stage;
-use crate::base::sampling::{combine, cosine_around, sobol_2d};
+use crate::base::sampling::{cosine_around, sobol_2d};
 use crate::scene::Scene;
 use crate::trace::{RawHit, Ray};
 use glam::Vec3;
@@ -142,19 +142,18 @@ impl Search<'_> {
         }
         let texels = map.texels_of(placement);
         let indices = texels.indices();
-        let seed = seed_of(self.scene, self.charts, chart);
+        let seed = |texel: usize| map.seed_in(placement, TexelId::new(texel));
         let mut buried = Vec::new();
         for first in indices.clone().step_by(BLOCK) {
             stage.advance(0)?;
             let points = &map.texels.samples[first..indices.end.min(first + BLOCK)];
-            let seed = seed.wrapping_add((first - indices.start) as u32);
-            let are_buried = self.are_buried(points, seed, is_back, &mut found.rays);
+            let are_buried = self.are_buried(points, seed(first), is_back, &mut found.rays);
             for (i, _) in are_buried.iter().take(points.len()).enumerate().filter(|(_, is)| **is) {
                 try_push(&mut buried, TexelId::new(first + i), BURIED)?;
             }
         }
         if by_parts || buried.len() == texels.len() {
-            self.find_seen_parts(map, placement, (seed, is_back), &texels, &mut buried, &mut found, stage)?;
+            self.find_seen_parts(map, placement, is_back, &texels, &mut buried, &mut found, stage)?;
         }
         if !buried.is_empty() && buried.len() < texels.len() {
             found.moved = nearest_seen(map, placement, texels, buried, stage)?;
@@ -168,7 +167,7 @@ impl Search<'_> {
         &self,
         map: &ChartMap<M>,
         placement: PlacementId,
-        (seed, back): (u32, bool),
+        back: bool,
         texels: &TexelRange<M>,
         buried: &mut Vec<TexelId<M>>,
         found: &mut Found<M>,
@@ -191,7 +190,7 @@ impl Search<'_> {
                 let neighbour = map.at(placement, x, y);
                 neighbour.is_none_or(|n| !texels.contains(n) || !is_buried[texels.place(n)])
             });
-            let seed = seed.wrapping_add(texels.place(s) as u32);
+            let seed = map.seed_in(placement, s);
             let points = if is_at_border { self.points_of_texel(map, placement, s, seed) } else { Vec::new() };
             let mut is_buried = |point: &TexelSample| self.are_buried(&[*point], seed, back, &mut found.rays)[0];
             let seen = points.into_iter().find(|point| !is_buried(point));
@@ -331,18 +330,6 @@ struct Found<M: Map> {
     /// Texels that can be seen at another point than their sample, with that point.
     seen_parts: Vec<(TexelId<M>, TexelSample)>,
     rays: u64,
-}
-
-/// The bits of a float that are its exponent.
-const EXPONENT: u32 = 0x7f80_0000;
-
-/// Returns the seed of a chart's first texel; others count on from there. It goes by where the chart lies and not by its
-/// number, so that in a scene with more or fewer meshes the same texels are found; without exponents, so that a scene that is
-/// a power of two as large has the same light.
-fn seed_of(scene: &Scene, charts: &Charts, chart: ChartId) -> u32 {
-    let first = charts.triangles_of(chart).next();
-    let corners = first.map_or([Vec3::ZERO; 3], |triangle| scene.corners(triangle));
-    corners.iter().flat_map(|corner| corner.to_array()).fold(0, |seed, c| combine(seed, c.to_bits() & !EXPONENT))
 }
 
 /// Finds the nearest visible texels to those `buried`, ring by ring.
@@ -545,8 +532,8 @@ mod tests {
         let shows_rim = |&s: &LightTexel| atlas.map.surface(&atlas.scene, s).0.y == 1.0;
         let of_rim = texels.clone().filter(|&s| atlas.map.position(s).0 == 0 && !atlas.buried[s.index()]);
         let (shown, all) = (of_rim.clone().filter(shows_rim).count(), of_rim.count());
-        // A ray of a texel on the side may leave the gap.
-        assert!(all >= 40 && shown >= 36, "{shown} of {all}");
+        // A texel on the side counts as open if its first ray leaves the gap, which one in ten does.
+        assert!(all >= 40 && shown >= 30, "{shown} of {all}");
         // The others are buried and take its light.
         let (shown, all) = (texels.clone().filter(shows_rim).count(), texels.len());
         assert!(all >= 240 && shown > 9 * all / 10, "{shown} of {all}");

@@ -1,11 +1,13 @@
 //! A map of one resolution: the layout of the charts in it, and its texels.
 
 use super::charts::Charts;
-use super::ids::{Map, PlacementId, TexelId, TexelRange};
+use super::ids::{ChartId, Map, PlacementId, TexelId, TexelRange};
 use super::layout::Layout;
 use super::texels::{TexelMap, TexelSample};
 use crate::base::error::Result;
+use crate::base::memory::try_collect;
 use crate::base::progress::Stage;
+use crate::base::sampling::combine;
 use crate::direct::Receiver;
 use crate::scene::{NONE, Object, Scene};
 use crate::trace::offset::{Facet, SurfacePoint};
@@ -20,6 +22,8 @@ pub(crate) struct ChartMap<M: Map> {
     pub texels: TexelMap,
     /// First of the separate texels for backs.
     pub back_start: TexelId<M>,
+    /// What is added to the number of a texel, by placement, to make its [`seed`](Self::seed).
+    seeds: Vec<u32>,
     of: PhantomData<M>,
 }
 
@@ -37,7 +41,8 @@ impl<M: Map> ChartMap<M> {
         let texels = TexelMap::build(scene, charts, &layout, stage)?;
         let fronts = layout.placements.len() - layout.back_of.len();
         let back_start = TexelId::new(texels.chart_start[fronts] as usize);
-        Ok(ChartMap { layout, texels, back_start, of: PhantomData })
+        let seeds = seeds(scene, charts, &layout, &texels)?;
+        Ok(ChartMap { layout, texels, back_start, seeds, of: PhantomData })
     }
 
     /// Copies the map, with the samples of placements that are `anew` as [`new`](Self::new) makes them.
@@ -49,7 +54,8 @@ impl<M: Map> ChartMap<M> {
         stage: &Stage,
     ) -> Result<Self> {
         let texels = self.texels.copied(scene, charts, &self.layout, anew, stage)?;
-        Ok(ChartMap { layout: self.layout.clone(), texels, back_start: self.back_start, of: PhantomData })
+        let seeds = seeds(scene, charts, &self.layout, &texels)?;
+        Ok(ChartMap { layout: self.layout.clone(), texels, back_start: self.back_start, seeds, of: PhantomData })
     }
 
     /// Returns the number of texels that show a surface.
@@ -58,7 +64,7 @@ impl<M: Map> ChartMap<M> {
     }
 
     pub(crate) fn bytes(&self) -> usize {
-        self.texels.bytes() + size_of_val(&self.layout.placements[..])
+        self.texels.bytes() + size_of_val(&self.layout.placements[..]) + size_of_val(&self.seeds[..])
     }
 
     /// Returns all texels.
@@ -77,6 +83,20 @@ impl<M: Map> ChartMap<M> {
     pub(crate) fn texels_of(&self, placement: PlacementId) -> TexelRange<M> {
         let r = self.texels.samples_of(placement);
         TexelId::range(r.start as usize..r.end as usize)
+    }
+
+    /// Returns a seed of random numbers for a texel. It goes by where its chart lies and by its place in it: in a scene with
+    /// more or fewer meshes, texels of the others draw the same numbers, so that their light differs by what the meshes
+    /// change alone.
+    #[inline]
+    pub(crate) fn seed(&self, texel: TexelId<M>) -> u32 {
+        self.seed_in(self.texels.placement_of(texel.index() as u32), texel)
+    }
+
+    /// Returns the [`seed`](Self::seed) of a texel of a placement.
+    #[inline]
+    pub(crate) fn seed_in(&self, placement: PlacementId, texel: TexelId<M>) -> u32 {
+        self.seeds[placement.index()].wrapping_add(texel.index() as u32)
     }
 
     /// Returns a range of texels with those beside it, up to a number of rows away, of the placements that it cuts.
@@ -163,6 +183,28 @@ impl<M: Map> ChartMap<M> {
         let t = &self[texel];
         (t.position(scene), t.shading_normal(scene))
     }
+}
+
+/// Returns what makes seeds of texel numbers, by placement. Both sides of a chart draw the same numbers.
+fn seeds(scene: &Scene, charts: &Charts, layout: &Layout, texels: &TexelMap) -> Result<Vec<u32>> {
+    let of_placement = |placement: PlacementId| {
+        let of_chart = seed_of(scene, charts, layout.chart_of(placement));
+        of_chart.wrapping_sub(texels.samples_of(placement).start)
+    };
+    try_collect((0..layout.placements.len()).map(PlacementId::new).map(of_placement), "seeds of random numbers")
+}
+
+/// Returns a seed by where a chart lies, which is that of its first triangle. Coordinates are rounded to 2⁻¹⁸ of the power of
+/// two below the largest one: rounding seldom makes another seed, and a scene that is a power of two as large has the same
+/// light.
+fn seed_of(scene: &Scene, charts: &Charts, chart: ChartId) -> u32 {
+    const EXPONENT: u32 = 0xff << 23;
+    let first = charts.triangles_of(chart).next();
+    let corners = first.map_or([Vec3::ZERO; 3], |triangle| scene.corners(triangle));
+    let largest = corners.iter().map(|corner| corner.abs().max_element()).fold(0.0, f32::max);
+    let unit = f32::from_bits(largest.to_bits() & EXPONENT);
+    let rounded = |c: f32| (c / unit * (1 << 18) as f32).round() as i32 as u32;
+    corners.iter().flat_map(|corner| corner.to_array()).map(rounded).fold(0, combine)
 }
 
 /// Returns the texel of an entry of an index of texels; `None` where there is none.

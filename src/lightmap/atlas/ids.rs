@@ -110,12 +110,6 @@ impl<M: Map> TexelId<M> {
         self.0 as usize
     }
 
-    /// Returns the number as a seed of random numbers.
-    #[inline]
-    pub fn seed(self) -> u32 {
-        self.0
-    }
-
     /// Returns the texels of a range of indices.
     #[inline]
     pub fn range(range: Range<usize>) -> TexelRange<M> {

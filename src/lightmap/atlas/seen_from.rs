@@ -148,7 +148,7 @@ impl Eye<'_> {
         texels.step_by(step).any(|texel| {
             let (_, receiver) = self.radiance.receiver(self.scene, texel, !front);
             (0..LOOKS).any(|look| {
-                let place = self.place(look, texel.seed());
+                let place = self.place(look, self.radiance.seed(texel));
                 let away = receiver.origin - place;
                 if away.dot(receiver.geometric) >= 0.0 {
                     return false;

@@ -175,7 +175,10 @@ fn view(scene: &Scene, radiance: &ChartMap<RadianceMap>, placement: PlacementId)
     for (texel, rays) in places.zip(rays.chunks_mut(RAYS)) {
         let (_, receiver) = radiance.receiver(scene, texel, radiance.is_back(texel));
         for (i, ray) in rays.iter_mut().enumerate() {
-            *ray = Ray::new(receiver.origin, cosine_around(receiver.geometric, sobol_2d(i as u32, texel.seed())));
+            *ray = Ray::new(
+                receiver.origin,
+                cosine_around(receiver.geometric, sobol_2d(i as u32, radiance.seed_in(placement, texel))),
+            );
         }
     }
     scene.intersect_stream(rays, &mut hits);

@@ -186,6 +186,7 @@ impl<'a, 'p> Comparison<'a, 'p> {
             probes: [LightTexel::NONE; PROBES],
         };
         let mut cells = try_filled(count, nothing, CHANGED)?;
+        let seed = |texel| atlas.map.seed_in(placement, texel);
         for texel in atlas.map.texels_of(placement) {
             let cell = &mut cells[self.grid.of(placement, texel)];
             cell.bounds.add(atlas.map[texel].position(&atlas.scene));
@@ -199,7 +200,7 @@ impl<'a, 'p> Comparison<'a, 'p> {
             cell.texels += 1;
             let mut texel = texel;
             for probe in &mut cell.probes {
-                if *probe == LightTexel::NONE || mix(texel.seed()) < mix(probe.seed()) {
+                if *probe == LightTexel::NONE || mix(seed(texel)) < mix(seed(*probe)) {
                     std::mem::swap(&mut texel, probe);
                 }
                 if texel == LightTexel::NONE {

@@ -68,7 +68,7 @@ fn texels_keep_their_light_or_get_that_of_a_bake_from_nothing() {
         let (mut scene, mut map) = if is_area { rooms_with(area) } else { rooms() };
         map.bake(&params, &none).unwrap();
         let old = light(&map);
-        move_block(&mut scene, Vec3::new(0.3, 0.2, 0.0));
+        move_block(&mut scene, Vec3::new(0.6, 0.4, 0.0));
         map.follow(&scene, &none).unwrap();
         assert!(light(&map) == old, "light stays until the next bake");
         let stats = map.bake_changed(&params, 0.05, &none).unwrap();
@@ -94,7 +94,7 @@ fn texels_keep_their_light_or_get_that_of_a_bake_from_nothing() {
             assert!(worst < 0.25, "{what} light is wrong by {worst} of the mean");
             let old_worst =
                 (0..n).map(|i| (old[kind][i] - new[kind][i]).abs().element_sum() / mean).fold(0.0, f32::max);
-            assert!(old_worst > 0.15, "{what} light changed by {old_worst} only");
+            assert!(old_worst > 2.0 * worst.max(0.05), "{what} light changed by {old_worst} only");
         }
     }
 }
@@ -334,7 +334,7 @@ fn a_new_light_map_keeps_light_where_meshes_were_added_and_removed() {
         two.bake(&BakeParams { seed, ..params }, &none).unwrap();
         light(&two)
     });
-    // Random numbers are by the numbers of texels: what is kept has other noise, but no more than another seed brings.
+    // Light of either has noise of its own where what is seen differs a little, but no more than another seed brings.
     let rms = |a: &[Vec3], b: &[Vec3]| {
         a.iter().zip(b).map(|(a, b)| f64::from((*a - *b).length_squared())).sum::<f64>().sqrt()
             / (a.len() as f64).sqrt()

@@ -212,7 +212,7 @@ impl Upsampling {
         let mut receiver = atlas.receivers(&atlas.map, backs);
         let mut texel = |&place: &u32| TileTexel {
             receiver: receiver(texels[place as usize]),
-            seed: combine(own.seed, texels[place as usize].seed()),
+            seed: combine(own.seed, atlas.map.seed(texels[place as usize])),
             gathered: Gathered::default(),
             directional: own.directional.then(Directional::default),
         };

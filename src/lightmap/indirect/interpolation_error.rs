@@ -76,7 +76,8 @@ pub(super) fn surroundings(
         probes.clear();
         for &texel in texels {
             let receiver = receiver(texel);
-            let along = |i| cosine_around(receiver.normal, sobol_2d(i, texel.seed()));
+            let seed = atlas.gather.seed_in(placement, texel);
+            let along = |i| cosine_around(receiver.normal, sobol_2d(i, seed));
             let ray = |i| Ray::new(receiver.origin, along(i)).within(0.0, FAR * width);
             probes.extend((0..PROBES).map(ray));
         }

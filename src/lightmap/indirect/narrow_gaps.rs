@@ -59,8 +59,9 @@ pub(super) fn are_in_gaps<M: ShownMap>(
         for round in ROUNDS {
             stage.check()?;
             for i in (0..places.len()).filter(|&i| away[i] < AWAY) {
+                let seed = map.seed(texel(i));
                 for k in round.clone() {
-                    let direction = cosine_around(receivers[i].normal, sobol_2d(k, texel(i).seed()));
+                    let direction = cosine_around(receivers[i].normal, sobol_2d(k, seed));
                     sights.push(Ray::new(receivers[i].origin, direction).within(0.0, distance), i as u32)?;
                 }
             }

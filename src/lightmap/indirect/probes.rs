@@ -77,7 +77,7 @@ impl ProbeRays {
         let count = texels.len() * points.len();
         for (&texel, rays) in texels.iter().zip(self.rays.chunks_mut(points.len())) {
             let receiver = new.atlas.receiver(&new.atlas.map, new.backs, texel);
-            aim(&receiver, points, combine(seed, texel.seed()), rays);
+            aim(&receiver, points, combine(seed, new.atlas.map.seed(texel)), rays);
         }
         let rays = &self.rays[..count];
         let [old_hits, new_hits] = &mut self.hits;

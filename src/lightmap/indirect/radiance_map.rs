@@ -330,7 +330,7 @@ impl RadianceTile {
             let disc = |&i: &usize| {
                 let texel = texels[i];
                 let (point, receiver) = areas.map.receiver(areas.scene, texel, areas.map.is_back(texel));
-                (point.position, receiver.geometric, combine(light.seed, texel.seed()))
+                (point.position, receiver.geometric, combine(light.seed, areas.map.seed(texel)))
             };
             self.discs.irradiance(photons, reflecting.iter().map(disc), rays, |k, e| sums[reflecting[k]] += e);
         }
@@ -370,8 +370,9 @@ pub(crate) fn albedo<M: Map>(areas: &TexelAreas<M>, texel: TexelId<M>) -> Vec3 {
     }
     let count = (4.0 * texels).min(MAX_LOOKUPS as f32) as u32;
     let (mut sum, mut seen) = (Vec3::ZERO, 0);
+    let seed = map.seed_in(placement, texel);
     for i in 0..count {
-        let w = corner + weights * Vec2::from(sobol_2d(i, texel.seed()));
+        let w = corner + weights * Vec2::from(sobol_2d(i, seed));
         if w.min_element() >= 0.0 && w.x + w.y <= 1.0 && !scene.is_hole(sample.triangle, w.x, w.y) {
             sum += scene.albedo_at(material, || Some(uv(w)));
             seen += 1;

@@ -146,7 +146,7 @@ fn seams_of_instances_are_those_of_copies_inside_and_between_them() {
     let corner = |x: f32, z: f32| Vec3::new(x, 0.0, z);
     tile.grid_quad(corner(0.0, 0.0), corner(0.0, 1.0), corner(1.0, 1.0), corner(1.0, 0.0), 2, 2, 0);
     let mut ball = MeshBuilder::new();
-    ball.sphere(Vec3::Y, 0.5, 3, 0);
+    ball.sphere(Vec3::Y, 0.4, 3, 0);
     // Three tiles in a row. Copies of balls may be unwrapped with other rounding.
     for (mesh, difference) in [(tile.finish(), 0.0), (ball.finish(), 0.02)] {
         let mut data = SceneData::new();
@@ -167,7 +167,9 @@ fn seams_of_instances_are_those_of_copies_inside_and_between_them() {
             assert!(stats.seam_rms_after < 0.2 * stats.seam_rms_before, "{stats:?}");
             let text = map.plan_text();
             let edges = text.split("seams at ").nth(1).and_then(|rest| rest.split(' ').next()).unwrap();
-            [edges.parse().unwrap(), stats.seam_points as f64]
+            // Noise decides which points are left out for unlike light.
+            let unlike = text.split("except ").nth(1).and_then(|rest| rest.split(' ').next()).unwrap_or("0");
+            [edges.parse().unwrap(), stats.seam_points as f64 + unlike.parse::<f64>().unwrap()]
         });
         for (a, b) in instances.into_iter().zip(copies) {
             assert!((a - b).abs() <= difference * b, "{instances:?} {copies:?}");

@@ -159,7 +159,7 @@ impl TexelLight<'_, LightMap> {
         let n = add_points(points, &mut sum, |_| Vec3::ONE);
         if n == Vec3::ZERO {
             // All points miss a small part of a chart, or lie inside solids: the sample alone is lit.
-            let seed = combine(self.seed, t.texel.seed());
+            let seed = combine(self.seed, self.areas.map.seed(t.texel));
             if directional.is_empty() {
                 let soft = self.direct.at_point(&t.receiver, Lights::Soft, self.samples, seed, rays);
                 return (sharp + soft.value(), 0.0);

@@ -49,7 +49,7 @@ impl TexelLight<'_, RadianceMap> {
             let missing = (points.len() as f32 - n.x).max(if n == Vec3::ZERO { 1.0 } else { 0.0 });
             if missing > 0.0 {
                 // Few rays are left: those of the points inside solids go from the sample.
-                let seed = combine(self.seed, texel.seed());
+                let seed = combine(self.seed, self.areas.map.seed(texel));
                 let light = self.direct.at_point(&sample(i), Lights::All, self.samples, seed, rays);
                 sum.add(&light, Vec3::splat(missing));
                 n += missing;
