@@ -13,17 +13,21 @@ use crate::base::error::Result;
 use crate::base::memory::try_collect;
 use crate::base::parallel::{ParallelLoop, one_by_one};
 use crate::base::progress::Stage;
-use crate::base::sampling::{combine, cosine_around, mix, uniform, uniform_sphere};
+use crate::base::sampling::{combine, cosine_around, uniform, uniform_sphere};
 use crate::scene::{Light, Scene};
 use crate::trace::{PACKET_SIZE, Packet, RawHit, Ray};
 use glam::Vec3;
 use rayon::prelude::*;
 use std::sync::atomic::{AtomicU32, AtomicU64, Ordering::Relaxed};
 
-/// Number of places that are tried, per texel of the radiance map, and limits of the total.
+/// Number of places that are tried, per texel of the radiance map, and limits of the total: as many in the mean, since each
+/// texel draws how many start there. (In a scene with more or fewer meshes the others start from the same places.)
 const TRIES_PER_TEXEL: usize = 4;
 const LEAST_TRIES: usize = 1 << 10;
 const MOST_TRIES: usize = 1 << 14;
+
+/// Number of texels that a thread takes at a time.
+const TEXELS: usize = 1 << 10;
 
 /// Number of packets of rays from an open place. The first decides whether the place is open.
 const PACKETS: u32 = 4;
@@ -94,13 +98,22 @@ impl Seen {
         let look = Look { scene, charts, radiance, room, outdoors: is_outdoors(scene), lights: &lights, is_lit };
         let counters: Vec<[AtomicU32; 2]> = try_collect(charts.charts.iter().map(|_| Default::default()), COUNTS)?;
         let (places, rays) = (AtomicU64::new(0), AtomicU64::new(0));
-        one_by_one((0..Self::work(radiance) as u32).into_par_iter()).try_each(|number| {
+        let tries = (TRIES_PER_TEXEL * radiance.len()).clamp(LEAST_TRIES, MOST_TRIES);
+        let tries_per_texel = tries as f64 / radiance.len() as f64;
+        one_by_one((0..Self::work(radiance) as usize).into_par_iter()).try_each(|part| {
             let mut traced = 0;
-            if let Some((position, first)) = look.open_place(number, &mut traced) {
-                look.around(position, &first, number, &mut traced, |chart, side| {
-                    counters[chart.index()][side].fetch_add(1, Relaxed);
-                });
-                places.fetch_add(1, Relaxed);
+            for texel in TexelId::range(part * TEXELS..radiance.len().min((part + 1) * TEXELS)) {
+                let seed = radiance.seed(texel);
+                let tries = (tries_per_texel + f64::from(uniform(seed, 0, 3))) as u32;
+                for number in (0..tries).map(|i| combine(seed, i)) {
+                    if let Some((position, first)) = look.open_place(texel, number, &mut traced) {
+                        look.around(position, &first, number, &mut traced, |chart, side| {
+                            counters[chart.index()][side].fetch_add(1, Relaxed);
+                        });
+                        places.fetch_add(1, Relaxed);
+                    }
+                    stage.advance(0)?;
+                }
             }
             rays.fetch_add(traced, Relaxed);
             stage.advance(1)
@@ -121,7 +134,7 @@ impl Seen {
     pub(crate) fn work(radiance: &ChartMap<RadianceMap>) -> u64 {
         match radiance.layout.back_of.len() {
             0 => 0,
-            _ => (TRIES_PER_TEXEL * radiance.len()).clamp(LEAST_TRIES, MOST_TRIES) as u64,
+            _ => radiance.len().div_ceil(TEXELS) as u64,
         }
     }
 
@@ -176,11 +189,14 @@ struct Look<'a> {
 }
 
 impl Look<'_> {
-    /// Returns place `number` of those that are tried, if it is open, and the hits of a first packet of rays from
+    /// Returns a random place between a texel and another surface, if it is open, and the hits of a first packet of rays from
     /// there.
-    fn open_place(&self, number: u32, rays: &mut u64) -> Option<(Vec3, [RawHit; PACKET_SIZE])> {
-        let sample = (u64::from(mix(number)) * self.radiance.len() as u64) >> 32;
-        let texel = TexelId::new(sample as usize);
+    fn open_place(
+        &self,
+        texel: TexelId<RadianceMap>,
+        number: u32,
+        rays: &mut u64,
+    ) -> Option<(Vec3, [RawHit; PACKET_SIZE])> {
         let (_, from) = self.radiance.receiver(self.scene, texel, self.radiance.is_back(texel));
         let random = |dimension| uniform(number, dimension, 0);
         let direction = cosine_around(from.geometric, [random(0), random(1)]);

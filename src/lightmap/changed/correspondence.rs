@@ -33,6 +33,9 @@ const MATCHED: &str = "what two scenes have in common";
 /// rounding on where they lie.
 const SAME: f32 = 0.01;
 
+/// Distance up to which two unit normals are the same: light differs by as small a part of itself.
+const SAME_NORMAL: f32 = 1e-3;
+
 /// Bytes per triangle that is matched by itself: its number, hash, class (twice), and links to others alike.
 const TRIANGLE_BYTES: usize = 40;
 
@@ -181,8 +184,11 @@ impl Correspondence {
         }
         let is_buried = |atlas: &Atlas, texel: LightTexel| atlas.buried.get(texel.index()).is_some_and(|&b| b);
         let shows_same = || {
-            self.triangle(&new.scene, here.triangle) == Some(there.triangle)
-                && here.position(&new.scene).distance(there.position(&old.scene)) <= SAME / new.map.layout.density
+            let former = self.triangle(&new.scene, here.triangle);
+            // Rounding decides which of two triangles an edge is part of.
+            let is_alike = || here.shading_normal(&new.scene).distance(there.shading_normal(&old.scene)) <= SAME_NORMAL;
+            here.position(&new.scene).distance(there.position(&old.scene)) <= SAME / new.map.layout.density
+                && former.is_some_and(|former| former == there.triangle || is_alike())
         };
         (is_buried(new, texel) && is_buried(old, former_texel) || shows_same()).then_some(former_texel)
     }

@@ -351,6 +351,48 @@ fn a_new_light_map_keeps_light_where_meshes_were_added_and_removed() {
     assert_eq!((kept, worst[0]), (0.0, 0.0));
 }
 
+/// A block behind the wall, described first, goes: all triangles, charts and texels have other numbers.
+#[test]
+fn what_stays_draws_the_same_random_numbers() {
+    let none = Progress::none();
+    let params = params();
+    let rooms = |with_block: bool| {
+        let (scene, _) = revised([true, false], &[], 5.0);
+        let mut data = SceneData::new();
+        let white = data.add_material(scene.materials()[0]).unwrap();
+        if with_block {
+            let mut block = MeshBuilder::new();
+            block.box_(Vec3::new(0.6, 0.6, 0.0), Vec3::new(1.0, 1.0, 0.5), false, white);
+            data.add_mesh(block.finish()).unwrap();
+        }
+        data.add_mesh(scene.meshes()[0].clone()).unwrap();
+        for light in scene.lights().iter() {
+            data.add_light(*light).unwrap();
+        }
+        let desc = LightmapDesc { texels_per_unit: 24.0, page_size: 512, ..Default::default() };
+        Lightmap::create(&data.committed(), &desc, &none).unwrap()
+    };
+    let mut before = rooms(true);
+    before.bake(&params, &none).unwrap();
+    let mut after = rooms(false);
+    // All light is let stand that can be kept.
+    after.bake_changed_from(&before, &params, 1e9, &none).unwrap();
+    let kept = light(&after);
+    let [new, of_seed] = [params.seed, params.seed + 1].map(|seed| {
+        after.bake(&BakeParams { seed, ..params }, &none).unwrap();
+        light(&after)
+    });
+    let atlas = after.atlas();
+    let behind = atlas.map.all().filter(|&texel| atlas.map.surface(&atlas.scene, texel).0.x > 4.2);
+    let behind: Vec<usize> = behind.map(|texel| texel.index()).collect();
+    let rms = |a: &[Vec3], b: &[Vec3]| {
+        let squares = behind.iter().map(|&i| f64::from((a[i] - b[i]).length_squared()));
+        (squares.sum::<f64>() / behind.len() as f64).sqrt()
+    };
+    let (difference, noise) = (rms(&kept[1], &new[1]), rms(&new[1], &of_seed[1]));
+    assert!(behind.len() > 10_000 && difference < 0.2 * noise, "{difference} of {noise}, {} texels", behind.len());
+}
+
 #[test]
 fn light_of_another_light_map_is_kept_with_stitched_seams_passes_and_light_by_direction() {
     let none = Progress::none();
