@@ -194,16 +194,14 @@ fn seeds(scene: &Scene, charts: &Charts, layout: &Layout, texels: &TexelMap) -> 
     try_collect((0..layout.placements.len()).map(PlacementId::new).map(of_placement), "seeds of random numbers")
 }
 
-/// Returns a seed by where a chart lies, which is that of its first triangle. Coordinates are rounded to 2⁻¹⁸ of the power of
-/// two below the largest one: rounding seldom makes another seed, and a scene that is a power of two as large has the same
-/// light.
+/// Returns a seed by where a chart lies, which is that of its first triangle. Coordinates are rounded to 2⁻¹⁸ of the largest
+/// one: rounding seldom makes another seed, and a scene that is larger or smaller has the same light.
 fn seed_of(scene: &Scene, charts: &Charts, chart: ChartId) -> u32 {
-    const EXPONENT: u32 = 0xff << 23;
     let first = charts.triangles_of(chart).next();
     let corners = first.map_or([Vec3::ZERO; 3], |triangle| scene.corners(triangle));
     let largest = corners.iter().map(|corner| corner.abs().max_element()).fold(0.0, f32::max);
-    let unit = f32::from_bits(largest.to_bits() & EXPONENT);
-    let rounded = |c: f32| (c / unit * (1 << 18) as f32).round() as i32 as u32;
+    // What is not a number becomes 0.
+    let rounded = |c: f32| (c / largest * (1 << 18) as f32).round() as i32 as u32;
     corners.iter().flat_map(|corner| corner.to_array()).map(rounded).fold(0, combine)
 }
 
