@@ -103,7 +103,8 @@ impl Seen {
         one_by_one((0..Self::work(radiance) as usize).into_par_iter()).try_each(|part| {
             let mut traced = 0;
             for texel in TexelId::range(part * TEXELS..radiance.len().min((part + 1) * TEXELS)) {
-                let seed = radiance.seed(texel);
+                // Places before both sides of a chart are independent.
+                let seed = combine(radiance.seed(texel), u32::from(radiance.is_back(texel)));
                 let tries = (tries_per_texel + f64::from(uniform(seed, 0, 3))) as u32;
                 for number in (0..tries).map(|i| combine(seed, i)) {
                     if let Some((position, first)) = look.open_place(texel, number, &mut traced) {
