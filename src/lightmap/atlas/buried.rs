@@ -534,7 +534,7 @@ mod tests {
         let (shown, all) = (of_rim.clone().filter(shows_rim).count(), of_rim.count());
         // A texel on the side counts as open if its first ray leaves the gap, which one in ten does.
         assert!(all >= 40 && shown >= 30, "{shown} of {all}");
-        // The others are buried and take its light.
+        // The others are buried and take the light of the nearest: of the rim, or of one that counts as open, once in ten rows.
         let (shown, all) = (texels.clone().filter(shows_rim).count(), texels.len());
         assert!(all >= 240 && shown > 8 * all / 10, "{shown} of {all}");
     }

@@ -5,13 +5,14 @@ use super::ids::{ChartId, Map, PlacementId, TexelId, TexelRange};
 use super::layout::Layout;
 use super::texels::{TexelMap, TexelSample};
 use crate::base::error::Result;
-use crate::base::memory::try_collect;
+use crate::base::memory::try_par_collect;
 use crate::base::progress::Stage;
 use crate::base::sampling::combine;
 use crate::direct::Receiver;
 use crate::scene::{NONE, Object, Scene};
 use crate::trace::offset::{Facet, SurfacePoint};
 use glam::Vec3;
+use rayon::prelude::*;
 use std::marker::PhantomData;
 use std::ops::{Index, Range};
 
@@ -185,13 +186,14 @@ impl<M: Map> ChartMap<M> {
     }
 }
 
-/// Returns what makes seeds of texel numbers, by placement. Both sides of a chart draw the same numbers.
+/// Returns what is added to texel numbers to make seeds of them, by placement. Both sides of a chart draw the same numbers.
 fn seeds(scene: &Scene, charts: &Charts, layout: &Layout, texels: &TexelMap) -> Result<Vec<u32>> {
-    let of_placement = |placement: PlacementId| {
-        let of_chart = seed_of(scene, charts, layout.chart_of(placement));
-        of_chart.wrapping_sub(texels.samples_of(placement).start)
+    let of_placement = |number: usize| {
+        let placement = PlacementId::new(number);
+        seed_of(scene, charts, layout.chart_of(placement)).wrapping_sub(texels.samples_of(placement).start)
     };
-    try_collect((0..layout.placements.len()).map(PlacementId::new).map(of_placement), "seeds of random numbers")
+    let placements = (0..layout.placements.len()).into_par_iter();
+    scene.device().install(|| try_par_collect(placements.map(of_placement), "seeds of random numbers"))
 }
 
 /// Returns a seed by where a chart lies, which is that of its first triangle. Coordinates are rounded to 2⁻¹⁸ of the largest

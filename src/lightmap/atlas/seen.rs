@@ -21,7 +21,7 @@ use rayon::prelude::*;
 use std::sync::atomic::{AtomicU32, AtomicU64, Ordering::Relaxed};
 
 /// Number of places that are tried, per texel of the radiance map, and limits of the total: as many in the mean, since each
-/// texel draws how many start there. (In a scene with more or fewer meshes the others start from the same places.)
+/// texel draws how many start there. (In a scene with more or fewer meshes nearly the same places are tried near the others.)
 const TRIES_PER_TEXEL: usize = 4;
 const LEAST_TRIES: usize = 1 << 10;
 const MOST_TRIES: usize = 1 << 14;

@@ -142,13 +142,15 @@ impl Eye<'_> {
         if !front && !self.charts[chart].two_sided {
             return false;
         }
-        let texels = self.radiance.texels_of(PlacementId::front_of(chart));
+        let placement = PlacementId::front_of(chart);
+        let texels = self.radiance.texels_of(placement);
         let step = texels.len().div_ceil(POINTS).max(1);
         let mut crossings = Vec::new();
         texels.step_by(step).any(|texel| {
             let (_, receiver) = self.radiance.receiver(self.scene, texel, !front);
+            let seed = self.radiance.seed_in(placement, texel);
             (0..LOOKS).any(|look| {
-                let place = self.place(look, self.radiance.seed(texel));
+                let place = self.place(look, seed);
                 let away = receiver.origin - place;
                 if away.dot(receiver.geometric) >= 0.0 {
                     return false;

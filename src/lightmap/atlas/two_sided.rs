@@ -174,11 +174,9 @@ fn view(scene: &Scene, radiance: &ChartMap<RadianceMap>, placement: PlacementId)
     let rays = &mut rays[..places.len() * RAYS];
     for (texel, rays) in places.zip(rays.chunks_mut(RAYS)) {
         let (_, receiver) = radiance.receiver(scene, texel, radiance.is_back(texel));
-        for (i, ray) in rays.iter_mut().enumerate() {
-            *ray = Ray::new(
-                receiver.origin,
-                cosine_around(receiver.geometric, sobol_2d(i as u32, radiance.seed_in(placement, texel))),
-            );
+        let seed = radiance.seed_in(placement, texel);
+        for (i, ray) in (0..).zip(rays) {
+            *ray = Ray::new(receiver.origin, cosine_around(receiver.geometric, sobol_2d(i, seed)));
         }
     }
     scene.intersect_stream(rays, &mut hits);
