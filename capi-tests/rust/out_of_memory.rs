@@ -30,9 +30,9 @@ use std::sync::atomic::{AtomicI64, AtomicUsize, Ordering::SeqCst};
 /// more.
 static LARGE: AtomicUsize = AtomicUsize::new(128 << 10);
 
-/// For live objects, saved results and shares: what grows with the number of blocks or texels takes more, although there are
-/// few.
-const LARGE_OF_LIVE: usize = 16 << 10;
+/// For bakes, live objects, saved results and shares: what grows with the number of blocks or texels takes more, although
+/// there are few.
+const LARGE_OF_LIGHT: usize = 16 << 10;
 
 /// For their updates: the sums of one block's texels. (Queues of rayon, which cannot fail, take 1,520 bytes.)
 const LARGE_OF_UPDATES: usize = 1536;
@@ -125,6 +125,9 @@ fn fail_all<T>(what: &str, mut call: impl FnMut() -> Result<T>) -> T {
 /// Squares along each side of the ground.
 const SIDE: usize = 180;
 
+/// The same where light is baked, which takes longer than trees.
+const SIDE_OF_BAKES: usize = 90;
+
 /// A hilly ground of `side` × `side` squares, of which some are degenerate and some shine, with light map UVs, below a
 /// roof.
 fn description(side: usize) -> Result<SceneData> {
@@ -194,19 +197,17 @@ fn every_large_allocation_and_every_request_may_fail_and_nothing_is_lost() {
 
     let folder = std::env::temp_dir().join(format!("bakelite-out-of-memory-{}", std::process::id()));
     std::fs::create_dir_all(&folder).unwrap();
-    let large = LARGE.swap(LARGE_OF_LIVE, SeqCst);
+    let large = LARGE.swap(LARGE_OF_LIGHT, SeqCst);
     let mut small = small_lightmap(&device);
     trace_streams(small.scene());
     live(&small, &folder.join("light.live"));
-    LARGE.store(large, SeqCst);
     let expected = checkpoints(&mut small, &folder.join("light.checkpoint"));
     results(&mut small, &folder, expected);
-    LARGE.store(LARGE_OF_LIVE, SeqCst);
+    LARGE.store(LARGE_OF_LIGHT, SeqCst);
     shares(&mut small, &folder, expected);
     LARGE.store(large, SeqCst);
     drop(small);
 
-    let mut scene = None;
     for compact in [false, true] {
         for quality in BuildQuality::ALL {
             let build = BuildOptions { compact, quality, ..Default::default() };
@@ -223,24 +224,25 @@ fn every_large_allocation_and_every_request_may_fail_and_nothing_is_lost() {
             assert_eq!(committed.stats().triangles, 2 * (SIDE * SIDE) as u64 + 2);
             refit(committed.clone(), &format!("refit, {quality:?}, compact: {compact}"));
             scene_file(&committed, &folder.join("ground.bkscene"));
-            scene.get_or_insert(committed);
         }
     }
-    let scene = scene.unwrap();
 
-    let params = PhotonParams { photon_count: 100_000, ..Default::default() };
+    LARGE.store(LARGE_OF_LIGHT, SeqCst);
+    let ground = description(SIDE_OF_BAKES).unwrap();
+    let scene = Scene::commit(&device, ground, &BuildOptions::default(), &none).map_err(|(_, e)| e).unwrap();
+    let params = PhotonParams { photon_count: 25_000, ..Default::default() };
     let photons = fail_all("photon map", || PhotonMap::trace(&scene, &params, &none));
     fail_all("packed photons", || {
-        let photons = PhotonMap::trace(&scene, &PhotonParams { photon_count: 20_000, ..params }, &none)?;
+        let photons = PhotonMap::trace(&scene, &PhotonParams { photon_count: 5_000, ..params }, &none)?;
         photons.photons().map(|p| p.position.len())
     });
     drop(photons);
 
-    let desc = LightmapDesc { texels_per_unit: 200.0, page_size: 512, ..Default::default() };
+    let desc = LightmapDesc { texels_per_unit: 60.0, page_size: 128, ..Default::default() };
     let mut lightmap = fail_all("light map", || Lightmap::create(&scene, &desc, &none));
     let (gather_rays, interpolation_contrast) = (4, 0.15);
     let params = BakeParams {
-        photon_count: 100_000,
+        photon_count: 25_000,
         gather_rays,
         interpolation_contrast,
         direct_samples: 1,
@@ -272,7 +274,7 @@ fn every_large_allocation_and_every_request_may_fail_and_nothing_is_lost() {
     load(&device, &folder.join("ground.obj"));
     std::fs::remove_dir_all(&folder).unwrap();
 
-    LARGE.store(128 << 10, SeqCst);
+    LARGE.store(LARGE_OF_LIGHT, SeqCst);
     edits(&scene, &mut lightmap, &desc, &whole);
     drop((lightmap, scene));
     assert_eq!(ANNOUNCED.load(SeqCst), 0, "bytes announced, but not given back");
@@ -333,7 +335,7 @@ fn edits(scene: &Arc<Scene>, lightmap: &mut Lightmap, desc: &LightmapDesc, param
 fn results(lightmap: &mut Lightmap, folder: &Path, expected: u64) {
     let none = Progress::none();
     let path = &folder.join("light.result");
-    LARGE.store(LARGE_OF_LIVE, SeqCst);
+    LARGE.store(LARGE_OF_LIGHT, SeqCst);
     fail_each("saving a result", &ALLOCATIONS_LEFT, || lightmap.save_result(path, &none));
     LARGE.store(LARGE_OF_RECORDS, SeqCst);
     fail_all("loading a result", || lightmap.load_result(path, &none));
@@ -373,7 +375,9 @@ fn checkpoints(lightmap: &mut Lightmap, path: &Path) -> u64 {
         }
     }
     assert!(failures > 0 && completed > 0, "{failures} failed, {completed} did not");
+    let large = LARGE.swap(LARGE_OF_RECORDS, SeqCst);
     fail_each("bake that goes on", &ALLOCATIONS_LEFT, || lightmap.bake_with(params, Some(&checkpoint), &none));
+    LARGE.store(large, SeqCst);
     assert_eq!(bits(lightmap), expected);
     expected
 }

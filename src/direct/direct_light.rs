@@ -174,12 +174,10 @@ impl DirectLight {
         let mut areas = try_collect(all, LIGHT_TREE)?;
         areas.retain(|a| a.radiance.max_element() > 0.0 && a.area > 0.0);
         let shines = |l: &&Light| l.color().iter().any(|&c| c > 0.0);
-        let (points, mut each): (Vec<Light>, Vec<Light>) = lights
-            .iter()
-            .filter(|l| !matches!(l, Light::Rect { .. } | Light::Sky { .. }))
-            .filter(|l| !matches!(l, Light::Directional { angular_radius, .. } if *angular_radius > 0.0))
-            .filter(shines)
-            .partition(|l| matches!(l, Light::Point { .. } | Light::Spot { .. }));
+        let is_point = |l: &&Light| matches!(l, Light::Point { .. } | Light::Spot { .. });
+        let is_parallel = |l: &&Light| matches!(l, Light::Directional { angular_radius: 0.0, .. });
+        let points = try_collect(lights.iter().filter(shines).filter(is_point).copied(), LIGHT_TREE)?;
+        let mut each = try_collect(lights.iter().filter(shines).filter(is_parallel).copied(), LIGHT_TREE)?;
         let discs = lights.iter().filter(shines).filter_map(|l| match *l {
             Light::Directional { direction, irradiance, angular_radius } if angular_radius > 0.0 => {
                 Some(Disc { to_light: -direction, irradiance: Vec3::from(irradiance), angular_radius })
@@ -206,8 +204,8 @@ impl DirectLight {
             each,
             areas,
             area_count,
-            discs: discs.collect(),
-            skies: skies.collect(),
+            discs: try_collect(discs, LIGHT_TREE)?,
+            skies: try_collect(skies, LIGHT_TREE)?,
             many: (many.len() > 0).then_some(many),
         })
     }

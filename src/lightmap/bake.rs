@@ -30,7 +30,7 @@ use super::{
 };
 use crate::base::directional::Directional;
 use crate::base::error::{Error, Result, invalid_argument};
-use crate::base::memory::{try_filled, try_parts, try_to_vec, try_vec, try_zeroed};
+use crate::base::memory::{try_collect, try_filled, try_parts, try_to_vec, try_vec, try_zeroed};
 use crate::base::parallel::{ParallelLoop, one_by_one};
 use crate::base::progress::Progress;
 use crate::base::sampling::{combine, purpose_seed};
@@ -494,7 +494,7 @@ impl<'p> Bake<'_, 'p> {
         let is_needed = |texel: usize| redo.is_none_or(|redo| redo.gather[texel]);
         let mut upsampling = stages::upsampling(&self.inputs(), backs, placements.clone(), asked)?;
         let lookup = self.inputs().lookup(radiance);
-        let samples = SampleSet::new(self.params.gather_rays, purpose_seed(self.params.seed, purpose::GATHER_SET));
+        let samples = SampleSet::new(self.params.gather_rays, purpose_seed(self.params.seed, purpose::GATHER_SET))?;
         let seed = purpose_seed(self.params.seed, purpose::GATHER);
         let stage = self.progress.stage("gather", 0.315, 0.53, needed.len() as u64);
         let n = l.gather.len();
@@ -535,7 +535,7 @@ impl<'p> Bake<'_, 'p> {
                         gathered: Gathered::default(),
                         directional: nothing,
                     };
-                    let mut texels: Vec<_> = texels_of_tile.iter().map(texel).collect();
+                    let mut texels = try_collect(texels_of_tile.iter().map(texel), "the texels of a tile")?;
                     for round in 0..samples.rounds() {
                         // A tile may have 4 million rays.
                         self.progress.check()?;

@@ -123,7 +123,7 @@ impl Lightmap {
     /// light maps are saved.
     pub(super) fn patches(&self, progress: &Progress) -> Result<[Vec<Patch>; 3]> {
         fn of<M: Map>(a: &Atlas, map: &ChartMap<M>, buried: &[bool], stage: &Stage) -> Result<Vec<Patch>> {
-            Patch::all(map, &ChartMap::new(&a.scene, &a.charts, map.layout.clone(), stage)?, buried)
+            Patch::all(map, &ChartMap::new(&a.scene, &a.charts, map.layout.try_clone()?, stage)?, buried)
         }
         let a = &self.atlas;
         let layouts = [&a.map.layout, &a.gather.layout, &a.radiance.layout];

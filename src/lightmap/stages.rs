@@ -248,7 +248,7 @@ pub(crate) fn own_light(
     let set = |count| SampleSet::new(count, purpose_seed(params.seed, purpose::GATHER_SET));
     let rays = OwnRays {
         radiance: inputs.lookup(radiance),
-        samples: [&set(count), &set((2 * count).min(params.gather_rays).min(ROUND as u32))],
+        samples: [&set(count)?, &set((2 * count).min(params.gather_rays).min(ROUND as u32))?],
         seed: purpose_seed(params.seed, purpose::OWN),
         directional,
         gathered,

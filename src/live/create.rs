@@ -110,7 +110,7 @@ impl Live {
             memory,
             context: Context {
                 map: Arc::new(map),
-                samples: Arc::new(SampleSet::new(bake.gather_rays, purpose_seed(params.seed, purpose::GATHER_SET))),
+                samples: Arc::new(SampleSet::new(bake.gather_rays, purpose_seed(params.seed, purpose::GATHER_SET))?),
                 gather_seed: purpose_seed(params.seed, purpose::GATHER),
                 near_hits: params.near_hits,
                 direct_seed: purpose_seed(params.seed, purpose::DIRECT),

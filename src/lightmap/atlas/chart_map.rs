@@ -56,7 +56,7 @@ impl<M: Map> ChartMap<M> {
     ) -> Result<Self> {
         let texels = self.texels.copied(scene, charts, &self.layout, anew, stage)?;
         let seeds = seeds(scene, charts, &self.layout, &texels)?;
-        Ok(ChartMap { layout: self.layout.clone(), texels, back_start: self.back_start, seeds, of: PhantomData })
+        Ok(ChartMap { layout: self.layout.try_clone()?, texels, back_start: self.back_start, seeds, of: PhantomData })
     }
 
     /// Returns the number of texels that show a surface.

@@ -12,7 +12,7 @@ use super::charts::{Chart, Charts, MAX_TEXELS, padded_extent};
 use super::ids::{ChartId, PlacementId};
 use super::pieces::Given;
 use crate::base::error::{Error, Result, invalid_argument};
-use crate::base::memory::{try_collect, try_filled, try_with_capacity};
+use crate::base::memory::{try_collect, try_filled, try_to_vec, try_with_capacity};
 use crate::base::progress::Progress;
 use std::ops::Index;
 
@@ -58,7 +58,7 @@ impl Placement {
 }
 
 /// Placements of all charts in the square pages of a map; indexed by [`PlacementId`].
-#[derive(Clone, Debug, PartialEq)]
+#[derive(Debug, PartialEq)]
 pub struct Layout {
     /// Width and height of a page in texels.
     pub page_size: u32,
@@ -90,6 +90,16 @@ impl Index<PlacementId> for Layout {
 }
 
 impl Layout {
+    /// Copies the layout.
+    pub(crate) fn try_clone(&self) -> Result<Layout> {
+        Ok(Layout {
+            placements: try_to_vec(&self.placements, LAYOUT)?,
+            back_of: try_to_vec(&self.back_of, LAYOUT)?,
+            backs: try_to_vec(&self.backs, LAYOUT)?,
+            ..*self
+        })
+    }
+
     /// Packs `charts` at `density` texels per scene unit (finite, > 0) in as many pages of `page_size` (1 to
     /// [`MAX_PAGE_SIZE`](super::charts::MAX_PAGE_SIZE)) as they need, with `padding` texels around each.
     ///

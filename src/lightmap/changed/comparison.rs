@@ -243,7 +243,7 @@ impl<'a, 'p> Comparison<'a, 'p> {
         let [old, new] = [(self.old, radiance[0]), (self.new, radiance[1])]
             .map(|(s, radiance)| State::new(s.atlas, s.backs, radiance));
         let samples =
-            SampleSet::new(params.gather_rays.min(PROBE_RAYS), purpose_seed(params.seed, purpose::GATHER_SET));
+            SampleSet::new(params.gather_rays.min(PROBE_RAYS), purpose_seed(params.seed, purpose::GATHER_SET))?;
         let seed = purpose_seed(params.seed, purpose::PROBE);
         let dark = DARK * mean;
         let boxes = &self.moved.boxes;

@@ -12,7 +12,7 @@ use super::sample_set::SampleSet;
 use super::upsample::Upsampling;
 use crate::base::directional::{Directional, Linear};
 use crate::base::error::Result;
-use crate::base::memory::{try_filled, try_parts, try_vec, try_with_capacity};
+use crate::base::memory::{try_collect, try_filled, try_parts, try_vec, try_with_capacity};
 use crate::base::parallel::{ParallelLoop, one_by_one};
 use crate::base::progress::Stage;
 use crate::base::sampling::combine;
@@ -229,7 +229,7 @@ impl Upsampling {
         for (places, samples) in [places, lone].iter().zip(own.samples) {
             for places in places.chunks(Tile::texels(samples)) {
                 stage.check()?;
-                let mut of_tile: Vec<_> = places.iter().map(&mut texel).collect();
+                let mut of_tile = try_collect(places.iter().map(&mut texel), "the texels of a tile")?;
                 rays += tile.add_round(&atlas.scene, &own.radiance, &mut of_tile, samples, 0);
                 for (&place, texel) in places.iter().zip(&of_tile) {
                     out[place as usize] = self.own(atlas, own.gathered, texels[place as usize], texel);
@@ -281,7 +281,7 @@ mod tests {
     fn own_light(atlas: &Atlas, upsampling: &Upsampling, radiance: impl Fn(RadianceTexel) -> f32) -> (OwnLight, u64) {
         let values = atlas.radiance.all().map(|s| Vec3::splat(radiance(s))).collect();
         let radiance = Radiance { values, ..Default::default() };
-        let samples = SampleSet::new(OWN_RAYS, 0);
+        let samples = SampleSet::new(OWN_RAYS, 0).unwrap();
         let rays = OwnRays {
             radiance: HitRadiance::of_map(RadianceLookup::new(&atlas.charts, &atlas.radiance, &radiance)),
             samples: [&samples; 2],
@@ -384,7 +384,8 @@ mod tests {
         let of_texel = |s| Directional::of(light(s), Vec3::Z, 1.0);
         let directional: Vec<Directional> = atlas.gather.all().map(of_texel).collect();
         let radiance = Radiance { values: vec![Vec3::ZERO; atlas.radiance.len()], ..Default::default() };
-        let (sure, samples, progress) = (vec![0.0; atlas.gather.len()], SampleSet::new(OWN_RAYS, 0), Progress::none());
+        let (sure, samples, progress) =
+            (vec![0.0; atlas.gather.len()], SampleSet::new(OWN_RAYS, 0).unwrap(), Progress::none());
         let [sure_of, unsure] = [0.0, 1e9].map(|noise| {
             let unblurred = vec![noise; atlas.gather.len()];
             let gathered = GatherLight {

@@ -126,7 +126,7 @@ fn trials(
     let lookup =
         |bright| HitRadiance::of_map(RadianceLookup::new(&atlas.charts, &atlas.radiance, radiance).with(bright));
     let lookups = bright.map(lookup);
-    let samples = SampleSet::new(ROUND as u32, 0);
+    let samples = SampleSet::new(ROUND as u32, 0)?;
     let at = |&texel: &RadianceTexel| {
         progress.check()?;
         let (_, receiver) = atlas.radiance.receiver(&atlas.scene, texel, atlas.radiance.is_back(texel));
@@ -362,7 +362,7 @@ mod tests {
     fn gathered(lightmap: &Lightmap, radiance: &Radiance, rounds: usize) -> (Vec<Vec3>, f64) {
         let atlas = lightmap.atlas();
         let lookup = HitRadiance::of_map(RadianceLookup::new(&atlas.charts, &atlas.radiance, radiance));
-        let samples = SampleSet::new(64 * rounds as u32, 3);
+        let samples = SampleSet::new(64 * rounds as u32, 3).unwrap();
         let (mut means, mut variance) = (Vec::new(), 0.0);
         for texel in atlas.gather.all().step_by(100) {
             let receiver = atlas.receiver(&atlas.gather, &baked(lightmap).backs, texel);

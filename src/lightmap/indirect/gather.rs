@@ -300,7 +300,7 @@ mod tests {
 
     #[test]
     fn every_packet_is_a_narrower_bundle_than_its_round() {
-        let set = SampleSet::new(1024, 5);
+        let set = SampleSet::new(1024, 5).unwrap();
         for shift in [[0, 0], [0x1234_5678, 0x9abc_def0]] {
             for bundle in set.points().chunks(PACKET_SIZE) {
                 let extent = |k: usize| {

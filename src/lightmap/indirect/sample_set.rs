@@ -1,5 +1,7 @@
 //! Points of the square from which gather rays get their directions, in rounds.
 
+use crate::base::error::Result;
+use crate::base::memory::try_collect;
 use crate::base::sampling::sobol_2d_bits;
 
 /// Number of rays of a round.
@@ -11,12 +13,12 @@ pub(crate) struct SampleSet {
 }
 
 impl SampleSet {
-    pub(crate) fn new(count: u32, seed: u32) -> SampleSet {
-        let mut points: Vec<[u32; 2]> = (0..count).map(|i| sobol_2d_bits(i, seed)).collect();
+    pub(crate) fn new(count: u32, seed: u32) -> Result<SampleSet> {
+        let mut points = try_collect((0..count).map(|i| sobol_2d_bits(i, seed)), "the points of gather rays")?;
         for round in points.chunks_mut(ROUND) {
             round.sort_unstable_by_key(|&[x, y]| morton(x >> 16, y >> 16));
         }
-        SampleSet { points }
+        Ok(SampleSet { points })
     }
 
     /// Returns all points, round by round.
