@@ -140,8 +140,8 @@ pub struct bk_live_params {
     /// of live updates comes after that choice: they end with the light of a bake whose
     /// interpolation_contrast is INFINITY. Default: INFINITY.
     pub interpolation_error: f32,
-    /// Number of rays of texels of the light map that trace rays themselves, see bk_bake_params; 0: a
-    /// quarter of `max_rounds` * 64, at least 16, at most 64. Default: 16.
+    /// Number of rays of texels of the light map that trace rays themselves, see bk_bake_params; 0:
+    /// 64, as in a default bake. They come before the first light. Default: 16.
     pub own_rays: u32,
     /// 1: compute light that was reflected by other surfaces by direction too, as
     /// bk_bake_params.directional_indirect does. It takes 240 bytes more per texel of the gather map, half

@@ -5,7 +5,7 @@ use super::atlas::Atlas;
 use super::atlas::ids::RadianceTexel;
 use super::atlas::two_sided;
 use super::indirect::bright_patches::Bright;
-use super::indirect::fallback_gather::{OWN_PART, OWN_RAYS, OwnDirectional, OwnLight, OwnRays};
+use super::indirect::fallback_gather::{OwnDirectional, OwnLight, OwnRays};
 use super::indirect::find_bright_patches;
 use super::indirect::interpolation_contrast::GatherLight;
 use super::indirect::near_hits::{HitRadiance, NearHits};
@@ -243,8 +243,7 @@ pub(crate) fn own_light(
     (from, to): (f32, f32),
 ) -> Result<Own> {
     let Inputs { atlas, params, progress, .. } = *inputs;
-    let automatic = (params.gather_rays / OWN_PART).clamp(OWN_RAYS, ROUND as u32);
-    let count = if params.own_rays == 0 { automatic } else { params.own_rays }.min(params.gather_rays);
+    let count = if params.own_rays == 0 { ROUND as u32 } else { params.own_rays }.min(params.gather_rays);
     let set = |count| SampleSet::new(count, purpose_seed(params.seed, purpose::GATHER_SET));
     let rays = OwnRays {
         radiance: inputs.lookup(radiance),

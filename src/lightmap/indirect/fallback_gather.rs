@@ -29,10 +29,8 @@ use std::sync::atomic::{AtomicU64, Ordering::Relaxed};
 const BLOCK: usize = 4096;
 const BLURRED: usize = 256;
 
-/// Number of rays of a fallback gather that is not [lone](FEW), if it is not given: as many as a gather texel has, divided by
-/// this, but at least so many, and no more than a gather texel has or than there are in a round. (With 32 or 64 instead of
-/// 16 a furnished room has the same error.)
-pub(in crate::lightmap) const OWN_PART: u32 = 4;
+/// Number of rays of a fallback gather of live updates, if it is not given. (Bakes take those of a gather texel, up to a
+/// round: docs/accuracy.md#rays-of-texels-that-gather-for-themselves.)
 pub(crate) const OWN_RAYS: u32 = 16;
 
 /// Radius of the blur of fallback gathers, in texels of the light map.

@@ -7,8 +7,8 @@
 //! stratification. The rays of neighbouring texels pass the tree together as a [stream](crate::trace), and so do their
 //! shadow rays to bright patches.
 //!
-//! Tried, and not worth it: more rays where their variance is largest, and rays guided by photons; see
-//! docs/experiments.md#adaptive-and-guided-gather-rays.
+//! Tried, and not worth it: more rays where their variance is largest, and rays guided by photons or by what neighbouring
+//! texels found; see docs/experiments.md#adaptive-and-guided-gather-rays.
 
 use super::bright_patches::Unoccluded;
 use super::near_hits::HitRadiance;
