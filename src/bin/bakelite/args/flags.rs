@@ -161,6 +161,9 @@ pub struct QualityFlags {
     /// Points at which light is compared
     #[arg(long, value_name = "N", default_value_t = 400, value_parser = clap::value_parser!(u32).range(1..))]
     pub points: u32,
+    /// Seed of the places and the points. (--seed is that of the bakes, and leaves them where they are.)
+    #[arg(long, value_name = "N", default_value_t = 0)]
+    pub points_seed: u32,
     /// Bakes per setting, to tell noise from bias
     #[arg(long, value_name = "N", default_value_t = 4, value_parser = clap::value_parser!(u64).range(1..))]
     pub seeds: u64,
@@ -371,7 +374,7 @@ pub struct BakeFlags {
     #[arg(long, value_name = "F", default_value_t = BakeParams::default().interpolation_contrast,
           value_parser = of(|p: &mut BakeParams, v| p.interpolation_contrast = v))]
     pub interpolation_contrast: f32,
-    /// Rays of texels that gather for themselves; 0: a quarter of a gather texel's, at least 16
+    /// Rays of texels that gather for themselves; 0: a gather texel's, at most 64
     #[arg(long, value_name = "N", default_value_t = BakeParams::default().own_rays,
           value_parser = of(|p: &mut BakeParams, v| p.own_rays = v))]
     pub own_rays: u32,

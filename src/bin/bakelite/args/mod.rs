@@ -191,6 +191,8 @@ pub struct ReportArgs {
     pub live: LiveParams,
     /// Quality: points at which light is compared.
     pub points: usize,
+    /// Quality: seed of the places and the points.
+    pub points_seed: u32,
     /// Edits: objects that move, one after another.
     pub objects: usize,
     /// Quality: bakes per setting.
@@ -352,6 +354,7 @@ fn command_of(line: CommandLine, is_given: &dyn Fn(&str) -> bool) -> Result<Comm
         }
         Verb::Report(Report::Quality(quality)) => Command::ReportQuality(Box::new(ReportArgs {
             points: quality.points as usize,
+            points_seed: quality.points_seed,
             seeds: quality.seeds,
             paths: quality.paths,
             reference: quality.reference,
@@ -374,6 +377,7 @@ fn report_args(flags: Flags) -> Result<ReportArgs, String> {
         errors: true,
         live: LiveParams::default(),
         points: 0,
+        points_seed: 0,
         objects: 0,
         seeds: 0,
         paths: 0,

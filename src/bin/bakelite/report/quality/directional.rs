@@ -120,7 +120,7 @@ pub fn run(args: &ReportArgs) -> Result<()> {
         }
     }
     let camera = job.camera(&lightmap);
-    let points = Points::chosen(&lightmap, &camera, args.points)?.shown_by(&lightmap)?;
+    let points = Points::chosen(&lightmap, &camera, args.points, args.points_seed)?.shown_by(&lightmap)?;
     let info = lightmap.info();
     let mut text = format!(
         "# Light by direction: {}\n\n{} texels, {} gather texels; {} points, {} paths each.\n\n\

@@ -66,10 +66,9 @@ pub struct Errors {
 }
 
 impl Points {
-    /// Chooses `count` points of surfaces that are seen from places that can be reached from `camera` and from the
-    /// lamps, on whatever side, and path traces the reference there, with `paths` in f64 per point.
-    pub fn new(lightmap: &Lightmap, camera: &Camera, count: usize, paths: u32, progress: &Progress) -> Result<Points> {
-        let mut points = Points::chosen(lightmap, camera, count)?;
+    /// Path traces the reference at the points, with `paths` in f64 per point.
+    pub fn with_reference(mut self, lightmap: &Lightmap, paths: u32, progress: &Progress) -> Result<Points> {
+        let points = &mut self;
         let scene = lightmap.scene();
         let tracer = PathTracer::new(scene);
         let surface: Vec<SurfacePoint> = (0..points.on.len())
@@ -83,13 +82,14 @@ impl Points {
             points.indirect[half] = e.iter().map(|e| e.indirect).collect();
             points.all[half] = e.iter().map(|e| e.total()).collect();
         }
-        Ok(points)
+        Ok(self)
     }
 
-    /// Chooses points, without a reference.
-    pub fn chosen(lightmap: &Lightmap, camera: &Camera, count: usize) -> Result<Points> {
+    /// Chooses `count` points of surfaces, others for each seed, that are seen from places that can be reached from
+    /// `camera` and from the lamps, on whatever side; without a reference. More points begin with fewer ones.
+    pub fn chosen(lightmap: &Lightmap, camera: &Camera, count: usize, seed: u32) -> Result<Points> {
         let mut points = Points::default();
-        points.choose(lightmap, camera, count)?;
+        points.choose(lightmap, camera, count, seed)?;
         let none = || std::array::from_fn(|_| vec![[0.0; 3]; points.len()]);
         (points.indirect, points.all) = (none(), none());
         Ok(points)
@@ -178,15 +178,15 @@ impl Points {
     }
 
     /// Hits of random rays from places in turn.
-    fn choose(&mut self, lightmap: &Lightmap, camera: &Camera, count: usize) -> Result<()> {
+    fn choose(&mut self, lightmap: &Lightmap, camera: &Camera, count: usize, seed: u32) -> Result<()> {
         let scene = lightmap.scene();
-        let places = places::find(scene, &known_places(lightmap, camera), camera.up.normalize());
+        let places = places::find(scene, &known_places(lightmap, camera), camera.up.normalize(), seed);
         for i in 0..count as u32 * TRIES {
             if places.is_empty() || self.len() == count {
                 break;
             }
             let place = places[i as usize % places.len()];
-            let look = uniform_sphere([uniform(i, 2, 0), uniform(i, 3, 0)]);
+            let look = uniform_sphere([uniform(i, 2, seed), uniform(i, 3, seed)]);
             let hit = scene.intersect_raw(&Ray::new(place, look));
             if hit.is_miss() || !hit.front && !scene.material(hit.triangle).two_sided {
                 continue;
@@ -351,7 +351,10 @@ mod tests {
         };
         let cornell = lightmap("cornell");
         let camera = builtin_camera("cornell").unwrap();
-        let points = Points::new(&cornell, &camera, 20, 4, &Progress::none()).unwrap();
+        let points = Points::chosen(&cornell, &camera, 20, 0).unwrap();
+        let others = Points::chosen(&cornell, &camera, 20, 1).unwrap();
+        assert!(others.len() == 20 && points.positions.iter().all(|p| !others.positions.contains(p)));
+        let points = points.with_reference(&cornell, 4, &Progress::none()).unwrap();
         let file = std::env::temp_dir().join(format!("bakelite-points-{}.csv", std::process::id()));
         std::fs::write(&file, points.csv(&points.of_bake(&cornell, Layer::Indirect).unwrap())).unwrap();
         let again = Points::read(&file, &cornell);

@@ -72,7 +72,10 @@ pub fn run(args: &ReportArgs) -> Result<()> {
     let start = Instant::now();
     let seen = match &args.reference {
         Some(file) => Points::read(file, &lightmap)?,
-        None => job.bars.show("reference", |p| Points::new(&lightmap, &camera, args.points, args.paths, p))?,
+        None => job.bars.show("reference", |p| {
+            let chosen = Points::chosen(&lightmap, &camera, args.points, args.points_seed)?;
+            chosen.with_reference(&lightmap, args.paths, p)
+        })?,
     };
     let at_points = seen.csv(&seen.of_bake(&lightmap, Layer::Indirect)?);
     let points = seen.shown_by(&lightmap)?;

@@ -36,8 +36,9 @@ const SPREAD: f32 = 0.2;
 const SHRINK: f32 = 0.7;
 const ROUNDS: i32 = 16;
 
-/// Finds places that can be reached from some of `known`, spread evenly. Empty if none of `known` is in free space.
-pub fn find(scene: &Scene, known: &[Vec3], up: Vec3) -> Vec<Vec3> {
+/// Finds places that can be reached from some of `known`, spread evenly, others for each seed. Empty if none of `known` is in
+/// free space.
+pub fn find(scene: &Scene, known: &[Vec3], up: Vec3, seed: u32) -> Vec<Vec3> {
     let indoors: Vec<Vec3> = known.iter().copied().filter(|&p| is_free(scene, p, ENCLOSED)).collect();
     let (enclosed, mut found) = match indoors.len() {
         0 => (BESIDE, known.iter().copied().filter(|&p| is_free(scene, p, BESIDE)).collect::<Vec<_>>()),
@@ -53,7 +54,7 @@ pub fn find(scene: &Scene, known: &[Vec3], up: Vec3) -> Vec<Vec3> {
         }
         let spread = SPREAD * scene.diagonal() * SHRINK.powi(round);
         for i in 0..TRIES {
-            let random = |dimension| uniform(i, dimension, round as u32);
+            let random = |dimension| uniform(i, dimension, seed.wrapping_mul(ROUNDS as u32) + round as u32);
             let from = found[(random(0) * found.len() as f32) as usize];
             let direction = uniform_sphere([random(1), random(2)]);
             let place = from + direction * (random(3) * way(scene, from, direction));
@@ -122,7 +123,7 @@ mod tests {
     fn places_are_in_all_rooms_and_neither_in_walls_nor_solids_nor_outside() {
         for two_sided in [false, true] {
             let scene = rooms(two_sided);
-            let places = find(&scene, &[Vec3::new(0.5, 1.5, 4.0), Vec3::new(-9.0, 1.0, 1.0)], Vec3::Y);
+            let places = find(&scene, &[Vec3::new(0.5, 1.5, 4.0), Vec3::new(-9.0, 1.0, 1.0)], Vec3::Y, 0);
             assert!(places.len() >= PLACES, "{}", places.len());
             for p in &places {
                 let block = p.x > 1.0 && p.x < 2.5 && p.y < 2.0 && p.z > 1.0 && p.z < 2.5;
@@ -137,6 +138,6 @@ mod tests {
 
     #[test]
     fn nothing_is_found_from_inside_a_solid() {
-        assert!(find(&rooms(false), &[Vec3::new(1.7, 1.0, 1.7)], Vec3::Y).is_empty());
+        assert!(find(&rooms(false), &[Vec3::new(1.7, 1.0, 1.7)], Vec3::Y, 0).is_empty());
     }
 }
