@@ -176,9 +176,10 @@ impl DirectLight {
         let shines = |l: &&Light| l.color().iter().any(|&c| c > 0.0);
         let is_point = |l: &&Light| matches!(l, Light::Point { .. } | Light::Spot { .. });
         let is_parallel = |l: &&Light| matches!(l, Light::Directional { angular_radius: 0.0, .. });
-        let points = try_collect(lights.iter().filter(shines).filter(is_point).copied(), LIGHT_TREE)?;
-        let mut each = try_collect(lights.iter().filter(shines).filter(is_parallel).copied(), LIGHT_TREE)?;
-        let discs = lights.iter().filter(shines).filter_map(|l| match *l {
+        let shining = || lights.iter().filter(shines);
+        let points = try_collect(shining().filter(is_point).copied(), LIGHT_TREE)?;
+        let mut each = try_collect(shining().filter(is_parallel).copied(), LIGHT_TREE)?;
+        let discs = shining().filter_map(|l| match *l {
             Light::Directional { direction, irradiance, angular_radius } if angular_radius > 0.0 => {
                 Some(Disc { to_light: -direction, irradiance: Vec3::from(irradiance), angular_radius })
             }

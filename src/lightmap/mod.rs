@@ -167,8 +167,8 @@ pub struct BakeParams {
     /// light, weighted as interpolation weighs it, divided by the mean. Where the gather map has the light map's density there
     /// is nothing to compare.
     pub interpolation_contrast: f32,
-    /// Number of rays of texels of the light map that trace rays themselves, at most 64 and at most `gather_rays`, which 0
-    /// stands for. Those with few others beside them have twice as many, within the same limits.
+    /// Number of rays of texels of the light map that trace rays themselves, at most 64 and at most `gather_rays`; 0: as
+    /// many as `gather_rays`, at most 64. Those with few others beside them have twice as many, within the same limits.
     pub own_rays: u32,
     /// Radius of the gather map's blur in gather texels; 0: none, and direct light from skies, area lights and many lights
     /// is not blurred where it is noisy either.

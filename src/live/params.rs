@@ -5,7 +5,6 @@ use super::dirty::LEAST_BYTES;
 use crate::base::directional::Directional;
 use crate::base::error::{Result, invalid_argument};
 use crate::lightmap::indirect::blur::MAX_BLUR_RADIUS;
-use crate::lightmap::indirect::fallback_gather::OWN_RAYS;
 use crate::lightmap::indirect::gather::Gathered;
 use crate::lightmap::indirect::sample_set::ROUND;
 use crate::lightmap::{BakeParams, directional};
@@ -86,7 +85,8 @@ impl Default for LiveParams {
             radius: bake.radius,
             near_hits: bake.near_hits,
             interpolation_error: f32::INFINITY,
-            own_rays: OWN_RAYS,
+            // Fewer than in a bake: they come before the first light.
+            own_rays: 16,
             quick_start: false,
             background: false,
             directional: bake.directional,

@@ -29,10 +29,6 @@ use std::sync::atomic::{AtomicU64, Ordering::Relaxed};
 const BLOCK: usize = 4096;
 const BLURRED: usize = 256;
 
-/// Number of rays of a fallback gather of live updates, if it is not given. (Bakes take those of a gather texel, up to a
-/// round: docs/accuracy.md#rays-of-texels-that-gather-for-themselves.)
-pub(crate) const OWN_RAYS: u32 = 16;
-
 /// Radius of the blur of fallback gathers, in texels of the light map.
 const RADIUS: i32 = 4;
 
@@ -274,6 +270,8 @@ mod tests {
     use crate::lightmap::indirect::texel_set::TexelSet;
     use crate::lightmap::indirect::upsample::tests::{find, folded, plank};
     use std::ops::Range;
+
+    const OWN_RAYS: u32 = 16;
 
     /// What texels gather for themselves where each texel of the radiance map sends out its own radiance; and the rays.
     fn own_light(atlas: &Atlas, upsampling: &Upsampling, radiance: impl Fn(RadianceTexel) -> f32) -> (OwnLight, u64) {
