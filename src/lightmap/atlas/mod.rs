@@ -88,6 +88,22 @@ impl Atlas {
         }
     }
 
+    /// Returns the texel in which the sample of a buried texel lies, whose light it takes; `None` for other texels, and
+    /// where rounding leaves no such texel.
+    pub(crate) fn source_of_buried(&self, texel: LightTexel) -> Option<LightTexel> {
+        let is_buried = |texel: LightTexel| self.buried.get(texel.index()) == Some(&true);
+        if !is_buried(texel) {
+            return None;
+        }
+        let sample = &self.map[texel];
+        let placement = self.map.placement_of(&self.charts, texel);
+        let local = self.charts.local(sample.triangle, sample.u, sample.v);
+        let [x, y] = self.map.layout.texel_coord(placement, local).map(|c| c.floor() as i32);
+        // The window of given charts may contain another chart.
+        let of_placement = self.map.texels_of(placement);
+        self.map.at(placement, x, y).filter(|&source| of_placement.contains(source) && !is_buried(source))
+    }
+
     /// Calls `visit` with the gather texels around a texel of the light map and their bilinear weights.
     #[inline]
     pub(crate) fn gather_around(&self, texel: LightTexel, visit: impl FnMut(GatherTexel, f32)) {

@@ -1,6 +1,7 @@
 //! Fallback gathers: texels of the light map that trace a few rays themselves, instead of interpolating between gather
 //! texels. The result is averaged with those of such texels nearby, as far as they do not differ by more than noise.
-//! [Upsampling](super::upsample) chooses them.
+//! [Upsampling](super::upsample) chooses them. Buried texels among them trace none: they take the light of the texel in
+//! which their samples lie.
 //!
 //! Measured: docs/experiments.md#fallback-gather.
 
@@ -78,7 +79,9 @@ impl Upsampling {
         let (what, n) = ("texels on their own", self.alone.len());
         let traced = AtomicU64::new(0);
         let mut own = try_filled(n, Own::default(), what)?;
-        let _memory = atlas.scene.device().memory().reserve(size_of_val(&own[..]), what)?;
+        let sources = self.sources_of_buried(atlas)?;
+        let bytes = size_of_val(&own[..]) + size_of_val(&sources[..]);
+        let _memory = atlas.scene.device().memory().reserve(bytes, what)?;
         let mut light: OwnLight = try_filled(n, None, what)?;
         let n = if rays.directional { n } else { 0 };
         let mut directional: Vec<Directional> = try_vec(n, what)?;
@@ -127,7 +130,25 @@ impl Upsampling {
             });
             Ok(())
         })?;
+        for &(i, source) in &sources {
+            light[i as usize] = light[source as usize];
+            if rays.directional {
+                blurred[i as usize] = blurred[source as usize];
+            }
+        }
         Ok((light, blurred, traced.into_inner()))
+    }
+
+    /// Returns the fallback gathers of buried texels that take the light of another one, by their places, and the places of
+    /// those.
+    fn sources_of_buried(&self, atlas: &Atlas) -> Result<Vec<(u32, u32)>> {
+        let of = |(i, &texel): (usize, &LightTexel)| Some((i as u32, self.source(atlas, texel)? as u32));
+        try_collect(self.alone.iter().enumerate().filter_map(of), "buried texels on their own")
+    }
+
+    /// Returns the place of the fallback gather whose light that of a buried texel takes, if there is one.
+    fn source(&self, atlas: &Atlas, texel: LightTexel) -> Option<usize> {
+        self.is_alone.rank(atlas.source_of_buried(texel)?)
     }
 
     /// Returns the number of steps of [`own_light`](Self::own_light).
@@ -213,6 +234,7 @@ impl Upsampling {
         let mut rays = 0;
         let mut places = places_in_order(&atlas.map, texels)?;
         let mut lone = try_with_capacity(places.len(), "lone texels")?;
+        places.retain(|&place| self.source(atlas, texels[place as usize]).is_none());
         places.retain(|&place| {
             let is_lone = self.is_lone(atlas, texels[place as usize]);
             if is_lone {
@@ -245,7 +267,8 @@ impl Upsampling {
         let of_placement = map.texels_of(placement);
         let square = (-NEAR..=NEAR).flat_map(|dy| (-NEAR..=NEAR).map(move |dx| (x + dx, y + dy)));
         let beside = square.filter_map(|(x, y)| map.at(placement, x, y));
-        beside.filter(|&n| of_placement.contains(n) && self.is_alone.has(n)).take(FEW + 1).count() <= FEW
+        let gathers = |n: LightTexel| self.is_alone.has(n) && self.source(atlas, n).is_none();
+        beside.filter(|&n| of_placement.contains(n) && gathers(n)).take(FEW + 1).count() <= FEW
     }
 }
 
@@ -269,6 +292,9 @@ mod tests {
     use crate::lightmap::indirect::radiance_map::{Radiance, RadianceLookup};
     use crate::lightmap::indirect::texel_set::TexelSet;
     use crate::lightmap::indirect::upsample::tests::{find, folded, plank};
+    use crate::lightmap::{Lightmap, LightmapDesc};
+    use crate::scene::demo::shapes::MeshBuilder;
+    use crate::scene::{Light, Material, SceneData};
     use std::ops::Range;
 
     const OWN_RAYS: u32 = 16;
@@ -316,6 +342,49 @@ mod tests {
         }
         assert!(on_face >= 400 && elsewhere <= on_face / 4, "{on_face} and {elsewhere}");
         assert_eq!(rays, u64::from(OWN_RAYS) * own.len() as u64);
+    }
+
+    /// A solid block on the floor of a room.
+    #[test]
+    fn buried_texels_take_the_light_of_those_beside_them_without_rays() {
+        let mut data = SceneData::new();
+        let m = data.add_material(Material::default()).unwrap();
+        let block = [Vec3::new(1.0, -0.1, 1.0), Vec3::new(1.6, 1.0, 1.6)];
+        for ([lower, upper], inward) in [([Vec3::ZERO, Vec3::splat(4.0)], true), (block, false)] {
+            let mut builder = MeshBuilder::new();
+            builder.box_(lower, upper, inward, m);
+            data.add_mesh(builder.finish()).unwrap();
+        }
+        data.add_light(Light::Point { position: Vec3::new(2.0, 2.5, 3.5), intensity: [9.0; 3] }).unwrap();
+        let desc = LightmapDesc { texels_per_unit: 20.0, ..Default::default() };
+        let lightmap = Lightmap::create(&data.committed(), &desc, &Progress::none()).unwrap();
+        let atlas = lightmap.atlas();
+        let (placements, progress) = (atlas.map.layout.placements.len(), Progress::none());
+        let stage = progress.stage("upsampling", 0.0, 1.0, placements as u64);
+        let upsampling = Upsampling::find(atlas, 0..placements, &[], 1.5, None, &stage).unwrap();
+        // Each texel of the radiance map has another radiance.
+        let (light, rays) = own_light(atlas, &upsampling, |s| s.index() as f32);
+        let (mut taken, mut gathered) = (0, 0);
+        for (i, &texel) in upsampling.alone.iter().enumerate() {
+            let Some(source) = atlas.source_of_buried(texel) else {
+                gathered += 1;
+                continue;
+            };
+            let (x, y) = atlas.map.position(source);
+            let placement = atlas.map.placement_of(&atlas.charts, texel);
+            let sample = &atlas.map[texel];
+            let at = atlas.map.layout.texel_coord(placement, atlas.charts.local(sample.triangle, sample.u, sample.v));
+            assert!((at[0] - x as f32 - 0.5).abs() <= 0.5 && (at[1] - y as f32 - 0.5).abs() <= 0.5);
+            match upsampling.is_alone.rank(source) {
+                Some(source) => {
+                    assert!(light[i].is_some() && light[i] == light[source]);
+                    taken += 1;
+                }
+                None => gathered += 1,
+            }
+        }
+        assert!(taken > 80 && gathered > 80, "{taken} of {}", upsampling.alone.len());
+        assert_eq!(rays, u64::from(OWN_RAYS) * gathered);
     }
 
     /// Texels chosen by contrast, each of whose light is its own by far more than noise.

@@ -23,6 +23,11 @@ const BEND: f32 = 4.0;
 /// Maximum contribution of a ray: one that touches the surface says little about the others.
 const MOST: f32 = 4.0;
 
+/// Error where interpolated light is that of a point one gather texel away. (How near the surfaces around that point are
+/// tells little about the texel, which may be beneath a cupboard: taking it into account, too, brings no gain. What this
+/// part is worth: docs/accuracy.md#interpolation-error.)
+const OFFSET: f32 = 3.0;
+
 /// Length of the probes in widths of a gather texel. What is further away would add at most this part of the error at
 /// which texels gather for themselves. (Sponza at 31.5 texels/m: 0.87 of the time of upsampling, and 0.8 % fewer such
 /// texels, than with rays of any length.)
@@ -41,17 +46,42 @@ pub(super) struct Surroundings {
     /// Width of a gather texel divided by the harmonic mean distance of what the texel sees.
     nearness: f32,
     normal: Vec3,
+    position: Vec3,
 }
 
 impl Surroundings {
     /// Returns those of a texel in a narrow gap or outside, of which nothing else is known.
     pub(super) fn unknown(is_gap: bool) -> Surroundings {
-        Surroundings { is_gap, nearness: 0.0, normal: Vec3::ZERO }
+        Surroundings { is_gap, nearness: 0.0, normal: Vec3::ZERO, position: Vec3::ZERO }
     }
 
     /// Returns the estimated error of this texel's light at a texel nearby with a shading normal.
     pub(super) fn error_at(&self, normal: Vec3) -> f32 {
         self.nearness + BEND * (1.0 - self.normal.dot(normal)).max(0.0).sqrt()
+    }
+}
+
+/// Mean position of the gather texels between which a texel interpolates.
+///
+/// Bilinear weights of gather texels all around a texel have their mean at the texel. Where some are behind a wall or,
+/// because they are buried, have their samples elsewhere, it is beside the texel, and interpolated light is that of
+/// another place: an error of first order in the distance, where that of interpolation is of second order.
+#[derive(Default)]
+pub(super) struct MeanPosition {
+    sum: Vec3,
+    weight: f32,
+}
+
+impl MeanPosition {
+    /// Adds a gather texel with a weight.
+    pub(super) fn add(&mut self, around: &Surroundings, weight: f32) {
+        self.sum += around.position * weight;
+        self.weight += weight;
+    }
+
+    /// Returns the estimated error of the light of this place at a texel's position; `width` is that of a gather texel.
+    pub(super) fn error_at(&self, position: Vec3, width: f32) -> f32 {
+        if self.weight > 0.0 { OFFSET * (self.sum / self.weight).distance(position) / width } else { 0.0 }
     }
 }
 
@@ -87,8 +117,9 @@ pub(super) fn surroundings(
             let distances = hits.iter().map(|hit| if hit.is_miss() { f32::INFINITY } else { hit.t });
             let away = distances.clone().filter(|&t| t > width).count();
             let nearness = distances.map(|t| (width / t).min(MOST)).sum::<f32>() / PROBES as f32;
-            let normal = atlas.gather.surface(&atlas.scene, texel).1;
-            found[of_placement.place(texel)] = Surroundings { is_gap: away < AWAY as usize, nearness, normal };
+            let (position, normal) = atlas.gather.surface(&atlas.scene, texel);
+            found[of_placement.place(texel)] =
+                Surroundings { is_gap: away < AWAY as usize, nearness, normal, position };
         }
     }
     Ok(found)

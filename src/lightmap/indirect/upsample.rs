@@ -10,7 +10,7 @@
 //! light of the gather texels around [differs](super::interpolation_contrast): the density of the rays adapts to the scene.
 
 use super::interpolation_contrast::GatherLight;
-use super::interpolation_error::{Surroundings, surroundings};
+use super::interpolation_error::{MeanPosition, Surroundings, surroundings};
 use super::narrow_gaps::are_in_gaps;
 use super::texel_set::TexelSet;
 use super::upsample_visibility::{self, LastNormal, TEXELS_PER_CHECK};
@@ -332,15 +332,23 @@ impl Found {
                 false => Vec3::ZERO,
             };
             let (mut n, mut has_gap, mut sees_open, mut error) = (0, false, false, 0.0);
+            let mut mean = MeanPosition::default();
             atlas.gather_around(texel, |s, w| {
                 let around = &around[of_gather.place(s)];
+                let is_apart = apart.contains(&(texel, s));
                 n += 1;
                 has_gap |= around.is_gap;
-                sees_open |= !around.is_gap && !apart.contains(&(texel, s));
+                sees_open |= !around.is_gap && !is_apart;
                 if refines {
                     error += w * around.error_at(normal);
+                    if !is_apart {
+                        mean.add(around, w);
+                    }
                 }
             });
+            if refines {
+                error += mean.error_at(sample.position(&atlas.scene), width);
+            }
             let is_wrong = error > most_error;
             if has_gap && !is_wrong {
                 try_push(&mut maybe_in_gaps, texel, SHOWN)?;
@@ -564,6 +572,38 @@ pub(super) mod tests {
             near > 0.95 && far < 0.05 && bent > 0.5,
             "{near} near, {far} far from the wall, {bent} of what is bent"
         );
+    }
+
+    /// A floor with a kerb on it at x = 0.03, too low to be near in many directions.
+    #[test]
+    fn texels_gather_for_themselves_where_all_gather_texels_are_on_one_side() {
+        for kerb in [false, true] {
+            let mut data = SceneData::new();
+            let m = data.add_material(Material { two_sided: true, ..Default::default() }).unwrap();
+            let p = Vec3::new;
+            let mut builder = MeshBuilder::new();
+            builder.quad(p(-2.0, -2.0, 0.0), p(2.0, -2.0, 0.0), p(2.0, 2.0, 0.0), p(-2.0, 2.0, 0.0), m);
+            if kerb {
+                builder.box_(p(0.03, -3.0, -0.01), p(0.04, 3.0, 0.04), false, m);
+            }
+            data.add_mesh(builder.finish()).unwrap();
+            let desc = LightmapDesc { texels_per_unit: 50.0, gather_divisor: 10, ..Default::default() };
+            let lightmap = Lightmap::create(&data.committed(), &desc, &Progress::none()).unwrap();
+            let atlas = lightmap.atlas();
+            let progress = Progress::none();
+            let stage = progress.stage("upsampling", 0.0, 1.0, 1);
+            let found = Upsampling::find(atlas, 0..1, &[], 1.5, None, &stage).unwrap();
+            // Gather texels are at ±0.1. At 0 what is left of the kerb has light from half a gather texel away.
+            let part = |from: f32, to: f32| {
+                let x = |s| atlas.map.surface(&atlas.scene, s).0;
+                let texels = atlas.map.texels_of(PlacementId::front_of(atlas.charts.chart_of(0)));
+                let there: Vec<_> = texels.filter(|&s| x(s).x > from && x(s).x < to && x(s).y.abs() < 1.8).collect();
+                there.iter().filter(|s| found.is_alone.has(**s)).count() as f32 / there.len() as f32
+            };
+            let (beside, near, far) = (part(0.0, 0.025), part(-0.1, -0.04), part(-1.0, -0.2));
+            assert!(if kerb { beside > 0.95 } else { beside == 0.0 }, "{beside} beside the kerb");
+            assert!(near < 0.05 && far == 0.0, "{near} near, {far} far");
+        }
     }
 
     /// Light that doubles across a line of the floor.
