@@ -355,7 +355,8 @@ fn a_scene_that_uses_none_of_it_keeps_and_runs_none_of_it() {
 }
 
 /// Nobody can see the floor 1 cm below a carpet: it takes its light from beside the carpet, and gather texels four
-/// times as wide as the light map's darken neither.
+/// times as wide as the light map's darken neither. The first texel beside the carpet, whose middle is 5 mm away, is
+/// darker, in both maps.
 #[test]
 fn a_carpet_has_no_dark_rim_and_what_it_covers_shows_the_light_beside_it() {
     let mut data = SceneData::new();
@@ -374,11 +375,14 @@ fn a_carpet_has_no_dark_rim_and_what_it_covers_shows_the_light_beside_it() {
         };
         (0..30).map(|j| light(0.5 + 0.1 * j as f32)).sum::<f32>() / 30.0
     };
+    let first = mean(&coarse, 1.975) / mean(&fine, 1.975);
+    assert!((first - 1.0).abs() < 0.02 && mean(&fine, 1.975) < 0.9 * mean(&fine, 2.1), "{first} in the first texel");
     // The floor's own light changes by less than 0.6 % in 10 cm; so far from the carpet the fine map has no rim either.
     for x in (0..20).map(|i| 0.02 * i as f32) {
-        let (beside, below) =
-            (mean(&coarse, 2.0 + x) / mean(&fine, 2.1 + x), mean(&coarse, 1.84 - x) / mean(&fine, 2.1));
+        let (beside, below) = (mean(&coarse, 2.025 + x) / mean(&fine, 2.1 + x), mean(&coarse, 1.84 - x));
         assert!((beside - 1.0).abs() < 0.01, "{x} beside the carpet: {beside}");
-        assert!((below - 1.0).abs() < 0.02, "{x} below the carpet: {below}");
+        // The light of the first texel or, where one below counts as open by chance, of those around it.
+        let is_from_beside = below > 0.98 * mean(&fine, 1.975) && below < 1.02 * mean(&fine, 2.1);
+        assert!(is_from_beside, "{x} below the carpet: {below}");
     }
 }

@@ -65,7 +65,9 @@ impl Surroundings {
 ///
 /// Bilinear weights of gather texels all around a texel have their mean at the texel. Where some are behind a wall or,
 /// because they are buried, have their samples elsewhere, it is beside the texel, and interpolated light is that of
-/// another place: an error of first order in the distance, where that of interpolation is of second order.
+/// another place: an error of first order in the distance, where that of interpolation is of second order. (It does not
+/// count in [narrow gaps](super::narrow_gaps), most of which nobody sees: what a texel below a carpet gathers would
+/// be taken by the buried ones around it.)
 #[derive(Default)]
 pub(super) struct MeanPosition {
     sum: Vec3,

@@ -346,14 +346,12 @@ impl Found {
                     }
                 }
             });
-            if refines {
-                error += mean.error_at(sample.position(&atlas.scene), width);
-            }
             let is_wrong = error > most_error;
-            if has_gap && !is_wrong {
+            let is_beside = refines && error + mean.error_at(sample.position(&atlas.scene), width) > most_error;
+            if (has_gap || is_beside) && !is_wrong {
                 try_push(&mut maybe_in_gaps, texel, SHOWN)?;
             }
-            if (!sees_open || is_wrong) && n > 0 {
+            if (!sees_open || is_wrong || is_beside) && n > 0 {
                 try_push(&mut maybe_alone, texel, SHOWN)?;
             }
             if apart.len() < n {
