@@ -1,7 +1,8 @@
 //! Estimates the error of interpolation between gather texels from what surrounds them, before any light is known: light
 //! varies the more, the nearer other surfaces are and the more the surface itself bends (the split-sphere model of Ward,
 //! Rubinstein and Clear, *A Ray Tracing Solution for Diffuse Interreflection*, 1988, where the sum of both decides how
-//! far apart irradiance is computed).
+//! far apart irradiance is computed). To that comes how far the place whose light is interpolated is
+//! from the texel, as gather texels may all be on one side of it.
 //!
 //! Measured: docs/accuracy.md#interpolation-error.
 

@@ -572,26 +572,33 @@ pub(super) mod tests {
         );
     }
 
-    /// A floor with a kerb on it at x = 0.03, too low to be near in many directions.
+    /// A floor of 4 × 4 with a thin wall of a height on it at x = 0.03, or none, and gather texels of 0.2.
+    pub(crate) fn floor_with_wall(height: Option<f32>, texels_per_unit: f32) -> Lightmap {
+        let mut data = SceneData::new();
+        let m = data.add_material(Material { two_sided: true, ..Default::default() }).unwrap();
+        let p = Vec3::new;
+        let mut builder = MeshBuilder::new();
+        builder.quad(p(-2.0, -2.0, 0.0), p(2.0, -2.0, 0.0), p(2.0, 2.0, 0.0), p(-2.0, 2.0, 0.0), m);
+        if let Some(height) = height {
+            builder.box_(p(0.03, -3.0, -0.01), p(0.04, 3.0, height), false, m);
+        }
+        data.add_mesh(builder.finish()).unwrap();
+        let gather_divisor = (0.2 * texels_per_unit) as u32;
+        let desc = LightmapDesc { texels_per_unit, gather_divisor, ..Default::default() };
+        Lightmap::create(&data.committed(), &desc, &Progress::none()).unwrap()
+    }
+
+    /// The wall is a kerb, too low to be near in many directions.
     #[test]
     fn texels_gather_for_themselves_where_all_gather_texels_are_on_one_side() {
-        for kerb in [false, true] {
-            let mut data = SceneData::new();
-            let m = data.add_material(Material { two_sided: true, ..Default::default() }).unwrap();
-            let p = Vec3::new;
-            let mut builder = MeshBuilder::new();
-            builder.quad(p(-2.0, -2.0, 0.0), p(2.0, -2.0, 0.0), p(2.0, 2.0, 0.0), p(-2.0, 2.0, 0.0), m);
-            if kerb {
-                builder.box_(p(0.03, -3.0, -0.01), p(0.04, 3.0, 0.04), false, m);
-            }
-            data.add_mesh(builder.finish()).unwrap();
-            let desc = LightmapDesc { texels_per_unit: 50.0, gather_divisor: 10, ..Default::default() };
-            let lightmap = Lightmap::create(&data.committed(), &desc, &Progress::none()).unwrap();
+        for kerb in [None, Some(0.04)] {
+            let lightmap = floor_with_wall(kerb, 50.0);
             let atlas = lightmap.atlas();
             let progress = Progress::none();
             let stage = progress.stage("upsampling", 0.0, 1.0, 1);
             let found = Upsampling::find(atlas, 0..1, &[], 1.5, None, &stage).unwrap();
-            // Gather texels are at ±0.1. At 0 what is left of the kerb has light from half a gather texel away.
+            // Gather texels are at x = ±0.1, and those beyond the kerb are left out: at x = 0 the others are half the width
+            // of a gather texel away.
             let part = |from: f32, to: f32| {
                 let x = |s| atlas.map.surface(&atlas.scene, s).0;
                 let texels = atlas.map.texels_of(PlacementId::front_of(atlas.charts.chart_of(0)));
@@ -599,7 +606,7 @@ pub(super) mod tests {
                 there.iter().filter(|s| found.is_alone.has(**s)).count() as f32 / there.len() as f32
             };
             let (beside, near, far) = (part(0.0, 0.025), part(-0.1, -0.04), part(-1.0, -0.2));
-            assert!(if kerb { beside > 0.95 } else { beside == 0.0 }, "{beside} beside the kerb");
+            assert!(if kerb.is_some() { beside > 0.95 } else { beside == 0.0 }, "{beside} beside the kerb");
             assert!(near < 0.05 && far == 0.0, "{near} near, {far} far");
         }
     }

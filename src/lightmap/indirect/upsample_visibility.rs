@@ -235,26 +235,11 @@ mod tests {
     use crate::lightmap::atlas::Atlas;
     use crate::lightmap::atlas::chart_map::ChartMap;
     use crate::lightmap::atlas::ids::{LightTexel, Map, PerTexel, PlacementId, TexelId};
-    use crate::lightmap::indirect::upsample::tests::{dark, find};
+    use crate::lightmap::indirect::upsample::tests::{dark, find, floor_with_wall};
     use crate::lightmap::{Lightmap, LightmapDesc};
     use crate::scene::demo::shapes::MeshBuilder;
     use crate::scene::{LightmapUvs, Material, SceneData};
     use glam::{Vec2, Vec3};
-
-    /// A floor of 4 × 4 with a thin wall on it at x = 0.03, or none.
-    fn light_map(wall: bool) -> Lightmap {
-        let mut data = SceneData::new();
-        let m = data.add_material(Material { two_sided: true, ..Default::default() }).unwrap();
-        let p = Vec3::new;
-        let mut builder = MeshBuilder::new();
-        builder.quad(p(-2.0, -2.0, 0.0), p(2.0, -2.0, 0.0), p(2.0, 2.0, 0.0), p(-2.0, 2.0, 0.0), m);
-        if wall {
-            builder.box_(p(0.03, -3.0, -0.01), p(0.04, 3.0, 1.0), false, m);
-        }
-        data.add_mesh(builder.finish()).unwrap();
-        let desc = LightmapDesc { texels_per_unit: 20.0, gather_divisor: 4, ..Default::default() };
-        Lightmap::create(&data.committed(), &desc, &Progress::none()).unwrap()
-    }
 
     /// Texels of the only chart that show some of a light on gather texels with x < `edge`, but for those to `skip`,
     /// and whether interpolation has anything to heed.
@@ -278,7 +263,8 @@ mod tests {
     fn light_does_not_go_through_walls_by_interpolation() {
         for wall in [true, false] {
             // Below the wall nothing is seen.
-            let (mixed, heeds) = mixed(&light_map(wall), 0.035, |x| (0.02..0.05).contains(&x));
+            let (mixed, heeds) =
+                mixed(&floor_with_wall(wall.then_some(1.0), 20.0), 0.035, |x| (0.02..0.05).contains(&x));
             assert_eq!((mixed > 0, heeds), (!wall, wall), "{mixed}");
         }
     }
