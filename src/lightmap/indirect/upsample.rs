@@ -44,8 +44,9 @@ pub(crate) struct Upsampling {
     pub(super) is_alone: TexelSet<LightMap>,
     /// Texels of the light map with a fallback gather, in ascending order.
     pub(super) alone: Vec<LightTexel>,
-    /// Those that have one by the [contrast](Self::add_where_light_differs) alone.
-    pub(super) by_contrast: TexelSet<LightMap>,
+    /// Those whose light counts only as far as it differs from interpolated light by more than noise, if the gather map
+    /// is known: chosen by the [contrast](Self::add_where_light_differs) alone, or because gather texels are on one side.
+    pub(super) is_weighed: TexelSet<LightMap>,
     /// Number of rays traced to find the constraints.
     pub rays: u64,
     _memory: Option<Reservation>,
@@ -80,6 +81,7 @@ impl Upsampling {
             let mut found = Found::in_placement(atlas, backs, PlacementId::new(placement), most_error, stage)?;
             if let Some(asked) = asked {
                 found.alone.retain(|texel| asked.alone[texel.index()]);
+                found.weighed.retain(|texel| asked.alone[texel.index()]);
             }
             stage.advance(1)?;
             Ok(found)
@@ -99,18 +101,10 @@ impl Upsampling {
         stage.check()?;
         let alone = try_collect(found.iter().flat_map(|f| &f.alone).copied(), SHOWN)?;
         let is_alone = TexelSet::new(alone.iter(), atlas.map.len(), SHOWN)?;
+        let is_weighed = TexelSet::new(found.iter().flat_map(|f| &f.weighed), atlas.map.len(), SHOWN)?;
         let rays = found.iter().map(|f| f.rays).sum();
-        let mut found = Upsampling {
-            gather_gaps,
-            map_gaps,
-            walled,
-            walls,
-            is_alone,
-            alone,
-            by_contrast: TexelSet::default(),
-            rays,
-            _memory: None,
-        };
+        let mut found =
+            Upsampling { gather_gaps, map_gaps, walled, walls, is_alone, alone, is_weighed, rays, _memory: None };
         found._memory = Some(device.memory().reserve(found.bytes(), SHOWN)?);
         Ok(found)
     }
@@ -118,7 +112,7 @@ impl Upsampling {
     /// Returns the bytes held, and those of the light of the [fallback gathers](super::fallback_gather).
     fn bytes(&self) -> usize {
         let bits: usize =
-            [&self.map_gaps, &self.walled, &self.is_alone, &self.by_contrast].map(TexelSet::bytes).iter().sum();
+            [&self.map_gaps, &self.walled, &self.is_alone, &self.is_weighed].map(TexelSet::bytes).iter().sum();
         let own = self.alone.len() * size_of::<Option<Vec3>>();
         self.gather_gaps.bytes() + bits + size_of_val(&self.walls[..]) + size_of_val(&self.alone[..]) + own
     }
@@ -160,8 +154,8 @@ impl Upsampling {
         let alone =
             device.install(|| try_par_gather(placements.len(), SHOWN, |i, out| of_placement(first + i, out)))?;
         stage.check()?;
-        let added = alone.iter().filter(|texel| !self.is_alone.has(**texel));
-        self.by_contrast = TexelSet::new(added, atlas.map.len(), SHOWN)?;
+        let weighed = alone.iter().filter(|texel| !self.is_alone.has(**texel) || self.is_weighed.has(**texel));
+        self.is_weighed = TexelSet::new(weighed, atlas.map.len(), SHOWN)?;
         self.is_alone = TexelSet::new(alone.iter(), atlas.map.len(), SHOWN)?;
         self.alone = alone;
         self._memory = None;
@@ -283,6 +277,8 @@ struct Found {
     map_gaps: Vec<LightTexel>,
     walls: Vec<(LightTexel, GatherTexel)>,
     alone: Vec<LightTexel>,
+    /// Those of `alone` that are there only because gather texels are on one side.
+    weighed: Vec<LightTexel>,
     rays: u64,
 }
 
@@ -353,6 +349,9 @@ impl Found {
             }
             if (!sees_open || is_wrong || is_beside) && n > 0 {
                 try_push(&mut maybe_alone, texel, SHOWN)?;
+                if sees_open && !is_wrong {
+                    try_push(&mut found.weighed, texel, SHOWN)?;
+                }
             }
             if apart.len() < n {
                 try_append(&mut found.walls, apart, SHOWN)?;
@@ -362,6 +361,7 @@ impl Found {
         let in_gaps = maybe_in_gaps.iter().zip(gaps).filter_map(|(&texel, is)| is.then_some(texel));
         found.map_gaps = try_collect(in_gaps, SHOWN)?;
         maybe_alone.retain(|texel| found.map_gaps.binary_search(texel).is_err());
+        found.weighed.retain(|texel| found.map_gaps.binary_search(texel).is_err());
         found.alone = maybe_alone;
         Ok(found)
     }
@@ -603,6 +603,8 @@ pub(super) mod tests {
                 let x = |s| atlas.map.surface(&atlas.scene, s).0;
                 let texels = atlas.map.texels_of(PlacementId::front_of(atlas.charts.chart_of(0)));
                 let there: Vec<_> = texels.filter(|&s| x(s).x > from && x(s).x < to && x(s).y.abs() < 1.8).collect();
+                // Nothing else has chosen them, so that noise does not show.
+                assert!(there.iter().all(|&s| found.is_alone.has(s) == found.is_weighed.has(s)));
                 there.iter().filter(|s| found.is_alone.has(**s)).count() as f32 / there.len() as f32
             };
             let (beside, near, far) = (part(0.0, 0.025), part(-0.1, -0.04), part(-1.0, -0.2));

@@ -44,9 +44,9 @@ impl Drop for Folder {
 /// A light map whose radiance map has several blocks of texels.
 fn lightmap(threads: usize) -> Lightmap {
     let coarse = lightmap_with(threads, 20.0);
-    let desc = LightmapDesc { texels_per_unit: 40.0, page_size: 256, radiance_divisor: 1, ..Default::default() };
+    let desc = LightmapDesc { texels_per_unit: 28.0, page_size: 256, radiance_divisor: 1, ..Default::default() };
     let map = Lightmap::create(coarse.scene(), &desc, &Progress::none()).unwrap();
-    assert!(map.atlas.radiance.len() > 6 * 1024, "{}", map.atlas.radiance.len());
+    assert!(map.atlas.radiance.len() > 3 * 1024, "{}", map.atlas.radiance.len());
     map
 }
 
@@ -168,13 +168,13 @@ fn damaged_shares_are_refused_and_change_nothing() {
     compute_all(&map, &params(), &shares);
     let file = folder.file("a-radiance-1-of-2.bkshare");
     let bytes = std::fs::read(&file).unwrap();
-    for i in 0..60 {
+    for i in 0..24 {
         let mut flipped = bytes.clone();
-        let at = (i * bytes.len() + bytes.len() / 2) / 60;
+        let at = (i * bytes.len() + bytes.len() / 2) / 24;
         flipped[at] ^= 1 << (i % 8);
         std::fs::write(&file, &flipped).unwrap();
         assert_refused(&mut map, &params(), &shares, "a-radiance-1-of-2");
-        std::fs::write(&file, &bytes[..i * bytes.len() / 60]).unwrap();
+        std::fs::write(&file, &bytes[..i * bytes.len() / 24]).unwrap();
         assert_refused(&mut map, &params(), &shares, "a-radiance-1-of-2");
     }
     std::fs::remove_file(&file).unwrap();
@@ -183,10 +183,10 @@ fn damaged_shares_are_refused_and_change_nothing() {
     // Photons are read for the radiance map.
     let file = folder.file("a-photons-0-of-2.bkshare");
     let bytes = std::fs::read(&file).unwrap();
-    for i in 0..100 {
+    for i in 0..40 {
         let mut damaged = bytes.clone();
-        damaged[(i * bytes.len() + bytes.len() / 2) / 100] ^= 1 << (i % 8);
-        damaged.truncate(if i % 2 == 0 { bytes.len() } else { i * bytes.len() / 100 });
+        damaged[(i * bytes.len() + bytes.len() / 2) / 40] ^= 1 << (i % 8);
+        damaged.truncate(if i % 2 == 0 { bytes.len() } else { i * bytes.len() / 40 });
         std::fs::write(&file, &damaged).unwrap();
         let refused = compute(&map, &params(), &shares, ShareStage::Radiance, 1);
         assert!(matches!(refused, Err(Error::Io(_) | Error::InvalidArgument(_))), "{refused:?}");
