@@ -9,6 +9,8 @@
 mod damaged_files;
 #[path = "../../fuzz/src/live_state.rs"]
 mod live_state;
+#[path = "../../fuzz/src/records.rs"]
+mod records;
 #[path = "../../fuzz/src/room.rs"]
 mod room;
 #[path = "../../fuzz/src/saved.rs"]
@@ -17,6 +19,8 @@ mod saved;
 mod scene_file;
 #[path = "../../fuzz/src/seeds.rs"]
 mod seeds;
+#[path = "../../fuzz/src/shares.rs"]
+mod shares;
 
 use seeds::{TARGETS, seeds};
 use std::time::{Duration, Instant};

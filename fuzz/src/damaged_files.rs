@@ -3,6 +3,7 @@
 use crate::live_state::LiveState;
 use crate::saved::Saved;
 use crate::scene_file::SceneFile;
+use crate::shares::Shares;
 use bakelite::scene::{SceneData, is_valid_triangle};
 use bakelite::{Error, Progress, io};
 use std::path::{Path, PathBuf};
@@ -14,6 +15,7 @@ const TRIANGLES: &str = "mtllib a.mtl\nv 0 0 0\nv 1 0 0\nv 0 1 0\nvt 0 0\nusemtl
 static RESULT: LazyLock<Mutex<Saved>> = LazyLock::new(|| Mutex::new(Saved::result()));
 static SCENE: LazyLock<Mutex<SceneFile>> = LazyLock::new(|| Mutex::new(SceneFile::of_room(folder())));
 static LIVE_STATE: LazyLock<Mutex<LiveState>> = LazyLock::new(|| Mutex::new(LiveState::of_room()));
+static SHARES: LazyLock<Mutex<Shares>> = LazyLock::new(|| Mutex::new(Shares::of_room()));
 static CHECKPOINT: LazyLock<Mutex<Saved>> = LazyLock::new(|| Mutex::new(Saved::checkpoint()));
 
 /// The folder of this process. It holds an OBJ file, a library and an image that inputs may name.
@@ -57,6 +59,7 @@ pub fn read(target: &str, bytes: &[u8]) {
         "scene_file" => SCENE.lock().expect("no earlier panic").open(bytes),
         "saved_result" => RESULT.lock().expect("no earlier panic").load(bytes),
         "checkpoint" => CHECKPOINT.lock().expect("no earlier panic").resume(bytes),
+        "share" => SHARES.lock().expect("no earlier panic").read(bytes),
         _ => match io::image::read_environment(&write("sky")) {
             Ok(sky) => assert!(sky.rgb().as_flattened().iter().all(|c| c.is_finite() && *c >= 0.0)),
             Err(e) => check_error(&e),

@@ -3,7 +3,9 @@
 
 pub mod damaged_files;
 pub mod live_state;
+pub mod records;
 pub mod room;
 pub mod saved;
 pub mod scene_file;
 pub mod seeds;
+pub mod shares;

@@ -8,7 +8,7 @@ use image::{ExtendedColorType as Color, ImageEncoder, Rgb};
 use std::io::Cursor;
 
 /// The targets: kinds of files.
-pub const TARGETS: [&str; 13] = [
+pub const TARGETS: [&str; 14] = [
     "obj",
     "mtl",
     "ply",
@@ -22,6 +22,7 @@ pub const TARGETS: [&str; 13] = [
     "saved_result",
     "checkpoint",
     "live_restore",
+    "share",
 ];
 
 /// Valid files, each with its target, and changes to saved ones.
@@ -43,6 +44,8 @@ pub fn seeds() -> Vec<(&'static str, Vec<u8>)> {
     all.extend([Color::L8, Color::Rgb8].map(|color| ("jpeg", jpeg(color))));
     all.extend([("hdr", hdr(2)), ("hdr", hdr(16)), ("exr", exr())]);
     all.extend(["saved_result", "checkpoint"].into_iter().flat_map(|target| changes().map(move |c| (target, c))));
+    let of_shares = |first: u8| changes().map(move |c| ("share", [&[first][..], &c].concat()));
+    all.extend([0, 1].into_iter().flat_map(of_shares));
     all.extend(scene_changes().map(|c| ("scene_file", c)));
     all.extend(live_changes().map(|c| ("live_restore", c)));
     all
