@@ -2073,7 +2073,9 @@ typedef struct bk_bake_params {
   /// the harmonic mean distance of the surfaces that it sees, plus 4 times the root of 1 − cos of
   /// the angle between normals (after Ward, Rubinstein and Clear 1988), plus, outside of gaps
   /// narrower than a gather texel, 3 times the distance, in widths of a gather texel, between the
-  /// texel and the mean position of the gather texels that nothing hides from it. 0.5 for final light;
+  /// texel and the mean position of the gather texels that nothing hides from it. Light that is
+  /// gathered because of this distance alone counts only as far as it differs from the interpolated one
+  /// by more than noise, unless interpolation_contrast is INFINITY. 0.5 for final light;
   /// INFINITY for a preview, or where a scene is open and flat. 1 halves the error of a furnished
   /// room for a tenth more time, and takes up to a quarter more elsewhere: docs/accuracy.md,
   /// "Interpolation error". Default: 1.5.

@@ -19,6 +19,7 @@ pub struct Records {
 }
 
 impl Records {
+    /// Splits a true file into its records.
     pub fn read(path: &Path) -> Records {
         let file = std::fs::read(path).expect("a file");
         let (magic, mut rest) = file.split_first_chunk().expect("a magic number");
@@ -77,7 +78,7 @@ fn change<'a>((tag, content): &mut Record, what: u8, at: usize, bytes: &'a [u8])
     bytes
 }
 
-/// The files of one process, in memory where that can be.
+/// Returns where this process has a file, in memory where that can be.
 pub fn place(name: &str) -> PathBuf {
     let shared_memory = Path::new("/dev/shm");
     let parent = if shared_memory.is_dir() { shared_memory.to_owned() } else { std::env::temp_dir() };

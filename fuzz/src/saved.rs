@@ -17,7 +17,7 @@ pub struct Saved {
     input: PathBuf,
 }
 
-/// Those of all files.
+/// Parameters of the bakes whose files are damaged.
 pub fn params() -> BakeParams {
     BakeParams { photon_count: 500, gather_rays: 4, direct_samples: 1, ..Default::default() }
 }
@@ -78,7 +78,7 @@ impl Drop for Saved {
     }
 }
 
-/// The bits of all layers.
+/// Checks that light is finite and not negative, and returns the bits of all layers.
 pub fn check_light(lightmap: &Lightmap) -> Vec<u32> {
     let mut bits = Vec::new();
     for layer in [Layer::Combined, Layer::Indirect, Layer::Direct, Layer::Radiance, Layer::Validity] {
@@ -93,6 +93,7 @@ pub fn check_light(lightmap: &Lightmap) -> Vec<u32> {
     bits
 }
 
+/// Checks that an error is one that a damaged file may bring.
 pub fn check_error(e: &Error) {
     use Error::*;
     assert!(matches!(e, Io(_) | InvalidArgument(_) | InvalidState(_) | OutOfMemory(_)), "{e}");

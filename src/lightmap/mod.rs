@@ -161,7 +161,9 @@ pub struct BakeParams {
     /// the width of a gather texel divided by the harmonic mean distance of what it sees, plus 4 √(1 − cos) of the angle
     /// between normals: the split-sphere model (Ward, Rubinstein and Clear 1988), with weights of its own. Outside of gaps
     /// narrower than a gather texel, 3 times the distance, in widths of a gather texel, between the texel and the mean
-    /// position of the gather texels that nothing hides from it is added: these may all be on one side.
+    /// position of the gather texels that nothing hides from it is added: these may all be on one side. Light that is
+    /// gathered because of this distance alone counts only as far as it differs from the interpolated one by more than
+    /// noise, unless `interpolation_contrast` is infinite.
     pub interpolation_error: f32,
     /// RMS contrast of the gather texels between which a texel of the light map interpolates, beyond what is noise, above
     /// which it traces rays itself (`own_rays`): > 0, infinity: never. The light that it gathers counts only as far as it

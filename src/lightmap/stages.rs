@@ -231,7 +231,7 @@ pub(crate) struct Own {
     pub rays: u64,
 }
 
-/// Traces the fallback gathers of an interpolation. `gathered`: the gather map, if its contrast has chosen some of them;
+/// Traces the fallback gathers of an interpolation. `gathered`: the gather map, if what some of them gather is weighed against it;
 /// `directional`: whether light by direction is asked for; `from`, `to`: the progress of the bake.
 pub(crate) fn own_light(
     inputs: &Inputs,

@@ -291,7 +291,7 @@ struct Own {
 }
 
 impl Own {
-    /// Returns the brightness of the interpolated light that it differs from.
+    /// Returns the sum over the channels of the interpolated light that it differs from.
     fn interpolated(&self) -> Option<f32> {
         Some((self.light?.value - self.difference?.value).element_sum())
     }
