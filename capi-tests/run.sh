@@ -79,7 +79,7 @@ scenes=${BAKELITE_SCENES:-$root/../shared/scenes}
 [ -d "$scenes" ] || echo "   (no folder $scenes: only the built-in scenes are compared with Embree)"
 cmake -S capi-tests -B "$build" -DBAKELITE_CARGO_TARGET_DIR="$target" -DBAKELITE_SCENES="$scenes" \
     -DBAKELITE_TEST_EMBREE=$embree -DBAKELITE_TEST_VIEWER=$viewer >/dev/null
-cmake --build "$build" || verdict=1
+cmake --build "$build" --parallel 2 || verdict=1
 ctest --test-dir "$build" --output-on-failure --parallel 2 2>&1 | tee -a "$log" || verdict=1
 
 # ---- The count: "test result: ok. 3 passed; 0 failed; ..." and "100% tests passed, 0 tests failed out of 12" ----

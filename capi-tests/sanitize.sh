@@ -36,23 +36,32 @@ run() {
     fi
 }
 
-# programs FOLDER FLAGS...: every C and C++ test program, linked with the library in FOLDER, and run; but not runtime.c,
-# whose stacks are too small for sanitizers, nor storage_faults.c, whose children end by signals and in the middle of work.
+# program SOURCE FOLDER FLAGS...: one C or C++ test program, linked with the library in FOLDER, and run. Fails if that fails.
+program() {
+    local source=$1 library=$2 name verdict=0 compiler
+    shift 2
+    name=$(basename "$source")
+    compiler=("${CC:-cc}" -std=gnu99)
+    [ "${name##*.}" = c ] || compiler=("${CXX:-c++}" -std=c++17)
+    mkdir -p "$out/$name.out"
+    run "build-$name" "${compiler[@]}" -g -O1 -fno-omit-frame-pointer "$@" -I include "$source" -o "$out/$name.bin" \
+        -L "$library" -lbakelite -lpthread -lm
+    [ $verdict != 0 ] || run "$name" env LD_LIBRARY_PATH="$library" "$out/$name.bin" "$out/$name.out/"
+    rm -rf "$out/$name.bin" "$out/$name.out"
+    return $verdict
+}
+
+# programs FOLDER FLAGS...: every C and C++ test program, two at a time; but not runtime.c, whose stacks are too small for
+# sanitizers, nor storage_faults.c, whose children end by signals and in the middle of work.
 programs() {
-    local library=$1 source name flags
-    shift
+    local source
+    rm -f "$out/failed"
     for source in $(grep -l 'check\.h' capi-tests/c/*.c capi-tests/c/*.cpp | grep -v 'runtime\.c\|storage_faults\.c'); do
-        name=$(basename "$source")
-        mkdir -p "$out/$name.out"
-        flags=(-g -O1 -fno-omit-frame-pointer "$@" -I include)
-        if [ "${name##*.}" = c ]; then
-            run "build-$name" "${CC:-cc}" -std=gnu99 "${flags[@]}" "$source" -o "$out/$name.bin" -L "$library" -lbakelite -lpthread -lm
-        else
-            run "build-$name" "${CXX:-c++}" -std=c++17 "${flags[@]}" "$source" -o "$out/$name.bin" -L "$library" -lbakelite -lpthread -lm
-        fi
-        [ -x "$out/$name.bin" ] && run "$name" env LD_LIBRARY_PATH="$library" "$out/$name.bin" "$out/$name.out/"
-        rm -rf "$out/$name.bin" "$out/$name.out"
+        [ "$(jobs -rp | wc -l)" -lt 2 ] || wait -n || true
+        { program "$source" "$@" || touch "$out/failed"; } &
     done
+    wait
+    [ ! -e "$out/failed" ] || verdict=1
 }
 
 # shared: the shared library, with all that the programs call.

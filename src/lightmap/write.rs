@@ -368,7 +368,7 @@ mod tests {
             LayerData::Rgb(v) => v,
             _ => panic!("no light"),
         };
-        let reference = atrium(&BakeParams { passes: 32, seed: 99, ..params });
+        let reference = atrium(&BakeParams { passes: 16, seed: 99, ..params });
         for layer in [Layer::Combined, Layer::Indirect, Layer::Direct] {
             let (a, b, both) = (half(layer, Half::First), half(layer, Half::Second), read(&map, layer));
             let (mut errors, mut product) = ([0.0; 2], 0.0);

@@ -318,7 +318,7 @@ mod tests {
     use super::*;
     use crate::args::BakeArgs;
     use crate::job::Job;
-    use bakelite::lightmap::BakeParams;
+    use bakelite::lightmap::{BakeParams, LightmapDesc};
     use bakelite::sampling::mix;
     use bakelite::scene::builtin_camera;
 
@@ -343,9 +343,10 @@ mod tests {
     #[test]
     fn points_are_the_same_when_read_again_and_none_of_another_scene() {
         let lightmap = |scene: &str| {
-            let args = BakeArgs { scene: scene.into(), threads: 1, quiet: true, ..Default::default() };
+            let desc = LightmapDesc { texels_per_unit: 40.0, page_size: 128, ..Default::default() };
+            let args = BakeArgs { scene: scene.into(), desc, threads: 1, quiet: true, ..Default::default() };
             let mut lightmap = Job::new(&args).unbaked().unwrap();
-            let params = BakeParams { photon_count: 1000, ..Default::default() };
+            let params = BakeParams { photon_count: 1000, gather_rays: 4, direct_samples: 1, ..Default::default() };
             lightmap.bake(&params, &Progress::none()).unwrap();
             lightmap
         };
