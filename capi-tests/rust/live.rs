@@ -188,7 +188,7 @@ fn around_given_charts_whatever_changes_is_dirty() {
 #[test]
 fn position_based_and_uniform_updates_end_with_the_bits_of_a_bake() {
     for (mode, threads) in [(Mode::Position, 1), (Mode::Position, 2), (Mode::Uniform, 2)] {
-        let mut lightmap = unbaked("cornell", threads, 60.0);
+        let mut lightmap = unbaked("cornell", threads, 24.0);
         let mut live = Live::new(&lightmap, &params(mode), &Progress::none()).unwrap();
         let stats = finish(&mut live);
         assert_eq!(stats.finished, 1.0, "{mode:?}");
@@ -290,7 +290,7 @@ fn texels_on_their_own_end_with_the_light_by_direction_of_a_bake() {
 
 #[test]
 fn view_based_updates_finish_what_the_camera_sees() {
-    let lightmap = unbaked("cornell", 2, 60.0);
+    let lightmap = unbaked("cornell", 2, 24.0);
     let mut live = Live::new(&lightmap, &params(Mode::View), &Progress::none()).unwrap();
     let mut stats = LiveStats::default();
     for _ in 0..3000 {
@@ -309,7 +309,7 @@ fn view_based_updates_finish_what_the_camera_sees() {
 
 #[test]
 fn after_a_light_has_changed_the_updates_end_with_the_bits_of_a_bake_under_it() {
-    let mut lightmap = unbaked("cornell", 2, 60.0);
+    let mut lightmap = unbaked("cornell", 2, 24.0);
     // Near hits see direct light, which changes before indirect light does.
     let params = LiveParams { near_hits: 1.0, directional: 3, ..params(Mode::Position) };
     let mut live = Live::new(&lightmap, &params, &Progress::none()).unwrap();
@@ -351,7 +351,7 @@ fn after_a_quick_start_the_updates_end_with_the_bits_of_a_bake() {
     // With 2 texels per unit in the atrium, whose photon discs are wider than its columns then, the first light is 0.78 of the
     // last: plain estimates know nothing of what lies beside a surface.
     for (name, directional) in [("cornell", 3), ("atrium", 0)] {
-        let mut lightmap = unbaked(name, 2, if name == "cornell" { 60.0 } else { 4.0 });
+        let mut lightmap = unbaked(name, 2, if name == "cornell" { 24.0 } else { 4.0 });
         let params = LiveParams { quick_start: true, directional, ..params(Mode::Position) };
         let mut live = Live::new(&lightmap, &params, &Progress::none()).unwrap();
         let first = pages(&live, &lightmap);
@@ -368,7 +368,7 @@ fn after_a_quick_start_the_updates_end_with_the_bits_of_a_bake() {
 
 #[test]
 fn a_light_that_changes_during_a_quick_start_ends_with_the_bits_of_a_bake_under_it() {
-    let mut lightmap = unbaked("cornell", 2, 60.0);
+    let mut lightmap = unbaked("cornell", 2, 24.0);
     let params = LiveParams { quick_start: true, ..params(Mode::Position) };
     let mut live = Live::new(&lightmap, &params, &Progress::none()).unwrap();
     let scene = lightmap.scene().clone();
@@ -386,7 +386,7 @@ fn a_light_that_changes_during_a_quick_start_ends_with_the_bits_of_a_bake_under_
 #[test]
 fn what_changes_is_covered_by_dirty_rectangles_and_is_never_negative() {
     for mode in [Mode::View, Mode::Position, Mode::Uniform] {
-        let lightmap = unbaked("cornell", 2, 60.0);
+        let lightmap = unbaked("cornell", 2, 24.0);
         let mut live = Live::new(&lightmap, &params(mode), &Progress::none()).unwrap();
         let size = lightmap.info().width;
         let whole = PageRect { page: 0, x: 0, y: 0, width: size, height: size };
@@ -538,7 +538,7 @@ fn no_update_gives_out_more_bytes_than_its_limit_and_all_comes_in_the_end() {
 
 #[test]
 fn cells_are_promoted_near_the_camera_first() {
-    let lightmap = unbaked("cornell", 2, 60.0);
+    let lightmap = unbaked("cornell", 2, 24.0);
     let mut live = Live::new(&lightmap, &params(Mode::Position), &Progress::none()).unwrap();
     let (info, lods) = live.cell_lods().unwrap();
     assert_eq!(info.dimensions.iter().product::<u32>() as usize, lods.len());
@@ -563,7 +563,7 @@ fn cells_are_promoted_near_the_camera_first() {
 
 #[test]
 fn work_between_updates_ends_with_the_bits_of_a_bake_and_can_be_paused() {
-    let mut lightmap = unbaked("cornell", 2, 60.0);
+    let mut lightmap = unbaked("cornell", 2, 24.0);
     let params = LiveParams { background: true, near_hits: 1.0, ..params(Mode::Position) };
     let mut live = Live::new(&lightmap, &params, &Progress::none()).unwrap();
     let little = Budget { milliseconds: 0.0, rays: 64, max_dirty_bytes: 0 };
@@ -593,7 +593,7 @@ fn work_between_updates_ends_with_the_bits_of_a_bake_and_can_be_paused() {
 /// With one thread, updates limited by rays do the same work every time.
 #[test]
 fn errors_of_blocks_that_are_worked_on_between_updates_count() {
-    let lightmap = unbaked("cornell", 1, 60.0);
+    let lightmap = unbaked("cornell", 1, 24.0);
     let create = |background| {
         let params = LiveParams { background, max_rounds: 64, ..params(Mode::View) };
         Live::new(&lightmap, &params, &Progress::none()).unwrap()
@@ -618,7 +618,7 @@ fn errors_of_blocks_that_are_worked_on_between_updates_count() {
 
 #[test]
 fn a_saved_state_goes_on_where_it_was() {
-    let mut lightmap = unbaked("cornell", 2, 60.0);
+    let mut lightmap = unbaked("cornell", 2, 24.0);
     let mut live = Live::new(&lightmap, &params(Mode::Position), &Progress::none()).unwrap();
     for i in 0..15 {
         live.update(&camera(i), &RAYS).unwrap();
@@ -675,7 +675,7 @@ fn no_file_with_a_right_checksum_brings_light_that_cannot_be() {
 
 /// Restores a state, with a number of changes one after the other.
 fn mutate_state(directional: u32, turns: u32) {
-    let lightmap = unbaked("cornell", 2, 16.0);
+    let lightmap = unbaked("cornell", 2, 8.0);
     let params = |mode| LiveParams { directional, ..params(mode) };
     let mut live = Live::new(&lightmap, &params(Mode::Position), &Progress::none()).unwrap();
     for i in 0..8 {
@@ -787,7 +787,7 @@ fn a_cancelled_create_save_or_restore_changes_nothing() {
 
 #[test]
 fn a_lower_lod_can_be_read_beside_what_is_shown() {
-    let lightmap = unbaked("cornell", 2, 60.0);
+    let lightmap = unbaked("cornell", 2, 24.0);
     let mut live = Live::new(&lightmap, &params(Mode::Position), &Progress::none()).unwrap();
     let size = lightmap.info().width;
     let whole = PageRect { page: 0, x: 0, y: 0, width: size, height: size };
@@ -830,7 +830,7 @@ fn a_monitor_that_refuses_growth_stops_the_work_and_nothing_else() {
 
 #[test]
 fn bad_cameras_and_budgets_are_refused_and_change_nothing() {
-    let lightmap = unbaked("cornell", 1, 60.0);
+    let lightmap = unbaked("cornell", 1, 24.0);
     let mut live = Live::new(&lightmap, &params(Mode::View), &Progress::none()).unwrap();
     live.take_dirty(usize::MAX).unwrap();
     let before = (live.sums().unwrap(), pages(&live, &lightmap));
