@@ -1,6 +1,6 @@
 //! Describing and moving scenes of many meshes: the time per mesh must not grow with their number.
 //!
-//!     cargo bench --bench describe
+//!     cargo bench -p bakelite-benches --bench describe
 
 use bakelite::bvh::BuildOptions;
 use bakelite::{Array, Device, DeviceOptions, Light, Material, Mesh, Progress, Scene, SceneData};

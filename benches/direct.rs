@@ -5,8 +5,6 @@
 //! a tenth of the mean irradiance), rays and microseconds per point. On the atrium, or on the scene
 //! file that `BAKELITE_BENCH_SCENE` names.
 
-mod common;
-
 use bakelite::bvh::BuildOptions;
 use bakelite::direct::{DirectLight, Receiver};
 use bakelite::sampling::{combine, sobol_2d, uniform, uniform_sphere, uniform_triangle};

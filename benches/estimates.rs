@@ -1,13 +1,11 @@
 //! Irradiance estimates against those with a k-d tree, kiddo's immutable one, on one thread: the same photons, points,
 //! radius, cylinder and filter, 20,000 points spread over the photons, in five alternating pairs:
 //!
-//!     cargo bench --features peers --bench estimates
+//!     cargo bench -p bakelite-benches --bench estimates
 //!
 //! The scene is the atrium with its lights, or the file that `BAKELITE_BENCH_SCENE` names, lit from its middle. The
 //! tree finds the photons in the ball around the cylinder; which of them count, and how much, is decided photon by
 //! photon with the library's data.
-
-mod common;
 
 use bakelite::bvh::BuildQuality;
 use bakelite::photon::{PhotonMap, PhotonParams};

@@ -1,7 +1,7 @@
 //! Closest hits, primary rays and occlusion against other ray tracers that crates.io offers, on the same
 //! rays of the same scene (common/mod.rs), on one thread:
 //!
-//!     cargo bench --features peers --bench peers
+//!     cargo bench -p bakelite-benches --bench peers
 //!
 //! - `obvhs`: 8-wide nodes of quantised boxes (Ylitie, Karras and Laine 2017) over PLOC with reinsertion,
 //!   traversed with SSE2, in Rust. Its presets `medium_build` and `very_slow_build`; the latter cuts triangles.
@@ -11,8 +11,6 @@
 //! obvhs is not watertight. A rate is a median, a ratio the median over alternating pairs (ours, theirs) of our
 //! rate to theirs. Hits agree if both name the same triangle or the same t, up to 1e-4 relative; what is counted
 //! as "lost" one side hits and the other does not. Denormals are flushed to zero for all.
-
-mod common;
 
 use bakelite::bvh::BuildQuality;
 use bakelite::trace::{Hit, RawHit, Ray};

@@ -1,8 +1,6 @@
 //! Every kernel on every ISA: rays of all kinds, of closest hits also against the binary baseline, and what
 //! makes the tree. The scene and its rays: common/mod.rs.
 
-mod common;
-
 use bakelite::bvh::{BinaryBvh, BuildOptions, BuildQuality};
 use bakelite::trace::{Hit, baseline};
 use bakelite::{Isa, Progress, Scene};

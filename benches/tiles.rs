@@ -1,14 +1,12 @@
 //! Gather rays of tiles of neighbouring texels and of one origin: as streams, and in packets whose rays are traced one
 //! by one; shadow rays of tiles to a lamp: as streams, and by one call each.
 //!
-//!     cargo bench --features io --bench tiles -- SCENE... [ISA...] [8x8x64... lamp]
+//!     cargo bench -p bakelite-benches --bench tiles -- SCENE... [ISA...] [8x8x64... lamp]
 //!
 //! Instruction sets (portable, avx2, avx512) and kinds of tiles (side × side texels × rays) that are named are the only
 //! ones.
 //!
 //! Alternating pairs in one process, one thread; medians, and a count of hits whose bits differ.
-
-mod common;
 
 use bakelite::bvh::BuildOptions;
 use bakelite::io::load;

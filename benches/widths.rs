@@ -1,7 +1,7 @@
 //! Primary, incoherent and gather rays through the binary tree, the 4-wide and the 8-wide one, and as streams: the rays
 //! of the thesis's tables 4.1 to 4.3.
 //!
-//!     cargo bench --features io,reference --bench widths -- SCENE... [ISA...]
+//!     cargo bench -p bakelite-benches --bench widths -- SCENE... [ISA...]
 //!
 //! One thread; every way traces the same rays, by turns; medians of five rounds, in million rays per second. Primary
 //! rays are those of a pinhole (90 degrees, in tiles of 4 × 4 pixels), incoherent ones go from points of triangles taken
@@ -9,8 +9,6 @@
 //! uniform over the surface, and, 256 and 32 each, from single places. Hits that are not those of single rays in the
 //! 8-wide tree are counted: of the binary tree, whose triangle test has other arithmetic, by the triangle, else by all
 //! bits.
-
-mod common;
 
 use bakelite::bvh::{BinaryBvh, BuildOptions};
 use bakelite::io::load;

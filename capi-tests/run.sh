@@ -69,10 +69,11 @@ cargo check --release --locked --no-default-features
 echo '== Rust documentation'
 RUSTDOCFLAGS='-D warnings' cargo doc --release --locked --no-deps --lib --all-features
 
-# `peers` brings other crates' ray tracing, for benches alone.
-echo '== Rust, with all features but peers'
+echo '== Rust, with all features'
 export PROPTEST_RNG_SEED=${PROPTEST_RNG_SEED:-1}
 cargo test --release --locked --features io,reference,unwrap --no-fail-fast 2>&1 | tee -a "$log" || verdict=1
+# Apart: together, cbindgen would turn on features of the library's dependencies, which C programs then compile anew.
+cargo test --release --locked -p bakelite-header 2>&1 | tee -a "$log" || verdict=1
 
 echo '== C and C++'
 scenes=${BAKELITE_SCENES:-$root/../shared/scenes}

@@ -15,7 +15,7 @@
  * bk_live_create refines the light of a scene while it is shown, instead of a bake.
  *
  * Generated from src/capi by cbindgen; do not edit. To update it:
- *     BAKELITE_UPDATE_HEADER=1 cargo test --test header
+ *     BAKELITE_UPDATE_HEADER=1 cargo test -p bakelite-header
  */
 #ifndef BAKELITE_H
 #define BAKELITE_H

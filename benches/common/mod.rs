@@ -2,9 +2,6 @@
 //!
 //! The scene is the built-in atrium, or the file that `BAKELITE_BENCH_SCENE` names.
 
-// No bench uses all of it.
-#![allow(dead_code)]
-
 use bakelite::bvh::{BuildOptions, BuildQuality};
 use bakelite::sampling::{concentric_disc, cosine_around, orthonormal_basis, sobol_2d, uniform, uniform_triangle};
 use bakelite::scene::builtin;
@@ -18,9 +15,8 @@ use std::sync::Arc;
 pub fn data() -> SceneData {
     let Ok(path) = env::var("BAKELITE_BENCH_SCENE") else { return builtin("atrium").expect("scene") };
     let mut data = SceneData::new();
-    #[cfg(feature = "io")]
     bakelite::io::load(path.as_ref(), &mut data).expect("scene file");
-    assert!(data.triangle_count() > 0, "{path} has no triangles, or this was built without the feature `io`");
+    assert!(data.triangle_count() > 0, "{path} has no triangles");
     data
 }
 

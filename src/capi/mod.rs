@@ -2,7 +2,7 @@
 //!
 //! One file per section of the header, in its order: [`error`], [`device`], [`scene`], [`files`], [`textures`], [`meshes`],
 //! [`instances`], [`lights`], [`rays`], [`photons`], [`lightmap`], [`bake`], [`read`], [`live`]. cbindgen makes the
-//! header from exactly these files (`capi-tests/rust/header.rs`); their `//!` heads become the sections'
+//! header from exactly these files (`capi-tests/header/lib.rs`); their `//!` heads become the sections'
 //! heads and every public item's documentation becomes the manual, so both are written for the C
 //! reader. `handles`, `shared` and `args` hold what the sections
 //! share.

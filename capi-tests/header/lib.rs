@@ -1,5 +1,5 @@
-//! `include/bakelite.h` is generated from `src/capi` and committed. This test generates it again
-//! and fails on a difference; `BAKELITE_UPDATE_HEADER=1 cargo test --test header` writes it.
+//! `include/bakelite.h` is generated from `src/capi` and committed. A test generates it again
+//! and fails on a difference; `BAKELITE_UPDATE_HEADER=1 cargo test -p bakelite-header` writes it.
 //! `check_header.py` judges what it says, `abi.py` whether it is still the same interface.
 //!
 //! cbindgen sorts a file's items by kind (constants, types, functions). So that the header reads by
@@ -46,7 +46,7 @@ const HEAD: &str = "\
  * bk_live_create refines the light of a scene while it is shown, instead of a bake.
  *
  * Generated from src/capi by cbindgen; do not edit. To update it:
- *     BAKELITE_UPDATE_HEADER=1 cargo test --test header
+ *     BAKELITE_UPDATE_HEADER=1 cargo test -p bakelite-header
  */
 #ifndef BAKELITE_H
 #define BAKELITE_H
@@ -81,24 +81,11 @@ const TAIL: &str = "
 #endif /* BAKELITE_H */
 ";
 
-#[test]
-fn the_committed_header_is_what_the_sources_say() {
-    let root = Path::new(env!("CARGO_MANIFEST_DIR"));
-    let path = root.join("include/bakelite.h");
+/// The text of the header of the sources in `root`, the folder of the library.
+pub fn header(root: &Path) -> String {
     let sections: Vec<String> =
         SECTIONS.iter().map(|name| section(&root.join(format!("src/capi/{name}.rs")))).collect();
-    let header = format!("{HEAD}{}{TAIL}", sections.concat());
-    if std::env::var_os("BAKELITE_UPDATE_HEADER").is_some() {
-        std::fs::write(&path, &header).expect("include/bakelite.h can be written");
-    }
-    let committed = std::fs::read_to_string(&path).unwrap_or_default();
-    let difference = header.lines().zip(committed.lines()).position(|(a, b)| a != b);
-    assert!(
-        header == committed,
-        "include/bakelite.h differs from src/capi, first at line {}: \
-         run `BAKELITE_UPDATE_HEADER=1 cargo test --test header` and commit it",
-        difference.unwrap_or(header.lines().count().min(committed.lines().count())) + 1
-    );
+    format!("{HEAD}{}{TAIL}", sections.concat())
 }
 
 fn section(source: &Path) -> String {
@@ -165,5 +152,28 @@ fn config() -> Config {
         sort_by: SortKey::None,
         function: FunctionConfig { prefix: Some("BK_API".into()), sort_by: Some(SortKey::None), ..Default::default() },
         ..Default::default()
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::header;
+    use std::path::Path;
+
+    #[test]
+    fn the_committed_header_is_what_the_sources_say() {
+        let root = Path::new(env!("CARGO_MANIFEST_DIR")).join("../..");
+        let (path, header) = (root.join("include/bakelite.h"), header(&root));
+        if std::env::var_os("BAKELITE_UPDATE_HEADER").is_some() {
+            std::fs::write(&path, &header).expect("include/bakelite.h can be written");
+        }
+        let committed = std::fs::read_to_string(&path).unwrap_or_default();
+        let difference = header.lines().zip(committed.lines()).position(|(a, b)| a != b);
+        assert!(
+            header == committed,
+            "include/bakelite.h differs from src/capi, first at line {}: \
+             run `BAKELITE_UPDATE_HEADER=1 cargo test -p bakelite-header` and commit it",
+            difference.unwrap_or(header.lines().count().min(committed.lines().count())) + 1
+        );
     }
 }
