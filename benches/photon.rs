@@ -18,8 +18,7 @@ const ESTIMATES: usize = 20_000;
 
 fn data() -> SceneData {
     let Ok(path) = env::var("BAKELITE_BENCH_SCENE") else { return builtin("cornell").expect("scene") };
-    let mut data = SceneData::new();
-    bakelite::io::load(path.as_ref(), &mut data).expect("scene file");
+    let mut data = common::load(&path);
     let position = match env::var("BAKELITE_BENCH_LIGHT") {
         Ok(text) => {
             let xyz: Vec<f32> = text.split(',').map(|x| x.parse().expect("a number")).collect();

@@ -9,11 +9,10 @@
 //! Alternating pairs in one process, one thread; medians, and a count of hits whose bits differ.
 
 use bakelite::bvh::BuildOptions;
-use bakelite::io::load;
 use bakelite::sampling::uniform;
 use bakelite::trace::{PACKET_SIZE, Packet, RawHit, Ray};
-use bakelite::{Device, DeviceOptions, Isa, Progress, Scene, SceneData};
-use common::{areas, median, tile};
+use bakelite::{Device, DeviceOptions, Isa, Progress, Scene};
+use common::{areas, load, median, tile};
 use glam::Vec3;
 use std::path::Path;
 use std::time::Instant;
@@ -108,8 +107,7 @@ fn main() {
         named.peek().is_none() || named.any(|a| a == name)
     };
     for file in arguments.iter().filter(|a| !is_isa(a) && !is_kind(a)) {
-        let mut data = SceneData::new();
-        load(Path::new(file), &mut data).expect("scene");
+        let data = load(file);
         for isa in Isa::available().filter(|isa| is_wanted(isa.name(), &is_isa)) {
             let device =
                 Device::new(DeviceOptions { isa: Some(isa), num_threads: 1, ..Default::default() }).expect("device");

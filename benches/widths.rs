@@ -11,11 +11,10 @@
 //! bits.
 
 use bakelite::bvh::{BinaryBvh, BuildOptions};
-use bakelite::io::load;
 use bakelite::trace::four_wide::FourWide;
 use bakelite::trace::{Hit, RawHit, Ray, baseline};
-use bakelite::{Device, DeviceOptions, Isa, Progress, Scene, SceneData};
-use common::{areas, camera, incoherent, median, tile};
+use bakelite::{Device, DeviceOptions, Isa, Progress, Scene};
+use common::{areas, camera, incoherent, load, median, tile};
 use glam::Vec3;
 use std::path::Path;
 use std::time::Instant;
@@ -110,8 +109,7 @@ fn main() {
     let is_isa = |a: &String| Isa::ALL.iter().any(|isa| isa.name() == a);
     let wanted: Vec<&String> = arguments.iter().filter(|&a| is_isa(a)).collect();
     for file in arguments.iter().filter(|&a| !is_isa(a)) {
-        let mut data = SceneData::new();
-        load(Path::new(file), &mut data).expect("scene");
+        let data = load(file);
         for isa in Isa::available().filter(|isa| wanted.is_empty() || wanted.iter().any(|a| *a == isa.name())) {
             let device =
                 Device::new(DeviceOptions { isa: Some(isa), num_threads: 1, ..Default::default() }).expect("device");

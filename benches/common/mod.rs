@@ -10,13 +10,20 @@ use bakelite::{Device, DeviceOptions, Isa, Light, Progress, Scene, SceneData};
 use glam::Vec3;
 use std::env;
 use std::f32::consts::TAU;
+use std::path::Path;
 use std::sync::Arc;
 
 pub fn data() -> SceneData {
     let Ok(path) = env::var("BAKELITE_BENCH_SCENE") else { return builtin("atrium").expect("scene") };
+    load(&path)
+}
+
+/// Reads a scene file. Relative paths start at the folder of the library: cargo runs benches in their own.
+pub fn load(path: &str) -> SceneData {
     let mut data = SceneData::new();
-    bakelite::io::load(path.as_ref(), &mut data).expect("scene file");
-    assert!(data.triangle_count() > 0, "{path} has no triangles");
+    let path = Path::new(concat!(env!("CARGO_MANIFEST_DIR"), "/..")).join(path);
+    bakelite::io::load(&path, &mut data).unwrap_or_else(|e| panic!("{}: {e}", path.display()));
+    assert!(data.triangle_count() > 0, "{} has no triangles", path.display());
     data
 }
 
