@@ -71,7 +71,7 @@ RUSTDOCFLAGS='-D warnings' cargo doc --release --locked --no-deps --lib --all-fe
 
 echo '== Rust, with all features'
 export PROPTEST_RNG_SEED=${PROPTEST_RNG_SEED:-1}
-cargo test --release --locked --features io,reference,unwrap --no-fail-fast 2>&1 | tee -a "$log" || verdict=1
+cargo test --release --locked --all-features --no-fail-fast 2>&1 | tee -a "$log" || verdict=1
 # Apart: together, cbindgen would turn on features of the library's dependencies, which C programs then compile anew.
 cargo test --release --locked -p bakelite-header 2>&1 | tee -a "$log" || verdict=1
 

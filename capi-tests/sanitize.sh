@@ -36,7 +36,8 @@ run() {
     fi
 }
 
-# program SOURCE FOLDER FLAGS...: one C or C++ test program, linked with the library in FOLDER, and run. Fails if that fails.
+# program SOURCE FOLDER FLAGS...: one C or C++ test program, linked with the library in FOLDER, and run. Fails if that fails:
+# `run` sets the verdict here, not the script's.
 program() {
     local source=$1 library=$2 name verdict=0 compiler
     shift 2

@@ -81,7 +81,7 @@ const TAIL: &str = "
 #endif /* BAKELITE_H */
 ";
 
-/// The text of the header of the sources in `root`, the folder of the library.
+/// Makes the text of the header from the sources of the library in the folder `root`.
 pub fn header(root: &Path) -> String {
     let sections: Vec<String> =
         SECTIONS.iter().map(|name| section(&root.join(format!("src/capi/{name}.rs")))).collect();

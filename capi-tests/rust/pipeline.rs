@@ -424,6 +424,7 @@ fn a_room_with_an_open_front_under_sky_and_sun_agrees_with_the_path_tracer() {
         }
     }
     let points: Vec<SurfacePoint> = places.iter().map(|p| p.point(&scene)).collect();
+    // Its noise is far below what is allowed.
     let reference = tracer.irradiance_many(scene.device(), &points, CORNELL_SAMPLES / 4, 1, &Progress::none()).unwrap();
     for (layer, expected) in [
         (Layer::Direct, (|e: &Irradiance| e.direct) as fn(&Irradiance) -> [f64; 3]),
