@@ -14,17 +14,18 @@
 //! else either, but from farther away or in the light of a lamp.)
 
 use super::chart_index::ChartIndex;
-use super::chart_map::ChartMap;
+use super::chart_map::{ChartMap, receiver_of};
 use super::charts::Charts;
 use super::fill::{Hole, around};
 use super::ids::{Map, PlacementId, TexelId, TexelRange};
 use super::seen::{self, Seen};
 use super::texels::TexelSample;
 use crate::base::error::Result;
-use crate::base::memory::{try_collect, try_par_collect, try_push, try_vec, try_with_capacity};
+use crate::base::memory::{try_collect, try_filled, try_par_collect, try_push, try_vec, try_with_capacity};
 use crate::base::parallel::one_by_one;
 use crate::base::progress::Stage;
 use crate::base::sampling::{cosine_around, sobol_2d};
+use crate::base::scratch::Scratch;
 use crate::scene::Scene;
 use crate::trace::{RawHit, Ray};
 use glam::Vec3;
@@ -87,8 +88,10 @@ impl Search<'_> {
         by_parts: bool,
         stage: &Stage,
     ) -> Result<(Vec<bool>, u64)> {
+        let tests = Scratch::new();
         let of_placement = |placement: usize| {
-            let found = self.in_placement(map, PlacementId::new(placement), by_parts, stage)?;
+            let mut test = tests.take(Test::new)?;
+            let found = self.in_placement(map, PlacementId::new(placement), by_parts, &mut test, stage)?;
             stage.advance(1)?;
             Ok(found)
         };
@@ -120,6 +123,7 @@ impl Search<'_> {
         map: &ChartMap<M>,
         placement: PlacementId,
         by_parts: bool,
+        test: &mut Test,
         stage: &Stage,
     ) -> Result<Found<M>> {
         let mut found = Found::default();
@@ -142,18 +146,17 @@ impl Search<'_> {
         }
         let texels = map.texels_of(placement);
         let indices = texels.indices();
-        let seed = |texel: usize| map.seed_in(placement, TexelId::new(texel));
         let mut buried = Vec::new();
         for first in indices.clone().step_by(BLOCK) {
             stage.advance(0)?;
-            let points = &map.texels.samples[first..indices.end.min(first + BLOCK)];
-            let are_buried = self.are_buried(points, seed(first), is_back, &mut found.rays);
-            for (i, _) in are_buried.iter().take(points.len()).enumerate().filter(|(_, is)| **is) {
-                try_push(&mut buried, TexelId::new(first + i), BURIED)?;
+            let block = TexelId::range(first..indices.end.min(first + BLOCK));
+            let points = block.map(|texel| (map[texel], map.seed_in(placement, texel)));
+            for &number in self.buried(test, points, is_back, &mut found.rays) {
+                try_push(&mut buried, TexelId::new(first + number as usize), BURIED)?;
             }
         }
         if by_parts || buried.len() == texels.len() {
-            self.find_seen_parts(map, placement, is_back, &texels, &mut buried, &mut found, stage)?;
+            self.find_seen_parts(map, placement, is_back, &texels, &mut buried, test, &mut found, stage)?;
         }
         if !buried.is_empty() && buried.len() < texels.len() {
             found.moved = nearest_seen(map, placement, texels, buried, stage)?;
@@ -170,6 +173,7 @@ impl Search<'_> {
         back: bool,
         texels: &TexelRange<M>,
         buried: &mut Vec<TexelId<M>>,
+        test: &mut Test,
         found: &mut Found<M>,
         stage: &Stage,
     ) -> Result<()> {
@@ -177,29 +181,45 @@ impl Search<'_> {
             return Ok(());
         }
         let mut is_buried = try_vec(texels.len(), BURIED)?;
-        let mut result = Ok(());
         buried.iter().for_each(|&s| is_buried[texels.place(s)] = true);
-        buried.retain(|&s| {
-            // Up to 128 rays.
-            result = result.clone().and_then(|()| stage.check());
-            if result.is_err() {
-                return true;
-            }
-            // A texel surrounded by buried ones is taken to have no visible point.
-            let is_at_border = around(map.position(s)).any(|(x, y)| {
+        // A texel surrounded by buried ones is taken to have no visible point.
+        let is_at_border = |s: TexelId<M>| {
+            around(map.position(s)).any(|(x, y)| {
                 let neighbour = map.at(placement, x, y);
                 neighbour.is_none_or(|n| !texels.contains(n) || !is_buried[texels.place(n)])
-            });
-            let seed = map.seed_in(placement, s);
-            let points = if is_at_border { self.points_of_texel(map, placement, s, seed) } else { Vec::new() };
-            let mut is_buried = |point: &TexelSample| self.are_buried(&[*point], seed, back, &mut found.rays)[0];
-            let seen = points.into_iter().find(|point| !is_buried(point));
-            if let Some(point) = seen {
-                result = try_push(&mut found.seen_parts, (s, point), BURIED);
+            })
+        };
+        let mut candidates: Vec<Candidates<M>> = try_with_capacity(BLOCK.min(buried.len()), BURIED)?;
+        let first_seen = found.seen_parts.len();
+        let of_texel = |&texel: &TexelId<M>| {
+            let seed = map.seed_in(placement, texel);
+            Candidates { texel, seed, points: self.points_of_texel(map, placement, texel, seed), tested: 0 }
+        };
+        let mut others = buried.iter().filter(|&&s| is_at_border(s)).map(of_texel).filter(|c| !c.points.is_empty());
+        // Points of a texel are tested one by one until one of them can be seen, those of many texels side by side.
+        loop {
+            stage.advance(0)?;
+            candidates.retain(|c| c.tested < c.points.len());
+            candidates.extend(others.by_ref().take(BLOCK - candidates.len()));
+            if candidates.is_empty() {
+                break;
             }
-            seen.is_none()
-        });
-        result
+            let points = candidates.iter().map(|c| (c.points[c.tested], c.seed));
+            let mut are_buried = self.buried(test, points, back, &mut found.rays).iter().peekable();
+            for (number, c) in (0..).zip(&mut candidates) {
+                if are_buried.next_if_eq(&&number).is_some() {
+                    c.tested += 1;
+                } else {
+                    try_push(&mut found.seen_parts, (c.texel, c.points[c.tested]), BURIED)?;
+                    c.tested = c.points.len();
+                }
+            }
+        }
+        for &(texel, _) in &found.seen_parts[first_seen..] {
+            is_buried[texels.place(texel)] = false;
+        }
+        buried.retain(|&s| is_buried[texels.place(s)]);
+        Ok(())
     }
 
     /// Returns some points of the chart in a texel, as many in other triangles as in that of its sample: where a chart folds,
@@ -223,29 +243,35 @@ impl Search<'_> {
         points.filter(|point| is_wanted(point)).collect()
     }
 
-    /// Which of at most [`BLOCK`] points are buried; `seed` is the first one's, which the others' follow. Rays come in rounds of one per point
-    /// that is undecided, which are traced as streams: neighbours look the same ways.
-    fn are_buried(&self, points: &[TexelSample], seed: u32, back: bool, rays: &mut u64) -> [bool; BLOCK] {
-        let mut undecided: [Undecided; BLOCK] = std::array::from_fn(|i| {
-            let Some(point) = points.get(i) else { return Undecided::default() };
-            let (_, receiver) = super::chart_map::receiver_of(self.scene, point, back);
-            Undecided { number: i as u32, origin: receiver.origin, normal: receiver.geometric, ..Default::default() }
-        });
-        let mut probes = [Ray::new(Vec3::ZERO, Vec3::ZERO); BLOCK];
-        let mut hits = [RawHit::MISS; BLOCK];
-        let mut count = points.len();
+    /// Returns the numbers, in order, of those of at most [`BLOCK`] points, each with a seed, that are buried. Rays come in
+    /// rounds of one per point that is undecided, which are traced as streams.
+    fn buried<'t>(
+        &self,
+        test: &'t mut Test,
+        points: impl Iterator<Item = (TexelSample, u32)>,
+        back: bool,
+        rays: &mut u64,
+    ) -> &'t [u32] {
+        let Test { undecided, probes, hits, buried } = test;
+        buried.clear();
+        undecided.clear();
+        undecided.extend((0..).zip(points).map(|(number, (point, seed))| {
+            let (_, receiver) = receiver_of(self.scene, &point, back);
+            Undecided { number, seed, origin: receiver.origin, normal: receiver.geometric, ..Default::default() }
+        }));
         for i in 0..RAYS {
-            for (probe, point) in probes.iter_mut().zip(&undecided[..count]) {
-                *probe =
-                    Ray::new(point.origin, cosine_around(point.normal, sobol_2d(i, seed.wrapping_add(point.number))));
+            if undecided.is_empty() {
+                break;
             }
-            self.scene.intersect_stream(&probes[..count], &mut hits);
-            *rays += count as u64;
-            let mut kept = 0;
-            for k in 0..count {
-                let (mut point, hit) = (undecided[k], &hits[k]);
+            probes.clear();
+            probes.extend(undecided.iter().map(|p| Ray::new(p.origin, cosine_around(p.normal, sobol_2d(i, p.seed)))));
+            self.scene.intersect_stream(probes, hits);
+            *rays += probes.len() as u64;
+            let (mut hits, left) = (hits.iter(), RAYS - 1 - i);
+            undecided.retain_mut(|point| {
+                let Some(hit) = hits.next() else { return true };
                 match self.seen_by(hit) {
-                    Sight::Open if i == 0 && hit.t > AT_ONCE * self.near => continue,
+                    Sight::Open if i == 0 && hit.t > AT_ONCE * self.near => return false,
                     Sight::Open => point.open += 1,
                     Sight::Nothing => (point.open, point.nothing) = (point.open + 1, point.nothing + 1),
                     Sight::Back => {
@@ -254,22 +280,21 @@ impl Search<'_> {
                     }
                     Sight::Covered => {}
                 }
-                if point.open < OPEN || point.backs > 0 || point.open == point.nothing {
-                    undecided[kept] = point;
-                    kept += 1;
+                // What the rays that are left may find changes nothing any more.
+                if point.open + left < OPEN || 2 * point.backs > RAYS {
+                    buried.push(point.number);
+                    return false;
                 }
-            }
-            count = kept;
+                let may_be_buried = point.backs > 0 && 2 * (point.backs + left) > RAYS;
+                point.open < OPEN || point.open == point.nothing || may_be_buried
+            });
         }
-        let mut are_buried = [false; BLOCK];
-        for point in &undecided[..count] {
-            let mut sees_nothing = || {
-                let is_behind = point.open == point.nothing && FEW_BACKS * point.near_backs >= RAYS;
-                is_behind && !self.sees_lamp(point.origin, point.normal, rays)
-            };
-            are_buried[point.number as usize] = point.open < OPEN || 2 * point.backs > RAYS || sees_nothing();
-        }
-        are_buried
+        buried.extend(undecided.iter().filter_map(|point| {
+            let is_behind = point.open == point.nothing && FEW_BACKS * point.near_backs >= RAYS;
+            (is_behind && !self.sees_lamp(point.origin, point.normal, rays)).then_some(point.number)
+        }));
+        buried.sort_unstable();
+        buried
     }
 
     /// Whether a lamp, which may be switched off, can be seen from a point. (Like the [open places](super::seen) this holds for
@@ -313,6 +338,7 @@ enum Sight {
 struct Undecided {
     /// Its number among the points.
     number: u32,
+    seed: u32,
     origin: Vec3,
     normal: Vec3,
     /// Rays that ended in the open, and those of them that left an indoor scene.
@@ -321,6 +347,34 @@ struct Undecided {
     /// Rays that ended on backs, and those of them that ended nearby.
     backs: u32,
     near_backs: u32,
+}
+
+/// Working memory to test points.
+struct Test {
+    undecided: Vec<Undecided>,
+    probes: Vec<Ray>,
+    hits: Vec<RawHit>,
+    buried: Vec<u32>,
+}
+
+impl Test {
+    fn new() -> Result<Test> {
+        Ok(Test {
+            undecided: try_with_capacity(BLOCK, BURIED)?,
+            probes: try_with_capacity(BLOCK, BURIED)?,
+            hits: try_filled(BLOCK, RawHit::MISS, BURIED)?,
+            buried: try_with_capacity(BLOCK, BURIED)?,
+        })
+    }
+}
+
+/// Points of a texel whose sample is buried, one of which may be visible.
+struct Candidates<M: Map> {
+    texel: TexelId<M>,
+    seed: u32,
+    points: Vec<TexelSample>,
+    /// Number of those that are buried.
+    tested: usize,
 }
 
 #[derive(Default)]
