@@ -88,10 +88,10 @@ impl Search<'_> {
         by_parts: bool,
         stage: &Stage,
     ) -> Result<(Vec<bool>, u64)> {
-        let tests = Scratch::new();
+        let scratch = Scratch::new();
         let of_placement = |placement: usize| {
-            let mut test = tests.take(Test::new)?;
-            let found = self.in_placement(map, PlacementId::new(placement), by_parts, &mut test, stage)?;
+            let mut tests = scratch.take(PointTests::new)?;
+            let found = self.in_placement(map, PlacementId::new(placement), by_parts, &mut tests, stage)?;
             stage.advance(1)?;
             Ok(found)
         };
@@ -123,7 +123,7 @@ impl Search<'_> {
         map: &ChartMap<M>,
         placement: PlacementId,
         by_parts: bool,
-        test: &mut Test,
+        tests: &mut PointTests,
         stage: &Stage,
     ) -> Result<Found<M>> {
         let mut found = Found::default();
@@ -151,12 +151,12 @@ impl Search<'_> {
             stage.advance(0)?;
             let block = TexelId::range(first..indices.end.min(first + BLOCK));
             let points = block.map(|texel| (map[texel], map.seed_in(placement, texel)));
-            for &number in self.buried(test, points, is_back, &mut found.rays) {
+            for &number in self.find_buried(tests, points, is_back, &mut found.rays) {
                 try_push(&mut buried, TexelId::new(first + number as usize), BURIED)?;
             }
         }
         if by_parts || buried.len() == texels.len() {
-            self.find_seen_parts(map, placement, is_back, &texels, &mut buried, test, &mut found, stage)?;
+            self.find_seen_parts(map, placement, is_back, &texels, &mut buried, tests, &mut found, stage)?;
         }
         if !buried.is_empty() && buried.len() < texels.len() {
             found.moved = nearest_seen(map, placement, texels, buried, stage)?;
@@ -173,7 +173,7 @@ impl Search<'_> {
         back: bool,
         texels: &TexelRange<M>,
         buried: &mut Vec<TexelId<M>>,
-        test: &mut Test,
+        tests: &mut PointTests,
         found: &mut Found<M>,
         stage: &Stage,
     ) -> Result<()> {
@@ -190,32 +190,38 @@ impl Search<'_> {
             })
         };
         let mut candidates: Vec<Candidates<M>> = try_with_capacity(BLOCK.min(buried.len()), BURIED)?;
-        let first_seen = found.seen_parts.len();
-        let of_texel = |&texel: &TexelId<M>| {
-            let seed = map.seed_in(placement, texel);
-            Candidates { texel, seed, points: self.points_of_texel(map, placement, texel, seed), tested: 0 }
-        };
-        let mut others = buried.iter().filter(|&&s| is_at_border(s)).map(of_texel).filter(|c| !c.points.is_empty());
-        // Points of a texel are tested one by one until one of them can be seen, those of many texels side by side.
+        let mut others = buried.iter();
+        // The points of a texel are tested one by one until one of them can be seen, those of many texels side by side: alone,
+        // each would take a stream of one ray per round.
         loop {
-            stage.advance(0)?;
-            candidates.retain(|c| c.tested < c.points.len());
-            candidates.extend(others.by_ref().take(BLOCK - candidates.len()));
+            candidates.retain(|c| c.next < c.points.len());
+            while candidates.len() < BLOCK {
+                stage.check()?;
+                let Some(&texel) = others.next() else { break };
+                if !is_at_border(texel) {
+                    continue;
+                }
+                let seed = map.seed_in(placement, texel);
+                let points = self.points_of_texel(map, placement, texel, seed);
+                if !points.is_empty() {
+                    candidates.push(Candidates { texel, seed, points, next: 0 });
+                }
+            }
             if candidates.is_empty() {
                 break;
             }
-            let points = candidates.iter().map(|c| (c.points[c.tested], c.seed));
-            let mut are_buried = self.buried(test, points, back, &mut found.rays).iter().peekable();
+            let points = candidates.iter().map(|c| (c.points[c.next], c.seed));
+            let mut numbers = self.find_buried(tests, points, back, &mut found.rays).iter().peekable();
             for (number, c) in (0..).zip(&mut candidates) {
-                if are_buried.next_if_eq(&&number).is_some() {
-                    c.tested += 1;
+                if numbers.next_if_eq(&&number).is_some() {
+                    c.next += 1;
                 } else {
-                    try_push(&mut found.seen_parts, (c.texel, c.points[c.tested]), BURIED)?;
-                    c.tested = c.points.len();
+                    try_push(&mut found.seen_parts, (c.texel, c.points[c.next]), BURIED)?;
+                    c.next = c.points.len();
                 }
             }
         }
-        for &(texel, _) in &found.seen_parts[first_seen..] {
+        for &(texel, _) in &found.seen_parts {
             is_buried[texels.place(texel)] = false;
         }
         buried.retain(|&s| is_buried[texels.place(s)]);
@@ -243,22 +249,22 @@ impl Search<'_> {
         points.filter(|point| is_wanted(point)).collect()
     }
 
-    /// Returns the numbers, in order, of those of at most [`BLOCK`] points, each with a seed, that are buried. Rays come in
-    /// rounds of one per point that is undecided, which are traced as streams.
-    fn buried<'t>(
+    /// Returns the numbers of the points that are buried, in order; there are at most [`BLOCK`] points, each with a seed. In
+    /// each round every undecided point traces a ray, all of them as a stream.
+    fn find_buried<'t>(
         &self,
-        test: &'t mut Test,
+        tests: &'t mut PointTests,
         points: impl Iterator<Item = (TexelSample, u32)>,
         back: bool,
         rays: &mut u64,
     ) -> &'t [u32] {
-        let Test { undecided, probes, hits, buried } = test;
-        buried.clear();
+        let PointTests { undecided, probes, hits, numbers } = tests;
         undecided.clear();
         undecided.extend((0..).zip(points).map(|(number, (point, seed))| {
             let (_, receiver) = receiver_of(self.scene, &point, back);
             Undecided { number, seed, origin: receiver.origin, normal: receiver.geometric, ..Default::default() }
         }));
+        assert!(undecided.len() <= hits.len());
         for i in 0..RAYS {
             if undecided.is_empty() {
                 break;
@@ -267,9 +273,9 @@ impl Search<'_> {
             probes.extend(undecided.iter().map(|p| Ray::new(p.origin, cosine_around(p.normal, sobol_2d(i, p.seed)))));
             self.scene.intersect_stream(probes, hits);
             *rays += probes.len() as u64;
-            let (mut hits, left) = (hits.iter(), RAYS - 1 - i);
+            let mut hits = hits.iter();
             undecided.retain_mut(|point| {
-                let Some(hit) = hits.next() else { return true };
+                let hit = hits.next().expect("there is one for each ray");
                 match self.seen_by(hit) {
                     Sight::Open if i == 0 && hit.t > AT_ONCE * self.near => return false,
                     Sight::Open => point.open += 1,
@@ -280,21 +286,18 @@ impl Search<'_> {
                     }
                     Sight::Covered => {}
                 }
-                // What the rays that are left may find changes nothing any more.
-                if point.open + left < OPEN || 2 * point.backs > RAYS {
-                    buried.push(point.number);
-                    return false;
-                }
-                let may_be_buried = point.backs > 0 && 2 * (point.backs + left) > RAYS;
-                point.open < OPEN || point.open == point.nothing || may_be_buried
+                point.open < OPEN || point.backs > 0 || point.open == point.nothing
             });
         }
-        buried.extend(undecided.iter().filter_map(|point| {
-            let is_behind = point.open == point.nothing && FEW_BACKS * point.near_backs >= RAYS;
-            (is_behind && !self.sees_lamp(point.origin, point.normal, rays)).then_some(point.number)
+        numbers.clear();
+        numbers.extend(undecided.iter().filter_map(|point| {
+            let mut sees_nothing = || {
+                let is_behind = point.open == point.nothing && FEW_BACKS * point.near_backs >= RAYS;
+                is_behind && !self.sees_lamp(point.origin, point.normal, rays)
+            };
+            (point.open < OPEN || 2 * point.backs > RAYS || sees_nothing()).then_some(point.number)
         }));
-        buried.sort_unstable();
-        buried
+        numbers
     }
 
     /// Whether a lamp, which may be switched off, can be seen from a point. (Like the [open places](super::seen) this holds for
@@ -334,7 +337,7 @@ enum Sight {
 }
 
 /// A point of which rays have not told yet whether it is buried.
-#[derive(Clone, Copy, Default)]
+#[derive(Default)]
 struct Undecided {
     /// Its number among the points.
     number: u32,
@@ -349,21 +352,22 @@ struct Undecided {
     near_backs: u32,
 }
 
-/// Working memory to test points.
-struct Test {
+/// Working memory to test up to [`BLOCK`] points.
+struct PointTests {
     undecided: Vec<Undecided>,
     probes: Vec<Ray>,
     hits: Vec<RawHit>,
-    buried: Vec<u32>,
+    /// Numbers of the points that are buried.
+    numbers: Vec<u32>,
 }
 
-impl Test {
-    fn new() -> Result<Test> {
-        Ok(Test {
+impl PointTests {
+    fn new() -> Result<PointTests> {
+        Ok(PointTests {
             undecided: try_with_capacity(BLOCK, BURIED)?,
             probes: try_with_capacity(BLOCK, BURIED)?,
             hits: try_filled(BLOCK, RawHit::MISS, BURIED)?,
-            buried: try_with_capacity(BLOCK, BURIED)?,
+            numbers: try_with_capacity(BLOCK, BURIED)?,
         })
     }
 }
@@ -373,8 +377,8 @@ struct Candidates<M: Map> {
     texel: TexelId<M>,
     seed: u32,
     points: Vec<TexelSample>,
-    /// Number of those that are buried.
-    tested: usize,
+    /// The one to be tested next; none is left once one can be seen.
+    next: usize,
 }
 
 #[derive(Default)]
@@ -422,8 +426,10 @@ fn nearest_seen<M: Map>(
 
 #[cfg(test)]
 mod tests {
+    use super::*;
     use crate::base::progress::Progress;
-    use crate::lightmap::atlas::ids::{LightTexel, PlacementId};
+    use crate::lightmap::atlas::Atlas;
+    use crate::lightmap::atlas::ids::LightTexel;
     use crate::lightmap::{Lightmap, LightmapDesc};
     use crate::scene::demo::shapes::MeshBuilder;
     use crate::scene::{Light, LightmapUvs, Material, SceneData};
@@ -591,6 +597,36 @@ mod tests {
         // The others are buried and take the light of the nearest: of the rim, or of one that counts as open, once in ten rows.
         let (shown, all) = (texels.clone().filter(shows_rim).count(), texels.len());
         assert!(all >= 240 && shown > 8 * all / 10, "{shown} of {all}");
+    }
+
+    #[test]
+    fn points_that_are_tested_together_are_buried_if_they_are_alone() {
+        let (lower, upper) = (Vec3::new(1.0, -0.1, 1.0), Vec3::new(1.6, 1.0, 1.6));
+        let lightmap = room(false, [lower, upper], Vec3::ONE);
+        let atlas = lightmap.atlas();
+        let Atlas { scene, charts, index, seen, .. } = &**atlas;
+        let search = Search { scene, charts, index, seen, near: 0.05, outdoors: false, only: None };
+        let (mut together, mut alone) = (PointTests::new().unwrap(), PointTests::new().unwrap());
+        let (mut buried, mut rays, mut rays_alone) = (0, 0, 0);
+        // The floor's texels, at their own places: samples of buried ones lie elsewhere.
+        let count = |p: &PlacementId| atlas.map.texels_of(*p).filter(|s| atlas.buried[s.index()]).count();
+        let floor = (0..atlas.map.layout.placements.len()).map(PlacementId::new).max_by_key(count).unwrap();
+        let texels: Vec<LightTexel> = atlas.map.texels_of(floor).collect();
+        for block in texels.chunks(BLOCK) {
+            let point = |&s: &LightTexel| {
+                let placement = &atlas.map.layout[floor];
+                atlas.index.in_texel(&atlas.charts, placement, &atlas.map[s], [0.5; 2]).map(|p| (p, s.index() as u32))
+            };
+            let points: Vec<(TexelSample, u32)> = block.iter().filter_map(point).collect();
+            let found = search.find_buried(&mut together, points.iter().copied(), false, &mut rays);
+            let is_alone = |(_, point): &(u32, &(TexelSample, u32))| {
+                !search.find_buried(&mut alone, std::iter::once(**point), false, &mut rays_alone).is_empty()
+            };
+            let expected: Vec<u32> = (0..).zip(&points).filter(is_alone).map(|(number, _)| number).collect();
+            assert_eq!(found, expected);
+            buried += found.len();
+        }
+        assert!(buried > 80 && texels.len() > buried + BLOCK && rays == rays_alone, "{buried} of {}", texels.len());
     }
 
     /// A wall between two rooms, and a poster 5 mm behind a part of it.
