@@ -627,6 +627,24 @@ mod tests {
             buried += found.len();
         }
         assert!(buried > 80 && texels.len() > buried + BLOCK && rays == rays_alone, "{buried} of {}", texels.len());
+
+        // Other points of more texels than are tested together: of every second column, as if their samples were buried.
+        let (all, mut found, progress) = (atlas.map.texels_of(floor), Found::default(), Progress::none());
+        let given: Vec<LightTexel> = texels.iter().copied().step_by(2).collect();
+        let (mut left, stage) = (given.clone(), progress.stage("buried texels", 0.0, 1.0, 1));
+        search.find_seen_parts(&atlas.map, floor, false, &all, &mut left, &mut together, &mut found, &stage).unwrap();
+        found.seen_parts.sort_unstable_by_key(|part| part.0);
+        let place = |(s, p): (LightTexel, TexelSample)| (s, p.triangle, p.u, p.v);
+        let seen_part = |&s: &LightTexel| {
+            let seed = atlas.map.seed_in(floor, s);
+            let mut points = search.points_of_texel(&atlas.map, floor, s, seed).into_iter();
+            points
+                .find(|&p| search.find_buried(&mut alone, std::iter::once((p, seed)), false, &mut 0).is_empty())
+                .map(|point| place((s, point)))
+        };
+        let expected: Vec<_> = given.iter().filter_map(seen_part).collect();
+        assert_eq!(found.seen_parts.into_iter().map(place).collect::<Vec<_>>(), expected);
+        assert!(expected.len() > BLOCK && left.len() > 20 && left.len() + expected.len() == given.len());
     }
 
     /// A wall between two rooms, and a poster 5 mm behind a part of it.
