@@ -52,6 +52,12 @@ const LAMPS: usize = 64;
 /// need only one ray.
 const AT_ONCE: f32 = 4.0;
 
+/// A texel's sample is buried if none of its first rays, this many, ends in the open, and another point of the texel if none of
+/// its first rays does. (Of texels that all rays would find visible one in a thousand is lost in Sponza; of those that another
+/// point saves one in five, those that see least. docs/experiments.md#sides-and-buried-texels)
+const GIVE_UP: u32 = 8;
+const GIVE_UP_OTHERS: u32 = 4;
+
 /// Number of other points of a texel, in the triangle of its sample and in other triangles, that are tested if its sample is
 /// buried, and number of candidates for them, which may miss its chart.
 const POINTS: usize = 4;
@@ -151,7 +157,7 @@ impl Search<'_> {
             stage.advance(0)?;
             let block = TexelId::range(first..indices.end.min(first + BLOCK));
             let points = block.map(|texel| (map[texel], map.seed_in(placement, texel)));
-            for &number in self.find_buried(tests, points, is_back, &mut found.rays) {
+            for &number in self.find_buried(tests, points, is_back, GIVE_UP, &mut found.rays) {
                 try_push(&mut buried, TexelId::new(first + number as usize), BURIED)?;
             }
         }
@@ -211,7 +217,8 @@ impl Search<'_> {
                 break;
             }
             let points = others.iter().map(|o| (o.points[o.next], o.seed));
-            let mut numbers = self.find_buried(tests, points, back, &mut found.rays).iter().peekable();
+            let numbers = self.find_buried(tests, points, back, GIVE_UP_OTHERS, &mut found.rays);
+            let mut numbers = numbers.iter().peekable();
             for (number, other) in (0..).zip(&mut others) {
                 if numbers.next_if_eq(&&number).is_some() {
                     other.next += 1;
@@ -250,13 +257,14 @@ impl Search<'_> {
     }
 
     /// Returns the numbers of those points that are buried, in order. There are at most [`BLOCK`] points, each with the seed of
-    /// its rays, on backs if `back`. Rays are traced as streams of one per undecided point, since most points need one and
-    /// nearly all others need all. Adds the number of rays to `rays`.
+    /// its rays, on backs if `back`; one is buried if none of its first `give_up` rays ends in the open. Rays are traced as streams
+    /// of one per undecided point, since most points need one and nearly all others need many. Adds the number of rays to `rays`.
     fn find_buried<'t>(
         &self,
         tests: &'t mut PointTests,
         points: impl Iterator<Item = (TexelSample, u32)>,
         back: bool,
+        give_up: u32,
         rays: &mut u64,
     ) -> &'t [u32] {
         let PointTests { undecided, probes, hits, numbers } = tests;
@@ -266,6 +274,7 @@ impl Search<'_> {
             Undecided { number, seed, origin: receiver.origin, normal: receiver.geometric, ..Default::default() }
         }));
         assert!(undecided.len() <= hits.len());
+        numbers.clear();
         for i in 0..RAYS {
             if undecided.is_empty() {
                 break;
@@ -287,10 +296,13 @@ impl Search<'_> {
                     }
                     Sight::Covered => {}
                 }
+                if i + 1 == give_up && point.open == 0 {
+                    numbers.push(point.number);
+                    return false;
+                }
                 point.open < OPEN || point.backs > 0 || point.open == point.nothing
             });
         }
-        numbers.clear();
         numbers.extend(undecided.iter().filter_map(|point| {
             let mut sees_nothing = || {
                 let is_behind = point.open == point.nothing && FEW_BACKS * point.near_backs >= RAYS;
@@ -298,6 +310,7 @@ impl Search<'_> {
             };
             (point.open < OPEN || 2 * point.backs > RAYS || sees_nothing()).then_some(point.number)
         }));
+        numbers.sort_unstable();
         numbers
     }
 
