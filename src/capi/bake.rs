@@ -107,7 +107,7 @@ pub struct bk_bake_params {
     /// around is a valid source of interpolation (1 to 3 %), and those beyond
     /// `interpolation_error` or `interpolation_contrast`, trace `own_rays` themselves.
     /// Raise it to 256 for final light: noise falls with its root, the time of the gather map grows
-    /// in proportion; 16 suffices for a preview. Default: 64.
+    /// in proportion; 32 suffice for a preview. Default: 128.
     pub gather_rays: u32,
     /// Search radius of photons in scene units, finite and at least 1.2e-38; 0: from the number of
     /// photons that reach surfaces and the lit area, and at least three quarters of a texel of the

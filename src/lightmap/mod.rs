@@ -219,7 +219,7 @@ impl Default for BakeParams {
         BakeParams {
             photon_count: 1_000_000,
             max_bounces: 0,
-            gather_rays: 64,
+            gather_rays: 128,
             radius: 0.0,
             near_hits: 0.0,
             interpolation_error: 1.5,

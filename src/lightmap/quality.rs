@@ -50,7 +50,7 @@ impl Quality {
                 let most = (d.interpolation_error, d.interpolation_contrast);
                 (d.photon_count, d.gather_rays, d.near_hits, most, d.blur_radius, d.direct_samples, d.passes)
             }
-            Quality::High => (4_000_000, 128, 1.0, (0.5, d.interpolation_contrast), 1, 32, 1),
+            Quality::High => (4_000_000, 256, 1.0, (0.5, d.interpolation_contrast), 1, 32, 1),
             Quality::Reference => (0, 256, f32::INFINITY, (NEVER, NEVER), 0, 64, 4),
         };
         params.photon_count = photons;
