@@ -52,10 +52,12 @@ const LAMPS: usize = 64;
 /// need only one ray.
 const AT_ONCE: f32 = 4.0;
 
-/// A texel's sample is buried if none of its first rays, this many, ends in the open, and another point of the texel if none of
-/// its first rays does. (Of texels that all rays would find visible one in a thousand is lost in Sponza; of those that another
-/// point saves one in five, those that see least. docs/experiments.md#sides-and-buried-texels)
+/// Number of rays after which a texel's sample counts as buried if none of them has ended in the open. (Two fifths fewer rays
+/// than without this and [`GIVE_UP_OTHERS`]; in Sponza two in a thousand visible samples are lost, those that see least:
+/// docs/experiments.md#sides-and-buried-texels.)
 const GIVE_UP: u32 = 8;
+
+/// The same of another point of a texel. (One in five of the visible ones is lost.)
 const GIVE_UP_OTHERS: u32 = 4;
 
 /// Number of other points of a texel, in the triangle of its sample and in other triangles, that are tested if its sample is
