@@ -380,7 +380,7 @@ impl BinaryBvh {
 
     /// Builds the tree over at least one reference.
     pub(super) fn of(references: References, options: &BuildOptions, progress: &Progress) -> Result<BinaryBvh> {
-        let References { mut refs, extent } = references;
+        let References { mut refs, extent, .. } = references;
         let n = refs.len();
         let mut nodes = try_zeroed_as_needed::<BinaryNode>(2 * n - 1, TREE)?;
         let mut triangles = try_zeroed::<u32>(n, TREE)?;

@@ -2,11 +2,14 @@
 
 use crate::base::error::Result;
 use crate::base::geometry::half_area;
-use crate::base::memory::{try_par_collect, try_zeroed};
+use crate::base::memory::{try_par_collect_ok, try_push, try_with_capacity, try_zeroed};
 use crate::base::progress::Progress;
 use bytemuck::Zeroable;
 use glam::{Mat4, Vec3, Vec4, Vec4Swizzles};
 use rayon::prelude::*;
+
+/// Name of this memory in error messages.
+const REFERENCES: &str = "references to triangles";
 
 /// Number of references that one thread takes of a range at a time.
 pub(super) const CHUNK: usize = 1 << 12;
@@ -172,8 +175,19 @@ impl Extent {
 
 /// References to all triangles that a tree is built over, and their extent.
 pub(crate) struct References {
+    /// In no order that any result depends on.
     pub(super) refs: Vec<Reference>,
     pub(super) extent: Extent,
+    /// The numbers of the triangles that are not valid, ascending.
+    pub(crate) skipped: Vec<u32>,
+}
+
+/// What a thread found of a chunk of references.
+struct Filled {
+    /// Number of references, which lie at the beginning of the chunk.
+    count: usize,
+    extent: Extent,
+    skipped: Vec<u32>,
 }
 
 impl References {
@@ -202,33 +216,73 @@ impl References {
         reference: impl Fn(usize) -> Option<Reference> + Sync,
         progress: &Progress,
     ) -> Result<References> {
-        let mut refs = try_zeroed::<Reference>(count, "references to triangles")?;
+        let mut refs = try_zeroed::<Reference>(count, REFERENCES)?;
         let fill = |(i, chunk): (usize, &mut [Reference])| {
-            let mut n = 0;
-            if progress.is_cancelled() {
-                return (n, Extent::EMPTY);
+            let (mut n, mut skipped) = (0, Vec::new());
+            progress.check()?;
+            for number in i * CHUNK..i * CHUNK + chunk.len() {
+                match reference(number) {
+                    Some(reference) => {
+                        chunk[n] = reference;
+                        n += 1;
+                    }
+                    None => try_push(&mut skipped, number as u32, REFERENCES)?,
+                }
             }
-            for r in (i * CHUNK..i * CHUNK + chunk.len()).filter_map(&reference) {
-                chunk[n] = r;
-                n += 1;
-            }
-            (n, Extent::of(&chunk[..n]))
+            Ok(Filled { count: n, extent: Extent::of(&chunk[..n]), skipped })
         };
-        let chunks = try_par_collect(refs.par_chunks_mut(CHUNK).enumerate().map(fill), "references to triangles")?;
-        progress.check()?;
-        // Chunks move up to those before.
-        let mut end = 0;
-        for (i, &(n, _)) in chunks.iter().enumerate() {
-            if end < i * CHUNK {
-                refs.copy_within(i * CHUNK..i * CHUNK + n, end);
-            }
-            end += n;
-        }
-        refs.truncate(end);
-        Ok(References { refs, extent: chunks.iter().fold(Extent::EMPTY, |e, c| e.join(c.1)) })
+        let chunks = try_par_collect_ok(refs.par_chunks_mut(CHUNK).enumerate().map(fill), REFERENCES)?;
+        let all = chunks.iter().map(|c| c.count).sum();
+        fill_gaps(&mut refs, all, &chunks);
+        refs.truncate(all);
+        let mut skipped = try_with_capacity(count - all, REFERENCES)?;
+        chunks.iter().for_each(|c| skipped.extend_from_slice(&c.skipped));
+        Ok(References { refs, extent: chunks.iter().fold(Extent::EMPTY, |e, c| e.join(c.extent)), skipped })
     }
 
     pub(crate) fn len(&self) -> usize {
         self.refs.len()
+    }
+}
+
+/// Moves the last references into the gaps that chunks have before place `all`, the number of references.
+fn fill_gaps(refs: &mut [Reference], all: usize, chunks: &[Filled]) {
+    let gaps = chunks.iter().enumerate().map(|(i, c)| i * CHUNK + c.count..all.min((i + 1) * CHUNK));
+    let rest = chunks.iter().enumerate().map(|(i, c)| all.max(i * CHUNK)..i * CHUNK + c.count);
+    let mut rest = rest.filter(|r| !r.is_empty());
+    let mut from = 0..0;
+    for mut gap in gaps {
+        while !gap.is_empty() {
+            if from.is_empty() {
+                from = rest.next().expect("there is a reference for each place");
+            }
+            let n = gap.len().min(from.len());
+            refs.copy_within(from.start..from.start + n, gap.start);
+            (gap.start, from.start) = (gap.start + n, from.start + n);
+        }
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use crate::base::sampling::uniform;
+
+    #[test]
+    fn references_are_those_of_valid_triangles_and_the_others_are_named() {
+        let corners = |i: u32| [0.0, 1.0, 2.0].map(|x| Vec3::new(i as f32 + x, x * x, 0.0));
+        for (count, part) in [(1, 1.0), (CHUNK, 0.0), (3 * CHUNK + 17, 0.5), (2 * CHUNK + 1, 0.999), (5 * CHUNK, 0.01)]
+        {
+            let is_valid = |i: u32| uniform(i, 0, count as u32) < part;
+            let by_corners = |c: [Vec3; 3]| is_valid(c[0].x as u32);
+            let found = References::of_valid(count, &corners, by_corners, &Progress::none()).unwrap();
+            let mut ids: Vec<u32> = found.refs.iter().map(Reference::id).collect();
+            ids.sort_unstable();
+            let (valid, skipped): (Vec<u32>, Vec<u32>) = (0..count as u32).partition(|&i| is_valid(i));
+            assert_eq!((ids, &found.skipped), (valid, &skipped));
+            assert!(found.refs.iter().all(|r| r.bounds().corners() == triangle_box(corners(r.id())).corners()));
+            let extent = Extent::of(&found.refs);
+            assert_eq!(found.extent.boxes.corners(), extent.boxes.corners());
+        }
     }
 }

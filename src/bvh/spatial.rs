@@ -402,7 +402,7 @@ impl BinaryBvh {
         options: &BuildOptions,
         progress: &Progress,
     ) -> Result<BinaryBvh> {
-        let References { refs, extent } = references;
+        let References { refs, extent, .. } = references;
         let n = refs.len();
         let extra = ((n as f64 * f64::from(options.split_budget)) as usize).min(MAX_SLOTS - n.min(MAX_SLOTS));
         let least_overlap = extent.boxes.half_area() * f64::from(ALPHA);

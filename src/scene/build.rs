@@ -7,7 +7,7 @@ use super::precision::too_few_digits;
 use super::{Emitter, Material, MeshMaterials, NONE, Scene, SceneData, is_valid_triangle};
 use crate::base::error::{Error, Result};
 use crate::base::geometry::MAX_COORDINATE;
-use crate::base::memory::{Reservation, try_par_filter, try_with_capacity};
+use crate::base::memory::{Reservation, try_with_capacity};
 use crate::base::progress::Progress;
 use crate::bvh::instances::Instances;
 use crate::bvh::{self, BuildOptions, References, Tree};
@@ -101,19 +101,14 @@ impl Scene {
             let object = object_of(&first_triangle, t);
             data.object(object as u32).corners(t - first_triangle[object])
         };
-        let references = device.install(|| References::of_valid(own, &corners, is_valid_triangle, progress))?;
+        let mut references = device.install(|| References::of_valid(own, &corners, is_valid_triangle, progress))?;
         progress.check()?;
         if references.len() == 0 && !instances.as_ref().is_some_and(Instances::are_hit) {
             return Err(Error::InvalidState(format!(
                 "all {total} triangles of the scene are degenerate, not finite or beyond {MAX_COORDINATE:e} units"
             )));
         }
-        let skipped: Vec<u32> = if references.len() == own {
-            Vec::new()
-        } else {
-            let is_skipped = |t| !is_valid_triangle(corners(t));
-            device.install(|| try_par_filter(own, "the triangles that are skipped", is_skipped))?
-        };
+        let skipped = std::mem::take(&mut references.skipped);
         let all_skipped = skipped.len() + instances.as_ref().map_or(0, Instances::skipped);
         if all_skipped > 0 {
             device.log(

@@ -2,7 +2,7 @@
 
 use super::{Instance, SceneData, is_valid_triangle};
 use crate::base::error::Result;
-use crate::base::memory::{try_collect, try_par_collect, try_par_filter, try_par_gather};
+use crate::base::memory::{try_collect, try_par_collect, try_par_gather};
 use crate::base::progress::Progress;
 use crate::bvh::instances::{Instances, MeshTree, PlacedTree, placed_box};
 use crate::bvh::{self, BuildOptions, References, RefitRoom, Tree};
@@ -126,12 +126,9 @@ fn tree_of(data: &SceneData, number: u32, options: &BuildOptions, progress: &Pro
     let mesh = &data.meshes[number as usize];
     let total = mesh.indices.len();
     let corners = |t: u32| mesh.corners(t as usize);
-    let references = References::of_valid(total, &corners, is_valid_triangle, progress)?;
+    let mut references = References::of_valid(total, &corners, is_valid_triangle, progress)?;
     progress.check()?;
-    let skipped = match references.len() == total {
-        true => Vec::new(),
-        false => try_par_filter(total, TREES, |t| !is_valid_triangle(corners(t)))?,
-    };
+    let skipped = std::mem::take(&mut references.skipped);
     let range = [0, total as u32];
     let tree = match references.len() {
         0 => Tree::nothing(),

@@ -133,7 +133,9 @@ impl Mesh {
     /// The corners of `triangle`.
     #[inline]
     pub fn corners(&self, triangle: usize) -> [Vec3; 3] {
-        self.indices[triangle].map(|i| self.positions[i as usize])
+        let [a, b, c] = self.indices[triangle];
+        let at = |i: u32| self.positions[i as usize];
+        [at(a), at(b), at(c)]
     }
 
     /// Checks sizes and index ranges, and the vertices if `strict`.
