@@ -14,6 +14,9 @@ use rayon::prelude::*;
 /// four scenes, but on San Miguel 4 % higher, and rays visit 13 % more nodes.)
 const SLABS: usize = 32;
 
+/// Number of references whose slabs are found before they are added.
+const BATCH: usize = 32;
+
 /// One slab on each axis.
 #[derive(Clone, Copy)]
 struct Slab {
@@ -170,23 +173,35 @@ impl Slabs {
         }
     }
 
+    /// Adds references, as [`Bins`](super::bins::Bins) does: slabs, and corners where they are needed, are found for some
+    /// before the first is added.
     fn add(&mut self, refs: &[Reference], corners: &impl Fn(u32) -> [Vec3; 3], grid: &Grid) {
-        for r in refs {
-            let [first, last] = grid.slabs_of(&r.bounds());
-            for axis in 0..3 {
-                self.slabs[first[axis] as usize].first[axis] += 1;
-                self.slabs[last[axis] as usize].last[axis] += 1;
-                if first[axis] == last[axis] {
-                    let b = &mut self.slabs[first[axis] as usize].boxes[axis];
-                    *b = b.join(r.bounds());
+        let mut ranges = [[[0; 3]; 2]; BATCH];
+        let mut corners_of = [[Vec4::ZERO; 3]; BATCH];
+        for refs in refs.chunks(BATCH) {
+            for (r, range) in refs.iter().zip(&mut ranges) {
+                *range = grid.slabs_of(&r.bounds());
+            }
+            for ((r, [first, last]), corners_of) in refs.iter().zip(&ranges).zip(&mut corners_of) {
+                // Only these need the corners, which are far away in memory.
+                if first != last {
+                    *corners_of = corners(r.id()).map(|c| c.extend(0.0));
                 }
             }
-            if first != last {
-                // Only these need the corners, which are far away in memory.
-                let corners = corners(r.id()).map(|c| c.extend(0.0));
-                self.add_parts::<0>(r, &corners, [first[0], last[0]], grid);
-                self.add_parts::<1>(r, &corners, [first[1], last[1]], grid);
-                self.add_parts::<2>(r, &corners, [first[2], last[2]], grid);
+            for ((r, [first, last]), corners) in refs.iter().zip(&ranges).zip(&corners_of) {
+                for axis in 0..3 {
+                    self.slabs[first[axis] as usize].first[axis] += 1;
+                    self.slabs[last[axis] as usize].last[axis] += 1;
+                    if first[axis] == last[axis] {
+                        let b = &mut self.slabs[first[axis] as usize].boxes[axis];
+                        *b = b.join(r.bounds());
+                    }
+                }
+                if first != last {
+                    self.add_parts::<0>(r, corners, [first[0], last[0]], grid);
+                    self.add_parts::<1>(r, corners, [first[1], last[1]], grid);
+                    self.add_parts::<2>(r, corners, [first[2], last[2]], grid);
+                }
             }
         }
     }

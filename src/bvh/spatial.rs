@@ -11,7 +11,7 @@
 use super::BuildOptions;
 use super::binary::{BinaryBvh, BinaryNode};
 use super::binned::PARALLEL_SUBTREE;
-use super::bins::{BinMap, Bins, bin_count};
+use super::bins::{BinMap, Bins, Side, bin_count};
 use super::cut::cut;
 use super::layout::SAH_DEPTH;
 use super::partings::{best_parting, halve, leaf_cost, part_few};
@@ -59,6 +59,25 @@ impl Work {
             side.try_reserve(n).ok()?;
         }
         Some(())
+    }
+
+    /// Adds references to both sides, which have room for all of them.
+    fn part(&mut self, refs: &[Reference], side: &Side) {
+        let [left, right] = [&mut self.left, &mut self.right].map(|s| &mut s.spare_capacity_mut()[..refs.len()]);
+        // Without branches on the side: every reference is written to both, and the wrong copy is overwritten by the next.
+        let (mut l, mut r) = (0, 0);
+        for reference in refs {
+            left[l].write(*reference);
+            right[r].write(*reference);
+            let is_left = side.is_left(reference);
+            l += usize::from(is_left);
+            r += usize::from(!is_left);
+        }
+        // SAFETY: so many have been written beyond the lengths, within the capacities.
+        unsafe {
+            self.left.set_len(self.left.len() + l);
+            self.right.set_len(self.right.len() + r);
+        }
     }
 }
 
@@ -300,10 +319,7 @@ impl Builder<'_, '_> {
         }
         match object {
             Some((_, split)) => {
-                let side = map.side(&split);
-                for r in refs.iter() {
-                    if side.is_left(r) { work.left.push(*r) } else { work.right.push(*r) }
-                }
+                work.part(refs, &map.side(&split));
                 Some(self.sides(n, extra, work))
             }
             None => (!may_be_leaf).then(|| self.halve(refs, extent, extra, work)),
