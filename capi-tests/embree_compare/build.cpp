@@ -122,8 +122,8 @@ void split(const RTCBuildPrimitive *primitive, unsigned axis, float position, RT
     const Scene &s = *static_cast<const Scene *>(user);
     *left = *right = no_bounds();
     for (int c = 0; c < 3; c++) {
-        const float *const a = s.vertex(primitive->geomID, primitive->primID, c);
-        const float *const b = s.vertex(primitive->geomID, primitive->primID, (c + 1) % 3);
+        const Position a = s.vertex(primitive->geomID, primitive->primID, c);
+        const Position b = s.vertex(primitive->geomID, primitive->primID, (c + 1) % 3);
         if (a[axis] <= position) grow(*left, a);
         if (a[axis] >= position) grow(*right, a);
         if ((a[axis] < position && b[axis] > position) || (a[axis] > position && b[axis] < position)) {

@@ -7,7 +7,7 @@ namespace {
 struct Hit {
     bool hit;
     float t;
-    uint32_t mesh, triangle;
+    uint32_t mesh, triangle; // of instances the number of the instance, as of a mesh of its own
 };
 
 // What extended precision says about a ray and one triangle (Moeller and Trumbore 1997).
@@ -81,10 +81,13 @@ Hit embree_hit(RTCScene scene, const RTCRay &ray) {
     h.ray = ray;
     h.hit.geomID = h.hit.instID[0] = RTC_INVALID_GEOMETRY_ID;
     rtcIntersect1(scene, &c, &h);
-    return {h.hit.geomID != RTC_INVALID_GEOMETRY_ID, h.ray.tfar, h.hit.geomID, h.hit.primID};
+    const bool is_instance = h.hit.instID[0] != RTC_INVALID_GEOMETRY_ID;
+    return {h.hit.geomID != RTC_INVALID_GEOMETRY_ID, h.ray.tfar, is_instance ? h.hit.instID[0] : h.hit.geomID, h.hit.primID};
 }
 
-Hit our_hit(const bk_hit &h) { return {h.triangle != BK_NONE, h.t, h.mesh, h.triangle}; }
+Hit our_hit(const bk_hit &h) {
+    return {h.triangle != BK_NONE, h.t, h.instance != BK_NONE ? h.instance : h.mesh, h.triangle};
+}
 
 void print_real(const Kind &k, size_t i, const Hit &ours, const Hit &theirs) {
     const bk_ray &r = k.rays.rays[i];

@@ -17,6 +17,7 @@
 //     --embree-isa NAME  sse2, sse4.2, avx, avx2, avx512 (default: its own choice, unless --isa is all)
 //     --build LIST       builds of ours that rays are traced on: default, high or both (default: default)
 //     --repeat LIST      as 1,4,12: each scene so many times, beside itself (default 1)
+//     --instances        as instances of one mesh instead of copies, on both sides: rays alone
 //     --markdown         tables ready for a document, at the end; all other text goes to stderr
 //     --csv FILE         all figures
 //
@@ -61,7 +62,7 @@ namespace {
 struct Options {
     std::vector<std::string> scenes;
     std::string csv, embree_isa;
-    bool rays_too = true, commits_too = true, markdown = false, all_isas = false;
+    bool rays_too = true, commits_too = true, markdown = false, all_isas = false, instances = false;
     size_t rays = 500000;
     std::vector<unsigned> threads = {1};
     std::vector<size_t> kinds;
@@ -103,7 +104,7 @@ uint32_t one_of(const char *const (&names)[N], const std::string &value, const s
 Options parse(int argc, char **argv) {
     const char *usage =
         "usage: embree_compare SCENE... [--only rays|commits] [--kinds LIST] [--rays N] [--pairs P] [--seed S]\n"
-        "    [--threads LIST] [--isa NAME|all] [--embree-isa NAME] [--build LIST] [--repeat LIST]\n"
+        "    [--threads LIST] [--isa NAME|all] [--embree-isa NAME] [--build LIST] [--repeat LIST] [--instances]\n"
         "    [--markdown] [--csv FILE]";
     Options o;
     for (int i = 1; i < argc; i++) {
@@ -114,6 +115,10 @@ Options parse(int argc, char **argv) {
         }
         if (arg == "--markdown") {
             o.markdown = true;
+            continue;
+        }
+        if (arg == "--instances") {
+            o.instances = true;
             continue;
         }
         if (i + 1 == argc) fail(arg == "--help" ? usage : arg + " wants a value");
@@ -150,6 +155,10 @@ Options parse(int argc, char **argv) {
         }
     }
     if (o.scenes.empty()) fail(usage);
+    if (o.instances) {
+        if (!o.rays_too) fail("--instances is for rays");
+        o.commits_too = false;
+    }
     if (o.kinds.empty()) {
         for (size_t kind = 0; kind < KINDS; kind++) o.kinds.push_back(kind);
     }
@@ -325,7 +334,8 @@ size_t run_rays(const Scene &s, const Setup &setup, const Options &o, const Row 
         std::fprintf(o.text(), " %17s  ", (std::string("Embree ") + MODE_NAMES[mode]).c_str());
     }
     std::fprintf(o.text(), "\n");
-    const std::vector<std::unique_ptr<Peer>> others = peers(s);
+    const std::vector<std::unique_ptr<Peer>> others =
+        s.places.empty() ? peers(s) : std::vector<std::unique_ptr<Peer>>();
     size_t real = 0;
     for (const size_t kind : o.kinds) {
         Kind k;
@@ -389,6 +399,7 @@ size_t run_scene(const std::string &name, Setup setup, const Options &o, std::ve
         const Scene s(name, setup);
         Row row;
         row.scene = setup.times == 1 ? name : name + " x " + std::to_string(setup.times);
+        if (setup.instances) row.scene += " instances";
         row.isa = ISA_NAMES[bk_device_isa(s.device)];
         row.embree_isa = setup.embree_isa.empty() ? "best" : setup.embree_isa;
         row.build = QUALITY_NAMES[quality];
@@ -416,6 +427,7 @@ int main(int argc, char **argv) {
         for (Setup setup : setups(o)) {
             for (const unsigned times : o.repeats) {
                 setup.times = times;
+                setup.instances = o.instances;
                 real += run_scene(scene, setup, o, rows);
             }
         }

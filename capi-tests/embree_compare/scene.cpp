@@ -83,11 +83,18 @@ bk_scene *our_scene(bk_device *device, const Scene &s, uint32_t quality) {
     return scene;
 }
 
-RTCScene embree_scene(RTCDevice device, const Scene &s, Mode mode) {
+static RTCScene empty_embree_scene(RTCDevice device, Mode mode) {
     RTCScene scene = rtcNewScene(device);
     rtcSetSceneBuildQuality(scene, mode == HIGH ? RTC_BUILD_QUALITY_HIGH : RTC_BUILD_QUALITY_MEDIUM);
     rtcSetSceneFlags(scene, mode == ROBUST ? RTC_SCENE_FLAG_ROBUST : RTC_SCENE_FLAG_NONE);
-    for (size_t m = 0; m < s.meshes.size(); m++) {
+    return scene;
+}
+
+RTCScene embree_scene(RTCDevice device, const Scene &s, Mode mode) {
+    RTCScene scene = empty_embree_scene(device, mode);
+    // Instances are all of the first mesh.
+    const size_t meshes = s.places.empty() ? s.meshes.size() : 1;
+    for (size_t m = 0; m < meshes; m++) {
         const bk_mesh_view &mesh = s.meshes[m];
         if (mesh.triangle_count == 0) continue;
         RTCGeometry geometry = rtcNewGeometry(device, RTC_GEOMETRY_TYPE_TRIANGLE);
@@ -102,31 +109,83 @@ RTCScene embree_scene(RTCDevice device, const Scene &s, Mode mode) {
         rtcAttachGeometryByID(scene, geometry, unsigned(m));
         rtcReleaseGeometry(geometry);
     }
-    return scene;
+    if (s.places.empty()) return scene;
+    rtcCommitScene(scene);
+    RTCScene all = empty_embree_scene(device, mode);
+    for (size_t i = 0; i < s.places.size(); i++) {
+        const float *const at = s.places[i];
+        const float transform[12] = {1, 0, 0, 0, 1, 0, 0, 0, 1, at[0], at[1], at[2]};
+        RTCGeometry geometry = rtcNewGeometry(device, RTC_GEOMETRY_TYPE_INSTANCE);
+        rtcSetGeometryInstancedScene(geometry, scene);
+        rtcSetGeometryTransform(geometry, 0, RTC_FORMAT_FLOAT3X4_COLUMN_MAJOR, transform);
+        rtcCommitGeometry(geometry);
+        rtcAttachGeometryByID(all, geometry, unsigned(i));
+        rtcReleaseGeometry(geometry);
+    }
+    rtcReleaseScene(scene);
+    return all;
 }
 
-// A scene in which a committed one stands `times` times in a square grid on the plane of x and z, each beside the next, as
-// `bakelite bake --repeat` places them.
-static bk_scene *repeated(bk_device *device, const bk_scene *once, unsigned times) {
+// Where a scene stands `times` times in a square grid on the plane of x and z, each beside the next, as
+// `bakelite bake --repeat` places it.
+static std::vector<Position> grid(const bk_scene *once, unsigned times) {
+    float lower[3], upper[3];
+    check(bk_scene_bounds(once, lower, upper));
+    const auto columns = unsigned(std::ceil(std::sqrt(double(times))));
+    std::vector<Position> places;
+    for (unsigned i = 0; i < times; i++) {
+        places.push_back({{(upper[0] - lower[0]) * float(i % columns), 0, (upper[2] - lower[2]) * float(i / columns)}});
+    }
+    return places;
+}
+
+// A scene of instances of a committed one, whose meshes become one mesh.
+static bk_scene *instanced(bk_device *device, const bk_scene *once, const std::vector<Position> &places) {
     bk_scene *scene;
     check(bk_scene_create(device, &scene));
     bk_material_desc material;
     bk_material_desc_init(&material);
     check(bk_scene_add_material(scene, &material, nullptr));
-    float lower[3], upper[3];
-    check(bk_scene_bounds(once, lower, upper));
-    const auto columns = unsigned(std::ceil(std::sqrt(double(times))));
+    std::vector<float> positions;
+    std::vector<uint32_t> indices;
+    for (uint32_t m = 0; m < bk_scene_mesh_count(once); m++) {
+        bk_mesh_view mesh;
+        bk_mesh_view_init(&mesh);
+        check(bk_scene_get_mesh(once, m, &mesh));
+        const auto first = uint32_t(positions.size() / 3);
+        positions.insert(positions.end(), mesh.positions, mesh.positions + 3 * size_t(mesh.vertex_count));
+        for (size_t i = 0; i < 3 * size_t(mesh.triangle_count); i++) indices.push_back(first + mesh.indices[i]);
+    }
+    bk_mesh_desc desc;
+    bk_mesh_desc_init(&desc);
+    desc.positions = positions.data();
+    desc.vertex_count = uint32_t(positions.size() / 3);
+    desc.indices = indices.data();
+    desc.triangle_count = uint32_t(indices.size() / 3);
+    uint32_t all;
+    check(bk_scene_add_mesh(scene, &desc, &all));
+    for (const Position &at : places) {
+        const float transform[12] = {1, 0, 0, 0, 1, 0, 0, 0, 1, at.x[0], at.x[1], at.x[2]};
+        check(bk_scene_add_instance(scene, all, transform, nullptr));
+    }
+    return scene;
+}
+
+// A scene of copies of a committed one.
+static bk_scene *repeated(bk_device *device, const bk_scene *once, const std::vector<Position> &places) {
+    bk_scene *scene;
+    check(bk_scene_create(device, &scene));
+    bk_material_desc material;
+    bk_material_desc_init(&material);
+    check(bk_scene_add_material(scene, &material, nullptr));
     std::vector<float> positions;
     for (uint32_t m = 0; m < bk_scene_mesh_count(once); m++) {
         bk_mesh_view mesh;
         bk_mesh_view_init(&mesh);
         check(bk_scene_get_mesh(once, m, &mesh));
-        for (unsigned copy = 0; copy < times; copy++) {
+        for (const Position &at : places) {
             positions.assign(mesh.positions, mesh.positions + 3 * size_t(mesh.vertex_count));
-            for (size_t i = 0; i < positions.size(); i += 3) {
-                positions[i] += (upper[0] - lower[0]) * float(copy % columns);
-                positions[i + 2] += (upper[2] - lower[2]) * float(copy / columns);
-            }
+            for (size_t i = 0; i < positions.size(); i++) positions[i] += at.x[i % 3];
             bk_mesh_desc desc;
             bk_mesh_desc_init(&desc);
             desc.positions = positions.data();
@@ -146,10 +205,12 @@ Scene::Scene(const std::string &name, const Setup &setup) {
     check(bk_scene_create(device, &scene));
     const bool file = name.find('.') != std::string::npos;
     check(file ? bk_scene_load_file(scene, name.c_str(), nullptr, nullptr, nullptr, nullptr) : bk_scene_load_builtin(scene, name.c_str()));
-    if (setup.times > 1) {
+    if (setup.times > 1 || setup.instances) {
         bk_scene *const once = scene;
         check(bk_scene_commit(once, nullptr, nullptr));
-        scene = repeated(device, once, setup.times);
+        const std::vector<Position> all = grid(once, setup.times);
+        scene = setup.instances ? instanced(device, once, all) : repeated(device, once, all);
+        if (setup.instances) places = all;
         bk_scene_release(once);
     }
     bk_build_params params;
@@ -165,10 +226,11 @@ Scene::Scene(const std::string &name, const Setup &setup) {
     center = (load(lower) + load(upper)) * 0.5;
     diagonal = length(load(upper) - load(lower));
     double sum = 0;
-    for (uint32_t m = 0; m < bk_scene_mesh_count(scene); m++) {
+    const auto count = places.empty() ? bk_scene_mesh_count(scene) : uint32_t(places.size());
+    for (uint32_t m = 0; m < count; m++) {
         bk_mesh_view view;
         bk_mesh_view_init(&view);
-        check(bk_scene_get_mesh(scene, m, &view));
+        check(bk_scene_get_mesh(scene, places.empty() ? m : 0, &view));
         meshes.push_back(view);
         for (uint32_t t = 0; t < view.triangle_count; t++) {
             const Vec3d a = load(vertex(m, t, 0)), b = load(vertex(m, t, 1)), c = load(vertex(m, t, 2));

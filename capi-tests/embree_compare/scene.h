@@ -17,17 +17,25 @@ struct Setup {
     uint32_t isa = BK_ISA_AUTO;
     std::string embree_isa; // empty: its own choice
     uint32_t quality = BK_BUILD_QUALITY_DEFAULT;
-    unsigned times = 1; // how often the scene stands beside itself
+    unsigned times = 1;     // how often the scene stands beside itself
+    bool instances = false; // as instances of one mesh, instead of copies
 };
 
 inline const char *const ISA_NAMES[] = {"auto", "portable", "avx2", "avx512"};
 inline const char *const QUALITY_NAMES[] = {"default", "high"};
 
+// A position that can be given where floats are wanted.
+struct Position {
+    float x[3];
+    operator const float *() const { return x; }
+};
+
 // Our side: committed, and all that rays are made from.
 struct Scene {
     bk_device *device = nullptr;
     bk_scene *scene = nullptr;
-    std::vector<bk_mesh_view> meshes;
+    std::vector<bk_mesh_view> meshes; // of instances the same one for each
+    std::vector<Position> places;     // where instances stand; empty: there are none
     std::vector<std::pair<uint32_t, uint32_t>> triangles; // (mesh, triangle) of those with an area
     std::vector<double> area_sums;
     bk_scene_stats stats;
@@ -38,9 +46,12 @@ struct Scene {
     Scene(const Scene &) = delete;
     ~Scene();
 
-    const float *vertex(uint32_t mesh, uint32_t triangle, int corner) const {
+    Position vertex(uint32_t mesh, uint32_t triangle, int corner) const {
         const bk_mesh_view &m = meshes[mesh];
-        return m.positions + 3 * size_t(m.indices[3 * size_t(triangle) + size_t(corner)]);
+        const float *const p = m.positions + 3 * size_t(m.indices[3 * size_t(triangle) + size_t(corner)]);
+        if (places.empty()) return {{p[0], p[1], p[2]}};
+        const float *const at = places[mesh];
+        return {{p[0] + at[0], p[1] + at[1], p[2] + at[2]}};
     }
 };
 

@@ -81,7 +81,7 @@ std::vector<std::unique_ptr<Peer>> peers(const Scene &s) {
     for (uint32_t m = 0; m < s.meshes.size(); m++) {
         for (uint32_t t = 0; t < s.meshes[m].triangle_count; t++) {
             for (int corner = 0; corner < 3; corner++) {
-                const float *v = s.vertex(m, t, corner);
+                const Position v = s.vertex(m, t, corner);
                 triangles->emplace_back(v[0], v[1], v[2], 0.0f);
             }
         }
