@@ -81,8 +81,8 @@ Hit embree_hit(RTCScene scene, const RTCRay &ray) {
     h.ray = ray;
     h.hit.geomID = h.hit.instID[0] = RTC_INVALID_GEOMETRY_ID;
     rtcIntersect1(scene, &c, &h);
-    const bool is_instance = h.hit.instID[0] != RTC_INVALID_GEOMETRY_ID;
-    return {h.hit.geomID != RTC_INVALID_GEOMETRY_ID, h.ray.tfar, is_instance ? h.hit.instID[0] : h.hit.geomID, h.hit.primID};
+    const uint32_t mesh = h.hit.instID[0] != RTC_INVALID_GEOMETRY_ID ? h.hit.instID[0] : h.hit.geomID;
+    return {h.hit.geomID != RTC_INVALID_GEOMETRY_ID, h.ray.tfar, mesh, h.hit.primID};
 }
 
 Hit our_hit(const bk_hit &h) {

@@ -12,7 +12,7 @@ use super::binary::{BinaryBvh, BinaryNode};
 use super::compact::{self, Compact, CompactNode};
 use super::layout::{ChildRef, LEAF_PAD, LEAF_STRIDE, Mbvh, Node, WIDTH};
 use super::references::Box4;
-use crate::base::error::Result;
+use crate::base::error::{Error, Result};
 use crate::base::memory::{try_append, try_par_collect, try_par_collect_ok, try_push, try_with_capacity, try_zeroed};
 use crate::base::parallel::ParallelLoop;
 use crate::base::progress::Progress;
@@ -146,6 +146,7 @@ fn plans_in_sequence<const W: usize>(binary: &BinaryBvh, source: Subtree, progre
 }
 
 const PLANS: &str = "the plan of the tree";
+const LEAVES: &str = "the leaves of the tree";
 
 /// Collapses a binary tree to one of compact nodes and leaves; `meshes` as in [`Compact::new`].
 pub(super) fn collapse_compact(binary: &BinaryBvh, meshes: &[u32], progress: &Progress) -> Result<Compact> {
@@ -180,7 +181,7 @@ pub(super) fn collapse<const W: usize>(
     };
     let nodes = try_par_collect((0..plans.len()).into_par_iter().with_min_len(1024).map(plan_of), "the tree")?;
     progress.check()?;
-    let mut leaves = try_zeroed(n * LEAF_STRIDE + LEAF_PAD, "the leaves of the tree")?;
+    let mut leaves = try_zeroed(n * LEAF_STRIDE + LEAF_PAD, LEAVES)?;
     let mut rest = &mut leaves[..n * LEAF_STRIDE];
     let mut jobs = Vec::with_capacity(order.len() / NODES_PER_JOB + 1);
     for (i, part) in order.chunks(NODES_PER_JOB).enumerate() {
@@ -198,10 +199,10 @@ pub(super) fn collapse<const W: usize>(
             for (k, &plan) in nodes.iter().enumerate() {
                 let next = part.get(i * NODES_PER_BLOCK + k + AHEAD);
                 next.inspect(|&&next| plans[next as usize].prefetch(binary));
-                plans[plan as usize].leaves(binary).for_each(|leaf| block.add(leaf, binary));
+                plans[plan as usize].leaves(binary).try_for_each(|leaf| block.add(leaf, binary))?;
             }
             let (of_block, others) = rows.split_at_mut(block.triangles.len() * LEAF_STRIDE);
-            block.fill(of_block, corners);
+            block.fill(of_block, corners)?;
             rows = others;
         }
         Ok(())
@@ -236,13 +237,15 @@ impl LeafBlock {
         self.corners.clear();
     }
 
-    fn add(&mut self, leaf: &BinaryNode, binary: &BinaryBvh) {
-        self.counts.push(leaf.count);
-        self.triangles.extend_from_slice(&binary.triangles[leaf.index as usize..][..leaf.count as usize]);
+    fn add(&mut self, leaf: &BinaryNode, binary: &BinaryBvh) -> Result<()> {
+        try_push(&mut self.counts, leaf.count, LEAVES)?;
+        try_append(&mut self.triangles, &binary.triangles[leaf.index as usize..][..leaf.count as usize], LEAVES)
     }
 
     /// Fills in the leaves, which follow each other.
-    fn fill(&mut self, mut rows: &mut [f32], corners: &impl Fn(u32) -> [Vec3; 3]) {
+    fn fill(&mut self, mut rows: &mut [f32], corners: &impl Fn(u32) -> [Vec3; 3]) -> Result<()> {
+        let no_room = |e| Error::OutOfMemory(format!("{LEAVES}: {e}"));
+        self.corners.try_reserve(self.triangles.len()).map_err(no_room)?;
         self.corners.extend(self.triangles.iter().map(|&t| corners(t)));
         let (mut triangles, mut corners) = (&self.triangles[..], &self.corners[..]);
         for count in self.counts.iter().map(|&n| n as usize) {
@@ -250,6 +253,7 @@ impl LeafBlock {
             fill_leaf(leaf, &triangles[..count], &corners[..count]);
             (rows, triangles, corners) = (others, &triangles[count..], &corners[count..]);
         }
+        Ok(())
     }
 }
 
