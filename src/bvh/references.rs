@@ -175,7 +175,7 @@ impl Extent {
 
 /// References to all triangles that a tree is built over, and their extent.
 pub(crate) struct References {
-    /// In no order that any result depends on.
+    /// In order of their numbers, on which trees with spatial splits depend.
     pub(super) refs: Vec<Reference>,
     pub(super) extent: Extent,
     /// The numbers of the triangles that are not valid, ascending.
@@ -232,8 +232,14 @@ impl References {
             Ok(Filled { count: n, extent: Extent::of(&chunk[..n]), skipped })
         };
         let chunks = try_par_collect_ok(refs.par_chunks_mut(CHUNK).enumerate().map(fill), REFERENCES)?;
-        let all = chunks.iter().map(|c| c.count).sum();
-        fill_gaps(&mut refs, all, &chunks);
+        // Chunks move up to those before.
+        let mut all = 0;
+        for (i, chunk) in chunks.iter().enumerate() {
+            if all < i * CHUNK {
+                refs.copy_within(i * CHUNK..i * CHUNK + chunk.count, all);
+            }
+            all += chunk.count;
+        }
         refs.truncate(all);
         let mut skipped = try_with_capacity(count - all, REFERENCES)?;
         chunks.iter().for_each(|c| skipped.extend_from_slice(&c.skipped));
@@ -242,24 +248,6 @@ impl References {
 
     pub(crate) fn len(&self) -> usize {
         self.refs.len()
-    }
-}
-
-/// Moves the last references into the gaps that chunks have before place `all`, the number of references.
-fn fill_gaps(refs: &mut [Reference], all: usize, chunks: &[Filled]) {
-    let gaps = chunks.iter().enumerate().map(|(i, c)| i * CHUNK + c.count..all.min((i + 1) * CHUNK));
-    let rest = chunks.iter().enumerate().map(|(i, c)| all.max(i * CHUNK)..i * CHUNK + c.count);
-    let mut rest = rest.filter(|r| !r.is_empty());
-    let mut from = 0..0;
-    for mut gap in gaps {
-        while !gap.is_empty() {
-            if from.is_empty() {
-                from = rest.next().expect("there is a reference for each place");
-            }
-            let n = gap.len().min(from.len());
-            refs.copy_within(from.start..from.start + n, gap.start);
-            (gap.start, from.start) = (gap.start + n, from.start + n);
-        }
     }
 }
 
@@ -276,8 +264,7 @@ mod tests {
             let is_valid = |i: u32| uniform(i, 0, count as u32) < part;
             let by_corners = |c: [Vec3; 3]| is_valid(c[0].x as u32);
             let found = References::of_valid(count, &corners, by_corners, &Progress::none()).unwrap();
-            let mut ids: Vec<u32> = found.refs.iter().map(Reference::id).collect();
-            ids.sort_unstable();
+            let ids: Vec<u32> = found.refs.iter().map(Reference::id).collect();
             let (valid, skipped): (Vec<u32>, Vec<u32>) = (0..count as u32).partition(|&i| is_valid(i));
             assert_eq!((ids, &found.skipped), (valid, &skipped));
             assert!(found.refs.iter().all(|r| r.bounds().corners() == triangle_box(corners(r.id())).corners()));
