@@ -61,25 +61,36 @@ RTCDevice embree_device(const Setup &setup, unsigned threads) {
     return rtcNewDevice(config.c_str());
 }
 
-bk_scene *our_scene(bk_device *device, const Scene &s, uint32_t quality) {
+// Of one material, without meshes.
+static bk_scene *empty_scene(bk_device *device) {
     bk_scene *scene;
     check(bk_scene_create(device, &scene));
+    bk_material_desc material;
+    bk_material_desc_init(&material);
+    check(bk_scene_add_material(scene, &material, nullptr));
+    return scene;
+}
+
+// Adds the triangles of a mesh with other positions, as many; returns the new mesh's number.
+static uint32_t add_mesh(bk_scene *scene, const bk_mesh_view &view, const float *positions) {
+    bk_mesh_desc mesh;
+    bk_mesh_desc_init(&mesh);
+    mesh.positions = positions;
+    mesh.vertex_count = view.vertex_count;
+    mesh.indices = view.indices;
+    mesh.triangle_count = view.triangle_count;
+    uint32_t number;
+    check(bk_scene_add_mesh(scene, &mesh, &number));
+    return number;
+}
+
+bk_scene *our_scene(bk_device *device, const Scene &s, uint32_t quality) {
+    bk_scene *const scene = empty_scene(device);
     bk_build_params params;
     bk_build_params_init(&params);
     params.quality = quality;
     check(bk_scene_set_build(scene, &params));
-    bk_material_desc material;
-    bk_material_desc_init(&material);
-    check(bk_scene_add_material(scene, &material, nullptr));
-    for (const bk_mesh_view &view : s.meshes) {
-        bk_mesh_desc mesh;
-        bk_mesh_desc_init(&mesh);
-        mesh.positions = view.positions;
-        mesh.vertex_count = view.vertex_count;
-        mesh.indices = view.indices;
-        mesh.triangle_count = view.triangle_count;
-        check(bk_scene_add_mesh(scene, &mesh, nullptr));
-    }
+    for (const bk_mesh_view &view : s.meshes) add_mesh(scene, view, view.positions);
     return scene;
 }
 
@@ -141,11 +152,7 @@ static std::vector<Position> grid(const bk_scene *once, unsigned times) {
 
 // A scene of instances of a committed one, whose meshes become one mesh.
 static bk_scene *instanced(bk_device *device, const bk_scene *once, const std::vector<Position> &places) {
-    bk_scene *scene;
-    check(bk_scene_create(device, &scene));
-    bk_material_desc material;
-    bk_material_desc_init(&material);
-    check(bk_scene_add_material(scene, &material, nullptr));
+    bk_scene *const scene = empty_scene(device);
     std::vector<float> positions;
     std::vector<uint32_t> indices;
     for (uint32_t m = 0; m < bk_scene_mesh_count(once); m++) {
@@ -156,14 +163,12 @@ static bk_scene *instanced(bk_device *device, const bk_scene *once, const std::v
         positions.insert(positions.end(), mesh.positions, mesh.positions + 3 * size_t(mesh.vertex_count));
         for (size_t i = 0; i < 3 * size_t(mesh.triangle_count); i++) indices.push_back(first + mesh.indices[i]);
     }
-    bk_mesh_desc desc;
-    bk_mesh_desc_init(&desc);
-    desc.positions = positions.data();
-    desc.vertex_count = uint32_t(positions.size() / 3);
-    desc.indices = indices.data();
-    desc.triangle_count = uint32_t(indices.size() / 3);
-    uint32_t all;
-    check(bk_scene_add_mesh(scene, &desc, &all));
+    bk_mesh_view merged;
+    bk_mesh_view_init(&merged);
+    merged.vertex_count = uint32_t(positions.size() / 3);
+    merged.indices = indices.data();
+    merged.triangle_count = uint32_t(indices.size() / 3);
+    const uint32_t all = add_mesh(scene, merged, positions.data());
     for (const Position &at : places) {
         const float transform[12] = {1, 0, 0, 0, 1, 0, 0, 0, 1, at.x[0], at.x[1], at.x[2]};
         check(bk_scene_add_instance(scene, all, transform, nullptr));
@@ -173,11 +178,7 @@ static bk_scene *instanced(bk_device *device, const bk_scene *once, const std::v
 
 // A scene of copies of a committed one.
 static bk_scene *repeated(bk_device *device, const bk_scene *once, const std::vector<Position> &places) {
-    bk_scene *scene;
-    check(bk_scene_create(device, &scene));
-    bk_material_desc material;
-    bk_material_desc_init(&material);
-    check(bk_scene_add_material(scene, &material, nullptr));
+    bk_scene *const scene = empty_scene(device);
     std::vector<float> positions;
     for (uint32_t m = 0; m < bk_scene_mesh_count(once); m++) {
         bk_mesh_view mesh;
@@ -186,13 +187,7 @@ static bk_scene *repeated(bk_device *device, const bk_scene *once, const std::ve
         for (const Position &at : places) {
             positions.assign(mesh.positions, mesh.positions + 3 * size_t(mesh.vertex_count));
             for (size_t i = 0; i < positions.size(); i++) positions[i] += at.x[i % 3];
-            bk_mesh_desc desc;
-            bk_mesh_desc_init(&desc);
-            desc.positions = positions.data();
-            desc.vertex_count = mesh.vertex_count;
-            desc.indices = mesh.indices;
-            desc.triangle_count = mesh.triangle_count;
-            check(bk_scene_add_mesh(scene, &desc, nullptr));
+            add_mesh(scene, mesh, positions.data());
         }
     }
     return scene;

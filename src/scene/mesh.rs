@@ -133,6 +133,7 @@ impl Mesh {
     /// The corners of `triangle`.
     #[inline]
     pub fn corners(&self, triangle: usize) -> [Vec3; 3] {
+        // Not by `map`: that writes coordinates to the stack in two pieces and reads them in one, for which the processor waits.
         let [a, b, c] = self.indices[triangle];
         let at = |i: u32| self.positions[i as usize];
         [at(a), at(b), at(c)]
