@@ -14,6 +14,7 @@ use crate::base::parallel::ParallelLoop;
 use bytemuck::{Pod, Zeroable};
 use glam::Vec3;
 use rayon::prelude::*;
+use std::hint::select_unpredictable;
 
 /// An 8-wide node in 80 bytes.
 ///
@@ -327,11 +328,9 @@ impl Compact {
     /// Address of the node or leaf of a reference.
     #[inline(always)]
     pub(crate) fn address(&self, child: ChildRef) -> *const u8 {
-        if child.is_leaf() {
-            self.triangles.as_ptr().wrapping_add(child.leaf_slot()).cast()
-        } else {
-            self.nodes.as_ptr().wrapping_add(child.node_index()).cast()
-        }
+        let leaf = self.triangles.as_ptr().wrapping_add(child.leaf_slot()).cast();
+        let node = self.nodes.as_ptr().wrapping_add(child.node_index()).cast();
+        select_unpredictable(child.is_leaf(), leaf, node)
     }
 
     /// The triangle numbers of a leaf.

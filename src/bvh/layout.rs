@@ -9,6 +9,7 @@ use crate::simd::prefetch;
 use bytemuck::{Pod, Zeroable};
 use glam::Vec3;
 use rayon::prelude::*;
+use std::hint::select_unpredictable;
 
 /// Maximum number of triangles of a leaf reference.
 pub(crate) const MAX_LEAF: usize = 8;
@@ -202,6 +203,11 @@ impl<const W: usize> Mbvh<W> {
         Mbvh { nodes: vec![Node::EMPTY].into(), leaves: vec![0.0; LEAF_PAD].into(), bounds }
     }
 
+    #[inline]
+    pub(crate) fn has_no_leaves(&self) -> bool {
+        self.leaves.len() <= LEAF_PAD
+    }
+
     /// Copies the tree; fails if there is not enough memory.
     pub(super) fn try_clone(&self) -> Result<Self> {
         let what = "a copy of the tree";
@@ -272,11 +278,10 @@ impl<const W: usize> Mbvh<W> {
     /// Where a child begins in memory.
     #[inline(always)]
     fn address(&self, child: ChildRef) -> *const u8 {
-        if child.is_leaf() {
-            self.leaves.as_ptr().wrapping_add(LEAF_STRIDE * child.leaf_slot()).cast()
-        } else {
-            self.nodes.as_ptr().wrapping_add(child.node_index()).cast()
-        }
+        let leaf = self.leaves.as_ptr().wrapping_add(LEAF_STRIDE * child.leaf_slot()).cast();
+        let node = self.nodes.as_ptr().wrapping_add(child.node_index()).cast();
+        // (Where rays are in different trees, it had become a branch, which was often mispredicted.)
+        select_unpredictable(child.is_leaf(), leaf, node)
     }
 
     /// Pointer to the first row of a leaf; [`LEAF_PAD`] floats behind the last leaf are readable.

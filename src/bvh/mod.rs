@@ -124,6 +124,12 @@ impl Tree {
         Tree::Whole(Mbvh::nothing())
     }
 
+    /// Whether this is [`Self::nothing`].
+    #[inline]
+    pub(crate) fn is_nothing(&self) -> bool {
+        matches!(self, Tree::Whole(tree) if tree.has_no_leaves())
+    }
+
     /// Lower and upper corner of the box around all triangles.
     pub(crate) fn bounds(&self) -> (Vec3, Vec3) {
         match self {

@@ -38,7 +38,29 @@ struct Way {
     sign: [f32; 3],
 }
 
-/// Number of rays, from the first, that make a bundle: they share origin and range, octant and longest axis of their
+/// Number of rays before the next bundles, and of those in bundles that follow one another from there on.
+///
+/// # Safety
+/// The CPU must have the ISA.
+#[inline(always)]
+pub(super) unsafe fn next<S: Simd>(rays: &[Ray]) -> (usize, usize) {
+    let (mut before, mut end) = (0, 0);
+    while end < rays.len() {
+        // SAFETY: forwarded.
+        let length = unsafe { bundle::<S>(&rays[end..]) };
+        if length >= LEAST {
+            end += length;
+        } else if before < end {
+            break;
+        } else {
+            before += length.max(1);
+            end = before;
+        }
+    }
+    (before, end - before)
+}
+
+/// Number of rays, from the first, that make a bundle: they share their origin and tmin, octant and longest axis of their
 /// directions, and nearly their slopes. It is less than [`LEAST`] if there is no bundle.
 ///
 /// # Safety
@@ -46,7 +68,7 @@ struct Way {
 #[inline(always)]
 pub(super) unsafe fn bundle<S: Simd>(rays: &[Ray]) -> usize {
     // Rejects most rays that are in no bundle at once.
-    if rays.len() < LEAST || !starts_as(&rays[1], &rays[0]) || !(rays[0].tmax > rays[0].tmin) {
+    if rays.len() < LEAST || !starts_as(&rays[1], &rays[0]) || !starts_as(&rays[0], &rays[0]) {
         return 0;
     }
     let rays = &rays[..rays.len().min(SIZE)];
@@ -88,13 +110,13 @@ fn longest_axis(d: [f32; 3]) -> Option<usize> {
     (LARGEST.contains(&largest) && least > STEEP * largest).then_some(k)
 }
 
-/// Whether two rays have the same origin and range, bit for bit.
+/// Whether a ray is not empty and has the same origin and tmin as another, bit for bit.
 #[inline(always)]
 fn starts_as(a: &Ray, b: &Ray) -> bool {
     // All at once, without branches.
     let differ = |a: f32, b: f32| a.to_bits() ^ b.to_bits();
     let origin = (0..3).fold(0, |sum, i| sum | differ(a.origin[i], b.origin[i]));
-    origin | differ(a.tmin, b.tmin) | differ(a.tmax, b.tmax) == 0
+    (origin | differ(a.tmin, b.tmin) == 0) & (a.tmax > a.tmin)
 }
 
 /// Whether a ray goes the way of others whose slopes are given, to which its own are added.
@@ -124,7 +146,7 @@ unsafe fn eights<S: Simd>(rays: &[Ray], &Way { axes: [i, j, k], sign }: &Way) ->
     unsafe {
         let splat = |x: f32| S::F8::splat(x);
         let [si, sj, sk] = [splat(sign[i]), splat(sign[j]), splat(sign[k])];
-        let (steep, one) = (splat(STEEP), splat(1.0));
+        let (steep, one, tmin) = (splat(STEEP), splat(1.0), splat(rays[0].tmin));
         let (mut least, mut most) = ([splat(f32::INFINITY); 2], [splat(0.0); 2]);
         for eight in rays.chunks_exact(8) {
             let mut differ = [0; 8];
@@ -132,13 +154,14 @@ unsafe fn eights<S: Simd>(rays: &[Ray], &Way { axes: [i, j, k], sign }: &Way) ->
                 let bits: [u32; 8] = bytemuck::cast(*ray);
                 differ = from_fn(|a| differ[a] | bits[a] ^ first[a]);
             }
-            let d = directions::<S>(eight);
+            let (d, tmax) = directions_and_ends::<S>(eight);
             let (x, y, z) = (d[i] * si, d[j] * sj, d[k] * sk);
             let limit = steep * z;
             let is_alike = x.lt(z).and(y.lt(z)).and(limit.lt(x)).and(limit.lt(y));
             let is_alike = is_alike.and(splat(*LARGEST.start()).le(z)).and(z.le(splat(*LARGEST.end())));
-            let [ox, oy, oz, tmin, _, _, _, tmax] = differ;
-            if ox | oy | oz | tmin | tmax != 0 || is_alike.bits() & 0xff != 0xff {
+            let is_alike = is_alike.and(tmin.lt(tmax));
+            let [ox, oy, oz, begin, ..] = differ;
+            if ox | oy | oz | begin != 0 || is_alike.bits() & 0xff != 0xff {
                 break;
             }
             let inverse = one.div(z);
@@ -151,15 +174,15 @@ unsafe fn eights<S: Simd>(rays: &[Ray], &Way { axes: [i, j, k], sign }: &Way) ->
     }
 }
 
-/// The directions of eight rays, by component.
+/// The directions of eight rays, by component, and their tmax.
 ///
 /// # Safety
 /// The CPU must have the ISA, and there must be eight rays.
 #[inline(always)]
-pub(super) unsafe fn directions<S: Simd>(rays: &[Ray]) -> [S::F8; 3] {
+pub(super) unsafe fn directions_and_ends<S: Simd>(rays: &[Ray]) -> ([S::F8; 3], S::F8) {
     debug_assert_eq!(rays.len(), 8);
     // SAFETY: forwarded; a ray is eight floats.
     let rows = from_fn(|r| unsafe { S::F8::load(rays.as_ptr().add(r).cast()) });
-    let [_, _, _, _, x, y, z, _] = S::F8::transpose(rows);
-    [x, y, z]
+    let [_, _, _, _, x, y, z, tmax] = S::F8::transpose(rows);
+    ([x, y, z], tmax)
 }

@@ -1,16 +1,15 @@
 //! Rays through instances (the two levels of [`crate::bvh::instances`]): each ray goes from box to box through the tree
 //! over instances, nearest first, and at each box through the tree of the instance's mesh, up to its best hit so far.
 //!
-//! Many rays do so by turns: all go on to their next box, then those that wait at one instance go through its mesh
-//! together, as a stream where they are many. (The queues of Pharr et al., *Rendering Complex Scenes with
-//! Memory-Coherent Ray Tracing*, 1997.) Transformed rays keep the length of their direction, so that distances are those
-//! in the scene, and the arithmetic of a transformed ray does not depend on the rays beside it: hits are the same, bit
-//! for bit, for one ray and for many.
+//! Rays that go alike do so [as lists](super::box_lists), others [one by one](super::two_levels), many at a time.
+//! Transformed rays keep the length of their direction, so that distances are those in the scene, and the arithmetic of a
+//! transformed ray does not depend on the rays beside it: hits are the same, bit for bit, for one ray and for many.
 
+use super::box_lists::{self, MAX_RAYS};
 use super::filter::Filter;
 use super::queries::TreeView;
 use super::single::Walk;
-use super::{RawHit, Ray};
+use super::{Kernels, RawHit, Ray};
 use crate::base::geometry::NONE;
 use crate::bvh::instances::{Instances, PlacedTree};
 use crate::bvh::{ChildRef, Mbvh};
@@ -19,9 +18,6 @@ use glam::Vec3A;
 use std::cell::Cell;
 use std::mem::MaybeUninit;
 
-/// Maximum number of rays that go by turns.
-const BATCH: usize = 1024;
-
 /// Least number of rays at one instance that are traced as a stream.
 const LEAST_STREAM: usize = 16;
 
@@ -29,11 +25,20 @@ const LEAST_STREAM: usize = 16;
 pub(super) trait Answer: Copy {
     const MISS: Self;
 
+    /// What a hit says.
+    fn of(hit: RawHit) -> Self;
+
     /// The buffer of answers in a room.
     fn buffer(room: &mut Buffers) -> &mut Vec<Self>;
 
     /// How far the ray goes on; `None` if its answer cannot change.
     fn tmax(&self, ray: &Ray) -> Option<f32>;
+
+    /// Traces rays through instances, one by one.
+    fn trace_instances(scene: &Scene, instances: &Instances, rays: &[Ray], answers: &mut [Self]);
+
+    /// Number of rays before the first that are faster together, and of those.
+    fn next_bundles(kernels: &Kernels, rays: &[Ray]) -> (usize, usize);
 
     /// Traces rays through what is below a node of a tree; `alike`: as a stream if there are enough.
     fn trace(scene: &Scene, tree: TreeView, root: ChildRef, rays: &[Ray], alike: bool, out: &mut [Self]);
@@ -45,6 +50,11 @@ pub(super) trait Answer: Copy {
 impl Answer for RawHit {
     const MISS: RawHit = RawHit::MISS;
 
+    #[inline]
+    fn of(hit: RawHit) -> RawHit {
+        hit
+    }
+
     fn buffer(room: &mut Buffers) -> &mut Vec<RawHit> {
         &mut room.hits
     }
@@ -52,6 +62,14 @@ impl Answer for RawHit {
     #[inline]
     fn tmax(&self, ray: &Ray) -> Option<f32> {
         Some(if self.is_miss() { ray.tmax } else { self.t })
+    }
+
+    fn trace_instances(scene: &Scene, instances: &Instances, rays: &[Ray], answers: &mut [RawHit]) {
+        scene.kernels().intersect_instances(scene, instances, rays, answers);
+    }
+
+    fn next_bundles(kernels: &Kernels, rays: &[Ray]) -> (usize, usize) {
+        kernels.next_bundles(rays)
     }
 
     fn trace(scene: &Scene, tree: TreeView, root: ChildRef, rays: &[Ray], alike: bool, out: &mut [RawHit]) {
@@ -81,6 +99,11 @@ impl Answer for RawHit {
 impl Answer for u8 {
     const MISS: u8 = 0;
 
+    #[inline]
+    fn of(hit: RawHit) -> u8 {
+        !hit.is_miss() as u8
+    }
+
     fn buffer(room: &mut Buffers) -> &mut Vec<u8> {
         &mut room.occluded
     }
@@ -88,6 +111,15 @@ impl Answer for u8 {
     #[inline]
     fn tmax(&self, ray: &Ray) -> Option<f32> {
         (*self == 0).then_some(ray.tmax)
+    }
+
+    fn trace_instances(scene: &Scene, instances: &Instances, rays: &[Ray], answers: &mut [u8]) {
+        scene.kernels().occluded_instances(scene, instances, rays, answers);
+    }
+
+    /// There are no bundles to any hit.
+    fn next_bundles(_: &Kernels, rays: &[Ray]) -> (usize, usize) {
+        (rays.len(), 0)
     }
 
     fn trace(scene: &Scene, tree: TreeView, root: ChildRef, rays: &[Ray], alike: bool, out: &mut [u8]) {
@@ -108,19 +140,17 @@ impl Answer for u8 {
 }
 
 /// The ray in the coordinates of an instance's mesh.
-#[inline]
-fn to_mesh(at: &PlacedTree, ray: &Ray, tmax: f32) -> Ray {
-    let origin = at.to_mesh * (Vec3A::from(ray.origin) - at.origin);
-    let direction = at.to_mesh * Vec3A::from(ray.direction);
+#[inline(always)]
+pub(super) fn to_mesh(at: &PlacedTree, ray: &Ray, tmax: f32) -> Ray {
+    let turned = |v: Vec3A| at.to_mesh.x_axis * v.x + at.to_mesh.y_axis * v.y + at.to_mesh.z_axis * v.z;
+    let (origin, direction) = (turned(Vec3A::from(ray.origin) - at.origin), turned(Vec3A::from(ray.direction)));
     Ray { origin: origin.into(), tmin: ray.tmin, direction: direction.into(), tmax }
 }
 
-/// Working memory of a thread for rays that go by turns, kept for the next ones: 4.7 MB, of which little is touched.
+/// Working memory of a thread for rays that go as lists, kept for the next ones.
 #[derive(Default)]
 struct Room {
-    walks: Vec<Walk>,
-    /// The instance that a ray waits at, above the number of the ray.
-    visits: Vec<u64>,
+    lists: box_lists::Room,
     rays: Vec<Ray>,
     found: Buffers,
 }
@@ -135,7 +165,7 @@ pub(super) struct Buffers {
 thread_local! {
     static ROOM: Cell<Room> = const {
         let found = Buffers { hits: Vec::new(), occluded: Vec::new() };
-        Cell::new(Room { walks: Vec::new(), visits: Vec::new(), rays: Vec::new(), found })
+        Cell::new(Room { lists: box_lists::Room::new(), rays: Vec::new(), found })
     };
 }
 
@@ -154,26 +184,22 @@ impl Scene {
         if let ([ray], [answer]) = (rays, &mut *answers) {
             return self.meet_one_by_one(instances, ray, answer);
         }
-        let mut room = ROOM.try_with(Cell::take).unwrap_or_default();
-        let size = rays.len().min(BATCH);
-        room.walks.clear();
-        room.visits.clear();
-        room.rays.clear();
-        let has_room = room.walks.try_reserve_exact(size).is_ok()
-            && room.visits.try_reserve(size).is_ok()
-            && room.rays.try_reserve(size).is_ok()
-            && A::buffer(&mut room.found).try_reserve(size).is_ok();
-        if has_room {
-            for (rays, answers) in rays.chunks(BATCH).zip(answers.chunks_mut(BATCH)) {
-                self.meet_by_turns(instances, rays, alike, answers, &mut room);
+        let mut start = 0;
+        while start < rays.len() {
+            let rest = &rays[start..];
+            let (apart, together) = if alike { (0, rest.len()) } else { A::next_bundles(self.kernels(), rest) };
+            if apart > 0 {
+                A::trace_instances(self, instances, &rest[..apart], &mut answers[start..start + apart]);
             }
-        } else {
-            rays.iter().zip(answers).for_each(|(ray, answer)| self.meet_one_by_one(instances, ray, answer));
+            if together > 0 {
+                let these = apart..apart + together;
+                self.meet_as_lists(instances, &rest[these], alike, &mut answers[start + apart..][..together]);
+            }
+            start += apart + together;
         }
-        let _ = ROOM.try_with(|kept| kept.set(room));
     }
 
-    fn meet_one_by_one<A: Answer>(&self, instances: &Instances, ray: &Ray, answer: &mut A) {
+    pub(super) fn meet_one_by_one<A: Answer>(&self, instances: &Instances, ray: &Ray, answer: &mut A) {
         let kernels = self.kernels();
         let mut place = MaybeUninit::uninit();
         if answer.tmax(ray).is_none() || !Walk::begin::<Mbvh>(&mut place, ChildRef::ROOT, ray, 0) {
@@ -200,54 +226,53 @@ impl Scene {
         }
     }
 
-    /// `room` has capacity for as many rays.
-    fn meet_by_turns<A: Answer>(
+    fn meet_as_lists<A: Answer>(&self, instances: &Instances, rays: &[Ray], alike: bool, answers: &mut [A]) {
+        let mut room = ROOM.try_with(Cell::take).unwrap_or_default();
+        let size = rays.len().min(MAX_RAYS);
+        room.rays.clear();
+        let has_memory = room.lists.has_memory()
+            && room.rays.try_reserve(size).is_ok()
+            && A::buffer(&mut room.found).try_reserve(size).is_ok();
+        if has_memory {
+            for (rays, answers) in rays.chunks(MAX_RAYS).zip(answers.chunks_mut(MAX_RAYS)) {
+                self.meet_list(instances, rays, alike, answers, &mut room);
+            }
+        } else {
+            A::trace_instances(self, instances, rays, answers);
+        }
+        let _ = ROOM.try_with(|kept| kept.set(room));
+    }
+
+    /// `room` has memory for as many rays.
+    fn meet_list<A: Answer>(
         &self,
         instances: &Instances,
         rays: &[Ray],
         alike: bool,
         answers: &mut [A],
-        room: &mut Room,
+        Room { lists, found, rays: alone }: &mut Room,
     ) {
-        let kernels = self.kernels();
-        let Room { walks, visits, rays: turned, found } = room;
         let found = A::buffer(found);
-        let walks = &mut walks.spare_capacity_mut()[..rays.len()];
-        visits.clear();
-        for (r, ((ray, answer), place)) in rays.iter().zip(&*answers).zip(&mut *walks).enumerate() {
-            if answer.tmax(ray).is_some() && Walk::begin::<Mbvh>(place, ChildRef::ROOT, ray, r) {
-                visits.push(r as u64);
+        let count = lists.take(rays.iter().zip(&*answers).map(|(ray, answer)| (ray, answer.tmax(ray))));
+        self.kernels().list_instances(instances, count, lists, &mut |mut visit| {
+            let at = &instances.placed[visit.instance as usize];
+            found.clear();
+            found.resize(visit.rays.len(), A::MISS);
+            A::trace(self, self.tree_of(instances, at.tree), ChildRef::ROOT, visit.rays, alike, found);
+            for (&number, &found) in visit.numbers.iter().zip(&*found) {
+                let answer = &mut answers[number as usize];
+                answer.add(found, at.first_triangle);
+                visit.end(number, answer.tmax(&rays[number as usize]));
             }
-        }
-        loop {
-            visits.retain_mut(|visit| {
-                let r = *visit as u32 as usize;
-                let Some(tmax) = answers[r].tmax(&rays[r]) else { return false };
-                // SAFETY: the walks of rays among the visits have begun.
-                let walk = unsafe { walks[r].assume_init_mut() };
-                let instance = kernels.next_box(&instances.top, walk, tmax);
-                *visit = u64::from(instance) << 32 | r as u64;
-                instance != NONE
-            });
-            if visits.is_empty() {
-                return;
-            }
-            visits.sort_unstable();
-            for at_one in visits.chunk_by(|a, b| a >> 32 == b >> 32) {
-                let at = &instances.placed[(at_one[0] >> 32) as usize];
-                let ray = |&visit: &u64| {
-                    let r = visit as u32 as usize;
-                    to_mesh(at, &rays[r], answers[r].tmax(&rays[r]).unwrap_or(0.0))
-                };
-                turned.clear();
-                turned.extend(at_one.iter().map(ray));
-                found.clear();
-                found.resize(turned.len(), A::MISS);
-                A::trace(self, self.tree_of(instances, at.tree), ChildRef::ROOT, turned, alike, found);
-                for (&visit, &found) in at_one.iter().zip(&*found) {
-                    answers[visit as u32 as usize].add(found, at.first_triangle);
-                }
-            }
+        });
+        if !lists.alone().is_empty() {
+            let numbers = || lists.alone().iter().map(|&number| number as usize);
+            alone.clear();
+            alone.extend(numbers().map(|number| rays[number]));
+            found.clear();
+            found.extend(numbers().map(|number| answers[number]));
+            A::trace_instances(self, instances, alone, found);
+            numbers().zip(&*found).for_each(|(number, &found)| answers[number] = found);
         }
     }
 

@@ -7,10 +7,12 @@ use super::compact::View;
 use super::filter::Filter;
 use super::single::Walk;
 use super::tree::{Leaf, Tree};
-use super::{PACKET_SIZE, Packet, RawHit, Ray, gather, packet, single, stream};
+use super::{PACKET_SIZE, Packet, RawHit, Ray, box_lists, bundle, gather, packet, single, stream, two_levels};
 use crate::base::geometry::NONE;
+use crate::bvh::instances::Instances;
 use crate::bvh::{ChildRef, Mbvh};
 use crate::device::Device;
+use crate::scene::Scene;
 use crate::simd::{self, Isa, entry_point, isa_features};
 use glam::Vec3;
 
@@ -31,6 +33,10 @@ pub(crate) struct Kernels {
     filtered: [unsafe fn(&Mbvh, &Ray, &mut Filter) -> RawHit; 2],
     compact_filtered: [unsafe fn(&View, &Ray, &mut Filter) -> RawHit; 2],
     next_box: unsafe fn(&Mbvh, &mut Walk, f32) -> u32,
+    list_instances: unsafe fn(&Instances, usize, &mut box_lists::Room, &mut dyn FnMut(box_lists::Visit)),
+    next_bundles: unsafe fn(&[Ray]) -> (usize, usize),
+    intersect_instances: unsafe fn(&Scene, &Instances, &[Ray], &mut [RawHit]),
+    occluded_instances: unsafe fn(&Scene, &Instances, &[Ray], &mut [u8]),
 }
 
 /// Kernels of streams. On AVX-512 there are two of each: with VBMI2 and without.
@@ -149,6 +155,27 @@ macro_rules! table {
                 }
             } }
 
+            isa_features! { $isa => entry_point! {
+                fn list_instances(
+                    instances: &Instances, count: usize, room: &mut box_lists::Room, visit: &mut dyn FnMut(box_lists::Visit)
+                ) {
+                    box_lists::trace::<S>(instances, count, room, visit)
+                }
+            } }
+            isa_features! { $isa => entry_point! {
+                fn next_bundles(rays: &[Ray]) -> (usize, usize) { bundle::next::<S>(rays) }
+            } }
+            isa_features! { $isa => entry_point! {
+                fn intersect_instances(scene: &Scene, instances: &Instances, rays: &[Ray], out: &mut [RawHit]) {
+                    two_levels::trace::<S, _, false>(scene, instances, rays, out)
+                }
+            } }
+            isa_features! { $isa => entry_point! {
+                fn occluded_instances(scene: &Scene, instances: &Instances, rays: &[Ray], out: &mut [u8]) {
+                    two_levels::trace::<S, _, true>(scene, instances, rays, out)
+                }
+            } }
+
             pub(super) const TABLE: Kernels = Kernels {
                 intersect,
                 intersect_block,
@@ -161,6 +188,10 @@ macro_rules! table {
                 filtered: [filtered::<false>, filtered::<true>],
                 compact_filtered: [compact_filtered::<false>, compact_filtered::<true>],
                 next_box,
+                list_instances,
+                next_bundles,
+                intersect_instances,
+                occluded_instances,
             };
         }
         static $name: Kernels = $module::TABLE;
@@ -316,5 +347,35 @@ impl Kernels {
     pub(super) fn next_box(&self, boxes: &Mbvh, walk: &mut Walk, tmax: f32) -> u32 {
         // SAFETY: see `intersect`.
         unsafe { (self.next_box)(boxes, walk, tmax) }
+    }
+
+    /// Takes rays that go alike through the tree over instances: see [`box_lists::trace`].
+    pub(super) fn list_instances(
+        &self,
+        instances: &Instances,
+        count: usize,
+        room: &mut box_lists::Room,
+        visit: &mut dyn FnMut(box_lists::Visit),
+    ) {
+        // SAFETY: see `intersect`.
+        unsafe { (self.list_instances)(instances, count, room, visit) }
+    }
+
+    /// Number of rays before the first that are faster together, and of those.
+    pub(super) fn next_bundles(&self, rays: &[Ray]) -> (usize, usize) {
+        // SAFETY: see `intersect`.
+        unsafe { (self.next_bundles)(rays) }
+    }
+
+    /// Closest hits of rays in instances, one by one, where they are nearer than what `out` says.
+    pub(super) fn intersect_instances(&self, scene: &Scene, instances: &Instances, rays: &[Ray], out: &mut [RawHit]) {
+        // SAFETY: see `intersect`.
+        unsafe { (self.intersect_instances)(scene, instances, rays, out) }
+    }
+
+    /// Any hit of rays in instances, one by one, of those that have none according to `out`.
+    pub(super) fn occluded_instances(&self, scene: &Scene, instances: &Instances, rays: &[Ray], out: &mut [u8]) {
+        // SAFETY: see `intersect`.
+        unsafe { (self.occluded_instances)(scene, instances, rays, out) }
     }
 }

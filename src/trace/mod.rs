@@ -6,6 +6,7 @@
 
 pub mod baseline;
 mod beams;
+mod box_lists;
 mod bundle;
 mod compact;
 pub(crate) mod filter;
@@ -27,6 +28,7 @@ mod stream;
 mod stream_rays;
 mod tree;
 mod triangle;
+mod two_levels;
 mod waiting;
 mod whole;
 

@@ -21,7 +21,7 @@
 //!
 //! The file is long because all of it is inlined into one entry point per instruction set.
 
-use super::bundle::{LEAST, SIZE, bundle, directions};
+use super::bundle::{LEAST, SIZE, bundle, directions_and_ends};
 use super::single;
 use super::tree::{BEYOND, EPSILON, OFFSET_ERROR, beyond};
 use super::triangle::{GRAZING, Projected, Shear, V3, accurate_distance, barycentrics};
@@ -287,7 +287,7 @@ unsafe fn trace<S: Simd>(bvh: &Mbvh, root: ChildRef, rays: &[Ray], out: &mut [Ra
 #[inline(always)]
 unsafe fn begin<'a, S: Simd>(rays: &[Ray], place: &'a mut MaybeUninit<Bundle>) -> (&'a mut Bundle, Shared, Frustum) {
     let width = S::Packet::WIDTH;
-    let Ray { origin, direction, tmin, tmax } = rays[0];
+    let Ray { origin, direction, tmin, .. } = rays[0];
     let axes = Shear::new(origin, direction).axes.map(|a| a as usize);
     let negative = direction.map(|d| d < 0.0);
     let shift = 3 * (negative[0] as u32 | (negative[1] as u32) << 1 | (negative[2] as u32) << 2);
@@ -302,16 +302,16 @@ unsafe fn begin<'a, S: Simd>(rays: &[Ray], place: &'a mut MaybeUninit<Bundle>) -
     for (g, eight) in eights.iter().enumerate() {
         // SAFETY: the caller vouches for the ISA; columns have room for as many eights.
         unsafe {
-            let directions = directions::<S>(eight);
+            let (directions, tmax) = directions_and_ends::<S>(eight);
             b.direction.iter_mut().zip(directions).for_each(|(column, d)| store(column, g, d));
-            store(&mut b.limit, g, S::F8::splat(beyond(tmax)));
+            store(&mut b.t, g, tmax);
         }
     }
     for i in 8 * eights.len()..shared.groups * width {
         let ray = rest.get(i - 8 * eights.len());
-        let (d, limit) = ray.map_or((direction, f32::NEG_INFINITY), |ray| (ray.direction, beyond(tmax)));
+        let (d, tmax) = ray.map_or((direction, f32::MIN), |ray| (ray.direction, ray.tmax));
         (b.direction[0][i], b.direction[1][i], b.direction[2][i]) = (d[0], d[1], d[2]);
-        b.limit[i] = limit;
+        b.t[i] = tmax;
     }
     // SAFETY: the caller vouches for the ISA; groups are of the bundle.
     unsafe {
@@ -340,7 +340,9 @@ unsafe fn begin<'a, S: Simd>(rays: &[Ray], place: &'a mut MaybeUninit<Bundle>) -
             store(&mut b.shear[1], g, d[j] * inverse);
             store(&mut b.grazing, g, splat(GRAZING) * (abs(d[0]) + abs(d[1]) + abs(d[2])));
             store(&mut b.length, g, length);
-            store(&mut b.t, g, splat(tmax));
+            let t = lanes::<S::Packet>(&b.t, g);
+            // As `beyond`.
+            store(&mut b.limit, g, t + splat(BEYOND) * abs(t));
             store(&mut b.u, g, zero);
             store(&mut b.v, g, zero);
             store(&mut b.sum, g, splat(1.0));

@@ -72,6 +72,12 @@ impl Scene {
         }
     }
 
+    /// The acceleration structure where rays begin; `None` if all meshes have instances.
+    #[inline]
+    fn first_tree(&self) -> Option<TreeView<'_>> {
+        (self.instance_trees().is_none() || !self.acceleration().0.is_nothing()).then(|| self.tree())
+    }
+
     /// The acceleration structure, for kernels.
     #[inline]
     pub(super) fn whole_tree(&self) -> TreeView<'_> {
@@ -315,9 +321,10 @@ impl Scene {
     /// are left alone.
     #[inline]
     pub fn gather_packet(&self, origin: Vec3, packet: &Packet, tmin: f32, tmax: f32, out: &mut [RawHit; PACKET_SIZE]) {
-        match self.tree() {
-            TreeView::Whole(tree) => self.kernels().gather(tree, origin, packet, tmin, tmax, out),
-            TreeView::Compact(tree) => {
+        match self.first_tree() {
+            None => out[..packet.count.min(PACKET_SIZE)].fill(RawHit::MISS),
+            Some(TreeView::Whole(tree)) => self.kernels().gather(tree, origin, packet, tmin, tmax, out),
+            Some(TreeView::Compact(tree)) => {
                 let count = packet.count.min(PACKET_SIZE);
                 let rays: [Ray; PACKET_SIZE] = std::array::from_fn(|i| {
                     Ray::new(origin, Vec3::new(packet.x[i], packet.y[i], packet.z[i])).within(tmin, tmax)
@@ -340,9 +347,10 @@ impl Scene {
     /// Closest hit with `tmin < t ≤ tmax`, by global triangle number.
     #[inline]
     pub fn intersect_raw(&self, ray: &Ray) -> RawHit {
-        let mut hit = [match self.tree() {
-            TreeView::Whole(tree) => self.kernels().intersect(tree, ray),
-            TreeView::Compact(tree) => {
+        let mut hit = [match self.first_tree() {
+            None => RawHit::MISS,
+            Some(TreeView::Whole(tree)) => self.kernels().intersect(tree, ray),
+            Some(TreeView::Compact(tree)) => {
                 let mut hit = [RawHit::MISS];
                 self.kernels().compact_intersect(&tree, ChildRef::ROOT, std::slice::from_ref(ray), &mut hit);
                 hit[0]
@@ -370,9 +378,10 @@ impl Scene {
     #[inline]
     pub(super) fn anything_on(&self, ray: &Ray) -> bool {
         let mut occluded = [0];
-        match self.tree() {
-            TreeView::Whole(tree) => occluded[0] = self.kernels().occluded(tree, ray) as u8,
-            TreeView::Compact(tree) => {
+        match self.first_tree() {
+            None => {}
+            Some(TreeView::Whole(tree)) => occluded[0] = self.kernels().occluded(tree, ray) as u8,
+            Some(TreeView::Compact(tree)) => {
                 self.kernels().compact_occluded(&tree, ChildRef::ROOT, std::slice::from_ref(ray), &mut occluded);
             }
         }
@@ -383,9 +392,10 @@ impl Scene {
 
     /// Closest hits of as many rays as both slices have.
     pub(crate) fn intersect_block(&self, rays: &[Ray], out: &mut [RawHit]) {
-        match self.tree() {
-            TreeView::Whole(tree) => self.kernels().intersect_block(tree, ChildRef::ROOT, rays, out),
-            TreeView::Compact(tree) => self.kernels().compact_intersect(&tree, ChildRef::ROOT, rays, out),
+        match self.first_tree() {
+            None => out.iter_mut().take(rays.len()).for_each(|out| *out = RawHit::MISS),
+            Some(TreeView::Whole(tree)) => self.kernels().intersect_block(tree, ChildRef::ROOT, rays, out),
+            Some(TreeView::Compact(tree)) => self.kernels().compact_intersect(&tree, ChildRef::ROOT, rays, out),
         }
         self.meet_parts(rays, false, out);
         self.meet_instances(rays, false, out);
@@ -397,9 +407,10 @@ impl Scene {
     /// Closest hits of as many rays as both slices have, which start near one another: traced as a stream. The hits are
     /// those of [`intersect_raw`](Self::intersect_raw), bit for bit.
     pub fn intersect_stream(&self, rays: &[Ray], out: &mut [RawHit]) {
-        match self.tree() {
-            TreeView::Whole(tree) => self.kernels().stream(tree, ChildRef::ROOT, rays, out),
-            TreeView::Compact(tree) => self.kernels().compact_stream(&tree, ChildRef::ROOT, rays, out),
+        match self.first_tree() {
+            None => out.iter_mut().take(rays.len()).for_each(|out| *out = RawHit::MISS),
+            Some(TreeView::Whole(tree)) => self.kernels().stream(tree, ChildRef::ROOT, rays, out),
+            Some(TreeView::Compact(tree)) => self.kernels().compact_stream(&tree, ChildRef::ROOT, rays, out),
         }
         self.meet_parts(rays, true, out);
         self.meet_instances(rays, true, out);
@@ -410,9 +421,10 @@ impl Scene {
 
     /// Any hit of as many rays as both slices have, which start near one another, traced as a stream: 1 or 0.
     pub fn occluded_stream(&self, rays: &[Ray], out: &mut [u8]) {
-        match self.tree() {
-            TreeView::Whole(tree) => self.kernels().stream_occluded(tree, ChildRef::ROOT, rays, out),
-            TreeView::Compact(tree) => self.kernels().compact_stream_occluded(&tree, ChildRef::ROOT, rays, out),
+        match self.first_tree() {
+            None => out.iter_mut().take(rays.len()).for_each(|out| *out = 0),
+            Some(TreeView::Whole(tree)) => self.kernels().stream_occluded(tree, ChildRef::ROOT, rays, out),
+            Some(TreeView::Compact(tree)) => self.kernels().compact_stream_occluded(&tree, ChildRef::ROOT, rays, out),
         }
         self.meet_parts(rays, true, out);
         self.meet_instances(rays, true, out);
@@ -423,9 +435,10 @@ impl Scene {
 
     /// Any hit of as many rays as both slices have: 1 or 0.
     pub(crate) fn occluded_block(&self, rays: &[Ray], out: &mut [u8]) {
-        match self.tree() {
-            TreeView::Whole(tree) => self.kernels().occluded_block(tree, ChildRef::ROOT, rays, out),
-            TreeView::Compact(tree) => self.kernels().compact_occluded(&tree, ChildRef::ROOT, rays, out),
+        match self.first_tree() {
+            None => out.iter_mut().take(rays.len()).for_each(|out| *out = 0),
+            Some(TreeView::Whole(tree)) => self.kernels().occluded_block(tree, ChildRef::ROOT, rays, out),
+            Some(TreeView::Compact(tree)) => self.kernels().compact_occluded(&tree, ChildRef::ROOT, rays, out),
         }
         self.meet_parts(rays, false, out);
         self.meet_instances(rays, false, out);

@@ -118,10 +118,13 @@ unsafe fn leaf<S: Simd, T: Tree, A: Accept, const ANY: bool>(
 /// begin. No box begins behind the closest hit so far. The lowest [`BOTTOM`] entries are [`ChildRef::EMPTY`], which end
 /// the traversal.
 struct Stack {
-    near: [MaybeUninit<f32>; BOTTOM + STACK_SIZE],
-    child: [MaybeUninit<ChildRef>; BOTTOM + STACK_SIZE],
+    near: [MaybeUninit<f32>; BOTTOM + OUTER + STACK_SIZE],
+    child: [MaybeUninit<ChildRef>; BOTTOM + OUTER + STACK_SIZE],
     count: usize,
 }
+
+/// Room for what waits in another tree while a ray goes through one: see [`Walk::enter`].
+const OUTER: usize = 128;
 
 /// Number of sentinels at the bottom of the stack: enough that no group of eight entries, counted from the top, reaches
 /// below the stack.
@@ -219,7 +222,7 @@ pub(super) struct Walk {
     /// Factor from the traversal's t to the ray's own t.
     scale: f32,
     /// Index of the ray in its batch.
-    number: usize,
+    pub(super) number: usize,
     stack: Stack,
 }
 
@@ -241,7 +244,7 @@ impl Walk {
         // SAFETY: the pointers lead into `place`. Everything but entries of the stack is written, and
         // those are `MaybeUninit` themselves.
         unsafe {
-            (&raw mut (*p).ray).write(RaySetup::new::<T>(ray.origin, d, tmin));
+            RaySetup::write::<T>(&raw mut (*p).ray, ray.origin, d, tmin);
             (&raw mut (*p).best).write(Best::none(tmax));
             (&raw mut (*p).limit).write(beyond(tmax));
             (&raw mut (*p).current).write(root);
@@ -251,11 +254,6 @@ impl Walk {
             // Sentinels never begin behind a hit, so that `cut` keeps them.
             (&raw mut (*p).stack.near).cast::<[f32; BOTTOM]>().write([f32::NEG_INFINITY; BOTTOM]);
             (&raw mut (*p).stack.child).cast::<[ChildRef; BOTTOM]>().write([ChildRef::EMPTY; BOTTOM]);
-            // The change is made in place: a call that may change a ray keeps the compiler from building it at its
-            // destination, and the ray was then copied through memory twice.
-            if RaySetup::must_be_slow(d) {
-                (*p).ray.make_slow::<T>(ray.origin, d);
-            }
         }
         true
     }
@@ -340,8 +338,50 @@ impl Walk {
         self.current
     }
 
+    /// Goes into a tree that is the current leaf, with the ray in its coordinates. What waits in the outer tree stays on the
+    /// stack, and comes up after the inner one has ended: see [`Self::leave`]. Returns false, and changes nothing, for some
+    /// rays, which need a walk of their own.
+    ///
+    /// # Safety
+    /// The walk must have been begun, and not be in an inner tree.
     #[inline(always)]
-    fn hit(&self) -> RawHit {
+    pub(super) unsafe fn enter<T: Tree>(&mut self, ray: &Ray) -> bool {
+        let can_enter = direction_scale(ray) == Some(1.0)
+            && self.scale == 1.0
+            && ray.tmax > ray.tmin
+            && self.stack.count < BOTTOM + OUTER;
+        if !can_enter {
+            return false;
+        }
+        self.set_ray::<T>(ray);
+        self.best = Best::none(ray.tmax);
+        self.limit = beyond(ray.tmax);
+        self.current = ChildRef::ROOT;
+        self.stack.near[self.stack.count].write(f32::NEG_INFINITY);
+        self.stack.child[self.stack.count].write(ChildRef::EMPTY);
+        self.stack.count += 1;
+        true
+    }
+
+    /// Comes out of an inner tree that has ended, with the ray in the coordinates of the outer one. Returns false if nothing
+    /// waits there.
+    #[inline(always)]
+    pub(super) fn leave<T: Tree>(&mut self, ray: &Ray) -> bool {
+        let has_more = self.stack.count > BOTTOM;
+        if has_more {
+            self.set_ray::<T>(ray);
+        }
+        has_more
+    }
+
+    #[inline(always)]
+    fn set_ray<T: Tree>(&mut self, ray: &Ray) {
+        // SAFETY: the walk's own.
+        unsafe { RaySetup::write::<T>(&raw mut self.ray, ray.origin, ray.direction, ray.tmin) }
+    }
+
+    #[inline(always)]
+    pub(super) fn hit(&self) -> RawHit {
         let mut hit = self.best.hit();
         hit.t *= self.scale;
         hit
@@ -394,7 +434,7 @@ pub(super) unsafe fn one_of<S: Simd, T: Tree, A: Accept, const ANY: bool>(
 
 /// Number of rays under way at the same time. (Sponza, random rays: 4 trace 2.3, 8 trace 2.6, 16 and 32 trace 3.0
 /// Mrays/s.)
-const FLIGHT: usize = 16;
+pub(super) const FLIGHT: usize = 16;
 
 thread_local! {
     /// An empty vector with capacity for [`FLIGHT`] traversals: 73 kB, more than some callers' threads have of stack.
@@ -416,14 +456,65 @@ fn give_room_back(room: Vec<Walk>) {
     let _ = ROOM.try_with(|kept| kept.set(room));
 }
 
+/// What [`fly`] is to traverse.
+pub(super) trait Work<T> {
+    /// Begins the next traversal in a place, of that number among those under way. Returns false when nothing is left.
+    ///
+    /// # Safety
+    /// The CPU must have the ISA.
+    unsafe fn begin<S: Simd>(&mut self, place: &mut MaybeUninit<Walk>, number: usize) -> bool;
+
+    /// Takes what a traversal has found. Returns true if it has begun another one in its place.
+    ///
+    /// # Safety
+    /// The CPU must have the ISA; the traversal must have ended.
+    unsafe fn end<S: Simd>(&mut self, walk: &mut Walk) -> bool;
+
+    /// The tree of a traversal.
+    fn tree(&self, walk: &Walk) -> &T;
+}
+
+/// Rays from 0 to `count`, which `ray` returns, below a node of a tree; `done` receives their hits.
+struct Rays<'a, T, R, D> {
+    tree: &'a T,
+    root: ChildRef,
+    next: usize,
+    count: usize,
+    ray: R,
+    done: D,
+}
+
+impl<T: Tree, R: Fn(usize) -> Ray, D: FnMut(usize, RawHit)> Work<T> for Rays<'_, T, R, D> {
+    #[inline(always)]
+    unsafe fn begin<S: Simd>(&mut self, place: &mut MaybeUninit<Walk>, _: usize) -> bool {
+        while self.next < self.count {
+            let number = self.next;
+            self.next += 1;
+            if Walk::begin::<T>(place, self.root, &(self.ray)(number), number) {
+                return true;
+            }
+            (self.done)(number, RawHit::MISS);
+        }
+        false
+    }
+
+    #[inline(always)]
+    unsafe fn end<S: Simd>(&mut self, walk: &mut Walk) -> bool {
+        (self.done)(walk.number, walk.hit());
+        false
+    }
+
+    #[inline(always)]
+    fn tree(&self, _: &Walk) -> &T {
+        self.tree
+    }
+}
+
 /// Traversals that wait for the same kind of visit: one more than there can be, for a branch-free push.
 type Queue = [*mut Walk; FLIGHT + 1];
 
-/// Traces many rays below the node `root`, [`FLIGHT`] of them at a time: `ray` returns the rays from 0 to `count`, `done` receives their
-/// hits, in any order.
-///
-/// While one ray waits for memory, others go on; and visits of nodes and of leaves are done by turns
-/// for all rays under way, so that the kind of the next child is not a branch to be mispredicted.
+/// Traces many rays below the node `root`, [`FLIGHT`] of them at a time: `ray` returns the rays from 0 to `count`,
+/// `done` receives their hits, in any order.
 ///
 /// # Safety
 /// The CPU must have the ISA.
@@ -433,8 +524,21 @@ pub(super) unsafe fn many<S: Simd, T: Tree, const ANY: bool>(
     root: ChildRef,
     count: usize,
     ray: impl Fn(usize) -> Ray,
-    mut done: impl FnMut(usize, RawHit),
+    done: impl FnMut(usize, RawHit),
 ) {
+    // SAFETY: forwarded.
+    unsafe { fly::<S, T, ANY>(&mut Rays { tree, root, next: 0, count, ray, done }) }
+}
+
+/// Does `work`, [`FLIGHT`] traversals at a time.
+///
+/// While one ray waits for memory, others go on; and visits of nodes and of leaves are done by turns
+/// for all rays under way, so that the kind of the next child is not a branch to be mispredicted.
+///
+/// # Safety
+/// The CPU must have the ISA.
+#[inline(always)]
+pub(super) unsafe fn fly<S: Simd, T: Tree, const ANY: bool>(work: &mut impl Work<T>) {
     let mut room = take_room();
     let mut place = MaybeUninit::uninit();
     let (first, flight) = match room.capacity() {
@@ -445,21 +549,21 @@ pub(super) unsafe fn many<S: Simd, T: Tree, const ANY: bool>(
     let (mut at_nodes, mut at_leaves): (Queue, Queue) = ([std::ptr::null_mut(); _], [std::ptr::null_mut(); _]);
     let (idle, at_nodes, at_leaves) = (idle.as_mut_ptr(), at_nodes.as_mut_ptr(), at_leaves.as_mut_ptr());
     let (mut idle_count, mut node_count, mut leaf_count) = (flight, 0, 0);
-    let mut next = 0;
     // Every traversal is in one queue, so that no queue holds more than FLIGHT; the blocks below rely on that.
     loop {
-        while idle_count > 0 && next < count {
-            // SAFETY: the queue's last entry, which names one of the places; nothing else refers to an idle one.
-            let place = unsafe { &mut *(*idle.add(idle_count - 1)).cast() };
-            if Walk::begin::<T>(place, root, &ray(next), next) {
+        while idle_count > 0 {
+            // SAFETY: the queue's last entry, which names one of the places; nothing else refers to an idle one. The
+            // caller vouches for the ISA.
+            unsafe {
+                let walk = *idle.add(idle_count - 1);
+                if !work.begin::<S>(&mut *walk.cast(), walk.offset_from_unsigned(first)) {
+                    break;
+                }
                 idle_count -= 1;
-                // SAFETY: the walk was idle, so that there is room among those at nodes.
-                unsafe { *at_nodes.add(node_count) = place.as_mut_ptr() };
+                // The walk was idle, so that there is room among those at nodes.
+                *at_nodes.add(node_count) = walk;
                 node_count += 1;
-            } else {
-                done(next, RawHit::MISS);
             }
-            next += 1;
         }
         if idle_count == flight {
             return give_room_back(room);
@@ -467,7 +571,6 @@ pub(super) unsafe fn many<S: Simd, T: Tree, const ANY: bool>(
         // Puts a traversal into the queue of its next visit: it is written to both queues, but counted in one, at or
         // before the position that is read next.
         let enqueue = |walk: *mut Walk, child: ChildRef, nodes: &mut usize, leaves: &mut usize| {
-            tree.prefetch(child);
             // SAFETY: at most FLIGHT walks are counted in a queue, and each has room for one more.
             unsafe {
                 *at_nodes.add(*nodes) = walk;
@@ -482,7 +585,10 @@ pub(super) unsafe fn many<S: Simd, T: Tree, const ANY: bool>(
             // vouches for the ISA.
             let (walk, child) = unsafe {
                 let walk = *at_nodes.add(k);
-                (walk, (*walk).visit_node::<S, T, false, ANY>(tree))
+                let tree = work.tree(&*walk);
+                let child = (*walk).visit_node::<S, T, false, ANY>(tree);
+                tree.prefetch(child);
+                (walk, child)
             };
             enqueue(walk, child, &mut node_count, &mut leaf_count);
         }
@@ -492,14 +598,20 @@ pub(super) unsafe fn many<S: Simd, T: Tree, const ANY: bool>(
             let walk = unsafe { &mut **at_leaves.add(k) };
             let mut child = walk.current;
             if child != ChildRef::EMPTY {
+                let tree = work.tree(walk);
                 // SAFETY: it has begun in this tree, and is at a leaf. The caller vouches for the ISA.
                 child = unsafe { walk.visit_leaf::<S, T, All, ANY>(tree, &mut All) };
+                if child != ChildRef::EMPTY {
+                    tree.prefetch(child);
+                    enqueue(walk, child, &mut node_count, &mut leaf_count);
+                    continue;
+                }
             }
-            if child != ChildRef::EMPTY {
-                enqueue(walk, child, &mut node_count, &mut leaf_count);
+            // SAFETY: the walk has ended. The caller vouches for the ISA.
+            if unsafe { work.end::<S>(walk) } {
+                enqueue(walk, walk.current, &mut node_count, &mut leaf_count);
                 continue;
             }
-            done(walk.number, walk.hit());
             // SAFETY: the walk was in another queue, so that there is room among the idle ones.
             unsafe { *idle.add(idle_count) = walk };
             idle_count += 1;

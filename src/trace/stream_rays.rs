@@ -272,6 +272,39 @@ pub(super) fn sort_rest(room: &mut Room) -> [usize; SPECIAL + 2] {
     starts
 }
 
+/// What the box test needs of rays: see [`RaySetup`](super::tree::RaySetup).
+pub(super) struct Offsets<L> {
+    pub reciprocal: [L; 3],
+    pub near: [L; 3],
+    pub far: [L; 3],
+    /// Conservative tmax.
+    pub limit: L,
+}
+
+/// Prepares rays for the box test, with the arithmetic of [`RaySetup::new`](super::tree::RaySetup::new).
+///
+/// # Safety
+/// The CPU must have the ISA.
+#[inline(always)]
+pub(super) unsafe fn offsets<L: Lanes>(origin: [L; 3], direction: [L; 3], tmax: L) -> Offsets<L> {
+    // SAFETY: the caller vouches for the ISA.
+    let splat = |x: f32| unsafe { L::splat(x) };
+    let (zero, one, minus) = (splat(0.0), splat(1.0), splat(-1.0));
+    let abs = |x: L| x.max(zero - x);
+    let [dx, dy, dz] = direction;
+    let reciprocal = [one.div(dx), one.div(dy), one.div(dz)];
+    let offset = |a: usize| minus * origin[a] * reciprocal[a];
+    let offset = [offset(0), offset(1), offset(2)];
+    let error = |a: usize| splat(OFFSET_ERROR) * abs(offset[a]);
+    let error = [error(0), error(1), error(2)];
+    Offsets {
+        reciprocal,
+        near: [offset[0] - error[0], offset[1] - error[1], offset[2] - error[2]],
+        far: [offset[0] + error[0], offset[1] + error[1], offset[2] + error[2]],
+        limit: tmax + splat(BEYOND) * abs(tmax),
+    }
+}
+
 /// Slabs and targets of eight rays with the same [axes](Shear::axes), as halves of eight floats.
 ///
 /// # Safety
@@ -284,25 +317,12 @@ unsafe fn set_up<L: Eight>(rays: [L; 8], axes: [usize; 3]) -> ([[L; 8]; 2], [[L;
     let (zero, one, minus) = (splat(0.0), splat(1.0), splat(-1.0));
     let abs = |x: L| x.max(zero - x);
     let (origin, direction) = ([ox, oy, oz], [dx, dy, dz]);
-    let reciprocal = [one.div(dx), one.div(dy), one.div(dz)];
-    let offset = |a: usize| minus * origin[a] * reciprocal[a];
-    let offset = [offset(0), offset(1), offset(2)];
-    let error = |a: usize| splat(OFFSET_ERROR) * abs(offset[a]);
-    let error = [error(0), error(1), error(2)];
-    let limit = tmax + splat(BEYOND) * abs(tmax);
+    // SAFETY: forwarded.
+    let Offsets { reciprocal, near, far, limit } = unsafe { offsets(origin, direction, tmax) };
     let inverse = minus.div(direction[axes[2]]);
     let slabs = [
-        L::transpose([
-            reciprocal[0],
-            reciprocal[1],
-            reciprocal[2],
-            offset[0] - error[0],
-            offset[1] - error[1],
-            offset[2] - error[2],
-            offset[0] + error[0],
-            offset[1] + error[1],
-        ]),
-        L::transpose([offset[2] + error[2], tmin, limit, zero, zero, zero, zero, zero]),
+        L::transpose([reciprocal[0], reciprocal[1], reciprocal[2], near[0], near[1], near[2], far[0], far[1]]),
+        L::transpose([far[2], tmin, limit, zero, zero, zero, zero, zero]),
     ];
     let targets = [
         L::transpose([

@@ -224,8 +224,25 @@ impl RaySetup {
         }
     }
 
+    /// Writes the setup of a ray to `place`, by the box test that it needs. (In place: a call that may change a ray keeps
+    /// the compiler from building it at its destination, and the ray was then copied through memory twice, which stalls
+    /// where wide loads follow narrow stores.)
+    ///
+    /// # Safety
+    /// `place` must be valid for writing.
     #[inline(always)]
-    pub(super) fn must_be_slow(direction: [f32; 3]) -> bool {
+    pub(super) unsafe fn write<T: Tree>(place: *mut RaySetup, origin: [f32; 3], direction: [f32; 3], tmin: f32) {
+        // SAFETY: forwarded.
+        unsafe {
+            place.write(RaySetup::new::<T>(origin, direction, tmin));
+            if RaySetup::must_be_slow(direction) {
+                (*place).make_slow::<T>(origin, direction);
+            }
+        }
+    }
+
+    #[inline(always)]
+    fn must_be_slow(direction: [f32; 3]) -> bool {
         let [x, y, z] = direction.map(f32::abs);
         lesser(lesser(x, y), z) <= STEEP * greater(greater(x, y), z)
     }
