@@ -145,17 +145,8 @@ fn all_queries_agree(data: &SceneData) {
         let scene = commit(isa, build, data);
         let single: Vec<RawHit> = rays.iter().map(|r| scene.intersect_raw(r)).collect();
         let occluded: Vec<u8> = rays.iter().map(|r| scene.occluded(r) as u8).collect();
-        let mut hits = vec![RawHit::MISS; rays.len()];
-        scene.intersect_stream(&rays, &mut hits);
-        assert!(hits == single, "{isa:?}");
-        scene.intersect_block(&rays, &mut hits);
-        assert!(hits == single, "{isa:?}");
-        let mut any = vec![2; rays.len()];
-        scene.occluded_stream(&rays, &mut any);
-        assert!(any == occluded, "{isa:?}");
-        scene.occluded_block(&rays, &mut any);
-        assert!(any == occluded, "{isa:?}");
-        assert!(any.iter().zip(&single).all(|(&any, hit)| (any == 1) != hit.is_miss()));
+        many_rays_agree(&scene, &rays, &single, &occluded);
+        assert!(occluded.iter().zip(&single).all(|(&any, hit)| (any == 1) != hit.is_miss()));
 
         let mut many = vec![Hit::MISS; rays.len()];
         scene.intersect_many(&rays, true, &mut many).unwrap();
@@ -188,6 +179,96 @@ fn all_queries_agree(data: &SceneData) {
             assert_eq!(differing, 0, "{isa:?} {build:?}");
         }
     }
+}
+
+fn many_rays_agree(scene: &Scene, rays: &[Ray], single: &[RawHit], occluded: &[u8]) {
+    let isa = scene.device().isa();
+    let mut hits = vec![RawHit::MISS; rays.len()];
+    scene.intersect_stream(rays, &mut hits);
+    assert!(hits == single, "{isa:?}");
+    scene.intersect_block(rays, &mut hits);
+    assert!(hits == single, "{isa:?}");
+    let mut any = vec![2; rays.len()];
+    scene.occluded_stream(rays, &mut any);
+    assert!(any == occluded, "{isa:?}");
+    scene.occluded_block(rays, &mut any);
+    assert!(any == occluded, "{isa:?}");
+}
+
+/// Checks rays together against rays alone, and these against the same scene without instances; returns how many hit
+/// something.
+fn check(data: &SceneData, rays: &[Ray]) -> usize {
+    let flat = commit(Isa::Portable, BuildOptions::default(), &flattened(data));
+    let mut met = 0;
+    for (isa, build) in builds() {
+        let scene = commit(isa, build, data);
+        let single: Vec<RawHit> = rays.iter().map(|r| scene.intersect_raw(r)).collect();
+        let occluded: Vec<u8> = rays.iter().map(|r| scene.occluded(r) as u8).collect();
+        many_rays_agree(&scene, rays, &single, &occluded);
+        let others = rays.iter().zip(&single).filter(|(ray, hit)| flat.intersect_raw(ray).triangle != hit.triangle);
+        // Transformed rays have other roundings.
+        assert!(others.count() <= rays.len() / 500, "{isa:?} {build:?}");
+        met = single.iter().filter(|hit| !hit.is_miss()).count();
+    }
+    met
+}
+
+#[test]
+fn rays_of_a_camera_hit_instances_as_rays_alone() {
+    let place = Vec3::new(0.3, -0.2, -7.0);
+    let ray = |i: u32| {
+        // Tiles of 8 x 8 pixels; some rays end early.
+        let (tile, pixel) = (i / 64, i % 64);
+        let (x, y) = (8 * (tile % 8) + pixel % 8, 8 * (tile / 8) + pixel / 8);
+        let ray = Ray::new(place, Vec3::new(x as f32 / 64.0 - 0.48, y as f32 / 64.0 - 0.49, 1.0));
+        if i % 5 == 0 { ray.within(0.0, 6.0 + uniform(i, 0, 3)) } else { ray }
+    };
+    let rays: Vec<Ray> = (0..64 * 64).map(ray).collect();
+    assert!(check(&data(9, true), &rays) > 400);
+}
+
+#[test]
+fn rays_that_are_scaled_in_instances_hit_them_as_copies() {
+    for scale in [1e-8, 1e8f32] {
+        let mut data = SceneData::new();
+        let material = data.add_material(Material::default()).unwrap();
+        for seed in [3, 4] {
+            let mut mesh = soup(60, seed, material);
+            mesh.positions.iter_mut().for_each(|p| *p /= scale);
+            let mesh = data.add_mesh(mesh).unwrap();
+            let transform = transform(seed, 9) * Affine3A::from_scale(Vec3::splat(scale));
+            data.add_instance(Instance { mesh, transform }).unwrap();
+        }
+        let rays: Vec<Ray> = (0..6000).map(|i| Ray::new(4.0 * vector(i, 0, 2), vector(i, 3, 2))).collect();
+        assert!(check(&data, &rays) > 100);
+    }
+}
+
+#[test]
+fn rays_whose_lists_find_no_room_at_instances_hit_them_as_rays_alone() {
+    let mut data = SceneData::new();
+    let material = data.add_material(Material::default()).unwrap();
+    // Little in a large box, so that rays meet thousands of boxes.
+    let mut mesh = soup(2, 6, material);
+    let corners: [Vec3; 2] = [Vec3::splat(-1.0), Vec3::ONE];
+    for (i, p) in mesh.positions.iter_mut().enumerate() {
+        *p = corners[i / 3] + 0.01 * vector(i as u32, 40, 1);
+    }
+    let mesh = data.add_mesh(mesh).unwrap();
+    for i in 0..5000 {
+        data.add_instance(Instance { mesh, transform: Affine3A::from_translation(0.05 * vector(i, 0, 8)) }).unwrap();
+    }
+    let ray = |i: u32| {
+        let target = Vec3::splat(if i % 4 == 0 { 1.0 } else { 0.0 }) + 0.1 * vector(i, 3, 7);
+        let origin = Vec3::new(0.1, 0.2, -3.0) + 0.01 * vector(i, 6, 7);
+        Ray::new(origin, target - origin)
+    };
+    let rays: Vec<Ray> = (0..1024).map(ray).collect();
+    let scene = commit(Isa::best(), BuildOptions::default(), &data);
+    let single: Vec<RawHit> = rays.iter().map(|r| scene.intersect_raw(r)).collect();
+    let occluded: Vec<u8> = rays.iter().map(|r| scene.occluded(r) as u8).collect();
+    many_rays_agree(&scene, &rays, &single, &occluded);
+    assert!(occluded.iter().filter(|&&o| o == 1).count() > 20);
 }
 
 #[test]

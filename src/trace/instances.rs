@@ -181,8 +181,8 @@ impl Scene {
     }
 
     fn meet_all<A: Answer>(&self, instances: &Instances, rays: &[Ray], alike: bool, answers: &mut [A]) {
-        if let ([ray], [answer]) = (rays, &mut *answers) {
-            return self.meet_one_by_one(instances, ray, answer);
+        if rays.len() == 1 {
+            return A::trace_instances(self, instances, rays, answers);
         }
         let mut start = 0;
         while start < rays.len() {
@@ -199,10 +199,12 @@ impl Scene {
         }
     }
 
+    /// Traces a ray through instances with a walk of its own through each, whatever its length and theirs.
+    #[cold]
     pub(super) fn meet_one_by_one<A: Answer>(&self, instances: &Instances, ray: &Ray, answer: &mut A) {
         let kernels = self.kernels();
         let mut place = MaybeUninit::uninit();
-        if answer.tmax(ray).is_none() || !Walk::begin::<Mbvh>(&mut place, ChildRef::ROOT, ray, 0) {
+        if answer.tmax(ray).is_none() || !Walk::begin::<Mbvh, false>(&mut place, ChildRef::ROOT, ray, 0) {
             return;
         }
         // SAFETY: it has begun.
@@ -286,7 +288,7 @@ impl Scene {
         filter: &mut Filter,
     ) -> RawHit {
         let mut place = MaybeUninit::uninit();
-        if !Walk::begin::<Mbvh>(&mut place, ChildRef::ROOT, ray, 0) {
+        if !Walk::begin::<Mbvh, false>(&mut place, ChildRef::ROOT, ray, 0) {
             return best;
         }
         // SAFETY: it has begun.

@@ -9,6 +9,7 @@ use super::tree::{Children, Leaf, RaySetup, Tree, beyond, direction_scale};
 use super::triangle::barycentrics;
 use super::{RawHit, Ray};
 use crate::base::geometry::NONE;
+use crate::bvh::Mbvh;
 use crate::bvh::layout::{ChildRef, STACK_SIZE, WIDTH};
 use crate::simd::{Compress, Lanes, Mask, Simd};
 use std::cell::Cell;
@@ -228,9 +229,14 @@ pub(super) struct Walk {
 
 impl Walk {
     /// Begins the traversal of a ray in `place`; returns whether there is anything to traverse: some rays cannot hit
-    /// anything.
+    /// anything. Without `TRIANGLES` it goes through boxes alone: by [`next_leaf`](Self::next_leaf).
     #[inline(always)]
-    pub(super) fn begin<T: Tree>(place: &mut MaybeUninit<Walk>, root: ChildRef, ray: &Ray, number: usize) -> bool {
+    pub(super) fn begin<T: Tree, const TRIANGLES: bool>(
+        place: &mut MaybeUninit<Walk>,
+        root: ChildRef,
+        ray: &Ray,
+        number: usize,
+    ) -> bool {
         let Some(scale) = direction_scale(ray) else { return false };
         let (mut d, mut tmin, mut tmax) = (ray.direction, ray.tmin, ray.tmax);
         if scale != 1.0 {
@@ -244,7 +250,7 @@ impl Walk {
         // SAFETY: the pointers lead into `place`. Everything but entries of the stack is written, and
         // those are `MaybeUninit` themselves.
         unsafe {
-            RaySetup::write::<T>(&raw mut (*p).ray, ray.origin, d, tmin);
+            RaySetup::write::<T, TRIANGLES>(&raw mut (*p).ray, ray.origin, d, tmin);
             (&raw mut (*p).best).write(Best::none(tmax));
             (&raw mut (*p).limit).write(beyond(tmax));
             (&raw mut (*p).current).write(root);
@@ -353,7 +359,7 @@ impl Walk {
         if !can_enter {
             return false;
         }
-        self.set_ray::<T>(ray);
+        self.set_ray::<T, true>(ray);
         self.best = Best::none(ray.tmax);
         self.limit = beyond(ray.tmax);
         self.current = ChildRef::ROOT;
@@ -366,18 +372,47 @@ impl Walk {
     /// Comes out of an inner tree that has ended, with the ray in the coordinates of the outer one. Returns false if nothing
     /// waits there.
     #[inline(always)]
-    pub(super) fn leave<T: Tree>(&mut self, ray: &Ray) -> bool {
+    pub(super) fn leave(&mut self, ray: &Ray) -> bool {
         let has_more = self.stack.count > BOTTOM;
         if has_more {
-            self.set_ray::<T>(ray);
+            self.set_ray::<Mbvh, false>(ray);
         }
         has_more
     }
 
     #[inline(always)]
-    fn set_ray<T: Tree>(&mut self, ray: &Ray) {
+    fn set_ray<T: Tree, const TRIANGLES: bool>(&mut self, ray: &Ray) {
         // SAFETY: the walk's own.
-        unsafe { RaySetup::write::<T>(&raw mut self.ray, ray.origin, ray.direction, ray.tmin) }
+        unsafe { RaySetup::write::<T, TRIANGLES>(&raw mut self.ray, ray.origin, ray.direction, ray.tmin) }
+    }
+
+    /// Goes on to the end of the tree, and returns what has been found there.
+    ///
+    /// # Safety
+    /// The CPU must have the ISA; the walk must be in `tree`.
+    #[inline(always)]
+    pub(super) unsafe fn run<S: Simd, T: Tree, A: Accept, const ANY: bool>(
+        &mut self,
+        tree: &T,
+        accept: &mut A,
+    ) -> RawHit {
+        while self.current != ChildRef::EMPTY {
+            // SAFETY: forwarded.
+            unsafe {
+                if self.current.is_leaf() {
+                    self.visit_leaf::<S, T, A, ANY>(tree, accept);
+                } else {
+                    self.visit_node::<S, T, true, ANY>(tree);
+                    // Prefetches what is next, before it is known to be a node or a leaf, and two entries that follow.
+                    // (One entry alone takes 1 to 3 % more time; more are no faster:
+                    // docs/experiments.md#single-rays.)
+                    tree.prefetch(self.current);
+                    tree.prefetch(self.stack.peek(0));
+                    tree.prefetch(self.stack.peek(1));
+                }
+            }
+        }
+        self.hit()
     }
 
     #[inline(always)]
@@ -409,27 +444,11 @@ pub(super) unsafe fn one_of<S: Simd, T: Tree, A: Accept, const ANY: bool>(
     accept: &mut A,
 ) -> RawHit {
     let mut place = MaybeUninit::uninit();
-    if !Walk::begin::<T>(&mut place, ChildRef::ROOT, ray, 0) {
+    if !Walk::begin::<T, true>(&mut place, ChildRef::ROOT, ray, 0) {
         return RawHit::MISS;
     }
-    // SAFETY: it has begun.
-    let walk = unsafe { place.assume_init_mut() };
-    while walk.current != ChildRef::EMPTY {
-        // SAFETY: forwarded.
-        unsafe {
-            if walk.current.is_leaf() {
-                walk.visit_leaf::<S, T, A, ANY>(tree, accept);
-            } else {
-                walk.visit_node::<S, T, true, ANY>(tree);
-                // Prefetches what is next, before it is known to be a node or a leaf, and two entries that follow. (One
-                // entry alone takes 1 to 3 % more time; more are no faster: docs/experiments.md#single-rays.)
-                tree.prefetch(walk.current);
-                tree.prefetch(walk.stack.peek(0));
-                tree.prefetch(walk.stack.peek(1));
-            }
-        }
-    }
-    walk.hit()
+    // SAFETY: it has begun. The caller vouches for the ISA.
+    unsafe { place.assume_init_mut().run::<S, T, A, ANY>(tree, accept) }
 }
 
 /// Number of rays under way at the same time. (Sponza, random rays: 4 trace 2.3, 8 trace 2.6, 16 and 32 trace 3.0
@@ -490,7 +509,7 @@ impl<T: Tree, R: Fn(usize) -> Ray, D: FnMut(usize, RawHit)> Work<T> for Rays<'_,
         while self.next < self.count {
             let number = self.next;
             self.next += 1;
-            if Walk::begin::<T>(place, self.root, &(self.ray)(number), number) {
+            if Walk::begin::<T, true>(place, self.root, &(self.ray)(number), number) {
                 return true;
             }
             (self.done)(number, RawHit::MISS);

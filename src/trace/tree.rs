@@ -203,7 +203,11 @@ impl RaySetup {
     /// [`make_slow`](Self::make_slow) must follow. (All axes in one vector by hand take no fewer instructions.)
     #[inline(always)]
     pub(super) fn new<T: Tree>(origin: [f32; 3], direction: [f32; 3], tmin: f32) -> Self {
-        let shear = Shear::new(origin, direction);
+        Self::with::<T>(origin, direction, tmin, Shear::new(origin, direction))
+    }
+
+    #[inline(always)]
+    fn with<T: Tree>(origin: [f32; 3], direction: [f32; 3], tmin: f32, shear: Shear) -> Self {
         let is_negative = direction.map(|d| d < 0.0);
         let reciprocal = direction.map(|d| 1.0 / d);
         let offset: [f32; 3] = std::array::from_fn(|a| -origin[a] * reciprocal[a]);
@@ -224,17 +228,23 @@ impl RaySetup {
         }
     }
 
-    /// Writes the setup of a ray to `place`, by the box test that it needs. (In place: a call that may change a ray keeps
+    /// Writes the setup of a ray to `place`, by the box test that it needs; without `TRIANGLES` it tests boxes alone. (In place: a call that may change a ray keeps
     /// the compiler from building it at its destination, and the ray was then copied through memory twice, which stalls
     /// where wide loads follow narrow stores.)
     ///
     /// # Safety
     /// `place` must be valid for writing.
     #[inline(always)]
-    pub(super) unsafe fn write<T: Tree>(place: *mut RaySetup, origin: [f32; 3], direction: [f32; 3], tmin: f32) {
+    pub(super) unsafe fn write<T: Tree, const TRIANGLES: bool>(
+        place: *mut RaySetup,
+        origin: [f32; 3],
+        direction: [f32; 3],
+        tmin: f32,
+    ) {
+        let shear = if TRIANGLES { Shear::new(origin, direction) } else { Shear::NONE };
         // SAFETY: forwarded.
         unsafe {
-            place.write(RaySetup::new::<T>(origin, direction, tmin));
+            place.write(RaySetup::with::<T>(origin, direction, tmin, shear));
             if RaySetup::must_be_slow(direction) {
                 (*place).make_slow::<T>(origin, direction);
             }

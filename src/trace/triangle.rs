@@ -73,6 +73,10 @@ pub(super) struct Shear {
 }
 
 impl Shear {
+    /// That of rays that meet no triangles.
+    pub(super) const NONE: Shear =
+        Shear { axes: [0, 1, 2], origin: [0.0; 3], back: [0.0; 3], shear: [0.0; 2], grazing: 0.0 };
+
     #[inline(always)]
     pub(super) fn new(origin: [f32; 3], d: [f32; 3]) -> Shear {
         let [x, y, z] = d.map(f32::abs);

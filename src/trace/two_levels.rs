@@ -5,11 +5,12 @@
 
 use super::Ray;
 use super::compact::View;
+use super::filter::All;
 use super::instances::{Answer, to_mesh};
 use super::queries::TreeView;
 use super::single::{self, FLIGHT, Walk, Work};
 use super::tree::{Leaf, Tree};
-use crate::bvh::instances::Instances;
+use crate::bvh::instances::{Instances, MeshTree};
 use crate::bvh::{self, ChildRef, Mbvh};
 use crate::scene::Scene;
 use crate::simd::Simd;
@@ -56,7 +57,8 @@ pub(super) unsafe fn trace<S: Simd, A: Answer, const ANY: bool>(
         TreeView::Compact(view) => Some(view),
     };
     // All trees are of one kind, but for those without triangles, which no ray meets.
-    let is_compact = instances.trees.iter().any(|t| matches!(t.tree, bvh::Tree::Compact(_)));
+    let is_compact =
+        matches!(instances.trees.iter().find(|t| t.is_hit()), Some(MeshTree { tree: bvh::Tree::Compact(_), .. }));
     // SAFETY: forwarded.
     unsafe {
         match is_compact {
@@ -78,11 +80,54 @@ unsafe fn trace_in<S: Simd, T: Tree, H: Borrow<T> + Copy, A: Answer, const ANY: 
     rays: &[Ray],
     answers: &mut [A],
 ) {
+    if let ([ray], [answer]) = (rays, &mut *answers) {
+        // SAFETY: forwarded.
+        return unsafe { trace_one::<S, T, H, A, ANY>(scene, instances, tree_of, ray, answer) };
+    }
     let at = [const { MaybeUninit::uninit() }; FLIGHT];
     let rays = &rays[..rays.len().min(answers.len())];
     let mut work = Placed { scene, instances, tree_of, rays, answers, next: 0, at };
     // SAFETY: forwarded.
     unsafe { single::fly::<S, T, ANY>(&mut work) }
+}
+
+/// As [`trace_in`] for one ray.
+///
+/// # Safety
+/// The CPU must have the ISA.
+#[inline(always)]
+unsafe fn trace_one<S: Simd, T: Tree, H: Borrow<T>, A: Answer, const ANY: bool>(
+    scene: &Scene,
+    instances: &Instances,
+    tree_of: impl Fn(u32) -> Option<H>,
+    ray: &Ray,
+    answer: &mut A,
+) {
+    let mut place = MaybeUninit::uninit();
+    if answer.tmax(ray).is_none() || !Walk::begin::<Mbvh, false>(&mut place, ChildRef::ROOT, ray, 0) {
+        return;
+    }
+    // SAFETY: it has begun. The leaves of the tree over boxes hold the instances' numbers, one each. The caller vouches for
+    // the ISA.
+    unsafe {
+        let walk = place.assume_init_mut();
+        while let Some(tmax) = answer.tmax(ray) {
+            let leaf = walk.next_leaf::<S, Mbvh>(&instances.top, tmax);
+            if leaf == ChildRef::EMPTY {
+                return;
+            }
+            let at = &instances.placed[Tree::leaf::<S>(&instances.top, leaf).number(0) as usize];
+            let Some(tree) = tree_of(at.tree) else { continue };
+            if !walk.enter::<T>(&to_mesh(at, ray, tmax)) {
+                return scene.meet_one_by_one(instances, ray, answer);
+            }
+            let hit = walk.run::<S, T, All, ANY>(tree.borrow(), &mut All);
+            answer.add(A::of(hit), at.first_triangle);
+            if !walk.leave(ray) {
+                return;
+            }
+        }
+    }
 }
 
 impl<A: Answer, H: Copy, F: Fn(u32) -> Option<H>> Placed<'_, A, H, F> {
@@ -123,7 +168,7 @@ impl<T: Tree, A: Answer, H: Borrow<T> + Copy, F: Fn(u32) -> Option<H>> Work<T> f
             let ray = self.next;
             self.next += 1;
             let goes_on = self.answers[ray].tmax(&self.rays[ray]).is_some();
-            if goes_on && Walk::begin::<Mbvh>(place, ChildRef::ROOT, &self.rays[ray], number) {
+            if goes_on && Walk::begin::<Mbvh, false>(place, ChildRef::ROOT, &self.rays[ray], number) {
                 // SAFETY: it has begun. The caller vouches for the ISA.
                 if unsafe { self.go_on::<S, T>(place.assume_init_mut(), ray) } {
                     return true;
@@ -139,7 +184,7 @@ impl<T: Tree, A: Answer, H: Borrow<T> + Copy, F: Fn(u32) -> Option<H>> Work<T> f
         unsafe {
             let At { ray, first_triangle, .. } = self.at[walk.number].assume_init();
             self.answers[ray].add(A::of(walk.hit()), first_triangle);
-            walk.leave::<Mbvh>(&self.rays[ray]) && self.go_on::<S, T>(walk, ray)
+            walk.leave(&self.rays[ray]) && self.go_on::<S, T>(walk, ray)
         }
     }
 

@@ -102,7 +102,7 @@ impl<A: Answer> Batch<A> {
         for (ray, answer) in rays.iter().zip(answers) {
             all.begin.push(u32::try_from(all.parts.len()).ok()?);
             let Some(tmax) = answer.tmax(ray) else { continue };
-            if !Walk::begin::<Mbvh>(&mut place, ChildRef::ROOT, ray, 0) {
+            if !Walk::begin::<Mbvh, false>(&mut place, ChildRef::ROOT, ray, 0) {
                 continue;
             }
             // SAFETY: it has begun.
