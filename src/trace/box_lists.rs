@@ -69,6 +69,9 @@ pub(super) struct Visit<'a> {
     slabs: &'a mut [Slab],
 }
 
+/// What is done with the rays at an instance.
+pub(super) type OnVisit<'a> = &'a mut dyn FnMut(Visit);
+
 impl Visit<'_> {
     /// Tells how far a ray goes on; `None`: no further.
     #[inline(always)]
@@ -150,12 +153,7 @@ struct Entry {
 /// # Safety
 /// The CPU must have the ISA.
 #[inline(always)]
-pub(super) unsafe fn trace<S: Simd>(
-    instances: &Instances,
-    count: usize,
-    room: &mut Room,
-    visit: &mut dyn FnMut(Visit),
-) {
+pub(super) unsafe fn trace<S: Simd>(instances: &Instances, count: usize, room: &mut Room, visit: OnVisit) {
     let top = &instances.top;
     let has_room = room.slabs.len() == MAX_RAYS && room.numbers.len() == NUMBERS && room.masks.len() >= MAX_RAYS + 64;
     assert!(has_room && count <= MAX_RAYS && room.rays.len() == MAX_RAYS && room.turned.len() >= MAX_RAYS + 8);

@@ -221,7 +221,7 @@ fn rays_of_a_camera_hit_instances_as_rays_alone() {
         let (tile, pixel) = (i / 64, i % 64);
         let (x, y) = (8 * (tile % 8) + pixel % 8, 8 * (tile / 8) + pixel / 8);
         let ray = Ray::new(place, Vec3::new(x as f32 / 64.0 - 0.48, y as f32 / 64.0 - 0.49, 1.0));
-        if i % 5 == 0 { ray.within(0.0, 6.0 + uniform(i, 0, 3)) } else { ray }
+        if i.is_multiple_of(5) { ray.within(0.0, 6.0 + uniform(i, 0, 3)) } else { ray }
     };
     let rays: Vec<Ray> = (0..64 * 64).map(ray).collect();
     assert!(check(&data(9, true), &rays) > 400);
@@ -259,7 +259,7 @@ fn rays_whose_lists_find_no_room_at_instances_hit_them_as_rays_alone() {
         data.add_instance(Instance { mesh, transform: Affine3A::from_translation(0.05 * vector(i, 0, 8)) }).unwrap();
     }
     let ray = |i: u32| {
-        let target = Vec3::splat(if i % 4 == 0 { 1.0 } else { 0.0 }) + 0.1 * vector(i, 3, 7);
+        let target = Vec3::splat(if i.is_multiple_of(4) { 1.0 } else { 0.0 }) + 0.1 * vector(i, 3, 7);
         let origin = Vec3::new(0.1, 0.2, -3.0) + 0.01 * vector(i, 6, 7);
         Ray::new(origin, target - origin)
     };

@@ -33,7 +33,7 @@ pub(crate) struct Kernels {
     filtered: [unsafe fn(&Mbvh, &Ray, &mut Filter) -> RawHit; 2],
     compact_filtered: [unsafe fn(&View, &Ray, &mut Filter) -> RawHit; 2],
     next_box: unsafe fn(&Mbvh, &mut Walk, f32) -> u32,
-    list_instances: unsafe fn(&Instances, usize, &mut box_lists::Room, &mut dyn FnMut(box_lists::Visit)),
+    list_instances: unsafe fn(&Instances, usize, &mut box_lists::Room, box_lists::OnVisit),
     next_bundles: unsafe fn(&[Ray]) -> (usize, usize),
     intersect_instances: unsafe fn(&Scene, &Instances, &[Ray], &mut [RawHit]),
     occluded_instances: unsafe fn(&Scene, &Instances, &[Ray], &mut [u8]),
@@ -157,7 +157,7 @@ macro_rules! table {
 
             isa_features! { $isa => entry_point! {
                 fn list_instances(
-                    instances: &Instances, count: usize, room: &mut box_lists::Room, visit: &mut dyn FnMut(box_lists::Visit)
+                    instances: &Instances, count: usize, room: &mut box_lists::Room, visit: box_lists::OnVisit
                 ) {
                     box_lists::trace::<S>(instances, count, room, visit)
                 }
@@ -355,7 +355,7 @@ impl Kernels {
         instances: &Instances,
         count: usize,
         room: &mut box_lists::Room,
-        visit: &mut dyn FnMut(box_lists::Visit),
+        visit: box_lists::OnVisit,
     ) {
         // SAFETY: see `intersect`.
         unsafe { (self.list_instances)(instances, count, room, visit) }
