@@ -96,17 +96,14 @@ impl Room {
 
     /// Whether there is memory for as many rays as go together.
     pub(super) fn has_memory(&mut self) -> bool {
-        if self.turned.is_empty() {
-            let nothing = Ray::zeroed();
-            let has_memory = self.alone.try_reserve_exact(MAX_RAYS).is_ok()
-                && fill(&mut self.rays, MAX_RAYS, nothing)
-                && fill(&mut self.slabs, MAX_RAYS, Slab::zeroed())
-                && fill(&mut self.masks, MAX_RAYS + 64, 0)
-                && fill(&mut self.numbers, NUMBERS, 0)
-                && fill(&mut self.turned, MAX_RAYS + 8, nothing);
-            return has_memory;
-        }
-        true
+        let nothing = Ray::zeroed();
+        self.alone.clear();
+        self.alone.try_reserve_exact(MAX_RAYS).is_ok()
+            && fill(&mut self.rays, MAX_RAYS, nothing)
+            && fill(&mut self.slabs, MAX_RAYS, Slab::zeroed())
+            && fill(&mut self.masks, MAX_RAYS + 64, 0)
+            && fill(&mut self.numbers, NUMBERS, 0)
+            && fill(&mut self.turned, MAX_RAYS + 8, nothing)
     }
 
     /// Takes the rays of the next visit, at most [`MAX_RAYS`], with how far they go: `None` if they do not. Returns their
@@ -127,8 +124,8 @@ impl Room {
     }
 }
 
-/// Returns false if there is not enough memory.
-fn fill<T: Clone>(v: &mut Vec<T>, count: usize, value: T) -> bool {
+/// Gives a buffer its length, if it has not got it yet. Returns false if there is not enough memory.
+pub(super) fn fill<T: Clone>(v: &mut Vec<T>, count: usize, value: T) -> bool {
     let has_memory = v.try_reserve_exact(count.saturating_sub(v.len())).is_ok();
     if has_memory {
         v.resize(count, value);

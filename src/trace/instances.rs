@@ -14,7 +14,7 @@ use crate::base::geometry::NONE;
 use crate::bvh::instances::{Instances, PlacedTree};
 use crate::bvh::{ChildRef, Mbvh};
 use crate::scene::Scene;
-use glam::Vec3A;
+use glam::{Vec3, Vec3A};
 use std::cell::Cell;
 use std::mem::MaybeUninit;
 
@@ -43,8 +43,8 @@ pub(super) trait Answer: Copy {
     /// Traces rays through what is below a node of a tree; `alike`: as a stream if there are enough.
     fn trace(scene: &Scene, tree: TreeView, root: ChildRef, rays: &[Ray], alike: bool, out: &mut [Self]);
 
-    /// Adds what a ray has found in an instance.
-    fn add(&mut self, found: Self, first_triangle: u32);
+    /// Adds what a ray has found in an instance; returns whether that changes the answer.
+    fn add(&mut self, found: Self, first_triangle: u32) -> bool;
 }
 
 impl Answer for RawHit {
@@ -84,14 +84,16 @@ impl Answer for RawHit {
     }
 
     #[inline]
-    fn add(&mut self, mut found: RawHit, first_triangle: u32) {
+    fn add(&mut self, mut found: RawHit, first_triangle: u32) -> bool {
         if found.is_miss() {
-            return;
+            return false;
         }
         found.triangle += first_triangle;
-        if self.is_miss() || found.t < self.t || (found.t == self.t && found.triangle < self.triangle) {
+        let is_closer = self.is_miss() || found.t < self.t || (found.t == self.t && found.triangle < self.triangle);
+        if is_closer {
             *self = found;
         }
+        is_closer
     }
 }
 
@@ -134,8 +136,9 @@ impl Answer for u8 {
     }
 
     #[inline]
-    fn add(&mut self, found: u8, _: u32) {
+    fn add(&mut self, found: u8, _: u32) -> bool {
         *self |= found;
+        found != 0
     }
 }
 
@@ -151,7 +154,8 @@ pub(super) fn to_mesh(at: &PlacedTree, ray: &Ray, tmax: f32) -> Ray {
 #[derive(Default)]
 struct Room {
     lists: box_lists::Room,
-    rays: Vec<Ray>,
+    /// Rays that are in no list.
+    alone: Vec<Ray>,
     found: Buffers,
 }
 
@@ -165,7 +169,7 @@ pub(super) struct Buffers {
 thread_local! {
     static ROOM: Cell<Room> = const {
         let found = Buffers { hits: Vec::new(), occluded: Vec::new() };
-        Cell::new(Room { lists: box_lists::Room::new(), rays: Vec::new(), found })
+        Cell::new(Room { lists: box_lists::Room::new(), alone: Vec::new(), found })
     };
 }
 
@@ -230,11 +234,9 @@ impl Scene {
 
     fn meet_as_lists<A: Answer>(&self, instances: &Instances, rays: &[Ray], alike: bool, answers: &mut [A]) {
         let mut room = ROOM.try_with(Cell::take).unwrap_or_default();
-        let size = rays.len().min(MAX_RAYS);
-        room.rays.clear();
         let has_memory = room.lists.has_memory()
-            && room.rays.try_reserve(size).is_ok()
-            && A::buffer(&mut room.found).try_reserve(size).is_ok();
+            && box_lists::fill(&mut room.alone, MAX_RAYS, Ray::new(Vec3::ZERO, Vec3::ZERO))
+            && box_lists::fill(A::buffer(&mut room.found), MAX_RAYS, A::MISS);
         if has_memory {
             for (rays, answers) in rays.chunks(MAX_RAYS).zip(answers.chunks_mut(MAX_RAYS)) {
                 self.meet_list(instances, rays, alike, answers, &mut room);
@@ -245,36 +247,35 @@ impl Scene {
         let _ = ROOM.try_with(|kept| kept.set(room));
     }
 
-    /// `room` has memory for as many rays.
+    /// At most [`MAX_RAYS`] rays; `room` has memory for them.
     fn meet_list<A: Answer>(
         &self,
         instances: &Instances,
         rays: &[Ray],
         alike: bool,
         answers: &mut [A],
-        Room { lists, found, rays: alone }: &mut Room,
+        Room { lists, found, alone }: &mut Room,
     ) {
         let found = A::buffer(found);
         let count = lists.take(rays.iter().zip(&*answers).map(|(ray, answer)| (ray, answer.tmax(ray))));
         self.kernels().list_instances(instances, count, lists, &mut |mut visit| {
             let at = &instances.placed[visit.instance as usize];
-            found.clear();
-            found.resize(visit.rays.len(), A::MISS);
+            let found = &mut found[..visit.rays.len()];
             A::trace(self, self.tree_of(instances, at.tree), ChildRef::ROOT, visit.rays, alike, found);
             for (&number, &found) in visit.numbers.iter().zip(&*found) {
                 let answer = &mut answers[number as usize];
-                answer.add(found, at.first_triangle);
-                visit.end(number, answer.tmax(&rays[number as usize]));
+                if answer.add(found, at.first_triangle) {
+                    visit.end(number, answer.tmax(&rays[number as usize]));
+                }
             }
         });
-        if !lists.alone().is_empty() {
-            let numbers = || lists.alone().iter().map(|&number| number as usize);
-            alone.clear();
-            alone.extend(numbers().map(|number| rays[number]));
-            found.clear();
-            found.extend(numbers().map(|number| answers[number]));
-            A::trace_instances(self, instances, alone, found);
-            numbers().zip(&*found).for_each(|(number, &found)| answers[number] = found);
+        let numbers = lists.alone();
+        if !numbers.is_empty() {
+            for (i, &number) in numbers.iter().enumerate() {
+                (alone[i], found[i]) = (rays[number as usize], answers[number as usize]);
+            }
+            A::trace_instances(self, instances, &alone[..numbers.len()], &mut found[..numbers.len()]);
+            numbers.iter().zip(&*found).for_each(|(&number, &found)| answers[number as usize] = found);
         }
     }
 
