@@ -43,7 +43,7 @@ struct Slab {
     unused: [f32; 2],
 }
 
-/// Working memory: 0.2 MB per thread that traces such rays.
+/// Working memory: 0.25 MB per thread that traces such rays.
 #[derive(Default)]
 pub(super) struct Room {
     /// Rays, with how far they go now.
