@@ -57,6 +57,8 @@ pub(super) struct Room {
     alone: Vec<u16>,
     /// The rays at an instance, in the coordinates of its mesh.
     turned: Vec<Ray>,
+    /// Whether rays have an end that they had not when they were listed.
+    has_ended: bool,
 }
 
 /// The rays at an instance.
@@ -67,6 +69,7 @@ pub(super) struct Visit<'a> {
     pub rays: &'a [Ray],
     ends: &'a mut [Ray],
     slabs: &'a mut [Slab],
+    has_ended: &'a mut bool,
 }
 
 /// What is done with the rays at an instance.
@@ -77,6 +80,7 @@ impl Visit<'_> {
     #[inline(always)]
     pub(super) fn end(&mut self, number: u16, tmax: Option<f32>) {
         let tmax = tmax.unwrap_or(f32::NEG_INFINITY);
+        *self.has_ended = true;
         self.ends[number as usize].tmax = tmax;
         self.slabs[number as usize].limit = if tmax == f32::NEG_INFINITY { tmax } else { beyond(tmax) };
     }
@@ -91,6 +95,7 @@ impl Room {
             numbers: Vec::new(),
             alone: Vec::new(),
             turned: Vec::new(),
+            has_ended: false,
         }
     }
 
@@ -158,7 +163,8 @@ pub(super) unsafe fn trace<S: Simd>(instances: &Instances, count: usize, room: &
     let all = unsafe { set_up::<S::F8>(count, room) };
     let mut stack = [const { MaybeUninit::<Entry>::uninit() }; STACK_SIZE];
     stack[0].write(Entry { child: ChildRef::ROOT, start: 0, count: all as u32, parent: ChildRef::ROOT, lane: 0 });
-    let (mut depth, mut has_visited) = (usize::from(all > 0), false);
+    let mut depth = usize::from(all > 0);
+    room.has_ended = false;
     while depth > 0 {
         depth -= 1;
         // SAFETY: entries below `depth` have been written; children of the tree are its nodes and leaves, of one box
@@ -170,17 +176,16 @@ pub(super) unsafe fn trace<S: Simd>(instances: &Instances, count: usize, room: &
                 depth += visit_node::<S>(top, entry, room, stack.as_mut_ptr().add(depth).cast());
                 continue;
             }
-            if has_visited {
+            if room.has_ended {
                 entry.count = keep_those_that_hit::<S>(top, entry, room);
             }
             if entry.count > 0 {
                 let instance = Tree::leaf::<S>(top, entry.child).number(0);
                 let numbers = entry.start as usize..(entry.start + entry.count) as usize;
                 turn::<S::F8>(&instances.placed[instance as usize], numbers.clone(), room);
-                let Room { rays, slabs, numbers: all, turned, .. } = &mut *room;
+                let Room { rays, slabs, numbers: all, turned, has_ended, .. } = &mut *room;
                 let turned = &turned[..numbers.len()];
-                visit(Visit { instance, numbers: &all[numbers], rays: turned, ends: rays, slabs });
-                has_visited = true;
+                visit(Visit { instance, numbers: &all[numbers], rays: turned, ends: rays, slabs, has_ended });
             }
         }
     }
@@ -332,6 +337,7 @@ unsafe fn visit_node<S: Simd>(top: &Mbvh, entry: Entry, room: &mut Room, stack: 
         let mut end = start + count;
         // `pick` reads and writes up to 31 numbers beyond a list.
         if end + met.count_ones() as usize * count + 32 > room.numbers.len() {
+            room.has_ended = true;
             for place in start..end {
                 let number = room.numbers[place];
                 if std::mem::replace(&mut room.slabs[number as usize].limit, f32::NEG_INFINITY) != f32::NEG_INFINITY {
