@@ -18,6 +18,8 @@ pub(crate) struct Instances {
     pub trees: Vec<MeshTree>,
     /// The instances, by number.
     pub placed: Vec<PlacedTree>,
+    /// The greatest [margin](crate::scene::Instance::margin) of all instances.
+    pub margin: f32,
 }
 
 /// The tree of a mesh that has instances, with triangles by their number in the mesh.
@@ -46,19 +48,20 @@ pub(crate) struct PlacedTree {
     pub first_triangle: u32,
 }
 
-/// Distance by which the boxes of instances are larger than those of their triangles, as a fraction of their
-/// coordinates and extents: some ten roundings, for what transforming a ray moves it by.
-const MARGIN: f32 = 1e-6;
-
-/// Returns the box around the image of another, moved outwards; `reach`: the largest coordinate that placing a corner
-/// goes through. A box that is not finite, of a mesh that cannot be hit, gives one that no ray meets.
-pub(crate) fn placed_box((lower, upper): (Vec3, Vec3), reach: f32, place: impl Fn(Vec3) -> Vec3) -> (Vec3, Vec3) {
+/// Returns the box around the image of another, moved outwards by `margin`, a fraction of its coordinates and extents, for
+/// what transforming a ray moves it by; `reach`: the largest coordinate that placing a corner goes through. A box that is not finite, of a mesh that cannot be hit, gives one that no ray meets.
+pub(crate) fn placed_box(
+    (lower, upper): (Vec3, Vec3),
+    reach: f32,
+    margin: f32,
+    place: impl Fn(Vec3) -> Vec3,
+) -> (Vec3, Vec3) {
     let corner = |i: usize| place(Vec3::from_array([0, 1, 2].map(|a| [lower, upper][i >> a & 1][a])));
     let (mut low, mut high) = (Vec3::INFINITY, Vec3::NEG_INFINITY);
     for c in (0..8).map(corner) {
         (low, high) = (low.min(c), high.max(c));
     }
-    let margin = MARGIN * ((high - low).max_element() + low.abs().max(high.abs()).max_element().max(reach));
+    let margin = margin * ((high - low).max_element() + low.abs().max(high.abs()).max_element().max(reach));
     (low - margin, high + margin)
 }
 
@@ -116,7 +119,12 @@ impl Instances {
             };
             try_push(&mut trees, copy, what)?;
         }
-        Ok(Instances { top: self.top.try_clone()?, trees, placed: try_to_vec(&self.placed, what)? })
+        Ok(Instances {
+            top: self.top.try_clone()?,
+            trees,
+            placed: try_to_vec(&self.placed, what)?,
+            margin: self.margin,
+        })
     }
 }
 

@@ -2,7 +2,7 @@
 
 use super::{Mesh, check_finite};
 use crate::base::error::{Result, invalid_argument};
-use glam::{Affine3A, DMat3, Mat3A, Vec3, Vec3A};
+use glam::{Affine3A, DMat3, DVec3, Mat3A, Vec3, Vec3A};
 
 /// One placement of a mesh. A mesh that has instances stands in the scene where they say, and nowhere else; its
 /// vertices and its tree exist once.
@@ -17,6 +17,13 @@ pub struct Instance {
 /// Least volume of the box that the images of the axes span, as a fraction of the product of their lengths: with a
 /// smaller one, transformed rays have too few digits.
 const LEAST_VOLUME: f64 = 1e-3;
+
+/// Least [`Instance::margin`].
+const LEAST_MARGIN: f32 = 1e-6;
+
+/// Number of roundings, relative to coordinates, that transforming a ray to a mesh goes through: five of its origin, four of its
+/// direction, and one to spare.
+const ROUNDINGS: f32 = 10.0;
 
 impl Instance {
     /// Checks that the transform is finite, can be inverted and does not mirror.
@@ -47,6 +54,19 @@ impl Instance {
         let (m, far) = (&self.transform.matrix3, Vec3A::from(lower.abs().max(upper.abs())));
         let terms = m.x_axis.abs() * far.x + m.y_axis.abs() * far.y + m.z_axis.abs() * far.z;
         (terms + self.transform.translation.abs()).max_element()
+    }
+
+    /// Returns by how much a ray in the mesh's coordinates may lie beside where it is in the scene, as a fraction of the
+    /// coordinates and extents that it goes through: at least some ten roundings. The boxes of instances and the rays that
+    /// are tested against them are wider by that, so that no ray enters a box behind what it hits in the instance, and hits
+    /// do not depend on which instance comes first. (The condition of Skeel, *Scaling for Numerical Stability in Gaussian
+    /// Elimination*, 1979: 1 for scaling along the axes, up to 3 for rotations, more for shears.)
+    pub(crate) fn margin(&self) -> f32 {
+        let m = &self.transform.matrix3;
+        let m = DMat3::from_cols(m.x_axis.as_dvec3(), m.y_axis.as_dvec3(), m.z_axis.as_dvec3());
+        let abs = |m: DMat3| DMat3::from_cols(m.x_axis.abs(), m.y_axis.abs(), m.z_axis.abs());
+        let condition = (abs(m) * abs(m.inverse()) * DVec3::ONE).max_element() as f32;
+        LEAST_MARGIN.max(ROUNDINGS * f32::EPSILON / 2.0 * condition)
     }
 
     /// Returns the map of vectors from the scene's coordinates to those of the mesh.

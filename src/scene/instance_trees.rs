@@ -67,7 +67,7 @@ pub(super) fn place(
     let of_instance = |i: usize| box_of(&data.instances[i], trees[placed[i].tree as usize].tree.bounds());
     let boxes = try_par_collect((0..placed.len()).into_par_iter().map(of_instance), TREES)?;
     let top = Instances::top_of(&boxes, progress)?;
-    Ok(Instances { top, trees, placed })
+    Ok(Instances { top, trees, placed, margin: margin_of(data) })
 }
 
 /// Refits the trees after vertices of meshes and instances have moved; `rooms` are those of the meshes' trees. Returns
@@ -93,7 +93,8 @@ pub(super) fn refit(
     for (at, instance) in instances.placed.iter_mut().zip(&data.instances) {
         (at.to_mesh, at.origin) = (instance.to_mesh(), instance.transform.translation);
     }
-    let Instances { top, trees, placed } = instances;
+    instances.margin = margin_of(data);
+    let Instances { top, trees, placed, .. } = instances;
     let corners = |i: u32| {
         let bounds = trees[placed[i as usize].tree as usize].tree.bounds();
         Instances::corners_of_box(box_of(&data.instances[i as usize], bounds))
@@ -102,9 +103,13 @@ pub(super) fn refit(
     gone
 }
 
+fn margin_of(data: &SceneData) -> f32 {
+    data.instances.iter().map(Instance::margin).fold(0.0, f32::max)
+}
+
 /// The box in the scene of an instance of a mesh with given bounds.
 pub(super) fn box_of(instance: &Instance, bounds: (Vec3, Vec3)) -> (Vec3, Vec3) {
-    placed_box(bounds, instance.reach(bounds), |p| super::instance::placed(&instance.transform, p))
+    placed_box(bounds, instance.reach(bounds), instance.margin(), |p| super::instance::placed(&instance.transform, p))
 }
 
 /// Returns the box around a scene whose meshes without instances have the tree `own`, and its

@@ -57,7 +57,7 @@ pub(super) struct Room {
     alone: Vec<u16>,
     /// The rays at an instance, in the coordinates of its mesh.
     turned: Vec<Ray>,
-    /// Whether rays have an end that they had not when they were listed.
+    /// Whether any ray's end has changed since the rays were set up.
     has_ended: bool,
 }
 
@@ -102,17 +102,15 @@ impl Room {
     /// Whether there is memory for as many rays as go together.
     pub(super) fn has_memory(&mut self) -> bool {
         let nothing = Ray::zeroed();
-        self.alone.clear();
-        self.alone.try_reserve_exact(MAX_RAYS).is_ok()
+        self.alone.try_reserve_exact(MAX_RAYS.saturating_sub(self.alone.len())).is_ok()
             && fill(&mut self.rays, MAX_RAYS, nothing)
             && fill(&mut self.slabs, MAX_RAYS, Slab::zeroed())
             && fill(&mut self.masks, MAX_RAYS + 64, 0)
             && fill(&mut self.numbers, NUMBERS, 0)
-            && fill(&mut self.turned, MAX_RAYS + 8, nothing)
+            && fill(&mut self.turned, MAX_RAYS, nothing)
     }
 
-    /// Takes the rays of the next visit, at most [`MAX_RAYS`], with how far they go: `None` if they do not. Returns their
-    /// number.
+    /// Takes rays, at most [`MAX_RAYS`], with how far they go: `None` if they do not. Returns their number.
     #[inline]
     pub(super) fn take<'a>(&mut self, rays: impl Iterator<Item = (&'a Ray, Option<f32>)>) -> usize {
         let mut count = 0;
@@ -123,7 +121,7 @@ impl Room {
         count
     }
 
-    /// Numbers of the rays that were in no list, or were not to the end.
+    /// Numbers of the rays that were in no list, or in one that found no room: they are still to be traced.
     pub(super) fn alone(&self) -> &[u16] {
         &self.alone
     }
@@ -158,9 +156,9 @@ struct Entry {
 pub(super) unsafe fn trace<S: Simd>(instances: &Instances, count: usize, room: &mut Room, visit: OnVisit) {
     let top = &instances.top;
     let has_room = room.slabs.len() == MAX_RAYS && room.numbers.len() == NUMBERS && room.masks.len() >= MAX_RAYS + 64;
-    assert!(has_room && count <= MAX_RAYS && room.rays.len() == MAX_RAYS && room.turned.len() >= MAX_RAYS + 8);
+    assert!(has_room && count <= MAX_RAYS && room.rays.len() == MAX_RAYS && room.turned.len() == MAX_RAYS);
     // SAFETY: forwarded.
-    let all = unsafe { set_up::<S::F8>(count, room) };
+    let all = unsafe { set_up::<S::F8>(count, instances.margin, room) };
     let mut stack = [const { MaybeUninit::<Entry>::uninit() }; STACK_SIZE];
     stack[0].write(Entry { child: ChildRef::ROOT, start: 0, count: all as u32, parent: ChildRef::ROOT, lane: 0 });
     let mut depth = usize::from(all > 0);
@@ -196,7 +194,7 @@ pub(super) unsafe fn trace<S: Simd>(instances: &Instances, count: usize, room: &
 /// # Safety
 /// The CPU must have the ISA; the room must have its full length.
 #[inline(always)]
-unsafe fn set_up<L: Eight>(count: usize, room: &mut Room) -> usize {
+unsafe fn set_up<L: Eight>(count: usize, margin: f32, room: &mut Room) -> usize {
     room.alone.clear();
     let mut listed = 0;
     for first in (0..count).step_by(8) {
@@ -207,6 +205,11 @@ unsafe fn set_up<L: Eight>(count: usize, room: &mut Room) -> usize {
             let [ox, oy, oz, tmin, dx, dy, dz, tmax] = rays;
             let Offsets { reciprocal, near, far, limit } = offsets([ox, oy, oz], [dx, dy, dz], tmax);
             let zero = L::splat(0.0);
+            let abs = |x: L| x.max(zero - x);
+            // As in `RaySetup::write_for_boxes`.
+            let beside = L::splat(margin) * abs(ox).max(abs(oy)).max(abs(oz));
+            let wider = |a: usize| beside * abs(reciprocal[a]);
+            let (near, far) = ([0, 1, 2].map(|a| near[a] - wider(a)), [0, 1, 2].map(|a| far[a] + wider(a)));
             let row = |axis: u32, d: L| {
                 let row = |place: u32| L::splat(f32::from_bits(Mbvh::<WIDTH>::ROW * place));
                 L::select(d.lt(zero), row(axis + 3), row(axis))
@@ -261,7 +264,7 @@ unsafe fn turn<L: Eight>(at: &PlacedTree, list: std::ops::Range<usize>, room: &m
     }
 }
 
-/// Mask of a node's children that a ray hits, and where it enters their boxes, by the arithmetic of
+/// Where a ray enters the boxes of a node's children, and a mask of those that it hits, by the arithmetic of
 /// [`RaySetup::boxes`](super::tree::RaySetup::boxes).
 ///
 /// # Safety

@@ -5,8 +5,11 @@ use crate::device::{Device, DeviceOptions};
 use crate::scene::{Instance, Material, Mesh, MeshMaterials, NONE, Scene, SceneData, Texture};
 use crate::simd::Isa;
 use crate::trace::offset::{SurfacePoint, offset_ray_origin};
+use crate::trace::single::Walk;
 use crate::trace::{Hit, PACKET_SIZE, Packet, RawHit, Ray};
-use glam::{Affine3A, Quat, Vec2, Vec3};
+use glam::{Affine3A, Mat3, Quat, Vec2, Vec3};
+use std::f32::consts::FRAC_PI_2;
+use std::mem::MaybeUninit;
 use std::sync::Arc;
 
 fn vector(i: u32, dimension: u32, seed: u32) -> Vec3 {
@@ -269,6 +272,52 @@ fn rays_whose_lists_find_no_room_at_instances_hit_them_as_rays_alone() {
     let occluded: Vec<u8> = rays.iter().map(|r| scene.occluded(r) as u8).collect();
     many_rays_agree(&scene, &rays, &single, &occluded);
     assert!(occluded.iter().filter(|&&o| o == 1).count() > 20);
+}
+
+#[test]
+fn no_ray_enters_the_box_of_an_instance_behind_what_it_hits_there() {
+    let corner = |i: u32| Vec3::from_array([0, 1, 2].map(|a| (i >> a & 1) as f32 - 0.5));
+    let faces = [[0, 2, 3, 1], [4, 5, 7, 6], [0, 1, 5, 4], [2, 6, 7, 3], [0, 4, 6, 2], [1, 3, 7, 5]];
+    let cube = Mesh {
+        positions: (0..8).map(corner).collect(),
+        indices: faces.iter().flat_map(|&[a, b, c, d]| [[a, b, c], [a, c, d]]).collect(),
+        ..Default::default()
+    };
+    let shear = Mat3::from_cols(Vec3::X, Vec3::new(9.0, 1.0, 0.0), Vec3::new(0.0, 4.0, 1.0));
+    let turns = [Mat3::IDENTITY, Mat3::from_rotation_y(0.5), Mat3::from_rotation_x(FRAC_PI_2), shear];
+    for turn in turns {
+        let mut data = SceneData::new();
+        data.add_material(Material::default()).unwrap();
+        let mesh = data.add_mesh(cube.clone()).unwrap();
+        let transform = Affine3A::from_mat3_translation(turn, Vec3::splat(3.0));
+        data.add_instance(Instance { mesh, transform }).unwrap();
+        for isa in Isa::available() {
+            let scene = commit(isa, BuildOptions::default(), &data);
+            let instances = scene.instance_trees().unwrap();
+            let bounds = scene.bounds();
+            let mut met = 0;
+            for i in 0..40_000 {
+                // From far away, rays graze the sides of the box.
+                let (a, distance) = (i as usize % 3, 4f32.powi((i / 3 % 8) as i32));
+                let mut target = bounds.0 + (bounds.1 - bounds.0) * (0.5 + 0.5 * vector(i, 0, 5));
+                target[a] = [bounds.0[a], bounds.1[a]][i as usize & 1];
+                let mut direction = uniform_sphere([uniform(i, 5, 5), uniform(i, 6, 5)]);
+                direction[a] *= 0.03;
+                let ray = Ray::new(target - distance * direction, direction);
+                let hit = scene.intersect_raw(&ray);
+                if hit.is_miss() {
+                    continue;
+                }
+                met += 1;
+                let mut place = MaybeUninit::uninit();
+                assert!(Walk::begin_in_boxes(&mut place, &ray.within(0.0, hit.t), 0, instances.margin));
+                // SAFETY: it has begun.
+                let walk = unsafe { place.assume_init_mut() };
+                assert_eq!(scene.kernels().next_box(&instances.top, walk, hit.t), 0, "{isa:?} {turn} {i}");
+            }
+            assert!(met > 3000, "{met}");
+        }
+    }
 }
 
 #[test]

@@ -1,9 +1,11 @@
 //! Rays through instances (the two levels of [`crate::bvh::instances`]): each ray goes from box to box through the tree
-//! over instances, nearest first, and at each box through the tree of the instance's mesh, up to its best hit so far.
+//! over instances, and at each box through the tree of the instance's mesh, up to its best hit so far.
 //!
 //! Rays that go alike do so [as lists](super::box_lists), others [one by one](super::two_levels), many at a time.
-//! Transformed rays keep the length of their direction, so that distances are those in the scene, and the arithmetic of a
-//! transformed ray does not depend on the rays beside it: hits are the same, bit for bit, for one ray and for many.
+//! Transformed rays keep the length of their direction, so that distances are those in the scene. Hits are the same, bit for
+//! bit, for one ray and for many: the arithmetic of a transformed ray does not depend on the rays beside it, and no ray
+//! enters a box behind what it hits there, so that the order of boxes does not matter: see
+//! [`margin`](crate::scene::Instance::margin).
 
 use super::box_lists::{self, MAX_RAYS};
 use super::filter::Filter;
@@ -11,8 +13,8 @@ use super::queries::TreeView;
 use super::single::Walk;
 use super::{Kernels, RawHit, Ray};
 use crate::base::geometry::NONE;
+use crate::bvh::ChildRef;
 use crate::bvh::instances::{Instances, PlacedTree};
-use crate::bvh::{ChildRef, Mbvh};
 use crate::scene::Scene;
 use glam::{Vec3, Vec3A};
 use std::cell::Cell;
@@ -208,7 +210,7 @@ impl Scene {
     pub(super) fn meet_one_by_one<A: Answer>(&self, instances: &Instances, ray: &Ray, answer: &mut A) {
         let kernels = self.kernels();
         let mut place = MaybeUninit::uninit();
-        if answer.tmax(ray).is_none() || !Walk::begin::<Mbvh, false>(&mut place, ChildRef::ROOT, ray, 0) {
+        if answer.tmax(ray).is_none() || !Walk::begin_in_boxes(&mut place, ray, 0, instances.margin) {
             return;
         }
         // SAFETY: it has begun.
@@ -289,7 +291,7 @@ impl Scene {
         filter: &mut Filter,
     ) -> RawHit {
         let mut place = MaybeUninit::uninit();
-        if !Walk::begin::<Mbvh, false>(&mut place, ChildRef::ROOT, ray, 0) {
+        if !Walk::begin_in_boxes(&mut place, ray, 0, instances.margin) {
             return best;
         }
         // SAFETY: it has begun.

@@ -80,7 +80,7 @@ struct Bundle {
     grazing: Column,
     /// The largest component of the direction: factor from t to the distance along its axis.
     length: Column,
-    /// Conservative tmax: boxes that begin behind it are not entered. −inf for lanes behind the last ray.
+    /// Conservative tmax: boxes that begin behind it are not entered. Near the least float for lanes behind the last ray.
     limit: Column,
     t: Column,
     u: Column,

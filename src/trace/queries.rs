@@ -153,7 +153,7 @@ impl Scene {
 
     /// Closest hits of many rays, in order. `parallel`: spread over the device's threads.
     ///
-    /// Consecutive rays of a pinhole camera, with one origin and range, traverse the tree together and are several
+    /// Consecutive rays of a pinhole camera, with one origin and `tmin`, traverse the tree together and are several
     /// times as fast as others: best in small square tiles of pixels. Hits are the same, bit for bit.
     pub fn intersect_many(&self, rays: &[Ray], parallel: bool, out: &mut [Hit]) -> Result<()> {
         if rays.len() != out.len() {

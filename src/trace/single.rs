@@ -150,7 +150,7 @@ impl Stack {
     ) -> u32 {
         let mut room = MaybeUninit::uninit();
         let (order, shift) = if ANY && T::IS_BY_WORTH { (IN_ORDER.as_ptr(), 0) } else { (T::order(node), shift) };
-        // SAFETY: the builder bounds the tree's depth so that there is room (see `STACK_SIZE`).
+        // SAFETY: the builder bounds the trees' depth so that there is room (see `STACK_SIZE`, and `OUTER`).
         let set = unsafe {
             near.compress(
                 T::names(node, &mut room),
@@ -222,20 +222,37 @@ pub(super) struct Walk {
     current: ChildRef,
     /// Factor from the traversal's t to the ray's own t.
     scale: f32,
-    /// Index of the ray in its batch.
+    /// Number of the ray in its batch, or of the walk among those under way.
     pub(super) number: usize,
     stack: Stack,
 }
 
 impl Walk {
     /// Begins the traversal of a ray in `place`; returns whether there is anything to traverse: some rays cannot hit
-    /// anything. Without `TRIANGLES` it goes through boxes alone: by [`next_leaf`](Self::next_leaf).
+    /// anything.
     #[inline(always)]
-    pub(super) fn begin<T: Tree, const TRIANGLES: bool>(
+    pub(super) fn begin<T: Tree>(place: &mut MaybeUninit<Walk>, root: ChildRef, ray: &Ray, number: usize) -> bool {
+        // SAFETY: `place` is that of a setup.
+        let write = |p, d, tmin| unsafe { RaySetup::write::<T>(p, ray.origin, d, tmin) };
+        Self::begin_with(place, root, ray, number, write)
+    }
+
+    /// As [`begin`](Self::begin), for a walk through boxes by [`next_leaf`](Self::next_leaf), of a ray that may lie beside
+    /// where it is by `margin`, a fraction of its origin's coordinates.
+    #[inline(always)]
+    pub(super) fn begin_in_boxes(place: &mut MaybeUninit<Walk>, ray: &Ray, number: usize, margin: f32) -> bool {
+        // SAFETY: `place` is that of a setup.
+        let write = |p, d, tmin| unsafe { RaySetup::write_for_boxes::<Mbvh>(p, ray.origin, d, tmin, margin) };
+        Self::begin_with(place, ChildRef::ROOT, ray, number, write)
+    }
+
+    #[inline(always)]
+    fn begin_with(
         place: &mut MaybeUninit<Walk>,
         root: ChildRef,
         ray: &Ray,
         number: usize,
+        write: impl FnOnce(*mut RaySetup, [f32; 3], f32),
     ) -> bool {
         let Some(scale) = direction_scale(ray) else { return false };
         let (mut d, mut tmin, mut tmax) = (ray.direction, ray.tmin, ray.tmax);
@@ -250,7 +267,7 @@ impl Walk {
         // SAFETY: the pointers lead into `place`. Everything but entries of the stack is written, and
         // those are `MaybeUninit` themselves.
         unsafe {
-            RaySetup::write::<T, TRIANGLES>(&raw mut (*p).ray, ray.origin, d, tmin);
+            write(&raw mut (*p).ray, d, tmin);
             (&raw mut (*p).best).write(Best::none(tmax));
             (&raw mut (*p).limit).write(beyond(tmax));
             (&raw mut (*p).current).write(root);
@@ -324,7 +341,8 @@ impl Walk {
     /// call to call; nearest first. Returns [`ChildRef::EMPTY`] after the last one.
     ///
     /// # Safety
-    /// The CPU must have the ISA; the walk must have been begun in `tree`, and only this function have been called.
+    /// The CPU must have the ISA; the walk must have been begun in `tree`, and only this function have been called, or inner
+    /// trees have been entered and left.
     #[inline(always)]
     pub(super) unsafe fn next_leaf<S: Simd, T: Tree>(&mut self, tree: &T, tmax: f32) -> ChildRef {
         let limit = beyond(tmax / self.scale);
@@ -349,7 +367,7 @@ impl Walk {
     /// rays, which need a walk of their own.
     ///
     /// # Safety
-    /// The walk must have been begun, and not be in an inner tree.
+    /// The walk must have been begun, and not be in an inner tree. Until it leaves that, it may be in no tree but a `T`.
     #[inline(always)]
     pub(super) unsafe fn enter<T: Tree>(&mut self, ray: &Ray) -> bool {
         let can_enter = direction_scale(ray) == Some(1.0)
@@ -359,7 +377,8 @@ impl Walk {
         if !can_enter {
             return false;
         }
-        self.set_ray::<T, true>(ray);
+        // SAFETY: the walk's own.
+        unsafe { RaySetup::write::<T>(&raw mut self.ray, ray.origin, ray.direction, ray.tmin) }
         self.best = Best::none(ray.tmax);
         self.limit = beyond(ray.tmax);
         self.current = ChildRef::ROOT;
@@ -369,21 +388,17 @@ impl Walk {
         true
     }
 
-    /// Comes out of an inner tree that has ended, with the ray in the coordinates of the outer one. Returns false if nothing
-    /// waits there.
+    /// Comes out of an inner tree that has ended, with the ray in the coordinates of the outer one, and the margin of
+    /// [`begin_in_boxes`](Self::begin_in_boxes). Returns false if nothing waits there.
     #[inline(always)]
-    pub(super) fn leave(&mut self, ray: &Ray) -> bool {
+    pub(super) fn leave(&mut self, ray: &Ray, margin: f32) -> bool {
         let has_more = self.stack.count > BOTTOM;
         if has_more {
-            self.set_ray::<Mbvh, false>(ray);
+            let place = &raw mut self.ray;
+            // SAFETY: the walk's own.
+            unsafe { RaySetup::write_for_boxes::<Mbvh>(place, ray.origin, ray.direction, ray.tmin, margin) }
         }
         has_more
-    }
-
-    #[inline(always)]
-    fn set_ray<T: Tree, const TRIANGLES: bool>(&mut self, ray: &Ray) {
-        // SAFETY: the walk's own.
-        unsafe { RaySetup::write::<T, TRIANGLES>(&raw mut self.ray, ray.origin, ray.direction, ray.tmin) }
     }
 
     /// Goes on to the end of the tree, and returns what has been found there.
@@ -444,7 +459,7 @@ pub(super) unsafe fn one_of<S: Simd, T: Tree, A: Accept, const ANY: bool>(
     accept: &mut A,
 ) -> RawHit {
     let mut place = MaybeUninit::uninit();
-    if !Walk::begin::<T, true>(&mut place, ChildRef::ROOT, ray, 0) {
+    if !Walk::begin::<T>(&mut place, ChildRef::ROOT, ray, 0) {
         return RawHit::MISS;
     }
     // SAFETY: it has begun. The caller vouches for the ISA.
@@ -476,7 +491,10 @@ fn give_room_back(room: Vec<Walk>) {
 }
 
 /// What [`fly`] is to traverse.
-pub(super) trait Work<T> {
+///
+/// # Safety
+/// Where `begin` and `end` return true, the walk must have been begun, be at a node, and be in the tree that `tree` returns.
+pub(super) unsafe trait Work<T> {
     /// Begins the next traversal in a place, of that number among those under way. Returns false when nothing is left.
     ///
     /// # Safety
@@ -490,7 +508,10 @@ pub(super) trait Work<T> {
     unsafe fn end<S: Simd>(&mut self, walk: &mut Walk) -> bool;
 
     /// The tree of a traversal.
-    fn tree(&self, walk: &Walk) -> &T;
+    ///
+    /// # Safety
+    /// The traversal must have begun.
+    unsafe fn tree(&self, walk: &Walk) -> &T;
 }
 
 /// Rays from 0 to `count`, which `ray` returns, below a node of a tree; `done` receives their hits.
@@ -503,13 +524,14 @@ struct Rays<'a, T, R, D> {
     done: D,
 }
 
-impl<T: Tree, R: Fn(usize) -> Ray, D: FnMut(usize, RawHit)> Work<T> for Rays<'_, T, R, D> {
+// SAFETY: walks are begun in the one tree, at its root or another node.
+unsafe impl<T: Tree, R: Fn(usize) -> Ray, D: FnMut(usize, RawHit)> Work<T> for Rays<'_, T, R, D> {
     #[inline(always)]
     unsafe fn begin<S: Simd>(&mut self, place: &mut MaybeUninit<Walk>, _: usize) -> bool {
         while self.next < self.count {
             let number = self.next;
             self.next += 1;
-            if Walk::begin::<T, true>(place, self.root, &(self.ray)(number), number) {
+            if Walk::begin::<T>(place, self.root, &(self.ray)(number), number) {
                 return true;
             }
             (self.done)(number, RawHit::MISS);
@@ -524,7 +546,7 @@ impl<T: Tree, R: Fn(usize) -> Ray, D: FnMut(usize, RawHit)> Work<T> for Rays<'_,
     }
 
     #[inline(always)]
-    fn tree(&self, _: &Walk) -> &T {
+    unsafe fn tree(&self, _: &Walk) -> &T {
         self.tree
     }
 }
@@ -617,8 +639,9 @@ pub(super) unsafe fn fly<S: Simd, T: Tree, const ANY: bool>(work: &mut impl Work
             let walk = unsafe { &mut **at_leaves.add(k) };
             let mut child = walk.current;
             if child != ChildRef::EMPTY {
-                let tree = work.tree(walk);
                 // SAFETY: it has begun in this tree, and is at a leaf. The caller vouches for the ISA.
+                let tree = unsafe { work.tree(walk) };
+                // SAFETY: as above.
                 child = unsafe { walk.visit_leaf::<S, T, All, ANY>(tree, &mut All) };
                 if child != ChildRef::EMPTY {
                     tree.prefetch(child);

@@ -1,6 +1,6 @@
 //! Many single rays through both levels of the trees of [`instances`](super::instances): each goes from box to box,
 //! nearest first, and at each through the tree of the instance's mesh, up to its best hit so far. While one ray waits for
-//! memory, others go on, wherever each of them is (Wald, Benthin and Slusallek, *Distributed Interactive Ray Tracing of
+//! the memory of a mesh's tree, others go on, whichever mesh they are in (Wald, Benthin and Slusallek, *Distributed Interactive Ray Tracing of
 //! Dynamic Scenes*, 2003, with the flights of [`single`]).
 
 use super::Ray;
@@ -104,7 +104,7 @@ unsafe fn trace_one<S: Simd, T: Tree, H: Borrow<T>, A: Answer, const ANY: bool>(
     answer: &mut A,
 ) {
     let mut place = MaybeUninit::uninit();
-    if answer.tmax(ray).is_none() || !Walk::begin::<Mbvh, false>(&mut place, ChildRef::ROOT, ray, 0) {
+    if answer.tmax(ray).is_none() || !Walk::begin_in_boxes(&mut place, ray, 0, instances.margin) {
         return;
     }
     // SAFETY: it has begun. The leaves of the tree over boxes hold the instances' numbers, one each. The caller vouches for
@@ -123,7 +123,7 @@ unsafe fn trace_one<S: Simd, T: Tree, H: Borrow<T>, A: Answer, const ANY: bool>(
             }
             let hit = walk.run::<S, T, All, ANY>(tree.borrow(), &mut All);
             answer.add(A::of(hit), at.first_triangle);
-            if !walk.leave(ray) {
+            if !walk.leave(ray, instances.margin) {
                 return;
             }
         }
@@ -134,7 +134,7 @@ impl<A: Answer, H: Copy, F: Fn(u32) -> Option<H>> Placed<'_, A, H, F> {
     /// Sends a ray into the next box. Returns false after its last one.
     ///
     /// # Safety
-    /// The CPU must have the ISA; the walk must be in the tree over boxes, with that number.
+    /// The CPU must have the ISA; the walk must be that ray's, and in the tree over boxes.
     #[inline(always)]
     unsafe fn go_on<S: Simd, T: Tree>(&mut self, walk: &mut Walk, ray: usize) -> bool
     where
@@ -161,14 +161,15 @@ impl<A: Answer, H: Copy, F: Fn(u32) -> Option<H>> Placed<'_, A, H, F> {
     }
 }
 
-impl<T: Tree, A: Answer, H: Borrow<T> + Copy, F: Fn(u32) -> Option<H>> Work<T> for Placed<'_, A, H, F> {
+// SAFETY: walks enter the tree that is noted in their place, at its root.
+unsafe impl<T: Tree, A: Answer, H: Borrow<T> + Copy, F: Fn(u32) -> Option<H>> Work<T> for Placed<'_, A, H, F> {
     #[inline(always)]
     unsafe fn begin<S: Simd>(&mut self, place: &mut MaybeUninit<Walk>, number: usize) -> bool {
         while self.next < self.rays.len() {
             let ray = self.next;
             self.next += 1;
             let goes_on = self.answers[ray].tmax(&self.rays[ray]).is_some();
-            if goes_on && Walk::begin::<Mbvh, false>(place, ChildRef::ROOT, &self.rays[ray], number) {
+            if goes_on && Walk::begin_in_boxes(place, &self.rays[ray], number, self.instances.margin) {
                 // SAFETY: it has begun. The caller vouches for the ISA.
                 if unsafe { self.go_on::<S, T>(place.assume_init_mut(), ray) } {
                     return true;
@@ -184,12 +185,12 @@ impl<T: Tree, A: Answer, H: Borrow<T> + Copy, F: Fn(u32) -> Option<H>> Work<T> f
         unsafe {
             let At { ray, first_triangle, .. } = self.at[walk.number].assume_init();
             self.answers[ray].add(A::of(walk.hit()), first_triangle);
-            walk.leave(&self.rays[ray]) && self.go_on::<S, T>(walk, ray)
+            walk.leave(&self.rays[ray], self.instances.margin) && self.go_on::<S, T>(walk, ray)
         }
     }
 
     #[inline(always)]
-    fn tree(&self, walk: &Walk) -> &T {
+    unsafe fn tree(&self, walk: &Walk) -> &T {
         // SAFETY: a ray is in its place.
         unsafe { self.at[walk.number].assume_init_ref() }.tree.borrow()
     }

@@ -6,8 +6,8 @@ use super::instances::Answer;
 use super::single::Walk;
 use super::tree::beyond;
 use crate::base::geometry::NONE;
+use crate::bvh::ChildRef;
 use crate::bvh::parts::Part;
-use crate::bvh::{ChildRef, Mbvh};
 use crate::scene::Scene;
 use crate::scene::waiting::{self, WaitingRays};
 use std::mem::MaybeUninit;
@@ -102,7 +102,7 @@ impl<A: Answer> Batch<A> {
         for (ray, answer) in rays.iter().zip(answers) {
             all.begin.push(u32::try_from(all.parts.len()).ok()?);
             let Some(tmax) = answer.tmax(ray) else { continue };
-            if !Walk::begin::<Mbvh, false>(&mut place, ChildRef::ROOT, ray, 0) {
+            if !Walk::begin_in_boxes(&mut place, ray, 0, 0.0) {
                 continue;
             }
             // SAFETY: it has begun.
