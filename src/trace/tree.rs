@@ -207,7 +207,6 @@ impl RaySetup {
     }
 
     /// `beside`: by how much the ray may lie beside where it is.
-
     #[inline(always)]
     fn with<T: Tree>(origin: [f32; 3], direction: [f32; 3], tmin: f32, beside: f32, shear: Shear) -> Self {
         let is_negative = direction.map(|d| d < 0.0);
