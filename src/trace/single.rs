@@ -362,7 +362,7 @@ impl Walk {
         self.current
     }
 
-    /// Goes into a tree that is the current leaf, with the ray in its coordinates. What waits in the outer tree stays on the
+    /// Goes into the tree that the current leaf stands for, with the ray in its coordinates. What waits in the outer tree stays on the
     /// stack, and comes up after the inner one has ended: see [`Self::leave`]. Returns false, and changes nothing, for some
     /// rays, which need a walk of their own.
     ///
