@@ -1058,7 +1058,7 @@ BK_API bk_result bk_scene_get_mesh(const bk_scene *scene, uint32_t mesh, bk_mesh
  *
  * A mesh that stands in the scene many times is added once, with an instance for each place. It then stands where its
  * instances say, and nowhere else. Vertices and acceleration structure exist once; each instance has light of its
- * own, at coordinates of its own in the light map.
+ * own, at coordinates of its own in the light map, unless it is to [share](bk_instance_share_light) that of another.
  *
  * A transform is 12 floats: the images of the x, y and z axis, then the translation (a 3 by 4 matrix by columns; the
  * rows of a row-major 4 by 3 matrix that row vectors are multiplied with). It must not mirror: add a mirrored mesh
@@ -1090,6 +1090,34 @@ bk_result bk_scene_add_instance(bk_scene *scene,
                                 uint32_t mesh,
                                 const float *transform,
                                 uint32_t *out_id);
+
+/// Lets an instance show the light of another instance of the same mesh: it gets no texels of its own in light maps,
+/// bk_lightmap_instance_uvs returns those of the other one for it, and what it reflects to other
+/// surfaces is what the other one reflects. For what stands in places of much the same light so
+/// often that texels for each would be too many. Rays hit it where it stands, and it casts shadows
+/// there.
+///
+/// @param scene  scene that is not committed
+/// @param instance  number of the instance
+/// @param of  number of an instance of the same mesh, less than `instance`. If it shows the light of
+///   a third one itself, both do.
+/// @retval BK_ERROR_INVALID_ARGUMENT  there is no such instance, or `of` is not less than it or of
+///   another mesh
+/// @retval BK_ERROR_INVALID_STATE  the scene is committed or another thread is changing it
+BK_API
+bk_result bk_instance_share_light(bk_scene *scene,
+                                  uint32_t instance,
+                                  uint32_t of);
+
+/// Gets the instance whose texels and light an instance shows, of a scene that is committed or not:
+/// itself, unless bk_instance_share_light or a scene file said otherwise.
+///
+/// @param scene  any scene
+/// @param instance  number of the instance
+/// @param out_instance  receives the number
+/// @retval BK_ERROR_INVALID_ARGUMENT  there is no such instance, or out_instance is NULL
+/// @retval BK_ERROR_INVALID_STATE  the scene is being refitted, or another thread is changing it
+BK_API bk_result bk_instance_light_of(const bk_scene *scene, uint32_t instance, uint32_t *out_instance);
 
 /// Sets a new transform for an instance of a committed scene. Nothing changes before bk_scene_refit,
 /// which applies the last transform that was set for each instance.

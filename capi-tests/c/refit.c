@@ -140,6 +140,87 @@ static void test_instances(bk_device *device) {
     bk_scene_release(scene);
 }
 
+/* Two floors one above the other, of which the second shows the light of the first. */
+static void test_shared_light(bk_device *device) {
+    static const float AT[3][12] = {
+        {1, 0, 0, 0, 1, 0, 0, 0, 1, 0, 0, 0}, {1, 0, 0, 0, 1, 0, 0, 0, 1, 0, 0, 1}, {1, 0, 0, 0, 1, 0, 0, 0, 1, 5, 0, 0}};
+    static const float UP_THERE[3] = {0.5f, 0.5f, 3.0f}, WHITE[3] = {1, 1, 1};
+    float uvs[3][12];
+    uint32_t i, pages[3][2], of = 7;
+    bk_scene *scene = NULL;
+    bk_lightmap *lightmap = NULL;
+    bk_lightmap_desc desc;
+    bk_lightmap_info alone, shared;
+    bk_material_desc material;
+    bk_mesh_desc floor;
+    bk_light_desc lamp;
+    bk_bake_params params;
+    CHECK_OK(bk_scene_create(device, &scene));
+    bk_material_desc_init(&material);
+    CHECK_OK(bk_scene_add_material(scene, &material, NULL));
+    bk_mesh_desc_init(&floor);
+    floor.positions = SQUARE[0];
+    floor.vertex_count = 4;
+    floor.indices = UP[0];
+    floor.triangle_count = 2;
+    for (i = 0; i < 2; i++) {
+        CHECK_OK(bk_scene_add_mesh(scene, &floor, NULL));
+    }
+    for (i = 0; i < 3; i++) {
+        CHECK_OK(bk_scene_add_instance(scene, i / 2, AT[i], NULL));
+    }
+    CHECK_ERROR(bk_instance_share_light(scene, 3, 0), ARGUMENT, "instance 3");
+    CHECK_ERROR(bk_instance_share_light(scene, 1, 1), ARGUMENT, "before it");
+    CHECK_ERROR(bk_instance_share_light(scene, 0, 1), ARGUMENT, "before it");
+    CHECK_ERROR(bk_instance_share_light(scene, 2, 0), ARGUMENT, "mesh 0");
+    CHECK_OK(bk_instance_light_of(scene, 1, &of));
+    CHECK(of == 1);
+    CHECK_OK(bk_instance_share_light(scene, 1, 0));
+    CHECK_OK(bk_instance_light_of(scene, 1, &of));
+    CHECK(of == 0);
+    CHECK_ERROR(bk_instance_light_of(scene, 3, &of), ARGUMENT, "instance 3");
+    CHECK_ERROR(bk_instance_light_of(scene, 0, NULL), ARGUMENT, "out_instance");
+    bk_light_desc_init(&lamp);
+    lamp.type = BK_LIGHT_POINT;
+    memcpy(lamp.position, UP_THERE, sizeof lamp.position);
+    memcpy(lamp.color, WHITE, sizeof lamp.color);
+    CHECK_OK(bk_scene_add_light(scene, &lamp, NULL));
+    CHECK_OK(bk_scene_commit(scene, NULL, NULL));
+    CHECK_ERROR(bk_instance_share_light(scene, 1, 0), STATE, "share light no more");
+    CHECK_OK(bk_instance_light_of(scene, 1, &of));
+    CHECK(of == 0);
+
+    bk_lightmap_desc_init(&desc);
+    desc.texels_per_unit = 8;
+    CHECK_OK(bk_lightmap_create(scene, &desc, NULL, NULL, &lightmap));
+    for (i = 0; i < 3; i++) {
+        CHECK_OK(bk_lightmap_instance_uvs(lightmap, i, uvs[i], pages[i]));
+    }
+    CHECK(memcmp(uvs[0], uvs[1], sizeof uvs[0]) == 0 && memcmp(uvs[0], uvs[2], sizeof uvs[0]) != 0);
+    bk_lightmap_info_init(&shared);
+    CHECK_OK(bk_lightmap_get_info(lightmap, &shared));
+    bk_bake_params_init(&params);
+    params.photon_count = 1000;
+    CHECK_OK(bk_bake(lightmap, &params, NULL, NULL, NULL));
+    bk_lightmap_release(lightmap);
+    bk_scene_release(scene);
+
+    /* As many texels as two floors have. */
+    CHECK_OK(bk_scene_create(device, &scene));
+    CHECK_OK(bk_scene_add_material(scene, &material, NULL));
+    CHECK_OK(bk_scene_add_mesh(scene, &floor, NULL));
+    for (i = 0; i < 2; i++) {
+        CHECK_OK(bk_scene_add_instance(scene, 0, AT[i], NULL));
+    }
+    CHECK_OK(bk_scene_commit(scene, NULL, NULL));
+    CHECK_OK(bk_lightmap_create(scene, &desc, NULL, NULL, &lightmap));
+    bk_lightmap_info_init(&alone);
+    CHECK_OK(bk_lightmap_get_info(lightmap, &alone));
+    CHECK(shared.texels == alone.texels && shared.chart_count == alone.chart_count);
+    bk_lightmap_release(lightmap);
+    bk_scene_release(scene);
+}
+
 static void test_use(bk_device *device) {
     bk_scene *scene = committed_scene(device, 0);
     bk_scene_stats before = stats_of(scene), after;
@@ -280,6 +361,7 @@ int main(void) {
     desc.num_threads = 2;
     CHECK_OK(bk_device_create(&desc, &device));
     test_instances(device);
+    test_shared_light(device);
     test_use(device);
     test_old_lightmaps(device);
     test_bad_input(device);

@@ -43,7 +43,7 @@ fn rooms(is_instance: bool) -> (Arc<Scene>, Lightmap) {
     data.add_mesh(block(Vec3::new(3.9, 0.0, 0.0), Vec3::new(4.1, 2.8, 3.0), false)).unwrap();
     data.add_mesh(block(Vec3::new(0.6, 0.6, 0.0), Vec3::new(1.1, 1.1, 0.6), false)).unwrap();
     if is_instance {
-        data.add_instance(Instance { mesh: 2, transform: Affine3A::IDENTITY }).unwrap();
+        data.add_instance(Instance::new(2, Affine3A::IDENTITY)).unwrap();
     }
     for x in [2.0, 6.0] {
         data.add_light(lamp(x, 5.0)).unwrap();

@@ -318,6 +318,11 @@ fn backs_have_uvs_positions_and_normals_of_their_own() {
 
 /// A closed white room with a lamp, and balls in it that are instances of one mesh, or copies of it.
 fn room_of_balls(threads: usize, copies: bool) -> Arc<Scene> {
+    let (device, data) = (device(threads, None), described_balls(copies));
+    Scene::commit(&device, data, &BuildOptions::default(), &Progress::none()).map_err(|e| e.1).unwrap()
+}
+
+fn described_balls(copies: bool) -> SceneData {
     let mut data = SceneData::new();
     let white = data.add_material(Material { albedo: [0.7; 3], ..Default::default() }).unwrap();
     let red = data.add_material(Material { albedo: [0.6, 0.1, 0.1], ..Default::default() }).unwrap();
@@ -332,7 +337,7 @@ fn room_of_balls(threads: usize, copies: bool) -> Arc<Scene> {
         let scale = if i == 4 { Vec3::new(1.2, 0.6, 1.0) } else { Vec3::splat(0.5 + 0.2 * i as f32) };
         let turn = Quat::from_rotation_z(0.7 * i as f32);
         let transform = Affine3A::from_scale_rotation_translation(scale, turn, place);
-        data.add_instance(Instance { mesh, transform }).unwrap();
+        data.add_instance(Instance::new(mesh, transform)).unwrap();
     }
     let lamp = Light::Point { position: Vec3::new(2.0, 2.7, 2.0), intensity: [3.0; 3] };
     if copies {
@@ -342,7 +347,7 @@ fn room_of_balls(threads: usize, copies: bool) -> Arc<Scene> {
         data = flat;
     }
     data.add_light(lamp).unwrap();
-    Scene::commit(&device(threads, None), data, &BuildOptions::default(), &Progress::none()).map_err(|e| e.1).unwrap()
+    data
 }
 
 #[test]
@@ -379,6 +384,59 @@ fn instances_have_the_light_of_copies_each_its_own() {
     }
     println!("light of the first ball: {light:.2}, by paths {truth:.2}");
     assert!((light / truth - 1.0).abs() < 0.04, "{light} {truth}");
+}
+
+#[test]
+fn instances_that_share_light_show_that_of_one() {
+    let desc = LightmapDesc { texels_per_unit: 16.0, ..Default::default() };
+    let shared = |shared: &[(u32, u32)], threads| {
+        let mut data = described_balls(false);
+        shared.iter().for_each(|&(instance, of)| data.share_light(instance, of).unwrap());
+        let scene = Scene::commit(&device(threads, None), data, &BuildOptions::default(), &Progress::none());
+        let mut map = Lightmap::create(&scene.map_err(|e| e.1).unwrap(), &desc, &Progress::none()).unwrap();
+        map.bake(&BakeParams::default(), &Progress::none()).unwrap();
+        map
+    };
+    // Two balls beside one another; and the flattened one, whose charts are of another shape.
+    let (some, alone) = (shared(&[(2, 1), (4, 0)], 2), shared(&[], 2));
+    assert_same_bits(&bits(&some), &bits(&shared(&[(2, 1), (4, 0)], 1)), "one thread");
+    assert!(some.plan_text().contains("left out: texels of 2 instances"));
+    assert!(some.info().texels < alone.info().texels);
+    let scene = some.scene();
+    let (mut random, mut squares, mut sum) = (Random::new(4, 0), 0.0, 0.0);
+    for (instance, of) in [(2, 1), (4, 0)] {
+        let [first, shown] = [instance, of].map(|i| scene.first_triangle(2 + i));
+        assert_eq!(some.instance_uvs(instance).unwrap(), some.instance_uvs(of).unwrap());
+        for t in (0..scene.triangles_of(2).len() as u32).step_by(5) {
+            let [a, b] = [first, shown].map(|f| some.sample(Layer::Combined, f + t, true, 0.3, 0.3));
+            assert!(a == b && a[0] > 0.0, "{t}: {a:?} {b:?}");
+        }
+    }
+    // The room has the light that it has with texels for each ball, but for what two of them reflect in places of much the
+    // same light.
+    for _ in 0..2000 {
+        let place = Place::random(scene, &mut random);
+        if scene.locate(place.triangle).0 == 0 {
+            let [a, b] = [&some, &alone].map(|map| place.sample(map, Layer::Combined));
+            squares += (a[0] - b[0]).powi(2);
+            sum += b[0];
+        }
+    }
+    let error = (squares / 2000.0).sqrt() / (sum / 2000.0);
+    println!("shared light against each its own, on the walls: {:.2} % RMS", 100.0 * error);
+    assert!(error < 0.03, "{error}");
+    // A layout and a scene file say who shows whose light.
+    let folder = std::env::temp_dir().join(format!("bakelite-shared-light-{}", std::process::id()));
+    std::fs::create_dir_all(&folder).unwrap();
+    let [layout, file] = ["layout", "scene"].map(|name| folder.join(name));
+    some.save_layout(&layout, &Progress::none()).unwrap();
+    scene.save(&file, &Progress::none()).unwrap();
+    let opened = Scene::open(&device(2, None), &file, &Default::default(), &Progress::none()).unwrap();
+    assert_eq!((0..5).map(|i| opened.light_of_instance(i)).collect::<Vec<_>>(), [0, 1, 1, 3, 0]);
+    let loaded = Lightmap::load_layout(&opened, &desc, &layout, &Progress::none()).unwrap();
+    assert_eq!(loaded.instance_uvs(2).unwrap(), some.instance_uvs(1).unwrap());
+    assert!(Lightmap::load_layout(alone.scene(), &desc, &layout, &Progress::none()).is_err());
+    std::fs::remove_dir_all(&folder).unwrap();
 }
 
 /// The Cornell box, whose front is open, in the light of a sky with an image and of a low sun with a disc.

@@ -2,7 +2,7 @@
 //!
 //! A mesh that stands in the scene many times is added once, with an instance for each place. It then stands where its
 //! instances say, and nowhere else. Vertices and acceleration structure exist once; each instance has light of its
-//! own, at coordinates of its own in the light map.
+//! own, at coordinates of its own in the light map, unless it is to [share](bk_instance_share_light) that of another.
 //!
 //! A transform is 12 floats: the images of the x, y and z axis, then the translation (a 3 by 4 matrix by columns; the
 //! rows of a row-major 4 by 3 matrix that row vectors are multiplied with). It must not mirror: add a mirrored mesh
@@ -14,7 +14,7 @@
 //! third of the time through copies and twice as long, through meshes of some 1,000 triangles up to
 //! four times as long: see the manual, docs/performance.md.
 
-use super::args::{read_strided, write_optional};
+use super::args::{read_strided, write, write_optional};
 use super::error::{bk_result, call, call_or};
 use super::handles::object;
 use super::scene::bk_scene;
@@ -51,9 +51,55 @@ pub unsafe extern "C" fn bk_scene_add_instance(
     // SAFETY: transform and out_id are the caller's, or NULL.
     call(|| unsafe {
         let transform = read_transform(transform)?;
-        let id =
-            object!(scene).describe("instances can be added", |d| d.data.add_instance(Instance { mesh, transform }))?;
+        let id = object!(scene)
+            .describe("instances can be added", |d| d.data.add_instance(Instance::new(mesh, transform)))?;
         write_optional(out_id, id)
+    })
+}
+
+/// Lets an instance show the light of another instance of the same mesh: it gets no texels of its own in light maps,
+/// bk_lightmap_instance_uvs returns those of the other one for it, and what it reflects to other
+/// surfaces is what the other one reflects. For what stands in places of much the same light so
+/// often that texels for each would be too many. Rays hit it where it stands, and it casts shadows
+/// there.
+///
+/// @param scene  scene that is not committed
+/// @param instance  number of the instance
+/// @param of  number of an instance of the same mesh, less than `instance`. If it shows the light of
+///   a third one itself, both do.
+/// @retval BK_ERROR_INVALID_ARGUMENT  there is no such instance, or `of` is not less than it or of
+///   another mesh
+/// @retval BK_ERROR_INVALID_STATE  the scene is committed or another thread is changing it
+#[unsafe(no_mangle)]
+pub unsafe extern "C" fn bk_instance_share_light(scene: *mut bk_scene, instance: u32, of: u32) -> bk_result {
+    call(|| object!(scene).describe("instances can share light", |d| d.data.share_light(instance, of)))
+}
+
+/// Gets the instance whose texels and light an instance shows, of a scene that is committed or not:
+/// itself, unless bk_instance_share_light or a scene file said otherwise.
+///
+/// @param scene  any scene
+/// @param instance  number of the instance
+/// @param out_instance  receives the number
+/// @retval BK_ERROR_INVALID_ARGUMENT  there is no such instance, or out_instance is NULL
+/// @retval BK_ERROR_INVALID_STATE  the scene is being refitted, or another thread is changing it
+#[unsafe(no_mangle)]
+pub unsafe extern "C" fn bk_instance_light_of(
+    scene: *const bk_scene,
+    instance: u32,
+    out_instance: *mut u32,
+) -> bk_result {
+    // SAFETY: the place is the caller's, or NULL.
+    call(|| unsafe {
+        let find = |count: usize, shown: &dyn Fn() -> u32| match (instance as usize) < count {
+            true => Ok(shown()),
+            false => invalid_argument!("instance {instance} does not exist, the scene has {count}"),
+        };
+        let shown = object!(scene).either(
+            |d| find(d.instances().len(), &|| d.light_of_instance(instance)),
+            |s| find(s.instances().len(), &|| s.light_of_instance(instance)),
+        )?;
+        write(out_instance, shown, "out_instance")
     })
 }
 

@@ -113,7 +113,16 @@ impl Plan {
         }
         plan.materials(scene);
         plan.directional(params);
+        plan.shared_light(scene);
         plan
+    }
+
+    /// Adds a line on instances that show the light of others.
+    fn shared_light(&mut self, scene: &Scene) {
+        match scene.instances().iter().filter(|i| i.light_of.is_some()).count() {
+            0 => (),
+            n => self.lines.push(format!("left out: texels of {n} instances (they show the light of others)")),
+        }
     }
 
     /// Adds a line on light by direction.

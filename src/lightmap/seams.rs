@@ -345,7 +345,9 @@ impl Job<'_, '_, '_> {
         let (mut edges, mut others) = (Vec::new(), Vec::new());
         for (number, sheet) in (0..).zip(&charts.shared) {
             let [inside, alone] = self.edges_of(sheet)?;
-            let places = try_collect(charts.places.iter().filter(|place| place.sheet == number), SEAMS)?;
+            // Of instances that show another one's light, neighbours in the scene are not neighbours of that light.
+            let own = (0..).zip(&charts.places).filter(|&(i, place)| place.sheet == number && place.shown == i);
+            let places = try_collect(own.map(|(_, place)| place), SEAMS)?;
             let shift = |place: &Place| place.first_triangle.wrapping_sub(sheet.first_triangle);
             let found = try_par_gather(places.len(), SEAMS, |i, out| {
                 self.stage.check()?;

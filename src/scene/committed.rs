@@ -156,6 +156,16 @@ impl Scene {
         self.data.is_instanced(mesh)
     }
 
+    /// Returns the instance whose texels and light an instance, which must exist, shows: itself, or another one.
+    pub fn light_of_instance(&self, instance: u32) -> u32 {
+        self.data.light_of_instance(instance)
+    }
+
+    /// Whether an object is an instance that shows the light of another one.
+    pub(crate) fn shows_light_of_other(&self, object: u32) -> bool {
+        self.data.shows_light_of_other(object)
+    }
+
     /// Whether `other` is this scene in another state: as it was before refits, or is after them.
     pub(crate) fn is_state_of(&self, other: &Scene) -> bool {
         Arc::ptr_eq(&self.lights, &other.lights)

@@ -12,6 +12,9 @@ pub struct Instance {
     pub mesh: u32,
     /// Map from the mesh's coordinates to those of the scene.
     pub transform: Affine3A,
+    /// Number of another instance of the mesh, less than that of this one, whose texels and light this one shows; `None`: it has
+    /// some of its own.
+    pub light_of: Option<u32>,
 }
 
 /// Least volume of the box that the images of the axes span, as a fraction of the product of their lengths: with a
@@ -26,6 +29,11 @@ const LEAST_MARGIN: f32 = 1e-6;
 const ROUNDINGS: f32 = 10.0;
 
 impl Instance {
+    /// An instance with light of its own.
+    pub fn new(mesh: u32, transform: Affine3A) -> Instance {
+        Instance { mesh, transform, light_of: None }
+    }
+
     /// Checks that the transform is finite, can be inverted and does not mirror.
     pub fn validate(&self, mesh_count: usize) -> Result<()> {
         if self.mesh as usize >= mesh_count {
@@ -175,7 +183,7 @@ mod tests {
     use glam::Quat;
 
     fn of(transform: Affine3A) -> Instance {
-        Instance { mesh: 0, transform }
+        Instance::new(0, transform)
     }
 
     #[test]

@@ -33,7 +33,7 @@ pub use saved::OpenOptions;
 pub use texture::{MAX_TEXTURE_SIZE, Texture};
 
 use crate::base::error::{Error, Result, invalid_argument};
-use crate::base::memory::{try_push, try_to_vec, try_with_capacity};
+use crate::base::memory::{try_filled, try_push, try_to_vec, try_with_capacity};
 use std::borrow::Cow;
 use std::sync::Arc;
 
@@ -108,6 +108,9 @@ impl SceneData {
     /// where its instances do, and nowhere else.
     pub fn add_instance(&mut self, instance: Instance) -> Result<u32> {
         instance.validate(self.meshes.len())?;
+        if let Some(of) = instance.light_of {
+            self.check_shared_light(self.instances.len() as u32, instance.mesh, of)?;
+        }
         let mesh = instance.mesh as usize;
         let triangles = self.meshes[mesh].indices.len();
         let own = self.own_triangles - if self.is_instanced(instance.mesh) { 0 } else { triangles };
@@ -123,6 +126,55 @@ impl SceneData {
         self.own_triangles = own;
         self.instance_triangles += triangles;
         Ok(self.instances.len() as u32 - 1)
+    }
+
+    /// Lets an instance show the texels and the light of another one, `of`, of the same mesh and with a lower number, instead
+    /// of some of its own. If that shows those of a third one, both do.
+    pub fn share_light(&mut self, instance: u32, of: u32) -> Result<()> {
+        let Some(&Instance { mesh, .. }) = self.instances.get(instance as usize) else {
+            return invalid_argument!("instance {instance} does not exist, the scene has {}", self.instances.len());
+        };
+        self.check_shared_light(instance, mesh, of)?;
+        self.instances[instance as usize].light_of = Some(of);
+        Ok(())
+    }
+
+    /// Lets all instances of each mesh show the texels and the light of the first one.
+    pub fn share_light_of_meshes(&mut self) -> Result<()> {
+        let mut firsts: Vec<Option<u32>> = try_filled(self.meshes.len(), None, "the instances")?;
+        for (number, instance) in (0..).zip(&mut self.instances) {
+            let first = &mut firsts[instance.mesh as usize];
+            instance.light_of = *first;
+            first.get_or_insert(number);
+        }
+        Ok(())
+    }
+
+    /// Checks that an instance of a mesh, by its number, may show the light of another one.
+    fn check_shared_light(&self, instance: u32, mesh: u32, of: u32) -> Result<()> {
+        match self.instances.get(of as usize).filter(|_| of < instance) {
+            Some(other) if other.mesh == mesh => Ok(()),
+            Some(other) => invalid_argument!(
+                "instance {instance} is of mesh {mesh} and cannot show the light of instance {of}, which is of mesh {}",
+                other.mesh
+            ),
+            None => invalid_argument!("instance {instance} can show the light of those before it, and {of} is not"),
+        }
+    }
+
+    /// Returns the instance whose texels and light an instance shows: itself, or another one with some of its own.
+    pub fn light_of_instance(&self, instance: u32) -> u32 {
+        let mut shown = instance;
+        while let Some(of) = self.instances[shown as usize].light_of {
+            shown = of;
+        }
+        shown
+    }
+
+    /// Whether an [object](Self::object) is an instance that shows the light of another one.
+    pub(crate) fn shows_light_of_other(&self, object: u32) -> bool {
+        let instance = (object as usize).checked_sub(self.meshes.len()).and_then(|i| self.instances.get(i));
+        instance.is_some_and(|instance| instance.light_of.is_some())
     }
 
     /// Adds a light and returns its number.

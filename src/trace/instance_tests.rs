@@ -57,7 +57,7 @@ fn data(copies: u32, only_instances: bool) -> SceneData {
         mesh.indices[7] = [1; 3];
         let mesh = data.add_mesh(mesh).unwrap();
         for i in 0..copies {
-            data.add_instance(Instance { mesh, transform: transform(i, seed) }).unwrap();
+            data.add_instance(Instance::new(mesh, transform(i, seed))).unwrap();
         }
     }
     data
@@ -240,7 +240,7 @@ fn rays_that_are_scaled_in_instances_hit_them_as_copies() {
             mesh.positions.iter_mut().for_each(|p| *p /= scale);
             let mesh = data.add_mesh(mesh).unwrap();
             let transform = transform(seed, 9) * Affine3A::from_scale(Vec3::splat(scale));
-            data.add_instance(Instance { mesh, transform }).unwrap();
+            data.add_instance(Instance::new(mesh, transform)).unwrap();
         }
         let rays: Vec<Ray> = (0..6000).map(|i| Ray::new(4.0 * vector(i, 0, 2), vector(i, 3, 2))).collect();
         assert!(check(&data, &rays) > 100);
@@ -259,7 +259,7 @@ fn rays_whose_lists_find_no_room_at_instances_hit_them_as_rays_alone() {
     }
     let mesh = data.add_mesh(mesh).unwrap();
     for i in 0..5000 {
-        data.add_instance(Instance { mesh, transform: Affine3A::from_translation(0.05 * vector(i, 0, 8)) }).unwrap();
+        data.add_instance(Instance::new(mesh, Affine3A::from_translation(0.05 * vector(i, 0, 8)))).unwrap();
     }
     let ray = |i: u32| {
         let target = Vec3::splat(if i.is_multiple_of(4) { 1.0 } else { 0.0 }) + 0.1 * vector(i, 3, 7);
@@ -290,7 +290,7 @@ fn no_ray_enters_the_box_of_an_instance_behind_what_it_hits_there() {
         data.add_material(Material::default()).unwrap();
         let mesh = data.add_mesh(cube.clone()).unwrap();
         let transform = Affine3A::from_mat3_translation(turn, Vec3::splat(3.0));
-        data.add_instance(Instance { mesh, transform }).unwrap();
+        data.add_instance(Instance::new(mesh, transform)).unwrap();
         for isa in Isa::available() {
             let scene = commit(isa, BuildOptions::default(), &data);
             let instances = scene.instance_trees().unwrap();
@@ -392,7 +392,7 @@ fn rays_from_instances_do_not_hit_them_again_however_far_their_mesh_is_from_its_
         for i in 0..4 {
             let turn = Affine3A::from_quat(transform(i, 5).to_scale_rotation_translation().1);
             let back = Affine3A::from_translation(3.0 * vector(i, 3, 4) - turn.transform_vector3(offset));
-            data.add_instance(Instance { mesh, transform: back * turn }).unwrap();
+            data.add_instance(Instance::new(mesh, back * turn)).unwrap();
         }
         let scene = commit(Isa::Portable, BuildOptions::default(), &data);
         let mut tested = 0;
@@ -421,14 +421,14 @@ fn scenes_of_which_nothing_can_be_hit_are_refused() {
         let mut data = SceneData::new();
         let material = data.add_material(Material::default()).unwrap();
         let mesh = data.add_mesh(soup(20, 3, material)).unwrap();
-        data.add_instance(Instance { mesh, transform: far }).unwrap();
+        data.add_instance(Instance::new(mesh, far)).unwrap();
         let device = Device::new(DeviceOptions { isa: Some(isa), num_threads: 1, ..Default::default() }).unwrap();
         match Scene::commit(&device, data.clone(), &build, &Progress::none()) {
             Ok(scene) => panic!("{isa:?} {build:?}: a scene with bounds {:?}", scene.bounds()),
             Err((_, e)) => assert!(e.to_string().contains("beyond 1e12"), "{e}"),
         }
         // One that is met, which then goes where the other is, by its transform and by its mesh; and both at once back.
-        data.add_instance(Instance { mesh, transform: transform(1, 3) }).unwrap();
+        data.add_instance(Instance::new(mesh, transform(1, 3))).unwrap();
         let mut scene = commit(isa, build, &data);
         let at_end = vec![Vec3::splat(1e12); data.meshes()[0].positions.len()];
         let positions = &data.meshes()[0].positions[..];
@@ -475,7 +475,7 @@ fn what_instances_share_takes_memory_once() {
     let mut many = SceneData::new();
     let mesh = mesh(&mut many, 5000);
     for i in 0..100 {
-        many.add_instance(Instance { mesh, transform: transform(i, 3) }).unwrap();
+        many.add_instance(Instance::new(mesh, transform(i, 3))).unwrap();
     }
     let many = commit(Isa::Portable, BuildOptions::default(), &many);
     assert_eq!(many.stats().triangles, 100 * once.stats().triangles);

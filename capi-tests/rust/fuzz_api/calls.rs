@@ -445,6 +445,11 @@ fn refit(w: &W, s: &mut Source) {
         {
             broken("an instance names a mesh that does not exist");
         }
+        ask!(bk_instance_share_light(scene.p(), instance, s.index()));
+        let mut of = 0;
+        if ask!(bk_instance_light_of(scene.p(), instance, &mut of)) == BK_OK && of > instance {
+            broken("an instance shows the light of a later one");
+        }
     }
     ask!(bk_scene_refit(scene.p()));
 }

@@ -105,6 +105,9 @@ impl<'a> Job<'a> {
         if self.args.repeat > 1 {
             repeat(&mut data, self.args.repeat, self.args.instances)?;
         }
+        if self.args.share_light {
+            data.share_light_of_meshes()?;
+        }
         for given in &self.args.lights {
             let mut light = given.light;
             if let Light::Sky { environment, up, .. } = &mut light {

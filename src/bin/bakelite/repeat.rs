@@ -17,7 +17,7 @@ pub fn repeat(data: &mut SceneData, times: u32, as_instances: bool) -> Result<()
     for mesh in 0..data.meshes().len() as u32 {
         for i in (0..times).filter(|&i| as_instances || i > 0) {
             if as_instances {
-                data.add_instance(Instance { mesh, transform: Affine3A::from_translation(place(i)) })?;
+                data.add_instance(Instance::new(mesh, Affine3A::from_translation(place(i))))?;
                 continue;
             }
             let mut copy = data.meshes()[mesh as usize].clone();

@@ -114,7 +114,7 @@ impl<'i> Reader<'i, '_> {
         };
         let m = transform.to_cols_array_2d().map(|column| column.map(|x| x as f32));
         let transform_of_instance = Affine3A::from_cols_array_2d(&m.map(|[x, y, z, _]| [x, y, z]));
-        let may_be = |mesh| Instance { mesh, transform: transform_of_instance }.validate(mesh as usize + 1).is_ok();
+        let may_be = |mesh| Instance::new(mesh, transform_of_instance).validate(mesh as usize + 1).is_ok();
         if is_unique || corners < 3 * LEAST_TRIANGLES || !may_be(0) {
             return self.add_primitive(primitive, transform, is_unique);
         }
@@ -132,7 +132,7 @@ impl<'i> Reader<'i, '_> {
             }
         };
         match number {
-            Some(mesh) => self.import.add_instance(Instance { mesh, transform: transform_of_instance }),
+            Some(mesh) => self.import.add_instance(Instance::new(mesh, transform_of_instance)),
             None => Ok(()),
         }
     }

@@ -13,7 +13,7 @@ use crate::scene::Scene;
 use glam::{DMat3, DVec3};
 use rayon::prelude::*;
 
-/// Which instance's sheet an instance gets, and the factor of its lengths.
+/// Which instance's sheet an instance gets, and the factor of its lengths. One that shows the light of another has that one's.
 #[derive(Clone, Copy, Debug, PartialEq)]
 pub(in crate::lightmap) struct Source {
     /// Number of the instance, at most that of this one.
@@ -54,6 +54,10 @@ fn find(scene: &Scene, has_same: &dyn Fn(u32, u32) -> Result<bool>) -> Result<Ve
     let mut sources = try_with_capacity(scene.instances().len(), CHARTS)?;
     let mut known: Vec<Vec<(u32, f64, [DVec3; 2])>> = try_collect(scene.meshes().iter().map(|_| Vec::new()), CHARTS)?;
     for (number, instance) in (0..).zip(scene.instances()) {
+        if let Some(of) = instance.light_of {
+            sources.push(sources[of as usize]);
+            continue;
+        }
         let (length, shape) = shape(instance.transform.matrix3.into());
         let others = &mut known[instance.mesh as usize];
         let mut source = None;
@@ -96,15 +100,19 @@ mod tests {
 
     /// A ball and what stands for a curved part of it, as instances with these transforms.
     fn scene(transforms: &[Affine3A]) -> std::sync::Arc<Scene> {
+        described(transforms).committed()
+    }
+
+    fn described(transforms: &[Affine3A]) -> SceneData {
         let mut data = SceneData::new();
         let material = data.add_material(Material::default()).unwrap();
         let mut ball = MeshBuilder::new();
         ball.sphere(Vec3::ZERO, 1.0, 3, material);
         let mesh = data.add_mesh(ball.finish()).unwrap();
         for &transform in transforms {
-            data.add_instance(Instance { mesh, transform }).unwrap();
+            data.add_instance(Instance::new(mesh, transform)).unwrap();
         }
-        data.committed()
+        data
     }
 
     fn at(scale: Vec3, turn: f32, x: f32) -> Affine3A {
@@ -141,6 +149,36 @@ mod tests {
             let local = charts.local(t, 0.3, 0.3);
             let found = index.locate(&charts, charts.chart_of(t), local.into(), t).unwrap();
             assert!(found.triangle == t && (found.u - 0.3).abs() + (found.v - 0.3).abs() < 1e-4, "{t} {found:?}");
+        }
+    }
+
+    #[test]
+    fn an_instance_that_shows_the_light_of_another_has_its_charts() {
+        let transforms: Vec<Affine3A> =
+            (0..6).map(|i| at(Vec3::splat(1.0 + i as f32), i as f32, 40.0 * i as f32)).collect();
+        let mut data = described(&transforms);
+        // 4 shows 3's, and so 1's.
+        for (instance, of) in [(3, 1), (4, 3), (5, 0)] {
+            data.share_light(instance, of).unwrap();
+        }
+        assert_eq!((0..6).map(|i| data.light_of_instance(i)).collect::<Vec<_>>(), [0, 1, 2, 1, 1, 0]);
+        let scene = data.committed();
+        let (charts, _) = Charts::of_scene(&scene, 4.0, 256, 2, &Progress::none()).unwrap();
+        let (of_three, _) = Charts::of_scene(&self::scene(&transforms[..3]), 4.0, 256, 2, &Progress::none()).unwrap();
+        assert_eq!((charts.charts.len(), charts.places.len()), (of_three.charts.len(), 6));
+        let index = ChartIndex::new(scene.device(), &charts).unwrap();
+        for instance in 0..6 {
+            let (own, shown) = (scene.object_of_instance(instance), scene.light_of_instance(instance));
+            let [first, shown_first] = [own, scene.object_of_instance(shown)].map(|o| scene.first_triangle(o));
+            for t in (0..scene.triangles_of(own).len() as u32).step_by(7) {
+                let (triangle, of_shown) = (first + t, shown_first + t);
+                let chart = charts.chart_of(triangle);
+                assert_eq!((chart, charts.find(triangle)), (of_three.chart_of(of_shown), Some(chart)));
+                assert_eq!(charts.corners(triangle), of_three.corners(of_shown));
+                assert!(charts.triangles_of(chart).any(|other| other == of_shown), "{instance} {t}");
+                let local = charts.local(triangle, 0.3, 0.3);
+                assert_eq!(index.locate(&charts, chart, local.into(), of_shown).unwrap().triangle, of_shown);
+            }
         }
     }
 

@@ -163,7 +163,7 @@ impl Charts {
 
     /// Returns the chart of what may be a triangle of an instance; `None` if there is no such triangle.
     fn of_instance(&self, triangle: u32) -> Option<ChartId> {
-        let (place, sheet, own) = self.place_of(triangle)?;
+        let (place, sheet, own) = self.shown_by(triangle)?;
         Some(match sheet.of_triangles[own as usize] {
             ChartId::NONE => ChartId::NONE,
             chart => ChartId::new(place.first_chart.index() + chart.index()),
@@ -204,7 +204,7 @@ impl Charts {
     }
 
     fn corners_in_instance(&self, triangle: u32) -> [[f32; 2]; 3] {
-        let (place, sheet, own) = self.place_of(triangle).expect("a triangle of the scene");
+        let (place, sheet, own) = self.shown_by(triangle).expect("a triangle of the scene");
         scaled(sheet.corners[own as usize], place.factor)
     }
 
@@ -220,12 +220,14 @@ impl Charts {
         self.places.first().map_or(self.charts.len(), |place| place.first_chart.index())
     }
 
-    /// Returns the chart of a triangle of an instance, and its sheet; `None` if there is no such triangle.
-    pub(super) fn place_of(&self, triangle: u32) -> Option<(&Place, &Sheet, u32)> {
+    /// Returns the place whose charts a triangle of an instance has, its sheet, and the triangle's number in that; `None` if
+    /// there is no such triangle.
+    fn shown_by(&self, triangle: u32) -> Option<(&Place, &Sheet, u32)> {
         let after = self.places.partition_point(|place| place.first_triangle <= triangle);
         let place = self.places.get(after.checked_sub(1)?)?;
         let (sheet, own) = (&self.shared[place.sheet as usize], triangle - place.first_triangle);
-        ((own as usize) < sheet.of_triangles.len()).then_some((place, sheet, own))
+        let shown = &self.places[place.shown as usize];
+        ((own as usize) < sheet.of_triangles.len()).then_some((shown, sheet, own))
     }
 
     /// Returns a chart as it is in its sheet.
@@ -233,6 +235,7 @@ impl Charts {
         if chart.index() < self.own_charts() {
             return Shape { sheet: &self.own, first_triangle: 0, factor: 1.0, number: chart.index() };
         }
+        // The last place from whose first chart on it lies: those without charts come before the next one that has some.
         let place = &self.places[self.places.partition_point(|place| place.first_chart <= chart) - 1];
         let sheet = &self.shared[place.sheet as usize];
         let number = sheet.first_shape as usize + chart.index() - place.first_chart.index();
@@ -268,7 +271,13 @@ impl Charts {
             stage.check()?;
             let triangles = scene.triangles_of(scene.object_of_instance(instance));
             let (first_triangle, first_chart) = (triangles.start, ChartId::new(charts.len()));
-            let sheet = if source.instance == instance {
+            let mut shown = instance;
+            let sheet = if let Some(of) = scene.instances()[instance as usize].light_of {
+                stage.advance(triangles.len() as u64)?;
+                let other: &Place = &places[of as usize];
+                shown = other.shown;
+                other.sheet
+            } else if source.instance == instance {
                 try_push(&mut shared, of_range(triangles, &mut charts, shapes)?, CHARTS)?;
                 shapes += charts.len() - first_chart.index();
                 shared.len() as u32 - 1
@@ -283,7 +292,7 @@ impl Charts {
                 stage.advance(triangles.len() as u64)?;
                 sheet
             };
-            places.push(Place { first_triangle, first_chart, sheet, factor: source.factor });
+            places.push(Place { first_triangle, first_chart, shown, sheet, factor: source.factor });
             if charts.len() as u64 > MAX_TEXELS {
                 return Err(Error::OutOfMemory(format!("instances have more than {MAX_TEXELS} charts")));
             }
@@ -292,7 +301,7 @@ impl Charts {
     }
 }
 
-/// Returns the area of all valid triangles, in squared scene units.
+/// Returns the area of all valid triangles that have texels of their own, in squared scene units.
 pub fn surface_area(scene: &Scene) -> Result<f64> {
     let area = |object: u32| -> f64 {
         scene.triangles_of(object).filter(|&t| scene.is_valid(t)).map(|t| triangle_area(scene, t)).sum()
@@ -300,8 +309,11 @@ pub fn surface_area(scene: &Scene) -> Result<f64> {
     let of_meshes: f64 = (0..scene.meshes().len() as u32).map(area).sum();
     let mut of_instances: Vec<f64> = try_with_capacity(scene.instances().len(), CHARTS)?;
     for (instance, source) in (0..).zip(alike::sources_by_transform(scene)?) {
-        of_instances.push(if source.instance == instance {
-            area(scene.object_of_instance(instance))
+        let object = scene.object_of_instance(instance);
+        of_instances.push(if scene.shows_light_of_other(object) {
+            0.0
+        } else if source.instance == instance {
+            area(object)
         } else {
             of_instances[source.instance as usize] * f64::from(source.factor).powi(2)
         });

@@ -48,7 +48,10 @@ pub(in crate::lightmap) struct Sheet {
 pub(in crate::lightmap) struct Place {
     /// Global number of the first triangle.
     pub first_triangle: u32,
+    /// Its first chart; of an instance without charts of its own, the next one's.
     pub first_chart: ChartId,
+    /// Number of the instance whose charts it has: another one's if it shows the light of that.
+    pub shown: u32,
     /// Index among the sheets of instances.
     pub sheet: u32,
     /// Scene units per unit of the sheet's local coordinates.

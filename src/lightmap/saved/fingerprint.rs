@@ -232,6 +232,9 @@ pub(crate) fn geometry(scene: &Scene) -> u32 {
     for instance in scene.instances() {
         sum.update(&instance.mesh.to_ne_bytes());
         sum.update(bytemuck::cast_slice(&instance.transform.to_cols_array()));
+        if let Some(of) = instance.light_of {
+            sum.update(&of.to_ne_bytes());
+        }
     }
     sum.finalize()
 }

@@ -155,7 +155,7 @@ fn seams_of_instances_are_those_of_copies_inside_and_between_them() {
         let mesh = data.add_mesh(mesh).unwrap();
         for (x, scale) in [(0.0, 1.0), (1.0, 1.0), (2.0, 1.0), (7.0, 2.0)] {
             let transform = Affine3A::from_scale_rotation_translation(Vec3::splat(scale), Quat::IDENTITY, x * Vec3::X);
-            data.add_instance(Instance { mesh, transform }).unwrap();
+            data.add_instance(Instance::new(mesh, transform)).unwrap();
         }
         data.add_light(LAMP).unwrap();
         let mut copies = SceneData::new();

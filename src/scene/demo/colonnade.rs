@@ -51,7 +51,7 @@ pub(super) fn colonnade(triangles: usize, copies: bool) -> Result<SceneData> {
             mesh.positions.iter_mut().for_each(|p| *p = transform.transform_point3(*p));
             scene.add_mesh(mesh)?;
         } else {
-            scene.add_instance(Instance { mesh: number, transform })?;
+            scene.add_instance(Instance::new(number, transform))?;
         }
     }
     scene.add_light(Light::Sky { radiance: [0.6, 0.8, 1.0], environment: NONE, up: Vec3::Y, rotation: 0.0 })?;

@@ -45,10 +45,11 @@ pub(super) enum Kind {
     CompactNodes = 19,
     CompactLeaves = 20,
     Skipped = 21,
+    SharedLight = 22,
 }
 
 /// The last of [`Kind`].
-pub(super) const KINDS: u32 = Kind::Skipped as u32;
+pub(super) const KINDS: u32 = Kind::SharedLight as u32;
 
 /// Kinds that a scene uses where they are; the others are copied.
 pub(super) const IN_PLACE: [Kind; 11] = [
@@ -137,6 +138,14 @@ pub(super) struct SavedInstance {
     pub mesh: u32,
     /// Images of the axes, then of the origin.
     pub transform: [f32; 12],
+}
+
+/// An instance that shows the light of another one.
+#[derive(Clone, Copy, Pod, Zeroable)]
+#[repr(C)]
+pub(super) struct SavedSharedLight {
+    pub instance: u32,
+    pub of: u32,
 }
 
 #[derive(Clone, Copy, Pod, Zeroable)]

@@ -261,7 +261,11 @@ impl File {
         }
         let Some(instances) = self.records::<SavedInstance>(Kind::Instances) else { return Ok(None) };
         for i in &instances {
-            data.add_instance(Instance { mesh: i.mesh, transform: Affine3A::from_cols_array(&i.transform) })?;
+            data.add_instance(Instance::new(i.mesh, Affine3A::from_cols_array(&i.transform)))?;
+        }
+        let Some(shared) = self.records::<SavedSharedLight>(Kind::SharedLight) else { return Ok(None) };
+        for &SavedSharedLight { instance, of } in &shared[..] {
+            data.share_light(instance, of)?;
         }
         let Some(lights) = self.records::<SavedLight>(Kind::Lights) else { return Ok(None) };
         for saved in &lights {

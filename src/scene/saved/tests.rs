@@ -86,7 +86,7 @@ fn data(instances: bool) -> SceneData {
         for i in 0..5u32 {
             let turn = Quat::from_rotation_y(i as f32);
             let transform = Affine3A::from_scale_rotation_translation(Vec3::ONE, turn, Vec3::X * i as f32);
-            data.add_instance(Instance { mesh, transform }).unwrap();
+            data.add_instance(Instance::new(mesh, transform)).unwrap();
         }
     }
     data

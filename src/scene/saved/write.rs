@@ -42,6 +42,11 @@ impl Writer<'_, '_> {
         let instance =
             |i: &crate::scene::Instance| SavedInstance { mesh: i.mesh, transform: i.transform.to_cols_array() };
         self.records(Kind::Instances, scene.instances().iter().map(instance))?;
+        let shared = (0..).zip(scene.instances()).filter_map(|(instance, i)| {
+            let of = i.light_of?;
+            Some(SavedSharedLight { instance, of })
+        });
+        self.records(Kind::SharedLight, shared)?;
         self.records(Kind::Materials, scene.materials().iter().map(SavedMaterial::new))?;
         self.records(Kind::Lights, scene.lights().iter().map(SavedLight::new))?;
         let images = scene.textures().iter().map(|t| SavedImage { width: t.width, height: t.height });

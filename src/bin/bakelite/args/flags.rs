@@ -282,6 +282,9 @@ pub struct FileFlags {
     /// As instances instead of copies
     #[arg(long, requires = "repeat")]
     pub instances: bool,
+    /// Let all instances of a mesh show the light of the first one, without texels of their own
+    #[arg(long)]
+    pub share_light: bool,
 }
 
 const LIGHTS: &str = "A light, added to those of the scene; may be repeated

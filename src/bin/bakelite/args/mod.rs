@@ -113,6 +113,8 @@ pub struct BakeArgs {
     /// How often the scene stands beside itself, and whether as instances.
     pub repeat: u32,
     pub instances: bool,
+    /// Whether all instances of a mesh show the light of the first one.
+    pub share_light: bool,
     pub lights: Vec<GivenLight>,
     pub desc: LightmapDesc,
     pub layout: Option<PathBuf>,
@@ -479,6 +481,7 @@ fn bake_args(f: Flags) -> Result<BakeArgs, String> {
         ray_queues: f.file.ray_queues,
         repeat: f.file.repeat,
         instances: f.file.instances,
+        share_light: f.file.share_light,
         lights: f.lights.light,
         desc,
         layout: f.lightmap.layout,
