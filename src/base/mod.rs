@@ -2,6 +2,7 @@
 //! that call or are called.
 
 pub mod array;
+pub(crate) mod bounds;
 pub(crate) mod callback;
 pub(crate) mod directional;
 pub mod error;

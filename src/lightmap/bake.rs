@@ -158,6 +158,9 @@ impl Lightmap {
             if let Some((before, redo)) = before.as_ref().and_then(|b| Some((b, b.redo.get()?))) {
                 stats.kept_texels = redo.kept();
                 plan.note_kept(stats.kept_texels, range.len() as u64, before.keep_error);
+                if let Some(&kept) = before.kept_radiance.get() {
+                    plan.note_kept_radiance(kept, atlas.radiance.len() as u64);
+                }
             }
             light.plan = plan.clone();
             light.origin = Some(origin);
@@ -376,6 +379,11 @@ impl<'p> Bake<'_, 'p> {
         }
         if let Some(c) = self.from.checkpoint
             && let Some(radiance) = self.atlas.scene.device().install(|| c.radiance(self.atlas))?
+        {
+            return Ok(radiance);
+        }
+        if let Some(before) = self.from.before
+            && let Some(radiance) = before.illuminate(&self.inputs(), self.plan, stats)?
         {
             return Ok(radiance);
         }

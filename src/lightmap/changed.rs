@@ -1,18 +1,19 @@
 //! Which light a bake after a change computes anew: where the scene has moved, or a light was set.
 //!
-//! Photons and the radiance map are made anew, with the same random numbers. The light map is cut into cells of 8 × 8
-//! texels of the gather map. Indirect light of a cell is computed anew if
+//! Photons are traced again with the same random numbers, and texels of the radiance map that they and lamps reach as
+//! before are [kept](radiance). The light map is cut into cells of 8 × 8 texels of the gather map. Indirect light of a cell is computed anew if
 //!
 //! - its surface or what it shows moved, or what moved is so near or so large that light may differ within the cell, or
 //! - one of its [probes](super::indirect::probes) gathers another light than before: rays from a few of its texels, traced
 //!   in both states of the scene, each with its radiance map.
 //!
 //! Direct light of a texel is computed anew if what moved lies, or lay, between it and a light. All other texels keep
-//! their light. Those that are computed anew get the bits of a bake from nothing, as their random numbers, the radiance
-//! map and the texels around them are the same.
+//! their light. Those that are computed anew get the light of a bake from nothing, as their random numbers and the texels
+//! around them are the same; its bits, if no difference is let stand and so the radiance map is made anew, too.
 
 pub(crate) mod comparison;
 pub(crate) mod correspondence;
+mod radiance;
 mod sources;
 
 use super::atlas::Atlas;
@@ -56,8 +57,8 @@ pub(super) struct Redo {
 impl Lightmap {
     /// Bakes again after lights were [set](crate::scene::Scene::set_light) or the scene [has moved](Lightmap::follow).
     /// Texels whose light has changed by less than `keep_error` (finite, ≥ 0), as far as probes tell, keep it; it is
-    /// relative to their light or, if that is more, to a tenth of the mean light. All others get the bits of
-    /// [`bake`](Self::bake).
+    /// relative to their light or, if that is more, to a tenth of the mean light. So do texels of the radiance map. All others
+    /// get the light of [`bake`](Self::bake); if `keep_error` is 0, its bits.
     ///
     /// `params` are those of the last bake, for all texels and without a target error. If others were used, or there is
     /// no light yet, all is baked. Many small changes that are each let stand add up: now and then bake from nothing.
@@ -65,7 +66,7 @@ impl Lightmap {
     /// whose light did not change are kept only if `keep_error` is above that noise.
     pub fn bake_changed(&mut self, params: &BakeParams, keep_error: f32, progress: &Progress) -> Result<BakeStats> {
         self.check_changed(params, keep_error)?;
-        self.bake_all(params, None, None, Some(Keep { keep_error, earlier: None }), progress)
+        self.bake_all(params, None, None, Some(Keep { keep_error, keeps_radiance: true, earlier: None }), progress)
     }
 
     /// Bakes and keeps light of an `earlier` light map, of a scene of which this light map's is a revision: texels of
@@ -85,7 +86,7 @@ impl Lightmap {
     ) -> Result<BakeStats> {
         self.check_changed(params, keep_error)?;
         let scene = earlier.atlas.scene.clone();
-        let keep = Keep { keep_error, earlier: Some(earlier) };
+        let keep = Keep { keep_error, keeps_radiance: true, earlier: Some(earlier) };
         scene.while_unchanged(|| self.bake_all(params, None, None, Some(keep), progress))
     }
 
@@ -140,7 +141,9 @@ impl Lightmap {
             has_other_lights,
             blurs_direct: direct_blur::is_needed(direct, params, plan),
             keep_error: keep.keep_error,
+            keeps_radiance: keep.keeps_radiance && params.passes == 1 && keep.keep_error > 0.0,
             redo: OnceLock::new(),
+            kept_radiance: OnceLock::new(),
         }))
     }
 }
@@ -150,6 +153,8 @@ impl Lightmap {
 pub(super) struct Keep<'a> {
     /// Relative difference of light that is let stand.
     pub keep_error: f32,
+    /// Whether texels of the radiance map may be kept, too: else all that is computed has the bits of a bake from nothing.
+    pub keeps_radiance: bool,
     /// The light map that has it, if another one.
     pub earlier: Option<&'a Lightmap>,
 }
@@ -175,8 +180,12 @@ pub(super) struct Before<'a> {
     pub blurs_direct: bool,
     /// Relative difference of light that is let stand.
     pub keep_error: f32,
+    /// Whether texels of the radiance map may be kept.
+    keeps_radiance: bool,
     /// What is computed anew, once that is known.
     pub redo: OnceLock<Redo>,
+    /// Number of texels of the radiance map that are kept, once that is known.
+    pub kept_radiance: OnceLock<u64>,
 }
 
 impl Before<'_> {

@@ -282,6 +282,13 @@ impl Plan {
         ));
     }
 
+    /// Adds a line on radiance that is kept.
+    pub(crate) fn note_kept_radiance(&mut self, kept: u64, all: u64) {
+        self.lines.push(format!(
+            "left out: radiance of {kept} of {all} texels of the radiance map (lamps and photons reach them as before)"
+        ));
+    }
+
     /// Adds a line on why nothing was stitched.
     pub(crate) fn leave_out_seams(&mut self, why: &str) {
         self.leave_out(left_out::SEAMS, "stitching of seams", why);

@@ -2,14 +2,13 @@
 //! that are shown, how texels interpolate, and fallback gathers.
 
 use super::atlas::Atlas;
-use super::atlas::ids::RadianceTexel;
+use super::atlas::ids::{RadianceMap, RadianceTexel};
 use super::atlas::two_sided;
-use super::indirect::bright_patches::Bright;
 use super::indirect::fallback_gather::{OwnDirectional, OwnLight, OwnRays};
 use super::indirect::find_bright_patches;
 use super::indirect::interpolation_contrast::GatherLight;
 use super::indirect::near_hits::{HitRadiance, NearHits};
-use super::indirect::radiance_map::{self, Radiance, RadianceInput, RadianceLookup};
+use super::indirect::radiance_map::{self, Anew, Radiance, RadianceInput, RadianceLookup};
 use super::indirect::sample_set::{ROUND, SampleSet};
 use super::indirect::upsample::{Asked, Upsampling};
 use super::plan::{Plan, left_out};
@@ -22,7 +21,7 @@ use crate::base::sampling::{combine, purpose_seed};
 use crate::base::share::Share;
 use crate::direct::DirectLight;
 use crate::photon::trace::Traced;
-use crate::photon::{PhotonMap, PhotonParams, PhotonStats};
+use crate::photon::{Change, Difference, Guidance, PhotonMap, PhotonParams, PhotonStats};
 use glam::Vec3;
 use std::ops::Range;
 use std::time::Instant;
@@ -144,22 +143,72 @@ pub(crate) fn photon_params(inputs: &Inputs) -> PhotonParams {
 fn photons(inputs: &Inputs, stats: &mut BakeStats) -> Result<PhotonMap> {
     let start = Instant::now();
     let map = PhotonMap::trace_within(&inputs.atlas.scene, &photon_params(inputs), inputs.progress, 0.0, 0.2)?;
+    note_photons(&map, start, stats);
+    Ok(map)
+}
+
+/// Traces the photons of a scene after a change, and tells which came and went; `None` if all may have changed.
+pub(crate) fn photons_again(
+    inputs: &Inputs,
+    change: &Change,
+    stats: &mut BakeStats,
+) -> Result<Option<(PhotonMap, Difference)>> {
+    let (start, scene) = (Instant::now(), &inputs.atlas.scene);
+    let trace = || PhotonMap::trace_again(scene, &photon_params(inputs), change, inputs.progress, (0.0, 0.2));
+    let found = scene.device().install(trace)?;
+    if let Some((map, _)) = &found {
+        note_photons(map, start, stats);
+    }
+    Ok(found)
+}
+
+fn note_photons(map: &PhotonMap, start: Instant, stats: &mut BakeStats) {
     let s = map.stats();
     stats.photons = StageStats { seconds: start.elapsed().as_secs_f64(), rays: s.rays, bytes: map.bytes() as u64 };
     (stats.photons_emitted, stats.photons_stored) = (s.emitted, s.stored);
-    Ok(map)
 }
 
 fn radiance(inputs: &Inputs, photons: Option<&PhotonMap>, quick: bool, stats: &mut BakeStats) -> Result<Radiance> {
     let start = Instant::now();
     let (values, mut rays) = radiance_values(inputs, photons, 0..inputs.atlas.radiance.len(), quick, (0.2, 0.3))?;
-    let mut radiance = Radiance { values, bright: Bright::default() };
+    let mut radiance = Radiance { values, ..Default::default() };
     if !quick {
         find_bright(inputs, &mut radiance, &mut rays)?;
+        radiance.guidance = photons.map(PhotonMap::guidance).transpose()?.flatten();
     }
-    let bytes = (radiance.values.len() * size_of::<Vec3>() + inputs.atlas.radiance.bytes()) as u64;
-    stats.radiance = StageStats { seconds: start.elapsed().as_secs_f64(), rays, bytes };
+    stats.radiance = radiance_stats(inputs, start, rays);
     Ok(radiance)
+}
+
+/// Computes the radiance of the texels of `values` that are to be `anew`, given what photons after later changes have in common
+/// with these.
+pub(crate) fn radiance_again(
+    inputs: &Inputs,
+    photons: &PhotonMap,
+    guidance: Guidance,
+    (mut values, anew): (Vec<Vec3>, &[bool]),
+    stats: &mut BakeStats,
+) -> Result<Radiance> {
+    let (start, atlas) = (Instant::now(), inputs.atlas);
+    let anew = Anew::new(&atlas.areas(&atlas.radiance), anew)?;
+    let range = 0..values.len();
+    let stage = inputs.progress.stage("radiance", 0.2, 0.3, radiance_map::work(&atlas.radiance, &range));
+    let input =
+        RadianceInput { light: radiance_light(inputs), photons: Some(photons), quick: false, anew: Some(&anew) };
+    let mut rays = radiance_map::bake(atlas.scene.device(), &input, range, &mut values, &stage)?;
+    let mut radiance = Radiance { values, guidance: Some(guidance), ..Default::default() };
+    find_bright(inputs, &mut radiance, &mut rays)?;
+    stats.radiance = radiance_stats(inputs, start, rays);
+    Ok(radiance)
+}
+
+fn radiance_stats(inputs: &Inputs, start: Instant, rays: u64) -> StageStats {
+    let map = &inputs.atlas.radiance;
+    StageStats {
+        seconds: start.elapsed().as_secs_f64(),
+        rays,
+        bytes: (map.len() * size_of::<Vec3>() + map.bytes()) as u64,
+    }
 }
 
 /// Finds the bright patches of a complete radiance map. Adds the rays traced to `rays`.
@@ -180,18 +229,23 @@ fn radiance_values(
     quick: bool,
     (from, to): (f32, f32),
 ) -> Result<(Vec<Vec3>, u64)> {
-    let Inputs { atlas, direct, params, progress } = *inputs;
+    let Inputs { atlas, progress, .. } = *inputs;
     let stage = progress.stage("radiance", from, to, radiance_map::work(&atlas.radiance, &range));
     let mut values = try_vec(range.len(), "the radiance map")?;
-    let light = TexelLight {
+    let input = RadianceInput { light: radiance_light(inputs), photons, quick, anew: None };
+    let rays = radiance_map::bake(atlas.scene.device(), &input, range, &mut values, &stage)?;
+    Ok((values, rays))
+}
+
+/// Direct light of the radiance map's texels.
+fn radiance_light<'a>(inputs: &Inputs<'a, '_>) -> TexelLight<'a, RadianceMap> {
+    let Inputs { atlas, direct, params, .. } = *inputs;
+    TexelLight {
         areas: atlas.areas(&atlas.radiance),
         direct,
         samples: params.direct_samples.div_ceil(RADIANCE_SAMPLE_DIVISOR),
         seed: purpose_seed(params.seed, purpose::RADIANCE),
-    };
-    let input = RadianceInput { light, photons, quick };
-    let rays = radiance_map::bake(atlas.scene.device(), &input, range, &mut values, &stage)?;
-    Ok((values, rays))
+    }
 }
 
 /// Decides for each two-sided chart without separate texels for its back whether the back is baked. With the radiance

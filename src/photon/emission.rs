@@ -17,7 +17,7 @@
 use super::guide::{Guide, PilotPhoton};
 use super::spot::SpotProfile;
 use crate::base::error::{Error, Result};
-use crate::base::memory::{try_filled, try_push, try_with_capacity};
+use crate::base::memory::{try_filled, try_push, try_to_vec, try_with_capacity};
 use crate::base::sampling::{concentric_disc, cosine_around, orthonormal_basis, uniform_triangle};
 use crate::scene::{Emitter, Light, Scene, Sky};
 use crate::trace::offset::{offset_ray_origin, ray_epsilon};
@@ -35,7 +35,7 @@ pub(super) struct Emitted {
 }
 
 /// Distribution of start points and directions of the photons of a light without geometry.
-#[derive(Clone, Copy, Debug)]
+#[derive(Clone, Copy, Debug, PartialEq)]
 enum Shape {
     /// Emission from a point into the cone around `axis`, uniformly; `height` is 1 − cos of its half-angle.
     Cone {
@@ -89,7 +89,7 @@ impl Shape {
     }
 }
 
-#[derive(Clone, Copy, Debug)]
+#[derive(Clone, Copy, Debug, PartialEq)]
 struct Source {
     shape: Shape,
     /// Power in W per channel.
@@ -184,6 +184,31 @@ impl<'a> Emission<'a> {
         }
         self.guides.iter_mut().zip(&of_source).for_each(|(guide, photons)| *guide = Guide::new(photons));
         Ok(())
+    }
+
+    /// The guide of each source.
+    pub(super) fn guides(&self) -> &[Option<Guide>] {
+        &self.guides
+    }
+
+    /// Guides the emission by guides that were made for another one; returns whether they are for as many sources.
+    pub(super) fn guide_by(&mut self, guides: &[Option<Guide>]) -> Result<bool> {
+        let is_for_these = guides.len() == self.sources.len();
+        if is_for_these {
+            self.guides = try_to_vec(guides, "the guides of lights")?;
+        }
+        Ok(is_for_these)
+    }
+
+    /// Whether photons leave the lights alike in another state of the scene, given the same guides.
+    pub(super) fn is_like(&self, other: &Emission<'a>) -> bool {
+        // Triangles may have other numbers.
+        let emitters = |scene: &'a Scene| scene.emitters().iter().map(|e| Emitter { triangle: 0, ..*e });
+        self.sources == other.sources
+            && self.first == other.first
+            && self.photons_per_watt.to_bits() == other.photons_per_watt.to_bits()
+            && (self.centre, self.radius) == (other.centre, other.radius)
+            && emitters(self.scene).eq(emitters(other.scene))
     }
 
     /// Emits photon `index`; `p` chooses its position on the light and `d` its direction, both uniform in the unit

@@ -183,7 +183,7 @@ mod tests {
     fn grid_of(photons: &[StoredPhoton], radius: f32) -> Grid {
         let blocks = photons.chunks(37).map(<[_]>::to_vec).collect();
         let memory = Account::new(Arc::new(MemoryMonitor::new(None)), 0);
-        let traced = Traced { blocks, stats: Default::default(), memory };
+        let traced = Traced { blocks, stats: Default::default(), memory, guides: None };
         Grid::build(traced, radius, &Progress::none(), (0.0, 1.0)).unwrap().0
     }
 

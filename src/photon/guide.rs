@@ -10,6 +10,9 @@
 //!
 //! Each light has a guide of its own. Measured: docs/experiments.md#photon-guiding.
 
+use crate::base::error::Result;
+use crate::base::memory::{try_collect, try_push, try_to_vec};
+
 /// Minimum number of pilot photons per cell.
 const PER_CELL: usize = 32;
 
@@ -21,6 +24,12 @@ const LEAST: f32 = 0.5;
 
 /// Minimum gain of photons on surfaces for which a guide is used: powers that differ are noise too.
 const GAIN: f32 = 1.25;
+
+/// Minimum density of a row, or of a cell in its row, in guides of files; those that are made have more.
+const LEAST_POSSIBLE: f32 = 1e-4;
+
+/// Name of guides in error messages.
+const GUIDES: &str = "the guides of lights";
 
 /// A photon of the pilot.
 #[derive(Clone, Copy, Debug)]
@@ -72,6 +81,31 @@ impl Guide {
         }
         let sums: Vec<f32> = raised.chunks(side).map(|row| row.iter().sum()).collect();
         Some(Guide { side, rows: cumulative(&sums), columns: raised.chunks(side).flat_map(cumulative).collect() })
+    }
+
+    /// Appends the guide as words of files: its side, then its distributions.
+    pub(super) fn append_words(&self, words: &mut Vec<u32>) -> Result<()> {
+        let sums = self.rows.iter().chain(&self.columns).map(|sum| sum.to_bits());
+        std::iter::once(self.side as u32).chain(sums).try_for_each(|word| try_push(words, word, GUIDES))
+    }
+
+    /// Reads a guide of some side from the words that follow it; `None` if they are no distributions.
+    pub(super) fn take_words(side: u32, words: &mut &[u32]) -> Result<Option<Guide>> {
+        let side = side as usize;
+        if !side.is_power_of_two() || side > MAX_SIDE {
+            return Ok(None);
+        }
+        let Some((own, rest)) = words.split_at_checked((side + 1) * (side + 1)) else { return Ok(None) };
+        *words = rest;
+        let sums = try_collect(own.iter().map(|&word| f32::from_bits(word)), GUIDES)?;
+        // No part is so small that its photons would be too bright.
+        let is_possible = |pair: &[f32]| pair[1] - pair[0] >= LEAST_POSSIBLE / side as f32;
+        let ends = |sums: &[f32]| sums[0] == 0.0 && sums[side] == 1.0;
+        if !sums.chunks(side + 1).all(|sums| ends(sums) && sums.windows(2).all(is_possible)) {
+            return Ok(None);
+        }
+        let (rows, columns) = sums.split_at(side + 1);
+        Ok(Some(Guide { side, rows: try_to_vec(rows, GUIDES)?, columns: try_to_vec(columns, GUIDES)? }))
     }
 
     /// Maps a uniform point of the unit square to one with the guide's density; returns that density too.
@@ -162,6 +196,25 @@ mod tests {
         let last = 1.0 - 0.5 * f32::EPSILON;
         let (place, density) = guide.place([last; 2]);
         assert!(place[0] < 1.0 && place[1] < 1.0 && density > 0.0);
+    }
+
+    #[test]
+    fn a_guide_in_a_file_is_itself_and_damaged_ones_are_refused() {
+        let guide = Guide::new(&pilot()).unwrap();
+        let mut words = Vec::new();
+        guide.append_words(&mut words).unwrap();
+        words.push(7);
+        let read = |words: &[u32]| {
+            let mut rest = &words[1..];
+            Guide::take_words(words[0], &mut rest).unwrap().map(|guide| (guide, rest.len()))
+        };
+        assert_eq!(read(&words), Some((guide, 1)));
+        for (place, word) in [(0, 3), (0, 0), (0, 128), (0, 32), (1, 1), (2, 0), (3, f32::NAN.to_bits()), (20, 0)] {
+            let mut damaged = words.clone();
+            damaged[place] = word;
+            assert_eq!(read(&damaged), None, "{place} {word}");
+        }
+        assert_eq!(read(&words[..words.len() - 2]), None);
     }
 
     #[test]

@@ -5,6 +5,7 @@
 //! | `emission.rs`, `spot.rs` | lights by power, stratified positions and directions |
 //! | `trace.rs` | paths with Russian roulette, blocks of photons in parallel |
 //! | `share.rs` | photons that several machines trace |
+//! | `again.rs` | photons after something has moved, old and new ones told apart |
 //! | `radius.rs` | the automatic search radius |
 //! | `grid.rs` | photons sorted into a uniform grid, one array per component |
 //! | `estimate.rs` | the irradiance estimate, over the lanes of each ISA |
@@ -12,6 +13,7 @@
 //!
 //! The same seed and ISA give the same map and the same estimates for any number of threads.
 
+mod again;
 pub(crate) mod coverage;
 mod cylinder;
 mod emission;
@@ -24,6 +26,8 @@ mod share;
 mod spot;
 pub(crate) mod trace;
 
+pub(crate) use again::{Change, Difference, Guidance};
+
 use crate::base::error::{Result, invalid_argument};
 use crate::base::memory::{MemoryMonitor, Reservation, try_vec};
 use crate::base::parallel::ParallelLoop;
@@ -35,6 +39,7 @@ use cylinder::Cylinder;
 use estimate::EstimateFn;
 use glam::Vec3;
 use grid::Grid;
+use guide::Guide;
 use noted::Noted;
 use rayon::prelude::*;
 use std::sync::{Arc, OnceLock};
@@ -217,6 +222,8 @@ pub struct PhotonMap {
     grid: Grid,
     cylinder: Cylinder,
     kernel: EstimateFn,
+    /// How the lights were guided, if all photons were stored.
+    guides: Option<Vec<Option<Guide>>>,
     packed: OnceLock<PackedPhotons>,
     _memory: Reservation,
 }
@@ -257,7 +264,8 @@ impl PhotonMap {
         to: f32,
     ) -> Result<PhotonMap> {
         scene.device().install(|| {
-            let mut stats = traced.stats;
+            let (mut stats, mut traced) = (traced.stats, traced);
+            let guides = traced.guides.take();
             let start = Instant::now();
             let radius = if params.radius > 0.0 {
                 params.radius
@@ -273,6 +281,7 @@ impl PhotonMap {
                 grid,
                 cylinder: Cylinder::new(radius, params.half_height, params.cone_k),
                 kernel: estimate::kernel(scene.device().isa()),
+                guides,
                 packed: OnceLock::new(),
                 _memory: memory,
             })

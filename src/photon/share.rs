@@ -43,7 +43,7 @@ impl Traced {
     /// No photons, to which others are [added](Self::add). `emitted`: number of photons emitted in all.
     pub fn none(scene: &Scene, params: &PhotonParams, emitted: u64) -> Traced {
         let memory = Account::new(scene.device().memory().clone(), params.memory_budget);
-        Traced { blocks: Vec::new(), stats: PhotonStats { emitted, ..Default::default() }, memory }
+        Traced { blocks: Vec::new(), stats: PhotonStats { emitted, ..Default::default() }, memory, guides: None }
     }
 
     /// Returns the photons in runs, as bytes.

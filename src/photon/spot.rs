@@ -7,7 +7,7 @@
 use std::f64::consts::TAU;
 
 /// The falloff as a distribution over 1 − cos θ.
-#[derive(Clone, Copy, Debug)]
+#[derive(Clone, Copy, Debug, PartialEq)]
 pub(super) struct SpotProfile {
     /// 1 − cos of the inner half-angle.
     inner: f64,

@@ -7,10 +7,13 @@
 //! and its bounce, and blocks are kept in order, so threads make no difference.
 
 use super::emission::Emission;
-use super::guide::PilotPhoton;
+use super::guide::{Guide, PilotPhoton};
 use super::{PATH_LIMIT, PhotonParams, PhotonStats};
+use crate::base::bounds::Bounds;
 use crate::base::error::{Error, Result};
-use crate::base::memory::{MemoryMonitor, Reservation, try_collect, try_filled, try_par_collect_ok, try_with_capacity};
+use crate::base::memory::{
+    MemoryMonitor, Reservation, try_collect, try_filled, try_par_collect_ok, try_push, try_to_vec, try_with_capacity,
+};
 use crate::base::progress::{Progress, Stage};
 use crate::base::sampling::{combine, cosine_around, purpose_seed, sobol_2d, sobol_2d_bits, uniform};
 use crate::base::share::Share;
@@ -78,6 +81,8 @@ pub(crate) struct Traced {
     pub(super) blocks: Vec<Vec<StoredPhoton>>,
     pub(crate) stats: PhotonStats,
     pub(super) memory: Account,
+    /// How the lights were guided, if all photons were stored.
+    pub(super) guides: Option<Vec<Option<Guide>>>,
 }
 
 impl StoredPhoton {
@@ -98,7 +103,6 @@ pub(super) fn trace(
     (from, to): (f32, f32),
 ) -> Result<Traced> {
     let mut tracer = Tracer::guided(scene, lights, params)?;
-    let count = tracer.emission.count();
     tracer.thin_out(params.most_stored)?;
     let numbers = share.of(tracer.blocks().len());
     let stage = progress.stage("photons", from, to, numbers.len() as u64);
@@ -111,23 +115,34 @@ pub(super) fn trace(
     });
     let results: Vec<(Vec<StoredPhoton>, Tally)> = try_par_collect_ok(traced, "blocks of photons")?;
 
-    let mut tally = Tally::default();
-    let mut blocks = try_with_capacity(results.len(), "blocks of photons")?;
-    for (block, t) in results {
-        tally.add(&t);
-        blocks.push(block);
+    tracer.traced(results, memory)
+}
+
+impl Tracer<'_> {
+    /// Puts traced blocks of photons together.
+    pub(super) fn traced(&self, results: Vec<(Vec<StoredPhoton>, Tally)>, memory: Account) -> Result<Traced> {
+        let mut tally = Tally::default();
+        let mut blocks = try_with_capacity(results.len(), "blocks of photons")?;
+        for (block, t) in results {
+            tally.add(&t);
+            blocks.push(block);
+        }
+        let guides = match self.stored_part == 1.0 {
+            true => Some(try_to_vec(self.emission.guides(), "the guides of lights")?),
+            false => None,
+        };
+        let stats = PhotonStats {
+            emitted: self.emission.count(),
+            stored: blocks.iter().map(|b| b.len() as u64).sum(),
+            rays: tally.rays + self.pilot_rays,
+            emitted_power: self.emission.power.to_array(),
+            absorbed_power: tally.absorbed.to_array(),
+            escaped_power: (tally.escaped + self.emission.unaimed).to_array(),
+            truncated_power: tally.truncated.to_array(),
+            ..Default::default()
+        };
+        Ok(Traced { blocks, stats, memory, guides })
     }
-    let stats = PhotonStats {
-        emitted: count,
-        stored: blocks.iter().map(|b| b.len() as u64).sum(),
-        rays: tally.rays + tracer.pilot_rays,
-        emitted_power: tracer.emission.power.to_array(),
-        absorbed_power: tally.absorbed.to_array(),
-        escaped_power: (tally.escaped + tracer.emission.unaimed).to_array(),
-        truncated_power: tally.truncated.to_array(),
-        ..Default::default()
-    };
-    Ok(Traced { blocks, stats, memory })
 }
 
 /// Records the rays of all paths.
@@ -142,8 +157,8 @@ pub(super) fn record_rays(scene: &Arc<Scene>, lights: &[Light], params: &PhotonP
 
 /// Sums over the paths of a block, powers in W per channel.
 #[derive(Clone, Copy, Default)]
-struct Tally {
-    rays: u64,
+pub(super) struct Tally {
+    pub(super) rays: u64,
     absorbed: DVec3,
     escaped: DVec3,
     truncated: DVec3,
@@ -160,13 +175,41 @@ impl Tally {
 
 /// A path that is still alive.
 #[derive(Clone, Copy)]
-struct Path {
+pub(super) struct Path {
     photon: u32,
     /// Random number of Russian roulette: uniform in (0, 1), given that the path is still alive.
     luck: f32,
     power: Vec3,
     /// Number of reflections so far.
     bounces: u32,
+    /// Whether it has [met](Meetings) what moved.
+    has_met: bool,
+}
+
+/// Paths that pass boxes around what moved between two states of a scene, and the photons that they store from there on.
+/// Up to there, and if they pass none, they are the same in both states.
+pub(super) struct Meetings<'a> {
+    boxes: &'a [Bounds],
+    /// Numbers of the paths' photons.
+    pub photons: Vec<u32>,
+    pub stored: Vec<StoredPhoton>,
+}
+
+impl<'a> Meetings<'a> {
+    pub fn new(boxes: &'a [Bounds]) -> Meetings<'a> {
+        Meetings { boxes, photons: Vec::new(), stored: Vec::new() }
+    }
+
+    fn note(&mut self, rays: &[Ray], hits: &[RawHit], paths: &mut [Path]) -> Result<()> {
+        for (path, (ray, hit)) in paths.iter_mut().zip(rays.iter().zip(hits)).filter(|(path, _)| !path.has_met) {
+            let passes = |moved: &Bounds| moved.is_hit(ray.origin.into(), ray.direction.into(), hit.t);
+            if self.boxes.iter().any(passes) {
+                path.has_met = true;
+                try_push(&mut self.photons, path.photon, "paths that meet what moved")?;
+            }
+        }
+        Ok(())
+    }
 }
 
 /// The surface that a path hits.
@@ -186,21 +229,21 @@ impl Surface {
         Surface { corners: [Vec3::ZERO; 3], weights: [0.0; 2], front: false, material: NONE, albedo: Vec3::ZERO };
 }
 
-struct Tracer<'a> {
+pub(super) struct Tracer<'a> {
     scene: &'a Scene,
-    emission: Emission<'a>,
+    pub(super) emission: Emission<'a>,
     seed: u32,
     /// Maximum number of surface interactions per path, passages through sheets not counted.
     limit: u32,
     store_direct: bool,
     /// The part of the photons on surfaces that is stored.
-    stored_part: f32,
+    pub(super) stored_part: f32,
     /// Number of rays traced to find guides and the part of photons to be stored.
     pilot_rays: u64,
 }
 
 impl<'a> Tracer<'a> {
-    fn new(scene: &'a Scene, lights: &[Light], params: &PhotonParams) -> Result<Self> {
+    pub(super) fn new(scene: &'a Scene, lights: &[Light], params: &PhotonParams) -> Result<Self> {
         let seed = purpose_seed(params.seed, PURPOSE);
         let emission = Emission::new(scene, lights, params.photon_count, uniform(0, ALLOTMENT, seed))?;
         let limit = if params.max_bounces == 0 { PATH_LIMIT } else { params.max_bounces.min(PATH_LIMIT) };
@@ -225,13 +268,13 @@ impl<'a> Tracer<'a> {
     }
 
     /// The numbers of the blocks of photons.
-    fn blocks(&self) -> std::ops::Range<usize> {
+    pub(super) fn blocks(&self) -> std::ops::Range<usize> {
         0..self.emission.count().div_ceil(BLOCK) as usize
     }
 
     /// Stores only a part of the photons if they would be more than `most` (0: any number) in all, estimated from the
     /// first block.
-    fn thin_out(&mut self, most: u64) -> Result<()> {
+    pub(super) fn thin_out(&mut self, most: u64) -> Result<()> {
         let count = self.emission.count();
         if most == 0 || count < BLOCK || count.saturating_mul(MOST_PER_PATH) < most {
             return Ok(());
@@ -268,14 +311,31 @@ impl<'a> Tracer<'a> {
         &self,
         block: u64,
         watch: Option<(&Stage, &Account)>,
+        see: impl FnMut(u32, &[Ray], &[Path]),
+    ) -> Result<(Vec<StoredPhoton>, Tally)> {
+        self.some(self.numbers(block), block, watch, None, see)
+    }
+
+    /// The numbers of the photons of a block.
+    pub(super) fn numbers(&self, block: u64) -> impl Iterator<Item = u32> + use<> {
+        (block * BLOCK..((block + 1) * BLOCK).min(self.emission.count())).map(|number| number as u32)
+    }
+
+    /// Does the work of [`block`](Self::block) for some photons of a block. `meetings` notes those that pass where something
+    /// has moved.
+    pub(super) fn some(
+        &self,
+        numbers: impl Iterator<Item = u32>,
+        block: u64,
+        watch: Option<(&Stage, &Account)>,
+        mut meetings: Option<&mut Meetings>,
         mut see: impl FnMut(u32, &[Ray], &[Path]),
     ) -> Result<(Vec<StoredPhoton>, Tally)> {
-        let numbers = block * BLOCK..((block + 1) * BLOCK).min(self.emission.count());
         let what = "a block of photons";
         let mut rays = try_with_capacity(BLOCK as usize, what)?;
         let mut paths = try_with_capacity(BLOCK as usize, what)?;
         for number in numbers {
-            let (ray, path) = self.emit(number as u32);
+            let (ray, path) = self.emit(number);
             rays.push(ray);
             paths.push(path);
         }
@@ -303,6 +363,9 @@ impl<'a> Tracer<'a> {
             see(step, &rays, &paths);
             self.scene.intersect_block(&rays, &mut hits);
             tally.rays += rays.len() as u64;
+            if let Some(meetings) = &mut meetings {
+                meetings.note(&rays, &hits, &mut paths)?;
+            }
             stored.try_reserve(rays.len()).map_err(|e| Error::OutOfMemory(format!("the photons being traced: {e}")))?;
             // Surfaces have a loop of their own, short enough for the processor to overlap the cache misses of several
             // hits: within the next loop, tracing Sponza took a tenth longer.
@@ -312,7 +375,13 @@ impl<'a> Tracer<'a> {
             // Survivors move to the front.
             let mut alive = 0;
             for i in 0..rays.len() {
+                let before = stored.len();
                 let next = self.interact(&rays[i], paths[i], &surfaces[i], step, &mut stored, &mut tally);
+                if paths[i].has_met
+                    && let Some(meetings) = &mut meetings
+                {
+                    stored[before..].iter().try_for_each(|&photon| try_push(&mut meetings.stored, photon, what))?;
+                }
                 if let Some((ray, path)) = next {
                     (rays[alive], paths[alive]) = (ray, path);
                     alive += 1;
@@ -337,7 +406,7 @@ impl<'a> Tracer<'a> {
         // Uses all 32 bits: the longest of 10⁷ paths are decided by the last bits.
         let [luck, _] = sobol_2d_bits(photon, combine(self.seed, ROULETTE));
         let luck = ((luck as f64 + 0.5) / (1u64 << 32) as f64) as f32;
-        (Ray::new(e.origin, e.direction), Path { photon, luck, power: e.power, bounces: 0 })
+        (Ray::new(e.origin, e.direction), Path { photon, luck, power: e.power, bounces: 0, has_met: false })
     }
 
     /// The surface of a hit.

@@ -7,7 +7,7 @@ use glam::Vec3;
 pub(super) const EMITTERS: &str = "the emissive triangles";
 
 /// An emissive triangle as a light.
-#[derive(Clone, Copy, Debug)]
+#[derive(Clone, Copy, Debug, PartialEq)]
 pub struct Emitter {
     /// Global triangle number.
     pub triangle: u32,

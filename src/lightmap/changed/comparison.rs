@@ -3,6 +3,7 @@
 
 use super::correspondence::Correspondence;
 use super::sources::{Source, part_of_light, sources};
+use crate::base::bounds::Bounds;
 use crate::base::error::Result;
 use crate::base::memory::{try_collect, try_filled, try_par_collect_ok, try_par_gather};
 use crate::base::progress::Progress;
@@ -14,7 +15,7 @@ use crate::lightmap::atlas::ids::{LightTexel, PlacementId};
 use crate::lightmap::indirect::probes::{PROBE_RAYS, Probe, ProbeRays, State};
 use crate::lightmap::indirect::radiance_map::Radiance;
 use crate::lightmap::indirect::sample_set::SampleSet;
-use crate::lightmap::moved::{Bounds, Moved};
+use crate::lightmap::moved::Moved;
 use crate::lightmap::stages::purpose;
 use crate::lightmap::tiles::TILE;
 use crate::trace::{RawHit, Ray};
@@ -34,7 +35,7 @@ const PROBED_TEXELS: u32 = 256;
 const NEAR: f32 = 0.15;
 
 /// Texels darker than this part of the mean light count as if they were so bright.
-const DARK: f32 = 0.1;
+pub(super) const DARK: f32 = 0.1;
 
 /// Number of pairs of a source and of what moved between it and a cell, beyond which all texels of the cell count as
 /// shadowed: testing each takes longer than its direct light.

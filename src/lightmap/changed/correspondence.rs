@@ -6,6 +6,7 @@
 //! and counts as [moved](Moved). Charts are matched whose triangles are, with the same coordinates in the chart, and with
 //! them their texels: these are numbered alike in a placement.
 
+use crate::base::bounds::Bounds;
 use crate::base::directional::Directional;
 use crate::base::error::Result;
 use crate::base::geometry::is_valid_triangle;
@@ -14,11 +15,12 @@ use crate::base::parallel::one_by_one;
 use crate::base::progress::Progress;
 use crate::base::sort::sort;
 use crate::lightmap::atlas::Atlas;
-use crate::lightmap::atlas::ids::{ChartId, LightTexel, PlacementId};
+use crate::lightmap::atlas::chart_map::ChartMap;
+use crate::lightmap::atlas::ids::{ChartId, LightTexel, Map, PlacementId, RadianceTexel, TexelId};
 use crate::lightmap::atlas::layout::Placement;
 use crate::lightmap::atlas::texels::TexelSample;
 use crate::lightmap::indirect::radiance_map::Radiance;
-use crate::lightmap::moved::{Bounds, Moved};
+use crate::lightmap::moved::Moved;
 use crate::lightmap::plan::Plan;
 use crate::lightmap::{Light, Spread};
 use crate::scene::{Material, NONE, Object, Scene, Texture};
@@ -59,6 +61,8 @@ pub(crate) struct Correspondence {
     triangles: Vec<u32>,
     /// By placement of the light map, that of the same texels; [`PlacementId::NONE`]: there was none.
     placements: Vec<PlacementId>,
+    /// The same of the radiance map.
+    radiance_placements: Vec<PlacementId>,
     _memory: Reservation,
 }
 
@@ -112,11 +116,19 @@ impl Correspondence {
             *former = rest[0][*former as usize];
         }
         memory.shrink(bytes - size_of_val(&triangles[..]));
-        let mut found = Correspondence { objects, triangles, placements: Vec::new(), _memory: memory };
+        let mut found = Correspondence {
+            objects,
+            triangles,
+            placements: Vec::new(),
+            radiance_placements: Vec::new(),
+            _memory: memory,
+        };
         let charts = 0..new.charts.charts.len();
         let former_chart = |chart| found.former_chart(old, new, ChartId::new(chart));
         let charts = try_par_collect(one_by_one(charts.into_par_iter().map(former_chart)), MATCHED)?;
-        found.placements = try_collect(Self::former_placements(old, new, &charts), MATCHED)?;
+        found.placements = try_collect(Self::former_placements(&old.map, &new.map, &charts), MATCHED)?;
+        let of_radiance = Self::former_placements(&old.radiance, &new.radiance, &charts);
+        found.radiance_placements = try_collect(of_radiance, MATCHED)?;
         let has_moved = charts.iter().map(|&chart| chart == ChartId::NONE);
         let moved = Moved::new(try_collect(has_moved, MATCHED)?, boxes, emits);
         Ok((found, moved))
@@ -150,20 +162,20 @@ impl Correspondence {
         if triangles.len() == count && triangles.clone().all(is_same) { found } else { ChartId::NONE }
     }
 
-    /// Yields the former placement of each placement, given the former charts.
-    fn former_placements<'a>(
-        old: &'a Atlas,
-        new: &'a Atlas,
+    /// Yields the former placement of each placement of a map, given the former charts.
+    fn former_placements<'a, M: Map>(
+        old: &'a ChartMap<M>,
+        new: &'a ChartMap<M>,
         charts: &'a [ChartId],
-    ) -> impl Iterator<Item = PlacementId> + use<'a> {
-        let layouts = [&old.map.layout, &new.map.layout];
+    ) -> impl Iterator<Item = PlacementId> + use<'a, M> {
+        let layouts = [&old.layout, &new.layout];
         (0..layouts[1].placements.len()).map(PlacementId::new).map(move |placement| {
             let chart = charts[layouts[1].chart_of(placement).index()];
             if chart == ChartId::NONE {
                 return PlacementId::NONE;
             }
             let former = layouts[0].side(chart, !layouts[1].is_back(placement));
-            let is_alike = |&p: &PlacementId| old.map.texels_of(p).len() == new.map.texels_of(placement).len();
+            let is_alike = |&p: &PlacementId| old.texels_of(p).len() == new.texels_of(placement).len();
             former.filter(is_alike).unwrap_or(PlacementId::NONE)
         })
     }
@@ -171,26 +183,51 @@ impl Correspondence {
     /// Returns the former number of a texel of a placement, if it showed the same point, or neither shows one of its own,
     /// being buried.
     pub fn texel(&self, old: &Atlas, new: &Atlas, placement: PlacementId, texel: LightTexel) -> Option<LightTexel> {
-        let former = self.placements[placement.index()];
+        let former = self.in_placement((&old.map, &new.map), self.placements[placement.index()], placement, texel)?;
+        let is_buried = |atlas: &Atlas, texel: LightTexel| atlas.buried.get(texel.index()).is_some_and(|&b| b);
+        let shows_same = || self.shows_same((old, new), &old.map[former], &new.map[texel], new.map.layout.density);
+        (is_buried(new, texel) && is_buried(old, former) || shows_same()).then_some(former)
+    }
+
+    /// Returns the former number of a texel of a placement of the radiance map, if it showed the same point.
+    pub fn radiance_texel(
+        &self,
+        old: &Atlas,
+        new: &Atlas,
+        placement: PlacementId,
+        texel: RadianceTexel,
+    ) -> Option<RadianceTexel> {
+        let maps = (&old.radiance, &new.radiance);
+        let former = self.in_placement(maps, self.radiance_placements[placement.index()], placement, texel)?;
+        let shows_same = self.shows_same((old, new), &maps.0[former], &maps.1[texel], maps.1.layout.density);
+        shows_same.then_some(former)
+    }
+
+    /// Returns the texel at the same place in the former placement.
+    fn in_placement<M: Map>(
+        &self,
+        (old, new): (&ChartMap<M>, &ChartMap<M>),
+        former: PlacementId,
+        placement: PlacementId,
+        texel: TexelId<M>,
+    ) -> Option<TexelId<M>> {
         if former == PlacementId::NONE {
             return None;
         }
-        let place = texel.index() - new.map.texels_of(placement).indices().start;
-        let former_texel = LightTexel::new(old.map.texels_of(former).indices().start + place);
-        let (here, there) = (&new.map[texel], &old.map[former_texel]);
+        let place = texel.index() - new.texels_of(placement).indices().start;
+        let former_texel = TexelId::new(old.texels_of(former).indices().start + place);
         let within = |texel: &TexelSample, rect: &Placement| (texel.x - rect.x, texel.y - rect.y);
-        if within(here, &new.map.layout[placement]) != within(there, &old.map.layout[former]) {
-            return None;
-        }
-        let is_buried = |atlas: &Atlas, texel: LightTexel| atlas.buried.get(texel.index()).is_some_and(|&b| b);
-        let shows_same = || {
-            let former = self.triangle(&new.scene, here.triangle);
-            // Rounding decides which of two triangles an edge is part of.
-            let is_alike = || here.shading_normal(&new.scene).distance(there.shading_normal(&old.scene)) <= SAME_NORMAL;
-            here.position(&new.scene).distance(there.position(&old.scene)) <= SAME / new.map.layout.density
-                && former.is_some_and(|former| former == there.triangle || is_alike())
-        };
-        (is_buried(new, texel) && is_buried(old, former_texel) || shows_same()).then_some(former_texel)
+        let is_alike = within(&new[texel], &new.layout[placement]) == within(&old[former_texel], &old.layout[former]);
+        is_alike.then_some(former_texel)
+    }
+
+    /// Whether a texel shows the point that another one showed, given the density of their map.
+    fn shows_same(&self, (old, new): (&Atlas, &Atlas), there: &TexelSample, here: &TexelSample, density: f32) -> bool {
+        let former = self.triangle(&new.scene, here.triangle);
+        // Rounding decides which of two triangles an edge is part of.
+        let is_alike = || here.shading_normal(&new.scene).distance(there.shading_normal(&old.scene)) <= SAME_NORMAL;
+        here.position(&new.scene).distance(there.position(&old.scene)) <= SAME / density
+            && former.is_some_and(|former| former == there.triangle || is_alike())
     }
 
     /// Copies light of the earlier atlas, as it was before seams were stitched, to the texels that are the same in the new

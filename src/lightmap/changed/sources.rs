@@ -1,8 +1,9 @@
 //! What gives direct light, as volumes, to tell whether what moved lies between them and a surface.
 
+use crate::base::bounds::Bounds;
 use crate::base::error::Result;
 use crate::base::memory::{try_collect, try_push};
-use crate::lightmap::moved::{Bounds, merged};
+use crate::lightmap::moved::merged;
 use crate::scene::{Light as Lamp, Scene};
 use glam::Vec3;
 use std::f32::consts::PI;

@@ -41,6 +41,12 @@ fn move_block(scene: &mut Arc<Scene>, by: Vec3) {
     Scene::refit(scene, &[(1, &moved)]).unwrap();
 }
 
+/// Bakes what has changed with a radiance map that is made anew, so that all new light has the bits of a bake from nothing.
+fn bake_exactly(map: &mut Lightmap, params: &BakeParams, keep_error: f32) -> BakeStats {
+    let keep = Keep { keep_error, keeps_radiance: false, earlier: None };
+    map.bake_all(params, None, None, Some(keep), &Progress::none()).unwrap()
+}
+
 fn light(map: &Lightmap) -> [Vec<Vec3>; 2] {
     let light = map.light.as_ref().unwrap();
     [light.direct.clone(), light.indirect.clone()]
@@ -71,7 +77,7 @@ fn texels_keep_their_light_or_get_that_of_a_bake_from_nothing() {
         move_block(&mut scene, Vec3::new(0.6, 0.4, 0.0));
         map.follow(&scene, &none).unwrap();
         assert!(light(&map) == old, "light stays until the next bake");
-        let stats = map.bake_changed(&params, 0.05, &none).unwrap();
+        let stats = bake_exactly(&mut map, &params, 0.05);
         let changed = light(&map);
         map.bake(&params, &none).unwrap();
         let new = light(&map);
@@ -111,7 +117,7 @@ fn texels_chosen_by_contrast_get_the_light_of_a_bake_from_nothing() {
         let old = light(&map);
         move_block(&mut scene, Vec3::new(0.3, 0.2, 0.0));
         map.follow(&scene, &none).unwrap();
-        map.bake_changed(&params, 0.05, &none).unwrap();
+        bake_exactly(&mut map, &params, 0.05);
         let changed = light(&map);
         map.bake(&params, &none).unwrap();
         let new = light(&map);
@@ -120,6 +126,56 @@ fn texels_chosen_by_contrast_get_the_light_of_a_bake_from_nothing() {
         let renewed = indirect.filter(|(changed, (old, new))| changed != old && changed == new).count();
         assert!(neither == 0 && renewed > 1000, "{neither} of {renewed} are neither old nor new");
     }
+}
+
+/// Where a lamp and photons reach texels of the radiance map as before, these keep their bits; the light is as right as with a
+/// radiance map from nothing.
+#[test]
+fn the_radiance_map_is_kept_where_nothing_changes_it() {
+    let none = Progress::none();
+    let params = BakeParams { photon_count: 100_000, ..params() };
+    let by = Vec3::new(0.6, 0.4, 0.0);
+    let radiance = |map: &Lightmap| map.light.as_ref().unwrap().radiance.values.clone();
+    let path = std::env::temp_dir().join(format!("bakelite-kept-radiance-{}", std::process::id()));
+    let (mut scene, mut map) = rooms();
+    map.bake(&params, &none).unwrap();
+    map.save_result(&path, &none).unwrap();
+    let (old, old_light) = (radiance(&map), light(&map));
+    move_block(&mut scene, by);
+    map.follow(&scene, &none).unwrap();
+    let stats = map.bake_changed(&params, 0.05, &none).unwrap();
+    let (changed, kept_light) = (radiance(&map), light(&map));
+    let kept = changed.iter().zip(&old).filter(|(a, b)| a == b).count() as f64 / old.len() as f64;
+    assert!((0.5..0.99).contains(&kept), "{kept} kept");
+    assert!(map.plan_text().contains("texels of the radiance map (lamps and photons reach them as before)"));
+    assert!(stats.kept_texels > 0 && kept_light != old_light);
+    // Against the mean of many bakes: no further away than one from nothing.
+    map.bake(&params, &none).unwrap();
+    let [anew, new_light] = [vec![radiance(&map)], light(&map).to_vec()];
+    map.bake(&BakeParams { seed: 99, passes: 16, ..params }, &none).unwrap();
+    let right = light(&map);
+    let error = |light: &[Vec<Vec3>]| {
+        let squares = light[1].iter().zip(&right[1]).map(|(a, b)| f64::from((*a - *b).length_squared()));
+        (squares.sum::<f64>() / right[1].len() as f64).sqrt()
+    };
+    let [of_kept, of_new, of_old] = [&kept_light[..], &new_light, &old_light].map(error);
+    println!("{kept} kept, error {of_kept}, from nothing {of_new}, old light {of_old}");
+    assert!(anew[0] != changed && of_kept < 1.05 * of_new && of_old > 1.2 * of_new, "{of_kept} {of_new} {of_old}");
+    // What was loaded knows as much as what was baked.
+    let (mut scene, mut loaded) = rooms();
+    loaded.load_result(&path, &none).unwrap();
+    std::fs::remove_file(&path).unwrap();
+    move_block(&mut scene, by);
+    loaded.follow(&scene, &none).unwrap();
+    loaded.bake_changed(&params, 0.05, &none).unwrap();
+    assert!(radiance(&loaded) == changed);
+    // Without any difference to let stand, all has the bits of a bake from nothing.
+    let (mut scene, mut map) = rooms();
+    map.bake(&params, &none).unwrap();
+    move_block(&mut scene, by);
+    map.follow(&scene, &none).unwrap();
+    map.bake_changed(&params, 0.0, &none).unwrap();
+    assert!(radiance(&map) == anew[0]);
 }
 
 #[test]

@@ -386,7 +386,7 @@ mod tests {
         for two_sided in [false, true] {
             let lightmap = room(two_sided, 0.3);
             let with = &baked(&lightmap).radiance;
-            let without = Radiance { values: with.values.clone(), bright: Bright::default() };
+            let without = Radiance { values: with.values.clone(), ..Default::default() };
             assert!(with.bright.len() > 20, "{}", with.bright.len());
             let (a, noise) = gathered(&lightmap, with, 256);
             let (b, noise_without) = gathered(&lightmap, &without, 256);

@@ -14,7 +14,7 @@
 
 use super::bright_patches::Bright;
 use crate::base::error::Result;
-use crate::base::memory::{try_zeroed, try_zeroed_as_needed};
+use crate::base::memory::{try_to_vec, try_zeroed, try_zeroed_as_needed};
 use crate::base::parallel::{ParallelLoop, one_by_one};
 use crate::base::progress::Stage;
 use crate::base::sampling::{combine, sobol_2d};
@@ -28,8 +28,8 @@ use crate::lightmap::atlas::texels::TexelSample;
 use crate::lightmap::texel_light::looks::Look;
 use crate::lightmap::texel_light::{TexelAreas, TexelLight, TilePoints};
 use crate::lightmap::tiles::{TILE, in_order, texels_per_tile};
-use crate::photon::PhotonMap;
 use crate::photon::coverage::Discs;
+use crate::photon::{Guidance, PhotonMap};
 use crate::scene::{NONE, Scene};
 use crate::simd::prefetch;
 use crate::trace::filter::Crossing;
@@ -56,6 +56,8 @@ pub(crate) struct RadianceLookup<'a> {
 pub(crate) struct Radiance {
     pub values: Vec<Vec3>,
     pub bright: Bright,
+    /// What photons after a change have in common with those of this map; `None`: unknown, or there were none.
+    pub guidance: Option<Guidance>,
 }
 
 impl<'a> RadianceLookup<'a> {
@@ -186,6 +188,30 @@ pub(crate) struct RadianceInput<'a> {
     pub photons: Option<&'a PhotonMap>,
     /// Whether a first impression is enough: few points of each texel, and photons without a look at what hides them.
     pub quick: bool,
+    /// The texels to compute, if not all; the others keep their values. Not for a first impression.
+    pub anew: Option<&'a Anew<'a>>,
+}
+
+/// Which texels of the map are computed, if not all.
+pub(crate) struct Anew<'a> {
+    /// By texel.
+    texels: &'a [bool],
+    /// Those whose first look is needed: the texels and their neighbours.
+    looked_at: Vec<bool>,
+}
+
+impl<'a> Anew<'a> {
+    pub(crate) fn new(areas: &TexelAreas<RadianceMap>, texels: &'a [bool]) -> Result<Anew<'a>> {
+        let mut looked_at = try_to_vec(texels, "texels of the radiance map")?;
+        for i in (0..texels.len()).filter(|&i| texels[i]) {
+            areas
+                .neighbours(RadianceTexel::new(i))
+                .into_iter()
+                .flatten()
+                .for_each(|near| looked_at[near.index()] = true);
+        }
+        Ok(Anew { texels, looked_at })
+    }
 }
 
 /// Texels whose work of [`bake`] is done for a range of them: those of the first look, with the neighbours, and the range.
@@ -235,7 +261,9 @@ pub(crate) fn bake(
         one_by_one(looks[needed.clone()].par_chunks_mut(BLOCK).enumerate()).try_each(|(block, out)| {
             let (mut traced, first) = (0, needed.start + block * BLOCK);
             let mut tile = tiles.take(|| TilePoints::new(TILE))?;
-            for texels in in_order(map, first..first + out.len())?.chunks(per_tile) {
+            let mut order = in_order(map, first..first + out.len())?;
+            order.retain(|texel| input.anew.is_none_or(|anew| anew.looked_at[texel.index()]));
+            for texels in order.chunks(per_tile) {
                 stage.check()?;
                 let place = |i: usize| texels[i].index() - first;
                 input.light.first_look(texels, &mut tile, &mut traced, |i, look| out[place(i)] = look);
@@ -247,7 +275,9 @@ pub(crate) fn bake(
             let (mut traced, first) = (0, range.start + block * BLOCK);
             let make = || Ok(RadianceTile { points: TilePoints::new(TILE)?, discs: Discs::new(TILE)? });
             let mut room = rooms.take(make)?;
-            for texels in in_order(map, first..first + out.len())?.chunks(per_tile) {
+            let mut order = in_order(map, first..first + out.len())?;
+            order.retain(|texel| input.anew.is_none_or(|anew| anew.texels[texel.index()]));
+            for texels in order.chunks(per_tile) {
                 stage.check()?;
                 let place = |i: usize| texels[i].index() - first;
                 room.radiance(input, PerTexel::new(&looks), texels, &mut traced, |i, value| out[place(i)] = value);

@@ -1,7 +1,7 @@
 //! Results: saving the light of all baked texels of a light map to a file, and loading it.
 //!
 //! A file holds records (`super::records`): `RSLT` with fingerprint and counts, `PLAN`, `BACK` (the sides that are
-//! shown), `RADI` (the radiance map, in runs), `TEXL` (direct and indirect light and state of runs of texels), each
+//! shown), `GUID` (what photons after a change have in common with those of the bake, if known), `RADI` (the radiance map, in runs), `TEXL` (direct and indirect light and state of runs of texels), each
 //! followed by `DIRL` (their light by direction) if that was asked for and `SPRD` (error and halves of their light) after
 //! several passes, `DONE`.
 //! Light is saved as it was before seams were stitched. Loading the last texels stitches anew, so that light maps
@@ -15,10 +15,10 @@ use crate::base::error::{Error, Result};
 use crate::base::files;
 use crate::base::memory::{try_collect, try_push, try_to_vec, try_vec, try_with_capacity};
 use crate::base::progress::Progress;
-use crate::lightmap::indirect::bright_patches::Bright;
 use crate::lightmap::indirect::radiance_map::Radiance;
 use crate::lightmap::plan::Plan;
 use crate::lightmap::{BakeStats, Light, Lightmap, Spread, TexelState};
+use crate::photon::Guidance;
 use crate::scene::MOST_LIGHT;
 use bytemuck::{Pod, Zeroable};
 use glam::Vec3;
@@ -33,6 +33,7 @@ const RADIANCE: Tag = *b"RADI";
 const TEXELS: Tag = *b"TEXL";
 const DIRECTIONAL: Tag = *b"DIRL";
 const SPREAD: Tag = *b"SPRD";
+const GUIDANCE: Tag = *b"GUID";
 const DONE: Tag = *b"DONE";
 
 /// The content of the first record.
@@ -82,6 +83,9 @@ impl Lightmap {
             records::append(&mut out, HEAD, &[bytemuck::bytes_of(&head)])?;
             records::append(&mut out, PLAN, &[light.plan.text().as_bytes()])?;
             records::append(&mut out, BACKS, &[bytemuck::cast_slice(&light.backs)])?;
+            if let Some(guidance) = &light.radiance.guidance {
+                records::append(&mut out, GUIDANCE, &[bytemuck::cast_slice(&guidance.words()?)])?;
+            }
             for values in light.radiance.values.chunks(RUN) {
                 records::append(&mut out, RADIANCE, &[bytemuck::cast_slice(values)])?;
                 write(&mut out, values.len())?;
@@ -236,7 +240,7 @@ impl<'a> Loading<'a> {
     fn read_into(&mut self, light: &mut Light, charts: usize, progress: &Progress) -> Result<()> {
         let stage = progress.stage("loading", 0.0, 1.0, self.head.radiance + self.head.texels);
         let (mut texels, mut directional, mut spread) = (0, 0, 0);
-        light.radiance = Radiance { values: Vec::new(), bright: Bright::default() };
+        light.radiance = Radiance::default();
         light.radiance.values = try_with_capacity(self.head.radiance as usize, "the radiance map of a result")?;
         loop {
             let next = self.records.next();
@@ -248,6 +252,9 @@ impl<'a> Loading<'a> {
                     .map(|text| light.plan = Plan::from_text(self.head.left_out as u32, &text))
                     .map(|()| 0),
                 BACKS => read_backs(&content, charts)?.map(|backs| light.backs = backs).map(|()| 0),
+                GUIDANCE => {
+                    read_guidance(&content)?.map(|guidance| light.radiance.guidance = Some(guidance)).map(|()| 0)
+                }
                 RADIANCE => read_radiance(&content, self.head.radiance as usize, &mut light.radiance.values),
                 TEXELS => read_texels(&content, light).inspect(|&n| texels += n as u64),
                 DIRECTIONAL => read_directional(&content, light).inspect(|&n| directional += n as u64).map(|_| 0),
@@ -273,6 +280,12 @@ fn read_backs(content: &[u8], charts: usize) -> Result<Option<Vec<bool>>> {
     let fits = content.is_empty() || content.len() == charts;
     let are_possible = fits && content.iter().all(|&b| b <= 1);
     are_possible.then(|| try_collect(content.iter().map(|&b| b == 1), "the sides of charts")).transpose()
+}
+
+fn read_guidance(content: &[u8]) -> Result<Option<Guidance>> {
+    let words = content.chunks_exact(size_of::<u32>()).map(|word| bytemuck::pod_read_unaligned::<u32>(word));
+    let is_whole = content.len().is_multiple_of(size_of::<u32>());
+    if is_whole { Guidance::from_words(&try_collect(words, "the result of a bake")?) } else { Ok(None) }
 }
 
 /// Appends a run of the radiance map; returns its length.

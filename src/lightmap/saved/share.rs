@@ -16,7 +16,6 @@ use crate::base::progress::{Progress, Stage};
 use crate::base::share::Share;
 use crate::direct::DirectLight;
 use crate::lightmap::atlas::Atlas;
-use crate::lightmap::indirect::bright_patches::Bright;
 use crate::lightmap::indirect::radiance_map::{self, Radiance};
 use crate::lightmap::passes;
 use crate::lightmap::plan::left_out;
@@ -252,7 +251,7 @@ impl<'a> Shares<'a> {
         if values.len() != all {
             return Err(damaged(&self.path(Which { stage: ShareStage::Radiance, share: 0, pass })));
         }
-        let (mut radiance, mut rays) = (Radiance { values, bright: Bright::default() }, 0);
+        let (mut radiance, mut rays) = (Radiance { values, ..Default::default() }, 0);
         stages::find_bright(inputs, &mut radiance, &mut rays)?;
         (stats.photons_emitted, stats.photons_stored) = (emitted, stored);
         stats.radiance.seconds = start.elapsed().as_secs_f64();

@@ -148,7 +148,8 @@ fn the_radiance_map_has_the_energy_of_a_patch_of_sun_smaller_than_its_texels() {
         let atlas = map.atlas();
         let direct = DirectLight::new(&scene);
         let light = TexelLight { areas: atlas.areas(&atlas.radiance), direct: &direct, samples: 4, seed: 5 };
-        let input = crate::lightmap::indirect::radiance_map::RadianceInput { light, photons: None, quick: false };
+        let input =
+            crate::lightmap::indirect::radiance_map::RadianceInput { light, photons: None, quick: false, anew: None };
         let mut values = vec![Vec3::ZERO; atlas.radiance.len()];
         let progress = Progress::none();
         let stage = progress.stage("radiance", 0.0, 1.0, 1);
