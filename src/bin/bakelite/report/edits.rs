@@ -93,10 +93,10 @@ pub fn run(args: &ReportArgs) -> Result<()> {
     map.save_result(&path, &progress)?;
     println!("Seconds in brackets are the processor's, of all threads.\n");
     println!(
-        "| triangles moved | size | texels changed | refit, follow, s | keep_error | what changed, s | from nothing, s | kept | \
+        "| triangles moved | size | texels changed | refit, follow, s | keep_error | what changed, s | of these photons, radiance map | from nothing, s | kept | \
          error, in these texels: what changed | from nothing | old light |"
     );
-    println!("|---|---|---|---|---|---|---|---|---|---|---|");
+    println!("|---|---|---|---|---|---|---|---|---|---|---|---|");
     for (number, piece) in pieces.iter().enumerate() {
         let [here, there] = places(&scene, piece, number, args.bake.up);
         let old = light(&map)?;
@@ -127,10 +127,12 @@ pub fn run(args: &ReportArgs) -> Result<()> {
             let error = errors(&new);
             let text = |[all, changed]: [f64; 2]| format!("{all:.2e}, {changed:.2e}");
             println!(
-                "| {} | {:.2} | {part:.2} % | {refit:.2}, {follow:.2} | {keep_error} | {} | {} | {:.1} % | {} | {} | {} |",
+                "| {} | {:.2} | {part:.2} % | {refit:.2}, {follow:.2} | {keep_error} | {} | {:.2}, {:.2} | {} | {:.1} % | {} | {} | {} |",
                 piece.triangles,
                 piece.size,
                 time.text(),
+                stats.photons.seconds,
+                stats.radiance.seconds,
                 whole.text(),
                 100.0 * stats.kept_texels as f64 / map.info().texels as f64,
                 text(error),
