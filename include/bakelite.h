@@ -1091,11 +1091,10 @@ bk_result bk_scene_add_instance(bk_scene *scene,
                                 const float *transform,
                                 uint32_t *out_id);
 
-/// Lets an instance show the light of another instance of the same mesh: it gets no texels of its own in light maps,
-/// bk_lightmap_instance_uvs returns those of the other one for it, and what it reflects to other
-/// surfaces is what the other one reflects. For what stands in places of much the same light so
-/// often that texels for each would be too many. Rays hit it where it stands, and it casts shadows
-/// there.
+/// Sets an instance to show the light of another instance of the same mesh: it gets no texels of its
+/// own in light maps, and has the light map coordinates and the radiance of the other one. For meshes
+/// that stand in places of much the same light so often that texels for each would be too many. Rays
+/// hit it where it stands, and it casts shadows there. A triangle that vanishes by rounding where the other one stands has no light.
 ///
 /// @param scene  scene that is not committed
 /// @param instance  number of the instance
@@ -2247,25 +2246,29 @@ bk_result bk_bake(bk_lightmap *lightmap,
 /// Bakes a light map again where its light has changed, after lights were set (bk_scene_set_light)
 /// or the scene has moved (bk_lightmap_follow).
 ///
-/// Photons and the radiance map are made anew. Indirect light is computed again around moved
+/// Photons are traced again; texels of the radiance map that they and lamps reach as before keep
+/// their radiance. Indirect light is computed again around moved
 /// surfaces, and where probes find it changed: rays from one or two texels of every 8 x 8 texels of
 /// the gather map, traced in the scene before and after. Direct light is computed again where a
 /// moved surface lies, or lay, in the way to a light, and everywhere if a light was set or an
-/// emissive surface moved. These texels get the bits that bk_bake gives them; the others keep their
-/// light. If there is no light yet, or the last bake had other parameters, everything is baked.
-/// bk_bake_stats.kept_texels and bk_plan_describe report how much was kept.
+/// emissive surface moved. These texels get the light that bk_bake gives them, and its bits if
+/// `keep_error` is 0; the others keep their light. If there is no light yet, or the last bake had
+/// other parameters, everything is baked. bk_bake_stats.kept_texels and bk_plan_describe report how
+/// much was kept.
 ///
 /// Each call may leave an error of `keep_error`, and these errors add up: use bk_bake for final
-/// light. With several passes, `keep_error` below the noise of one pass's photons keeps little.
+/// light. With several passes, `keep_error` below the noise of one pass's photons keeps little, and
+/// the radiance map is made anew.
 ///
-/// Cost: photons, radiance map and seams as in a bake; of the other stages the part that changed.
+/// Cost: photons and seams as in a bake; of the other stages the part that changed.
 /// Measured: docs/performance.md, "Edits".
 ///
 /// @param lightmap  any light map
 /// @param params  parameters of the last bake, without a range of texels, checkpoint, shares and
 ///   target_error; NULL for the defaults
 /// @param keep_error  change of light below which texels keep it, as a fraction of their irradiance
-///   or, if that is more, of a tenth of the mean irradiance; finite, >= 0. 0.03 is hard to see
+///   or, if that is more, of a tenth of the mean irradiance; finite, >= 0. 0.03 is hard to see.
+///   Texels of the radiance map keep their radiance by the same measure, unless it is 0
 /// @param progress,user  progress callback and its pointer; may be NULL
 /// @param out  receives numbers about the bake; may be NULL
 /// @retval BK_ERROR_INVALID_ARGUMENT  `keep_error` or a field of `params` is out of its range
@@ -2286,8 +2289,8 @@ bk_result bk_bake_changed(bk_lightmap *lightmap,
 /// The new scene is described and committed like any other, and its light map made with the
 /// `texels_per_unit` (not 0), divisors and other fields of the earlier one, so that surfaces which
 /// both scenes have are given the same texels. Surfaces are matched by content and place: whole
-/// objects first, then single triangles of the others. Add new meshes after those that stay: random
-/// numbers go by the number of a texel, so that more light is found unchanged. Light is compared and
+/// objects first, then single triangles of the others; where a mesh stands in the description does
+/// not matter. Light is compared and
 /// baked as bk_bake_changed does it; surfaces that only one of the scenes has count as moved. Light
 /// that the light map already has is replaced. If the earlier light map has no light, was baked with
 /// other parameters or has no surface in common with this one, everything is baked.

@@ -360,6 +360,10 @@ public:
         const bk_result code = bk_scene_add_instance(get(), mesh, transform, &id);
         return detail::finish(code, id);
     }
+    /// Lets an instance show the light of another one of its mesh, with a lower number.
+    Result<void> share_light(std::uint32_t instance, std::uint32_t of) {
+        return detail::finish(bk_instance_share_light(get(), instance, of));
+    }
     Result<std::uint32_t> add_light(const LightDesc &desc) { return add(bk_scene_add_light, desc); }
     Result<void> set_light(std::uint32_t id, const LightDesc &desc) {
         return detail::finish(bk_scene_set_light(get(), id, &desc));

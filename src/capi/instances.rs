@@ -57,11 +57,10 @@ pub unsafe extern "C" fn bk_scene_add_instance(
     })
 }
 
-/// Lets an instance show the light of another instance of the same mesh: it gets no texels of its own in light maps,
-/// bk_lightmap_instance_uvs returns those of the other one for it, and what it reflects to other
-/// surfaces is what the other one reflects. For what stands in places of much the same light so
-/// often that texels for each would be too many. Rays hit it where it stands, and it casts shadows
-/// there.
+/// Sets an instance to show the light of another instance of the same mesh: it gets no texels of its
+/// own in light maps, and has the light map coordinates and the radiance of the other one. For meshes
+/// that stand in places of much the same light so often that texels for each would be too many. Rays
+/// hit it where it stands, and it casts shadows there. A triangle that vanishes by rounding where the other one stands has no light.
 ///
 /// @param scene  scene that is not committed
 /// @param instance  number of the instance

@@ -371,7 +371,7 @@ impl<'p> Bake<'_, 'p> {
         Ok(before.redo.get_or_init(|| redo))
     }
 
-    /// Computes the radiance map, or reads it from the checkpoint or from the files of shares; empty if the plan leaves
+    /// Computes the radiance map, or what has changed of it, or reads it from the checkpoint or from the files of shares; empty if the plan leaves
     /// indirect light out.
     fn illuminate(&self, stats: &mut BakeStats) -> Result<Radiance> {
         if !self.plan.runs(left_out::INDIRECT) {

@@ -131,7 +131,8 @@ impl Lightmap {
             Some(former) => Kept::Carried(Box::new(former.carried(light, atlas, &self.atlas)?)),
             None => Kept::InPlace(light),
         };
-        let has_other_lights = !light.origin.is_some_and(|of_light| of_light.has_lights_of(origin));
+        let has_other_lights = !light.origin.is_some_and(|of_light| of_light.has_lights_of(origin))
+            || keep.earlier.is_some() && atlas.scene.environments() != self.atlas.scene.environments();
         Ok(Some(Before {
             atlas,
             former,

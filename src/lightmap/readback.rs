@@ -36,7 +36,8 @@ impl Lightmap {
         self.object_uvs(self.object_of_mesh(mesh)?)
     }
 
-    /// Returns what [`mesh_uvs`](Self::mesh_uvs) returns, of an instance: each has a place of its own in the light map.
+    /// Returns what [`mesh_uvs`](Self::mesh_uvs) returns, of an instance: each has a place of its own in the light map, unless it shows the light of
+    /// another one.
     pub fn instance_uvs(&self, instance: u32) -> Result<MeshUvs> {
         self.object_uvs(self.object_of_instance(instance)?)
     }

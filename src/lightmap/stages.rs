@@ -24,6 +24,7 @@ use crate::photon::trace::Traced;
 use crate::photon::{Change, Difference, Guidance, PhotonMap, PhotonParams, PhotonStats};
 use glam::Vec3;
 use std::ops::Range;
+use std::sync::Arc;
 use std::time::Instant;
 
 /// Purposes of the random numbers of a bake.
@@ -174,7 +175,7 @@ fn radiance(inputs: &Inputs, photons: Option<&PhotonMap>, quick: bool, stats: &m
     let mut radiance = Radiance { values, ..Default::default() };
     if !quick {
         find_bright(inputs, &mut radiance, &mut rays)?;
-        radiance.guidance = photons.map(PhotonMap::guidance).transpose()?.flatten();
+        radiance.guidance = photons.map(PhotonMap::guidance).transpose()?.flatten().map(Arc::new);
     }
     stats.radiance = radiance_stats(inputs, start, rays);
     Ok(radiance)
@@ -185,7 +186,7 @@ fn radiance(inputs: &Inputs, photons: Option<&PhotonMap>, quick: bool, stats: &m
 pub(crate) fn radiance_again(
     inputs: &Inputs,
     photons: &PhotonMap,
-    guidance: Guidance,
+    guidance: Arc<Guidance>,
     (mut values, anew): (Vec<Vec3>, &[bool]),
     stats: &mut BakeStats,
 ) -> Result<Radiance> {

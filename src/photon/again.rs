@@ -30,7 +30,7 @@ use std::time::Instant;
 #[derive(Clone, Debug, PartialEq)]
 pub(crate) struct Guidance {
     /// By source of light.
-    guides: Vec<Option<Guide>>,
+    guides: Vec<Option<Arc<Guide>>>,
     radius: f32,
 }
 
@@ -63,7 +63,7 @@ impl Guidance {
             if side != 0 && guide.is_none() {
                 return Ok(None);
             }
-            guides.push(guide);
+            guides.push(guide.map(Arc::new));
         }
         Ok(rest.is_empty().then_some(Guidance { guides, radius }))
     }
@@ -88,6 +88,9 @@ pub(crate) struct Difference {
 
 /// Name of what maps have in common, in error messages.
 const GUIDANCE: &str = "the guides of lights";
+
+/// Part of the paths that may meet what moved.
+const MOST_MEETINGS: f64 = 0.5;
 
 /// Part of the scene's diagonal by which boxes around what moved are wider: rounding of hits.
 const MARGIN: f32 = 1e-5;
@@ -125,13 +128,26 @@ impl PhotonMap {
         if !tracer.emission.is_like(&former.emission) || epsilon(scene) != epsilon(change.old) {
             return Ok(None);
         }
+        // From a file it may be any number.
+        let radii = match params.radius {
+            0.0 => params.least_radius.min(scene.diagonal())..=scene.diagonal().max(f32::MIN_POSITIVE),
+            given => given..=given,
+        };
         tracer.thin_out(params.most_stored)?;
-        if tracer.stored_part < 1.0 {
+        if tracer.stored_part < 1.0 || !radii.contains(&change.guidance.radius) {
             return Ok(None);
         }
         let boxes = change.boxes.iter().map(|bounds| bounds.grown(MARGIN * scene.diagonal()));
         let boxes = try_collect(boxes, "boxes around what moved")?;
         let split = from + 0.95 * (to - from);
+        if !tracer.blocks().is_empty() {
+            // Where most paths meet what moved, two of each cost more than all are worth.
+            let mut meetings = Meetings::new(&boxes);
+            tracer.some(tracer.numbers(0), 0, None, Some(&mut meetings), |_, _, _| ())?;
+            if meetings.photons.len() as f64 > MOST_MEETINGS * tracer.numbers(0).count() as f64 {
+                return Ok(None);
+            }
+        }
         let stage = progress.stage("photons", from, split, tracer.blocks().len() as u64);
         let monitor = scene.device().memory();
         let account = || Account::new(monitor.clone(), params.memory_budget);
@@ -144,7 +160,9 @@ impl PhotonMap {
             let (stored, mut tally) = tracer.some(numbers, block, watch, Some(&mut after), |_, _, _| ())?;
             if !after.photons.is_empty() {
                 let again = after.photons.iter().copied();
-                tally.rays += former.some(again, block, None, Some(&mut before), |_, _, _| ())?.1.rays;
+                let (photons, of_former) = former.some(again, block, None, Some(&mut before), |_, _, _| ())?;
+                tally.rays += of_former.rays;
+                memory.grow((photons.len() + after.stored.len() + before.stored.len()) * size_of::<StoredPhoton>())?;
             }
             stage.advance(1)?;
             Ok(((stored, tally), [after.stored, before.stored]))

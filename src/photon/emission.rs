@@ -23,6 +23,7 @@ use crate::scene::{Emitter, Light, Scene, Sky};
 use crate::trace::offset::{offset_ray_origin, ray_epsilon};
 use glam::{DVec3, Vec3};
 use std::f64::consts::PI;
+use std::sync::Arc;
 
 /// A photon as it leaves its light.
 #[derive(Clone, Copy, Debug)]
@@ -107,7 +108,7 @@ pub(super) struct Emission<'a> {
     /// First photon of each source, then of each emissive triangle, then the number of photons.
     first: Vec<u64>,
     /// Guide of each source, if it has one.
-    guides: Vec<Option<Guide>>,
+    guides: Vec<Option<Arc<Guide>>>,
     /// Photons per watt (of the mean over the channels).
     photons_per_watt: f64,
     /// Power of all lights, W per channel.
@@ -182,17 +183,17 @@ impl<'a> Emission<'a> {
         for (source, photon) in pilot {
             try_push(&mut of_source[source], photon, what)?;
         }
-        self.guides.iter_mut().zip(&of_source).for_each(|(guide, photons)| *guide = Guide::new(photons));
+        self.guides.iter_mut().zip(&of_source).for_each(|(guide, photons)| *guide = Guide::new(photons).map(Arc::new));
         Ok(())
     }
 
     /// The guide of each source.
-    pub(super) fn guides(&self) -> &[Option<Guide>] {
+    pub(super) fn guides(&self) -> &[Option<Arc<Guide>>] {
         &self.guides
     }
 
     /// Guides the emission by guides that were made for another one; returns whether they are for as many sources.
-    pub(super) fn guide_by(&mut self, guides: &[Option<Guide>]) -> Result<bool> {
+    pub(super) fn guide_by(&mut self, guides: &[Option<Arc<Guide>>]) -> Result<bool> {
         let is_for_these = guides.len() == self.sources.len();
         if is_for_these {
             self.guides = try_to_vec(guides, "the guides of lights")?;
@@ -205,6 +206,7 @@ impl<'a> Emission<'a> {
         // Triangles may have other numbers.
         let emitters = |scene: &'a Scene| scene.emitters().iter().map(|e| Emitter { triangle: 0, ..*e });
         self.sources == other.sources
+            && self.skies == other.skies
             && self.first == other.first
             && self.photons_per_watt.to_bits() == other.photons_per_watt.to_bits()
             && (self.centre, self.radius) == (other.centre, other.radius)

@@ -25,8 +25,8 @@ const LEAST: f32 = 0.5;
 /// Minimum gain of photons on surfaces for which a guide is used: powers that differ are noise too.
 const GAIN: f32 = 1.25;
 
-/// Minimum density of a row, or of a cell in its row, in guides of files; those that are made have more.
-const LEAST_POSSIBLE: f32 = 1e-4;
+/// Minimum density of a cell in guides of files; those that are made have more.
+const LEAST_POSSIBLE: f32 = 0.1;
 
 /// Name of guides in error messages.
 const GUIDES: &str = "the guides of lights";
@@ -98,13 +98,17 @@ impl Guide {
         let Some((own, rest)) = words.split_at_checked((side + 1) * (side + 1)) else { return Ok(None) };
         *words = rest;
         let sums = try_collect(own.iter().map(|&word| f32::from_bits(word)), GUIDES)?;
-        // No part is so small that its photons would be too bright.
-        let is_possible = |pair: &[f32]| pair[1] - pair[0] >= LEAST_POSSIBLE / side as f32;
         let ends = |sums: &[f32]| sums[0] == 0.0 && sums[side] == 1.0;
-        if !sums.chunks(side + 1).all(|sums| ends(sums) && sums.windows(2).all(is_possible)) {
+        let (rows, columns) = sums.split_at(side + 1);
+        // No cell is so small that its photons would be too bright.
+        let density = |pair: &[f32]| (pair[1] - pair[0]) * side as f32;
+        let mut of_rows = rows.windows(2).map(density).zip(columns.chunks(side + 1));
+        let is_possible = |(row, columns): (f32, &[f32])| {
+            row > 0.0 && ends(columns) && columns.windows(2).all(|pair| row * density(pair) >= LEAST_POSSIBLE)
+        };
+        if !ends(rows) || !of_rows.all(is_possible) {
             return Ok(None);
         }
-        let (rows, columns) = sums.split_at(side + 1);
         Ok(Some(Guide { side, rows: try_to_vec(rows, GUIDES)?, columns: try_to_vec(columns, GUIDES)? }))
     }
 

@@ -223,7 +223,7 @@ pub struct PhotonMap {
     cylinder: Cylinder,
     kernel: EstimateFn,
     /// How the lights were guided, if all photons were stored.
-    guides: Option<Vec<Option<Guide>>>,
+    guides: Option<Vec<Option<Arc<Guide>>>>,
     packed: OnceLock<PackedPhotons>,
     _memory: Reservation,
 }

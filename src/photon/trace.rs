@@ -82,7 +82,7 @@ pub(crate) struct Traced {
     pub(crate) stats: PhotonStats,
     pub(super) memory: Account,
     /// How the lights were guided, if all photons were stored.
-    pub(super) guides: Option<Vec<Option<Guide>>>,
+    pub(super) guides: Option<Vec<Option<Arc<Guide>>>>,
 }
 
 impl StoredPhoton {

@@ -128,7 +128,7 @@ fn brightness(rgb: &[f32; 3]) -> f64 {
 }
 
 /// A sky prepared for sampling: its environment, if it has one, turned as the light specifies.
-#[derive(Clone, Debug)]
+#[derive(Clone, Debug, PartialEq)]
 pub struct Sky {
     radiance: Vec3,
     image: Option<Arc<Environment>>,

@@ -135,7 +135,7 @@ impl SceneData {
             return invalid_argument!("instance {instance} does not exist, the scene has {}", self.instances.len());
         };
         self.check_shared_light(instance, mesh, of)?;
-        self.instances[instance as usize].light_of = Some(of);
+        self.instances[instance as usize].light_of = Some(self.light_of_instance(of));
         Ok(())
     }
 

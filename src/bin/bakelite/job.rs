@@ -69,6 +69,12 @@ impl<'a> Job<'a> {
             let name = &self.args.scene;
             return Err(Error::InvalidArgument(format!("{name} is opened as it was saved; --repeat does not apply")));
         }
+        if self.args.share_light {
+            let name = &self.args.scene;
+            return Err(Error::InvalidArgument(format!(
+                "{name} is opened as it was saved; --share-light does not apply"
+            )));
+        }
         let start = Instant::now();
         let options = OpenOptions { map: !self.args.read_scene, ray_queues: self.args.ray_queues };
         let path = Path::new(&self.args.scene);

@@ -230,13 +230,29 @@ impl Charts {
         ((own as usize) < sheet.of_triangles.len()).then_some((shown, sheet, own))
     }
 
+    /// Whether a triangle has texels of its own, if it has any: it is not of an instance that shows another one's.
+    pub(in crate::lightmap) fn is_own(&self, triangle: u32) -> bool {
+        let after = self.places.partition_point(|place| place.first_triangle <= triangle);
+        after.checked_sub(1).is_none_or(|number| self.places[number].shown as usize == number)
+    }
+
+    /// Returns the number of objects that have a chart.
+    pub(in crate::lightmap) fn times_shown(&self, chart: ChartId) -> u32 {
+        if chart.index() < self.own_charts() { 1 } else { self.place_with(chart).times }
+    }
+
+    /// Returns the instance that has a chart of its own.
+    fn place_with(&self, chart: ChartId) -> &Place {
+        // The last place from whose first chart on it lies: those without charts come before the next one that has some.
+        &self.places[self.places.partition_point(|place| place.first_chart <= chart) - 1]
+    }
+
     /// Returns a chart as it is in its sheet.
     pub(in crate::lightmap) fn shape(&self, chart: ChartId) -> Shape<'_> {
         if chart.index() < self.own_charts() {
             return Shape { sheet: &self.own, first_triangle: 0, factor: 1.0, number: chart.index() };
         }
-        // The last place from whose first chart on it lies: those without charts come before the next one that has some.
-        let place = &self.places[self.places.partition_point(|place| place.first_chart <= chart) - 1];
+        let place = self.place_with(chart);
         let sheet = &self.shared[place.sheet as usize];
         let number = sheet.first_shape as usize + chart.index() - place.first_chart.index();
         Shape { sheet, first_triangle: place.first_triangle, factor: place.factor, number }
@@ -292,7 +308,8 @@ impl Charts {
                 stage.advance(triangles.len() as u64)?;
                 sheet
             };
-            places.push(Place { first_triangle, first_chart, shown, sheet, factor: source.factor });
+            places.push(Place { first_triangle, first_chart, shown, times: 0, sheet, factor: source.factor });
+            places[shown as usize].times += 1;
             if charts.len() as u64 > MAX_TEXELS {
                 return Err(Error::OutOfMemory(format!("instances have more than {MAX_TEXELS} charts")));
             }

@@ -54,6 +54,7 @@ impl Patch {
     fn is_possible(&self, charts: &Charts, own: &TexelSample) -> bool {
         let is_weight = |w: f32| (-TOLERANCE..=1.0 + TOLERANCE).contains(&w);
         charts.find(self.triangle) == Some(charts.chart_of(own.triangle))
+            && charts.is_own(self.triangle)
             && is_weight(self.u)
             && is_weight(self.v)
             && is_weight(self.u + self.v)

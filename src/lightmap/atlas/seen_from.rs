@@ -142,6 +142,10 @@ impl Eye<'_> {
         if !front && !self.charts[chart].two_sided {
             return false;
         }
+        if self.charts.times_shown(chart) > 1 {
+            // Texels tell of one of the places where it stands.
+            return true;
+        }
         let placement = PlacementId::front_of(chart);
         let texels = self.radiance.texels_of(placement);
         let step = texels.len().div_ceil(POINTS).max(1);

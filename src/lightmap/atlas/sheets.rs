@@ -52,9 +52,11 @@ pub(in crate::lightmap) struct Place {
     pub first_chart: ChartId,
     /// Number of the instance whose charts it has: another one's if it shows the light of that.
     pub shown: u32,
+    /// Number of instances that have its charts; 0 if it has none of its own.
+    pub times: u32,
     /// Index among the sheets of instances.
     pub sheet: u32,
-    /// Scene units per unit of the sheet's local coordinates.
+    /// Scene units per unit of the sheet's local coordinates, in the instance whose charts it has.
     pub factor: f32,
 }
 

@@ -8,7 +8,8 @@
 //! - by the photons in its disc that came and those that went, its radiance changes by more than `keep_error`, relative to its
 //!   radiance or, if that is more, to a tenth of the mean.
 //!
-//! All others keep their radiance, bit for bit, so that rays which end on them tell no difference.
+//! All others keep their radiance, bit for bit, so that rays which end on them tell no difference but where other patches
+//! count as bright.
 
 use super::Before;
 use super::comparison::{CHANGED, DARK, MOST_CUTS};
@@ -24,7 +25,7 @@ use crate::lightmap::indirect::radiance_map::{self, Radiance};
 use crate::lightmap::plan::{Plan, left_out};
 use crate::lightmap::stages::{self, Inputs};
 use crate::photon::{Change, Difference};
-use crate::scene::NONE;
+use crate::scene::{NONE, Scene};
 use glam::Vec3;
 use std::f32::consts::PI;
 
@@ -32,8 +33,8 @@ use std::f32::consts::PI;
 const RUN: usize = 64;
 
 /// How much more of a disc's photons may be gone than their light tells, as the estimate is divided by the visible part of the
-/// disc: at an edge of a surface half of it.
-const AT_EDGES: f32 = 2.0;
+/// disc: at an edge of a surface half of it, in a corner a quarter.
+const AT_EDGES: f32 = 4.0;
 
 /// Width of the rim around a texel, in texels, at whose points its direct light may be computed.
 const RIM: f32 = 2.0;
@@ -43,6 +44,11 @@ impl Before<'_> {
     pub fn illuminate(&self, inputs: &Inputs, plan: &Plan, stats: &mut BakeStats) -> Result<Option<Radiance>> {
         let lights_stay = !self.has_other_lights && !self.moved.emits;
         if !self.keeps_radiance || !lights_stay || !plan.runs(left_out::PHOTONS) {
+            return Ok(None);
+        }
+        // Others round differently, so that their paths are not the former ones.
+        let rounds_alike = |scene: &Scene| scene.device().isa().is_fused();
+        if rounds_alike(&self.atlas.scene) != rounds_alike(&inputs.atlas.scene) {
             return Ok(None);
         }
         let Some(guidance) = &self.radiance.guidance else { return Ok(None) };
@@ -57,7 +63,6 @@ impl Before<'_> {
             sources: sources(&atlas.scene)?,
             difference,
             dark: DARK * (sum / old.len().max(1) as f64) as f32,
-            width: RIM / atlas.radiance.layout.density,
         };
         let placements = atlas.radiance.layout.placements.len();
         let find = || try_par_gather(placements, CHANGED, |p, out| search.look(PlacementId::new(p), out));
@@ -67,6 +72,7 @@ impl Before<'_> {
         let kept = |&former: &u32| old.get(former as usize).copied().unwrap_or_default();
         let values = try_collect(former.iter().map(kept), "the radiance map")?;
         let anew = try_collect(former.iter().map(|&former| former == NONE), CHANGED)?;
+        drop(search);
         let count = anew.iter().filter(|&&anew| !anew).count() as u64;
         let radiance = stages::radiance_again(inputs, &photons, guidance.clone(), (values, &anew), stats)?;
         self.kept_radiance.get_or_init(|| count);
@@ -82,14 +88,11 @@ struct Search<'a, 'b, 'p> {
     difference: Difference,
     /// Texels darker than this, by the sum of channels, count as if they were so bright.
     dark: f32,
-    /// Width of a texel with its rim, in scene units.
-    width: f32,
 }
 
 impl Search<'_, '_, '_> {
     /// Appends the former texel of each texel of a placement, [`NONE`] for those that are computed anew.
     fn look(&self, placement: PlacementId, out: &mut Vec<u32>) -> Result<()> {
-        self.progress.check()?;
         let (map, moved) = (&self.atlas.radiance, &self.before.moved);
         let texels = map.texels_of(placement).indices();
         if moved.has(map.layout.chart_of(placement)) {
@@ -103,8 +106,12 @@ impl Search<'_, '_, '_> {
     }
 
     fn look_at_run(&self, placement: PlacementId, texels: std::ops::Range<usize>, out: &mut Vec<u32>) -> Result<()> {
+        self.progress.check()?;
         let (atlas, boxes) = (self.atlas, &self.before.moved.boxes);
         let (map, n) = (&atlas.radiance, texels.len());
+        let [x, y] = map.layout[placement].scale;
+        // Of a texel with its rim, in scene units.
+        let width = RIM / x.min(y);
         let (mut positions, mut normals) = ([[0.0; 3]; RUN], [[0.0; 3]; RUN]);
         let (mut changes, mut room) = ([[0.0; 3]; RUN], [[0.0; 3]; RUN]);
         let mut bounds = Bounds::EMPTY;
@@ -116,9 +123,9 @@ impl Search<'_, '_, '_> {
         if !self.difference.is_none() {
             self.difference.irradiance(&positions[..n], &normals[..n], &mut room[..n], &mut changes[..n]);
         }
-        let near = self.width + self.difference.radius();
+        let near = width + self.difference.radius();
         let is_near = boxes.iter().any(|moved| bounds.distance(moved) < near);
-        let around = bounds.grown(self.width);
+        let around = bounds.grown(width);
         let cuts = self.cuts(&around)?;
         for (i, texel) in texels.map(RadianceTexel::new).enumerate() {
             let position = Vec3::from(positions[i]);
@@ -127,7 +134,7 @@ impl Search<'_, '_, '_> {
                 let former = self.former(placement, texel)?;
                 let hides = is_near && boxes.iter().any(|moved| point.distance(moved) < near);
                 let is_kept =
-                    !hides && !self.is_cut(&point.grown(self.width), &cuts) && self.is_like(texel, former, changes[i]);
+                    !hides && !self.is_cut(&point.grown(width), &cuts) && self.is_like(texel, former, changes[i]);
                 is_kept.then_some(former.index() as u32)
             };
             out.push(keeps().unwrap_or(NONE));

@@ -4,7 +4,7 @@ use crate::base::bounds::Bounds;
 use crate::base::error::Result;
 use crate::base::memory::{try_collect, try_push};
 use crate::lightmap::moved::merged;
-use crate::scene::{Light as Lamp, Scene};
+use crate::scene::{Environment, Light as Lamp, Scene};
 use glam::Vec3;
 use std::f32::consts::PI;
 
@@ -22,8 +22,8 @@ pub(in crate::lightmap) enum Source {
     Near(Bounds),
     /// From infinitely far away, up to an angle with this tangent from a direction.
     Far { direction: Vec3, spread: f32 },
-    /// From everywhere.
-    Sky,
+    /// From everywhere: the brightest radiance, as a multiple of the mean.
+    Sky(f32),
 }
 
 /// Returns what gives direct light.
@@ -40,11 +40,13 @@ pub(in crate::lightmap) fn sources(scene: &Scene) -> Result<Vec<Source>> {
             Lamp::Rect { position, edge_u, edge_v, .. } => {
                 Source::Near(around(&[Vec3::ZERO, edge_u, edge_v, edge_u + edge_v].map(|edge| position + edge)))
             }
-            Lamp::Directional { angular_radius, .. } if angular_radius > WIDE => Source::Sky,
+            Lamp::Directional { angular_radius, .. } if angular_radius > WIDE => Source::Sky(1.0),
             Lamp::Directional { direction, angular_radius, .. } => {
                 Source::Far { direction: -direction.normalize_or_zero(), spread: angular_radius.tan() }
             }
-            Lamp::Sky { .. } => Source::Sky,
+            Lamp::Sky { environment, .. } => {
+                Source::Sky(scene.environments().get(environment as usize).map_or(1.0, |e| contrast(e)))
+            }
         };
         try_push(&mut sources, source, SOURCES)?;
     }
@@ -54,6 +56,13 @@ pub(in crate::lightmap) fn sources(scene: &Scene) -> Result<Vec<Source>> {
         try_push(&mut sources, Source::Near(bounds), SOURCES)?;
     }
     Ok(sources)
+}
+
+/// Returns the brightest radiance of an environment as a multiple of the mean of its pixels.
+fn contrast(environment: &Environment) -> f32 {
+    let sums = || environment.rgb().iter().map(|pixel| pixel.iter().sum::<f32>());
+    let mean = sums().map(f64::from).sum::<f64>() / sums().count().max(1) as f64;
+    if mean > 0.0 { (f64::from(sums().fold(0.0, f32::max)) / mean) as f32 } else { 1.0 }
 }
 
 impl Source {
@@ -66,7 +75,8 @@ impl Source {
                 // A unit vector of a cone differs from its axis by no more in any coordinate.
                 points.sweeps(direction - spread, direction + spread, f32::INFINITY, moved)
             }
-            Source::Sky => part.0 > part.1,
+            // A sun in a sky may be hidden by what takes next to nothing of the hemisphere.
+            Source::Sky(contrast) => part.0 * contrast > part.1,
         }
     }
 }
@@ -76,4 +86,36 @@ impl Source {
 pub(super) fn part_of_light(from: &Bounds, moved: &Bounds) -> f32 {
     let d = from.distance(moved);
     if d > 0.0 { 0.5 * moved.area() / (PI * d * d) } else { f32::INFINITY }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use crate::scene::SceneData;
+    use crate::scene::demo::shapes::MeshBuilder;
+    use crate::scene::{Material, NONE};
+
+    #[test]
+    fn what_hides_the_sun_of_a_sky_lies_between_however_small_it_is() {
+        let is_cut = |image: Option<f32>| {
+            let mut data = SceneData::new();
+            let material = data.add_material(Material::default()).unwrap();
+            let mut room = MeshBuilder::new();
+            room.box_(Vec3::ZERO, Vec3::ONE, false, material);
+            data.add_mesh(room.finish()).unwrap();
+            let pixel = |sun: f32, i: usize| [if i == 40 { sun } else { 1.0 }; 3];
+            let environment = image.map_or(NONE, |sun| {
+                let pixels = (0..128).map(|i| pixel(sun, i)).collect();
+                data.add_environment(Environment::new(16, 8, pixels).unwrap())
+            });
+            data.add_light(Lamp::Sky { radiance: [1.0; 3], environment, up: Vec3::Y, rotation: 0.0 }).unwrap();
+            let sources = sources(&data.committed()).unwrap();
+            let (from, moved) = ([Vec3::ZERO; 2], [Vec3::new(9.0, 9.0, 9.0), Vec3::splat(10.0)]);
+            let [from, moved] = [from, moved].map(|[lower, upper]| Bounds { lower, upper });
+            let part = part_of_light(&from, &moved);
+            assert!((0.001..0.01).contains(&part), "{part}");
+            sources[0].is_cut(&from, &moved, (part, 0.03))
+        };
+        assert_eq!([None, Some(1.0), Some(1000.0)].map(is_cut), [false, false, true]);
+    }
 }

@@ -474,6 +474,34 @@ fn light_of_another_light_map_is_kept_with_stitched_seams_passes_and_light_by_di
     }
 }
 
+/// Lights name images of skies by number: under the same one, there may be another image.
+#[test]
+fn light_of_another_sky_is_not_kept() {
+    let none = Progress::none();
+    let params = params();
+    let bake = |turned: usize| {
+        let mut data = SceneData::new();
+        let white = data.add_material(Material { albedo: [0.7; 3], two_sided: true, ..Default::default() }).unwrap();
+        let mut floor = MeshBuilder::new();
+        floor.box_(Vec3::ZERO, Vec3::new(4.0, 4.0, 0.1), false, white);
+        floor.box_(Vec3::new(1.0, 1.0, 0.1), Vec3::new(1.5, 1.5, 1.0), false, white);
+        data.add_mesh(floor.finish()).unwrap();
+        let pixels = (0..128).map(|i| [if (i + turned) % 16 == 3 { 5.0 } else { 1.0 }; 3]).collect();
+        let environment = data.add_environment(crate::scene::Environment::new(16, 8, pixels).unwrap());
+        data.add_light(Lamp::Sky { radiance: [1.0; 3], environment, up: Vec3::Z, rotation: 0.0 }).unwrap();
+        let desc = LightmapDesc { texels_per_unit: 8.0, page_size: 256, ..Default::default() };
+        Lightmap::create(&data.committed(), &desc, &none).unwrap()
+    };
+    let mut first = bake(0);
+    first.bake(&params, &none).unwrap();
+    for (turned, keeps) in [(0, true), (5, false)] {
+        let mut second = bake(turned);
+        let (kept, worst) = revise(&first, &mut second, &params, 0.05);
+        assert_eq!(kept, if keeps { 1.0 } else { 0.0 });
+        assert!(worst[0] < 1e-6, "direct light is wrong by {}", worst[0]);
+    }
+}
+
 #[test]
 fn what_looks_other_is_baked() {
     let none = Progress::none();

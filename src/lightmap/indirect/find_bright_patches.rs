@@ -198,6 +198,8 @@ fn seen_by_gather_rays(atlas: &Atlas, radiance: &Radiance, rays: &mut u64, progr
 /// A grid point on a bright texel, on the side that the texel shows.
 struct Place {
     texel: RadianceTexel,
+    /// What it lies on: several instances may show the light of a texel.
+    object: u32,
     /// Number among the points of all texels.
     number: u32,
     placement: PlacementId,
@@ -216,20 +218,27 @@ fn patches(
     rays: &mut u64,
     progress: &Progress,
 ) -> Result<Vec<Patch>> {
-    let count = values.iter().filter(|v| v.element_sum() > limit).count();
-    let chance = (most as f32 / count.max(1) as f32).min(1.0);
-    let is_light = |texel: RadianceTexel| {
-        values[texel.index()].element_sum() > limit && uniform(atlas.radiance.seed(texel), 0, 0) < chance
+    let (scene, map, charts) = (&atlas.scene, &atlas.radiance, &atlas.charts);
+    let is_bright = |texel: &RadianceTexel| values[texel.index()].element_sum() > limit;
+    let of_placement = |p: usize| {
+        let placement = PlacementId::new(p);
+        let count = map.texels_of(placement).filter(is_bright).count();
+        count * charts.times_shown(map.layout.chart_of(placement)) as usize
     };
+    let count: usize = (0..map.layout.placements.len()).into_par_iter().map(of_placement).sum();
+    let chance = (most as f32 / count.max(1) as f32).min(1.0);
+    let is_light = |texel: RadianceTexel| is_bright(&texel) && uniform(map.seed(texel), 0, 0) < chance;
     let [fewest, most_along_axis] = PLACES_ALONG_AXIS;
     let along_axis = ((PLACES / count.clamp(1, most.max(1))).isqrt() as u32).clamp(fewest, most_along_axis);
     let traced = AtomicU64::new(0);
     let mut places = places(atlas, along_axis, is_light, &traced, progress)?;
     *rays += traced.into_inner();
-    places.sort_unstable_by_key(|p| (p.texel, p.number));
+    places.sort_unstable_by_key(|p| (p.texel, p.object, p.number));
     let patch = |of_texel: &[Place]| {
         let area: f32 = of_texel.iter().map(|p| p.area).sum();
-        let mut at = area * uniform(atlas.radiance.seed(of_texel[0].texel), 1, 0);
+        let first = &of_texel[0];
+        let shown = first.object.wrapping_sub(scene.locate(map[first.texel].triangle).0);
+        let mut at = area * uniform(map.seed(first.texel), 1, shown);
         let chosen = of_texel.iter().find(|p| {
             at -= p.area;
             at < 0.0
@@ -237,9 +246,9 @@ fn patches(
         let Place { texel, placement, position, normal, .. } = *chosen.unwrap_or(&of_texel[0]);
         let radiance = values[texel.index()];
         let flux = radiance * ((1.0 - limit / radiance.element_sum()) * area / chance);
-        Patch { position, normal, flux, near2: near2(&atlas.radiance, placement) }
+        Patch { position, normal, flux, near2: near2(map, placement) }
     };
-    try_collect(places.chunk_by(|a, b| a.texel == b.texel).map(patch), "bright patches")
+    try_collect(places.chunk_by(|a, b| (a.texel, a.object) == (b.texel, b.object)).map(patch), "bright patches")
 }
 
 /// Returns points on bright texels from a grid that divides texels evenly, shifted at random for each triangle. The
@@ -258,7 +267,7 @@ fn places(
     let on_side = |t: u32, front: bool| -> Vec<Place> {
         let placement = map.layout.side(charts.chart_of(t), front).filter(|&p| has_lights[p.index()]);
         let Some(placement) = placement else { return Vec::new() };
-        let [a, b, c] = scene.corners(t);
+        let ([a, b, c], object) = (scene.corners(t), scene.locate(t).0);
         let area = 0.5 * (b - a).cross(c - a).length();
         let texel = |u, v| Vec2::from(map.layout.texel_coord(placement, charts.local(t, u, v)));
         let (origin, scale) = (texel(0.0, 0.0), 1.0 / along_axis as f32);
@@ -282,7 +291,7 @@ fn places(
             // Points in cut-outs do not count, nor points that another triangle covers.
             rays.fetch_add(1, Relaxed);
             let is_seen = scene.intersect_raw(&Ray::new(position, -normal)).triangle == t;
-            is_seen.then_some(Place { texel, number: 0, placement, area: cell, position, normal })
+            is_seen.then_some(Place { texel, object, number: 0, placement, area: cell, position, normal })
         };
         let offset = Vec2::new(uniform(t, 2, 0), uniform(t, 3, 0));
         grid_points([a2, b2, c2], offset).filter_map(place).collect()

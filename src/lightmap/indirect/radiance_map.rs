@@ -38,6 +38,7 @@ use glam::{Mat2, Vec2, Vec3};
 use rayon::prelude::*;
 use std::f32::consts::PI;
 use std::ops::Range;
+use std::sync::Arc;
 use std::sync::atomic::{AtomicU64, Ordering::Relaxed};
 
 /// Number of texels that a thread processes at a time.
@@ -57,7 +58,7 @@ pub(crate) struct Radiance {
     pub values: Vec<Vec3>,
     pub bright: Bright,
     /// What photons after a change have in common with those of this map; `None`: unknown, or there were none.
-    pub guidance: Option<Guidance>,
+    pub guidance: Option<Arc<Guidance>>,
 }
 
 impl<'a> RadianceLookup<'a> {

@@ -25,6 +25,7 @@ use glam::Vec3;
 use std::io::BufReader;
 use std::ops::Range;
 use std::path::Path;
+use std::sync::Arc;
 
 const HEAD: Tag = *b"RSLT";
 const PLAN: Tag = *b"PLAN";
@@ -252,9 +253,9 @@ impl<'a> Loading<'a> {
                     .map(|text| light.plan = Plan::from_text(self.head.left_out as u32, &text))
                     .map(|()| 0),
                 BACKS => read_backs(&content, charts)?.map(|backs| light.backs = backs).map(|()| 0),
-                GUIDANCE => {
-                    read_guidance(&content)?.map(|guidance| light.radiance.guidance = Some(guidance)).map(|()| 0)
-                }
+                GUIDANCE => read_guidance(&content)?
+                    .map(|guidance| light.radiance.guidance = Some(Arc::new(guidance)))
+                    .map(|()| 0),
                 RADIANCE => read_radiance(&content, self.head.radiance as usize, &mut light.radiance.values),
                 TEXELS => read_texels(&content, light).inspect(|&n| texels += n as u64),
                 DIRECTIONAL => read_directional(&content, light).inspect(|&n| directional += n as u64).map(|_| 0),

@@ -88,6 +88,8 @@ fn data(instances: bool) -> SceneData {
             let transform = Affine3A::from_scale_rotation_translation(Vec3::ONE, turn, Vec3::X * i as f32);
             data.add_instance(Instance::new(mesh, transform)).unwrap();
         }
+        data.share_light(3, 1).unwrap();
+        data.share_light(4, 3).unwrap();
     }
     data
 }
@@ -107,7 +109,8 @@ fn seen(scene: &Scene) -> String {
         let hit = scene.intersect(ray);
         format!("{:?} {:?}", hit, scene.occluded(ray))
     };
-    rays().iter().map(hit).collect::<Vec<_>>().join("\n")
+    let shared = (0..scene.instances().len() as u32).map(|i| format!("{i} shows {}", scene.light_of_instance(i)));
+    shared.chain(rays().iter().map(hit)).collect::<Vec<_>>().join("\n")
 }
 
 fn commit(device: &Arc<Device>, data: SceneData, options: &BuildOptions) -> Arc<Scene> {
