@@ -38,7 +38,7 @@ impl Guidance {
     /// Returns it as words of files: radius, number of sources, and for each of these the side of its guide, 0 if it has none,
     /// and the guide.
     pub(crate) fn words(&self) -> Result<Vec<u32>> {
-        let mut words = try_collect([self.radius.to_bits(), self.guides.len() as u32].into_iter(), GUIDANCE)?;
+        let mut words = try_collect([self.radius.to_bits(), self.guides.len() as u32], GUIDANCE)?;
         for guide in &self.guides {
             match guide {
                 Some(guide) => guide.append_words(&mut words)?,

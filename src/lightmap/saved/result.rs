@@ -284,7 +284,7 @@ fn read_backs(content: &[u8], charts: usize) -> Result<Option<Vec<bool>>> {
 }
 
 fn read_guidance(content: &[u8]) -> Result<Option<Guidance>> {
-    let words = content.chunks_exact(size_of::<u32>()).map(|word| bytemuck::pod_read_unaligned::<u32>(word));
+    let words = content.chunks_exact(size_of::<u32>()).map(bytemuck::pod_read_unaligned::<u32>);
     let is_whole = content.len().is_multiple_of(size_of::<u32>());
     if is_whole { Guidance::from_words(&try_collect(words, "the result of a bake")?) } else { Ok(None) }
 }
