@@ -106,8 +106,8 @@ impl PhotonMap {
     }
 
     /// Makes the map of a scene after a change, and finds the photons that came and went; `None` if the lights do not shine
-    /// as they did, or too many photons would be stored. Reports progress over `[from, to]` of the bar. To be called on the
-    /// device's threads.
+    /// as they did, too many photons would be stored, or most paths meet what moved. Reports progress over `[from, to]` of the
+    /// bar. To be called on the device's threads.
     pub(crate) fn trace_again(
         scene: &Arc<Scene>,
         params: &PhotonParams,
