@@ -216,7 +216,7 @@ static void test_shared_light(bk_device *device) {
     CHECK_OK(bk_lightmap_create(scene, &desc, NULL, NULL, &lightmap));
     bk_lightmap_info_init(&alone);
     CHECK_OK(bk_lightmap_get_info(lightmap, &alone));
-    CHECK(shared.texels == alone.texels && shared.chart_count == alone.chart_count);
+    CHECK(shared.texels == alone.texels && shared.charts == alone.charts);
     bk_lightmap_release(lightmap);
     bk_scene_release(scene);
 }
