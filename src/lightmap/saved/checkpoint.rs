@@ -1,7 +1,7 @@
 //! Checkpoints: the finished work of a bake, kept in a file, so that a bake whose process was killed can continue.
 //!
 //! The file holds records (`super::records`): `CKPT` with the fingerprint of the bake, then finished work in the order
-//! in which threads finish it: `RADI` (runs of the radiance map), `RDNE` (bright patches; the radiance map is
+//! in which threads finish it: `RADI` (runs of the radiance map), `RDNE` (bright patches and, if known, what photons after a change have in common with these; the radiance map is
 //! complete), `BACK` (the sides that are shown), `OWNL` (fallback gathers), `GAT2` (blocks of the gather map), `DRC2`
 //! (blocks of direct light; `GATH` and `DRCT` were smaller ones), and `OWND`, `GATD` and `DRCD` for light by direction.
 //! All of it is independent of the number of threads and the order, so missing work is done again and gives the same
@@ -13,7 +13,7 @@
 
 use super::fingerprint::{Fingerprint, Origin};
 use super::records::{self, MAGIC, Next, Tag, take, take_one};
-use super::result::is_light;
+use super::result::{is_light, read_guidance};
 use super::{damaged, foreign, unreadable};
 use crate::base::directional::Directional;
 use crate::base::error::{Error, Result, invalid_argument};
@@ -31,7 +31,7 @@ use std::fs::{File, OpenOptions, TryLockError};
 use std::io::{BufReader, Read, Seek, SeekFrom, Write};
 use std::path::{Path, PathBuf};
 use std::sync::atomic::{AtomicU32, Ordering::Relaxed};
-use std::sync::{Mutex, MutexGuard};
+use std::sync::{Arc, Mutex, MutexGuard};
 use std::time::{Duration, Instant};
 
 const HEAD: Tag = *b"CKPT";
@@ -211,11 +211,12 @@ impl<'a> Checkpoint<'a> {
             return Ok(None);
         };
         let is_possible = limit.is_finite() && (limit <= 0.0 || (1..=MAX_SHADOW_RAYS).contains(&shadow_rays));
-        if !is_light(&values) || !is_possible {
+        let guidance = if rest.is_empty() { None } else { read_guidance(rest)?.map(Arc::new) };
+        if !is_light(&values) || !is_possible || guidance.is_none() != rest.is_empty() {
             return Ok(None);
         }
         let bright = find_bright_patches::again(atlas, &values, limit, shadow_rays)?;
-        Ok(Some(Radiance { values, bright, guidance: None }))
+        Ok(Some(Radiance { values, bright, guidance }))
     }
 
     pub fn keep_radiance(&self, radiance: &Radiance) {
@@ -223,7 +224,11 @@ impl<'a> Checkpoint<'a> {
             self.keep(RADIANCE, run as u64, &[bytemuck::cast_slice(values)]);
         }
         let (limit, shadow_rays) = radiance.bright.parts();
-        self.keep(RADIANCE_DONE, 0, &[&limit.to_ne_bytes(), &shadow_rays.to_ne_bytes()]);
+        // Without memory for them, the radiance map is made again.
+        if let Ok(words) = radiance.guidance.as_ref().map_or(Ok(Vec::new()), |guidance| guidance.words()) {
+            let parts = [&limit.to_ne_bytes(), &shadow_rays.to_ne_bytes(), bytemuck::cast_slice(&words)];
+            self.keep(RADIANCE_DONE, 0, &parts);
+        }
     }
 
     /// Returns for each chart whether its back is shown, from an earlier run.

@@ -283,7 +283,8 @@ fn read_backs(content: &[u8], charts: usize) -> Result<Option<Vec<bool>>> {
     are_possible.then(|| try_collect(content.iter().map(|&b| b == 1), "the sides of charts")).transpose()
 }
 
-fn read_guidance(content: &[u8]) -> Result<Option<Guidance>> {
+/// Reads what photons after a change have in common with those of a bake; `None` if it is damaged.
+pub(super) fn read_guidance(content: &[u8]) -> Result<Option<Guidance>> {
     let words = content.chunks_exact(size_of::<u32>()).map(bytemuck::pod_read_unaligned::<u32>);
     let is_whole = content.len().is_multiple_of(size_of::<u32>());
     if is_whole { Guidance::from_words(&try_collect(words, "the result of a bake")?) } else { Ok(None) }
