@@ -1,9 +1,10 @@
 //! Checkpoints: the finished work of a bake, kept in a file, so that a bake whose process was killed can continue.
 //!
 //! The file holds records (`super::records`): `CKPT` with the fingerprint of the bake, then finished work in the order
-//! in which threads finish it: `RADI` (runs of the radiance map), `RDNE` (bright patches and, if known, what photons after a change have in common with these; the radiance map is
-//! complete), `BACK` (the sides that are shown), `OWNL` (fallback gathers), `GAT2` (blocks of the gather map), `DRC2`
-//! (blocks of direct light; `GATH` and `DRCT` were smaller ones), and `OWND`, `GATD` and `DRCD` for light by direction.
+//! in which threads finish it: `RADI` (runs of the radiance map), `RDNE` (bright patches and, if known, what photons after a
+//! change have in common with these; the radiance map is complete), `BACK` (the sides that are shown), `OWNL` (fallback
+//! gathers), `GAT2` (blocks of the gather map), `DRC2` (blocks of direct light; `GATH` and `DRCT` were smaller ones), and
+//! `OWND`, `GATD` and `DRCD` for light by direction.
 //! All of it is independent of the number of threads and the order, so missing work is done again and gives the same
 //! bits. Photons, upsampling, blur and seams are not kept: they take a small part of a bake. The numbers of blocks hold
 //! the pass that they belong to.
