@@ -74,21 +74,11 @@ static bk_scene_stats stats_of(const bk_scene *scene) {
     return stats;
 }
 
-/* The floor as two instances, one of them turned upside down at z = 1, which then moves. */
-static void test_instances(bk_device *device) {
-    static const float AT_0[12] = {1, 0, 0, 0, 1, 0, 0, 0, 1, 0, 0, 0};
-    static const float AT_1[12] = {1, 0, 0, 0, -1, 0, 0, 0, -1, 0, 1, 1};
-    static const float MIRROR[12] = {1, 0, 0, 0, 1, 0, 0, 0, -1, 0, 0, 0};
-    float at[12], back[12], uvs[2][12], none[12];
-    uint32_t id = 7, mesh = 7, pages[2][2];
-    uint8_t separate[2];
+/* A scene that is not committed, of a number of meshes that are each a floor. */
+static bk_scene *floors(bk_device *device, int count) {
     bk_scene *scene = NULL;
-    bk_lightmap *lightmap = NULL;
-    bk_lightmap_desc desc;
     bk_material_desc material;
     bk_mesh_desc floor;
-    bk_ray ray = {{0.3f, 0.4f, 0.125f}, 0.0f, {0, 0, 1}, INFINITY};
-    bk_hit hit;
     CHECK_OK(bk_scene_create(device, &scene));
     bk_material_desc_init(&material);
     CHECK_OK(bk_scene_add_material(scene, &material, NULL));
@@ -97,7 +87,26 @@ static void test_instances(bk_device *device) {
     floor.vertex_count = 4;
     floor.indices = UP[0];
     floor.triangle_count = 2;
-    CHECK_OK(bk_scene_add_mesh(scene, &floor, NULL));
+    while (count-- > 0) {
+        CHECK_OK(bk_scene_add_mesh(scene, &floor, NULL));
+    }
+    return scene;
+}
+
+/* The floor as two instances, one of them turned upside down at z = 1, which then moves. */
+static void test_instances(bk_device *device) {
+    static const float AT_0[12] = {1, 0, 0, 0, 1, 0, 0, 0, 1, 0, 0, 0};
+    static const float AT_1[12] = {1, 0, 0, 0, -1, 0, 0, 0, -1, 0, 1, 1};
+    static const float MIRROR[12] = {1, 0, 0, 0, 1, 0, 0, 0, -1, 0, 0, 0};
+    float at[12], back[12], uvs[2][12], none[12];
+    uint32_t id = 7, mesh = 7, pages[2][2];
+    uint8_t separate[2];
+    bk_scene *scene;
+    bk_lightmap *lightmap = NULL;
+    bk_lightmap_desc desc;
+    bk_ray ray = {{0.3f, 0.4f, 0.125f}, 0.0f, {0, 0, 1}, INFINITY};
+    bk_hit hit;
+    scene = floors(device, 1);
     CHECK_ERROR(bk_scene_add_instance(scene, 1, AT_0, &id), ARGUMENT, "mesh 1");
     CHECK_ERROR(bk_scene_add_instance(scene, 0, MIRROR, &id), ARGUMENT, "mirrors");
     CHECK_ERROR(bk_scene_add_instance(scene, 0, NULL, &id), ARGUMENT, "transform");
@@ -147,25 +156,13 @@ static void test_shared_light(bk_device *device) {
     static const float UP_THERE[3] = {0.5f, 0.5f, 3.0f}, WHITE[3] = {1, 1, 1};
     float uvs[3][12];
     uint32_t i, pages[3][2], of = 7;
-    bk_scene *scene = NULL;
+    bk_scene *scene;
     bk_lightmap *lightmap = NULL;
     bk_lightmap_desc desc;
     bk_lightmap_info alone, shared;
-    bk_material_desc material;
-    bk_mesh_desc floor;
     bk_light_desc lamp;
     bk_bake_params params;
-    CHECK_OK(bk_scene_create(device, &scene));
-    bk_material_desc_init(&material);
-    CHECK_OK(bk_scene_add_material(scene, &material, NULL));
-    bk_mesh_desc_init(&floor);
-    floor.positions = SQUARE[0];
-    floor.vertex_count = 4;
-    floor.indices = UP[0];
-    floor.triangle_count = 2;
-    for (i = 0; i < 2; i++) {
-        CHECK_OK(bk_scene_add_mesh(scene, &floor, NULL));
-    }
+    scene = floors(device, 2);
     for (i = 0; i < 3; i++) {
         CHECK_OK(bk_scene_add_instance(scene, i / 2, AT[i], NULL));
     }
@@ -206,9 +203,7 @@ static void test_shared_light(bk_device *device) {
     bk_scene_release(scene);
 
     /* As many texels as two floors have. */
-    CHECK_OK(bk_scene_create(device, &scene));
-    CHECK_OK(bk_scene_add_material(scene, &material, NULL));
-    CHECK_OK(bk_scene_add_mesh(scene, &floor, NULL));
+    scene = floors(device, 1);
     for (i = 0; i < 2; i++) {
         CHECK_OK(bk_scene_add_instance(scene, 0, AT[i], NULL));
     }

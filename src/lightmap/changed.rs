@@ -1,7 +1,8 @@
 //! Which light a bake after a change computes anew: where the scene has moved, or a light was set.
 //!
 //! Photons are traced again with the same random numbers, and texels of the radiance map that they and lamps reach as
-//! before are [kept](radiance). The light map is cut into cells of 8 × 8 texels of the gather map. Indirect light of a cell is computed anew if
+//! before are [kept](radiance). The light map is cut into cells of 8 × 8 texels of the gather map. Indirect light of a
+//! cell is computed anew if
 //!
 //! - its surface or what it shows moved, or what moved is so near or so large that light may differ within the cell, or
 //! - one of its [probes](super::indirect::probes) gathers another light than before: rays from a few of its texels, traced

@@ -162,6 +162,9 @@ mod tests {
             data.share_light(instance, of).unwrap();
         }
         assert_eq!((0..6).map(|i| data.light_of_instance(i)).collect::<Vec<_>>(), [0, 1, 2, 1, 1, 0]);
+        let mut all = described(&transforms);
+        all.share_light_of_meshes().unwrap();
+        assert!((0..6).all(|i| all.light_of_instance(i) == 0));
         let scene = data.committed();
         let (charts, _) = Charts::of_scene(&scene, 4.0, 256, 2, &Progress::none()).unwrap();
         let (of_three, _) = Charts::of_scene(&self::scene(&transforms[..3]), 4.0, 256, 2, &Progress::none()).unwrap();

@@ -2,7 +2,7 @@
 //! light that follows its scene. A cell is a square of 8 × 8 texels of the gather map.
 
 use super::correspondence::Correspondence;
-use super::sources::{Source, part_of_light, sources};
+use super::sources::{Cuts, Shadows, part_of_light};
 use crate::base::bounds::Bounds;
 use crate::base::error::Result;
 use crate::base::memory::{try_collect, try_filled, try_par_collect_ok, try_par_gather};
@@ -36,10 +36,6 @@ const NEAR: f32 = 0.15;
 
 /// Texels darker than this part of the mean light count as if they were so bright.
 pub(super) const DARK: f32 = 0.1;
-
-/// Number of pairs of a source and of what moved between it and a cell, beyond which all texels of the cell count as
-/// shadowed: testing each takes longer than its direct light.
-pub(super) const MOST_CUTS: usize = 16;
 
 /// Name of these lists in error messages.
 pub(super) const CHANGED: &str = "which light has changed";
@@ -146,8 +142,8 @@ pub(crate) struct Comparison<'a, 'p> {
     /// Relative difference of light that is let stand.
     keep_error: f32,
     pub(super) grid: CellGrid<'a>,
-    /// What gives direct light in the new state.
-    pub(super) sources: Vec<Source>,
+    /// What gives direct light in the new state, and what moved.
+    shadows: Shadows<'a>,
     pub(super) progress: &'a Progress<'p>,
 }
 
@@ -159,8 +155,8 @@ impl<'a, 'p> Comparison<'a, 'p> {
         keep_error: f32,
         progress: &'a Progress<'p>,
     ) -> Result<Self> {
-        let (grid, sources) = (CellGrid::new(new.atlas)?, sources(&new.atlas.scene)?);
-        Ok(Comparison { old, new, moved, keep_error, grid, sources, progress })
+        let shadows = Shadows::new(&new.atlas.scene, &moved.boxes, keep_error)?;
+        Ok(Comparison { old, new, moved, keep_error, grid: CellGrid::new(new.atlas)?, shadows, progress })
     }
 
     /// Returns the cells by placement, row by row: [new](Cell::is_new) are those whose surface moved or that are near what
@@ -220,9 +216,7 @@ impl<'a, 'p> Comparison<'a, 'p> {
                 cell.is_new |= cell.bounds.distance(moved) < radius;
             }
             cell.is_new |= part > NEAR;
-            let (part, bounds) = ((part, self.keep_error), cell.bounds.grown(2.0 * width));
-            let is_cut = |moved: &Bounds| self.sources.iter().any(|s| s.is_cut(&bounds, moved, part));
-            cell.is_shadowed = moved.boxes.iter().any(is_cut);
+            cell.is_shadowed = self.shadows.is_any_cut(&cell.bounds.grown(2.0 * width), part);
         }
         out.append(&mut cells);
         Ok(())
@@ -282,17 +276,9 @@ impl<'a, 'p> Comparison<'a, 'p> {
         Ok(rays.into_inner())
     }
 
-    /// Returns sources, and boxes of what moved that may lie between them and a cell: at most one more than
-    /// [`MOST_CUTS`].
-    pub(super) fn cuts(&self, cell: &Cell) -> Result<Vec<(u32, u32)>> {
-        let around = cell.bounds.grown(2.0 / self.new.atlas.info.texels_per_unit);
-        let part = self.part(&around);
-        let boxes = &self.moved.boxes;
-        let pairs = (0..).zip(&self.sources).flat_map(|(s, source)| {
-            let cut = (0..).zip(boxes).filter(move |(_, moved)| source.is_cut(&around, moved, part));
-            cut.map(move |(b, _)| (s, b))
-        });
-        try_collect(pairs.take(MOST_CUTS + 1), CHANGED)
+    /// Returns what lies between a cell and lights.
+    pub(super) fn cuts(&self, cell: &Cell) -> Result<Cuts> {
+        self.shadows.cuts(&cell.bounds.grown(2.0 / self.new.atlas.info.texels_per_unit))
     }
 
     /// Whether what moved lies between a texel and a source, of these `cuts` of its cell.
@@ -301,13 +287,6 @@ impl<'a, 'p> Comparison<'a, 'p> {
         let at = atlas.map[texel].position(&atlas.scene);
         // Direct light is averaged where that of neighbours differs.
         let around = Bounds { lower: at, upper: at }.grown(2.0 / atlas.info.texels_per_unit);
-        let (part, boxes) = (self.part(&around), &self.moved.boxes);
-        cuts.len() > MOST_CUTS
-            || cuts.iter().any(|&(s, b)| self.sources[s as usize].is_cut(&around, &boxes[b as usize], part))
-    }
-
-    /// A bound of the part of light that all of what moved takes, and the part that matters.
-    fn part(&self, around: &Bounds) -> (f32, f32) {
-        (self.moved.boxes.iter().map(|moved| part_of_light(around, moved)).sum(), self.keep_error)
+        self.shadows.is_cut(&around, cuts)
     }
 }

@@ -12,8 +12,8 @@
 //! count as bright.
 
 use super::Before;
-use super::comparison::{CHANGED, DARK, MOST_CUTS};
-use super::sources::{Source, part_of_light, sources};
+use super::comparison::{CHANGED, DARK};
+use super::sources::Shadows;
 use crate::base::bounds::Bounds;
 use crate::base::error::Result;
 use crate::base::memory::{try_collect, try_par_gather};
@@ -28,6 +28,7 @@ use crate::photon::{Change, Difference};
 use crate::scene::{NONE, Scene};
 use glam::Vec3;
 use std::f32::consts::PI;
+use std::ops::Range;
 
 /// Number of texels of a placement, beside one another in it, that are compared with sources of light together.
 const RUN: usize = 64;
@@ -60,7 +61,7 @@ impl Before<'_> {
             before: self,
             atlas,
             progress: inputs.progress,
-            sources: sources(&atlas.scene)?,
+            shadows: Shadows::new(&atlas.scene, &self.moved.boxes, self.keep_error)?,
             difference,
             dark: DARK * (sum / old.len().max(1) as f64) as f32,
         };
@@ -80,11 +81,12 @@ impl Before<'_> {
     }
 }
 
+/// The search for texels whose radiance may stay.
 struct Search<'a, 'b, 'p> {
     before: &'a Before<'b>,
     atlas: &'a Atlas,
     progress: &'a Progress<'p>,
-    sources: Vec<Source>,
+    shadows: Shadows<'a>,
     difference: Difference,
     /// Texels darker than this, by the sum of channels, count as if they were so bright.
     dark: f32,
@@ -105,7 +107,8 @@ impl Search<'_, '_, '_> {
         Ok(())
     }
 
-    fn look_at_run(&self, placement: PlacementId, texels: std::ops::Range<usize>, out: &mut Vec<u32>) -> Result<()> {
+    /// Does the work of [`look`](Self::look) for a run of texels, whose light is compared with sources together.
+    fn look_at_run(&self, placement: PlacementId, texels: Range<usize>, out: &mut Vec<u32>) -> Result<()> {
         self.progress.check()?;
         let (atlas, boxes) = (self.atlas, &self.before.moved.boxes);
         let (map, n) = (&atlas.radiance, texels.len());
@@ -125,16 +128,16 @@ impl Search<'_, '_, '_> {
         }
         let near = width + self.difference.radius();
         let is_near = boxes.iter().any(|moved| bounds.distance(moved) < near);
-        let around = bounds.grown(width);
-        let cuts = self.cuts(&around)?;
+        let cuts = self.shadows.cuts(&bounds.grown(width))?;
         for (i, texel) in texels.map(RadianceTexel::new).enumerate() {
             let position = Vec3::from(positions[i]);
             let point = Bounds { lower: position, upper: position };
             let keeps = || {
                 let former = self.former(placement, texel)?;
                 let hides = is_near && boxes.iter().any(|moved| point.distance(moved) < near);
-                let is_kept =
-                    !hides && !self.is_cut(&point.grown(width), &cuts) && self.is_like(texel, former, changes[i]);
+                let is_kept = !hides
+                    && !self.shadows.is_cut(&point.grown(width), &cuts)
+                    && self.is_like(texel, former, changes[i]);
                 is_kept.then_some(former.index() as u32)
             };
             out.push(keeps().unwrap_or(NONE));
@@ -161,30 +164,5 @@ impl Search<'_, '_, '_> {
         let radiance = self.before.radiance.values[former.index()].element_sum();
         // What is not a number differs.
         change <= self.before.keep_error * radiance.max(self.dark)
-    }
-
-    /// Returns sources, and boxes of what moved that may lie between them and points: at most one more than [`MOST_CUTS`].
-    fn cuts(&self, points: &Bounds) -> Result<Vec<(u32, u32)>> {
-        let (boxes, part) = (&self.before.moved.boxes, self.part(points));
-        let pairs = (0..).zip(&self.sources).flat_map(|(s, source)| {
-            let cut = (0..).zip(boxes).filter(move |(_, moved)| source.is_cut(points, moved, part));
-            cut.map(move |(b, _)| (s, b))
-        });
-        try_collect(pairs.take(MOST_CUTS + 1), CHANGED)
-    }
-
-    /// Whether what moved lies between points and a source, of these `cuts`.
-    fn is_cut(&self, points: &Bounds, cuts: &[(u32, u32)]) -> bool {
-        if cuts.is_empty() || cuts.len() > MOST_CUTS {
-            return !cuts.is_empty();
-        }
-        let (boxes, part) = (&self.before.moved.boxes, self.part(points));
-        cuts.iter().any(|&(s, b)| self.sources[s as usize].is_cut(points, &boxes[b as usize], part))
-    }
-
-    /// A bound of the part of light that all of what moved takes, and the part that matters.
-    fn part(&self, points: &Bounds) -> (f32, f32) {
-        let part = self.before.moved.boxes.iter().map(|moved| part_of_light(points, moved)).sum();
-        (part, self.before.keep_error)
     }
 }

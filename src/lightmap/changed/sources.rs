@@ -10,6 +10,10 @@ use std::f32::consts::PI;
 
 const SOURCES: &str = "what gives direct light";
 
+/// Number of pairs of a source and of what moved between it and points, beyond which all of these count as shadowed: testing
+/// each takes longer than its direct light.
+const MOST_CUTS: usize = 16;
+
 /// Radius in radians from which on the disc of a directional light counts as a sky.
 const WIDE: f32 = 0.5;
 
@@ -17,7 +21,7 @@ const WIDE: f32 = 0.5;
 const MOST_EMITTERS: usize = 64;
 
 /// Where light comes from.
-pub(in crate::lightmap) enum Source {
+enum Source {
     /// From a box, which may be a point.
     Near(Bounds),
     /// From infinitely far away, up to an angle with this tangent from a direction.
@@ -27,7 +31,7 @@ pub(in crate::lightmap) enum Source {
 }
 
 /// Returns what gives direct light.
-pub(in crate::lightmap) fn sources(scene: &Scene) -> Result<Vec<Source>> {
+fn sources(scene: &Scene) -> Result<Vec<Source>> {
     let mut sources = Vec::new();
     let around = |points: &[Vec3]| {
         let mut bounds = Bounds::EMPTY;
@@ -68,7 +72,7 @@ fn contrast(environment: &Environment) -> f32 {
 impl Source {
     /// Whether what moved may lie between points and the source. `part`: a bound of the part of the hemisphere that all
     /// of it takes, and the part that matters.
-    pub fn is_cut(&self, points: &Bounds, moved: &Bounds, part: (f32, f32)) -> bool {
+    fn is_cut(&self, points: &Bounds, moved: &Bounds, part: (f32, f32)) -> bool {
         match *self {
             Source::Near(end) => points.sweeps(end.lower - points.lower, end.upper - points.upper, 1.0, moved),
             Source::Far { direction, spread } => {
@@ -78,6 +82,54 @@ impl Source {
             // A sun in a sky may be hidden by what takes next to nothing of the hemisphere.
             Source::Sky(contrast) => part.0 * contrast > part.1,
         }
+    }
+}
+
+/// Pairs of a source and of what moved, by number, that may lie between it and points.
+pub(super) type Cuts = Vec<(u32, u32)>;
+
+/// What gives direct light, and what moved, which may hide it.
+pub(super) struct Shadows<'a> {
+    sources: Vec<Source>,
+    boxes: &'a [Bounds],
+    /// Relative difference of light that is let stand.
+    keep_error: f32,
+}
+
+impl<'a> Shadows<'a> {
+    pub fn new(scene: &Scene, boxes: &'a [Bounds], keep_error: f32) -> Result<Shadows<'a>> {
+        Ok(Shadows { sources: sources(scene)?, boxes, keep_error })
+    }
+
+    /// Whether anything that moved may lie between points and a source. `part`: a bound of the part of the hemisphere that all
+    /// of it takes.
+    pub fn is_any_cut(&self, points: &Bounds, part: f32) -> bool {
+        let is_cut = |moved: &Bounds| self.sources.iter().any(|s| s.is_cut(points, moved, (part, self.keep_error)));
+        self.boxes.iter().any(is_cut)
+    }
+
+    /// Returns which of what moved may lie between points and which sources: at most one pair more than [`MOST_CUTS`].
+    pub fn cuts(&self, points: &Bounds) -> Result<Cuts> {
+        let part = self.part(points);
+        let pairs = (0..).zip(&self.sources).flat_map(|(s, source)| {
+            let cut = (0..).zip(self.boxes).filter(move |(_, moved)| source.is_cut(points, moved, part));
+            cut.map(move |(b, _)| (s, b))
+        });
+        try_collect(pairs.take(MOST_CUTS + 1), SOURCES)
+    }
+
+    /// Whether what moved may lie between points and a source, given the cuts of a region around them.
+    pub fn is_cut(&self, points: &Bounds, cuts: &[(u32, u32)]) -> bool {
+        if cuts.is_empty() || cuts.len() > MOST_CUTS {
+            return !cuts.is_empty();
+        }
+        let part = self.part(points);
+        cuts.iter().any(|&(s, b)| self.sources[s as usize].is_cut(points, &self.boxes[b as usize], part))
+    }
+
+    /// A bound of the part of light that all of what moved takes, and the part that matters.
+    fn part(&self, points: &Bounds) -> (f32, f32) {
+        (self.boxes.iter().map(|moved| part_of_light(points, moved)).sum(), self.keep_error)
     }
 }
 
