@@ -1093,8 +1093,10 @@ bk_result bk_scene_add_instance(bk_scene *scene,
 
 /// Sets an instance to show the light of another instance of the same mesh: it gets no texels of its
 /// own in light maps, and has the light map coordinates and the radiance of the other one. For meshes
-/// that stand in places of much the same light so often that texels for each would be too many. Rays
-/// hit it where it stands, and it casts shadows there. A triangle that vanishes by rounding where the other one stands has no light.
+/// that stand in places of much the same light so often that texels for each would be too many. The
+/// light turns with the instance: a side that the sun shines on where the other one stands is bright
+/// wherever it faces here, and shadows of others fall as they do there. Rays hit it where it stands,
+/// and it casts shadows there. A triangle that vanishes by rounding where the other one stands has no light.
 ///
 /// @param scene  scene that is not committed
 /// @param instance  number of the instance
@@ -1103,10 +1105,7 @@ bk_result bk_scene_add_instance(bk_scene *scene,
 /// @retval BK_ERROR_INVALID_ARGUMENT  there is no such instance, or `of` is not less than it or of
 ///   another mesh
 /// @retval BK_ERROR_INVALID_STATE  the scene is committed or another thread is changing it
-BK_API
-bk_result bk_instance_share_light(bk_scene *scene,
-                                  uint32_t instance,
-                                  uint32_t of);
+BK_API bk_result bk_instance_share_light(bk_scene *scene, uint32_t instance, uint32_t of);
 
 /// Gets the instance whose texels and light an instance shows, of a scene that is committed or not:
 /// itself, unless bk_instance_share_light or a scene file said otherwise.

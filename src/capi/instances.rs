@@ -59,8 +59,10 @@ pub unsafe extern "C" fn bk_scene_add_instance(
 
 /// Sets an instance to show the light of another instance of the same mesh: it gets no texels of its
 /// own in light maps, and has the light map coordinates and the radiance of the other one. For meshes
-/// that stand in places of much the same light so often that texels for each would be too many. Rays
-/// hit it where it stands, and it casts shadows there. A triangle that vanishes by rounding where the other one stands has no light.
+/// that stand in places of much the same light so often that texels for each would be too many. The
+/// light turns with the instance: a side that the sun shines on where the other one stands is bright
+/// wherever it faces here, and shadows of others fall as they do there. Rays hit it where it stands,
+/// and it casts shadows there. A triangle that vanishes by rounding where the other one stands has no light.
 ///
 /// @param scene  scene that is not committed
 /// @param instance  number of the instance
