@@ -59,7 +59,7 @@ class LightmapInfo(Structure):
                 ("texels", c_uint64), ("gather_texels", c_uint64), ("radiance_texels", c_uint64), ("bytes", c_uint64),
                 ("uv_out_of_range", c_uint64), ("uv_degenerate", c_uint64), ("uv_overlapping_texels", c_uint64),
                 ("unwrap_seconds", ctypes.c_double), ("back_texels", c_uint64), ("unseen_charts", c_uint64),
-                ("spared_texels", c_uint64)]
+                ("spared_texels", c_uint64), ("kept_charts", c_uint64)]
 
 
 PROGRESS = ctypes.CFUNCTYPE(c_int32, c_void_p, c_float, c_char_p)

@@ -1673,6 +1673,8 @@ typedef struct bk_lightmap_info {
   uint64_t unseen_charts;
   /// Number of texels that they would have had, roughly.
   uint64_t spared_texels;
+  /// Number of charts whose texels bk_lightmap_create_from took over, all or some.
+  uint64_t kept_charts;
 } bk_lightmap_info;
 
 /// Sets `struct_size` and fills in the defaults.
@@ -1707,6 +1709,43 @@ bk_result bk_lightmap_create(const bk_scene *scene,
                              bk_progress_fn progress,
                              void *user,
                              bk_lightmap **out);
+
+/// Creates a light map as bk_lightmap_create does, of a scene that was described anew after meshes
+/// were added, removed or edited, and takes over from the light map of the scene before: curved
+/// surfaces that both scenes have keep their charts, and texels far from all changes are not
+/// searched for those that nobody can see. bk_bake_changed_from then keeps their light.
+///
+/// Meshes, and triangles in them, are the same if all their numbers are, bit for bit, in the same
+/// place. Far is more than four texels from boxes around all that only one of the scenes has, and
+/// not in a chart that touches one of which another side can be seen now; that a texel sees nothing
+/// but backs or hidden sides farther away is not noticed. Where charts lie on their pages depends on
+/// all of them: UVs are new. With another `desc`, with `texels_per_unit` 0 (which then is another
+/// density), or if a lamp was moved, added or removed, charts are taken over, and all texels are
+/// searched. bk_lightmap_info.kept_charts says of how many charts texels were taken over.
+///
+/// Cost: that of matching triangles, a third of a second per million, of laying out the pages, and
+/// of unwrapping new surfaces. Measured beside bk_lightmap_create: docs/performance.md, "Edits".
+///
+/// @param scene  committed scene, kept alive by the light map
+/// @param desc  parameters; NULL for the defaults
+/// @param earlier  light map of the scene before, baked or not, on any device
+/// @param progress,user  progress callback and its pointer; may be NULL
+/// @param out  receives the light map, which the caller releases with bk_lightmap_release; NULL on
+///   failure
+/// @retval BK_ERROR_INVALID_ARGUMENT  a field of `desc` is out of its range, a mesh names a page
+///   beyond 2^29 texels, or `earlier` is NULL
+/// @retval BK_ERROR_INVALID_STATE  the scene is not committed or is being refitted, or another call
+///   is changing the earlier light map
+/// @retval BK_ERROR_OUT_OF_MEMORY  there would be more than 2^29 texels, they do not fit, or the
+///   memory callback refuses
+/// @retval BK_ERROR_CANCELLED  the progress callback returned 0
+BK_API
+bk_result bk_lightmap_create_from(const bk_scene *scene,
+                                  const bk_lightmap_desc *desc,
+                                  const bk_lightmap *earlier,
+                                  bk_progress_fn progress,
+                                  void *user,
+                                  bk_lightmap **out);
 
 /// Updates a light map to the geometry of its scene after bk_scene_refit. Charts, pages and UVs
 /// stay as they are, and so do an engine's vertex buffers. Without this call the light map keeps
@@ -2294,8 +2333,8 @@ bk_result bk_bake_changed(bk_lightmap *lightmap,
 /// that the light map already has is replaced. If the earlier light map has no light, was baked with
 /// other parameters or has no surface in common with this one, everything is baked.
 ///
-/// Errors add up as in bk_bake_changed. A cache folder (bk_device_desc.cache_folder) saves the
-/// unwraps of meshes that stay, too.
+/// Errors add up as in bk_bake_changed. bk_lightmap_create_from makes the light map without
+/// unwrapping common surfaces; a cache folder (bk_device_desc.cache_folder) saves unwraps, too.
 ///
 /// Cost: as bk_bake_changed, and up to some 100 bytes and a microsecond per triangle of objects that
 /// changed, less of those that did not; the earlier light is held a second time while it is baked.

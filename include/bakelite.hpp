@@ -494,6 +494,15 @@ public:
         Lightmap map(out);
         return detail::finish(progress.after(code), std::move(map));
     }
+    /// The light map of a scene that was described anew: takes over charts from that of the scene before.
+    static Result<Lightmap> create_from(const Scene &scene, const Lightmap &earlier, const LightmapDesc &desc = {},
+                                        const Progress &progress = {}) {
+        bk_lightmap *out = nullptr;
+        const bk_result code = bk_lightmap_create_from(scene.get(), &desc, earlier.get(), progress.function(),
+                                                       progress.user(), &out);
+        Lightmap map(out);
+        return detail::finish(progress.after(code), std::move(map));
+    }
     /// The light map whose layout was saved: as from `create`, without unwrapping.
     static Result<Lightmap> load_layout(const Scene &scene, const std::string &path, const LightmapDesc &desc = {},
                                         const Progress &progress = {}) {

@@ -132,7 +132,7 @@ static double difference(const float *a, const float *b, size_t count) {
 /* A new scene has a block more: its light map keeps light of the old one's. */
 static void revise(bk_device *device, const bk_lightmap_desc *desc) {
     bk_scene *scenes[2];
-    bk_lightmap *maps[2] = {NULL, NULL}, *another = NULL;
+    bk_lightmap *maps[2] = {NULL, NULL}, *another = NULL, *refused = NULL;
     bk_lightmap_info info;
     bk_bake_params params;
     bk_bake_stats stats;
@@ -152,15 +152,22 @@ static void revise(bk_device *device, const bk_lightmap_desc *desc) {
     fresh = light_of(maps[1], &count);
 
     CHECK_OK(bk_bake(maps[0], &params, NULL, NULL, NULL));
-    CHECK_OK(bk_lightmap_create(scenes[1], desc, NULL, NULL, &another));
+    CHECK_OK(bk_lightmap_create_from(scenes[1], desc, maps[0], NULL, NULL, &another));
     bk_lightmap_info_init(&info);
+    CHECK_OK(bk_lightmap_get_info(maps[1], &info));
+    CHECK(info.kept_charts == 0);
     CHECK_OK(bk_lightmap_get_info(another, &info));
+    CHECK(info.kept_charts > 0 && info.kept_charts < info.charts);
     CHECK_OK(bk_bake_changed_from(another, maps[0], &params, 0.03f, NULL, NULL, &stats));
     CHECK(stats.kept_texels > info.texels / 10 && stats.kept_texels < info.texels);
     kept = light_of(another, &count);
     CHECK(difference(kept, fresh, count) < 0.005);
 
     /* Refused, and nothing lost. */
+    CHECK_ERROR(bk_lightmap_create_from(scenes[1], desc, NULL, NULL, NULL, &refused), BK_ERROR_INVALID_ARGUMENT,
+                "earlier is NULL");
+    CHECK(refused == NULL);
+    CHECK_ERROR(bk_lightmap_create_from(NULL, desc, maps[0], NULL, NULL, &refused), BK_ERROR_INVALID_ARGUMENT, "scene");
     CHECK_ERROR(bk_bake_changed_from(another, another, &params, 0.03f, NULL, NULL, NULL), BK_ERROR_INVALID_ARGUMENT,
                 "bk_bake_changed");
     CHECK_ERROR(bk_bake_changed_from(another, NULL, &params, 0.03f, NULL, NULL, NULL), BK_ERROR_INVALID_ARGUMENT,

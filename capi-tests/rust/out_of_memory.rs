@@ -325,7 +325,8 @@ fn edits(scene: &Arc<Scene>, lightmap: &mut Lightmap, desc: &LightmapDesc, param
     revision.add_mesh(added).unwrap();
     let device = scene.device();
     let revision = Scene::commit(device, revision, &BuildOptions::default(), &none).map_err(|e| e.1).unwrap();
-    let mut revised = Lightmap::create(&revision, desc, &none).unwrap();
+    let mut revised =
+        fail_all("a light map from another one", || Lightmap::create_from(&revision, desc, lightmap, &none));
     let stats = fail_all("light of another light map", || revised.bake_changed_from(lightmap, params, 0.03, &none));
     assert!(stats.kept_texels > 0);
 }

@@ -29,6 +29,10 @@ impl Bounds {
         Bounds { lower: self.lower - by, upper: self.upper + by }
     }
 
+    pub fn contains(&self, point: Vec3) -> bool {
+        self.lower.cmple(point).all() && point.cmple(self.upper).all()
+    }
+
     pub fn overlaps(&self, other: &Bounds) -> bool {
         self.lower.cmple(other.upper).all() && other.lower.cmple(self.upper).all()
     }

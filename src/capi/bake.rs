@@ -561,8 +561,8 @@ unsafe fn params_of_changes(params: *const bk_bake_params, function: &str) -> Re
 /// that the light map already has is replaced. If the earlier light map has no light, was baked with
 /// other parameters or has no surface in common with this one, everything is baked.
 ///
-/// Errors add up as in bk_bake_changed. A cache folder (bk_device_desc.cache_folder) saves the
-/// unwraps of meshes that stay, too.
+/// Errors add up as in bk_bake_changed. bk_lightmap_create_from makes the light map without
+/// unwrapping common surfaces; a cache folder (bk_device_desc.cache_folder) saves unwraps, too.
 ///
 /// Cost: as bk_bake_changed, and up to some 100 bytes and a microsecond per triangle of objects that
 /// changed, less of those that did not; the earlier light is held a second time while it is baked.

@@ -170,6 +170,58 @@ pub unsafe extern "C" fn bk_lightmap_create(
     })
 }
 
+/// Creates a light map as bk_lightmap_create does, of a scene that was described anew after meshes
+/// were added, removed or edited, and takes over from the light map of the scene before: curved
+/// surfaces that both scenes have keep their charts, and texels far from all changes are not
+/// searched for those that nobody can see. bk_bake_changed_from then keeps their light.
+///
+/// Meshes, and triangles in them, are the same if all their numbers are, bit for bit, in the same
+/// place. Far is more than four texels from boxes around all that only one of the scenes has, and
+/// not in a chart that touches one of which another side can be seen now; that a texel sees nothing
+/// but backs or hidden sides farther away is not noticed. Where charts lie on their pages depends on
+/// all of them: UVs are new. With another `desc`, with `texels_per_unit` 0 (which then is another
+/// density), or if a lamp was moved, added or removed, charts are taken over, and all texels are
+/// searched. bk_lightmap_info.kept_charts says of how many charts texels were taken over.
+///
+/// Cost: that of matching triangles, a third of a second per million, of laying out the pages, and
+/// of unwrapping new surfaces. Measured beside bk_lightmap_create: docs/performance.md, "Edits".
+///
+/// @param scene  committed scene, kept alive by the light map
+/// @param desc  parameters; NULL for the defaults
+/// @param earlier  light map of the scene before, baked or not, on any device
+/// @param progress,user  progress callback and its pointer; may be NULL
+/// @param out  receives the light map, which the caller releases with bk_lightmap_release; NULL on
+///   failure
+/// @retval BK_ERROR_INVALID_ARGUMENT  a field of `desc` is out of its range, a mesh names a page
+///   beyond 2^29 texels, or `earlier` is NULL
+/// @retval BK_ERROR_INVALID_STATE  the scene is not committed or is being refitted, or another call
+///   is changing the earlier light map
+/// @retval BK_ERROR_OUT_OF_MEMORY  there would be more than 2^29 texels, they do not fit, or the
+///   memory callback refuses
+/// @retval BK_ERROR_CANCELLED  the progress callback returned 0
+#[unsafe(no_mangle)]
+pub unsafe extern "C" fn bk_lightmap_create_from(
+    scene: *const bk_scene,
+    desc: *const bk_lightmap_desc,
+    earlier: *const bk_lightmap,
+    progress: bk_progress_fn,
+    user: *mut c_void,
+    out: *mut *mut bk_lightmap,
+) -> bk_result {
+    // SAFETY: desc and out are the caller's, or NULL.
+    call(|| unsafe {
+        write(out, std::ptr::null_mut(), "out")?;
+        refuse_in_callback()?;
+        let scene = Arc::clone(&*hold(scene, "scene")?.committed()?);
+        scene.device().check_process()?;
+        let desc = core_desc(desc)?;
+        let earlier = hold(earlier, "earlier")?;
+        let progress = self::progress(progress, user);
+        let lightmap = earlier.read(|earlier| Lightmap::create_from(&scene, &desc, earlier, &progress))?;
+        write(out, create(bk_lightmap { lightmap: RwLock::new(lightmap) }), "out")
+    })
+}
+
 /// Updates a light map to the geometry of its scene after bk_scene_refit. Charts, pages and UVs
 /// stay as they are, and so do an engine's vertex buffers. Without this call the light map keeps
 /// the old geometry.
@@ -377,6 +429,8 @@ pub struct bk_lightmap_info {
     pub unseen_charts: u64,
     /// Number of texels that they would have had, roughly.
     pub spared_texels: u64,
+    /// Number of charts whose texels bk_lightmap_create_from took over, all or some.
+    pub kept_charts: u64,
 }
 
 sized_struct!(bk_lightmap_info, defaults: info(&Default::default()));
@@ -404,6 +458,7 @@ fn info(i: &LightmapInfo) -> bk_lightmap_info {
         back_texels: i.back_texels,
         unseen_charts: i.unseen_charts.into(),
         spared_texels: i.spared_texels,
+        kept_charts: i.kept_charts.into(),
     }
 }
 

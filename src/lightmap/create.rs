@@ -5,9 +5,11 @@ use super::atlas::buried::Search;
 use super::atlas::chart_index::ChartIndex;
 use super::atlas::chart_map::ChartMap;
 use super::atlas::charts::{Charts, automatic_density};
+use super::atlas::earlier::{Earlier, TakenOver};
 use super::atlas::ids::{ChartId, GatherMap, LightMap, Map, RadianceMap};
 use super::atlas::known::{Known, Patch};
 use super::atlas::layout::Layout;
+use super::atlas::pieces::KnownPieces;
 use super::atlas::seen::{self, Seen};
 use super::atlas::seen_from;
 use super::atlas::texels::TexelMap;
@@ -37,33 +39,62 @@ impl Lightmap {
     /// Creates a light map: unwraps meshes without usable UVs, lays out the pages and maps texels to triangles.
     pub fn create(scene: &Arc<Scene>, desc: &LightmapDesc, progress: &Progress) -> Result<Lightmap> {
         desc.validate()?;
-        let lay_out = || Self::lay_out(scene, desc, None, progress);
+        let lay_out = || Self::lay_out(scene, desc, None, None, progress);
         scene.while_unchanged(|| scene.device().run(progress, lay_out))
     }
 
-    /// Creates a light map whose description is checked. What is `known` is not searched for.
+    /// Creates a light map as [`create`](Self::create) does, of a scene of which that of an `earlier` light map is a
+    /// revision: of meshes, or triangles in them, that both scenes have, curved surfaces keep their charts, and texels far from
+    /// what has changed are not searched for those that nobody can see. For meshes that were added, removed or edited;
+    /// [`bake_changed_from`](Self::bake_changed_from) then keeps their light.
+    ///
+    /// Far is more than four texels from boxes around what has changed, and not in a chart that touches one of which another
+    /// side can be seen now. With another description or density, or if a lamp was moved, added or removed, charts are kept and
+    /// all texels are searched.
+    pub fn create_from(
+        scene: &Arc<Scene>,
+        desc: &LightmapDesc,
+        earlier: &Lightmap,
+        progress: &Progress,
+    ) -> Result<Lightmap> {
+        desc.validate()?;
+        let lay_out = || {
+            let earlier = scene.device().install(|| Earlier::new(&earlier.atlas, scene, progress))?;
+            Self::lay_out(scene, desc, None, Some(&earlier), progress)
+        };
+        let of_both = || scene.while_unchanged(|| scene.device().run(progress, lay_out));
+        earlier.atlas.scene.while_unchanged(of_both)
+    }
+
+    /// Creates a light map whose description is checked. What is `known` is not searched for, and what can be taken over from
+    /// an `earlier` one is.
     pub(super) fn lay_out(
         scene: &Arc<Scene>,
         desc: &LightmapDesc,
         mut known: Option<Known>,
+        earlier: Option<&Earlier>,
         progress: &Progress,
     ) -> Result<Lightmap> {
         let start = Instant::now();
-        let is_outdoors = seen::is_outdoors(scene);
+        let (is_outdoors, lamps) = (seen::is_outdoors(scene), seen::lamps(scene)?);
         let density = match desc.texels_per_unit {
             0.0 => automatic_density(scene, desc.page_size, AUTOMATIC_PAGES)?,
             d => d,
         };
         let (charts, mut uvs) = match &mut known {
             Some(known) => (std::mem::take(&mut known.charts), known.uvs),
-            None => Charts::of_scene(scene, density, desc.page_size, desc.padding, progress)?,
+            None => {
+                let pieces = earlier.map(|e| move |triangles: &[u32], stage: &Stage| e.pieces(scene, triangles, stage));
+                let pieces = pieces.as_ref().map(|pieces| pieces as KnownPieces);
+                Charts::of_scene_with(scene, density, desc.page_size, desc.padding, pieces, progress)?
+            }
         };
         let unwrap_seconds = start.elapsed().as_secs_f64();
         let index = ChartIndex::new(scene.device(), &charts)?;
         let two_sided: Vec<ChartId> =
             try_collect(charts.ids().filter(|&c| charts[c].two_sided), "the two-sided charts")?;
-        let Maps { map, gather, radiance, seen, with_backs, buried, sight_rays } =
-            Maps::lay_out(scene, desc, &charts, &index, &two_sided, density, known.as_mut(), progress)?;
+        let Maps { map, gather, radiance, seen, with_backs, buried, sight_rays, kept_charts } =
+            Maps::lay_out(scene, desc, &charts, &index, &two_sided, density, known.as_mut(), earlier, progress)?;
         uvs.overlapping_texels = map.texels.overlapping_texels;
         uvs.reduced_charts = map.layout.reduced;
         let device = scene.device();
@@ -88,6 +119,7 @@ impl Lightmap {
             unseen_charts: seen.unseen.iter().filter(|&&unseen| unseen).count() as u32,
             spared_texels: map.layout.spared,
             sight_rays,
+            kept_charts,
         };
         let memory = scene.device().memory().reserve(own_bytes, "the charts")?;
         if let Some(message) = too_few_digits(scene, "texels", 1.0 / density, OFFSET_PART) {
@@ -109,6 +141,7 @@ impl Lightmap {
             padding: desc.padding,
             desc: desc.clone(),
             is_outdoors,
+            lamps,
             info,
             seen: Arc::new(seen),
             buried,
@@ -143,6 +176,8 @@ struct Maps {
     /// By texel of the light map; empty if none is.
     buried: Vec<bool>,
     sight_rays: u64,
+    /// Number of charts that were taken over from an earlier light map with their texels.
+    kept_charts: u32,
 }
 
 impl Maps {
@@ -156,6 +191,7 @@ impl Maps {
         two_sided: &[ChartId],
         density: f32,
         known: Option<&mut Known>,
+        earlier: Option<&Earlier>,
         progress: &Progress,
     ) -> Result<Maps> {
         let pack = |divisor: u32, padding: u32, given: bool, with_backs: &[ChartId], unseen: &[bool]| {
@@ -191,22 +227,37 @@ impl Maps {
             known.patch(1, charts, &mut gather)?;
             known.patch(2, charts, &mut radiance)?;
             let sight_rays = known.sight_rays;
-            return Ok(Maps { map, gather, radiance, seen, with_backs, buried, sight_rays });
+            return Ok(Maps { map, gather, radiance, seen, with_backs, buried, sight_rays, kept_charts: 0 });
         }
         let placements = [&map.layout, &gather.layout, &radiance.layout].map(|layout| layout.placements.len() as u64);
         let stage = progress.stage("buried texels", 0.8, 1.0, placements.iter().sum());
         let (near, outdoors) = (texel.min(seen::ROOM * scene.diagonal()), seen::is_outdoors(scene));
-        let search = Search { scene, charts, index, seen: &seen, near, outdoors, only: None };
+        let find = |e: &Earlier| e.texels(scene, charts, (&map, &gather, &radiance), &seen, near, &stage);
+        let taken = earlier.map(|e| Ok((e, scene.install(|| find(e))?))).transpose()?;
+        let copy = |(e, taken): &(&Earlier, TakenOver)| {
+            scene.install(|| e.copy(scene, charts, taken, (&mut map, &mut gather, &mut radiance), &stage))
+        };
+        let were_buried = taken.as_ref().map(copy).transpose()?.unwrap_or_default();
+        let only = taken.as_ref().map(|(_, taken)| taken.only());
+        let search = Search { scene, charts, index, seen: &seen, near, outdoors, only };
         // The visible part of a mostly buried texel is a strip along the surface that covers it, often darker than its
         // surroundings. Gather texels are larger and would spread that darkness as a rim.
-        let (buried, rays) = scene.install(|| {
+        let (mut buried, rays) = scene.install(|| {
             let (_, of_radiance) = search.move_buried(&mut radiance, true, &stage)?;
             let (_, of_gather) = search.move_buried(&mut gather, false, &stage)?;
             let (buried, of_map) = search.move_buried(&mut map, true, &stage)?;
             Ok((buried, of_radiance + of_gather + of_map))
         })?;
         let sight_rays = seen.rays + rays;
-        Ok(Maps { map, gather, radiance, seen, with_backs, buried, sight_rays })
+        if buried.is_empty() {
+            buried = were_buried;
+        } else {
+            let both = buried.iter_mut().zip(were_buried).zip(map.all());
+            // One with the sample of another texel that was covered now may have got a point of its own.
+            both.filter(|((_, was), _)| *was).for_each(|((is, _), texel)| *is |= !map.is_of_own(charts, texel));
+        }
+        let kept_charts = taken.map_or(0, |(_, taken)| taken.charts());
+        Ok(Maps { map, gather, radiance, seen, with_backs, buried, sight_rays, kept_charts })
     }
 }
 

@@ -4,20 +4,17 @@
 
 use super::Lightmap;
 use super::atlas::Atlas;
-use super::atlas::buried::Search;
+use super::atlas::buried::{Only, Part, REACH, Search};
 use super::atlas::chart_map::ChartMap;
 use super::atlas::ids::{ChartId, Map, PlacementId};
 use super::atlas::seen;
 use super::moved::Moved;
 use crate::base::bounds::Bounds;
 use crate::base::error::{Result, invalid_argument};
-use crate::base::memory::{try_collect, try_vec};
+use crate::base::memory::{try_collect, try_to_vec, try_vec};
 use crate::base::progress::{Progress, Stage};
 use crate::scene::Scene;
 use std::sync::Arc;
-
-/// What lies within this many times the distance at which surfaces cover texels may cover some.
-const REACH: f32 = 4.0;
 
 impl Lightmap {
     /// Takes over another state of the light map's scene, whose vertices or instances have moved. Charts, pages and UVs
@@ -50,15 +47,14 @@ impl Atlas {
         let texel = 1.0 / self.info.texels_per_unit;
         let near = texel.min(seen::ROOM * scene.diagonal());
         let boxes: Vec<Bounds> = moved.boxes.iter().map(|bounds| bounds.grown(REACH * near)).collect();
-        let is_near = |chart: ChartId| {
-            let mut bounds = Bounds::EMPTY;
-            for triangle in self.charts.triangles_of(chart) {
-                let (object, of_object) = scene.locate(triangle);
-                scene.object(object).corners(of_object).into_iter().for_each(|corner| bounds.add(corner));
+        let part = |chart: ChartId| {
+            let bounds = self.charts.bounds(scene, chart);
+            match moved.has(chart) || boxes.iter().any(|moved| moved.overlaps(&bounds)) {
+                true => Part::All,
+                false => Part::None,
             }
-            moved.has(chart) || boxes.iter().any(|moved| moved.overlaps(&bounds))
         };
-        let charts = try_collect(self.charts.ids().map(is_near), "charts near what has moved")?;
+        let charts = try_collect(self.charts.ids().map(part), "charts near what has moved")?;
         let search = Search {
             scene,
             charts: &self.charts,
@@ -66,7 +62,7 @@ impl Atlas {
             seen: &self.seen,
             near,
             outdoors: self.is_outdoors,
-            only: Some(&charts),
+            only: Some(Only { charts: &charts, boxes: &boxes }),
         };
         let work = [&self.map.layout, &self.gather.layout, &self.radiance.layout]
             .map(|layout| 2 * layout.placements.len() as u64);
@@ -86,6 +82,7 @@ impl Atlas {
             padding: self.padding,
             desc: self.desc.clone(),
             is_outdoors: self.is_outdoors,
+            lamps: try_to_vec(&self.lamps, "the places of lamps")?,
             info,
             seen: self.seen.clone(),
             buried,
@@ -104,7 +101,8 @@ fn follow<M: Map>(
     stage: &Stage,
 ) -> Result<(ChartMap<M>, Vec<bool>)> {
     let layout = &old.layout;
-    let is_searched = |placement| search.only.is_none_or(|only| only[layout.chart_of(placement).index()]);
+    let is_searched =
+        |placement| search.only.is_none_or(|only| only.charts[layout.chart_of(placement).index()] != Part::None);
     let mut map = old.copied(search.scene, search.charts, &is_searched, stage)?;
     let (mut buried, _) = search.scene.device().install(|| search.move_buried(&mut map, by_parts, stage))?;
     if buried.is_empty() && !was_buried.is_empty() {

@@ -20,6 +20,7 @@ mod readback;
 pub(crate) mod saved;
 mod seams;
 pub(crate) mod stages;
+mod surfaces;
 pub(crate) mod texel_light;
 pub(crate) mod tiles;
 mod write;
@@ -135,6 +136,9 @@ pub struct LightmapInfo {
     pub unseen_charts: u32,
     /// Number of texels that they would have had, roughly.
     pub spared_texels: u64,
+    /// Number of charts of which texels, all or some, were taken over from an earlier light map: see
+    /// [`Lightmap::create_from`].
+    pub kept_charts: u32,
 }
 
 /// Parameters of a bake.

@@ -9,7 +9,7 @@ use crate::base::memory::{try_push, try_vec};
 use crate::scene::Scene;
 
 /// Maximum number of boxes; those whose union adds least are merged until there are so few.
-const MOST_BOXES: usize = 32;
+pub(super) const MOST_BOXES: usize = 32;
 
 /// Boxes that are merged in pairs at most; of more, neighbours in the order of objects are merged first, since trying all
 /// pairs takes the square of their number.

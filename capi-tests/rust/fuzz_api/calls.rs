@@ -655,6 +655,10 @@ fn lightmap(w: &W, s: &mut Source) {
         let result =
             ask!(bk_lightmap_load_layout(scene.p(), &desc, from.as_ptr(), Some(progress), watched.user(), &mut out));
         ("bk_lightmap_load_layout", result)
+    } else if let Some(earlier) = w.pick(Kind::Lightmap, s).filter(|_| s.one_in(4)) {
+        let result =
+            ask!(bk_lightmap_create_from(scene.p(), &desc, earlier.p(), Some(progress), watched.user(), &mut out));
+        ("bk_lightmap_create_from", result)
     } else {
         let result = ask!(bk_lightmap_create(scene.p(), &desc, Some(progress), watched.user(), &mut out));
         ("bk_lightmap_create", result)
@@ -1153,6 +1157,7 @@ fn null_handles(s: &mut Source) {
         }
         _ => {
             failed(ask!(bk_lightmap_create(null(), null(), None, null_mut(), words.as_mut_ptr().cast())));
+            failed(ask!(bk_lightmap_create_from(null(), null(), null(), None, null_mut(), words.as_mut_ptr().cast())));
             failed(ask!(bk_bake(null_mut(), null(), None, null_mut(), null_mut())));
             failed(ask!(bk_bake_changed(null_mut(), null(), 0.0, None, null_mut(), null_mut())));
             failed(ask!(bk_bake_changed_from(null_mut(), null(), null(), 0.0, None, null_mut(), null_mut())));

@@ -20,6 +20,7 @@ use super::fill::{Hole, around};
 use super::ids::{Map, PlacementId, TexelId, TexelRange};
 use super::seen::{self, Seen};
 use super::texels::TexelSample;
+use crate::base::bounds::Bounds;
 use crate::base::error::Result;
 use crate::base::memory::{try_collect, try_filled, try_par_collect, try_push, try_vec, try_with_capacity};
 use crate::base::parallel::one_by_one;
@@ -45,6 +46,9 @@ const FEW_BACKS: u32 = 8;
 /// Backs up to this many times `near` away tell that a texel which sees nothing else lies below or behind a surface.
 const NEARBY: f32 = 4.0;
 
+/// What lies within this many times the distance at which surfaces cover texels may cover some.
+pub(in crate::lightmap) const REACH: f32 = 4.0;
+
 /// Maximum number of lamps that are looked for.
 const LAMPS: usize = 64;
 
@@ -68,7 +72,7 @@ const POINT_TRIES: u32 = 32;
 /// Number of points that are tested together.
 const BLOCK: usize = 256;
 
-const BURIED: &str = "which texels are buried";
+pub(super) const BURIED: &str = "which texels are buried";
 
 /// Inputs of the search for buried texels.
 #[derive(Clone, Copy)]
@@ -81,8 +85,34 @@ pub(in crate::lightmap) struct Search<'a> {
     pub near: f32,
     /// Whether a sun or a sky shines, so that people may stand where rays leave the scene.
     pub outdoors: bool,
-    /// Whether each chart is searched; `None`: all are.
-    pub only: Option<&'a [bool]>,
+    /// Which texels are searched; `None`: all are.
+    pub only: Option<Only<'a>>,
+}
+
+/// Which texels are searched.
+#[derive(Clone, Copy)]
+pub(in crate::lightmap) struct Only<'a> {
+    /// By chart.
+    pub charts: &'a [Part],
+    /// Where those of [`Part::Near`] are.
+    pub boxes: &'a [Bounds],
+}
+
+/// Part of a chart that is searched.
+#[derive(Clone, Copy, PartialEq)]
+pub(in crate::lightmap) enum Part {
+    None,
+    /// Texels whose samples lie in the boxes. All others have the samples that they are to have.
+    Near,
+    All,
+}
+
+impl Only<'_> {
+    /// Whether a texel is searched whose chart is searched in part.
+    pub fn is_near(&self, scene: &Scene, texel: &TexelSample) -> bool {
+        let at = texel.position(scene);
+        self.boxes.iter().any(|bounds| bounds.contains(at))
+    }
 }
 
 impl Search<'_> {
@@ -136,9 +166,11 @@ impl Search<'_> {
     ) -> Result<Found<M>> {
         let mut found = Found::default();
         let chart = map.layout.chart_of(placement);
-        if self.only.is_some_and(|only| !only[chart.index()]) {
-            return Ok(found);
-        }
+        let near = match self.only.map(|only| (only, only.charts[chart.index()])) {
+            Some((_, Part::None)) => return Ok(found),
+            Some((only, Part::Near)) => Some(only),
+            None | Some((_, Part::All)) => None,
+        };
         let is_back = match map.layout.is_back(placement) {
             true => true,
             false if !self.charts[chart].two_sided || map.layout.back(chart).is_some() => false,
@@ -153,14 +185,17 @@ impl Search<'_> {
             return Ok(found);
         }
         let texels = map.texels_of(placement);
-        let indices = texels.indices();
         let mut buried = Vec::new();
+        let indices = texels.indices();
+        let mut block = [TexelId::new(0); BLOCK];
         for first in indices.clone().step_by(BLOCK) {
             stage.advance(0)?;
-            let block = TexelId::range(first..indices.end.min(first + BLOCK));
-            let points = block.map(|texel| (map[texel], map.seed_in(placement, texel)));
+            let all = TexelId::range(first..indices.end.min(first + BLOCK));
+            let wanted = all.filter(|&texel| near.is_none_or(|only| only.is_near(self.scene, &map[texel])));
+            let count = block.iter_mut().zip(wanted).map(|(place, texel)| *place = texel).count();
+            let points = block[..count].iter().map(|&texel| (map[texel], map.seed_in(placement, texel)));
             for &number in self.find_buried(tests, points, is_back, GIVE_UP, &mut found.rays) {
-                try_push(&mut buried, TexelId::new(first + number as usize), BURIED)?;
+                try_push(&mut buried, block[number as usize], BURIED)?;
             }
         }
         if by_parts || buried.len() == texels.len() {

@@ -179,6 +179,14 @@ impl<M: Map> ChartMap<M> {
         self.layout.place_of(charts.chart_of(self[texel].triangle), !self.is_back(texel))
     }
 
+    /// Whether a texel's sample lies in the texel.
+    pub(in crate::lightmap) fn is_of_own(&self, charts: &Charts, texel: TexelId<M>) -> bool {
+        let t = &self[texel];
+        let local = charts.local(t.triangle, t.u, t.v);
+        let at = self.layout.texel_coord(self.placement_of(charts, texel), local);
+        at.map(|c| c.floor() as i32) == [t.x, t.y].map(i32::from)
+    }
+
     /// Returns position and normal of a texel's sample.
     pub(crate) fn surface(&self, scene: &Scene, texel: TexelId<M>) -> (Vec3, Vec3) {
         let t = &self[texel];

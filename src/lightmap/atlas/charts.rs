@@ -6,10 +6,11 @@
 use super::alike::{self, Source};
 use super::ids::ChartId;
 pub use super::pieces::Given;
-use super::pieces::{CHARTS, Groups, Piece, connected, float_key, surface_kind, triangle_area};
+use super::pieces::{CHARTS, Groups, KnownPieces, Piece, connected, float_key, surface_kind, triangle_area};
 pub use super::sheets::Chart;
 use super::sheets::{Place, Shape, Sheet, scaled};
 use super::unwrap;
+use crate::base::bounds::Bounds;
 use crate::base::error::{Error, Result, invalid_argument};
 use crate::base::memory::{try_collect, try_push, try_with_capacity};
 use crate::base::progress::{Progress, Stage};
@@ -92,6 +93,18 @@ impl Charts {
         padding: u32,
         progress: &Progress,
     ) -> Result<(Charts, UvReport)> {
+        Self::of_scene_with(scene, texels_per_unit, page_size, padding, None, progress)
+    }
+
+    /// Same as [`of_scene`](Self::of_scene), but curved triangles whose charts are `known` are not unwrapped.
+    pub(in crate::lightmap) fn of_scene_with(
+        scene: &Scene,
+        texels_per_unit: f32,
+        page_size: u32,
+        padding: u32,
+        known: Option<KnownPieces>,
+        progress: &Progress,
+    ) -> Result<(Charts, UvReport)> {
         let start = Instant::now();
         let max_extent = padded_extent(page_size, padding)? as f64 / texels_per_unit as f64;
         check_density(surface_area(scene)?, texels_per_unit)?;
@@ -112,7 +125,7 @@ impl Charts {
             let own = scene.triangles_of_meshes();
             stage.advance(own.len() as u64 - rest.len() as u64)?;
             report.given_charts = pieces.len() as u32;
-            for piece in unwrap::unwrap(scene, &rest, &stage)? {
+            for piece in unwrap::unwrap(scene, &rest, known, &stage)? {
                 stage.check()?;
                 split_to_fit(piece, max_extent as f32, &mut pieces)?;
             }
@@ -122,7 +135,7 @@ impl Charts {
                 // As small as the largest of the instances needs them.
                 let instance = object - scene.object_of_instance(0);
                 let largest = sources.iter().filter(|s| s.instance == instance).fold(1.0f32, |m, s| m.max(s.factor));
-                for piece in unwrap::unwrap(scene, &valid, &stage)? {
+                for piece in unwrap::unwrap(scene, &valid, known, &stage)? {
                     stage.check()?;
                     split_to_fit(piece, max_extent as f32 / largest, &mut pieces)?;
                 }
@@ -192,6 +205,16 @@ impl Charts {
         let Range { start, end } = self[chart].triangles;
         let Shape { sheet, first_triangle, .. } = self.shape(chart);
         sheet.triangles[start as usize..end as usize].iter().map(move |&t| first_triangle + t)
+    }
+
+    /// Returns a box around a chart.
+    pub(in crate::lightmap) fn bounds(&self, scene: &Scene, chart: ChartId) -> Bounds {
+        let mut bounds = Bounds::EMPTY;
+        for triangle in self.triangles_of(chart) {
+            let (object, of_object) = scene.locate(triangle);
+            scene.object(object).corners(of_object).into_iter().for_each(|corner| bounds.add(corner));
+        }
+        bounds
     }
 
     /// Returns the local coordinates of the corners of a global triangle.

@@ -5,6 +5,7 @@ pub(crate) mod buried;
 pub(crate) mod chart_index;
 pub(crate) mod chart_map;
 pub mod charts;
+pub(in crate::lightmap) mod earlier;
 pub(crate) mod fill;
 pub(crate) mod flat_triangle;
 pub mod ids;
@@ -29,6 +30,7 @@ use crate::scene::Scene;
 use chart_index::ChartIndex;
 use chart_map::{ChartMap, Receivers};
 use charts::Charts;
+use glam::Vec3;
 use ids::{GatherMap, GatherTexel, LightMap, LightTexel, PlacementId, RadianceMap, ShownMap, TexelId};
 use seen::Seen;
 use std::sync::Arc;
@@ -45,9 +47,10 @@ pub(crate) struct Atlas {
     pub gather: ChartMap<GatherMap>,
     pub radiance: ChartMap<RadianceMap>,
     pub padding: u32,
-    /// What the light map was created with: its description, and whether a sun or a sky shone.
+    /// What the light map was created with: its description, whether a sun or a sky shone, and the places of lamps.
     pub(in crate::lightmap) desc: LightmapDesc,
     pub(in crate::lightmap) is_outdoors: bool,
+    pub(in crate::lightmap) lamps: Vec<Option<Vec3>>,
     pub info: LightmapInfo,
     pub seen: Arc<Seen>,
     /// Whether each texel of the light map is buried, with the sample point of another one. Empty if none is.

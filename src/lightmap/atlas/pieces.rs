@@ -31,6 +31,10 @@ pub(in crate::lightmap) struct Piece {
     pub given: Option<Given>,
 }
 
+/// Makes pieces of those of some triangles of an object (global numbers, ascending) whose charts are known. To be called on
+/// the device's threads.
+pub(in crate::lightmap) type KnownPieces<'a> = &'a (dyn Fn(&[u32], &Stage) -> Result<Vec<Piece>> + Sync);
+
 impl Piece {
     /// Moves the piece to where it takes no memory, if there is a folder for scratch files.
     pub fn kept(self, device: &Device) -> Result<Piece> {

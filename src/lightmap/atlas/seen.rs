@@ -177,6 +177,11 @@ pub(super) fn middle_of(light: &Light) -> Option<Vec3> {
     }
 }
 
+/// Returns the places of all lamps, or their middles; `None`: it is infinitely far away.
+pub(in crate::lightmap) fn lamps(scene: &Scene) -> Result<Vec<Option<Vec3>>> {
+    try_collect(scene.lights().iter().map(middle_of), "the places of lamps")
+}
+
 /// Inputs of the search for open places.
 struct Look<'a> {
     scene: &'a Scene,

@@ -8,7 +8,7 @@
 //! Without the feature `unwrap`, and for triangles that the crate cannot unwrap, charts are single triangles and pairs
 //! of nearly coplanar triangles, projected on their plane: poor, but valid by construction.
 
-use super::pieces::{CHARTS, Groups, Piece, connected_by_vertices};
+use super::pieces::{CHARTS, Groups, KnownPieces, Piece, connected_by_vertices};
 use super::planar::{Regions, flat_piece, flat_regions, planar_pieces};
 use super::welded::Geometry;
 use crate::base::error::Result;
@@ -38,18 +38,24 @@ pub(in crate::lightmap) fn bytes(triangles: usize, vertices: usize, threads: usi
         + triangles.min(threads * PART_TRIANGLES) * BYTES_IN_PART
 }
 
-/// Unwraps `triangles` (valid global numbers, ascending), object by object. Advances `stage` by one per triangle.
-pub(in crate::lightmap) fn unwrap(scene: &Scene, triangles: &[u32], stage: &Stage) -> Result<Vec<Piece>> {
+/// Unwraps `triangles` (valid global numbers, ascending), object by object, but for curved ones whose charts are `known`.
+/// Advances `stage` by one per triangle.
+pub(in crate::lightmap) fn unwrap(
+    scene: &Scene,
+    triangles: &[u32],
+    known: Option<KnownPieces>,
+    stage: &Stage,
+) -> Result<Vec<Piece>> {
     let of_objects = triangles.chunk_by(|&a, &b| scene.locate(a).0 == scene.locate(b).0);
     let of_objects = try_collect(of_objects, CHARTS)?;
     try_par_gather(of_objects.len(), CHARTS, |i, out| {
         stage.check()?;
-        *out = unwrap_mesh(scene, of_objects[i], stage)?;
+        *out = unwrap_mesh(scene, of_objects[i], known, stage)?;
         Ok(())
     })
 }
 
-fn unwrap_mesh(scene: &Scene, triangles: &[u32], stage: &Stage) -> Result<Vec<Piece>> {
+fn unwrap_mesh(scene: &Scene, triangles: &[u32], known: Option<KnownPieces>, stage: &Stage) -> Result<Vec<Piece>> {
     let geometry = Geometry::of(scene, triangles, stage)?;
     let neighbours = geometry.neighbours(scene.device(), stage)?;
     let all = try_collect(0..triangles.len() as u32, CHARTS)?;
@@ -70,6 +76,17 @@ fn unwrap_mesh(scene: &Scene, triangles: &[u32], stage: &Stage) -> Result<Vec<Pi
         regions.get(*region).iter().for_each(|&t| rest[t as usize] = false);
     }
     drop(regions);
+    let mut taken_over = Vec::new();
+    if let Some(known) = known {
+        let curved = all.iter().filter(|&&t| rest[t as usize]).map(|&t| triangles[t as usize]);
+        taken_over = known(&try_collect(curved, CHARTS)?, stage)?;
+        for piece in &taken_over {
+            for t in &piece.triangles {
+                rest[triangles.binary_search(t).expect("it is one of them")] = false;
+            }
+            stage.advance(piece.triangles.len() as u64)?;
+        }
+    }
     let rest = try_collect(all.into_iter().filter(|&t| rest[t as usize]), CHARTS)?;
     let parts = parts(&geometry, &neighbours, &rest, stage)?;
     drop(neighbours);
@@ -78,8 +95,8 @@ fn unwrap_mesh(scene: &Scene, triangles: &[u32], stage: &Stage) -> Result<Vec<Pi
         *out = unwrap_part(&geometry.part(&parts[i], stage)?, scene, stage)?;
         stage.advance(parts[i].len() as u64)
     })?;
-    let mut pieces = try_with_capacity(flat.len() + curved.len(), CHARTS)?;
-    for piece in flat.into_iter().map(|(_, piece)| piece).chain(curved) {
+    let mut pieces = try_with_capacity(flat.len() + taken_over.len() + curved.len(), CHARTS)?;
+    for piece in flat.into_iter().map(|(_, piece)| piece).chain(taken_over).chain(curved) {
         pieces.push(piece.kept(scene.device())?);
     }
     Ok(pieces)

@@ -247,7 +247,7 @@ impl<'a, 'p> Comparison<'a, 'p> {
         let former = |ray: &Ray, hit: &RawHit| {
             let passes = |moved: &Bounds| moved.is_hit(ray.origin.into(), ray.direction.into(), hit.t);
             let former = match self.old.former {
-                Some(former) if !hit.is_miss() => former.triangle(&self.new.atlas.scene, hit.triangle),
+                Some(former) if !hit.is_miss() => former.surfaces.triangle(&self.new.atlas.scene, hit.triangle),
                 _ => Some(hit.triangle),
             };
             let triangle = former.filter(|_| !boxes.iter().any(passes))?;

@@ -252,7 +252,7 @@ impl Lightmap {
         desc.validate()?;
         scene.device().run(progress, || {
             let known = read(scene, desc, path, progress)?;
-            Self::lay_out(scene, desc, Some(known), progress)
+            Self::lay_out(scene, desc, Some(known), None, progress)
         })
     }
 }

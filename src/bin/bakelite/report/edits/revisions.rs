@@ -17,10 +17,11 @@ const ALL: f32 = 1e9;
 pub fn run(args: &ReportArgs, scene: &Arc<Scene>, map: &mut Lightmap, pieces: &[Piece]) -> Result<()> {
     println!("\nScenes described anew, without an object and with it again:\n");
     println!(
-        "| triangles | size | | commit, charts and texels, s | texels changed | keep_error | what changed, s | from nothing, s | \
-         kept | error, in these texels: what changed | from nothing | old light |"
+        "| triangles | size | | commit, s | charts and texels: those that changed, s | from nothing, s | charts kept | \
+         texels changed | keep_error | what changed, s | from nothing, s | kept | error, in these texels: what changed | \
+         from nothing | old light |"
     );
-    println!("|---|---|---|---|---|---|---|---|---|---|---|---|");
+    println!("|---|---|---|---|---|---|---|---|---|---|---|---|---|---|---|");
     for piece in pieces {
         map.bake(&args.bake.params, &Progress::none())?;
         let mut less = revise(args, scene, map, Some(piece), piece)?;
@@ -42,8 +43,12 @@ fn revise(
     let data = copy(scene, without)?;
     let start = Instant::now();
     let revised = Scene::commit(scene.device(), data, &args.bake.build, &progress).map_err(|(_, e)| e)?;
-    let mut map = Lightmap::create(&revised, &args.bake.desc, &progress)?;
-    let made = start.elapsed().as_secs_f64();
+    let commit = start.elapsed().as_secs_f64();
+    let desc = &args.bake.desc;
+    let (anew, of_all) = Time::of(|| Lightmap::create(&revised, desc, &progress))?;
+    let (mut map, of_changed) = Time::of(|| Lightmap::create_from(&revised, desc, earlier, &progress))?;
+    drop(anew);
+    let info = map.info();
     let (_, whole) = Time::of(|| map.bake(&params, &progress))?;
     let from_nothing_light = light(&map)?;
     map.bake(&BakeParams { seed: params.seed + 1, passes: PASSES, ..params }, &progress)?;
@@ -61,10 +66,13 @@ fn revise(
     for keep_error in KEEP_ERRORS {
         let (stats, time) = Time::of(|| map.bake_changed_from(earlier, &params, keep_error, &progress))?;
         println!(
-            "| {} | {:.2} | {} | {made:.2} | {:.2} % | {keep_error} | {} | {} | {:.1} % | {} | {} | {} |",
+            "| {} | {:.2} | {} | {commit:.2} | {} | {} | {:.1} % | {:.2} % | {keep_error} | {} | {} | {:.1} % | {} | {} | {} |",
             piece.triangles,
             piece.size,
             if without.is_some() { "taken away" } else { "put back" },
+            of_changed.text(),
+            of_all.text(),
+            100.0 * f64::from(info.kept_charts) / f64::from(info.charts),
             100.0 * count as f64 / texels,
             time.text(),
             whole.text(),
