@@ -48,6 +48,12 @@ impl Bounds {
         (self.upper - self.lower).length()
     }
 
+    /// Returns the length of the sides that are neither the longest nor the shortest.
+    pub fn width(&self) -> f32 {
+        let d = self.upper - self.lower;
+        d.element_sum() - d.min_element() - d.max_element()
+    }
+
     /// Returns the distance to another box, 0 if they overlap.
     pub fn distance(&self, other: &Bounds) -> f32 {
         (other.lower - self.upper).max(self.lower - other.upper).max(Vec3::ZERO).length()

@@ -177,11 +177,12 @@ pub unsafe extern "C" fn bk_lightmap_create(
 ///
 /// Meshes, and triangles in them, are the same if all their numbers are, bit for bit, in the same
 /// place. Far is more than four texels from boxes around all that only one of the scenes has, and
-/// not in a chart that touches one of which another side can be seen now; that a texel sees nothing
-/// but backs or hidden sides farther away is not noticed. Where charts lie on their pages depends on
-/// all of them: UVs are new. With another `desc`, with `texels_per_unit` 0 (which then is another
-/// density), or if a lamp was moved, added or removed, charts are taken over, and all texels are
-/// searched. bk_lightmap_info.kept_charts says of how many charts texels were taken over.
+/// more than its width from a chart with a side that is seen now and was not, or the other way
+/// round; that a texel sees nothing but backs farther away is not noticed. Where charts lie on their
+/// pages depends on all of them: UVs are new. With another `desc`, with `texels_per_unit` 0 (which
+/// then is another density), or if a lamp was moved, added or removed, charts are taken over, and
+/// all texels are searched. bk_lightmap_info.kept_charts says of how many charts texels were taken
+/// over.
 ///
 /// Cost: that of matching triangles, a third of a second per million, of laying out the pages, and
 /// of unwrapping new surfaces. Measured beside bk_lightmap_create: docs/performance.md, "Edits".

@@ -1,7 +1,7 @@
 //! Creates light maps: unwraps, lays out pages, maps texels to triangles and finds the texels that can be seen.
 
 use super::atlas::Atlas;
-use super::atlas::buried::Search;
+use super::atlas::buried::{Part, Search};
 use super::atlas::chart_index::ChartIndex;
 use super::atlas::chart_map::ChartMap;
 use super::atlas::charts::{Charts, automatic_density};
@@ -48,8 +48,8 @@ impl Lightmap {
     /// what has changed are not searched for those that nobody can see. For meshes that were added, removed or edited;
     /// [`bake_changed_from`](Self::bake_changed_from) then keeps their light.
     ///
-    /// Far is more than four texels from boxes around what has changed, and not in a chart that touches one of which another
-    /// side can be seen now. With another description or density, or if a lamp was moved, added or removed, charts are kept and
+    /// Far is more than four texels from boxes around what has changed, and more than its width from a chart with a side that is
+    /// seen now and was not, or the other way round. With another description or density, or if a lamp was moved, added or removed, charts are kept and
     /// all texels are searched.
     pub fn create_from(
         scene: &Arc<Scene>,
@@ -252,9 +252,14 @@ impl Maps {
         if buried.is_empty() {
             buried = were_buried;
         } else {
+            // One whose sample is another texel's that is covered now may have got a point of its own.
+            let is_searched = |texel| {
+                let chart = charts.chart_of(map[texel].triangle);
+                only.is_some_and(|only| only.charts[chart.index()] != Part::None)
+            };
+            let has_own = |texel| is_searched(texel) && map.is_of_own(charts, texel);
             let both = buried.iter_mut().zip(were_buried).zip(map.all());
-            // One with the sample of another texel that was covered now may have got a point of its own.
-            both.filter(|((_, was), _)| *was).for_each(|((is, _), texel)| *is |= !map.is_of_own(charts, texel));
+            both.filter(|((_, was), _)| *was).for_each(|((is, _), texel)| *is |= !has_own(texel));
         }
         let kept_charts = taken.map_or(0, |(_, taken)| taken.charts());
         Ok(Maps { map, gather, radiance, seen, with_backs, buried, sight_rays, kept_charts })

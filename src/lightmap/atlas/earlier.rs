@@ -29,8 +29,12 @@ const SAME: f32 = 0.01;
 /// Greatest relative difference of the area of a chart's triangles from that when it was made.
 const SAME_AREA: f64 = 0.01;
 
-/// Maximum number of boxes around charts of which another side can be seen than before.
+/// Maximum number of boxes around charts with a side that is hidden and was not, or the other way round.
 const MOST_TURNED: usize = 256;
+
+/// A side that was hidden is seen now, or the other way round, if its rays from open places have doubled or halved, by more than
+/// this number: else chance has decided, and nothing around it can have changed.
+const CLEARLY: u32 = 8;
 
 /// The atlas of an earlier scene, and what it has in common with the new one.
 pub(in crate::lightmap) struct Earlier<'a> {
@@ -97,48 +101,48 @@ impl<'a> Earlier<'a> {
         stage: &Stage,
     ) -> Result<TakenOver> {
         let atlas = self.atlas;
-        let boxes: Vec<Bounds> = self.boxes.iter().map(|bounds| bounds.grown(REACH * near)).collect();
+        let mut boxes: Vec<Bounds> = self.boxes.iter().map(|bounds| bounds.grown(REACH * near)).collect();
         let most = SAME / map.layout.density;
         let of_chart = |number: usize| {
             let chart = ChartId::new(number);
             stage.check()?;
             let Some(former) = self.has_same_lamps.then(|| self.former_chart(scene, charts, chart, most)).flatten()
             else {
-                return Ok((ChartId::NONE, Bounds::EMPTY, true));
+                return Ok((ChartId::NONE, Bounds::EMPTY, false));
             };
             let before = &atlas.seen;
-            let is_hidden = |seen: &Seen, chart| [true, false].map(|front| seen.is_hidden(chart, front));
-            let has_same_sides = is_hidden(seen, chart) == is_hidden(before, former)
+            let has_same_sides = [true, false].map(|front| seen.is_hidden(chart, front))
+                == [true, false].map(|front| before.is_hidden(former, front))
                 && seen.shows_back(chart) == before.shows_back(former);
+            let counts = [(seen, chart), (before, former)].map(|(seen, chart)| seen.counts.get(chart.index()));
+            let differ = |a: u32, b: u32| a.abs_diff(b) > a.min(b).max(CLEARLY);
+            let has_turned =
+                !has_same_sides && matches!(counts, [Some(&[a, b]), Some(&[c, d])] if differ(a, c) || differ(b, d));
             let size = charts[chart].size;
             let is_alike = are_alike((&atlas.map, former), (map, chart), size)
                 && are_alike((&atlas.gather, former), (gather, chart), size)
                 && are_alike((&atlas.radiance, former), (radiance, chart), size);
             let former = if has_same_sides && is_alike { former } else { ChartId::NONE };
-            Ok((former, charts.bounds(scene, chart), has_same_sides))
+            Ok((former, charts.bounds(scene, chart), has_turned))
         };
         let numbers = 0..charts.charts.len();
         let found = try_par_collect(one_by_one(numbers.into_par_iter().map(of_chart)), CHARTS)?;
         let (mut formers, mut bounds, mut turned) =
             (try_with_capacity(found.len(), CHARTS)?, try_with_capacity(found.len(), CHARTS)?, Vec::new());
         for of_chart in found {
-            let (former, around, has_same_sides): (ChartId, Bounds, bool) = of_chart?;
+            let (former, around, has_turned): (ChartId, Bounds, bool) = of_chart?;
             formers.push(former);
             bounds.push(around);
-            if !has_same_sides {
-                try_push(&mut turned, around.grown(REACH * near), CHARTS)?;
+            // What sees little else than this chart is no farther away than it is wide.
+            if has_turned {
+                try_push(&mut turned, around.grown(around.width().max(REACH * near)), CHARTS)?;
             }
         }
-        let turned = merged(turned, MOST_TURNED);
-        let part = |(former, around): (&ChartId, &Bounds)| {
-            let overlaps = |boxes: &[Bounds]| boxes.iter().any(|bounds| bounds.overlaps(around));
-            // Where a side that was hidden can be seen now, or the other way round, texels far from it may be buried or not.
-            match (former, overlaps(&boxes)) {
-                (&ChartId::NONE, _) => Part::All,
-                _ if overlaps(&turned) => Part::All,
-                (_, true) => Part::Near,
-                (_, false) => Part::None,
-            }
+        boxes.append(&mut merged(turned, MOST_TURNED));
+        let part = |(former, around): (&ChartId, &Bounds)| match former {
+            &ChartId::NONE => Part::All,
+            _ if boxes.iter().any(|bounds| bounds.overlaps(around)) => Part::Near,
+            _ => Part::None,
         };
         let parts = formers.par_iter().zip(&bounds).map(part);
         let searched = try_par_collect(parts, CHARTS)?;
@@ -253,7 +257,7 @@ pub(in crate::lightmap) struct TakenOver {
     formers: Vec<ChartId>,
     /// Part of each chart that is searched for buried texels. The rest is taken over.
     searched: Vec<Part>,
-    /// Boxes around what has changed, so large that nothing outside of them covers texels.
+    /// Boxes around what has changed, so large that nothing in the changes covers texels outside of them.
     boxes: Vec<Bounds>,
 }
 
