@@ -154,7 +154,7 @@ static void bake(const Scene &scene) {
     VALUE(map.follow(scene));
     CHECK_FAILS(map.bake_changed({}, -1), BK_ERROR_INVALID_ARGUMENT, "keep_error");
     VALUE(map.bake_changed({}, 0.1f));
-    const LightmapInfo revised = VALUE(VALUE(Lightmap::create_from(scene, map)).info());
+    const LightmapInfo revised = VALUE(VALUE(Lightmap::create_from(scene, map, desc)).info());
     CHECK(revised.kept_charts == revised.charts);
     CHECK_FAILS(map.bake_changed_from(map, {}, 0.1f), BK_ERROR_INVALID_ARGUMENT, "earlier");
     CHECK(map.plan().find("direct") != std::string::npos && map.plan().back() != '\0');

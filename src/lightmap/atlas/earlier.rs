@@ -14,7 +14,7 @@ use super::texels::TexelSample;
 use crate::base::bounds::Bounds;
 use crate::base::error::Result;
 use crate::base::memory::{try_collect, try_par_collect, try_push, try_vec, try_with_capacity};
-use crate::base::parallel::one_by_one;
+use crate::base::parallel::{ParallelLoop, one_by_one};
 use crate::base::progress::{Progress, Stage};
 use crate::base::sort::sort;
 use crate::lightmap::moved::{MOST_BOXES, merged};
@@ -144,8 +144,7 @@ impl<'a> Earlier<'a> {
             _ if boxes.iter().any(|bounds| bounds.overlaps(around)) => Part::Near,
             _ => Part::None,
         };
-        let parts = formers.par_iter().zip(&bounds).map(part);
-        let searched = try_par_collect(parts, CHARTS)?;
+        let searched = try_collect(formers.iter().zip(&bounds).map(part), CHARTS)?;
         Ok(TakenOver { formers, searched, boxes })
     }
 
@@ -226,7 +225,7 @@ impl<'a> Earlier<'a> {
             let [a, b] = [a, b].map(|t| Vec2::from(charts.local(t.triangle, t.u, t.v)));
             a.distance_squared(b) <= most * most
         };
-        one_by_one(parts.into_par_iter()).try_for_each(|(chart, former, samples)| {
+        one_by_one(parts.into_par_iter()).try_each(|(chart, former, samples)| {
             stage.check()?;
             let number = |triangle| Some((self.surfaces.triangle(scene, triangle)?, triangle));
             let mut numbers = try_collect(charts.triangles_of(chart).map_while(number), BURIED)?;
