@@ -184,8 +184,8 @@ pub unsafe extern "C" fn bk_lightmap_create(
 /// all texels are searched. bk_lightmap_info.kept_charts says of how many charts texels were taken
 /// over.
 ///
-/// Cost: that of matching triangles, a third of a second per million, of laying out the pages, and
-/// of unwrapping new surfaces. Measured beside bk_lightmap_create: docs/performance.md, "Edits".
+/// Cost: that of matching triangles, up to a second per million, of laying out the pages, and of
+/// unwrapping new surfaces. Measured beside bk_lightmap_create: docs/performance.md, "Edits".
 ///
 /// @param scene  committed scene, kept alive by the light map
 /// @param desc  parameters; NULL for the defaults

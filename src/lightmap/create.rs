@@ -1,7 +1,7 @@
 //! Creates light maps: unwraps, lays out pages, maps texels to triangles and finds the texels that can be seen.
 
 use super::atlas::Atlas;
-use super::atlas::buried::{Part, Search};
+use super::atlas::buried::Search;
 use super::atlas::chart_index::ChartIndex;
 use super::atlas::chart_map::ChartMap;
 use super::atlas::charts::{Charts, automatic_density};
@@ -48,9 +48,9 @@ impl Lightmap {
     /// what has changed are not searched for those that nobody can see. For meshes that were added, removed or edited;
     /// [`bake_changed_from`](Self::bake_changed_from) then keeps their light.
     ///
-    /// Far is more than four texels from boxes around what has changed, and more than its width from a chart with a side that is
-    /// seen now and was not, or the other way round. With another description or density, or if a lamp was moved, added or removed, charts are kept and
-    /// all texels are searched.
+    /// Far is more than four texels from boxes around what has changed, and more than its width from a chart with a side that
+    /// is seen now and was not, or the other way round. With another description or density, or if a lamp was moved, added or
+    /// removed, charts are kept and all texels are searched.
     pub fn create_from(
         scene: &Arc<Scene>,
         desc: &LightmapDesc,
@@ -176,7 +176,7 @@ struct Maps {
     /// By texel of the light map; empty if none is.
     buried: Vec<bool>,
     sight_rays: u64,
-    /// Number of charts that were taken over from an earlier light map with their texels.
+    /// Number of charts of which texels were taken over from an earlier light map.
     kept_charts: u32,
 }
 
@@ -249,19 +249,11 @@ impl Maps {
             Ok((buried, of_radiance + of_gather + of_map))
         })?;
         let sight_rays = seen.rays + rays;
-        if buried.is_empty() {
-            buried = were_buried;
-        } else {
-            // One whose sample is another texel's that is covered now may have got a point of its own.
-            let is_searched = |texel| {
-                let chart = charts.chart_of(map[texel].triangle);
-                only.is_some_and(|only| only.charts[chart.index()] != Part::None)
-            };
-            let has_own = |texel| is_searched(texel) && map.is_of_own(charts, texel);
-            let both = buried.iter_mut().zip(were_buried).zip(map.all());
-            both.filter(|((_, was), _)| *was).for_each(|((is, _), texel)| *is |= !has_own(texel));
+        let mut kept_charts = 0;
+        if let Some((_, taken)) = &taken {
+            taken.add_buried(&were_buried, charts, &map, &mut buried)?;
+            kept_charts = taken.charts();
         }
-        let kept_charts = taken.map_or(0, |(_, taken)| taken.charts());
         Ok(Maps { map, gather, radiance, seen, with_backs, buried, sight_rays, kept_charts })
     }
 }

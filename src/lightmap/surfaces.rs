@@ -4,6 +4,8 @@
 //! Objects of the same content in the same place are matched first, by hashes and then bit for bit. Of the others, single
 //! triangles are, since an edited mesh may have kept most of its own. What is left in either scene was removed or is new.
 
+use super::atlas::charts::Charts;
+use super::atlas::ids::ChartId;
 use crate::base::bounds::Bounds;
 use crate::base::error::Result;
 use crate::base::geometry::is_valid_triangle;
@@ -109,6 +111,23 @@ impl Surfaces {
             Former::Object(first) => Some(first + of_object),
             Former::Triangles(begin) => Some(self.triangles[begin + of_object as usize]).filter(|&t| t != NONE),
         }
+    }
+
+    /// Returns the former number of a chart; `None` if none of its triangles was in one of as many triangles, or one lay
+    /// elsewhere in it, by more than `most`. (Of a chart of the caller's, single triangles may be new.) Charts of the earlier
+    /// scene come first.
+    pub fn chart(&self, scene: &Scene, [old, new]: [&Charts; 2], chart: ChartId, most: f32) -> Option<ChartId> {
+        let former = |triangle| self.triangle(scene, triangle);
+        let mut triangles = new.triangles_of(chart);
+        let found = old.find(triangles.clone().find_map(former)?)?;
+        let is_near = |(a, b): (&[f32; 2], &[f32; 2])| (a[0] - b[0]).abs() <= most && (a[1] - b[1]).abs() <= most;
+        let is_same = |triangle: u32| {
+            former(triangle).is_none_or(|former| {
+                let corners = [old.corners(former), new.corners(triangle)];
+                old.find(former) == Some(found) && corners[0].iter().zip(&corners[1]).all(is_near)
+            })
+        };
+        (triangles.len() == old.triangles_of(found).len() && triangles.all(is_same)).then_some(found)
     }
 }
 

@@ -148,23 +148,12 @@ impl<'a> Earlier<'a> {
         Ok(TakenOver { formers, searched, boxes })
     }
 
-    /// Returns the former chart of the same triangles in the same places, up to a distance.
+    /// Returns the former chart of the same triangles in the same places, up to a distance, that was theirs alone.
     fn former_chart(&self, scene: &Scene, charts: &Charts, chart: ChartId, most: f32) -> Option<ChartId> {
-        let before = &self.atlas.charts;
-        let is_near = |(a, b): (&[f32; 2], &[f32; 2])| (a[0] - b[0]).abs() <= most && (a[1] - b[1]).abs() <= most;
-        let mut triangles = charts.triangles_of(chart);
-        let former = |triangle| self.surfaces.triangle(scene, triangle);
-        let found = before.find(former(charts.triangles_of(chart).next()?)?)?;
-        let is_same = triangles.len() == before.triangles_of(found).len()
-            && triangles.all(|triangle| {
-                former(triangle).is_some_and(|former| {
-                    let corners = [before.corners(former), charts.corners(triangle)];
-                    before.find(former) == Some(found)
-                        && before.is_own(former)
-                        && corners[0].iter().zip(&corners[1]).all(is_near)
-                })
-            });
-        is_same.then_some(found)
+        let before = &*self.atlas.charts;
+        let found = self.surfaces.chart(scene, [before, charts], chart, most)?;
+        let had_own = |triangle| self.surfaces.triangle(scene, triangle).is_some_and(|former| before.is_own(former));
+        charts.triangles_of(chart).all(had_own).then_some(found)
     }
 
     /// Copies samples that are taken over. Returns which texels of the light map are buried among them; empty: none.
@@ -269,6 +258,26 @@ impl TakenOver {
     /// Returns the number of charts that are taken over, at least in part.
     pub fn charts(&self) -> u32 {
         self.formers.iter().filter(|&&former| former != ChartId::NONE).count() as u32
+    }
+
+    /// Adds the texels of the light map that [were](Earlier::copy) buried to those that the search has found (empty: none).
+    pub fn add_buried(
+        &self,
+        were: &[bool],
+        charts: &Charts,
+        map: &ChartMap<LightMap>,
+        buried: &mut Vec<bool>,
+    ) -> Result<()> {
+        if buried.is_empty() {
+            *buried = try_vec(were.len(), BURIED)?;
+        }
+        // One whose sample was another texel's may have been searched, and may have a point of its own now.
+        let is_searched = |texel| self.searched[charts.chart_of(map[texel].triangle).index()] != Part::None;
+        let has_own = |texel| is_searched(texel) && map.is_of_own(charts, texel);
+        for ((is, _), texel) in buried.iter_mut().zip(were).zip(map.all()).filter(|((_, was), _)| **was) {
+            *is |= !has_own(texel);
+        }
+        Ok(())
     }
 
     /// Returns the former place of a placement whose chart has a former one.

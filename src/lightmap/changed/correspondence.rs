@@ -44,7 +44,9 @@ impl Correspondence {
         let (surfaces, Rest { boxes, emits }) = Surfaces::between([&old.scene, &new.scene], progress)?;
         let mut found = Correspondence { surfaces, placements: Vec::new(), radiance_placements: Vec::new() };
         let charts = 0..new.charts.charts.len();
-        let former_chart = |chart| found.former_chart(old, new, ChartId::new(chart));
+        let most = SAME / new.map.layout.density;
+        let former = |chart| found.surfaces.chart(&new.scene, [&old.charts, &new.charts], ChartId::new(chart), most);
+        let former_chart = |chart| former(chart).unwrap_or(ChartId::NONE);
         let charts = try_par_collect(one_by_one(charts.into_par_iter().map(former_chart)), MATCHED)?;
         found.placements = try_collect(Self::former_placements(&old.map, &new.map, &charts), MATCHED)?;
         let of_radiance = Self::former_placements(&old.radiance, &new.radiance, &charts);
@@ -52,25 +54,6 @@ impl Correspondence {
         let has_moved = charts.iter().map(|&chart| chart == ChartId::NONE);
         let moved = Moved::new(try_collect(has_moved, MATCHED)?, boxes, emits);
         Ok((found, moved))
-    }
-
-    /// Returns the former number of a chart, [`ChartId::NONE`] if none of its triangles was in one of as many triangles, or
-    /// lay elsewhere in it. (Of a chart of the caller's, single triangles may be new.)
-    fn former_chart(&self, old: &Atlas, new: &Atlas, chart: ChartId) -> ChartId {
-        let former = |triangle| self.surfaces.triangle(&new.scene, triangle);
-        let triangles = new.charts.triangles_of(chart);
-        let first = triangles.clone().find_map(former);
-        let Some(found) = first.and_then(|triangle| old.charts.find(triangle)) else { return ChartId::NONE };
-        let most = SAME / new.map.layout.density;
-        let is_near = |(a, b): (&[f32; 2], &[f32; 2])| (a[0] - b[0]).abs() <= most && (a[1] - b[1]).abs() <= most;
-        let is_same = |triangle: u32| {
-            former(triangle).is_none_or(|former| {
-                let corners = [old.charts.corners(former), new.charts.corners(triangle)];
-                old.charts.find(former) == Some(found) && corners[0].iter().zip(&corners[1]).all(is_near)
-            })
-        };
-        let count = old.charts.triangles_of(found).len();
-        if triangles.len() == count && triangles.clone().all(is_same) { found } else { ChartId::NONE }
     }
 
     /// Yields the former placement of each placement of a map, given the former charts.
