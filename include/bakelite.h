@@ -2951,6 +2951,41 @@ bk_result bk_live_create(bk_lightmap *lightmap,
                          void *user,
                          bk_live **out);
 
+/// Creates a live object of a scene that was described anew, after meshes were added, removed or
+/// edited, with the parameters of the live object of the scene before, which is not changed.
+///
+/// Blocks of texels that show the same surfaces keep their rays, and their direct light where nothing
+/// that changed lies between them and a light. When all photons of the new scene have been traced, rays
+/// of a few texels of each block find out whether its indirect light differs by more than `keep_error`; if
+/// it does, it is gathered again, while the old light fades out. With bk_live_params.quick_start all that
+/// can be kept is shown at once, and photons are traced beside the updates, while
+/// bk_live_stats.light_pending is 1; else they are traced in this call. If light was pending in the earlier
+/// object, its light is shown until new rays replace it. All pages are dirty afterwards.
+///
+/// Cost: that of bk_live_create, and about 0.3 seconds per million texels and thread; see
+/// docs/performance.md, "Edits".
+///
+/// @param lightmap  light map of the new scene, best made by bk_lightmap_create_from; need not be baked,
+///   is not changed, and may be released
+/// @param earlier  live object of the scene before; it may be released afterwards
+/// @param keep_error  change of light below which blocks keep it, as a fraction of their light or, if
+///   that is more, of a tenth of the mean light; finite, >= 0. 0.03 is hard to see
+/// @param progress,user  progress callback and its pointer; may be NULL
+/// @param out  receives the live object, which the caller releases with bk_live_release; NULL on
+///   failure
+/// @retval BK_ERROR_INVALID_ARGUMENT  `keep_error` is out of its range
+/// @retval BK_ERROR_INVALID_STATE  the light map is being baked, or another call is using the earlier
+///   object
+/// @retval BK_ERROR_OUT_OF_MEMORY  both live objects do not fit or the memory callback refuses
+/// @retval BK_ERROR_CANCELLED  the progress callback returned 0
+BK_API
+bk_result bk_live_create_from(bk_lightmap *lightmap,
+                              bk_live *earlier,
+                              float keep_error,
+                              bk_progress_fn progress,
+                              void *user,
+                              bk_live **out);
+
 /// Adds one reference.
 ///
 /// @param live  NULL is ignored

@@ -628,6 +628,15 @@ public:
         Live live(out);
         return detail::finish(progress.after(code), std::move(live));
     }
+    /// Live light of a scene that was described anew, with the parameters and, where it stays, the light of that before.
+    static Result<Live> create_from(const Lightmap &map, const Live &earlier, float keep_error,
+                                    const Progress &progress = {}) {
+        bk_live *out = nullptr;
+        const bk_result code =
+            bk_live_create_from(map.get(), earlier.get(), keep_error, progress.function(), progress.user(), &out);
+        Live live(out);
+        return detail::finish(progress.after(code), std::move(live));
+    }
     Result<LiveStats> update(const Camera &camera, const Budget &budget = {}) {
         LiveStats stats;
         return detail::finish(bk_live_update(get(), &camera, &budget, &stats), stats);

@@ -1,5 +1,5 @@
-//! Live light whose scene moves: it ends with the light of the moved scene, what a move does not change keeps its rays, and
-//! an application sees every change.
+//! Live light whose scene moves, or is described anew: it ends with the light of the new scene, what a change does not reach
+//! keeps its rays, and an application sees every change.
 
 use bakelite::bvh::BuildOptions;
 use bakelite::lightmap::{Layer, LayerData, Lightmap, LightmapDesc};
@@ -37,20 +37,27 @@ fn lamp(x: f32, intensity: f32) -> Light {
 /// Two rooms of 4 × 4 × 3 m with a door between them, a lamp in each, and a block in the first one: mesh 2, or the instance
 /// of it.
 fn rooms(is_instance: bool) -> (Arc<Scene>, Lightmap) {
+    let block = block(Vec3::new(0.6, 0.6, 0.0), Vec3::new(1.1, 1.1, 0.6), false);
+    let scene = rooms_with(&[block], is_instance, 5.0);
+    (scene.clone(), map_of(&scene))
+}
+
+/// The rooms with other blocks, of which the first is an instance or none is, and the intensity of the second lamp.
+fn rooms_with(blocks: &[Mesh], is_instance: bool, intensity: f32) -> Arc<Scene> {
     let mut data = SceneData::new();
     data.add_material(Material { albedo: [0.7; 3], ..Default::default() }).unwrap();
     data.add_mesh(block(Vec3::ZERO, Vec3::new(8.0, 4.0, 3.0), true)).unwrap();
     data.add_mesh(block(Vec3::new(3.9, 0.0, 0.0), Vec3::new(4.1, 2.8, 3.0), false)).unwrap();
-    data.add_mesh(block(Vec3::new(0.6, 0.6, 0.0), Vec3::new(1.1, 1.1, 0.6), false)).unwrap();
+    for block in blocks {
+        data.add_mesh(block.clone()).unwrap();
+    }
     if is_instance {
         data.add_instance(Instance::new(2, Affine3A::IDENTITY)).unwrap();
     }
-    for x in [2.0, 6.0] {
-        data.add_light(lamp(x, 5.0)).unwrap();
-    }
+    data.add_light(lamp(2.0, 5.0)).unwrap();
+    data.add_light(lamp(6.0, intensity)).unwrap();
     let device = Device::new(DeviceOptions { num_threads: 2, ..Default::default() }).unwrap();
-    let scene = Scene::commit(&device, data, &BuildOptions::default(), &Progress::none()).map_err(|e| e.1).unwrap();
-    (scene.clone(), map_of(&scene))
+    Scene::commit(&device, data, &BuildOptions::default(), &Progress::none()).map_err(|e| e.1).unwrap()
 }
 
 fn map_of(scene: &Arc<Scene>) -> Lightmap {
@@ -278,4 +285,143 @@ fn what_cannot_be_followed_changes_nothing() {
     assert!(matches!(live.restore(&path, &none), Err(Error::InvalidArgument(_))));
     std::fs::remove_file(&path).unwrap();
     finish(&mut live);
+}
+
+/// A light map of a scene described anew, with charts of the one before.
+fn map_from(scene: &Arc<Scene>, earlier: &Lightmap) -> Lightmap {
+    let desc = LightmapDesc { texels_per_unit: 16.0, page_size: 512, ..Default::default() };
+    Lightmap::create_from(scene, &desc, earlier, &Progress::none()).unwrap()
+}
+
+#[test]
+fn a_scene_that_is_described_anew_and_the_same_keeps_all_light() {
+    for (is_instance, mode, directional) in [(false, Mode::Uniform, 3), (true, Mode::Position, 0)] {
+        let none = Progress::none();
+        let (scene, lightmap) = rooms(is_instance);
+        let params = LiveParams { directional, ..params(mode) };
+        let mut live = Live::new(&lightmap, &params, &none).unwrap();
+        finish(&mut live);
+        let blocks: Vec<Mesh> = scene.meshes()[2..].to_vec();
+        let again = rooms_with(&blocks, is_instance, 5.0);
+        let map = map_from(&again, &lightmap);
+        let mut carried = Live::create_from(&map, &mut live, 0.0, &none).unwrap();
+        let stats = carried.update(&camera(0), &RAYS).unwrap();
+        assert_eq!((stats.finished, stats.light_pending, stats.dirty_bytes > 0), (1.0, false, true), "{mode:?}");
+        assert_eq!(carried.sums().unwrap(), live.sums().unwrap(), "{mode:?}");
+        for layer in [Layer::Direct, Layer::Indirect] {
+            assert_eq!(pages(&carried, &map, layer), pages(&live, &lightmap, layer), "{mode:?}, {layer:?}");
+        }
+    }
+}
+
+#[test]
+fn what_an_added_or_removed_block_does_not_change_keeps_its_rays() {
+    let none = Progress::none();
+    let near = block(Vec3::new(0.6, 0.6, 0.0), Vec3::new(1.1, 1.1, 0.6), false);
+    let other = block(Vec3::new(6.5, 2.5, 0.0), Vec3::new(7.0, 3.0, 0.5), false);
+    for (before, after) in [(&[near.clone(), other.clone()][..], &[other.clone()][..]), (&[], &[near])] {
+        let earlier = map_of(&rooms_with(before, false, 5.0));
+        let scene = rooms_with(after, false, 5.0);
+        let mut map = map_from(&scene, &earlier);
+        let mut ends = Vec::new();
+        for quick_start in [false, true] {
+            let params = LiveParams { quick_start, ..params(Mode::Uniform) };
+            let mut live = Live::new(&earlier, &params, &none).unwrap();
+            finish(&mut live);
+            let of_before = live.sums().unwrap();
+            let mut carried = Live::create_from(&map, &mut live, 0.05, &none).unwrap();
+            assert_eq!(live.sums().unwrap(), of_before);
+            // It needs neither the object nor the light map that it was made from.
+            drop(live);
+            let at_once = pages(&carried, &map, Layer::Indirect);
+            let with_rays = |sums: &[([f32; 3], u32)]| sums.iter().filter(|sum| sum.1 == 128).count();
+            let known = with_rays(&carried.sums().unwrap());
+            finish(&mut carried);
+            let (sums, n) = (carried.sums().unwrap(), map.info().gather_texels as usize);
+            assert_eq!(with_rays(&sums), n);
+            let mut fresh = Live::new(&map, &params, &none).unwrap();
+            let coarse = pages(&fresh, &map, Layer::Indirect);
+            finish(&mut fresh);
+            let of_fresh = fresh.sums().unwrap();
+            let is_of_before = |sum: &([f32; 3], u32)| of_before.contains(sum);
+            let neither = (0..n).filter(|&i| sums[i] != of_fresh[i] && !is_of_before(&sums[i])).count();
+            assert_eq!(neither, 0, "quick_start {quick_start}: texels with sums that are neither old nor new");
+            let kept = (0..n).filter(|&i| sums[i] != of_fresh[i]).count();
+            assert!(kept > n / 10 && known > n / 2, "quick_start {quick_start}: {kept}, {known} of {n}");
+            for layer in [Layer::Direct, Layer::Indirect] {
+                let shown = pages(&carried, &map, layer);
+                let (right, valid) = baked(&mut map, &carried, layer);
+                let wrong = worst(&shown, &right, &valid);
+                assert!(wrong <= most_error(layer, 0.05), "quick_start {quick_start}, {layer:?}: wrong by {wrong}");
+                if layer == Layer::Indirect {
+                    let mean = |light: &[[f32; 3]]| {
+                        let difference = |i: usize| (light[i][0] - right[i][0]).abs();
+                        let seen = || (0..valid.len()).filter(|&i| valid[i]);
+                        seen().map(difference).sum::<f32>() / seen().map(|i| right[i][0]).sum::<f32>()
+                    };
+                    let (at_once, coarse) = (mean(&at_once), mean(&coarse));
+                    assert!(
+                        at_once < 0.5 * coarse,
+                        "quick_start {quick_start}: wrong by {at_once}, from nothing {coarse}"
+                    );
+                }
+            }
+            ends.push((sums, pages(&carried, &map, Layer::Combined)));
+        }
+        assert!(ends[0] == ends[1], "a quick start ends with other light");
+    }
+}
+
+#[test]
+fn other_lights_in_a_scene_that_is_described_anew_shine() {
+    let none = Progress::none();
+    let (scene, earlier) = rooms(false);
+    let blocks: Vec<Mesh> = scene.meshes()[2..].to_vec();
+    for quick_start in [false, true] {
+        let mut live = Live::new(&earlier, &LiveParams { quick_start, ..params(Mode::Uniform) }, &none).unwrap();
+        finish(&mut live);
+        let mut map = map_from(&rooms_with(&blocks, false, 50.0), &earlier);
+        let mut carried = Live::create_from(&map, &mut live, 0.02, &none).unwrap();
+        if quick_start {
+            // Another change before the photons of this one have come.
+            map.scene().set_light(1, lamp(6.0, 40.0)).unwrap();
+            carried.light_changed(1).unwrap();
+        }
+        finish(&mut carried);
+        for layer in [Layer::Direct, Layer::Indirect] {
+            let shown = pages(&carried, &map, layer);
+            let (right, valid) = baked(&mut map, &carried, layer);
+            let wrong = worst(&shown, &right, &valid);
+            assert!(wrong <= most_error(layer, 0.02), "quick_start {quick_start}, {layer:?}: wrong by {wrong}");
+        }
+    }
+}
+
+#[test]
+fn live_light_is_carried_on_the_way_and_moved_after_it() {
+    let none = Progress::none();
+    let (scene, earlier) = rooms(false);
+    let blocks: Vec<Mesh> = scene.meshes()[2..].to_vec();
+    let params = LiveParams { quick_start: true, ..params(Mode::Uniform) };
+    // The earlier object has a first impression alone, or less light than it will have.
+    let mut live = Live::new(&earlier, &params, &none).unwrap();
+    let mut again = rooms_with(&blocks, false, 5.0);
+    let mut map = map_from(&again, &earlier);
+    let mut carried = Live::create_from(&map, &mut live, 0.05, &none).unwrap();
+    drop(live);
+    // And the scene moves before the photons have come.
+    move_block(&mut again, Vec3::new(0.3, 0.2, 0.0));
+    map.follow(&again, &none).unwrap();
+    carried.follow(&map, 0.05, &none).unwrap();
+    finish(&mut carried);
+    for layer in [Layer::Direct, Layer::Indirect] {
+        let shown = pages(&carried, &map, layer);
+        let (right, valid) = baked(&mut map, &carried, layer);
+        let wrong = worst(&shown, &right, &valid);
+        assert!(wrong <= most_error(layer, 0.05), "{layer:?}: wrong by {wrong}");
+    }
+    assert!(matches!(Live::create_from(&map, &mut carried, -1.0, &none), Err(Error::InvalidArgument(_))));
+    assert!(matches!(Live::create_from(&map, &mut carried, f32::NAN, &none), Err(Error::InvalidArgument(_))));
+    let cancel = Progress::new(|_, _| false);
+    assert!(matches!(Live::create_from(&map, &mut carried, 0.0, &cancel), Err(Error::Cancelled)));
 }

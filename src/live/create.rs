@@ -18,9 +18,9 @@ use crate::base::memory::{try_vec, try_with_capacity};
 use crate::base::parallel::{ParallelLoop, one_by_one};
 use crate::base::progress::Progress;
 use crate::base::sampling::purpose_seed;
-use crate::lightmap::Lightmap;
 use crate::lightmap::indirect::sample_set::SampleSet;
 use crate::lightmap::stages::purpose;
+use crate::lightmap::{BakeParams, Lightmap};
 use glam::Vec3;
 use rayon::prelude::*;
 use std::collections::VecDeque;
@@ -39,7 +39,8 @@ impl Live {
         params.validate()?;
         let device = lightmap.atlas().scene.device();
         device.run(progress, || {
-            let mut live = Live::idle(lightmap, params, progress)?;
+            let light = |bake: &_| Illumination::new(lightmap.atlas(), bake, params.quick_start, progress);
+            let mut live = Live::idle(lightmap, params, light, progress)?;
             live.start(progress)?;
             if params.quick_start && live.context.light.has_indirect {
                 live.make_room_for_epochs()?;
@@ -49,15 +50,20 @@ impl Live {
         })
     }
 
-    /// Creates the object with all buffers; only photons and radiance are computed.
-    pub(super) fn idle(lightmap: &Lightmap, params: &LiveParams, progress: &Progress) -> Result<Live> {
+    /// Creates the object with all buffers; only photons and radiance are computed, by `light`.
+    pub(super) fn idle(
+        lightmap: &Lightmap,
+        params: &LiveParams,
+        light: impl FnOnce(&BakeParams) -> Result<Illumination>,
+        progress: &Progress,
+    ) -> Result<Live> {
         let atlas = lightmap.atlas();
         let bake = params.bake();
         let mut map = BlockMap::new(atlas, params.lod_count, 0.02, progress)?;
         let (lower, upper) = atlas.scene.bounds();
         let grid = Grid::new(lower, upper, params.cell_size, &mut map.tiles)?;
         let lights = atlas.scene.lights();
-        let light = Illumination::new(atlas, &bake, params.quick_start, progress)?;
+        let light = light(&bake)?;
         progress.check()?;
         let display = Display::new(&map, params.blur, params.directional != 0)?;
         progress.check()?;

@@ -7,17 +7,18 @@
 
 use super::Live;
 use super::Mode;
-use super::blocks::{BlockMap, Rect};
+use super::blocks::{BlockMap, Rect, Tile};
 use super::cells::{Grid, Promotion};
 use super::choose::Chooser;
 use super::display::{Changed, Display};
-use super::illumination::{Illumination, Indirect, Part, Sides};
+use super::illumination::{Illumination, Indirect, Part};
 use crate::base::error::{Result, invalid_argument};
-use crate::base::memory::{Reservation, try_collect, try_filled};
+use crate::base::memory::{Reservation, try_collect, try_filled, try_to_vec};
 use crate::base::progress::Progress;
 use crate::direct::DirectLight;
 use crate::lightmap::atlas::Atlas;
-use crate::lightmap::changed::comparison::{Comparison, SceneState};
+use crate::lightmap::changed::comparison::{Cell, Comparison, SceneState};
+use crate::lightmap::changed::correspondence::Correspondence;
 use crate::lightmap::indirect::radiance_map::Radiance;
 use crate::lightmap::moved::Moved;
 use crate::lightmap::{BakeParams, Lightmap};
@@ -26,23 +27,28 @@ use std::sync::Arc;
 
 const MOVED: &str = "blocks whose light a move has changed";
 
-/// The light from before a move, with which that after it is compared.
+/// The light from before a change, with which that after it is compared.
 pub(super) struct Base {
-    map: Arc<BlockMap>,
-    radiance: Arc<Radiance>,
-    sides: Arc<Sides>,
-    /// Light of each block, by the sum of its channels, and its mean over the light map.
-    light: Vec<f32>,
-    mean: f32,
-    _memory: Reservation,
+    pub atlas: Arc<Atlas>,
+    pub radiance: Arc<Radiance>,
+    /// Which charts show their backs, by their numbers after the change (empty: none).
+    pub backs: Vec<bool>,
+    /// How surfaces were numbered, and what changed, if the scene was described anew.
+    pub former: Option<(Correspondence, Moved)>,
+    /// Blocks as they are numbered after the change, the light of each from before it, by the sum of its channels, and its
+    /// mean over the light map.
+    pub map: Arc<BlockMap>,
+    pub light: Vec<f32>,
+    pub mean: f32,
+    pub _memory: Reservation,
 }
 
 /// What a renewal of indirect light is compared with.
 #[derive(Clone)]
 pub(super) struct Following {
-    base: Arc<Base>,
+    pub base: Arc<Base>,
     /// Relative difference of light that is let stand.
-    keep_error: f32,
+    pub keep_error: f32,
 }
 
 impl Following {
@@ -51,16 +57,50 @@ impl Following {
         if !new.has_indirect {
             return Ok(Vec::new());
         }
-        let base = &*self.base;
-        let old = &*base.map.atlas;
-        let moved = Moved::between(&old.scene, &atlas.scene, &atlas.charts)?;
-        let old = SceneState { atlas: old, backs: &base.sides.backs, former: None };
-        let states = [old, SceneState { atlas, backs: &new.sides.backs, former: None }];
-        let comparison = Comparison::new(states, &moved, self.keep_error, progress)?;
-        let mut cells = comparison.cells()?;
-        let light = |texel| base.light[base.map.block_of(texel) as usize];
-        comparison.probe(&mut cells, [&base.radiance, &new.radiance], params, light, base.mean)?;
+        let cells = self.cells(atlas, &new.sides.backs, Some((&new.radiance, params)), progress)?;
         try_collect(cells.iter().map(|cell| !cell.is_new), MOVED)
+    }
+
+    /// Compares all blocks with what they were: by what lies near them, and by probes under new light with all photons, if
+    /// that is given.
+    pub fn cells(
+        &self,
+        atlas: &Atlas,
+        backs: &[bool],
+        light: Option<(&Radiance, &BakeParams)>,
+        progress: &Progress,
+    ) -> Result<Vec<Cell>> {
+        let base = &*self.base;
+        let old = &*base.atlas;
+        let between;
+        let (former, moved) = match &base.former {
+            Some((former, moved)) => (Some(former), moved),
+            None => {
+                between = Moved::between(&old.scene, &atlas.scene, &atlas.charts)?;
+                (None, &between)
+            }
+        };
+        let old = SceneState { atlas: old, backs: &base.backs, former };
+        let states = [old, SceneState { atlas, backs, former: None }];
+        let comparison = Comparison::new(states, moved, self.keep_error, progress)?;
+        let mut cells = comparison.cells()?;
+        if let Some((radiance, params)) = light {
+            let light = |texel| base.light[base.map.block_of(texel) as usize];
+            comparison.probe(&mut cells, [&base.radiance, radiance], params, light, base.mean)?;
+        }
+        Ok(cells)
+    }
+}
+
+impl Base {
+    /// Returns the mean of the light of blocks.
+    pub fn mean(light: &[f32], tiles: &[Tile]) -> f32 {
+        let (mut sum, mut texels) = (0.0, 0.0);
+        for (light, tile) in light.iter().zip(tiles) {
+            let n = f64::from(tile.map_texels);
+            (sum, texels) = (sum + f64::from(*light) * n, texels + n);
+        }
+        (sum / f64::max(texels, 1.0)) as f32
     }
 }
 
@@ -140,6 +180,12 @@ impl Live {
             map: Arc::new(map),
             grid,
         };
+        self.make_room_for_stale()?;
+        Ok(place)
+    }
+
+    /// Makes the marks of blocks whose light a change has made stale, if there are none.
+    pub(super) fn make_room_for_stale(&mut self) -> Result<()> {
         if self.is_stale.is_empty() {
             let count = self.blocks.len();
             self.reserve(count)?;
@@ -147,13 +193,17 @@ impl Live {
             self.fixed += count;
             self.bytes_full += count as u64;
         }
-        Ok(place)
+        Ok(())
     }
 
     /// Returns what the light after a move is to be compared with: that from before the first move since all blocks had
     /// the same; `None` if they have not.
     fn following(&self, keep_error: f32) -> Result<Option<Following>> {
         if let Some(following) = &self.relight.following {
+            if following.base.former.is_some() {
+                // Surfaces are numbered otherwise than when the scene was described anew and have moved since.
+                return Ok(None);
+            }
             let keep_error = keep_error.min(following.keep_error);
             return Ok(Some(Following { keep_error, ..following.clone() }));
         }
@@ -163,16 +213,13 @@ impl Live {
         }
         let map = &self.context.map;
         let of_blocks = try_collect(self.blocks.status().iter().map(|b| b.mean + b.direct_mean), MOVED)?;
-        let (mut sum, mut texels) = (0.0, 0.0);
-        for (light, tile) in of_blocks.iter().zip(&map.tiles) {
-            let n = f64::from(tile.map_texels);
-            (sum, texels) = (sum + f64::from(*light) * n, texels + n);
-        }
-        let mean = (sum / f64::max(texels, 1.0)) as f32;
-        let (radiance, sides) = (light.radiance.clone(), light.sides.clone());
+        let mean = Base::mean(&of_blocks, &map.tiles);
+        let radiance = light.radiance.clone();
+        let backs = try_to_vec(&light.sides.backs, MOVED)?;
         let bytes = map.bytes() + size_of_val(&radiance.values[..]) + size_of_val(&of_blocks[..]);
         let memory = map.atlas.scene.device().memory().reserve(bytes, MOVED)?;
-        let base = Base { map: map.clone(), radiance, sides, light: of_blocks, mean, _memory: memory };
+        let (atlas, map) = (map.atlas.clone(), map.clone());
+        let base = Base { atlas, radiance, backs, former: None, map, light: of_blocks, mean, _memory: memory };
         Ok(Some(Following { base: Arc::new(base), keep_error }))
     }
 
@@ -221,7 +268,7 @@ impl Live {
     }
 
     /// Shows the LOD that all blocks of a cell have, after blocks came to other cells.
-    fn show_cells(&mut self) {
+    pub(super) fn show_cells(&mut self) {
         if self.params.mode != Mode::Position {
             return;
         }

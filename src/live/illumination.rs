@@ -3,16 +3,19 @@
 
 use super::blocks::Rect;
 use crate::base::error::Result;
-use crate::base::memory::{try_collect, try_vec};
+use crate::base::memory::{try_collect, try_par_collect, try_vec};
 use crate::base::progress::Progress;
 use crate::direct::DirectLight;
 use crate::lightmap::atlas::Atlas;
+use crate::lightmap::atlas::ids::RadianceTexel;
+use crate::lightmap::changed::correspondence::Correspondence;
 use crate::lightmap::indirect::fallback_gather::{OwnDirectional, OwnLight};
 use crate::lightmap::indirect::radiance_map::Radiance;
 use crate::lightmap::indirect::upsample::Upsampling;
 use crate::lightmap::plan::{Plan, left_out};
 use crate::lightmap::stages::{self, Inputs, Own};
 use crate::lightmap::{BakeParams, BakeStats, directional};
+use rayon::prelude::*;
 use std::sync::Arc;
 
 /// The shown sides of charts.
@@ -134,6 +137,39 @@ impl Illumination {
             direct_epoch: 1,
             indirect_epoch: 1,
         })
+    }
+
+    /// Computes light of a scene that was described anew, with that of `before` it where surfaces show the same, and a first
+    /// impression elsewhere. `former`: how surfaces were numbered, in the atlas of before.
+    pub fn carried(
+        atlas: &Atlas,
+        params: &BakeParams,
+        before: &Illumination,
+        (old, former): (&Atlas, &Correspondence),
+        progress: &Progress,
+    ) -> Result<Illumination> {
+        let mut light = Illumination::new(atlas, params, true, progress)?;
+        if !light.has_indirect || !before.has_indirect || before.radiance.values.is_empty() {
+            return Ok(light);
+        }
+        let inputs = Inputs { atlas, direct: &light.direct, params, progress };
+        let (map, first) = (&atlas.radiance, &light.radiance.values);
+        let radiance = |i: usize| {
+            let texel = RadianceTexel::new(i);
+            let former = former.radiance_texel(old, atlas, map.placement_of(&atlas.charts, texel), texel);
+            former.map_or(first[i], |former| before.radiance.values[former.index()])
+        };
+        let values = try_par_collect((0..first.len()).into_par_iter().map(radiance), "the radiance map")?;
+        // Bright patches are left to all photons: until then gather rays find them.
+        let radiance = Radiance { values, ..Default::default() };
+        let backs = former.backs(&before.sides.backs, &light.sides.backs)?;
+        let upsampling = stages::upsampling(&inputs, &backs, 0..atlas.map.layout.placements.len(), None)?;
+        let asks = params.directional & directional::INDIRECT != 0;
+        let own = stages::own_light(&inputs, &radiance, &backs, &upsampling, None, asks, (0.315, 0.32))?;
+        light.radiance = Arc::new(radiance);
+        light.sides = Arc::new(Sides { backs, upsampling, is_first_impression: false });
+        (light.own, light.own_directional) = (Arc::new(own.light), Arc::new(own.directional));
+        Ok(light)
     }
 
     /// Makes a copy with new indirect light.

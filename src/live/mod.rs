@@ -15,6 +15,7 @@
 mod background;
 mod batch;
 mod blocks;
+mod carry;
 mod cells;
 mod choose;
 mod create;

@@ -61,11 +61,14 @@ impl std::fmt::Write for Hash {
     }
 }
 
-/// A block as read from a file.
-struct Saved {
-    block: Block,
-    shown: u8,
-    direct: Option<DirectTile>,
+/// A block as read from a file, or as another object has it.
+#[derive(Default)]
+pub(super) struct Saved {
+    pub block: Block,
+    pub shown: u8,
+    pub direct: Option<DirectTile>,
+    /// Whether its indirect light is that of before a change.
+    pub is_old: bool,
 }
 
 /// Reason for which a part of a file is rejected.
@@ -137,7 +140,7 @@ impl Live {
     }
 
     /// Makes display and blocks from the saved ones: the part of restoring that can fail.
-    fn restored(&mut self, saved: Vec<Saved>, progress: &Progress) -> Result<(Display, Blocks)> {
+    pub(super) fn restored(&mut self, saved: Vec<Saved>, progress: &Progress) -> Result<(Display, Blocks)> {
         let direct = |s: &Saved| s.direct.as_ref().map_or(0, DirectTile::bytes);
         let held: usize = saved.iter().map(|s| s.block.work.bytes() + direct(s)).sum();
         // Old and new state are held at the same time.
@@ -159,7 +162,7 @@ impl Live {
             block.status.coarse_epoch = old.coarse_epoch;
             block.status.direct_mean = old.direct_mean;
             block.status.direct_epoch = old.direct_epoch;
-            block.status.indirect_epoch = context.light.indirect_epoch;
+            block.status.indirect_epoch = context.light.indirect_epoch - u32::from(saved.is_old);
             if let Some(tile) = saved.direct
                 && block.status.changes_behind(context) == 0
             {
@@ -178,7 +181,7 @@ impl Live {
         Ok((display, blocks))
     }
 
-    fn go_on_from(&mut self, display: Display, blocks: Blocks) {
+    pub(super) fn go_on_from(&mut self, display: Display, blocks: Blocks) {
         self.display = display;
         self.blocks.replace_by(blocks);
         self.held = self.blocks.bytes() as isize + self.display.tile_bytes() as isize;
@@ -378,6 +381,7 @@ impl Live {
             },
             shown,
             direct,
+            is_old: false,
         })
     }
 

@@ -965,9 +965,16 @@ fn live(w: &W, s: &mut Source) {
     }
     let mut out = std::ptr::dangling_mut();
     let watched = Watched::new(w, s);
-    let result = ask!(bk_live_create(lightmap.p(), &params, Some(progress), watched.user(), &mut out));
-    watched.end("bk_live_create", result);
-    check_created("bk_live_create", result, out.cast());
+    let (name, result) = if let Some(earlier) = w.pick(Kind::Live, s).filter(|_| s.one_in(3)) {
+        let keep_error = [0.0, 0.03, 1.0, -1.0, f32::NAN, f32::INFINITY][s.below(6)];
+        let (map, earlier) = (lightmap.p(), earlier.p());
+        let result = ask!(bk_live_create_from(map, earlier, keep_error, Some(progress), watched.user(), &mut out));
+        ("bk_live_create_from", result)
+    } else {
+        ("bk_live_create", ask!(bk_live_create(lightmap.p(), &params, Some(progress), watched.user(), &mut out)))
+    };
+    watched.end(name, result);
+    check_created(name, result, out.cast());
     if result == BK_OK {
         w.add(Handle::new(out, Kind::Live, lightmap.life()));
     }
@@ -1168,6 +1175,8 @@ fn null_handles(s: &mut Source) {
             failed(ask!(bk_lightmap_save(null(), null(), 1, None, null_mut())));
             failed(ask!(bk_lightmap_write(null_mut(), null(), 0, 1, null(), None, null_mut())));
             failed(ask!(bk_live_create(null_mut(), null(), None, null_mut(), words.as_mut_ptr().cast())));
+            let live = words.as_mut_ptr().cast();
+            failed(ask!(bk_live_create_from(null_mut(), null_mut(), 0.0, None, null_mut(), live)));
             failed(ask!(bk_live_update(null_mut(), null(), null(), null_mut())));
             failed(ask!(bk_live_save(null_mut(), null(), None, null_mut())));
             if bk!(bk_plan_describe(null(), null_mut(), 0)) != 0 || bk!(bk_live_lod_at(null(), null())) != BK_NONE {

@@ -11,7 +11,7 @@ use crate::base::parallel::one_by_one;
 use crate::base::progress::Progress;
 use crate::lightmap::atlas::Atlas;
 use crate::lightmap::atlas::chart_map::ChartMap;
-use crate::lightmap::atlas::ids::{ChartId, LightTexel, Map, PlacementId, RadianceTexel, TexelId};
+use crate::lightmap::atlas::ids::{ChartId, GatherTexel, LightTexel, Map, PlacementId, RadianceTexel, TexelId};
 use crate::lightmap::atlas::layout::Placement;
 use crate::lightmap::atlas::texels::TexelSample;
 use crate::lightmap::indirect::radiance_map::Radiance;
@@ -32,9 +32,12 @@ const SAME_NORMAL: f32 = 1e-3;
 /// For the texels of a light map, the same ones of an earlier one.
 pub(crate) struct Correspondence {
     pub(super) surfaces: Surfaces,
+    /// By chart, the same one; [`ChartId::NONE`]: there was none.
+    charts: Vec<ChartId>,
     /// By placement of the light map, that of the same texels; [`PlacementId::NONE`]: there was none.
     placements: Vec<PlacementId>,
-    /// The same of the radiance map.
+    /// The same of the gather map and of the radiance map.
+    gather_placements: Vec<PlacementId>,
     radiance_placements: Vec<PlacementId>,
 }
 
@@ -42,17 +45,20 @@ impl Correspondence {
     /// Matches the surfaces of two atlases; returns also what only one of them has. To be called on the device's threads.
     pub fn between(old: &Atlas, new: &Atlas, progress: &Progress) -> Result<(Correspondence, Moved)> {
         let (surfaces, Rest { boxes, emits }) = Surfaces::between([&old.scene, &new.scene], progress)?;
-        let mut found = Correspondence { surfaces, placements: Vec::new(), radiance_placements: Vec::new() };
         let charts = 0..new.charts.charts.len();
         let most = SAME / new.map.layout.density;
-        let former = |chart| found.surfaces.chart(&new.scene, [&old.charts, &new.charts], ChartId::new(chart), most);
+        let former = |chart| surfaces.chart(&new.scene, [&old.charts, &new.charts], ChartId::new(chart), most);
         let former_chart = |chart| former(chart).unwrap_or(ChartId::NONE);
         let charts = try_par_collect(one_by_one(charts.into_par_iter().map(former_chart)), MATCHED)?;
-        found.placements = try_collect(Self::former_placements(&old.map, &new.map, &charts), MATCHED)?;
-        let of_radiance = Self::former_placements(&old.radiance, &new.radiance, &charts);
-        found.radiance_placements = try_collect(of_radiance, MATCHED)?;
         let has_moved = charts.iter().map(|&chart| chart == ChartId::NONE);
         let moved = Moved::new(try_collect(has_moved, MATCHED)?, boxes, emits);
+        let found = Correspondence {
+            placements: try_collect(Self::former_placements(&old.map, &new.map, &charts), MATCHED)?,
+            gather_placements: try_collect(Self::former_placements(&old.gather, &new.gather, &charts), MATCHED)?,
+            radiance_placements: try_collect(Self::former_placements(&old.radiance, &new.radiance, &charts), MATCHED)?,
+            surfaces,
+            charts,
+        };
         Ok((found, moved))
     }
 
@@ -81,6 +87,35 @@ impl Correspondence {
         let is_buried = |atlas: &Atlas, texel: LightTexel| atlas.buried.get(texel.index()).is_some_and(|&b| b);
         let shows_same = || self.shows_same((old, new), &old.map[former], &new.map[texel], new.map.layout.density);
         (is_buried(new, texel) && is_buried(old, former) || shows_same()).then_some(former)
+    }
+
+    /// Returns the former number of a placement of the gather map, if it had as many texels of the same chart.
+    pub fn gather_placement(&self, placement: PlacementId) -> Option<PlacementId> {
+        Some(self.gather_placements[placement.index()]).filter(|&former| former != PlacementId::NONE)
+    }
+
+    /// Returns the former number of a texel of a placement of the gather map, if it showed the same point.
+    pub fn gather_texel(
+        &self,
+        old: &Atlas,
+        new: &Atlas,
+        placement: PlacementId,
+        texel: GatherTexel,
+    ) -> Option<GatherTexel> {
+        let maps = (&old.gather, &new.gather);
+        let former = self.in_placement(maps, self.gather_placements[placement.index()], placement, texel)?;
+        let shows_same = self.shows_same((old, new), &maps.0[former], &maps.1[texel], maps.1.layout.density);
+        shows_same.then_some(former)
+    }
+
+    /// Returns which charts show their backs, given which did before, and what new ones show (each empty: none).
+    pub fn backs(&self, former: &[bool], new: &[bool]) -> Result<Vec<bool>> {
+        let charts = if former.is_empty() && new.is_empty() { &[][..] } else { &self.charts[..] };
+        let shows_back = |(i, chart): (usize, &ChartId)| match *chart {
+            ChartId::NONE => new.get(i).is_some_and(|&back| back),
+            chart => former.get(chart.index()).is_some_and(|&back| back),
+        };
+        try_collect(charts.iter().enumerate().map(shows_back), MATCHED)
     }
 
     /// Returns the former number of a texel of a placement of the radiance map, if it showed the same point.
@@ -138,7 +173,7 @@ impl Correspondence {
             spread: try_vec(spread, MATCHED)?,
             state: Vec::new(),
             radiance: Radiance::default(),
-            backs: try_vec(if light.backs.is_empty() { 0 } else { new.charts.charts.len() }, MATCHED)?,
+            backs: self.backs(&light.backs, &[])?,
             stitch: None,
             origin: light.origin,
             plan: Plan::default(),
@@ -158,10 +193,6 @@ impl Correspondence {
             }
             let spread = out.spread.get_mut(to).unwrap_or_default();
             spread.copy_from_slice(light.spread.get(from).unwrap_or_default());
-            let charts = [old.map.layout.chart_of(former), new.map.layout.chart_of(placement)];
-            if let Some((to, &from)) = out.backs.get_mut(charts[1].index()).zip(light.backs.get(charts[0].index())) {
-                *to = from;
-            }
         }
         Ok(out)
     }

@@ -1,6 +1,6 @@
 //! `bakelite report edits`: an object of a scene moves; seconds to right light by baking what has changed, beside a bake
 //! from nothing, and the difference of the two; the same of live light that follows, beside live light made anew; and of
-//! scenes that are described anew, without the object and with it again.
+//! scenes that are described anew, without the object and with it again, and their live light.
 //!
 //! Objects are pieces whose triangles hang together. Some are chosen at random among those of a size that a person
 //! would move, and move by their own size across the floor.
@@ -151,15 +151,7 @@ pub fn run(args: &ReportArgs) -> Result<()> {
 
 /// Prints a table of live light that follows the pieces. Updates without a camera have no limit of time.
 fn live_light(args: &ReportArgs, scene: &mut Arc<Scene>, map: &mut Lightmap, pieces: &[Piece]) -> Result<()> {
-    let bake = args.bake.params;
-    let params = LiveParams {
-        mode: Mode::Uniform,
-        max_rounds: bake.gather_rays.div_ceil(64),
-        photon_count: bake.photon_count,
-        direct_samples: bake.direct_samples,
-        seed: bake.seed,
-        ..Default::default()
-    };
+    let params = live_params(args);
     let progress = Progress::none();
     let anew = |map: &Lightmap| {
         Time::of(|| {
@@ -211,6 +203,19 @@ fn live_light(args: &ReportArgs, scene: &mut Arc<Scene>, map: &mut Lightmap, pie
         }
     }
     Ok(())
+}
+
+/// Parameters of live light that ends with as many rays as a bake.
+fn live_params(args: &ReportArgs) -> LiveParams {
+    let bake = args.bake.params;
+    LiveParams {
+        mode: Mode::Uniform,
+        max_rounds: bake.gather_rays.div_ceil(64),
+        photon_count: bake.photon_count,
+        direct_samples: bake.direct_samples,
+        seed: bake.seed,
+        ..Default::default()
+    }
 }
 
 /// Updates live light until nothing is left to do.

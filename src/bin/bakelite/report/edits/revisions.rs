@@ -1,9 +1,12 @@
 //! The part of `bakelite report edits` about new scenes: an object is taken away and put back, each time by a scene that is
-//! described and committed anew, whose light map keeps light of the one before.
+//! described and committed anew, whose light map and live light keep light of those before.
 
-use super::{CLEARLY, KEEP_ERRORS, Light, PASSES, Piece, Time, difference, differences, light};
+use super::{
+    CLEARLY, KEEP_ERRORS, Light, PASSES, Piece, Time, difference, differences, finish, light, live_params, shown,
+};
 use crate::args::ReportArgs;
-use bakelite::lightmap::{BakeParams, Lightmap};
+use bakelite::lightmap::{BakeParams, Layer, Lightmap};
+use bakelite::live::{Live, LiveParams};
 use bakelite::scene::MeshMaterials;
 use bakelite::{Progress, Result, Scene, SceneData};
 use std::collections::HashSet;
@@ -13,7 +16,10 @@ use std::time::Instant;
 /// A difference of light that lets all light stand which can be kept: only surfaces that are new are baked.
 const ALL: f32 = 1e9;
 
-/// Prints a table in Markdown. `map` is a light map of `scene`.
+/// Difference of live light that is let stand.
+const KEEP_LIVE: f32 = 0.03;
+
+/// Prints two tables in Markdown. `map` is a light map of `scene`.
 pub fn run(args: &ReportArgs, scene: &Arc<Scene>, map: &mut Lightmap, pieces: &[Piece]) -> Result<()> {
     println!("\nScenes described anew, without an object and with it again:\n");
     println!(
@@ -22,11 +28,69 @@ pub fn run(args: &ReportArgs, scene: &Arc<Scene>, map: &mut Lightmap, pieces: &[
          from nothing | old light |"
     );
     println!("|---|---|---|---|---|---|---|---|---|---|---|---|---|---|---|");
+    let mut live = Vec::new();
     for piece in pieces {
         map.bake(&args.bake.params, &Progress::none())?;
         let mut less = revise(args, scene, map, Some(piece), piece)?;
+        live_rows(args, [map, &less], (piece, "taken away"), &mut live)?;
         less.bake(&args.bake.params, &Progress::none())?;
-        revise(args, scene, &less, None, piece)?;
+        let again = revise(args, scene, &less, None, piece)?;
+        live_rows(args, [&less, &again], (piece, "put back"), &mut live)?;
+    }
+    println!("\nLive light of scenes described anew, keep_error {KEEP_LIVE}:\n");
+    println!(
+        "| triangles | size | | quick start | created from that before, s | until all is gathered, s | from nothing: created, s | \
+         all gathered, s | kept | difference of indirect light as soon as it is created: from that before | from nothing | \
+         at the end: indirect | direct | old light: indirect | direct |"
+    );
+    println!("|---|---|---|---|---|---|---|---|---|---|---|---|---|---|---|");
+    live.iter().for_each(|row| println!("{row}"));
+    Ok(())
+}
+
+/// Adds rows about live light of the second of two light maps, which keeps light of that of the first.
+fn live_rows(
+    args: &ReportArgs,
+    [earlier, map]: [&Lightmap; 2],
+    (piece, change): (&Piece, &str),
+    rows: &mut Vec<String>,
+) -> Result<()> {
+    let progress = Progress::none();
+    for quick_start in [false, true] {
+        let params = LiveParams { quick_start, ..live_params(args) };
+        let mut before = Live::new(earlier, &params, &progress)?;
+        finish(&mut before)?;
+        // The light of before, at the texels of the new light map that show the same.
+        let mut old = Live::create_from(map, &mut before, ALL, &progress)?;
+        finish(&mut old)?;
+        let (mut live, of_live) = Time::of(|| Live::create_from(map, &mut before, KEEP_LIVE, &progress))?;
+        let at_once = shown(&live, map, Layer::Indirect)?;
+        let (_, gathered) = Time::of(|| finish(&mut live))?;
+        let (mut fresh, of_fresh) = Time::of(|| Live::new(map, &params, &progress))?;
+        let coarse = shown(&fresh, map, Layer::Indirect)?;
+        let (_, all) = Time::of(|| finish(&mut fresh))?;
+        let sums = [live.sums()?, fresh.sums()?];
+        let kept = sums[0].iter().zip(&sums[1]).filter(|(a, b)| a != b).count() as f64 / sums[0].len() as f64;
+        let right = [shown(&fresh, map, Layer::Indirect)?, shown(&fresh, map, Layer::Direct)?];
+        let everywhere = vec![true; right[0].len()];
+        let wrong = |light: &Light, right: &Light| difference(light, right, &everywhere);
+        rows.push(format!(
+            "| {} | {:.2} | {change} | {} | {} | {} | {} | {} | {:.1} % | {:.1e} | {:.1e} | {:.1e} | {:.1e} | {:.1e} | {:.1e} |",
+            piece.triangles,
+            piece.size,
+            if quick_start { "yes" } else { "no" },
+            of_live.text(),
+            gathered.text(),
+            of_fresh.text(),
+            all.text(),
+            100.0 * kept,
+            wrong(&at_once, &right[0]),
+            wrong(&coarse, &right[0]),
+            wrong(&shown(&live, map, Layer::Indirect)?, &right[0]),
+            wrong(&shown(&live, map, Layer::Direct)?, &right[1]),
+            wrong(&shown(&old, map, Layer::Indirect)?, &right[0]),
+            wrong(&shown(&old, map, Layer::Direct)?, &right[1]),
+        ));
     }
     Ok(())
 }

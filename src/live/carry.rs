@@ -1,0 +1,184 @@
+//! Makes live light of a scene that was described anew, and keeps what live light of the scene before has gathered: after
+//! meshes were added, removed or edited.
+//!
+//! A block keeps its rays if all of its texels show the [same points](Correspondence) as those of a former block, and its
+//! direct light if nothing that changed lies between it and a light. Where light may differ, near what changed and, with all
+//! photons, where probes find it as in a bake of changes, old light fades out while new rays come in, as after a
+//! [move](super::follow).
+
+use super::Live;
+use super::blocks::{Block, BlockMap, BlockStatus, BlockWork, DirectTile, Tile};
+use super::follow::{Base, Following};
+use super::illumination::Illumination;
+use super::save::Saved;
+use super::work_on_direct::owns;
+use crate::base::error::{Result, invalid_argument};
+use crate::base::memory::{try_collect, try_par_collect, try_par_collect_ok, try_to_vec};
+use crate::base::progress::Progress;
+use crate::lightmap::Lightmap;
+use crate::lightmap::changed::comparison::Cell;
+use crate::lightmap::changed::correspondence::Correspondence;
+use crate::scene::NONE;
+use rayon::prelude::*;
+use std::sync::Arc;
+
+const KEPT: &str = "live light of before a change";
+
+impl Live {
+    /// Makes live light of a scene that was described anew, with the parameters of an `earlier` object, of the scene before.
+    /// What that has gathered is kept where the scenes are alike, unless light has changed by more than `keep_error` (finite,
+    /// ≥ 0; relative to the light or, if that is more, to a tenth of the mean), as far as probes tell. `lightmap` is best made by
+    /// [`Lightmap::create_from`], and need not be baked.
+    ///
+    /// With [`quick_start`](super::LiveParams::quick_start) all that can be kept is shown at once, and new photons are traced beside
+    /// the updates; else they are traced now. The earlier object is not changed, and may be dropped.
+    pub fn create_from(lightmap: &Lightmap, earlier: &mut Live, keep_error: f32, progress: &Progress) -> Result<Live> {
+        if !(keep_error >= 0.0 && keep_error.is_finite()) {
+            return invalid_argument!("keep_error is {keep_error}, not a finite number ≥ 0");
+        }
+        earlier.collect_now()?;
+        let (earlier, scene) = (&*earlier, &lightmap.atlas().scene);
+        let carry = || scene.device().run(progress, || Live::carry_from(lightmap, earlier, keep_error, progress));
+        earlier.scene().while_unchanged(carry)
+    }
+
+    fn carry_from(lightmap: &Lightmap, earlier: &Live, keep_error: f32, progress: &Progress) -> Result<Live> {
+        let (atlas, old, before) = (lightmap.atlas(), &earlier.context.map, &earlier.context.light);
+        let params = &earlier.params;
+        let (former, moved) = Correspondence::between(&old.atlas, atlas, progress)?;
+        let light = |bake: &_| match params.quick_start {
+            true => Illumination::carried(atlas, bake, before, (&old.atlas, &former), progress),
+            false => Illumination::new(atlas, bake, false, progress),
+        };
+        let mut live = Live::idle(lightmap, params, light, progress)?;
+        live.start(progress)?;
+        let map = live.context.map.clone();
+        let match_block = |b: usize| former_block((old, &map), &former, b).unwrap_or(NONE);
+        let former_blocks = try_par_collect((0..map.tiles.len()).into_par_iter().map(match_block), KEPT)?;
+        let has_same_lights = live.lights == earlier.lights
+            && atlas.scene.environments() == old.atlas.scene.environments()
+            && !moved.emits;
+        let statuses = earlier.blocks.status();
+        let light_of = |&b: &u32| statuses.get(b as usize).map_or(0.0, |b| b.mean + b.direct_mean);
+        let of_blocks = try_collect(former_blocks.iter().map(light_of), KEPT)?;
+        let bytes = size_of_val(&before.radiance.values[..]) + size_of_val(&of_blocks[..]);
+        let base = Base {
+            atlas: old.atlas.clone(),
+            radiance: before.radiance.clone(),
+            backs: former.backs(&before.sides.backs, &[])?,
+            former: Some((former, moved)),
+            mean: Base::mean(&of_blocks, &map.tiles),
+            map: map.clone(),
+            light: of_blocks,
+            _memory: atlas.scene.device().memory().reserve(bytes, KEPT)?,
+        };
+        let following = Following { base: Arc::new(base), keep_error };
+        // Blocks that all have the light of one radiance map can be compared.
+        let is_settled = !earlier.is_light_pending() && before.has_indirect && !before.radiance.values.is_empty();
+        let new = live.context.light.clone();
+        let with_all_photons =
+            (is_settled && !params.quick_start && new.has_indirect).then_some((&*new.radiance, &live.bake));
+        let cells = following.cells(atlas, &new.sides.backs, with_all_photons, progress)?;
+        if new.has_indirect {
+            let carry = Carry { earlier, live: &live, following: &following, has_same_lights };
+            let carry = |(b, (&former, cell)): (usize, (&u32, &Cell))| {
+                let is_old = !is_settled || cell.is_new && !params.quick_start;
+                carry.block(b as u32, former, cell, is_old, progress)
+            };
+            let blocks = former_blocks.par_iter().zip(&cells).enumerate();
+            let kept = try_par_collect_ok(blocks.map(carry), KEPT)?;
+            let (display, blocks) = live.restored(kept, progress)?;
+            live.go_on_from(display, blocks);
+            live.settle();
+            live.show_cells();
+        }
+        if params.quick_start && new.has_indirect {
+            live.make_room_for_epochs()?;
+            live.make_room_for_stale()?;
+            live.is_stale.iter_mut().zip(&cells).for_each(|(is_stale, cell)| *is_stale = cell.is_new);
+            live.relight.following = is_settled.then_some(following);
+            live.relight.follow_first_impression(&map, &live.bake)?;
+        }
+        Ok(live)
+    }
+}
+
+/// Returns the former block of a block, if all of their texels show the same points.
+fn former_block((old, new): (&BlockMap, &BlockMap), former: &Correspondence, block: usize) -> Option<u32> {
+    let tile = &new.tiles[block];
+    let placement = former.gather_placement(tile.placement)?;
+    let size = |map: &BlockMap, placement| (map.own_rect(placement).width(), map.own_rect(placement).height());
+    if size(old, placement) != size(new, tile.placement) {
+        return None;
+    }
+    let found = old.of_placement(placement).start + block as u32 - new.of_placement(tile.placement).start;
+    let there = &old.tiles[found as usize];
+    let is_same = |(&texel, &there)| former.gather_texel(&old.atlas, &new.atlas, tile.placement, texel) == Some(there);
+    let is_alike = tile.lod_end == there.lod_end && tile.texels.iter().zip(&there.texels).all(is_same);
+    is_alike.then_some(found)
+}
+
+/// Copies blocks of an earlier object.
+struct Carry<'a> {
+    earlier: &'a Live,
+    live: &'a Live,
+    following: &'a Following,
+    has_same_lights: bool,
+}
+
+impl Carry<'_> {
+    /// Returns what a block keeps of a former one ([`NONE`]: nothing), whose indirect light may be old.
+    fn block(&self, b: u32, former: u32, cell: &Cell, is_old: bool, progress: &Progress) -> Result<Saved> {
+        progress.check()?;
+        let Carry { earlier, live, .. } = *self;
+        let Some(status) = earlier.blocks.status().get(former as usize) else { return Ok(Saved::default()) };
+        let Some(work) = earlier.blocks.work(former).filter(|_| !status.has_old_light(&earlier.context)) else {
+            return Ok(Saved::default());
+        };
+        let (lod, rounds) = (status.fresh_lod, status.rounds);
+        let keeps_direct = self.has_same_lights && !cell.is_new && !cell.is_shadowed;
+        let direct = earlier.display.direct_tile(former).filter(|&(_, is_current)| is_current && keeps_direct);
+        Ok(Saved {
+            block: Block {
+                status: BlockStatus { lod, fresh_lod: lod, rounds, ..Default::default() },
+                work: BlockWork {
+                    gathered: try_to_vec(&work.gathered, KEPT)?,
+                    directional: try_to_vec(&work.directional, KEPT)?,
+                    deviations: work.deviations,
+                    deviation_count: work.deviation_count,
+                    ..Default::default()
+                },
+            },
+            shown: earlier.display.lods[former as usize].min(lod),
+            direct: match direct {
+                Some((direct, _)) => self.direct(&live.context.map.tiles[b as usize], direct)?,
+                None => None,
+            },
+            is_old,
+        })
+    }
+
+    /// Copies direct light to the place of the same texels; `None` if not all show the same points.
+    fn direct(&self, tile: &Tile, from: &DirectTile) -> Result<Option<DirectTile>> {
+        let (context, old) = (&self.live.context, &self.following.base.atlas);
+        let Some((former, _)) = &self.following.base.former else { return Ok(None) };
+        let rect = context.map.rect_in_light_map(tile.placement, &tile.rect);
+        if (rect.width(), rect.height()) != (from.rect.width(), from.rect.height()) {
+            return Ok(None);
+        }
+        let is_same = |(x, y): (i32, i32)| {
+            let Some(texel) = owns(context, tile, x, y) else { return true };
+            let place = (x - rect.x0 + from.rect.x0, y - rect.y0 + from.rect.y0);
+            let former = former.texel(old, &context.map.atlas, tile.placement, texel);
+            former.is_some_and(|former| old.map.position(former) == place)
+        };
+        if !rect.texels().all(is_same) {
+            return Ok(None);
+        }
+        Ok(Some(DirectTile {
+            rect,
+            values: try_to_vec(&from.values, KEPT)?.into_boxed_slice(),
+            directional: try_to_vec(&from.directional, KEPT)?.into_boxed_slice(),
+        }))
+    }
+}
