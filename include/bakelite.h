@@ -2960,10 +2960,11 @@ bk_result bk_live_create(bk_lightmap *lightmap,
 /// it does, it is gathered again, while the old light fades out. With bk_live_params.quick_start all that
 /// can be kept is shown at once, and photons are traced beside the updates, while
 /// bk_live_stats.light_pending is 1; else they are traced in this call. If light was pending in the earlier
-/// object, its light is shown until new rays replace it. All pages are dirty afterwards.
+/// object, its light is shown until new rays replace it. All pages are dirty afterwards. Until the photons
+/// have come, the live object keeps the scene before in memory, with its device.
 ///
-/// Cost: that of bk_live_create, and about 0.3 seconds per million texels and thread; see
-/// docs/performance.md, "Edits".
+/// Cost: that of bk_live_create without quick_start and 0.2 to 0.7 seconds more in Sponza; with it twice
+/// that of bk_live_create there, see docs/performance.md, "Edits".
 ///
 /// @param lightmap  light map of the new scene, best made by bk_lightmap_create_from; need not be baked,
 ///   is not changed, and may be released
@@ -2973,7 +2974,8 @@ bk_result bk_live_create(bk_lightmap *lightmap,
 /// @param progress,user  progress callback and its pointer; may be NULL
 /// @param out  receives the live object, which the caller releases with bk_live_release; NULL on
 ///   failure
-/// @retval BK_ERROR_INVALID_ARGUMENT  `keep_error` is out of its range
+/// @retval BK_ERROR_INVALID_ARGUMENT  `keep_error` is out of its range, or the earlier object's cell_size
+///   is too small for the new scene
 /// @retval BK_ERROR_INVALID_STATE  the light map is being baked, or another call is using the earlier
 ///   object
 /// @retval BK_ERROR_OUT_OF_MEMORY  both live objects do not fit or the memory callback refuses

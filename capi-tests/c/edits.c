@@ -129,6 +129,52 @@ static double difference(const float *a, const float *b, size_t count) {
     return sum / all;
 }
 
+/* Live light of a new scene keeps that of the old one's. */
+static void revise_live(bk_lightmap *old, bk_lightmap *new) {
+    bk_live_params params;
+    bk_live *live = NULL, *another = NULL, *refused = NULL;
+    bk_live_stats stats;
+    bk_camera camera;
+    bk_lightmap_info info;
+    float *shown[4];
+    size_t count;
+    int i;
+    bk_live_params_init(&params);
+    params.mode = BK_LIVE_UNIFORM;
+    params.photon_count = 50000;
+    params.max_rounds = 1;
+    params.quick_start = 1;
+    bk_lightmap_info_init(&info);
+    CHECK_OK(bk_lightmap_get_info(new, &info));
+    count = (size_t)info.width * info.height * 3;
+    CHECK_OK(bk_live_create(old, &params, NULL, NULL, &live));
+    finish(live);
+    CHECK_ERROR(bk_live_create_from(new, live, NAN, NULL, NULL, &refused), BK_ERROR_INVALID_ARGUMENT, "keep_error");
+    CHECK_ERROR(bk_live_create_from(NULL, live, 0, NULL, NULL, &refused), BK_ERROR_INVALID_ARGUMENT, "lightmap");
+    CHECK_ERROR(bk_live_create_from(new, NULL, 0, NULL, NULL, &refused), BK_ERROR_INVALID_ARGUMENT, "earlier");
+    CHECK_ERROR(bk_live_create_from(new, live, 0, NULL, NULL, NULL), BK_ERROR_INVALID_ARGUMENT, "out");
+    CHECK(refused == NULL);
+    CHECK_OK(bk_live_create_from(new, live, 0.03f, NULL, NULL, &another));
+    bk_live_release(live);
+    bk_live_stats_init(&stats);
+    bk_camera_init(&camera);
+    CHECK_OK(bk_live_update(another, &camera, NULL, &stats));
+    shown[0] = shown_by(another, new);
+    finish(another);
+    shown[1] = shown_by(another, new);
+    bk_live_release(another);
+    CHECK_OK(bk_live_create(new, &params, NULL, NULL, &live));
+    shown[2] = shown_by(live, new);
+    finish(live);
+    shown[3] = shown_by(live, new);
+    bk_live_release(live);
+    CHECK(difference(shown[1], shown[3], count) < 0.005);
+    CHECK(difference(shown[0], shown[3], count) < 0.5 * difference(shown[2], shown[3], count));
+    for (i = 0; i < 4; i++) {
+        free(shown[i]);
+    }
+}
+
 /* A new scene has a block more: its light map keeps light of the old one's. */
 static void revise(bk_device *device, const bk_lightmap_desc *desc) {
     bk_scene *scenes[2];
@@ -185,6 +231,8 @@ static void revise(bk_device *device, const bk_lightmap_desc *desc) {
                 "all texels");
     again = light_of(another, &count);
     CHECK(memcmp(kept, again, count * sizeof *kept) == 0);
+
+    revise_live(maps[0], another);
 
     free(kept), free(fresh), free(again);
     for (i = 0; i < 2; i++) {

@@ -4,7 +4,7 @@
 use bakelite::bvh::BuildOptions;
 use bakelite::lightmap::{Layer, LayerData, Lightmap, LightmapDesc};
 use bakelite::live::{Budget, Live, LiveCamera, LiveParams, Mode, PageRect};
-use bakelite::scene::{Instance, Light, MeshMaterials};
+use bakelite::scene::{Environment, Instance, Light, MeshMaterials};
 use bakelite::{Device, DeviceOptions, Error, Material, Mesh, Progress, Scene, SceneData};
 use glam::{Affine3A, Vec3};
 use std::sync::Arc;
@@ -403,25 +403,154 @@ fn live_light_is_carried_on_the_way_and_moved_after_it() {
     let (scene, earlier) = rooms(false);
     let blocks: Vec<Mesh> = scene.meshes()[2..].to_vec();
     let params = LiveParams { quick_start: true, ..params(Mode::Uniform) };
-    // The earlier object has a first impression alone, or less light than it will have.
-    let mut live = Live::new(&earlier, &params, &none).unwrap();
-    let mut again = rooms_with(&blocks, false, 5.0);
-    let mut map = map_from(&again, &earlier);
-    let mut carried = Live::create_from(&map, &mut live, 0.05, &none).unwrap();
-    drop(live);
-    // And the scene moves before the photons have come.
-    move_block(&mut again, Vec3::new(0.3, 0.2, 0.0));
-    map.follow(&again, &none).unwrap();
-    carried.follow(&map, 0.05, &none).unwrap();
-    finish(&mut carried);
-    for layer in [Layer::Direct, Layer::Indirect] {
-        let shown = pages(&carried, &map, layer);
-        let (right, valid) = baked(&mut map, &carried, layer);
-        let wrong = worst(&shown, &right, &valid);
-        assert!(wrong <= most_error(layer, 0.05), "{layer:?}: wrong by {wrong}");
+    for is_finished in [false, true] {
+        // The earlier object has a first impression alone, or all of its light.
+        let mut live = Live::new(&earlier, &params, &none).unwrap();
+        if is_finished {
+            finish(&mut live);
+        }
+        let mut again = rooms_with(&blocks, false, 5.0);
+        let mut map = map_from(&again, &earlier);
+        let mut carried = Live::create_from(&map, &mut live, 0.05, &none).unwrap();
+        drop(live);
+        // And the scene moves before the photons have come.
+        move_block(&mut again, Vec3::new(0.3, 0.2, 0.0));
+        map.follow(&again, &none).unwrap();
+        carried.follow(&map, 0.05, &none).unwrap();
+        finish(&mut carried);
+        for layer in [Layer::Direct, Layer::Indirect] {
+            let shown = pages(&carried, &map, layer);
+            let (right, valid) = baked(&mut map, &carried, layer);
+            let wrong = worst(&shown, &right, &valid);
+            assert!(wrong <= most_error(layer, 0.05), "{is_finished}, {layer:?}: wrong by {wrong}");
+        }
+        for keep_error in [-1.0, f32::NAN, f32::INFINITY] {
+            let refused = Live::create_from(&map, &mut carried, keep_error, &none);
+            assert!(matches!(refused, Err(Error::InvalidArgument(_))), "{keep_error}");
+        }
+        let cancel = Progress::new(|_, _| false);
+        assert!(matches!(Live::create_from(&map, &mut carried, 0.0, &cancel), Err(Error::Cancelled)));
     }
-    assert!(matches!(Live::create_from(&map, &mut carried, -1.0, &none), Err(Error::InvalidArgument(_))));
-    assert!(matches!(Live::create_from(&map, &mut carried, f32::NAN, &none), Err(Error::InvalidArgument(_))));
-    let cancel = Progress::new(|_, _| false);
-    assert!(matches!(Live::create_from(&map, &mut carried, 0.0, &cancel), Err(Error::Cancelled)));
+}
+
+#[test]
+fn light_that_is_behind_is_carried_and_replaced() {
+    let none = Progress::none();
+    let (scene, earlier) = rooms(false);
+    let blocks: Vec<Mesh> = scene.meshes()[2..].to_vec();
+    for quick_start in [false, true] {
+        let params = LiveParams { quick_start, ..params(Mode::Uniform) };
+        let mut live = Live::new(&earlier, &params, &none).unwrap();
+        finish(&mut live);
+        // A light changes, and some blocks only have new light when the scene is described anew.
+        scene.set_light(1, lamp(6.0, 50.0)).unwrap();
+        live.light_changed(1).unwrap();
+        live.finish_relighting().unwrap();
+        let few = Budget { milliseconds: 0.0, rays: 20_000, max_dirty_bytes: 0 };
+        assert!(live.update(&camera(0), &few).unwrap().finished < 1.0);
+        let before = pages(&live, &earlier, Layer::Indirect);
+        let mut map = map_from(&rooms_with(&blocks, false, 50.0), &earlier);
+        let mut carried = Live::create_from(&map, &mut live, 0.02, &none).unwrap();
+        let shown = pages(&carried, &map, Layer::Indirect);
+        finish(&mut carried);
+        let (right, valid) = baked(&mut map, &carried, Layer::Indirect);
+        // What is behind is shown as it was, until new light comes.
+        let [old, first] = [&before, &shown].map(|light| worst(light, &right, &valid));
+        assert!(old > 0.25 && first <= 1.1 * old, "quick_start {quick_start}: {first}, before {old}");
+        for layer in [Layer::Direct, Layer::Indirect] {
+            let shown = pages(&carried, &map, layer);
+            let (right, valid) = baked(&mut map, &carried, layer);
+            let wrong = worst(&shown, &right, &valid);
+            assert!(wrong <= most_error(layer, 0.02), "quick_start {quick_start}, {layer:?}: wrong by {wrong}");
+        }
+        scene.set_light(1, lamp(6.0, 5.0)).unwrap();
+    }
+}
+
+/// A room that is open at the top, in which a two-sided screen stands, with a glowing block or none, below a sky whose sun
+/// is in a column of its image.
+fn yard(has_glow: bool, sun: usize) -> Arc<Scene> {
+    let mut data = SceneData::new();
+    data.add_material(Material { albedo: [0.7; 3], ..Default::default() }).unwrap();
+    let screen = data.add_material(Material { albedo: [0.5; 3], two_sided: true, ..Default::default() }).unwrap();
+    let glow = data.add_material(Material { emission: [3.0; 3], ..Default::default() }).unwrap();
+    let mut walls = block(Vec3::ZERO, Vec3::new(4.0, 3.0, 2.0), true);
+    // Without the ceiling.
+    walls.indices.as_vec().drain(2..4);
+    data.add_mesh(walls).unwrap();
+    let corners = [[1.0, 1.0, 0.0], [2.0, 2.0, 0.0], [2.0, 2.0, 1.2], [1.0, 1.0, 1.2]].map(Vec3::from);
+    data.add_mesh(Mesh {
+        positions: corners.to_vec().into(),
+        indices: vec![[0, 1, 2], [0, 2, 3]].into(),
+        materials: MeshMaterials::One(screen),
+        ..Default::default()
+    })
+    .unwrap();
+    if has_glow {
+        let mut lamp = block(Vec3::new(3.0, 0.5, 0.2), Vec3::new(3.3, 0.8, 0.5), false);
+        lamp.materials = MeshMaterials::One(glow);
+        data.add_mesh(lamp).unwrap();
+    }
+    let pixels = (0..128).map(|i| [if i % 16 == sun && i < 64 { 8.0 } else { 0.5 }; 3]).collect();
+    let environment = data.add_environment(Environment::new(16, 8, pixels).unwrap());
+    data.add_light(Light::Sky { radiance: [1.0; 3], environment, up: Vec3::Z, rotation: 0.0 }).unwrap();
+    let device = Device::new(DeviceOptions { num_threads: 2, ..Default::default() }).unwrap();
+    Scene::commit(&device, data, &BuildOptions::default(), &Progress::none()).map_err(|e| e.1).unwrap()
+}
+
+#[test]
+fn glowing_surfaces_and_skies_that_change_leave_no_light_behind() {
+    let none = Progress::none();
+    for (from, to) in [((true, 3), (false, 3)), ((false, 3), (true, 3)), ((false, 3), (false, 9))] {
+        for quick_start in [false, true] {
+            let params = LiveParams { quick_start, blur: 0, ..params(Mode::Uniform) };
+            let earlier = map_of(&yard(from.0, from.1));
+            let mut live = Live::new(&earlier, &params, &none).unwrap();
+            finish(&mut live);
+            let mut map = map_from(&yard(to.0, to.1), &earlier);
+            let mut carried = Live::create_from(&map, &mut live, 0.02, &none).unwrap();
+            drop(live);
+            finish(&mut carried);
+            let mut fresh = Live::new(&map, &params, &none).unwrap();
+            finish(&mut fresh);
+            let [shown, right] = [&carried, &fresh].map(|live| pages(live, &map, Layer::Direct));
+            assert!(shown == right, "{from:?}, {to:?}, quick_start {quick_start}: direct light differs");
+            let (_, valid) = baked(&mut map, &carried, Layer::Indirect);
+            let [shown, right] = [&carried, &fresh].map(|live| pages(live, &map, Layer::Indirect));
+            let wrong = worst(&shown, &right, &valid);
+            assert!(wrong <= 0.1, "{from:?}, {to:?}, quick_start {quick_start}: wrong by {wrong}");
+        }
+    }
+}
+
+#[test]
+fn cancels_leave_the_earlier_object_as_it_was() {
+    let (earlier, later) = (rooms(false).1, rooms_with(&[], false, 5.0));
+    let map = map_from(&later, &earlier);
+    for quick_start in [false, true] {
+        let mut live =
+            Live::new(&earlier, &LiveParams { quick_start, ..params(Mode::Uniform) }, &Progress::none()).unwrap();
+        finish(&mut live);
+        let before = live.sums().unwrap();
+        let asked = Arc::new(AtomicU32::new(0));
+        let count = asked.clone();
+        let counting = Progress::new(move |_, _| {
+            count.fetch_add(1, SeqCst);
+            true
+        });
+        let right = Live::create_from(&map, &mut live, 0.03, &counting).unwrap().sums().unwrap();
+        let all = asked.load(SeqCst);
+        for at in (0..all).step_by((all as usize / 12).max(1)) {
+            let asked = AtomicU32::new(0);
+            let cancel = Progress::new(move |_, _| asked.fetch_add(1, SeqCst) < at);
+            match Live::create_from(&map, &mut live, 0.03, &cancel) {
+                Err(Error::Cancelled) => {}
+                Err(e) => panic!("{e}"),
+                // How often is asked depends on time.
+                Ok(_) => assert!(at > all / 2, "not cancelled at {at} of {all}"),
+            }
+        }
+        assert_eq!(live.sums().unwrap(), before);
+        assert_eq!(Live::create_from(&map, &mut live, 0.03, &Progress::none()).unwrap().sums().unwrap(), right);
+    }
 }

@@ -50,7 +50,7 @@ impl Live {
     }
 
     /// Does the work of [`collect`](Self::collect) outside of updates.
-    pub(super) fn collect_now(&mut self) -> Result<()> {
+    pub(crate) fn collect_now(&mut self) -> Result<()> {
         let mut stats = LiveStats::default();
         let result = self.collect(&mut stats);
         self.total_rays += stats.rays;

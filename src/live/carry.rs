@@ -11,9 +11,10 @@ use super::blocks::{Block, BlockMap, BlockStatus, BlockWork, DirectTile, Tile};
 use super::follow::{Base, Following};
 use super::illumination::Illumination;
 use super::save::Saved;
+use super::shown_layer::Shown;
 use super::work_on_direct::owns;
 use crate::base::error::{Result, invalid_argument};
-use crate::base::memory::{try_collect, try_par_collect, try_par_collect_ok, try_to_vec};
+use crate::base::memory::{try_collect, try_par_collect_ok, try_to_vec};
 use crate::base::progress::Progress;
 use crate::lightmap::Lightmap;
 use crate::lightmap::changed::comparison::Cell;
@@ -33,13 +34,23 @@ impl Live {
     /// With [`quick_start`](super::LiveParams::quick_start) all that can be kept is shown at once, and new photons are traced beside
     /// the updates; else they are traced now. The earlier object is not changed, and may be dropped.
     pub fn create_from(lightmap: &Lightmap, earlier: &mut Live, keep_error: f32, progress: &Progress) -> Result<Live> {
+        earlier.collect_now()?;
+        Live::create_from_idle(lightmap, earlier, keep_error, progress)
+    }
+
+    /// Does the work of [`create_from`](Self::create_from). What the earlier object's background work has at the time is not kept.
+    pub(crate) fn create_from_idle(
+        lightmap: &Lightmap,
+        earlier: &Live,
+        keep_error: f32,
+        progress: &Progress,
+    ) -> Result<Live> {
         if !(keep_error >= 0.0 && keep_error.is_finite()) {
             return invalid_argument!("keep_error is {keep_error}, not a finite number ≥ 0");
         }
-        earlier.collect_now()?;
-        let (earlier, scene) = (&*earlier, &lightmap.atlas().scene);
+        let scene = &lightmap.atlas().scene;
         let carry = || scene.device().run(progress, || Live::carry_from(lightmap, earlier, keep_error, progress));
-        earlier.scene().while_unchanged(carry)
+        scene.while_unchanged(|| earlier.scene().while_unchanged(carry))
     }
 
     fn carry_from(lightmap: &Lightmap, earlier: &Live, keep_error: f32, progress: &Progress) -> Result<Live> {
@@ -53,19 +64,22 @@ impl Live {
         let mut live = Live::idle(lightmap, params, light, progress)?;
         live.start(progress)?;
         let map = live.context.map.clone();
-        let match_block = |b: usize| former_block((old, &map), &former, b).unwrap_or(NONE);
-        let former_blocks = try_par_collect((0..map.tiles.len()).into_par_iter().map(match_block), KEPT)?;
+        let match_block = |b: usize| {
+            progress.check()?;
+            Ok(former_block((old, &map), &former, b).unwrap_or(NONE))
+        };
+        let former_blocks = try_par_collect_ok((0..map.tiles.len()).into_par_iter().map(match_block), KEPT)?;
         let has_same_lights = live.lights == earlier.lights
             && atlas.scene.environments() == old.atlas.scene.environments()
             && !moved.emits;
         let statuses = earlier.blocks.status();
         let light_of = |&b: &u32| statuses.get(b as usize).map_or(0.0, |b| b.mean + b.direct_mean);
         let of_blocks = try_collect(former_blocks.iter().map(light_of), KEPT)?;
-        let bytes = size_of_val(&before.radiance.values[..]) + size_of_val(&of_blocks[..]);
+        let bytes = size_of_val(&before.radiance.values[..]) + size_of_val(&of_blocks[..]) + former.bytes();
         let base = Base {
             atlas: old.atlas.clone(),
             radiance: before.radiance.clone(),
-            backs: former.backs(&before.sides.backs, &[])?,
+            backs: former.backs(&before.sides.backs)?,
             former: Some((former, moved)),
             mean: Base::mean(&of_blocks, &map.tiles),
             map: map.clone(),
@@ -74,12 +88,16 @@ impl Live {
         };
         let following = Following { base: Arc::new(base), keep_error };
         // Blocks that all have the light of one radiance map can be compared.
-        let is_settled = !earlier.is_light_pending() && before.has_indirect && !before.radiance.values.is_empty();
+        let is_settled = !earlier.relight.is_pending() && before.has_indirect && !before.radiance.values.is_empty();
         let new = live.context.light.clone();
         let with_all_photons =
             (is_settled && !params.quick_start && new.has_indirect).then_some((&*new.radiance, &live.bake));
         let cells = following.cells(atlas, &new.sides.backs, with_all_photons, progress)?;
         if new.has_indirect {
+            let known = former_blocks.iter().filter(|&&former| former != NONE);
+            let bytes = known.map(|&former| earlier.carried_bytes(former)).sum::<usize>();
+            // The list of blocks is collected twice, with errors and without.
+            live.reserve(bytes + 2 * map.tiles.len() * size_of::<Saved>())?;
             let carry = Carry { earlier, live: &live, following: &following, has_same_lights };
             let carry = |(b, (&former, cell)): (usize, (&u32, &Cell))| {
                 let is_old = !is_settled || cell.is_new && !params.quick_start;
@@ -87,10 +105,16 @@ impl Live {
             };
             let blocks = former_blocks.par_iter().zip(&cells).enumerate();
             let kept = try_par_collect_ok(blocks.map(carry), KEPT)?;
+            let is_any_old = kept.iter().any(|saved| saved.is_old);
             let (display, blocks) = live.restored(kept, progress)?;
             live.go_on_from(display, blocks);
             live.settle();
             live.show_cells();
+            if is_any_old {
+                // Its detail stays while the first new rays come in.
+                live.make_room_for_epochs()?;
+                live.display.begin_indirect_epoch();
+            }
         }
         if params.quick_start && new.has_indirect {
             live.make_room_for_epochs()?;
@@ -100,6 +124,14 @@ impl Live {
             live.relight.follow_first_impression(&map, &live.bake)?;
         }
         Ok(live)
+    }
+}
+
+impl Live {
+    /// Bytes of what a block has gathered, and of its direct light.
+    fn carried_bytes(&self, block: u32) -> usize {
+        let work = self.blocks.work(block).map_or(0, BlockWork::bytes);
+        work + self.display.direct_tile(block).map_or(0, |(tile, _)| tile.bytes())
     }
 }
 
@@ -132,9 +164,7 @@ impl Carry<'_> {
         progress.check()?;
         let Carry { earlier, live, .. } = *self;
         let Some(status) = earlier.blocks.status().get(former as usize) else { return Ok(Saved::default()) };
-        let Some(work) = earlier.blocks.work(former).filter(|_| !status.has_old_light(&earlier.context)) else {
-            return Ok(Saved::default());
-        };
+        let Some(work) = earlier.blocks.work(former) else { return Ok(Saved::default()) };
         let (lod, rounds) = (status.fresh_lod, status.rounds);
         let keeps_direct = self.has_same_lights && !cell.is_new && !cell.is_shadowed;
         let direct = earlier.display.direct_tile(former).filter(|&(_, is_current)| is_current && keeps_direct);
@@ -144,6 +174,8 @@ impl Carry<'_> {
                 work: BlockWork {
                     gathered: try_to_vec(&work.gathered, KEPT)?,
                     directional: try_to_vec(&work.directional, KEPT)?,
+                    prior: try_to_vec(&work.prior, KEPT)?.into_boxed_slice(),
+                    prior_directional: try_to_vec(&work.prior_directional, KEPT)?.into_boxed_slice(),
                     deviations: work.deviations,
                     deviation_count: work.deviation_count,
                     ..Default::default()
@@ -154,7 +186,7 @@ impl Carry<'_> {
                 Some((direct, _)) => self.direct(&live.context.map.tiles[b as usize], direct)?,
                 None => None,
             },
-            is_old,
+            is_old: is_old || status.has_old_light(&earlier.context),
         })
     }
 
@@ -166,19 +198,25 @@ impl Carry<'_> {
         if (rect.width(), rect.height()) != (from.rect.width(), from.rect.height()) {
             return Ok(None);
         }
-        let is_same = |(x, y): (i32, i32)| {
-            let Some(texel) = owns(context, tile, x, y) else { return true };
-            let place = (x - rect.x0 + from.rect.x0, y - rect.y0 + from.rect.y0);
-            let former = former.texel(old, &context.map.atlas, tile.placement, texel);
-            former.is_some_and(|former| old.map.position(former) == place)
-        };
-        if !rect.texels().all(is_same) {
-            return Ok(None);
-        }
-        Ok(Some(DirectTile {
+        let mut tile_of = DirectTile {
             rect,
             values: try_to_vec(&from.values, KEPT)?.into_boxed_slice(),
             directional: try_to_vec(&from.directional, KEPT)?.into_boxed_slice(),
-        }))
+        };
+        for (i, (x, y)) in rect.texels().enumerate() {
+            let Some(texel) = owns(context, tile, x, y) else {
+                // Rounding may have it that the block owned the texel where it was before.
+                tile_of.values[i] = Shown::UNKNOWN;
+                tile_of.directional.iter_mut().skip(i).take(1).for_each(|unknown| *unknown = Shown::UNKNOWN);
+                continue;
+            };
+            let place = (x - rect.x0 + from.rect.x0, y - rect.y0 + from.rect.y0);
+            let former = former.texel(old, &context.map.atlas, tile.placement, texel);
+            let is_same = former.is_some_and(|former| old.map.position(former) == place);
+            if !is_same || !tile_of.values[i].is_known() {
+                return Ok(None);
+            }
+        }
+        Ok(Some(tile_of))
     }
 }

@@ -2,8 +2,9 @@
 //! first impression of them.
 
 use super::blocks::Rect;
-use crate::base::error::Result;
-use crate::base::memory::{try_collect, try_par_collect, try_vec};
+use crate::base::error::{Error, Result};
+use crate::base::memory::{try_collect, try_to_vec, try_vec};
+use crate::base::parallel::ParallelLoop;
 use crate::base::progress::Progress;
 use crate::direct::DirectLight;
 use crate::lightmap::atlas::Atlas;
@@ -17,6 +18,9 @@ use crate::lightmap::stages::{self, Inputs, Own};
 use crate::lightmap::{BakeParams, BakeStats, directional};
 use rayon::prelude::*;
 use std::sync::Arc;
+
+/// Number of texels of the radiance map that a thread takes over at a time.
+const TEXELS: usize = 1 << 12;
 
 /// The shown sides of charts.
 #[derive(Default)]
@@ -152,17 +156,32 @@ impl Illumination {
         if !light.has_indirect || !before.has_indirect || before.radiance.values.is_empty() {
             return Ok(light);
         }
-        let inputs = Inputs { atlas, direct: &light.direct, params, progress };
-        let (map, first) = (&atlas.radiance, &light.radiance.values);
-        let radiance = |i: usize| {
-            let texel = RadianceTexel::new(i);
-            let former = former.radiance_texel(old, atlas, map.placement_of(&atlas.charts, texel), texel);
-            former.map_or(first[i], |former| before.radiance.values[former.index()])
+        let mut radiance = match Arc::try_unwrap(light.radiance) {
+            // Bright patches are left to all photons: until then gather rays find them.
+            Ok(first) => Radiance { values: first.values, ..Default::default() },
+            Err(_) => return Err(Error::Internal("a first impression is shown already".into())),
         };
-        let values = try_par_collect((0..first.len()).into_par_iter().map(radiance), "the radiance map")?;
-        // Bright patches are left to all photons: until then gather rays find them.
-        let radiance = Radiance { values, ..Default::default() };
-        let backs = former.backs(&before.sides.backs, &light.sides.backs)?;
+        let map = &atlas.radiance;
+        radiance.values.par_chunks_mut(TEXELS).enumerate().try_each(|(part, values)| {
+            progress.check()?;
+            for (i, value) in (part * TEXELS..).zip(values) {
+                let texel = RadianceTexel::new(i);
+                let placement = map.placement_of(&atlas.charts, texel);
+                if let Some(former) = former.radiance_texel(old, atlas, placement, texel) {
+                    *value = before.radiance.values[former.index()];
+                }
+            }
+            Ok(())
+        })?;
+        // A chart shows its former side, unless it has texels for both now, or had, or is mostly seen from another side.
+        let mut backs = try_to_vec(&light.sides.backs, "which sides of charts are shown")?;
+        for (chart, shows_back) in atlas.charts.ids().zip(&mut backs) {
+            let side = |atlas: &Atlas, chart| (atlas.map.layout.back(chart).is_some(), atlas.seen.shows_back(chart));
+            if let Some(former) = former.chart(chart).filter(|&former| side(old, former) == side(atlas, chart)) {
+                *shows_back = before.sides.backs.get(former.index()).is_some_and(|&back| back);
+            }
+        }
+        let inputs = Inputs { atlas, direct: &light.direct, params, progress };
         let upsampling = stages::upsampling(&inputs, &backs, 0..atlas.map.layout.placements.len(), None)?;
         let asks = params.directional & directional::INDIRECT != 0;
         let own = stages::own_light(&inputs, &radiance, &backs, &upsampling, None, asks, (0.315, 0.32))?;

@@ -104,8 +104,8 @@ pub struct Live {
     /// Queue of blocks whose shown light must be refreshed.
     waiting: VecDeque<u32>,
     is_waiting: Vec<bool>,
-    /// By block, whether a move has changed its light, until indirect light with all photons has followed; empty before
-    /// the first move.
+    /// By block, whether a change of the scene has changed its light, until indirect light with all photons has followed;
+    /// empty before the first change.
     is_stale: Vec<bool>,
     /// Blocks that are fading, and a buffer for those that go on fading. Each has capacity for all blocks.
     fading: Vec<u32>,

@@ -41,7 +41,7 @@ pub(super) struct Relight {
     /// Whether light changed while a renewal of before was under way, or while on hold.
     again: bool,
     on_hold: bool,
-    /// What renewals are compared with, if all that has changed is that the scene has moved.
+    /// What renewals are compared with, if all that has changed is that the scene has moved or was described anew.
     pub following: Option<Following>,
 }
 

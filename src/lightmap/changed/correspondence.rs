@@ -89,6 +89,17 @@ impl Correspondence {
         (is_buried(new, texel) && is_buried(old, former) || shows_same()).then_some(former)
     }
 
+    /// Bytes held beside those of the [surfaces](Surfaces).
+    pub fn bytes(&self) -> usize {
+        let placements = self.placements.len() + self.gather_placements.len() + self.radiance_placements.len();
+        placements * size_of::<PlacementId>() + size_of_val(&self.charts[..])
+    }
+
+    /// Returns the former number of a chart.
+    pub fn chart(&self, chart: ChartId) -> Option<ChartId> {
+        Some(self.charts[chart.index()]).filter(|&former| former != ChartId::NONE)
+    }
+
     /// Returns the former number of a placement of the gather map, if it had as many texels of the same chart.
     pub fn gather_placement(&self, placement: PlacementId) -> Option<PlacementId> {
         Some(self.gather_placements[placement.index()]).filter(|&former| former != PlacementId::NONE)
@@ -108,14 +119,10 @@ impl Correspondence {
         shows_same.then_some(former)
     }
 
-    /// Returns which charts show their backs, given which did before, and what new ones show (each empty: none).
-    pub fn backs(&self, former: &[bool], new: &[bool]) -> Result<Vec<bool>> {
-        let charts = if former.is_empty() && new.is_empty() { &[][..] } else { &self.charts[..] };
-        let shows_back = |(i, chart): (usize, &ChartId)| match *chart {
-            ChartId::NONE => new.get(i).is_some_and(|&back| back),
-            chart => former.get(chart.index()).is_some_and(|&back| back),
-        };
-        try_collect(charts.iter().enumerate().map(shows_back), MATCHED)
+    /// Returns which charts show their backs, given which did before (empty: none); those that are new do not.
+    pub fn backs(&self, former: &[bool]) -> Result<Vec<bool>> {
+        let charts = if former.is_empty() { &[][..] } else { &self.charts[..] };
+        try_collect(charts.iter().map(|chart| former.get(chart.index()).is_some_and(|&back| back)), MATCHED)
     }
 
     /// Returns the former number of a texel of a placement of the radiance map, if it showed the same point.
@@ -173,7 +180,7 @@ impl Correspondence {
             spread: try_vec(spread, MATCHED)?,
             state: Vec::new(),
             radiance: Radiance::default(),
-            backs: self.backs(&light.backs, &[])?,
+            backs: self.backs(&light.backs)?,
             stitch: None,
             origin: light.origin,
             plan: Plan::default(),

@@ -64,13 +64,13 @@ fn live_rows(
         let mut old = Live::create_from(map, &mut before, ALL, &progress)?;
         finish(&mut old)?;
         let (mut live, of_live) = Time::of(|| Live::create_from(map, &mut before, KEEP_LIVE, &progress))?;
-        let at_once = shown(&live, map, Layer::Indirect)?;
+        let (at_once, of_before) = (shown(&live, map, Layer::Indirect)?, live.sums()?);
         let (_, gathered) = Time::of(|| finish(&mut live))?;
         let (mut fresh, of_fresh) = Time::of(|| Live::new(map, &params, &progress))?;
         let coarse = shown(&fresh, map, Layer::Indirect)?;
         let (_, all) = Time::of(|| finish(&mut fresh))?;
-        let sums = [live.sums()?, fresh.sums()?];
-        let kept = sums[0].iter().zip(&sums[1]).filter(|(a, b)| a != b).count() as f64 / sums[0].len() as f64;
+        let kept = live.sums()?.iter().zip(&of_before).filter(|(new, old)| new == old).count() as f64;
+        let kept = kept / of_before.len() as f64;
         let right = [shown(&fresh, map, Layer::Indirect)?, shown(&fresh, map, Layer::Direct)?];
         let everywhere = vec![true; right[0].len()];
         let wrong = |light: &Light, right: &Light| difference(light, right, &everywhere);
