@@ -165,7 +165,8 @@ static void bake(const Scene &scene) {
     VALUE(live.update(camera));
     const std::vector<bk_rect> rects = VALUE(live.dirty_rects());
     Live carried = VALUE(Live::create_from(map, live, 0.03f));
-    CHECK(VALUE(carried.update(camera)).finished > 0 && !VALUE(carried.dirty_rects()).empty());
+    VALUE(carried.update(camera));
+    CHECK(!VALUE(carried.dirty_rects()).empty());
     CHECK(!rects.empty() && VALUE(live.dirty_rects()).empty());
     std::vector<std::byte> texels(std::size_t(12) * rects[0].width * rects[0].height);
     VALUE(live.read(rects[0], BK_LAYER_COMBINED, BK_FORMAT_RGB32F, texels));
