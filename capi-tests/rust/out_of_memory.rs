@@ -329,6 +329,14 @@ fn edits(scene: &Arc<Scene>, lightmap: &mut Lightmap, desc: &LightmapDesc, param
         fail_all("a light map from another one", || Lightmap::create_from(&revision, desc, lightmap, &none));
     let stats = fail_all("light of another light map", || revised.bake_changed_from(lightmap, params, 0.03, &none));
     assert!(stats.kept_texels > 0);
+    let live_params = LiveParams { lod_count: 2, max_rounds: 1, photon_count: 10_000, ..Default::default() };
+    let mut live = Live::new(lightmap, &live_params, &none).unwrap();
+    let camera = LiveCamera { position: Vec3::ZERO, forward: Vec3::X, up: Vec3::Z, fov_y: 1.0, width: 64, height: 64 };
+    live.update(&camera, &Budget { milliseconds: 0.0, rays: 500_000, max_dirty_bytes: 0 }).unwrap();
+    let before = live.sums().unwrap();
+    let mut carried = fail_all("live light from before", || Live::create_from(&revised, &mut live, 0.03, &none));
+    assert!(live.sums().unwrap() == before, "live light of before has changed");
+    assert!(carried.sums().unwrap().iter().any(|sum| before.contains(sum) && sum.1 > 0));
 }
 
 /// Saves and loads the light map's result, and saves its pages. (EXR files are left out: the
