@@ -19,6 +19,7 @@ use crate::base::progress::Progress;
 use crate::lightmap::Lightmap;
 use crate::lightmap::changed::comparison::Cell;
 use crate::lightmap::changed::correspondence::Correspondence;
+use crate::lightmap::moved::Moved;
 use crate::scene::NONE;
 use rayon::prelude::*;
 use std::sync::Arc;
@@ -54,84 +55,102 @@ impl Live {
     }
 
     fn carry_from(lightmap: &Lightmap, earlier: &Live, keep_error: f32, progress: &Progress) -> Result<Live> {
-        let (atlas, old, before) = (lightmap.atlas(), &earlier.context.map, &earlier.context.light);
+        let (atlas, old, before) = (lightmap.atlas(), &earlier.context.map.atlas, &earlier.context.light);
         let params = &earlier.params;
-        let (former, moved) = Correspondence::between(&old.atlas, atlas, progress)?;
+        let (former, moved) = Correspondence::between(old, atlas, progress)?;
         let light = |bake: &_| match params.quick_start {
-            true => Illumination::carried(atlas, bake, before, (&old.atlas, &former), progress),
+            true => Illumination::carried(atlas, bake, before, (old, &former), progress),
             false => Illumination::new(atlas, bake, false, progress),
         };
         let mut live = Live::idle(lightmap, params, light, progress)?;
         live.start(progress)?;
-        let map = live.context.map.clone();
-        let match_block = |b: usize| {
-            progress.check()?;
-            Ok(former_block((old, &map), &former, b).unwrap_or(NONE))
-        };
-        let former_blocks = try_par_collect_ok((0..map.tiles.len()).into_par_iter().map(match_block), KEPT)?;
-        let has_same_lights = live.lights == earlier.lights
-            && atlas.scene.environments() == old.atlas.scene.environments()
-            && !moved.emits;
-        let statuses = earlier.blocks.status();
-        let light_of = |&b: &u32| statuses.get(b as usize).map_or(0.0, |b| b.mean + b.direct_mean);
-        let of_blocks = try_collect(former_blocks.iter().map(light_of), KEPT)?;
-        let bytes = size_of_val(&before.radiance.values[..]) + size_of_val(&of_blocks[..]) + former.bytes();
-        let base = Base {
-            atlas: old.atlas.clone(),
-            radiance: before.radiance.clone(),
-            backs: former.backs(&before.sides.backs)?,
-            former: Some((former, moved)),
-            mean: Base::mean(&of_blocks, &map.tiles),
-            map: map.clone(),
-            light: of_blocks,
-            _memory: atlas.scene.device().memory().reserve(bytes, KEPT)?,
-        };
-        let following = Following { base: Arc::new(base), keep_error };
+        let new = live.context.light.clone();
+        if !new.has_indirect {
+            return Ok(live);
+        }
+        let has_same_lights =
+            live.lights == earlier.lights && atlas.scene.environments() == old.scene.environments() && !moved.emits;
+        let blocks = live.former_blocks(earlier, &former, progress)?;
+        let base = Arc::new(live.base_of(earlier, &blocks, (former, moved))?);
+        let following = Following { base, keep_error };
         // Blocks that all have the light of one radiance map can be compared.
         let is_settled = !earlier.relight.is_pending() && before.has_indirect && !before.radiance.values.is_empty();
-        let new = live.context.light.clone();
-        let with_all_photons =
-            (is_settled && !params.quick_start && new.has_indirect).then_some((&*new.radiance, &live.bake));
+        let with_all_photons = (is_settled && !params.quick_start).then_some((&*new.radiance, &live.bake));
         let cells = following.cells(atlas, &new.sides.backs, with_all_photons, progress)?;
-        if new.has_indirect {
-            let known = former_blocks.iter().filter(|&&former| former != NONE);
-            let bytes = known.map(|&former| earlier.carried_bytes(former)).sum::<usize>();
-            // The list of blocks is collected twice, with errors and without.
-            live.reserve(bytes + 2 * map.tiles.len() * size_of::<Saved>())?;
-            let carry = Carry { earlier, live: &live, following: &following, has_same_lights };
-            let carry = |(b, (&former, cell)): (usize, (&u32, &Cell))| {
-                let is_old = !is_settled || cell.is_new && !params.quick_start;
-                carry.block(b as u32, former, cell, is_old, progress)
-            };
-            let blocks = former_blocks.par_iter().zip(&cells).enumerate();
-            let kept = try_par_collect_ok(blocks.map(carry), KEPT)?;
-            let is_any_old = kept.iter().any(|saved| saved.is_old);
-            let (display, blocks) = live.restored(kept, progress)?;
-            live.go_on_from(display, blocks);
-            live.settle();
-            live.show_cells();
-            if is_any_old {
-                // Its detail stays while the first new rays come in.
-                live.make_room_for_epochs()?;
-                live.display.begin_indirect_epoch();
-            }
-        }
-        if params.quick_start && new.has_indirect {
+        live.take_blocks(earlier, &blocks, (&cells, &following), (is_settled, has_same_lights), progress)?;
+        if params.quick_start {
             live.make_room_for_epochs()?;
             live.make_room_for_stale()?;
             live.is_stale.iter_mut().zip(&cells).for_each(|(is_stale, cell)| *is_stale = cell.is_new);
             live.relight.following = is_settled.then_some(following);
-            live.relight.follow_first_impression(&map, &live.bake)?;
+            live.relight.follow_first_impression(&live.context.map, &live.bake)?;
         }
         Ok(live)
     }
-}
 
-impl Live {
-    /// Bytes of what a block has gathered, and of its direct light.
-    fn carried_bytes(&self, block: u32) -> usize {
-        let work = self.blocks.work(block).map_or(0, BlockWork::bytes);
-        work + self.display.direct_tile(block).map_or(0, |(tile, _)| tile.bytes())
+    /// Returns the former block of each block, [`NONE`] where there was none.
+    fn former_blocks(&self, earlier: &Live, former: &Correspondence, progress: &Progress) -> Result<Vec<u32>> {
+        let maps = (&*earlier.context.map, &*self.context.map);
+        let former_block = |block| {
+            progress.check()?;
+            Ok(former_block(maps, former, block).unwrap_or(NONE))
+        };
+        try_par_collect_ok((0..self.blocks.len()).into_par_iter().map(former_block), KEPT)
+    }
+
+    /// Returns the light of an earlier object, with which that of this one is compared.
+    fn base_of(&self, earlier: &Live, blocks: &[u32], former: (Correspondence, Moved)) -> Result<Base> {
+        let (map, before) = (self.context.map.clone(), &earlier.context.light);
+        let statuses = earlier.blocks.status();
+        let light = |&b: &u32| statuses.get(b as usize).map_or(0.0, |b| b.mean + b.direct_mean);
+        let light = try_collect(blocks.iter().map(light), KEPT)?;
+        let bytes = size_of_val(&before.radiance.values[..]) + size_of_val(&light[..]) + former.0.bytes();
+        Ok(Base {
+            atlas: earlier.context.map.atlas.clone(),
+            radiance: before.radiance.clone(),
+            backs: former.0.backs(&before.sides.backs)?,
+            former: Some(former),
+            mean: Base::mean(&light, &map.tiles),
+            light,
+            _memory: map.atlas.scene.device().memory().reserve(bytes, KEPT)?,
+            map,
+        })
+    }
+
+    /// Takes over what former blocks have. With a quick start light that may be another now counts as the present one until
+    /// all photons have come.
+    fn take_blocks(
+        &mut self,
+        earlier: &Live,
+        blocks: &[u32],
+        (cells, following): (&[Cell], &Following),
+        (is_settled, has_same_lights): (bool, bool),
+        progress: &Progress,
+    ) -> Result<()> {
+        let bytes = |&block: &u32| {
+            let work = earlier.blocks.work(block).map_or(0, BlockWork::bytes);
+            work + earlier.display.direct_tile(block).map_or(0, |(tile, _)| tile.bytes())
+        };
+        let known: usize = blocks.iter().filter(|&&block| block != NONE).map(bytes).sum();
+        // The list of blocks is collected twice, with errors and without.
+        self.reserve(known + 2 * blocks.len() * size_of::<Saved>())?;
+        let carry = Carry { earlier, live: self, following, has_same_lights };
+        let carry = |(b, (&former, cell)): (usize, (&u32, &Cell))| {
+            let is_old = !is_settled || cell.is_new && !earlier.params.quick_start;
+            carry.block(b as u32, former, cell, is_old, progress)
+        };
+        let kept = try_par_collect_ok(blocks.par_iter().zip(cells).enumerate().map(carry), KEPT)?;
+        let is_any_old = kept.iter().any(|saved| saved.is_old);
+        let (display, blocks) = self.restored(kept, progress)?;
+        self.go_on_from(display, blocks);
+        self.settle();
+        self.show_cells();
+        if is_any_old {
+            // Its detail stays while the first new rays come in.
+            self.make_room_for_epochs()?;
+            self.display.begin_indirect_epoch();
+        }
+        Ok(())
     }
 }
 
