@@ -537,6 +537,7 @@ fn glowing_surfaces_and_skies_that_change_leave_no_light_behind() {
             let (_, valid) = baked(&mut map, &carried, Layer::Indirect);
             let [shown, right] = [&carried, &fresh].map(|live| pages(live, &map, Layer::Indirect));
             let wrong = worst(&shown, &right, &valid);
+            // The lamp hangs close to walls, where light falls off within a block whose probes may lie elsewhere: 0.055.
             assert!(wrong <= 0.1, "{i}, quick_start {quick_start}: wrong by {wrong}");
         }
     }

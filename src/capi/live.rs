@@ -463,8 +463,8 @@ pub unsafe extern "C" fn bk_live_create(
 /// object, its light is shown until new rays replace it. All pages are dirty afterwards. Until the photons
 /// have come, the live object keeps the scene before in memory, with its device.
 ///
-/// Cost: up to half as much again as bk_live_create, with quick_start twice as much: in Sponza 1.8 instead
-/// of 0.9 seconds on two threads; see docs/performance.md, "Edits".
+/// Cost: up to half as much again as bk_live_create, with quick_start two to three times as much: in
+/// Sponza 1.8 instead of 0.9 seconds on two threads; see docs/performance.md, "Edits".
 ///
 /// @param lightmap  light map of the new scene, best made by bk_lightmap_create_from; need not be baked,
 ///   is not changed, and may be released

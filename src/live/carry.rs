@@ -226,7 +226,9 @@ impl Carry<'_> {
             let Some(texel) = owns(context, tile, x, y) else {
                 // Rounding may have it that the block owned the texel where it was before.
                 tile_of.values[i] = Shown::UNKNOWN;
-                tile_of.directional.iter_mut().skip(i).take(1).for_each(|unknown| *unknown = Shown::UNKNOWN);
+                if let Some(by_direction) = tile_of.directional.get_mut(i) {
+                    *by_direction = Shown::UNKNOWN;
+                }
                 continue;
             };
             let place = (x - rect.x0 + from.rect.x0, y - rect.y0 + from.rect.y0);

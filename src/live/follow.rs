@@ -201,7 +201,7 @@ impl Live {
     fn following(&self, keep_error: f32) -> Result<Option<Following>> {
         if let Some(following) = &self.relight.following {
             if following.base.former.is_some() {
-                // Surfaces are numbered otherwise than when the scene was described anew and have moved since.
+                // What it knows to have changed is what the new description changed, without this move.
                 return Ok(None);
             }
             let keep_error = keep_error.min(following.keep_error);

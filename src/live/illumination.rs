@@ -2,7 +2,7 @@
 //! first impression of them.
 
 use super::blocks::Rect;
-use crate::base::error::{Error, Result};
+use crate::base::error::Result;
 use crate::base::memory::{try_collect, try_to_vec, try_vec};
 use crate::base::parallel::ParallelLoop;
 use crate::base::progress::Progress;
@@ -127,20 +127,24 @@ impl Illumination {
     /// Computes the light of the scene's current lights, with all photons, or a first impression of it.
     pub fn new(atlas: &Atlas, params: &BakeParams, quick: bool, progress: &Progress) -> Result<Illumination> {
         let direct = DirectLight::try_new(&atlas.scene)?;
-        let i = match quick {
+        let indirect = match quick {
             true => illuminate_quickly(atlas, params, &direct, progress)?,
             false => illuminate(atlas, params, &direct, None, progress)?,
         };
-        Ok(Illumination {
+        Ok(Illumination::of(direct, indirect))
+    }
+
+    fn of(direct: DirectLight, indirect: Indirect) -> Illumination {
+        Illumination {
             direct: Arc::new(direct),
-            radiance: Arc::new(i.radiance),
-            sides: i.sides,
-            own: Arc::new(i.own.light),
-            own_directional: Arc::new(i.own.directional),
-            has_indirect: i.has_indirect,
+            radiance: Arc::new(indirect.radiance),
+            sides: indirect.sides,
+            own: Arc::new(indirect.own.light),
+            own_directional: Arc::new(indirect.own.directional),
+            has_indirect: indirect.has_indirect,
             direct_epoch: 1,
             indirect_epoch: 1,
-        })
+        }
     }
 
     /// Computes light of a scene that was described anew, with that of `before` it where surfaces show the same, and a first
@@ -152,17 +156,15 @@ impl Illumination {
         (old, former): (&Atlas, &Correspondence),
         progress: &Progress,
     ) -> Result<Illumination> {
-        let mut light = Illumination::new(atlas, params, true, progress)?;
-        if !light.has_indirect || !before.has_indirect || before.radiance.values.is_empty() {
-            return Ok(light);
+        let direct = DirectLight::try_new(&atlas.scene)?;
+        let mut indirect = illuminate_quickly(atlas, params, &direct, progress)?;
+        if !indirect.has_indirect || !before.has_indirect || before.radiance.values.is_empty() {
+            return Ok(Illumination::of(direct, indirect));
         }
-        let mut radiance = match Arc::try_unwrap(light.radiance) {
-            // Bright patches are left to all photons: until then gather rays find them.
-            Ok(first) => Radiance { values: first.values, ..Default::default() },
-            Err(_) => return Err(Error::Internal("a first impression is shown already".into())),
-        };
+        // Bright patches are left to all photons: until then gather rays find them.
+        indirect.radiance = Radiance { values: indirect.radiance.values, ..Default::default() };
         let map = &atlas.radiance;
-        radiance.values.par_chunks_mut(TEXELS).enumerate().try_each(|(part, values)| {
+        indirect.radiance.values.par_chunks_mut(TEXELS).enumerate().try_each(|(part, values)| {
             progress.check()?;
             for (i, value) in (part * TEXELS..).zip(values) {
                 let texel = RadianceTexel::new(i);
@@ -174,21 +176,19 @@ impl Illumination {
             Ok(())
         })?;
         // A chart shows its former side, unless it has texels for both now, or had, or is mostly seen from another side.
-        let mut backs = try_to_vec(&light.sides.backs, "which sides of charts are shown")?;
+        let mut backs = try_to_vec(&indirect.sides.backs, "which sides of charts are shown")?;
         for (chart, shows_back) in atlas.charts.ids().zip(&mut backs) {
             let side = |atlas: &Atlas, chart| (atlas.map.layout.back(chart).is_some(), atlas.seen.shows_back(chart));
             if let Some(former) = former.chart(chart).filter(|&former| side(old, former) == side(atlas, chart)) {
                 *shows_back = before.sides.backs.get(former.index()).is_some_and(|&back| back);
             }
         }
-        let inputs = Inputs { atlas, direct: &light.direct, params, progress };
+        let inputs = Inputs { atlas, direct: &direct, params, progress };
         let upsampling = stages::upsampling(&inputs, &backs, 0..atlas.map.layout.placements.len(), None)?;
         let asks = params.directional & directional::INDIRECT != 0;
-        let own = stages::own_light(&inputs, &radiance, &backs, &upsampling, None, asks, (0.315, 0.32))?;
-        light.radiance = Arc::new(radiance);
-        light.sides = Arc::new(Sides { backs, upsampling, is_first_impression: false });
-        (light.own, light.own_directional) = (Arc::new(own.light), Arc::new(own.directional));
-        Ok(light)
+        indirect.own = stages::own_light(&inputs, &indirect.radiance, &backs, &upsampling, None, asks, (0.315, 0.32))?;
+        indirect.sides = Arc::new(Sides { backs, upsampling, is_first_impression: false });
+        Ok(Illumination::of(direct, indirect))
     }
 
     /// Makes a copy with new indirect light.

@@ -113,10 +113,8 @@ impl Correspondence {
         placement: PlacementId,
         texel: GatherTexel,
     ) -> Option<GatherTexel> {
-        let maps = (&old.gather, &new.gather);
-        let former = self.in_placement(maps, self.gather_placements[placement.index()], placement, texel)?;
-        let shows_same = self.shows_same((old, new), &maps.0[former], &maps.1[texel], maps.1.layout.density);
-        shows_same.then_some(former)
+        let former = self.gather_placements[placement.index()];
+        self.same_in_placement((old, new), (&old.gather, &new.gather), former, placement, texel)
     }
 
     /// Returns which charts show their backs, given which did before (empty: none); those that are new do not.
@@ -133,9 +131,21 @@ impl Correspondence {
         placement: PlacementId,
         texel: RadianceTexel,
     ) -> Option<RadianceTexel> {
-        let maps = (&old.radiance, &new.radiance);
-        let former = self.in_placement(maps, self.radiance_placements[placement.index()], placement, texel)?;
-        let shows_same = self.shows_same((old, new), &maps.0[former], &maps.1[texel], maps.1.layout.density);
+        let former = self.radiance_placements[placement.index()];
+        self.same_in_placement((old, new), (&old.radiance, &new.radiance), former, placement, texel)
+    }
+
+    /// Returns the texel at the same place in the former placement, if it showed the same point.
+    fn same_in_placement<M: Map>(
+        &self,
+        atlases: (&Atlas, &Atlas),
+        maps: (&ChartMap<M>, &ChartMap<M>),
+        former: PlacementId,
+        placement: PlacementId,
+        texel: TexelId<M>,
+    ) -> Option<TexelId<M>> {
+        let former = self.in_placement(maps, former, placement, texel)?;
+        let shows_same = self.shows_same(atlases, &maps.0[former], &maps.1[texel], maps.1.layout.density);
         shows_same.then_some(former)
     }
 
