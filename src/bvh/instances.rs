@@ -12,14 +12,37 @@ use glam::{Mat3A, Vec3, Vec3A};
 
 /// The trees of a scene's instances.
 pub(crate) struct Instances {
-    /// Tree over the boxes of instances; its leaves hold their numbers, one each.
+    /// Tree over the boxes of instances, with the [margin](Margin) of rays around them; its leaves hold their numbers, one
+    /// each.
     pub top: Mbvh,
     /// The meshes that have instances.
     pub trees: Vec<MeshTree>,
     /// The instances, by number.
     pub placed: Vec<PlacedTree>,
-    /// The greatest [margin](crate::scene::Instance::margin) of all instances.
-    pub margin: f32,
+    pub margin: Margin,
+}
+
+/// By how much rays that are tested against boxes of instances may lie beside where they are, since what is hit in an
+/// instance is found by transformed rays.
+#[derive(Clone, Copy)]
+pub(crate) struct Margin {
+    /// The greatest [margin](crate::scene::Instance::margin) of all instances, a fraction of the coordinates of a ray's
+    /// origin.
+    pub part: f32,
+    /// The boxes in the tree are larger by the margin of rays whose origins have coordinates up to this. Those of rays
+    /// from farther away are added where these are set up.
+    pub reach: f32,
+}
+
+impl Margin {
+    /// That of boxes whose triangles are hit by rays as they are.
+    pub(crate) const NONE: Margin = Margin { part: 0.0, reach: f32::INFINITY };
+
+    /// Returns a box as it is in the tree.
+    pub(crate) fn around(self, (lower, upper): (Vec3, Vec3)) -> (Vec3, Vec3) {
+        let beside = self.part * self.reach;
+        (lower - beside, upper + beside)
+    }
 }
 
 /// The tree of a mesh that has instances, with triangles by their number in the mesh.

@@ -64,6 +64,12 @@ impl Instance {
         (terms + self.transform.translation.abs()).max_element()
     }
 
+    /// Returns the greatest extent of the image of a box of the mesh.
+    pub(super) fn extent(&self, (lower, upper): (Vec3, Vec3)) -> f32 {
+        let (m, size) = (&self.transform.matrix3, Vec3A::from(upper - lower));
+        (m.x_axis.abs() * size.x + m.y_axis.abs() * size.y + m.z_axis.abs() * size.z).max_element()
+    }
+
     /// Returns by how much a ray in the mesh's coordinates may lie beside where it is in the scene, as a fraction of the
     /// coordinates and extents that it goes through: at least some ten roundings. The boxes of instances and the rays that
     /// are tested against them are wider by that, so that no ray enters a box behind what it hits in the instance, and hits

@@ -2,9 +2,10 @@
 
 use super::{Instance, SceneData, is_valid_triangle};
 use crate::base::error::Result;
+use crate::base::geometry::MAX_COORDINATE;
 use crate::base::memory::{try_collect, try_par_collect, try_par_gather};
 use crate::base::progress::Progress;
-use crate::bvh::instances::{Instances, MeshTree, PlacedTree, placed_box};
+use crate::bvh::instances::{Instances, Margin, MeshTree, PlacedTree, placed_box};
 use crate::bvh::{self, BuildOptions, References, RefitRoom, Tree};
 use glam::Vec3;
 use rayon::prelude::*;
@@ -64,10 +65,11 @@ pub(super) fn place(
         first_triangle,
     };
     let placed = try_collect(data.instances.iter().zip(first).map(place), TREES)?;
+    let margin = margin_of(data, &trees, &placed);
     let of_instance = |i: usize| box_of(&data.instances[i], trees[placed[i].tree as usize].tree.bounds());
-    let boxes = try_par_collect((0..placed.len()).into_par_iter().map(of_instance), TREES)?;
-    let top = Instances::top_of(&boxes, progress)?;
-    Ok(Instances { top, trees, placed, margin: margin_of(data) })
+    let boxes = (0..placed.len()).into_par_iter().map(|i| margin.around(of_instance(i)));
+    let top = Instances::top_of(&try_par_collect(boxes, TREES)?, progress)?;
+    Ok(Instances { top, trees, placed, margin })
 }
 
 /// Refits the trees after vertices of meshes and instances have moved; `rooms` are those of the meshes' trees. Returns
@@ -93,18 +95,32 @@ pub(super) fn refit(
     for (at, instance) in instances.placed.iter_mut().zip(&data.instances) {
         (at.to_mesh, at.origin) = (instance.to_mesh(), instance.transform.translation);
     }
-    instances.margin = margin_of(data);
-    let Instances { top, trees, placed, .. } = instances;
+    instances.margin = margin_of(data, &instances.trees, &instances.placed);
+    let Instances { top, trees, placed, margin } = instances;
     let corners = |i: u32| {
         let bounds = trees[placed[i as usize].tree as usize].tree.bounds();
-        Instances::corners_of_box(box_of(&data.instances[i as usize], bounds))
+        Instances::corners_of_box(margin.around(box_of(&data.instances[i as usize], bounds)))
     };
     bvh::refit_whole(top, &corners);
     gone
 }
 
-fn margin_of(data: &SceneData) -> f32 {
-    data.instances.iter().map(Instance::margin).fold(0.0, f32::max)
+/// The margin of the instances' boxes: of rays from within twice the greatest coordinate of the instances, unless the
+/// boxes would grow by more than a hundredth of the instances' (geometric) mean size, as with a single one far away.
+fn margin_of(data: &SceneData, trees: &[MeshTree], placed: &[PlacedTree]) -> Margin {
+    let (mut part, mut farthest, mut size, mut count) = (0f32, 0f32, 0.0, 0);
+    for (instance, at) in data.instances.iter().zip(placed) {
+        let bounds = trees[at.tree as usize].tree.bounds();
+        let (reach, extent) = (instance.reach(bounds), instance.extent(bounds));
+        part = part.max(instance.margin());
+        if reach <= MAX_COORDINATE && extent > 0.0 {
+            farthest = farthest.max(reach);
+            size += extent.log2() as f64;
+            count += 1;
+        }
+    }
+    let mean = (size / f64::from(count.max(1))).exp2() as f32;
+    Margin { part, reach: (2.0 * farthest).min(0.01 * mean / part.max(f32::MIN_POSITIVE)) }
 }
 
 /// The box in the scene of an instance of a mesh with given bounds.

@@ -16,7 +16,7 @@ use super::Ray;
 use super::ray_keys::{SPECIAL, keys_of};
 use super::stream_rays::{Offsets, offsets};
 use super::tree::{Leaf, Tree, beyond};
-use crate::bvh::instances::{Instances, PlacedTree};
+use crate::bvh::instances::{Instances, Margin, PlacedTree};
 use crate::bvh::layout::{ChildRef, Mbvh, Node, STACK_SIZE, WIDTH};
 use crate::simd::{Eight, Lanes, Mask, Simd};
 use bytemuck::Zeroable;
@@ -194,7 +194,7 @@ pub(super) unsafe fn trace<S: Simd>(instances: &Instances, count: usize, room: &
 /// # Safety
 /// The CPU must have the ISA; the room must have its full length.
 #[inline(always)]
-unsafe fn set_up<L: Eight>(count: usize, margin: f32, room: &mut Room) -> usize {
+unsafe fn set_up<L: Eight>(count: usize, margin: Margin, room: &mut Room) -> usize {
     room.alone.clear();
     let mut listed = 0;
     for first in (0..count).step_by(8) {
@@ -203,13 +203,17 @@ unsafe fn set_up<L: Eight>(count: usize, margin: f32, room: &mut Room) -> usize 
         let keys = unsafe {
             let rays = L::transpose(std::array::from_fn(|i| L::load(std::ptr::from_ref(&room.rays[first + i]).cast())));
             let [ox, oy, oz, tmin, dx, dy, dz, tmax] = rays;
-            let Offsets { reciprocal, near, far, limit } = offsets([ox, oy, oz], [dx, dy, dz], tmax);
+            let Offsets { reciprocal, mut near, mut far, limit } = offsets([ox, oy, oz], [dx, dy, dz], tmax);
             let zero = L::splat(0.0);
             let abs = |x: L| x.max(zero - x);
             // As in `RaySetup::write_for_boxes`.
-            let beside = L::splat(margin) * abs(ox).max(abs(oy)).max(abs(oz));
-            let wider = |a: usize| beside * abs(reciprocal[a]);
-            let (near, far) = ([0, 1, 2].map(|a| near[a] - wider(a)), [0, 1, 2].map(|a| far[a] + wider(a)));
+            let most = abs(ox).max(abs(oy)).max(abs(oz));
+            if L::splat(margin.reach).lt(most).any() {
+                for a in 0..3 {
+                    let beside = L::splat(margin.part) * most * abs(reciprocal[a]);
+                    (near[a], far[a]) = (near[a] - beside, far[a] + beside);
+                }
+            }
             let row = |axis: u32, d: L| {
                 let row = |place: u32| L::splat(f32::from_bits(Mbvh::<WIDTH>::ROW * place));
                 L::select(d.lt(zero), row(axis + 3), row(axis))

@@ -10,6 +10,7 @@ use super::triangle::barycentrics;
 use super::{RawHit, Ray};
 use crate::base::geometry::NONE;
 use crate::bvh::Mbvh;
+use crate::bvh::instances::Margin;
 use crate::bvh::layout::{ChildRef, STACK_SIZE, WIDTH};
 use crate::simd::{Compress, Lanes, Mask, Simd};
 use std::cell::Cell;
@@ -237,10 +238,10 @@ impl Walk {
         Self::begin_with(place, root, ray, number, write)
     }
 
-    /// As [`begin`](Self::begin), for a walk through boxes by [`next_leaf`](Self::next_leaf), of a ray that may lie beside
-    /// where it is by `margin`, a fraction of its origin's coordinates.
+    /// As [`begin`](Self::begin), for a walk through the boxes of instances by [`next_leaf`](Self::next_leaf), with their
+    /// `margin`.
     #[inline(always)]
-    pub(super) fn begin_in_boxes(place: &mut MaybeUninit<Walk>, ray: &Ray, number: usize, margin: f32) -> bool {
+    pub(super) fn begin_in_boxes(place: &mut MaybeUninit<Walk>, ray: &Ray, number: usize, margin: Margin) -> bool {
         // SAFETY: `place` is that of a setup.
         let write = |p, d, tmin| unsafe { RaySetup::write_for_boxes::<Mbvh>(p, ray.origin, d, tmin, margin) };
         Self::begin_with(place, ChildRef::ROOT, ray, number, write)
@@ -391,7 +392,7 @@ impl Walk {
     /// Comes out of an inner tree that has ended, with the ray in the coordinates of the outer one, and the margin of
     /// [`begin_in_boxes`](Self::begin_in_boxes). Returns false if nothing waits there.
     #[inline(always)]
-    pub(super) fn leave(&mut self, ray: &Ray, margin: f32) -> bool {
+    pub(super) fn leave(&mut self, ray: &Ray, margin: Margin) -> bool {
         let has_more = self.stack.count > BOTTOM;
         if has_more {
             let place = &raw mut self.ray;

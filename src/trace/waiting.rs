@@ -7,6 +7,7 @@ use super::single::Walk;
 use super::tree::beyond;
 use crate::base::geometry::NONE;
 use crate::bvh::ChildRef;
+use crate::bvh::instances::Margin;
 use crate::bvh::parts::Part;
 use crate::scene::Scene;
 use crate::scene::waiting::{self, WaitingRays};
@@ -102,7 +103,7 @@ impl<A: Answer> Batch<A> {
         for (ray, answer) in rays.iter().zip(answers) {
             all.begin.push(u32::try_from(all.parts.len()).ok()?);
             let Some(tmax) = answer.tmax(ray) else { continue };
-            if !Walk::begin_in_boxes(&mut place, ray, 0, 0.0) {
+            if !Walk::begin_in_boxes(&mut place, ray, 0, Margin::NONE) {
                 continue;
             }
             // SAFETY: it has begun.
