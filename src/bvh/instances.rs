@@ -38,6 +38,12 @@ impl Margin {
     /// That of boxes whose triangles are hit by rays as they are.
     pub(crate) const NONE: Margin = Margin { part: 0.0, reach: f32::INFINITY };
 
+    /// By how much a ray from `origin` may lie beside where it is, if the boxes are not large enough for that.
+    pub(crate) fn beside(self, origin: [f32; 3]) -> f32 {
+        let far = origin.map(f32::abs).into_iter().fold(0.0, f32::max);
+        if far > self.reach { self.part * far } else { 0.0 }
+    }
+
     /// Returns a box as it is in the tree.
     pub(crate) fn around(self, (lower, upper): (Vec3, Vec3)) -> (Vec3, Vec3) {
         let beside = self.part * self.reach;

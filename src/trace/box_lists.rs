@@ -47,18 +47,18 @@ struct Slab {
 #[derive(Default)]
 pub(super) struct Room {
     /// Rays, with how far they go now.
-    rays: Vec<Ray>,
+    pub(super) rays: Vec<Ray>,
     slabs: Vec<Slab>,
     /// Boxes that the rays of a list hit, bit i for child i.
     masks: Vec<u8>,
     /// Lists of numbers of rays.
-    numbers: Vec<u16>,
+    pub(super) numbers: Vec<u16>,
     /// Rays that are in no list: those that need special treatment in a test, and those whose lists found no room.
-    alone: Vec<u16>,
+    pub(super) alone: Vec<u16>,
     /// The rays at an instance, in the coordinates of its mesh.
     turned: Vec<Ray>,
     /// Whether any ray's end has changed since the rays were set up.
-    has_ended: bool,
+    pub(super) has_ended: bool,
 }
 
 /// The rays at an instance.
@@ -110,6 +110,32 @@ impl Room {
             && fill(&mut self.turned, MAX_RAYS, nothing)
     }
 
+    /// Whether all buffers have their lengths.
+    pub(super) fn is_full(&self) -> bool {
+        let has_lists =
+            self.slabs.len() == MAX_RAYS && self.numbers.len() == NUMBERS && self.masks.len() >= MAX_RAYS + 64;
+        has_lists && self.rays.len() == MAX_RAYS && self.turned.len() == MAX_RAYS
+    }
+
+    /// Takes the rays of a list, which lies within `numbers`, to an instance.
+    ///
+    /// # Safety
+    /// The CPU must have the ISA; the numbers of the list must be those of rays.
+    #[inline(always)]
+    pub(super) unsafe fn visit<S: Simd>(
+        &mut self,
+        instances: &Instances,
+        instance: u32,
+        list: std::ops::Range<usize>,
+        visit: OnVisit,
+    ) {
+        // SAFETY: forwarded.
+        unsafe { turn::<S::F8>(&instances.placed[instance as usize], list.clone(), self) }
+        let Room { rays, slabs, numbers, turned, has_ended, .. } = self;
+        let turned = &turned[..list.len()];
+        visit(Visit { instance, numbers: &numbers[list], rays: turned, ends: rays, slabs, has_ended });
+    }
+
     /// Takes rays, at most [`MAX_RAYS`], with how far they go: `None` if they do not. Returns their number.
     #[inline]
     pub(super) fn take<'a>(&mut self, rays: impl Iterator<Item = (&'a Ray, Option<f32>)>) -> usize {
@@ -155,8 +181,7 @@ struct Entry {
 #[inline(always)]
 pub(super) unsafe fn trace<S: Simd>(instances: &Instances, count: usize, room: &mut Room, visit: OnVisit) {
     let top = &instances.top;
-    let has_room = room.slabs.len() == MAX_RAYS && room.numbers.len() == NUMBERS && room.masks.len() >= MAX_RAYS + 64;
-    assert!(has_room && count <= MAX_RAYS && room.rays.len() == MAX_RAYS && room.turned.len() == MAX_RAYS);
+    assert!(room.is_full() && count <= MAX_RAYS);
     // SAFETY: forwarded.
     let all = unsafe { set_up::<S::F8>(count, instances.margin, room) };
     let mut stack = [const { MaybeUninit::<Entry>::uninit() }; STACK_SIZE];
@@ -180,10 +205,7 @@ pub(super) unsafe fn trace<S: Simd>(instances: &Instances, count: usize, room: &
             if entry.count > 0 {
                 let instance = Tree::leaf::<S>(top, entry.child).number(0);
                 let numbers = entry.start as usize..(entry.start + entry.count) as usize;
-                turn::<S::F8>(&instances.placed[instance as usize], numbers.clone(), room);
-                let Room { rays, slabs, numbers: all, turned, has_ended, .. } = &mut *room;
-                let turned = &turned[..numbers.len()];
-                visit(Visit { instance, numbers: &all[numbers], rays: turned, ends: rays, slabs, has_ended });
+                room.visit::<S>(instances, instance, numbers, visit);
             }
         }
     }

@@ -218,16 +218,19 @@ fn check(data: &SceneData, rays: &[Ray]) -> usize {
 
 #[test]
 fn rays_of_a_camera_hit_instances_as_rays_alone() {
-    let place = Vec3::new(0.3, -0.2, -7.0);
-    let ray = |i: u32| {
-        // Tiles of 8 x 8 pixels; some rays end early.
-        let (tile, pixel) = (i / 64, i % 64);
-        let (x, y) = (8 * (tile % 8) + pixel % 8, 8 * (tile / 8) + pixel / 8);
-        let ray = Ray::new(place, Vec3::new(x as f32 / 64.0 - 0.48, y as f32 / 64.0 - 0.49, 1.0));
-        if i.is_multiple_of(5) { ray.within(0.0, 6.0 + uniform(i, 0, 3)) } else { ray }
-    };
-    let rays: Vec<Ray> = (0..64 * 64).map(ray).collect();
-    assert!(check(&data(9, true), &rays) > 400);
+    // From farther away than the boxes' margin is made for, too.
+    for distance in [7.0, 2000.0] {
+        let place = Vec3::new(0.3, -0.2, -distance);
+        let ray = |i: u32| {
+            // Tiles of 8 x 8 pixels; some rays end early.
+            let (tile, pixel) = (i / 64, i % 64);
+            let (x, y) = (8 * (tile % 8) + pixel % 8, 8 * (tile / 8) + pixel / 8);
+            let ray = Ray::new(place, Vec3::new(x as f32 / 64.0 - 0.48, y as f32 / 64.0 - 0.49, distance / 7.0));
+            if i.is_multiple_of(5) { ray.within(0.0, 7.0 + (uniform(i, 0, 3) - 1.0) * 7.0 / distance) } else { ray }
+        };
+        let rays: Vec<Ray> = (0..64 * 64).map(ray).collect();
+        assert!(check(&data(9, true), &rays) > 400);
+    }
 }
 
 #[test]

@@ -1,7 +1,8 @@
 //! Rays through instances (the two levels of [`crate::bvh::instances`]): each ray goes from box to box through the tree
 //! over instances, and at each box through the tree of the instance's mesh, up to its best hit so far.
 //!
-//! Rays that go alike do so [as lists](super::box_lists), others [one by one](super::two_levels), many at a time.
+//! Rays that go alike do so [as lists](super::box_lists), those of a pinhole [as bundles](super::bundle_boxes), others
+//! [one by one](super::two_levels), many at a time.
 //! Transformed rays keep the length of their direction, so that distances are those in the scene. Hits are the same, bit for
 //! bit, for one ray and for many: the arithmetic of a transformed ray does not depend on the rays beside it, and no ray
 //! enters a box behind what it hits there, so that the order of boxes does not matter: see
@@ -260,7 +261,7 @@ impl Scene {
     ) {
         let found = A::buffer(found);
         let count = lists.take(rays.iter().zip(&*answers).map(|(ray, answer)| (ray, answer.tmax(ray))));
-        self.kernels().list_instances(instances, count, lists, &mut |mut visit| {
+        let mut at_instance = |mut visit: box_lists::Visit| {
             let at = &instances.placed[visit.instance as usize];
             let found = &mut found[..visit.rays.len()];
             A::trace(self, self.tree_of(instances, at.tree), ChildRef::ROOT, visit.rays, alike, found);
@@ -270,7 +271,11 @@ impl Scene {
                     visit.end(number, answer.tmax(&rays[number as usize]));
                 }
             }
-        });
+        };
+        match alike {
+            true => self.kernels().list_instances(instances, count, lists, &mut at_instance),
+            false => self.kernels().bundle_instances(instances, count, lists, &mut at_instance),
+        }
         let numbers = lists.alone();
         if !numbers.is_empty() {
             for (i, &number) in numbers.iter().enumerate() {

@@ -7,13 +7,15 @@ use super::compact::View;
 use super::filter::Filter;
 use super::single::Walk;
 use super::tree::{Leaf, Tree};
-use super::{PACKET_SIZE, Packet, RawHit, Ray, box_lists, bundle, gather, packet, single, stream, two_levels};
+use super::{
+    PACKET_SIZE, Packet, RawHit, Ray, box_lists, bundle, bundle_boxes, gather, packet, single, stream, two_levels,
+};
 use crate::base::geometry::NONE;
 use crate::bvh::instances::Instances;
 use crate::bvh::{ChildRef, Mbvh};
 use crate::device::Device;
 use crate::scene::Scene;
-use crate::simd::{self, Isa, entry_point, isa_features};
+use crate::simd::{self, Isa, Lanes, Simd, entry_point, isa_features};
 use glam::Vec3;
 
 /// Kernels of one ISA. Tables exist for every ISA, but [`Kernels::of`] returns only those that the machine can run:
@@ -34,6 +36,8 @@ pub(crate) struct Kernels {
     compact_filtered: [unsafe fn(&View, &Ray, &mut Filter) -> RawHit; 2],
     next_box: unsafe fn(&Mbvh, &mut Walk, f32) -> u32,
     list_instances: unsafe fn(&Instances, usize, &mut box_lists::Room, box_lists::OnVisit),
+    /// `None`: as lists. (On the portable lanes bundles take 27 kB of the library.)
+    bundle_instances: Option<unsafe fn(&Instances, usize, &mut box_lists::Room, box_lists::OnVisit)>,
     next_bundles: unsafe fn(&[Ray]) -> (usize, usize),
     intersect_instances: unsafe fn(&Scene, &Instances, &[Ray], &mut [RawHit]),
     occluded_instances: unsafe fn(&Scene, &Instances, &[Ray], &mut [u8]),
@@ -163,6 +167,13 @@ macro_rules! table {
                 }
             } }
             isa_features! { $isa => entry_point! {
+                fn bundle_instances(
+                    instances: &Instances, count: usize, room: &mut box_lists::Room, visit: box_lists::OnVisit
+                ) {
+                    bundle_boxes::trace::<S>(instances, count, room, visit)
+                }
+            } }
+            isa_features! { $isa => entry_point! {
                 fn next_bundles(rays: &[Ray]) -> (usize, usize) { bundle::next::<S>(rays) }
             } }
             isa_features! { $isa => entry_point! {
@@ -189,6 +200,10 @@ macro_rules! table {
                 compact_filtered: [compact_filtered::<false>, compact_filtered::<true>],
                 next_box,
                 list_instances,
+                bundle_instances: match <<S as Simd>::Packet as Lanes>::WIDTH {
+                    0..=4 => None,
+                    _ => Some(bundle_instances),
+                },
                 next_bundles,
                 intersect_instances,
                 occluded_instances,
@@ -359,6 +374,18 @@ impl Kernels {
     ) {
         // SAFETY: see `intersect`.
         unsafe { (self.list_instances)(instances, count, room, visit) }
+    }
+
+    /// Takes bundles of rays through the tree over instances: see [`bundle_boxes::trace`].
+    pub(super) fn bundle_instances(
+        &self,
+        instances: &Instances,
+        count: usize,
+        room: &mut box_lists::Room,
+        visit: box_lists::OnVisit,
+    ) {
+        // SAFETY: see `intersect`.
+        unsafe { self.bundle_instances.unwrap_or(self.list_instances)(instances, count, room, visit) }
     }
 
     /// Number of rays before the first that are faster together, and of those.

@@ -8,6 +8,7 @@ pub mod baseline;
 mod beams;
 mod box_lists;
 mod bundle;
+mod bundle_boxes;
 mod compact;
 pub(crate) mod filter;
 #[cfg(any(test, feature = "reference"))]

@@ -69,7 +69,7 @@ type Column = [f32; SIZE];
 
 /// The rays of a bundle, and the best hits so far as in [`single::Best`].
 #[repr(C, align(64))]
-struct Bundle {
+pub(super) struct Bundle {
     direction: [Column; 3],
     /// Reciprocals of directions, as in `RaySetup`.
     reciprocal: [Column; 3],
@@ -81,7 +81,7 @@ struct Bundle {
     /// The largest component of the direction: factor from t to the distance along its axis.
     length: Column,
     /// Conservative tmax: boxes that begin behind it are not entered. Near the least float for lanes behind the last ray.
-    limit: Column,
+    pub(super) limit: Column,
     t: Column,
     u: Column,
     v: Column,
@@ -91,9 +91,9 @@ struct Bundle {
 }
 
 /// Data that all rays of a bundle share.
-struct Shared {
+pub(super) struct Shared {
     origin: [f32; 3],
-    tmin: f32,
+    pub(super) tmin: f32,
     /// The scene's axes in the order of the rays' frame, as in [`Shear`].
     axes: [usize; 3],
     /// The origin in the order of `axes`.
@@ -102,13 +102,13 @@ struct Shared {
     /// Shift that selects the rays' octant in [`Node::order`].
     shift: u32,
     /// Number of lane groups that have rays.
-    groups: usize,
+    pub(super) groups: usize,
 }
 
 /// Frustum that encloses the rays. Distances are along the longest axis; they differ from t by a factor per ray, so the
 /// three intervals of a box are independent, and the test is exact but for rounding: a common distance exists if and
 /// only if one exists for any two of them.
-struct Frustum {
+pub(super) struct Frustum {
     /// 1 or −1: planes × `sign` + `near` or `far` are distances from the origin along the axis.
     sign: [f32; 3],
     near: [f32; 3],
@@ -212,7 +212,61 @@ unsafe fn replace<L: Lanes>(column: &mut Column, g: usize, mask: L::Mask, x: L) 
 unsafe fn trace<S: Simd>(bvh: &Mbvh, root: ChildRef, rays: &[Ray], out: &mut [RawHit]) {
     let mut place = MaybeUninit::uninit();
     // SAFETY: forwarded.
-    let (rays, shared, mut frustum) = unsafe { begin::<S>(rays, &mut place) };
+    unsafe {
+        let (rays, shared, frustum) = begin::<S>(rays, 0.0, &mut place);
+        walk::<S>(bvh, root, rays, &shared, frustum, &mut Triangles(bvh));
+        finish(rays, out);
+    }
+}
+
+/// What is done with a bundle at a leaf.
+pub(super) trait AtLeaf<S: Simd> {
+    /// `planes` are the leaf's box, for which groups before `first` need not be tested. Returns whether any ray's end has
+    /// changed.
+    ///
+    /// # Safety
+    /// The CPU must have the ISA; `leaf` must be a leaf of the tree, and `first` a group of the rays.
+    unsafe fn visit(
+        &mut self,
+        rays: &mut Bundle,
+        shared: &Shared,
+        leaf: ChildRef,
+        planes: &[[S::Packet; 2]; 3],
+        first: usize,
+    ) -> bool;
+}
+
+/// Leaves with triangles.
+struct Triangles<'a>(&'a Mbvh);
+
+impl<S: Simd> AtLeaf<S> for Triangles<'_> {
+    #[inline(always)]
+    unsafe fn visit(
+        &mut self,
+        rays: &mut Bundle,
+        shared: &Shared,
+        leaf: ChildRef,
+        planes: &[[S::Packet; 2]; 3],
+        first: usize,
+    ) -> bool {
+        // SAFETY: forwarded.
+        unsafe { rays.leaf::<S>(self.0, leaf, shared, planes, first) }
+    }
+}
+
+/// Takes a bundle through a tree.
+///
+/// # Safety
+/// The CPU must have the ISA; the bundle must have been [begun](begin).
+#[inline(always)]
+pub(super) unsafe fn walk<S: Simd>(
+    bvh: &Mbvh,
+    root: ChildRef,
+    rays: &mut Bundle,
+    shared: &Shared,
+    mut frustum: Frustum,
+    leaves: &mut impl AtLeaf<S>,
+) {
     let mut stack = MaybeUninit::<Stack>::uninit();
     let stack = stack.as_mut_ptr();
     // SAFETY: addresses within the stack; nothing is read.
@@ -238,7 +292,6 @@ unsafe fn trace<S: Simd>(bvh: &Mbvh, root: ChildRef, rays: &[Ray], out: &mut [Ra
         }
         loop {
             if count == 0 {
-                finish(rays, out);
                 return;
             }
             count -= 1;
@@ -272,7 +325,7 @@ unsafe fn trace<S: Simd>(bvh: &Mbvh, root: ChildRef, rays: &[Ray], out: &mut [Ra
                     number = child.node_index();
                     break;
                 }
-                if rays.leaf::<S>(bvh, child, &shared, &planes, first) {
+                if leaves.visit(rays, shared, child, &planes, first) {
                     frustum.end = rays.end::<S::Packet>(shared.groups);
                 }
             }
@@ -280,12 +333,16 @@ unsafe fn trace<S: Simd>(bvh: &Mbvh, root: ChildRef, rays: &[Ray], out: &mut [Ra
     }
 }
 
-/// Sets up a bundle in `place`, with all lanes of its groups.
+/// Sets up a bundle in `place`, with all lanes of its groups; `beside`: by how much its rays may lie beside where they are.
 ///
 /// # Safety
 /// As for [`trace`].
 #[inline(always)]
-unsafe fn begin<'a, S: Simd>(rays: &[Ray], place: &'a mut MaybeUninit<Bundle>) -> (&'a mut Bundle, Shared, Frustum) {
+pub(super) unsafe fn begin<'a, S: Simd>(
+    rays: &[Ray],
+    beside: f32,
+    place: &'a mut MaybeUninit<Bundle>,
+) -> (&'a mut Bundle, Shared, Frustum) {
     let width = S::Packet::WIDTH;
     let Ray { origin, direction, tmin, .. } = rays[0];
     let axes = Shear::new(origin, direction).axes.map(|a| a as usize);
@@ -329,8 +386,13 @@ unsafe fn begin<'a, S: Simd>(rays: &[Ray], place: &'a mut MaybeUninit<Bundle>) -
                 let offset = splat(-origin[a]) * r;
                 let error = splat(OFFSET_ERROR) * abs(offset);
                 store(&mut b.reciprocal[a], g, r);
-                store(&mut b.near_offset[a], g, offset - error);
-                store(&mut b.far_offset[a], g, offset + error);
+                let (mut near, mut far) = (offset - error, offset + error);
+                if beside > 0.0 {
+                    let beside = splat(beside) * abs(r);
+                    (near, far) = (near - beside, far + beside);
+                }
+                store(&mut b.near_offset[a], g, near);
+                store(&mut b.far_offset[a], g, far);
                 let r = abs(r) * length;
                 (least[a], most[a]) = (least[a].min(r), most[a].max(r));
             }
@@ -352,7 +414,7 @@ unsafe fn begin<'a, S: Simd>(rays: &[Ray], place: &'a mut MaybeUninit<Bundle>) -
         let begin = tmin * if tmin < 0.0 { simd::greatest(longest) } else { simd::least(shortest) };
         let sign = negative.map(|n| if n { -1.0 } else { 1.0 });
         // Larger than the margin for rounding of a single ray's test; all rays have that one.
-        let margin = origin.map(|o| 16.0 * EPSILON * o.abs());
+        let margin = origin.map(|o| 16.0 * EPSILON * o.abs() + beside);
         let frustum = Frustum {
             sign,
             near: [0, 1, 2].map(|a| -origin[a] * sign[a] - margin[a]),
@@ -388,7 +450,7 @@ impl Bundle {
     /// # Safety
     /// The CPU must have the ISA; the group must be of the bundle.
     #[inline(always)]
-    unsafe fn meet<L: Lanes>(&self, planes: &[[L; 2]; 3], tmin: f32, g: usize) -> L::Mask {
+    pub(super) unsafe fn meet<L: Lanes>(&self, planes: &[[L; 2]; 3], tmin: f32, g: usize) -> L::Mask {
         // SAFETY: forwarded.
         unsafe {
             let axis = |a: usize| {

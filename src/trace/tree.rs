@@ -271,9 +271,9 @@ impl RaySetup {
 
     /// Changes the setup of a ray from far away, or for the slower box test.
     #[cold]
+    #[inline(never)]
     fn change_for_boxes<T: Tree>(&mut self, origin: [f32; 3], direction: [f32; 3], margin: Margin) {
-        let far = origin.map(f32::abs).into_iter().fold(0.0, f32::max);
-        let beside = if far > margin.reach { margin.part * far } else { 0.0 };
+        let beside = margin.beside(origin);
         for a in 0..3 {
             self.near_offset[a] -= beside * self.reciprocal[a].abs();
             self.far_offset[a] += beside * self.reciprocal[a].abs();
