@@ -13,6 +13,7 @@ pub(in crate::lightmap) mod known;
 pub mod layout;
 pub(crate) mod pieces;
 mod planar;
+mod repeats;
 pub(crate) mod seen;
 pub(crate) mod seen_from;
 pub(in crate::lightmap) mod sheets;

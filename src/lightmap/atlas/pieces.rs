@@ -161,8 +161,16 @@ impl Groups {
         Ok(Groups { items, starts })
     }
 
+    pub(in crate::lightmap) fn len(&self) -> usize {
+        self.starts.len() - 1
+    }
+
+    pub(in crate::lightmap) fn get(&self, group: usize) -> &[u32] {
+        &self.items[self.starts[group] as usize..self.starts[group + 1] as usize]
+    }
+
     pub(in crate::lightmap) fn iter(&self) -> impl Iterator<Item = &[u32]> {
-        self.starts.windows(2).map(|w| &self.items[w[0] as usize..w[1] as usize])
+        (0..self.len()).map(|group| self.get(group))
     }
 }
 

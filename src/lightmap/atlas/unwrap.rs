@@ -10,6 +10,7 @@
 
 use super::pieces::{CHARTS, Groups, KnownPieces, Piece, connected_by_vertices};
 use super::planar::{Regions, flat_piece, flat_regions, planar_pieces};
+use super::repeats::Components;
 use super::welded::Geometry;
 use crate::base::error::Result;
 use crate::base::memory::{try_append, try_collect, try_filled, try_par_gather, try_push, try_with_capacity};
@@ -60,7 +61,7 @@ fn unwrap_mesh(scene: &Scene, triangles: &[u32], known: Option<KnownPieces>, sta
     let neighbours = geometry.neighbours(scene.device(), stage)?;
     let all = try_collect(0..triangles.len() as u32, CHARTS)?;
     let regions = flat_regions(&geometry, &neighbours, &all, stage)?;
-    let flat = try_par_gather(regions.len().div_ceil(REGIONS_PER_JOB), CHARTS, |i, out| {
+    let mut flat = try_par_gather(regions.len().div_ceil(REGIONS_PER_JOB), CHARTS, |i, out| {
         stage.check()?;
         let mut done = 0;
         for region in i * REGIONS_PER_JOB..regions.len().min((i + 1) * REGIONS_PER_JOB) {
@@ -76,27 +77,53 @@ fn unwrap_mesh(scene: &Scene, triangles: &[u32], known: Option<KnownPieces>, sta
         regions.get(*region).iter().for_each(|&t| rest[t as usize] = false);
     }
     drop(regions);
-    let mut taken_over = Vec::new();
+    let (mut taken_over, mut is_taken) = (Vec::new(), Vec::new());
     if let Some(known) = known {
         let curved = all.iter().filter(|&&t| rest[t as usize]).map(|&t| triangles[t as usize]);
         taken_over = known(&try_collect(curved, CHARTS)?, stage)?;
+        is_taken = try_filled(triangles.len(), false, CHARTS)?;
         for piece in &taken_over {
             for t in &piece.triangles {
-                rest[triangles.binary_search(t).expect("it is one of them")] = false;
+                let t = triangles.binary_search(t).expect("it is one of them");
+                (rest[t], is_taken[t]) = (false, true);
             }
             stage.advance(piece.triangles.len() as u64)?;
         }
     }
-    let rest = try_collect(all.into_iter().filter(|&t| rest[t as usize]), CHARTS)?;
-    let parts = parts(&geometry, &neighbours, &rest, stage)?;
-    drop(neighbours);
-    let curved = try_par_gather(parts.len(), CHARTS, |i, out: &mut Vec<Piece>| {
-        stage.check()?;
-        *out = unwrap_part(&geometry.part(&parts[i], stage)?, scene, stage)?;
-        stage.advance(parts[i].len() as u64)
-    })?;
-    let mut pieces = try_with_capacity(flat.len() + taken_over.len() + curved.len(), CHARTS)?;
-    for piece in flat.into_iter().map(|(_, piece)| piece).chain(taken_over).chain(curved) {
+    let unwrap_parts = |parts: Vec<Vec<u32>>| {
+        try_par_gather(parts.len(), CHARTS, |i, out: &mut Vec<Piece>| {
+            stage.check()?;
+            *out = unwrap_part(&geometry.part(&parts[i], stage)?, scene, stage)?;
+            stage.advance(parts[i].len() as u64)
+        })
+    };
+    let (mut curved, mut copies, mut left) = (Vec::new(), Vec::new(), Vec::new());
+    if rest.contains(&true) {
+        // What is all flat has exact charts of its own, and what an earlier light map has keeps them.
+        let may_copy = |first: &[u32], copy: &[u32]| {
+            first.iter().any(|&t| rest[t as usize]) && !copy.iter().any(|&t| is_taken.get(t as usize) == Some(&true))
+        };
+        let components = Components::of(&geometry, may_copy, stage)?;
+        let place = |t: &u32| triangles.binary_search(t).expect("it is one of them");
+        flat.retain(|(_, piece)| !components.is_copied(place(&piece.triangles[0])));
+        let firsts = all.iter().copied().filter(|&t| rest[t as usize] && !components.is_copied(t as usize));
+        let parts_of_firsts = parts(&geometry, &neighbours, &try_collect(firsts, CHARTS)?, stage)?;
+        drop(neighbours);
+        curved = unwrap_parts(parts_of_firsts)?;
+        let firsts = flat.iter().map(|(_, piece)| piece).chain(&taken_over).chain(&curved);
+        let without;
+        (copies, without) = components.copies(&geometry, firsts, stage)?;
+        drop(components);
+        let copied = copies.iter().flat_map(|piece| piece.triangles.iter()).filter(|t| rest[place(t)]);
+        stage.advance(copied.count() as u64)?;
+        if !without.is_empty() {
+            left = unwrap_parts(parts(&geometry, &geometry.neighbours(scene.device(), stage)?, &without, stage)?)?;
+        }
+    }
+    let count = flat.len() + taken_over.len() + curved.len() + copies.len() + left.len();
+    let mut pieces = try_with_capacity(count, CHARTS)?;
+    let flat = flat.into_iter().map(|(_, piece)| piece);
+    for piece in flat.chain(taken_over).chain(curved).chain(copies).chain(left) {
         pieces.push(piece.kept(scene.device())?);
     }
     Ok(pieces)
