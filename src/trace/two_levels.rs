@@ -13,7 +13,7 @@ use super::tree::{Leaf, Tree};
 use crate::bvh::instances::{Instances, MeshTree};
 use crate::bvh::{self, ChildRef, Mbvh};
 use crate::scene::Scene;
-use crate::simd::Simd;
+use crate::simd::{Lanes, Simd};
 use std::borrow::Borrow;
 use std::mem::MaybeUninit;
 
@@ -80,7 +80,9 @@ unsafe fn trace_in<S: Simd, T: Tree, H: Borrow<T> + Copy, A: Answer, const ANY: 
     rays: &[Ray],
     answers: &mut [A],
 ) {
-    if let ([ray], [answer]) = (rays, &mut *answers) {
+    // (Compact trees on the portable lanes do without: it took 0.09 MB of the library there.)
+    let has_one = T::IS_BY_WORTH || <S::Packet as Lanes>::WIDTH > 4;
+    if let ([ray], [answer], true) = (rays, &mut *answers, has_one) {
         // SAFETY: forwarded.
         return unsafe { trace_one::<S, T, H, A, ANY>(scene, instances, tree_of, ray, answer) };
     }

@@ -5,15 +5,14 @@
 //! A chart is valid for any triangles that are joined alike: whether it folds or overlaps is a matter of its own coordinates.
 //! Lengths need to agree only as well as charts keep them, which is not exactly either.
 
-use super::pieces::{CHARTS, Groups, Piece, connected_by_vertices};
+use super::pieces::{CHARTS, Groups, ITEMS_PER_CHECK, Piece, connected_by_vertices};
 use super::welded::Geometry;
 use crate::base::error::Result;
-use crate::base::memory::{try_collect, try_filled, try_par_collect, try_push};
+use crate::base::memory::{try_collect, try_filled, try_push, try_with_capacity};
 use crate::base::progress::Stage;
 use crate::base::sort::sort;
 use crate::scene::NONE;
 use glam::DVec3;
-use rayon::prelude::*;
 use std::hash::{DefaultHasher, Hasher};
 
 /// Greatest difference of a triangle's sides, as a fraction of its longest one.
@@ -66,8 +65,13 @@ impl Components {
         }
         stage.check()?;
         let shapes = Shapes { geometry, order: &order };
-        let hashes = (0..groups.len()).into_par_iter().with_min_len(64).map(|c| (shapes.hash(groups.get(c)), c as u32));
-        let mut hashes = try_par_collect(hashes, CHARTS)?;
+        let mut hashes = try_with_capacity(groups.len(), CHARTS)?;
+        for (c, members) in (0u32..).zip(groups.iter()) {
+            if (c as usize).is_multiple_of(ITEMS_PER_CHECK) {
+                stage.check()?;
+            }
+            hashes.push((shapes.hash(members), c));
+        }
         sort(&mut hashes, &|| stage.check())?;
         let mut first = try_collect(0..groups.len() as u32, CHARTS)?;
         for same in hashes.chunk_by(|a, b| a.0 == b.0) {
@@ -103,13 +107,11 @@ impl Components {
         pieces: impl Iterator<Item = &'a Piece>,
         stage: &Stage,
     ) -> Result<(Vec<Piece>, Vec<u32>)> {
-        let copies = (0..).zip(&self.first).filter(|&(c, &first)| first != c).map(|(c, &first)| (first, c));
-        let mut copies: Vec<(u32, u32)> = try_collect(copies, CHARTS)?;
-        copies.sort_unstable();
-        let copies_of = |component: u32| {
-            let begin = copies.partition_point(|copy| copy.0 < component);
-            copies[begin..].iter().take_while(move |copy| copy.0 == component).map(|copy| copy.1)
-        };
+        // After each component the next copy of the same.
+        let mut next = try_filled(self.first.len(), NONE, CHARTS)?;
+        for (copy, &first) in self.first.iter().enumerate().rev().filter(|&(copy, &first)| first as usize != copy) {
+            next[copy] = std::mem::replace(&mut next[first as usize], copy as u32);
+        }
         // Where a triangle stands: its component, and its rank there.
         let stands = |global: &u32| {
             let t = geometry.triangles.binary_search(global).expect("pieces are of this mesh") as u32;
@@ -126,8 +128,10 @@ impl Components {
                 places.iter().for_each(|&(c, _)| is_mixed[c as usize] = true);
                 continue;
             }
-            for copy in copies_of(component) {
+            let mut copy = next[component as usize];
+            while copy != NONE {
                 let members = self.groups.get(copy as usize);
+                copy = next[copy as usize];
                 let of_copy = places.iter().map(|&(_, rank)| geometry.triangles[members[rank] as usize]);
                 let of_copy = Piece {
                     triangles: try_collect(of_copy, CHARTS)?.into(),
@@ -138,8 +142,10 @@ impl Components {
             }
         }
         let mut without = Vec::new();
-        for &(_, copy) in copies.iter().filter(|copy| is_mixed[copy.0 as usize]) {
-            self.groups.get(copy as usize).iter().try_for_each(|&t| try_push(&mut without, t, CHARTS))?;
+        for (copy, &first) in self.first.iter().enumerate() {
+            if first as usize != copy && is_mixed[first as usize] {
+                self.groups.get(copy).iter().try_for_each(|&t| try_push(&mut without, t, CHARTS))?;
+            }
         }
         without.sort_unstable();
         all.retain(|&(component, _)| !is_mixed[component as usize]);
