@@ -5,7 +5,7 @@
 use super::layout::{ChildRef, Mbvh};
 use super::{BuildOptions, BuildQuality, Tree, build_few};
 use crate::base::error::Result;
-use crate::base::geometry::is_valid_triangle;
+use crate::base::geometry::{MAX_COORDINATE, is_valid_triangle};
 use crate::base::memory::{try_collect, try_push, try_to_vec};
 use crate::base::progress::Progress;
 use glam::{Mat3A, Vec3, Vec3A};
@@ -47,7 +47,9 @@ impl Margin {
     /// Returns a box as it is in the tree.
     pub(crate) fn around(self, (lower, upper): (Vec3, Vec3)) -> (Vec3, Vec3) {
         let beside = self.part * self.reach;
-        (lower - beside, upper + beside)
+        // A box that is valid stays so.
+        let low = (lower - beside).max(Vec3::splat(-MAX_COORDINATE)).min(lower);
+        (low, (upper + beside).min(Vec3::splat(MAX_COORDINATE)).max(upper))
     }
 }
 

@@ -106,7 +106,7 @@ pub(super) fn refit(
 }
 
 /// The margin of the instances' boxes: of rays from within twice the greatest coordinate of the instances, unless the
-/// boxes would grow by more than a hundredth of the instances' (geometric) mean size, as with a single one far away.
+/// boxes would grow by more than a tenth of the instances' (geometric) mean size, as with a single one far away.
 fn margin_of(data: &SceneData, trees: &[MeshTree], placed: &[PlacedTree]) -> Margin {
     let (mut part, mut farthest, mut size, mut count) = (0f32, 0f32, 0.0, 0);
     for (instance, at) in data.instances.iter().zip(placed) {
@@ -120,7 +120,7 @@ fn margin_of(data: &SceneData, trees: &[MeshTree], placed: &[PlacedTree]) -> Mar
         }
     }
     let mean = (size / f64::from(count.max(1))).exp2() as f32;
-    Margin { part, reach: (2.0 * farthest).min(0.01 * mean / part.max(f32::MIN_POSITIVE)) }
+    Margin { part, reach: (2.0 * farthest).min(0.1 * mean / part.max(f32::MIN_POSITIVE)) }
 }
 
 /// The box in the scene of an instance of a mesh with given bounds.
@@ -134,8 +134,13 @@ pub(super) fn bounds_and_extent(data: &SceneData, own: &Tree, instances: Option<
     let (mut lower, mut upper) = own.bounds();
     let mut reach = 0.0;
     if let Some(instances) = instances {
-        let (low, high) = instances.top.bounds();
-        (lower, upper) = (lower.min(low), upper.max(high));
+        for i in instances.in_top() {
+            let bounds = instances.trees[instances.placed[i as usize].tree as usize].tree.bounds();
+            let (low, high) = box_of(&data.instances[i as usize], bounds);
+            if is_valid_triangle(Instances::corners_of_box((low, high))) {
+                (lower, upper) = (lower.min(low), upper.max(high));
+            }
+        }
         let of_instance = |(i, at): (&Instance, &PlacedTree)| i.reach(instances.trees[at.tree as usize].tree.bounds());
         let all = data.instances.iter().zip(&instances.placed).map(of_instance);
         reach = all.filter(|r| r.is_finite()).fold(0.0, f32::max);

@@ -53,7 +53,8 @@ pub(super) struct Room {
     masks: Vec<u8>,
     /// Lists of numbers of rays.
     pub(super) numbers: Vec<u16>,
-    /// Rays that are in no list: those that need special treatment in a test, and those whose lists found no room.
+    /// Rays that are in no list: those that need special treatment in a test, those whose lists found no room, and those
+    /// in no bundle.
     pub(super) alone: Vec<u16>,
     /// The rays at an instance, in the coordinates of its mesh.
     turned: Vec<Ray>,

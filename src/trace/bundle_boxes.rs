@@ -20,6 +20,7 @@ use std::mem::MaybeUninit;
 pub(super) unsafe fn trace<S: Simd>(instances: &Instances, count: usize, room: &mut Room, visit: OnVisit) {
     assert!(room.is_full() && count <= MAX_RAYS);
     room.alone.clear();
+    room.has_ended = false;
     let mut start = 0;
     while start < count {
         // SAFETY: forwarded.

@@ -6,7 +6,8 @@
 //! push the root, with group 0                     (a group: as many rays as there are lanes)
 //! while a child is popped, with the first group that may hit it:
 //!     advance that group until one hits the child's box; if none does, pop the next child
-//!     leaf:  for each group from there on that hits the leaf's box, test the leaf's triangles
+//!     leaf:  for each group from there on that hits the leaf's box, test the leaf's triangles,
+//!            or take the rays that hit it to an instance: see `bundle_boxes`
 //!     node:  test the frustum around all rays against the node's eight children at once;
 //!            push those that it overlaps, the nearest last, each with that first group
 //! ```
@@ -19,7 +20,7 @@
 //!
 //! Tried for final gathering, with an origin per ray: slower, see docs/experiments.md#bundles-for-final-gathering.
 //!
-//! The file is long because all of it is inlined into one entry point per instruction set.
+//! The file is long because all of it is inlined into one entry point per instruction set, and again into that for instances.
 
 use super::bundle::{LEAST, SIZE, bundle, directions_and_ends};
 use super::single;

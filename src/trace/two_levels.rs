@@ -81,8 +81,8 @@ unsafe fn trace_in<S: Simd, T: Tree, H: Borrow<T> + Copy, A: Answer, const ANY: 
     answers: &mut [A],
 ) {
     // (Compact trees on the portable lanes do without: it took 0.09 MB of the library there.)
-    let has_one = T::IS_BY_WORTH || <S::Packet as Lanes>::WIDTH > 4;
-    if let ([ray], [answer], true) = (rays, &mut *answers, has_one) {
+    let is_whole = T::IS_BY_WORTH;
+    if let ([ray], [answer], true) = (rays, &mut *answers, is_whole || <S::Packet as Lanes>::WIDTH > 4) {
         // SAFETY: forwarded.
         return unsafe { trace_one::<S, T, H, A, ANY>(scene, instances, tree_of, ray, answer) };
     }

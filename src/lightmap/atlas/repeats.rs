@@ -1,9 +1,10 @@
 //! What repeats in a mesh, as columns, chairs and balusters do in scenes that were exported without instances: connected
-//! surface with the same triangles in the same order and of the same lengths. The first of each kind is unwrapped, and the
-//! others get its charts.
+//! surface with the same triangles in the same order, which differ by little but where they lie. The first of each kind is
+//! unwrapped, and the others get its charts.
 //!
 //! A chart is valid for any triangles that are joined alike: whether it folds or overlaps is a matter of its own coordinates.
-//! Lengths need to agree only as well as charts keep them, which is not exactly either.
+//! How much it is stretched is a matter of the triangles, and bounded here. What is all flat is left alone: its charts are
+//! exact, and soon made.
 
 use super::pieces::{CHARTS, Groups, ITEMS_PER_CHECK, Piece, connected_by_vertices};
 use super::welded::Geometry;
@@ -15,11 +16,11 @@ use crate::scene::NONE;
 use glam::DVec3;
 use std::hash::{DefaultHasher, Hasher};
 
-/// Greatest difference of a triangle's sides, as a fraction of its longest one.
-const SIDE: f64 = 0.01;
+/// Greatest factor by which a copy's triangle may be longer or shorter in any direction than that of the first.
+const STRETCH: f64 = 1.05;
 
-/// What is added to that, as a fraction of the extent of the whole component: exporters round coordinates.
-const ROUNDING: f64 = 1e-3;
+/// Greatest part of the surface where it may be more: slivers, which rounded coordinates change much.
+const MISFIT: f64 = 0.005;
 
 /// Greatest difference of the distances of vertices from the middle, as a fraction of the extent: surfaces with the same
 /// lengths may still be bent otherwise, and have creases elsewhere.
@@ -34,77 +35,102 @@ pub(super) struct Components {
     groups: Groups,
     /// The component of each triangle.
     of: Vec<u32>,
+    /// Whether any triangle of each is curved.
+    are_curved: Vec<bool>,
     /// The component that each is a copy of; the number of one that is no copy.
     first: Vec<u32>,
 }
 
 impl Components {
-    /// Finds the components of a mesh, and which of them repeat. `may_copy` says whether one (the second) may get the charts
-    /// of another.
-    pub(super) fn of(
-        geometry: &Geometry,
-        may_copy: impl Fn(&[u32], &[u32]) -> bool,
-        stage: &Stage,
-    ) -> Result<Components> {
-        let roots = connected_by_vertices(geometry.indices.iter().copied(), geometry.positions.len(), stage)?;
-        let groups = Groups::new(&roots, stage)?;
-        let mut of = roots;
-        // Vertices by the order in which the component's triangles name them.
-        let mut order = try_filled(geometry.positions.len(), NONE, CHARTS)?;
+    /// Bytes per triangle, if each is a component and curved.
+    pub(super) const BYTES_PER_TRIANGLE: usize = 8 + 4 + 1 + 4;
+
+    /// Finds the components of a mesh.
+    pub(super) fn of(geometry: &Geometry, is_curved: &[bool], stage: &Stage) -> Result<Components> {
+        let mut of = connected_by_vertices(geometry.indices.iter().copied(), geometry.positions.len(), stage)?;
+        let groups = Groups::new(&of, stage)?;
+        let mut are_curved = try_filled(groups.len(), false, CHARTS)?;
+        let mut looks = Looks { stage, since: 0 };
         for (number, members) in (0..).zip(groups.iter()) {
-            let mut next = 0;
             for &t in members {
+                looks.count()?;
                 of[t as usize] = number;
-                for v in geometry.indices[t as usize] {
-                    let place = &mut order[v as usize];
-                    if *place == NONE {
-                        (*place, next) = (next, next + 1);
-                    }
-                }
+                are_curved[number as usize] |= is_curved[t as usize];
             }
         }
-        stage.check()?;
-        let shapes = Shapes { geometry, order: &order };
-        let mut hashes = try_with_capacity(groups.len(), CHARTS)?;
-        for (c, members) in (0u32..).zip(groups.iter()) {
-            if (c as usize).is_multiple_of(ITEMS_PER_CHECK) {
-                stage.check()?;
-            }
-            hashes.push((shapes.hash(members), c));
-        }
-        sort(&mut hashes, &|| stage.check())?;
-        let mut first = try_collect(0..groups.len() as u32, CHARTS)?;
-        for same in hashes.chunk_by(|a, b| a.0 == b.0) {
-            stage.check()?;
-            let mut kinds: Vec<u32> = Vec::new();
-            for &(_, c) in same {
-                let members = groups.get(c as usize);
-                let is_first = |&&other: &&u32| {
-                    let first = groups.get(other as usize);
-                    shapes.are_alike(first, members) && may_copy(first, members)
-                };
-                match kinds.iter().find(is_first) {
-                    Some(&other) => first[c as usize] = other,
-                    None if kinds.len() < MOST_COMPARED => try_push(&mut kinds, c, CHARTS)?,
-                    None => {}
-                }
-            }
-        }
-        Ok(Components { groups, of, first })
+        let first = try_collect(0..groups.len() as u32, CHARTS)?;
+        Ok(Components { groups, of, are_curved, first })
     }
 
-    /// Whether a triangle (by its place in the geometry) belongs to a copy.
+    /// Whether a triangle (by its place in the geometry) belongs to a component that is not all flat.
+    pub(super) fn is_curved(&self, triangle: usize) -> bool {
+        self.are_curved[self.of[triangle] as usize]
+    }
+
+    /// Whether a triangle belongs to a copy.
     pub(super) fn is_copied(&self, triangle: usize) -> bool {
         let component = self.of[triangle];
         self.first[component as usize] != component
     }
 
+    /// Finds which components are copies of others. None are those with triangles that have charts already.
+    pub(super) fn find_copies(
+        &mut self,
+        geometry: &Geometry,
+        has_chart: impl Fn(u32) -> bool,
+        stage: &Stage,
+    ) -> Result<()> {
+        let groups = &self.groups;
+        let mut looks = Looks { stage, since: 0 };
+        // Vertices by the order in which the component's triangles name them.
+        let mut order = try_filled(geometry.positions.len(), NONE, CHARTS)?;
+        let mut hashes = try_with_capacity(self.are_curved.iter().filter(|&&is_curved| is_curved).count(), CHARTS)?;
+        for (number, members) in (0..).zip(groups.iter()).filter(|&(c, _)| self.are_curved[c as usize]) {
+            let (mut next, mut hasher) = (0, DefaultHasher::new());
+            for &t in members {
+                looks.count()?;
+                let vertices = geometry.indices[t as usize].map(|v| {
+                    let place = &mut order[v as usize];
+                    if *place == NONE {
+                        (*place, next) = (next, next + 1);
+                    }
+                    u128::from(*place)
+                });
+                let kind = u128::from(geometry.kinds[t as usize]);
+                hasher.write_u128(kind << 96 | vertices[0] << 64 | vertices[1] << 32 | vertices[2]);
+            }
+            hashes.push((hasher.finish(), number));
+        }
+        sort(&mut hashes, &|| stage.check())?;
+        for same in hashes.chunk_by(|a, b| a.0 == b.0).filter(|same| same.len() > 1) {
+            let mut kinds: Vec<(u32, Size)> = Vec::new();
+            for &(_, c) in same {
+                let members = groups.get(c as usize);
+                let size = Size::of(geometry, members, &mut looks)?;
+                let mut like = None;
+                for &(other, of_other) in &kinds {
+                    let shapes = Shapes { geometry, order: &order, sizes: [of_other, size] };
+                    if shapes.are_alike(groups.get(other as usize), members, &mut looks)? {
+                        like = Some(other);
+                        break;
+                    }
+                }
+                match like {
+                    Some(other) if !members.iter().any(|&t| has_chart(t)) => self.first[c as usize] = other,
+                    None if kinds.len() < MOST_COMPARED => try_push(&mut kinds, (c, size), CHARTS)?,
+                    _ => {}
+                }
+            }
+        }
+        Ok(())
+    }
+
     /// Makes the pieces of copies from those of all other triangles. Also returns the triangles of copies that there are
-    /// none for: a piece of what they are copies of belongs to another component, too.
+    /// none for, ascending: a piece of what they are copies of belongs to another component, too.
     pub(super) fn copies<'a>(
         &self,
         geometry: &Geometry,
-        pieces: impl Iterator<Item = &'a Piece>,
+        pieces: impl Iterator<Item = &'a Piece> + Clone,
         stage: &Stage,
     ) -> Result<(Vec<Piece>, Vec<u32>)> {
         // After each component the next copy of the same.
@@ -112,33 +138,36 @@ impl Components {
         for (copy, &first) in self.first.iter().enumerate().rev().filter(|&(copy, &first)| first as usize != copy) {
             next[copy] = std::mem::replace(&mut next[first as usize], copy as u32);
         }
-        // Where a triangle stands: its component, and its rank there.
-        let stands = |global: &u32| {
-            let t = geometry.triangles.binary_search(global).expect("pieces are of this mesh") as u32;
-            let component = self.of[t as usize];
-            (component, self.groups.get(component as usize).binary_search(&t).expect("it is in its group"))
-        };
-        let mut all = Vec::new();
+        let mut looks = Looks { stage, since: 0 };
+        let place = |global: u32| geometry.triangles.binary_search(&global).expect("pieces are of this mesh") as u32;
+        let component = |global: u32| self.of[place(global) as usize] as usize;
         let mut is_mixed = try_filled(self.first.len(), false, CHARTS)?;
-        for piece in pieces {
-            stage.check()?;
-            let component = stands(&piece.triangles[0]).0;
-            let places = try_collect(piece.triangles.iter().map(stands), CHARTS)?;
-            if places.iter().any(|&(other, _)| other != component) {
-                places.iter().for_each(|&(c, _)| is_mixed[c as usize] = true);
-                continue;
+        let repeats = |piece: &&Piece| next[component(piece.triangles[0])] != NONE;
+        for piece in pieces.clone() {
+            let first = component(piece.triangles[0]);
+            for &t in &piece.triangles {
+                looks.count()?;
+                let other = component(t);
+                if other != first {
+                    (is_mixed[first], is_mixed[other]) = (true, true);
+                }
             }
-            let mut copy = next[component as usize];
+        }
+        let mut all = Vec::new();
+        for piece in pieces.filter(repeats) {
+            let first = component(piece.triangles[0]);
+            let mut copy = if is_mixed[first] { NONE } else { next[first] };
             while copy != NONE {
                 let members = self.groups.get(copy as usize);
                 copy = next[copy as usize];
-                let of_copy = places.iter().map(|&(_, rank)| geometry.triangles[members[rank] as usize]);
-                let of_copy = Piece {
-                    triangles: try_collect(of_copy, CHARTS)?.into(),
-                    corners: try_collect(piece.corners.iter().copied(), CHARTS)?.into(),
-                    given: None,
-                };
-                try_push(&mut all, (component, of_copy), CHARTS)?;
+                let mut of_copy = try_with_capacity(piece.triangles.len(), CHARTS)?;
+                for &t in &piece.triangles {
+                    looks.count()?;
+                    let rank = self.groups.get(first).binary_search(&place(t)).expect("it is in its group");
+                    of_copy.push(geometry.triangles[members[rank] as usize]);
+                }
+                let corners = try_collect(piece.corners.iter().copied(), CHARTS)?;
+                try_push(&mut all, Piece { triangles: of_copy.into(), corners: corners.into(), given: None }, CHARTS)?;
             }
         }
         let mut without = Vec::new();
@@ -148,15 +177,58 @@ impl Components {
             }
         }
         without.sort_unstable();
-        all.retain(|&(component, _)| !is_mixed[component as usize]);
-        Ok((try_collect(all.into_iter().map(|(_, piece)| piece), CHARTS)?, without))
+        Ok((all, without))
     }
 }
 
-/// The shapes of components, by their triangles.
+/// Looks for a cancel, each time so many triangles have been counted.
+struct Looks<'a, 'p, 's> {
+    stage: &'a Stage<'p, 's>,
+    since: usize,
+}
+
+impl Looks<'_, '_, '_> {
+    fn count(&mut self) -> Result<()> {
+        self.since += 1;
+        if self.since == ITEMS_PER_CHECK {
+            self.since = 0;
+            self.stage.check()?;
+        }
+        Ok(())
+    }
+}
+
+/// How large a component is.
+#[derive(Clone, Copy)]
+struct Size {
+    /// Mean of its triangles' corners.
+    middle: DVec3,
+    extent: f64,
+    area: f64,
+}
+
+impl Size {
+    fn of(geometry: &Geometry, members: &[u32], looks: &mut Looks) -> Result<Size> {
+        let (mut lower, mut upper, mut area) = (DVec3::INFINITY, DVec3::NEG_INFINITY, 0.0);
+        let start = geometry.corners(members[0] as usize)[0];
+        let mut sum = DVec3::ZERO;
+        for &t in members {
+            looks.count()?;
+            let corners = geometry.corners(t as usize);
+            area += triangle_area(corners);
+            for c in corners {
+                (lower, upper, sum) = (lower.min(c), upper.max(c), sum + (c - start));
+            }
+        }
+        Ok(Size { middle: start + sum / (3 * members.len()) as f64, extent: (upper - lower).max_element(), area })
+    }
+}
+
+/// The shapes of two components.
 struct Shapes<'a> {
     geometry: &'a Geometry,
     order: &'a [u32],
+    sizes: [Size; 2],
 }
 
 impl Shapes<'_> {
@@ -166,40 +238,56 @@ impl Shapes<'_> {
         (self.geometry.kinds[triangle as usize], vertices)
     }
 
-    fn hash(&self, members: &[u32]) -> u64 {
-        let mut hasher = DefaultHasher::new();
-        for &triangle in members {
-            let (kind, [a, b, c]) = self.joined(triangle);
-            hasher.write_u128(u128::from(kind) << 96 | u128::from(a) << 64 | u128::from(b) << 32 | u128::from(c));
+    fn are_alike(&self, a: &[u32], b: &[u32], looks: &mut Looks) -> Result<bool> {
+        let [of_a, of_b] = self.sizes;
+        let area_ratio = of_a.area / of_b.area;
+        if a.len() != b.len() || !(1.0 / (STRETCH * STRETCH)..STRETCH * STRETCH).contains(&area_ratio) {
+            return Ok(false);
         }
-        hasher.finish()
-    }
-
-    /// The middle of a component's corners, and its extent.
-    fn middle(&self, members: &[u32]) -> (DVec3, f64) {
-        let corners = || members.iter().flat_map(|&t| self.geometry.corners(t as usize));
-        let lower = corners().fold(DVec3::INFINITY, DVec3::min);
-        let upper = corners().fold(DVec3::NEG_INFINITY, DVec3::max);
-        let sum: DVec3 = corners().map(|c| c - lower).sum();
-        (lower + sum / (3 * members.len()) as f64, (upper - lower).max_element())
-    }
-
-    fn are_alike(&self, a: &[u32], b: &[u32]) -> bool {
-        let pairs = || a.iter().copied().zip(b.iter().copied());
-        if a.len() != b.len() || pairs().any(|(a, b)| self.joined(a) != self.joined(b)) {
-            return false;
-        }
-        let [(middle_a, extent), (middle_b, _)] = [self.middle(a), self.middle(b)];
-        pairs().all(|(a, b)| {
+        let mut misfit = 0.0;
+        for (&a, &b) in a.iter().zip(b) {
+            looks.count()?;
+            if self.joined(a) != self.joined(b) {
+                return Ok(false);
+            }
             let [a, b] = [a, b].map(|t| self.geometry.corners(t as usize));
-            let side = |c: [DVec3; 3], k: usize| c[k].distance(c[(k + 1) % 3]);
-            let longest = side(a, 0).max(side(a, 1)).max(side(a, 2));
-            (0..3).all(|k| {
-                let far = a[k].distance(middle_a) - b[k].distance(middle_b);
-                (side(a, k) - side(b, k)).abs() <= SIDE * longest + ROUNDING * extent && far.abs() <= SHAPE * extent
-            })
-        })
+            let is_far = |k: usize| {
+                let difference = a[k].distance(of_a.middle) - b[k].distance(of_b.middle);
+                difference.abs() > SHAPE * of_a.extent
+            };
+            if (0..3).any(is_far) {
+                return Ok(false);
+            }
+            if !fits(a, b) {
+                misfit += triangle_area(a).max(triangle_area(b));
+                if misfit > MISFIT * of_a.area {
+                    return Ok(false);
+                }
+            }
+        }
+        Ok(true)
     }
+}
+
+fn triangle_area([a, b, c]: [DVec3; 3]) -> f64 {
+    0.5 * (b - a).cross(c - a).length()
+}
+
+/// Whether the affine map from a triangle to another stretches or shrinks no length by more than [`STRETCH`].
+fn fits(a: [DVec3; 3], b: [DVec3; 3]) -> bool {
+    // In the plane of each, with the first side along x: the map is a triangular matrix.
+    let flat = |[p, q, r]: [DVec3; 3]| {
+        let (along, other) = (q - p, r - p);
+        let x = along.length();
+        (x, other.dot(along) / x, along.cross(other).length() / x)
+    };
+    let ((ax, au, av), (bx, bu, bv)) = (flat(a), flat(b));
+    let (xx, yy) = (bx / ax, bv / av);
+    let xy = (bu - xx * au) / av;
+    // The singular values, by the sum of their squares and their product.
+    let (sum, product) = (xx * xx + xy * xy + yy * yy, xx * yy);
+    let most = (0.5 * (sum + (sum * sum - 4.0 * product * product).max(0.0).sqrt())).sqrt();
+    most <= STRETCH && product / most >= 1.0 / STRETCH
 }
 
 #[cfg(test)]
@@ -273,11 +361,13 @@ mod tests {
         let scene = scene_on(1, mesh);
         let triangles: Vec<u32> = (0..scene.triangle_count()).collect();
         let geometry = Geometry::of(&scene, &triangles, &stage).unwrap();
-        let components = Components::of(&geometry, |_, _| true, &stage).unwrap();
-        assert_eq!(components.first.len(), 4);
-        assert_eq!(&components.first[..3], [0, 1, 0]);
-        let copied = (0..count).filter(|&t| components.is_copied(t)).count();
-        assert_eq!(copied, components.first.iter().enumerate().filter(|&(c, &f)| c != f as usize).count() * count / 4);
+        let curved = vec![true; count];
+        let mut components = Components::of(&geometry, &curved, &stage).unwrap();
+        components.find_copies(&geometry, |_| false, &stage).unwrap();
+        // Mirrored surface has the same sides, and the same distances from its middle.
+        assert_eq!(components.first, [0, 1, 0, 0]);
+        let copied = count / 2;
+        assert_eq!((0..count).filter(|&t| components.is_copied(t)).count(), copied);
         // A piece of two components leaves the copies of both without any.
         let all: Vec<u32> = (0..count as u32 / 2).collect();
         let mixed = Piece { corners: vec![[[0.0; 2]; 3]; all.len()].into(), triangles: all.into(), given: None };
@@ -285,8 +375,26 @@ mod tests {
         assert!(
             pieces.is_empty() && without.len() == copied && without.iter().all(|&t| components.is_copied(t as usize))
         );
-        // Who may not get the charts of another keeps his own.
-        let none = Components::of(&geometry, |_, _| false, &stage).unwrap();
-        assert!((0..count).all(|t| !none.is_copied(t)));
+        // What has charts keeps them, but others may get the same; what is all flat is not compared.
+        components.first = (0..4).collect();
+        components.find_copies(&geometry, |t| (t as usize) < count / 4, &stage).unwrap();
+        assert_eq!(components.first, [0, 1, 0, 0]);
+        components.first = (0..4).collect();
+        components.find_copies(&geometry, |t| (t as usize) >= count / 2, &stage).unwrap();
+        assert_eq!(components.first, [0, 1, 2, 3]);
+        let mut flat = Components::of(&geometry, &vec![false; count], &stage).unwrap();
+        flat.find_copies(&geometry, |_| false, &stage).unwrap();
+        assert_eq!(flat.first, [0, 1, 2, 3]);
+    }
+
+    #[test]
+    fn no_more_than_a_little_of_a_copy_is_stretched() {
+        let triangle = |x: f64, y: f64| [DVec3::ZERO, DVec3::X, DVec3::new(x, y, 0.0)];
+        assert!(fits(triangle(0.5, 1.0), triangle(0.5, 1.04)));
+        assert!(!fits(triangle(0.5, 1.0), triangle(0.5, 1.06)) && !fits(triangle(0.5, 1.06), triangle(0.5, 1.0)));
+        assert!(!fits(triangle(0.5, 1.0), triangle(0.8, 1.0)));
+        // Sides of about the same lengths, ten times the area.
+        assert!(!fits(triangle(0.5, 0.01), triangle(0.5, 0.1)));
+        assert!(!fits(triangle(0.5, 0.0), triangle(0.5, 0.0)));
     }
 }

@@ -26,7 +26,7 @@ const PART_TRIANGLES: usize = 30_000;
 const REGIONS_PER_JOB: usize = 256;
 
 /// Bytes per triangle of the flat regions, and of what is cut into parts: the component and the middle of each region.
-const BYTES_OF_REGIONS: usize = Regions::BYTES_PER_TRIANGLE + 4 + 32;
+const BYTES_OF_REGIONS: usize = Regions::BYTES_PER_TRIANGLE + 4 + 32 + Components::BYTES_PER_TRIANGLE;
 
 /// Bytes per triangle of a part that is being unwrapped. (Measured: some 275 in the bunny, whose parts are all curved.)
 const BYTES_IN_PART: usize = 300;
@@ -77,19 +77,6 @@ fn unwrap_mesh(scene: &Scene, triangles: &[u32], known: Option<KnownPieces>, sta
         regions.get(*region).iter().for_each(|&t| rest[t as usize] = false);
     }
     drop(regions);
-    let (mut taken_over, mut is_taken) = (Vec::new(), Vec::new());
-    if let Some(known) = known {
-        let curved = all.iter().filter(|&&t| rest[t as usize]).map(|&t| triangles[t as usize]);
-        taken_over = known(&try_collect(curved, CHARTS)?, stage)?;
-        is_taken = try_filled(triangles.len(), false, CHARTS)?;
-        for piece in &taken_over {
-            for t in &piece.triangles {
-                let t = triangles.binary_search(t).expect("it is one of them");
-                (rest[t], is_taken[t]) = (false, true);
-            }
-            stage.advance(piece.triangles.len() as u64)?;
-        }
-    }
     let unwrap_parts = |parts: Vec<Vec<u32>>| {
         try_par_gather(parts.len(), CHARTS, |i, out: &mut Vec<Piece>| {
             stage.check()?;
@@ -97,25 +84,43 @@ fn unwrap_mesh(scene: &Scene, triangles: &[u32], known: Option<KnownPieces>, sta
             stage.advance(parts[i].len() as u64)
         })
     };
-    let (mut curved, mut copies, mut left) = (Vec::new(), Vec::new(), Vec::new());
+    let (mut taken_over, mut curved, mut copies, mut left) = (Vec::new(), Vec::new(), Vec::new(), Vec::new());
     if rest.contains(&true) {
-        // What is all flat has exact charts of its own, and what an earlier light map has keeps them.
-        let may_copy = |first: &[u32], copy: &[u32]| {
-            first.iter().any(|&t| rest[t as usize]) && !copy.iter().any(|&t| is_taken.get(t as usize) == Some(&true))
-        };
-        let components = Components::of(&geometry, may_copy, stage)?;
-        let place = |t: &u32| triangles.binary_search(t).expect("it is one of them");
-        flat.retain(|(_, piece)| !components.is_copied(place(&piece.triangles[0])));
-        let firsts = all.iter().copied().filter(|&t| rest[t as usize] && !components.is_copied(t as usize));
+        let is_curved = rest;
+        let place = |t: u32| triangles.binary_search(&t).expect("it is one of them");
+        let mut components = Components::of(&geometry, &is_curved, stage)?;
+        let mut is_taken = Vec::new();
+        if let Some(known) = known {
+            // What is flat in curved surface, too: it may have had the chart of what its surface is a copy of.
+            let offered = all.iter().filter(|&&t| components.is_curved(t as usize)).map(|&t| triangles[t as usize]);
+            taken_over = known(&try_collect(offered, CHARTS)?, stage)?;
+            is_taken = try_filled(triangles.len(), false, CHARTS)?;
+            for piece in &taken_over {
+                stage.check()?;
+                piece.triangles.iter().for_each(|&t| is_taken[place(t)] = true);
+            }
+        }
+        let is_taken = |t: u32| is_taken.get(t as usize) == Some(&true);
+        components.find_copies(&geometry, is_taken, stage)?;
+        flat.retain(|(_, piece)| {
+            !components.is_copied(place(piece.triangles[0]))
+                && !piece.triangles.iter().any(|&t| is_taken(place(t) as u32))
+        });
+        let mut is_open = try_filled(triangles.len(), true, CHARTS)?;
+        for (_, piece) in &flat {
+            stage.check()?;
+            piece.triangles.iter().for_each(|&t| is_open[place(t)] = false);
+        }
+        let is_copied = |t: u32| components.is_copied(t as usize);
+        let settled = all.iter().filter(|&&t| is_curved[t as usize] && (is_taken(t) || is_copied(t))).count();
+        let firsts = all.iter().copied().filter(|&t| is_open[t as usize] && !is_taken(t) && !is_copied(t));
         let parts_of_firsts = parts(&geometry, &neighbours, &try_collect(firsts, CHARTS)?, stage)?;
-        drop(neighbours);
+        drop((neighbours, is_open));
         curved = unwrap_parts(parts_of_firsts)?;
         let firsts = flat.iter().map(|(_, piece)| piece).chain(&taken_over).chain(&curved);
         let without;
         (copies, without) = components.copies(&geometry, firsts, stage)?;
-        drop(components);
-        let copied = copies.iter().flat_map(|piece| piece.triangles.iter()).filter(|t| rest[place(t)]);
-        stage.advance(copied.count() as u64)?;
+        stage.advance(settled as u64)?;
         if !without.is_empty() {
             left = unwrap_parts(parts(&geometry, &geometry.neighbours(scene.device(), stage)?, &without, stage)?)?;
         }
