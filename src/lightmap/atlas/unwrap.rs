@@ -1,7 +1,7 @@
 //! Unwrapping by parts, in parallel, for triangles without usable UVs (thesis 3.2.3).
 //!
 //! Flat regions between creases are projected ([`planar`](super::planar)). The other triangles are grouped into parts
-//! of bounded size, each part is unwrapped separately by the crate `uvunwrap` (region growing, LSCM refined as rigidly
+//! of bounded size, but for what [repeats](super::repeats): each part is unwrapped separately by the crate `uvunwrap` (region growing, LSCM refined as rigidly
 //! as possible), and only its charts are kept: packing is done by the layout. The parts depend on the mesh alone, so
 //! the charts do not depend on the number of threads.
 //!
