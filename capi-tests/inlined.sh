@@ -6,9 +6,9 @@
 #     inlined.sh --self-test    the check fails where it must
 set -euo pipefail
 
-# What entry points may call of this crate. Rare: rays nearly parallel to an axis, distances in wider precision, buffers
+# What entry points may call of this crate. Rare: rays nearly parallel to an axis or from far away, distances in wider precision, buffers
 # of a call, rays that leave a stream or must be scaled in an instance. Without lanes: a leaf's one box, and what a filter says of one hit.
-allowed='RaySetup::make_slow|Bundle::accurate|triangle::accurate_distance|single::(take_room|give_room_back)'
+allowed='RaySetup::(make_slow|change_for_boxes)|Bundle::accurate|triangle::accurate_distance|single::(take_room|give_room_back)'
 allowed+='|stream_rays::(Room::(take|give_back|leave_alone)|sort_rest)|stream::Traversal<T>::leave_alone'
 allowed+='|Scene>::meet_one_by_one|CompactLeaf::outer_box|<bakelite::trace::filter::Filter as bakelite::trace::filter::Accept>::accepts'
 # Entry points: src/trace/kernels.rs (streams on AVX-512 with and without VBMI2), src/photon/estimate.rs and

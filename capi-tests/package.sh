@@ -30,7 +30,7 @@ packages() {
     bytes=$(stat -Lc %s "$libraries/libbakelite.a")
     [ "$bytes" -le 30000000 ] || { echo "libbakelite.a has $bytes bytes, more than 30 MB" && exit 1; }
     bytes=$(stat -Lc %s "$libraries/libbakelite.so")
-    [ "$bytes" -le 11500000 ] || { echo "libbakelite.so has $bytes bytes, more than 11.5 MB" && exit 1; }
+    [ "$bytes" -le 11600000 ] || { echo "libbakelite.so has $bytes bytes, more than 11.6 MB" && exit 1; }
 }
 
 # A picture of a lit room is no single colour: its file cannot be compressed to nothing.

@@ -80,7 +80,7 @@ unsafe fn trace_in<S: Simd, T: Tree, H: Borrow<T> + Copy, A: Answer, const ANY: 
     rays: &[Ray],
     answers: &mut [A],
 ) {
-    // (Compact trees on the portable lanes do without: it took 0.09 MB of the library there.)
+    // (Compact trees on the portable lanes do without: it took some 25 kB of the library there.)
     let is_whole = T::IS_BY_WORTH;
     if let ([ray], [answer], true) = (rays, &mut *answers, is_whole || <S::Packet as Lanes>::WIDTH > 4) {
         // SAFETY: forwarded.
