@@ -2,8 +2,8 @@
 //! against the frustum around all rays. At an instance, those rays that meet its box are transformed, and go through its
 //! mesh together.
 
-use super::box_lists::{MAX_RAYS, OnVisit, Room};
-use super::bundle::{LEAST, SIZE, bundle};
+use super::box_lists::{MAX_RAYS, OnVisit, Room, Visit};
+use super::bundle::{LEAST, bundle};
 use super::packet::{self, AtLeaf, Bundle, Shared};
 use super::tree::{Leaf, Tree, beyond};
 use crate::bvh::ChildRef;
@@ -51,7 +51,7 @@ struct Boxes<'a, 'b> {
     /// The bundle's rays in the room.
     start: usize,
     end: usize,
-    visit: &'a mut (dyn FnMut(super::box_lists::Visit) + 'b),
+    visit: &'a mut (dyn FnMut(Visit) + 'b),
 }
 
 impl<S: Simd> AtLeaf<S> for Boxes<'_, '_> {
@@ -86,7 +86,7 @@ impl<S: Simd> AtLeaf<S> for Boxes<'_, '_> {
         if has_ended {
             for &number in &self.room.numbers[..met] {
                 let number = number as usize;
-                rays.limit[(number - self.start) % SIZE] = beyond(self.room.rays[number].tmax);
+                rays.limit[number - self.start] = beyond(self.room.rays[number].tmax);
             }
         }
         has_ended

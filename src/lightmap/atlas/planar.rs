@@ -147,7 +147,8 @@ pub(super) fn flat_piece(
     }))
 }
 
-fn doubled_area([a, b, c]: [DVec3; 3]) -> DVec3 {
+/// The vector of a triangle's normal whose length is twice its area.
+pub(super) fn doubled_area([a, b, c]: [DVec3; 3]) -> DVec3 {
     (b - a).cross(c - a)
 }
 

@@ -7,6 +7,7 @@
 //! exact, and soon made.
 
 use super::pieces::{CHARTS, Groups, ITEMS_PER_CHECK, Piece, connected_by_vertices};
+use super::planar::doubled_area;
 use super::welded::Geometry;
 use crate::base::error::Result;
 use crate::base::memory::{try_collect, try_filled, try_push, try_with_capacity};
@@ -269,8 +270,8 @@ impl Shapes<'_> {
     }
 }
 
-fn triangle_area([a, b, c]: [DVec3; 3]) -> f64 {
-    0.5 * (b - a).cross(c - a).length()
+fn triangle_area(corners: [DVec3; 3]) -> f64 {
+    0.5 * doubled_area(corners).length()
 }
 
 /// Whether the affine map from a triangle to another stretches or shrinks no length by more than [`STRETCH`].
@@ -296,6 +297,7 @@ mod tests {
     use super::*;
     use crate::base::progress::Progress;
     use crate::lightmap::atlas::charts::tests::{grid, scene_on};
+    use crate::lightmap::{Lightmap, LightmapDesc};
     use crate::scene::Mesh;
     use glam::{Quat, Vec3};
 
@@ -347,6 +349,21 @@ mod tests {
             let ratio = area(corners[t].unwrap().map(|[x, y]| Vec3::new(x, y, 0.0))) / area(scene.corners(t as u32));
             assert!((0.5..=2.0).contains(&ratio), "{t} {ratio}");
         }
+    }
+
+    #[test]
+    fn a_light_map_of_the_same_scene_keeps_the_charts_of_copies() {
+        let wave: fn(f32, f32) -> f32 = |x, y| 1.5 * (0.6 * x).sin() + (0.5 * y).cos();
+        let scene = || scene_on(2, sheets(&[wave, |x, y| 0.2 * x * x + y, wave, wave]));
+        let desc = LightmapDesc { texels_per_unit: 3.0, page_size: 512, ..Default::default() };
+        let first = Lightmap::create(&scene(), &desc, &Progress::none()).unwrap();
+        let scene = scene();
+        let again = Lightmap::create_from(&scene, &desc, &first, &Progress::none()).unwrap();
+        for triangle in 0..scene.triangle_count() {
+            let corners = |map: &Lightmap| map.atlas.charts.corners(triangle);
+            assert_eq!(corners(&first), corners(&again), "{triangle}");
+        }
+        assert_eq!(again.atlas.info.kept_charts, again.atlas.info.charts);
     }
 
     #[test]

@@ -1,9 +1,9 @@
 //! Unwrapping by parts, in parallel, for triangles without usable UVs (thesis 3.2.3).
 //!
 //! Flat regions between creases are projected ([`planar`](super::planar)). The other triangles are grouped into parts
-//! of bounded size, but for what [repeats](super::repeats): each part is unwrapped separately by the crate `uvunwrap` (region growing, LSCM refined as rigidly
-//! as possible), and only its charts are kept: packing is done by the layout. The parts depend on the mesh alone, so
-//! the charts do not depend on the number of threads.
+//! of bounded size, but for what [repeats](super::repeats). Each part is unwrapped separately by the crate `uvunwrap`
+//! (region growing, LSCM refined as rigidly as possible), and only its charts are kept: packing is done by the layout.
+//! The parts depend on the mesh alone, so the charts do not depend on the number of threads.
 //!
 //! Without the feature `unwrap`, and for triangles that the crate cannot unwrap, charts are single triangles and pairs
 //! of nearly coplanar triangles, projected on their plane: poor, but valid by construction.
@@ -12,6 +12,7 @@ use super::pieces::{CHARTS, Groups, KnownPieces, Piece, connected_by_vertices};
 use super::planar::{Regions, flat_piece, flat_regions, planar_pieces};
 use super::repeats::Components;
 use super::welded::Geometry;
+use crate::base::array::Array;
 use crate::base::error::Result;
 use crate::base::memory::{try_append, try_collect, try_filled, try_par_gather, try_push, try_with_capacity};
 use crate::base::progress::Stage;
@@ -61,7 +62,7 @@ fn unwrap_mesh(scene: &Scene, triangles: &[u32], known: Option<KnownPieces>, sta
     let neighbours = geometry.neighbours(scene.device(), stage)?;
     let all = try_collect(0..triangles.len() as u32, CHARTS)?;
     let regions = flat_regions(&geometry, &neighbours, &all, stage)?;
-    let mut flat = try_par_gather(regions.len().div_ceil(REGIONS_PER_JOB), CHARTS, |i, out| {
+    let flat = try_par_gather(regions.len().div_ceil(REGIONS_PER_JOB), CHARTS, |i, out| {
         stage.check()?;
         let mut done = 0;
         for region in i * REGIONS_PER_JOB..regions.len().min((i + 1) * REGIONS_PER_JOB) {
@@ -72,11 +73,59 @@ fn unwrap_mesh(scene: &Scene, triangles: &[u32], known: Option<KnownPieces>, sta
         }
         stage.advance(done as u64)
     })?;
-    let mut rest = try_filled(triangles.len(), true, CHARTS)?;
+    let mut is_curved = try_filled(triangles.len(), true, CHARTS)?;
     for (region, _) in &flat {
-        regions.get(*region).iter().for_each(|&t| rest[t as usize] = false);
+        regions.get(*region).iter().for_each(|&t| is_curved[t as usize] = false);
     }
-    drop(regions);
+    drop((regions, all));
+    let mut flat = try_collect(flat.into_iter().map(|(_, piece)| piece), CHARTS)?;
+    let curved = match is_curved.contains(&true) {
+        true => curved_pieces(scene, &geometry, neighbours, &is_curved, &mut flat, known, stage)?,
+        false => Vec::new(),
+    };
+    let mut pieces = try_with_capacity(flat.len() + curved.len(), CHARTS)?;
+    for piece in flat.into_iter().chain(curved) {
+        pieces.push(piece.kept(scene.device())?);
+    }
+    Ok(pieces)
+}
+
+/// Makes the pieces of a mesh that are not `flat`: those that are `known`, those that are unwrapped, and copies of both. Removes
+/// the flat ones of which another piece has triangles then.
+fn curved_pieces(
+    scene: &Scene,
+    geometry: &Geometry,
+    neighbours: Array<[u32; 3]>,
+    is_curved: &[bool],
+    flat: &mut Vec<Piece>,
+    known: Option<KnownPieces>,
+    stage: &Stage,
+) -> Result<Vec<Piece>> {
+    let triangles = &geometry.triangles;
+    let all = || 0..triangles.len() as u32;
+    let place = |t: &u32| triangles.binary_search(t).expect("it is one of them");
+    let mut components = Components::of(geometry, is_curved, stage)?;
+    let (mut pieces, mut is_taken) = (Vec::new(), try_filled(triangles.len(), false, CHARTS)?);
+    if let Some(known) = known {
+        // What is flat in curved surface, too: it may have had the chart of what its surface is a copy of.
+        let offered = all().filter(|&t| components.is_curved(t as usize)).map(|t| triangles[t as usize]);
+        pieces = known(&try_collect(offered, CHARTS)?, stage)?;
+        for piece in &pieces {
+            stage.check()?;
+            piece.triangles.iter().for_each(|t| is_taken[place(t)] = true);
+        }
+    }
+    components.find_copies(geometry, |t| is_taken[t as usize], stage)?;
+    let is_copied = |t: usize| components.is_copied(t);
+    flat.retain(|piece| !is_copied(place(&piece.triangles[0])) && !piece.triangles.iter().any(|t| is_taken[place(t)]));
+    let settled = all().filter(|&t| is_curved[t as usize] && (is_taken[t as usize] || is_copied(t as usize))).count();
+    let mut has_piece = is_taken;
+    for piece in flat.iter() {
+        stage.check()?;
+        piece.triangles.iter().for_each(|t| has_piece[place(t)] = true);
+    }
+    let firsts = try_collect(all().filter(|&t| !has_piece[t as usize] && !is_copied(t as usize)), CHARTS)?;
+    drop(has_piece);
     let unwrap_parts = |parts: Vec<Vec<u32>>| {
         try_par_gather(parts.len(), CHARTS, |i, out: &mut Vec<Piece>| {
             stage.check()?;
@@ -84,54 +133,21 @@ fn unwrap_mesh(scene: &Scene, triangles: &[u32], known: Option<KnownPieces>, sta
             stage.advance(parts[i].len() as u64)
         })
     };
-    let (mut taken_over, mut curved, mut copies, mut left) = (Vec::new(), Vec::new(), Vec::new(), Vec::new());
-    if rest.contains(&true) {
-        let is_curved = rest;
-        let place = |t: u32| triangles.binary_search(&t).expect("it is one of them");
-        let mut components = Components::of(&geometry, &is_curved, stage)?;
-        let mut is_taken = Vec::new();
-        if let Some(known) = known {
-            // What is flat in curved surface, too: it may have had the chart of what its surface is a copy of.
-            let offered = all.iter().filter(|&&t| components.is_curved(t as usize)).map(|&t| triangles[t as usize]);
-            taken_over = known(&try_collect(offered, CHARTS)?, stage)?;
-            is_taken = try_filled(triangles.len(), false, CHARTS)?;
-            for piece in &taken_over {
-                stage.check()?;
-                piece.triangles.iter().for_each(|&t| is_taken[place(t)] = true);
-            }
-        }
-        let is_taken = |t: u32| is_taken.get(t as usize) == Some(&true);
-        components.find_copies(&geometry, is_taken, stage)?;
-        flat.retain(|(_, piece)| {
-            !components.is_copied(place(piece.triangles[0]))
-                && !piece.triangles.iter().any(|&t| is_taken(place(t) as u32))
-        });
-        let mut is_open = try_filled(triangles.len(), true, CHARTS)?;
-        for (_, piece) in &flat {
-            stage.check()?;
-            piece.triangles.iter().for_each(|&t| is_open[place(t)] = false);
-        }
-        let is_copied = |t: u32| components.is_copied(t as usize);
-        let settled = all.iter().filter(|&&t| is_curved[t as usize] && (is_taken(t) || is_copied(t))).count();
-        let firsts = all.iter().copied().filter(|&t| is_open[t as usize] && !is_taken(t) && !is_copied(t));
-        let parts_of_firsts = parts(&geometry, &neighbours, &try_collect(firsts, CHARTS)?, stage)?;
-        drop((neighbours, is_open));
-        curved = unwrap_parts(parts_of_firsts)?;
-        let firsts = flat.iter().map(|(_, piece)| piece).chain(&taken_over).chain(&curved);
-        let without;
-        (copies, without) = components.copies(&geometry, firsts, stage)?;
-        stage.advance(settled as u64)?;
-        if !without.is_empty() {
-            left = unwrap_parts(parts(&geometry, &geometry.neighbours(scene.device(), stage)?, &without, stage)?)?;
-        }
-    }
-    let count = flat.len() + taken_over.len() + curved.len() + copies.len() + left.len();
-    let mut pieces = try_with_capacity(count, CHARTS)?;
-    let flat = flat.into_iter().map(|(_, piece)| piece);
-    for piece in flat.chain(taken_over).chain(curved).chain(copies).chain(left) {
-        pieces.push(piece.kept(scene.device())?);
+    let of_firsts = parts(geometry, &neighbours, &firsts, stage)?;
+    drop((neighbours, firsts));
+    add(&mut pieces, unwrap_parts(of_firsts)?)?;
+    let (copies, without) = components.copies(geometry, flat.iter().chain(&pieces), stage)?;
+    stage.advance(settled as u64)?;
+    add(&mut pieces, copies)?;
+    if !without.is_empty() {
+        let neighbours = geometry.neighbours(scene.device(), stage)?;
+        add(&mut pieces, unwrap_parts(parts(geometry, &neighbours, &without, stage)?)?)?;
     }
     Ok(pieces)
+}
+
+fn add(pieces: &mut Vec<Piece>, more: Vec<Piece>) -> Result<()> {
+    more.into_iter().try_for_each(|piece| try_push(pieces, piece, CHARTS))
 }
 
 /// Divides some triangles of a mesh (ascending) into parts: connected components stay together, and large ones are cut
