@@ -12,6 +12,7 @@
 use super::area_light::AreaLight;
 use super::light_tree::LIGHT_TREE;
 use super::many_lights::ManyLights;
+use super::near_lights::NearLights;
 use super::point_light::push_one;
 use super::receiver::Receiver;
 use super::shadow_rays::{KINDS, PointRoom, ShadowRays, shadow_ray};
@@ -159,6 +160,8 @@ pub struct DirectLight {
     skies: Vec<Sky>,
     /// Point and spot lights if these are many, and area lights if these are many.
     many: Option<ManyLights>,
+    /// Point and spot lights, few or many, by place.
+    pub(crate) near: NearLights,
 }
 
 impl DirectLight {
@@ -195,7 +198,7 @@ impl DirectLight {
             if few_areas { &[] } else { &areas },
         )?;
         if few_points {
-            each.extend(points);
+            each.extend_from_slice(&points);
         }
         if !few_areas {
             areas = Vec::new();
@@ -208,6 +211,7 @@ impl DirectLight {
             discs: try_collect(discs, LIGHT_TREE)?,
             skies: try_collect(skies, LIGHT_TREE)?,
             many: (many.len() > 0).then_some(many),
+            near: NearLights::new(points),
         })
     }
 

@@ -5,6 +5,7 @@ pub(crate) mod direct_light;
 mod light_node;
 pub(crate) mod light_tree;
 pub(crate) mod many_lights;
+pub(crate) mod near_lights;
 pub(crate) mod point_light;
 mod polygon;
 pub(crate) mod receiver;

@@ -193,6 +193,7 @@ impl<R: AsMut<[Ray]>, C: AsMut<[Carried]>, O: AsMut<[u8]>, V: AsMut<[Vec3]>> Roo
             slot: 0,
             light: 0,
             normal: Vec3::ZERO,
+            near2: 0.0,
             by_light: self.by_light.as_mut(),
             directed: self.directed.as_mut(),
         }
@@ -216,7 +217,10 @@ pub(crate) struct ShadowRays<'a> {
     /// 1.1 times the time of their rays in the living room.) Lights from [`u8::MAX`] on count as one.
     pub(super) light: usize,
     /// Unit normal of the receiver of the next rays.
-    pub(super) normal: Vec3,
+    pub(crate) normal: Vec3,
+    /// Square of the distance within which point and spot lights do not shine on the next receivers, since what comes from
+    /// there is sampled [otherwise](crate::lightmap::texel_light); mostly 0.
+    pub(crate) near2: f32,
     by_light: Option<&'a mut ByLight>,
     directed: Option<&'a mut Directed>,
 }

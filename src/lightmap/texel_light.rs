@@ -16,12 +16,15 @@
 //! seen, or the ways straight up and to four sides end at the solid's surface from inside. If all points do, as in a
 //! texel of which a strip looks out from under a block, the texel's sample alone is lit.
 //!
+//! What point and spot lights bring that are much nearer than a texel is wide is sampled [apart](near).
+//!
 //! The data used of neighbours is a function of their numbers alone, so that shards of a bake and tiles of live
 //! updates, which recompute it, have the same bits. The shadow rays of a [tile](super::tiles) are traced together,
 //! which changes no bit.
 
 pub(crate) mod averages;
 pub(crate) mod looks;
+mod near;
 
 use super::atlas::Atlas;
 use super::atlas::chart_index::ChartIndex;
@@ -76,6 +79,12 @@ impl<M: Map> TexelAreas<'_, M> {
     /// Returns point `number` of a sequence that is stratified over a texel; `None` if it misses the chart or lies in a
     /// cut-out.
     pub(crate) fn point(&self, texel: TexelId<M>, number: u32, seed: u32) -> Option<TexelSample> {
+        self.point_at(texel, sobol_2d(number, combine(seed, 32)))
+    }
+
+    /// Returns the point of the chart at a place in a texel, (0, 0) to (1, 1); `None` if it misses the chart or lies in a
+    /// cut-out.
+    fn point_at(&self, texel: TexelId<M>, place: [f32; 2]) -> Option<TexelSample> {
         let own = &self.map[texel];
         let placement = &self.map.layout[self.map.placement_of(self.charts, texel)];
         // The sample of a buried texel lies in another texel; no other points are used.
@@ -84,7 +93,7 @@ impl<M: Map> TexelAreas<'_, M> {
         if within.min_element() < -0.01 || within.max_element() > 1.01 {
             return None;
         }
-        let point = self.index.in_texel(self.charts, placement, own, sobol_2d(number, combine(seed, 32)))?;
+        let point = self.index.in_texel(self.charts, placement, own, place)?;
         (!self.scene.is_hole(point.triangle, point.u, point.v)).then_some(point)
     }
 
@@ -153,6 +162,12 @@ fn line_of_sight(a: &Receiver, b: &Receiver) -> Ray {
     let raise = RAISED * a.origin.distance(b.origin);
     let (from, to) = (a.origin + raise * a.geometric, b.origin + raise * b.geometric);
     Ray::new(from, to - from).within(0.0, 1.0)
+}
+
+/// Whether another surface stands between two points of a surface.
+fn is_hidden(scene: &Scene, a: &Receiver, b: &Receiver, rays: &mut u64) -> bool {
+    *rays += 1;
+    scene.occluded(&line_of_sight(a, b))
 }
 
 /// Returns one of the rays that tell whether a point lies inside a solid.
@@ -317,6 +332,7 @@ impl TilePoints {
             let samples = by.samples.div_ceil(numbers.len() as u32);
             let (seed, first) = (combine(by.seed, by.areas.map.seed(texel)), self.counts[place]);
             let of_round = combine(seed, numbers.start);
+            shadow.near2 = by.near2(texel);
             for number in numbers {
                 let Some(on) = by.areas.point(texel, number, seed) else { continue };
                 let receiver = receivers.of(&on, back);

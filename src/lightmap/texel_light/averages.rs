@@ -1,7 +1,8 @@
 //! Direct light of texels of the light map: light without penumbrae at their samples, whether it varies, and averages
 //! of points.
 
-use super::{AROUND, FEW, MAX_POINTS, Point, TexelLight, TilePoints, Wanted, add_points, differ, line_of_sight, vary};
+use super::near::Near;
+use super::{AROUND, FEW, MAX_POINTS, Point, TexelLight, TilePoints, Wanted, add_points, differ, is_hidden, vary};
 use crate::base::directional::Directional;
 use crate::base::sampling::combine;
 use crate::direct::Receiver;
@@ -83,6 +84,9 @@ impl TexelLight<'_, LightMap> {
     pub(crate) fn varies(&self, texel: LightTexel, sharp: Vec3, mut of: impl FnMut(LightTexel) -> Vec3) -> Variation {
         if !self.direct.has_sharp() {
             return Variation::None;
+        }
+        if self.near2(texel) > 0.0 {
+            return Variation::Some;
         }
         let mut variation = Variation::None;
         for ((dx, dy), near) in AROUND.into_iter().zip(self.areas.neighbours(texel)) {
@@ -176,9 +180,13 @@ impl TexelLight<'_, LightMap> {
             // it.
             sum.sharp = sharp * n;
         }
+        let tried = if goes_on || t.variation == Variation::Some { MAX_POINTS as f32 } else { FEW as f32 };
+        let mut near = Near { directional: (!directional.is_empty()).then(Directional::default), ..Near::default() };
+        self.sample_near((t.texel, t.back), |_| Vec3::ONE, Some(&t.receiver), &mut near, rays);
+        sum.sharp += near.light * tried;
         let e = sum.value() / n;
-        if !directional.is_empty() {
-            *out = average_by_direction(t, points, directional, (&sum, n.x), is_even);
+        if let Some(near) = near.directional {
+            *out = average_by_direction(t, points, (directional, near * tried), (&sum, n.x), is_even);
         }
         (if t.variation == Variation::None { sharp + e } else { e }, variance(points))
     }
@@ -197,12 +205,13 @@ fn variance(points: &[Point]) -> f32 {
     SKEWED * squares / (n * (n - 1.0)).max(1.0) + STRATIFIED * areas / (n * n * (rays as f32).sqrt().max(1.0))
 }
 
-/// Averages the light by direction of a texel's points. `sum`: their light, and the number of those that count.
+/// Averages the light by direction of a texel's points, and that of lights nearby. `sum`: their light, and the number of
+/// points that count.
 #[inline(never)]
 fn average_by_direction(
     t: &Averaged,
     points: &[Point],
-    directional: &[[Directional; KINDS]],
+    (directional, near): (&[[Directional; KINDS]], Directional),
     (sum, n): (&PointLight, f32),
     is_even: bool,
 ) -> Directional {
@@ -214,14 +223,9 @@ fn average_by_direction(
     if is_even {
         kinds[0] = t.sharp_directional * n;
     }
+    kinds[0] += near;
     let average = sum.by_direction(&kinds) / n;
     if t.variation == Variation::None { t.sharp_directional + average } else { average }
-}
-
-/// Whether another surface stands between two points of a surface.
-fn is_hidden(scene: &Scene, a: &Receiver, b: &Receiver, rays: &mut u64) -> bool {
-    *rays += 1;
-    scene.occluded(&line_of_sight(a, b))
 }
 
 /// Whether some point lies in the penumbra of a disc.

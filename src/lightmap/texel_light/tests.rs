@@ -214,3 +214,60 @@ fn a_wall_that_reaches_into_floor_and_ceiling_has_no_dark_line_at_its_foot() {
     let ratio = beside[0] / beside[1] / (away[0] / away[1]);
     assert!((0.96..1.01).contains(&ratio), "{ratio}");
 }
+
+/// A floor of 2 x 2 under lamps.
+fn under_lamps(positions: &[Vec3]) -> Arc<Scene> {
+    let mut data = SceneData::new();
+    let m = data.add_material(Material { albedo: [0.5; 3], ..Default::default() }).unwrap();
+    let mut builder = MeshBuilder::new();
+    builder.quad(Vec3::ZERO, Vec3::X * 2.0, Vec3::new(2.0, 2.0, 0.0), Vec3::Y * 2.0, m);
+    data.add_mesh(builder.finish()).unwrap();
+    for &position in positions {
+        data.add_light(Light::Point { position, intensity: [1.0; 3] }).unwrap();
+    }
+    data.committed()
+}
+
+/// Half of the light of a lamp close to a surface falls on a spot that is much smaller than a texel.
+#[test]
+fn texels_have_the_energy_of_lamps_close_to_them() {
+    let one = |x, y, height| vec![Vec3::new(x, y, height)];
+    // Many enough to be sampled by a tree.
+    let many = (0..100).map(|i| Vec3::new(0.107 + 0.2 * (i % 10) as f32, 0.093 + 0.2 * (i / 10) as f32, 0.005));
+    let mut cases = vec![many.collect()];
+    for height in [0.1, 0.03, 0.01, 1e-3, 1e-4] {
+        cases.extend([one(1.03, 0.97, height), one(0.5612, 1.274, height)]);
+    }
+    for lamps in cases {
+        let scene = under_lamps(&lamps);
+        let mut map = created(&scene, 20.0);
+        map.bake(&BakeParams { gather_rays: 0, ..Default::default() }, &Progress::none()).unwrap();
+        let (atlas, area) = (map.atlas(), 0.05f32.powi(2));
+        let of_map: f32 = map.light.as_ref().unwrap().direct.iter().map(|e| e.x * area).sum();
+        let direct = DirectLight::new(&scene);
+        let light = TexelLight { areas: atlas.areas(&atlas.radiance), direct: &direct, samples: 4, seed: 5 };
+        let mut tile = TilePoints::new(1).unwrap();
+        let mut of_radiance = 0.0;
+        for texel in atlas.radiance.all() {
+            light.closer_look(
+                &[texel],
+                &mut tile,
+                |_| Vec3::ONE,
+                &mut 0,
+                |_, e| {
+                    of_radiance += e.unwrap().x * 16.0 * area;
+                },
+            );
+        }
+        // The solid angles of the floor's four parts around the foot of each lamp.
+        let floor = |lamp: &Vec3| {
+            let part = |x: f32, y: f32| (x * y).atan2(lamp.z * (x * x + y * y + lamp.z * lamp.z).sqrt());
+            let Vec3 { x, y, .. } = *lamp;
+            part(x, y) + part(2.0 - x, y) + part(x, 2.0 - y) + part(2.0 - x, 2.0 - y)
+        };
+        let expected: f32 = lamps.iter().map(floor).sum();
+        for (sum, what) in [(of_map, "light map"), (of_radiance, "radiance map")] {
+            assert!((sum / expected - 1.0).abs() < 0.02, "{} in the {what} at {}", sum / expected, lamps[0]);
+        }
+    }
+}

@@ -11,11 +11,12 @@ use glam::{DVec3, Vec3};
 use std::f64::consts::PI;
 use std::time::Instant;
 
-pub const CASES: [(&str, Case); 8] = [
+pub const CASES: [(&str, Case); 9] = [
     ("furnace", furnace),
     ("energy", energy),
     ("light power", light_power),
     ("point light near a wall", point_near_wall),
+    ("point light near a ceiling", point_near_ceiling),
     ("rect light on a wall", rect_on_wall),
     ("emissive quad in a wall", emissive_in_wall),
     ("point light in a solid", light_in_solid),
@@ -149,7 +150,7 @@ fn point_near_wall(lab: &Lab, rows: &mut Vec<Row>) -> Result<()> {
         };
         // Rays start 32 rounding steps of the scene above the floor: a light below that shines from behind.
         let sound = !mean(&texels).is_nan();
-        rows.push(row.within(0.01).or_degrades(sound && height < 1e-4).note(if sound {
+        rows.push(row.within(0.01).or_degrades(sound && height < 1e-5).note(if sound {
             "finite"
         } else {
             "not finite"
@@ -187,6 +188,38 @@ fn against_path_tracer(
     let reference = tracer.irradiance_many(&lab.device, &points, samples, 1, &Progress::none())?;
     let expected = reference.iter().map(|e| e.total()[0]).sum::<f64>() / points.len() as f64;
     Ok((expected, mean(&some), !mean(&all).is_nan()))
+}
+
+/// A lamp just below the ceiling, which reflects half of its light from a spot much smaller than a texel: the same as a lamp that
+/// shines downwards alone, and a small rect light in place of the spot.
+fn point_near_ceiling(lab: &Lab, rows: &mut Vec<Row>) -> Result<()> {
+    for height in lab.some(&[1e-2f32, 1e-3, 1e-4]) {
+        let position = Vec3::new(0.47, 1.0 - height, 0.56);
+        let lit = |lights: &[Light]| -> Result<SceneData> {
+            let mut data = SceneData::new();
+            room(&mut data, ALBEDO)?;
+            for &light in lights {
+                data.add_light(light)?;
+            }
+            Ok(data)
+        };
+        const ALBEDO: f32 = 0.5;
+        const SIDE: f32 = 0.01;
+        let (inner, outer) = (89.9f32.to_radians(), 90f32.to_radians());
+        let below = Light::Spot { position, direction: -Vec3::Y, inner, outer, intensity: [1.0; 3] };
+        let (edge_u, edge_v) = (Vec3::X * SIDE, Vec3::Z * SIDE);
+        let corner = Vec3::new(position.x, 1.0 - 1e-4, position.z) - 0.5 * (edge_u + edge_v);
+        let radiance = [2.0 * ALBEDO / (SIDE * SIDE); 3];
+        let reference = lit(&[below, Light::Rect { position: corner, edge_u, edge_v, radiance }])?;
+        let lamp = lit(&[Light::Point { position, intensity: [1.0; 3] }])?;
+        let (expected, got, sound) = against_path_tracer(lab, &reference, lamp, 200, |p| p.y < 0.9)?;
+        let got = if sound { got } else { f64::NAN };
+        let name = "point light near a ceiling";
+        rows.push(
+            Row::new(name, format!("{height:e}"), height as f64, expected, got).within(0.02).note("f64 path tracer"),
+        );
+    }
+    Ok(())
 }
 
 /// The wall that a rect light lies on, at 0 and near it, does not shade the room.
