@@ -11,9 +11,9 @@
 use super::area_light::AreaLight;
 use super::light_node::Bounds;
 use super::light_tree::{LIGHT_TREE, LightTree};
-use super::point_light::point_light;
+use super::point_light::{is_apart, point_light};
 use super::receiver::Receiver;
-use super::shadow_rays::{Candidate, Choice, ShadowRays, shadow_ray};
+use super::shadow_rays::{Candidate, Choice, Near, ShadowRays, shadow_ray};
 use crate::base::error::Result;
 use crate::base::memory::try_collect;
 use crate::base::sampling::{combine, sobol_2d};
@@ -116,14 +116,14 @@ impl ManyLights {
     pub(crate) fn push(&self, receiver: &Receiver, n: u32, seed: u32, shadow: &mut ShadowRays) -> f32 {
         shadow.normal = receiver.normal;
         let mut choice = std::mem::take(shadow.choice);
-        self.find_candidates(receiver, n * self.candidates, seed, shadow.near2, &mut choice);
+        self.find_candidates(receiver, n * self.candidates, seed, &shadow.near, &mut choice);
         let total = push_some(receiver, n, seed, &choice.candidates, shadow);
         *shadow.choice = choice;
         total
     }
 
-    /// Finds `n` candidates at most, no point or spot lights nearer than the root of `near2` among them.
-    fn find_candidates(&self, receiver: &Receiver, n: u32, seed: u32, near2: f32, choice: &mut Choice) {
+    /// Finds `n` candidates at most, no lights that are `near` among them.
+    fn find_candidates(&self, receiver: &Receiver, n: u32, seed: u32, near: &Near, choice: &mut Choice) {
         let Choice { descent, candidates } = choice;
         candidates.clear();
         let offset = sobol_2d(0, combine(seed, 1))[0];
@@ -154,7 +154,8 @@ impl ManyLights {
                 let share = share_of(due, count);
                 match &lights[light] {
                     Source::Point(light) => {
-                        if let Some((target, light)) = point_light(light, receiver, near2) {
+                        let light = point_light(light, receiver);
+                        if let Some((target, light)) = light.filter(|&(at, _)| !is_apart(near, receiver, at)) {
                             candidates.push(Candidate { target, light: light * (share * count as f32) });
                         }
                     }

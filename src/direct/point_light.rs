@@ -1,7 +1,7 @@
 //! Point, spot and parallel lights, which take one shadow ray.
 
 use super::receiver::Receiver;
-use super::shadow_rays::ShadowRays;
+use super::shadow_rays::{Near, ShadowRays};
 use crate::scene::{BRIGHTEST, Light};
 use crate::trace::Ray;
 use glam::Vec3;
@@ -14,14 +14,20 @@ pub(crate) fn push_one(light: &Light, receiver: &Receiver, shadow: &mut ShadowRa
         if cosine > 0.0 && receiver.faces(-direction) && irradiance.max_element() > 0.0 {
             shadow.push(Ray::new(receiver.shadow_origin, -direction), irradiance);
         }
-    } else if let Some((position, light)) = point_light(light, receiver, shadow.near2) {
+    } else if let Some((position, light)) =
+        point_light(light, receiver).filter(|&(at, _)| !is_apart(&shadow.near, receiver, at))
+    {
         shadow.push_point(receiver, position, light);
     }
 }
 
-/// Position of a point or spot light, and its unoccluded irradiance; `None` if it cannot shine on the receiver, or is nearer
-/// than the root of `near2`.
-pub(crate) fn point_light(light: &Light, receiver: &Receiver, near2: f32) -> Option<(Vec3, Vec3)> {
+/// Whether what a receiver gets of the light at a position is sampled [apart](crate::direct::shadow_rays::Near).
+pub(crate) fn is_apart(near: &Near, receiver: &Receiver, position: Vec3) -> bool {
+    near.distance2 > 0.0 && near.has(position, receiver.position.distance_squared(position))
+}
+
+/// Position of a point or spot light, and its unoccluded irradiance; `None` if it cannot shine on the receiver.
+pub(crate) fn point_light(light: &Light, receiver: &Receiver) -> Option<(Vec3, Vec3)> {
     let (position, intensity) = match *light {
         Light::Point { position, intensity } => (position, Vec3::from(intensity)),
         Light::Spot { position, direction, inner, outer, intensity } => {
@@ -34,7 +40,7 @@ pub(crate) fn point_light(light: &Light, receiver: &Receiver, near2: f32) -> Opt
     let way = position.as_dvec3() - receiver.position.as_dvec3();
     let d2 = way.length_squared();
     let cosine = way.dot(receiver.normal.as_dvec3());
-    if cosine <= 0.0 || d2 < f64::from(near2) || !receiver.faces(way.as_vec3()) || intensity.max_element() <= 0.0 {
+    if cosine <= 0.0 || !receiver.faces(way.as_vec3()) || intensity.max_element() <= 0.0 {
         return None;
     }
     let factor = (cosine / (d2 * d2.sqrt())).min(BRIGHTEST as f64) as f32;

@@ -193,10 +193,27 @@ impl<R: AsMut<[Ray]>, C: AsMut<[Carried]>, O: AsMut<[u8]>, V: AsMut<[Vec3]>> Roo
             slot: 0,
             light: 0,
             normal: Vec3::ZERO,
-            near2: 0.0,
+            near: Near::default(),
             by_light: self.by_light.as_mut(),
             directed: self.directed.as_mut(),
         }
+    }
+}
+
+/// Point and spot lights whose light is sampled [apart](crate::lightmap::texel_light) at receivers nearby.
+#[derive(Clone, Copy, Default)]
+pub(crate) struct Near {
+    /// Square of the distance up to which it is.
+    pub distance2: f32,
+    /// The lights are those within the root of `reach2` of a place.
+    pub of: Vec3,
+    pub reach2: f32,
+}
+
+impl Near {
+    /// Whether the light at a position is sampled apart at a receiver the root of `distance2` away from it.
+    pub(crate) fn has(&self, position: Vec3, distance2: f32) -> bool {
+        distance2 < self.distance2 && position.distance_squared(self.of) <= self.reach2
     }
 }
 
@@ -218,9 +235,8 @@ pub(crate) struct ShadowRays<'a> {
     pub(super) light: usize,
     /// Unit normal of the receiver of the next rays.
     pub(crate) normal: Vec3,
-    /// Square of the distance within which point and spot lights do not shine on the next receivers, since what comes from
-    /// there is sampled [otherwise](crate::lightmap::texel_light); mostly 0.
-    pub(crate) near2: f32,
+    /// Lights that do not shine on the next receivers, mostly none.
+    pub(crate) near: Near,
     by_light: Option<&'a mut ByLight>,
     directed: Option<&'a mut Directed>,
 }

@@ -136,12 +136,20 @@ struct Point {
     place: u32,
     /// Whether it is known to lie inside a solid.
     is_buried: bool,
+    /// Whether light of lamps close to its texel is sampled [apart](near), so that it may be lit although its light is dark.
+    is_near_lamps: bool,
+}
+
+impl Point {
+    fn may_be_lit(&self) -> bool {
+        self.is_near_lamps || !self.light.is_dark()
+    }
 }
 
 /// Adds the light of the points that are not inside solids, by their weights; returns the sum of the weights. Only unlit
 /// points have been tested; if all are unlit, the first one tells it for all.
 fn add_points(points: &[Point], sum: &mut PointLight, weight: impl Fn(&TexelSample) -> Vec3) -> Vec3 {
-    let is_lit = points.iter().any(|p| !p.light.is_dark());
+    let is_lit = points.iter().any(Point::may_be_lit);
     if !is_lit && points.first().is_some_and(|p| p.is_buried) {
         return Vec3::ZERO;
     }
@@ -213,8 +221,14 @@ impl TilePoints {
             shadow_origin: Vec3::ZERO,
             raised: false,
         };
-        let point =
-            Point { on: TexelSample::default(), receiver, light: PointLight::default(), place: 0, is_buried: false };
+        let point = Point {
+            on: TexelSample::default(),
+            receiver,
+            light: PointLight::default(),
+            place: 0,
+            is_buried: false,
+            is_near_lamps: false,
+        };
         let points = texels * MAX_POINTS;
         Ok(TilePoints {
             points: try_filled(points, point, what)?,
@@ -262,7 +276,7 @@ impl TilePoints {
         for (i, &count) in self.counts[..texels].iter().enumerate() {
             let points = i * MAX_POINTS..i * MAX_POINTS + count;
             let dark = |&place: &usize| self.points[place].light.is_dark();
-            let few = if points.clone().all(|place| dark(&place)) { 1 } else { count };
+            let few = if points.clone().any(|place| self.points[place].may_be_lit()) { count } else { 1 };
             let mut to = None;
             for place in points.filter(dark).take(few) {
                 let to = to.get_or_insert_with(|| sample(i));
@@ -332,14 +346,15 @@ impl TilePoints {
             let samples = by.samples.div_ceil(numbers.len() as u32);
             let (seed, first) = (combine(by.seed, by.areas.map.seed(texel)), self.counts[place]);
             let of_round = combine(seed, numbers.start);
-            shadow.near2 = by.near2(texel);
+            shadow.near = by.near(texel);
+            let is_near_lamps = shadow.near.distance2 > 0.0;
             for number in numbers {
                 let Some(on) = by.areas.point(texel, number, seed) else { continue };
                 let receiver = receivers.of(&on, back);
                 let (count, at) = (self.counts[place], place * MAX_POINTS + self.counts[place]);
                 shadow.slot = KINDS * at;
                 let light = by.direct.push(&receiver, (count - first) as u32, lights, samples, of_round, &mut shadow);
-                self.points[at] = Point { on, receiver, light, place: at as u32, is_buried: false };
+                self.points[at] = Point { on, receiver, light, place: at as u32, is_buried: false, is_near_lamps };
                 self.pending.push(at as u32);
                 self.counts[place] += 1;
             }

@@ -176,7 +176,7 @@ fn many_lights_are_sampled_without_bias() {
                         expected += area.radiance * (weight / n as f32);
                     }
                 }
-            } else if let Some((target, light)) = point_light(light, &r, 0.0)
+            } else if let Some((target, light)) = point_light(light, &r)
                 && !scene.occluded(&shadow_ray(&r, target))
             {
                 expected += light;

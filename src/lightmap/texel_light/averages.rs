@@ -1,7 +1,6 @@
 //! Direct light of texels of the light map: light without penumbrae at their samples, whether it varies, and averages
 //! of points.
 
-use super::near::Near;
 use super::{AROUND, FEW, MAX_POINTS, Point, TexelLight, TilePoints, Wanted, add_points, differ, is_hidden, vary};
 use crate::base::directional::Directional;
 use crate::base::sampling::combine;
@@ -82,11 +81,11 @@ impl TexelLight<'_, LightMap> {
     /// Whether light without penumbrae varies in a texel, judged by its neighbours: `sharp` is the texel's own light,
     /// and `of` returns a neighbour's.
     pub(crate) fn varies(&self, texel: LightTexel, sharp: Vec3, mut of: impl FnMut(LightTexel) -> Vec3) -> Variation {
+        if self.near(texel).distance2 > 0.0 {
+            return Variation::Some;
+        }
         if !self.direct.has_sharp() {
             return Variation::None;
-        }
-        if self.near2(texel) > 0.0 {
-            return Variation::Some;
         }
         let mut variation = Variation::None;
         for ((dx, dy), near) in AROUND.into_iter().zip(self.areas.neighbours(texel)) {
@@ -180,13 +179,16 @@ impl TexelLight<'_, LightMap> {
             // it.
             sum.sharp = sharp * n;
         }
-        let tried = if goes_on || t.variation == Variation::Some { MAX_POINTS as f32 } else { FEW as f32 };
-        let mut near = Near { directional: (!directional.is_empty()).then(Directional::default), ..Near::default() };
-        self.sample_near((t.texel, t.back), |_| Vec3::ONE, Some(&t.receiver), &mut near, rays);
-        sum.sharp += near.light * tried;
+        let near = self.near(t.texel);
+        let mut near_directional = Directional::default();
+        if near.distance2 > 0.0 {
+            let directional = (!directional.is_empty()).then_some(&mut near_directional);
+            let light = self.sample_near((t.texel, t.back), &near, &t.receiver, |_| Vec3::ONE, directional, rays);
+            sum.sharp += light * n;
+        }
         let e = sum.value() / n;
-        if let Some(near) = near.directional {
-            *out = average_by_direction(t, points, (directional, near * tried), (&sum, n.x), is_even);
+        if !directional.is_empty() {
+            *out = average_by_direction(t, points, (directional, near_directional * n.x), (&sum, n.x), is_even);
         }
         (if t.variation == Variation::None { sharp + e } else { e }, variance(points))
     }
@@ -205,7 +207,7 @@ fn variance(points: &[Point]) -> f32 {
     SKEWED * squares / (n * (n - 1.0)).max(1.0) + STRATIFIED * areas / (n * n * (rays as f32).sqrt().max(1.0))
 }
 
-/// Averages the light by direction of a texel's points, and that of lights nearby. `sum`: their light, and the number of
+/// Averages the light by direction of a texel's points, and adds that of lamps close to it. `sum`: their light, and the number of
 /// points that count.
 #[inline(never)]
 fn average_by_direction(
@@ -234,7 +236,7 @@ fn has_penumbra(points: &[Point]) -> bool {
 }
 
 /// Returns the points that are seen from the texel's sample, `own`, whose light without penumbrae is `sharp`. Points
-/// with the same light are kept without a test.
+/// with the same light are kept without a test, unless light of lamps close to them is sampled apart.
 fn without_other_rooms<'p>(
     points: &'p mut [Point],
     scene: &Scene,
@@ -245,7 +247,8 @@ fn without_other_rooms<'p>(
     let mut kept = 0;
     for i in 0..points.len() {
         let point = points[i];
-        if differ(point.light.sharp, sharp, DIFFERENCE) && is_hidden(scene, own, &point.receiver, rays) {
+        let is_alike = !point.is_near_lamps && !differ(point.light.sharp, sharp, DIFFERENCE);
+        if !is_alike && is_hidden(scene, own, &point.receiver, rays) {
             continue;
         }
         points[kept] = point;

@@ -1,6 +1,5 @@
 //! Direct light of texels of the radiance map: a first look by a few points, and a closer one where it varies.
 
-use super::near::Near;
 use super::{FEW, MAX_POINTS, Point, TexelLight, TilePoints, Wanted, add_points, differ, vary};
 use crate::base::sampling::combine;
 use crate::direct::Receiver;
@@ -55,13 +54,11 @@ impl TexelLight<'_, RadianceMap> {
                 sum.add(&light, Vec3::splat(missing));
                 n += missing;
             }
-            let narrow = sum.narrow() / n;
-            let near = self.near_light(texel, |_| Vec3::ONE, rays);
-            sum.sharp += near.unwrap_or_default() * FEW as f32;
-            let varies = near.is_some()
+            // Lamps close to the texel are left to the closer look.
+            let varies = points.iter().any(|p| p.is_near_lamps)
                 || vary(points, PointLight::narrow, DIFFERENCE)
                 || vary(points, PointLight::unoccluded_areas, DIFFERENCE);
-            out(i, Look { irradiance: sum.value() / n, narrow, varies });
+            out(i, Look { irradiance: sum.value() / n, narrow: sum.narrow() / n, varies });
         }
     }
 
@@ -79,16 +76,20 @@ impl TexelLight<'_, RadianceMap> {
         for (i, &texel) in texels.iter().enumerate() {
             let (mut sum, points) = (PointLight::default(), tile.of(i));
             points.iter().for_each(|p| sum.add(&p.light, Vec3::ONE));
-            sum.sharp += self.near_light(texel, |_| Vec3::ONE, rays).unwrap_or_default() * FEW as f32;
-            out(i, sum.value() / points.len().max(1) as f32);
+            let near = self.near_light(texel, |_| Vec3::ONE, rays);
+            out(i, sum.value() / points.len().max(1) as f32 + near);
         }
     }
 
-    /// Returns the light of [lights nearby](super::near), if there are any.
-    fn near_light(&self, texel: RadianceTexel, weight: impl Fn(&TexelSample) -> Vec3, rays: &mut u64) -> Option<Vec3> {
-        let mut near = Near::default();
-        let there_are = self.sample_near((texel, self.areas.map.is_back(texel)), weight, None, &mut near, rays);
-        there_are.then_some(near.light)
+    /// Returns what [lamps close to a texel](super::near) bring to it.
+    fn near_light(&self, texel: RadianceTexel, weight: impl Fn(&TexelSample) -> Vec3, rays: &mut u64) -> Vec3 {
+        let near = self.near(texel);
+        match near.distance2 > 0.0 {
+            true => {
+                self.sample_near((texel, self.areas.map.is_back(texel)), &near, &self.sample(texel), weight, None, rays)
+            }
+            false => Vec3::ZERO,
+        }
     }
 
     /// Returns the sample of a texel of the radiance map as a receiver.
@@ -144,10 +145,8 @@ impl TexelLight<'_, RadianceMap> {
                 }
             }
         }
-        for (i, (sum, n)) in sums.iter_mut().zip(weights).take(texels.len()).enumerate() {
-            let tried = if has_spikes[i] { MANY as f32 } else { MAX_POINTS as f32 };
-            sum.sharp += self.near_light(texels[i], weight, rays).unwrap_or_default() * tried;
-            out(i, (n != Vec3::ZERO).then(|| sum.value() / n));
+        for (i, (sum, n)) in sums.iter().zip(weights).take(texels.len()).enumerate() {
+            out(i, (n != Vec3::ZERO).then(|| sum.value() / n + self.near_light(texels[i], weight, rays)));
         }
     }
 }

@@ -1,11 +1,12 @@
-//! Light of point and spot lights that are much nearer to a texel than it is wide, such as lamps just below a ceiling.
+//! Light of lamps (point and spot lights) that are closer to a texel than it is wide, such as just below a ceiling.
 //!
 //! A lamp 5 mm from a surface sends half of its light to a spot of a few centimetres. A few points spread over a texel miss
 //! that spot or exaggerate it, and with it what the spot reflects to all the room. So a texel's area is split in two for
-//! each light: what is farther from it than [`NEAR`] times the texel's width gets its light at the texel's usual points, and the
-//! rest is sampled here, by points that lie as densely as the light would fall on a plane, mixed with points spread evenly, which
-//! find what is not in that plane (both weighted by the balance heuristic of Veach and Guibas, *Optimally Combining Sampling
-//! Techniques for Monte Carlo Rendering*, 1995). The result has no bias; on a plane without occluders it has hardly any noise.
+//! each lamp: what is farther from it than [`NEAR`] times the texel's width gets its light at the texel's usual points
+//! ([`Near`]), and the rest is sampled here, by points that lie as densely as the light would fall on a plane, mixed with points
+//! spread evenly, which find what is not in that plane (both weighted by the balance heuristic of Veach and Guibas, *Optimally
+//! Combining Sampling Techniques for Monte Carlo Rendering*, 1995). On a plane without occluders there is hardly any noise. Points
+//! that the texel's sample does not see, inside solids or behind a wall that stands on the texel, do not count.
 //!
 //! Measured: docs/accuracy.md#lamps-close-to-surfaces.
 
@@ -13,103 +14,107 @@ use super::{TexelAreas, TexelLight, is_hidden};
 use crate::base::directional::Directional;
 use crate::base::sampling::{combine, sobol_2d};
 use crate::direct::Receiver;
-use crate::direct::point_light::point_light;
-use crate::direct::shadow_rays::PointRoom;
+use crate::direct::point_light::{is_apart, point_light};
+use crate::direct::shadow_rays::{Near, PointRoom};
 use crate::lightmap::atlas::chart_map::Receivers;
 use crate::lightmap::atlas::ids::{Map, TexelId};
 use crate::lightmap::atlas::texels::TexelSample;
-use crate::scene::Scene;
 use glam::{DVec2, DVec3, Vec3};
 use std::f64::consts::TAU;
 
-/// Distance up to which a light's irradiance is sampled here, in widths of a texel.
+/// Distance up to which a lamp's light is sampled here, in widths of a texel.
 const NEAR: f32 = 1.0;
 
-/// Distance of a light from a texel's sample, in widths of the texel, from which no point of the texel is [`NEAR`] it: half of the
-/// diagonal of a texel that is stretched to twice its width, and a sample in a corner, included.
-const FAR: f32 = 2.0;
+/// Greatest distance of such a lamp from the texel's sample, in widths of the texel: of others the usual points find the
+/// light, as of a lamp a width away from the corner of a square texel with its sample in the middle.
+const REACH: f32 = 1.75;
 
-/// Number of points spread evenly over a texel, and of those that lie where a light falls.
+/// Number of points spread evenly over a texel, of those that lie where the light of one lamp falls, and of the latter for
+/// all lamps together. Where more lamps than [`MOST`] are close to a texel, none is sampled here: there is no spot then.
 const EVEN: u32 = 32;
 const PEAKED: u32 = 96;
+const PEAKED_OF_ALL: u32 = 768;
+const MOST: usize = 64;
 
-/// Least height of a light above a texel's plane by which points are placed, in widths of the texel.
+/// Least height of a lamp above a texel's plane by which points are placed, in widths of the texel.
 const LEAST_HEIGHT: f64 = 1e-6;
 
-/// What lights nearby bring to a texel.
-#[derive(Default)]
-pub(super) struct Near {
-    /// Mean over the texel's square, outside of its chart 0.
-    pub light: Vec3,
-    /// That light by direction; `None`: nobody asks for it.
-    pub directional: Option<Directional>,
-}
+/// Rounding of places in texels.
+const ROUNDING: f64 = 1e-3;
 
 impl<M: Map> TexelLight<'_, M> {
-    /// Returns the square of the distance within which point and spot lights are sampled [here](self); 0 if none is so near to
-    /// a texel.
-    pub(super) fn near2(&self, texel: TexelId<M>) -> f32 {
+    /// Returns the lamps of which light is sampled [here](self), if there are any so close to a texel.
+    pub(super) fn near(&self, texel: TexelId<M>) -> Near {
         if self.direct.near.is_empty() {
-            return 0.0;
+            return Near::default();
         }
         let width = self.areas.width(texel);
-        let at = self.areas.map[texel].position(self.areas.scene);
-        let is_near = self.direct.near.within((NEAR + FAR) * width, at).next().is_some();
-        if is_near && width.is_finite() { (NEAR * width).powi(2) } else { 0.0 }
+        let (of, reach2) = (self.areas.map[texel].position(self.areas.scene), (REACH * width).powi(2));
+        let count = self.direct.near.within(reach2, of).take(MOST + 1).count();
+        let is_near = (1..=MOST).contains(&count) && reach2.is_finite();
+        Near { distance2: if is_near { (NEAR * width).powi(2) } else { 0.0 }, of, reach2 }
     }
 
-    /// Adds the light of lights nearby to a texel, on its back if `back`; returns whether there are any. Light at a point counts
-    /// by its `weight`, and only where the point can be seen from `own`, if it is given.
+    /// Returns the mean light of lamps `near` a texel, on its back if `back`. Light at a point counts by its `weight`, and points
+    /// by whether they are seen from the texel's sample, `own`. If light by direction is asked for, it is added to `directional`.
     pub(super) fn sample_near(
         &self,
         (texel, back): (TexelId<M>, bool),
+        near: &Near,
+        own: &Receiver,
         weight: impl Fn(&TexelSample) -> Vec3,
-        own: Option<&Receiver>,
-        out: &mut Near,
+        directional: Option<&mut Directional>,
         rays: &mut u64,
-    ) -> bool {
-        let near2 = self.near2(texel);
-        if near2 == 0.0 {
-            return false;
-        }
+    ) -> Vec3 {
         let TexelAreas { scene, map, .. } = self.areas;
-        let at = map[texel].position(scene);
         let seed = combine(combine(self.seed, map.seed(texel)), 33);
-        let mut room = if out.directional.is_some() { PointRoom::by_direction() } else { PointRoom::new() };
-        let (mut shadow, mut receivers) = (room.begin(scene), Receivers::new(scene));
-        for (light, position) in self.direct.near.within((NEAR + FAR) * self.areas.width(texel), at) {
+        let mut receivers = Receivers::new(scene);
+        let mut counting = |place, rays: &mut u64| {
+            let on = self.areas.point_at(texel, place)?;
+            let receiver = receivers.of(&on, back);
+            (!is_hidden(scene, own, &receiver, rays)).then_some((on, receiver))
+        };
+        let even: [_; EVEN as usize] = std::array::from_fn(|i| counting(sobol_2d(i as u32, seed), rays));
+        let sum: Vec3 = even.iter().flatten().map(|(on, _)| weight(on)).sum();
+        if sum == Vec3::ZERO {
+            return Vec3::ZERO;
+        }
+        let mut room = if directional.is_some() { PointRoom::by_direction() } else { PointRoom::new() };
+        let mut shadow = room.begin(scene);
+        let lamps = || self.direct.near.within(near.reach2, near.of);
+        let of_one = (PEAKED_OF_ALL / lamps().count().max(1) as u32).min(PEAKED);
+        for (light, position) in lamps() {
+            let mut push = |on: &TexelSample, receiver: &Receiver, scale: f64| {
+                if let Some((target, light)) =
+                    point_light(light, receiver).filter(|_| is_apart(near, receiver, position))
+                {
+                    shadow.normal = receiver.normal;
+                    shadow.push_point(receiver, target, light * weight(on) * scale as f32);
+                }
+            };
             let peak = self.areas.peak(texel, position);
-            for i in 0..EVEN + PEAKED {
-                let place = match &peak {
-                    Some(peak) if i >= EVEN => peak.place(sobol_2d(i - EVEN, combine(seed, 1))),
-                    _ => sobol_2d(i, seed),
-                };
-                if !place.iter().all(|x| (0.0..1.0).contains(x)) {
-                    continue;
+            // Of points of both kinds, by the sum of their densities.
+            let scale = |on: &TexelSample| match &peak {
+                Some(peak) => {
+                    1.0 / (f64::from(EVEN) + f64::from(of_one) * peak.density(self.areas.place(texel, peak, on)))
                 }
-                let Some(on) = self.areas.point_at(texel, place) else { continue };
-                let receiver = receivers.of(&on, back);
-                if receiver.position.distance_squared(position) >= near2 {
-                    continue;
+                None => 1.0 / f64::from(EVEN),
+            };
+            even.iter().flatten().for_each(|(on, receiver)| push(on, receiver, scale(on)));
+            for i in (0..of_one).filter(|_| peak.is_some()) {
+                let Some(place) = peak.as_ref().map(|peak| peak.place(sobol_2d(i, combine(seed, 1)))) else { continue };
+                if let Some((on, receiver)) = counting(place, rays) {
+                    push(&on, &receiver, scale(&on));
                 }
-                let Some((target, irradiance)) = point_light(light, &receiver, 0.0) else { continue };
-                if own.is_some_and(|own| is_hidden(scene, own, &receiver, rays)) {
-                    continue;
-                }
-                let density = peak.as_ref().map_or(1.0, |peak| {
-                    (f64::from(EVEN) + f64::from(PEAKED) * peak.density(place)) / f64::from(EVEN + PEAKED)
-                });
-                let scale = (1.0 / (density * f64::from(EVEN + PEAKED))) as f32;
-                shadow.normal = receiver.normal;
-                shadow.push_point(&receiver, target, irradiance * scale * weight(&on));
             }
         }
         let (arrived, directed) = shadow.finish_by_direction(rays);
-        out.light += arrived[0];
-        if let (Some(out), Some(&directed)) = (&mut out.directional, directed.first()) {
-            *out += directed;
+        // What has arrived is the mean over the texel's square; of the square, so much counts.
+        let part = sum / EVEN as f32;
+        if let (Some(out), Some(&directed)) = (directional, directed.first()) {
+            *out += directed / part.x;
         }
-        true
+        arrived[0] / part
     }
 }
 
@@ -120,42 +125,55 @@ impl<M: Map> TexelAreas<'_, M> {
         1.0 / x.min(y)
     }
 
-    /// Returns where on a texel the light of a point light falls; `None` if its triangle is too narrow to tell, or if it is far away.
-    fn peak(&self, texel: TexelId<M>, light: Vec3) -> Option<Peak> {
+    /// Returns the place of a triangle's point in a texel.
+    fn in_texel(&self, texel: TexelId<M>, triangle: u32, u: f32, v: f32) -> DVec2 {
         let own = &self.map[texel];
         let placement = &self.map.layout[self.map.placement_of(self.charts, texel)];
-        let [a, b, c] = corners(self.scene, own.triangle);
-        let in_texel = |u: f32, v: f32| {
-            let at = placement.texel_coord(self.charts.local(own.triangle, u, v));
-            DVec2::new(f64::from(at[0]) - f64::from(own.x), f64::from(at[1]) - f64::from(own.y))
-        };
-        let (origin, along_u, along_v) = (in_texel(0.0, 0.0), in_texel(1.0, 0.0), in_texel(0.0, 1.0));
-        let (along_u, along_v) = (along_u - origin, along_v - origin);
-        let (edge_u, edge_v, to) = (b - a, c - a, light.as_dvec3() - a);
+        let [x, y] = placement.texel_coord(self.charts.local(triangle, u, v));
+        DVec2::new(f64::from(x) - f64::from(own.x), f64::from(y) - f64::from(own.y))
+    }
+
+    /// Returns where on a texel the light of a lamp falls; `None` if its triangle is too narrow to tell, or if it is far away.
+    fn peak(&self, texel: TexelId<M>, lamp: Vec3) -> Option<Peak> {
+        let own = &self.map[texel];
+        let (object, triangle) = self.scene.locate(own.triangle);
+        let [a, b, c] = self.scene.object(object).corners(triangle).map(|corner| corner.as_dvec3());
+        let at = |u, v| self.in_texel(texel, own.triangle, u, v);
+        let origin = at(0.0, 0.0);
+        let axes = [at(1.0, 0.0) - origin, at(0.0, 1.0) - origin];
+        let (edge_u, edge_v, to) = (b - a, c - a, lamp.as_dvec3() - a);
         let normal = edge_u.cross(edge_v);
-        // Barycentric weights of the foot of the perpendicular from the light.
+        // Barycentric weights of the foot of the perpendicular from the lamp.
         let twice_area2 = normal.length_squared();
         let u = to.cross(edge_v).dot(normal) / twice_area2;
         let v = edge_u.cross(to).dot(normal) / twice_area2;
-        let texels2 = along_u.perp_dot(along_v).abs() / twice_area2.sqrt();
+        let texels2 = axes[0].perp_dot(axes[1]).abs() / twice_area2.sqrt();
         let height = (to.dot(normal).abs() / twice_area2.sqrt() * texels2.sqrt()).max(LEAST_HEIGHT);
-        let foot = origin + u * along_u + v * along_v;
+        let foot = origin + u * axes[0] + v * axes[1];
         // Chart maps may be stretched.
-        let [x, y] = placement.scale;
+        let [x, y] = self.map.layout[self.map.placement_of(self.charts, texel)].scale;
         let radius = 2.0 * f64::from(NEAR * x.max(y) / x.min(y));
-        (foot.is_finite() && height.is_finite()).then(|| Peak::new(foot, height, radius)).flatten()
+        let is_known = foot.is_finite() && height.is_finite();
+        is_known.then(|| Peak::new((own.triangle, origin, axes), foot, height, radius)).flatten()
     }
-}
 
-fn corners(scene: &Scene, triangle: u32) -> [DVec3; 3] {
-    let (object, triangle) = scene.locate(triangle);
-    scene.object(object).corners(triangle).map(|corner| corner.as_dvec3())
+    /// Returns the place of a point in its texel: in the triangle by which the peak was found without the rounding of texel
+    /// coordinates, which in wide pages may be more than a lamp's height.
+    fn place(&self, texel: TexelId<M>, peak: &Peak, on: &TexelSample) -> DVec2 {
+        let &(triangle, origin, [along_u, along_v]) = &peak.plane;
+        match on.triangle == triangle {
+            true => origin + f64::from(on.u) * along_u + f64::from(on.v) * along_v,
+            false => self.in_texel(texel, on.triangle, on.u, on.v),
+        }
+    }
 }
 
 /// Density of points in the part of a texel that lies within a square around the foot of the perpendicular from a light to its plane,
 /// in proportion to its irradiance there: uniform in the solid angle of a rectangle (Ureña, Fajardo and King, *An
 /// Area-Preserving Parametrization for Spherical Rectangles*, 2013). Lengths are in texels.
 struct Peak {
+    /// Triangle in whose plane it lies, place of its corner 0, and its edges.
+    plane: (u32, DVec2, [DVec2; 2]),
     foot: DVec2,
     height: f64,
     /// Corners of the rectangle, seen from the foot.
@@ -170,7 +188,7 @@ struct Peak {
 
 impl Peak {
     /// Makes the density in a texel, up to a `radius` from the foot; `None` if the texel lies beyond it.
-    fn new(foot: DVec2, height: f64, radius: f64) -> Option<Peak> {
+    fn new(plane: (u32, DVec2, [DVec2; 2]), foot: DVec2, height: f64, radius: f64) -> Option<Peak> {
         let lower = (-foot).max(DVec2::splat(-radius));
         let upper = (DVec2::ONE - foot).min(DVec2::splat(radius));
         let corners = [(lower.x, lower.y), (upper.x, lower.y), (upper.x, upper.y), (lower.x, upper.y)];
@@ -182,7 +200,7 @@ impl Peak {
         let solid_angle = angle(0) + angle(1) - rest;
         let normals = [normals[0].z, normals[2].z];
         let is_seen = lower.cmplt(upper).all() && solid_angle > 0.0;
-        is_seen.then_some(Peak { foot, height, lower, upper, solid_angle, rest, normals })
+        is_seen.then_some(Peak { plane, foot, height, lower, upper, solid_angle, rest, normals })
     }
 
     /// Returns a place of this density for a point of the unit square.
@@ -196,14 +214,15 @@ impl Peak {
         let [h0, h1] = [lower.y, upper.y].map(|y| y / (d2 + y * y).sqrt());
         let h = h0 + f64::from(t) * (h1 - h0);
         let y = (h * (d2 / (1.0 - h * h)).sqrt()).clamp(lower.y, upper.y);
-        [(foot.x + x) as f32, (foot.y + y) as f32]
+        // Rounded up to 1 it would be another texel's.
+        [foot.x + x, foot.y + y].map(|at| (at as f32).clamp(0.0, 1.0 - f32::EPSILON))
     }
 
     /// Returns the density at a place, per area of a texel.
-    fn density(&self, [x, y]: [f32; 2]) -> f64 {
-        let at = DVec2::new(f64::from(x), f64::from(y)) - self.foot;
+    fn density(&self, place: DVec2) -> f64 {
+        let at = place - self.foot;
         let d2 = self.height * self.height + at.length_squared();
-        let is_within = at.cmpge(self.lower).all() && at.cmple(self.upper).all();
+        let is_within = at.cmpge(self.lower - ROUNDING).all() && at.cmple(self.upper + ROUNDING).all();
         if is_within { self.height / (d2 * d2.sqrt() * self.solid_angle) } else { 0.0 }
     }
 }
@@ -215,7 +234,7 @@ mod tests {
     #[test]
     fn places_have_the_density_that_is_told() {
         for (foot, height) in [([0.4, 0.6], 0.3), ([0.5, 0.03], 0.01), ([1.2, -0.3], 0.05), ([0.2, 1.7], 0.5)] {
-            let peak = Peak::new(DVec2::from(foot), height, 2.0).unwrap();
+            let peak = Peak::new((0, DVec2::ZERO, [DVec2::X, DVec2::Y]), DVec2::from(foot), height, 2.0).unwrap();
             // The texel in cells: the density's integral, and the part of the places in each.
             const CELLS: usize = 4;
             let (mut found, mut expected) = ([0.0; CELLS * CELLS], [0.0; CELLS * CELLS]);
@@ -230,8 +249,10 @@ mod tests {
                 const FINE: usize = 400;
                 let width = 1.0 / (CELLS * FINE) as f64;
                 for i in 0..FINE * FINE {
-                    let at = |cell: usize, i: usize| (((cell * FINE + i) as f64 + 0.5) * width) as f32;
-                    *expected += peak.density([at(cell % CELLS, i % FINE), at(cell / CELLS, i / FINE)]) * width * width;
+                    let at = |cell: usize, i: usize| ((cell * FINE + i) as f64 + 0.5) * width;
+                    *expected += peak.density(DVec2::new(at(cell % CELLS, i % FINE), at(cell / CELLS, i / FINE)))
+                        * width
+                        * width;
                 }
             }
             let total: f64 = expected.iter().sum();

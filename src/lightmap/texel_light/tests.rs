@@ -3,6 +3,7 @@
 use super::*;
 use crate::base::progress::Progress;
 use crate::direct::direct_light::DirectLight;
+use crate::lightmap::atlas::ids::PlacementId;
 use crate::lightmap::{BakeParams, Lightmap, LightmapDesc};
 use crate::scene::demo::shapes::MeshBuilder;
 use crate::scene::{Light, Material, SceneData, builtin};
@@ -215,17 +216,39 @@ fn a_wall_that_reaches_into_floor_and_ceiling_has_no_dark_line_at_its_foot() {
     assert!((0.96..1.01).contains(&ratio), "{ratio}");
 }
 
-/// A floor of 2 x 2 under lamps.
-fn under_lamps(positions: &[Vec3]) -> Arc<Scene> {
+/// A floor of 2 x 2 under lamps. If `block`, a block stands on it where x > 1.
+fn under_lamps(positions: &[Vec3], block: bool) -> Arc<Scene> {
     let mut data = SceneData::new();
     let m = data.add_material(Material { albedo: [0.5; 3], ..Default::default() }).unwrap();
     let mut builder = MeshBuilder::new();
     builder.quad(Vec3::ZERO, Vec3::X * 2.0, Vec3::new(2.0, 2.0, 0.0), Vec3::Y * 2.0, m);
     data.add_mesh(builder.finish()).unwrap();
+    if block {
+        let mut builder = MeshBuilder::new();
+        builder.box_(Vec3::new(1.0, -0.5, -0.1), Vec3::new(2.5, 2.5, 0.6), false, m);
+        data.add_mesh(builder.finish()).unwrap();
+    }
     for &position in positions {
         data.add_light(Light::Point { position, intensity: [1.0; 3] }).unwrap();
     }
     data.committed()
+}
+
+/// The light of the floor up to x = `edge` by a map's texels.
+fn light_of_floor<M: Map>(atlas: &Atlas, map: &ChartMap<M>, edge: f32, light: &[f32]) -> f64 {
+    const N: u32 = 2000;
+    let step = |i: u32, of: f32| of * (i as f32 + 0.5) / N as f32;
+    let mut sum = 0.0;
+    for (i, k) in (0..N).flat_map(|i| (0..N).map(move |k| (i, k))) {
+        let (x, y) = (step(i, edge) / 2.0, step(k, 2.0) / 2.0);
+        // The floor is made of the triangles (0, 1, 2) and (0, 2, 3) of its corners.
+        let (triangle, u, v) = if x > y { (0, x - y, y) } else { (1, x, y - x) };
+        let placement = PlacementId::new(atlas.charts.chart_of(triangle).index());
+        let [s, t] = map.layout.texel_coord(placement, atlas.charts.local(triangle, u, v));
+        let texel = map.at(placement, s as i32, t as i32).expect("a texel of the floor");
+        sum += f64::from(light[texel.index()]);
+    }
+    sum * f64::from(edge) * 2.0 / f64::from(N * N)
 }
 
 /// Half of the light of a lamp close to a surface falls on a spot that is much smaller than a texel.
@@ -234,20 +257,24 @@ fn texels_have_the_energy_of_lamps_close_to_them() {
     let one = |x, y, height| vec![Vec3::new(x, y, height)];
     // Many enough to be sampled by a tree.
     let many = (0..100).map(|i| Vec3::new(0.107 + 0.2 * (i % 10) as f32, 0.093 + 0.2 * (i / 10) as f32, 0.005));
-    let mut cases = vec![many.collect()];
+    let mut cases = vec![(many.collect(), false)];
     for height in [0.1, 0.03, 0.01, 1e-3, 1e-4] {
-        cases.extend([one(1.03, 0.97, height), one(0.5612, 1.274, height)]);
+        cases.extend([(one(1.03, 0.97, height), false), (one(0.5612, 1.274, height), false)]);
+        // A part of the texels around the lamp lies under the block.
+        cases.push((one(0.985, 1.03, height), true));
     }
-    for lamps in cases {
-        let scene = under_lamps(&lamps);
+    for (lamps, block) in cases {
+        let scene = under_lamps(&lamps, block);
         let mut map = created(&scene, 20.0);
         map.bake(&BakeParams { gather_rays: 0, ..Default::default() }, &Progress::none()).unwrap();
-        let (atlas, area) = (map.atlas(), 0.05f32.powi(2));
-        let of_map: f32 = map.light.as_ref().unwrap().direct.iter().map(|e| e.x * area).sum();
+        let atlas = map.atlas();
+        let edge = if block { 1.0 } else { 2.0 };
+        let light: Vec<f32> = map.light.as_ref().unwrap().direct.iter().map(|e| e.x).collect();
+        let of_map = light_of_floor(atlas, &atlas.map, edge, &light);
         let direct = DirectLight::new(&scene);
         let light = TexelLight { areas: atlas.areas(&atlas.radiance), direct: &direct, samples: 4, seed: 5 };
         let mut tile = TilePoints::new(1).unwrap();
-        let mut of_radiance = 0.0;
+        let mut looks = vec![0.0; atlas.radiance.len()];
         for texel in atlas.radiance.all() {
             light.closer_look(
                 &[texel],
@@ -255,19 +282,21 @@ fn texels_have_the_energy_of_lamps_close_to_them() {
                 |_| Vec3::ONE,
                 &mut 0,
                 |_, e| {
-                    of_radiance += e.unwrap().x * 16.0 * area;
+                    looks[texel.index()] = e.unwrap_or_default().x;
                 },
             );
         }
+        let of_radiance = light_of_floor(atlas, &atlas.radiance, edge, &looks);
         // The solid angles of the floor's four parts around the foot of each lamp.
         let floor = |lamp: &Vec3| {
-            let part = |x: f32, y: f32| (x * y).atan2(lamp.z * (x * x + y * y + lamp.z * lamp.z).sqrt());
-            let Vec3 { x, y, .. } = *lamp;
-            part(x, y) + part(2.0 - x, y) + part(x, 2.0 - y) + part(2.0 - x, 2.0 - y)
+            let Vec3 { x, y, z } = *lamp;
+            let part = |x: f32, y: f32| (x * y).atan2(z * (x * x + y * y + z * z).sqrt());
+            f64::from(part(x, y) + part(edge - x, y) + part(x, 2.0 - y) + part(edge - x, 2.0 - y))
         };
-        let expected: f32 = lamps.iter().map(floor).sum();
-        for (sum, what) in [(of_map, "light map"), (of_radiance, "radiance map")] {
-            assert!((sum / expected - 1.0).abs() < 0.02, "{} in the {what} at {}", sum / expected, lamps[0]);
+        let expected: f64 = lamps.iter().map(floor).sum();
+        for (sum, what, bound) in [(of_map, "light map", 0.02), (of_radiance, "radiance map", 0.02)] {
+            let part = sum / expected;
+            assert!((part - 1.0).abs() < bound, "{part} in the {what}, lamp at {}, block: {block}", lamps[0]);
         }
     }
 }
