@@ -109,12 +109,12 @@ impl<M: Map> TexelLight<'_, M> {
             }
         }
         let (arrived, directed) = shadow.finish_by_direction(rays);
-        // What has arrived is the mean over the texel's square; of the square, so much counts.
-        let part = sum / EVEN as f32;
+        // What has arrived is the mean over the texel's square, of which a part counts. (Albedos of 0 weigh next to nothing, and a
+        // part of that may be nothing.)
         if let (Some(out), Some(&directed)) = (directional, directed.first()) {
-            *out += directed / part.x;
+            *out += directed * EVEN as f32 / sum.x;
         }
-        arrived[0] / part
+        arrived[0] * EVEN as f32 / sum
     }
 }
 
@@ -168,7 +168,7 @@ impl<M: Map> TexelAreas<'_, M> {
     }
 }
 
-/// Density of points in the part of a texel that lies within a square around the foot of the perpendicular from a light to its plane,
+/// Density of points in the part of a texel that lies within a square around the foot of the perpendicular from a lamp to its plane,
 /// in proportion to its irradiance there: uniform in the solid angle of a rectangle (Ureña, Fajardo and King, *An
 /// Area-Preserving Parametrization for Spherical Rectangles*, 2013). Lengths are in texels.
 struct Peak {
@@ -182,7 +182,7 @@ struct Peak {
     solid_angle: f64,
     /// Sum of the angles at the rectangle's corners at its greater x, from which angles of parts of it are counted.
     rest: f64,
-    /// Components along the light's height of the normals of the planes through the light and the sides along x.
+    /// Components along the lamp's height of the normals of the planes through the lamp and the sides along x.
     normals: [f64; 2],
 }
 
