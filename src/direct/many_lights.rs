@@ -11,7 +11,7 @@
 use super::area_light::AreaLight;
 use super::light_node::Bounds;
 use super::light_tree::{LIGHT_TREE, LightTree};
-use super::point_light::{is_apart, point_light};
+use super::point_light::point_light;
 use super::receiver::Receiver;
 use super::shadow_rays::{Candidate, Choice, Near, ShadowRays, shadow_ray};
 use crate::base::error::Result;
@@ -122,7 +122,7 @@ impl ManyLights {
         total
     }
 
-    /// Finds `n` candidates at most, no lights that are `near` among them.
+    /// Finds `n` candidates at most; lights that are sampled apart, since they are `near`, are left out.
     fn find_candidates(&self, receiver: &Receiver, n: u32, seed: u32, near: &Near, choice: &mut Choice) {
         let Choice { descent, candidates } = choice;
         candidates.clear();
@@ -155,7 +155,7 @@ impl ManyLights {
                 match &lights[light] {
                     Source::Point(light) => {
                         let light = point_light(light, receiver);
-                        if let Some((target, light)) = light.filter(|&(at, _)| !is_apart(near, receiver, at)) {
+                        if let Some((target, light)) = light.filter(|&(at, _)| !near.has(at, receiver)) {
                             candidates.push(Candidate { target, light: light * (share * count as f32) });
                         }
                     }

@@ -1,7 +1,7 @@
 //! Point, spot and parallel lights, which take one shadow ray.
 
 use super::receiver::Receiver;
-use super::shadow_rays::{Near, ShadowRays};
+use super::shadow_rays::ShadowRays;
 use crate::scene::{BRIGHTEST, Light};
 use crate::trace::Ray;
 use glam::Vec3;
@@ -15,15 +15,10 @@ pub(crate) fn push_one(light: &Light, receiver: &Receiver, shadow: &mut ShadowRa
             shadow.push(Ray::new(receiver.shadow_origin, -direction), irradiance);
         }
     } else if let Some((position, light)) =
-        point_light(light, receiver).filter(|&(at, _)| !is_apart(&shadow.near, receiver, at))
+        point_light(light, receiver).filter(|&(at, _)| !shadow.near.has(at, receiver))
     {
         shadow.push_point(receiver, position, light);
     }
-}
-
-/// Whether what a receiver gets of the light at a position is sampled [apart](crate::direct::shadow_rays::Near).
-pub(crate) fn is_apart(near: &Near, receiver: &Receiver, position: Vec3) -> bool {
-    near.distance2 > 0.0 && near.has(position, receiver.position.distance_squared(position))
 }
 
 /// Position of a point or spot light, and its unoccluded irradiance; `None` if it cannot shine on the receiver.

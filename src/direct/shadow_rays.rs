@@ -203,7 +203,7 @@ impl<R: AsMut<[Ray]>, C: AsMut<[Carried]>, O: AsMut<[u8]>, V: AsMut<[Vec3]>> Roo
 /// Point and spot lights whose light is sampled [apart](crate::lightmap::texel_light) at receivers nearby.
 #[derive(Clone, Copy, Default)]
 pub(crate) struct Near {
-    /// Square of the distance up to which it is.
+    /// Square of the distance up to which it is; 0: nowhere.
     pub distance2: f32,
     /// The lights are those within the root of `reach2` of a place.
     pub of: Vec3,
@@ -211,9 +211,10 @@ pub(crate) struct Near {
 }
 
 impl Near {
-    /// Whether the light at a position is sampled apart at a receiver the root of `distance2` away from it.
-    pub(crate) fn has(&self, position: Vec3, distance2: f32) -> bool {
-        distance2 < self.distance2 && position.distance_squared(self.of) <= self.reach2
+    /// Whether what a receiver gets of the light at a position is sampled apart.
+    pub(crate) fn has(&self, position: Vec3, receiver: &Receiver) -> bool {
+        position.distance_squared(receiver.position) < self.distance2
+            && position.distance_squared(self.of) <= self.reach2
     }
 }
 

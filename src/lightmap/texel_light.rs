@@ -16,7 +16,7 @@
 //! seen, or the ways straight up and to four sides end at the solid's surface from inside. If all points do, as in a
 //! texel of which a strip looks out from under a block, the texel's sample alone is lit.
 //!
-//! What point and spot lights bring that are much nearer than a texel is wide is sampled [apart](near).
+//! Light of point and spot lights closer to a texel than it is wide is sampled [apart](near).
 //!
 //! The data used of neighbours is a function of their numbers alone, so that shards of a bake and tiles of live
 //! updates, which recompute it, have the same bits. The shadow rays of a [tile](super::tiles) are traced together,
@@ -31,6 +31,7 @@ use super::atlas::chart_index::ChartIndex;
 use super::atlas::chart_map::{ChartMap, Receivers};
 use super::atlas::charts::Charts;
 use super::atlas::ids::{Map, TexelId};
+use super::atlas::layout::Placement;
 use super::atlas::seen::Seen;
 use super::atlas::texels::TexelSample;
 use crate::base::directional::Directional;
@@ -85,8 +86,7 @@ impl<M: Map> TexelAreas<'_, M> {
     /// Returns the point of the chart at a place in a texel, (0, 0) to (1, 1); `None` if it misses the chart or lies in a
     /// cut-out.
     fn point_at(&self, texel: TexelId<M>, place: [f32; 2]) -> Option<TexelSample> {
-        let own = &self.map[texel];
-        let placement = &self.map.layout[self.map.placement_of(self.charts, texel)];
+        let (own, placement) = (&self.map[texel], self.placement(texel));
         // The sample of a buried texel lies in another texel; no other points are used.
         let at = Vec2::from(placement.texel_coord(self.charts.local(own.triangle, own.u, own.v)));
         let within = at - Vec2::new(own.x as f32, own.y as f32);
@@ -95,6 +95,10 @@ impl<M: Map> TexelAreas<'_, M> {
         }
         let point = self.index.in_texel(self.charts, placement, own, place)?;
         (!self.scene.is_hole(point.triangle, point.u, point.v)).then_some(point)
+    }
+
+    fn placement(&self, texel: TexelId<M>) -> &Placement {
+        &self.map.layout[self.map.placement_of(self.charts, texel)]
     }
 
     /// Whether a hit is on a surface from inside a solid: on the back of a one-sided surface, or on a side that is seen

@@ -78,7 +78,7 @@ impl TexelLight<'_, LightMap> {
         }
     }
 
-    /// Whether light without penumbrae varies in a texel, judged by its neighbours: `sharp` is the texel's own light,
+    /// Whether light without penumbrae varies in a texel, because [lamps](super::near) are close to it or judged by its neighbours: `sharp` is the texel's own light,
     /// and `of` returns a neighbour's.
     pub(crate) fn varies(&self, texel: LightTexel, sharp: Vec3, mut of: impl FnMut(LightTexel) -> Vec3) -> Variation {
         if self.near(texel).distance2 > 0.0 {

@@ -14,7 +14,7 @@ use super::{TexelAreas, TexelLight, is_hidden};
 use crate::base::directional::Directional;
 use crate::base::sampling::{combine, sobol_2d};
 use crate::direct::Receiver;
-use crate::direct::point_light::{is_apart, point_light};
+use crate::direct::point_light::point_light;
 use crate::direct::shadow_rays::{Near, PointRoom};
 use crate::lightmap::atlas::chart_map::Receivers;
 use crate::lightmap::atlas::ids::{Map, TexelId};
@@ -30,7 +30,7 @@ const NEAR: f32 = 1.0;
 const REACH: f32 = 1.75;
 
 /// Number of points spread evenly over a texel, of those that lie where the light of one lamp falls, and of the latter for
-/// all lamps together. Where more lamps than [`MOST`] are close to a texel, none is sampled here: there is no spot then.
+/// all lamps together. Where more lamps than [`MOST`] are close to a texel, none is sampled here, which would take long.
 const EVEN: u32 = 32;
 const PEAKED: u32 = 96;
 const PEAKED_OF_ALL: u32 = 768;
@@ -39,7 +39,7 @@ const MOST: usize = 64;
 /// Least height of a lamp above a texel's plane by which points are placed, in widths of the texel.
 const LEAST_HEIGHT: f64 = 1e-6;
 
-/// Rounding of places in texels.
+/// Distance in texels by which a point may miss the place that was asked for.
 const ROUNDING: f64 = 1e-3;
 
 impl<M: Map> TexelLight<'_, M> {
@@ -85,9 +85,7 @@ impl<M: Map> TexelLight<'_, M> {
         let of_one = (PEAKED_OF_ALL / lamps().count().max(1) as u32).min(PEAKED);
         for (light, position) in lamps() {
             let mut push = |on: &TexelSample, receiver: &Receiver, scale: f64| {
-                if let Some((target, light)) =
-                    point_light(light, receiver).filter(|_| is_apart(near, receiver, position))
-                {
+                if let Some((target, light)) = point_light(light, receiver).filter(|&(at, _)| near.has(at, receiver)) {
                     shadow.normal = receiver.normal;
                     shadow.push_point(receiver, target, light * weight(on) * scale as f32);
                 }
@@ -101,8 +99,7 @@ impl<M: Map> TexelLight<'_, M> {
                 None => 1.0 / f64::from(EVEN),
             };
             even.iter().flatten().for_each(|(on, receiver)| push(on, receiver, scale(on)));
-            for i in (0..of_one).filter(|_| peak.is_some()) {
-                let Some(place) = peak.as_ref().map(|peak| peak.place(sobol_2d(i, combine(seed, 1)))) else { continue };
+            for place in peak.iter().flat_map(|peak| (0..of_one).map(|i| peak.place(sobol_2d(i, combine(seed, 1))))) {
                 if let Some((on, receiver)) = counting(place, rays) {
                     push(&on, &receiver, scale(&on));
                 }
@@ -121,15 +118,14 @@ impl<M: Map> TexelLight<'_, M> {
 impl<M: Map> TexelAreas<'_, M> {
     /// Returns the greater side of a texel in the scene.
     fn width(&self, texel: TexelId<M>) -> f32 {
-        let [x, y] = self.map.layout[self.map.placement_of(self.charts, texel)].scale;
+        let [x, y] = self.placement(texel).scale;
         1.0 / x.min(y)
     }
 
     /// Returns the place of a triangle's point in a texel.
     fn in_texel(&self, texel: TexelId<M>, triangle: u32, u: f32, v: f32) -> DVec2 {
         let own = &self.map[texel];
-        let placement = &self.map.layout[self.map.placement_of(self.charts, texel)];
-        let [x, y] = placement.texel_coord(self.charts.local(triangle, u, v));
+        let [x, y] = self.placement(texel).texel_coord(self.charts.local(triangle, u, v));
         DVec2::new(f64::from(x) - f64::from(own.x), f64::from(y) - f64::from(own.y))
     }
 
@@ -151,7 +147,7 @@ impl<M: Map> TexelAreas<'_, M> {
         let height = (to.dot(normal).abs() / twice_area2.sqrt() * texels2.sqrt()).max(LEAST_HEIGHT);
         let foot = origin + u * axes[0] + v * axes[1];
         // Chart maps may be stretched.
-        let [x, y] = self.map.layout[self.map.placement_of(self.charts, texel)].scale;
+        let [x, y] = self.placement(texel).scale;
         let radius = 2.0 * f64::from(NEAR * x.max(y) / x.min(y));
         let is_known = foot.is_finite() && height.is_finite();
         is_known.then(|| Peak::new((own.triangle, origin, axes), foot, height, radius)).flatten()
