@@ -270,7 +270,7 @@ impl Plan {
     pub(crate) fn run_seams(&mut self, edges: u64, unlike: u64) {
         let but = match unlike {
             0 => String::new(),
-            n => format!(", except {n} points with very different indirect light on the two sides"),
+            n => format!(", except {n} points whose two sides face different ways or have very different light"),
         };
         self.run(&format!("stitching of seams at {edges} edges of smooth surfaces{but}"));
     }

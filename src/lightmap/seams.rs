@@ -8,9 +8,10 @@
 //! which the texel grids of both sides must be aligned.) The normal equations are solved by conjugate gradients
 //! (Hestenes and Stiefel 1952), one set of texels for each layer of light.
 //!
-//! If the two sides have very different indirect light, one of them is not visible there: its texels show the other
-//! face of the surface, or it lies in a narrow gap. Stitching would spread its light to the visible side, so such
-//! points are left unstitched.
+//! If the two sides have very different light, or their texels face different ways, one of them is not visible there: its
+//! texels show the other face of the surface, or it lies in a narrow gap, or the surface bends within a texel. Stitching
+//! would spread its light to the visible side, so such points are left unstitched. (Measured:
+//! docs/experiments.md#seams-at-rounded-edges.)
 //!
 //! Edges are compared by the positions of their ends: T-junctions, where a vertex lies inside another triangle's edge,
 //! are not found.
@@ -19,7 +20,7 @@ mod sides;
 mod solver;
 
 use super::atlas::Atlas;
-use super::atlas::ids::{ChartId, PlacementId};
+use super::atlas::ids::{ChartId, LightTexel, PlacementId};
 use super::atlas::sheets::{Place, Sheet};
 use super::atlas::texels::TexelSample;
 use super::plan::{Plan, left_out};
@@ -42,13 +43,12 @@ use std::ops::Range;
 use std::sync::atomic::{AtomicU64, Ordering::Relaxed};
 use std::time::Instant;
 
-/// Cosine of the greatest angle (30 degrees) between the normals of a smooth surface. Sharper edges are not stitched.
+/// Cosine of the greatest angle (30 degrees) between the normals of a smooth surface, at an edge and of the texels on its
+/// two sides. Sharper edges are not stitched.
 const SMOOTH_COSINE: f32 = 0.866;
 
-/// Points whose sides differ by more than this factor in indirect light are not stitched. In the living room this
-/// changed a shade beside a lamp from 9.9 to 4.4 (5.5 is right) and the mean squared relative error of all but the
-/// worst hundredth of the points from 1.36e-2 to 1.15e-2; 2 is no better, and 8 is no better than no limit. No
-/// difference in Sponza, whatever the factor.
+/// Points whose sides differ by more than this factor in indirect light, or in all light, are not stitched. (For indirect
+/// light, 2 is no better, and 8 is no better than no limit: docs/experiments.md#seams-at-rounded-edges.)
 const CONTRAST: f32 = 4.0;
 
 /// Distance between the points of an edge, in texels: both sides are linear between texels, each in its own grid.
@@ -217,13 +217,16 @@ impl View<'_> {
         stitched.or(source.directional.get(sample)).copied().unwrap_or_default()
     }
 
-    /// Whether the indirect light of both sides of a point is of the same order.
+    /// Whether both sides of a point have light of the same order, indirect light and all.
     fn are_alike(&self, p: &Point) -> bool {
-        let shown = |side: Range<usize>| -> f32 {
-            side.map(|k| p.weights[k].abs() * self.light(p.texels[k] as usize)[1].element_sum()).sum()
+        let shown = |side: Range<usize>| {
+            side.fold([0.0; 2], |[indirect, all], k| {
+                let light = self.light(p.texels[k] as usize).map(|l| p.weights[k].abs() * l.element_sum());
+                [indirect + light[1], all + light[0] + light[1]]
+            })
         };
         let (a, b) = (shown(0..4), shown(4..8));
-        a.max(b) <= CONTRAST * a.min(b)
+        a.into_iter().zip(b).all(|(a, b): (f32, f32)| a.max(b) <= CONTRAST * a.min(b))
     }
 
     /// Whether a sample may be changed: hidden ones repeat texels around them, and values that have overflowed must not
@@ -255,7 +258,7 @@ impl Job<'_, '_, '_> {
             if !is_cut(p) || !p.texels.iter().all(|&t| view.is_valid(t as usize)) {
                 return false;
             }
-            let alike = view.are_alike(p);
+            let alike = self.bends_little(p) && view.are_alike(p);
             unlike.fetch_add(u64::from(!alike), Relaxed);
             alike
         };
@@ -309,6 +312,23 @@ impl Job<'_, '_, '_> {
         };
         let stitch = Stitch { texels, direct, indirect, directional, _memory: memory };
         Ok(Some((stitch, [count as u64, unlike.into_inner()])))
+    }
+
+    /// Whether the surface bends little between what the texels on the two sides of a point show. Where an edge is rounded
+    /// by strips that are narrower than a texel, each bend is smooth, but the texels on both sides face different ways.
+    fn bends_little(&self, p: &Point) -> bool {
+        let map = &self.atlas.map;
+        let normal = |side: Range<usize>| -> Vec3 {
+            let of_texel = |k: usize| {
+                let texel = LightTexel::new(p.texels[k] as usize);
+                let (_, normal) = map.surface(&self.atlas.scene, texel);
+                let sign = if self.atlas.is_back(map, self.backs, texel) { -1.0 } else { 1.0 };
+                normal * (sign * p.weights[k].abs())
+            };
+            side.map(of_texel).sum()
+        };
+        let (a, b) = (normal(0..4), normal(4..8));
+        a.dot(b) > SMOOTH_COSINE * a.length() * b.length()
     }
 
     /// Returns the stitched light by direction, of which each coefficient is a layer.

@@ -116,6 +116,69 @@ fn both_sides_of_a_seam_agree_and_nothing_else_changes() {
 }
 
 #[test]
+fn edges_rounded_within_a_texel_are_not_stitched() {
+    // A floor and its side, which a lamp lights nearly as much. Between them the edge is rounded by four strips, of a
+    // millimetre together, that are as smooth as the side of a column of sixteen faces.
+    let square = |corners: [[f32; 2]; 2], uv| {
+        let [a, b] = corners.map(|[x, y]| [0.0, 1.0].map(|z| Vec3::new(x, y, z)));
+        quad([a[0], a[1], b[1], b[0]], uv, 0.0)
+    };
+    let radius = 1e-3;
+    let on_arc = |i: usize| {
+        let (sin, cos) = (i as f32 * std::f32::consts::FRAC_PI_8).sin_cos();
+        [1.0 + radius * sin, radius * (cos - 1.0)]
+    };
+    let arc = (0..5).map(on_arc);
+    let positions: Vec<Vec3> = arc.flat_map(|[x, y]| [0.0, 1.0].map(|z| Vec3::new(x, y, z))).collect();
+    // All in one column of texels, whose samples lie in the middle of the bend.
+    let uvs: Vec<Vec2> =
+        (0..5).flat_map(|i| [0.1, 0.4].map(|v| Vec2::new(70.5 / 128.0 + 1e-4 * (i as f32 - 2.0), v))).collect();
+    let strips = Mesh {
+        positions: positions.into(),
+        indices: (0..4).flat_map(|i| [[0, 1, 3], [0, 3, 2]].map(|t| t.map(|k| 2 * i + k))).collect::<Vec<_>>().into(),
+        lightmap: Some(LightmapUvs { uvs: uvs.into(), pages: Vec::new().into() }),
+        ..Default::default()
+    };
+    let ceiling = floor().remove(2);
+    let meshes = vec![
+        square([[0.0, 0.0], on_arc(0)], Vec2::new(0.25, 0.25)),
+        strips,
+        square([on_arc(4), [1.0 + radius, -1.0]], Vec2::new(0.75, 0.25)),
+        ceiling,
+    ];
+    let lamp = crate::scene::Light::Point { position: Vec3::new(2.0, 0.5, 0.5), intensity: [4.0; 3] };
+    let mut map = lightmap(&scene(2, meshes, lamp));
+    bake(&mut map, &params(false));
+    let (plain, n) = (bits(&map), map.atlas.map.len());
+    let stats = bake(&mut map, &params(true));
+    let stitched = bits(&map);
+    let changed = (0..2 * n).filter(|&i| stitched[i] != plain[i]).map(|i| map.atlas.map.texels.samples[i % n]);
+    // Triangles of the floor and of its side come first and last before the ceiling.
+    let changed = changed.filter(|sample| !(2..10).contains(&sample.triangle)).count();
+    assert_eq!((changed, stats.seam_points), (0, 0), "{}", map.plan_text());
+}
+
+#[test]
+fn light_is_not_stitched_to_shade() {
+    // A curtain hangs down to half of the seam and shades the second square, which sees nearly all of the ceiling.
+    let mut meshes = floor();
+    let curtain = [[0.3, 0.0], [0.3, 0.5], [1e-4, 0.5], [1e-4, 0.0]].map(|[y, z]| Vec3::new(1.000_01, y, z));
+    meshes.push(quad(curtain, Vec2::new(0.75, 0.75), 0.0));
+    let mut map = lightmap(&scene(2, meshes, LAMP));
+    bake(&mut map, &params(false));
+    let plain = bits(&map);
+    bake(&mut map, &params(true));
+    let stitched = bits(&map);
+    let n = map.atlas.map.len();
+    let (mut open, mut shaded) = (0, 0);
+    for i in (0..n).filter(|&i| stitched[i] != plain[i]) {
+        let z = map.atlas.map.texels.samples[i].position(&map.atlas.scene).z;
+        (open, shaded) = (open + (z > 0.55) as u32, shaded + (z < 0.45) as u32);
+    }
+    assert!(open > 50 && shaded == 0, "{open} {shaded}");
+}
+
+#[test]
 fn what_lies_in_a_gap_is_not_stitched_to_what_does_not() {
     // Half of the second square is covered, and a curtain hangs down from the cover where the squares meet.
     let mut meshes = floor();
