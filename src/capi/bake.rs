@@ -118,11 +118,14 @@ pub struct bk_bake_params {
     /// the error in the Cornell box. Default: 0.
     pub radius: f32,
     /// Distance, in texels of the radiance map, up to which the light reflected where a gather ray
-    /// hits is computed by a short path instead of looked up, 0 to infinity; 0: never. Set it to 1
-    /// for final light, where corners, gaps behind furniture and contacts matter: a fifth to a half
-    /// more time. INFINITY traces paths from every hit, where `photon_count` may be 0: nothing but
-    /// surfaces behind sheets that transmit is looked up in the radiance map, and the error falls
-    /// as long as `gather_rays` are raised, from several times the noise. Default: 0.
+    /// hits is computed by a short path instead of looked up, 0 to infinity; 0: never. If > 0, so is
+    /// that of texels that lie on both sides of a wall and have different light there, however far
+    /// away: rooms would see the sun outside on floors that go on below their walls. Set it to 0.01
+    /// for these alone, and to 1 for final light, where corners, gaps behind furniture and contacts
+    /// matter: a fifth to a half more time. INFINITY traces paths from every hit, where
+    /// `photon_count` may be 0: nothing but surfaces behind sheets that transmit is looked up in the
+    /// radiance map, and the error falls as long as `gather_rays` are raised, from several times
+    /// the noise. Default: 0.
     pub near_hits: f32,
     /// Radius of the gather map's blur in texels of the gather map, at most 16; 0: no blur. Lower
     /// it to 1 or 0, with more gather rays, where contact shadows matter; it costs little time. 4

@@ -378,8 +378,10 @@ impl<'p> Bake<'_, 'p> {
             return Ok(Radiance::default());
         }
         if let Some(c) = self.from.checkpoint
-            && let Some(radiance) = self.atlas.scene.device().install(|| c.radiance(self.atlas))?
+            && let Some(mut radiance) = self.atlas.scene.device().install(|| c.radiance(self.atlas))?
         {
+            // Not kept, since few rays find it again.
+            stages::find_split(&self.inputs(), &mut radiance, &mut 0)?;
             return Ok(radiance);
         }
         if let Some(before) = self.from.before

@@ -5,12 +5,12 @@ use super::atlas::Atlas;
 use super::atlas::ids::{RadianceMap, RadianceTexel};
 use super::atlas::two_sided;
 use super::indirect::fallback_gather::{OwnDirectional, OwnLight, OwnRays};
-use super::indirect::find_bright_patches;
 use super::indirect::interpolation_contrast::GatherLight;
 use super::indirect::near_hits::{HitRadiance, NearHits};
 use super::indirect::radiance_map::{self, Anew, Radiance, RadianceInput, RadianceLookup};
 use super::indirect::sample_set::{ROUND, SampleSet};
 use super::indirect::upsample::{Asked, Upsampling};
+use super::indirect::{find_bright_patches, split_texels};
 use super::plan::{Plan, left_out};
 use super::texel_light::TexelLight;
 use super::{BakeParams, BakeStats, StageStats};
@@ -174,7 +174,7 @@ fn radiance(inputs: &Inputs, photons: Option<&PhotonMap>, quick: bool, stats: &m
     let (values, mut rays) = radiance_values(inputs, photons, 0..inputs.atlas.radiance.len(), quick, (0.2, 0.3))?;
     let mut radiance = Radiance { values, ..Default::default() };
     if !quick {
-        find_bright(inputs, &mut radiance, &mut rays)?;
+        complete(inputs, &mut radiance, &mut rays)?;
         radiance.guidance = photons.map(PhotonMap::guidance).transpose()?.flatten().map(Arc::new);
     }
     stats.radiance = radiance_stats(inputs, start, rays);
@@ -198,7 +198,7 @@ pub(crate) fn radiance_again(
         RadianceInput { light: radiance_light(inputs), photons: Some(photons), quick: false, anew: Some(&anew) };
     let mut rays = radiance_map::bake(atlas.scene.device(), &input, range, &mut values, &stage)?;
     let mut radiance = Radiance { values, guidance: Some(guidance), ..Default::default() };
-    find_bright(inputs, &mut radiance, &mut rays)?;
+    complete(inputs, &mut radiance, &mut rays)?;
     stats.radiance = radiance_stats(inputs, start, rays);
     Ok(radiance)
 }
@@ -212,12 +212,24 @@ fn radiance_stats(inputs: &Inputs, start: Instant, rays: u64) -> StageStats {
     }
 }
 
-/// Finds the bright patches of a complete radiance map. Adds the rays traced to `rays`.
-pub(crate) fn find_bright(inputs: &Inputs, radiance: &mut Radiance, rays: &mut u64) -> Result<()> {
+/// Finds what gather rays do not look up in a complete radiance map: the light of bright patches, and texels on both sides
+/// of a wall. Adds the rays traced to `rays`.
+pub(crate) fn complete(inputs: &Inputs, radiance: &mut Radiance, rays: &mut u64) -> Result<()> {
     let Inputs { atlas, params, progress, .. } = *inputs;
     // Paths from all hits look nothing up, and so find bright patches by their own shadow rays.
     if params.near_hits < f32::INFINITY {
         atlas.scene.device().install(|| find_bright_patches::find(atlas, radiance, rays, progress))?;
+    }
+    find_split(inputs, radiance, rays)
+}
+
+/// Finds the texels of a complete radiance map that lie on both sides of a wall, if paths are computed from some hits. Adds
+/// the rays traced to `rays`.
+pub(crate) fn find_split(inputs: &Inputs, radiance: &mut Radiance, rays: &mut u64) -> Result<()> {
+    let Inputs { atlas, direct, params, progress } = *inputs;
+    if params.near_hits > 0.0 && params.near_hits < f32::INFINITY {
+        let find = || split_texels::find(atlas, radiance, direct, rays, progress);
+        radiance.split = atlas.scene.device().install(find)?;
     }
     Ok(())
 }

@@ -13,6 +13,7 @@ pub(in crate::lightmap) mod probes;
 pub(crate) mod radiance_map;
 pub(crate) mod sample_set;
 mod sights;
+pub(crate) mod split_texels;
 mod texel_set;
 pub(crate) mod upsample;
 mod upsample_visibility;

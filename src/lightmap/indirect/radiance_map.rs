@@ -13,6 +13,7 @@
 //! Tried: look-ups that interpolate, and a radius per texel; see docs/experiments.md#look-ups-in-the-radiance-map.
 
 use super::bright_patches::Bright;
+use super::texel_set::TexelSet;
 use crate::base::error::Result;
 use crate::base::memory::{try_to_vec, try_zeroed, try_zeroed_as_needed};
 use crate::base::parallel::{ParallelLoop, one_by_one};
@@ -50,6 +51,7 @@ pub(crate) struct RadianceLookup<'a> {
     map: &'a ChartMap<RadianceMap>,
     values: &'a [Vec3],
     bright: &'a Bright,
+    split: &'a TexelSet<RadianceMap>,
 }
 
 /// Reflected radiance per texel, front sides first; W/(m²·sr).
@@ -57,18 +59,26 @@ pub(crate) struct RadianceLookup<'a> {
 pub(crate) struct Radiance {
     pub values: Vec<Vec3>,
     pub bright: Bright,
+    /// Texels on both sides of a wall, of which gather rays do not see the value.
+    pub(crate) split: TexelSet<RadianceMap>,
     /// What photons after a change have in common with those of this map; `None`: unknown, or there were none.
     pub guidance: Option<Arc<Guidance>>,
 }
 
 impl<'a> RadianceLookup<'a> {
     pub(crate) fn new(charts: &'a Charts, map: &'a ChartMap<RadianceMap>, radiance: &'a Radiance) -> Self {
-        RadianceLookup { charts, map, values: &radiance.values, bright: &radiance.bright }
+        RadianceLookup { charts, map, values: &radiance.values, bright: &radiance.bright, split: &radiance.split }
     }
 
     /// The same radiance with other bright patches.
     pub(super) fn with(self, bright: &'a Bright) -> Self {
         RadianceLookup { bright, ..self }
+    }
+
+    /// Whether the texel of a place lies on [both sides of a wall](super::split_texels).
+    #[inline]
+    pub(super) fn is_split(&self, place: &Place) -> bool {
+        !self.split.is_empty() && place.texel != NONE && self.split.has(RadianceTexel::new(place.texel as usize))
     }
 
     /// Returns the map that is looked up.

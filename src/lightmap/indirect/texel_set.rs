@@ -8,7 +8,7 @@ use std::marker::PhantomData;
 
 /// Texels of map `M`, a bit for each; no bits if there are none.
 #[derive(Default)]
-pub(super) struct TexelSet<M: Map> {
+pub(crate) struct TexelSet<M: Map> {
     words: Vec<u64>,
     /// Number of texels in the words before each.
     before: Vec<u32>,
@@ -42,7 +42,7 @@ impl<M: Map> TexelSet<M> {
     }
 
     #[inline]
-    pub(super) fn has(&self, texel: TexelId<M>) -> bool {
+    pub(in crate::lightmap) fn has(&self, texel: TexelId<M>) -> bool {
         let i = texel.index();
         self.words.get(i / 64).is_some_and(|word| word >> (i % 64) & 1 != 0)
     }

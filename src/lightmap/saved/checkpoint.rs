@@ -217,7 +217,7 @@ impl<'a> Checkpoint<'a> {
             return Ok(None);
         }
         let bright = find_bright_patches::again(atlas, &values, limit, shadow_rays)?;
-        Ok(Some(Radiance { values, bright, guidance }))
+        Ok(Some(Radiance { values, bright, guidance, ..Default::default() }))
     }
 
     pub fn keep_radiance(&self, radiance: &Radiance) {

@@ -252,7 +252,7 @@ impl<'a> Shares<'a> {
             return Err(damaged(&self.path(Which { stage: ShareStage::Radiance, share: 0, pass })));
         }
         let (mut radiance, mut rays) = (Radiance { values, ..Default::default() }, 0);
-        stages::find_bright(inputs, &mut radiance, &mut rays)?;
+        stages::complete(inputs, &mut radiance, &mut rays)?;
         (stats.photons_emitted, stats.photons_stored) = (emitted, stored);
         stats.radiance.seconds = start.elapsed().as_secs_f64();
         stats.radiance.rays = rays;
