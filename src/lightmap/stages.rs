@@ -218,18 +218,20 @@ pub(crate) fn complete(inputs: &Inputs, radiance: &mut Radiance, rays: &mut u64)
     let Inputs { atlas, params, progress, .. } = *inputs;
     // Paths from all hits look nothing up, and so find bright patches by their own shadow rays.
     if params.near_hits < f32::INFINITY {
-        atlas.scene.device().install(|| find_bright_patches::find(atlas, radiance, rays, progress))?;
+        atlas.scene.device().install(|| {
+            find_bright_patches::find(atlas, radiance, rays, progress)?;
+            find_split(inputs, radiance, rays)
+        })?;
     }
-    find_split(inputs, radiance, rays)
+    Ok(())
 }
 
 /// Finds the texels of a complete radiance map that lie on both sides of a wall, if paths are computed from some hits. Adds
-/// the rays traced to `rays`.
+/// the rays traced to `rays`. To be called on the device's threads.
 pub(crate) fn find_split(inputs: &Inputs, radiance: &mut Radiance, rays: &mut u64) -> Result<()> {
     let Inputs { atlas, direct, params, progress } = *inputs;
     if params.near_hits > 0.0 && params.near_hits < f32::INFINITY {
-        let find = || split_texels::find(atlas, radiance, direct, rays, progress);
-        radiance.split = atlas.scene.device().install(find)?;
+        radiance.split = split_texels::find(atlas, radiance, direct, rays, progress)?;
     }
     Ok(())
 }

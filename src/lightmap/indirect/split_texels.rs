@@ -14,7 +14,7 @@
 use super::radiance_map::Radiance;
 use super::texel_set::TexelSet;
 use crate::base::error::Result;
-use crate::base::memory::{try_par_gather, try_push};
+use crate::base::memory::{try_collect, try_par_gather, try_push};
 use crate::base::progress::Progress;
 use crate::direct::{DirectLight, Receiver};
 use crate::lightmap::atlas::Atlas;
@@ -55,18 +55,19 @@ pub(crate) fn find(
 ) -> Result<TexelSet<RadianceMap>> {
     let look = Look { atlas, areas: atlas.areas(&atlas.radiance), radiance, direct };
     let (traced, count) = (AtomicU64::new(0), atlas.radiance.len());
-    let found = try_par_gather(count.div_ceil(BLOCK), SPLIT, |block, out: &mut Vec<RadianceTexel>| {
+    let found = try_par_gather(count.div_ceil(BLOCK), SPLIT, |block, out: &mut Vec<u32>| {
         progress.check()?;
         let mut rays = 0;
         for texel in RadianceTexel::range(block * BLOCK..count.min((block + 1) * BLOCK)) {
             if look.is_split(texel, &mut rays) {
-                try_push(out, texel, SPLIT)?;
+                try_push(out, texel.index() as u32, SPLIT)?;
             }
         }
         traced.fetch_add(rays, Relaxed);
         Ok(())
     })?;
     *rays += traced.into_inner();
+    let found = try_collect(found.iter().map(|&i| RadianceTexel::new(i as usize)), SPLIT)?;
     TexelSet::new(found.iter(), count, SPLIT)
 }
 
@@ -78,6 +79,7 @@ struct Look<'a> {
 }
 
 impl Look<'_> {
+    #[inline(never)]
     fn is_split(&self, texel: RadianceTexel, rays: &mut u64) -> bool {
         let (map, scene) = (&self.atlas.radiance, &self.atlas.scene);
         let placement = map.texels.placement_of(texel.index() as u32);
