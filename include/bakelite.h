@@ -2057,14 +2057,11 @@ typedef struct bk_bake_params {
   /// the error in the Cornell box. Default: 0.
   float radius;
   /// Distance, in texels of the radiance map, up to which the light reflected where a gather ray
-  /// hits is computed by a short path instead of looked up, 0 to infinity; 0: never. If > 0, so is
-  /// that of texels that lie on both sides of a wall and have different light there, however far
-  /// away: rooms would see the sun outside on floors that go on below their walls. Set it to 0.01
-  /// for these alone, and to 1 for final light, where corners, gaps behind furniture and contacts
-  /// matter: a fifth to a half more time. INFINITY traces paths from every hit, where
-  /// `photon_count` may be 0: nothing but surfaces behind sheets that transmit is looked up in the
-  /// radiance map, and the error falls as long as `gather_rays` are raised, from several times
-  /// the noise. Default: 0.
+  /// hits is computed by a short path instead of looked up, 0 to infinity; 0: never. Set it to 1 for
+  /// final light, where corners, gaps behind furniture and contacts matter: a fifth to a half more
+  /// time. INFINITY traces paths from every hit, where `photon_count` may be 0: nothing but surfaces
+  /// behind sheets that transmit is looked up in the radiance map, and the error falls as long as
+  /// `gather_rays` are raised, from several times the noise. Default: 0.
   float near_hits;
   /// Radius of the gather map's blur in texels of the gather map, at most 16; 0: no blur. Lower
   /// it to 1 or 0, with more gather rays, where contact shadows matter; it costs little time. 4
@@ -2095,10 +2092,12 @@ typedef struct bk_bake_params {
   /// bk_lightmap_info.texels; 0: all. See `texel_begin`. Default: 0.
   uint64_t texel_end;
   /// 1: stitch seams. Where a smooth surface is cut in the light map, the texels along the edge
-  /// are changed so that both sides look the same under bilinear filtering. Seams are stitched
-  /// when all texels are baked. Live updates do not stitch: their finished texels have the bits
-  /// of a bake with 0. 0: leave seams as they are. Set it to 0 where results are compared with
-  /// live updates or seams do not matter; it takes bk_bake_stats.seam_seconds. Default: 1.
+  /// are changed so that both sides look the same under bilinear filtering, but for points where
+  /// the texels of both sides face more than 30 degrees apart or have light that differs by more
+  /// than a factor of 4. Seams are stitched when all texels are baked. Live updates do not
+  /// stitch: their finished texels have the bits of a bake with 0. 0: leave seams as they are.
+  /// Set it to 0 where results are compared with live updates or seams do not matter; it takes
+  /// bk_bake_stats.seam_seconds. Default: 1.
   uint32_t stitch;
   /// Experimental: interval in seconds between two writes of the checkpoint, 0 to 1e9. A process
   /// that is killed loses at most the work of this interval; with 0, that of the blocks of texels

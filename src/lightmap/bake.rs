@@ -371,16 +371,6 @@ impl<'p> Bake<'_, 'p> {
         Ok(before.redo.get_or_init(|| redo))
     }
 
-    /// Returns the radiance map of an earlier run, if it was completed. To be called on the device's threads.
-    fn radiance_of(&self, checkpoint: &Checkpoint) -> Result<Option<Radiance>> {
-        let mut radiance = checkpoint.radiance(self.atlas)?;
-        if let Some(radiance) = &mut radiance {
-            // Not kept, since few rays find them again.
-            stages::find_split(&self.inputs(), radiance, &mut 0)?;
-        }
-        Ok(radiance)
-    }
-
     /// Computes the radiance map, or what has changed of it, or reads it from the checkpoint or from the files of shares; empty if the plan leaves
     /// indirect light out.
     fn illuminate(&self, stats: &mut BakeStats) -> Result<Radiance> {
@@ -388,7 +378,7 @@ impl<'p> Bake<'_, 'p> {
             return Ok(Radiance::default());
         }
         if let Some(c) = self.from.checkpoint
-            && let Some(radiance) = self.atlas.scene.device().install(|| self.radiance_of(c))?
+            && let Some(radiance) = self.atlas.scene.device().install(|| c.radiance(self.atlas, self.progress))?
         {
             return Ok(radiance);
         }

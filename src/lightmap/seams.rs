@@ -172,7 +172,7 @@ impl Lightmap {
                 plan.run_seams(edges, unlike);
                 return Ok(Some(stitch));
             }
-            "no edge of a smooth surface is a seam between sides of similar light"
+            "no edge of a smooth surface is a seam between sides that face alike and have similar light"
         };
         plan.leave_out_seams(why);
         Ok(None)

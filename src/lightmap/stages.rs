@@ -212,28 +212,18 @@ fn radiance_stats(inputs: &Inputs, start: Instant, rays: u64) -> StageStats {
     }
 }
 
-/// Finds what gather rays do not look up in a complete radiance map: the light of bright patches, and texels on both sides
-/// of a wall. Adds the rays traced to `rays`.
+/// Finds what look-ups need to know of a complete radiance map: its texels on both sides of a wall, and its bright patches.
+/// Adds the rays traced to `rays`.
 pub(crate) fn complete(inputs: &Inputs, radiance: &mut Radiance, rays: &mut u64) -> Result<()> {
     let Inputs { atlas, params, progress, .. } = *inputs;
-    // Paths from all hits look nothing up, and so find bright patches by their own shadow rays.
-    if params.near_hits < f32::INFINITY {
-        atlas.scene.device().install(|| {
-            find_bright_patches::find(atlas, radiance, rays, progress)?;
-            find_split(inputs, radiance, rays)
-        })?;
-    }
-    Ok(())
-}
-
-/// Finds the texels of a complete radiance map that lie on both sides of a wall, if paths are computed from some hits. Adds
-/// the rays traced to `rays`. To be called on the device's threads.
-pub(crate) fn find_split(inputs: &Inputs, radiance: &mut Radiance, rays: &mut u64) -> Result<()> {
-    let Inputs { atlas, direct, params, progress } = *inputs;
-    if params.near_hits > 0.0 && params.near_hits < f32::INFINITY {
-        radiance.split = split_texels::find(atlas, radiance, direct, rays, progress)?;
-    }
-    Ok(())
+    atlas.scene.device().install(|| {
+        radiance.split = split_texels::find(atlas, &radiance.values, rays, progress)?;
+        // Paths from all hits look nothing up, and so find bright patches by their own shadow rays.
+        match params.near_hits < f32::INFINITY {
+            true => find_bright_patches::find(atlas, radiance, rays, progress),
+            false => Ok(()),
+        }
+    })
 }
 
 /// Computes a range of the radiance map; returns the number of rays, too.

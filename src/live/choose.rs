@@ -7,6 +7,7 @@ use super::work::{Context, Step};
 use super::{LiveCamera, Mode};
 use crate::base::memory::{try_filled, try_vec, try_with_capacity};
 use crate::base::sampling::{combine, mix};
+use crate::base::sort::greatest_first;
 use std::cmp::Ordering;
 
 /// State that choosing keeps from update to update.
@@ -225,11 +226,5 @@ impl Chooser {
 fn greatest(keyed: &mut Vec<(f32, u32)>, all: impl Iterator<Item = (f32, u32)>, count: usize) -> Vec<u32> {
     keyed.clear();
     keyed.extend(all);
-    let order = |a: &(f32, u32), b: &(f32, u32)| b.0.total_cmp(&a.0).then(a.1.cmp(&b.1));
-    if keyed.len() > count {
-        keyed.select_nth_unstable_by(count, order);
-        keyed.truncate(count);
-    }
-    keyed.sort_unstable_by(order);
-    keyed.iter().map(|k| k.1).collect()
+    greatest_first(keyed, count).0.iter().map(|k| k.1).collect()
 }

@@ -10,6 +10,7 @@ use super::blocks::Rect;
 use super::display::Changed;
 use crate::base::error::Result;
 use crate::base::memory::{try_vec, try_with_capacity};
+use crate::base::sort::greatest_first;
 
 /// Side of a square in texels.
 const SQUARE: i32 = 4;
@@ -177,16 +178,10 @@ impl Dirty {
         let mut urgent = std::mem::take(&mut self.urgent);
         urgent.clear();
         urgent.extend(seen.map(|(mark, b)| (mark * self.changes[b as usize], b)).filter(|u| u.0 > 0.0));
-        let order = |a: &(f32, u32), b: &(f32, u32)| a.0.total_cmp(&b.0).then(b.1.cmp(&a.1));
         let mut rest = &mut urgent[..];
         while !rest.is_empty() && self.has_room(SEEN, limit) {
-            let middle = rest.len().saturating_sub(SORTED);
-            if middle > 0 {
-                rest.select_nth_unstable_by(middle, order);
-            }
-            let (others, some) = rest.split_at_mut(middle);
-            some.sort_unstable_by(order);
-            for &(_, b) in some.iter().rev() {
+            let (some, others) = greatest_first(rest, SORTED);
+            for &(_, b) in &*some {
                 let (page, rect) = place(b);
                 let is_whole = self.give(page, &rect, SEEN, limit);
                 if !is_whole {

@@ -12,6 +12,7 @@ use crate::lightmap::atlas::ids::RadianceTexel;
 use crate::lightmap::changed::correspondence::Correspondence;
 use crate::lightmap::indirect::fallback_gather::{OwnDirectional, OwnLight};
 use crate::lightmap::indirect::radiance_map::Radiance;
+use crate::lightmap::indirect::split_texels;
 use crate::lightmap::indirect::upsample::Upsampling;
 use crate::lightmap::plan::{Plan, left_out};
 use crate::lightmap::stages::{self, Inputs, Own};
@@ -175,6 +176,7 @@ impl Illumination {
             }
             Ok(())
         })?;
+        indirect.radiance.split = split_texels::find(atlas, &indirect.radiance.values, &mut 0, progress)?;
         // A chart shows its former side, unless it has texels for both now, or had, or is mostly seen from another side.
         let mut backs = try_to_vec(&indirect.sides.backs, "which sides of charts are shown")?;
         for (chart, shows_back) in atlas.charts.ids().zip(&mut backs) {

@@ -206,6 +206,7 @@ impl Live {
             p.seed,
             p.direct_samples as u64,
             p.directional as u64,
+            p.near_hits.to_bits().into(),
         ] {
             h.word(n);
         }

@@ -6,6 +6,7 @@ use super::gather::{Gathered, Round};
 use super::near_hits::HitRadiance;
 use super::radiance_map::{Radiance, RadianceLookup};
 use super::sample_set::{ROUND, SampleSet};
+use super::split_texels::SplitTexels;
 use crate::base::error::Result;
 use crate::base::memory::{try_append, try_collect, try_par_collect, try_par_collect_ok, try_par_gather, try_push};
 use crate::base::progress::Progress;
@@ -74,7 +75,7 @@ pub(crate) fn find(atlas: &Atlas, radiance: &mut Radiance, rays: &mut u64, progr
     }
     let beyond: f32 = seen.iter().map(|s| (s - limit).max(0.0)).sum();
     let share = beyond / (mean * seen.len() as f32);
-    let patches = patches(atlas, &radiance.values, limit, MAX_PATCHES, rays, progress)?;
+    let patches = patches(atlas, radiance, limit, MAX_PATCHES, rays, progress)?;
     if patches.is_empty() {
         return Ok(());
     }
@@ -91,11 +92,11 @@ pub(crate) fn find(atlas: &Atlas, radiance: &mut Radiance, rays: &mut u64, progr
 }
 
 /// Makes the patches again that an earlier [`find`] kept, from the same radiance map.
-pub(crate) fn again(atlas: &Atlas, values: &[Vec3], limit: f32, shadow_rays: u32) -> Result<Bright> {
+pub(crate) fn again(atlas: &Atlas, radiance: &Radiance, limit: f32, shadow_rays: u32) -> Result<Bright> {
     if !(limit > 0.0) {
         return Ok(Bright::default());
     }
-    let patches = patches(atlas, values, limit, MAX_PATCHES, &mut 0, &Progress::none())?;
+    let patches = patches(atlas, radiance, limit, MAX_PATCHES, &mut 0, &Progress::none())?;
     let patches = ManyLights::of_patches(atlas.scene.device().isa(), patches)?;
     let memory = atlas.scene.device().memory().reserve(patches.bytes(), "bright patches")?;
     Ok(Bright { limit, patches: Some(patches), shadow_rays, _memory: Some(memory) })
@@ -198,6 +199,8 @@ fn seen_by_gather_rays(atlas: &Atlas, radiance: &Radiance, rays: &mut u64, progr
 /// A grid point on a bright texel, on the side that the texel shows.
 struct Place {
     texel: RadianceTexel,
+    /// The texel whose light it shows, which is another one on the far side of a wall.
+    shown: RadianceTexel,
     /// What it lies on: several instances may show the light of a texel.
     object: u32,
     /// Number among the points of all texels.
@@ -212,13 +215,14 @@ struct Place {
 /// Makes patches of the bright texels or, if there are more, of about `most` of them.
 fn patches(
     atlas: &Atlas,
-    values: &[Vec3],
+    radiance: &Radiance,
     limit: f32,
     most: usize,
     rays: &mut u64,
     progress: &Progress,
 ) -> Result<Vec<Patch>> {
     let (scene, map, charts) = (&atlas.scene, &atlas.radiance, &atlas.charts);
+    let Radiance { values, split, .. } = radiance;
     let is_bright = |texel: &RadianceTexel| values[texel.index()].element_sum() > limit;
     let of_placement = |p: usize| {
         let placement = PlacementId::new(p);
@@ -231,7 +235,7 @@ fn patches(
     let [fewest, most_along_axis] = PLACES_ALONG_AXIS;
     let along_axis = ((PLACES / count.clamp(1, most.max(1))).isqrt() as u32).clamp(fewest, most_along_axis);
     let traced = AtomicU64::new(0);
-    let mut places = places(atlas, along_axis, is_light, &traced, progress)?;
+    let mut places = places(atlas, split, along_axis, is_light, &traced, progress)?;
     *rays += traced.into_inner();
     places.sort_unstable_by_key(|p| (p.texel, p.object, p.number));
     let patch = |of_texel: &[Place]| {
@@ -243,8 +247,8 @@ fn patches(
             at -= p.area;
             at < 0.0
         });
-        let Place { texel, placement, position, normal, .. } = *chosen.unwrap_or(&of_texel[0]);
-        let radiance = values[texel.index()];
+        let Place { shown, placement, position, normal, .. } = *chosen.unwrap_or(&of_texel[0]);
+        let radiance = values[shown.index()];
         let flux = radiance * ((1.0 - limit / radiance.element_sum()) * area / chance);
         Patch { position, normal, flux, near2: near2(map, placement) }
     };
@@ -255,6 +259,7 @@ fn patches(
 /// area of texels that lie in one triangle is exact, that of others right on average.
 fn places(
     atlas: &Atlas,
+    split: &SplitTexels,
     along_axis: u32,
     is_light: impl Fn(RadianceTexel) -> bool + Sync,
     rays: &AtomicU64,
@@ -281,8 +286,10 @@ fn places(
         let place = |p: Vec2| {
             let w = weights * (p - a2);
             let (u, v) = (w.x.max(0.0), w.y.max(0.0));
-            let texel = map.nearest(placement, charts.local(t, u, v))?;
-            if !is_light(texel) {
+            let local = charts.local(t, u, v);
+            let texel = map.nearest(placement, local)?;
+            let shown = split.shown(map, placement, texel, local);
+            if !is_light(shown) {
                 return None;
             }
             let point = SurfacePoint::new([a, b, c], u, v, scene);
@@ -291,7 +298,7 @@ fn places(
             // Points in cut-outs do not count, nor points that another triangle covers.
             rays.fetch_add(1, Relaxed);
             let is_seen = scene.intersect_raw(&Ray::new(position, -normal)).triangle == t;
-            is_seen.then_some(Place { texel, object, number: 0, placement, area: cell, position, normal })
+            is_seen.then_some(Place { texel, shown, object, number: 0, placement, area: cell, position, normal })
         };
         let offset = Vec2::new(uniform(t, 2, 0), uniform(t, 3, 0));
         grid_points([a2, b2, c2], offset).filter_map(place).collect()
@@ -339,6 +346,7 @@ mod tests {
     use crate::base::sampling::uniform_triangle;
     use crate::lightmap::indirect::gather::Gathered;
     use crate::lightmap::indirect::sample_set::SampleSet;
+    use crate::lightmap::indirect::split_texels::{self, tests::closed_box};
     use crate::lightmap::plan::left_out;
     use crate::lightmap::{BakeParams, Light as Baked, Lightmap, LightmapDesc};
     use crate::scene::demo::shapes::MeshBuilder;
@@ -395,7 +403,8 @@ mod tests {
         for two_sided in [false, true] {
             let lightmap = room(two_sided, 0.3);
             let with = &baked(&lightmap).radiance;
-            let without = Radiance { values: with.values.clone(), ..Default::default() };
+            let split = split_texels::find(lightmap.atlas(), &with.values, &mut 0, &Progress::none()).unwrap();
+            let without = Radiance { values: with.values.clone(), split, ..Default::default() };
             assert!(with.bright.len() > 20, "{}", with.bright.len());
             let (a, noise) = gathered(&lightmap, with, 256);
             let (b, noise_without) = gathered(&lightmap, &without, 256);
@@ -409,13 +418,11 @@ mod tests {
         }
     }
 
-    #[test]
-    fn patches_reflect_what_is_beyond_the_limit_however_few_they_are() {
-        let lightmap = room(false, 0.3);
-        let values = &baked(&lightmap).radiance.values;
-        let limit = 0.05 * values.iter().map(|v| v.element_sum()).fold(0.0, f32::max);
-        let (atlas, scene) = (lightmap.atlas(), &lightmap.atlas().scene);
-        let lookup = RadianceLookup::new(&atlas.charts, &atlas.radiance, &baked(&lightmap).radiance);
+    /// Returns a limit of radiance, and what the surfaces reflect beyond it.
+    fn beyond_a_limit(lightmap: &Lightmap) -> (f32, f32) {
+        let (atlas, scene, radiance) = (lightmap.atlas(), &lightmap.atlas().scene, &baked(lightmap).radiance);
+        let limit = 0.05 * radiance.values.iter().map(|v| v.element_sum()).fold(0.0, f32::max);
+        let lookup = RadianceLookup::new(&atlas.charts, &atlas.radiance, radiance);
         let of_triangle = |t: u32| {
             let [a, b, c] = scene.corners(t);
             let beyond = |i: u32| {
@@ -426,22 +433,41 @@ mod tests {
             let n = 1 << 15;
             (0..n).map(beyond).sum::<f32>() / n as f32 * 0.5 * (b - a).cross(c - a).length()
         };
-        let beyond: f32 = (0..scene.triangle_count()).map(of_triangle).sum();
-        let found = |most: usize| {
-            let patches = patches(atlas, values, limit, most, &mut 0, &Progress::none()).unwrap();
-            assert!(patches.iter().all(|p| p.position.abs().max_element() < 2.0));
-            patches.iter().map(|p| p.flux.element_sum()).collect::<Vec<f32>>()
-        };
-        let all = found(1 << 16);
+        (limit, (0..scene.triangle_count()).map(of_triangle).sum())
+    }
+
+    /// Returns what is beyond the limit of each of about `most` patches.
+    fn flux_of_patches(lightmap: &Lightmap, limit: f32, most: usize) -> Vec<f32> {
+        let (atlas, radiance) = (lightmap.atlas(), &baked(lightmap).radiance);
+        let patches = patches(atlas, radiance, limit, most, &mut 0, &Progress::none()).unwrap();
+        assert!(patches.iter().all(|p| p.position.abs().max_element() < 4.1));
+        patches.iter().map(|p| p.flux.element_sum()).collect()
+    }
+
+    #[test]
+    fn patches_reflect_what_is_beyond_the_limit_however_few_they_are() {
+        let lightmap = room(false, 0.3);
+        let (limit, beyond) = beyond_a_limit(&lightmap);
+        let all = flux_of_patches(&lightmap, limit, 1 << 16);
         assert!((all.iter().sum::<f32>() / beyond - 1.0).abs() < 0.01, "{all:?} {beyond}");
         // Of about so many, each one of all by chance, the sum is within three standard deviations.
         for most in [50, 100, 200] {
             let chance = most as f32 / all.len() as f32;
-            let few = found(most);
+            let few = flux_of_patches(&lightmap, limit, most);
             let deviation = all.iter().map(|flux| flux * flux * (1.0 / chance - 1.0)).sum::<f32>().sqrt();
             assert!(few.len() > most / 2 && few.len() < most * 3 / 2, "{} of {}", few.len(), all.len());
             assert!((few.iter().sum::<f32>() - beyond).abs() < 3.0 * deviation, "{few:?} {beyond} {deviation}");
         }
+    }
+
+    #[test]
+    fn patches_on_both_sides_of_a_wall_are_bright_on_one() {
+        let lightmap = closed_box();
+        assert!(!baked(&lightmap).radiance.split.is_empty());
+        let (limit, beyond) = beyond_a_limit(&lightmap);
+        let all = flux_of_patches(&lightmap, limit, 1 << 16);
+        // A third of a texel is in the sun, which few grid points tell to within a tenth; whole texels would have thrice that.
+        assert!((all.iter().sum::<f32>() / beyond - 1.0).abs() < 0.1, "{all:?} {beyond}");
     }
 
     #[test]

@@ -121,8 +121,8 @@ impl Gathered {
         for (entry, hit) in entries.iter_mut().zip(hits).filter(|(_, hit)| !hit.is_miss()) {
             *entry = radiance.lookup.entry(hit);
         }
-        for (place, entry) in places.iter_mut().zip(&entries) {
-            *place = entry.and_then(|entry| radiance.lookup.place(&entry));
+        for ((place, entry), hit) in places.iter_mut().zip(&entries).zip(hits) {
+            *place = entry.and_then(|entry| radiance.lookup.place(hit, &entry));
         }
         for (i, ((ray, hit), place)) in (0..).zip(rays.iter().zip(hits).zip(&places)) {
             if hit.is_miss() {

@@ -5,8 +5,7 @@
 //! corners, in gaps behind furniture and under mouldings, sees a single one. So where a ray hits nearer than some texels
 //! of the map, the light reflected there is sampled: direct light by shadow rays, indirect light by one more ray, which
 //! looks up the radiance map. If all hits are near, paths go on until Russian roulette ends them. What is seen through
-//! transmissive sheets is always looked up. The same is done where a ray hits a texel that lies on [both sides of a
-//! wall](super::split_texels), however far away.
+//! transmissive sheets is always looked up.
 //!
 //! What they are worth and cost: docs/accuracy.md#near-hits.
 
@@ -74,7 +73,7 @@ impl HitRadiance<'_> {
         let seen = self.lookup.bright().seen(cached, self.lookup.map(), placement, hit.t);
         match &self.near {
             // The bright part, which gather rays leave to shadow rays, is that of the map.
-            Some(near) if self.lookup.is_split(place) || self.is_near(near, placement, hit.t) => {
+            Some(near) if self.is_near(near, placement, hit.t) => {
                 let computed = self.computed(near, scene, hit, seed, rays);
                 if seen == cached { computed } else { seen + computed - cached }
             }

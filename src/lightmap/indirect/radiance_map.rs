@@ -13,7 +13,7 @@
 //! Tried: look-ups that interpolate, and a radius per texel; see docs/experiments.md#look-ups-in-the-radiance-map.
 
 use super::bright_patches::Bright;
-use super::texel_set::TexelSet;
+use super::split_texels::SplitTexels;
 use crate::base::error::Result;
 use crate::base::memory::{try_to_vec, try_zeroed, try_zeroed_as_needed};
 use crate::base::parallel::{ParallelLoop, one_by_one};
@@ -51,7 +51,7 @@ pub(crate) struct RadianceLookup<'a> {
     map: &'a ChartMap<RadianceMap>,
     values: &'a [Vec3],
     bright: &'a Bright,
-    split: &'a TexelSet<RadianceMap>,
+    split: &'a SplitTexels,
 }
 
 /// Reflected radiance per texel, front sides first; W/(m²·sr).
@@ -59,8 +59,8 @@ pub(crate) struct RadianceLookup<'a> {
 pub(crate) struct Radiance {
     pub values: Vec<Vec3>,
     pub bright: Bright,
-    /// Texels on both sides of a wall, of which gather rays do not see the value.
-    pub(crate) split: TexelSet<RadianceMap>,
+    /// Texels on both sides of a wall, whose light depends on where they are hit.
+    pub(crate) split: SplitTexels,
     /// What photons after a change have in common with those of this map; `None`: unknown, or there were none.
     pub guidance: Option<Arc<Guidance>>,
 }
@@ -73,12 +73,6 @@ impl<'a> RadianceLookup<'a> {
     /// The same radiance with other bright patches.
     pub(super) fn with(self, bright: &'a Bright) -> Self {
         RadianceLookup { bright, ..self }
-    }
-
-    /// Whether the texel of a place lies on [both sides of a wall](super::split_texels).
-    #[inline]
-    pub(super) fn is_split(&self, place: &Place) -> bool {
-        !self.split.is_empty() && place.texel != NONE && self.split.has(RadianceTexel::new(place.texel as usize))
     }
 
     /// Returns the map that is looked up.
@@ -132,7 +126,7 @@ impl<'a> RadianceLookup<'a> {
     /// Finds where the map has a hit; `None` on the back of a one-sided surface.
     #[inline]
     fn find(&self, hit: &RawHit) -> Option<Place> {
-        self.place(&self.entry(hit)?)
+        self.place(hit, &self.entry(hit)?)
     }
 
     /// Begins to find where the map has a hit, and asks for what [`place`](Self::place) reads; `None` on the back of a
@@ -150,18 +144,29 @@ impl<'a> RadianceLookup<'a> {
         Some(Entry { placement, number })
     }
 
-    /// Finds a place, and asks for its radiance; `None` if its placement has no texel.
+    /// Finds the place of a hit, and asks for its radiance; `None` if its placement has no texel.
     #[inline]
-    pub(super) fn place(&self, entry: &Entry) -> Option<Place> {
+    pub(super) fn place(&self, hit: &RawHit, entry: &Entry) -> Option<Place> {
         let &Entry { placement, number } = entry;
         if placement == PlacementId::NONE {
             return Some(Place { placement, texel: NONE });
         }
-        let texel = self.map.texels.nearest_of(placement, number);
+        let mut texel = self.map.texels.nearest_of(placement, number);
+        if texel != NONE && self.split.has(RadianceTexel::new(texel as usize)) {
+            texel = self.beside_wall(hit, placement, texel);
+        }
         if let Some(value) = self.values.get(texel as usize) {
             prefetch(value);
         }
         (texel != NONE).then_some(Place { placement, texel })
+    }
+
+    /// Returns the texel whose light is seen at a hit on a texel that lies on both sides of a wall.
+    #[cold]
+    #[inline(never)]
+    fn beside_wall(&self, hit: &RawHit, placement: PlacementId, texel: u32) -> u32 {
+        let local = self.charts.local(hit.triangle, hit.u, hit.v);
+        self.split.shown(self.map, placement, RadianceTexel::new(texel as usize), local).index() as u32
     }
 
     /// Asks for what is read to find a hit.

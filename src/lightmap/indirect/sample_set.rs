@@ -16,7 +16,14 @@ impl SampleSet {
     pub(crate) fn new(count: u32, seed: u32) -> Result<SampleSet> {
         let mut points = try_collect((0..count).map(|i| sobol_2d_bits(i, seed)), "the points of gather rays")?;
         for round in points.chunks_mut(ROUND) {
-            round.sort_unstable_by_key(|&[x, y]| morton(x >> 16, y >> 16));
+            let (mut order, mut sorted) = ([(0, 0); ROUND], [[0; 2]; ROUND]);
+            let order = &mut order[..round.len()];
+            for ((key, &[x, y]), i) in order.iter_mut().zip(&*round).zip(0u32..) {
+                *key = (morton(x >> 16, y >> 16), i);
+            }
+            order.sort_unstable();
+            sorted.iter_mut().zip(&*order).for_each(|(point, &(_, i))| *point = round[i as usize]);
+            round.copy_from_slice(&sorted[..round.len()]);
         }
         Ok(SampleSet { points })
     }

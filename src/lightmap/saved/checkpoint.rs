@@ -19,12 +19,14 @@ use super::{damaged, foreign, unreadable};
 use crate::base::directional::Directional;
 use crate::base::error::{Error, Result, invalid_argument};
 use crate::base::memory::{try_collect, try_vec};
+use crate::base::progress::Progress;
 use crate::device::LogLevel;
 use crate::lightmap::TexelState;
 use crate::lightmap::atlas::Atlas;
 use crate::lightmap::indirect::fallback_gather::{OwnDirectional, OwnLight};
 use crate::lightmap::indirect::find_bright_patches::{self, MAX_SHADOW_RAYS};
 use crate::lightmap::indirect::radiance_map::Radiance;
+use crate::lightmap::indirect::split_texels;
 use crate::scene::Scene;
 use glam::Vec3;
 use std::collections::HashMap;
@@ -198,7 +200,7 @@ impl<'a> Checkpoint<'a> {
     }
 
     /// Returns the radiance map of an earlier run, if it was completed. To be called on the device's threads.
-    pub fn radiance(&self, atlas: &Atlas) -> Result<Option<Radiance>> {
+    pub fn radiance(&self, atlas: &Atlas, progress: &Progress) -> Result<Option<Radiance>> {
         let Some(end) = self.take(RADIANCE_DONE, 0) else { return Ok(None) };
         let mut values: Vec<Vec3> = try_vec(atlas.radiance.len(), "the radiance map of a checkpoint")?;
         for (run, of_run) in (0..).zip(values.chunks_mut(RUN)) {
@@ -216,8 +218,11 @@ impl<'a> Checkpoint<'a> {
         if !is_light(&values) || !is_possible || guidance.is_none() != rest.is_empty() {
             return Ok(None);
         }
-        let bright = find_bright_patches::again(atlas, &values, limit, shadow_rays)?;
-        Ok(Some(Radiance { values, bright, guidance, ..Default::default() }))
+        let mut radiance = Radiance { values, guidance, ..Default::default() };
+        // Not kept, since few rays find them again.
+        radiance.split = split_texels::find(atlas, &radiance.values, &mut 0, progress)?;
+        radiance.bright = find_bright_patches::again(atlas, &radiance, limit, shadow_rays)?;
+        Ok(Some(radiance))
     }
 
     pub fn keep_radiance(&self, radiance: &Radiance) {

@@ -16,6 +16,7 @@ use crate::base::files;
 use crate::base::memory::{try_collect, try_push, try_to_vec, try_vec, try_with_capacity};
 use crate::base::progress::Progress;
 use crate::lightmap::indirect::radiance_map::Radiance;
+use crate::lightmap::indirect::split_texels;
 use crate::lightmap::plan::Plan;
 use crate::lightmap::{BakeStats, Light, Lightmap, Spread, TexelState};
 use crate::photon::Guidance;
@@ -164,6 +165,8 @@ impl Lightmap {
             }
         }
         file.read_into(&mut light, self.atlas.charts.charts.len(), progress)?;
+        // Not kept, since few rays find them again.
+        light.radiance.split = split_texels::find(&self.atlas, &light.radiance.values, &mut 0, progress)?;
         Ok(light)
     }
 }

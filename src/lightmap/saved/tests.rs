@@ -83,6 +83,8 @@ fn params() -> BakeParams {
 fn bake(threads: usize, params: &BakeParams) -> Lightmap {
     let mut map = lightmap(threads);
     map.bake(params, &Progress::none()).unwrap();
+    let light = map.light.as_ref().unwrap();
+    assert!(!light.radiance.split.is_empty(), "no texel lies on both sides of a wall");
     map
 }
 
