@@ -15,6 +15,7 @@ use super::indirect::gather::{Gathered, Tile, TileTexel};
 use super::indirect::interpolation_contrast::GatherLight;
 use super::indirect::radiance_map::Radiance;
 use super::indirect::sample_set::SampleSet;
+use super::indirect::split_texels;
 use super::indirect::upsample::Upsampling;
 use super::passes::{self, Passes};
 use super::plan::{Plan, left_out};
@@ -225,6 +226,9 @@ impl Lightmap {
             if all.count >= needed {
                 progress.set_part(0.0, 1.0);
                 let (mut light, stats) = device.install(|| all.finish(range));
+                // Those of the first pass lie between other values.
+                let find = || split_texels::find(&self.atlas, &light.radiance.values, &mut 0, progress);
+                light.radiance.split = device.install(find)?;
                 if let Some(before) = before {
                     before.keep_spread(&mut light);
                 }

@@ -158,8 +158,7 @@ pub struct BakeParams {
     pub radius: f32,
     /// Distance, in texels of the radiance map, up to which the light reflected where a gather ray hits is computed by a
     /// short path instead of looked up: 0 (never) to infinity (always: path tracing, whose error has no floor but that of
-    /// the gather map's texels, and for which `photon_count` may be 0). If > 0, so is light, from however far away, in texels
-    /// that lie on both sides of a wall with different light. Through transmissive sheets radiance is looked up.
+    /// the gather map's texels, and for which `photon_count` may be 0). Through transmissive sheets radiance is looked up.
     pub near_hits: f32,
     /// Estimated error of interpolation between gather texels above which texels of the light map trace rays themselves
     /// (`own_rays`): > 0, infinity: never but where there is nothing to interpolate. It is

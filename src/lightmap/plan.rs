@@ -190,10 +190,7 @@ impl Plan {
         if params.near_hits == f32::INFINITY {
             self.run("paths from all hits of gather rays");
         } else if params.near_hits > 0.0 {
-            let near = params.near_hits;
-            self.run(&format!(
-                "paths from hits of gather rays nearer than {near} radiance texels or on both sides of a wall"
-            ));
+            self.run(&format!("paths from hits of gather rays nearer than {} radiance texels", params.near_hits));
         }
         if params.interpolation_error < f32::INFINITY {
             let most = params.interpolation_error;

@@ -6,7 +6,6 @@ use super::gather::{Gathered, Round};
 use super::near_hits::HitRadiance;
 use super::radiance_map::{Radiance, RadianceLookup};
 use super::sample_set::{ROUND, SampleSet};
-use super::split_texels::SplitTexels;
 use crate::base::error::Result;
 use crate::base::memory::{try_append, try_collect, try_par_collect, try_par_collect_ok, try_par_gather, try_push};
 use crate::base::progress::Progress;
@@ -57,6 +56,10 @@ const MAX_PATCHES: usize = 1 << 16;
 /// estimate a texel's area, and few texels make most of the light.)
 const PLACES: usize = 1 << 18;
 const PLACES_ALONG_AXIS: [u32; 2] = [2, 16];
+
+/// The same minimum in charts with texels of which only one side of a wall is bright: their points lie alike, and a strip that
+/// a wall leaves of each would have none, or too many.
+const LEAST_AT_WALLS: u32 = 8;
 
 /// Number of triangles that a thread searches for bright texels at a time.
 const TRIANGLES: u32 = 64;
@@ -199,8 +202,8 @@ fn seen_by_gather_rays(atlas: &Atlas, radiance: &Radiance, rays: &mut u64, progr
 /// A grid point on a bright texel, on the side that the texel shows.
 struct Place {
     texel: RadianceTexel,
-    /// The texel whose light it shows, which is another one on the far side of a wall.
-    shown: RadianceTexel,
+    /// Radiance there.
+    radiance: Vec3,
     /// What it lies on: several instances may show the light of a texel.
     object: u32,
     /// Number among the points of all texels.
@@ -223,7 +226,10 @@ fn patches(
 ) -> Result<Vec<Patch>> {
     let (scene, map, charts) = (&atlas.scene, &atlas.radiance, &atlas.charts);
     let Radiance { values, split, .. } = radiance;
-    let is_bright = |texel: &RadianceTexel| values[texel.index()].element_sum() > limit;
+    let is_bright = |texel: &RadianceTexel| {
+        let [a, b] = split.both(*texel).unwrap_or([values[texel.index()]; 2]);
+        a.element_sum().max(b.element_sum()) > limit
+    };
     let of_placement = |p: usize| {
         let placement = PlacementId::new(p);
         let count = map.texels_of(placement).filter(is_bright).count();
@@ -235,7 +241,7 @@ fn patches(
     let [fewest, most_along_axis] = PLACES_ALONG_AXIS;
     let along_axis = ((PLACES / count.clamp(1, most.max(1))).isqrt() as u32).clamp(fewest, most_along_axis);
     let traced = AtomicU64::new(0);
-    let mut places = places(atlas, split, along_axis, is_light, &traced, progress)?;
+    let mut places = places(atlas, radiance, limit, along_axis, is_light, &traced, progress)?;
     *rays += traced.into_inner();
     places.sort_unstable_by_key(|p| (p.texel, p.object, p.number));
     let patch = |of_texel: &[Place]| {
@@ -247,8 +253,7 @@ fn patches(
             at -= p.area;
             at < 0.0
         });
-        let Place { shown, placement, position, normal, .. } = *chosen.unwrap_or(&of_texel[0]);
-        let radiance = values[shown.index()];
+        let Place { radiance, placement, position, normal, .. } = *chosen.unwrap_or(&of_texel[0]);
         let flux = radiance * ((1.0 - limit / radiance.element_sum()) * area / chance);
         Patch { position, normal, flux, near2: near2(map, placement) }
     };
@@ -259,23 +264,33 @@ fn patches(
 /// area of texels that lie in one triangle is exact, that of others right on average.
 fn places(
     atlas: &Atlas,
-    split: &SplitTexels,
+    radiance: &Radiance,
+    limit: f32,
     along_axis: u32,
     is_light: impl Fn(RadianceTexel) -> bool + Sync,
     rays: &AtomicU64,
     progress: &Progress,
 ) -> Result<Vec<Place>> {
     let (scene, charts, map) = (&atlas.scene, &atlas.charts, &atlas.radiance);
+    let Radiance { values, split, .. } = radiance;
     let placements = (0..map.layout.placements.len()).into_par_iter();
-    let has_lights = placements.map(|p| map.texels_of(PlacementId::new(p)).any(&is_light));
-    let has_lights = try_par_collect(has_lights, "bright patches")?;
+    // Number of points along an axis of a texel; 0: there is no light.
+    let along = |p: usize| {
+        let mut texels = map.texels_of(PlacementId::new(p));
+        match texels.clone().any(&is_light) {
+            false => 0,
+            true if texels.any(|texel| split.has(texel)) => along_axis.max(LEAST_AT_WALLS),
+            true => along_axis,
+        }
+    };
+    let along = try_par_collect(placements.map(along), "bright patches")?;
     let on_side = |t: u32, front: bool| -> Vec<Place> {
-        let placement = map.layout.side(charts.chart_of(t), front).filter(|&p| has_lights[p.index()]);
+        let placement = map.layout.side(charts.chart_of(t), front).filter(|&p| along[p.index()] > 0);
         let Some(placement) = placement else { return Vec::new() };
         let ([a, b, c], object) = (scene.corners(t), scene.locate(t).0);
         let area = 0.5 * (b - a).cross(c - a).length();
         let texel = |u, v| Vec2::from(map.layout.texel_coord(placement, charts.local(t, u, v)));
-        let (origin, scale) = (texel(0.0, 0.0), 1.0 / along_axis as f32);
+        let (origin, scale) = (texel(0.0, 0.0), 1.0 / along[placement.index()] as f32);
         let [a2, b2, c2] = [origin, texel(1.0, 0.0), texel(0.0, 1.0)].map(|c| c / scale);
         let weights = Mat2::from_cols(b2 - a2, c2 - a2);
         let cell = area / (0.5 * weights.determinant().abs());
@@ -288,8 +303,8 @@ fn places(
             let (u, v) = (w.x.max(0.0), w.y.max(0.0));
             let local = charts.local(t, u, v);
             let texel = map.nearest(placement, local)?;
-            let shown = split.shown(map, placement, texel, local);
-            if !is_light(shown) {
+            let radiance = split.radiance(map, placement, texel, local).unwrap_or(values[texel.index()]);
+            if radiance.element_sum() <= limit || !is_light(texel) {
                 return None;
             }
             let point = SurfacePoint::new([a, b, c], u, v, scene);
@@ -298,7 +313,7 @@ fn places(
             // Points in cut-outs do not count, nor points that another triangle covers.
             rays.fetch_add(1, Relaxed);
             let is_seen = scene.intersect_raw(&Ray::new(position, -normal)).triangle == t;
-            is_seen.then_some(Place { texel, shown, object, number: 0, placement, area: cell, position, normal })
+            is_seen.then_some(Place { texel, radiance, object, number: 0, placement, area: cell, position, normal })
         };
         let offset = Vec2::new(uniform(t, 2, 0), uniform(t, 3, 0));
         grid_points([a2, b2, c2], offset).filter_map(place).collect()

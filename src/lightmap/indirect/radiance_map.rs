@@ -149,24 +149,24 @@ impl<'a> RadianceLookup<'a> {
     pub(super) fn place(&self, hit: &RawHit, entry: &Entry) -> Option<Place> {
         let &Entry { placement, number } = entry;
         if placement == PlacementId::NONE {
-            return Some(Place { placement, texel: NONE });
+            return Some(Place { placement, texel: NONE, beside_wall: None });
         }
-        let mut texel = self.map.texels.nearest_of(placement, number);
+        let texel = self.map.texels.nearest_of(placement, number);
         if texel != NONE && self.split.has(RadianceTexel::new(texel as usize)) {
-            texel = self.beside_wall(hit, placement, texel);
+            return Some(Place { placement, texel, beside_wall: self.beside_wall(hit, placement, texel) });
         }
         if let Some(value) = self.values.get(texel as usize) {
             prefetch(value);
         }
-        (texel != NONE).then_some(Place { placement, texel })
+        (texel != NONE).then_some(Place { placement, texel, beside_wall: None })
     }
 
-    /// Returns the texel whose light is seen at a hit on a texel that lies on both sides of a wall.
+    /// Returns the radiance at a hit on a texel that lies on both sides of a wall.
     #[cold]
     #[inline(never)]
-    fn beside_wall(&self, hit: &RawHit, placement: PlacementId, texel: u32) -> u32 {
+    fn beside_wall(&self, hit: &RawHit, placement: PlacementId, texel: u32) -> Option<Vec3> {
         let local = self.charts.local(hit.triangle, hit.u, hit.v);
-        self.split.shown(self.map, placement, RadianceTexel::new(texel as usize), local).index() as u32
+        self.split.radiance(self.map, placement, RadianceTexel::new(texel as usize), local)
     }
 
     /// Asks for what is read to find a hit.
@@ -178,8 +178,8 @@ impl<'a> RadianceLookup<'a> {
     /// Returns placement and radiance at a place.
     #[inline]
     pub(super) fn at(&self, place: &Place) -> (PlacementId, Vec3) {
-        let value = if place.texel == NONE { Vec3::ZERO } else { self.values[place.texel as usize] };
-        (place.placement, value)
+        let value = || if place.texel == NONE { Vec3::ZERO } else { self.values[place.texel as usize] };
+        (place.placement, place.beside_wall.unwrap_or_else(value))
     }
 }
 
@@ -188,6 +188,8 @@ impl<'a> RadianceLookup<'a> {
 pub(super) struct Place {
     placement: PlacementId,
     texel: u32,
+    /// Radiance there, if the texel lies on both sides of a wall.
+    beside_wall: Option<Vec3>,
 }
 
 /// An entry of the map's index; no placement where a surface has no chart.

@@ -165,8 +165,10 @@ impl Lightmap {
             }
         }
         file.read_into(&mut light, self.atlas.charts.charts.len(), progress)?;
-        // Not kept, since few rays find them again.
-        light.radiance.split = split_texels::find(&self.atlas, &light.radiance.values, &mut 0, progress)?;
+        // Not kept, since few rays find them again, when all files are read.
+        if light.state.iter().all(|&state| state != TexelState::Unbaked) {
+            light.radiance.split = split_texels::find(&self.atlas, &light.radiance.values, &mut 0, progress)?;
+        }
         Ok(light)
     }
 }
