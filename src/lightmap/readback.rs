@@ -2,8 +2,8 @@
 
 use super::atlas::ids::{ChartId, LightTexel};
 use super::atlas::texels::PageArea;
-use super::indirect::radiance_map;
 use super::indirect::radiance_map::RadianceLookup;
+use super::indirect::texel_albedo::albedo;
 use super::{Half, Layer, LayerData, Light, Lightmap, Spread, TexelState};
 use crate::base::error::{Error, Result, invalid_argument};
 use crate::base::memory::{try_collect, try_vec, try_with_capacity};
@@ -228,7 +228,7 @@ impl Lightmap {
         if light.radiance.values.is_empty() {
             let e = light.direct[texel.index()] + light.indirect[texel.index()];
             let a = &self.atlas;
-            l += radiance_map::albedo(&a.areas(&a.map), texel) * e / std::f32::consts::PI;
+            l += albedo(&a.areas(&a.map), texel) * e / std::f32::consts::PI;
         } else {
             let lookup = RadianceLookup::new(&self.atlas.charts, &self.atlas.radiance, &light.radiance);
             let hit = RawHit { t: 0.0, u: t.u, v: t.v, triangle: t.triangle, front: !back };

@@ -21,7 +21,8 @@ use crate::base::progress::Progress;
 use crate::lightmap::BakeStats;
 use crate::lightmap::atlas::Atlas;
 use crate::lightmap::atlas::ids::{PlacementId, RadianceTexel};
-use crate::lightmap::indirect::radiance_map::{self, Radiance};
+use crate::lightmap::indirect::radiance_map::Radiance;
+use crate::lightmap::indirect::texel_albedo;
 use crate::lightmap::plan::{Plan, left_out};
 use crate::lightmap::stages::{self, Inputs};
 use crate::photon::{Change, Difference};
@@ -159,7 +160,7 @@ impl Search<'_, '_, '_> {
         if change == [0.0; 3] {
             return true;
         }
-        let albedo = radiance_map::albedo(&self.atlas.areas(&self.atlas.radiance), texel);
+        let albedo = texel_albedo::albedo(&self.atlas.areas(&self.atlas.radiance), texel);
         let change = AT_EDGES * (albedo * Vec3::from(change)).abs().element_sum() / PI;
         let radiance = self.before.radiance.values[former.index()].element_sum();
         // What is not a number differs.

@@ -14,6 +14,7 @@ pub(crate) mod radiance_map;
 pub(crate) mod sample_set;
 mod sights;
 pub(crate) mod split_texels;
+pub(crate) mod texel_albedo;
 mod texel_set;
 pub(crate) mod upsample;
 mod upsample_visibility;

@@ -6,25 +6,22 @@
 //! percent or two of a bake.) Emission is not part of it: the emitters are sampled as lights
 //! wherever light is gathered, and would count twice.
 //!
-//! The albedo of a texel is that of its point or, if a texture varies, the average of look-ups spread over the part of
-//! its triangle in the texel. (A mip chain would be kept for this alone, and the look-ups take less time than a texel's
-//! shadow rays.)
-//!
 //! Tried: look-ups that interpolate, and a radius per texel; see docs/experiments.md#look-ups-in-the-radiance-map.
 
 use super::bright_patches::Bright;
 use super::split_texels::SplitTexels;
+use super::texel_albedo::albedo;
 use crate::base::error::Result;
 use crate::base::memory::{try_to_vec, try_zeroed, try_zeroed_as_needed};
 use crate::base::parallel::{ParallelLoop, one_by_one};
 use crate::base::progress::Stage;
-use crate::base::sampling::{combine, sobol_2d};
+use crate::base::sampling::combine;
 use crate::base::scratch::Scratch;
 use crate::base::share::Share;
 use crate::device::Device;
 use crate::lightmap::atlas::chart_map::ChartMap;
 use crate::lightmap::atlas::charts::Charts;
-use crate::lightmap::atlas::ids::{ChartId, Map, PerTexel, PlacementId, RadianceMap, RadianceTexel, TexelId};
+use crate::lightmap::atlas::ids::{ChartId, PerTexel, PlacementId, RadianceMap, RadianceTexel};
 use crate::lightmap::atlas::texels::TexelSample;
 use crate::lightmap::texel_light::looks::Look;
 use crate::lightmap::texel_light::{TexelAreas, TexelLight, TilePoints};
@@ -35,7 +32,7 @@ use crate::scene::{NONE, Scene};
 use crate::simd::prefetch;
 use crate::trace::filter::Crossing;
 use crate::trace::{RawHit, Ray};
-use glam::{Mat2, Vec2, Vec3};
+use glam::Vec3;
 use rayon::prelude::*;
 use std::f32::consts::PI;
 use std::ops::Range;
@@ -386,45 +383,4 @@ impl RadianceTile {
             out(i, albedos[i] * sums[i] / PI);
         }
     }
-}
-
-/// Maximum number of look-ups of a texture in one texel.
-const MAX_LOOKUPS: u32 = 256;
-
-/// Returns the albedo of a texel of a map.
-pub(crate) fn albedo<M: Map>(areas: &TexelAreas<M>, texel: TexelId<M>) -> Vec3 {
-    let TexelAreas { scene, charts, map, .. } = *areas;
-    let sample = &map[texel];
-    let point = || scene.albedo(sample.triangle, sample.u, sample.v);
-    let material = scene.material(sample.triangle);
-    if !scene.uses().textures || material.albedo_texture == NONE {
-        return Vec3::from(material.albedo);
-    }
-    let (object, triangle) = scene.locate(sample.triangle);
-    let mesh = scene.object(object).mesh();
-    let uv = |w: Vec2| mesh.texture_coordinates(triangle as usize, w.x, w.y).unwrap_or_default();
-    // Weights of corners 1 and 2 as a function of texel coordinates in the map.
-    let placement = map.placement_of(charts, texel);
-    let place = |u, v| Vec2::from(map.layout.texel_coord(placement, charts.local(sample.triangle, u, v)));
-    let origin = place(0.0, 0.0);
-    let weights = Mat2::from_cols(place(1.0, 0.0) - origin, place(0.0, 1.0) - origin).inverse();
-    let Some(texture) = scene.textures().get(material.albedo_texture as usize) else { return point() };
-    let (x, y) = map.position(texel);
-    let corner = weights * (Vec2::new(x as f32, y as f32) - origin);
-    let size = |edge: Vec2| ((uv(edge) - uv(Vec2::ZERO)) * texture.size()).length();
-    let texels = size(weights.x_axis).max(1.0) * size(weights.y_axis).max(1.0);
-    if mesh.uvs.is_empty() || !texels.is_finite() {
-        return point();
-    }
-    let count = (4.0 * texels).min(MAX_LOOKUPS as f32) as u32;
-    let (mut sum, mut seen) = (Vec3::ZERO, 0);
-    let seed = map.seed_in(placement, texel);
-    for i in 0..count {
-        let w = corner + weights * Vec2::from(sobol_2d(i, seed));
-        if w.min_element() >= 0.0 && w.x + w.y <= 1.0 && !scene.is_hole(sample.triangle, w.x, w.y) {
-            sum += scene.albedo_at(material, || Some(uv(w)));
-            seen += 1;
-        }
-    }
-    if seen > 0 { sum / seen as f32 } else { point() }
 }

@@ -10,7 +10,7 @@
 //!
 //! Measured: docs/experiments.md#texels-on-both-sides-of-a-wall.
 
-use super::radiance_map;
+use super::texel_albedo::albedo;
 use super::texel_set::TexelSet;
 use crate::base::error::Result;
 use crate::base::memory::{Reservation, try_append, try_collect, try_par_gather};
@@ -211,7 +211,7 @@ impl Look<'_> {
         if texel == other {
             return self.value(texel);
         }
-        let [own, others] = [texel, other].map(|texel| radiance_map::albedo(&self.areas, texel));
+        let [own, others] = [texel, other].map(|texel| albedo(&self.areas, texel));
         // Of what reflects nothing no light is known.
         Vec3::select(others.cmpgt(Vec3::ZERO), self.value(other) * own / others, self.value(texel))
     }
