@@ -33,7 +33,7 @@ const CONTRAST: f32 = 1.25;
 /// Maximum number of points of a texel that are looked for behind a wall.
 const POINTS: usize = 16;
 
-/// On the side of its sample a texel shows its own light if at most this fraction of its points is behind the wall.
+/// On the side of its sample a texel keeps its own light if at most this fraction of its points is behind the wall.
 const FEW: f32 = 0.125;
 
 /// A plane is that of a wall if it has at least this fraction of a texel's points on the right side.
@@ -75,7 +75,7 @@ struct Wall {
     radiance: [[f32; 3]; 2],
 }
 
-/// Returns the walls in a vector of words. (Such vectors are collected elsewhere, too, so that the code for it is there.)
+/// Returns the walls in a vector of words. (Words are gathered elsewhere, too: the library has that code once.)
 fn walls_in(words: &[u32]) -> &[Wall] {
     bytemuck::cast_slice(words)
 }
@@ -206,13 +206,13 @@ impl Look<'_> {
         self.values[texel.index()]
     }
 
-    /// Returns the radiance of a texel if it has the light of another one.
+    /// Returns the radiance that a texel would have in the light of another one.
     fn in_light_of(&self, texel: RadianceTexel, other: RadianceTexel) -> Vec3 {
         if texel == other {
             return self.value(texel);
         }
         let [own, others] = [texel, other].map(|texel| albedo(&self.areas, texel));
-        // Of what reflects nothing no light is known.
+        // A neighbour that reflects nothing does not tell what light it gets.
         Vec3::select(others.cmpgt(Vec3::ZERO), self.value(other) * own / others, self.value(texel))
     }
 
@@ -256,7 +256,7 @@ impl Look<'_> {
         if (plane.agreeing(points) as f32) < AGREE * count as f32 {
             return None;
         }
-        // On each side, that neighbour is shown which is farthest from the wall, of those beside the texel if there are any.
+        // On each side, the neighbour farthest from the wall gives its light, of those beside the texel if there are any.
         let mut best = |side: f32, from: &dyn Fn(&Point) -> bool| {
             let (mut best, mut farthest) = (texel, 0.0);
             for (i, &near) in (0..).zip(&neighbours) {
