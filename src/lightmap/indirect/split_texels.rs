@@ -13,7 +13,7 @@
 use super::texel_albedo::albedo;
 use super::texel_set::TexelSet;
 use crate::base::error::Result;
-use crate::base::memory::{Reservation, try_append, try_collect, try_par_gather};
+use crate::base::memory::{Reservation, try_par_gather, try_push};
 use crate::base::progress::Progress;
 use crate::direct::Receiver;
 use crate::lightmap::atlas::Atlas;
@@ -23,7 +23,6 @@ use crate::lightmap::atlas::texels::TexelSample;
 use crate::lightmap::texel_light::TexelAreas;
 use crate::scene::Scene;
 use crate::trace::{RawHit, Ray};
-use bytemuck::{Pod, Zeroable};
 use glam::{DMat3, DVec3, Vec2, Vec3};
 use std::sync::atomic::{AtomicU64, Ordering::Relaxed};
 
@@ -58,26 +57,20 @@ const SPLIT: &str = "texels on both sides of a wall";
 #[derive(Default)]
 pub(crate) struct SplitTexels {
     set: TexelSet<RadianceMap>,
-    /// A [`Wall`] for each, by number in the set.
-    walls: Vec<u32>,
+    /// By number in the set.
+    walls: Vec<Wall>,
     _memory: Option<Reservation>,
 }
 
 /// A wall on a texel.
-#[derive(Clone, Copy, Pod, Zeroable)]
-#[repr(C)]
+#[derive(Clone, Copy)]
 struct Wall {
-    texel: u32,
+    texel: RadianceTexel,
     /// Factors of the coordinates in the texel, and a summand: the sum is negative on the far side of the wall, as seen from
     /// the texel's sample.
     line: [f32; 3],
     /// Radiance on the side of the sample and on the far side.
-    radiance: [[f32; 3]; 2],
-}
-
-/// Returns the walls in a vector of words. (Words are gathered elsewhere, too: the library has that code once.)
-fn walls_in(words: &[u32]) -> &[Wall] {
-    bytemuck::cast_slice(words)
+    radiance: [Vec3; 2],
 }
 
 impl SplitTexels {
@@ -94,7 +87,7 @@ impl SplitTexels {
 
     /// Returns the radiance of a texel on the sides of its wall; `None` if it is not one of them.
     pub fn both(&self, texel: RadianceTexel) -> Option<[Vec3; 2]> {
-        Some(walls_in(&self.walls)[self.set.rank(texel)?].radiance.map(Vec3::from))
+        Some(self.walls[self.set.rank(texel)?].radiance)
     }
 
     /// Returns the radiance of a texel of a placement at a place in the chart; `None` if the texel is not one of them.
@@ -105,9 +98,9 @@ impl SplitTexels {
         texel: RadianceTexel,
         local: [f32; 2],
     ) -> Option<Vec3> {
-        let Wall { line: [x, y, one], radiance, .. } = walls_in(&self.walls)[self.set.rank(texel)?];
+        let Wall { line: [x, y, one], radiance, .. } = self.walls[self.set.rank(texel)?];
         let at = within(map, placement, texel, local);
-        Some(radiance[usize::from(x * at.x + y * at.y + one < 0.0)].into())
+        Some(radiance[usize::from(x * at.x + y * at.y + one < 0.0)])
     }
 }
 
@@ -122,20 +115,19 @@ fn within(map: &ChartMap<RadianceMap>, placement: PlacementId, texel: RadianceTe
 pub(crate) fn find(atlas: &Atlas, values: &[Vec3], rays: &mut u64, progress: &Progress) -> Result<SplitTexels> {
     let look = Look { atlas, areas: atlas.areas(&atlas.radiance), values };
     let (traced, count) = (AtomicU64::new(0), values.len());
-    let walls = try_par_gather(count.div_ceil(BLOCK), SPLIT, |block, out: &mut Vec<u32>| {
+    let walls = try_par_gather(count.div_ceil(BLOCK), SPLIT, |block, out: &mut Vec<Wall>| {
         progress.check()?;
         let mut rays = 0;
         for texel in RadianceTexel::range(block * BLOCK..count.min((block + 1) * BLOCK)) {
             if let Some(wall) = look.at(texel, &mut rays) {
-                try_append(out, bytemuck::cast_slice(&[wall]), SPLIT)?;
+                try_push(out, wall, SPLIT)?;
             }
         }
         traced.fetch_add(rays, Relaxed);
         Ok(())
     })?;
     *rays += traced.into_inner();
-    let texels = try_collect(walls_in(&walls).iter().map(|wall| RadianceTexel::new(wall.texel as usize)), SPLIT)?;
-    let set = TexelSet::new(texels.iter(), count, SPLIT)?;
+    let set = TexelSet::new(walls.iter().map(|wall| &wall.texel), count, SPLIT)?;
     let memory = atlas.scene.device().memory().reserve(set.bytes() + size_of_val(&walls[..]), SPLIT)?;
     Ok(SplitTexels { set, walls, _memory: Some(memory) })
 }
@@ -279,8 +271,7 @@ impl Look<'_> {
         // Neighbours with another albedo may have the same light.
         let radiance = [here, there].map(|other| self.in_light_of(texel, other));
         let is_needed = radiance.iter().any(|&radiance| differ(radiance, self.value(texel)));
-        let (number, radiance) = (texel.index() as u32, radiance.map(|radiance| radiance.to_array()));
-        is_needed.then(|| Wall { texel: number, line: plane.line(points), radiance })
+        is_needed.then(|| Wall { texel, line: plane.line(points), radiance })
     }
 }
 
