@@ -240,12 +240,10 @@ impl Maps {
         let were_buried = taken.as_ref().map(copy).transpose()?.unwrap_or_default();
         let only = taken.as_ref().map(|(_, taken)| taken.only());
         let search = Search { scene, charts, index, seen: &seen, near, outdoors, only };
-        // The visible part of a mostly buried texel is a strip along the surface that covers it, often darker than its
-        // surroundings. Gather texels are larger and would spread that darkness as a rim.
         let (mut buried, rays) = scene.install(|| {
-            let (_, of_radiance) = search.move_buried(&mut radiance, true, &stage)?;
-            let (_, of_gather) = search.move_buried(&mut gather, false, &stage)?;
-            let (buried, of_map) = search.move_buried(&mut map, true, &stage)?;
+            let (_, of_radiance) = search.move_buried(&mut radiance, &stage)?;
+            let (_, of_gather) = search.move_buried(&mut gather, &stage)?;
+            let (buried, of_map) = search.move_buried(&mut map, &stage)?;
             Ok((buried, of_radiance + of_gather + of_map))
         })?;
         let sight_rays = seen.rays + rays;

@@ -4,9 +4,9 @@
 
 use super::Lightmap;
 use super::atlas::Atlas;
-use super::atlas::buried::{Only, Part, REACH, Search};
+use super::atlas::buried::{Only, Part, Search, Searched, reach};
 use super::atlas::chart_map::ChartMap;
-use super::atlas::ids::{ChartId, Map, PlacementId};
+use super::atlas::ids::{ChartId, PlacementId};
 use super::atlas::seen;
 use super::moved::Moved;
 use crate::base::bounds::Bounds;
@@ -46,7 +46,7 @@ impl Atlas {
         let moved = Moved::between(&self.scene, scene, &self.charts)?;
         let texel = 1.0 / self.info.texels_per_unit;
         let near = texel.min(seen::ROOM * scene.diagonal());
-        let boxes: Vec<Bounds> = moved.boxes.iter().map(|bounds| bounds.grown(REACH * near)).collect();
+        let boxes: Vec<Bounds> = moved.boxes.iter().map(|bounds| bounds.grown(reach(near, texel))).collect();
         let part = |chart: ChartId| {
             let bounds = self.charts.bounds(scene, chart);
             match moved.has(chart) || boxes.iter().any(|moved| moved.overlaps(&bounds)) {
@@ -67,9 +67,9 @@ impl Atlas {
         let work = [&self.map.layout, &self.gather.layout, &self.radiance.layout]
             .map(|layout| 2 * layout.placements.len() as u64);
         let stage = progress.stage("texels", 0.0, 1.0, work.iter().sum());
-        let (radiance, _) = follow(&search, &self.radiance, &[], true, &stage)?;
-        let (gather, _) = follow(&search, &self.gather, &[], false, &stage)?;
-        let (map, buried) = follow(&search, &self.map, &self.buried, true, &stage)?;
+        let (radiance, _) = follow(&search, &self.radiance, &[], &stage)?;
+        let (gather, _) = follow(&search, &self.gather, &[], &stage)?;
+        let (map, buried) = follow(&search, &self.map, &self.buried, &stage)?;
         let mut info = self.info;
         info.buried_texels = buried.iter().filter(|&&b| b).count() as u64;
         Ok(Atlas {
@@ -93,18 +93,17 @@ impl Atlas {
 
 /// Makes a map anew in the charts that are searched, and copies it in the others. Returns it with its buried texels
 /// (empty: none).
-fn follow<M: Map>(
+fn follow<M: Searched>(
     search: &Search,
     old: &ChartMap<M>,
     was_buried: &[bool],
-    by_parts: bool,
     stage: &Stage,
 ) -> Result<(ChartMap<M>, Vec<bool>)> {
     let layout = &old.layout;
     let is_searched =
         |placement| search.only.is_none_or(|only| only.charts[layout.chart_of(placement).index()] != Part::None);
     let mut map = old.copied(search.scene, search.charts, &is_searched, stage)?;
-    let (mut buried, _) = search.scene.device().install(|| search.move_buried(&mut map, by_parts, stage))?;
+    let (mut buried, _) = search.scene.device().install(|| search.move_buried(&mut map, stage))?;
     if buried.is_empty() && !was_buried.is_empty() {
         buried = try_vec(map.len(), "buried texels")?;
     }

@@ -124,8 +124,8 @@ pub struct LightmapInfo {
     pub both_sided_charts: u32,
     /// Number of separate texels for backs, included in `texels`.
     pub back_texels: u64,
-    /// Number of texels that nobody can see (inside solids, below or behind other surfaces), included in `texels`. They
-    /// show the light of the nearest texels that can be seen.
+    /// Number of texels that nobody can see (inside solids, below or behind other surfaces), or that lie on narrow ledges behind
+    /// walls, included in `texels`. They show the light of the nearest texels that can be seen.
     pub buried_texels: u64,
     /// Number of open places from which rays were traced to find the sides that can be seen. 0 if no material is
     /// two-sided.

@@ -12,17 +12,19 @@
 //! where no sun or sky shines, if all of them end on backs, some of them near, or leave the scene, and no lamp can be seen,
 //! as below the floor of a room of sheets. (A floor below a grate, or beside the back of a wall in the open, sees nothing
 //! else either, but from farther away or in the light of a lamp.)
+//!
+//! Texels of [ledges] behind walls count as buried, too.
 
 use super::chart_index::ChartIndex;
 use super::chart_map::{ChartMap, receiver_of};
 use super::charts::Charts;
 use super::fill::{Hole, around};
-use super::ids::{Map, PlacementId, TexelId, TexelRange};
+use super::ids::{GatherMap, LightMap, Map, PlacementId, RadianceMap, TexelId, TexelRange};
 use super::seen::{self, Seen};
 use super::texels::TexelSample;
 use crate::base::bounds::Bounds;
 use crate::base::error::Result;
-use crate::base::memory::{try_collect, try_filled, try_par_collect, try_push, try_vec, try_with_capacity};
+use crate::base::memory::{try_append, try_collect, try_filled, try_par_collect, try_push, try_vec, try_with_capacity};
 use crate::base::parallel::one_by_one;
 use crate::base::progress::Stage;
 use crate::base::sampling::{cosine_around, sobol_2d};
@@ -47,7 +49,7 @@ const FEW_BACKS: u32 = 8;
 const NEARBY: f32 = 4.0;
 
 /// What lies within this many times the distance at which surfaces cover texels may cover some.
-pub(in crate::lightmap) const REACH: f32 = 4.0;
+const REACH: f32 = 4.0;
 
 /// Maximum number of lamps that are looked for.
 const LAMPS: usize = 64;
@@ -73,6 +75,32 @@ const POINT_TRIES: u32 = 32;
 const BLOCK: usize = 256;
 
 pub(super) const BURIED: &str = "which texels are buried";
+
+/// A map whose buried texels are looked for.
+pub(in crate::lightmap) trait Searched: Map {
+    /// Whether texels with another point that can be seen show that point. (It is a strip along the surface that covers the
+    /// texel, often darker than its surroundings; the gather map would spread that darkness as a rim.)
+    const BY_PARTS: bool;
+    /// Whether texels on [ledges] take the light of those in the room.
+    const LEDGES: bool;
+}
+
+impl Searched for LightMap {
+    const BY_PARTS: bool = true;
+    const LEDGES: bool = true;
+}
+
+impl Searched for GatherMap {
+    const BY_PARTS: bool = false;
+    // Light map texels use those gather texels that they see.
+    const LEDGES: bool = false;
+}
+
+impl Searched for RadianceMap {
+    const BY_PARTS: bool = true;
+    // Its texels have a value for each side of a wall.
+    const LEDGES: bool = false;
+}
 
 /// Inputs of the search for buried texels.
 #[derive(Clone, Copy)]
@@ -107,6 +135,12 @@ pub(in crate::lightmap) enum Part {
     All,
 }
 
+/// Returns the distance from what has changed within which texels are searched again, given that at which surfaces cover texels and
+/// the width of a texel of the light map.
+pub(in crate::lightmap) fn reach(near: f32, texel: f32) -> f32 {
+    (REACH * near).max(ledges::REACH * texel)
+}
+
 impl Only<'_> {
     /// Whether a texel is searched whose chart is searched in part.
     pub fn is_near(&self, scene: &Scene, texel: &TexelSample) -> bool {
@@ -116,20 +150,15 @@ impl Only<'_> {
 }
 
 impl Search<'_> {
-    /// Moves the samples of a map's buried texels to the nearest visible ones, and returns which texels were moved
-    /// (empty: none) and the number of rays. If `by_parts`, samples of texels with another point that can be seen are
-    /// moved to that point instead; in placements without any visible sample this is done in any case. Advances `stage`
-    /// by one per placement. To be called on the device's threads.
-    pub fn move_buried<M: Map>(
-        &self,
-        map: &mut ChartMap<M>,
-        by_parts: bool,
-        stage: &Stage,
-    ) -> Result<(Vec<bool>, u64)> {
+    /// Moves the samples of a map's buried texels, and of those on [ledges], to the nearest visible ones, and returns which texels were moved
+    /// (empty: none) and the number of rays. If [by parts](Searched::BY_PARTS), samples of texels with another point that can
+    /// be seen are moved to that point instead; in placements without any visible sample this is done in any case. Advances
+    /// `stage` by one per placement. To be called on the device's threads.
+    pub fn move_buried<M: Searched>(&self, map: &mut ChartMap<M>, stage: &Stage) -> Result<(Vec<bool>, u64)> {
         let scratch = Scratch::new();
         let of_placement = |placement: usize| {
             let mut tests = scratch.take(PointTests::new)?;
-            let found = self.in_placement(map, PlacementId::new(placement), by_parts, &mut tests, stage)?;
+            let found = self.in_placement(map, PlacementId::new(placement), &mut tests, stage)?;
             stage.advance(1)?;
             Ok(found)
         };
@@ -156,11 +185,10 @@ impl Search<'_> {
         Ok((is_moved, rays))
     }
 
-    fn in_placement<M: Map>(
+    fn in_placement<M: Searched>(
         &self,
         map: &ChartMap<M>,
         placement: PlacementId,
-        by_parts: bool,
         tests: &mut PointTests,
         stage: &Stage,
     ) -> Result<Found<M>> {
@@ -171,15 +199,14 @@ impl Search<'_> {
             Some((only, Part::Near)) => Some(only),
             None | Some((_, Part::All)) => None,
         };
-        let is_back = match map.layout.is_back(placement) {
-            true => true,
-            false if !self.charts[chart].two_sided || map.layout.back(chart).is_some() => false,
-            // The bake chooses the side if open places do not decide it.
-            false => match self.seen.shows_back(chart) {
-                Some(back) => back,
-                None => return Ok(found),
-            },
+        let shows_back = match map.layout.is_back(placement) {
+            true => Some(true),
+            false if !self.charts[chart].two_sided || map.layout.back(chart).is_some() => Some(false),
+            // The bake chooses the side if open places do not decide it: buried texels are not searched then, and ledges of the
+            // front, which it prefers.
+            false => self.seen.shows_back(chart),
         };
+        let is_back = shows_back.unwrap_or(false);
         // Nobody sees a hidden side, and all of its texels would be tested by all rays.
         if self.seen.is_hidden(chart, !is_back) {
             return Ok(found);
@@ -188,7 +215,8 @@ impl Search<'_> {
         let mut buried = Vec::new();
         let indices = texels.indices();
         let mut block = [TexelId::new(0); BLOCK];
-        for first in indices.clone().step_by(BLOCK) {
+        let searched = if shows_back.is_some() { indices.clone() } else { 0..0 };
+        for first in searched.step_by(BLOCK) {
             stage.advance(0)?;
             let all = TexelId::range(first..indices.end.min(first + BLOCK));
             let wanted = all.filter(|&texel| near.is_none_or(|only| only.is_near(self.scene, &map[texel])));
@@ -198,11 +226,14 @@ impl Search<'_> {
                 try_push(&mut buried, block[number as usize], BURIED)?;
             }
         }
-        if by_parts || buried.len() == texels.len() {
+        if M::BY_PARTS || !buried.is_empty() && buried.len() == texels.len() {
             self.find_seen_parts(map, placement, is_back, &mut buried, tests, &mut found, stage)?;
         }
+        if M::LEDGES {
+            found.moved = self.find_ledges(map, placement, is_back, near, &buried, tests, &mut found.rays, stage)?;
+        }
         if !buried.is_empty() && buried.len() < texels.len() {
-            found.moved = nearest_seen(map, placement, texels, buried, stage)?;
+            nearest_seen(map, placement, texels, buried, &mut found.moved, stage)?;
         }
         Ok(found)
     }
@@ -443,17 +474,19 @@ struct Found<M: Map> {
     rays: u64,
 }
 
-/// Finds the nearest visible texels to those `buried`, ring by ring.
+/// Finds the nearest visible texels to those `buried`, ring by ring, and adds them to `moved`, which has texels on ledges.
 fn nearest_seen<M: Map>(
     map: &ChartMap<M>,
     placement: PlacementId,
     texels: TexelRange<M>,
     buried: Vec<TexelId<M>>,
+    moved: &mut Vec<(TexelId<M>, TexelId<M>)>,
     stage: &Stage,
-) -> Result<Vec<(TexelId<M>, TexelId<M>)>> {
+) -> Result<()> {
     let mut to: Vec<Option<TexelId<M>>> = try_collect(texels.clone().map(Some), BURIED)?;
     buried.iter().for_each(|&s| to[texels.place(s)] = None);
-    let mut moved = try_with_capacity(buried.len(), BURIED)?;
+    moved.iter().for_each(|&(texel, inner)| to[texels.place(texel)] = Some(inner));
+    let mut filled = try_with_capacity(buried.len(), BURIED)?;
     let nearest = |to: &Vec<Option<TexelId<M>>>, texel: TexelId<M>| {
         let (ox, oy) = map.position(texel);
         let known = around((ox, oy)).filter_map(|(x, y)| {
@@ -471,11 +504,12 @@ fn nearest_seen<M: Map>(
         nearest,
         |to, texel, known| {
             to[texels.place(texel)] = Some(known);
-            moved.push((texel, known));
+            filled.push((texel, known));
         },
     )?;
-    Ok(moved)
+    try_append(moved, &filled, BURIED)
 }
 
+mod ledges;
 #[cfg(test)]
 mod tests;

@@ -4,7 +4,7 @@
 //! Sides are counted anew: that takes little time, and new things may hide or show any of them.
 
 use super::Atlas;
-use super::buried::{BURIED, Only, Part, REACH};
+use super::buried::{BURIED, Only, Part, reach};
 use super::chart_map::ChartMap;
 use super::charts::Charts;
 use super::ids::{ChartId, GatherMap, LightMap, Map, PlacementId, RadianceMap};
@@ -101,7 +101,8 @@ impl<'a> Earlier<'a> {
         stage: &Stage,
     ) -> Result<TakenOver> {
         let atlas = self.atlas;
-        let mut boxes: Vec<Bounds> = self.boxes.iter().map(|bounds| bounds.grown(REACH * near)).collect();
+        let reach = reach(near, 1.0 / map.layout.density);
+        let mut boxes: Vec<Bounds> = self.boxes.iter().map(|bounds| bounds.grown(reach)).collect();
         let most = SAME / map.layout.density;
         let of_chart = |number: usize| {
             let chart = ChartId::new(number);
@@ -135,7 +136,7 @@ impl<'a> Earlier<'a> {
             bounds.push(around);
             // What sees little else than this chart is no farther away than it is wide.
             if has_turned {
-                try_push(&mut turned, around.grown(around.width().max(REACH * near)), CHARTS)?;
+                try_push(&mut turned, around.grown(around.width().max(reach)), CHARTS)?;
             }
         }
         boxes.append(&mut merged(turned, MOST_TURNED));
