@@ -150,10 +150,10 @@ impl Only<'_> {
 }
 
 impl Search<'_> {
-    /// Moves the samples of a map's buried texels, and of those on [ledges], to the nearest visible ones, and returns which texels were moved
-    /// (empty: none) and the number of rays. If [by parts](Searched::BY_PARTS), samples of texels with another point that can
-    /// be seen are moved to that point instead; in placements without any visible sample this is done in any case. Advances
-    /// `stage` by one per placement. To be called on the device's threads.
+    /// Moves the samples of a map's buried texels, and of those on [ledges], to the nearest visible ones, and returns which
+    /// texels were moved (empty: none) and the number of rays. If [by parts](Searched::BY_PARTS), samples of texels with
+    /// another point that can be seen are moved to that point instead; in placements without any visible sample this is done
+    /// in any case. Advances `stage` by one per placement. To be called on the device's threads.
     pub fn move_buried<M: Searched>(&self, map: &mut ChartMap<M>, stage: &Stage) -> Result<(Vec<bool>, u64)> {
         let scratch = Scratch::new();
         let of_placement = |placement: usize| {
@@ -226,7 +226,7 @@ impl Search<'_> {
                 try_push(&mut buried, block[number as usize], BURIED)?;
             }
         }
-        if M::BY_PARTS || !buried.is_empty() && buried.len() == texels.len() {
+        if M::BY_PARTS || buried.len() == texels.len() {
             self.find_seen_parts(map, placement, is_back, &mut buried, tests, &mut found, stage)?;
         }
         if M::LEDGES {

@@ -80,12 +80,10 @@ struct Strips<'a, M: Map> {
 }
 
 impl<M: Map> Strips<'_, M> {
-    /// Returns the texel some steps away.
+    /// Returns the texel some steps away, if the placement has one there.
     fn beside(&self, texel: TexelId<M>, (dx, dy): (i32, i32), steps: i32) -> Option<TexelId<M>> {
-        let (x, y) = self.map.position(texel);
-        let found = self.map.at(self.placement, x + steps * dx, y + steps * dy)?;
-        // The window of given charts may contain another chart.
-        self.map.texels_of(self.placement).contains(found).then_some(found)
+        let [found] = self.map.around(self.placement, texel, [(steps * dx, steps * dy)]);
+        found
     }
 
     fn is_buried(&self, texel: TexelId<M>) -> bool {
