@@ -184,7 +184,7 @@ impl Live {
         self.held = self.blocks.bytes() as isize;
         let stage = progress.stage("show", 0.9, 1.0, 2 * self.blocks.len() as u64);
         for some in in_parts(self.blocks.len()) {
-            self.display.take_coarse(&context.map, &mut self.blocks, &some, |_| ());
+            self.display.take_coarse(&context.map, &mut self.blocks, &some, &mut |_| ());
             stage.advance(some.len() as u64)?;
         }
         for (lod, status) in self.display.lods.iter_mut().zip(self.blocks.status()) {
@@ -192,7 +192,7 @@ impl Live {
         }
         self.reserve(0)?;
         for some in in_parts(self.blocks.len()) {
-            self.display.refresh(&context.map, &self.blocks, &some, |_| ());
+            self.display.refresh(&context.map, &self.blocks, &some, &mut |_| ());
             stage.advance(some.len() as u64)?;
         }
         self.note_all_shown();

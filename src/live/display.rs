@@ -150,7 +150,7 @@ impl Display {
 
     /// Shows the newest light of the `changed` blocks, at most [`SHOWN_AT_ONCE`]; reports to `note` where that changes
     /// the light map. A block that is away keeps its shown light until it is back.
-    pub fn refresh(&mut self, map: &BlockMap, blocks: &Blocks, changed: &[u32], note: impl FnMut(Changed)) {
+    pub fn refresh(&mut self, map: &BlockMap, blocks: &Blocks, changed: &[u32], note: &mut dyn FnMut(Changed)) {
         for &b in changed {
             let Some(block) = blocks.work(b) else { continue };
             let tile = &map.tiles[b as usize];
@@ -173,7 +173,7 @@ impl Display {
 
     /// Interpolates, fills and blurs the texels that depend on those of the `changed` blocks; reports to `note` where
     /// that changes the light map.
-    fn spread(&mut self, map: &BlockMap, changed: &[u32], mut note: impl FnMut(Changed)) {
+    fn spread(&mut self, map: &BlockMap, changed: &[u32], note: &mut dyn FnMut(Changed)) {
         let Display { irradiance, directional, on, scratch: Scratch { all, to_fill }, .. } = self;
         let top = map.top();
         // Neighbouring blocks that interpolate use texels of these blocks too.
@@ -228,7 +228,7 @@ impl Display {
         (lower.irradiance.old, lower.directional.old) = (Vec::new(), Vec::new());
         lower.on.fades.fill(0);
         let device = map.atlas.scene.device();
-        device.install(|| in_parts(map.tiles.len()).for_each(|some| lower.spread(map, &some, |_| ())));
+        device.install(|| in_parts(map.tiles.len()).for_each(|some| lower.spread(map, &some, &mut |_| ())));
         Ok(lower)
     }
 

@@ -175,7 +175,7 @@ impl Live {
         }
         let stage = progress.stage("show", 0.6, 1.0, blocks.len() as u64);
         for some in in_parts(blocks.len()) {
-            display.refresh(&context.map, &blocks, &some, |_| ());
+            display.refresh(&context.map, &blocks, &some, &mut |_| ());
             stage.advance(some.len() as u64)?;
         }
         Ok((display, blocks))

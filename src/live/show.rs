@@ -121,7 +121,7 @@ impl Live {
             }
             let batch: Vec<u32> = self.waiting.drain(..fit.min(PASS).min(self.waiting.len())).collect();
             let dirty = &mut self.dirty;
-            self.display.refresh(&self.context.map, &self.blocks, &batch, |c| dirty.add(c));
+            self.display.refresh(&self.context.map, &self.blocks, &batch, &mut |c| dirty.add(c));
             for &b in &batch {
                 self.is_waiting[b as usize] = false;
                 let status = *self.status(b);

@@ -259,13 +259,14 @@ impl Layout {
 
     /// Packs all but the given charts.
     fn place(&mut self, progress: &Progress) -> Result<()> {
-        let mut order = try_collect(self.given..self.placements.len() as u32, LAYOUT)?;
-        // The highest first, of these the widest. (One number: code that sorts by three is large.)
+        // The highest first, of these the widest.
         let key = |p: &Placement| u32::from(!p.h) << 16 | u32::from(!p.w);
-        order.sort_unstable_by_key(|&p| u64::from(key(&self.placements[p as usize])) << 32 | u64::from(p));
+        let charts = self.given..self.placements.len() as u32;
+        let mut order = try_collect(charts.map(|p| (key(&self.placements[p as usize]), p)), LAYOUT)?;
+        order.sort_unstable();
         let first_page = self.page_count;
         let mut pages: Vec<Skyline> = Vec::new();
-        for n in order {
+        for (_, n) in order {
             progress.check()?;
             let p = &mut self.placements[n as usize];
             let (w, h) = (p.w as u32, p.h as u32);

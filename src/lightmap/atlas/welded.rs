@@ -136,14 +136,19 @@ impl Geometry {
         }
         let mut neighbours: Array<[u32; 3]> = device.zeroed(self.indices.len(), CHARTS)?;
         neighbours.fill([NONE; 3]);
+        // Edges of a vertex behind their upper ones.
+        let most = starts.windows(2).map(|range| range[1] - range[0]).max().unwrap_or(0);
+        let mut of_vertex: Vec<(u32, u32)> = try_with_capacity(most as usize, CHARTS)?;
         for (vertex, range) in starts.windows(2).enumerate() {
             if vertex % ITEMS_PER_CHECK == 0 {
                 stage.check()?;
             }
-            let of_vertex = &mut edges[range[0] as usize..range[1] as usize];
-            of_vertex.sort_unstable_by_key(|&edge| upper(edge));
-            for same in of_vertex.chunk_by(|&a, &b| upper(a) == upper(b)) {
-                let &[a, b] = same else { continue };
+            let edges = &edges[range[0] as usize..range[1] as usize];
+            of_vertex.clear();
+            of_vertex.extend(edges.iter().map(|&edge| (upper(edge), edge)));
+            of_vertex.sort_unstable();
+            for same in of_vertex.chunk_by(|a, b| a.0 == b.0) {
+                let &[(_, a), (_, b)] = same else { continue };
                 let [t, other] = [a, b].map(|edge| edge / 3);
                 if ends(a)[0] != ends(b)[0] && self.kinds[t as usize] == self.kinds[other as usize] {
                     neighbours[t as usize][a as usize % 3] = other;
