@@ -2,6 +2,7 @@
 
 pub(crate) mod area_light;
 pub(crate) mod direct_light;
+pub(crate) mod guide;
 mod light_node;
 pub(crate) mod light_tree;
 pub(crate) mod many_lights;

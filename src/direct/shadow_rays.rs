@@ -3,6 +3,7 @@
 //! Those of a tile of texels go down the tree as a [stream](crate::trace). The light that arrives is added up per slot
 //! in the order of the rays, whatever is traced together: a point has the same bits alone and in a tile.
 
+use super::guide::Guide;
 use super::light_tree::Descent;
 use super::receiver::Receiver;
 use crate::base::directional::Directional;
@@ -194,6 +195,7 @@ impl<R: AsMut<[Ray]>, C: AsMut<[Carried]>, O: AsMut<[u8]>, V: AsMut<[Vec3]>> Roo
             light: 0,
             normal: Vec3::ZERO,
             near: Near::default(),
+            guide: None,
             by_light: self.by_light.as_mut(),
             directed: self.directed.as_mut(),
         }
@@ -238,6 +240,8 @@ pub(crate) struct ShadowRays<'a> {
     pub(crate) normal: Vec3,
     /// Lights that do not shine on the next receivers, mostly none.
     pub(crate) near: Near,
+    /// Where the next receivers may see the sky.
+    pub(crate) guide: Option<Guide>,
     by_light: Option<&'a mut ByLight>,
     directed: Option<&'a mut Directed>,
 }

@@ -4,9 +4,11 @@
 //! cuts it (the form factor of a sphere as seen from its tangent cone; Howell, *A Catalog of Radiation Heat Transfer
 //! Configuration Factors*, B-42), times the visible fraction of directions uniform in it. A constant sky is sampled by
 //! cosine, so without occluders it has no noise. A sky with an image is sampled half by importance, half by cosine, and
-//! both halves are weighted by the density of the mixture (Veach 1997, section 9.2.2). Gather rays that leave the scene
+//! both halves are weighted by the density of the mixture (Veach 1997, section 9.2.2). Where a [guide](super::guide) says
+//! from which directions sky comes, what is sampled by cosine follows it. Gather rays that leave the scene
 //! contribute nothing: skies are direct light, and would count twice.
 
+use super::guide::square_of;
 use super::receiver::Receiver;
 use super::shadow_rays::ShadowRays;
 use crate::base::sampling::{combine, cosine_hemisphere, orthonormal_basis, sobol_2d};
@@ -89,9 +91,12 @@ impl Disc {
 /// Pushes up to `n` shadow rays, whose sum is the irradiance of the sky.
 pub(crate) fn push_sky(sky: &Sky, receiver: &Receiver, n: u32, seed: u32, shadow: &mut ShadowRays) {
     let (t, b) = orthonormal_basis(receiver.normal);
+    let guide = shadow.guide;
+    // A direction, and its density as a multiple of that by cosine.
     let by_cosine = |u| {
+        let (u, density) = guide.as_ref().map_or((u, 1.0), |guide| guide.warp(u));
         let d = cosine_hemisphere(u);
-        t * d.x + b * d.y + receiver.normal * d.z
+        (t * d.x + b * d.y + receiver.normal * d.z, density)
     };
     let mut push = |direction: Vec3, light: Vec3| {
         if receiver.faces(direction) && light.max_element() > 0.0 {
@@ -100,21 +105,25 @@ pub(crate) fn push_sky(sky: &Sky, receiver: &Receiver, n: u32, seed: u32, shadow
     };
     if sky.is_constant() {
         let light = sky.at(receiver.normal).0 * (PI / n as f32);
-        (0..n).for_each(|k| push(by_cosine(sobol_2d(k, combine(seed, 5))), light));
+        for k in 0..n {
+            let (direction, density) = by_cosine(sobol_2d(k, combine(seed, 5)));
+            push(direction, light / density);
+        }
         return;
     }
     // All samples of one kind together have the density n/2 · p; both kinds together, the sum of their densities.
     let half = n.div_ceil(2);
-    let weighted = |direction: Vec3, radiance: Vec3, by_image: f32| {
+    let weighted = |direction: Vec3, radiance: Vec3, by_image: f32, guided: f32| {
         let cosine = direction.dot(receiver.normal).max(0.0);
-        radiance * (cosine / (half as f32 * (by_image + cosine / PI)))
+        radiance * (cosine / (half as f32 * (by_image + guided * cosine / PI)))
     };
     for k in 0..half {
         let (direction, radiance, density) = sky.sample(sobol_2d(k, combine(seed, 6)));
-        push(direction, weighted(direction, radiance, density));
-        let direction = by_cosine(sobol_2d(k, combine(seed, 5)));
+        let guided = guide.as_ref().map_or(1.0, |g| g.density(square_of(direction.dot(t), direction.dot(b))));
+        push(direction, weighted(direction, radiance, density, guided));
+        let (direction, guided) = by_cosine(sobol_2d(k, combine(seed, 5)));
         let (radiance, density) = sky.at(direction);
-        push(direction, weighted(direction, radiance, density));
+        push(direction, weighted(direction, radiance, density, guided));
     }
 }
 

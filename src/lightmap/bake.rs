@@ -37,6 +37,7 @@ use crate::base::progress::Progress;
 use crate::base::sampling::{combine, purpose_seed};
 use crate::base::scratch::Scratch;
 use crate::direct::DirectLight;
+use crate::direct::guide::SkySeen;
 use crate::scene::Scene;
 use glam::Vec3;
 use rayon::prelude::*;
@@ -455,6 +456,9 @@ impl<'p> Bake<'_, 'p> {
         if self.blurs_direct() {
             bytes += l.map.len() * direct_blur::TEXEL_BYTES;
         }
+        if self.direct.sky_count() > 0 {
+            bytes += l.radiance.len() * SkySeen::PLACE_BYTES;
+        }
         if self.asks(directional::INDIRECT) {
             bytes += l.gather.len() * DIRECTIONAL_BYTES;
         }
@@ -630,6 +634,7 @@ impl<'p> Bake<'_, 'p> {
         let stage = self.progress.stage("direct", 0.65, 1.0, (2 * range.len() + blurred) as u64);
         let rays = AtomicU64::new(0);
         let backs = &light.backs[..];
+        self.direct.make_room_for_sky_seen(l.radiance.len())?;
         let texels = self.texel_light();
         // Blocks whose light is in the checkpoint.
         let mut known = try_filled(range.len().div_ceil(BLOCK), false, "blocks of texels")?;

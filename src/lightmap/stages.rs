@@ -194,8 +194,12 @@ pub(crate) fn radiance_again(
     let anew = Anew::new(&atlas.areas(&atlas.radiance), anew)?;
     let range = 0..values.len();
     let stage = inputs.progress.stage("radiance", 0.2, 0.3, radiance_map::work(&atlas.radiance, &range));
-    let input =
-        RadianceInput { light: radiance_light(inputs), photons: Some(photons), quick: false, anew: Some(&anew) };
+    let input = RadianceInput {
+        light: radiance_light(inputs, false)?,
+        photons: Some(photons),
+        quick: false,
+        anew: Some(&anew),
+    };
     let mut rays = radiance_map::bake(atlas.scene.device(), &input, range, &mut values, &stage)?;
     let mut radiance = Radiance { values, guidance: Some(guidance), ..Default::default() };
     complete(inputs, &mut radiance, &mut rays)?;
@@ -237,20 +241,22 @@ fn radiance_values(
     let Inputs { atlas, progress, .. } = *inputs;
     let stage = progress.stage("radiance", from, to, radiance_map::work(&atlas.radiance, &range));
     let mut values = try_vec(range.len(), "the radiance map")?;
-    let input = RadianceInput { light: radiance_light(inputs), photons, quick, anew: None };
+    let input = RadianceInput { light: radiance_light(inputs, quick)?, photons, quick, anew: None };
     let rays = radiance_map::bake(atlas.scene.device(), &input, range, &mut values, &stage)?;
     Ok((values, rays))
 }
 
-/// Direct light of the radiance map's texels.
-fn radiance_light<'a>(inputs: &Inputs<'a, '_>) -> TexelLight<'a, RadianceMap> {
+/// Direct light of the radiance map's texels; `quick`: without looking first where the sky is seen.
+fn radiance_light<'a>(inputs: &Inputs<'a, '_>, quick: bool) -> Result<TexelLight<'a, RadianceMap>> {
     let Inputs { atlas, direct, params, .. } = *inputs;
-    TexelLight {
+    direct.make_room_for_sky_seen(atlas.radiance.len())?;
+    Ok(TexelLight {
         areas: atlas.areas(&atlas.radiance),
         direct,
         samples: params.direct_samples.div_ceil(RADIANCE_SAMPLE_DIVISOR),
         seed: purpose_seed(params.seed, purpose::RADIANCE),
-    }
+        sky_from: (!quick).then_some(&atlas.radiance),
+    })
 }
 
 /// Decides for each two-sided chart without separate texels for its back whether the back is baked. With the radiance

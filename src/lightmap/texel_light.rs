@@ -25,12 +25,13 @@
 pub(crate) mod averages;
 pub(crate) mod looks;
 mod near;
+mod sky_seen;
 
 use super::atlas::Atlas;
 use super::atlas::chart_index::ChartIndex;
 use super::atlas::chart_map::{ChartMap, Receivers};
 use super::atlas::charts::Charts;
-use super::atlas::ids::{Map, TexelId};
+use super::atlas::ids::{Map, RadianceMap, TexelId};
 use super::atlas::layout::Placement;
 use super::atlas::seen::Seen;
 use super::atlas::texels::TexelSample;
@@ -44,6 +45,7 @@ use crate::direct::shadow_rays::{KINDS, TileRoom};
 use crate::scene::Scene;
 use crate::trace::{RawHit, Ray};
 use glam::{Vec2, Vec3};
+use sky_seen::Guides;
 use std::ops::Range;
 
 /// Maximum number of points of a texel that are lit together.
@@ -128,6 +130,8 @@ pub(crate) struct TexelLight<'a, M: Map> {
     pub samples: u32,
     /// Seed of the stage.
     pub seed: u32,
+    /// From whose texels [the sky is seen](sky_seen), which guides shadow rays to it; `None`: they go anywhere.
+    pub sky_from: Option<&'a ChartMap<RadianceMap>>,
 }
 
 /// A point of a texel and its light.
@@ -345,12 +349,14 @@ impl TilePoints {
     fn light<M: Map>(&mut self, by: &TexelLight<M>, wanted: impl Iterator<Item = Wanted<M>>, rays: &mut u64) {
         let scene = by.areas.scene;
         let (mut shadow, mut receivers) = (self.room.begin(scene), Receivers::new(scene));
+        let mut guides = Guides::default();
         self.pending.clear();
         for Wanted { place, texel, back, numbers, lights } in wanted {
             let samples = by.samples.div_ceil(numbers.len() as u32);
             let (seed, first) = (combine(by.seed, by.areas.map.seed(texel)), self.counts[place]);
             let of_round = combine(seed, numbers.start);
             shadow.near = by.near(texel);
+            shadow.guide = guides.of(by, (texel, back), rays);
             let is_near_lamps = shadow.near.distance2 > 0.0;
             for number in numbers {
                 let Some(on) = by.areas.point(texel, number, seed) else { continue };

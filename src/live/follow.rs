@@ -169,11 +169,13 @@ impl Live {
         let states = [&*old.atlas, &**atlas].map(|atlas| SceneState { atlas, backs, former: None });
         let cells = Comparison::new(states, &moved, keep_error, progress)?.cells()?;
         let grid = Grid::with(self.grid.info, &mut map.tiles)?;
+        let direct = DirectLight::try_new(&atlas.scene)?;
+        direct.make_room_for_sky_seen(atlas.radiance.len())?;
         let place = Place {
+            direct,
             normals: Display::normals(&map)?,
             promotion: Promotion::new(&map.tiles, &grid)?,
             chooser: Chooser::new(&map, &grid)?,
-            direct: DirectLight::try_new(&atlas.scene)?,
             differs: try_collect(cells.iter().map(|cell| [cell.is_new, cell.is_new || cell.is_shadowed]), MOVED)?,
             emits: moved.emits,
             _memory: memory,

@@ -132,11 +132,12 @@ impl Illumination {
             true => illuminate_quickly(atlas, params, &direct, progress)?,
             false => illuminate(atlas, params, &direct, None, progress)?,
         };
-        Ok(Illumination::of(direct, indirect))
+        Illumination::of(atlas, direct, indirect)
     }
 
-    fn of(direct: DirectLight, indirect: Indirect) -> Illumination {
-        Illumination {
+    fn of(atlas: &Atlas, direct: DirectLight, indirect: Indirect) -> Result<Illumination> {
+        direct.make_room_for_sky_seen(atlas.radiance.len())?;
+        Ok(Illumination {
             direct: Arc::new(direct),
             radiance: Arc::new(indirect.radiance),
             sides: indirect.sides,
@@ -145,7 +146,7 @@ impl Illumination {
             has_indirect: indirect.has_indirect,
             direct_epoch: 1,
             indirect_epoch: 1,
-        }
+        })
     }
 
     /// Computes light of a scene that was described anew, with that of `before` it where surfaces show the same, and a first
@@ -160,7 +161,7 @@ impl Illumination {
         let direct = DirectLight::try_new(&atlas.scene)?;
         let mut indirect = illuminate_quickly(atlas, params, &direct, progress)?;
         if !indirect.has_indirect || !before.has_indirect || before.radiance.values.is_empty() {
-            return Ok(Illumination::of(direct, indirect));
+            return Illumination::of(atlas, direct, indirect);
         }
         // Bright patches are left to all photons: until then gather rays find them.
         indirect.radiance = Radiance { values: indirect.radiance.values, ..Default::default() };
@@ -190,7 +191,7 @@ impl Illumination {
         let asks = params.directional & directional::INDIRECT != 0;
         indirect.own = stages::own_light(&inputs, &indirect.radiance, &backs, &upsampling, None, asks, (0.315, 0.32))?;
         indirect.sides = Arc::new(Sides { backs, upsampling, is_first_impression: false });
-        Ok(Illumination::of(direct, indirect))
+        Illumination::of(atlas, direct, indirect)
     }
 
     /// Makes a copy with new indirect light.

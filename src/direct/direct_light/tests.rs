@@ -1,11 +1,13 @@
 //! Tests of direct light against analysis.
 
 use super::*;
-use crate::base::sampling::{uniform, uniform_sphere};
+use crate::base::sampling::{cosine_hemisphere, orthonormal_basis, uniform, uniform_sphere};
+use crate::direct::guide::{BINS, Guide};
 use crate::direct::point_light::point_light;
 use crate::direct::polygon;
 use crate::scene::demo::shapes::MeshBuilder;
 use crate::scene::{Material, SceneData, builtin};
+use crate::trace::Ray;
 use crate::trace::offset::offset_ray_origin;
 use glam::DVec3;
 use std::f32::consts::PI;
@@ -326,4 +328,87 @@ fn an_image_with_one_bright_pixel_is_a_sun() {
     let expected = 3.0 * 1e4 * solid_angle * theta(y + 0.5).cos();
     let e = mean(&direct, Vec3::ZERO, 16, 16);
     assert!((e / expected - 1.0).abs() < 1e-4, "{e}, not {expected}");
+}
+
+/// A roof at z = 1 with a square hole.
+fn roof(builder: &mut MeshBuilder) -> [Vec3; 4] {
+    let p = |x: f32, y: f32| Vec3::new(x, y, 1.0);
+    let (x0, x1, y0, y1, far) = (0.6, 0.8, -0.1, 0.1, 1e4);
+    builder.quad(p(-far, -far), p(x0, -far), p(x0, far), p(-far, far), 0);
+    builder.quad(p(x1, -far), p(far, -far), p(far, far), p(x1, far), 0);
+    builder.quad(p(x0, -far), p(x1, -far), p(x1, y0), p(x0, y0), 0);
+    builder.quad(p(x0, y1), p(x1, y1), p(x1, far), p(x0, far), 0);
+    [p(x0, y0), p(x1, y0), p(x1, y1), p(x0, y1)]
+}
+
+/// Mean light at the origin of the floor and variance of single estimates, guided by what is `seen` of the sky from there.
+fn guided(direct: &DirectLight, seen: Option<u64>, seeds: u32) -> [f64; 2] {
+    let r = receiver(&direct.scene, Vec3::ZERO, Vec3::Z);
+    let (mut sum, mut squares) = (0.0, 0.0);
+    for seed in 0..seeds {
+        let mut room = PointRoom::new();
+        let mut shadow = room.begin(&direct.scene);
+        shadow.guide = seen.and_then(|seen| Guide::new(std::iter::once(seen)));
+        assert_eq!(shadow.guide.is_some(), seen.is_some());
+        let mut light = direct.push(&r, 0, Lights::All, 4, combine(seed, 9), &mut shadow);
+        light.take(shadow.finish(&mut 0));
+        let e = f64::from(light.value().x);
+        (sum, squares) = (sum + e, squares + e * e);
+    }
+    let mean = sum / f64::from(seeds);
+    [mean, squares / f64::from(seeds) - mean * mean]
+}
+
+/// The bins of a guide in which the sky is seen from the origin of the floor.
+fn seen(direct: &DirectLight) -> u64 {
+    let r = receiver(&direct.scene, Vec3::ZERO, Vec3::Z);
+    let (t, b) = orthonormal_basis(Vec3::Z);
+    (0..BINS as u32 * 16).fold(0, |bits, i| {
+        let (bin, within) = (i / 16, i % 16);
+        let place = |k: u32| ((bin >> (3 * k) & 7) as f32 + ((within >> (2 * k) & 3) as f32 + 0.5) / 4.0) / 8.0;
+        let d = cosine_hemisphere([place(0), place(1)]);
+        let ray = Ray::new(r.shadow_origin, t * d.x + b * d.y + Vec3::Z * d.z);
+        bits | u64::from(!direct.scene.occluded(&ray)) << bin
+    })
+}
+
+#[test]
+fn guided_rays_to_a_sky_bring_the_same_light_with_less_noise() {
+    let mut hole = [Vec3::ZERO; 4];
+    let scene = floor(|data, builder| {
+        hole = roof(builder);
+        data.add_light(sky(2.0)).unwrap();
+    });
+    let direct = DirectLight::new(&scene);
+    let r = receiver(&scene, Vec3::ZERO, Vec3::Z);
+    let expected = 2.0 * lambert(r.origin, hole);
+    assert!(expected < 0.02 * 2.0 * f64::from(PI), "a small window: {expected}");
+    let seen = seen(&direct);
+    assert!((1..=8).contains(&seen.count_ones()), "{seen:b}");
+    let [[plain, noise], [mean, less]] = [None, Some(seen)].map(|seen| guided(&direct, seen, 20_000));
+    assert!((plain / expected - 1.0).abs() < 0.06, "{plain}, not {expected}");
+    assert!((mean / expected - 1.0).abs() < 0.01, "{mean}, not {expected}");
+    assert!(less < 0.1 * noise, "variance {noise}, guided {less}");
+    // A guide that knows nothing of the window misses none of its light.
+    let [mean, _] = guided(&direct, Some(1 << 63 | 1 << 7), 40_000);
+    assert!((mean / expected - 1.0).abs() < 0.06, "{mean}, not {expected}");
+}
+
+#[test]
+fn guided_rays_to_an_image_bring_the_same_light_with_less_noise() {
+    use crate::scene::Environment;
+    let rgb = (0..64).map(|i| [0.2 + uniform(i, 0, 7); 3]).collect();
+    let image = Environment::new(16, 4, rgb).unwrap();
+    let scene = floor(|data, builder| {
+        roof(builder);
+        let environment = data.add_environment(image);
+        data.add_light(Light::Sky { radiance: [3.0; 3], environment, up: Vec3::Z, rotation: 0.4 }).unwrap();
+    });
+    let direct = DirectLight::new(&scene);
+    let seen = seen(&direct);
+    let [[plain, noise], [mean, less]] = [None, Some(seen)].map(|seen| guided(&direct, seen, 40_000));
+    assert!((mean / plain - 1.0).abs() < 0.05, "{mean}, not {plain}");
+    assert!(less < 0.15 * noise, "variance {noise}, guided {less}");
+    let [other, _] = guided(&direct, Some(1 << 63 | 1 << 7), 40_000);
+    assert!((other / plain - 1.0).abs() < 0.08, "{other}, not {plain}");
 }

@@ -148,7 +148,8 @@ fn the_radiance_map_has_the_energy_of_a_patch_of_sun_smaller_than_its_texels() {
         let map = created(&scene, 10.0);
         let atlas = map.atlas();
         let direct = DirectLight::new(&scene);
-        let light = TexelLight { areas: atlas.areas(&atlas.radiance), direct: &direct, samples: 4, seed: 5 };
+        let light =
+            TexelLight { areas: atlas.areas(&atlas.radiance), direct: &direct, samples: 4, seed: 5, sky_from: None };
         let input =
             crate::lightmap::indirect::radiance_map::RadianceInput { light, photons: None, quick: false, anew: None };
         let mut values = vec![Vec3::ZERO; atlas.radiance.len()];
@@ -171,7 +172,8 @@ fn what_lies_under_a_block_does_not_darken_texels_beside_it() {
     let lightmap = created(&scene, 40.0);
     let atlas = lightmap.atlas();
     let direct = DirectLight::new(&scene);
-    let light = TexelLight { areas: atlas.areas(&atlas.radiance), direct: &direct, samples: 16, seed: 3 };
+    let light =
+        TexelLight { areas: atlas.areas(&atlas.radiance), direct: &direct, samples: 16, seed: 3, sky_from: None };
     let (mut dark, mut lit) = (0, 0);
     for texel in atlas.radiance.all() {
         let (point, receiver) = atlas.radiance.receiver(&scene, texel, false);
@@ -272,7 +274,8 @@ fn texels_have_the_energy_of_lamps_close_to_them() {
         let light: Vec<f32> = map.light.as_ref().unwrap().direct.iter().map(|e| e.x).collect();
         let of_map = light_of_floor(atlas, &atlas.map, edge, &light);
         let direct = DirectLight::new(&scene);
-        let light = TexelLight { areas: atlas.areas(&atlas.radiance), direct: &direct, samples: 4, seed: 5 };
+        let light =
+            TexelLight { areas: atlas.areas(&atlas.radiance), direct: &direct, samples: 4, seed: 5, sky_from: None };
         let mut tile = TilePoints::new(1).unwrap();
         let mut looks = vec![0.0; atlas.radiance.len()];
         for texel in atlas.radiance.all() {

@@ -1,0 +1,188 @@
+//! Directions of shadow rays to skies, guided by where the sky has been seen from nearby.
+//!
+//! In a room with a window that fills a hundredth of the hemisphere, 99 of 100 rays distributed by cosine end on walls. A
+//! guide has the unit square, which [`cosine_hemisphere`](crate::base::sampling::cosine_hemisphere) maps to directions, cut
+//! into 8 × 8 bins, and says in which of them the sky has been seen. Samples are warped by it, row by row and column by
+//! column (importance sampling of a piecewise constant density; Pharr, Jakob and Humphreys, *Physically Based Rendering*,
+//! 3rd ed., 13.6.7), and weighted by its density: the estimate stays without bias, whatever the guide says, since a part of
+//! the samples goes everywhere. The root of the part that is seen of a bin is the density of least variance.
+
+use crate::base::error::Result;
+use crate::base::memory::try_collect;
+use std::f32::consts::PI;
+use std::sync::atomic::AtomicU64;
+use std::sync::atomic::Ordering::{Acquire, Relaxed, Release};
+
+/// Number of bins to a side.
+const SIDE: usize = 8;
+
+/// Number of bins, and of the bits that tell in which of them the sky is seen.
+pub(crate) const BINS: usize = SIDE * SIDE;
+
+/// Part of the samples that is distributed as if there were no guide: what it does not know gets so many.
+const UNGUIDED: f32 = 0.25;
+
+/// A density over the unit square, constant in each bin.
+#[derive(Clone, Copy, Debug)]
+pub(crate) struct Guide {
+    /// Share of the samples that lie below the end of each row.
+    rows: [f32; SIDE],
+    /// Of the samples of a row, the share that lies before the end of each column.
+    columns: [[f32; SIDE]; SIDE],
+}
+
+impl Guide {
+    /// Returns the guide by what `seen` says of places nearby: a bit per bin, set where the sky was seen. `None` if it was
+    /// seen nowhere, or everywhere.
+    pub(crate) fn new(seen: impl Iterator<Item = u64>) -> Option<Guide> {
+        let (mut counts, mut places) = ([0u8; BINS], 0);
+        for bits in seen {
+            counts.iter_mut().enumerate().for_each(|(bin, count)| *count += (bits >> bin & 1) as u8);
+            places += 1;
+        }
+        if counts.iter().all(|&count| count == 0) || counts.iter().all(|&count| count == places) {
+            return None;
+        }
+        let roots = counts.map(|count| f32::from(count).sqrt());
+        let guided = (1.0 - UNGUIDED) / roots.iter().sum::<f32>();
+        let mut guide = Guide { rows: [0.0; SIDE], columns: [[0.0; SIDE]; SIDE] };
+        let mut below = 0.0;
+        for ((row, columns), roots) in guide.rows.iter_mut().zip(&mut guide.columns).zip(roots.as_chunks().0) {
+            let roots: &[f32; SIDE] = roots;
+            let mut before = 0.0;
+            for (column, root) in columns.iter_mut().zip(roots) {
+                before += guided * root + UNGUIDED / BINS as f32;
+                *column = before;
+            }
+            columns.iter_mut().for_each(|column| *column /= before);
+            columns[SIDE - 1] = 1.0;
+            below += before;
+            *row = below;
+        }
+        guide.rows[SIDE - 1] = 1.0;
+        Some(guide)
+    }
+
+    /// Returns the point of the unit square that belongs to a uniformly distributed one, and its density.
+    pub(crate) fn warp(&self, [x, y]: [f32; 2]) -> ([f32; 2], f32) {
+        let (row, y, share) = part(&self.rows, y);
+        let (column, x, of_row) = part(&self.columns[row], x);
+        let place = |bin: usize, within: f32| ((bin as f32 + within) / SIDE as f32).min(1.0);
+        ([place(column, x), place(row, y)], share * of_row * BINS as f32)
+    }
+
+    /// Returns the density at a point of the unit square.
+    pub(crate) fn density(&self, [x, y]: [f32; 2]) -> f32 {
+        let bin = |at: f32| ((at * SIDE as f32) as usize).min(SIDE - 1);
+        let share = |ends: &[f32; SIDE], bin: usize| ends[bin] - if bin > 0 { ends[bin - 1] } else { 0.0 };
+        share(&self.rows, bin(y)) * share(&self.columns[bin(y)], bin(x)) * BINS as f32
+    }
+}
+
+/// In which bins the sky is seen from each of many places, which are looked from when somebody asks first.
+pub(crate) struct SkySeen {
+    /// A bit per bin, for each place.
+    seen: Vec<AtomicU64>,
+    /// A bit per place: whether somebody has looked.
+    known: Vec<AtomicU64>,
+}
+
+impl SkySeen {
+    /// Bytes per place.
+    pub(crate) const PLACE_BYTES: usize = size_of::<u64>() + 1;
+
+    pub(super) fn new(places: usize) -> Result<SkySeen> {
+        let zeros = |count| try_collect((0..count).map(|_| AtomicU64::new(0)), "where the sky is seen");
+        Ok(SkySeen { seen: zeros(places)?, known: zeros(places.div_ceil(64))? })
+    }
+
+    /// Returns the bins in which the sky is seen from a place, as `look` finds it. Adds the rays traced to `rays`.
+    pub(crate) fn from(&self, place: usize, rays: &mut u64, look: impl FnOnce() -> u64) -> u64 {
+        let (seen, known, bit) = (&self.seen[place], &self.known[place / 64], 1 << (place % 64));
+        if known.load(Acquire) & bit != 0 {
+            return seen.load(Relaxed);
+        }
+        let bits = look();
+        seen.store(bits, Relaxed);
+        // Other threads may look at the same time, and see the same; the rays count once.
+        if known.fetch_or(bit, Release) & bit == 0 {
+            *rays += BINS as u64;
+        }
+        bits
+    }
+}
+
+/// Returns the part of [0, 1] that a number lies in, given the parts' ends; its place there, and the width of the part.
+fn part(ends: &[f32; SIDE], at: f32) -> (usize, f32, f32) {
+    let bin = ends[..SIDE - 1].iter().filter(|&&end| at >= end).count();
+    let begin = if bin > 0 { ends[bin - 1] } else { 0.0 };
+    let width = ends[bin] - begin;
+    (bin, (at - begin) / width, width)
+}
+
+/// Returns the point of the unit square that [`cosine_hemisphere`](crate::base::sampling::cosine_hemisphere) maps to a
+/// direction above (x, y), to 1e-5.
+pub(crate) fn square_of(x: f32, y: f32) -> [f32; 2] {
+    let radius = (x * x + y * y).sqrt().min(1.0);
+    let (along, across) = if x.abs() > y.abs() { (x, y) } else { (y, x) };
+    let r = radius.copysign(along);
+    let t = across / along;
+    let angle = if t.is_finite() { arc_tangent(t) } else { 0.0 };
+    let other = r * (4.0 / PI * angle);
+    let [a, b] = if x.abs() > y.abs() { [r, other] } else { [other, r] };
+    [0.5 * (a + 1.0), 0.5 * (b + 1.0)]
+}
+
+/// The arc tangent of a number from -1 to 1, to 1e-5 (Abramowitz and Stegun, 4.4.49 has the form), the same on every machine.
+fn arc_tangent(t: f32) -> f32 {
+    let s = t * t;
+    t * (0.999_866 + s * (-0.330_299_5 + s * (0.180_141 + s * (-0.085_133 + s * 0.020_835_1))))
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use crate::base::sampling::{cosine_hemisphere, sobol_2d, uniform};
+
+    fn guide() -> Guide {
+        // Some bins seen from all places, some from one, most from none.
+        Guide::new([1 << 9 | 1 << 10 | 3 << 40, 1 << 9, 1 << 9 | 1 << 63].into_iter()).unwrap()
+    }
+
+    #[test]
+    fn samples_have_the_density_that_is_said() {
+        let guide = guide();
+        let (n, mut sum) = (1 << 14, [0.0f64; BINS]);
+        for k in 0..n {
+            let (at, density) = guide.warp(sobol_2d(k, 7));
+            assert!((0.0..=1.0).contains(&at[0]) && (0.0..=1.0).contains(&at[1]));
+            assert!(density >= 0.99 * UNGUIDED && (guide.density(at) / density - 1.0).abs() < 1e-4, "{at:?}");
+            let bin = at.map(|v| ((v * SIDE as f32) as usize).min(SIDE - 1));
+            sum[bin[1] * SIDE + bin[0]] += 1.0 / f64::from(density);
+        }
+        // By their weights the samples are uniform.
+        assert!(sum.iter().all(|s| (s / n as f64 * BINS as f64 - 1.0).abs() < 0.05), "{sum:?}");
+        assert!(guide.density([1.5 / 8.0, 1.5 / 8.0]) > 10.0);
+    }
+
+    #[test]
+    fn what_is_seen_nowhere_or_everywhere_needs_no_guide() {
+        assert!(Guide::new([0, 0].into_iter()).is_none());
+        assert!(Guide::new([u64::MAX; 25].into_iter()).is_none());
+        assert!(Guide::new([].into_iter()).is_none());
+        assert!(Guide::new([u64::MAX, u64::MAX >> 1].into_iter()).is_some());
+    }
+
+    #[test]
+    fn directions_are_mapped_back_to_the_square() {
+        for i in 0..2000 {
+            let u = [uniform(i, 0, 1), uniform(i, 1, 1)];
+            let d = cosine_hemisphere(u);
+            let back = square_of(d.x, d.y);
+            assert!((0..2).all(|k| (back[k] - u[k]).abs() < 2e-5), "{u:?}: {back:?}");
+        }
+        for [x, y] in [[0.0, 0.0], [1.0, 0.0], [0.0, -1.0], [-0.0, 0.0], [0.5, 0.5], [-0.5, 0.5]] {
+            assert!(square_of(x, y).into_iter().all(|v| (0.0..=1.0).contains(&v)), "{x} {y}");
+        }
+    }
+}
