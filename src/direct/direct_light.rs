@@ -10,7 +10,6 @@
 //! In scenes with transmissive surfaces, the light along a ray is multiplied by their transmittance.
 
 use super::area_light::AreaLight;
-use super::guide::SkySeen;
 use super::light_tree::LIGHT_TREE;
 use super::many_lights::ManyLights;
 use super::near_lights::NearLights;
@@ -24,7 +23,7 @@ use crate::base::memory::try_collect;
 use crate::base::sampling::{combine, sobol_2d};
 use crate::scene::{Light, Scene, Sky};
 use glam::Vec3;
-use std::sync::{Arc, OnceLock};
+use std::sync::Arc;
 
 /// Up to this many area lights are evaluated exactly at every point, and up to this many point and
 /// spot lights get a ray each: no noise, and no more rays than sampling takes.
@@ -163,7 +162,6 @@ pub struct DirectLight {
     many: Option<ManyLights>,
     /// Point and spot lights, few or many, by place.
     pub(crate) near: NearLights,
-    sky_seen: OnceLock<SkySeen>,
 }
 
 impl DirectLight {
@@ -214,7 +212,6 @@ impl DirectLight {
             skies: try_collect(skies, LIGHT_TREE)?,
             many: (many.len() > 0).then_some(many),
             near: NearLights::new(points),
-            sky_seen: OnceLock::new(),
         })
     }
 
@@ -236,19 +233,6 @@ impl DirectLight {
     /// Number of skies that shine.
     pub fn sky_count(&self) -> usize {
         self.skies.len()
-    }
-
-    /// Makes room for what is seen of the sky from so many places, if there is a sky and nobody has done it yet.
-    pub(crate) fn make_room_for_sky_seen(&self, places: usize) -> Result<()> {
-        if !self.skies.is_empty() && self.sky_seen.get().is_none() {
-            let _ = self.sky_seen.set(SkySeen::new(places)?);
-        }
-        Ok(())
-    }
-
-    /// What is seen of the sky, if there is room for it.
-    pub(crate) fn sky_seen(&self) -> Option<&SkySeen> {
-        self.sky_seen.get()
     }
 
     /// Number of rays that [`irradiance`](Self::irradiance) traces at a point where all lights shine.

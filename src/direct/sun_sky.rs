@@ -8,7 +8,7 @@
 //! from which directions sky comes, what is sampled by cosine follows it. Gather rays that leave the scene
 //! contribute nothing: skies are direct light, and would count twice.
 
-use super::guide::square_of;
+use super::guide::{frame, square_of};
 use super::receiver::Receiver;
 use super::shadow_rays::ShadowRays;
 use crate::base::sampling::{combine, cosine_hemisphere, orthonormal_basis, sobol_2d};
@@ -90,8 +90,8 @@ impl Disc {
 
 /// Pushes up to `n` shadow rays, whose sum is the irradiance of the sky.
 pub(crate) fn push_sky(sky: &Sky, receiver: &Receiver, n: u32, seed: u32, shadow: &mut ShadowRays) {
-    let (t, b) = orthonormal_basis(receiver.normal);
     let guide = shadow.guide;
+    let (t, b) = if guide.is_some() { frame(receiver.normal) } else { orthonormal_basis(receiver.normal) };
     // A direction, and its density as a multiple of that by cosine.
     let by_cosine = |u| {
         let (u, density) = guide.as_ref().map_or((u, 1.0), |guide| guide.warp(u));

@@ -37,7 +37,6 @@ use crate::base::progress::Progress;
 use crate::base::sampling::{combine, purpose_seed};
 use crate::base::scratch::Scratch;
 use crate::direct::DirectLight;
-use crate::direct::guide::SkySeen;
 use crate::scene::Scene;
 use glam::Vec3;
 use rayon::prelude::*;
@@ -456,9 +455,6 @@ impl<'p> Bake<'_, 'p> {
         if self.blurs_direct() {
             bytes += l.map.len() * direct_blur::TEXEL_BYTES;
         }
-        if self.direct.sky_count() > 0 {
-            bytes += l.radiance.len() * SkySeen::PLACE_BYTES;
-        }
         if self.asks(directional::INDIRECT) {
             bytes += l.gather.len() * DIRECTIONAL_BYTES;
         }
@@ -634,7 +630,7 @@ impl<'p> Bake<'_, 'p> {
         let stage = self.progress.stage("direct", 0.65, 1.0, (2 * range.len() + blurred) as u64);
         let rays = AtomicU64::new(0);
         let backs = &light.backs[..];
-        self.direct.make_room_for_sky_seen(l.radiance.len())?;
+        l.make_room_for_sky_seen(self.direct)?;
         let texels = self.texel_light();
         // Blocks whose light is in the checkpoint.
         let mut known = try_filled(range.len().div_ceil(BLOCK), false, "blocks of texels")?;

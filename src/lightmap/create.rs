@@ -23,7 +23,7 @@ use crate::device::LogLevel;
 use crate::direct::DirectLight;
 use crate::scene::Scene;
 use crate::scene::precision::too_few_digits;
-use std::sync::Arc;
+use std::sync::{Arc, OnceLock};
 use std::time::Instant;
 
 /// Number of pages that a scene fills, roughly, with the automatic density.
@@ -145,6 +145,7 @@ impl Lightmap {
             info,
             seen: Arc::new(seen),
             buried,
+            sky_seen: OnceLock::new(),
             _memory: Arc::new(memory),
         };
         Ok(Lightmap { atlas: Arc::new(atlas), plan, light: None, before: None })

@@ -14,7 +14,7 @@ use crate::base::error::{Result, invalid_argument};
 use crate::base::memory::{try_collect, try_to_vec, try_vec};
 use crate::base::progress::{Progress, Stage};
 use crate::scene::Scene;
-use std::sync::Arc;
+use std::sync::{Arc, OnceLock};
 
 impl Lightmap {
     /// Takes over another state of the light map's scene, whose vertices or instances have moved. Charts, pages and UVs
@@ -86,6 +86,7 @@ impl Atlas {
             info,
             seen: self.seen.clone(),
             buried,
+            sky_seen: OnceLock::new(),
             _memory: self._memory.clone(),
         })
     }

@@ -246,16 +246,18 @@ fn radiance_values(
     Ok((values, rays))
 }
 
-/// Direct light of the radiance map's texels; `quick`: without looking first where the sky is seen.
+/// Direct light of the radiance map's texels; `quick`: without a look at where the sky is seen.
 fn radiance_light<'a>(inputs: &Inputs<'a, '_>, quick: bool) -> Result<TexelLight<'a, RadianceMap>> {
     let Inputs { atlas, direct, params, .. } = *inputs;
-    direct.make_room_for_sky_seen(atlas.radiance.len())?;
+    if !quick {
+        atlas.make_room_for_sky_seen(direct)?;
+    }
     Ok(TexelLight {
         areas: atlas.areas(&atlas.radiance),
         direct,
         samples: params.direct_samples.div_ceil(RADIANCE_SAMPLE_DIVISOR),
         seed: purpose_seed(params.seed, purpose::RADIANCE),
-        sky_from: (!quick).then_some(&atlas.radiance),
+        sky_from: (!quick).then_some(atlas),
     })
 }
 

@@ -31,7 +31,7 @@ use super::atlas::Atlas;
 use super::atlas::chart_index::ChartIndex;
 use super::atlas::chart_map::{ChartMap, Receivers};
 use super::atlas::charts::Charts;
-use super::atlas::ids::{Map, RadianceMap, TexelId};
+use super::atlas::ids::{Map, TexelId};
 use super::atlas::layout::Placement;
 use super::atlas::seen::Seen;
 use super::atlas::texels::TexelSample;
@@ -130,8 +130,8 @@ pub(crate) struct TexelLight<'a, M: Map> {
     pub samples: u32,
     /// Seed of the stage.
     pub seed: u32,
-    /// From whose texels [the sky is seen](sky_seen), which guides shadow rays to it; `None`: they go anywhere.
-    pub sky_from: Option<&'a ChartMap<RadianceMap>>,
+    /// From where [the sky is seen](sky_seen), which guides shadow rays to it; `None`: they go anywhere.
+    pub sky_from: Option<&'a Atlas>,
 }
 
 /// A point of a texel and its light.

@@ -170,7 +170,7 @@ impl Live {
         let cells = Comparison::new(states, &moved, keep_error, progress)?.cells()?;
         let grid = Grid::with(self.grid.info, &mut map.tiles)?;
         let direct = DirectLight::try_new(&atlas.scene)?;
-        direct.make_room_for_sky_seen(atlas.radiance.len())?;
+        atlas.make_room_for_sky_seen(&direct)?;
         let place = Place {
             direct,
             normals: Display::normals(&map)?,

@@ -136,7 +136,7 @@ impl Illumination {
     }
 
     fn of(atlas: &Atlas, direct: DirectLight, indirect: Indirect) -> Result<Illumination> {
-        direct.make_room_for_sky_seen(atlas.radiance.len())?;
+        atlas.make_room_for_sky_seen(&direct)?;
         Ok(Illumination {
             direct: Arc::new(direct),
             radiance: Arc::new(indirect.radiance),

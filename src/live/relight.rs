@@ -290,7 +290,7 @@ impl Live {
             return invalid_argument!("light {id} does not exist, the scene has {count}");
         }
         let direct = Arc::new(DirectLight::try_new(self.scene())?);
-        direct.make_room_for_sky_seen(self.context.map.atlas.radiance.len())?;
+        self.context.map.atlas.make_room_for_sky_seen(&direct)?;
         self.collect_now()?;
         self.make_room_for_epochs()?;
         let following = self.relight.following.take();

@@ -164,7 +164,7 @@ impl DirectWork {
             direct: &c.light.direct,
             samples: c.direct_samples,
             seed: c.direct_seed,
-            sky_from: Some(&a.radiance),
+            sky_from: Some(a),
         };
         let Room { averaged, places, own, .. } = room;
         averaged.clear();

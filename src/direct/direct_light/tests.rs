@@ -1,8 +1,8 @@
 //! Tests of direct light against analysis.
 
 use super::*;
-use crate::base::sampling::{cosine_hemisphere, orthonormal_basis, uniform, uniform_sphere};
-use crate::direct::guide::{BINS, Guide};
+use crate::base::sampling::{cosine_hemisphere, uniform, uniform_sphere};
+use crate::direct::guide::{BINS, Guide, frame};
 use crate::direct::point_light::point_light;
 use crate::direct::polygon;
 use crate::scene::demo::shapes::MeshBuilder;
@@ -348,7 +348,7 @@ fn guided(direct: &DirectLight, seen: Option<u64>, seeds: u32) -> [f64; 2] {
     for seed in 0..seeds {
         let mut room = PointRoom::new();
         let mut shadow = room.begin(&direct.scene);
-        shadow.guide = seen.and_then(|seen| Guide::new(std::iter::once(seen)));
+        shadow.guide = seen.and_then(|seen| Guide::new(std::iter::repeat_n((seen, false), 81)));
         assert_eq!(shadow.guide.is_some(), seen.is_some());
         let mut light = direct.push(&r, 0, Lights::All, 4, combine(seed, 9), &mut shadow);
         light.take(shadow.finish(&mut 0));
@@ -362,7 +362,7 @@ fn guided(direct: &DirectLight, seen: Option<u64>, seeds: u32) -> [f64; 2] {
 /// The bins of a guide in which the sky is seen from the origin of the floor.
 fn seen(direct: &DirectLight) -> u64 {
     let r = receiver(&direct.scene, Vec3::ZERO, Vec3::Z);
-    let (t, b) = orthonormal_basis(Vec3::Z);
+    let (t, b) = frame(Vec3::Z);
     (0..BINS as u32 * 16).fold(0, |bits, i| {
         let (bin, within) = (i / 16, i % 16);
         let place = |k: u32| ((bin >> (3 * k) & 7) as f32 + ((within >> (2 * k) & 3) as f32 + 0.5) / 4.0) / 8.0;

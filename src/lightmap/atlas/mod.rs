@@ -27,6 +27,7 @@ mod welded;
 use super::{LightmapDesc, LightmapInfo};
 use crate::base::memory::Reservation;
 use crate::direct::Receiver;
+use crate::direct::guide::SkySeen;
 use crate::scene::Scene;
 use chart_index::ChartIndex;
 use chart_map::{ChartMap, Receivers};
@@ -34,7 +35,7 @@ use charts::Charts;
 use glam::Vec3;
 use ids::{GatherMap, GatherTexel, LightMap, LightTexel, PlacementId, RadianceMap, ShownMap, TexelId};
 use seen::Seen;
-use std::sync::Arc;
+use std::sync::{Arc, OnceLock};
 
 /// Charts and texels of a scene: all of a light map but its light. Immutable, and shared with live updates.
 pub(crate) struct Atlas {
@@ -56,6 +57,8 @@ pub(crate) struct Atlas {
     pub seen: Arc<Seen>,
     /// Whether each texel of the light map is buried, with the sample point of another one. Empty if none is.
     pub buried: Vec<bool>,
+    /// Where the texels of the radiance map see the sky, as far as somebody has looked.
+    pub(in crate::lightmap) sky_seen: OnceLock<SkySeen>,
     pub(in crate::lightmap) _memory: Arc<Reservation>,
 }
 

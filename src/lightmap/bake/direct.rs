@@ -41,7 +41,7 @@ impl Bake<'_, '_> {
             direct: self.direct,
             samples: self.params.direct_samples,
             seed: purpose_seed(self.params.seed, purpose::DIRECT),
-            sky_from: Some(&self.atlas.radiance),
+            sky_from: Some(self.atlas),
         }
     }
 
