@@ -33,10 +33,18 @@ impl Atlas {
     }
 }
 
+/// The guide at a texel of the radiance map.
+#[derive(Clone, Copy)]
+struct Kept {
+    placement: PlacementId,
+    at: [i32; 2],
+    guide: Option<Guide>,
+}
+
 /// Guides of a tile of texels, which lie in few texels of the radiance map: of 2 × 2 of them, by the last bits of their
 /// columns and rows.
 #[derive(Clone, Copy, Default)]
-pub(super) struct Guides([Option<(PlacementId, [i32; 2], Option<Guide>)>; 4]);
+pub(super) struct Guides([Option<Kept>; 4]);
 
 impl Guides {
     /// Returns the guide of a texel, on its back if so said; `None` if its surroundings [have none](Guide::new), or if shadow
@@ -54,10 +62,8 @@ impl Guides {
         let at = map.layout.texel_coord(placement, areas.charts.local(own.triangle, own.u, own.v));
         let [x, y] = at.map(|v| v.floor() as i32);
         let kept = &mut self.0[(x & 1 | (y & 1) << 1) as usize];
-        if let Some((of, place, guide)) = kept
-            && (*of, *place) == (placement, [x, y])
-        {
-            return *guide;
+        if let Some(kept) = kept.filter(|kept| (kept.placement, kept.at) == (placement, [x, y])) {
+            return kept.guide;
         }
         let around = (-REACH..=REACH).flat_map(|dy| (-REACH..=REACH).map(move |dx| (dx, dy)));
         let near = |(dx, dy): (i32, i32)| Some((map.at(placement, x + dx, y + dy)?, dx.abs().max(dy.abs()) <= 1));
@@ -67,7 +73,7 @@ impl Guides {
             Some(_) => Guide::new(texels.map(|(texel, is_near)| (look_from(texel, rays), is_near))),
             None => None,
         };
-        *kept = Some((placement, [x, y], guide));
+        *kept = Some(Kept { placement, at: [x, y], guide });
         guide
     }
 }
