@@ -5,7 +5,8 @@
 //! into 8 × 8 bins, and says in which of them the sky has been seen. Samples are warped by it, row by row and column by
 //! column (importance sampling of a piecewise constant density; Pharr, Jakob and Humphreys, *Physically Based Rendering*,
 //! 3rd ed., 13.6.7), and weighted by its density: the estimate stays without bias, whatever the guide says, since a part of
-//! the samples goes everywhere. Where the guide knows little, or where it is little needed, that part is greater. The root of the part that is seen of a bin is the density of least variance.
+//! the samples goes everywhere. Where the guide knows little, or where it is little needed, that part is greater. The density
+//! of least variance is in proportion to the root of the part of a bin in which the sky is seen.
 
 use crate::base::error::Result;
 use crate::base::memory::{MemoryMonitor, Reservation, try_collect};
@@ -25,8 +26,8 @@ pub(crate) const BINS: usize = SIDE * SIDE;
 /// Part of the samples that is distributed as if there were no guide, at least: what it does not know gets so many.
 const UNGUIDED: f32 = 0.25;
 
-/// Part of the hemisphere that the sky fills above which there is no guide. Samples by cosine are good there, and a guide that
-/// is not quite right makes more noise than it spares.
+/// Part of the hemisphere, weighted by cosine, from which on there is no guide if the sky fills it. Samples by cosine are good
+/// there, and a guide that is not quite right makes more noise than it spares.
 const MOST: f32 = 0.1;
 
 /// Weight of a place next to where samples begin: behind a corner all others may see nothing, or something else.
@@ -47,9 +48,9 @@ pub(crate) struct Guide {
 }
 
 impl Guide {
-    /// Returns the guide by what `seen` says of up to 100 places: a bit per bin, set where the sky was seen, and whether the
-    /// place is next to where the samples begin. `None` if the sky was seen nowhere, if it fills much of the hemisphere, or if
-    /// there are [`FEW`] places.
+    /// Returns the guide by what `seen` says of up to 200 places: a bit per bin, set where the sky was seen, and whether the
+    /// place is next to where the samples begin, as at most 9 of them are. `None` if the sky was seen nowhere, if it fills much
+    /// of the hemisphere, or if there are no more than [`FEW`] places.
     pub(crate) fn new(seen: impl Iterator<Item = (u64, bool)>) -> Option<Guide> {
         let (mut counts, mut places, mut all) = ([0u8; BINS], 0, 0);
         let (mut near_places, mut near) = (0, 0);
@@ -103,7 +104,7 @@ impl Guide {
     }
 }
 
-/// In which bins the sky is seen from each of many places, which are looked from when somebody asks first.
+/// The bins in which the sky is seen from each of many places; whoever asks for a place first looks from there.
 pub(crate) struct SkySeen {
     /// A bit per bin, for each place.
     seen: Vec<AtomicU64>,
@@ -113,6 +114,7 @@ pub(crate) struct SkySeen {
 }
 
 impl SkySeen {
+    /// Makes room for so many places, and announces it to `memory`.
     pub(crate) fn new(places: usize, memory: &Arc<MemoryMonitor>) -> Result<SkySeen> {
         let (what, parts) = ("where the sky is seen", places.div_ceil(64));
         let zeros = |count| try_collect((0..count).map(|_| AtomicU64::new(0)), what);
@@ -120,7 +122,8 @@ impl SkySeen {
         Ok(SkySeen { seen: zeros(places)?, known: zeros(parts)?, _memory: memory })
     }
 
-    /// Returns the bins in which the sky is seen from a place, as `look` finds it. Adds the rays traced to `rays`.
+    /// Returns the bins in which the sky is seen from a place; `look` finds them, with the same result whenever it is called.
+    /// Adds the rays traced to `rays`.
     pub(crate) fn from(&self, place: usize, rays: &mut u64, look: impl FnOnce() -> u64) -> u64 {
         let (seen, known, bit) = (&self.seen[place], &self.known[place / 64], 1 << (place % 64));
         if known.load(Acquire) & bit != 0 {

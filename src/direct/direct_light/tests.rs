@@ -386,6 +386,7 @@ fn guided_rays_to_a_sky_bring_the_same_light_with_less_noise() {
     let seen = seen(&direct);
     assert!((1..=8).contains(&seen.count_ones()), "{seen:b}");
     let [[plain, noise], [mean, less]] = [None, Some(seen)].map(|seen| guided(&direct, seen, 20_000));
+    // (Standard errors, by the rays that pass the hole: 2.3 %, less than 0.8 % and, at last, 3.3 %.)
     assert!((plain / expected - 1.0).abs() < 0.06, "{plain}, not {expected}");
     assert!((mean / expected - 1.0).abs() < 0.01, "{mean}, not {expected}");
     assert!(less < 0.1 * noise, "variance {noise}, guided {less}");

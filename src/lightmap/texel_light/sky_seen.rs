@@ -143,7 +143,7 @@ mod tests {
     }
 
     #[test]
-    fn texels_of_a_room_are_guided_to_its_window_and_know_it_better() {
+    fn texels_of_a_room_are_guided_to_its_window_and_look_once() {
         let lightmap = room(true);
         let atlas = lightmap.atlas();
         let direct = DirectLight::new(&atlas.scene);
