@@ -33,10 +33,13 @@ const MOST: f32 = 0.1;
 /// Weight of a place next to where samples begin: behind a corner all others may see nothing, or something else.
 const NEAR: u8 = 4;
 
-/// Number of places up to which there is no guide: they miss bins in which little of the sky is seen, and what comes from
-/// there has few samples of great weight. (Sponza under a sky has many small charts: with a guide for all of them direct light
-/// had 1.6 times the error of none.)
-pub(crate) const FEW: usize = 16;
+/// Weight of a bin in which no place has seen the sky, as a part of that of the greatest of the bins around it. An opening
+/// shifts over the hemisphere from place to place; where it reaches a bin that nobody knows of, the samples are few and of
+/// great weight, and leave single bright texels.
+const BESIDE: f32 = 0.25;
+
+/// Number of places up to which there is no guide: they miss bins in which little of the sky is seen.
+pub(crate) const FEW: usize = 4;
 
 /// A density over the unit square, constant in each bin.
 #[derive(Clone, Copy, Debug)]
@@ -68,7 +71,7 @@ impl Guide {
         if all == 0 || !(unguided < 1.0) {
             return None;
         }
-        let roots = counts.map(|count| f32::from(count).sqrt());
+        let roots = with_bins_beside(counts).map(f32::sqrt);
         let guided = (1.0 - unguided) / roots.iter().sum::<f32>();
         let mut guide = Guide { rows: [0.0; SIDE], columns: [[0.0; SIDE]; SIDE] };
         let mut below = 0.0;
@@ -152,6 +155,17 @@ pub(crate) fn frame(normal: Vec3) -> (Vec3, Vec3) {
     (across, normal.cross(across))
 }
 
+/// Returns how many places have seen the sky in each bin, but at least [`BESIDE`] times as many as in each of the up to eight
+/// bins around it.
+fn with_bins_beside(counts: [u8; BINS]) -> [f32; BINS] {
+    let around = |at: usize| at.saturating_sub(1)..(at + 2).min(SIDE);
+    std::array::from_fn(|bin| {
+        let bins = around(bin / SIDE).flat_map(|y| around(bin % SIDE).map(move |x| y * SIDE + x));
+        let most = bins.map(|bin| counts[bin]).max().unwrap_or(0);
+        f32::from(counts[bin]).max(BESIDE * f32::from(most))
+    })
+}
+
 /// Returns the part of [0, 1] that a number lies in, given the parts' ends; its place there, and the width of the part.
 fn part(ends: &[f32; SIDE], at: f32) -> (usize, f32, f32) {
     let bin = ends[..SIDE - 1].iter().filter(|&&end| at >= end).count();
@@ -203,7 +217,28 @@ mod tests {
         }
         // By their weights the samples are uniform.
         assert!(sum.iter().all(|s| (s / n as f64 * BINS as f64 - 1.0).abs() < 0.05), "{sum:?}");
-        assert!(guide.density([1.5 / 8.0, 1.5 / 8.0]) > 10.0);
+        assert!(guide.density([1.5 / 8.0, 1.5 / 8.0]) > 4.0);
+    }
+
+    #[test]
+    fn bins_beside_those_in_which_the_sky_is_seen_have_samples_too() {
+        let guide = Guide::new(std::iter::repeat_n((1 << 31 | 1 << 42, false), 81)).unwrap();
+        let place = |i: usize| (i as f32 + 0.5) / SIDE as f32;
+        let density = |bin: usize| guide.density([place(bin % SIDE), place(bin / SIDE)]);
+        let guided = |bin: usize| density(bin) - density(7);
+        // Bin 31 is the last one of its row; 32 is the first of the next, at the other edge.
+        let beside = [22, 23, 30, 38, 39, 33, 34, 35, 41, 43, 49, 50, 51];
+        for bin in 0..BINS {
+            let part = guided(bin) / guided(31);
+            let expected = if [31, 42].contains(&bin) {
+                1.0
+            } else if beside.contains(&bin) {
+                0.5
+            } else {
+                0.0
+            };
+            assert!((part - expected).abs() < 1e-4, "{bin}: {part}");
+        }
     }
 
     #[test]
@@ -215,9 +250,11 @@ mod tests {
         assert!(Guide::new((0..81).map(|i| if i < 9 { (0xff, true) } else { (0, false) })).is_none());
         // What little is known counts little.
         let of_bin = |guide: Option<Guide>| guide.unwrap().density([0.05, 0.05]);
-        let [few, many] = [FEW + 4, 81].map(|places| of_bin(guide(1, places)));
+        let [few, many] = [FEW + 1, 81].map(|places| of_bin(guide(1, places)));
         assert!(1.0 < few && few < 0.4 * many, "{few} {many}");
-        assert!((many / (0.75 * BINS as f32 + 0.25) - 1.0).abs() < 1e-3, "{many}");
+        // The bin in the corner of the square has weight 1, three around it have the root of a quarter.
+        let expected = (1.0 - UNGUIDED) * BINS as f32 / 2.5 + UNGUIDED;
+        assert!((many / expected - 1.0).abs() < 1e-3, "{many}");
     }
 
     #[test]
