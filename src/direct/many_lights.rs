@@ -37,6 +37,10 @@ enum Source {
     Area(AreaLight),
 }
 
+/// Part of the variance of independent samples that systematic ones are taken to have. (It is 0.1 to 0.9 in the test below.
+/// What more and less do: docs/experiments.md#bright-patches-as-lights.)
+const SYSTEMATIC: f32 = 0.6;
+
 /// Lights of a set. Patches are so many that other lights' size would not fit the caches.
 enum Sources {
     Lights(Vec<Source>),
@@ -65,6 +69,58 @@ impl Patch {
         let direction = way / d2.sqrt();
         let (here, there) = (direction.dot(receiver.normal), -direction.dot(self.normal));
         (d2 > self.near2 && here > 0.0 && there > 0.0 && receiver.faces(way)).then(|| self.flux * (here * there / d2))
+    }
+}
+
+/// Light of shadow rays if nothing occludes them, summed over the channels.
+#[derive(Clone, Copy, Debug, Default)]
+pub(crate) struct Unoccluded {
+    sum: f32,
+    /// Number of rays that were asked for.
+    rays: u32,
+    /// Estimated variance by the choice of patches.
+    of_choice: f32,
+}
+
+impl Unoccluded {
+    /// Returns the variance of the sum over the channels of what arrives.
+    pub(crate) fn variance(&self, arrived: Vec3) -> f32 {
+        if !(self.sum > 0.0) {
+            return 0.0;
+        }
+        let sum = arrived.element_sum();
+        // Rays bring about the same amount each, or nothing; and a patch that is rarely chosen may be all that arrives. (Without
+        // the latter part texels that had got its light looked as sure as those that had got none of it:
+        // docs/experiments.md#bright-patches-as-lights.)
+        let of_occlusion = sum * (self.sum - sum).max(0.0) / self.rays as f32;
+        of_occlusion + self.of_choice * (sum / self.sum).min(1.0)
+    }
+}
+
+/// Patches that samples have fallen on, without those that are due at least one, whose light is exact.
+#[derive(Default)]
+struct Drawn {
+    count: f32,
+    /// Sum of their unoccluded light divided by the probability of each, and that of its squares; both summed over the channels.
+    sum: f32,
+    squares: f32,
+}
+
+impl Drawn {
+    /// Adds a patch that is due a number of samples and has such light; `None`: it faces away, or the receiver does.
+    fn add(&mut self, light: Option<Vec3>, due: f32) {
+        if due < 1.0 {
+            let light = light.map_or(0.0, |light| light.element_sum());
+            (self.count, self.sum, self.squares) = (self.count + 1.0, self.sum + light, self.squares + light * light);
+        }
+    }
+
+    /// Returns the estimated variance of the sum (Hansen and Hurwitz, *On the Theory of Sampling from Finite Populations*, 1943,
+    /// for independent samples).
+    fn variance(&self) -> f32 {
+        // One alone may as well have been none.
+        let n = self.count.max(2.0);
+        SYSTEMATIC * (n * self.squares - self.sum * self.sum).max(0.0) / (n - 1.0)
     }
 }
 
@@ -111,23 +167,24 @@ impl ManyLights {
         }
     }
 
-    /// Pushes up to `n` shadow rays, whose sum is the irradiance without bias. Returns the unoccluded irradiance by the
-    /// same samples, summed over the channels.
-    pub(crate) fn push(&self, receiver: &Receiver, n: u32, seed: u32, shadow: &mut ShadowRays) -> f32 {
+    /// Pushes up to `n` shadow rays, whose sum is the irradiance without bias. Returns what they would bring if nothing
+    /// occluded them.
+    pub(crate) fn push(&self, receiver: &Receiver, n: u32, seed: u32, shadow: &mut ShadowRays) -> Unoccluded {
         shadow.normal = receiver.normal;
         let mut choice = std::mem::take(shadow.choice);
-        self.find_candidates(receiver, n * self.candidates, seed, &shadow.near, &mut choice);
-        let total = push_some(receiver, n, seed, &choice.candidates, shadow);
+        let drawn = self.find_candidates(receiver, n * self.candidates, seed, &shadow.near, &mut choice);
+        let sum = push_some(receiver, n, seed, &choice.candidates, shadow);
         *shadow.choice = choice;
-        total
+        Unoccluded { sum, rays: n, of_choice: drawn.variance() }
     }
 
-    /// Finds `n` candidates at most; lights that are sampled apart, since they are `near`, are left out.
-    fn find_candidates(&self, receiver: &Receiver, n: u32, seed: u32, near: &Near, choice: &mut Choice) {
+    /// Finds `n` candidates at most; lights that are sampled apart, since they are `near`, are left out. Returns
+    /// the light of the patches among them.
+    fn find_candidates(&self, receiver: &Receiver, n: u32, seed: u32, near: &Near, choice: &mut Choice) -> Drawn {
         let Choice { descent, candidates } = choice;
         candidates.clear();
         let offset = sobol_2d(0, combine(seed, 1))[0];
-        let mut next = 0;
+        let (mut next, mut drawn) = (0, Drawn::default());
         let at = (receiver.origin, receiver.normal);
         // A light that is due several candidates gets that number rounded down or up and divides its light among them.
         let share_of = |due: f32, count: u32| 1.0 / if due >= 1.0 { count as f32 } else { due };
@@ -136,12 +193,13 @@ impl ManyLights {
             Sources::Patches(patches) => {
                 let prefetch = |i: usize| simd::prefetch(&patches[i]);
                 self.tree.sample(at, n, offset, descent, prefetch, |i, due, count| {
-                    if let Some(light) = patches[i].light(receiver) {
-                        let light = light * (share_of(due, count) * count as f32);
+                    let light = patches[i].light(receiver).map(|light| light * (share_of(due, count) * count as f32));
+                    drawn.add(light, due);
+                    if let Some(light) = light {
                         candidates.push(Candidate { target: patches[i].position, light });
                     }
                 });
-                return;
+                return drawn;
             }
         };
         self.tree.sample(
@@ -172,6 +230,7 @@ impl ManyLights {
                 }
             },
         );
+        drawn
     }
 }
 
@@ -222,4 +281,63 @@ fn bounds(source: &Source) -> Bounds {
 fn bounds_of_patch(p: &Patch) -> Bounds {
     let power = p.flux.element_sum();
     Bounds { lower: p.position, upper: p.position, axis: p.normal, spread: 0.0, reach: FRAC_PI_2, power }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use crate::base::sampling::uniform;
+    use crate::direct::shadow_rays::PointRoom;
+    use crate::scene::demo::shapes::MeshBuilder;
+    use crate::scene::{Material, SceneData};
+
+    /// Patches above a floor, of which few are much brighter than the others or nearer; `hidden`: those beyond x = 0.5 are behind
+    /// a wall. Returns the variance of the light of a few shadow rays from its middle, and the mean of their estimates of it,
+    /// by the square of the light.
+    fn variance_and_estimate(rays: u32, hidden: bool) -> [f64; 2] {
+        let mut data = SceneData::new();
+        let m = data.add_material(Material { two_sided: true, ..Default::default() }).unwrap();
+        let mut builder = MeshBuilder::new();
+        let p = Vec3::new;
+        builder.quad(p(-9.0, -9.0, 0.0), p(9.0, -9.0, 0.0), p(9.0, 9.0, 0.0), p(-9.0, 9.0, 0.0), m);
+        if hidden {
+            builder.quad(p(0.25, -9.0, 0.0), p(0.25, 9.0, 0.0), p(0.25, 9.0, 9.0), p(0.25, -9.0, 9.0), m);
+        }
+        data.add_mesh(builder.finish()).unwrap();
+        let scene = data.committed();
+        let patch = |i: u32| Patch {
+            position: p(4.0 * uniform(i, 0, 3) - 2.0, 4.0 * uniform(i, 1, 3) - 2.0, 0.2 + 1.8 * uniform(i, 2, 3)),
+            normal: if i.is_multiple_of(3) { -Vec3::Z } else { p(-0.6, 0.0, -0.8) },
+            flux: Vec3::splat(if i.is_multiple_of(20) { 1.0 } else { 0.02 }),
+            near2: 0.0,
+        };
+        let lights = ManyLights::of_patches(Isa::Portable, (0..300).map(patch).collect()).unwrap();
+        let origin = p(0.0, 0.0, 1e-3);
+        let up = Vec3::Z;
+        let r =
+            Receiver { origin, normal: up, geometric: up, position: Vec3::ZERO, shadow_origin: origin, raised: false };
+        let (n, mut sum, mut squares, mut estimates) = (20_000, 0.0, 0.0, 0.0);
+        let mut room = PointRoom::new();
+        for seed in 0..n {
+            let mut shadow = room.begin(&scene);
+            let unoccluded = lights.push(&r, rays, combine(seed, 4), &mut shadow);
+            let arrived = shadow.finish(&mut 0)[0];
+            let light = f64::from(arrived.element_sum());
+            (sum, squares) = (sum + light, squares + light * light);
+            estimates += f64::from(unoccluded.variance(arrived));
+        }
+        let mean = sum / f64::from(n);
+        [squares / f64::from(n) / (mean * mean) - 1.0, estimates / f64::from(n) / (mean * mean)]
+    }
+
+    #[test]
+    fn the_estimated_variance_is_about_that_of_the_light() {
+        for rays in [2, 8, 32] {
+            for hidden in [false, true] {
+                let [variance, estimate] = variance_and_estimate(rays, hidden);
+                let ratio = estimate / variance;
+                assert!(variance > 1e-4 && ratio > 0.5 && ratio < 8.0, "{rays} {hidden}: {estimate}, not {variance}");
+            }
+        }
+    }
 }

@@ -14,7 +14,7 @@
 use super::sample_set::ROUND;
 use crate::base::memory::Reservation;
 use crate::direct::Receiver;
-use crate::direct::many_lights::ManyLights;
+use crate::direct::many_lights::{ManyLights, Unoccluded};
 use crate::direct::shadow_rays::ShadowRays;
 use crate::lightmap::atlas::chart_map::ChartMap;
 use crate::lightmap::atlas::ids::{PlacementId, RadianceMap};
@@ -80,26 +80,7 @@ impl Bright {
         // Shadow rays start where gather rays do.
         let receiver = Receiver { shadow_origin: receiver.origin, raised: false, ..*receiver };
         let rays = (self.shadow_rays * gather_rays as u32).div_ceil(ROUND as u32);
-        Unoccluded { sum: patches.push(&receiver, rays, seed, shadow), rays }
-    }
-}
-
-/// Light of the shadow rays of a round if nothing occludes them, summed over the channels.
-#[derive(Clone, Copy, Default)]
-pub(crate) struct Unoccluded {
-    sum: f32,
-    rays: u32,
-}
-
-impl Unoccluded {
-    /// Returns the variance of the sum over the channels of what arrives.
-    pub(crate) fn variance(&self, arrived: Vec3) -> f32 {
-        if self.rays == 0 {
-            return 0.0;
-        }
-        // Each ray contributes about the same amount, or nothing.
-        let sum = arrived.element_sum();
-        sum * (self.sum - sum).max(0.0) / self.rays as f32
+        patches.push(&receiver, rays, seed, shadow)
     }
 }
 

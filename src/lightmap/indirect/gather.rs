@@ -10,7 +10,6 @@
 //! Tried, and not worth it: more rays where their variance is largest, and rays guided by photons or by what neighbouring
 //! texels found; see docs/experiments.md#adaptive-and-guided-gather-rays.
 
-use super::bright_patches::Unoccluded;
 use super::near_hits::HitRadiance;
 use super::sample_set::{ROUND, SampleSet};
 use crate::base::directional::Directional;
@@ -18,6 +17,7 @@ use crate::base::error::Result;
 use crate::base::memory::try_filled;
 use crate::base::sampling::{combine, concentric_disc, orthonormal_basis, unit_float};
 use crate::direct::Receiver;
+use crate::direct::many_lights::Unoccluded;
 use crate::direct::shadow_rays::{PointRoom, TileRoom};
 use crate::lightmap::tiles::TILE;
 use crate::scene::Scene;
