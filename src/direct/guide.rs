@@ -6,7 +6,8 @@
 //! column (importance sampling of a piecewise constant density; Pharr, Jakob and Humphreys, *Physically Based Rendering*,
 //! 3rd ed., 13.6.7), and weighted by its density: the estimate stays without bias, whatever the guide says, since a part of
 //! the samples goes everywhere. Where the guide knows little, or where it is little needed, that part is greater. The density
-//! of least variance is in proportion to the root of the part of a bin in which the sky is seen.
+//! of least variance is in proportion to the root of the part of a bin in which the sky is seen; bins beside those in which it
+//! is seen get samples, too.
 
 use crate::base::error::Result;
 use crate::base::memory::{MemoryMonitor, Reservation, try_collect};
@@ -33,12 +34,13 @@ const MOST: f32 = 0.1;
 /// Weight of a place next to where samples begin: behind a corner all others may see nothing, or something else.
 const NEAR: u8 = 4;
 
-/// Weight of a bin in which no place has seen the sky, as a part of that of the greatest of the bins around it. An opening
-/// shifts over the hemisphere from place to place; where it reaches a bin that nobody knows of, the samples are few and of
-/// great weight, and leave single bright texels.
+/// Least weight of a bin, as a part of that of the greatest of the bins around it, before the root: such a bin has half the
+/// density of that one. An opening shifts over the hemisphere from place to place; where it reaches a bin that nobody knows of,
+/// samples would be few and of great weight, and leave single bright texels.
 const BESIDE: f32 = 0.25;
 
-/// Number of places up to which there is no guide: they miss bins in which little of the sky is seen.
+/// Number of places up to which there is no guide: they miss bins in which little of the sky is seen. (With more, and with
+/// fewer: docs/experiments.md#shadow-rays-guided-to-the-sky.)
 pub(crate) const FEW: usize = 4;
 
 /// A density over the unit square, constant in each bin.

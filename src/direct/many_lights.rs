@@ -30,16 +30,16 @@ const CANDIDATES: u32 = 8;
 /// docs/experiments.md#bright-patches-as-lights.)
 const CANDIDATES_OF_PATCHES: u32 = 2;
 
+/// Part of the variance of independent samples that systematic ones are taken to have. (It is 0.1 to 0.9 in the test below.
+/// What more and less do: docs/experiments.md#bright-patches-as-lights.)
+const SYSTEMATIC: f32 = 0.6;
+
 #[derive(Clone, Copy)]
 enum Source {
     /// A point or spot light.
     Point(Light),
     Area(AreaLight),
 }
-
-/// Part of the variance of independent samples that systematic ones are taken to have. (It is 0.1 to 0.9 in the test below.
-/// What more and less do: docs/experiments.md#bright-patches-as-lights.)
-const SYSTEMATIC: f32 = 0.6;
 
 /// Lights of a set. Patches are so many that other lights' size would not fit the caches.
 enum Sources {
@@ -78,7 +78,7 @@ pub(crate) struct Unoccluded {
     sum: f32,
     /// Number of rays that were asked for.
     rays: u32,
-    /// Estimated variance by the choice of patches.
+    /// Estimated variance by the choice of patches; 0 for other lights.
     of_choice: f32,
 }
 
@@ -91,7 +91,8 @@ impl Unoccluded {
         let sum = arrived.element_sum();
         // Rays bring about the same amount each, or nothing; and a patch that is rarely chosen may be all that arrives. (Without
         // the latter part texels that had got its light looked as sure as those that had got none of it:
-        // docs/experiments.md#bright-patches-as-lights.)
+        // docs/experiments.md#bright-patches-as-lights.) Which of the light that was chosen has arrived is not known: all of it is
+        // taken to arrive alike.
         let of_occlusion = sum * (self.sum - sum).max(0.0) / self.rays as f32;
         of_occlusion + self.of_choice * (sum / self.sum).min(1.0)
     }
@@ -107,7 +108,7 @@ struct Drawn {
 }
 
 impl Drawn {
-    /// Adds a patch that is due a number of samples and has such light; `None`: it faces away, or the receiver does.
+    /// Adds a patch that is due a number of samples and has such light; `None`: it does not shine on the receiver.
     fn add(&mut self, light: Option<Vec3>, due: f32) {
         if due < 1.0 {
             let light = light.map_or(0.0, |light| light.element_sum());
@@ -118,7 +119,7 @@ impl Drawn {
     /// Returns the estimated variance of the sum (Hansen and Hurwitz, *On the Theory of Sampling from Finite Populations*, 1943,
     /// for independent samples).
     fn variance(&self) -> f32 {
-        // One alone may as well have been none.
+        // One alone may as well have been none, unless it was due nearly one sample, which then is too great a variance.
         let n = self.count.max(2.0);
         SYSTEMATIC * (n * self.squares - self.sum * self.sum).max(0.0) / (n - 1.0)
     }
@@ -291,8 +292,8 @@ mod tests {
     use crate::scene::demo::shapes::MeshBuilder;
     use crate::scene::{Material, SceneData};
 
-    /// Patches above a floor, of which few are much brighter than the others or nearer; `hidden`: those beyond x = 0.5 are behind
-    /// a wall. Returns the variance of the light of a few shadow rays from its middle, and the mean of their estimates of it,
+    /// Patches above a floor, of which few are much brighter than the others or nearer; `hidden`: those beyond x = 0.25 are
+    /// behind a wall. Returns the variance of the light of a few shadow rays from its middle, and the mean of their estimates of it,
     /// by the square of the light.
     fn variance_and_estimate(rays: u32, hidden: bool) -> [f64; 2] {
         let mut data = SceneData::new();

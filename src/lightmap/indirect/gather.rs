@@ -57,7 +57,9 @@ impl Gathered {
     }
 
     /// Returns the variance of the [`irradiance`](Self::irradiance)'s sum over the channels, from the spread of the
-    /// rays (an overestimate, since the rays are stratified; its users allow for that).
+    /// rays (an overestimate, since the rays are stratified; its users allow for that). Where bright patches bring much of the
+    /// light it is too small, as the square of all light is subtracted from that of the rays' light:
+    /// docs/experiments.md#bright-patches-as-lights.
     pub(crate) fn variance(&self) -> f32 {
         let n = self.rays as f32;
         let mean = self.sum.element_sum() / n;
