@@ -410,6 +410,7 @@ fn guided_rays_to_an_image_bring_the_same_light_with_less_noise() {
     let seen = seen(&direct);
     let [[plain, noise], [mean, less]] = [None, Some(seen)].map(|seen| guided(&direct, seen, 40_000));
     assert!((mean / plain - 1.0).abs() < 0.05, "{mean}, not {plain}");
+    // (Half of the rays go to what is bright in the image, without a guide.)
     assert!(less < 0.25 * noise, "variance {noise}, guided {less}");
     let [other, _] = guided(&direct, Some(1 << 63 | 1 << 7), 40_000);
     assert!((other / plain - 1.0).abs() < 0.08, "{other}, not {plain}");

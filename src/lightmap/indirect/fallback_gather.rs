@@ -34,8 +34,9 @@ const BLURRED: usize = 256;
 const RADIUS: i32 = 4;
 
 /// Factor on the estimated variance of a fallback gather when it is compared with others: its few rays are stratified, and
-/// vary less than independent ones, as which they are estimated; the choice of bright patches counts as less before that. (With 1 the blur has a bias: a furnished room has 1.05
-/// times the error of a radius of 2, with this factor 0.94 times.)
+/// vary less than independent ones, as which they are estimated. (The choice of bright patches, which are drawn systematically,
+/// has been reduced before.) (With 1 the blur has a bias: a furnished room has 1.05 times the error of a radius of 2, with this
+/// factor 0.94 times.)
 const STRATIFIED: f32 = 0.35;
 
 /// Ratio of interpolated light up to which fallback gathers are averaged where their differences from it are alike. (Without
