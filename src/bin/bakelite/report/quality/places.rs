@@ -6,7 +6,7 @@
 
 use bakelite::Scene;
 use bakelite::sampling::{orthonormal_basis, uniform, uniform_sphere};
-use bakelite::trace::Ray;
+use bakelite::trace::{RawHit, Ray};
 use glam::Vec3;
 
 /// Places that are looked for.
@@ -15,11 +15,15 @@ const PLACES: usize = 50;
 /// Fewer of them with a floor below are not enough: the others count, too.
 const FEW: usize = 8;
 
-/// Free space around a place, as a part of the scene's diagonal.
+/// Free space around a place, as a part of the [size](size_around) of what is around it.
 const BODY: f32 = 0.01;
 
-/// A floor is at most so far below, as a part of the scene's diagonal.
+/// A floor is at most so far below, as a part of that size.
 const STANDING: f32 = 0.1;
+
+/// What is around a place is at most this many times as large as the median of the distances to it: a house stands on a wide
+/// ground.
+const LARGE: f32 = 20.0;
 
 /// Part of the directions in which a place inside sees surfaces, and a place beside an object.
 const ENCLOSED: f32 = 0.5;
@@ -31,7 +35,7 @@ const PROBES: u32 = 64;
 /// Places tried before they may be closer together.
 const TRIES: u32 = 2000;
 
-/// Distance of places to begin with, as a part of the scene's diagonal, what it shrinks by, and how often it does.
+/// Distance of places to begin with, as a part of that size, what it shrinks by, and how often it does.
 const SPREAD: f32 = 0.2;
 const SHRINK: f32 = 0.7;
 const ROUNDS: i32 = 16;
@@ -39,27 +43,30 @@ const ROUNDS: i32 = 16;
 /// Finds places that can be reached from some of `known`, spread evenly, others for each seed. Empty if none of `known` is in
 /// free space.
 pub fn find(scene: &Scene, known: &[Vec3], up: Vec3, seed: u32) -> Vec<Vec3> {
-    let indoors: Vec<Vec3> = known.iter().copied().filter(|&p| is_free(scene, p, ENCLOSED)).collect();
+    let size = known.iter().map(|&place| size_around(scene, place)).fold(0.0, f32::max);
+    let body = BODY * size;
+    let free = |enclosed: f32| known.iter().copied().filter(|&p| is_free(scene, p, enclosed, body)).collect::<Vec<_>>();
+    let indoors = free(ENCLOSED);
     let (enclosed, mut found) = match indoors.len() {
-        0 => (BESIDE, known.iter().copied().filter(|&p| is_free(scene, p, BESIDE)).collect::<Vec<_>>()),
+        0 => (BESIDE, free(BESIDE)),
         _ => (ENCLOSED, indoors),
     };
     let stands = |p: &&Vec3| {
-        let floor = Ray::new(**p, -up).within(0.0, STANDING * scene.diagonal());
+        let floor = Ray::new(**p, -up).within(0.0, STANDING * size);
         !scene.intersect_raw(&floor).is_miss()
     };
     for round in 0..ROUNDS {
         if found.is_empty() || found.iter().filter(stands).count() >= PLACES {
             break;
         }
-        let spread = SPREAD * scene.diagonal() * SHRINK.powi(round);
+        let spread = SPREAD * size * SHRINK.powi(round);
         for i in 0..TRIES {
             let random = |dimension| uniform(i, dimension, seed.wrapping_mul(ROUNDS as u32) + round as u32);
             let from = found[(random(0) * found.len() as f32) as usize];
             let direction = uniform_sphere([random(1), random(2)]);
-            let place = from + direction * (random(3) * way(scene, from, direction));
+            let place = from + direction * (random(3) * way(scene, from, direction, body));
             let is_new = found.iter().all(|p| p.distance(place) >= spread);
-            if is_new && is_free(scene, place, enclosed) {
+            if is_new && is_free(scene, place, enclosed, body) {
                 found.push(place);
             }
         }
@@ -69,29 +76,36 @@ pub fn find(scene: &Scene, known: &[Vec3], up: Vec3, seed: u32) -> Vec<Vec3> {
 }
 
 /// How far a body gets from a place.
-fn way(scene: &Scene, from: Vec3, direction: Vec3) -> f32 {
+fn way(scene: &Scene, from: Vec3, direction: Vec3, body: f32) -> f32 {
     let (x, y) = orthonormal_basis(direction);
-    let body = BODY * scene.diagonal();
     let free = |aside: Vec3| scene.intersect_raw(&Ray::new(from + 0.7 * body * aside, direction)).t;
     let nearest = [Vec3::ZERO, x, -x, y, -y].into_iter().map(free).fold(scene.diagonal(), f32::min);
     (nearest - body).max(0.0)
 }
 
+/// What rays in all directions from a place hit; misses are left out.
+fn look_around(scene: &Scene, place: Vec3) -> impl Iterator<Item = RawHit> {
+    let direction = |i| uniform_sphere([uniform(i, 0, 1), uniform(i, 1, 1)]);
+    (0..PROBES).map(move |i| scene.intersect_raw(&Ray::new(place, direction(i)))).filter(|hit| !hit.is_miss())
+}
+
+/// Size of what is around a place: the scene's diagonal, unless most of what is seen is much nearer.
+fn size_around(scene: &Scene, place: Vec3) -> f32 {
+    let mut distances: Vec<f32> = look_around(scene, place).map(|hit| hit.t).collect();
+    distances.sort_unstable_by(f32::total_cmp);
+    distances.get(distances.len() / 2).map_or(0.0, |median| (LARGE * median).min(scene.diagonal()))
+}
+
 /// Whether a place has room for a body, sees surfaces in a part `enclosed` of all directions, and none from inside a
 /// solid.
-fn is_free(scene: &Scene, place: Vec3, enclosed: f32) -> bool {
+fn is_free(scene: &Scene, place: Vec3, enclosed: f32, body: f32) -> bool {
     let (mut hits, mut backs, mut nearest) = (0, 0, f32::INFINITY);
-    for i in 0..PROBES {
-        let direction = uniform_sphere([uniform(i, 0, 1), uniform(i, 1, 1)]);
-        let hit = scene.intersect_raw(&Ray::new(place, direction));
-        if hit.is_miss() {
-            continue;
-        }
+    for hit in look_around(scene, place) {
         hits += 1;
         backs += u32::from(!hit.front && !scene.material(hit.triangle).two_sided);
         nearest = nearest.min(hit.t);
     }
-    hits as f32 >= enclosed * PROBES as f32 && backs * 20 <= hits && nearest > BODY * scene.diagonal()
+    hits as f32 >= enclosed * PROBES as f32 && backs * 20 <= hits && nearest > body
 }
 
 #[cfg(test)]
@@ -134,6 +148,22 @@ mod tests {
             let beyond = places.iter().filter(|p| p.x > 5.1).count();
             assert!(beyond * 4 > places.len(), "{beyond} of {} in the second room", places.len());
         }
+    }
+
+    #[test]
+    fn places_are_in_a_room_on_a_wide_ground() {
+        let mut data = SceneData::new();
+        let m = data.add_material(Material { two_sided: true, ..Default::default() }).unwrap();
+        let p = Vec3::new;
+        let mut b = MeshBuilder::new();
+        b.box_(p(0.0, 0.0, 0.0), p(4.0, 3.0, 5.0), true, m);
+        b.quad(p(-500.0, -0.2, -500.0), p(-500.0, -0.2, 500.0), p(500.0, -0.2, 500.0), p(500.0, -0.2, -500.0), m);
+        data.add_mesh(b.finish()).unwrap();
+        let device = Device::new(Default::default()).unwrap();
+        let scene = Scene::commit(&device, data, &BuildOptions::default(), &Progress::none()).map_err(|e| e.1).unwrap();
+        let places = find(&scene, &[p(1.0, 1.6, 1.0)], Vec3::Y, 0);
+        assert!(places.len() >= PLACES, "{}", places.len());
+        assert!(places.iter().all(|p| p.cmpgt(Vec3::ZERO).all() && p.cmplt(Vec3::new(4.0, 3.0, 5.0)).all()));
     }
 
     #[test]
