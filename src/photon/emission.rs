@@ -163,12 +163,13 @@ impl<'a> Emission<'a> {
         (light, power / share)
     }
 
-    /// The source that a pilot photon comes from, and its position in the unit square that a guide divides; `None` for
-    /// lights with an area.
-    pub(super) fn guidable(&self, index: u64, p: [f32; 2], d: [f32; 2]) -> Option<(usize, [f32; 2])> {
+    /// The source that a pilot photon comes from, and the photon, which left nothing yet; `None` for lights with an area.
+    pub(super) fn guidable(&self, index: u64, p: [f32; 2], d: [f32; 2]) -> Option<(usize, PilotPhoton)> {
         let (light, _) = self.light_of(index);
         let square = self.sources.get(light)?.shape.square()?;
-        Some((light, if square == Square::Direction { d } else { p }))
+        let at = if square == Square::Direction { d } else { p };
+        let (place, density) = self.guides[light].as_ref().map_or((at, 1.0), |guide| guide.place(at));
+        Some((light, PilotPhoton { place, left: 0, weight: 1.0 / density }))
     }
 
     /// Whether any light could have a guide.
@@ -183,7 +184,9 @@ impl<'a> Emission<'a> {
         for (source, photon) in pilot {
             try_push(&mut of_source[source], photon, what)?;
         }
-        self.guides.iter_mut().zip(&of_source).for_each(|(guide, photons)| *guide = Guide::new(photons).map(Arc::new));
+        for (guide, photons) in self.guides.iter_mut().zip(&of_source) {
+            *guide = Guide::new(photons)?.map(Arc::new);
+        }
         Ok(())
     }
 

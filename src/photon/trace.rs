@@ -12,7 +12,8 @@ use super::{PATH_LIMIT, PhotonParams, PhotonStats};
 use crate::base::bounds::Bounds;
 use crate::base::error::{Error, Result};
 use crate::base::memory::{
-    MemoryMonitor, Reservation, try_collect, try_filled, try_par_collect_ok, try_push, try_to_vec, try_with_capacity,
+    MemoryMonitor, Reservation, try_append, try_collect, try_filled, try_par_collect_ok, try_push, try_to_vec,
+    try_with_capacity,
 };
 use crate::base::progress::{Progress, Stage};
 use crate::base::sampling::{combine, cosine_around, purpose_seed, sobol_2d, sobol_2d_bits, uniform};
@@ -34,14 +35,20 @@ const MEMORY_STEP: usize = 16 << 20;
 /// Memory is announced in steps of this many bytes within a block, as its photons are stored.
 const BLOCK_STEP: usize = 1 << 20;
 
-/// Divisor of the photon count for the pilot, from which guides are made.
+/// Divisor of the photon count for a round of the pilot, from which guides are made.
 const PILOT_PART: u64 = 16;
 
-/// Maximum number of pilot photons.
+/// Maximum number of pilot photons of a round.
 const MAX_PILOT: u64 = 1 << 16;
+
+/// Number of rounds of the pilot. There is only one if it makes no guide.
+const ROUNDS: u64 = 3;
 
 /// Changes the seed for the random numbers of the pilot.
 const PILOT_SEED: u64 = u64::from_be_bytes(*b"phopilot");
+
+/// Name of the pilot's photons in error messages.
+const PILOT: &str = "pilot photons";
 
 /// A pilot photon and its source.
 type Guidable = (usize, PilotPhoton);
@@ -258,12 +265,21 @@ impl<'a> Tracer<'a> {
         if count < BLOCK || !tracer.emission.can_be_guided() {
             return Ok(tracer);
         }
-        let params = PhotonParams { photon_count: count, seed: params.seed ^ PILOT_SEED, ..*params };
-        let pilot = Tracer::new(scene, lights, &params)?;
-        let blocks = pilot.blocks().into_par_iter().map(|block| pilot.left_by_block(block as u64));
-        let blocks: Vec<(Vec<Guidable>, u64)> = try_par_collect_ok(blocks, "pilot photons")?;
-        tracer.pilot_rays = blocks.iter().map(|b| b.1).sum();
-        tracer.emission.guide(blocks.into_iter().flat_map(|b| b.0))?;
+        let mut photons: Vec<Guidable> = Vec::new();
+        for round in 0..ROUNDS {
+            let seed = (params.seed ^ PILOT_SEED).wrapping_add(round);
+            let mut pilot = Tracer::new(scene, lights, &PhotonParams { photon_count: count, seed, ..*params })?;
+            pilot.emission.guide_by(tracer.emission.guides())?;
+            let blocks = pilot.blocks().into_par_iter().map(|block| pilot.left_by_block(block as u64));
+            for (guidable, rays) in try_par_collect_ok(blocks, PILOT)? {
+                try_append(&mut photons, &guidable, PILOT)?;
+                tracer.pilot_rays += rays;
+            }
+            tracer.emission.guide(photons.iter().copied())?;
+            if tracer.emission.guides().iter().all(Option::is_none) {
+                break;
+            }
+        }
         Ok(tracer)
     }
 
@@ -299,10 +315,10 @@ impl<'a> Tracer<'a> {
         let photons = (block * BLOCK..self.emission.count()).zip(left);
         let guidable = photons.filter_map(|(photon, left)| {
             let at = |dimension| sobol_2d(photon as u32, combine(self.seed, dimension));
-            let (source, place) = self.emission.guidable(photon, at(EMIT_POSITION), at(EMIT_DIRECTION))?;
-            Some((source, PilotPhoton { place, left }))
+            let (source, pilot) = self.emission.guidable(photon, at(EMIT_POSITION), at(EMIT_DIRECTION))?;
+            Some((source, PilotPhoton { left, ..pilot }))
         });
-        Ok((try_collect(guidable, "pilot photons")?, tally.rays))
+        Ok((try_collect(guidable, PILOT)?, tally.rays))
     }
 
     /// Traces one block of photons; `watch` may cancel and counts the memory; `see` receives the number, the rays and
