@@ -96,7 +96,7 @@ pub struct bk_bake_params {
     /// the indirect light of the Cornell box is 9 % too low). Default: 0.
     pub max_bounces: u32,
     /// Number of photons to emit, at most 2^32; 0: no light that is reflected more than once. A
-    /// pilot of a sixteenth as many, at most 65,536, finds out beforehand where to send them. Raise
+    /// pilot of up to 3/16 as many, at most 196,608, finds out beforehand where to send them. Raise
     /// it against blotches that are the same with every number of gather rays; time and memory of
     /// the photons grow in proportion, and beyond 1,000,000 the error fell by a tenth in the
     /// Cornell box. Default: 1,000,000.

@@ -8,9 +8,9 @@
 //! Monte Carlo Particle Tracing for Diffuse Environments with Adaptive Probability Density Functions*, 1995, guide all
 //! reflections in this way, by their contribution to a picture.)
 //!
-//! Around a house on a wide ground one photon in thousands is useful. So cells are small, and what few pilot photons say of
-//! one is drawn towards the mean of the four cells that it is a quarter of, as if [`PRIOR`] photons had said that. The pilot
-//! is traced in rounds, each guided by those before, whose photons weigh by what they stand for.
+//! Around a house on a wide ground one photon in thousands is useful. So cells are small, and the estimate for a cell is the
+//! mean of its own pilot photons and of [`PRIOR`] imaginary ones with the average of the block of 2 × 2 cells that it belongs
+//! to; that average is found in the same way. The pilot is traced in rounds, each guided by those before.
 //!
 //! Each light has a guide of its own. Measured: docs/experiments.md#photon-guiding.
 
@@ -21,11 +21,11 @@ use std::ops::AddAssign;
 /// Minimum number of pilot photons per cell, in the mean.
 const PER_CELL: usize = 4;
 
-/// Maximum number of cells along an axis. (Pilots of 3 · 2^16 photons make 64.)
+/// Maximum number of cells along an axis, for lights with 2^16 pilot photons or more.
 const MAX_SIDE: usize = 128;
 
-/// Number of pilot photons that the mean of four cells counts as in each of them. (With 8 the rooms of
-/// docs/experiments.md#photon-guiding have 1.2 to 2.1 times the error.)
+/// Number of imaginary pilot photons in a cell, which left as much as those of the block around it. (With 8 indirect light of
+/// rooms under a sky had more noise: docs/experiments.md#photon-guiding.)
 const PRIOR: f32 = 32.0;
 
 /// Minimum density of a cell, relative to that without a guide.
@@ -47,56 +47,57 @@ pub(super) struct PilotPhoton {
     pub place: [f32; 2],
     /// Number of times it was left on a surface after a reflection.
     pub left: u32,
-    /// Number of photons that it stands for: 1, or less where a guide sent more.
+    /// Number of photons without a guide that it stands for: the reciprocal of the guide's density there.
     pub weight: f32,
 }
 
 /// Sums over pilot photons of a cell.
 #[derive(Clone, Copy, Default)]
 struct Sums {
-    photons: f32,
+    /// Of weights, and of their squares.
     weights: f32,
+    squares: f32,
     /// Of [`PilotPhoton::left`] and of its square, by weight.
     left: [f32; 2],
 }
 
 impl AddAssign for Sums {
     fn add_assign(&mut self, other: Sums) {
-        self.photons += other.photons;
         self.weights += other.weights;
+        self.squares += other.squares;
         self.left.iter_mut().zip(other.left).for_each(|(sum, more)| *sum += more);
     }
 }
 
 impl Sums {
-    fn of(photon: &PilotPhoton) -> Sums {
-        let PilotPhoton { left, weight, .. } = *photon;
-        let left = left as f32;
-        Sums { photons: 1.0, weights: weight, left: [weight * left, weight * left * left] }
+    fn of(photon: &PilotPhoton, weight: f32) -> Sums {
+        let left = photon.left as f32;
+        Sums { weights: weight, squares: weight * weight, left: [weight * left, weight * left * left] }
     }
 
-    /// Returns the mean number of photons left and the mean of its square, given those of the cells around.
-    fn means(&self, around: Option<[f32; 2]>) -> [f32; 2] {
-        let prior = if around.is_some() { PRIOR } else { 0.0 };
-        let around = around.unwrap_or_default();
-        std::array::from_fn(|i| {
-            let own = if self.weights > 0.0 { self.left[i] / self.weights } else { 0.0 };
-            (self.photons * own + prior * around[i]) / (self.photons + prior).max(1.0)
-        })
+    /// Returns the mean number of photons left and the mean of its square, given those of the block around and how many
+    /// photons they count as.
+    fn means(&self, block: [f32; 2], prior: f32) -> [f32; 2] {
+        if !(self.squares > 0.0) {
+            return block;
+        }
+        // Photons of unequal weight tell as much as so many equal ones (Kish, *Survey Sampling*, 1965).
+        let photons = self.weights * self.weights / self.squares;
+        std::array::from_fn(|i| (photons * self.left[i] / self.weights + prior * block[i]) / (photons + prior))
     }
 }
 
-/// Returns the [means](Sums::means) of each of `side`² cells.
-fn means(of_cells: &[Sums], side: usize) -> Result<Vec<[f32; 2]>> {
+/// Returns the [means](Sums::means) of `side`² cells. `weighted` has the same photons by their weights.
+fn means(of_cells: &[Sums], weighted: &[Sums], side: usize) -> Result<Vec<[f32; 2]>> {
     if side == 1 {
-        return try_collect(of_cells.iter().map(|sums| sums.means(None)), GUIDES);
+        return try_collect(of_cells.iter().map(|sums| sums.means([0.0; 2], 0.0)), GUIDES);
     }
     let half = side / 2;
-    let quarter_of = |cell: usize| cell / side / 2 * half + cell % side / 2;
-    let mut of_four = try_filled(half * half, Sums::default(), GUIDES)?;
-    of_cells.iter().enumerate().for_each(|(cell, &sums)| of_four[quarter_of(cell)] += sums);
-    let around = means(&of_four, half)?;
-    let own = of_cells.iter().enumerate().map(|(cell, sums)| sums.means(Some(around[quarter_of(cell)])));
+    let block_of = |cell: usize| cell / side / 2 * half + cell % side / 2;
+    let mut blocks = try_filled(half * half, Sums::default(), GUIDES)?;
+    weighted.iter().enumerate().for_each(|(cell, &sums)| blocks[block_of(cell)] += sums);
+    let of_blocks = means(&blocks, &blocks, half)?;
+    let own = of_cells.iter().enumerate().map(|(cell, sums)| sums.means(of_blocks[block_of(cell)], PRIOR));
     try_collect(own, GUIDES)
 }
 
@@ -117,9 +118,14 @@ impl Guide {
         while 4 * side * side * PER_CELL <= pilot.len() && side < MAX_SIDE {
             side *= 2;
         }
-        let mut of_cells = try_filled(side * side, Sums::default(), GUIDES)?;
-        pilot.iter().for_each(|photon| of_cells[cell(photon.place, side)] += Sums::of(photon));
-        let means = means(&of_cells, side)?;
+        // The cells of earlier guides are as large or larger, so that in a cell all photons are alike: they count the same, but
+        // in blocks of cells by their weights.
+        let of_cells = |weight: fn(&PilotPhoton) -> f32| -> Result<Vec<Sums>> {
+            let mut of_cells = try_filled(side * side, Sums::default(), GUIDES)?;
+            pilot.iter().for_each(|photon| of_cells[cell(photon.place, side)] += Sums::of(photon, weight(photon)));
+            Ok(of_cells)
+        };
+        let means = means(&of_cells(|_| 1.0)?, &of_cells(|photon| photon.weight)?, side)?;
         let cells = means.len() as f32;
         let wanted = means.iter().map(|[_, squares]| squares.sqrt());
         let average = wanted.clone().sum::<f32>() / cells;
@@ -257,6 +263,29 @@ mod tests {
         assert!(place[0] < 1.0 && place[1] < 1.0 && density > 0.0);
     }
 
+    /// A guide sent 15 of 16 photons to a quarter of the square, where each left one.
+    #[test]
+    fn photons_of_rounds_count_by_their_weights_in_blocks_and_alike_in_cells() {
+        let photon = |i: u32, scale: f32, left, weight| {
+            let [x, y] = sobol_2d(i, 4);
+            PilotPhoton { place: [scale * x, scale * y], left, weight }
+        };
+        let sparse = (0..1 << 8).map(|i| photon(i, 1.0, 0, 4.0)).filter(|p| p.place[0].max(p.place[1]) >= 0.5);
+        let photons: Vec<PilotPhoton> =
+            (0..15 << 8).map(|i| photon(i, 0.5, 1, 4.0 / 15.0 / 4.0)).chain(sparse).collect();
+        let sums = |side: usize, weight: &dyn Fn(&PilotPhoton) -> f32| {
+            let mut sums = vec![Sums::default(); side * side];
+            photons.iter().for_each(|p| sums[cell(p.place, side)] += Sums::of(p, weight(p)));
+            sums
+        };
+        let [left, squares] = means(&sums(1, &|p| p.weight), &[], 1).unwrap()[0];
+        assert!((left - 0.25).abs() < 0.01 && left == squares, "{left} {squares}");
+        let cells = means(&sums(2, &|_| 1.0), &sums(2, &|p| p.weight), 2).unwrap();
+        // As of 3,840 photons and 32 of 0.25, or of 64 and 32.
+        let expected = [(3840.0 + 32.0 * left) / 3872.0, 32.0 * left / 96.0];
+        assert!((cells[0][0] - expected[0]).abs() < 1e-3 && (cells[3][0] - expected[1]).abs() < 0.01, "{cells:?}");
+    }
+
     /// One photon in five thousand is useful, all of them in a window.
     #[test]
     fn rounds_lead_to_a_place_that_few_photons_find() {
@@ -308,7 +337,10 @@ mod tests {
         };
         assert_eq!(Guide::new(&alike(2)).unwrap(), None);
         assert_eq!(Guide::new(&alike(0)).unwrap(), None);
-        assert_eq!(Guide::new(&pilot()[..10]).unwrap(), None);
+        // One photon that left a lot is chance.
+        let mut few = alike(1)[..64].to_vec();
+        few[5].left = 50;
+        assert_eq!(Guide::new(&few).unwrap(), None);
         assert_eq!(Guide::new(&[]).unwrap(), None);
     }
 }

@@ -52,7 +52,7 @@ pub const MAX_PHOTONS: u64 = 1 << 32;
 /// Parameters of a photon map.
 #[derive(Clone, Copy, Debug, PartialEq)]
 pub struct PhotonParams {
-    /// Photons emitted, 1 to [`MAX_PHOTONS`]. A sixteenth as many, at most 65,536, are traced before to find out where
+    /// Photons emitted, 1 to [`MAX_PHOTONS`]. Up to 3/16 as many, at most 196,608, are traced before to find out where
     /// to send them.
     pub photon_count: u64,
     /// Maximum number of surface interactions per photon (1: direct light only); 0: paths are ended by Russian roulette

@@ -109,7 +109,7 @@ pub(super) fn trace(
     progress: &Progress,
     (from, to): (f32, f32),
 ) -> Result<Traced> {
-    let mut tracer = Tracer::guided(scene, lights, params)?;
+    let mut tracer = Tracer::guided(scene, lights, params, progress)?;
     tracer.thin_out(params.most_stored)?;
     let numbers = share.of(tracer.blocks().len());
     let stage = progress.stage("photons", from, to, numbers.len() as u64);
@@ -154,7 +154,7 @@ impl Tracer<'_> {
 
 /// Records the rays of all paths.
 pub(super) fn record_rays(scene: &Arc<Scene>, lights: &[Light], params: &PhotonParams) -> Result<Vec<Ray>> {
-    let tracer = Tracer::guided(scene, lights, params)?;
+    let tracer = Tracer::guided(scene, lights, params, &Progress::none())?;
     let mut rays = Vec::new();
     for block in 0..tracer.emission.count().div_ceil(BLOCK) {
         tracer.block(block, None, |_, traced, _| rays.extend_from_slice(traced))?;
@@ -259,7 +259,7 @@ impl<'a> Tracer<'a> {
     }
 
     /// Makes a tracer with guides, if there are enough photons to find any.
-    fn guided(scene: &'a Scene, lights: &[Light], params: &PhotonParams) -> Result<Self> {
+    fn guided(scene: &'a Scene, lights: &[Light], params: &PhotonParams, progress: &Progress) -> Result<Self> {
         let count = (params.photon_count / PILOT_PART).min(MAX_PILOT);
         let mut tracer = Tracer::new(scene, lights, params)?;
         if count < BLOCK || !tracer.emission.can_be_guided() {
@@ -267,10 +267,14 @@ impl<'a> Tracer<'a> {
         }
         let mut photons: Vec<Guidable> = Vec::new();
         for round in 0..ROUNDS {
-            let seed = (params.seed ^ PILOT_SEED).wrapping_add(round);
+            let seed = params.seed ^ PILOT_SEED ^ round << 32;
             let mut pilot = Tracer::new(scene, lights, &PhotonParams { photon_count: count, seed, ..*params })?;
-            pilot.emission.guide_by(tracer.emission.guides())?;
-            let blocks = pilot.blocks().into_par_iter().map(|block| pilot.left_by_block(block as u64));
+            let is_guided = pilot.emission.guide_by(tracer.emission.guides())?;
+            debug_assert!(is_guided, "the lights are the same");
+            let blocks = pilot.blocks().into_par_iter().map(|block| {
+                progress.check()?;
+                pilot.left_by_block(block as u64)
+            });
             for (guidable, rays) in try_par_collect_ok(blocks, PILOT)? {
                 try_append(&mut photons, &guidable, PILOT)?;
                 tracer.pilot_rays += rays;
@@ -651,7 +655,7 @@ mod tests {
                 (inside, red, all, emitted)
             };
             let plain = sums(Tracer::new(&scene, lights, &params).unwrap());
-            let guided = sums(Tracer::guided(&scene, lights, &params).unwrap());
+            let guided = sums(Tracer::guided(&scene, lights, &params, &Progress::none()).unwrap());
             // A hundredth of the pilot photons makes coarse guides. The plain 1,316 photons have 3 % noise.
             let (more, tolerance) = if lights.len() < 100 { (2.0, 0.03) } else { (1.5, 0.06) };
             assert!(guided.0 as f64 > more * plain.0 as f64, "{lights:?}: {} {}", guided.0, plain.0);

@@ -18,11 +18,11 @@ const FEW: usize = 8;
 /// Free space around a place, as a part of the [size](size_around) of what is around it.
 const BODY: f32 = 0.01;
 
-/// A floor is at most so far below, as a part of that size.
+/// A floor is at most so far below, as a part of that [size](size_around).
 const STANDING: f32 = 0.1;
 
-/// What is around a place is at most this many times as large as the median of the distances to it: a house stands on a wide
-/// ground.
+/// The size of what is around a place is at most this many times the median distance to what is seen from there, so that a wide
+/// ground around a house does not count.
 const LARGE: f32 = 20.0;
 
 /// Part of the directions in which a place inside sees surfaces, and a place beside an object.
@@ -35,7 +35,7 @@ const PROBES: u32 = 64;
 /// Places tried before they may be closer together.
 const TRIES: u32 = 2000;
 
-/// Distance of places to begin with, as a part of that size, what it shrinks by, and how often it does.
+/// Distance of places to begin with, as a part of that [size](size_around), what it shrinks by, and how often it does.
 const SPREAD: f32 = 0.2;
 const SHRINK: f32 = 0.7;
 const ROUNDS: i32 = 16;
@@ -43,14 +43,17 @@ const ROUNDS: i32 = 16;
 /// Finds places that can be reached from some of `known`, spread evenly, others for each seed. Empty if none of `known` is in
 /// free space.
 pub fn find(scene: &Scene, known: &[Vec3], up: Vec3, seed: u32) -> Vec<Vec3> {
-    let size = known.iter().map(|&place| size_around(scene, place)).fold(0.0, f32::max);
-    let body = BODY * size;
-    let free = |enclosed: f32| known.iter().copied().filter(|&p| is_free(scene, p, enclosed, body)).collect::<Vec<_>>();
-    let indoors = free(ENCLOSED);
-    let (enclosed, mut found) = match indoors.len() {
-        0 => (BESIDE, free(BESIDE)),
-        _ => (ENCLOSED, indoors),
+    let sizes: Vec<(Vec3, f32)> = known.iter().map(|&place| (place, size_around(scene, place))).collect();
+    let free = |enclosed: f32| -> Vec<(Vec3, f32)> {
+        sizes.iter().copied().filter(|&(place, size)| is_free(scene, place, enclosed, BODY * size)).collect()
     };
+    let indoors = free(ENCLOSED);
+    let (enclosed, known) = if indoors.is_empty() { (BESIDE, free(BESIDE)) } else { (ENCLOSED, indoors) };
+    // A lamp in its housing sees nothing but that.
+    let size = known.iter().map(|&(_, size)| size).fold(0.0, f32::max);
+    let body = BODY * size;
+    let mut found: Vec<Vec3> =
+        known.iter().map(|&(place, _)| place).filter(|&p| is_free(scene, p, enclosed, body)).collect();
     let stands = |p: &&Vec3| {
         let floor = Ray::new(**p, -up).within(0.0, STANDING * size);
         !scene.intersect_raw(&floor).is_miss()
@@ -96,7 +99,7 @@ fn size_around(scene: &Scene, place: Vec3) -> f32 {
     distances.get(distances.len() / 2).map_or(0.0, |median| (LARGE * median).min(scene.diagonal()))
 }
 
-/// Whether a place has room for a body, sees surfaces in a part `enclosed` of all directions, and none from inside a
+/// Whether a place has room for a `body` of that radius, sees surfaces in a part `enclosed` of all directions, and none from inside a
 /// solid.
 fn is_free(scene: &Scene, place: Vec3, enclosed: f32, body: f32) -> bool {
     let (mut hits, mut backs, mut nearest) = (0, 0, f32::INFINITY);
@@ -161,7 +164,8 @@ mod tests {
         data.add_mesh(b.finish()).unwrap();
         let device = Device::new(Default::default()).unwrap();
         let scene = Scene::commit(&device, data, &BuildOptions::default(), &Progress::none()).map_err(|e| e.1).unwrap();
-        let places = find(&scene, &[p(1.0, 1.6, 1.0)], Vec3::Y, 0);
+        // The second is high above.
+        let places = find(&scene, &[p(1.0, 1.6, 1.0), p(30.0, 40.0, 30.0)], Vec3::Y, 0);
         assert!(places.len() >= PLACES, "{}", places.len());
         assert!(places.iter().all(|p| p.cmpgt(Vec3::ZERO).all() && p.cmplt(Vec3::new(4.0, 3.0, 5.0)).all()));
     }
