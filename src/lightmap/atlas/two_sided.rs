@@ -16,7 +16,8 @@
 //! since light leaks between layers of cloth.
 //!
 //! The front of a surface in the open is kept if it is clearly brighter than the back: some light gets into a hollow
-//! body through its openings.
+//! body through its openings. Where a sun or a sky shines, this holds unless one side is clearly seen more: the sun on the
+//! upper side of a ceiling is no reason to show that.
 
 use super::Atlas;
 use super::chart_map::ChartMap;
@@ -88,11 +89,14 @@ pub(crate) fn backs(
         };
         let front = PlacementId::front_of(chart);
         let [of_front, of_back] = [front, back].map(|placement| view(scene, radiance, placement));
-        if of_front.is_in_the_open() && lit(front) > BRIGHTER * lit(back) {
-            return false;
-        }
-        if of_back.is_in_the_open() && lit(back) > BRIGHTER * BETTER * lit(front) {
-            return true;
+        // In scenes without a sun or a sky no rays start in the open.
+        if !(atlas.is_outdoors && atlas.seen.shows_back(chart).is_some()) {
+            if of_front.is_in_the_open() && lit(front) > BRIGHTER * lit(back) {
+                return false;
+            }
+            if of_back.is_in_the_open() && lit(back) > BRIGHTER * BETTER * lit(front) {
+                return true;
+            }
         }
         if let Some(is_back) = atlas.seen.shows_back(chart) {
             let [shown, other] = if is_back { [back, front] } else { [front, back] };
@@ -325,6 +329,28 @@ mod tests {
         assert!(shown([3, 200], seen, [1.0, 0.01]) && shown([0, 200], front_hidden, [1.0, 0.0]));
         assert!(!shown([3, 200], front_hidden, [1.0, 0.0]) && !shown([0, 200], seen, [1.0, 0.0]));
         assert!(shown([200, 3], seen, [0.0, 1.0]) && !shown([200, 3], seen, [0.0, 0.0]));
+    }
+
+    /// The ceiling of a house without a roof, seen far more often from inside.
+    #[test]
+    fn the_sun_does_not_turn_a_ceiling_over_unless_it_is_seen_from_above() {
+        let (mut data, m) = two_sided();
+        let mut builder = MeshBuilder::new();
+        builder.box_(Vec3::splat(-1.0), Vec3::splat(1.0), true, m);
+        data.add_mesh(builder.finish()).unwrap();
+        data.add_light(Light::Directional { direction: Vec3::NEG_Y, irradiance: [1.0; 3], angular_radius: 0.0 })
+            .unwrap();
+        let mut lightmap = lightmap(data, false);
+        let mut shows_back = |counts: [u32; 2]| {
+            let atlas = Arc::get_mut(&mut lightmap.atlas).unwrap();
+            let seen = Arc::get_mut(&mut atlas.seen).unwrap();
+            seen.counts.iter_mut().for_each(|of_chart| *of_chart = counts);
+            let light = |s| if lightmap.atlas.radiance.is_back(s) { 9.0 } else { 1.0 };
+            let backs = backs(&lightmap.atlas, light, &Progress::none()).unwrap();
+            assert!(backs.iter().all(|&back| back == backs[0]));
+            backs[0]
+        };
+        assert_eq!([[200, 3], [200, 30], [3, 200]].map(&mut shows_back), [false, true, true]);
     }
 
     #[test]
