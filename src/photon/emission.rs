@@ -163,7 +163,8 @@ impl<'a> Emission<'a> {
         (light, power / share)
     }
 
-    /// The source that a pilot photon comes from, and the photon, which left nothing yet; `None` for lights with an area.
+    /// The source that pilot photon `index` comes from, given its random numbers as in [`emit`](Self::emit), and the photon,
+    /// which left nothing yet; `None` for lights with an area.
     pub(super) fn guidable(&self, index: u64, p: [f32; 2], d: [f32; 2]) -> Option<(usize, PilotPhoton)> {
         let (light, _) = self.light_of(index);
         let square = self.sources.get(light)?.shape.square()?;

@@ -89,7 +89,7 @@ pub(crate) fn backs(
         };
         let front = PlacementId::front_of(chart);
         let [of_front, of_back] = [front, back].map(|placement| view(scene, radiance, placement));
-        // In scenes without a sun or a sky no rays start in the open.
+        // Rays that were counted start in the open only if a sun or a sky shines.
         if !(atlas.is_outdoors && atlas.seen.shows_back(chart).is_some()) {
             if of_front.is_in_the_open() && lit(front) > BRIGHTER * lit(back) {
                 return false;
@@ -358,7 +358,8 @@ mod tests {
         assert!(!wall_shows_back(true, 1.0, 1e6));
     }
 
-    /// The charts with two places of a box in the open, with `light`, in which a lamp is switched off; on a `ground` of some size.
+    /// The charts with two places of a box in the open, with `light`, in which a lamp is switched off; it stands on a square ground
+    /// of that width (0: none).
     fn both_sided_of_a_house(light: Light, ground: f32) -> u32 {
         let (mut data, m) = two_sided();
         let mut builder = MeshBuilder::new();
@@ -389,7 +390,7 @@ mod tests {
     fn the_inside_of_a_house_on_a_wide_ground_is_seen() {
         let sun = Light::Directional { direction: Vec3::NEG_Y, irradiance: [1.0; 3], angular_radius: 0.0 };
         let [alone, on_ground] = [0.0, 60.0].map(|ground| both_sided_of_a_house(sun, ground));
-        // Nobody sees it from below.
+        // The house's floor is not seen from below.
         assert_eq!([alone, on_ground], [6, 5]);
     }
 
